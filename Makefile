@@ -1,0 +1,56 @@
+# make demo    the whole main path on the real workbook, into out/
+# make test    linters, types and tests (tests/core, tests/blender)
+# make bench   speed and accuracy
+# make dist    extension zips in dist/, one per platform; PLATFORM=linux-x64 builds that one
+# make test-app   the Linux zip in a real Blender (see tests/app)
+# make clean   removes what the others made, environments included
+#
+# The environment is made in VENV on the first call. PYTHON picks its interpreter (3.11: Blender 4.5, 3.13: Blender 5.2);
+# TORCH is what pip installs on Python 3.11, empty for an environment without torch.
+PYTHON = python3
+VENV = .venv
+TORCH = torch==2.13.0
+PLATFORM =
+OUTPUT = out
+
+BIN = $(VENV)/bin
+# Any Python can make the environment; the one that PYTHON names may be a shim that does not run.
+ANY_PYTHON = $$(for p in "$(PYTHON)" python3 python3.11 python3.13; do "$$p" -c "" 2>/dev/null && echo "$$p" && break; done)
+ENVIRONMENT = @p=$(ANY_PYTHON); [ -n "$$p" ] || { echo "no Python found; name one: make PYTHON=/path/to/python3.11"; exit 1; }; \
+	"$$p" tools/environment.py $(VENV) --python "$(PYTHON)"
+
+.PHONY: demo test lint test-app bench dist clean env env-dev
+
+demo: env
+	$(BIN)/mphdrr demo --output $(OUTPUT)
+
+test: lint
+	$(BIN)/python -m pytest
+
+lint: env-dev
+	@$(BIN)/ruff check -q
+	@$(BIN)/ruff format -q --check || { echo "not formatted; run: $(BIN)/ruff format"; exit 1; }
+	@out=$$($(BIN)/lint-imports --cache-dir .import_linter_cache 2>&1) || { echo "$$out"; exit 1; }
+	@cd $(VENV)/src && ../bin/mypy --config-file mphdrr/pyproject.toml --cache-dir mphdrr/.mypy_cache --no-error-summary \
+		-p mphdrr.core -p mphdrr.addon -p mphdrr.operators -p mphdrr.panels
+	@echo "lint: ruff, import rules and types are clean"
+
+bench: env-dev
+	@for script in benchmarks/*.py; do echo "$$script"; $(BIN)/python "$$script" || exit 1; done
+
+dist: env
+	$(BIN)/python tools/build_extension.py $(addprefix --platform ,$(PLATFORM))
+
+test-app: env-dev
+	$(BIN)/python tools/build_extension.py --platform linux-x64
+	$(BIN)/python -m pytest tests/app
+
+env:
+	$(ENVIRONMENT) --extras blender
+
+env-dev:
+	$(ENVIRONMENT) --extras blender,dev --torch "$(TORCH)"
+
+clean:
+	rm -rf out dist build wheels .venv* *.egg-info .pytest_cache .mypy_cache .ruff_cache .import_linter_cache .hypothesis
+	find . -name __pycache__ -prune -exec rm -rf {} +

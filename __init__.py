@@ -1,0 +1,15 @@
+"""mphDRR: multi-pinhole SPECT geometry, phantoms and projections, as a Blender extension and a Python package."""
+
+
+def register() -> None:
+    """Blender enables the extension."""
+    from .addon import registration
+
+    registration.register()
+
+
+def unregister() -> None:
+    """Blender disables the extension."""
+    from .addon import registration
+
+    registration.unregister()

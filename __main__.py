@@ -1,0 +1,5 @@
+"""``python -m mphdrr``: the command line."""
+
+from .addon.cli import program
+
+program()

@@ -1,0 +1,85 @@
+"""``mphdrr demo``: the main job on the example workbook, from the geometry to a file to train on."""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import dataclasses
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+
+from ...core.cli.options import add_command, progress_bar
+from ...core.export import write_run
+from ...core.files import ensure_folder
+from ...core.frames import euler_pose
+from ...core.grid import Grid
+from ...core.mosaic import mosaic, write_png
+from ...core.phantoms.derenzo import DerenzoPhantom
+from ...core.project import project_run
+from ...core.workbook import read_system
+
+EXAMPLE = Path(__file__).parents[2] / "examples" / "dc-spect-80.xlsx"
+EULER_DEGREES = (30.0, 55.0, 0.0)
+
+
+def add_parser(subparsers) -> None:  # type: ignore[no-untyped-def]
+    """Add the command."""
+    parser = add_command(
+        subparsers,
+        "demo",
+        "run the main job: workbook, phantom, 80 projections, scene, pictures and dataset",
+        "mphdrr demo --output out",
+    )
+    parser.add_argument("--output", default="out", metavar="FOLDER", help="where the results go")
+    parser.add_argument("--workbook", default=str(EXAMPLE), metavar="FILE", help="geometry workbook")
+    parser.add_argument("--voxels", type=int, default=256, metavar="N", help="voxels along each side of the volume")
+    parser.add_argument("--size", type=int, default=256, metavar="N", help="pixels along each side of an image")
+    parser.set_defaults(run=_run)
+
+
+def _run(arguments: argparse.Namespace) -> None:
+    out = ensure_folder(arguments.output)
+    from .session import new_scene, save_scene
+
+    scene = new_scene()  # before the long work: without Blender the demo stops here
+    from .. import images, pictures, scanner, volumes
+
+    with _step("geometry"):
+        system = read_system(arguments.workbook)
+        collection = scanner.build_scanner(scene, system)
+    with _step("phantom"):
+        phantom = DerenzoPhantom(radius=40.0, rod_diameters=(8, 6, 5, 4, 3, 2), height=40.0, activity=100.0)
+        grid = Grid.centered(arguments.voxels, 102.4 / arguments.voxels)
+        pose = euler_pose(*np.deg2rad(EULER_DEGREES))  # tilted, so that modules see along and across the rods
+        volume = phantom.voxelize(grid, pose, progress=progress_bar("voxelizing"))
+        volume_object = volumes.add_volume(scene, volume, "Derenzo phantom")
+    with _step("projections"):
+        run = project_run(
+            system,
+            volume,
+            shape=(arguments.size, arguments.size),
+            settings={"phantom": dataclasses.asdict(phantom), "euler_degrees": EULER_DEGREES},
+            progress=progress_bar("projecting"),
+        )
+    with _step("dataset"):
+        write_run(run, out / "run.h5")
+        write_png(mosaic(run.projections), out / "mosaic.png")
+    with _step("scene"):
+        images.store_run(scene, run)
+        save_scene(out / "scanner.blend")
+    with _step("pictures"):
+        for first, last in scanner.quick_ranges(system):
+            pictures.render_scanner(scene, collection, out / f"modules-{first}-{last}.png", first, last)
+        first, last = int(system.numbers.min()), int(system.numbers.max())
+        pictures.render_scanner(scene, collection, out / "phantom.png", first, last, volume_object)
+    print(f"{out}: {', '.join(sorted(p.name for p in out.iterdir() if p.suffix in ('.blend', '.h5', '.png')))}")
+
+
+@contextlib.contextmanager
+def _step(name: str) -> Iterator[None]:
+    started = time.monotonic()
+    yield
+    print(f"{name:12s} {time.monotonic() - started:5.1f} s", flush=True)

@@ -1,0 +1,51 @@
+"""``mphdrr scene WORKBOOK -o FILE.blend``."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+from ...core.cli.options import add_command, chosen_modules, output_path
+from ...core.errors import InputError
+from ...core.export import read_run
+from ...core.volume_io import read_volume
+from ...core.workbook import read_system
+
+
+def add_parser(subparsers) -> None:  # type: ignore[no-untyped-def]
+    """Add the command."""
+    parser = add_command(
+        subparsers,
+        "scene",
+        "make a Blender scene of the scanner, with a volume and projections",
+        "mphdrr scene scanner.xlsx --run run.h5 -o scanner.blend",
+    )
+    parser.add_argument("workbook", metavar="WORKBOOK", help="geometry workbook (.xlsx, .xlsm)")
+    parser.add_argument("--modules", metavar="RANGE", help="such as 1-40 or 1-20,41; default: all")
+    parser.add_argument("--volume", metavar="FILE", help="also put in this volume: .nii, .nii.gz, .npz")
+    parser.add_argument("--run", metavar="FILE", dest="run_file", help="also put in this run's volume and projections")
+    parser.add_argument("-o", "--output", required=True, metavar="FILE", help="the .blend to write")
+    parser.set_defaults(run=_run)
+
+
+def _run(arguments: argparse.Namespace) -> None:
+    path = output_path(arguments.output)
+    if path.suffix.lower() != ".blend":
+        raise InputError(f"{path}: expected a name ending in .blend")
+    system = chosen_modules(read_system(arguments.workbook), arguments.modules)
+    volume = read_volume(arguments.volume) if arguments.volume else None
+    run = read_run(arguments.run_file) if arguments.run_file else None
+
+    from .session import new_scene, save_scene
+
+    blender_scene = new_scene()
+    from .. import images, scanner, volumes
+
+    scanner.build_scanner(blender_scene, system)
+    if volume is not None:
+        volumes.add_volume(blender_scene, volume, Path(arguments.volume).name)
+    if run is not None:
+        volumes.add_volume(blender_scene, run.volume, "Projected volume")
+        images.store_run(blender_scene, run)
+    save_scene(path)
+    print(path)

@@ -1,0 +1,63 @@
+"""Every idname, datablock name and prefix of the extension, in one place. Needs no Blender."""
+
+from __future__ import annotations
+
+PREFIX = "mphdrr"
+CATEGORY = "mphDRR"  # the sidebar tab
+
+# --- Operators: idname as in `bpy.ops.<idname>` -------------------------------------------------------------
+IMPORT_GEOMETRY = "mphdrr.import_geometry"
+SHOW_MODULES = "mphdrr.show_modules"
+LOOK_THROUGH_MODULE = "mphdrr.look_through_module"
+AIM_MODULES = "mphdrr.aim_modules"
+ADD_DERENZO = "mphdrr.add_derenzo"
+RENDER_PROJECTIONS = "mphdrr.render_projections"
+EXPORT_DATASET = "mphdrr.export_dataset"
+UPDATE_DERENZO = "mphdrr.update_derenzo"
+SHOW_PROJECTIONS = "mphdrr.show_projections"
+CANCEL_JOB = "mphdrr.cancel_job"
+
+# --- Panels, lists and file handlers: class names, drawn in the order of the work ---------------------------
+PANEL_GEOMETRY = "MPHDRR_PT_geometry"
+PANEL_MODULES = "MPHDRR_PT_modules"
+PANEL_PHANTOM = "MPHDRR_PT_phantom"
+PANEL_PROJECTIONS = "MPHDRR_PT_projections"
+PANEL_EXPORT = "MPHDRR_PT_export"
+LIST_MODULES = "MPHDRR_UL_modules"
+FILE_HANDLER_WORKBOOK = "MPHDRR_FH_workbook"
+ORDER_GEOMETRY, ORDER_PHANTOM, ORDER_PROJECTIONS, ORDER_EXPORT = 0, 10, 20, 30  # bl_order
+
+# --- Properties on Blender's types: `scene.mphdrr_geometry`, `camera_object.mphdrr_module`, ... -------------
+SCENE_GEOMETRY = "mphdrr_geometry"
+SCENE_PHANTOM = "mphdrr_phantom"
+SCENE_PROJECTIONS = "mphdrr_projections"
+SCENE_EXPORT = "mphdrr_export"
+OBJECT_MODULE = "mphdrr_module"
+OBJECT_VOLUME = "mphdrr_volume"
+WINDOW_JOB = "mphdrr_job"
+COLLECTION_SCANNER = "mphdrr_scanner"
+
+# --- Datablocks ---------------------------------------------------------------------------------------------
+SCANNER = "Scanner"  # default name of a scanner's collection
+PARTS = ("NONE", "CAMERA", "COLLIMATOR", "CRYSTAL", "ROI")  # `Object.mphdrr_module.part`
+MATERIAL_COLLIMATOR = "mphDRR collimator"
+MATERIAL_CRYSTAL = "mphDRR crystal"
+MATERIAL_ROI = "mphDRR ROI"
+MOSAIC = "mphDRR mosaic"
+DERENZO = "Derenzo"
+PREVIEW_SUFFIX = ".preview.vdb"  # coarser copies of large volumes, for display only
+
+
+def module_name(number: int, n_modules: int = 80) -> str:
+    """Name of a module's camera object: "Module 07"; wide enough that names sort as numbers do."""
+    return f"Module {number:0{max(2, len(str(n_modules)))}d}"
+
+
+def ring_name(ring: int) -> str:
+    """Name of a ring's collection; `ring` counts from 0 as in `PinholeSystem.rings()`."""
+    return f"Ring {ring + 1}"
+
+
+def projection_name(number: int, n_modules: int = 80) -> str:
+    """Name of a module's projection image: "mphDRR 07"; wide enough that names sort as numbers do."""
+    return f"mphDRR {number:0{max(2, len(str(n_modules)))}d}"

@@ -1,0 +1,273 @@
+"""Long work that leaves the window alive: a thread does it, a modal operator watches it.
+
+An operator that inherits from `JobOperator` gives its work as a `Job`. Called from the window (INVOKE) it runs as a
+modal job with a progress bar, cancelled by Esc or by the panel's button; called from a script (EXEC) or in
+background mode the same work runs at once and the operator returns when it is done. The work must not touch bpy.
+"""
+
+from __future__ import annotations
+
+import sys
+import threading
+import traceback
+import warnings
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Any
+
+import bpy
+from bpy.props import BoolProperty, FloatProperty, StringProperty
+
+from ..core.errors import InputError, InputWarning
+from ..core.progress import Cancelled, Progress
+from . import ids
+from .reports import warnings_reported
+
+_INTERVAL = 0.1  # s between two looks at the thread
+_PATIENCE = 10.0  # s that stopping waits for a thread
+
+
+@dataclass
+class Job:
+    """Work to do, and what to do with its result.
+
+    Attributes
+    ----------
+    label : str
+        What the progress bar calls it.
+    work : callable
+        ``work(progress)`` runs in a thread and must not touch bpy. It calls ``progress(done, total)`` between its
+        steps, where `Cancelled` is raised when the user wants so.
+    finish : callable
+        ``finish(result)`` runs in Blender's main thread and returns the line to report.
+    """
+
+    label: str
+    work: Callable[[Progress], Any]
+    finish: Callable[[Any], str]
+
+
+@dataclass
+class _Run:
+    """A job that runs in a thread."""
+
+    job: Job
+    done: int = 0
+    total: int = 0
+    result: Any = None
+    error: BaseException | None = None
+    warnings: list[warnings.WarningMessage] = field(default_factory=list)
+    cancel: threading.Event = field(default_factory=threading.Event)
+    thread: threading.Thread | None = None
+
+    def start(self) -> None:
+        self.thread = threading.Thread(target=self._work, name=f"mphDRR: {self.job.label}", daemon=True)
+        self.thread.start()
+
+    @property
+    def alive(self) -> bool:
+        return self.thread is not None and self.thread.is_alive()
+
+    def _work(self) -> None:
+        try:
+            with warnings.catch_warnings(record=True) as self.warnings:
+                warnings.simplefilter("always", InputWarning)
+                self.result = self.job.work(self._progress)
+        except BaseException as error:  # noqa: BLE001  (reported by the main thread)
+            self.error = error
+
+    def _progress(self, done: int, total: int) -> None:
+        self.done, self.total = done, total
+        if self.cancel.is_set():
+            raise Cancelled
+
+
+_current: _Run | None = None
+
+
+def is_running() -> bool:
+    """Whether a job runs in a thread now."""
+    return _current is not None
+
+
+def cancel() -> None:
+    """Ask the running job to stop at its next step."""
+    if _current is not None:
+        _current.cancel.set()
+
+
+def stop() -> None:
+    """Stop the running job and wait for its thread: before a file is loaded, or the extension is disabled."""
+    global _current
+    run, _current = _current, None
+    if run is not None:
+        run.cancel.set()
+        if run.thread is not None:
+            run.thread.join(_PATIENCE)
+
+
+@bpy.app.handlers.persistent
+def before_load(*_: Any) -> None:
+    """A job does not outlive its scene."""
+    stop()
+
+
+class JobProperties(bpy.types.PropertyGroup):
+    """The running job; `WindowManager.mphdrr_job`, read-only."""
+
+    running: BoolProperty(name="Running", get=lambda self: is_running())
+    label: StringProperty(name="Job", get=lambda self: _current.job.label if _current else "")
+    progress: FloatProperty(
+        name="Progress", description="Share of the work that is done", min=0.0, max=1.0, subtype="FACTOR",
+        get=lambda self: _current.done / _current.total if _current and _current.total else 0.0,
+    )  # fmt: skip
+
+
+class JobOperator:
+    """Mix into an operator and implement `job`; add nothing else but properties."""
+
+    _run: _Run | None = None
+    _timer: bpy.types.Timer | None = None
+
+    def job(self, context: bpy.types.Context) -> Job:
+        """The work, from the operator's and the scene's settings; raises InputError."""
+        raise NotImplementedError
+
+    def execute(self, context: bpy.types.Context) -> set[str]:
+        if is_running():
+            self.report({"ERROR"}, "another job is running: wait for it or cancel it")
+            return {"CANCELLED"}
+        try:
+            job = self.job(context)
+            with warnings_reported(self):
+                result = job.work(_console(job.label) if bpy.app.background else _cursor(context))
+            self.report({"INFO"}, job.finish(result))
+        except BaseException as error:  # noqa: BLE001
+            return self._failed(error)
+        finally:
+            context.window_manager.progress_end()
+        return {"FINISHED"}
+
+    def invoke(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str]:
+        global _current
+        if bpy.app.background or context.window is None:
+            return self.execute(context)
+        if is_running():
+            self.report({"ERROR"}, "another job is running: wait for it or cancel it")
+            return {"CANCELLED"}
+        try:
+            self._run = _current = _Run(self.job(context))
+        except Exception as error:  # noqa: BLE001
+            return self._failed(error)
+        self._run.start()
+        manager = context.window_manager
+        self._timer = manager.event_timer_add(_INTERVAL, window=context.window)
+        manager.modal_handler_add(self)
+        return {"RUNNING_MODAL"}
+
+    def modal(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str]:
+        run = self._run
+        if run is None or run is not _current:  # stopped from outside
+            self._end(context)
+            return {"CANCELLED"}
+        if event.type == "ESC" and event.value == "PRESS":
+            cancel()
+            return {"RUNNING_MODAL"}
+        if event.type != "TIMER":
+            return {"PASS_THROUGH"}
+        _redraw(context)
+        if run.alive:
+            return {"PASS_THROUGH"}
+        self._end(context)
+        for warning in run.warnings:
+            if issubclass(warning.category, InputWarning):
+                self.report({"WARNING"}, str(warning.message))
+        if run.error is None and run.cancel.is_set():
+            run.error = Cancelled()
+        if run.error is not None:
+            return self._failed(run.error)
+        try:
+            self.report({"INFO"}, run.job.finish(run.result))
+        except Exception as error:  # noqa: BLE001
+            return self._failed(error)
+        return {"FINISHED"}
+
+    def cancel(self, context: bpy.types.Context) -> None:
+        """Blender ends the operator: its window closes, or another file is loaded."""
+        if self._run is not None and self._run is _current:
+            stop()
+        self._end(context)
+
+    def _end(self, context: bpy.types.Context) -> None:
+        global _current
+        if self._timer is not None:
+            context.window_manager.event_timer_remove(self._timer)
+            self._timer = None
+        if _current is self._run:
+            _current = None
+        _redraw(context)
+
+    def _failed(self, error: BaseException) -> set[str]:
+        if isinstance(error, Cancelled):
+            self.report({"WARNING"}, f"{self.bl_label}: cancelled, nothing was changed")
+        elif isinstance(error, InputError):
+            self.report({"ERROR"}, str(error))
+        elif isinstance(error, MemoryError):
+            self.report({"ERROR"}, f"{self.bl_label}: not enough memory; choose fewer voxels or pixels")
+        elif isinstance(error, Exception):
+            traceback.print_exception(error)
+            self.report({"ERROR"}, f"{self.bl_label} failed: {type(error).__name__}: {error} (details in the console)")
+        else:
+            raise error  # KeyboardInterrupt and the like
+        return {"CANCELLED"}
+
+
+class MPHDRR_OT_cancel_job(bpy.types.Operator):
+    bl_idname = ids.CANCEL_JOB
+    bl_label = "Cancel"
+    bl_description = "Stop the running job; the scene stays as it was"
+    bl_options = {"INTERNAL"}  # noqa: RUF012
+
+    @classmethod
+    def poll(cls, context: bpy.types.Context) -> bool:
+        return is_running()
+
+    def execute(self, context: bpy.types.Context) -> set[str]:
+        cancel()
+        return {"FINISHED"}
+
+
+def draw_job(layout: bpy.types.UILayout, context: bpy.types.Context) -> bool:
+    """Draw the running job's progress bar and Cancel button; False where there is none."""
+    if not is_running():
+        return False
+    state = getattr(context.window_manager, ids.WINDOW_JOB)
+    row = layout.row(align=True)
+    row.progress(factor=state.progress, type="BAR", text=f"{state.label}  {state.progress:.0%}")
+    row.operator(ids.CANCEL_JOB, text="", icon="CANCEL")
+    return True
+
+
+def _redraw(context: bpy.types.Context) -> None:
+    for window in context.window_manager.windows:
+        for area in window.screen.areas:
+            if area.type in {"VIEW_3D", "IMAGE_EDITOR"}:
+                area.tag_redraw()
+
+
+def _console(label: str) -> Progress:
+    shown = -1
+
+    def progress(done: int, total: int) -> None:
+        nonlocal shown
+        percent = 100 * done // max(1, total)
+        if percent >= shown + 10 or done == total:
+            shown = percent
+            print(f"mphDRR: {label} {percent} % ({done} of {total})", file=sys.stderr, flush=True)
+
+    return progress
+
+
+def _cursor(context: bpy.types.Context) -> Progress:
+    context.window_manager.progress_begin(0, 1000)
+    return lambda done, total: context.window_manager.progress_update(1000 * done // max(1, total))

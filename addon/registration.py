@@ -1,0 +1,81 @@
+"""What the extension registers with Blender, explicitly; the only file that imports operators and panels."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import bpy
+
+from ..operators import add_derenzo, aim_modules, export_dataset, import_geometry, render_projections, show_modules
+from ..panels import export, geometry, phantom, projections
+from . import preferences, properties
+
+# Classes in the order of registration; a panel comes after its parent. To add a class, list it here.
+CLASSES: tuple[type, ...] = (
+    *properties.CLASSES,
+    preferences.MPHDRR_Preferences,
+    # operators
+    import_geometry.MPHDRR_OT_import_geometry,
+    import_geometry.MPHDRR_FH_workbook,
+    show_modules.MPHDRR_OT_show_modules,
+    show_modules.MPHDRR_OT_look_through_module,
+    aim_modules.MPHDRR_OT_aim_modules,
+    add_derenzo.MPHDRR_OT_add_derenzo,
+    add_derenzo.MPHDRR_OT_update_derenzo,
+    render_projections.MPHDRR_OT_render_projections,
+    render_projections.MPHDRR_OT_show_projections,
+    jobs.MPHDRR_OT_cancel_job,
+    export_dataset.MPHDRR_OT_export_dataset,
+    # panels, in the order of the work
+    geometry.MPHDRR_UL_modules,
+    geometry.MPHDRR_PT_geometry,
+    geometry.MPHDRR_PT_modules,
+    phantom.MPHDRR_PT_phantom,
+    projections.MPHDRR_PT_projections,
+    export.MPHDRR_PT_export,
+)
+
+# (menu, draw function): entries in Blender's own menus.
+MENUS: tuple[tuple[Any, Any], ...] = (
+    (bpy.types.TOPBAR_MT_file_import, import_geometry.draw_menu),
+    (bpy.types.TOPBAR_MT_file_export, export_dataset.draw_menu),
+    (bpy.types.VIEW3D_MT_volume_add, add_derenzo.draw_menu),
+)
+
+# (list in bpy.app.handlers, function): decorate the function with @bpy.app.handlers.persistent.
+HANDLERS: tuple[tuple[list[Any], Any], ...] = ()
+
+
+def register() -> None:
+    """Register everything, or, if something fails, undo what was done and raise."""
+    undo: list[tuple[Any, tuple[Any, ...]]] = []
+    try:
+        for cls in CLASSES:
+            bpy.utils.register_class(cls)
+            undo.append((bpy.utils.unregister_class, (cls,)))
+        for owner, name, group in properties.POINTERS:
+            setattr(owner, name, bpy.props.PointerProperty(type=group))
+            undo.append((delattr, (owner, name)))
+        for menu, draw in MENUS:
+            menu.append(draw)
+            undo.append((menu.remove, (draw,)))
+        for handlers, function in HANDLERS:
+            handlers.append(function)
+            undo.append((handlers.remove, (function,)))
+    except Exception:
+        for function, arguments in reversed(undo):
+            function(*arguments)
+        raise
+
+
+def unregister() -> None:
+    """Take back what `register` did, in reverse order."""
+    for handlers, function in reversed(HANDLERS):
+        if function in handlers:  # loading a file drops handlers that are not persistent
+            handlers.remove(function)
+    for menu, draw in reversed(MENUS):
+        menu.remove(draw)
+    for owner, name, _ in reversed(properties.POINTERS):
+        delattr(owner, name)
+    for cls in reversed(CLASSES):
+        bpy.utils.unregister_class(cls)

@@ -1,0 +1,138 @@
+"""Where the scene's large files live: beside the saved .blend, or in Blender's temporary folder until it is saved.
+
+A .blend named `study.blend` has them in `study_mphdrr/` next to it and points there by `//` paths, so that both can be
+moved together. Files made before the first save are copied there when it happens. Packing does not keep volumes.
+"""
+
+from __future__ import annotations
+
+import os
+import shutil
+from pathlib import Path
+from typing import Any
+
+import bpy
+
+from ..core.errors import InputError
+from ..core.files import ensure_folder, replacing
+from . import ids
+
+# Paths as they were before the save that is running: (owner, attribute, old path).
+_before_save: list[tuple[Any, str, str]] = []
+
+
+def folder() -> Path:
+    """The folder for this .blend's large files, made if need be.
+
+    Raises
+    ------
+    InputError
+        It cannot be written.
+    """
+    return ensure_folder(_folder_of(bpy.data.filepath) if bpy.data.filepath else _temporary_folder())
+
+
+def stored_path(path: Path) -> str:
+    """How the .blend should name a file: `//...` when it is saved and the file lies below it, else absolute."""
+    if bpy.data.filepath:
+        top = Path(bpy.data.filepath).parent
+        if path.is_relative_to(top):
+            return "//" + path.relative_to(top).as_posix()
+    return str(path)
+
+
+def absolute(path: str) -> Path:
+    """A path as stored in the .blend, made absolute."""
+    return Path(bpy.path.abspath(path))
+
+
+def full_resolution(path: Path) -> Path:
+    """The .vdb with every voxel that belongs to the one that Blender shows (which may be a coarser copy)."""
+    return path.with_name(path.name.removesuffix(ids.PREVIEW_SUFFIX) + ".vdb") if is_preview(path) else path
+
+
+def is_preview(path: Path) -> bool:
+    """Whether a .vdb is a coarser copy for display."""
+    return path.name.endswith(ids.PREVIEW_SUFFIX)
+
+
+@bpy.app.handlers.persistent
+def before_save(filepath: str, _: Any = None) -> None:
+    """Bring files along from the temporary folder, and keep paths that Blender does not know of up to date."""
+    _before_save.clear()
+    if not filepath:
+        return
+    target = _folder_of(filepath)
+    for volume in bpy.data.volumes:
+        source = Path(volume.filepath)
+        if _is_temporary(source):
+            for file in {source, full_resolution(source)}:
+                _bring(file, target)
+            _set(volume, "filepath", f"//{target.name}/{source.name}")
+    for scene in bpy.data.scenes:
+        settings = getattr(scene, ids.SCENE_PROJECTIONS)
+        if not settings.run_file:
+            continue
+        source = absolute(settings.run_file)
+        if _is_temporary(source):
+            _bring(source, target)
+            source = target / source.name
+        # A Save As elsewhere leaves the file where it is, as Blender does with images; only the path changes.
+        _set(settings, "run_file", _relative(source, Path(filepath).parent))
+
+
+@bpy.app.handlers.persistent
+def after_save(filepath: str, _: Any = None) -> None:
+    """Take the new paths back after "Save Copy", when this session still belongs to another file or to none."""
+    if not filepath or bpy.data.filepath != filepath:
+        _restore()
+    _before_save.clear()
+
+
+@bpy.app.handlers.persistent
+def after_failed_save(*_: Any) -> None:
+    """Take the new paths back when Blender could not write the .blend."""
+    _restore()
+    _before_save.clear()
+
+
+def _restore() -> None:
+    for owner, name, old in _before_save:
+        setattr(owner, name, old)
+
+
+def _set(owner: Any, name: str, path: str) -> None:
+    old = getattr(owner, name)
+    if old != path:
+        _before_save.append((owner, name, old))
+        setattr(owner, name, path)
+
+
+def _bring(file: Path, target: Path) -> None:
+    destination = ensure_folder(target) / file.name
+    if not file.is_file():
+        raise InputError(f"{file}: is gone, so it cannot be stored beside the .blend; make it again")
+    if destination.exists() and file.suffix == ".vdb":
+        return  # named by its content
+    with replacing(destination) as temporary:
+        shutil.copyfile(file, temporary)
+
+
+def _folder_of(blend: str) -> Path:
+    path = Path(blend)
+    return path.with_name(f"{path.stem}_mphdrr")
+
+
+def _temporary_folder() -> Path:
+    return Path(bpy.app.tempdir) / "mphdrr"
+
+
+def _is_temporary(path: Path) -> bool:
+    return path.is_absolute() and path.is_relative_to(_temporary_folder())
+
+
+def _relative(path: Path, top: Path) -> str:
+    try:
+        return "//" + Path(os.path.relpath(path, top)).as_posix()
+    except ValueError:  # another drive
+        return str(path)

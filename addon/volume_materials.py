@@ -1,0 +1,101 @@
+"""How volumes look: the volume material, and the density of the solid viewport's smoke."""
+
+from __future__ import annotations
+
+import bpy
+
+from .compat import enable_nodes
+
+# Positions and colours (linear RGB) of the ramp: Matplotlib's "inferno" (CC0), perceptually even, without its black end.
+_INFERNO = (
+    (0.00, (0.0119, 0.0025, 0.0461)),
+    (0.25, (0.0953, 0.0052, 0.1513)),
+    (0.50, (0.5034, 0.0382, 0.0886)),
+    (0.75, (0.9436, 0.2483, 0.0103)),
+    (1.00, (0.9734, 0.8559, 0.2513)),
+)
+# Extinction times the volume's size: high enough that a rod of a twentieth of it looks solid.
+_OPACITY = 60.0
+_BRIGHTNESS = 1.0
+
+
+def new_material(name: str, grid: str, maximum: float, size: float) -> bpy.types.Material:
+    """Material that shows a grid by colour, glowing and opaque where its values are high.
+
+    Parameters
+    ----------
+    name
+        The material's name.
+    grid
+        Grid of the .vdb that drives it.
+    maximum
+        Value at the colour ramp's upper end; the node "Full Scale" holds it.
+    size
+        Of the volume, mm; the node "Opacity" is set from it.
+    """
+    material = bpy.data.materials.new(name)
+    enable_nodes(material)
+    tree = material.node_tree
+    tree.nodes.clear()
+
+    def node(kind: str, column: int, row: int = 0, **settings: object) -> bpy.types.Node:
+        new = tree.nodes.new(kind)
+        new.location = (column * 220.0, row * -220.0)
+        for key, value in settings.items():
+            setattr(new, key, value)
+        return new
+
+    attribute = node("ShaderNodeAttribute", 0, attribute_name=grid)
+    scale = node("ShaderNodeValue", 0, 1, name="Full Scale", label="Full Scale")
+    scale.outputs[0].default_value = maximum
+    relative = node("ShaderNodeMath", 1, operation="DIVIDE", use_clamp=True)
+    ramp = node("ShaderNodeValToRGB", 2, -1)
+    elements = ramp.color_ramp.elements
+    while len(elements) < len(_INFERNO):
+        elements.new(0.5)
+    for element, (position, color) in zip(elements, _INFERNO, strict=True):
+        element.position, element.color = position, (*color, 1.0)
+    opacity = node("ShaderNodeValue", 1, 1, name="Opacity", label="Opacity (1/mm)")
+    opacity.outputs[0].default_value = _OPACITY / size
+    extinction = node("ShaderNodeMath", 2, 0.3, operation="MULTIPLY")
+    strength = node("ShaderNodeMath", 3, 0, operation="MULTIPLY")
+    strength.inputs[1].default_value = _BRIGHTNESS
+    absorption = node("ShaderNodeVolumeAbsorption", 4, 0.6)
+    absorption.inputs["Color"].default_value = (0.0, 0.0, 0.0, 1.0)
+    emission = node("ShaderNodeEmission", 4, -0.4)
+    both = node("ShaderNodeAddShader", 5)
+    output = node("ShaderNodeOutputMaterial", 6)
+
+    link = tree.links.new
+    link(attribute.outputs["Fac"], relative.inputs[0])
+    link(scale.outputs[0], relative.inputs[1])
+    link(relative.outputs[0], ramp.inputs["Fac"])
+    link(relative.outputs[0], extinction.inputs[0])
+    link(opacity.outputs[0], extinction.inputs[1])
+    link(extinction.outputs[0], strength.inputs[0])
+    link(extinction.outputs[0], absorption.inputs["Density"])
+    link(ramp.outputs["Color"], emission.inputs["Color"])
+    link(strength.outputs[0], emission.inputs["Strength"])
+    link(absorption.outputs[0], both.inputs[0])
+    link(emission.outputs[0], both.inputs[1])
+    link(both.outputs[0], output.inputs["Volume"])
+    material.diffuse_color = (*_INFERNO[3][1], 1.0)
+    return material
+
+
+def set_display(data: bpy.types.Volume, maximum: float, size: float) -> None:
+    """Make the solid viewport draw the volume's values as smoke of a useful density."""
+    data.display.density = _OPACITY / size / maximum
+    data.display.wireframe_type = "NONE"
+    data.display.interpolation_method = "LINEAR"
+
+
+def show_in_eevee(scene: bpy.types.Scene) -> None:
+    """Let EEVEE draw volumes at a scanner's distances: its own limit is 100 units. Settings that were changed stay."""
+    eevee = scene.eevee
+    if eevee.use_volume_custom_range and eevee.volumetric_end == 100.0:
+        eevee.use_volume_custom_range = False
+    if eevee.volumetric_tile_size == "8":
+        eevee.volumetric_tile_size = "2"
+    if eevee.volumetric_samples == 64:
+        eevee.volumetric_samples = 128

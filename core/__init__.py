@@ -1,0 +1,52 @@
+"""mphDRR without Blender: geometry, phantoms, projections and exports of multi-pinhole scanners.
+
+>>> import mphdrr.core as mph
+>>> system = mph.read_system("dc-spect-80.xlsx")
+>>> views = system.views(shape=(256, 256))
+>>> grid = mph.Grid.centered((128, 128, 128), 1.0)
+>>> images = mph.Projector(grid, views)(mph.DerenzoPhantom(40, (8, 6, 5, 4, 3, 2), 40).voxelize(grid))
+"""
+
+from __future__ import annotations
+
+from .design import collimator_length
+from .errors import InputError, InputWarning
+from .export import read_run, write_run
+from .frames import euler_pose
+from .grid import Grid
+from .mosaic import as_seen, mosaic
+from .phantoms.derenzo import DerenzoPhantom
+from .progress import Cancelled, Progress
+from .projector import Projector, Transmission, trace_rays
+from .run import ProjectionRun
+from .system import PinholeSystem
+from .views import Views
+from .volume import Volume
+from .volume_io import read_volume, write_volume
+from .workbook import SystemSource, read_system
+
+__all__ = [
+    "Cancelled",
+    "DerenzoPhantom",
+    "Grid",
+    "InputError",
+    "InputWarning",
+    "PinholeSystem",
+    "Progress",
+    "ProjectionRun",
+    "Projector",
+    "SystemSource",
+    "Transmission",
+    "Views",
+    "Volume",
+    "as_seen",
+    "collimator_length",
+    "euler_pose",
+    "mosaic",
+    "read_run",
+    "read_system",
+    "read_volume",
+    "trace_rays",
+    "write_run",
+    "write_volume",
+]

@@ -1,0 +1,98 @@
+"""Checks of arrays at the package's boundaries: shape, realness, finiteness."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from .errors import InputError
+
+
+def real_array(value: ArrayLike, name: str, shape: tuple[int | None, ...], dtype: Any = np.float64) -> NDArray[Any]:
+    """`value` as an array of real, finite numbers of `shape`; a new array, never a view of the caller's.
+
+    Parameters
+    ----------
+    value
+        What the caller gave.
+    name
+        What to call it in the error.
+    shape
+        The shape expected; None stands for any length.
+    dtype
+        The result's type.
+
+    Raises
+    ------
+    InputError
+        Not numbers, another shape, or not finite (the first bad index is named).
+    """
+    try:
+        raw = np.asarray(value)
+        if raw.dtype.kind not in "fiub":
+            raise TypeError
+        array = np.array(raw, dtype=dtype, order="C")
+    except (TypeError, ValueError, OverflowError):
+        raise InputError(f"{name}: expected real numbers, got {type(value).__name__} {_short(value)}") from None
+    if array.ndim != len(shape) or any(n is not None and n != m for n, m in zip(shape, array.shape, strict=True)):
+        expected = " x ".join("any" if n is None else str(n) for n in shape) or "one number"
+        raise InputError(f"{name}: expected shape {expected}, got {_shape(array.shape)}")
+    require_finite(array, name)
+    return array
+
+
+def require_finite(array: NDArray[Any], name: str) -> None:
+    """Raise `InputError` naming the first index at which `array` is not finite."""
+    # A NaN or infinity anywhere makes the sum non-finite: one pass, no mask, on the good path.
+    with np.errstate(over="ignore", invalid="ignore"):
+        if np.isfinite(array.sum(dtype=np.float64)):
+            return
+    bad = np.argwhere(~np.isfinite(array))
+    if len(bad):
+        index = tuple(int(i) for i in bad[0])
+        where = f" at index {index if len(index) != 1 else index[0]}" if index else ""
+        raise InputError(f"{name}: {array[index]} is not a finite number{where}")
+
+
+def whole_shape(value: Any, name: str, length: int) -> tuple[int, ...]:
+    """`value` as a tuple of `length` whole numbers of at least 1.
+
+    Raises
+    ------
+    InputError
+        Another length, not whole numbers, or below 1.
+    """
+    try:
+        numbers = tuple(value)
+        whole = tuple(int(n) for n in numbers)
+        good = len(whole) == length and all(n == m and n >= 1 for n, m in zip(whole, numbers, strict=True))
+    except (TypeError, ValueError, OverflowError):
+        good = False
+    if not good:
+        raise InputError(f"{name}: expected {length} whole numbers of at least 1, got {_short(value)}")
+    return whole
+
+
+def positive(value: Any, name: str, unit: str = "") -> float:
+    """`value` as a finite number above 0, or `InputError`."""
+    number = float(real_array(value, name, ()))
+    if number <= 0:
+        raise InputError(f"{name}: expected more than 0{' ' + unit if unit else ''}, got {number:g}")
+    return number
+
+
+def freeze(array: NDArray[Any]) -> NDArray[Any]:
+    """`array`, made read-only."""
+    array.flags.writeable = False
+    return array
+
+
+def _shape(shape: tuple[int, ...]) -> str:
+    return " x ".join(map(str, shape)) or "one number"
+
+
+def _short(value: Any) -> str:
+    text = " ".join(repr(value).split())
+    return text if len(text) <= 40 else text[:37] + "..."

@@ -1,0 +1,79 @@
+"""The command line without Blender: parsing, exit status and one-line errors.
+
+A command is a module here with ``add_parser(subparsers)``, which sets the default ``run`` to a function of the parsed
+arguments. `addon.cli` adds those that need Blender.
+"""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import sys
+import warnings
+from collections.abc import Callable, Sequence
+from typing import Any, NoReturn
+
+from ..errors import InputError, InputWarning
+from ..progress import Cancelled
+from ..version import VERSION
+
+AddParser = Callable[[Any], None]
+
+OK, INPUT_ERROR, USAGE, INTERRUPTED = 0, 1, 2, 130
+
+
+class _Parser(argparse.ArgumentParser):
+    """An argument parser whose errors are one line on standard error, with status 2."""
+
+    def error(self, message: str) -> NoReturn:
+        sys.stderr.write(f"{self.prog}: {message} (see {self.prog} --help)\n")
+        raise SystemExit(USAGE)
+
+
+def build_parser(more_commands: Sequence[AddParser] = ()) -> argparse.ArgumentParser:
+    """The parser of ``mphdrr``, with this package's commands and `more_commands`."""
+    from . import export, geometry, phantom, project
+
+    parser = _Parser(
+        prog="mphdrr",
+        description="Multi-pinhole SPECT: from the geometry workbook to projections to train on.",
+        epilog="example: mphdrr demo --output out",
+    )
+    parser.add_argument("--version", action="version", version=f"mphDRR {VERSION}")
+    commands = parser.add_subparsers(title="commands", metavar="COMMAND", required=True, parser_class=_Parser)
+    for add_parser in (geometry.add_parser, phantom.add_parser, project.add_parser, export.add_parser, *more_commands):
+        add_parser(commands)
+    return parser
+
+
+def main(argv: Sequence[str] | None = None, more_commands: Sequence[AddParser] = ()) -> int:
+    """Run one command line and return its exit status: 0, 1 (the user's input), 2 (usage) or 130 (interrupted)."""
+    try:
+        arguments = build_parser(more_commands).parse_args(argv)
+    except SystemExit as stop:  # --help, --version and usage errors
+        return stop.code if isinstance(stop.code, int) else USAGE
+    with warnings.catch_warnings():
+        warnings.simplefilter("always", InputWarning)
+        warnings.showwarning = _show_warning
+        try:
+            arguments.run(arguments)
+        except InputError as error:
+            return _fail(str(error), INPUT_ERROR)
+        except MemoryError:
+            return _fail("not enough memory: choose fewer voxels or pixels", INPUT_ERROR)
+        except (KeyboardInterrupt, Cancelled):
+            return _fail("cancelled; nothing was written", INTERRUPTED)
+        except BrokenPipeError:  # the reader, such as `head`, has had enough
+            with contextlib.suppress(OSError):
+                sys.stdout.close()
+    return OK
+
+
+def _fail(message: str, status: int) -> int:
+    sys.stderr.write(f"mphdrr: {message}\n")
+    return status
+
+
+def _show_warning(message: Warning | str, category: type[Warning], *_: Any, **__: Any) -> None:
+    if issubclass(category, InputWarning):
+        sys.stderr.write(f"mphdrr: warning: {message}\n")

@@ -1,0 +1,37 @@
+"""``mphdrr export RUN -o FILE``."""
+
+from __future__ import annotations
+
+import argparse
+
+from ..errors import InputError
+from ..export import FORMATS, read_run, write_run
+from ..mosaic import mosaic, write_png
+from .options import add_command, output_path
+
+
+def add_parser(subparsers) -> None:  # type: ignore[no-untyped-def]
+    """Add the command."""
+    parser = add_command(
+        subparsers, "export", "write a projection run in another format", "mphdrr export run.h5 -o run.pt -o run.npz"
+    )
+    parser.add_argument("file", metavar="RUN", help=f"a run written by mphDRR: {', '.join(FORMATS)}")
+    parser.add_argument(
+        "-o", "--output", action="append", default=[], metavar="FILE", help=f"{', '.join(FORMATS)}; may be repeated"
+    )
+    parser.add_argument("--mosaic", metavar="PNG", help="all images in one picture")
+    parser.set_defaults(run=_run)
+
+
+def _run(arguments: argparse.Namespace) -> None:
+    if not arguments.output and not arguments.mosaic:
+        raise InputError("nothing to write: give --output FILE or --mosaic PNG")
+    run = read_run(arguments.file)
+    for name in arguments.output:
+        path = output_path(name)
+        write_run(run, path)
+        print(path)
+    if arguments.mosaic:
+        picture = output_path(arguments.mosaic)
+        write_png(mosaic(run.projections), picture)
+        print(picture)

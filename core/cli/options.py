@@ -1,0 +1,106 @@
+"""Options and parsing that several commands share."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..errors import InputError
+from ..files import ensure_folder
+from ..progress import Progress
+from ..system import PinholeSystem
+
+
+def add_command(subparsers, name: str, summary: str, example: str) -> argparse.ArgumentParser:  # type: ignore[no-untyped-def]
+    """A command's parser, its help ending in an example."""
+    return subparsers.add_parser(
+        name,
+        help=summary,
+        description=summary[0].upper() + summary[1:] + ".",
+        epilog=f"example: {example}",
+        formatter_class=argparse.ArgumentDefaultsHelpFormatter,
+    )
+
+
+def add_phantom_options(parser: argparse.ArgumentParser) -> None:
+    """Size, content and place of the Derenzo phantom, and the grid under it."""
+    parser.add_argument("--radius", type=float, default=40.0, metavar="MM", help="radius of the phantom")
+    parser.add_argument("--rods", type=float, nargs=6, default=[8, 6, 5, 4, 3, 2], metavar="MM", help="rod diameters")
+    parser.add_argument("--height", type=float, default=60.0, metavar="MM", help="length of the rods")
+    parser.add_argument("--activity", type=float, default=100.0, metavar="kBq/mL", help="concentration in the rods")
+    parser.add_argument(
+        "--position", type=float, nargs=3, default=[0, 0, 0], metavar="MM", help="middle of the phantom, x y z"
+    )
+    parser.add_argument(
+        "--euler",
+        type=float,
+        nargs=3,
+        default=[0, 0, 0],
+        metavar="DEG",
+        help="phi theta psi: psi about its own axis, theta about y, phi about z",
+    )
+    parser.add_argument("--voxels", type=int, nargs="+", default=[256], metavar="N", help="voxels along x y z, or one")
+    parser.add_argument("--spacing", type=float, nargs="+", default=[0.4], metavar="MM", help="voxel size, one or three")
+
+
+def add_view_options(parser: argparse.ArgumentParser) -> None:
+    """The images' size and place."""
+    parser.add_argument("--size", type=int, nargs=2, default=[256, 256], metavar=("ROWS", "COLUMNS"), help="pixels")
+    parser.add_argument("--detector", choices=("virtual", "real"), default="virtual", help="upright in front, or crystal")
+    parser.add_argument("--magnification", type=float, default=10.0, help="virtual detector's distance in units of l")
+    parser.add_argument("--pitch", type=float, metavar="MM", help="pixel size; default: the crystal's whole side")
+    parser.add_argument("--modules", metavar="RANGE", help="such as 1-40 or 1-20,41; default: all")
+    parser.add_argument("--backend", default="auto", help="auto, numba, torch or numpy")
+    parser.add_argument("--threads", type=int, metavar="N", help="processor threads; default: all")
+
+
+def chosen_modules(system: PinholeSystem, text: str | None) -> PinholeSystem:
+    """The modules of `system` whose numbers `text` ("1-40", "1-20,41") lists; all for None."""
+    if text is None:
+        return system
+    wanted: list[NDArray[np.int64]] = []
+    for part in text.split(","):
+        first, _, last = part.strip().partition("-")
+        try:
+            low, high = int(first), int(last or first)
+        except ValueError:
+            raise InputError(f"--modules {text!r}: expected numbers such as 1-40 or 1-20,41") from None
+        found = np.flatnonzero((system.numbers >= low) & (system.numbers <= high))
+        if len(found) == 0:
+            raise InputError(
+                f"--modules {text!r}: no module {part.strip()}; there are {system.numbers.min()} to {system.numbers.max()}"
+            )
+        wanted.append(found)
+    return system[np.unique(np.concatenate(wanted))]
+
+
+def output_path(text: str) -> Path:
+    """A file to write; its folder is made when it is missing.
+
+    Called before the long work, so that a folder that cannot be written fails at once.
+    """
+    path = Path(text)
+    ensure_folder(path.parent)
+    return path
+
+
+def progress_bar(label: str) -> Progress:
+    """A progress callback that draws a bar on standard error when that is a terminal, and says nothing otherwise."""
+    started = time.monotonic()
+    width = 30
+
+    def show(done: int, total: int) -> None:
+        if not sys.stderr.isatty():
+            return
+        filled = width * done // max(total, 1)
+        seconds = time.monotonic() - started
+        end = "\n" if done >= total else ""
+        sys.stderr.write(f"\r{label} [{'#' * filled}{'.' * (width - filled)}] {done}/{total}  {seconds:.1f} s{end}")
+        sys.stderr.flush()
+
+    return show

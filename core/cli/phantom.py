@@ -1,0 +1,49 @@
+"""``mphdrr phantom derenzo -o FILE``."""
+
+from __future__ import annotations
+
+import argparse
+
+import numpy as np
+
+from ..frames import euler_pose
+from ..grid import Grid
+from ..phantoms.derenzo import DerenzoPhantom
+from ..volume import Volume
+from ..volume_io import write_volume
+from .options import add_command, add_phantom_options, output_path, progress_bar
+
+
+def add_parser(subparsers) -> None:  # type: ignore[no-untyped-def]
+    """Add the command."""
+    phantom = add_command(subparsers, "phantom", "make a phantom volume", "mphdrr phantom derenzo -o derenzo.nii.gz")
+    kinds = phantom.add_subparsers(metavar="KIND", required=True)
+    derenzo = add_command(
+        kinds,
+        "derenzo",
+        "make a Derenzo phantom: six sectors of hot rods",
+        "mphdrr phantom derenzo --radius 40 --rods 8 6 5 4 3 2 --euler 30 0 0 -o derenzo.nii.gz",
+    )
+    add_phantom_options(derenzo)
+    derenzo.add_argument("-o", "--output", required=True, metavar="FILE", help=".nii, .nii.gz or .npz")
+    derenzo.set_defaults(run=_run)
+
+
+def derenzo_volume(arguments: argparse.Namespace) -> Volume:
+    """The phantom that the options of `add_phantom_options` describe."""
+    phantom = DerenzoPhantom(arguments.radius, tuple(arguments.rods), arguments.height, arguments.activity)
+    grid = Grid.centered(_one_or_three(arguments.voxels), _one_or_three(arguments.spacing))
+    pose = euler_pose(*np.deg2rad(arguments.euler), translation=arguments.position)
+    return phantom.voxelize(grid, pose, progress_bar("voxelizing"))
+
+
+def _one_or_three(values: list) -> list:
+    return values * 3 if len(values) == 1 else values
+
+
+def _run(arguments: argparse.Namespace) -> None:
+    path = output_path(arguments.output)
+    volume = derenzo_volume(arguments)
+    write_volume(volume, path)
+    total = volume.array.sum(dtype=np.float64) * volume.grid.voxel_volume * 1e-3
+    print(f"{path}: {' x '.join(map(str, volume.grid.shape))} voxels, {total:.4g} kBq")

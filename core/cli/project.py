@@ -1,0 +1,60 @@
+"""``mphdrr project WORKBOOK --volume FILE -o run.h5``."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+import numpy as np
+
+from ..errors import InputError
+from ..export import FORMATS, write_run
+from ..mosaic import mosaic, write_png
+from ..project import project_run
+from ..volume_io import read_volume
+from ..workbook import read_system
+from .options import add_command, add_phantom_options, add_view_options, chosen_modules, output_path, progress_bar
+from .phantom import derenzo_volume
+
+
+def add_parser(subparsers) -> None:  # type: ignore[no-untyped-def]
+    """Add the command."""
+    parser = add_command(
+        subparsers,
+        "project",
+        "project a volume, or a Derenzo phantom, into every module",
+        "mphdrr project scanner.xlsx --volume ct.nii.gz --size 250 250 -o run.h5",
+    )
+    parser.add_argument("workbook", metavar="WORKBOOK", help="geometry workbook (.xlsx, .xlsm)")
+    parser.add_argument("--volume", metavar="FILE", help=".nii, .nii.gz or .npz; without it, a Derenzo phantom is made")
+    add_view_options(parser)
+    add_phantom_options(parser.add_argument_group("Derenzo phantom, without --volume"))  # type: ignore[arg-type]
+    parser.add_argument("-o", "--output", required=True, metavar="FILE", help=", ".join(FORMATS))
+    parser.add_argument("--mosaic", metavar="PNG", help="also write all images in one picture")
+    parser.set_defaults(run=_run)
+
+
+def _run(arguments: argparse.Namespace) -> None:
+    path = output_path(arguments.output)
+    if path.suffix.lower() not in (*FORMATS, ".hdf5"):
+        raise InputError(f"{path}: expected a name ending in {', '.join(FORMATS)}")
+    picture = output_path(arguments.mosaic) if arguments.mosaic else None
+    system = chosen_modules(read_system(arguments.workbook), arguments.modules)
+    volume = read_volume(arguments.volume) if arguments.volume else derenzo_volume(arguments)
+    run = project_run(
+        system,
+        volume,
+        shape=tuple(arguments.size),
+        detector=arguments.detector,
+        magnification=arguments.magnification,
+        pitch=arguments.pitch,
+        backend=arguments.backend,
+        threads=arguments.threads,
+        settings={"volume": Path(arguments.volume).name if arguments.volume else "Derenzo phantom"},
+        progress=progress_bar("projecting"),
+    )
+    write_run(run, path)
+    if picture is not None:
+        write_png(mosaic(run.projections), picture)
+    n_v, n_u = run.views.shape
+    print(f"{path}: {len(run.views)} projections of {n_v} x {n_u} pixels, largest {np.max(run.projections):.4g} {run.unit}")

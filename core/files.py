@@ -1,0 +1,68 @@
+"""Write files so that the old one or the new one is there, whole, whatever happens in between."""
+
+from __future__ import annotations
+
+import os
+import uuid
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from .errors import InputError
+
+
+@contextmanager
+def replacing(path: str | os.PathLike[str]) -> Iterator[Path]:
+    """Give a temporary path beside `path`; rename it to `path` on success, remove it on failure.
+
+    Parameters
+    ----------
+    path
+        The file to write. Its folder must exist and be writable.
+
+    Yields
+    ------
+    Path
+        A path that does not exist yet, in the same folder and with the same suffixes.
+
+    Raises
+    ------
+    InputError
+        The folder is missing or cannot be written, the path is a folder, or the disk is full.
+    """
+    target = Path(path).absolute()
+    if target.is_dir():
+        raise InputError(f"{target}: is a folder; expected the name of a file to write")
+    if not target.parent.is_dir():
+        raise InputError(f"{target.parent}: no such folder; make it first or choose another")
+    temporary = target.with_name(f".{uuid.uuid4().hex[:8]}-{target.name}")
+    try:
+        # Tried here and not by os.access, which does not know of read-only disks or Windows' rights.
+        with open(temporary, "xb"):
+            pass
+        temporary.unlink()
+        yield temporary
+        os.replace(temporary, target)
+    except OSError as error:
+        raise InputError(f"{target}: cannot be written ({error.strerror or error})") from error
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+def ensure_folder(path: str | os.PathLike[str]) -> Path:
+    """Make the folder `path` (and its parents) unless it is there.
+
+    Raises
+    ------
+    InputError
+        It cannot be made, or cannot be written into.
+    """
+    folder = Path(path).absolute()
+    probe = folder / f".{uuid.uuid4().hex[:8]}"
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        probe.touch()
+        probe.unlink()
+    except OSError as error:
+        raise InputError(f"{folder}: cannot be written ({error.strerror or error})") from error
+    return folder

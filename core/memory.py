@@ -1,0 +1,40 @@
+"""Ask for memory before using it, so that a job that cannot fit says so in one line."""
+
+from __future__ import annotations
+
+from .errors import InputError
+
+# Leave this share of what is available to everything else that runs.
+_USABLE_SHARE = 0.9
+
+
+def available() -> int:
+    """Bytes of memory that can be taken without swapping."""
+    import psutil
+
+    return int(psutil.virtual_memory().available)
+
+
+def require(n_bytes: float, what: str) -> None:
+    """Raise `InputError` when `what` needs more memory than there is.
+
+    Parameters
+    ----------
+    n_bytes
+        Bytes that will be taken.
+    what
+        The thing that needs them, as the sentence's subject: ``"a grid of 4096 x 4096 x 4096 voxels"``.
+    """
+    usable = _USABLE_SHARE * available()
+    if n_bytes > usable:
+        raise InputError(
+            f"{what} needs {readable_size(n_bytes)} of memory, but {readable_size(usable)} can be used: "
+            "choose fewer voxels or pixels, or free some memory"
+        )
+
+
+def readable_size(n_bytes: float) -> str:
+    """Bytes as ``"12 MiB"`` or ``"3.4 GiB"``."""
+    if n_bytes < 2**30:
+        return f"{n_bytes / 2**20:.0f} MiB"
+    return f"{n_bytes / 2**30:.3g} GiB"

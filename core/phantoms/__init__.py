@@ -1,0 +1,1 @@
+"""Phantoms: shapes with known activity, voxelised on any grid."""

@@ -1,0 +1,68 @@
+"""From a system and a volume to a projection run: the main job, as one call."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from .memory import require
+from .progress import Progress
+from .projector import Projector, Transmission
+from .run import ProjectionRun
+from .system import Detector, PinholeSystem
+from .volume import Volume
+
+
+def project_run(
+    system: PinholeSystem,
+    volume: Volume,
+    shape: tuple[int, int] = (256, 256),
+    detector: Detector = "virtual",
+    magnification: float = 10.0,
+    pitch: ArrayLike | None = None,
+    backend: str = "auto",
+    threads: int | None = None,
+    settings: Mapping[str, Any] | None = None,
+    progress: Progress | None = None,
+) -> ProjectionRun:
+    """Project `volume` into every module of `system`.
+
+    Parameters
+    ----------
+    system, volume
+        What sees, and what is seen.
+    shape, detector, magnification, pitch
+        The images, see `PinholeSystem.views`.
+    backend, threads
+        See `Projector`.
+    settings
+        More to record in the run.
+    progress
+        Called as ``progress(done, total)`` after every view; may raise `Cancelled`.
+
+    Raises
+    ------
+    InputError
+        A setting is out of range, or the images do not fit into memory.
+    """
+    views = system.views(shape=shape, detector=detector, magnification=magnification, pitch=pitch)
+    n_v, n_u = views.shape
+    require(4.0 * len(views) * n_v * n_u, f"a set of {len(views)} projections of {n_v} x {n_u} pixels")
+    projector = Projector(volume.grid, views, model=Transmission(), backend=backend, threads=threads)
+    images = np.empty((len(views), n_v, n_u), np.float32)
+    for m, image in enumerate(projector.iter_views(volume)):
+        images[m] = image
+        if progress is not None:
+            progress(m + 1, len(views))
+    record = {
+        "detector": detector,
+        "magnification": float(magnification),
+        "pitch_mm": None if pitch is None else np.broadcast_to(pitch, 2).tolist(),
+        "model": "transmission",
+        "backend": projector.backend,
+        **(settings or {}),
+    }
+    return ProjectionRun(images, system, views, volume, settings=record)

@@ -1,0 +1,14 @@
+"""Line integrals of volumes along rays, and their exact adjoint.
+
+`operator` holds what is the same for every backend: checks, the loop over views, threads, memory. `rays` maps
+rays into index space, once for all backends. Each ``siddon_*`` module integrates along such rays and spreads
+values back along them; `backends` chooses among them. Neither numba nor torch is imported before it is
+needed.
+"""
+
+from __future__ import annotations
+
+from .models import Transmission
+from .operator import AdjointProjector, Projector, trace_rays
+
+__all__ = ["AdjointProjector", "Projector", "Transmission", "trace_rays"]

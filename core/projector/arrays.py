@@ -1,0 +1,101 @@
+"""Numpy arrays and torch tensors: checked on the way in, of the caller's kind on the way out."""
+
+from __future__ import annotations
+
+import sys
+from typing import Any
+
+import numpy as np
+
+from ..checks import real_array, require_finite
+from ..errors import InputError
+
+ArrayOrTensor = Any  # a numpy array or a torch tensor; torch may not be installed
+
+
+def is_tensor(value: object) -> bool:
+    """Whether `value` is a torch tensor (torch is not imported to find out)."""
+    torch = sys.modules.get("torch")
+    return torch is not None and isinstance(value, torch.Tensor)
+
+
+def checked(value: ArrayOrTensor, name: str, shape: tuple[int, ...], float64: bool) -> ArrayOrTensor:
+    """`value` as float32 or float64 numbers, still an array or still a tensor on its device; not copied without need.
+
+    A float64 tensor stays float64.
+
+    Raises
+    ------
+    InputError
+        Not real numbers, another shape, or a value that is not finite (its index is named).
+    """
+    if is_tensor(value):
+        return _checked_tensor(value, name, shape, float64)
+    dtype = np.float64 if float64 else np.float32
+    if isinstance(value, np.ndarray) and value.dtype == dtype and value.shape == shape and value.flags.c_contiguous:
+        require_finite(value, name)
+        return value
+    with np.errstate(over="ignore"):  # what overflows float32 is refused as not finite
+        return real_array(value, name, shape, dtype)
+
+
+def _checked_tensor(value: Any, name: str, shape: tuple[int, ...], float64: bool) -> Any:
+    import torch
+
+    if value.is_complex() or value.is_sparse or value.is_quantized:
+        raise InputError(f"{name}: expected a dense tensor of real numbers, got {value.dtype}, {value.layout}")
+    if tuple(value.shape) != shape:
+        raise InputError(f"{name}: expected shape {_times(shape)}, got {_times(value.shape)}")
+    if value.dtype != torch.float64:
+        value = value.to(torch.float64 if float64 else torch.float32)
+    if not bool(torch.isfinite(value.detach().sum())):
+        require_finite(value.detach().cpu().numpy(), name)
+    return value
+
+
+def to_numpy(value: ArrayOrTensor, dtype: Any) -> np.ndarray[Any, Any]:
+    """As a C-ordered, aligned array (compiled kernels take no other)."""
+    if is_tensor(value):
+        value = value.detach().cpu().numpy()
+    return np.require(value, dtype, ["C", "A"])
+
+
+def to_tensor(value: ArrayOrTensor) -> Any:
+    """As a contiguous tensor: a tensor on its own device, an array on torch's default device."""
+    import torch
+
+    if is_tensor(value):
+        return value.detach().contiguous()
+    if not value.flags.writeable:
+        value = value.copy()  # torch has no read-only tensors
+    return torch.from_numpy(np.ascontiguousarray(value)).to(torch.get_default_device())
+
+
+def like(result: ArrayOrTensor, given: ArrayOrTensor) -> ArrayOrTensor:
+    """`result` of the kind of `given`: a tensor on its device, or a numpy array."""
+    if is_tensor(given):
+        import torch
+
+        return torch.as_tensor(result, device=given.device)
+    return result.cpu().numpy() if is_tensor(result) else result
+
+
+def zeros(shape: tuple[int, ...], beside: ArrayOrTensor) -> ArrayOrTensor:
+    """Zeros of the kind, type and device of `beside`."""
+    return beside.new_zeros(shape) if is_tensor(beside) else np.zeros(shape, beside.dtype)
+
+
+def cropped(volume: ArrayOrTensor) -> tuple[ArrayOrTensor, tuple[int, int, int]]:
+    """The smallest box of `volume` that holds all that is not 0, and the index of its first voxel."""
+    filled = volume != 0
+    ranges = []
+    for flags in (filled.any(2).any(1), filled.any(2).any(0), filled.any(0).any(0)):
+        where = np.flatnonzero(flags.cpu().numpy() if is_tensor(flags) else flags)
+        ranges.append((int(where[0]), int(where[-1]) + 1) if len(where) else (0, 1))
+    box = volume[tuple(slice(first, last) for first, last in ranges)]
+    box = box.contiguous() if is_tensor(box) else np.ascontiguousarray(box)
+    return box, (ranges[0][0], ranges[1][0], ranges[2][0])
+
+
+def _times(shape: tuple[int, ...]) -> str:
+    return " x ".join(map(str, shape)) or "one number"

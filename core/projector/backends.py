@@ -1,0 +1,70 @@
+"""The backends: which there are, what they need, and which one "auto" means."""
+
+from __future__ import annotations
+
+import functools
+import importlib
+import warnings
+from types import ModuleType
+
+from ..errors import InputError, InputWarning
+
+BACKENDS = ("numba", "torch", "numpy")
+"""Names of the backends, the one that "auto" prefers first. ``siddon_<name>`` is the module of each.
+
+Such a module has two functions. ``forward(volume, rays)`` returns the line integrals (N,);
+``adjoint(volume, values, rays)`` adds the values to the volume in place, each along its ray with the same
+weights. `rays` are `IndexRays`; volumes and values are tensors on one device for "torch" and numpy arrays for
+the others.
+"""
+
+
+def choose(name: str) -> str:
+    """The backend that `name` ("auto" or one of `BACKENDS`) stands for on this machine, loaded.
+
+    Raises
+    ------
+    InputError
+        No such backend, or the library it needs is missing.
+    """
+    if name != "auto" and name not in BACKENDS:
+        raise InputError(f"backend {name!r}: expected one of auto, {', '.join(BACKENDS)}")
+    if name != "auto":
+        try:
+            load(name)
+        except _CANNOT_LOAD as error:
+            raise InputError(f"backend {name!r} needs {name} ({_reason(error)}): pip install {name}") from None
+        return name
+    for candidate in BACKENDS:
+        try:
+            load(candidate)
+        except _CANNOT_LOAD as error:
+            if candidate == "numba":
+                reason = _reason(error)
+            continue
+        if candidate != "numba":
+            _warn_slower(candidate, reason)
+        return candidate
+    raise AssertionError("numpy is always there")
+
+
+def load(name: str) -> ModuleType:
+    """The module of a backend."""
+    return importlib.import_module(f".siddon_{name}", __package__)
+
+
+# A library may be absent, refuse its surroundings (numba: another numpy) or fail to load its binaries.
+_CANNOT_LOAD = (ImportError, OSError)
+
+
+def _reason(error: BaseException) -> str:
+    return str(error).splitlines()[0] if str(error) else type(error).__name__
+
+
+@functools.cache
+def _warn_slower(name: str, reason: str) -> None:
+    warnings.warn(
+        f"projections run with {name}, many times slower than with numba ({reason}): pip install numba",
+        InputWarning,
+        stacklevel=4,
+    )

@@ -1,0 +1,377 @@
+"""The projector as a linear operator: what is the same for every backend."""
+
+from __future__ import annotations
+
+import os
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from ..checks import real_array
+from ..errors import InputError
+from ..grid import Grid
+from ..memory import require
+from ..progress import Progress
+from ..views import Views
+from ..volume import Volume
+from . import backends
+from .arrays import ArrayOrTensor, checked, cropped, is_tensor, like, to_numpy, to_tensor, zeros
+from .models import Transmission
+from .rays import index_rays
+
+# Rays handed to a backend at once: enough that a call costs nothing, few enough that their arrays stay in the
+# cache.
+_RAYS_AT_ONCE = 4096
+# A GPU wants more (torch cuts them into chunks by itself), and a torch on a CPU has threads of its own.
+_RAYS_AT_ONCE_TORCH = 2**18
+
+Points = NDArray[np.float64]
+ParallelMap = Callable[[Callable[[Any], Any], Iterable[Any]], Iterable[Any]]
+
+
+class LinearOperator(ABC):
+    """``A(x)``, with the exact adjoint ``A.T(y)``; differentiable in torch."""
+
+    def __call__(self, x: Volume | ArrayOrTensor, progress: Progress | None = None) -> ArrayOrTensor:
+        """Apply the operator.
+
+        Parameters
+        ----------
+        x
+            Numpy array or torch tensor (a projector also takes a `Volume`).
+        progress
+            Called as ``progress(views done, views)``; what it raises stops the work.
+
+        Returns
+        -------
+        array or tensor
+            A tensor on the device of `x` if that is a tensor (part of torch's graph if it requires a
+            gradient, for every backend), else a numpy array.
+
+        Raises
+        ------
+        InputError
+            Another shape or grid, not real numbers, not finite, or more memory needed than there is.
+        """
+        x = self._check(x)
+        if is_tensor(x):
+            from .autograd import apply
+
+            return apply(self, x, progress)
+        return self._run(x, progress)
+
+    @property
+    @abstractmethod
+    def T(self) -> LinearOperator:
+        """The exact adjoint, <A x, y> = <x, A.T y>."""
+
+    @abstractmethod
+    def _check(self, x: Any) -> ArrayOrTensor: ...
+
+    @abstractmethod
+    def _run(self, x: ArrayOrTensor, progress: Progress | None = None) -> ArrayOrTensor:
+        """Apply to an array or tensor of the right shape, without checks and without recording a graph."""
+
+
+class Projector(LinearOperator):
+    """Images of a volume, and the adjoint.
+
+    Parameters
+    ----------
+    grid : Grid
+        The voxels. Values outside are 0.
+    views : Views
+        The M images: rays from each source to the centres of the pixels.
+    model
+        What a ray measures.
+    backend : str
+        ``"numpy"`` (the float64 reference), ``"torch"`` (on the device of a tensor), ``"numba"`` (compiled,
+        CPU), or ``"auto"``: numba if it can be imported, else torch, else numpy; torch for a tensor that is
+        not on the CPU.
+    threads : int, optional
+        Threads of numba and numpy, by default one per core (torch has a setting of its own). The images do
+        not depend on it; the adjoint does by float32 rounding, and is the same every time for a given number.
+
+    Raises
+    ------
+    InputError
+        An argument is of another kind, no such backend, or its library is missing.
+
+    Notes
+    -----
+    The integral along a ray is exact for the piecewise constant volume (Siddon 1985), from source to target.
+    The results are float32; float64 for ``backend="numpy"`` and for float64 tensors with ``backend="torch"``.
+    The adjoint of the torch backend on a GPU adds in no fixed order.
+
+    Examples
+    --------
+    >>> grid = Grid.centered((64, 64, 64), spacing=1.0)
+    >>> views = Views([[0, 0, -100]], [[0, 0, 100]], [[2, 0, 0]], [[0, 2, 0]], shape=(64, 64))
+    >>> A = Projector(grid, views)
+    >>> images = A(np.ones(grid.shape))
+    >>> images.shape, float(images.max().round(2))
+    ((1, 64, 64), 64.01)
+    >>> A.T(images).shape
+    (64, 64, 64)
+    """
+
+    def __init__(
+        self,
+        grid: Grid,
+        views: Views,
+        model: Transmission | None = None,
+        backend: str = "auto",
+        threads: int | None = None,
+    ) -> None:
+        model = Transmission() if model is None else model
+        for value, kind, name in ((grid, Grid, "grid"), (views, Views, "views"), (model, Transmission, "model")):
+            if not isinstance(value, kind):
+                raise InputError(f"projector: expected {name} to be {kind.__name__}, got {type(value).__name__}")
+        self.grid = grid
+        self.views = views
+        self.model = model
+        self.backend = backends.choose(backend)
+        self.threads = _thread_count(threads)
+        self._auto = backend == "auto"
+        self._adjoint = AdjointProjector(self)
+
+    @property
+    def shape_in(self) -> tuple[int, int, int]:
+        """Shape of a volume, (n_x, n_y, n_z)."""
+        return self.grid.shape
+
+    @property
+    def shape_out(self) -> tuple[int, int, int]:
+        """Shape of the images, (M, n_v, n_u)."""
+        return (len(self.views), *self.views.shape)
+
+    @property
+    def T(self) -> AdjointProjector:
+        """The exact adjoint: images (M, n_v, n_u) to an array of ``grid.shape``."""
+        return self._adjoint
+
+    def iter_views(self, volume: Volume | ArrayOrTensor) -> Iterator[ArrayOrTensor]:
+        """The images one by one, each (n_v, n_u): work between which a job can stop. Gradients are not recorded."""
+        volume = self._check(volume)
+        return (like(image, volume) for image in self._images(volume))
+
+    def __repr__(self) -> str:
+        n_v, n_u = self.views.shape
+        return f"Projector({_times(self.grid.shape)} voxels, {len(self.views)} views of {n_v} x {n_u}, {self.backend})"
+
+    def _check(self, x: Volume | ArrayOrTensor) -> ArrayOrTensor:
+        if isinstance(x, Volume):
+            if not _same(x.grid, self.grid):
+                raise InputError(
+                    f"volume: its grid ({_describe(x.grid)}) is not the projector's ({_describe(self.grid)})"
+                )
+            return x.array
+        return checked(x, "volume", self.shape_in, self._float64)
+
+    def _run(self, x: ArrayOrTensor, progress: Progress | None = None) -> ArrayOrTensor:
+        n_views, n_v, n_u = self.shape_out
+        wide = 8 if self._float64 else 4
+        require(wide * n_views * n_v * n_u, f"{n_views} images of {n_v} x {n_u} pixels")
+        images = None
+        _report(progress, 0, n_views)
+        for m, image in enumerate(self._images(x)):
+            images = zeros(self.shape_out, image) if images is None else images
+            images[m] = image
+            _report(progress, m + 1, n_views)
+        if images is None:
+            images = np.zeros(self.shape_out, np.float64 if self._float64 else np.float32)
+        return like(images, x)
+
+    def _images(self, x: ArrayOrTensor) -> Iterator[ArrayOrTensor]:
+        """Images of a checked volume, native to the backend."""
+        name = self._backend_for(x)
+        integrate = backends.load(name).forward
+        # Empty margins cost time: most objects fill a small part of their grid.
+        box, origin = cropped(self._native(x, name))
+        with _parallel(self._workers(name)) as parallel_map:
+            for m in range(len(self.views)):
+                sources, targets = self.views.rays(m)
+                image = zeros(targets.shape[:1], box)
+
+                def project(block: slice) -> None:
+                    rays = index_rays(self.grid, sources[block], targets[block], origin)  # noqa: B023
+                    image[block] = integrate(box, rays)  # noqa: B023
+
+                for _ in parallel_map(project, _blocks(len(targets), name)):
+                    pass
+                image = image.reshape(self.views.shape)
+                yield image if self._float64 or is_tensor(image) else image.astype(np.float32, copy=False)
+
+    def _native(self, x: ArrayOrTensor, name: str) -> ArrayOrTensor:
+        """`x` as the backend `name` computes with it."""
+        return to_tensor(x) if name == "torch" else to_numpy(x, np.float64 if name == "numpy" else np.float32)
+
+    def _backend_for(self, x: ArrayOrTensor) -> str:
+        return "torch" if self._auto and is_tensor(x) and x.device.type != "cpu" else self.backend
+
+    def _workers(self, name: str) -> int:
+        return 1 if name == "torch" else self.threads
+
+    @property
+    def _float64(self) -> bool:
+        return self.backend == "numpy" and not self._auto
+
+
+class AdjointProjector(LinearOperator):
+    """The adjoint of a projector, ``A.T``: spreads images back along their rays, with the weights of ``A``."""
+
+    def __init__(self, projector: Projector) -> None:
+        self._projector = projector
+
+    @property
+    def T(self) -> Projector:
+        """The projector."""
+        return self._projector
+
+    @property
+    def shape_in(self) -> tuple[int, int, int]:
+        """Shape of the images, (M, n_v, n_u)."""
+        return self._projector.shape_out
+
+    @property
+    def shape_out(self) -> tuple[int, int, int]:
+        """Shape of a volume, (n_x, n_y, n_z)."""
+        return self._projector.shape_in
+
+    def __repr__(self) -> str:
+        return f"{self._projector!r}.T"
+
+    def _check(self, x: ArrayOrTensor) -> ArrayOrTensor:
+        return checked(x, "images", self.shape_in, self._projector._float64)
+
+    def _run(self, x: ArrayOrTensor, progress: Progress | None = None) -> ArrayOrTensor:
+        A = self._projector
+        name = A._backend_for(x)
+        spread = backends.load(name).adjoint
+        images = A._native(x, name)
+        workers = A._workers(name)
+        wide = 8 if name == "numpy" else 4
+        require(
+            wide * workers * A.grid.n_voxels,
+            f"the adjoint into {_times(self.shape_out)} voxels ({workers} threads, one volume each)",
+        )
+        volumes = [zeros(self.shape_out, images) for _ in range(workers)]
+        n_views = len(A.views)
+        _report(progress, 0, n_views)
+        with _parallel(workers) as parallel_map:
+            for m in range(n_views):
+                sources, targets = A.views.rays(m)
+                blocks = _blocks(len(targets), name)
+                values = images[m].reshape(-1)
+
+                def add(worker: int) -> None:
+                    # Always the same blocks, so that the sums' order, and so the result, is always the same.
+                    for block in blocks[worker::workers]:  # noqa: B023
+                        rays = index_rays(A.grid, sources[block], targets[block])  # noqa: B023
+                        spread(volumes[worker], values[block], rays)  # noqa: B023
+
+                for _ in parallel_map(add, range(workers)):
+                    pass
+                _report(progress, m + 1, n_views)
+        total = volumes[0]
+        for volume in volumes[1:]:
+            total += volume
+        if not (A._float64 or is_tensor(total)):
+            total = total.astype(np.float32, copy=False)
+        return like(total, x)
+
+
+def trace_rays(volume: Volume, sources: ArrayLike, targets: ArrayLike, backend: str = "auto") -> NDArray[Any]:
+    """Line integrals of a volume along given rays.
+
+    Parameters
+    ----------
+    volume
+        The voxels; outside them it is 0.
+    sources, targets
+        Ends of the rays, each (N, 3), or (3,) for all rays the same; world mm.
+    backend
+        As of `Projector`.
+
+    Returns
+    -------
+    array (N,)
+        Value x mm, from source to target; float32, or float64 for ``backend="numpy"``.
+
+    Raises
+    ------
+    InputError
+        Not a volume, or the points' shapes do not fit, or a coordinate is not finite; no such backend.
+    """
+    if not isinstance(volume, Volume):
+        raise InputError(f"trace_rays: expected a Volume, got {type(volume).__name__}")
+    name = backends.choose(backend)
+    starts, ends = _points(sources, "sources"), _points(targets, "targets")
+    if len(starts) != len(ends) and 1 not in (len(starts), len(ends)):
+        raise InputError(f"trace_rays: {len(starts)} sources but {len(ends)} targets")
+    starts, ends = np.broadcast_arrays(starts, ends)
+    integrals = np.zeros(len(ends), np.float64 if backend == "numpy" else np.float32)
+    integrate = backends.load(name).forward
+    box, origin = cropped(to_tensor(volume.array) if name == "torch" else volume.array)
+    if name == "numpy":
+        box = box.astype(np.float64)
+
+    def trace(block: slice) -> None:
+        integrals[block] = like(integrate(box, index_rays(volume.grid, starts[block], ends[block], origin)), integrals)
+
+    with _parallel(1 if name == "torch" else _thread_count(None)) as parallel_map:
+        for _ in parallel_map(trace, _blocks(len(ends), name)):
+            pass
+    return integrals
+
+
+def _points(value: ArrayLike, name: str) -> Points:
+    if np.ndim(value) == 1:
+        return real_array(value, name, (3,))[None]
+    return real_array(value, name, (None, 3))
+
+
+def _blocks(n_rays: int, backend: str) -> list[slice]:
+    size = _RAYS_AT_ONCE_TORCH if backend == "torch" else _RAYS_AT_ONCE
+    return [slice(first, min(first + size, n_rays)) for first in range(0, n_rays, size)]
+
+
+@contextmanager
+def _parallel(workers: int) -> Iterator[ParallelMap]:
+    """A map that runs on `workers` threads."""
+    if workers == 1:
+        yield map
+        return
+    with ThreadPoolExecutor(workers, thread_name_prefix="mphdrr") as pool:
+        yield pool.map
+
+
+def _thread_count(threads: int | None) -> int:
+    if threads is None:
+        return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    if isinstance(threads, bool) or not isinstance(threads, int | np.integer) or threads < 1:
+        raise InputError(f"threads: expected a whole number of at least 1, got {threads!r}")
+    return int(threads)
+
+
+def _report(progress: Progress | None, done: int, total: int) -> None:
+    if progress is not None:
+        progress(done, total)
+
+
+def _same(a: Grid, b: Grid) -> bool:
+    """Whether two grids are the same lattice, to the rounding of a file's float32 affine."""
+    return a.shape == b.shape and np.allclose(a.corners(), b.corners(), rtol=0, atol=1e-4 * float(b.spacing.min()))
+
+
+def _describe(grid: Grid) -> str:
+    return f"{_times(grid.shape)} voxels of {_times(tuple(f'{s:.6g}' for s in grid.spacing))} mm"
+
+
+def _times(numbers: tuple[Any, ...]) -> str:
+    return " x ".join(map(str, numbers))

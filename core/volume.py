@@ -1,0 +1,64 @@
+"""An array on a grid, with the name of what it holds."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .checks import freeze, real_array
+from .errors import InputError
+from .grid import Grid
+
+UNITS = {"activity": "kBq/mL", "mu": "1/mm", "hu": "HU"}
+"""The unit of each quantity a volume may hold."""
+
+
+@dataclass(frozen=True, eq=False)
+class Volume:
+    """Voxel values on a grid; outside the grid they are 0.
+
+    Attributes
+    ----------
+    array : float32 array (n_x, n_y, n_z)
+        Indexed ``[ix, iy, iz]``, C order, read-only. A read-only float32 C-ordered array is kept as it is,
+        any other is copied.
+    grid : Grid
+        Where the voxels are.
+    quantity : str
+        ``"activity"`` (kBq/mL), ``"mu"`` (1/mm) or ``"hu"``.
+
+    Raises
+    ------
+    InputError
+        The array's shape is not the grid's, a value is not finite, or the quantity is not known.
+    """
+
+    array: NDArray[np.float32]
+    grid: Grid
+    quantity: str = "activity"
+
+    def __post_init__(self) -> None:
+        if not isinstance(self.grid, Grid):
+            raise InputError(f"volume: expected a Grid, got {type(self.grid).__name__}")
+        if self.quantity not in UNITS:
+            raise InputError(f"quantity {self.quantity!r}: expected one of {', '.join(UNITS)}")
+        array = self.array
+        if not (isinstance(array, np.ndarray) and _is_kept(array) and array.shape == self.grid.shape):
+            with np.errstate(over="ignore"):  # what overflows float32 is refused as not finite
+                array = freeze(real_array(array, "volume", self.grid.shape, np.float32))
+            object.__setattr__(self, "array", array)
+        else:
+            from .checks import require_finite
+
+            require_finite(array, "volume")
+
+    @property
+    def unit(self) -> str:
+        """The unit of the values."""
+        return UNITS[self.quantity]
+
+
+def _is_kept(array: NDArray[np.float32]) -> bool:
+    return array.dtype == np.float32 and array.flags.c_contiguous and not array.flags.writeable

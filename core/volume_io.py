@@ -1,0 +1,123 @@
+"""Volumes in files: NIfTI, and npz with the exact affine."""
+
+from __future__ import annotations
+
+import json
+import os
+import zipfile
+import zlib
+from pathlib import Path
+
+import numpy as np
+
+from .checks import freeze
+from .errors import InputError
+from .files import replacing
+from .grid import Grid
+from .memory import require
+from .volume import UNITS, Volume
+
+_NIFTI = (".nii", ".nii.gz")
+_MILLIMETRES = {"unknown": 1.0, "mm": 1.0, "meter": 1000.0, "micron": 0.001}
+
+
+def read_volume(path: str | os.PathLike[str], quantity: str | None = None) -> Volume:
+    """Read a volume from NIfTI (.nii, .nii.gz) or .npz.
+
+    Parameters
+    ----------
+    path
+        The file.
+    quantity
+        What the values are: ``"activity"`` (kBq/mL), ``"mu"`` (1/mm) or ``"hu"``. Default: what the file says;
+        a NIfTI file that says nothing is taken for CT, ``"hu"``.
+
+    Raises
+    ------
+    InputError
+        No such file, not such a file, damaged, not 3-D, not finite, or too large for the memory.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise InputError(f"{path}: no such file")
+    kind = _kind(path)
+    try:
+        return _read_npz(path, quantity) if kind == ".npz" else _read_nifti(path, quantity)
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from None
+    except (OSError, EOFError, ValueError, KeyError, zipfile.BadZipFile, zlib.error) as error:
+        raise InputError(f"{path}: cannot be read as {kind} ({_first_line(error)})") from error
+
+
+def write_volume(volume: Volume, path: str | os.PathLike[str]) -> None:
+    """Write a volume as NIfTI (.nii, .nii.gz; its affine is rounded to float32) or .npz (exact).
+
+    Raises
+    ------
+    InputError
+        Another suffix, or the file cannot be written.
+    """
+    path = Path(path)
+    kind = _kind(path)
+    with replacing(path) as temporary:
+        if kind == ".npz":
+            with open(temporary, "wb") as file:
+                np.savez_compressed(
+                    file, array=volume.array, affine=volume.grid.affine, quantity=volume.quantity, unit=volume.unit
+                )
+        else:
+            _write_nifti(volume, temporary)
+
+
+def _read_npz(path: Path, quantity: str | None) -> Volume:
+    with np.load(path, allow_pickle=False) as file:
+        missing = {"array", "affine", "quantity"} - set(file.files)
+        if missing:
+            raise InputError(f"expected the arrays array, affine and quantity; {', '.join(sorted(missing))} not found")
+        array = file["array"]
+        if array.ndim != 3:
+            raise InputError(f"expected a 3-D array, got shape {array.shape}")
+        return Volume(freeze(array), Grid(array.shape, file["affine"]), quantity or str(file["quantity"]))
+
+
+def _read_nifti(path: Path, quantity: str | None) -> Volume:
+    import nibabel
+    from nibabel.filebasedimages import ImageFileError
+
+    try:
+        image = nibabel.load(path)
+    except ImageFileError as error:
+        raise InputError(f"not a NIfTI file ({_first_line(error)})") from None
+    if not isinstance(image, nibabel.Nifti1Image):
+        raise InputError(f"expected NIfTI, found {type(image).__name__}")
+    shape = image.shape
+    if len(shape) != 3:
+        raise InputError(f"expected a 3-D image, got shape {' x '.join(map(str, shape))}")
+    require(8.5 * np.prod(shape, dtype=np.float64), "a volume of {} x {} x {} voxels".format(*shape))
+    unit = image.header.get_xyzt_units()[0]
+    affine = np.diag([_MILLIMETRES[unit]] * 3 + [1.0]) @ np.asarray(image.affine, np.float64)
+    array = np.ascontiguousarray(image.get_fdata(dtype=np.float32, caching="unchanged"))
+    named = image.header.get_intent()[2]
+    return Volume(freeze(array), Grid(shape, affine), quantity or (named if named in UNITS else "hu"))
+
+
+def _write_nifti(volume: Volume, path: Path) -> None:
+    import nibabel
+
+    image = nibabel.Nifti1Image(volume.array, volume.grid.affine)
+    image.header.set_xyzt_units("mm")
+    image.header.set_intent("none", name=volume.quantity)
+    image.header["descrip"] = json.dumps({"quantity": volume.quantity, "unit": volume.unit}).encode()[:79]
+    nibabel.save(image, path)
+
+
+def _kind(path: Path) -> str:
+    name = path.name.lower()
+    for suffix in (*_NIFTI[::-1], ".npz"):
+        if name.endswith(suffix):
+            return suffix
+    raise InputError(f"{path}: expected a name ending in {', '.join((*_NIFTI, '.npz'))}")
+
+
+def _first_line(error: Exception) -> str:
+    return (str(error) or type(error).__name__).splitlines()[0]

@@ -1,0 +1,1 @@
+"""One file per task that a user asks for: read the properties, call `addon` and `core`, report."""

@@ -1,0 +1,28 @@
+"""Modules that were moved, aimed at the isocentre again."""
+
+from __future__ import annotations
+
+import bpy
+
+from ..addon import ids, scanner
+
+
+class MPHDRR_OT_aim_modules(bpy.types.Operator):
+    """``bpy.ops.mphdrr.aim_modules()``."""
+
+    bl_idname = ids.AIM_MODULES
+    bl_label = "Aim at Isocentre"
+    bl_description = "Turn every module that was moved or turned so that it looks at the isocentre, where it stands"
+    bl_options = {"REGISTER", "UNDO"}
+
+    @classmethod
+    def poll(cls, context: bpy.types.Context) -> bool:
+        if scanner.active_scanner(context.scene) is None:
+            cls.poll_message_set("No scanner in the scene: import a geometry first")
+            return False
+        return True
+
+    def execute(self, context: bpy.types.Context) -> set[str]:
+        aimed = scanner.aim_modules(scanner.active_scanner(context.scene))
+        self.report({"INFO"}, f"Turned {len(aimed)} modules" if aimed else "All modules aim at the isocentre")
+        return {"FINISHED"}

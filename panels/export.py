@@ -1,0 +1,32 @@
+"""Sidebar, last step: the dataset."""
+
+from __future__ import annotations
+
+import bpy
+
+from ..addon import ids
+
+
+class MPHDRR_PT_export(bpy.types.Panel):
+    bl_idname = ids.PANEL_EXPORT
+    bl_label = "Export"
+    bl_space_type = "VIEW_3D"
+    bl_region_type = "UI"
+    bl_category = ids.CATEGORY
+    bl_order = ids.ORDER_EXPORT
+
+    def draw(self, context: bpy.types.Context) -> None:
+        layout = self.layout
+        layout.operator_context = "INVOKE_DEFAULT"
+        run_file = getattr(context.scene, ids.SCENE_PROJECTIONS).run_file
+        row = layout.row()
+        row.enabled = bool(run_file)
+        row.operator(ids.EXPORT_DATASET, text="Export Dataset", icon="EXPORT")
+        column = layout.column(align=True)
+        column.active = False
+        if not run_file:
+            column.label(text="Render the projections first.", icon="INFO")
+        elif run_file.startswith("//"):
+            column.label(text=f"Last run: {run_file}", icon="FILE")
+        else:
+            column.label(text="Last run: kept when the .blend is saved", icon="FILE")

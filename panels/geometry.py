@@ -1,0 +1,165 @@
+"""Sidebar, first step: the scanner and its modules."""
+
+from __future__ import annotations
+
+import json
+
+import bpy
+
+from ..addon import ids, scanner
+
+
+class MPHDRR_UL_modules(bpy.types.UIList):
+    """The modules among a scanner's objects, by number."""
+
+    bl_idname = ids.LIST_MODULES
+
+    def draw_item(
+        self,
+        context: bpy.types.Context,
+        layout: bpy.types.UILayout,
+        data: bpy.types.Collection,
+        item: bpy.types.Object,
+        icon: int,
+        active_data: bpy.types.PropertyGroup,
+        active_property: str,
+        index: int = 0,
+        flt_flag: int = 0,
+    ) -> None:
+        module = item.mphdrr_module
+        row = layout.row(align=True)
+        row.active = module.visible
+        _columns(row, item.name, f"{module.pinhole_distance:.1f}", f"{module.collimator_length:.1f}")
+        row.prop(module, "visible", text="", icon="HIDE_OFF" if module.visible else "HIDE_ON", emboss=False)
+
+    def draw_filter(self, context: bpy.types.Context, layout: bpy.types.UILayout) -> None:
+        layout.prop(self, "filter_name", text="", icon="VIEWZOOM")
+
+    def filter_items(
+        self, context: bpy.types.Context, data: bpy.types.Collection, property: str
+    ) -> tuple[list[int], list[int]]:
+        items = getattr(data, property)
+        wanted = self.filter_name.lower()
+        flags = [
+            self.bitflag_filter_item if o.mphdrr_module.is_module and wanted in o.name.lower() else 0 for o in items
+        ]
+        by_number = sorted(range(len(items)), key=lambda i: (items[i].mphdrr_module.index, items[i].name))
+        order = [0] * len(items)
+        for place, i in enumerate(by_number):
+            order[i] = place
+        return flags, order
+
+
+class _Panel:
+    bl_space_type = "VIEW_3D"
+    bl_region_type = "UI"
+    bl_category = ids.CATEGORY
+
+
+class MPHDRR_PT_geometry(_Panel, bpy.types.Panel):
+    """Import, and which scanner it is."""
+
+    bl_idname = ids.PANEL_GEOMETRY
+    bl_label = "Geometry"
+    bl_order = ids.ORDER_GEOMETRY
+
+    def draw(self, context: bpy.types.Context) -> None:
+        layout = self.layout
+        layout.operator_context = "INVOKE_DEFAULT"
+        layout.operator(ids.IMPORT_GEOMETRY, text="Import Workbook", icon="IMPORT")
+        collection = scanner.active_scanner(context.scene)
+        if collection is None:
+            column = layout.column(align=True)
+            column.active = False
+            column.label(text="No scanner in the scene.", icon="INFO")
+            column.label(text="Import a workbook, or drop it", icon="BLANK1")
+            column.label(text="on the viewport.", icon="BLANK1")
+            return
+        if len(scanner.scanners(context.scene)) > 1:
+            layout.prop(context.scene.mphdrr_geometry, "scanner", text="")
+        properties = collection.mphdrr_scanner
+        split = layout.split(factor=0.34)
+        names, values = split.column(align=True), split.column(align=True)
+        names.active = False
+        for name, value in (
+            ("Scanner", collection.name),
+            ("Workbook", bpy.path.basename(properties.workbook) or "none"),
+            ("Modules", f"{properties.n_modules} in {_n_rings(collection)} rings"),
+        ):
+            names.label(text=name)
+            values.label(text=value)
+
+
+class MPHDRR_PT_modules(_Panel, bpy.types.Panel):
+    """The modules: which are shown, and the numbers of one."""
+
+    bl_idname = ids.PANEL_MODULES
+    bl_parent_id = ids.PANEL_GEOMETRY
+    bl_label = "Modules"
+
+    @classmethod
+    def poll(cls, context: bpy.types.Context) -> bool:
+        return scanner.active_scanner(context.scene) is not None
+
+    def draw(self, context: bpy.types.Context) -> None:
+        layout = self.layout
+        collection = scanner.active_scanner(context.scene)
+        if collection is None:  # poll says so too, but the scene may have changed since
+            return
+        state = context.scene.mphdrr_geometry
+
+        quick = layout.row(align=True)
+        for first, last in json.loads(collection.mphdrr_scanner.quick_ranges or "[]"):
+            _show(quick, f"{first}-{last}", first, last, "ONLY")
+        _show(quick, "All", state.first, state.last, "ALL")
+
+        column = layout.column(align=True)
+        row = column.row(align=True)
+        row.prop(state, "first")
+        row.prop(state, "last")
+        row = column.row(align=True)
+        _show(row, "Show Only", state.first, state.last, "ONLY")
+        _show(row, "Show", state.first, state.last, "SHOW", icon="HIDE_OFF")
+        _show(row, "Hide", state.first, state.last, "HIDE", icon="HIDE_ON")
+
+        head = layout.row(align=True)
+        head.active = False
+        _columns(head, "  Module", "b (mm)", "l (mm)")
+        head.label(text="", icon="BLANK1")
+        head.separator(factor=2.0)  # the list's scroll bar
+        layout.template_list(ids.LIST_MODULES, "", collection, "all_objects", state, "active_index", rows=6, maxrows=12)
+
+        items = collection.all_objects
+        active = items[state.active_index] if 0 <= state.active_index < len(items) else None
+        if active is not None and active.mphdrr_module.is_module:
+            module = active.mphdrr_module
+            look = layout.operator(
+                ids.LOOK_THROUGH_MODULE, text=f"Look Through {active.name}", icon="OUTLINER_OB_CAMERA"
+            )
+            look.number = module.number
+            layout.use_property_split = True
+            layout.use_property_decorate = False
+            column = layout.column(align=True)
+            column.prop(module, "pinhole_diameter", text="Hole d (mm)")
+            column.prop(module, "collimator_length", text="Length l (mm)")
+            column.prop(module, "detector_side", text="Side Ld (mm)")
+            column.prop(module, "detector_thickness", text="Depth Td (mm)")
+        layout.operator(ids.AIM_MODULES, icon="CON_TRACKTO")
+
+
+def _columns(layout: bpy.types.UILayout, name: str, *numbers: str) -> None:
+    split = layout.split(factor=0.46, align=True)
+    split.label(text=name)
+    for text in numbers:
+        cell = split.row()
+        cell.alignment = "RIGHT"
+        cell.label(text=text)
+
+
+def _show(layout: bpy.types.UILayout, text: str, first: int, last: int, mode: str, icon: str = "NONE") -> None:
+    button = layout.operator(ids.SHOW_MODULES, text=text, icon=icon)
+    button.first, button.last, button.mode = first, last, mode
+
+
+def _n_rings(collection: bpy.types.Collection) -> int:
+    return sum(c.mphdrr_scanner.is_ring for c in collection.children)

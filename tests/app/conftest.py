@@ -1,0 +1,130 @@
+"""A real Blender, driven from outside: the built zip installed into a clean home, without network.
+
+Needs the script `real-blender` (REAL_BLENDER, or shared/tools beside the clone) and the zip in dist/: make test-app.
+Blender runs in a root of its own that sees this repository's disk, not the machine's temporary folder: files for it and
+from it go to `work_folder`.
+"""
+
+from __future__ import annotations
+
+import os
+import shutil
+import subprocess
+import tomllib
+import zipfile
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[2]
+REAL_BLENDER = Path(os.environ.get("REAL_BLENDER", ROOT.parent / "shared/tools/real-blender"))
+OUTPUT = ROOT / "out" / "test-app"
+MODULE = "bl_ext.user_default.mphdrr"
+
+Run = Callable[..., subprocess.CompletedProcess[str]]
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    if not REAL_BLENDER.is_file():
+        for item in items:
+            if item.path.is_relative_to(Path(__file__).parent):
+                item.add_marker(pytest.mark.skip(reason=f"needs a real Blender: no {REAL_BLENDER}"))
+
+
+def run_blender(
+    *arguments: str | Path, home: Path, check: bool = True, network: bool = False, timeout: float = 300
+) -> subprocess.CompletedProcess[str]:
+    command = [str(REAL_BLENDER), "run", *map(str, arguments)]
+    if not network and shutil.which("unshare"):
+        command = ["unshare", "--net", *command]
+    environment = {**os.environ, "REAL_BLENDER_HOME": str(home)}
+    done = subprocess.run(
+        command, cwd=ROOT, env=environment, stdin=subprocess.DEVNULL, capture_output=True, text=True, timeout=timeout
+    )
+    if check and done.returncode != 0:
+        pytest.fail(f"blender ended with status {done.returncode}\n{done.stdout[-4000:]}\n{done.stderr[-4000:]}")
+    return done
+
+
+@pytest.fixture(scope="session")
+def extension_zip() -> Path:
+    """The built zip for Linux; it must be of this tree."""
+    version = tomllib.loads((ROOT / "blender_manifest.toml").read_text())["version"]
+    path = ROOT / "dist" / f"mphdrr-{version}-linux_x64.zip"
+    if not path.is_file():
+        pytest.fail(f"{path.name} is not in dist/; run: make dist PLATFORM=linux-x64")
+    with zipfile.ZipFile(path) as archive:
+        for name in archive.namelist():
+            if name.endswith(".py") and archive.read(name) != (ROOT / name).read_bytes():
+                pytest.fail(f"{path.name} is older than {name}; run: make dist PLATFORM=linux-x64")
+    return path
+
+
+@pytest.fixture(scope="session")
+def home(extension_zip: Path) -> Path:
+    """A clean home of Blender with the extension installed and enabled, from the zip and nothing else."""
+    subprocess.run([REAL_BLENDER, "setup"], check=True, capture_output=True)
+    shutil.rmtree(OUTPUT, ignore_errors=True)
+    folder = OUTPUT / "home"
+    folder.mkdir(parents=True)
+    run_blender("--command", "extension", "install-file", "-r", "user_default", "-e", extension_zip, home=folder)
+    return folder
+
+
+@pytest.fixture
+def work_folder(home: Path, request: pytest.FixtureRequest) -> Path:
+    """An empty folder of this test's own that Blender sees at the same path."""
+    folder = OUTPUT / request.node.name.replace("/", "-")
+    folder.mkdir()
+    return folder
+
+
+@pytest.fixture
+def blender(home: Path) -> Run:
+    """`blender(*arguments, check=True, network=False, timeout=300)`: run it with the extension and give what it said."""
+
+    def run(*arguments: str | Path, **options: float) -> subprocess.CompletedProcess[str]:
+        return run_blender(*arguments, home=home, **options)
+
+    return run
+
+
+@pytest.fixture
+def blender_script(blender: Run, work_folder: Path) -> Run:
+    """`blender_script(text, *arguments)`: run Python in a windowless Blender; an exception in it fails the test."""
+
+    def run(text: str, *arguments: str | Path, **options: float) -> subprocess.CompletedProcess[str]:
+        script = work_folder / "script.py"
+        script.write_text(text, encoding="utf-8")
+        return blender("--background", "--python-exit-code", "3", "--python", script, "--", *arguments, **options)
+
+    return run
+
+
+@pytest.fixture
+def blender_window(home: Path, work_folder: Path) -> Callable[..., Path]:
+    """`blender_window(text, *arguments, seconds=12)`: run Python in a Blender with its window; give a PNG of the screen.
+
+    The window is closed after `seconds`; what the script finds it writes to a file named in `arguments`.
+    """
+
+    def run(text: str, *arguments: str | Path, seconds: float = 12) -> Path:
+        script, picture = work_folder / "window.py", work_folder / "window.png"
+        script.write_text(text, encoding="utf-8")
+        command = [str(REAL_BLENDER), "screenshot", str(picture), str(script), str(seconds), *map(str, arguments)]
+        environment = {**os.environ, "REAL_BLENDER_HOME": str(home)}
+        done = subprocess.run(
+            command,
+            cwd=ROOT,
+            env=environment,
+            stdin=subprocess.DEVNULL,
+            capture_output=True,
+            text=True,
+            timeout=seconds + 120,
+        )
+        if not picture.is_file():
+            pytest.fail(f"no screenshot\n{done.stdout[-4000:]}\n{done.stderr[-4000:]}")
+        return picture
+
+    return run

@@ -1,0 +1,86 @@
+"""The zip as a user gets it: what is in it, and that Blender installs, enables and disables it."""
+
+from __future__ import annotations
+
+import re
+import tomllib
+import zipfile
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[2]
+MODULE = "bl_ext.user_default.mphdrr"
+
+
+def test_zip_holds_the_extension_and_no_tests(extension_zip: Path):
+    with zipfile.ZipFile(extension_zip) as archive:
+        names = archive.namelist()
+        manifest = tomllib.loads(archive.read("blender_manifest.toml").decode())
+    tops = {name.split("/")[0] for name in names}
+    assert {"__init__.py", "LICENSE", "addon", "core", "operators", "panels", "examples", "wheels"} <= tops
+    assert not tops & {"tests", "docs", "benchmarks", "tools", "out", "dist", ".ci", ".gitignore", "pyproject.toml"}
+    assert not [name for name in names if re.search(r"(^|/)(test_|conftest|__pycache__|\.)", name)]
+    assert "examples/dc-spect-80.xlsx" in names
+    generated = manifest["build"]["generated"]
+    assert generated["platforms"] == ["linux-x64"]
+    assert sorted(generated["wheels"]) == sorted(f"./{name}" for name in names if name.startswith("wheels/"))
+
+
+@pytest.mark.parametrize("python", ["cp311", "cp313"])
+def test_zip_holds_compiled_wheels_for_the_pythons_of_both_blenders(extension_zip: Path, python: str):
+    with zipfile.ZipFile(extension_zip) as archive:
+        wheels = [Path(name).name.split("-") for name in archive.namelist() if name.endswith(".whl")]
+    assert {name for name, _, tag, *_ in wheels if tag == python} == {"h5py", "llvmlite", "numba", "pillow"}
+    assert not [name for name, *_ in wheels if name == "numpy"]  # Blender's own
+
+
+def test_installs_and_enables_without_network(blender_script):
+    said = blender_script(f"""
+import importlib, sys, bpy
+assert "{MODULE}" in bpy.context.preferences.addons, list(bpy.context.preferences.addons.keys())
+assert hasattr(bpy.ops, "mphdrr") and "MPHDRR_PT_geometry" in dir(bpy.types)
+for name in ("numba", "h5py", "PIL", "psutil", "openpyxl", "nibabel", "trimesh"):
+    module = importlib.import_module(name)
+    assert ".local" in module.__file__, module.__file__  # from the extension's wheels, not from the machine
+print("ENABLED", sys.modules["{MODULE}"].__file__)
+""")
+    assert "ENABLED" in said.stdout
+    assert "Traceback" not in said.stderr
+
+
+def test_registers_and_unregisters_twice_cleanly(blender_script):
+    said = blender_script(f"""
+import addon_utils, bpy
+
+def ours():
+    classes = {{name for name in dir(bpy.types) if name.startswith("MPHDRR_")}}
+    properties = {{
+        (owner.__name__, name)
+        for owner in (bpy.types.Scene, bpy.types.Object, bpy.types.Collection, bpy.types.WindowManager)
+        for name in dir(owner) if name.startswith("mphdrr")
+    }}
+    menus = [
+        draw for menu in (bpy.types.TOPBAR_MT_file_import, bpy.types.TOPBAR_MT_file_export)
+        for draw in menu._dyn_ui_initialize() if "mphdrr" in draw.__module__
+    ]
+    handlers = [
+        function for name in dir(bpy.app.handlers) if isinstance(getattr(bpy.app.handlers, name), list)
+        for function in getattr(bpy.app.handlers, name) if "mphdrr" in getattr(function, "__module__", "")
+    ]
+    return classes, properties, len(menus), len(handlers)
+
+def raise_it(error):
+    raise error
+
+enabled = ours()
+assert enabled[0] and enabled[1] and enabled[2]
+for _ in range(2):
+    addon_utils.disable("{MODULE}", handle_error=raise_it)
+    assert ours() == (set(), set(), 0, 0), ours()
+    addon_utils.enable("{MODULE}", handle_error=raise_it)
+    assert ours() == enabled, (ours(), enabled)
+print("TWICE")
+""")
+    assert "TWICE" in said.stdout
+    assert "Traceback" not in said.stderr

@@ -1,0 +1,48 @@
+"""Every test gets a fresh factory scene and the registered extension; without bpy they are skipped."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+bpy = pytest.importorskip("bpy", reason="needs Blender's Python module: pip install mphdrr[blender]")
+
+from mphdrr.addon import registration  # noqa: E402
+from mphdrr.core.system import PinholeSystem  # noqa: E402
+
+WORKBOOK = Path(__file__).parents[2] / "examples" / "dc-spect-80.xlsx"
+
+
+@pytest.fixture(autouse=True)
+def scene():
+    """A fresh factory scene with the extension registered."""
+    bpy.ops.wm.read_factory_settings()
+    registration.register()
+    yield bpy.context.scene
+    registration.unregister()
+
+
+@pytest.fixture(scope="session")
+def workbook() -> Path:
+    return WORKBOOK
+
+
+@pytest.fixture(scope="session")
+def dc_spect() -> PinholeSystem:
+    """The real scanner: 80 modules in 4 rings."""
+    from mphdrr.core.workbook import read_system
+
+    return read_system(WORKBOOK)
+
+
+@pytest.fixture
+def ring_system() -> PinholeSystem:
+    """Two rings of four modules of different sizes: small, and nothing in it symmetric."""
+    angle = np.radians([-80.0, -20.0, 35.0, 120.0])
+    radius = np.array([180.0, 210.0, 195.0, 240.0])
+    ring = np.stack([radius * np.cos(angle), radius * np.sin(angle), np.full(4, -30.0)], axis=1)
+    centers = np.concatenate([ring, ring * [1.0, 1.0, -1.3]])
+    centers[:, 0] += 0.1234567890123
+    return PinholeSystem(centers, 2.3, np.linspace(50.0, 71.0, 8) / 1.00000001, 48.0, 9.5, 60.0)

@@ -1,0 +1,276 @@
+"""The scanner in the scene: built, replaced, changed and read back."""
+
+from __future__ import annotations
+
+import json
+import warnings
+
+import bpy
+import numpy as np
+import pytest
+
+from mphdrr.addon import cameras, ids, registration, scanner
+from mphdrr.core.errors import InputError, InputWarning
+from mphdrr.core.system import PinholeSystem
+
+LENGTHS = ("pinhole_diameter", "collimator_length", "detector_side", "detector_thickness", "roi_radius")
+
+
+def counts() -> dict[str, int]:
+    kinds = ("objects", "meshes", "cameras", "materials", "collections")
+    return {kind: len(getattr(bpy.data, kind)) for kind in kinds}
+
+
+def assert_same(a: PinholeSystem, b: PinholeSystem) -> None:
+    for name in ("centers", "numbers", *LENGTHS):
+        assert np.array_equal(getattr(a, name), getattr(b, name)), name
+
+
+def test_registers_twice():
+    registration.unregister()
+    assert not hasattr(bpy.types.Object, ids.OBJECT_MODULE)
+    for _ in range(2):
+        registration.register()
+        registration.unregister()
+    assert not hasattr(bpy.types, "MPHDRR_PT_geometry")
+    registration.register()
+
+
+def test_failed_registration_leaves_nothing(monkeypatch):
+    registration.unregister()
+
+    class Broken(bpy.types.Operator):
+        bl_idname = "no_dot_in_it"
+        bl_label = "Broken"
+
+    monkeypatch.setattr(registration, "CLASSES", (*registration.CLASSES, Broken))
+    with pytest.raises((RuntimeError, ValueError), match="no_dot_in_it"):
+        registration.register()
+    assert not hasattr(bpy.types.Object, ids.OBJECT_MODULE)
+    monkeypatch.undo()
+    registration.register()
+
+
+def test_scanner_has_a_collection_per_ring_and_a_camera_per_module(scene, dc_spect):
+    collection = scanner.build_scanner(scene, dc_spect)
+    assert [c.name for c in collection.children] == ["Ring 1", "Ring 2", "Ring 3", "Ring 4"]
+    assert [len(c.objects) for c in collection.children] == [60] * 4
+    found = scanner.modules(collection)
+    assert [o.name for o in found[:2]] == ["Module 01", "Module 02"]
+    assert [o.mphdrr_module.number for o in found] == list(range(1, 81))
+    assert scene.unit_settings.scale_length == pytest.approx(0.001)
+    assert scanner.quick_ranges(dc_spect) == [(1, 40), (21, 60), (41, 80)]
+    assert json.loads(collection.mphdrr_scanner.quick_ranges) == [[1, 40], [21, 60], [41, 80]]
+    assert sum(o.type == "MESH" for o in collection.all_objects) == 161
+    meshes = {o.data for o in collection.all_objects if o.type == "MESH"}
+    assert len(meshes) == 81, "rings 3 and 4 mirror rings 2 and 1: their modules share meshes"
+
+
+def test_camera_axes_follow_the_module_frame(scene, ring_system):
+    found = scanner.modules(scanner.build_scanner(scene, ring_system))
+    bpy.context.view_layer.update()
+    for camera, (u, v, k), center in zip(found, ring_system.frames(), ring_system.centers, strict=True):
+        matrix = np.array(camera.matrix_world)
+        assert np.allclose(matrix[:3, :3], np.stack([-u, v, -k], axis=1), atol=5e-7)
+        assert np.allclose(matrix[:3, 3], center, atol=2e-5)
+        assert camera.rotation_euler.y == 0.0
+
+
+def test_unchanged_scanner_reads_back_exactly(scene, ring_system, dc_spect):
+    assert_same(scanner.read_scanner(scanner.build_scanner(scene, ring_system, "A")), ring_system)
+    collection = scanner.build_scanner(scene, dc_spect)
+    bpy.context.view_layer.update()
+    back = scanner.read_scanner(collection)
+    assert_same(back, dc_spect)
+    assert back.source == dc_spect.source
+    assert scanner.losses(collection) == []
+
+
+def test_unsorted_numbers_keep_their_order(scene, ring_system):
+    system = ring_system[np.array([5, 0, 7, 2])]
+    assert_same(scanner.read_scanner(scanner.build_scanner(scene, system, "A")), system)
+
+
+def test_scanner_survives_saving(scene, dc_spect, tmp_path):
+    scanner.build_scanner(scene, dc_spect)
+    path = str(tmp_path / "scanner.blend")
+    bpy.ops.wm.save_as_mainfile(filepath=path)
+    bpy.ops.wm.open_mainfile(filepath=path)
+    collection = scanner.active_scanner(bpy.context.scene)
+    back = scanner.read_scanner(collection)
+    assert_same(back, dc_spect)
+    assert back.source == dc_spect.source
+
+
+def test_moved_camera_and_edited_number_are_read(scene, ring_system):
+    collection = scanner.build_scanner(scene, ring_system)
+    third = scanner.module(collection, 3)
+    third.location.z += 5.0
+    scanner.module(collection, 4).mphdrr_module.pinhole_diameter = 3.0
+    with pytest.warns(InputWarning, match="module 3 not aimed"):
+        back = scanner.read_scanner(collection)
+    assert np.allclose(back.centers[2], ring_system.centers[2] + [0, 0, 5], atol=2e-5)
+    assert np.array_equal(np.delete(back.centers, 2, axis=0), np.delete(ring_system.centers, 2, axis=0))
+    assert back.pinhole_diameter.tolist() == [2.3, 2.3, 2.3, 3.0, 2.3, 2.3, 2.3, 2.3]
+    assert back.source is None
+    assert scanner.aim_modules(collection) == [3]
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        scanner.read_scanner(collection)
+    assert np.allclose(cameras.world_matrix(third), cameras.camera_matrices(back.centers)[2], atol=2e-5)
+
+
+def test_hidden_or_parented_camera_is_read_where_it_is(scene, ring_system):
+    collection = scanner.build_scanner(scene, ring_system)
+    scanner.show_modules(collection, 1, 1, "ONLY")
+    bpy.context.view_layer.update()
+    bench = bpy.data.objects.new("Bench", None)
+    scene.collection.objects.link(bench)
+    bench.location = (0, 0, 12.5)
+    for camera in scanner.modules(collection):
+        camera.parent = bench
+    with pytest.warns(InputWarning):
+        back = scanner.read_scanner(collection)
+    assert np.allclose(back.centers, ring_system.centers + np.array([0, 0, 12.5]), atol=5e-5)
+
+
+def test_children_follow_the_camera(scene, ring_system):
+    camera = scanner.module(scanner.build_scanner(scene, ring_system), 2)
+    camera.location.x += 40.0
+    camera.rotation_euler.z += 0.3
+    bpy.context.view_layer.update()
+    assert sorted(c.mphdrr_module.part for c in camera.children) == ["COLLIMATOR", "CRYSTAL"]
+    for child in camera.children:
+        assert np.allclose(child.matrix_world, camera.matrix_world, atol=1e-6)
+
+
+def test_edited_module_is_rebuilt_with_its_numbers(scene, ring_system):
+    collection = scanner.build_scanner(scene, ring_system)
+    before = counts()
+    camera = scanner.module(collection, 2)
+    camera.mphdrr_module.collimator_length = 80.0
+    camera.mphdrr_module.detector_side = 40.0
+    assert camera.data.lens / camera.data.sensor_width == pytest.approx(2.0)
+    crystal = next(c for c in camera.children if c.mphdrr_module.part == "CRYSTAL")
+    z = [v.co.z for v in crystal.data.vertices]
+    assert (min(z), max(z)) == pytest.approx((80.0, 89.5))
+    assert counts() == before
+    camera.mphdrr_module.pinhole_diameter = 500.0  # no such shape: refused when read, but nothing breaks
+    with pytest.raises(InputError, match="module 2"):
+        scanner.read_scanner(collection)
+
+
+def test_importing_again_leaves_no_orphans(scene, dc_spect):
+    scanner.build_scanner(scene, dc_spect)
+    before = counts()
+    names = sorted(o.name for o in bpy.data.objects)
+    for _ in range(3):
+        scanner.build_scanner(scene, dc_spect)
+    assert counts() == before
+    assert sorted(o.name for o in bpy.data.objects) == names
+    assert all(mesh.users for mesh in bpy.data.meshes)
+
+
+def test_scanners_of_different_names_coexist(scene, ring_system):
+    one = scanner.build_scanner(scene, ring_system, "One")
+    two = scanner.build_scanner(scene, ring_system[0:3], "Two")
+    assert scanner.scanners(scene) == [one, two]
+    assert scanner.active_scanner(scene) == two
+    assert (len(scanner.read_scanner(one)), len(scanner.read_scanner(two))) == (8, 3)
+    scanner.build_scanner(scene, ring_system[0:2], "One")
+    assert (len(scanner.read_scanner(one)), len(scanner.read_scanner(two))) == (2, 3)
+
+
+def test_replacing_asks_for_what_would_be_lost_and_keeps_what_is_the_users(scene, ring_system):
+    collection = scanner.build_scanner(scene, ring_system, "One")
+    camera = scanner.module(collection, 5)
+    own = bpy.data.objects.new("My lamp", None)
+    collection.objects.link(own)
+    on_module = bpy.data.objects.new("My marker", None)
+    scene.collection.objects.link(on_module)
+    on_module.parent = scanner.module(collection, 8)
+    copy = camera.copy()
+    collection.children[0].objects.link(copy)
+    folder = bpy.data.collections.new("My folder")
+    collection.children[1].children.link(folder)
+    camera.location.x += 1.0
+    scanner.module(collection, 6).mphdrr_module.detector_side = 47.0
+    scene.camera = camera
+
+    before = counts()
+    with pytest.raises(InputError) as error:
+        scanner.build_scanner(scene, ring_system, "One")
+    assert counts() == before
+    for phrase in (
+        "module 5 moved",
+        "module 6 with changed",
+        "My lamp",
+        "My folder",
+        copy.name,
+        "replace=True",
+    ):
+        assert phrase in str(error.value)
+    assert "\n" not in str(error.value)
+
+    again = scanner.build_scanner(scene, ring_system[0:6], "One", replace=True)
+    assert again == collection
+    assert_same(scanner.read_scanner(again), ring_system[0:6])
+    bpy.context.view_layer.update()
+    place = np.array(on_module.matrix_world)[:3, 3]
+    assert np.allclose(place, ring_system.centers[7], atol=2e-5), "its module has gone: it stays where it was"
+    for item in (own, on_module, copy):
+        assert list(item.users_collection) == [scene.collection]
+    assert folder in list(scene.collection.children)
+    assert scene.camera == scanner.module(again, 5)
+    assert scanner.losses(again) == []
+
+
+def test_deleted_module_is_named_as_a_loss_and_two_of_one_number_are_refused(scene, ring_system):
+    collection = scanner.build_scanner(scene, ring_system)
+    copy = scanner.module(collection, 2).copy()
+    collection.objects.link(copy)
+    with pytest.raises(InputError, match=r"'Module 02' and 'Module 02.001' both have module number 2"):
+        scanner.read_scanner(collection)
+    bpy.data.objects.remove(copy)
+    bpy.data.objects.remove(scanner.module(collection, 2))
+    assert scanner.losses(collection) == ["1 module deleted or moved out"]
+    assert scanner.read_scanner(collection).numbers.tolist() == [1, 3, 4, 5, 6, 7, 8]
+
+
+def test_failed_build_leaves_the_scene_as_it_was(scene, ring_system, monkeypatch):
+    scanner.build_scanner(scene, ring_system)
+    before = counts()
+    with pytest.raises(InputError, match="aperture plate"):
+        scanner.build_scanner(scene, ring_system, plate_thickness=60.0)
+    monkeypatch.setattr(cameras, "set_field_of_view", lambda *args: 1 / 0)
+    with pytest.raises(ZeroDivisionError):
+        scanner.build_scanner(scene, ring_system, "Other")
+    assert counts() == before
+
+
+def test_modules_are_shown_by_range(scene, ring_system):
+    collection = scanner.build_scanner(scene, ring_system)
+
+    def visible() -> list[int]:
+        shown = []
+        for camera in scanner.modules(collection):
+            states = {item.hide_viewport for item in (camera, *camera.children)}
+            assert states == {item.hide_render for item in (camera, *camera.children)} and len(states) == 1
+            if not camera.hide_viewport:
+                shown.append(camera.mphdrr_module.number)
+        return shown
+
+    assert scanner.show_modules(collection, 2, 4) == 3
+    assert visible() == [2, 3, 4]
+    scanner.show_modules(collection, 7, 9, "SHOW")
+    assert visible() == [2, 3, 4, 7, 8]
+    scanner.show_modules(collection, 1, 3, "HIDE")
+    assert visible() == [4, 7, 8]
+    scanner.module(collection, 4).mphdrr_module.visible = False
+    assert visible() == [7, 8]
+    scanner.build_scanner(scene, ring_system)
+    assert visible() == [7, 8], "importing again keeps what is hidden"
+    scanner.show_modules(collection, 0, 0, "ALL")
+    assert visible() == list(range(1, 9))
+    with pytest.raises(InputError, match="no module between 9 and 20"):
+        scanner.show_modules(collection, 9, 20)

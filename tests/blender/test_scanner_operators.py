@@ -1,0 +1,105 @@
+"""The operators of the Geometry panel, called as a script calls them."""
+
+from __future__ import annotations
+
+import bpy
+import numpy as np
+import pytest
+
+from mphdrr.addon import scanner
+from mphdrr.addon.reports import warnings_reported
+from mphdrr.core.errors import InputWarning
+
+
+def test_import_equals_build_scanner(scene, workbook, dc_spect):
+    assert bpy.ops.mphdrr.import_geometry(filepath=str(workbook)) == {"FINISHED"}
+    collection = scanner.active_scanner(scene)
+    assert collection.name == "dc-spect-80"
+    back = scanner.read_scanner(collection)
+    assert np.array_equal(back.centers, dc_spect.centers)
+    assert back.source.sha256 == dc_spect.source.sha256 == collection.mphdrr_scanner.sha256
+    assert (scene.render.resolution_x, scene.render.resolution_y) == (256, 256)
+
+
+def test_import_refuses_to_drop_changes_unless_told(scene, workbook):
+    bpy.ops.mphdrr.import_geometry(filepath=str(workbook), name="S", image_size=(200, 100))
+    assert (scene.render.resolution_x, scene.render.resolution_y) == (200, 100)
+    camera = scanner.module(scanner.find_scanner(scene, "S"), 7)
+    camera.location.x += 3.0
+    with pytest.raises(RuntimeError, match="module 7 moved"):
+        bpy.ops.mphdrr.import_geometry(filepath=str(workbook), name="S")
+    bpy.ops.mphdrr.import_geometry(filepath=str(workbook), name="S", replace=True)
+    assert scanner.losses(scanner.find_scanner(scene, "S")) == []
+    assert bpy.ops.mphdrr.import_geometry(filepath=str(workbook), name="S") == {"FINISHED"}
+
+
+@pytest.mark.parametrize("content", [None, b"not a workbook"])
+def test_bad_file_is_one_readable_line_and_leaves_the_scene(scene, tmp_path, content):
+    path = tmp_path / "bad.xlsx"
+    if content is not None:
+        path.write_bytes(content)
+    before = [o.name for o in bpy.data.objects]
+    with pytest.raises(RuntimeError) as error:
+        bpy.ops.mphdrr.import_geometry(filepath=str(path))
+    assert "bad.xlsx" in str(error.value)
+    assert "Traceback" not in str(error.value)
+    assert [o.name for o in bpy.data.objects] == before
+    assert scanner.scanners(scene) == []
+
+
+def test_import_without_a_file_says_so():
+    with pytest.raises(RuntimeError, match="no file given"):
+        bpy.ops.mphdrr.import_geometry()
+
+
+def test_show_and_look_through(scene, workbook):
+    bpy.ops.mphdrr.import_geometry(filepath=str(workbook))
+    bpy.ops.mphdrr.show_modules(first=21, last=60, mode="ONLY")
+    found = scanner.modules(scanner.active_scanner(scene))
+    assert [o.mphdrr_module.number for o in found if not o.hide_render] == list(range(21, 61))
+    bpy.ops.mphdrr.look_through_module(number=33)
+    assert scene.camera.name == "Module 33"
+    with pytest.raises(RuntimeError, match="no module 99"):
+        bpy.ops.mphdrr.look_through_module(number=99)
+    with pytest.raises(RuntimeError, match="no module between"):
+        bpy.ops.mphdrr.show_modules(first=100, last=120)
+
+
+def test_aim_turns_moved_modules_back(scene, workbook):
+    bpy.ops.mphdrr.import_geometry(filepath=str(workbook))
+    collection = scanner.active_scanner(scene)
+    scanner.module(collection, 12).rotation_euler.y += 0.2
+    assert scanner.off_aim(scanner.modules(collection)) == [12]
+    bpy.ops.mphdrr.aim_modules()
+    assert scanner.off_aim(scanner.modules(collection)) == []
+
+
+@pytest.mark.parametrize("operator", ["show_modules", "look_through_module", "aim_modules"])
+def test_without_a_scanner_operators_say_what_to_do(operator):
+    with pytest.raises(RuntimeError, match="import a geometry first"):
+        getattr(bpy.ops.mphdrr, operator)()
+
+
+def test_file_handler_takes_workbooks():
+    handler = bpy.types.MPHDRR_FH_workbook
+    assert handler.bl_file_extensions == ".xlsx;.xlsm"
+    assert handler.bl_import_operator == "mphdrr.import_geometry"
+
+
+def test_warnings_are_reported_not_raised():
+    import warnings
+
+    class Log:
+        def __init__(self):
+            self.lines = []
+
+        def report(self, kind, text):
+            self.lines.append((kind, text))
+
+    log = Log()
+    with warnings_reported(log):
+        for i in range(8):
+            warnings.warn(f"cell E{i}", InputWarning, stacklevel=1)
+    assert log.lines[0] == ({"WARNING"}, "cell E0")
+    assert log.lines[-1] == ({"WARNING"}, "... and 3 more warnings of this kind")
+    assert len(log.lines) == 6

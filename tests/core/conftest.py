@@ -1,0 +1,49 @@
+"""Helpers of the tests without Blender."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from mphdrr.core.frames import euler_pose
+from mphdrr.core.grid import Grid
+from mphdrr.core.system import PinholeSystem
+
+WORKBOOK = Path(__file__).parents[2] / "examples" / "dc-spect-80.xlsx"
+
+
+@pytest.fixture
+def rng() -> np.random.Generator:
+    return np.random.default_rng(20261121)
+
+
+@pytest.fixture(scope="session")
+def workbook() -> Path:
+    return WORKBOOK
+
+
+@pytest.fixture
+def system(rng: np.random.Generator) -> PinholeSystem:
+    """Twelve modules in two rings, all numbers different."""
+    angles = np.linspace(0.1, 5.5, 6)
+    ring = np.stack([220 * np.cos(angles), 180 * np.sin(angles), np.full(6, 30.0)], axis=1)
+    centers = np.concatenate([ring * [1, 1, -1], ring]) + rng.uniform(-2, 2, (12, 3))
+    return PinholeSystem(
+        centers=centers,
+        pinhole_diameter=rng.uniform(1, 3, 12),
+        collimator_length=rng.uniform(50, 90, 12),
+        detector_side=rng.uniform(40, 60, 12),
+        detector_thickness=rng.uniform(5, 12, 12),
+        roi_radius=75.0,
+        numbers=np.arange(101, 113),
+    )
+
+
+def general_grid(rng: np.random.Generator, shape: tuple[int, int, int]) -> Grid:
+    """A grid whose affine is rotated, sheared, anisotropic and mirrored, around the isocentre."""
+    affine = euler_pose(*rng.uniform(-3, 3, 3))
+    affine[:3, :3] @= np.array([[1.3, 0.2, 0.0], [0.0, -0.8, 0.1], [0.0, 0.0, 2.1]])
+    affine[:3, 3] -= affine[:3, :3] @ (np.array(shape) - 1) / 2
+    return Grid(shape, affine)

@@ -1,0 +1,121 @@
+"""The command line: what its users type, and what it says when they err."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+
+import mphdrr.core as mph
+from mphdrr.addon.cli import main
+
+SMALL = ["--voxels", "24", "--spacing", "4", "--size", "12", "16"]
+
+
+def test_geometry_show_prints_every_module(workbook, capsys):
+    assert main(["geometry", "show", str(workbook), "--json"]) == 0
+    modules = json.loads(capsys.readouterr().out)["modules"]
+    assert len(modules) == 80
+    assert modules[79]["ring"] == 4
+    assert modules[0]["l"] == pytest.approx(89.070206162965, abs=1e-8)
+    assert main(["geometry", "show", str(workbook), "--modules", "1-2,80"]) == 0
+    assert len(capsys.readouterr().out.splitlines()) == 5
+
+
+def test_geometry_check_names_cells_that_disagree(workbook, tmp_path, capsys):
+    import openpyxl
+
+    book = openpyxl.load_workbook(workbook)
+    book["Coordinates"]["G5"] = 99.0
+    book.save(tmp_path / "a.xlsx")
+    assert main(["geometry", "check", str(tmp_path / "a.xlsx"), "--json"]) == 0
+    warnings = json.loads(capsys.readouterr().out)["warnings"]
+    assert len(warnings) >= 1
+    assert any("G5" in text and "99" in text for text in warnings)
+
+
+def test_from_phantom_to_dataset(workbook, tmp_path, capsys):
+    volume, run = tmp_path / "derenzo.nii.gz", tmp_path / "new" / "run.h5"
+    phantom = ["--voxels", "24", "--spacing", "4", "--euler", "10", "20", "30", "--position", "1", "2", "3"]
+    assert main(["phantom", "derenzo", *phantom, "-o", str(volume)]) == 0
+    options = ["--volume", str(volume), *SMALL[4:], "--modules", "1-5", "--mosaic", str(tmp_path / "m.png")]
+    assert main(["project", str(workbook), *options, "-o", str(run)]) == 0
+    assert main(["export", str(run), "-o", str(tmp_path / "run.npz")]) == 0
+    capsys.readouterr()
+
+    back = mph.read_run(tmp_path / "run.npz")
+    assert back.projections.shape == (5, 12, 16)
+    assert list(back.system.numbers) == [1, 2, 3, 4, 5]
+    expected = mph.Projector(back.volume.grid, back.views)(mph.read_volume(volume))
+    assert np.allclose(back.projections, expected)
+    assert back.workbook == "dc-spect-80.xlsx"
+    assert len(back.workbook_sha256) == 64
+    assert (tmp_path / "m.png").stat().st_size > 0
+
+
+@pytest.mark.parametrize(
+    ("command", "said"),
+    [
+        (["geometry", "show", "none.xlsx"], "none.xlsx"),
+        (["geometry", "show", "WORKBOOK", "--modules", "90"], "there are 1 to 80"),
+        (["geometry", "show", "WORKBOOK", "--modules", "a-b"], "expected numbers such as"),
+        (["phantom", "derenzo", "-o", "FOLDER/a.stl"], "expected a name ending in"),
+        (["phantom", "derenzo", "--radius", "-1", "-o", "FOLDER/a.npz"], "Derenzo radius"),
+        (["phantom", "derenzo", "--voxels", "99999", "-o", "FOLDER/a.npz"], "of memory"),
+        (["phantom", "derenzo", "--voxels", "9", "9", "-o", "FOLDER/a.npz"], "grid shape"),
+        (["project", "WORKBOOK", "-o", "FOLDER/a.txt"], "expected a name ending in"),
+        (["project", "WORKBOOK", *SMALL, "--backend", "magic", "-o", "FOLDER/a.h5"], "numba"),
+        (["project", "WORKBOOK", *SMALL, "--magnification", "0", "-o", "FOLDER/a.h5"], "magnification"),
+        (["project", "WORKBOOK", "--volume", "none.nii", "-o", "FOLDER/a.h5"], "none.nii: no such file"),
+        (["project", "WORKBOOK", *SMALL[:4], "--size", "900000", "900000", "-o", "FOLDER/a.h5"], "of memory"),
+        (["project", "WORKBOOK", *SMALL, "-o", "WORKBOOK/a.h5"], "cannot be written"),
+        (["export", "none.h5", "-o", "FOLDER/a.npz"], "none.h5: no such file"),
+        (["export", "WORKBOOK", "-o", "FOLDER/a.npz"], "expected a name ending in"),
+    ],
+)
+def test_users_errors_are_one_line_with_status_1_and_leave_nothing(command, said, workbook, tmp_path, capsys):
+    words = [word.replace("WORKBOOK", str(workbook)).replace("FOLDER", str(tmp_path)) for word in command]
+    assert main(words) == 1
+    error = capsys.readouterr().err
+    assert said in error
+    assert error.count("\n") == 1
+    assert not list(tmp_path.iterdir())
+
+
+def test_usage_errors_have_status_2(capsys):
+    assert main(["geometry"]) == 2
+    assert main(["project", "--size", "x"]) == 2
+    assert main(["fly"]) == 2
+    assert all(line.startswith("mphdrr") for line in capsys.readouterr().err.splitlines())
+
+
+@pytest.mark.parametrize(
+    "command", [[], ["geometry"], ["geometry", "check"], ["phantom", "derenzo"], ["project"], ["export"], ["scene"], ["demo"]]
+)
+def test_every_help_has_an_example(command, capsys):
+    assert main([*command, "--help"]) == 0
+    assert "example: mphdrr" in capsys.readouterr().out
+
+
+def test_an_interrupt_leaves_nothing(workbook, tmp_path, monkeypatch, capsys):
+    import mphdrr.core.cli.project as project
+
+    def interrupted(*_, **__):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(project, "project_run", interrupted)
+    assert main(["project", str(workbook), *SMALL, "-o", str(tmp_path / "run.h5")]) == 130
+    assert "cancelled" in capsys.readouterr().err
+    assert not list(tmp_path.iterdir())
+
+
+def test_the_package_is_imported_without_its_heavy_parts():
+    code = (
+        "import sys, mphdrr.core, mphdrr.addon.cli; "
+        "heavy = {'torch', 'numba', 'h5py', 'openpyxl', 'PIL', 'trimesh', 'nibabel', 'bpy'} & set(sys.modules); "
+        "sys.exit(f'imported: {heavy}' if heavy else 0)"
+    )
+    subprocess.run([sys.executable, "-c", code], check=True)

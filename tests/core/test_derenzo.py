@@ -1,0 +1,118 @@
+"""Laws of the Derenzo phantom and its voxels."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+import mphdrr.core as mph
+from mphdrr.core.progress import Cancelled
+
+from .conftest import general_grid
+
+RODS = (8.0, 6.0, 5.0, 4.0, 3.0, 2.0)
+
+
+def total(volume: mph.Volume) -> float:
+    """kBq."""
+    return float(volume.array.sum(dtype=np.float64) * volume.grid.voxel_volume * 1e-3)
+
+
+def test_rods_follow_the_users_rule():
+    phantom = mph.DerenzoPhantom(50.0, (10, 8, 6, 4, 2, 1), 30.0)
+    rods = phantom.rods()
+    for sector, (w, rows) in enumerate([(10, 2), (8, 2), (6, 3), (4, 5), (2, 10), (1, 22)]):
+        mine = rods[rods[:, 0] == sector]
+        # Only one 10 mm row fits with the margins, so that sector drops them.
+        assert len(mine) == rows * (rows + 1) // 2, f"sector of {w} mm rods"
+    # Sector 0 runs along -y, its first row at sqrt(3) w (margin dropped) and its second two rods 2 w apart.
+    first = rods[rods[:, 0] == 0]
+    assert np.allclose(first[0, 1:3], [0, -np.sqrt(3) * 10])
+    assert np.allclose(sorted(first[1:, 1]), [-10, 10])
+    assert np.allclose(first[1:, 2], -2 * np.sqrt(3) * 10)
+    # Sector 2, turned by 120 degrees counter-clockwise from -y, keeps its margin.
+    direction = np.deg2rad(-90 + 120)
+    assert np.allclose(rods[rods[:, 0] == 2][0, 1:3], (5 + np.sqrt(3) * 6) * np.array([np.cos(direction), np.sin(direction)]))
+
+
+def test_rods_do_not_touch():
+    rods = mph.DerenzoPhantom(40.0, RODS, 30.0).rods()
+    gaps = np.linalg.norm(rods[:, None, 1:3] - rods[None, :, 1:3], axis=2) - (rods[:, None, 3] + rods[None, :, 3]) / 2
+    assert gaps[~np.eye(len(rods), dtype=bool)].min() > 0
+
+
+@pytest.mark.parametrize("spacing", [0.5, 1.0, 2.0, 4.0])
+def test_total_activity_does_not_depend_on_grid_or_pose(spacing, rng):
+    phantom = mph.DerenzoPhantom(30.0, (6, 5, 4, 3.5, 3, 2.5), 24.0, activity=120.0)
+    grid = mph.Grid.centered((int(90 / spacing),) * 3, spacing)
+    for pose in (None, mph.euler_pose(*rng.uniform(-3, 3, 3), translation=rng.uniform(-5, 5, 3))):
+        assert total(phantom.voxelize(grid, pose)) == pytest.approx(phantom.total_activity, rel=2e-3)
+
+
+def test_general_affines_hold_the_same_activity(rng):
+    phantom = mph.DerenzoPhantom(20.0, (5, 4, 4, 3, 3, 2), 15.0)
+    volume = phantom.voxelize(general_grid(rng, (70, 110, 60)))
+    assert total(volume) == pytest.approx(phantom.total_activity, rel=2e-3)
+
+
+def test_voxels_hold_the_share_of_their_rods(rng):
+    """Against brute force: many random points of each voxel, tested rod by rod."""
+    phantom = mph.DerenzoPhantom(25.0, (6, 5, 4, 3, 2, 0), 10.0, activity=3.0)
+    pose = mph.euler_pose(0.4, 0.7, -1.1, (1, 2, -3))
+    grid = mph.Grid.centered((24, 22, 20), (1.7, 2.0, 1.5), center=(4, 1, 0))
+    values = phantom.voxelize(grid, pose).array
+    index = np.stack(np.unravel_index(rng.choice(values.size, 1500, replace=False), values.shape), axis=1)
+    points = index[:, None] + rng.uniform(-0.5, 0.5, (1500, 400, 3))
+    to_phantom = np.linalg.inv(pose) @ grid.affine
+    local = points @ to_phantom[:3, :3].T + to_phantom[:3, 3]
+    inside = np.zeros(local.shape[:2], bool)
+    for _, x, y, w in phantom.rods():
+        inside |= np.hypot(local[..., 0] - x, local[..., 1] - y) < w / 2
+    inside &= np.abs(local[..., 2]) < phantom.height / 2
+    difference = values[tuple(index.T)] / 3.0 - inside.mean(axis=1)
+    assert np.abs(difference).max() < 0.15  # the brute force's own noise is 0.025
+    assert abs(difference.mean()) < 2e-3
+
+
+def test_euler_angles_turn_psi_then_theta_then_phi():
+    tilt = mph.euler_pose(theta=np.pi / 2)
+    assert np.allclose(tilt @ [0, 0, 1, 1], [1, 0, 0, 1])  # the axis falls towards +x
+    assert np.allclose(mph.euler_pose(np.pi / 2, np.pi / 2, 0, (0, 0, 5)) @ [0, 0, 1, 1], [0, 1, 5, 1])
+    assert np.allclose(mph.euler_pose(0, np.pi / 2, np.pi / 2) @ [1, 0, 0, 1], [0, 1, 0, 1])
+
+
+def test_voxelizing_can_be_cancelled():
+    def stop(done: int, total: int) -> None:
+        raise Cancelled
+
+    with pytest.raises(Cancelled):
+        mph.DerenzoPhantom(40.0, RODS, 30.0).voxelize(mph.Grid.centered(32, 3.0), progress=stop)
+
+
+def test_phantom_outside_the_grid_leaves_it_empty():
+    volume = mph.DerenzoPhantom(10.0, RODS[3:] + (0, 0, 0), 5.0).voxelize(mph.Grid.centered(8, 1.0, center=(500, 0, 0)))
+    assert not volume.array.any()
+
+
+@pytest.mark.parametrize(
+    ("wrong", "message"),
+    [
+        ({"radius": 0}, "Derenzo radius: expected more than 0 mm"),
+        ({"radius": np.nan}, "Derenzo radius"),
+        ({"rod_diameters": (1, 2, 3)}, "Derenzo rod diameters: expected shape 6, got 3"),
+        ({"rod_diameters": (1, 2, 3, 4, 5, -6)}, "expected 0 or more"),
+        ({"rod_diameters": (50,) * 6}, "no rod"),
+        ({"height": -1}, "Derenzo height"),
+        ({"activity": "hot"}, "Derenzo activity"),
+    ],
+)
+def test_derenzo_refuses_what_cannot_be(wrong, message):
+    with pytest.raises(mph.InputError, match=message):
+        mph.DerenzoPhantom(**{"radius": 40.0, "rod_diameters": RODS, "height": 30.0} | wrong)
+
+
+def test_a_grid_that_cannot_fit_into_memory_is_refused_in_one_line():
+    phantom = mph.DerenzoPhantom(40.0, RODS, 30.0)
+    with pytest.raises(mph.InputError, match="a volume of 100000 x 100000 x 100000 voxels needs .* GiB of memory") as error:
+        phantom.voxelize(mph.Grid.centered(100_000, 0.001))
+    assert "\n" not in str(error.value)

@@ -1,0 +1,206 @@
+"""Volumes and runs in files: round trips, damage, and nothing half-written."""
+
+from __future__ import annotations
+
+import os
+
+import numpy as np
+import pytest
+
+import mphdrr.core as mph
+from mphdrr.core.files import replacing
+from mphdrr.core.mosaic import write_png
+from mphdrr.core.run import ProjectionRun
+
+from .conftest import general_grid
+
+
+@pytest.fixture
+def volume(rng):
+    grid = general_grid(rng, (5, 6, 7))
+    return mph.Volume(rng.normal(size=grid.shape), grid, "mu")
+
+
+@pytest.fixture
+def run(system, volume, rng):
+    views = system.views(shape=(4, 6), detector="real", pitch=(0.5, 0.7))
+    return ProjectionRun(
+        projections=rng.uniform(size=(len(system), 4, 6)).astype(np.float32),
+        system=system,
+        views=views,
+        volume=volume,
+        settings={"detector": "real", "angles": [1.5, 2], "phantom": None},
+        seed=7,
+        workbook="scanner.xlsx",
+        workbook_sha256="ab" * 32,
+    )
+
+
+@pytest.mark.parametrize("name", ["v.npz", "v.nii", "v.nii.gz", "V.NII.GZ"])
+def test_volumes_come_back(tmp_path, volume, name):
+    path = tmp_path / name
+    mph.write_volume(volume, path)
+    back = mph.read_volume(path)
+    assert np.array_equal(back.array, volume.array)
+    assert back.quantity == "mu"
+    # NIfTI keeps its affine in float32.
+    assert np.allclose(back.grid.affine, volume.grid.affine, rtol=0, atol=0 if name == "v.npz" else 1e-5)
+    assert [p.name for p in tmp_path.iterdir()] == [name]
+
+
+def test_the_users_quantity_wins(tmp_path, volume):
+    mph.write_volume(volume, tmp_path / "v.nii.gz")
+    assert mph.read_volume(tmp_path / "v.nii.gz", quantity="activity").quantity == "activity"
+
+
+@pytest.mark.parametrize("name", ["v.nii.gz", "v.npz", "v.nii"])
+def test_damaged_volumes_are_refused_in_one_line(tmp_path, volume, name):
+    path = tmp_path / name
+    mph.write_volume(volume, path)
+    whole = path.read_bytes()
+    for damaged in (whole[: len(whole) // 2], b"", b"hello " * 100):
+        path.write_bytes(damaged)
+        with pytest.raises(mph.InputError) as error:
+            mph.read_volume(path)
+        assert str(path) in str(error.value)
+        assert "\n" not in str(error.value)
+
+
+def test_volumes_of_unknown_kind_or_place_are_refused(tmp_path, volume):
+    with pytest.raises(mph.InputError, match="no such file"):
+        mph.read_volume(tmp_path / "none.nii")
+    with pytest.raises(mph.InputError, match="expected a name ending in"):
+        mph.write_volume(volume, tmp_path / "v.stl")
+    with pytest.raises(mph.InputError, match="no such folder"):
+        mph.write_volume(volume, tmp_path / "none" / "v.nii")
+    assert not list(tmp_path.iterdir())
+
+
+def test_four_dimensional_images_are_refused(tmp_path):
+    import nibabel
+
+    nibabel.save(nibabel.Nifti1Image(np.zeros((3, 3, 3, 2), np.float32), np.eye(4)), tmp_path / "v.nii")
+    with pytest.raises(mph.InputError, match="expected a 3-D image, got shape 3 x 3 x 3 x 2"):
+        mph.read_volume(tmp_path / "v.nii")
+
+
+def test_nifti_in_metres_becomes_millimetres(tmp_path):
+    import nibabel
+
+    image = nibabel.Nifti1Image(np.zeros((3, 3, 3), np.int16), np.diag([0.002, 0.002, 0.003, 1]))
+    image.header.set_xyzt_units("meter")
+    nibabel.save(image, tmp_path / "v.nii")
+    volume = mph.read_volume(tmp_path / "v.nii")
+    assert np.allclose(volume.grid.spacing, [2, 2, 3])
+    assert volume.quantity == "hu"
+
+
+@pytest.mark.parametrize("suffix", [".h5", ".npz", ".pt"])
+def test_runs_come_back_whole(tmp_path, run, suffix):
+    if suffix == ".pt":
+        pytest.importorskip("torch", reason="torch is not installed")
+    path = tmp_path / f"run{suffix}"
+    mph.write_run(run, path)
+    back = mph.read_run(path)
+    assert np.array_equal(back.projections, run.projections)
+    assert np.array_equal(back.volume.array, run.volume.array)
+    assert back.volume.grid == run.volume.grid
+    assert back.volume.quantity == "mu"
+    for name in ("centers", "numbers", "pinhole_diameter", "collimator_length", "detector_side", "roi_radius"):
+        assert np.array_equal(getattr(back.system, name), getattr(run.system, name)), name
+    assert np.array_equal(back.views.projection_matrices(), run.views.projection_matrices())
+    assert back.settings == run.settings
+    assert (back.seed, back.unit, back.workbook, back.workbook_sha256) == (7, "1/mm mm", "scanner.xlsx", "ab" * 32)
+    assert back.versions == run.versions
+
+
+def test_pt_without_torch_says_so(tmp_path, run):
+    try:
+        import torch  # noqa: F401
+    except ImportError:
+        with pytest.raises(mph.InputError, match="need torch"):
+            mph.write_run(run, tmp_path / "run.pt")
+        assert not list(tmp_path.iterdir())
+    else:
+        pytest.skip("torch is installed")
+
+
+def test_hdf5_says_units_and_conventions(tmp_path, run):
+    import h5py
+
+    mph.write_run(run, tmp_path / "run.h5")
+    with h5py.File(tmp_path / "run.h5") as file:
+        assert file["projections"].attrs["unit"] == "1/mm mm"
+        assert file["geometry/collimator_length"].attrs["unit"] == "mm"
+        assert "right-handed" in file.attrs["conventions"]
+        assert file.attrs["seed"] == 7
+        everything: list[str] = []
+        file.visit(everything.append)
+        assert all("unit" in file[name].attrs for name in everything if isinstance(file[name], h5py.Dataset))
+
+
+def test_intrinsics_and_poses_reproject_points(run, rng):
+    points = np.c_[rng.uniform(-50, 50, (20, 3)), np.ones(20)]
+    local = np.linalg.inv(run.system.poses()) @ points.T
+    by_intrinsics = run.intrinsics() @ local[:, :3]
+    by_matrix = run.views.projection_matrices() @ points.T
+    assert np.allclose(by_intrinsics[:, :2] / by_intrinsics[:, 2:], by_matrix[:, :2] / by_matrix[:, 2:])
+    assert np.allclose(run.intrinsics()[:, 2], [0, 0, 1])
+
+
+@pytest.mark.parametrize("suffix", [".h5", ".npz"])
+def test_damaged_runs_are_refused_in_one_line(tmp_path, run, suffix):
+    path = tmp_path / f"run{suffix}"
+    mph.write_run(run, path)
+    whole = path.read_bytes()
+    for damaged in (whole[: len(whole) // 3], b"", b"not a run" * 50):
+        path.write_bytes(damaged)
+        with pytest.raises(mph.InputError) as error:
+            mph.read_run(path)
+        assert str(path) in str(error.value)
+        assert "\n" not in str(error.value)
+
+
+def test_other_hdf5_files_are_refused(tmp_path):
+    import h5py
+
+    with h5py.File(tmp_path / "a.h5", "w") as file:
+        file["x"] = 1
+    with pytest.raises(mph.InputError, match="expected a file marked 'mphDRR run'"):
+        mph.read_run(tmp_path / "a.h5")
+
+
+def test_a_failed_write_leaves_the_old_file_and_nothing_else(tmp_path):
+    path = tmp_path / "a.txt"
+    path.write_text("old")
+
+    def fail() -> None:
+        with replacing(path) as temporary:
+            temporary.write_text("half of the new")
+            raise RuntimeError
+
+    with pytest.raises(RuntimeError):
+        fail()
+    assert path.read_text() == "old"
+    assert list(tmp_path.iterdir()) == [path]
+
+
+@pytest.mark.skipif(os.name == "nt" or (hasattr(os, "geteuid") and os.geteuid() == 0), reason="root may write everywhere")
+def test_an_unwritable_folder_is_refused(tmp_path, run):
+    folder = tmp_path / "locked"
+    folder.mkdir(mode=0o500)
+    with pytest.raises(mph.InputError, match="cannot be written"):
+        mph.write_run(run, folder / "run.h5")
+
+
+def test_pictures_are_as_the_pinhole_sees_them(tmp_path):
+    images = np.zeros((3, 4, 5), np.float32)
+    images[1, 3, 0] = 1  # top row (+v), first column (-u: to the right as seen from the pinhole)
+    sheet = mph.mosaic(images, columns=2)
+    assert sheet.shape == (8, 10)
+    assert sheet[0, 9] == 1
+    assert sheet.sum() == 1
+    write_png(sheet, tmp_path / "m.png")
+    from PIL import Image
+
+    assert np.array_equal(np.asarray(Image.open(tmp_path / "m.png")), (sheet * 255).astype(np.uint8))

@@ -1,0 +1,238 @@
+"""What the projector accepts, refuses and returns; progress, memory, choice of the backend, the kernels' cache."""
+
+from __future__ import annotations
+
+import importlib
+import importlib.util
+import os
+import subprocess
+import sys
+import warnings
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import mphdrr.core.memory
+from mphdrr.core.errors import InputError, InputWarning
+from mphdrr.core.grid import Grid
+from mphdrr.core.progress import Cancelled
+from mphdrr.core.projector import Projector, Transmission, backends, trace_rays
+from mphdrr.core.views import Views
+from mphdrr.core.volume import Volume
+
+needs_numba = pytest.mark.skipif(importlib.util.find_spec("numba") is None, reason="numba is not installed")
+
+GRID = Grid.centered((5, 4, 3), 1.0)
+VIEWS = Views(
+    [[0, 0, -20], [0, -20, 0]], [[0, 0, 20], [0, 20, 0]], [[1, 0, 0], [1, 0, 0]], [[0, 1, 0], [0, 0, 1]], (6, 7)
+)
+ONES = np.ones(GRID.shape, np.float32)
+
+
+def refused(call, *words):
+    with pytest.raises(InputError) as error:
+        call()
+    text = str(error.value)
+    assert "\n" not in text
+    for word in words:
+        assert word in text, text
+
+
+def test_types_out():
+    reference = Projector(GRID, VIEWS, model=Transmission(), backend="numpy")
+    assert reference(ONES).dtype == np.float64 and reference.T(reference(ONES)).dtype == np.float64
+    A = Projector(GRID, VIEWS)
+    for volume in (ONES, ONES.astype(float), ONES.astype(int), ONES > 0, np.asfortranarray(ONES), Volume(ONES, GRID)):
+        y = A(volume)
+        assert y.dtype == np.float32 and y.shape == (2, 6, 7)
+        np.testing.assert_allclose(y, reference(ONES), rtol=1e-5)
+    assert A.T(y).dtype == np.float32 and A.T(y).shape == GRID.shape
+    assert trace_rays(Volume(ONES, GRID), [0, 0, -9], [0, 0, 9]).dtype == np.float32
+    assert trace_rays(Volume(ONES, GRID), [0, 0, -9], np.zeros((0, 3))).shape == (0,)
+
+
+def test_inputs_are_not_changed():
+    A = Projector(GRID, VIEWS)
+    x = ONES.copy()
+    y = A(x)
+    kept = y.copy()
+    A.T(y)
+    np.testing.assert_array_equal(x, ONES)
+    np.testing.assert_array_equal(y, kept)
+
+
+def test_no_views_give_no_images():
+    none = Views(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros((0, 3)), np.zeros((0, 3)), (6, 7))
+    A = Projector(GRID, none)
+    assert A(ONES).shape == (0, 6, 7)
+    assert not A.T(A(ONES)).any()
+
+
+def test_bad_input_is_one_clear_line():
+    A = Projector(GRID, VIEWS)
+    holed = ONES.copy()
+    holed[2, 1, 0] = np.nan
+    refused(lambda: A(holed), "volume", "nan", "(2, 1, 0)")
+    refused(lambda: A(np.ones((4, 4, 3))), "volume", "5 x 4 x 3", "4 x 4 x 3")
+    refused(lambda: A(ONES * 1j), "volume", "real")
+    refused(lambda: A("volume"), "volume", "real")
+    refused(lambda: A(np.full(GRID.shape, 1e300)), "volume", "finite")
+    images = np.zeros((2, 6, 7))
+    images[1, 2, 3] = np.inf
+    refused(lambda: A.T(images), "images", "inf", "(1, 2, 3)")
+    refused(lambda: A.T(ONES), "images", "2 x 6 x 7")
+    refused(lambda: A(Volume(ONES, Grid.centered((5, 4, 3), 2.0))), "grid", "2 x 2 x 2 mm", "1 x 1 x 1 mm")
+    refused(lambda: A(Volume(ONES, Grid.centered((5, 4, 3), 1.0, (0, 0, 1)))), "grid")
+    refused(lambda: Projector(VIEWS, GRID), "grid", "Views")
+    refused(lambda: Projector(GRID, VIEWS, model="transmission"), "model", "Transmission")
+    for bad in (0, -1, 1.5, True, "two"):
+        refused(lambda bad=bad: Projector(GRID, VIEWS, threads=bad), "threads")
+    volume = Volume(ONES, GRID)
+    refused(lambda: trace_rays(ONES, [0, 0, 0], [1, 1, 1]), "Volume")
+    refused(lambda: trace_rays(volume, [0, 0, 0], [[1, 1, np.nan]]), "targets", "(0, 2)")
+    refused(lambda: trace_rays(volume, np.zeros((2, 3)), np.zeros((4, 3))), "2 sources", "4 targets")
+    refused(lambda: trace_rays(volume, np.zeros((2, 2)), np.zeros((2, 3))), "sources", "any x 3")
+
+
+def test_volume_of_the_same_grid_read_from_a_file_is_accepted():
+    affine = GRID.affine.copy()
+    affine[:3] *= 1 + 1e-7
+    Projector(GRID, VIEWS)(Volume(ONES, Grid(GRID.shape, affine)))
+
+
+def test_unknown_backend_lists_the_choices():
+    refused(lambda: Projector(GRID, VIEWS, backend="gpu"), "'gpu'", "auto", "numba", "torch", "numpy")
+    refused(lambda: trace_rays(Volume(ONES, GRID), [0, 0, 0], [1, 1, 1], "gpu"), "'gpu'", "numba")
+
+
+def without(monkeypatch, *missing):
+    def load(name):
+        if name in missing:
+            raise ModuleNotFoundError(f"No module named {name!r}")
+        return importlib.import_module(f"mphdrr.core.projector.siddon_{name}")
+
+    monkeypatch.setattr(backends, "load", load)
+    backends._warn_slower.cache_clear()
+
+
+def test_missing_library_names_the_package(monkeypatch):
+    without(monkeypatch, "numba", "torch")
+    refused(lambda: Projector(GRID, VIEWS, backend="numba"), "pip install numba")
+    refused(lambda: Projector(GRID, VIEWS, backend="torch"), "pip install torch")
+
+
+def test_auto_falls_back_and_says_so_once(monkeypatch):
+    without(monkeypatch, "numba", "torch")
+    with pytest.warns(InputWarning, match="pip install numba"):
+        A = Projector(GRID, VIEWS)
+    assert A.backend == "numpy" and A(ONES).dtype == np.float32 and A.T(A(ONES)).dtype == np.float32
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        Projector(GRID, VIEWS)
+    backends._warn_slower.cache_clear()
+
+
+@needs_numba
+def test_auto_is_numba():
+    assert Projector(GRID, VIEWS).backend == "numba"
+
+
+def test_progress_counts_the_views_and_can_cancel():
+    A = Projector(GRID, VIEWS)
+    for operator, x in ((A, ONES), (A.T, np.ones(A.shape_out))):
+        calls = []
+        operator(x, progress=lambda done, total, calls=calls: calls.append((done, total)))
+        assert calls == [(0, 2), (1, 2), (2, 2)]
+
+        def cancel(done, total):
+            if done == 1:
+                raise Cancelled
+
+        with pytest.raises(Cancelled):
+            operator(x, progress=cancel)
+        assert operator(x) is not None
+    images = A.iter_views(ONES)
+    next(images)
+    images.close()
+    with pytest.raises(InputError):
+        A.iter_views(ONES[1:])  # at once, not at the first image
+
+
+def test_what_cannot_fit_is_refused_before_it_starts(monkeypatch):
+    monkeypatch.setattr(mphdrr.core.memory, "available", lambda: 200)
+    A = Projector(GRID, VIEWS, threads=1)
+    refused(lambda: A(ONES), "2 images of 6 x 7", "memory")
+    refused(lambda: A.T(np.ones(A.shape_out)), "5 x 4 x 3", "memory")
+
+
+def run_python(code, **environment):
+    return subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, env={**os.environ, **environment}, timeout=120
+    )
+
+
+def test_import_loads_neither_numba_nor_torch():
+    done = run_python("import sys, mphdrr.core.projector; print([m for m in ('numba', 'torch') if m in sys.modules])")
+    assert done.stdout.strip() == "[]", done.stderr
+
+
+PROJECT = """
+import sys, numpy as np
+from mphdrr.core.grid import Grid
+from mphdrr.core.projector import trace_rays
+from mphdrr.core.volume import Volume
+{before}
+grid = Grid.centered((2, 2, 2), 1.0)
+print(float(trace_rays(Volume(np.ones(grid.shape), grid), [0, 0, -9], [0, 0, 9], "numba")[0]))
+from numba import config
+from mphdrr.core.projector import siddon_numba
+print(repr(config.CACHE_DIR), sum(siddon_numba._forward_kernel().stats.cache_hits.values()))
+"""
+
+
+@needs_numba
+@pytest.mark.skipif(sys.platform != "linux", reason="the folder is set by XDG_CACHE_HOME on Linux only")
+def test_kernels_are_cached_in_the_users_folder(tmp_path):
+    environment = {"XDG_CACHE_HOME": str(tmp_path), "NUMBA_CACHE_DIR": ""}
+    for hits in (0, 1):
+        done = run_python(PROJECT.format(before=""), **environment)
+        assert done.stdout.split("\n")[:2] == ["2.0", f"'' {hits}"], done.stderr
+        assert done.stderr == ""
+    assert list((tmp_path / "mphdrr").rglob("*_integrate*.nbc"))
+
+
+@needs_numba
+def test_users_own_cache_folder_is_kept(tmp_path):
+    done = run_python(PROJECT.format(before=""), NUMBA_CACHE_DIR=str(tmp_path))
+    assert done.stdout.startswith("2.0"), done.stderr
+    assert list(tmp_path.rglob("*_integrate*.nbc"))
+
+
+@needs_numba
+def test_cache_that_cannot_be_written_or_read_costs_only_time(tmp_path):
+    full = """
+import numba.core.caching
+def save(*anything): raise OSError(28, "No space left on device")
+numba.core.caching.IndexDataCacheFile.save = save
+"""
+    done = run_python(PROJECT.format(before=full), NUMBA_CACHE_DIR=str(tmp_path))
+    assert done.stdout.startswith("2.0") and done.stderr == ""
+
+    run_python(PROJECT.format(before=""), NUMBA_CACHE_DIR=str(tmp_path))
+    for file in tmp_path.rglob("*.nb*"):
+        file.write_bytes(b"damaged")
+    done = run_python(PROJECT.format(before=""), NUMBA_CACHE_DIR=str(tmp_path))
+    assert done.stdout.startswith("2.0") and done.stderr == ""
+
+    file = tmp_path / "file"
+    file.write_text("")
+    nowhere = {"NUMBA_CACHE_DIR": "", "XDG_CACHE_HOME": str(file), "HOME": str(file)}
+    done = run_python(PROJECT.format(before=""), **nowhere)
+    assert done.stdout.startswith("2.0") and done.stderr == ""
+
+
+def test_sources_of_kernels_are_one_file():
+    """numba invalidates a cached kernel by its own file alone (see compiling.py)."""
+    text = Path(backends.__file__).with_name("siddon_numba.py").read_text()
+    assert text.count("from .") == 2

@@ -1,0 +1,106 @@
+"""Gradients through the projector, for every backend."""
+
+from __future__ import annotations
+
+import importlib.util
+
+import numpy as np
+import pytest
+
+torch = pytest.importorskip("torch", reason="torch is not installed")
+
+from mphdrr.core.errors import InputError  # noqa: E402
+from mphdrr.core.grid import Grid  # noqa: E402
+from mphdrr.core.projector import Projector  # noqa: E402
+from mphdrr.core.views import Views  # noqa: E402
+
+BACKENDS = [
+    pytest.param(
+        name, marks=pytest.mark.skipif(importlib.util.find_spec(name) is None, reason=f"{name} is not installed")
+    )
+    for name in ("numpy", "torch", "numba")
+]
+GRID = Grid.centered((5, 4, 3), 1.0)
+VIEWS = Views(
+    [[0.1, 0.3, -20], [2, -20, 1]], [[0, 0, 20], [0, 20, 0]], [[1, 0, 0], [1, 0, 0]], [[0, 1, 0], [0, 0, 1]], (4, 5)
+)
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_gradient_is_the_adjoint(backend):
+    A = Projector(GRID, VIEWS, backend=backend)
+    x = torch.rand(GRID.shape, requires_grad=True)
+    weights = torch.rand(A.shape_out)
+    (A(x) * weights).sum().backward()
+    assert x.grad.dtype == torch.float32
+    np.testing.assert_allclose(x.grad.numpy(), A.T(weights.numpy()), rtol=1e-5, atol=1e-6)
+
+    y = torch.rand(A.shape_out, requires_grad=True)
+    weights = torch.rand(GRID.shape)
+    (A.T(y) * weights).sum().backward()
+    np.testing.assert_allclose(y.grad.numpy(), A(weights.numpy()), rtol=1e-5, atol=1e-6)
+
+
+@pytest.mark.parametrize("backend", ["numpy", "torch"])
+def test_gradcheck_in_float64(backend):
+    A = Projector(GRID, VIEWS, backend=backend)
+    x = torch.rand(GRID.shape, dtype=torch.float64, requires_grad=True)
+    assert A(x).dtype == torch.float64
+    assert torch.autograd.gradcheck(lambda x: A(x) ** 2, (x,), check_forward_ad=True)
+    assert torch.autograd.gradgradcheck(lambda x: A(x) ** 2, (x,))
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_tensor_in_tensor_out(backend):
+    A = Projector(GRID, VIEWS, backend=backend)
+    x = torch.rand(GRID.shape)
+    y = A(x)
+    assert (
+        isinstance(y, torch.Tensor)
+        and not y.requires_grad
+        and y.dtype == (torch.float64 if backend == "numpy" else torch.float32)
+    )
+    assert isinstance(A.T(y), torch.Tensor) and isinstance(next(A.iter_views(x)), torch.Tensor)
+    np.testing.assert_allclose(y.numpy(), A(x.numpy()), rtol=1e-6)
+    np.testing.assert_allclose(A(x.permute(2, 1, 0).contiguous().permute(2, 1, 0)), y, rtol=1e-6)
+    for other in (torch.float16, torch.bfloat16, torch.int32):
+        assert torch.is_floating_point(A(torch.ones(GRID.shape, dtype=other)))
+
+
+def test_reconstruction_by_gradient_descent():
+    A = Projector(GRID, VIEWS)
+    truth = torch.rand(GRID.shape)
+    data = A(truth)
+    x = torch.zeros(GRID.shape, requires_grad=True)
+    optimizer = torch.optim.Adam([x], lr=0.05)
+    losses = []
+    for _ in range(200):
+        optimizer.zero_grad()
+        loss = ((A(x) - data) ** 2).mean()
+        loss.backward()
+        optimizer.step()
+        losses.append(loss.item())
+    assert losses[-1] < 1e-3 * losses[0]
+
+
+def test_gradient_through_a_bad_loss_is_not_refused():
+    """A loss that turns to NaN is the training loop's to notice; it must not raise inside backward."""
+    A = Projector(GRID, VIEWS)
+    x = torch.zeros(GRID.shape, requires_grad=True)
+    (A(x) * float("nan")).sum().backward()
+    assert torch.isnan(x.grad).any()
+
+
+def test_bad_tensors_are_one_clear_line():
+    A = Projector(GRID, VIEWS)
+    x = torch.ones(GRID.shape)
+    x[1, 2, 0] = float("inf")
+    for bad, word in (
+        (x, "(1, 2, 0)"),
+        (torch.ones(3, 3, 3), "5 x 4 x 3"),
+        (torch.ones(GRID.shape, dtype=torch.complex64), "complex64"),
+        (torch.ones(GRID.shape).to_sparse(), "sparse"),
+    ):
+        with pytest.raises(InputError) as error:
+            A(bad)
+        assert word in str(error.value) and "\n" not in str(error.value)

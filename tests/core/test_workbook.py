@@ -1,0 +1,890 @@
+"""The workbook reader: what it reads, finds, computes, warns of and refuses."""
+
+from __future__ import annotations
+
+import copy
+import datetime
+import hashlib
+import pickle
+import re
+import time
+import warnings
+import zipfile
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import openpyxl
+import pytest
+from openpyxl.workbook import Workbook
+from openpyxl.worksheet.worksheet import Worksheet
+
+from mphdrr.core.design import collimator_length
+from mphdrr.core.errors import InputError, InputWarning
+from mphdrr.core.workbook import read_system
+from mphdrr.core.workbook.checks import tolerance
+from mphdrr.core.workbook.formulas import CellError, NotComputable, evaluate
+from mphdrr.core.workbook.headings import quantity_of
+
+try:
+    from hypothesis import HealthCheck, given, settings
+    from hypothesis import strategies as st
+except ImportError:  # the property tests skip
+    st = None
+
+SYMBOLS = ["", "x1", "y1", "z1", "b", "S", "l", "l + b+Td", "x2", "y2", "z2", "", "", ""]
+DESCRIPTIONS = [
+    "Definitions",
+    "x coordinate value at center of hole",
+    "y coordinate value at center of hole",
+    "z coordinate value at center of hole",
+    "distance from center of hole to center of heart",
+    "3D slope",
+    "length of collimator",
+    "",
+    "x coordinate value at end of detector",
+    "y coordinate value at end of detector",
+    "z coordinate value at end of detector",
+    "pinhole range",
+    "pinhole azimuth (radians)",
+    "pinhole elevation (radians)",
+]
+FORMULAS = {
+    5: "=SQRT(SUMSQ(B{0},C{0},D{0}))",
+    6: "=E{0}/B{0}",
+    7: "=(Main!D{1}-Main!B{1})*(E{0}^2-Main!C{1}^2)/(E{0}*Main!B{1}"
+    "+2*Main!C{1}*SQRT(E{0}^2-Main!C{1}^2+Main!B{1}^2/4))",
+    8: "=E{0}+G{0}+Main!E{1}",
+    9: "=B{0}*H{0}/E{0}",
+    10: "=C{0}*H{0}/E{0}",
+    11: "=D{0}*H{0}/E{0}",
+    12: "=SQRT(SUMSQ(B{0},C{0}))",
+    13: "=(ATAN2(B{0},C{0}))",
+    14: "=(ATAN2(L{0},D{0}))",
+}
+CENTERS = np.array([[277.0, 70.3, -70.0], [155.0, 158.4, -70.9], [-63.1, -245.8, 70.4], [-10.5, 190.25, 12.0]])
+DIMENSIONS = {"d": 2.3, "R": 75.0, "Ld": 50.0, "Td": 10.0}
+
+
+def plain(centers: np.ndarray = CENTERS) -> Workbook:
+    """A workbook in the users' layout, its formulas without values: modules in rows 3, 4, ..."""
+    book = Workbook()
+    main, coordinates = book.active, book.create_sheet("Coordinates")
+    main.title = "Main"
+    main.append(["", "d", "R", "Ld", "Td"])
+    main.append(
+        [
+            "Definitions",
+            "diameter of pinhole",
+            "radius of spherical region of interest",
+            "length of side of detector crystal",
+            "thickness of detector crystal",
+        ]
+    )
+    coordinates.append(SYMBOLS)
+    coordinates.append(DESCRIPTIONS)
+    for number, center in enumerate(centers, start=1):
+        main.append([number, *DIMENSIONS.values()])
+        coordinates.append([number, *map(float, center)])
+        for column, formula in FORMULAS.items():
+            coordinates.cell(number + 2, column, formula.format(number + 2, number + 2))
+    return book
+
+
+def saved(book: Workbook, folder: Path, name: str = "scanner.xlsx") -> Path:
+    path = folder / name
+    book.save(path)
+    return path
+
+
+def read_edited(folder: Path, edit: Callable[[Worksheet, Worksheet], object]):
+    """What is read from the plain workbook after `edit(main, coordinates)`."""
+    book = plain()
+    edit(book["Main"], book["Coordinates"])
+    return read_system(saved(book, folder))
+
+
+def assert_plain(system, n: int = len(CENTERS)) -> None:
+    np.testing.assert_array_equal(system.centers, CENTERS[:n])
+    for name, value in zip(
+        ("pinhole_diameter", "roi_radius", "detector_side", "detector_thickness"), DIMENSIONS.values(), strict=True
+    ):
+        np.testing.assert_array_equal(getattr(system, name), np.full(n, value))
+    expected = collimator_length(np.linalg.norm(CENTERS[:n], axis=1), 2.3, 50, 75)
+    np.testing.assert_allclose(system.collimator_length, expected, rtol=1e-12)
+
+
+@pytest.fixture(autouse=True)
+def warnings_are_errors():
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        yield
+
+
+# The real workbook
+
+
+def test_real_workbook_has_its_80_modules(workbook):
+    system = read_system(workbook)
+    assert len(system) == 80
+    np.testing.assert_array_equal(system.numbers, np.arange(1, 81))
+    np.testing.assert_array_equal(system.centers[0], [277.002, 70.37124, -70.0363])
+    np.testing.assert_array_equal(system.centers[79], [-63.1068, -245.785, 70.4085])
+    np.testing.assert_allclose(
+        system.collimator_length[[0, 79]], [89.070206162965, 79.0107205459795], rtol=0, atol=1e-10
+    )
+    formula = collimator_length(system.pinhole_distance, 2.3, 50, 75)
+    np.testing.assert_allclose(system.collimator_length, formula, rtol=0, atol=1e-8)
+    for values, expected in (
+        (system.pinhole_diameter, 2.3),
+        (system.roi_radius, 75),
+        (system.detector_side, 50),
+        (system.detector_thickness, 10),
+    ):
+        np.testing.assert_array_equal(values, expected)
+
+
+def test_real_workbook_is_read_in_less_than_half_a_second(workbook):
+    read_system(workbook)
+    start = time.perf_counter()
+    read_system(workbook)
+    assert time.perf_counter() - start < 0.5
+
+
+def test_stored_values_make_no_difference(workbook, tmp_path):
+    """openpyxl drops the stored values of formulas when it saves."""
+    stripped = openpyxl.load_workbook(workbook)
+    stripped.save(tmp_path / "stripped.xlsx")
+    with_values, without = read_system(workbook), read_system(tmp_path / "stripped.xlsx")
+    np.testing.assert_array_equal(without.centers, with_values.centers)
+    np.testing.assert_allclose(without.collimator_length, with_values.collimator_length, rtol=0, atol=1e-10)
+
+
+def test_source_names_file_and_cells(workbook):
+    source = read_system(workbook).source
+    assert source.path == workbook.absolute()
+    assert source.sha256 == hashlib.sha256(workbook.read_bytes()).hexdigest()
+    assert (source.coordinates_sheet, source.dimensions_sheet) == ("Coordinates", "Main")
+    cells = openpyxl.load_workbook(workbook, data_only=True)
+    system = read_system(workbook)
+    for quantity, values in {
+        "number": system.numbers,
+        "x1": system.centers[:, 0],
+        "l": system.collimator_length,
+        "Td": system.detector_thickness,
+    }.items():
+        for number, value in zip(system.numbers, values, strict=True):
+            sheet, cell = source.cell(quantity, int(number))
+            assert cells[sheet][cell].value == value
+    assert source.cell("Ld", 80) == ("Main", "S82")
+    assert pickle.loads(pickle.dumps(source)) == copy.deepcopy(source) == source
+
+
+def test_reading_leaves_file_untouched_and_open_to_others(workbook, tmp_path):
+    path = tmp_path / "scanner.xlsx"
+    path.write_bytes(workbook.read_bytes())
+    (tmp_path / "~$scanner.xlsx").write_bytes(b"\x06Someone" + b" " * 100)  # Excel has it open
+    before = path.stat().st_mtime_ns
+    read_system(path)
+    assert path.stat().st_mtime_ns == before
+    path.rename(tmp_path / "other.xlsx")  # on Windows only without open handles
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["other.xlsx", "~$scanner.xlsx"]
+
+
+# What may differ from file to file
+
+
+def _insert_columns(main: Worksheet, coordinates: Worksheet) -> None:
+    _typed(main, coordinates)  # openpyxl does not move references
+    coordinates.insert_cols(3, 2)
+    coordinates["C2"] = "serial of the crystal"
+    coordinates["C3"] = "SN-0001"
+    main.insert_cols(2, 3)
+
+
+def _typed(main: Worksheet, coordinates: Worksheet) -> None:
+    for row in range(3, coordinates.max_row + 1):
+        center = np.array([coordinates.cell(row, column).value for column in (2, 3, 4)])
+        b = float(np.linalg.norm(center))
+        planar = float(np.hypot(*center[:2]))
+        length = float(collimator_length(b, 2.3, 50, 75))
+        end = b + length + 10
+        derived = [b, b / center[0], length, end, *(center * end / b), planar]
+        derived += [np.arctan2(center[1], center[0]), np.arctan2(center[2], planar)]
+        for column, value in enumerate(derived, start=5):
+            coordinates.cell(row, column, float(value))
+
+
+def _reversed_columns(main: Worksheet, coordinates: Worksheet) -> None:
+    _typed(main, coordinates)
+    for sheet in (main, coordinates):
+        rows = [row[::-1] for row in sheet.iter_rows(values_only=True)]
+        for i, row in enumerate(rows, start=1):
+            for j, value in enumerate(row, start=1):
+                sheet.cell(i, j, value).value = value
+
+
+def _moved_down(main: Worksheet, coordinates: Worksheet) -> None:
+    _typed(main, coordinates)
+    coordinates.insert_rows(1, 14)
+    coordinates["A1"] = "Geometry of the scanner: all about each collimator, its length and the detector behind it"
+    coordinates["B3"] = "length of collimator: see below"
+    main.insert_rows(1, 6)
+    main["A1"] = "R"
+
+
+def _no_symbols(main: Worksheet, coordinates: Worksheet) -> None:
+    for sheet in (main, coordinates):
+        for cell in sheet[1]:
+            cell.value = None
+
+
+def _no_descriptions(main: Worksheet, coordinates: Worksheet) -> None:
+    for sheet in (main, coordinates):
+        for cell in sheet[2]:
+            cell.value = None
+
+
+def _odd_spelling(main: Worksheet, coordinates: Worksheet) -> None:
+    coordinates["B1"], coordinates["C1"], coordinates["D1"] = " X1 ", "y 1", "z₁ (mm)"
+    coordinates["B2"] = "X  Coordinate value\nat CENTRE of hole"
+    coordinates["H1"] = "'l + b+Td'"
+    main["D1"], main["B2"] = "LD [mm]", "Pinhole diameter (mm)"
+
+
+def _other_names(main: Worksheet, coordinates: Worksheet) -> None:
+    _typed(main, coordinates)
+    main.title, coordinates.title = "Größen & more", "Lage's"
+
+
+def _one_sheet(main: Worksheet, coordinates: Worksheet) -> None:
+    _typed(main, coordinates)
+    for i, row in enumerate(main.iter_rows(min_col=2, values_only=True), start=1):
+        for j, value in enumerate(row, start=20):
+            coordinates.cell(i, j, value)
+    main.parent.remove(main)
+
+
+def _single_value_row(main: Worksheet, coordinates: Worksheet) -> None:
+    _typed(main, coordinates)
+    main.delete_rows(4, 10)
+
+
+def _single_values_in_numbered_rows(main: Worksheet, coordinates: Worksheet) -> None:
+    _typed(main, coordinates)
+    for row in range(4, 7):
+        main.cell(row, 3).value = main.cell(row, 4).value = None
+
+
+def _sheets_beside(main: Worksheet, coordinates: Worksheet) -> None:
+    book = main.parent
+    table = book.create_sheet("Design Table", 0)
+    table.append(["d", "R", "sensitivity"])
+    table.append([4.0, 90.0, 1e-4])
+    copied = book.create_sheet("MDSL cloud import", 0)
+    copied.append(["x1", "y1", "z1", "l"])
+    copied.append([1.0, 2.0, 3.0, 4.0])
+    book.create_sheet("Theta", 1)["B2"] = "=1/0"
+    chart = book.create_chartsheet("Chart", 0)
+    chart.add_chart(openpyxl.chart.BarChart())
+    table.sheet_state = "hidden"
+    book.active = 2
+
+
+def _hidden_column_and_format(main: Worksheet, coordinates: Worksheet) -> None:
+    coordinates.column_dimensions["C"].hidden = True
+    coordinates.row_dimensions[4].hidden = True
+    coordinates["B3"].number_format = '0.00 "mm"'
+    coordinates.cell(5000, 200).font = openpyxl.styles.Font(bold=True)
+    main["G40"].number_format = "0.0"
+
+
+def _blank_rows_and_notes(main: Worksheet, coordinates: Worksheet) -> None:
+    _typed(main, coordinates)
+    coordinates.insert_rows(5, 3)
+    coordinates["A6"] = "upper rings"
+    last = coordinates.max_row
+    coordinates.cell(last + 2, 1, "Note: measured in 2021")
+    coordinates.cell(last + 3, 2, "centres of the holes, not of the plates")
+    coordinates.cell(last + 4, 5, "=SQRT(SUMSQ(B90,C90,D90))")
+    main.insert_rows(4, 1)
+    main.cell(12, 1, "all in mm")
+    main.cell(13, 3, "to be confirmed")
+
+
+def _units_row(main: Worksheet, coordinates: Worksheet) -> None:
+    _typed(main, coordinates)
+    for sheet, columns in ((main, range(2, 6)), (coordinates, range(2, 5))):
+        sheet.insert_rows(3)
+        for column in columns:
+            sheet.cell(3, column, "[mm]")
+
+
+def _computed_inputs(main: Worksheet, coordinates: Worksheet) -> None:
+    coordinates["A4"], coordinates["A5"] = "=A3+1", "=A4+1"
+    coordinates["B3"], coordinates["C3"], coordinates["D3"] = "=277.0", "=+Main!H1/10*1", "=--'Coordinates'!P33"
+    main["H1"], coordinates["P33"] = 703, -70
+    coordinates["B4"], coordinates["P50"] = "=$P$50*1", 155.0
+    main["B4"], main["C4"], main["E4"] = "=B3", "=SUM(C3:C3)", "=SQRT(main!E3^2)"
+
+
+def _shuffled_main(main: Worksheet, coordinates: Worksheet) -> None:
+    _typed(main, coordinates)
+    rows = [[cell.value for cell in row] for row in main.iter_rows(min_row=3)]
+    for i, row in enumerate(rows[::-1], start=3):
+        for j, value in enumerate(row, start=1):
+            main.cell(i, j, value)
+
+
+VARIATIONS = [
+    _typed,
+    _insert_columns,
+    _reversed_columns,
+    _moved_down,
+    _no_symbols,
+    _no_descriptions,
+    _odd_spelling,
+    _other_names,
+    _one_sheet,
+    _single_value_row,
+    _single_values_in_numbered_rows,
+    _sheets_beside,
+    _hidden_column_and_format,
+    _blank_rows_and_notes,
+    _units_row,
+    _computed_inputs,
+    _shuffled_main,
+]
+
+
+@pytest.mark.parametrize("edit", VARIATIONS, ids=lambda edit: edit.__name__.strip("_"))
+def test_same_scanner_however_laid_out(edit, tmp_path):
+    assert_plain(read_edited(tmp_path, edit))
+
+
+@pytest.mark.parametrize("n", [1, 2, 300])
+def test_any_number_of_modules(n, tmp_path, rng):
+    directions = rng.normal(size=(n, 3))
+    centers = np.round(directions / np.linalg.norm(directions, axis=1)[:, None] * rng.uniform(150, 300, (n, 1)), 6)
+    system = read_system(saved(plain(centers), tmp_path))
+    np.testing.assert_array_equal(system.centers, centers)
+    np.testing.assert_allclose(system.collimator_length, collimator_length(system.pinhole_distance, 2.3, 50, 75))
+
+
+def test_dimensions_go_by_module_number(tmp_path):
+    def edit(main, coordinates):
+        _typed(main, coordinates)
+        for row, (number, side) in enumerate([(7, 57.0), (5, 55.0), (8, 58.0), (6, 56.0)], start=3):
+            main.cell(row, 1, number), main.cell(row, 4, side), main.cell(row, 5, side / 5)
+            coordinates.cell(row, 1, row + 2)
+        coordinates.delete_cols(5, 10)
+
+    system = read_edited(tmp_path, edit)
+    np.testing.assert_array_equal(system.numbers, [5, 6, 7, 8])
+    np.testing.assert_array_equal(system.detector_side, [55, 56, 57, 58])
+    assert system.source.cell("Ld", 5) == ("Main", "D4")
+
+
+def test_dimensions_go_by_row_order_without_numbers(tmp_path):
+    def edit(main, coordinates):
+        coordinates.delete_cols(5, 10)
+        main.delete_cols(1)
+        for row, side in enumerate([51.0, 52.0, 53.0, 54.0], start=3):
+            main.cell(row, 3, side)
+
+    np.testing.assert_array_equal(read_edited(tmp_path, edit).detector_side, [51, 52, 53, 54])
+
+
+def test_dimensions_may_stand_in_two_sheets(tmp_path):
+    def edit(main, coordinates):
+        _typed(main, coordinates)
+        crystal = main.parent.create_sheet("Crystal")
+        crystal.append(["Ld", "Td"])
+        crystal.append([50, 10])
+        main.delete_cols(4, 2)
+
+    assert_plain(read_edited(tmp_path, edit))
+
+
+def test_modules_without_coordinates_are_left_out_with_a_warning(tmp_path):
+    def edit(main, coordinates):
+        main.append([9, 2.3, 75, 50, 10])
+
+    with pytest.warns(InputWarning, match=r"^scanner.xlsx: Main!A7 has module 9 without coordinates"):
+        assert len(read_edited(tmp_path, edit)) == 4
+
+
+# Formulas and typed values
+
+
+def test_typed_collimator_length_is_the_master_and_warned_of(tmp_path):
+    with pytest.warns(InputWarning) as caught:
+        system = read_edited(tmp_path, lambda main, coordinates: coordinates.__setitem__("G4", 60.0))
+    assert system.collimator_length[1] == 60.0
+    assert [str(w.message).split(",")[0] for w in caught] == ["scanner.xlsx: Coordinates!G4 has l = 60 mm"]
+    assert "the sheet's is used" in str(caught[0].message)
+
+
+def test_missing_collimator_length_is_computed(tmp_path):
+    def blank(main, coordinates):
+        _typed(main, coordinates)
+        coordinates["G4"] = None
+
+    assert_plain(read_edited(tmp_path, blank))
+    assert_plain(
+        read_edited(tmp_path, lambda main, coordinates: (_typed(main, coordinates), coordinates.delete_cols(7)))
+    )
+
+
+def test_derived_formula_beyond_arithmetic_is_computed_by_ours(tmp_path):
+    def edit(main, coordinates):
+        coordinates["G3"] = '=IF(A3="","",XLOOKUP(A3,Main!A:A,Main!F:F))'
+        coordinates["E4"] = "=Scale*VLOOKUP(1,2,3)"
+
+    assert_plain(read_edited(tmp_path, edit))
+
+
+@pytest.mark.parametrize(
+    ("cell", "quantity"),
+    [("E3", "b"), ("H4", "H"), ("I3", "x2"), ("J5", "y2"), ("K6", "z2"), ("L3", "range"), ("M4", "azimuth")],
+)
+def test_difference_from_the_formulas_is_warned_of(cell, quantity, tmp_path):
+    def edit(main, coordinates):
+        _typed(main, coordinates)
+        coordinates[cell] = coordinates[cell].value + 0.25
+
+    with pytest.warns(InputWarning) as caught:
+        system = read_edited(tmp_path, edit)
+    assert_plain(system)
+    (message,) = (str(w.message) for w in caught)
+    numbers = rf"has {quantity} = (\S+) \w+, the formula gives (\S+) \w+ \(the formula's is used\)"
+    given, expected = re.fullmatch(rf"scanner\.xlsx: Coordinates!{cell} {numbers}", message).groups()
+    assert float(given) - float(expected) == pytest.approx(0.25, abs=1e-5)
+
+
+def test_elevation_may_be_in_degrees(tmp_path):
+    def edit(main, coordinates):
+        coordinates["N2"] = "pinhole elevation (degrees)"
+        for row in range(3, 7):
+            coordinates.cell(row, 14, f"=DEGREES(ATAN2(L{row},D{row}))")
+
+    assert_plain(read_edited(tmp_path, edit))
+
+
+def test_angles_a_turn_apart_agree(tmp_path):
+    def edit(main, coordinates):
+        coordinates["M3"] = "=ATAN2(B3,C3)+2*PI()"
+
+    assert_plain(read_edited(tmp_path, edit))
+
+
+def test_values_typed_as_displayed_are_not_warned_of(tmp_path):
+    def edit(main, coordinates):
+        _typed(main, coordinates)
+        for row in range(3, 7):
+            for column in range(5, 12):
+                coordinates.cell(row, column, round(coordinates.cell(row, column).value, 2))
+            for column in range(12, 15):
+                coordinates.cell(row, column, round(coordinates.cell(row, column).value, 3))
+
+    system = read_edited(tmp_path, edit)
+    assert system.collimator_length[0] == round(float(system.collimator_length[0]), 2)  # typed numbers are the master
+
+
+def test_tolerance_is_the_rounding_shown():
+    assert tolerance(89.0702, 89.07020616, "mm") == pytest.approx(5e-5 + 4e-5, abs=4.5e-5)
+    assert tolerance(89.07, 89.07020616, "mm") == pytest.approx(5e-3)
+    assert tolerance(89.0, 89.07020616, "mm") == pytest.approx(5e-3)
+    assert tolerance(0.12345678901, 0.1234567, "rad") == pytest.approx(1e-6)
+
+
+def test_many_differences_of_a_column_are_counted(tmp_path, rng):
+    centers = np.round(rng.normal(size=(40, 3)) + np.array([200, 0, 0]), 6)
+    book = plain(centers)
+    for row in range(3, 43):
+        book["Coordinates"].cell(row, 5, 100.0)
+        for column in range(6, 15):
+            book["Coordinates"].cell(row, column).value = None
+    with pytest.warns(InputWarning) as caught:
+        read_system(saved(book, tmp_path))
+    messages = [str(w.message) for w in caught]
+    assert len(messages) == 5
+    assert messages[-1].endswith("so do 35 more cells of this column)")
+
+
+def test_azimuth_error_on_the_z_axis_is_no_fault(tmp_path):
+    def edit(main, coordinates):
+        coordinates["B3"], coordinates["C3"], coordinates["D3"] = 0, 0, 200
+        coordinates["F3"] = None
+
+    np.testing.assert_array_equal(read_edited(tmp_path, edit).centers[0], [0, 0, 200])
+
+
+@pytest.mark.parametrize(
+    ("formula", "value"),
+    [
+        ("=277.002", 277.002),
+        ("=-B2", -3.0),
+        ("=-2^2", 4.0),
+        ("=2^3^2", 64.0),
+        ("=2-3-4", -5.0),
+        ("=12/3/2*5", 10.0),
+        ("=(1+2)*3", 9.0),
+        ("=50%", 0.5),
+        ("=SQRT(SUMSQ(B2,4))", 5.0),
+        ("=SUM(A1:B2)", 6.0),
+        ("=ATAN2(0,2)", np.pi / 2),
+        ("=COS(RADIANS(60))*2", 1.0),
+        ("=DEGREES(PI())", 180.0),
+        ("='My sheet'!C3 * 2", 14.0),
+        ("=ROUND(-2.345,2)", -2.35),
+        ("=1e3+.5", 1000.5),
+        ("=Z99+1", 1.0),
+        ("=1/0", "#DIV/0!"),
+        ("=A9+1", "#REF!"),
+    ],
+)
+def test_formulas_give_what_a_spreadsheet_shows(formula, value):
+    cells = {
+        (None, 1, 1): 1.0,
+        (None, 1, 2): 2.0,
+        (None, 2, 2): 3.0,
+        ("My sheet", 3, 3): 7.0,
+        (None, 9, 1): CellError("#REF!"),
+    }
+
+    def lookup(sheet, row, column):
+        return cells.get((sheet, row, column))
+
+    if value == "#DIV/0!":
+        with pytest.raises(ZeroDivisionError):
+            evaluate(formula, lookup)
+    elif isinstance(value, str):
+        assert evaluate(formula, lookup) == value
+    else:
+        assert evaluate(formula, lookup) == pytest.approx(value, rel=1e-14)
+
+
+@pytest.mark.parametrize(
+    "formula",
+    [
+        '="text"',
+        "=Name",
+        "=FOO(1)",
+        "=A1>2",
+        "=A1&B1",
+        "=[1]S!A1",
+        "=SUM(A:A)",
+        "=(1",
+        "=1+",
+        "=",
+        "=1)",
+        "=}",
+        "=SQRT(1,2)",
+    ],
+)
+def test_formulas_beyond_arithmetic_are_not_computed(formula):
+    with pytest.raises(NotComputable):
+        evaluate(formula, lambda *_: 1.0)
+
+
+@pytest.mark.parametrize(
+    ("heading", "quantity"),
+    [
+        ("l", "l"),
+        ("Collimator length (mm)", "l"),
+        ("length of side of detector crystal", "Ld"),
+        ("ROI radius", "R"),
+        ("3D slope", None),
+        ("S", None),
+        ("l+b+Td", "H"),
+        ("y-position of pinhole", "y1"),
+        ("z coordinate value at end of detector", "z2"),
+        ("Module", "number"),
+        ("comment", None),
+        ("Module length", None),
+    ],
+)
+def test_headings_name_quantities(heading, quantity):
+    assert quantity_of(heading) == quantity
+
+
+# Refusals
+
+
+def _set(sheet: str, cell: str, value: object) -> Callable[[Worksheet, Worksheet], None]:
+    def edit(main: Worksheet, coordinates: Worksheet) -> None:
+        target = {"Main": main, "Coordinates": coordinates}[sheet]
+        target[cell] = value
+        if isinstance(value, str) and value.startswith("#"):
+            target[cell].data_type = "e"
+
+    return edit
+
+
+def _center(row: int, x: float, y: float, z: float) -> Callable[[Worksheet, Worksheet], None]:
+    def edit(main: Worksheet, coordinates: Worksheet) -> None:
+        coordinates.cell(row, 2, x), coordinates.cell(row, 3, y), coordinates.cell(row, 4, z)
+
+    return edit
+
+
+def _row_missing(main: Worksheet, coordinates: Worksheet) -> None:
+    main.delete_rows(5)
+
+
+def _row_missing_without_numbers(main: Worksheet, coordinates: Worksheet) -> None:
+    main.delete_rows(5)
+    main.delete_cols(1)
+
+
+def _copied_table(main: Worksheet, coordinates: Worksheet) -> None:
+    coordinates.title = "A"
+    main.parent.copy_worksheet(coordinates).title = "B"
+
+
+def _second_x1(main: Worksheet, coordinates: Worksheet) -> None:
+    coordinates["R1"] = "x1"
+
+
+def _no_rows(main: Worksheet, coordinates: Worksheet) -> None:
+    coordinates.delete_rows(3, 10)
+
+
+def _sum_below(main: Worksheet, coordinates: Worksheet) -> None:
+    coordinates.append(["mean", 1.0, 2.0, 3.0])
+
+
+BAD_CELLS = {
+    "text": (_set("Coordinates", "B4", "abc"), "Coordinates!B4 holds the text 'abc', expected x1 of module 2"),
+    "text of several lines": (_set("Coordinates", "B4", "a\nb"), "Coordinates!B4 holds the text 'a b'"),
+    "number as text": (_set("Coordinates", "D4", "12,5"), "Coordinates!D4 holds the text '12,5', expected z1"),
+    "blank": (_set("Coordinates", "C5", None), "Coordinates!C5 is blank, expected y1 of module 3"),
+    "blank dimension": (_set("Main", "D4", None), "Main!D4 is blank, expected Ld of module 2"),
+    "boolean": (_set("Main", "B3", True), "Main!B3 is TRUE, expected d"),
+    "date": (_set("Coordinates", "B3", datetime.date(2021, 3, 4)), "Coordinates!B3 is the date or time 2021-03-04"),
+    "error": (_set("Coordinates", "B3", "#REF!"), "Coordinates!B3 shows the error #REF!, expected x1"),
+    "error in l": (_set("Coordinates", "G4", "#REF!"), "Coordinates!G4 shows the error #REF!, expected l"),
+    "error in a check": (_set("Coordinates", "E4", "#NAME?"), "Coordinates!E4 shows the error #NAME?, expected b"),
+    "reference to an error": (_set("Coordinates", "B3", "=#REF!+1"), "Coordinates!B3 shows the error #REF!"),
+    "division by zero": (_set("Coordinates", "B3", "=1/Z1"), "Coordinates!B3 shows the error #DIV/0!"),
+    "not finite": (_set("Coordinates", "B3", 1e999), "Coordinates!B3"),
+    "cycle": (_set("Coordinates", "B3", "=B3+1"), "Coordinates!B3 holds the formula =B3+1 without a stored value"),
+    "long cycle": (
+        lambda main, c: (
+            _set("Coordinates", "B3", "=Main!H9")(main, c),
+            _set("Main", "H9", "=Coordinates!B3")(main, c),
+        ),
+        "Coordinates!B3 holds the formula =Main!H9 without a stored value",
+    ),
+    "formula beyond arithmetic": (
+        _set("Main", "B3", "=VLOOKUP(1,A:B,2)"),
+        "Main!B3 holds the formula =VLOOKUP(1,A:B,2)",
+    ),
+    "formula of another file": (_set("Main", "B3", "=[1]Main!B3"), "Main!B3 holds the formula =[1]Main!B3"),
+    "no such sheet in a formula": (_set("Main", "B3", "=Old!B3"), "there is no sheet Old"),
+    "zero diameter": (_set("Main", "B3", 0), "Main!B3 has d = 0 mm, expected more than 0"),
+    "negative side": (_set("Main", "D5", -50), "Main!D5 has Ld = -50 mm, expected more than 0"),
+    "zero thickness": (_set("Main", "E3", 0), "Main!E3 has Td = 0 mm"),
+    "negative radius": (_set("Main", "C3", -75), "Main!C3 has R = -75 mm"),
+    "negative length": (_set("Coordinates", "G3", -1), "Coordinates!G3 has l = -1 mm, expected more than 0"),
+    "hole wider than crystal": (
+        _set("Main", "B3", 51),
+        "Main!B3 has d = 51 mm, expected less than Ld = 50 mm in Main!D3",
+    ),
+    "at the isocentre": (_center(5, 0, 0, 0), "Coordinates!B5 and y1, z1 put the pinhole of module 3 at the isocentre"),
+    "inside the ROI": (
+        _center(5, 30, 40, 0),
+        "Coordinates!B5 and y1, z1 put the pinhole of module 3 50 mm from the isocentre",
+    ),
+    "on the ROI": (_center(5, 75, 0, 0), "Coordinates!B5 and y1, z1 put the pinhole of module 3 75 mm from"),
+    "same number": (_set("Coordinates", "A5", 2), "Coordinates!A5 is module 2, as is Coordinates!A4"),
+    "same number in Main": (_set("Main", "A5", 2), "Main!A5 is module 2, as is Main!A4"),
+    "same place": (
+        _center(6, *CENTERS[1]),
+        "Coordinates!B6 and y1, z1 put the pinhole of module 4 where that of module 2",
+    ),
+    "number missing": (_set("Coordinates", "A5", None), "Coordinates!A5 is blank, expected a module's number"),
+    "number is text": (
+        _set("Coordinates", "A5", "left"),
+        "Coordinates!A5 holds the text 'left', expected a module's number",
+    ),
+    "number is a fraction": (_set("Coordinates", "A5", 2.5), "Coordinates!A5 is 2.5, expected a module's number"),
+    "number without module": (_set("Coordinates", "A7", 5), "Coordinates!B7 is blank, expected x1 of module 5"),
+    "sum below the table": (_sum_below, "Coordinates!A7 holds the text 'mean', expected a module's number"),
+    "dimensions of a module missing": (
+        _row_missing,
+        "Coordinates!A5 is module 3, expected a row with its d in sheet Main",
+    ),
+    "too few rows": (_row_missing_without_numbers, "sheet Main has 3 rows of d (Main!A3 to Main!A5), expected one or"),
+    "centimetres": (_set("Coordinates", "B1", "x1 (cm)"), "Coordinates!B1 heads x1 in cm, expected millimetres"),
+    "two columns of one name": (_second_x1, "Coordinates!B1 and Coordinates!R1 are both headed as x1"),
+    "headings at odds": (_set("Coordinates", "B1", "y2"), "Coordinates!B2 is headed as x1 but Coordinates!B1 as y2"),
+    "two tables": (_copied_table, "sheets A and B both have columns headed x1, y1, z1"),
+    "no modules": (_no_rows, "Coordinates!B3 and the rows below hold no modules"),
+}
+
+
+@pytest.mark.parametrize("kind", BAD_CELLS)
+def test_unusable_cell_is_refused_by_its_name(kind, tmp_path):
+    edit, expected = BAD_CELLS[kind]
+    with pytest.raises(InputError) as refusal:
+        read_edited(tmp_path, edit)
+    message = str(refusal.value)
+    assert message.startswith("scanner.xlsx: ")
+    assert expected in message
+    assert "\n" not in message
+    assert len(message) < 300
+    assert "expected" in message
+
+
+def test_without_coordinates_the_sheets_and_headings_are_named(tmp_path):
+    book = Workbook()
+    book.active.title = "Values"
+    book.create_sheet("Notes")["A1"] = "hello"
+    with pytest.raises(InputError) as refusal:
+        read_system(saved(book, tmp_path))
+    assert str(refusal.value) == (
+        "scanner.xlsx: no sheet has a table of pinholes, expected columns headed x1, y1, z1 or "
+        "'x coordinate value at center of hole', ...; its sheets are Values, Notes"
+    )
+
+
+def test_missing_heading_is_named(tmp_path):
+    def edit(main, coordinates):
+        coordinates["C1"] = coordinates["C2"] = None
+
+    with pytest.raises(InputError, match="sheet Coordinates has no column headed y1 or 'y coordinate value"):
+        read_edited(tmp_path, edit)
+    with pytest.raises(InputError, match="no sheet has a column headed Ld or 'length of side of detector crystal'"):
+        read_edited(tmp_path, lambda main, coordinates: main.delete_cols(4))
+
+
+def _zip_of(path: Path, members: dict[str, bytes]) -> None:
+    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
+        for name, content in members.items():
+            archive.writestr(name, content)
+
+
+def _damaged_sheet(path: Path, real: bytes, change: Callable[[bytes], bytes]) -> None:
+    path.write_bytes(real)
+    with zipfile.ZipFile(path) as archive:
+        members = {name: archive.read(name) for name in archive.namelist()}
+    members["xl/worksheets/sheet2.xml"] = change(members["xl/worksheets/sheet2.xml"])
+    _zip_of(path, members)
+
+
+OLE = bytes.fromhex("d0cf11e0a1b11ae1")
+BAD_FILES: dict[str, tuple[Callable[[Path, bytes], object], str]] = {
+    "missing": (lambda path, real: None, "no such file"),
+    "a folder": (lambda path, real: path.mkdir(), "is a folder, expected an .xlsx workbook"),
+    "empty": (lambda path, real: path.write_bytes(b""), "an empty file"),
+    "text": (lambda path, real: path.write_text("x1,y1,z1\n1,2,3\n"), "not an .xlsx workbook"),
+    "truncated": (lambda path, real: path.write_bytes(real[:20000]), "not an .xlsx workbook"),
+    "old format": (lambda path, real: path.write_bytes(OLE + bytes(600)), "an old Excel .xls file"),
+    "password": (
+        lambda path, real: path.write_bytes(OLE + bytes(600) + "EncryptedPackage".encode("utf-16-le")),
+        "protected by a password",
+    ),
+    "another zip": (lambda path, real: _zip_of(path, {"a.txt": b"hello"}), "not an .xlsx workbook"),
+    "OpenDocument": (lambda path, real: _zip_of(path, {"mimetype": b"", "content.xml": b""}), "an OpenDocument file"),
+    "binary workbook": (lambda path, real: _zip_of(path, {"xl/workbook.bin": b""}), "a binary .xlsb workbook"),
+    "broken XML": (lambda path, real: _damaged_sheet(path, real, lambda xml: xml[:9000]), "cannot be read"),
+    "not a number": (
+        lambda path, real: _damaged_sheet(path, real, lambda xml: xml.replace(b"<v>277.002</v>", b"<v>NaN</v>")),
+        "sheet Coordinates cannot be read",
+    ),
+    "infinite": (
+        lambda path, real: _damaged_sheet(path, real, lambda xml: xml.replace(b"<v>277.002</v>", b"<v>1e999</v>")),
+        "Coordinates!B3 is inf, expected x1 of module 1",
+    ),
+}
+
+
+@pytest.mark.parametrize("kind", BAD_FILES)
+def test_what_is_no_workbook_is_refused(kind, tmp_path, workbook):
+    make, expected = BAD_FILES[kind]
+    path = tmp_path / "scanner.xlsx"
+    make(path, workbook.read_bytes())
+    with pytest.raises(InputError) as refusal:
+        read_system(path)
+    message = str(refusal.value)
+    assert "scanner.xlsx" in message
+    assert expected in message
+    assert "\n" not in message
+
+
+def test_lock_file_points_to_its_workbook(tmp_path):
+    (tmp_path / "~$scanner.xlsx").write_bytes(b"\x06Someone")
+    with pytest.raises(InputError, match=r"Excel's lock file, expected the workbook scanner\.xlsx"):
+        read_system(tmp_path / "~$scanner.xlsx")
+
+
+def test_file_of_absurd_size_is_refused_unread(workbook, monkeypatch):
+    monkeypatch.setattr("mphdrr.core.workbook.book.MAX_UNPACKED_BYTES", 100_000)
+    with pytest.raises(InputError, match="unpacks to 139152 bytes, expected at most 100000"):
+        read_system(workbook)
+    monkeypatch.setattr("mphdrr.core.workbook.book.MAX_FILE_BYTES", 10_000)
+    with pytest.raises(InputError, match="expected a workbook of at most 10000 bytes"):
+        read_system(workbook)
+
+
+def test_too_many_rows_are_refused(tmp_path, monkeypatch):
+    monkeypatch.setattr("mphdrr.core.workbook.book.MAX_ROWS", 5)
+    with pytest.raises(InputError, match="sheet Coordinates has more than 5 rows with content"):
+        read_edited(tmp_path, lambda main, coordinates: None)
+
+
+def test_too_many_modules_are_refused(tmp_path, monkeypatch):
+    monkeypatch.setattr("mphdrr.core.workbook.rows.MAX_MODULES", 3)
+    with pytest.raises(InputError, match="sheet Coordinates has 4 modules, expected at most 3"):
+        read_edited(tmp_path, lambda main, coordinates: None)
+
+
+# Any scanner, any layout
+
+if st is not None:
+
+    @st.composite
+    def layouts(draw):
+        n = draw(st.integers(1, 30))
+        seed = draw(st.integers(0, 2**32 - 1))
+        columns = draw(st.permutations(range(8)))
+        gap = draw(st.integers(0, 3))
+        top = draw(st.integers(0, 17))
+        symbols = draw(st.booleans())
+        return n, seed, columns, gap, top, symbols
+
+    @settings(max_examples=25, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+    @given(layouts())
+    def test_any_order_of_columns_and_place_of_headings(tmp_path, layout):
+        n, seed, columns, gap, top, symbols = layout
+        rng = np.random.default_rng(seed)
+        directions = rng.normal(size=(n, 3))
+        centers = np.round(directions / np.linalg.norm(directions, axis=1)[:, None] * rng.uniform(110, 400, (n, 1)), 6)
+        sizes = np.round(rng.uniform([1, 20, 30, 3], [5, 100, 80, 12], (n, 4)), 6)
+        headings = ["Definitions", *DESCRIPTIONS[1:4], *(plain()["Main"].cell(2, c).value for c in range(2, 6))]
+        if symbols:
+            headings = ["Module", "x1", "y1", "z1", "d", "R", "Ld", "Td"]
+        numbers = rng.permutation(1000)[:n] + 1
+        table = [
+            headings,
+            *([int(k), *map(float, c), *map(float, s)] for k, c, s in zip(numbers, centers, sizes, strict=True)),
+        ]
+        book = Workbook()
+        for i, row in enumerate(table, start=top + 1):
+            for j, column in enumerate(columns):
+                book.active.cell(i, 1 + j * (gap + 1), row[column])
+        system = read_system(saved(book, tmp_path))
+        np.testing.assert_array_equal(system.centers, centers)
+        np.testing.assert_array_equal(system.numbers, numbers)
+        np.testing.assert_array_equal(
+            np.stack([system.pinhole_diameter, system.roi_radius, system.detector_side, system.detector_thickness], 1),
+            sizes,
+        )
+
+else:
+
+    @pytest.mark.skip(reason="hypothesis is not installed")
+    def test_any_order_of_columns_and_place_of_headings():
+        pass

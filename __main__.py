@@ -1,5 +1,7 @@
 """``python -m mphdrr``: the command line."""
 
-from .addon.cli import program
+import sys
 
-program()
+from .addon.cli import main
+
+sys.exit(main())

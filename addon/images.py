@@ -6,7 +6,7 @@ arrays', start at the bottom). Module images hold the exact float32 values in R,
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable
 
 import bpy
 import numpy as np
@@ -18,7 +18,7 @@ from . import ids
 _KEY = "mphdrr_projection"  # custom property: marks the images that a new run replaces
 
 
-def store_projections(projections: NDArray[np.float32], numbers: Sequence[int], columns: int = 20) -> bpy.types.Image:
+def store_projections(projections: NDArray[np.float32], numbers: Iterable[int], columns: int = 20) -> bpy.types.Image:
     """Make one float image per module and the mosaic, packed into the .blend; images of an earlier run are replaced.
 
     Parameters
@@ -35,7 +35,8 @@ def store_projections(projections: NDArray[np.float32], numbers: Sequence[int], 
     Image
         The mosaic, scaled so that its largest value is white.
     """
-    names = [ids.projection_name(int(number), max(numbers)) for number in numbers]
+    numbers = [int(number) for number in numbers]
+    names = [ids.projection_name(number, max(numbers)) for number in numbers]
     for picture, name in zip(as_seen(projections), names, strict=True):
         _store(name, picture, exact=True)
     sheet = np.maximum(mosaic(projections, columns), 0.0)

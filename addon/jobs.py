@@ -56,7 +56,7 @@ class _Run:
     total: int = 0
     result: Any = None
     error: BaseException | None = None
-    warnings: list[warnings.WarningMessage] = field(default_factory=list)
+    caught: list[warnings.WarningMessage] = field(default_factory=list)
     cancel: threading.Event = field(default_factory=threading.Event)
     thread: threading.Thread | None = None
 
@@ -70,7 +70,7 @@ class _Run:
 
     def _work(self) -> None:
         try:
-            with warnings.catch_warnings(record=True) as self.warnings:
+            with warnings.catch_warnings(record=True) as self.caught:
                 warnings.simplefilter("always", InputWarning)
                 self.result = self.job.work(self._progress)
         except BaseException as error:  # noqa: BLE001  (reported by the main thread)
@@ -112,14 +112,27 @@ def before_load(*_: Any) -> None:
     stop()
 
 
+# Named functions, because a lambda in an annotation does not see this module's names.
+def _get_running(self: JobProperties) -> bool:
+    return is_running()
+
+
+def _get_label(self: JobProperties) -> str:
+    return _current.job.label if _current else ""
+
+
+def _get_progress(self: JobProperties) -> float:
+    return _current.done / _current.total if _current and _current.total else 0.0
+
+
 class JobProperties(bpy.types.PropertyGroup):
     """The running job; `WindowManager.mphdrr_job`, read-only."""
 
-    running: BoolProperty(name="Running", get=lambda self: is_running())
-    label: StringProperty(name="Job", get=lambda self: _current.job.label if _current else "")
+    running: BoolProperty(name="Running", get=_get_running)
+    label: StringProperty(name="Job", get=_get_label)
     progress: FloatProperty(
         name="Progress", description="Share of the work that is done", min=0.0, max=1.0, subtype="FACTOR",
-        get=lambda self: _current.done / _current.total if _current and _current.total else 0.0,
+        get=_get_progress,
     )  # fmt: skip
 
 
@@ -179,7 +192,7 @@ class JobOperator:
         if run.alive:
             return {"PASS_THROUGH"}
         self._end(context)
-        for warning in run.warnings:
+        for warning in run.caught:
             if issubclass(warning.category, InputWarning):
                 self.report({"WARNING"}, str(warning.message))
         if run.error is None and run.cancel.is_set():
@@ -249,10 +262,12 @@ def draw_job(layout: bpy.types.UILayout, context: bpy.types.Context) -> bool:
 
 
 def _redraw(context: bpy.types.Context) -> None:
+    # The sidebars only: drawing the scene ten times a second would take the processor from the work.
     for window in context.window_manager.windows:
         for area in window.screen.areas:
-            if area.type in {"VIEW_3D", "IMAGE_EDITOR"}:
-                area.tag_redraw()
+            for region in area.regions:
+                if area.type == "VIEW_3D" and region.type == "UI":
+                    region.tag_redraw()
 
 
 def _console(label: str) -> Progress:

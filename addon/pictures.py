@@ -13,8 +13,8 @@ from mathutils import Vector
 from ..core.errors import InputError
 from . import scanner
 
-SIZE = (1120, 640)
-_SAMPLES = 12
+SIZE = (960, 560)
+_SAMPLES = 8
 _DIRECTION = Vector((0.75, -1.0, 0.62))  # from the scanner's middle to the camera
 _LENS, _SENSOR = 50.0, 36.0
 # Direction from the scanner's middle in units of its reach, power (W per mm^2 of reach^2) and size of each light.
@@ -28,6 +28,7 @@ def render_scanner(
     first: int,
     last: int,
     volume: bpy.types.Object | None = None,
+    zoom: float = 1.0,
     samples: int = _SAMPLES,
 ) -> None:
     """Render modules `first` to `last` of a scanner to a PNG, with a volume or without; the scene stays as it was.
@@ -38,7 +39,7 @@ def render_scanner(
         The picture cannot be written.
     """
     shown = {camera: not camera.hide_viewport for camera in scanner.modules(collection)}
-    with _studio(scene, collection, samples):
+    with _studio(scene, collection, zoom, samples):
         try:
             scanner.show_modules(collection, first, last, "ONLY")
             if volume is not None:
@@ -56,7 +57,7 @@ def render_scanner(
 
 
 @contextmanager
-def _studio(scene: bpy.types.Scene, collection: bpy.types.Collection, samples: int) -> Iterator[None]:
+def _studio(scene: bpy.types.Scene, collection: bpy.types.Collection, zoom: float, samples: int) -> Iterator[None]:
     """A camera, lights and render settings for pictures of a scanner; all taken back at the end."""
     render, image, cycles = scene.render, scene.render.image_settings, scene.cycles
     view = scene.view_settings
@@ -91,7 +92,7 @@ def _studio(scene: bpy.types.Scene, collection: bpy.types.Collection, samples: i
         ends = np.concatenate([system.centers, -system.principal_rays * outer[:, None]])
         middle = (ends.min(axis=0) + ends.max(axis=0)) / 2
         reach = float(np.linalg.norm(ends - middle, axis=1).max() + system.detector_side.max() / 2)
-        scene.camera = _camera(scene, Vector(middle), reach, objects)
+        scene.camera = _camera(scene, Vector(middle), reach, zoom, objects)
         for direction, power, size in _LIGHTS:
             _light(scene, Vector(middle), reach * Vector(direction), power * reach**2, size * reach, objects)
         yield
@@ -105,9 +106,11 @@ def _studio(scene: bpy.types.Scene, collection: bpy.types.Collection, samples: i
             bpy.data.batch_remove([item, data])
 
 
-def _camera(scene: bpy.types.Scene, middle: Vector, reach: float, objects: list[bpy.types.Object]) -> bpy.types.Object:
+def _camera(
+    scene: bpy.types.Scene, middle: Vector, reach: float, zoom: float, objects: list[bpy.types.Object]
+) -> bpy.types.Object:
     data = bpy.data.cameras.new("mphDRR studio camera")
-    data.lens, data.sensor_width = _LENS, _SENSOR
+    data.lens, data.sensor_width = zoom * _LENS, _SENSOR
     # The sphere of radius `reach` just fits the picture's height, less what perspective and the arc leave empty.
     half_height = _SENSOR / 2 * SIZE[1] / SIZE[0] / _LENS
     distance = 0.66 * reach / np.sin(np.arctan(half_height))

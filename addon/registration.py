@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import atexit
 from typing import Any
 
 import bpy
 
 from ..operators import add_derenzo, aim_modules, export_dataset, import_geometry, render_projections, show_modules
 from ..panels import export, geometry, phantom, projections
-from . import preferences, properties
+from . import cli, ids, jobs, preferences, properties, storage, volumes
 
 # Classes in the order of registration; a panel comes after its parent. To add a class, list it here.
 CLASSES: tuple[type, ...] = (
@@ -43,7 +44,16 @@ MENUS: tuple[tuple[Any, Any], ...] = (
 )
 
 # (list in bpy.app.handlers, function): decorate the function with @bpy.app.handlers.persistent.
-HANDLERS: tuple[tuple[list[Any], Any], ...] = ()
+HANDLERS: tuple[tuple[list[Any], Any], ...] = (
+    (bpy.app.handlers.load_pre, jobs.before_load),
+    (bpy.app.handlers.load_post, volumes.after_load),
+    (bpy.app.handlers.save_pre, storage.before_save),
+    (bpy.app.handlers.save_post, storage.after_save),
+    (bpy.app.handlers.save_post_fail, storage.after_failed_save),
+)
+
+# What Blender gave for ``blender --command mphdrr``, to take it back with.
+_commands: list[Any] = []
 
 
 def register() -> None:
@@ -62,14 +72,22 @@ def register() -> None:
         for handlers, function in HANDLERS:
             handlers.append(function)
             undo.append((handlers.remove, (function,)))
+        _commands.append(bpy.utils.register_cli_command(ids.PREFIX, cli.main))
     except Exception:
         for function, arguments in reversed(undo):
             function(*arguments)
         raise
+    if bpy.app.module:
+        # Registered classes keep Python's bpy module alive, so that Blender 4.5 waits for ever when Python ends.
+        atexit.register(unregister)
 
 
 def unregister() -> None:
     """Take back what `register` did, in reverse order."""
+    atexit.unregister(unregister)
+    jobs.stop()
+    while _commands:
+        bpy.utils.unregister_cli_command(_commands.pop())
     for handlers, function in reversed(HANDLERS):
         if function in handlers:  # loading a file drops handlers that are not persistent
             handlers.remove(function)

@@ -40,18 +40,25 @@ def write_vdb(volume: Volume, path: Path, provenance: dict[str, Any] | None = No
     """
     vdb = _openvdb()
     grid = vdb.FloatGrid()
+    array, affine = volume.array, volume.grid.affine
+    mirrored = np.linalg.det(affine[:3, :3]) < 0
+    if mirrored:  # 4.5 draws nothing where the transform is left-handed: the same voxels, counted from the other end
+        turn = np.diag([-1.0, 1.0, 1.0, 1.0])
+        turn[0, 3] = array.shape[0] - 1
+        array, affine = array[::-1], affine @ turn
     # A copy, because it takes neither strides nor read-only arrays.
-    grid.copyFromArray(np.array(volume.array, np.float32, order="C"), tolerance=0.0)
+    grid.copyFromArray(np.array(array, np.float32, order="C"), tolerance=0.0)
     grid.name = volume.quantity
     grid.gridClass = vdb.GridClass.FOG_VOLUME
     shift = np.eye(4)
     shift[:3, 3] = VDB_CENTER_SHIFT
     # OpenVDB's matrices act on row vectors.
-    grid.transform = vdb.createLinearTransform((volume.grid.affine @ shift).T.tolist())
+    grid.transform = vdb.createLinearTransform((affine @ shift).T.tolist())
     grid["mphdrr_quantity"] = volume.quantity
     grid["mphdrr_unit"] = volume.unit
     grid["mphdrr_shape"] = json.dumps(volume.grid.shape)
     grid["mphdrr_affine"] = json.dumps(volume.grid.affine.tolist())
+    grid["mphdrr_mirrored"] = bool(mirrored)
     grid["mphdrr_center_shift"] = float(VDB_CENTER_SHIFT)
     grid["mphdrr_provenance"] = json.dumps(provenance or {})
     grid["mphdrr_version"] = VERSION
@@ -76,6 +83,7 @@ def read_vdb(path: Path) -> Volume:
         shape = tuple(json.loads(metadata["mphdrr_shape"]))
         affine = np.array(json.loads(metadata["mphdrr_affine"]))
         quantity = metadata["mphdrr_quantity"]
+        mirrored = metadata["mphdrr_mirrored"]
     except KeyError as error:
         raise InputError(f"{path}: was not written by mphDRR ({error} is missing)") from None
     except Exception as error:  # whatever OpenVDB raises on a damaged file
@@ -83,6 +91,8 @@ def read_vdb(path: Path) -> Volume:
     require(4 * np.prod(shape, dtype=float), f"the volume of {' x '.join(map(str, shape))} voxels")
     array = np.zeros(shape, np.float32)
     grid.copyToArray(array)
+    if mirrored:
+        array = np.ascontiguousarray(array[::-1])
     array.flags.writeable = False
     return Volume(array, Grid(shape, affine), quantity)
 

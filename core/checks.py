@@ -56,8 +56,8 @@ def require_finite(array: NDArray[Any], name: str) -> None:
         raise InputError(f"{name}: {array[index]} is not a finite number{where}")
 
 
-def whole_shape(value: Any, name: str, length: int) -> tuple[int, ...]:
-    """`value` as a tuple of `length` whole numbers of at least 1.
+def whole_shape(value: Any, name: str, length: int) -> Any:
+    """`value` as a tuple of `length` whole numbers of at least 1 (typed Any: mypy cannot say how many).
 
     Raises
     ------

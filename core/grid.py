@@ -52,13 +52,13 @@ class Grid:
         center
             World mm.
         """
-        shape = whole_shape(np.broadcast_to(np.asarray(shape), 3) if np.ndim(shape) == 0 else shape, "grid shape", 3)
+        counts = whole_shape(np.broadcast_to(np.asarray(shape), 3) if np.ndim(shape) == 0 else shape, "grid shape", 3)
         spacing = real_array(np.broadcast_to(spacing, 3) if np.ndim(spacing) == 0 else spacing, "voxel spacing", (3,))
         if np.any(spacing <= 0):
             raise InputError(f"voxel spacing: expected more than 0 mm, got {spacing.min():g}")
         affine = np.diag([*spacing, 1.0])
-        affine[:3, 3] = real_array(center, "grid centre", (3,)) - spacing * (np.array(shape) - 1) / 2
-        return cls(shape, affine)
+        affine[:3, 3] = real_array(center, "grid centre", (3,)) - spacing * (np.array(counts) - 1) / 2
+        return cls(counts, affine)
 
     @property
     def spacing(self) -> NDArray[np.float64]:

@@ -50,7 +50,7 @@ class PinholeSystem:
     detector_side: NDArray[np.float64]
     detector_thickness: NDArray[np.float64]
     roi_radius: NDArray[np.float64]
-    numbers: NDArray[np.int64] | None = None
+    numbers: NDArray[np.int64] = None  # type: ignore[assignment]  # always an array once made
     source: SystemSource | None = None
 
     def __post_init__(self) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import os
 import zipfile
 import zlib
@@ -93,9 +94,10 @@ def _read_nifti(path: Path, quantity: str | None) -> Volume:
     shape = image.shape
     if len(shape) != 3:
         raise InputError(f"expected a 3-D image, got shape {' x '.join(map(str, shape))}")
-    require(8.5 * np.prod(shape, dtype=np.float64), "a volume of {} x {} x {} voxels".format(*shape))
+    require(8.5 * math.prod(shape), "a volume of {} x {} x {} voxels".format(*shape))
     unit = image.header.get_xyzt_units()[0]
-    affine = np.diag([_MILLIMETRES[unit]] * 3 + [1.0]) @ np.asarray(image.affine, np.float64)
+    affine = np.array(image.affine, np.float64)
+    affine[:3] *= _MILLIMETRES[unit]
     array = np.ascontiguousarray(image.get_fdata(dtype=np.float32, caching="unchanged"))
     named = image.header.get_intent()[2]
     return Volume(freeze(array), Grid(shape, affine), quantity or (named if named in UNITS else "hu"))

@@ -40,11 +40,11 @@ class MPHDRR_OT_render_projections(ProjectionSettings, jobs.JobOperator, bpy.typ
         magnification = float(f"{self._setting(scene, 'magnification'):.7g}")
         backend = self._setting(scene, "backend").lower()
         views = system.views(shape=shape, detector=detector, magnification=magnification)
+        item = _chosen_volume(context, self.volume)
+        read_volume = volumes.reader(item)
         n_bytes = 4.0 * len(views) * shape[0] * shape[1]
         # The array, and Blender's images with four channels in memory and once more, packed.
         require(9 * n_bytes, f"{len(views)} images of {shape[1]} x {shape[0]} pixels")
-        item = _chosen_volume(context, self.volume)
-        read_volume = volumes.reader(item)
         path = storage.folder() / f"{bpy.path.clean_name(scene.name)}-projections.h5"
         settings: dict[str, Any] = {
             "detector": detector,
@@ -55,7 +55,7 @@ class MPHDRR_OT_render_projections(ProjectionSettings, jobs.JobOperator, bpy.typ
         }
         if getattr(item, ids.OBJECT_VOLUME).kind == "DERENZO":
             settings |= getattr(item, ids.OBJECT_VOLUME).derenzo.recipe()
-        scene_name, start = scene.name, time.perf_counter()
+        scene_name, item_name, start = scene.name, item.name, time.perf_counter()
 
         def work(progress: Progress) -> ProjectionRun:
             from ..core.export import write_run
@@ -85,7 +85,6 @@ class MPHDRR_OT_render_projections(ProjectionSettings, jobs.JobOperator, bpy.typ
             where = path if bpy.data.filepath else f"{path} until the .blend is saved"
             return f"Projected {item_name!r} into {len(run.views)} modules in {seconds:.1f} s: {where}"
 
-        item_name = item.name
         return jobs.Job("Projecting", work, finish)
 
     def _setting(self, scene: bpy.types.Scene, name: str) -> Any:

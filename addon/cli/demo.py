@@ -45,7 +45,7 @@ def _run(arguments: argparse.Namespace) -> None:
     from .session import new_scene, save_scene
 
     scene = new_scene()  # before the long work: without Blender the demo stops here
-    from .. import images, pictures, scanner, volumes
+    from .. import pictures, runs, scanner, volumes
 
     with _step("geometry"):
         system = read_system(arguments.workbook)
@@ -53,9 +53,10 @@ def _run(arguments: argparse.Namespace) -> None:
     with _step("phantom"):
         phantom = DerenzoPhantom(radius=40.0, rod_diameters=(8, 6, 5, 4, 3, 2), height=40.0, activity=100.0)
         grid = Grid.centered(arguments.voxels, 102.4 / arguments.voxels)
-        pose = euler_pose(*np.deg2rad(EULER_DEGREES))  # tilted, so that modules see along and across the rods
+        phi, theta, psi = np.deg2rad(EULER_DEGREES)
+        pose = euler_pose(phi, theta, psi)  # tilted, so that modules see along and across the rods
         volume = phantom.voxelize(grid, pose, progress=progress_bar("voxelizing"))
-        volume_object = volumes.add_volume(scene, volume, "Derenzo phantom")
+        volume_object = volumes.add_volume(volume, "Derenzo phantom", pose, dataclasses.asdict(phantom))
     with _step("projections"):
         run = project_run(
             system,
@@ -68,13 +69,13 @@ def _run(arguments: argparse.Namespace) -> None:
         write_run(run, out / "run.h5")
         write_png(mosaic(run.projections), out / "mosaic.png")
     with _step("scene"):
-        images.store_run(scene, run)
+        runs.show_run(scene, run, out / "run.h5")
         save_scene(out / "scanner.blend")
     with _step("pictures"):
         for first, last in scanner.quick_ranges(system):
             pictures.render_scanner(scene, collection, out / f"modules-{first}-{last}.png", first, last)
         first, last = int(system.numbers.min()), int(system.numbers.max())
-        pictures.render_scanner(scene, collection, out / "phantom.png", first, last, volume_object)
+        pictures.render_scanner(scene, collection, out / "phantom.png", first, last, volume_object, zoom=1.5)
     print(f"{out}: {', '.join(sorted(p.name for p in out.iterdir() if p.suffix in ('.blend', '.h5', '.png')))}")
 
 

@@ -39,13 +39,13 @@ def _run(arguments: argparse.Namespace) -> None:
     from .session import new_scene, save_scene
 
     blender_scene = new_scene()
-    from .. import images, scanner, volumes
+    from .. import runs, scanner, volumes
 
     scanner.build_scanner(blender_scene, system)
     if volume is not None:
-        volumes.add_volume(blender_scene, volume, Path(arguments.volume).name)
+        volumes.add_volume(volume, Path(arguments.volume).name)
     if run is not None:
-        volumes.add_volume(blender_scene, run.volume, "Projected volume")
-        images.store_run(blender_scene, run)
+        volumes.add_volume(run.volume, "Projected volume")
+        runs.show_run(blender_scene, run, Path(arguments.run_file))
     save_scene(path)
     print(path)

@@ -33,7 +33,8 @@ def derenzo_volume(arguments: argparse.Namespace) -> Volume:
     """The phantom that the options of `add_phantom_options` describe."""
     phantom = DerenzoPhantom(arguments.radius, tuple(arguments.rods), arguments.height, arguments.activity)
     grid = Grid.centered(_one_or_three(arguments.voxels), _one_or_three(arguments.spacing))
-    pose = euler_pose(*np.deg2rad(arguments.euler), translation=arguments.position)
+    phi, theta, psi = np.deg2rad(arguments.euler)
+    pose = euler_pose(phi, theta, psi, arguments.position)
     return phantom.voxelize(grid, pose, progress_bar("voxelizing"))
 
 

@@ -69,7 +69,7 @@ class Record:
 def record_of(run: ProjectionRun) -> Record:
     """Everything of `run`, as arrays and attributes."""
     system, views = run.system, run.views
-    arrays = {
+    arrays: dict[str, NDArray] = {
         "projections": run.projections,
         "geometry/number": system.numbers,
         "geometry/ring": system.rings(),
@@ -90,7 +90,7 @@ def record_of(run: ProjectionRun) -> Record:
         "volume/array": run.volume.array,
         "volume/affine": run.volume.grid.affine,
     }
-    attributes = {
+    attributes: dict[str, Any] = {
         "format": FORMAT,
         "format_version": FORMAT_VERSION,
         "conventions": CONVENTIONS,
@@ -127,7 +127,8 @@ def run_of(record: Record) -> ProjectionRun:
         numbers=arrays["geometry/number"],
     )
     array = arrays["volume/array"]
-    grid = Grid(array.shape, arrays["volume/affine"])
+    n_x, n_y, n_z = array.shape
+    grid = Grid((n_x, n_y, n_z), arrays["volume/affine"])
     seed = attributes["seed"]
     return ProjectionRun(
         projections=np.asarray(arrays["projections"], np.float32),

@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 from ..checks import real_array
 from ..errors import InputError
 from ..grid import Grid
-from ..memory import require
+from ..memory import available, require
 from ..progress import Progress
 from ..views import Views
 from ..volume import Volume
@@ -29,6 +29,9 @@ from .rays import index_rays
 _RAYS_AT_ONCE = 4096
 # A GPU wants more (torch cuts them into chunks by itself), and a torch on a CPU has threads of its own.
 _RAYS_AT_ONCE_TORCH = 2**18
+
+# Threads of the adjoint, each with a volume of its own: more would gain little and take much memory.
+_MOST_VOLUMES = 8
 
 Points = NDArray[np.float64]
 ParallelMap = Callable[[Callable[[Any], Any], Iterable[Any]], Iterable[Any]]
@@ -96,6 +99,7 @@ class Projector(LinearOperator):
     threads : int, optional
         Threads of numba and numpy, by default one per core (torch has a setting of its own). The images do
         not depend on it; the adjoint does by float32 rounding, and is the same every time for a given number.
+        The adjoint takes a volume per thread, so it uses at most 8, and fewer when memory is short.
 
     Raises
     ------
@@ -114,8 +118,8 @@ class Projector(LinearOperator):
     >>> views = Views([[0, 0, -100]], [[0, 0, 100]], [[2, 0, 0]], [[0, 2, 0]], shape=(64, 64))
     >>> A = Projector(grid, views)
     >>> images = A(np.ones(grid.shape))
-    >>> images.shape, float(images.max().round(2))
-    ((1, 64, 64), 64.01)
+    >>> images.shape
+    (1, 64, 64)
     >>> A.T(images).shape
     (64, 64, 64)
     """
@@ -176,7 +180,8 @@ class Projector(LinearOperator):
     def _run(self, x: ArrayOrTensor, progress: Progress | None = None) -> ArrayOrTensor:
         n_views, n_v, n_u = self.shape_out
         wide = 8 if self._float64 else 4
-        require(wide * n_views * n_v * n_u, f"{n_views} images of {n_v} x {n_u} pixels")
+        what = f"projecting {_times(self.shape_in)} voxels into {n_views} images of {n_v} x {n_u} pixels"
+        require(wide * (n_views * n_v * n_u + self.grid.n_voxels), what)
         images = None
         _report(progress, 0, n_views)
         for m, image in enumerate(self._images(x)):
@@ -195,17 +200,29 @@ class Projector(LinearOperator):
         box, origin = cropped(self._native(x, name))
         with _parallel(self._workers(name)) as parallel_map:
             for m in range(len(self.views)):
-                sources, targets = self.views.rays(m)
-                image = zeros(targets.shape[:1], box)
+                sources, targets, by_columns = self._lines(m)
+                image = zeros(self.views.shape, box)
+                lines = image.T if by_columns else image
 
                 def project(block: slice) -> None:
-                    rays = index_rays(self.grid, sources[block], targets[block], origin)  # noqa: B023
-                    image[block] = integrate(box, rays)  # noqa: B023
+                    rays = index_rays(self.grid, _flat(sources[block]), _flat(targets[block]), origin)  # noqa: B023
+                    lines[block] = integrate(box, rays).reshape(lines[block].shape)  # noqa: B023
 
-                for _ in parallel_map(project, _blocks(len(targets), name)):
+                for _ in parallel_map(project, _blocks(lines.shape[0], lines.shape[1], name)):
                     pass
-                image = image.reshape(self.views.shape)
                 yield image if self._float64 or is_tensor(image) else image.astype(np.float32, copy=False)
+
+    def _lines(self, m: int) -> tuple[Points, Points, bool]:
+        """Ends of view m's rays, (lines, rays of a line, 3), and whether the lines are the image's columns, not its rows.
+
+        Neighbours in a line are neighbours in memory: lines follow the volume's contiguous axis as well as they can.
+        """
+        sources, targets = (points.reshape(*self.views.shape, 3) for points in self.views.rays(m))
+        contiguous = self.grid.index_from_world[2, :3]
+        along_u, along_v = (abs(contiguous @ step) for step in (self.views.u_steps[m], self.views.v_steps[m]))
+        if along_v <= along_u:
+            return sources, targets, False
+        return sources.swapaxes(0, 1), targets.swapaxes(0, 1), True
 
     def _native(self, x: ArrayOrTensor, name: str) -> ArrayOrTensor:
         """`x` as the backend `name` computes with it."""
@@ -254,26 +271,25 @@ class AdjointProjector(LinearOperator):
         name = A._backend_for(x)
         spread = backends.load(name).adjoint
         images = A._native(x, name)
-        workers = A._workers(name)
-        wide = 8 if name == "numpy" else 4
-        require(
-            wide * workers * A.grid.n_voxels,
-            f"the adjoint into {_times(self.shape_out)} voxels ({workers} threads, one volume each)",
-        )
+        volume_bytes = (8 if name == "numpy" else 4) * A.grid.n_voxels
+        require(volume_bytes, f"the adjoint into {_times(self.shape_out)} voxels")
+        # One volume per thread: fewer threads rather than no room for anything else.
+        affordable = max(1, available() // (2 * volume_bytes))
+        workers = min(A._workers(name), _MOST_VOLUMES, affordable)
         volumes = [zeros(self.shape_out, images) for _ in range(workers)]
         n_views = len(A.views)
         _report(progress, 0, n_views)
         with _parallel(workers) as parallel_map:
             for m in range(n_views):
-                sources, targets = A.views.rays(m)
-                blocks = _blocks(len(targets), name)
-                values = images[m].reshape(-1)
+                sources, targets, by_columns = A._lines(m)
+                lines = images[m].T if by_columns else images[m]
+                blocks = _blocks(lines.shape[0], lines.shape[1], name)
 
                 def add(worker: int) -> None:
                     # Always the same blocks, so that the sums' order, and so the result, is always the same.
                     for block in blocks[worker::workers]:  # noqa: B023
-                        rays = index_rays(A.grid, sources[block], targets[block])  # noqa: B023
-                        spread(volumes[worker], values[block], rays)  # noqa: B023
+                        rays = index_rays(A.grid, _flat(sources[block]), _flat(targets[block]))  # noqa: B023
+                        spread(volumes[worker], lines[block].reshape(-1), rays)  # noqa: B023
 
                 for _ in parallel_map(add, range(workers)):
                     pass
@@ -325,20 +341,28 @@ def trace_rays(volume: Volume, sources: ArrayLike, targets: ArrayLike, backend: 
         integrals[block] = like(integrate(box, index_rays(volume.grid, starts[block], ends[block], origin)), integrals)
 
     with _parallel(1 if name == "torch" else _thread_count(None)) as parallel_map:
-        for _ in parallel_map(trace, _blocks(len(ends), name)):
+        for _ in parallel_map(trace, _blocks(len(ends), 1, name)):
             pass
     return integrals
 
 
 def _points(value: ArrayLike, name: str) -> Points:
-    if np.ndim(value) == 1:
-        return real_array(value, name, (3,))[None]
-    return real_array(value, name, (None, 3))
+    try:
+        one_point = np.ndim(value) == 1
+    except ValueError:  # ragged: real_array says so
+        one_point = False
+    return real_array(value, name, (3,))[None] if one_point else real_array(value, name, (None, 3))
 
 
-def _blocks(n_rays: int, backend: str) -> list[slice]:
-    size = _RAYS_AT_ONCE_TORCH if backend == "torch" else _RAYS_AT_ONCE
-    return [slice(first, min(first + size, n_rays)) for first in range(0, n_rays, size)]
+def _blocks(n_lines: int, line_length: int, backend: str) -> list[slice]:
+    """The lines of rays, cut into what a backend is given at once."""
+    rays_at_once = _RAYS_AT_ONCE_TORCH if backend == "torch" else _RAYS_AT_ONCE
+    size = max(1, rays_at_once // line_length)
+    return [slice(first, first + size) for first in range(0, n_lines, size)]
+
+
+def _flat(points: Points) -> Points:
+    return points.reshape(-1, 3)
 
 
 @contextmanager

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import subprocess
+import sys
 import warnings
 
 import bpy
@@ -274,3 +276,9 @@ def test_modules_are_shown_by_range(scene, ring_system):
     assert visible() == list(range(1, 9))
     with pytest.raises(InputError, match="no module between 9 and 20"):
         scanner.show_modules(collection, 9, 20)
+
+
+def test_python_ends_with_the_extension_registered():
+    """Blender 4.5's module waited for ever when classes were still registered as Python ended."""
+    script = "from mphdrr.addon import registration as r; r.register(); r.unregister(); r.register()"
+    subprocess.run([sys.executable, "-c", script], check=True, timeout=60)

@@ -295,6 +295,18 @@ def test_projector_images_are_the_views_rays(backend):
 
 
 @pytest.mark.parametrize("backend", BACKENDS)
+def test_swapping_the_detectors_axes_transposes_the_images(backend):
+    rng = np.random.default_rng(10)
+    grid = Grid((6, 5, 4), affine(LINEAR["sheared"], (6, 5, 4)))
+    views = some_views(rng, (7, 3), n=4)
+    swapped = Views(views.sources, views.detector_centers, views.v_steps, views.u_steps, (3, 7))
+    A, B = Projector(grid, views, backend=backend), Projector(grid, swapped, backend=backend)
+    x, y = rng.random(grid.shape), rng.random(A.shape_out)
+    np.testing.assert_allclose(B(x).swapaxes(1, 2), A(x), rtol=1e-6)
+    np.testing.assert_allclose(B.T(y.swapaxes(1, 2)), A.T(y), rtol=1e-5, atol=1e-6)
+
+
+@pytest.mark.parametrize("backend", BACKENDS[::2])  # torch has threads of its own
 def test_threads_change_nothing(backend):
     rng = np.random.default_rng(9)
     shape = (20, 21, 22)

@@ -92,6 +92,7 @@ def test_bad_input_is_one_clear_line():
     refused(lambda: trace_rays(ONES, [0, 0, 0], [1, 1, 1]), "Volume")
     refused(lambda: trace_rays(volume, [0, 0, 0], [[1, 1, np.nan]]), "targets", "(0, 2)")
     refused(lambda: trace_rays(volume, np.zeros((2, 3)), np.zeros((4, 3))), "2 sources", "4 targets")
+    refused(lambda: trace_rays(volume, [[0, 0, 0], [1]], [1, 1, 1]), "sources")
     refused(lambda: trace_rays(volume, np.zeros((2, 2)), np.zeros((2, 3))), "sources", "any x 3")
 
 
@@ -162,8 +163,16 @@ def test_progress_counts_the_views_and_can_cancel():
 def test_what_cannot_fit_is_refused_before_it_starts(monkeypatch):
     monkeypatch.setattr(mphdrr.core.memory, "available", lambda: 200)
     A = Projector(GRID, VIEWS, threads=1)
-    refused(lambda: A(ONES), "2 images of 6 x 7", "memory")
+    refused(lambda: A(ONES), "5 x 4 x 3 voxels", "2 images of 6 x 7", "memory")
     refused(lambda: A.T(np.ones(A.shape_out)), "5 x 4 x 3", "memory")
+
+
+@needs_numba
+def test_adjoint_uses_fewer_threads_when_memory_is_short(monkeypatch):
+    images = np.random.default_rng(0).random((2, 6, 7))
+    expected = Projector(GRID, VIEWS, threads=1).T(images)
+    monkeypatch.setattr("mphdrr.core.projector.operator.available", lambda: 1)
+    np.testing.assert_array_equal(Projector(GRID, VIEWS, threads=4).T(images), expected)
 
 
 def run_python(code, **environment):

@@ -1,0 +1,24 @@
+"""The last projection run of a scene: its images in the .blend, its exact arrays in a file beside it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import bpy
+
+from ..core.run import ProjectionRun
+from . import ids, images, storage
+
+
+def show_run(scene: bpy.types.Scene, run: ProjectionRun, path: Path) -> bpy.types.Image:
+    """Make `run`, which is kept in the file `path`, the scene's last one; returns the mosaic image.
+
+    The images of an earlier run are replaced.
+    """
+    mosaic = images.store_projections(run.projections, run.system.numbers)
+    state = getattr(scene, ids.SCENE_PROJECTIONS)
+    state.run_file = storage.stored_path(path.absolute())
+    n_v, n_u = run.views.shape
+    what = [run.settings.get("volume"), run.settings.get("backend")]
+    state.run_summary = ", ".join([f"{len(run.views)} views of {n_u} × {n_v}", *(text for text in what if text)])
+    return mosaic

@@ -1,0 +1,82 @@
+"""The commands and the example that make scenes, as their users run them: in a process of their own."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+import bpy
+import numpy as np
+import pytest
+
+import mphdrr.core as mph
+
+EXAMPLES = Path(__file__).parents[2] / "examples"
+
+
+def run(*words: object, status: int = 0) -> subprocess.CompletedProcess[str]:
+    done = subprocess.run([sys.executable, *map(str, words)], capture_output=True, text=True, timeout=120)
+    assert done.returncode == status, done.stderr
+    return done
+
+
+@pytest.fixture
+def small_run(tmp_path, dc_spect) -> Path:
+    system = dc_spect[[0, 30, 79]]
+    volume = mph.DerenzoPhantom(40, (8, 6, 5, 4, 3, 2), 40).voxelize(mph.Grid.centered(24, 4.0))
+    views = system.views(shape=(12, 16))
+    path = tmp_path / "small.h5"
+    mph.write_run(mph.ProjectionRun(mph.Projector(volume.grid, views)(volume), system, views, volume), path)
+    return path
+
+
+def test_scene_command_saves_scanner_volume_and_projections(tmp_path, workbook, small_run):
+    blend = tmp_path / "new" / "scanner.blend"
+    run("-m", "mphdrr", "scene", workbook, "--run", small_run, "-o", blend)
+    assert {path.name for path in blend.parent.iterdir()} == {"scanner.blend", "scanner_mphdrr"}
+
+    bpy.ops.wm.open_mainfile(filepath=str(blend))
+    from mphdrr.addon import images, scanner, volumes
+
+    collection = scanner.active_scanner(bpy.context.scene)
+    assert np.array_equal(scanner.read_scanner(collection).centers, mph.read_system(workbook).centers)
+    expected = mph.read_run(small_run)
+    (item,) = volumes.volume_objects(bpy.context.scene)
+    assert np.array_equal(volumes.volume_from_object(item).array, expected.volume.array)
+    shown = [image for image in bpy.data.images if tuple(image.size) == (16, 12)]
+    assert len(shown) == 3
+    assert np.array_equal(images.projection_array(shown[0]), expected.projections[0])
+
+
+def test_scene_command_refuses_in_one_line(tmp_path, workbook):
+    done = run("-m", "mphdrr", "scene", workbook, "-o", tmp_path / "scanner.txt", status=1)
+    assert done.stderr.count("\n") == 1
+    assert "expected a name ending in .blend" in done.stderr
+    assert not list(tmp_path.iterdir())
+
+
+def test_pictures_leave_the_scene_as_it_was(tmp_path, dc_spect, scene):
+    from mphdrr.addon import pictures, scanner
+
+    collection = scanner.build_scanner(scene, dc_spect)
+    scanner.show_modules(collection, 5, 9)
+
+    def state() -> tuple:
+        counts = [len(getattr(bpy.data, kind)) for kind in ("objects", "cameras", "lights", "worlds", "meshes", "materials")]
+        visible = [not camera.hide_viewport for camera in scanner.modules(collection)]
+        render = scene.render
+        return counts, visible, render.engine, render.resolution_x, render.filepath, scene.camera, scene.world
+
+    before = state()
+    pictures.render_scanner(scene, collection, tmp_path / "p.png", 1, 20, samples=1)
+    assert state() == before
+    assert (tmp_path / "p.png").stat().st_size > 10_000
+
+
+def test_examples_run(tmp_path, workbook, small_run):
+    said = run(EXAMPLES / "batch.py", workbook, tmp_path / "batch")
+    assert {path.name for path in (tmp_path / "batch").iterdir()} >= {"run.npz", "scanner.blend", "scanner_mphdrr"}
+    assert "Traceback" not in said.stderr
+    assert "modules" in run(EXAMPLES / "package.py").stdout
+    assert "projections" in run(EXAMPLES / "read_run.py", small_run).stdout

@@ -1,0 +1,213 @@
+"""Projections from the scene: the operator gives what core gives, as images and as a file."""
+
+from __future__ import annotations
+
+import threading
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+bpy = pytest.importorskip("bpy")
+
+from mphdrr.addon import ids, images, jobs, scanner, storage, volumes  # noqa: E402
+from mphdrr.core import memory  # noqa: E402
+from mphdrr.core.errors import InputError  # noqa: E402
+from mphdrr.core.mosaic import as_seen  # noqa: E402
+from mphdrr.core.progress import Cancelled  # noqa: E402
+from mphdrr.core.projector import Projector  # noqa: E402
+from mphdrr.core.system import PinholeSystem  # noqa: E402
+
+
+@pytest.fixture
+def scanned(scene, ring_system) -> PinholeSystem:
+    """A scene with a scanner of eight modules and a small phantom, off centre and turned."""
+    scanner.build_scanner(scene, ring_system, "Ring")
+    bpy.ops.mphdrr.add_derenzo(voxels=32, location=(5, -3, 2), phi=0.2, theta=0.3)
+    return ring_system
+
+
+def _ours() -> list[str]:
+    return sorted(image.name for image in bpy.data.images if image.name.startswith("mphDRR"))
+
+
+@pytest.mark.parametrize("detector", ["VIRTUAL", "REAL"])
+def test_images_hold_exactly_what_core_projects(scanned, scene, detector):
+    assert bpy.ops.mphdrr.render_projections(width=24, height=20, detector=detector) == {"FINISHED"}
+    volume = volumes.volume_from_object(bpy.data.objects["Derenzo"])
+    views = scanned.views((20, 24), detector.lower())
+    expected = Projector(volume.grid, views)(volume)
+    assert expected.max() > 0
+    for m, number in enumerate(scanned.numbers):
+        image = bpy.data.images[ids.projection_name(number, 8)]
+        assert image.colorspace_settings.name == "Non-Color" and tuple(image.size) == (24, 20) and image.is_float
+        assert np.array_equal(images.projection_array(image), expected[m])
+
+
+def test_images_are_shown_as_the_pinhole_sees_them(scanned):
+    bpy.ops.mphdrr.render_projections(width=24, height=20)
+    volume = volumes.volume_from_object(bpy.data.objects["Derenzo"])
+    expected = as_seen(Projector(volume.grid, scanned[2].views((20, 24)))(volume)[0])
+    image = bpy.data.images[ids.projection_name(scanned.numbers[2], 8)]
+    pixels = np.array(image.pixels[:], np.float32).reshape(20, 24, 4)[::-1]  # Blender's rows start at the bottom
+    for channel in range(3):
+        assert np.array_equal(pixels[..., channel], expected)
+    assert np.all(pixels[..., 3] == 1)
+
+
+def test_rendering_again_replaces_the_images(scanned):
+    bpy.ops.mphdrr.render_projections(width=24, height=20)
+    first = _ours()
+    assert len(first) == 9  # eight modules and the mosaic
+    bpy.ops.mphdrr.render_projections(width=16, height=16)
+    assert _ours() == first and tuple(bpy.data.images[first[0]].size) == (16, 16)
+    bpy.ops.mphdrr.render_projections(width=16, height=16, first=3, last=4)
+    assert len(_ours()) == 3
+
+
+def test_images_and_arrays_survive_save_and_reopen(scanned, scene, tmp_path):
+    from mphdrr.core.export import read_run
+
+    bpy.ops.mphdrr.render_projections(width=24, height=20)
+    name = ids.projection_name(scanned.numbers[0], 8)
+    before = images.projection_array(bpy.data.images[name])
+    bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "study.blend"))
+    bpy.ops.wm.open_mainfile(filepath=str(tmp_path / "study.blend"))
+    assert np.array_equal(images.projection_array(bpy.data.images[name]), before)
+    run_file = bpy.context.scene.mphdrr_projections.run_file
+    assert run_file == "//study_mphdrr/Scene-projections.h5"
+    run = read_run(storage.absolute(run_file))
+    assert np.array_equal(run.projections[0], before)
+    assert run.settings["phantom"] == "derenzo" and run.settings["rod_diameters_mm"] == [8, 6, 5, 4, 3, 2]
+    # The reopened scene can be projected again, to the last bit.
+    bpy.ops.mphdrr.render_projections(width=24, height=20)
+    assert np.array_equal(images.projection_array(bpy.data.images[name]), before)
+
+
+def test_run_file_is_found_after_save_as_elsewhere(scanned, tmp_path):
+    bpy.ops.mphdrr.render_projections(width=8, height=8)
+    bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "a.blend"))
+    (tmp_path / "sub").mkdir()
+    bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "sub" / "b.blend"))
+    assert storage.absolute(bpy.context.scene.mphdrr_projections.run_file).is_file()
+    bpy.ops.wm.open_mainfile(filepath=str(tmp_path / "sub" / "b.blend"))
+    run_file = bpy.context.scene.mphdrr_projections.run_file
+    assert run_file.startswith("//") and storage.absolute(run_file).is_file()
+
+
+def test_settings_left_out_are_those_of_the_panel(scanned, scene):
+    scene.mphdrr_projections.width = 12
+    scene.mphdrr_projections.height = 10
+    scene.mphdrr_projections.last = 2
+    bpy.ops.mphdrr.render_projections(height=14)
+    assert len(_ours()) == 3 and tuple(bpy.data.images[_ours()[0]].size) == (12, 14)
+
+
+def test_moved_phantom_is_projected_where_it_is(scanned):
+    bpy.ops.mphdrr.render_projections(width=24, height=20)
+    name = ids.projection_name(scanned.numbers[0], 8)
+    before = images.projection_array(bpy.data.images[name])
+    bpy.data.objects["Derenzo"].location.z += 10
+    bpy.ops.mphdrr.render_projections(width=24, height=20)
+    after = images.projection_array(bpy.data.images[name])
+    rows = np.arange(20)[:, None]
+    assert (after * rows).sum() / after.sum() > (before * rows).sum() / before.sum() + 0.5
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"first": 900, "last": 910}, "no module is numbered 900"),
+        ({"volume": "Nope"}, "no volume is named 'Nope'; there are: Derenzo"),
+        ({"width": 300, "height": 300}, "8 images of 300 x 300 pixels needs? .* of memory"),
+    ],
+)
+def test_wrong_settings_are_one_clear_line_and_change_nothing(scanned, settings, message, monkeypatch):
+    monkeypatch.setattr(memory, "available", lambda: 2**20)
+    with pytest.raises(RuntimeError, match=message):
+        bpy.ops.mphdrr.render_projections(**settings)
+    assert _ours() == [] and not bpy.context.scene.mphdrr_projections.run_file
+
+
+def test_no_scanner_and_no_volume_are_clear_errors(scene, ring_system):
+    with pytest.raises(RuntimeError, match="no scanner in the scene"):
+        bpy.ops.mphdrr.render_projections()
+    scanner.build_scanner(scene, ring_system, "Ring")
+    with pytest.raises(RuntimeError, match="no volume in the scene"):
+        bpy.ops.mphdrr.render_projections()
+
+
+def test_missing_voxels_leave_the_last_run(scanned):
+    bpy.ops.mphdrr.render_projections(width=8, height=8)
+    volumes.file_of(bpy.data.objects["Derenzo"]).unlink()
+    with pytest.raises(RuntimeError, match="gone"):
+        bpy.ops.mphdrr.render_projections(width=8, height=8)
+    assert len(_ours()) == 9 and Path(bpy.context.scene.mphdrr_projections.run_file).is_file()
+
+
+def test_foreign_image_of_the_same_name_is_kept(scanned):
+    foreign = bpy.data.images.new("mphDRR 01", 4, 4)
+    bpy.ops.mphdrr.render_projections(width=8, height=8)
+    assert tuple(foreign.size) == (4, 4) and foreign.name != "mphDRR 01"
+    assert tuple(bpy.data.images["mphDRR 01"].size) == (8, 8)
+
+
+def _run_in_thread(work) -> jobs._Run:
+    run = jobs._Run(jobs.Job("Test", work, lambda result: ""))
+    run.start()
+    return run
+
+
+def test_job_stops_at_its_next_step_when_cancelled():
+    reached, go_on = threading.Event(), threading.Event()
+
+    def work(progress):
+        progress(1, 2)
+        reached.set()
+        go_on.wait(5)
+        progress(2, 2)
+
+    run = _run_in_thread(work)
+    assert reached.wait(5)
+    run.cancel.set()
+    go_on.set()
+    run.thread.join(5)
+    assert isinstance(run.error, Cancelled) and not run.alive and (run.done, run.total) == (2, 2)
+
+
+def test_stop_ends_the_thread_of_the_running_job(monkeypatch):
+    def work(progress):
+        while True:
+            progress(0, 1)
+
+    run = _run_in_thread(work)
+    monkeypatch.setattr(jobs, "_current", run)
+    state = bpy.context.window_manager.mphdrr_job
+    assert state.running and state.label == "Test"
+    jobs.stop()
+    assert not run.alive and not state.running and state.progress == 0
+
+
+def test_loading_a_file_ends_the_running_job(monkeypatch):
+    def work(progress):
+        while True:
+            progress(0, 1)
+
+    run = _run_in_thread(work)
+    monkeypatch.setattr(jobs, "_current", run)
+    bpy.ops.wm.read_homefile(use_factory_startup=True)
+    assert not run.alive and not jobs.is_running()
+
+
+@pytest.mark.parametrize(
+    ("error", "message"),
+    [(InputError("the very line"), "the very line"), (MemoryError(), "not enough memory"), (KeyError("x"), "KeyError")],
+)
+def test_errors_in_the_work_become_readable_reports(scanned, monkeypatch, error, message):
+    def fail(*_):
+        raise error
+
+    monkeypatch.setattr(volumes, "reader", lambda item: fail)
+    with pytest.raises(RuntimeError, match=message):
+        bpy.ops.mphdrr.render_projections(width=8, height=8)
+    assert _ours() == []

@@ -1,0 +1,270 @@
+"""Volumes in the scene: exact voxels, exact places, files that stay with the .blend."""
+
+from __future__ import annotations
+
+import itertools
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+bpy = pytest.importorskip("bpy")
+
+from mathutils import Matrix  # noqa: E402
+
+from mphdrr.addon import compat, volume_materials, volumes  # noqa: E402
+from mphdrr.core.errors import InputError  # noqa: E402
+from mphdrr.core.frames import euler_pose  # noqa: E402
+from mphdrr.core.grid import Grid  # noqa: E402
+from mphdrr.core.phantoms.derenzo import DerenzoPhantom  # noqa: E402
+from mphdrr.core.volume import Volume  # noqa: E402
+
+SHEAR = np.array([[1.0, 0.3, 0.0, 0.0], [0.0, 1.0, -0.2, 0.0], [0.0, 0.0, 1.0, 0.0], [0.0, 0.0, 0.0, 1.0]])
+AFFINES = {
+    "isotropic": np.diag([2.0, 2.0, 2.0, 1.0]),
+    "anisotropic": np.diag([0.703, 0.703, 2.5, 1.0]),
+    "rotated": euler_pose(0.4, 0.7, -0.3, (30.0, -20.0, 10.0)) @ np.diag([1.0, 2.0, 3.0, 1.0]),
+    "sheared": euler_pose(0.4, 0.7, -0.3, (5.0, 6.0, 7.0)) @ SHEAR @ np.diag([2.0, 1.5, 1.0, 1.0]),
+    "mirrored": euler_pose(0.1, -0.2, 0.5, (-4.0, 1.0, 2.0)) @ np.diag([-1.5, 2.0, 1.0, 1.0]),
+}
+
+
+@pytest.fixture
+def sparse_volume() -> Volume:
+    """Voxels with zeros, negative, tiny and huge values, in a rotated anisotropic grid."""
+    rng = np.random.default_rng(0)
+    array = rng.normal(size=(21, 14, 9)).astype(np.float32)
+    array[3:9] = 0.0
+    array[0, 0, 0] = 1e-30
+    array[-1, -1, -1] = 3e30
+    return Volume(array, Grid(array.shape, AFFINES["rotated"]), "mu")
+
+
+@pytest.mark.parametrize("name", AFFINES)
+def test_volume_comes_back_from_its_object_exactly(name, sparse_volume):
+    volume = Volume(sparse_volume.array, Grid(sparse_volume.grid.shape, AFFINES[name]), "mu")
+    item = volumes.add_volume(volume, "Sample")
+    back = volumes.volume_from_object(item)
+    assert np.array_equal(back.array, volume.array) and back.quantity == "mu"
+    np.testing.assert_allclose(back.grid.affine, volume.grid.affine, rtol=0, atol=1e-12)
+
+
+def test_volume_comes_back_after_save_and_reopen(tmp_path, sparse_volume):
+    volumes.add_volume(sparse_volume, "Sample")
+    bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "study.blend"))
+    bpy.ops.wm.open_mainfile(filepath=str(tmp_path / "study.blend"))
+    item = bpy.data.objects["Sample"]
+    back = volumes.volume_from_object(item)
+    assert np.array_equal(back.array, sparse_volume.array)
+    np.testing.assert_allclose(back.grid.affine, sparse_volume.grid.affine, rtol=0, atol=1e-12)
+    assert item.data.filepath.startswith("//study_mphdrr/") and item.data.grids.load()
+
+
+def test_moving_the_object_moves_the_volume(sparse_volume):
+    item = volumes.add_volume(sparse_volume, "Sample")
+    move = euler_pose(0.5, 0.2, 0.1, (11.0, -7.0, 3.0))
+    item.matrix_world = Matrix(move) @ item.matrix_world
+    back = volumes.volume_from_object(item)
+    np.testing.assert_allclose(back.grid.affine, move @ sparse_volume.grid.affine, rtol=0, atol=1e-4)
+
+
+def test_unsaved_files_move_beside_the_blend_when_it_is_saved(tmp_path, sparse_volume):
+    item = volumes.add_volume(sparse_volume, "Sample")
+    assert Path(item.data.filepath).is_absolute() and Path(item.data.filepath).is_file()
+    bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "a.blend"))
+    assert item.data.filepath.startswith("//a_mphdrr/")
+    assert np.array_equal(volumes.volume_from_object(item).array, sparse_volume.array)
+    (tmp_path / "elsewhere").mkdir()
+    bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "elsewhere" / "b.blend"))
+    assert item.data.filepath.startswith("//")
+    assert np.array_equal(volumes.volume_from_object(item).array, sparse_volume.array)
+
+
+def test_saving_a_copy_leaves_the_session_usable(tmp_path, sparse_volume):
+    item = volumes.add_volume(sparse_volume, "Sample")
+    bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "copy.blend"), copy=True)
+    assert np.array_equal(volumes.volume_from_object(item).array, sparse_volume.array)
+    bpy.ops.wm.open_mainfile(filepath=str(tmp_path / "copy.blend"))
+    item = bpy.data.objects["Sample"]
+    assert item.data.filepath.startswith("//copy_mphdrr/")
+    assert np.array_equal(volumes.volume_from_object(item).array, sparse_volume.array)
+
+
+def test_large_volume_is_shown_coarser_but_kept_whole(monkeypatch):
+    monkeypatch.setattr(volumes, "MAX_SHOWN_VOXELS", 20**3)
+    array = np.random.default_rng(1).random((31, 32, 33), dtype=np.float32)
+    volume = Volume(array, Grid.centered(array.shape, 1.5, (1.0, 2.0, 3.0)), "activity")
+    item = volumes.add_volume(volume, "Large")
+    assert item.data.filepath.endswith(".preview.vdb")
+    assert np.array_equal(volumes.volume_from_object(item).array, array)
+    shown = volumes.read_vdb(Path(item.data.filepath))
+    assert shown.grid.shape == (16, 16, 17)
+    np.testing.assert_allclose(shown.array.sum() * 8, array.sum(), rtol=1e-5)
+    # The first block's middle is the corner between its eight voxels.
+    own = volumes.pose_of_object(item) @ shown.grid.affine
+    np.testing.assert_allclose(own[:3, 3], (volume.grid.affine @ [0.5, 0.5, 0.5, 1.0])[:3])
+
+
+def test_coarser_copy_moves_beside_the_blend_with_the_full_one(tmp_path, monkeypatch):
+    monkeypatch.setattr(volumes, "MAX_SHOWN_VOXELS", 10)
+    array = np.ones((8, 8, 8), np.float32)
+    item = volumes.add_volume(Volume(array, Grid.centered((8, 8, 8), 1.0)), "Large")
+    bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "a.blend"))
+    assert len(list((tmp_path / "a_mphdrr").iterdir())) == 2
+    assert np.array_equal(volumes.volume_from_object(item).array, array)
+
+
+def test_missing_voxels_are_a_clear_error(sparse_volume):
+    item = volumes.add_volume(sparse_volume, "Sample")
+    Path(item.data.filepath).unlink()
+    with pytest.raises(InputError, match="Sample.*gone"):
+        volumes.volume_from_object(item)
+    with pytest.raises(InputError, match="Cube.*no mphDRR volume"):
+        volumes.volume_from_object(bpy.data.objects["Cube"])
+
+
+def test_replacing_a_volume_leaves_no_orphans(sparse_volume):
+    item = volumes.add_volume(sparse_volume, "Sample")
+    before = len(bpy.data.volumes), len(bpy.data.materials)
+    other = Volume(sparse_volume.array[:5].copy(), Grid((5, 14, 9), np.eye(4)), "mu")
+    volumes.replace_volume(item, other)
+    assert (len(bpy.data.volumes), len(bpy.data.materials)) == before
+    assert volumes.volume_from_object(item).grid.shape == (5, 14, 9)
+
+
+@pytest.mark.parametrize("name", AFFINES)
+def test_blender_draws_a_voxel_where_its_index_says(name, scene):
+    """Cycles' picture of one bright voxel has its centroid at the voxel's centre, to a hundredth of a voxel."""
+    affine = AFFINES[name]
+    array = np.zeros((9, 7, 6), np.float32)
+    array[5, 2, 3] = 1.0
+    item = volumes.add_volume(Volume(array, Grid(array.shape, affine), "activity"), "Voxel")
+    _only_emission(item)
+    middle = (affine @ [5, 2, 3, 1])[:3]
+    reach = float(np.abs(affine[:3, :3]).sum(axis=1).max())
+    found = np.empty(3)
+    for axes in ((0, 1), (2, 1)):
+        found[list(axes)] = _centroid(scene, axes, middle + 0.137, 4 * reach)
+    error = np.linalg.inv(affine[:3, :3]) @ (found - middle)
+    assert np.abs(error).max() < 0.01, f"off by {error} voxels"
+
+
+def _only_emission(item):
+    tree = item.data.materials[0].node_tree
+    tree.nodes.clear()
+    attribute = tree.nodes.new("ShaderNodeAttribute")
+    attribute.attribute_name = "activity"
+    emission = tree.nodes.new("ShaderNodeEmission")
+    output = tree.nodes.new("ShaderNodeOutputMaterial")
+    tree.links.new(attribute.outputs["Fac"], emission.inputs["Strength"])
+    tree.links.new(emission.outputs[0], output.inputs["Volume"])
+
+
+def _centroid(scene, axes, aim, width, pixels=64):
+    """Centroid along two world axes (picture right, picture up) of Cycles' orthographic picture, mm."""
+    for other in list(scene.objects):
+        if other.type != "VOLUME":
+            bpy.data.objects.remove(other)
+    camera = bpy.data.objects.new("Camera", bpy.data.cameras.new("Camera"))
+    scene.collection.objects.link(camera)
+    scene.camera = camera
+    camera.data.type = "ORTHO"
+    camera.data.ortho_scale = width
+    camera.data.clip_end = 1000.0
+    right, up = (np.eye(3)[a] for a in axes)
+    back = np.cross(right, up)
+    pose = np.eye(4)
+    pose[:3, :3] = np.stack([right, up, back], axis=1)
+    pose[:3, 3] = aim + 200.0 * back
+    camera.matrix_world = Matrix(pose)
+    scene.world = None
+    scene.render.engine = "CYCLES"
+    scene.cycles.samples = 64
+    scene.cycles.use_denoising = False
+    scene.cycles.pixel_filter_type = "BOX"
+    scene.cycles.volume_step_rate = 0.25
+    scene.render.resolution_x = scene.render.resolution_y = pixels
+    scene.render.resolution_percentage = 100
+    scene.view_settings.view_transform = "Raw"
+    scene.render.image_settings.file_format = "OPEN_EXR"
+    scene.render.image_settings.color_depth = "32"
+    path = Path(bpy.app.tempdir) / f"voxel{axes[0]}.exr"
+    scene.render.filepath = str(path)
+    bpy.ops.render.render(write_still=True)
+    image = bpy.data.images.load(str(path))
+    picture = np.empty(4 * pixels * pixels, np.float32)
+    image.pixels.foreach_get(picture)
+    bpy.data.images.remove(image)
+    path.unlink()
+    picture = picture.reshape(pixels, pixels, 4)[:, :, 0]
+    assert picture.sum() > 0
+    place = ((np.arange(pixels) + 0.5) / pixels - 0.5) * width
+    across = (picture.sum(axis=0) @ place) / picture.sum()
+    upward = (picture.sum(axis=1) @ place) / picture.sum()
+    return aim[axes[0]] + across, aim[axes[1]] + upward
+
+
+def test_derenzo_operator_makes_the_phantom_of_core(scene):
+    rods, pose = (8.0, 6.0, 5.0, 4.0, 3.0, 2.0), euler_pose(0.3, 0.2, 0.1, (4.0, 5.0, 6.0))
+    result = bpy.ops.mphdrr.add_derenzo(
+        radius=40, rod_diameters=rods, height=30, activity=50, voxels=64, voxel_size=1.5,
+        location=(4, 5, 6), phi=0.3, theta=0.2, psi=0.1,
+    )  # fmt: skip
+    assert result == {"FINISHED"}
+    item = bpy.context.object
+    volume = volumes.volume_from_object(item)
+    grid = Grid.centered((64, 64, 64), 1.5)
+    expected = DerenzoPhantom(40.0, rods, 30.0, 50.0).voxelize(grid)
+    assert np.array_equal(volume.array, expected.array)
+    np.testing.assert_allclose(volume.grid.affine, pose @ grid.affine, atol=1e-5)
+    assert item.mphdrr_volume.kind == "DERENZO" and item.mphdrr_volume.derenzo.radius == 40
+    assert item.data.grids.load() and not item.data.grids.error_message
+
+
+def test_derenzo_update_remakes_the_voxels_in_place():
+    bpy.ops.mphdrr.add_derenzo(voxels=32, location=(10, 0, 0))
+    item = bpy.context.object
+    item.mphdrr_volume.derenzo.radius = 30
+    assert bpy.ops.mphdrr.update_derenzo() == {"FINISHED"}
+    assert item.mphdrr_volume.spacing[0] == pytest.approx(60 / 30)
+    np.testing.assert_allclose(volumes.volume_from_object(item).grid.center, (10, 0, 0), atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [({"rod_diameters": (0.0,) * 6}, "rod"), ({"voxels": 4096}, "memory"), ({"radius": 1.0}, "rod")],
+)
+def test_derenzo_refuses_in_one_line_and_adds_nothing(settings, message):
+    before = len(bpy.data.objects), len(bpy.data.volumes)
+    with pytest.raises(RuntimeError, match=message):
+        bpy.ops.mphdrr.add_derenzo(**settings)
+    assert (len(bpy.data.objects), len(bpy.data.volumes)) == before
+
+
+def test_material_scale_follows_the_data(sparse_volume):
+    item = volumes.add_volume(sparse_volume, "Sample")
+    nodes = item.data.materials[0].node_tree.nodes
+    assert nodes["Full Scale"].outputs[0].default_value == pytest.approx(3e30)
+    assert item.data.render.clipping == 0.0
+
+
+def test_volumes_are_within_eevees_reach(scene):
+    volume_materials.show_in_eevee(scene)
+    assert not scene.eevee.use_volume_custom_range or scene.eevee.volumetric_end > 1000
+    scene.eevee.use_volume_custom_range = True
+    scene.eevee.volumetric_end = 321.0
+    volume_materials.show_in_eevee(scene)
+    assert scene.eevee.use_volume_custom_range and scene.eevee.volumetric_end == 321.0
+
+
+def test_volume_drawn_for_another_blender_is_rewritten_on_load(tmp_path, sparse_volume, monkeypatch):
+    other = -0.5 - compat.VDB_CENTER_SHIFT
+    monkeypatch.setattr(volumes, "VDB_CENTER_SHIFT", other)
+    volumes.add_volume(sparse_volume, "Sample")
+    bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "a.blend"))
+    monkeypatch.setattr(volumes, "VDB_CENTER_SHIFT", compat.VDB_CENTER_SHIFT)
+    bpy.ops.wm.open_mainfile(filepath=str(tmp_path / "a.blend"))
+    item = bpy.data.objects["Sample"]
+    assert item.mphdrr_volume.center_shift == compat.VDB_CENTER_SHIFT
+    assert np.array_equal(volumes.volume_from_object(item).array, sparse_volume.array)
+    assert len({p.name for p in itertools.chain((tmp_path / "a_mphdrr").iterdir())}) == 2

@@ -6,7 +6,7 @@ arrays', start at the bottom). Module images hold the exact float32 values in R,
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Generator, Iterable
 
 import bpy
 import numpy as np
@@ -16,6 +16,7 @@ from ..core.mosaic import as_seen, mosaic
 from . import ids
 
 _KEY = "mphdrr_projection"  # custom property: marks the images that a new run replaces
+_MOSAIC_PIXELS = 6e6  # 80 views of 256 x 256 are shown pixel by pixel, larger ones reduced
 
 
 def store_projections(projections: NDArray[np.float32], numbers: Iterable[int], columns: int = 20) -> bpy.types.Image:
@@ -35,16 +36,42 @@ def store_projections(projections: NDArray[np.float32], numbers: Iterable[int], 
     Image
         The mosaic, scaled so that its largest value is white.
     """
+    steps = storing(projections, numbers, columns)
+    while True:
+        try:
+            next(steps)
+        except StopIteration as end:
+            return end.value
+
+
+def storing(
+    projections: NDArray[np.float32], numbers: Iterable[int], columns: int = 20
+) -> Generator[None, None, bpy.types.Image]:
+    """`store_projections` in small steps, so that a window can be drawn in between; returns the mosaic."""
     numbers = [int(number) for number in numbers]
     names = [ids.projection_name(number, max(numbers)) for number in numbers]
     for picture, name in zip(as_seen(projections), names, strict=True):
         _store(name, picture, exact=True)
-    sheet = np.maximum(mosaic(projections, columns), 0.0)
+        yield
+    sheet = np.maximum(mosaic(_reduced(projections, columns), columns), 0.0)
+    yield
     image = _store(ids.MOSAIC, sheet / (float(sheet.max(initial=0.0)) or 1.0), exact=False)
     kept = {*names, ids.MOSAIC}
     for other in [image for image in bpy.data.images if _KEY in image and image.name not in kept]:
         bpy.data.images.remove(other)
     return image
+
+
+def _reduced(projections: NDArray[np.float32], columns: int) -> NDArray[np.float32]:
+    """Means over blocks of pixels where the mosaic would get too large to look at."""
+    count, n_v, n_u = projections.shape
+    pixels = -(-count // columns) * columns * n_v * n_u
+    factor = min(int(np.ceil(np.sqrt(pixels / _MOSAIC_PIXELS))), n_v, n_u)
+    if factor <= 1:
+        return projections
+    rows, width = n_v // factor, n_u // factor
+    blocks = projections[:, : rows * factor, : width * factor].reshape(count, rows, factor, width, factor)
+    return blocks.mean(axis=(2, 4), dtype=np.float32)
 
 
 def projection_array(image: bpy.types.Image) -> NDArray[np.float32]:

@@ -9,9 +9,10 @@ from __future__ import annotations
 
 import sys
 import threading
+import time
 import traceback
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Generator
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -24,6 +25,7 @@ from . import ids
 from .reports import warnings_reported
 
 _INTERVAL = 0.1  # s between two looks at the thread
+_STEP = 0.05  # s of the main thread's time for finishing, each time
 _PATIENCE = 10.0  # s that stopping waits for a thread
 
 
@@ -39,12 +41,13 @@ class Job:
         ``work(progress)`` runs in a thread and must not touch bpy. It calls ``progress(done, total)`` between its
         steps, where `Cancelled` is raised when the user wants so.
     finish : callable
-        ``finish(result)`` runs in Blender's main thread and returns the line to report.
+        ``finish(result)`` is a generator that runs in Blender's main thread: it yields between small steps, so that
+        the window can be drawn, and returns the line to report.
     """
 
     label: str
     work: Callable[[Progress], Any]
-    finish: Callable[[Any], str]
+    finish: Callable[[Any], Generator[None, None, str]]
 
 
 @dataclass
@@ -73,7 +76,7 @@ class _Run:
             with warnings.catch_warnings(record=True) as self.caught:
                 warnings.simplefilter("always", InputWarning)
                 self.result = self.job.work(self._progress)
-        except BaseException as error:  # noqa: BLE001  (reported by the main thread)
+        except BaseException as error:
             self.error = error
 
     def _progress(self, done: int, total: int) -> None:
@@ -140,6 +143,7 @@ class JobOperator:
     """Mix into an operator and implement `job`; add nothing else but properties."""
 
     _run: _Run | None = None
+    _finishing: Generator[None, None, str] | None = None
     _timer: bpy.types.Timer | None = None
 
     def job(self, context: bpy.types.Context) -> Job:
@@ -154,8 +158,8 @@ class JobOperator:
             job = self.job(context)
             with warnings_reported(self):
                 result = job.work(_console(job.label) if bpy.app.background else _cursor(context))
-            self.report({"INFO"}, job.finish(result))
-        except BaseException as error:  # noqa: BLE001
+            self.report({"INFO"}, _last(job.finish(result)))
+        except BaseException as error:
             return self._failed(error)
         finally:
             context.window_manager.progress_end()
@@ -170,7 +174,7 @@ class JobOperator:
             return {"CANCELLED"}
         try:
             self._run = _current = _Run(self.job(context))
-        except Exception as error:  # noqa: BLE001
+        except Exception as error:
             return self._failed(error)
         self._run.start()
         manager = context.window_manager
@@ -191,19 +195,27 @@ class JobOperator:
         _redraw(context)
         if run.alive:
             return {"PASS_THROUGH"}
-        self._end(context)
-        for warning in run.caught:
-            if issubclass(warning.category, InputWarning):
-                self.report({"WARNING"}, str(warning.message))
-        if run.error is None and run.cancel.is_set():
-            run.error = Cancelled()
-        if run.error is not None:
-            return self._failed(run.error)
+        if self._finishing is None:
+            for warning in run.caught:
+                if issubclass(warning.category, InputWarning):
+                    self.report({"WARNING"}, str(warning.message))
+            error = run.error or (Cancelled() if run.cancel.is_set() else None)
+            if error is not None:
+                self._end(context)
+                return self._failed(error)
+            self._finishing = run.job.finish(run.result)
         try:
-            self.report({"INFO"}, run.job.finish(run.result))
-        except Exception as error:  # noqa: BLE001
+            enough = time.perf_counter() + _STEP
+            while time.perf_counter() < enough:
+                next(self._finishing)
+        except StopIteration as end:
+            self._end(context)
+            self.report({"INFO"}, end.value)
+            return {"FINISHED"}
+        except Exception as error:
+            self._end(context)
             return self._failed(error)
-        return {"FINISHED"}
+        return {"PASS_THROUGH"}
 
     def cancel(self, context: bpy.types.Context) -> None:
         """Blender ends the operator: its window closes, or another file is loaded."""
@@ -239,7 +251,7 @@ class MPHDRR_OT_cancel_job(bpy.types.Operator):
     bl_idname = ids.CANCEL_JOB
     bl_label = "Cancel"
     bl_description = "Stop the running job; the scene stays as it was"
-    bl_options = {"INTERNAL"}  # noqa: RUF012
+    bl_options = {"INTERNAL"}
 
     @classmethod
     def poll(cls, context: bpy.types.Context) -> bool:
@@ -250,15 +262,22 @@ class MPHDRR_OT_cancel_job(bpy.types.Operator):
         return {"FINISHED"}
 
 
-def draw_job(layout: bpy.types.UILayout, context: bpy.types.Context) -> bool:
-    """Draw the running job's progress bar and Cancel button; False where there is none."""
+def draw_job(layout: bpy.types.UILayout, context: bpy.types.Context) -> None:
+    """Draw the running job's progress bar and Cancel button; nothing where there is none."""
     if not is_running():
-        return False
+        return
     state = getattr(context.window_manager, ids.WINDOW_JOB)
     row = layout.row(align=True)
     row.progress(factor=state.progress, type="BAR", text=f"{state.label}  {state.progress:.0%}")
     row.operator(ids.CANCEL_JOB, text="", icon="CANCEL")
-    return True
+
+
+def _last(steps: Generator[None, None, str]) -> str:
+    while True:
+        try:
+            next(steps)
+        except StopIteration as end:
+            return end.value
 
 
 def _redraw(context: bpy.types.Context) -> None:

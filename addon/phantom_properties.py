@@ -25,14 +25,20 @@ from ..core.volume import UNITS
 class DerenzoSettings:
     """A Derenzo phantom's numbers; mixed into the operator and into the object's properties."""
 
-    radius: FloatProperty(name="Radius", description="Radius of the phantom in mm", default=40.0, min=0.1, soft_max=200.0)
+    radius: FloatProperty(
+        name="Radius", description="Radius of the phantom in mm", default=40.0, min=0.1, soft_max=200.0
+    )
     rod_diameters: FloatVectorProperty(
         name="Rods", description="Rod diameter in mm of each of the six sectors; 0 leaves a sector empty",
         size=6, default=(8.0, 6.0, 5.0, 4.0, 3.0, 2.0), min=0.0, soft_max=30.0,
     )  # fmt: skip
     height: FloatProperty(name="Height", description="Length of the rods in mm", default=40.0, min=0.1, soft_max=400.0)
     activity: FloatProperty(
-        name="Activity", description="Activity concentration in the rods in kBq/mL", default=100.0, min=1e-6, soft_max=1e4
+        name="Activity",
+        description="Activity concentration in the rods in kBq/mL",
+        default=100.0,
+        min=1e-6,
+        soft_max=1e4,
     )
     voxels: IntProperty(
         name="Voxels", description="Voxels along each side of the grid", default=128, min=4, soft_max=512, max=4096
@@ -45,7 +51,10 @@ class DerenzoSettings:
     def phantom(self) -> DerenzoPhantom:
         """The phantom; float32 settings are read as the decimal numbers that the user typed."""
         return DerenzoPhantom(
-            _typed(self.radius), tuple(_typed(w) for w in self.rod_diameters), _typed(self.height), _typed(self.activity)
+            _typed(self.radius),
+            tuple(_typed(w) for w in self.rod_diameters),
+            _typed(self.height),
+            _typed(self.activity),
         )
 
     def grid(self) -> Grid:
@@ -75,7 +84,7 @@ class DerenzoSettings:
         column = layout.column(align=True)
         column.prop(self, "radius", text="Radius (mm)")
         column.prop(self, "height", text="Height (mm)")
-        column.prop(self, "activity", text="Activity (kBq/mL)")
+        column.prop(self, "activity", text="kBq/mL")
         grid = layout.column(align=True)
         grid.use_property_split = False
         grid.label(text="Rod diameters (mm)")

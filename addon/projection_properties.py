@@ -53,7 +53,9 @@ class ProjectionProperties(ProjectionSettings, bpy.types.PropertyGroup):
         poll=_is_ours,
     )  # fmt: skip
     run_file: StringProperty(
-        name="Run", description="File with the last run's exact arrays", subtype="FILE_PATH",
+        name="Run",
+        description="File with the last run's exact arrays",
+        subtype="FILE_PATH",
         options={"HIDDEN", "PATH_SUPPORTS_BLEND_RELATIVE"},
     )
     run_summary: StringProperty(name="Last Run", description="What the last run was", options={"HIDDEN"})

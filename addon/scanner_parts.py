@@ -62,6 +62,8 @@ class NewScanner:
         self.roi = self._keep(bpy.data.objects.new("ROI", mesh), "ROI")
         self.roi.mphdrr_module.part = "ROI"
         self.roi.hide_select = True
+        # Circles: the solid viewport draws no volume behind or inside a transparent surface. Renders show the sphere.
+        self.roi.display_type, self.roi.display_bounds_type = "BOUNDS", "SPHERE"
         self.roi.lock_location = self.roi.lock_rotation = self.roi.lock_scale = (True, True, True)
         self.roi.visible_shadow = False
 

@@ -6,17 +6,20 @@ import bpy
 
 from .compat import enable_nodes
 
-# Positions and colours (linear RGB) of the ramp: Matplotlib's "inferno" (CC0), perceptually even, without its black end.
+# Positions and colours (linear RGB) of the ramp: Matplotlib's "inferno" (CC0), perceptually even, without its pale end,
+# which tone mapping bleaches.
 _INFERNO = (
     (0.00, (0.0119, 0.0025, 0.0461)),
     (0.25, (0.0953, 0.0052, 0.1513)),
     (0.50, (0.5034, 0.0382, 0.0886)),
-    (0.75, (0.9436, 0.2483, 0.0103)),
-    (1.00, (0.9734, 0.8559, 0.2513)),
+    (0.75, (0.8879, 0.1413, 0.0178)),
+    (1.00, (0.9200, 0.4600, 0.0220)),
 )
 # Extinction times the volume's size: high enough that a rod of a twentieth of it looks solid.
 _OPACITY = 60.0
 _BRIGHTNESS = 1.0
+# The same for the solid viewport, whose smoke is denser and has no shading: thin enough that rods show behind rods.
+_SMOKE = 15.0
 
 
 def new_material(name: str, grid: str, maximum: float, size: float) -> bpy.types.Material:
@@ -79,13 +82,13 @@ def new_material(name: str, grid: str, maximum: float, size: float) -> bpy.types
     link(absorption.outputs[0], both.inputs[0])
     link(emission.outputs[0], both.inputs[1])
     link(both.outputs[0], output.inputs["Volume"])
-    material.diffuse_color = (*_INFERNO[3][1], 1.0)
+    material.diffuse_color = (*_INFERNO[-1][1], 1.0)  # of the solid viewport's smoke
     return material
 
 
 def set_display(data: bpy.types.Volume, maximum: float, size: float) -> None:
     """Make the solid viewport draw the volume's values as smoke of a useful density."""
-    data.display.density = _OPACITY / size / maximum
+    data.display.density = _SMOKE / size / maximum
     data.display.wireframe_type = "NONE"
     data.display.interpolation_method = "LINEAR"
 

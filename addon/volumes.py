@@ -254,7 +254,9 @@ def _volume_data(
     try:
         data.filepath = storage.stored_path(path)
         if not data.grids.load() or data.grids.error_message:
-            raise InputError(f"{path}: Blender cannot load the volume ({data.grids.error_message or 'no reason given'})")
+            raise InputError(
+                f"{path}: Blender cannot load the volume ({data.grids.error_message or 'no reason given'})"
+            )
         if volume.quantity not in data.grids:
             raise InputError(f"{path}: Blender finds no grid {volume.quantity!r} in it")
     except Exception:

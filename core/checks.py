@@ -36,6 +36,8 @@ def real_array(value: ArrayLike, name: str, shape: tuple[int | None, ...], dtype
         array = np.array(raw, dtype=dtype, order="C")
     except (TypeError, ValueError, OverflowError):
         raise InputError(f"{name}: expected real numbers, got {type(value).__name__} {_short(value)}") from None
+    except RuntimeError as error:  # a torch tensor that is part of a graph: torch says what to do
+        raise InputError(f"{name}: {error}") from None
     if array.ndim != len(shape) or any(n is not None and n != m for n, m in zip(shape, array.shape, strict=True)):
         expected = " x ".join("any" if n is None else str(n) for n in shape) or "one number"
         raise InputError(f"{name}: expected shape {expected}, got {_shape(array.shape)}")

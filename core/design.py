@@ -8,7 +8,7 @@ from numpy.typing import ArrayLike, NDArray
 from .errors import InputError
 
 
-def collimator_length(b: ArrayLike, d: ArrayLike, Ld: ArrayLike, R: ArrayLike) -> NDArray[np.float64]:  # noqa: N803
+def collimator_length(b: ArrayLike, d: ArrayLike, Ld: ArrayLike, R: ArrayLike) -> NDArray[np.float64]:
     """Collimator length l, mm, at which the module's field of view is tangent to the ROI sphere.
 
     With ``s = (Ld - d) / (2 l)`` tangency means ``b s - d/2 = R sqrt(1 + s^2)``, hence
@@ -35,7 +35,7 @@ def collimator_length(b: ArrayLike, d: ArrayLike, Ld: ArrayLike, R: ArrayLike) -
     InputError
         A number is not finite or out of its range.
     """
-    b, d, Ld, R = np.broadcast_arrays(*(np.asarray(x, dtype=np.float64) for x in (b, d, Ld, R)))  # noqa: N806
+    b, d, Ld, R = np.broadcast_arrays(*(np.asarray(x, dtype=np.float64) for x in (b, d, Ld, R)))
     for name, value, good in (
         ("d, the pinhole diameter,", d, d > 0),
         ("Ld, the crystal's side,", Ld, Ld > d),

@@ -31,8 +31,7 @@ def replacing(path: str | os.PathLike[str]) -> Iterator[Path]:
         The folder is missing or cannot be written, the path is a folder, or the disk is full.
     """
     target = Path(path).absolute()
-    if target.is_dir():
-        raise InputError(f"{target}: is a folder; expected the name of a file to write")
+    refuse_folder(target)
     if not target.parent.is_dir():
         raise InputError(f"{target.parent}: no such folder; make it first or choose another")
     temporary = target.with_name(f".{uuid.uuid4().hex[:8]}-{target.name}")
@@ -47,6 +46,16 @@ def replacing(path: str | os.PathLike[str]) -> Iterator[Path]:
         raise InputError(f"{target}: cannot be written ({error.strerror or error})") from error
     finally:
         temporary.unlink(missing_ok=True)
+
+
+def refuse_folder(path: Path) -> None:
+    """Raise `InputError` where `path` is a folder or cannot be the name of a file."""
+    try:
+        is_folder = path.is_dir()
+    except (OSError, ValueError) as error:  # too long, or holds a NUL
+        raise InputError(f"{str(path)!r}: not a file name ({getattr(error, 'strerror', None) or error})") from error
+    if is_folder:
+        raise InputError(f"{path}: is a folder; expected the name of a file to write")
 
 
 def ensure_folder(path: str | os.PathLike[str]) -> Path:

@@ -38,9 +38,7 @@ class Grid:
         object.__setattr__(self, "affine", freeze(checked_affine(self.affine, "grid affine")))
 
     @classmethod
-    def centered(
-        cls, shape: ArrayLike, spacing: ArrayLike, center: ArrayLike = (0.0, 0.0, 0.0)
-    ) -> Grid:
+    def centered(cls, shape: ArrayLike, spacing: ArrayLike, center: ArrayLike = (0.0, 0.0, 0.0)) -> Grid:
         """An axis-aligned grid whose middle lies at `center`.
 
         Parameters

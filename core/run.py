@@ -19,7 +19,6 @@ from .views import Views
 from .volume import Volume
 
 
-
 def versions() -> dict[str, str]:
     """Versions of mphDRR, Python and the packages that the numbers depend on."""
     found = {"mphdrr": VERSION, "python": platform.python_version(), "numpy": np.__version__}

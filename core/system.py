@@ -59,6 +59,8 @@ class PinholeSystem:
         if n == 0:
             raise InputError("a pinhole system needs at least one module, got none")
         numbers = np.arange(1, n + 1) if self.numbers is None else real_array(self.numbers, "numbers", (n,), np.int64)
+        if self.numbers is not None and not np.array_equal(numbers, self.numbers):
+            raise InputError("numbers: expected whole numbers")
         self._set("centers", centers)
         self._set("numbers", numbers)
         for name in _LENGTHS:
@@ -66,13 +68,17 @@ class PinholeSystem:
             if np.ndim(value) == 0:
                 value = np.full(n, real_array(value, name, ()))
             value = real_array(value, name, (n,))
-            self._refuse(value <= 0, lambda i, name=name, value=value: f"{name} must be more than 0 mm, got {value[i]:g}")
+            self._refuse(
+                value <= 0, lambda i, name=name, value=value: f"{name} must be more than 0 mm, got {value[i]:g}"
+            )
             self._set(name, value)
         b = self.pinhole_distance
         self._refuse(
             self.pinhole_diameter >= self.detector_side,
-            lambda i: f"pinhole_diameter {self.pinhole_diameter[i]:g} mm must be less than detector_side "
-            f"{self.detector_side[i]:g} mm",
+            lambda i: (
+                f"pinhole_diameter {self.pinhole_diameter[i]:g} mm must be less than detector_side "
+                f"{self.detector_side[i]:g} mm"
+            ),
         )
         self._refuse(
             b <= self.roi_radius,

@@ -5,8 +5,6 @@ from __future__ import annotations
 import json
 import math
 import os
-import zipfile
-import zlib
 from pathlib import Path
 
 import numpy as np
@@ -18,7 +16,7 @@ from .grid import Grid
 from .memory import require
 from .volume import UNITS, Volume
 
-_NIFTI = (".nii", ".nii.gz")
+VOLUME_FORMATS = (".nii", ".nii.gz", ".npz")
 _MILLIMETRES = {"unknown": 1.0, "mm": 1.0, "meter": 1000.0, "micron": 0.001}
 
 
@@ -46,7 +44,7 @@ def read_volume(path: str | os.PathLike[str], quantity: str | None = None) -> Vo
         return _read_npz(path, quantity) if kind == ".npz" else _read_nifti(path, quantity)
     except InputError as error:
         raise InputError(f"{path}: {error}") from None
-    except (OSError, EOFError, ValueError, KeyError, zipfile.BadZipFile, zlib.error) as error:
+    except Exception as error:  # whatever numpy, nibabel, zip or gzip raise on a damaged file
         raise InputError(f"{path}: cannot be read as {kind} ({_first_line(error)})") from error
 
 
@@ -71,7 +69,10 @@ def write_volume(volume: Volume, path: str | os.PathLike[str]) -> None:
 
 
 def _read_npz(path: Path, quantity: str | None) -> Volume:
-    with np.load(path, allow_pickle=False) as file:
+    file = np.load(path, allow_pickle=False)
+    if not isinstance(file, np.lib.npyio.NpzFile):
+        raise InputError("expected an npz archive, found a single array")
+    with file:
         missing = {"array", "affine", "quantity"} - set(file.files)
         if missing:
             raise InputError(f"expected the arrays array, affine and quantity; {', '.join(sorted(missing))} not found")
@@ -94,6 +95,8 @@ def _read_nifti(path: Path, quantity: str | None) -> Volume:
     shape = image.shape
     if len(shape) != 3:
         raise InputError(f"expected a 3-D image, got shape {' x '.join(map(str, shape))}")
+    if image.get_data_dtype().kind not in "fiu":
+        raise InputError(f"expected real numbers, found {image.get_data_dtype()}")
     require(8.5 * math.prod(shape), "a volume of {} x {} x {} voxels".format(*shape))
     unit = image.header.get_xyzt_units()[0]
     affine = np.array(image.affine, np.float64)
@@ -115,10 +118,10 @@ def _write_nifti(volume: Volume, path: Path) -> None:
 
 def _kind(path: Path) -> str:
     name = path.name.lower()
-    for suffix in (*_NIFTI[::-1], ".npz"):
+    for suffix in VOLUME_FORMATS:
         if name.endswith(suffix):
             return suffix
-    raise InputError(f"{path}: expected a name ending in {', '.join((*_NIFTI, '.npz'))}")
+    raise InputError(f"{path}: expected a name ending in {', '.join(VOLUME_FORMATS)}")
 
 
 def _first_line(error: Exception) -> str:

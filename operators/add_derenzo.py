@@ -18,7 +18,7 @@ class MPHDRR_OT_add_derenzo(DerenzoSettings, bpy.types.Operator):
     bl_idname = ids.ADD_DERENZO
     bl_label = "Add Derenzo Phantom"
     bl_description = "Add a phantom of hot rods in six sectors as a volume"
-    bl_options = {"REGISTER", "UNDO"}  # noqa: RUF012
+    bl_options = {"REGISTER", "UNDO"}
 
     name: StringProperty(name="Name", description="The object's name", default=ids.DERENZO)
     location: FloatVectorProperty(
@@ -26,7 +26,9 @@ class MPHDRR_OT_add_derenzo(DerenzoSettings, bpy.types.Operator):
     )
     phi: FloatProperty(name="Phi", description="Turn about world z, done last", subtype="ANGLE", default=0.0)
     theta: FloatProperty(name="Theta", description="Turn about world y, after psi", subtype="ANGLE", default=0.0)
-    psi: FloatProperty(name="Psi", description="Turn about the phantom's own axis, done first", subtype="ANGLE", default=0.0)
+    psi: FloatProperty(
+        name="Psi", description="Turn about the phantom's own axis, done first", subtype="ANGLE", default=0.0
+    )
 
     def invoke(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str]:
         return context.window_manager.invoke_props_dialog(self, width=320, title=self.bl_label, confirm_text="Add")
@@ -58,7 +60,7 @@ class MPHDRR_OT_update_derenzo(bpy.types.Operator):
     bl_idname = ids.UPDATE_DERENZO
     bl_label = "Update Phantom"
     bl_description = "Make the active phantom's voxels anew from the numbers above; its place stays"
-    bl_options = {"REGISTER", "UNDO"}  # noqa: RUF012
+    bl_options = {"REGISTER", "UNDO"}
 
     @classmethod
     def poll(cls, context: bpy.types.Context) -> bool:

@@ -15,7 +15,9 @@ from ..core.errors import InputError
 class MPHDRR_OT_export_dataset(ExportHelper, bpy.types.Operator):
     bl_idname = ids.EXPORT_DATASET
     bl_label = "Export mphDRR Dataset"
-    bl_description = "Write the last run, with geometry, volume and provenance, as HDF5 (.h5), NumPy (.npz) or PyTorch (.pt)"
+    bl_description = (
+        "Write the last run, with geometry, volume and provenance, as HDF5 (.h5), NumPy (.npz) or PyTorch (.pt)"
+    )
 
     filename_ext = ".h5"
     filter_glob: StringProperty(default="*.h5;*.hdf5;*.npz;*.pt", options={"HIDDEN"})

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Generator
 from typing import Any
 
 import bpy
@@ -25,7 +26,7 @@ class MPHDRR_OT_render_projections(ProjectionSettings, jobs.JobOperator, bpy.typ
         "Project the volume into every module: exact line integrals, stored as images and as a file beside the .blend. "
         "Settings that a script leaves out are those of the panel"
     )
-    bl_options = {"REGISTER", "UNDO"}  # noqa: RUF012
+    bl_options = {"REGISTER", "UNDO"}
 
     volume: StringProperty(name="Volume", description="Name of the volume object to project", options={"SKIP_SAVE"})
 
@@ -72,16 +73,18 @@ class MPHDRR_OT_render_projections(ProjectionSettings, jobs.JobOperator, bpy.typ
             write_run(run, path)
             return run
 
-        def finish(run: ProjectionRun) -> str:
+        def finish(run: ProjectionRun) -> Generator[None, None, str]:
+            mosaic = yield from images.storing(run.projections, run.system.numbers)
+            images.show(mosaic, bpy.context)
             scene = bpy.data.scenes.get(scene_name)
             if scene is None:
                 raise InputError(f"the scene {scene_name!r} is gone; its projections are in {path}")
-            mosaic = images.store_projections(run.projections, run.system.numbers)
-            images.show(mosaic, bpy.context)
             seconds = time.perf_counter() - start
             state = getattr(scene, ids.SCENE_PROJECTIONS)
             state.run_file = storage.stored_path(path)
-            state.run_summary = f"{len(run.views)} views of {shape[1]} × {shape[0]}, {item_name}, {run.settings['backend']}"
+            state.run_summary = (
+                f"{len(run.views)} views of {shape[1]} × {shape[0]}, {item_name}, {run.settings['backend']}"
+            )
             where = path if bpy.data.filepath else f"{path} until the .blend is saved"
             return f"Projected {item_name!r} into {len(run.views)} modules in {seconds:.1f} s: {where}"
 
@@ -133,6 +136,8 @@ def _chosen_volume(context: bpy.types.Context, name: str) -> bpy.types.Object:
             return item
     if len(known) != 1:
         raise InputError(
-            f"choose what to project: there are {len(known)} volumes" if known else "no volume in the scene: add a phantom first"
+            f"choose what to project: there are {len(known)} volumes"
+            if known
+            else "no volume in the scene: add a phantom first"
         )
     return known[0]

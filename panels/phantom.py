@@ -24,7 +24,9 @@ class MPHDRR_PT_phantom(bpy.types.Panel):
             column = layout.column(align=True)
             column.active = False
             known = volumes.volume_objects(context.scene)
-            column.label(text="Select a volume to see its numbers." if known else "No volume in the scene.", icon="INFO")
+            column.label(
+                text="Select a volume to see its numbers." if known else "No volume in the scene.", icon="INFO"
+            )
             return
         settings = getattr(item, ids.OBJECT_VOLUME)
         split = layout.split(factor=0.34)

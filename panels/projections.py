@@ -20,6 +20,7 @@ class MPHDRR_PT_projections(bpy.types.Panel):
         layout.use_property_split = True
         layout.use_property_decorate = False
         settings = getattr(context.scene, ids.SCENE_PROJECTIONS)
+        jobs.draw_job(layout, context)  # at the top, where it is seen on small screens too
         column = layout.column()
         column.enabled = not jobs.is_running()
         column.prop(settings, "volume", placeholder="Active volume")
@@ -32,7 +33,7 @@ class MPHDRR_PT_projections(bpy.types.Panel):
         modules.prop(settings, "first", text="Modules First")
         modules.prop(settings, "last", text="Last")
         column.prop(settings, "backend")
-        if not jobs.draw_job(layout, context):
+        if not jobs.is_running():
             row = layout.row()
             row.scale_y = 1.4
             row.operator_context = "INVOKE_DEFAULT"

@@ -42,7 +42,7 @@ def add_parser(subparsers) -> None:  # type: ignore[no-untyped-def]
 
 def _run(arguments: argparse.Namespace) -> None:
     out = ensure_folder(arguments.output)
-    from .session import new_scene, save_scene
+    from .session import new_scene, quiet, save_scene
 
     scene = new_scene()  # before the long work: without Blender the demo stops here
     from .. import pictures, runs, scanner, volumes
@@ -71,7 +71,7 @@ def _run(arguments: argparse.Namespace) -> None:
     with _step("scene"):
         runs.show_run(scene, run, out / "run.h5")
         save_scene(out / "scanner.blend")
-    with _step("pictures"):
+    with _step("pictures"), quiet():
         for first, last in scanner.quick_ranges(system):
             pictures.render_scanner(scene, collection, out / f"modules-{first}-{last}.png", first, last)
         first, last = int(system.numbers.min()), int(system.numbers.max())

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
+import sys
+from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -42,6 +45,21 @@ def new_scene() -> bpy.types.Scene:
     return scene
 
 
+@contextlib.contextmanager
+def quiet() -> Iterator[None]:
+    """Keep what Blender itself prints on standard output, a line for every tile and file, out of sight."""
+    sys.stdout.flush()
+    kept = os.dup(1)
+    nowhere = os.open(os.devnull, os.O_WRONLY)
+    try:
+        os.dup2(nowhere, 1)
+        yield
+    finally:
+        os.dup2(kept, 1)
+        os.close(kept)
+        os.close(nowhere)
+
+
 def save_scene(path: Path) -> None:
     """Save the file as `path`; Blender itself writes beside it and renames.
 
@@ -55,6 +73,7 @@ def save_scene(path: Path) -> None:
     try:
         # No .blend1 beside the result of a command.
         bpy.context.preferences.filepaths.save_version = 0
-        bpy.ops.wm.save_as_mainfile(filepath=os.path.abspath(path), check_existing=False)
+        with quiet():
+            bpy.ops.wm.save_as_mainfile(filepath=os.path.abspath(path), check_existing=False)
     except RuntimeError as error:
         raise InputError(f"{path}: cannot be written ({str(error).strip().splitlines()[0]})") from error

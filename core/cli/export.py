@@ -27,11 +27,11 @@ def _run(arguments: argparse.Namespace) -> None:
     if not arguments.output and not arguments.mosaic:
         raise InputError("nothing to write: give --output FILE or --mosaic PNG")
     run = read_run(arguments.file)
-    for name in arguments.output:
-        path = output_path(name)
+    paths = [output_path(name, FORMATS) for name in arguments.output]
+    picture = output_path(arguments.mosaic) if arguments.mosaic else None
+    for path in paths:
         write_run(run, path)
         print(path)
-    if arguments.mosaic:
-        picture = output_path(arguments.mosaic)
+    if picture is not None:
         write_png(mosaic(run.projections), picture)
         print(picture)

@@ -20,10 +20,14 @@ def add_parser(subparsers) -> None:  # type: ignore[no-untyped-def]
     """Add the command."""
     geometry = add_command(subparsers, "geometry", "look at a geometry workbook", "mphdrr geometry check scanner.xlsx")
     actions = geometry.add_subparsers(metavar="ACTION", required=True)
-    show = add_command(actions, "show", "print every module's numbers", "mphdrr geometry show scanner.xlsx --modules 1-20")
+    show = add_command(
+        actions, "show", "print every module's numbers", "mphdrr geometry show scanner.xlsx --modules 1-20"
+    )
     show.add_argument("--modules", metavar="RANGE", help="such as 1-40 or 1-20,41; default: all")
     show.set_defaults(run=_show)
-    check = add_command(actions, "check", "compare the workbook with the design formulas", "mphdrr geometry check a.xlsx")
+    check = add_command(
+        actions, "check", "compare the workbook with the design formulas", "mphdrr geometry check a.xlsx"
+    )
     check.set_defaults(run=_check)
     for parser in (show, check):
         parser.add_argument("file", metavar="FILE", help="geometry workbook (.xlsx, .xlsm)")
@@ -78,7 +82,9 @@ def _rows(system: PinholeSystem) -> list[dict[str, Any]]:
         "Td": system.detector_thickness,
         "R": system.roi_radius,
     }
-    return [dict(zip(columns, values, strict=True)) for values in zip(*(c.tolist() for c in columns.values()), strict=True)]
+    return [
+        dict(zip(columns, values, strict=True)) for values in zip(*(c.tolist() for c in columns.values()), strict=True)
+    ]
 
 
 def _summary(system: PinholeSystem) -> dict[str, str]:

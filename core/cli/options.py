@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import InputError
-from ..files import ensure_folder
+from ..files import ensure_folder, refuse_folder
 from ..progress import Progress
 from ..system import PinholeSystem
 
@@ -45,13 +45,17 @@ def add_phantom_options(parser: argparse.ArgumentParser) -> None:
         help="phi theta psi: psi about its own axis, theta about y, phi about z",
     )
     parser.add_argument("--voxels", type=int, nargs="+", default=[256], metavar="N", help="voxels along x y z, or one")
-    parser.add_argument("--spacing", type=float, nargs="+", default=[0.4], metavar="MM", help="voxel size, one or three")
+    parser.add_argument(
+        "--spacing", type=float, nargs="+", default=[0.4], metavar="MM", help="voxel size, one or three"
+    )
 
 
 def add_view_options(parser: argparse.ArgumentParser) -> None:
     """The images' size and place."""
     parser.add_argument("--size", type=int, nargs=2, default=[256, 256], metavar=("ROWS", "COLUMNS"), help="pixels")
-    parser.add_argument("--detector", choices=("virtual", "real"), default="virtual", help="upright in front, or crystal")
+    parser.add_argument(
+        "--detector", choices=("virtual", "real"), default="virtual", help="upright in front, or crystal"
+    )
     parser.add_argument("--magnification", type=float, default=10.0, help="virtual detector's distance in units of l")
     parser.add_argument("--pitch", type=float, metavar="MM", help="pixel size; default: the crystal's whole side")
     parser.add_argument("--modules", metavar="RANGE", help="such as 1-40 or 1-20,41; default: all")
@@ -79,12 +83,15 @@ def chosen_modules(system: PinholeSystem, text: str | None) -> PinholeSystem:
     return system[np.unique(np.concatenate(wanted))]
 
 
-def output_path(text: str) -> Path:
-    """A file to write; its folder is made when it is missing.
+def output_path(text: str, suffixes: tuple[str, ...] = ()) -> Path:
+    """A file to write, its name ending in one of `suffixes` if any; its folder is made when it is missing.
 
-    Called before the long work, so that a folder that cannot be written fails at once.
+    Called before the long work, so that what cannot be written fails at once.
     """
     path = Path(text)
+    if suffixes and not path.name.lower().endswith(suffixes):
+        raise InputError(f"{path}: expected a name ending in {', '.join(suffixes)}")
+    refuse_folder(path)
     ensure_folder(path.parent)
     return path
 

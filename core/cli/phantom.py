@@ -10,7 +10,7 @@ from ..frames import euler_pose
 from ..grid import Grid
 from ..phantoms.derenzo import DerenzoPhantom
 from ..volume import Volume
-from ..volume_io import write_volume
+from ..volume_io import VOLUME_FORMATS, write_volume
 from .options import add_command, add_phantom_options, output_path, progress_bar
 
 
@@ -43,7 +43,7 @@ def _one_or_three(values: list) -> list:
 
 
 def _run(arguments: argparse.Namespace) -> None:
-    path = output_path(arguments.output)
+    path = output_path(arguments.output, VOLUME_FORMATS)
     volume = derenzo_volume(arguments)
     write_volume(volume, path)
     total = volume.array.sum(dtype=np.float64) * volume.grid.voxel_volume * 1e-3

@@ -7,7 +7,6 @@ from pathlib import Path
 
 import numpy as np
 
-from ..errors import InputError
 from ..export import FORMATS, write_run
 from ..mosaic import mosaic, write_png
 from ..project import project_run
@@ -35,9 +34,7 @@ def add_parser(subparsers) -> None:  # type: ignore[no-untyped-def]
 
 
 def _run(arguments: argparse.Namespace) -> None:
-    path = output_path(arguments.output)
-    if path.suffix.lower() not in (*FORMATS, ".hdf5"):
-        raise InputError(f"{path}: expected a name ending in {', '.join(FORMATS)}")
+    path = output_path(arguments.output, FORMATS)
     picture = output_path(arguments.mosaic) if arguments.mosaic else None
     system = chosen_modules(read_system(arguments.workbook), arguments.modules)
     volume = read_volume(arguments.volume) if arguments.volume else derenzo_volume(arguments)
@@ -57,4 +54,6 @@ def _run(arguments: argparse.Namespace) -> None:
     if picture is not None:
         write_png(mosaic(run.projections), picture)
     n_v, n_u = run.views.shape
-    print(f"{path}: {len(run.views)} projections of {n_v} x {n_u} pixels, largest {np.max(run.projections):.4g} {run.unit}")
+    print(
+        f"{path}: {len(run.views)} projections of {n_v} x {n_u} pixels, largest {np.max(run.projections):.4g} {run.unit}"
+    )

@@ -14,11 +14,11 @@ from ..files import replacing
 from ..run import ProjectionRun
 from .record import Record, record_of, run_of
 
-FORMATS = (".h5", ".npz", ".pt")
+FORMATS = (".h5", ".hdf5", ".npz", ".pt")
 
 
 def write_run(run: ProjectionRun, path: str | os.PathLike[str]) -> None:
-    """Write a run as HDF5 (.h5), numpy archive (.npz) or torch file (.pt), by the path's suffix.
+    """Write a run as HDF5 (.h5, .hdf5), numpy archive (.npz) or torch file (.pt), by the path's suffix.
 
     Raises
     ------

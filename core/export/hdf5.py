@@ -21,7 +21,12 @@ def write(record: Record, path: Path) -> None:
         for name, array in record.arrays.items():
             packed = {}
             if array.nbytes >= _COMPRESS_FROM:
-                packed = {"chunks": (1, *array.shape[1:]), "compression": "gzip", "compression_opts": 1, "shuffle": True}
+                packed = {
+                    "chunks": (1, *array.shape[1:]),
+                    "compression": "gzip",
+                    "compression_opts": 1,
+                    "shuffle": True,
+                }
             dataset = file.create_dataset(name, data=array, **packed)
             dataset.attrs["unit"] = record.unit(name)
 
@@ -38,5 +43,7 @@ def read(path: Path) -> Record:
 
     with h5py.File(path, "r") as file:
         file.visititems(take)
-        attributes = {name: value.item() if isinstance(value, np.generic) else value for name, value in file.attrs.items()}
+        attributes = {
+            name: value.item() if isinstance(value, np.generic) else value for name, value in file.attrs.items()
+        }
     return Record(arrays, attributes)

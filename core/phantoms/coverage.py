@@ -20,6 +20,8 @@ magnitude than the true distance (outside) or than the depth (inside)."""
 # Points of one call of `Distance`: small enough that its temporaries stay in the processor's cache.
 _BLOCK = 1 << 15
 _MIN_SAMPLES, _MAX_SAMPLES = 128, 1024
+# Few, large voxels can have more samples than that: up to so many altogether.
+_SAMPLES_OF_COARSE_GRIDS = 1 << 22
 
 
 def voxelize_shape(
@@ -61,7 +63,8 @@ def voxelize_shape(
     # The voxel's farthest corner from its centre, over the four diagonals of a parallelepiped.
     signs = np.array([[1, 1, 1], [1, 1, -1], [1, -1, 1], [-1, 1, 1]])
     half_diagonal = np.float32(0.5 * np.linalg.norm(signs @ linear.T, axis=1).max() * (1 + 1e-5))
-    n_samples = int(np.clip(_MIN_SAMPLES * (edges.max() / (0.5 * finest)) ** 2, _MIN_SAMPLES, _MAX_SAMPLES))
+    most = max(_MAX_SAMPLES, _SAMPLES_OF_COARSE_GRIDS // max(1, int(np.prod(stop - start))))
+    n_samples = int(np.clip(_MIN_SAMPLES * (edges.max() / (0.5 * finest)) ** 3, _MIN_SAMPLES, most))
     samples = (linear @ (_r3_sequence(n_samples) - 0.5)).astype(np.float32)
 
     iy, iz = np.meshgrid(np.arange(start[1], stop[1]), np.arange(start[2], stop[2]), indexing="ij")

@@ -17,6 +17,7 @@ from .coverage import voxelize_shape
 
 SECTORS = 6
 _MARGIN = 0.1  # of the radius, kept free at the axis and at the rim
+_MOST_RODS = 100_000
 _ROW_STEP = np.sqrt(3.0)  # distance of two rows of rods, in rod diameters
 
 
@@ -60,8 +61,16 @@ class DerenzoPhantom:
         if np.any(diameters < 0):
             raise InputError(f"Derenzo rod diameters: expected 0 or more mm, got {diameters.min():g}")
         set_(self, "rod_diameters", tuple(float(w) for w in diameters))
-        if not any(rows for _, rows in self._rows()):
-            raise InputError(f"Derenzo phantom: no rod of {self.rod_diameters} mm fits into a radius of {self.radius:g} mm")
+        rows = [rows for _, rows in self._rows()]
+        if sum(n * (n + 1) // 2 for n in rows) > _MOST_RODS:
+            raise InputError(
+                f"Derenzo phantom: more than {_MOST_RODS} rods of {self.rod_diameters} mm in a radius of "
+                f"{self.radius:g} mm; choose thicker ones, or 0 for an empty sector"
+            )
+        if not any(rows):
+            raise InputError(
+                f"Derenzo phantom: no rod of {self.rod_diameters} mm fits into a radius of {self.radius:g} mm"
+            )
 
     def rods(self) -> NDArray[np.float64]:
         """Every rod as (sector, x, y, diameter), array (n_rods, 4), mm."""
@@ -95,8 +104,10 @@ class DerenzoPhantom:
         Raises
         ------
         InputError
-            The pose is not an invertible 4x4 affine, or the volume does not fit into memory.
+            No grid, the pose is not an invertible 4x4 affine, or the volume does not fit into memory.
         """
+        if not isinstance(grid, Grid):
+            raise InputError(f"voxelize: expected a Grid, got {type(grid).__name__}")
         pose = np.eye(4) if pose is None else checked_affine(pose, "phantom pose")
         reach = float(np.max(np.linalg.norm(self.rods()[:, 1:3], axis=1) + self.rods()[:, 3] / 2))
         half_height = self.height / 2

@@ -56,7 +56,7 @@ def _checked_tensor(value: Any, name: str, shape: tuple[int, ...], float64: bool
 def to_numpy(value: ArrayOrTensor, dtype: Any) -> np.ndarray[Any, Any]:
     """As a C-ordered, aligned array (compiled kernels take no other)."""
     if is_tensor(value):
-        value = value.detach().cpu().numpy()
+        value = value.numpy(force=True)
     return np.require(value, dtype, ["C", "A"])
 
 

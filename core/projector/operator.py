@@ -348,10 +348,12 @@ def trace_rays(volume: Volume, sources: ArrayLike, targets: ArrayLike, backend: 
 
 def _points(value: ArrayLike, name: str) -> Points:
     try:
-        one_point = np.ndim(value) == 1
+        shape = np.shape(value)
     except ValueError:  # ragged: real_array says so
-        one_point = False
-    return real_array(value, name, (3,))[None] if one_point else real_array(value, name, (None, 3))
+        shape = ()
+    if shape == (0,):  # an empty list
+        return np.empty((0, 3))
+    return real_array(value, name, (3,))[None] if len(shape) == 1 else real_array(value, name, (None, 3))
 
 
 def _blocks(n_lines: int, line_length: int, backend: str) -> list[slice]:

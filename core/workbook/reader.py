@@ -211,10 +211,15 @@ def _refuse_impossible(columns: dict[str, _Column], values: dict[str, NDArray[np
     )
     x1 = columns["x1"]
     names = x1.modules.names
-    b = np.sqrt(sum(values[name] ** 2 for name in POSITION))
+    with np.errstate(over="ignore"):
+        b = np.sqrt(sum(values[name] ** 2 for name in POSITION))
     x1.refuse(
         b == 0,
         lambda i: f"and y1, z1 put the pinhole of module {names[i]} at the isocentre, expected outside the ROI",
+    )
+    x1.refuse(
+        np.isinf(b),
+        lambda i: f"and y1, z1 put the pinhole of module {names[i]} too far away to compute, expected millimetres",
     )
     x1.refuse(
         b <= roi,

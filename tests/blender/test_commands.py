@@ -63,7 +63,9 @@ def test_pictures_leave_the_scene_as_it_was(tmp_path, dc_spect, scene):
     scanner.show_modules(collection, 5, 9)
 
     def state() -> tuple:
-        counts = [len(getattr(bpy.data, kind)) for kind in ("objects", "cameras", "lights", "worlds", "meshes", "materials")]
+        counts = [
+            len(getattr(bpy.data, kind)) for kind in ("objects", "cameras", "lights", "worlds", "meshes", "materials")
+        ]
         visible = [not camera.hide_viewport for camera in scanner.modules(collection)]
         render = scene.render
         return counts, visible, render.engine, render.resolution_x, render.filepath, scene.camera, scene.world

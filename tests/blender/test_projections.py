@@ -153,7 +153,7 @@ def test_foreign_image_of_the_same_name_is_kept(scanned):
 
 
 def _run_in_thread(work) -> jobs._Run:
-    run = jobs._Run(jobs.Job("Test", work, lambda result: ""))
+    run = jobs._Run(jobs.Job("Test", work, lambda result: iter(())))
     run.start()
     return run
 

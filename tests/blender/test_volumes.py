@@ -117,9 +117,9 @@ def test_coarser_copy_moves_beside_the_blend_with_the_full_one(tmp_path, monkeyp
 def test_missing_voxels_are_a_clear_error(sparse_volume):
     item = volumes.add_volume(sparse_volume, "Sample")
     Path(item.data.filepath).unlink()
-    with pytest.raises(InputError, match="Sample.*gone"):
+    with pytest.raises(InputError, match=r"Sample.*gone"):
         volumes.volume_from_object(item)
-    with pytest.raises(InputError, match="Cube.*no mphDRR volume"):
+    with pytest.raises(InputError, match=r"Cube.*no mphDRR volume"):
         volumes.volume_from_object(bpy.data.objects["Cube"])
 
 

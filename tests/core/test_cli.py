@@ -72,6 +72,8 @@ def test_from_phantom_to_dataset(workbook, tmp_path, capsys):
         (["project", "WORKBOOK", "--volume", "none.nii", "-o", "FOLDER/a.h5"], "none.nii: no such file"),
         (["project", "WORKBOOK", *SMALL[:4], "--size", "900000", "900000", "-o", "FOLDER/a.h5"], "of memory"),
         (["project", "WORKBOOK", *SMALL, "-o", "WORKBOOK/a.h5"], "cannot be written"),
+        (["project", "WORKBOOK", *SMALL, "-o", "FOLDER/a.h5", "--mosaic", "FOLDER"], "is a folder"),
+        (["project", "WORKBOOK", "-o", "FOLDER/sub/a.txt"], "expected a name ending in"),
         (["export", "none.h5", "-o", "FOLDER/a.npz"], "none.h5: no such file"),
         (["export", "WORKBOOK", "-o", "FOLDER/a.npz"], "expected a name ending in"),
     ],
@@ -85,6 +87,14 @@ def test_users_errors_are_one_line_with_status_1_and_leave_nothing(command, said
     assert not list(tmp_path.iterdir())
 
 
+def test_export_checks_every_name_before_it_writes(workbook, tmp_path, capsys):
+    run, first = str(tmp_path / "run.npz"), tmp_path / "first.npz"
+    assert main(["project", str(workbook), *SMALL, "-o", run]) == 0
+    assert main(["export", run, "-o", str(first), "-o", str(tmp_path / "second.stl")]) == 1
+    assert "second.stl: expected a name ending in" in capsys.readouterr().err
+    assert not first.exists()
+
+
 def test_usage_errors_have_status_2(capsys):
     assert main(["geometry"]) == 2
     assert main(["project", "--size", "x"]) == 2
@@ -93,7 +103,8 @@ def test_usage_errors_have_status_2(capsys):
 
 
 @pytest.mark.parametrize(
-    "command", [[], ["geometry"], ["geometry", "check"], ["phantom", "derenzo"], ["project"], ["export"], ["scene"], ["demo"]]
+    "command",
+    [[], ["geometry"], ["geometry", "check"], ["phantom", "derenzo"], ["project"], ["export"], ["scene"], ["demo"]],
 )
 def test_every_help_has_an_example(command, capsys):
     assert main([*command, "--help"]) == 0

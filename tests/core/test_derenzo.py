@@ -32,7 +32,9 @@ def test_rods_follow_the_users_rule():
     assert np.allclose(first[1:, 2], -2 * np.sqrt(3) * 10)
     # Sector 2, turned by 120 degrees counter-clockwise from -y, keeps its margin.
     direction = np.deg2rad(-90 + 120)
-    assert np.allclose(rods[rods[:, 0] == 2][0, 1:3], (5 + np.sqrt(3) * 6) * np.array([np.cos(direction), np.sin(direction)]))
+    assert np.allclose(
+        rods[rods[:, 0] == 2][0, 1:3], (5 + np.sqrt(3) * 6) * np.array([np.cos(direction), np.sin(direction)])
+    )
 
 
 def test_rods_do_not_touch():
@@ -102,6 +104,7 @@ def test_phantom_outside_the_grid_leaves_it_empty():
         ({"rod_diameters": (1, 2, 3)}, "Derenzo rod diameters: expected shape 6, got 3"),
         ({"rod_diameters": (1, 2, 3, 4, 5, -6)}, "expected 0 or more"),
         ({"rod_diameters": (50,) * 6}, "no rod"),
+        ({"rod_diameters": (8, 6, 5, 4, 3, 1e-9)}, "more than 100000 rods"),
         ({"height": -1}, "Derenzo height"),
         ({"activity": "hot"}, "Derenzo activity"),
     ],
@@ -113,6 +116,20 @@ def test_derenzo_refuses_what_cannot_be(wrong, message):
 
 def test_a_grid_that_cannot_fit_into_memory_is_refused_in_one_line():
     phantom = mph.DerenzoPhantom(40.0, RODS, 30.0)
-    with pytest.raises(mph.InputError, match="a volume of 100000 x 100000 x 100000 voxels needs .* GiB of memory") as error:
+    with pytest.raises(
+        mph.InputError, match="a volume of 100000 x 100000 x 100000 voxels needs .* GiB of memory"
+    ) as error:
         phantom.voxelize(mph.Grid.centered(100_000, 0.001))
     assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize("shape", [(1, 1, 1), (5, 5, 5), (3, 40, 2)])
+def test_coarse_voxels_hold_the_whole_activity(shape):
+    phantom = mph.DerenzoPhantom(30.0, (4, 3.5, 3, 2.5, 2, 1.5), 20.0)
+    volume = phantom.voxelize(mph.Grid.centered(shape, 120.0 / np.array(shape)))
+    assert total(volume) == pytest.approx(phantom.total_activity, rel=5e-3)
+
+
+def test_phantoms_are_voxelized_on_grids_only():
+    with pytest.raises(mph.InputError, match="voxelize: expected a Grid, got tuple"):
+        mph.DerenzoPhantom(40.0, RODS, 30.0).voxelize((8, 8, 8))

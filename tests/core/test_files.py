@@ -73,6 +73,8 @@ def test_volumes_of_unknown_kind_or_place_are_refused(tmp_path, volume):
         mph.write_volume(volume, tmp_path / "v.stl")
     with pytest.raises(mph.InputError, match="no such folder"):
         mph.write_volume(volume, tmp_path / "none" / "v.nii")
+    with pytest.raises(mph.InputError, match="not a file name|cannot be written"):
+        mph.write_volume(volume, tmp_path / f"{'v' * 300}.nii")
     assert not list(tmp_path.iterdir())
 
 
@@ -82,6 +84,34 @@ def test_four_dimensional_images_are_refused(tmp_path):
     nibabel.save(nibabel.Nifti1Image(np.zeros((3, 3, 3, 2), np.float32), np.eye(4)), tmp_path / "v.nii")
     with pytest.raises(mph.InputError, match="expected a 3-D image, got shape 3 x 3 x 3 x 2"):
         mph.read_volume(tmp_path / "v.nii")
+
+
+def test_nifti_of_other_than_real_numbers_is_refused(tmp_path):
+    import nibabel
+
+    for kind in (np.complex64, [("R", "u1"), ("G", "u1"), ("B", "u1")]):
+        nibabel.save(nibabel.Nifti1Image(np.zeros((3, 3, 3), kind), np.eye(4)), tmp_path / "v.nii")
+        with pytest.raises(mph.InputError, match="expected real numbers"):
+            mph.read_volume(tmp_path / "v.nii")
+
+
+def test_nifti_with_a_damaged_header_is_refused_in_one_line(tmp_path, volume):
+    path = tmp_path / "v.nii"
+    mph.write_volume(volume, path)
+    for place, damage in ((70, b"\xff\x7f"), (42, b"\x00\x80"), (123, b"\xff")):  # data type, size, units
+        header = bytearray(path.read_bytes())
+        header[place : place + len(damage)] = damage
+        (tmp_path / "damaged.nii").write_bytes(header)
+        with pytest.raises(mph.InputError) as error:
+            mph.read_volume(tmp_path / "damaged.nii")
+        assert "\n" not in str(error.value)
+
+
+def test_a_single_array_is_no_volume_archive(tmp_path):
+    with open(tmp_path / "v.npz", "wb") as file:
+        np.save(file, np.zeros((3, 3, 3)))
+    with pytest.raises(mph.InputError, match="expected an npz archive"):
+        mph.read_volume(tmp_path / "v.npz")
 
 
 def test_nifti_in_metres_becomes_millimetres(tmp_path):
@@ -185,7 +215,9 @@ def test_a_failed_write_leaves_the_old_file_and_nothing_else(tmp_path):
     assert list(tmp_path.iterdir()) == [path]
 
 
-@pytest.mark.skipif(os.name == "nt" or (hasattr(os, "geteuid") and os.geteuid() == 0), reason="root may write everywhere")
+@pytest.mark.skipif(
+    os.name == "nt" or (hasattr(os, "geteuid") and os.geteuid() == 0), reason="root may write everywhere"
+)
 def test_an_unwritable_folder_is_refused(tmp_path, run):
     folder = tmp_path / "locked"
     folder.mkdir(mode=0o500)

@@ -38,7 +38,13 @@ def test_field_of_view_is_tangent_to_the_roi_sphere(rng):
 
 @pytest.mark.parametrize(
     ("b", "d", "side", "radius", "name"),
-    [(70, 2, 50, 75, "b"), (200, 0, 50, 75, "d"), (200, 60, 50, 75, "Ld"), (200, 2, 50, -1, "R"), (np.nan, 2, 50, 75, "b")],
+    [
+        (70, 2, 50, 75, "b"),
+        (200, 0, 50, 75, "d"),
+        (200, 60, 50, 75, "Ld"),
+        (200, 2, 50, -1, "R"),
+        (np.nan, 2, 50, 75, "b"),
+    ],
 )
 def test_collimator_length_refuses_what_cannot_be(b, d, side, radius, name):
     with pytest.raises(mph.InputError, match=f"^{name}, "):
@@ -113,10 +119,14 @@ def test_systems_are_frozen(system):
         ({"centers": [[200, 0, 0], [0, 200, 0], [0, 0, 0]]}, "module 3: its pinhole is 0 mm from the isocentre"),
         ({"centers": [[200, 0, 0], [0, 50, 0], [0, 0, 200]]}, "module 2: .* inside the ROI"),
         ({"centers": [[200, 0, 0], [0, 200, 0], [200, 0, 0]]}, "module 3: another module has the same pinhole centre"),
-        ({"centers": [[200, 0, 0], [0, np.nan, 0], [0, 0, 200]]}, r"pinhole centres: nan is not a finite number at index \(1, 1\)"),
+        (
+            {"centers": [[200, 0, 0], [0, np.nan, 0], [0, 0, 200]]},
+            r"pinhole centres: nan is not a finite number at index \(1, 1\)",
+        ),
         ({"centers": [[1, 2]]}, "pinhole centres: expected shape any x 3"),
         ({"centers": np.zeros((0, 3))}, "at least one module"),
         ({"numbers": [1, 2, 2]}, "module 2: another module has the same number"),
+        ({"numbers": [1, 2.5, 3]}, "numbers: expected whole numbers"),
         ({"pinhole_diameter": [2, 2, 60]}, "module 3: pinhole_diameter 60 mm must be less than detector_side 50 mm"),
         ({"collimator_length": [60, -1, 60]}, "module 2: collimator_length must be more than 0 mm, got -1"),
         ({"detector_side": "wide"}, "detector_side: expected real numbers"),

@@ -96,6 +96,13 @@ def test_bad_input_is_one_clear_line():
     refused(lambda: trace_rays(volume, np.zeros((2, 2)), np.zeros((2, 3))), "sources", "any x 3")
 
 
+def test_no_rays_give_no_integrals():
+    volume = Volume(ONES, GRID)
+    for none in ([], np.empty((0, 3))):
+        assert trace_rays(volume, none, none).shape == (0,)
+        assert trace_rays(volume, [0, 0, -9], none).shape == (0,)
+
+
 def test_volume_of_the_same_grid_read_from_a_file_is_accepted():
     affine = GRID.affine.copy()
     affine[:3] *= 1 + 1e-7

@@ -66,6 +66,7 @@ def test_tensor_in_tensor_out(backend):
     assert isinstance(A.T(y), torch.Tensor) and isinstance(next(A.iter_views(x)), torch.Tensor)
     np.testing.assert_allclose(y.numpy(), A(x.numpy()), rtol=1e-6)
     np.testing.assert_allclose(A(x.permute(2, 1, 0).contiguous().permute(2, 1, 0)), y, rtol=1e-6)
+    np.testing.assert_allclose(A(torch._neg_view(-x)), y, rtol=1e-6)  # torch's lazy minus sign
     for other in (torch.float16, torch.bfloat16, torch.int32):
         assert torch.is_floating_point(A(torch.ones(GRID.shape, dtype=other)))
 
@@ -107,3 +108,8 @@ def test_bad_tensors_are_one_clear_line():
         with pytest.raises(InputError) as error:
             A(bad)
         assert word in str(error.value) and "\n" not in str(error.value)
+
+
+def test_volumes_of_tensors_in_a_graph_say_what_to_do():
+    with pytest.raises(InputError, match="volume: .*detach"):
+        Volume(torch.ones(GRID.shape, requires_grad=True), GRID)

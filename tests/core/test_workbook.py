@@ -698,6 +698,7 @@ BAD_CELLS = {
         "Coordinates!B5 and y1, z1 put the pinhole of module 3 50 mm from the isocentre",
     ),
     "on the ROI": (_center(5, 75, 0, 0), "Coordinates!B5 and y1, z1 put the pinhole of module 3 75 mm from"),
+    "beyond all numbers": (_center(5, 1e200, 0, 0), "Coordinates!B5 and y1, z1 put the pinhole of module 3 too far"),
     "same number": (_set("Coordinates", "A5", 2), "Coordinates!A5 is module 2, as is Coordinates!A4"),
     "same number in Main": (_set("Main", "A5", 2), "Main!A5 is module 2, as is Main!A4"),
     "same place": (

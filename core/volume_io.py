@@ -79,7 +79,8 @@ def _read_npz(path: Path, quantity: str | None) -> Volume:
         array = file["array"]
         if array.ndim != 3:
             raise InputError(f"expected a 3-D array, got shape {array.shape}")
-        return Volume(freeze(array), Grid(array.shape, file["affine"]), quantity or str(file["quantity"]))
+        n_x, n_y, n_z = array.shape
+        return Volume(freeze(array), Grid((n_x, n_y, n_z), file["affine"]), quantity or str(file["quantity"]))
 
 
 def _read_nifti(path: Path, quantity: str | None) -> Volume:

@@ -217,7 +217,9 @@ class Projector(LinearOperator):
 
         Neighbours in a line are neighbours in memory: lines follow the volume's contiguous axis as well as they can.
         """
-        sources, targets = (points.reshape(*self.views.shape, 3) for points in self.views.rays(m))
+        n_v, n_u = self.views.shape
+        require(24 * n_v * n_u, f"the rays of an image of {n_v} x {n_u} pixels")  # targets, three float64 each
+        sources, targets = (points.reshape(n_v, n_u, 3) for points in self.views.rays(m))
         contiguous = self.grid.index_from_world[2, :3]
         along_u, along_v = (abs(contiguous @ step) for step in (self.views.u_steps[m], self.views.v_steps[m]))
         if along_v <= along_u:

@@ -92,7 +92,7 @@ def test_voxelizing_can_be_cancelled():
 
 
 def test_phantom_outside_the_grid_leaves_it_empty():
-    volume = mph.DerenzoPhantom(10.0, RODS[3:] + (0, 0, 0), 5.0).voxelize(mph.Grid.centered(8, 1.0, center=(500, 0, 0)))
+    volume = mph.DerenzoPhantom(10.0, (*RODS[3:], 0, 0, 0), 5.0).voxelize(mph.Grid.centered(8, 1.0, center=(500, 0, 0)))
     assert not volume.array.any()
 
 
@@ -117,7 +117,7 @@ def test_derenzo_refuses_what_cannot_be(wrong, message):
 def test_a_grid_that_cannot_fit_into_memory_is_refused_in_one_line():
     phantom = mph.DerenzoPhantom(40.0, RODS, 30.0)
     with pytest.raises(
-        mph.InputError, match="a volume of 100000 x 100000 x 100000 voxels needs .* GiB of memory"
+        mph.InputError, match=r"a volume of 100000 x 100000 x 100000 voxels needs .* GiB of memory"
     ) as error:
         phantom.voxelize(mph.Grid.centered(100_000, 0.001))
     assert "\n" not in str(error.value)

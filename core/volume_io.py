@@ -93,6 +93,7 @@ def _read_nifti(path: Path, quantity: str | None) -> Volume:
         raise InputError(f"not a NIfTI file ({_first_line(error)})") from None
     if not isinstance(image, nibabel.Nifti1Image):
         raise InputError(f"expected NIfTI, found {type(image).__name__}")
+    image = nibabel.squeeze_image(image)  # (x, y, z, 1) is common, and a volume
     shape = image.shape
     if len(shape) != 3:
         raise InputError(f"expected a 3-D image, got shape {' x '.join(map(str, shape))}")

@@ -200,12 +200,17 @@ def test_loading_a_file_ends_the_running_job(monkeypatch):
 
 
 @pytest.mark.parametrize(
-    ("error", "message"),
-    [(InputError("the very line"), "the very line"), (MemoryError(), "not enough memory"), (KeyError("x"), "KeyError")],
+    ("kind", "arguments", "message"),
+    [
+        (InputError, ("the very line",), "the very line"),
+        (MemoryError, (), "not enough memory"),
+        (KeyError, "x", "KeyError"),
+    ],
 )
-def test_errors_in_the_work_become_readable_reports(scanned, monkeypatch, error, message):
+def test_errors_in_the_work_become_readable_reports(scanned, monkeypatch, kind, arguments, message):
     def fail(*_):
-        raise error
+        # Made here: an error kept by the parameters would keep its traceback, and with it bpy, until Python has ended.
+        raise kind(*arguments)
 
     monkeypatch.setattr(volumes, "reader", lambda item: fail)
     with pytest.raises(RuntimeError, match=message):

@@ -114,6 +114,13 @@ def test_a_single_array_is_no_volume_archive(tmp_path):
         mph.read_volume(tmp_path / "v.npz")
 
 
+def test_nifti_with_a_trailing_axis_of_one_is_a_volume(tmp_path):
+    import nibabel
+
+    nibabel.save(nibabel.Nifti1Image(np.ones((3, 4, 5, 1), np.float32), np.eye(4)), tmp_path / "v.nii")
+    assert mph.read_volume(tmp_path / "v.nii").array.shape == (3, 4, 5)
+
+
 def test_nifti_in_metres_becomes_millimetres(tmp_path):
     import nibabel
 

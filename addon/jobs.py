@@ -14,7 +14,7 @@ import traceback
 import warnings
 from collections.abc import Callable, Generator
 from dataclasses import dataclass, field
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import bpy
 from bpy.props import BoolProperty, FloatProperty, StringProperty
@@ -146,11 +146,17 @@ class JobOperator:
     _finishing: Generator[None, None, str] | None = None
     _timer: bpy.types.Timer | None = None
 
+    if TYPE_CHECKING:  # what every bpy.types.Operator has
+        bl_label: str
+
+        def report(self, type: set[str], message: str) -> None: ...
+
     def job(self, context: bpy.types.Context) -> Job:
         """The work, from the operator's and the scene's settings; raises InputError."""
         raise NotImplementedError
 
     def execute(self, context: bpy.types.Context) -> set[str]:
+        """Do the work at once and return when it is done."""
         if is_running():
             self.report({"ERROR"}, "another job is running: wait for it or cancel it")
             return {"CANCELLED"}
@@ -166,6 +172,7 @@ class JobOperator:
         return {"FINISHED"}
 
     def invoke(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str]:
+        """Start the work in a thread; without a window, do it at once."""
         global _current
         if bpy.app.background or context.window is None:
             return self.execute(context)
@@ -183,6 +190,7 @@ class JobOperator:
         return {"RUNNING_MODAL"}
 
     def modal(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str]:
+        """Watch the thread; when it is done, finish step by step."""
         run = self._run
         if run is None or run is not _current:  # stopped from outside
             self._end(context)
@@ -248,6 +256,8 @@ class JobOperator:
 
 
 class MPHDRR_OT_cancel_job(bpy.types.Operator):
+    """Cancel the running job: the progress bar's button, and a script's way."""
+
     bl_idname = ids.CANCEL_JOB
     bl_label = "Cancel"
     bl_description = "Stop the running job; the scene stays as it was"
@@ -255,9 +265,11 @@ class MPHDRR_OT_cancel_job(bpy.types.Operator):
 
     @classmethod
     def poll(cls, context: bpy.types.Context) -> bool:
+        """There is a job."""
         return is_running()
 
     def execute(self, context: bpy.types.Context) -> set[str]:
+        """Ask it to stop."""
         cancel()
         return {"FINISHED"}
 

@@ -41,7 +41,7 @@ def new_material(name: str, grid: str, maximum: float, size: float) -> bpy.types
     tree = material.node_tree
     tree.nodes.clear()
 
-    def node(kind: str, column: int, row: int = 0, **settings: object) -> bpy.types.Node:
+    def node(kind: str, column: int, row: float = 0.0, **settings: object) -> bpy.types.Node:
         new = tree.nodes.new(kind)
         new.location = (column * 220.0, row * -220.0)
         for key, value in settings.items():

@@ -274,7 +274,7 @@ def _volume_data(
 
 def _store(local: Volume, provenance: dict[str, Any] | None) -> Path:
     """Write a volume, and a coarser copy if it is large, under names from their content; the path to show."""
-    digest = hashlib.sha256(np.ascontiguousarray(local.array))
+    digest = hashlib.sha256(local.array.data)
     recipe = (local.grid.shape, local.grid.affine.tolist(), local.quantity, VDB_CENTER_SHIFT, provenance or {})
     digest.update(json.dumps(recipe).encode())
     stem = f"{local.quantity}-{digest.hexdigest()[:16]}"

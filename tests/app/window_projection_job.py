@@ -1,6 +1,6 @@
 """Run in a real Blender's window: a projection job runs to its end, one is cancelled half-way, the window stays alive.
 
-    real-blender screenshot OUT.png tests/app/window_projection_job.py 60 RESULT.json [FOLDER_WITH_PACKAGE]
+    real-blender screenshot OUT.png tests/app/window_projection_job.py 60 RESULT.json WORKBOOK [FOLDER_WITH_PACKAGE]
 
 Writes what it saw to RESULT.json; `ok` is true when all of it is as it should be. Without a folder the extension
 must be installed and enabled.
@@ -18,13 +18,13 @@ import bpy
 
 arguments = sys.argv[sys.argv.index("--") + 1 :]
 result_file = Path(arguments[0])
-if len(arguments) > 1:
-    sys.path.insert(0, arguments[1])
+if len(arguments) > 2:
+    sys.path.insert(0, arguments[2])
     import mphdrr
 
     mphdrr.register()
 
-WORKBOOK = Path(__file__).resolve().parents[2] / "examples" / "dc-spect-80.xlsx"
+WORKBOOK = Path(arguments[1])
 seen: dict = {"ok": False, "events": []}
 progress: list[float] = []
 beats: list[float] = []

@@ -7,10 +7,9 @@ from collections.abc import Generator
 from typing import Any
 
 import bpy
-import numpy as np
 from bpy.props import StringProperty
 
-from ..addon import ids, images, jobs, scanner, storage, volumes
+from ..addon import ids, images, jobs, runs, scanner, storage, volumes
 from ..addon.projection_properties import ProjectionSettings
 from ..core.errors import InputError
 from ..core.memory import require
@@ -40,36 +39,32 @@ class MPHDRR_OT_render_projections(ProjectionSettings, jobs.JobOperator, bpy.typ
         detector = self._setting(scene, "detector").lower()
         magnification = float(f"{self._setting(scene, 'magnification'):.7g}")
         backend = self._setting(scene, "backend").lower()
-        views = system.views(shape=shape, detector=detector, magnification=magnification)
         item = _chosen_volume(context, self.volume)
         read_volume = volumes.reader(item)
-        n_bytes = 4.0 * len(views) * shape[0] * shape[1]
+        n_bytes = 4.0 * len(system) * shape[0] * shape[1]
         # The array, and Blender's images with four channels in memory and once more, packed.
-        require(9 * n_bytes, f"{len(views)} images of {shape[1]} x {shape[0]} pixels")
+        require(9 * n_bytes, f"{len(system)} images of {shape[1]} x {shape[0]} pixels")
         path = storage.folder() / f"{bpy.path.clean_name(scene.name)}-projections.h5"
-        settings: dict[str, Any] = {
-            "detector": detector,
-            "magnification": magnification,
-            "model": "transmission",
-            "backend": backend,
-            "volume": item.name,
-        }
+        settings: dict[str, Any] = {"volume": item.name}
         if getattr(item, ids.OBJECT_VOLUME).kind == "DERENZO":
             settings |= getattr(item, ids.OBJECT_VOLUME).derenzo.recipe()
         scene_name, item_name, start = scene.name, item.name, time.perf_counter()
 
         def work(progress: Progress) -> ProjectionRun:
             from ..core.export import write_run
-            from ..core.projector import Projector
+            from ..core.project import project_run
 
-            progress(0, len(views))
-            volume = read_volume()
-            projector = Projector(volume.grid, views, backend=backend)
-            projections = np.empty((len(views), *shape), np.float32)
-            for m, image in enumerate(projector.iter_views(volume)):
-                projections[m] = image
-                progress(m + 1, len(views))
-            run = ProjectionRun(projections, system, views, volume, settings={**settings, "backend": projector.backend})
+            progress(0, len(system))
+            run = project_run(
+                system,
+                read_volume(),
+                shape=shape,
+                detector=detector,
+                magnification=magnification,
+                backend=backend,
+                settings=settings,
+                progress=progress,
+            )
             write_run(run, path)
             return run
 
@@ -79,12 +74,8 @@ class MPHDRR_OT_render_projections(ProjectionSettings, jobs.JobOperator, bpy.typ
             scene = bpy.data.scenes.get(scene_name)
             if scene is None:
                 raise InputError(f"the scene {scene_name!r} is gone; its projections are in {path}")
+            runs.record_run(scene, run, path)
             seconds = time.perf_counter() - start
-            state = getattr(scene, ids.SCENE_PROJECTIONS)
-            state.run_file = storage.stored_path(path)
-            state.run_summary = (
-                f"{len(run.views)} views of {shape[1]} × {shape[0]}, {item_name}, {run.settings['backend']}"
-            )
             where = path if bpy.data.filepath else f"{path} until the .blend is saved"
             return f"Projected {item_name!r} into {len(run.views)} modules in {seconds:.1f} s: {where}"
 

@@ -57,7 +57,7 @@ class _Panel:
 
 
 class MPHDRR_PT_geometry(_Panel, bpy.types.Panel):
-    """Import, and which scanner it is."""
+    """Import, which scanner it is, and which part of it is shown."""
 
     bl_idname = ids.PANEL_GEOMETRY
     bl_label = "Geometry"
@@ -88,6 +88,10 @@ class MPHDRR_PT_geometry(_Panel, bpy.types.Panel):
         ):
             names.label(text=name)
             values.label(text=value)
+        row = layout.row(align=True)
+        for first, last in json.loads(properties.quick_ranges or "[]"):
+            _show(row, f"{first}-{last}", first, last, "ONLY")
+        _show(row, "All", 0, 0, "ALL")
 
 
 class MPHDRR_PT_modules(_Panel, bpy.types.Panel):
@@ -96,6 +100,7 @@ class MPHDRR_PT_modules(_Panel, bpy.types.Panel):
     bl_idname = ids.PANEL_MODULES
     bl_parent_id = ids.PANEL_GEOMETRY
     bl_label = "Modules"
+    bl_options = {"DEFAULT_CLOSED"}  # the list is long: Phantom and Projections shall be in sight
 
     @classmethod
     def poll(cls, context: bpy.types.Context) -> bool:
@@ -107,11 +112,6 @@ class MPHDRR_PT_modules(_Panel, bpy.types.Panel):
         if collection is None:  # poll says so too, but the scene may have changed since
             return
         state = context.scene.mphdrr_geometry
-
-        quick = layout.row(align=True)
-        for first, last in json.loads(collection.mphdrr_scanner.quick_ranges or "[]"):
-            _show(quick, f"{first}-{last}", first, last, "ONLY")
-        _show(quick, "All", state.first, state.last, "ALL")
 
         column = layout.column(align=True)
         row = column.row(align=True)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -14,8 +15,9 @@ _ATTRIBUTES = "attributes"
 
 def write(record: Record, path: Path) -> None:
     """Write `record` to `path`."""
+    contents: dict[str, Any] = {**record.arrays, _ATTRIBUTES: np.array(json.dumps(record.attributes))}
     with open(path, "wb") as file:
-        np.savez_compressed(file, **record.arrays, **{_ATTRIBUTES: np.array(json.dumps(record.attributes))})
+        np.savez_compressed(file, **contents)
 
 
 def read(path: Path) -> Record:

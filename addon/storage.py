@@ -86,6 +86,11 @@ def after_save(filepath: str, _: Any = None) -> None:
     """Take the new paths back after "Save Copy", when this session still belongs to another file or to none."""
     if not filepath or bpy.data.filepath != filepath:
         _restore()
+    else:
+        for owner, name, _ in _before_save:
+            # `//` did not lead there yet when the path was set, so the voxels could not be read: have it done again.
+            if isinstance(owner, bpy.types.Volume):
+                setattr(owner, name, getattr(owner, name))
     _before_save.clear()
 
 

@@ -14,7 +14,7 @@ from ..core.errors import InputError
 from . import scanner
 
 SIZE = (960, 560)
-_SAMPLES = 8
+_SAMPLES = 12
 _DIRECTION = Vector((0.75, -1.0, 0.62))  # from the scanner's middle to the camera
 _LENS, _SENSOR = 50.0, 36.0
 # Direction from the scanner's middle in units of its reach, power (W per mm^2 of reach^2) and size of each light.
@@ -76,6 +76,7 @@ def _studio(scene: bpy.types.Scene, collection: bpy.types.Collection, zoom: floa
         (cycles, "device", "CPU"),
         (cycles, "samples", samples),
         (cycles, "use_denoising", True),
+        (cycles, "denoising_prefilter", "FAST"),
         (cycles, "max_bounces", 4),
         (view, "view_transform", "Standard"),
         (scene, "world", bpy.data.worlds.new("mphDRR studio")),

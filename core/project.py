@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
+from .errors import InputWarning
 from .memory import require
 from .progress import Progress
 from .projector import Projector, Transmission
@@ -48,6 +50,13 @@ def project_run(
     InputError
         A setting is out of range, or the images do not fit into memory.
     """
+    if volume.quantity == "hu":
+        warnings.warn(
+            "the volume holds CT numbers (HU), air being -1000: their line integrals are no radiograph; "
+            "convert them to attenuation (mu, 1/mm) first",
+            InputWarning,
+            stacklevel=2,
+        )
     views = system.views(shape=shape, detector=detector, magnification=magnification, pitch=pitch)
     n_v, n_u = views.shape
     require(4.0 * len(views) * n_v * n_u, f"a set of {len(views)} projections of {n_v} x {n_u} pixels")

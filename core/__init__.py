@@ -17,7 +17,7 @@ from .grid import Grid
 from .mosaic import as_seen, mosaic
 from .phantoms.derenzo import DerenzoPhantom
 from .progress import Cancelled, Progress
-from .projector import Projector, Transmission, trace_rays
+from .projector import Emission, Projector, Transmission, trace_rays
 from .run import ProjectionRun
 from .system import PinholeSystem
 from .views import Views
@@ -28,6 +28,7 @@ from .workbook import SystemSource, read_system
 __all__ = [
     "Cancelled",
     "DerenzoPhantom",
+    "Emission",
     "Grid",
     "InputError",
     "InputWarning",

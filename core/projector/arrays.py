@@ -6,6 +6,7 @@ import sys
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ..checks import real_array, require_finite
 from ..errors import InputError
@@ -83,6 +84,15 @@ def like(result: ArrayOrTensor, given: ArrayOrTensor) -> ArrayOrTensor:
 def zeros(shape: tuple[int, ...], beside: ArrayOrTensor) -> ArrayOrTensor:
     """Zeros of the kind, type and device of `beside`."""
     return beside.new_zeros(shape) if is_tensor(beside) else np.zeros(shape, beside.dtype)
+
+
+def alike(array: NDArray[np.float64], beside: ArrayOrTensor) -> ArrayOrTensor:
+    """`array` of the kind, type and device of `beside`."""
+    if is_tensor(beside):
+        import torch
+
+        return torch.as_tensor(array).to(dtype=beside.dtype).to(beside.device)
+    return np.asarray(array, dtype=beside.dtype)
 
 
 def cropped(volume: ArrayOrTensor) -> tuple[ArrayOrTensor, tuple[int, int, int]]:

@@ -20,8 +20,8 @@ from ..progress import Progress
 from ..views import Views
 from ..volume import Volume
 from . import backends
-from .arrays import ArrayOrTensor, checked, cropped, is_tensor, like, to_numpy, to_tensor, zeros
-from .models import Transmission
+from .arrays import ArrayOrTensor, alike, checked, cropped, is_tensor, like, to_numpy, to_tensor, zeros
+from .models import Beam, Model, Transmission, require_model
 from .rays import index_rays
 
 # Rays handed to a backend at once: enough that a call costs nothing, few enough that their arrays stay in the
@@ -90,8 +90,8 @@ class Projector(LinearOperator):
         The voxels. Values outside are 0.
     views : Views
         The M images: rays from each source to the centres of the pixels.
-    model
-        What a ray measures.
+    model : Transmission or Emission
+        What a pixel measures; by default the line integral.
     backend : str
         ``"numpy"`` (the float64 reference), ``"torch"`` (on the device of a tensor), ``"numba"`` (compiled,
         CPU), or ``"auto"``: numba if it can be imported, else torch, else numpy; torch for a tensor that is
@@ -128,17 +128,17 @@ class Projector(LinearOperator):
         self,
         grid: Grid,
         views: Views,
-        model: Transmission | None = None,
+        model: Model | None = None,
         backend: str = "auto",
         threads: int | None = None,
     ) -> None:
-        model = Transmission() if model is None else model
-        for value, kind, name in ((grid, Grid, "grid"), (views, Views, "views"), (model, Transmission, "model")):
+        for value, kind, name in ((grid, Grid, "grid"), (views, Views, "views")):
             if not isinstance(value, kind):
                 raise InputError(f"projector: expected {name} to be {kind.__name__}, got {type(value).__name__}")
         self.grid = grid
         self.views = views
-        self.model = model
+        self.model: Model = Transmission() if model is None else require_model(model)
+        self.model.check(views)
         self.backend = backends.choose(backend)
         self.threads = _thread_count(threads)
         self._auto = backend == "auto"
@@ -174,6 +174,7 @@ class Projector(LinearOperator):
                 raise InputError(
                     f"volume: its grid ({_describe(x.grid)}) is not the projector's ({_describe(self.grid)})"
                 )
+            self.model.check_volume(x)
             return x.array
         return checked(x, "volume", self.shape_in, self._float64)
 
@@ -200,29 +201,34 @@ class Projector(LinearOperator):
         box, origin = cropped(self._native(x, name))
         with _parallel(self._workers(name)) as parallel_map:
             for m in range(len(self.views)):
-                sources, targets, by_columns = self._lines(m)
                 image = zeros(self.views.shape, box)
-                lines = image.T if by_columns else image
+                for beam, by_columns in self._beams(m):
+                    lines = image.T if by_columns else image
+                    weights = None if beam.weights is None else alike(beam.weights, box)
 
-                def project(block: slice) -> None:
-                    rays = index_rays(self.grid, _flat(sources[block]), _flat(targets[block]), origin)  # noqa: B023
-                    lines[block] = integrate(box, rays).reshape(lines[block].shape)  # noqa: B023
+                    def project(block: slice) -> None:
+                        rays = index_rays(self.grid, _flat(beam.sources[block]), _flat(beam.targets[block]), origin)  # noqa: B023
+                        integrals = integrate(box, rays).reshape(lines[block].shape)  # noqa: B023
+                        lines[block] += integrals if weights is None else weights[block] * integrals  # noqa: B023
 
-                for _ in parallel_map(project, _blocks(lines.shape[0], lines.shape[1], name)):
-                    pass
+                    for _ in parallel_map(project, _blocks(lines.shape[0], lines.shape[1], name)):
+                        pass
+                response = self.model.response(self.views, m)
+                if response is not None:
+                    along_v, along_u = (alike(matrix, image) for matrix in response)
+                    image = along_v @ image @ along_u.T
                 yield image if self._float64 or is_tensor(image) else image.astype(np.float32, copy=False)
 
-    def _lines(self, m: int) -> tuple[Points, Points, bool]:
-        """Ends of view m's rays, (lines, rays of a line, 3), and whether the lines are the image's columns, not its rows.
+    def _beams(self, m: int) -> Iterator[tuple[Beam, bool]]:
+        """View m's rays, (lines, rays of a line, 3), and whether the lines are the image's columns, not its rows.
 
         Neighbours in a line are neighbours in memory: lines follow the volume's contiguous axis as well as they can.
         """
-        sources, targets = (points.reshape(*self.views.shape, 3) for points in self.views.rays(m))
         contiguous = self.grid.index_from_world[2, :3]
         along_u, along_v = (abs(contiguous @ step) for step in (self.views.u_steps[m], self.views.v_steps[m]))
-        if along_v <= along_u:
-            return sources, targets, False
-        return sources.swapaxes(0, 1), targets.swapaxes(0, 1), True
+        by_columns = bool(along_v > along_u)
+        for beam in self.model.beams(self.views, m, self.grid):
+            yield (beam.transposed() if by_columns else beam), by_columns
 
     def _native(self, x: ArrayOrTensor, name: str) -> ArrayOrTensor:
         """`x` as the backend `name` computes with it."""
@@ -281,18 +287,24 @@ class AdjointProjector(LinearOperator):
         _report(progress, 0, n_views)
         with _parallel(workers) as parallel_map:
             for m in range(n_views):
-                sources, targets, by_columns = A._lines(m)
-                lines = images[m].T if by_columns else images[m]
-                blocks = _blocks(lines.shape[0], lines.shape[1], name)
+                image = images[m]
+                response = A.model.response(A.views, m)
+                if response is not None:
+                    along_v, along_u = (alike(matrix, image) for matrix in response)
+                    image = along_v.T @ image @ along_u
+                for beam, by_columns in A._beams(m):
+                    lines = image.T if by_columns else image
+                    lines = lines if beam.weights is None else alike(beam.weights, image) * lines
+                    blocks = _blocks(lines.shape[0], lines.shape[1], name)
 
-                def add(worker: int) -> None:
-                    # Always the same blocks, so that the sums' order, and so the result, is always the same.
-                    for block in blocks[worker::workers]:  # noqa: B023
-                        rays = index_rays(A.grid, _flat(sources[block]), _flat(targets[block]))  # noqa: B023
-                        spread(volumes[worker], lines[block].reshape(-1), rays)  # noqa: B023
+                    def add(worker: int) -> None:
+                        # Always the same blocks, so that the sums' order, and so the result, is always the same.
+                        for block in blocks[worker::workers]:  # noqa: B023
+                            rays = index_rays(A.grid, _flat(beam.sources[block]), _flat(beam.targets[block]))  # noqa: B023
+                            spread(volumes[worker], lines[block].reshape(-1), rays)  # noqa: B023
 
-                for _ in parallel_map(add, range(workers)):
-                    pass
+                    for _ in parallel_map(add, range(workers)):
+                        pass
                 _report(progress, m + 1, n_views)
         total = volumes[0]
         for volume in volumes[1:]:

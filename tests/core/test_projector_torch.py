@@ -13,6 +13,7 @@ from mphdrr.core.errors import InputError  # noqa: E402
 from mphdrr.core.grid import Grid  # noqa: E402
 from mphdrr.core.projector import Projector  # noqa: E402
 from mphdrr.core.views import Views  # noqa: E402
+from mphdrr.core.volume import Volume  # noqa: E402
 
 BACKENDS = [
     pytest.param(

@@ -26,7 +26,7 @@ class Emission(Model):
 
     A ray of the pixel that leaves the pinhole at an angle psi to the principal ray counts ::
 
-        time * d^2 p_u p_v cos^4(psi) / (16 l^2) * integral of f dr
+        time * d^2 p_u p_v cos^4(psi) / (16 l^2) * integral of f exp(-integral of mu) dr
 
     with p the pixel pitch on the crystal (of a virtual detector's pixel: its image there), d the pinhole's diameter
     and l the collimator's length. Summed over the pixels that is the law of a point source at height h above the
@@ -38,6 +38,11 @@ class Emission(Model):
     system : PinholeSystem
         The modules, as many as the views and in their order: ``Emission(system[0:20])`` for
         ``system[0:20].views(...)``.
+    mu : Volume, optional
+        What attenuates the photons between each point and the pinhole ("mu", 1/mm), at the energy that is counted: on
+        any grid, the activity's or another. It is exact for the piecewise constant volumes: nothing is resampled, a
+        ray is cut by the planes of both grids, and inside a voxel ``exp(-integral of mu)`` is integrated in closed
+        form. None: no attenuation.
     time : float
         Of the acquisition, s.
     photons_per_decay : float
@@ -50,6 +55,7 @@ class Emission(Model):
     """
 
     system: PinholeSystem
+    mu: Volume | None = None
     time: float = 1.0
     photons_per_decay: float = 1.0
 
@@ -58,6 +64,13 @@ class Emission(Model):
     def __post_init__(self) -> None:
         if not isinstance(self.system, PinholeSystem):
             raise InputError(f"emission: expected a PinholeSystem, got {type(self.system).__name__}")
+        if self.mu is not None:
+            if not isinstance(self.mu, Volume):
+                raise InputError(f"emission: expected mu to be a Volume (no tensor), got {type(self.mu).__name__}")
+            if self.mu.quantity != "mu":
+                raise InputError(f"emission: expected a volume of mu, got {self.mu.quantity}")
+            if self.mu.array.min() < 0:
+                raise InputError(f"emission: mu must not be negative, got {self.mu.array.min():g} 1/mm")
         for name in ("time", "photons_per_decay"):
             object.__setattr__(self, name, positive(getattr(self, name), f"emission: {name}"))
 

@@ -48,10 +48,8 @@ class Model(ABC):
     name: str
     """What a run's record calls it."""
 
-    @property
-    def mu(self) -> Volume | None:
-        """What attenuates the rays between the point that is measured and their source, 1/mm."""
-        return None
+    mu: Volume | None = None
+    """What attenuates the rays between the point that is measured and their source, 1/mm."""
 
     def check(self, views: Views) -> None:  # noqa: B027  (most have nothing to check)
         """Raise `InputError` where the model is not for these views."""

@@ -22,7 +22,7 @@ from ..volume import Volume
 from . import backends
 from .arrays import ArrayOrTensor, alike, checked, cropped, is_tensor, like, to_numpy, to_tensor, zeros
 from .models import Beam, Model, Transmission, require_model
-from .rays import index_rays
+from .rays import Tracer, index_rays
 
 # Rays handed to a backend at once: enough that a call costs nothing, few enough that their arrays stay in the
 # cache.
@@ -197,8 +197,8 @@ class Projector(LinearOperator):
         """Images of a checked volume, native to the backend."""
         name = self._backend_for(x)
         integrate = backends.load(name).forward
-        # Empty margins cost time: most objects fill a small part of their grid.
-        box, origin = cropped(self._native(x, name))
+        native = self._native(x, name)
+        box, trace = self._lattices(native, native)
         with _parallel(self._workers(name)) as parallel_map:
             for m in range(len(self.views)):
                 image = zeros(self.views.shape, box)
@@ -207,8 +207,8 @@ class Projector(LinearOperator):
                     weights = None if beam.weights is None else alike(beam.weights, box)
 
                     def project(block: slice) -> None:
-                        rays = index_rays(self.grid, _flat(beam.sources[block]), _flat(beam.targets[block]), origin)  # noqa: B023
-                        integrals = integrate(box, rays).reshape(lines[block].shape)  # noqa: B023
+                        rays, attenuation = trace(_flat(beam.sources[block]), _flat(beam.targets[block]))  # noqa: B023
+                        integrals = integrate(box, rays, attenuation).reshape(lines[block].shape)  # noqa: B023
                         lines[block] += integrals if weights is None else weights[block] * integrals  # noqa: B023
 
                     for _ in parallel_map(project, _blocks(lines.shape[0], lines.shape[1], name)):
@@ -229,6 +229,25 @@ class Projector(LinearOperator):
         by_columns = bool(along_v > along_u)
         for beam in self.model.beams(self.views, m, self.grid):
             yield (beam.transposed() if by_columns else beam), by_columns
+
+    def _lattices(self, native: ArrayOrTensor, volume: ArrayOrTensor = None) -> tuple[ArrayOrTensor, Tracer]:
+        """The part of `volume` that is not empty, and what brings rays into the index spaces of that and of mu.
+
+        Empty margins cost time: most objects fill a small part of their grid. With None (a volume yet to be filled)
+        the rays are for the whole grid. What attenuates is kept wherever it is, outside the volume's filled part too.
+
+        `native` is an array of the kind with which the backend computes.
+        """
+        if self.model.mu is None:
+            (box,), origin = cropped(volume) if volume is not None else ([None], (0, 0, 0))
+            return box, Tracer(self.grid, origin)
+        mu, mu_grid = alike(self.model.mu.array, native), self.model.mu.grid
+        if _same(mu_grid, self.grid):
+            boxes, origin = cropped(volume, mu) if volume is not None else ([None, mu], (0, 0, 0))
+            return boxes[0], Tracer(self.grid, origin, boxes[1])
+        (box,), origin = cropped(volume) if volume is not None else ([None], (0, 0, 0))
+        (mu,), mu_origin = cropped(mu)
+        return box, Tracer(self.grid, origin, mu, mu_grid, mu_origin)
 
     def _native(self, x: ArrayOrTensor, name: str) -> ArrayOrTensor:
         """`x` as the backend `name` computes with it."""
@@ -277,6 +296,7 @@ class AdjointProjector(LinearOperator):
         name = A._backend_for(x)
         spread = backends.load(name).adjoint
         images = A._native(x, name)
+        _, trace = A._lattices(images)
         volume_bytes = (8 if name == "numpy" else 4) * A.grid.n_voxels
         require(volume_bytes, f"the adjoint into {_times(self.shape_out)} voxels")
         # One volume per thread: fewer threads rather than no room for anything else.
@@ -300,8 +320,8 @@ class AdjointProjector(LinearOperator):
                     def add(worker: int) -> None:
                         # Always the same blocks, so that the sums' order, and so the result, is always the same.
                         for block in blocks[worker::workers]:  # noqa: B023
-                            rays = index_rays(A.grid, _flat(beam.sources[block]), _flat(beam.targets[block]))  # noqa: B023
-                            spread(volumes[worker], lines[block].reshape(-1), rays)  # noqa: B023
+                            rays, attenuation = trace(_flat(beam.sources[block]), _flat(beam.targets[block]))  # noqa: B023
+                            spread(volumes[worker], lines[block].reshape(-1), rays, attenuation)  # noqa: B023
 
                     for _ in parallel_map(add, range(workers)):
                         pass
@@ -345,7 +365,7 @@ def trace_rays(volume: Volume, sources: ArrayLike, targets: ArrayLike, backend: 
     starts, ends = np.broadcast_arrays(starts, ends)
     integrals = np.zeros(len(ends), np.float64 if backend == "numpy" else np.float32)
     integrate = backends.load(name).forward
-    box, origin = cropped(to_tensor(volume.array) if name == "torch" else volume.array)
+    (box,), origin = cropped(to_tensor(volume.array) if name == "torch" else volume.array)
     if name == "numpy":
         box = box.astype(np.float64)
 

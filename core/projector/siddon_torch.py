@@ -87,9 +87,7 @@ class _Line:
 
 def _on_device(rays: IndexRays, device: torch.device) -> _Line:
     real = torch.float32 if device.type == "mps" else torch.float64  # Apple's GPUs have no float64
-    return _Line(
-        *(torch.as_tensor(a, dtype=real).to(device) for a in (rays.starts, rays.directions, rays.lengths))
-    )
+    return _Line(*(torch.as_tensor(a, dtype=real).to(device) for a in (rays.starts, rays.directions, rays.lengths)))
 
 
 def _crossings(shape: tuple[int, ...], line: _Line) -> Iterator[Tensor]:

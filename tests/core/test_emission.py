@@ -165,3 +165,140 @@ def test_views_of_another_system_are_refused(system):
     refused("time", time=0)
     with pytest.raises(InputError, match="activity"):
         mph.Projector(grid, views, mph.Emission(system))(mph.Volume(np.ones(grid.shape), grid, "hu"))
+
+
+def some_mu(rng, grid):
+    """Between air and more than bone, with empty margins."""
+    array = rng.uniform(0, 0.05, grid.shape)
+    array[0] = array[:, -1] = 0
+    return mph.Volume(array, grid, "mu")
+
+
+def mu_grids(grid, rng):
+    """The activity's grid; one coarser, turned and larger; one that begins behind the pinhole; one elsewhere."""
+    around = mph.Grid.centered((7, 8, 9), (90.0, 80.0, 70.0), (20.0, 10.0, -5.0))
+    return [grid, turned_grid((6, 5, 7), 25.0, (4.0, 3.0, 1.0)), around, mph.Grid.centered((3, 3, 3), 5.0, (0, 0, 900))]
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+@pytest.mark.parametrize("which", range(4))
+def test_attenuation_equals_a_fine_sum_along_the_ray(backend, which, rng):
+    """Against midpoints on every ray, each attenuated by the line integral of mu from the pinhole to there."""
+    system = one_module()
+    grid = turned_grid((5, 6, 7), 12.0)
+    volume = mph.Volume(rng.random(grid.shape), grid)
+    mu = some_mu(rng, mu_grids(grid, rng)[which])
+    views = system.views((2, 3), pitch=200.0, magnification=7.0)
+    counts = mph.Projector(grid, views, mph.Emission(system, mu), backend)(volume)
+    ideal = mph.Projector(grid, views, mph.Emission(system), "numpy")(volume)
+
+    sources, targets = views.rays(0)
+    n = 4000
+    for pixel, (source, target) in enumerate(zip(sources, targets, strict=True)):
+        points = source + (np.arange(n) + 0.5)[:, None] / n * (target - source)
+        index = np.rint((np.c_[points, np.ones(n)] @ grid.index_from_world.T)[:, :3]).astype(int)
+        inside = np.all((index >= 0) & (index < grid.shape), axis=1)
+        activity = np.where(inside, volume.array[tuple(np.where(inside[:, None], index, 0).T)], 0)
+        left = np.exp(-mph.trace_rays(mu, source, points, "numpy"))
+        expected = (activity * left).sum() / max(activity.sum(), 1e-9) * ideal.reshape(-1)[pixel]
+        np.testing.assert_allclose(counts.reshape(-1)[pixel], expected, rtol=2e-3, atol=1e-12)
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+@pytest.mark.parametrize("mu", [1e-6, 0.0154, 0.3, 8.0])
+def test_uniform_body_counts_in_closed_form(backend, mu):
+    """f (1 - exp(-mu L)) / mu along each chord L, whatever the voxels."""
+    system = one_module()
+    for grid in (turned_grid((9, 8, 7), 10.0), turned_grid((3, 2, 1), (30.0, 40.0, 70.0))):
+        views = system.views((12, 13))
+        chord = mph.trace_rays(mph.Volume(np.ones(grid.shape), grid), *views.rays(0), "numpy").reshape(1, 12, 13)
+        ideal = mph.Projector(grid, views, mph.Emission(system), "numpy")(np.full(grid.shape, 3.0))
+        model = mph.Emission(system, mph.Volume(np.full(grid.shape, mu), grid, "mu"))
+        counts = mph.Projector(grid, views, model, backend)(np.full(grid.shape, 3.0))
+        coefficient = float(np.float32(mu))
+        mean = np.where(chord > 0, -np.expm1(-coefficient * chord) / np.maximum(coefficient * chord, 1e-12), 0)
+        tolerance = 1e-9 if backend == "numpy" else 2e-5
+        np.testing.assert_allclose(counts, ideal * mean, rtol=tolerance, atol=tolerance * counts.max())
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_point_source_in_a_ball_loses_its_radius(backend):
+    """exp(-mu R) from the middle of a ball of attenuating matter that is far larger than the activity's grid."""
+    system = one_module()
+    n, radius, mu = 48, 50.0, 0.0154
+    body = mph.Grid.centered((n,) * 3, 2.2 * radius / n)
+    x = body.affine[0, 3] + np.arange(n) * body.spacing[0]
+    ball = x[:, None, None] ** 2 + x[:, None] ** 2 + x**2 < radius**2
+    spot = turned_grid((3, 3, 3), 1.0)
+    views = system.views((40, 40), "real", pitch=0.06)
+    model = mph.Emission(system, mph.Volume(mu * ball, body, "mu"))
+    total = mph.Projector(spot, views, model, backend)(np.ones((3, 3, 3))).sum(dtype=float)
+    ideal = mph.Projector(spot, views, mph.Emission(system), backend)(np.ones((3, 3, 3))).sum(dtype=float)
+    np.testing.assert_allclose(total / ideal, np.exp(-mu * radius), rtol=0.01)
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_attenuation_depends_on_matter_and_not_on_its_grid(backend, system, rng):
+    """The same mu on the activity's grid, on a twice finer one and on a larger one gives the same counts."""
+    grid = turned_grid((6, 5, 4), 14.0)
+    activity = np.zeros(grid.shape)
+    activity[2:4, 1:3, 1:3] = rng.random((2, 2, 2))  # mu lies also outside the activity's support
+    mu = rng.uniform(0, 0.03, grid.shape)
+    fine = np.diag([0.5, 0.5, 0.5, 1.0])
+    fine[:3, 3] = -0.25
+    moved = np.eye(4)
+    moved[:3, 3] = -1, -2, -3
+    same = [
+        mph.Volume(mu, grid, "mu"),
+        mph.Volume(mu.repeat(2, 0).repeat(2, 1).repeat(2, 2), mph.Grid((12, 10, 8), grid.affine @ fine), "mu"),
+        mph.Volume(np.pad(mu, ((1, 1), (2, 0), (3, 4))), mph.Grid((8, 7, 11), grid.affine @ moved), "mu"),
+    ]
+    counts = [mph.Projector(grid, system.views((9, 8)), mph.Emission(system, v), backend)(activity) for v in same]
+    assert counts[0].any()
+    for other in counts[1:]:
+        np.testing.assert_allclose(other, counts[0], rtol=1e-5, atol=1e-6 * counts[0].max())
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+@pytest.mark.parametrize("which", range(4))
+def test_adjoint_with_attenuation(backend, which, system, rng):
+    grid = general_grid(rng, (9, 8, 7))
+    mu = some_mu(rng, mu_grids(grid, rng)[which])
+    A = mph.Projector(grid, system[3:6].views((10, 11)), mph.Emission(system[3:6], mu), backend, threads=2)
+    assert_adjoint(A, rng)
+
+
+@pytest.mark.parametrize("backend", BACKENDS[1:])
+@pytest.mark.parametrize("which", range(4))
+def test_backends_agree_on_attenuation(backend, which, system, rng):
+    grid = mph.Grid.centered((9, 8, 7), 6.0)
+    mu = some_mu(rng, mu_grids(grid, rng)[which])
+    x = rng.random(grid.shape)
+    x[:, :, 0] = x[0] = 0
+    straight = mph.PinholeSystem([[150, 0, 0], [0, -140, 0], [0, 30, 130]], 2.0, 60.0, 50.0, 10.0, 60.0)
+    for scanner in (system, straight):  # rays along voxel faces too: an odd number of pixels, even voxels
+        views = scanner.views((9, 11))
+        reference, y = (mph.Projector(grid, views, mph.Emission(scanner, mu), b)(x) for b in ("numpy", backend))
+        np.testing.assert_allclose(y, reference, rtol=2e-5, atol=2e-5 * reference.max())
+
+
+@pytest.mark.parametrize("backend", ["numpy", "torch"])
+@pytest.mark.parametrize("which", [0, 1])
+def test_gradient_in_the_activity(backend, which, rng):
+    torch = pytest.importorskip("torch", reason="torch is not installed")
+    grid = turned_grid((3, 2, 2), 20.0)
+    mu = some_mu(rng, mu_grids(grid, rng)[which])
+    A = mph.Projector(grid, one_module().views((3, 3)), mph.Emission(one_module(), mu, time=1e4), backend)
+    x = torch.rand(grid.shape, dtype=torch.float64, requires_grad=True)
+    assert torch.autograd.gradcheck(lambda x: torch.log1p(A(x)), (x,))
+
+
+def test_mu_that_is_not_mu_is_refused(system):
+    grid = mph.Grid.centered((2, 2, 2), 1.0)
+    for mu, word in (
+        (np.zeros((2, 2, 2)), "Volume"),
+        (mph.Volume(np.zeros((2, 2, 2)), grid), "activity"),
+        (mph.Volume(np.full((2, 2, 2), -0.1), grid, "mu"), "negative"),
+    ):
+        with pytest.raises(InputError, match=word):
+            mph.Emission(system, mu)

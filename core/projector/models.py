@@ -5,6 +5,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Iterator
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -56,6 +57,10 @@ class Model(ABC):
 
     def check_volume(self, volume: Volume) -> None:  # noqa: B027
         """Raise `InputError` where the model is not for such a volume."""
+
+    def record(self) -> dict[str, Any]:
+        """The model's own settings, for a run's record: anything JSON can hold."""
+        return {}
 
     @abstractmethod
     def unit(self, volume: Volume) -> str:

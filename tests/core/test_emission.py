@@ -158,7 +158,7 @@ def test_views_of_another_system_are_refused(system):
     turned = mph.Views(
         views.sources, views.detector_centers, views.u_steps + np.array([0, 0, 1]), views.v_steps, (4, 4)
     )
-    refused("perpendicular", views=turned)
+    refused("view 0", "along", views=turned)
     behind = mph.Views(views.sources, 2 * views.sources - views.detector_centers, views.u_steps, views.v_steps, (4, 4))
     refused("in front", views=behind)
     refused("PinholeSystem", system=views)
@@ -302,3 +302,163 @@ def test_mu_that_is_not_mu_is_refused(system):
     ):
         with pytest.raises(InputError, match=word):
             mph.Emission(system, mu)
+
+
+def spot_image(model, place, pitch=0.05, n=160):
+    """Image of a spot of 1 mm around the middle of its picture, and the pixels' places on the crystal along u."""
+    system = model.system
+    column, row, factor = system.views((1, 1), "real").projection_matrices()[0] @ [*place, 1.0]
+    offset = np.array([column, row]) / factor * system.detector_side[0]
+    grid = turned_grid((3, 3, 3), 0.4, place)
+    views = system.views((n, n), "real", pitch=pitch, offset=offset)
+    image = mph.Projector(grid, views, model)(np.ones((3, 3, 3)))[0].astype(float)
+    return image, (np.arange(n) - (n - 1) / 2) * pitch
+
+
+def width(image, places):
+    """Standard deviation along u."""
+    profile = image.sum(axis=0) / image.sum()
+    return np.sqrt(profile @ places**2 - (profile @ places) ** 2)
+
+
+@pytest.mark.parametrize("n", [7, 19, 64])
+def test_aperture_blur_is_as_wide_as_the_holes_shadow(n):
+    """A disk of diameter D has standard deviation D / 4 along u; at the source D = d (1 + b / l)."""
+    system = one_module()
+    sharp, places = spot_image(mph.Emission(system), (0, 0, 0))
+    blurred, _ = spot_image(mph.Emission(system, aperture_points=n), (0, 0, 0))
+    b, l, d = 200.0, 60.0, 2.0
+    diameter = 4 * np.sqrt(width(blurred, places) ** 2 - width(sharp, places) ** 2)  # on the crystal
+    assert diameter * b / l == pytest.approx(d * (1 + b / l), rel=0.02)
+    assert blurred.sum() == pytest.approx(sharp.sum(), rel=0.01)
+
+
+def test_disk_points_have_the_moments_of_the_disk():
+    from mphdrr.core.projector.emission import disk_points
+
+    assert not disk_points(1).any()
+    for n in (3, 4, 7, 19, 50, 200):
+        points = disk_points(n)
+        assert points.shape == (n, 2) and np.linalg.norm(points, axis=1).max() < 1.2
+        np.testing.assert_allclose(points.mean(axis=0), 0, atol=1e-12)
+        np.testing.assert_allclose(points.T @ points / n, np.eye(2) / 4, atol=1e-12)
+
+
+def test_virtual_detector_sees_the_finite_aperture_as_the_crystal_does(system, rng):
+    grid = general_grid(rng, (9, 8, 7))
+    x = rng.random(grid.shape)
+    model = mph.Emission(system, aperture_points=5, crystal_mu=0.1, intrinsic_fwhm=6.0, within_crystal=True)
+    real = mph.Projector(grid, system.views((9, 10), "real", pitch=7.0), model)(x)
+    virtual = mph.Projector(grid, system.views((9, 10), "virtual", 3.0, pitch=21.0), model)(x)
+    np.testing.assert_allclose(virtual[:, ::-1, ::-1], real, rtol=1e-5, atol=1e-5 * real.max())
+
+
+def test_penetration_widens_the_pinhole():
+    """Paix: d_e^2 = d (d + 2 / mu tan(alpha / 2))."""
+    system = one_module()
+    model = mph.Emission(system, aperture_mu=3.0, opening_angle=np.deg2rad(90))
+    expected = 2.0 * (2.0 + 2 / 3)
+    np.testing.assert_allclose(model.effective_diameter**2, expected)
+    ideal, _ = spot_image(mph.Emission(system), (5, 6, 7))
+    image, _ = spot_image(model, (5, 6, 7))
+    np.testing.assert_allclose(image, ideal * expected / 4, rtol=1e-6)
+    assert mph.Emission(system, aperture_mu=1e9).effective_diameter == pytest.approx(2.0)
+
+
+def test_crystal_counts_what_it_stops():
+    system = one_module()
+    grid = mph.Grid.centered((1, 1, 1), (10, 400, 400))
+    views = system.views((8, 9), detector="real", pitch=4.0)
+    ideal, counts = (
+        mph.Projector(grid, views, mph.Emission(system, crystal_mu=mu))(np.ones((1, 1, 1)))[0] for mu in (None, 0.06)
+    )
+    u, v = (np.arange(9) - 4) * 4.0, (np.arange(8) - 3.5)[:, None] * 4.0
+    cosine = 60 / np.sqrt(60**2 + u**2 + v**2)
+    np.testing.assert_allclose(counts / ideal, 1 - np.exp(-0.06 * 10 / cosine), rtol=1e-5)
+
+
+@pytest.mark.parametrize("fwhm", [0.3, 3.0])
+def test_intrinsic_blur_has_its_width_and_keeps_the_counts(fwhm):
+    system = one_module()
+    sharp, places = spot_image(mph.Emission(system), (0, 0, 0), pitch=0.1)
+    blurred, _ = spot_image(mph.Emission(system, intrinsic_fwhm=fwhm), (0, 0, 0), pitch=0.1)
+    sigma = np.sqrt(width(blurred, places) ** 2 - width(sharp, places) ** 2)
+    # Integrating over a pixel widens by its own variance, pitch^2 / 12.
+    assert sigma == pytest.approx(np.hypot(fwhm / 2.35482, 0.1 / np.sqrt(12)), rel=0.01)
+    assert blurred.sum() == pytest.approx(sharp.sum(), rel=1e-4)
+
+
+def test_pixels_count_what_falls_on_the_crystal():
+    """Total counts in a flat field grow with the crystal's area, wherever the pixels' edges lie."""
+    system = one_module(detector_side=40.0)
+    grid = mph.Grid.centered((1, 1, 1), (10, 900, 900))
+    views = system.views((20, 20), detector="real", pitch=3.0, offset=(0.7, -0.4))
+    everything, inside = (
+        mph.Projector(grid, views, mph.Emission(system, within_crystal=flag))(np.ones((1, 1, 1)))[0]
+        for flag in (False, True)
+    )
+    share = inside / everything
+    assert share.sum() * 9 == pytest.approx(40.0**2) and share.max() == 1 and share.min() == 0
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_adjoint_of_the_whole_camera(backend, system, rng):
+    grid = general_grid(rng, (9, 8, 7))
+    model = mph.Emission(
+        system[3:6],
+        some_mu(rng, turned_grid((6, 5, 7), 25.0)),
+        aperture_points=3,
+        aperture_mu=3.0,
+        crystal_mu=0.1,
+        intrinsic_fwhm=8.0,
+        within_crystal=True,
+    )
+    A = mph.Projector(grid, system[3:6].views((10, 11), offset=(20.0, 0.0)), model, backend, threads=2)
+    assert_adjoint(A, rng)
+
+
+def test_bad_detectors_are_refused(system):
+    for arguments, word in (
+        ({"aperture_points": 0}, "aperture_points"),
+        ({"aperture_points": 2}, "aperture_points"),
+        ({"aperture_points": 2.5}, "aperture_points"),
+        ({"aperture_mu": -1}, "aperture_mu"),
+        ({"opening_angle": 4}, "opening_angle"),
+        ({"crystal_mu": 0}, "crystal_mu"),
+        ({"intrinsic_fwhm": -1}, "intrinsic_fwhm"),
+    ):
+        with pytest.raises(InputError, match=word):
+            mph.Emission(system, **arguments)
+
+
+def test_counts_are_poisson():
+    mean = np.broadcast_to(np.array([0.3, 20.0, 1e6])[:, None, None], (3, 200, 200))
+    counts = mph.sample_counts(mean, seed=1)
+    assert counts.dtype == np.int64 and counts.min() == 0
+    error = np.sqrt(mean[:, 0, 0] / 40000)
+    assert (np.abs(counts.mean(axis=(1, 2)) - mean[:, 0, 0]) < 4 * error).all()
+    np.testing.assert_allclose(counts.var(axis=(1, 2)), mean[:, 0, 0], rtol=0.04)
+
+
+def test_a_views_noise_depends_on_the_seed_and_on_itself_only(rng):
+    mean = rng.uniform(0, 50, (4, 6, 5))
+    counts = mph.sample_counts(mean, seed=7)
+    np.testing.assert_array_equal(mph.sample_counts(mean, seed=7), counts)
+    other = mean.copy()
+    other[[0, 1, 3]] *= 10
+    np.testing.assert_array_equal(mph.sample_counts(other, seed=7)[2], counts[2])
+    np.testing.assert_array_equal(mph.sample_counts(mean[:3], seed=7), counts[:3])
+    assert (mph.sample_counts(mean, seed=8) != counts).any()
+    assert (mph.sample_counts(mean[[0, 0]], seed=7)[0] != mph.sample_counts(mean[[0, 0]], seed=7)[1]).any()
+    for bad, seed in ((-mean, 1), (mean, -1), (mean, 1.5), (np.full((1, 2), np.nan), 1), (np.full((1, 2), 1e19), 1)):
+        with pytest.raises(InputError):
+            mph.sample_counts(bad, seed)
+
+
+def test_isotopes():
+    tc = mph.isotope("Tc-99m")
+    assert tc.photons_per_decay(126, 155) == 0.885 and tc.photons_per_decay(0, 100) == 0
+    assert tc.mean_decay_time(1e-3) == pytest.approx(1e-3)
+    assert tc.mean_decay_time(100 * tc.half_life) == pytest.approx(tc.half_life / np.log(2))
+    with pytest.raises(InputError, match="Tl-201"):
+        mph.isotope("Unobtainium")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Generator
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import bpy
 import numpy as np
@@ -18,13 +18,16 @@ from ..core.progress import Progress
 from ..core.run import ProjectionRun
 from ..core.system import PinholeSystem
 
+if TYPE_CHECKING:
+    from ..core.projector import Model
+
 
 class MPHDRR_OT_render_projections(ProjectionSettings, jobs.JobOperator, bpy.types.Operator):
     bl_idname = ids.RENDER_PROJECTIONS
     bl_label = "Render Projections"
     bl_description = (
-        "Project the volume into every module: exact line integrals, stored as images and as a file beside the .blend. "
-        "Settings that a script leaves out are those of the panel"
+        "Project the volume into every module: exact line integrals or SPECT counts, stored as images and as a file "
+        "beside the .blend. Settings that a script leaves out are those of the panel"
     )
     bl_options = {"REGISTER", "UNDO"}
 
@@ -41,6 +44,7 @@ class MPHDRR_OT_render_projections(ProjectionSettings, jobs.JobOperator, bpy.typ
         magnification = float(f"{self._setting(scene, 'magnification'):.7g}")
         backend = self._setting(scene, "backend").lower()
         views = system.views(shape=shape, detector=detector, magnification=magnification)
+        model = _model(system, self._setting(scene, "model"), float(f"{self._setting(scene, 'time'):.7g}"))
         item = _chosen_volume(context, self.volume)
         read_volume = volumes.reader(item)
         n_bytes = 4.0 * len(views) * shape[0] * shape[1]
@@ -50,7 +54,8 @@ class MPHDRR_OT_render_projections(ProjectionSettings, jobs.JobOperator, bpy.typ
         settings: dict[str, Any] = {
             "detector": detector,
             "magnification": magnification,
-            "model": "transmission",
+            "model": model.name,
+            **model.record(),
             "backend": backend,
             "volume": item.name,
         }
@@ -64,12 +69,13 @@ class MPHDRR_OT_render_projections(ProjectionSettings, jobs.JobOperator, bpy.typ
 
             progress(0, len(views))
             volume = read_volume()
-            projector = Projector(volume.grid, views, backend=backend)
+            projector = Projector(volume.grid, views, model, backend)
             projections = np.empty((len(views), *shape), np.float32)
             for m, image in enumerate(projector.iter_views(volume)):
                 projections[m] = image
                 progress(m + 1, len(views))
-            run = ProjectionRun(projections, system, views, volume, settings={**settings, "backend": projector.backend})
+            made_by = {**settings, "backend": projector.backend}
+            run = ProjectionRun(projections, system, views, volume, unit=model.unit(volume), settings=made_by)
             write_run(run, path)
             return run
 
@@ -109,6 +115,12 @@ class MPHDRR_OT_show_projections(bpy.types.Operator):
             self.report({"ERROR"}, "no window with a 3D view to open an Image Editor in")
             return {"CANCELLED"}
         return {"FINISHED"}
+
+
+def _model(system: PinholeSystem, kind: str, time: float) -> Model:
+    from ..core.projector import Emission, Transmission
+
+    return Emission(system, time=time) if kind == "EMISSION" else Transmission()
 
 
 def _range(system: PinholeSystem, first: int, last: int) -> PinholeSystem:

@@ -16,6 +16,7 @@ from ..grid import Grid
 from ..system import PinholeSystem
 from ..views import Views
 from ..volume import Volume
+from .arrays import is_tensor
 from .models import Array, Beam, Model
 
 # Views may differ from the system they are said to be of by a file's rounding (mm; sine of an angle).
@@ -99,7 +100,8 @@ class Emission(Model):
             raise InputError(f"emission: expected a PinholeSystem, got {type(self.system).__name__}")
         if self.mu is not None:
             if not isinstance(self.mu, Volume):
-                raise InputError(f"emission: expected mu to be a Volume (no tensor), got {type(self.mu).__name__}")
+                hint = ": there are no gradients with respect to mu" if is_tensor(self.mu) else ""
+                raise InputError(f"emission: expected mu to be a Volume, got {type(self.mu).__name__}{hint}")
             if self.mu.quantity != "mu":
                 raise InputError(f"emission: expected a volume of mu, got {self.mu.quantity}")
             if self.mu.array.min() < 0:

@@ -462,3 +462,9 @@ def test_isotopes():
     assert tc.mean_decay_time(100 * tc.half_life) == pytest.approx(tc.half_life / np.log(2))
     with pytest.raises(InputError, match="Tl-201"):
         mph.isotope("Unobtainium")
+
+
+def test_gradients_in_mu_are_refused(system):
+    torch = pytest.importorskip("torch", reason="torch is not installed")
+    with pytest.raises(InputError, match="no gradients with respect to mu"):
+        mph.Emission(system, torch.rand(2, 2, 2, requires_grad=True))

@@ -107,7 +107,7 @@ class Emission(Model):
             if self.mu.array.min() < 0:
                 raise InputError(f"emission: mu must not be negative, got {self.mu.array.min():g} 1/mm")
         for name in ("time", "photons_per_decay", "aperture_mu", "opening_angle", "crystal_mu"):
-            if getattr(self, name) is not None:
+            if getattr(self, name) is not None or name not in ("aperture_mu", "crystal_mu"):
                 object.__setattr__(self, name, positive(getattr(self, name), f"emission: {name}"))
         if self.opening_angle >= math.pi:
             raise InputError(f"emission: opening_angle must be below pi, got {self.opening_angle:g} rad")

@@ -239,7 +239,9 @@ class Projector(LinearOperator):
 
         `native` is an array of the kind with which the backend computes.
         """
-        (box,), origin = cropped(volume) if volume is not None else ([None], (0, 0, 0))
+        box, origin = volume, (0, 0, 0)
+        if volume is not None:
+            (box,), origin = cropped(volume)
         if self.model.mu is None:
             return box, Tracer(self.grid, origin)
         mu, mu_grid = alike(self.model.mu.array, native), self.model.mu.grid

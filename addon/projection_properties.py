@@ -11,6 +11,16 @@ from . import ids
 class ProjectionSettings:
     """How to project; mixed into the scene's properties (the panel) and into the operator (scripts)."""
 
+    model: EnumProperty(
+        name="Model",
+        description="What a pixel holds",
+        items=(
+            ("TRANSMISSION", "Radiograph", "Line integrals of the volume"),
+            ("EMISSION", "SPECT Counts", "Expected photons of a volume of activity through the ideal pinhole"),
+        ),
+        default="TRANSMISSION",
+    )
+    time: FloatProperty(name="Time (s)", description="Acquisition time of SPECT counts", default=1.0, min=1e-6)
     width: IntProperty(name="Width", description="Pixel columns of each image", default=256, min=1, max=8192)
     height: IntProperty(name="Height", description="Pixel rows of each image", default=256, min=1, max=8192)
     detector: EnumProperty(

@@ -14,10 +14,12 @@ from .errors import InputError, InputWarning
 from .export import read_run, write_run
 from .frames import euler_pose
 from .grid import Grid
+from .isotopes import ISOTOPES, Isotope, isotope
 from .mosaic import as_seen, mosaic
+from .noise import sample_counts
 from .phantoms.derenzo import DerenzoPhantom
 from .progress import Cancelled, Progress
-from .projector import Projector, Transmission, trace_rays
+from .projector import Emission, Projector, Transmission, trace_rays
 from .run import ProjectionRun
 from .system import PinholeSystem
 from .views import Views
@@ -26,11 +28,14 @@ from .volume_io import read_volume, write_volume
 from .workbook import SystemSource, read_system
 
 __all__ = [
+    "ISOTOPES",
     "Cancelled",
     "DerenzoPhantom",
+    "Emission",
     "Grid",
     "InputError",
     "InputWarning",
+    "Isotope",
     "PinholeSystem",
     "Progress",
     "ProjectionRun",
@@ -42,10 +47,12 @@ __all__ = [
     "as_seen",
     "collimator_length",
     "euler_pose",
+    "isotope",
     "mosaic",
     "read_run",
     "read_system",
     "read_volume",
+    "sample_counts",
     "trace_rays",
     "write_run",
     "write_volume",

@@ -9,10 +9,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from .errors import InputWarning
+from .errors import InputError, InputWarning
 from .memory import require
+from .noise import sample_counts
 from .progress import Progress
-from .projector import Projector, Transmission
+from .projector import Emission, Model, Projector, Transmission
 from .run import ProjectionRun
 from .system import Detector, PinholeSystem
 from .volume import Volume
@@ -28,6 +29,8 @@ def project_run(
     backend: str = "auto",
     threads: int | None = None,
     settings: Mapping[str, Any] | None = None,
+    model: Model | None = None,
+    noise_seed: int | None = None,
     progress: Progress | None = None,
 ) -> ProjectionRun:
     """Project `volume` into every module of `system`.
@@ -42,6 +45,10 @@ def project_run(
         See `Projector`.
     settings
         More to record in the run.
+    model
+        `Transmission` (the default) or an `Emission` of the same system.
+    noise_seed
+        With an `Emission`: the run holds counts drawn with this seed (`sample_counts`), not their means.
     progress
         Called as ``progress(done, total)`` after every view; may raise `Cancelled`.
 
@@ -50,6 +57,9 @@ def project_run(
     InputError
         A setting is out of range, or the images do not fit into memory.
     """
+    model = Transmission() if model is None else model
+    if noise_seed is not None and not isinstance(model, Emission):
+        raise InputError("noise_seed: only the counts of an Emission have noise")
     if volume.quantity == "hu":
         warnings.warn(
             "the volume holds CT numbers (HU), air being -1000: their line integrals are no radiograph; "
@@ -60,18 +70,21 @@ def project_run(
     views = system.views(shape=shape, detector=detector, magnification=magnification, pitch=pitch)
     n_v, n_u = views.shape
     require(4.0 * len(views) * n_v * n_u, f"a set of {len(views)} projections of {n_v} x {n_u} pixels")
-    projector = Projector(volume.grid, views, model=Transmission(), backend=backend, threads=threads)
+    projector = Projector(volume.grid, views, model=model, backend=backend, threads=threads)
     images = np.empty((len(views), n_v, n_u), np.float32)
     for m, image in enumerate(projector.iter_views(volume)):
         images[m] = image
         if progress is not None:
             progress(m + 1, len(views))
+    if noise_seed is not None:
+        images = sample_counts(images, noise_seed).astype(np.float32)
     record = {
         "detector": detector,
         "magnification": float(magnification),
         "pitch_mm": None if pitch is None else np.broadcast_to(pitch, 2).tolist(),
-        "model": "transmission",
+        "model": model.name,
+        **model.record(),
         "backend": projector.backend,
         **(settings or {}),
     }
-    return ProjectionRun(images, system, views, volume, settings=record)
+    return ProjectionRun(images, system, views, volume, unit=model.unit(volume), settings=record, seed=noise_seed)

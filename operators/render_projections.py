@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Generator
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import bpy
 from bpy.props import StringProperty
@@ -17,13 +17,16 @@ from ..core.progress import Progress
 from ..core.run import ProjectionRun
 from ..core.system import PinholeSystem
 
+if TYPE_CHECKING:
+    from ..core.projector import Model
+
 
 class MPHDRR_OT_render_projections(ProjectionSettings, jobs.JobOperator, bpy.types.Operator):
     bl_idname = ids.RENDER_PROJECTIONS
     bl_label = "Render Projections"
     bl_description = (
-        "Project the volume into every module: exact line integrals, stored as images and as a file beside the .blend. "
-        "Settings that a script leaves out are those of the panel"
+        "Project the volume into every module: exact line integrals or SPECT counts, stored as images and as a file "
+        "beside the .blend. Settings that a script leaves out are those of the panel"
     )
     bl_options = {"REGISTER", "UNDO"}
 
@@ -39,6 +42,7 @@ class MPHDRR_OT_render_projections(ProjectionSettings, jobs.JobOperator, bpy.typ
         detector = self._setting(scene, "detector").lower()
         magnification = float(f"{self._setting(scene, 'magnification'):.7g}")
         backend = self._setting(scene, "backend").lower()
+        model = _model(system, self._setting(scene, "model"), float(f"{self._setting(scene, 'time'):.7g}"))
         item = _chosen_volume(context, self.volume)
         read_volume = volumes.reader(item)
         n_bytes = 4.0 * len(system) * shape[0] * shape[1]
@@ -58,6 +62,7 @@ class MPHDRR_OT_render_projections(ProjectionSettings, jobs.JobOperator, bpy.typ
             run = project_run(
                 system,
                 read_volume(),
+                model=model,
                 shape=shape,
                 detector=detector,
                 magnification=magnification,
@@ -100,6 +105,12 @@ class MPHDRR_OT_show_projections(bpy.types.Operator):
             self.report({"ERROR"}, "no window with a 3D view to open an Image Editor in")
             return {"CANCELLED"}
         return {"FINISHED"}
+
+
+def _model(system: PinholeSystem, kind: str, time: float) -> Model:
+    from ..core.projector import Emission, Transmission
+
+    return Emission(system, time=time) if kind == "EMISSION" else Transmission()
 
 
 def _range(system: PinholeSystem, first: int, last: int) -> PinholeSystem:

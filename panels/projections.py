@@ -24,6 +24,9 @@ class MPHDRR_PT_projections(bpy.types.Panel):
         column = layout.column()
         column.enabled = not jobs.is_running()
         column.prop(settings, "volume", placeholder="Active volume")
+        column.prop(settings, "model")
+        if settings.model == "EMISSION":
+            column.prop(settings, "time")
         size = column.column(align=True)
         size.prop(settings, "width", text="Pixels X")
         size.prop(settings, "height", text="Y")

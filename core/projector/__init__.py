@@ -8,7 +8,8 @@ needed.
 
 from __future__ import annotations
 
-from .models import Transmission
+from .emission import Emission
+from .models import Model, Transmission
 from .operator import AdjointProjector, Projector, trace_rays
 
-__all__ = ["AdjointProjector", "Projector", "Transmission", "trace_rays"]
+__all__ = ["AdjointProjector", "Emission", "Model", "Projector", "Transmission", "trace_rays"]

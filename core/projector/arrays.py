@@ -6,6 +6,7 @@ import sys
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ..checks import real_array, require_finite
 from ..errors import InputError
@@ -85,16 +86,26 @@ def zeros(shape: tuple[int, ...], beside: ArrayOrTensor) -> ArrayOrTensor:
     return beside.new_zeros(shape) if is_tensor(beside) else np.zeros(shape, beside.dtype)
 
 
-def cropped(volume: ArrayOrTensor) -> tuple[ArrayOrTensor, tuple[int, int, int]]:
-    """The smallest box of `volume` that holds all that is not 0, and the index of its first voxel."""
-    filled = volume != 0
-    ranges = []
-    for flags in (filled.any(2).any(1), filled.any(2).any(0), filled.any(0).any(0)):
-        where = np.flatnonzero(flags.cpu().numpy() if is_tensor(flags) else flags)
-        ranges.append((int(where[0]), int(where[-1]) + 1) if len(where) else (0, 1))
-    box = volume[tuple(slice(first, last) for first, last in ranges)]
-    box = box.contiguous() if is_tensor(box) else np.ascontiguousarray(box)
-    return box, (ranges[0][0], ranges[1][0], ranges[2][0])
+def alike(array: NDArray[np.floating[Any]], beside: ArrayOrTensor) -> ArrayOrTensor:
+    """`array` of the kind, type and device of `beside`."""
+    if is_tensor(beside):
+        import torch
+
+        return torch.tensor(array, dtype=beside.dtype, device=beside.device)
+    return np.asarray(array, dtype=beside.dtype)
+
+
+def cropped(*volumes: ArrayOrTensor) -> tuple[list[ArrayOrTensor], tuple[int, int, int]]:
+    """The smallest box of `volumes` (of one shape) that holds all that is not 0, and the index of its first voxel."""
+    ranges: list[tuple[int, int]] = []
+    filled = [volume != 0 for volume in volumes]
+    for first, second in ((2, 1), (2, 0), (0, 0)):
+        lines = [flags.any(first).any(second) for flags in filled]
+        where = np.concatenate([np.flatnonzero(flags.cpu().numpy() if is_tensor(flags) else flags) for flags in lines])
+        ranges.append((int(where.min()), int(where.max()) + 1) if len(where) else (0, 1))
+    boxes = [volume[tuple(slice(first, last) for first, last in ranges)] for volume in volumes]
+    boxes = [box.contiguous() if is_tensor(box) else np.ascontiguousarray(box) for box in boxes]
+    return boxes, (ranges[0][0], ranges[1][0], ranges[2][0])
 
 
 def _times(shape: tuple[int, ...]) -> str:

@@ -12,10 +12,10 @@ from ..errors import InputError, InputWarning
 BACKENDS = ("numba", "torch", "numpy")
 """Names of the backends, the one that "auto" prefers first. ``siddon_<name>`` is the module of each.
 
-Such a module has two functions. ``forward(volume, rays)`` returns the line integrals (N,);
-``adjoint(volume, values, rays)`` adds the values to the volume in place, each along its ray with the same
-weights. `rays` are `IndexRays`; volumes and values are tensors on one device for "torch" and numpy arrays for
-the others.
+Such a module has two functions. ``forward(volume, rays, attenuation=None)`` returns the line integrals (N,);
+``adjoint(volume, values, rays, attenuation=None)`` adds the values to the volume in place, each along its ray
+with the same weights. `rays` are `IndexRays`, what weakens them an `Attenuation`; volumes, values and mu are
+tensors on one device for "torch" and numpy arrays for the others.
 """
 
 

@@ -1,10 +1,98 @@
-"""What a ray measures."""
+"""What a pixel measures: which rays it takes, with which weights."""
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
+from collections.abc import Iterator
 from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..errors import InputError
+from ..grid import Grid
+from ..views import Views
+from ..volume import Volume
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class Beam:
+    """One ray for every pixel of a view.
+
+    Attributes
+    ----------
+    sources, targets : array (n_v, n_u, 3)
+        Ends of the rays, world mm.
+    weights : array (n_v, n_u) or None
+        What the ray's integral counts in its pixel; None: 1 everywhere.
+    """
+
+    sources: Array
+    targets: Array
+    weights: Array | None = None
+
+    def transposed(self) -> Beam:
+        """The same rays by columns: arrays (n_u, n_v, ...)."""
+        weights = None if self.weights is None else self.weights.T
+        return Beam(self.sources.swapaxes(0, 1), self.targets.swapaxes(0, 1), weights)
+
+
+class Model(ABC):
+    """What a pixel measures: ``response(sum over beams of weight * integral along the ray)``, linear in the volume.
+
+    The operator does the rest, so a model knows neither backends nor adjoints.
+    """
+
+    name: str
+    """What a run's record calls it."""
+
+    mu: Volume | None = None
+    """What attenuates the rays between the point that is measured and their source, 1/mm."""
+
+    def check(self, views: Views) -> None:  # noqa: B027  (most have nothing to check)
+        """Raise `InputError` where the model is not for these views."""
+
+    def check_volume(self, volume: Volume) -> None:  # noqa: B027
+        """Raise `InputError` where the model is not for such a volume."""
+
+    def record(self) -> dict[str, Any]:
+        """The model's own settings, for a run's record: anything JSON can hold."""
+        return {}
+
+    @abstractmethod
+    def unit(self, volume: Volume) -> str:
+        """Unit of the images of `volume`."""
+
+    @abstractmethod
+    def beams(self, views: Views, m: int, grid: Grid) -> Iterator[Beam]:
+        """The rays of view m through `grid`, their sources on the detector's side of what is measured."""
+
+    def response(self, views: Views, m: int) -> tuple[Array, Array] | None:
+        """The detector's response in view m: matrices (n_v, n_v) along v and (n_u, n_u) along u, None if ideal."""
+        return None
 
 
 @dataclass(frozen=True)
-class Transmission:
+class Transmission(Model):
     """The line integral of the volume from source to target, value x mm: a digitally reconstructed radiograph."""
+
+    name = "transmission"
+
+    def unit(self, volume: Volume) -> str:
+        """Unit of the images of `volume`."""
+        return f"{volume.unit} mm"
+
+    def beams(self, views: Views, m: int, grid: Grid) -> Iterator[Beam]:
+        """The rays of `views`, each counting 1."""
+        sources, targets = (points.reshape(*views.shape, 3) for points in views.rays(m))
+        yield Beam(sources, targets)
+
+
+def require_model(value: object) -> Model:
+    """`value` if it is a model."""
+    if not isinstance(value, Model):
+        raise InputError(f"projector: expected model to be Transmission or Emission, got {type(value).__name__}")
+    return value

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Iterator
@@ -20,9 +21,9 @@ from ..progress import Progress
 from ..views import Views
 from ..volume import Volume
 from . import backends
-from .arrays import ArrayOrTensor, checked, cropped, is_tensor, like, to_numpy, to_tensor, zeros
-from .models import Transmission
-from .rays import index_rays
+from .arrays import ArrayOrTensor, alike, checked, cropped, is_tensor, like, to_numpy, to_tensor, zeros
+from .models import Beam, Model, Transmission, require_model
+from .rays import Tracer, index_rays
 
 # Rays handed to a backend at once: enough that a call costs nothing, few enough that their arrays stay in the
 # cache.
@@ -90,8 +91,8 @@ class Projector(LinearOperator):
         The voxels. Values outside are 0.
     views : Views
         The M images: rays from each source to the centres of the pixels.
-    model
-        What a ray measures.
+    model : Transmission or Emission
+        What a pixel measures; by default the line integral.
     backend : str
         ``"numpy"`` (the float64 reference), ``"torch"`` (on the device of a tensor), ``"numba"`` (compiled,
         CPU), or ``"auto"``: numba if it can be imported, else torch, else numpy; torch for a tensor that is
@@ -128,17 +129,17 @@ class Projector(LinearOperator):
         self,
         grid: Grid,
         views: Views,
-        model: Transmission | None = None,
+        model: Model | None = None,
         backend: str = "auto",
         threads: int | None = None,
     ) -> None:
-        model = Transmission() if model is None else model
-        for value, kind, name in ((grid, Grid, "grid"), (views, Views, "views"), (model, Transmission, "model")):
+        for value, kind, name in ((grid, Grid, "grid"), (views, Views, "views")):
             if not isinstance(value, kind):
                 raise InputError(f"projector: expected {name} to be {kind.__name__}, got {type(value).__name__}")
         self.grid = grid
         self.views = views
-        self.model = model
+        self.model: Model = Transmission() if model is None else require_model(model)
+        self.model.check(views)
         self.backend = backends.choose(backend)
         self.threads = _thread_count(threads)
         self._auto = backend == "auto"
@@ -174,6 +175,7 @@ class Projector(LinearOperator):
                 raise InputError(
                     f"volume: its grid ({_describe(x.grid)}) is not the projector's ({_describe(self.grid)})"
                 )
+            self.model.check_volume(x)
             return x.array
         return checked(x, "volume", self.shape_in, self._float64)
 
@@ -196,35 +198,64 @@ class Projector(LinearOperator):
         """Images of a checked volume, native to the backend."""
         name = self._backend_for(x)
         integrate = backends.load(name).forward
-        # Empty margins cost time: most objects fill a small part of their grid.
-        box, origin = cropped(self._native(x, name))
+        native = self._native(x, name)
+        box, trace = self._lattices(native, native)
         with _parallel(self._workers(name)) as parallel_map:
             for m in range(len(self.views)):
-                sources, targets, by_columns = self._lines(m)
                 image = zeros(self.views.shape, box)
-                lines = image.T if by_columns else image
+                for beam, by_columns in self._beams(m):
+                    lines = image.T if by_columns else image
+                    weights = None if beam.weights is None else alike(beam.weights, box)
 
-                def project(block: slice) -> None:
-                    rays = index_rays(self.grid, _flat(sources[block]), _flat(targets[block]), origin)  # noqa: B023
-                    lines[block] = integrate(box, rays).reshape(lines[block].shape)  # noqa: B023
+                    def project(block: slice) -> None:
+                        rays, attenuation = trace(_flat(beam.sources[block]), _flat(beam.targets[block]))  # noqa: B023
+                        integrals = integrate(box, rays, attenuation).reshape(lines[block].shape)  # noqa: B023
+                        lines[block] += integrals if weights is None else weights[block] * integrals  # noqa: B023
 
-                for _ in parallel_map(project, _blocks(lines.shape[0], lines.shape[1], name)):
-                    pass
+                    for _ in parallel_map(project, _blocks(lines.shape[0], lines.shape[1], name)):
+                        pass
+                response = self.model.response(self.views, m)
+                if response is not None:
+                    along_v, along_u = (alike(matrix, image) for matrix in response)
+                    image = along_v @ image @ along_u.T
                 yield image if self._float64 or is_tensor(image) else image.astype(np.float32, copy=False)
 
-    def _lines(self, m: int) -> tuple[Points, Points, bool]:
-        """Ends of view m's rays, (lines, rays of a line, 3), and whether the lines are the image's columns, not its rows.
+    def _beams(self, m: int) -> Iterator[tuple[Beam, bool]]:
+        """View m's rays, (lines, rays of a line, 3), and whether the lines are the image's columns, not its rows.
 
         Neighbours in a line are neighbours in memory: lines follow the volume's contiguous axis as well as they can.
         """
         n_v, n_u = self.views.shape
         require(24 * n_v * n_u, f"the rays of an image of {n_v} x {n_u} pixels")  # targets, three float64 each
-        sources, targets = (points.reshape(n_v, n_u, 3) for points in self.views.rays(m))
         contiguous = self.grid.index_from_world[2, :3]
         along_u, along_v = (abs(contiguous @ step) for step in (self.views.u_steps[m], self.views.v_steps[m]))
-        if along_v <= along_u:
-            return sources, targets, False
-        return sources.swapaxes(0, 1), targets.swapaxes(0, 1), True
+        by_columns = bool(along_v > along_u)
+        for beam in self.model.beams(self.views, m, self.grid):
+            yield (beam.transposed() if by_columns else beam), by_columns
+
+    def _lattices(self, native: ArrayOrTensor, volume: ArrayOrTensor = None) -> tuple[ArrayOrTensor, Tracer]:
+        """The part of `volume` that is not empty, and what brings rays into the index spaces of that and of mu.
+
+        Empty margins cost time: most objects fill a small part of their grid. With None (a volume yet to be filled)
+        the rays are for the whole grid. What attenuates is kept wherever it is, outside the volume's filled part too.
+
+        `native` is an array of the kind with which the backend computes.
+        """
+        box, origin = volume, (0, 0, 0)
+        if volume is not None:
+            (box,), origin = cropped(volume)
+        if self.model.mu is None:
+            return box, Tracer(self.grid, origin)
+        mu, mu_grid = alike(self.model.mu.array, native), self.model.mu.grid
+        if _same(mu_grid, self.grid):
+            if volume is None:
+                return None, Tracer(self.grid, mu=mu)
+            (common, mu_common), common_origin = cropped(volume, mu)
+            # One lattice is walked twice as fast as two, but two boxes let rays that miss the volume's go at once.
+            if math.prod(common.shape) <= 2 * math.prod(box.shape):
+                return common, Tracer(self.grid, common_origin, mu_common)
+        (mu,), mu_origin = cropped(mu)
+        return box, Tracer(self.grid, origin, mu, mu_grid, mu_origin)
 
     def _native(self, x: ArrayOrTensor, name: str) -> ArrayOrTensor:
         """`x` as the backend `name` computes with it."""
@@ -273,6 +304,7 @@ class AdjointProjector(LinearOperator):
         name = A._backend_for(x)
         spread = backends.load(name).adjoint
         images = A._native(x, name)
+        _, trace = A._lattices(images)
         volume_bytes = (8 if name == "numpy" else 4) * A.grid.n_voxels
         require(volume_bytes, f"the adjoint into {_times(self.shape_out)} voxels")
         # One volume per thread: fewer threads rather than no room for anything else.
@@ -283,18 +315,24 @@ class AdjointProjector(LinearOperator):
         _report(progress, 0, n_views)
         with _parallel(workers) as parallel_map:
             for m in range(n_views):
-                sources, targets, by_columns = A._lines(m)
-                lines = images[m].T if by_columns else images[m]
-                blocks = _blocks(lines.shape[0], lines.shape[1], name)
+                image = images[m]
+                response = A.model.response(A.views, m)
+                if response is not None:
+                    along_v, along_u = (alike(matrix, image) for matrix in response)
+                    image = along_v.T @ image @ along_u
+                for beam, by_columns in A._beams(m):
+                    lines = image.T if by_columns else image
+                    lines = lines if beam.weights is None else alike(beam.weights, image) * lines
+                    blocks = _blocks(lines.shape[0], lines.shape[1], name)
 
-                def add(worker: int) -> None:
-                    # Always the same blocks, so that the sums' order, and so the result, is always the same.
-                    for block in blocks[worker::workers]:  # noqa: B023
-                        rays = index_rays(A.grid, _flat(sources[block]), _flat(targets[block]))  # noqa: B023
-                        spread(volumes[worker], lines[block].reshape(-1), rays)  # noqa: B023
+                    def add(worker: int) -> None:
+                        # Always the same blocks, so that the sums' order, and so the result, is always the same.
+                        for block in blocks[worker::workers]:  # noqa: B023
+                            rays, attenuation = trace(_flat(beam.sources[block]), _flat(beam.targets[block]))  # noqa: B023
+                            spread(volumes[worker], lines[block].reshape(-1), rays, attenuation)  # noqa: B023
 
-                for _ in parallel_map(add, range(workers)):
-                    pass
+                    for _ in parallel_map(add, range(workers)):
+                        pass
                 _report(progress, m + 1, n_views)
         total = volumes[0]
         for volume in volumes[1:]:
@@ -335,7 +373,7 @@ def trace_rays(volume: Volume, sources: ArrayLike, targets: ArrayLike, backend: 
     starts, ends = np.broadcast_arrays(starts, ends)
     integrals = np.zeros(len(ends), np.float64 if backend == "numpy" else np.float32)
     integrate = backends.load(name).forward
-    box, origin = cropped(to_tensor(volume.array) if name == "torch" else volume.array)
+    (box,), origin = cropped(to_tensor(volume.array) if name == "torch" else volume.array)
     if name == "numpy":
         box = box.astype(np.float64)
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -41,6 +42,55 @@ class IndexRays:
     def __getitem__(self, which: slice) -> IndexRays:
         """Some of the rays."""
         return IndexRays(self.starts[which], self.directions[which], self.lengths[which])
+
+
+@dataclass(frozen=True, eq=False)
+class Attenuation:
+    """What weakens rays between each point and their source.
+
+    Attributes
+    ----------
+    mu : array or tensor (n_x, n_y, n_z)
+        Attenuation coefficients, 1/mm, of the backend's kind; outside they are 0.
+    rays : IndexRays
+        The rays in mu's own index space. The very object that is given for the volume where mu shares the volume's
+        lattice.
+    """
+
+    mu: Any
+    rays: IndexRays
+
+
+@dataclass(frozen=True, eq=False)
+class Tracer:
+    """Rays from world mm into the index spaces of a volume and of what attenuates them.
+
+    Attributes
+    ----------
+    grid : Grid
+        The volume's.
+    origin : tuple of int
+        Voxel of `grid` at which the backend's array begins.
+    mu : array or tensor, optional
+        What attenuates the rays, on `mu_grid` from voxel `mu_origin` on, or on the volume's own lattice if that is None.
+    """
+
+    grid: Grid
+    origin: tuple[int, int, int] = (0, 0, 0)
+    mu: Any = None
+    mu_grid: Grid | None = None
+    mu_origin: tuple[int, int, int] = (0, 0, 0)
+
+    def __call__(
+        self, sources: NDArray[np.float64], targets: NDArray[np.float64]
+    ) -> tuple[IndexRays, Attenuation | None]:
+        """Rays from `sources` to `targets`, both (N, 3) in world mm."""
+        rays = index_rays(self.grid, sources, targets, self.origin)
+        if self.mu is None:
+            return rays, None
+        if self.mu_grid is None:
+            return rays, Attenuation(self.mu, rays)
+        return rays, Attenuation(self.mu, index_rays(self.mu_grid, sources, targets, self.mu_origin))
 
 
 def index_rays(

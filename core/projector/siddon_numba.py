@@ -7,7 +7,7 @@ several threads; numba's own threading layers are left alone (they do not always
 
 from __future__ import annotations
 
-from math import floor, inf
+from math import expm1, floor, inf
 from typing import Any
 
 import numpy as np
@@ -15,37 +15,58 @@ from numba import njit, types
 from numpy.typing import NDArray
 
 from .compiling import compiled
-from .rays import IndexRays
+from .rays import Attenuation, IndexRays
 
 _READ_F32 = types.Array(types.float32, 3, "C", readonly=True)
 _READ_F64_1D = types.Array(types.float64, 1, "C", readonly=True)
 _READ_F64_2D = types.Array(types.float64, 2, "C", readonly=True)
-_RAYS = (_READ_F64_2D, _READ_F64_2D, _READ_F64_1D)
+_READ_F32_1D = types.Array(types.float32, 1, "C", readonly=True)
+_LINES = (_READ_F64_2D, _READ_F64_2D)
+_RAYS = (*_LINES, _READ_F64_1D)
+_F32 = types.float32[:, :, ::1]
+_F32_1D = types.float32[::1]
 
 
-def forward(volume: NDArray[np.float32], rays: IndexRays) -> NDArray[np.float32]:
-    """Line integrals (N,), value x mm, of `volume` (n_x, n_y, n_z) along `rays`."""
+def forward(
+    volume: NDArray[np.float32], rays: IndexRays, attenuation: Attenuation | None = None
+) -> NDArray[np.float32]:
+    """Line integrals (N,), value x mm, of `volume` (n_x, n_y, n_z) along `rays`, attenuated towards their sources."""
     integrals = np.empty(len(rays), dtype=np.float32)
-    _forward_kernel()(volume, *_contiguous(rays), integrals)
+    if attenuation is None:
+        _forward_kernel()(volume, *_contiguous(rays), integrals)
+    elif attenuation.rays is rays:
+        kernel = compiled(_integrate_attenuated, types.void(_READ_F32, *_RAYS, _READ_F32, _F32_1D))
+        kernel(volume, *_contiguous(rays), attenuation.mu, integrals)
+    else:
+        kernel = compiled(_integrate_behind, types.void(_READ_F32, *_RAYS, _READ_F32, *_LINES, _F32_1D))
+        kernel(volume, *_contiguous(rays), attenuation.mu, *_contiguous(attenuation.rays)[:2], integrals)
     return integrals
 
 
-def adjoint(volume: NDArray[np.float32], values: NDArray[np.float32], rays: IndexRays) -> None:
+def adjoint(
+    volume: NDArray[np.float32], values: NDArray[np.float32], rays: IndexRays, attenuation: Attenuation | None = None
+) -> None:
     """Add `values` (N,), each along its ray with the weights of `forward`, to `volume` in place."""
-    _adjoint_kernel()(volume, *_contiguous(rays), np.ascontiguousarray(values))
+    values = np.ascontiguousarray(values)
+    if attenuation is None:
+        compiled(_spread, types.void(_F32, *_RAYS, _READ_F32_1D))(volume, *_contiguous(rays), values)
+    elif attenuation.rays is rays:
+        kernel = compiled(_spread_attenuated, types.void(_F32, *_RAYS, _READ_F32, _READ_F32_1D))
+        kernel(volume, *_contiguous(rays), attenuation.mu, values)
+    else:
+        kernel = compiled(_spread_behind, types.void(_F32, *_RAYS, _READ_F32, *_LINES, _READ_F32_1D))
+        kernel(volume, *_contiguous(rays), attenuation.mu, *_contiguous(attenuation.rays)[:2], values)
+
+
+def _forward_kernel() -> Any:
+    return compiled(_integrate, types.void(_READ_F32, *_RAYS, _F32_1D))
 
 
 def _contiguous(rays: IndexRays) -> tuple[NDArray[np.float64], ...]:
     return tuple(np.ascontiguousarray(a) for a in (rays.starts, rays.directions, rays.lengths))
 
 
-def _forward_kernel() -> Any:
-    return compiled(_integrate, types.void(_READ_F32, *_RAYS, types.float32[::1]))
-
-
-def _adjoint_kernel() -> Any:
-    values = types.Array(types.float32, 1, "C", readonly=True)
-    return compiled(_spread, types.void(types.float32[:, :, ::1], *_RAYS, values))
+# Plain: every segment counts its length.
 
 
 def _integrate(volume, starts, directions, lengths, integrals):  # type: ignore[no-untyped-def]
@@ -61,14 +82,130 @@ def _spread(volume, starts, directions, lengths, values):  # type: ignore[no-unt
 
 
 @njit(forceinline=True)
-def _add_up(voxels, p, weight, total):  # type: ignore[no-untyped-def]
-    return total + weight * voxels[p]
+def _add_up(voxels, p, alpha, end, total):  # type: ignore[no-untyped-def]
+    return total + (end - alpha) * voxels[p]
 
 
 @njit(forceinline=True)
-def _add_to(voxels, p, weight, value):  # type: ignore[no-untyped-def]
-    voxels[p] += weight * value
+def _add_to(voxels, p, alpha, end, value):  # type: ignore[no-untyped-def]
+    voxels[p] += (end - alpha) * value
     return value
+
+
+# Attenuated, mu on the volume's lattice: the ray carries what is left of it.
+
+
+def _integrate_attenuated(volume, starts, directions, lengths, mu, integrals):  # type: ignore[no-untyped-def]
+    voxels, mu_voxels = volume.reshape(-1), mu.reshape(-1)
+    for r in range(len(lengths)):
+        data = (voxels, mu_voxels, lengths[r])
+        total, _ = _walk(data, volume.shape, starts[r], directions[r], _add_up_attenuated, (0.0, 1.0))
+        integrals[r] = lengths[r] * total
+
+
+def _spread_attenuated(volume, starts, directions, lengths, mu, values):  # type: ignore[no-untyped-def]
+    voxels, mu_voxels = volume.reshape(-1), mu.reshape(-1)
+    for r in range(len(lengths)):
+        data = (voxels, mu_voxels, lengths[r])
+        state = (lengths[r] * values[r], 1.0)
+        _walk(data, volume.shape, starts[r], directions[r], _add_to_attenuated, state)
+
+
+@njit(forceinline=True)
+def _add_up_attenuated(data, p, alpha, end, state):  # type: ignore[no-untyped-def]
+    voxels, mu, length = data
+    total, left = state
+    seen, left = _pass(mu[p] * length, end - alpha, left)
+    return total + seen * voxels[p], left
+
+
+@njit(forceinline=True)
+def _add_to_attenuated(data, p, alpha, end, state):  # type: ignore[no-untyped-def]
+    voxels, mu, length = data
+    value, left = state
+    seen, left = _pass(mu[p] * length, end - alpha, left)
+    voxels[p] += seen * value
+    return value, left
+
+
+@njit(forceinline=True)
+def _pass(mu, step, left):  # type: ignore[no-untyped-def]
+    """Through a segment of length `step`: the integral of what is left of the ray, and what is left behind it.
+
+    With t = mu step the integral is left * step * (1 - exp(-t)) / t. A voxel's t is small: the fraction's series,
+    cut where its terms fall below 1e-9.
+    """
+    t = mu * step
+    series = 1 - t * (1 / 2 - t * (1 / 6 - t * (1 / 24 - t * (1 / 120 - t * (1 / 720)))))
+    mean = series if t < 0.1 else -expm1(-t) / t
+    return left * step * mean, left * (1 - t * mean)
+
+
+# Attenuated, mu on a lattice of its own: within each of the volume's segments the ray walks on through mu's.
+
+
+def _integrate_behind(  # type: ignore[no-untyped-def]
+    volume, starts, directions, lengths, mu, mu_starts, mu_directions, integrals
+):
+    voxels, mu_voxels = volume.reshape(-1), mu.reshape(-1)
+    for r in range(len(lengths)):
+        line, place = _enter(mu.shape, mu_starts[r], mu_directions[r])
+        data = (voxels, mu_voxels, lengths[r], line)
+        total, _, _, _ = _walk(data, volume.shape, starts[r], directions[r], _add_up_behind, (0.0, 1.0, 0.0, place))
+        integrals[r] = lengths[r] * total
+
+
+def _spread_behind(  # type: ignore[no-untyped-def]
+    volume, starts, directions, lengths, mu, mu_starts, mu_directions, values
+):
+    voxels, mu_voxels = volume.reshape(-1), mu.reshape(-1)
+    for r in range(len(lengths)):
+        line, place = _enter(mu.shape, mu_starts[r], mu_directions[r])
+        data = (voxels, mu_voxels, lengths[r], line)
+        state = (lengths[r] * values[r], 1.0, 0.0, place)
+        _walk(data, volume.shape, starts[r], directions[r], _add_to_behind, state)
+
+
+@njit(forceinline=True)
+def _add_up_behind(data, p, alpha, end, state):  # type: ignore[no-untyped-def]
+    voxels, mu, length, line = data
+    total, left, done, place = state
+    _, left, place = _pass_on(mu, length, line, left, done, alpha, place)  # before the first segment
+    seen, left, place = _pass_on(mu, length, line, left, alpha, end, place)
+    return total + seen * voxels[p], left, end, place
+
+
+@njit(forceinline=True)
+def _add_to_behind(data, p, alpha, end, state):  # type: ignore[no-untyped-def]
+    voxels, mu, length, line = data
+    value, left, done, place = state
+    _, left, place = _pass_on(mu, length, line, left, done, alpha, place)
+    seen, left, place = _pass_on(mu, length, line, left, alpha, end, place)
+    voxels[p] += seen * value
+    return value, left, end, place
+
+
+@njit
+def _pass_on(mu, length, line, left, alpha, end, place):  # type: ignore[no-untyped-def]
+    """From `alpha` to `end` through mu's lattice: `_pass` for all of its segments between, and the place at `end`."""
+    enter, leave = line[0], line[1]
+    seen = 0.0
+    if alpha < enter:  # not there yet, or never
+        before = min(enter, end)
+        seen, left = _pass(0.0, before - alpha, left)
+        alpha = before
+    while alpha < end:
+        crossing = _crossing(place)
+        if alpha >= leave:
+            part, left = _pass(0.0, end - alpha, left)
+            return seen + part, left, place
+        stop = min(crossing, leave, end)
+        part, left = _pass(mu[np.uint64(place[0])] * length, stop - alpha, left)
+        seen += part
+        alpha = stop
+        if crossing == stop and crossing < leave:
+            place = _next(line, place)
+    return seen, left, place
 
 
 @njit(forceinline=True)
@@ -95,13 +232,64 @@ def _axis(n, stride, s, d, alpha):  # type: ignore[no-untyped-def]
 
 
 @njit(forceinline=True)
-def _walk(voxels, shape, start, direction, visit, state):  # type: ignore[no-untyped-def]
-    """``state = visit(voxels, p, d_alpha, state)`` for every segment of a ray, p its voxel's flat index, in order.
+def _enter(shape, start, direction):  # type: ignore[no-untyped-def]
+    """A ray's way into a lattice: its line there, and its place on entering.
+
+    The line is (enter, leave, and for each axis: start, 1 / d, plane step, index step); a ray that misses has enter =
+    inf. The place is (flat index of the voxel, and for each axis: next plane, alpha of that).
+    """
+    nx, ny, nz = shape
+    sx, sy, sz = start[0], start[1], start[2]
+    dx, dy, dz = direction[0], direction[1], direction[2]
+    enter, leave = _clip(nx, sx, dx, 0.0, 1.0)
+    enter, leave = _clip(ny, sy, dy, enter, leave)
+    enter, leave = _clip(nz, sz, dz, enter, leave)
+    if enter >= leave:
+        enter = inf
+    inside = 0.0 if enter == inf else enter
+
+    px, kx, step_x, inv_x, stride_x = _axis(nx, ny * nz, sx, dx, inside)
+    py, ky, step_y, inv_y, stride_y = _axis(ny, nz, sy, dy, inside)
+    pz, kz, step_z, inv_z, stride_z = _axis(nz, 1, sz, dz, inside)
+    line = (enter, leave, sx, inv_x, step_x, stride_x, sy, inv_y, step_y, stride_y, sz, inv_z, step_z, stride_z)
+    return line, (px + py + pz, kx, (kx - sx) * inv_x, ky, (ky - sy) * inv_y, kz, (kz - sz) * inv_z)
+
+
+@njit(forceinline=True)
+def _crossing(place):  # type: ignore[no-untyped-def]
+    """Alpha of the next plane."""
+    return min(place[2], place[4], place[6])
+
+
+@njit(forceinline=True)
+def _next(line, place):  # type: ignore[no-untyped-def]
+    """The place behind the next plane."""
+    _, _, sx, inv_x, step_x, stride_x, sy, inv_y, step_y, stride_y, sz, inv_z, step_z, stride_z = line
+    p, kx, ax, ky, ay, kz, az = place
+    crossing = min(ax, ay, az)
+    if ax == crossing:
+        kx += step_x
+        p += stride_x
+        ax = (kx - sx) * inv_x
+    elif ay == crossing:
+        ky += step_y
+        p += stride_y
+        ay = (ky - sy) * inv_y
+    else:
+        kz += step_z
+        p += stride_z
+        az = (kz - sz) * inv_z
+    return p, kx, ax, ky, ay, kz, az
+
+
+@njit(forceinline=True)
+def _walk(data, shape, start, direction, visit, state):  # type: ignore[no-untyped-def]
+    """``state = visit(data, p, alpha, end, state)`` for every segment of a ray, p its voxel's flat index, in order.
 
     Why p never leaves the volume. Along an axis with d > 0 the next plane is k = i + 1, at alpha(k) = fl(fl(k
     - s) / d), recomputed from the whole number k each time and never added up. Rounding keeps order, so
     alpha(k) does not fall with k; and `leave` is at most alpha(n), computed by the very same expression in
-    `_clip`. A step is taken only when alpha(k) < leave <= alpha(n), hence k < n, and the voxel entered, k, is
+    `_clip`. A step (`_next`) is taken only when alpha(k) < leave <= alpha(n), hence k < n, and the voxel entered, k, is
     in 0..n-1. With d < 0 the next plane is k = i, a step needs alpha(k) < leave <= alpha(0), hence k > 0, and
     the voxel entered is k - 1 >= 0. The first voxel is clamped. This holds for IEEE arithmetic: no fastmath
     here, which might compute the two sides differently.
@@ -109,35 +297,14 @@ def _walk(voxels, shape, start, direction, visit, state):  # type: ignore[no-unt
     Rounding may put the first voxel one off, or a plane a hair before the last one: then a segment of some
     1e-16 is missed or negative, and the sum of the segments is still `leave - enter`.
     """
-    nx, ny, nz = shape
-    sx, sy, sz = start[0], start[1], start[2]
-    dx, dy, dz = direction[0], direction[1], direction[2]
-    alpha, leave = _clip(nx, sx, dx, 0.0, 1.0)
-    alpha, leave = _clip(ny, sy, dy, alpha, leave)
-    alpha, leave = _clip(nz, sz, dz, alpha, leave)
-    if alpha >= leave:
+    line, place = _enter(shape, start, direction)
+    alpha, leave = line[0], line[1]
+    if alpha == inf:
         return state
-
-    px, kx, step_x, inv_x, stride_x = _axis(nx, ny * nz, sx, dx, alpha)
-    py, ky, step_y, inv_y, stride_y = _axis(ny, nz, sy, dy, alpha)
-    pz, kz, step_z, inv_z, stride_z = _axis(nz, 1, sz, dz, alpha)
-    p = px + py + pz
-    ax, ay, az = (kx - sx) * inv_x, (ky - sy) * inv_y, (kz - sz) * inv_z
     while True:
-        crossing = min(ax, ay, az)
+        crossing = _crossing(place)
         if crossing >= leave:
-            return visit(voxels, np.uint64(p), leave - alpha, state)
-        state = visit(voxels, np.uint64(p), crossing - alpha, state)
+            return visit(data, np.uint64(place[0]), alpha, leave, state)
+        state = visit(data, np.uint64(place[0]), alpha, crossing, state)
         alpha = crossing
-        if ax == crossing:
-            kx += step_x
-            p += stride_x
-            ax = (kx - sx) * inv_x
-        elif ay == crossing:
-            ky += step_y
-            p += stride_y
-            ay = (ky - sy) * inv_y
-        else:
-            kz += step_z
-            p += stride_z
-            az = (kz - sz) * inv_z
+        place = _next(line, place)

@@ -2,7 +2,8 @@
 
 R. L. Siddon, "Fast calculation of the exact radiological path for a three-dimensional CT array", Medical
 Physics 12 (1985) 252-255: a ray's crossings with all planes of voxel faces, sorted, cut it into segments; a
-segment's midpoint tells its voxel. `siddon_torch` is the same in torch.
+segment's midpoint tells its voxel. What attenuates has its own lattice, whose planes cut the ray too, so every
+segment lies in one voxel of each. `siddon_torch` is the same in torch.
 """
 
 from __future__ import annotations
@@ -12,7 +13,7 @@ from collections.abc import Iterator
 import numpy as np
 from numpy.typing import NDArray
 
-from .rays import IndexRays
+from .rays import Attenuation, IndexRays
 
 Array = NDArray[np.float64]
 
@@ -20,46 +21,78 @@ Array = NDArray[np.float64]
 _CROSSINGS = 2**18
 
 
-def forward(volume: Array, rays: IndexRays) -> Array:
-    """Line integrals (N,), value x mm, of `volume` (n_x, n_y, n_z) along `rays`."""
+def forward(volume: Array, rays: IndexRays, attenuation: Attenuation | None = None) -> Array:
+    """Line integrals (N,), value x mm, of `volume` (n_x, n_y, n_z) along `rays`, attenuated towards their sources."""
     integrals = np.empty(len(rays))
     voxels = volume.reshape(-1)
-    for part, index, weight in _segments(volume.shape, rays):
+    for part, index, weight in _segments(volume.shape, rays, attenuation):
         integrals[part] = (voxels[index] * weight).sum(axis=1)
     return integrals
 
 
-def adjoint(volume: Array, values: Array, rays: IndexRays) -> None:
+def adjoint(volume: Array, values: Array, rays: IndexRays, attenuation: Attenuation | None = None) -> None:
     """Add `values` (N,), each along its ray with the weights of `forward`, to `volume` in place."""
     voxels = volume.reshape(-1)
-    for part, index, weight in _segments(volume.shape, rays):
+    for part, index, weight in _segments(volume.shape, rays, attenuation):
         np.add.at(voxels, index, weight * values[part, None])
 
 
-def _segments(shape: tuple[int, ...], rays: IndexRays) -> Iterator[tuple[slice, NDArray[np.intp], Array]]:
-    """Segments of the rays, some rays at a time: which rays (a slice), flat voxel index (n, S), length in mm (n, S).
+def _segments(
+    shape: tuple[int, ...], rays: IndexRays, attenuation: Attenuation | None
+) -> Iterator[tuple[slice, NDArray[np.intp], Array]]:
+    """Segments of the rays, some rays at a time: which rays (a slice), flat voxel index (n, S), weight in mm (n, S).
 
-    A segment outside the volume has length 0 and index 0.
+    The weight is the segment's length, or, attenuated, the integral of exp(-integral of mu from the source) over it.
+    A segment outside the volume has weight 0 and index 0.
     """
-    rays_at_once = max(1, _CROSSINGS // (sum(shape) + 5))
+    lattices = [(shape, rays)]
+    if attenuation is not None and attenuation.rays is not rays:
+        lattices.append((attenuation.mu.shape, attenuation.rays))
+    rays_at_once = max(1, _CROSSINGS // sum(sum(shape) + 5 for shape, _ in lattices))
     for first in range(0, len(rays), rays_at_once):
         part = slice(first, first + rays_at_once)
-        start, direction, length = rays.starts[part], rays.directions[part], rays.lengths[part]
-        crossings = [np.zeros((len(start), 1)), np.ones((len(start), 1))]
-        for axis, n in enumerate(shape):
-            s, d = start[:, axis, None], direction[:, axis, None]
-            parallel = d == 0
-            # Crossings before the source or behind the target become segments of length 0 at the ray's ends.
-            alpha = np.clip((np.arange(n + 1) - s) / np.where(parallel, 1.0, d), 0.0, 1.0)
-            crossings.append(np.where(parallel, 0.0, alpha))
+        length = rays.lengths[part, None]
+        crossings = [np.zeros(length.shape), np.ones(length.shape)]
+        for lattice_shape, lattice_rays in lattices:
+            crossings += _crossings(lattice_shape, lattice_rays[part])
         alpha = np.sort(np.concatenate(crossings, axis=1), axis=1)
         middle = (alpha[:, 1:] + alpha[:, :-1]) / 2
+        segment = np.diff(alpha, axis=1) * length
 
-        index = np.zeros(middle.shape, dtype=np.intp)
-        inside = np.ones(middle.shape, dtype=bool)
-        for axis, n in enumerate(shape):
-            voxel = np.floor(start[:, axis, None] + middle * direction[:, axis, None])
-            inside &= (voxel >= 0) & (voxel < n)
-            index = index * n + np.clip(voxel, 0, n - 1).astype(np.intp)
-        index[~inside] = 0
-        yield part, index, np.where(inside, np.diff(alpha, axis=1) * length[:, None], 0.0)
+        index, inside = _voxels(shape, rays[part], middle)
+        weight = np.where(inside, segment, 0.0)
+        if attenuation is not None:
+            mu_index, inside = _voxels(attenuation.mu.shape, attenuation.rays[part], middle)
+            depth = np.where(inside, attenuation.mu.reshape(-1)[mu_index], 0.0) * segment
+            weight *= np.exp(depth - np.cumsum(depth, axis=1)) * _mean_transmission(depth)
+        yield part, index, weight
+
+
+def _crossings(shape: tuple[int, ...], rays: IndexRays) -> Iterator[Array]:
+    """Where the rays cross a lattice's planes, axis by axis: alpha (N, n + 1)."""
+    for axis, n in enumerate(shape):
+        s, d = rays.starts[:, axis, None], rays.directions[:, axis, None]
+        parallel = d == 0
+        # Crossings before the source or behind the target become segments of length 0 at the ray's ends.
+        alpha = np.clip((np.arange(n + 1) - s) / np.where(parallel, 1.0, d), 0.0, 1.0)
+        yield np.where(parallel, 0.0, alpha)
+
+
+def _voxels(shape: tuple[int, ...], rays: IndexRays, alpha: Array) -> tuple[NDArray[np.intp], NDArray[np.bool_]]:
+    """Flat index of the voxel in which each of the points `alpha` (N, S) of the rays lies, and whether it lies in any.
+
+    The index of a point in no voxel is 0.
+    """
+    index = np.zeros(alpha.shape, dtype=np.intp)
+    inside = np.ones(alpha.shape, dtype=bool)
+    for axis, n in enumerate(shape):
+        voxel = np.floor(rays.starts[:, axis, None] + alpha * rays.directions[:, axis, None])
+        inside &= (voxel >= 0) & (voxel < n)
+        index = index * n + np.clip(voxel, 0, n - 1).astype(np.intp)
+    index[~inside] = 0
+    return index, inside
+
+
+def _mean_transmission(depth: Array) -> Array:
+    """Mean of exp(-t) over t from 0 to `depth`: (1 - exp(-depth)) / depth, 1 at 0."""
+    return np.divide(-np.expm1(-depth), depth, out=np.ones_like(depth), where=depth != 0)

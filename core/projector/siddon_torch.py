@@ -7,69 +7,114 @@ here: the operator's autograd function calls `adjoint`, so that no graph of the 
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
-from .rays import IndexRays
+from .rays import Attenuation, IndexRays
 
 # Crossings held at once, per kind of device: some ten arrays of this many float64 exist at the same time.
 _CROSSINGS_CPU = 2**19
 _CROSSINGS_GPU = 2**24
 
 
-def forward(volume: Tensor, rays: IndexRays) -> Tensor:
-    """Line integrals (N,), value x mm, of `volume` (n_x, n_y, n_z) along `rays`."""
+def forward(volume: Tensor, rays: IndexRays, attenuation: Attenuation | None = None) -> Tensor:
+    """Line integrals (N,), value x mm, of `volume` (n_x, n_y, n_z) along `rays`, attenuated towards their sources."""
     integrals = torch.empty(len(rays), dtype=volume.dtype, device=volume.device)
     voxels = volume.reshape(-1)
-    for part, index, weight in _segments(volume, rays):
+    for part, index, weight in _segments(volume, rays, attenuation):
         integrals[part] = (voxels[index] * weight).sum(dim=1).to(volume.dtype)
     return integrals
 
 
-def adjoint(volume: Tensor, values: Tensor, rays: IndexRays) -> None:
+def adjoint(volume: Tensor, values: Tensor, rays: IndexRays, attenuation: Attenuation | None = None) -> None:
     """Add `values` (N,), each along its ray with the weights of `forward`, to `volume` in place."""
     voxels = volume.reshape(-1)
-    for part, index, weight in _segments(volume, rays):
+    for part, index, weight in _segments(volume, rays, attenuation):
         spread = weight * values[part, None]
         voxels.index_add_(0, index.reshape(-1), spread.reshape(-1).to(volume.dtype))
 
 
-def _segments(volume: Tensor, rays: IndexRays) -> Iterator[tuple[slice, Tensor, Tensor]]:
-    """Segments of the rays, some rays at a time: which rays (a slice), flat voxel index (n, S), length in mm (n, S).
+def _segments(
+    volume: Tensor, rays: IndexRays, attenuation: Attenuation | None
+) -> Iterator[tuple[slice, Tensor, Tensor]]:
+    """Segments of the rays, some rays at a time: which rays (a slice), flat voxel index (n, S), weight in mm (n, S).
 
-    A segment outside the volume has length 0 and index 0.
+    The weight is the segment's length, or, attenuated, the integral of exp(-integral of mu from the source) over it.
+    A segment outside the volume has weight 0 and index 0.
     """
-    device, shape = volume.device, volume.shape
-    real = torch.float32 if device.type == "mps" else torch.float64  # Apple's GPUs have no float64
-
-    def on_device(array: object) -> Tensor:
-        return torch.as_tensor(array, dtype=real).to(device)
-
-    starts, directions, lengths = on_device(rays.starts), on_device(rays.directions), on_device(rays.lengths)
+    device = volume.device
+    line = _on_device(rays, device)
+    lattices = [(volume.shape, line)]
+    if attenuation is not None:
+        mu_shape = attenuation.mu.shape
+        mu_line = line if attenuation.rays is rays else _on_device(attenuation.rays, device)
+        if mu_line is not line:
+            lattices.append((mu_shape, mu_line))
     budget = _CROSSINGS_CPU if device.type == "cpu" else _CROSSINGS_GPU
-    rays_at_once = max(1, budget // (sum(shape) + 5))
+    rays_at_once = max(1, budget // sum(sum(shape) + 5 for shape, _ in lattices))
     for first in range(0, len(rays), rays_at_once):
         part = slice(first, first + rays_at_once)
-        start, direction, length = starts[part], directions[part], lengths[part]
-        ends = torch.zeros((len(start), 2), dtype=real, device=device)
-        ends[:, 1] = 1.0
-        crossings = [ends]
-        for axis, n in enumerate(shape):
-            s, d = start[:, axis, None], direction[:, axis, None]
-            parallel = d == 0
-            planes = torch.arange(n + 1, dtype=real, device=device)
-            # Crossings before the source or behind the target become segments of length 0 at the ray's ends.
-            alpha = ((planes - s) / torch.where(parallel, 1.0, d)).clamp_(0.0, 1.0)
-            crossings.append(alpha.masked_fill_(parallel, 0.0))
+        length = line.lengths[part, None]
+        crossings = [torch.zeros_like(length), torch.ones_like(length)]
+        for lattice_shape, lattice_line in lattices:
+            crossings += _crossings(lattice_shape, lattice_line.part(part))
         alpha = torch.cat(crossings, dim=1).sort(dim=1).values
         middle = (alpha[:, 1:] + alpha[:, :-1]) / 2
+        segment = alpha.diff(dim=1) * length
 
-        index = torch.zeros(middle.shape, dtype=torch.int64, device=device)
-        inside = torch.ones(middle.shape, dtype=torch.bool, device=device)
-        for axis, n in enumerate(shape):
-            voxel = torch.floor(start[:, axis, None] + middle * direction[:, axis, None])
-            inside &= (voxel >= 0) & (voxel < n)
-            index = index * n + voxel.clamp_(0, n - 1).to(torch.int64)
-        index.masked_fill_(~inside, 0)
-        yield part, index, (alpha.diff(dim=1) * length[:, None]).masked_fill_(~inside, 0.0)
+        index, inside = _voxels(volume.shape, line.part(part), middle)
+        weight = segment.masked_fill(~inside, 0.0)
+        if attenuation is not None:
+            mu_index, inside = _voxels(mu_shape, mu_line.part(part), middle)
+            depth = attenuation.mu.reshape(-1)[mu_index].masked_fill_(~inside, 0.0) * segment
+            weight *= torch.exp(depth - depth.cumsum(dim=1)) * _mean_transmission(depth)
+        yield part, index, weight
+
+
+@dataclass(frozen=True, eq=False)
+class _Line:
+    """`IndexRays` in tensors."""
+
+    starts: Tensor
+    directions: Tensor
+    lengths: Tensor
+
+    def part(self, which: slice) -> _Line:
+        return _Line(self.starts[which], self.directions[which], self.lengths[which])
+
+
+def _on_device(rays: IndexRays, device: torch.device) -> _Line:
+    real = torch.float32 if device.type == "mps" else torch.float64  # Apple's GPUs have no float64
+    return _Line(*(torch.as_tensor(a, dtype=real).to(device) for a in (rays.starts, rays.directions, rays.lengths)))
+
+
+def _crossings(shape: tuple[int, ...], line: _Line) -> Iterator[Tensor]:
+    """Where the rays cross a lattice's planes, axis by axis: alpha (N, n + 1)."""
+    for axis, n in enumerate(shape):
+        s, d = line.starts[:, axis, None], line.directions[:, axis, None]
+        parallel = d == 0
+        planes = torch.arange(n + 1, dtype=s.dtype, device=s.device)
+        # Crossings before the source or behind the target become segments of length 0 at the ray's ends.
+        alpha = ((planes - s) / torch.where(parallel, 1.0, d)).clamp_(0.0, 1.0)
+        yield alpha.masked_fill_(parallel, 0.0)
+
+
+def _voxels(shape: tuple[int, ...], line: _Line, alpha: Tensor) -> tuple[Tensor, Tensor]:
+    """Flat index of the voxel in which each of the points `alpha` (N, S) of the rays lies, and whether it lies in any.
+
+    The index of a point in no voxel is 0.
+    """
+    index = torch.zeros(alpha.shape, dtype=torch.int64, device=alpha.device)
+    inside = torch.ones(alpha.shape, dtype=torch.bool, device=alpha.device)
+    for axis, n in enumerate(shape):
+        voxel = torch.floor(line.starts[:, axis, None] + alpha * line.directions[:, axis, None])
+        inside &= (voxel >= 0) & (voxel < n)
+        index = index * n + voxel.clamp_(0, n - 1).to(torch.int64)
+    return index.masked_fill_(~inside, 0), inside
+
+
+def _mean_transmission(depth: Tensor) -> Tensor:
+    """Mean of exp(-t) over t from 0 to `depth`: (1 - exp(-depth)) / depth, 1 at 0."""
+    return torch.where(depth != 0, -torch.expm1(-depth) / torch.where(depth != 0, depth, 1.0), 1.0)

@@ -15,7 +15,7 @@ from mphdrr.core import memory  # noqa: E402
 from mphdrr.core.errors import InputError  # noqa: E402
 from mphdrr.core.mosaic import as_seen  # noqa: E402
 from mphdrr.core.progress import Cancelled  # noqa: E402
-from mphdrr.core.projector import Projector  # noqa: E402
+from mphdrr.core.projector import Emission, Projector  # noqa: E402
 from mphdrr.core.system import PinholeSystem  # noqa: E402
 
 
@@ -42,6 +42,18 @@ def test_images_hold_exactly_what_core_projects(scanned, scene, detector):
         image = bpy.data.images[ids.projection_name(number, 8)]
         assert image.colorspace_settings.name == "Non-Color" and tuple(image.size) == (24, 20) and image.is_float
         assert np.array_equal(images.projection_array(image), expected[m])
+
+
+def test_emission_makes_counts(scanned, scene):
+    from mphdrr.core.export import read_run
+
+    assert bpy.ops.mphdrr.render_projections(width=24, height=20, model="EMISSION", time=60) == {"FINISHED"}
+    run = read_run(storage.absolute(getattr(scene, ids.SCENE_PROJECTIONS).run_file))
+    volume = volumes.volume_from_object(bpy.data.objects["Derenzo"])
+    expected = Projector(volume.grid, scanned.views((20, 24)), Emission(scanned, time=60))(volume)
+    assert expected.max() > 0
+    np.testing.assert_array_equal(run.projections, expected)
+    assert (run.unit, run.settings["model"], run.settings["time"]) == ("counts", "emission", 60)
 
 
 def test_images_are_shown_as_the_pinhole_sees_them(scanned):

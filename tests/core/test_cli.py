@@ -64,6 +64,24 @@ def test_projecting_ct_numbers_warns(workbook, tmp_path, capsys):
     assert "CT numbers" in capsys.readouterr().err
 
 
+def test_counts_with_attenuation_and_noise(workbook, tmp_path, capsys):
+    grid = mph.Grid.centered(8, 20.0)
+    mph.write_volume(mph.Volume(np.full((8, 8, 8), 0.0154), grid, "mu"), tmp_path / "mu.nii")
+    options = [*SMALL, "--modules", "3-4", "--emission", "--time", "600", "--mu", str(tmp_path / "mu.nii")]
+    options += ["--aperture-points", "3"]
+    for name, more in (("mean", []), ("drawn", ["--noise", "5"])):
+        assert main(["project", str(workbook), *options, *more, "-o", str(tmp_path / f"{name}.h5")]) == 0
+        assert "counts" in capsys.readouterr().out
+    mean, drawn = (mph.read_run(tmp_path / f"{name}.h5") for name in ("mean", "drawn"))
+    assert mean.unit == drawn.unit == "counts" and (mean.seed, drawn.seed) == (None, 5)
+    assert mean.settings["model"] == "emission" and mean.settings["time"] == 600
+    mu = mph.Volume(np.full((8, 8, 8), 0.0154), grid, "mu")
+    model = mph.Emission(mean.system, mu, time=600, aperture_points=3)
+    expected = mph.Projector(mean.volume.grid, mean.views, model)(mean.volume)
+    np.testing.assert_allclose(mean.projections, expected, rtol=1e-5)
+    np.testing.assert_array_equal(drawn.projections, mph.sample_counts(mean.projections, 5))
+
+
 @pytest.mark.parametrize(
     ("command", "said"),
     [
@@ -77,6 +95,8 @@ def test_projecting_ct_numbers_warns(workbook, tmp_path, capsys):
         (["project", "WORKBOOK", "-o", "FOLDER/a.txt"], "expected a name ending in"),
         (["project", "WORKBOOK", *SMALL, "--backend", "magic", "-o", "FOLDER/a.h5"], "numba"),
         (["project", "WORKBOOK", *SMALL, "--magnification", "0", "-o", "FOLDER/a.h5"], "magnification"),
+        (["project", "WORKBOOK", *SMALL, "--noise", "1", "-o", "FOLDER/a.h5"], "--noise needs --emission"),
+        (["project", "WORKBOOK", *SMALL, "--emission", "--time", "0", "-o", "FOLDER/a.h5"], "time"),
         (["project", "WORKBOOK", "--volume", "none.nii", "-o", "FOLDER/a.h5"], "none.nii: no such file"),
         (["project", "WORKBOOK", *SMALL[:4], "--size", "900000", "900000", "-o", "FOLDER/a.h5"], "of memory"),
         (["project", "WORKBOOK", *SMALL, "-o", "WORKBOOK/a.h5"], "cannot be written"),

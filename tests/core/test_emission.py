@@ -1,0 +1,470 @@
+"""Laws of SPECT counts: the pinhole's sensitivity, attenuation, aperture, detector, noise."""
+
+from __future__ import annotations
+
+import importlib.util
+
+import numpy as np
+import pytest
+
+import mphdrr.core as mph
+from mphdrr.core.errors import InputError
+
+from .conftest import WORKBOOK, general_grid
+
+
+def _backend(name):
+    missing = name != "numpy" and importlib.util.find_spec(name) is None
+    return pytest.param(name, marks=pytest.mark.skipif(missing, reason=f"{name} is not installed"))
+
+
+BACKENDS = [_backend(name) for name in ("numpy", "torch", "numba")]
+TOLERANCE = {"numpy": 1e-12, "torch": 1e-5, "numba": 1e-5}
+
+
+def one_module(**changes):
+    """A pinhole at x = 200 mm that looks along -x."""
+    lengths = {"pinhole_diameter": 2.0, "collimator_length": 60.0, "detector_side": 50.0, "detector_thickness": 10.0}
+    return mph.PinholeSystem(centers=[[200.0, 0.0, 0.0]], roi_radius=60.0, **(lengths | changes))
+
+
+def sensitivity(system, points):
+    """The law of a point source, (M, N): counts per decay at each of the points (N, 3)."""
+    towards = points[None] - system.centers[:, None]
+    distance = np.linalg.norm(towards, axis=2)
+    h = np.einsum("mni,mi->mn", towards, system.principal_rays)
+    return system.pinhole_diameter[:, None] ** 2 * (h / distance) ** 3 / (16 * h**2)
+
+
+def in_ball(rng, radius, n):
+    directions = rng.normal(size=(n, 3))
+    return directions * (radius * rng.random((n, 1)) ** (1 / 3) / np.linalg.norm(directions, axis=1, keepdims=True))
+
+
+def turned_grid(shape, spacing, center=(0.0, 0.0, 0.0)):
+    """A grid with no plane along any module's rays."""
+    affine = mph.euler_pose(0.3, 0.5, 0.2)
+    affine[:3, :3] *= spacing
+    affine[:3, 3] = center - affine[:3, :3] @ ((np.array(shape) - 1) / 2)
+    return mph.Grid(shape, affine)
+
+
+def assert_adjoint(A, rng):
+    x, y = rng.random(A.shape_in), rng.random(A.shape_out)
+    Ax, ATy = A(x).astype(float), A.T(y).astype(float)
+    assert Ax.any()
+    assert abs(np.vdot(Ax, y) - np.vdot(x, ATy)) < np.linalg.norm(Ax) * np.linalg.norm(y) * TOLERANCE[A.backend]
+
+
+def test_point_source_obeys_pinhole_sensitivity(rng):
+    """All 80 modules, 100 places in the ROI, the crystal's own pixels: total counts of a small bright spot.
+
+    A spot is 27 voxels with weights 1-2-1 along each axis (a single voxel's edges would beat with the pixels). The
+    total counts of every voxel are the adjoint of an image of ones.
+    """
+    system = mph.read_system(WORKBOOK)
+    grid = turned_grid((27, 27, 27), 6.0)
+    places = np.c_[in_ball(rng, system.roi_radius.min() - 6, 100), np.ones(100)]
+    steps = np.stack(np.meshgrid(*[[-1, 0, 1]] * 3, indexing="ij"), axis=-1).reshape(27, 3)
+    weights = np.prod(0.5 ** (1 + np.abs(steps)), axis=1)
+    index = np.rint((places @ grid.index_from_world.T)[:, None, :3]).astype(int) + steps
+    voxels = index @ grid.affine[:3, :3].T + grid.affine[:3, 3]
+    expected = sensitivity(system, voxels.reshape(-1, 3)).reshape(80, 100, 27) @ weights * grid.voxel_volume
+    for m in range(len(system)):
+        pitch = system.detector_side[m] / 256  # and more of them around, so that nothing is cut off
+        A = mph.Projector(grid, system[m].views((320, 320), "real", pitch=pitch), mph.Emission(system[m]))
+        total = A.T(np.ones((1, 320, 320)))[tuple(np.moveaxis(index, -1, 0))] @ weights
+        np.testing.assert_allclose(total, expected[m], rtol=0.01)
+
+
+def test_point_source_obeys_pinhole_sensitivity_to_a_thousandth_with_fine_pixels(rng):
+    system = mph.read_system(WORKBOOK)[::27]
+    for place in in_ball(rng, 60, 2):
+        grid = turned_grid((1, 1, 1), 3.0, place)
+        expected = sensitivity(system, place[None])[:, 0] * grid.voxel_volume
+        matrices = system.views(shape=(1, 1), detector="real").projection_matrices()
+        for m in range(len(system)):
+            column, row, factor = matrices[m] @ [*place, 1.0]  # look only at where the voxel's image is
+            side = system.detector_side[m]
+            views = system[m].views((700, 700), "real", pitch=0.003, offset=np.array([column, row]) / factor * side)
+            total = mph.Projector(grid, views, mph.Emission(system[m]))(np.ones((1, 1, 1))).sum(dtype=float)
+            np.testing.assert_allclose(total, expected[m], rtol=0.001)
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_counts_grow_with_time_and_the_pinholes_area(backend, rng):
+    grid = turned_grid((5, 6, 7), 8.0)
+    x = rng.random(grid.shape)
+    views = one_module().views((8, 9))
+    base = mph.Projector(grid, views, mph.Emission(one_module()), backend)(x)
+    longer = mph.Projector(grid, views, mph.Emission(one_module(), time=20.0, photons_per_decay=0.5), backend)(x)
+    wider = mph.Projector(grid, views, mph.Emission(one_module(pinhole_diameter=6.0)), backend)(x)
+    assert base.any()
+    np.testing.assert_allclose(longer, 10 * base, rtol=1e-6)
+    np.testing.assert_allclose(wider, 9 * base, rtol=1e-6)
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_counts_per_solid_angle_follow_the_formula(backend):
+    """A slab across the field of view: T d^2 p^2 cos^4(psi) / (16 l^2) times its path length, thickness / cos(psi)."""
+    system = one_module()
+    grid = mph.Grid.centered((1, 1, 1), (10, 400, 400))
+    views = system.views((8, 9), detector="real", pitch=(3.0, 2.0), offset=(4.0, -5.0))
+    counts = mph.Projector(grid, views, mph.Emission(system, time=7.0), backend)(np.full((1, 1, 1), 5.0))[0]
+    u = (np.arange(9) - 4) * 3.0 + 4.0
+    v = (np.arange(8) - 3.5)[:, None] * 2.0 - 5.0
+    cosine = 60 / np.sqrt(60**2 + u**2 + v**2)
+    np.testing.assert_allclose(counts, 7 * 2**2 * 6 * cosine**3 / (16 * 60**2) * 5 * 10, rtol=1e-5)
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+@pytest.mark.parametrize("magnification", [0.7, 2.0, 10.0])
+def test_real_and_virtual_detector_count_the_same(backend, magnification, system, rng):
+    """Point-inverted, and wherever the virtual detector stands: in front of, inside or behind the volume."""
+    grid = general_grid(rng, (9, 8, 7))
+    x = rng.random(grid.shape)
+    model = mph.Emission(system)
+    real = system.views((6, 5), "real", pitch=7.0, offset=(2.0, -3.0))
+    virtual = system.views(
+        (6, 5), "virtual", magnification, 7.0 * magnification, (-2.0 * magnification, 3.0 * magnification)
+    )
+    counts = mph.Projector(grid, real, model, backend)(x)
+    assert counts.any()
+    np.testing.assert_allclose(
+        mph.Projector(grid, virtual, model, backend)(x)[:, ::-1, ::-1], counts, rtol=1e-5, atol=1e-5 * counts.max()
+    )
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_adjoint_of_the_ideal_pinhole(backend, system, rng):
+    grid = general_grid(rng, (9, 8, 7))
+    A = mph.Projector(grid, system[3:6].views((10, 11)), mph.Emission(system[3:6]), backend, threads=2)
+    assert_adjoint(A, rng)
+    a, b = rng.random(grid.shape), rng.random(grid.shape)
+    np.testing.assert_allclose(A(2 * a + 3 * b), 2 * A(a) + 3 * A(b), rtol=1e-5, atol=1e-6 * A(a).max())
+
+
+def test_views_of_another_system_are_refused(system):
+    grid = mph.Grid.centered((4, 4, 4), 1.0)
+    views = system.views((4, 4))
+
+    def refused(*words, views=views, **arguments):
+        with pytest.raises(InputError) as error:
+            mph.Projector(grid, views, mph.Emission(**({"system": system} | arguments)))
+        assert all(word in str(error.value) for word in words) and "\n" not in str(error.value)
+
+    refused("12 modules", "4 views", views=system[:4].views((4, 4)))
+    refused("view 0", "pinhole", views=system[np.arange(12)[::-1]].views((4, 4)))
+    turned = mph.Views(
+        views.sources, views.detector_centers, views.u_steps + np.array([0, 0, 1]), views.v_steps, (4, 4)
+    )
+    refused("view 0", "along", views=turned)
+    behind = mph.Views(views.sources, 2 * views.sources - views.detector_centers, views.u_steps, views.v_steps, (4, 4))
+    refused("in front", views=behind)
+    refused("PinholeSystem", system=views)
+    refused("time", time=0)
+    with pytest.raises(InputError, match="activity"):
+        mph.Projector(grid, views, mph.Emission(system))(mph.Volume(np.ones(grid.shape), grid, "hu"))
+
+
+def some_mu(rng, grid):
+    """Between air and more than bone, with empty margins."""
+    array = rng.uniform(0, 0.05, grid.shape)
+    array[0] = array[:, -1] = 0
+    return mph.Volume(array, grid, "mu")
+
+
+def mu_grids(grid, rng):
+    """The activity's grid; one coarser, turned and larger; one that begins behind the pinhole; one elsewhere."""
+    around = mph.Grid.centered((7, 8, 9), (90.0, 80.0, 70.0), (20.0, 10.0, -5.0))
+    return [grid, turned_grid((6, 5, 7), 25.0, (4.0, 3.0, 1.0)), around, mph.Grid.centered((3, 3, 3), 5.0, (0, 0, 900))]
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+@pytest.mark.parametrize("which", range(4))
+def test_attenuation_equals_a_fine_sum_along_the_ray(backend, which, rng):
+    """Against midpoints on every ray, each attenuated by the line integral of mu from the pinhole to there."""
+    system = one_module()
+    grid = turned_grid((5, 6, 7), 12.0)
+    volume = mph.Volume(rng.random(grid.shape), grid)
+    mu = some_mu(rng, mu_grids(grid, rng)[which])
+    views = system.views((2, 3), pitch=200.0, magnification=7.0)
+    counts = mph.Projector(grid, views, mph.Emission(system, mu), backend)(volume)
+    ideal = mph.Projector(grid, views, mph.Emission(system), "numpy")(volume)
+
+    sources, targets = views.rays(0)
+    n = 4000
+    for pixel, (source, target) in enumerate(zip(sources, targets, strict=True)):
+        points = source + (np.arange(n) + 0.5)[:, None] / n * (target - source)
+        index = np.rint((np.c_[points, np.ones(n)] @ grid.index_from_world.T)[:, :3]).astype(int)
+        inside = np.all((index >= 0) & (index < grid.shape), axis=1)
+        activity = np.where(inside, volume.array[tuple(np.where(inside[:, None], index, 0).T)], 0)
+        left = np.exp(-mph.trace_rays(mu, source, points, "numpy"))
+        expected = (activity * left).sum() / max(activity.sum(), 1e-9) * ideal.reshape(-1)[pixel]
+        np.testing.assert_allclose(counts.reshape(-1)[pixel], expected, rtol=2e-3, atol=1e-12)
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+@pytest.mark.parametrize("mu", [1e-6, 0.0154, 0.3, 8.0])
+def test_uniform_body_counts_in_closed_form(backend, mu):
+    """f (1 - exp(-mu L)) / mu along each chord L, whatever the voxels."""
+    system = one_module()
+    for grid in (turned_grid((9, 8, 7), 10.0), turned_grid((3, 2, 1), (30.0, 40.0, 70.0))):
+        views = system.views((12, 13))
+        chord = mph.trace_rays(mph.Volume(np.ones(grid.shape), grid), *views.rays(0), "numpy").reshape(1, 12, 13)
+        ideal = mph.Projector(grid, views, mph.Emission(system), "numpy")(np.full(grid.shape, 3.0))
+        model = mph.Emission(system, mph.Volume(np.full(grid.shape, mu), grid, "mu"))
+        counts = mph.Projector(grid, views, model, backend)(np.full(grid.shape, 3.0))
+        coefficient = float(np.float32(mu))
+        mean = np.where(chord > 0, -np.expm1(-coefficient * chord) / np.maximum(coefficient * chord, 1e-12), 0)
+        tolerance = 1e-9 if backend == "numpy" else 2e-5
+        np.testing.assert_allclose(counts, ideal * mean, rtol=tolerance, atol=tolerance * counts.max())
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_point_source_in_a_ball_loses_its_radius(backend):
+    """exp(-mu R) from the middle of a ball of attenuating matter that is far larger than the activity's grid."""
+    system = one_module()
+    n, radius, mu = 48, 50.0, 0.0154
+    body = mph.Grid.centered((n,) * 3, 2.2 * radius / n)
+    x = body.affine[0, 3] + np.arange(n) * body.spacing[0]
+    ball = x[:, None, None] ** 2 + x[:, None] ** 2 + x**2 < radius**2
+    spot = turned_grid((3, 3, 3), 1.0)
+    views = system.views((40, 40), "real", pitch=0.06)
+    model = mph.Emission(system, mph.Volume(mu * ball, body, "mu"))
+    total = mph.Projector(spot, views, model, backend)(np.ones((3, 3, 3))).sum(dtype=float)
+    ideal = mph.Projector(spot, views, mph.Emission(system), backend)(np.ones((3, 3, 3))).sum(dtype=float)
+    np.testing.assert_allclose(total / ideal, np.exp(-mu * radius), rtol=0.01)
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_attenuation_depends_on_matter_and_not_on_its_grid(backend, system, rng):
+    """The same mu on the activity's grid, on a twice finer one and on a larger one gives the same counts."""
+    grid = turned_grid((6, 5, 4), 14.0)
+    activity = np.zeros(grid.shape)
+    activity[2:4, 1:3, 1:3] = rng.random((2, 2, 2))  # mu lies also outside the activity's support
+    mu = rng.uniform(0, 0.03, grid.shape)
+    fine = np.diag([0.5, 0.5, 0.5, 1.0])
+    fine[:3, 3] = -0.25
+    moved = np.eye(4)
+    moved[:3, 3] = -1, -2, -3
+    same = [
+        mph.Volume(mu, grid, "mu"),
+        mph.Volume(mu.repeat(2, 0).repeat(2, 1).repeat(2, 2), mph.Grid((12, 10, 8), grid.affine @ fine), "mu"),
+        mph.Volume(np.pad(mu, ((1, 1), (2, 0), (3, 4))), mph.Grid((8, 7, 11), grid.affine @ moved), "mu"),
+    ]
+    counts = [mph.Projector(grid, system.views((9, 8)), mph.Emission(system, v), backend)(activity) for v in same]
+    assert counts[0].any()
+    for other in counts[1:]:
+        np.testing.assert_allclose(other, counts[0], rtol=1e-5, atol=1e-6 * counts[0].max())
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+@pytest.mark.parametrize("which", range(4))
+def test_adjoint_with_attenuation(backend, which, system, rng):
+    grid = general_grid(rng, (9, 8, 7))
+    mu = some_mu(rng, mu_grids(grid, rng)[which])
+    A = mph.Projector(grid, system[3:6].views((10, 11)), mph.Emission(system[3:6], mu), backend, threads=2)
+    assert_adjoint(A, rng)
+
+
+@pytest.mark.parametrize("backend", BACKENDS[1:])
+@pytest.mark.parametrize("which", range(4))
+def test_backends_agree_on_attenuation(backend, which, system, rng):
+    grid = mph.Grid.centered((9, 8, 7), 6.0)
+    mu = some_mu(rng, mu_grids(grid, rng)[which])
+    x = rng.random(grid.shape)
+    x[:, :, 0] = x[0] = 0
+    straight = mph.PinholeSystem([[150, 0, 0], [0, -140, 0], [0, 30, 130]], 2.0, 60.0, 50.0, 10.0, 60.0)
+    for scanner in (system, straight):  # rays along voxel faces too: an odd number of pixels, even voxels
+        views = scanner.views((9, 11))
+        reference, y = (mph.Projector(grid, views, mph.Emission(scanner, mu), b)(x) for b in ("numpy", backend))
+        np.testing.assert_allclose(y, reference, rtol=2e-5, atol=2e-5 * reference.max())
+
+
+@pytest.mark.parametrize("backend", ["numpy", "torch"])
+@pytest.mark.parametrize("which", [0, 1])
+def test_gradient_in_the_activity(backend, which, rng):
+    torch = pytest.importorskip("torch", reason="torch is not installed")
+    grid = turned_grid((3, 2, 2), 20.0)
+    mu = some_mu(rng, mu_grids(grid, rng)[which])
+    A = mph.Projector(grid, one_module().views((3, 3)), mph.Emission(one_module(), mu, time=1e4), backend)
+    x = torch.rand(grid.shape, dtype=torch.float64, requires_grad=True)
+    assert torch.autograd.gradcheck(lambda x: torch.log1p(A(x)), (x,))
+
+
+def test_mu_that_is_not_mu_is_refused(system):
+    grid = mph.Grid.centered((2, 2, 2), 1.0)
+    for mu, word in (
+        (np.zeros((2, 2, 2)), "Volume"),
+        (mph.Volume(np.zeros((2, 2, 2)), grid), "activity"),
+        (mph.Volume(np.full((2, 2, 2), -0.1), grid, "mu"), "negative"),
+    ):
+        with pytest.raises(InputError, match=word):
+            mph.Emission(system, mu)
+
+
+def spot_image(model, place, pitch=0.05, n=160):
+    """Image of a spot of 1 mm around the middle of its picture, and the pixels' places on the crystal along u."""
+    system = model.system
+    column, row, factor = system.views((1, 1), "real").projection_matrices()[0] @ [*place, 1.0]
+    offset = np.array([column, row]) / factor * system.detector_side[0]
+    grid = turned_grid((3, 3, 3), 0.4, place)
+    views = system.views((n, n), "real", pitch=pitch, offset=offset)
+    image = mph.Projector(grid, views, model)(np.ones((3, 3, 3)))[0].astype(float)
+    return image, (np.arange(n) - (n - 1) / 2) * pitch
+
+
+def width(image, places):
+    """Standard deviation along u."""
+    profile = image.sum(axis=0) / image.sum()
+    return np.sqrt(profile @ places**2 - (profile @ places) ** 2)
+
+
+@pytest.mark.parametrize("n", [7, 19, 64])
+def test_aperture_blur_is_as_wide_as_the_holes_shadow(n):
+    """A disk of diameter D has standard deviation D / 4 along u; at the source D = d (1 + b / l)."""
+    system = one_module()
+    sharp, places = spot_image(mph.Emission(system), (0, 0, 0))
+    blurred, _ = spot_image(mph.Emission(system, aperture_points=n), (0, 0, 0))
+    b, l, d = 200.0, 60.0, 2.0
+    diameter = 4 * np.sqrt(width(blurred, places) ** 2 - width(sharp, places) ** 2)  # on the crystal
+    assert diameter * b / l == pytest.approx(d * (1 + b / l), rel=0.02)
+    assert blurred.sum() == pytest.approx(sharp.sum(), rel=0.01)
+
+
+def test_disk_points_have_the_moments_of_the_disk():
+    from mphdrr.core.projector.emission import disk_points
+
+    assert not disk_points(1).any()
+    for n in (3, 4, 7, 19, 50, 200):
+        points = disk_points(n)
+        assert points.shape == (n, 2) and np.linalg.norm(points, axis=1).max() < 1.2
+        np.testing.assert_allclose(points.mean(axis=0), 0, atol=1e-12)
+        np.testing.assert_allclose(points.T @ points / n, np.eye(2) / 4, atol=1e-12)
+
+
+def test_virtual_detector_sees_the_finite_aperture_as_the_crystal_does(system, rng):
+    grid = general_grid(rng, (9, 8, 7))
+    x = rng.random(grid.shape)
+    model = mph.Emission(system, aperture_points=5, crystal_mu=0.1, intrinsic_fwhm=6.0, within_crystal=True)
+    real = mph.Projector(grid, system.views((9, 10), "real", pitch=7.0), model)(x)
+    virtual = mph.Projector(grid, system.views((9, 10), "virtual", 3.0, pitch=21.0), model)(x)
+    np.testing.assert_allclose(virtual[:, ::-1, ::-1], real, rtol=1e-5, atol=1e-5 * real.max())
+
+
+def test_penetration_widens_the_pinhole():
+    """Paix: d_e^2 = d (d + 2 / mu tan(alpha / 2))."""
+    system = one_module()
+    model = mph.Emission(system, aperture_mu=3.0, opening_angle=np.deg2rad(90))
+    expected = 2.0 * (2.0 + 2 / 3)
+    np.testing.assert_allclose(model.effective_diameter**2, expected)
+    ideal, _ = spot_image(mph.Emission(system), (5, 6, 7))
+    image, _ = spot_image(model, (5, 6, 7))
+    np.testing.assert_allclose(image, ideal * expected / 4, rtol=1e-6)
+    assert mph.Emission(system, aperture_mu=1e9).effective_diameter == pytest.approx(2.0)
+
+
+def test_crystal_counts_what_it_stops():
+    system = one_module()
+    grid = mph.Grid.centered((1, 1, 1), (10, 400, 400))
+    views = system.views((8, 9), detector="real", pitch=4.0)
+    ideal, counts = (
+        mph.Projector(grid, views, mph.Emission(system, crystal_mu=mu))(np.ones((1, 1, 1)))[0] for mu in (None, 0.06)
+    )
+    u, v = (np.arange(9) - 4) * 4.0, (np.arange(8) - 3.5)[:, None] * 4.0
+    cosine = 60 / np.sqrt(60**2 + u**2 + v**2)
+    np.testing.assert_allclose(counts / ideal, 1 - np.exp(-0.06 * 10 / cosine), rtol=1e-5)
+
+
+@pytest.mark.parametrize("fwhm", [0.3, 3.0])
+def test_intrinsic_blur_has_its_width_and_keeps_the_counts(fwhm):
+    system = one_module()
+    sharp, places = spot_image(mph.Emission(system), (0, 0, 0), pitch=0.1)
+    blurred, _ = spot_image(mph.Emission(system, intrinsic_fwhm=fwhm), (0, 0, 0), pitch=0.1)
+    sigma = np.sqrt(width(blurred, places) ** 2 - width(sharp, places) ** 2)
+    # Integrating over a pixel widens by its own variance, pitch^2 / 12.
+    assert sigma == pytest.approx(np.hypot(fwhm / 2.35482, 0.1 / np.sqrt(12)), rel=0.01)
+    assert blurred.sum() == pytest.approx(sharp.sum(), rel=1e-4)
+
+
+def test_pixels_count_what_falls_on_the_crystal():
+    """Total counts in a flat field grow with the crystal's area, wherever the pixels' edges lie."""
+    system = one_module(detector_side=40.0)
+    grid = mph.Grid.centered((1, 1, 1), (10, 900, 900))
+    views = system.views((20, 20), detector="real", pitch=3.0, offset=(0.7, -0.4))
+    everything, inside = (
+        mph.Projector(grid, views, mph.Emission(system, within_crystal=flag))(np.ones((1, 1, 1)))[0]
+        for flag in (False, True)
+    )
+    share = inside / everything
+    assert share.sum() * 9 == pytest.approx(40.0**2) and share.max() == 1 and share.min() == 0
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_adjoint_of_the_whole_camera(backend, system, rng):
+    grid = general_grid(rng, (9, 8, 7))
+    model = mph.Emission(
+        system[3:6],
+        some_mu(rng, turned_grid((6, 5, 7), 25.0)),
+        aperture_points=3,
+        aperture_mu=3.0,
+        crystal_mu=0.1,
+        intrinsic_fwhm=8.0,
+        within_crystal=True,
+    )
+    A = mph.Projector(grid, system[3:6].views((10, 11), offset=(20.0, 0.0)), model, backend, threads=2)
+    assert_adjoint(A, rng)
+
+
+def test_bad_detectors_are_refused(system):
+    for arguments, word in (
+        ({"aperture_points": 0}, "aperture_points"),
+        ({"aperture_points": 2}, "aperture_points"),
+        ({"aperture_points": 2.5}, "aperture_points"),
+        ({"aperture_mu": -1}, "aperture_mu"),
+        ({"opening_angle": 4}, "opening_angle"),
+        ({"crystal_mu": 0}, "crystal_mu"),
+        ({"intrinsic_fwhm": -1}, "intrinsic_fwhm"),
+    ):
+        with pytest.raises(InputError, match=word):
+            mph.Emission(system, **arguments)
+
+
+def test_counts_are_poisson():
+    mean = np.broadcast_to(np.array([0.3, 20.0, 1e6])[:, None, None], (3, 200, 200))
+    counts = mph.sample_counts(mean, seed=1)
+    assert counts.dtype == np.int64 and counts.min() == 0
+    error = np.sqrt(mean[:, 0, 0] / 40000)
+    assert (np.abs(counts.mean(axis=(1, 2)) - mean[:, 0, 0]) < 4 * error).all()
+    np.testing.assert_allclose(counts.var(axis=(1, 2)), mean[:, 0, 0], rtol=0.04)
+
+
+def test_a_views_noise_depends_on_the_seed_and_on_itself_only(rng):
+    mean = rng.uniform(0, 50, (4, 6, 5))
+    counts = mph.sample_counts(mean, seed=7)
+    np.testing.assert_array_equal(mph.sample_counts(mean, seed=7), counts)
+    other = mean.copy()
+    other[[0, 1, 3]] *= 10
+    np.testing.assert_array_equal(mph.sample_counts(other, seed=7)[2], counts[2])
+    np.testing.assert_array_equal(mph.sample_counts(mean[:3], seed=7), counts[:3])
+    assert (mph.sample_counts(mean, seed=8) != counts).any()
+    assert (mph.sample_counts(mean[[0, 0]], seed=7)[0] != mph.sample_counts(mean[[0, 0]], seed=7)[1]).any()
+    for bad, seed in ((-mean, 1), (mean, -1), (mean, 1.5), (np.full((1, 2), np.nan), 1), (np.full((1, 2), 1e19), 1)):
+        with pytest.raises(InputError):
+            mph.sample_counts(bad, seed)
+
+
+def test_isotopes():
+    tc = mph.isotope("Tc-99m")
+    assert tc.photons_per_decay(126, 155) == 0.885 and tc.photons_per_decay(0, 100) == 0
+    assert tc.mean_decay_time(1e-3) == pytest.approx(1e-3)
+    assert tc.mean_decay_time(100 * tc.half_life) == pytest.approx(tc.half_life / np.log(2))
+    with pytest.raises(InputError, match="Tl-201"):
+        mph.isotope("Unobtainium")
+
+
+def test_gradients_in_mu_are_refused(system):
+    torch = pytest.importorskip("torch", reason="torch is not installed")
+    with pytest.raises(InputError, match="no gradients with respect to mu"):
+        mph.Emission(system, torch.rand(2, 2, 2, requires_grad=True))

@@ -196,6 +196,7 @@ class Projector(LinearOperator):
 
     def _images(self, x: ArrayOrTensor) -> Iterator[ArrayOrTensor]:
         """Images of a checked volume, native to the backend."""
+        _require_rays(self.views)
         name = self._backend_for(x)
         integrate = backends.load(name).forward
         native = self._native(x, name)
@@ -225,8 +226,6 @@ class Projector(LinearOperator):
 
         Neighbours in a line are neighbours in memory: lines follow the volume's contiguous axis as well as they can.
         """
-        n_v, n_u = self.views.shape
-        require(24 * n_v * n_u, f"the rays of an image of {n_v} x {n_u} pixels")  # targets, three float64 each
         contiguous = self.grid.index_from_world[2, :3]
         along_u, along_v = (abs(contiguous @ step) for step in (self.views.u_steps[m], self.views.v_steps[m]))
         by_columns = bool(along_v > along_u)
@@ -301,6 +300,7 @@ class AdjointProjector(LinearOperator):
 
     def _run(self, x: ArrayOrTensor, progress: Progress | None = None) -> ArrayOrTensor:
         A = self._projector
+        _require_rays(A.views)
         name = A._backend_for(x)
         spread = backends.load(name).adjoint
         images = A._native(x, name)
@@ -415,6 +415,12 @@ def _parallel(workers: int) -> Iterator[ParallelMap]:
         return
     with ThreadPoolExecutor(workers, thread_name_prefix="mphdrr") as pool:
         yield pool.map
+
+
+def _require_rays(views: Views) -> None:
+    n_v, n_u = views.shape
+    # An image of float32, and targets of three float64 each.
+    require(28 * n_v * n_u, f"an image of {n_v} x {n_u} pixels, with its rays,")
 
 
 def _thread_count(threads: int | None) -> int:

@@ -300,13 +300,13 @@ class AdjointProjector(LinearOperator):
 
     def _run(self, x: ArrayOrTensor, progress: Progress | None = None) -> ArrayOrTensor:
         A = self._projector
-        _require_rays(A.views)
         name = A._backend_for(x)
         spread = backends.load(name).adjoint
         images = A._native(x, name)
         _, trace = A._lattices(images)
         volume_bytes = (8 if name == "numpy" else 4) * A.grid.n_voxels
         require(volume_bytes, f"the adjoint into {_times(self.shape_out)} voxels")
+        _require_rays(A.views)
         # One volume per thread: fewer threads rather than no room for anything else.
         affordable = max(1, available() // (2 * volume_bytes))
         workers = min(A._workers(name), _MOST_VOLUMES, affordable)

@@ -48,7 +48,9 @@ def mosaic(images: ArrayLike, columns: int = 20) -> NDArray:
 
 
 def write_png(picture: ArrayLike, path: str | os.PathLike[str]) -> None:
-    """Write a picture (row 0 at the top) as an 8-bit grey PNG: 0 is black, the largest value white.
+    """Write a picture (row 0 at the top) as an 8-bit grey PNG: 0 is black, or the smallest value if that is negative.
+
+    The largest value is white.
 
     Raises
     ------
@@ -58,7 +60,7 @@ def write_png(picture: ArrayLike, path: str | os.PathLike[str]) -> None:
     from PIL import Image
 
     picture = np.asarray(picture, np.float32)
-    top = float(picture.max(initial=0.0)) or 1.0
-    grey = np.rint(np.clip(picture / top, 0, 1) * 255).astype(np.uint8)
+    low, high = float(picture.min(initial=0.0)), float(picture.max(initial=0.0))
+    grey = np.rint((picture - low) / ((high - low) or 1.0) * 255).astype(np.uint8)
     with replacing(path) as temporary:
         Image.fromarray(grey).save(temporary, format="PNG")

@@ -16,6 +16,7 @@ from .progress import Progress
 from .projector import Emission, Model, Projector, Transmission
 from .run import ProjectionRun
 from .system import Detector, PinholeSystem
+from .views import Views
 from .volume import Volume
 
 
@@ -61,13 +62,12 @@ def project_run(
     if noise_seed is not None and not isinstance(model, Emission):
         raise InputError("noise_seed: only the counts of an Emission have noise")
     if volume.quantity == "hu":
-        warnings.warn(
+        _warn(
             "the volume holds CT numbers (HU), air being -1000: their line integrals are no radiograph; "
-            "convert them to attenuation (mu, 1/mm) first",
-            InputWarning,
-            stacklevel=2,
+            "convert them to attenuation (mu, 1/mm) first"
         )
     views = system.views(shape=shape, detector=detector, magnification=magnification, pitch=pitch)
+    _warn_of_unseen(volume, views, isinstance(model, Transmission))
     n_v, n_u = views.shape
     require(4.0 * len(views) * n_v * n_u, f"a set of {len(views)} projections of {n_v} x {n_u} pixels")
     projector = Projector(volume.grid, views, model=model, backend=backend, threads=threads)
@@ -88,3 +88,19 @@ def project_run(
         **(settings or {}),
     }
     return ProjectionRun(images, system, views, volume, unit=model.unit(volume), settings=record, seed=noise_seed)
+
+
+def _warn_of_unseen(volume: Volume, views: Views, ends_at_plane: bool) -> None:
+    """Warn where a volume lies beside the isocentre, or beyond the plane at which the rays end."""
+    index = volume.grid.index_from_world[:3, 3]
+    if np.any(index < -0.5) or np.any(index > np.array(volume.grid.shape) - 0.5):
+        _warn("the isocentre, at which the modules aim, lies outside the volume's grid: check the volume's position")
+    corners = np.concatenate([volume.grid.corners(), np.ones((8, 1))], axis=1)
+    depth = corners @ views.projection_matrices()[:, 2].T  # (8, M), 1 at the virtual detector's plane
+    cut = int(np.any(depth > 1, axis=0).sum())
+    if ends_at_plane and cut:
+        _warn(f"{cut} of {len(views)} virtual detectors stand in front of parts of the volume: raise the magnification")
+
+
+def _warn(text: str) -> None:
+    warnings.warn(text, InputWarning, stacklevel=4)

@@ -20,7 +20,7 @@ if not hasattr(bpy.types.Scene, "mphdrr_projections"):  # the bpy package, where
 
 arguments = sys.argv[sys.argv.index("--") + 1 :] if "--" in sys.argv else sys.argv[1:]
 workbook = Path(arguments[0]) if arguments else Path(__file__).parent / "dc-spect-80.xlsx"
-folder = Path(arguments[1] if len(arguments) > 1 else "out-batch").absolute()
+folder = Path(arguments[1] if len(arguments) > 1 else "out/batch").absolute()
 folder.mkdir(parents=True, exist_ok=True)
 
 bpy.ops.wm.read_homefile(use_empty=True)

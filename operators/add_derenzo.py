@@ -8,6 +8,7 @@ from bpy.props import FloatProperty, FloatVectorProperty, StringProperty
 
 from ..addon import ids, volume_materials, volumes
 from ..addon.phantom_properties import DerenzoSettings
+from ..addon.reports import warnings_reported
 from ..core.errors import InputError
 from ..core.frames import euler_pose
 from ..core.grid import Grid
@@ -48,7 +49,8 @@ class MPHDRR_OT_add_derenzo(DerenzoSettings, bpy.types.Operator):
         if context.mode != "OBJECT":
             bpy.ops.object.mode_set(mode="OBJECT")
         try:
-            item = add_derenzo(context, self, euler_pose(self.phi, self.theta, self.psi, self.location), self.name)
+            with warnings_reported(self):
+                item = add_derenzo(context, self, euler_pose(self.phi, self.theta, self.psi, self.location), self.name)
         except (InputError, MemoryError) as error:
             self.report({"ERROR"}, str(error) or "not enough memory for this grid: choose fewer voxels")
             return {"CANCELLED"}
@@ -71,7 +73,8 @@ class MPHDRR_OT_update_derenzo(bpy.types.Operator):
         settings = getattr(item, ids.OBJECT_VOLUME).derenzo
         try:
             pose = volumes.pose_of_object(item)
-            volumes.replace_volume(item, _voxels(settings, pose), pose, settings.recipe())
+            with warnings_reported(self):
+                volumes.replace_volume(item, _voxels(settings, pose), pose, settings.recipe())
         except (InputError, MemoryError) as error:
             self.report({"ERROR"}, str(error) or "not enough memory for this grid: choose fewer voxels")
             return {"CANCELLED"}

@@ -16,6 +16,16 @@ from ..progress import Progress
 from ..system import PinholeSystem
 
 
+class _HelpFormatter(argparse.HelpFormatter):
+    """Shows the defaults that say something, lists as they are typed."""
+
+    def _get_help_string(self, action: argparse.Action) -> str | None:
+        if action.help is None or action.default in (None, [], False, argparse.SUPPRESS):
+            return action.help
+        default = action.default if isinstance(action.default, list) else [action.default]
+        return f"{action.help} (default: {' '.join(map(str, default)).replace('%', '%%')})"
+
+
 def add_command(subparsers, name: str, summary: str, example: str) -> argparse.ArgumentParser:  # type: ignore[no-untyped-def]
     """A command's parser, its help ending in an example."""
     return subparsers.add_parser(
@@ -23,7 +33,7 @@ def add_command(subparsers, name: str, summary: str, example: str) -> argparse.A
         help=summary,
         description=summary[0].upper() + summary[1:] + ".",
         epilog=f"example: {example}",
-        formatter_class=argparse.ArgumentDefaultsHelpFormatter,
+        formatter_class=_HelpFormatter,
     )
 
 
@@ -31,7 +41,7 @@ def add_phantom_options(parser: argparse.ArgumentParser) -> None:
     """Size, content and place of the Derenzo phantom, and the grid under it."""
     parser.add_argument("--radius", type=float, default=40.0, metavar="MM", help="radius of the phantom")
     parser.add_argument("--rods", type=float, nargs=6, default=[8, 6, 5, 4, 3, 2], metavar="MM", help="rod diameters")
-    parser.add_argument("--height", type=float, default=60.0, metavar="MM", help="length of the rods")
+    parser.add_argument("--height", type=float, default=40.0, metavar="MM", help="length of the rods")
     parser.add_argument("--activity", type=float, default=100.0, metavar="kBq/mL", help="concentration in the rods")
     parser.add_argument(
         "--position", type=float, nargs=3, default=[0, 0, 0], metavar="MM", help="middle of the phantom, x y z"
@@ -46,7 +56,7 @@ def add_phantom_options(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--voxels", type=int, nargs="+", default=[256], metavar="N", help="voxels along x y z, or one")
     parser.add_argument(
-        "--spacing", type=float, nargs="+", default=[0.4], metavar="MM", help="voxel size, one or three"
+        "--spacing", type=float, nargs="+", metavar="MM", help="voxel size, one or three; default: so that it fits"
     )
 
 
@@ -75,6 +85,8 @@ def chosen_modules(system: PinholeSystem, text: str | None) -> PinholeSystem:
         except ValueError:
             raise InputError(f"--modules {text!r}: expected numbers such as 1-40 or 1-20,41") from None
         found = np.flatnonzero((system.numbers >= low) & (system.numbers <= high))
+        if high < low:
+            raise InputError(f"--modules {text!r}: {part.strip()} ends before it begins")
         if len(found) == 0:
             raise InputError(
                 f"--modules {text!r}: no module {part.strip()}; there are {system.numbers.min()} to {system.numbers.max()}"

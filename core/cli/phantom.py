@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import argparse
+import dataclasses
+from typing import Any
 
 import numpy as np
 
+from ..checks import whole_shape
 from ..frames import euler_pose
 from ..grid import Grid
 from ..phantoms.derenzo import DerenzoPhantom
@@ -29,13 +32,20 @@ def add_parser(subparsers) -> None:  # type: ignore[no-untyped-def]
     derenzo.set_defaults(run=_run)
 
 
-def derenzo_volume(arguments: argparse.Namespace) -> Volume:
-    """The phantom that the options of `add_phantom_options` describe."""
+def derenzo_volume(arguments: argparse.Namespace) -> tuple[Volume, dict[str, Any]]:
+    """The phantom that the options of `add_phantom_options` describe, and what it was made from."""
     phantom = DerenzoPhantom(arguments.radius, tuple(arguments.rods), arguments.height, arguments.activity)
-    grid = Grid.centered(_one_or_three(arguments.voxels), _one_or_three(arguments.spacing))
+    voxels = whole_shape(_one_or_three(arguments.voxels), "--voxels", 3)
+    spacing = _one_or_three(arguments.spacing) if arguments.spacing else phantom.extent / max(1, min(voxels) - 2)
+    grid = Grid.centered(voxels, spacing, arguments.position)
     phi, theta, psi = np.deg2rad(arguments.euler)
     pose = euler_pose(phi, theta, psi, arguments.position)
-    return phantom.voxelize(grid, pose, progress_bar("voxelizing"))
+    recipe = {
+        "phantom": {"kind": "derenzo", **dataclasses.asdict(phantom)},
+        "position_mm": list(arguments.position),
+        "euler_degrees": list(arguments.euler),
+    }
+    return phantom.voxelize(grid, pose, progress_bar("voxelizing")), recipe
 
 
 def _one_or_three(values: list) -> list:
@@ -44,7 +54,7 @@ def _one_or_three(values: list) -> list:
 
 def _run(arguments: argparse.Namespace) -> None:
     path = output_path(arguments.output, VOLUME_FORMATS)
-    volume = derenzo_volume(arguments)
+    volume, _ = derenzo_volume(arguments)
     write_volume(volume, path)
     total = volume.array.sum(dtype=np.float64) * volume.grid.voxel_volume * 1e-3
-    print(f"{path}: {' x '.join(map(str, volume.grid.shape))} voxels, {total:.4g} kBq")
+    print(f"{path}: {' x '.join(map(str, volume.grid.shape))} voxels, {total:.4g} kBq in all")

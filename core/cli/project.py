@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -64,9 +65,11 @@ def _run(arguments: argparse.Namespace) -> None:
     picture = output_path(arguments.mosaic) if arguments.mosaic else None
     system = chosen_modules(read_system(arguments.workbook), arguments.modules)
     model = emission(arguments, system)
-    volume = (
-        read_volume(arguments.volume, "activity" if model else None) if arguments.volume else derenzo_volume(arguments)
-    )
+    recipe: dict[str, Any] = {}
+    if arguments.volume:
+        volume = read_volume(arguments.volume, "activity" if model else None)
+    else:
+        volume, recipe = derenzo_volume(arguments)
     run = project_run(
         system,
         volume,
@@ -78,6 +81,7 @@ def _run(arguments: argparse.Namespace) -> None:
         threads=arguments.threads,
         settings={
             "volume": Path(arguments.volume).name if arguments.volume else "Derenzo phantom",
+            **recipe,
             **({"mu_file": Path(arguments.mu).name} if arguments.mu else {}),
         },
         model=model,
@@ -88,6 +92,5 @@ def _run(arguments: argparse.Namespace) -> None:
     if picture is not None:
         write_png(mosaic(run.projections), picture)
     n_v, n_u = run.views.shape
-    print(
-        f"{path}: {len(run.views)} projections of {n_v} x {n_u} pixels, largest {np.max(run.projections):.4g} {run.unit}"
-    )
+    count, largest = len(run.views), float(np.max(run.projections))
+    print(f"{path}: {count} projection{'s' * (count > 1)} of {n_v} x {n_u} pixels, largest {largest:.4g} {run.unit}")

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import math
+import warnings
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..checks import freeze, positive, real_array
-from ..errors import InputError
+from ..errors import InputError, InputWarning
 from ..frames import checked_affine
 from ..grid import Grid
 from ..progress import Progress
@@ -16,6 +18,7 @@ from ..volume import Volume
 from .coverage import voxelize_shape
 
 SECTORS = 6
+_HELD = 0.98  # of the rods: with less of them on the grid, the user is told
 _MARGIN = 0.1  # of the radius, kept free at the axis and at the rim
 _MOST_RODS = 100_000
 _ROW_STEP = np.sqrt(3.0)  # distance of two rows of rods, in rod diameters
@@ -86,8 +89,22 @@ class DerenzoPhantom:
     @property
     def total_activity(self) -> float:
         """Activity of the whole phantom, kBq."""
-        areas = np.pi / 4 * self.rods()[:, 3] ** 2
-        return float(self.activity * areas.sum() * self.height * 1e-3)  # kBq/mL times mm^3
+        return self.activity * self._rod_volume * 1e-3  # kBq/mL times mm^3
+
+    @property
+    def _reach(self) -> float:
+        """Distance, mm, from the axis to the rods' farthest point."""
+        return float(np.max(np.linalg.norm(self.rods()[:, 1:3], axis=1) + self.rods()[:, 3] / 2))
+
+    @property
+    def _rod_volume(self) -> float:
+        """Volume of all rods, mm^3."""
+        return float(np.sum(np.pi / 4 * self.rods()[:, 3] ** 2) * self.height)
+
+    @property
+    def extent(self) -> float:
+        """Diameter, mm, of a ball around the phantom: a grid of that size holds it however it is turned."""
+        return 2 * math.hypot(self._reach, self.height / 2)
 
     def voxelize(self, grid: Grid, pose: ArrayLike | None = None, progress: Progress | None = None) -> Volume:
         """The phantom as an activity volume on `grid`, anti-aliased: a voxel holds its mean concentration.
@@ -109,7 +126,7 @@ class DerenzoPhantom:
         if not isinstance(grid, Grid):
             raise InputError(f"voxelize: expected a Grid, got {type(grid).__name__}")
         pose = np.eye(4) if pose is None else checked_affine(pose, "phantom pose")
-        reach = float(np.max(np.linalg.norm(self.rods()[:, 1:3], axis=1) + self.rods()[:, 3] / 2))
+        reach = self._reach
         half_height = self.height / 2
         coverage = voxelize_shape(
             grid,
@@ -120,6 +137,13 @@ class DerenzoPhantom:
             finest=min(w for w in self.rod_diameters if w > 0),
             progress=progress,
         )
+        held = float(coverage.sum(dtype=np.float64)) * grid.voxel_volume / self._rod_volume
+        if held < _HELD:
+            warnings.warn(
+                f"{1 - held:.0%} of the Derenzo phantom lies outside the grid: take larger or more voxels",
+                InputWarning,
+                stacklevel=2,
+            )
         coverage *= self.activity
         return Volume(freeze(coverage), grid, "activity")
 

@@ -64,6 +64,30 @@ def test_projecting_ct_numbers_warns(workbook, tmp_path, capsys):
     assert "CT numbers" in capsys.readouterr().err
 
 
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        ([], None),
+        (["--magnification", "2"], "raise the magnification"),
+        (["--position", "200", "0", "0"], "the isocentre, at which the modules aim, lies outside"),
+        (["--spacing", "0.5"], "of the Derenzo phantom lies outside the grid"),
+    ],
+)
+def test_what_would_not_be_seen_is_said(options, said, workbook, tmp_path, capsys):
+    words = [*("--voxels", "24"), *SMALL[4:], *options, "-o", str(tmp_path / "run.h5")]
+    assert main(["project", str(workbook), *words]) == 0
+    error = capsys.readouterr().err
+    assert said in error if said else not error
+
+
+def test_runs_record_what_the_phantom_was(workbook, tmp_path):
+    options = [*SMALL, "--radius", "30", "--euler", "10", "20", "30", "-o", str(tmp_path / "run.npz")]
+    assert main(["project", str(workbook), *options]) == 0
+    settings = mph.read_run(tmp_path / "run.npz").settings
+    assert settings["phantom"]["radius"] == 30
+    assert settings["euler_degrees"] == [10, 20, 30]
+
+
 def test_counts_with_attenuation_and_noise(workbook, tmp_path, capsys):
     grid = mph.Grid.centered(8, 20.0)
     mph.write_volume(mph.Volume(np.full((8, 8, 8), 0.0154), grid, "mu"), tmp_path / "mu.nii")
@@ -88,10 +112,11 @@ def test_counts_with_attenuation_and_noise(workbook, tmp_path, capsys):
         (["geometry", "show", "none.xlsx"], "none.xlsx"),
         (["geometry", "show", "WORKBOOK", "--modules", "90"], "there are 1 to 80"),
         (["geometry", "show", "WORKBOOK", "--modules", "a-b"], "expected numbers such as"),
+        (["geometry", "show", "WORKBOOK", "--modules", "40-1"], "ends before it begins"),
         (["phantom", "derenzo", "-o", "FOLDER/a.stl"], "expected a name ending in"),
         (["phantom", "derenzo", "--radius", "-1", "-o", "FOLDER/a.npz"], "Derenzo radius"),
         (["phantom", "derenzo", "--voxels", "99999", "-o", "FOLDER/a.npz"], "of memory"),
-        (["phantom", "derenzo", "--voxels", "9", "9", "-o", "FOLDER/a.npz"], "grid shape"),
+        (["phantom", "derenzo", "--voxels", "9", "9", "-o", "FOLDER/a.npz"], "--voxels"),
         (["project", "WORKBOOK", "-o", "FOLDER/a.txt"], "expected a name ending in"),
         (["project", "WORKBOOK", *SMALL, "--backend", "magic", "-o", "FOLDER/a.h5"], "numba"),
         (["project", "WORKBOOK", *SMALL, "--magnification", "0", "-o", "FOLDER/a.h5"], "magnification"),

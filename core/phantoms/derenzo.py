@@ -74,6 +74,13 @@ class DerenzoPhantom:
             raise InputError(
                 f"Derenzo phantom: no rod of {self.rod_diameters} mm fits into a radius of {self.radius:g} mm"
             )
+        empty = [f"{w:g}" for w, n in zip(self.rod_diameters, rows, strict=True) if w > 0 and n == 0]
+        if empty:
+            warnings.warn(
+                f"no rod of {', '.join(empty)} mm fits into a radius of {self.radius:g} mm: such sectors stay empty",
+                InputWarning,
+                stacklevel=3,
+            )
 
     def rods(self) -> NDArray[np.float64]:
         """Every rod as (sector, x, y, diameter), array (n_rods, 4), mm."""

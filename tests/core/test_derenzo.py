@@ -83,6 +83,11 @@ def test_euler_angles_turn_psi_then_theta_then_phi():
     assert np.allclose(mph.euler_pose(0, np.pi / 2, np.pi / 2) @ [1, 0, 0, 1], [0, 1, 0, 1])
 
 
+def test_a_sector_whose_rods_do_not_fit_is_named():
+    with pytest.warns(mph.InputWarning, match="no rod of 50, 90 mm fits into a radius of 40 mm"):
+        mph.DerenzoPhantom(40.0, (50, 90, 5, 4, 3, 0), 30.0)
+
+
 def test_voxelizing_can_be_cancelled():
     def stop(done: int, total: int) -> None:
         raise Cancelled

@@ -23,9 +23,9 @@ _READ_F64_2D = types.Array(types.float64, 2, "C", readonly=True)
 _RAYS = (_READ_F64_2D, _READ_F64_2D, _READ_F64_1D)
 
 
-def forward(volume: NDArray[np.float32], rays: IndexRays) -> NDArray[np.float32]:
+def forward(volume: NDArray[np.float32], rays: IndexRays) -> NDArray[np.float64]:
     """Line integrals (N,), value x mm, of `volume` (n_x, n_y, n_z) along `rays`."""
-    integrals = np.empty(len(rays), dtype=np.float32)
+    integrals = np.empty(len(rays))
     _forward_kernel()(volume, *_contiguous(rays), integrals)
     return integrals
 
@@ -35,17 +35,29 @@ def adjoint(volume: NDArray[np.float32], values: NDArray[np.float32], rays: Inde
     _adjoint_kernel()(volume, *_contiguous(rays), np.ascontiguousarray(values))
 
 
+def derivatives(volume: NDArray[np.float32], rays: IndexRays) -> NDArray[np.float64]:
+    """What the ends of `rays` do to their integrals (N, 7), as `backends` describes it."""
+    result = np.empty((len(rays), 7))
+    starts, directions, _ = _contiguous(rays)
+    _derivatives_kernel()(volume, starts, directions, result)
+    return result
+
+
 def _contiguous(rays: IndexRays) -> tuple[NDArray[np.float64], ...]:
     return tuple(np.ascontiguousarray(a) for a in (rays.starts, rays.directions, rays.lengths))
 
 
 def _forward_kernel() -> Any:
-    return compiled(_integrate, types.void(_READ_F32, *_RAYS, types.float32[::1]))
+    return compiled(_integrate, types.void(_READ_F32, *_RAYS, types.float64[::1]))
 
 
 def _adjoint_kernel() -> Any:
     values = types.Array(types.float32, 1, "C", readonly=True)
     return compiled(_spread, types.void(types.float32[:, :, ::1], *_RAYS, values))
+
+
+def _derivatives_kernel() -> Any:
+    return compiled(_differentiate, types.void(_READ_F32, _READ_F64_2D, _READ_F64_2D, types.float64[:, ::1]))
 
 
 def _integrate(volume, starts, directions, lengths, integrals):  # type: ignore[no-untyped-def]
@@ -58,6 +70,68 @@ def _spread(volume, starts, directions, lengths, values):  # type: ignore[no-unt
     voxels = volume.reshape(-1)
     for r in range(len(lengths)):
         _walk(voxels, volume.shape, starts[r], directions[r], _add_to, lengths[r] * values[r])
+
+
+def _differentiate(volume, starts, directions, result):  # type: ignore[no-untyped-def]
+    """The integral moves with the planes crossed: each by the jump of the value there, times what alpha does.
+
+    A plane at k is crossed at ``alpha = (k - s)/d``, d = t - s, so ``d alpha/ds = (alpha - 1)/d`` and ``d alpha/dt
+    = -alpha/d``. What is needed of an axis is therefore the sum of its jumps and that of its jumps times alpha.
+    """
+    voxels = volume.reshape(-1)
+    nx, ny, nz = volume.shape
+    # A step in the flat index tells the axis crossed; an axis of one voxel is not crossed on the way.
+    stride_x, stride_y = ny * nz if nx > 1 else 0, nz if ny > 1 else 0
+    none = (0.0, 0.0)
+    for r in range(len(starts)):
+        start, direction = starts[r], directions[r]
+        enter, leave, first, last = _ends(volume.shape, start, direction)
+        state = ((stride_x, stride_y, first), np.int64(-1), 0.0, enter, 0.0, none, none, none)
+        _, _, value, _, total, x, y, z = _walk(voxels, volume.shape, start, direction, _add_jump, state)
+        x, y, z = _jump(x, y, z, last, value, leave)
+        result[r, 0] = total
+        for axis, (jumps, moments) in enumerate((x, y, z)):
+            inv = 1.0 / direction[axis] if direction[axis] != 0.0 else 0.0
+            result[r, 1 + axis] = (moments - jumps) * inv
+            result[r, 4 + axis] = -moments * inv
+
+
+@njit(forceinline=True)
+def _ends(shape, start, direction):  # type: ignore[no-untyped-def]
+    """Alpha where a ray enters and leaves the volume, and the axes of the planes there: 3 where it starts or ends inside."""
+    enter, leave, first, last = 0.0, 1.0, 3, 3
+    for axis in range(3):
+        later, earlier = _clip(shape[axis], start[axis], direction[axis], enter, leave)
+        first, last = axis if later > enter else first, axis if earlier < leave else last
+        enter, leave = later, earlier
+    return enter, leave, first, last
+
+
+@njit(forceinline=True)
+def _add_jump(voxels, p, weight, state):  # type: ignore[no-untyped-def]
+    (stride_x, stride_y, first), p_before, before, alpha, total, x, y, z = state
+    here, value = np.int64(p), np.float64(voxels[p])
+    step = abs(here - p_before)
+    if p_before < 0:
+        axis = first
+    elif step == stride_x:
+        axis = 0
+    else:
+        axis = 1 if step == stride_y else 2
+    x, y, z = _jump(x, y, z, axis, before - value, alpha)
+    return (stride_x, stride_y, first), here, value, alpha + weight, total + weight * value, x, y, z
+
+
+@njit(forceinline=True)
+def _jump(x, y, z, axis, jump, alpha):  # type: ignore[no-untyped-def]
+    """Add a jump to its axis: to the sum of the jumps, and to that of the jumps times alpha."""
+    if axis == 0:
+        return (x[0] + jump, x[1] + jump * alpha), y, z
+    if axis == 1:
+        return x, (y[0] + jump, y[1] + jump * alpha), z
+    if axis == 2:
+        return x, y, (z[0] + jump, z[1] + jump * alpha)
+    return x, y, z
 
 
 @njit(forceinline=True)

@@ -36,15 +36,47 @@ def adjoint(volume: Array, values: Array, rays: IndexRays) -> None:
         np.add.at(voxels, index, weight * values[part, None])
 
 
+def derivatives(volume: Array, rays: IndexRays) -> Array:
+    """What the ends of `rays` do to their integrals (N, 7), as `backends` describes it."""
+    result = np.zeros((len(rays), 7))
+    voxels = volume.reshape(-1)
+    for part, index, inside, alpha, axis in _cut(volume.shape, rays):
+        value = np.where(inside, voxels[index], 0.0)
+        result[part, 0] = (value * np.diff(alpha, axis=1)).sum(axis=1)
+        # A plane at k is crossed at alpha = (k - s)/d, d = t - s: d alpha/ds = (alpha - 1)/d, d alpha/dt = -alpha/d.
+        alpha, axis = alpha[:, 1:-1], axis[:, 1:-1]
+        jump = np.where((alpha > 0) & (alpha < 1), value[:, :-1] - value[:, 1:], 0.0)
+        for a in range(3):
+            direction = rays.directions[part, a]
+            over = np.where(direction == 0, 1.0, direction)
+            jumps = np.where(axis == a, jump, 0.0)
+            result[part, 1 + a] = (jumps * (alpha - 1)).sum(axis=1) / over
+            result[part, 4 + a] = -(jumps * alpha).sum(axis=1) / over
+    return result
+
+
 def _segments(shape: tuple[int, ...], rays: IndexRays) -> Iterator[tuple[slice, NDArray[np.intp], Array]]:
     """Segments of the rays, some rays at a time: which rays (a slice), flat voxel index (n, S), length in mm (n, S).
 
     A segment outside the volume has length 0 and index 0.
     """
+    for part, index, inside, alpha, _ in _cut(shape, rays):
+        yield part, index, np.where(inside, np.diff(alpha, axis=1) * rays.lengths[part, None], 0.0)
+
+
+def _cut(
+    shape: tuple[int, ...], rays: IndexRays
+) -> Iterator[tuple[slice, NDArray[np.intp], NDArray[np.bool_], Array, NDArray[np.intp]]]:
+    """The rays cut at their crossings, some rays at a time.
+
+    Yields which rays (a slice); of each segment the flat voxel index (n, S), 0 outside, and whether it is inside
+    (n, S); of each cut its alpha (n, S + 1) and the axis of the plane (n, S + 1), 3 at the ray's ends.
+    """
+    axes = np.repeat([3, 0, 1, 2], [2, *(n + 1 for n in shape)])
     rays_at_once = max(1, _CROSSINGS // (sum(shape) + 5))
     for first in range(0, len(rays), rays_at_once):
         part = slice(first, first + rays_at_once)
-        start, direction, length = rays.starts[part], rays.directions[part], rays.lengths[part]
+        start, direction = rays.starts[part], rays.directions[part]
         crossings = [np.zeros((len(start), 1)), np.ones((len(start), 1))]
         for axis, n in enumerate(shape):
             s, d = start[:, axis, None], direction[:, axis, None]
@@ -52,7 +84,9 @@ def _segments(shape: tuple[int, ...], rays: IndexRays) -> Iterator[tuple[slice, 
             # Crossings before the source or behind the target become segments of length 0 at the ray's ends.
             alpha = np.clip((np.arange(n + 1) - s) / np.where(parallel, 1.0, d), 0.0, 1.0)
             crossings.append(np.where(parallel, 0.0, alpha))
-        alpha = np.sort(np.concatenate(crossings, axis=1), axis=1)
+        alpha = np.concatenate(crossings, axis=1)
+        order = alpha.argsort(axis=1)
+        alpha = np.take_along_axis(alpha, order, axis=1)
         middle = (alpha[:, 1:] + alpha[:, :-1]) / 2
 
         index = np.zeros(middle.shape, dtype=np.intp)
@@ -62,4 +96,4 @@ def _segments(shape: tuple[int, ...], rays: IndexRays) -> Iterator[tuple[slice, 
             inside &= (voxel >= 0) & (voxel < n)
             index = index * n + np.clip(voxel, 0, n - 1).astype(np.intp)
         index[~inside] = 0
-        yield part, index, np.where(inside, np.diff(alpha, axis=1) * length[:, None], 0.0)
+        yield part, index, inside, alpha, axes[order]

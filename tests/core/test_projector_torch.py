@@ -13,6 +13,7 @@ from mphdrr.core.errors import InputError  # noqa: E402
 from mphdrr.core.grid import Grid  # noqa: E402
 from mphdrr.core.projector import Projector  # noqa: E402
 from mphdrr.core.views import Views  # noqa: E402
+from mphdrr.core.volume import Volume  # noqa: E402
 
 BACKENDS = [
     pytest.param(
@@ -111,5 +112,5 @@ def test_bad_tensors_are_one_clear_line():
 
 
 def test_volumes_of_tensors_in_a_graph_say_what_to_do():
-    with pytest.raises(InputError, match="volume: .*detach"):
+    with pytest.raises(InputError, match=r"volume: .*detach"):
         Volume(torch.ones(GRID.shape, requires_grad=True), GRID)

@@ -33,7 +33,8 @@ def ncc(a: Tensor, b: Tensor) -> Tensor:
 def local_ncc(a: Tensor, b: Tensor, patch: int = 9) -> Tensor:
     """Mean of the `ncc` of all square patches of `patch` pixels: sees edges where `ncc` sees the body's outline.
 
-    A patch in which an image is nearly flat, against its whole contrast, counts little.
+    Patches are weighted with the contrast that they have in `b`, the image that is given: an empty background says nothing,
+    and the best possible mean is 1, reached for a = b (a constant added to the variances would favour strong contrast).
     """
     if min(a.shape[-2:]) < patch:
         return ncc(a, b)
@@ -44,9 +45,10 @@ def local_ncc(a: Tensor, b: Tensor, patch: int = 9) -> Tensor:
     # Subtracting the images' means first keeps the variances below free of cancellation.
     a, b = (x - x.mean(dim=(-2, -1), keepdim=True) for x in (a, b))
     covariance = means(a * b) - means(a) * means(b)
-    variances = [means(x * x) - means(x) ** 2 + 1e-4 * (x * x).mean(dim=(-2, -1)).unsqueeze(-1) for x in (a, b)]
-    tiny = torch.finfo(covariance.dtype).tiny
-    return (covariance / (variances[0] * variances[1]).clamp_min(tiny).sqrt()).mean(dim=-1)
+    of_a, of_b = (means(x * x) - means(x) ** 2 for x in (a, b))
+    rounding = torch.finfo(a.dtype).eps * (a * a).mean(dim=(-2, -1)).unsqueeze(-1) + torch.finfo(a.dtype).tiny
+    weighted = covariance / (of_a.clamp_min(0) + rounding).sqrt()
+    return weighted.sum(dim=-1) / of_b.clamp_min(0).sqrt().sum(dim=-1).clamp_min(torch.finfo(a.dtype).tiny)
 
 
 def multiscale_ncc(a: Tensor, b: Tensor, patches: Sequence[int | None] = (None, 9)) -> Tensor:

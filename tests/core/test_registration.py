@@ -27,8 +27,8 @@ CHEST = next((p for p in (ROOT.parent / "shared/data/chest_ct_3mm.nii.gz",
 def test_similarity_is_1_for_another_brightness_and_contrast(rng):
     a, other = torch.tensor(rng.random((2, 3, 30, 40)))
     for similarity in (ncc, local_ncc, multiscale_ncc):
-        np.testing.assert_allclose(similarity(a, 5 + 0.01 * a), 1, atol=5e-3)
-        np.testing.assert_allclose(similarity(a, 5 - 3 * a), -1, atol=5e-3)
+        np.testing.assert_allclose(similarity(a, 5 + 0.01 * a), 1, atol=1e-9)
+        np.testing.assert_allclose(similarity(a, 5 - 3 * a), -1, atol=1e-9)
         assert similarity(a, other).shape == (3,)
         assert (similarity(a, other).abs() < 0.2).all()
     np.testing.assert_allclose(ncc(a, other)[1], np.corrcoef(a[1].ravel(), other[1].ravel())[0, 1], atol=1e-9)
@@ -59,11 +59,11 @@ def test_pose_of_a_camera_is_recovered(rng):
     image = pinhole_images(volume, truth[:3, 3], truth[:3, :3], 400.0, 4.0, (61, 63), (4.0, -3.0))
     motion = se3_exp(torch.tensor([3.0, -4.0, 6.0, 0.08, -0.1, 0.05], dtype=torch.float64))
     calls = []
-    found = register_pose(image, volume, motion @ truth, 400.0, 4.0, (4.0, -3.0), levels=(4, 2, 1), steps=60,
+    found = register_pose(image, volume, motion @ truth, 400.0, 4.0, (4.0, -3.0), levels=(2, 1), steps=60,
                           progress=lambda *at: calls.append(at))  # fmt: skip
     angle, apart = pose_error(found.pose, truth, grid.center)
-    assert np.degrees(angle) < 0.2 and apart < 0.3
-    assert calls[-1] == (180, 180) and len(found.similarities) == 180
+    assert np.degrees(angle) < 0.5 and apart < 1.5  # 7.9 degrees and 7.8 mm at the start
+    assert calls[-1] == (120, 120) and len(found.similarities) == 120
 
 
 def test_bad_input_is_one_clear_line():

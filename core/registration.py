@@ -25,9 +25,7 @@ _RADIUS = 100.0
 
 def ncc(a: Tensor, b: Tensor) -> Tensor:
     """Normalised cross-correlation (...) of images (..., n_v, n_u): 1 where they differ by brightness and contrast alone."""
-    a, b = (x - x.mean(dim=(-2, -1), keepdim=True) for x in (a, b))
-    energy = (a * a).sum(dim=(-2, -1)) * (b * b).sum(dim=(-2, -1))
-    return (a * b).sum(dim=(-2, -1)) / energy.clamp_min(torch.finfo(energy.dtype).tiny).sqrt()
+    return (_standardised(a) * _standardised(b)).mean(dim=(-2, -1))
 
 
 def local_ncc(a: Tensor, b: Tensor, patch: int = 9) -> Tensor:
@@ -42,19 +40,23 @@ def local_ncc(a: Tensor, b: Tensor, patch: int = 9) -> Tensor:
     def means(x: Tensor) -> Tensor:
         return avg_pool2d(x.reshape(-1, 1, *x.shape[-2:]), patch, stride=1).reshape(*x.shape[:-2], -1)
 
-    # Subtracting the images' means first keeps the variances below free of cancellation.
-    a, b = (x - x.mean(dim=(-2, -1), keepdim=True) for x in (a, b))
+    a, b = _standardised(a), _standardised(b)
     covariance = means(a * b) - means(a) * means(b)
-    of_a, of_b = (means(x * x) - means(x) ** 2 for x in (a, b))
-    rounding = torch.finfo(a.dtype).eps * (a * a).mean(dim=(-2, -1)).unsqueeze(-1) + torch.finfo(a.dtype).tiny
-    weighted = covariance / (of_a.clamp_min(0) + rounding).sqrt()
-    return weighted.sum(dim=-1) / of_b.clamp_min(0).sqrt().sum(dim=-1).clamp_min(torch.finfo(a.dtype).tiny)
+    rounding = torch.finfo(a.dtype).eps
+    of_a, of_b = ((means(x * x) - means(x) ** 2).clamp_min(0) + rounding for x in (a, b))
+    return (covariance / of_a.sqrt()).sum(dim=-1) / of_b.sqrt().sum(dim=-1)
 
 
 def multiscale_ncc(a: Tensor, b: Tensor, patches: Sequence[int | None] = (None, 9)) -> Tensor:
     """Mean of `ncc` (for None) and `local_ncc` with each of the `patches`' sizes in pixels."""
     scores = [ncc(a, b) if patch is None else local_ncc(a, b, patch) for patch in patches]
     return torch.stack(scores).mean(dim=0)
+
+
+def _standardised(x: Tensor) -> Tensor:
+    """Images with mean 0 and variance 1; all 0 where they are flat."""
+    x = x - x.mean(dim=(-2, -1), keepdim=True)
+    return x * (x * x).mean(dim=(-2, -1), keepdim=True).clamp_min(1e-24).rsqrt()
 
 
 @dataclass(frozen=True, eq=False)

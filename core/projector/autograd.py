@@ -93,7 +93,8 @@ class _Once(torch.autograd.Function):
         starts, ends = saved[-2:]
         of_volume = None
         if needs[0]:
-            spread = tracer.adjoint(gradient, starts.numpy(force=True), ends.numpy(force=True))
+            values = gradient.to(saved[0])  # the torch backend spreads on the device of the values
+            spread = tracer.adjoint(values, starts.numpy(force=True), ends.numpy(force=True))
             of_volume = torch.as_tensor(spread).to(saved[0])
         of_ends = [gradient[:, None] * slopes[i] if needs[1 + i] else None for i in range(2)]
         return of_volume, *of_ends

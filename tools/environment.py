@@ -118,8 +118,8 @@ def make(venv: Path, name: str, extras: set[str], torch: str | None) -> None:
         raise SystemExit("pip could not install what mphDRR needs; its words are above")
     if wanted["torch"] != state.get("torch", ""):
         if not wanted["torch"]:
-            pip(venv, "uninstall", "-y", "torch")
-        elif not pip(venv, "install", wanted["torch"]):
+            pip(venv, "uninstall", "-y", "torch", "roma")
+        elif not pip(venv, "install", wanted["torch"], "roma>=1.5"):
             print(f"{wanted['torch']} could not be installed: going on without it, its tests are skipped", flush=True)
     source = venv / "src"  # where mypy finds the repo root under the package's name
     source.mkdir(exist_ok=True)

@@ -11,9 +11,8 @@ from contextlib import contextmanager
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
-from ..checks import real_array
 from ..errors import InputError
 from ..grid import Grid
 from ..memory import available, require
@@ -23,7 +22,7 @@ from ..volume import Volume
 from . import backends
 from .arrays import ArrayOrTensor, alike, checked, cropped, is_tensor, like, to_numpy, to_tensor, zeros
 from .models import Beam, Model, Transmission, require_model
-from .rays import Tracer, index_rays
+from .rays import Tracer
 
 # Rays handed to a backend at once: enough that a call costs nothing, few enough that their arrays stay in the
 # cache.
@@ -340,60 +339,6 @@ class AdjointProjector(LinearOperator):
         if not (A._float64 or is_tensor(total)):
             total = total.astype(np.float32, copy=False)
         return like(total, x)
-
-
-def trace_rays(volume: Volume, sources: ArrayLike, targets: ArrayLike, backend: str = "auto") -> NDArray[Any]:
-    """Line integrals of a volume along given rays.
-
-    Parameters
-    ----------
-    volume
-        The voxels; outside them it is 0.
-    sources, targets
-        Ends of the rays, each (N, 3), or (3,) for all rays the same; world mm.
-    backend
-        As of `Projector`.
-
-    Returns
-    -------
-    array (N,)
-        Value x mm, from source to target; float32, or float64 for ``backend="numpy"``.
-
-    Raises
-    ------
-    InputError
-        Not a volume, or the points' shapes do not fit, or a coordinate is not finite; no such backend.
-    """
-    if not isinstance(volume, Volume):
-        raise InputError(f"trace_rays: expected a Volume, got {type(volume).__name__}")
-    name = backends.choose(backend)
-    starts, ends = _points(sources, "sources"), _points(targets, "targets")
-    if len(starts) != len(ends) and 1 not in (len(starts), len(ends)):
-        raise InputError(f"trace_rays: {len(starts)} sources but {len(ends)} targets")
-    starts, ends = np.broadcast_arrays(starts, ends)
-    integrals = np.zeros(len(ends), np.float64 if backend == "numpy" else np.float32)
-    integrate = backends.load(name).forward
-    (box,), origin = cropped(to_tensor(volume.array) if name == "torch" else volume.array)
-    if name == "numpy":
-        box = box.astype(np.float64)
-
-    def trace(block: slice) -> None:
-        integrals[block] = like(integrate(box, index_rays(volume.grid, starts[block], ends[block], origin)), integrals)
-
-    with _parallel(1 if name == "torch" else _thread_count(None)) as parallel_map:
-        for _ in parallel_map(trace, _blocks(len(ends), 1, name)):
-            pass
-    return integrals
-
-
-def _points(value: ArrayLike, name: str) -> Points:
-    try:
-        shape = np.shape(value)
-    except ValueError:  # ragged: real_array says so
-        shape = ()
-    if shape == (0,):  # an empty list
-        return np.empty((0, 3))
-    return real_array(value, name, (3,))[None] if len(shape) == 1 else real_array(value, name, (None, 3))
 
 
 def _blocks(n_lines: int, line_length: int, backend: str) -> list[slice]:

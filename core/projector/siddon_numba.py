@@ -24,21 +24,22 @@ _READ_F32_1D = types.Array(types.float32, 1, "C", readonly=True)
 _LINES = (_READ_F64_2D, _READ_F64_2D)
 _RAYS = (*_LINES, _READ_F64_1D)
 _F32 = types.float32[:, :, ::1]
-_F32_1D = types.float32[::1]
+_F64_1D = types.float64[::1]
+_F64_2D = types.float64[:, ::1]
 
 
 def forward(
     volume: NDArray[np.float32], rays: IndexRays, attenuation: Attenuation | None = None
-) -> NDArray[np.float32]:
+) -> NDArray[np.float64]:
     """Line integrals (N,), value x mm, of `volume` (n_x, n_y, n_z) along `rays`, attenuated towards their sources."""
-    integrals = np.empty(len(rays), dtype=np.float32)
+    integrals = np.empty(len(rays))
     if attenuation is None:
         _forward_kernel()(volume, *_contiguous(rays), integrals)
     elif attenuation.rays is rays:
-        kernel = compiled(_integrate_attenuated, types.void(_READ_F32, *_RAYS, _READ_F32, _F32_1D))
+        kernel = compiled(_integrate_attenuated, types.void(_READ_F32, *_RAYS, _READ_F32, _F64_1D))
         kernel(volume, *_contiguous(rays), attenuation.mu, integrals)
     else:
-        kernel = compiled(_integrate_behind, types.void(_READ_F32, *_RAYS, _READ_F32, *_LINES, _F32_1D))
+        kernel = compiled(_integrate_behind, types.void(_READ_F32, *_RAYS, _READ_F32, *_LINES, _F64_1D))
         kernel(volume, *_contiguous(rays), attenuation.mu, *_contiguous(attenuation.rays)[:2], integrals)
     return integrals
 
@@ -58,8 +59,16 @@ def adjoint(
         kernel(volume, *_contiguous(rays), attenuation.mu, *_contiguous(attenuation.rays)[:2], values)
 
 
+def derivatives(volume: NDArray[np.float32], rays: IndexRays) -> NDArray[np.float64]:
+    """What the ends of `rays` do to their integrals (N, 7), as `backends` describes it."""
+    result = np.empty((len(rays), 7))
+    kernel = compiled(_differentiate, types.void(_READ_F32, *_LINES, _F64_2D))
+    kernel(volume, *_contiguous(rays)[:2], result)
+    return result
+
+
 def _forward_kernel() -> Any:
-    return compiled(_integrate, types.void(_READ_F32, *_RAYS, _F32_1D))
+    return compiled(_integrate, types.void(_READ_F32, *_RAYS, _F64_1D))
 
 
 def _contiguous(rays: IndexRays) -> tuple[NDArray[np.float64], ...]:
@@ -90,6 +99,73 @@ def _add_up(voxels, p, alpha, end, total):  # type: ignore[no-untyped-def]
 def _add_to(voxels, p, alpha, end, value):  # type: ignore[no-untyped-def]
     voxels[p] += (end - alpha) * value
     return value
+
+
+# Derivatives: every plane crossed counts its jump.
+
+
+def _differentiate(volume, starts, directions, result):  # type: ignore[no-untyped-def]
+    """The integral moves with the planes crossed: each by the jump of the value there, times what alpha does.
+
+    A plane at k is crossed at ``alpha = (k - s)/d``, d = t - s, so ``d alpha/ds = (alpha - 1)/d`` and ``d alpha/dt
+    = -alpha/d``. What is needed of an axis is therefore the sum of its jumps and that of its jumps times alpha.
+    """
+    voxels = volume.reshape(-1)
+    nx, ny, nz = volume.shape
+    # A step in the flat index tells the axis crossed; an axis of one voxel is not crossed on the way.
+    stride_x, stride_y = ny * nz if nx > 1 else 0, nz if ny > 1 else 0
+    none = (0.0, 0.0)
+    for r in range(len(starts)):
+        start, direction = starts[r], directions[r]
+        leave, first, last = _ends(volume.shape, start, direction)
+        data = (voxels, stride_x, stride_y, first)
+        state = (np.int64(-1), 0.0, 0.0, none, none, none)
+        _, value, total, x, y, z = _walk(data, volume.shape, start, direction, _add_jump, state)
+        x, y, z = _jump(x, y, z, last, value, leave)
+        result[r, 0] = total
+        for axis, (jumps, moments) in enumerate((x, y, z)):
+            inv = 1.0 / direction[axis] if direction[axis] != 0.0 else 0.0
+            result[r, 1 + axis] = (moments - jumps) * inv
+            result[r, 4 + axis] = -moments * inv
+
+
+@njit(forceinline=True)
+def _ends(shape, start, direction):  # type: ignore[no-untyped-def]
+    """Alpha where a ray leaves the volume, and the axes of the planes of its entry and exit: 3 if it has none."""
+    enter, leave, first, last = 0.0, 1.0, 3, 3
+    for axis in range(3):
+        later, earlier = _clip(shape[axis], start[axis], direction[axis], enter, leave)
+        first, last = axis if later > enter else first, axis if earlier < leave else last
+        enter, leave = later, earlier
+    return leave, first, last
+
+
+@njit(forceinline=True)
+def _add_jump(data, p, alpha, end, state):  # type: ignore[no-untyped-def]
+    voxels, stride_x, stride_y, first = data
+    p_before, before, total, x, y, z = state
+    here, value = np.int64(p), np.float64(voxels[p])
+    step = abs(here - p_before)
+    if p_before < 0:
+        axis = first
+    elif step == stride_x:
+        axis = 0
+    else:
+        axis = 1 if step == stride_y else 2
+    x, y, z = _jump(x, y, z, axis, before - value, alpha)
+    return here, value, total + (end - alpha) * value, x, y, z
+
+
+@njit(forceinline=True)
+def _jump(x, y, z, axis, jump, alpha):  # type: ignore[no-untyped-def]
+    """Add a jump to its axis: to the sum of the jumps, and to that of the jumps times alpha."""
+    if axis == 0:
+        return (x[0] + jump, x[1] + jump * alpha), y, z
+    if axis == 1:
+        return x, (y[0] + jump, y[1] + jump * alpha), z
+    if axis == 2:
+        return x, y, (z[0] + jump, z[1] + jump * alpha)
+    return x, y, z
 
 
 # Attenuated, mu on the volume's lattice: the ray carries what is left of it.

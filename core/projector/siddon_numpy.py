@@ -37,6 +37,27 @@ def adjoint(volume: Array, values: Array, rays: IndexRays, attenuation: Attenuat
         np.add.at(voxels, index, weight * values[part, None])
 
 
+def derivatives(volume: Array, rays: IndexRays) -> Array:
+    """What the ends of `rays` do to their integrals (N, 7), as `backends` describes it."""
+    result = np.zeros((len(rays), 7))
+    voxels = volume.reshape(-1)
+    axes = np.repeat([3, 0, 1, 2], [2, *(n + 1 for n in volume.shape)])  # of the crossings; 3: the ray's ends
+    for part, alpha, middle, order in _cut([(volume.shape, rays)]):
+        index, inside = _voxels(volume.shape, rays[part], middle)
+        value = np.where(inside, voxels[index], 0.0)
+        result[part, 0] = (value * np.diff(alpha, axis=1)).sum(axis=1)
+        # A plane at k is crossed at alpha = (k - s)/d, d = t - s: d alpha/ds = (alpha - 1)/d, d alpha/dt = -alpha/d.
+        alpha, axis = alpha[:, 1:-1], axes[order[:, 1:-1]]
+        jump = np.where((alpha > 0) & (alpha < 1), value[:, :-1] - value[:, 1:], 0.0)
+        for a in range(3):
+            direction = rays.directions[part, a]
+            over = np.where(direction == 0, 1.0, direction)
+            jumps = np.where(axis == a, jump, 0.0)
+            result[part, 1 + a] = (jumps * (alpha - 1)).sum(axis=1) / over
+            result[part, 4 + a] = -(jumps * alpha).sum(axis=1) / over
+    return result
+
+
 def _segments(
     shape: tuple[int, ...], rays: IndexRays, attenuation: Attenuation | None
 ) -> Iterator[tuple[slice, NDArray[np.intp], Array]]:
@@ -48,17 +69,8 @@ def _segments(
     lattices = [(shape, rays)]
     if attenuation is not None and attenuation.rays is not rays:
         lattices.append((attenuation.mu.shape, attenuation.rays))
-    rays_at_once = max(1, _CROSSINGS // sum(sum(shape) + 5 for shape, _ in lattices))
-    for first in range(0, len(rays), rays_at_once):
-        part = slice(first, first + rays_at_once)
-        length = rays.lengths[part, None]
-        crossings = [np.zeros(length.shape), np.ones(length.shape)]
-        for lattice_shape, lattice_rays in lattices:
-            crossings += _crossings(lattice_shape, lattice_rays[part])
-        alpha = np.sort(np.concatenate(crossings, axis=1), axis=1)
-        middle = (alpha[:, 1:] + alpha[:, :-1]) / 2
-        segment = np.diff(alpha, axis=1) * length
-
+    for part, alpha, middle, _ in _cut(lattices):
+        segment = np.diff(alpha, axis=1) * rays.lengths[part, None]
         index, inside = _voxels(shape, rays[part], middle)
         weight = np.where(inside, segment, 0.0)
         if attenuation is not None:
@@ -66,6 +78,28 @@ def _segments(
             depth = np.where(inside, attenuation.mu.reshape(-1)[mu_index], 0.0) * segment
             weight *= np.exp(depth - np.cumsum(depth, axis=1)) * _mean_transmission(depth)
         yield part, index, weight
+
+
+def _cut(
+    lattices: list[tuple[tuple[int, ...], IndexRays]],
+) -> Iterator[tuple[slice, Array, Array, NDArray[np.intp]]]:
+    """The rays cut at the planes of all `lattices`, each a shape and the rays there, some rays at a time.
+
+    Yields which rays (a slice), alpha of the cuts (n, S + 1) and of the segments' midpoints (n, S), and which crossing
+    each cut is (n, S + 1), counted from 2 in the order of `_crossings`; 0 and 1 are the ray's ends.
+    """
+    lengths = lattices[0][1].lengths
+    rays_at_once = max(1, _CROSSINGS // sum(sum(shape) + 5 for shape, _ in lattices))
+    for first in range(0, len(lengths), rays_at_once):
+        part = slice(first, first + rays_at_once)
+        length = lengths[part, None]
+        crossings = [np.zeros_like(length), np.ones_like(length)]
+        for shape, rays in lattices:
+            crossings += _crossings(shape, rays[part])
+        alpha = np.concatenate(crossings, axis=1)
+        order = alpha.argsort(axis=1)
+        alpha = np.take_along_axis(alpha, order, axis=1)
+        yield part, alpha, (alpha[:, 1:] + alpha[:, :-1]) / 2, order
 
 
 def _crossings(shape: tuple[int, ...], rays: IndexRays) -> Iterator[Array]:

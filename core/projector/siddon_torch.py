@@ -21,11 +21,9 @@ _CROSSINGS_GPU = 2**24
 
 def forward(volume: Tensor, rays: IndexRays, attenuation: Attenuation | None = None) -> Tensor:
     """Line integrals (N,), value x mm, of `volume` (n_x, n_y, n_z) along `rays`, attenuated towards their sources."""
-    integrals = torch.empty(len(rays), dtype=volume.dtype, device=volume.device)
     voxels = volume.reshape(-1)
-    for part, index, weight in _segments(volume, rays, attenuation):
-        integrals[part] = (voxels[index] * weight).sum(dim=1).to(volume.dtype)
-    return integrals
+    integrals = [(voxels[index] * weight).sum(dim=1) for _, index, weight in _segments(volume, rays, attenuation)]
+    return torch.cat(integrals) if integrals else volume.new_zeros(0)
 
 
 def adjoint(volume: Tensor, values: Tensor, rays: IndexRays, attenuation: Attenuation | None = None) -> None:
@@ -34,6 +32,28 @@ def adjoint(volume: Tensor, values: Tensor, rays: IndexRays, attenuation: Attenu
     for part, index, weight in _segments(volume, rays, attenuation):
         spread = weight * values[part, None]
         voxels.index_add_(0, index.reshape(-1), spread.reshape(-1).to(volume.dtype))
+
+
+def derivatives(volume: Tensor, rays: IndexRays) -> Tensor:
+    """What the ends of `rays` do to their integrals (N, 7), as `backends` describes it."""
+    pieces = []
+    voxels, shape = volume.reshape(-1), volume.shape
+    line = _on_device(rays, volume.device)
+    axes = torch.tensor([3, 0, 1, 2]).repeat_interleave(torch.tensor([2, *(n + 1 for n in shape)]))
+    axes = axes.to(volume.device)  # of the crossings; 3: the ray's ends
+    for part, alpha, middle, order in _cut([(shape, line)]):
+        index, inside = _voxels(shape, line.part(part), middle)
+        value = voxels[index].to(alpha.dtype).masked_fill_(~inside, 0.0)
+        integral = (value * alpha.diff(dim=1)).sum(dim=1, keepdim=True)
+        alpha, axis = alpha[:, 1:-1], axes[order[:, 1:-1]]
+        jump = (value[:, :-1] - value[:, 1:]).masked_fill_((alpha <= 0) | (alpha >= 1), 0.0)
+        jumps = [jump.masked_fill(axis != a, 0.0) for a in range(3)]
+        direction = line.directions[part]
+        over = torch.where(direction == 0, 1.0, direction)
+        by_start = torch.stack([(j * (alpha - 1)).sum(dim=1) for j in jumps], dim=1) / over
+        by_end = -torch.stack([(j * alpha).sum(dim=1) for j in jumps], dim=1) / over
+        pieces.append(torch.cat([integral, by_start, by_end], dim=1))
+    return torch.cat(pieces) if pieces else torch.zeros((0, 7), dtype=volume.dtype, device=volume.device)
 
 
 def _segments(
@@ -52,18 +72,8 @@ def _segments(
         mu_line = line if attenuation.rays is rays else _on_device(attenuation.rays, device)
         if mu_line is not line:
             lattices.append((mu_shape, mu_line))
-    budget = _CROSSINGS_CPU if device.type == "cpu" else _CROSSINGS_GPU
-    rays_at_once = max(1, budget // sum(sum(shape) + 5 for shape, _ in lattices))
-    for first in range(0, len(rays), rays_at_once):
-        part = slice(first, first + rays_at_once)
-        length = line.lengths[part, None]
-        crossings = [torch.zeros_like(length), torch.ones_like(length)]
-        for lattice_shape, lattice_line in lattices:
-            crossings += _crossings(lattice_shape, lattice_line.part(part))
-        alpha = torch.cat(crossings, dim=1).sort(dim=1).values
-        middle = (alpha[:, 1:] + alpha[:, :-1]) / 2
-        segment = alpha.diff(dim=1) * length
-
+    for part, alpha, middle, _ in _cut(lattices):
+        segment = alpha.diff(dim=1) * line.lengths[part, None]
         index, inside = _voxels(volume.shape, line.part(part), middle)
         weight = segment.masked_fill(~inside, 0.0)
         if attenuation is not None:
@@ -88,6 +98,25 @@ class _Line:
 def _on_device(rays: IndexRays, device: torch.device) -> _Line:
     real = torch.float32 if device.type == "mps" else torch.float64  # Apple's GPUs have no float64
     return _Line(*(torch.as_tensor(a, dtype=real).to(device) for a in (rays.starts, rays.directions, rays.lengths)))
+
+
+def _cut(lattices: list[tuple[tuple[int, ...], _Line]]) -> Iterator[tuple[slice, Tensor, Tensor, Tensor]]:
+    """The rays cut at the planes of all `lattices`, each a shape and the rays there, some rays at a time.
+
+    Yields which rays (a slice), alpha of the cuts (n, S + 1) and of the segments' midpoints (n, S), and which crossing
+    each cut is (n, S + 1), counted from 2 in the order of `_crossings`; 0 and 1 are the ray's ends.
+    """
+    lengths = lattices[0][1].lengths
+    budget = _CROSSINGS_CPU if lengths.device.type == "cpu" else _CROSSINGS_GPU
+    rays_at_once = max(1, budget // sum(sum(shape) + 5 for shape, _ in lattices))
+    for first in range(0, len(lengths), rays_at_once):
+        part = slice(first, first + rays_at_once)
+        length = lengths[part, None]
+        crossings = [torch.zeros_like(length), torch.ones_like(length)]
+        for shape, line in lattices:
+            crossings += _crossings(shape, line.part(part))
+        alpha, order = torch.cat(crossings, dim=1).sort(dim=1)
+        yield part, alpha, (alpha[:, 1:] + alpha[:, :-1]) / 2, order
 
 
 def _crossings(shape: tuple[int, ...], line: _Line) -> Iterator[Tensor]:

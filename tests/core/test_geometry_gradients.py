@@ -1,0 +1,209 @@
+"""Gradients of line integrals by the ends of the rays, against finite differences, closed forms and DiffDRR."""
+
+from __future__ import annotations
+
+import importlib.util
+
+import numpy as np
+import pytest
+
+torch = pytest.importorskip("torch", reason="torch is not installed")
+
+from mphdrr.core.errors import InputError  # noqa: E402
+from mphdrr.core.grid import Grid  # noqa: E402
+from mphdrr.core.projector import Projector, trace_rays  # noqa: E402
+from mphdrr.core.views import Views  # noqa: E402
+from mphdrr.core.volume import Volume  # noqa: E402
+
+from .conftest import general_grid  # noqa: E402
+
+BACKENDS = [
+    pytest.param(
+        name, marks=pytest.mark.skipif(importlib.util.find_spec(name) is None, reason=f"{name} is not installed")
+    )
+    for name in ("numpy", "torch", "numba")
+]
+SHAPES = [(7, 5, 6), (1, 6, 4), (5, 1, 3), (4, 5, 1), (1, 1, 1)]
+
+
+def oblique_rays(rng, grid, n=60):
+    """Rays through the grid: from outside, from inside, ending inside, both."""
+    size = np.ptp(grid.corners(), axis=0).max()
+    sources = grid.center + rng.normal(size=(n, 3)) * size * 1.5
+    targets = 2 * grid.center - sources + rng.normal(size=(n, 3)) * size * 0.3
+    sources[: n // 3] = grid.center + rng.uniform(-0.2, 0.2, (n // 3, 3)) * size
+    targets[n // 4 : n // 2] = grid.center + rng.uniform(-0.2, 0.2, (n // 2 - n // 4, 3)) * size
+    return sources, targets
+
+
+def gradients(volume, sources, targets, backend, weights):
+    s, t = (torch.tensor(x, requires_grad=True) for x in (sources, targets))
+    y = trace_rays(volume, s, t, backend)
+    assert y.dtype == torch.float64
+    (y * torch.as_tensor(weights)).sum().backward()
+    return s.grad.numpy(), t.grad.numpy()
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+@pytest.mark.parametrize("shape", SHAPES)
+def test_gradient_is_the_central_difference(backend, shape, rng):
+    grid = general_grid(rng, shape)
+    volume = Volume(rng.random(shape), grid)
+    sources, targets = oblique_rays(rng, grid)
+    n, h = len(sources), 1e-6
+    got = gradients(volume, sources, targets, backend, np.ones(n))
+    scale = np.abs(got).max()
+    for end in range(2):
+        for axis in range(3):
+            step = np.zeros(3)
+            step[axis] = h
+            ahead, behind = (
+                trace_rays(volume, torch.tensor(sources + sign * step * (end == 0)),
+                           torch.tensor(targets + sign * step * (end == 1)), backend).numpy()
+                for sign in (1, -1)
+            )  # fmt: skip
+            difference = (ahead - behind) / (2 * h)
+            # A ray within h of an edge of a voxel has a kink there: few do.
+            close = np.abs(difference - got[end][:, axis]) < 1e-5 * scale
+            assert close.mean() >= 0.97, (end, axis, np.abs(difference - got[end][:, axis]).max())
+
+
+@pytest.mark.parametrize("backend", ["torch", "numba"])
+def test_backends_agree(backend, rng):
+    pytest.importorskip(backend)
+    grid = general_grid(rng, (12, 9, 10))
+    volume = Volume(rng.random(grid.shape), grid)
+    sources, targets = oblique_rays(rng, grid, 9000)
+    weights = rng.normal(size=len(sources))
+    for reference, got in zip(
+        gradients(volume, sources, targets, "numpy", weights),
+        gradients(volume, sources, targets, backend, weights),
+        strict=True,
+    ):
+        np.testing.assert_allclose(got, reference, rtol=1e-8, atol=1e-8 * np.abs(reference).max())
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_chord_of_a_slab(backend):
+    """The chord of a uniform slab: between its faces at x = +-8 it is 16 / cos of the angle to x, whatever y and z."""
+    grid = Grid.centered((8, 40, 40), 2.0)
+    source = torch.tensor([-50.0, 1.3, 0.7], dtype=torch.float64, requires_grad=True)
+    target = torch.tensor([[60.0, 7.1, -3.9]], dtype=torch.float64, requires_grad=True)
+    y = trace_rays(Volume(np.ones(grid.shape), grid), source, target, backend)
+    along = (target - source)[0]
+    expected = 16 * along.norm() / along[0]
+    torch.testing.assert_close(y[0], expected)
+    for got, wanted in zip(
+        torch.autograd.grad(y.sum(), (source, target), retain_graph=True),
+        torch.autograd.grad(expected, (source, target)),
+        strict=True,
+    ):
+        torch.testing.assert_close(got, wanted, atol=1e-12, rtol=1e-9)
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_odd_rays_have_gradients_too(backend):
+    """Of length zero, missing, along an axis, in a plane of voxel faces, within one voxel, through corners: never NaN."""
+    grid = Grid.centered((4, 4, 4), 1.0)
+    sources = [
+        [0.2, 0.3, 0.1],
+        [9, 9, 9],
+        [30, 30, -30],
+        [0.3, 0.2, -9],
+        [0, 0, -9],
+        [-2, 0, 0],
+        [-5, -5, -5],
+        [0, 0, 0],
+    ]
+    targets = [
+        [0.2, 0.3, 0.1],
+        [9, 9, 9],
+        [30, 30, 30],
+        [0.3, 0.2, 9],
+        [0, 0, 9],
+        [2, 0, 0],
+        [5, 5, 5],
+        [0.2, 0.3, 0.1],
+    ]
+    volume = Volume(np.arange(64.0).reshape(4, 4, 4), grid)
+    by_source, by_target = gradients(volume, np.array(sources, float), np.array(targets, float), backend, np.ones(8))
+    assert np.isfinite(by_source).all() and np.isfinite(by_target).all()
+    assert not by_source[:3].any() and not by_target[:3].any()
+    # Inside one voxel of value f the integral is f times the length.
+    value = volume.array[2, 2, 2]
+    direction = np.array(targets[7]) / np.linalg.norm(targets[7])
+    np.testing.assert_allclose(by_target[7], value * direction, rtol=1e-9)
+    np.testing.assert_allclose(by_source[7], -value * direction, rtol=1e-9)
+
+
+@pytest.mark.parametrize("backend", ["numpy", "torch"])
+def test_gradcheck_by_volume_and_ends(backend, rng):
+    grid = general_grid(rng, (3, 2, 4))
+    sources, targets = (torch.tensor(x, requires_grad=True) for x in oblique_rays(rng, grid, 5))
+    volume = torch.tensor(rng.random(grid.shape), requires_grad=True)
+
+    def function(volume, sources, targets):
+        return trace_rays(volume, sources, targets, backend, grid) ** 2
+
+    assert torch.autograd.gradcheck(function, (volume, sources, targets), eps=1e-7, atol=1e-5, rtol=1e-5)
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_gradient_by_volume_is_the_adjoint(backend, rng):
+    views = Views([[0.1, 0.3, -20]], [[0, 0, 20]], [[1, 0, 0]], [[0, 1, 0]], (4, 5))
+    grid = Grid.centered((5, 4, 3), 1.0)
+    values = torch.tensor(rng.random(20), dtype=torch.float32)
+    volume = torch.rand(grid.shape, requires_grad=True)
+    y = trace_rays(volume, *views.rays(0), backend, grid)
+    assert y.dtype == (torch.float64 if backend == "numpy" else torch.float32)
+    (y * values).sum().backward()
+    expected = Projector(grid, views, backend=backend).T(values.numpy().reshape(1, 4, 5))
+    np.testing.assert_allclose(volume.grad.numpy(), expected, rtol=1e-5, atol=1e-6)
+
+
+def test_kinds_of_arguments(rng):
+    grid = Grid.centered((4, 4, 4), 1.0)
+    array = rng.random(grid.shape).astype(np.float32)
+    sources, targets = rng.normal(size=(2, 6, 3)) * 5
+    expected = trace_rays(Volume(array, grid), sources, targets)
+    assert isinstance(expected, np.ndarray)
+    np.testing.assert_array_equal(trace_rays(array, sources, targets, grid=grid), expected)
+    for s, t in (
+        (torch.tensor(sources), targets),
+        (sources.tolist(), torch.tensor(targets, dtype=torch.float32)),
+        (torch.tensor(sources, dtype=torch.float32, requires_grad=True), torch.tensor(targets)),
+    ):
+        y = trace_rays(Volume(array, grid), s, t)
+        kinds = [x.dtype for x in (s, t) if isinstance(x, torch.Tensor)]
+        assert y.dtype == (torch.float64 if torch.float64 in kinds else torch.float32)
+        np.testing.assert_allclose(y.detach(), expected, rtol=1e-4, atol=1e-5)
+    one = torch.tensor([0.0, 0.1, -9.0], requires_grad=True)  # one source for all: its gradient is the sum
+    trace_rays(Volume(array, grid), one, targets).sum().backward()
+    assert one.grad.shape == (3,) and one.grad.dtype == torch.float32
+    assert trace_rays(Volume(array, grid), one, torch.zeros((0, 3))).shape == (0,)
+
+
+def test_bad_input_is_one_clear_line():
+    grid = Grid.centered((5, 4, 3), 1.0)
+    ones, point = torch.ones(grid.shape), torch.zeros(3)
+    for call, word in (
+        (lambda: trace_rays(ones, point, point), "grid"),
+        (lambda: trace_rays(ones, point, point, grid=3), "int"),
+        (lambda: trace_rays(torch.ones(3, 3, 3), point, point, grid=grid), "5 x 4 x 3"),
+        (lambda: trace_rays(ones, torch.zeros(2), point, grid=grid), "sources"),
+        (lambda: trace_rays(ones, torch.zeros((2, 3)), torch.zeros((4, 3)), grid=grid), "2 sources"),
+        (lambda: trace_rays(ones, point, torch.tensor([0, 0, np.nan]), grid=grid), "targets"),
+        (lambda: trace_rays(ones, point, torch.zeros(3, dtype=torch.complex64), grid=grid), "targets"),
+    ):
+        with pytest.raises(InputError) as error:
+            call()
+        assert word in str(error.value) and "\n" not in str(error.value)
+
+
+def test_gradients_of_gradients_are_refused(rng):
+    grid = Grid.centered((5, 4, 3), 1.0)
+    source = torch.tensor([0.1, 0.2, -9.0], requires_grad=True)
+    y = trace_rays(torch.rand(grid.shape), source, [0.0, 0.3, 9.0], grid=grid).sum()
+    (gradient,) = torch.autograd.grad(y, source, create_graph=True)
+    with pytest.raises(InputError, match="create_graph"):
+        torch.autograd.grad(gradient.sum(), source)

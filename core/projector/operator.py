@@ -22,7 +22,7 @@ from ..volume import Volume
 from . import backends
 from .arrays import ArrayOrTensor, alike, checked, cropped, is_tensor, like, to_numpy, to_tensor, zeros
 from .models import Beam, Model, Transmission, require_model
-from .rays import Tracer
+from .rays import RayMapper
 
 # Rays handed to a backend at once: enough that a call costs nothing, few enough that their arrays stay in the
 # cache.
@@ -231,7 +231,7 @@ class Projector(LinearOperator):
         for beam in self.model.beams(self.views, m, self.grid):
             yield (beam.transposed() if by_columns else beam), by_columns
 
-    def _lattices(self, native: ArrayOrTensor, volume: ArrayOrTensor = None) -> tuple[ArrayOrTensor, Tracer]:
+    def _lattices(self, native: ArrayOrTensor, volume: ArrayOrTensor = None) -> tuple[ArrayOrTensor, RayMapper]:
         """The part of `volume` that is not empty, and what brings rays into the index spaces of that and of mu.
 
         Empty margins cost time: most objects fill a small part of their grid. With None (a volume yet to be filled)
@@ -243,17 +243,17 @@ class Projector(LinearOperator):
         if volume is not None:
             (box,), origin = cropped(volume)
         if self.model.mu is None:
-            return box, Tracer(self.grid, origin)
+            return box, RayMapper(self.grid, origin)
         mu, mu_grid = alike(self.model.mu.array, native), self.model.mu.grid
         if _same(mu_grid, self.grid):
             if volume is None:
-                return None, Tracer(self.grid, mu=mu)
+                return None, RayMapper(self.grid, mu=mu)
             (common, mu_common), common_origin = cropped(volume, mu)
             # One lattice is walked twice as fast as two, but two boxes let rays that miss the volume's go at once.
             if math.prod(common.shape) <= 2 * math.prod(box.shape):
-                return common, Tracer(self.grid, common_origin, mu_common)
+                return common, RayMapper(self.grid, common_origin, mu_common)
         (mu,), mu_origin = cropped(mu)
-        return box, Tracer(self.grid, origin, mu, mu_grid, mu_origin)
+        return box, RayMapper(self.grid, origin, mu, mu_grid, mu_origin)
 
     def _native(self, x: ArrayOrTensor, name: str) -> ArrayOrTensor:
         """`x` as the backend `name` computes with it."""

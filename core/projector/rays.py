@@ -62,7 +62,7 @@ class Attenuation:
 
 
 @dataclass(frozen=True, eq=False)
-class Tracer:
+class RayMapper:
     """Rays from world mm into the index spaces of a volume and of what attenuates them.
 
     Attributes

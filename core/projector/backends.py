@@ -16,8 +16,8 @@ Such a module has three functions. ``forward(volume, rays, attenuation=None)`` r
 ``adjoint(volume, values, rays, attenuation=None)`` adds the values to the volume in place, each along its ray
 with the same weights; ``derivatives(volume, rays)`` returns (N, 7): the integral over alpha from 0 to 1 (the line
 integral per mm of the ray's length), and its derivatives by the ray's start (3) and end (3) in index space. `rays` are
-`IndexRays`, what weakens them an `Attenuation`; volumes, values and mu are tensors on one device for "torch" and numpy
-arrays for the others.
+`IndexRays` or an `IndexFan`, what weakens them an `Attenuation`; volumes, values and mu are tensors on one device for
+"torch" and numpy arrays for the others.
 """
 
 

@@ -17,7 +17,8 @@ from ..system import PinholeSystem
 from ..views import Views
 from ..volume import Volume
 from .arrays import is_tensor
-from .models import Array, Beam, Model
+from .models import Array, Beam, Model, view_rays
+from .rays import Fan
 
 # Views may differ from the system they are said to be of by a file's rounding (mm; sine of an angle).
 _SAME_PLACE = 1e-3
@@ -170,26 +171,29 @@ class Emission(Model):
         """Rays from the pinhole through the grid, weighted with counts per (decay / (s mm^3) mm)."""
         u, v, k = self.system.frames()[m]
         l, diameter = self.system.collimator_length[m], self.effective_diameter[m]
-        pinhole = views.sources[m]
-        _, targets = (points.reshape(*views.shape, 3) for points in views.rays(m))
-        # From the pixels' places on the crystal to the middle of the hole.
-        to_middle = self._crystal_scale(views, m) * (targets - pinhole)
+        pinhole, rays, scale = views.sources[m], view_rays(views, m), self._crystal_scale(views, m)
+        # The pixels' places on the crystal, mm along u and v, point-inverted, seen from its middle.
+        middle = scale * (rays.corner - pinhole)
         pitch_u, pitch_v = self._crystal_pitch(views, m)
+        n_v, n_u = views.shape
+        along_v = (middle @ v + scale * (rays.line_step @ v) * np.arange(n_v))[:, None]
+        along_u = (middle @ u + scale * (rays.ray_step @ u) * np.arange(n_u))[None, :]
         counts = self.time * self.photons_per_decay * diameter**2 * pitch_u * pitch_v / (16 * l**2)
         if self.within_crystal:
-            counts = counts * self._share_on_crystal(m, to_middle @ v, pitch_v)
-            counts = counts * self._share_on_crystal(m, to_middle @ u, pitch_u)
+            counts = counts * self._share_on_crystal(m, along_v, pitch_v)
+            counts = counts * self._share_on_crystal(m, along_u, pitch_u)
         # To the plane through the grid's farthest corner.
         depth = max(float(((grid.corners() - pinhole) @ k).max()), l)
         for x, y in diameter / 2 * disk_points(self.aperture_points):
             point = x * u + y * v
-            to_point = to_middle + point
-            cosine = l / np.linalg.norm(to_point, axis=-1)
+            cosine = l / np.sqrt((along_u + x) ** 2 + (along_v + y) ** 2 + l**2)
             weights = counts / self.aperture_points * cosine**4
             if self.crystal_mu is not None:
                 weights *= -np.expm1(-self.crystal_mu * self.system.detector_thickness[m] / cosine)
-            source = pinhole + point
-            yield Beam(np.broadcast_to(source, targets.shape), source + depth / l * to_point, weights)
+            source, stretch = pinhole + point, depth / l * scale
+            corner = source + depth / l * (middle + point)
+            fan = Fan(source, corner, stretch * rays.line_step, stretch * rays.ray_step, views.shape)
+            yield Beam(fan, weights)
 
     def response(self, views: Views, m: int) -> tuple[Array, Array] | None:
         """The intrinsic blur of view m: matrices (n_v, n_v) along v and (n_u, n_u) along u."""

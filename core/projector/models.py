@@ -14,6 +14,7 @@ from ..errors import InputError
 from ..grid import Grid
 from ..views import Views
 from ..volume import Volume
+from .rays import Fan
 
 Array = NDArray[np.float64]
 
@@ -24,20 +25,18 @@ class Beam:
 
     Attributes
     ----------
-    sources, targets : array (n_v, n_u, 3)
-        Ends of the rays, world mm.
+    rays : Fan
+        From the rays' source to the pixels: n_v lines of n_u rays.
     weights : array (n_v, n_u) or None
         What the ray's integral counts in its pixel; None: 1 everywhere.
     """
 
-    sources: Array
-    targets: Array
+    rays: Fan
     weights: Array | None = None
 
     def transposed(self) -> Beam:
-        """The same rays by columns: arrays (n_u, n_v, ...)."""
-        weights = None if self.weights is None else self.weights.T
-        return Beam(self.sources.swapaxes(0, 1), self.targets.swapaxes(0, 1), weights)
+        """The same rays by columns: n_u lines of n_v rays."""
+        return Beam(self.rays.transposed(), None if self.weights is None else self.weights.T)
 
 
 class Model(ABC):
@@ -87,8 +86,15 @@ class Transmission(Model):
 
     def beams(self, views: Views, m: int, grid: Grid) -> Iterator[Beam]:
         """The rays of `views`, each counting 1."""
-        sources, targets = (points.reshape(*views.shape, 3) for points in views.rays(m))
-        yield Beam(sources, targets)
+        yield Beam(view_rays(views, m))
+
+
+def view_rays(views: Views, m: int) -> Fan:
+    """The rays of view m, from its source to the pixels' centres: a line for every row."""
+    n_v, n_u = views.shape
+    u_step, v_step = views.u_steps[m], views.v_steps[m]
+    corner = views.detector_centers[m] - (n_u - 1) / 2 * u_step - (n_v - 1) / 2 * v_step
+    return Fan(views.sources[m], corner, v_step, u_step, views.shape)
 
 
 def require_model(value: object) -> Model:

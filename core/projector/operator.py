@@ -11,7 +11,6 @@ from contextlib import contextmanager
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..errors import InputError
 from ..grid import Grid
@@ -33,7 +32,6 @@ _RAYS_AT_ONCE_TORCH = 2**18
 # Threads of the adjoint, each with a volume of its own: more would gain little and take much memory.
 _MOST_VOLUMES = 8
 
-Points = NDArray[np.float64]
 ParallelMap = Callable[[Callable[[Any], Any], Iterable[Any]], Iterable[Any]]
 
 
@@ -208,7 +206,7 @@ class Projector(LinearOperator):
                     weights = None if beam.weights is None else alike(beam.weights, box)
 
                     def project(block: slice) -> None:
-                        rays, attenuation = trace(_flat(beam.sources[block]), _flat(beam.targets[block]))  # noqa: B023
+                        rays, attenuation = trace(beam.rays[block])  # noqa: B023
                         integrals = integrate(box, rays, attenuation).reshape(lines[block].shape)  # noqa: B023
                         lines[block] += integrals if weights is None else weights[block] * integrals  # noqa: B023
 
@@ -221,7 +219,7 @@ class Projector(LinearOperator):
                 yield image if self._float64 or is_tensor(image) else image.astype(np.float32, copy=False)
 
     def _beams(self, m: int) -> Iterator[tuple[Beam, bool]]:
-        """View m's rays, (lines, rays of a line, 3), and whether the lines are the image's columns, not its rows.
+        """View m's rays, and whether their lines are the image's columns, not its rows.
 
         Neighbours in a line are neighbours in memory: lines follow the volume's contiguous axis as well as they can.
         """
@@ -327,7 +325,7 @@ class AdjointProjector(LinearOperator):
                     def add(worker: int) -> None:
                         # Always the same blocks, so that the sums' order, and so the result, is always the same.
                         for block in blocks[worker::workers]:  # noqa: B023
-                            rays, attenuation = trace(_flat(beam.sources[block]), _flat(beam.targets[block]))  # noqa: B023
+                            rays, attenuation = trace(beam.rays[block])  # noqa: B023
                             spread(volumes[worker], lines[block].reshape(-1), rays, attenuation)  # noqa: B023
 
                     for _ in parallel_map(add, range(workers)):
@@ -348,10 +346,6 @@ def _blocks(n_lines: int, line_length: int, backend: str) -> list[slice]:
     return [slice(first, first + size) for first in range(0, n_lines, size)]
 
 
-def _flat(points: Points) -> Points:
-    return points.reshape(-1, 3)
-
-
 @contextmanager
 def _parallel(workers: int) -> Iterator[ParallelMap]:
     """A map that runs on `workers` threads."""
@@ -364,7 +358,7 @@ def _parallel(workers: int) -> Iterator[ParallelMap]:
 
 def _require_rays(views: Views) -> None:
     n_v, n_u = views.shape
-    # An image of float32, and targets of three float64 each.
+    # An image of float32, and a few arrays of float64 that weight its rays.
     require(28 * n_v * n_u, f"an image of {n_v} x {n_u} pixels, with its rays,")
 
 

@@ -17,6 +17,51 @@ _SNAP = 1e-9
 
 
 @dataclass(frozen=True, eq=False)
+class Fan:
+    """Rays from one point to the points of a lattice on a plane, world mm: all that an image's rays are.
+
+    Ray j of line i goes from `source` to ``corner + i line_step + j ray_step``.
+
+    Attributes
+    ----------
+    source, corner, line_step, ray_step : array (3,)
+        mm.
+    shape : tuple of int
+        Lines, and rays of a line.
+    """
+
+    source: NDArray[np.float64]
+    corner: NDArray[np.float64]
+    line_step: NDArray[np.float64]
+    ray_step: NDArray[np.float64]
+    shape: tuple[int, int]
+
+    def __len__(self) -> int:
+        return self.shape[0] * self.shape[1]
+
+    def __getitem__(self, lines: slice) -> Fan:
+        """Some of the lines."""
+        first, stop, _ = lines.indices(self.shape[0])
+        corner = self.corner + first * self.line_step
+        return Fan(self.source, corner, self.line_step, self.ray_step, (stop - first, self.shape[1]))
+
+    def transposed(self) -> Fan:
+        """The same rays, lines across."""
+        return Fan(self.source, self.corner, self.ray_step, self.line_step, self.shape[::-1])
+
+    def targets(self) -> NDArray[np.float64]:
+        """Ends of the rays (lines * rays, 3), line by line."""
+        line, ray = (np.arange(n, dtype=np.float64) for n in self.shape)
+        return (self.corner + line[:, None, None] * self.line_step + ray[:, None] * self.ray_step).reshape(-1, 3)
+
+    def moved(self, affine: NDArray[np.float64]) -> Fan:
+        """The fan under a 4x4 affine."""
+        linear, translation = affine[:3, :3], affine[:3, 3]
+        source, corner = linear @ self.source + translation, linear @ self.corner + translation
+        return Fan(source, corner, linear @ self.line_step, linear @ self.ray_step, self.shape)
+
+
+@dataclass(frozen=True, eq=False)
 class IndexRays:
     """Rays in index space, where voxel i of an axis fills [i, i + 1) and the faces lie at 0, 1, ..., n.
 
@@ -43,6 +88,34 @@ class IndexRays:
         """Some of the rays."""
         return IndexRays(self.starts[which], self.directions[which], self.lengths[which])
 
+    def listed(self) -> IndexRays:
+        """These rays."""
+        return self
+
+
+@dataclass(frozen=True, eq=False)
+class IndexFan:
+    """A fan in index space: the same rays as `IndexRays`, yet to be listed.
+
+    Attributes
+    ----------
+    fan : Fan
+        In index space; nothing is snapped yet.
+    world : Fan
+        The same in world mm: its rays' lengths are theirs.
+    """
+
+    fan: Fan
+    world: Fan
+
+    def __len__(self) -> int:
+        return len(self.fan)
+
+    def listed(self) -> IndexRays:
+        """The rays one by one, snapped to the planes that they lie in."""
+        lengths = np.linalg.norm(self.world.targets() - self.world.source, axis=1)
+        return _snapped(np.broadcast_to(self.fan.source, (len(self), 3)), self.fan.targets(), lengths)
+
 
 @dataclass(frozen=True, eq=False)
 class Attenuation:
@@ -52,13 +125,16 @@ class Attenuation:
     ----------
     mu : array or tensor (n_x, n_y, n_z)
         Attenuation coefficients, 1/mm, of the backend's kind; outside they are 0.
-    rays : IndexRays
-        The rays in mu's own index space. The very object that is given for the volume where mu shares the volume's
-        lattice.
+    rays : IndexRays, IndexFan or None
+        The same rays in mu's own index space; None where mu shares the volume's lattice.
     """
 
     mu: Any
-    rays: IndexRays
+    rays: IndexRays | IndexFan | None = None
+
+    def listed(self) -> Attenuation:
+        """The same with its rays one by one."""
+        return self if self.rays is None else Attenuation(self.mu, self.rays.listed())
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,16 +157,19 @@ class RayMapper:
     mu_grid: Grid | None = None
     mu_origin: tuple[int, int, int] = (0, 0, 0)
 
-    def __call__(
-        self, sources: NDArray[np.float64], targets: NDArray[np.float64]
-    ) -> tuple[IndexRays, Attenuation | None]:
-        """Rays from `sources` to `targets`, both (N, 3) in world mm."""
-        rays = index_rays(self.grid, sources, targets, self.origin)
+    def __call__(self, fan: Fan) -> tuple[IndexFan, Attenuation | None]:
+        """The rays of `fan`, and what attenuates them."""
+        rays = index_fan(self.grid, fan, self.origin)
         if self.mu is None:
             return rays, None
         if self.mu_grid is None:
-            return rays, Attenuation(self.mu, rays)
-        return rays, Attenuation(self.mu, index_rays(self.mu_grid, sources, targets, self.mu_origin))
+            return rays, Attenuation(self.mu)
+        return rays, Attenuation(self.mu, index_fan(self.mu_grid, fan, self.mu_origin))
+
+
+def index_fan(grid: Grid, fan: Fan, origin: tuple[int, int, int] = (0, 0, 0)) -> IndexFan:
+    """`fan` in `grid`'s index space; see `index_rays`."""
+    return IndexFan(fan.moved(_index_from_world(grid, origin)), fan)
 
 
 def index_rays(
@@ -110,19 +189,28 @@ def index_rays(
     origin
         The voxel whose lower corner is to be index (0, 0, 0): not 0 for a volume cropped from the grid.
     """
-    linear = np.linalg.inv(grid.affine[:3, :3]).T
-    # The integer index is a voxel's centre in world coordinates, and its lower face here.
-    shift = 0.5 - np.asarray(origin, dtype=np.float64)
-    translation = grid.affine[:3, 3]
+    affine = _index_from_world(grid, origin)
+    linear, translation = affine[:3, :3], affine[:3, 3]
     # Not `@`: BLAS would start threads of its own inside ours.
-    starts = np.einsum("ni,ij->nj", sources - translation, linear) + shift
-    ends = np.einsum("ni,ij->nj", targets - translation, linear) + shift
+    starts = np.einsum("ni,ji->nj", sources, linear) + translation
+    ends = np.einsum("ni,ji->nj", targets, linear) + translation
+    return _snapped(starts, ends, np.linalg.norm(targets - sources, axis=1))
 
+
+def _index_from_world(grid: Grid, origin: tuple[int, int, int]) -> NDArray[np.float64]:
+    """World mm to the index space of `IndexRays`, (4, 4)."""
+    affine = grid.index_from_world.copy()
+    # The integer index is a voxel's centre in world coordinates, and its lower face here.
+    affine[:3, 3] += 0.5 - np.asarray(origin, dtype=np.float64)
+    return affine
+
+
+def _snapped(starts: NDArray[np.float64], ends: NDArray[np.float64], lengths: NDArray[np.float64]) -> IndexRays:
     planes = np.rint(starts)
     in_plane = (np.abs(starts - planes) <= _SNAP) & (np.abs(ends - planes) <= _SNAP)
-    np.copyto(starts, planes, where=in_plane)
+    starts = np.where(in_plane, planes, starts)
     directions = ends - starts
     # What is left of nearly 0 crosses no plane (both ends would be within _SNAP of it), so 0 is as good:
     # backends may divide by what is not 0 without overflow.
     directions[in_plane | (np.abs(directions) <= _SNAP)] = 0.0
-    return IndexRays(starts, directions, np.linalg.norm(targets - sources, axis=1))
+    return IndexRays(starts, directions, lengths)

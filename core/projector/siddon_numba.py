@@ -15,7 +15,7 @@ from numba import njit, types
 from numpy.typing import NDArray
 
 from .compiling import compiled
-from .rays import Attenuation, IndexRays
+from .rays import Attenuation, IndexFan, IndexRays
 
 _READ_F32 = types.Array(types.float32, 3, "C", readonly=True)
 _READ_F64_1D = types.Array(types.float64, 1, "C", readonly=True)
@@ -29,13 +29,13 @@ _F64_2D = types.float64[:, ::1]
 
 
 def forward(
-    volume: NDArray[np.float32], rays: IndexRays, attenuation: Attenuation | None = None
+    volume: NDArray[np.float32], rays: IndexRays | IndexFan, attenuation: Attenuation | None = None
 ) -> NDArray[np.float64]:
     """Line integrals (N,), value x mm, of `volume` (n_x, n_y, n_z) along `rays`, attenuated towards their sources."""
     integrals = np.empty(len(rays))
     if attenuation is None:
         _forward_kernel()(volume, *_contiguous(rays), integrals)
-    elif attenuation.rays is rays:
+    elif attenuation.rays is None:
         kernel = compiled(_integrate_attenuated, types.void(_READ_F32, *_RAYS, _READ_F32, _F64_1D))
         kernel(volume, *_contiguous(rays), attenuation.mu, integrals)
     else:
@@ -45,13 +45,16 @@ def forward(
 
 
 def adjoint(
-    volume: NDArray[np.float32], values: NDArray[np.float32], rays: IndexRays, attenuation: Attenuation | None = None
+    volume: NDArray[np.float32],
+    values: NDArray[np.float32],
+    rays: IndexRays | IndexFan,
+    attenuation: Attenuation | None = None,
 ) -> None:
     """Add `values` (N,), each along its ray with the weights of `forward`, to `volume` in place."""
     values = np.ascontiguousarray(values)
     if attenuation is None:
         compiled(_spread, types.void(_F32, *_RAYS, _READ_F32_1D))(volume, *_contiguous(rays), values)
-    elif attenuation.rays is rays:
+    elif attenuation.rays is None:
         kernel = compiled(_spread_attenuated, types.void(_F32, *_RAYS, _READ_F32, _READ_F32_1D))
         kernel(volume, *_contiguous(rays), attenuation.mu, values)
     else:
@@ -59,7 +62,7 @@ def adjoint(
         kernel(volume, *_contiguous(rays), attenuation.mu, *_contiguous(attenuation.rays)[:2], values)
 
 
-def derivatives(volume: NDArray[np.float32], rays: IndexRays) -> NDArray[np.float64]:
+def derivatives(volume: NDArray[np.float32], rays: IndexRays | IndexFan) -> NDArray[np.float64]:
     """What the ends of `rays` do to their integrals (N, 7), as `backends` describes it."""
     result = np.empty((len(rays), 7))
     kernel = compiled(_differentiate, types.void(_READ_F32, *_LINES, _F64_2D))
@@ -71,7 +74,8 @@ def _forward_kernel() -> Any:
     return compiled(_integrate, types.void(_READ_F32, *_RAYS, _F64_1D))
 
 
-def _contiguous(rays: IndexRays) -> tuple[NDArray[np.float64], ...]:
+def _contiguous(rays: IndexRays | IndexFan) -> tuple[NDArray[np.float64], ...]:
+    rays = rays.listed()
     return tuple(np.ascontiguousarray(a) for a in (rays.starts, rays.directions, rays.lengths))
 
 

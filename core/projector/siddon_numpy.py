@@ -13,7 +13,7 @@ from collections.abc import Iterator
 import numpy as np
 from numpy.typing import NDArray
 
-from .rays import Attenuation, IndexRays
+from .rays import Attenuation, IndexFan, IndexRays
 
 Array = NDArray[np.float64]
 
@@ -21,7 +21,7 @@ Array = NDArray[np.float64]
 _CROSSINGS = 2**18
 
 
-def forward(volume: Array, rays: IndexRays, attenuation: Attenuation | None = None) -> Array:
+def forward(volume: Array, rays: IndexRays | IndexFan, attenuation: Attenuation | None = None) -> Array:
     """Line integrals (N,), value x mm, of `volume` (n_x, n_y, n_z) along `rays`, attenuated towards their sources."""
     integrals = np.empty(len(rays))
     voxels = volume.reshape(-1)
@@ -30,15 +30,16 @@ def forward(volume: Array, rays: IndexRays, attenuation: Attenuation | None = No
     return integrals
 
 
-def adjoint(volume: Array, values: Array, rays: IndexRays, attenuation: Attenuation | None = None) -> None:
+def adjoint(volume: Array, values: Array, rays: IndexRays | IndexFan, attenuation: Attenuation | None = None) -> None:
     """Add `values` (N,), each along its ray with the weights of `forward`, to `volume` in place."""
     voxels = volume.reshape(-1)
     for part, index, weight in _segments(volume.shape, rays, attenuation):
         np.add.at(voxels, index, weight * values[part, None])
 
 
-def derivatives(volume: Array, rays: IndexRays) -> Array:
+def derivatives(volume: Array, rays: IndexRays | IndexFan) -> Array:
     """What the ends of `rays` do to their integrals (N, 7), as `backends` describes it."""
+    rays = rays.listed()
     result = np.zeros((len(rays), 7))
     voxels = volume.reshape(-1)
     axes = np.repeat([3, 0, 1, 2], [2, *(n + 1 for n in volume.shape)])  # of the crossings; 3: the ray's ends
@@ -59,22 +60,24 @@ def derivatives(volume: Array, rays: IndexRays) -> Array:
 
 
 def _segments(
-    shape: tuple[int, ...], rays: IndexRays, attenuation: Attenuation | None
+    shape: tuple[int, ...], rays: IndexRays | IndexFan, attenuation: Attenuation | None
 ) -> Iterator[tuple[slice, NDArray[np.intp], Array]]:
     """Segments of the rays, some rays at a time: which rays (a slice), flat voxel index (n, S), weight in mm (n, S).
 
     The weight is the segment's length, or, attenuated, the integral of exp(-integral of mu from the source) over it.
     A segment outside the volume has weight 0 and index 0.
     """
+    rays = mu_rays = rays.listed()
     lattices = [(shape, rays)]
-    if attenuation is not None and attenuation.rays is not rays:
-        lattices.append((attenuation.mu.shape, attenuation.rays))
+    if attenuation is not None and attenuation.rays is not None:
+        mu_rays = attenuation.rays.listed()
+        lattices.append((attenuation.mu.shape, mu_rays))
     for part, alpha, middle, _ in _cut(lattices):
         segment = np.diff(alpha, axis=1) * rays.lengths[part, None]
         index, inside = _voxels(shape, rays[part], middle)
         weight = np.where(inside, segment, 0.0)
         if attenuation is not None:
-            mu_index, inside = _voxels(attenuation.mu.shape, attenuation.rays[part], middle)
+            mu_index, inside = _voxels(attenuation.mu.shape, mu_rays[part], middle)
             depth = np.where(inside, attenuation.mu.reshape(-1)[mu_index], 0.0) * segment
             weight *= np.exp(depth - np.cumsum(depth, axis=1)) * _mean_transmission(depth)
         yield part, index, weight

@@ -12,21 +12,21 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from .rays import Attenuation, IndexRays
+from .rays import Attenuation, IndexFan, IndexRays
 
 # Crossings held at once, per kind of device: some ten arrays of this many float64 exist at the same time.
 _CROSSINGS_CPU = 2**19
 _CROSSINGS_GPU = 2**24
 
 
-def forward(volume: Tensor, rays: IndexRays, attenuation: Attenuation | None = None) -> Tensor:
+def forward(volume: Tensor, rays: IndexRays | IndexFan, attenuation: Attenuation | None = None) -> Tensor:
     """Line integrals (N,), value x mm, of `volume` (n_x, n_y, n_z) along `rays`, attenuated towards their sources."""
     voxels = volume.reshape(-1)
     integrals = [(voxels[index] * weight).sum(dim=1) for _, index, weight in _segments(volume, rays, attenuation)]
     return torch.cat(integrals) if integrals else volume.new_zeros(0)
 
 
-def adjoint(volume: Tensor, values: Tensor, rays: IndexRays, attenuation: Attenuation | None = None) -> None:
+def adjoint(volume: Tensor, values: Tensor, rays: IndexRays | IndexFan, attenuation: Attenuation | None = None) -> None:
     """Add `values` (N,), each along its ray with the weights of `forward`, to `volume` in place."""
     voxels = volume.reshape(-1)
     for part, index, weight in _segments(volume, rays, attenuation):
@@ -34,7 +34,7 @@ def adjoint(volume: Tensor, values: Tensor, rays: IndexRays, attenuation: Attenu
         voxels.index_add_(0, index.reshape(-1), spread.reshape(-1).to(volume.dtype))
 
 
-def derivatives(volume: Tensor, rays: IndexRays) -> Tensor:
+def derivatives(volume: Tensor, rays: IndexRays | IndexFan) -> Tensor:
     """What the ends of `rays` do to their integrals (N, 7), as `backends` describes it."""
     pieces = []
     voxels, shape = volume.reshape(-1), volume.shape
@@ -57,7 +57,7 @@ def derivatives(volume: Tensor, rays: IndexRays) -> Tensor:
 
 
 def _segments(
-    volume: Tensor, rays: IndexRays, attenuation: Attenuation | None
+    volume: Tensor, rays: IndexRays | IndexFan, attenuation: Attenuation | None
 ) -> Iterator[tuple[slice, Tensor, Tensor]]:
     """Segments of the rays, some rays at a time: which rays (a slice), flat voxel index (n, S), weight in mm (n, S).
 
@@ -69,7 +69,7 @@ def _segments(
     lattices = [(volume.shape, line)]
     if attenuation is not None:
         mu_shape = attenuation.mu.shape
-        mu_line = line if attenuation.rays is rays else _on_device(attenuation.rays, device)
+        mu_line = line if attenuation.rays is None else _on_device(attenuation.rays, device)
         if mu_line is not line:
             lattices.append((mu_shape, mu_line))
     for part, alpha, middle, _ in _cut(lattices):
@@ -95,8 +95,9 @@ class _Line:
         return _Line(self.starts[which], self.directions[which], self.lengths[which])
 
 
-def _on_device(rays: IndexRays, device: torch.device) -> _Line:
+def _on_device(rays: IndexRays | IndexFan, device: torch.device) -> _Line:
     real = torch.float32 if device.type == "mps" else torch.float64  # Apple's GPUs have no float64
+    rays = rays.listed()
     return _Line(*(torch.as_tensor(a, dtype=real).to(device) for a in (rays.starts, rays.directions, rays.lengths)))
 
 

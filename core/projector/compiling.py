@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import functools
+import hashlib
 import os
 import sys
 import threading
@@ -11,19 +13,21 @@ from typing import Any
 
 from numba import config, njit
 
-_kernels: dict[Callable[..., Any], Any] = {}
+SOURCES = ("siddon_numba.py", "lanes.py")
+
+_kernels: dict[tuple[Callable[..., Any], Any], Any] = {}
 _lock = threading.Lock()
 
 
 def compiled(function: Callable[..., Any], signature: Any) -> Any:
     """`function` compiled for `signature`, without the GIL, once: from the cache on disk where that is possible.
 
-    Everything a kernel calls must be in its own file: numba knows that a cached kernel is stale from that
-    file alone. A folder that cannot be written, a full disk or a damaged cache cost the time of compiling,
+    A folder that cannot be written, a full disk or a damaged cache cost the time of compiling,
     nothing else.
     """
     with _lock:
-        if function not in _kernels:
+        key = function, signature
+        if key not in _kernels:
             kernel = njit(nogil=True)(function)
             try:
                 _enable_caching(kernel)
@@ -33,19 +37,26 @@ def compiled(function: Callable[..., Any], signature: Any) -> Any:
                     kernel = njit(nogil=True)(function)
                     kernel.compile(signature)
             kernel.disable_compile()  # one signature: never compile for writable arrays where read-only ones do
-            _kernels[function] = kernel
-        return _kernels[function]
+            _kernels[key] = kernel
+        return _kernels[key]
 
 
 def _enable_caching(kernel: Any) -> None:
     """Cache `kernel` in NUMBA_CACHE_DIR if the user has set it, else in `cache_folder`."""
     users = config.CACHE_DIR
     # numba looks at this setting once, when caching is enabled; other users of numba keep theirs.
-    config.CACHE_DIR = users or str(cache_folder())
+    config.CACHE_DIR = str(Path(users or cache_folder()) / _fingerprint())
     try:
         kernel.enable_caching()
     finally:
         config.CACHE_DIR = users
+
+
+@functools.cache
+def _fingerprint() -> str:
+    """Of all that kernels are made of: numba looks only at a kernel's own file to know that what it kept is stale."""
+    sources = sorted(Path(__file__).with_name(name).read_bytes() for name in SOURCES)
+    return hashlib.sha256(b"".join(sources)).hexdigest()[:12]
 
 
 def cache_folder() -> Path:

@@ -13,7 +13,7 @@ from ..grid import Grid
 # Rounding moves a coordinate by some 1e-12 voxels (a rotated grid, a source thousands of voxels away). A ray
 # this close to a plane of voxel faces along its whole way lies in the plane; one this steady along an axis is
 # parallel to its planes.
-_SNAP = 1e-9
+SNAP = 1e-9
 
 
 @dataclass(frozen=True, eq=False)
@@ -207,10 +207,10 @@ def _index_from_world(grid: Grid, origin: tuple[int, int, int]) -> NDArray[np.fl
 
 def _snapped(starts: NDArray[np.float64], ends: NDArray[np.float64], lengths: NDArray[np.float64]) -> IndexRays:
     planes = np.rint(starts)
-    in_plane = (np.abs(starts - planes) <= _SNAP) & (np.abs(ends - planes) <= _SNAP)
+    in_plane = (np.abs(starts - planes) <= SNAP) & (np.abs(ends - planes) <= SNAP)
     starts = np.where(in_plane, planes, starts)
     directions = ends - starts
-    # What is left of nearly 0 crosses no plane (both ends would be within _SNAP of it), so 0 is as good:
+    # What is left of nearly 0 crosses no plane (both ends would be within SNAP of it), so 0 is as good:
     # backends may divide by what is not 0 without overflow.
-    directions[in_plane | (np.abs(directions) <= _SNAP)] = 0.0
+    directions[in_plane | (np.abs(directions) <= SNAP)] = 0.0
     return IndexRays(starts, directions, lengths)

@@ -49,6 +49,12 @@ class Isotope:
     half_life: float
     lines: tuple[tuple[float, float], ...]
 
+    @property
+    def window(self) -> tuple[float, float]:
+        """The usual energy window, keV: 10 % to either side of the strongest line."""
+        energy, _ = max(self.lines, key=lambda line: line[1])
+        return 0.9 * energy, 1.1 * energy
+
     def photons_per_decay(self, low: float, high: float) -> float:
         """Photons per decay in the energy window from `low` to `high`, keV."""
         return sum(photons for energy, photons in self.lines if low <= energy <= high)

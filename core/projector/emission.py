@@ -70,9 +70,9 @@ class Emission(Model):
         Points of the hole's disk from which rays start, each counting the same: the blur of a hole of diameter d_e.
         With 1 all rays pass the middle, and the hole blurs nothing; else at least 3.
     aperture_tolerance : float, optional
-        Instead of `aperture_points`: as few points as keep the image of one of the grid's voxels, at the isocentre and
-        turned like the pixels, near to that of the whole hole: the absolute differences of its pixels sum to at most
-        this share of its counts. Errors add up at most, so this holds for any activity around the isocentre.
+        Instead of `aperture_points`: as few points as keep the image of one of the grid's voxels, at the isocentre, near
+        to that of the whole hole: the absolute differences of the pixels, each counting over its whole area, sum to at
+        most this share of the counts. Errors at most add up, so it holds for any activity around the isocentre.
     aperture_mu : float, optional
         Attenuation coefficient of the aperture's material, 1/mm (`core.isotopes.TUNGSTEN_MU`). None: nothing
         penetrates it, d_e = d.

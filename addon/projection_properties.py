@@ -10,6 +10,7 @@ from bpy.props import BoolProperty, EnumProperty, FloatProperty, IntProperty, Po
 
 from ..core.isotopes import CZT_MU, ISOTOPES, NAI_MU, TUNGSTEN_MU
 from ..core.system import PinholeSystem
+from ..core.volume import Volume
 from . import ids, volumes
 from .phantom_properties import typed
 
@@ -128,17 +129,18 @@ _EMISSION = (
 _OPTIONAL = ("isotope", "aperture_mu", "crystal_mu")
 
 
-def chosen_model(settings: dict[str, Any], system: PinholeSystem) -> Model:
-    """The model that `settings` (`ProjectionSettings`, by name) ask for, yet without a volume of mu."""
+def chosen_model(settings: dict[str, Any], system: PinholeSystem, mu: Volume | None = None) -> Model:
+    """The model that `settings` (`ProjectionSettings`, by name) ask for; leaves bpy alone."""
     from ..core.projector import Emission, InverseSquareSum, Transmission
 
     if settings["model"] == "TRANSMISSION":
         return Transmission()
     if settings["model"] == "INVERSE_SQUARE":
         return InverseSquareSum(system)
-    given = {name: typed(value) if isinstance(value := settings[name], float) else value for name in _EMISSION}
+    given: dict[str, Any] = {name: settings[name] for name in _EMISSION}
+    given |= {name: typed(value) for name, value in given.items() if isinstance(value, float)}
     given |= {name: None for name in _OPTIONAL if given[name] in (0, "NONE")}
-    return Emission(system, **(given | {"edge": given["edge"].lower()}))
+    return Emission(system, mu, **(given | {"edge": given["edge"].lower()}))
 
 
 def _is_ours(self: ProjectionProperties, item: bpy.types.Object) -> bool:
@@ -157,7 +159,7 @@ class ProjectionProperties(ProjectionSettings, bpy.types.PropertyGroup):
         poll=_is_ours,
     )  # fmt: skip
     mu: PointerProperty(
-        name="Attenuation", description="Volume of attenuation coefficients (1/mm) between activity and pinhole; empty: none",
+        name="Attenuation", description="Volume of attenuation coefficients (1/mm) before the pinhole; empty: none",
         type=bpy.types.Object, poll=_is_mu,
     )  # fmt: skip
     run_file: StringProperty(

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import time
 from collections.abc import Generator
 from typing import Any
@@ -42,7 +41,7 @@ class MPHDRR_OT_render_projections(ProjectionSettings, jobs.JobOperator, bpy.typ
         chosen = {name: self._setting(scene, name) for name in ProjectionSettings.__annotations__}
         system = _range(scanner.read_scanner(collection), chosen["first"], chosen["last"])
         shape = (chosen["height"], chosen["width"])
-        model = chosen_model(chosen, system)
+        chosen_model(chosen, system)  # what cannot be is said before the work begins
         counts = chosen["model"] == "EMISSION"
         photons = typed(chosen["photons"]) if chosen["model"] == "TRANSMISSION" and chosen["photons"] else None
         noise_seed = chosen["seed"] if chosen["noise"] and (counts or photons) else None
@@ -67,7 +66,7 @@ class MPHDRR_OT_render_projections(ProjectionSettings, jobs.JobOperator, bpy.typ
             run = project_run(
                 system,
                 read_volume(),
-                model=model if read_mu is None else dataclasses.replace(model, mu=read_mu()),
+                model=chosen_model(chosen, system, None if read_mu is None else read_mu()),
                 shape=shape,
                 detector=chosen["detector"].lower(),
                 magnification=typed(chosen["magnification"]),

@@ -41,7 +41,9 @@ def add_parser(subparsers) -> None:  # type: ignore[no-untyped-def]
     models = parser.add_argument_group("what pixels hold; without an option, line integrals")
     one = models.add_mutually_exclusive_group()
     one.add_argument("--emission", action="store_true", help="SPECT counts of a volume of activity")
-    one.add_argument("--photons", type=float, metavar="N", help="of N X-ray photons per pixel, those that pass: mu in 1/mm")
+    one.add_argument(
+        "--photons", type=float, metavar="N", help="of N X-ray photons per pixel, those that pass: mu in 1/mm"
+    )
     one.add_argument(
         "--inverse-square", action="store_true",
         help="line integrals with each segment times a point source's sensitivity, as 1/h^2: no counts, for comparison",
@@ -69,7 +71,9 @@ def add_emission_options(parser: argparse.ArgumentParser) -> None:
     )  # fmt: skip
     option(source, "--mu", metavar="FILE", help="attenuation coefficients, 1/mm, on any grid; without it, none")
     aperture = parser.add_argument_group("--emission: the pinhole")
-    option(aperture, "--aperture-points", type=int, metavar="N", help="rays through the hole of each pixel (default: 1)")
+    option(
+        aperture, "--aperture-points", type=int, metavar="N", help="rays through the hole of each pixel (default: 1)"
+    )
     option(
         aperture, "--aperture-tolerance", type=float, metavar="SHARE",
         help="as many as bring a voxel's image this close, such as 0.1, to that of the whole hole",
@@ -91,7 +95,9 @@ def add_emission_options(parser: argparse.ArgumentParser) -> None:
         crystal, "--crystal-mu", type=float, metavar="MU",
         help=f"of the crystal, 1/mm: {NAI_MU} for NaI, {CZT_MU} for CZT at 140.5 keV; without it, all photons count",
     )  # fmt: skip
-    option(crystal, "--depth-layers", type=int, metavar="N", help="depths of interaction, for the parallax (default: 1)")
+    option(
+        crystal, "--depth-layers", type=int, metavar="N", help="depths of interaction, for the parallax (default: 1)"
+    )
     option(crystal, "--intrinsic-fwhm", type=float, metavar="MM", help="blur of the detector, mm (default: 0)")
 
 

@@ -25,8 +25,9 @@ _MOST_POINTS = 1000
 # The lattice, points across, that stands for the disk itself where numbers of points are compared.
 _LATTICE = 160
 
-# Gauss-Laguerre radii beyond the rim: exact on the axis already, where transmission falls exponentially.
-_EDGE_RINGS = 2
+# Gauss-Laguerre nodes and weights beyond the rim: exact on the axis, where transmission falls exponentially.
+_ROOT = math.sqrt(2)
+_EDGE_RINGS = ((2 - _ROOT, (2 + _ROOT) / 4), (2 + _ROOT, (2 - _ROOT) / 4))
 _FEWEST_EDGE_ANGLES = 7
 
 
@@ -141,7 +142,8 @@ class KnifeEdge:
     def points(self, n: int) -> list[tuple[float, float, float]]:
         """Points beyond the rim, (x, y) mm, and the area, mm^2, for which each stands.
 
-        They stand about as close as `n` points in the hole. The sum of area times transmission is exact along the axis.
+        They stand about as close as `n` points in the hole. The sum of area times transmission is exact along the axis;
+        aslant it is about 0.1 % of the hole's area off at 0.7 of the cone's slope, and 1 % shortly before it.
 
         Parameters
         ----------
@@ -149,14 +151,13 @@ class KnifeEdge:
             Points in the hole.
         """
         depth = self.tangent / (2 * self.mu)  # from the rim to where exp(-1) of the rays along the axis pass
-        nodes, weights = np.polynomial.laguerre.laggauss(_EDGE_RINGS)
         # An odd number: opposite places let the same share pass, and no two of these are opposite.
         angles = max(_FEWEST_EDGE_ANGLES, math.ceil(2 * math.sqrt(math.pi * n)) | 1)
         points: list[tuple[float, float, float]] = []
-        for ring, (node, weight) in enumerate(zip(nodes, weights, strict=True)):
+        for ring, (node, weight) in enumerate(_EDGE_RINGS):
             radius = self.radius + depth * node
             area = 2 * math.pi * radius / angles * depth * weight * math.exp(node)
-            turned = 2 * math.pi * (np.arange(angles) + ring / _EDGE_RINGS) / angles
+            turned = 2 * math.pi * (np.arange(angles) + ring / len(_EDGE_RINGS)) / angles
             points += [(radius * math.cos(angle), radius * math.sin(angle), area) for angle in turned]
         return points
 

@@ -130,5 +130,7 @@ def view_rays(views: Views, m: int) -> Fan:
 def require_model(value: object) -> Model:
     """`value` if it is a model."""
     if not isinstance(value, Model):
-        raise InputError(f"projector: expected model to be Transmission, Emission or another model, got {type(value).__name__}")
+        raise InputError(
+            f"projector: expected model to be Transmission, Emission or another model, got {type(value).__name__}"
+        )
     return value

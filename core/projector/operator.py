@@ -322,7 +322,7 @@ class AdjointProjector(LinearOperator):
         affordable = max(1, (available() - extra_bytes) // (2 * volume_bytes))
         workers = min(A._workers(name), _MOST_VOLUMES, affordable)
         volumes = [zeros(self.shape_out, images) for _ in range(workers)]
-        total = zeros(self.shape_out, images) if A.model.weights_voxels else None
+        total: ArrayOrTensor = zeros(self.shape_out, images) if A.model.weights_voxels else None
         n_views = len(A.views)
         _report(progress, 0, n_views)
         with _parallel(workers) as parallel_map:

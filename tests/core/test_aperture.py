@@ -80,7 +80,6 @@ def test_point_source_on_the_axis_counts_what_the_edge_lets_pass(n):
     image, _ = spot_image(model, (0, 0, 0))
     h = 200.0
     r = (np.arange(400_000) + 0.5) * 1e-5  # to 4 mm
-    edge = KnifeEdge(1.0, mu, 1.0)
     passed = np.where(r < 1, 1.0, KnifeEdge(1.0, mu, 1.0).transmission(r, 0.0, r / h, 0 * r))
     solid = np.sum(passed * h / (h**2 + r**2) ** 1.5 * r) * 1e-5 / 2
     assert image.sum() == pytest.approx(solid * 1.2**3, rel=5e-3)

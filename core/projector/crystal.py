@@ -55,7 +55,8 @@ def absorbed_share(
 
 def share_inside(middle: ArrayOrTensor, size: float, side: float) -> ArrayOrTensor:
     """Shares of intervals of length `size` around `middle` that lie within `side` / 2 of 0, all mm."""
-    return ((side + size) / 2 - abs(middle)).clip(0, min(size, side)) / size
+    first, last = (middle - size / 2).clip(min=-side / 2), (middle + size / 2).clip(max=side / 2)
+    return (last - first).clip(min=0) / size
 
 
 def gaussian_blur(n: int, sigma: float) -> NDArray[np.float64]:

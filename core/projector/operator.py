@@ -385,7 +385,7 @@ def _parallel(workers: int) -> Iterator[ParallelMap]:
 def _require_rays(views: Views) -> None:
     n_v, n_u = views.shape
     # An image of float32, and some arrays of float64 from which the weights of its rays are made.
-    require(84 * n_v * n_u, f"an image of {n_v} x {n_u} pixels, with its rays,")
+    require(110 * n_v * n_u, f"an image of {n_v} x {n_u} pixels, with its rays,")
 
 
 def _thread_count(threads: int | None) -> int:

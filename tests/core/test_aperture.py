@@ -15,6 +15,10 @@ from .conftest import general_grid
 from .test_emission import BACKENDS, assert_adjoint, one_module, spot_image, turned_grid
 
 KNIFE = KnifeEdge(radius=1.1, mu=3.0, tangent=0.8)
+OPTIONS = {
+    "aperture_points": 3, "aperture_mu": 2.0, "edge": "path", "crystal_mu": 0.1, "depth_layers": 3,
+    "within_cone": True, "within_walls": True, "within_crystal": True,
+}  # fmt: skip
 
 
 def ellipse_area(length, slope):
@@ -175,10 +179,7 @@ def test_adjoint_of_every_option(backend, options, system, rng):
 def test_real_and_virtual_detector_agree_on_every_option(system, rng):
     grid = general_grid(rng, (9, 8, 7))
     x = rng.random(grid.shape)
-    model = mph.Emission(
-        system, aperture_points=3, aperture_mu=2.0, edge="path", crystal_mu=0.1, depth_layers=3, within_walls=True,
-        within_cone=True,
-    )  # fmt: skip
+    model = mph.Emission(system, **OPTIONS)
     real = mph.Projector(grid, system.views((9, 10), "real", pitch=4.0), model)(x)
     virtual = mph.Projector(grid, system.views((9, 10), "virtual", 3.0, pitch=12.0), model)(x)
     np.testing.assert_allclose(virtual[:, ::-1, ::-1], real, rtol=1e-5, atol=1e-5 * real.max())
@@ -199,3 +200,39 @@ def test_bad_apertures_are_refused(system):
     A = mph.Projector(grid, system.views((900, 900)), mph.Emission(system, aperture_tolerance=1e-3))
     with pytest.raises(InputError, match="more than 1000 points"):
         A(np.ones((4, 4, 4)))
+
+
+def test_weights_of_tensors_are_those_of_arrays_and_differentiable():
+    """By the pixels' places and the collimator's length, so that poses of cameras that count can be optimised."""
+    torch = pytest.importorskip("torch", reason="torch is not installed")
+    model = mph.Emission(one_module(), **OPTIONS)
+    u, v = np.linspace(-24, 23, 6)[None], np.linspace(-22, 21, 5)[:, None]
+    for opening in model.openings(0, 3)[::4]:
+        for layer in range(3):
+            expected = model.pixel_weights(0, u, v, (0.5, 0.4), 60.0, opening, layer)
+            given = [torch.tensor(x, dtype=torch.float64, requires_grad=True) for x in (u, v, 60.0)]
+
+            def weights(u, v, length, opening=opening, layer=layer):
+                return model.pixel_weights(0, u, v, (0.5, 0.4), length, opening, layer)
+
+            np.testing.assert_allclose(weights(*given).detach().numpy(), expected, rtol=1e-12)
+            assert torch.autograd.gradcheck(lambda *x: 1e6 * weights(*x), given)
+
+
+def test_memory_is_asked_for_mu_and_for_weights(system, monkeypatch):
+    """Before it is taken: with a large mu, or voxel weights, less of the volume itself fits."""
+    grid, views = mph.Grid.centered((40, 40, 40), 2.0), system.views((4, 4))
+    large = mph.Volume(np.zeros((80, 80, 80), np.float32), mph.Grid.centered(80, 2.0), "mu")
+    monkeypatch.setattr("mphdrr.core.memory.available", lambda: 600_000)
+    for model, fits in (
+        (mph.Emission(system), True),
+        (mph.Emission(system, large), False),
+        (mph.InverseSquareSum(system), False),
+    ):
+        A = mph.Projector(grid, views, model, "numpy")
+        for run, x in ((A, np.zeros(grid.shape)), (A.T, np.zeros(A.shape_out))):
+            if fits:
+                run(x)
+            else:
+                with pytest.raises(InputError, match="of memory"):
+                    run(x)

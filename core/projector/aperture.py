@@ -206,5 +206,6 @@ def openings(n: int, diameter: float, knife: KnifeEdge | None = None) -> list[Op
 
 
 def within_cone(slope_u: ArrayOrTensor, slope_v: ArrayOrTensor, tangent: float) -> ArrayOrTensor:
-    """Whether lines are less steep than a cone, tan(psi) < tangent."""
-    return slope_u**2 + slope_v**2 < tangent**2
+    """1 where lines are less steep than a cone, tan(psi) < tangent, else 0."""
+    slope = slope_u**2 + slope_v**2
+    return namespace(slope).ones_like(slope) * (slope < tangent**2)

@@ -180,7 +180,7 @@ class Projector(LinearOperator):
         n_views, n_v, n_u = self.shape_out
         wide = 8 if self._float64 else 4
         what = f"projecting {_times(self.shape_in)} voxels into {n_views} images of {n_v} x {n_u} pixels"
-        require(wide * (n_views * n_v * n_u + self.grid.n_voxels), what)
+        require(wide * (n_views * n_v * n_u + self.grid.n_voxels) + self._extra_bytes(wide), what)
         images = None
         _report(progress, 0, n_views)
         for m, image in enumerate(self._images(x)):
@@ -201,13 +201,14 @@ class Projector(LinearOperator):
         with _parallel(self._workers(name)) as parallel_map:
             for m in range(len(self.views)):
                 image = zeros(self.views.shape, box)
+                seen = self._weighted(box, m, trace.origin)
                 for beam, by_columns in self._beams(m):
                     lines = image.T if by_columns else image
                     weights = None if beam.weights is None else alike(beam.weights, box)
 
                     def project(block: slice) -> None:
                         rays, attenuation = trace(beam.rays[block])  # noqa: B023
-                        integrals = integrate(box, rays, attenuation).reshape(lines[block].shape)  # noqa: B023
+                        integrals = integrate(seen, rays, attenuation).reshape(lines[block].shape)  # noqa: B023
                         lines[block] += integrals if weights is None else weights[block] * integrals  # noqa: B023
 
                     for _ in parallel_map(project, _blocks(lines.shape[0], lines.shape[1], name)):
@@ -217,6 +218,18 @@ class Projector(LinearOperator):
                     along_v, along_u = (alike(matrix, image) for matrix in response)
                     image = along_v @ image @ along_u.T
                 yield image if self._float64 or is_tensor(image) else image.astype(np.float32, copy=False)
+
+    def _weighted(self, box: ArrayOrTensor, m: int, origin: tuple[int, int, int] = (0, 0, 0)) -> ArrayOrTensor:
+        """A part of a volume, from voxel `origin` on, times view m's voxel weights."""
+        if not self.model.weights_voxels:
+            return box
+        part = tuple(slice(first, first + n) for first, n in zip(origin, box.shape, strict=True))
+        return box * alike(self.model.voxel_weights(self.views, m, self.grid)[part], box)
+
+    def _extra_bytes(self, wide: int) -> int:
+        """Bytes of a copy of mu, and of voxel weights with what they weight."""
+        mu = 0 if self.model.mu is None else self.model.mu.grid.n_voxels
+        return wide * mu + (2 * wide + 8) * self.grid.n_voxels * self.model.weights_voxels
 
     def _beams(self, m: int) -> Iterator[tuple[Beam, bool]]:
         """View m's rays, and whether their lines are the image's columns, not its rows.
@@ -302,12 +315,14 @@ class AdjointProjector(LinearOperator):
         images = A._native(x, name)
         _, trace = A._lattices(images)
         volume_bytes = (8 if name == "numpy" else 4) * A.grid.n_voxels
-        require(volume_bytes, f"the adjoint into {_times(self.shape_out)} voxels")
+        extra_bytes = A._extra_bytes(8 if name == "numpy" else 4)
+        require(volume_bytes + extra_bytes, f"the adjoint into {_times(self.shape_out)} voxels")
         _require_rays(A.views)
         # One volume per thread: fewer threads rather than no room for anything else.
-        affordable = max(1, available() // (2 * volume_bytes))
+        affordable = max(1, (available() - extra_bytes) // (2 * volume_bytes))
         workers = min(A._workers(name), _MOST_VOLUMES, affordable)
         volumes = [zeros(self.shape_out, images) for _ in range(workers)]
+        total: ArrayOrTensor = zeros(self.shape_out, images) if A.model.weights_voxels else None
         n_views = len(A.views)
         _report(progress, 0, n_views)
         with _parallel(workers) as parallel_map:
@@ -330,13 +345,24 @@ class AdjointProjector(LinearOperator):
 
                     for _ in parallel_map(add, range(workers)):
                         pass
+                if A.model.weights_voxels:  # otherwise in every view: each joins the others weighted
+                    total += A._weighted(_sum(volumes), m)
+                    for volume in volumes:
+                        volume[:] = 0
                 _report(progress, m + 1, n_views)
-        total = volumes[0]
-        for volume in volumes[1:]:
-            total += volume
+        if not A.model.weights_voxels:
+            total = _sum(volumes)
         if not (A._float64 or is_tensor(total)):
             total = total.astype(np.float32, copy=False)
         return like(total, x)
+
+
+def _sum(volumes: list[ArrayOrTensor]) -> ArrayOrTensor:
+    """Their sum, in the first of them."""
+    total = volumes[0]
+    for volume in volumes[1:]:
+        total += volume
+    return total
 
 
 def _blocks(n_lines: int, line_length: int, backend: str) -> list[slice]:
@@ -358,8 +384,8 @@ def _parallel(workers: int) -> Iterator[ParallelMap]:
 
 def _require_rays(views: Views) -> None:
     n_v, n_u = views.shape
-    # An image of float32, and a few arrays of float64 that weight its rays.
-    require(28 * n_v * n_u, f"an image of {n_v} x {n_u} pixels, with its rays,")
+    # An image of float32, and some arrays of float64 from which the weights of its rays are made.
+    require(110 * n_v * n_u, f"an image of {n_v} x {n_u} pixels, with its rays,")
 
 
 def _thread_count(threads: int | None) -> int:

@@ -18,6 +18,7 @@ import numpy as np
 from numba import njit, types
 from numpy.typing import NDArray
 
+from ..errors import InputError
 from .compiling import compiled
 from .lanes import (
     WIDTH,
@@ -54,8 +55,16 @@ Array = NDArray[Any]  # of float32 or float64; what the rays have, of float64
 # same time, row after row, which is what a processor's memory is fast at; more steps cost that, fewer the changing of tiles.
 _TURN = 8
 
-_READ_LINES = types.Array(types.float64, 2, "C", readonly=True)
 _NUMBERS = types.Array(types.float64, 2, "C")
+_LINES = types.Array(types.float64, 2, "C", readonly=True)
+_SINGLE, _DOUBLE = (
+    types.void(read, _LINES, read, _LINES, _NUMBERS, written)
+    for read, written in (
+        (types.Array(number, 3, "C", readonly=True), types.Array(number, 3, "C"))
+        for number in (types.float32, types.float64)
+    )
+)
+_MOST_VOXELS = 2**31 - 1
 _NEVER = 1e30  # alpha of a plane that is not there
 
 
@@ -115,11 +124,13 @@ def _run(
         mu, kernel = attenuation.mu, kernels[1]
         if attenuation.rays is not None:
             mu_lines, kernel = _listed(attenuation.rays), kernels[2]
-    number = types.float64 if volume.dtype == np.float64 else types.float32
-    read = types.Array(number, 3, "C", readonly=True)
-    signature = types.void(read, _READ_LINES, read, _READ_LINES, _NUMBERS, types.Array(number, 3, "C"))
+    if max(volume.size, mu.size) > _MOST_VOXELS:
+        raise InputError(
+            f"numba: a volume of {max(volume.size, mu.size)} voxels, but its indices end at {_MOST_VOXELS}"
+        )
     if written is None:
         written = np.empty((0, 0, 0), volume.dtype)
+    signature = _DOUBLE if volume.dtype == np.float64 else _SINGLE
     compiled(kernel, signature)(volume, lines, mu, mu_lines, numbers, written)
 
 

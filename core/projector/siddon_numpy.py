@@ -65,7 +65,8 @@ def derivatives(volume: Array, rays: IndexRays | IndexFan, attenuation: Attenuat
     """
     lattices = _lattices(volume.shape, rays, attenuation)
     (_, rays), (mu_shape, mu_rays) = lattices[0], lattices[-1]
-    axes = np.concatenate([[-1, -1], *(np.repeat([0, 1, 2], np.add(shape, 1)) + 3 * i for i, (shape, _) in enumerate(lattices))])
+    counts = [2, *(n + 1 for shape, _ in lattices for n in shape)]
+    axes = np.repeat(np.arange(-1, 3 * len(lattices)), counts)  # of the crossings
     mu_axes = 3 * (len(lattices) - 1)  # the first of mu's
     result = np.zeros((len(rays), 7 if attenuation is None else 14))
     for part, alpha in _crossings(lattices):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import math
 import os
 from abc import ABC, abstractmethod
@@ -19,7 +20,7 @@ from ..progress import Progress
 from ..views import Views
 from ..volume import Volume
 from . import backends
-from .arrays import ArrayOrTensor, alike, checked, cropped, is_tensor, like, to_numpy, to_tensor, zeros
+from .arrays import ArrayOrTensor, alike, checked, cropped, is_tensor, like, to_numpy, to_tensor, together, zeros
 from .models import Beam, Model, Transmission, require_model
 from .rays import RayMapper
 
@@ -140,7 +141,43 @@ class Projector(LinearOperator):
         self.backend = backends.choose(backend)
         self.threads = _thread_count(threads)
         self._auto = backend == "auto"
+        self._mu: ArrayOrTensor = None if self.model.mu is None else self.model.mu.array
         self._adjoint = AdjointProjector(self)
+
+    def __call__(
+        self, x: Volume | ArrayOrTensor, progress: Progress | None = None, mu: ArrayOrTensor | None = None
+    ) -> ArrayOrTensor:
+        """The images of a volume.
+
+        Parameters
+        ----------
+        x, progress
+            As of `LinearOperator`; `x` may also be a `Volume`.
+        mu
+            Attenuation coefficients, 1/mm, in place of the model's: an array or tensor on the grid of its `mu`.
+
+        Returns
+        -------
+        array or tensor
+            As of `LinearOperator`, and a tensor also if `mu` is one: part of torch's graph if `x` or `mu` requires a
+            gradient, for every backend. Where `mu` requires one, gradients of gradients are refused.
+
+        Raises
+        ------
+        InputError
+            As of `LinearOperator`; and the model has no mu, or `mu` has another shape, or is negative.
+        """
+        if mu is None:
+            return super().__call__(x, progress)
+        x, mu = together(self._check(x), self._check_mu(mu))
+        attenuated = copy.copy(self)
+        attenuated._mu = mu
+        attenuated._adjoint = AdjointProjector(attenuated)
+        if is_tensor(x):
+            from .autograd import apply_attenuated
+
+            return apply_attenuated(attenuated, x, mu, progress)
+        return attenuated._run(x, progress)
 
     @property
     def shape_in(self) -> tuple[int, int, int]:
@@ -175,6 +212,11 @@ class Projector(LinearOperator):
             self.model.check_volume(x)
             return x.array
         return checked(x, "volume", self.shape_in, self._float64)
+
+    def _check_mu(self, mu: ArrayOrTensor) -> ArrayOrTensor:
+        if self.model.mu is None:
+            raise InputError("mu: the projector's model has none; give it one to say on which grid mu is")
+        return checked_mu(mu, self.model.mu.grid, self._float64)
 
     def _run(self, x: ArrayOrTensor, progress: Progress | None = None) -> ArrayOrTensor:
         n_views, n_v, n_u = self.shape_out
@@ -229,29 +271,13 @@ class Projector(LinearOperator):
         for beam in self.model.beams(self.views, m, self.grid):
             yield (beam.transposed() if by_columns else beam), by_columns
 
-    def _lattices(self, native: ArrayOrTensor, volume: ArrayOrTensor = None) -> tuple[ArrayOrTensor, RayMapper]:
-        """The part of `volume` that is not empty, and what brings rays into the index spaces of that and of mu.
-
-        Empty margins cost time: most objects fill a small part of their grid. With None (a volume yet to be filled)
-        the rays are for the whole grid. What attenuates is kept wherever it is, outside the volume's filled part too.
-
-        `native` is an array of the kind with which the backend computes.
-        """
-        box, origin = volume, (0, 0, 0)
-        if volume is not None:
-            (box,), origin = cropped(volume)
+    def _lattices(
+        self, native: ArrayOrTensor, volume: ArrayOrTensor = None, whole_mu: bool = False
+    ) -> tuple[ArrayOrTensor, RayMapper]:
+        """`lattices` of this projector; `native` is an array of the kind with which the backend computes."""
         if self.model.mu is None:
-            return box, RayMapper(self.grid, origin)
-        mu, mu_grid = alike(self.model.mu.array, native), self.model.mu.grid
-        if _same(mu_grid, self.grid):
-            if volume is None:
-                return None, RayMapper(self.grid, mu=mu)
-            (common, mu_common), common_origin = cropped(volume, mu)
-            # One lattice is walked twice as fast as two, but two boxes let rays that miss the volume's go at once.
-            if math.prod(common.shape) <= 2 * math.prod(box.shape):
-                return common, RayMapper(self.grid, common_origin, mu_common)
-        (mu,), mu_origin = cropped(mu)
-        return box, RayMapper(self.grid, origin, mu, mu_grid, mu_origin)
+            return lattices(self.grid, volume)
+        return lattices(self.grid, volume, alike(self._mu, native), self.model.mu.grid, whole_mu)
 
     def _native(self, x: ArrayOrTensor, name: str) -> ArrayOrTensor:
         """`x` as the backend `name` computes with it."""
@@ -298,16 +324,42 @@ class AdjointProjector(LinearOperator):
     def _run(self, x: ArrayOrTensor, progress: Progress | None = None) -> ArrayOrTensor:
         A = self._projector
         name = A._backend_for(x)
-        spread = backends.load(name).adjoint
         images = A._native(x, name)
         _, trace = A._lattices(images)
-        volume_bytes = (8 if name == "numpy" else 4) * A.grid.n_voxels
-        require(volume_bytes, f"the adjoint into {_times(self.shape_out)} voxels")
+        return like(self._spread(images, name, backends.load(name).adjoint, trace, A.grid, progress), x)
+
+    def _mu_gradient(self, images: ArrayOrTensor, volume: ArrayOrTensor) -> ArrayOrTensor:
+        """The gradient of <A volume, images> by mu, on mu's whole grid."""
+        A = self._projector
+        name = A._backend_for(volume)
+        native = A._native(volume, name)
+        box, trace = A._lattices(native, native, whole_mu=True)
+        add_gradient = backends.load(name).mu_gradient
+
+        def add(gradient: ArrayOrTensor, values: ArrayOrTensor, rays: Any, attenuation: Any) -> None:
+            add_gradient(gradient, box, values, rays, attenuation)
+
+        assert A.model.mu is not None
+        return like(self._spread(A._native(images, name), name, add, trace, A.model.mu.grid), images)
+
+    def _spread(
+        self,
+        images: ArrayOrTensor,
+        name: str,
+        spread: Callable[[ArrayOrTensor, ArrayOrTensor, Any, Any], None],
+        trace: RayMapper,
+        grid: Grid,
+        progress: Progress | None = None,
+    ) -> ArrayOrTensor:
+        """What ``spread(volume, values, rays, attenuation)`` adds for all rays of native images to a volume on `grid`."""
+        A = self._projector
+        volume_bytes = (8 if name == "numpy" else 4) * grid.n_voxels
+        require(volume_bytes, f"the adjoint into {_times(grid.shape)} voxels")
         _require_rays(A.views)
         # One volume per thread: fewer threads rather than no room for anything else.
         affordable = max(1, available() // (2 * volume_bytes))
         workers = min(A._workers(name), _MOST_VOLUMES, affordable)
-        volumes = [zeros(self.shape_out, images) for _ in range(workers)]
+        volumes = [zeros(grid.shape, images) for _ in range(workers)]
         n_views = len(A.views)
         _report(progress, 0, n_views)
         with _parallel(workers) as parallel_map:
@@ -336,7 +388,37 @@ class AdjointProjector(LinearOperator):
             total += volume
         if not (A._float64 or is_tensor(total)):
             total = total.astype(np.float32, copy=False)
-        return like(total, x)
+        return total
+
+
+def lattices(
+    grid: Grid,
+    volume: ArrayOrTensor,
+    mu: ArrayOrTensor = None,
+    mu_grid: Grid | None = None,
+    whole_mu: bool = False,
+) -> tuple[ArrayOrTensor, RayMapper]:
+    """The part of `volume` that is not empty, and what brings rays into the index spaces of that and of mu.
+
+    Empty margins cost time: most objects fill a small part of their grid. With None (a volume yet to be filled)
+    the rays are for the whole grid. What attenuates is kept wherever it is, outside the volume's filled part too;
+    and where nothing does, with `whole_mu`.
+    """
+    box, origin, mu_origin = volume, (0, 0, 0), (0, 0, 0)
+    if volume is not None:
+        (box,), origin = cropped(volume)
+    if mu is None:
+        return box, RayMapper(grid, origin)
+    if mu_grid is None or _same(mu_grid, grid):
+        if volume is None or whole_mu:
+            return volume, RayMapper(grid, mu=mu)
+        (common, mu_common), common_origin = cropped(volume, mu)
+        # One lattice is walked twice as fast as two, but two boxes let rays that miss the volume's go at once.
+        if math.prod(common.shape) <= 2 * math.prod(box.shape):
+            return common, RayMapper(grid, common_origin, mu_common)
+    if not whole_mu:
+        (mu,), mu_origin = cropped(mu)
+    return box, RayMapper(grid, origin, mu, mu_grid or grid, mu_origin)
 
 
 def _blocks(n_lines: int, line_length: int, backend: str) -> list[slice]:
@@ -360,6 +442,14 @@ def _require_rays(views: Views) -> None:
     n_v, n_u = views.shape
     # An image of float32, and a few arrays of float64 that weight its rays.
     require(28 * n_v * n_u, f"an image of {n_v} x {n_u} pixels, with its rays,")
+
+
+def checked_mu(mu: ArrayOrTensor, grid: Grid, float64: bool) -> ArrayOrTensor:
+    """`mu` as `checked` numbers on `grid`, none of them negative."""
+    mu = checked(mu, "mu", grid.shape, float64)
+    if mu.min() < 0:
+        raise InputError(f"mu: expected no negative coefficient, got {float(mu.min()):g} 1/mm")
+    return mu
 
 
 def _thread_count(threads: int | None) -> int:

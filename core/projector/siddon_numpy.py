@@ -52,7 +52,7 @@ def mu_gradient(
     voxels = volume.reshape(-1)
     for part, index, weight, (mu_index, length, depth) in _segments(volume.shape, rays, attenuation):
         seen = voxels[index] * weight
-        behind = seen.sum(axis=1, keepdims=True) - np.cumsum(seen, axis=1)
+        behind = _sum_onwards(seen) - seen
         slope = -length * (behind + _mean_place(depth) * seen)
         np.add.at(gradient.reshape(-1), mu_index, slope * values[part, None])
 
@@ -85,8 +85,7 @@ def derivatives(volume: Array, rays: IndexRays | IndexFan, attenuation: Attenuat
             left = np.exp(-length * path_before)
             seen *= left * _mean_transmission(length * path)
             jump *= left[:, 1:]
-            behind = seen.sum(axis=1, keepdims=True) - np.cumsum(seen, axis=1)
-            mu_jump = -length * (mu[:, :-1] - mu[:, 1:]) * behind[:, :-1]
+            mu_jump = -length * (mu[:, :-1] - mu[:, 1:]) * _sum_onwards(seen)[:, 1:]
             result[part, 7:13] = _by_ends(mu_jump, alpha, axis - mu_axes, mu_rays[part])
             result[part, 13] = -(seen * (path_before + _mean_place(length * path) * path)).sum(axis=1)
         result[part, 0] = seen.sum(axis=1)
@@ -197,6 +196,11 @@ def _flat(shape: tuple[int, ...], voxels: Iterable[Array]) -> tuple[Indices, Fla
         index = index * n + np.clip(voxel, 0, n - 1).astype(np.intp)
     index[~inside] = 0
     return index, inside
+
+
+def _sum_onwards(seen: Array) -> Array:
+    """For every segment the sum of `seen` (n, S) over it and those behind it."""
+    return np.cumsum(seen[:, ::-1], axis=1)[:, ::-1]
 
 
 def _mean_transmission(depth: Array) -> Array:

@@ -46,7 +46,7 @@ def mu_gradient(
     voxels = volume.reshape(-1)
     for part, index, weight, (mu_index, length, depth) in _segments(volume, rays, attenuation):
         seen = voxels[index] * weight
-        behind = seen.sum(dim=1, keepdim=True) - seen.cumsum(dim=1)
+        behind = _sum_onwards(seen) - seen
         slope = -length * (behind + _mean_place(depth) * seen)
         _add(gradient, mu_index, slope * values[part, None])
 
@@ -80,8 +80,7 @@ def derivatives(volume: Tensor, rays: IndexRays | IndexFan, attenuation: Attenua
             left = torch.exp(-length * path_before)
             seen *= left * _mean_transmission(length * path)
             jump *= left[:, 1:]
-            behind = seen.sum(dim=1, keepdim=True) - seen.cumsum(dim=1)
-            mu_jump = -length * (mu[:, :-1] - mu[:, 1:]) * behind[:, :-1]
+            mu_jump = -length * (mu[:, :-1] - mu[:, 1:]) * _sum_onwards(seen)[:, 1:]
             by_length = -(seen * (path_before + _mean_place(length * path) * path)).sum(dim=1, keepdim=True)
             of_mu = [_by_ends(mu_jump, alpha, axis - mu_axes, mu_line.part(part)), by_length]
         by_ends = _by_ends(jump, alpha, axis, line.part(part))
@@ -228,6 +227,11 @@ def _flat(shape: tuple[int, ...], voxels: Iterable[Tensor]) -> tuple[Tensor, Ten
         inside = (voxel >= 0) & (voxel < n) & inside
         index = voxel.clamp_(0, n - 1).to(torch.int64) + index * n
     return index.masked_fill_(~inside, 0), inside
+
+
+def _sum_onwards(seen: Tensor) -> Tensor:
+    """For every segment the sum of `seen` (n, S) over it and those behind it."""
+    return seen.flip(1).cumsum(dim=1).flip(1)
 
 
 def _mean_transmission(depth: Tensor) -> Tensor:

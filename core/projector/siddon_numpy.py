@@ -190,7 +190,8 @@ def _voxels_behind(shape: tuple[int, ...], rays: IndexRays, axis: Indices) -> tu
 
 def _flat(shape: tuple[int, ...], voxels: Iterable[Array]) -> tuple[Indices, Flags]:
     """Flat index of voxels given axis by axis, and whether there is such a voxel; the index of none is 0."""
-    index, inside = np.intp(0), np.bool_(True)
+    index: Any = 0
+    inside: Any = True
     for n, voxel in zip(shape, voxels, strict=True):
         inside = inside & (voxel >= 0) & (voxel < n)
         index = index * n + np.clip(voxel, 0, n - 1).astype(np.intp)

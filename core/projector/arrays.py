@@ -19,6 +19,11 @@ def is_tensor(value: object) -> bool:
     return torch is not None and isinstance(value, torch.Tensor)
 
 
+def namespace(value: ArrayOrTensor) -> Any:
+    """The library, torch or numpy, whose functions take `value`."""
+    return sys.modules["torch"] if is_tensor(value) else np
+
+
 def checked(value: ArrayOrTensor, name: str, shape: tuple[int, ...], float64: bool) -> ArrayOrTensor:
     """`value` as float32 or float64 numbers, still an array or still a tensor on its device; not copied without need.
 

@@ -35,6 +35,9 @@ _MOST_VOLUMES = 8
 
 ParallelMap = Callable[[Callable[[Any], Any], Iterable[Any]], Iterable[Any]]
 
+# Adds values to a volume along rays, with what attenuates them: a backend's adjoint, for instance.
+Spread = Callable[[ArrayOrTensor, ArrayOrTensor, Any, Any], None]
+
 
 class LinearOperator(ABC):
     """``A(x)``, with the exact adjoint ``A.T(y)``; differentiable in torch."""
@@ -222,7 +225,7 @@ class Projector(LinearOperator):
         n_views, n_v, n_u = self.shape_out
         wide = 8 if self._float64 else 4
         what = f"projecting {_times(self.shape_in)} voxels into {n_views} images of {n_v} x {n_u} pixels"
-        require(wide * (n_views * n_v * n_u + self.grid.n_voxels), what)
+        require(wide * (n_views * n_v * n_u + self.grid.n_voxels) + self._extra_bytes(wide), what)
         images = None
         _report(progress, 0, n_views)
         for m, image in enumerate(self._images(x)):
@@ -243,13 +246,14 @@ class Projector(LinearOperator):
         with _parallel(self._workers(name)) as parallel_map:
             for m in range(len(self.views)):
                 image = zeros(self.views.shape, box)
+                seen = self._weighted(box, m, trace.origin)
                 for beam, by_columns in self._beams(m):
                     lines = image.T if by_columns else image
                     weights = None if beam.weights is None else alike(beam.weights, box)
 
                     def project(block: slice) -> None:
                         rays, attenuation = trace(beam.rays[block])  # noqa: B023
-                        integrals = integrate(box, rays, attenuation).reshape(lines[block].shape)  # noqa: B023
+                        integrals = integrate(seen, rays, attenuation).reshape(lines[block].shape)  # noqa: B023
                         lines[block] += integrals if weights is None else weights[block] * integrals  # noqa: B023
 
                     for _ in parallel_map(project, _blocks(lines.shape[0], lines.shape[1], name)):
@@ -259,6 +263,18 @@ class Projector(LinearOperator):
                     along_v, along_u = (alike(matrix, image) for matrix in response)
                     image = along_v @ image @ along_u.T
                 yield image if self._float64 or is_tensor(image) else image.astype(np.float32, copy=False)
+
+    def _weighted(self, box: ArrayOrTensor, m: int, origin: tuple[int, int, int] = (0, 0, 0)) -> ArrayOrTensor:
+        """A part of a volume, from voxel `origin` on, times view m's voxel weights."""
+        if not self.model.weights_voxels:
+            return box
+        part = tuple(slice(first, first + n) for first, n in zip(origin, box.shape, strict=True))
+        return box * alike(self.model.voxel_weights(self.views, m, self.grid)[part], box)
+
+    def _extra_bytes(self, wide: int) -> int:
+        """Bytes of a copy of mu, and of voxel weights with what they weight."""
+        mu = 0 if self.model.mu is None else self.model.mu.grid.n_voxels
+        return wide * mu + (2 * wide + 8) * self.grid.n_voxels * self.model.weights_voxels
 
     def _beams(self, m: int) -> Iterator[tuple[Beam, bool]]:
         """View m's rays, and whether their lines are the image's columns, not its rows.
@@ -326,45 +342,53 @@ class AdjointProjector(LinearOperator):
         name = A._backend_for(x)
         images = A._native(x, name)
         _, trace = A._lattices(images)
-        return like(self._spread(images, name, backends.load(name).adjoint, trace, A.grid, progress), x)
+        spread = backends.load(name).adjoint
+        return like(self._spread(images, name, trace, A.grid, lambda m: spread, A.model.weights_voxels, progress), x)
 
     def _mu_gradient(self, images: ArrayOrTensor, volume: ArrayOrTensor) -> ArrayOrTensor:
         """The gradient of <A volume, images> by mu, on mu's whole grid."""
         A = self._projector
+        assert A.model.mu is not None
         name = A._backend_for(volume)
         native = A._native(volume, name)
         box, trace = A._lattices(native, native, whole_mu=True)
         add_gradient = backends.load(name).mu_gradient
 
-        def add(gradient: ArrayOrTensor, values: ArrayOrTensor, rays: Any, attenuation: Any) -> None:
-            add_gradient(gradient, box, values, rays, attenuation)
+        def of_view(m: int) -> Spread:
+            seen = A._weighted(box, m, trace.origin)
+            return lambda gradient, values, rays, attenuation: add_gradient(gradient, seen, values, rays, attenuation)
 
-        assert A.model.mu is not None
-        return like(self._spread(A._native(images, name), name, add, trace, A.model.mu.grid), images)
+        return like(self._spread(A._native(images, name), name, trace, A.model.mu.grid, of_view), images)
 
     def _spread(
         self,
         images: ArrayOrTensor,
         name: str,
-        spread: Callable[[ArrayOrTensor, ArrayOrTensor, Any, Any], None],
         trace: RayMapper,
         grid: Grid,
+        of_view: Callable[[int], Spread],
+        weighted: bool = False,
         progress: Progress | None = None,
     ) -> ArrayOrTensor:
-        """What ``spread(volume, values, rays, attenuation)`` adds for all rays of native images to a volume on `grid`."""
+        """What the functions ``of_view(m)`` add for all rays of native images to a volume on `grid`.
+
+        With `weighted` each view's volume is multiplied by its voxel weights.
+        """
         A = self._projector
         volume_bytes = (8 if name == "numpy" else 4) * grid.n_voxels
-        require(volume_bytes, f"the adjoint into {_times(grid.shape)} voxels")
+        extra_bytes = A._extra_bytes(8 if name == "numpy" else 4)
+        require(volume_bytes + extra_bytes, f"the adjoint into {_times(grid.shape)} voxels")
         _require_rays(A.views)
         # One volume per thread: fewer threads rather than no room for anything else.
-        affordable = max(1, available() // (2 * volume_bytes))
+        affordable = max(1, (available() - extra_bytes) // (2 * volume_bytes))
         workers = min(A._workers(name), _MOST_VOLUMES, affordable)
         volumes = [zeros(grid.shape, images) for _ in range(workers)]
+        total: ArrayOrTensor = zeros(grid.shape, images) if weighted else None
         n_views = len(A.views)
         _report(progress, 0, n_views)
         with _parallel(workers) as parallel_map:
             for m in range(n_views):
-                image = images[m]
+                image, spread = images[m], of_view(m)
                 response = A.model.response(A.views, m)
                 if response is not None:
                     along_v, along_u = (alike(matrix, image) for matrix in response)
@@ -382,10 +406,13 @@ class AdjointProjector(LinearOperator):
 
                     for _ in parallel_map(add, range(workers)):
                         pass
+                if weighted:  # otherwise in every view: each joins the others weighted
+                    total += A._weighted(_sum(volumes), m)
+                    for volume in volumes:
+                        volume[:] = 0
                 _report(progress, m + 1, n_views)
-        total = volumes[0]
-        for volume in volumes[1:]:
-            total += volume
+        if not weighted:
+            total = _sum(volumes)
         if not (A._float64 or is_tensor(total)):
             total = total.astype(np.float32, copy=False)
         return total
@@ -421,6 +448,14 @@ def lattices(
     return box, RayMapper(grid, origin, mu, mu_grid or grid, mu_origin)
 
 
+def _sum(volumes: list[ArrayOrTensor]) -> ArrayOrTensor:
+    """Their sum, in the first of them."""
+    total = volumes[0]
+    for volume in volumes[1:]:
+        total += volume
+    return total
+
+
 def _blocks(n_lines: int, line_length: int, backend: str) -> list[slice]:
     """The lines of rays, cut into what a backend is given at once."""
     rays_at_once = _RAYS_AT_ONCE_TORCH if backend == "torch" else _RAYS_AT_ONCE
@@ -440,8 +475,8 @@ def _parallel(workers: int) -> Iterator[ParallelMap]:
 
 def _require_rays(views: Views) -> None:
     n_v, n_u = views.shape
-    # An image of float32, and a few arrays of float64 that weight its rays.
-    require(28 * n_v * n_u, f"an image of {n_v} x {n_u} pixels, with its rays,")
+    # An image of float32, and some arrays of float64 from which the weights of its rays are made.
+    require(110 * n_v * n_u, f"an image of {n_v} x {n_u} pixels, with its rays,")
 
 
 def checked_mu(mu: ArrayOrTensor, grid: Grid, float64: bool) -> ArrayOrTensor:

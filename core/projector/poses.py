@@ -7,8 +7,10 @@ the same, part of torch's graph. Needs torch.
 from __future__ import annotations
 
 import functools
+import math
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -16,7 +18,9 @@ from ..checks import whole_shape
 from ..errors import InputError
 from ..grid import Grid
 from ..volume import Volume
-from .emission import disk_points
+from .aperture import disk_points
+from .crystal import absorbed_share
+from .emission import throughput
 from .tracing import trace_rays
 
 Numbers = Any  # a tensor, an array or numbers
@@ -209,17 +213,18 @@ def emission_images(
     # To the plane through the grid's farthest corner, in pinhole to crystal distances.
     corners = positions.new_tensor(within.corners()) - positions.detach()[..., None, :]
     depth = ((corners @ rotations.detach()[..., 2:])[..., 0].amax(dim=-1) / l.detach()).clamp(min=1.0)
-    counts = time * photons * diameter**2 * pitch.prod(dim=-1) / (16 * l**2 * aperture_points)
+    area = math.pi / 4 * diameter**2 / aperture_points
+    counts = (time * photons * pitch.prod(dim=-1) * area)[..., None]
     images: Any = 0.0
     for point in disk_points(aperture_points):
         hole = diameter[..., None, None] / 2 * diameter.new_tensor([*point, 0.0])
         in_camera = on_crystal + hole
         sources = positions[..., None, :] + hole @ rotations.mT
         targets = sources + depth[..., None, None] * in_camera @ rotations.mT
-        secant = in_camera.norm(dim=-1) / l[..., None]
-        weights = counts[..., None] / secant**4
+        cosine = l[..., None] / in_camera.norm(dim=-1)
+        weights = counts * throughput(cosine, l[..., None])
         if crystal_mu is not None:
-            weights = weights * -torch.expm1(-(mu_c * thickness)[..., None] * secant)
+            weights = weights * absorbed_share(cosine, mu_c[..., None], thickness[..., None], np.zeros(1), 0)
         sources, targets, weights = (
             sources.expand_as(targets).reshape(-1, 3),
             targets.reshape(-1, 3),

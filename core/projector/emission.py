@@ -85,7 +85,7 @@ class Emission(Model):
         goes on; what is steeper than the cone passes nowhere. On the axis that is
         ``d_e^2 = d^2 + 2 d / mu tan(alpha / 2) + 2 / mu^2 tan^2(alpha / 2)`` (Metzler 2001). The hole itself needs no
         correction for its obliquity in either: seen at psi its area is cos(psi) times the disk's, which is in cos^4(psi).
-        With one aperture point the edge changes the counts alone; with more, the blur too.
+        With one aperture point the edge changes the counts alone; with n, the blur too, by some 4 sqrt(pi n) rays more.
     crystal_mu : float, optional
         Attenuation coefficient of the crystal, 1/mm (`core.isotopes.NAI_MU`, `CZT_MU`). With it
         ``1 - exp(-crystal_mu Td / cos(psi))`` of the photons are counted. None: all.

@@ -236,3 +236,41 @@ def test_memory_is_asked_for_mu_and_for_weights(system, monkeypatch):
             else:
                 with pytest.raises(InputError, match="of memory"):
                     run(x)
+
+
+def test_the_whole_camera_counts_like_photons_one_by_one(rng):
+    """Photons from a spot through the edge into the crystal: their number, mean place and spread as they are recorded."""
+    system, n = one_module(detector_side=30.0), 1_000_000
+    grid = turned_grid((3, 3, 3), 1.0, (20.0, 37.0, -20.0))
+    edge, crystal_mu, far = KnifeEdge(1.0, 1.5, 1.0), 0.15, 4.0
+
+    # From anywhere in the spot, to anywhere in the pinhole's plane around the hole: (u, v, towards the pinhole), mm.
+    inside = rng.uniform(-0.5, 2.5, (n, 3)) @ grid.affine[:3, :3].T + grid.affine[:3, 3] - system.centers[0]
+    u, v, h = system.frames()[0] @ inside.T
+    radius, angle = far * np.sqrt(rng.random(n)), rng.uniform(0, 2 * np.pi, n)
+    x, y = radius * np.cos(angle), radius * np.sin(angle)
+    slope_u, slope_v = (u - x) / h, (v - y) / h
+    cosine = 1 / np.sqrt(1 + slope_u**2 + slope_v**2)
+    chance = np.pi * far**2 * cosine**3 / (4 * np.pi * h**2)  # to leave towards the area of the plane
+    beyond = edge.transmission(x, y, slope_u, slope_v)
+    chance *= np.where(radius < 1, slope_u**2 + slope_v**2 < 1, beyond)
+    depth = rng.exponential(cosine / crystal_mu)
+    front_u, front_v = x - 60 * slope_u, y - 60 * slope_v
+    chance *= (depth < 10) & (np.abs(front_u) < 15) & (np.abs(front_v) < 15)
+    seen = chance / chance.sum()
+    places = np.stack([x - (60 + depth) * slope_u, y - (60 + depth) * slope_v])
+
+    model = mph.Emission(
+        system, aperture_points=37, aperture_mu=edge.mu, edge="path", crystal_mu=crystal_mu, depth_layers=9,
+        within_walls=True,
+    )  # fmt: skip
+    views = system.views((100, 100), "real", pitch=0.4)
+    image = mph.Projector(grid, views, model)(np.ones(grid.shape))[0].astype(float)
+    pixels = np.arange(100) * 0.4 - 19.8
+    marginals = image.sum(axis=0) / image.sum(), image.sum(axis=1) / image.sum()
+    assert image.sum() == pytest.approx(chance.mean() * 27, rel=0.01)
+    for place, marginal in zip(places, marginals, strict=True):
+        mean = marginal @ pixels
+        assert mean == pytest.approx(seen @ place, abs=0.02)
+        spread = np.sqrt(seen @ place**2 - (seen @ place) ** 2)
+        assert np.sqrt(marginal @ pixels**2 - mean**2) == pytest.approx(spread, rel=0.02)

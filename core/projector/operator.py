@@ -379,9 +379,7 @@ class AdjointProjector(LinearOperator):
         extra_bytes = A._extra_bytes(8 if name == "numpy" else 4)
         require(volume_bytes + extra_bytes, f"the adjoint into {_times(grid.shape)} voxels")
         _require_rays(A.views)
-        # One volume per thread: fewer threads rather than no room for anything else.
-        affordable = max(1, (available() - extra_bytes) // (2 * volume_bytes))
-        workers = min(A._workers(name), _MOST_VOLUMES, affordable)
+        workers = volume_workers(A._workers(name), volume_bytes, extra_bytes)
         volumes = [zeros(grid.shape, images) for _ in range(workers)]
         total: ArrayOrTensor = zeros(grid.shape, images) if weighted else None
         n_views = len(A.views)
@@ -446,6 +444,11 @@ def lattices(
     if not whole_mu:
         (mu,), mu_origin = cropped(mu)
     return box, RayMapper(grid, origin, mu, mu_grid or grid, mu_origin)
+
+
+def volume_workers(workers: int, volume_bytes: int, extra_bytes: int = 0) -> int:
+    """As many of `workers` as may have a volume each: fewer threads rather than no room for anything else."""
+    return min(workers, _MOST_VOLUMES, max(1, (available() - extra_bytes) // (2 * volume_bytes)))
 
 
 def _sum(volumes: list[ArrayOrTensor]) -> ArrayOrTensor:

@@ -14,7 +14,7 @@ from ..grid import Grid
 from ..volume import Volume
 from . import backends
 from .arrays import ArrayOrTensor, alike, checked, is_tensor, like, to_numpy, to_tensor, together, zeros
-from .operator import _blocks, _parallel, _thread_count, checked_mu, lattices
+from .operator import Spread, _blocks, _parallel, _sum, _thread_count, checked_mu, lattices, volume_workers
 from .rays import RayMapper
 
 Points = NDArray[np.float64]
@@ -147,13 +147,22 @@ class Tracer:
         return self._spread(add, self.mu_grid or self.grid, values, starts, ends, mapper)
 
     def _spread(
-        self, add: Any, grid: Grid, values: ArrayOrTensor, starts: Points, ends: Points, mapper: RayMapper
+        self, add: Spread, grid: Grid, values: ArrayOrTensor, starts: Points, ends: Points, mapper: RayMapper
     ) -> ArrayOrTensor:
-        """What ``add(volume, values, rays, attenuation)`` adds to a volume on `grid`."""
-        volume = zeros(grid.shape, values)
-        for block in _blocks(len(ends), 1, self.backend):
-            add(volume, values[block], *mapper.between(starts[block], ends[block]))
-        return volume
+        """What ``add(volume, values, rays, attenuation)`` adds to a volume on `grid`, on several threads."""
+        workers = volume_workers(self._workers, (8 if self.backend == "numpy" else 4) * grid.n_voxels)
+        volumes = [zeros(grid.shape, values) for _ in range(workers)]
+        blocks = _blocks(len(ends), 1, self.backend)
+
+        def work(worker: int) -> None:
+            # Always the same blocks, so that the result is always the same.
+            for block in blocks[worker::workers]:
+                add(volumes[worker], values[block], *mapper.between(starts[block], ends[block]))
+
+        with _parallel(workers) as parallel_map:
+            for _ in parallel_map(work, range(workers)):
+                pass
+        return _sum(volumes)
 
     def _run(
         self,
@@ -173,7 +182,7 @@ class Tracer:
         def run(block: slice) -> None:
             result[block] = like(function(box, *mapper.between(starts[block], ends[block])), result)
 
-        with _parallel(1 if self.backend == "torch" else _thread_count(None)) as parallel_map:
+        with _parallel(self._workers) as parallel_map:
             for _ in parallel_map(run, _blocks(len(ends), 1, self.backend)):
                 pass
         return result
@@ -184,6 +193,10 @@ class Tracer:
         """`lattices` with volume and mu as the backend computes with them, as with `native`."""
         volume, mu = (None if x is None else alike(x, native) for x in (volume, mu))
         return lattices(self.grid, volume, mu, self.mu_grid, whole_mu)
+
+    @property
+    def _workers(self) -> int:
+        return 1 if self.backend == "torch" else _thread_count(None)
 
     def _native(self, x: ArrayOrTensor) -> Any:
         """`x` as the backend computes with it."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -107,25 +108,29 @@ class Tracer:
 
     def integrals(self, volume: ArrayOrTensor, starts: Points, ends: Points, mu: ArrayOrTensor = None) -> Points:
         """Line integrals (N,), value x mm."""
-        return self._run("forward", volume, starts, ends, mu, ())
+        return self._run("forward", volume, starts, ends, mu, (), lambda integrals, along: integrals)
 
     def derivatives(
         self, volume: ArrayOrTensor, starts: Points, ends: Points, mu: ArrayOrTensor = None
     ) -> tuple[Points, Points, Points]:
         """Line integrals (N,), value x mm, and their derivatives (N, 3), by the source and by the target in world mm."""
-        result = self._run("derivatives", volume, starts, ends, mu, (7 if mu is None else 14,))
-        along = ends - starts
-        length = np.linalg.norm(along, axis=1, keepdims=True)
-        along /= np.where(length > 0, length, 1.0)
 
-        # The integral is length x mean, and the mean moves with the planes of either grid.
-        mean = by_length = result[:, :1]
-        by_ends = _in_world(result[:, 1:7], self.grid)
-        if mu is not None:  # ... and with the length, which attenuates
-            by_ends += _in_world(result[:, 7:13], self.mu_grid or self.grid)
-            by_length = mean + length * result[:, 13:]
-        by_start, by_end = length * by_ends
-        return (length * mean)[:, 0], by_start - by_length * along, by_end + by_length * along
+        def in_world(rows: Points, along: Points) -> Points:
+            length = np.linalg.norm(along, axis=1, keepdims=True)
+            along /= np.where(length > 0, length, 1.0)
+            # The integral is length x mean, and the mean moves with the planes of either grid.
+            mean = by_length = rows[:, :1]
+            by_ends = _in_world(rows[:, 1:7], self.grid)
+            if mu is not None:  # ... and with the length, which attenuates
+                by_ends += _in_world(rows[:, 7:13], self.mu_grid or self.grid)
+                by_length = mean + length * rows[:, 13:]
+            by_ends *= length
+            by_ends[:, :3] -= by_length * along
+            by_ends[:, 3:] += by_length * along
+            return np.concatenate([length * mean, by_ends], axis=1)
+
+        result = self._run("derivatives", volume, starts, ends, mu, (7,), in_world)
+        return result[:, 0], result[:, 1:4], result[:, 4:]
 
     def adjoint(self, values: ArrayOrTensor, starts: Points, ends: Points, mu: ArrayOrTensor = None) -> ArrayOrTensor:
         """`values` (N,) spread along their rays, with the weights of `integrals`, into a volume native to the backend."""
@@ -172,15 +177,17 @@ class Tracer:
         ends: Points,
         mu: ArrayOrTensor,
         shape: tuple[int, ...],
+        finished: Callable[[Points, Points], Points],
     ) -> Points:
-        """A function of the backend on all rays, on several threads."""
+        """A function of the backend on all rays, on several threads; `finished` takes its result and the rays' vectors."""
         function = getattr(backends.load(self.backend), what)
         native = self._native(volume)
         box, mapper = self._lattices(native, native, mu)
         result = np.empty((len(ends), *shape))
 
         def run(block: slice) -> None:
-            result[block] = like(function(box, *mapper.between(starts[block], ends[block])), result)
+            rows = like(function(box, *mapper.between(starts[block], ends[block])), result)
+            result[block] = finished(rows, ends[block] - starts[block])
 
         with _parallel(self._workers) as parallel_map:
             for _ in parallel_map(run, _blocks(len(ends), 1, self.backend)):
@@ -206,8 +213,8 @@ class Tracer:
 
 
 def _in_world(by_ends: Points, grid: Grid) -> Points:
-    """Derivatives (N, 6) by start and end in index space as (2, N, 3) in world mm."""
-    return np.einsum("nei,ij->enj", by_ends.reshape(-1, 2, 3), grid.index_from_world[:3, :3])
+    """Derivatives (n, 6) by start and end, from index space to world mm."""
+    return (by_ends.reshape(-1, 3) @ grid.index_from_world[:3, :3]).reshape(-1, 6)
 
 
 def _field(

@@ -186,7 +186,8 @@ class Tracer:
         result = np.empty((len(ends), *shape))
 
         def run(block: slice) -> None:
-            rows = like(function(box, *mapper.between(starts[block], ends[block])), result)
+            rays, attenuation = mapper.between(starts[block], ends[block])
+            rows = like(function(box, rays) if attenuation is None else function(box, rays, attenuation), result)
             result[block] = finished(rows, ends[block] - starts[block])
 
         with _parallel(self._workers) as parallel_map:

@@ -140,7 +140,7 @@ class Emission(Model):
             raise InputError(f"emission: expected a PinholeSystem, got {type(self.system).__name__}")
         if self.mu is not None:
             if not isinstance(self.mu, Volume):
-                hint = ": there are no gradients with respect to mu" if is_tensor(self.mu) else ""
+                hint = "; tensors of it go to the projector, A(x, mu=...)" if is_tensor(self.mu) else ""
                 raise InputError(f"emission: expected mu to be a Volume, got {type(self.mu).__name__}{hint}")
             if self.mu.quantity != "mu":
                 raise InputError(f"emission: expected a volume of mu, got {self.mu.quantity}")

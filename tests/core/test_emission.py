@@ -497,5 +497,5 @@ def test_an_isotope_counts_its_photons_and_decays(rng):
 
 def test_gradients_in_mu_are_refused(system):
     torch = pytest.importorskip("torch", reason="torch is not installed")
-    with pytest.raises(InputError, match="no gradients with respect to mu"):
+    with pytest.raises(InputError, match=r"A\(x, mu=...\)"):
         mph.Emission(system, torch.rand(2, 2, 2, requires_grad=True))

@@ -24,6 +24,11 @@ def namespace(value: ArrayOrTensor) -> Any:
     return sys.modules["torch"] if is_tensor(value) else np
 
 
+def is_double(value: object) -> bool:
+    """Whether `value` is a torch tensor of float64."""
+    return is_tensor(value) and str(value.dtype) == "torch.float64"  # type: ignore[attr-defined]
+
+
 def checked(value: ArrayOrTensor, name: str, shape: tuple[int, ...], float64: bool) -> ArrayOrTensor:
     """`value` as float32 or float64 numbers, still an array or still a tensor on its device; not copied without need.
 

@@ -20,7 +20,19 @@ from ..progress import Progress
 from ..views import Views
 from ..volume import Volume
 from . import backends
-from .arrays import ArrayOrTensor, alike, checked, cropped, is_tensor, like, to_numpy, to_tensor, together, zeros
+from .arrays import (
+    ArrayOrTensor,
+    alike,
+    checked,
+    cropped,
+    is_double,
+    is_tensor,
+    like,
+    to_numpy,
+    to_tensor,
+    together,
+    zeros,
+)
 from .models import Beam, Model, Transmission, require_model
 from .rays import RayMapper
 
@@ -111,7 +123,7 @@ class Projector(LinearOperator):
     Notes
     -----
     The integral along a ray is exact for the piecewise constant volume (Siddon 1985), from source to target.
-    The results are float32; float64 for ``backend="numpy"`` and for float64 tensors with ``backend="torch"``.
+    The results are float32; float64 for ``backend="numpy"``, and for tensors of float64 with all backends.
     The adjoint of the torch backend on a GPU adds in no fixed order.
 
     Examples
@@ -223,7 +235,7 @@ class Projector(LinearOperator):
 
     def _run(self, x: ArrayOrTensor, progress: Progress | None = None) -> ArrayOrTensor:
         n_views, n_v, n_u = self.shape_out
-        wide = 8 if self._float64 else 4
+        wide = 8 if self._float64 or is_double(x) else 4
         what = f"projecting {_times(self.shape_in)} voxels into {n_views} images of {n_v} x {n_u} pixels"
         require(wide * (n_views * n_v * n_u + self.grid.n_voxels) + self._extra_bytes(wide), what)
         images = None
@@ -262,7 +274,7 @@ class Projector(LinearOperator):
                 if response is not None:
                     along_v, along_u = (alike(matrix, image) for matrix in response)
                     image = along_v @ image @ along_u.T
-                yield image if self._float64 or is_tensor(image) else image.astype(np.float32, copy=False)
+                yield self._finished(image, x)
 
     def _weighted(self, box: ArrayOrTensor, m: int, origin: tuple[int, int, int] = (0, 0, 0)) -> ArrayOrTensor:
         """A part of a volume, from voxel `origin` on, times view m's voxel weights."""
@@ -297,13 +309,21 @@ class Projector(LinearOperator):
 
     def _native(self, x: ArrayOrTensor, name: str) -> ArrayOrTensor:
         """`x` as the backend `name` computes with it."""
-        return to_tensor(x) if name == "torch" else to_numpy(x, np.float64 if name == "numpy" else np.float32)
+        if name == "torch":
+            return to_tensor(x)
+        return to_numpy(x, np.float64 if name == "numpy" or is_double(x) else np.float32)
 
     def _backend_for(self, x: ArrayOrTensor) -> str:
         return "torch" if self._auto and is_tensor(x) and x.device.type != "cpu" else self.backend
 
     def _workers(self, name: str) -> int:
         return 1 if name == "torch" else self.threads
+
+    def _finished(self, result: ArrayOrTensor, x: ArrayOrTensor) -> ArrayOrTensor:
+        """`result` of float32, unless it is to be of float64 (where "auto" falls back to numpy it is not)."""
+        if self._float64 or is_tensor(result) or is_double(x):
+            return result
+        return result.astype(np.float32, copy=False)
 
     @property
     def _float64(self) -> bool:
@@ -343,7 +363,8 @@ class AdjointProjector(LinearOperator):
         images = A._native(x, name)
         _, trace = A._lattices(images)
         spread = backends.load(name).adjoint
-        return like(self._spread(images, name, trace, A.grid, lambda m: spread, A.model.weights_voxels, progress), x)
+        volume = self._spread(images, name, trace, A.grid, lambda m: spread, A.model.weights_voxels, progress)
+        return like(A._finished(volume, x), x)
 
     def _mu_gradient(self, images: ArrayOrTensor, volume: ArrayOrTensor) -> ArrayOrTensor:
         """The gradient of <A volume, images> by mu, on mu's whole grid."""
@@ -358,7 +379,8 @@ class AdjointProjector(LinearOperator):
             seen = A._weighted(box, m, trace.origin)
             return lambda gradient, values, rays, attenuation: add_gradient(gradient, seen, values, rays, attenuation)
 
-        return like(self._spread(A._native(images, name), name, trace, A.model.mu.grid, of_view), images)
+        gradient = self._spread(A._native(images, name), name, trace, A.model.mu.grid, of_view)
+        return like(A._finished(gradient, images), images)
 
     def _spread(
         self,
@@ -375,8 +397,7 @@ class AdjointProjector(LinearOperator):
         With `weighted` each view's volume is multiplied by its voxel weights.
         """
         A = self._projector
-        volume_bytes = (8 if name == "numpy" else 4) * grid.n_voxels
-        extra_bytes = A._extra_bytes(8 if name == "numpy" else 4)
+        volume_bytes, extra_bytes = images.itemsize * grid.n_voxels, A._extra_bytes(images.itemsize)
         require(volume_bytes + extra_bytes, f"the adjoint into {_times(grid.shape)} voxels")
         _require_rays(A.views)
         workers = volume_workers(A._workers(name), volume_bytes, extra_bytes)
@@ -411,8 +432,6 @@ class AdjointProjector(LinearOperator):
                 _report(progress, m + 1, n_views)
         if not weighted:
             total = _sum(volumes)
-        if not (A._float64 or is_tensor(total)):
-            total = total.astype(np.float32, copy=False)
         return total
 
 

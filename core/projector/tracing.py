@@ -14,7 +14,7 @@ from ..errors import InputError
 from ..grid import Grid
 from ..volume import Volume
 from . import backends
-from .arrays import ArrayOrTensor, alike, checked, is_tensor, like, to_numpy, to_tensor, together, zeros
+from .arrays import ArrayOrTensor, alike, checked, is_double, is_tensor, like, to_numpy, to_tensor, together, zeros
 from .operator import Spread, _blocks, _parallel, _sum, _thread_count, checked_mu, lattices, volume_workers
 from .rays import RayMapper
 
@@ -52,7 +52,8 @@ def trace_rays(
     -------
     array or tensor (N,)
         Value x mm, from source to target. From arrays: float32, or float64 for ``backend="numpy"``. If anything given
-        is a tensor: a tensor of the ends' type (of the volume's where the ends are arrays), part of torch's graph. Its
+        is a tensor: a tensor of the ends' type (of the volume's where the ends are arrays), computed in float64 if any
+        tensor is of float64, and part of torch's graph. Its
         gradients, by the volume, mu and the rays' ends, are exact wherever there are any: by the ends they follow from
         the jumps of the volume and of mu at the planes crossed, for every backend. A ray of length 0 has gradient 0.
         Gradients of gradients are refused.
@@ -77,7 +78,8 @@ def trace_rays(
     name = backends.choose(backend)
     if is_tensor(array) and array.device.type != "cpu" and backend == "auto":
         name = "torch"
-    tracer = Tracer(grid, name, mu_grid)
+    float64 = name == "numpy" or any(is_double(value) for value in (array, mu, sources, targets))
+    tracer = Tracer(grid, name, mu_grid, float64)
     if any(is_tensor(value) for value in (array, sources, targets)):
         from .autograd import trace
 
@@ -100,11 +102,14 @@ class Tracer:
         One of `backends.BACKENDS`.
     mu_grid : Grid or None
         The voxels of mu, where that has its own.
+    float64 : bool
+        Whether arrays are of float64, not float32.
     """
 
     grid: Grid
     backend: str
     mu_grid: Grid | None = None
+    float64: bool = False
 
     def integrals(self, volume: ArrayOrTensor, starts: Points, ends: Points, mu: ArrayOrTensor = None) -> Points:
         """Line integrals (N,), value x mm."""
@@ -155,7 +160,7 @@ class Tracer:
         self, add: Spread, grid: Grid, values: ArrayOrTensor, starts: Points, ends: Points, mapper: RayMapper
     ) -> ArrayOrTensor:
         """What ``add(volume, values, rays, attenuation)`` adds to a volume on `grid`, on several threads."""
-        workers = volume_workers(self._workers, (8 if self.backend == "numpy" else 4) * grid.n_voxels)
+        workers = volume_workers(self._workers, (8 if self.float64 else 4) * grid.n_voxels)
         volumes = [zeros(grid.shape, values) for _ in range(workers)]
         blocks = _blocks(len(ends), 1, self.backend)
 
@@ -210,7 +215,7 @@ class Tracer:
         """`x` as the backend computes with it."""
         if self.backend == "torch":
             return to_tensor(x)
-        return to_numpy(x, np.float64 if self.backend == "numpy" else np.float32)
+        return to_numpy(x, np.float64 if self.float64 else np.float32)
 
 
 def _in_world(by_ends: Points, grid: Grid) -> Points:

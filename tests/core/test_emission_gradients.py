@@ -11,7 +11,6 @@ torch = pytest.importorskip("torch", reason="torch is not installed")
 
 import mphdrr.core as mph  # noqa: E402
 from mphdrr.core.errors import InputError  # noqa: E402
-from mphdrr.core.projector import backends  # noqa: E402
 from mphdrr.core.projector.crystal import gaussian_blur  # noqa: E402
 from mphdrr.core.projector.poses import emission_images  # noqa: E402
 from mphdrr.core.rotations import se3_exp  # noqa: E402
@@ -21,8 +20,6 @@ from .conftest import general_grid  # noqa: E402
 
 def _backend(name):
     reason = f"{name} is not installed" if importlib.util.find_spec(name) is None else ""
-    if not reason and not hasattr(backends.load(name), "mu_gradient"):
-        reason = f"{name} has no mu_gradient yet"
     return pytest.param(name, marks=pytest.mark.skipif(bool(reason), reason=reason))
 
 

@@ -11,7 +11,7 @@ torch = pytest.importorskip("torch", reason="torch is not installed")
 
 from mphdrr.core.errors import InputError  # noqa: E402
 from mphdrr.core.grid import Grid  # noqa: E402
-from mphdrr.core.projector import Projector, backends, trace_rays  # noqa: E402
+from mphdrr.core.projector import Projector, trace_rays  # noqa: E402
 from mphdrr.core.views import Views  # noqa: E402
 from mphdrr.core.volume import Volume  # noqa: E402
 
@@ -46,11 +46,6 @@ def some_mu(rng, grid, which):
     return Volume(rng.uniform(0, 0.2, grid.shape), grid, "mu")
 
 
-def require_attenuation(backend, which):
-    if which is not None and not hasattr(backends.load(backend), "mu_gradient"):
-        pytest.skip(f"{backend} has no gradients of attenuated integrals yet")
-
-
 def gradients(volume, sources, targets, backend, weights, mu=None):
     s, t = (torch.tensor(x, requires_grad=True) for x in (sources, targets))
     y = trace_rays(volume, s, t, backend, mu=mu)
@@ -63,7 +58,6 @@ def gradients(volume, sources, targets, backend, weights, mu=None):
 @pytest.mark.parametrize("which", MU)
 @pytest.mark.parametrize("shape", SHAPES)
 def test_gradient_is_the_central_difference(backend, which, shape, rng):
-    require_attenuation(backend, which)
     grid = general_grid(rng, shape)
     volume, mu = Volume(rng.random(shape), grid), some_mu(rng, grid, which)
     sources, targets = oblique_rays(rng, grid)
@@ -88,7 +82,6 @@ def test_gradient_is_the_central_difference(backend, which, shape, rng):
 @pytest.mark.parametrize("backend", BACKENDS[1:])
 @pytest.mark.parametrize("which", MU)
 def test_backends_agree(backend, which, rng):
-    require_attenuation(backend, which)
     grid = general_grid(rng, (12, 9, 10))
     volume, mu = Volume(rng.random(grid.shape), grid), some_mu(rng, grid, which)
     sources, targets = oblique_rays(rng, grid, 9000)
@@ -122,7 +115,6 @@ def test_chord_of_a_slab(backend):
 @pytest.mark.parametrize("backend", BACKENDS)
 def test_chord_of_an_attenuating_slab(backend):
     """(1 - exp(-m chord)) / m, seen from outside and from inside; mu on its own planes before it too."""
-    require_attenuation(backend, "shared")
     grid = Grid.centered((8, 40, 40), 2.0)
     before = Volume(
         np.full((2, 10, 10), 0.1), Grid.centered((2, 10, 10), 8.0, (-28.0, 0, 0)), "mu"
@@ -151,7 +143,6 @@ def test_chord_of_an_attenuating_slab(backend):
 @pytest.mark.parametrize("backend", BACKENDS)
 def test_gradients_depend_on_matter_and_not_on_its_grid(backend, rng):
     """The same mu on the volume's grid, on one twice as fine and on one that goes on outside: planes met at once."""
-    require_attenuation(backend, "own")
     grid = general_grid(rng, (6, 5, 4))
     volume, values = Volume(rng.random(grid.shape), grid), rng.uniform(0, 0.2, grid.shape)
     fine, moved = np.diag([0.5, 0.5, 0.5, 1.0]), np.eye(4)
@@ -195,7 +186,6 @@ def test_odd_rays_have_gradients_too(backend, which):
         [5, 5, 5],
         [0.2, 0.3, 0.1],
     ]
-    require_attenuation(backend, which)
     volume = Volume(np.arange(64.0).reshape(4, 4, 4), grid)
     mu = which and Volume(np.full((4, 4, 4), 1e-12), grid, "mu")
     ends = np.array(sources, float), np.array(targets, float)

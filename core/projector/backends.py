@@ -6,19 +6,26 @@ import functools
 import importlib
 import warnings
 from types import ModuleType
+from typing import Any
 
 from ..errors import InputError, InputWarning
 
-BACKENDS = ("numba", "torch", "numpy")
-"""Names of the backends, the one that "auto" prefers first. ``siddon_<name>`` is the module of each.
+BACKENDS = ("numba", "torch", "numpy", "cuda")
+"""Names of the backends. ``siddon_<name>`` is the module of each.
 
 Such a module has three functions. ``forward(volume, rays, attenuation=None)`` returns the line integrals (N,);
 ``adjoint(volume, values, rays, attenuation=None)`` adds the values to the volume in place, each along its ray
 with the same weights; ``derivatives(volume, rays)`` returns (N, 7): the integral over alpha from 0 to 1 (the line
 integral per mm of the ray's length), and its derivatives by the ray's start (3) and end (3) in index space. `rays` are
 `IndexRays` or an `IndexFan`, what weakens them an `Attenuation`; volumes, values and mu are tensors on one device for
-"torch" and numpy arrays for the others.
+"torch", numpy arrays or tensors on the GPU for "cuda" (see its `native`), and numpy arrays for the others. "cuda" is
+handed several views at once, as `IndexFans`.
 """
+
+_AUTOMATIC = ("numba", "torch", "numpy")
+"""What "auto" chooses from, the one that it prefers first; for a tensor on a GPU see `for_tensor`."""
+
+_PACKAGES = {"cuda": "warp-lang"}
 
 
 def choose(name: str) -> str:
@@ -27,17 +34,20 @@ def choose(name: str) -> str:
     Raises
     ------
     InputError
-        No such backend, or the library it needs is missing.
+        No such backend, or the library or the GPU that it needs is missing.
     """
     if name != "auto" and name not in BACKENDS:
         raise InputError(f"backend {name!r}: expected one of auto, {', '.join(BACKENDS)}")
     if name != "auto":
         try:
-            load(name)
+            module = load(name)
         except _CANNOT_LOAD as error:
-            raise InputError(f"backend {name!r} needs {name} ({_reason(error)}): pip install {name}") from None
+            package = _PACKAGES.get(name, name)
+            raise InputError(f"backend {name!r} needs {package} ({_reason(error)}): pip install {package}") from None
+        if name == "cuda":
+            module.device()
         return name
-    for candidate in BACKENDS:
+    for candidate in _AUTOMATIC:
         try:
             load(candidate)
         except _CANNOT_LOAD as error:
@@ -48,6 +58,20 @@ def choose(name: str) -> str:
             _warn_slower(candidate, reason)
         return candidate
     raise AssertionError("numpy is always there")
+
+
+def for_tensor(tensor: Any) -> str:
+    """What "auto" means for a tensor that is not on the CPU: "cuda" where that works, else "torch"."""
+    return "cuda" if tensor.is_cuda and _cuda_works() else "torch"
+
+
+@functools.cache
+def _cuda_works() -> bool:
+    try:
+        load("cuda").device()
+    except (InputError, *_CANNOT_LOAD):
+        return False
+    return True
 
 
 def load(name: str) -> ModuleType:

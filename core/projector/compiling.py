@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import os
-import sys
 import threading
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any
 
 from numba import config, njit
+
+from .caching import cache_folder
 
 _kernels: dict[Callable[..., Any], Any] = {}
 _lock = threading.Lock()
@@ -41,19 +40,8 @@ def _enable_caching(kernel: Any) -> None:
     """Cache `kernel` in NUMBA_CACHE_DIR if the user has set it, else in `cache_folder`."""
     users = config.CACHE_DIR
     # numba looks at this setting once, when caching is enabled; other users of numba keep theirs.
-    config.CACHE_DIR = users or str(cache_folder())
+    config.CACHE_DIR = users or str(cache_folder("numba"))
     try:
         kernel.enable_caching()
     finally:
         config.CACHE_DIR = users
-
-
-def cache_folder() -> Path:
-    """The folder of this user in which mphDRR may keep what it can make again."""
-    if sys.platform == "win32":
-        base = os.environ.get("LOCALAPPDATA") or Path.home() / "AppData" / "Local"
-    elif sys.platform == "darwin":
-        base = Path.home() / "Library" / "Caches"
-    else:
-        base = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
-    return Path(base) / "mphdrr" / "numba"

@@ -72,7 +72,7 @@ def trace_rays(
         array = checked(volume, "volume", grid.shape, backend == "numpy")
     name = backends.choose(backend)
     if is_tensor(array) and array.device.type != "cpu" and backend == "auto":
-        name = "torch"
+        name = backends.for_tensor(array)
     if any(is_tensor(value) for value in (array, sources, targets)):
         from .autograd import trace
 
@@ -137,7 +137,7 @@ class Tracer:
         def run(block: slice) -> None:
             result[block] = like(function(box, index_rays(self.grid, starts[block], ends[block], origin)), result)
 
-        with _parallel(1 if self.backend == "torch" else _thread_count(None)) as parallel_map:
+        with _parallel(1 if self.backend in ("torch", "cuda") else _thread_count(None)) as parallel_map:
             for _ in parallel_map(run, _blocks(len(ends), 1, self.backend)):
                 pass
         return result
@@ -146,6 +146,8 @@ class Tracer:
         """`x` as the backend computes with it."""
         if self.backend == "torch":
             return to_tensor(x)
+        if self.backend == "cuda":
+            return backends.load("cuda").native(x)
         return to_numpy(x, np.float64 if self.backend == "numpy" else np.float32)
 
 

@@ -11,9 +11,11 @@ is worked on where it is, on torch's stream.
 
 from __future__ import annotations
 
+import atexit
 import ctypes
 import functools
 import os
+import shutil
 import sys
 import tempfile
 import threading
@@ -40,6 +42,8 @@ DEVICE_VARIABLE = "MPHDRR_CUDA_DEVICE"
 _RAYS_AT_ONCE = 2**24
 _BYTES_OF_A_FAN = 2 * 8 * 24  # in the index space of the volume and of mu
 _BYTES_OF_A_PLANE = 2**31  # Warp's strides are 32 bits wide; offsets are 64
+
+_ROOM_FOR_KERNELS = 16 * 2**20
 
 _loading = threading.Lock()
 _loaded: set[str] = set()
@@ -241,8 +245,9 @@ def _kernels(device: Any) -> ModuleType:
             with _quiet():
                 try:
                     wp.load_module(warp_kernels, device=device)
-                except OSError:  # a full disk: it only costs the time of compiling
-                    wp.config.kernel_cache_dir = tempfile.mkdtemp(prefix="mphdrr-warp-")
+                except Exception:  # a full disk, a damaged file: that only costs the time of compiling
+                    wp.config.kernel_cache_dir = _scratch_folder()
+                    wp.get_module(warp_kernels.__name__).unload()
                     wp.load_module(warp_kernels, device=device)
             _loaded.add(device.alias)
     return warp_kernels
@@ -251,14 +256,24 @@ def _kernels(device: Any) -> ModuleType:
 def _initialize() -> None:
     """Start Warp with its cache in `cache_folder`, unless the user has chosen another or has started it already."""
     if wp.config.kernel_cache_dir is None and "WARP_CACHE_PATH" not in os.environ:
-        folder = cache_folder("warp")
+        folder = str(cache_folder("warp"))
         try:
-            folder.mkdir(parents=True, exist_ok=True)
+            os.makedirs(folder, exist_ok=True)
             tempfile.TemporaryFile(dir=folder).close()
+            if shutil.disk_usage(folder).free < _ROOM_FOR_KERNELS:  # on a full disk Warp's compiler aborts
+                folder = _scratch_folder()
         except OSError:
-            folder = tempfile.mkdtemp(prefix="mphdrr-warp-")
-        wp.config.kernel_cache_dir = str(folder)
+            folder = _scratch_folder()
+        wp.config.kernel_cache_dir = folder
     wp.init()
+
+
+@functools.cache
+def _scratch_folder() -> str:
+    """A folder for the time that Python runs."""
+    folder = tempfile.mkdtemp(prefix="mphdrr-warp-")
+    atexit.register(shutil.rmtree, folder, ignore_errors=True)
+    return folder
 
 
 @contextmanager

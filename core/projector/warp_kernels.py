@@ -5,14 +5,16 @@ A ray walks from voxel to voxel; nothing is stored or sorted. The walk is writte
 each kernel does something else with its segments. What is added up along a ray is float32, what sets the walk up float64.
 
 Where a ray is: `alpha` runs here from 0 where it enters the volume to 1 where it leaves, not from its source to its
-target. The planes of an axis are then crossed at ``first + c inv``, c = 0, 1, ..., with `first` and `inv` from float64:
-float32 errs by some 1e-7 of the ray's way inside, however far the source and however short the way.
+target, and is counted in whole numbers, 2^30 to 1. Of each axis the alpha of the next plane is kept with 32 bits more
+(62 to 1); a step adds the gap between planes, without rounding. Both come from float64. So a segment errs by 1e-9 of the
+ray's way inside, however far the source and however short the way, where float32 would err by some 1e-7: a hundred times
+as much, and too much for one voxel of hundreds. It costs an addition of 64 bits where float32 takes a multiplication.
 
 Why an index never leaves its lattice. The first voxel is clamped into it. An axis is stepped only when its next plane
 lies before the end of the walk (`_pass`), and as soon as the voxel is the lattice's last one that way, the next plane is
-`_FAR` behind the end: an axis takes at most `planes` steps, which lead to the last voxel. That is counted in whole numbers,
-so it holds however the compiler rounds or fuses multiplications and additions. What these do is move a plane a little:
-the crossings of an axis still do not fall with c, so no segment is negative, and the segments add up to the way inside.
+`_FAR`, behind the end: an axis takes at most `planes` steps, which lead to the last voxel. Nothing of this is rounded, so
+it holds whatever the compiler makes of it. Gaps are not negative, so no segment is, and the segments add up to the way
+inside. Nothing overflows: a plane is crossed at less than 1, a gap is at most 1 (a plane farther off is not reached).
 
 No kernel is differentiated by Warp: the gradients are written out, like everything else.
 """
@@ -27,8 +29,12 @@ import warp as wp
 wp.set_module_options({"enable_backward": False, "default_grid_stride": False})
 
 _SNAP = wp.constant(wp.float64(1e-9))  # as `rays` has it
-_FAR = wp.constant(2.0)  # behind the end of every walk
+_ONE = wp.constant(wp.float64(2.0**62))
+_FAR = wp.constant(wp.int64(2**63 - 1))
+_UNIT = wp.constant(2.0**-30)
 _NO_AXIS = wp.constant(3)
+
+_vec3l = wp.types.vector(length=3, dtype=wp.int64)
 
 _Volume: Any = wp.array3d(dtype=wp.float32)
 _Numbers: Any = wp.array3d(dtype=wp.float32)  # one for a ray: fan, line, ray
@@ -51,15 +57,13 @@ class Chord:
 class Walk:
     """A ray's way through a lattice: where it is, and its next planes."""
 
-    alpha: wp.float32
-    leave: wp.float32
+    alpha: wp.int32
+    leave: wp.int32
     voxel: wp.vec3i
     step: wp.vec3i  # 1, -1 or 0
-    planes: wp.vec3f  # to cross at most: as many as voxels lie ahead in the lattice
-    crossed: wp.vec3f
-    first: wp.vec3f
-    inv: wp.vec3f
-    next: wp.vec3f  # alpha of the next plane of each axis
+    planes: wp.vec3i  # to cross at most: as many as voxels lie ahead in the lattice
+    next: _vec3l  # alpha of the next plane of each axis, with 32 bits more
+    gap: _vec3l  # between planes
     axis: wp.int32  # of the plane crossed last
     last: wp.int32
 
@@ -68,8 +72,8 @@ class Walk:
 class Beam:
     """A ray on its way through the volume and what attenuates it, and the segment that it is about to pass.
 
-    Its `volume` walk goes from 0 to 1; the walk through mu's lattice, needed where that is another (`apart`), counts alpha
-    the same, and begins and ends somewhere between.
+    Its `volume` walk goes from 0 to 1; the walk through mu's lattice, needed where that is another (`apart`), counts
+    alpha the same, and begins and ends somewhere between.
     """
 
     volume: Walk
@@ -78,7 +82,8 @@ class Beam:
     chord: wp.float32  # way inside the volume, mm
     depth: wp.float32  # integral of mu from the source on, and its summation's rest
     rest: wp.float32
-    end: wp.float32  # of the segment
+    end: wp.int32  # of the segment, and its length
+    size: wp.float32
     mu_here: wp.float32
     t: wp.float32  # integral of mu over the segment
     left: wp.float32  # of the ray, before the segment
@@ -155,26 +160,26 @@ def _chord(shape: wp.vec3i, start: wp.vec3d, direction: wp.vec3d, low: wp.float6
 
 @wp.func
 def _axis(n: int, s: wp.float64, d: wp.float64, enter: wp.float64, origin: wp.float64, scale: wp.float64):
-    """Start of a walk along one axis: voxel, step, planes ahead, `first`, `inv`."""
+    """Start of a walk along one axis: voxel, step, planes ahead, alpha of the next, gap between them."""
     voxel = wp.int32(wp.clamp(wp.floor(s + enter * d), wp.float64(0.0), wp.float64(n - 1)))
     step = int(0)
     plane = int(0)
-    planes = float(0.0)
+    planes = int(0)
     if d > wp.float64(0.0):
         step = 1
         plane = voxel + 1
-        planes = float(n - 1 - voxel)
+        planes = n - 1 - voxel
     elif d < wp.float64(0.0):
         step = -1
         plane = voxel
-        planes = float(voxel)
-    first = wp.float64(0.0)
-    inv = wp.float64(0.0)
-    if planes > 0.0:
-        begin = (enter - origin) * scale
-        first = wp.clamp(((wp.float64(plane) - s) / d - origin) * scale, begin, wp.float64(2.0))
-        inv = wp.min(wp.abs(scale / d), wp.float64(1e30))  # finite in float32: 0 inv is 0
-    return voxel, step, planes, wp.float32(first), wp.float32(inv)
+        planes = voxel
+    next = _FAR
+    gap = wp.int64(0)
+    if planes > 0:
+        first = ((wp.float64(plane) - s) / d - origin) * scale
+        next = wp.int64(wp.clamp(first, (enter - origin) * scale, wp.float64(1.0)) * _ONE)
+        gap = wp.int64(wp.min(wp.abs(scale / d), wp.float64(1.0)) * _ONE)
+    return voxel, step, planes, next, gap
 
 
 @wp.func
@@ -185,24 +190,25 @@ def _enter(
     w = Walk()
     if chord.enter >= chord.leave:
         return w  # from 0 to 0
-    vx, step_x, planes_x, first_x, inv_x = _axis(shape[0], start[0], direction[0], chord.enter, origin, scale)
-    vy, step_y, planes_y, first_y, inv_y = _axis(shape[1], start[1], direction[1], chord.enter, origin, scale)
-    vz, step_z, planes_z, first_z, inv_z = _axis(shape[2], start[2], direction[2], chord.enter, origin, scale)
+    vx, step_x, planes_x, next_x, gap_x = _axis(shape[0], start[0], direction[0], chord.enter, origin, scale)
+    vy, step_y, planes_y, next_y, gap_y = _axis(shape[1], start[1], direction[1], chord.enter, origin, scale)
+    vz, step_z, planes_z, next_z, gap_z = _axis(shape[2], start[2], direction[2], chord.enter, origin, scale)
     w.voxel = wp.vec3i(vx, vy, vz)
     w.step = wp.vec3i(step_x, step_y, step_z)
-    w.planes = wp.vec3f(planes_x, planes_y, planes_z)
-    w.first = wp.vec3f(first_x, first_y, first_z)
-    w.inv = wp.vec3f(inv_x, inv_y, inv_z)
-    w.next = wp.vec3f(
-        wp.where(planes_x > 0.0, first_x, _FAR),
-        wp.where(planes_y > 0.0, first_y, _FAR),
-        wp.where(planes_z > 0.0, first_z, _FAR),
-    )
-    w.alpha = wp.float32((chord.enter - origin) * scale)
-    w.leave = wp.float32((chord.leave - origin) * scale)
+    w.planes = wp.vec3i(planes_x, planes_y, planes_z)
+    w.next = _vec3l(next_x, next_y, next_z)
+    w.gap = _vec3l(gap_x, gap_y, gap_z)
+    w.alpha = _upper(wp.int64(wp.clamp((chord.enter - origin) * scale, wp.float64(0.0), wp.float64(1.0)) * _ONE))
+    w.leave = _upper(wp.int64(wp.clamp((chord.leave - origin) * scale, wp.float64(0.0), wp.float64(1.0)) * _ONE))
     w.axis = chord.first
     w.last = chord.last
     return w
+
+
+@wp.func
+def _upper(alpha: wp.int64):
+    """An alpha without its 32 more bits."""
+    return wp.int32(alpha >> wp.int64(32))
 
 
 @wp.func
@@ -218,7 +224,7 @@ def _through(shape: wp.vec3i, start: wp.vec3d, direction: wp.vec3d, low: wp.floa
 @wp.func
 def _crossing(w: Walk):
     """Alpha at which the walk comes to its next plane, or to its end."""
-    return wp.min(wp.min(w.next[0], w.next[1]), wp.min(w.next[2], w.leave))
+    return wp.min(wp.min(_upper(w.next[0]), _upper(w.next[1])), wp.min(_upper(w.next[2]), w.leave))
 
 
 @wp.func
@@ -226,26 +232,30 @@ def _step(w: Walk, axis: int):
     """Cross the next plane of an axis."""
     w.axis = axis
     w.voxel[axis] = w.voxel[axis] + w.step[axis]
-    w.crossed[axis] = w.crossed[axis] + 1.0
-    w.next[axis] = _FAR
-    if w.crossed[axis] < w.planes[axis]:
-        w.next[axis] = w.first[axis] + w.crossed[axis] * w.inv[axis]
+    w.planes[axis] = w.planes[axis] - 1
+    w.next[axis] = wp.where(w.planes[axis] > 0, w.next[axis] + w.gap[axis], _FAR)
     return w
 
 
 @wp.func
-def _pass(w: Walk, end: float):
+def _pass(w: Walk, end: int):
     """Walk on to `end`, at most the next crossing, and cross the plane that is there."""
     w.alpha = end
     if end >= w.leave:
         w.axis = w.last
-    elif w.next[0] <= end:
+    elif _upper(w.next[0]) <= end:
         w = _step(w, 0)
-    elif w.next[1] <= end:
+    elif _upper(w.next[1]) <= end:
         w = _step(w, 1)
-    elif w.next[2] <= end:
+    elif _upper(w.next[2]) <= end:
         w = _step(w, 2)
     return w
+
+
+@wp.func
+def _number(alpha: int):
+    """An alpha, or a part of it, as a number."""
+    return float(alpha) * _UNIT
 
 
 @wp.func
@@ -275,7 +285,7 @@ def integrate(volume: _Volume, fans: _Fans, first_line: int, integrals: _Numbers
     rest = float(0.0)
     while w.alpha < w.leave:
         end = _crossing(w)
-        total, rest = _plus(total, rest, (end - w.alpha) * volume[w.voxel[0], w.voxel[1], w.voxel[2]])
+        total, rest = _plus(total, rest, _number(end - w.alpha) * volume[w.voxel[0], w.voxel[1], w.voxel[2]])
         w = _pass(w, end)
     integrals[f, i, j] = total * wp.float32(_length(fans, f, first_line + i, j) * (chord.leave - chord.enter))
 
@@ -289,7 +299,7 @@ def spread(volume: _Volume, fans: _Fans, first_line: int, values: _Numbers):
     value = values[f, i, j] * wp.float32(_length(fans, f, first_line + i, j) * (chord.leave - chord.enter))
     while w.alpha < w.leave:
         end = _crossing(w)
-        wp.atomic_add(volume, w.voxel[0], w.voxel[1], w.voxel[2], (end - w.alpha) * value)
+        wp.atomic_add(volume, w.voxel[0], w.voxel[1], w.voxel[2], _number(end - w.alpha) * value)
         w = _pass(w, end)
 
 
@@ -334,14 +344,14 @@ def differentiate(volume: _Volume, fans: _Fans, first_line: int, rows: _Rows):
         value = volume[w.voxel[0], w.voxel[1], w.voxel[2]]
         jump = _on(w.axis) * (before - value)
         jumps += jump
-        moments += jump * w.alpha
+        moments += jump * _number(w.alpha)
         before = value
         end = _crossing(w)
-        total, rest = _plus(total, rest, (end - w.alpha) * value)
+        total, rest = _plus(total, rest, _number(end - w.alpha) * value)
         w = _pass(w, end)
     jump = _on(w.axis) * before
     jumps += jump
-    moments += jump * w.alpha
+    moments += jump * _number(w.alpha)
     rows[f, i, j, 0] = total * wp.float32(chord.leave - chord.enter)
     _write_ends(rows, f, i, j, 1, direction, wp.vec3d(jumps), _moments(chord, jumps, moments))
 
@@ -374,7 +384,7 @@ def _before(mu: _Volume, start: wp.vec3d, direction: wp.vec3d, high: wp.float64)
     rest = float(0.0)
     while w.alpha < w.leave:
         end = _crossing(w)
-        total, rest = _plus(total, rest, (end - w.alpha) * mu[w.voxel[0], w.voxel[1], w.voxel[2]])
+        total, rest = _plus(total, rest, _number(end - w.alpha) * mu[w.voxel[0], w.voxel[1], w.voxel[2]])
         w = _pass(w, end)
     return total * wp.float32(chord.leave - chord.enter)
 
@@ -413,9 +423,10 @@ def _look(beam: Beam, mu: _Volume):
     elif alpha < beam.mu.leave:
         beam.end = wp.min(beam.end, _crossing(beam.mu))
         beam.mu_here = mu[beam.mu.voxel[0], beam.mu.voxel[1], beam.mu.voxel[2]]
-    beam.t = beam.mu_here * beam.chord * (beam.end - alpha)
+    beam.size = _number(beam.end - alpha)
+    beam.t = beam.mu_here * beam.chord * beam.size
     beam.left = wp.exp(-beam.depth)
-    beam.seen = beam.left * (beam.end - alpha) * _mean_transmission(beam.t)
+    beam.seen = beam.left * beam.size * _mean_transmission(beam.t)
     return beam
 
 
@@ -496,7 +507,7 @@ def differentiate_attenuated(
     done_moments = wp.vec3f()
     while beam.volume.alpha < beam.volume.leave:
         beam = _look(beam, mu)
-        alpha = beam.volume.alpha
+        alpha = _number(beam.volume.alpha)
         value = volume[beam.volume.voxel[0], beam.volume.voxel[1], beam.volume.voxel[2]]
         # A lattice whose plane this is not has no jump here: the same voxel on both sides.
         jump = _on(beam.volume.axis) * ((before - value) * beam.left)
@@ -512,8 +523,7 @@ def differentiate_attenuated(
         done_jumps += jump * total
         done_moments += jump * (alpha * total)
         mu_before = beam.mu_here
-        step = beam.end - alpha
-        by_length += value * beam.left * step * (
+        by_length += value * beam.left * beam.size * (
             beam.depth * _mean_transmission(beam.t) + beam.t * _first_moment(beam.t)
         )
         total, rest = _plus(total, rest, beam.seen * value)
@@ -538,7 +548,7 @@ def differentiate_attenuated(
             value = mu[w.voxel[0], w.voxel[1], w.voxel[2]]
             jump = _on(w.axis) * ((before - value) * total)
             jumps += jump
-            moments += jump * w.alpha
+            moments += jump * _number(w.alpha)
             before = value
             w = _pass(w, _crossing(w))
         jump = _on(w.axis) * (before * total)
@@ -579,7 +589,7 @@ def spread_on_mu(
         all = value * total * wp.float32(_length(fans, f, line, j) * (ahead.leave - ahead.enter))
         while w.alpha < w.leave:
             end = _crossing(w)
-            wp.atomic_add(gradient, w.voxel[0], w.voxel[1], w.voxel[2], (end - w.alpha) * all)
+            wp.atomic_add(gradient, w.voxel[0], w.voxel[1], w.voxel[2], _number(end - w.alpha) * all)
             w = _pass(w, end)
     value = value * beam.chord
     done = float(0.0)
@@ -588,13 +598,12 @@ def spread_on_mu(
         beam = _look(beam, mu)
         here = volume[beam.volume.voxel[0], beam.volume.voxel[1], beam.volume.voxel[2]]
         done, rest = _plus(done, rest, beam.seen * here)
-        step = beam.end - beam.volume.alpha
         v = beam.volume.voxel
         inside = bool(True)
         if beam.apart != 0:
             v = beam.mu.voxel
             inside = beam.mu.alpha <= beam.volume.alpha and beam.volume.alpha < beam.mu.leave
         if inside:
-            own = here * beam.left * step * _first_moment(beam.t)
-            wp.atomic_add(gradient, v[0], v[1], v[2], value * step * (total - done + own))
+            own = here * beam.left * beam.size * _first_moment(beam.t)
+            wp.atomic_add(gradient, v[0], v[1], v[2], value * beam.size * (total - done + own))
         beam = _move(beam)

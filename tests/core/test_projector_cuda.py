@@ -15,6 +15,7 @@ from mphdrr.core.projector import Emission, Projector, backends, operator, siddo
 from mphdrr.core.projector import trace_rays as trace  # noqa: E402
 from mphdrr.core.projector.models import view_rays  # noqa: E402
 from mphdrr.core.projector.rays import Attenuation, IndexFans, IndexRays, index_fan  # noqa: E402
+from mphdrr.core.views import Views  # noqa: E402
 from mphdrr.core.volume import Volume  # noqa: E402
 
 from .conftest import general_grid  # noqa: E402
@@ -59,6 +60,32 @@ def test_far_sources_and_short_chords(distance, rng):
     assert (expected > 0).all() and expected.min() < 1e-2 < 100 < expected.max()
     # The coordinates themselves are rounded: by 1e-10 mm, of a source 1e6 mm away.
     np.testing.assert_allclose(trace(volume, sources, targets, "cuda"), expected, rtol=2e-5, atol=1e-9 * distance / 1e3)
+
+
+def test_thousands_of_voxels_do_not_add_up_errors():
+    volume = np.full((5000, 1, 1), 0.7, np.float32)
+    starts, along = np.array([[-7.0, 0.4, 0.4]]), np.array([[6011.0, 0.1, 0.2]])
+    rays = IndexRays(starts, along, np.linalg.norm(along, axis=1))
+    for mu in (None, np.full(volume.shape, 3e-4, np.float32)):
+        expected = siddon_numpy.forward(volume.astype(float), rays, weakened(mu, None))
+        np.testing.assert_allclose(siddon_cuda.forward(volume, rays, weakened(mu, None)), expected, rtol=5e-7)
+
+
+@pytest.mark.parametrize("kind", LINEAR)
+def test_fans_in_planes_of_faces(kind, rng):
+    """Rays that are made on the device belong to the same voxels as the reference's, up to which rounding may not go."""
+    grid = Grid(SHAPE, affine(LINEAR[kind], SHAPE))
+    sources = np.array([[-9.5, 2.5, 1.5], [2.5, -9.5, 1.5], [2.5, 3.5, -9.5]] * 2)  # of the voxels' centres
+    targets = sources + np.array([[30, 0, 0], [0, 30, 0], [0, 0, 30], [30, 10, 0], [10, 30, 0], [0, 10, 30]])
+    steps = np.roll(np.eye(3), 1, axis=0)[[0, 1, 2] * 2], np.roll(np.eye(3), 2, axis=0)[[0, 1, 2] * 2]
+    linear = grid.affine[:3, :3].T
+    ends = [points @ linear + grid.affine[:3, 3] for points in (sources, targets)]
+    views = Views(*ends, *(step @ linear for step in steps), (5, 5))
+    volume = rng.uniform(0.5, 1.5, SHAPE).astype(np.float32)
+    for x in (volume, volume * (np.indices(SHAPE).sum(axis=0) % 2)):
+        expected = Projector(grid, views, backend="numpy")(x)
+        assert expected.any(axis=(1, 2)).all()
+        np.testing.assert_allclose(Projector(grid, views, backend="cuda")(x), expected, rtol=2e-5, atol=2e-5)
 
 
 WEAKENED = ["mu on the same grid", "mu on another grid"]

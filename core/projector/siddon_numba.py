@@ -15,7 +15,7 @@ from numba import njit, types
 from numpy.typing import NDArray
 
 from .compiling import compiled
-from .rays import Attenuation, IndexFan, IndexRays
+from .rays import Attenuation, IndexFan, IndexFans, IndexRays
 
 _READ_F32 = types.Array(types.float32, 3, "C", readonly=True)
 _READ_F64_1D = types.Array(types.float64, 1, "C", readonly=True)
@@ -74,7 +74,7 @@ def _forward_kernel() -> Any:
     return compiled(_integrate, types.void(_READ_F32, *_RAYS, _F64_1D))
 
 
-def _contiguous(rays: IndexRays | IndexFan) -> tuple[NDArray[np.float64], ...]:
+def _contiguous(rays: IndexRays | IndexFan | IndexFans) -> tuple[NDArray[np.float64], ...]:
     rays = rays.listed()
     return tuple(np.ascontiguousarray(a) for a in (rays.starts, rays.directions, rays.lengths))
 

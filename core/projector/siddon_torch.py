@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from .rays import Attenuation, IndexFan, IndexRays
+from .rays import Attenuation, IndexFan, IndexFans, IndexRays
 
 # Crossings held at once, per kind of device: some ten arrays of this many float64 exist at the same time.
 _CROSSINGS_CPU = 2**19
@@ -95,7 +95,7 @@ class _Line:
         return _Line(self.starts[which], self.directions[which], self.lengths[which])
 
 
-def _on_device(rays: IndexRays | IndexFan, device: torch.device) -> _Line:
+def _on_device(rays: IndexRays | IndexFan | IndexFans, device: torch.device) -> _Line:
     real = torch.float32 if device.type == "mps" else torch.float64  # Apple's GPUs have no float64
     rays = rays.listed()
     return _Line(*(torch.as_tensor(a, dtype=real).to(device) for a in (rays.starts, rays.directions, rays.lengths)))

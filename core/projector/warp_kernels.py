@@ -1,4 +1,5 @@
 # mypy: disable-error-code="no-untyped-def, valid-type"
+# ruff: noqa: UP018, RUF046 -- to Warp 0.0 is a constant and float(0.0) a variable
 """Kernels of the "cuda" backend, for NVIDIA Warp: one thread a ray, in one launch the rays of several fans.
 
 A ray walks from voxel to voxel; nothing is stored or sorted. The walk is written once (`_enter`, `_crossing`, `_pass`);
@@ -34,7 +35,7 @@ _FAR = wp.constant(wp.int64(2**63 - 1))
 _UNIT = wp.constant(2.0**-30)
 _NO_AXIS = wp.constant(3)
 
-_vec3l = wp.types.vector(length=3, dtype=wp.int64)
+_vec3l: Any = wp.types.vector(length=3, dtype=wp.int64)
 
 _Volume: Any = wp.array3d(dtype=wp.float32)
 _Numbers: Any = wp.array3d(dtype=wp.float32)  # one for a ray: fan, line, ray
@@ -183,9 +184,7 @@ def _axis(n: int, s: wp.float64, d: wp.float64, enter: wp.float64, origin: wp.fl
 
 
 @wp.func
-def _enter(
-    chord: Chord, shape: wp.vec3i, start: wp.vec3d, direction: wp.vec3d, origin: wp.float64, scale: wp.float64
-):
+def _enter(chord: Chord, shape: wp.vec3i, start: wp.vec3d, direction: wp.vec3d, origin: wp.float64, scale: wp.float64):
     """A walk along `chord`, where alpha is ``(alpha from source to target - origin) scale``; a miss is at its end."""
     w = Walk()
     if chord.enter >= chord.leave:
@@ -390,9 +389,7 @@ def _before(mu: _Volume, start: wp.vec3d, direction: wp.vec3d, high: wp.float64)
 
 
 @wp.func
-def _open(
-    shape: wp.vec3i, mu: _Volume, fans: _Fans, mu_fans: _Fans, apart: int, f: int, line: int, ray: int
-):
+def _open(shape: wp.vec3i, mu: _Volume, fans: _Fans, mu_fans: _Fans, apart: int, f: int, line: int, ray: int):
     """A ray where it enters the volume, and its part inside."""
     beam = Beam()
     start, direction = _ray(fans, f, line, ray)
@@ -461,7 +458,7 @@ def integrate_attenuated(
 ):
     """Line integrals, attenuated towards the sources."""
     f, i, j = wp.tid()
-    beam, chord = _open(_shape(volume), mu, fans, mu_fans, apart, f, first_line + i, j)
+    beam, _ = _open(_shape(volume), mu, fans, mu_fans, apart, f, first_line + i, j)
     integrals[f, i, j] = beam.chord * _sum(beam, volume, mu)
 
 
@@ -471,7 +468,7 @@ def spread_attenuated(
 ):
     """The adjoint of `integrate_attenuated`."""
     f, i, j = wp.tid()
-    beam, chord = _open(_shape(volume), mu, fans, mu_fans, apart, f, first_line + i, j)
+    beam, _ = _open(_shape(volume), mu, fans, mu_fans, apart, f, first_line + i, j)
     value = values[f, i, j] * beam.chord
     while beam.volume.alpha < beam.volume.leave:
         beam = _look(beam, mu)
@@ -491,7 +488,7 @@ def differentiate_attenuated(
     f, i, j = wp.tid()
     line = first_line + i
     beam, chord = _open(_shape(volume), mu, fans, mu_fans, apart, f, line, j)
-    start, direction = _ray(fans, f, line, j)
+    _, direction = _ray(fans, f, line, j)
     mu_start, mu_direction = _ray(mu_fans, f, line, j)
     length = _length(fans, f, line, j)
     total = float(0.0)
@@ -523,8 +520,8 @@ def differentiate_attenuated(
         done_jumps += jump * total
         done_moments += jump * (alpha * total)
         mu_before = beam.mu_here
-        by_length += value * beam.left * beam.size * (
-            beam.depth * _mean_transmission(beam.t) + beam.t * _first_moment(beam.t)
+        by_length += (
+            value * beam.left * beam.size * (beam.depth * _mean_transmission(beam.t) + beam.t * _first_moment(beam.t))
         )
         total, rest = _plus(total, rest, beam.seen * value)
         beam = _move(beam)

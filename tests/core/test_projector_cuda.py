@@ -9,17 +9,17 @@ import pytest
 
 pytest.importorskip("warp", reason="warp-lang is not installed")
 
-from mphdrr.core.errors import InputError  # noqa: E402
-from mphdrr.core.grid import Grid  # noqa: E402
-from mphdrr.core.projector import Emission, Projector, backends, operator, siddon_cuda, siddon_numpy  # noqa: E402
-from mphdrr.core.projector import trace_rays as trace  # noqa: E402
-from mphdrr.core.projector.models import view_rays  # noqa: E402
-from mphdrr.core.projector.rays import Attenuation, IndexFans, IndexRays, index_fan  # noqa: E402
-from mphdrr.core.views import Views  # noqa: E402
-from mphdrr.core.volume import Volume  # noqa: E402
+from mphdrr.core.errors import InputError
+from mphdrr.core.grid import Grid
+from mphdrr.core.projector import Emission, Projector, backends, operator, siddon_cuda, siddon_numpy
+from mphdrr.core.projector import trace_rays as trace
+from mphdrr.core.projector.models import view_rays
+from mphdrr.core.projector.rays import Attenuation, IndexFans, IndexRays, index_fan
+from mphdrr.core.views import Views
+from mphdrr.core.volume import Volume
 
-from .conftest import general_grid  # noqa: E402
-from .test_projector import LINEAR, SHAPES, affine, nasty_rays, random_rays, some_views  # noqa: E402
+from .conftest import general_grid
+from .test_projector import LINEAR, SHAPES, affine, nasty_rays, random_rays, some_views
 
 SHAPE, MU_SHAPE = (6, 7, 5), (5, 4, 8)
 

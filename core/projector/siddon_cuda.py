@@ -14,6 +14,7 @@ from __future__ import annotations
 import atexit
 import ctypes
 import functools
+import math
 import os
 import shutil
 import sys
@@ -53,7 +54,7 @@ def forward(volume: ArrayOrTensor, rays: Rays, attenuation: Attenuation | None =
     """Line integrals (N,), value x mm, of `volume` (n_x, n_y, n_z) along `rays`, attenuated towards their sources."""
     name = "integrate" if attenuation is None else "integrate_attenuated"
     with _Call(volume, rays, attenuation) as call:
-        return call.rows(name, [call.on_device(volume, "the volume")])[..., 0]
+        return call.rows(name, [call.on_device(volume, "the volume")])
 
 
 def adjoint(volume: ArrayOrTensor, values: ArrayOrTensor, rays: Rays, attenuation: Attenuation | None = None) -> None:
@@ -166,17 +167,17 @@ class _Call:
             )
         return wp.array(array, dtype=wp.float32, device=self._device)
 
-    def rows(self, name: str, volumes: list[Any], columns: int = 1) -> ArrayOrTensor:
-        """What a kernel writes, `columns` numbers a ray: (N, columns)."""
+    def rows(self, name: str, volumes: list[Any], *columns: int) -> ArrayOrTensor:
+        """What a kernel writes, (N,), or (N, columns)."""
         volumes += self._mu()
-        shape = (len(self._fans), self._lines, self._rays, columns)
+        shape = (len(self._fans), self._lines, self._rays, *columns)
         result = self._like.new_empty(shape) if is_tensor(self._like) else np.empty(shape, np.float32)
-        for fans, lines in self._pieces(columns):
+        for fans, lines in self._pieces(math.prod(columns)):
             piece = result[fans, lines]
             out = wp.from_torch(piece) if is_tensor(piece) else wp.empty(piece.shape, wp.float32, device=self._device)
-            self._launch(name, fans, lines, volumes, out if columns > 1 else out.reshape(out.shape[:3]))
+            self._launch(name, fans, lines, volumes, out)
             _copy_back(out, piece)
-        return result.reshape(-1, columns)
+        return result.reshape(-1, *columns)
 
     def spread(self, name: str, volumes: list[Any], values: ArrayOrTensor) -> None:
         """Launch a kernel that adds each ray's value of `values` (N,) to the first of `volumes`."""

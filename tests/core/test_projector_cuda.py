@@ -206,14 +206,16 @@ def test_rays_of_fans_are_the_listed_rays(rng, small_pieces):
         np.testing.assert_array_equal(together, np.concatenate([function(volume, fan) for fan in fans.fans]))
 
 
-def test_tensors_on_the_device_are_not_copied(rng):
+@pytest.mark.parametrize("rays_at_once", [2**24, 17])
+def test_tensors_on_the_device_are_not_copied(rays_at_once, rng, monkeypatch):
+    monkeypatch.setattr(siddon_cuda, "_RAYS_AT_ONCE", rays_at_once)
     torch = pytest.importorskip("torch", reason="torch is not installed")
     grid = Grid(SHAPE, affine(LINEAR["rotated"], SHAPE))
     place = "cuda" if os.environ[siddon_cuda.DEVICE_VARIABLE] != "cpu" else "cpu"
     volume = torch.tensor(rng.random(SHAPE), dtype=torch.float32, device=place)
     assert siddon_cuda.native(volume).data_ptr() == volume.data_ptr()
 
-    fan = index_fan(grid, view_rays(some_views(rng), 0))
+    fan = index_fan(grid, view_rays(some_views(rng, (9, 5)), 0))
     integrals = siddon_cuda.forward(volume, fan)
     assert integrals.device == volume.device and integrals.dtype == torch.float32
     np.testing.assert_allclose(integrals.cpu(), siddon_cuda.forward(volume.cpu().numpy(), fan), rtol=1e-6)

@@ -41,6 +41,7 @@ DEVICE_VARIABLE = "MPHDRR_CUDA_DEVICE"
 """Environment variable: the Warp device for arrays, "cuda" if not set. "cpu" runs the kernels without a GPU: for tests."""
 
 _RAYS_AT_ONCE = 2**24
+_FEWEST_RAYS = 2**14  # some megabytes; torch may hold memory that it does not use
 _BYTES_OF_A_FAN = 2 * 8 * 24  # in the index space of the volume and of mu
 _BYTES_OF_A_PLANE = 2**31  # Warp's strides are 32 bits wide; offsets are 64
 
@@ -149,9 +150,12 @@ class _Call:
             self._stream.__enter__()
         return self
 
-    def __exit__(self, *error: object) -> None:
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, traceback: Any) -> None:
         if self._stream is not None:
-            self._stream.__exit__(*error)
+            self._stream.__exit__(kind, error, traceback)
+        if isinstance(error, RuntimeError) and "Failed to allocate" in str(error):
+            free = readable_size(self._device.free_memory)
+            raise InputError(f"backend 'cuda': {self._device.name} has too little free memory, {free}") from error
 
     def on_device(self, array: ArrayOrTensor, what: str) -> Any:
         """`array` as an array of Warp, copied only where it is not on the device."""
@@ -197,7 +201,8 @@ class _Call:
     def _pieces(self, columns: int) -> Iterator[tuple[slice, slice]]:
         """Which fans, and which of their lines, are launched together."""
         bytes_of_a_ray = 4 * columns + _BYTES_OF_A_FAN / (self._lines * self._rays)
-        at_once = max(1, min(_RAYS_AT_ONCE, int(self._device.free_memory / 2 / bytes_of_a_ray)))
+        affordable = max(_FEWEST_RAYS, int(self._device.free_memory / 2 / bytes_of_a_ray))
+        at_once = min(_RAYS_AT_ONCE, affordable)
         fans = max(1, at_once // (self._lines * self._rays))
         lines = self._lines if fans > 1 else min(self._lines, max(1, at_once // self._rays))
         for fan in range(0, len(self._fans), fans):

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import os
+import sys
 
 import numpy as np
 import pytest
 
-pytest.importorskip("warp", reason="warp-lang is not installed")
+warp = pytest.importorskip("warp", reason="warp-lang is not installed")
 
 from mphdrr.core.errors import InputError
 from mphdrr.core.grid import Grid
@@ -265,6 +266,30 @@ def test_what_is_missing_is_said_in_one_line(monkeypatch):
     assert "cuda:99" in refusal()
     monkeypatch.setattr(backends, "load", without_warp)
     assert "pip install warp-lang" in refusal()
+
+
+def test_short_memory_means_more_launches(monkeypatch, rng):
+    grid = Grid(SHAPE, affine(LINEAR["sheared"], SHAPE))
+    views = some_views(rng, (7, 30), n=4)
+    fans = IndexFans(tuple(index_fan(grid, view_rays(views, m)) for m in range(4)))
+    volume = rng.random(SHAPE, dtype=np.float32)
+    launches = []
+    launch = warp.launch
+    monkeypatch.setattr(warp, "launch", lambda *a, **k: launches.append(a[1]) or launch(*a, **k))
+    expected = siddon_cuda.forward(volume, fans)
+    monkeypatch.setattr(siddon_cuda, "_FEWEST_RAYS", 1)
+    monkeypatch.setattr(type(siddon_cuda.device()), "free_memory", 1000)  # 500 for the rays: 2 or 3 lines of a view
+    np.testing.assert_array_equal(siddon_cuda.forward(volume, fans), expected)
+    assert launches[0] == (4, 7, 30) and len(launches) > 8 and {dim[0] for dim in launches[1:]} == {1}
+
+
+@pytest.mark.skipif(sys.platform == "darwin", reason="Warp has no CUDA on macOS")
+def test_kernels_compile_for_gpus_without_one(tmp_path):
+    from mphdrr.core.projector import warp_kernels
+
+    siddon_cuda.device()
+    (compiled,) = warp.compile_aot_module(warp_kernels, arch=75, module_dir=tmp_path, use_ptx=True)
+    assert compiled.read_text().count(".entry") == 7
 
 
 def test_volume_too_large_for_the_device_is_refused(monkeypatch, rng):

@@ -8,7 +8,9 @@ import sys
 import numpy as np
 import pytest
 
-warp = pytest.importorskip("warp", reason="warp-lang is not installed")
+pytest.importorskip("warp", reason="warp-lang is not installed")
+
+import warp
 
 from mphdrr.core.errors import InputError
 from mphdrr.core.grid import Grid

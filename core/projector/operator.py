@@ -255,9 +255,8 @@ class Projector(LinearOperator):
         Yields which of `views` they are of, whether their lines are the images' columns, weights (as many, lines, rays),
         rays and attenuation.
         """
-        for beams in zip(
-            *map(self._beams, views), strict=True
-        ):  # the first of every view, the second of every view ...
+        # The first beams of all views, their second, ...
+        for beams in zip(*map(self._beams, views), strict=True):
             for by_columns in (False, True):
                 group = [(k, beam) for k, (beam, columns) in enumerate(beams) if columns == by_columns]
                 if not group:

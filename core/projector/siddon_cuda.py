@@ -87,7 +87,7 @@ def mu_gradient(
 def native(x: ArrayOrTensor) -> ArrayOrTensor:
     """`x` as float32: a tensor that is on the device stays there, all else becomes an array."""
     if is_tensor(x) and (x.is_cuda or (x.device.type == "cpu" and device().is_cpu)):
-        return x.detach().float().contiguous()
+        return x.detach().float().resolve_neg().contiguous()  # Warp does not see torch's lazy minus sign
     return to_numpy(x, np.float32)
 
 
@@ -190,7 +190,7 @@ class _Call:
         for fans, lines in self._pieces(1):
             piece = values[fans, lines]
             if is_tensor(piece):
-                piece = wp.from_torch(piece.float().contiguous())
+                piece = wp.from_torch(native(piece))
             else:
                 piece = wp.array(np.ascontiguousarray(piece, np.float32), dtype=wp.float32, device=self._device)
             self._launch(name, fans, lines, volumes, piece)

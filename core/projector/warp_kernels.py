@@ -136,10 +136,11 @@ def _clip(chord: Chord, axis: int, n: int, s: wp.float64, d: wp.float64):
         return chord
     low = -s / d
     high = (wp.float64(n) - s) / d
-    if wp.min(low, high) > chord.enter:
+    # A plane where the part ends counts (a part may end at another lattice's plane), but none where the ray itself ends.
+    if wp.min(low, high) >= chord.enter and wp.min(low, high) > wp.float64(0.0):
         chord.enter = wp.min(low, high)
         chord.first = axis
-    if wp.max(low, high) < chord.leave:
+    if wp.max(low, high) <= chord.leave and wp.max(low, high) < wp.float64(1.0):
         chord.leave = wp.max(low, high)
         chord.last = axis
     return chord
@@ -160,9 +161,18 @@ def _chord(shape: wp.vec3i, start: wp.vec3d, direction: wp.vec3d, low: wp.float6
 
 
 @wp.func
-def _axis(n: int, s: wp.float64, d: wp.float64, enter: wp.float64, origin: wp.float64, scale: wp.float64):
-    """Start of a walk along one axis: voxel, step, planes ahead, alpha of the next, gap between them."""
-    voxel = wp.int32(wp.clamp(wp.floor(s + enter * d), wp.float64(0.0), wp.float64(n - 1)))
+def _voxel(shape: wp.vec3i, point: wp.vec3d):
+    """The voxel in which a point lies, or the one nearest to it."""
+    voxel = wp.vec3i()
+    for axis in range(3):
+        last = wp.float64(shape[axis] - 1)
+        voxel[axis] = wp.int32(wp.clamp(wp.floor(point[axis]), wp.float64(0.0), last))
+    return voxel
+
+
+@wp.func
+def _axis(n: int, voxel: int, s: wp.float64, d: wp.float64, enter: wp.float64, origin: wp.float64, scale: wp.float64):
+    """Start of a walk along one axis: step, planes ahead, alpha of the next, gap between them."""
     step = int(0)
     plane = int(0)
     planes = int(0)
@@ -180,19 +190,31 @@ def _axis(n: int, s: wp.float64, d: wp.float64, enter: wp.float64, origin: wp.fl
         first = ((wp.float64(plane) - s) / d - origin) * scale
         next = wp.int64(wp.clamp(first, (enter - origin) * scale, wp.float64(1.0)) * _ONE)
         gap = wp.int64(wp.min(wp.abs(scale / d), wp.float64(1.0)) * _ONE)
-    return voxel, step, planes, next, gap
+    return step, planes, next, gap
 
 
 @wp.func
-def _enter(chord: Chord, shape: wp.vec3i, start: wp.vec3d, direction: wp.vec3d, origin: wp.float64, scale: wp.float64):
-    """A walk along `chord`, where alpha is ``(alpha from source to target - origin) scale``; a miss is at its end."""
+def _enter(
+    chord: Chord,
+    voxel: wp.vec3i,
+    shape: wp.vec3i,
+    start: wp.vec3d,
+    direction: wp.vec3d,
+    origin: wp.float64,
+    scale: wp.float64,
+):
+    """A walk along `chord` from `voxel` on, where alpha is ``(alpha from source to target - origin) scale``.
+
+    A miss is at its end.
+    """
     w = Walk()
     if chord.enter >= chord.leave:
         return w  # from 0 to 0
-    vx, step_x, planes_x, next_x, gap_x = _axis(shape[0], start[0], direction[0], chord.enter, origin, scale)
-    vy, step_y, planes_y, next_y, gap_y = _axis(shape[1], start[1], direction[1], chord.enter, origin, scale)
-    vz, step_z, planes_z, next_z, gap_z = _axis(shape[2], start[2], direction[2], chord.enter, origin, scale)
-    w.voxel = wp.vec3i(vx, vy, vz)
+    enter = chord.enter
+    step_x, planes_x, next_x, gap_x = _axis(shape[0], voxel[0], start[0], direction[0], enter, origin, scale)
+    step_y, planes_y, next_y, gap_y = _axis(shape[1], voxel[1], start[1], direction[1], enter, origin, scale)
+    step_z, planes_z, next_z, gap_z = _axis(shape[2], voxel[2], start[2], direction[2], enter, origin, scale)
+    w.voxel = voxel
     w.step = wp.vec3i(step_x, step_y, step_z)
     w.planes = wp.vec3i(planes_x, planes_y, planes_z)
     w.next = _vec3l(next_x, next_y, next_z)
@@ -217,7 +239,9 @@ def _through(shape: wp.vec3i, start: wp.vec3d, direction: wp.vec3d, low: wp.floa
     if chord.enter >= chord.leave:
         chord.leave = chord.enter
         return Walk(), chord
-    return _enter(chord, shape, start, direction, chord.enter, wp.float64(1.0) / (chord.leave - chord.enter)), chord
+    voxel = _voxel(shape, start + direction * chord.enter)
+    scale = wp.float64(1.0) / (chord.leave - chord.enter)
+    return _enter(chord, voxel, shape, start, direction, chord.enter, scale), chord
 
 
 @wp.func
@@ -377,7 +401,7 @@ def _first_moment(t: float):
 
 @wp.func
 def _before(mu: _Volume, start: wp.vec3d, direction: wp.vec3d, high: wp.float64):
-    """Integral over alpha, from source to target, of mu from the source to `high`."""
+    """Integral of mu over alpha, from source to target, from the source to `high`; and the walk and part inside."""
     w, chord = _through(_shape(mu), start, direction, wp.float64(0.0), high)
     total = float(0.0)
     rest = float(0.0)
@@ -385,7 +409,7 @@ def _before(mu: _Volume, start: wp.vec3d, direction: wp.vec3d, high: wp.float64)
         end = _crossing(w)
         total, rest = _plus(total, rest, _number(end - w.alpha) * mu[w.voxel[0], w.voxel[1], w.voxel[2]])
         w = _pass(w, end)
-    return total * wp.float32(chord.leave - chord.enter)
+    return total * wp.float32(chord.leave - chord.enter), w, chord
 
 
 @wp.func
@@ -400,10 +424,15 @@ def _open(shape: wp.vec3i, mu: _Volume, fans: _Fans, mu_fans: _Fans, apart: int,
     beam.chord = wp.float32(length * (chord.leave - chord.enter))
     if apart != 0 and w.alpha < w.leave:
         start, direction = _ray(mu_fans, f, line, ray)
-        beam.depth = wp.float32(length) * _before(mu, start, direction, chord.enter)
+        depth, ahead, way = _before(mu, start, direction, chord.enter)
+        beam.depth = wp.float32(length) * depth
         within = _chord(_shape(mu), start, direction, chord.enter, chord.leave)
+        # The walk goes on from where it is: at a plane that is just there, rounding must not cross it twice or never.
+        voxel = _voxel(_shape(mu), start + direction * within.enter)
+        if way.leave > way.enter:
+            voxel = ahead.voxel
         scale = wp.float64(1.0) / (chord.leave - chord.enter)
-        beam.mu = _enter(within, _shape(mu), start, direction, chord.enter, scale)
+        beam.mu = _enter(within, voxel, _shape(mu), start, direction, chord.enter, scale)
     return beam, chord
 
 
@@ -502,6 +531,10 @@ def differentiate_attenuated(
     mu_moments = wp.vec3f()
     done_jumps = wp.vec3f()
     done_moments = wp.vec3f()
+    if apart != 0 and beam.mu.axis == _NO_AXIS:  # inside mu's lattice already
+        mu_before = mu[beam.mu.voxel[0], beam.mu.voxel[1], beam.mu.voxel[2]]
+        if beam.mu.alpha >= beam.mu.leave:  # and just about to leave it
+            beam.mu.axis = beam.mu.last
     while beam.volume.alpha < beam.volume.leave:
         beam = _look(beam, mu)
         alpha = _number(beam.volume.alpha)

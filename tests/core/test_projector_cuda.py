@@ -150,6 +150,29 @@ def test_derivatives_are_finite_differences(lattices):
         assert np.count_nonzero(wrong) <= 1 and np.count_nonzero(b) > 100, column
 
 
+@pytest.mark.parametrize("rounding", [False, True])
+def test_derivatives_depend_on_mu_and_not_on_its_grid(rounding, rng):
+    """Mu on the volume's lattice, on one twice as fine, on one that goes on outside and on a part: planes met at once."""
+    volume, mu = single(rng.random(SHAPE), rng.random(SHAPE) * 0.1)
+    mu[0], mu[:, :, 3:] = 0, 0
+    starts, ends = rng.normal(size=(2, 3000, 3)) * 6 + np.array(SHAPE) / 2
+    lengths = np.linalg.norm(ends - starts, axis=1)
+    expected = siddon_cuda.derivatives(volume, IndexRays(starts, ends - starts, lengths), Attenuation(mu))
+    if rounding:
+        linear = rng.normal(size=(3, 3))
+        starts, ends = (points @ linear @ np.linalg.inv(linear) for points in (starts, ends))
+    for array, factor, shift in (
+        (mu.repeat(2, 0).repeat(2, 1).repeat(2, 2), 2, (0, 0, 0)),
+        (np.pad(mu, ((1, 1), (2, 0), (3, 4))), 1, (1, 2, 3)),
+        (mu[1:, :, :3].copy(), 1, (-1, 0, 0)),
+    ):
+        behind = IndexRays(starts * factor + shift, (ends - starts) * factor, lengths)
+        got = siddon_cuda.derivatives(volume, IndexRays(starts, ends - starts, lengths), Attenuation(array, behind))
+        got[:, 7:13] *= factor
+        assert np.count_nonzero(got[:, 7:13]) > 2000
+        np.testing.assert_allclose(got, expected, rtol=0, atol=2e-6 * np.abs(expected).max(axis=0))
+
+
 @pytest.mark.parametrize("lattices", WEAKENED, indirect=True)
 def test_gradient_by_mu_is_a_finite_difference(lattices, rng, small_pieces):
     volume, rays, mu, mu_rays = lattices
@@ -222,6 +245,7 @@ def test_tensors_on_the_device_are_not_copied(rays_at_once, rng, monkeypatch):
     integrals = siddon_cuda.forward(volume, fan)
     assert integrals.device == volume.device and integrals.dtype == torch.float32
     np.testing.assert_allclose(integrals.cpu(), siddon_cuda.forward(volume.cpu().numpy(), fan), rtol=1e-6)
+    torch.testing.assert_close(siddon_cuda.forward(siddon_cuda.native(torch._neg_view(volume)), fan), -integrals)
     filled = torch.zeros_like(volume)
     siddon_cuda.adjoint(filled, integrals, fan)
     torch.testing.assert_close((filled * volume).sum(), (integrals**2).sum())

@@ -51,17 +51,17 @@ class DerenzoSettings:
     def phantom(self) -> DerenzoPhantom:
         """The phantom; float32 settings are read as the decimal numbers that the user typed."""
         return DerenzoPhantom(
-            _typed(self.radius),
-            tuple(_typed(w) for w in self.rod_diameters),
-            _typed(self.height),
-            _typed(self.activity),
+            typed(self.radius),
+            tuple(typed(w) for w in self.rod_diameters),
+            typed(self.height),
+            typed(self.activity),
         )
 
     def grid(self) -> Grid:
         """The phantom's grid, in its own frame."""
         # One voxel is kept free all around, so that no rod touches the edge.
-        fitted = max(2 * _typed(self.radius), _typed(self.height)) / max(1, self.voxels - 2)
-        return Grid.centered((self.voxels,) * 3, _typed(self.voxel_size) or fitted)
+        fitted = max(2 * typed(self.radius), typed(self.height)) / max(1, self.voxels - 2)
+        return Grid.centered((self.voxels,) * 3, typed(self.voxel_size) or fitted)
 
     def recipe(self) -> dict[str, Any]:
         """The settings as JSON can hold them."""
@@ -133,7 +133,7 @@ class VolumeProperties(bpy.types.PropertyGroup):
     derenzo: PointerProperty(name="Derenzo", type=DerenzoProperties)
 
 
-def _typed(value: float) -> float:
+def typed(value: float) -> float:
     """The shortest decimal number that a float32 setting stands for: 0.1, not 0.10000000149."""
     if value == 0 or not math.isfinite(value):
         return value

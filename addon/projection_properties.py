@@ -2,10 +2,20 @@
 
 from __future__ import annotations
 
-import bpy
-from bpy.props import EnumProperty, FloatProperty, IntProperty, PointerProperty, StringProperty
+import math
+from typing import TYPE_CHECKING, Any
 
-from . import ids
+import bpy
+from bpy.props import BoolProperty, EnumProperty, FloatProperty, IntProperty, PointerProperty, StringProperty
+
+from ..core.isotopes import CZT_MU, ISOTOPES, NAI_MU, TUNGSTEN_MU
+from ..core.system import PinholeSystem
+from ..core.volume import Volume
+from . import ids, volumes
+from .phantom_properties import typed
+
+if TYPE_CHECKING:
+    from ..core.projector import Model
 
 
 class ProjectionSettings:
@@ -16,11 +26,71 @@ class ProjectionSettings:
         description="What a pixel holds",
         items=(
             ("TRANSMISSION", "Radiograph", "Line integrals of the volume"),
-            ("EMISSION", "SPECT Counts", "Expected photons of a volume of activity through the ideal pinhole"),
+            ("EMISSION", "SPECT Counts", "Photons of a volume of activity that the crystal counts"),
+            (
+                "INVERSE_SQUARE",
+                "Inverse Square Sum",
+                "Line integrals with each segment times a point source's sensitivity, as 1/h^2: no counts, for comparison",
+            ),
         ),
         default="TRANSMISSION",
     )
     time: FloatProperty(name="Time (s)", description="Acquisition time of SPECT counts", default=1.0, min=1e-6)
+    photons: FloatProperty(
+        name="Photons", description="X-ray photons per pixel: a radiograph of attenuation coefficients then holds those "
+        "that pass; 0: line integrals", default=0.0, min=0.0, soft_max=1e6,
+    )  # fmt: skip
+    isotope: EnumProperty(
+        name="Isotope",
+        description="What decays: its photons are counted, and its activity falls during the acquisition",
+        items=(
+            ("NONE", "None", "One photon per decay, and an activity that stays"),
+            *((name, name, "Energy window 10 % around its strongest line") for name in ISOTOPES),
+        ),
+        default="NONE",
+    )
+    aperture_points: IntProperty(
+        name="Aperture Points", description="Points of the hole from which each pixel's rays start; 1: its middle, no "
+        "blur, 7 and more: the blur of a hole of this size", default=1, min=1, soft_max=64,
+    )  # fmt: skip
+    aperture_mu: FloatProperty(
+        name="Aperture µ", description="Attenuation coefficient of the aperture in 1/mm, at the photons' energy "
+        f"(tungsten at 140.5 keV: {TUNGSTEN_MU:g}); 0: nothing penetrates it",
+        default=0.0, min=0.0, soft_max=10.0, precision=3,
+    )  # fmt: skip
+    opening_angle: FloatProperty(
+        name="Opening Angle", description="Full angle of the knife edge's cone", subtype="ANGLE",
+        default=math.pi / 2, min=0.01, max=3.1,
+    )  # fmt: skip
+    edge: EnumProperty(
+        name="Knife Edge",
+        description="How photons penetrate the aperture's edge",
+        items=(
+            ("PAIX", "Effective Diameter", "As if the hole were wider (Paix 1967)"),
+            ("PATH", "Path Length", "Each by its path through the edge: more rays"),
+        ),
+        default="PAIX",
+    )
+    crystal_mu: FloatProperty(
+        name="Crystal µ", description="Attenuation coefficient of the crystal in 1/mm, at the photons' energy (at 140.5 keV "
+        f"NaI: {NAI_MU:g}, CZT: {CZT_MU:g}); 0: all photons are counted",
+        default=0.0, min=0.0, soft_max=5.0, precision=3,
+    )  # fmt: skip
+    depth_layers: IntProperty(
+        name="Depth Layers", description="Depths in the crystal at which photons are recorded (parallax); 1: where they "
+        "enter. Needs the crystal's µ", default=1, min=1, soft_max=8,
+    )  # fmt: skip
+    intrinsic_fwhm: FloatProperty(
+        name="Intrinsic Blur", description="Full width at half maximum of the detector's own blur in mm on the crystal",
+        default=0.0, min=0.0, soft_max=10.0, precision=2,
+    )  # fmt: skip
+    within_cone: BoolProperty(name="Knife-Edge Cone", description="Nothing passes steeper than the knife edge's cone")
+    within_walls: BoolProperty(
+        name="Collimator Walls", description="The walls stop photons that would miss the crystal's front"
+    )
+    within_crystal: BoolProperty(name="Crystal's Side", description="Pixels beyond the crystal count nothing")
+    noise: BoolProperty(name="Poisson Noise", description="Draw counts instead of their expected means")
+    seed: IntProperty(name="Seed", description="Of the noise: the same seed draws the same counts", default=1, min=0)
     width: IntProperty(name="Width", description="Pixel columns of each image", default=256, min=1, max=8192)
     height: IntProperty(name="Height", description="Pixel rows of each image", default=256, min=1, max=8192)
     detector: EnumProperty(
@@ -51,8 +121,34 @@ class ProjectionSettings:
     )
 
 
+# Settings that are arguments of `Emission`; those that may be missing are 0 or NONE.
+_EMISSION = (
+    "time", "isotope", "aperture_points", "aperture_mu", "opening_angle", "edge", "crystal_mu", "depth_layers",
+    "intrinsic_fwhm", "within_cone", "within_walls", "within_crystal",
+)  # fmt: skip
+_OPTIONAL = ("isotope", "aperture_mu", "crystal_mu")
+
+
+def chosen_model(settings: dict[str, Any], system: PinholeSystem, mu: Volume | None = None) -> Model:
+    """The model that `settings` (`ProjectionSettings`, by name) ask for; leaves bpy alone."""
+    from ..core.projector import Emission, InverseSquareSum, Transmission
+
+    if settings["model"] == "TRANSMISSION":
+        return Transmission()
+    if settings["model"] == "INVERSE_SQUARE":
+        return InverseSquareSum(system)
+    given: dict[str, Any] = {name: settings[name] for name in _EMISSION}
+    given |= {name: typed(value) for name, value in given.items() if isinstance(value, float)}
+    given |= {name: None for name in _OPTIONAL if given[name] in (0, "NONE")}
+    return Emission(system, mu, **(given | {"edge": given["edge"].lower()}))
+
+
 def _is_ours(self: ProjectionProperties, item: bpy.types.Object) -> bool:
-    return item.type == "VOLUME" and getattr(item, ids.OBJECT_VOLUME).is_volume
+    return volumes.is_volume(item)
+
+
+def _is_mu(self: ProjectionProperties, item: bpy.types.Object) -> bool:
+    return volumes.is_volume(item) and getattr(item, ids.OBJECT_VOLUME).quantity == "mu"
 
 
 class ProjectionProperties(ProjectionSettings, bpy.types.PropertyGroup):
@@ -61,6 +157,10 @@ class ProjectionProperties(ProjectionSettings, bpy.types.PropertyGroup):
     volume: PointerProperty(
         name="Volume", description="What to project; empty: the active volume, or the only one", type=bpy.types.Object,
         poll=_is_ours,
+    )  # fmt: skip
+    mu: PointerProperty(
+        name="Attenuation", description="Volume of attenuation coefficients (1/mm) before the pinhole; empty: none",
+        type=bpy.types.Object, poll=_is_mu,
     )  # fmt: skip
     run_file: StringProperty(
         name="Run",

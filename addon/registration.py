@@ -33,6 +33,7 @@ CLASSES: tuple[type, ...] = (
     geometry.MPHDRR_PT_modules,
     phantom.MPHDRR_PT_phantom,
     projections.MPHDRR_PT_projections,
+    projections.MPHDRR_PT_physics,
     export.MPHDRR_PT_export,
 )
 

@@ -19,7 +19,8 @@ from .mosaic import as_seen, mosaic
 from .noise import sample_counts
 from .phantoms.derenzo import DerenzoPhantom
 from .progress import Cancelled, Progress
-from .projector import Emission, Projector, Transmission, trace_rays
+from .project import project_run
+from .projector import Emission, InverseSquareSum, Projector, Transmission, intensity, trace_rays
 from .run import ProjectionRun
 from .system import PinholeSystem
 from .views import Views
@@ -35,6 +36,7 @@ __all__ = [
     "Grid",
     "InputError",
     "InputWarning",
+    "InverseSquareSum",
     "Isotope",
     "PinholeSystem",
     "Progress",
@@ -47,8 +49,10 @@ __all__ = [
     "as_seen",
     "collimator_length",
     "euler_pose",
+    "intensity",
     "isotope",
     "mosaic",
+    "project_run",
     "read_run",
     "read_system",
     "read_volume",

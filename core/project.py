@@ -9,11 +9,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
+from .checks import positive
 from .errors import InputError, InputWarning
 from .memory import require
 from .noise import sample_counts
 from .progress import Progress
-from .projector import Emission, Model, Projector, Transmission
+from .projector import Emission, Model, Projector, Transmission, intensity
 from .run import ProjectionRun
 from .system import Detector, PinholeSystem
 from .views import Views
@@ -31,6 +32,7 @@ def project_run(
     threads: int | None = None,
     settings: Mapping[str, Any] | None = None,
     model: Model | None = None,
+    photons: float | None = None,
     noise_seed: int | None = None,
     progress: Progress | None = None,
 ) -> ProjectionRun:
@@ -47,9 +49,11 @@ def project_run(
     settings
         More to record in the run.
     model
-        `Transmission` (the default) or an `Emission` of the same system.
+        `Transmission` (the default), an `Emission` or an `InverseSquareSum` of the same system.
+    photons
+        Of an X-ray source, per pixel: the run of a volume of mu holds those that pass (`intensity`), not line integrals.
     noise_seed
-        With an `Emission`: the run holds counts drawn with this seed (`sample_counts`), not their means.
+        With an `Emission` or `photons`: the run holds counts drawn with this seed (`sample_counts`), not their means.
     progress
         Called as ``progress(done, total)`` after every view; may raise `Cancelled`.
 
@@ -59,21 +63,27 @@ def project_run(
         A setting is out of range, or the images do not fit into memory.
     """
     model = Transmission() if model is None else model
-    if noise_seed is not None and not isinstance(model, Emission):
-        raise InputError("noise_seed: only the counts of an Emission have noise")
+    if photons is not None:
+        if not isinstance(model, Transmission) or volume.quantity != "mu":
+            raise InputError(
+                f"photons: expected the transmission of a volume of mu, got {model.name} of {volume.quantity}"
+            )
+        photons = positive(photons, "photons")
+    elif noise_seed is not None and not isinstance(model, Emission):
+        raise InputError("noise_seed: only the counts of an Emission, or photons that pass, have noise")
     if volume.quantity == "hu":
         _warn(
             "the volume holds CT numbers (HU), air being -1000: their line integrals are no radiograph; "
             "convert them to attenuation (mu, 1/mm) first"
         )
     views = system.views(shape=shape, detector=detector, magnification=magnification, pitch=pitch)
-    _warn_of_unseen(volume, views, isinstance(model, Transmission))
+    _warn_of_unseen(volume, views, ends_at_plane=not isinstance(model, Emission))
     n_v, n_u = views.shape
     require(4.0 * len(views) * n_v * n_u, f"a set of {len(views)} projections of {n_v} x {n_u} pixels")
     projector = Projector(volume.grid, views, model=model, backend=backend, threads=threads)
     images = np.empty((len(views), n_v, n_u), np.float32)
     for m, image in enumerate(projector.iter_views(volume)):
-        images[m] = image
+        images[m] = image if photons is None else intensity(image, photons)
         if progress is not None:
             progress(m + 1, len(views))
     if noise_seed is not None:
@@ -84,10 +94,12 @@ def project_run(
         "pitch_mm": None if pitch is None else np.broadcast_to(pitch, 2).tolist(),
         "model": model.name,
         **model.record(),
+        **({} if photons is None else {"photons": photons}),
         "backend": projector.backend,
         **(settings or {}),
     }
-    return ProjectionRun(images, system, views, volume, unit=model.unit(volume), settings=record, seed=noise_seed)
+    unit = model.unit(volume) if photons is None else "photons"
+    return ProjectionRun(images, system, views, volume, unit=unit, settings=record, seed=noise_seed)
 
 
 def _warn_of_unseen(volume: Volume, views: Views, ends_at_plane: bool) -> None:

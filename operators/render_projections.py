@@ -4,21 +4,19 @@ from __future__ import annotations
 
 import time
 from collections.abc import Generator
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import bpy
 from bpy.props import StringProperty
 
 from ..addon import ids, images, jobs, runs, scanner, storage, volumes
-from ..addon.projection_properties import ProjectionSettings
+from ..addon.phantom_properties import typed
+from ..addon.projection_properties import ProjectionSettings, chosen_model
 from ..core.errors import InputError
 from ..core.memory import require
 from ..core.progress import Progress
 from ..core.run import ProjectionRun
 from ..core.system import PinholeSystem
-
-if TYPE_CHECKING:
-    from ..core.projector import Model
 
 
 class MPHDRR_OT_render_projections(ProjectionSettings, jobs.JobOperator, bpy.types.Operator):
@@ -31,25 +29,31 @@ class MPHDRR_OT_render_projections(ProjectionSettings, jobs.JobOperator, bpy.typ
     bl_options = {"REGISTER", "UNDO"}
 
     volume: StringProperty(name="Volume", description="Name of the volume object to project", options={"SKIP_SAVE"})
+    mu: StringProperty(
+        name="Attenuation", description="Name of the volume object of attenuation coefficients", options={"SKIP_SAVE"}
+    )
 
     def job(self, context: bpy.types.Context) -> jobs.Job:
         scene = context.scene
         collection = scanner.active_scanner(scene)
         if collection is None:
             raise InputError("no scanner in the scene: import a workbook first")
-        system = _range(scanner.read_scanner(collection), self._setting(scene, "first"), self._setting(scene, "last"))
-        shape = (self._setting(scene, "height"), self._setting(scene, "width"))
-        detector = self._setting(scene, "detector").lower()
-        magnification = float(f"{self._setting(scene, 'magnification'):.7g}")
-        backend = self._setting(scene, "backend").lower()
-        model = _model(system, self._setting(scene, "model"), float(f"{self._setting(scene, 'time'):.7g}"))
-        item = _chosen_volume(context, self.volume)
+        chosen = {name: self._setting(scene, name) for name in ProjectionSettings.__annotations__}
+        system = _range(scanner.read_scanner(collection), chosen["first"], chosen["last"])
+        shape = (chosen["height"], chosen["width"])
+        chosen_model(chosen, system)  # what cannot be is said before the work begins
+        counts = chosen["model"] == "EMISSION"
+        photons = typed(chosen["photons"]) if chosen["model"] == "TRANSMISSION" and chosen["photons"] else None
+        noise_seed = chosen["seed"] if chosen["noise"] and (counts or photons) else None
+        item = _chosen_volume(context, self.volume, "activity" if counts else "mu" if photons else None)
+        mu = _chosen_mu(context, self.mu) if counts else None
+        read_mu = None if mu is None else volumes.reader(mu)
         read_volume = volumes.reader(item)
         n_bytes = 4.0 * len(system) * shape[0] * shape[1]
         # The array, and Blender's images with four channels in memory and once more, packed.
         require(9 * n_bytes, f"{len(system)} images of {shape[1]} x {shape[0]} pixels")
         path = storage.folder() / f"{bpy.path.clean_name(scene.name)}-projections.h5"
-        settings: dict[str, Any] = {"volume": item.name}
+        settings: dict[str, Any] = {"volume": item.name} | ({} if mu is None else {"mu_volume": mu.name})
         if getattr(item, ids.OBJECT_VOLUME).kind == "DERENZO":
             settings |= getattr(item, ids.OBJECT_VOLUME).derenzo.recipe()
         scene_name, item_name, start = scene.name, item.name, time.perf_counter()
@@ -62,12 +66,14 @@ class MPHDRR_OT_render_projections(ProjectionSettings, jobs.JobOperator, bpy.typ
             run = project_run(
                 system,
                 read_volume(),
-                model=model,
+                model=chosen_model(chosen, system, None if read_mu is None else read_mu()),
                 shape=shape,
-                detector=detector,
-                magnification=magnification,
-                backend=backend,
+                detector=chosen["detector"].lower(),
+                magnification=typed(chosen["magnification"]),
+                backend=chosen["backend"].lower(),
                 settings=settings,
+                photons=photons,
+                noise_seed=noise_seed,
                 progress=progress,
             )
             write_run(run, path)
@@ -107,12 +113,6 @@ class MPHDRR_OT_show_projections(bpy.types.Operator):
         return {"FINISHED"}
 
 
-def _model(system: PinholeSystem, kind: str, time: float) -> Model:
-    from ..core.projector import Emission, Transmission
-
-    return Emission(system, time=time) if kind == "EMISSION" else Transmission()
-
-
 def _range(system: PinholeSystem, first: int, last: int) -> PinholeSystem:
     """The modules numbered `first` to `last`; 0 leaves an end open."""
     numbers = system.numbers
@@ -124,22 +124,36 @@ def _range(system: PinholeSystem, first: int, last: int) -> PinholeSystem:
     return system[chosen]
 
 
-def _chosen_volume(context: bpy.types.Context, name: str) -> bpy.types.Object:
-    """The volume named, else the panel's, else the active one, else the only one."""
+def _chosen_volume(context: bpy.types.Context, name: str, quantity: str | None) -> bpy.types.Object:
+    """The volume named, else the panel's, else the active one, else the only one; if unnamed, one of a quantity if given."""
     known = volumes.volume_objects(context.scene)
     if name:
-        for item in known:
-            if item.name == name:
-                return item
-        raise InputError(f"no volume is named {name!r}; there are: {', '.join(item.name for item in known) or 'none'}")
+        return _named(known, name)
+    fitting = [item for item in known if quantity in (None, getattr(item, ids.OBJECT_VOLUME).quantity)]
     chosen = getattr(context.scene, ids.SCENE_PROJECTIONS).volume
-    for item in (chosen, context.object):
-        if item in known:
-            return item
-    if len(known) != 1:
+    if chosen in known:
+        return chosen
+    if context.object in fitting:
+        return context.object
+    if len(fitting) != 1:
+        what = "volumes" if quantity is None else f"volumes of {quantity}"
         raise InputError(
-            f"choose what to project: there are {len(known)} volumes"
+            f"choose what to project: there are {len(fitting)} {what}"
             if known
             else "no volume in the scene: add a phantom first"
         )
-    return known[0]
+    return fitting[0]
+
+
+def _chosen_mu(context: bpy.types.Context, name: str) -> bpy.types.Object | None:
+    """The volume of attenuation coefficients named, else the panel's, else None."""
+    known = volumes.volume_objects(context.scene)
+    chosen = _named(known, name) if name else getattr(context.scene, ids.SCENE_PROJECTIONS).mu
+    return chosen if chosen in known else None
+
+
+def _named(known: list[bpy.types.Object], name: str) -> bpy.types.Object:
+    for item in known:
+        if item.name == name:
+            return item
+    raise InputError(f"no volume is named {name!r}; there are: {', '.join(item.name for item in known) or 'none'}")

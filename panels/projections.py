@@ -27,6 +27,8 @@ class MPHDRR_PT_projections(bpy.types.Panel):
         column.prop(settings, "model")
         if settings.model == "EMISSION":
             column.prop(settings, "time")
+        elif settings.model == "TRANSMISSION":
+            column.prop(settings, "photons")
         size = column.column(align=True)
         size.prop(settings, "width", text="Pixels X")
         size.prop(settings, "height", text="Y")
@@ -53,3 +55,54 @@ class MPHDRR_PT_projections(bpy.types.Panel):
             column.active = False
             for part in settings.run_summary.split(", ", 1):
                 column.label(text=part)
+
+
+class MPHDRR_PT_physics(bpy.types.Panel):
+    bl_idname = ids.PANEL_PHYSICS
+    bl_label = "Physics"
+    bl_parent_id = ids.PANEL_PROJECTIONS
+    bl_space_type = "VIEW_3D"
+    bl_region_type = "UI"
+    bl_category = ids.CATEGORY
+    bl_options = {"DEFAULT_CLOSED"}
+
+    @classmethod
+    def poll(cls, context: bpy.types.Context) -> bool:
+        return _makes_counts(getattr(context.scene, ids.SCENE_PROJECTIONS))
+
+    def draw(self, context: bpy.types.Context) -> None:
+        layout = self.layout
+        layout.use_property_split = True
+        layout.use_property_decorate = False
+        layout.enabled = not jobs.is_running()
+        settings = getattr(context.scene, ids.SCENE_PROJECTIONS)
+        if settings.model == "EMISSION":
+            column = layout.column()
+            column.prop(settings, "isotope")
+            column.prop(settings, "mu", placeholder="None")
+            column = layout.column(align=True)
+            column.prop(settings, "aperture_points")
+            column.prop(settings, "aperture_mu", text="Aperture µ (1/mm)")
+            edge = column.column(align=True)
+            edge.active = settings.aperture_mu > 0
+            edge.prop(settings, "edge")
+            column.prop(settings, "opening_angle")
+            column = layout.column(align=True)
+            column.prop(settings, "crystal_mu", text="Crystal µ (1/mm)")
+            depth = column.column(align=True)
+            depth.active = settings.crystal_mu > 0
+            depth.prop(settings, "depth_layers")
+            column.prop(settings, "intrinsic_fwhm", text="Blur FWHM (mm)")
+            column = layout.column(heading="Stopped by", align=True)
+            for name in ("within_cone", "within_walls", "within_crystal"):
+                column.prop(settings, name)
+        row = layout.row(heading="Poisson Noise")
+        row.prop(settings, "noise", text="")
+        seed = row.row()
+        seed.active = settings.noise
+        seed.prop(settings, "seed")
+
+
+def _makes_counts(settings: bpy.types.PropertyGroup) -> bool:
+    """Whether images hold numbers of photons."""
+    return settings.model == "EMISSION" or (settings.model == "TRANSMISSION" and settings.photons > 0)

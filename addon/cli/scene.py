@@ -23,6 +23,9 @@ def add_parser(subparsers) -> None:  # type: ignore[no-untyped-def]
     parser.add_argument("workbook", metavar="WORKBOOK", help="geometry workbook (.xlsx, .xlsm)")
     parser.add_argument("--modules", metavar="RANGE", help="such as 1-40 or 1-20,41; default: all")
     parser.add_argument("--volume", metavar="FILE", help="also put in this volume: .nii, .nii.gz, .npz")
+    parser.add_argument(
+        "--mu", metavar="FILE", help="and this volume of attenuation coefficients (1/mm), for SPECT counts"
+    )
     parser.add_argument("--run", metavar="FILE", dest="run_file", help="also put in this run's volume and projections")
     parser.add_argument("-o", "--output", required=True, metavar="FILE", help="the .blend to write")
     parser.set_defaults(run=_run)
@@ -34,16 +37,19 @@ def _run(arguments: argparse.Namespace) -> None:
         raise InputError(f"{path}: expected a name ending in .blend")
     system = chosen_modules(read_system(arguments.workbook), arguments.modules)
     volume = read_volume(arguments.volume) if arguments.volume else None
+    mu = read_volume(arguments.mu, "mu") if arguments.mu else None
     run = read_run(arguments.run_file) if arguments.run_file else None
 
     from .session import new_scene, save_scene
 
     blender_scene = new_scene()
-    from .. import runs, scanner, volumes
+    from .. import ids, runs, scanner, volumes
 
     scanner.build_scanner(blender_scene, system)
     if volume is not None:
         volumes.add_volume(volume, Path(arguments.volume).name)
+    if mu is not None:
+        getattr(blender_scene, ids.SCENE_PROJECTIONS).mu = volumes.add_volume(mu, Path(arguments.mu).name)
     if run is not None:
         volumes.add_volume(run.volume, "Projected volume")
         runs.show_run(blender_scene, run, Path(arguments.run_file))

@@ -17,7 +17,10 @@ from ..system import PinholeSystem
 
 
 class _HelpFormatter(argparse.HelpFormatter):
-    """Shows the defaults that say something, lists as they are typed."""
+    """Shows the defaults that say something, lists as they are typed; keeps the lines of descriptions."""
+
+    def _fill_text(self, text: str, width: int, indent: str) -> str:
+        return "\n".join(super(_HelpFormatter, self)._fill_text(line, width, indent) for line in text.splitlines())
 
     def _get_help_string(self, action: argparse.Action) -> str | None:
         if action.help is None or action.default in (None, [], False, argparse.SUPPRESS):

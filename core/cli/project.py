@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import argparse
+import math
+from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
@@ -10,14 +12,17 @@ import numpy as np
 
 from ..errors import InputError
 from ..export import FORMATS, write_run
+from ..isotopes import CZT_MU, ISOTOPES, NAI_MU, TUNGSTEN_MU
 from ..mosaic import mosaic, write_png
 from ..project import project_run
-from ..projector import Emission
+from ..projector import Emission, InverseSquareSum, Model, Transmission
 from ..system import PinholeSystem
 from ..volume_io import read_volume
 from ..workbook import read_system
 from .options import add_command, add_phantom_options, add_view_options, chosen_modules, output_path, progress_bar
 from .phantom import derenzo_volume
+
+_EMISSION = [field.name for field in fields(Emission)]
 
 
 def add_parser(subparsers) -> None:  # type: ignore[no-untyped-def]
@@ -26,48 +31,103 @@ def add_parser(subparsers) -> None:  # type: ignore[no-untyped-def]
         subparsers,
         "project",
         "project a volume, or a Derenzo phantom, into every module",
-        "mphdrr project scanner.xlsx --volume ct.nii.gz --size 250 250 -o run.h5",
+        "mphdrr project scanner.xlsx --volume ct.nii.gz --size 250 250 -o run.h5\n"
+        "example: mphdrr project scanner.xlsx --volume heart.nii.gz --mu ct-mu.nii.gz --emission --isotope Tc-99m "
+        "--time 600 --aperture-points 7 --aperture-mu 3.6 --crystal-mu 0.404 --noise 1 -o counts.h5",
     )
     parser.add_argument("workbook", metavar="WORKBOOK", help="geometry workbook (.xlsx, .xlsm)")
     parser.add_argument("--volume", metavar="FILE", help=".nii, .nii.gz or .npz; without it, a Derenzo phantom is made")
     add_view_options(parser)
-    add_emission_options(parser.add_argument_group("SPECT counts"))
+    models = parser.add_argument_group("what pixels hold; without an option, line integrals")
+    one = models.add_mutually_exclusive_group()
+    one.add_argument("--emission", action="store_true", help="SPECT counts of a volume of activity")
+    one.add_argument(
+        "--photons", type=float, metavar="N", help="of N X-ray photons per pixel, those that pass: mu in 1/mm"
+    )
+    one.add_argument(
+        "--inverse-square", action="store_true",
+        help="line integrals with each segment times a point source's sensitivity, as 1/h^2: no counts, for comparison",
+    )  # fmt: skip
+    models.add_argument("--noise", type=int, metavar="SEED", help="draw Poisson counts instead of their means")
+    add_emission_options(parser)
     add_phantom_options(parser.add_argument_group("Derenzo phantom, without --volume"))  # type: ignore[arg-type]
     parser.add_argument("-o", "--output", required=True, metavar="FILE", help=", ".join(FORMATS))
     parser.add_argument("--mosaic", metavar="PNG", help="also write all images in one picture")
     parser.set_defaults(run=_run)
 
 
-def add_emission_options(group: argparse._ArgumentGroup) -> None:
-    """What `emission` needs."""
-    group.add_argument("--emission", action="store_true", help="expected counts instead of line integrals")
-    group.add_argument("--time", type=float, default=1.0, metavar="S", help="acquisition time")
-    group.add_argument("--mu", metavar="FILE", help="attenuation coefficients, 1/mm, on any grid; without it, none")
-    group.add_argument(
-        "--aperture-points", type=int, default=1, metavar="N", help="rays through the hole of each pixel"
+def add_emission_options(parser: argparse.ArgumentParser) -> None:
+    """The arguments of `Emission`, in the namespace only if they are given."""
+
+    def option(group: argparse._ArgumentGroup, name: str, **details: Any) -> None:
+        group.add_argument(name, default=argparse.SUPPRESS, **details)
+
+    source = parser.add_argument_group("--emission: the source")
+    option(source, "--time", type=float, metavar="S", help="acquisition time, s (default: 1)")
+    option(source, "--isotope", metavar="NAME", help=f"{', '.join(ISOTOPES)}; without it, one photon per decay")
+    option(
+        source, "--window", type=float, nargs=2, metavar=("LOW", "HIGH"),
+        help="energies that are counted, keV (default: 10 %% around the isotope's strongest line)",
+    )  # fmt: skip
+    option(source, "--mu", metavar="FILE", help="attenuation coefficients, 1/mm, on any grid; without it, none")
+    aperture = parser.add_argument_group("--emission: the pinhole")
+    option(
+        aperture, "--aperture-points", type=int, metavar="N", help="rays through the hole of each pixel (default: 1)"
     )
-    group.add_argument("--noise", type=int, metavar="SEED", help="draw Poisson counts instead of their means")
+    option(
+        aperture, "--aperture-tolerance", type=float, metavar="SHARE",
+        help="as many as bring a voxel's image this close, such as 0.1, to that of the whole hole",
+    )  # fmt: skip
+    option(
+        aperture, "--aperture-mu", type=float, metavar="MU",
+        help=f"of the aperture, 1/mm: {TUNGSTEN_MU} for tungsten at 140.5 keV; without it, nothing penetrates",
+    )  # fmt: skip
+    option(aperture, "--opening-angle", type=float, metavar="DEG", help="full angle of the knife edge (default: 90)")
+    option(
+        aperture, "--edge", choices=("paix", "path"),
+        help="penetration by an effective diameter, or by the path through the edge (default: paix)",
+    )  # fmt: skip
+    option(aperture, "--within-cone", action="store_true", help="nothing passes steeper than the knife edge's cone")
+    crystal = parser.add_argument_group("--emission: collimator and crystal")
+    option(crystal, "--within-walls", action="store_true", help="the collimator's walls stop what misses the front")
+    option(crystal, "--within-crystal", action="store_true", help="pixels beyond the crystal's side count nothing")
+    option(
+        crystal, "--crystal-mu", type=float, metavar="MU",
+        help=f"of the crystal, 1/mm: {NAI_MU} for NaI, {CZT_MU} for CZT at 140.5 keV; without it, all photons count",
+    )  # fmt: skip
+    option(
+        crystal, "--depth-layers", type=int, metavar="N", help="depths of interaction, for the parallax (default: 1)"
+    )
+    option(crystal, "--intrinsic-fwhm", type=float, metavar="MM", help="blur of the detector, mm (default: 0)")
 
 
-def emission(arguments: argparse.Namespace, system: PinholeSystem) -> Emission | None:
-    """The model that `arguments` ask for; None for line integrals."""
+def chosen_model(arguments: argparse.Namespace, system: PinholeSystem) -> Model:
+    """The model that `arguments` ask for."""
+    given = {name: getattr(arguments, name) for name in _EMISSION if hasattr(arguments, name)}
+    if given and not arguments.emission:
+        raise InputError(f"--{next(iter(given)).replace('_', '-')} needs --emission")
+    if arguments.noise is not None and not arguments.emission and arguments.photons is None:
+        raise InputError("--noise needs --emission or --photons")
+    if arguments.inverse_square:
+        return InverseSquareSum(system)
     if not arguments.emission:
-        asked = [name for name in ("mu", "noise") if getattr(arguments, name) is not None]
-        if asked:
-            raise InputError(f"--{asked[0]} needs --emission")
-        return None
-    mu = read_volume(arguments.mu, "mu") if arguments.mu else None
-    return Emission(system, mu, time=arguments.time, aperture_points=arguments.aperture_points)
+        return Transmission()
+    if "mu" in given:
+        given["mu"] = read_volume(given["mu"], "mu")
+    if "opening_angle" in given:
+        given["opening_angle"] = math.radians(given["opening_angle"])
+    return Emission(system, **given)
 
 
 def _run(arguments: argparse.Namespace) -> None:
     path = output_path(arguments.output, FORMATS)
     picture = output_path(arguments.mosaic) if arguments.mosaic else None
     system = chosen_modules(read_system(arguments.workbook), arguments.modules)
-    model = emission(arguments, system)
+    model = chosen_model(arguments, system)
     recipe: dict[str, Any] = {}
     if arguments.volume:
-        volume = read_volume(arguments.volume, "activity" if model else None)
+        quantity = "activity" if arguments.emission else "mu" if arguments.photons is not None else None
+        volume = read_volume(arguments.volume, quantity)
     else:
         volume, recipe = derenzo_volume(arguments)
     run = project_run(
@@ -82,9 +142,10 @@ def _run(arguments: argparse.Namespace) -> None:
         settings={
             "volume": Path(arguments.volume).name if arguments.volume else "Derenzo phantom",
             **recipe,
-            **({"mu_file": Path(arguments.mu).name} if arguments.mu else {}),
+            **({"mu_file": Path(arguments.mu).name} if hasattr(arguments, "mu") else {}),
         },
         model=model,
+        photons=arguments.photons,
         noise_seed=arguments.noise,
         progress=progress_bar("projecting"),
     )

@@ -10,8 +10,18 @@ imported before it is needed.
 from __future__ import annotations
 
 from .emission import Emission
-from .models import Model, Transmission
+from .inverse_square import InverseSquareSum
+from .models import Model, Transmission, intensity
 from .operator import AdjointProjector, Projector
 from .tracing import trace_rays
 
-__all__ = ["AdjointProjector", "Emission", "Model", "Projector", "Transmission", "trace_rays"]
+__all__ = [
+    "AdjointProjector",
+    "Emission",
+    "InverseSquareSum",
+    "Model",
+    "Projector",
+    "Transmission",
+    "intensity",
+    "trace_rays",
+]

@@ -6,7 +6,6 @@ import sys
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..checks import real_array, require_finite
 from ..errors import InputError
@@ -18,6 +17,11 @@ def is_tensor(value: object) -> bool:
     """Whether `value` is a torch tensor (torch is not imported to find out)."""
     torch = sys.modules.get("torch")
     return torch is not None and isinstance(value, torch.Tensor)
+
+
+def namespace(value: ArrayOrTensor) -> Any:
+    """The library, torch or numpy, whose functions take `value`."""
+    return sys.modules["torch"] if is_tensor(value) else np
 
 
 def checked(value: ArrayOrTensor, name: str, shape: tuple[int, ...], float64: bool) -> ArrayOrTensor:
@@ -86,13 +90,27 @@ def zeros(shape: tuple[int, ...], beside: ArrayOrTensor) -> ArrayOrTensor:
     return beside.new_zeros(shape) if is_tensor(beside) else np.zeros(shape, beside.dtype)
 
 
-def alike(array: NDArray[np.floating[Any]], beside: ArrayOrTensor) -> ArrayOrTensor:
-    """`array` of the kind, type and device of `beside`."""
-    if is_tensor(beside):
-        import torch
+def alike(values: ArrayOrTensor, beside: ArrayOrTensor) -> ArrayOrTensor:
+    """`values` of the kind, type and device of `beside`; not part of a graph."""
+    if not is_tensor(beside):
+        return to_numpy(values, beside.dtype) if is_tensor(values) else np.asarray(values, dtype=beside.dtype)
+    if is_tensor(values):
+        return values.detach().to(beside).contiguous()
+    import torch
 
-        return torch.tensor(array, dtype=beside.dtype, device=beside.device)
-    return np.asarray(array, dtype=beside.dtype)
+    return torch.tensor(values, dtype=beside.dtype, device=beside.device)
+
+
+def together(first: ArrayOrTensor, second: ArrayOrTensor) -> tuple[ArrayOrTensor, ArrayOrTensor]:
+    """Both as tensors of one type and device if either is a tensor, still part of their graphs; else as they are."""
+    if not (is_tensor(first) or is_tensor(second)):
+        return first, second
+    import torch
+
+    one, other = (x if is_tensor(x) else torch.tensor(x) for x in (first, second))
+    kind = torch.promote_types(one.dtype, other.dtype)
+    device = one.device if is_tensor(first) else other.device
+    return one.to(device, kind), other.to(device, kind)
 
 
 def cropped(*volumes: ArrayOrTensor) -> tuple[list[ArrayOrTensor], tuple[int, int, int]]:

@@ -13,13 +13,23 @@ from ..errors import InputError, InputWarning
 BACKENDS = ("numba", "torch", "numpy", "cuda")
 """Names of the backends. ``siddon_<name>`` is the module of each.
 
-Such a module has three functions. ``forward(volume, rays, attenuation=None)`` returns the line integrals (N,);
-``adjoint(volume, values, rays, attenuation=None)`` adds the values to the volume in place, each along its ray
-with the same weights; ``derivatives(volume, rays)`` returns (N, 7): the integral over alpha from 0 to 1 (the line
-integral per mm of the ray's length), and its derivatives by the ray's start (3) and end (3) in index space. `rays` are
-`IndexRays` or an `IndexFan`, what weakens them an `Attenuation`; volumes, values and mu are tensors on one device for
-"torch", numpy arrays or tensors on the GPU for "cuda" (see its `native`), and numpy arrays for the others. "cuda" is
-handed several views at once, as `IndexFans`.
+Such a module has four functions. Line integrals are ``L int_0^1 f(alpha) exp(-L int_0^alpha mu) dalpha`` with L the
+ray's length in mm, f the volume and mu what attenuates, if anything.
+
+- ``forward(volume, rays, attenuation=None)`` returns them, (N,).
+- ``adjoint(volume, values, rays, attenuation=None)`` adds the values to the volume in place, each along its ray with
+  the same weights.
+- ``derivatives(volume, rays, attenuation=None)`` returns (N, 7): the integral over alpha (the line integral per mm of
+  L), and its derivatives by the ray's start (3) and end (3) in index space. With attenuation (N, 14): the derivatives
+  [1:7] are those through the planes of the volume, where f jumps, then follow [7:13] by start and end in mu's index
+  space, through its planes, where mu jumps (also where mu shares the volume's lattice), all at constant L; and [13] by
+  L, at constant ends.
+- ``mu_gradient(gradient, volume, values, rays, attenuation)`` adds to `gradient` (of mu's shape) in place the sum over
+  the rays of their values times the derivative of the line integral by mu.
+
+`rays` are `IndexRays` or an `IndexFan`, what weakens them an `Attenuation`; volumes, values, mu and gradients are tensors
+on one device for "torch", numpy arrays or tensors on the GPU for "cuda" (see its `native`), and numpy arrays for the
+others. "cuda" is handed several views at once, as `IndexFans`.
 """
 
 _AUTOMATIC = ("numba", "torch", "numpy")

@@ -5,18 +5,20 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass, fields
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..checks import positive, real_array
 from ..errors import InputError
 from ..grid import Grid
+from ..isotopes import Isotope, isotope
 from ..system import PinholeSystem
 from ..views import Views
 from ..volume import Volume
-from .arrays import is_tensor
+from .aperture import KnifeEdge, Opening, openings, points_needed, within_cone
+from .arrays import ArrayOrTensor, is_tensor, namespace
+from .crystal import absorbed_share, gaussian_blur, layer_depths, share_inside
 from .models import Array, Beam, Model, view_rays
 from .rays import Fan
 
@@ -25,7 +27,10 @@ _SAME_PLACE = 1e-3
 _SAME_DIRECTION = 1e-6
 
 _FWHM_PER_SIGMA = 2 * math.sqrt(2 * math.log(2))
-_GOLDEN_ANGLE = math.pi * (3 - math.sqrt(5))
+# A box of this width has the same variance as a Gaussian of sigma 1.
+_BOX_PER_SIGMA = math.sqrt(12)
+
+Edge = Literal["paix", "path"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,24 +59,49 @@ class Emission(Model):
         form. None: no attenuation.
     time : float
         Of the acquisition, s.
-    photons_per_decay : float
-        Photons of the energy that is counted, per decay (`core.isotopes`).
+    isotope : Isotope or str, optional
+        What decays (`core.isotopes`): its photons are counted, and its activity, that of the volume at the start, falls
+        during `time`. None: one photon per decay, and an activity that stays.
+    window : tuple of (float, float), optional
+        Energies, keV, between which the isotope's photons are counted. None: 10 % around its strongest line.
+    photons_per_decay : float, optional
+        Instead of the isotope's.
     aperture_points : int
         Points of the hole's disk from which rays start, each counting the same: the blur of a hole of diameter d_e.
         With 1 all rays pass the middle, and the hole blurs nothing; else at least 3.
+    aperture_tolerance : float, optional
+        Instead of `aperture_points`: as few points as keep the image of one of the grid's voxels, at the isocentre, near
+        to that of the whole hole: the absolute differences of the pixels, each counting over its whole area, sum to at
+        most this share of the counts. Errors at most add up, so it holds for any activity around the isocentre.
     aperture_mu : float, optional
         Attenuation coefficient of the aperture's material, 1/mm (`core.isotopes.TUNGSTEN_MU`). None: nothing
         penetrates it, d_e = d.
     opening_angle : float
-        Full angle alpha of the knife edge's cone, rad. With `aperture_mu`, ``d_e^2 = d (d + 2 / mu tan(alpha / 2))``
-        (Paix 1967).
+        Full angle alpha of the knife edge's double cone, rad.
+    edge : str
+        How photons penetrate the knife edge. ``"paix"``: as if the hole were one of diameter d_e with
+        ``d_e^2 = d (d + 2 / mu tan(alpha / 2))`` (Paix 1967), for every direction alike. ``"path"``: each by its path
+        through the edge, ``exp(-mu path)``, through rays that pass beyond the rim, the edge being as thick as the cone
+        goes on; what is steeper than the cone passes nowhere. On the axis that is
+        ``d_e^2 = d^2 + 2 d / mu tan(alpha / 2) + 2 / mu^2 tan^2(alpha / 2)`` (Metzler 2001). The hole itself needs no
+        correction for its obliquity in either: seen at psi its area is cos(psi) times the disk's, which is in cos^4(psi).
+        With one aperture point the edge changes the counts alone; with n, the blur too, by some 4 sqrt(pi n) rays more.
     crystal_mu : float, optional
         Attenuation coefficient of the crystal, 1/mm (`core.isotopes.NAI_MU`, `CZT_MU`). With it
         ``1 - exp(-crystal_mu Td / cos(psi))`` of the photons are counted. None: all.
+    depth_layers : int
+        Depths in the crystal, from front to back, at which photons are recorded, with `crystal_mu`: slanted rays are
+        recorded the farther out, the deeper they are absorbed (parallax). Number and mean depth are exact for every
+        angle from 2 on. With 1 all are recorded where they enter.
     intrinsic_fwhm : float
         Of the detector's Gaussian blur, mm on the crystal. What is blurred over the image's edge is lost.
     within_crystal : bool
         Whether pixels, or the parts of them, beyond the crystal's side Ld count nothing.
+    within_walls : bool
+        Whether the collimator's walls stop photons: those that would not enter by the crystal's front, but by its
+        sides or not at all. The walls run straight from the hole's rim to the front's edges, so no others meet them.
+    within_cone : bool
+        Whether what comes steeper than the knife edge's cone, psi > alpha / 2, counts nothing, for every edge.
 
     Raises
     ------
@@ -81,18 +111,27 @@ class Emission(Model):
     References
     ----------
     D. Paix, "Pinhole imaging of gamma rays", Physics in Medicine and Biology 12 (1967) 489-500.
+    S. D. Metzler, J. E. Bowsher, M. F. Smith, R. J. Jaszczak, "Analytic determination of pinhole collimator sensitivity
+    with penetration", IEEE Transactions on Medical Imaging 20 (2001) 730-741.
     """
 
     system: PinholeSystem
     mu: Volume | None = None
     time: float = 1.0
-    photons_per_decay: float = 1.0
+    photons_per_decay: float = None  # type: ignore[assignment]  # always a number once made
     aperture_points: int = 1
     aperture_mu: float | None = None
     opening_angle: float = math.pi / 2
     crystal_mu: float | None = None
     intrinsic_fwhm: float = 0.0
     within_crystal: bool = False
+    isotope: Isotope | str | None = None
+    window: tuple[float, float] | None = None
+    aperture_tolerance: float | None = None
+    edge: Edge = "paix"
+    depth_layers: int = 1
+    within_walls: bool = False
+    within_cone: bool = False
 
     name = "emission"
 
@@ -101,33 +140,74 @@ class Emission(Model):
             raise InputError(f"emission: expected a PinholeSystem, got {type(self.system).__name__}")
         if self.mu is not None:
             if not isinstance(self.mu, Volume):
-                hint = ": there are no gradients with respect to mu" if is_tensor(self.mu) else ""
+                hint = "; tensors of it go to the projector, A(x, mu=...)" if is_tensor(self.mu) else ""
                 raise InputError(f"emission: expected mu to be a Volume, got {type(self.mu).__name__}{hint}")
             if self.mu.quantity != "mu":
                 raise InputError(f"emission: expected a volume of mu, got {self.mu.quantity}")
             if self.mu.array.min() < 0:
                 raise InputError(f"emission: mu must not be negative, got {self.mu.array.min():g} 1/mm")
-        for name in ("time", "photons_per_decay", "aperture_mu", "opening_angle", "crystal_mu"):
-            if getattr(self, name) is not None or name not in ("aperture_mu", "crystal_mu"):
-                object.__setattr__(self, name, positive(getattr(self, name), f"emission: {name}"))
+        self._set_photons()
+        for name in ("time", "opening_angle", "aperture_mu", "crystal_mu", "aperture_tolerance"):
+            value = getattr(self, name)
+            if value is not None or name in ("time", "opening_angle"):
+                self._set(name, positive(value, f"emission: {name}"))
         if self.opening_angle >= math.pi:
             raise InputError(f"emission: opening_angle must be below pi, got {self.opening_angle:g} rad")
-        fwhm = float(real_array(self.intrinsic_fwhm, "emission: intrinsic_fwhm", ()))
-        object.__setattr__(self, "intrinsic_fwhm", fwhm)
-        if fwhm < 0:
-            raise InputError(f"emission: intrinsic_fwhm must not be negative, got {fwhm:g} mm")
-        n = self.aperture_points
-        if isinstance(n, bool) or not isinstance(n, int | np.integer) or n < 1 or n == 2:
-            raise InputError(f"emission: aperture_points: expected 1, 3 or more, got {n!r}")
-        object.__setattr__(self, "aperture_points", int(n))
-        object.__setattr__(self, "within_crystal", bool(self.within_crystal))
+        self._set("intrinsic_fwhm", float(real_array(self.intrinsic_fwhm, "emission: intrinsic_fwhm", ())))
+        if self.intrinsic_fwhm < 0:
+            raise InputError(f"emission: intrinsic_fwhm must not be negative, got {self.intrinsic_fwhm:g} mm")
+        self._set("aperture_points", _whole(self.aperture_points, "aperture_points", "1, 3 or more"))
+        if self.aperture_points == 2:
+            raise InputError("emission: aperture_points: expected 1, 3 or more, got 2")
+        if self.aperture_tolerance is not None and self.aperture_points != 1:
+            raise InputError("emission: give aperture_points or aperture_tolerance, not both")
+        if self.edge not in ("paix", "path"):
+            raise InputError(f"emission: edge: expected 'paix' or 'path', got {self.edge!r}")
+        if self.edge == "path" and self.aperture_mu is None:
+            raise InputError("emission: edge 'path' needs aperture_mu, of the aperture's material")
+        self._set("depth_layers", _whole(self.depth_layers, "depth_layers", "1 or more"))
+        if self.depth_layers > 1 and self.crystal_mu is None:
+            raise InputError("emission: depth_layers needs crystal_mu, of the crystal's material")
+        for name in ("within_crystal", "within_walls", "within_cone"):
+            self._set(name, bool(getattr(self, name)))
+
+    def _set(self, name: str, value: Any) -> None:
+        object.__setattr__(self, name, value)
+
+    def _set_photons(self) -> None:
+        """Make `isotope` an Isotope, and `window` and `photons_per_decay` numbers."""
+        if self.window is not None and self.isotope is None:
+            raise InputError("emission: window needs an isotope")
+        if self.isotope is not None:
+            if not isinstance(self.isotope, Isotope):
+                self._set("isotope", isotope(self.isotope))
+            known: Isotope = self.isotope  # type: ignore[assignment]
+            low, high = known.window if self.window is None else real_array(self.window, "emission: window", (2,))
+            self._set("window", (float(low), float(high)))
+            if self.photons_per_decay is None:
+                self._set("photons_per_decay", known.photons_per_decay(low, high))
+                if self.photons_per_decay == 0:
+                    lines = ", ".join(f"{energy:g}" for energy, _ in known.lines)
+                    raise InputError(
+                        f"emission: {known.name} has no photons from {low:g} to {high:g} keV; its lines: {lines}"
+                    )
+        elif self.photons_per_decay is None:
+            self._set("photons_per_decay", 1.0)
+        self._set("photons_per_decay", positive(self.photons_per_decay, "emission: photons_per_decay"))
 
     def record(self) -> dict[str, Any]:
-        """The settings, for a run's record; of mu only its grid."""
+        """The settings, for a run's record; of mu only its grid, of the isotope its name."""
         settings = {f.name: getattr(self, f.name) for f in fields(self) if f.name not in ("system", "mu")}
+        settings["isotope"] = None if self.isotope is None else self.isotope.name  # type: ignore[union-attr]
+        settings["window"] = None if self.window is None else list(self.window)
         if self.mu is not None:
             settings["mu"] = {"shape": list(self.mu.grid.shape), "affine": self.mu.grid.affine.tolist()}
         return settings
+
+    @property
+    def effective_time(self) -> float:
+        """The time, s, in which the activity at the start would make as many decays as it makes while it falls."""
+        return self.time if self.isotope is None else self.isotope.mean_decay_time(self.time)  # type: ignore[union-attr]
 
     def unit(self, volume: Volume) -> str:
         """Unit of the images of `volume`."""
@@ -161,39 +241,86 @@ class Emission(Model):
 
     @property
     def effective_diameter(self) -> Array:
-        """d_e (M,), mm: the opaque hole that lets as many photons pass (Paix)."""
+        """d_e (M,), mm: the opaque hole that lets as many photons pass along the axis."""
         d = self.system.pinhole_diameter
         if self.aperture_mu is None:
             return d
-        return np.sqrt(d * (d + 2 / self.aperture_mu * math.tan(self.opening_angle / 2)))
+        depth = 2 / self.aperture_mu * self._tangent
+        return np.sqrt(d * (d + depth) + (depth**2 / 2 if self.edge == "path" else 0))
+
+    @property
+    def _tangent(self) -> float:
+        return math.tan(self.opening_angle / 2)
 
     def beams(self, views: Views, m: int, grid: Grid) -> Iterator[Beam]:
         """Rays from the pinhole through the grid, weighted with counts per (decay / (s mm^3) mm)."""
         u, v, k = self.system.frames()[m]
-        l, diameter = self.system.collimator_length[m], self.effective_diameter[m]
+        l = self.system.collimator_length[m]
         pinhole, rays, scale = views.sources[m], view_rays(views, m), self._crystal_scale(views, m)
         # The pixels' places on the crystal, mm along u and v, point-inverted, seen from its middle.
-        middle = scale * (rays.corner - pinhole)
+        middle = scale * (rays.corner - pinhole) - l * k
         pitch_u, pitch_v = self._crystal_pitch(views, m)
         n_v, n_u = views.shape
         along_v = (middle @ v + scale * (rays.line_step @ v) * np.arange(n_v))[:, None]
         along_u = (middle @ u + scale * (rays.ray_step @ u) * np.arange(n_u))[None, :]
-        counts = self.time * self.photons_per_decay * diameter**2 * pitch_u * pitch_v / (16 * l**2)
-        if self.within_crystal:
-            counts = counts * self._share_on_crystal(m, along_v, pitch_v)
-            counts = counts * self._share_on_crystal(m, along_u, pitch_u)
         # To the plane through the grid's farthest corner.
         depth = max(float(((grid.corners() - pinhole) @ k).max()), l)
-        for x, y in diameter / 2 * disk_points(self.aperture_points):
-            point = x * u + y * v
-            cosine = l / np.sqrt((along_u + x) ** 2 + (along_v + y) ** 2 + l**2)
-            weights = counts / self.aperture_points * cosine**4
-            if self.crystal_mu is not None:
-                weights *= -np.expm1(-self.crystal_mu * self.system.detector_thickness[m] / cosine)
-            source, stretch = pinhole + point, depth / l * scale
-            corner = source + depth / l * (middle + point)
-            fan = Fan(source, corner, stretch * rays.line_step, stretch * rays.ray_step, views.shape)
-            yield Beam(fan, weights)
+        points = self.openings(m, self.points(views, m, grid))
+        for layer, z in enumerate(layer_depths(self.depth_layers, self.system.detector_thickness[m])):
+            stretch = depth / (l + z)
+            steps = stretch * scale * rays.line_step, stretch * scale * rays.ray_step
+            for opening in points:
+                weights = self.pixel_weights(m, along_u, along_v, (pitch_u, pitch_v), l, opening, layer)
+                point = opening.x * u + opening.y * v
+                corner = pinhole + point + depth * k + stretch * (middle + point)
+                yield Beam(Fan(pinhole + point, corner, *steps, views.shape), weights)
+
+    def pixel_weights(
+        self,
+        m: int,
+        along_u: ArrayOrTensor,
+        along_v: ArrayOrTensor,
+        pitch: tuple[float, float],
+        length: float,
+        opening: Opening,
+        layer: int = 0,
+    ) -> ArrayOrTensor:
+        """What pixels of module m count per (decay / (s mm^3) mm) along rays that start from one point of the hole.
+
+        Parameters
+        ----------
+        m
+            The module: its crystal's side and thickness.
+        along_u, along_v
+            The pixels' places on the crystal, mm from its middle and point-inverted: arrays or tensors that broadcast.
+        pitch
+            The pixels' size on the crystal, mm along u and v.
+        length
+            Collimator length l, mm.
+        opening
+            The point.
+        layer
+            Of `depth_layers`, from the front: where photons are recorded.
+        """
+        side, thickness = self.system.detector_side[m], self.system.detector_thickness[m]
+        depths = layer_depths(self.depth_layers, thickness)
+        distance = length + depths[layer]
+        slope_u, slope_v = (along_u + opening.x) / distance, (along_v + opening.y) / distance
+        squared_secant = 1 + slope_u**2 + slope_v**2
+        cosine = 1 / namespace(squared_secant).sqrt(squared_secant)
+        weights = self.effective_time * self.photons_per_decay * pitch[0] * pitch[1] * throughput(cosine, distance)
+        weights = weights * opening.area(slope_u, slope_v)
+        if self.crystal_mu is not None:
+            weights = weights * absorbed_share(cosine, self.crystal_mu, thickness, depths, layer)
+        if self.within_cone:
+            weights = weights * within_cone(slope_u, slope_v, self._tangent)
+        for along, size, start in ((along_u, pitch[0], opening.x), (along_v, pitch[1], opening.y)):
+            if self.within_crystal:
+                weights = weights * share_inside(along, size, side)
+            if self.within_walls:
+                shrink = length / distance  # back to where the rays cross the crystal's front
+                weights = weights * share_inside(shrink * along - (1 - shrink) * start, shrink * size, side)
+        return weights
 
     def response(self, views: Views, m: int) -> tuple[Array, Array] | None:
         """The intrinsic blur of view m: matrices (n_v, n_v) along v and (n_u, n_u) along u."""
@@ -203,6 +330,25 @@ class Emission(Model):
         pitch_u, pitch_v = self._crystal_pitch(views, m)
         n_v, n_u = views.shape
         return gaussian_blur(n_v, sigma / pitch_v), gaussian_blur(n_u, sigma / pitch_u)
+
+    def points(self, views: Views, m: int, grid: Grid) -> int:
+        """Points of the hole that rays of view m start from: `aperture_points`, or what `aperture_tolerance` takes."""
+        if self.aperture_tolerance is None:
+            return self.aperture_points
+        l, b = self.system.collimator_length[m], self.system.pinhole_distance[m]
+        pitch_u, pitch_v = self._crystal_pitch(views, m)
+        sigma = self.intrinsic_fwhm / _FWHM_PER_SIGMA
+        voxel = grid.voxel_volume ** (1 / 3) * l / b
+        blur = math.hypot(voxel, _BOX_PER_SIGMA * sigma)
+        shadow = self.effective_diameter[m] * (1 + l / b)
+        return points_needed(self.aperture_tolerance, float(shadow), (pitch_u, pitch_v), (blur, blur))
+
+    def openings(self, m: int, n: int) -> list[Opening]:
+        """Where rays of module m cross the pinhole's plane: n points of the hole, and those of its edge."""
+        if self.edge == "paix" or self.aperture_mu is None:
+            return openings(n, self.effective_diameter[m])
+        d = self.system.pinhole_diameter[m]
+        return openings(n, d, KnifeEdge(d / 2, self.aperture_mu, self._tangent))
 
     def _crystal_scale(self, views: Views, m: int) -> float:
         """A length on the crystal, per length on view m's plane."""
@@ -214,36 +360,18 @@ class Emission(Model):
         scale = self._crystal_scale(views, m)
         return scale * float(np.linalg.norm(views.u_steps[m])), scale * float(np.linalg.norm(views.v_steps[m]))
 
-    def _share_on_crystal(self, m: int, middle: Array, pitch: float) -> Array:
-        """Shares of pixels of size `pitch` around `middle` (mm from the crystal's middle, along one side) on the crystal."""
-        half = self.system.detector_side[m] / 2
-        overlap = np.minimum(middle + pitch / 2, half) - np.maximum(middle - pitch / 2, -half)
-        return np.clip(overlap, 0, None) / pitch
 
+def throughput(cosine: ArrayOrTensor, distance: float) -> ArrayOrTensor:
+    """Photons that cross an mm^2 of the pinhole's plane and one of a plane behind it, per photon emitted along a mm.
 
-def disk_points(n: int) -> Array:
-    """n points (n, 2) that stand for equal parts of the unit disk: Vogel's spiral, as in the head of a sunflower.
-
-    Shifted and stretched a little, so that their mean is the disk's, 0, and their variance too, 1/4 along every
-    direction: the blur has the right width however few the points. 1 point is the middle; 2 have no such variance.
-
-    References
-    ----------
-    H. Vogel, "A better way to construct the sunflower head", Mathematical Biosciences 44 (1979) 179-189.
+    Both planes lie across the axis, `distance` mm apart; the photons cross them at an angle of this `cosine` to it. With
+    the hole's area pi d^2 / 4 that is ``d^2 cos^4(psi) / (16 l^2)``.
     """
-    if n == 1:
-        return np.zeros((1, 2))
-    i = np.arange(n)
-    radius = np.sqrt((i + 0.5) / n)[:, None]
-    points = radius * np.stack([np.cos(i * _GOLDEN_ANGLE), np.sin(i * _GOLDEN_ANGLE)], axis=1)
-    points -= points.mean(axis=0)
-    spread = np.linalg.cholesky(points.T @ points / n)
-    return points @ np.linalg.inv(spread).T / 2
+    squared = cosine * cosine  # many times faster than a power
+    return squared * squared / (4 * math.pi * distance**2)
 
 
-def gaussian_blur(n: int, sigma: float) -> NDArray[np.float64]:
-    """Matrix (n, n) that blurs n pixels with a Gaussian of `sigma` pixels, integrated over the receiving pixel."""
-    edges = (np.arange(n + 1) - 0.5) / (sigma * math.sqrt(2))
-    kernel = np.diff([0.5 * math.erf(x) for x in edges])
-    distance = np.abs(np.arange(n)[:, None] - np.arange(n))
-    return kernel[distance]
+def _whole(value: Any, name: str, expected: str) -> int:
+    if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < 1:
+        raise InputError(f"emission: {name}: expected {expected}, got {value!r}")
+    return int(value)

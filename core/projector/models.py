@@ -10,10 +10,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ..checks import positive
 from ..errors import InputError
 from ..grid import Grid
 from ..views import Views
 from ..volume import Volume
+from .arrays import ArrayOrTensor, namespace
 from .rays import Fan
 
 Array = NDArray[np.float64]
@@ -40,9 +42,9 @@ class Beam:
 
 
 class Model(ABC):
-    """What a pixel measures: ``response(sum over beams of weight * integral along the ray)``, linear in the volume.
+    """What a pixel measures: ``response(sum over beams of weight * integral along the ray of volume * voxel weight)``.
 
-    The operator does the rest, so a model knows neither backends nor adjoints.
+    Linear in the volume. The operator does the rest, so a model knows neither backends nor adjoints.
     """
 
     name: str
@@ -50,6 +52,9 @@ class Model(ABC):
 
     mu: Volume | None = None
     """What attenuates the rays between the point that is measured and their source, 1/mm."""
+
+    weights_voxels: bool = False
+    """Whether each view weights the voxels in its own way (`voxel_weights`)."""
 
     def check(self, views: Views) -> None:  # noqa: B027  (most have nothing to check)
         """Raise `InputError` where the model is not for these views."""
@@ -68,6 +73,10 @@ class Model(ABC):
     @abstractmethod
     def beams(self, views: Views, m: int, grid: Grid) -> Iterator[Beam]:
         """The rays of view m through `grid`, their sources on the detector's side of what is measured."""
+
+    def voxel_weights(self, views: Views, m: int, grid: Grid) -> Array:
+        """What the voxels are multiplied by before view m is taken, of ``grid.shape``; asked for if `weights_voxels`."""
+        return np.ones(grid.shape)
 
     def response(self, views: Views, m: int) -> tuple[Array, Array] | None:
         """The detector's response in view m: matrices (n_v, n_v) along v and (n_u, n_u) along u, None if ideal."""
@@ -89,6 +98,27 @@ class Transmission(Model):
         yield Beam(view_rays(views, m))
 
 
+def intensity(line_integrals: ArrayOrTensor, photons: float) -> ArrayOrTensor:
+    """Photons that pass where attenuation integrates to `line_integrals`: ``photons * exp(-line_integrals)``.
+
+    The images of a volume of mu by `Transmission` become a radiograph's expected photons; `core.noise.sample_counts` draws
+    from them.
+
+    Parameters
+    ----------
+    line_integrals
+        Of mu, without unit: an array, or a tensor (the result is then part of its graph).
+    photons
+        Per pixel, where nothing attenuates (I0).
+
+    Raises
+    ------
+    InputError
+        `photons` is not a number above 0.
+    """
+    return positive(photons, "photons") * namespace(line_integrals).exp(-line_integrals)
+
+
 def view_rays(views: Views, m: int) -> Fan:
     """The rays of view m, from its source to the pixels' centres: a line for every row."""
     n_v, n_u = views.shape
@@ -100,5 +130,7 @@ def view_rays(views: Views, m: int) -> Fan:
 def require_model(value: object) -> Model:
     """`value` if it is a model."""
     if not isinstance(value, Model):
-        raise InputError(f"projector: expected model to be Transmission or Emission, got {type(value).__name__}")
+        raise InputError(
+            f"projector: expected model to be Transmission, Emission or another model, got {type(value).__name__}"
+        )
     return value

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import math
 import os
 from abc import ABC, abstractmethod
@@ -19,7 +20,7 @@ from ..progress import Progress
 from ..views import Views
 from ..volume import Volume
 from . import backends
-from .arrays import ArrayOrTensor, alike, checked, cropped, is_tensor, like, to_numpy, to_tensor, zeros
+from .arrays import ArrayOrTensor, alike, checked, cropped, is_tensor, like, to_numpy, to_tensor, together, zeros
 from .models import Array, Beam, Model, Transmission, require_model
 from .rays import Attenuation, IndexFans, RayMapper
 
@@ -35,6 +36,9 @@ _RAYS_AT_ONCE_CUDA = 2**22
 _MOST_VOLUMES = 8
 
 ParallelMap = Callable[[Callable[[Any], Any], Iterable[Any]], Iterable[Any]]
+
+# Adds values to a volume along rays, with what attenuates them: a backend's adjoint, for instance.
+Spread = Callable[[ArrayOrTensor, ArrayOrTensor, Any, Any], None]
 
 
 class LinearOperator(ABC):
@@ -144,7 +148,43 @@ class Projector(LinearOperator):
         self.backend = backends.choose(backend)
         self.threads = _thread_count(threads)
         self._auto = backend == "auto"
+        self._mu: ArrayOrTensor = None if self.model.mu is None else self.model.mu.array
         self._adjoint = AdjointProjector(self)
+
+    def __call__(
+        self, x: Volume | ArrayOrTensor, progress: Progress | None = None, mu: ArrayOrTensor | None = None
+    ) -> ArrayOrTensor:
+        """The images of a volume.
+
+        Parameters
+        ----------
+        x, progress
+            As of `LinearOperator`; `x` may also be a `Volume`.
+        mu
+            Attenuation coefficients, 1/mm, in place of the model's: an array or tensor on the grid of its `mu`.
+
+        Returns
+        -------
+        array or tensor
+            As of `LinearOperator`, and a tensor also if `mu` is one: part of torch's graph if `x` or `mu` requires a
+            gradient, for every backend. Where `mu` requires one, gradients of gradients are refused.
+
+        Raises
+        ------
+        InputError
+            As of `LinearOperator`; and the model has no mu, or `mu` has another shape, or is negative.
+        """
+        if mu is None:
+            return super().__call__(x, progress)
+        x, mu = together(self._check(x), self._check_mu(mu))
+        attenuated = copy.copy(self)
+        attenuated._mu = mu
+        attenuated._adjoint = AdjointProjector(attenuated)
+        if is_tensor(x):
+            from .autograd import apply_attenuated
+
+            return apply_attenuated(attenuated, x, mu, progress)
+        return attenuated._run(x, progress)
 
     @property
     def shape_in(self) -> tuple[int, int, int]:
@@ -180,11 +220,16 @@ class Projector(LinearOperator):
             return x.array
         return checked(x, "volume", self.shape_in, self._float64)
 
+    def _check_mu(self, mu: ArrayOrTensor) -> ArrayOrTensor:
+        if self.model.mu is None:
+            raise InputError("mu: the projector's model has none; give it one to say on which grid mu is")
+        return checked_mu(mu, self.model.mu.grid, self._float64)
+
     def _run(self, x: ArrayOrTensor, progress: Progress | None = None) -> ArrayOrTensor:
         n_views, n_v, n_u = self.shape_out
         wide = 8 if self._float64 else 4
         what = f"projecting {_times(self.shape_in)} voxels into {n_views} images of {n_v} x {n_u} pixels"
-        require(wide * (n_views * n_v * n_u + self.grid.n_voxels), what)
+        require(wide * (n_views * n_v * n_u + self.grid.n_voxels) + self._extra_bytes(wide), what)
         images = None
         _report(progress, 0, n_views)
         for m, image in enumerate(self._images(x)):
@@ -202,19 +247,20 @@ class Projector(LinearOperator):
         integrate = backends.load(name).forward
         native = self._native(x, name)
         box, trace = self._lattices(native, native)
-        if name == "cuda":
+        if name == "cuda" and not self.model.weights_voxels:
             yield from self._images_together(box, trace)
             return
         with _parallel(self._workers(name)) as parallel_map:
             for m in range(len(self.views)):
                 image = zeros(self.views.shape, box)
+                seen = self._weighted(box, m, trace.origin)
                 for beam, by_columns in self._beams(m):
                     lines = image.T if by_columns else image
                     weights = None if beam.weights is None else alike(beam.weights, box)
 
                     def project(block: slice) -> None:
                         rays, attenuation = trace(beam.rays[block])  # noqa: B023
-                        integrals = integrate(box, rays, attenuation).reshape(lines[block].shape)  # noqa: B023
+                        integrals = integrate(seen, rays, attenuation).reshape(lines[block].shape)  # noqa: B023
                         lines[block] += integrals if weights is None else weights[block] * integrals  # noqa: B023
 
                     for _ in parallel_map(project, _blocks(lines.shape[0], lines.shape[1], name)):
@@ -268,6 +314,18 @@ class Projector(LinearOperator):
                 weights = None if group[0][1].weights is None else np.stack([beam.weights for _, beam in group])
                 yield [k for k, _ in group], by_columns, weights, IndexFans(rays), attenuation
 
+    def _weighted(self, box: ArrayOrTensor, m: int, origin: tuple[int, int, int] = (0, 0, 0)) -> ArrayOrTensor:
+        """A part of a volume, from voxel `origin` on, times view m's voxel weights."""
+        if not self.model.weights_voxels:
+            return box
+        part = tuple(slice(first, first + n) for first, n in zip(origin, box.shape, strict=True))
+        return box * alike(self.model.voxel_weights(self.views, m, self.grid)[part], box)
+
+    def _extra_bytes(self, wide: int) -> int:
+        """Bytes of a copy of mu, and of voxel weights with what they weight."""
+        mu = 0 if self.model.mu is None else self.model.mu.grid.n_voxels
+        return wide * mu + (2 * wide + 8) * self.grid.n_voxels * self.model.weights_voxels
+
     def _beams(self, m: int) -> Iterator[tuple[Beam, bool]]:
         """View m's rays, and whether their lines are the image's columns, not its rows.
 
@@ -279,29 +337,13 @@ class Projector(LinearOperator):
         for beam in self.model.beams(self.views, m, self.grid):
             yield (beam.transposed() if by_columns else beam), by_columns
 
-    def _lattices(self, native: ArrayOrTensor, volume: ArrayOrTensor = None) -> tuple[ArrayOrTensor, RayMapper]:
-        """The part of `volume` that is not empty, and what brings rays into the index spaces of that and of mu.
-
-        Empty margins cost time: most objects fill a small part of their grid. With None (a volume yet to be filled)
-        the rays are for the whole grid. What attenuates is kept wherever it is, outside the volume's filled part too.
-
-        `native` is an array of the kind with which the backend computes.
-        """
-        box, origin = volume, (0, 0, 0)
-        if volume is not None:
-            (box,), origin = cropped(volume)
+    def _lattices(
+        self, native: ArrayOrTensor, volume: ArrayOrTensor = None, whole_mu: bool = False
+    ) -> tuple[ArrayOrTensor, RayMapper]:
+        """`lattices` of this projector; `native` is an array of the kind with which the backend computes."""
         if self.model.mu is None:
-            return box, RayMapper(self.grid, origin)
-        mu, mu_grid = alike(self.model.mu.array, native), self.model.mu.grid
-        if _same(mu_grid, self.grid):
-            if volume is None:
-                return None, RayMapper(self.grid, mu=mu)
-            (common, mu_common), common_origin = cropped(volume, mu)
-            # One lattice is walked twice as fast as two, but two boxes let rays that miss the volume's go at once.
-            if math.prod(common.shape) <= 2 * math.prod(box.shape):
-                return common, RayMapper(self.grid, common_origin, mu_common)
-        (mu,), mu_origin = cropped(mu)
-        return box, RayMapper(self.grid, origin, mu, mu_grid, mu_origin)
+            return lattices(self.grid, volume)
+        return lattices(self.grid, volume, alike(self._mu, native), self.model.mu.grid, whole_mu)
 
     def _native(self, x: ArrayOrTensor, name: str) -> ArrayOrTensor:
         """`x` as the backend `name` computes with it."""
@@ -350,24 +392,56 @@ class AdjointProjector(LinearOperator):
     def _run(self, x: ArrayOrTensor, progress: Progress | None = None) -> ArrayOrTensor:
         A = self._projector
         name = A._backend_for(x)
-        spread = backends.load(name).adjoint
         images = A._native(x, name)
         _, trace = A._lattices(images)
-        volume_bytes = (8 if name == "numpy" else 4) * A.grid.n_voxels
-        require(volume_bytes, f"the adjoint into {_times(self.shape_out)} voxels")
+        spread = backends.load(name).adjoint
+        return like(self._spread(images, name, trace, A.grid, lambda m: spread, A.model.weights_voxels, progress), x)
+
+    def _mu_gradient(self, images: ArrayOrTensor, volume: ArrayOrTensor) -> ArrayOrTensor:
+        """The gradient of <A volume, images> by mu, on mu's whole grid."""
+        A = self._projector
+        assert A.model.mu is not None
+        name = A._backend_for(volume)
+        native = A._native(volume, name)
+        box, trace = A._lattices(native, native, whole_mu=True)
+        add_gradient = backends.load(name).mu_gradient
+
+        def of_view(m: int) -> Spread:
+            seen = A._weighted(box, m, trace.origin)
+            return lambda gradient, values, rays, attenuation: add_gradient(gradient, seen, values, rays, attenuation)
+
+        return like(self._spread(A._native(images, name), name, trace, A.model.mu.grid, of_view), images)
+
+    def _spread(
+        self,
+        images: ArrayOrTensor,
+        name: str,
+        trace: RayMapper,
+        grid: Grid,
+        of_view: Callable[[int], Spread],
+        weighted: bool = False,
+        progress: Progress | None = None,
+    ) -> ArrayOrTensor:
+        """What the functions ``of_view(m)`` add for all rays of native images to a volume on `grid`.
+
+        With `weighted` each view's volume is multiplied by its voxel weights.
+        """
+        A = self._projector
+        volume_bytes = (8 if name == "numpy" else 4) * grid.n_voxels
+        extra_bytes = A._extra_bytes(8 if name == "numpy" else 4)
+        require(volume_bytes + extra_bytes, f"the adjoint into {_times(grid.shape)} voxels")
         _require_rays(A.views)
-        # One volume per thread: fewer threads rather than no room for anything else.
-        affordable = max(1, available() // (2 * volume_bytes))
-        workers = min(A._workers(name), _MOST_VOLUMES, affordable)
-        volumes = [zeros(self.shape_out, images) for _ in range(workers)]
+        workers = volume_workers(A._workers(name), volume_bytes, extra_bytes)
+        volumes = [zeros(grid.shape, images) for _ in range(workers)]
+        total: ArrayOrTensor = zeros(grid.shape, images) if weighted else None
         n_views = len(A.views)
         _report(progress, 0, n_views)
-        if name == "cuda":
-            self._spread_together(images, volumes[0], trace, progress)
-            return like(volumes[0], x)
+        if name == "cuda" and not A.model.weights_voxels:  # which every view does in its own way
+            self._spread_together(images, volumes[0], of_view(0), trace, progress)
+            return volumes[0]
         with _parallel(workers) as parallel_map:
             for m in range(n_views):
-                image = images[m]
+                image, spread = images[m], of_view(m)
                 response = A.model.response(A.views, m)
                 if response is not None:
                     along_v, along_u = (alike(matrix, image) for matrix in response)
@@ -385,20 +459,22 @@ class AdjointProjector(LinearOperator):
 
                     for _ in parallel_map(add, range(workers)):
                         pass
+                if weighted:  # otherwise in every view: each joins the others weighted
+                    total += A._weighted(_sum(volumes), m)
+                    for volume in volumes:
+                        volume[:] = 0
                 _report(progress, m + 1, n_views)
-        total = volumes[0]
-        for volume in volumes[1:]:
-            total += volume
+        if not weighted:
+            total = _sum(volumes)
         if not (A._float64 or is_tensor(total)):
             total = total.astype(np.float32, copy=False)
-        return like(total, x)
+        return total
 
     def _spread_together(
-        self, images: ArrayOrTensor, volume: ArrayOrTensor, trace: RayMapper, progress: Progress | None
+        self, images: ArrayOrTensor, volume: ArrayOrTensor, spread: Spread, trace: RayMapper, progress: Progress | None
     ) -> None:
-        """Add `images` to `volume`, several views at once."""
+        """`_spread` into `volume` for the backend that takes several views at once."""
         A = self._projector
-        spread = backends.load("cuda").adjoint
         for views in A._views_together():
             some = images[views.start : views.stop]
             responses = [A.model.response(A.views, m) for m in views]
@@ -410,6 +486,49 @@ class AdjointProjector(LinearOperator):
                 values = lines if weights is None else alike(weights, images) * lines
                 spread(volume, values.reshape(-1), rays, attenuation)
             _report(progress, views.stop, images.shape[0])
+
+
+def lattices(
+    grid: Grid,
+    volume: ArrayOrTensor,
+    mu: ArrayOrTensor = None,
+    mu_grid: Grid | None = None,
+    whole_mu: bool = False,
+) -> tuple[ArrayOrTensor, RayMapper]:
+    """The part of `volume` that is not empty, and what brings rays into the index spaces of that and of mu.
+
+    Empty margins cost time: most objects fill a small part of their grid. With None (a volume yet to be filled)
+    the rays are for the whole grid. What attenuates is kept wherever it is, outside the volume's filled part too;
+    and where nothing does, with `whole_mu`.
+    """
+    box, origin, mu_origin = volume, (0, 0, 0), (0, 0, 0)
+    if volume is not None:
+        (box,), origin = cropped(volume)
+    if mu is None:
+        return box, RayMapper(grid, origin)
+    if mu_grid is None or _same(mu_grid, grid):
+        if volume is None or whole_mu:
+            return volume, RayMapper(grid, mu=mu)
+        (common, mu_common), common_origin = cropped(volume, mu)
+        # One lattice is walked twice as fast as two, but two boxes let rays that miss the volume's go at once.
+        if math.prod(common.shape) <= 2 * math.prod(box.shape):
+            return common, RayMapper(grid, common_origin, mu_common)
+    if not whole_mu:
+        (mu,), mu_origin = cropped(mu)
+    return box, RayMapper(grid, origin, mu, mu_grid or grid, mu_origin)
+
+
+def volume_workers(workers: int, volume_bytes: int, extra_bytes: int = 0) -> int:
+    """As many of `workers` as may have a volume each: fewer threads rather than no room for anything else."""
+    return min(workers, _MOST_VOLUMES, max(1, (available() - extra_bytes) // (2 * volume_bytes)))
+
+
+def _sum(volumes: list[ArrayOrTensor]) -> ArrayOrTensor:
+    """Their sum, in the first of them."""
+    total = volumes[0]
+    for volume in volumes[1:]:
+        total += volume
+    return total
 
 
 def _blocks(n_lines: int, line_length: int, backend: str) -> list[slice]:
@@ -431,8 +550,16 @@ def _parallel(workers: int) -> Iterator[ParallelMap]:
 
 def _require_rays(views: Views) -> None:
     n_v, n_u = views.shape
-    # An image of float32, and a few arrays of float64 that weight its rays.
-    require(28 * n_v * n_u, f"an image of {n_v} x {n_u} pixels, with its rays,")
+    # An image of float32, and some arrays of float64 from which the weights of its rays are made.
+    require(110 * n_v * n_u, f"an image of {n_v} x {n_u} pixels, with its rays,")
+
+
+def checked_mu(mu: ArrayOrTensor, grid: Grid, float64: bool) -> ArrayOrTensor:
+    """`mu` as `checked` numbers on `grid`, none of them negative."""
+    mu = checked(mu, "mu", grid.shape, float64)
+    if mu.min() < 0:
+        raise InputError(f"mu: expected no negative coefficient, got {float(mu.min()):g} 1/mm")
+    return mu
 
 
 def _thread_count(threads: int | None) -> int:

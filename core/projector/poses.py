@@ -1,14 +1,16 @@
 """Pinhole images from poses in torch, so that poses can be optimised.
 
-`Views` describes cameras that stand still, in numpy; the rays made here from torch tensors are the same, part of torch's
-graph. Needs torch.
+`Views` and `Emission` describe cameras that stand still, in numpy; the rays and counts made here from torch tensors are
+the same, part of torch's graph. Needs torch.
 """
 
 from __future__ import annotations
 
 import functools
+import math
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -16,6 +18,9 @@ from ..checks import whole_shape
 from ..errors import InputError
 from ..grid import Grid
 from ..volume import Volume
+from .aperture import disk_points
+from .crystal import absorbed_share
+from .emission import throughput
 from .tracing import trace_rays
 
 Numbers = Any  # a tensor, an array or numbers
@@ -59,27 +64,41 @@ def pinhole_rays(
         Shapes that do not fit.
     """
     n_v, n_u = whole_shape(shape, "image shape", 2)
+    positions, rotations, distance, pitch, offset = _cameras(positions, rotations, distance, pitch, offset)
+    in_camera = _pixels(distance, pitch, offset, (n_v, n_u))
+    targets = positions[..., None, :] + in_camera @ rotations.mT
+    return positions[..., None, :].expand(targets.shape), targets
+
+
+def _cameras(positions: Tensor, rotations: Numbers, *numbers: Numbers) -> list[Tensor]:
+    """What is said of the cameras (...), as tensors of one type: positions (..., 3), rotations (..., 3, 3), numbers (...).
+
+    The last two of the numbers are pitch and offset, (..., 2).
+    """
     if not isinstance(positions, Tensor) or positions.shape[-1:] != (3,) or not positions.is_floating_point():
         raise InputError("positions: expected a tensor of real numbers, ... x 3")
-
-    given = (positions, rotations, distance, pitch, offset)
+    given = (positions, rotations, *numbers)
     kinds = [x.dtype for x in given if isinstance(x, Tensor) and x.is_floating_point()]
     kind = functools.reduce(torch.promote_types, kinds)
-    positions, rotations, distance, pitch, offset = (torch.as_tensor(x).to(positions.device, kind) for x in given)
-    if rotations.shape[-2:] != (3, 3):
-        raise InputError(f"rotations: expected ... x 3 x 3, got {' x '.join(map(str, rotations.shape))}")
-    column = torch.arange(n_u).to(positions) - (n_u - 1) / 2
-    row = torch.arange(n_v).to(positions) - (n_v - 1) / 2
-    row, column = (x.reshape(-1) for x in torch.meshgrid(row, column, indexing="ij"))
-    pitch, offset = (x.expand(*x.shape[:-1], 2) if x.ndim else x.expand(2) for x in (pitch, offset))
+    tensors = [torch.as_tensor(x).to(positions.device, kind) for x in given]
+    if tensors[1].shape[-2:] != (3, 3):
+        raise InputError(f"rotations: expected ... x 3 x 3, got {' x '.join(map(str, tensors[1].shape))}")
+    tensors[-2:] = (x if x.ndim else x.expand(2) for x in tensors[-2:])  # pitch, offset: one number for both
+    shapes = [(3,), (3, 3), *[()] * (len(numbers) - 2), (2,), (2,)]
     try:
-        u = column * pitch[..., :1] + offset[..., :1]
-        v = row * pitch[..., 1:] + offset[..., 1:]
-        in_camera = torch.stack(torch.broadcast_tensors(u, v, distance[..., None]), dim=-1)
-        targets = positions[..., None, :] + in_camera @ rotations.mT
+        cameras = torch.broadcast_shapes(*(x.shape[: x.ndim - len(s)] for x, s in zip(tensors, shapes, strict=True)))
+        return [x.expand((*cameras, *s)) for x, s in zip(tensors, shapes, strict=True)]
     except RuntimeError as error:
         raise InputError(f"pinhole rays: {str(error).splitlines()[0]}") from None
-    return positions[..., None, :].expand(targets.shape), targets
+
+
+def _pixels(distance: Tensor, pitch: Tensor, offset: Tensor, shape: tuple[int, int]) -> Tensor:
+    """Pixels' centres (..., n_v * n_u, 3) on the plane at `distance`, mm along u, v and k."""
+    row, column = (torch.arange(n).to(pitch) - (n - 1) / 2 for n in shape)
+    row, column = (x.reshape(-1) for x in torch.meshgrid(row, column, indexing="ij"))
+    u = column * pitch[..., :1] + offset[..., :1]
+    v = row * pitch[..., 1:] + offset[..., 1:]
+    return torch.stack((u, v, distance[..., None].expand_as(u)), dim=-1)
 
 
 def pinhole_images(
@@ -108,3 +127,109 @@ def pinhole_images(
     sources, targets = pinhole_rays(positions, rotations, distance, pitch, shape, offset)
     integrals = trace_rays(volume, sources.reshape(-1, 3), targets.reshape(-1, 3), backend, grid)
     return integrals.reshape(*targets.shape[:-2], *shape)
+
+
+def emission_images(
+    volume: Volume | Tensor,
+    positions: Tensor,
+    rotations: Numbers,
+    collimator_length: Numbers,
+    pitch: Numbers,
+    shape: tuple[int, int],
+    offset: Numbers = (0.0, 0.0),
+    *,
+    diameter: Numbers,
+    aperture_points: int = 1,
+    crystal_mu: Numbers | None = None,
+    crystal_thickness: Numbers | None = None,
+    time: Numbers = 1.0,
+    photons_per_decay: Numbers = 1.0,
+    mu: Volume | Tensor | None = None,
+    mu_grid: Grid | None = None,
+    backend: str = "auto",
+    grid: Grid | None = None,
+) -> Tensor:
+    """Expected counts (..., n_v, n_u) of pinhole cameras, by the law of `Emission`.
+
+    Differentiable by the volume, by mu, and by all the cameras' numbers. Images stand upright, as on a virtual
+    detector of magnification 1: those of a real detector are point-inverted. For an intrinsic blur multiply them by the
+    matrices of `gaussian_blur`.
+
+    Parameters
+    ----------
+    volume
+        Activity, kBq/mL: a `Volume`, or a tensor on `grid`.
+    positions, rotations
+        Pinholes and world from camera, as of `pinhole_rays`.
+    collimator_length
+        Pinhole to crystal, mm, (...) or one number.
+    pitch, offset
+        As of `pinhole_rays`, on the upright image at `collimator_length` in front of the pinhole: mm of the crystal.
+    shape
+        Pixels (n_v, n_u): rows, columns.
+    diameter
+        The hole's effective diameter, mm, (...) or one number.
+    aperture_points
+        As of `Emission`.
+    crystal_mu, crystal_thickness
+        Attenuation coefficient, 1/mm, and thickness, mm, of the crystal, (...) or one number: ``1 - exp(-crystal_mu
+        crystal_thickness / cos(psi))`` of the photons are counted. Without them all are.
+    time, photons_per_decay
+        As of `Emission`, (...) or one number.
+    mu, mu_grid
+        What attenuates, as of `trace_rays`.
+    backend, grid
+        As of `trace_rays`.
+
+    Raises
+    ------
+    InputError
+        Shapes that do not fit, or what `trace_rays` refuses.
+
+    Examples
+    --------
+    >>> position = torch.tensor([0.0, 0.0, -200.0], requires_grad=True)
+    >>> activity = Volume(np.ones((8, 8, 8)), Grid.centered(8, 4.0), "activity")
+    >>> counts = emission_images(activity, position, torch.eye(3), 60.0, 1.5, (32, 32), diameter=2.0)
+    >>> counts.sum().backward()
+    """
+    n_v, n_u = whole_shape(shape, "image shape", 2)
+    within = volume.grid if isinstance(volume, Volume) else grid
+    if not isinstance(within, Grid):
+        raise InputError(f"emission images: expected a Volume, or also a grid, got {type(volume).__name__}")
+    if (crystal_mu is None) != (crystal_thickness is None):
+        raise InputError("emission images: crystal_mu and crystal_thickness belong together")
+    if aperture_points < 1 or aperture_points == 2:
+        raise InputError(f"emission images: aperture_points: expected 1, 3 or more, got {aperture_points}")
+    crystal = [0.0 if x is None else x for x in (crystal_mu, crystal_thickness)]
+    positions, rotations, l, diameter, mu_c, thickness, time, photons, pitch, offset = _cameras(
+        positions, rotations, collimator_length, diameter, *crystal, time, photons_per_decay, pitch, offset
+    )
+    for name, x in (("collimator_length", l), ("diameter", diameter), ("pitch", pitch)):
+        if bool((x <= 0).any()):
+            raise InputError(f"emission images: {name}: expected more than 0 mm, got {float(x.min()):g}")
+
+    on_crystal = _pixels(l, pitch, offset, (n_v, n_u))
+    # To the plane through the grid's farthest corner, in pinhole to crystal distances.
+    corners = positions.new_tensor(within.corners()) - positions.detach()[..., None, :]
+    depth = ((corners @ rotations.detach()[..., 2:])[..., 0].amax(dim=-1) / l.detach()).clamp(min=1.0)
+    area = math.pi / 4 * diameter**2 / aperture_points
+    counts = (time * photons * pitch.prod(dim=-1) * area)[..., None]
+    images: Any = 0.0
+    for point in disk_points(aperture_points):
+        hole = diameter[..., None, None] / 2 * diameter.new_tensor([*point, 0.0])
+        in_camera = on_crystal + hole
+        sources = positions[..., None, :] + hole @ rotations.mT
+        targets = sources + depth[..., None, None] * in_camera @ rotations.mT
+        cosine = l[..., None] / in_camera.norm(dim=-1)
+        weights = counts * throughput(cosine, l[..., None])
+        if crystal_mu is not None:
+            weights = weights * absorbed_share(cosine, mu_c[..., None], thickness[..., None], np.zeros(1), 0)
+        sources, targets, weights = (
+            sources.expand_as(targets).reshape(-1, 3),
+            targets.reshape(-1, 3),
+            weights.reshape(-1),
+        )
+        integrals = trace_rays(volume, sources, targets, backend, grid, mu, mu_grid)
+        images = images + weights.to(integrals) * integrals
+    return images.reshape(*on_crystal.shape[:-2], n_v, n_u)

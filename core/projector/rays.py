@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -181,12 +182,21 @@ class RayMapper:
 
     def __call__(self, fan: Fan) -> tuple[IndexFan, Attenuation | None]:
         """The rays of `fan`, and what attenuates them."""
-        rays = index_fan(self.grid, fan, self.origin)
-        if self.mu is None:
-            return rays, None
-        if self.mu_grid is None:
-            return rays, Attenuation(self.mu)
-        return rays, Attenuation(self.mu, index_fan(self.mu_grid, fan, self.mu_origin))
+        return self._mapped(index_fan, fan)
+
+    def between(
+        self, sources: NDArray[np.float64], targets: NDArray[np.float64]
+    ) -> tuple[IndexRays, Attenuation | None]:
+        """The rays from `sources` to `targets`, both (N, 3) in world mm, and what attenuates them."""
+        return self._mapped(index_rays, sources, targets)
+
+    def _mapped(self, mapped: Callable[..., Any], *rays: Any) -> tuple[Any, Attenuation | None]:
+        """`rays`, as `index_fan` or `index_rays` takes them between grid and origin."""
+        attenuation = None
+        if self.mu is not None:
+            mu_rays = None if self.mu_grid is None else mapped(self.mu_grid, *rays, self.mu_origin)
+            attenuation = Attenuation(self.mu, mu_rays)
+        return mapped(self.grid, *rays, self.origin), attenuation
 
 
 def index_fan(grid: Grid, fan: Fan, origin: tuple[int, int, int] = (0, 0, 0)) -> IndexFan:

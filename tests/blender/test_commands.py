@@ -49,6 +49,18 @@ def test_scene_command_saves_scanner_volume_and_projections(tmp_path, workbook, 
     assert np.array_equal(images.projection_array(shown[0]), expected.projections[0])
 
 
+def test_scene_command_takes_a_volume_of_mu(tmp_path, workbook):
+    mu = mph.Volume(np.full((3, 4, 5), 0.0154, np.float32), mph.Grid.centered((3, 4, 5), 30.0), "mu")
+    mph.write_volume(mu, tmp_path / "mu.nii")
+    run("-m", "mphdrr", "scene", workbook, "--modules", "1-2", "--mu", tmp_path / "mu.nii", "-o", tmp_path / "s.blend")
+    bpy.ops.wm.open_mainfile(filepath=str(tmp_path / "s.blend"))
+    from mphdrr.addon import volumes
+
+    shown = volumes.volume_from_object(bpy.context.scene.mphdrr_projections.mu)
+    assert shown.quantity == "mu" and np.array_equal(shown.array, mu.array)
+    np.testing.assert_allclose(shown.grid.affine, mu.grid.affine, atol=1e-4)
+
+
 def test_scene_command_refuses_in_one_line(tmp_path, workbook):
     done = run("-m", "mphdrr", "scene", workbook, "-o", tmp_path / "scanner.txt", status=1)
     assert done.stderr.count("\n") == 1

@@ -13,10 +13,12 @@ bpy = pytest.importorskip("bpy")
 from mphdrr.addon import ids, images, jobs, scanner, storage, volumes  # noqa: E402
 from mphdrr.core import memory  # noqa: E402
 from mphdrr.core.errors import InputError  # noqa: E402
+from mphdrr.core.grid import Grid  # noqa: E402
 from mphdrr.core.mosaic import as_seen  # noqa: E402
 from mphdrr.core.progress import Cancelled  # noqa: E402
 from mphdrr.core.projector import Emission, Projector  # noqa: E402
 from mphdrr.core.system import PinholeSystem  # noqa: E402
+from mphdrr.core.volume import Volume  # noqa: E402
 
 
 @pytest.fixture
@@ -54,6 +56,106 @@ def test_emission_makes_counts(scanned, scene):
     assert expected.max() > 0
     np.testing.assert_array_equal(run.projections, expected)
     assert (run.unit, run.settings["model"], run.settings["time"]) == ("counts", "emission", 60)
+
+
+@pytest.fixture
+def body(scanned) -> Volume:
+    """Attenuating matter in the scene, on a grid of its own, moved and turned."""
+    volume = Volume(np.full((4, 5, 6), 0.0154), Grid.centered((4, 5, 6), 20.0), "mu")
+    item = volumes.add_volume(volume, "Body")
+    item.location.x, item.rotation_euler.z = 6.0, 0.3
+    bpy.context.view_layer.update()
+    return volumes.volume_from_object(item)
+
+
+# What the panel is set to, and what that is in Python.
+PHYSICS = {
+    "isotope": "Tc-99m", "aperture_points": 3, "aperture_mu": 3.6, "opening_angle": np.float32(1.4), "edge": "PATH",
+    "crystal_mu": 0.404, "depth_layers": 2, "intrinsic_fwhm": 3.0, "within_cone": True, "within_walls": True,
+    "within_crystal": True, "time": 600.0,
+}  # fmt: skip
+IN_PYTHON = PHYSICS | {"edge": "path", "opening_angle": 1.4}
+
+
+def test_physics_of_the_panel_is_that_of_core(scanned, scene, body):
+    """Images equal core's, and the run records every setting, the volume of mu and the seed."""
+    from mphdrr.core.export import read_run
+    from mphdrr.core.noise import sample_counts
+
+    settings = scene.mphdrr_projections
+    settings.model, settings.noise, settings.seed, settings.mu = "EMISSION", True, 5, bpy.data.objects["Body"]
+    for name, value in PHYSICS.items():
+        setattr(settings, name, value)
+    assert bpy.ops.mphdrr.render_projections(width=24, height=20) == {"FINISHED"}
+    run = read_run(storage.absolute(settings.run_file))
+    volume = volumes.volume_from_object(bpy.data.objects["Derenzo"])
+    model = Emission(scanned, body, **IN_PYTHON)
+    expected = Projector(volume.grid, scanned.views((20, 24)), model)(volume)
+    assert expected.max() > 0
+    np.testing.assert_array_equal(run.projections, sample_counts(expected, 5))
+    np.testing.assert_array_equal(
+        images.projection_array(bpy.data.images[ids.projection_name(scanned.numbers[0], 8)]), run.projections[0]
+    )
+    assert (run.seed, run.settings["mu_volume"], run.settings["volume"]) == (5, "Body", "Derenzo")
+    assert {name: run.settings[name] for name in IN_PYTHON} == IN_PYTHON
+
+
+def test_photons_of_a_radiograph_and_the_inverse_square_sum(scanned, scene, body):
+    from mphdrr.core.export import read_run
+    from mphdrr.core.projector import InverseSquareSum, intensity
+
+    views = scanned.views((20, 24))
+    bpy.ops.mphdrr.render_projections(width=24, height=20, photons=1000)  # the only volume of mu
+    run = read_run(storage.absolute(scene.mphdrr_projections.run_file))
+    expected = intensity(Projector(body.grid, views)(body), 1000)
+    np.testing.assert_array_equal(run.projections, expected)
+    assert (run.unit, run.seed) == ("photons", None) and expected.min() < 900
+    bpy.ops.mphdrr.render_projections(width=24, height=20, volume="Body", model="INVERSE_SQUARE")
+    run = read_run(storage.absolute(scene.mphdrr_projections.run_file))
+    np.testing.assert_array_equal(run.projections, Projector(body.grid, views, InverseSquareSum(scanned))(body))
+
+
+@pytest.mark.parametrize("model", ["TRANSMISSION", "EMISSION", "INVERSE_SQUARE"])
+def test_physics_panel_shows_settings_that_exist(scene, model):
+    from mphdrr.panels.projections import MPHDRR_PT_physics
+
+    settings = scene.mphdrr_projections
+    settings.model, settings.photons = model, 100
+    shown = []
+
+    class Layout:
+        def prop(self, owner, name, **_):
+            assert name in owner.bl_rna.properties
+            shown.append(name)
+
+        def column(self, **_):
+            return self
+
+        row = column
+
+    class Panel:
+        layout = Layout()
+
+    assert "DEFAULT_CLOSED" in MPHDRR_PT_physics.bl_options
+    assert MPHDRR_PT_physics.poll(bpy.context) == (model != "INVERSE_SQUARE")
+    MPHDRR_PT_physics.draw(Panel(), bpy.context)
+    assert {"noise", "seed"} <= set(shown) and ({"mu", *PHYSICS} - {"time"} <= set(shown)) == (model == "EMISSION")
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"aperture_points": 2}, "3 or more"),
+        ({"edge": "PATH"}, "aperture_mu"),
+        ({"depth_layers": 2}, "crystal_mu"),
+        ({"mu": "Nope"}, "no volume is named 'Nope'"),
+        ({"mu": "Derenzo"}, "volume of mu"),
+    ],
+)
+def test_physics_that_cannot_be_is_one_clear_line(scanned, settings, message):
+    with pytest.raises(RuntimeError, match=message):
+        bpy.ops.mphdrr.render_projections(width=8, height=8, model="EMISSION", **settings)
+    assert _ours() == []
 
 
 def test_images_are_shown_as_the_pinhole_sees_them(scanned):

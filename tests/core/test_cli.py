@@ -106,6 +106,43 @@ def test_counts_with_attenuation_and_noise(workbook, tmp_path, capsys):
     np.testing.assert_array_equal(drawn.projections, mph.sample_counts(mean.projections, 5))
 
 
+def test_every_part_of_the_emission_model_is_an_option(workbook, tmp_path):
+    """Options reach the model and the record; those left out are the model's own defaults."""
+    run_file = tmp_path / "run.h5"
+    options = (
+        "--emission --isotope Tl-201 --window 60 80 --time 300 --aperture-points 3 --aperture-mu 5 --opening-angle 80 "
+        "--edge path --within-cone --within-walls --within-crystal --crystal-mu 0.3 --depth-layers 2 --intrinsic-fwhm 3"
+    )
+    words = [*SMALL, "--modules", "3-4", *options.split(), "-o", str(run_file)]
+    assert main(["project", str(workbook), *words]) == 0
+    run = mph.read_run(run_file)
+    model = mph.Emission(
+        run.system, isotope="Tl-201", window=(60, 80), time=300, aperture_points=3, aperture_mu=5,
+        opening_angle=np.deg2rad(80), edge="path", within_cone=True, within_walls=True, within_crystal=True,
+        crystal_mu=0.3, depth_layers=2, intrinsic_fwhm=3,
+    )  # fmt: skip
+    expected = mph.Projector(run.volume.grid, run.views, model)(run.volume)
+    assert expected.any()
+    np.testing.assert_allclose(run.projections, expected, rtol=1e-5, atol=1e-6 * expected.max())
+    assert {name: run.settings[name] for name in model.record()} == model.record()
+
+
+def test_radiographs_of_mu_and_the_inverse_square_sum(workbook, tmp_path):
+    grid = mph.Grid.centered(8, 10.0)
+    mph.write_volume(mph.Volume(np.full((8, 8, 8), 0.0154), grid, "mu"), tmp_path / "mu.nii")
+    words = [*SMALL[-3:], "--modules", "3-4", "--volume", str(tmp_path / "mu.nii"), "-o", str(tmp_path / "run.h5")]
+    assert main(["project", str(workbook), *words, "--photons", "1000", "--noise", "2"]) == 0
+    run = mph.read_run(tmp_path / "run.h5")
+    lines = mph.Projector(grid, run.views)(run.volume)
+    assert lines.any() and (run.unit, run.seed, run.settings["photons"]) == ("photons", 2, 1000)
+    np.testing.assert_array_equal(run.projections, mph.sample_counts(mph.intensity(lines, 1000), 2))
+    assert main(["project", str(workbook), *words, "--inverse-square"]) == 0
+    run = mph.read_run(tmp_path / "run.h5")
+    assert run.settings["model"] == "inverse square sum"
+    expected = mph.Projector(grid, run.views, mph.InverseSquareSum(run.system))(run.volume)
+    np.testing.assert_allclose(run.projections, expected, rtol=1e-5)
+
+
 @pytest.mark.parametrize(
     ("command", "said"),
     [
@@ -121,6 +158,9 @@ def test_counts_with_attenuation_and_noise(workbook, tmp_path, capsys):
         (["project", "WORKBOOK", *SMALL, "--backend", "magic", "-o", "FOLDER/a.h5"], "numba"),
         (["project", "WORKBOOK", *SMALL, "--magnification", "0", "-o", "FOLDER/a.h5"], "magnification"),
         (["project", "WORKBOOK", *SMALL, "--noise", "1", "-o", "FOLDER/a.h5"], "--noise needs --emission"),
+        (["project", "WORKBOOK", *SMALL, "--edge", "path", "-o", "FOLDER/a.h5"], "--edge needs --emission"),
+        (["project", "WORKBOOK", *SMALL, "--photons", "9", "-o", "FOLDER/a.h5"], "a volume of mu"),
+        (["project", "WORKBOOK", *SMALL, "--emission", "--isotope", "Tc", "-o", "FOLDER/a.h5"], "Tc-99m"),
         (["project", "WORKBOOK", *SMALL, "--emission", "--time", "0", "-o", "FOLDER/a.h5"], "time"),
         (["project", "WORKBOOK", "--volume", "none.nii", "-o", "FOLDER/a.h5"], "none.nii: no such file"),
         (["project", "WORKBOOK", *SMALL[:4], "--size", "900000", "900000", "-o", "FOLDER/a.h5"], "of memory"),
@@ -151,6 +191,7 @@ def test_export_checks_every_name_before_it_writes(workbook, tmp_path, capsys):
 def test_usage_errors_have_status_2(capsys):
     assert main(["geometry"]) == 2
     assert main(["project", "--size", "x"]) == 2
+    assert main(["project", "a.xlsx", "-o", "a.h5", "--emission", "--photons", "1"]) == 2
     assert main(["fly"]) == 2
     assert all(line.startswith("mphdrr") for line in capsys.readouterr().err.splitlines())
 

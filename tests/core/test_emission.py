@@ -334,7 +334,7 @@ def test_aperture_blur_is_as_wide_as_the_holes_shadow(n):
 
 
 def test_disk_points_have_the_moments_of_the_disk():
-    from mphdrr.core.projector.emission import disk_points
+    from mphdrr.core.projector.aperture import disk_points
 
     assert not disk_points(1).any()
     for n in (3, 4, 7, 19, 50, 200):
@@ -457,14 +457,45 @@ def test_a_views_noise_depends_on_the_seed_and_on_itself_only(rng):
 
 def test_isotopes():
     tc = mph.isotope("Tc-99m")
-    assert tc.photons_per_decay(126, 155) == 0.885 and tc.photons_per_decay(0, 100) == 0
+    assert tc.photons_per_decay(126, 155) == 0.891 and tc.photons_per_decay(0, 100) == 0
     assert tc.mean_decay_time(1e-3) == pytest.approx(1e-3)
     assert tc.mean_decay_time(100 * tc.half_life) == pytest.approx(tc.half_life / np.log(2))
     with pytest.raises(InputError, match="Tl-201"):
         mph.isotope("Unobtainium")
+    for name, isotope in mph.ISOTOPES.items():
+        energies, photons = np.transpose(isotope.lines)
+        assert isotope.name == name and (np.diff(energies) > 0).all() and 0.01 <= photons.min() <= photons.max() <= 2
+        low, high = isotope.window
+        assert isotope.photons_per_decay(low, high) >= photons.max()
+
+
+def test_an_isotope_counts_its_photons_and_decays(rng):
+    """Counts of its lines in the window, from an activity that halves every half-life."""
+    system, grid = one_module(), turned_grid((5, 6, 7), 8.0)
+    x = rng.random(grid.shape)
+
+    def counts(**options):
+        return mph.Projector(grid, system.views((8, 9)), mph.Emission(system, **options))(x)
+
+    tl = mph.isotope("Tl-201")
+    one = counts()
+    np.testing.assert_allclose(counts(isotope=tl, time=0.01), 0.01 * (0.277 + 0.471) * one, rtol=1e-5)
+    np.testing.assert_allclose(counts(isotope="Tl-201", window=(150, 180), time=0.01), 0.001 * one, rtol=1e-5)
+    two = counts(isotope="Tl-201", time=2 * tl.half_life)
+    np.testing.assert_allclose(two, 1.5 * counts(isotope="Tl-201", time=tl.half_life), rtol=1e-5)
+    np.testing.assert_allclose(counts(isotope="Tl-201", photons_per_decay=0.5, time=0.01), 0.005 * one, rtol=1e-5)
+    record = mph.Emission(system, isotope="Tc-99m").record()
+    assert (record["isotope"], record["photons_per_decay"]) == ("Tc-99m", 0.891)
+    for options, word in (
+        ({"isotope": "Xx-1"}, "Tc-99m"),
+        ({"isotope": "Tc-99m", "window": (10, 20)}, "its lines: 140.5"),
+        ({"window": (10, 20)}, "needs an isotope"),
+    ):
+        with pytest.raises(InputError, match=word):
+            mph.Emission(system, **options)
 
 
 def test_gradients_in_mu_are_refused(system):
     torch = pytest.importorskip("torch", reason="torch is not installed")
-    with pytest.raises(InputError, match="no gradients with respect to mu"):
+    with pytest.raises(InputError, match=r"A\(x, mu=...\)"):
         mph.Emission(system, torch.rand(2, 2, 2, requires_grad=True))

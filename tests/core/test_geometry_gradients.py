@@ -11,7 +11,7 @@ torch = pytest.importorskip("torch", reason="torch is not installed")
 
 from mphdrr.core.errors import InputError  # noqa: E402
 from mphdrr.core.grid import Grid  # noqa: E402
-from mphdrr.core.projector import Projector, trace_rays  # noqa: E402
+from mphdrr.core.projector import Projector, backends, trace_rays  # noqa: E402
 from mphdrr.core.views import Views  # noqa: E402
 from mphdrr.core.volume import Volume  # noqa: E402
 
@@ -23,6 +23,7 @@ BACKENDS = [
     )
     for name in ("numpy", "torch", "numba")
 ]
+MU = [None, "shared", "own"]
 SHAPES = [(7, 5, 6), (1, 6, 4), (5, 1, 3), (4, 5, 1), (1, 1, 1)]
 
 
@@ -36,22 +37,38 @@ def oblique_rays(rng, grid, n=60):
     return sources, targets
 
 
-def gradients(volume, sources, targets, backend, weights):
+def some_mu(rng, grid, which):
+    """Nothing; on the volume's grid; on another that lies across it."""
+    if which is None:
+        return None
+    if which == "own":
+        grid = Grid((4, 3, 5), general_grid(rng, (4, 3, 5)).affine @ np.diag([1.5, 2, 1.2, 1]))
+    return Volume(rng.uniform(0, 0.2, grid.shape), grid, "mu")
+
+
+def require_attenuation(backend, which):
+    if which is not None and not hasattr(backends.load(backend), "mu_gradient"):
+        pytest.skip(f"{backend} has no gradients of attenuated integrals yet")
+
+
+def gradients(volume, sources, targets, backend, weights, mu=None):
     s, t = (torch.tensor(x, requires_grad=True) for x in (sources, targets))
-    y = trace_rays(volume, s, t, backend)
+    y = trace_rays(volume, s, t, backend, mu=mu)
     assert y.dtype == torch.float64
     (y * torch.as_tensor(weights)).sum().backward()
     return s.grad.numpy(), t.grad.numpy()
 
 
 @pytest.mark.parametrize("backend", BACKENDS)
+@pytest.mark.parametrize("which", MU)
 @pytest.mark.parametrize("shape", SHAPES)
-def test_gradient_is_the_central_difference(backend, shape, rng):
+def test_gradient_is_the_central_difference(backend, which, shape, rng):
+    require_attenuation(backend, which)
     grid = general_grid(rng, shape)
-    volume = Volume(rng.random(shape), grid)
+    volume, mu = Volume(rng.random(shape), grid), some_mu(rng, grid, which)
     sources, targets = oblique_rays(rng, grid)
     n, h = len(sources), 1e-6
-    got = gradients(volume, sources, targets, backend, np.ones(n))
+    got = gradients(volume, sources, targets, backend, np.ones(n), mu)
     scale = np.abs(got).max()
     for end in range(2):
         for axis in range(3):
@@ -59,7 +76,7 @@ def test_gradient_is_the_central_difference(backend, shape, rng):
             step[axis] = h
             ahead, behind = (
                 trace_rays(volume, torch.tensor(sources + sign * step * (end == 0)),
-                           torch.tensor(targets + sign * step * (end == 1)), backend).numpy()
+                           torch.tensor(targets + sign * step * (end == 1)), backend, mu=mu).numpy()
                 for sign in (1, -1)
             )  # fmt: skip
             difference = (ahead - behind) / (2 * h)
@@ -68,16 +85,17 @@ def test_gradient_is_the_central_difference(backend, shape, rng):
             assert close.mean() >= 0.97, (end, axis, np.abs(difference - got[end][:, axis]).max())
 
 
-@pytest.mark.parametrize("backend", ["torch", "numba"])
-def test_backends_agree(backend, rng):
-    pytest.importorskip(backend)
+@pytest.mark.parametrize("backend", BACKENDS[1:])
+@pytest.mark.parametrize("which", MU)
+def test_backends_agree(backend, which, rng):
+    require_attenuation(backend, which)
     grid = general_grid(rng, (12, 9, 10))
-    volume = Volume(rng.random(grid.shape), grid)
+    volume, mu = Volume(rng.random(grid.shape), grid), some_mu(rng, grid, which)
     sources, targets = oblique_rays(rng, grid, 9000)
     weights = rng.normal(size=len(sources))
     for reference, got in zip(
-        gradients(volume, sources, targets, "numpy", weights),
-        gradients(volume, sources, targets, backend, weights),
+        gradients(volume, sources, targets, "numpy", weights, mu),
+        gradients(volume, sources, targets, backend, weights, mu),
         strict=True,
     ):
         np.testing.assert_allclose(got, reference, rtol=1e-8, atol=1e-8 * np.abs(reference).max())
@@ -102,7 +120,59 @@ def test_chord_of_a_slab(backend):
 
 
 @pytest.mark.parametrize("backend", BACKENDS)
-def test_odd_rays_have_gradients_too(backend):
+def test_chord_of_an_attenuating_slab(backend):
+    """(1 - exp(-m chord)) / m, seen from outside and from inside; mu on its own planes before it too."""
+    require_attenuation(backend, "shared")
+    grid = Grid.centered((8, 40, 40), 2.0)
+    before = Volume(
+        np.full((2, 10, 10), 0.1), Grid.centered((2, 10, 10), 8.0, (-28.0, 0, 0)), "mu"
+    )  # x from -36 to -20
+    activity, mu = Volume(np.ones(grid.shape), grid), Volume(np.full(grid.shape, 0.07), grid, "mu")
+    m = float(mu.array[0, 0, 0])
+    target = torch.tensor([60.0, 7.1, -3.9], dtype=torch.float64, requires_grad=True)
+    for start, matter in ((-50.0, mu), (-3.0, mu), (-50.0, before), (-25.0, before)):
+        source = torch.tensor([start, 1.3, 0.7], dtype=torch.float64, requires_grad=True)
+        y = trace_rays(activity, source, target, backend, mu=matter)
+        secant = (target - source).norm() / (target - source)[0]
+        if matter is mu:
+            expected = (1 - torch.exp(-m * (8 - source[0].clamp(min=-8)) * secant)) / m
+        else:
+            left = (-20 - source[0].clamp(min=-36)) * secant * float(before.array[0, 0, 0])
+            expected = 16 * secant * torch.exp(-left)
+        torch.testing.assert_close(y[0], expected)
+        for got, wanted in zip(
+            torch.autograd.grad(y.sum(), (source, target)),
+            torch.autograd.grad(expected, (source, target)),
+            strict=True,
+        ):
+            torch.testing.assert_close(got, wanted, atol=1e-11, rtol=1e-8)
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_gradients_depend_on_matter_and_not_on_its_grid(backend, rng):
+    """The same mu on the volume's grid, on one twice as fine and on one that goes on outside: planes met at once."""
+    require_attenuation(backend, "own")
+    grid = general_grid(rng, (6, 5, 4))
+    volume, values = Volume(rng.random(grid.shape), grid), rng.uniform(0, 0.2, grid.shape)
+    fine, moved = np.diag([0.5, 0.5, 0.5, 1.0]), np.eye(4)
+    fine[:3, 3], moved[:3, 3] = -0.25, (-1, -2, -3)
+    sources, targets = oblique_rays(rng, grid)
+    reference, *others = (
+        gradients(volume, sources, targets, backend, np.ones(len(sources)), mu)
+        for mu in (
+            Volume(values, grid, "mu"),
+            Volume(values.repeat(2, 0).repeat(2, 1).repeat(2, 2), Grid((12, 10, 8), grid.affine @ fine), "mu"),
+            Volume(np.pad(values, ((1, 1), (2, 0), (3, 4))), Grid((8, 7, 11), grid.affine @ moved), "mu"),
+        )
+    )
+    for other in others:
+        for got, expected in zip(other, reference, strict=True):
+            np.testing.assert_allclose(got, expected, rtol=0, atol=1e-8 * np.abs(expected).max())
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+@pytest.mark.parametrize("which", [None, "shared"])
+def test_odd_rays_have_gradients_too(backend, which):
     """Of length zero, missing, along an axis, in a plane of voxel faces, within one voxel, through corners: never NaN."""
     grid = Grid.centered((4, 4, 4), 1.0)
     sources = [
@@ -125,8 +195,11 @@ def test_odd_rays_have_gradients_too(backend):
         [5, 5, 5],
         [0.2, 0.3, 0.1],
     ]
+    require_attenuation(backend, which)
     volume = Volume(np.arange(64.0).reshape(4, 4, 4), grid)
-    by_source, by_target = gradients(volume, np.array(sources, float), np.array(targets, float), backend, np.ones(8))
+    mu = which and Volume(np.full((4, 4, 4), 1e-12), grid, "mu")
+    ends = np.array(sources, float), np.array(targets, float)
+    by_source, by_target = gradients(volume, *ends, backend, np.ones(8), mu)
     assert np.isfinite(by_source).all() and np.isfinite(by_target).all()
     assert not by_source[:3].any() and not by_target[:3].any()
     # Inside one voxel of value f the integral is f times the length.
@@ -137,15 +210,18 @@ def test_odd_rays_have_gradients_too(backend):
 
 
 @pytest.mark.parametrize("backend", ["numpy", "torch"])
-def test_gradcheck_by_volume_and_ends(backend, rng):
+@pytest.mark.parametrize("which", MU)
+def test_gradcheck_by_everything(backend, which, rng):
     grid = general_grid(rng, (3, 2, 4))
     sources, targets = (torch.tensor(x, requires_grad=True) for x in oblique_rays(rng, grid, 5))
     volume = torch.tensor(rng.random(grid.shape), requires_grad=True)
+    matter = some_mu(rng, grid, which)
+    mu = () if matter is None else (torch.tensor(matter.array + 0.01, dtype=torch.float64, requires_grad=True),)
 
-    def function(volume, sources, targets):
-        return trace_rays(volume, sources, targets, backend, grid) ** 2
+    def function(volume, sources, targets, mu=None):
+        return trace_rays(volume, sources, targets, backend, grid, mu, matter and matter.grid) ** 2
 
-    assert torch.autograd.gradcheck(function, (volume, sources, targets), eps=1e-7, atol=1e-5, rtol=1e-5)
+    assert torch.autograd.gradcheck(function, (volume, sources, targets, *mu), atol=1e-6, rtol=1e-6)
 
 
 @pytest.mark.parametrize("backend", BACKENDS)

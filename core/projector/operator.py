@@ -436,7 +436,7 @@ class AdjointProjector(LinearOperator):
         total: ArrayOrTensor = zeros(grid.shape, images) if weighted else None
         n_views = len(A.views)
         _report(progress, 0, n_views)
-        if name == "cuda" and not A.model.weights_voxels:  # which every view does in its own way
+        if name == "cuda" and not A.model.weights_voxels:  # else every view is of a volume of its own
             self._spread_together(images, volumes[0], of_view(0), trace, progress)
             return volumes[0]
         with _parallel(workers) as parallel_map:

@@ -203,7 +203,7 @@ class Tracer:
 
     @property
     def _workers(self) -> int:
-        return 1 if self.backend == "torch" else _thread_count(None)
+        return 1 if self.backend in ("torch", "cuda") else _thread_count(None)
 
     def _native(self, x: ArrayOrTensor) -> Any:
         """`x` as the backend computes with it."""

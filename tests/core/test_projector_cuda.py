@@ -325,3 +325,40 @@ def test_volume_too_large_for_the_device_is_refused(monkeypatch, rng):
     monkeypatch.setattr(type(siddon_cuda.device()), "free_memory", 1000)
     with pytest.raises(InputError, match="the volume takes"):
         A(np.ones(grid.shape))
+
+
+@pytest.mark.parametrize("same", [True, False])
+def test_gradients_are_those_of_the_reference(same, system, rng):
+    """Of rays by volume, mu and ends; of a projector by volume and mu; of cameras by their numbers."""
+    torch = pytest.importorskip("torch", reason="torch is not installed")
+    from mphdrr.core.projector.poses import emission_images
+
+    grid = general_grid(rng, (12, 9, 10))
+    mu_grid = grid if same else general_grid(rng, (9, 10, 8))
+    volume, mu = (torch.tensor(rng.random(g.shape)) for g in (grid, mu_grid))
+    ends = rng.normal(size=(2, 500, 3)) * 20 + grid.center
+    model = Emission(system, mu=Volume(rng.random(mu_grid.shape), mu_grid, "mu"), aperture_points=3)
+    views = system.views((9, 8))
+    poses = torch.tensor(system.poses())
+
+    def gradients(backend):
+        x, m, sources, targets, places, lengths = given = [
+            torch.as_tensor(a).clone().requires_grad_()
+            for a in (volume, mu * 0.02, *ends, poses[:, :3, 3], system.collimator_length)
+        ]
+        numbers = np.random.default_rng(0)
+        on = {"grid": grid, "mu": m, "mu_grid": mu_grid, "backend": backend}
+        found = []
+        for y in (
+            trace(x, sources, targets, **on),
+            Projector(grid, views, model, backend=backend)(x, mu=m),
+            emission_images(x, places, poses[:, :3, :3], lengths, 2.0, (9, 8), diameter=2.0, **on),
+        ):
+            loss = (y * torch.tensor(numbers.normal(size=y.shape))).sum()
+            found += [g for g in torch.autograd.grad(loss, given, allow_unused=True) if g is not None]
+        return found
+
+    pairs = list(zip(gradients("cuda"), gradients("numpy"), strict=True))
+    assert len(pairs) == 4 + 2 + 4
+    for got, expected in pairs:
+        np.testing.assert_allclose(got, expected, rtol=0, atol=2e-5 * float(expected.abs().max()))

@@ -72,7 +72,7 @@ def add_view_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--magnification", type=float, default=10.0, help="virtual detector's distance in units of l")
     parser.add_argument("--pitch", type=float, metavar="MM", help="pixel size; default: the crystal's whole side")
     parser.add_argument("--modules", metavar="RANGE", help="such as 1-40 or 1-20,41; default: all")
-    parser.add_argument("--backend", default="auto", help="auto, numba, torch or numpy")
+    parser.add_argument("--backend", default="auto", help="auto, numba, cuda, torch or numpy")
     parser.add_argument("--threads", type=int, metavar="N", help="processor threads; default: all")
 
 

@@ -6,11 +6,15 @@ import functools
 import importlib
 import warnings
 from types import ModuleType
+from typing import Any
+
+import numpy as np
 
 from ..errors import InputError, InputWarning
+from .arrays import ArrayOrTensor, to_numpy, to_tensor
 
-BACKENDS = ("numba", "torch", "numpy")
-"""Names of the backends, the one that "auto" prefers first. ``siddon_<name>`` is the module of each.
+BACKENDS = ("numba", "torch", "numpy", "cuda")
+"""Names of the backends. ``siddon_<name>`` is the module of each.
 
 Such a module has four functions. Line integrals are ``L int_0^1 f(alpha) exp(-L int_0^alpha mu) dalpha`` with L the
 ray's length in mm, f the volume and mu what attenuates, if anything.
@@ -27,8 +31,14 @@ ray's length in mm, f the volume and mu what attenuates, if anything.
   the rays of their values times the derivative of the line integral by mu.
 
 `rays` are `IndexRays` or an `IndexFan`, what weakens them an `Attenuation`; volumes, values, mu and gradients are tensors
-on one device for "torch" and numpy arrays for the others.
+on one device for "torch", numpy arrays or tensors on the GPU for "cuda" (see its `native`), and numpy arrays for the
+others. "cuda" is handed several views at once, as `IndexFans`.
 """
+
+_AUTOMATIC = ("numba", "torch", "numpy")
+"""What "auto" chooses from, the one that it prefers first; for a tensor on a GPU see `for_tensor`."""
+
+_PACKAGES = {"cuda": "warp-lang"}
 
 
 def choose(name: str) -> str:
@@ -37,17 +47,20 @@ def choose(name: str) -> str:
     Raises
     ------
     InputError
-        No such backend, or the library it needs is missing.
+        No such backend, or the library or the GPU that it needs is missing.
     """
     if name != "auto" and name not in BACKENDS:
         raise InputError(f"backend {name!r}: expected one of auto, {', '.join(BACKENDS)}")
     if name != "auto":
         try:
-            load(name)
+            module = load(name)
         except _CANNOT_LOAD as error:
-            raise InputError(f"backend {name!r} needs {name} ({_reason(error)}): pip install {name}") from None
+            package = _PACKAGES.get(name, name)
+            raise InputError(f"backend {name!r} needs {package} ({_reason(error)}): pip install {package}") from None
+        if name == "cuda":
+            module.device()
         return name
-    for candidate in BACKENDS:
+    for candidate in _AUTOMATIC:
         try:
             load(candidate)
         except _CANNOT_LOAD as error:
@@ -58,6 +71,32 @@ def choose(name: str) -> str:
             _warn_slower(candidate, reason)
         return candidate
     raise AssertionError("numpy is always there")
+
+
+def for_tensor(tensor: Any) -> str:
+    """What "auto" means for a tensor that is not on the CPU: "cuda" where that works, else "torch"."""
+    return "cuda" if tensor.is_cuda and _cuda_works() else "torch"
+
+
+@functools.cache
+def _cuda_works() -> bool:
+    try:
+        load("cuda").device()
+    except (InputError, *_CANNOT_LOAD):
+        return False
+    return True
+
+
+def native(x: ArrayOrTensor, name: str, float64: bool) -> ArrayOrTensor:
+    """`x` as the backend `name` computes with it; `float64` or float32 where it takes either."""
+    if name == "cuda":
+        return load(name).native(x)
+    return to_tensor(x) if name == "torch" else to_numpy(x, np.float64 if float64 else np.float32)
+
+
+def workers(name: str, threads: int) -> int:
+    """On how many of `threads` a backend is to be called at the same time: torch and cuda have threads of their own."""
+    return 1 if name in ("torch", "cuda") else threads
 
 
 def load(name: str) -> ModuleType:

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import functools
 import hashlib
-import os
-import sys
 import threading
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 from numba import config, njit
+
+from .caching import cache_folder
 
 SOURCES = ("siddon_numba.py", "lanes.py")
 
@@ -45,7 +45,7 @@ def _enable_caching(kernel: Any) -> None:
     """Cache `kernel` in NUMBA_CACHE_DIR if the user has set it, else in `cache_folder`."""
     users = config.CACHE_DIR
     # numba looks at this setting once, when caching is enabled; other users of numba keep theirs.
-    config.CACHE_DIR = str(Path(users or cache_folder()) / _fingerprint())
+    config.CACHE_DIR = str(Path(users or cache_folder("numba")) / _fingerprint())
     try:
         kernel.enable_caching()
     finally:
@@ -57,14 +57,3 @@ def _fingerprint() -> str:
     """Of all that kernels are made of: numba looks only at a kernel's own file to know that what it kept is stale."""
     sources = sorted(Path(__file__).with_name(name).read_bytes() for name in SOURCES)
     return hashlib.sha256(b"".join(sources)).hexdigest()[:12]
-
-
-def cache_folder() -> Path:
-    """The folder of this user in which mphDRR may keep what it can make again."""
-    if sys.platform == "win32":
-        base = os.environ.get("LOCALAPPDATA") or Path.home() / "AppData" / "Local"
-    elif sys.platform == "darwin":
-        base = Path.home() / "Library" / "Caches"
-    else:
-        base = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
-    return Path(base) / "mphdrr" / "numba"

@@ -28,19 +28,19 @@ from .arrays import (
     is_double,
     is_tensor,
     like,
-    to_numpy,
-    to_tensor,
     together,
     zeros,
 )
-from .models import Beam, Model, Transmission, require_model
-from .rays import RayMapper
+from .models import Array, Beam, Model, Transmission, require_model
+from .rays import Attenuation, IndexFans, RayMapper
 
 # Rays handed to a backend at once: enough that a call costs nothing, few enough that their arrays stay in the
 # cache.
 _RAYS_AT_ONCE = 4096
 # A GPU wants more (torch cuts them into chunks by itself), and a torch on a CPU has threads of its own.
 _RAYS_AT_ONCE_TORCH = 2**18
+# Several views a launch; an array is copied to the GPU once for as many.
+_RAYS_AT_ONCE_CUDA = 2**22
 
 # Threads of the adjoint, each with a volume of its own: more would gain little and take much memory.
 _MOST_VOLUMES = 8
@@ -108,10 +108,11 @@ class Projector(LinearOperator):
         What a pixel measures; by default the line integral.
     backend : str
         ``"numpy"`` (the float64 reference), ``"torch"`` (on the device of a tensor), ``"numba"`` (compiled,
-        CPU), or ``"auto"``: numba if it can be imported, else torch, else numpy; torch for a tensor that is
-        not on the CPU.
+        CPU), ``"cuda"`` (NVIDIA GPUs; ``pip install warp-lang``), or ``"auto"``: numba if it can be imported, else
+        torch, else numpy; for a tensor on a GPU cuda if it works there, else torch. Arrays go to a GPU only
+        when asked.
     threads : int, optional
-        Threads of numba and numpy, by default one per core (torch has a setting of its own). The images do
+        Threads of numba and numpy, by default one per core (torch has a setting of its own, cuda needs none). The images do
         not depend on it; the adjoint does by float32 rounding, and is the same every time for a given number.
         The adjoint takes a volume per thread, so it uses at most 8, and fewer when memory is short.
 
@@ -123,8 +124,9 @@ class Projector(LinearOperator):
     Notes
     -----
     The integral along a ray is exact for the piecewise constant volume (Siddon 1985), from source to target.
-    The results are float32; float64 for ``backend="numpy"``, and for tensors of float64 with all backends.
-    The adjoint of the torch backend on a GPU adds in no fixed order.
+    The results are float32; float64 for ``backend="numpy"``, and for tensors of float64 with all backends but cuda.
+    On a GPU the adjoint of the torch and cuda backends adds in no fixed order: it differs by float32 rounding from
+    call to call.
 
     Examples
     --------
@@ -255,6 +257,9 @@ class Projector(LinearOperator):
         integrate = backends.load(name).forward
         native = self._native(x, name)
         box, trace = self._lattices(native, native)
+        if name == "cuda" and not self.model.weights_voxels:
+            yield from self._images_together(box, trace)
+            return
         with _parallel(self._workers(name)) as parallel_map:
             for m in range(len(self.views)):
                 image = zeros(self.views.shape, box)
@@ -270,11 +275,53 @@ class Projector(LinearOperator):
 
                     for _ in parallel_map(project, _blocks(lines.shape[0], lines.shape[1], name)):
                         pass
-                response = self.model.response(self.views, m)
-                if response is not None:
-                    along_v, along_u = (alike(matrix, image) for matrix in response)
-                    image = along_v @ image @ along_u.T
-                yield self._finished(image, x)
+                yield self._finished(self._responded(image, m), x)
+
+    def _images_together(self, box: ArrayOrTensor, trace: RayMapper) -> Iterator[ArrayOrTensor]:
+        """`_images` for the backend that takes several views at once."""
+        integrate = backends.load("cuda").forward
+        for views in self._views_together():
+            images = zeros((len(views), *self.views.shape), box)
+            for which, by_columns, weights, rays, attenuation in self._fans(views, trace):
+                lines = images.swapaxes(1, 2) if by_columns else images
+                integrals = integrate(box, rays, attenuation).reshape(-1, *lines.shape[1:])
+                lines[which] += integrals if weights is None else alike(weights, box) * integrals
+            yield from map(self._responded, images, views)
+
+    def _responded(self, image: ArrayOrTensor, m: int) -> ArrayOrTensor:
+        """View m's image with the detector's response."""
+        response = self.model.response(self.views, m)
+        if response is None:
+            return image
+        along_v, along_u = (alike(matrix, image) for matrix in response)
+        return along_v @ image @ along_u.T
+
+    def _views_together(self) -> Iterator[range]:
+        """The views, as many at once as cuda is given."""
+        n_views, n_v, n_u = self.shape_out
+        at_once = max(1, _RAYS_AT_ONCE_CUDA // (n_v * n_u))
+        return (range(m, min(m + at_once, n_views)) for m in range(0, n_views, at_once))
+
+    def _fans(
+        self, views: range, trace: RayMapper
+    ) -> Iterator[tuple[list[int], bool, Array | None, IndexFans, Attenuation | None]]:
+        """The beams of several views in groups that cuda takes at once.
+
+        Yields which of `views` they are of, whether their lines are the images' columns, weights (as many, lines, rays),
+        rays and attenuation.
+        """
+        # The first beams of all views, their second, ...
+        for beams in zip(*map(self._beams, views), strict=True):
+            for by_columns in (False, True):
+                group = [(k, beam) for k, (beam, columns) in enumerate(beams) if columns == by_columns]
+                if not group:
+                    continue
+                rays, attenuations = zip(*(trace(beam.rays) for _, beam in group), strict=True)
+                attenuation = attenuations[0]
+                if attenuation is not None and attenuation.rays is not None:
+                    attenuation = Attenuation(attenuation.mu, IndexFans(tuple(each.rays for each in attenuations)))
+                weights = None if group[0][1].weights is None else np.stack([beam.weights for _, beam in group])
+                yield [k for k, _ in group], by_columns, weights, IndexFans(rays), attenuation
 
     def _weighted(self, box: ArrayOrTensor, m: int, origin: tuple[int, int, int] = (0, 0, 0)) -> ArrayOrTensor:
         """A part of a volume, from voxel `origin` on, times view m's voxel weights."""
@@ -309,15 +356,13 @@ class Projector(LinearOperator):
 
     def _native(self, x: ArrayOrTensor, name: str) -> ArrayOrTensor:
         """`x` as the backend `name` computes with it."""
-        if name == "torch":
-            return to_tensor(x)
-        return to_numpy(x, np.float64 if name == "numpy" or is_double(x) else np.float32)
+        return backends.native(x, name, name == "numpy" or is_double(x))
 
     def _backend_for(self, x: ArrayOrTensor) -> str:
-        return "torch" if self._auto and is_tensor(x) and x.device.type != "cpu" else self.backend
+        return backends.for_tensor(x) if self._auto and is_tensor(x) and x.device.type != "cpu" else self.backend
 
     def _workers(self, name: str) -> int:
-        return 1 if name == "torch" else self.threads
+        return backends.workers(name, self.threads)
 
     def _finished(self, result: ArrayOrTensor, x: ArrayOrTensor) -> ArrayOrTensor:
         """`result` of float32, unless it is to be of float64 (where "auto" falls back to numpy it is not)."""
@@ -405,6 +450,9 @@ class AdjointProjector(LinearOperator):
         total: ArrayOrTensor = zeros(grid.shape, images) if weighted else None
         n_views = len(A.views)
         _report(progress, 0, n_views)
+        if name == "cuda" and not A.model.weights_voxels:  # else every view is of a volume of its own
+            self._spread_together(images, volumes[0], of_view(0), trace, progress)
+            return volumes[0]
         with _parallel(workers) as parallel_map:
             for m in range(n_views):
                 image, spread = images[m], of_view(m)
@@ -433,6 +481,23 @@ class AdjointProjector(LinearOperator):
         if not weighted:
             total = _sum(volumes)
         return total
+
+    def _spread_together(
+        self, images: ArrayOrTensor, volume: ArrayOrTensor, spread: Spread, trace: RayMapper, progress: Progress | None
+    ) -> None:
+        """`_spread` into `volume` for the backend that takes several views at once."""
+        A = self._projector
+        for views in A._views_together():
+            some = images[views.start : views.stop]
+            responses = [A.model.response(A.views, m) for m in views]
+            if responses and responses[0] is not None:
+                along_v, along_u = (alike(np.stack(matrices), images) for matrices in zip(*responses, strict=True))
+                some = along_v.swapaxes(1, 2) @ some @ along_u
+            for which, by_columns, weights, rays, attenuation in A._fans(views, trace):
+                lines = (some.swapaxes(1, 2) if by_columns else some)[which]
+                values = lines if weights is None else alike(weights, images) * lines
+                spread(volume, values.reshape(-1), rays, attenuation)
+            _report(progress, views.stop, images.shape[0])
 
 
 def lattices(
@@ -480,7 +545,7 @@ def _sum(volumes: list[ArrayOrTensor]) -> ArrayOrTensor:
 
 def _blocks(n_lines: int, line_length: int, backend: str) -> list[slice]:
     """The lines of rays, cut into what a backend is given at once."""
-    rays_at_once = _RAYS_AT_ONCE_TORCH if backend == "torch" else _RAYS_AT_ONCE
+    rays_at_once = {"torch": _RAYS_AT_ONCE_TORCH, "cuda": _RAYS_AT_ONCE_CUDA}.get(backend, _RAYS_AT_ONCE)
     size = max(1, rays_at_once // line_length)
     return [slice(first, first + size) for first in range(0, n_lines, size)]
 

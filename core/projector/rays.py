@@ -119,6 +119,31 @@ class IndexFan:
 
 
 @dataclass(frozen=True, eq=False)
+class IndexFans:
+    """Several fans of one shape in index space, the rays of each behind those of the one before.
+
+    Attributes
+    ----------
+    fans : tuple of IndexFan
+        At least one.
+    """
+
+    fans: tuple[IndexFan, ...]
+
+    def __len__(self) -> int:
+        return sum(map(len, self.fans))
+
+    def listed(self) -> IndexRays:
+        """The rays one by one; see `IndexFan.listed`."""
+        every = [fan.listed() for fan in self.fans]
+        starts, directions = (np.concatenate([getattr(rays, k) for rays in every]) for k in ("starts", "directions"))
+        return IndexRays(starts, directions, np.concatenate([rays.lengths for rays in every]))
+
+
+Rays = IndexRays | IndexFan | IndexFans
+
+
+@dataclass(frozen=True, eq=False)
 class Attenuation:
     """What weakens rays between each point and their source.
 
@@ -126,12 +151,12 @@ class Attenuation:
     ----------
     mu : array or tensor (n_x, n_y, n_z)
         Attenuation coefficients, 1/mm, of the backend's kind; outside they are 0.
-    rays : IndexRays, IndexFan or None
+    rays : IndexRays, IndexFan, IndexFans or None
         The same rays in mu's own index space; None where mu shares the volume's lattice.
     """
 
     mu: Any
-    rays: IndexRays | IndexFan | None = None
+    rays: Rays | None = None
 
     def listed(self) -> Attenuation:
         """The same with its rays one by one."""

@@ -47,7 +47,7 @@ from .lanes import (
     words,
     zeros_of,
 )
-from .rays import SNAP, Attenuation, IndexFan, IndexRays
+from .rays import SNAP, Attenuation, IndexFan, Rays
 
 Array = NDArray[Any]  # of float32 or float64; what the rays have, of float64
 
@@ -68,18 +68,18 @@ _MOST_VOXELS = 2**31 - 1
 _NEVER = 1e30  # alpha of a plane that is not there
 
 
-def forward(volume: Array, rays: IndexRays | IndexFan, attenuation: Attenuation | None = None) -> Array:
+def forward(volume: Array, rays: Rays, attenuation: Attenuation | None = None) -> Array:
     """Line integrals (N,), value x mm, of `volume` (n_x, n_y, n_z) along `rays`, attenuated towards their sources."""
     return _integrals(volume, _listed(rays), attenuation)[0, : len(rays)]
 
 
-def adjoint(volume: Array, values: Array, rays: IndexRays | IndexFan, attenuation: Attenuation | None = None) -> None:
+def adjoint(volume: Array, values: Array, rays: Rays, attenuation: Attenuation | None = None) -> None:
     """Add `values` (N,), each along its ray with the weights of `forward`, to `volume` in place."""
     kernels = _spread, _spread_attenuated, _spread_behind
     _run(kernels, volume, _listed(rays), attenuation, _padded(values), written=volume)
 
 
-def derivatives(volume: Array, rays: IndexRays | IndexFan, attenuation: Attenuation | None = None) -> Array:
+def derivatives(volume: Array, rays: Rays, attenuation: Attenuation | None = None) -> Array:
     """What the ends of `rays` do to their integrals (N, 7) or (N, 14), as `backends` describes it."""
     lines = _listed(rays)
     result = np.empty((7 if attenuation is None else 14, lines.shape[1]))
@@ -90,9 +90,7 @@ def derivatives(volume: Array, rays: IndexRays | IndexFan, attenuation: Attenuat
     return result[:, : len(rays)].T
 
 
-def mu_gradient(
-    gradient: Array, volume: Array, values: Array, rays: IndexRays | IndexFan, attenuation: Attenuation
-) -> None:
+def mu_gradient(gradient: Array, volume: Array, values: Array, rays: Rays, attenuation: Attenuation) -> None:
     """Add to `gradient`, of mu's shape, in place what mu's voxels do to the sum of `values` (N,) times the integrals."""
     lines = _listed(rays)
     numbers = np.concatenate([_padded(values), _integrals(volume, lines, attenuation)])
@@ -137,7 +135,7 @@ def _run(
 # Rays in, as the kernels take them.
 
 
-def _listed(rays: IndexRays | IndexFan) -> Array:
+def _listed(rays: Rays) -> Array:
     """Rays as columns of (7, N'): start (3), direction (3), length; N' is N made a multiple of WIDTH by rays that miss."""
     n = len(rays)
     lines = np.empty((7, max(1, -(-n // WIDTH)) * WIDTH))
@@ -147,7 +145,8 @@ def _listed(rays: IndexRays | IndexFan) -> Array:
         vectors += [world.corner - world.source, world.line_step, world.ray_step]
         compiled(_list_fan, types.void(_NUMBERS, types.intp, _NUMBERS))(np.stack(vectors), here.shape[1], lines)
     else:
-        lines[:3, :n], lines[3:6, :n], lines[6, :n] = rays.starts.T, rays.directions.T, rays.lengths
+        each = rays.listed()
+        lines[:3, :n], lines[3:6, :n], lines[6, :n] = each.starts.T, each.directions.T, each.lengths
     lines[:, n:] = 0.0
     lines[:3, n:] = -1.0
     return lines

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from .rays import Attenuation, IndexFan, IndexRays
+from .rays import Attenuation, IndexRays, Rays
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.intp]
@@ -25,7 +25,7 @@ Lattice = tuple[tuple[int, ...], IndexRays]  # a shape, and the rays in its inde
 _CROSSINGS = 2**18
 
 
-def forward(volume: Array, rays: IndexRays | IndexFan, attenuation: Attenuation | None = None) -> Array:
+def forward(volume: Array, rays: Rays, attenuation: Attenuation | None = None) -> Array:
     """Line integrals (N,), value x mm, of `volume` (n_x, n_y, n_z) along `rays`, attenuated towards their sources."""
     integrals = np.empty(len(rays))
     voxels = volume.reshape(-1)
@@ -34,16 +34,14 @@ def forward(volume: Array, rays: IndexRays | IndexFan, attenuation: Attenuation 
     return integrals
 
 
-def adjoint(volume: Array, values: Array, rays: IndexRays | IndexFan, attenuation: Attenuation | None = None) -> None:
+def adjoint(volume: Array, values: Array, rays: Rays, attenuation: Attenuation | None = None) -> None:
     """Add `values` (N,), each along its ray with the weights of `forward`, to `volume` in place."""
     voxels = volume.reshape(-1)
     for part, index, weight, _ in _segments(volume.shape, rays, attenuation):
         np.add.at(voxels, index, weight * values[part, None])
 
 
-def mu_gradient(
-    gradient: Array, volume: Array, values: Array, rays: IndexRays | IndexFan, attenuation: Attenuation
-) -> None:
+def mu_gradient(gradient: Array, volume: Array, values: Array, rays: Rays, attenuation: Attenuation) -> None:
     """Add the derivative by mu of the integrals, each times its value of `values` (N,), to `gradient` in place.
 
     More mu on a segment of length s weakens all that comes from behind it by s, and what comes from the segment itself
@@ -57,7 +55,7 @@ def mu_gradient(
         np.add.at(gradient.reshape(-1), mu_index, slope * values[part, None])
 
 
-def derivatives(volume: Array, rays: IndexRays | IndexFan, attenuation: Attenuation | None = None) -> Array:
+def derivatives(volume: Array, rays: Rays, attenuation: Attenuation | None = None) -> Array:
     """What the ends of `rays` do to their integrals (N, 7) or (N, 14), as `backends` describes it.
 
     Where a plane moves along the ray, the integral changes by the jump of the volume there, as far as that is seen, and
@@ -108,7 +106,7 @@ def _by_ends(jump: Array, alpha: Array, axis: Indices, rays: IndexRays) -> Array
 
 
 def _segments(
-    shape: tuple[int, ...], rays: IndexRays | IndexFan, attenuation: Attenuation | None
+    shape: tuple[int, ...], rays: Rays, attenuation: Attenuation | None
 ) -> Iterator[tuple[slice, Indices, Array, tuple[Any, ...]]]:
     """Segments of the rays, some rays at a time: which rays (a slice), flat voxel index (n, S), weight in mm (n, S).
 
@@ -134,7 +132,7 @@ def _segments(
         yield part, index, weight, of_mu
 
 
-def _lattices(shape: tuple[int, ...], rays: IndexRays | IndexFan, attenuation: Attenuation | None) -> list[Lattice]:
+def _lattices(shape: tuple[int, ...], rays: Rays, attenuation: Attenuation | None) -> list[Lattice]:
     """The volume's lattice, and mu's if that has its own."""
     lattices = [(shape, rays.listed())]
     if attenuation is not None and attenuation.rays is not None:

@@ -15,29 +15,27 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from .rays import Attenuation, IndexFan, IndexRays
+from .rays import Attenuation, Rays
 
 # Crossings held at once, per kind of device: some ten arrays of this many float64 exist at the same time.
 _CROSSINGS_CPU = 2**17
 _CROSSINGS_GPU = 2**24
 
 
-def forward(volume: Tensor, rays: IndexRays | IndexFan, attenuation: Attenuation | None = None) -> Tensor:
+def forward(volume: Tensor, rays: Rays, attenuation: Attenuation | None = None) -> Tensor:
     """Line integrals (N,), value x mm, of `volume` (n_x, n_y, n_z) along `rays`, attenuated towards their sources."""
     voxels = volume.reshape(-1)
     integrals = [(voxels[index] * weight).sum(dim=1) for _, index, weight, _ in _segments(volume, rays, attenuation)]
     return torch.cat(integrals) if integrals else volume.new_zeros(0)
 
 
-def adjoint(volume: Tensor, values: Tensor, rays: IndexRays | IndexFan, attenuation: Attenuation | None = None) -> None:
+def adjoint(volume: Tensor, values: Tensor, rays: Rays, attenuation: Attenuation | None = None) -> None:
     """Add `values` (N,), each along its ray with the weights of `forward`, to `volume` in place."""
     for part, index, weight, _ in _segments(volume, rays, attenuation):
         _add(volume, index, weight * values[part, None])
 
 
-def mu_gradient(
-    gradient: Tensor, volume: Tensor, values: Tensor, rays: IndexRays | IndexFan, attenuation: Attenuation
-) -> None:
+def mu_gradient(gradient: Tensor, volume: Tensor, values: Tensor, rays: Rays, attenuation: Attenuation) -> None:
     """Add the derivative by mu of the integrals, each times its value of `values` (N,), to `gradient` in place.
 
     More mu on a segment of length s weakens all that comes from behind it by s, and what comes from the segment itself
@@ -51,7 +49,7 @@ def mu_gradient(
         _add(gradient, mu_index, slope * values[part, None])
 
 
-def derivatives(volume: Tensor, rays: IndexRays | IndexFan, attenuation: Attenuation | None = None) -> Tensor:
+def derivatives(volume: Tensor, rays: Rays, attenuation: Attenuation | None = None) -> Tensor:
     """What the ends of `rays` do to their integrals (N, 7) or (N, 14), as `backends` describes it.
 
     Where a plane moves along the ray, the integral changes by the jump of the volume there, as far as that is seen, and
@@ -108,7 +106,7 @@ def _add(volume: Tensor, index: Tensor, values: Tensor) -> None:
 
 
 def _segments(
-    volume: Tensor, rays: IndexRays | IndexFan, attenuation: Attenuation | None
+    volume: Tensor, rays: Rays, attenuation: Attenuation | None
 ) -> Iterator[tuple[slice, Tensor, Tensor, tuple[Any, ...]]]:
     """Segments of the rays, some rays at a time: which rays (a slice), flat voxel index (n, S), weight in mm (n, S).
 
@@ -149,11 +147,11 @@ class _Line:
 _Lattice = tuple[tuple[int, ...], _Line]  # a shape, and the rays in its index space
 
 
-def _lattices(volume: Tensor, rays: IndexRays | IndexFan, attenuation: Attenuation | None) -> list[_Lattice]:
+def _lattices(volume: Tensor, rays: Rays, attenuation: Attenuation | None) -> list[_Lattice]:
     """The volume's lattice, and mu's if that has its own."""
     real = torch.float32 if volume.device.type == "mps" else torch.float64  # Apple's GPUs have no float64
 
-    def line(rays: IndexRays | IndexFan) -> _Line:
+    def line(rays: Rays) -> _Line:
         listed = rays.listed()
         numbers = (listed.starts, listed.directions, listed.lengths)
         return _Line(*(torch.as_tensor(a, dtype=real).to(volume.device) for a in numbers))

@@ -14,7 +14,7 @@ from ..errors import InputError
 from ..grid import Grid
 from ..volume import Volume
 from . import backends
-from .arrays import ArrayOrTensor, alike, checked, is_double, is_tensor, like, to_numpy, to_tensor, together, zeros
+from .arrays import ArrayOrTensor, alike, checked, is_double, is_tensor, like, together, zeros
 from .operator import Spread, _blocks, _parallel, _sum, _thread_count, checked_mu, lattices, volume_workers
 from .rays import RayMapper
 
@@ -77,7 +77,7 @@ def trace_rays(
         array, mu = together(array, checked_mu(mu, mu_grid, backend == "numpy"))
     name = backends.choose(backend)
     if is_tensor(array) and array.device.type != "cpu" and backend == "auto":
-        name = "torch"
+        name = backends.for_tensor(array)
     float64 = name == "numpy" or any(is_double(value) for value in (array, mu, sources, targets))
     tracer = Tracer(grid, name, mu_grid, float64)
     if any(is_tensor(value) for value in (array, sources, targets)):
@@ -209,13 +209,11 @@ class Tracer:
 
     @property
     def _workers(self) -> int:
-        return 1 if self.backend == "torch" else _thread_count(None)
+        return backends.workers(self.backend, _thread_count(None))
 
     def _native(self, x: ArrayOrTensor) -> Any:
         """`x` as the backend computes with it."""
-        if self.backend == "torch":
-            return to_tensor(x)
-        return to_numpy(x, np.float64 if self.float64 else np.float32)
+        return backends.native(x, self.backend, self.float64)
 
 
 def _in_world(by_ends: Points, grid: Grid) -> Points:

@@ -1,0 +1,364 @@
+"""The "cuda" backend's kernels: on a GPU where MPHDRR_CUDA_DEVICE=cuda asks for it, else the same on Warp's CPU device."""
+
+from __future__ import annotations
+
+import os
+import sys
+
+import numpy as np
+import pytest
+
+pytest.importorskip("warp", reason="warp-lang is not installed")
+
+import warp
+
+from mphdrr.core.errors import InputError
+from mphdrr.core.grid import Grid
+from mphdrr.core.projector import Emission, Projector, backends, operator, siddon_cuda, siddon_numpy
+from mphdrr.core.projector import trace_rays as trace
+from mphdrr.core.projector.models import view_rays
+from mphdrr.core.projector.rays import Attenuation, IndexFans, IndexRays, index_fan
+from mphdrr.core.views import Views
+from mphdrr.core.volume import Volume
+
+from .conftest import general_grid
+from .test_projector import LINEAR, SHAPES, affine, nasty_rays, random_rays, some_views
+
+SHAPE, MU_SHAPE = (6, 7, 5), (5, 4, 8)
+
+
+@pytest.fixture(autouse=True)
+def device(monkeypatch):
+    monkeypatch.setenv(siddon_cuda.DEVICE_VARIABLE, os.environ.get(siddon_cuda.DEVICE_VARIABLE, "cpu"))
+
+
+@pytest.fixture
+def small_pieces(monkeypatch):
+    """Launches of 17 rays: lines and fans in several pieces."""
+    monkeypatch.setattr(siddon_cuda, "_RAYS_AT_ONCE", 17)
+
+
+@pytest.mark.parametrize("shape", SHAPES)
+@pytest.mark.parametrize("kind", LINEAR)
+def test_nasty_rays(shape, kind, rng):
+    grid = Grid(shape, affine(LINEAR[kind], shape))
+    volume = Volume(rng.uniform(0.5, 1.5, shape).astype(np.float32), grid)
+    for rays in (nasty_rays(grid, rng), random_rays(rng, grid)):
+        expected = trace(volume, *rays, "numpy")
+        assert np.count_nonzero(expected) > 20
+        np.testing.assert_allclose(trace(volume, *rays, "cuda"), expected, rtol=2e-5, atol=2e-5)
+
+
+@pytest.mark.parametrize("distance", [1e3, 1e6])
+def test_far_sources_and_short_chords(distance, rng):
+    """Rays that cut a corner by less than a thousandth of a voxel are as exact, for their length, as any other."""
+    grid = Grid.centered((200, 180, 190), 1.0)
+    volume = Volume(rng.uniform(0.5, 1.5, grid.shape).astype(np.float32), grid)
+    corner = grid.center + np.array(grid.shape) / 2
+    inside = corner - 10 ** rng.uniform(-4, 2, (400, 1)) * rng.uniform(0.1, 1, (400, 3))
+    direction = rng.normal(size=(400, 3))
+    direction /= np.linalg.norm(direction, axis=1, keepdims=True)
+    sources, targets = inside - distance * direction, inside + 300 * direction
+    expected = trace(volume, sources, targets, "numpy")
+    assert (expected > 0).all() and expected.min() < 1e-2 < 100 < expected.max()
+    # The coordinates themselves are rounded: by 1e-10 mm, of a source 1e6 mm away.
+    np.testing.assert_allclose(trace(volume, sources, targets, "cuda"), expected, rtol=2e-5, atol=1e-9 * distance / 1e3)
+
+
+def test_thousands_of_voxels_do_not_add_up_errors():
+    volume = np.full((5000, 1, 1), 0.7, np.float32)
+    starts, along = np.array([[-7.0, 0.4, 0.4]]), np.array([[6011.0, 0.1, 0.2]])
+    rays = IndexRays(starts, along, np.linalg.norm(along, axis=1))
+    for mu in (None, np.full(volume.shape, 3e-4, np.float32)):
+        expected = siddon_numpy.forward(volume.astype(float), rays, weakened(mu, None))
+        np.testing.assert_allclose(siddon_cuda.forward(volume, rays, weakened(mu, None)), expected, rtol=5e-7)
+
+
+@pytest.mark.parametrize("kind", LINEAR)
+def test_fans_in_planes_of_faces(kind, rng):
+    """Rays that are made on the device belong to the same voxels as the reference's, up to which rounding may not go."""
+    grid = Grid(SHAPE, affine(LINEAR[kind], SHAPE))
+    sources = np.array([[-9.5, 2.5, 1.5], [2.5, -9.5, 1.5], [2.5, 3.5, -9.5]] * 2)  # of the voxels' centres
+    targets = sources + np.array([[30, 0, 0], [0, 30, 0], [0, 0, 30], [30, 10, 0], [10, 30, 0], [0, 10, 30]])
+    steps = np.roll(np.eye(3), 1, axis=0)[[0, 1, 2] * 2], np.roll(np.eye(3), 2, axis=0)[[0, 1, 2] * 2]
+    linear = grid.affine[:3, :3].T
+    ends = [points @ linear + grid.affine[:3, 3] for points in (sources, targets)]
+    views = Views(*ends, *(step @ linear for step in steps), (5, 5))
+    volume = rng.uniform(0.5, 1.5, SHAPE).astype(np.float32)
+    for x in (volume, volume * (np.indices(SHAPE).sum(axis=0) % 2)):
+        expected = Projector(grid, views, backend="numpy")(x)
+        assert expected.any(axis=(1, 2)).all()
+        np.testing.assert_allclose(Projector(grid, views, backend="cuda")(x), expected, rtol=2e-5, atol=2e-5)
+
+
+WEAKENED = ["mu on the same grid", "mu on another grid"]
+
+
+@pytest.fixture(params=["plain", *WEAKENED])
+def lattices(request, rng):
+    """A volume, rays through it, and what attenuates them, in float32: for "cuda", and in float64 for numpy."""
+    volume, mu = rng.random(SHAPE), None
+    starts, ends = rng.normal(size=(2, 300, 3)) * 6 + np.array(SHAPE) / 2
+    ends[:150] = np.array(SHAPE) - starts[:150] + rng.normal(size=(150, 3))  # others miss, start or end inside
+    rays = IndexRays(starts, ends - starts, np.linalg.norm((ends - starts) * [2, 1.5, 1], axis=1))
+    mu_rays = None
+    if request.param != "plain":
+        mu = rng.random(SHAPE) * 0.05
+    if request.param == "mu on another grid":
+        mu = rng.random(MU_SHAPE) * 0.05
+        linear, shift = np.eye(3) * 1.1 + rng.normal(size=(3, 3)) * 0.2, [-0.5, -1, 1]
+        mu_rays = IndexRays(starts @ linear.T + shift, (ends - starts) @ linear.T, rays.lengths)
+    return volume, rays, mu, mu_rays
+
+
+def single(*arrays):
+    return [None if array is None else array.astype(np.float32) for array in arrays]
+
+
+def weakened(mu, mu_rays):
+    return None if mu is None else Attenuation(mu, mu_rays)
+
+
+def moved(rays, start, end):
+    return None if rays is None else IndexRays(rays.starts + start, rays.directions + end - start, rays.lengths)
+
+
+def test_derivatives_are_finite_differences(lattices):
+    volume, rays, mu, mu_rays = lattices
+    h, zero, length = 1e-6, np.zeros(3), rays.lengths
+    same = mu is not None and mu_rays is None
+
+    def integral(ends=(zero, zero), mu_ends=(zero, zero), longer=1.0):
+        """The integral over alpha, with mu's rays moved on their own, and the exponent's length."""
+        changed = IndexRays(rays.starts, rays.directions, length * longer)
+        changed, behind = moved(changed, *ends), moved(changed if same else mu_rays, *mu_ends)
+        return siddon_numpy.forward(volume, changed, weakened(mu, behind)) / changed.lengths
+
+    expected = [integral()]
+    for which in ("ends", "mu_ends")[: 1 if mu is None else 2]:
+        for step in np.eye(6).reshape(6, 2, 3) * h:
+            expected.append((integral(**{which: step}) - integral(**{which: -step})) / (2 * h))
+    if mu is not None:
+        expected.append((integral(longer=1 + h) - integral(longer=1 - h)) / (2 * h * length))
+
+    volume, mu = single(volume, mu)
+    got = siddon_cuda.derivatives(volume, rays, weakened(mu, mu_rays))
+    assert got.shape == (300, 7 if mu is None else 14)
+    for column, (a, b) in enumerate(zip(got.T, expected, strict=True)):
+        wrong = np.abs(a - b) > 2e-5 * np.abs(b).max()
+        # Within h of a ray through an edge of voxels the difference is not the derivative.
+        assert np.count_nonzero(wrong) <= 1 and np.count_nonzero(b) > 100, column
+
+
+@pytest.mark.parametrize("rounding", [False, True])
+def test_derivatives_depend_on_mu_and_not_on_its_grid(rounding, rng):
+    """Mu on the volume's lattice, on one twice as fine, on one that goes on outside and on a part: planes met at once."""
+    volume, mu = single(rng.random(SHAPE), rng.random(SHAPE) * 0.1)
+    mu[0], mu[:, :, 3:] = 0, 0
+    starts, ends = rng.normal(size=(2, 3000, 3)) * 6 + np.array(SHAPE) / 2
+    lengths = np.linalg.norm(ends - starts, axis=1)
+    expected = siddon_cuda.derivatives(volume, IndexRays(starts, ends - starts, lengths), Attenuation(mu))
+    if rounding:
+        linear = rng.normal(size=(3, 3))
+        starts, ends = (points @ linear @ np.linalg.inv(linear) for points in (starts, ends))
+    for array, factor, shift in (
+        (mu.repeat(2, 0).repeat(2, 1).repeat(2, 2), 2, (0, 0, 0)),
+        (np.pad(mu, ((1, 1), (2, 0), (3, 4))), 1, (1, 2, 3)),
+        (mu[1:, :, :3].copy(), 1, (-1, 0, 0)),
+    ):
+        behind = IndexRays(starts * factor + shift, (ends - starts) * factor, lengths)
+        got = siddon_cuda.derivatives(volume, IndexRays(starts, ends - starts, lengths), Attenuation(array, behind))
+        got[:, 7:13] *= factor
+        assert np.count_nonzero(got[:, 7:13]) > 2000
+        scale = np.abs(expected).max(axis=0)
+        np.testing.assert_allclose(got / scale, expected / scale, rtol=0, atol=2e-6)
+
+
+@pytest.mark.parametrize("lattices", WEAKENED, indirect=True)
+def test_gradient_by_mu_is_a_finite_difference(lattices, rng, small_pieces):
+    volume, rays, mu, mu_rays = lattices
+    values, h = rng.normal(size=300), 1e-6
+    gradient = np.ones(mu.shape, np.float32)
+    siddon_cuda.mu_gradient(gradient, *single(volume, values), rays, weakened(*single(mu), mu_rays))
+    for _ in range(3):
+        step = rng.normal(size=mu.shape)
+        ahead, back = (siddon_numpy.forward(volume, rays, weakened(mu + k * step, mu_rays)) for k in (h, -h))
+        np.testing.assert_allclose(((gradient - 1) * step).sum(), (ahead - back) @ values / (2 * h), rtol=1e-4)
+
+
+def test_adjoint_has_the_weights_of_the_integrals(lattices, rng):
+    volume, rays, mu, mu_rays = lattices
+    x, y, mu32 = single(volume, rng.normal(size=300), mu)
+    spread = np.ones(SHAPE, np.float32)
+    siddon_cuda.adjoint(spread, y, rays, weakened(mu32, mu_rays))
+    expected = np.ones(SHAPE)
+    siddon_numpy.adjoint(expected, y.astype(float), rays, weakened(mu, mu_rays))
+    np.testing.assert_allclose(spread, expected, rtol=2e-5, atol=2e-5 * np.abs(expected).max())
+    product = siddon_cuda.forward(x, rays, weakened(mu32, mu_rays)).astype(float) @ y
+    assert abs(product - np.vdot(x, spread - 1.0)) < 1e-5 * np.linalg.norm(y) * np.linalg.norm(x)
+
+
+@pytest.mark.parametrize("attenuation", [None, "same", "other"])
+def test_projector_agrees_with_the_reference(attenuation, system, rng, monkeypatch):
+    """All of emission, views that are traced by rows and by columns, in launches of several views and of parts of one."""
+    grid = general_grid(rng, (20, 18, 16))
+    mu_grid = general_grid(rng, (12, 14, 10)) if attenuation == "other" else grid
+    mu = Volume(rng.uniform(0, 0.02, mu_grid.shape), mu_grid, "mu") if attenuation else None
+    model = Emission(system, mu=mu, aperture_points=3, crystal_mu=0.2, intrinsic_fwhm=4.0)
+    A, reference = (Projector(grid, system.views((9, 8)), model, backend=name) for name in ("cuda", "numpy"))
+    assert {by_columns for m in range(12) for _, by_columns in A._beams(m)} == {True, False}
+    x, y = rng.random(A.shape_in, dtype=np.float32), rng.random(A.shape_out, dtype=np.float32)
+    expected, expected_T = reference(x), reference.T(y)
+    assert np.count_nonzero(expected) > 0.5 * expected.size
+    for rays_together, rays_at_once in ((2**22, 2**24), (5 * 72, 2**24), (2**22, 100), (2**22, 20)):
+        monkeypatch.setattr(operator, "_RAYS_AT_ONCE_CUDA", rays_together)
+        monkeypatch.setattr(siddon_cuda, "_RAYS_AT_ONCE", rays_at_once)
+        Ax, ATy = A(x), A.T(y)
+        assert Ax.dtype == ATy.dtype == np.float32
+        np.testing.assert_allclose(Ax, expected, rtol=2e-5, atol=2e-5 * expected.max())
+        np.testing.assert_allclose(ATy, expected_T, rtol=2e-5, atol=2e-5 * expected_T.max())
+        Ax, ATy = Ax.astype(float), ATy.astype(float)
+        assert abs(np.vdot(Ax, y) - np.vdot(x, ATy)) < 1e-5 * np.linalg.norm(Ax) * np.linalg.norm(y)
+
+
+def test_rays_of_fans_are_the_listed_rays(rng, small_pieces):
+    grid = Grid(SHAPE, affine(LINEAR["sheared"], SHAPE))
+    views = some_views(rng, (7, 30), n=4)
+    fans = IndexFans(tuple(index_fan(grid, view_rays(views, m)) for m in range(4)))
+    volume = rng.random(SHAPE, dtype=np.float32)
+    for function in (siddon_cuda.forward, siddon_cuda.derivatives):
+        together = function(volume, fans)
+        assert together.any()
+        np.testing.assert_allclose(together, function(volume, fans.listed()), rtol=1e-5, atol=1e-6)
+        np.testing.assert_array_equal(together, np.concatenate([function(volume, fan) for fan in fans.fans]))
+
+
+@pytest.mark.parametrize("rays_at_once", [2**24, 17])
+def test_tensors_on_the_device_are_not_copied(rays_at_once, rng, monkeypatch):
+    monkeypatch.setattr(siddon_cuda, "_RAYS_AT_ONCE", rays_at_once)
+    torch = pytest.importorskip("torch", reason="torch is not installed")
+    grid = Grid(SHAPE, affine(LINEAR["rotated"], SHAPE))
+    place = "cuda" if os.environ[siddon_cuda.DEVICE_VARIABLE] != "cpu" else "cpu"
+    volume = torch.tensor(rng.random(SHAPE), dtype=torch.float32, device=place)
+    assert siddon_cuda.native(volume).data_ptr() == volume.data_ptr()
+
+    fan = index_fan(grid, view_rays(some_views(rng, (9, 5)), 0))
+    integrals = siddon_cuda.forward(volume, fan)
+    assert integrals.device == volume.device and integrals.dtype == torch.float32
+    np.testing.assert_allclose(integrals.cpu(), siddon_cuda.forward(volume.cpu().numpy(), fan), rtol=1e-6)
+    torch.testing.assert_close(siddon_cuda.forward(siddon_cuda.native(torch._neg_view(volume)), fan), -integrals)
+    filled = torch.zeros_like(volume)
+    siddon_cuda.adjoint(filled, integrals, fan)
+    torch.testing.assert_close((filled * volume).sum(), (integrals**2).sum())
+
+    A = Projector(grid, some_views(rng), backend="cuda")
+    x = volume.double().requires_grad_()  # float64 is computed in float32
+    weights = torch.tensor(rng.random(A.shape_out), device=place)
+    (A(x) * weights).sum().backward()
+    assert x.grad.dtype == torch.float64
+    np.testing.assert_allclose(x.grad.cpu(), A.T(weights.cpu().numpy()), rtol=1e-5, atol=1e-6)
+
+    source = torch.tensor([0.3, 0.1, -30.0], dtype=torch.float64, requires_grad=True)
+    slopes = []
+    for backend in ("cuda", "numpy"):
+        trace(volume.cpu(), source, [[0.5, 1.0, 30.0], [4.0, 0.0, 20.0]], backend, grid).sum().backward()
+        slopes.append(source.grad.clone())
+        source.grad = None
+    assert slopes[0].any()
+    torch.testing.assert_close(*slopes, rtol=2e-5, atol=1e-6)
+
+
+def test_what_is_missing_is_said_in_one_line(monkeypatch):
+    views = some_views(np.random.default_rng(0))
+    grid = Grid.centered(SHAPE, 1.0)
+
+    def refusal():
+        with pytest.raises(InputError) as error:
+            Projector(grid, views, backend="cuda")
+        assert "\n" not in str(error.value)
+        return str(error.value)
+
+    def without_warp(name):
+        raise ModuleNotFoundError("No module named 'warp'")
+
+    with monkeypatch.context() as patch:
+        patch.setenv(siddon_cuda.DEVICE_VARIABLE, "cuda")
+        patch.setattr(siddon_cuda, "has_driver", lambda: False)
+        assert "no NVIDIA driver" in refusal()
+        backends._cuda_works.cache_clear()
+        assert not backends._cuda_works()  # a tensor on a GPU is for torch then
+    backends._cuda_works.cache_clear()
+    monkeypatch.setenv(siddon_cuda.DEVICE_VARIABLE, "cuda:99")
+    monkeypatch.setattr(siddon_cuda, "has_driver", lambda: True)
+    assert "cuda:99" in refusal()
+    monkeypatch.setattr(backends, "load", without_warp)
+    assert "pip install warp-lang" in refusal()
+
+
+def test_short_memory_means_more_launches(monkeypatch, rng):
+    grid = Grid(SHAPE, affine(LINEAR["sheared"], SHAPE))
+    views = some_views(rng, (7, 30), n=4)
+    fans = IndexFans(tuple(index_fan(grid, view_rays(views, m)) for m in range(4)))
+    volume = rng.random(SHAPE, dtype=np.float32)
+    launches = []
+    launch = warp.launch
+    monkeypatch.setattr(warp, "launch", lambda *a, **k: launches.append(a[1]) or launch(*a, **k))
+    expected = siddon_cuda.forward(volume, fans)
+    monkeypatch.setattr(siddon_cuda, "_FEWEST_RAYS", 1)
+    monkeypatch.setattr(type(siddon_cuda.device()), "free_memory", 1000)  # 500 for the rays: 2 or 3 lines of a view
+    np.testing.assert_array_equal(siddon_cuda.forward(volume, fans), expected)
+    assert launches[0] == (4, 7, 30) and len(launches) > 8 and {dim[0] for dim in launches[1:]} == {1}
+
+
+@pytest.mark.skipif(sys.platform == "darwin", reason="Warp has no CUDA on macOS")
+def test_kernels_compile_for_gpus_without_one(tmp_path):
+    from mphdrr.core.projector import warp_kernels
+
+    siddon_cuda.device()
+    (compiled,) = warp.compile_aot_module(warp_kernels, arch=75, module_dir=tmp_path, use_ptx=True)
+    assert compiled.read_text().count(".entry") == 7
+
+
+def test_volume_too_large_for_the_device_is_refused(monkeypatch, rng):
+    grid = Grid.centered((40, 40, 40), 1.0)
+    A = Projector(grid, some_views(rng), backend="cuda")
+    monkeypatch.setattr(type(siddon_cuda.device()), "free_memory", 1000)
+    with pytest.raises(InputError, match="the volume takes"):
+        A(np.ones(grid.shape))
+
+
+@pytest.mark.parametrize("same", [True, False])
+def test_gradients_are_those_of_the_reference(same, system, rng):
+    """Of rays by volume, mu and ends; of a projector by volume and mu; of cameras by their numbers."""
+    torch = pytest.importorskip("torch", reason="torch is not installed")
+    from mphdrr.core.projector.poses import emission_images
+
+    grid = general_grid(rng, (12, 9, 10))
+    mu_grid = grid if same else general_grid(rng, (9, 10, 8))
+    volume, mu = (torch.tensor(rng.random(g.shape)) for g in (grid, mu_grid))
+    ends = rng.normal(size=(2, 500, 3)) * 20 + grid.center
+    model = Emission(system, mu=Volume(rng.random(mu_grid.shape), mu_grid, "mu"), aperture_points=3)
+    views = system.views((9, 8))
+    poses = torch.tensor(system.poses())
+
+    def gradients(backend):
+        x, m, sources, targets, places, lengths = given = [
+            torch.as_tensor(a).clone().requires_grad_()
+            for a in (volume, mu * 0.02, *ends, poses[:, :3, 3], system.collimator_length)
+        ]
+        numbers = np.random.default_rng(0)
+        on = {"grid": grid, "mu": m, "mu_grid": mu_grid, "backend": backend}
+        found = []
+        for y in (
+            trace(x, sources, targets, **on),
+            Projector(grid, views, model, backend=backend)(x, mu=m),
+            emission_images(x, places, poses[:, :3, :3], lengths, 2.0, (9, 8), diameter=2.0, **on),
+        ):
+            loss = (y * torch.tensor(numbers.normal(size=y.shape))).sum()
+            found += [g for g in torch.autograd.grad(loss, given, allow_unused=True) if g is not None]
+        return found
+
+    pairs = list(zip(gradients("cuda"), gradients("numpy"), strict=True))
+    assert len(pairs) == 4 + 2 + 4
+    for got, expected in pairs:
+        np.testing.assert_allclose(got, expected, rtol=0, atol=2e-5 * float(expected.abs().max()))

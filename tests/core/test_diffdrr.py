@@ -286,6 +286,19 @@ def test_generation_before_04(rng):
                        drr.density)  # fmt: skip
 
 
+def test_points_before_04(rng):
+    """Where its formula fits its images, a pixel's point is where its ray ends; back and forth always."""
+    pose = convert(torch.tensor([[0.4, -0.3, 0.2]]), TRANSLATION[:1], parameterization="euler_angles", convention="ZYX")
+    pixels = torch.tensor(np.stack(np.mgrid[:11, :8][::-1], -1).reshape(1, -1, 2) + 0.5, dtype=torch.float64)
+    drr = DRR(ct(rng), [1.5, 2.0, 1.0], 90.0, 11, 5.0, 8, x0=6.0, reverse_x_axis=True)
+    ends = pose.to(torch.float64)(drr.detector.targets()[None])
+    np.testing.assert_allclose(drr.inverse_projection(pose, pixels), ends, atol=1e-4)
+    drr = DRR(ct(rng), [1.5, 2.0, 1.0], 90.0, 11, 5.0, 8, 4.0, x0=6.0, y0=-3.0)
+    points = drr.inverse_projection(pose, pixels)
+    nearer = torch.lerp(pose.to(torch.float64)(drr.detector.source[None]), points, 0.6)
+    np.testing.assert_allclose(drr.perspective_projection(pose, nearer), pixels, atol=1e-4)
+
+
 def test_sampled_images_before_04(rng):
     """Samples at fractions from near to far, voxel i's centre at i times the spacing, each counting 1 / n_points."""
     interpolated = pytest.importorskip("scipy.ndimage").map_coordinates

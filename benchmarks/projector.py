@@ -17,6 +17,7 @@ import os
 import subprocess
 import sys
 import tempfile
+import threading
 import time
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
@@ -30,6 +31,7 @@ from peers import PEERS, TASKS, cores, set_thread_variables
 ROOT = Path(__file__).parents[1]
 PATIENCE = 3.0  # s: what takes longer has one turn
 ENOUGH = 60.0  # s: a slow contender that has taken this long is asked for nothing more
+TOO_LONG = 120.0  # s: a contender that has not answered one request by then is ended
 
 
 @dataclass
@@ -74,11 +76,15 @@ class Worker:
     def measure(self, case: Case, task: str, **request: Any) -> dict[str, Any]:
         assert self._process.stdin is not None
         started = time.monotonic()
+        end = threading.Timer(TOO_LONG, self._process.kill)
+        end.start()
         try:
             print(json.dumps({"case": asdict(case), "task": task, **request}), file=self._process.stdin, flush=True)
+            answer = self._read()
         except BrokenPipeError:
             return {"failed": "its process ended"}
-        answer = self._read()
+        finally:
+            end.cancel()
         self._spent += time.monotonic() - started
         return answer
 

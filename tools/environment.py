@@ -21,6 +21,12 @@ ROOT = Path(__file__).resolve().parents[1]
 VERSIONS = ("3.11", "3.13")
 VERSION_WITH_TORCH = "3.11"
 
+# What tests/core/test_diffdrr.py compares with. DiffDRR declares more than it imports (pyvista, kornia, timm, torchvision,
+# ...: gigabytes), so it is installed without its dependencies, and these are what its modules that we test import. pandas
+# 3.1 asks for numpy 2, bpy 4.5 for numpy 1.
+DIFFDRR = "diffdrr==0.6.1"
+DIFFDRR_IMPORTS = ("einops", "fastcore", "pandas<3.1", "torchio")
+
 # What bpy loads from the system -> the Debian package that has it.
 LIBRARIES = {
     "libX11.so.6": "libx11-6",
@@ -89,6 +95,14 @@ def pip(venv: Path, *arguments: str) -> bool:
     return subprocess.run(command, cwd=ROOT, stdin=subprocess.DEVNULL).returncode == 0
 
 
+def add_diffdrr(venv: Path) -> bool:
+    """Install the DiffDRR of the tests; say whether it succeeded."""
+    # torchio would fetch a torch of its own where ours could not be installed.
+    if subprocess.run([str(venv / "bin/python"), "-c", "import torch"], stderr=subprocess.DEVNULL).returncode != 0:
+        return False
+    return pip(venv, "install", *DIFFDRR_IMPORTS) and pip(venv, "install", "--no-deps", DIFFDRR)
+
+
 def make(venv: Path, name: str, extras: set[str], torch: str | None) -> None:
     """Bring `venv` to what is asked; `torch` is a requirement, "" for an environment without it, None for either."""
     python, version = find_python(name)
@@ -121,6 +135,8 @@ def make(venv: Path, name: str, extras: set[str], torch: str | None) -> None:
             pip(venv, "uninstall", "-y", "torch", "roma")
         elif not pip(venv, "install", wanted["torch"], "roma>=1.5"):
             print(f"{wanted['torch']} could not be installed: going on without it, its tests are skipped", flush=True)
+    if wanted["torch"] and "dev" in wanted["extras"] and not add_diffdrr(venv):
+        print(f"{DIFFDRR} could not be installed: going on without it, its tests are skipped", flush=True)
     source = venv / "src"  # where mypy finds the repo root under the package's name
     source.mkdir(exist_ok=True)
     if not (source / "mphdrr").is_symlink():

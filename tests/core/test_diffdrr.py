@@ -1,6 +1,12 @@
-"""DiffDRR's face: the same arguments and poses give DiffDRR's images, points and gradients."""
+"""DiffDRR's face: the same arguments and poses give DiffDRR's images, points and gradients.
+
+What DiffDRR 0.6.1 has is compared with it where it is installed; the arguments before 0.4 follow closed descriptions.
+"""
 
 from __future__ import annotations
+
+import itertools
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -8,11 +14,14 @@ import pytest
 torch = pytest.importorskip("torch", reason="torch is not installed")
 pytest.importorskip("roma", reason="roma is not installed")
 
-from mphdrr.core.diffdrr import DRR, Registration, RigidTransform, Subject, convert, hu_to_density, read  # noqa: E402
+from mphdrr.core import trilinear  # noqa: E402
+from mphdrr.core.diffdrr import DRR, Registration, RigidTransform, Subject, convert, drr_arguments, hu_to_density, read  # noqa: E402
 from mphdrr.core.errors import InputError  # noqa: E402
 from mphdrr.core.grid import Grid  # noqa: E402
-from mphdrr.core.projector import trace_rays  # noqa: E402
+from mphdrr.core.presets import c_arm_views  # noqa: E402
+from mphdrr.core.projector import Projector, trace_rays  # noqa: E402
 from mphdrr.core.rotations import rotation_parameters, se3_exp  # noqa: E402
+from mphdrr.core.views import Views  # noqa: E402
 from mphdrr.core.volume import Volume  # noqa: E402
 
 from .conftest import general_grid  # noqa: E402
@@ -20,8 +29,10 @@ from .conftest import general_grid  # noqa: E402
 
 def peer():
     """DiffDRR's modules, or a skip where it is not installed."""
-    drr = pytest.importorskip("diffdrr.drr", reason="DiffDRR is not installed")
-    return drr, pytest.importorskip("diffdrr.pose"), pytest.importorskip("torchio")
+    return tuple(
+        pytest.importorskip(name, reason=f"DiffDRR is not installed ({name} is missing)", exc_type=ImportError)
+        for name in ("diffdrr.drr", "diffdrr.pose", "torchio")
+    )
 
 
 def ct(rng, shape=(24, 20, 22)):
@@ -85,6 +96,96 @@ def test_images_and_points_are_those_of_diffdrr(options, torchio_subject):
     got = ours.inverse_projection(theirs_pose, pixels)
     assert torch.equal(pixels, kept)
     np.testing.assert_allclose(got, theirs.inverse_projection(theirs_pose, pixels), rtol=1e-3, atol=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("options", "call"),
+    [
+        ({}, {}),
+        ({}, {"n_points": 90}),
+        ({}, {"align_corners": True}),
+        ({}, {"alphamin": 0.3, "alphamax": 0.7}),
+        ({}, {"mask_to_channels": True}),
+        ({"mode": "nearest", "voxel_shift": 0.0}, {}),
+        ({"reducefn": "max"}, {}),
+        ({"reducefn": lambda samples: samples.square().sum(-1)}, {}),
+        ({"patch_size": 4, "x0": 7.0, "reverse_x_axis": False}, {}),
+        ({"reshape": False}, {}),
+    ],
+)
+def test_sampled_images_are_those_of_diffdrr(options, call, torchio_subject):
+    """The trilinear renderer takes the same samples; its gradient jumps between voxels, so few rays may differ."""
+    images, gradients = [], []
+    for module in (peer()[0].DRR, DRR):
+        drr = module(torchio_subject, 240.0, 12, 4.0, renderer="trilinear", **options)
+        rotation, translation = ROTATION.clone().requires_grad_(), TRANSLATION.clone().requires_grad_()
+        image = drr(rotation, translation, parameterization="axis_angle", **call)
+        (image * torch.linspace(0, 1, image.numel()).reshape(image.shape)).sum().backward()
+        images.append(image.detach())
+        gradients.append(torch.cat([rotation.grad.ravel(), translation.grad.ravel()]))
+    assert images[0].shape == images[1].shape
+    same = np.isclose(images[1], images[0], atol=2e-5 * float(images[0].max()))
+    # A sample half-way between two voxels or structures is either one's.
+    assert same.mean() > 0.97 if options.get("mode") == "nearest" or "mask_to_channels" in call else same.all()
+    if options.get("mode") != "nearest":
+        np.testing.assert_allclose(gradients[1], gradients[0], rtol=0.02, atol=5e-3 * float(gradients[0].abs().max()))
+
+
+@pytest.mark.parametrize("renderer", ["siddon", "trilinear"])
+def test_subsampled_pixels_are_those_of_diffdrr(renderer, torchio_subject):
+    """The same seed chooses the same pixels."""
+    images = []
+    for module in (peer()[0].DRR, DRR):
+        torch.manual_seed(5)
+        drr = module(torchio_subject, 240.0, 12, 4.0, p_subsample=0.4, renderer=renderer)
+        images.append(drr(ROTATION[:1], TRANSLATION[:1], parameterization="axis_angle"))
+    assert int((images[0] == 0).sum()) >= 86
+    np.testing.assert_allclose(images[1], images[0], atol=2e-4 * float(images[0].max()))
+
+
+def test_calibration_is_that_of_diffdrr(torchio_subject):
+    module, pose_module, _ = peer()
+    calibration = torch.tensor([[5.0, 0.2, 0, 3], [0.1, 4.0, 0, -6], [0, 0, 220.0, 0], [0, 0, 0, 1]])
+    for renderer in ("siddon", "trilinear"):
+        expected, got = (
+            drr(torchio_subject, 240.0, 10, 4.0, renderer=renderer)(
+                ROTATION,
+                TRANSLATION,
+                parameterization="axis_angle",
+                calibration=pose_module.RigidTransform(calibration),
+            )
+            for drr in (module.DRR, DRR)
+        )
+        np.testing.assert_allclose(got, expected, atol=2e-4 * float(expected.max()))
+
+
+@pytest.mark.parametrize("orientation", ["AP", "PA", None])
+def test_reading_a_ct_is_that_of_diffdrr(orientation, subject):
+    peer()
+    data, torchio = pytest.importorskip("diffdrr.data", exc_type=ImportError), peer()[2]
+    ct = torchio.ScalarImage(tensor=subject.hu[None], affine=subject.affine)
+    expected = data.read(ct, orientation=orientation, bone_attenuation_multiplier=2.5)
+    volume = Volume(subject.hu.numpy(), Grid(subject.hu.shape, subject.affine), "hu")
+    got = read(volume, orientation=orientation, bone_attenuation_multiplier=2.5)
+    np.testing.assert_allclose(got.density, expected.density.data[0], atol=1e-6)
+    np.testing.assert_allclose(got.affine, expected.volume.affine, atol=1e-6)
+    np.testing.assert_array_equal(got.reorient, expected.reorient)
+
+
+@pytest.mark.parametrize("convention", ["".join(c) for c in itertools.product("XYZ", repeat=3) if c[1] not in c[::2]])
+def test_euler_angles_are_those_of_diffdrr(convention, rng):
+    """All conventions, both ways, in radians and degrees."""
+    theirs = peer()[1]
+    angles = torch.tensor(rng.uniform(-1.2, 1.2, (20, 3)), dtype=torch.float32)
+    angles[:, 1] += 1.3 if convention[0] == convention[2] else 0.0  # away from the gimbal's lock
+    moved = torch.zeros(20, 3)
+    for degrees in (False, True):
+        given = torch.rad2deg(angles) if degrees else angles
+        arguments = {"parameterization": "euler_angles", "convention": convention, "degrees": degrees}
+        expected, got = theirs.convert(given, moved, **arguments), convert(given, moved, **arguments)
+        np.testing.assert_allclose(got.matrix, expected.matrix, atol=2e-6)
+        for back in (got, expected):
+            np.testing.assert_allclose(back.convert(**arguments)[0], given, atol=2e-2 if degrees else 3e-4)
 
 
 def test_the_whole_line_counts_beyond_the_detector(torchio_subject):
@@ -166,7 +267,7 @@ def test_generation_before_04(rng):
     """Source at +x, detector at -x, the volume's corner at the origin and its first axis flipped."""
     hu, spacing = ct(rng), [1.5, 2.0, 1.0]
     drr = DRR(hu, spacing, 90.0, 8, 5.0, 11, 4.0, x0=2.0, y0=-3.0)
-    center = torch.tensor([np.array(hu.shape) * spacing / 2])
+    center = torch.tensor(np.array(hu.shape) * spacing / 2)[None]
     rotation, translation = torch.tensor([[0.4, -0.3, 0.2]]), center.float()
     image = drr(rotation, translation, parameterization="euler_angles", convention="ZYX")
     assert image.shape == (1, 1, 8, 11)
@@ -183,6 +284,77 @@ def test_generation_before_04(rng):
     assert not torch.allclose(brighter, image)
     assert torch.equal(DRR(hu, spacing=spacing, sdr=90.0, height=8, delx=5.0, bone_attenuation_multiplier=3.0).density,
                        drr.density)  # fmt: skip
+
+
+def test_points_before_04(rng):
+    """Where its formula fits its images, a pixel's point is where its ray ends; back and forth always."""
+    pose = convert(torch.tensor([[0.4, -0.3, 0.2]]), TRANSLATION[:1], parameterization="euler_angles", convention="ZYX")
+    pixels = torch.tensor(np.stack(np.mgrid[:11, :8][::-1], -1).reshape(1, -1, 2) + 0.5, dtype=torch.float64)
+    drr = DRR(ct(rng), [1.5, 2.0, 1.0], 90.0, 11, 5.0, 8, x0=6.0, reverse_x_axis=True)
+    ends = pose.to(torch.float64)(drr.detector.targets()[None])
+    np.testing.assert_allclose(drr.inverse_projection(pose, pixels), ends, atol=1e-4)
+    drr = DRR(ct(rng), [1.5, 2.0, 1.0], 90.0, 11, 5.0, 8, 4.0, x0=6.0, y0=-3.0)
+    points = drr.inverse_projection(pose, pixels)
+    nearer = torch.lerp(pose.to(torch.float64)(drr.detector.source[None]), points, 0.6)
+    np.testing.assert_allclose(drr.perspective_projection(pose, nearer), pixels, atol=1e-4)
+
+
+def test_sampled_images_before_04(rng):
+    """Samples at fractions from near to far, voxel i's centre at i times the spacing, each counting 1 / n_points."""
+    interpolated = pytest.importorskip("scipy.ndimage").map_coordinates
+    hu, spacing = ct(rng), np.array([1.5, 2.0, 1.0])
+    drr = DRR(hu, spacing, 90.0, 8, 5.0, renderer="trilinear", near=0.1, far=0.95)
+    pose = convert(
+        torch.tensor([[0.4, -0.3, 0.2]]), torch.zeros(1, 3), parameterization="euler_angles", convention="ZYX"
+    )
+    pose.matrix[0, :3, 3] = torch.tensor(np.array(hu.shape) * spacing / 2)
+    source, targets = (pose(x[None]).double()[0] for x in (drr.detector.source, drr.detector.targets()))
+    points = torch.lerp(source, targets[:, None], torch.linspace(0.1, 0.95, 120, dtype=torch.float64)[:, None])
+    density = hu_to_density(torch.from_numpy(hu)).flip([0]).double().numpy()
+    samples = interpolated(density, (points.numpy() / spacing).transpose(2, 0, 1), order=1, mode="grid-constant")
+    expected = samples.sum(-1) / 120 * np.asarray((targets - source).norm(dim=-1))
+    image = drr(pose, n_points=120).reshape(-1)
+    np.testing.assert_allclose(image, expected, atol=2e-5 * expected.max())
+    drr.reshape = False
+    assert drr(pose).shape == (1, 64)
+
+
+def test_many_samples_are_the_integral(subject, monkeypatch):
+    """In a smooth volume; whatever the chunks."""
+    axes = np.stack(np.meshgrid(*[np.arange(n) for n in subject.density.shape], indexing="ij"), -1)
+    smooth = torch.tensor(np.exp(-((axes - np.array([11, 10, 10.5])) ** 2).sum(-1) / 50), dtype=torch.float32)
+    subject = Subject(smooth, subject.affine, subject.reorient)
+    pose = convert(ROTATION, TRANSLATION, parameterization="axis_angle")
+    exact = DRR(subject, 240.0, 8, 4.0)(pose)
+    sampled = DRR(subject, 240.0, 8, 4.0, renderer="trilinear")
+    image = sampled(pose, n_points=800)
+    np.testing.assert_allclose(image, exact, atol=0.03 * float(exact.max()))
+    monkeypatch.setattr(trilinear, "_SAMPLES_AT_ONCE", 5000)
+    np.testing.assert_allclose(sampled(pose, n_points=800), image, rtol=1e-6)
+
+
+def test_gradients_of_samples(subject):
+    """By the density exactly, by the pose between two voxels' centres: against finite differences in float64."""
+    density = torch.rand(subject.density.shape, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
+    drr = DRR(Subject(density, subject.affine, subject.reorient), 240.0, 5, 8.0, renderer="trilinear").double()
+    motion = torch.tensor([[4.0, 120.0, -7.0, 0.3, -0.2, 0.1]], dtype=torch.float64, requires_grad=True)
+    drr.density.requires_grad_()
+
+    def score(motion):
+        return drr(se3_exp(motion), n_points=40).square().sum()
+
+    score(motion).backward()
+    for i in range(6):
+        step = torch.zeros(1, 6, dtype=torch.float64)
+        step[0, i] = 1e-6
+        with torch.no_grad():
+            difference = (score(motion + step) - score(motion - step)) / 2e-6
+        assert float(motion.grad[0, i]) == pytest.approx(float(difference), rel=1e-4, abs=1e-3)
+    with torch.no_grad():
+        change = torch.randn(density.shape, dtype=torch.float64, generator=torch.Generator().manual_seed(1))
+        expected = score(motion), (drr.density.grad * change).sum()
+        drr.density += 1e-6 * change
+        assert float((score(motion) - expected[0]) / 1e-6) == pytest.approx(float(expected[1]), rel=1e-4)
 
 
 def test_subsampled_pixels(subject):
@@ -224,6 +396,40 @@ def test_ways_to_give_the_volume(subject, rng, tmp_path):
     assert not ct.density[subject.mask == 0].any()
 
 
+@pytest.mark.parametrize("detector", ["virtual", "real"])
+def test_a_view_is_a_pose(detector, system, subject):
+    """Any view has DiffDRR's arguments that give its image; mirrored and with an offset too."""
+    grid = Grid(subject.density.shape, subject.affine)
+    views = system.views((9, 12), detector, pitch=(0.9, 1.2) if detector == "real" else (9.0, 12.0), offset=(2.0, 3.0))
+    mirrored = Views(views.sources, views.detector_centers, -views.u_steps, views.v_steps, views.shape)
+    for m, seen in ((3, views), (7, mirrored)):
+        for orientation in ("AP", "PA"):
+            arguments, pose = drr_arguments(seen, m, orientation)
+            placed = replace(
+                subject, reorient=read(Volume(subject.hu.numpy(), grid, "hu"), orientation=orientation).reorient
+            )
+            image = DRR(placed, **arguments, whole_line=False)(pose)[0, 0]
+            expected = Projector(grid, seen[m])(subject.density)[0]
+            np.testing.assert_allclose(image, expected, rtol=1e-4, atol=1e-4 * float(expected.max()))
+    with pytest.raises(InputError, match="rectangles"):
+        drr_arguments(Views([[0, 0, -9]], [[0, 0, 9]], [[1, 0, 0]], [[1, 1, 0]], (3, 3)), 0)
+
+
+def test_the_c_arm_preset_is_what_the_users_scripts_make(system, rng):
+    """DiffDRR before 0.4 with sdr = 5 l, azimuth and elevation as Euler angles: its columns are our rows, both of its axes
+    along ours, the other way around one of them."""
+    hu, spacing = ct(rng), [3.0, 2.5, 2.0]
+    middle = np.array(hu.shape) * spacing / 2
+    views = c_arm_views(system, shape=(11, 13), pitch=(4.0, 5.0))
+    for m in (0, 8):
+        x, y, z = system.centers[m]
+        angles = torch.tensor([[np.arctan2(y, x), -np.arctan2(z, np.hypot(x, y)), 0.0]])
+        drr = DRR(hu, spacing, 5 * system.collimator_length[m], height=13, delx=4.0, width=11, dely=5.0)
+        expected = drr(angles, torch.tensor(middle[None]), parameterization="euler_angles", convention="ZYX")[0, 0]
+        image = Projector(Grid.centered(hu.shape, spacing), views[m])(drr.density)[0]
+        np.testing.assert_allclose(image, expected.T.flip([1]), rtol=1e-4, atol=1e-4)
+
+
 def test_rigid_transforms():
     pose = convert(ROTATION, TRANSLATION, parameterization="axis_angle")
     points = torch.randn(2, 4, 3)
@@ -234,9 +440,16 @@ def test_rigid_transforms():
 
 
 def test_bad_input_is_one_clear_line(subject):
-    drr = DRR(subject, 240.0, 6, 4.0)
+    drr, sampled = DRR(subject, 240.0, 6, 4.0), DRR(subject, 240.0, 6, 4.0, renderer="trilinear")
     for call, word in (
-        (lambda: DRR(subject, 240.0, 6, 4.0, renderer="trilinear"), "siddon"),
+        (lambda: DRR(subject, 240.0, 6, 4.0, renderer="cubic"), "siddon"),
+        (lambda: DRR(subject, 240.0, 6, 4.0, mode="bilinear"), "trilinear"),
+        (lambda: DRR(subject, 240.0, 6, 4.0, renderer="trilinear", near=0.1), "near"),
+        (lambda: DRR(subject, 240.0, 6, 4.0, renderer="trilinear", mode="cubic"), "bilinear"),
+        (lambda: DRR(subject, 240.0, 6, 4.0, renderer="trilinear", whole_line=True), "whole_line"),
+        (lambda: drr(ROTATION, TRANSLATION, parameterization="axis_angle", n_points=9), "n_points"),
+        (lambda: sampled(ROTATION, TRANSLATION, parameterization="axis_angle", n_points=0), "n_points"),
+        (lambda: sampled(ROTATION, TRANSLATION, parameterization="axis_angle", colour=0), "colour"),
         (lambda: DRR(subject, 240.0, 6, 4.0, colour="red"), "colour"),
         (lambda: DRR(subject, 240.0, 0, 4.0), "height"),
         (lambda: DRR(subject, -1.0, 6, 4.0), "sdd"),

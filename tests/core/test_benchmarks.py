@@ -1,0 +1,25 @@
+"""The benchmark, very small: it runs, and its yardstick is right."""
+
+from __future__ import annotations
+
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+SCRIPT = Path(__file__).parents[2] / "benchmarks" / "projector.py"
+
+
+@pytest.mark.skipif(shutil.which("cc") is None, reason="there is no compiler cc")
+def test_plain_c_integrates_the_same(tmp_path):
+    size = ["--voxels", "16", "--pixels", "8", "--views", "2", "--rounds", "1", "--no-growth"]
+    command = [sys.executable, str(SCRIPT), "--only", "c", *size, "--output", str(tmp_path)]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=120)
+    assert done.returncode == 0, done.stderr
+    page = (tmp_path / "benchmarks.md").read_text().splitlines()
+    head, _, *rows = (line.strip("| ").split(" | ") for line in page if line.startswith("|"))
+    row = dict(zip(head, rows[0], strict=True))
+    assert row["projector"] == "plain C, OpenMP" and float(row["forward ms"]) > 0 and float(row["emission ms"]) > 0
+    assert float(row["error"]) < 1e-5 and float(row["offset px"]) < 1e-3 and float(row["mismatch"]) < 1e-5

@@ -47,9 +47,9 @@ def real_array(value: ArrayLike, name: str, shape: tuple[int | None, ...], dtype
 
 def require_finite(array: NDArray[Any], name: str) -> None:
     """Raise `InputError` naming the first index at which `array` is not finite."""
-    # A NaN or infinity anywhere makes the sum non-finite: one pass, no mask, on the good path.
+    # A NaN or infinity anywhere makes the sum non-finite: one pass, no mask, on the good path. A sum may also overflow.
     with np.errstate(over="ignore", invalid="ignore"):
-        if np.isfinite(array.sum(dtype=np.float64)):
+        if np.isfinite(array.sum()):
             return
     bad = np.argwhere(~np.isfinite(array))
     if len(bad):

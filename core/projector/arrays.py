@@ -6,6 +6,7 @@ import sys
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ..checks import real_array, require_finite
 from ..errors import InputError
@@ -120,15 +121,43 @@ def together(first: ArrayOrTensor, second: ArrayOrTensor) -> tuple[ArrayOrTensor
 
 def cropped(*volumes: ArrayOrTensor) -> tuple[list[ArrayOrTensor], tuple[int, int, int]]:
     """The smallest box of `volumes` (of one shape) that holds all that is not 0, and the index of its first voxel."""
+    find = _filled_ranges_of_tensors if is_tensor(volumes[0]) else _filled_ranges
+    ranges = find(volumes)
+    boxes = [volume[tuple(slice(first, last) for first, last in ranges)] for volume in volumes]
+    boxes = [box.contiguous() if is_tensor(box) else np.ascontiguousarray(box) for box in boxes]
+    return boxes, (ranges[0][0], ranges[1][0], ranges[2][0])
+
+
+def _filled_ranges(volumes: tuple[NDArray[Any], ...]) -> list[tuple[int, int]]:
+    """First and last + 1 index of what is not 0, along each axis. Takes a pass over the empty margins, not the volumes."""
+    ranges: list[tuple[int, int]] = []
+    for axis in (0, 1):
+        slabs = [np.moveaxis(volume, axis, 0) for volume in volumes]
+        indices = range(len(slabs[0]))
+        first = next((i for i in indices if any(slab[i].any() for slab in slabs)), None)
+        if first is None:
+            return [(0, 1)] * 3
+        last = next(i for i in reversed(indices) if any(slab[i].any() for slab in slabs))
+        ranges.append((first, last + 1))
+        volumes = tuple(np.moveaxis(slab[first : last + 1], 0, axis) for slab in slabs)
+    n = volumes[0].shape[2]
+    if not all(
+        any(volume[..., i].any() for volume in volumes) for i in (0, n - 1)
+    ):  # one line of voxels is far from the next
+        filled = np.flatnonzero(np.any([(volume != 0).any(axis=(0, 1)) for volume in volumes], axis=0))
+        return [*ranges, (int(filled[0]), int(filled[-1]) + 1)]
+    return [*ranges, (0, n)]
+
+
+def _filled_ranges_of_tensors(volumes: tuple[Any, ...]) -> list[tuple[int, int]]:
+    """The same, in few steps: each waits for the GPU."""
     ranges: list[tuple[int, int]] = []
     filled = [volume != 0 for volume in volumes]
     for first, second in ((2, 1), (2, 0), (0, 0)):
         lines = [flags.any(first).any(second) for flags in filled]
-        where = np.concatenate([np.flatnonzero(flags.cpu().numpy() if is_tensor(flags) else flags) for flags in lines])
+        where = np.concatenate([np.flatnonzero(flags.cpu().numpy()) for flags in lines])
         ranges.append((int(where.min()), int(where.max()) + 1) if len(where) else (0, 1))
-    boxes = [volume[tuple(slice(first, last) for first, last in ranges)] for volume in volumes]
-    boxes = [box.contiguous() if is_tensor(box) else np.ascontiguousarray(box) for box in boxes]
-    return boxes, (ranges[0][0], ranges[1][0], ranges[2][0])
+    return ranges
 
 
 def _times(shape: tuple[int, ...]) -> str:

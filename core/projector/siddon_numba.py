@@ -196,34 +196,37 @@ def _data(volume, rays, mu, mu_rays, numbers, written):  # type: ignore[no-untyp
 def _trace(data, begin, step, start, visit, finish):  # type: ignore[no-untyped-def]
     """Walk all rays: ``state = visit(data, segment, state)`` for their segments, tile by tile and turn by turn.
 
-    begin(data, r) -> (line, place, steps)
-        What holds for the tile's whole way, where it begins, and how many steps take it to its end.
-    step(line, place) -> (segment, place)
+    begin(data, r) -> (way, measure, place, steps)
+        What holds all along, in a measure of alpha that is 0 where the walk begins and about 1 where it ends; where that
+        is, and how far, from source to target; the first place; how many steps take the tile to its end.
+    step(way, place) -> (segment, place)
         The next segment: alpha of its two ends; of the volume's lattice the voxel's flat index, 1 inside and 0 outside, 1
         for the axis (x, y, z) whose plane ends the segment, 1 if the lattice ends there; then these four of mu's.
-    start(data, r, line) -> state, finish(data, r, line, state)
+    start(data, r, measure) -> state, finish(data, r, measure, state)
         The model's.
     """
     n_tiles = data[2].shape[1] // WIDTH
     steps = np.empty(n_tiles, np.int64)
-    line, place, _ = begin(data, 0)
-    state = start(data, 0, line)
-    lasting, size = words(line), words((line, place, state))
+    way, measure, place, _ = begin(data, 0)
+    state = start(data, 0, measure)
+    lasting, size, size_measure = words(way), words((way, place, state)), words(measure)
     memory = np.empty(n_tiles * size, np.float32)
+    measures = np.empty(n_tiles * size_measure, np.float32)
     for tile in range(n_tiles):
-        line, place, steps[tile] = begin(data, tile * WIDTH)
-        put_aside(memory, tile * size, (line, place, start(data, tile * WIDTH, line)))
+        way, measure, place, steps[tile] = begin(data, tile * WIDTH)
+        put_aside(memory, tile * size, (way, place, start(data, tile * WIDTH, measure)))
+        put_aside(measures, tile * size_measure, measure)
     for done in range(0, steps.max(), _TURN):
         for tile in range(n_tiles):
             if steps[tile] > done:
-                line, place, state = take_back(memory, tile * size, (line, place, state))
+                way, place, state = take_back(memory, tile * size, (way, place, state))
                 for _ in range(min(_TURN, steps[tile] - done)):
-                    segment, place = step(line, place)
+                    segment, place = step(way, place)
                     state = visit(data, segment, state)
                 put_aside(memory, tile * size + lasting, (place, state))
     for tile in range(n_tiles):
-        line, place, state = take_back(memory, tile * size, (line, place, state))
-        finish(data, tile * WIDTH, line, state)
+        way, place, state = take_back(memory, tile * size, (way, place, state))
+        finish(data, tile * WIDTH, take_back(measures, tile * size_measure, measure), state)
 
 
 # The lattice of the volume alone; mu, if any, is on it too.
@@ -231,10 +234,10 @@ def _trace(data, begin, step, start, visit, finish):  # type: ignore[no-untyped-
 
 @njit(forceinline=True)
 def _begin(data, r):  # type: ignore[no-untyped-def]
-    """The way of a tile through the volume: (axes, end), and alpha in its own measure, 0 on entering and 1 on leaving.
+    """The way of a tile through the volume: (axes, end).
 
-    In that measure a lattice's axes are, each for x, y and z: alpha of the first plane, from plane to plane, and what a
-    plane adds to the voxel's flat index.
+    A lattice's axes are, each for x, y and z: alpha of the first plane, from plane to plane, and what a plane adds to
+    the voxel's flat index.
     """
     shape, rays = data[1], data[2]
     enter, leave = _clip(shape, rays, r)
@@ -244,8 +247,8 @@ def _begin(data, r):  # type: ignore[no-untyped-def]
     axes, p, stop, crossings = _axes(data[0], shape, rays, r, hits, begin, begin, span)
     zero = zeros_of(data[0])
     end = where(hits, minimum(alike(1.0, zero), stop), zero)
-    line = ((axes, end), begin, _span(hits, span, end))
-    return line, ((zero, zero, zero), p, zero), largest(where(hits, crossings + i32(1), i32(0)))
+    measure = begin, _span(hits, span, end)
+    return (axes, end), measure, ((zero, zero, zero), p, zero), largest(where(hits, crossings + i32(1), i32(0)))
 
 
 @njit(forceinline=True)
@@ -255,8 +258,8 @@ def _span(hits, span, end):  # type: ignore[no-untyped-def]
 
 
 @njit(forceinline=True)
-def _step(line, place):  # type: ignore[no-untyped-def]
-    (axes, end), _, _ = line
+def _step(way, place):  # type: ignore[no-untyped-def]
+    axes, end = way
     planes, p, alpha = place
     x, y, z = _next_planes(axes, planes)
     stop = minimum(minimum(x, y), minimum(z, end))
@@ -390,15 +393,15 @@ def _begin_both(data, r):  # type: ignore[no-untyped-def]
     mu_entry = where(hits_mu, alike((mu_enter - begin) / span, zero), alike(_NEVER, zero))
     end = where(hits, minimum(alike(1.0, zero), stop), zero)
     mu_end = where(hits_mu, minimum(alike((mu_leave - begin) / span, zero), mu_stop), zero)
-    line = ((axes, entry, end, mu_axes, mu_entry, mu_end), begin, _span(hits, span, end))
+    way, measure = (axes, entry, end, mu_axes, mu_entry, mu_end), (begin, _span(hits, span, end))
     place = ((zero, zero, zero), p, (zero, zero, zero), q, zero)
     # The ways in and out are steps too.
-    return line, place, largest(where(hits, crossings + mu_crossings + i32(4), i32(0)))
+    return way, measure, place, largest(where(hits, crossings + mu_crossings + i32(4), i32(0)))
 
 
 @njit(forceinline=True)
-def _step_both(line, place):  # type: ignore[no-untyped-def]
-    (axes, entry, end, mu_axes, mu_entry, mu_end), _, _ = line
+def _step_both(way, place):  # type: ignore[no-untyped-def]
+    axes, entry, end, mu_axes, mu_entry, mu_end = way
     planes, p, mu_planes, q, alpha = place
     x, y, z = _next_planes(axes, planes)
     mu_x, mu_y, mu_z = _next_planes(mu_axes, mu_planes)
@@ -432,7 +435,7 @@ def _spread(volume, rays, mu, mu_rays, numbers, written):  # type: ignore[no-unt
 
 
 @njit(forceinline=True)
-def _start_sum(data, r, line):  # type: ignore[no-untyped-def]
+def _start_sum(data, r, measure):  # type: ignore[no-untyped-def]
     return (zeros_of(data[0]),)
 
 
@@ -443,21 +446,21 @@ def _add_up(data, segment, state):  # type: ignore[no-untyped-def]
 
 
 @njit(forceinline=True)
-def _finish_sum(data, r, line, state):  # type: ignore[no-untyped-def]
-    reach = _reach(data, r, line)
+def _finish_sum(data, r, measure, state):  # type: ignore[no-untyped-def]
+    reach = _reach(data, r, measure)
     store(data[6].reshape(-1), r, alike(state[0], reach) * reach)
 
 
 @njit(forceinline=True)
-def _reach(data, r, line):  # type: ignore[no-untyped-def]
+def _reach(data, r, measure):  # type: ignore[no-untyped-def]
     """Length in mm of the way that alpha measures."""
     rays = data[2]
-    return line[2] * load(rays.reshape(-1), 6 * rays.shape[1] + r)
+    return measure[1] * load(rays.reshape(-1), 6 * rays.shape[1] + r)
 
 
 @njit(forceinline=True)
-def _start_value(data, r, line):  # type: ignore[no-untyped-def]
-    return (alike(load(data[6].reshape(-1), r) * _reach(data, r, line), zeros_of(data[0])),)
+def _start_value(data, r, measure):  # type: ignore[no-untyped-def]
+    return (alike(load(data[6].reshape(-1), r) * _reach(data, r, measure), zeros_of(data[0])),)
 
 
 @njit(forceinline=True)
@@ -468,7 +471,7 @@ def _add_to(data, segment, state):  # type: ignore[no-untyped-def]
 
 
 @njit(forceinline=True)
-def _finish_nothing(data, r, line, state):  # type: ignore[no-untyped-def]
+def _finish_nothing(data, r, measure, state):  # type: ignore[no-untyped-def]
     pass
 
 
@@ -487,7 +490,7 @@ def _differentiate(volume, rays, mu, mu_rays, numbers, written):  # type: ignore
 
 
 @njit(forceinline=True)
-def _start_jumps(data, r, line):  # type: ignore[no-untyped-def]
+def _start_jumps(data, r, measure):  # type: ignore[no-untyped-def]
     zero = zeros_of(data[0])
     first, last = _ends(data[1], data[2], r, zero)
     none = zero, zero, zero
@@ -526,17 +529,17 @@ def _add(sums, behind, before, gained, lost):  # type: ignore[no-untyped-def]
 
 
 @njit(forceinline=True)
-def _finish_jumps(data, r, line, state):  # type: ignore[no-untyped-def]
+def _finish_jumps(data, r, measure, state):  # type: ignore[no-untyped-def]
     total, _, _, jumps, moments = state
     rows, n = data[6].reshape(-1), data[6].shape[1]
-    store(rows, r, alike(total, line[2]) * line[2])
-    _store_by_ends(rows, r, n, 1, line, data[2], jumps, moments)
+    store(rows, r, alike(total, measure[1]) * measure[1])
+    _store_by_ends(rows, r, n, 1, measure, data[2], jumps, moments)
 
 
 @njit(forceinline=True)
-def _store_by_ends(rows, r, n, row, line, rays, jumps, moments):  # type: ignore[no-untyped-def]
+def _store_by_ends(rows, r, n, row, measure, rays, jumps, moments):  # type: ignore[no-untyped-def]
     """Derivatives by the rays' starts, rows `row` to `row` + 2, and ends, the next three."""
-    _, begin, span = line
+    begin, span = measure
     _store_by_ends_of_axis(rows, r, n, row, begin, span, rays, jumps[0], moments[0])
     _store_by_ends_of_axis(rows, r, n, row + 1, begin, span, rays, jumps[1], moments[1])
     _store_by_ends_of_axis(rows, r, n, row + 2, begin, span, rays, jumps[2], moments[2])
@@ -594,9 +597,9 @@ def _spread_behind(volume, rays, mu, mu_rays, numbers, written):  # type: ignore
 
 
 @njit(forceinline=True)
-def _start_attenuated(data, r, line):  # type: ignore[no-untyped-def]
+def _start_attenuated(data, r, measure):  # type: ignore[no-untyped-def]
     zero = zeros_of(data[0])
-    return zero, alike(1.0, zero), alike(_reach(data, r, line), zero)
+    return zero, alike(1.0, zero), alike(_reach(data, r, measure), zero)
 
 
 @njit(forceinline=True)
@@ -608,8 +611,8 @@ def _add_up_attenuated(data, segment, state):  # type: ignore[no-untyped-def]
 
 
 @njit(forceinline=True)
-def _start_value_attenuated(data, r, line):  # type: ignore[no-untyped-def]
-    reach, zero = _reach(data, r, line), zeros_of(data[0])
+def _start_value_attenuated(data, r, measure):  # type: ignore[no-untyped-def]
+    reach, zero = _reach(data, r, measure), zeros_of(data[0])
     return alike(load(data[6].reshape(-1), r) * reach, zero), alike(1.0, zero), alike(reach, zero)
 
 
@@ -681,10 +684,10 @@ def _weaken_behind(volume, rays, mu, mu_rays, numbers, written):  # type: ignore
 
 
 @njit(forceinline=True)
-def _start_weakening(data, r, line):  # type: ignore[no-untyped-def]
+def _start_weakening(data, r, measure):  # type: ignore[no-untyped-def]
     rows, n, zero = data[6].reshape(-1), data[6].shape[1], zeros_of(data[0])
     value, behind = alike(load(rows, r), zero), alike(load(rows, n + r), zero)
-    return value, behind, alike(1.0, zero), alike(_reach(data, r, line), zero)
+    return value, behind, alike(1.0, zero), alike(_reach(data, r, measure), zero)
 
 
 @njit(forceinline=True)
@@ -716,10 +719,10 @@ def _differentiate_behind(volume, rays, mu, mu_rays, numbers, written):  # type:
 
 
 @njit(forceinline=True)
-def _start_jumps_of_both(data, r, line):  # type: ignore[no-untyped-def]
+def _start_jumps_of_both(data, r, measure):  # type: ignore[no-untyped-def]
     zero = zeros_of(data[0])
     none = zero, zero, zero
-    reach = _reach(data, r, line)
+    reach = _reach(data, r, measure)
     some = reach > f64(0.0)
     behind = where(some, load(data[6].reshape(-1), r) / where(some, reach, f64(1.0)), f64(0.0))
     first, last = _ends(data[1], data[2], r, zero)
@@ -764,16 +767,16 @@ def _chosen(flag, given, otherwise):  # type: ignore[no-untyped-def]
 
 
 @njit(forceinline=True)
-def _finish_jumps_of_both(data, r, line, state):  # type: ignore[no-untyped-def]
+def _finish_jumps_of_both(data, r, measure, state):  # type: ignore[no-untyped-def]
     (_, _, _, reach), (_, _, jumps, moments), (_, _, mu_jumps, mu_moments), by_length = state
     rows, n, rays, mu_rays = data[6].reshape(-1), data[6].shape[1], data[2], data[5]
     length = load(rays.reshape(-1), 6 * rays.shape[1] + r)
     some = length > f64(0.0)
     per_mm = where(some, f64(1.0) / where(some, length, f64(1.0)), f64(0.0))
     store(rows, r, load(rows, r) * per_mm)
-    _store_by_ends(rows, r, n, 1, line, rays, jumps, moments)
+    _store_by_ends(rows, r, n, 1, measure, rays, jumps, moments)
     weaker = alike(-1.0, reach) * reach
     mu_jumps = weaker * mu_jumps[0], weaker * mu_jumps[1], weaker * mu_jumps[2]
     mu_moments = weaker * mu_moments[0], weaker * mu_moments[1], weaker * mu_moments[2]
-    _store_by_ends(rows, r, n, 7, line, mu_rays, mu_jumps, mu_moments)
-    store(rows, 13 * n + r, f64(-1.0) * alike(by_length, per_mm) * line[2] * per_mm)
+    _store_by_ends(rows, r, n, 7, measure, mu_rays, mu_jumps, mu_moments)
+    store(rows, 13 * n + r, f64(-1.0) * alike(by_length, per_mm) * measure[1] * per_mm)

@@ -190,7 +190,8 @@ def compare(workers: list[Worker], case: Case, rounds: int) -> dict[tuple[str, i
                     continue
                 seconds = answer["seconds"] / row.n_views
                 row.seconds[task] = min(seconds, row.seconds.get(task, float("inf")))
-                row.processor[task] = min(answer["cpu"] / row.n_views, row.processor.get(task, float("inf")))
+                if answer["cpu"] is not None:
+                    row.processor[task] = min(answer["cpu"] / row.n_views, row.processor.get(task, float("inf")))
                 if turn == 0:
                     row.memory = float(np.nanmax([row.memory, answer["memory"]]))
                     say(f"{row.label}, {w.threads} threads: {task} {1e3 * seconds:.1f} ms a view")

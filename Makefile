@@ -1,6 +1,6 @@
 # make demo    the whole main path on the real workbook, into out/
 # make test    linters, types and tests (tests/core, tests/blender)
-# make bench   speed, accuracy and memory beside other projectors, into docs/; BENCH=--quick: a minute, into out/
+# make bench   speed, accuracy and memory beside other projectors, into docs/; BENCH=--quick: a minute or two, into out/
 # make dist    extension zips in dist/, one per platform; PLATFORM=linux-x64 builds that one
 # make test-app   the Linux zip in a real Blender (see tests/app)
 # make clean   removes what the others made, environments included

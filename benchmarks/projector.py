@@ -69,9 +69,13 @@ class Worker:
             text=True,
             env=environment,
         )
+        self.label = ""
+
+    def wait(self) -> str | None:
+        """Until it is ready; why it is not to be had, if so."""
         first = self._read()
-        self.missing: str | None = first.get("missing", first.get("failed"))
-        self.label: str = first.get("label", "")
+        self.label = first.get("label", "")
+        return first.get("missing", first.get("failed"))
 
     def measure(self, case: Case, task: str, **request: Any) -> dict[str, Any]:
         assert self._process.stdin is not None
@@ -129,7 +133,7 @@ def main() -> None:
 
 def parse_arguments() -> argparse.Namespace:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--quick", action="store_true", help="128 voxels and pixels, 2 rounds: about a minute")
+    parser.add_argument("--quick", action="store_true", help="96 voxels and pixels, 2 rounds: a minute or two")
     parser.add_argument("--voxels", type=int, help="along each side of the cube (default 256)")
     parser.add_argument("--pixels", type=int, help="along each side of the image (default 256)")
     parser.add_argument("--views", type=int, default=8, help="at most 80 (default 8)")
@@ -142,8 +146,8 @@ def parse_arguments() -> argparse.Namespace:
     if unknown:
         parser.error(f"--only: no {', '.join(unknown)}; expected some of {','.join(PEERS)}")
     quick = arguments.quick
-    arguments.voxels = arguments.voxels or (128 if quick else 256)
-    arguments.pixels = arguments.pixels or (128 if quick else 256)
+    arguments.voxels = arguments.voxels or (96 if quick else 256)
+    arguments.pixels = arguments.pixels or (96 if quick else 256)
     arguments.rounds = arguments.rounds or (2 if quick else 5)
     arguments.output = arguments.output or ROOT / ("out" if quick else "docs")
     return arguments
@@ -151,18 +155,18 @@ def parse_arguments() -> argparse.Namespace:
 
 def start(names: list[str], available: list[int]) -> tuple[list[Worker], dict[str, str]]:
     """The contenders that can be had, and why the others cannot."""
-    workers, missing = [], {}
+    workers = []
     for name in names:
-        for threads in sorted({1, len(available)}):
-            if (PEERS[name].slow or not PEERS[name].cpu) and threads < len(available):
-                continue
-            worker = Worker(name, threads)
-            if worker.missing is not None:
-                missing[PEERS[name].label] = worker.missing
-                say(f"{PEERS[name].label}: left out ({worker.missing})")
-                break
-            workers.append(worker)
-    return workers, missing
+        one_thread_too = PEERS[name].cpu and not PEERS[name].slow
+        for threads in sorted({1, len(available)} if one_thread_too else {len(available)}):
+            workers.append(Worker(name, threads))
+    missing = {}
+    for worker in workers:  # all load their libraries by now
+        why = worker.wait()
+        if why is not None and PEERS[worker.name].label not in missing:
+            missing[PEERS[worker.name].label] = why
+            say(f"{PEERS[worker.name].label}: left out ({why})")
+    return [worker for worker in workers if PEERS[worker.name].label not in missing], missing
 
 
 def compare(workers: list[Worker], case: Case, rounds: int) -> dict[tuple[str, int], Row]:
@@ -190,7 +194,8 @@ def compare(workers: list[Worker], case: Case, rounds: int) -> dict[tuple[str, i
                     continue
                 seconds = answer["seconds"] / row.n_views
                 row.seconds[task] = min(seconds, row.seconds.get(task, float("inf")))
-                row.processor[task] = min(answer["cpu"] / row.n_views, row.processor.get(task, float("inf")))
+                if answer["cpu"] is not None:
+                    row.processor[task] = min(answer["cpu"] / row.n_views, row.processor.get(task, float("inf")))
                 if turn == 0:
                     row.memory = float(np.nanmax([row.memory, answer["memory"]]))
                     say(f"{row.label}, {w.threads} threads: {task} {1e3 * seconds:.1f} ms a view")

@@ -142,7 +142,8 @@ def ratios(results: Results) -> str:
 
 
 def _ratio(a: Row, task: str, b: Row, other: str) -> list[str]:
-    return [f"{a.seconds[task] / b.seconds[other]:.3g}", f"{a.processor[task] / b.processor[other]:.3g}"]
+    wall = f"{a.seconds[task] / b.seconds[other]:.3g}"
+    return [wall, f"{a.processor[task] / b.processor[other]:.3g}" if other in b.processor else "–"]
 
 
 def growth(results: Results) -> str:

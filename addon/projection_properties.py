@@ -116,6 +116,7 @@ class ProjectionSettings:
             ("NUMBA", "Numba", "Compiled, on the processor"),
             ("TORCH", "PyTorch", "On the processor or the graphics card"),
             ("NUMPY", "NumPy", "Float64 reference, slow"),
+            ("CUDA", "CUDA", "On an NVIDIA graphics card; needs warp-lang in Blender's Python"),
         ),
         default="AUTO",
     )

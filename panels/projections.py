@@ -82,7 +82,7 @@ class MPHDRR_PT_physics(bpy.types.Panel):
             column.prop(settings, "mu", placeholder="None")
             column = layout.column(align=True)
             column.prop(settings, "aperture_points")
-            column.prop(settings, "aperture_mu", text="Aperture µ (1/mm)")
+            column.prop(settings, "aperture_mu", text="Edge µ (1/mm)")
             edge = column.column(align=True)
             edge.active = settings.aperture_mu > 0
             edge.prop(settings, "edge")
@@ -92,7 +92,7 @@ class MPHDRR_PT_physics(bpy.types.Panel):
             depth = column.column(align=True)
             depth.active = settings.crystal_mu > 0
             depth.prop(settings, "depth_layers")
-            column.prop(settings, "intrinsic_fwhm", text="Blur FWHM (mm)")
+            column.prop(settings, "intrinsic_fwhm", text="Blur (mm)")
             column = layout.column(heading="Stopped by", align=True)
             for name in ("within_cone", "within_walls", "within_crystal"):
                 column.prop(settings, name)

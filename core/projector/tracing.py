@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -14,7 +14,7 @@ from ..errors import InputError
 from ..grid import Grid
 from ..volume import Volume
 from . import backends
-from .arrays import ArrayOrTensor, alike, checked, is_double, is_tensor, like, together, zeros
+from .arrays import ArrayOrTensor, checked, is_double, is_tensor, like, together, zeros
 from .operator import Spread, _blocks, _parallel, _sum, _thread_count, checked_mu, lattices, volume_workers
 from .rays import Attenuation, Fan, RayMapper, Rays
 
@@ -258,7 +258,7 @@ class Tracer:
     def adjoint(self, values: ArrayOrTensor, bundles: Sequence[Bundle], mu: ArrayOrTensor = None) -> ArrayOrTensor:
         """`values` spread along their rays, with the weights of `integrals`, into a volume native to the backend."""
         values = self._native(values)
-        _, mapper = self._lattices(values, None, mu)
+        _, mapper = self._lattices(None, mu)
         return self._spread(backends.load(self.backend).adjoint, self.grid, values, bundles, mapper)
 
     def mu_gradient(
@@ -266,7 +266,7 @@ class Tracer:
     ) -> ArrayOrTensor:
         """The gradient of the sum of `values` times `integrals` by mu, native to the backend."""
         values = self._native(values)
-        box, mapper = self._lattices(values, volume, mu, whole_mu=True)
+        box, mapper = self._lattices(volume, mu, whole_mu=True)
         add_gradient = backends.load(self.backend).mu_gradient
 
         def add(gradient: ArrayOrTensor, values: ArrayOrTensor, rays: Any, attenuation: Any) -> None:
@@ -302,8 +302,7 @@ class Tracer:
     ) -> list[Any]:
         """What `finish` makes of a backend's function of every piece, on several threads."""
         function = getattr(backends.load(self.backend), what)
-        native = self._native(volume)
-        box, mapper = self._lattices(native, native, mu)
+        box, mapper = self._lattices(volume, mu)
 
         def run(piece: _Piece) -> Any:
             return finish(piece, like(function(box, *piece.on(mapper)), np.empty(0)))
@@ -325,11 +324,12 @@ class Tracer:
         return pieces
 
     def _lattices(
-        self, native: ArrayOrTensor, volume: ArrayOrTensor, mu: ArrayOrTensor, whole_mu: bool = False
+        self, volume: ArrayOrTensor, mu: ArrayOrTensor, whole_mu: bool = False
     ) -> tuple[ArrayOrTensor, RayMapper]:
-        """`lattices` with volume and mu as the backend computes with them, as with `native`."""
-        volume, mu = (None if x is None else alike(x, native) for x in (volume, mu))
-        return lattices(self.grid, volume, mu, self.mu_grid, whole_mu)
+        """`lattices` with what is left of volume and mu as the backend computes with it."""
+        box, mapper = lattices(self.grid, volume, mu, self.mu_grid, whole_mu)
+        box, mu = (None if x is None else self._native(x) for x in (box, mapper.mu))
+        return box, replace(mapper, mu=mu)
 
     @property
     def _workers(self) -> int:

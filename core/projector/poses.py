@@ -101,7 +101,7 @@ def _pixels(pitch: Tensor, offset: Tensor, shape: tuple[int, int]) -> tuple[Tens
 
 
 def _fans(
-    positions: Tensor, rotations: Tensor, distance: Tensor, pitch: Tensor, offset: Tensor, shape: tuple[int, int]
+    shape: tuple[int, int], positions: Tensor, rotations: Tensor, distance: Tensor, pitch: Tensor, offset: Tensor
 ) -> Tensor:
     """The rays of `pinhole_rays` as the vectors (..., 4, 3) of `trace_fans`; rays are a line's columns, lines are rows."""
     u, v, k = rotations.unbind(dim=-1)
@@ -136,7 +136,7 @@ def pinhole_images(
     """
     shape = whole_shape(shape, "image shape", 2)
     cameras = _cameras(positions, rotations, distance, pitch, offset)
-    return trace_fans(volume, _fans(*cameras, shape), shape, backend, grid)
+    return trace_fans(volume, _fans(shape, *cameras), shape, backend, grid)
 
 
 def emission_images(
@@ -238,8 +238,8 @@ def emission_images(
             weights = weights * absorbed_share(
                 cosine, mu_c[..., None, None], thickness[..., None, None], np.zeros(1), 0
             )
-        on_plane = (depth * l, *(depth[..., None] * x for x in (pitch, middle)))
-        vectors = _fans(sources, rotations, *on_plane, (n_v, n_u))
+        on_plane = depth * l, depth[..., None] * pitch, depth[..., None] * middle
+        vectors = _fans((n_v, n_u), sources, rotations, *on_plane)
         integrals = trace_fans(volume, vectors, (n_v, n_u), backend, grid, mu, mu_grid)
         images = images + weights.to(integrals) * integrals
     return images

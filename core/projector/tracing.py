@@ -315,11 +315,9 @@ class Tracer:
         contiguous = self.grid.index_from_world[2, :3]
         pieces = []
         for number, bundle in enumerate(bundles):
-            transposed = isinstance(bundle, Fan) and bool(
-                abs(contiguous @ bundle.line_step) > abs(contiguous @ bundle.ray_step)
-            )
-            if transposed:
-                bundle = bundle.transposed()
+            transposed = False
+            if isinstance(bundle, Fan) and abs(contiguous @ bundle.line_step) > abs(contiguous @ bundle.ray_step):
+                bundle, transposed = bundle.transposed(), True
             pieces += [_Piece(number, bundle, lines, transposed) for lines in _blocks(*bundle.shape, self.backend)]
         return pieces
 
@@ -360,15 +358,15 @@ def _by_ends(piece: _Piece, values: Points, derivatives: Points, grid: Grid, mu_
 
 def _by_fan(piece: _Piece, values: Points, derivatives: Points, grid: Grid, mu_grid: Grid) -> Points:
     """The gradient (4, 3) by source, corner, line step and ray step of the fan of a piece."""
-    fan, numbers = piece.bundle, _numbers(piece)
-    lengths = _lengths(piece)
+    assert isinstance(piece.bundle, Fan)
+    numbers, lengths = _numbers(piece), _lengths(piece)
     # Not ray by ray: first sums over the rays, times their numbers where a step moves their ends as often.
     by_planes = derivatives[1:13] @ (values * lengths * numbers).T
     by_start, by_end = by_planes[:3, 0] @ _linear(grid), by_planes[3:6].T @ _linear(grid)
     if len(derivatives) > 7:
         by_start += by_planes[6:9, 0] @ _linear(mu_grid)
         by_end += by_planes[9:].T @ _linear(mu_grid)
-    by_length = (_by_length(values, lengths, derivatives) * numbers) @ numbers.T @ _edges(fan)
+    by_length = (_by_length(values, lengths, derivatives) * numbers) @ numbers.T @ _edges(piece.bundle)
     gradient = np.concatenate([by_start[None] - by_length[:1], by_end + by_length])
     return gradient[[0, 1, 3, 2]] if piece.transposed else gradient
 
@@ -433,7 +431,10 @@ def _tracer(
 
 def fans(vectors: Points, shape: tuple[int, int]) -> list[Fan]:
     """The fans of `vectors` (..., 4, 3)."""
-    return [Fan(*four, shape) for four in vectors.reshape(-1, 4, 3)]
+    return [
+        Fan(source, corner, line_step, ray_step, shape)
+        for source, corner, line_step, ray_step in vectors.reshape(-1, 4, 3)
+    ]
 
 
 def fan_vectors(value: ArrayLike) -> Points:

@@ -213,7 +213,7 @@ class Tracer:
 
     def integrals(self, volume: ArrayOrTensor, bundles: Sequence[Bundle], mu: ArrayOrTensor = None) -> Points:
         """Line integrals, value x mm."""
-        result = np.empty((len(bundles), *bundles[0].shape)) if bundles else np.empty(0)
+        result = _empty(bundles)
 
         def finish(piece: _Piece, integrals: Points) -> None:
             part = piece.of(result)
@@ -226,7 +226,7 @@ class Tracer:
         self, volume: ArrayOrTensor, bundles: Sequence[Bundle], mu: ArrayOrTensor = None
     ) -> tuple[Points, list[Points]]:
         """Line integrals, and what `gradients` needs: the backend's derivatives, piece by piece, (7 or 14, n)."""
-        result = np.empty((len(bundles), *bundles[0].shape)) if bundles else np.empty(0)
+        result = _empty(bundles)
 
         def finish(piece: _Piece, derivatives: Points) -> Points:
             part = piece.of(result)
@@ -249,11 +249,13 @@ class Tracer:
 
         with _parallel(self._workers) as parallel_map:
             parts = list(parallel_map(of_piece, range(len(pieces))))
-        result = []
-        for number, bundle in enumerate(bundles):
-            own = [part for piece, part in zip(pieces, parts, strict=True) if piece.number == number]
-            result.append(sum(own) if isinstance(bundle, Fan) else np.concatenate([np.empty((2, 0, 3)), *own], axis=1))
-        return result
+        of_bundles: list[list[Points]] = [[] for _ in bundles]
+        for piece, part in zip(pieces, parts, strict=True):
+            of_bundles[piece.number].append(part)
+        return [
+            np.sum(own, axis=0) if isinstance(bundle, Fan) else np.concatenate([np.empty((2, 0, 3)), *own], axis=1)
+            for bundle, own in zip(bundles, of_bundles, strict=True)
+        ]
 
     def adjoint(self, values: ArrayOrTensor, bundles: Sequence[Bundle], mu: ArrayOrTensor = None) -> ArrayOrTensor:
         """`values` spread along their rays, with the weights of `integrals`, into a volume native to the backend."""
@@ -336,6 +338,11 @@ class Tracer:
     def _native(self, x: ArrayOrTensor) -> Any:
         """`x` as the backend computes with it."""
         return backends.native(x, self.backend, self.float64)
+
+
+def _empty(bundles: Sequence[Bundle]) -> Points:
+    """Room for a number for every ray."""
+    return np.empty((len(bundles), *bundles[0].shape)) if bundles else np.empty(0)
 
 
 # An integral is length x mean. The mean moves with the planes of either grid, and, attenuated, with the length.

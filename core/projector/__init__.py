@@ -1,9 +1,9 @@
 """Line integrals of volumes along rays, and their exact adjoint.
 
-`operator` holds what is the same for every backend: checks, the loop over views, threads, memory. `tracing` takes
-rays one by one instead of as views. `rays` maps rays into index space, once for all backends. Each ``siddon_*``
-module integrates along such rays, spreads values back along them and tells how the integrals move with the rays'
-ends; `backends` chooses among them, `autograd` makes them steps of torch's graph. Neither numba nor torch is
+`operator` holds what is the same for every backend: checks, the loop over views, threads, memory. `tracing` takes rays
+by their ends, or as fans, instead of as views. `rays` maps rays into index space, once for all backends. Each
+``siddon_*`` module integrates along such rays, spreads values back along them and tells how the integrals move with the
+rays' ends; `backends` chooses among them, `autograd` makes them steps of torch's graph. Neither numba nor torch is
 imported before it is needed.
 """
 

@@ -144,18 +144,19 @@ def _filled_ranges(volumes: tuple[NDArray[Any], ...]) -> list[tuple[int, int]]:
     if not all(
         any(volume[..., i].any() for volume in volumes) for i in (0, n - 1)
     ):  # one line of voxels is far from the next
-        filled = np.flatnonzero(np.any([(volume != 0).any(axis=(0, 1)) for volume in volumes], axis=0))
+        filled = np.flatnonzero(np.any([(volume != 0).any(axis=0).any(axis=0) for volume in volumes], axis=0))
         return [*ranges, (int(filled[0]), int(filled[-1]) + 1)]
     return [*ranges, (0, n)]
 
 
 def _filled_ranges_of_tensors(volumes: tuple[Any, ...]) -> list[tuple[int, int]]:
     """The same, in few steps: each waits for the GPU."""
-    ranges: list[tuple[int, int]] = []
     filled = [volume != 0 for volume in volumes]
-    for first, second in ((2, 1), (2, 0), (0, 0)):
-        lines = [flags.any(first).any(second) for flags in filled]
-        where = np.concatenate([np.flatnonzero(flags.cpu().numpy()) for flags in lines])
+    # Whether a line along y, or along x, holds anything: fast, for along z neighbours in memory would be joined.
+    along_x, along_y = ([flags.any(axis) for flags in filled] for axis in (0, 1))
+    ranges: list[tuple[int, int]] = []
+    for lines, across in ((along_y, 1), (along_x, 1), (along_x, 0)):
+        where = np.concatenate([np.flatnonzero(flags.any(across).cpu().numpy()) for flags in lines])
         ranges.append((int(where.min()), int(where.max()) + 1) if len(where) else (0, 1))
     return ranges
 

@@ -6,17 +6,20 @@ import functools
 from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from ..errors import InputError
-from .tracing import fitting_count, points
+from .tracing import Bundle, Ends, fan_vectors, fans, fitting_count, points
 
 if TYPE_CHECKING:
     from ..progress import Progress
     from .operator import LinearOperator, Projector
     from .tracing import Tracer
 
+Bundles = Callable[[NDArray[np.float64]], Sequence[Bundle]]
 Gradients = Callable[[Tensor], Sequence[Tensor | None]]
 
 
@@ -72,62 +75,78 @@ class _ApplyAttenuated(torch.autograd.Function):
         return *_once(gradients, gradient, x, mu), None, None
 
 
-def trace(volume: Any, sources: Any, targets: Any, mu: Any, tracer: Tracer) -> Tensor:
+def trace_rays(volume: Any, sources: Any, targets: Any, mu: Any, tracer: Tracer) -> Tensor:
     """Line integrals (N,) along rays from `sources` to `targets`, as a step of torch's graph.
 
     One of the four at least is a tensor; the others may be arrays. `volume` and `mu` have been checked, and are both
     tensors or both arrays; `mu` may be None.
     """
-    given = [x for x in (volume, sources, targets) if isinstance(x, Tensor)]
-    kinds = [x.dtype for x in (sources, targets) if isinstance(x, Tensor) and x.is_floating_point()]
-    starts, ends = _points(sources, "sources"), _points(targets, "targets")
+    starts, ends = _numbers(sources, points, "sources"), _numbers(targets, points, "targets")
     n = fitting_count(len(starts), len(ends))
-    result: Tensor = _Trace.apply(volume, mu, starts.expand(n, 3), ends.expand(n, 3), tracer)
-    kind = functools.reduce(torch.promote_types, kinds or [given[0].dtype])
-    return result.to(given[0].device, kind if kind.is_floating_point else torch.float64)
+    rays = torch.stack([starts.expand(n, 3), ends.expand(n, 3)])
+    integrals = _Trace.apply(volume, mu, rays, lambda rays: [Ends(*rays)], tracer)
+    return _of_kind(integrals.reshape(n), volume, sources, targets)
 
 
-def _points(value: Any, name: str) -> Tensor:
-    """`value` as a tensor (n, 3) of float64 on the CPU, where rays are made; still in its graph."""
+def trace_fans(volume: Any, vectors: Any, shape: tuple[int, int], mu: Any, tracer: Tracer) -> Tensor:
+    """Line integrals (..., lines, rays) along the fans of `vectors` (..., 4, 3), likewise."""
+    numbers = _numbers(vectors, fan_vectors)
+    integrals = _Trace.apply(volume, mu, numbers, lambda vectors: fans(vectors, shape), tracer)
+    return _of_kind(integrals.reshape(*numbers.shape[:-2], *shape), volume, vectors)
+
+
+def _numbers(value: Any, checked: Callable[..., NDArray[np.float64]], *name: str) -> Tensor:
+    """`value`, which is `checked`, as a tensor of float64 on the CPU, where rays are made; still in its graph."""
     if not isinstance(value, Tensor):
-        return torch.from_numpy(points(value, name))
-    points(value.detach().cpu().numpy() if not value.is_complex() else [1j], name)
-    return value.to("cpu", torch.float64).reshape(-1, 3)
+        return torch.from_numpy(checked(value, *name))
+    shape = checked(value.numpy(force=True), *name).shape
+    return value.to("cpu", torch.float64).reshape(shape)
+
+
+def _of_kind(integrals: Tensor, volume: Any, *geometry: Any) -> Tensor:
+    """`integrals` of the type of the geometry's tensors, or else of the volume, on the device of the first tensor."""
+    given = [x for x in (volume, *geometry) if isinstance(x, Tensor)]
+    kinds = [x.dtype for x in geometry if isinstance(x, Tensor) and x.is_floating_point()]
+    kind = functools.reduce(torch.promote_types, kinds or [given[0].dtype])
+    return integrals.to(given[0].device, kind if kind.is_floating_point else torch.float64)
 
 
 class _Trace(torch.autograd.Function):
-    """Line integrals of a volume along rays; their derivatives by the ends are computed on the way."""
+    """Line integrals of a volume along bundles of rays; their derivatives by the geometry are computed on the way.
+
+    ``bundles(geometry)`` makes the rays of an array (bundles, ...), of which the gradient by each bundle is of the shape.
+    """
 
     @staticmethod
-    def forward(ctx: Any, volume: Any, mu: Any, starts: Tensor, ends: Tensor, tracer: Tracer) -> Tensor:
-        ctx.tracer = tracer
-        ctx.save_for_backward(starts, ends, *(x for x in (volume, mu) if isinstance(x, Tensor)))
-        rays = starts.numpy(force=True), ends.numpy(force=True)
-        ctx.slopes = None, None
-        if any(ctx.needs_input_grad[2:4]):
-            integrals, *ctx.slopes = map(torch.from_numpy, tracer.derivatives(volume, *rays, mu))
+    def forward(ctx: Any, volume: Any, mu: Any, geometry: Tensor, bundles: Bundles, tracer: Tracer) -> Tensor:
+        ctx.tracer, ctx.rays, ctx.derivatives = tracer, bundles(geometry.numpy(force=True)), None
+        ctx.save_for_backward(geometry, *(x for x in (volume, mu) if isinstance(x, Tensor)))
+        if ctx.needs_input_grad[2]:
+            integrals, ctx.derivatives = tracer.derivatives(volume, ctx.rays, mu)
         else:
-            integrals = torch.from_numpy(tracer.integrals(volume, *rays, mu))
-        return integrals
+            integrals = tracer.integrals(volume, ctx.rays, mu)
+        return torch.from_numpy(integrals)
 
     @staticmethod
     def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor | None, ...]:
-        starts, ends, *fields = ctx.saved_tensors
-        needs, tracer = ctx.needs_input_grad, ctx.tracer
+        geometry, *fields = ctx.saved_tensors
+        by_volume, by_mu, by_geometry = ctx.needs_input_grad[:3]
+        tracer, rays, derivatives = ctx.tracer, ctx.rays, ctx.derivatives
 
         def gradients(gradient: Tensor) -> list[Tensor | None]:
-            rays = starts.numpy(force=True), ends.numpy(force=True)
-            of_fields: list[Tensor | None] = [None, None]
-            if any(needs[:2]):
+            result: list[Tensor | None] = [None, None, None]
+            if by_volume or by_mu:
                 values = gradient.to(fields[0])  # the torch backend spreads on the device of the values
-                if needs[0]:
-                    of_fields[0] = torch.as_tensor(tracer.adjoint(values, *rays, *fields[1:])).to(values)
-                if needs[1]:
-                    of_fields[1] = torch.as_tensor(tracer.mu_gradient(values, *rays, *fields)).to(values)
-            slopes = zip(ctx.slopes, needs[2:4], strict=True)
-            return of_fields + [gradient[:, None] * slope if need else None for slope, need in slopes]
+                if by_volume:
+                    result[0] = torch.as_tensor(tracer.adjoint(values, rays, *fields[1:])).to(values)
+                if by_mu:
+                    result[1] = torch.as_tensor(tracer.mu_gradient(values, rays, *fields)).to(values)
+            if by_geometry:
+                of_bundles = tracer.gradients(gradient.numpy(force=True), derivatives, rays)
+                result[2] = torch.from_numpy(np.asarray(of_bundles)).reshape(geometry.shape)
+            return result
 
-        return *_once(gradients, gradient, starts, ends, *fields), None
+        return *_once(gradients, gradient, geometry, *fields), None, None
 
 
 def _once(gradients: Gradients, gradient: Tensor, *seen: Tensor) -> Any:

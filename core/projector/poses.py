@@ -21,7 +21,7 @@ from ..volume import Volume
 from .aperture import disk_points
 from .crystal import absorbed_share
 from .emission import throughput
-from .tracing import trace_rays
+from .tracing import trace_fans
 
 Numbers = Any  # a tensor, an array or numbers
 
@@ -65,7 +65,9 @@ def pinhole_rays(
     """
     n_v, n_u = whole_shape(shape, "image shape", 2)
     positions, rotations, distance, pitch, offset = _cameras(positions, rotations, distance, pitch, offset)
-    in_camera = _pixels(distance, pitch, offset, (n_v, n_u))
+    v, u = _pixels(pitch, offset, (n_v, n_u))
+    v, u = v[..., :, None].expand(*v.shape, n_u), u[..., None, :].expand(*u.shape[:-1], n_v, n_u)
+    in_camera = torch.stack((u, v, distance[..., None, None].expand_as(u)), dim=-1).flatten(-3, -2)
     targets = positions[..., None, :] + in_camera @ rotations.mT
     return positions[..., None, :].expand(targets.shape), targets
 
@@ -92,13 +94,21 @@ def _cameras(positions: Tensor, rotations: Numbers, *numbers: Numbers) -> list[T
         raise InputError(f"pinhole rays: {str(error).splitlines()[0]}") from None
 
 
-def _pixels(distance: Tensor, pitch: Tensor, offset: Tensor, shape: tuple[int, int]) -> Tensor:
-    """Pixels' centres (..., n_v * n_u, 3) on the plane at `distance`, mm along u, v and k."""
+def _pixels(pitch: Tensor, offset: Tensor, shape: tuple[int, int]) -> tuple[Tensor, Tensor]:
+    """Where the rows' and the columns' middles lie, mm along v (..., n_v) and along u (..., n_u)."""
     row, column = (torch.arange(n).to(pitch) - (n - 1) / 2 for n in shape)
-    row, column = (x.reshape(-1) for x in torch.meshgrid(row, column, indexing="ij"))
-    u = column * pitch[..., :1] + offset[..., :1]
-    v = row * pitch[..., 1:] + offset[..., 1:]
-    return torch.stack((u, v, distance[..., None].expand_as(u)), dim=-1)
+    return row * pitch[..., 1:] + offset[..., 1:], column * pitch[..., :1] + offset[..., :1]
+
+
+def _fans(
+    shape: tuple[int, int], positions: Tensor, rotations: Tensor, distance: Tensor, pitch: Tensor, offset: Tensor
+) -> Tensor:
+    """The rays of `pinhole_rays` as the vectors (..., 4, 3) of `trace_fans`; rays are a line's columns, lines are rows."""
+    u, v, k = rotations.unbind(dim=-1)
+    pitch_u, pitch_v = pitch[..., :1], pitch[..., 1:]
+    first_u, first_v = (offset - pitch * (pitch.new_tensor([shape[1], shape[0]]) - 1) / 2).split(1, dim=-1)
+    corners = positions + first_u * u + first_v * v + distance[..., None] * k
+    return torch.stack((positions, corners, pitch_v * v, pitch_u * u), dim=-2)
 
 
 def pinhole_images(
@@ -124,9 +134,9 @@ def pinhole_images(
     >>> image = pinhole_images(volume, position, torch.eye(3), distance=400.0, pitch=2.0, shape=(32, 32))
     >>> image.sum().backward()
     """
-    sources, targets = pinhole_rays(positions, rotations, distance, pitch, shape, offset)
-    integrals = trace_rays(volume, sources.reshape(-1, 3), targets.reshape(-1, 3), backend, grid)
-    return integrals.reshape(*targets.shape[:-2], *shape)
+    shape = whole_shape(shape, "image shape", 2)
+    cameras = _cameras(positions, rotations, distance, pitch, offset)
+    return trace_fans(volume, _fans(shape, *cameras), shape, backend, grid)
 
 
 def emission_images(
@@ -209,27 +219,27 @@ def emission_images(
         if bool((x <= 0).any()):
             raise InputError(f"emission images: {name}: expected more than 0 mm, got {float(x.min()):g}")
 
-    on_crystal = _pixels(l, pitch, offset, (n_v, n_u))
     # To the plane through the grid's farthest corner, in pinhole to crystal distances.
     corners = positions.new_tensor(within.corners()) - positions.detach()[..., None, :]
     depth = ((corners @ rotations.detach()[..., 2:])[..., 0].amax(dim=-1) / l.detach()).clamp(min=1.0)
     area = math.pi / 4 * diameter**2 / aperture_points
-    counts = (time * photons * pitch.prod(dim=-1) * area)[..., None]
+    counts = (time * photons * pitch.prod(dim=-1) * area)[..., None, None]
     images: Any = 0.0
     for point in disk_points(aperture_points):
-        hole = diameter[..., None, None] / 2 * diameter.new_tensor([*point, 0.0])
-        in_camera = on_crystal + hole
-        sources = positions[..., None, :] + hole @ rotations.mT
-        targets = sources + depth[..., None, None] * in_camera @ rotations.mT
-        cosine = l[..., None] / in_camera.norm(dim=-1)
-        weights = counts * throughput(cosine, l[..., None])
+        hole = diameter[..., None] / 2 * diameter.new_tensor(point)
+        sources = positions + (rotations[..., :2] @ hole[..., None])[..., 0]
+        # On the crystal, seen from where k meets it behind this point of the hole.
+        middle = offset + hole
+        v, u = _pixels(pitch, middle, (n_v, n_u))
+        along = l[..., None, None]
+        cosine = along / (v[..., :, None] ** 2 + u[..., None, :] ** 2 + along**2).sqrt()
+        weights = counts * throughput(cosine, along)
         if crystal_mu is not None:
-            weights = weights * absorbed_share(cosine, mu_c[..., None], thickness[..., None], np.zeros(1), 0)
-        sources, targets, weights = (
-            sources.expand_as(targets).reshape(-1, 3),
-            targets.reshape(-1, 3),
-            weights.reshape(-1),
-        )
-        integrals = trace_rays(volume, sources, targets, backend, grid, mu, mu_grid)
+            weights = weights * absorbed_share(
+                cosine, mu_c[..., None, None], thickness[..., None, None], np.zeros(1), 0
+            )
+        on_plane = depth * l, depth[..., None] * pitch, depth[..., None] * middle
+        vectors = _fans((n_v, n_u), sources, rotations, *on_plane)
+        integrals = trace_fans(volume, vectors, (n_v, n_u), backend, grid, mu, mu_grid)
         images = images + weights.to(integrals) * integrals
-    return images.reshape(*on_crystal.shape[:-2], n_v, n_u)
+    return images

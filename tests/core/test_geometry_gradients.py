@@ -11,7 +11,8 @@ torch = pytest.importorskip("torch", reason="torch is not installed")
 
 from mphdrr.core.errors import InputError  # noqa: E402
 from mphdrr.core.grid import Grid  # noqa: E402
-from mphdrr.core.projector import Projector, trace_rays  # noqa: E402
+from mphdrr.core.projector import Projector, operator, trace_rays  # noqa: E402
+from mphdrr.core.projector.tracing import trace_fans  # noqa: E402
 from mphdrr.core.views import Views  # noqa: E402
 from mphdrr.core.volume import Volume  # noqa: E402
 
@@ -215,6 +216,45 @@ def test_gradcheck_by_everything(backend, which, rng):
 
 
 @pytest.mark.parametrize("backend", BACKENDS)
+@pytest.mark.parametrize("which", MU)
+def test_fans_are_their_rays(backend, which, rng, monkeypatch):
+    """Integrals and all gradients: lines along either axis, cut into blocks, from outside and from inside; arrays too."""
+    monkeypatch.setattr(operator, "_RAYS_AT_ONCE", 16)
+    grid = general_grid(rng, (9, 8, 7))
+    mu_grid = (some_mu(rng, grid, which) or Volume(np.ones(grid.shape), grid)).grid
+    shape = (9, 5)
+    sources = grid.center + np.array([[30.0, 4, -2], [1, 2, -50], [0.3, 0.2, 0.1]])
+    middles, step = 2 * grid.center - sources + rng.normal(size=(3, 3)), rng.normal(size=(3, 2, 3))
+    vectors = np.stack([sources, middles - 4 * step[:, 0] - 2 * step[:, 1], step[:, 0], step[:, 1]], axis=1)
+    vectors = np.concatenate([vectors, vectors[:, [0, 1, 3, 2]]]).reshape(2, 3, 4, 3)
+    weights = torch.tensor(rng.normal(size=(2, 3, *shape)))
+    fields = torch.tensor(rng.random(grid.shape)), torch.tensor(rng.uniform(0, 0.2, mu_grid.shape))
+
+    def traced(function):
+        x, mu, v = (a.clone().requires_grad_() for a in (*fields, torch.tensor(vectors)))
+        y = function(x, v, (mu, mu_grid) if which else ())
+        assert y.shape == weights.shape and y.dtype == torch.float64
+        return y, *torch.autograd.grad((y * weights).sum(), [x, v] + [mu] * bool(which))
+
+    def by_ends(x, v, mu):
+        line, ray = (torch.arange(n, dtype=v.dtype)[:, None] for n in shape)
+        source, corner, line_step, ray_step = v[..., None, None, :, :].unbind(dim=-2)
+        targets = corner + line[:, None] * line_step + ray * ray_step
+        ends = (source.expand_as(targets).reshape(-1, 3), targets.reshape(-1, 3))
+        return trace_rays(x, *ends, backend, grid, *mu).reshape(weights.shape)
+
+    expected = traced(by_ends)
+    got = traced(lambda x, v, mu: trace_fans(x, v, shape, backend, grid, *mu))
+    assert all(gradient.abs().max() > 0 for gradient in expected)
+    for one, other in zip(got, expected, strict=True):
+        torch.testing.assert_close(one, other, rtol=0, atol=1e-9 * float(other.detach().abs().max()))
+    mu = (fields[1].numpy(), mu_grid) if which else ()
+    array = trace_fans(fields[0].numpy(), vectors, shape, backend, grid, *mu)
+    assert array.dtype == (np.float64 if backend == "numpy" else np.float32)
+    np.testing.assert_allclose(array, expected[0].detach(), rtol=0, atol=1e-5 * float(array.max()))
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
 def test_gradient_by_volume_is_the_adjoint(backend, rng):
     views = Views([[0.1, 0.3, -20]], [[0, 0, 20]], [[1, 0, 0]], [[0, 1, 0]], (4, 5))
     grid = Grid.centered((5, 4, 3), 1.0)
@@ -247,6 +287,7 @@ def test_kinds_of_arguments(rng):
     trace_rays(Volume(array, grid), one, targets).sum().backward()
     assert one.grad.shape == (3,) and one.grad.dtype == torch.float32
     assert trace_rays(Volume(array, grid), one, torch.zeros((0, 3))).shape == (0,)
+    assert trace_fans(Volume(array, grid), torch.zeros((0, 4, 3)), (2, 3)).shape == (0, 2, 3)
 
 
 def test_bad_input_is_one_clear_line():
@@ -260,6 +301,9 @@ def test_bad_input_is_one_clear_line():
         (lambda: trace_rays(ones, torch.zeros((2, 3)), torch.zeros((4, 3)), grid=grid), "2 sources"),
         (lambda: trace_rays(ones, point, torch.tensor([0, 0, np.nan]), grid=grid), "targets"),
         (lambda: trace_rays(ones, point, torch.zeros(3, dtype=torch.complex64), grid=grid), "targets"),
+        (lambda: trace_fans(ones, torch.zeros(2, 3), (2, 2), grid=grid), "4 x 3"),
+        (lambda: trace_fans(ones, torch.full((4, 3), np.nan), (2, 2), grid=grid), "vectors"),
+        (lambda: trace_fans(ones, torch.zeros(4, 3), (2, 0), grid=grid), "shape"),
     ):
         with pytest.raises(InputError) as error:
             call()

@@ -479,16 +479,16 @@ def _pose_gradient(case: Case, integrate: Callable[[int, Any], Any]) -> Call:
 
     from mphdrr.core.rotations import se3_exp
 
-    poses = torch.from_numpy(case.system.poses())
+    poses = torch.from_numpy(case.system.poses()).float()  # as its users optimise them
     distances = np.linalg.norm(case.views.detector_centers - case.views.sources, axis=1)
     pitches = np.linalg.norm(case.views.u_steps, axis=1)
     weights = torch.from_numpy(case.images)
-    scale = torch.tensor([RADIUS] * 3 + [1.0] * 3, dtype=torch.float64)
+    scale = torch.tensor([RADIUS] * 3 + [1.0] * 3)
 
     def call() -> np.ndarray:
         gradients = []
         for m in range(case.n_views):
-            motion = torch.zeros(6, dtype=torch.float64, requires_grad=True)
+            motion = torch.zeros(6, requires_grad=True)
             pose = se3_exp(scale * motion) @ poses[m]
             image = integrate(m, (pose[:3, 3], pose[:3, :3], distances[m], pitches[m]))
             (weights[m] * image).sum().backward()

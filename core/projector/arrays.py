@@ -93,7 +93,13 @@ def like(result: ArrayOrTensor, given: ArrayOrTensor) -> ArrayOrTensor:
 
 def zeros(shape: tuple[int, ...], beside: ArrayOrTensor) -> ArrayOrTensor:
     """Zeros of the kind, type and device of `beside`."""
-    return beside.new_zeros(shape) if is_tensor(beside) else np.zeros(shape, beside.dtype)
+    if is_tensor(beside):
+        return beside.new_zeros(shape)
+    array = np.empty(
+        shape, beside.dtype
+    )  # which, unlike np.zeros, gets large pages of memory: half the time of an adjoint
+    array.fill(0)
+    return array
 
 
 def alike(values: ArrayOrTensor, beside: ArrayOrTensor) -> ArrayOrTensor:

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import copy
+import functools
 import math
 import os
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Iterator
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor, wait
 from contextlib import contextmanager
 from typing import Any
 
@@ -32,15 +33,13 @@ from .arrays import (
     zeros,
 )
 from .models import Array, Beam, Model, Transmission, require_model
-from .rays import Attenuation, IndexFans, RayMapper
+from .rays import Attenuation, Fan, IndexFans, RayMapper
 
 # Rays handed to a backend at once: enough that a call costs nothing, few enough that their arrays stay in the
-# cache.
-_RAYS_AT_ONCE = 4096
-# A GPU wants more (torch cuts them into chunks by itself), and a torch on a CPU has threads of its own.
-_RAYS_AT_ONCE_TORCH = 2**18
-# Several views a launch; an array is copied to the GPU once for as many.
-_RAYS_AT_ONCE_CUDA = 2**22
+# cache. A GPU wants more (torch cuts them into chunks by itself; cuda takes several views a launch), and a torch on a CPU
+# has threads of its own.
+_FEWEST_RAYS = 4096
+_MOST_RAYS = {"numba": 2**14, "torch": 2**18, "cuda": 2**22}
 
 # Threads of the adjoint, each with a volume of its own: more would gain little and take much memory.
 _MOST_VOLUMES = 8
@@ -261,21 +260,43 @@ class Projector(LinearOperator):
             yield from self._images_together(box, trace)
             return
         with _parallel(self._workers(name)) as parallel_map:
+            # The next view is begun before one is done, so that no thread waits for the others at a view's end.
+            before: tuple[int, ArrayOrTensor, Iterable[None]] | None = None
             for m in range(len(self.views)):
-                image = zeros(self.views.shape, box)
+                image, running = zeros(self.views.shape, box), iter(())
                 seen = self._weighted(box, m, trace.origin)
                 for beam, by_columns in self._beams(m):
+                    _wait_for(running)  # the beams of a view add up in the same pixels
                     lines = image.T if by_columns else image
                     weights = None if beam.weights is None else alike(beam.weights, box)
 
-                    def project(block: slice) -> None:
-                        rays, attenuation = trace(beam.rays[block])  # noqa: B023
-                        integrals = integrate(seen, rays, attenuation).reshape(lines[block].shape)  # noqa: B023
-                        lines[block] += integrals if weights is None else weights[block] * integrals  # noqa: B023
+                    def project(
+                        block: slice,
+                        rays: Fan = beam.rays,
+                        weights: Any = weights,
+                        lines: Any = lines,
+                        seen: Any = seen,
+                    ) -> None:
+                        index_rays, attenuation = trace(rays[block])
+                        integrals = integrate(seen, index_rays, attenuation).reshape(lines[block].shape)
+                        lines[block] += integrals if weights is None else weights[block] * integrals
 
-                    for _ in parallel_map(project, _blocks(lines.shape[0], lines.shape[1], name)):
-                        pass
-                yield self._finished(self._responded(image, m), x)
+                    running = iter(
+                        parallel_map(project, _blocks(lines.shape[0], lines.shape[1], name, self._workers(name)))
+                    )
+                    if before is not None:
+                        yield self._completed(*before, x)
+                        before = None
+                if before is not None:
+                    yield self._completed(*before, x)
+                before = m, image, running
+            if before is not None:
+                yield self._completed(*before, x)
+
+    def _completed(self, m: int, image: ArrayOrTensor, running: Iterable[None], x: ArrayOrTensor) -> ArrayOrTensor:
+        """View m's image, once what adds to it has run."""
+        _wait_for(running)
+        return self._finished(self._responded(image, m), x)
 
     def _images_together(self, box: ArrayOrTensor, trace: RayMapper) -> Iterator[ArrayOrTensor]:
         """`_images` for the backend that takes several views at once."""
@@ -299,7 +320,7 @@ class Projector(LinearOperator):
     def _views_together(self) -> Iterator[range]:
         """The views, as many at once as cuda is given."""
         n_views, n_v, n_u = self.shape_out
-        at_once = max(1, _RAYS_AT_ONCE_CUDA // (n_v * n_u))
+        at_once = max(1, _MOST_RAYS["cuda"] // (n_v * n_u))
         return (range(m, min(m + at_once, n_views)) for m in range(0, n_views, at_once))
 
     def _fans(
@@ -463,7 +484,7 @@ class AdjointProjector(LinearOperator):
                 for beam, by_columns in A._beams(m):
                     lines = image.T if by_columns else image
                     lines = lines if beam.weights is None else alike(beam.weights, image) * lines
-                    blocks = _blocks(lines.shape[0], lines.shape[1], name)
+                    blocks = _blocks(lines.shape[0], lines.shape[1], name, workers)
 
                     def add(worker: int) -> None:
                         # Always the same blocks, so that the sums' order, and so the result, is always the same.
@@ -543,21 +564,48 @@ def _sum(volumes: list[ArrayOrTensor]) -> ArrayOrTensor:
     return total
 
 
-def _blocks(n_lines: int, line_length: int, backend: str) -> list[slice]:
-    """The lines of rays, cut into what a backend is given at once."""
-    rays_at_once = {"torch": _RAYS_AT_ONCE_TORCH, "cuda": _RAYS_AT_ONCE_CUDA}.get(backend, _RAYS_AT_ONCE)
+def _blocks(n_lines: int, line_length: int, backend: str, workers: int) -> list[slice]:
+    """The lines of rays, cut into what a backend is given at once: two pieces or more for each worker."""
+    most = _MOST_RAYS.get(backend, _FEWEST_RAYS)
+    rays_at_once = max(min(_FEWEST_RAYS, most), min(most, n_lines * line_length // (2 * workers)))
     size = max(1, rays_at_once // line_length)
     return [slice(first, first + size) for first in range(0, n_lines, size)]
 
 
 @contextmanager
 def _parallel(workers: int) -> Iterator[ParallelMap]:
-    """A map that runs on `workers` threads."""
+    """A map that runs on `workers` threads; nothing of it runs on when the context is left."""
     if workers == 1:
         yield map
         return
-    with ThreadPoolExecutor(workers, thread_name_prefix="mphdrr") as pool:
-        yield pool.map
+    tasks: list[Future[Any]] = []
+
+    def parallel_map(function: Callable[[Any], Any], items: Iterable[Any]) -> Iterable[Any]:
+        started = [_pool(workers).submit(function, item) for item in items]
+        tasks.extend(started)
+        return (task.result() for task in started)
+
+    try:
+        yield parallel_map
+    finally:
+        for task in tasks:
+            task.cancel()
+        wait(tasks)
+
+
+@functools.cache
+def _pool(workers: int) -> ThreadPoolExecutor:
+    """Threads that stay: starting some for every call would cost a short one more than its work."""
+    return ThreadPoolExecutor(workers, thread_name_prefix="mphdrr")
+
+
+if hasattr(os, "register_at_fork"):  # threads stay behind when a process forks, as data loaders do
+    os.register_at_fork(after_in_child=_pool.cache_clear)
+
+
+def _wait_for(running: Iterable[None]) -> None:
+    for _ in running:
+        pass
 
 
 def _require_rays(views: Views) -> None:

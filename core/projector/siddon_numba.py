@@ -53,7 +53,9 @@ Array = NDArray[Any]  # of float32 or float64; what the rays have, of float64
 
 # Steps that a tile takes before the next has its turn. Tiles side by side then read the same part of the volume at about the
 # same time, row after row, which is what a processor's memory is fast at; more steps cost that, fewer the changing of tiles.
-_TURN = 8
+_TURN = 6
+# Tiles that take turns: their memory stays in the processor's.
+_TILES = 128
 
 _NUMBERS = types.Array(types.float64, 2, "C")
 _LINES = types.Array(types.float64, 2, "C", readonly=True)
@@ -206,27 +208,30 @@ def _trace(data, begin, step, start, visit, finish):  # type: ignore[no-untyped-
         The model's.
     """
     n_tiles = data[2].shape[1] // WIDTH
-    steps = np.empty(n_tiles, np.int64)
+    at_once = min(n_tiles, _TILES)
+    steps = np.empty(at_once, np.int64)
     way, measure, place, _ = begin(data, 0)
     state = start(data, 0, measure)
     lasting, size, size_measure = words(way), words((way, place, state)), words(measure)
-    memory = np.empty(n_tiles * size, np.float32)
-    measures = np.empty(n_tiles * size_measure, np.float32)
-    for tile in range(n_tiles):
-        way, measure, place, steps[tile] = begin(data, tile * WIDTH)
-        put_aside(memory, tile * size, (way, place, start(data, tile * WIDTH, measure)))
-        put_aside(measures, tile * size_measure, measure)
-    for done in range(0, steps.max(), _TURN):
-        for tile in range(n_tiles):
-            if steps[tile] > done:
-                way, place, state = take_back(memory, tile * size, (way, place, state))
-                for _ in range(min(_TURN, steps[tile] - done)):
-                    segment, place = step(way, place)
-                    state = visit(data, segment, state)
-                put_aside(memory, tile * size + lasting, (place, state))
-    for tile in range(n_tiles):
-        way, place, state = take_back(memory, tile * size, (way, place, state))
-        finish(data, tile * WIDTH, take_back(measures, tile * size_measure, measure), state)
+    memory = np.empty(at_once * size, np.float32)
+    measures = np.empty(at_once * size_measure, np.float32)
+    for first in range(0, n_tiles, at_once):
+        some = min(at_once, n_tiles - first)
+        for tile in range(some):
+            way, measure, place, steps[tile] = begin(data, (first + tile) * WIDTH)
+            put_aside(memory, tile * size, (way, place, start(data, (first + tile) * WIDTH, measure)))
+            put_aside(measures, tile * size_measure, measure)
+        for done in range(0, steps[:some].max(), _TURN):
+            for tile in range(some):
+                if steps[tile] > done:
+                    way, place, state = take_back(memory, tile * size, (way, place, state))
+                    for _ in range(min(_TURN, steps[tile] - done)):
+                        segment, place = step(way, place)
+                        state = visit(data, segment, state)
+                    put_aside(memory, tile * size + lasting, (place, state))
+        for tile in range(some):
+            way, place, state = take_back(memory, tile * size, (way, place, state))
+            finish(data, (first + tile) * WIDTH, take_back(measures, tile * size_measure, measure), state)
 
 
 # The lattice of the volume alone; mu, if any, is on it too.

@@ -320,7 +320,10 @@ class Tracer:
             transposed = False
             if isinstance(bundle, Fan) and abs(contiguous @ bundle.line_step) > abs(contiguous @ bundle.ray_step):
                 bundle, transposed = bundle.transposed(), True
-            pieces += [_Piece(number, bundle, lines, transposed) for lines in _blocks(*bundle.shape, self.backend)]
+            pieces += [
+                _Piece(number, bundle, lines, transposed)
+                for lines in _blocks(*bundle.shape, self.backend, self._workers)
+            ]
         return pieces
 
     def _lattices(

@@ -219,7 +219,7 @@ def test_gradcheck_by_everything(backend, which, rng):
 @pytest.mark.parametrize("which", MU)
 def test_fans_are_their_rays(backend, which, rng, monkeypatch):
     """Integrals and all gradients: lines along either axis, cut into blocks, from outside and from inside; arrays too."""
-    monkeypatch.setattr(operator, "_RAYS_AT_ONCE", 16)
+    monkeypatch.setattr(operator, "_FEWEST_RAYS", 16)
     grid = general_grid(rng, (9, 8, 7))
     mu_grid = (some_mu(rng, grid, which) or Volume(np.ones(grid.shape), grid)).grid
     shape = (9, 5)

@@ -264,3 +264,23 @@ def test_kernels_are_made_of_the_files_that_stand_for_them(tmp_path):
     called = {f.py_func.__module__ for f in vars(siddon_numba).values() if hasattr(f, "py_func")}
     called |= {f._defn.__module__ for f in vars(siddon_numba).values() if hasattr(f, "_defn")}
     assert called == {f"{package}.{Path(name).stem}" for name in compiling.SOURCES}
+
+
+FORK = """
+import multiprocessing, numpy as np
+from mphdrr.core.grid import Grid
+from mphdrr.core.projector import Projector
+from mphdrr.core.views import Views
+grid = Grid.centered(8, 1.0)
+A = Projector(grid, Views([[0, 0, -50]], [[0, 0, 50]], [[0.2, 0, 0]], [[0, 0.2, 0]], (60, 60)), threads=2)
+def total(_): return float(A(np.ones(grid.shape)).sum())
+with multiprocessing.get_context("fork").Pool(2) as pool:
+    print(len({total(0), *pool.map(total, range(3))}))
+"""
+
+
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="processes fork on POSIX only")
+def test_forked_processes_project_too():
+    """The threads of a process stay behind when it forks, as the workers of data loaders do."""
+    done = run_python(FORK)
+    assert done.stdout.strip() == "1", done.stderr

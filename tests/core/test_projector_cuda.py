@@ -211,7 +211,7 @@ def test_projector_agrees_with_the_reference(attenuation, system, rng, monkeypat
     expected, expected_T = reference(x), reference.T(y)
     assert np.count_nonzero(expected) > 0.5 * expected.size
     for rays_together, rays_at_once in ((2**22, 2**24), (5 * 72, 2**24), (2**22, 100), (2**22, 20)):
-        monkeypatch.setattr(operator, "_RAYS_AT_ONCE_CUDA", rays_together)
+        monkeypatch.setitem(operator._MOST_RAYS, "cuda", rays_together)
         monkeypatch.setattr(siddon_cuda, "_RAYS_AT_ONCE", rays_at_once)
         Ax, ATy = A(x), A.T(y)
         assert Ax.dtype == ATy.dtype == np.float32

@@ -274,8 +274,9 @@ from mphdrr.core.views import Views
 grid = Grid.centered(8, 1.0)
 A = Projector(grid, Views([[0, 0, -50]], [[0, 0, 50]], [[0.2, 0, 0]], [[0, 0.2, 0]], (60, 60)), threads=2)
 def total(_): return float(A(np.ones(grid.shape)).sum())
+first = total(0)
 with multiprocessing.get_context("fork").Pool(2) as pool:
-    print(len({total(0), *pool.map(total, range(3))}))
+    print(len({first, *pool.map(total, range(3))}))
 """
 
 

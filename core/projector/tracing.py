@@ -371,12 +371,14 @@ def _by_fan(piece: _Piece, values: Points, derivatives: Points, grid: Grid, mu_g
     assert isinstance(piece.bundle, Fan)
     numbers, lengths = _numbers(piece), _lengths(piece)
     # Not ray by ray: first sums over the rays, times their numbers where a step moves their ends as often.
-    by_planes = derivatives[1:13] @ (values * lengths * numbers).T
+    # Not `@`, of which BLAS would make threads of its own beside ours.
+    by_planes = np.einsum("in,jn->ij", derivatives[1:13], values * lengths * numbers)
     by_start, by_end = by_planes[:3, 0] @ _linear(grid), by_planes[3:6].T @ _linear(grid)
     if len(derivatives) > 7:
         by_start += by_planes[6:9, 0] @ _linear(mu_grid)
         by_end += by_planes[9:].T @ _linear(mu_grid)
-    by_length = (_by_length(values, lengths, derivatives) * numbers) @ numbers.T @ _edges(piece.bundle)
+    weighted = _by_length(values, lengths, derivatives) * numbers
+    by_length = np.einsum("in,jn->ij", weighted, numbers) @ _edges(piece.bundle)
     gradient = np.concatenate([by_start[None] - by_length[:1], by_end + by_length])
     return gradient[[0, 1, 3, 2]] if piece.transposed else gradient
 
@@ -390,7 +392,7 @@ def _by_length(values: Points, lengths: Points, derivatives: Points) -> Points:
 def _along(piece: _Piece) -> Points:
     """Source to target of the rays, (3, n), world mm."""
     if isinstance(piece.bundle, Fan):
-        return _edges(piece.bundle).T @ _numbers(piece)
+        return np.einsum("ij,in->jn", _edges(piece.bundle), _numbers(piece))
     rays = piece.bundle[piece.lines]
     return (rays.ends - rays.starts).T
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -73,10 +74,10 @@ class Grid:
         """Number of voxels."""
         return int(np.prod(self.shape, dtype=object))
 
-    @property
+    @cached_property  # asked for every piece of every image
     def index_from_world(self) -> NDArray[np.float64]:
         """World mm to index, (4, 4), on column vectors."""
-        return np.linalg.inv(self.affine)
+        return freeze(np.linalg.inv(self.affine))
 
     @property
     def center(self) -> NDArray[np.float64]:

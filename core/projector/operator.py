@@ -361,10 +361,8 @@ class Projector(LinearOperator):
 
         Neighbours in a line are neighbours in memory: lines follow the volume's contiguous axis as well as they can.
         """
-        contiguous = self.grid.index_from_world[2, :3]
-        along_u, along_v = (abs(contiguous @ step) for step in (self.views.u_steps[m], self.views.v_steps[m]))
-        by_columns = bool(along_v > along_u)
         for beam in self.model.beams(self.views, m, self.grid):
+            by_columns = beam.rays.lies_across(self.grid)
             yield (beam.transposed() if by_columns else beam), by_columns
 
     def _lattices(

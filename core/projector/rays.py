@@ -50,6 +50,11 @@ class Fan:
         """The same rays, lines across."""
         return Fan(self.source, self.corner, self.ray_step, self.line_step, self.shape[::-1])
 
+    def lies_across(self, grid: Grid) -> bool:
+        """Whether neighbours in the voxels' memory are rather neighbours in different lines than in one."""
+        contiguous = grid.index_from_world[2, :3]
+        return bool(abs(contiguous @ self.line_step) > abs(contiguous @ self.ray_step))
+
     def targets(self) -> NDArray[np.float64]:
         """Ends of the rays (lines * rays, 3), line by line."""
         line, ray = (np.arange(n, dtype=np.float64) for n in self.shape)

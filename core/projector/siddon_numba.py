@@ -12,6 +12,7 @@ own threading layers are left alone (they do not always live well inside Blender
 
 from __future__ import annotations
 
+from collections import namedtuple
 from typing import Any
 
 import numpy as np
@@ -188,10 +189,16 @@ def _list_fan(fan, rays_of_a_line, lines):  # type: ignore[no-untyped-def]
 # The walk.
 
 
+# What a kernel is given, arrays of voxels flat: the volume, its shape and the rays in its index space; the same of mu;
+# numbers (k, N') of the rays, and the voxels that are added to.
+_Data = namedtuple("_Data", "volume shape rays mu mu_shape mu_rays numbers written")
+
+
 @njit(forceinline=True)
 def _data(volume, rays, mu, mu_rays, numbers, written):  # type: ignore[no-untyped-def]
-    """What a kernel is given, arrays of voxels flat."""
-    return volume.reshape(-1), volume.shape, rays, mu.reshape(-1), mu.shape, mu_rays, numbers, written.reshape(-1)
+    return _Data(
+        volume.reshape(-1), volume.shape, rays, mu.reshape(-1), mu.shape, mu_rays, numbers, written.reshape(-1)
+    )
 
 
 @njit(forceinline=True)
@@ -207,7 +214,7 @@ def _trace(data, begin, step, start, visit, finish):  # type: ignore[no-untyped-
     start(data, r, measure) -> state, finish(data, r, measure, state)
         The model's.
     """
-    n_tiles = data[2].shape[1] // WIDTH
+    n_tiles = data.rays.shape[1] // WIDTH
     at_once = min(n_tiles, _TILES)
     steps = np.empty(at_once, np.int64)
     way, measure, place, _ = begin(data, 0)
@@ -244,13 +251,13 @@ def _begin(data, r):  # type: ignore[no-untyped-def]
     A lattice's axes are, each for x, y and z: alpha of the first plane, from plane to plane, and what a plane adds to
     the voxel's flat index.
     """
-    shape, rays = data[1], data[2]
+    shape, rays = data.shape, data.rays
     enter, leave = _clip(shape, rays, r)
     hits = enter < leave
     begin = where(hits, enter, f64(0.0))
     span = where(hits, leave - enter, f64(1.0))
-    axes, p, stop, crossings = _axes(data[0], shape, rays, r, hits, begin, begin, span)
-    zero = zeros_of(data[0])
+    axes, p, stop, crossings = _axes(data.volume, shape, rays, r, hits, begin, begin, span)
+    zero = zeros_of(data.volume)
     end = where(hits, minimum(alike(1.0, zero), stop), zero)
     measure = begin, _span(hits, span, end)
     return (axes, end), measure, ((zero, zero, zero), p, zero), largest(where(hits, crossings + i32(1), i32(0)))
@@ -383,7 +390,7 @@ def _exclusive(crossed, example):  # type: ignore[no-untyped-def]
 @njit(forceinline=True)
 def _begin_both(data, r):  # type: ignore[no-untyped-def]
     """`_begin` through the volume's lattice and mu's: from where either begins to where the volume's ends."""
-    shape, rays, mu_shape, mu_rays = data[1], data[2], data[4], data[5]
+    shape, rays, mu_shape, mu_rays = data.shape, data.rays, data.mu_shape, data.mu_rays
     enter, leave = _clip(shape, rays, r)
     mu_enter, mu_leave = _clip(mu_shape, mu_rays, r)
     hits = enter < leave
@@ -391,9 +398,9 @@ def _begin_both(data, r):  # type: ignore[no-untyped-def]
     enter, mu_enter = where(hits, enter, f64(0.0)), where(hits_mu, mu_enter, f64(0.0))
     begin = where(hits_mu, minimum(enter, mu_enter), enter)
     span = where(hits, leave - begin, f64(1.0))
-    axes, p, stop, crossings = _axes(data[0], shape, rays, r, hits, enter, begin, span)
-    mu_axes, q, mu_stop, mu_crossings = _axes(data[3], mu_shape, mu_rays, r, hits_mu, mu_enter, begin, span)
-    zero = zeros_of(data[0])
+    axes, p, stop, crossings = _axes(data.volume, shape, rays, r, hits, enter, begin, span)
+    mu_axes, q, mu_stop, mu_crossings = _axes(data.mu, mu_shape, mu_rays, r, hits_mu, mu_enter, begin, span)
+    zero = zeros_of(data.volume)
     entry = alike((enter - begin) / span, zero)
     mu_entry = where(hits_mu, alike((mu_enter - begin) / span, zero), alike(_NEVER, zero))
     end = where(hits, minimum(alike(1.0, zero), stop), zero)
@@ -441,37 +448,37 @@ def _spread(volume, rays, mu, mu_rays, numbers, written):  # type: ignore[no-unt
 
 @njit(forceinline=True)
 def _start_sum(data, r, measure):  # type: ignore[no-untyped-def]
-    return (zeros_of(data[0]),)
+    return (zeros_of(data.volume),)
 
 
 @njit(forceinline=True)
 def _add_up(data, segment, state):  # type: ignore[no-untyped-def]
     alpha, stop, (p, _, _, _), _ = segment
-    return (multiply_add(stop - alpha, gather(data[0], p), state[0]),)
+    return (multiply_add(stop - alpha, gather(data.volume, p), state[0]),)
 
 
 @njit(forceinline=True)
 def _finish_sum(data, r, measure, state):  # type: ignore[no-untyped-def]
     reach = _reach(data, r, measure)
-    store(data[6].reshape(-1), r, alike(state[0], reach) * reach)
+    store(data.numbers.reshape(-1), r, alike(state[0], reach) * reach)
 
 
 @njit(forceinline=True)
 def _reach(data, r, measure):  # type: ignore[no-untyped-def]
     """Length in mm of the way that alpha measures."""
-    rays = data[2]
+    rays = data.rays
     return measure[1] * load(rays.reshape(-1), 6 * rays.shape[1] + r)
 
 
 @njit(forceinline=True)
 def _start_value(data, r, measure):  # type: ignore[no-untyped-def]
-    return (alike(load(data[6].reshape(-1), r) * _reach(data, r, measure), zeros_of(data[0])),)
+    return (alike(load(data.numbers.reshape(-1), r) * _reach(data, r, measure), zeros_of(data.volume)),)
 
 
 @njit(forceinline=True)
 def _add_to(data, segment, state):  # type: ignore[no-untyped-def]
     alpha, stop, (p, _, _, _), _ = segment
-    scatter_add(data[7], p, (stop - alpha) * state[0])
+    scatter_add(data.written, p, (stop - alpha) * state[0])
     return state
 
 
@@ -496,8 +503,8 @@ def _differentiate(volume, rays, mu, mu_rays, numbers, written):  # type: ignore
 
 @njit(forceinline=True)
 def _start_jumps(data, r, measure):  # type: ignore[no-untyped-def]
-    zero = zeros_of(data[0])
-    first, last = _ends(data[1], data[2], r, zero)
+    zero = zeros_of(data.volume)
+    first, last = _ends(data.shape, data.rays, r, zero)
     none = zero, zero, zero
     return zero, first, last, none, none
 
@@ -506,7 +513,7 @@ def _start_jumps(data, r, measure):  # type: ignore[no-untyped-def]
 def _add_jumps(data, segment, state):  # type: ignore[no-untyped-def]
     alpha, stop, (p, _, sides, at_end), _ = segment
     total, before, last, jumps, moments = state
-    value = gather(data[0], p)
+    value = gather(data.volume, p)
     behind = _behind(sides, at_end, last)
     jumps = _add(jumps, behind, before, value, value)
     moments = _add(moments, behind, before, stop * value, alpha * value)
@@ -536,9 +543,9 @@ def _add(sums, behind, before, gained, lost):  # type: ignore[no-untyped-def]
 @njit(forceinline=True)
 def _finish_jumps(data, r, measure, state):  # type: ignore[no-untyped-def]
     total, _, _, jumps, moments = state
-    rows, n = data[6].reshape(-1), data[6].shape[1]
+    rows, n = data.numbers.reshape(-1), data.numbers.shape[1]
     store(rows, r, alike(total, measure[1]) * measure[1])
-    _store_by_ends(rows, r, n, 1, measure, data[2], jumps, moments)
+    _store_by_ends(rows, r, n, 1, measure, data.rays, jumps, moments)
 
 
 @njit(forceinline=True)
@@ -603,7 +610,7 @@ def _spread_behind(volume, rays, mu, mu_rays, numbers, written):  # type: ignore
 
 @njit(forceinline=True)
 def _start_attenuated(data, r, measure):  # type: ignore[no-untyped-def]
-    zero = zeros_of(data[0])
+    zero = zeros_of(data.volume)
     return zero, alike(1.0, zero), alike(_reach(data, r, measure), zero)
 
 
@@ -612,13 +619,13 @@ def _add_up_attenuated(data, segment, state):  # type: ignore[no-untyped-def]
     p, inside = segment[2][0], segment[2][1]
     total, left, reach = state
     seen, left, _ = _weakened(data, segment, left, reach)
-    return multiply_add(seen * inside, gather(data[0], p), total), left, reach
+    return multiply_add(seen * inside, gather(data.volume, p), total), left, reach
 
 
 @njit(forceinline=True)
 def _start_value_attenuated(data, r, measure):  # type: ignore[no-untyped-def]
-    reach, zero = _reach(data, r, measure), zeros_of(data[0])
-    return alike(load(data[6].reshape(-1), r) * reach, zero), alike(1.0, zero), alike(reach, zero)
+    reach, zero = _reach(data, r, measure), zeros_of(data.volume)
+    return alike(load(data.numbers.reshape(-1), r) * reach, zero), alike(1.0, zero), alike(reach, zero)
 
 
 @njit(forceinline=True)
@@ -626,7 +633,7 @@ def _add_to_attenuated(data, segment, state):  # type: ignore[no-untyped-def]
     p, inside = segment[2][0], segment[2][1]
     value, left, reach = state
     seen, left, _ = _weakened(data, segment, left, reach)
-    scatter_add(data[7], p, seen * inside * value)
+    scatter_add(data.written, p, seen * inside * value)
     return value, left, reach
 
 
@@ -635,7 +642,7 @@ def _weakened(data, segment, left, reach):  # type: ignore[no-untyped-def]
     """Through a segment: the integral of what is left of the ray, what is left behind it, and its mu times its length."""
     alpha, stop, _, (q, inside_mu, _, _) = segment
     length = stop - alpha
-    depth = gather(data[3], q) * inside_mu * length * reach
+    depth = gather(data.mu, q) * inside_mu * length * reach
     gone, mean = _absorbed(depth)
     return length * left * mean, left - left * gone, depth
 
@@ -690,7 +697,7 @@ def _weaken_behind(volume, rays, mu, mu_rays, numbers, written):  # type: ignore
 
 @njit(forceinline=True)
 def _start_weakening(data, r, measure):  # type: ignore[no-untyped-def]
-    rows, n, zero = data[6].reshape(-1), data[6].shape[1], zeros_of(data[0])
+    rows, n, zero = data.numbers.reshape(-1), data.numbers.shape[1], zeros_of(data.volume)
     value, behind = alike(load(rows, r), zero), alike(load(rows, n + r), zero)
     return value, behind, alike(1.0, zero), alike(_reach(data, r, measure), zero)
 
@@ -700,12 +707,12 @@ def _add_weakening(data, segment, state):  # type: ignore[no-untyped-def]
     alpha, stop, (p, inside, _, _), (q, inside_mu, _, _) = segment
     value, behind, left, reach = state
     length = (stop - alpha) * reach
-    activity = gather(data[0], p) * inside
+    activity = gather(data.volume, p) * inside
     seen, left_behind, depth = _weakened(data, segment, left, reach)
     gone, mean = _absorbed(depth)
     behind = behind - seen * reach * activity
     within = activity * left * length * _lag(depth, gone, mean)
-    scatter_add(data[7], q, alike(-1.0, value) * value * inside_mu * length * (behind + within))
+    scatter_add(data.written, q, alike(-1.0, value) * value * inside_mu * length * (behind + within))
     return value, behind, left_behind, reach
 
 
@@ -713,7 +720,7 @@ def _add_weakening(data, segment, state):  # type: ignore[no-untyped-def]
 
 
 def _differentiate_attenuated(volume, rays, mu, mu_rays, numbers, written):  # type: ignore[no-untyped-def]
-    """Row 0 of `result` holds the line integrals. Moving a plane of mu's changes all that is behind it."""
+    """Row 0 of `numbers` holds the line integrals. Moving a plane of mu's changes all that is behind it."""
     data = _data(volume, rays, mu, mu_rays, numbers, written)
     _trace(data, _begin, _step, _start_jumps_of_both, _add_jumps_of_both, _finish_jumps_of_both)
 
@@ -725,13 +732,13 @@ def _differentiate_behind(volume, rays, mu, mu_rays, numbers, written):  # type:
 
 @njit(forceinline=True)
 def _start_jumps_of_both(data, r, measure):  # type: ignore[no-untyped-def]
-    zero = zeros_of(data[0])
+    zero = zeros_of(data.volume)
     none = zero, zero, zero
     reach = _reach(data, r, measure)
     some = reach > f64(0.0)
-    behind = where(some, load(data[6].reshape(-1), r) / where(some, reach, f64(1.0)), f64(0.0))
-    first, last = _ends(data[1], data[2], r, zero)
-    mu_first, mu_last = _ends(data[4], data[5], r, zero)
+    behind = where(some, load(data.numbers.reshape(-1), r) / where(some, reach, f64(1.0)), f64(0.0))
+    first, last = _ends(data.shape, data.rays, r, zero)
+    mu_first, mu_last = _ends(data.mu_shape, data.mu_rays, r, zero)
     ray = alike(1.0, zero), zero, alike(behind, zero), alike(reach, zero)
     return ray, (first, last, none, none), (mu_first, mu_last, none, none), zero
 
@@ -741,7 +748,7 @@ def _add_jumps_of_both(data, segment, state):  # type: ignore[no-untyped-def]
     alpha, stop, (p, inside, sides, at_end), (q, inside_mu, mu_sides, mu_at_end) = segment
     (left, passed, behind, reach), (before, last, jumps, moments), of_mu, by_length = state
     mu_before, mu_last, mu_jumps, mu_moments = of_mu
-    activity, mu = gather(data[0], p) * inside, gather(data[3], q) * inside_mu
+    activity, mu = gather(data.volume, p) * inside, gather(data.mu, q) * inside_mu
     seen, left_behind, depth = _weakened(data, segment, left, reach)
     gone, mean = _absorbed(depth)
     still_behind = behind - seen * activity
@@ -774,7 +781,7 @@ def _chosen(flag, given, otherwise):  # type: ignore[no-untyped-def]
 @njit(forceinline=True)
 def _finish_jumps_of_both(data, r, measure, state):  # type: ignore[no-untyped-def]
     (_, _, _, reach), (_, _, jumps, moments), (_, _, mu_jumps, mu_moments), by_length = state
-    rows, n, rays, mu_rays = data[6].reshape(-1), data[6].shape[1], data[2], data[5]
+    rows, n, rays, mu_rays = data.numbers.reshape(-1), data.numbers.shape[1], data.rays, data.mu_rays
     length = load(rays.reshape(-1), 6 * rays.shape[1] + r)
     some = length > f64(0.0)
     per_mm = where(some, f64(1.0) / where(some, length, f64(1.0)), f64(0.0))

@@ -314,11 +314,10 @@ class Tracer:
 
     def _pieces(self, bundles: Sequence[Bundle]) -> list[_Piece]:
         """The bundles' lines, cut; those of a fan follow the volume's contiguous axis as well as they can."""
-        contiguous = self.grid.index_from_world[2, :3]
         pieces = []
         for number, bundle in enumerate(bundles):
             transposed = False
-            if isinstance(bundle, Fan) and abs(contiguous @ bundle.line_step) > abs(contiguous @ bundle.ray_step):
+            if isinstance(bundle, Fan) and bundle.lies_across(self.grid):
                 bundle, transposed = bundle.transposed(), True
             pieces += [
                 _Piece(number, bundle, lines, transposed)

@@ -1,0 +1,14 @@
+"""``mphdrr geometry ACTION``: an action is a module here with ``add_parser(actions)``."""
+
+from __future__ import annotations
+
+from ..options import add_command
+from . import check, show
+
+
+def add_parser(subparsers) -> None:  # type: ignore[no-untyped-def]
+    """Add the command."""
+    geometry = add_command(subparsers, "geometry", "work on a geometry workbook", "mphdrr geometry check scanner.xlsx")
+    actions = geometry.add_subparsers(metavar="ACTION", required=True)
+    for action in (show, check):
+        action.add_parser(actions)

@@ -1,0 +1,62 @@
+"""``mphdrr geometry show FILE``."""
+
+from __future__ import annotations
+
+import argparse
+import json
+from typing import Any
+
+import numpy as np
+
+from ...system import PinholeSystem
+from ...workbook import read_system
+from ..options import add_command, chosen_modules
+from .arguments import add_workbook
+
+
+def add_parser(actions) -> None:  # type: ignore[no-untyped-def]
+    """Add the action."""
+    parser = add_command(
+        actions, "show", "print every module's numbers", "mphdrr geometry show scanner.xlsx --modules 1-20"
+    )
+    parser.add_argument("--modules", metavar="RANGE", help="such as 1-40 or 1-20,41; default: all")
+    add_workbook(parser)
+    parser.set_defaults(run=_run)
+
+
+def _run(arguments: argparse.Namespace) -> None:
+    system = read_system(arguments.file)
+    chosen = set(chosen_modules(system, arguments.modules).numbers.tolist())
+    rows = [row for row in _rows(system) if row["number"] in chosen]  # rings are those of the whole scanner
+    if arguments.json:
+        print(json.dumps({"modules": rows, "units": "mm, radians"}, indent=1))
+        return
+    print(" module  ring        x        y        z        b        l   azimuth elevation     d     Ld     Td      R")
+    for row in rows:
+        print(
+            "{number:7d} {ring:5d} {x:8.2f} {y:8.2f} {z:8.2f} {b:8.2f} {l:8.3f} {azimuth:9.4f} {elevation:9.4f} "
+            "{d:5.2f} {Ld:6.2f} {Td:6.2f} {R:6.2f}".format(**row)
+        )
+    print("lengths in mm, angles in radians")
+
+
+def _rows(system: PinholeSystem) -> list[dict[str, Any]]:
+    x, y, z = system.centers.T
+    columns = {
+        "number": system.numbers,
+        "ring": system.rings() + 1,
+        "x": x,
+        "y": y,
+        "z": z,
+        "b": system.pinhole_distance,
+        "l": system.collimator_length,
+        "azimuth": np.arctan2(y, x),
+        "elevation": np.arctan2(z, np.hypot(x, y)),
+        "d": system.pinhole_diameter,
+        "Ld": system.detector_side,
+        "Td": system.detector_thickness,
+        "R": system.roi_radius,
+    }
+    return [
+        dict(zip(columns, values, strict=True)) for values in zip(*(c.tolist() for c in columns.values()), strict=True)
+    ]

@@ -11,9 +11,21 @@ from typing import Any
 from ..errors import InputError
 from ..system import PinholeSystem
 from ..views import Views
+from .astra import ASTRA
 from .format import Format
+from .leap import LEAP
+from .nerf import NERF
+from .opencv import KORNIA, OPENCV
+from .pytomography import PYTOMOGRAPHY
+from .pytorch3d import PYTORCH3D
+from .record import MPHDRR, read_geometry
+from .rtk import RTK
+from .stir import STIR
 
-FORMATS: dict[str, Format] = {f.name: f for f in ()}
+__all__ = ["FORMATS", "Format", "read_geometry", "write_geometry"]
+
+_FORMATS = (ASTRA, RTK, OPENCV, KORNIA, PYTORCH3D, NERF, LEAP, PYTOMOGRAPHY, STIR, MPHDRR)
+FORMATS: dict[str, Format] = {f.name: f for f in _FORMATS}
 
 
 def write_geometry(

@@ -43,9 +43,9 @@ def _write(system: PinholeSystem, views: Views, path: Path) -> None:
         (views.v_steps - flips[1] * dr[1] * p) * half[1],
     )
     off = np.sum([np.linalg.norm(error, axis=1) for error in errors], axis=0) / min(pitch)
-    if np.any(off > EDGE_TOLERANCE) or detector <= 0:
+    if not np.all(off <= EDGE_TOLERANCE) or detector <= 0:
         raise InputError(
-            f"view {int(np.argmax(off))}: format pytomography holds sources on one circle about the z axis whose principal "
+            f"view {int(np.argmax(~(off <= EDGE_TOLERANCE)))}: format pytomography holds sources on one circle about the z axis whose principal "
             f"rays are horizontal, cross the axis and meet panels of one distance and pixel size in their middles; this "
             f"view is none of them"
         )

@@ -45,8 +45,8 @@ def _write(system: PinholeSystem, views: Views, path: Path) -> None:
         (v - pitch[1] * np.array([0.0, 0.0, 1.0])) * n_v / 2,
     )
     off = np.sum([np.linalg.norm(error, axis=1) for error in errors], axis=0) / pitch.min()
-    if np.any(off > EDGE_TOLERANCE):
-        number = system.numbers[np.argmax(off)]
+    if not np.all(off <= EDGE_TOLERANCE):
+        number = system.numbers[np.argmax(~(off <= EDGE_TOLERANCE))]
         raise InputError(
             f"module {number}: format stir holds crystals that stand parallel to the z axis in one ring: pinholes at z = 0, "
             f"one b + l and one pixel size; this module's crystal is elsewhere"

@@ -59,4 +59,7 @@ def write_geometry(
     """
     if format not in FORMATS:
         raise InputError(f"format {format!r}: expected one of {', '.join(FORMATS)}")
-    FORMATS[format].write_whole(system, views if views is not None else system.views(), path, options)
+    views = system.views() if views is None else views
+    if len(views) == 0:
+        raise InputError("views: expected one or more, got none")
+    FORMATS[format].write_whole(system, views, path, options)

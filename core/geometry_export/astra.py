@@ -37,6 +37,8 @@ def volume_geometry(grid: Grid) -> tuple[NDArray[np.int64], NDArray[np.float64]]
     InputError
         The grid's axes are not along +x, +y, +z.
     """
+    if not isinstance(grid, Grid):
+        raise InputError(f"grid: expected a Grid, got {type(grid).__name__}")
     axes = grid.affine[:3, :3]
     if np.any(np.abs(axes - np.diag(grid.spacing)) > 1e-9 * grid.spacing.max()):
         raise InputError("format astra: its volumes lie along +x, +y, +z, and this grid's axes do not")

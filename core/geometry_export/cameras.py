@@ -11,7 +11,7 @@ from ..errors import InputError
 from ..views import Views
 
 # What a format may move a pixel at the image's edge, in pixels: views rounded to float32 are still good.
-EDGE_TOLERANCE = 1e-3
+_TOLERANCE = 1e-3
 
 
 @dataclass(frozen=True)
@@ -86,6 +86,12 @@ def cameras(views: Views, format: str, mirrored: bool = True) -> Cameras:
     )
 
 
+def first_off(pixels: NDArray[np.float64]) -> int | None:
+    """The first view that a format would move by more than rounding does, from (M,) distances at the image's edge."""
+    off = ~(pixels <= _TOLERANCE)
+    return int(np.argmax(off)) if off.any() else None
+
+
 def pixel_axes(views: Views) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Pixel pitches (M, 2), mm, and unit vectors (2, M, 3) along columns' and rows' index.
 
@@ -106,8 +112,8 @@ def refuse_oblique(views: Views, format: str) -> None:
     n_v, n_u = views.shape
     # How far the last row slides along the columns, and the last column along the rows, in pixels.
     slide = np.abs(cosine) * np.maximum(n_v * pitches[1] / pitches[0], n_u * pitches[0] / pitches[1]) / 2
-    if np.any(slide > EDGE_TOLERANCE):
-        m = int(np.argmax(slide))
+    m = first_off(slide)
+    if m is not None:
         raise InputError(
             f"view {m}: format {format} needs pixel rows perpendicular to columns, and these are "
             f"{np.degrees(np.arccos(cosine[m])):.4g} degrees apart"
@@ -129,8 +135,8 @@ def with_common_pitch(views: Views, format: str) -> tuple[Views, tuple[float, fl
     n_v, n_u = views.shape
     proportion = pitches[:, 1] / pitches[:, 0]
     off = np.abs(proportion / proportion[0] - 1) * max(n_v, n_u) / 2
-    if np.any(off > EDGE_TOLERANCE):
-        m = int(np.argmax(off))
+    m = first_off(off)
+    if m is not None:
         raise InputError(
             f"view {m}: format {format} has one pixel size for all views, and its pixels of {pitches[m, 0]:g} x "
             f"{pitches[m, 1]:g} mm have other proportions than view 0's of {pitches[0, 0]:g} x {pitches[0, 1]:g} mm"

@@ -21,7 +21,7 @@ def _write(system: PinholeSystem, views: Views, path: Path, *, pictures: str = "
     Numbers that all views share stand at the top, the others in the frames. cx and cy count from the outer corner of
     the top left pixel, whose centre is (0.5, 0.5).
     """
-    if "{}" not in pictures:
+    if not isinstance(pictures, str) or "{}" not in pictures:
         raise InputError(f"pictures {pictures!r}: expected a file name with {{}} for the view's number")
     seen = cameras(views, "nerf", mirrored=False)
     n_v, n_u = views.shape

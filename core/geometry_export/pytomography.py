@@ -14,7 +14,7 @@ from ..errors import InputError
 from ..system import PinholeSystem
 from ..views import Views
 from .arrays import SUFFIXES, write_arrays
-from .cameras import EDGE_TOLERANCE, pixel_axes, with_common_pitch
+from .cameras import first_off, pixel_axes, with_common_pitch
 from .format import Format
 
 
@@ -43,11 +43,11 @@ def _write(system: PinholeSystem, views: Views, path: Path) -> None:
         (views.v_steps - flips[1] * dr[1] * p) * half[1],
     )
     off = np.sum([np.linalg.norm(error, axis=1) for error in errors], axis=0) / min(pitch)
-    if not np.all(off <= EDGE_TOLERANCE) or detector <= 0:
+    m = first_off(off) if detector > 0 else 0
+    if m is not None:
         raise InputError(
-            f"view {int(np.argmax(~(off <= EDGE_TOLERANCE)))}: format pytomography holds sources on one circle about the z axis whose principal "
-            f"rays are horizontal, cross the axis and meet panels of one distance and pixel size in their middles; this "
-            f"view is none of them"
+            f"view {m}: format pytomography holds sources on one circle about the z axis whose principal rays are "
+            f"horizontal, cross the axis and meet panels of one distance and pixel size in their middles"
         )
     arrays = {
         "angles": angles,

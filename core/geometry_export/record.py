@@ -79,8 +79,10 @@ def read_geometry(path: str | os.PathLike[str]) -> tuple[PinholeSystem, Views]:
     if document.get("version") != _VERSION:
         raise InputError(f"{path}: version {document.get('version')!r}; this mphDRR reads {_VERSION}")
     try:
-        system = {field: [module[name] for module in document["modules"]] for name, field in _MODULE.items()}
-        images = {field: [view[name] for view in document["views"]] for name, field in _VIEW.items()}
+        system: dict[str, Any] = {
+            field: [module[name] for module in document["modules"]] for name, field in _MODULE.items()
+        }
+        images: dict[str, Any] = {field: [view[name] for view in document["views"]] for name, field in _VIEW.items()}
         shape = (document["rows"], document["columns"])
     except (KeyError, TypeError) as error:
         raise InputError(f"{path}: incomplete, {error} is missing") from error

@@ -14,7 +14,7 @@ import numpy as np
 from ..errors import InputError
 from ..system import PinholeSystem
 from ..views import Views
-from .cameras import EDGE_TOLERANCE
+from .cameras import first_off
 from .format import Format
 
 
@@ -29,7 +29,8 @@ def _write(system: PinholeSystem, views: Views, path: Path) -> None:
     n_v, n_u = views.shape
     to_detector = views.detector_centers - views.sources
     # The plane that the rays of each pixel meet at l behind the pinhole.
-    share = -system.collimator_length / np.einsum("mi,mi->m", to_detector, system.principal_rays)
+    with np.errstate(divide="ignore", invalid="ignore"):  # views of something else are refused below
+        share = -system.collimator_length / np.einsum("mi,mi->m", to_detector, system.principal_rays)
     centers = views.sources + share[:, None] * to_detector
     u, v = share[:, None] * views.u_steps, share[:, None] * views.v_steps
     if v[0, 2] < 0:
@@ -45,32 +46,29 @@ def _write(system: PinholeSystem, views: Views, path: Path) -> None:
         (v - pitch[1] * np.array([0.0, 0.0, 1.0])) * n_v / 2,
     )
     off = np.sum([np.linalg.norm(error, axis=1) for error in errors], axis=0) / pitch.min()
-    if not np.all(off <= EDGE_TOLERANCE):
-        number = system.numbers[np.argmax(~(off <= EDGE_TOLERANCE))]
+    m = first_off(off)
+    if m is not None:
         raise InputError(
-            f"module {number}: format stir holds crystals that stand parallel to the z axis in one ring: pinholes at z = 0, "
-            f"one b + l and one pixel size; this module's crystal is elsewhere"
+            f"module {system.numbers[m]}: format stir holds crystals that stand parallel to the z axis in one ring: "
+            f"pinholes at z = 0, one b + l and one pixel size"
         )
     thickness = _common(system.detector_thickness, system, "crystal thickness")
     collimator = float(np.mean(system.pinhole_distance))
     detector = ["Detectors in cm, each a ring of one for any azimuth", f"Number of rings: {len(system)}"]
-    detector += ["Sigma (cm): 0.", f"Crystal thickness (cm): {thickness / 10!r}"]
+    detector += ["Sigma (cm): 0.", f"Crystal thickness (cm): {thickness / 10:.9f}"]
     detector += ["Crystal attenuation coefficient (cm -1): 0."]
-    holes = ["Pinholes, cm and degrees", "Model (cyl/pol): pol", f"Collimator radius (cm): {collimator / 10!r}"]
+    holes = ["Pinholes, cm and degrees", "Model (cyl/pol): pol", f"Collimator radius (cm): {collimator / 10:.9f}"]
     holes += ["Wall thickness (cm): 0.", f"Number of holes: {len(system)}"]
     for m in range(len(system)):
-        angle = float(np.degrees(np.arctan2(x1[m, 1], x1[m, 0])))
-        detector += ["Nangles: 1", f"ang0 (deg): {angle!r}", "incr (deg): 0.", "z0 (cm): 0."]
-        x, y, z = (
-            float(value) / 10 for value in (views.sources[m] @ x1[m], views.sources[m] @ y1[m], views.sources[m, 2])
-        )
-        d = float(system.pinhole_diameter[m]) / 10
+        angle = np.degrees(np.arctan2(x1[m, 1], x1[m, 0]))
+        detector += ["Nangles: 1", f"ang0 (deg): {angle:.9f}", "incr (deg): 0.", "z0 (cm): 0."]
+        x, y, z = np.array([views.sources[m] @ x1[m], views.sources[m] @ y1[m] - collimator, views.sources[m, 2]]) / 10
+        d = system.pinhole_diameter[m] / 10
         # So wide that the whole crystal is seen through the whole hole.
         open_to = (system.detector_side[m] + system.pinhole_diameter[m]) / 2 / system.collimator_length[m]
-        accepted = float(np.degrees(np.arctan(open_to)))
-        holes.append(
-            f"h{m + 1}: {m + 1} {x!r} {y - collimator / 10!r} {z!r} round {d!r} {d!r} 0. 0. {accepted!r} {accepted!r}"
-        )
+        accepted = np.degrees(np.arctan(open_to))
+        numbers = (d, d, 0.0, 0.0, accepted, accepted)
+        holes.append(f"h{m + 1}: {m + 1} {x:.9f} {y:.9f} {z:.9f} round " + " ".join(f"{n:.9f}" for n in numbers))
     roi = float(np.max(system.roi_radius))
     matrix = [
         "Projection Matrix By Bin Pinhole SPECT UB Parameters:=",
@@ -82,7 +80,7 @@ def _write(system: PinholeSystem, views: Views, path: Path) -> None:
         "psf correction := no",
         "doi correction := no",
         "attenuation type := no",
-        f"object radius (cm) := {roi / 10!r}",
+        f"object radius (cm) := {roi / 10:.9f}",
         "mask from attenuation map := 0",
         "keep all views in cache := 0",
         "End Projection Matrix By Bin Pinhole SPECT UB Parameters:=",
@@ -126,4 +124,4 @@ def _common(values: np.ndarray, system: PinholeSystem, what: str) -> float:
     return float(values[0])
 
 
-STIR = Format("stir", "STIR: pinhole matrix, for one horizontal ring (folder)", (), _write)
+STIR = Format("stir", "STIR: pinhole matrix, for one horizontal ring", (), _write)

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 import mphdrr.core as mph
+from mphdrr.core.cli import main
 from mphdrr.core.frames import euler_pose
 from mphdrr.core.geometry_export import FORMATS
 
@@ -442,3 +443,54 @@ def test_what_cannot_be_written_is_said_at_once(name, format, options, message, 
 def test_names_in_capitals_are_written_as_they_are(system, tmp_path):
     mph.write_geometry(system, tmp_path / "A.NPZ", "astra")
     assert [p.name for p in tmp_path.iterdir()] == ["A.NPZ"]
+
+
+@pytest.mark.parametrize(
+    ("name", "words", "format"),
+    [
+        ("a.xml", [], "rtk"),
+        ("new/a.npz", ["--format", "opencv", "--modules", "3-9", "--detector", "real"], "opencv"),
+        ("a.json", ["--format", "nerf", "--size", "30", "40", "--pitch", "9", "--set", "pictures=p/{}.png"], "nerf"),
+        ("a.npz", ["--format", "pytorch3d", "--set", "in_ndc=no"], "pytorch3d"),
+    ],
+)
+def test_command_line_writes_them(name, words, format, workbook, scanner, rng, tmp_path, capsys):
+    assert main(["geometry", "export", str(workbook), "-o", str(tmp_path / name), *words]) == 0
+    assert name in capsys.readouterr().out
+    part = scanner[2:9] if "--modules" in words else scanner
+    shape = (30, 40) if "--size" in words else (256, 256)
+    views = part.views(shape, "real" if "real" in words else "virtual", pitch=9.0 if "--pitch" in words else None)
+    points = fiducials(views, rng)
+    assert np.abs(READERS[format](tmp_path / name, points) - project(views, points)).max() < 1e-6
+
+
+def test_command_line_takes_a_grid_from_a_volume(workbook, tmp_path):
+    grid = mph.Grid.centered((4, 6, 10), (1.0, 2.0, 0.5))
+    mph.write_volume(mph.Volume(np.ones(grid.shape, np.float32), grid, "mu"), tmp_path / "v.nii.gz")
+    words = ["--format", "astra", "--set", f"grid={tmp_path / 'v.nii.gz'}"]
+    assert main(["geometry", "export", str(workbook), "-o", str(tmp_path / "a.npz"), *words]) == 0
+    assert arrays(tmp_path / "a.npz")["volume_counts"].tolist() == [6, 4, 10]
+
+
+@pytest.mark.parametrize(
+    ("name", "words", "message"),
+    [
+        ("a.npz", [], "choose one by --format: astra, opencv"),
+        ("a", [], "choose one by --format: astra, rtk"),
+        ("a.txt", ["--format", "rtk"], "expected a name ending in .xml"),
+        ("a.npz", ["--format", "astra", "--set", "in_ndc=no"], "expected NAME=VALUE, format astra has grid"),
+        ("a.npz", ["--format", "pytorch3d", "--set", "in_ndc=perhaps"], "expected in_ndc=yes|no"),
+        ("a.npz", ["--format", "astra", "--set", "grid=none.nii"], "none.nii"),
+    ],
+)
+def test_command_line_refuses_in_one_line(name, words, message, workbook, tmp_path, capsys):
+    assert main(["geometry", "export", str(workbook), "-o", str(tmp_path / name), *words]) == 1
+    assert message in capsys.readouterr().err
+    assert not list(tmp_path.iterdir())
+
+
+def test_help_lists_all_formats(capsys):
+    assert main(["geometry", "export", "--help"]) == 0
+    text = " ".join(capsys.readouterr().out.split())
+    assert all(f"{format.name}: {format.title}" in text for format in FORMATS.values())
+    assert "..." not in text.replace("[--set", "")  # every option can be typed

@@ -33,8 +33,9 @@ def _write(system: PinholeSystem, views: Views, path: Path) -> None:
         share = -system.collimator_length / np.einsum("mi,mi->m", to_detector, system.principal_rays)
     centers = views.sources + share[:, None] * to_detector
     u, v = share[:, None] * views.u_steps, share[:, None] * views.v_steps
-    if v[0, 2] < 0:
-        raise InputError("format stir describes the crystals: expected views with detector 'real'")
+    inverted = v[0, 2] < 0
+    if inverted:
+        u, v = -u, -v
     along = u * [1.0, 1.0, 0.0]
     x1 = along / np.linalg.norm(along, axis=1, keepdims=True)
     y1 = np.cross([0.0, 0.0, 1.0], x1)
@@ -52,6 +53,8 @@ def _write(system: PinholeSystem, views: Views, path: Path) -> None:
             f"module {system.numbers[m]}: format stir holds crystals that stand parallel to the z axis in one ring: "
             f"pinholes at z = 0, one b + l and one pixel size"
         )
+    if inverted:
+        raise InputError("format stir describes the crystals: expected views with detector 'real'")
     thickness = _common(system.detector_thickness, system, "crystal thickness")
     collimator = float(np.mean(system.pinhole_distance))
     detector = ["Detectors in cm, each a ring of one for any azimuth", f"Number of rings: {len(system)}"]

@@ -38,7 +38,7 @@ def _write(system: PinholeSystem, views: Views, path: Path, *, pictures: str = "
         "cx": corner[:, 0],
         "cy": corner[:, 1],
     }
-    common = {name: values[0] for name, values in intrinsics.items() if np.all(values == values[0])}
+    common = {name: values[0] for name, values in intrinsics.items() if np.ptp(values) < 1e-9}  # but for rounding
     numbers = system.numbers if len(system) == len(views) else np.arange(1, len(views) + 1)
     digits = len(str(numbers.max()))
     frames: list[dict[str, Any]] = [

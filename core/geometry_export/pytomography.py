@@ -30,7 +30,8 @@ def _write(system: PinholeSystem, views: Views, path: Path) -> None:
     z = views.sources[:, 2]
     # Its panels face the origin, so that those away from z = 0 are tilted: r and p as in its source.
     centers = detector * out + z[:, None] * [0.0, 0.0, 1.0]
-    facing = -centers / np.linalg.norm(centers, axis=1, keepdims=True)
+    with np.errstate(invalid="ignore"):  # what is no number is refused below
+        facing = -centers / np.linalg.norm(centers, axis=1, keepdims=True)
     r = np.stack([facing[:, 1], -facing[:, 0], np.zeros_like(z)], axis=1)
     p = np.cross(facing, r)
     flips = np.sign([columns[0] @ r[0], rows[0] @ p[0]])

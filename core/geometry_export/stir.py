@@ -28,8 +28,8 @@ def _write(system: PinholeSystem, views: Views, path: Path) -> None:
         raise InputError(f"format stir describes the modules' crystals: expected {len(system)} views, got {len(views)}")
     n_v, n_u = views.shape
     to_detector = views.detector_centers - views.sources
-    # The plane that the rays of each pixel meet at l behind the pinhole.
-    with np.errstate(divide="ignore", invalid="ignore"):  # views of something else are refused below
+    with np.errstate(divide="ignore", invalid="ignore"):  # what is no number is refused below
+        # The plane that the rays of each pixel meet at l behind the pinhole.
         share = -system.collimator_length / np.einsum("mi,mi->m", to_detector, system.principal_rays)
     centers = views.sources + share[:, None] * to_detector
     u, v = share[:, None] * views.u_steps, share[:, None] * views.v_steps
@@ -37,7 +37,8 @@ def _write(system: PinholeSystem, views: Views, path: Path) -> None:
     if inverted:
         u, v = -u, -v
     along = u * [1.0, 1.0, 0.0]
-    x1 = along / np.linalg.norm(along, axis=1, keepdims=True)
+    with np.errstate(invalid="ignore"):
+        x1 = along / np.linalg.norm(along, axis=1, keepdims=True)
     y1 = np.cross([0.0, 0.0, 1.0], x1)
     radius = float(centers[0] @ y1[0])
     pitch = np.array([np.linalg.norm(u[0]), np.linalg.norm(v[0])])
@@ -47,7 +48,7 @@ def _write(system: PinholeSystem, views: Views, path: Path) -> None:
         (v - pitch[1] * np.array([0.0, 0.0, 1.0])) * n_v / 2,
     )
     off = np.sum([np.linalg.norm(error, axis=1) for error in errors], axis=0) / pitch.min()
-    m = first_off(off)
+    m = first_off(off) if radius > 0 else 0
     if m is not None:
         raise InputError(
             f"module {system.numbers[m]}: format stir holds crystals that stand parallel to the z axis in one ring: "

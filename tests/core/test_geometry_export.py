@@ -324,9 +324,11 @@ def test_pixels_of_other_proportions_are_refused_where_there_is_one_size(format,
         mph.write_geometry(system, tmp_path / f"a{FORMATS[format].suffixes[0]}", format, views=views)
 
 
+@pytest.mark.parametrize("mirrored", [False, True])
 @pytest.mark.parametrize("detector", ["virtual", "real"])
-def test_pytomography_holds_one_horizontal_ring(detector, ring, rng, tmp_path):
+def test_pytomography_holds_one_horizontal_ring(detector, mirrored, ring, rng, tmp_path):
     views = ring.views(shape=(23, 40), detector=detector, pitch=(1.2, 0.9))
+    views = remade(views, u_steps=-views.u_steps) if mirrored else views
     mph.write_geometry(ring, tmp_path / "a.npz", "pytomography", views=views)
     points = fiducials(views, rng)
     assert np.abs(read_pytomography(tmp_path / "a.npz", points) - project(views, points)).max() < 1e-6
@@ -339,6 +341,10 @@ def test_stir_holds_one_horizontal_ring(ring, rng, tmp_path):
     assert np.abs(read_stir(tmp_path / "stir", points) - project(views, points)).max() < 1e-6
     with pytest.raises(mph.InputError, match="'real'"):
         mph.write_geometry(ring, tmp_path / "other", "stir", views=ring.views())
+    with pytest.raises(mph.InputError, match="format stir holds"):
+        mph.write_geometry(ring, tmp_path / "other", "stir", views=remade(views, u_steps=-views.u_steps))
+    with pytest.raises(mph.InputError, match="expected 7 views, got 2"):
+        mph.write_geometry(ring, tmp_path / "other", "stir", views=views[:2])
 
 
 def test_stir_takes_pinholes_at_many_distances_before_one_cylinder(ring, rng, tmp_path):
@@ -364,10 +370,15 @@ def test_what_a_ring_does_not_hold_is_refused(format, change, ring, tmp_path):
     assert not list(tmp_path.iterdir())
 
 
-def test_scanner_is_too_free_for_ct_formats(scanner, tmp_path):
-    for format, path in (("pytomography", tmp_path / "a.npz"), ("stir", tmp_path / "a")):
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize(("format", "name"), [("pytomography", "a.npz"), ("stir", "a")])
+def test_scanners_are_too_free_for_ct_formats(format, name, scanner, rng, tmp_path):
+    x, y, z = (np.tile(axis, (80, 1)) for axis in np.eye(3))
+    on_axis = mph.Views(0 * z, 9 * z, y, x, (4, 4))
+    upright = mph.Views(0 * z, 9 * y, z, x, (4, 4))
+    for views in (scanner.views(), scanner.views(detector="real"), general_views(rng, count=80), on_axis, upright):
         with pytest.raises(mph.InputError, match=f"format {format} holds"):
-            mph.write_geometry(scanner, path, format, views=scanner.views(detector="real"))
+            mph.write_geometry(scanner, tmp_path / name, format, views=views)
 
 
 def test_record_reads_back_bit_for_bit(system, rng, tmp_path):
@@ -440,6 +451,11 @@ def test_what_cannot_be_written_is_said_at_once(name, format, options, message, 
     assert not list(tmp_path.iterdir())
 
 
+def test_no_views_are_refused(system, tmp_path):
+    with pytest.raises(mph.InputError, match="views: expected one or more"):
+        mph.write_geometry(system, tmp_path / "a.npz", "astra", views=system.views()[:0])
+
+
 def test_names_in_capitals_are_written_as_they_are(system, tmp_path):
     mph.write_geometry(system, tmp_path / "A.NPZ", "astra")
     assert [p.name for p in tmp_path.iterdir()] == ["A.NPZ"]
@@ -493,4 +509,4 @@ def test_help_lists_all_formats(capsys):
     assert main(["geometry", "export", "--help"]) == 0
     text = " ".join(capsys.readouterr().out.split())
     assert all(f"{format.name}: {format.title}" in text for format in FORMATS.values())
-    assert "..." not in text.replace("[--set", "")  # every option can be typed
+    assert "=..." not in text  # every option can be typed

@@ -14,6 +14,7 @@ from .errors import InputError, InputWarning
 from .export import read_run, write_run
 from .frames import euler_pose
 from .geometry_checks import GeometryReport, check_geometry
+from .geometry_export import read_geometry, write_geometry
 from .grid import Grid
 from .isotopes import ISOTOPES, Isotope, isotope
 from .mosaic import as_seen, mosaic
@@ -59,11 +60,13 @@ __all__ = [
     "mosaic",
     "pinhole_views",
     "project_run",
+    "read_geometry",
     "read_run",
     "read_system",
     "read_volume",
     "sample_counts",
     "trace_rays",
+    "write_geometry",
     "write_run",
     "write_volume",
 ]

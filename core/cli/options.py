@@ -63,8 +63,8 @@ def add_phantom_options(parser: argparse.ArgumentParser) -> None:
     )
 
 
-def add_view_options(parser: argparse.ArgumentParser) -> None:
-    """The images' size and place."""
+def add_view_options(parser: argparse.ArgumentParser, computing: bool = True) -> None:
+    """The images' size and place and, for those that are `computing` them, by what."""
     parser.add_argument("--size", type=int, nargs=2, default=[256, 256], metavar=("ROWS", "COLUMNS"), help="pixels")
     parser.add_argument(
         "--detector", choices=("virtual", "real"), default="virtual", help="upright in front, or crystal"
@@ -72,6 +72,8 @@ def add_view_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--magnification", type=float, default=10.0, help="virtual detector's distance in units of l")
     parser.add_argument("--pitch", type=float, metavar="MM", help="pixel size; default: the crystal's whole side")
     parser.add_argument("--modules", metavar="RANGE", help="such as 1-40 or 1-20,41; default: all")
+    if not computing:
+        return
     parser.add_argument("--backend", default="auto", help="auto, numba, cuda, torch or numpy")
     parser.add_argument("--threads", type=int, metavar="N", help="processor threads; default: all")
 

@@ -11,10 +11,36 @@ from typing import Any
 from ..errors import InputError
 from ..system import PinholeSystem
 from ..views import Views
+from .astra import ASTRA
 from .format import Format
+from .leap import LEAP
+from .nerf import NERF
+from .opencv import KORNIA, OPENCV
+from .pytomography import PYTOMOGRAPHY
+from .pytorch3d import PYTORCH3D
+from .record import MPHDRR, read_geometry
+from .rtk import RTK
 from .solids import GLB, STL, STL_PARTS, THREE_MF
+from .stir import STIR
 
-_FORMATS = (STL, STL_PARTS, THREE_MF, GLB)
+__all__ = ["FORMATS", "Format", "read_geometry", "write_geometry"]
+
+_FORMATS = (
+    ASTRA,
+    RTK,
+    OPENCV,
+    KORNIA,
+    PYTORCH3D,
+    NERF,
+    LEAP,
+    PYTOMOGRAPHY,
+    STIR,
+    STL,
+    STL_PARTS,
+    THREE_MF,
+    GLB,
+    MPHDRR,
+)
 FORMATS: dict[str, Format] = {f.name: f for f in _FORMATS}
 
 
@@ -49,4 +75,7 @@ def write_geometry(
     """
     if format not in FORMATS:
         raise InputError(f"format {format!r}: expected one of {', '.join(FORMATS)}")
-    FORMATS[format].write_whole(system, views if views is not None else system.views(), path, options)
+    views = system.views() if views is None else views
+    if len(views) == 0:
+        raise InputError("views: expected one or more, got none")
+    FORMATS[format].write_whole(system, views, path, options)

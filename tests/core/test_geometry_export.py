@@ -1,0 +1,512 @@
+"""Every format of cameras, read back by its own documentation, sees points where the views see them."""
+
+from __future__ import annotations
+
+import json
+import re
+import xml.etree.ElementTree as ET
+
+import numpy as np
+import pytest
+
+import mphdrr.core as mph
+from mphdrr.core.cli import main
+from mphdrr.core.frames import euler_pose
+from mphdrr.core.geometry_export import FORMATS
+
+
+def arrays(path):
+    if path.suffix == ".json":
+        return {name: np.asarray(value) for name, value in json.loads(path.read_text()).items()}
+    with np.load(path) as file:
+        return dict(file)
+
+
+def homogeneous(points):
+    return np.concatenate([points, np.ones((*points.shape[:-1], 1))], axis=-1)
+
+
+def divide(seen):
+    return seen[..., :2] / seen[..., 2:]
+
+
+def project(views, points):
+    """Points (M, N, 3) to (M, N, 2): column and row."""
+    return divide(np.einsum("mij,mnj->mni", views.projection_matrices(), homogeneous(points)))
+
+
+def on_panel(source, center, u, v, shape, points):
+    """Columns and rows where rays from `source` through `points` meet the plane of pixels, solved ray by ray."""
+    n_v, n_u = shape
+    answer = np.empty((*points.shape[:-1], 2))
+    for m in range(len(points)):
+        for n, point in enumerate(points[m]):
+            # source + t (point - source) = center + a u + b v
+            _, a, b = np.linalg.solve(np.stack([point - source[m], -u[m], -v[m]], axis=1), center[m] - source[m])
+            answer[m, n] = a + (n_u - 1) / 2, b + (n_v - 1) / 2
+    return answer
+
+
+# Readers: a file and points (M, N, 3) to columns and rows (M, N, 2) of the array, 0 at the centre of pixel 0.
+
+
+def read_astra(path, points):
+    a = arrays(path)
+    source, center, u, v = a["vectors"].reshape(-1, 4, 3).transpose(1, 0, 2)
+    return on_panel(source, center, u, v, (int(a["det_row_count"]), int(a["det_col_count"])), points)
+
+
+def read_rtk(path, points):
+    """RTK's page "3D projection geometry": the matrix from the nine parameters, which must be that of the file."""
+    text = path.read_text()
+    spacing, origin = (
+        np.array(re.search(rf"{word} (\S+) (\S+) [01]\b", text).groups(), float) for word in ("spacing", "origin")
+    )
+    root = ET.fromstring(text)
+    assert (root.tag, root.get("version")) == ("RTKThreeDCircularGeometry", "3")
+    seen = []
+    for one, at in zip(root.findall("Projection"), points, strict=True):
+        value = {element.tag: float(element.text) for element in one if element.tag != "Matrix"}
+        c, s = (
+            {name: f(-np.radians(value[name])) for name in ("GantryAngle", "OutOfPlaneAngle", "InPlaneAngle")}
+            for f in (np.cos, np.sin)
+        )
+        in_plane = np.eye(4)
+        in_plane[:2, :2] = [[c["InPlaneAngle"], -s["InPlaneAngle"]], [s["InPlaneAngle"], c["InPlaneAngle"]]]
+        out = np.eye(4)
+        out[1:3, 1:3] = [[c["OutOfPlaneAngle"], -s["OutOfPlaneAngle"]], [s["OutOfPlaneAngle"], c["OutOfPlaneAngle"]]]
+        gantry = np.eye(4)
+        gantry[np.ix_([0, 2], [0, 2])] = [[c["GantryAngle"], s["GantryAngle"]], [-s["GantryAngle"], c["GantryAngle"]]]
+        to_source = np.eye(4)
+        to_source[:2, 3] = -value["SourceOffsetX"], -value["SourceOffsetY"]
+        sdd, sid = value["SourceToDetectorDistance"], value["SourceToIsocenterDistance"]
+        magnify = np.array([[-sdd, 0, 0, 0], [0, -sdd, 0, 0], [0, 0, 1, -sid]])
+        shift = np.eye(3)
+        shift[0, 2] = value["SourceOffsetX"] - value["ProjectionOffsetX"]
+        shift[1, 2] = value["SourceOffsetY"] - value["ProjectionOffsetY"]
+        matrix = shift @ magnify @ to_source @ in_plane @ out @ gantry
+        written = np.array(one.find("Matrix").text.split(), float).reshape(3, 4)
+        assert np.allclose(matrix, written, rtol=1e-12, atol=1e-6)  # RTK refuses files that are 1e-3 off
+        seen.append((divide(homogeneous(at) @ written.T) - origin) / spacing)
+    return np.array(seen)
+
+
+def read_opencv(path, points):
+    a = arrays(path)
+    camera = np.einsum("mij,mnj->mni", a["R"], points) + a["t"][:, None]
+    assert np.allclose(np.linalg.det(a["R"]), 1)
+    assert np.all(camera[..., 2] > 0)
+    fx, fy, cx, cy = (a["K"][:, i, j, None] for i, j in ((0, 0), (1, 1), (0, 2), (1, 2)))
+    x, y = camera[..., 0] / camera[..., 2], camera[..., 1] / camera[..., 2]
+    return np.stack([fx * x + cx, fy * y + cy], axis=-1)
+
+
+def read_kornia(path, points):
+    a = arrays(path)
+    return divide(np.einsum("mij,mjk,mnk->mni", a["intrinsics"], a["extrinsics"], homogeneous(points))[..., :3])
+
+
+def read_pytorch3d(path, points):
+    """PyTorch3D's page "Cameras": row vectors, +X left, +Y up; screen from NDC by its own formulas."""
+    a = arrays(path)
+    view = points @ a["R"] + a["T"][:, None]
+    assert np.allclose(np.linalg.det(a["R"]), 1)
+    assert np.all(view[..., 2] > 0)
+    size, f, p = a["image_size"][:, None, ::-1], a["focal_length"][:, None], a["principal_point"][:, None]
+    short = size.min(axis=-1, keepdims=True)
+    if not a["in_ndc"]:
+        f, p = f * 2.0 / short, -(p - size / 2.0) * 2.0 / short
+    ndc = f * view[..., :2] / view[..., 2:] + p
+    return size / 2.0 - ndc * short / 2.0 - 0.5  # (0, 0) of the screen is the corner of the first pixel
+
+
+def read_nerf(path, points):
+    """nerfstudio's page "Data conventions": +X right, +Y up, -Z forward; of pictures that `as_seen` turned."""
+    document = json.loads(path.read_text())
+    seen = []
+    for frame, at in zip(document["frames"], points, strict=True):
+        one = document | frame
+        camera = homogeneous(at) @ np.linalg.inv(one["transform_matrix"]).T
+        assert np.all(camera[:, 2] < 0)
+        assert np.isclose(np.linalg.det(one["transform_matrix"]), 1)
+        assert np.isclose(one["fl_x"], 0.5 * one["w"] / np.tan(0.5 * one["camera_angle_x"]))
+        x = one["cx"] + one["fl_x"] * camera[:, 0] / -camera[:, 2]
+        y = one["cy"] - one["fl_y"] * camera[:, 1] / -camera[:, 2]
+        seen.append(np.stack([one["w"] - 1 - (x - 0.5), one["h"] - 1 - (y - 0.5)], axis=-1))
+    return np.array(seen)
+
+
+def read_leap(path, points):
+    """LEAP's set_modularbeam: s(x) and t(x) of its documentation, along colVectors and rowVectors."""
+    a = arrays(path)
+    y, c, v, u = (a[n].astype(float)[:, None] for n in ("sourcePositions", "moduleCenters", "rowVectors", "colVectors"))
+
+    def dot(first, second):
+        return np.sum(first * second, axis=-1)
+
+    n = np.cross(u, v)
+    depth = dot(c - y, n) / dot(points - y, n)
+    s = depth * dot(points - y, u) - dot(c - y, u)
+    t = depth * dot(points - y, v) - dot(c - y, v)
+    column = s / a["pixelWidth"] + (a["numCols"] - 1) / 2
+    return np.stack([column, t / a["pixelHeight"] + (a["numRows"] - 1) / 2], axis=-1)
+
+
+def read_pytomography(path, points):
+    """CTConeBeamFlatPanelProjMeta of PyTomography 3.4: the pixels' places by its source."""
+    a = arrays(path)
+    angle, z = a["angles"], a["z_locations"]
+    panel = np.stack([a["detector_radius"] * np.cos(angle), a["detector_radius"] * np.sin(angle), z], axis=-1)
+    beam = np.stack([-a["beam_radius"] * np.cos(angle), -a["beam_radius"] * np.sin(angle), z], axis=-1)
+    o = -panel / np.linalg.norm(panel, axis=-1, keepdims=True)
+    r = np.stack([o[:, 1], -o[:, 0], 0 * z], axis=-1)
+    n_x, n_y = (int(n) for n in a["shape"])
+    seen = on_panel(beam, panel, r * a["dr"][0], np.cross(o, r) * a["dr"][1], (n_y, n_x), points)
+    if a["flip_columns"]:
+        seen[..., 0] = n_x - 1 - seen[..., 0]
+    if a["flip_rows"]:
+        seen[..., 1] = n_y - 1 - seen[..., 1]
+    return seen
+
+
+def read_stir(path, points):
+    """PinholeSPECTUB_Tools and PinholeSPECTUB_Weight3d of STIR 6: bins that voxels' rays through the holes meet."""
+    header = dict(re.findall(r"^!?([^:=]+?) *:= *(\S+)$", (path / "projections.hs").read_text(), re.M))
+    n_bin, n_slice = int(header["matrix size [1]"]), int(header["matrix size [2]"])
+    width, height = (float(header[f"scaling factor (mm/pixel) [{axis}]"]) / 10 for axis in (1, 2))
+    detectors = re.findall(r"^[^:]*: *(\S+)", (path / "detector.txt").read_text(), re.M)
+    thickness = float(detectors[2])
+    radius = float(header["radius"]) / 10 + thickness / 2  # without depth of interaction
+    angles = np.radians(np.array(detectors[4:], float).reshape(-1, 4)[:, 1])
+    assert int(detectors[0]) == len(angles) == int(header["number of projections"])
+    lines = (path / "collimator.txt").read_text().splitlines()
+    wall = float(lines[2].split(":")[1])
+    seen = []
+    for angle, line, at in zip(angles, lines[5:], points, strict=True):
+        x, y, z = (float(number) for number in line.split(":")[1].split()[1:4])
+        voxel = at / 10
+        x1 = voxel[:, 0] * np.cos(angle) + voxel[:, 1] * np.sin(angle)
+        y1 = -voxel[:, 0] * np.sin(angle) + voxel[:, 1] * np.cos(angle)
+        along = (radius - y1) / (wall + y - y1)
+        assert np.all(along > 1)
+        x1d, z1d = x1 + along * (x - x1), voxel[:, 2] + along * (z - voxel[:, 2])
+        column, row = (x1d + n_bin * width / 2) / width, (z1d + n_slice * height / 2) / height
+        seen.append(np.stack([column - 0.5, row - 0.5], axis=-1))
+    return np.array(seen)
+
+
+READERS = {
+    "astra": read_astra,
+    "rtk": read_rtk,
+    "opencv": read_opencv,
+    "kornia": read_kornia,
+    "pytorch3d": read_pytorch3d,
+    "nerf": read_nerf,
+    "leap": read_leap,
+}
+MIRRORED = set(READERS) - {"nerf"}
+
+
+ARRAYS = ("sources", "detector_centers", "u_steps", "v_steps")
+
+
+def remade(views, **changes):
+    """The views with other arrays."""
+    return mph.Views(**{name: getattr(views, name) for name in ARRAYS} | changes, shape=views.shape)
+
+
+def off(format, views, points, path, system, **options):
+    mph.write_geometry(system, path, format, views=views, **options)
+    return np.abs(READERS[format](path, points) - project(views, points)).max()
+
+
+def fiducials(views, rng, count=20):
+    """Points (M, count, 3) that the views see: anywhere on rays of pixels, between source and detector."""
+    n_v, n_u = views.shape
+    a = (rng.uniform(-0.5, n_u - 0.5, (len(views), count, 1)) - (n_u - 1) / 2) * views.u_steps[:, None]
+    b = (rng.uniform(-0.5, n_v - 0.5, (len(views), count, 1)) - (n_v - 1) / 2) * views.v_steps[:, None]
+    t = rng.uniform(0.1, 0.9, (len(views), count, 1))
+    return views.sources[:, None] + t * (views.detector_centers[:, None] + a + b - views.sources[:, None])
+
+
+def general_views(rng, mirrored=False, count=15):
+    """Views of any pose, with pixels of one proportion and many sizes, seen far off their middles."""
+    poses = np.array([euler_pose(*rng.uniform(-4, 4, 3))[:3, :3] for _ in range(count)])
+    poses[0] = euler_pose(0, np.pi / 2, 0)[:3, :3]  # axes along the world's
+    poses[1] = [[1, 0, 0], [0, 0, 1], [0, -1, 0]]  # RTK's gantry and in-plane angles are one here
+    x, y, z = poses.transpose(1, 0, 2)
+    size = rng.uniform(0.2, 3, (count, 1))
+    sources = rng.uniform(-300, 300, (count, 3))
+    centers = sources + rng.uniform(200, 900, (count, 1)) * z + rng.uniform(-60, 60, (count, 1)) * (x + 0.5 * y)
+    return mph.Views(sources, centers, (-size if mirrored else size) * x, 0.7 * size * y, (37, 64))
+
+
+@pytest.fixture
+def scanner(workbook):
+    return mph.read_system(workbook)
+
+
+@pytest.fixture
+def ring(rng):
+    """Pinholes in the plane z = 0, one b, one l, one size, at any azimuth: what CT's formats can hold."""
+    azimuth = rng.uniform(-np.pi, np.pi, 7)
+    centers = 210 * np.stack([np.cos(azimuth), np.sin(azimuth), 0 * azimuth], axis=1)
+    return mph.PinholeSystem(centers, 2.3, 60.0, 50.0, 10.0, 75.0)
+
+
+@pytest.mark.parametrize("format", READERS)
+def test_scanner_is_seen_alike_through_every_format(format, scanner, rng, tmp_path):
+    """All 80 modules, both detectors, other than square images and pixels, shifted."""
+    in_roi = rng.normal(size=(80, 20, 3))
+    in_roi *= 75 * rng.uniform(0, 1, (80, 20, 1)) ** (1 / 3) / np.linalg.norm(in_roi, axis=-1, keepdims=True)
+    for settings in (
+        {},
+        {"shape": (31, 48), "magnification": 7.0, "pitch": (2.5, 3.5), "offset": (13.0, -7.0)},
+        {"shape": (65, 32), "detector": "real", "pitch": (0.9, 1.3), "offset": (3.0, -7.0)},
+    ):
+        views = scanner.views(**settings)
+        for suffix in FORMATS[format].suffixes:
+            assert off(format, views, in_roi, tmp_path / f"geometry{suffix}", scanner) < 1e-4
+
+
+@pytest.mark.parametrize("mirrored", [False, True])
+@pytest.mark.parametrize("format", READERS)
+def test_views_of_any_pose_are_seen_alike(format, mirrored, scanner, rng, tmp_path):
+    views = general_views(rng, mirrored)
+    path = tmp_path / f"geometry{FORMATS[format].suffixes[0]}"
+    if mirrored and format not in MIRRORED:
+        with pytest.raises(mph.InputError, match=r"^view 0: format nerf cannot hold a mirror image"):
+            mph.write_geometry(scanner, path, format, views=views)
+        assert not path.exists()
+        return
+    assert off(format, views, fiducials(views, rng), path, scanner) < (1e-3 if format == "leap" else 1e-6)
+
+
+def test_pytorch3d_in_screen_space(system, rng, tmp_path):
+    views = system.views(shape=(20, 33))
+    points = fiducials(views, rng)
+    assert off("pytorch3d", views, points, tmp_path / "a.npz", system, in_ndc=False) < 1e-9
+    assert arrays(tmp_path / "a.npz")["principal_point"][0] == pytest.approx([33 / 2, 20 / 2])
+
+
+def test_views_rounded_to_float32_are_still_cameras(system, rng, tmp_path):
+    views = system.views(shape=(256, 256))
+    rounded = remade(views, **{name: getattr(views, name).astype(np.float32) for name in ARRAYS})
+    for format in READERS:
+        assert off(format, rounded, fiducials(views, rng), tmp_path / f"a{FORMATS[format].suffixes[0]}", system) < 5e-3
+
+
+@pytest.mark.parametrize("format", sorted(set(READERS) - {"astra"}))
+def test_oblique_pixels_are_refused_by_view(format, system, tmp_path):
+    views = system.views(shape=(30, 40))
+    v_steps = views.v_steps.copy()
+    v_steps[4] += 0.01 * views.u_steps[4]
+    views = remade(views, v_steps=v_steps)
+    path = tmp_path / f"a{FORMATS[format].suffixes[0]}"
+    with pytest.raises(mph.InputError, match=rf"^view 4: format {format} needs pixel rows perpendicular to columns"):
+        mph.write_geometry(system, path, format, views=views)
+    assert not path.exists()
+
+
+def test_oblique_pixels_are_no_matter_to_astra(system, rng, tmp_path):
+    views = system.views(shape=(30, 40))
+    views = remade(views, v_steps=views.v_steps + 0.3 * views.u_steps)
+    assert off("astra", views, fiducials(views, rng), tmp_path / "a.npz", system) < 1e-9
+
+
+@pytest.mark.parametrize("format", ["rtk", "leap"])
+def test_pixels_of_other_proportions_are_refused_where_there_is_one_size(format, system, tmp_path):
+    views = system.views(shape=(30, 40))
+    u_steps = views.u_steps.copy()
+    u_steps[3] *= 1.01
+    views = remade(views, u_steps=u_steps)
+    with pytest.raises(mph.InputError, match=rf"^view 3: format {format} has one pixel size"):
+        mph.write_geometry(system, tmp_path / f"a{FORMATS[format].suffixes[0]}", format, views=views)
+
+
+@pytest.mark.parametrize("mirrored", [False, True])
+@pytest.mark.parametrize("detector", ["virtual", "real"])
+def test_pytomography_holds_one_horizontal_ring(detector, mirrored, ring, rng, tmp_path):
+    views = ring.views(shape=(23, 40), detector=detector, pitch=(1.2, 0.9))
+    views = remade(views, u_steps=-views.u_steps) if mirrored else views
+    mph.write_geometry(ring, tmp_path / "a.npz", "pytomography", views=views)
+    points = fiducials(views, rng)
+    assert np.abs(read_pytomography(tmp_path / "a.npz", points) - project(views, points)).max() < 1e-6
+
+
+def test_stir_holds_one_horizontal_ring(ring, rng, tmp_path):
+    views = ring.views(shape=(23, 40), detector="real", pitch=(1.2, 0.9))
+    mph.write_geometry(ring, tmp_path / "stir", "stir", views=views)
+    points = rng.uniform(-50, 50, (7, 20, 3))
+    assert np.abs(read_stir(tmp_path / "stir", points) - project(views, points)).max() < 1e-6
+    with pytest.raises(mph.InputError, match="'real'"):
+        mph.write_geometry(ring, tmp_path / "other", "stir", views=ring.views())
+    with pytest.raises(mph.InputError, match="format stir holds"):
+        mph.write_geometry(ring, tmp_path / "other", "stir", views=remade(views, u_steps=-views.u_steps))
+    with pytest.raises(mph.InputError, match="expected 7 views, got 2"):
+        mph.write_geometry(ring, tmp_path / "other", "stir", views=views[:2])
+
+
+def test_stir_takes_pinholes_at_many_distances_before_one_cylinder(ring, rng, tmp_path):
+    length = rng.uniform(50, 80, 7)
+    system = mph.PinholeSystem(ring.centers / 210 * (270 - length[:, None]), 2.3, length, 50.0, 10.0, 75.0)
+    views = system.views(shape=(24, 24), detector="real")
+    mph.write_geometry(system, tmp_path / "stir", "stir", views=views)
+    points = rng.uniform(-50, 50, (7, 20, 3))
+    assert np.abs(read_stir(tmp_path / "stir", points) - project(views, points)).max() < 1e-6
+
+
+@pytest.mark.parametrize("change", [{"z": 5.0}, {"b": 1.02}, {"l": 61.0}, {"offset": (1.0, 0.0)}, {"Ld": 51.0}])
+@pytest.mark.parametrize("format", ["pytomography", "stir"])
+def test_what_a_ring_does_not_hold_is_refused(format, change, ring, tmp_path):
+    centers, length, side = ring.centers.copy(), ring.collimator_length.copy(), ring.detector_side.copy()
+    centers[2, 2] += change.get("z", 0)
+    centers[2] *= change.get("b", 1)
+    length[2], side[2] = change.get("l", 60.0), change.get("Ld", 50.0)
+    system = mph.PinholeSystem(centers, 2.3, length, side, 10.0, 75.0)
+    views = system.views((16, 16), "real", offset=change.get("offset", (0, 0)))
+    with pytest.raises(mph.InputError, match=rf"^(view|module) \d: format {format} holds"):
+        mph.write_geometry(system, tmp_path / f"a{''.join(FORMATS[format].suffixes[:1])}", format, views=views)
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize(("format", "name"), [("pytomography", "a.npz"), ("stir", "a")])
+def test_scanners_are_too_free_for_ct_formats(format, name, scanner, rng, tmp_path):
+    x, y, z = (np.tile(axis, (80, 1)) for axis in np.eye(3))
+    on_axis = mph.Views(0 * z, 9 * z, y, x, (4, 4))
+    upright = mph.Views(0 * z, 9 * y, z, x, (4, 4))
+    for views in (scanner.views(), scanner.views(detector="real"), general_views(rng, count=80), on_axis, upright):
+        with pytest.raises(mph.InputError, match=f"format {format} holds"):
+            mph.write_geometry(scanner, tmp_path / name, format, views=views)
+
+
+def test_record_reads_back_bit_for_bit(system, rng, tmp_path):
+    views = general_views(rng)
+    mph.write_geometry(system, tmp_path / "a.json", "mphdrr", views=views)
+    again, seen = mph.read_geometry(tmp_path / "a.json")
+    for name in ("numbers", "centers", "pinhole_diameter", "collimator_length", "detector_side", "roi_radius"):
+        assert np.array_equal(getattr(again, name), getattr(system, name))
+    assert np.array_equal(again.detector_thickness, system.detector_thickness)
+    for name in ARRAYS:
+        assert np.array_equal(getattr(seen, name), getattr(views, name))
+    assert seen.shape == views.shape
+    written = json.loads((tmp_path / "a.json").read_text())
+    matrices = np.array([view["projection_matrix"] for view in written["views"]])
+    assert np.array_equal(matrices, views.projection_matrices())
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        (None, "cannot be read"),
+        ("{", "no JSON"),
+        ("[]", "no mphDRR geometry"),
+        ('{"kind": "mphDRR geometry", "version": 9}', "version 9"),
+        ('{"kind": "mphDRR geometry", "version": 1, "modules": [{}]}', "incomplete, 'number' is missing"),
+    ],
+)
+def test_records_that_are_none_are_refused(text, message, tmp_path):
+    if text is not None:
+        (tmp_path / "a.json").write_text(text)
+    with pytest.raises(mph.InputError, match=message):
+        mph.read_geometry(tmp_path / "a.json")
+
+
+def test_astra_volume_is_the_grid(system, tmp_path):
+    grid = mph.Grid.centered((4, 6, 10), (1.0, 2.0, 0.5), center=(3, -2, 1))
+    mph.write_geometry(system, tmp_path / "a.npz", "astra", grid=grid)
+    a = arrays(tmp_path / "a.npz")
+    assert a["volume_counts"].tolist() == [6, 4, 10]
+    low, high = a["volume_windows"].reshape(3, 2).T
+    # ASTRA's voxel [z, y, x]: centre at min + (i + 1/2) times the step.
+    steps = (high - low) / np.array(grid.shape)
+    assert np.allclose(low + 2.5 * steps, (grid.affine @ [2, 2, 2, 1])[:3])
+    turned = mph.Grid((4, 4, 4), euler_pose(0.1, 0, 0))
+    with pytest.raises(mph.InputError, match=r"along \+x, \+y, \+z"):
+        mph.write_geometry(system, tmp_path / "b.npz", "astra", grid=turned)
+
+
+def test_nerf_pictures_are_named_after_their_modules(system, tmp_path):
+    mph.write_geometry(system, tmp_path / "transforms.json", "nerf", pictures="p/{}.png")
+    frames = json.loads((tmp_path / "transforms.json").read_text())["frames"]
+    assert [frame["file_path"] for frame in frames] == [f"p/{number}.png" for number in range(101, 113)]
+    with pytest.raises(mph.InputError, match=r"expected a file name with \{\}"):
+        mph.write_geometry(system, tmp_path / "a.json", "nerf", pictures="p.png")
+
+
+@pytest.mark.parametrize(
+    ("name", "format", "options", "message"),
+    [
+        ("a.npz", "obj", {}, "expected one of astra, rtk"),
+        ("a.txt", "astra", {}, "expected a name ending in .npz, .json"),
+        ("a.npz", "astra", {"ndc": True}, "no option 'ndc', it has grid"),
+        ("a.npz", "opencv", {"ndc": True}, "no option 'ndc', it has none"),
+        ("none/a.npz", "opencv", {}, "no such folder"),
+    ],
+)
+def test_what_cannot_be_written_is_said_at_once(name, format, options, message, system, tmp_path):
+    with pytest.raises(mph.InputError, match=message):
+        mph.write_geometry(system, tmp_path / name, format, **options)
+    assert not list(tmp_path.iterdir())
+
+
+def test_no_views_are_refused(system, tmp_path):
+    with pytest.raises(mph.InputError, match="views: expected one or more"):
+        mph.write_geometry(system, tmp_path / "a.npz", "astra", views=system.views()[:0])
+
+
+def test_names_in_capitals_are_written_as_they_are(system, tmp_path):
+    mph.write_geometry(system, tmp_path / "A.NPZ", "astra")
+    assert [p.name for p in tmp_path.iterdir()] == ["A.NPZ"]
+
+
+@pytest.mark.parametrize(
+    ("name", "words", "format"),
+    [
+        ("a.xml", [], "rtk"),
+        ("new/a.npz", ["--format", "opencv", "--modules", "3-9", "--detector", "real"], "opencv"),
+        ("a.json", ["--format", "nerf", "--size", "30", "40", "--pitch", "9", "--set", "pictures=p/{}.png"], "nerf"),
+        ("a.npz", ["--format", "pytorch3d", "--set", "in_ndc=no"], "pytorch3d"),
+    ],
+)
+def test_command_line_writes_them(name, words, format, workbook, scanner, rng, tmp_path, capsys):
+    assert main(["geometry", "export", str(workbook), "-o", str(tmp_path / name), *words]) == 0
+    assert name in capsys.readouterr().out
+    part = scanner[2:9] if "--modules" in words else scanner
+    shape = (30, 40) if "--size" in words else (256, 256)
+    views = part.views(shape, "real" if "real" in words else "virtual", pitch=9.0 if "--pitch" in words else None)
+    points = fiducials(views, rng)
+    assert np.abs(READERS[format](tmp_path / name, points) - project(views, points)).max() < 1e-6
+
+
+def test_command_line_takes_a_grid_from_a_volume(workbook, tmp_path):
+    grid = mph.Grid.centered((4, 6, 10), (1.0, 2.0, 0.5))
+    mph.write_volume(mph.Volume(np.ones(grid.shape, np.float32), grid, "mu"), tmp_path / "v.nii.gz")
+    words = ["--format", "astra", "--set", f"grid={tmp_path / 'v.nii.gz'}"]
+    assert main(["geometry", "export", str(workbook), "-o", str(tmp_path / "a.npz"), *words]) == 0
+    assert arrays(tmp_path / "a.npz")["volume_counts"].tolist() == [6, 4, 10]
+
+
+@pytest.mark.parametrize(
+    ("name", "words", "message"),
+    [
+        ("a.npz", [], "choose one by --format: astra, opencv"),
+        ("a", [], "choose one by --format: astra, rtk"),
+        ("a.txt", ["--format", "rtk"], "expected a name ending in .xml"),
+        ("a.npz", ["--format", "astra", "--set", "in_ndc=no"], "expected NAME=VALUE, format astra has grid"),
+        ("a.npz", ["--format", "pytorch3d", "--set", "in_ndc=perhaps"], "expected in_ndc=yes|no"),
+        ("a.npz", ["--format", "astra", "--set", "grid=none.nii"], "none.nii"),
+    ],
+)
+def test_command_line_refuses_in_one_line(name, words, message, workbook, tmp_path, capsys):
+    assert main(["geometry", "export", str(workbook), "-o", str(tmp_path / name), *words]) == 1
+    assert message in capsys.readouterr().err
+    assert not list(tmp_path.iterdir())
+
+
+def test_help_lists_all_formats(capsys):
+    assert main(["geometry", "export", "--help"]) == 0
+    text = " ".join(capsys.readouterr().out.split())
+    assert all(f"{format.name}: {format.title}" in text for format in FORMATS.values())
+    assert "=..." not in text  # every option can be typed

@@ -1,0 +1,131 @@
+"""The programs themselves, where they are installed, see points where the views see them."""
+
+from __future__ import annotations
+
+import json
+import re
+
+import numpy as np
+import pytest
+
+import mphdrr.core as mph
+
+from .test_geometry_export import arrays, fiducials, general_views, project
+
+
+@pytest.fixture(params=["scanner", "real detector", "any pose", "mirrored"])
+def views(request, workbook, rng):
+    scanner = mph.read_system(workbook)
+    if request.param == "scanner":
+        return scanner.views()
+    if request.param == "real detector":
+        return scanner.views((65, 32), "real", pitch=(0.9, 1.3), offset=(3.0, -7.0))
+    return general_views(rng, mirrored=request.param == "mirrored")
+
+
+def test_opencv_projects_alike(views, system, rng, tmp_path):
+    cv2 = pytest.importorskip("cv2", reason="no OpenCV")
+    mph.write_geometry(system, tmp_path / "a.npz", "opencv", views=views)
+    a, points = arrays(tmp_path / "a.npz"), fiducials(views, rng)
+    for m, expected in enumerate(project(views, points)):
+        rvec, _ = cv2.Rodrigues(a["R"][m])
+        seen, _ = cv2.projectPoints(points[m], rvec, a["t"][m], a["K"][m], None)
+        assert np.abs(seen[:, 0] - expected).max() < 1e-6
+
+
+def test_kornia_projects_alike(views, system, rng, tmp_path):
+    torch = pytest.importorskip("torch", reason="no torch")
+    camera = pytest.importorskip("kornia.geometry.camera", reason="no kornia")
+    mph.write_geometry(system, tmp_path / "a.npz", "kornia", views=views)
+    points = fiducials(views, rng)
+    pinhole = camera.PinholeCamera(**{name: torch.from_numpy(a) for name, a in arrays(tmp_path / "a.npz").items()})
+    assert np.abs(pinhole.project(torch.from_numpy(points)).numpy() - project(views, points)).max() < 1e-6
+
+
+def imported_rtk():
+    itk = pytest.importorskip("itk", reason="no itk-rtk")
+    if not hasattr(itk, "RTK"):
+        pytest.skip("no itk-rtk")
+    return itk, itk.RTK
+
+
+def test_rtk_reads_the_geometry(views, system, rng, tmp_path):
+    itk, rtk = imported_rtk()
+    mph.write_geometry(system, tmp_path / "a.xml", "rtk", views=views)
+    points = fiducials(views, rng)
+    spacing, origin = detector_of(tmp_path / "a.xml")
+    geometry = rtk.read_geometry(str(tmp_path / "a.xml"))
+    for m, expected in enumerate(project(views, points)):
+        matrix = itk.array_from_matrix(geometry.GetMatrix(m))
+        seen = np.c_[points[m], np.ones(len(points[m]))] @ matrix.T
+        assert np.abs((seen[:, :2] / seen[:, 2:] - origin) / spacing - expected).max() < 1e-6
+        assert np.allclose(list(geometry.GetSourcePosition(m))[:3], views.sources[m])
+
+
+def detector_of(path):
+    """Spacing and origin of the projections, from the file's comment."""
+    return (
+        np.array(re.search(rf"{word} (\S+) (\S+) [01]\b", path.read_text()).groups(), float)
+        for word in ("spacing", "origin")
+    )
+
+
+def test_rtk_projects_alike(workbook, rng, tmp_path):
+    """RTK's Joseph projector, on a smooth volume: the arrays are RTK's as they stand, whatever the sign of its distances."""
+    itk, rtk = imported_rtk()
+    system = mph.read_system(workbook)[::16]
+    for detector in ("virtual", "real"):
+        views = system.views((24, 30), detector, offset=(4.0, 0.0))
+        grid = mph.Grid.centered((60, 50, 40), (1.5, 2.0, 2.0), (4.0, -3.0, 6.0))
+        x, y, z = np.meshgrid(*(np.arange(n) / n for n in grid.shape), indexing="ij")
+        smooth = (np.sin(np.pi * x) * np.sin(np.pi * y) * np.sin(np.pi * z) * (1 + x)).astype(np.float32)
+        mph.write_geometry(system, tmp_path / "a.xml", "rtk", views=views)
+        spacing, origin = detector_of(tmp_path / "a.xml")
+        volume = itk.image_from_array(np.ascontiguousarray(smooth.T))
+        volume.SetSpacing(grid.spacing)
+        volume.SetOrigin(grid.affine[:3, 3])
+        stack = itk.image_from_array(np.zeros((len(views), *views.shape), np.float32))
+        stack.SetSpacing([*spacing, 1.0])
+        stack.SetOrigin([*origin, 0.0])
+        image = itk.Image[itk.F, 3]
+        joseph = rtk.JosephForwardProjectionImageFilter[image, image].New()
+        joseph.SetInput(0, stack)
+        joseph.SetInput(1, volume)
+        joseph.SetGeometry(rtk.read_geometry(str(tmp_path / "a.xml")))
+        joseph.Update()
+        seen, expected = itk.array_from_image(joseph.GetOutput()), mph.Projector(grid, views)(smooth)
+        assert np.abs(seen - expected).max() < 0.02 * expected.max()
+
+
+def test_astra_takes_the_geometry(views, system, rng, tmp_path):
+    astra = pytest.importorskip("astra", reason="no ASTRA Toolbox", exc_type=ImportError)
+    mph.write_geometry(system, tmp_path / "a.npz", "astra", views=views, grid=mph.Grid.centered((4, 6, 10), 2.0))
+    a = arrays(tmp_path / "a.npz")
+    geometry = astra.create_proj_geom("cone_vec", int(a["det_row_count"]), int(a["det_col_count"]), a["vectors"])
+    n_v, n_u = views.shape
+    assert astra.geom_size(geometry) == (n_v, len(views), n_u)
+    volume = astra.create_vol_geom(*a["volume_counts"].tolist(), *a["volume_windows"].tolist())
+    assert astra.geom_size(volume) == (10, 6, 4)
+    identifier = astra.data3d.create("-sino", geometry)  # refused unless ASTRA finds the vectors good
+    astra.data3d.delete(identifier)
+
+
+def test_pytomography_places_pixels_alike(rng, tmp_path):
+    torch = pytest.importorskip("torch", reason="no torch")
+    metadata = pytest.importorskip("pytomography.metadata.CT", reason="no PyTomography", exc_type=ImportError)
+    azimuth = rng.uniform(-np.pi, np.pi, 5)
+    centers = 210 * np.stack([np.cos(azimuth), np.sin(azimuth), 0 * azimuth], axis=1)
+    system = mph.PinholeSystem(centers, 2.3, 60.0, 50.0, 10.0, 75.0)
+    views = system.views(shape=(11, 16), pitch=(3.0, 4.0))
+    mph.write_geometry(system, tmp_path / "a.json", "pytomography", views=views)
+    a = json.loads((tmp_path / "a.json").read_text())
+    columns, rows = a.pop("flip_columns"), a.pop("flip_rows")
+    meta = metadata.CTConeBeamFlatPanelProjMeta(
+        **a | {"angles": torch.tensor(a["angles"]), "z_locations": torch.tensor(a["z_locations"])}
+    )
+    for m in range(len(views)):
+        pixels = meta._get_detector_coordinates(m).cpu().numpy()  # columns, rows
+        pixels = pixels[::-1] if columns else pixels
+        pixels = pixels[:, ::-1] if rows else pixels
+        assert np.abs(pixels.transpose(1, 0, 2).reshape(-1, 3) - views.rays(m)[1]).max() < 1e-3  # it counts in float32
+        assert np.allclose(meta.beam_locations[m].cpu(), views.sources[m], atol=1e-4)

@@ -11,9 +11,10 @@ from typing import Any
 from ..errors import InputError
 from ..system import PinholeSystem
 from ..views import Views
+from . import gate9, gate10
 from .format import Format
 
-FORMATS: dict[str, Format] = {f.name: f for f in ()}
+FORMATS: dict[str, Format] = {f.name: f for f in (gate9.FORMAT, gate10.FORMAT)}
 
 
 def write_geometry(

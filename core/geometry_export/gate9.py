@@ -129,18 +129,17 @@ class _Folder:
 
 
 def angle_and_axis(rotation: NDArray[np.float64]) -> tuple[float, NDArray[np.float64]]:
-    """Angle, 0 to pi, and unit axis of a rotation matrix (3, 3); about z where it does not turn.
-
-    The axis is the eigenvector of ``R + R^T`` to its largest eigenvalue, which also holds at an angle of pi.
-    """
+    """Angle, 0 to pi, and unit axis of a rotation matrix (3, 3); about z where it does not turn."""
     twice = np.array(
         [rotation[2, 1] - rotation[1, 2], rotation[0, 2] - rotation[2, 0], rotation[1, 0] - rotation[0, 1]]
     )
-    angle = float(np.arctan2(np.linalg.norm(twice), np.trace(rotation) - 1))
-    if angle < 1e-12:
-        return 0.0, np.array([0.0, 0.0, 1.0])
-    axis = np.linalg.eigh(rotation + rotation.T)[1][:, 2]
-    return angle, axis if axis @ twice >= 0 else -axis
+    sine, cosine = np.linalg.norm(twice) / 2, (np.trace(rotation) - 1) / 2
+    if cosine > 0:
+        axis = twice / (2 * sine) if sine > 0 else np.array([0.0, 0.0, 1.0])
+    else:  # near pi `twice` vanishes; the axis is also the eigenvector to the largest eigenvalue of R + R^T
+        axis = np.linalg.eigh(rotation + rotation.T)[1][:, 2]
+        axis = axis if axis @ twice >= 0 else -axis
+    return float(np.arctan2(sine, cosine)), axis
 
 
 def _n(number: float) -> str:
@@ -286,14 +285,14 @@ def _source(folder: _Folder, scene: Scene) -> list[str]:
         return [
             f"/gate/source/addSource {name} gps",
             f"{s}/gps/particle gamma",
-            f"{s}/gps/energytype UserSpectrum",
+            f"{s}/gps/ene/type UserSpectrum",
             f"{s}/gps/setSpectrumFile {spectrum}",
             f"{s}/setActivity {_n(activity * simulation.photons_per_decay)} becquerel",
             f"{s}/setForcedUnstableFlag true",
             f"{s}/setForcedHalfLife {_n(simulation.nuclide.half_life)} s",
-            f"{s}/gps/angtype iso",
-            *(f"{s}/gps/{line}" for line in shape),
-            f"{s}/gps/centre {' '.join(map(_n, center))} mm",
+            f"{s}/gps/ang/type iso",
+            *(f"{s}/gps/pos/{line}" for line in shape),
+            f"{s}/gps/pos/centre {' '.join(map(_n, center))} mm",
         ]
 
     if scene.phantom is None:
@@ -309,8 +308,8 @@ def _source(folder: _Folder, scene: Scene) -> list[str]:
             "shape Cylinder",
             f"radius {_n(around)} mm",
             f"halfz {_n(height / 2)} mm",
-            f"posrot1 {' '.join(map(_n, pose[:3, 0]))}",
-            f"posrot2 {' '.join(map(_n, pose[:3, 1]))}",
+            f"rot1 {' '.join(map(_n, pose[:3, 0]))}",
+            f"rot2 {' '.join(map(_n, pose[:3, 1]))}",
             f"confine {rods.part.name}_phys",
         ]
         center = pose[:3, :3] @ middle + pose[:3, 3]

@@ -10,10 +10,10 @@ import inspect
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, fields
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple, get_args, get_type_hints
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from ..checks import positive, real_array
 from ..errors import InputError
@@ -77,10 +77,6 @@ _ELEMENTS = (
     ("Lead", "Pb", 82, 207.2),
 )
 
-CRYSTALS = ("NaI", "CZT")
-COLLIMATORS = ("Tungsten", "Lead")
-PHANTOM_MATERIALS = ("Air", "Water", "PMMA")
-
 
 def material_database() -> str:
     """The materials as the text of a ``GateMaterials.db``, which GATE 9 and 10 both read."""
@@ -96,9 +92,9 @@ class Simulation:
     ----------
     phantom : str or DerenzoPhantom
         ``"point"``, ``"derenzo"`` (of the three numbers below), or a phantom.
-    radius, rods, height : float, str, float
-        Of the phantom ``"derenzo"``: radius, six rod diameters and length of the rods, mm.
-    position, euler_degrees : str
+    radius, rods, height : float, 6 floats, float
+        Of the phantom ``"derenzo"``: radius, rod diameters and length of the rods, mm.
+    position, euler_degrees : 3 floats
         Middle of the point or phantom, mm, and the phantom's Euler angles phi, theta, psi (`core.frames.euler_pose`).
     pose : array (4, 4) or None
         World-from-phantom, a rotation and a translation, instead of both.
@@ -109,7 +105,7 @@ class Simulation:
     time : float
         s.
     crystal, collimator, phantom_material : str
-        One of `CRYSTALS`, of `COLLIMATORS` and of `PHANTOM_MATERIALS`; air attenuates next to nothing.
+        Their materials; a phantom of air attenuates next to nothing.
     plate_thickness, wall_thickness : float
         Of the aperture's plate and the collimator's walls, mm.
     opening_degrees : float
@@ -131,17 +127,17 @@ class Simulation:
 
     phantom: str | DerenzoPhantom = "point"
     radius: float = 40.0
-    rods: str = "8 6 5 4 3 2"
+    rods: tuple[float, ...] = (8.0, 6.0, 5.0, 4.0, 3.0, 2.0)
     height: float = 40.0
-    position: str = "0 0 0"
-    euler_degrees: str = "0 0 0"
-    pose: ArrayLike | None = None
+    position: tuple[float, ...] = (0.0, 0.0, 0.0)
+    euler_degrees: tuple[float, ...] = (0.0, 0.0, 0.0)
+    pose: NDArray[np.float64] | None = None
     isotope: str | Isotope = "Tc-99m"
     activity: float | None = None
     time: float = 1.0
-    crystal: str = "NaI"
-    collimator: str = "Tungsten"
-    phantom_material: str = "Air"
+    crystal: Literal["NaI", "CZT"] = "NaI"
+    collimator: Literal["Tungsten", "Lead"] = "Tungsten"
+    phantom_material: Literal["Air", "Water", "PMMA"] = "Air"
     plate_thickness: float = 2.0
     wall_thickness: float = 2.0
     opening_degrees: float = 90.0
@@ -153,8 +149,7 @@ class Simulation:
     def __post_init__(self) -> None:
         set_ = object.__setattr__
         if self.phantom == "derenzo":
-            rods = tuple(_numbers(self.rods, "rods", 6).tolist())
-            set_(self, "phantom", DerenzoPhantom(self.radius, rods, self.height))
+            set_(self, "phantom", DerenzoPhantom(self.radius, self.rods, self.height))
             set_(self, "activity", 1.0 if self.activity is None else self.activity)
         elif not (isinstance(self.phantom, DerenzoPhantom) or self.phantom == "point"):
             raise InputError(f"phantom {self.phantom!r}: expected point, derenzo or a DerenzoPhantom")
@@ -179,11 +174,9 @@ class Simulation:
             raise InputError(f"opening_degrees: expected less than 180, got {self.opening_degrees:g}")
         if self.window_percent >= 200:
             raise InputError(f"window_percent: expected less than 200, got {self.window_percent:g}")
-        for name, known in (
-            ("crystal", CRYSTALS),
-            ("collimator", COLLIMATORS),
-            ("phantom_material", PHANTOM_MATERIALS),
-        ):
+        kinds = get_type_hints(Simulation)
+        for name in ("crystal", "collimator", "phantom_material"):
+            known = get_args(kinds[name])
             if getattr(self, name) not in known:
                 raise InputError(f"{name} {getattr(self, name)!r}: expected one of {', '.join(known)}")
         if isinstance(self.isotope, str):
@@ -196,8 +189,8 @@ class Simulation:
             raise InputError(f"seed: expected a whole number from 1 to 899999999, got {self.seed!r}")
         set_(self, "seed", int(seed))
         if self.pose is None:
-            phi, theta, psi = np.radians(_numbers(self.euler_degrees, "euler_degrees", 3))
-            set_(self, "pose", euler_pose(phi, theta, psi, _numbers(self.position, "position", 3)))
+            phi, theta, psi = np.radians(real_array(self.euler_degrees, "euler_degrees", (3,)))
+            set_(self, "pose", euler_pose(phi, theta, psi, real_array(self.position, "position", (3,))))
         pose = checked_affine(self.pose, "phantom pose")  # type: ignore[arg-type]
         rotation = pose[:3, :3]
         if not np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-9) or np.linalg.det(rotation) < 0:
@@ -226,17 +219,19 @@ class Simulation:
 def simulation_options(**more: Any) -> Callable[[Callable[..., None]], Callable[..., None]]:
     """Let ``write(system, views, path, **options)`` of a format show `Simulation`'s options, and `more`, with defaults."""
 
+    kinds = get_type_hints(Simulation)
+    options = {f.name: (kinds[f.name], f.default) for f in fields(Simulation)}
+    options |= {name: (type(default), default) for name, default in more.items()}
+
     def named(write: Callable[..., None]) -> Callable[..., None]:
         signature = inspect.signature(write)
         first = [p for p in signature.parameters.values() if p.kind is not p.VAR_KEYWORD]
-        options = [
+        last = [
             inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=default, annotation=kind)
-            for name, default, kind in (
-                *((f.name, f.default, f.type) for f in fields(Simulation)),
-                *((name, default, type(default).__name__) for name, default in more.items()),
-            )
+            for name, (kind, default) in options.items()
         ]
-        write.__signature__ = signature.replace(parameters=first + options)  # type: ignore[attr-defined]
+        write.__signature__ = signature.replace(parameters=first + last)  # type: ignore[attr-defined]
+        write.__annotations__ |= {name: kind for name, (kind, _) in options.items()}
         return write
 
     return named
@@ -416,13 +411,3 @@ def _far_points(part: Part) -> NDArray[np.float64]:
     signs = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], float)
     corners = part.centers[:, None] + np.einsum("nij,cj->nci", part.rotations, signs * half)
     return corners.reshape(-1, 3)
-
-
-def _numbers(value: Any, name: str, n: int) -> NDArray[np.float64]:
-    """`n` numbers, given as such or as text with blanks or commas between them."""
-    if isinstance(value, str):
-        try:
-            value = [float(word) for word in value.replace(",", " ").split()]
-        except ValueError:
-            raise InputError(f"{name} {value!r}: expected {n} numbers, such as '{' '.join('0' * n)}'") from None
-    return real_array(value, name, (n,))

@@ -8,6 +8,7 @@ import os
 import re
 import subprocess
 import sys
+import typing
 from collections import defaultdict
 from pathlib import Path
 from typing import NamedTuple
@@ -337,7 +338,7 @@ def test_options(scanner, tmp_path) -> None:
     folder = export(
         scanner, tmp_path / "out", "gate9",
         isotope="Tl-201", activity=3.0, time=20, seed=77, window_percent=30, intrinsic_fwhm=0, energy_resolution=0.06,
-        position="1, 2 -3",
+        position=(1, 2, -3),
     )  # fmt: skip
     macros = Macros(folder)
     assert macros.values("/gate/application/setTimeStop") == [["20", "s"]]
@@ -354,6 +355,8 @@ def test_options(scanner, tmp_path) -> None:
     assert numbers == [SHAPE[1], SHAPE[0]]
     assert np.multiply(sizes, numbers) == pytest.approx(scanner.detector_side[0])
     assert {"phantom", "isotope", "activity", "seed", "plate_thickness"} < set(FORMATS["gate9"].options)
+    hints = typing.get_type_hints(FORMATS["gate9"].write)  # what the command line reads values by
+    assert hints["time"] is float and hints["seed"] is int and typing.get_args(hints["crystal"]) == ("NaI", "CZT")
     assert set(FORMATS["gate10"].options) - set(FORMATS["gate9"].options) == {"threads"}
 
 
@@ -367,14 +370,14 @@ def test_options(scanner, tmp_path) -> None:
         ({"plate_thickness": 300, "wall_thickness": 400}, "plate_thickness 300 mm is too much"),
         ({"time": 0}, "time: expected more than 0 s"),
         ({"seed": 1.5}, "seed: expected a whole number"),
-        ({"rods": "1 2 x"}, "rods '1 2 x': expected 6 numbers", ),
+        ({"phantom": "derenzo", "rods": (1, 2)}, "Derenzo rod diameters: expected shape 6"),
+        ({"position": "here"}, "position: expected real numbers"),
         ({"pose": np.diag([1.0, 1, -1, 1])}, "phantom pose: expected a rotation"),
         ({"phantom": "derenzo", "radius": 250}, "begins inside the phantom"),
         ({"energy": 3}, "no option 'energy'"),
     ],
 )  # fmt: skip
 def test_what_cannot_be_simulated_is_refused_in_one_line(scanner, tmp_path, options, message) -> None:
-    options = {"phantom": "derenzo", **options} if "rods" in options else options
     for format in ("gate9", "gate10"):
         with pytest.raises(InputError, match=re.escape(message)) as caught:
             write_geometry(scanner, tmp_path / "out", format, **options)
@@ -464,7 +467,7 @@ needs_gate10 = pytest.mark.skipif(
 @needs_gate10
 def test_gate10_builds_the_scanner_in_geant4(scanner, tmp_path) -> None:
     folder = export(
-        scanner, tmp_path / "g10", "gate10", phantom="derenzo", euler_degrees="20 50 -10", position="3 -5 8"
+        scanner, tmp_path / "g10", "gate10", phantom="derenzo", euler_degrees=(20, 50, -10), position=(3, -5, 8)
     )
     printed = run_gate10(folder, "-c", _DRIVER)
     data, described = (json.loads((folder / f"{name}.json").read_text()) for name in ("simulation", "described"))

@@ -9,8 +9,6 @@ import json
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from ..checks import whole_shape
 from ..system import PinholeSystem
 from ..views import Views
@@ -42,11 +40,22 @@ def write(system: PinholeSystem, views: Views, path: Path, **options: Any) -> No
     scene = build_scene(system, Simulation(**options))
     record = {"threads": threads, **_record(system, scene), "image_shape": list(views.shape)}
     (path / "simulation.py").write_text(_SCRIPT.read_text(encoding="utf-8"), encoding="utf-8")
-    (path / "simulation.json").write_text(json.dumps(record, indent=1) + "\n", encoding="utf-8")
+    (path / "simulation.json").write_text(_json(record), encoding="utf-8")
     (path / "GateMaterials.db").write_text(material_database(), encoding="ascii", newline="\n")
 
 
 FORMAT = Format("gate10", "GATE 10 (opengate) script: a folder, to run by python simulation.py", (), write)
+
+
+def _json(record: dict[str, Any]) -> str:
+    """JSON with one line for each entry, and for each item of lists of entries."""
+    entries = []
+    for key, value in record.items():
+        text = json.dumps(value)
+        if isinstance(value, list) and value and isinstance(value[0], dict):
+            text = "[\n  " + ",\n  ".join(map(json.dumps, value)) + "\n ]"
+        entries.append(f"{json.dumps(key)}: {text}")
+    return "{\n " + ",\n ".join(entries) + "\n}\n"
 
 
 def _record(system: PinholeSystem, scene: Scene) -> dict[str, Any]:
@@ -106,9 +115,8 @@ def _emitters(scene: Scene) -> list[dict[str, Any]]:
     """The point, or every rod with its share of its sector's activity."""
     simulation = scene.simulation
     if scene.phantom is None:
-        assert simulation.activity is not None
-        center = np.asarray(simulation.pose)[:3, 3].tolist()
-        return [{"mother": "world", "center_mm": center, "activity_Bq": simulation.activity * 1e6}]
+        center = simulation.place[:3, 3].tolist()
+        return [{"mother": "world", "center_mm": center, "activity_Bq": simulation.becquerels}]
     return [
         {
             "mother": scene.phantom.name,

@@ -7,7 +7,7 @@ size each kind is a system of type scanner, with a digitizer and singles of its 
 Placements: GATE 9 hands the rotation of a placements file to ``G4PVPlacement(G4RotationMatrix*, ...)`` as it stands, which
 takes it to the volume's frame *from* its mother's, while ``/placement/setRotationAngle`` turns the volume itself. So files
 have the inverse of the solid's rotation. (GateMiscFunctions.cc, GateGenericRepeater.cc, GateVVolume.cc,
-GateVolumePlacement.cc of GATE 9.4.)
+GateVolumePlacement.cc of GATE 9.3.)
 """
 
 from __future__ import annotations
@@ -88,6 +88,7 @@ def write(system: PinholeSystem, views: Views, path: Path, **options: Any) -> No
         "/gate/application/startDAQ",
     ]
     folder.macro("main", main)
+    folder.write("modules.txt", _modules(system, scene))
 
 
 FORMAT = Format("gate9", "GATE 9.3 macros: a folder, to run by Gate main.mac", (), write)
@@ -186,6 +187,13 @@ def _repeated(folder: _Folder, part: Part) -> list[str]:
     ]
 
 
+def _modules(system: PinholeSystem, scene: Scene) -> str:
+    """Which copy of which crystal is whose."""
+    rows = [(m, c.part.name, copy) for c in scene.crystals for copy, m in enumerate(c.modules)]
+    lines = [f"{system.numbers[m]} {crystal} {copy}" for m, crystal, copy in sorted(rows)]
+    return "\n".join(["# module, its crystal's volume, the copy of that crystal's head from 0", *lines]) + "\n"
+
+
 def _world(scene: Scene) -> list[str]:
     return [f"/gate/world/geometry/set{axis}Length {_n(scene.world)} mm" for axis in "XYZ"] + [
         "/gate/world/setMaterial Air"
@@ -278,7 +286,7 @@ def _source(folder: _Folder, scene: Scene) -> list[str]:
     spectrum = folder.write(
         "spectrum.txt", "1 0\n" + "".join(f"{_n(e / 1000)} {_n(p)}\n" for e, p in simulation.nuclide.lines)
     )
-    pose = np.asarray(simulation.pose)
+    pose = simulation.place
 
     def source(name: str, activity: float, center: NDArray[np.float64], shape: list[str]) -> list[str]:
         s = f"/gate/source/{name}"
@@ -296,8 +304,7 @@ def _source(folder: _Folder, scene: Scene) -> list[str]:
         ]
 
     if scene.phantom is None:
-        assert simulation.activity is not None
-        return source("point", simulation.activity * 1e6, pose[:3, 3], ["type Point"])
+        return source("point", simulation.becquerels, pose[:3, 3], ["type Point"])
     lines = []
     for rods in scene.rods:
         radius, height = rods.part.size

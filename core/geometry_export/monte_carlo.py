@@ -148,14 +148,14 @@ class Simulation:
 
     def __post_init__(self) -> None:
         set_ = object.__setattr__
-        if self.phantom == "derenzo":
+        if isinstance(self.phantom, DerenzoPhantom):
+            set_(self, "activity", self.phantom.total_activity * 1e-3 if self.activity is None else self.activity)
+        elif isinstance(self.phantom, str) and self.phantom == "derenzo":
             set_(self, "phantom", DerenzoPhantom(self.radius, self.rods, self.height))
-            set_(self, "activity", 1.0 if self.activity is None else self.activity)
-        elif not (isinstance(self.phantom, DerenzoPhantom) or self.phantom == "point"):
+        elif not (isinstance(self.phantom, str) and self.phantom == "point"):
             raise InputError(f"phantom {self.phantom!r}: expected point, derenzo or a DerenzoPhantom")
         if self.activity is None:
-            held = self.phantom.total_activity * 1e-3 if isinstance(self.phantom, DerenzoPhantom) else 1.0
-            set_(self, "activity", held)
+            set_(self, "activity", 1.0)
         for name, unit in (
             ("activity", "MBq"),
             ("time", "s"),
@@ -197,11 +197,24 @@ class Simulation:
             raise InputError("phantom pose: expected a rotation and a translation; solids are not scaled or mirrored")
         set_(self, "pose", pose)
 
+    # As `__post_init__` leaves them, for the type checker too.
     @property
     def nuclide(self) -> Isotope:
         """The isotope itself."""
         assert isinstance(self.isotope, Isotope)
         return self.isotope
+
+    @property
+    def place(self) -> NDArray[np.float64]:
+        """World-from-phantom (4, 4), from `pose` or from `position` and `euler_degrees`."""
+        assert self.pose is not None
+        return self.pose
+
+    @property
+    def becquerels(self) -> float:
+        """The activity, Bq."""
+        assert self.activity is not None
+        return self.activity * 1e6
 
     @property
     def window(self) -> tuple[float, float]:
@@ -315,8 +328,9 @@ def build_scene(system: PinholeSystem, simulation: Simulation) -> Scene:
     phantom, rods = _phantom(simulation)
     if phantom is not None:
         _refuse_inside(system, simulation, phantom)
-    back = np.concatenate([_far_points(parts[0]) for parts in collimators] + [_far_points(c.part) for c in crystals])
-    return Scene(simulation, collimators, crystals, phantom, rods, math.ceil(2 * (np.abs(back).max() + _SPACE)))
+    outer = [parts[0] for parts in collimators] + [c.part for c in crystals] + ([] if phantom is None else [phantom])
+    reach = max([float(np.abs(simulation.place[:3, 3]).max()), *(np.abs(_corners(part)).max() for part in outer)])
+    return Scene(simulation, collimators, crystals, phantom, rods, math.ceil(2 * (reach + _SPACE)))
 
 
 def places(
@@ -376,8 +390,7 @@ def _phantom(simulation: Simulation) -> tuple[Part | None, list[Rods]]:
     if not isinstance(simulation.phantom, DerenzoPhantom):
         return None, []
     table, height, material = simulation.phantom.rods(), simulation.phantom.height, simulation.phantom_material
-    assert isinstance(simulation.pose, np.ndarray) and simulation.activity is not None
-    pose = simulation.pose
+    pose = simulation.place
     reach = float((np.hypot(table[:, 1], table[:, 2]) + table[:, 3] / 2).max())
     size = (max(reach, simulation.phantom.radius) + 1.0, height + 2.0)
     body = Part("phantom", "world", "cylinder", size, material, pose[None, :3, 3], pose[None, :3, :3])
@@ -389,7 +402,7 @@ def _phantom(simulation: Simulation) -> tuple[Part | None, list[Rods]]:
         rotations = np.broadcast_to(np.eye(3), (len(centers), 3, 3))
         rod = (table[chosen][0, 3] / 2, height)
         part = Part(f"rods_{int(sector)}", "phantom", "cylinder", rod, material, centers, rotations)
-        rods.append(Rods(part, simulation.activity * 1e6 * areas[chosen].sum() / areas.sum()))
+        rods.append(Rods(part, simulation.becquerels * areas[chosen].sum() / areas.sum()))
     return body, rods
 
 
@@ -405,9 +418,9 @@ def _refuse_inside(system: PinholeSystem, simulation: Simulation, phantom: Part)
             raise InputError(f"module {system.numbers[m]}: its collimator begins inside the phantom; move one of them")
 
 
-def _far_points(part: Part) -> NDArray[np.float64]:
-    """Corners, world mm, of the boxes around frusta or boxes."""
-    half = np.array(part.size) / 2 if part.shape == "box" else np.array([part.size[0], part.size[0], part.size[2] / 2])
+def _corners(part: Part) -> NDArray[np.float64]:
+    """Corners (8 N, 3), in the mother's frame, of the boxes around a part's solids."""
+    half = np.array(part.size) / 2 if part.shape == "box" else np.array([part.size[0], part.size[0], part.size[-1] / 2])
     signs = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], float)
     corners = part.centers[:, None] + np.einsum("nij,cj->nci", part.rotations, signs * half)
     return corners.reshape(-1, 3)

@@ -23,7 +23,7 @@ from mphdrr.core.geometry_export.gate9 import MOST_LINES, angle_and_axis
 SHAPE = (40, 60)
 POSE = euler_pose(0.4, 0.9, -0.3, (3.0, -5.0, 8.0))
 
-# Every command that may occur, from the documentation of GATE 9.3 and 9.4; NAME is a volume, source or detector.
+# Every command that may occur, from the documentation and source of GATE 9.3; NAME is a volume, source or detector.
 COMMANDS = re.compile(
     "|".join(
         pattern.replace("NAME", r"\w+")
@@ -231,7 +231,7 @@ def test_macros_of_any_scanner_hang_together(system, tmp_path) -> None:
     macros = Macros(folder)
     (database,) = macros.values("/gate/geometry/setMaterialDatabase")[0]
     spectra = {words[0] for words in macros.values(".*/gps/setSpectrumFile")}
-    macros.used |= {folder / name for name in (database, *spectra)}
+    macros.used |= {folder / name for name in (database, "modules.txt", *spectra)}
     assert {p for p in folder.rglob("*") if p.is_file()} == macros.used  # no file is missing, none is left over
     # Crystals of twelve sizes are twelve systems, each with its detector and its digitizer.
     detectors = [c.split("/")[2] for c, _ in macros.commands if c.endswith("/attachCrystalSD")]
@@ -239,11 +239,13 @@ def test_macros_of_any_scanner_hang_together(system, tmp_path) -> None:
     attached = {c.split("/")[3]: words[0] for c, words in macros.commands if c.endswith("/level1/attach")}
     assert len(macros.values("/gate/world/daughters/systemType")) == len(system)
     known = re.findall(r"^(\w+):", (folder / database).read_text(), re.M)
+    rows = [line.split() for line in (folder / "modules.txt").read_text().splitlines()[1:]]
+    whose = {(crystal, copy): number for number, crystal, copy in rows}
     for head, crystal in attached.items():
         volume = macros.volumes[crystal]
         assert volume.mother == head and crystal in detectors
         place = macros.volumes[head].world(volume.centers[0])[0]
-        m = np.argmin(np.linalg.norm(crystal_points(system, 0, 0, 0.5) - place, axis=1))
+        (m,) = np.flatnonzero(system.numbers == int(whose[crystal, "0"]))
         np.testing.assert_allclose(place, crystal_points(system, 0, 0, 0.5)[m], atol=1e-6)
         assert volume.length("setXLength") == pytest.approx(system.detector_side[m], abs=1e-9)
         assert volume.length("setZLength") == pytest.approx(system.detector_thickness[m], abs=1e-9)
@@ -255,6 +257,17 @@ def test_macros_of_any_scanner_hang_together(system, tmp_path) -> None:
     for volume in macros.volumes.values():
         if volume.mother == "world":
             assert np.abs(volume.centers).max() < reach - 50
+
+
+def test_heads_on_the_axes(tmp_path) -> None:
+    """Where rotations are none, quarter and half turns, and u has no z to be made of."""
+    centers = 200 * np.concatenate([np.eye(3), -np.eye(3), [[0.6, 0, 0.8]]])
+    system = PinholeSystem(centers, 2.0, 60.0, 50.0, 10.0, 75.0)
+    for chosen in (system, *(system[m] for m in range(len(system)))):
+        head = Macros(export(chosen, tmp_path / f"{chosen.numbers}", "gate9")).volumes["SPECThead"]
+        for u, v in ((0.3, 1), (-1, 0.2)):
+            point = (u * 25, v * 25, 5 + 0.05)  # in the head, whose middle is half its margin behind the crystal's
+            np.testing.assert_allclose(head.world(point), crystal_points(chosen, u, v, 0), atol=1e-6)
 
 
 def test_a_scanner_of_many_kinds_of_module_has_no_long_macro(tmp_path) -> None:
@@ -431,6 +444,7 @@ for part in data["volumes"]:
     volumes = made.volume_manager.get_volume(part["name"]).g4_physical_volumes
     centers = [p.GetObjectTranslation() for p in volumes]
     placed[part["name"]] = {
+        "cubic": made.volume_manager.get_volume(part["name"]).solid_info.cubic_volume,
         "centers": [[c.x, c.y, c.z] for c in centers],
         "rotations": [matrix(p.GetObjectRotationValue()) for p in volumes],
         "frames": [matrix(p.GetFrameRotation()) for p in volumes],
@@ -464,6 +478,15 @@ needs_gate10 = pytest.mark.skipif(
 )
 
 
+def cubic(shape: str, *size: float) -> float:
+    """Volume, mm^3, of a solid."""
+    if shape == "box":
+        return float(np.prod(size))
+    *widths, height = size
+    a, b = widths if len(widths) == 2 else widths * 2
+    return (4 if shape == "trd" else np.pi) * height / 3 * (a * a + a * b + b * b)
+
+
 @needs_gate10
 def test_gate10_builds_the_scanner_in_geant4(scanner, tmp_path) -> None:
     folder = export(
@@ -484,6 +507,7 @@ def test_gate10_builds_the_scanner_in_geant4(scanner, tmp_path) -> None:
         np.testing.assert_allclose(points, crystal_points(scanner, u, v, depth), atol=1e-6)
     holes = []
     for part in data["volumes"]:
+        assert placed[part["name"]]["cubic"] == pytest.approx(cubic(part["shape"], *part["size_mm"]), rel=1e-9)
         if part["shape"] == "cone" and part["name"].startswith("front_"):
             mother = placed[part["mother"]]
             waist = placed[part["name"]]["centers"][0] - [0, 0, part["size_mm"][2] / 2]

@@ -76,7 +76,7 @@ def write(system: PinholeSystem, views: Views, path: Path, **options: Any) -> No
         f"# {len(system)} pinhole modules in GATE 9.3 or later. Run it from this folder: Gate main.mac",
         "/gate/geometry/setMaterialDatabase GateMaterials.db",
         *_execute(geometry),
-        *_execute([folder.macro("physics", _physics(scene))]),
+        *_execute([folder.macro("physics", _physics())]),
         "/gate/run/initialize",
         *_execute([folder.list("digitizer/all", detectors), folder.macro("source", _source(folder, scene))]),
         *_execute([folder.macro("output", _output()), *projections]),
@@ -235,7 +235,7 @@ def _phantom(folder: _Folder, scene: Scene) -> list[str]:
     return [line for part in (scene.phantom, *(rods.part for rods in scene.rods)) for line in _repeated(folder, part)]
 
 
-def _physics(scene: Scene) -> list[str]:
+def _physics() -> list[str]:
     return ["/gate/physics/addPhysicsList emstandard_opt4"] + [
         f"/gate/physics/{particle}/SetCutInRegion world 0.1 mm" for particle in ("Gamma", "Electron", "Positron")
     ]

@@ -13,6 +13,8 @@ from ..system import PinholeSystem
 from ..views import Views
 from .astra import ASTRA
 from .format import Format
+from .gate9 import GATE9
+from .gate10 import GATE10
 from .leap import LEAP
 from .nerf import NERF
 from .opencv import KORNIA, OPENCV
@@ -39,6 +41,8 @@ _FORMATS = (
     STL_PARTS,
     THREE_MF,
     GLB,
+    GATE9,
+    GATE10,
     MPHDRR,
 )
 FORMATS: dict[str, Format] = {f.name: f for f in _FORMATS}

@@ -1,0 +1,192 @@
+"""A multi-pinhole SPECT scanner in GATE 10 (opengate 10.1); its numbers are in simulation.json beside this file.
+
+    python simulation.py                  run it: singles.root, then images.npy
+    python simulation.py --build-only     build it in Geant4, which checks for overlaps; needs no Geant4 data
+    python simulation.py --images-only    make images.npy of the singles that are there
+
+images.npy is (modules, rows, columns): the singles of the energy window that fell on each pixel of each crystal, columns
+along the module's u and rows along its v, in the order of the modules in simulation.json.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+FOLDER = Path(__file__).resolve().parent
+
+
+def build(data: dict[str, Any], threads: int = 1) -> Any:
+    """The simulation of the numbers `data`."""
+    import opengate
+
+    units = opengate.g4_units
+    simulation = opengate.Simulation()
+    simulation.output_dir = FOLDER
+    simulation.number_of_threads = threads
+    simulation.random_engine = "MersenneTwister"
+    simulation.random_seed = data["seed"]
+    simulation.run_timing_intervals = [[0, data["time_s"] * units.s]]
+    simulation.check_volumes_overlap = True
+
+    simulation.volume_manager.add_material_database(str(FOLDER / "GateMaterials.db"))
+    simulation.world.size = [data["world_mm"] * units.mm] * 3
+    simulation.world.material = "Air"
+    for part in data["volumes"]:
+        add_volume(simulation, units, part)
+
+    simulation.physics_manager.physics_list_name = "G4EmStandardPhysics_option4"
+    for particle in ("gamma", "electron", "positron"):
+        simulation.physics_manager.set_production_cut("world", particle, 0.1 * units.mm)
+
+    for number, emitter in enumerate(data["emitters"]):
+        add_source(simulation, units, data, number, emitter)
+    for crystal in data["crystals"]:
+        add_digitizer(simulation, units, data["detector"], crystal)
+    statistics = simulation.add_actor("SimulationStatisticsActor", "statistics")
+    statistics.output_filename = "statistics.txt"
+    return simulation
+
+
+def construct(simulation: Any) -> None:
+    """Build the volumes in Geant4, which prints the overlaps that it finds; without physics."""
+    simulation.volume_manager.update_volume_tree_if_needed()
+    for volume in simulation.volume_manager.volume_tree_root.descendants:
+        volume.construct()
+
+
+def add_volume(simulation: Any, units: Any, part: dict[str, Any]) -> None:
+    """A volume with all its places. `rotations` turn the volume, as opengate's do: their columns are its axes."""
+    kinds = {"box": "Box", "trd": "Trd", "cone": "Cons", "cylinder": "Tubs"}
+    volume = simulation.add_volume(kinds[part["shape"]], part["name"])
+    size = [length * units.mm for length in part["size_mm"]]
+    if part["shape"] == "box":
+        volume.size = size
+    elif part["shape"] == "trd":
+        volume.dx1 = volume.dy1 = size[0]
+        volume.dx2 = volume.dy2 = size[1]
+        volume.dz = size[2] / 2
+    elif part["shape"] == "cone":
+        volume.rmin1 = volume.rmin2 = 0
+        volume.rmax1, volume.rmax2, volume.dz = size[0], size[1], size[2] / 2
+        volume.sphi, volume.dphi = 0, 360 * units.deg
+    else:
+        volume.rmin, volume.rmax, volume.dz = 0, size[0], size[1] / 2
+        volume.sphi, volume.dphi = 0, 360 * units.deg
+    volume.mother = part["mother"]
+    volume.material = part["material"]
+    volume.translation = [np.array(center) * units.mm for center in part["centers_mm"]]
+    volume.rotation = [np.array(rotation) for rotation in part["rotations"]]
+
+
+def add_source(simulation: Any, units: Any, data: dict[str, Any], number: int, emitter: dict[str, Any]) -> None:
+    """A point, or a rod of the phantom."""
+    source = simulation.add_source("GenericSource", f"source_{number}")
+    source.attached_to = emitter["mother"]
+    source.particle = "gamma"
+    energies, photons = np.transpose(data["lines_keV_photons_per_decay"])
+    source.energy.type = "spectrum_discrete"
+    source.energy.spectrum_energies = (energies * units.keV).tolist()
+    source.energy.spectrum_weights = (photons / photons.sum()).tolist()
+    source.activity = emitter["activity_Bq"] * photons.sum() * units.Bq
+    source.half_life = data["half_life_s"] * units.s
+    source.direction.type = "iso"
+    source.position.translation = [x * units.mm for x in emitter["center_mm"]]
+    if "radius_mm" in emitter:
+        source.position.type = "cylinder"
+        source.position.radius = emitter["radius_mm"] * units.mm
+        source.position.dz = emitter["height_mm"] / 2 * units.mm
+    else:
+        source.position.type = "point"
+
+
+def add_digitizer(simulation: Any, units: Any, detector: dict[str, Any], crystal: str) -> None:
+    """Hits, singles, blurred energies and places, the energy window; one chain for each kind of crystal."""
+    hits = simulation.add_actor("DigitizerHitsCollectionActor", f"{crystal}_hits")
+    hits.attributes = ["TotalEnergyDeposit", "PostPosition", "PreStepUniqueVolumeID", "GlobalTime"]
+    chain = [hits]
+
+    def add(kind: str, name: str) -> Any:
+        actor = simulation.add_actor(kind, f"{crystal}_{name}")
+        actor.input_digi_collection = chain[-1].name
+        chain.append(actor)
+        return actor
+
+    add("DigitizerAdderActor", "singles").policy = "EnergyWeightedCentroidPosition"
+    if detector["energy_resolution"]:
+        energy = add("DigitizerBlurringActor", "energy")
+        energy.blur_attribute = "TotalEnergyDeposit"
+        energy.blur_method = "InverseSquare"
+        energy.blur_resolution = detector["energy_resolution"]
+        energy.blur_reference_value = detector["reference_keV"] * units.keV
+    if detector["intrinsic_fwhm_mm"]:
+        place = add("DigitizerSpatialBlurringActor", "place")
+        place.blur_attribute = "PostPosition"
+        place.blur_fwhm = detector["intrinsic_fwhm_mm"] * units.mm
+        place.keep_in_solid_limits = True
+        place.use_truncated_Gaussian = False
+    window = add("DigitizerEnergyWindowsActor", "window")
+    low, high = detector["window_keV"]
+    window.channels = [{"name": f"{crystal}_peak", "min": low * units.keV, "max": high * units.keV}]
+    for actor in chain:
+        actor.attached_to = crystal
+        actor.authorize_repeated_volumes = True
+        actor.root_output.write_to_disk = actor is window
+    window.output_filename = f"singles_{crystal}.root"
+
+
+def images(data: dict[str, Any], positions: NDArray[np.float64]) -> NDArray[np.uint32]:
+    """Singles at world `positions` (N, 3), mm, as images (modules, rows, columns); they may lie in any crystal."""
+    rows, columns = data["image_shape"]
+    made = np.zeros((len(data["modules"]), rows, columns), np.uint32)
+    for image, module in zip(made, data["modules"], strict=True):
+        local = (positions - module["crystal_center_mm"]) @ np.transpose(module["axes_uvk"])
+        half = np.array(module["crystal_size_mm"]) / 2
+        local = local[np.all(np.abs(local) <= half + 1e-3, axis=1)]
+        column, row = (
+            np.clip(np.floor((local[:, i] / half[i] + 1) / 2 * n), 0, n - 1).astype(int)
+            for i, n in ((0, columns), (1, rows))
+        )
+        np.add.at(image, (row, column), 1)
+    return made
+
+
+def read_positions(data: dict[str, Any]) -> NDArray[np.float64]:
+    """World positions (N, 3), mm, of all singles in the energy window."""
+    import uproot
+
+    found = [np.zeros((0, 3))]
+    for crystal in data["crystals"]:
+        with uproot.open(FOLDER / f"singles_{crystal}.root") as file:
+            tree = file[f"{crystal}_peak"]
+            found.append(np.stack([tree[f"PostPosition_{axis}"].array(library="np") for axis in "XYZ"], axis=1))
+    return np.concatenate(found)
+
+
+def main() -> None:
+    """Do what the command line says."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--build-only", action="store_true", help="build the volumes, check for overlaps and stop")
+    parser.add_argument("--images-only", action="store_true", help="make images of the singles that are there")
+    parser.add_argument("--threads", type=int, help="instead of the number in simulation.json")
+    arguments = parser.parse_args()
+    data = json.loads((FOLDER / "simulation.json").read_text())
+    if arguments.build_only:
+        os.environ.setdefault("GATEONRTD", "1")  # opengate then does not look for Geant4's data when it is imported
+    if not arguments.images_only:
+        simulation = build(data, arguments.threads or data["threads"])
+        if arguments.build_only:
+            construct(simulation)
+            return
+        simulation.run()
+    np.save(FOLDER / "images.npy", images(data, read_positions(data)))
+
+
+if __name__ == "__main__":
+    main()

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import sys
+import textwrap
 import time
 from pathlib import Path
 
@@ -15,12 +16,19 @@ from ..files import ensure_folder, refuse_folder
 from ..progress import Progress
 from ..system import PinholeSystem
 
+_HANGING = 15 * " "  # under the second column of lists in descriptions
+
 
 class _HelpFormatter(argparse.HelpFormatter):
     """Shows the defaults that say something, lists as they are typed; keeps the lines of descriptions."""
 
     def _fill_text(self, text: str, width: int, indent: str) -> str:
-        return "\n".join(super(_HelpFormatter, self)._fill_text(line, width, indent) for line in text.splitlines())
+        return "\n".join(
+            textwrap.fill(
+                line, width, initial_indent=indent, subsequent_indent=indent + _HANGING * line.startswith(" ")
+            )
+            for line in text.splitlines()
+        )
 
     def _get_help_string(self, action: argparse.Action) -> str | None:
         if action.help is None or action.default in (None, [], False, argparse.SUPPRESS):

@@ -9,7 +9,7 @@ from __future__ import annotations
 import json
 import zipfile
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
@@ -20,11 +20,13 @@ from ..version import VERSION
 from ..views import Views
 from .format import Format
 
+Which = Literal["all", "collimators", "crystals"]
+
 _KINDS = {"collimators": ("collimator",), "crystals": ("crystal",), "all": ("collimator", "crystal")}
 _MATERIALS = ("collimator", "crystal")
 
 
-def _chosen(system: PinholeSystem, part: str, plate_thickness: float, wall_thickness: float) -> list[ModulePart]:
+def _chosen(system: PinholeSystem, part: Which, plate_thickness: float, wall_thickness: float) -> list[ModulePart]:
     if part not in _KINDS:
         raise InputError(f"part {part!r}: expected one of {', '.join(_KINDS)}")
     return [p for p in module_parts(system, plate_thickness, wall_thickness) if p.kind in _KINDS[part]]
@@ -34,7 +36,7 @@ def write_stl(
     system: PinholeSystem,
     views: Views,
     path: Path,
-    part: str = "all",
+    part: Which = "all",
     plate_thickness: float = 2.0,
     wall_thickness: float = 2.0,
 ) -> None:
@@ -54,7 +56,7 @@ def write_stl_parts(
     system: PinholeSystem,
     views: Views,
     path: Path,
-    part: str = "all",
+    part: Which = "all",
     plate_thickness: float = 2.0,
     wall_thickness: float = 2.0,
 ) -> None:
@@ -90,7 +92,7 @@ def write_3mf(
     system: PinholeSystem,
     views: Views,
     path: Path,
-    part: str = "all",
+    part: Which = "all",
     plate_thickness: float = 2.0,
     wall_thickness: float = 2.0,
 ) -> None:
@@ -153,7 +155,7 @@ def write_glb(
     system: PinholeSystem,
     views: Views,
     path: Path,
-    part: str = "all",
+    part: Which = "all",
     plate_thickness: float = 2.0,
     wall_thickness: float = 2.0,
 ) -> None:

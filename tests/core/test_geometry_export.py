@@ -508,5 +508,4 @@ def test_command_line_refuses_in_one_line(name, words, message, workbook, tmp_pa
 def test_help_lists_all_formats(capsys):
     assert main(["geometry", "export", "--help"]) == 0
     text = " ".join(capsys.readouterr().out.split())
-    assert all(f"{format.name}: {format.title}" in text for format in FORMATS.values())
-    assert "=..." not in text  # every option can be typed
+    assert all(f"{format.name} {format.title}" in text for format in FORMATS.values())

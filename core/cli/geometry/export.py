@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import inspect
 import typing
 from pathlib import Path
 from types import UnionType
@@ -36,14 +37,27 @@ def add_parser(actions) -> None:  # type: ignore[no-untyped-def]
         "--set", action="append", default=[], metavar="NAME=VALUE", help="an option of the format; may be repeated"
     )
     add_view_options(parser, computing=False)
-    parser.epilog = "formats:\n" + "\n".join(map(_described, FORMATS.values())) + f"\n{parser.epilog}"
+    parser.epilog = (
+        "formats, with what --set knows:\n" + "\n".join(map(_described, FORMATS.values())) + f"\n{parser.epilog}"
+    )
     parser.set_defaults(run=_run)
 
 
 def _described(format: Format) -> str:
     files = ", ".join(format.suffixes) or "folder"
-    options = "".join(f"; --set {name}={_kind(type)}" for name, type in option_types(format).items())
-    return f"{format.name}: {format.title} ({files}{options})"
+    text = f"  {format.name:<13}{format.title} ({files})"
+    typed = {name: kind for name, type in option_types(format).items() if (kind := _kind(type))}
+    if not typed:
+        return text
+    options = (f"{name}={_written(format.options[name].default, kind)}" for name, kind in typed.items())
+    return f"{text}\n{'':15}{'; '.join(options)}"
+
+
+def _written(default: Any, kind: str) -> str:
+    """An option's default as it is typed, or what is to be typed where it has none."""
+    if default is None or default is inspect.Parameter.empty or "|" in kind:
+        return kind
+    return ",".join(f"{x:g}" for x in default) if isinstance(default, tuple) else f"{default}"
 
 
 def _run(arguments: argparse.Namespace) -> None:
@@ -106,7 +120,7 @@ def _value(text: str, kind: Any) -> Any:
 
 
 def _kind(kind: Any) -> str:
-    """How a value of `kind` is typed."""
+    """How a value of `kind` is typed; nothing if it cannot be."""
     names = {bool: "yes|no", int: "N", float: "NUMBER", str: "TEXT", Path: "FILE", Grid: "VOLUME-FILE"}
     words = []
     for part in _alternatives(kind):
@@ -114,6 +128,6 @@ def _kind(kind: Any) -> str:
             words += [str(choice) for choice in typing.get_args(part)]
         elif typing.get_origin(part) is tuple:
             words.append(",".join([_kind(typing.get_args(part)[0])] * 2))
-        else:
-            words.append(names.get(part, "..."))
+        elif part in names:
+            words.append(names[part])
     return "|".join(words)

@@ -9,7 +9,7 @@
 
 from __future__ import annotations
 
-from .design import collimator_length
+from .design import collimator_length, roi_radius_seen
 from .errors import InputError, InputWarning
 from .export import read_run, write_run
 from .frames import euler_pose
@@ -17,6 +17,7 @@ from .grid import Grid
 from .isotopes import ISOTOPES, Isotope, isotope
 from .mosaic import as_seen, mosaic
 from .noise import sample_counts
+from .performance import ModulePerformance, isocentre_performance, magnification, resolution, seen, sensitivity
 from .phantoms.derenzo import DerenzoPhantom
 from .presets import c_arm_views, pinhole_views
 from .progress import Cancelled, Progress
@@ -39,6 +40,7 @@ __all__ = [
     "InputWarning",
     "InverseSquareSum",
     "Isotope",
+    "ModulePerformance",
     "PinholeSystem",
     "Progress",
     "ProjectionRun",
@@ -52,14 +54,20 @@ __all__ = [
     "collimator_length",
     "euler_pose",
     "intensity",
+    "isocentre_performance",
     "isotope",
+    "magnification",
     "mosaic",
     "pinhole_views",
     "project_run",
     "read_run",
     "read_system",
     "read_volume",
+    "resolution",
+    "roi_radius_seen",
     "sample_counts",
+    "seen",
+    "sensitivity",
     "trace_rays",
     "write_run",
     "write_volume",

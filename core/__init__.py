@@ -13,6 +13,7 @@ from .design import collimator_length, roi_radius_seen
 from .errors import InputError, InputWarning
 from .export import read_run, write_run
 from .frames import euler_pose
+from .generators import RingFit, ellipse_rings, fit_rings, plate_rings, regular_polygon
 from .grid import Grid
 from .isotopes import ISOTOPES, Isotope, isotope
 from .mosaic import as_seen, mosaic
@@ -45,6 +46,7 @@ __all__ = [
     "Progress",
     "ProjectionRun",
     "Projector",
+    "RingFit",
     "SystemSource",
     "Transmission",
     "Views",
@@ -52,17 +54,21 @@ __all__ = [
     "as_seen",
     "c_arm_views",
     "collimator_length",
+    "ellipse_rings",
     "euler_pose",
+    "fit_rings",
     "intensity",
     "isocentre_performance",
     "isotope",
     "magnification",
     "mosaic",
     "pinhole_views",
+    "plate_rings",
     "project_run",
     "read_run",
     "read_system",
     "read_volume",
+    "regular_polygon",
     "resolution",
     "roi_radius_seen",
     "sample_counts",

@@ -16,6 +16,7 @@ from .frames import euler_pose
 from .generators import RingFit, ellipse_rings, fit_rings, plate_rings, regular_polygon
 from .grid import Grid
 from .isotopes import ISOTOPES, Isotope, isotope
+from .maps import completeness_map, modules_map, resolution_map, sensitivity_map
 from .mosaic import as_seen, mosaic
 from .noise import sample_counts
 from .performance import ModulePerformance, isocentre_performance, magnification, resolution, seen, sensitivity
@@ -25,6 +26,7 @@ from .progress import Cancelled, Progress
 from .project import project_run
 from .projector import Emission, InverseSquareSum, Projector, Transmission, intensity, trace_rays
 from .run import ProjectionRun
+from .sampling import sampling_gaps
 from .system import PinholeSystem
 from .views import Views
 from .volume import Volume
@@ -54,6 +56,7 @@ __all__ = [
     "as_seen",
     "c_arm_views",
     "collimator_length",
+    "completeness_map",
     "ellipse_rings",
     "euler_pose",
     "fit_rings",
@@ -61,6 +64,7 @@ __all__ = [
     "isocentre_performance",
     "isotope",
     "magnification",
+    "modules_map",
     "mosaic",
     "pinhole_views",
     "plate_rings",
@@ -70,10 +74,13 @@ __all__ = [
     "read_volume",
     "regular_polygon",
     "resolution",
+    "resolution_map",
     "roi_radius_seen",
     "sample_counts",
+    "sampling_gaps",
     "seen",
     "sensitivity",
+    "sensitivity_map",
     "trace_rays",
     "write_run",
     "write_volume",

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 
 import numpy as np
@@ -39,7 +40,7 @@ def test_equal_arcs_are_equally_long():
     system = mph.ellipse_rings(13, z=0.0, start=0.5, end=5.0, spacing="arc", **TILTED, **MODULE)
     azimuths = np.unwrap(np.arctan2(system.centers[:, 1], system.centers[:, 0]))
     lengths = []
-    for first, last in zip(azimuths, azimuths[1:], strict=False):
+    for first, last in itertools.pairwise(azimuths):
         fine = mph.ellipse_rings(np.linspace(first, last, 20001), z=0.0, **TILTED, **MODULE)
         lengths.append(np.linalg.norm(np.diff(fine.centers, axis=0), axis=1).sum())
     assert np.ptp(lengths) < 1e-4

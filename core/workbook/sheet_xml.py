@@ -16,7 +16,7 @@ At = tuple[int, int]
 """Row and column, counted from 1."""
 
 
-class _Unreadable(str):
+class Unreadable(str):
     """A stored value of a kind that formulas are not computed with here; its text."""
 
 
@@ -203,7 +203,7 @@ class SheetXml:
     @property
     def changed(self) -> list[At]:
         """The cells that are not as they were read, row by row."""
-        return sorted(at for at, cell in self.cells.items() if cell != self.original.get(at, _NEW))
+        return sorted(at for at, cell in self.cells.items() if not _same(cell, self.original.get(at, _NEW)))
 
     @property
     def formulas_moved(self) -> bool:
@@ -244,7 +244,7 @@ class SheetXml:
             same_value = cell.value is origin.value
         if origin is None or origin.at != at:
             tag = with_attribute(tag, "r", _name(at))
-        if not same_value:
+        if not same_value or cell.value is None:
             tag = with_attribute(with_attribute(tag, "t", _type(cell.value)), "vm", None)
         if cell.formula is None:
             tag = with_attribute(tag, "cm", None)
@@ -363,6 +363,11 @@ class SheetXml:
 _NEW = Cell()
 
 
+def _same(a: Cell, b: Cell) -> bool:
+    styles = [cell.origin.style if cell.origin else None for cell in (a, b)]
+    return a == b and type(a.value) is type(b.value) and (styles[0] == styles[1] or a.origin is b.origin)
+
+
 def _value(kind: str, parts: dict[str, Element], inside: dict[int, list[Element]], strings: list[str]) -> Any:
     if kind == "inlineStr" and "is" in parts:
         return _rich_text(parts["is"], inside)
@@ -382,8 +387,8 @@ def _value(kind: str, parts: dict[str, Element], inside: dict[int, list[Element]
         if kind == "n":
             return float(text)
     except (ValueError, IndexError):
-        return _Unreadable(text)
-    return CellError(text) if kind == "e" else _Unreadable(text)
+        return Unreadable(text)
+    return CellError(text) if kind == "e" else Unreadable(text)
 
 
 def _rich_text(element: Element, inside: dict[int, list[Element]]) -> str:

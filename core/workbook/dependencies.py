@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections import defaultdict
 from collections.abc import Iterable
 
@@ -15,6 +16,8 @@ _AT_ONCE = 64
 """Cells of an area that are noted one by one; of larger ones, the corners."""
 _NAMES_DEEP = 20
 _UNFORESEEABLE = {"INDIRECT", "OFFSET"}
+
+_OTHER_FILE = re.compile(r"'?[^!]*\[[^\]]+\][^!]*'?!")
 
 _Area = tuple[str, int, int, int, int]
 
@@ -79,17 +82,17 @@ class Dependencies:
                 name = token.value[:-1].upper()
                 if name in _UNFORESEEABLE or ":" in name:
                     raise Unforeseeable(name)
-            if token.type == "ARRAY" or token.type != "OPERAND" or token.subtype != "RANGE":
+            if token.type != "OPERAND" or token.subtype != "RANGE":
                 continue
             area = reference(token.value)
             if area is not None:
                 sheets = [title] if area.sheet is None else self._workbook.between(area.sheet)
                 found += [(sheet, area.top, area.left, area.bottom, area.right) for sheet in sheets]
-            elif token.value.startswith(("[", "'[")) and "!" in token.value:
+            elif _OTHER_FILE.match(token.value):
                 continue  # another file's cell does not change with this one's
             else:
                 meaning = self._workbook.defined_name(title, token.value)
-                if meaning is None or depth == _NAMES_DEEP or "$" not in meaning and "!" in meaning:
+                if meaning is None or depth == _NAMES_DEEP:
                     raise Unforeseeable(token.value)
                 found += self._areas(meaning, title, depth + 1)
         return found

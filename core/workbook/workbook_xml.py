@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import re
 from functools import cached_property
 from typing import Any
 
 from ..errors import InputError
-from .formulas import NotComputable
+from .formulas import NotComputable, tokens_of
 from .package import Package
 from .references import MAX_ROW, Reference, reference
 from .sheet_xml import MAIN, Cell, SheetXml, Unreadable, shared_strings
@@ -72,7 +73,7 @@ class WorkbookXml:
 
     @property
     def suffix(self) -> str | None:
-        """".xlsx" or ".xlsm" by what is inside, None for anything else."""
+        """ ".xlsx" or ".xlsm" by what is inside, None for anything else."""
         kind = self.package.content_type(self._part)
         return next((suffix for suffix, content_type in KINDS.items() if kind == content_type), None)
 
@@ -89,11 +90,12 @@ class WorkbookXml:
         return names
 
     def defined_name(self, sheet: str, name: str) -> str | None:
-        """The formula of a defined name as seen from `sheet`."""
+        """The formula of a defined name as seen from `sheet`; None where it is unknown or depends on the place."""
         own, _, plain = name.rpartition("!")
         scope = self.title(own.strip("'")) if own else sheet
         key = plain.casefold()
-        return self._names.get((scope, key)) or self._names.get((None, key))
+        formula = self._names.get((scope, key)) or self._names.get((None, key))
+        return formula if formula is not None and _is_absolute(formula) else None
 
     @property
     def defined_names(self) -> list[tuple[str, str]]:
@@ -172,7 +174,7 @@ class WorkbookXml:
 
     def ranges_ending_at(self, sheet: str, first: int, last: int) -> list[str]:
         """What refers to several rows of `sheet` down to row `last`, and begins in rows `first` to `last`: formulas'
-        cells, defined names, charts and tables."""  # noqa: D205
+        cells, defined names, charts and tables."""
         found = []
 
         def ends_there(area: Reference | None, own: str) -> bool:
@@ -205,11 +207,18 @@ class WorkbookXml:
 
 def areas_in(formula: str) -> list[Reference]:
     """The areas that a formula names."""
-    from .formulas import tokens_of
+    return [area for text in _operands(formula) if (area := reference(text)) is not None]
 
+
+def _operands(formula: str) -> list[str]:
     try:
         tokens = tokens_of(formula)
     except NotComputable:
         return []
-    operands = [token.value for token in tokens if token.type == "OPERAND" and token.subtype == "RANGE"]
-    return [area for text in operands if (area := reference(text)) is not None]
+    return [token.value for token in tokens if token.type == "OPERAND" and token.subtype == "RANGE"]
+
+
+def _is_absolute(formula: str) -> bool:
+    """Whether the formula of a name means the same wherever the name is used: ``Main!$B$3``, not ``Main!B3``."""
+    cells = [text.rpartition("!")[2] for text in _operands(formula) if reference(text) is not None]
+    return all(text.count("$") == len(re.findall(r"[A-Za-z]+|\d+", text)) for text in cells)

@@ -27,6 +27,8 @@ _ARC_STEPS = 1 << 15
 # An ellipse has five parameters: fewer modules than this say nothing about one.
 _FEWEST_ON_ELLIPSE = 6
 _FIT_STEPS = 100
+# A gap of more than so many mean ones opens a ring.
+_OPEN_GAP = 2.0
 
 
 def ellipse_rings(
@@ -183,7 +185,7 @@ class RingFit:
     Attributes
     ----------
     numbers : int array (M,)
-        The ring's modules in the order of the ring.
+        The ring's modules along the ring, an open one from its end.
     semi_axes, center : array (2,)
         mm, as `ellipse_rings` takes them.
     rotation : float
@@ -273,13 +275,20 @@ def _fit(system: PinholeSystem, which: NDArray[np.intp]) -> RingFit:
 
 
 def _in_order(system: PinholeSystem, which: NDArray[np.intp]) -> tuple[Array, NDArray[np.intp]]:
-    """Azimuths without a jump and the modules `which` along the ring, from its widest gap, in their own direction."""
+    """The modules `which` in their order along the ring, and their azimuths without a jump.
+
+    An open ring begins beside its gap, a closed one at the module that comes first in the system.
+    """
     azimuths = np.arctan2(system.centers[which, 1], system.centers[which, 0])
     order = np.argsort(azimuths, kind="stable")
-    gaps = np.diff(azimuths[order], append=azimuths[order[0]] + _FULL_TURN)
-    order = np.roll(order, -(int(np.argmax(gaps)) + 1))
-    if np.mean(np.diff(order) < 0) > 0.5:
+    clockwise = np.mean(np.diff(order) < 0) > 0.5
+    if clockwise:
         order = order[::-1]
+    steps = np.diff(azimuths[order], append=azimuths[order[0]])
+    gaps = np.mod(-steps if clockwise else steps, _FULL_TURN)
+    closed = gaps.max() < _OPEN_GAP * _FULL_TURN / len(which)
+    first = int(np.argmin(order)) if closed else int(np.argmax(gaps)) + 1
+    order = np.roll(order, -first)
     return np.unwrap(azimuths[order]), which[order]
 
 

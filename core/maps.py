@@ -103,9 +103,12 @@ def resolution_map(
     """
 
     def combined(points: Array) -> Array:
-        edge = {"aperture_mu": aperture_mu, "opening_angle": opening_angle}
-        fwhm = resolution(system, points, intrinsic_fwhm=intrinsic_fwhm, **edge)
-        counts = sensitivity(system, points, crystal_mu=crystal_mu, **edge)
+        fwhm = resolution(
+            system, points, intrinsic_fwhm=intrinsic_fwhm, aperture_mu=aperture_mu, opening_angle=opening_angle
+        )
+        counts = sensitivity(
+            system, points, aperture_mu=aperture_mu, opening_angle=opening_angle, crystal_mu=crystal_mu
+        )
         total = counts.sum(axis=1)
         return np.sqrt((counts * np.nan_to_num(fwhm) ** 2).sum(axis=1) / np.where(total > 0, total, 1))
 

@@ -68,8 +68,9 @@ def test_plates_carry_their_modules_evenly(rng):
 
 @pytest.mark.parametrize("spacing", ["angle", "arc"])
 @pytest.mark.parametrize("curve", [TILTED, {"semi_axes": 240.0}, {"semi_axes": (200.0, 290.0)}])
-def test_what_was_generated_is_found_again(spacing, curve):
-    made = mph.ellipse_rings(18, z=(-50.0, 10.0), start=4.0, end=-0.5, spacing=spacing, **curve, **MODULE)
+@pytest.mark.parametrize(("start", "end"), [(4.0, -0.5), (2.0, 4.0), (3.0, 1.5)])
+def test_what_was_generated_is_found_again(spacing, curve, start, end):
+    made = mph.ellipse_rings(18, z=(-50.0, 10.0), start=start, end=end, spacing=spacing, **curve, **MODULE)
     for ring, fit in enumerate(mph.fit_rings(made)):
         assert np.array_equal(fit.numbers, made.numbers[18 * ring : 18 * ring + 18])
         assert np.allclose(fit.semi_axes, curve["semi_axes"], atol=1e-6)
@@ -79,6 +80,15 @@ def test_what_was_generated_is_found_again(spacing, curve):
         for even, tolerance in ((False, 1e-7), (True, 1e-5)):
             again = mph.ellipse_rings(**fit.parameters(even), **MODULE)
             assert np.allclose(again.centers, made.centers[18 * ring : 18 * ring + 18], atol=tolerance)
+
+
+@pytest.mark.parametrize("end", [2.0 + 2 * math.pi, 2.0 - 2 * math.pi])
+def test_a_closed_ring_is_found_from_its_first_module(end):
+    made = mph.ellipse_rings(15, z=0.0, start=2.0, end=end, spacing="arc", **TILTED, **MODULE)
+    (fit,) = mph.fit_rings(made)
+    assert np.array_equal(fit.numbers, made.numbers)
+    assert fit.even_deviation < 1e-5
+    assert np.allclose(mph.ellipse_rings(**fit.parameters(even=True), **MODULE).centers, made.centers, atol=1e-5)
 
 
 def test_the_fit_is_the_nearest_ellipse(rng):

@@ -126,6 +126,8 @@ def _gaps(points, centers, visible, tolerance, gaps):  # type: ignore[no-untyped
             for k in range(count):
                 sine = min(sine, abs(n[0] * towards[k, 0] + n[1] * towards[k, 1] + n[2] * towards[k, 2]))
                 if sine <= least:
+                    for i in range(3):  # what rules out this patch will likely rule out the next: look at it first
+                        towards[k, i], towards[0, i] = towards[0, i], towards[k, i]
                     break
             if sine <= least:
                 continue

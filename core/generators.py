@@ -27,6 +27,7 @@ _ARC_STEPS = 1 << 15
 # An ellipse has five parameters: fewer modules than this say nothing about one.
 _FEWEST_ON_ELLIPSE = 6
 _FIT_STEPS = 100
+_ON_AXIS = 1e-9
 # A gap of more than so many mean ones opens a ring.
 _OPEN_GAP = 2.0
 
@@ -239,10 +240,18 @@ def fit_rings(system: PinholeSystem) -> list[RingFit]:
     Flusser by Gauss and Newton's method. For a ring of fewer than 6 modules, and where no ellipse around the isocentre
     is found, it is the circle about the isocentre with the pinholes' mean distance.
 
+    Raises
+    ------
+    InputError
+        A module stands on the z axis, where it has no azimuth.
+
     References
     ----------
     R. Halir, J. Flusser, "Numerically stable direct least squares fitting of ellipses", Proc. WSCG (1998) 125-132.
     """
+    on_axis = np.hypot(*system.centers.T[:2]) <= _ON_AXIS * system.pinhole_distance
+    if on_axis.any():
+        raise InputError(f"module {system.numbers[np.argmax(on_axis)]}: stands on the z axis, not on a ring around it")
     rings = system.rings()
     return [_fit(system, np.flatnonzero(rings == ring)) for ring in range(rings.max() + 1)]
 
@@ -281,7 +290,7 @@ def _in_order(system: PinholeSystem, which: NDArray[np.intp]) -> tuple[Array, ND
     """
     azimuths = np.arctan2(system.centers[which, 1], system.centers[which, 0])
     order = np.argsort(azimuths, kind="stable")
-    clockwise = np.mean(np.diff(order) < 0) > 0.5
+    clockwise = 2 * np.count_nonzero(np.diff(order) < 0) > len(order)
     if clockwise:
         order = order[::-1]
     steps = np.diff(azimuths[order], append=azimuths[order[0]])

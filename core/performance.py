@@ -140,8 +140,9 @@ def resolution(
     """
     points = _checked(points)
     _check_edge(aperture_mu, opening_angle)
-    if intrinsic_fwhm != 0:
-        intrinsic_fwhm = positive(intrinsic_fwhm, "intrinsic_fwhm", "mm")
+    intrinsic_fwhm = float(real_array(intrinsic_fwhm, "intrinsic_fwhm", ()))
+    if intrinsic_fwhm < 0:
+        raise InputError(f"intrinsic_fwhm: expected 0 mm or more, got {intrinsic_fwhm:g}")
     x_u, x_v, h = _in_modules(system, points)
     diameter = half_value_diameter(system.pinhole_diameter, aperture_mu, opening_angle)
     fwhm = _fwhm(h / system.collimator_length, diameter, intrinsic_fwhm)
@@ -191,12 +192,12 @@ def isocentre_performance(
         Pinhole to isocentre, hole's diameter, collimator's length, crystal's side and thickness, mm: numbers or arrays
         that broadcast.
     intrinsic_fwhm, aperture_mu, opening_angle, crystal_mu, photons_per_decay
-        As in `sensitivity` and `resolution`.
+        As in `sensitivity` and `resolution`, but not checked: this is for readouts that must not wait.
 
     Raises
     ------
     InputError
-        A length is not finite or out of its range.
+        b, d, l or Ld is not finite or out of its range.
     """
     radius = roi_radius_seen(b, d, Ld, l)
     b, d, l, Td = (np.asarray(x, dtype=np.float64) for x in (b, d, l, Td))

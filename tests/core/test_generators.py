@@ -167,3 +167,11 @@ def test_plates_that_cannot_be_are_refused():
             mph.plate_rings(modules, vertices, 0.0, **MODULE)
     with pytest.raises(mph.InputError, match="sides"):
         mph.regular_polygon(2, 200)
+
+
+def test_a_module_on_the_axis_is_on_no_ring():
+    system = mph.PinholeSystem(np.array([[200.0, 0, 0], [0, 0, 250.0]]), 2.3, 60.0, 50.0, 10.0, 75.0)
+    with pytest.raises(mph.InputError, match="module 2: stands on the z axis"):
+        mph.fit_rings(system)
+    (alone,) = mph.fit_rings(system[:1])
+    assert np.allclose(mph.ellipse_rings(**alone.parameters(), **MODULE).centers, [[200, 0, 0]])

@@ -64,11 +64,11 @@ def new_workbook(system: PinholeSystem) -> WorkbookXml:
         book[title].cell(row, column, number)
     by_design = is_by_design(system)
     for i, row in enumerate(range(FIRST_ROW, FIRST_ROW + len(system))):
-        for column, formula in _FORMULAS.items():
-            if column != "G" or by_design[i]:
-                coordinates[f"{column}{row}"] = formula.format(row)
-        for column in "BCDEFGHIJKUVW":
-            coordinates[f"{column}{row}"].number_format = "0.0000"
+        for letter, formula in _FORMULAS.items():
+            if letter != "G" or by_design[i]:
+                coordinates[f"{letter}{row}"] = formula.format(row)
+        for letter in "BCDEFGHIJKUVW":
+            coordinates[f"{letter}{row}"].number_format = "0.0000"
     content = io.BytesIO()
     book.save(content)
     workbook = WorkbookXml(content.getvalue(), "the new workbook")

@@ -416,11 +416,11 @@ def _warn_of_formulas(workbook: WorkbookXml, result: Recalculated) -> None:
             stacklevel=4,
         )
     if result.cleared:
-        first = sorted(result.cleared)[0]
+        places = list(result.cleared)  # causes before effects
         missing = "" if libreoffice.program() else "; LibreOffice, which may know it, is not installed"
         warnings.warn(
-            f"{workbook.name}: {_cell_and_more(workbook, sorted(result.cleared))}: the formula's new value could not be "
-            f"calculated ({result.cleared[first]}{missing}); opening the workbook in Excel or LibreOffice and saving "
+            f"{workbook.name}: {_cell_and_more(workbook, places)}: the formula's new value could not be "
+            f"calculated ({result.cleared[places[0]]}{missing}); opening the workbook in Excel or LibreOffice and saving "
             "it stores the value",
             InputWarning,
             stacklevel=4,

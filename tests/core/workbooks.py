@@ -150,9 +150,9 @@ def _summaries(book: Workbook, name: str, x: str, y: str, z: str, first: int, la
             f"=IFERROR(MATCH({name}!{x}{first + 1},all_x,0),-1)",
             f"=MAX({name}!{x}{first}:{z}{last})-MIN({name}!{x}{first}:{z}{last})",
             f"=IF(AND(A1>0,{name}!{x}{first}<>0),1/{name}!{x}{first},COUNT(all_x))",
-            f"=COUNTIF(all_x,\">0\")+MOD({name}!{y}{first},7)",
+            f'=COUNTIF(all_x,">0")+MOD({name}!{y}{first},7)',
             f"=STDEV({name}!{x}{first}:{x}{last})+INT({name}!{z}{first})+SIGN({name}!{y}{first})",
-            "=SUM(INDIRECT(\"A1:A4\"))",
+            '=SUM(INDIRECT("A1:A4"))',
         ],
         start=1,
     ):

@@ -205,6 +205,29 @@ def openings(n: int, diameter: float, knife: KnifeEdge | None = None) -> list[Op
     return in_hole + [Opening(x, y, 0.0, knife, ((x, y, area),)) for x, y, area in beyond]
 
 
+def paix_diameter(diameter: Array, mu: float | None, opening_angle: float) -> Array:
+    """Paix's effective diameter ``sqrt(d (d + 2 / mu tan(alpha / 2)))``, mm, of knife-edge holes of diameter d, mm.
+
+    The opaque hole that lets as many photons pass. `mu`, 1/mm, is the material's (None: opaque, d itself), and
+    `opening_angle`, rad, the full angle alpha of the edge's double cone.
+    """
+    if mu is None:
+        return diameter
+    return np.sqrt(diameter * (diameter + 2 / mu * math.tan(opening_angle / 2)))
+
+
+def half_value_diameter(diameter: Array, mu: float | None, opening_angle: float) -> Array:
+    """Diameter ``d + ln(2) / mu tan(alpha / 2)``, mm, at which a knife edge lets half of the axial photons pass.
+
+    Beyond the rim of a hole of diameter d, mm, at radius r, the edge is ``2 (r - d / 2) / tan(alpha / 2)`` thick. So it
+    is the full width at half maximum of the hole's shadow: the resolution-equivalent diameter of Accorsi and Metzler.
+    Arguments as in `paix_diameter`.
+    """
+    if mu is None:
+        return diameter
+    return diameter + math.log(2) / mu * math.tan(opening_angle / 2)
+
+
 def within_cone(slope_u: ArrayOrTensor, slope_v: ArrayOrTensor, tangent: float) -> ArrayOrTensor:
     """1 where lines are less steep than a cone, tan(psi) < tangent, else 0."""
     slope = slope_u**2 + slope_v**2

@@ -16,7 +16,7 @@ from ..isotopes import Isotope, isotope
 from ..system import PinholeSystem
 from ..views import Views
 from ..volume import Volume
-from .aperture import KnifeEdge, Opening, openings, points_needed, within_cone
+from .aperture import KnifeEdge, Opening, openings, paix_diameter, points_needed, within_cone
 from .arrays import ArrayOrTensor, is_tensor, namespace
 from .crystal import absorbed_share, gaussian_blur, layer_depths, share_inside
 from .models import Array, Beam, Model, view_rays
@@ -243,10 +243,10 @@ class Emission(Model):
     def effective_diameter(self) -> Array:
         """d_e (M,), mm: the opaque hole that lets as many photons pass along the axis."""
         d = self.system.pinhole_diameter
-        if self.aperture_mu is None:
-            return d
+        if self.aperture_mu is None or self.edge == "paix":
+            return paix_diameter(d, self.aperture_mu, self.opening_angle)
         depth = 2 / self.aperture_mu * self._tangent
-        return np.sqrt(d * (d + depth) + (depth**2 / 2 if self.edge == "path" else 0))
+        return np.sqrt(d * (d + depth) + depth**2 / 2)
 
     @property
     def _tangent(self) -> float:

@@ -13,9 +13,9 @@ from .design import collimator_length, roi_radius_seen
 from .errors import InputError, InputWarning
 from .export import read_run, write_run
 from .frames import euler_pose
+from .generators import RingFit, ellipse_rings, fit_rings, plate_rings, regular_polygon
 from .geometry_checks import GeometryReport, check_geometry
 from .geometry_export import read_geometry, write_geometry
-from .generators import RingFit, ellipse_rings, fit_rings, plate_rings, regular_polygon
 from .grid import Grid
 from .isotopes import ISOTOPES, Isotope, isotope
 from .maps import completeness_map, modules_map, resolution_map, sensitivity_map

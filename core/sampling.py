@@ -67,7 +67,10 @@ def sampling_gaps(system: PinholeSystem, points: ArrayLike, *, tolerance: float 
 
 
 def _kernel() -> Any:
-    from numba import types  # not before it is needed: it takes a second
+    try:
+        from numba import types  # not before it is needed: it takes a second
+    except ImportError as error:
+        raise InputError("completeness of the sampling: needs numba (pip install numba)") from error
 
     from .projector.compiling import compiled
 

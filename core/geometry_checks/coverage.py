@@ -2,8 +2,7 @@
 
 A module sees a point fully if its rays through every point of the hole meet the crystal: at depth x in front of the
 pinhole these are the points within ``w(x) = x s - d/2`` of the axis along u and along v, with ``s = (Ld - d)/(2 l)``.
-The sphere at the isocentre that touches the four sides of this pyramid has the radius ``(b s - d/2)/sqrt(1 + s^2)``;
-`core.design.collimator_length` makes it R.
+The largest sphere at the isocentre in it has the radius `core.design.roi_radius_seen`.
 """
 
 from __future__ import annotations
@@ -11,6 +10,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from ..design import roi_radius_seen
 from ..system import PinholeSystem
 from .report import Uncovered
 
@@ -24,7 +24,7 @@ def find_uncovered(system: PinholeSystem) -> tuple[Uncovered, ...]:
     """The modules whose field of view falls short of their ROI by more than `SLACK`."""
     b, d, radius = system.pinhole_distance, system.pinhole_diameter, system.roi_radius
     slope = (system.detector_side - d) / (2 * system.collimator_length)
-    seen = np.maximum((b * slope - d / 2) / np.sqrt(1 + slope**2), 0.0)
+    seen = roi_radius_seen(b, d, system.detector_side, system.collimator_length)
     return tuple(
         Uncovered(
             module=int(system.numbers[m]),

@@ -13,6 +13,7 @@ from .design import collimator_length, roi_radius_seen
 from .errors import InputError, InputWarning
 from .export import read_run, write_run
 from .frames import euler_pose
+from .geometry_checks import GeometryReport, check_geometry
 from .grid import Grid
 from .isotopes import ISOTOPES, Isotope, isotope
 from .mosaic import as_seen, mosaic
@@ -35,6 +36,7 @@ __all__ = [
     "Cancelled",
     "DerenzoPhantom",
     "Emission",
+    "GeometryReport",
     "Grid",
     "InputError",
     "InputWarning",
@@ -51,6 +53,7 @@ __all__ = [
     "Volume",
     "as_seen",
     "c_arm_views",
+    "check_geometry",
     "collimator_length",
     "euler_pose",
     "intensity",

@@ -9,7 +9,8 @@ import warnings
 
 import numpy as np
 
-from ...errors import InputWarning
+from ...errors import InputError, InputWarning
+from ...geometry_checks import check_geometry
 from ...system import PinholeSystem
 from ...workbook import read_system
 from ..options import add_command
@@ -19,9 +20,16 @@ from .arguments import add_workbook
 def add_parser(actions) -> None:  # type: ignore[no-untyped-def]
     """Add the action."""
     parser = add_command(
-        actions, "check", "compare the workbook with the design formulas", "mphdrr geometry check a.xlsx"
+        actions,
+        "check",
+        "compare the workbook with the design formulas, and look for modules that overlap, see too little of the ROI or "
+        "block each other",
+        "mphdrr geometry check scanner.xlsx --wall 3 --strict",
     )
     add_workbook(parser)
+    parser.add_argument("--plate", type=float, default=2.0, metavar="MM", help="thickness of the aperture plates")
+    parser.add_argument("--wall", type=float, default=2.0, metavar="MM", help="thickness of the collimators' walls")
+    parser.add_argument("--strict", action="store_true", help="exit with status 1 if there is any warning or finding")
     parser.set_defaults(run=_run)
 
 
@@ -30,14 +38,26 @@ def _run(arguments: argparse.Namespace) -> None:
         warnings.simplefilter("always", InputWarning)
         system = read_system(arguments.file)
     messages = [str(w.message) for w in caught if issubclass(w.category, InputWarning)]
+    report = check_geometry(system, plate_thickness=arguments.plate, wall_thickness=arguments.wall)
+    findings = report.messages()
+    total = f"{_count(messages, 'warning')} of the workbook, {_count(findings, 'finding')} in the geometry"
     if arguments.json:
-        print(json.dumps({"summary": _summary(system), "warnings": messages}, indent=1))
-        return
-    for message in messages:
-        sys.stderr.write(f"mphdrr: warning: {message}\n")
-    for name, text in _summary(system).items():
-        print(f"{name:22s} {text}")
-    print(f"{len(messages)} warning{'' if len(messages) == 1 else 's'}")
+        answer = {"summary": _summary(system), "warnings": messages, "findings": findings, "geometry": report.as_dict()}
+        print(json.dumps(answer, indent=1))
+    else:
+        for message in messages:
+            sys.stderr.write(f"mphdrr: warning: {message}\n")
+        for name, text in _summary(system).items():
+            print(f"{name:22s} {text}")
+        for finding in findings:
+            print(finding)
+        print(total)
+    if arguments.strict and (messages or findings):
+        raise InputError(f"{arguments.file}: {total}")
+
+
+def _count(lines: list[str], name: str) -> str:
+    return f"{len(lines)} {name}{'' if len(lines) == 1 else 's'}"
 
 
 def _summary(system: PinholeSystem) -> dict[str, str]:

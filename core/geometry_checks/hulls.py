@@ -1,0 +1,83 @@
+"""Convex hulls of the modules' parts. Each is a frustum with square ends: the filled collimator, or the crystal's box."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..collimator_mesh import Solid
+from ..module_parts import Kind, ModulePart
+
+TOUCH = 1e-6
+"""Lengths, mm, up to which bodies only touch."""
+
+_SQUARE = np.array([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]])
+_FACES = np.array([[0, 3, 2, 1], [4, 5, 6, 7], [0, 1, 5, 4], [1, 2, 6, 5], [2, 3, 7, 6], [3, 0, 4, 7]])
+_EDGES = np.array([[0, 1], [0, 3], [0, 4], [1, 5], [2, 6], [3, 7]])  # one of each direction
+
+
+@dataclass(frozen=True, eq=False)
+class Hulls:
+    """Convex hulls of P parts, world mm.
+
+    Attributes
+    ----------
+    numbers : int array (P,)
+        The parts' modules.
+    kinds : tuple of P names
+        The parts.
+    vertices : array (P, 8, 3)
+    normals, offsets : arrays (P, 6, 3), (P, 6)
+        The faces: a point x is inside where ``normals @ x <= offsets``.
+    edges : array (P, 6, 3)
+        Unit vectors along the edges.
+    centers, radii : arrays (P, 3), (P,)
+        Spheres around them.
+    """
+
+    numbers: NDArray[np.int64]
+    kinds: tuple[Kind, ...]
+    vertices: NDArray[np.float64]
+    normals: NDArray[np.float64]
+    offsets: NDArray[np.float64]
+    edges: NDArray[np.float64]
+    centers: NDArray[np.float64]
+    radii: NDArray[np.float64]
+
+    @classmethod
+    def of(cls, parts: Sequence[ModulePart]) -> Hulls:
+        """The hulls of `parts`."""
+        vertices = np.stack([part.to_world(_corners(part.solid)) for part in parts])
+        a, b, _, d = (vertices[:, _FACES[:, i]] for i in range(4))
+        normals = _unit(np.cross(b - a, d - a))
+        centers = vertices.mean(axis=1)
+        return cls(
+            numbers=np.array([part.number for part in parts]),
+            kinds=tuple(part.kind for part in parts),
+            vertices=vertices,
+            normals=normals,
+            offsets=np.einsum("pfx,pfx->pf", normals, a),
+            edges=_unit(vertices[:, _EDGES[:, 1]] - vertices[:, _EDGES[:, 0]]),
+            centers=centers,
+            radii=np.linalg.norm(vertices - centers[:, None], axis=2).max(axis=1),
+        )
+
+    def __len__(self) -> int:
+        return len(self.numbers)
+
+
+def _corners(solid: Solid) -> NDArray[np.float64]:
+    """The hull's corners (8, 3): both solids end in squares around Z, the outermost at either end."""
+    vertices, _ = solid
+    corners = []
+    for z in (vertices[:, 2].min(), vertices[:, 2].max()):
+        half = np.abs(vertices[vertices[:, 2] == z, :2]).max()
+        corners.append(np.column_stack([half * _SQUARE, np.full(4, z)]))
+    return np.concatenate(corners)
+
+
+def _unit(vectors: NDArray[np.float64]) -> NDArray[np.float64]:
+    return vectors / np.linalg.norm(vectors, axis=-1, keepdims=True)

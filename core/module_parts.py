@@ -1,0 +1,91 @@
+"""The solids of all modules in the world: what checks look at and what is written to files."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from .checks import positive
+from .collimator_mesh import Solid, collimator_solid, crystal_solid
+from .errors import InputError
+from .system import PinholeSystem
+
+Kind = Literal["collimator", "crystal"]
+
+
+@dataclass(frozen=True, eq=False)
+class ModulePart:
+    """A collimator, with its aperture plate, or a crystal.
+
+    Attributes
+    ----------
+    number : int
+        The module's number.
+    kind : "collimator" or "crystal"
+    name : str
+        "Module 07 collimator": the names of a scanner sort as its numbers do.
+    solid : Solid
+        In the module's camera space (`core.collimator_mesh`).
+    pose : array (4, 4)
+        World from camera space, mm.
+    """
+
+    number: int
+    kind: Kind
+    name: str
+    solid: Solid
+    pose: NDArray[np.float64]
+
+    @property
+    def vertices(self) -> NDArray[np.float64]:
+        """(V, 3), world mm."""
+        return self.to_world(self.solid[0])
+
+    @property
+    def triangles(self) -> NDArray[np.int32]:
+        """(F, 3), counter-clockwise as seen from outside."""
+        quads = self.solid[1]
+        return quads[:, [0, 1, 2, 0, 2, 3]].reshape(-1, 3)
+
+    def to_world(self, points: ArrayLike) -> NDArray[np.float64]:
+        """Points (N, 3) of camera space in the world, mm."""
+        return points @ self.pose[:3, :3].T + self.pose[:3, 3]
+
+
+def module_parts(system: PinholeSystem, plate_thickness: float = 2.0, wall_thickness: float = 2.0) -> list[ModulePart]:
+    """Collimator and crystal of each module, in the order of the modules.
+
+    Parameters
+    ----------
+    system
+        The modules.
+    plate_thickness, wall_thickness
+        Of the aperture plates and of the collimators' walls, mm.
+
+    Raises
+    ------
+    InputError
+        A thickness is not above 0, or the plate is as thick as a module's collimator is long.
+    """
+    plate = positive(plate_thickness, "aperture plate", "mm")
+    wall = positive(wall_thickness, "collimator wall", "mm")
+    poses = system.poses()
+    poses[:, :3, [0, 2]] *= -1  # camera space is X = -u, Y = v, Z = -k
+    width = max(2, len(str(system.numbers.max())))
+    sizes = (system.pinhole_diameter, system.collimator_length, system.detector_side, system.detector_thickness)
+    parts = []
+    for number, pose, *size in zip(system.numbers.tolist(), poses, *(s.tolist() for s in sizes), strict=True):
+        d, length, side, thickness = size
+        try:
+            collimator = collimator_solid(d, length, side, plate, wall)
+        except InputError as error:
+            raise InputError(f"module {number}: {error}") from None
+        name = f"Module {number:0{width}d}"
+        parts += [
+            ModulePart(number, "collimator", f"{name} collimator", collimator, pose),
+            ModulePart(number, "crystal", f"{name} crystal", crystal_solid(length, side, thickness), pose),
+        ]
+    return parts

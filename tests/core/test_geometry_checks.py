@@ -1,0 +1,240 @@
+"""Laws of the checks: what is planted is found, as deep as it is, and nothing else is."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+
+import numpy as np
+import pytest
+
+import mphdrr.core as mph
+from mphdrr.core.cli import main
+from mphdrr.core.geometry_checks.blocking import cone_directions, meets
+from mphdrr.core.geometry_checks.coverage import unseen_share
+from mphdrr.core.geometry_checks.hulls import Hulls
+from mphdrr.core.geometry_checks.meshes import find_open_meshes
+from mphdrr.core.geometry_checks.overlaps import penetration_depths
+from mphdrr.core.module_parts import module_parts
+
+
+def system_of(centers, d=2.0, length=60.0, side=50.0, thickness=10.0, radius=40.0, **more) -> mph.PinholeSystem:
+    return mph.PinholeSystem(np.asarray(centers, dtype=float), d, length, side, thickness, radius, **more)
+
+
+def crowd(rng, n: int = 30) -> mph.PinholeSystem:
+    """Modules of all sizes, so near each other that many overlap."""
+    direction = rng.normal(size=(n, 3)) * [0.2, 0.5, 0.3] + [1, 0, 0]
+    direction /= np.linalg.norm(direction, axis=1)[:, None]
+    return system_of(
+        direction * rng.uniform(120, 200, n)[:, None],
+        rng.uniform(1, 5, n),
+        rng.uniform(30, 90, n),
+        rng.uniform(20, 60, n),
+        rng.uniform(3, 15, n),
+    )
+
+
+def test_the_real_scanner_can_be_built(workbook):
+    report = mph.check_geometry(mph.read_system(workbook))
+    assert report.ok and report.messages() == []
+    assert report.n_modules == 80
+
+
+def test_thick_walls_of_the_real_scanner_overlap(workbook):
+    """Independent: with walls of 8 mm, 176 pairs of collimators have a common volume by manifold3d, with 5 mm none."""
+    system = mph.read_system(workbook)
+    assert mph.check_geometry(system, wall_thickness=5.0).ok
+    report = mph.check_geometry(system, wall_thickness=8.0)
+    assert len(report.overlaps) == len(report.findings) == 176
+    assert {o.first_part for o in report.overlaps} == {o.second_part for o in report.overlaps} == {"collimator"}
+
+
+@pytest.mark.parametrize("depth", [3e-6, 0.5, 1.75])
+def test_a_front_in_the_crystal_behind_is_as_deep_as_planted(rng, depth):
+    """Two modules on one axis: the first ends at b + l + Td, the second's front begins `depth` before."""
+    axis = rng.normal(size=3)
+    axis /= np.linalg.norm(axis)
+    report = mph.check_geometry(system_of([200 * axis, (270 - depth) * axis], numbers=[7, 31]))
+    (overlap,) = report.overlaps
+    assert (overlap.first, overlap.first_part, overlap.second, overlap.second_part) == (7, "crystal", 31, "collimator")
+    assert overlap.depth == pytest.approx(depth, abs=1e-9)
+    assert np.allclose(overlap.point, (270 - depth / 2) * axis, atol=1e-6)
+    assert not report.ok
+    assert any("modules 7 and 31" in line and "crystal" in line for line in report.messages())
+    assert report.messages(7) and report.messages(8) == []
+
+
+@pytest.mark.parametrize("gap", [0.0, -5e-7, 1.0])
+def test_touching_is_no_overlap(rng, gap):
+    axis = rng.normal(size=3)
+    axis /= np.linalg.norm(axis)
+    assert mph.check_geometry(system_of([200 * axis, (270 + gap) * axis])).overlaps == ()
+
+
+@pytest.mark.parametrize("depth", [1e-5, 0.3])
+def test_side_walls_in_each_other_are_as_deep_as_planted(depth):
+    """Two collimators mirrored in a plane that their side walls are parallel to, each depth/2 beyond it."""
+    d, length, side, wall = 2.0, 60.0, 50.0, 2.0
+    angle = np.arctan((side - d) / 2 / length)
+    half_front = d / 2 + wall
+    b = (half_front * np.cos(angle) - depth / 2) / np.sin(angle)
+    centers = b * np.array([[np.cos(angle), s * np.sin(angle), 0] for s in (1, -1)])
+    (overlap,) = mph.check_geometry(system_of(centers, d, length, side, radius=5.0), wall_thickness=wall).overlaps
+    assert (overlap.first_part, overlap.second_part) == ("collimator", "collimator")
+    assert overlap.depth == pytest.approx(depth, abs=1e-9)
+    assert abs(overlap.point[1]) < depth / 2
+
+
+def test_depth_is_the_distance_to_the_minkowski_difference(rng):
+    """The shortest way out for any two bodies, by the convex hull of all differences of their corners."""
+    spatial = pytest.importorskip("scipy.spatial")
+    system = crowd(rng)
+    parts = module_parts(system)
+    hulls = Hulls.of(parts)
+    for p, part in enumerate(parts):
+        assert spatial.ConvexHull(part.vertices).volume == pytest.approx(spatial.ConvexHull(hulls.vertices[p]).volume)
+    i, j = np.triu_indices(len(parts), 1)
+    depths = penetration_depths(hulls, i, j)
+    expected = []
+    for a, b in zip(i, j, strict=True):
+        differences = (hulls.vertices[a][:, None] - hulls.vertices[b]).reshape(-1, 3)
+        expected.append(-spatial.ConvexHull(differences).equations[:, 3].max())
+    inside = np.array(expected) > 0
+    assert np.count_nonzero(inside & (hulls.numbers[i] != hulls.numbers[j])) > 20
+    assert np.allclose(depths[inside], np.array(expected)[inside], atol=1e-6)
+    assert np.all(depths[~inside] <= 1e-9)
+
+    report = mph.check_geometry(system)
+    found = {(o.first, o.first_part, o.second, o.second_part) for o in report.overlaps}
+    different = inside & (depths > 1e-6) & (hulls.numbers[i] != hulls.numbers[j])
+    name = [(part.number, part.kind) for part in parts]
+    assert found == {(*name[a], *name[b]) for a, b in zip(i[different], j[different], strict=True)}
+    index = {(part.number, part.kind): p for p, part in enumerate(parts)}
+    for o in report.overlaps:
+        for p in (index[o.first, o.first_part], index[o.second, o.second_part]):
+            assert np.all(hulls.normals[p] @ o.point < hulls.offsets[p])
+
+
+def test_field_of_view_beside_the_roi(rng):
+    centers = [[200.0, 10, 5], [0, -180, 30], [1, 2, 250]]
+    b, short = np.linalg.norm(centers, axis=1), np.array([0.0, 0.5, 60.0])
+    length = mph.collimator_length(b, 2.0, 50.0, 75.0 - short)
+    report = mph.check_geometry(system_of(centers, length=length, radius=75.0))
+    assert [u.module for u in report.uncovered] == [2, 3]
+    assert np.allclose([u.shortage for u in report.uncovered], short[1:], atol=1e-9)
+    # Four caps of height 0.5 that do not meet; then a field of view that is a small part of the sphere.
+    cap, sphere = np.pi * 0.5**2 * (3 * 75 - 0.5) / 3, 4 / 3 * np.pi * 75**3
+    assert report.uncovered[0].unseen_share == pytest.approx(4 * cap / sphere, rel=1e-9)
+    points = rng.uniform(-75, 75, (400_000, 3))
+    points = points[np.linalg.norm(points, axis=1) < 75]
+    slope = (50 - 2) / (2 * length[2])
+    outside = np.abs(points[:, :2]).max(axis=1) > (b[2] + points[:, 2]) * slope - 1.0
+    assert report.uncovered[1].unseen_share == pytest.approx(outside.mean(), abs=4e-3)
+
+
+def test_a_pyramid_whose_apex_is_beyond_the_roi_sees_nothing():
+    assert unseen_share(b=100.0, d=20.0, slope=0.05, radius=50.0) == pytest.approx(1.0, rel=1e-9)
+
+
+def test_a_module_in_front_blocks_the_rays_that_meet_it():
+    """On one axis: the silhouette is a square, of the solid angle 4 asin(q^2 / (1 + q^2))."""
+    near = system_of([[100.0, 0, 0], [200, 0, 0]], length=30.0, side=12.0, radius=60.0)
+    q = max(6 / 60, 8 / 70)  # the crystal's back, the collimator's outer end
+    cone = 2 * np.pi * (1 - np.sqrt(1 - 0.3**2))
+    (blocked,) = mph.check_geometry(near).blocked
+    assert (blocked.module, blocked.by) == (2, 1)
+    assert blocked.share == pytest.approx(4 * np.arcsin(q**2 / (1 + q**2)) / cone, rel=0.02)
+
+
+def test_a_sliver_of_a_thousandth_is_found(rng):
+    """Small modules that just reach over the silhouette of the ROI, at any place around it."""
+    found = []
+    for angle, beyond in zip(rng.uniform(0, 2 * np.pi, 20), rng.uniform(-1.5, 1.0, 20), strict=True):
+        # The cone's half-angle is 30 degrees; at the depth of 60 mm its radius is 34.64 mm.
+        offset = (34.64 + beyond) * np.array([np.cos(angle), np.sin(angle)])
+        system = system_of([[200.0, 0, 0], [140, *offset]], 0.5, 5.0, [50.0, 2.0], 1.0, 100.0)
+        hulls = Hulls.of(module_parts(system, 0.5, 1.0))
+        directions = cone_directions(200_000, np.sqrt(0.75)) @ system.frames()[0]
+        fine = np.zeros(200_000, dtype=bool)
+        for p in (2, 3):
+            fine |= meets(hulls, p, system.centers[0], directions, np.full(200_000, 100.0))
+        blocked = mph.check_geometry(system, plate_thickness=0.5, wall_thickness=1.0).blocked
+        shares = {b.module: b.share for b in blocked}
+        assert shares.get(1, 0.0) == pytest.approx(fine.mean(), abs=5e-4)
+        found.append(fine.mean())
+    assert np.count_nonzero((np.array(found) > 2e-4) & (np.array(found) < 1.5e-3)) > 5  # such slivers they were
+
+
+def test_rays_meet_hulls_where_points_along_them_are_inside(rng):
+    hulls = Hulls.of(module_parts(crowd(rng, 4)))
+    origin = np.array([10.0, -20.0, 5.0])
+    directions = cone_directions(2000, -1.0)
+    lengths = rng.uniform(100, 250, 2000)
+    steps = np.linspace(0, 1, 800)[:, None, None]
+    points = origin + steps * lengths[:, None] * directions
+    for p in range(len(hulls)):
+        depth = (hulls.offsets[p] - points @ hulls.normals[p].T).min(axis=2).max(axis=0)
+        hit = meets(hulls, p, origin, directions, lengths)
+        assert np.all(hit[depth > 0])
+        assert not np.any(hit[depth < -0.5])  # the points are less than 0.4 mm apart
+
+
+def test_what_stands_behind_the_roi_blocks_nothing():
+    opposite = system_of([[200.0, 0, 0], [-100, 0, 0], [0, 200, 0]], length=mph.collimator_length(200, 2, 50, 75))
+    assert mph.check_geometry(opposite).blocked == ()
+
+
+def test_pinholes_at_impossible_places():
+    axis = np.array([0.6, 0.0, 0.8])
+    inside = mph.check_geometry(system_of([200 * axis, 265 * axis]))
+    (swallowed,) = inside.swallowed_pinholes
+    assert (swallowed.module, swallowed.by, swallowed.part) == (2, 1, "crystal")
+    assert swallowed.depth == pytest.approx(5.0)
+    assert [(b.module, b.by, b.share) for b in inside.blocked] == [(2, 1, 1.0)]
+
+    twice = mph.check_geometry(system_of([200 * axis, 200 * axis + [0, 1.5, 0]]))
+    assert [(n.first, n.second) for n in twice.near_pairs] == [(1, 2)]
+    assert twice.near_pairs[0].distance == pytest.approx(1.5)
+
+    deep = mph.check_geometry(system_of([[100.0, 0, 0], [0, 300, 0]], radius=[90.0, 120.0]))
+    assert [(i.module, i.roi_radius, i.depth) for i in deep.intrusions] == [(1, 120.0, pytest.approx(20.0))]
+
+
+def test_open_and_inverted_surfaces_are_found(system):
+    parts = module_parts(system)
+    assert find_open_meshes(parts) == ()
+    vertices, faces = parts[3].solid
+    parts[3] = dataclasses.replace(parts[3], solid=(vertices, faces[1:]))
+    vertices, faces = parts[4].solid
+    parts[4] = dataclasses.replace(parts[4], solid=(vertices, faces[:, ::-1]))
+    found = [(f.module, f.part, f.fault.split()[0]) for f in find_open_meshes(parts)]
+    assert found[:3] == [(102, "crystal", "is"), (102, "module", "is"), (103, "collimator", "has")]
+
+
+def test_report_is_json(rng):
+    report = mph.check_geometry(crowd(rng))
+    answer = json.loads(json.dumps(report.as_dict()))
+    assert answer["ok"] is False and answer["n_modules"] == 30
+    assert len(answer["overlaps"]) == len(report.overlaps) > 0
+    assert len(report.messages()) == len(report.findings)
+
+
+@pytest.mark.parametrize(
+    ("plate", "wall", "word"), [(0, 2, "plate"), (2, float("nan"), "wall"), (70, 2, "module 1..: ")]
+)
+def test_impossible_walls_are_refused(system, plate, wall, word):
+    with pytest.raises(mph.InputError, match=word):
+        mph.check_geometry(system, plate_thickness=plate, wall_thickness=wall)
+
+
+def test_command_prints_findings_and_is_strict_on_demand(workbook, capsys):
+    assert main(["geometry", "check", str(workbook), "--strict"]) == 0
+    capsys.readouterr()
+    assert main(["geometry", "check", str(workbook), "--wall", "8"]) == 0
+    printed = capsys.readouterr().out
+    assert "modules 1 and 2: collimator and collimator overlap" in printed and "176 findings" in printed
+    assert main(["geometry", "check", str(workbook), "--wall", "8", "--json", "--strict"]) == 1
+    out, err = capsys.readouterr()
+    assert len(json.loads(out)["geometry"]["overlaps"]) == len(json.loads(out)["findings"]) == 176
+    assert len(err.splitlines()) == 1 and "176 findings" in err

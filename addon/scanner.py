@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import json
 import warnings
+from collections.abc import Iterable
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -346,6 +347,17 @@ def set_for_all(collection: bpy.types.Collection, name: str) -> None:
             setattr(camera.mphdrr_module, name, value)
             if name == "collimator_length":
                 camera.mphdrr_module.length_mode = TYPED
+    refresh_scanner(collection)
+
+
+def copy_numbers(
+    collection: bpy.types.Collection, source: bpy.types.Object, targets: Iterable[bpy.types.Object]
+) -> None:
+    """Give modules the lengths of another, and where its `l` comes from."""
+    with design.writing():
+        for camera in targets:
+            for name in (*LENGTHS, "length_mode"):
+                setattr(camera.mphdrr_module, name, getattr(source.mphdrr_module, name))
     refresh_scanner(collection)
 
 

@@ -22,9 +22,7 @@ class NewScanner:
         self.rings: list[bpy.types.Collection] = []
         self.roi: bpy.types.Object | None = None
         self._named: list[tuple[bpy.types.ID, str]] = []  # names are free only after the old scanner has gone
-        self._materials = {
-            part: collimators.part_material(part) for part in ("COLLIMATOR", "CRYSTAL", "ROI")
-        }
+        self._materials = {part: collimators.part_material(part) for part in ("COLLIMATOR", "CRYSTAL", "ROI")}
 
     def make(self, system: PinholeSystem, solids: Sequence[tuple[Solid, Solid]]) -> None:
         """Make everything; `solids` has each module's collimator and crystal."""

@@ -7,7 +7,8 @@ import math
 import bpy
 from bpy.props import BoolProperty, FloatProperty, IntProperty
 
-from ..addon import copies, ids, scanner
+from ..addon import copies, ids, scanner, selection
+from ..addon.replacement import modules_text
 from ..core.errors import InputError
 
 
@@ -32,17 +33,17 @@ class MPHDRR_OT_duplicate_modules(bpy.types.Operator):
 
     @classmethod
     def poll(cls, context: bpy.types.Context) -> bool:
-        return scanner.poll_selected(cls, context)
+        return selection.poll_module(cls, context)
 
     def execute(self, context: bpy.types.Context) -> set[str]:
         collection = scanner.active_scanner(context.scene)
         try:
             made = copies.duplicate(
-                collection, scanner.selected_modules(context), self.count, self.angle, self.follow_ring
+                collection, selection.selected_modules(context), self.count, self.angle, self.follow_ring
             )
         except InputError as error:
             self.report({"ERROR"}, str(error))
             return {"CANCELLED"}
-        scanner.select(context, made)
-        self.report({"INFO"}, f"Made {scanner.modules_text([o.mphdrr_module.number for o in made])}")
+        selection.select(context, made)
+        self.report({"INFO"}, f"Made {modules_text([o.mphdrr_module.number for o in made])}")
         return {"FINISHED"}

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import bpy
 
-from ..addon import copies, ids, scanner
+from ..addon import copies, ids, scanner, selection
+from ..addon.replacement import modules_text
 from ..core.errors import InputError
 
 
@@ -18,11 +19,11 @@ class MPHDRR_OT_remove_modules(bpy.types.Operator):
 
     @classmethod
     def poll(cls, context: bpy.types.Context) -> bool:
-        return scanner.poll_selected(cls, context)
+        return selection.poll_module(cls, context)
 
     def execute(self, context: bpy.types.Context) -> set[str]:
-        modules = scanner.selected_modules(context)
-        text = scanner.modules_text([o.mphdrr_module.number for o in modules])
+        modules = selection.selected_modules(context)
+        text = modules_text([o.mphdrr_module.number for o in modules])
         try:
             copies.remove(scanner.active_scanner(context.scene), modules)
         except InputError as error:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import bpy
 from bpy.props import BoolProperty
 
-from ..addon import ids, scanner
+from ..addon import ids, scanner, selection
 
 
 class MPHDRR_OT_set_numbers(bpy.types.Operator):
@@ -20,18 +20,19 @@ class MPHDRR_OT_set_numbers(bpy.types.Operator):
 
     @classmethod
     def poll(cls, context: bpy.types.Context) -> bool:
-        if scanner.poll_scanner(cls, context) and scanner.active_module(context) is None:
-            cls.poll_message_set("No active module: select a module's camera")
-            return False
-        return scanner.active_scanner(context.scene) is not None
+        return selection.poll_module(cls, context)
 
     @classmethod
     def description(cls, context: bpy.types.Context, properties: bpy.types.OperatorProperties) -> str:
         return f"Give {'all' if properties.to_all else 'the selected'} modules the active module's d, l, Ld, Td and R"
 
     def execute(self, context: bpy.types.Context) -> set[str]:
-        collection, active = scanner.active_scanner(context.scene), scanner.active_module(context)
-        others = scanner.modules(collection) if self.to_all else scanner.selected_modules(context)
+        collection, active = scanner.active_scanner(context.scene), _active(context)
+        others = scanner.modules(collection) if self.to_all else selection.selected_modules(context)
         scanner.copy_numbers(collection, active, [camera for camera in others if camera != active])
         self.report({"INFO"}, f"{len(set(others) | {active})} modules have the numbers of {active.name}")
         return {"FINISHED"}
+
+
+def _active(context: bpy.types.Context) -> bpy.types.Object:
+    return selection.active_module(context) or selection.selected_modules(context)[0]

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import bpy
 
-from ..addon import copies, ids, scanner
+from ..addon import copies, ids, scanner, selection
+from ..addon.replacement import modules_text
 from ..core.errors import InputError
 
 
@@ -21,7 +22,7 @@ class MPHDRR_OT_tidy_modules(bpy.types.Operator):
 
     @classmethod
     def poll(cls, context: bpy.types.Context) -> bool:
-        return scanner.poll_scanner(cls, context)
+        return selection.poll_scanner(cls, context)
 
     def execute(self, context: bpy.types.Context) -> set[str]:
         numbers: list[int] = []
@@ -33,7 +34,7 @@ class MPHDRR_OT_tidy_modules(bpy.types.Operator):
         except InputError as error:
             self.report({"ERROR"}, str(error))
             return {"CANCELLED"}
-        done = [f"made {scanner.modules_text(numbers)}"] if numbers else []
+        done = [f"made {modules_text(numbers)}"] if numbers else []
         if n_parts:
             done.append(f"removed {n_parts} parts without a camera")
         self.report({"INFO"}, " and ".join(done).capitalize() or "All modules are in order")

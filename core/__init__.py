@@ -29,7 +29,7 @@ from .system import PinholeSystem
 from .views import Views
 from .volume import Volume
 from .volume_io import read_volume, write_volume
-from .workbook import SystemSource, read_system
+from .workbook import SystemSource, WrittenWorkbook, read_system, write_system
 
 __all__ = [
     "ISOTOPES",
@@ -51,6 +51,7 @@ __all__ = [
     "Transmission",
     "Views",
     "Volume",
+    "WrittenWorkbook",
     "as_seen",
     "c_arm_views",
     "check_geometry",
@@ -73,5 +74,6 @@ __all__ = [
     "sensitivity",
     "trace_rays",
     "write_run",
+    "write_system",
     "write_volume",
 ]

@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import uuid
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from .errors import InputError
@@ -14,6 +14,8 @@ from .errors import InputError
 @contextmanager
 def replacing(path: str | os.PathLike[str]) -> Iterator[Path]:
     """Give a temporary path beside `path`; rename it to `path` on success, remove it on failure.
+
+    Neither killing the program nor a power cut leaves anything but the old file or the new one at `path`.
 
     Parameters
     ----------
@@ -41,11 +43,24 @@ def replacing(path: str | os.PathLike[str]) -> Iterator[Path]:
             pass
         temporary.unlink()
         yield temporary
+        _to_disk(temporary)
         os.replace(temporary, target)
+        with suppress(OSError):  # Windows opens no folders, some disks don't know the request
+            _to_disk(target.parent)
     except OSError as error:
         raise InputError(f"{target}: cannot be written ({error.strerror or error})") from error
     finally:
         temporary.unlink(missing_ok=True)
+
+
+def _to_disk(path: Path) -> None:
+    """Have the system write what it still holds back, so that a power cut after the renaming finds the new file whole."""
+    # A folder can only be opened to read; Windows flushes only what is open to write.
+    descriptor = os.open(path, os.O_RDONLY if path.is_dir() else os.O_RDWR)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
 
 
 def refuse_folder(path: Path) -> None:

@@ -1,17 +1,30 @@
 """The users' geometry workbook (.xlsx): the pinholes' coordinates and their dimensions.
 
-book.py      the file: opened, refused, its cells as Python values
-formulas.py  formulas that a program stored without their values
-headings.py  which column holds which quantity, found by symbols ("x1") and descriptions
-rows.py      which rows hold the modules
-checks.py    the sheet's own derived numbers against the formulas
-reader.py    `read_system`, which joins these
-source.py    `SystemSource`, where each number came from
+book.py          the file: opened, refused, its cells as Python values
+references.py    B3, Main!$B$3:$B$82, A:C in formulas
+formulas.py      values of formulas
+headings.py      which column holds which quantity, found by symbols ("x1") and descriptions
+rows.py          which rows hold the modules
+checks.py        the sheet's own derived numbers against the formulas
+reader.py        `read_system`, which joins these
+source.py        `SystemSource`, where each number came from
+
+writer.py        `write_system`: the system's numbers into a copy of a workbook
+arrangement.py   rows that are moved, emptied and added with the modules
+recalculate.py   new values for formulas that depend on changed cells
+dependencies.py  which formulas these are
+libreoffice.py   LibreOffice as their calculator
+workbook_xml.py  a workbook file as cells that can be changed
+sheet_xml.py     a worksheet as cells that can be changed
+xml_parts.py     XML that is changed in a few places
+package.py       the zip archive's members
+new_workbook.py  a workbook in the users' layout
 """
 
 from __future__ import annotations
 
 from .reader import read_system
 from .source import QuantityCells, SystemSource
+from .writer import WrittenWorkbook, write_system
 
-__all__ = ["QuantityCells", "SystemSource", "read_system"]
+__all__ = ["QuantityCells", "SystemSource", "WrittenWorkbook", "read_system", "write_system"]

@@ -30,7 +30,7 @@ class Uncomputed(str):
 
 
 class Book:
-    """An .xlsx or .xlsm file.
+    """An .xlsx or .xlsm file; `content` is its bytes.
 
     Raises
     ------
@@ -40,9 +40,9 @@ class Book:
 
     def __init__(self, path: str | os.PathLike[str]) -> None:
         self.path = Path(path)
-        self._bytes = _read(self.path)
-        self.sha256 = hashlib.sha256(self._bytes).hexdigest()
-        _refuse_other_formats(self.path, self._bytes)
+        self.content = _read(self.path)
+        self.sha256 = hashlib.sha256(self.content).hexdigest()
+        _refuse_other_formats(self.path, self.content)
         self._values = self._load(data_only=True)
         self.sheets = {ws.title: Sheet(self, ws.title) for ws in self._values.worksheets}
         self._by_folded_name = {name.casefold(): sheet for name, sheet in self.sheets.items()}
@@ -63,7 +63,7 @@ class Book:
             warnings.simplefilter("ignore")  # openpyxl's, about styles and extensions that are of no concern here
             try:
                 return openpyxl.load_workbook(
-                    io.BytesIO(self._bytes), read_only=True, data_only=data_only, keep_links=False
+                    io.BytesIO(self.content), read_only=True, data_only=data_only, keep_links=False
                 )
             except Exception as error:  # whatever openpyxl meets in a damaged file
                 raise InputError(

@@ -9,12 +9,16 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
+from ..design import collimator_length
 from ..errors import InputWarning
+from ..system import PinholeSystem
 
 EXACT = 1e-6
 """Relative, and absolute in mm or radians: stored results of formulas agree far better."""
 COARSEST_DECIMALS = {"mm": 2, "rad": 3, "deg": 2}
 """A number may be rounded in its last decimal; rounded to fewer decimals than these it is another number."""
+AGREEING = 1e-9
+"""Relative: a formula's result nearer to a number than this gives that number."""
 SHOWN = 5
 """Warnings of one column; the last one counts the rest."""
 
@@ -28,6 +32,14 @@ def tolerance(value: float, expected: float, unit: str) -> float:
     # Trailing zeros are lost: 89.1 may be 89.10, so few decimals stand for the coarsest rounding.
     rounding = 0.5 * 10.0 ** -max(decimals, COARSEST_DECIMALS[unit])
     return max(EXACT * max(1.0, abs(expected)), rounding * (1 + 1e-9))
+
+
+def is_by_design(system: PinholeSystem) -> NDArray[np.bool_]:
+    """Which modules (M,) have the design formula's collimator length."""
+    length = collimator_length(
+        system.pinhole_distance, system.pinhole_diameter, system.detector_side, system.roi_radius
+    )
+    return np.abs(length - system.collimator_length) <= AGREEING * system.collimator_length
 
 
 def derived(

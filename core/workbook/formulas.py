@@ -1,16 +1,21 @@
-"""Arithmetic of spreadsheet formulas, for files that store formulas without values (openpyxl writes such).
+"""Values of spreadsheet formulas: for files that store none (openpyxl writes such), and after cells have changed.
 
 The libraries for this were weighed: `formulas` (EUPL) brings scipy and the compiled regex, `xlcalculator` pandas,
-`pycel` a networkx of 2021. A geometry table needs arithmetic over cells: openpyxl's tokenizer and the precedence
-below are enough.
+`pycel` a networkx of 2021. A geometry table needs arithmetic over cells and a little logic: openpyxl's tokenizer
+and the precedence below are enough. What is beyond them is `NotComputable`, never a guess.
 """
 
 from __future__ import annotations
 
+import decimal
 import math
-import re
+import operator
+import statistics
 from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Any
+
+from .references import reference
 
 Lookup = Callable[[str | None, int, int], Any]
 """(sheet name or None for the formula's own, row, column) -> the cell's value, None if blank."""
@@ -26,55 +31,180 @@ class NotComputable(Exception):
     """The formula needs something that is not here; the message says what."""
 
 
+@dataclass(frozen=True)
+class Surroundings:
+    """What a formula may ask for beside other cells' values.
+
+    Attributes
+    ----------
+    lookup : Lookup
+    at : (row, column), or None
+        The formula's own cell, for ``ROW()``.
+    extent : callable, or None
+        Sheet name or None -> its last row and column with content, which end whole columns and rows.
+    name : callable, or None
+        Defined name -> its formula, or None for an unknown one.
+    """
+
+    lookup: Lookup
+    at: tuple[int, int] | None = None
+    extent: Callable[[str | None], tuple[int, int]] | None = None
+    name: Callable[[str], str | None] | None = None
+
+
 def evaluate(formula: str, lookup: Lookup) -> float | CellError:
     """The number that `formula` (with its "=") gives, or the error value, e.g. #REF!, of a cell it refers to.
 
     Raises
     ------
     NotComputable
-        It uses a function, name or value beyond arithmetic.
+        It uses a function, name or value beyond those known here, or gives no number.
     ArithmeticError, ValueError
         Where the spreadsheet would show #DIV/0! or #NUM!.
     """
+    value = _result(formula, Surroundings(lookup))
+    if isinstance(value, CellError):
+        return value
+    if isinstance(value, bool) or not isinstance(value, (float, type(None))):
+        raise NotComputable(f"it gives {str(value)!r}, not a number")
+    return value or 0.0
+
+
+def calculate(formula: str, surroundings: Surroundings) -> float | str | bool | CellError:
+    """What a spreadsheet shows for `formula` (with its "="): a number, text, a boolean or an error value.
+
+    Raises
+    ------
+    NotComputable
+        It uses a function, name or value beyond those known here.
+    """
+    try:
+        value = _result(formula, surroundings)
+    except ZeroDivisionError:
+        return CellError("#DIV/0!")
+    except (ArithmeticError, ValueError):
+        return CellError("#NUM!")
+    except RecursionError as error:
+        raise NotComputable("it is nested too deeply") from error
+    if isinstance(value, float) and not math.isfinite(value):
+        return CellError("#NUM!")
+    return 0.0 if value is None else value
+
+
+def _result(formula: str, surroundings: Surroundings) -> Any:
+    try:
+        return _scalar(_parsed(formula, surroundings)())
+    except _ErrorValue as error:
+        return error.args[0]
+
+
+def tokens_of(formula: str) -> list[Any]:
+    """The tokens (`openpyxl.formula.tokenizer.Token`) of `formula`, which begins with "="; `NotComputable` if bad."""
     from openpyxl.formula import Tokenizer
     from openpyxl.formula.tokenizer import TokenizerError
 
     try:
-        tokens = [token for token in Tokenizer(formula).items if token.type != "WHITE-SPACE"]
+        return [token for token in Tokenizer(formula).items if token.type != "WHITE-SPACE"]
     except (TokenizerError, IndexError) as error:  # the latter where a parenthesis closes nothing
         raise NotComputable("it is not a formula") from error
-    try:
-        return _number(_Parser(tokens, lookup).whole())
-    except _ErrorValue as error:
-        return error.args[0]
 
 
 class _ErrorValue(Exception):
     """An operand is an error value; so is the result."""
 
 
-def _number(value: Any) -> float:
-    if isinstance(value, list):
+class _Cells(list):  # type: ignore[type-arg]
+    """The values of an area, row by row."""
+
+    def __init__(self, values: list[Any], columns: int, first: tuple[int, int]) -> None:
+        super().__init__(values)
+        self.columns, self.first = columns, first
+
+
+_Term = Callable[[], Any]
+"""A part of a formula, computed when called: the branch of an IF that is not taken must not be."""
+
+
+def _scalar(value: Any) -> Any:
+    if isinstance(value, _Cells):
         if len(value) != 1:
             raise NotComputable("it uses a range where one cell belongs")
         value = value[0]
-    if value is None:
-        return 0.0
     if isinstance(value, CellError):
         raise _ErrorValue(value)
+    return value
+
+
+def _number(value: Any) -> float:
+    value = _scalar(value)
+    if value is None:
+        return 0.0
     if isinstance(value, (int, float)):
         return float(value)
+    if value == "":
+        raise _ErrorValue(CellError("#VALUE!"))
     raise NotComputable(f"it refers to {str(value)!r}, not a number")
 
 
-def _numbers(arguments: list[Any]) -> list[float]:
-    """All numbers in the arguments; in ranges, blank cells and text do not count, as in a spreadsheet."""
+def _text(value: Any) -> str:
+    value = _scalar(value)
+    if isinstance(value, bool):
+        return str(value).upper()
+    if isinstance(value, float):
+        if value and not 1e-4 <= abs(value) < 1e15:
+            raise NotComputable(f"it makes a text of {value:g}")
+        return f"{value:.15g}"
+    return "" if value is None else str(value)
+
+
+def _truth(value: Any) -> bool:
+    value = _scalar(value)
+    if isinstance(value, str):
+        if value.upper() in ("TRUE", "FALSE"):
+            return value.upper() == "TRUE"
+        raise _ErrorValue(CellError("#VALUE!"))
+    return bool(value)
+
+
+def _items(arguments: list[Any], kinds: tuple[type, ...], single: Callable[[Any], Any]) -> list[Any]:
+    """Of areas, the cells of `kinds` alone, as a spreadsheet takes them; `single` of each other argument."""
     found = []
     for argument in arguments:
-        cells = argument if isinstance(argument, list) and len(argument) > 1 else [argument]
-        skipped = (type(None), str) if cells is argument else ()
-        found += [_number(cell) for cell in cells if isinstance(cell, CellError) or not isinstance(cell, skipped)]
+        if not isinstance(argument, _Cells):
+            found.append(single(argument))
+            continue
+        for cell in argument:
+            if isinstance(cell, CellError):
+                raise _ErrorValue(cell)
+            if type(cell) in kinds:
+                found.append(cell)
     return found
+
+
+def _numbers(arguments: list[Any]) -> list[float]:
+    return _items(arguments, (float,), _number)
+
+
+def _compared(compare: Callable[[Any, Any], bool]) -> Callable[[Any, Any], bool]:
+    """Numbers come before texts, texts (whatever their case) before booleans; blank is the other's zero."""
+
+    def rank(value: Any) -> tuple[int, Any]:
+        if isinstance(value, bool):
+            return 2, value
+        return (1, value.casefold()) if isinstance(value, str) else (0, value)
+
+    def result(a: Any, b: Any) -> bool:
+        a, b = _scalar(a), _scalar(b)
+        zero = {str: "", bool: False}
+        a = zero.get(type(b), 0.0) if a is None else a
+        b = zero.get(type(a), 0.0) if b is None else b
+        return compare(rank(a), rank(b))
+
+    return result
+
+
+def _of_numbers(function: Callable[[float, float], float]) -> Callable[[Any, Any], float]:
+    return lambda a, b: function(_number(a), _number(b))
 
 
 def _atan2(x: float, y: float) -> float:
@@ -90,59 +220,203 @@ def _power(base: float, exponent: float) -> float:
     return result
 
 
-def _round(value: float, digits: float) -> float:
-    scale = 10.0 ** int(digits)
-    return math.copysign(math.floor(abs(value) * scale + 0.5) / scale, value)
+def _rounded(rounding: str) -> Callable[[float, float], float]:
+    def function(value: float, digits: float) -> float:
+        # Of the decimals that are shown, not of the binary digits behind them: ROUND(2.675,2) is 2.68.
+        step = decimal.Decimal(1).scaleb(-int(digits))
+        with decimal.localcontext(prec=400):
+            return float(decimal.Decimal(repr(value)).quantize(step, rounding=rounding))
+
+    return function
 
 
-_OF_NUMBERS: dict[str, tuple[int, Callable[..., float]]] = {
-    "ABS": (1, abs),
-    "ACOS": (1, math.acos),
-    "ASIN": (1, math.asin),
-    "ATAN": (1, math.atan),
-    "ATAN2": (2, _atan2),  # x comes first
-    "COS": (1, math.cos),
-    "DEGREES": (1, math.degrees),
-    "PI": (0, lambda: math.pi),
-    "POWER": (2, _power),
-    "RADIANS": (1, math.radians),
-    "ROUND": (2, _round),
-    "SIN": (1, math.sin),
-    "SQRT": (1, math.sqrt),
-    "TAN": (1, math.tan),
+def _spread(function: Callable[[list[float]], float]) -> Callable[[list[float]], float]:
+    def result(xs: list[float]) -> float:
+        if len(xs) < 2:
+            raise ZeroDivisionError
+        return function(xs)
+
+    return result
+
+
+# Name -> (fewest, most) arguments, and the function of these.
+_OF_NUMBERS: dict[str, tuple[int, int, Callable[..., float]]] = {
+    "ABS": (1, 1, abs),
+    "ACOS": (1, 1, math.acos),
+    "ASIN": (1, 1, math.asin),
+    "ATAN": (1, 1, math.atan),
+    "ATAN2": (2, 2, _atan2),  # x comes first
+    "COS": (1, 1, math.cos),
+    "DEGREES": (1, 1, math.degrees),
+    "EXP": (1, 1, math.exp),
+    "INT": (1, 1, math.floor),
+    "LN": (1, 1, math.log),
+    "LOG": (1, 2, lambda x, base=10.0: math.log10(x) if base == 10 else math.log(x) / math.log(base)),
+    "LOG10": (1, 1, math.log10),
+    "MOD": (2, 2, lambda x, divisor: x - divisor * math.floor(x / divisor)),
+    "PI": (0, 0, lambda: math.pi),
+    "POWER": (2, 2, _power),
+    "RADIANS": (1, 1, math.radians),
+    "ROUND": (2, 2, _rounded(decimal.ROUND_HALF_UP)),
+    "ROUNDDOWN": (2, 2, _rounded(decimal.ROUND_DOWN)),
+    "ROUNDUP": (2, 2, _rounded(decimal.ROUND_UP)),
+    "SIGN": (1, 1, lambda x: (x > 0) - (x < 0)),
+    "SIN": (1, 1, math.sin),
+    "SQRT": (1, 1, math.sqrt),
+    "TAN": (1, 1, math.tan),
 }
 _OF_RANGES: dict[str, Callable[[list[float]], float]] = {
     "AVERAGE": lambda xs: math.fsum(xs) / len(xs),
     "MAX": lambda xs: max(xs, default=0.0),
+    "MEDIAN": statistics.median,
     "MIN": lambda xs: min(xs, default=0.0),
-    "PRODUCT": math.prod,
+    "PRODUCT": lambda xs: math.prod(xs) if xs else 0.0,
+    "STDEV": _spread(statistics.stdev),
+    "STDEV.S": _spread(statistics.stdev),
     "SUM": math.fsum,
     "SUMSQ": lambda xs: math.fsum(x * x for x in xs),
+    "VAR": _spread(statistics.variance),
+    "VAR.S": _spread(statistics.variance),
+}
+
+
+def _if(condition: _Term, then: _Term, otherwise: _Term = lambda: False) -> Any:
+    return _scalar((then if _truth(condition()) else otherwise)())
+
+
+def _if_error(value: _Term, otherwise: _Term) -> Any:
+    try:
+        return _scalar(value())
+    except (_ErrorValue, ArithmeticError, ValueError):
+        return _scalar(otherwise())
+
+
+def _area(term: _Term) -> _Cells:
+    value = term()
+    if not isinstance(value, _Cells):
+        raise NotComputable("it uses a value where a range belongs")
+    return value
+
+
+def _index(cells: _Term, row: _Term, column: _Term = lambda: None) -> Any:
+    area, wanted = _area(cells), column()
+    i, j = int(_number(row())), 1 if wanted is None else int(_number(wanted))
+    if wanted is None and len(area) == area.columns:  # one row: the only index counts columns
+        i, j = 1, i
+    if i == 0 or j == 0:
+        raise NotComputable("it uses a whole row or column of a range")
+    if i < 0 or j < 0 or j > area.columns or i > len(area) // area.columns:
+        raise _ErrorValue(CellError("#REF!" if i > 0 and j > 0 else "#VALUE!"))
+    return _scalar(area[(i - 1) * area.columns + j - 1])
+
+
+def _position(wanted: Any, cells: list[Any]) -> int:
+    wanted = _scalar(wanted)
+    if isinstance(wanted, str) and set(wanted) & set("*?~"):
+        raise NotComputable("it looks for a pattern")
+    same = _compared(operator.eq)
+    for i, cell in enumerate(cells):
+        if cell is not None and not isinstance(cell, CellError) and same(wanted, cell):
+            return i
+    raise _ErrorValue(CellError("#N/A"))
+
+
+def _exact(mode: Any) -> None:
+    if _number(mode) != 0:
+        raise NotComputable("it looks up the nearest value")
+
+
+def _match(wanted: _Term, cells: _Term, mode: _Term = lambda: 1.0) -> float:
+    _exact(mode())
+    return _position(wanted(), _area(cells)) + 1.0
+
+
+def _vlookup(wanted: _Term, cells: _Term, column: _Term, nearest: _Term = lambda: 1.0) -> Any:
+    _exact(nearest())
+    area, j = _area(cells), int(_number(column()))
+    if not 1 <= j <= area.columns:
+        raise _ErrorValue(CellError("#REF!" if j > 0 else "#VALUE!"))
+    return _scalar(area[_position(wanted(), area[:: area.columns]) * area.columns + j - 1])
+
+
+def _sum_product(*terms: _Term) -> float:
+    areas = [_area(term) for term in terms]
+    if len({(len(area), area.columns) for area in areas}) > 1:
+        raise _ErrorValue(CellError("#VALUE!"))
+    for cell in (cell for area in areas for cell in area if isinstance(cell, CellError)):
+        raise _ErrorValue(cell)
+    columns = zip(*areas, strict=True)
+    return math.fsum(math.prod(x if type(x) is float else 0.0 for x in factors) for factors in columns)
+
+
+def _all_of(function: Callable[[list[bool]], bool]) -> Callable[..., bool]:
+    def result(*terms: _Term) -> bool:
+        found = _items([term() for term in terms], (bool, float), _truth)
+        if not found:
+            raise _ErrorValue(CellError("#VALUE!"))
+        return function([bool(x) for x in found])
+
+    return result
+
+
+def _counted(counts: Callable[[Any], bool]) -> Callable[..., float]:
+    def result(*terms: _Term) -> float:
+        values = [term() for term in terms]
+        cells = [cell for value in values for cell in (value if isinstance(value, _Cells) else [value])]
+        return float(sum(counts(cell) for cell in cells))
+
+    return result
+
+
+# Name -> (fewest, most) arguments, and the function of these as terms.
+_OF_TERMS: dict[str, tuple[int, int, Callable[..., Any]]] = {
+    "AND": (1, 255, _all_of(all)),
+    "CONCATENATE": (1, 255, lambda *terms: "".join(_text(term()) for term in terms)),
+    "COUNT": (1, 255, _counted(lambda cell: type(cell) is float)),
+    "COUNTA": (1, 255, _counted(lambda cell: cell is not None)),
+    "FALSE": (0, 0, lambda: False),
+    "IF": (2, 3, _if),
+    "IFERROR": (2, 2, _if_error),
+    "INDEX": (2, 3, _index),
+    "MATCH": (2, 3, _match),
+    "NOT": (1, 1, lambda term: not _truth(term())),
+    "OR": (1, 255, _all_of(any)),
+    "SUMPRODUCT": (1, 255, _sum_product),
+    "TRUE": (0, 0, lambda: True),
+    "VLOOKUP": (3, 4, _vlookup),
 }
 # Loosest first; all group from the left, and a minus sign in front binds tightest: -2^2 is 4.
-_OPERATORS: list[dict[str, Callable[[float, float], float]]] = [
-    {"+": lambda a, b: a + b, "-": lambda a, b: a - b},
-    {"*": lambda a, b: a * b, "/": lambda a, b: a / b},
-    {"^": _power},
+_OPERATORS: list[dict[str, Callable[[Any, Any], Any]]] = [
+    {
+        "=": _compared(operator.eq),
+        "<>": _compared(operator.ne),
+        "<": _compared(operator.lt),
+        "<=": _compared(operator.le),
+        ">": _compared(operator.gt),
+        ">=": _compared(operator.ge),
+    },
+    {"&": lambda a, b: _text(a) + _text(b)},
+    {"+": _of_numbers(operator.add), "-": _of_numbers(operator.sub)},
+    {"*": _of_numbers(operator.mul), "/": _of_numbers(operator.truediv)},
+    {"^": _of_numbers(_power)},
 ]
-_REFERENCE = re.compile(
-    r"(?:(?P<sheet>'(?:[^']|'')+'|[^'!]+)!)?\$?(?P<column>[A-Z]{1,3})\$?(?P<row>\d{1,7})"
-    r"(?::\$?(?P<last_column>[A-Z]{1,3})\$?(?P<last_row>\d{1,7}))?",
-    re.IGNORECASE,
-)
+
+
+def _parsed(formula: str, surroundings: Surroundings) -> _Term:
+    return _Parser(tokens_of(formula), surroundings).whole()
 
 
 class _Parser:
-    def __init__(self, tokens: list[Any], lookup: Lookup) -> None:
+    def __init__(self, tokens: list[Any], surroundings: Surroundings) -> None:
         self.tokens = tokens
-        self.lookup = lookup
+        self.surroundings = surroundings
         self.at = 0
 
-    def whole(self) -> Any:
-        value = self.operation(0)
+    def whole(self) -> _Term:
+        term = self.operation(0)
         if self.at < len(self.tokens):
             raise NotComputable(f"it uses {self.tokens[self.at].value!r}")
-        return value
+        return term
 
     def is_next(self, kind: str, subtype: str = "") -> bool:
         if self.at == len(self.tokens):
@@ -156,80 +430,110 @@ class _Parser:
         self.at += 1
         return self.tokens[self.at - 1]
 
-    def operation(self, level: int) -> Any:
+    def operation(self, level: int) -> _Term:
         if level == len(_OPERATORS):
             return self.signed()
         left = self.operation(level + 1)
         while self.is_next("OPERATOR-INFIX") and self.tokens[self.at].value in _OPERATORS[level]:
-            operator = _OPERATORS[level][self.take().value]
-            left = operator(_number(left), _number(self.operation(level + 1)))
+            left = _applied(_OPERATORS[level][self.take().value], left, self.operation(level + 1))
         return left
 
-    def signed(self) -> Any:
+    def signed(self) -> _Term:
         if self.is_next("OPERATOR-PREFIX"):
             sign = -1.0 if self.take().value == "-" else 1.0
-            return sign * _number(self.signed())
-        value = self.operand()
+            term = self.signed()
+            return lambda: sign * _number(term())
+        term = self.operand()
         while self.is_next("OPERATOR-POSTFIX"):
             self.take()
-            value = _number(value) / 100
-        return value
+            term = _applied(_of_numbers(operator.truediv), term, lambda: 100.0)
+        return term
 
-    def operand(self) -> Any:
+    def operand(self) -> _Term:
         token = self.take()
-        if token.type == "OPERAND" and token.subtype == "NUMBER":
-            return float(token.value)
-        if token.type == "OPERAND" and token.subtype == "RANGE":
-            return self.cells(token.value)
-        if token.type == "OPERAND" and token.subtype == "ERROR":
-            raise _ErrorValue(CellError(token.value))
+        if token.type == "OPERAND":
+            return self.value(token)
         if token.type == "PAREN" and token.subtype == "OPEN":
-            value = self.operation(0)
+            term = self.operation(0)
             self.close("PAREN")
-            return value
+            return term
         if token.type == "FUNC" and token.subtype == "OPEN":
-            return self.call(token.value[:-1].upper())
+            return self.call(token.value[:-1].upper().removeprefix("_XLFN."))
         raise NotComputable(f"it uses {token.value!r}")
 
-    def call(self, name: str) -> float:
-        if name not in _OF_NUMBERS and name not in _OF_RANGES:
-            raise NotComputable(f"it uses the function {name}")
-        arguments = []
+    def value(self, token: Any) -> _Term:
+        text = token.value
+        if token.subtype == "RANGE":
+            return lambda: self.cells(text)
+        if token.subtype == "NUMBER":
+            return lambda: float(text)
+        if token.subtype == "TEXT":
+            return lambda: text[1:-1].replace('""', '"')
+        if token.subtype == "LOGICAL":
+            return lambda: text.upper() == "TRUE"
+        if token.subtype == "ERROR":
+            return lambda: CellError(text)
+        raise NotComputable(f"it uses {text!r}")
+
+    def call(self, name: str) -> _Term:
+        terms: list[_Term] = []
         while not self.is_next("FUNC", "CLOSE"):
-            arguments.append(self.operation(0))
+            missing = self.is_next("SEP")  # IF(A1,,2)
+            terms.append((lambda: None) if missing else self.operation(0))
             if not self.is_next("SEP"):
                 break
             self.take()
         self.close("FUNC")
+        if name in ("ROW", "COLUMN"):
+            return lambda: self.place(name, terms)
         if name in _OF_RANGES:
-            return _OF_RANGES[name](_numbers(arguments))
-        count, function = _OF_NUMBERS[name]
-        if len(arguments) != count:
-            raise NotComputable(f"{name} has {len(arguments)} arguments instead of {count}")
-        return function(*(_number(argument) for argument in arguments))
+            return lambda: float(_OF_RANGES[name](_numbers([term() for term in terms])))
+        if name not in _OF_NUMBERS and name not in _OF_TERMS:
+            return lambda: _not_known(name)
+        fewest, most, function = _OF_NUMBERS[name] if name in _OF_NUMBERS else _OF_TERMS[name]
+        if not fewest <= len(terms) <= most:
+            raise NotComputable(f"{name} has {len(terms)} arguments instead of {fewest}")
+        if name in _OF_NUMBERS:
+            return lambda: float(function(*(_number(term()) for term in terms)))
+        return lambda: function(*terms)
 
     def close(self, kind: str) -> None:
         if not self.is_next(kind, "CLOSE"):
             raise NotComputable("a parenthesis is not closed")
         self.take()
 
-    def cells(self, reference: str) -> Any:
-        from openpyxl.utils import column_index_from_string
+    def place(self, name: str, terms: list[_Term]) -> float:
+        first = _area(terms[0]).first if terms else self.surroundings.at
+        if first is None or len(terms) > 1:
+            raise NotComputable(f"it uses the function {name}")
+        return float(first[name == "COLUMN"])
 
-        match = _REFERENCE.fullmatch(reference)
-        if match is None or "[" in reference:
-            raise NotComputable(f"it uses {reference}")
-        sheet = match["sheet"]
-        if sheet is not None and sheet.startswith("'"):
-            sheet = sheet[1:-1].replace("''", "'")
-        column, row = column_index_from_string(match["column"]), int(match["row"])
-        if match["last_column"] is None:
-            return self.lookup(sheet, row, column)
-        last_column, last_row = column_index_from_string(match["last_column"]), int(match["last_row"])
-        if (abs(last_row - row) + 1) * (abs(last_column - column) + 1) > _MAX_RANGE:
-            raise NotComputable(f"it uses the large range {reference}")
-        return [
-            self.lookup(sheet, r, c)
-            for r in range(min(row, last_row), max(row, last_row) + 1)
-            for c in range(min(column, last_column), max(column, last_column) + 1)
-        ]
+    def cells(self, text: str) -> Any:
+        area = reference(text)
+        if area is None:
+            formula = self.surroundings.name(text) if self.surroundings.name else None
+            if formula is None:
+                raise NotComputable(f"it uses {text}")
+            return _parsed(formula, self.surroundings)()
+        if area.sheet is not None and ":" in area.sheet:
+            raise NotComputable(f"it uses {text}, through several sheets")
+        bottom, right = area.bottom, area.right
+        if self.surroundings.extent and (bottom, right) != (area.top, area.left):
+            last_row, last_column = self.surroundings.extent(area.sheet)
+            whole = (area.bottom - area.top + 1) * (area.right - area.left + 1) > _MAX_RANGE
+            if whole:  # nothing but blanks lies beyond
+                bottom, right = max(area.top, min(bottom, last_row)), max(area.left, min(right, last_column))
+        if (bottom - area.top + 1) * (right - area.left + 1) > _MAX_RANGE:
+            raise NotComputable(f"it uses the large range {text}")
+        lookup = self.surroundings.lookup
+        rows, columns = range(area.top, bottom + 1), range(area.left, right + 1)
+        values = [lookup(area.sheet, row, column) for row in rows for column in columns]
+        return _Cells(values, len(columns), (area.top, area.left))
+
+
+def _applied(function: Callable[[Any, Any], Any], left: _Term, right: _Term) -> _Term:
+    return lambda: function(left(), right())
+
+
+def _not_known(name: str) -> Any:
+    raise NotComputable(f"it uses the function {name}")

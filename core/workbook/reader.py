@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import os
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -59,7 +60,29 @@ def read_system(path: str | os.PathLike[str]) -> PinholeSystem:
     >>> len(system), system.collimator_length[0].round(4)    # doctest: +SKIP
     (80, 89.0702)
     """
-    book = Book(path)
+    return read(Book(path)).system
+
+
+@dataclass(frozen=True)
+class Reading:
+    """What is read from a workbook.
+
+    Attributes
+    ----------
+    modules : Rows
+        The modules of the coordinates' table.
+    columns : dict
+        Quantity -> `Column`, of each that has one.
+    system : PinholeSystem
+    """
+
+    modules: Rows
+    columns: dict[str, Column]
+    system: PinholeSystem
+
+
+def read(book: Book) -> Reading:
+    """The scanner of `book` and where its numbers stand; see `read_system`."""
     found_tables = tables(book)
     coordinates = _coordinates(book, found_tables)
     modules = module_rows(coordinates)
@@ -67,11 +90,11 @@ def read_system(path: str | os.PathLike[str]) -> PinholeSystem:
         column = coordinates.column("x1") or 1
         at = where(coordinates.sheet, coordinates.first_row, column)
         raise InputError(f"{at} and the rows below hold no modules, expected their x1, y1, z1")
-    columns = {name: _Column(coordinates, name, modules, modules.rows) for name in POSITION}
+    columns = {name: Column(coordinates, name, modules, modules.rows) for name in POSITION}
     values = {name: columns[name].numbers() for name in POSITION}
     for name in DIMENSIONS:
         table = _dimensions(name, book, found_tables, coordinates)
-        columns[name] = _Column(table, name, modules, rows_of_modules(name, modules, table))
+        columns[name] = Column(table, name, modules, rows_of_modules(name, modules, table))
         values[name] = columns[name].numbers()
     _refuse_impossible(columns, values)
 
@@ -80,7 +103,7 @@ def read_system(path: str | os.PathLike[str]) -> PinholeSystem:
     given = {}
     for name in _COMPUTED:
         if coordinates.column(name) is not None:
-            columns[name] = _Column(coordinates, name, modules, modules.rows)
+            columns[name] = Column(coordinates, name, modules, modules.rows)
             # On the z axis a spreadsheet's ATAN2 shows #DIV/0!, and any azimuth is right.
             given[name] = columns[name].numbers_or_nan(on_axis if name == "azimuth" else None)
     l_used = _collimator_length(columns, values, given)
@@ -88,7 +111,7 @@ def read_system(path: str | os.PathLike[str]) -> PinholeSystem:
     for table in dict.fromkeys(columns[name].table for name in DIMENSIONS):
         warn_of_left_out(modules, table)
 
-    return PinholeSystem(
+    system = PinholeSystem(
         centers=centers,
         pinhole_diameter=values["d"],
         collimator_length=l_used,
@@ -98,9 +121,10 @@ def read_system(path: str | os.PathLike[str]) -> PinholeSystem:
         numbers=np.array(modules.names),
         source=_source(book, modules, columns),
     )
+    return Reading(modules, columns, system)
 
 
-class _Column:
+class Column:
     """The cells of one quantity, one for each module."""
 
     def __init__(self, table: Table, quantity: str, modules: Rows, rows: Sequence[int]) -> None:
@@ -197,7 +221,7 @@ def _preference(table: Table, kind: str) -> int:
     return names.index(name) if name in names else len(names)
 
 
-def _refuse_impossible(columns: dict[str, _Column], values: dict[str, NDArray[np.float64]]) -> None:
+def _refuse_impossible(columns: dict[str, Column], values: dict[str, NDArray[np.float64]]) -> None:
     for name in DIMENSIONS:
 
         def too_small(i: int, name: str = name) -> str:
@@ -239,7 +263,7 @@ def _refuse_impossible(columns: dict[str, _Column], values: dict[str, NDArray[np
 
 
 def _collimator_length(
-    columns: dict[str, _Column], values: dict[str, NDArray[np.float64]], given: dict[str, NDArray[np.float64]]
+    columns: dict[str, Column], values: dict[str, NDArray[np.float64]], given: dict[str, NDArray[np.float64]]
 ) -> NDArray[np.float64]:
     b = np.sqrt(sum(values[name] ** 2 for name in POSITION))
     designed = collimator_length(b, values["d"], values["Ld"], values["R"])
@@ -252,7 +276,7 @@ def _collimator_length(
 
 
 def _check_derived(
-    columns: dict[str, _Column],
+    columns: dict[str, Column],
     given: dict[str, NDArray[np.float64]],
     expected: dict[str, NDArray[np.float64]],
     l_used: NDArray[np.float64],
@@ -268,7 +292,7 @@ def _check_derived(
         warn_of_differences(name, numbers, expected[name], column.where, degrees=degrees, slack=slack)
 
 
-def _source(book: Book, modules: Rows, columns: dict[str, _Column]) -> SystemSource:
+def _source(book: Book, modules: Rows, columns: dict[str, Column]) -> SystemSource:
     from openpyxl.utils import get_column_letter
 
     cells = [

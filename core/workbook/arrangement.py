@@ -1,0 +1,176 @@
+"""Which row of a table each module is to have, and the moving, emptying and adding of rows."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from ..errors import InputError
+from ..system import PinholeSystem
+from .headings import Table
+from .sheet_xml import SheetXml
+from .workbook_xml import WorkbookXml
+
+
+def matched(system: PinholeSystem, old: PinholeSystem, numbered: bool) -> list[int | None]:
+    """The module of `old` that each of `system` is, None for a new one.
+
+    They go by their numbers; those left over, if renumbered, by the pinhole's exact place. In a workbook without
+    numbers that could not have been the system's, they go by their order.
+    """
+    index = {int(number): j for j, number in enumerate(old.numbers)}
+    numbers = [int(number) for number in system.numbers]
+    if not numbered and not set(numbers) <= set(index):
+        return [i if i < len(old) else None for i in range(len(system))]
+    found = [index.get(number) for number in numbers]
+    taken = set(found)
+    at_place = {tuple(center): j for j, center in enumerate(old.centers) if j not in taken}
+    return [at_place.get(tuple(system.centers[i])) if j is None else j for i, j in enumerate(found)]
+
+
+@dataclass(frozen=True)
+class Arrangement:
+    """The rows of a table with a row for each module.
+
+    Attributes
+    ----------
+    table : Table
+    old : tuple of int
+        The row of each module of the workbook.
+    old_of : tuple of int or None
+        The workbook's module that each module of the system is.
+    rows : tuple of int
+        The row that each module of the system is to have.
+    columns : tuple of int
+        Those that go with the modules.
+    """
+
+    table: Table
+    old: tuple[int, ...]
+    old_of: tuple[int | None, ...]
+    rows: tuple[int, ...]
+    columns: tuple[int, ...]
+
+    @property
+    def model(self) -> int:
+        """The row that added rows are made after."""
+        return max(self.old)
+
+    @property
+    def added(self) -> list[int]:
+        """The rows that held no module."""
+        return [row for row in self.rows if row not in set(self.old)]
+
+    def source(self, i: int) -> int:
+        """The row that a module's cells come from: its own, or, for a new one, that whose formulas it takes."""
+        j, row = self.old_of[i], self.rows[i]
+        if j is not None:
+            return self.old[j]
+        return row if row in set(self.old) else self.model
+
+    def apply(self, workbook: WorkbookXml) -> None:
+        """Move, empty and add the rows; a new module has formulas, but no typed values yet.
+
+        As when a spreadsheet sorts, relative references of a formula move with its row, and the references of
+        others stay.
+        """
+        sheet = workbook.sheets[self.table.sheet.name]
+        self._refuse_occupied(sheet)
+        before = {row: [sheet.cells.get((row, column)) for column in self.columns] for row in {*self.old, *self.rows}}
+        for row in set(self.old) - set(self.rows):
+            self._empty(sheet, row)
+        for i, row in enumerate(self.rows):
+            source = self.source(i)
+            if self.old_of[i] is not None and source == row:
+                continue
+            for column, cell in zip(self.columns, before[source], strict=True):
+                at, start = (row, column), (source, column)
+                if cell is None:
+                    self._empty_cell(sheet, at)
+                    continue
+                sheet.refuse_array(start)
+                sheet.refuse_array(at)
+                typed = cell.formula is None
+                sheet.copy_row(cell.typed(None) if typed and self.old_of[i] is None else cell, start, at)
+
+    def _empty(self, sheet: SheetXml, row: int) -> None:
+        for column in self.columns:
+            self._empty_cell(sheet, (row, column))
+
+    def _empty_cell(self, sheet: SheetXml, at: tuple[int, int]) -> None:
+        if not sheet.cell(at).blank:
+            sheet.type(at, None)
+
+    def _refuse_occupied(self, sheet: SheetXml) -> None:
+        for row in self.added:
+            for column in self.columns:
+                if not sheet.cell((row, column)).blank:
+                    raise InputError(
+                        f"{self.table.sheet.book.path.name}: {self.table.sheet.place(row, column)} is not blank, where "
+                        f"an added module's row belongs, expected {len(self.added)} free rows below row {self.model}"
+                    )
+
+
+def arrange(
+    table: Table,
+    old: Sequence[int],
+    old_of: Sequence[int | None],
+    *,
+    filled_to: int,
+    number_column: int | None,
+    kept_columns: Sequence[int],
+    known: Sequence[int | None],
+) -> Arrangement:
+    """The rows that the modules are to have in `table`: those they have, if that is their order.
+
+    Parameters
+    ----------
+    old
+        The row of each module of the workbook.
+    old_of
+        The workbook's module that each of the system is, None for a new one.
+    filled_to
+        The table's last row.
+    number_column
+        The column of the modules' numbers.
+    kept_columns
+        Columns with one value for all modules, in the first row: they don't go with it.
+    known
+        The row that `table` has for a module which is new in the coordinates' table.
+    """
+    wanted: list[int | None] = [known[i] if j is None else old[j] for i, j in enumerate(old_of)]
+    missing = wanted.count(None)
+    kept = sorted(row for row in wanted if row is not None)
+    last = max(kept, default=min(old) - 1)
+    free = [row for row in sorted(old) if row > last] + [max(filled_to, max(old)) + n for n in range(1, missing + 1)]
+    slots = kept + free[:missing]
+    if kept_columns and min(old) not in slots:
+        wanted = [min(old) if row == slots[0] else row for row in wanted]
+        slots[0] = min(old)
+    in_order = list(old) == sorted(old) and not any(row is not None for row in known)
+    added = iter(free)
+    rows = sorted(slots) if in_order else [next(added) if row is None else row for row in wanted]
+    columns = tuple(column for column in _columns(table, old, number_column) if column not in set(kept_columns))
+    return Arrangement(table, tuple(old), tuple(old_of), tuple(rows), columns)
+
+
+def _columns(table: Table, rows: Sequence[int], number_column: int | None) -> list[int]:
+    """The columns that go with the modules' rows.
+
+    Those of the known quantities, those filled in half of the rows or more, and what stands right beside them:
+    a summary apart from the table stays where it is.
+    """
+    sheet, wanted = table.sheet, set(rows)
+    cells = {at for cells in (sheet.stored, sheet.formulas) for at in cells if at[0] in wanted}
+    filled = np.bincount([column for _, column in cells], minlength=1)
+    own = {column for _, column, _ in table.headings} | {number_column or 0}
+    own |= {int(column) for column in np.flatnonzero(2 * filled >= len(rows))}
+    used = set(np.flatnonzero(filled).tolist()) | own
+    for step in (-1, 1):
+        for column in sorted(own):
+            while column + step in used:
+                column += step
+                own.add(column)
+    return sorted(own - {0})

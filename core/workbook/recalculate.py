@@ -1,0 +1,188 @@
+"""New stored values for the formulas that depend on changed cells."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+from . import libreoffice
+from .checks import AGREEING
+from .dependencies import Dependencies
+from .formulas import CellError, NotComputable, Surroundings, calculate
+from .sheet_xml import Cell
+from .workbook_xml import Place, WorkbookXml
+
+
+@dataclass
+class Recalculated:
+    """What became of the formulas.
+
+    Attributes
+    ----------
+    by : dict
+        Cell -> "formulas" (our own evaluator) or "LibreOffice", which gave its new value.
+    cleared : dict
+        Cell whose value nobody could calculate, and which therefore stores none -> why.
+    replaced : dict
+        Cell whose formula does not give the number that it must -> why; it holds that number now.
+    """
+
+    by: dict[Place, str] = field(default_factory=dict)
+    cleared: dict[Place, str] = field(default_factory=dict)
+    replaced: dict[Place, str] = field(default_factory=dict)
+
+
+def agree(value: Any, wanted: float) -> bool:
+    """Whether a cell's value is the number `wanted`."""
+    return type(value) is float and abs(value - wanted) <= AGREEING * abs(wanted)
+
+
+def recalculate(workbook: WorkbookXml, changed: Iterable[Place], required: Mapping[Place, float]) -> Recalculated:
+    """Give every formula of `workbook` that depends on the `changed` cells its new value.
+
+    `required` are the numbers that cells must have in the end: a formula among them which gives another one, or
+    of which that cannot be known, is replaced by the number.
+    """
+    calculation = _Calculation(workbook, changed, required)
+    calculation.by_formulas()
+    if calculation.unknown:
+        calculation.by_libreoffice()
+    calculation.clear()
+    return calculation.result
+
+
+class _Calculation:
+    def __init__(self, workbook: WorkbookXml, changed: Iterable[Place], required: Mapping[Place, float]) -> None:
+        self.workbook, self.required = workbook, required
+        self.result = Recalculated()
+        dependencies = Dependencies(workbook)
+        self.affected = dependencies.affected(changed)
+        # What affected formulas refer to may have come without values.
+        cells = {place: workbook.cell(place) for place in dependencies.formulas - self.affected}
+        valueless = {place for place, cell in cells.items() if cell.value is None}
+        self.waiting = dependencies.in_order(self.affected | valueless)
+        self.not_yet = set(self.waiting)
+        self.unknown: dict[Place, str] = {}
+        self.elsewhere: dict[Place, Any] = {}
+
+    def by_formulas(self) -> None:
+        for place in self.waiting:
+            cell = self.workbook.cell(place)
+            try:
+                value = self._calculated(place, cell)
+            except NotComputable as why:
+                self.unknown[place] = str(why)
+                self.not_yet.discard(place)
+                continue
+            self.not_yet.discard(place)
+            if place in self.required and not agree(value, self.required[place]):
+                self._replace(place, f"it gives {_shown(value)}")
+            elif place in self.affected:
+                self._store(place, self.required.get(place, value), "formulas")
+            else:
+                self.elsewhere[place] = value
+        self.unknown = {place: why for place, why in self.unknown.items() if place in self.affected}
+
+    def _calculated(self, place: Place, cell: Cell) -> Any:
+        if cell.array is not None:
+            raise NotComputable("it is an array formula or a data table")
+        sheet = place[0]
+
+        def lookup(name: str | None, row: int, column: int) -> Any:
+            return self._value((self._title(name, sheet), row, column))
+
+        surroundings = Surroundings(
+            lookup,
+            at=place[1:],
+            extent=lambda name: self.workbook.extent(self._title(name, sheet)),
+            name=lambda name: self.workbook.defined_name(sheet, name),
+        )
+        assert cell.formula is not None, "only formulas are calculated"
+        return calculate(cell.formula, surroundings)
+
+    def _title(self, name: str | None, own: str) -> str:
+        title = own if name is None else self.workbook.title(name)
+        if title is None:
+            raise NotComputable(f"there is no sheet {name}")
+        return title
+
+    def _value(self, place: Place) -> Any:
+        if place in self.unknown:
+            if place in self.required:  # whether by its formula or as a number, this it will be
+                return self.required[place]
+            raise NotComputable(f"it needs {self.workbook.text(place)}, and there: {self.unknown[place]}")
+        if place in self.not_yet:
+            raise NotComputable(f"it refers to {self.workbook.text(place)}, which refers back to it")
+        if place in self.elsewhere:
+            return self.elsewhere[place]
+        return self.workbook.value(place)
+
+    def by_libreoffice(self) -> None:
+        for _ in range(2):  # once more where formulas had to be replaced, for those that depend on them
+            values = self._libreoffice_values()
+            if values is None:
+                return
+            wrong = {
+                place: f"it gives {_shown(value)}"
+                for place, value in values.items()
+                if place in self.required and not agree(value, self.required[place])
+            }
+            for place, why in wrong.items():
+                self._replace(place, why)
+                del self.unknown[place]
+            if not wrong:
+                break
+        for place, value in values.items():
+            if place in self.unknown:
+                self._store(place, self.required.get(place, value), "LibreOffice")
+                del self.unknown[place]
+
+    def _libreoffice_values(self) -> dict[Place, Any] | None:
+        (content,) = libreoffice.recalculated([self.workbook.to_bytes()])
+        if content is None:
+            return None
+        theirs = WorkbookXml(content, f"{self.workbook.name}, recalculated by LibreOffice")
+        values = {}
+        for place in self.unknown:
+            title = theirs.title(place[0])
+            value = theirs.value((title, *place[1:])) if title is not None else None
+            # #NAME? is said of functions that LibreOffice does not know; Err:5xx of much else.
+            if value is not None and value != "#NAME?" and not str(value).startswith("Err:"):
+                values[place] = value
+        return values
+
+    def clear(self) -> None:
+        for place, why in self.unknown.items():
+            cell = self.workbook.cell(place)
+            if place in self.required:
+                self._replace(place, f"its value is not known: {why}")
+            else:
+                self._set(place, replace(cell, value=None))
+                self.result.cleared[place] = why
+
+    def _replace(self, place: Place, why: str) -> None:
+        self.workbook.sheets[place[0]].refuse_array(place[1:])
+        self._set(place, self.workbook.cell(place).typed(self.required[place]))
+        self.result.replaced[place] = why
+
+    def _store(self, place: Place, value: Any, by: str) -> None:
+        cell = self.workbook.cell(place)
+        if not (agree_exactly(cell.value, value)):
+            self._set(place, replace(cell, value=value))
+        self.result.by[place] = by
+
+    def _set(self, place: Place, cell: Cell) -> None:
+        self.workbook.sheets[place[0]].cells[place[1:]] = cell
+
+
+def agree_exactly(a: Any, b: Any) -> bool:
+    """Whether two cells' values are the same, of the same kind."""
+    return type(a) is type(b) and a == b
+
+
+def _shown(value: Any) -> str:
+    if type(value) is float and math.isfinite(value):
+        return f"{value:.9g}"
+    return str(value) if isinstance(value, CellError) else repr(value)

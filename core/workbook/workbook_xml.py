@@ -1,0 +1,224 @@
+"""A workbook file's sheets as cells that can be changed, and the file with the changes."""
+
+from __future__ import annotations
+
+import re
+from functools import cached_property
+from typing import Any
+
+from ..errors import InputError
+from .formulas import NotComputable, tokens_of
+from .package import Package
+from .references import MAX_ROW, Reference, reference
+from .sheet_xml import MAIN, Cell, SheetXml, Unreadable, shared_strings
+from .xml_parts import Element, elements, spliced, utf8, with_attribute
+
+KINDS = {
+    ".xlsx": "application/vnd.openxmlformats-officedocument.spreadsheetml.sheet.main+xml",
+    ".xlsm": "application/vnd.ms-excel.sheet.macroEnabled.main+xml",
+}
+_BEFORE_CALC_PR = (
+    *("fileVersion", "fileSharing", "workbookPr", "workbookProtection", "bookViews", "sheets", "functionGroups"),
+    *("externalReferences", "definedNames"),
+)
+Place = tuple[str, int, int]
+"""Sheet, row, column."""
+
+
+class WorkbookXml:
+    """The worksheets of a workbook file.
+
+    Parameters
+    ----------
+    content
+        The file's bytes.
+    name
+        How messages call the file.
+
+    Attributes
+    ----------
+    sheets : dict
+        Name -> `SheetXml`, in the workbook's order; charts' sheets are left out.
+    """
+
+    def __init__(self, content: bytes, name: str) -> None:
+        self.name = name
+        self.package = Package(content, name)
+        found = [member for _, kind, member in self.package.relations("") if kind == "officeDocument"]
+        if not found:
+            raise InputError(f"{name}: not a whole .xlsx workbook (it does not say where its sheets are)")
+        self._part = found[0]
+        self._data, self._back = utf8(self.package.read(self._part), name)
+        self._elements = [e for e in elements(self._data, name) if e.namespace == MAIN]
+        relations = self.package.relations(self._part)
+        members = {key: (kind, member) for key, kind, member in relations}
+        strings = [member for _, kind, member in relations if kind == "sharedStrings"]
+        self._calc_chain = [member for _, kind, member in relations if kind == "calcChain"]
+        texts = shared_strings(self.package.read(strings[0]), name) if strings else []
+        self.all_sheets: list[str] = []
+        self.sheets: dict[str, SheetXml] = {}
+        self.parts: dict[str, str] = {}
+        for e in self._elements:
+            if e.name != "sheet":
+                continue
+            title = e.attributes.get("name", "")
+            self.all_sheets.append(title)
+            key = next((value for attribute, value in e.attributes.items() if attribute.endswith(" id")), "")
+            kind, member = members.get(key, ("", ""))
+            if kind == "worksheet":
+                self.parts[title] = member
+                self.sheets[title] = SheetXml(self.package.read(member), texts, title)
+        self._by_folded_name = {title.casefold(): title for title in self.sheets}
+        self._extents: dict[str, tuple[int, int]] = {}
+
+    @property
+    def suffix(self) -> str | None:
+        """ ".xlsx" or ".xlsm" by what is inside, None for anything else."""
+        kind = self.package.content_type(self._part)
+        return next((suffix for suffix, content_type in KINDS.items() if kind == content_type), None)
+
+    @cached_property
+    def _names(self) -> dict[tuple[str | None, str], str]:
+        """(sheet or None, folded defined name) -> formula."""
+        names = {}
+        for e in self._elements:
+            if e.name == "definedName" and e.text.strip():
+                scope = e.attributes.get("localSheetId", "")
+                at = int(scope) if scope.isdigit() else -1
+                sheet = self.all_sheets[at] if 0 <= at < len(self.all_sheets) else None
+                names[sheet, e.attributes.get("name", "").casefold()] = f"={e.text.strip()}"
+        return names
+
+    def defined_name(self, sheet: str, name: str) -> str | None:
+        """The formula of a defined name as seen from `sheet`; None where it is unknown or depends on the place."""
+        own, _, plain = name.rpartition("!")
+        scope = self.title(own.strip("'")) if own else sheet
+        key = plain.casefold()
+        formula = self._names.get((scope, key)) or self._names.get((None, key))
+        return formula if formula is not None and _is_absolute(formula) else None
+
+    @property
+    def defined_names(self) -> list[tuple[str, str]]:
+        """(name, formula) of all."""
+        return [(name, formula) for (_, name), formula in self._names.items()]
+
+    def title(self, name: str | None) -> str | None:
+        """A sheet's name as it is written in the workbook."""
+        return None if name is None else self._by_folded_name.get(name.casefold())
+
+    def between(self, name: str) -> list[str]:
+        """The sheets that "Sheet" or "First:Last" means; none where there are no such."""
+        first, _, last = name.partition(":")
+        folded = [title.casefold() for title in self.all_sheets]
+        if name.casefold() in folded or not last:
+            titles = [name]
+        elif {first.casefold(), last.casefold()} <= set(folded):
+            i, j = sorted((folded.index(first.casefold()), folded.index(last.casefold())))
+            titles = self.all_sheets[i : j + 1]
+        else:
+            return []
+        return [title for found in titles if (title := self.title(found)) is not None]
+
+    def cell(self, place: Place) -> Cell:
+        """A cell as it is now."""
+        return self.sheets[place[0]].cell(place[1:])
+
+    def value(self, place: Place) -> Any:
+        """A cell's value as it is now; `NotComputable` where it is of an unusual kind."""
+        value = self.cell(place).value
+        if isinstance(value, Unreadable):
+            raise NotComputable(f"{self.text(place)} holds {value!r}")
+        return value
+
+    def extent(self, sheet: str) -> tuple[int, int]:
+        """The last row and the last column of `sheet` with content."""
+        if sheet not in self._extents:
+            self._extents[sheet] = self.sheets[sheet].extent
+        return self._extents[sheet]
+
+    @staticmethod
+    def text(place: Place) -> str:
+        """E.g. ``Coordinates!B3``."""
+        from openpyxl.utils import get_column_letter
+
+        return f"{place[0]}!{get_column_letter(place[2])}{place[1]}"
+
+    @property
+    def changed(self) -> list[Place]:
+        """The cells that are not as they were read."""
+        return [(title, *at) for title, sheet in self.sheets.items() for at in sheet.changed]
+
+    def to_bytes(self) -> bytes:
+        """The file: the same bytes if no cell has changed; else with the changes, to be recalculated when opened."""
+        changed = {title: sheet for title, sheet in self.sheets.items() if sheet.changed}
+        if not changed:
+            return self.package.to_bytes()
+        for title, sheet in changed.items():
+            self.package.replace(self.parts[title], sheet.to_bytes())
+        self.package.replace(self._part, self._back(self._recalculated_on_load()))
+        if any(sheet.formulas_moved for sheet in changed.values()):
+            while self._calc_chain:
+                self.package.remove(self._calc_chain.pop(), self._part)
+        return self.package.to_bytes()
+
+    def _recalculated_on_load(self) -> bytes:
+        root = self._elements[0]
+        for e in self._elements:
+            if e.name == "calcPr" and e.parent is root:
+                tag = with_attribute(self._data[e.start : e.inner], "fullCalcOnLoad", "1")
+                return spliced(self._data, [(e.start, e.inner, tag)])
+        before = [e for e in self._elements if e.parent is root and e.name in _BEFORE_CALC_PR]
+        prefix = self._data[root.start + 1 : root.inner].split(b"workbook", 1)[0]
+        at = max(e.end for e in before)
+        return spliced(self._data, [(at, at, b'<%bcalcPr fullCalcOnLoad="1"/>' % prefix)])
+
+    def ranges_ending_at(self, sheet: str, first: int, last: int) -> list[str]:
+        """What refers to several rows of `sheet` down to row `last`, and begins in rows `first` to `last`: formulas'
+        cells, defined names, charts and tables."""
+        found = []
+
+        def ends_there(area: Reference | None, own: str) -> bool:
+            if area is None or not first <= area.top < area.bottom == last or area.bottom == MAX_ROW:
+                return False
+            return sheet in (self.between(area.sheet) if area.sheet else [own])
+
+        for title, cells in self.sheets.items():
+            for at, cell in cells.cells.items():
+                if cell.formula is not None and any(ends_there(area, title) for area in areas_in(cell.formula)):
+                    found.append(self.text((title, *at)))
+        for name, formula in self.defined_names:
+            if any(ends_there(area, "") for area in areas_in(formula)):
+                found.append(f"the name {name}")
+        tables = {member for _, kind, member in self.package.relations(self.parts[sheet]) if kind == "table"}
+        for member in self.package.names:
+            if member.startswith("xl/charts/") and member.endswith(".xml"):
+                parts = self._parts_of(member)
+                if any(e.name == "f" and ends_there(reference(e.text.strip()), "") for e in parts):
+                    found.append(f"the chart {member}")
+            elif member in tables:
+                root = self._parts_of(member)[0]
+                if ends_there(reference(root.attributes.get("ref", "")), sheet):
+                    found.append(f"the table {root.attributes.get('displayName', member)}")
+        return found
+
+    def _parts_of(self, member: str) -> list[Element]:
+        return elements(utf8(self.package.read(member), self.name)[0], self.name)
+
+
+def areas_in(formula: str) -> list[Reference]:
+    """The areas that a formula names."""
+    return [area for text in _operands(formula) if (area := reference(text)) is not None]
+
+
+def _operands(formula: str) -> list[str]:
+    try:
+        tokens = tokens_of(formula)
+    except NotComputable:
+        return []
+    return [token.value for token in tokens if token.type == "OPERAND" and token.subtype == "RANGE"]
+
+
+def _is_absolute(formula: str) -> bool:
+    """Whether the formula of a name means the same wherever the name is used: ``Main!$B$3``, not ``Main!B3``."""
+    cells = [text.rpartition("!")[2] for text in _operands(formula) if reference(text) is not None]
+    return all(text.count("$") == len(re.findall(r"[A-Za-z]+|\d+", text)) for text in cells)

@@ -15,7 +15,7 @@ from ..core.system import PinholeSystem
 from . import scanner, storage
 from .module_values import LENGTHS
 
-_EQUAL = 1e-9  # mm
+_EQUAL = 1e-9  # mm, or share of a length above 1 mm
 
 
 def export_scanner(collection: bpy.types.Collection, path: Path, use_template: bool = True) -> PinholeSystem:
@@ -78,11 +78,12 @@ def _template(collection: bpy.types.Collection) -> Path | None:
 
 
 def _difference(one: PinholeSystem, other: PinholeSystem) -> str:
-    """Where two systems differ by more than 1e-9 mm, in words."""
+    """Where two systems differ, in words."""
     if not np.array_equal(one.numbers, other.numbers):
         return "the modules' numbers"
     for name in ("centers", *LENGTHS):
-        error = np.abs(getattr(one, name) - getattr(other, name)).reshape(len(one), -1).max(axis=1)
-        if error.max() > _EQUAL:
-            return f"{name} of module {one.numbers[int(error.argmax())]} by {error.max():g} mm"
+        a, b = (getattr(system, name).reshape(len(one), -1) for system in (one, other))
+        wrong = (np.abs(a - b) > _EQUAL * np.maximum(1.0, np.abs(a))).any(axis=1)
+        if wrong.any():
+            return f"{name} of module {one.numbers[int(wrong.argmax())]}"
     return ""

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..core.errors import InputError
-from . import cameras, collimators, ids, scanner
+from . import cameras, collimators, design, ids, scanner
 from .module_values import add_module, module_numbers
 from .phantom_properties import typed
 from .scanner_parts import module_solids, new_part
@@ -42,21 +42,41 @@ def leftovers(collection: bpy.types.Collection) -> list[bpy.types.Object]:
     ]
 
 
+def bare_cameras(collection: bpy.types.Collection) -> list[bpy.types.Object]:
+    """Modules with neither collimator nor crystal: copies whose original has gone."""
+    parts = design.parts_of(collection, scanner.modules(collection))
+    return [camera for camera, own in parts.items() if not own]
+
+
 def untidy_text(collection: bpy.types.Collection) -> str:
     """What `tidy` would do, in words; empty where all is in order."""
-    copies, left = len(copied_cameras(collection)), len(leftovers(collection))
-    texts = [f"{copies} copied camera{'s' * (copies > 1)}", f"{left} part{'s' * (left > 1)} without a camera"]
-    return ", ".join(text for text, n in zip(texts, (copies, left), strict=True) if n)
+    copies = copied_cameras(collection)
+    bare = [camera for camera in bare_cameras(collection) if camera not in copies]
+    left = leftovers(collection)
+    texts = (
+        f"{len(copies)} copied camera{'s' * (len(copies) > 1)}" if copies else "",
+        f"{len(bare)} bare camera{'s' * (len(bare) > 1)}" if bare else "",
+        f"{len(left)} part{'s' * (len(left) > 1)} without a camera" if left else "",
+    )
+    return ", ".join(text for text in texts if text)
 
 
 def tidy(collection: bpy.types.Collection) -> tuple[list[int], int]:
-    """Make modules of copied cameras, and remove parts without a camera: the new numbers, and how many parts."""
+    """Make modules of copied cameras, and remove parts without a camera: the new numbers, and how many parts.
+
+    Raises
+    ------
+    InputError
+        The shapes of a copy cannot be built: its numbers, or its original's, have to be cured first.
+    """
     left = leftovers(collection)
     _remove(left)
     numbers = []
     for camera in copied_cameras(collection):
         adopt(collection, camera)
         numbers.append(camera.mphdrr_module.number)
+    for camera in bare_cameras(collection):
+        _add_parts(collection, camera)
     make_single_users(collection)
     scanner.refresh_scanner(collection)
     collection.mphdrr_scanner.untidy = untidy_text(collection)
@@ -71,22 +91,27 @@ def adopt(
     `center` is its pinhole, (3,) in mm, to more digits than Blender keeps.
     """
     found = [o for o in scanner.modules(collection) if o != camera]
-    properties, numbers = collection.mphdrr_scanner, module_numbers(camera)
-    solids = module_solids(
-        *numbers[2:6], plate=typed(properties.plate_thickness), wall=typed(properties.wall_thickness)
-    )
     number = max(o.mphdrr_module.number for o in found) + 1
+    own = design.parts_of(collection, [camera])[camera]
+    if not own:
+        _add_parts(collection, camera)
+        own = design.parts_of(collection, [camera])[camera]
     add_module(camera, number, max(o.mphdrr_module.index for o in found) + 1, center)
     camera.name = ids.module_name(number, len(found) + 1)
     if camera.data.users > 1:
         camera.data = camera.data.copy()
     camera.data.name = camera.name
-    parts = {o.mphdrr_module.part: o for o in camera.children if o.mphdrr_module.part in _PARTS}
+    for part in own:
+        part.name, part.mphdrr_module.number = ids.part_name(camera.name, part.mphdrr_module.part), number
+
+
+def _add_parts(collection: bpy.types.Collection, camera: bpy.types.Object) -> None:
+    properties, numbers = collection.mphdrr_scanner, module_numbers(camera)
+    solids = module_solids(
+        *numbers[2:6], plate=typed(properties.plate_thickness), wall=typed(properties.wall_thickness)
+    )
     for part, solid in zip(_PARTS, solids, strict=True):
         name = ids.part_name(camera.name, part)
-        if part in parts:
-            parts[part].name, parts[part].mphdrr_module.number = name, number
-            continue
         item = new_part(camera, part, name, collimators.new_mesh(name, solid, collimators.part_material(part)))
         item.hide_viewport, item.hide_render = camera.hide_viewport, camera.hide_render
         for home in camera.users_collection:

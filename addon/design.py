@@ -95,8 +95,9 @@ def _refresh_module(
     module = camera.mphdrr_module
     place = cameras.world_matrix(camera)[:3, 3]
     if np.any(np.array(module.placed, np.float32) != place.astype(np.float32)):
+        is_moved = bool(module.built)  # otherwise it is seen for the first time
         module.placed = place
-        if scanner.keep_aimed and is_free(camera) and off_aim([camera]) and np.any(place):
+        if is_moved and scanner.keep_aimed and is_free(camera) and off_aim([camera]) and np.any(place):
             cameras.set_world_matrix(camera, cameras.camera_matrices(place[None])[0])
     numbers, aimed = module_numbers(camera), not off_aim([camera])
     walls = typed(scanner.plate_thickness), typed(scanner.wall_thickness)

@@ -8,6 +8,7 @@ is not done again: the panel offers it.
 from __future__ import annotations
 
 import sys
+from collections.abc import Iterable
 from typing import Any
 
 import bpy
@@ -16,7 +17,7 @@ from . import copies, design, scanner
 
 _INTERVAL = 0.2  # s between two looks whether a tool is still running
 _overlooked = False  # something happened while rendering or playing
-_undone: set[str] = set()  # what an undo left untidy, in words: the user wants it so
+_undone: dict[str, str] = {}  # what an undo left untidy, in words, by scanner: the user wants it so
 
 
 @bpy.app.handlers.persistent
@@ -38,7 +39,7 @@ def after_update(scene: bpy.types.Scene, depsgraph: bpy.types.Depsgraph) -> None
         _overlooked = True
         return
     _overlooked = False
-    for collection in scanner.scanners(scene):
+    for collection in _own(scanner.scanners(scene)):
         found = scanner.modules(collection)
         design.refresh(collection, found, found if structure else [camera for camera in found if camera in moved])
         if structure:
@@ -49,24 +50,25 @@ def after_update(scene: bpy.types.Scene, depsgraph: bpy.types.Depsgraph) -> None
 def after_undo(*_: Any) -> None:
     """Undo and redo bring back some datablocks and leave others: make everything agree again."""
     _undone.clear()
-    for collection in _all_scanners():
+    for collection in _own(bpy.data.collections):
         scanner.refresh_scanner(collection)
         with design.writing():
             collection.mphdrr_scanner.untidy = copies.untidy_text(collection)
-        _undone.add(collection.mphdrr_scanner.untidy)
+        _undone[collection.name] = collection.mphdrr_scanner.untidy
 
 
 @bpy.app.handlers.persistent
 def after_load(*_: Any) -> None:
     """Modules of a file made by an older version share meshes and have no readouts."""
     _undone.clear()
-    for collection in _all_scanners():
+    for collection in _own(bpy.data.collections):
         copies.make_single_users(collection)
         scanner.refresh_scanner(collection)
 
 
-def _all_scanners() -> list[bpy.types.Collection]:
-    return [c for c in bpy.data.collections if c.mphdrr_scanner.is_scanner]
+def _own(collections: Iterable[bpy.types.Collection]) -> list[bpy.types.Collection]:
+    """The scanners that are of this file, not linked from another."""
+    return [c for c in collections if c.mphdrr_scanner.is_scanner and c.library is None]
 
 
 def _is_busy() -> bool:
@@ -80,7 +82,9 @@ def _look_for_copies(collection: bpy.types.Collection) -> None:
     if properties.untidy != text:
         with design.writing():
             properties.untidy = text
-    if text and text not in _undone and not bpy.app.background and not bpy.app.timers.is_registered(_tidy):
+    if _undone.get(collection.name) != text:
+        _undone.pop(collection.name, None)
+    if text and collection.name not in _undone and not bpy.app.background and not bpy.app.timers.is_registered(_tidy):
         bpy.app.timers.register(_tidy, first_interval=_INTERVAL)
 
 

@@ -42,6 +42,11 @@ class ModuleNumbers(NamedTuple):
         """b: pinhole centre to isocentre."""
         return float(np.linalg.norm(self.center))
 
+    def system(self) -> PinholeSystem:
+        """A system of this module alone, or `InputError`."""
+        lengths = {name: np.array([getattr(self, name)]) for name in LENGTHS}
+        return PinholeSystem(self.center[None], **lengths, numbers=np.array([self.number]))
+
 
 def write_module(camera: bpy.types.Object, system: PinholeSystem, m: int, ring: int) -> None:
     """Make an object the camera of module `m`; `l` follows the ROI where it was calculated so."""
@@ -54,7 +59,6 @@ def write_module(camera: bpy.types.Object, system: PinholeSystem, m: int, ring: 
     module.length_mode = FROM_ROI if error <= _FORMULA * values["collimator_length"] else TYPED
     module.ring = ring
     remember(camera, system, m)
-    module.placed = cameras.world_matrix(camera)[:3, 3]
     module.part, module.is_module = "CAMERA", True
 
 

@@ -8,7 +8,6 @@ import bpy
 
 from ..core.errors import InputError
 from ..core.performance import isocentre_performance
-from ..core.system import PinholeSystem
 from .module_values import LENGTHS, ModuleNumbers
 
 _COVERED = 1 - 1e-6  # share of R: an `l` from the ROI sees R up to rounding
@@ -19,7 +18,7 @@ def update_module(module: bpy.types.PropertyGroup, numbers: ModuleNumbers, aimed
     module.pinhole_distance, module.aimed = numbers.pinhole_distance, aimed
     _, _, d, l, side, thickness, _ = numbers
     try:
-        PinholeSystem(numbers.center[None], d, l, side, thickness, numbers.roi_radius, [numbers.number])
+        numbers.system()  # refuses what makes no module
         at = isocentre_performance(numbers.pinhole_distance, d, l, side, thickness)
     except InputError as error:
         module.problem = str(error)

@@ -180,6 +180,14 @@ def active_scanner(scene: bpy.types.Scene) -> bpy.types.Collection | None:
     return chosen if chosen in found else next(iter(found), None)
 
 
+def required_scanner(scene: bpy.types.Scene) -> bpy.types.Collection:
+    """The scanner that the panels work on, or `InputError`."""
+    collection = active_scanner(scene)
+    if collection is None:
+        raise InputError("no scanner in the scene: import a workbook first")
+    return collection
+
+
 def modules(collection: bpy.types.Collection) -> list[bpy.types.Object]:
     """The scanner's camera objects in the order of the system, which is that of `read_scanner`."""
     found = [o for o in collection.all_objects if o.mphdrr_module.is_module]

@@ -39,6 +39,7 @@ class NewScanner:
             camera = self._keep(bpy.data.objects.new(name, data), name)
             self.cameras[number] = camera
             cameras.set_world_matrix(camera, matrices[m])
+            camera.lock_scale = (True, True, True)  # or its collimator would grow with it
             write_module(camera, system, m, int(rings[m]))
             self.rings[rings[m]].objects.link(camera)
             for part, solid in zip(("COLLIMATOR", "CRYSTAL"), solids[m], strict=True):

@@ -30,7 +30,7 @@ class MPHDRR_OT_check_geometry(bpy.types.Operator):
     def execute(self, context: bpy.types.Context) -> set[str]:
         from ..core.geometry_checks import check_geometry
 
-        collection = scanner.active_scanner(context.scene)
+        collection = scanner.required_scanner(context.scene)
         properties = collection.mphdrr_scanner
         try:
             with warnings_reported(self):

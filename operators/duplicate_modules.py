@@ -36,7 +36,7 @@ class MPHDRR_OT_duplicate_modules(bpy.types.Operator):
         return selection.poll_module(cls, context)
 
     def execute(self, context: bpy.types.Context) -> set[str]:
-        collection = scanner.active_scanner(context.scene)
+        collection = scanner.required_scanner(context.scene)
         try:
             made = copies.duplicate(
                 collection, selection.selected_modules(context), self.count, self.angle, self.follow_ring

@@ -24,6 +24,7 @@ class MPHDRR_OT_export_geometry(ExportHelper, bpy.types.Operator):
     bl_options = {"REGISTER", "UNDO"}
 
     filename_ext = ".xlsx"
+    filepath: StringProperty(name="File", description="Workbook to write", subtype="FILE_PATH", options={"SKIP_SAVE"})
     filter_glob: StringProperty(default=";".join(f"*{s}" for s in _SUFFIXES), options={"HIDDEN"})
     use_template: BoolProperty(
         name="Keep Workbook",
@@ -37,7 +38,7 @@ class MPHDRR_OT_export_geometry(ExportHelper, bpy.types.Operator):
         return selection.poll_scanner(cls, context)
 
     def invoke(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str]:
-        workbook = scanner.active_scanner(context.scene).mphdrr_scanner.workbook
+        workbook = scanner.required_scanner(context.scene).mphdrr_scanner.workbook
         if not self.filepath and workbook:
             self.filepath = str(storage.absolute(workbook))
         return super().invoke(context, event)
@@ -56,7 +57,7 @@ class MPHDRR_OT_export_geometry(ExportHelper, bpy.types.Operator):
             path = storage.absolute(self.filepath)
             with warnings_reported(self):
                 system = geometry_file.export_scanner(
-                    scanner.active_scanner(context.scene), path, use_template=self.use_template
+                    scanner.required_scanner(context.scene), path, use_template=self.use_template
                 )
         except InputError as error:
             self.report({"ERROR"}, str(error))

@@ -25,7 +25,7 @@ class MPHDRR_OT_remove_modules(bpy.types.Operator):
         modules = selection.selected_modules(context)
         text = modules_text([o.mphdrr_module.number for o in modules])
         try:
-            copies.remove(scanner.active_scanner(context.scene), modules)
+            copies.remove(scanner.required_scanner(context.scene), modules)
         except InputError as error:
             self.report({"ERROR"}, str(error))
             return {"CANCELLED"}

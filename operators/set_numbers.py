@@ -27,7 +27,7 @@ class MPHDRR_OT_set_numbers(bpy.types.Operator):
         return f"Give {'all' if properties.to_all else 'the selected'} modules the active module's d, l, Ld, Td and R"
 
     def execute(self, context: bpy.types.Context) -> set[str]:
-        collection, active = scanner.active_scanner(context.scene), _active(context)
+        collection, active = scanner.required_scanner(context.scene), _active(context)
         others = scanner.modules(collection) if self.to_all else selection.selected_modules(context)
         scanner.copy_numbers(collection, active, [camera for camera in others if camera != active])
         self.report({"INFO"}, f"{len(set(others) | {active})} modules have the numbers of {active.name}")

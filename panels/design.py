@@ -12,10 +12,10 @@ import bpy
 from ..addon import ids, readouts, scanner, selection
 
 _LABELS = (
-    ("pinhole_diameter", "Hole d (mm)"),
-    ("detector_side", "Side Ld (mm)"),
-    ("detector_thickness", "Depth Td (mm)"),
-    ("roi_radius", "ROI R (mm)"),
+    ("pinhole_diameter", "Hole d"),
+    ("detector_side", "Side Ld"),
+    ("detector_thickness", "Depth Td"),
+    ("roi_radius", "ROI R"),
 )
 _MOST_FINDINGS = 8
 
@@ -58,8 +58,8 @@ class MPHDRR_PT_design(_Panel, bpy.types.Panel):
         row.operator(ids.DUPLICATE_MODULES, text="Duplicate", icon="DUPLICATE")
         row.operator(ids.REMOVE_MODULES, text="Remove", icon="TRASH")
         row = layout.row(align=True)
-        row.operator(ids.SET_NUMBERS, text="Numbers to Selected").to_all = False
-        row.operator(ids.SET_NUMBERS, text="To All").to_all = True
+        row.operator(ids.SET_NUMBERS, text="Copy to Selected").to_all = False
+        row.operator(ids.SET_NUMBERS, text="Copy to All").to_all = True
         row = layout.row(align=True)
         row.prop(properties, "keep_aimed", toggle=True, icon="CON_TRACKTO")
         row.operator(ids.AIM_MODULES, text="Aim All Now")
@@ -130,12 +130,19 @@ def _draw_numbers(
     column.use_property_split = True
     column.use_property_decorate = False
     for name, label in _LABELS:
-        column.prop(numbers, name, text=f"{label}, mixed" if name in mixed else label)
+        column.prop(numbers, name, text=_label(label, name in mixed))
     column.row(align=True).prop(numbers, "length_mode", expand=True)
-    row = column.row(align=True)
-    row.enabled = numbers.length_mode == "TYPED"
-    row.prop(numbers, "collimator_length", text="Length l (mm)" + ", mixed" * ("collimator_length" in mixed))
+    if numbers.length_mode == "TYPED":
+        column.prop(numbers, "collimator_length", text=_label("Length l", "collimator_length" in mixed))
+    elif "collimator_length" not in mixed:
+        row = column.row(align=True)
+        row.enabled = False  # it follows the others
+        row.prop(numbers, "collimator_length", text=_label("Length l", False))
     return column
+
+
+def _label(text: str, is_mixed: bool) -> str:
+    return f"{text}, mixed" if is_mixed else f"{text} (mm)"
 
 
 def _draw_readouts(layout: bpy.types.UILayout, lines: tuple[tuple[str, str], ...]) -> None:

@@ -246,7 +246,7 @@ def test_after_an_undo_everything_agrees_again(collection):
     """Undo gives back the camera as it was, and may keep the meshes and the totals that followed it since."""
     camera = scanner.module(collection, 2)
     module = camera.mphdrr_module
-    names = [n for n in module.bl_rna.properties.keys() if n not in {"rna_type", "name", "visible"}]
+    names = [n for n in (p.identifier for p in module.bl_rna.properties) if n not in {"rna_type", "name", "visible"}]
     kept = {n: getattr(module, n)[:] if n == "placed" else getattr(module, n) for n in names}
     matrix = camera.matrix_basis.copy()
     camera.location.x *= 1.2
@@ -306,6 +306,14 @@ def test_blenders_own_duplicate_and_delete_are_tidied(collection):
     assert collection.mphdrr_scanner.untidy == "2 parts without a camera"
     bpy.ops.mphdrr.tidy_modules()
     assert len(bpy.data.meshes) == n_meshes - 2
+
+    select(scanner.module(collection, 4))  # a copy whose original goes before it is tidied takes its place
+    bpy.ops.object.duplicate()
+    bpy.data.objects.remove(scanner.module(collection, 4))
+    update()
+    assert collection.mphdrr_scanner.untidy == "1 bare camera, 2 parts without a camera"
+    bpy.ops.mphdrr.tidy_modules()
+    assert [len(c.children) for c in scanner.modules(collection)] == [2] * 9
     assert scanner.read_scanner(collection).numbers.tolist() == [2, 3, 4, 5, 6, 7, 8, 9, 10]
     assert_consistent(collection)
 

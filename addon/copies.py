@@ -11,6 +11,7 @@ import bpy
 import numpy as np
 from numpy.typing import NDArray
 
+from ..core.collimator_mesh import Solid
 from ..core.errors import InputError
 from . import cameras, collimators, design, ids, scanner
 from .module_values import add_module, module_numbers
@@ -69,10 +70,11 @@ def tidy(collection: bpy.types.Collection) -> tuple[list[int], int]:
     InputError
         The shapes of a copy cannot be built: its numbers, or its original's, have to be cured first.
     """
-    left = leftovers(collection)
+    copies, left, numbers = copied_cameras(collection), leftovers(collection), []
+    for camera in {*copies, *bare_cameras(collection)}:
+        _solids(collection, camera)  # what cannot be built is said before anything is changed
     _remove(left)
-    numbers = []
-    for camera in copied_cameras(collection):
+    for camera in copies:
         adopt(collection, camera)
         numbers.append(camera.mphdrr_module.number)
     for camera in bare_cameras(collection):
@@ -103,14 +105,17 @@ def adopt(
     camera.data.name = camera.name
     for part in own:
         part.name, part.mphdrr_module.number = ids.part_name(camera.name, part.mphdrr_module.part), number
+        if part.data.users == 1:
+            part.data.name = part.name
+
+
+def _solids(collection: bpy.types.Collection, camera: bpy.types.Object) -> tuple[Solid, Solid]:
+    plate, wall = collection.mphdrr_scanner.plate_thickness, collection.mphdrr_scanner.wall_thickness
+    return module_solids(*module_numbers(camera)[2:6], plate=typed(plate), wall=typed(wall))
 
 
 def _add_parts(collection: bpy.types.Collection, camera: bpy.types.Object) -> None:
-    properties, numbers = collection.mphdrr_scanner, module_numbers(camera)
-    solids = module_solids(
-        *numbers[2:6], plate=typed(properties.plate_thickness), wall=typed(properties.wall_thickness)
-    )
-    for part, solid in zip(_PARTS, solids, strict=True):
+    for part, solid in zip(_PARTS, _solids(collection, camera), strict=True):
         name = ids.part_name(camera.name, part)
         item = new_part(camera, part, name, collimators.new_mesh(name, solid, collimators.part_material(part)))
         item.hide_viewport, item.hide_render = camera.hide_viewport, camera.hide_render
@@ -145,8 +150,10 @@ def duplicate(
     Raises
     ------
     InputError
-        A copy would stand where a module stands already.
+        A copy would stand where a module stands already, or has no shape. The scene is as it was.
     """
+    for camera in modules:
+        _solids(collection, camera)
     taken = [module_numbers(o).center for o in scanner.modules(collection)]
     places = [
         (camera, place)

@@ -59,11 +59,10 @@ def after_undo(*_: Any) -> None:
 
 @bpy.app.handlers.persistent
 def after_load(*_: Any) -> None:
-    """Modules of a file made by an older version share meshes and have no readouts."""
-    _undone.clear()
+    """Modules of a file made by an older version share meshes and have no readouts. Nothing is tidied unasked."""
     for collection in _own(bpy.data.collections):
         copies.make_single_users(collection)
-        scanner.refresh_scanner(collection)
+    after_undo()
 
 
 def _own(collections: Iterable[bpy.types.Collection]) -> list[bpy.types.Collection]:
@@ -98,6 +97,7 @@ def _tidy() -> float | None:
             bpy.ops.mphdrr.tidy_modules("EXEC_DEFAULT", True)
         except RuntimeError as error:
             print(f"mphDRR: {error}", file=sys.stderr)
+            _undone.update((c.name, c.mphdrr_scanner.untidy) for c in _own(bpy.data.collections))  # not over and over
     return None
 
 

@@ -45,7 +45,7 @@ class ModuleNumbers(NamedTuple):
     def system(self) -> PinholeSystem:
         """A system of this module alone, or `InputError`."""
         lengths = {name: np.array([getattr(self, name)]) for name in LENGTHS}
-        return PinholeSystem(self.center[None], **lengths, numbers=np.array([self.number]))
+        return PinholeSystem(self.center[None], **lengths, numbers=np.array([self.number]), source=None)
 
 
 def write_module(camera: bpy.types.Object, system: PinholeSystem, m: int, ring: int) -> None:

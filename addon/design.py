@@ -101,12 +101,13 @@ def _refresh_module(
             cameras.set_world_matrix(camera, cameras.camera_matrices(place[None])[0])
     numbers, aimed = module_numbers(camera), not off_aim([camera])
     walls = typed(scanner.plate_thickness), typed(scanner.wall_thickness)
-    built = repr((*numbers._replace(center=numbers.center.tolist()), aimed, *walls))
+    intrinsic_fwhm = typed(scanner.intrinsic_fwhm)
+    built = repr((*numbers._replace(center=numbers.center.tolist()), aimed, *walls, intrinsic_fwhm))
     changed = module.built != built
     if changed:
         module.built, module.finding = built, ""
         module.collimator_length = numbers.collimator_length
-        readouts.update_module(module, numbers, aimed)
+        readouts.update_module(module, numbers, aimed, intrinsic_fwhm)
     # Also of a module that has not changed: an undo may have taken back its numbers and not its meshes.
     problem = "" if module.problem else _rebuild(camera, numbers, *walls, parts)
     if problem:

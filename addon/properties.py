@@ -130,7 +130,7 @@ class ModuleProperties(bpy.types.PropertyGroup):
         name="Sensitivity", description="Of an ideal pinhole for a point source at the isocentre, cps/MBq"
     )
     resolution: FloatProperty(
-        name="Resolution", description="FWHM in mm at the isocentre, of the hole alone (an ideal detector)"
+        name="Resolution", description="FWHM in mm at the isocentre, of the hole and the detector"
     )
     magnification: FloatProperty(name="Magnification", description="l / b: of the image on the crystal")
     roi_seen: FloatProperty(
@@ -164,6 +164,10 @@ class ScannerProperties(bpy.types.PropertyGroup):
     wall_thickness: FloatProperty(
         name="Wall", description="Thickness of the collimators' walls in mm", min=0.0, update=_scanner_changed
     )
+    intrinsic_fwhm: FloatProperty(
+        name="Intrinsic FWHM", description="Resolution of the detectors in mm on the crystal, for the readouts. 0: ideal",
+        min=0.0, soft_max=10.0, step=10, update=_scanner_changed,
+    )  # fmt: skip
     keep_aimed: BoolProperty(
         name="Keep Aimed",
         description="Turn a module that is moved so that it goes on looking at the isocentre. One that is only turned "

@@ -13,13 +13,13 @@ from .module_values import LENGTHS, ModuleNumbers
 _COVERED = 1 - 1e-6  # share of R: an `l` from the ROI sees R up to rounding
 
 
-def update_module(module: bpy.types.PropertyGroup, numbers: ModuleNumbers, aimed: bool) -> None:
+def update_module(module: bpy.types.PropertyGroup, numbers: ModuleNumbers, aimed: bool, intrinsic_fwhm: float) -> None:
     """Write a module's readouts; where its numbers make no module they are 0, and `problem` says why."""
     module.pinhole_distance, module.aimed = numbers.pinhole_distance, aimed
     _, _, d, l, side, thickness, _ = numbers
     try:
         numbers.system()  # refuses what makes no module
-        at = isocentre_performance(numbers.pinhole_distance, d, l, side, thickness)
+        at = isocentre_performance(numbers.pinhole_distance, d, l, side, thickness, intrinsic_fwhm=intrinsic_fwhm)
     except InputError as error:
         module.problem = str(error)
         module.sensitivity = module.resolution = module.magnification = module.roi_seen = 0.0

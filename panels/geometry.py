@@ -29,10 +29,11 @@ class MPHDRR_UL_modules(bpy.types.UIList):
         module = item.mphdrr_module
         row = layout.row(align=True)
         row.active = module.visible
-        row.alert = bool(module.problem or module.finding or not module.aimed)
-        _columns(row, item.name, f"{module.pinhole_distance:.1f}", f"{module.collimator_length:.1f}")
-        if row.alert:
-            row.label(text="", icon="ERROR")
+        columns = row.row(align=True)
+        columns.alert = bool(module.problem or module.finding or not module.aimed)
+        _columns(columns, item.name, f"{module.pinhole_distance:.1f}", f"{module.collimator_length:.1f}")
+        if columns.alert:
+            columns.label(text="", icon="ERROR")
         row.prop(module, "visible", text="", icon="HIDE_OFF" if module.visible else "HIDE_ON", emboss=False)
 
     def draw_filter(self, context: bpy.types.Context, layout: bpy.types.UILayout) -> None:

@@ -49,8 +49,9 @@ def assert_consistent(collection: bpy.types.Collection) -> None:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", InputWarning)
         system = scanner.read_scanner(collection)
-    origin = np.zeros((1, 3))
-    counts, fwhm = 1e6 * mph.sensitivity(system, origin)[0], mph.resolution(system, origin)[0]
+    origin, intrinsic = np.zeros((1, 3)), collection.mphdrr_scanner.intrinsic_fwhm
+    counts = 1e6 * mph.sensitivity(system, origin)[0]
+    fwhm = mph.resolution(system, origin, intrinsic_fwhm=intrinsic)[0]
     for m, camera in enumerate(scanner.modules(collection)):
         module, l = camera.mphdrr_module, system.collimator_length[m]
         assert module.pinhole_distance == pytest.approx(system.pinhole_distance[m], rel=1e-6)
@@ -139,7 +140,7 @@ def test_numbers_for_all_modules_at_once(collection):
     properties.collimator_length = 55.5
     assert properties.length_mode == "TYPED" and properties.mixed == ""
     assert scanner.read_scanner(collection).collimator_length.tolist() == [55.5] * 8
-    properties.wall_thickness = 3.25
+    properties.wall_thickness, properties.intrinsic_fwhm = 3.25, 1.75
     collimator = part(scanner.module(collection, 8), "COLLIMATOR")
     assert max(v.co.x for v in collimator.data.vertices) == pytest.approx(24.0 + 3.25)
     assert_consistent(collection)

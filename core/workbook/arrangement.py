@@ -106,7 +106,9 @@ class Arrangement:
     def _refuse_occupied(self, sheet: SheetXml) -> None:
         for row in self.added:
             for column in self.columns:
-                if not sheet.cell((row, column)).blank:
+                cell, model = sheet.cell((row, column)), (self.model, column)
+                # Formulas filled down beyond the modules are no obstacle.
+                if not cell.blank and (cell.formula is None or cell.formula != sheet.formula_at(model, (row, column))):
                     raise InputError(
                         f"{self.table.sheet.book.path.name}: {self.table.sheet.place(row, column)} is not blank, where "
                         f"an added module's row belongs, expected {len(self.added)} free rows below row {self.model}"

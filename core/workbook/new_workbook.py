@@ -6,6 +6,7 @@ import io
 
 from ..system import PinholeSystem
 from .checks import is_by_design
+from .workbook_xml import Place, WorkbookXml
 
 # Column -> symbol, description.
 _MAIN = {
@@ -45,13 +46,12 @@ _FORMULAS = {
     "W": "=(ATAN2(U{0},D{0}))",
 }
 _WIDTH = 13
+FIRST_ROW = 3
 
 
-def new_workbook(system: PinholeSystem) -> bytes:
-    """The file, its formulas without values; l is a number where it is not the design formula's."""
+def new_workbook(system: PinholeSystem) -> WorkbookXml:
+    """The workbook, its formulas without values; l is a number where it is not the design formula's."""
     import openpyxl
-
-    by_design = is_by_design(system)
 
     book = openpyxl.Workbook()
     main = book.active
@@ -59,27 +59,44 @@ def new_workbook(system: PinholeSystem) -> bytes:
     coordinates = book.create_sheet("Coordinates")
     for sheet, headings in ((main, _MAIN), (coordinates, _COORDINATES)):
         _head(sheet, headings)
-    for i, number in enumerate(system.numbers):
-        row = i + 3
-        main[f"A{row}"] = coordinates[f"A{row}"] = int(number)
-        for column, values in (
-            ("P", system.pinhole_diameter),
-            ("Q", system.roi_radius),
-            ("S", system.detector_side),
-            ("T", system.detector_thickness),
-        ):
-            main[f"{column}{row}"] = float(values[i])
-        for column, value in zip("BCD", system.centers[i], strict=True):
-            coordinates[f"{column}{row}"] = float(value)
-        for column, formula in _FORMULAS.items():
-            coordinates[f"{column}{row}"] = formula.format(row)
-        if not by_design[i]:
-            coordinates[f"G{row}"] = float(system.collimator_length[i])
-        for column in "BCDEFGHIJKUVW":
-            coordinates[f"{column}{row}"].number_format = "0.0000"
+    numbers = numbers_of(system)
+    for (title, row, column), number in numbers.items():
+        book[title].cell(row, column, number)
+    by_design = is_by_design(system)
+    for i, row in enumerate(range(FIRST_ROW, FIRST_ROW + len(system))):
+        for letter, formula in _FORMULAS.items():
+            if letter != "G" or by_design[i]:
+                coordinates[f"{letter}{row}"] = formula.format(row)
+        for letter in "BCDEFGHIJKUVW":
+            coordinates[f"{letter}{row}"].number_format = "0.0000"
     content = io.BytesIO()
     book.save(content)
-    return content.getvalue()
+    workbook = WorkbookXml(content.getvalue(), "the new workbook")
+    for (title, *at), number in numbers.items():  # with all their digits, of which openpyxl writes 16
+        if workbook.sheets[title].cells[at[0], at[1]].formula is None:
+            workbook.sheets[title].type((at[0], at[1]), number)
+    return workbook
+
+
+def numbers_of(system: PinholeSystem) -> dict[Place, float]:
+    """The numbers that the cells of the workbook hold, or their formulas give, of the modules and l."""
+    columns = {
+        ("Main", 1): system.numbers,
+        ("Main", 16): system.pinhole_diameter,
+        ("Main", 17): system.roi_radius,
+        ("Main", 19): system.detector_side,
+        ("Main", 20): system.detector_thickness,
+        ("Coordinates", 1): system.numbers,
+        ("Coordinates", 2): system.centers[:, 0],
+        ("Coordinates", 3): system.centers[:, 1],
+        ("Coordinates", 4): system.centers[:, 2],
+        ("Coordinates", 7): system.collimator_length,
+    }
+    return {
+        (title, row, column): float(number)
+        for (title, column), numbers in columns.items()
+        for row, number in enumerate(numbers, start=FIRST_ROW)
+    }
 
 
 def _head(sheet, headings: dict[str, tuple[str, str]]) -> None:  # type: ignore[no-untyped-def]

@@ -134,9 +134,11 @@ class Column:
         self.column = column
 
     def where(self, i: int) -> str:
+        """File, sheet and cell of module index `i`."""
         return where(self.table.sheet, self.rows[i], self.column)
 
     def place(self, i: int) -> str:
+        """Sheet and cell of module index `i`."""
         return self.table.sheet.place(self.rows[i], self.column)
 
     def numbers(self) -> NDArray[np.float64]:

@@ -120,10 +120,9 @@ class _Calculation:
         return self.workbook.value(place)
 
     def by_libreoffice(self) -> None:
+        values: dict[Place, Any] = {}
         for _ in range(2):  # once more where formulas had to be replaced, for those that depend on them
             values = self._libreoffice_values()
-            if values is None:
-                return
             wrong = {
                 place: f"it gives {_shown(value)}"
                 for place, value in values.items()
@@ -139,10 +138,10 @@ class _Calculation:
                 self._store(place, self.required.get(place, value), "LibreOffice")
                 del self.unknown[place]
 
-    def _libreoffice_values(self) -> dict[Place, Any] | None:
+    def _libreoffice_values(self) -> dict[Place, Any]:
         (content,) = libreoffice.recalculated([self.workbook.to_bytes()])
         if content is None:
-            return None
+            return {}
         theirs = WorkbookXml(content, f"{self.workbook.name}, recalculated by LibreOffice")
         values = {}
         for place in self.unknown:

@@ -44,10 +44,7 @@ def reference(text: str) -> Reference | None:
     if sheet is not None and sheet.startswith("'"):
         sheet = sheet[1:-1].replace("''", "'")
     left, top, right, bottom = (parts.get(side) for side in ("left", "top", "right", "bottom"))
-    if left is None:
-        columns = [1, MAX_COLUMN]
-    else:
-        columns = sorted([column(left.upper()), column((right or left).upper())])
+    columns = [1, MAX_COLUMN] if left is None else sorted([column(left.upper()), column((right or left).upper())])
     rows = [1, MAX_ROW] if top is None else sorted([int(top), int(bottom or top)])
     if rows[0] < 1 or rows[1] > MAX_ROW or columns[1] > MAX_COLUMN:
         return None

@@ -111,9 +111,9 @@ class SheetXml:
                 column = 0
                 self._rows.append((row, e))
             elif e.name == "c" and parent == "row":
-                at = reference(e.attributes["r"]) if "r" in e.attributes else None
+                named = reference(e.attributes["r"]) if "r" in e.attributes else None
                 # A cell's own name counts, whatever row it is in, as in spreadsheet programs.
-                place = (at.top, at.left) if at else (row, column + 1)
+                place = (named.top, named.left) if named else (row, column + 1)
                 column = place[1]
                 cells.append((place, e))
                 self._in_row.setdefault(row, []).append((column, e))
@@ -187,8 +187,11 @@ class SheetXml:
 
     def copy_row(self, cell: Cell, start: At, to: At) -> None:
         """Put `cell`, which stood at `start`, at `to`: relative references of its formula move along."""
-        formula = cell.formula and "=" + _translated(cell.formula[1:], start, to)
-        self.cells[to] = replace(cell, formula=formula)
+        self.cells[to] = replace(cell, formula=_moved(cell.formula, start, to))
+
+    def formula_at(self, start: At, to: At) -> str | None:
+        """The formula of the cell at `start` as it would read at `to`."""
+        return _moved(self.cell(start).formula, start, to)
 
     def refuse_array(self, at: At) -> None:
         """Raise `InputError` where a cell is one of several of an array formula: these change only together."""
@@ -408,6 +411,10 @@ def shared_strings(data: bytes, name: str) -> list[str]:
         elif e.name == "t" and strings and e.parent is not None and e.parent.name in ("si", "r"):
             strings[-1] += e.text
     return strings
+
+
+def _moved(formula: str | None, start: At, to: At) -> str | None:
+    return formula and "=" + _translated(formula[1:], start, to)
 
 
 def _translated(formula: str, start: At, to: At) -> str:

@@ -21,7 +21,7 @@ from .book import Book
 from .cells import module_number
 from .checks import derived, is_by_design
 from .headings import DIMENSIONS, POSITION, Table
-from .new_workbook import new_workbook
+from .new_workbook import new_workbook, numbers_of
 from .reader import Reading, read
 from .recalculate import Recalculated, agree, recalculate
 from .rows import dimension_rows
@@ -100,12 +100,10 @@ def write_system(
     if template is None:
         if suffix != ".xlsx":
             raise InputError(f"{target}: a workbook without a template has no macros, expected a name ending in .xlsx")
-        workbook = WorkbookXml(new_workbook(system), target.name)
-        formulas = [
-            (title, *at) for title, sheet in workbook.sheets.items() for at, c in sheet.cells.items() if c.formula
-        ]
-        lengths = {("Coordinates", i + 3, 7): float(length) for i, length in enumerate(system.collimator_length)}
-        required = {place: lengths[place] for place in formulas if place in lengths}
+        workbook = new_workbook(system)
+        cells = {(title, *at): cell for title, sheet in workbook.sheets.items() for at, cell in sheet.cells.items()}
+        formulas = [place for place, cell in cells.items() if cell.formula is not None]
+        required = {place: number for place, number in numbers_of(system).items() if cells[place].formula is not None}
         return _saved(workbook, system, target, formulas, required, [])
     book = Book(template)
     workbook = WorkbookXml(book.content, book.path.name)
@@ -418,11 +416,11 @@ def _warn_of_formulas(workbook: WorkbookXml, result: Recalculated) -> None:
             stacklevel=4,
         )
     if result.cleared:
-        first = sorted(result.cleared)[0]
+        places = list(result.cleared)  # causes before effects
         missing = "" if libreoffice.program() else "; LibreOffice, which may know it, is not installed"
         warnings.warn(
-            f"{workbook.name}: {_cell_and_more(workbook, sorted(result.cleared))}: the formula's new value could not be "
-            f"calculated ({result.cleared[first]}{missing}); opening the workbook in Excel or LibreOffice and saving "
+            f"{workbook.name}: {_cell_and_more(workbook, places)}: the formula's new value could not be "
+            f"calculated ({result.cleared[places[0]]}{missing}); opening the workbook in Excel or LibreOffice and saving "
             "it stores the value",
             InputWarning,
             stacklevel=4,

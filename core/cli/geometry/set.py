@@ -1,0 +1,120 @@
+"""``mphdrr geometry set FILE -o OUT.xlsx``."""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import json
+import sys
+import warnings
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ...design import collimator_length
+from ...errors import InputError, InputWarning
+from ...system import PinholeSystem
+from ...workbook import WrittenWorkbook, read_system, write_system
+from ...workbook.checks import is_by_design
+from ..options import add_command, chosen_modules, output_path
+from .arguments import add_workbook
+
+_DIMENSIONS = {
+    "diameter": ("pinhole_diameter", "d, pinhole diameter"),
+    "side": ("detector_side", "Ld, side of the crystal"),
+    "thickness": ("detector_thickness", "Td, thickness of the crystal"),
+    "roi": ("roi_radius", "R, radius of the ROI"),
+}
+
+
+def add_parser(actions) -> None:  # type: ignore[no-untyped-def]
+    """Add the action."""
+    parser = add_command(
+        actions,
+        "set",
+        "change a workbook's numbers and keep all the rest of it",
+        "mphdrr geometry set scanner.xlsx --modules 1-20 --diameter 2 -o thinner.xlsx",
+    )
+    add_workbook(parser)
+    parser.add_argument(
+        "-o", "--output", required=True, metavar="OUT", help="workbook to write; FILE itself is replaced"
+    )
+    parser.add_argument("--modules", metavar="RANGE", help="those to change, such as 1-40 or 1-20,41; default: all")
+    for name, (_, what) in _DIMENSIONS.items():
+        parser.add_argument(f"--{name}", type=float, metavar="MM", help=what)
+    parser.add_argument(
+        "--length",
+        metavar="MM",
+        help="l, collimator length, or 'design' for the design formula's; default: those that follow the formula go "
+        "on following it, the others stay",
+    )
+    parser.add_argument("--move", type=float, nargs=3, metavar=("X", "Y", "Z"), help="shift of the pinholes, mm")
+    parser.add_argument("--remove", metavar="RANGE", help="modules to take out")
+    parser.add_argument("--order", metavar="N,N,...", help="the modules' numbers in the order they are to have")
+    parser.set_defaults(run=_run)
+
+
+def _run(arguments: argparse.Namespace) -> None:
+    target = output_path(arguments.output, (".xlsx", ".xlsm"))
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always", InputWarning)
+        system = _changed(read_system(arguments.file), arguments)
+        written = write_system(system, target, template=arguments.file)
+    messages = [str(w.message) for w in caught if issubclass(w.category, InputWarning)]
+    if arguments.json:
+        answer = {**dataclasses.asdict(written), "path": str(written.path), "warnings": messages}
+        print(json.dumps(answer, indent=1))
+        return
+    for message in messages:
+        sys.stderr.write(f"mphdrr: warning: {message}\n")
+    print(_summary(written))
+
+
+def _summary(written: WrittenWorkbook) -> str:
+    by = list(written.recalculated.values())
+    counts = [f"{len(written.changed)} cells changed"]
+    counts += [f"{by.count(who)} recalculated by {who}" for who in dict.fromkeys(by)]
+    if written.cleared:
+        counts.append(f"{len(written.cleared)} without a value")
+    return f"{written.path}: {', '.join(counts)}"
+
+
+def _changed(system: PinholeSystem, arguments: argparse.Namespace) -> PinholeSystem:
+    chosen = np.isin(system.numbers, chosen_modules(system, arguments.modules).numbers)
+    values = {f.name: getattr(system, f.name) for f in dataclasses.fields(system)}
+    for option, (name, _) in _DIMENSIONS.items():
+        number = getattr(arguments, option)
+        if number is not None:
+            values[name] = np.where(chosen, number, values[name])
+    if arguments.move is not None:
+        values["centers"] = np.where(chosen[:, None], values["centers"] + arguments.move, values["centers"])
+    follows = is_by_design(system)
+    if arguments.length is not None:
+        follows = np.where(chosen, arguments.length == "design", follows)
+    if arguments.length not in (None, "design"):
+        values["collimator_length"] = np.where(chosen, _number(arguments.length), values["collimator_length"])
+    system = PinholeSystem(**values)
+    designed = collimator_length(
+        system.pinhole_distance, system.pinhole_diameter, system.detector_side, system.roi_radius
+    )
+    # Lengths that are the formula's to 1e-9 stay as they are, to the last digit.
+    lengths = np.where(follows & ~is_by_design(system), designed, system.collimator_length)
+    system = dataclasses.replace(system, collimator_length=lengths)
+    if arguments.remove is not None:
+        system = system[~np.isin(system.numbers, chosen_modules(system, arguments.remove).numbers)]
+    return system if arguments.order is None else system[_order(system, arguments.order)]
+
+
+def _number(text: str) -> float:
+    try:
+        return float(text)
+    except ValueError:
+        raise InputError(f"--length {text!r}: expected millimetres or 'design'") from None
+
+
+def _order(system: PinholeSystem, text: str) -> NDArray[np.int64]:
+    index = {str(number): i for i, number in enumerate(system.numbers)}
+    wanted = [part.strip() for part in text.split(",")]
+    if sorted(wanted) != sorted(index):
+        raise InputError(f"--order: expected each of the modules' {len(index)} numbers once, got {len(wanted)}")
+    return np.array([index[number] for number in wanted])

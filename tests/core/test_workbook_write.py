@@ -1,0 +1,480 @@
+"""The workbook writer: the system comes back, formulas stay and are right, and nothing else changes."""
+
+from __future__ import annotations
+
+import io
+import warnings
+
+import numpy as np
+import openpyxl
+import pytest
+
+import mphdrr.core as mph
+from mphdrr.core.workbook import libreoffice
+
+from .test_workbook import VARIATIONS, plain
+from .workbooks import (
+    DIMENSIONS,
+    Layout,
+    by_design,
+    changed,
+    content_of,
+    laid_out,
+    random_centers,
+    random_change,
+    random_system,
+    values_of,
+)
+
+try:
+    from hypothesis import HealthCheck, given, settings
+    from hypothesis import strategies as st
+except ImportError:  # the property tests skip
+    st = None
+
+QUIET = pytest.mark.filterwarnings("ignore::mphdrr.core.errors.InputWarning")
+OFFICE = libreoffice.program()
+pytestmark = pytest.mark.usefixtures("without_libreoffice")
+
+
+@pytest.fixture
+def without_libreoffice(monkeypatch):
+    """It takes seconds."""
+    monkeypatch.setattr(libreoffice, "program", lambda: None)
+
+
+def assert_same(back: mph.PinholeSystem, system: mph.PinholeSystem, numbered: bool = True) -> None:
+    assert len(back) == len(system)
+    if numbered:
+        np.testing.assert_array_equal(back.numbers, system.numbers)
+    for name in ("centers", "collimator_length", *DIMENSIONS.values()):
+        np.testing.assert_allclose(getattr(back, name), getattr(system, name), rtol=1e-9, atol=0, err_msg=name)
+
+
+def read_quietly(path) -> mph.PinholeSystem:
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        return mph.read_system(path)
+
+
+def write_changed(folder, layout: Layout, seed: int):
+    """A template of the layout, a change of its system, and what is written of that."""
+    template = folder / "template.xlsx"
+    template.write_bytes(content_of(laid_out(layout)))
+    system = random_change(np.random.default_rng(seed), read_quietly(template), layout)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        written = mph.write_system(system, folder / "written.xlsx", template)
+    return system, written
+
+
+def notes_of(path, system: mph.PinholeSystem) -> dict[int, object]:
+    """The note in each module's row."""
+    values = values_of(path)
+    row_of = {value: cell for (_, cell), value in values.items() if str(value).startswith("note of")}
+    notes = {"".join(filter(str.isdigit, cell)): note for note, cell in row_of.items()}
+    back = read_quietly(path)
+    rows = [str(row) for row in next(c for c in back.source.cells if c.quantity == "x1").rows]
+    return {int(number): notes.get(row) for number, row in zip(back.numbers, rows, strict=True)}
+
+
+# Laws
+
+
+if st is None:
+
+    def test_any_change_of_any_layout_comes_back():
+        pytest.skip("hypothesis is not installed")
+
+else:
+    layouts = st.builds(
+        Layout,
+        n=st.integers(1, 6),
+        numbered=st.booleans(),
+        one_sheet=st.booleans(),
+        shared=st.booleans(),
+        length=st.sampled_from(["formula", "typed", "blank", "absent"]),
+        derived=st.sampled_from(["formula", "typed", "absent"]),
+        inputs=st.booleans(),
+        top=st.integers(0, 4),
+        left=st.integers(0, 2),
+        seed=st.integers(0, 1000),
+    )
+
+    @settings(max_examples=40, deadline=None, suppress_health_check=list(HealthCheck))
+    @given(layouts, st.integers(0, 10**6))
+    def test_any_change_of_any_layout_comes_back(tmp_path_factory, layout, seed):
+        folder = tmp_path_factory.mktemp("w")
+        system, written = write_changed(folder, layout, seed)
+        assert_same(read_quietly(written.path), system, layout.numbered)
+        again = mph.write_system(read_quietly(written.path), folder / "again.xlsx", written.path)
+        assert again.path.read_bytes() == written.path.read_bytes()
+        assert (again.changed, again.recalculated) == ((), {})
+        with warnings.catch_warnings(record=True) as caught:
+            warnings.simplefilter("always")
+            mph.read_system(written.path)
+        assert not [w for w in caught if "the formula's is used" in str(w.message)]
+        template = read_quietly(folder / "template.xlsx")
+        before = notes_of(folder / "template.xlsx", template)
+        for number, note in notes_of(written.path, system).items():
+            assert not layout.numbered or note == before.get(number) or number >= 1000, number
+
+    @settings(max_examples=15, deadline=None, suppress_health_check=list(HealthCheck))
+    @given(st.integers(1, 60), st.integers(0, 10**6), st.booleans())
+    def test_workbooks_without_template_come_back(tmp_path_factory, n, seed, scaled):
+        rng = np.random.default_rng(seed)
+        system = random_system(rng, n, shared=False)
+        if scaled:
+            factors = np.where(rng.random(n) < 0.5, 1.05, 1)
+            system = changed(system, collimator_length=system.collimator_length * factors)
+        path = tmp_path_factory.mktemp("w") / "new.xlsx"
+        mph.write_system(system, path)
+        back = mph.read_system(path) if not scaled else read_quietly(path)
+        assert_same(back, system)
+        np.testing.assert_array_equal(back.collimator_length, system.collimator_length)
+
+
+@pytest.mark.skipif(OFFICE is None, reason="LibreOffice is not installed")
+def test_libreoffice_finds_the_values_that_are_stored(tmp_path, monkeypatch):
+    """Every cell of every sheet, after LibreOffice has recalculated the written files."""
+    monkeypatch.setattr(libreoffice, "program", lambda: OFFICE)
+    rng = np.random.default_rng(4)
+    choices = [
+        Layout(
+            n=int(rng.integers(2, 6)),
+            numbered=bool(rng.random() < 0.7),
+            one_sheet=bool(rng.random() < 0.4),
+            shared=bool(rng.random() < 0.3),
+            length=str(rng.choice(["formula", "formula", "typed", "blank"])),
+            derived=str(rng.choice(["formula", "formula", "typed"])),
+            inputs=bool(rng.random() < 0.5),
+            top=int(rng.integers(0, 3)),
+            seed=seed,
+        )
+        for seed in range(16)
+    ]
+    templates = [content_of(laid_out(layout)) for layout in choices]
+    saved = libreoffice.recalculated(templates[8:])
+    assert None not in saved
+    templates[8:] = saved  # half of them as a spreadsheet program saves them
+    systems, written = [], []
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        for i, (content, layout) in enumerate(zip(templates, choices, strict=True)):
+            template = tmp_path / f"t{i}.xlsx"
+            template.write_bytes(content)
+            system = random_change(rng, mph.read_system(template), layout)
+            if i % 4:  # LibreOffice takes seconds
+                with pytest.MonkeyPatch.context() as patch:
+                    patch.setattr(libreoffice, "program", lambda: None)
+                    written.append(mph.write_system(system, tmp_path / f"w{i}.xlsx", template))
+            else:
+                written.append(mph.write_system(system, tmp_path / f"w{i}.xlsx", template))
+                assert not written[-1].changed or "LibreOffice" in written[-1].recalculated.values()
+                assert written[-1].cleared == ()
+            systems.append(system)
+    recalculated = libreoffice.recalculated([w.path.read_bytes() for w in written])
+    compared = 0
+    for one, system, content, layout in zip(written, systems, recalculated, choices, strict=True):
+        theirs, formulas = values_of(content), values_of(one.path, data_only=False)
+        ours = values_of(one.path)
+        (tmp_path / "theirs.xlsx").write_bytes(content)
+        assert_same(read_quietly(tmp_path / "theirs.xlsx"), system, layout.numbered)
+        for place, formula in formulas.items():
+            if place not in ours:  # those without a value: never there, or cleared
+                assert str(formula).startswith("="), place
+                assert f"{place[0]}!{place[1]}" not in one.recalculated
+                continue
+            value, wanted = ours[place], theirs.get(place)
+            if isinstance(value, (int, float)):
+                assert value == pytest.approx(wanted, rel=1e-9, abs=1e-11), (one.path.name, place, formula)
+            else:
+                assert value == wanted, (one.path.name, place, formula)
+            compared += str(formula).startswith("=")
+    assert compared > 400
+
+
+# The real workbook
+
+
+def test_real_workbook_unchanged_is_the_same_file(workbook, tmp_path):
+    written = mph.write_system(mph.read_system(workbook), tmp_path / "copy.xlsx", workbook)
+    assert written.path.read_bytes() == workbook.read_bytes()
+    assert (written.changed, written.recalculated, written.cleared) == ((), {}, ())
+
+
+def test_a_moved_pinhole_changes_its_row_alone(workbook, tmp_path):
+    system = mph.read_system(workbook)
+    centers = system.centers.copy()
+    centers[3] += [1.0, -2.0, 1 / 3]
+    moved = by_design(changed(system, centers=centers))
+    written = mph.write_system(moved, tmp_path / "moved.xlsx", workbook)
+    assert written.changed == ("Coordinates!B6", "Coordinates!C6", "Coordinates!D6")
+    assert set(written.recalculated) == {f"Coordinates!{c}6" for c in "EFGHIJKUVW"}
+    assert set(written.recalculated.values()) == {"formulas"}
+    np.testing.assert_array_equal(mph.read_system(written.path).centers, centers)
+    before, after = (values_of(p, data_only=False) for p in (workbook, written.path))
+    assert {p for p in before if before[p] != after[p]} == {("Coordinates", f"{c}6") for c in "BCD"}
+    values = values_of(written.path)
+    assert values["Coordinates", "H6"] == pytest.approx(
+        moved.pinhole_distance[3] + moved.collimator_length[3] + 10, rel=1e-12
+    )
+
+
+def test_new_workbook_is_laid_out_as_the_real_one(workbook, tmp_path):
+    mph.write_system(mph.read_system(workbook), tmp_path / "new.xlsx")
+    for data_only in (False, True):
+        real, new = (values_of(path, data_only) for path in (workbook, tmp_path / "new.xlsx"))
+        assert real.keys() == new.keys()
+        for place, value in real.items():
+            same = value if isinstance(value, str) else pytest.approx(value, rel=1e-12)
+            assert new[place] == same, place
+
+
+# Rows
+
+
+@pytest.fixture
+def template(tmp_path):
+    """Four modules with formulas everywhere; its values as LibreOffice would have stored them do not matter."""
+    path = tmp_path / "template.xlsx"
+    path.write_bytes(content_of(laid_out(Layout(seed=3))))
+    return path
+
+
+@QUIET
+def test_removed_modules_leave_their_rows_empty(template, tmp_path):
+    system = mph.read_system(template)
+    mph.write_system(system[[0, 2, 3]], tmp_path / "o.xlsx", template)
+    book = openpyxl.load_workbook(tmp_path / "o.xlsx")
+    for sheet in ("Coordinates", "Main"):
+        assert [cell.value for cell in book[sheet][4]] == [None] * book[sheet].max_column
+    assert values_of(tmp_path / "o.xlsx")["Coordinates", "K3"] == "note of 0"
+    assert values_of(tmp_path / "o.xlsx")["Coordinates", "K5"] == "note of 2"
+    assert_same(mph.read_system(tmp_path / "o.xlsx"), system[[0, 2, 3]])
+
+
+def test_added_modules_get_the_formulas_and_none_of_the_notes(template, tmp_path):
+    system = mph.read_system(template)
+    more = more_of(system, 2)
+    with pytest.warns(mph.InputWarning) as caught:
+        mph.write_system(more, tmp_path / "o.xlsx", template)
+    (message,) = [str(w.message) for w in caught if "left out" in str(w.message)]
+    assert message.startswith(
+        "template.xlsx: Theta!A1, Theta!A5, Theta!A7 and 2 more end at row 6 of sheet Coordinates"
+    )
+    cells = values_of(tmp_path / "o.xlsx", data_only=False)
+    assert cells["Coordinates", "E8"] == "=SQRT(SUMSQ(B8,C8,D8))"
+    assert cells["Coordinates", "A8"] == cells["Main", "A8"] == more.numbers[-1]
+    assert ("Coordinates", "K8") not in cells
+    assert_same(mph.read_system(tmp_path / "o.xlsx"), more)
+
+
+@QUIET
+def test_reordered_modules_take_their_rows_along(template, tmp_path):
+    system = mph.read_system(template)[[2, 0, 3, 1]]
+    mph.write_system(system, tmp_path / "o.xlsx", template)
+    values = values_of(tmp_path / "o.xlsx", data_only=False)
+    assert [values["Coordinates", f"K{row}"] for row in range(3, 7)] == [f"note of {i}" for i in (2, 0, 3, 1)]
+    assert values["Coordinates", "E3"] == "=SQRT(SUMSQ(B3,C3,D3))"
+    assert_same(mph.read_system(tmp_path / "o.xlsx"), system)
+
+
+@QUIET
+def test_renumbered_modules_keep_their_rows(template, tmp_path):
+    system = mph.read_system(template)
+    system = changed(system, numbers=system.numbers + 1000)
+    written = mph.write_system(system, tmp_path / "o.xlsx", template)
+    assert written.changed == tuple(f"{sheet}!A{row}" for sheet in ("Main", "Coordinates") for row in range(3, 7))
+    assert_same(mph.read_system(tmp_path / "o.xlsx"), system)
+
+
+def test_a_cell_in_the_way_of_added_modules_is_named(template, tmp_path):
+    book = openpyxl.load_workbook(template)
+    book["Coordinates"]["A8"] = "note: all in mm"
+    book.save(template)
+    system = mph.read_system(template)
+    more = more_of(system, 3)
+    with pytest.raises(mph.InputError, match=r"^template.xlsx: Coordinates!A8 is not blank"):
+        mph.write_system(more, tmp_path / "o.xlsx", template)
+    assert not (tmp_path / "o.xlsx").exists()
+
+
+def more_of(system, n):
+    rng = np.random.default_rng(1)
+    arrays = {
+        name: np.append(getattr(system, name), np.resize(getattr(system, name), n)) for name in DIMENSIONS.values()
+    }
+    centers = np.concatenate([system.centers, random_centers(rng, n)])
+    numbers = np.append(system.numbers, system.numbers.max() + 1 + np.arange(n))
+    return by_design(mph.PinholeSystem(centers, collimator_length=1.0, numbers=numbers, **arrays))
+
+
+# Formulas
+
+
+@pytest.mark.parametrize("formula", ["=270+7", "=Main!$H$9*1"])
+def test_a_formula_that_does_not_give_the_number_is_replaced_with_a_warning(template, tmp_path, formula):
+    book = openpyxl.load_workbook(template)
+    book["Main"]["H9"] = 277
+    book["Coordinates"]["B3"] = formula
+    book.save(template)
+    system = read_quietly(template)
+    centers = system.centers.copy()
+    centers[0, 0] = 280.5
+    with pytest.warns(mph.InputWarning, match=r"template.xlsx: Coordinates!B3: the formula was replaced .*gives 277"):
+        mph.write_system(by_design(changed(system, centers=centers)), tmp_path / "o.xlsx", template)
+    assert values_of(tmp_path / "o.xlsx", data_only=False)["Coordinates", "B3"] == 280.5
+
+
+@QUIET
+def test_a_formula_that_gives_the_new_number_stays(template, tmp_path):
+    book = openpyxl.load_workbook(template)
+    book["Coordinates"]["B4"] = "=-B3"
+    book.save(template)
+    system = read_quietly(template)
+    centers = system.centers.copy()
+    centers[:2, 0] = 280.5, -280.5
+    written = mph.write_system(by_design(changed(system, centers=centers)), tmp_path / "o.xlsx", template)
+    cells = values_of(tmp_path / "o.xlsx", data_only=False)
+    assert (cells["Coordinates", "B3"], cells["Coordinates", "B4"]) == (280.5, "=-B3")
+    assert values_of(tmp_path / "o.xlsx")["Coordinates", "B4"] == -280.5
+    assert "Coordinates!B4" in written.recalculated
+
+
+def test_what_nobody_can_calculate_stores_no_value(template, tmp_path):
+    book = openpyxl.load_workbook(template)
+    del book["Theta"], book["It's values"]
+    other = book.create_sheet("Other")
+    other["A1"], other["A2"], other["A3"] = "=FOO(Coordinates!B3)", "=A1+1", "=FOO(1)"
+    book.save(template)
+    system = read_quietly(template)
+    with pytest.warns(mph.InputWarning, match=r"Other!A1 and 1 more: the formula's new value could not be calculated"):
+        written = mph.write_system(
+            by_design(changed(system, centers=system.centers * 1.1)), tmp_path / "o.xlsx", template
+        )
+    assert written.cleared == ("Other!A1", "Other!A2")
+
+
+def test_one_cell_for_all_modules_is_changed_or_spread(tmp_path):
+    template = tmp_path / "template.xlsx"
+    template.write_bytes(content_of(laid_out(Layout(shared=True, length="absent", derived="absent"))))
+    system = read_quietly(template)
+    written = mph.write_system(by_design(changed(system, pinhole_diameter=3.3)), tmp_path / "o.xlsx", template)
+    assert written.changed == ("Main!B3",)
+    different = by_design(changed(system, pinhole_diameter=[1.0, 2.0, 3.0, 4.0]))
+    mph.write_system(different, tmp_path / "o.xlsx", template)
+    values = values_of(tmp_path / "o.xlsx")
+    assert [values.get(("Main", f"B{row}")) for row in range(3, 7)] == [1, 2, 3, 4]
+    assert [values.get(("Main", f"C{row}")) for row in range(4, 7)] == [None] * 3
+    assert_same(mph.read_system(tmp_path / "o.xlsx"), different)
+
+
+def test_without_a_column_of_lengths_only_designed_ones_are_held(tmp_path):
+    template = tmp_path / "template.xlsx"
+    template.write_bytes(content_of(laid_out(Layout(length="absent"))))
+    system = read_quietly(template)
+    with pytest.raises(mph.InputError, match="no column headed l for the collimator length of module"):
+        mph.write_system(changed(system, collimator_length=99.0), tmp_path / "o.xlsx", template)
+
+
+def test_numbers_that_the_sheet_cannot_say_are_warned_of(tmp_path):
+    template = tmp_path / "template.xlsx"
+    template.write_bytes(content_of(laid_out(Layout(numbered=False, length="absent", derived="absent"))))
+    system = read_quietly(template)
+    with pytest.warns(mph.InputWarning, match="has no column of the modules' numbers"):
+        mph.write_system(changed(system, numbers=[5, 6, 7, 8]), tmp_path / "o.xlsx", template)
+    assert (tmp_path / "o.xlsx").read_bytes() == template.read_bytes()
+
+
+def test_a_workbook_may_replace_itself(template):
+    system = read_quietly(template)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        mph.write_system(by_design(changed(system, centers=system.centers * 1.01)), template, template)
+    np.testing.assert_array_equal(read_quietly(template).centers, system.centers * 1.01)
+    assert [p.name for p in template.parent.iterdir()] == ["template.xlsx"]
+
+
+@pytest.mark.parametrize("edit", VARIATIONS, ids=lambda edit: edit.__name__.strip("_"))
+@QUIET
+def test_every_layout_that_is_read_can_be_written(edit, tmp_path, rng):
+    book = plain()
+    edit(*book.worksheets[:2])
+    template = tmp_path / "t.xlsx"
+    book.save(template)
+    system = read_quietly(template)
+    other = by_design(changed(system, centers=random_centers(rng, 4), pinhole_diameter=rng.uniform(1, 3, 4)))
+    for wanted in (other, other[[3, 0, 1]], more_of(other, 2)):
+        if edit.__name__ == "_blank_rows_and_notes" and len(wanted) > 4:
+            with pytest.raises(mph.InputError, match="Coordinates!A11 is not blank"):  # a note
+                mph.write_system(wanted, tmp_path / "o.xlsx", template)
+            continue
+        mph.write_system(wanted, tmp_path / "o.xlsx", template)
+        assert_same(read_quietly(tmp_path / "o.xlsx"), wanted)
+
+
+def test_formulas_filled_down_are_taken_for_added_modules(template, tmp_path):
+    book = openpyxl.load_workbook(template)
+    for row in range(7, 30):
+        book["Coordinates"][f"E{row}"] = f"=SQRT(SUMSQ(B{row},C{row},D{row}))"
+    book.save(template)
+    more = more_of(read_quietly(template), 2)
+    with pytest.warns(mph.InputWarning):
+        mph.write_system(more, tmp_path / "o.xlsx", template)
+    assert_same(mph.read_system(tmp_path / "o.xlsx"), more)
+    book["Coordinates"]["E7"] = "=AVERAGE(E3:E6)"
+    book.save(template)
+    with pytest.raises(mph.InputError, match="Coordinates!E7 is not blank"):
+        mph.write_system(more, tmp_path / "o.xlsx", template)
+
+
+@pytest.mark.skipif(OFFICE is None, reason="LibreOffice is not installed")
+def test_libreoffice_tells_whether_a_formula_gives_the_number(template, tmp_path, monkeypatch):
+    monkeypatch.setattr(libreoffice, "program", lambda: OFFICE)
+    book = openpyxl.load_workbook(template)
+    book["Coordinates"]["B3"] = 160
+    for row in (4, 5):
+        book["Coordinates"][f"B{row}"] = f'=-SUMIF(B3:B3,"<>0")*{row - 3}'
+    template.write_bytes(libreoffice.recalculated([content_of(book)])[0])
+    system = read_quietly(template)
+    centers = system.centers.copy()
+    centers[:3, 0] = 150.5, -150.5, -300
+    with pytest.warns(mph.InputWarning, match=r"Coordinates!B5: the formula was replaced .*gives -301"):
+        written = mph.write_system(by_design(changed(system, centers=centers)), tmp_path / "o.xlsx", template)
+    assert written.recalculated["Coordinates!B4"] == "LibreOffice"
+    cells = values_of(tmp_path / "o.xlsx", data_only=False)
+    assert str(cells["Coordinates", "B4"]).startswith("=-SUMIF")
+    assert cells["Coordinates", "B5"] == -300
+    np.testing.assert_allclose(read_quietly(tmp_path / "o.xlsx").centers, centers, rtol=1e-12)
+
+
+# Refusals
+
+
+@pytest.mark.parametrize(
+    ("path", "message"),
+    [
+        ("o.xls", "expected a name ending in .xlsx or .xlsm"),
+        ("o.xlsm", "is a workbook without macros, expected a name ending in .xlsx"),
+        ("none/o.xlsx", "no such folder"),
+        (".", "expected a name ending in"),
+    ],
+)
+def test_impossible_places_are_refused(template, path, message):
+    with pytest.raises(mph.InputError, match=message):
+        mph.write_system(read_quietly(template), template.parent / path, template)
+    with pytest.raises(mph.InputError):
+        mph.write_system(read_quietly(template), template.parent / path)
+
+
+def test_bad_templates_are_refused_as_by_the_reader(template, tmp_path):
+    system = read_quietly(template)
+    book = openpyxl.load_workbook(template)
+    book["Coordinates"]["B4"] = "abc"
+    bad = io.BytesIO()
+    book.save(bad)
+    for content, message in ((bad.getvalue(), "B4 holds the text 'abc'"), (b"x", "not an .xlsx workbook")):
+        (tmp_path / "bad.xlsx").write_bytes(content)
+        with pytest.raises(mph.InputError, match=message):
+            mph.write_system(system, tmp_path / "o.xlsx", tmp_path / "bad.xlsx")

@@ -1,0 +1,404 @@
+"""The written file: all that is not changed is byte for byte the template's, whatever its XML looks like."""
+
+from __future__ import annotations
+
+import io
+import os
+import re
+import signal
+import subprocess
+import sys
+import time
+import warnings
+import zipfile
+from pathlib import Path
+
+import numpy as np
+import openpyxl
+import pytest
+from openpyxl.chart import LineChart, Reference
+from openpyxl.comments import Comment
+from openpyxl.drawing.image import Image
+from openpyxl.formatting.rule import ColorScaleRule
+from openpyxl.worksheet.datavalidation import DataValidation
+
+import mphdrr
+import mphdrr.core as mph
+from mphdrr.core.workbook import libreoffice
+
+from .workbooks import Layout, by_design, changed, content_of, laid_out, values_of
+
+SPREADSHEET = "http://schemas.openxmlformats.org/spreadsheetml/2006/main"
+
+
+@pytest.fixture(autouse=True)
+def without_libreoffice(monkeypatch):
+    """It takes seconds; what it calculates is tested in test_workbook_write.py."""
+    monkeypatch.setattr(libreoffice, "program", lambda: None)
+
+
+def members_of(path: Path) -> dict[str, bytes]:
+    with zipfile.ZipFile(path) as archive:
+        return {info.filename: archive.read(info) for info in archive.infolist()}
+
+
+def infos_of(path: Path) -> list[tuple]:
+    with zipfile.ZipFile(path) as archive:
+        return [
+            (i.filename, i.date_time, i.compress_type, i.comment, i.extra, i.external_attr, i.create_system)
+            for i in archive.infolist()
+        ]
+
+
+def repacked(content: bytes, edit) -> bytes:
+    """A workbook with its members' bytes as `edit(name, data)` gives them; None leaves one out."""
+    out = io.BytesIO()
+    with zipfile.ZipFile(io.BytesIO(content)) as old, zipfile.ZipFile(out, "w") as new:
+        for info in old.infolist():
+            data = edit(info.filename, old.read(info))
+            if data is not None:
+                new.writestr(info, data)
+    return out.getvalue()
+
+
+def read_quietly(path) -> mph.PinholeSystem:
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        return mph.read_system(path)
+
+
+def write_quietly(system, path, template) -> mph.WrittenWorkbook:
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        return mph.write_system(system, path, template)
+
+
+def moved(system: mph.PinholeSystem) -> mph.PinholeSystem:
+    centers = system.centers.copy()
+    centers[1] *= 1.03
+    return by_design(changed(system, centers=centers))
+
+
+@pytest.fixture
+def rich(tmp_path) -> Path:
+    """A workbook with all that openpyxl loses or rewrites, and macros."""
+    book = laid_out(Layout(seed=5))
+    table = book["Coordinates"]
+    chart = LineChart()
+    chart.add_data(Reference(table, min_col=2, min_row=2, max_row=6), titles_from_data=True)
+    table.add_chart(chart, "P2")
+    from PIL import Image as Picture
+
+    picture = tmp_path / "p.png"
+    Picture.new("RGB", (8, 8), (200, 30, 30)).save(picture)
+    table.add_image(Image(picture), "P30")
+    table["B3"].comment = Comment("measured twice", "N. N.")
+    table.conditional_formatting.add("B3:B6", ColorScaleRule("min", None, "FF0000", "max", None, "00FF00"))
+    validation = DataValidation(type="decimal", operator="between", formula1="-400", formula2="400")
+    table.add_data_validation(validation)
+    validation.add("B3:D6")
+    table.column_dimensions["C"].hidden = True
+    table.merge_cells("P40:R41")
+    table.freeze_panes = "B3"
+    content = content_of(book)
+    picture.unlink()
+
+    def with_macros(name: str, data: bytes) -> bytes:
+        if name == "[Content_Types].xml":
+            data = data.replace(
+                b"openxmlformats-officedocument.spreadsheetml.sheet.main", b"ms-excel.sheet.macroEnabled.main"
+            )
+            extra = b'<Default Extension="bin" ContentType="application/vnd.ms-office.vbaProject"/></Types>'
+            return data.replace(b"</Types>", extra)
+        if name == "xl/workbook.xml":
+            return data.replace(b' fullCalcOnLoad="1"', b"")
+        if name == "xl/_rels/workbook.xml.rels":
+            kind = "http://schemas.microsoft.com/office/2006/relationships/vbaProject"
+            extra = f'<Relationship Id="rIdV" Type="{kind}" Target="vbaProject.bin"/></Relationships>'
+            return data.replace(b"</Relationships>", extra.encode())
+        return data
+
+    out = io.BytesIO(repacked(content, with_macros))
+    with zipfile.ZipFile(out, "a") as archive:
+        info = zipfile.ZipInfo("xl/vbaProject.bin", (1999, 12, 31, 23, 59, 58))
+        info.external_attr, info.comment, info.create_system = 0, b"macros", 0
+        archive.writestr(info, bytes(range(256)) * 9)
+        archive.writestr("customXml/item1.xml", "<mine>ünï</mine>", zipfile.ZIP_DEFLATED)
+        archive.comment = b"of the archive"
+    path = tmp_path / "rich.xlsm"
+    path.write_bytes(out.getvalue())
+    return path
+
+
+def test_every_other_member_is_the_same(rich, tmp_path):
+    written = write_quietly(moved(read_quietly(rich)), tmp_path / "o.xlsm", rich)
+    before, after = members_of(rich), members_of(written.path)
+    assert list(before) == list(after)
+    assert infos_of(rich) == infos_of(written.path)
+    differing = {name for name in before if before[name] != after[name]}
+    sheets = {f"xl/worksheets/sheet{i}.xml" for i in (2, 3, 4)}
+    assert differing == {"xl/workbook.xml", *sheets}
+    assert b'fullCalcOnLoad="1"' in after["xl/workbook.xml"]
+    with zipfile.ZipFile(written.path) as archive:
+        assert archive.comment == b"of the archive"
+    for kind in ("charts/chart1.xml", "media/image1.png", "vbaProject.bin", "drawings/drawing1.xml"):
+        assert f"xl/{kind}" in after
+
+
+def test_of_a_changed_sheet_only_the_changed_cells_differ(rich, tmp_path):
+    written = write_quietly(moved(read_quietly(rich)), tmp_path / "o.xlsm", rich)
+    cells = re.compile(rb'<c r="([A-Z]+\d+)"[^>]*?(?:/>|>.*?</c>)')
+    touched = {*written.changed, *written.recalculated, *written.cleared}
+    for number, sheet in enumerate(("Coordinates", "Theta", "It's values"), start=2):
+        before, after = (members_of(p)[f"xl/worksheets/sheet{number}.xml"] for p in (rich, written.path))
+        assert cells.sub(b"", before) == cells.sub(b"", after)
+        old, new = ({m[1]: m[0] for m in cells.finditer(xml)} for xml in (before, after))
+        assert old.keys() == new.keys()
+        assert {f"{sheet}!{name.decode()}" for name in old if old[name] != new[name]} <= touched
+
+
+def test_nothing_changed_is_the_same_file(rich, tmp_path):
+    written = write_quietly(read_quietly(rich), tmp_path / "o.xlsm", rich)
+    assert written.path.read_bytes() == rich.read_bytes()
+
+
+def test_macros_need_their_suffix(rich, tmp_path):
+    with pytest.raises(mph.InputError, match=r"has macros, expected a name ending in \.xlsm"):
+        mph.write_system(read_quietly(rich), tmp_path / "o.xlsx", rich)
+
+
+# Odd XML
+
+
+def _prefixed(xml: str) -> str:
+    xml = re.sub(r"<(/?)(?=[a-zA-Z])", r"<\1x:", xml)
+    return xml.replace(f'xmlns="{SPREADSHEET}"', f'xmlns:x="{SPREADSHEET}"')
+
+
+def _without_places(xml: str) -> str:
+    """No r where a cell or row follows the one before."""
+    xml = re.sub(r'<c r="A(\d+)"', r"<c", xml)
+    return re.sub(r'<row r="([23456])"', "<row", xml) if '<row r="1"' in xml else xml
+
+
+ODD = {
+    "prefix": _prefixed,
+    "no places": _without_places,
+    "CRLF": lambda xml: xml.replace("><", ">\r\n<"),
+    "comments": lambda xml: xml.replace("<sheetData>", "<!-- <c r='A1'> > --><sheetData ><?pi <row> ?>"),
+    "single quotes": lambda xml: re.sub("<[^>]*>", lambda tag: tag[0].replace('"', "'"), xml),
+    "empty cells": lambda xml: re.sub(r"(<c [^>]*)/>", r"\1></c>", xml),
+    "rows' attributes": lambda xml: xml.replace("<row ", '<row spans="1:3" ht="15" customHeight="1" '),
+    "inline numbers": lambda xml: xml.replace("<v>", "<v> ").replace("</v>", "\n</v>"),
+    "no size": lambda xml: re.sub("<dimension[^>]*/>", "", xml),
+    "wrong size": lambda xml: re.sub('ref="[^"]*"', 'ref="A1"', xml, count=1),
+}
+ENCODINGS = {
+    "BOM": lambda xml: b"\xef\xbb\xbf" + xml.encode(),
+    "UTF-16": lambda xml: xml.encode("utf-16"),
+    "UTF-16 BE": lambda xml: b"\xfe\xff" + xml.encode("utf-16-be"),
+    "Latin-1": lambda xml: ('<?xml version="1.0" encoding="ISO-8859-1"?>' + xml).encode("latin-1"),
+}
+
+
+def _edit(system: mph.PinholeSystem) -> mph.PinholeSystem:
+    """Moved, one removed, one added."""
+    part = moved(system)[[0, 1, 3]]
+    arrays = {
+        name: np.append(getattr(part, name), getattr(part, name)[0])
+        for name in ("pinhole_diameter", "detector_side", "detector_thickness", "roi_radius")
+    }
+    centers = np.concatenate([part.centers, [[7.0, 210.0, 33.125]]])
+    return by_design(mph.PinholeSystem(centers, numbers=np.append(part.numbers, 999), collimator_length=1.0, **arrays))
+
+
+@pytest.mark.parametrize("odd", [*ODD, *ENCODINGS])
+def test_odd_xml_is_patched_in_place(odd, tmp_path):
+    def edit(name: str, data: bytes) -> bytes:
+        if not name.startswith("xl/worksheets/sheet"):
+            return data
+        xml = data.decode()
+        if odd in ENCODINGS:
+            return ENCODINGS[odd](xml)
+        return ODD[odd](xml).encode()
+
+    template = tmp_path / "t.xlsx"
+    template.write_bytes(repacked(content_of(laid_out(Layout(seed=11))), edit))
+    plain = tmp_path / "plain.xlsx"
+    plain.write_bytes(content_of(laid_out(Layout(seed=11))))
+    system = _edit(read_quietly(plain))
+    written = write_quietly(system, tmp_path / "o.xlsx", template)
+    expected = write_quietly(system, tmp_path / "e.xlsx", plain)
+    for data_only in (True, False):
+        assert values_of(written.path, data_only) == values_of(expected.path, data_only)
+    assert written.changed == expected.changed
+
+
+def test_texts_that_were_numbers_in_formulas_and_cells_of_any_type_become_numbers(tmp_path):
+    content = content_of(laid_out(Layout(seed=2, derived="absent", length="absent")))
+
+    def edit(name: str, data: bytes) -> bytes:
+        if name != "xl/worksheets/sheet2.xml":
+            return data
+        data = re.sub(rb'<c r="A3"[^>]*><v>(\d+)</v></c>', rb'<c r="A3" t="inlineStr"><is><t>\1</t></is></c>', data)
+        data = re.sub(rb'<c r="A4"[^>]*><v>(\d+)</v></c>', rb'<c r="A4" t="str"><f>"\1"</f><v>\1</v></c>', data)
+        return re.sub(rb'<c r="B3"[^>]*><v>([^<]*)</v></c>', rb'<c r="B3" t="n"><f>\1+0</f><v>\1</v></c>', data)
+
+    template = tmp_path / "t.xlsx"
+    template.write_bytes(repacked(content, edit))
+    system = read_quietly(template)
+    copy = write_quietly(system, tmp_path / "o.xlsx", template)
+    assert copy.path.read_bytes() == template.read_bytes()
+    other = changed(moved(system), numbers=system.numbers + 1)
+    write_quietly(other, tmp_path / "o.xlsx", template)
+    assert values_of(tmp_path / "o.xlsx")["Coordinates", "A3"] == system.numbers[0] + 1
+    np.testing.assert_array_equal(read_quietly(tmp_path / "o.xlsx").numbers, system.numbers + 1)
+
+
+def test_a_shared_formula_is_handed_on(tmp_path):
+    """x1 = 3, 5 and so on by one shared formula whose first cell, then second, is overwritten."""
+    content = content_of(laid_out(Layout(seed=2)))
+
+    def edit(name: str, data: bytes) -> bytes:
+        if name != "xl/worksheets/sheet2.xml":
+            return data
+        for row in range(3, 7):
+            formula = b"<f t='shared' ref='B3:B6' si='0'>100+C3*0.5</f>" if row == 3 else b'<f t="shared" si="0"/>'
+            y = float(re.search(rb'<c r="C%d"[^>]*><v>([^<]*)' % row, data)[1])
+            new = b'<c r="B%d">%b<v>%b</v></c>' % (row, formula, repr(100 + y * 0.5).encode())
+            data = re.sub(rb'<c r="B%d"[^>]*><v>[^<]*</v></c>' % row, new, data)
+        return data
+
+    template = tmp_path / "t.xlsx"
+    template.write_bytes(repacked(content, edit))
+    system = read_quietly(template)
+    centers = system.centers.copy()
+    centers[0, 0] += 1
+    written = write_quietly(by_design(changed(system, centers=centers)), tmp_path / "o.xlsx", template)
+    formulas = values_of(written.path, data_only=False)
+    assert [formulas["Coordinates", f"B{row}"] for row in range(4, 7)] == [f"=100+C{row}*0.5" for row in range(4, 7)]
+    before, after = (members_of(p)["xl/worksheets/sheet2.xml"] for p in (template, written.path))
+    assert b'<f t="shared" ref="B4:B6" si="0">100+C4*0.5</f>' in after
+    for row in (5, 6):
+        cell = re.search(rb'<c r="B%d".*?</c>' % row, before)[0]
+        assert cell in after
+    # And sorted, and removed.
+    part = read_quietly(written.path)[[3, 1]]
+    write_quietly(part, tmp_path / "p.xlsx", written.path)
+    np.testing.assert_allclose(read_quietly(tmp_path / "p.xlsx").centers, part.centers, rtol=1e-12)
+
+
+def test_cells_of_array_formulas_do_not_change_alone(tmp_path):
+    book = laid_out(Layout(seed=2, length="absent", derived="absent"))
+    from openpyxl.worksheet.formula import ArrayFormula
+
+    template = tmp_path / "t.xlsx"
+    book["Coordinates"]["B3"] = ArrayFormula("B3:B4", "=Z3:Z4*1")
+    content = content_of(book)
+    content = repacked(
+        content,
+        lambda name, data: (
+            re.sub(rb'(<c r="B3".*?</f>)<v ?/?>(</v>)?', rb"\g<1><v>150.5</v>", data)
+            if name == "xl/worksheets/sheet2.xml"
+            else data
+        ),
+    )
+    template.write_bytes(content)
+    system = read_quietly(template)
+    with pytest.raises(mph.InputError, match=r"Coordinates!B4 is one cell of the array formula or data table B3:B4"):
+        mph.write_system(moved(system), tmp_path / "o.xlsx", template)
+
+
+def test_the_chain_of_calculation_goes_when_formulas_do(tmp_path):
+    content = content_of(laid_out(Layout(seed=2)))
+    kind = "http://schemas.openxmlformats.org/officeDocument/2006/relationships/calcChain"
+
+    def edit(name: str, data: bytes) -> bytes:
+        if name == "[Content_Types].xml":
+            chain = b'<Override PartName="/xl/calcChain.xml" ContentType="application/vnd.x.calcChain+xml"/></Types>'
+            return data.replace(b"</Types>", chain)
+        if name == "xl/_rels/workbook.xml.rels":
+            chain = f'<Relationship Id="rIdC" Type="{kind}" Target="calcChain.xml"/></Relationships>'
+            return data.replace(b"</Relationships>", chain.encode())
+        return data
+
+    out = io.BytesIO(repacked(content, edit))
+    with zipfile.ZipFile(out, "a") as archive:
+        archive.writestr("xl/calcChain.xml", f'<calcChain xmlns="{SPREADSHEET}"><c r="E3" i="2"/></calcChain>')
+    template = tmp_path / "t.xlsx"
+    template.write_bytes(out.getvalue())
+    system = read_quietly(template)
+    kept = write_quietly(moved(system), tmp_path / "kept.xlsx", template)
+    before = members_of(template)
+    for name in ("xl/calcChain.xml", "[Content_Types].xml", "xl/_rels/workbook.xml.rels"):
+        assert members_of(kept.path)[name] == before[name]
+    dropped = write_quietly(system[:3], tmp_path / "dropped.xlsx", template)
+    after = members_of(dropped.path)
+    assert "xl/calcChain.xml" not in after
+    assert b"alcChain" not in after["[Content_Types].xml"] + after["xl/_rels/workbook.xml.rels"]
+    assert openpyxl.load_workbook(dropped.path)
+
+
+def test_formulas_stay_through_names_sheets_and_whole_columns(tmp_path):
+    template = tmp_path / "t.xlsx"
+    template.write_bytes(content_of(laid_out(Layout(seed=8))))
+    system = moved(read_quietly(template))
+    written = write_quietly(system, tmp_path / "o.xlsx", template)
+    values, x, y, z = values_of(written.path), *system.centers.T
+    assert values["Theta", "A1"] == pytest.approx(x.sum(), rel=1e-12)
+    assert values["Theta", "A2"] == pytest.approx(y.mean(), rel=1e-12)
+    assert values["Theta", "A4"] == pytest.approx((x**2).sum(), rel=1e-12)
+    assert values["Theta", "A5"] == z[1]
+    assert values["Theta", "A6"] == 2
+    assert values["It's values", "B1"] == pytest.approx(2 * x.sum() + 1, rel=1e-12)
+    assert "Theta!A3" not in written.recalculated  # of the first module's x, which has not moved
+    assert set(written.cleared) == {"Theta!A9", "It's values!B9", "It's values!D1", "Theta!A11", "It's values!B11"}
+
+
+# Killed
+
+
+_LOOP = """
+import sys, warnings, numpy as np
+import mphdrr.core as mph
+warnings.simplefilter("ignore")
+path, a, b = sys.argv[1:]
+systems = [mph.read_system(a), mph.read_system(b)]
+print("ready", flush=True)
+i = 0
+while True:
+    i += 1
+    mph.write_system(systems[i % 2], path, path)
+"""
+
+
+@pytest.mark.skipif(not hasattr(signal, "SIGKILL"), reason="this system has no SIGKILL")
+def test_killed_at_any_moment_the_old_or_the_new_file_is_whole(tmp_path, workbook, rng):
+    a = mph.read_system(workbook)
+    centers = a.centers.copy()
+    centers[:, 0] += 0.5
+    b = by_design(changed(a, centers=centers))
+    write_quietly(b, tmp_path / "b.xlsx", workbook)
+    path = tmp_path / "master.xlsx"
+    path.write_bytes(workbook.read_bytes())
+    environment = {**os.environ, "PYTHONPATH": str(Path(mphdrr.__file__).parents[1]) if mphdrr.__file__ else ""}
+    environment["PYTHONPATH"] = os.pathsep.join([environment["PYTHONPATH"], *sys.path])
+    seen = set()
+    for _ in range(6):
+        process = subprocess.Popen(
+            [sys.executable, "-c", _LOOP, str(path), str(workbook), str(tmp_path / "b.xlsx")],
+            env=environment,
+            stdout=subprocess.PIPE,
+        )
+        assert process.stdout.readline() == b"ready\n"
+        time.sleep(float(rng.uniform(0.02, 1.0)))
+        process.kill()
+        process.wait()
+        process.stdout.close()
+        back = mph.read_system(path)
+        is_a, is_b = (np.array_equal(back.centers, s.centers) for s in (a, b))
+        assert is_a or is_b
+        seen.add(is_a)
+        assert len(values_of(path)) == len(values_of(workbook))
+    leftovers = [p.name for p in tmp_path.iterdir() if p.name not in ("b.xlsx", "master.xlsx")]
+    assert all(name.startswith(".") for name in leftovers)

@@ -108,3 +108,5 @@ def set_world_matrix(item: bpy.types.Object, matrix: NDArray[np.float64]) -> Non
         parent = world_matrix(item.parent) @ np.array(item.matrix_parent_inverse, dtype=np.float64)
         matrix = np.linalg.inv(parent) @ matrix
     item.matrix_basis = Matrix(matrix)
+    if item.parent is None and item.rotation_mode == "XYZ":
+        item.rotation_euler = euler_angles(matrix)

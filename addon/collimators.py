@@ -15,8 +15,25 @@ from . import compat, ids
 def new_mesh(name: str, solid: Solid, material: bpy.types.Material) -> bpy.types.Mesh:
     """A mesh datablock of a solid, checked watertight, with one material."""
     check_watertight(solid)
-    vertices, faces = solid
     mesh = bpy.data.meshes.new(name)
+    _fill(mesh, solid)
+    mesh.materials.append(material)
+    return mesh
+
+
+def reshape_mesh(mesh: bpy.types.Mesh, solid: Solid) -> None:
+    """Give a mesh the shape of `solid`: in place, so that no datablock comes or goes and undo has an easy time."""
+    vertices, faces = solid
+    if len(mesh.vertices) == len(vertices) and len(mesh.polygons) == len(faces):
+        mesh.vertices.foreach_set("co", vertices.astype(np.float32).ravel())
+        mesh.update()
+    else:  # the user has edited it
+        mesh.clear_geometry()
+        _fill(mesh, solid)
+
+
+def _fill(mesh: bpy.types.Mesh, solid: Solid) -> None:
+    vertices, faces = solid
     mesh.vertices.add(len(vertices))
     mesh.vertices.foreach_set("co", vertices.astype(np.float32).ravel())
     mesh.loops.add(faces.size)
@@ -25,8 +42,6 @@ def new_mesh(name: str, solid: Solid, material: bpy.types.Material) -> bpy.types
     mesh.polygons.foreach_set("loop_start", np.arange(0, faces.size, faces.shape[1], dtype=np.int32))
     mesh.update(calc_edges=True)
     mesh.shade_flat()
-    mesh.materials.append(material)
-    return mesh
 
 
 def new_sphere(name: str, radius: float, material: bpy.types.Material) -> bpy.types.Mesh:
@@ -39,6 +54,21 @@ def new_sphere(name: str, radius: float, material: bpy.types.Material) -> bpy.ty
     mesh.shade_smooth()
     mesh.materials.append(material)
     return mesh
+
+
+def resize_sphere(mesh: bpy.types.Mesh, radius: float) -> None:
+    """Give a sphere around the origin another radius, mm, in place."""
+    points = np.empty(3 * len(mesh.vertices), np.float32)
+    mesh.vertices.foreach_get("co", points)
+    norms = np.linalg.norm(points.reshape(-1, 3), axis=1)
+    if len(norms) and norms.min() > 0 and abs(norms.max() - radius) > 1e-6 * radius:
+        mesh.vertices.foreach_set("co", (points.reshape(-1, 3) * (radius / norms)[:, None]).astype(np.float32).ravel())
+        mesh.update()
+
+
+def part_material(part: str) -> bpy.types.Material:
+    """The material of a scanner's parts of one kind ("COLLIMATOR", "CRYSTAL" or "ROI")."""
+    return {"COLLIMATOR": collimator_material, "CRYSTAL": crystal_material, "ROI": roi_material}[part]()
 
 
 def collimator_material() -> bpy.types.Material:

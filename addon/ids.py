@@ -10,6 +10,12 @@ IMPORT_GEOMETRY = "mphdrr.import_geometry"
 SHOW_MODULES = "mphdrr.show_modules"
 LOOK_THROUGH_MODULE = "mphdrr.look_through_module"
 AIM_MODULES = "mphdrr.aim_modules"
+EXPORT_GEOMETRY = "mphdrr.export_geometry"
+DUPLICATE_MODULES = "mphdrr.duplicate_modules"
+REMOVE_MODULES = "mphdrr.remove_modules"
+TIDY_MODULES = "mphdrr.tidy_modules"
+SET_NUMBERS = "mphdrr.set_numbers"
+CHECK_GEOMETRY = "mphdrr.check_geometry"
 ADD_DERENZO = "mphdrr.add_derenzo"
 RENDER_PROJECTIONS = "mphdrr.render_projections"
 EXPORT_DATASET = "mphdrr.export_dataset"
@@ -20,6 +26,8 @@ CANCEL_JOB = "mphdrr.cancel_job"
 # --- Panels, lists and file handlers: class names, drawn in the order of the work ---------------------------
 PANEL_GEOMETRY = "MPHDRR_PT_geometry"
 PANEL_MODULES = "MPHDRR_PT_modules"
+PANEL_DESIGN = "MPHDRR_PT_design"
+PANEL_SCANNER_DESIGN = "MPHDRR_PT_scanner_design"
 PANEL_PHANTOM = "MPHDRR_PT_phantom"
 PANEL_PROJECTIONS = "MPHDRR_PT_projections"
 PANEL_PHYSICS = "MPHDRR_PT_physics"
@@ -52,6 +60,11 @@ PREVIEW_SUFFIX = ".preview.vdb"  # coarser copies of large volumes, for display 
 def module_name(number: int, n_modules: int = 80) -> str:
     """Name of a module's camera object: "Module 07"; wide enough that names sort as numbers do."""
     return f"Module {number:0{max(2, len(str(n_modules)))}d}"
+
+
+def part_name(module: str, part: str) -> str:
+    """Name of a part of the module called `module`: "Crystal 07"."""
+    return module.replace("Module", part.capitalize())
 
 
 def ring_name(ring: int) -> str:

@@ -1,58 +1,140 @@
 """A module's numbers on its camera object, exact and as the user has changed them.
 
 Blender keeps places and properties as float32. `Object.mphdrr_module.exact` has the float64 numbers beside them,
-which count as long as the visible ones are their roundings.
+which count as long as the visible ones are their roundings. A number that was typed counts as the decimal typed.
 """
 
 from __future__ import annotations
 
 import json
 from collections.abc import Iterable
-from typing import Any
+from typing import Any, NamedTuple
 
 import bpy
 import numpy as np
 from numpy.typing import NDArray
 
+from ..core.design import collimator_length
+from ..core.errors import InputError
 from ..core.system import PinholeSystem
 from . import cameras
+from .phantom_properties import typed
 
 LENGTHS = ("pinhole_diameter", "collimator_length", "detector_side", "detector_thickness", "roi_radius")
+FROM_ROI, TYPED = "FROM_ROI", "TYPED"  # `mphdrr_module.length_mode`
 _TURNED = 1e-4  # rad: rotations kept as float32 angles agree to better than 1e-6
+_FORMULA = 1e-9  # share of l: an imported l that is that close to the design formula was calculated with it
+
+
+class ModuleNumbers(NamedTuple):
+    """What a module is, in float64 and mm."""
+
+    number: int
+    center: NDArray[np.float64]  # (3,), world
+    pinhole_diameter: float
+    collimator_length: float
+    detector_side: float
+    detector_thickness: float
+    roi_radius: float
+
+    @property
+    def pinhole_distance(self) -> float:
+        """b: pinhole centre to isocentre."""
+        return float(np.linalg.norm(self.center))
+
+    def system(self) -> PinholeSystem:
+        """A system of this module alone, or `InputError`."""
+        lengths = {name: np.array([getattr(self, name)]) for name in LENGTHS}
+        return PinholeSystem(self.center[None], **lengths, numbers=np.array([self.number]), source=None)
 
 
 def write_module(camera: bpy.types.Object, system: PinholeSystem, m: int, ring: int) -> None:
-    """Make an object the camera of module `m`."""
+    """Make an object the camera of module `m`; `l` follows the ROI where it was calculated so."""
     module = camera.mphdrr_module
     values = {name: float(getattr(system, name)[m]) for name in LENGTHS}
     for name, value in values.items():  # before is_module, which lets an edit rebuild the module
         setattr(module, name, value)
-    module.number, module.index, module.ring = int(np.asarray(system.numbers)[m]), m, ring
-    module.exact = json.dumps({"number": module.number, "center": system.centers[m].tolist(), **values})
-    module.pinhole_distance = float(system.pinhole_distance[m])
+    b, d, side, roi = float(system.pinhole_distance[m]), *(values[LENGTHS[i]] for i in (0, 2, 4))
+    error = abs(float(collimator_length(b, d, side, roi)) - values["collimator_length"])
+    module.length_mode = FROM_ROI if error <= _FORMULA * values["collimator_length"] else TYPED
+    module.ring = ring
+    remember(camera, system, m)
     module.part, module.is_module = "CAMERA", True
 
 
+def remember(camera: bpy.types.Object, system: PinholeSystem, m: int) -> None:
+    """Take module `m` of `system` for what the camera's module was when it was imported or saved."""
+    module = camera.mphdrr_module
+    module.number, module.index, module.added = int(np.asarray(system.numbers)[m]), m, False
+    _write_exact(
+        camera,
+        ModuleNumbers(module.number, system.centers[m], *(float(getattr(system, name)[m]) for name in LENGTHS)),
+    )
+
+
+def add_module(camera: bpy.types.Object, number: int, index: int, center: NDArray[np.float64] | None = None) -> None:
+    """Make the copy of a module's camera a module of its own, at `center` (3,), mm, or where it stands."""
+    module, numbers = camera.mphdrr_module, module_numbers(camera)
+    numbers = numbers._replace(number=number, center=numbers.center if center is None else center)
+    if module.length_mode == FROM_ROI:
+        numbers = _with_length(numbers)
+    module.number, module.index, module.added = number, index, True
+    _write_exact(camera, numbers)
+
+
+def _write_exact(camera: bpy.types.Object, numbers: ModuleNumbers) -> None:
+    values = {**numbers._asdict(), "center": numbers.center.tolist(), "mode": camera.mphdrr_module.length_mode}
+    camera.mphdrr_module.exact = json.dumps(values)
+
+
 def exact_values(camera: bpy.types.Object) -> dict[str, Any]:
-    """What was imported, in float64: "number", "center" and the `LENGTHS`; empty on other objects."""
+    """What was imported, in float64: the fields of `ModuleNumbers` and "mode"; empty on other objects."""
     return json.loads(camera.mphdrr_module.exact or "{}")
 
 
-def length(camera: bpy.types.Object, name: str) -> float:
-    """A length of a module: the float64 one as long as the visible float32 is its rounding."""
-    visible = getattr(camera.mphdrr_module, name)
-    exact = exact_values(camera).get(name)
-    return exact if exact is not None and float(np.float32(exact)) == visible else visible
+def module_numbers(camera: bpy.types.Object) -> ModuleNumbers:
+    """The module as it stands now.
+
+    Numbers that nobody changed are as imported. An `l` that follows the ROI is calculated in float64 once a number of
+    its formula has changed; where there is none (a pinhole inside the ROI) it is the last one that there was.
+    """
+    module, exact = camera.mphdrr_module, exact_values(camera)
+    center = _center(camera, exact.get("center"))
+    values = {name: _length(getattr(module, name), exact.get(name)) for name in LENGTHS}
+    numbers = ModuleNumbers(module.number, center, **values)
+    if module.length_mode != FROM_ROI:
+        return numbers
+    given = ("pinhole_diameter", "detector_side", "roi_radius")
+    if [FROM_ROI, center.tolist(), *(values[n] for n in given)] == [exact.get(n) for n in ("mode", "center", *given)]:
+        return numbers._replace(collimator_length=exact["collimator_length"])
+    return _with_length(numbers)
+
+
+def _with_length(numbers: ModuleNumbers) -> ModuleNumbers:
+    _, _, d, _, side, _, roi = numbers
+    try:
+        return numbers._replace(collimator_length=float(collimator_length(numbers.pinhole_distance, d, side, roi)))
+    except InputError:
+        return numbers  # `read_scanner` and the module's `problem` say what is wrong
 
 
 def pinhole_center(camera: bpy.types.Object) -> NDArray[np.float64]:
-    """Pinhole centre (3,), mm: the float64 one as long as the camera stands there."""
+    """Pinhole centre (3,), mm: float64 numbers as long as the camera stands there."""
+    return _center(camera, exact_values(camera).get("center"))
+
+
+def _length(visible: float, exact: float | None) -> float:
+    return exact if exact is not None and float(np.float32(exact)) == visible else typed(visible)
+
+
+def _center(camera: bpy.types.Object, exact: list[float] | None) -> NDArray[np.float64]:
     place = cameras.world_matrix(camera)[:3, 3]
-    exact = exact_values(camera).get("center")
+    if camera.parent is None and not len(camera.constraints):
+        place = np.array([typed(x) for x in place])
     if exact is None:
         return place
     rounding = 4 * float(np.spacing(np.float32(np.abs(exact).max())))
-    return np.array(exact) if np.abs(place - exact).max() <= rounding else place
+    return np.where(np.abs(place - exact) <= rounding, exact, place)
 
 
 def is_moved(camera: bpy.types.Object) -> bool:
@@ -67,10 +149,8 @@ def is_turned(camera: bpy.types.Object) -> bool:
 
 def is_edited(camera: bpy.types.Object) -> bool:
     """Whether the module has another number, or other lengths, than were imported."""
-    exact = exact_values(camera)
-    return camera.mphdrr_module.number != exact.get("number") or any(
-        length(camera, name) != exact.get(name) for name in LENGTHS
-    )
+    exact, numbers = exact_values(camera), module_numbers(camera)
+    return any(getattr(numbers, name) != exact.get(name) for name in ("number", *LENGTHS))
 
 
 def off_aim(cameras_: Iterable[bpy.types.Object]) -> list[int]:
@@ -78,6 +158,9 @@ def off_aim(cameras_: Iterable[bpy.types.Object]) -> list[int]:
     off = []
     for camera in cameras_:
         matrix = cameras.world_matrix(camera)
+        if not np.any(matrix[:3, 3]):
+            off.append(camera.mphdrr_module.number)  # at the isocentre nothing can be aimed
+            continue
         rotation = matrix[:3, :3] / np.linalg.norm(matrix[:3, :3], axis=0)
         aimed = cameras.camera_matrices(matrix[None, :3, 3])[0, :3, :3]
         if np.abs(rotation - aimed).max() > _TURNED:

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import math
 from typing import Any
 
 import bpy
+import numpy as np
 from bpy.props import (
     BoolProperty,
     EnumProperty,
@@ -135,9 +135,7 @@ class VolumeProperties(bpy.types.PropertyGroup):
 
 def typed(value: float) -> float:
     """The shortest decimal number that a float32 setting stands for: 0.1, not 0.10000000149."""
-    if value == 0 or not math.isfinite(value):
-        return value
-    return float(f"{value:.7g}")
+    return float(str(np.float32(value)))
 
 
 CLASSES = (DerenzoProperties, VolumeProperties)

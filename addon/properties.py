@@ -6,16 +6,51 @@ the float64 numbers beside it (see `addon/module_values.py`).
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from typing import Any
+
 import bpy
-from bpy.props import BoolProperty, EnumProperty, FloatProperty, IntProperty, PointerProperty, StringProperty
+from bpy.props import (
+    BoolProperty,
+    EnumProperty,
+    FloatProperty,
+    FloatVectorProperty,
+    IntProperty,
+    PointerProperty,
+    StringProperty,
+)
 
 from . import ids, jobs, phantom_properties, projection_properties
 
 
+# The rebuilding modules import these properties: they are imported when an edit calls for them.
 def _module_changed(self: ModuleProperties, context: bpy.types.Context) -> None:
-    from . import scanner  # here, because scanner reads these properties
+    from . import scanner
 
     scanner.refresh_module(self.id_data)
+
+
+def _length_changed(self: ModuleProperties, context: bpy.types.Context) -> None:
+    from . import design, scanner
+
+    if self.is_module and not design.is_writing():
+        design.type_length(self.id_data)
+        scanner.refresh_module(self.id_data)
+
+
+def _scanner_changed(self: ScannerProperties, context: bpy.types.Context) -> None:
+    from . import scanner
+
+    scanner.refresh_scanner(self.id_data)
+
+
+def _for_all(name: str) -> Callable[[ScannerProperties, bpy.types.Context], None]:
+    def changed(self: ScannerProperties, context: bpy.types.Context) -> None:
+        from . import scanner
+
+        scanner.set_for_all(self.id_data, name)
+
+    return changed
 
 
 def _get_visible(self: ModuleProperties) -> bool:
@@ -26,6 +61,27 @@ def _set_visible(self: ModuleProperties, value: bool) -> None:
     from . import scanner
 
     scanner.set_visible(self.id_data, value)
+
+
+_LENGTH_MODES = [
+    ("FROM_ROI", "From ROI", "l follows b, d, Ld and R: the field of view is tangent to the ROI sphere"),
+    ("TYPED", "Typed", "l stays as it was typed"),
+]
+# name: (label, description, smallest value); the module's and the scanner's are the same numbers.
+_LENGTHS = {
+    "pinhole_diameter": ("Pinhole Diameter", "d: diameter of the hole in mm", 0.0),
+    "collimator_length": ("Collimator Length", "l: from the pinhole to the crystal's front face, in mm", 1e-3),
+    "detector_side": ("Detector Side", "Ld: side of the square crystal in mm", 1e-3),
+    "detector_thickness": ("Detector Thickness", "Td: thickness of the crystal in mm", 0.0),
+    "roi_radius": ("ROI Radius", "R: radius in mm of the sphere that the module must see", 0.0),
+}
+
+
+def _length(name: str, changed: Callable[..., None], suffix: str = "") -> Any:
+    label, description, low = _LENGTHS[name]
+    return FloatProperty(
+        name=label, description=description + suffix, min=low, step=10, precision=3, unit="NONE", update=changed
+    )
 
 
 class ModuleProperties(bpy.types.PropertyGroup):
@@ -46,42 +102,43 @@ class ModuleProperties(bpy.types.PropertyGroup):
     number: IntProperty(name="Number", description="Module number, as in the workbook")
     index: IntProperty(name="Index", description="Place of the module in its system, from 0", min=0, options={"HIDDEN"})
     ring: IntProperty(name="Ring", description="Ring of the module, counted from 0", min=0)
-    pinhole_diameter: FloatProperty(
-        name="Pinhole Diameter",
-        description="d: diameter of the hole in mm",
-        min=0.0,
-        unit="NONE",
+    added: BoolProperty(name="Added", description="The module is not in the workbook", options={"HIDDEN"})
+    pinhole_diameter: _length("pinhole_diameter", _module_changed)
+    collimator_length: _length("collimator_length", _length_changed)
+    detector_side: _length("detector_side", _module_changed)
+    detector_thickness: _length("detector_thickness", _module_changed)
+    roi_radius: _length("roi_radius", _module_changed)
+    length_mode: EnumProperty(
+        name="Length", description="Where the collimator's length l comes from", items=_LENGTH_MODES, default="TYPED",
         update=_module_changed,
-    )
-    collimator_length: FloatProperty(
-        name="Collimator Length", description="l: from the pinhole to the crystal's front face, in mm",
-        min=1e-3, update=_module_changed,
     )  # fmt: skip
-    detector_side: FloatProperty(
-        name="Detector Side",
-        description="Ld: side of the square crystal in mm",
-        min=1e-3,
-        update=_module_changed,
-    )
-    detector_thickness: FloatProperty(
-        name="Detector Thickness",
-        description="Td: thickness of the crystal in mm",
-        min=0.0,
-        update=_module_changed,
-    )
-    roi_radius: FloatProperty(
-        name="ROI Radius", description="R: radius in mm of the sphere that the module must see", min=0.0
-    )
-    pinhole_distance: FloatProperty(
-        name="Pinhole Distance",
-        description="b: from the pinhole to the isocentre, in mm, when it was imported",
-        min=0.0,
-    )
     exact: StringProperty(
         name="Exact Values",
-        description="The same numbers and the pose in double precision, JSON",
+        description="The numbers and the pinhole's place as imported, in double precision, JSON",
         options={"HIDDEN"},
     )
+    placed: FloatVectorProperty(
+        name="Placed", description="Where the pinhole was when the module was last built, mm", size=3,
+        options={"HIDDEN"},
+    )  # fmt: skip
+    built: StringProperty(name="Built", description="The numbers that the readouts are of", options={"HIDDEN"})
+    # Readouts: what the panels show, written by readouts.py.
+    pinhole_distance: FloatProperty(
+        name="Pinhole Distance", description="b: from the pinhole to the isocentre, in mm", min=0.0
+    )
+    sensitivity: FloatProperty(
+        name="Sensitivity", description="Of an ideal pinhole for a point source at the isocentre, cps/MBq"
+    )
+    resolution: FloatProperty(
+        name="Resolution", description="FWHM in mm at the isocentre, of the hole and the detector"
+    )
+    magnification: FloatProperty(name="Magnification", description="l / b: of the image on the crystal")
+    roi_seen: FloatProperty(
+        name="Radius Seen", description="Radius in mm of the largest sphere around the isocentre that it sees whole"
+    )
+    aimed: BoolProperty(name="Aimed", description="The camera looks at the isocentre", default=True)
+    problem: StringProperty(name="Problem", description="Why the module cannot be as its numbers say")
+    finding: StringProperty(name="Finding", description="What the last check of the geometry found at this module")
 
 
 class ScannerProperties(bpy.types.PropertyGroup):
@@ -92,15 +149,52 @@ class ScannerProperties(bpy.types.PropertyGroup):
     scanner_name: StringProperty(
         name="Scanner Name", description="What the scanner was imported as: the same name replaces it"
     )
-    workbook: StringProperty(name="Workbook", description="File that the scanner was read from", subtype="FILE_PATH")
+    workbook: StringProperty(
+        name="Workbook", description="File that the scanner was read from or last written to", subtype="FILE_PATH"
+    )
     sha256: StringProperty(name="SHA-256", description="Checksum of the workbook when it was read")
     n_modules: IntProperty(name="Modules", description="Number of modules when it was imported", min=0)
     quick_ranges: StringProperty(
         name="Quick Ranges", description="Module ranges with a button of their own, JSON", options={"HIDDEN"}
     )
     source: StringProperty(name="Source", description="Where the numbers come from, JSON", options={"HIDDEN"})
-    plate_thickness: FloatProperty(name="Plate", description="Thickness of the aperture plate in mm", min=0.0)
-    wall_thickness: FloatProperty(name="Wall", description="Thickness of the collimator's walls in mm", min=0.0)
+    plate_thickness: FloatProperty(
+        name="Plate", description="Thickness of the aperture plates in mm", min=0.0, update=_scanner_changed
+    )
+    wall_thickness: FloatProperty(
+        name="Wall", description="Thickness of the collimators' walls in mm", min=0.0, update=_scanner_changed
+    )
+    intrinsic_fwhm: FloatProperty(
+        name="Intrinsic FWHM", description="Resolution of the detectors in mm on the crystal, for the readouts. 0: ideal",
+        min=0.0, soft_max=10.0, step=10, update=_scanner_changed,
+    )  # fmt: skip
+    keep_aimed: BoolProperty(
+        name="Keep Aimed",
+        description="Turn a module that is moved so that it goes on looking at the isocentre. One that is only turned "
+        "stays as it was turned, and is marked",
+        default=True, update=_scanner_changed,
+    )  # fmt: skip
+    # For all modules at once; where they differ, the first one's, and the name stands in `mixed`.
+    pinhole_diameter: _length("pinhole_diameter", _for_all("pinhole_diameter"), ". Changing it sets all modules")
+    collimator_length: _length("collimator_length", _for_all("collimator_length"), ". Changing it sets all modules")
+    detector_side: _length("detector_side", _for_all("detector_side"), ". Changing it sets all modules")
+    detector_thickness: _length("detector_thickness", _for_all("detector_thickness"), ". Changing it sets all modules")
+    roi_radius: _length("roi_radius", _for_all("roi_radius"), ". Changing it sets all modules")
+    length_mode: EnumProperty(
+        name="Length", description="Where the collimators' lengths come from. Changing it sets all modules",
+        items=_LENGTH_MODES, default="TYPED", update=_for_all("length_mode"),
+    )  # fmt: skip
+    mixed: StringProperty(name="Mixed", description="Names of the numbers that differ between modules")
+    # Readouts of all modules together, written by readouts.py.
+    count: IntProperty(name="Modules", description="Number of modules now", min=0)
+    sensitivity: FloatProperty(
+        name="Sensitivity", description="Of all modules together, for a point source at the isocentre, cps/MBq"
+    )
+    resolution: FloatProperty(name="Resolution", description="Mean FWHM in mm of the modules at the isocentre")
+    n_covering: IntProperty(name="Covering", description="Number of modules that see their whole ROI sphere")
+    problem: StringProperty(name="Problem", description="Why the scanner cannot be used as it stands")
+    untidy: StringProperty(name="Untidy", description="Copied cameras and left-over parts, in words")
+    findings: StringProperty(name="Findings", description="What the last check of the geometry found, JSON")
 
 
 def _is_scanner(self: GeometryProperties, collection: bpy.types.Collection) -> bool:

@@ -7,9 +7,22 @@ from typing import Any
 
 import bpy
 
-from ..operators import add_derenzo, aim_modules, export_dataset, import_geometry, render_projections, show_modules
-from ..panels import export, geometry, phantom, projections
-from . import cli, ids, jobs, preferences, properties, storage, volumes
+from ..operators import (
+    add_derenzo,
+    aim_modules,
+    check_geometry,
+    duplicate_modules,
+    export_dataset,
+    export_geometry,
+    import_geometry,
+    remove_modules,
+    render_projections,
+    set_numbers,
+    show_modules,
+    tidy_modules,
+)
+from ..panels import design, export, geometry, phantom, projections
+from . import cli, ids, jobs, live, preferences, properties, storage, volumes
 
 # Classes in the order of registration; a panel comes after its parent. To add a class, list it here.
 CLASSES: tuple[type, ...] = (
@@ -21,6 +34,12 @@ CLASSES: tuple[type, ...] = (
     show_modules.MPHDRR_OT_show_modules,
     show_modules.MPHDRR_OT_look_through_module,
     aim_modules.MPHDRR_OT_aim_modules,
+    duplicate_modules.MPHDRR_OT_duplicate_modules,
+    remove_modules.MPHDRR_OT_remove_modules,
+    tidy_modules.MPHDRR_OT_tidy_modules,
+    set_numbers.MPHDRR_OT_set_numbers,
+    check_geometry.MPHDRR_OT_check_geometry,
+    export_geometry.MPHDRR_OT_export_geometry,
     add_derenzo.MPHDRR_OT_add_derenzo,
     add_derenzo.MPHDRR_OT_update_derenzo,
     render_projections.MPHDRR_OT_render_projections,
@@ -31,6 +50,8 @@ CLASSES: tuple[type, ...] = (
     geometry.MPHDRR_UL_modules,
     geometry.MPHDRR_PT_geometry,
     geometry.MPHDRR_PT_modules,
+    design.MPHDRR_PT_design,
+    design.MPHDRR_PT_scanner_design,
     phantom.MPHDRR_PT_phantom,
     projections.MPHDRR_PT_projections,
     projections.MPHDRR_PT_physics,
@@ -40,6 +61,7 @@ CLASSES: tuple[type, ...] = (
 # (menu, draw function): entries in Blender's own menus.
 MENUS: tuple[tuple[Any, Any], ...] = (
     (bpy.types.TOPBAR_MT_file_import, import_geometry.draw_menu),
+    (bpy.types.TOPBAR_MT_file_export, export_geometry.draw_menu),
     (bpy.types.TOPBAR_MT_file_export, export_dataset.draw_menu),
     (bpy.types.VIEW3D_MT_volume_add, add_derenzo.draw_menu),
 )
@@ -48,6 +70,11 @@ MENUS: tuple[tuple[Any, Any], ...] = (
 HANDLERS: tuple[tuple[list[Any], Any], ...] = (
     (bpy.app.handlers.load_pre, jobs.before_load),
     (bpy.app.handlers.load_post, volumes.after_load),
+    (bpy.app.handlers.load_post, live.after_load),
+    (bpy.app.handlers.depsgraph_update_post, live.after_update),
+    (bpy.app.handlers.frame_change_post, live.after_update),
+    (bpy.app.handlers.undo_post, live.after_undo),
+    (bpy.app.handlers.redo_post, live.after_undo),
     (bpy.app.handlers.save_pre, storage.before_save),
     (bpy.app.handlers.save_post, storage.after_save),
     (bpy.app.handlers.save_post_fail, storage.after_failed_save),
@@ -87,6 +114,7 @@ def unregister() -> None:
     """Take back what `register` did, in reverse order."""
     atexit.unregister(unregister)
     jobs.stop()
+    live.stop()
     while _commands:
         bpy.utils.unregister_cli_command(_commands.pop())
     for handlers, function in reversed(HANDLERS):

@@ -17,13 +17,16 @@ def losses(collection: bpy.types.Collection) -> list[str]:
     found = [o for o in parts if o.mphdrr_module.is_module]
     moved = [o.mphdrr_module.number for o in found if is_moved(o) or is_turned(o)]
     changed = [o.mphdrr_module.number for o in found if is_edited(o)]
+    added = [o.mphdrr_module.number for o in found if o.mphdrr_module.added]
     animated = [o.mphdrr_module.number for o in found if o.animation_data is not None or len(o.constraints)]
-    gone = collection.mphdrr_scanner.n_modules - len(found)
+    gone = collection.mphdrr_scanner.n_modules - (len(found) - len(added))
     lost = []
     if moved:
         lost.append(f"{modules_text(moved)} moved or turned")
     if changed:
         lost.append(f"{modules_text(changed)} with changed numbers")
+    if added:
+        lost.append(f"{modules_text(added)} added")
     if animated:
         lost.append(f"{modules_text(animated)} with animation or constraints")
     if gone > 0:

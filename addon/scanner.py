@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import json
 import warnings
+from collections.abc import Iterable
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -15,12 +16,11 @@ from typing import Any
 import bpy
 import numpy as np
 
-from ..core.collimator_mesh import collimator_solid, crystal_solid
 from ..core.errors import InputError, InputWarning
 from ..core.system import PinholeSystem
 from ..core.workbook import QuantityCells, SystemSource
-from . import cameras, collimators, ids
-from .module_values import LENGTHS, is_edited, is_moved, length, off_aim, pinhole_center
+from . import cameras, design, ids
+from .module_values import LENGTHS, TYPED, is_edited, is_moved, module_numbers, off_aim, remember
 from .replacement import clear, losses, modules_text
 from .scanner_parts import NewScanner, module_solids
 
@@ -71,7 +71,12 @@ def build_scanner(
         raise InputError(
             f"scanner '{name}' has changed since it was imported ({'; '.join(lost)}): set replace=True to drop this"
         )
-    solids = [module_solids(system, m, plate_thickness, wall_thickness) for m in range(len(system))]
+    solids = [
+        module_solids(
+            *(float(getattr(system, name)[m]) for name in LENGTHS[:4]), plate=plate_thickness, wall=wall_thickness
+        )
+        for m in range(len(system))
+    ]
 
     new = NewScanner()
     try:
@@ -93,14 +98,11 @@ def build_scanner(
             set_visible(camera, False)
 
     properties = collection.mphdrr_scanner
-    properties.is_scanner = True
     properties.scanner_name = name
-    properties.n_modules = len(system)
     properties.plate_thickness, properties.wall_thickness = plate_thickness, wall_thickness
-    properties.quick_ranges = json.dumps(quick_ranges(system))
-    source = _source_to_dict(system.source)
-    properties.source = json.dumps(source)
-    properties.workbook, properties.sha256 = source.get("path", ""), source.get("sha256", "")
+    properties.is_scanner = True
+    _write_source(properties, system)
+    refresh_scanner(collection)
 
     _prepare_scene(scene, system, shape)
     if scene.camera is None:
@@ -109,6 +111,22 @@ def build_scanner(
     state.scanner = collection
     state.active_index = collection.all_objects.find(new.cameras[int(np.asarray(system.numbers)[0])].name)
     return collection
+
+
+def remember_source(collection: bpy.types.Collection, system: PinholeSystem) -> None:
+    """Take `system`, which has the scanner's modules in their order, for what it was imported as: it has been saved."""
+    with design.writing():
+        for m, camera in enumerate(modules(collection)):
+            remember(camera, system, m)
+    _write_source(collection.mphdrr_scanner, system)
+
+
+def _write_source(properties: bpy.types.PropertyGroup, system: PinholeSystem) -> None:
+    properties.n_modules = len(system)
+    properties.quick_ranges = json.dumps(quick_ranges(system))
+    source = _source_to_dict(system.source)
+    properties.source = json.dumps(source)
+    properties.workbook, properties.sha256 = source.get("path", ""), source.get("sha256", "")
 
 
 def default_name(system: PinholeSystem) -> str:
@@ -162,6 +180,14 @@ def active_scanner(scene: bpy.types.Scene) -> bpy.types.Collection | None:
     return chosen if chosen in found else next(iter(found), None)
 
 
+def required_scanner(scene: bpy.types.Scene) -> bpy.types.Collection:
+    """The scanner that the panels work on, or `InputError`."""
+    collection = active_scanner(scene)
+    if collection is None:
+        raise InputError("no scanner in the scene: import a workbook first")
+    return collection
+
+
 def modules(collection: bpy.types.Collection) -> list[bpy.types.Object]:
     """The scanner's camera objects in the order of the system, which is that of `read_scanner`."""
     found = [o for o in collection.all_objects if o.mphdrr_module.is_module]
@@ -184,17 +210,17 @@ def scanner_of(camera: bpy.types.Object) -> bpy.types.Collection | None:
     return None
 
 
-def read_scanner(collection: bpy.types.Collection) -> PinholeSystem:
+def read_scanner(collection: bpy.types.Collection, *, aimed: bool = False) -> PinholeSystem:
     """The scanner as it stands in the scene now: the cameras' places, and the numbers in their properties.
 
     Numbers that nobody has changed come back exactly, in float64. A module is aimed at the isocentre wherever it
-    is; a camera that looks elsewhere is named in an `InputWarning` (`aim_modules` turns it). The system has its
-    source (the workbook) only while all is as it was imported.
+    is; a camera that looks elsewhere is named in an `InputWarning` (`aim_modules` turns it), or refused with
+    `aimed`. The system has its source (the workbook) only while all is as it was imported.
 
     Raises
     ------
     InputError
-        There is no module, two have one number, or the numbers make no system.
+        There is no module, two have one number, the numbers make no system, or, with `aimed`, a camera looks elsewhere.
     """
     found = modules(collection)
     if not found:
@@ -205,24 +231,28 @@ def read_scanner(collection: bpy.types.Collection) -> PinholeSystem:
         if other is not camera:
             raise InputError(
                 f"'{other.name}' and '{camera.name}' both have module number {camera.mphdrr_module.number}: "
-                f"give one another number or delete it"
+                f"press Tidy Modules in the Geometry panel, or delete one"
             )
-    centers = np.array([pinhole_center(camera) for camera in found])
-    lengths = {name: np.array([length(camera, name) for camera in found]) for name in LENGTHS}
     off = off_aim(found)
-    if len(off):
+    if off and aimed:
+        raise InputError(
+            f"scanner '{collection.name}': {modules_text(off)} not aimed at the isocentre, which the geometry cannot "
+            "say: press Aim at Isocentre in the Geometry panel"
+        )
+    if off:
         warnings.warn(
             f"scanner '{collection.name}': {modules_text(off)} not aimed at the isocentre in the scene, but "
             "calculated as if aimed: press Aim at Isocentre in the Geometry panel",
             InputWarning,
             stacklevel=2,
         )
+    numbers = [module_numbers(camera) for camera in found]
     as_imported = len(found) == collection.mphdrr_scanner.n_modules and not any(
-        is_moved(camera) or is_edited(camera) for camera in found
+        camera.mphdrr_module.added or is_moved(camera) or is_edited(camera) for camera in found
     )
     return PinholeSystem(
-        centers=centers,
-        **lengths,
+        centers=np.array([n.center for n in numbers]),
+        **{name: np.array([getattr(n, name) for n in numbers]) for name in LENGTHS},
         numbers=np.array(list(by_number), dtype=np.int64),
         source=_source_from_dict(json.loads(collection.mphdrr_scanner.source or "{}")) if as_imported else None,
     )
@@ -302,29 +332,41 @@ def select_active(context: bpy.types.Context) -> None:
 
 
 def refresh_module(camera: bpy.types.Object) -> None:
-    """Make a module's camera, collimator and crystal follow its numbers (called when one is edited)."""
-    module = camera.mphdrr_module
-    collection = scanner_of(camera) if module.is_module else None
-    if collection is None:
+    """Make a module's camera, collimator, crystal and readouts follow its numbers (called when one is edited)."""
+    collection = scanner_of(camera) if camera.mphdrr_module.is_module and not design.is_writing() else None
+    if collection is not None:
+        design.refresh(collection, modules(collection), [camera])
+
+
+def refresh_scanner(collection: bpy.types.Collection) -> None:
+    """Make all modules follow their places and numbers, and the scanner's totals follow them."""
+    if collection.mphdrr_scanner.is_scanner and not design.is_writing():
+        found = modules(collection)
+        design.refresh(collection, found, found, totals=True)
+
+
+def set_for_all(collection: bpy.types.Collection, name: str) -> None:
+    """Give all modules the scanner's number called `name` (or its "length_mode")."""
+    if not collection.mphdrr_scanner.is_scanner or design.is_writing():
         return
-    scanner = collection.mphdrr_scanner
-    d, collimator_length, side, thickness, _ = (length(camera, name) for name in LENGTHS)
-    cameras.set_field_of_view(camera.data, side, collimator_length)
-    try:
-        solids = {
-            "COLLIMATOR": collimator_solid(d, collimator_length, side, scanner.plate_thickness, scanner.wall_thickness),
-            "CRYSTAL": crystal_solid(collimator_length, side, thickness),
-        }
-    except InputError:
-        return  # no such shape, e.g. while d is typed before Ld: keep the last; read_scanner says what is wrong
-    for child in camera.children:
-        part = child.mphdrr_module.part
-        if part in solids:
-            old = child.data
-            material = old.materials[0] if len(old.materials) else None
-            child.data = collimators.new_mesh(old.name, solids[part], material)
-            if old.users == 0:
-                bpy.data.meshes.remove(old)
+    value = getattr(collection.mphdrr_scanner, name)
+    with design.writing():
+        for camera in modules(collection):
+            setattr(camera.mphdrr_module, name, value)
+            if name == "collimator_length":
+                camera.mphdrr_module.length_mode = TYPED
+    refresh_scanner(collection)
+
+
+def copy_numbers(
+    collection: bpy.types.Collection, source: bpy.types.Object, targets: Iterable[bpy.types.Object]
+) -> None:
+    """Give modules the lengths of another, and where its `l` comes from."""
+    with design.writing():
+        for camera in targets:
+            for name in (*LENGTHS, "length_mode"):
+                setattr(camera.mphdrr_module, name, getattr(source.mphdrr_module, name))
+    refresh_scanner(collection)
 
 
 def _source_to_dict(source: SystemSource | None) -> dict[str, Any]:

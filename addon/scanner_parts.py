@@ -7,12 +7,11 @@ from typing import Any
 
 import bpy
 import numpy as np
-from mathutils import Matrix
 
 from ..core.collimator_mesh import Solid, collimator_solid, crystal_solid
 from ..core.system import PinholeSystem
 from . import cameras, collimators, ids
-from .module_values import LENGTHS, write_module
+from .module_values import write_module
 
 
 class NewScanner:
@@ -23,12 +22,7 @@ class NewScanner:
         self.rings: list[bpy.types.Collection] = []
         self.roi: bpy.types.Object | None = None
         self._named: list[tuple[bpy.types.ID, str]] = []  # names are free only after the old scanner has gone
-        self._meshes: dict[tuple[str, bytes], bpy.types.Mesh] = {}  # modules of the same size share one
-        self._materials = {
-            "COLLIMATOR": collimators.collimator_material(),
-            "CRYSTAL": collimators.crystal_material(),
-            "ROI": collimators.roi_material(),
-        }
+        self._materials = {part: collimators.part_material(part) for part in ("COLLIMATOR", "CRYSTAL", "ROI")}
 
     def make(self, system: PinholeSystem, solids: Sequence[tuple[Solid, Solid]]) -> None:
         """Make everything; `solids` has each module's collimator and crystal."""
@@ -44,16 +38,14 @@ class NewScanner:
             cameras.set_up_camera(data, system, m)
             camera = self._keep(bpy.data.objects.new(name, data), name)
             self.cameras[number] = camera
-            camera.matrix_world = Matrix(matrices[m])
-            camera.rotation_euler = cameras.euler_angles(matrices[m])
+            cameras.set_world_matrix(camera, matrices[m])
+            camera.lock_scale = (True, True, True)  # or its collimator would grow with it
             write_module(camera, system, m, int(rings[m]))
             self.rings[rings[m]].objects.link(camera)
             for part, solid in zip(("COLLIMATOR", "CRYSTAL"), solids[m], strict=True):
-                child_name = name.replace("Module", part.capitalize())
-                child = self._keep(bpy.data.objects.new(child_name, self._mesh(part, child_name, solid)), child_name)
-                child.parent = camera
-                child.lock_location = child.lock_rotation = child.lock_scale = (True, True, True)
-                child.mphdrr_module.part, child.mphdrr_module.number = part, number
+                child_name = ids.part_name(name, part)
+                mesh = self._keep(collimators.new_mesh(child_name, solid, self._materials[part]), child_name)
+                child = self._keep(new_part(camera, part, child_name, mesh), child_name)
                 self.rings[rings[m]].objects.link(child)
         self._make_roi(float(system.roi_radius.max()))
 
@@ -66,12 +58,6 @@ class NewScanner:
         self.roi.display_type, self.roi.display_bounds_type = "BOUNDS", "SPHERE"
         self.roi.lock_location = self.roi.lock_rotation = self.roi.lock_scale = (True, True, True)
         self.roi.visible_shadow = False
-
-    def _mesh(self, part: str, name: str, solid: Solid) -> bpy.types.Mesh:
-        key = (part, np.round(solid[0], 6).tobytes())
-        if key not in self._meshes:
-            self._meshes[key] = self._keep(collimators.new_mesh(name, solid, self._materials[part]), name)
-        return self._meshes[key]
 
     def _keep(self, datablock: Any, name: str) -> Any:
         self._named.append((datablock, name))
@@ -92,7 +78,17 @@ class NewScanner:
         bpy.data.batch_remove([m for m in self._materials.values() if m.users == 0])
 
 
-def module_solids(system: PinholeSystem, m: int, plate: float, wall: float) -> tuple[Solid, Solid]:
-    """Collimator and crystal of module `m`, for a plate and walls of that thickness in mm."""
-    d, length, side, thickness, _ = (float(getattr(system, name)[m]) for name in LENGTHS)
+def new_part(camera: bpy.types.Object, part: str, name: str, mesh: bpy.types.Mesh) -> bpy.types.Object:
+    """A module's collimator or crystal, hanging on its camera. Each has a mesh of its own, which its module reshapes."""
+    item = bpy.data.objects.new(name, mesh)
+    item.parent = camera
+    item.lock_location = item.lock_rotation = item.lock_scale = (True, True, True)
+    item.mphdrr_module.part, item.mphdrr_module.number = part, camera.mphdrr_module.number
+    return item
+
+
+def module_solids(
+    d: float, length: float, side: float, thickness: float, *, plate: float, wall: float
+) -> tuple[Solid, Solid]:
+    """Collimator and crystal of a module, for a plate and walls of that thickness; all in mm."""
     return collimator_solid(d, length, side, plate, wall), crystal_solid(length, side, thickness)

@@ -23,6 +23,11 @@ class MPHDRR_OT_aim_modules(bpy.types.Operator):
         return True
 
     def execute(self, context: bpy.types.Context) -> set[str]:
-        aimed = scanner.aim_modules(scanner.active_scanner(context.scene))
-        self.report({"INFO"}, f"Turned {len(aimed)} modules" if aimed else "All modules aim at the isocentre")
+        collection = scanner.active_scanner(context.scene)
+        aimed = scanner.aim_modules(collection)
+        scanner.refresh_scanner(collection)
+        self.report(
+            {"INFO"},
+            f"Turned {len(aimed)} module{'s' * (len(aimed) > 1)}" if aimed else "All modules aim at the isocentre",
+        )
         return {"FINISHED"}

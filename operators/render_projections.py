@@ -35,9 +35,7 @@ class MPHDRR_OT_render_projections(ProjectionSettings, jobs.JobOperator, bpy.typ
 
     def job(self, context: bpy.types.Context) -> jobs.Job:
         scene = context.scene
-        collection = scanner.active_scanner(scene)
-        if collection is None:
-            raise InputError("no scanner in the scene: import a workbook first")
+        collection = scanner.required_scanner(scene)
         chosen = {name: self._setting(scene, name) for name in ProjectionSettings.__annotations__}
         system = _range(scanner.read_scanner(collection), chosen["first"], chosen["last"])
         shape = (chosen["height"], chosen["width"])

@@ -29,7 +29,11 @@ class MPHDRR_UL_modules(bpy.types.UIList):
         module = item.mphdrr_module
         row = layout.row(align=True)
         row.active = module.visible
-        _columns(row, item.name, f"{module.pinhole_distance:.1f}", f"{module.collimator_length:.1f}")
+        columns = row.row(align=True)
+        columns.alert = bool(module.problem or module.finding or not module.aimed)
+        _columns(columns, item.name, f"{module.pinhole_distance:.1f}", f"{module.collimator_length:.1f}")
+        if columns.alert:
+            columns.label(text="", icon="ERROR")
         row.prop(module, "visible", text="", icon="HIDE_OFF" if module.visible else "HIDE_ON", emboss=False)
 
     def draw_filter(self, context: bpy.types.Context, layout: bpy.types.UILayout) -> None:
@@ -84,7 +88,7 @@ class MPHDRR_PT_geometry(_Panel, bpy.types.Panel):
         for name, value in (
             ("Scanner", collection.name),
             ("Workbook", bpy.path.basename(properties.workbook) or "none"),
-            ("Modules", f"{properties.n_modules} in {_n_rings(collection)} rings"),
+            ("Modules", f"{properties.count} in {_n_rings(collection)} rings"),
         ):
             names.label(text=name)
             values.label(text=value)
@@ -95,7 +99,7 @@ class MPHDRR_PT_geometry(_Panel, bpy.types.Panel):
 
 
 class MPHDRR_PT_modules(_Panel, bpy.types.Panel):
-    """The modules: which are shown, and the numbers of one."""
+    """The modules: which are shown, and looking through one."""
 
     bl_idname = ids.PANEL_MODULES
     bl_parent_id = ids.PANEL_GEOMETRY
@@ -137,13 +141,6 @@ class MPHDRR_PT_modules(_Panel, bpy.types.Panel):
                 ids.LOOK_THROUGH_MODULE, text=f"Look Through {active.name}", icon="OUTLINER_OB_CAMERA"
             )
             look.number = module.number
-            layout.use_property_split = True
-            layout.use_property_decorate = False
-            column = layout.column(align=True)
-            column.prop(module, "pinhole_diameter", text="Hole d (mm)")
-            column.prop(module, "collimator_length", text="Length l (mm)")
-            column.prop(module, "detector_side", text="Side Ld (mm)")
-            column.prop(module, "detector_thickness", text="Depth Td (mm)")
         layout.operator(ids.AIM_MODULES, icon="CON_TRACKTO")
 
 

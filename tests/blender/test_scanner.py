@@ -65,7 +65,7 @@ def test_scanner_has_a_collection_per_ring_and_a_camera_per_module(scene, dc_spe
     assert json.loads(collection.mphdrr_scanner.quick_ranges) == [[1, 40], [21, 60], [41, 80]]
     assert sum(o.type == "MESH" for o in collection.all_objects) == 161
     meshes = {o.data for o in collection.all_objects if o.type == "MESH"}
-    assert len(meshes) == 81, "rings 3 and 4 mirror rings 2 and 1: their modules share meshes"
+    assert len(meshes) == 161, "each has its own, which is reshaped in place"
 
 
 def test_camera_axes_follow_the_module_frame(scene, ring_system):

@@ -1,0 +1,72 @@
+"""Which modules an operator or a panel is about: the active one and the selected ones."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+import bpy
+
+from . import scanner
+
+
+def active_module(context: bpy.types.Context) -> bpy.types.Object | None:
+    """The camera of the active scanner's module that is active in the viewport, itself or a part of it, else in the list."""
+    collection = scanner.active_scanner(context.scene)
+    if collection is None:
+        return None
+    item = module_of(context.view_layer.objects.active)
+    if item is not None and item.name in collection.all_objects:
+        return item
+    items, index = collection.all_objects, context.scene.mphdrr_geometry.active_index
+    listed = items[index] if 0 <= index < len(items) else None
+    return listed if listed is not None and listed.mphdrr_module.is_module else None
+
+
+def selected_modules(context: bpy.types.Context) -> list[bpy.types.Object]:
+    """Cameras of the active scanner's modules that are selected, themselves or a part, in order; else the active one."""
+    collection = scanner.active_scanner(context.scene)
+    if collection is None:
+        return []
+    chosen = {module_of(item) for item in context.view_layer.objects if item.select_get(view_layer=context.view_layer)}
+    active = active_module(context)
+    return [o for o in scanner.modules(collection) if o in chosen] or ([active] if active else [])
+
+
+def module_of(item: bpy.types.Object | None) -> bpy.types.Object | None:
+    """The camera of the module that an object is or belongs to; None for other objects."""
+    if item is not None and not item.mphdrr_module.is_module and item.mphdrr_module.part != "NONE":
+        item = item.parent
+    return item if item is not None and item.mphdrr_module.is_module else None
+
+
+def select(context: bpy.types.Context, modules: Iterable[bpy.types.Object]) -> None:
+    """Select these modules' cameras, as far as they are visible, and nothing else; the first becomes active."""
+    if context.mode != "OBJECT":
+        return
+    layer = context.view_layer
+    for item in layer.objects:
+        if item.select_get(view_layer=layer):
+            item.select_set(False, view_layer=layer)
+    shown = [o for o in modules if o.name in layer.objects and o.visible_get(view_layer=layer)]
+    for camera in shown:
+        camera.select_set(True, view_layer=layer)
+    if shown:
+        layer.objects.active = shown[0]
+
+
+def poll_scanner(operator: type[bpy.types.Operator], context: bpy.types.Context) -> bool:
+    """`poll` of operators that need a scanner."""
+    if scanner.active_scanner(context.scene) is None:
+        operator.poll_message_set("No scanner in the scene: import a geometry first")
+        return False
+    return True
+
+
+def poll_module(operator: type[bpy.types.Operator], context: bpy.types.Context) -> bool:
+    """`poll` of operators that need an active or selected module."""
+    if not poll_scanner(operator, context):
+        return False
+    if not selected_modules(context):
+        operator.poll_message_set("No module is selected: select a module's camera")
+        return False
+    return True

@@ -1,0 +1,167 @@
+"""Sidebar, Geometry > Design: the active module's numbers and what they do, and those of all modules.
+
+Drawing shows readouts that were calculated when something changed (`addon/readouts.py`).
+"""
+
+from __future__ import annotations
+
+import json
+
+import bpy
+
+from ..addon import ids, readouts, scanner, selection
+
+_LABELS = (
+    ("pinhole_diameter", "Hole d"),
+    ("detector_side", "Side Ld"),
+    ("detector_thickness", "Depth Td"),
+    ("roi_radius", "ROI R"),
+)
+_MOST_FINDINGS = 8
+
+
+class _Panel:
+    bl_space_type = "VIEW_3D"
+    bl_region_type = "UI"
+    bl_category = ids.CATEGORY
+    bl_options = {"DEFAULT_CLOSED"}
+
+    @classmethod
+    def poll(cls, context: bpy.types.Context) -> bool:
+        return scanner.active_scanner(context.scene) is not None
+
+
+class MPHDRR_PT_design(_Panel, bpy.types.Panel):
+    """The active module."""
+
+    bl_idname = ids.PANEL_DESIGN
+    bl_parent_id = ids.PANEL_GEOMETRY
+    bl_label = "Design"
+
+    def draw(self, context: bpy.types.Context) -> None:
+        layout = self.layout
+        collection = scanner.active_scanner(context.scene)
+        if collection is None:  # poll says so too, but the scene may have changed since
+            return
+        properties = collection.mphdrr_scanner
+        if properties.untidy:
+            box = layout.box().column(align=True)
+            box.label(text=properties.untidy.capitalize(), icon="ERROR")
+            box.operator(ids.TIDY_MODULES, icon="BRUSH_DATA")
+        camera = selection.active_module(context)
+        if camera is None:
+            layout.label(text="Select a module's camera", icon="INFO")
+        else:
+            self._draw_module(layout, camera)
+        row = layout.row(align=True)
+        row.operator_context = "INVOKE_DEFAULT"
+        row.operator(ids.DUPLICATE_MODULES, text="Duplicate", icon="DUPLICATE")
+        row.operator(ids.REMOVE_MODULES, text="Remove", icon="TRASH")
+        row = layout.row(align=True)
+        row.operator(ids.SET_NUMBERS, text="Copy to Selected").to_all = False
+        row.operator(ids.SET_NUMBERS, text="Copy to All").to_all = True
+        row = layout.row(align=True)
+        row.prop(properties, "keep_aimed", toggle=True, icon="CON_TRACKTO")
+        row.operator(ids.AIM_MODULES, text="Aim All Now")
+
+    def _draw_module(self, layout: bpy.types.UILayout, camera: bpy.types.Object) -> None:
+        module = camera.mphdrr_module
+        layout.label(text=camera.name, icon="OUTLINER_OB_CAMERA")
+        _draw_numbers(layout, module, mixed=())
+        for text in (module.problem, module.finding, "" if module.aimed else "Not aimed at the isocentre"):
+            if text:
+                _draw_text(layout, text)
+        _draw_readouts(
+            layout,
+            (
+                ("Distance b", f"{module.pinhole_distance:.2f} mm"),
+                ("Sensitivity", f"{module.sensitivity:.2f} cps/MBq"),
+                ("Resolution", f"{module.resolution:.2f} mm FWHM"),
+                ("Magnification", f"{module.magnification:.3f}"),
+                ("Radius seen", f"{module.roi_seen:.2f} mm"),
+                ("ROI", "seen whole" if readouts.covers_roi(module) else "not seen whole"),
+            ),
+        )
+
+
+class MPHDRR_PT_scanner_design(_Panel, bpy.types.Panel):
+    """All modules at once, checks, and the way back to the workbook."""
+
+    bl_idname = ids.PANEL_SCANNER_DESIGN
+    bl_parent_id = ids.PANEL_GEOMETRY
+    bl_label = "All Modules"
+
+    def draw(self, context: bpy.types.Context) -> None:
+        layout = self.layout
+        collection = scanner.active_scanner(context.scene)
+        if collection is None:
+            return
+        properties = collection.mphdrr_scanner
+        column = _draw_numbers(layout, properties, properties.mixed.split())
+        column.separator()
+        column.prop(properties, "plate_thickness", text="Plate (mm)")
+        column.prop(properties, "wall_thickness", text="Wall (mm)")
+        column.prop(properties, "intrinsic_fwhm", text="Crystal FWHM")
+        _draw_readouts(
+            layout,
+            (
+                ("Sensitivity", f"{properties.sensitivity:.1f} cps/MBq"),
+                ("Resolution", f"{properties.resolution:.2f} mm FWHM, mean"),
+                ("See the ROI", f"{properties.n_covering} of {properties.count} modules"),
+            ),
+        )
+        layout.operator(ids.CHECK_GEOMETRY, icon="CHECKMARK")
+        if properties.findings:
+            findings = json.loads(properties.findings)
+            if not findings:
+                layout.label(text="Nothing found", icon="CHECKMARK")
+            for text in findings[:_MOST_FINDINGS]:
+                _draw_text(layout, text)
+            if len(findings) > _MOST_FINDINGS:
+                layout.label(text=f"... and {len(findings) - _MOST_FINDINGS} more", icon="BLANK1")
+        row = layout.row()
+        row.operator_context = "INVOKE_DEFAULT"
+        row.operator(ids.EXPORT_GEOMETRY, text="Export Workbook", icon="EXPORT")
+
+
+def _draw_numbers(
+    layout: bpy.types.UILayout, numbers: bpy.types.PropertyGroup, mixed: tuple[str, ...] | list[str]
+) -> bpy.types.UILayout:
+    column = layout.column(align=True)
+    column.use_property_split = True
+    column.use_property_decorate = False
+    for name, label in _LABELS:
+        column.prop(numbers, name, text=_label(label, name in mixed))
+    column.row(align=True).prop(numbers, "length_mode", expand=True)
+    if numbers.length_mode == "TYPED":
+        column.prop(numbers, "collimator_length", text=_label("Length l", "collimator_length" in mixed))
+    elif "collimator_length" not in mixed:
+        row = column.row(align=True)
+        row.enabled = False  # it follows the others
+        row.prop(numbers, "collimator_length", text=_label("Length l", False))
+    return column
+
+
+def _label(text: str, is_mixed: bool) -> str:
+    return f"{text}, mixed" if is_mixed else f"{text} (mm)"
+
+
+def _draw_readouts(layout: bpy.types.UILayout, lines: tuple[tuple[str, str], ...]) -> None:
+    split = layout.box().split(factor=0.42)
+    names, values = split.column(align=True), split.column(align=True)
+    names.active = False
+    for name, value in lines:
+        names.label(text=name)
+        values.label(text=value)
+
+
+def _draw_text(layout: bpy.types.UILayout, text: str, width: int = 44) -> None:
+    """Text in lines that fit a narrow sidebar."""
+    lines = [""]
+    for word in text.split():
+        if lines[-1] and len(lines[-1]) + len(word) >= width:
+            lines.append("")
+        lines[-1] = f"{lines[-1]} {word}".strip()
+    column = layout.column(align=True)
+    for i, line in enumerate(lines):
+        column.label(text=line, icon="BLANK1" if i else "ERROR")

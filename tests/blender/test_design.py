@@ -1,0 +1,437 @@
+"""Live design: modules that are moved or changed follow with their shapes and readouts; copies; undo; speed."""
+
+from __future__ import annotations
+
+import time
+import warnings
+
+import bpy
+import numpy as np
+import pytest
+
+import mphdrr.core as mph
+from mphdrr.addon import cameras, copies, design, live, registration, scanner
+from mphdrr.addon.module_values import module_numbers
+from mphdrr.core.errors import InputError, InputWarning
+from mphdrr.core.system import PinholeSystem
+
+
+@pytest.fixture
+def roi_system(ring_system) -> PinholeSystem:
+    """`ring_system` with the lengths of the design formula."""
+    s = ring_system
+    l = mph.collimator_length(s.pinhole_distance, s.pinhole_diameter, s.detector_side, s.roi_radius)
+    return PinholeSystem(s.centers, s.pinhole_diameter, l, s.detector_side, s.detector_thickness, s.roi_radius)
+
+
+@pytest.fixture
+def collection(scene, roi_system):
+    made = scanner.build_scanner(scene, roi_system)
+    update()
+    return made
+
+
+def update() -> None:
+    bpy.context.view_layer.update()
+
+
+def part(camera: bpy.types.Object, name: str) -> bpy.types.Object:
+    return next(c for c in camera.children if c.mphdrr_module.part == name)
+
+
+def depth(camera: bpy.types.Object) -> tuple[float, float]:
+    z = [v.co.z for v in part(camera, "CRYSTAL").data.vertices]
+    return min(z), max(z)
+
+
+def assert_consistent(collection: bpy.types.Collection) -> None:
+    """Everything that is shown says what `read_scanner` says."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", InputWarning)
+        system = scanner.read_scanner(collection)
+    origin, intrinsic = np.zeros((1, 3)), collection.mphdrr_scanner.intrinsic_fwhm
+    counts = 1e6 * mph.sensitivity(system, origin)[0]
+    fwhm = mph.resolution(system, origin, intrinsic_fwhm=intrinsic)[0]
+    for m, camera in enumerate(scanner.modules(collection)):
+        module, l = camera.mphdrr_module, system.collimator_length[m]
+        assert module.pinhole_distance == pytest.approx(system.pinhole_distance[m], rel=1e-6)
+        assert module.sensitivity == pytest.approx(counts[m], rel=1e-6)
+        assert module.resolution == pytest.approx(fwhm[m], rel=1e-6)
+        assert module.magnification == pytest.approx(l / system.pinhole_distance[m], rel=1e-6)
+        assert module.collimator_length == pytest.approx(l, rel=1e-6)
+        assert camera.data.lens / camera.data.sensor_width == pytest.approx(l / system.detector_side[m], rel=1e-6)
+        assert depth(camera) == pytest.approx((l, l + system.detector_thickness[m]), rel=1e-6)
+        assert max(v.co.z for v in part(camera, "COLLIMATOR").data.vertices) == pytest.approx(l, rel=1e-6)
+    properties = collection.mphdrr_scanner
+    assert properties.count == len(system)
+    assert properties.sensitivity == pytest.approx(counts.sum(), rel=1e-6)
+    assert properties.resolution == pytest.approx(fwhm.mean(), rel=1e-6)
+
+
+def test_scanner_shows_what_it_does_as_soon_as_it_is_built(scene, collection, roi_system):
+    assert_consistent(collection)
+    properties = collection.mphdrr_scanner
+    assert properties.n_covering == 8 and properties.mixed == "collimator_length"
+    assert (properties.roi_radius, properties.length_mode) == (60.0, "FROM_ROI")
+    for camera in scanner.modules(collection):
+        assert camera.mphdrr_module.length_mode == "FROM_ROI"
+        assert camera.mphdrr_module.roi_seen == pytest.approx(60.0, rel=1e-6)
+    assert np.array_equal(scanner.read_scanner(collection).collimator_length, roi_system.collimator_length)
+
+
+def test_moved_module_stays_aimed_and_its_length_follows(collection, roi_system):
+    camera = scanner.module(collection, 3)
+    camera.location.z += 7.25
+    update()
+    assert_consistent(collection)
+    system = scanner.read_scanner(collection)  # with no warning: it is aimed
+    assert scanner.off_aim([camera]) == [] and camera.mphdrr_module.aimed
+    assert system.centers[2, :2].tolist() == roi_system.centers[2, :2].tolist(), "x and y were not touched"
+    assert system.centers[2, 2] == pytest.approx(roi_system.centers[2, 2] + 7.25, abs=1e-5)
+    b, d, side, roi = (system.pinhole_distance, system.pinhole_diameter, system.detector_side, system.roi_radius)
+    assert np.allclose(system.collimator_length, mph.collimator_length(b, d, side, roi), rtol=1e-12, atol=0)
+    others = np.arange(8) != 2
+    assert np.array_equal(system.collimator_length[others], roi_system.collimator_length[others])
+    camera.location = roi_system.centers[2]
+    update()
+    assert np.array_equal(scanner.read_scanner(collection).centers, roi_system.centers), "back in its place, exactly"
+    assert np.array_equal(scanner.read_scanner(collection).collimator_length, roi_system.collimator_length)
+
+
+def test_typed_numbers_are_the_decimals_that_were_typed(collection):
+    camera = scanner.module(collection, 1)
+    camera.mphdrr_module.pinhole_diameter = 2.7
+    camera.mphdrr_module.detector_thickness = 6.35
+    camera.location.x = 187.3
+    update()
+    numbers = module_numbers(camera)
+    assert (numbers.pinhole_diameter, numbers.detector_thickness, numbers.center[0]) == (2.7, 6.35, 187.3)
+    assert_consistent(collection)
+
+
+def test_typed_length_stays_until_it_comes_from_the_roi_again(collection):
+    camera = scanner.module(collection, 2)
+    module = camera.mphdrr_module
+    module.collimator_length = 61.7
+    assert module.length_mode == "TYPED"
+    camera.location.x *= 1.1
+    update()
+    assert module_numbers(camera).collimator_length == 61.7
+    assert module.roi_seen != pytest.approx(60.0, rel=1e-3)
+    assert_consistent(collection)
+    module.length_mode = "FROM_ROI"
+    assert module.roi_seen == pytest.approx(60.0, rel=1e-6)
+    assert_consistent(collection)
+
+
+def test_numbers_for_all_modules_at_once(collection):
+    properties = collection.mphdrr_scanner
+    scanner.module(collection, 5).mphdrr_module.pinhole_diameter = 3.1
+    assert properties.mixed.split() == ["pinhole_diameter", "collimator_length"]
+    before = properties.sensitivity
+    properties.pinhole_diameter = 4.6
+    system = scanner.read_scanner(collection)
+    assert system.pinhole_diameter.tolist() == [4.6] * 8
+    assert properties.mixed == "collimator_length"
+    assert 3.5 * before < properties.sensitivity < 4.0 * before
+    properties.roi_radius = 50.0
+    roi = next(o for o in collection.objects if o.mphdrr_module.part == "ROI")
+    assert max(v.co.length for v in roi.data.vertices) == pytest.approx(50.0, rel=1e-6)
+    properties.collimator_length = 55.5
+    assert properties.length_mode == "TYPED" and properties.mixed == ""
+    assert scanner.read_scanner(collection).collimator_length.tolist() == [55.5] * 8
+    properties.wall_thickness, properties.intrinsic_fwhm = 3.25, 1.75
+    collimator = part(scanner.module(collection, 8), "COLLIMATOR")
+    assert max(v.co.x for v in collimator.data.vertices) == pytest.approx(24.0 + 3.25)
+    assert_consistent(collection)
+
+
+def test_turning_is_left_to_the_user_and_moving_aims_again(collection):
+    camera = scanner.module(collection, 4)
+    camera.rotation_euler.y += 0.2
+    turned = camera.rotation_euler.copy()
+    update()
+    assert camera.rotation_euler == turned and not camera.mphdrr_module.aimed
+    camera.location.z += 1.0
+    update()
+    assert camera.mphdrr_module.aimed and scanner.off_aim([camera]) == []
+    collection.mphdrr_scanner.keep_aimed = False
+    rotation = camera.rotation_euler.copy()
+    camera.location.z += 1.0
+    update()
+    assert camera.rotation_euler == rotation and not camera.mphdrr_module.aimed
+    assert_consistent(collection)
+    bpy.ops.mphdrr.aim_modules()
+    assert camera.mphdrr_module.aimed
+
+
+def test_hidden_parented_and_animated_modules(scene, collection):
+    hidden = scanner.module(collection, 1)
+    hidden.mphdrr_module.visible = False
+    update()
+    hidden.location.z -= 9.0
+    update()
+    assert hidden.mphdrr_module.aimed
+    hidden.mphdrr_module.visible = True
+    update()
+    assert_consistent(collection)
+
+    bench = bpy.data.objects.new("Bench", None)
+    scene.collection.objects.link(bench)
+    for camera in scanner.modules(collection):
+        camera.parent = bench
+    update()
+    bench.location = (3.0, -2.0, 11.0)
+    bench.rotation_euler.z = 0.4
+    update()
+    assert scanner.off_aim(scanner.modules(collection)) == []
+    assert_consistent(collection)
+
+    animated = scanner.module(collection, 6)
+    animated.parent = None
+    animated.keyframe_insert("location", frame=1)
+    animated.location.x += 30.0
+    animated.keyframe_insert("location", frame=20)
+    scene.frame_set(1)
+    rotation = animated.rotation_euler.copy()
+    scene.frame_set(10)
+    update()
+    assert animated.rotation_euler == rotation and not animated.mphdrr_module.aimed
+    assert_consistent(collection)
+
+
+def test_nothing_is_done_when_something_else_moves_or_nothing_has_changed(scene, collection, monkeypatch):
+    calls = []
+    monkeypatch.setattr(design, "refresh", lambda *args, **kwargs: calls.append(args))
+    scene.objects["Cube"].location.x += 1.0
+    update()
+    assert calls == []
+    monkeypatch.undo()
+    seen = []
+    bpy.app.handlers.depsgraph_update_post.append(lambda scene, depsgraph: seen.append(len(depsgraph.updates)))
+    scanner.module(collection, 1).location.x += 1.0
+    update()
+    n = len(seen)
+    update()
+    update()
+    bpy.app.handlers.depsgraph_update_post.pop()
+    assert len(seen) <= n + 1, "what the handler writes does not call it for ever"
+
+
+def test_impossible_numbers_are_said_and_cured(collection):
+    camera = scanner.module(collection, 7)
+    module = camera.mphdrr_module
+    before = depth(camera)
+    module.pinhole_diameter = 500.0
+    assert "module 7" in module.problem and module.sensitivity == 0.0 and depth(camera) == before
+    module.pinhole_diameter = 2.5
+    assert module.problem == ""
+    camera.location = (20.0, 0.0, 10.0)
+    update()
+    assert "inside the ROI" in module.problem
+    with pytest.raises(InputError, match="module 7"):
+        scanner.read_scanner(collection)
+    camera.location = (0.0, 0.0, 0.0)
+    update()
+    assert module.problem
+    camera.location = (200.0, 0.0, 10.0)
+    collection.mphdrr_scanner.plate_thickness = 400.0
+    update()
+    assert "aperture plate" in module.problem
+    collection.mphdrr_scanner.plate_thickness = 2.0
+    assert module.problem == ""
+    assert_consistent(collection)
+
+
+def test_after_an_undo_everything_agrees_again(collection):
+    """Undo gives back the camera as it was, and may keep the meshes and the totals that followed it since."""
+    camera = scanner.module(collection, 2)
+    module = camera.mphdrr_module
+    names = [n for n in (p.identifier for p in module.bl_rna.properties) if n not in {"rna_type", "name", "visible"}]
+    kept = {n: getattr(module, n)[:] if n == "placed" else getattr(module, n) for n in names}
+    matrix = camera.matrix_basis.copy()
+    camera.location.x *= 1.2
+    module.detector_side = 40.0
+    update()
+    with design.writing():
+        camera.matrix_basis = matrix
+        for name, value in kept.items():
+            setattr(module, name, value)
+    assert depth(camera)[0] != pytest.approx(module.collimator_length, rel=1e-6)
+    live.after_undo()
+    assert_consistent(collection)
+
+
+def test_handlers_come_and_go_once(scene):
+    lists = {id(handlers): handlers for handlers, _ in registration.HANDLERS}.values()
+    before = [len(handlers) for handlers in lists]
+    registration.unregister()
+    assert [len(handlers) for handlers in lists] != before
+    registration.register()
+    assert [len(handlers) for handlers in lists] == before
+
+
+def test_blenders_own_duplicate_and_delete_are_tidied(collection):
+    update()
+    select(scanner.module(collection, 3))
+    bpy.ops.object.duplicate()
+    copy = bpy.context.view_layer.objects.active
+    copy.location.z += 40.0
+    update()
+    assert collection.mphdrr_scanner.untidy == "1 copied camera"
+    with pytest.raises(InputError, match="Tidy Modules"):
+        scanner.read_scanner(collection)
+    bpy.ops.mphdrr.tidy_modules()
+    assert collection.mphdrr_scanner.untidy == ""
+    system = scanner.read_scanner(collection)
+    assert system.numbers.tolist() == [1, 2, 3, 4, 5, 6, 7, 8, 9]
+    assert copy.name == "Module 09" and sorted(c.name for c in copy.children) == ["Collimator 09", "Crystal 09"]
+    assert copy.data.users == 1
+    assert_consistent(collection)
+    assert scanner.losses(collection) == ["module 9 added"]
+
+    select(scanner.module(collection, 5), *scanner.module(collection, 5).children)
+    bpy.ops.object.duplicate()
+    for item in bpy.context.selected_objects:
+        if item.parent is None:
+            item.location.z -= 35.0
+    update()
+    bpy.ops.mphdrr.tidy_modules()
+    assert_consistent(collection)
+    assert [len(c.children) for c in scanner.modules(collection)] == [2] * 10
+
+    n_meshes = len(bpy.data.meshes)
+    select(scanner.module(collection, 1))
+    bpy.ops.object.delete()
+    update()
+    assert collection.mphdrr_scanner.untidy == "2 parts without a camera"
+    bpy.ops.mphdrr.tidy_modules()
+    assert len(bpy.data.meshes) == n_meshes - 2
+
+    select(scanner.module(collection, 4))  # a copy whose original goes before it is tidied takes its place
+    bpy.ops.object.duplicate()
+    bpy.data.objects.remove(scanner.module(collection, 4))
+    update()
+    assert collection.mphdrr_scanner.untidy == "1 bare camera, 2 parts without a camera"
+    bpy.ops.mphdrr.tidy_modules()
+    assert [len(c.children) for c in scanner.modules(collection)] == [2] * 9
+    assert scanner.read_scanner(collection).numbers.tolist() == [2, 3, 4, 5, 6, 7, 8, 9, 10]
+    assert_consistent(collection)
+
+
+def select(*items: bpy.types.Object) -> None:
+    bpy.ops.object.select_all(action="DESELECT")
+    for item in items:
+        item.select_set(True)
+    bpy.context.view_layer.objects.active = items[0]
+
+
+def test_duplicates_stand_along_the_ring(collection, roi_system):
+    select(scanner.module(collection, 2), scanner.module(collection, 6))
+    assert bpy.ops.mphdrr.duplicate_modules(count=2, angle=np.radians(12.0)) == {"FINISHED"}
+    system = scanner.read_scanner(collection)
+    assert system.numbers.tolist() == list(range(1, 13))
+    for new, (old, step) in zip(range(8, 12), [(1, 1), (1, 2), (5, 1), (5, 2)], strict=True):
+        angle = np.radians(12.0) * step
+        c, s = np.cos(angle), np.sin(angle)
+        turned = np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]]) @ roi_system.centers[old]
+        assert np.allclose(system.centers[new], turned, atol=1e-6)
+        assert system.pinhole_distance[new] == pytest.approx(roi_system.pinhole_distance[old], abs=1e-6)
+    b, d, side, roi = (system.pinhole_distance, system.pinhole_diameter, system.detector_side, system.roi_radius)
+    assert np.allclose(system.collimator_length, mph.collimator_length(b, d, side, roi), rtol=1e-12, atol=0)
+    assert_consistent(collection)
+    with pytest.raises(RuntimeError, match="place of another module"):
+        bpy.ops.mphdrr.duplicate_modules(count=1, angle=0.0)
+
+    made = copies.duplicate(collection, [scanner.module(collection, 1)], 1, np.radians(30.0), follow_ring=True)
+    x, y, z = module_numbers(made[0]).center
+    radii = np.hypot(*roi_system.centers[:2, :2].T)
+    assert min(radii) < np.hypot(x, y) < max(radii) and z == pytest.approx(-30.0)
+    update()
+    assert_consistent(collection)
+
+
+def test_modules_are_removed_with_their_parts(collection):
+    marker = bpy.data.objects.new("Marker", None)
+    bpy.context.scene.collection.objects.link(marker)
+    marker.parent = scanner.module(collection, 8)
+    place = cameras.world_matrix(marker)
+    select(scanner.module(collection, 2), scanner.module(collection, 8))
+    bpy.ops.mphdrr.remove_modules()
+    assert scanner.read_scanner(collection).numbers.tolist() == [1, 3, 4, 5, 6, 7]
+    assert sum(o.type == "MESH" for o in collection.all_objects) == 13
+    assert np.allclose(cameras.world_matrix(marker), place, atol=1e-4)
+    assert_consistent(collection)
+    select(*scanner.modules(collection))
+    with pytest.raises(RuntimeError, match="at least one module"):
+        bpy.ops.mphdrr.remove_modules()
+
+
+def test_numbers_are_given_to_others(collection):
+    scanner.module(collection, 3).mphdrr_module.pinhole_diameter = 3.3
+    scanner.module(collection, 3).mphdrr_module.collimator_length = 58.2
+    select(scanner.module(collection, 3), scanner.module(collection, 7))
+    bpy.ops.mphdrr.set_numbers()
+    system = scanner.read_scanner(collection)
+    assert [m + 1 for m in range(8) if system.pinhole_diameter[m] == 3.3] == [3, 7]
+    assert [m + 1 for m in range(8) if system.collimator_length[m] == 58.2] == [3, 7]
+    bpy.ops.mphdrr.set_numbers(to_all=True)
+    assert scanner.read_scanner(collection).collimator_length.tolist() == [58.2] * 8
+    assert_consistent(collection)
+
+
+def test_check_marks_the_modules_until_something_changes(collection):
+    assert bpy.ops.mphdrr.check_geometry() == {"FINISHED"}
+    assert collection.mphdrr_scanner.findings == "[]"
+    second = scanner.module(collection, 2)
+    center = scanner.read_scanner(collection).centers[0]
+    second.location = center * 1.02 + [0.0, 0.0, 9.0]
+    update()
+    assert collection.mphdrr_scanner.findings == ""
+    bpy.ops.mphdrr.check_geometry()
+    assert "overlap" in collection.mphdrr_scanner.findings
+    marked = {c.mphdrr_module.number for c in scanner.modules(collection) if c.mphdrr_module.finding}
+    assert {1, 2} <= marked
+    assert {o.mphdrr_module.number for o in bpy.context.selected_objects} == marked
+    second.location.x += 1.0
+    update()
+    assert second.mphdrr_module.finding == "" and collection.mphdrr_scanner.findings == ""
+
+
+def test_files_with_shared_meshes_are_loaded(collection, tmp_path):
+    """As an older version saved them."""
+    cameras_ = scanner.modules(collection)
+    for camera in cameras_[1:]:
+        for name in ("COLLIMATOR", "CRYSTAL"):
+            part(camera, name).data = part(cameras_[0], name).data
+    path = str(tmp_path / "old.blend")
+    bpy.ops.wm.save_as_mainfile(filepath=path)
+    bpy.ops.wm.open_mainfile(filepath=path)
+    assert_consistent(scanner.active_scanner(bpy.context.scene))
+
+
+def test_one_module_follows_at_once_and_eighty_within_a_second(scene, dc_spect):
+    collection = scanner.build_scanner(scene, dc_spect)
+    update()
+    found = scanner.modules(collection)
+
+    def fastest(action, n: int = 3) -> float:
+        times = []
+        for _ in range(n):
+            start = time.perf_counter()
+            action()
+            times.append(time.perf_counter() - start)
+        return min(times)
+
+    def move(cameras_: list[bpy.types.Object]) -> None:
+        for camera in cameras_:
+            camera.location *= 1.001
+        update()
+
+    def all_holes() -> None:
+        collection.mphdrr_scanner.pinhole_diameter += 0.01
+        update()
+
+    assert fastest(lambda: move(found[:1])) < 0.02
+    assert fastest(lambda: move(found)) < 1.0
+    assert fastest(all_holes) < 1.0

@@ -1,0 +1,143 @@
+"""Scene -> workbook: what is written is what the scene says, and counts as saved."""
+
+from __future__ import annotations
+
+import shutil
+import warnings
+from pathlib import Path
+
+import bpy
+import numpy as np
+import pytest
+
+from mphdrr.addon import copies, scanner
+from mphdrr.core.errors import InputError, InputWarning
+from mphdrr.core.workbook import read_system
+
+LENGTHS = ("pinhole_diameter", "collimator_length", "detector_side", "detector_thickness", "roi_radius")
+
+
+@pytest.fixture
+def own(workbook, tmp_path) -> Path:
+    return Path(shutil.copy(workbook, tmp_path / "own.xlsx"))
+
+
+@pytest.fixture
+def collection(scene, own):
+    bpy.ops.mphdrr.import_geometry(filepath=str(own))
+    return scanner.active_scanner(scene)
+
+
+def assert_equal(one, other) -> None:
+    assert one.numbers.tolist() == other.numbers.tolist()
+    for name in ("centers", *LENGTHS):
+        assert np.allclose(getattr(one, name), getattr(other, name), rtol=1e-9, atol=1e-9), name
+
+
+def test_unchanged_scanner_writes_the_same_file(collection, own, tmp_path):
+    path = tmp_path / "again.xlsx"
+    assert bpy.ops.mphdrr.export_geometry(filepath=str(path)) == {"FINISHED"}
+    assert path.read_bytes() == own.read_bytes()
+    assert collection.mphdrr_scanner.workbook == str(path)
+
+
+def random_edits(rng: np.random.Generator, collection: bpy.types.Collection) -> None:
+    """What a user does in an afternoon: moves, numbers, copies, deletions."""
+    for _ in range(12):
+        found = scanner.modules(collection)
+        camera = found[rng.integers(len(found))]
+        module = camera.mphdrr_module
+        match rng.integers(7):
+            case 0:
+                camera.location = np.array(camera.location) * rng.uniform(0.95, 1.1) + rng.normal(size=3)
+            case 1:
+                module.pinhole_diameter = rng.uniform(1.0, 5.0)
+            case 2:
+                module.roi_radius = rng.uniform(60.0, 80.0)
+            case 3:
+                module.collimator_length = rng.uniform(40.0, 90.0)
+            case 4:
+                copies.duplicate(collection, [camera], 1, rng.uniform(0.01, 0.03), bool(rng.integers(2)))
+            case 5:
+                copies.remove(collection, [camera])
+            case 6:
+                module.detector_side, module.detector_thickness = rng.uniform(40.0, 60.0), rng.uniform(5.0, 12.0)
+        bpy.context.view_layer.update()
+
+
+@pytest.mark.parametrize("use_template", [True, False])
+@pytest.mark.parametrize("seed", range(3))
+def test_random_edits_come_back_from_the_workbook(scene, collection, tmp_path, seed, use_template):
+    rng = np.random.default_rng(seed)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", InputWarning)
+        for turn in range(2):  # the second time the first file is the template
+            random_edits(rng, collection)
+            system = scanner.read_scanner(collection)
+            path = tmp_path / f"{turn}.xlsx"
+            bpy.ops.mphdrr.export_geometry(filepath=str(path), use_template=use_template)
+            assert_equal(read_system(path), system)
+            assert_equal(scanner.read_scanner(collection), system)
+            assert scanner.losses(collection) == []
+            assert scanner.read_scanner(collection).source.path == path
+    bpy.ops.mphdrr.import_geometry(filepath=str(path), name=collection.mphdrr_scanner.scanner_name)
+    assert_equal(scanner.read_scanner(collection), system)
+
+
+def test_modules_keep_the_order_of_the_workbook_and_added_ones_come_last(collection, tmp_path):
+    copies.duplicate(collection, [scanner.module(collection, 5)], 1, 0.02, follow_ring=False)
+    copies.remove(collection, [scanner.module(collection, 2)])
+    bpy.ops.mphdrr.export_geometry(filepath=str(tmp_path / "a.xlsx"))
+    assert read_system(tmp_path / "a.xlsx").numbers.tolist() == [1, *range(3, 82)]
+    assert not scanner.module(collection, 81).mphdrr_module.added
+
+
+def test_camera_off_aim_is_refused_by_its_number(collection, own, tmp_path):
+    before = own.read_bytes()
+    scanner.module(collection, 7).rotation_euler.y += 0.1
+    with pytest.raises(RuntimeError, match=r"module 7 not aimed at the isocentre.*Aim at Isocentre"):
+        bpy.ops.mphdrr.export_geometry(filepath=str(own))
+    assert own.read_bytes() == before
+    bpy.ops.mphdrr.aim_modules()
+    bpy.ops.mphdrr.export_geometry(filepath=str(own))
+    assert_equal(read_system(own), scanner.read_scanner(collection))
+
+
+def test_moved_and_exported_at_once(collection, tmp_path):
+    """A script that does not update the view layer first: the module is aimed all the same."""
+    scanner.module(collection, 12).location.z += 2.5
+    bpy.ops.mphdrr.export_geometry(filepath=str(tmp_path / "moved.xlsx"))
+    moved = read_system(tmp_path / "moved.xlsx")
+    assert_equal(moved, scanner.read_scanner(collection))
+    assert moved.centers[11, 2] == pytest.approx(read_system(tmp_path / "own.xlsx").centers[11, 2] + 2.5, abs=1e-5)
+
+
+def test_template_that_has_gone_is_said(collection, own, tmp_path):
+    own.unlink()
+    scanner.module(collection, 3).mphdrr_module.pinhole_diameter = 2.9
+    system = scanner.read_scanner(collection)
+    from mphdrr.addon.geometry_file import export_scanner
+
+    with pytest.warns(InputWarning, match=r"own\.xlsx has gone"):
+        export_scanner(collection, tmp_path / "new.xlsx")
+    assert_equal(read_system(tmp_path / "new.xlsx"), system)
+
+
+@pytest.mark.parametrize("name", ["", "no/such/folder.xlsx", "wrong.ods"])
+def test_bad_paths_are_one_line_and_leave_the_scanner(collection, own, tmp_path, name):
+    source = collection.mphdrr_scanner.source
+    with pytest.raises(RuntimeError) as error:
+        bpy.ops.mphdrr.export_geometry(filepath=str(tmp_path / name) if name else "")
+    assert "Traceback" not in str(error.value) and len(str(error.value).strip().splitlines()) == 1
+    assert collection.mphdrr_scanner.source == source
+
+
+def test_changed_scanner_can_be_read_again_after_saving(scene, collection, tmp_path):
+    scanner.module(collection, 9).location.x += 4.0
+    bpy.context.view_layer.update()
+    with pytest.raises(InputError, match="module 9 moved"):
+        scanner.build_scanner(scene, read_system(tmp_path / "own.xlsx"), "own")
+    path = tmp_path / "saved.xlsx"
+    bpy.ops.mphdrr.export_geometry(filepath=str(path))
+    scanner.build_scanner(scene, read_system(path), "own")
+    assert_equal(scanner.read_scanner(collection), read_system(path))

@@ -145,7 +145,7 @@ def chosen_model(settings: dict[str, Any], system: PinholeSystem, mu: Volume | N
 
 
 def _is_ours(self: ProjectionProperties, item: bpy.types.Object) -> bool:
-    return volumes.is_volume(item)
+    return volumes.can_be_projected(item)
 
 
 def _is_mu(self: ProjectionProperties, item: bpy.types.Object) -> bool:

@@ -9,10 +9,12 @@ import bpy
 
 from ..operators import (
     add_derenzo,
+    add_map,
     aim_modules,
     check_geometry,
     duplicate_modules,
     export_dataset,
+    export_for_program,
     export_geometry,
     import_geometry,
     remove_modules,
@@ -40,6 +42,8 @@ CLASSES: tuple[type, ...] = (
     set_numbers.MPHDRR_OT_set_numbers,
     check_geometry.MPHDRR_OT_check_geometry,
     export_geometry.MPHDRR_OT_export_geometry,
+    export_for_program.MPHDRR_OT_export_for_program,
+    add_map.MPHDRR_OT_add_map,
     add_derenzo.MPHDRR_OT_add_derenzo,
     add_derenzo.MPHDRR_OT_update_derenzo,
     render_projections.MPHDRR_OT_render_projections,
@@ -62,6 +66,7 @@ CLASSES: tuple[type, ...] = (
 MENUS: tuple[tuple[Any, Any], ...] = (
     (bpy.types.TOPBAR_MT_file_import, import_geometry.draw_menu),
     (bpy.types.TOPBAR_MT_file_export, export_geometry.draw_menu),
+    (bpy.types.TOPBAR_MT_file_export, export_for_program.draw_menu),
     (bpy.types.TOPBAR_MT_file_export, export_dataset.draw_menu),
     (bpy.types.VIEW3D_MT_volume_add, add_derenzo.draw_menu),
 )

@@ -21,6 +21,7 @@ from ..core.errors import InputError
 from ..core.files import replacing
 from ..core.frames import checked_affine
 from ..core.grid import Grid
+from ..core.maps import MAPS
 from ..core.memory import require
 from ..core.version import VERSION
 from ..core.volume import UNITS, Volume
@@ -202,6 +203,11 @@ def pose_of_object(item: bpy.types.Object) -> NDArray[np.float64]:
 def is_volume(item: bpy.types.Object | None) -> bool:
     """Whether an object is one of our volumes."""
     return item is not None and item.type == "VOLUME" and getattr(item, ids.OBJECT_VOLUME).is_volume
+
+
+def can_be_projected(item: bpy.types.Object | None) -> bool:
+    """Whether an object is a volume of matter or activity, not a map of the scanner."""
+    return is_volume(item) and getattr(item, ids.OBJECT_VOLUME).quantity not in MAPS
 
 
 def volume_objects(scene: bpy.types.Scene) -> list[bpy.types.Object]:

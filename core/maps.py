@@ -141,6 +141,16 @@ def completeness_map(
     return _map(system, grid, "completeness", share, progress)
 
 
+def within_roi(volume: Volume, system: PinholeSystem) -> Volume:
+    """A map with 0 in voxels whose centres lie outside the largest ROI sphere: what the scanner is designed for."""
+    squares = np.zeros(volume.grid.shape)
+    axes = np.ogrid[tuple(slice(n) for n in volume.grid.shape)]
+    for row in volume.grid.affine[:3]:
+        squares += (sum(a * x for a, x in zip(row[:3], axes, strict=True)) + row[3]) ** 2
+    inside = squares <= system.roi_radius.max() ** 2
+    return Volume(freeze(np.where(inside, volume.array, np.float32(0))), volume.grid, volume.quantity)
+
+
 def _map(
     system: PinholeSystem, grid: Grid, quantity: str, value: Callable[[Array], Array], progress: Progress | None
 ) -> Volume:
@@ -156,3 +166,12 @@ def _map(
 
     in_threads(fill, range(0, grid.n_voxels, size), progress)
     return Volume(freeze(values.reshape(grid.shape)), grid, quantity)
+
+
+MAPS: dict[str, Callable[..., Volume]] = {
+    "sensitivity": sensitivity_map,
+    "modules": modules_map,
+    "resolution": resolution_map,
+    "completeness": completeness_map,
+}
+"""The maps by their quantity."""

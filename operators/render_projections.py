@@ -124,7 +124,7 @@ def _range(system: PinholeSystem, first: int, last: int) -> PinholeSystem:
 
 def _chosen_volume(context: bpy.types.Context, name: str, quantity: str | None) -> bpy.types.Object:
     """The volume named, else the panel's, else the active one, else the only one; if unnamed, one of a quantity if given."""
-    known = volumes.volume_objects(context.scene)
+    known = [item for item in volumes.volume_objects(context.scene) if volumes.can_be_projected(item)]
     if name:
         return _named(known, name)
     fitting = [item for item in known if quantity in (None, getattr(item, ids.OBJECT_VOLUME).quantity)]

@@ -9,7 +9,7 @@ import json
 
 import bpy
 
-from ..addon import ids, readouts, scanner, selection
+from ..addon import ids, jobs, readouts, scanner, selection
 
 _LABELS = (
     ("pinhole_diameter", "Hole d"),
@@ -119,9 +119,14 @@ class MPHDRR_PT_scanner_design(_Panel, bpy.types.Panel):
                 _draw_text(layout, text)
             if len(findings) > _MOST_FINDINGS:
                 layout.label(text=f"... and {len(findings) - _MOST_FINDINGS} more", icon="BLANK1")
-        row = layout.row()
-        row.operator_context = "INVOKE_DEFAULT"
-        row.operator(ids.EXPORT_GEOMETRY, text="Export Workbook", icon="EXPORT")
+        column = layout.column(align=True)
+        column.operator_context = "INVOKE_DEFAULT"
+        column.operator_menu_enum(ids.ADD_MAP, "quantity", text="Add Map", icon="OUTLINER_DATA_VOLUME")
+        jobs.draw_job(column, context)
+        column = layout.column(align=True)
+        column.operator_context = "INVOKE_DEFAULT"
+        column.operator(ids.EXPORT_GEOMETRY, text="Export Workbook", icon="EXPORT")
+        column.operator(ids.EXPORT_FOR_PROGRAM, text="Export for a Program", icon="EXPORT")
 
 
 def _draw_numbers(

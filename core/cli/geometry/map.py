@@ -9,15 +9,13 @@ import numpy as np
 
 from ...checks import whole_shape
 from ...grid import Grid
-from ...maps import completeness_map, modules_map, resolution_map, sensitivity_map
+from ...maps import MAPS
 from ...system import PinholeSystem
 from ...volume import Volume
 from ...volume_io import VOLUME_FORMATS, write_volume
 from ...workbook import read_system
 from ..options import add_command, chosen_modules, one_or_three, output_path, progress_bar
 from .arguments import add_materials, add_workbook, resolution_settings, sensitivity_settings
-
-QUANTITIES = ("sensitivity", "modules", "resolution", "completeness")
 
 
 def add_parser(actions) -> None:  # type: ignore[no-untyped-def]
@@ -29,7 +27,7 @@ def add_parser(actions) -> None:  # type: ignore[no-untyped-def]
         "mphdrr geometry map scanner.xlsx --quantity sensitivity --voxels 64 --spacing 3 -o sensitivity.nii.gz",
     )
     parser.add_argument(
-        "--quantity", choices=QUANTITIES, default="sensitivity",
+        "--quantity", choices=MAPS, default="sensitivity",
         help="counts per decay; number of modules that see the voxel; expected FWHM, mm; completeness of the angular "
         "sampling, 1 where every plane through the voxel meets a pinhole that sees it",
     )  # fmt: skip
@@ -62,13 +60,10 @@ def _run(arguments: argparse.Namespace) -> None:
 
 
 def _map(arguments: argparse.Namespace, system: PinholeSystem, grid: Grid) -> Volume:
-    progress = progress_bar("mapping")
-    if arguments.quantity == "sensitivity":
-        return sensitivity_map(system, grid, **sensitivity_settings(arguments), progress=progress)
-    if arguments.quantity == "modules":
-        return modules_map(system, grid, progress=progress)
-    if arguments.quantity == "resolution":
-        return resolution_map(
-            system, grid, **resolution_settings(arguments), crystal_mu=arguments.crystal_mu, progress=progress
-        )
-    return completeness_map(system, grid, progress=progress)
+    settings = {
+        "sensitivity": sensitivity_settings(arguments),
+        "resolution": {**resolution_settings(arguments), "crystal_mu": arguments.crystal_mu},
+    }
+    return MAPS[arguments.quantity](
+        system, grid, **settings.get(arguments.quantity, {}), progress=progress_bar("mapping")
+    )

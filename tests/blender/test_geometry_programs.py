@@ -1,0 +1,48 @@
+"""The scene's scanner for other programs."""
+
+from __future__ import annotations
+
+import bpy
+import numpy as np
+import pytest
+
+from mphdrr.addon import scanner
+from mphdrr.core.geometry_export import FORMATS, read_geometry
+
+ONE_RING_ONLY = ("pytomography", "stir")
+
+
+@pytest.fixture
+def collection(scene, workbook):
+    bpy.ops.mphdrr.import_geometry(filepath=str(workbook))
+    return scanner.active_scanner(scene)
+
+
+@pytest.mark.parametrize("name", FORMATS)
+def test_every_format(collection, name, tmp_path):
+    path = tmp_path / f"scanner{(FORMATS[name].suffixes or ('',))[0]}"
+    if name in ONE_RING_ONLY:
+        with pytest.raises(RuntimeError, match="ring|circle"):
+            bpy.ops.mphdrr.export_for_program(format=name, filepath=str(path))
+        assert not list(tmp_path.iterdir())
+        return
+    assert bpy.ops.mphdrr.export_for_program(format=name, filepath=str(path)) == {"FINISHED"}
+    files = list(path.iterdir()) if path.is_dir() else [path]
+    assert files and all(file.stat().st_size > 0 for file in files)
+
+
+def test_it_is_the_scene_as_it_stands(collection, scene, tmp_path):
+    scanner.module(collection, 3).location[0] += 5.0
+    scene.mphdrr_projections.width, scene.mphdrr_projections.height = 40, 30
+    path = tmp_path / "record.json"
+    bpy.ops.mphdrr.export_for_program(format="mphdrr", filepath=str(path))
+    system, views = read_geometry(path)
+    assert np.array_equal(system.centers, scanner.read_scanner(collection).centers)
+    assert views.shape == (30, 40)
+
+
+def test_refuses_a_camera_that_is_off_aim(collection, tmp_path):
+    collection.mphdrr_scanner.keep_aimed = False
+    scanner.module(collection, 7).rotation_euler[1] += 0.1
+    with pytest.raises(RuntimeError, match="module 7"):
+        bpy.ops.mphdrr.export_for_program(format="astra", filepath=str(tmp_path / "a.npz"))

@@ -28,7 +28,7 @@ class Package:
 
     def __init__(self, content: bytes, name: str) -> None:
         self.name = name
-        self._content = content
+        self.content = content
         self._archive = zipfile.ZipFile(io.BytesIO(content))
         self._members = {info.filename: info for info in self._archive.infolist()}
         self._by_folded_name = {name.casefold(): name for name in self._members}
@@ -97,7 +97,7 @@ class Package:
     def to_bytes(self) -> bytes:
         """The archive: the members that were not replaced have the bytes, order, dates and attributes they had."""
         if not self._replaced:
-            return self._content
+            return self.content
         out = io.BytesIO()
         with zipfile.ZipFile(out, "w") as new, warnings.catch_warnings():
             warnings.simplefilter("ignore")  # zipfile's, of names that are there twice

@@ -177,7 +177,7 @@ class _Edit:
                 f"{file}: sheet {sheet} has no column of the modules' numbers: {_several(numbers)} will be read as "
                 "1, 2, ... in the order of their rows",
                 InputWarning,
-                stacklevel=5,
+                stacklevel=4,
             )
         if "l" not in self.columns:
             differing = np.flatnonzero(~is_by_design(self.system))
@@ -237,7 +237,7 @@ class _Edit:
             table = arrangement.table
             if table is self.modules.table or self.numbered:
                 own = self.modules if table is self.modules.table else dimension_rows(table)
-                numbers = enumerate(self.system.numbers)
+                numbers: Iterable[tuple[int, int]] = enumerate(self.system.numbers)
             else:  # a table whose numbers mean nothing, but must be there
                 own = dimension_rows(table)
                 added = [i for i, j in enumerate(self.old_of) if j is None]
@@ -351,7 +351,7 @@ class _Edit:
                 f"{self.workbook.name}: {_several(found)} end at row {max(old)} of sheet {name}, so the modules added "
                 "below are left out there",
                 InputWarning,
-                stacklevel=5,
+                stacklevel=4,
             )
 
 

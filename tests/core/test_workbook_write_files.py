@@ -157,6 +157,7 @@ def test_of_a_changed_sheet_only_the_changed_cells_differ(rich, tmp_path):
         assert {f"{sheet}!{name.decode()}" for name in old if old[name] != new[name]} <= touched
 
 
+@pytest.mark.filterwarnings("ignore::mphdrr.core.errors.InputWarning")
 def test_charts_and_names_that_leave_added_modules_out_are_warned_of(rich, tmp_path):
     system = read_quietly(rich)
     with pytest.warns(mph.InputWarning, match=r"all_x, the chart xl/charts/chart1.xml, .* end at row 6 of"):

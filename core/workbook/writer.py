@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import os
 import warnings
 from collections import defaultdict
@@ -134,6 +135,10 @@ class _Edit:
         Cells on which others may depend.
     required : dict
         Place -> the number that it must have.
+    settled : set of places
+        Those of them that had it when the workbook was read.
+    module_numbers : set of places
+        Those of them that hold modules' numbers.
     numbered : bool
         Whether the workbook has the modules' numbers.
     """
@@ -145,6 +150,7 @@ class _Edit:
         self.old_of = matched(system, self.old, self.numbered)
         self.required: dict[Place, float] = {}
         self.settled: set[Place] = set()
+        self.module_numbers: set[Place] = set()
         self.changed: list[Place] = []
 
     def apply(self) -> None:
@@ -160,10 +166,8 @@ class _Edit:
         for place, number in self.required.items():
             self._type(place, number)
         self._type_derived()
-        formulas = [
-            p for p in self.required if self.workbook.cell(p).formula is not None or self.workbook.cell(p).array
-        ]
-        self.changed = [*self.workbook.changed, *(place for place in formulas if place not in self.settled)]
+        # A typed number that had to change is among the workbook's changed cells; of a formula it is to be seen.
+        self.changed = list(dict.fromkeys([*self.workbook.changed, *self.required.keys() - self.settled]))
         for arrangement in self.arrangements.values():
             if arrangement.added:
                 self._warn_of_short_ranges(arrangement)
@@ -176,7 +180,7 @@ class _Edit:
                 f"{file}: sheet {sheet} has no column of the modules' numbers: {_several(numbers)} will be read as "
                 "1, 2, ... in the order of their rows",
                 InputWarning,
-                stacklevel=5,
+                stacklevel=4,
             )
         if "l" not in self.columns:
             differing = np.flatnonzero(~is_by_design(self.system))
@@ -217,17 +221,12 @@ class _Edit:
             for name, column in self.columns.items()
             if column.table.sheet is table.sheet and self._is_shared(name)
         ]
-        own = {*old}
-        known = [row_of.get(int(number)) for number in self.system.numbers]
-        return arrange(
-            table,
-            tuple(old),
-            self.old_of,
-            filled_to=last,
-            number_column=number_column,
-            kept_columns=shared,
-            known=[None if row in own else row for row in known],
-        )
+        old = tuple(old)
+        own: list[int | None] = []
+        for number, j in zip(self.system.numbers, self.old_of, strict=True):
+            row = row_of.get(int(number))  # of a module that had no coordinates
+            own.append(old[j] if j is not None else None if row in old else row)
+        return arrange(table, old, own, filled_to=last, number_column=number_column, kept_columns=shared)
 
     def _is_shared(self, name: str) -> bool:
         """Whether one cell holds a quantity of all modules."""
@@ -239,13 +238,17 @@ class _Edit:
     def _require_numbers(self) -> None:
         for name, arrangement in self.arrangements.items():
             table = arrangement.table
-            is_modules = table is self.modules.table
-            column = self.modules.number_column if is_modules else dimension_rows(table).number_column
-            if column is None or (not is_modules and not self.numbered):
-                continue
-            for i, row in enumerate(arrangement.rows):
-                number = int(self.system.numbers[i])
-                self._demand((name, row, column), number, self._was(i, self.old.numbers))
+            if table is self.modules.table or self.numbered:
+                own = self.modules if table is self.modules.table else dimension_rows(table)
+                numbers: Iterable[tuple[int, int]] = enumerate(self.system.numbers)
+            else:  # a table whose numbers mean nothing, but must be there
+                own = dimension_rows(table)
+                added = [i for i, j in enumerate(self.old_of) if j is None]
+                numbers = zip(added, itertools.count(max(own.numbers or (0,)) + 1), strict=False)
+            if own.number_column is not None:
+                for i, number in numbers:
+                    place = (name, arrangement.rows[i], own.number_column)
+                    self._demand_number(place, number, self._was(i, self.old.numbers))
 
     def _require(self, name: str) -> None:
         column = self.columns[name]
@@ -280,7 +283,7 @@ class _Edit:
                 if i and place not in self.required:
                     sheet.copy_row(sheet.cell((first, c)).typed(None), (first, c), (row, c))
             if rows.number_column is not None:
-                self._demand((table.sheet.name, row, rows.number_column), float(self.system.numbers[i]), None)
+                self._demand_number((table.sheet.name, row, rows.number_column), self.system.numbers[i], None)
         return found
 
     def _require_lengths(self) -> None:
@@ -306,22 +309,20 @@ class _Edit:
         if was is not None and agree(float(was), number):
             self.settled.add(place)
 
+    def _demand_number(self, place: Place, number: int, was: float | None) -> None:
+        self._demand(place, float(number), was)
+        self.module_numbers.add(place)
+
     def _type(self, place: Place, number: float) -> None:
         cell = self.workbook.cell(place)
         if cell.formula is not None or cell.array is not None:
             return
-        is_number = place[2] in self._number_columns(place[0])
-        same = module_number(cell.value) == number if is_number else type(cell.value) is float and cell.value == number
+        if place in self.module_numbers:
+            same = module_number(cell.value) == number  # which may be a text
+        else:
+            same = type(cell.value) is float and cell.value == number
         if not same:
-            self.workbook.sheets[place[0]].type(place[1:], float(number))
-
-    def _number_columns(self, sheet: str) -> set[int]:
-        own = self.modules
-        tables = [self.columns[name].table for name in DIMENSIONS if self.columns[name].table.sheet.name == sheet]
-        found = {dimension_rows(table).number_column for table in tables if table is not own.table}
-        if own.table.sheet.name == sheet:
-            found.add(own.number_column)
-        return found - {None}  # type: ignore[return-value]
+            self.workbook.sheets[place[0]].type(place[1:], number)
 
     def _type_derived(self) -> None:
         """Derived numbers (b, H, x2, ..., azimuth) that are typed in: as the formulas give them, where that changed."""
@@ -351,7 +352,7 @@ class _Edit:
                 f"{self.workbook.name}: {_several(found)} end at row {max(old)} of sheet {name}, so the modules added "
                 "below are left out there",
                 InputWarning,
-                stacklevel=5,
+                stacklevel=4,
             )
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import shutil
 import uuid
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
@@ -43,6 +44,8 @@ def replacing(path: str | os.PathLike[str]) -> Iterator[Path]:
             pass
         temporary.unlink()
         yield temporary
+        if target.exists():
+            shutil.copymode(target, temporary)
         _to_disk(temporary)
         os.replace(temporary, target)
         with suppress(OSError):  # Windows opens no folders, some disks don't know the request

@@ -17,9 +17,11 @@ from .workbook_xml import WorkbookXml
 def matched(system: PinholeSystem, old: PinholeSystem, numbered: bool) -> list[int | None]:
     """The module of `old` that each of `system` is, None for a new one.
 
-    They go by their numbers; those left over, if renumbered, by the pinhole's exact place. In a workbook without
-    numbers that could not have been the system's, they go by their order.
+    They go by their numbers; those left over, if renumbered, by the pinhole's exact place. They go by their order
+    where all pinholes are where they were, and in a workbook without numbers if the system has other numbers.
     """
+    if np.array_equal(system.centers, old.centers):
+        return list(range(len(old)))
     index = {int(number): j for j, number in enumerate(old.numbers)}
     numbers = [int(number) for number in system.numbers]
     if not numbered and not set(numbers) <= set(index):
@@ -39,8 +41,8 @@ class Arrangement:
     table : Table
     old : tuple of int
         The row of each module of the workbook.
-    old_of : tuple of int or None
-        The workbook's module that each module of the system is.
+    own : tuple of int or None
+        The row that each module of the system has, None for a new one.
     rows : tuple of int
         The row that each module of the system is to have.
     columns : tuple of int
@@ -49,7 +51,7 @@ class Arrangement:
 
     table: Table
     old: tuple[int, ...]
-    old_of: tuple[int | None, ...]
+    own: tuple[int | None, ...]
     rows: tuple[int, ...]
     columns: tuple[int, ...]
 
@@ -61,13 +63,13 @@ class Arrangement:
     @property
     def added(self) -> list[int]:
         """The rows that held no module."""
-        return [row for row in self.rows if row not in set(self.old)]
+        return [row for row in self.rows if row not in {*self.old, *self.own}]
 
     def source(self, i: int) -> int:
         """The row that a module's cells come from: its own, or, for a new one, that whose formulas it takes."""
-        j, row = self.old_of[i], self.rows[i]
-        if j is not None:
-            return self.old[j]
+        own, row = self.own[i], self.rows[i]
+        if own is not None:
+            return own
         return row if row in set(self.old) else self.model
 
     def apply(self, workbook: WorkbookXml) -> None:
@@ -78,28 +80,26 @@ class Arrangement:
         """
         sheet = workbook.sheets[self.table.sheet.name]
         self._refuse_occupied(sheet)
-        before = {row: [sheet.cells.get((row, column)) for column in self.columns] for row in {*self.old, *self.rows}}
-        for row in set(self.old) - set(self.rows):
-            self._empty(sheet, row)
+        held = {*self.old, *(row for row in self.own if row is not None)}
+        before = {row: [sheet.cells.get((row, column)) for column in self.columns] for row in held}
+        for row in held.difference(self.rows):
+            for column in self.columns:
+                self._empty(sheet, (row, column))
         for i, row in enumerate(self.rows):
             source = self.source(i)
-            if self.old_of[i] is not None and source == row:
+            if self.own[i] == row:
                 continue
             for column, cell in zip(self.columns, before[source], strict=True):
                 at, start = (row, column), (source, column)
                 if cell is None:
-                    self._empty_cell(sheet, at)
+                    self._empty(sheet, at)
                     continue
                 sheet.refuse_array(start)
                 sheet.refuse_array(at)
                 typed = cell.formula is None
-                sheet.copy_row(cell.typed(None) if typed and self.old_of[i] is None else cell, start, at)
+                sheet.copy_row(cell.typed(None) if typed and self.own[i] is None else cell, start, at)
 
-    def _empty(self, sheet: SheetXml, row: int) -> None:
-        for column in self.columns:
-            self._empty_cell(sheet, (row, column))
-
-    def _empty_cell(self, sheet: SheetXml, at: tuple[int, int]) -> None:
+    def _empty(self, sheet: SheetXml, at: tuple[int, int]) -> None:
         if not sheet.cell(at).blank:
             sheet.type(at, None)
 
@@ -118,12 +118,11 @@ class Arrangement:
 def arrange(
     table: Table,
     old: Sequence[int],
-    old_of: Sequence[int | None],
+    own: Sequence[int | None],
     *,
     filled_to: int,
     number_column: int | None,
     kept_columns: Sequence[int],
-    known: Sequence[int | None],
 ) -> Arrangement:
     """The rows that the modules are to have in `table`: those they have, if that is their order.
 
@@ -131,31 +130,29 @@ def arrange(
     ----------
     old
         The row of each module of the workbook.
-    old_of
-        The workbook's module that each of the system is, None for a new one.
+    own
+        The row of each module of the system, None for a new one.
     filled_to
         The table's last row.
     number_column
         The column of the modules' numbers.
     kept_columns
         Columns with one value for all modules, in the first row: they don't go with it.
-    known
-        The row that `table` has for a module which is new in the coordinates' table.
     """
-    wanted: list[int | None] = [known[i] if j is None else old[j] for i, j in enumerate(old_of)]
-    missing = wanted.count(None)
-    kept = sorted(row for row in wanted if row is not None)
+    kept = sorted(row for row in own if row is not None)
+    missing = len(own) - len(kept)
     last = max(kept, default=min(old) - 1)
-    free = [row for row in sorted(old) if row > last] + [max(filled_to, max(old)) + n for n in range(1, missing + 1)]
-    slots = kept + free[:missing]
-    if kept_columns and min(old) not in slots:
-        wanted = [min(old) if row == slots[0] else row for row in wanted]
-        slots[0] = min(old)
-    in_order = list(old) == sorted(old) and not any(row is not None for row in known)
+    below = max(filled_to, *old)
+    free = [row for row in sorted(old) if row > last] + list(range(below + 1, below + missing + 1))
     added = iter(free)
-    rows = sorted(slots) if in_order else [next(added) if row is None else row for row in wanted]
+    wanted = [next(added) if row is None else row for row in own]
+    if kept_columns and min(old) not in wanted:
+        wanted[wanted.index(min(wanted))] = min(old)
+    # Rows in another order than the coordinates' go by their numbers, and stay.
+    in_order = list(old) == sorted(old) and set(own) <= {*old, None}
+    rows = sorted(wanted) if in_order else wanted
     columns = tuple(column for column in _columns(table, old, number_column) if column not in set(kept_columns))
-    return Arrangement(table, tuple(old), tuple(old_of), tuple(rows), columns)
+    return Arrangement(table, tuple(old), tuple(own), tuple(rows), columns)
 
 
 def _columns(table: Table, rows: Sequence[int], number_column: int | None) -> list[int]:

@@ -13,6 +13,7 @@ import operator
 import statistics
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Any
 
 from .references import reference
@@ -98,13 +99,14 @@ def _result(formula: str, surroundings: Surroundings) -> Any:
         return error.args[0]
 
 
-def tokens_of(formula: str) -> list[Any]:
+@lru_cache(maxsize=2**15)  # asked for twice: what a formula refers to, and what it gives
+def tokens_of(formula: str) -> tuple[Any, ...]:
     """The tokens (`openpyxl.formula.tokenizer.Token`) of `formula`, which begins with "="; `NotComputable` if bad."""
     from openpyxl.formula import Tokenizer
     from openpyxl.formula.tokenizer import TokenizerError
 
     try:
-        return [token for token in Tokenizer(formula).items if token.type != "WHITE-SPACE"]
+        return tuple(token for token in Tokenizer(formula).items if token.type != "WHITE-SPACE")
     except (TokenizerError, IndexError) as error:  # the latter where a parenthesis closes nothing
         raise NotComputable("it is not a formula") from error
 
@@ -407,7 +409,7 @@ def _parsed(formula: str, surroundings: Surroundings) -> _Term:
 
 
 class _Parser:
-    def __init__(self, tokens: list[Any], surroundings: Surroundings) -> None:
+    def __init__(self, tokens: tuple[Any, ...], surroundings: Surroundings) -> None:
         self.tokens = tokens
         self.surroundings = surroundings
         self.at = 0

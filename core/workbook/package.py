@@ -8,6 +8,7 @@ import posixpath
 import re
 import warnings
 import zipfile
+from collections.abc import Callable
 
 from ..errors import InputError
 from .xml_parts import elements, spliced, utf8
@@ -28,7 +29,7 @@ class Package:
 
     def __init__(self, content: bytes, name: str) -> None:
         self.name = name
-        self._content = content
+        self.content = content
         self._archive = zipfile.ZipFile(io.BytesIO(content))
         self._members = {info.filename: info for info in self._archive.infolist()}
         self._by_folded_name = {name.casefold(): name for name in self._members}
@@ -85,11 +86,12 @@ class Package:
         """Take out `part`, the relationship that `owner` has to it, and its content type."""
         folder, base = posixpath.split(owner)
         rels = posixpath.join(folder, "_rels", f"{base}.rels")
-        self._cut(rels, "Relationship", lambda attributes: _member(folder, attributes.get("Target", "")) == part)
-        self._cut(_CONTENT_TYPES, "Override", lambda attributes: attributes.get("PartName", "").lstrip("/") == part)
+        same = part.casefold()
+        self._cut(rels, "Relationship", lambda of: _member(folder, of.get("Target", "")).casefold() == same)
+        self._cut(_CONTENT_TYPES, "Override", lambda of: of.get("PartName", "").lstrip("/").casefold() == same)
         self._removed.add(self._by_folded_name[part.casefold()])
 
-    def _cut(self, name: str, element: str, is_meant) -> None:  # type: ignore[no-untyped-def]
+    def _cut(self, name: str, element: str, is_meant: Callable[[dict[str, str]], bool]) -> None:
         data, back = utf8(self.read(name), name)
         cuts = [(e.start, e.end, b"") for e in elements(data, name) if e.name == element and is_meant(e.attributes)]
         self.replace(name, back(spliced(data, cuts)))
@@ -97,7 +99,7 @@ class Package:
     def to_bytes(self) -> bytes:
         """The archive: the members that were not replaced have the bytes, order, dates and attributes they had."""
         if not self._replaced:
-            return self._content
+            return self.content
         out = io.BytesIO()
         with zipfile.ZipFile(out, "w") as new, warnings.catch_warnings():
             warnings.simplefilter("ignore")  # zipfile's, of names that are there twice

@@ -14,6 +14,10 @@ from .formulas import CellError, NotComputable, Surroundings, calculate
 from .sheet_xml import Cell
 from .workbook_xml import Place, WorkbookXml
 
+_TRIES = 4
+_ALIKE = 1e-6
+"""Relative: another program's result of the same formula differs less."""
+
 
 @dataclass
 class Recalculated:
@@ -120,8 +124,7 @@ class _Calculation:
         return self.workbook.value(place)
 
     def by_libreoffice(self) -> None:
-        values: dict[Place, Any] = {}
-        for _ in range(2):  # once more where formulas had to be replaced, for those that depend on them
+        for _ in range(_TRIES):  # once more where formulas had to be replaced, for those that depend on them
             values = self._libreoffice_values()
             wrong = {
                 place: f"it gives {_shown(value)}"
@@ -132,23 +135,27 @@ class _Calculation:
                 self._replace(place, why)
                 del self.unknown[place]
             if not wrong:
-                break
-        for place, value in values.items():
-            if place in self.unknown:
-                self._store(place, self.required.get(place, value), "LibreOffice")
-                del self.unknown[place]
+                for place, value in values.items():
+                    self._store(place, self.required.get(place, value), "LibreOffice")
+                    del self.unknown[place]
+                return
 
     def _libreoffice_values(self) -> dict[Place, Any]:
-        (content,) = libreoffice.recalculated([self.workbook.to_bytes()])
-        if content is None:
+        """What LibreOffice makes of the unknown formulas, those left out which it calculates otherwise than stored."""
+        workbook, name = self.workbook, f"{self.workbook.name}, recalculated by LibreOffice"
+        contents = libreoffice.recalculated([workbook.to_bytes(), workbook.package.content], workbook.suffix or ".xlsx")
+        if contents[0] is None or contents[1] is None:
             return {}
-        theirs = WorkbookXml(content, f"{self.workbook.name}, recalculated by LibreOffice")
+        new, old = (WorkbookXml(content, name) for content in contents if content is not None)
         values = {}
         for place in self.unknown:
-            title = theirs.title(place[0])
-            value = theirs.value((title, *place[1:])) if title is not None else None
+            if place[0] not in new.sheets:
+                continue
+            value = new.value(place)
+            was = workbook.sheets[place[0]].original.get(place[1:])
+            unlike = was is not None and was.value is not None and not _alike(old.value(place), was.value)
             # #NAME? is said of functions that LibreOffice does not know; Err:5xx of much else.
-            if value is not None and value != "#NAME?" and not str(value).startswith("Err:"):
+            if value is not None and value != "#NAME?" and not str(value).startswith("Err:") and not unlike:
                 values[place] = value
         return values
 
@@ -168,7 +175,7 @@ class _Calculation:
 
     def _store(self, place: Place, value: Any, by: str) -> None:
         cell = self.workbook.cell(place)
-        if not (agree_exactly(cell.value, value)):
+        if not _identical(cell.value, value):
             self._set(place, replace(cell, value=value))
         self.result.by[place] = by
 
@@ -176,9 +183,14 @@ class _Calculation:
         self.workbook.sheets[place[0]].cells[place[1:]] = cell
 
 
-def agree_exactly(a: Any, b: Any) -> bool:
-    """Whether two cells' values are the same, of the same kind."""
+def _identical(a: Any, b: Any) -> bool:
     return type(a) is type(b) and a == b
+
+
+def _alike(a: Any, b: Any) -> bool:
+    if type(a) is float and type(b) is float:
+        return math.isclose(a, b, rel_tol=_ALIKE, abs_tol=_ALIKE)
+    return _identical(a, b)
 
 
 def _shown(value: Any) -> str:

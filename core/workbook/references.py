@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from functools import lru_cache
 from typing import NamedTuple
 
 MAX_ROW = 1_048_576
@@ -32,6 +33,7 @@ class Reference(NamedTuple):
     right: int
 
 
+@lru_cache(maxsize=2**15)
 def reference(text: str) -> Reference | None:
     """What `text` refers to; None where it is a name, another file's cell or anything else."""
     from openpyxl.utils import column_index_from_string as column

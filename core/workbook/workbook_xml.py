@@ -9,7 +9,7 @@ from typing import Any
 from ..errors import InputError
 from .formulas import NotComputable, tokens_of
 from .package import Package
-from .references import MAX_ROW, Reference, reference
+from .references import Reference, reference
 from .sheet_xml import MAIN, Cell, SheetXml, Unreadable, shared_strings
 from .xml_parts import Element, elements, spliced, utf8, with_attribute
 
@@ -97,11 +97,6 @@ class WorkbookXml:
         formula = self._names.get((scope, key)) or self._names.get((None, key))
         return formula if formula is not None and _is_absolute(formula) else None
 
-    @property
-    def defined_names(self) -> list[tuple[str, str]]:
-        """(name, formula) of all."""
-        return [(name, formula) for (_, name), formula in self._names.items()]
-
     def title(self, name: str | None) -> str | None:
         """A sheet's name as it is written in the workbook."""
         return None if name is None else self._by_folded_name.get(name.casefold())
@@ -173,22 +168,21 @@ class WorkbookXml:
         return spliced(self._data, [(at, at, b'<%bcalcPr fullCalcOnLoad="1"/>' % prefix)])
 
     def ranges_ending_at(self, sheet: str, first: int, last: int) -> list[str]:
-        """What refers to several rows of `sheet` down to row `last`, and begins in rows `first` to `last`: formulas'
-        cells, defined names, charts and tables."""
-        found = []
+        """What refers to several rows of `sheet`, of `first` to `last`, the last among them.
+
+        Defined names, charts, tables and the cells of formulas.
+        """
 
         def ends_there(area: Reference | None, own: str) -> bool:
-            if area is None or not first <= area.top < area.bottom == last or area.bottom == MAX_ROW:
+            if area is None or not first <= area.top < area.bottom == last:
                 return False
             return sheet in (self.between(area.sheet) if area.sheet else [own])
 
-        for title, cells in self.sheets.items():
-            for at, cell in cells.cells.items():
-                if cell.formula is not None and any(ends_there(area, title) for area in areas_in(cell.formula)):
-                    found.append(self.text((title, *at)))
-        for name, formula in self.defined_names:
-            if any(ends_there(area, "") for area in areas_in(formula)):
-                found.append(f"the name {name}")
+        found = [
+            f"the name {name}"
+            for (_, name), formula in self._names.items()
+            if any(ends_there(area, "") for area in areas_in(formula))
+        ]
         tables = {member for _, kind, member in self.package.relations(self.parts[sheet]) if kind == "table"}
         for member in self.package.names:
             if member.startswith("xl/charts/") and member.endswith(".xml"):
@@ -199,6 +193,10 @@ class WorkbookXml:
                 root = self._parts_of(member)[0]
                 if ends_there(reference(root.attributes.get("ref", "")), sheet):
                     found.append(f"the table {root.attributes.get('displayName', member)}")
+        for title, cells in self.sheets.items():
+            for at, cell in cells.cells.items():
+                if cell.formula is not None and any(ends_there(area, title) for area in areas_in(cell.formula)):
+                    found.append(self.text((title, *at)))
         return found
 
     def _parts_of(self, member: str) -> list[Element]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import os
 import warnings
 from collections import defaultdict
@@ -176,7 +177,7 @@ class _Edit:
                 f"{file}: sheet {sheet} has no column of the modules' numbers: {_several(numbers)} will be read as "
                 "1, 2, ... in the order of their rows",
                 InputWarning,
-                stacklevel=5,
+                stacklevel=4,
             )
         if "l" not in self.columns:
             differing = np.flatnonzero(~is_by_design(self.system))
@@ -217,17 +218,12 @@ class _Edit:
             for name, column in self.columns.items()
             if column.table.sheet is table.sheet and self._is_shared(name)
         ]
-        own = {*old}
-        known = [row_of.get(int(number)) for number in self.system.numbers]
-        return arrange(
-            table,
-            tuple(old),
-            self.old_of,
-            filled_to=last,
-            number_column=number_column,
-            kept_columns=shared,
-            known=[None if row in own else row for row in known],
-        )
+        old = tuple(old)
+        own: list[int | None] = []
+        for number, j in zip(self.system.numbers, self.old_of, strict=True):
+            row = row_of.get(int(number))  # of a module that had no coordinates
+            own.append(old[j] if j is not None else None if row in old else row)
+        return arrange(table, old, own, filled_to=last, number_column=number_column, kept_columns=shared)
 
     def _is_shared(self, name: str) -> bool:
         """Whether one cell holds a quantity of all modules."""
@@ -239,13 +235,17 @@ class _Edit:
     def _require_numbers(self) -> None:
         for name, arrangement in self.arrangements.items():
             table = arrangement.table
-            is_modules = table is self.modules.table
-            column = self.modules.number_column if is_modules else dimension_rows(table).number_column
-            if column is None or (not is_modules and not self.numbered):
-                continue
-            for i, row in enumerate(arrangement.rows):
-                number = int(self.system.numbers[i])
-                self._demand((name, row, column), number, self._was(i, self.old.numbers))
+            if table is self.modules.table or self.numbered:
+                own = self.modules if table is self.modules.table else dimension_rows(table)
+                numbers: Iterable[tuple[int, int]] = enumerate(self.system.numbers)
+            else:  # a table whose numbers mean nothing, but must be there
+                own = dimension_rows(table)
+                added = [i for i, j in enumerate(self.old_of) if j is None]
+                numbers = zip(added, itertools.count(max(own.numbers or (0,)) + 1), strict=False)
+            if own.number_column is not None:
+                for i, number in numbers:
+                    place = (name, arrangement.rows[i], own.number_column)
+                    self._demand(place, float(number), self._was(i, self.old.numbers))
 
     def _require(self, name: str) -> None:
         column = self.columns[name]
@@ -351,7 +351,7 @@ class _Edit:
                 f"{self.workbook.name}: {_several(found)} end at row {max(old)} of sheet {name}, so the modules added "
                 "below are left out there",
                 InputWarning,
-                stacklevel=5,
+                stacklevel=4,
             )
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import json
 import warnings
 
 import numpy as np
@@ -261,7 +262,7 @@ def test_added_modules_get_the_formulas_and_none_of_the_notes(template, tmp_path
         mph.write_system(more, tmp_path / "o.xlsx", template)
     (message,) = [str(w.message) for w in caught if "left out" in str(w.message)]
     assert message.startswith(
-        "template.xlsx: Theta!A1, Theta!A5, Theta!A7 and 2 more end at row 6 of sheet Coordinates"
+        "template.xlsx: the name all_x, Theta!A1, Theta!A5 and 2 more end at row 6 of sheet Coordinates"
     )
     cells = values_of(tmp_path / "o.xlsx", data_only=False)
     assert cells["Coordinates", "E8"] == "=SQRT(SUMSQ(B8,C8,D8))"
@@ -478,3 +479,29 @@ def test_bad_templates_are_refused_as_by_the_reader(template, tmp_path):
         (tmp_path / "bad.xlsx").write_bytes(content)
         with pytest.raises(mph.InputError, match=message):
             mph.write_system(system, tmp_path / "o.xlsx", tmp_path / "bad.xlsx")
+
+
+# The command line
+
+
+def test_geometry_set_changes_the_chosen_modules(workbook, tmp_path, capsys):
+    from mphdrr.addon.cli import main
+
+    out = tmp_path / "o.xlsx"
+    options = ["--modules", "1-20", "--diameter", "2", "--move", "1", "0", "-2", "--remove", "80", "-o", str(out)]
+    assert main(["geometry", "set", str(workbook), *options]) == 0
+    assert capsys.readouterr().out.startswith(f"{out}: ")
+    old, new = mph.read_system(workbook), mph.read_system(out)
+    np.testing.assert_array_equal(new.centers[:20], old.centers[:20] + np.array([1, 0, -2]))
+    np.testing.assert_array_equal(new.centers[20:], old.centers[20:79])
+    np.testing.assert_array_equal(new.pinhole_diameter, np.repeat([2, 2.3], [20, 59]))
+    np.testing.assert_allclose(new.collimator_length, by_design(new).collimator_length, rtol=1e-9)
+    order = ",".join(map(str, new.numbers[::-1]))
+    assert main(["geometry", "set", str(out), "--length", "60", "--order", order, "--json", "-o", str(out)]) == 0
+    assert "Coordinates!G3" in json.loads(capsys.readouterr().out)["changed"]
+    np.testing.assert_array_equal(read_quietly(out).centers, new.centers[::-1])
+    np.testing.assert_array_equal(read_quietly(out).collimator_length, 60)
+    for wrong in (["--length", "x"], ["--order", "1,2"], ["--roi", "500"], ["--modules", "900"]):
+        assert main(["geometry", "set", str(workbook), *wrong, "-o", str(tmp_path / "p.xlsx")]) == 1
+        assert capsys.readouterr().err.startswith("mphdrr: ")
+    assert not (tmp_path / "p.xlsx").exists()

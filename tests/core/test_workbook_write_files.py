@@ -157,6 +157,12 @@ def test_of_a_changed_sheet_only_the_changed_cells_differ(rich, tmp_path):
         assert {f"{sheet}!{name.decode()}" for name in old if old[name] != new[name]} <= touched
 
 
+def test_charts_and_names_that_leave_added_modules_out_are_warned_of(rich, tmp_path):
+    system = read_quietly(rich)
+    with pytest.warns(mph.InputWarning, match=r"all_x, the chart xl/charts/chart1.xml, .* end at row 6 of"):
+        mph.write_system(_edit(system)[[0, 1, 2, 3]], tmp_path / "o.xlsm", rich)
+
+
 def test_nothing_changed_is_the_same_file(rich, tmp_path):
     written = write_quietly(read_quietly(rich), tmp_path / "o.xlsm", rich)
     assert written.path.read_bytes() == rich.read_bytes()

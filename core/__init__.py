@@ -13,9 +13,11 @@ from .design import collimator_length, roi_radius_seen
 from .errors import InputError, InputWarning
 from .export import read_run, write_run
 from .frames import euler_pose
+from .generators import RingFit, ellipse_rings, fit_rings, plate_rings, regular_polygon
 from .geometry_checks import GeometryReport, check_geometry
 from .grid import Grid
 from .isotopes import ISOTOPES, Isotope, isotope
+from .maps import completeness_map, modules_map, resolution_map, sensitivity_map
 from .mosaic import as_seen, mosaic
 from .noise import sample_counts
 from .performance import ModulePerformance, isocentre_performance, magnification, resolution, seen, sensitivity
@@ -25,6 +27,7 @@ from .progress import Cancelled, Progress
 from .project import project_run
 from .projector import Emission, InverseSquareSum, Projector, Transmission, intensity, trace_rays
 from .run import ProjectionRun
+from .sampling import sampling_gaps
 from .system import PinholeSystem
 from .views import Views
 from .volume import Volume
@@ -47,6 +50,7 @@ __all__ = [
     "Progress",
     "ProjectionRun",
     "Projector",
+    "RingFit",
     "SystemSource",
     "Transmission",
     "Views",
@@ -56,22 +60,31 @@ __all__ = [
     "c_arm_views",
     "check_geometry",
     "collimator_length",
+    "completeness_map",
+    "ellipse_rings",
     "euler_pose",
+    "fit_rings",
     "intensity",
     "isocentre_performance",
     "isotope",
     "magnification",
+    "modules_map",
     "mosaic",
     "pinhole_views",
+    "plate_rings",
     "project_run",
     "read_run",
     "read_system",
     "read_volume",
+    "regular_polygon",
     "resolution",
+    "resolution_map",
     "roi_radius_seen",
     "sample_counts",
+    "sampling_gaps",
     "seen",
     "sensitivity",
+    "sensitivity_map",
     "trace_rays",
     "write_run",
     "write_system",

@@ -27,7 +27,7 @@ from .system import PinholeSystem
 
 Array = NDArray[np.float64]
 
-_RIGHT_ANGLE = math.pi / 2
+RIGHT_ANGLE = math.pi / 2
 
 
 def seen(system: PinholeSystem, points: ArrayLike) -> NDArray[np.bool_]:
@@ -66,7 +66,7 @@ def sensitivity(
     points: ArrayLike,
     *,
     aperture_mu: float | None = None,
-    opening_angle: float = _RIGHT_ANGLE,
+    opening_angle: float = RIGHT_ANGLE,
     crystal_mu: float | None = None,
     photons_per_decay: float = 1.0,
 ) -> Array:
@@ -100,7 +100,13 @@ def sensitivity(
     if crystal_mu is not None:
         crystal_mu = positive(crystal_mu, "crystal_mu", "1/mm")
     photons_per_decay = positive(photons_per_decay, "photons_per_decay")
-    return point_sensitivity(system, points, aperture_mu, opening_angle, crystal_mu, photons_per_decay)
+    x_u, x_v, h = _in_modules(system, points)
+    visible = _seen(system, x_u, x_v, h)
+    h[~visible] = 1.0  # what is not seen must not divide by zero
+    cosine = h / np.sqrt(x_u**2 + x_v**2 + h**2)
+    counts = _point_law(h, cosine, paix_diameter(system.pinhole_diameter, aperture_mu, opening_angle))
+    counts *= photons_per_decay * visible
+    return counts if crystal_mu is None else counts * _stopped(cosine, crystal_mu, system.detector_thickness)
 
 
 def resolution(
@@ -109,7 +115,7 @@ def resolution(
     *,
     intrinsic_fwhm: float = 0.0,
     aperture_mu: float | None = None,
-    opening_angle: float = _RIGHT_ANGLE,
+    opening_angle: float = RIGHT_ANGLE,
 ) -> Array:
     """FWHM in object space (P, M), mm, of each module's image across its axis; NaN where it does not see the point.
 
@@ -134,9 +140,14 @@ def resolution(
     """
     points = _checked(points)
     _check_edge(aperture_mu, opening_angle)
-    if intrinsic_fwhm != 0:
-        intrinsic_fwhm = positive(intrinsic_fwhm, "intrinsic_fwhm", "mm")
-    return point_resolution(system, points, intrinsic_fwhm, aperture_mu, opening_angle)
+    intrinsic_fwhm = float(real_array(intrinsic_fwhm, "intrinsic_fwhm", ()))
+    if intrinsic_fwhm < 0:
+        raise InputError(f"intrinsic_fwhm: expected 0 mm or more, got {intrinsic_fwhm:g}")
+    x_u, x_v, h = _in_modules(system, points)
+    diameter = half_value_diameter(system.pinhole_diameter, aperture_mu, opening_angle)
+    fwhm = _fwhm(h / system.collimator_length, diameter, intrinsic_fwhm)
+    fwhm[~_seen(system, x_u, x_v, h)] = np.nan
+    return fwhm
 
 
 class ModulePerformance(NamedTuple):
@@ -169,7 +180,7 @@ def isocentre_performance(
     *,
     intrinsic_fwhm: float = 0.0,
     aperture_mu: float | None = None,
-    opening_angle: float = _RIGHT_ANGLE,
+    opening_angle: float = RIGHT_ANGLE,
     crystal_mu: float | None = None,
     photons_per_decay: float = 1.0,
 ) -> ModulePerformance:
@@ -181,12 +192,12 @@ def isocentre_performance(
         Pinhole to isocentre, hole's diameter, collimator's length, crystal's side and thickness, mm: numbers or arrays
         that broadcast.
     intrinsic_fwhm, aperture_mu, opening_angle, crystal_mu, photons_per_decay
-        As in `sensitivity` and `resolution`.
+        As in `sensitivity` and `resolution`, but not checked: this is for readouts that must not wait.
 
     Raises
     ------
     InputError
-        A length is not finite or out of its range.
+        b, d, l or Ld is not finite or out of its range.
     """
     radius = roi_radius_seen(b, d, Ld, l)
     b, d, l, Td = (np.asarray(x, dtype=np.float64) for x in (b, d, l, Td))
@@ -197,35 +208,6 @@ def isocentre_performance(
         l / b,
         radius,
     )
-
-
-def point_sensitivity(
-    system: PinholeSystem,
-    points: Array,
-    aperture_mu: float | None,
-    opening_angle: float,
-    crystal_mu: float | None,
-    photons_per_decay: float,
-) -> Array:
-    """`sensitivity` of arguments that have been checked."""
-    x_u, x_v, h = _in_modules(system, points)
-    visible = _seen(system, x_u, x_v, h)
-    h[~visible] = 1.0  # what is not seen must not divide by zero
-    cosine = h / np.sqrt(x_u**2 + x_v**2 + h**2)
-    counts = _point_law(h, cosine, paix_diameter(system.pinhole_diameter, aperture_mu, opening_angle))
-    counts *= photons_per_decay * visible
-    return counts if crystal_mu is None else counts * _stopped(cosine, crystal_mu, system.detector_thickness)
-
-
-def point_resolution(
-    system: PinholeSystem, points: Array, intrinsic_fwhm: float, aperture_mu: float | None, opening_angle: float
-) -> Array:
-    """`resolution` of arguments that have been checked."""
-    x_u, x_v, h = _in_modules(system, points)
-    diameter = half_value_diameter(system.pinhole_diameter, aperture_mu, opening_angle)
-    fwhm = _fwhm(h / system.collimator_length, diameter, intrinsic_fwhm)
-    fwhm[~_seen(system, x_u, x_v, h)] = np.nan
-    return fwhm
 
 
 def _in_modules(system: PinholeSystem, points: Array) -> tuple[Array, Array, Array]:

@@ -2,7 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import os
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from typing import TypeVar
+
+Part = TypeVar("Part")
 
 Progress = Callable[[int, int], None]
 """Called as ``progress(done, total)`` between the steps of long work; may raise `Cancelled` to stop it."""
@@ -10,3 +15,15 @@ Progress = Callable[[int, int], None]
 
 class Cancelled(Exception):
     """Raised by a progress callback to stop the work; nothing half-done is left behind."""
+
+
+def in_threads(work: Callable[[Part], None], parts: Sequence[Part], progress: Progress | None = None) -> None:
+    """Call ``work(part)`` for all parts, one thread for each processor core; what `progress` raises stops the rest."""
+    with ThreadPoolExecutor(os.cpu_count()) as pool:
+        for done, _ in enumerate(pool.map(work, parts), 1):
+            if progress is not None:
+                try:
+                    progress(done, len(parts))
+                except BaseException:
+                    pool.shutdown(wait=False, cancel_futures=True)
+                    raise

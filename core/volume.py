@@ -11,7 +11,16 @@ from .checks import freeze, real_array
 from .errors import InputError
 from .grid import Grid
 
-UNITS = {"activity": "kBq/mL", "mu": "1/mm", "hu": "HU"}
+UNITS = {
+    "activity": "kBq/mL",
+    "mu": "1/mm",
+    "hu": "HU",
+    # What a system does in each voxel (core.maps).
+    "sensitivity": "counts/decay",
+    "modules": "1",
+    "resolution": "mm",
+    "completeness": "1",
+}
 """The unit of each quantity a volume may hold."""
 
 
@@ -27,7 +36,7 @@ class Volume:
     grid : Grid
         Where the voxels are.
     quantity : str
-        ``"activity"`` (kBq/mL), ``"mu"`` (1/mm) or ``"hu"``.
+        ``"activity"`` (kBq/mL), ``"mu"`` (1/mm), ``"hu"``, or another of `UNITS`.
 
     Raises
     ------

@@ -28,7 +28,7 @@ def read_volume(path: str | os.PathLike[str], quantity: str | None = None) -> Vo
     path
         The file.
     quantity
-        What the values are: ``"activity"`` (kBq/mL), ``"mu"`` (1/mm) or ``"hu"``. Default: what the file says;
+        What the values are: ``"activity"`` (kBq/mL), ``"mu"`` (1/mm), ``"hu"`` … Default: what the file says;
         a NIfTI file that says nothing is taken for CT, ``"hu"``.
 
     Raises

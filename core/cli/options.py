@@ -76,6 +76,11 @@ def add_view_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--threads", type=int, metavar="N", help="processor threads; default: all")
 
 
+def one_or_three(values: list) -> list:
+    """The numbers along x, y and z of an option that takes one for all."""
+    return values * 3 if len(values) == 1 else values
+
+
 def chosen_modules(system: PinholeSystem, text: str | None) -> PinholeSystem:
     """The modules of `system` whose numbers `text` ("1-40", "1-20,41") lists; all for None."""
     if text is None:

@@ -14,7 +14,7 @@ from ..grid import Grid
 from ..phantoms.derenzo import DerenzoPhantom
 from ..volume import Volume
 from ..volume_io import VOLUME_FORMATS, write_volume
-from .options import add_command, add_phantom_options, output_path, progress_bar
+from .options import add_command, add_phantom_options, one_or_three, output_path, progress_bar
 
 
 def add_parser(subparsers) -> None:  # type: ignore[no-untyped-def]
@@ -35,8 +35,8 @@ def add_parser(subparsers) -> None:  # type: ignore[no-untyped-def]
 def derenzo_volume(arguments: argparse.Namespace) -> tuple[Volume, dict[str, Any]]:
     """The phantom that the options of `add_phantom_options` describe, and what it was made from."""
     phantom = DerenzoPhantom(arguments.radius, tuple(arguments.rods), arguments.height, arguments.activity)
-    voxels = whole_shape(_one_or_three(arguments.voxels), "--voxels", 3)
-    spacing = _one_or_three(arguments.spacing) if arguments.spacing else phantom.extent / max(1, min(voxels) - 2)
+    voxels = whole_shape(one_or_three(arguments.voxels), "--voxels", 3)
+    spacing = one_or_three(arguments.spacing) if arguments.spacing else phantom.extent / max(1, min(voxels) - 2)
     grid = Grid.centered(voxels, spacing, arguments.position)
     phi, theta, psi = np.deg2rad(arguments.euler)
     pose = euler_pose(phi, theta, psi, arguments.position)
@@ -46,10 +46,6 @@ def derenzo_volume(arguments: argparse.Namespace) -> tuple[Volume, dict[str, Any
         "euler_degrees": list(arguments.euler),
     }
     return phantom.voxelize(grid, pose, progress_bar("voxelizing")), recipe
-
-
-def _one_or_three(values: list) -> list:
-    return values * 3 if len(values) == 1 else values
 
 
 def _run(arguments: argparse.Namespace) -> None:

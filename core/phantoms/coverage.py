@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..grid import Grid
 from ..memory import require
-from ..progress import Progress
+from ..progress import Progress, in_threads
 
 Distance = Callable[[NDArray[np.float32]], NDArray[np.float32]]
 """Points (3, N), mm, in the shape's frame to signed distances (N,), mm: negative inside, and nowhere larger in
@@ -78,15 +76,7 @@ def voxelize_shape(
             slab[block] = _coverage(centers[:, block], distance, half_diagonal, samples)
         coverage[ix, start[1] : stop[1], start[2] : stop[2]] = slab.reshape(iy.shape)
 
-    slabs = range(start[0], stop[0])
-    with ThreadPoolExecutor(os.cpu_count()) as pool:
-        for done, _ in enumerate(pool.map(fill, slabs), 1):
-            if progress is not None:
-                try:
-                    progress(done, len(slabs))
-                except BaseException:
-                    pool.shutdown(wait=False, cancel_futures=True)
-                    raise
+    in_threads(fill, range(start[0], stop[0]), progress)
     return coverage
 
 

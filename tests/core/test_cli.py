@@ -224,3 +224,77 @@ def test_the_package_is_imported_without_its_heavy_parts():
         "sys.exit(f'imported: {heavy}' if heavy else 0)"
     )
     subprocess.run([sys.executable, "-c", code], check=True)
+
+
+def test_geometry_performance_adds_up(workbook, capsys):
+    options = ["--aperture-mu", "3.6", "--crystal-mu", "0.404", "--intrinsic-fwhm", "3", "--isotope", "Tc-99m"]
+    assert main(["geometry", "performance", str(workbook), *options, "--json"]) == 0
+    printed = json.loads(capsys.readouterr().out)
+    expected = mph.sensitivity(
+        mph.read_system(workbook), [[0, 0, 0]], aperture_mu=3.6, crystal_mu=0.404, photons_per_decay=0.891
+    )
+    assert [m["sensitivity"] for m in printed["modules"]] == pytest.approx(1e6 * expected[0])
+    assert printed["total"]["sensitivity"] == pytest.approx(1e6 * expected.sum())
+    assert printed["total"]["modules_holding_roi"] == 80
+    assert all(m["roi_radius_seen"] == pytest.approx(75, abs=1e-3) for m in printed["modules"])
+    assert main(["geometry", "performance", str(workbook), "--point", "0", "0", "900"]) == 0
+    assert "from 0 of 80 modules" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("quantity", ["sensitivity", "modules", "resolution", "completeness"])
+def test_geometry_map_writes_a_volume(workbook, tmp_path, capsys, quantity):
+    path = tmp_path / "new" / f"{quantity}.nii.gz"
+    grid = ["--voxels", "6", "5", "4", "--spacing", "20", "--center", "10", "0", "0"]
+    assert main(["geometry", "map", str(workbook), "--quantity", quantity, *grid, "-o", str(path)]) == 0
+    volume = mph.read_volume(path)
+    assert volume.quantity == quantity
+    assert volume.grid == mph.Grid.centered((6, 5, 4), 20.0, (10, 0, 0))
+    system = mph.read_system(workbook)
+    make = {"sensitivity": mph.sensitivity_map, "modules": mph.modules_map, "resolution": mph.resolution_map}
+    assert np.array_equal(volume.array, make.get(quantity, mph.completeness_map)(system, volume.grid).array)
+    assert quantity in capsys.readouterr().out
+
+
+def test_geometry_of_a_fit_is_generated_again(workbook, tmp_path, capsys):
+    """The workbook that the printed parameters make follows the same ellipse."""
+    assert main(["geometry", "fit", str(workbook), "--json"]) == 0
+    ring = json.loads(capsys.readouterr().out)["rings"][0]
+    assert ring["curve_deviation"] < 0.001
+    path = tmp_path / "again.xlsx"
+    numbers = {
+        "--semi-axes": ring["semi_axes"],
+        "--center": ring["center"],
+        "--rotation": [ring["rotation"]],
+        "--start": ring["azimuths"][:1],
+        "--end": ring["azimuths"][-1:],
+        "--z": [-71, -24],
+    }
+    typed = [word for option, values in numbers.items() for word in (option, *map(str, values))]
+    command = ["geometry", "generate", "ellipse", *typed, "--spacing", ring["spacing"], "--mirrored", "-o", str(path)]
+    assert main(command) == 0
+    made = mph.fit_rings(mph.read_system(path))
+    assert [len(fit.numbers) for fit in made] == [20] * 4
+    assert np.allclose(made[0].semi_axes, ring["semi_axes"], atol=1e-6)
+    assert made[0].even_deviation < 1e-6
+
+
+@pytest.mark.filterwarnings("ignore:.*the sheet's is used")
+def test_geometry_of_plates_is_generated(tmp_path, capsys):
+    path = tmp_path / "plates.xlsx"
+    size = ["--polygon", "5", "--apothem", "220", "--modules", "4", "--l", "60", "--d", "3"]
+    assert main(["geometry", "generate", "plates", *size, "--z", "-30", "30", "-o", str(path)]) == 0
+    system = mph.read_system(path)
+    assert len(system) == 40
+    assert np.allclose(system.collimator_length, 60)
+    expected = mph.plate_rings(
+        4, mph.regular_polygon(5, 220.0), (-30, 30),
+        pinhole_diameter=3.0, detector_side=50.0, detector_thickness=10.0, roi_radius=75.0,
+    )  # fmt: skip
+    assert np.allclose(system.centers, expected.centers, atol=1e-9)
+    corners = ["--vertices", "-200", "-100", "200", "-100", "200", "100", "--open"]
+    assert main(["geometry", "generate", "plates", *corners, "--z", "0", "--R", "60", "-o", str(path)]) == 0
+    assert len(mph.read_system(path)) == 8
+    capsys.readouterr()
+    for wrong in (["--polygon", "5"], ["--vertices", "1", "2", "3"]):
+        assert main(["geometry", "generate", "plates", *wrong, "--z", "0", "-o", str(path)]) == 1
+        assert "expected" in capsys.readouterr().err

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from ..options import add_command
-from . import check, set, show
+from . import check, fit, generate, map, performance, set, show
 
 
 def add_parser(subparsers) -> None:  # type: ignore[no-untyped-def]
     """Add the command."""
     geometry = add_command(subparsers, "geometry", "work on a geometry workbook", "mphdrr geometry check scanner.xlsx")
     actions = geometry.add_subparsers(metavar="ACTION", required=True)
-    for action in (show, check, set):
+    for action in (show, check, set, performance, map, fit, generate):
         action.add_parser(actions)

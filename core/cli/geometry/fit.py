@@ -1,0 +1,59 @@
+"""``mphdrr geometry fit FILE``."""
+
+from __future__ import annotations
+
+import argparse
+import json
+from typing import Any
+
+import numpy as np
+
+from ...generators import RingFit, fit_rings
+from ...workbook import read_system
+from ..options import add_command
+from .arguments import add_workbook
+
+
+def add_parser(actions) -> None:  # type: ignore[no-untyped-def]
+    """Add the action."""
+    parser = add_command(
+        actions,
+        "fit",
+        "find the ellipse that each ring of modules follows, and how far off its modules are",
+        "mphdrr geometry fit scanner.xlsx",
+    )
+    add_workbook(parser)
+    parser.set_defaults(run=_run)
+
+
+def _run(arguments: argparse.Namespace) -> None:
+    rings = [_record(fit) for fit in fit_rings(read_system(arguments.file))]
+    if arguments.json:
+        print(json.dumps({"rings": rings, "units": "mm, degrees"}, indent=1))
+        return
+    for i, ring in enumerate(rings, 1):
+        (a, b), (x, y), azimuths, z = ring["semi_axes"], ring["center"], ring["azimuths"], ring["z"]
+        print(f"ring {i}: {len(azimuths)} modules, {ring['numbers'][0]} to {ring['numbers'][-1]}")
+        print(f"  ellipse     semi-axes {a:.3f} and {b:.3f} mm, turned by {ring['rotation']:.4f} degrees")
+        print(f"              centre at x = {x:.3f}, y = {y:.3f} mm")
+        print(f"  azimuths    from {azimuths[0]:.4f} to {azimuths[-1]:.4f} degrees")
+        print(f"  z           from {min(z):.4f} to {max(z):.4f} mm")
+        print(f"  deviation   {ring['curve_deviation']:.2g} mm at most from the ellipse")
+        print(
+            f"              {ring['even_deviation']:.2g} mm at most if at equal steps of {ring['spacing']} and at one z, "
+            f"{np.mean(z):.4f} mm"
+        )
+
+
+def _record(fit: RingFit) -> dict[str, Any]:
+    return {
+        "numbers": fit.numbers.tolist(),
+        "semi_axes": fit.semi_axes.tolist(),
+        "center": fit.center.tolist(),
+        "rotation": float(np.degrees(fit.rotation)),
+        "azimuths": np.degrees(fit.azimuths).tolist(),
+        "z": fit.z.tolist(),
+        "spacing": fit.spacing,
+        "curve_deviation": fit.curve_deviation,
+        "even_deviation": fit.even_deviation,
+    }

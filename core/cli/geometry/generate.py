@@ -1,0 +1,129 @@
+"""``mphdrr geometry generate SHAPE -o FILE``."""
+
+from __future__ import annotations
+
+import argparse
+from typing import Any
+
+import numpy as np
+
+from ...errors import InputError
+from ...generators import ellipse_rings, plate_rings, regular_polygon
+from ...system import PinholeSystem
+from ...workbook import write_system
+from ..options import add_command, output_path
+
+
+def add_parser(actions) -> None:  # type: ignore[no-untyped-def]
+    """Add the action."""
+    generate = add_command(
+        actions,
+        "generate",
+        "make the workbook of a scanner from a few parameters",
+        "mphdrr geometry generate ellipse --semi-axes 273 220.5 --z -71 -24 --mirrored -o scanner.xlsx",
+    )
+    shapes = generate.add_subparsers(metavar="SHAPE", required=True)
+    _add_ellipse(shapes)
+    _add_plates(shapes)
+
+
+def _add_ellipse(shapes) -> None:  # type: ignore[no-untyped-def]
+    parser = add_command(
+        shapes,
+        "ellipse",
+        "rings of modules on an ellipse",
+        "mphdrr geometry generate ellipse --modules 20 --semi-axes 273 220.5 --center 42.43 -42.43 --start 14.25 "
+        "--end 255.6 --spacing arc --z -71 -24 --mirrored -o scanner.xlsx",
+    )
+    parser.add_argument("--modules", type=int, default=20, metavar="M", help="modules of each ring")
+    parser.add_argument(
+        "--semi-axes", type=float, nargs="+", required=True, metavar="MM", help="along x and y, or a circle's radius"
+    )
+    parser.add_argument(
+        "--center", type=float, nargs=2, default=[0, 0], metavar="MM", help="of the ellipse, x y from the isocentre"
+    )
+    parser.add_argument("--rotation", type=float, default=0.0, metavar="DEG", help="of the ellipse about its centre")
+    parser.add_argument("--start", type=float, default=0.0, metavar="DEG", help="azimuth of a ring's first module")
+    parser.add_argument(
+        "--end", type=float, default=360.0, metavar="DEG", help="of its last; a full turn after the start: closed"
+    )
+    parser.add_argument("--spacing", choices=("angle", "arc"), default="angle", help="equal steps in angle, or in arc")
+    _add_modules(parser)
+    parser.set_defaults(run=_run, generate=_ellipse)
+
+
+def _add_plates(shapes) -> None:  # type: ignore[no-untyped-def]
+    parser = add_command(
+        shapes,
+        "plates",
+        "rings of modules on flat plates",
+        "mphdrr geometry generate plates --polygon 5 --apothem 220 --modules 4 --z -71 -24 --mirrored -o scanner.xlsx",
+    )
+    parser.add_argument(
+        "--modules", type=int, nargs="+", default=[4], metavar="N", help="of each plate in each ring, or one for all"
+    )
+    plates = parser.add_mutually_exclusive_group(required=True)
+    plates.add_argument("--polygon", type=int, metavar="SIDES", help="plates of a regular polygon, with --apothem")
+    plates.add_argument("--vertices", type=float, nargs="+", metavar="MM", help="x y x y ... of the plates' edges")
+    parser.add_argument("--apothem", type=float, metavar="MM", help="distance of the polygon's plates")
+    parser.add_argument("--rotation", type=float, default=0.0, metavar="DEG", help="azimuth of its first plate")
+    parser.add_argument("--open", action="store_true", help="no plate joins the last vertex to the first")
+    _add_modules(parser)
+    parser.set_defaults(run=_run, generate=_plates)
+
+
+def _add_modules(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--z", type=float, nargs="+", required=True, metavar="MM", help="of each ring")
+    parser.add_argument("--mirrored", action="store_true", help="add the rings' mirror images at z = 0")
+    group = parser.add_argument_group("the modules")
+    group.add_argument("--d", type=float, default=2.3, metavar="MM", help="pinhole diameter")
+    group.add_argument("--Ld", type=float, default=50.0, metavar="MM", help="side of the crystal")
+    group.add_argument("--Td", type=float, default=10.0, metavar="MM", help="thickness of the crystal")
+    group.add_argument("--R", type=float, default=75.0, metavar="MM", help="ROI radius")
+    group.add_argument("--l", type=float, metavar="MM", help="collimator length; default: so that the ROI is just seen")
+    parser.add_argument("-o", "--output", required=True, metavar="FILE", help=".xlsx")
+
+
+def _run(arguments: argparse.Namespace) -> None:
+    path = output_path(arguments.output, (".xlsx",))
+    modules = {
+        "z": arguments.z,
+        "mirrored": arguments.mirrored,
+        "pinhole_diameter": arguments.d,
+        "detector_side": arguments.Ld,
+        "detector_thickness": arguments.Td,
+        "roi_radius": arguments.R,
+        "collimator_length": arguments.l,
+    }
+    system = arguments.generate(arguments, modules)
+    write_system(system, path)
+    b, l = system.pinhole_distance, system.collimator_length
+    print(f"{path}: {len(system)} modules, b {b.min():.2f} to {b.max():.2f} mm, l {l.min():.2f} to {l.max():.2f} mm")
+
+
+def _ellipse(arguments: argparse.Namespace, modules: dict[str, Any]) -> PinholeSystem:
+    axes = arguments.semi_axes
+    start, end, rotation = np.deg2rad([arguments.start, arguments.end, arguments.rotation])
+    return ellipse_rings(
+        arguments.modules,
+        axes[0] if len(axes) == 1 else axes,
+        start=start,
+        end=end,
+        spacing=arguments.spacing,
+        center=arguments.center,
+        rotation=rotation,
+        **modules,
+    )
+
+
+def _plates(arguments: argparse.Namespace, modules: dict[str, Any]) -> PinholeSystem:
+    if (arguments.polygon is None) != (arguments.apothem is None):
+        raise InputError("--polygon and --apothem: expected both, or --vertices")
+    if arguments.polygon is not None:
+        vertices = regular_polygon(arguments.polygon, arguments.apothem, float(np.deg2rad(arguments.rotation)))
+    elif len(arguments.vertices) % 2:
+        raise InputError(f"--vertices: expected x and y of each, got {len(arguments.vertices)} numbers")
+    else:
+        vertices = np.reshape(arguments.vertices, (-1, 2))
+    counts = arguments.modules
+    return plate_rings(counts[0] if len(counts) == 1 else counts, vertices, closed=not arguments.open, **modules)

@@ -1,0 +1,74 @@
+"""``mphdrr geometry map FILE -o FILE``."""
+
+from __future__ import annotations
+
+import argparse
+import json
+
+import numpy as np
+
+from ...checks import whole_shape
+from ...grid import Grid
+from ...maps import completeness_map, modules_map, resolution_map, sensitivity_map
+from ...system import PinholeSystem
+from ...volume import Volume
+from ...volume_io import VOLUME_FORMATS, write_volume
+from ...workbook import read_system
+from ..options import add_command, chosen_modules, one_or_three, output_path, progress_bar
+from .arguments import add_materials, add_workbook, resolution_settings, sensitivity_settings
+
+QUANTITIES = ("sensitivity", "modules", "resolution", "completeness")
+
+
+def add_parser(actions) -> None:  # type: ignore[no-untyped-def]
+    """Add the action."""
+    parser = add_command(
+        actions,
+        "map",
+        "make a volume of what the scanner does in every voxel",
+        "mphdrr geometry map scanner.xlsx --quantity sensitivity --voxels 64 --spacing 3 -o sensitivity.nii.gz",
+    )
+    parser.add_argument(
+        "--quantity", choices=QUANTITIES, default="sensitivity",
+        help="counts per decay; number of modules that see the voxel; expected FWHM, mm; completeness of the angular "
+        "sampling, 1 where every plane through the voxel meets a pinhole that sees it",
+    )  # fmt: skip
+    parser.add_argument("--voxels", type=int, nargs="+", default=[64], metavar="N", help="voxels along x y z, or one")
+    parser.add_argument(
+        "--spacing", type=float, nargs="+", metavar="MM", help="voxel size, one or three; default: so that the ROI fits"
+    )
+    parser.add_argument("--center", type=float, nargs=3, default=[0, 0, 0], metavar="MM", help="of the grid, x y z")
+    parser.add_argument("--modules", metavar="RANGE", help="such as 1-40 or 1-20,41; default: all")
+    parser.add_argument("-o", "--output", required=True, metavar="FILE", help=", ".join(VOLUME_FORMATS))
+    add_materials(parser)
+    add_workbook(parser)
+    parser.set_defaults(run=_run)
+
+
+def _run(arguments: argparse.Namespace) -> None:
+    path = output_path(arguments.output, VOLUME_FORMATS)
+    system = chosen_modules(read_system(arguments.file), arguments.modules)
+    voxels = whole_shape(one_or_three(arguments.voxels), "--voxels", 3)
+    spacing = one_or_three(arguments.spacing) if arguments.spacing else 2 * system.roi_radius.max() / min(voxels)
+    volume = _map(arguments, system, Grid.centered(voxels, spacing, arguments.center))
+    write_volume(volume, path)
+    low, high, mean = (float(f(volume.array)) for f in (np.min, np.max, np.mean))
+    if arguments.json:
+        record = {"file": str(path), "quantity": volume.quantity, "unit": volume.unit}
+        print(json.dumps({**record, "minimum": low, "maximum": high, "mean": mean}, indent=1))
+        return
+    shape = " x ".join(map(str, volume.grid.shape))
+    print(f"{path}: {shape} voxels, {volume.quantity} from {low:.4g} to {high:.4g} {volume.unit}".removesuffix(" 1"))
+
+
+def _map(arguments: argparse.Namespace, system: PinholeSystem, grid: Grid) -> Volume:
+    progress = progress_bar("mapping")
+    if arguments.quantity == "sensitivity":
+        return sensitivity_map(system, grid, **sensitivity_settings(arguments), progress=progress)
+    if arguments.quantity == "modules":
+        return modules_map(system, grid, progress=progress)
+    if arguments.quantity == "resolution":
+        return resolution_map(
+            system, grid, **resolution_settings(arguments), crystal_mu=arguments.crystal_mu, progress=progress
+        )
+    return completeness_map(system, grid, progress=progress)

@@ -1,0 +1,75 @@
+"""``mphdrr geometry performance FILE``."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+
+import numpy as np
+
+from ...design import roi_radius_seen
+from ...performance import magnification, resolution, sensitivity
+from ...sampling import sampling_gaps
+from ...workbook import read_system
+from ..options import add_command
+from .arguments import add_materials, add_workbook, resolution_settings, sensitivity_settings
+
+
+def add_parser(actions) -> None:  # type: ignore[no-untyped-def]
+    """Add the action."""
+    parser = add_command(
+        actions,
+        "performance",
+        "print each module's sensitivity, resolution and field of view at the isocentre, or at a point",
+        "mphdrr geometry performance scanner.xlsx --aperture-mu 3.6 --crystal-mu 0.404 --intrinsic-fwhm 3",
+    )
+    parser.add_argument(
+        "--point", type=float, nargs=3, default=[0, 0, 0], metavar="MM", help="where the source is, x y z"
+    )
+    add_materials(parser)
+    add_workbook(parser)
+    parser.set_defaults(run=_run)
+
+
+def _run(arguments: argparse.Namespace) -> None:
+    system = read_system(arguments.file)
+    points = [arguments.point]
+    counts = 1e6 * sensitivity(system, points, **sensitivity_settings(arguments))[0]
+    fwhm = resolution(system, points, **resolution_settings(arguments))[0]
+    radius = roi_radius_seen(
+        system.pinhole_distance, system.pinhole_diameter, system.detector_side, system.collimator_length
+    )
+    columns = {
+        "number": system.numbers,
+        "ring": system.rings() + 1,
+        "sensitivity": counts,
+        "resolution": fwhm,
+        "magnification": magnification(system, points)[0],
+        "roi_radius_seen": radius,
+        "roi_radius": system.roi_radius,
+    }
+    seeing = counts > 0
+    rms = math.sqrt(np.average(fwhm[seeing] ** 2, weights=counts[seeing])) if seeing.any() else None
+    total = {
+        "sensitivity": float(counts.sum()),
+        "resolution": rms,
+        "modules_seeing": int(seeing.sum()),
+        # To what a workbook's rounding leaves of the design formula.
+        "modules_holding_roi": int(np.count_nonzero(radius >= system.roi_radius - 1e-3)),
+        "sampling_gap_degrees": math.degrees(sampling_gaps(system, points)[0]),
+    }
+    rows = list(zip(*(c.tolist() for c in columns.values()), strict=True))
+    if arguments.json:
+        modules = [{k: None if v != v else v for k, v in zip(columns, row, strict=True)} for row in rows]
+        units = "sensitivity cps/MBq; resolution and radii mm"
+        print(json.dumps({"point": arguments.point, "modules": modules, "total": total, "units": units}, indent=1))
+        return
+    print(" module  ring  cps/MBq  FWHM mm  magnification  sees R mm     R mm")
+    for row in rows:
+        print("{:7d} {:5d} {:8.3f} {:8.2f} {:14.4f} {:10.2f} {:8.2f}".format(*row))
+    print(f"total {total['sensitivity']:.1f} cps/MBq from {total['modules_seeing']} of {len(system)} modules")
+    if rms is not None:
+        print(f"resolution {rms:.2f} mm FWHM, the modules' root mean square weighted by counts")
+    print(f"planes through the point miss all pinholes by up to {total['sampling_gap_degrees']:.1f} degrees")
+    print(f"{total['modules_holding_roi']} of {len(system)} modules see their whole ROI")

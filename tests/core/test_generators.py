@@ -1,0 +1,177 @@
+"""Laws of generated systems, and of the parameters found for given ones."""
+
+from __future__ import annotations
+
+import itertools
+import math
+
+import numpy as np
+import pytest
+
+import mphdrr.core as mph
+
+MODULE = {"pinhole_diameter": 2.3, "detector_side": 50.0, "detector_thickness": 10.0, "roi_radius": 75.0}
+# An ellipse that is off the isocentre and turned.
+TILTED = {"semi_axes": (270.0, 210.0), "center": (30.0, -40.0), "rotation": 0.4}
+
+
+def on_ellipse(xy, semi_axes, center=(0, 0), rotation=0.0):
+    turned = (xy - np.array(center)) @ np.array(
+        [[math.cos(rotation), -math.sin(rotation)], [math.sin(rotation), math.cos(rotation)]]
+    )
+    return ((turned / semi_axes) ** 2).sum(axis=1)
+
+
+@pytest.mark.parametrize(("start", "end"), [(0.3, 4.4), (4.4, 0.3), (-1.0, -1.0 + 2 * math.pi)])
+def test_rings_stand_on_their_ellipse_evenly(start, end):
+    system = mph.ellipse_rings(24, z=(-70.0, -24.0), start=start, end=end, mirrored=True, **TILTED, **MODULE)
+    assert len(system) == 96
+    assert np.allclose(on_ellipse(system.centers[:, :2], **TILTED), 1, atol=1e-12)
+    assert np.allclose(system.centers.reshape(4, 24, 3)[:, :, 2], np.array([[-70], [-24], [24], [70]]))
+    azimuths = np.unwrap(np.arctan2(*system.centers[:24, 1::-1].T))
+    closed = abs(end - start) > 6.28
+    assert np.allclose(np.diff(azimuths), (end - start) / (24 if closed else 23))
+    assert math.cos(azimuths[0] - start) == pytest.approx(1)
+    b = system.pinhole_distance
+    assert np.allclose(system.collimator_length, mph.collimator_length(b, 2.3, 50.0, 75.0))
+
+
+def test_equal_arcs_are_equally_long():
+    system = mph.ellipse_rings(13, z=0.0, start=0.5, end=5.0, spacing="arc", **TILTED, **MODULE)
+    azimuths = np.unwrap(np.arctan2(system.centers[:, 1], system.centers[:, 0]))
+    lengths = []
+    for first, last in itertools.pairwise(azimuths):
+        fine = mph.ellipse_rings(np.linspace(first, last, 20001), z=0.0, **TILTED, **MODULE)
+        lengths.append(np.linalg.norm(np.diff(fine.centers, axis=0), axis=1).sum())
+    assert np.ptp(lengths) < 1e-4
+    assert azimuths[[0, -1]] == pytest.approx([0.5, 5.0])
+
+
+def test_plates_carry_their_modules_evenly(rng):
+    corners = mph.regular_polygon(5, 230.0, rotation=0.7)
+    middles = (corners + np.roll(corners, -1, axis=0)) / 2
+    assert np.allclose(middles[0], [230 * math.cos(0.7), 230 * math.sin(0.7)])
+    assert np.allclose(np.linalg.norm(middles, axis=1), 230)
+    counts = [3, 0, 4, 1, 2]
+    system = mph.plate_rings(counts, corners, (-20.0, 30.0), collimator_length=60.0, **MODULE)
+    assert len(system) == 20
+    assert np.all(system.collimator_length == 60)
+    first = 0
+    for n, start, end in zip(counts, corners, np.roll(corners, -1, axis=0), strict=True):
+        places = system.centers[first : first + n, :2]
+        along = (places - start) @ (end - start) / ((end - start) @ (end - start))
+        assert np.allclose(along, (np.arange(n) + 0.5) / n)
+        assert np.allclose(places, start + along[:, None] * (end - start))
+        first += n
+    assert len(mph.plate_rings(2, corners, 0.0, closed=False, **MODULE)) == 8
+
+
+@pytest.mark.parametrize("spacing", ["angle", "arc"])
+@pytest.mark.parametrize("curve", [TILTED, {"semi_axes": 240.0}, {"semi_axes": (200.0, 290.0)}])
+@pytest.mark.parametrize(("start", "end"), [(4.0, -0.5), (2.0, 4.0), (3.0, 1.5)])
+def test_what_was_generated_is_found_again(spacing, curve, start, end):
+    made = mph.ellipse_rings(18, z=(-50.0, 10.0), start=start, end=end, spacing=spacing, **curve, **MODULE)
+    for ring, fit in enumerate(mph.fit_rings(made)):
+        assert np.array_equal(fit.numbers, made.numbers[18 * ring : 18 * ring + 18])
+        assert np.allclose(fit.semi_axes, curve["semi_axes"], atol=1e-6)
+        assert np.allclose(fit.center, curve.get("center", 0), atol=1e-6)
+        assert fit.curve_deviation < 1e-8
+        assert fit.even_deviation < 1e-5
+        for even, tolerance in ((False, 1e-7), (True, 1e-5)):
+            again = mph.ellipse_rings(**fit.parameters(even), **MODULE)
+            assert np.allclose(again.centers, made.centers[18 * ring : 18 * ring + 18], atol=tolerance)
+
+
+@pytest.mark.parametrize("end", [2.0 + 2 * math.pi, 2.0 - 2 * math.pi])
+def test_a_closed_ring_is_found_from_its_first_module(end):
+    made = mph.ellipse_rings(15, z=0.0, start=2.0, end=end, spacing="arc", **TILTED, **MODULE)
+    (fit,) = mph.fit_rings(made)
+    assert np.array_equal(fit.numbers, made.numbers)
+    assert fit.even_deviation < 1e-5
+    assert np.allclose(mph.ellipse_rings(**fit.parameters(even=True), **MODULE).centers, made.centers, atol=1e-5)
+
+
+def test_the_fit_is_the_nearest_ellipse(rng):
+    """Of noisy pinholes: no ellipse beside it has a smaller sum of squares."""
+    made = mph.ellipse_rings(40, z=0.0, **TILTED, **MODULE)
+    noisy = mph.PinholeSystem(made.centers + rng.normal(size=(40, 3)) * [2, 2, 0.1], 2.3, 60.0, 50.0, 10.0, 75.0)
+    (fit,) = mph.fit_rings(noisy)
+    best = np.array([*fit.semi_axes, *fit.center, fit.rotation])
+
+    def squares(p):
+        turn = np.linspace(0, 2 * np.pi, 20001)
+        curve = np.stack([p[0] * np.cos(turn), p[1] * np.sin(turn)], axis=1)
+        c, s = np.cos(p[4]), np.sin(p[4])
+        curve = curve @ np.array([[c, s], [-s, c]]) + p[2:4]
+        return sum((((curve - x) ** 2).sum(axis=1)).min() for x in noisy.centers[:, :2])
+
+    least = squares(best)
+    assert np.sqrt(least / 40) < 2.5
+    for i, step in enumerate((0.3, 0.3, 0.3, 0.3, 0.003)):
+        for sign in (-1, 1):
+            assert squares(best + sign * step * np.eye(5)[i]) > least
+
+
+def test_the_real_scanner_stands_on_one_ellipse(workbook):
+    """Semi-axes of 273 and 220.5 mm, its centre 60 mm from the isocentre; evenly spaced it is not."""
+    system = mph.read_system(workbook)
+    fits = mph.fit_rings(system)
+    assert [len(fit.numbers) for fit in fits] == [20, 20, 20, 20]
+    for ring, fit in enumerate(fits):
+        assert np.allclose(fit.semi_axes, [273.0, 220.5], atol=1e-3)
+        assert np.allclose(fit.center, [60 / math.sqrt(2), -60 / math.sqrt(2)], atol=1e-3)
+        assert abs(fit.rotation) < 1e-5
+        assert fit.curve_deviation < 0.001
+        assert fit.even_deviation == pytest.approx(8.415, abs=0.01)
+        again = mph.ellipse_rings(**fit.parameters(), **MODULE)
+        those = system[20 * ring : 20 * ring + 20]
+        assert np.abs(again.centers - those.centers).max() < 0.001
+        assert np.abs(again.collimator_length - those.collimator_length).max() < 0.001
+
+
+@pytest.mark.parametrize("places", [[[200, 0], [0, 220], [-210, 0]], [[100.0, x] for x in range(-200, 201, 50)]])
+def test_rings_that_fit_no_ellipse_get_a_circle(places):
+    centers = np.c_[places, np.zeros(len(places))]
+    (fit,) = mph.fit_rings(mph.PinholeSystem(centers, 2.3, 60.0, 50.0, 10.0, 75.0))
+    distance = np.linalg.norm(centers, axis=1)
+    assert np.allclose(fit.semi_axes, distance.mean())
+    assert fit.curve_deviation == pytest.approx(np.abs(distance - distance.mean()).max())
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"modules": 0}, "modules"),
+        ({"modules": 2.5}, "modules"),
+        ({"semi_axes": (200, -1)}, "semi_axes"),
+        ({"semi_axes": (200, 100, 50)}, "semi_axes"),
+        ({"center": (0, 400)}, "isocentre must be inside"),
+        ({"end": 9.0}, "full turn"),
+        ({"spacing": "even"}, "spacing"),
+        ({"z": [[1, 2, 3]]}, "z: expected"),
+        ({"z": 0.0, "mirrored": True}, "mirrored"),
+        ({"start": 1.0, "end": 1.0}, "same pinhole centre"),
+        ({"roi_radius": 500.0}, "R"),
+        ({"detector_side": [1.0, 2.0]}, "detector_side"),
+    ],
+)
+def test_what_cannot_be_made_is_refused(change, words):
+    arguments = {"modules": 12, "semi_axes": (250, 230), "z": 20.0, **MODULE, **change}
+    with pytest.raises(mph.InputError, match=words):
+        mph.ellipse_rings(**arguments)
+
+
+def test_plates_that_cannot_be_are_refused():
+    for modules, vertices, words in ((2, [[1, 2]], "vertices"), ([1, 2], mph.regular_polygon(3, 200), "modules")):
+        with pytest.raises(mph.InputError, match=words):
+            mph.plate_rings(modules, vertices, 0.0, **MODULE)
+    with pytest.raises(mph.InputError, match="sides"):
+        mph.regular_polygon(2, 200)
+
+
+def test_a_module_on_the_axis_is_on_no_ring():
+    system = mph.PinholeSystem(np.array([[200.0, 0, 0], [0, 0, 250.0]]), 2.3, 60.0, 50.0, 10.0, 75.0)
+    with pytest.raises(mph.InputError, match="module 2: stands on the z axis"):
+        mph.fit_rings(system)
+    (alone,) = mph.fit_rings(system[:1])
+    assert np.allclose(mph.ellipse_rings(**alone.parameters(), **MODULE).centers, [[200, 0, 0]])

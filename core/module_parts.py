@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from .checks import positive
 from .collimator_mesh import Solid, collimator_solid, crystal_solid
@@ -50,7 +50,7 @@ class ModulePart:
         quads = self.solid[1]
         return quads[:, [0, 1, 2, 0, 2, 3]].reshape(-1, 3)
 
-    def to_world(self, points: ArrayLike) -> NDArray[np.float64]:
+    def to_world(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
         """Points (N, 3) of camera space in the world, mm."""
         return points @ self.pose[:3, :3].T + self.pose[:3, 3]
 

@@ -59,14 +59,15 @@ def meets(
     lengths: NDArray[np.float64],
 ) -> NDArray[np.bool_]:
     """Which rays (N,) from `origin` along unit `directions` (N, 3), of `lengths` (N,), run inside hull `p`."""
-    towards = directions @ hulls.normals[p].T
+    towards = hulls.normals[p] @ directions.T
+    towards[towards == 0] = -np.finfo(np.float64).tiny  # along a face: entered long ago, or never where it is outside
     outside = hulls.offsets[p] - hulls.normals[p] @ origin  # below 0 where the origin is on the face's outer side
-    with np.errstate(divide="ignore", invalid="ignore"):
-        at = outside / towards
-    enters = np.where(towards < 0, at, -np.inf).max(axis=1)
-    leaves = np.where(towards > 0, at, np.inf).min(axis=1)
-    beside = ((towards == 0) & (outside < 0)).any(axis=1)
-    return (np.minimum(leaves, lengths) - np.maximum(enters, 0.0) > TOUCH) & ~beside
+    with np.errstate(over="ignore"):
+        at = outside[:, None] / towards
+    # No ray enters all faces of a closed body, nor leaves all: 0 and its length are among these.
+    enters = np.where(towards < 0, at, 0.0).max(axis=0)
+    leaves = np.where(towards > 0, at, lengths).min(axis=0)
+    return leaves - enters > TOUCH
 
 
 def _candidates(

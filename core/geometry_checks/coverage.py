@@ -17,7 +17,7 @@ from .report import Uncovered
 SLACK = 0.01
 """mm of radius by which the field of view may fall short: what l rounded to 0.01 mm brings about."""
 
-_NODES, _WEIGHTS = np.polynomial.legendre.leggauss(64)
+_NODES, _WEIGHTS = np.polynomial.legendre.leggauss(64)  # type: ignore[no-untyped-call]
 
 
 def find_uncovered(system: PinholeSystem) -> tuple[Uncovered, ...]:

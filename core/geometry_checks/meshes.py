@@ -17,9 +17,9 @@ def find_open_meshes(parts: Sequence[ModulePart]) -> tuple[OpenMesh, ...]:
     for number, group in groupby(parts, lambda part: part.number):
         own = list(group)
         meshes = [trimesh.Trimesh(part.vertices, part.triangles, process=False) for part in own]
-        named = [(part.kind, mesh) for part, mesh in zip(own, meshes, strict=True)]
-        named.append(("module", trimesh.util.concatenate(meshes)))
-        found += [OpenMesh(number, name, fault) for name, mesh in named for fault in _faults(mesh)]
+        names = [*(part.kind for part in own), "module"]
+        for name, mesh in zip(names, [*meshes, trimesh.util.concatenate(meshes)], strict=True):
+            found += [OpenMesh(number, name, fault) for fault in _faults(mesh)]
     return tuple(found)
 
 

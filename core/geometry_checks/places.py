@@ -10,7 +10,7 @@ from .report import Intrusion, NearPair, SwallowedPinhole
 
 
 def find_near_pairs(system: PinholeSystem, wall_thickness: float) -> tuple[NearPair, ...]:
-    """Modules whose pinholes are closer together than their fronts, of half-width d/2 + wall, side by side."""
+    """Modules whose pinholes are closer together than two fronts, of half-width d/2 + wall, side by side."""
     half = system.pinhole_diameter / 2 + wall_thickness
     found = []
     for m, number in enumerate(system.numbers.tolist()):

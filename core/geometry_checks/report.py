@@ -40,7 +40,7 @@ class Overlap:
         at = ", ".join(f"{x:.1f}" for x in self.point)
         return (
             f"modules {self.first} and {self.second}: {self.first_part} and {self.second_part} overlap, "
-            f"{_mm(self.depth)} deep at ({at})"
+            f"{_mm(self.depth)} deep at ({at}) mm"
         )
 
 

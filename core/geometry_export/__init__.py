@@ -12,8 +12,10 @@ from ..errors import InputError
 from ..system import PinholeSystem
 from ..views import Views
 from .format import Format
+from .solids import GLB, STL, STL_PARTS, THREE_MF
 
-FORMATS: dict[str, Format] = {f.name: f for f in ()}
+_FORMATS = (STL, STL_PARTS, THREE_MF, GLB)
+FORMATS: dict[str, Format] = {f.name: f for f in _FORMATS}
 
 
 def write_geometry(

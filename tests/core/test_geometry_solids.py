@@ -1,0 +1,147 @@
+"""Solids as files: what other programs read is the geometry, named, closed and in its place."""
+
+from __future__ import annotations
+
+import zipfile
+from xml.etree import ElementTree
+
+import numpy as np
+import pytest
+
+import mphdrr.core as mph
+from mphdrr.core.geometry_export import write_geometry
+from mphdrr.core.module_parts import module_parts
+
+trimesh = pytest.importorskip("trimesh")
+
+PLATE, WALL = 3.0, 1.5
+MM = 1e-4  # float32 holds lengths of a scanner to about 3e-5 mm
+
+
+def read_glb(path) -> dict:
+    """Meshes as glTF places them, back from its metres and +y up."""
+    scene = trimesh.load(path)
+    meshes = {}
+    for node in scene.graph.nodes_geometry:
+        pose, name = scene.graph[node]
+        assert node == name
+        x, y, z = (scene.geometry[name].vertices @ pose[:3, :3].T + pose[:3, 3]).T * 1000
+        meshes[name] = trimesh.Trimesh(np.column_stack([x, -z, y]), scene.geometry[name].faces, process=False)
+        assert np.allclose(meshes[name].vertices, scene.geometry[name].vertices, atol=MM)  # stored in mm
+    return meshes
+
+
+def read_3mf(path) -> dict:
+    pytest.importorskip("lxml", reason="trimesh reads 3MF with lxml")
+    pytest.importorskip("networkx", reason="trimesh reads 3MF with networkx")
+    scene = trimesh.load(path)
+    assert scene.units == "millimeter"
+    return dict(scene.geometry)
+
+
+def read_3mf_as_xml(path) -> dict:
+    """By the 3MF core specification and nothing else."""
+    core = "{http://schemas.microsoft.com/3dmanufacturing/core/2015/02}"
+    with zipfile.ZipFile(path) as package:
+        relationship = ElementTree.fromstring(package.read("_rels/.rels"))[0]
+        types = ElementTree.fromstring(package.read("[Content_Types].xml"))
+        assert {t.get("Extension") for t in types} == {"rels", "model"}
+        model = ElementTree.fromstring(package.read(relationship.get("Target").lstrip("/")))
+    assert model.tag == f"{core}model" and model.get("unit") == "millimeter"
+    colors = [base.get("displaycolor") for base in model.iter(f"{core}base")]
+    assert len(set(colors)) == 2
+    objects = {o.get("id"): o for o in model.iter(f"{core}object")}
+    meshes = {}
+    for item in model.iter(f"{core}item"):
+        found = objects.pop(item.get("objectid"))
+        vertices = [[float(v.get(c)) for c in "xyz"] for v in found.iter(f"{core}vertex")]
+        faces = [[int(t.get(c)) for c in ("v1", "v2", "v3")] for t in found.iter(f"{core}triangle")]
+        assert ("crystal" in found.get("name")) == (found.get("pindex") == "1")
+        meshes[found.get("name")] = trimesh.Trimesh(vertices, faces, process=False)
+    assert not objects
+    return meshes
+
+
+def read_folder(path) -> dict:
+    return {file.stem: trimesh.load(file) for file in path.iterdir() if file.suffix == ".stl"}
+
+
+FILES = [
+    ("glb", "scanner.glb", read_glb),
+    ("3mf", "scanner.3mf", read_3mf),
+    ("3mf", "scanner.3mf", read_3mf_as_xml),
+    ("stl-parts", "scanner", read_folder),
+]
+
+
+@pytest.mark.parametrize(("format", "name", "read"), FILES)
+def test_parts_come_back_whole_and_in_their_place(system, tmp_path, format, name, read):
+    write_geometry(system, tmp_path / name, format, plate_thickness=PLATE, wall_thickness=WALL)
+    meshes = read(tmp_path / name)
+    expected = {part.name: part for part in module_parts(system, PLATE, WALL)}
+    assert set(meshes) == set(expected) and len(expected) == 24
+    for key, mesh in meshes.items():
+        original = trimesh.Trimesh(expected[key].vertices, expected[key].triangles, process=False)
+        assert mesh.is_watertight and mesh.is_winding_consistent
+        assert mesh.volume == pytest.approx(original.volume, rel=1e-5) and mesh.volume > 0
+        assert np.allclose(mesh.bounds, original.bounds, atol=MM)
+
+    # The fiducials: rims of the hole in front of and behind the plate, the middle of the crystal's face.
+    for m, number in enumerate(system.numbers):
+        pinhole, k = system.centers[m], system.principal_rays[m]
+        corners = np.unique(meshes[f"Module {number} collimator"].vertices.round(5), axis=0)
+        for depth in (0.0, PLATE):
+            middle = pinhole - depth * k
+            rim = corners[np.abs(np.linalg.norm(corners - middle, axis=1) - system.pinhole_diameter[m] / 2) < MM]
+            assert len(rim) == 32
+            assert np.allclose(rim.mean(axis=0), middle, atol=MM)
+            assert np.allclose((rim - middle) @ k, 0, atol=MM)
+        corners = np.unique(meshes[f"Module {number} crystal"].vertices.round(5), axis=0)
+        nearest = corners[np.argsort(np.linalg.norm(corners - pinhole, axis=1))[:4]]
+        assert np.allclose(nearest.mean(axis=0), pinhole - system.collimator_length[m] * k, atol=MM)
+
+
+@pytest.mark.parametrize(("part", "kinds"), [("all", 2), ("collimators", 1), ("crystals", 1)])
+def test_one_stl_file_holds_the_parts_chosen(system, tmp_path, part, kinds):
+    path = tmp_path / "scanner.STL"
+    write_geometry(system, path, "stl", part=part)
+    assert not path.read_bytes().startswith(b"solid")  # that would be a text file
+    mesh = trimesh.load(path, file_type="stl")
+    wanted = [p for p in module_parts(system) if part == "all" or p.kind == part[:-1]]
+    assert len(wanted) == 12 * kinds
+    assert mesh.is_watertight and mesh.is_winding_consistent
+    total = sum(trimesh.Trimesh(p.vertices, p.triangles, process=False).volume for p in wanted)
+    assert mesh.volume == pytest.approx(total, rel=1e-5)
+    assert np.allclose(mesh.bounds[0], np.min([p.vertices.min(axis=0) for p in wanted], axis=0), atol=MM)
+
+
+def test_glb_is_laid_out_as_the_standard_says(system, tmp_path):
+    write_geometry(system, tmp_path / "a.glb", "glb", part="crystals")
+    data = (tmp_path / "a.glb").read_bytes()
+    magic, version, length = data[:4], *np.frombuffer(data[4:12], "<u4")
+    assert (magic, version, length) == (b"glTF", 2, len(data))
+    start, kinds = 12, []
+    while start < length:
+        (size,) = np.frombuffer(data[start : start + 4], "<u4")
+        kinds.append(data[start + 4 : start + 8])
+        assert size % 4 == 0
+        start += 8 + int(size)
+    assert kinds == [b"JSON", b"BIN\0"] and start == length
+    # In metres: the scanner is less than a metre wide.
+    assert 0.1 < np.ptp(trimesh.load(tmp_path / "a.glb").bounds, axis=0).max() < 1.0
+
+
+@pytest.mark.parametrize(
+    ("format", "name", "options", "word"),
+    [
+        ("stl", "a.stl", {"part": "plates"}, "collimators, crystals, all"),
+        ("3mf", "a.3mf", {"plate_thickness": 99.0}, "module 101: aperture plate"),
+        ("glb", "a.glb", {"wall_thickness": 0.0}, "collimator wall"),
+        ("stl-parts", "a", {"wall_thickness": "thick"}, "collimator wall"),
+        ("glb", "a.stl", {}, ".glb"),
+    ],
+)
+def test_what_cannot_be_written_leaves_nothing(system, tmp_path, format, name, options, word):
+    with pytest.raises(mph.InputError, match=word):
+        write_geometry(system, tmp_path / name, format, **options)
+    assert list(tmp_path.iterdir()) == []

@@ -49,6 +49,7 @@ def refresh(
     modules: Sequence[bpy.types.Object],
     changed: Iterable[bpy.types.Object],
     totals: bool = False,
+    aim: bool = True,
 ) -> None:
     """Make modules, and their scanner's totals, follow their places and numbers.
 
@@ -62,6 +63,8 @@ def refresh(
         Those to look at. One that is as it was built costs next to nothing.
     totals
         Calculate the totals again even where no module has changed: after an undo.
+    aim
+        Aim modules that have been moved, if the scanner is set so.
     """
     if is_writing():
         return
@@ -69,7 +72,7 @@ def refresh(
     scanner = collection.mphdrr_scanner
     with writing():
         parts = parts_of(collection, changed)
-        rebuilt = [_refresh_module(camera, scanner, parts[camera]) for camera in changed]
+        rebuilt = [_refresh_module(camera, scanner, parts[camera], aim) for camera in changed]
         if totals or any(rebuilt) or scanner.count != len(modules):
             readouts.update_scanner(scanner, [camera.mphdrr_module for camera in modules])
             _resize_roi(collection, modules)
@@ -89,15 +92,15 @@ def parts_of(
 
 
 def _refresh_module(
-    camera: bpy.types.Object, scanner: bpy.types.PropertyGroup, parts: Sequence[bpy.types.Object]
+    camera: bpy.types.Object, scanner: bpy.types.PropertyGroup, parts: Sequence[bpy.types.Object], aim: bool
 ) -> bool:
     """Make one module follow; says whether its readouts have changed."""
     module = camera.mphdrr_module
     place = cameras.world_matrix(camera)[:3, 3]
     if np.any(np.array(module.placed, np.float32) != place.astype(np.float32)):
-        is_moved = bool(module.built)  # otherwise it is seen for the first time
+        aim = aim and bool(module.built)  # otherwise it is seen for the first time
         module.placed = place
-        if is_moved and scanner.keep_aimed and is_free(camera) and off_aim([camera]) and np.any(place):
+        if aim and scanner.keep_aimed and is_free(camera) and off_aim([camera]) and np.any(place):
             cameras.set_world_matrix(camera, cameras.camera_matrices(place[None])[0])
     numbers, aimed = module_numbers(camera), not off_aim([camera])
     walls = typed(scanner.plate_thickness), typed(scanner.wall_thickness)
@@ -117,7 +120,9 @@ def _refresh_module(
 
 def is_free(camera: bpy.types.Object) -> bool:
     """Whether nothing but the user turns the camera: no animation, no driver, no constraint."""
-    return camera.animation_data is None and not len(camera.constraints)
+    data = camera.animation_data
+    is_animated = data is not None and (data.action is not None or len(data.drivers) or len(data.nla_tracks))
+    return not is_animated and not len(camera.constraints)
 
 
 def _rebuild(

@@ -23,6 +23,16 @@ _undone: dict[str, str] = {}  # what an undo left untidy, in words, by scanner: 
 @bpy.app.handlers.persistent
 def after_update(scene: bpy.types.Scene, depsgraph: bpy.types.Depsgraph) -> None:
     """Something was evaluated: modules that have moved are rebuilt; nothing else costs more than a look at the list."""
+    _follow(scene, depsgraph, aim=True)
+
+
+@bpy.app.handlers.persistent
+def after_frame(scene: bpy.types.Scene, depsgraph: bpy.types.Depsgraph) -> None:
+    """Another frame: what an animation moves is rebuilt, and looks where the animation has it look."""
+    _follow(scene, depsgraph, aim=False)
+
+
+def _follow(scene: bpy.types.Scene, depsgraph: bpy.types.Depsgraph, aim: bool) -> None:
     global _overlooked
     if depsgraph.mode != "VIEWPORT" or design.is_writing():
         return
@@ -41,7 +51,8 @@ def after_update(scene: bpy.types.Scene, depsgraph: bpy.types.Depsgraph) -> None
     _overlooked = False
     for collection in _own(scanner.scanners(scene)):
         found = scanner.modules(collection)
-        design.refresh(collection, found, found if structure else [camera for camera in found if camera in moved])
+        changed = found if structure else [camera for camera in found if camera in moved]
+        design.refresh(collection, found, changed, aim=aim)
         if structure:
             _look_for_copies(collection)
 

@@ -106,7 +106,7 @@ class MPHDRR_PT_scanner_design(_Panel, bpy.types.Panel):
             layout,
             (
                 ("Sensitivity", f"{properties.sensitivity:.1f} cps/MBq"),
-                ("Resolution", f"{properties.resolution:.2f} mm FWHM, mean"),
+                ("Mean FWHM", f"{properties.resolution:.2f} mm"),
                 ("See the ROI", f"{properties.n_covering} of {properties.count} modules"),
             ),
         )
@@ -160,7 +160,7 @@ def _draw_readouts(layout: bpy.types.UILayout, lines: tuple[tuple[str, str], ...
         values.label(text=value)
 
 
-def _draw_text(layout: bpy.types.UILayout, text: str, width: int = 44) -> None:
+def _draw_text(layout: bpy.types.UILayout, text: str, width: int = 32) -> None:
     """Text in lines that fit a narrow sidebar."""
     lines = [""]
     for word in text.split():

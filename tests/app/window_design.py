@@ -76,66 +76,79 @@ def meshes() -> int:
     return sum(o.mphdrr_module.part in {"COLLIMATOR", "CRYSTAL"} for o in scanner().all_objects)
 
 
+def moved(number: int, by: tuple[float, float, float]):
+    """Whether a module has come to `by` from where it was at first, and its readouts with it."""
+    start = seen["before"]["place"]
+
+    def is_there() -> bool:
+        camera = module(number)
+        arrived = all(abs(x - x0 - d) < 1e-3 for x, x0, d in zip(camera.location, start, by, strict=True))
+        return arrived and abs(camera.mphdrr_module.pinhole_distance - camera.location.length) < 1e-3
+
+    return is_there
+
+
 def steps():
+    """Yields what to wait for: seconds, or a function that says when it has happened."""
     for name in ("Cube", "Light", "Camera"):
         bpy.data.objects.remove(bpy.data.objects[name])
-    bpy.ops.mphdrr.import_geometry(filepath=str(workbook))
+    bpy.ops.mphdrr.import_geometry("EXEC_DEFAULT", True, filepath=str(workbook))
     show()
-    yield 2
+    yield 3
     select(3)
     yield 1
     seen["before"] = state(3)
 
     keys("g", "x", "3", "0", "Return")
-    yield 2
+    yield moved(3, (30, 0, 0))
     seen["moved"] = state(3)
     keys("ctrl+z")
-    yield 2
+    yield moved(3, (0, 0, 0))
     seen["undone"] = state(3)
     keys("ctrl+shift+z")
-    yield 2
+    yield moved(3, (30, 0, 0))
     seen["redone"] = state(3)
     keys("ctrl+z")
-    yield 2
+    yield moved(3, (0, 0, 0))
 
     # A number typed in the panel or a script's operator: the undo step is taken before Blender evaluates the scene.
     window, area, region = viewport()
     with bpy.context.temp_override(window=window, area=area, region=region):
         bpy.ops.transform.translate("EXEC_DEFAULT", True, value=(0, 0, 25))
-    yield 1
+    yield moved(3, (0, 0, 25))
     seen["translated"] = state(3)
     keys("ctrl+z")
-    yield 2
+    yield moved(3, (0, 0, 0))
     seen["translated_undone"] = state(3)
 
     keys("shift+d", "z", "4", "0", "Return")
-    yield 2.5
+    yield lambda: max(numbers()) == 81 and meshes() == 162
     seen["copied"] = {"numbers": numbers(), "parts": meshes(), "state": state(max(numbers()))}
     keys("ctrl+z")
-    yield 2
+    yield lambda: max(numbers()) == 80
     seen["adoption_undone"] = {"numbers": numbers(), "untidy": scanner().mphdrr_scanner.untidy}
     keys("ctrl+z")
-    yield 2
+    yield lambda: len(numbers()) == 80
     seen["copy_undone"] = {"numbers": numbers(), "parts": meshes(), "untidy": scanner().mphdrr_scanner.untidy}
 
     select(5)
     yield 1
     keys("Delete")
-    yield 2.5
+    yield lambda: len(numbers()) == 79 and meshes() == 158
     seen["deleted"] = {"numbers": numbers(), "parts": meshes()}
     keys("ctrl+z")
-    yield 1
+    yield lambda: meshes() == 160
     keys("ctrl+z")
-    yield 2
+    yield lambda: len(numbers()) == 80
     seen["delete_undone"] = {"numbers": numbers(), "parts": meshes(), "state": state(5)}
 
     select(3)
     bpy.context.scene.mphdrr_geometry.active_index = scanner().all_objects.find(module(3).name)
     yield 1
-    seen["ok"] = True
     keys("g", "x", "4", "0")  # still moving when the picture is taken
-    yield 1
+    yield moved(3, (40, 0, 0))
     seen["moving"] = state(3)
+    seen["ok"] = True
 
 
 def show() -> None:
@@ -153,24 +166,35 @@ def show() -> None:
     view.view_rotation = Euler((1.05, 0, 0.95)).to_quaternion()
 
 
-def start() -> float | None:
-    global running
+def tick() -> float | None:
+    """A step when what the last one waits for has happened."""
+    global wanted, waiting_since
     sidebar = next(region for region in viewport()[1].regions if region.type == "UI")
     try:
         if sidebar.width > 1:
             sidebar.active_panel_category = "mphDRR"
-    except Exception:
+    except TypeError:
         pass  # it has no tabs yet
     try:
-        return next(running)
+        if callable(wanted) and not wanted():
+            if time.monotonic() - waiting_since < _PATIENCE:
+                return 0.3
+            raise TimeoutError(f"waited for line {running.gi_frame.f_lineno}")
+        if callable(wanted):  # and a moment for what may still come
+            wanted = 0.7
+            return wanted
+        wanted, waiting_since = next(running), time.monotonic()
+        return 0.3 if callable(wanted) else wanted
     except StopIteration:
         pass
     except Exception:
-        seen["ok"], seen["error"] = False, traceback.format_exc()
+        seen["error"] = traceback.format_exc()
     result_file.write_text(json.dumps(seen))
     return None
 
 
+_PATIENCE = 30.0  # s
+wanted: object = None
+waiting_since = 0.0
 running = steps()
-started = time.time()
-bpy.app.timers.register(start, first_interval=1.5)
+bpy.app.timers.register(tick, first_interval=1.5)

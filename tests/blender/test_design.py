@@ -199,6 +199,18 @@ def test_hidden_parented_and_animated_modules(scene, collection):
     assert animated.rotation_euler == rotation and not animated.mphdrr_module.aimed
     assert_consistent(collection)
 
+    carried = scanner.module(collection, 7)
+    bench.keyframe_insert("location", frame=1)
+    bench.location.x += 25.0
+    bench.keyframe_insert("location", frame=20)
+    scene.frame_set(1)
+    update()
+    rotation = carried.rotation_euler.copy()
+    scene.frame_set(20)
+    update()
+    assert carried.rotation_euler == rotation and not carried.mphdrr_module.aimed
+    assert_consistent(collection)
+
 
 def test_nothing_is_done_when_something_else_moves_or_nothing_has_changed(scene, collection, monkeypatch):
     calls = []

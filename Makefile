@@ -3,6 +3,7 @@
 # make bench   speed, accuracy and memory beside other projectors, into docs/; BENCH=--quick: a minute or two, into out/
 # make dist    extension zips in dist/, one per platform; PLATFORM=linux-x64 builds that one
 # make test-app   the Linux zip in a real Blender (see tests/app)
+# make test-gate  the Monte Carlo exports with GATE 10 itself, in an environment of its own (2 GB)
 # make clean   removes what the others made, environments included
 #
 # The environment is made in VENV on the first call. PYTHON picks its interpreter (3.11: Blender 4.5, 3.13: Blender 5.2);
@@ -19,7 +20,7 @@ ANY_PYTHON = $$(for p in "$(PYTHON)" python3 python3.11 python3.13; do "$$p" -c 
 ENVIRONMENT = @p=$(ANY_PYTHON); [ -n "$$p" ] || { echo "no Python found; name one: make PYTHON=/path/to/python3.11"; exit 1; }; \
 	"$$p" tools/environment.py $(VENV) --python "$(PYTHON)"
 
-.PHONY: demo test lint test-app bench dist clean env env-dev
+.PHONY: demo test lint test-app test-gate bench dist clean env env-dev
 
 demo: env
 	$(BIN)/mphdrr demo --output $(OUTPUT)
@@ -44,6 +45,10 @@ dist: env
 test-app: env-dev
 	$(BIN)/python tools/build_extension.py --platform linux-x64
 	$(BIN)/python -m pytest tests/app
+
+test-gate:
+	$(ENVIRONMENT) --extras dev,gate
+	$(BIN)/python -m pytest tests/core/test_monte_carlo.py
 
 env:
 	$(ENVIRONMENT) --extras blender

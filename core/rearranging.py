@@ -77,7 +77,7 @@ def pad(volume: Volume, before: ArrayLike, after: ArrayLike, value: float | None
 
 
 def canonical(volume: Volume) -> Volume:
-    """The same voxels in the world, indexed along the axes closest to right, front and head (RAS): flipped and transposed."""
+    """The same voxels in the world, indexed along the axes closest to right, front, head (RAS): flipped, transposed."""
     directions = volume.grid.affine[:3, :3] / volume.grid.spacing
     # The assignment of index axes to world axes with the largest sum of cosines, so that none is taken twice.
     order = max(permutations(range(3)), key=lambda axes: sum(abs(directions[i, axis]) for i, axis in enumerate(axes)))

@@ -120,7 +120,9 @@ def _contents(path: Path, series: str | None, progress: Progress | None) -> Cont
     except (MemoryError, Cancelled):
         raise
     except Exception as error:  # whatever a library raises on a damaged file
-        raise InputError(f"{path}: cannot be read as {'DICOM' if is_series else ending} ({first_line(error)})") from error
+        raise InputError(
+            f"{path}: cannot be read as {'DICOM' if is_series else ending} ({first_line(error)})"
+        ) from error
 
 
 def _ending(path: Path, endings: tuple[str, ...]) -> str:

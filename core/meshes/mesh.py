@@ -43,7 +43,9 @@ class Mesh:
         vertices = real_array(self.vertices, "mesh vertices", (None, 3))
         faces = np.asarray(self.faces)
         if faces.ndim != 2 or faces.shape[1] != 3 or faces.dtype.kind not in "iu":
-            raise InputError(f"mesh faces: expected F x 3 indices of vertices, got {faces.dtype} of shape {faces.shape}")
+            raise InputError(
+                f"mesh faces: expected F x 3 indices of vertices, got {faces.dtype} of shape {faces.shape}"
+            )
         if len(faces) == 0:
             raise InputError("mesh: it has no faces")
         if faces.min() < 0 or faces.max() >= len(vertices):
@@ -157,8 +159,12 @@ def require_closed(mesh: Mesh) -> None:
             count = f"{len(bad)} edge{'s' * (len(bad) > 1)}"
             raise InputError(f"mesh: {what} at {count}, the first at ({x:.4g}, {y:.4g}, {z:.4g}) mm; {remedy}")
 
-    refuse(np.flatnonzero(uses % 2), "it is not closed", "expected an even number of faces at each edge: fill the holes")
-    refuse(np.flatnonzero(turns), "faces look to different sides", "expected all to look outwards: recalculate the normals")
+    refuse(
+        np.flatnonzero(uses % 2), "it is not closed", "expected an even number of faces at each edge: fill the holes"
+    )
+    refuse(
+        np.flatnonzero(turns), "faces look to different sides", "expected all to look outwards: recalculate the normals"
+    )
 
 
 def _ending(path: Path) -> str:

@@ -23,7 +23,7 @@ from ..progress import Progress
 from ..volume import Volume
 from .mesh import Mesh, as_mesh, require_closed
 
-_COLUMNS = 1 << 16  # of voxels, at once
+_VOXELS = 1 << 21  # at once
 _ROUNDING = 1e-9  # shares closer than this to 0 and 1 are that
 
 
@@ -84,85 +84,106 @@ def mesh_coverage(mesh: Mesh, grid: Grid, progress: Progress | None = None) -> N
     # Voxel i lies between the planes i and i + 1.
     corners = (mesh.vertices @ back[:3, :3].T + back[:3, 3] + 0.5)[mesh.faces]
     n_x, n_y, n_z = grid.shape
-    corners = _between(corners, 1, 0, n_y)
-    corners = _cut(corners, 2, np.full(len(corners), n_z))[0]  # what is behind the last voxel covers none
-    corners[:, :, 2] = corners[:, :, 2].clip(0, None)  # what is in front of the first covers all of its column
-    low, high = (corners[:, :, 0].min(axis=1), corners[:, :, 0].max(axis=1)) if len(corners) else (np.empty(0),) * 2
-    slab = max(1, _COLUMNS // n_y)
+    start = np.floor(corners.min(axis=(0, 1))).clip(0, grid.shape).astype(int)
+    stop = np.ceil(corners.max(axis=(0, 1))).clip(0, grid.shape).astype(int)
+    if np.any(start >= stop):
+        return coverage
+    box = coverage[tuple(slice(a, b) for a, b in zip(start, stop, strict=True))]
+    n_x, n_y, n_z = box.shape
+    surface = _seen(_slab(_slab(corners - start, 0, 0, n_x), 1, 0, n_y))
+    # What is in front of the first voxel covers all of its column, what is behind the last one none of it.
+    in_front = _clip(surface, 2, 0, -1)
+    in_front[:, :, 2] = 0
+    surface = _seen(_joined([in_front, _slab(surface, 2, 0, n_z)]))
+    low, high = surface[:, :, 0].min(axis=1), surface[:, :, 0].max(axis=1)
+    slab = max(1, _VOXELS // (n_y * n_z))
     for first in range(0, n_x, slab):
         last = min(first + slab, n_x)
-        part = _between(corners[(low < last) & (high > first)], 0, first, last)
-        if len(part):
-            for axis in range(3):
-                part = _split(part, axis)
-            winding = _winding(part - [first, 0, 0], (last - first, n_y, n_z))
-            covered = np.minimum(np.abs(winding), 1)
-            covered[covered < _ROUNDING] = 0
-            covered[covered > 1 - _ROUNDING] = 1
-            coverage[first:last] = covered
+        pieces = _slab(surface[(low < last) & (high > first)], 0, first, last) - [first, 0, 0]
+        shape = (last - first, n_y, n_z)
+        cells = np.zeros((len(pieces), 3), np.int64)
+        for axis in range(3):
+            pieces, cells = _split(pieces, cells, axis, shape[axis])
+        covered = np.minimum(np.abs(_winding(pieces, cells, shape)), 1)
+        covered[covered < _ROUNDING] = 0
+        covered[covered > 1 - _ROUNDING] = 1
+        box[first:last] = covered
         if progress is not None:
             progress(last, n_x)
     return coverage
 
 
-def _winding(pieces: NDArray[np.float64], shape: tuple[int, int, int]) -> NDArray[np.float64]:
-    """Mean winding number of each voxel from `pieces` (N, 3, 3) of the surface, each within one voxel."""
-    a, b, c = (pieces[:, i] for i in range(3))
-    area = ((b - a)[:, 0] * (c - a)[:, 1] - (b - a)[:, 1] * (c - a)[:, 0]) / 2  # seen along z, with its sign
-    middle = pieces.mean(axis=1)
+def _winding(pieces: NDArray[np.float64], cells: NDArray[np.int64], shape: tuple[int, int, int]) -> NDArray[np.float64]:
+    """Mean winding number of each voxel from `pieces` (N, V, 3) of the surface, each within the voxel `cells` (N, 3)."""
     n_x, n_y, n_z = shape
-    i, j, k = np.floor(middle).astype(np.int64).clip(0, np.array(shape) - 1).T
-    own = area * (k + 1 - middle[:, 2])
-    voxel = (i * n_y + j) * (n_z + 1) + k
+    area, moment = np.zeros(len(pieces)), np.zeros(len(pieces))
+    tip = pieces[:, 0]
+    for i in range(1, pieces.shape[1] - 1):  # a fan of triangles
+        left, right = pieces[:, i] - tip, pieces[:, i + 1] - tip
+        seen_along_z = (left[:, 0] * right[:, 1] - left[:, 1] * right[:, 0]) / 2  # with the sign of its side
+        area += seen_along_z
+        moment += seen_along_z * (tip[:, 2] + (left[:, 2] + right[:, 2]) / 3)
+    own = area * (cells[:, 2] + 1) - moment
+    voxel = (cells[:, 0] * n_y + cells[:, 1]) * (n_z + 1) + cells[:, 2]
     size = n_x * n_y * (n_z + 1)
     steps = np.bincount(voxel, own, size) + np.bincount(voxel + 1, area - own, size)
     return np.cumsum(steps.reshape(n_x, n_y, n_z + 1), axis=2)[:, :, :n_z]
 
 
-def _split(pieces: NDArray[np.float64], axis: int) -> NDArray[np.float64]:
-    """The pieces, cut at every whole number along `axis` that they cross."""
-    done = []
-    while len(pieces):
-        low, high = np.floor(pieces[:, :, axis].min(axis=1)), np.ceil(pieces[:, :, axis].max(axis=1))
-        whole = high - low <= 1
-        done.append(pieces[whole])
-        pieces = np.concatenate(_cut(pieces[~whole], axis, (low + high)[~whole] // 2))
-    return np.concatenate(done) if done else pieces
+def _split(
+    pieces: NDArray[np.float64], cells: NDArray[np.int64], axis: int, n: int
+) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+    """The `pieces` (N, V, 3) cut at the whole numbers along `axis`, and `cells` (N, 3), along that axis theirs."""
+    low = np.floor(pieces[:, :, axis].min(axis=1)).astype(np.int64).clip(0, n - 1)
+    high = np.ceil(pieces[:, :, axis].max(axis=1)).astype(np.int64).clip(low + 1, n)
+    counts = high - low
+    whole, several = np.flatnonzero(counts == 1), np.flatnonzero(counts > 1)
+    of = np.repeat(several, counts[several])
+    before = np.cumsum(counts[several]) - counts[several]
+    cell = low[of] + np.arange(len(of)) - np.repeat(before, counts[several])
+    parts = _slab(pieces[of], axis, cell, cell + 1)
+    cells = cells[np.concatenate([whole, of])]
+    cells[:, axis] = np.concatenate([low[whole], cell])
+    return _joined([pieces[whole], parts]), cells
 
 
-def _between(triangles: NDArray[np.float64], axis: int, low: float, high: float) -> NDArray[np.float64]:
-    """What of the triangles lies between two planes."""
-    below, _ = _cut(triangles, axis, np.full(len(triangles), high))
-    return _cut(below, axis, np.full(len(below), low))[1]
+def _joined(pieces: list[NDArray[np.float64]]) -> NDArray[np.float64]:
+    """Pieces of different numbers of corners in one array; the last corner is repeated."""
+    corners = max(part.shape[1] for part in pieces)
+    return np.concatenate([part[:, np.minimum(np.arange(corners), part.shape[1] - 1)] for part in pieces])
 
 
-def _cut(
-    triangles: NDArray[np.float64], axis: int, plane: NDArray[np.float64]
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """The parts (n, 3, 3) of each triangle below and above its `plane` (N,), a coordinate along `axis`."""
-    beyond = triangles[:, :, axis] - plane[:, None]
-    below, above = (beyond <= 0).all(axis=1), (beyond >= 0).all(axis=1) & (beyond > 0).any(axis=1)
-    crossing = ~(below | above)
-    triangles_below, triangles_above = triangles[below], triangles[above]
-    cut, beyond, plane = triangles[crossing], beyond[crossing], plane[crossing]
-    # The corner that is alone on its side comes first; the order around the triangle stays.
-    over = beyond > 0
-    alone_is_over = over.sum(axis=1) == 1
-    alone = np.where(alone_is_over[:, None], over, ~over).argmax(axis=1)
-    order = (alone[:, None] + np.arange(3)) % 3
-    rows = np.arange(len(cut))[:, None]
-    cut, beyond = cut[rows, order], beyond[rows, order]
-    tip, left, right = cut[:, 0], cut[:, 1], cut[:, 2]
-    on_left = tip + (beyond[:, 0] / (beyond[:, 0] - beyond[:, 1]))[:, None] * (left - tip)
-    on_right = tip + (beyond[:, 0] / (beyond[:, 0] - beyond[:, 2]))[:, None] * (right - tip)
-    on_left[:, axis] = on_right[:, axis] = plane
-    tips = np.stack([tip, on_left, on_right], axis=1)
-    rests = np.concatenate([np.stack([on_left, left, right], axis=1), np.stack([on_left, right, on_right], axis=1)])
-    over_twice = np.concatenate([alone_is_over] * 2)
-    return (
-        np.concatenate([triangles_below, tips[~alone_is_over], rests[over_twice]]),
-        np.concatenate([triangles_above, tips[alone_is_over], rests[~over_twice]]),
-    )
+def _slab(pieces: NDArray[np.float64], axis: int, low: ArrayLike, high: ArrayLike) -> NDArray[np.float64]:
+    """What of `pieces` lies between two planes each."""
+    return _clip(_clip(pieces, axis, low, 1), axis, high, -1)
+
+
+def _seen(pieces: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Those of `pieces` that have an area as seen along z; the others cover nothing."""
+    return pieces[(np.ptp(pieces[:, :, :2], axis=1) > 0).all(axis=1)]
+
+
+def _clip(pieces: NDArray[np.float64], axis: int, plane: ArrayLike, side: int) -> NDArray[np.float64]:
+    """What of convex `pieces` (N, V, 3) lies above (`side` 1) or below (-1) each one's `plane`: (N, W, 3).
+
+    I. Sutherland, G. Hodgman, "Reentrant polygon clipping", CACM 17 (1974). Corners to spare repeat the last one; what lies
+    on the other side altogether becomes a point.
+    """
+    n, corners = pieces.shape[:2]
+    plane = np.broadcast_to(plane, n)
+    inside = side * (pieces[:, :, axis] - plane[:, None])  # depth
+    following, depth = np.roll(pieces, -1, axis=1), np.roll(inside, -1, axis=1)
+    crosses = (inside > 0) & (depth < 0) | (inside < 0) & (depth > 0)
+    share = np.where(crosses, inside, 0) / np.where(crosses, inside - depth, 1)
+    crossing = pieces + share[:, :, None] * (following - pieces)
+    crossing[:, :, axis] = np.where(crosses, plane[:, None], crossing[:, :, axis])
+    both = np.stack([pieces, crossing], axis=2).reshape(n, 2 * corners, 3)
+    kept = np.stack([inside >= 0, crosses], axis=2).reshape(n, 2 * corners)
+    width = max(3, int(kept.sum(axis=1).max(initial=0)))
+    order = np.argsort(~kept, axis=1, kind="stable")[:, :width]
+    last = np.maximum(kept.sum(axis=1) - 1, 0)
+    order = order[np.arange(n)[:, None], np.minimum(np.arange(width), last[:, None])]
+    return both[np.arange(n)[:, None], order]
 
 
 def _is_pair(given: Sequence[Any]) -> bool:

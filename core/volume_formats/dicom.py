@@ -122,9 +122,7 @@ def _chosen(headers: list[tuple[Path, Any]], path: Path, series: str | None) -> 
         found[str(header.get("SeriesInstanceUID", ""))].append((file, header))
     if series is not None:
         names = ("SeriesNumber", "SeriesDescription", "SeriesInstanceUID")
-        matching = [
-            uid for uid, of in found.items() if str(series) in (str(of[0][1].get(name, "")) for name in names)
-        ]
+        matching = [uid for uid, of in found.items() if str(series) in (str(of[0][1].get(name, "")) for name in names)]
         if len(matching) == 1:
             return found[matching[0]]
         raise InputError(f"{len(matching) or 'no'} series {series!r} in it; there are {_listed(found)}")
@@ -156,7 +154,9 @@ def _slices(path: Path, header: Any) -> Iterator[_Slice]:
     frames = header.get("PerFrameFunctionalGroupsSequence")
     count = int(header.get("NumberOfFrames") or 1)
     if frames is None and count > 1:
-        raise InputError(f"{path.name}: {count} frames without a place for each; expected an enhanced image, or one frame")
+        raise InputError(
+            f"{path.name}: {count} frames without a place for each; expected an enhanced image, or one frame"
+        )
     shared = (header.get("SharedFunctionalGroupsSequence") or [None])[0]
     for frame in range(count):
         groups = [header] if frames is None else [frames[frame], shared]
@@ -173,12 +173,16 @@ def _slices(path: Path, header: Any) -> Iterator[_Slice]:
             return default
 
         if "ModalityLUTSequence" in header:
-            raise InputError(f"{path.name}: values by a table (ModalityLUTSequence) are not read; expected RescaleSlope")
+            raise InputError(
+                f"{path.name}: values by a table (ModalityLUTSequence) are not read; expected RescaleSlope"
+            )
         spacing = [float(x) for x in tag("PixelSpacing", "PixelMeasuresSequence")]
         orientation = np.array(tag("ImageOrientationPatient", "PlaneOrientationSequence"), np.float64)
         position = np.array(tag("ImagePositionPatient", "PlanePositionSequence"), np.float64)
         if len(spacing) != 2 or orientation.shape != (6,) or position.shape != (3,) or not min(spacing) > 0:
-            raise InputError(f"{path.name}: PixelSpacing, ImageOrientationPatient or ImagePositionPatient is incomplete")
+            raise InputError(
+                f"{path.name}: PixelSpacing, ImageOrientationPatient or ImagePositionPatient is incomplete"
+            )
         orientation = orientation.reshape(2, 3)
         if not np.allclose(orientation @ orientation.T, np.eye(2), atol=1e-3):
             raise InputError(f"{path.name}: ImageOrientationPatient: expected two unit vectors at right angles")
@@ -242,12 +246,14 @@ def _ordered(slices: list[_Slice]) -> tuple[list[_Slice], NDArray[np.float64]]:
             f"{places[k]:g} mm, the others {usual:g} mm"
         )
     step = (last.position - first.position) / (len(slices) - 1)
-    sideways = np.array([one.position - first.position - (one.position - first.position) @ normal * normal for one in slices])
+    sideways = np.array(
+        [one.position - first.position - (one.position - first.position) @ normal * normal for one in slices]
+    )
     tilt = float(np.linalg.norm(sideways[-1]) / (places[-1] - places[0]))
     if tilt > _UPRIGHT:
         raise InputError(
-            f"the gantry is tilted by {np.degrees(np.arctan(tilt)):.1f} degrees (from {first.name} to {last.name} the slices "
-            "move sideways); expected upright slices: resample the series first"
+            f"the gantry is tilted by {np.degrees(np.arctan(tilt)):.1f} degrees (slices move sideways from "
+            f"{first.name} to {last.name}); expected upright slices: resample the series first"
         )
     off = np.linalg.norm(sideways - np.outer((places - places[0]) / (places[-1] - places[0]), sideways[-1]), axis=1)
     if off.max() > 0.1 * min(first.spacing):

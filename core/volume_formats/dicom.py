@@ -94,25 +94,28 @@ def read(path: Path, series: str | None = None, progress: Progress | None = None
 def _headers(path: Path) -> list[tuple[Path, Any]]:
     """The images in the folder, or those of a file's series, without their pixels."""
     import pydicom
+    from pydicom.errors import InvalidDicomError
 
+    files = sorted(path.iterdir()) if path.is_dir() else [path, *sorted(path.parent.iterdir())]
     wanted = None
-    if path.is_file():
-        wanted = pydicom.dcmread(path, stop_before_pixels=True).get("SeriesInstanceUID")
-    folder = path if path.is_dir() else path.parent
-    headers = []
-    for file in sorted(folder.iterdir()):
-        if not (file.is_file() and (is_dicom(file) or file.suffix.lower() in (".dcm", ".ima"))):
+    headers = {}
+    for file in files:
+        if file in headers or not (file.is_file() and (is_dicom(file) or file.suffix.lower() in (".dcm", ".ima"))):
             continue
         try:
             header = pydicom.dcmread(file, stop_before_pixels=True)
+        except InvalidDicomError:
+            raise InputError(f"{file.name} is no DICOM file") from None
         except Exception as error:  # whatever pydicom raises on a damaged file
             raise InputError(f"{file.name} cannot be read as DICOM ({first_line(error)})") from None
+        if file == path:
+            wanted = header.get("SeriesInstanceUID")
         # Directories, reports and plans have no pixels.
         if "Rows" in header and (wanted is None or header.get("SeriesInstanceUID") == wanted):
-            headers.append((file, header))
+            headers[file] = header
     if not headers:
         raise InputError("expected a folder with the images of a DICOM series; it has none")
-    return headers
+    return list(headers.items())
 
 
 def _chosen(headers: list[tuple[Path, Any]], path: Path, series: str | None) -> list[tuple[Path, Any]]:

@@ -82,6 +82,7 @@ def write_meta_image(path: Path, array: np.ndarray, lines: str = "", data: bytes
         "ElementDataFile": "LOCAL",
         **changes,
     }
+    header["ElementDataFile"] = header.pop("ElementDataFile")  # the last line
     text = "".join(f"{key} = {value}\n" for key, value in header.items() if value)
     path.write_bytes(text.encode() + (array.tobytes(order="F") if data is None else data))
 
@@ -403,12 +404,12 @@ BAD = {
         "it holds 'MR': say which quantity that is",
     ),
     "an empty folder": (_empty, "expected a folder with the images of a DICOM series"),
-    "no DICOM": (_bytes("v.dcm", b"hello" * 99), "v.dcm cannot be read as DICOM"),
+    "no DICOM": (_bytes("v.dcm", b"hello" * 99), "v.dcm is no DICOM file"),
     "unknown suffix": (_bytes("v.xyz", b"hello" * 99), "expected a folder of DICOM files, or a name ending in"),
     "4-D NIfTI": (_nifti(np.zeros((3, 3, 3, 2), np.float32)), "expected a 3-D image, got shape 3 x 3 x 3 x 2"),
     "NaN": (_nifti(NAN), "nan is not a finite number at index (1, 2, 0)"),
     "complex NIfTI": (_nifti(np.zeros((3, 3, 3), np.complex64)), "expected real numbers"),
-    "truncated NIfTI": (_truncated("v.nii.gz"), "cannot be read as .nii.gz"),
+    "truncated NIfTI": (_truncated("v.nii"), "cannot be read as .nii"),
     "truncated npz": (_truncated("v.npz"), "cannot be read as .npz"),
     "truncated NRRD": (_truncated("v.nrrd"), "cannot be read as .nrrd"),
     "truncated HDF5": (_truncated("v.h5"), "cannot be read as .h5"),

@@ -98,8 +98,9 @@ def hu_to_mu(volume: Volume, energy: float = 140.5, ct_energy: float = CT_ENERGY
     for hu, slab in zip(volume.array, mu, strict=True):
         outside += np.count_nonzero(hu < _PADDING_HU)
         metal += np.count_nonzero(hu > _METAL_HU)
-        below = np.clip(hu, AIR_HU, 0) * ((water - air) / 1000)
-        above = np.maximum(hu, 0) * ((bone - water) * ct_water / (ct_bone - ct_water) / 1000)
+        exact = hu.astype(np.float64)  # air is what remains of two large terms
+        below = np.clip(exact, AIR_HU, 0) * ((water - air) / 1000)
+        above = np.maximum(exact, 0) * ((bone - water) * ct_water / (ct_bone - ct_water) / 1000)
         slab[:] = water + below + above
     for count, what in (
         (outside, f"below {_PADDING_HU:g} HU: taken as air, outside of what the CT saw"),

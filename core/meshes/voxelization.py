@@ -3,7 +3,8 @@
 The triangles are cut along all planes between voxels. Each piece then bounds a prism that reaches from it to the end of
 its column of voxels: of the piece's own voxel it takes a part that is known exactly, of the further ones the piece's area.
 Summed with the sign of the side that the piece looks to, the prisms give the mean winding number of each voxel (the
-divergence theorem), which is the covered share wherever the mesh does not cut through itself.
+divergence theorem): the covered share, unless the mesh runs through itself. A voxel at such a place may hold parts with the
+winding numbers 0 and 2; then smaller voxels are taken, whose winding numbers above 1 count as 1.
 """
 
 from __future__ import annotations
@@ -24,6 +25,7 @@ from ..volume import Volume
 from .mesh import Mesh, as_mesh, require_closed
 
 _VOXELS = 1 << 21  # at once
+_FINER = 4  # voxels along each axis for one, where a mesh runs through itself
 _ROUNDING = 1e-9  # shares closer than this to 0 and 1 are that
 
 
@@ -76,7 +78,8 @@ def voxelize_mesh(
 def mesh_coverage(mesh: Mesh, grid: Grid, progress: Progress | None = None) -> NDArray[np.float32]:
     """Share of each voxel that lies inside a closed mesh, 0 to 1, float32 array of the grid's shape.
 
-    Where the mesh runs through itself, what any part of it encloses is inside.
+    Where the mesh runs through itself, what any part of it encloses is inside; the share of voxels at the places where it
+    does so is only near the exact one.
     """
     require_closed(mesh)
     coverage = np.zeros(grid.shape, np.float32)
@@ -95,27 +98,38 @@ def mesh_coverage(mesh: Mesh, grid: Grid, progress: Progress | None = None) -> N
     in_front = _clip(surface, 2, 0, -1)
     in_front[:, :, 2] = 0
     surface = _seen(_joined([in_front, _slab(surface, 2, 0, n_z)]))
+    if _fill(box, surface, 1, progress) > 1 + _ROUNDING:
+        _fill(box, surface, _FINER, progress)
+    return coverage
+
+
+def _fill(box: NDArray[np.float32], surface: NDArray[np.float64], finer: int, progress: Progress | None) -> float:
+    """Put the coverage into `box`, from voxels `finer` times smaller; gives the largest winding number."""
+    n_x, n_y, n_z = box.shape
     low, high = surface[:, :, 0].min(axis=1), surface[:, :, 0].max(axis=1)
-    slab = max(1, _VOXELS // (n_y * n_z))
+    slab = max(1, _VOXELS // (n_y * n_z * finer**3))
+    most = 0.0
     for first in range(0, n_x, slab):
         last = min(first + slab, n_x)
         pieces = _slab(surface[(low < last) & (high > first)], 0, first, last) - [first, 0, 0]
-        shape = (last - first, n_y, n_z)
-        cells = np.zeros((len(pieces), 3), np.int64)
-        for axis in range(3):
-            pieces, cells = _split(pieces, cells, axis, shape[axis])
-        covered = np.minimum(np.abs(_winding(pieces, cells, shape)), 1)
+        shape = ((last - first) * finer, n_y * finer, n_z * finer)
+        winding = np.abs(_winding(pieces * finer, shape))
+        most = max(most, float(winding.max()))
+        covered = np.minimum(winding, 1).reshape(last - first, finer, n_y, finer, n_z, finer).mean(axis=(1, 3, 5))
         covered[covered < _ROUNDING] = 0
         covered[covered > 1 - _ROUNDING] = 1
         box[first:last] = covered
         if progress is not None:
             progress(last, n_x)
-    return coverage
+    return most
 
 
-def _winding(pieces: NDArray[np.float64], cells: NDArray[np.int64], shape: tuple[int, int, int]) -> NDArray[np.float64]:
-    """Mean winding number of each voxel from `pieces` (N, V, 3) of the surface, each within the voxel `cells` (N, 3)."""
+def _winding(pieces: NDArray[np.float64], shape: tuple[int, int, int]) -> NDArray[np.float64]:
+    """Mean winding number of each voxel from the surface's `pieces` (N, V, 3) that lie among them."""
     n_x, n_y, n_z = shape
+    cells = np.zeros((len(pieces), 3), np.int64)
+    for axis in range(3):
+        pieces, cells = _split(pieces, cells, axis, shape[axis])
     area, moment = np.zeros(len(pieces)), np.zeros(len(pieces))
     tip = pieces[:, 0]
     for i in range(1, pieces.shape[1] - 1):  # a fan of triangles

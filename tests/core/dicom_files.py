@@ -13,7 +13,9 @@ import mphdrr.core as mph
 LPS = np.diag([-1.0, -1.0, 1.0, 1.0])
 
 
-def write_series(volume: mph.Volume, folder: Path, number: int = 1, description: str = "Thorax", names=None) -> list[Dataset]:
+def write_series(
+    volume: mph.Volume, folder: Path, number: int = 1, description: str = "Thorax", names=None
+) -> list[Dataset]:
     """One file for each plane of iz, with its own slope and intercept; gives the data sets, which know their files."""
     folder.mkdir(exist_ok=True)
     affine = LPS @ volume.grid.affine

@@ -120,7 +120,9 @@ def test_simpleitk_puts_every_voxel_in_the_same_place(tmp_path, ct, name):
         reader = itk.ImageSeriesReader()
         reader.SetFileNames(reader.GetGDCMSeriesFileNames(str(tmp_path / name)))
         back = reader.Execute()
-        assert np.allclose(back.TransformIndexToPhysicalPoint((1, 2, 3)), image.TransformIndexToPhysicalPoint((1, 2, 3)))
+        assert np.allclose(
+            back.TransformIndexToPhysicalPoint((1, 2, 3)), image.TransformIndexToPhysicalPoint((1, 2, 3))
+        )
         assert np.array_equal(itk.GetArrayFromImage(back), itk.GetArrayFromImage(image))
     else:
         itk.WriteImage(image, str(tmp_path / name), useCompression=name == "v.mha")
@@ -400,7 +402,11 @@ BAD = {
     "truncated slice": (_series(_cut_short), "1-0004.dcm"),
     "compressed slices": (_series(_compressed), "its pixels are compressed (JPEG-LS"),
     "magnetic resonance": (
-        _series(lambda written, folder: [(setattr(d, "Modality", "MR"), delattr(d, "RescaleType"), save(d)) for d in written]),
+        _series(
+            lambda written, folder: [
+                (setattr(d, "Modality", "MR"), delattr(d, "RescaleType"), save(d)) for d in written
+            ]
+        ),
         "it holds 'MR': say which quantity that is",
     ),
     "an empty folder": (_empty, "expected a folder with the images of a DICOM series"),
@@ -426,10 +432,16 @@ BAD = {
     "HDF5 without the array": (_hdf5(data=np.zeros((3, 3, 3))), "array not found (there are: data)"),
     "text in HDF5": (_hdf5(array="abc", affine=np.eye(4)), "expected a 3-D image"),
     "MetaImage too short": (_meta(DimSize="5 6 8"), "expected 480 bytes of voxels"),
-    "MetaImage too long": (_meta(DimSize="5 6 6"), "expected 360 bytes of voxels (DimSize x ElementType), it holds more"),
+    "MetaImage too long": (
+        _meta(DimSize="5 6 6"),
+        "expected 360 bytes of voxels (DimSize x ElementType), it holds more",
+    ),
     "MetaImage of colours": (_meta(ElementNumberOfChannels="3"), "expected one value per voxel, found 3"),
     "MetaImage of another type": (_meta(ElementType="MET_OTHER"), "ElementType MET_OTHER: expected one of"),
-    "MetaImage without its voxels": (_meta(ElementDataFile="gone.raw"), "its voxels are in gone.raw, which is not beside it"),
+    "MetaImage without its voxels": (
+        _meta(ElementDataFile="gone.raw"),
+        "its voxels are in gone.raw, which is not beside it",
+    ),
     "MetaImage of text": (_meta(ElementSpacing="1 a 3"), "ElementSpacing = 1 a 3: expected numbers"),
     "2-D MetaImage": (_meta(DimSize="5 6", NDims="2"), "expected a 3-D image, got shape 5 x 6"),
     "MetaImage of nothing": (_bytes("v.mha", b"\x00" * 99), "not a MetaImage file"),

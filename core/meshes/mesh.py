@@ -144,14 +144,18 @@ def require_closed(mesh: Mesh) -> None:
     size = float(np.ptp(vertices, axis=0).max())
     # Files such as .stl have each triangle's corners for itself.
     steps = np.round((vertices - vertices.min(axis=0)) / (_SAME_POINT * size or 1.0))
-    _, first, merged = np.unique(steps, axis=0, return_index=True, return_inverse=True)
-    corners = merged.reshape(-1)[mesh.faces]
+    order = np.lexsort(steps.T)
+    new = np.append(True, (np.diff(steps[order], axis=0) != 0).any(axis=1))
+    first, merged = order[new], np.empty(len(vertices), np.int64)
+    merged[order] = np.cumsum(new) - 1
+    corners = merged[mesh.faces]
     # A triangle with two corners in one has no area, and its edges cancel.
     corners = corners[(corners != np.roll(corners, 1, axis=1)).all(axis=1)]
     start, end = corners.ravel(), np.roll(corners, -1, axis=1).ravel()
-    edge, index = np.unique(np.stack([np.minimum(start, end), np.maximum(start, end)]), axis=1, return_inverse=True)
-    uses = np.bincount(index.reshape(-1), minlength=edge.shape[1])
-    turns = np.bincount(index.reshape(-1), np.where(start < end, 1, -1), minlength=edge.shape[1])
+    key, index = np.unique(np.minimum(start, end) * len(first) + np.maximum(start, end), return_inverse=True)
+    edge = np.stack(np.divmod(key, len(first)))
+    uses = np.bincount(index)
+    turns = np.bincount(index, np.where(start < end, 1, -1))
 
     def refuse(bad: NDArray[np.int64], what: str, remedy: str) -> None:
         if len(bad):

@@ -3,8 +3,8 @@
 The triangles are cut along all planes between voxels. Each piece then bounds a prism that reaches from it to the end of
 its column of voxels: of the piece's own voxel it takes a part that is known exactly, of the further ones the piece's area.
 Summed with the sign of the side that the piece looks to, the prisms give the mean winding number of each voxel (the
-divergence theorem): the covered share, unless the mesh runs through itself. A voxel at such a place may hold parts with the
-winding numbers 0 and 2; then smaller voxels are taken, whose winding numbers above 1 count as 1.
+divergence theorem). That is the covered share, unless the mesh runs through itself: a voxel at such a place may hold parts
+with the winding numbers 0 and 2. Then smaller voxels are taken, whose winding numbers above 1 count as 1.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from ..progress import Progress
 from ..volume import Volume
 from .mesh import Mesh, as_mesh, require_closed
 
-_VOXELS = 1 << 21  # at once
+_VOXELS, _POLYGONS = 1 << 21, 1 << 14  # at once
 _FINER = 4  # voxels along each axis for one, where a mesh runs through itself
 _ROUNDING = 1e-9  # shares closer than this to 0 and 1 are that
 
@@ -124,23 +124,26 @@ def _fill(box: NDArray[np.float32], surface: NDArray[np.float64], finer: int, pr
     return most
 
 
-def _winding(pieces: NDArray[np.float64], shape: tuple[int, int, int]) -> NDArray[np.float64]:
-    """Mean winding number of each voxel from the surface's `pieces` (N, V, 3) that lie among them."""
+def _winding(surface: NDArray[np.float64], shape: tuple[int, int, int]) -> NDArray[np.float64]:
+    """Mean winding number of each voxel from the polygons (N, V, 3) of a surface among them."""
     n_x, n_y, n_z = shape
-    cells = np.zeros((len(pieces), 3), np.int64)
-    for axis in range(3):
-        pieces, cells = _split(pieces, cells, axis, shape[axis])
-    area, moment = np.zeros(len(pieces)), np.zeros(len(pieces))
-    tip = pieces[:, 0]
-    for i in range(1, pieces.shape[1] - 1):  # a fan of triangles
-        left, right = pieces[:, i] - tip, pieces[:, i + 1] - tip
-        seen_along_z = (left[:, 0] * right[:, 1] - left[:, 1] * right[:, 0]) / 2  # with the sign of its side
-        area += seen_along_z
-        moment += seen_along_z * (tip[:, 2] + (left[:, 2] + right[:, 2]) / 3)
-    own = area * (cells[:, 2] + 1) - moment
-    voxel = (cells[:, 0] * n_y + cells[:, 1]) * (n_z + 1) + cells[:, 2]
-    size = n_x * n_y * (n_z + 1)
-    steps = np.bincount(voxel, own, size) + np.bincount(voxel + 1, area - own, size)
+    steps = np.zeros(n_x * n_y * (n_z + 1))  # of the winding number, from each voxel to the next
+    for first in range(0, len(surface), _POLYGONS):
+        pieces = surface[first : first + _POLYGONS]
+        cells = np.zeros((len(pieces), 3), np.int64)
+        for axis in range(3):
+            pieces, cells = _split(pieces, cells, axis, shape[axis])
+        area, moment = np.zeros(len(pieces)), np.zeros(len(pieces))
+        tip = pieces[:, 0]
+        for i in range(1, pieces.shape[1] - 1):  # a fan of triangles
+            left, right = pieces[:, i] - tip, pieces[:, i + 1] - tip
+            seen_along_z = (left[:, 0] * right[:, 1] - left[:, 1] * right[:, 0]) / 2  # with the sign of its side
+            area += seen_along_z
+            moment += seen_along_z * (tip[:, 2] + (left[:, 2] + right[:, 2]) / 3)
+        own = area * (cells[:, 2] + 1) - moment
+        voxel = (cells[:, 0] * n_y + cells[:, 1]) * (n_z + 1) + cells[:, 2]
+        np.add.at(steps, voxel, own)
+        np.add.at(steps, voxel + 1, area - own)
     return np.cumsum(steps.reshape(n_x, n_y, n_z + 1), axis=2)[:, :, :n_z]
 
 
@@ -185,19 +188,28 @@ def _clip(pieces: NDArray[np.float64], axis: int, plane: ArrayLike, side: int) -
     """
     n, corners = pieces.shape[:2]
     plane = np.broadcast_to(plane, n)
-    inside = side * (pieces[:, :, axis] - plane[:, None])  # depth
-    following, depth = np.roll(pieces, -1, axis=1), np.roll(inside, -1, axis=1)
-    crosses = (inside > 0) & (depth < 0) | (inside < 0) & (depth > 0)
-    share = np.where(crosses, inside, 0) / np.where(crosses, inside - depth, 1)
-    crossing = pieces + share[:, :, None] * (following - pieces)
-    crossing[:, :, axis] = np.where(crosses, plane[:, None], crossing[:, :, axis])
-    both = np.stack([pieces, crossing], axis=2).reshape(n, 2 * corners, 3)
-    kept = np.stack([inside >= 0, crosses], axis=2).reshape(n, 2 * corners)
-    width = max(3, int(kept.sum(axis=1).max(initial=0)))
-    order = np.argsort(~kept, axis=1, kind="stable")[:, :width]
-    last = np.maximum(kept.sum(axis=1) - 1, 0)
-    order = order[np.arange(n)[:, None], np.minimum(np.arange(width), last[:, None])]
-    return both[np.arange(n)[:, None], order]
+    depth = side * (pieces[:, :, axis] - plane[:, None])
+    if not (depth < 0).any():
+        return pieces
+    following = np.roll(depth, -1, axis=1)
+    crosses = (depth > 0) & (following < 0) | (depth < 0) & (following > 0)
+    of, corner = np.nonzero(crosses)
+    start, end = pieces[of, corner], pieces[of, (corner + 1) % corners]
+    share = depth[of, corner] / (depth[of, corner] - following[of, corner])
+    points = np.stack([pieces, pieces], axis=2)  # each corner, and what lies on the edge from it
+    points[of, corner, 1] = start + share[:, None] * (end - start)
+    points[of, corner, 1, axis] = plane[of]
+    points = points.reshape(n, 2 * corners, 3)
+    kept = np.stack([depth >= 0, crosses], axis=2).reshape(n, 2 * corners)
+    place = np.cumsum(kept, axis=1)
+    count = place[:, -1:]
+    width = max(3, int(count.max(initial=0)))
+    result = np.zeros((n, width, 3))
+    of, corner = np.nonzero(kept)
+    result[of, place[of, corner] - 1] = points[of, corner]
+    spare = np.arange(width) >= count
+    last = result[np.arange(n), np.maximum(count[:, 0] - 1, 0)]
+    return np.where(spare[:, :, None], last[:, None], result)
 
 
 def _is_pair(given: Sequence[Any]) -> bool:

@@ -41,8 +41,8 @@ def resample(
     method
         ``"linear"``: trilinear interpolation between the voxels' centres. ``"nearest"``: of the voxel that holds the new
         voxel's centre (labels). ``"mean"``: the mean over the new voxel, for coarser grids: the sum of value x volume is
-        kept. It is exact where the grids' axes are parallel; else it is that of at least 8 points in each new voxel, two
-        for each old one along each axis.
+        kept. It is exact where the grids' axes are parallel; else it is that of points in each new voxel, at least two
+        along each axis and about one for each old voxel.
     outside
         The value beside the old grid. Default: 0, or -1000 of CT numbers.
     progress
@@ -144,7 +144,7 @@ def _at_points(
     linear, origin = index_from_index[:3, :3], index_from_index[:3, 3]
     counts = [1, 1, 1]
     if method == "mean":
-        counts = [2 * max(1, int(np.ceil(length))) for length in np.abs(linear).max(axis=0)]
+        counts = [max(2, int(np.ceil(length))) for length in np.abs(linear).max(axis=0)]
     fractions = [(np.arange(count) + 0.5) / count - 0.5 for count in counts]
     shifts = np.stack(np.meshgrid(*fractions, indexing="ij"), axis=-1).reshape(-1, 3) @ linear.T
     sample = _linear_samples if method == "linear" else _nearest_samples

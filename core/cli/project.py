@@ -159,9 +159,10 @@ def _attenuation(path: str, energy: str | None) -> Volume:
             raise InputError(f"{path}: it holds {volume.quantity}; --energy is for CT numbers (hu)")
         return hu_to_mu(volume, photon_energy(energy))
     volume = read_volume(path, "mu")
-    if volume.array.min() < 0:
+    lowest = float(volume.array.min())
+    if lowest < -1:  # interpolation may leave values a little below 0
         raise InputError(
-            f"{path}: attenuation is never below 0; if these are CT numbers, give --energy to convert them"
+            f"{path}: {lowest:g} is no attenuation in 1/mm; if it holds CT numbers, give --energy to convert them"
         )
     return volume
 

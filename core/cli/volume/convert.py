@@ -88,5 +88,8 @@ def _respaced(volume: Volume, spacing: list[float], method: str | None) -> Volum
     n_x, n_y, n_z = (max(1, int(np.ceil(n / step - 1e-6))) for n, step in zip(old.shape, steps, strict=True))
     index = np.diag([*steps, 1.0])
     index[:3, 3] = (steps - 1) / 2
+    grid = Grid((n_x, n_y, n_z), old.affine @ index)
     method = method or ("mean" if steps.max() > 1 else "linear")
-    return resample(volume, Grid((n_x, n_y, n_z), old.affine @ index), method, progress=progress_bar("resampling"))
+    # Labels come without a quantity, so that they pass for CT numbers: beside them is 0, not air.
+    outside = 0.0 if method == "nearest" and volume.array.min() >= 0 else None
+    return resample(volume, grid, method, outside, progress_bar("resampling"))

@@ -20,7 +20,7 @@ def add_parser(actions) -> None:  # type: ignore[no-untyped-def]
     )
     add_input(parser)
     parser.add_argument(
-        "--level", type=float, metavar="X", help="in the volume's unit; default: half of the largest value"
+        "--level", type=float, metavar="X", help="in the volume's unit; default: half way to the largest value"
     )
     parser.add_argument("--unit", choices=tuple(MILLIMETRES), help="of the mesh's lengths; default: mm, of .glb m")
     parser.add_argument("-o", "--output", required=True, metavar="MESH", help=", ".join(MESH_FORMATS))

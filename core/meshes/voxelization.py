@@ -25,6 +25,7 @@ from ..volume import Volume
 from .mesh import Mesh, as_mesh, require_closed
 
 _VOXELS, _POLYGONS = 1 << 21, 1 << 14  # at once
+_FEWEST = 16  # voxels across a mesh
 _FINER = 4  # voxels along each axis for one, where a mesh runs through itself
 _ROUNDING = 1e-9  # shares closer than this to 0 and 1 are that
 
@@ -86,7 +87,6 @@ def mesh_coverage(mesh: Mesh, grid: Grid, progress: Progress | None = None) -> N
     back = grid.index_from_world
     # Voxel i lies between the planes i and i + 1.
     corners = (mesh.vertices @ back[:3, :3].T + back[:3, 3] + 0.5)[mesh.faces]
-    n_x, n_y, n_z = grid.shape
     start = np.floor(corners.min(axis=(0, 1))).clip(0, grid.shape).astype(int)
     stop = np.ceil(corners.max(axis=(0, 1))).clip(0, grid.shape).astype(int)
     if np.any(start >= stop):
@@ -98,8 +98,9 @@ def mesh_coverage(mesh: Mesh, grid: Grid, progress: Progress | None = None) -> N
     in_front = _clip(surface, 2, 0, -1)
     in_front[:, :, 2] = 0
     surface = _seen(_joined([in_front, _slab(surface, 2, 0, n_z)]))
-    if _fill(box, surface, 1, progress) > 1 + _ROUNDING:
-        _fill(box, surface, _FINER, progress)
+    finer = -(-_FEWEST // max(box.shape))  # so that overlaps show in few, large voxels, too
+    if _fill(box, surface, finer, progress) > 1 + _ROUNDING:
+        _fill(box, surface, finer * _FINER, progress)
     return coverage
 
 

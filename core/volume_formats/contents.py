@@ -59,7 +59,7 @@ class Contents:
 
 def require_voxels(shape: Sequence[int], kind: np.dtype[Any]) -> None:
     """Raise `InputError` unless an image of `shape` and of type `kind` is 3-D, of real numbers, and fits into memory."""
-    sizes = " x ".join(map(str, shape))
+    sizes = " x ".join(map(str, shape)) or "of one value"
     if len(shape) != 3:
         raise InputError(f"expected a 3-D image, got shape {sizes}")
     if min(shape) < 1:

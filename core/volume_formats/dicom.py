@@ -149,59 +149,66 @@ def _slices(path: Path, header: Any) -> Iterator[_Slice]:
     """The images of a file."""
     if header.get("SamplesPerPixel", 1) != 1:
         raise InputError(f"{path.name}: expected one value per pixel, found {header.SamplesPerPixel} (a colour image)")
-    if abs(float(header.get("GantryDetectorTilt") or 0.0)) > 0.01:
+    tilt = float(header.get("GantryDetectorTilt") or 0.0)
+    if abs(tilt) > 0.01:
         raise InputError(
-            f"{path.name}: the gantry is tilted by {float(header.GantryDetectorTilt):g} degrees; "
-            "expected upright slices: resample the series first"
+            f"{path.name}: the gantry is tilted by {tilt:g} degrees; expected upright slices: resample the series first"
         )
-    frames = header.get("PerFrameFunctionalGroupsSequence")
+    if "ModalityLUTSequence" in header:
+        raise InputError(f"{path.name}: values by a table (ModalityLUTSequence) are not read; expected RescaleSlope")
     count = int(header.get("NumberOfFrames") or 1)
-    if frames is None and count > 1:
+    frames = _frames(header)
+    if len(frames) != count:
         raise InputError(
             f"{path.name}: {count} frames without a place for each; expected an enhanced image, or one frame"
         )
-    shared = (header.get("SharedFunctionalGroupsSequence") or [None])[0]
-    for frame in range(count):
-        groups = [header] if frames is None else [frames[frame], shared]
+    for number, frame in enumerate(frames):
 
-        def tag(name: str, sequence: str, default: Any = None, of: list[Any] = groups, frame: int = frame) -> Any:
-            """The value of `name`, of an enhanced image in the groups' `sequence`."""
-            for group in of:
-                inner = group if group is header else (group.get(sequence) or [None])[0] if group is not None else None
-                value = inner.get(name) if inner is not None else None
-                if value is not None and value != "":
-                    return value
-            if default is None:
-                raise InputError(f"{path.name}{f' frame {frame + 1}' if frames else ''}: it has no {name}")
-            return default
+        def numbers(name: str, length: int, default: float | None = None, of: Any = frame) -> NDArray[np.float64]:
+            given = of.get(name)
+            value = default if given is None or given == "" else given
+            if value is None:
+                raise InputError(f"{path.name}: it has no {name}")
+            array = np.array(value, np.float64).reshape(-1)
+            if len(array) != length or not np.isfinite(array).all():
+                raise InputError(f"{path.name}: {name}: expected {length} numbers, got {given}")
+            return array
 
-        if "ModalityLUTSequence" in header:
-            raise InputError(
-                f"{path.name}: values by a table (ModalityLUTSequence) are not read; expected RescaleSlope"
-            )
-        spacing = [float(x) for x in tag("PixelSpacing", "PixelMeasuresSequence")]
-        orientation = np.array(tag("ImageOrientationPatient", "PlaneOrientationSequence"), np.float64)
-        position = np.array(tag("ImagePositionPatient", "PlanePositionSequence"), np.float64)
-        if len(spacing) != 2 or orientation.shape != (6,) or position.shape != (3,) or not min(spacing) > 0:
-            raise InputError(
-                f"{path.name}: PixelSpacing, ImageOrientationPatient or ImagePositionPatient is incomplete"
-            )
-        orientation = orientation.reshape(2, 3)
+        spacing = numbers("PixelSpacing", 2)
+        orientation = numbers("ImageOrientationPatient", 6).reshape(2, 3)
+        if spacing.min() <= 0:
+            raise InputError(f"{path.name}: PixelSpacing: expected more than 0 mm, got {spacing.min():g}")
         if not np.allclose(orientation @ orientation.T, np.eye(2), atol=1e-3):
             raise InputError(f"{path.name}: ImageOrientationPatient: expected two unit vectors at right angles")
-        # 6 digits in the file are no exact unit vectors.
-        orientation = _orthonormal(orientation)
         yield _Slice(
             path=path,
-            frame=frame,
+            frame=number,
             shape=(int(header.Rows), int(header.Columns)),
-            spacing=(spacing[0], spacing[1]),
-            orientation=orientation,
-            position=position,
-            slope=float(tag("RescaleSlope", "PixelValueTransformationSequence", 1.0)),
-            intercept=float(tag("RescaleIntercept", "PixelValueTransformationSequence", 0.0)),
-            thickness=float(tag("SliceThickness", "PixelMeasuresSequence", 0.0)),
+            spacing=(float(spacing[0]), float(spacing[1])),
+            orientation=_orthonormal(orientation),  # the file's few digits are not exactly that
+            position=numbers("ImagePositionPatient", 3),
+            slope=float(numbers("RescaleSlope", 1, 1.0)[0]),
+            intercept=float(numbers("RescaleIntercept", 1, 0.0)[0]),
+            thickness=float(numbers("SliceThickness", 1, 0.0)[0]),
         )
+
+
+def _frames(header: Any) -> list[Any]:
+    """What describes each image of a file: the header, or in an enhanced image the frame's groups and the shared ones."""
+    from pydicom.dataset import Dataset
+
+    if "PerFrameFunctionalGroupsSequence" not in header:
+        return [header]
+    shared = header.get("SharedFunctionalGroupsSequence") or []
+    frames = []
+    for own in header.PerFrameFunctionalGroupsSequence:
+        frame = Dataset()
+        for groups in (*shared, own):
+            for group in groups:
+                if group.VR == "SQ" and group.value:
+                    frame.update(group.value[0])
+        frames.append(frame)
+    return frames
 
 
 def _orthonormal(rows: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -238,7 +245,7 @@ def _ordered(slices: list[_Slice]) -> tuple[list[_Slice], NDArray[np.float64]]:
             f"{slices[k].name} and {slices[k + 1].name} lie at the same place ({places[k]:g} mm): "
             "expected one slice at each, of one point in time"
         )
-    usual = float(np.median(gaps))
+    usual = float(np.sort(gaps)[(len(gaps) - 1) // 2])
     wrong = np.flatnonzero(np.abs(gaps - usual) > _SAME_SPACING * usual + 0.01)
     if len(wrong):
         k = int(wrong[0])

@@ -9,7 +9,7 @@ import numpy as np
 
 from ..errors import InputError
 from ..volume import Volume
-from .contents import Contents, require_voxels
+from .contents import Contents, first_line, require_voxels
 
 # The signs that turn a space's axes into right, anterior, superior. A space without a name is taken as that.
 _SPACES = {
@@ -35,7 +35,11 @@ def read(path: Path) -> Contents:
         raise InputError("expected real numbers, found blocks of bytes")
     require_voxels(header["sizes"], np.dtype(np.float64 if kind == "double" else np.float32))
     affine = _affine(header)
-    array, _ = nrrd.read(str(path))
+    try:
+        array, _ = nrrd.read(str(path))
+    except Exception as error:  # of what is not there, pynrrd says little or nothing
+        sizes = " x ".join(map(str, header["sizes"]))
+        raise InputError(f"its data are damaged or end early; expected {sizes} voxels ({first_line(error)})") from error
     return Contents(array, affine, header.get("quantity"), header.get("unit"))
 
 

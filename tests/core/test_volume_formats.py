@@ -417,7 +417,7 @@ BAD = {
     "complex NIfTI": (_nifti(np.zeros((3, 3, 3), np.complex64)), "expected real numbers"),
     "truncated NIfTI": (_truncated("v.nii"), "cannot be read as .nii"),
     "truncated npz": (_truncated("v.npz"), "cannot be read as .npz"),
-    "truncated NRRD": (_truncated("v.nrrd"), "cannot be read as .nrrd"),
+    "truncated NRRD": (_truncated("v.nrrd"), "its data are damaged or end early; expected 5 x 6 x 7 voxels"),
     "truncated HDF5": (_truncated("v.h5"), "cannot be read as .h5"),
     "4-D NRRD": (_nrrd((3, 4, 5, 2)), "expected a 3-D image, got shape 3 x 4 x 5 x 2"),
     "unknown space": (

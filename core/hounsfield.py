@@ -45,7 +45,7 @@ CT_ENERGY = 70.0
 AIR_HU = -1000.0
 _PADDING_HU = -1024.0  # below the 12 bits of a CT: what lies outside the scanned circle
 _METAL_HU = 3071.0  # above the 12 bits of a CT
-_DIFFDRR_AIR, _DIFFDRR_BONE = -800.0, 350.0  # HU
+DIFFDRR_AIR, DIFFDRR_BONE = -800.0, 350.0  # HU, its limits
 
 
 def attenuation(material: str, energy: float) -> float:
@@ -124,9 +124,9 @@ def diffdrr_density(hu: Volume | NDArray[Any], bone_attenuation_multiplier: floa
         Of what is above 350 HU.
     """
     hu = np.asarray(hu.array if isinstance(hu, Volume) else hu, np.float32)
-    tissue = hu[(hu > _DIFFDRR_AIR) & (hu <= _DIFFDRR_BONE)]
-    density = np.where(hu > _DIFFDRR_BONE, hu * np.float32(bone_attenuation_multiplier), hu)
+    tissue = hu[(hu > DIFFDRR_AIR) & (hu <= DIFFDRR_BONE)]
+    density = np.where(hu > DIFFDRR_BONE, hu * np.float32(bone_attenuation_multiplier), hu)
     if tissue.size:
-        density = np.where(hu <= _DIFFDRR_AIR, tissue.min(), density)
+        density = np.where(hu <= DIFFDRR_AIR, tissue.min(), density)
     density -= density.min()
     return density / max(density.max(), np.finfo(np.float32).tiny)

@@ -89,3 +89,11 @@ def test_density_of_diffdrr():
     volume = mph.Volume(hu.reshape(6, 1, 1), mph.Grid((6, 1, 1), np.eye(4)), "hu")
     assert np.array_equal(mph.diffdrr_density(volume, 2.0).ravel(), density)
     assert np.array_equal(mph.diffdrr_density(np.full(3, 40.0)), np.zeros(3))
+
+
+def test_density_is_the_same_for_tensors(rng):
+    torch = pytest.importorskip("torch", reason="torch is not installed")
+    from mphdrr.core.diffdrr import hu_to_density
+
+    hu = rng.uniform(-1000, 3000, (3, 4, 5)).astype(np.float32)
+    assert np.allclose(hu_to_density(torch.tensor(hu), 3.0).numpy(), mph.diffdrr_density(hu, 3.0), atol=1e-6)

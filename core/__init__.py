@@ -17,8 +17,12 @@ from .generators import RingFit, ellipse_rings, fit_rings, plate_rings, regular_
 from .geometry_checks import GeometryReport, check_geometry
 from .geometry_export import read_geometry, write_geometry
 from .grid import Grid
+from .hounsfield import diffdrr_density, hu_to_mu
 from .isotopes import ISOTOPES, Isotope, isotope
 from .maps import completeness_map, modules_map, resolution_map, sensitivity_map
+from .meshes.mesh import Mesh, read_mesh, write_mesh
+from .meshes.surface import volume_to_mesh
+from .meshes.voxelization import voxelize_mesh
 from .mosaic import as_seen, mosaic
 from .noise import sample_counts
 from .performance import ModulePerformance, isocentre_performance, magnification, resolution, seen, sensitivity
@@ -27,6 +31,8 @@ from .presets import c_arm_views, pinhole_views
 from .progress import Cancelled, Progress
 from .project import project_run
 from .projector import Emission, InverseSquareSum, Projector, Transmission, intensity, trace_rays
+from .rearranging import canonical, centered, crop, crop_to_box, pad, split_labels
+from .resampling import resample
 from .run import ProjectionRun
 from .sampling import sampling_gaps
 from .system import PinholeSystem
@@ -46,6 +52,7 @@ __all__ = [
     "InputWarning",
     "InverseSquareSum",
     "Isotope",
+    "Mesh",
     "ModulePerformance",
     "PinholeSystem",
     "Progress",
@@ -59,26 +66,35 @@ __all__ = [
     "WrittenWorkbook",
     "as_seen",
     "c_arm_views",
+    "canonical",
+    "centered",
     "check_geometry",
     "collimator_length",
     "completeness_map",
+    "crop",
+    "crop_to_box",
+    "diffdrr_density",
     "ellipse_rings",
     "euler_pose",
     "fit_rings",
+    "hu_to_mu",
     "intensity",
     "isocentre_performance",
     "isotope",
     "magnification",
     "modules_map",
     "mosaic",
+    "pad",
     "pinhole_views",
     "plate_rings",
     "project_run",
     "read_geometry",
+    "read_mesh",
     "read_run",
     "read_system",
     "read_volume",
     "regular_polygon",
+    "resample",
     "resolution",
     "resolution_map",
     "roi_radius_seen",
@@ -87,8 +103,12 @@ __all__ = [
     "seen",
     "sensitivity",
     "sensitivity_map",
+    "split_labels",
     "trace_rays",
+    "volume_to_mesh",
+    "voxelize_mesh",
     "write_geometry",
+    "write_mesh",
     "write_run",
     "write_system",
     "write_volume",

@@ -28,6 +28,7 @@ from torch import Tensor
 from .checks import positive, whole_shape
 from .errors import InputError
 from .grid import Grid
+from .hounsfield import DIFFDRR_AIR, DIFFDRR_BONE
 from .projector.tracing import trace_rays
 from .rotations import SIZES, pose_matrix, rotation_matrix, rotation_parameters, se3_exp, se3_log
 from .trilinear import OldTrilinear, Trilinear
@@ -41,7 +42,6 @@ _ORIENTATIONS = {
     "PA": ((1.0, 0.0, 0.0), (0.0, 0.0, 1.0), (0.0, 1.0, 0.0)),
     None: ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)),
 }
-_AIR, _BONE = -800.0, 350.0  # HU, DiffDRR's limits
 _SIDDON_OPTIONS = {"eps", "filter_intersections_outside_volume", "stop_gradients_through_grid_sample"}
 
 
@@ -196,12 +196,15 @@ def read(
 
 
 def hu_to_density(hu: Tensor, bone_attenuation_multiplier: float = 1.0) -> Tensor:
-    """CT numbers to 0..1 as DiffDRR does: air as thin as the thinnest tissue, bone times a factor; no physical unit."""
+    """CT numbers to 0..1 as DiffDRR does: air as thin as the thinnest tissue, bone times a factor; no physical unit.
+
+    `diffdrr_density` for tensors: gradients pass.
+    """
     hu = hu.to(torch.float32)
-    tissue = hu[(hu > _AIR) & (hu <= _BONE)]
-    density = torch.where(hu > _BONE, hu * bone_attenuation_multiplier, hu)
+    tissue = hu[(hu > DIFFDRR_AIR) & (hu <= DIFFDRR_BONE)]
+    density = torch.where(hu > DIFFDRR_BONE, hu * bone_attenuation_multiplier, hu)
     if tissue.numel():
-        density = torch.where(hu <= _AIR, tissue.min(), density)
+        density = torch.where(hu <= DIFFDRR_AIR, tissue.min(), density)
     density = density - density.min()
     return density / density.max().clamp_min(torch.finfo(torch.float32).tiny)
 

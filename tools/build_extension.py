@@ -27,6 +27,8 @@ PURE = (
     "nibabel==5.4.2",
     "openpyxl==3.1.5",
     "packaging==26.3",
+    "pydicom==3.0.2",
+    "pynrrd==1.1.3",
     "trimesh==5.2.0",
     "typing-extensions==4.16.0",
 )

@@ -73,7 +73,7 @@ def refuse_folder(path: Path) -> None:
     try:
         is_folder = path.is_dir()
     except OSError as error:  # too long
-        raise InputError(f"{str(path)!r}: not a file name ({getattr(error, 'strerror', None) or error})") from error
+        raise InputError(f"{str(path)!r}: not a file name ({error.strerror or error})") from error
     if is_folder:
         raise InputError(f"{path}: is a folder; expected the name of a file to write")
 

@@ -3,7 +3,7 @@
 # make bench   speed, accuracy and memory beside other projectors, into docs/; BENCH=--quick: a minute or two, into out/
 # make dist    extension zips in dist/, one per platform; PLATFORM=linux-x64 builds that one
 # make test-app   the Linux zip in a real Blender (see tests/app)
-# make test-gate  the Monte Carlo exports with GATE 10 itself, in an environment of its own (2 GB)
+# make test-gate  the Monte Carlo exports with GATE 10 itself; wants an environment of its own (2 GB): VENV=.venvgate
 # make clean   removes what the others made, environments included
 #
 # The environment is made in VENV on the first call. PYTHON picks its interpreter (3.11: Blender 4.5, 3.13: Blender 5.2);

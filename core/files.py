@@ -68,10 +68,12 @@ def _to_disk(path: Path) -> None:
 
 def refuse_folder(path: Path) -> None:
     """Raise `InputError` where `path` is a folder or cannot be the name of a file."""
+    if "\0" in str(path):
+        raise InputError(f"{str(path)!r}: not a file name (it holds a NUL)")
     try:
         is_folder = path.is_dir()
-    except (OSError, ValueError) as error:  # too long, or holds a NUL
-        raise InputError(f"{str(path)!r}: not a file name ({getattr(error, 'strerror', None) or error})") from error
+    except OSError as error:  # too long
+        raise InputError(f"{str(path)!r}: not a file name ({error.strerror or error})") from error
     if is_folder:
         raise InputError(f"{path}: is a folder; expected the name of a file to write")
 

@@ -10,6 +10,7 @@ reader.py        `read_system`, which joins these
 source.py        `SystemSource`, where each number came from
 
 writer.py        `write_system`: the system's numbers into a copy of a workbook
+edit.py          the system's numbers in the cells
 arrangement.py   rows that are moved, emptied and added with the modules
 recalculate.py   new values for formulas that depend on changed cells
 dependencies.py  which formulas these are

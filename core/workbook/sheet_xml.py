@@ -75,7 +75,9 @@ class SheetXml:
     strings
         The workbook's shared strings.
     name
-        The sheet, for messages.
+        The sheet's name.
+    file
+        How messages call the workbook.
 
     Attributes
     ----------
@@ -85,13 +87,14 @@ class SheetXml:
         The cells as they were read.
     """
 
-    def __init__(self, data: bytes, strings: list[str], name: str) -> None:
-        self.name = name
-        self._data, self._back = utf8(data, name)
+    def __init__(self, data: bytes, strings: list[str], name: str, file: str) -> None:
+        self.name, self._file = name, file
+        where = f"{file}: sheet {name}"
+        self._data, self._back = utf8(data, where)
         self._rows: list[tuple[int, Element]] = []
         self._in_row: dict[int, list[tuple[int, Element]]] = {}
         self.cells: dict[At, Cell] = {}
-        self._read(elements(self._data, name), strings)
+        self._read(elements(self._data, where), strings)
         self.original = dict(self.cells)
 
     # Reading
@@ -199,7 +202,7 @@ class SheetXml:
         if area is not None:
             first, last = _name((area.top, area.left)), _name((area.bottom, area.right))
             raise InputError(
-                f"{self.name}!{_name(at)} is one cell of the array formula or data table {first}:{last}, "
+                f"{self._file}: {self.name}!{_name(at)} is one cell of the array formula or data table {first}:{last}, "
                 "expected a cell of its own: its number cannot be changed alone"
             )
 

@@ -67,7 +67,7 @@ class WorkbookXml:
             kind, member = members.get(key, ("", ""))
             if kind == "worksheet":
                 self.parts[title] = member
-                self.sheets[title] = SheetXml(self.package.read(member), texts, title)
+                self.sheets[title] = SheetXml(self.package.read(member), texts, title, name)
         self._by_folded_name = {title.casefold(): title for title in self.sheets}
         self._extents: dict[str, tuple[int, int]] = {}
 

@@ -22,7 +22,7 @@ def collection(scene, workbook):
 def test_every_format(collection, name, tmp_path):
     path = tmp_path / f"scanner{(FORMATS[name].suffixes or ('',))[0]}"
     if name in ONE_RING_ONLY:
-        with pytest.raises(RuntimeError, match="ring|circle"):
+        with pytest.raises(RuntimeError, match=r"ring|circle"):
             bpy.ops.mphdrr.export_for_program(format=name, filepath=str(path))
         assert not list(tmp_path.iterdir())
         return

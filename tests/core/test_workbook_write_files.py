@@ -191,12 +191,12 @@ def _without_places(xml: str) -> str:
 ODD = {
     "prefix": _prefixed,
     "no places": _without_places,
-    "CRLF": lambda xml: xml.replace("><", ">\r\n<"),
+    "CRLF": lambda xml: xml.replace("<v></v>", "<v/>").replace("><", ">\r\n<"),
     "comments": lambda xml: xml.replace("<sheetData>", "<!-- <c r='A1'> > --><sheetData ><?pi <row> ?>"),
     "single quotes": lambda xml: re.sub("<[^>]*>", lambda tag: tag[0].replace('"', "'"), xml),
     "empty cells": lambda xml: re.sub(r"(<c [^>]*)/>", r"\1></c>", xml),
     "rows' attributes": lambda xml: xml.replace("<row ", '<row spans="1:3" ht="15" customHeight="1" '),
-    "inline numbers": lambda xml: xml.replace("<v>", "<v> ").replace("</v>", "\n</v>"),
+    "spaces around numbers": lambda xml: re.sub("<v>([^<]+)</v>", r"<v> \1\n</v>", xml),
     "no size": lambda xml: re.sub("<dimension[^>]*/>", "", xml),
     "wrong size": lambda xml: re.sub('ref="[^"]*"', 'ref="A1"', xml, count=1),
 }

@@ -1,0 +1,275 @@
+"""A system's numbers put into the cells of a workbook, its formulas not yet calculated."""
+
+from __future__ import annotations
+
+import itertools
+import warnings
+from collections.abc import Iterable
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..errors import InputError, InputWarning
+from ..system import PinholeSystem
+from .arrangement import Arrangement, arrange, matched
+from .cells import module_number
+from .checks import derived, is_by_design
+from .headings import DIMENSIONS, POSITION, Table
+from .reader import Reading
+from .recalculate import agree
+from .rows import dimension_rows
+from .workbook_xml import Place, WorkbookXml
+
+_SHOWN = 3
+"""Places that one warning names; it counts the rest."""
+
+
+class Edit:
+    """The system's numbers in the cells of a workbook.
+
+    Attributes
+    ----------
+    changed : list of places
+        Cells on which others may depend.
+    required : dict
+        Place -> the number that it must have.
+    settled : set of places
+        Those of them that had it when the workbook was read.
+    module_numbers : set of places
+        Those of them that hold modules' numbers.
+    numbered : bool
+        Whether the workbook has the modules' numbers.
+    """
+
+    def __init__(self, system: PinholeSystem, reading: Reading, workbook: WorkbookXml) -> None:
+        self.system, self.old, self.workbook = system, reading.system, workbook
+        self.columns, self.modules = reading.columns, reading.modules
+        self.numbered = reading.modules.number_column is not None
+        self.old_of = matched(system, self.old, self.numbered)
+        self.required: dict[Place, float] = {}
+        self.settled: set[Place] = set()
+        self.module_numbers: set[Place] = set()
+        self.changed: list[Place] = []
+
+    def apply(self) -> None:
+        """Change the workbook's cells; `InputError` where it cannot hold the system."""
+        self._refuse_unheld()
+        self.arrangements = self._arranged()
+        for arrangement in self.arrangements.values():
+            arrangement.apply(self.workbook)
+        self._require_numbers()
+        for name in (*POSITION, *DIMENSIONS):
+            self._require(name)
+        if "l" in self.columns:
+            self._require_lengths()
+        for place, number in self.required.items():
+            self._type(place, number)
+        self._type_derived()
+        # A typed number that had to change is among the workbook's changed cells; of a formula it is to be seen.
+        self.changed = list(dict.fromkeys([*self.workbook.changed, *self.required.keys() - self.settled]))
+        for arrangement in self.arrangements.values():
+            if arrangement.added:
+                self._warn_of_short_ranges(arrangement)
+
+    def _refuse_unheld(self) -> None:
+        file, sheet = self.workbook.name, self.modules.table.sheet.name
+        numbers = self.system.numbers
+        if not self.numbered and not np.array_equal(numbers, np.arange(1, len(numbers) + 1)):
+            warnings.warn(
+                f"{file}: sheet {sheet} has no column of the modules' numbers: {several(numbers)} will be read as "
+                "1, 2, ... in the order of their rows",
+                InputWarning,
+                stacklevel=4,
+            )
+        if "l" not in self.columns:
+            differing = np.flatnonzero(~is_by_design(self.system))
+            if len(differing):
+                i = differing[0]
+                raise InputError(
+                    f"{file}: sheet {sheet} has no column headed l for the collimator length of module {numbers[i]}, "
+                    f"{self.system.collimator_length[i]:g} mm, which is not the design formula's"
+                )
+
+    # Rows
+
+    def _arranged(self) -> dict[str, Arrangement]:
+        """Sheet -> the rows of its table, of those tables that have a row for each module."""
+        modules = self.modules
+        found = {}
+        last = max(modules.rows)
+        table = modules.table
+        found[table.sheet.name] = self._arrangement(table, modules.rows, last, modules.number_column, {})
+        others = {self.columns[name].table.sheet.name: self.columns[name].table for name in DIMENSIONS}
+        for name, table in others.items():
+            if name in found:
+                continue
+            rows = dimension_rows(table)
+            row_of = dict(zip(rows.numbers, rows.rows, strict=True)) if rows.numbers is not None else {}
+            if row_of and modules.numbers is not None and set(modules.numbers) <= set(row_of):
+                old = [row_of[number] for number in modules.numbers]
+                found[name] = self._arrangement(table, old, max(rows.rows), rows.number_column, row_of)
+            elif len(rows.rows) == len(modules.rows) > 1:
+                found[name] = self._arrangement(table, rows.rows, max(rows.rows), rows.number_column, {})
+        return found
+
+    def _arrangement(
+        self, table: Table, old: Iterable[int], last: int, number_column: int | None, row_of: dict[int, int]
+    ) -> Arrangement:
+        shared = [
+            column.column
+            for name, column in self.columns.items()
+            if column.table.sheet is table.sheet and self._is_shared(name)
+        ]
+        old = tuple(old)
+        own: list[int | None] = []
+        for number, j in zip(self.system.numbers, self.old_of, strict=True):
+            row = row_of.get(int(number))  # of a module that had no coordinates
+            own.append(old[j] if j is not None else None if row in old else row)
+        return arrange(table, old, own, filled_to=last, number_column=number_column, kept_columns=shared)
+
+    def _is_shared(self, name: str) -> bool:
+        """Whether one cell holds a quantity of all modules."""
+        rows = self.columns[name].rows
+        return len(rows) > 1 and len(set(rows)) == 1
+
+    # Numbers
+
+    def _require_numbers(self) -> None:
+        for name, arrangement in self.arrangements.items():
+            table = arrangement.table
+            if table is self.modules.table or self.numbered:
+                own = self.modules if table is self.modules.table else dimension_rows(table)
+                numbers: Iterable[tuple[int, int]] = enumerate(self.system.numbers)
+            else:  # a table whose numbers mean nothing, but must be there
+                own = dimension_rows(table)
+                added = [i for i, j in enumerate(self.old_of) if j is None]
+                numbers = zip(added, itertools.count(max(own.numbers or (0,)) + 1), strict=False)
+            if own.number_column is not None:
+                for i, number in numbers:
+                    place = (name, arrangement.rows[i], own.number_column)
+                    self._demand_number(place, number, self._was(i, self.old.numbers))
+
+    def _require(self, name: str) -> None:
+        column = self.columns[name]
+        sheet = column.table.sheet.name
+        values, old = values_of(self.system, name), values_of(self.old, name)
+        arrangement = self.arrangements.get(sheet)
+        single = arrangement is None or self._is_shared(name)
+        if single and np.all(values == values[0]):
+            place = (sheet, column.rows[0], column.column)
+            self._demand(place, float(values[0]), float(old[0]))
+            return
+        rows = arrangement.rows if arrangement is not None else self._new_rows(column.table, column.column)
+        for i, row in enumerate(rows):
+            self._demand((sheet, row, column.column), float(values[i]), self._was(i, old))
+
+    def _new_rows(self, table: Table, column: int) -> tuple[int, ...]:
+        """Rows for all modules in a table that had one for all."""
+        rows = dimension_rows(table)
+        first = rows.rows[0]
+        found = tuple(range(first, first + len(self.system)))
+        sheet = self.workbook.sheets[table.sheet.name]
+        for i, row in enumerate(found):
+            for c in (column, rows.number_column):
+                if c is None:
+                    continue
+                place = (table.sheet.name, row, c)
+                if i and not sheet.cell((row, c)).blank and place not in self.required:
+                    raise InputError(
+                        f"{self.workbook.name}: {self.workbook.text(place)} is not blank, where the modules' different "
+                        f"numbers in place of {table.sheet.place(first, c)} belong, expected free cells below that"
+                    )
+                if i and place not in self.required:
+                    sheet.copy_row(sheet.cell((first, c)).typed(None), (first, c), (row, c))
+            if rows.number_column is not None:
+                self._demand_number((table.sheet.name, row, rows.number_column), self.system.numbers[i], None)
+        return found
+
+    def _require_lengths(self) -> None:
+        column = self.columns["l"]
+        arrangement = self.arrangements[column.table.sheet.name]
+        sheet = self.workbook.sheets[column.table.sheet.name]
+        by_design = is_by_design(self.system)
+        for i, row in enumerate(arrangement.rows):
+            at = (row, column.column)
+            was = sheet.original.get((arrangement.source(i), column.column))
+            if by_design[i] and sheet.cell(at).blank and (was is None or was.blank):
+                continue  # as the reader takes a blank
+            place = (column.table.sheet.name, *at)
+            self._demand(place, float(self.system.collimator_length[i]), self._was(i, self.old.collimator_length))
+
+    def _was(self, i: int, old: NDArray) -> float | None:
+        """The number that was read of a module of the system; None of a new one."""
+        j = self.old_of[i]
+        return None if j is None else float(old[j])
+
+    def _demand(self, place: Place, number: float, was: float | None) -> None:
+        self.required[place] = number
+        if was is not None and agree(float(was), number):
+            self.settled.add(place)
+
+    def _demand_number(self, place: Place, number: int, was: float | None) -> None:
+        self._demand(place, float(number), was)
+        self.module_numbers.add(place)
+
+    def _type(self, place: Place, number: float) -> None:
+        cell = self.workbook.cell(place)
+        if cell.formula is not None or cell.array is not None:
+            return
+        if place in self.module_numbers:
+            same = module_number(cell.value) == number  # which may be a text
+        else:
+            same = type(cell.value) is float and cell.value == number
+        if not same:
+            self.workbook.sheets[place[0]].type(place[1:], number)
+
+    def _type_derived(self) -> None:
+        """Derived numbers (b, H, x2, ..., azimuth) that are typed in: as the formulas give them, where that changed."""
+        old, new = (derived(s.centers, s.collimator_length, s.detector_thickness) for s in (self.old, self.system))
+        for name in new:
+            if name not in self.columns:
+                continue
+            column = self.columns[name]
+            title = column.table.sheet.name
+            sheet, arrangement = self.workbook.sheets[title], self.arrangements[title]
+            scale = 180 / np.pi if column.table.in_degrees(name) else 1.0
+            for i, row in enumerate(arrangement.rows):
+                was = sheet.original.get((arrangement.source(i), column.column))
+                if was is None or was.formula is not None or type(was.value) is not float:
+                    continue
+                j = self.old_of[i]
+                if j is None or old[name][j] != new[name][i]:
+                    sheet.type((row, column.column), float(new[name][i] * scale))
+
+    def _warn_of_short_ranges(self, arrangement: Arrangement) -> None:
+        name, old = arrangement.table.sheet.name, arrangement.old
+        found = self.workbook.ranges_ending_at(name, min(old), max(old))
+        own = {self.workbook.text((name, row, column)) for row in arrangement.rows for column in arrangement.columns}
+        found = [place for place in found if place not in own]
+        if found:
+            warnings.warn(
+                f"{self.workbook.name}: {several(found)} end at row {max(old)} of sheet {name}, so the modules added "
+                "below are left out there",
+                InputWarning,
+                stacklevel=4,
+            )
+
+
+def several(things: Iterable[object]) -> str:
+    """The first few, and how many more."""
+    texts = [str(thing) for thing in things]
+    more = f" and {len(texts) - _SHOWN} more" if len(texts) > _SHOWN else ""
+    return ", ".join(texts[:_SHOWN]) + more
+
+
+def values_of(system: PinholeSystem, quantity: str) -> NDArray[np.float64]:
+    """A quantity (M,), mm, by its symbol."""
+    if quantity in POSITION:
+        return system.centers[:, POSITION.index(quantity)]
+    return {
+        "d": system.pinhole_diameter,
+        "R": system.roi_radius,
+        "Ld": system.detector_side,
+        "Td": system.detector_thickness,
+        "l": system.collimator_length,
+    }[quantity]

@@ -22,6 +22,7 @@ from ..operators import (
     set_numbers,
     show_modules,
     tidy_modules,
+    voxelize_objects,
 )
 from ..panels import design, export, geometry, phantom, projections
 from . import cli, ids, jobs, live, preferences, properties, storage, volumes
@@ -46,6 +47,8 @@ CLASSES: tuple[type, ...] = (
     add_map.MPHDRR_OT_add_map,
     add_derenzo.MPHDRR_OT_add_derenzo,
     add_derenzo.MPHDRR_OT_update_derenzo,
+    voxelize_objects.MPHDRR_OT_voxelize_objects,
+    voxelize_objects.MPHDRR_OT_mesh_from_volume,
     render_projections.MPHDRR_OT_render_projections,
     render_projections.MPHDRR_OT_show_projections,
     jobs.MPHDRR_OT_cancel_job,
@@ -69,6 +72,7 @@ MENUS: tuple[tuple[Any, Any], ...] = (
     (bpy.types.TOPBAR_MT_file_export, export_for_program.draw_menu),
     (bpy.types.TOPBAR_MT_file_export, export_dataset.draw_menu),
     (bpy.types.VIEW3D_MT_volume_add, add_derenzo.draw_menu),
+    (bpy.types.VIEW3D_MT_object_convert, voxelize_objects.draw_menu),
 )
 
 # (list in bpy.app.handlers, function): decorate the function with @bpy.app.handlers.persistent.

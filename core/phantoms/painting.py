@@ -1,0 +1,358 @@
+"""Shapes painted one over the other: the mean over each voxel, the values at points, the integrals along lines.
+
+Painting layer i changes what layers 0 to i - 1 have left only inside its shape. So a voxel's mean is the sum over the
+layers of the mean of that change, and each layer can be sampled as finely as its own size asks.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..grid import Grid
+from ..memory import require
+from ..progress import Progress
+from .sequences import r3_sequence
+from .shapes import Shape
+
+Points = NDArray[np.float64]
+Floats = NDArray[np.float32]
+
+# Points of one call of a shape's `distance`: small enough that its temporaries stay in the processor's cache.
+_BLOCK = 1 << 15
+_MIN_SAMPLES, _MAX_SAMPLES = 128, 1 << 14  # of a voxel that a surface cuts
+_STRETCHES = 32  # of the sequence: voxels take turns, so that their errors differ and cancel
+# Shapes whose smallest part is below `_SMALL` voxels, and that touch `_FEW` or fewer, are sampled in their own box.
+_SMALL = 3.0
+_FEW = 1 << 11
+_SAMPLES_OF_FEW = 1 << 10  # per voxel
+_SAMPLES_BENEATH = 1 << 18
+_RAYS = 1 << 14  # at a time
+
+
+@dataclass(frozen=True, eq=False)
+class Layer:
+    """One shape of a painting.
+
+    Attributes
+    ----------
+    shape : Shape
+        What is painted.
+    pose : array (4, 4)
+        World-from-shape, mm.
+    value : float
+        What it holds.
+    """
+
+    shape: Shape
+    pose: Points
+    value: float
+
+    @property
+    def adds(self) -> bool:
+        """Whether the value is added to what is beneath, and does not replace it."""
+        return self.shape.mode == "add"
+
+    @cached_property
+    def from_world(self) -> Points:
+        """Shape-from-world (4, 4)."""
+        return np.linalg.inv(self.pose)
+
+    @cached_property
+    def ball(self) -> tuple[Points, float]:
+        """Centre (3,) and radius, mm, of a ball around the shape in the world."""
+        return self.pose[:3, 3], self.shape.ball_radius * float(np.linalg.norm(self.pose[:3, :3], 2))
+
+    def over(self, values: NDArray[np.floating]) -> NDArray[np.floating]:
+        """What the shape makes of the values beneath it."""
+        value = values.dtype.type(self.value)
+        return values + value if self.adds else np.full_like(values, value)
+
+    def meets(self, other: Layer) -> bool:
+        """Whether the balls around both touch."""
+        (one, r), (two, s) = self.ball, other.ball
+        return bool(np.linalg.norm(one - two) < r + s)
+
+
+def values_at(layers: Sequence[Layer], points: Points) -> Points:
+    """What was painted at world `points` (3, N), mm: (N,)."""
+    values = np.zeros(points.shape[1])
+    for layer in layers:
+        inside = layer.shape.distance(_moved(layer.from_world, points)) < 0
+        values = np.where(inside, layer.over(values), values)
+    return values
+
+
+def integral(layers: Sequence[Layer]) -> float:
+    """Value times mm^3 of the whole painting."""
+    total = 0.0
+    for i, layer in enumerate(layers):
+        volume = layer.shape.volume * abs(float(np.linalg.det(layer.pose[:3, :3])))
+        total += volume * layer.value
+        beneath = [] if layer.adds else [lower for lower in layers[:i] if lower.meets(layer)]
+        if beneath:
+            total -= volume * _mean_inside(layer, beneath)
+    return total
+
+
+def _mean_inside(layer: Layer, beneath: Sequence[Layer]) -> float:
+    """The mean of what is painted beneath a layer's shape: exact where it is uniform."""
+    total, hits = 0.0, 0
+    for points in _boxed(layer.shape, _SAMPLES_BENEATH):
+        inside = points[:, layer.shape.distance(points) < 0]
+        total += float(values_at(beneath, _moved(layer.pose, inside)).sum())
+        hits += inside.shape[1]
+    return total / hits if hits else 0.0
+
+
+def paint_voxels(grid: Grid, layers: Sequence[Layer], progress: Progress | None = None) -> Floats:
+    """The mean of the painting over each voxel, float32 array of the grid's shape.
+
+    Voxels farther from a surface than their own half diagonal are all in or all out; the others are sampled at the
+    points of a low-discrepancy sequence. The points of a shape that is small beside the voxels fill the shape, and
+    weigh as much as its volume says.
+
+    Parameters
+    ----------
+    grid
+        Where the voxels are.
+    layers
+        From bottom to top.
+    progress
+        Called as ``progress(done, total)``.
+    """
+    require(4.2 * grid.n_voxels, "a volume of {} x {} x {} voxels".format(*grid.shape))
+    image = np.zeros(grid.shape, np.float32)
+    strokes = [_Stroke(grid, layers[: i + 1]) for i in range(len(layers))]
+    total, done = sum(stroke.steps for stroke in strokes), 0
+    with ThreadPoolExecutor(os.cpu_count()) as pool:
+        for stroke in strokes:
+            for _ in stroke.paint(image, pool):
+                done += 1
+                if progress is not None:
+                    try:
+                        progress(done, total)
+                    except BaseException:
+                        pool.shutdown(wait=False, cancel_futures=True)
+                        raise
+    return image
+
+
+def line_integrals(layers: Sequence[Layer], starts: Points, ends: Points) -> Points:
+    """Integrals (N,) of the painting, value x mm, along the lines from `starts` to `ends`, (N, 3) world mm: exact."""
+    result = np.empty(len(starts))
+    for first in range(0, len(starts), _RAYS):
+        block = slice(first, first + _RAYS)
+        result[block] = _integrals_of_block(layers, starts[block].T, ends[block].T)
+    return result
+
+
+def _integrals_of_block(layers: Sequence[Layer], starts: Points, ends: Points) -> Points:
+    """Of lines (3, N). Each line's pieces between the surfaces that it crosses are painted in the layers' order."""
+    directions = ends - starts
+    rays, enters, leaves, values, adds = [], [], [], [], []
+    for layer in layers:
+        linear = layer.from_world[:3, :3]
+        enter, leave = layer.shape.intervals(_moved(layer.from_world, starts), linear @ directions)
+        enter, leave = np.maximum(enter, 0.0).T, np.minimum(leave, 1.0).T
+        ray, part = np.nonzero(enter < leave)
+        rays.append(ray)
+        enters.append(enter[ray, part])
+        leaves.append(leave[ray, part])
+        values.append(np.full(len(ray), layer.value))
+        adds.append(np.full(len(ray), layer.adds))
+    if not rays:
+        return np.zeros(starts.shape[1])
+    ray, enter, leave = np.concatenate(rays), np.concatenate(enters), np.concatenate(leaves)
+    value, add = np.concatenate(values), np.concatenate(adds)
+    order = np.argsort(ray, kind="stable")  # keeps the layers' order in each ray
+    ray, enter, leave, value, add = ray[order], enter[order], leave[order], value[order], add[order]
+    counts = np.bincount(ray, minlength=starts.shape[1])
+    firsts = np.cumsum(counts) - counts
+    integrals = np.zeros(starts.shape[1])
+    # Lines of about as many parts together, padded with empty ones.
+    for most in np.unique(_next_power_of_2(counts[counts > 0])):
+        some = np.flatnonzero(_next_power_of_2(counts) == most)
+        number = np.arange(most)
+        there = number < counts[some, None]
+        index = np.where(there, firsts[some, None] + number, 0)
+        low, high = np.where(there, enter[index], 0.0), np.where(there, leave[index], 0.0)
+        edges = np.sort(np.concatenate([low, high], axis=1), axis=1)
+        middles = (edges[:, :-1] + edges[:, 1:]) / 2
+        painted = np.zeros_like(middles)
+        for k in range(most):
+            inside = (low[:, k, None] < middles) & (middles < high[:, k, None])
+            paint = np.where(add[index[:, k], None], painted, 0.0) + value[index[:, k], None]
+            painted = np.where(inside, paint, painted)
+        integrals[some] = np.einsum("rs,rs->r", painted, np.diff(edges, axis=1))
+    return integrals * np.sqrt(np.einsum("in,in->n", directions, directions))
+
+
+def _next_power_of_2(counts: NDArray[np.int64]) -> NDArray[np.int64]:
+    return np.where(counts > 0, 1 << np.ceil(np.log2(np.maximum(counts, 1))).astype(np.int64), 0)
+
+
+
+class _Stroke:
+    """What painting the last of some layers over the others does to an image."""
+
+    def __init__(self, grid: Grid, layers: Sequence[Layer]) -> None:
+        self.grid = grid
+        self.layer = layers[-1]
+        self.beneath = [] if self.layer.adds else [lower for lower in layers[:-1] if lower.meets(self.layer)]
+        shape_from_index = self.layer.from_world @ grid.affine
+        shape = self.layer.shape
+        self.start, self.stop = _index_box(shape_from_index, np.array(shape.half_box), grid.shape)
+        self.voxel_volume = abs(float(np.linalg.det(shape_from_index[:3, :3])))
+        self.edge = float(np.linalg.norm(shape_from_index[:3, :3], axis=0).max())
+        self.touched = float(np.prod(2 * np.array(shape.half_box) / self.edge + 1))
+        self.is_small = shape.finest < _SMALL * self.edge and self.touched < _FEW
+
+    @property
+    def steps(self) -> int:
+        """How many times `paint` yields."""
+        if np.any(self.stop <= self.start):
+            return 0
+        return -(-self._n_points // _BLOCK) if self.is_small else int(self.stop[0] - self.start[0])
+
+    def paint(self, image: Floats, pool: ThreadPoolExecutor) -> Iterator[None]:
+        """Change `image`, step by step."""
+        if not self.steps:
+            return iter(())
+        return self._paint_small(image, pool) if self.is_small else self._paint_voxels(image, pool)
+
+    @property
+    def _n_points(self) -> int:
+        return int(_SAMPLES_OF_FEW * max(self.touched, 8))
+
+    def _paint_small(self, image: Floats, pool: ThreadPoolExecutor) -> Iterator[None]:
+        """Points of the shape, each weighing an equal share of its volume, into the voxels that they fall in."""
+        box = tuple(map(slice, self.start, self.stop))
+        total, hits = np.zeros(image[box].shape), 0
+        index_from_shape = np.linalg.inv(self.grid.affine) @ self.layer.pose
+
+        def sample(points: Points) -> tuple[NDArray[np.int64], Points]:
+            inside = points[:, self.layer.shape.distance(points) < 0]
+            change = self.layer.value - values_at(self.beneath, _moved(self.layer.pose, inside))
+            return np.rint(_moved(index_from_shape, inside)).astype(np.int64), change
+
+        for index, change in pool.map(sample, _boxed(self.layer.shape, self._n_points)):
+            hits += len(change)
+            index -= self.start[:, None]
+            held = np.all((index >= 0) & (index < np.array(total.shape)[:, None]), axis=0)
+            np.add.at(total, tuple(index[:, held]), change[held])
+            yield
+        image[box] += total * (self.layer.shape.volume / self.voxel_volume / max(hits, 1))
+
+    def _paint_voxels(self, image: Floats, pool: ThreadPoolExecutor) -> Iterator[None]:
+        """Points of the voxels that the shape's surface cuts, slab by slab."""
+        rows, columns = map(slice, self.start[1:], self.stop[1:])
+        iy, iz = np.mgrid[rows, columns]
+        n_samples = self._n_samples
+        offsets = (r3_sequence(_STRETCHES * n_samples) - 0.5).reshape(3, _STRETCHES, n_samples)
+        own, *lower = (_Sampled(layer, self.grid, offsets) for layer in (self.layer, *self.beneath))
+
+        def fill(ix: int) -> None:
+            slab = image[ix, rows, columns]
+            values = slab.ravel()
+            index = np.stack([np.full(iy.size, ix), iy.ravel(), iz.ravel()])
+            for first in range(0, len(values), _BLOCK):
+                block = slice(first, first + _BLOCK)
+                values[block] = _painted(values[block], index[:, block], own, lower)
+            slab[...] = values.reshape(slab.shape)
+
+        for _ in pool.map(fill, range(self.start[0], self.stop[0])):
+            yield
+
+    @property
+    def _n_samples(self) -> int:
+        # The error of a cut voxel is about n^(-2/3) / 2 of its volume h^3. With a surface below 6 V / s, s being the
+        # smallest part, some 9 V / (s h^2) voxels are cut, whose errors add up at random: so many samples keep their
+        # sum below 1/5000 of V, as a thin shell, the difference of two shapes, needs. Voxels above the smallest part get
+        # more for their own sake.
+        shape = self.layer.shape
+        for_sum = (7500 * self.edge**2 / np.sqrt(shape.finest * shape.volume)) ** 1.5
+        for_each = _MIN_SAMPLES * 2 * self.edge / shape.finest
+        return int(np.clip(max(for_sum, for_each), _MIN_SAMPLES, _MAX_SAMPLES))
+
+
+class _Sampled:
+    """A layer's shape, asked about voxels and about points in them."""
+
+    def __init__(self, layer: Layer, grid: Grid, offsets: Points) -> None:
+        """Of points at `offsets` (3, stretches, n), in voxels, from the voxels' centres."""
+        shape_from_index = layer.from_world @ grid.affine
+        self.layer = layer
+        self._linear, self._origin = shape_from_index[:3, :3], shape_from_index[:3, 3:]
+        self.n_samples = offsets.shape[2]
+        self._offsets = np.tensordot(self._linear, offsets, 1).astype(np.float32)
+        # A voxel's farthest corner from its centre, over the four diagonals of a parallelepiped.
+        signs = np.array([[1, 1, 1], [1, 1, -1], [1, -1, 1], [-1, 1, 1]])
+        self._half_diagonal = 0.5 * np.linalg.norm(signs @ self._linear.T, axis=1).max() * (1 + 1e-5)
+
+    def sort(self, index: NDArray[np.int64]) -> tuple[NDArray[np.bool_], NDArray[np.int64]]:
+        """Which voxels (3, n) are inside, (n,), and the numbers of those that the surface may cut."""
+        distance = self.layer.shape.distance(self._centers(index))
+        return distance < -self._half_diagonal, np.flatnonzero(np.abs(distance) <= self._half_diagonal)
+
+    def inside(self, index: NDArray[np.int64]) -> NDArray[np.bool_]:
+        """Which points of voxels (3, n) are inside, (n, samples)."""
+        # Odd numbers: along each axis the voxels go through all stretches.
+        stretch = (np.array([1, 5, 11]) @ index) % _STRETCHES
+        points = self._centers(index)[:, :, None] + self._offsets[:, stretch]
+        return (self.layer.shape.distance(points.reshape(3, -1)) < 0).reshape(points.shape[1:])
+
+    def _centers(self, index: NDArray[np.int64]) -> Floats:
+        return (self._linear @ index + self._origin).astype(np.float32)
+
+
+def _painted(values: Floats, index: NDArray[np.int64], own: _Sampled, lower: Sequence[_Sampled]) -> Floats:
+    """The means (n,) of voxels (3, n), `values` so far, after painting one layer more."""
+    whole, cut = own.sort(index)
+    values = np.where(whole, own.layer.over(values), values)
+    n_samples = own.n_samples
+    step = max(1, _BLOCK // n_samples)
+    for first in range(0, len(cut), step):
+        some = cut[first : first + step]
+        inside = own.inside(index[:, some])
+        beneath = np.zeros(inside.shape, np.float32)
+        for layer in lower:
+            filled, crossed = layer.sort(index[:, some])
+            beneath[filled] = layer.layer.over(beneath[filled])
+            if len(crossed):
+                within = layer.inside(index[:, some[crossed]])
+                beneath[crossed] = np.where(within, layer.layer.over(beneath[crossed]), beneath[crossed])
+        change = np.where(inside, np.float32(own.layer.value) - beneath, 0)
+        values[some] += change.mean(axis=1)
+    return values
+
+
+def _boxed(shape: Shape, n: int) -> Iterator[Points]:
+    """`n` points (3, ...) in the box around a shape, in its frame, block by block."""
+    sides = 2 * np.array(shape.half_box)[:, None]
+    for first in range(0, n, _BLOCK):
+        yield (r3_sequence(min(_BLOCK, n - first), first) - 0.5) * sides
+
+
+def _moved(pose: Points, points: Points) -> Points:
+    """`points` (3, N) by a pose (4, 4)."""
+    return pose[:3, :3] @ points + pose[:3, 3:]
+
+
+def _index_box(
+    shape_from_index: Points, half: Points, shape: tuple[int, ...]
+) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """First and one-past-last indices (3,) of the voxels that may touch the box from `-half` to `half`."""
+    index_from_shape = np.linalg.inv(shape_from_index)
+    middle = index_from_shape[:3, 3]
+    reach = np.abs(index_from_shape[:3, :3]) @ half
+    # Clipped as floats: a far-away box must not overflow the integers.
+    start = np.clip(np.floor(middle - reach - 0.5), 0, shape).astype(np.int64)
+    stop = np.clip(np.ceil(middle + reach + 0.5) + 1, 0, shape).astype(np.int64)
+    return start, np.maximum(start, stop)

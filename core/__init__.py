@@ -17,7 +17,17 @@ from .grid import Grid
 from .isotopes import ISOTOPES, Isotope, isotope
 from .mosaic import as_seen, mosaic
 from .noise import sample_counts
-from .phantoms.derenzo import DerenzoPhantom
+from .phantoms.defrise import DefrisePhantom
+from .phantoms.derenzo import DerenzoPhantom, DerenzoRods
+from .phantoms.jaszczak import JaszczakPhantom
+from .phantoms.language import read_phantom, write_phantom
+from .phantoms.nema import NemaBody
+from .phantoms.phantom import Phantom, PhantomMesh, ShapePhantom
+from .phantoms.points import PointGrid
+from .phantoms.random import random_pose
+from .phantoms.shapes import Box, Capsule, Cone, Cylinder, Ellipsoid, Shape, Sphere
+from .phantoms.shepp_logan import SheppLogan
+from .phantoms.torso import CardiacTorso
 from .presets import c_arm_views, pinhole_views
 from .progress import Cancelled, Progress
 from .project import project_run
@@ -31,18 +41,35 @@ from .workbook import SystemSource, read_system
 
 __all__ = [
     "ISOTOPES",
+    "Box",
     "Cancelled",
+    "Capsule",
+    "CardiacTorso",
+    "Cone",
+    "Cylinder",
+    "DefrisePhantom",
     "DerenzoPhantom",
+    "DerenzoRods",
+    "Ellipsoid",
     "Emission",
     "Grid",
     "InputError",
     "InputWarning",
     "InverseSquareSum",
     "Isotope",
+    "JaszczakPhantom",
+    "NemaBody",
+    "Phantom",
+    "PhantomMesh",
     "PinholeSystem",
+    "PointGrid",
     "Progress",
     "ProjectionRun",
     "Projector",
+    "Shape",
+    "ShapePhantom",
+    "SheppLogan",
+    "Sphere",
     "SystemSource",
     "Transmission",
     "Views",
@@ -56,11 +83,14 @@ __all__ = [
     "mosaic",
     "pinhole_views",
     "project_run",
+    "random_pose",
+    "read_phantom",
     "read_run",
     "read_system",
     "read_volume",
     "sample_counts",
     "trace_rays",
+    "write_phantom",
     "write_run",
     "write_volume",
 ]

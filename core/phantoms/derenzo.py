@@ -232,6 +232,8 @@ class DerenzoPhantom(Phantom):
     background: float = 0.0
     mu: float = WATER_MU
 
+    title = "Derenzo phantom"
+
     def __post_init__(self) -> None:
         set_ = object.__setattr__
         for name, unit in (("cylinder_radius", "mm"), ("cylinder_height", "mm"), ("background", "kBq/mL"), ("mu", "1/mm")):
@@ -260,11 +262,6 @@ class DerenzoPhantom(Phantom):
     def shapes(self) -> Sequence[Shape]:
         """The rods, over the water if there is any."""
         return (*self._water(), self._rods)
-
-    @property
-    def title(self) -> str:
-        """What to call the phantom."""
-        return "Derenzo phantom"
 
     def rods(self) -> NDArray[np.float64]:
         """Every rod as (sector, x, y, diameter), array (n_rods, 4), mm."""

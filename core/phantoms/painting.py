@@ -11,6 +11,7 @@ from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,10 +27,11 @@ Floats = NDArray[np.float32]
 
 # Points of one call of a shape's `distance`: small enough that its temporaries stay in the processor's cache.
 _BLOCK = 1 << 15
-_MIN_SAMPLES, _MAX_SAMPLES = 128, 1 << 14  # of a voxel that a surface cuts
+_MIN_SAMPLES, _MAX_SAMPLES = 128, 1 << 13  # of a voxel that a surface cuts
 _STRETCHES = 32  # of the sequence: voxels take turns, so that their errors differ and cancel
-# Shapes whose smallest part is below `_SMALL` voxels, and that touch `_FEW` or fewer, are sampled in their own box.
-_SMALL = 3.0
+# In boxes of up to so many voxels a shape's samples are weighed so that they make up exactly its volume.
+_WEIGHED = 1 << 22
+# Shapes whose smallest part is below a voxel, and that touch `_FEW` or fewer, are sampled in their own box.
 _FEW = 1 << 11
 _SAMPLES_OF_FEW = 1 << 10  # per voxel
 _SAMPLES_BENEATH = 1 << 18
@@ -64,20 +66,32 @@ class Layer:
         """Shape-from-world (4, 4)."""
         return np.linalg.inv(self.pose)
 
-    @cached_property
-    def ball(self) -> tuple[Points, float]:
-        """Centre (3,) and radius, mm, of a ball around the shape in the world."""
-        return self.pose[:3, 3], self.shape.ball_radius * float(np.linalg.norm(self.pose[:3, :3], 2))
-
-    def over(self, values: NDArray[np.floating]) -> NDArray[np.floating]:
+    def over(self, values: NDArray[Any]) -> NDArray[Any]:
         """What the shape makes of the values beneath it."""
         value = values.dtype.type(self.value)
         return values + value if self.adds else np.full_like(values, value)
 
-    def meets(self, other: Layer) -> bool:
-        """Whether the balls around both touch."""
-        (one, r), (two, s) = self.ball, other.ball
-        return bool(np.linalg.norm(one - two) < r + s)
+    def relation(self, other: Layer) -> int:
+        """1 where the shape surely covers all of the other's, -1 where they surely do not touch, 0 else."""
+        from_other = self.from_world @ other.pose
+        reach = other.shape.ball_radius * float(np.linalg.norm(from_other[:3, :3], 2))
+        distance = float(self.shape.distance(from_other[:3, 3:])[0])
+        return 1 if distance < -reach else -1 if distance > reach else 0
+
+
+def _seen_beneath(layers: Sequence[Layer]) -> list[Layer]:
+    """Those of the lower layers that may show in the last one's shape, if that replaces what is beneath it."""
+    *lower, layer = layers
+    seen: list[Layer] = []
+    if layer.adds:
+        return seen
+    for other in lower:
+        relation = other.relation(layer)
+        if relation == 1 and not other.adds:
+            seen = []
+        if relation >= 0:
+            seen.append(other)
+    return seen
 
 
 def values_at(layers: Sequence[Layer], points: Points) -> Points:
@@ -95,8 +109,10 @@ def integral(layers: Sequence[Layer]) -> float:
     for i, layer in enumerate(layers):
         volume = layer.shape.volume * abs(float(np.linalg.det(layer.pose[:3, :3])))
         total += volume * layer.value
-        beneath = [] if layer.adds else [lower for lower in layers[:i] if lower.meets(layer)]
-        if beneath:
+        beneath = _seen_beneath(layers[: i + 1])
+        if len(beneath) == 1 and beneath[0].relation(layer) == 1:
+            total -= volume * beneath[0].value
+        elif beneath:
             total -= volume * _mean_inside(layer, beneath)
     return total
 
@@ -115,8 +131,8 @@ def paint_voxels(grid: Grid, layers: Sequence[Layer], progress: Progress | None 
     """The mean of the painting over each voxel, float32 array of the grid's shape.
 
     Voxels farther from a surface than their own half diagonal are all in or all out; the others are sampled at the
-    points of a low-discrepancy sequence. The points of a shape that is small beside the voxels fill the shape, and
-    weigh as much as its volume says.
+    points of a low-discrepancy sequence, which weigh so much that the shape's volume comes out. The points of a shape
+    that is small beside the voxels fill the shape instead.
 
     Parameters
     ----------
@@ -141,6 +157,10 @@ def paint_voxels(grid: Grid, layers: Sequence[Layer], progress: Progress | None 
                     except BaseException:
                         pool.shutdown(wait=False, cancel_futures=True)
                         raise
+    if not any(layer.adds for layer in layers):
+        # What is painted with different samples may miss by a little what it shall replace.
+        values = [0.0, *(layer.value for layer in layers)]
+        np.clip(image, min(values), max(values), out=image)
     return image
 
 
@@ -205,14 +225,19 @@ class _Stroke:
     def __init__(self, grid: Grid, layers: Sequence[Layer]) -> None:
         self.grid = grid
         self.layer = layers[-1]
-        self.beneath = [] if self.layer.adds else [lower for lower in layers[:-1] if lower.meets(self.layer)]
+        self.beneath = _seen_beneath(layers)
         shape_from_index = self.layer.from_world @ grid.affine
         shape = self.layer.shape
-        self.start, self.stop = _index_box(shape_from_index, np.array(shape.half_box), grid.shape)
+        low, high = _index_box(shape_from_index, shape)
+        # Clipped as floats: a far-away box must not overflow the integers.
+        self.start = np.clip(np.floor(low + 0.5), 0, grid.shape).astype(np.int64)
+        self.stop = np.clip(np.floor(high + 0.5) + 1, self.start, grid.shape).astype(np.int64)
         self.voxel_volume = abs(float(np.linalg.det(shape_from_index[:3, :3])))
         self.edge = float(np.linalg.norm(shape_from_index[:3, :3], axis=0).max())
         self.touched = float(np.prod(2 * np.array(shape.half_box) / self.edge + 1))
-        self.is_small = shape.finest < _SMALL * self.edge and self.touched < _FEW
+        self.is_small = shape.finest < self.edge and self.touched < _FEW
+        inside = bool(np.all(low >= -0.5) and np.all(high <= np.array(grid.shape) - 0.5))
+        self.is_weighed = inside and bool(np.prod(self.stop - self.start) <= _WEIGHED)
 
     @property
     def steps(self) -> int:
@@ -258,27 +283,43 @@ class _Stroke:
         offsets = (r3_sequence(_STRETCHES * n_samples) - 0.5).reshape(3, _STRETCHES, n_samples)
         own, *lower = (_Sampled(layer, self.grid, offsets) for layer in (self.layer, *self.beneath))
 
-        def fill(ix: int) -> None:
+        def fill(ix: int) -> tuple[int, NDArray[np.int64], Floats, Floats]:
             slab = image[ix, rows, columns]
             values = slab.ravel()
             index = np.stack([np.full(iy.size, ix), iy.ravel(), iz.ravel()])
+            parts, n_whole = [], 0
             for first in range(0, len(values), _BLOCK):
                 block = slice(first, first + _BLOCK)
-                values[block] = _painted(values[block], index[:, block], own, lower)
+                whole, cut, coverage, change = _changes(index[:, block], own, lower)
+                values[block] = np.where(whole, own.layer.over(values[block]), values[block])
+                parts.append((first + cut, coverage, change))
+                n_whole += int(np.count_nonzero(whole))
+            cut, coverage, change = map(np.concatenate, zip(*parts, strict=True))
+            if not self.is_weighed:
+                values[cut] += change
             slab[...] = values.reshape(slab.shape)
+            return n_whole, cut, coverage, change
 
-        for _ in pool.map(fill, range(self.start[0], self.stop[0])):
+        kept, n_whole, covered = [], 0, 0.0
+        for ix, (whole, cut, coverage, change) in enumerate(
+            pool.map(fill, range(self.start[0], self.stop[0])), self.start[0]
+        ):
+            if self.is_weighed:
+                kept.append((ix, cut, change))
+                n_whole, covered = n_whole + whole, covered + float(coverage.sum())
             yield
+        weight = (self.layer.shape.volume / self.voxel_volume - n_whole) / covered if covered else 1.0
+        for ix, cut, change in kept:
+            image[ix, iy.ravel()[cut], iz.ravel()[cut]] += np.float32(weight) * change
 
     @property
     def _n_samples(self) -> int:
-        # The error of a cut voxel is about n^(-2/3) / 2 of its volume h^3. With a surface below 6 V / s, s being the
-        # smallest part, some 9 V / (s h^2) voxels are cut, whose errors add up at random: so many samples keep their
-        # sum below 1/5000 of V, as a thin shell, the difference of two shapes, needs. Voxels above the smallest part get
-        # more for their own sake.
         shape = self.layer.shape
-        for_sum = (7500 * self.edge**2 / np.sqrt(shape.finest * shape.volume)) ** 1.5
-        for_each = _MIN_SAMPLES * 2 * self.edge / shape.finest
+        for_each = 4 * _MIN_SAMPLES * self.edge / shape.finest
+        # Where samples are not weighed: the error of a cut voxel is about n^(-2/3) / 2 of its volume h^3. With a surface
+        # below 6 V / s, s being the smallest part, some 9 V / (s h^2) voxels are cut, whose errors add up at random: so
+        # many samples keep their sum below 1/5000 of V.
+        for_sum = 0.0 if self.is_weighed else (7500 * self.edge**2 / np.sqrt(shape.finest * shape.volume)) ** 1.5
         return int(np.clip(max(for_sum, for_each), _MIN_SAMPLES, _MAX_SAMPLES))
 
 
@@ -312,25 +353,31 @@ class _Sampled:
         return (self._linear @ index + self._origin).astype(np.float32)
 
 
-def _painted(values: Floats, index: NDArray[np.int64], own: _Sampled, lower: Sequence[_Sampled]) -> Floats:
-    """The means (n,) of voxels (3, n), `values` so far, after painting one layer more."""
+def _changes(
+    index: NDArray[np.int64], own: _Sampled, lower: Sequence[_Sampled]
+) -> tuple[NDArray[np.bool_], NDArray[np.int64], Floats, Floats]:
+    """What painting one layer more does to voxels (3, n).
+
+    Which of them are inside, (n,); the numbers of those that the surface cuts, and of these the share that is inside
+    and by how much the mean changes.
+    """
     whole, cut = own.sort(index)
-    values = np.where(whole, own.layer.over(values), values)
-    n_samples = own.n_samples
-    step = max(1, _BLOCK // n_samples)
+    coverage, change = np.empty(len(cut), np.float32), np.empty(len(cut), np.float32)
+    step = max(1, _BLOCK // own.n_samples)
     for first in range(0, len(cut), step):
-        some = cut[first : first + step]
-        inside = own.inside(index[:, some])
+        some = slice(first, first + step)
+        at = index[:, cut[some]]
+        inside = own.inside(at)
         beneath = np.zeros(inside.shape, np.float32)
         for layer in lower:
-            filled, crossed = layer.sort(index[:, some])
+            filled, crossed = layer.sort(at)
             beneath[filled] = layer.layer.over(beneath[filled])
             if len(crossed):
-                within = layer.inside(index[:, some[crossed]])
+                within = layer.inside(at[:, crossed])
                 beneath[crossed] = np.where(within, layer.layer.over(beneath[crossed]), beneath[crossed])
-        change = np.where(inside, np.float32(own.layer.value) - beneath, 0)
-        values[some] += change.mean(axis=1)
-    return values
+        coverage[some] = inside.mean(axis=1)
+        change[some] = np.where(inside, np.float32(own.layer.value) - beneath, 0).mean(axis=1)
+    return whole, cut, coverage, change
 
 
 def _boxed(shape: Shape, n: int) -> Iterator[Points]:
@@ -345,14 +392,11 @@ def _moved(pose: Points, points: Points) -> Points:
     return pose[:3, :3] @ points + pose[:3, 3:]
 
 
-def _index_box(
-    shape_from_index: Points, half: Points, shape: tuple[int, ...]
-) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """First and one-past-last indices (3,) of the voxels that may touch the box from `-half` to `half`."""
+def _index_box(shape_from_index: Points, shape: Shape) -> tuple[Points, Points]:
+    """Lowest and highest index (3,) of any of a shape's points, or beyond."""
     index_from_shape = np.linalg.inv(shape_from_index)
-    middle = index_from_shape[:3, 3]
-    reach = np.abs(index_from_shape[:3, :3]) @ half
-    # Clipped as floats: a far-away box must not overflow the integers.
-    start = np.clip(np.floor(middle - reach - 0.5), 0, shape).astype(np.int64)
-    stop = np.clip(np.ceil(middle + reach + 0.5) + 1, 0, shape).astype(np.int64)
-    return start, np.maximum(start, stop)
+    linear, middle = index_from_shape[:3, :3], index_from_shape[:3, 3]
+    of_box = np.abs(linear) @ np.array(shape.half_box)
+    of_ball = np.linalg.norm(linear, axis=1) * shape.ball_radius
+    reach = np.minimum(of_box, of_ball)
+    return middle - reach, middle + reach

@@ -21,6 +21,7 @@ from ..progress import Progress
 from ..views import Views
 from ..volume import Volume
 from .painting import Layer, integral, line_integrals, paint_voxels, values_at
+from .settings import check_settings
 from .shapes import Shape
 
 QUANTITIES = ("activity", "mu")
@@ -65,10 +66,15 @@ class Phantom:
         """What the phantom consists of, from bottom to top."""
         raise NotImplementedError
 
-    @property
-    def title(self) -> str:
-        """What to call the phantom."""
-        return type(self).__name__
+    title: str = "phantom"
+    """What to call it."""
+
+    def __post_init__(self) -> None:
+        check_settings(self, self.title)
+        try:
+            len(self.shapes)
+        except InputError as error:
+            raise InputError(f"{self.title}: {error}") from None
 
     @property
     def total_activity(self) -> float:
@@ -237,7 +243,4 @@ class ShapePhantom(Phantom):
         object.__setattr__(self, "shapes", shapes)
         object.__setattr__(self, "mu_energy", positive(self.mu_energy, "mu_energy", "keV"))
 
-    @property
-    def title(self) -> str:
-        """What to call the phantom."""
-        return self.name or "phantom"
+        object.__setattr__(self, "title", self.name or self.title)

@@ -17,14 +17,13 @@ from numpy.typing import ArrayLike, NDArray
 from ..checks import positive, real_array
 from ..errors import InputError
 from ..frames import euler_pose
-from .sequences import r3_sequence
 from .surfaces import Surface, clipped, lathe
 
 Real = NDArray[np.floating]
 Points = NDArray[np.float64]
 
 MODES = ("paint", "add")
-_VOLUME_POINTS = 1 << 20  # of a shape that is cut: its volume is then right to about 1e-5 of its box
+_VOLUME_LINES = 512  # each way, through a shape that is cut: its volume is then right to about 1e-5
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -135,12 +134,18 @@ class Shape:
 
     @cached_property
     def volume(self) -> float:
-        """mm^3: in closed form, and of a shape that is cut counted at points."""
+        """mm^3: in closed form, and of a shape that is cut summed over lines."""
         if not self.cut:
             return self._volume
-        box = np.array(self.half_box)
-        points = (r3_sequence(_VOLUME_POINTS) - 0.5) * (2 * box[:, None])
-        return float(np.mean(self.distance(points) < 0) * np.prod(2 * box))
+        # Aslant: along a plane of the cut the sum would jump from line to line, and converge badly.
+        slant = np.array([0.3, 0.2, 1.0])
+        a, b, c = self.half_box
+        width, depth = 2 * a * (1 + slant[0]), 2 * b * (1 + slant[1])
+        u, v = (np.mgrid[:_VOLUME_LINES, :_VOLUME_LINES].reshape(2, -1) + 0.5) / _VOLUME_LINES - 0.5
+        starts = np.stack([u * width, v * depth, np.zeros_like(u)])
+        directions = np.broadcast_to((slant * [a, b, c])[:, None], starts.shape)
+        enter, leave = self.intervals(starts, directions)
+        return float(np.maximum(leave - enter, 0.0).sum() / len(u) * width * depth * c)
 
     @property
     def finest(self) -> float:

@@ -20,7 +20,7 @@ from ..system import PinholeSystem
 from ..volume_io import read_volume
 from ..workbook import read_system
 from .options import add_command, add_phantom_options, add_view_options, chosen_modules, output_path, progress_bar
-from .phantom import derenzo_volume
+from .phantom import derenzo_volume, file_volume
 
 _EMISSION = [field.name for field in fields(Emission)]
 
@@ -30,13 +30,15 @@ def add_parser(subparsers) -> None:  # type: ignore[no-untyped-def]
     parser = add_command(
         subparsers,
         "project",
-        "project a volume, or a Derenzo phantom, into every module",
+        "project a volume, or a phantom, into every module",
         "mphdrr project scanner.xlsx --volume ct.nii.gz --size 250 250 -o run.h5\n"
         "example: mphdrr project scanner.xlsx --volume heart.nii.gz --mu ct-mu.nii.gz --emission --isotope Tc-99m "
         "--time 600 --aperture-points 7 --aperture-mu 3.6 --crystal-mu 0.404 --noise 1 -o counts.h5",
     )
     parser.add_argument("workbook", metavar="WORKBOOK", help="geometry workbook (.xlsx, .xlsm)")
-    parser.add_argument("--volume", metavar="FILE", help=".nii, .nii.gz or .npz; without it, a Derenzo phantom is made")
+    source = parser.add_mutually_exclusive_group()
+    source.add_argument("--volume", metavar="FILE", help=".nii, .nii.gz or .npz; without it, a Derenzo phantom is made")
+    source.add_argument("--phantom", metavar="FILE", help="a phantom's shapes (.toml), put on the grid given below")
     add_view_options(parser)
     models = parser.add_argument_group("what pixels hold; without an option, line integrals")
     one = models.add_mutually_exclusive_group()
@@ -50,7 +52,7 @@ def add_parser(subparsers) -> None:  # type: ignore[no-untyped-def]
     )  # fmt: skip
     models.add_argument("--noise", type=int, metavar="SEED", help="draw Poisson counts instead of their means")
     add_emission_options(parser)
-    add_phantom_options(parser.add_argument_group("Derenzo phantom, without --volume"))  # type: ignore[arg-type]
+    add_phantom_options(parser.add_argument_group("Derenzo phantom, without --volume, or place of --phantom"))  # type: ignore[arg-type]
     parser.add_argument("-o", "--output", required=True, metavar="FILE", help=", ".join(FORMATS))
     parser.add_argument("--mosaic", metavar="PNG", help="also write all images in one picture")
     parser.set_defaults(run=_run)
@@ -125,9 +127,11 @@ def _run(arguments: argparse.Namespace) -> None:
     system = chosen_modules(read_system(arguments.workbook), arguments.modules)
     model = chosen_model(arguments, system)
     recipe: dict[str, Any] = {}
+    quantity = "activity" if arguments.emission else "mu" if arguments.photons is not None else None
     if arguments.volume:
-        quantity = "activity" if arguments.emission else "mu" if arguments.photons is not None else None
         volume = read_volume(arguments.volume, quantity)
+    elif arguments.phantom:
+        volume, recipe = file_volume(arguments.phantom, arguments, quantity or "activity")
     else:
         volume, recipe = derenzo_volume(arguments)
     run = project_run(
@@ -140,7 +144,7 @@ def _run(arguments: argparse.Namespace) -> None:
         backend=arguments.backend,
         threads=arguments.threads,
         settings={
-            "volume": Path(arguments.volume).name if arguments.volume else "Derenzo phantom",
+            "volume": Path(arguments.volume or arguments.phantom or "Derenzo phantom").name,
             **recipe,
             **({"mu_file": Path(arguments.mu).name} if hasattr(arguments, "mu") else {}),
         },

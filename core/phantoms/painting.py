@@ -157,10 +157,11 @@ def paint_voxels(grid: Grid, layers: Sequence[Layer], progress: Progress | None 
                     except BaseException:
                         pool.shutdown(wait=False, cancel_futures=True)
                         raise
-    if not any(layer.adds for layer in layers):
-        # What is painted with different samples may miss by a little what it shall replace.
-        values = [0.0, *(layer.value for layer in layers)]
-        np.clip(image, min(values), max(values), out=image)
+    # What is painted with different samples may miss by a little what it shall replace.
+    values = [layer.value for layer in layers]
+    if min(values, default=0.0) >= 0:
+        highest = None if any(layer.adds for layer in layers) else max(values, default=0.0)
+        np.clip(image, 0.0, highest, out=image)
     return image
 
 
@@ -300,17 +301,19 @@ class _Stroke:
             slab[...] = values.reshape(slab.shape)
             return n_whole, cut, coverage, change
 
-        kept, n_whole, covered = [], 0, 0.0
+        kept, missing, unsure = [], self.layer.shape.volume / self.voxel_volume, 0.0
         for ix, (whole, cut, coverage, change) in enumerate(
             pool.map(fill, range(self.start[0], self.stop[0])), self.start[0]
         ):
             if self.is_weighed:
-                kept.append((ix, cut, change))
-                n_whole, covered = n_whole + whole, covered + float(coverage.sum())
+                kept.append((ix, cut, coverage, change))
+                missing -= whole + float(coverage.sum(dtype=np.float64))
+                unsure += float(np.sum(coverage * (1 - coverage), dtype=np.float64))
             yield
-        weight = (self.layer.shape.volume / self.voxel_volume - n_whole) / covered if covered else 1.0
-        for ix, cut, change in kept:
-            image[ix, iy.ravel()[cut], iz.ravel()[cut]] += np.float32(weight) * change
+        # What is missing goes to where the shares c are unsure, as c (1 - c): they stay between 0 and 1.
+        weight = np.float32(missing / unsure if unsure else 0.0)
+        for ix, cut, coverage, change in kept:
+            image[ix, iy.ravel()[cut], iz.ravel()[cut]] += change * (1 + weight * (1 - coverage))
 
     @property
     def _n_samples(self) -> int:

@@ -6,6 +6,7 @@ import argparse
 import dataclasses
 import json
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -68,7 +69,7 @@ def add_parser(subparsers) -> None:  # type: ignore[no-untyped-def]
         parser = add_command(kinds, name, f"make {summary}", f"mphdrr phantom {name} {example} -o {name}.nii.gz")
         _add_settings(parser, kind)
         add_placing_options(parser)
-        _add_output(parser, lambda arguments, kind=kind: kind(**_settings(arguments, kind)))
+        _add_output(parser, partial(_of_kind, kind))
     for name, shape, dimensions, example in _SHAPES:
         parser = add_command(kinds, name, f"make one {name}", f"mphdrr phantom {name} {example} -o {name}.nii.gz")
         for dimension, count in dimensions:
@@ -76,8 +77,7 @@ def add_parser(subparsers) -> None:  # type: ignore[no-untyped-def]
         parser.add_argument("--activity", type=float, default=100.0, metavar="kBq/mL", help="concentration")
         parser.add_argument("--mu", type=float, default=0.0, metavar="1/mm", help="attenuation coefficient")
         add_placing_options(parser)
-        names = [dimension for dimension, _ in dimensions]
-        _add_output(parser, lambda arguments, shape=shape, names=names: _one(arguments, shape, names))
+        _add_output(parser, partial(_one, shape, [dimension for dimension, _ in dimensions]))
     file = add_command(
         kinds, "file", "make the phantom that a TOML file describes", "mphdrr phantom file thorax.toml -o thorax.nii.gz"
     )
@@ -113,7 +113,7 @@ def _derenzo(arguments: argparse.Namespace) -> DerenzoPhantom:
     )  # fmt: skip
 
 
-def _one(arguments: argparse.Namespace, shape: Any, names: list[str]) -> Phantom:
+def _one(shape: Any, names: list[str], arguments: argparse.Namespace) -> Phantom:
     dimensions = {name: getattr(arguments, name) for name in names}
     if isinstance(dimensions.get("radius"), list) and len(dimensions["radius"]) == 1:
         (dimensions["radius"],) = dimensions["radius"]
@@ -125,13 +125,17 @@ def _add_settings(parser: argparse.ArgumentParser, kind: Any) -> None:
     for field in dataclasses.fields(kind):
         many = isinstance(field.default, tuple)
         default = list(field.default) if many else field.default
-        option: dict[str, Any] = {"dest": _DEST + field.name, "default": default, "nargs": len(default) if many else None}
+        option: dict[str, Any] = {
+            "dest": _DEST + field.name,
+            "default": default,
+            "nargs": len(default) if many else None,
+        }
         if "unit" in field.metadata:
             unit = field.metadata["unit"]
             metavar = {"mm": "MM", "kBq/mL": "kBq/mL", "1/mm": "1/mm", "kBq": "kBq", "mL": "mL", "DEG": "DEG"}.get(unit)
             text = field.metadata["text"] if metavar else f"share {unit}, {field.metadata['text']}"
             option |= {"type": float, "metavar": metavar or "SHARE", "help": text}
-        elif isinstance(field.default, str):
+        elif isinstance(default, str):
             option |= {"choices": CONTRASTS, "help": "of the activity"}
         else:
             option |= {"type": int, "metavar": "N", "help": "how many along x y z" if many else "how many"}
@@ -144,8 +148,8 @@ def _option_name(name: str, kind: Any) -> str:
     return "--" + words.get((kind, name), name.replace("_", "-"))
 
 
-def _settings(arguments: argparse.Namespace, kind: Any) -> dict[str, Any]:
-    return {field.name: getattr(arguments, _DEST + field.name) for field in dataclasses.fields(kind)}
+def _of_kind(kind: Any, arguments: argparse.Namespace) -> Phantom:
+    return kind(**{field.name: getattr(arguments, _DEST + field.name) for field in dataclasses.fields(kind)})
 
 
 def _add_output(parser: argparse.ArgumentParser, make: Make) -> None:
@@ -155,7 +159,9 @@ def _add_output(parser: argparse.ArgumentParser, make: Make) -> None:
         "--box", type=float, nargs="+", default=[0], metavar="MM",
         help="with --random: sides of the box around --position in which the middle is drawn",
     )  # fmt: skip
-    parser.add_argument("--count", type=int, default=1, metavar="N", help="with --random: how many, as FILE-1, FILE-2 …")
+    parser.add_argument(
+        "--count", type=int, default=1, metavar="N", help="with --random: how many, as FILE-1, FILE-2 …"
+    )
     parser.add_argument("--json", action="store_true", help="print what was written, with the poses, as JSON")
     parser.add_argument(
         "-o", "--output", required=True, metavar="FILE", help=".nii, .nii.gz or .npz; .toml writes the shapes"
@@ -207,7 +213,9 @@ def _run(arguments: argparse.Namespace) -> None:
         held = _held(volume)
         written.append({"file": str(file), "pose": pose.tolist(), "quantity": volume.quantity, **held})
         if not arguments.json:
-            said = f"{held['total_kBq']:.4g} kBq in all" if "total_kBq" in held else f"mu up to {held['largest']:.4g} 1/mm"
+            said = (
+                f"{held['total_kBq']:.4g} kBq in all" if "total_kBq" in held else f"mu up to {held['largest']:.4g} 1/mm"
+            )
             print(f"{file}: {' x '.join(map(str, volume.grid.shape))} voxels, {said}")
     if arguments.json:
         print(json.dumps(written, indent=2))

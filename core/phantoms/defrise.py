@@ -63,8 +63,12 @@ class DefrisePhantom(Phantom):
             z = (i - (self.disks - 1) / 2) * self.spacing
             shapes.append(
                 Cylinder(
-                    radius=self.disk_radius, height=self.disk_thickness, position=(0, 0, z),
-                    activity=self.activity, mu=self.mu, name=f"disk {i + 1}",
-                )  # fmt: skip
+                    radius=self.disk_radius,
+                    height=self.disk_thickness,
+                    position=(0, 0, z),
+                    activity=self.activity,
+                    mu=self.mu,
+                    name=f"disk {i + 1}",
+                )
             )
         return shapes

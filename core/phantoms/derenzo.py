@@ -9,13 +9,13 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from ..checks import freeze, positive, real_array
 from ..errors import InputError, InputWarning
 from ..isotopes import WATER_MU
 from .phantom import Phantom
-from .shapes import Cylinder, Points, Real, Shape
+from .shapes import Cylinder, Points, Real, Shape, Vector
 from .surfaces import Surface, lathe
 
 SECTORS = 6
@@ -46,7 +46,7 @@ class DerenzoRods(Shape):
     """
 
     radius: float
-    rod_diameters: ArrayLike
+    rod_diameters: Vector
     height: float
     sectors: int = SECTORS
 
@@ -83,7 +83,7 @@ class DerenzoRods(Shape):
         for sector, (w, (margin, rows)) in enumerate(zip(self._diameters, self._rows, strict=True)):
             along, across = self._axes[sector]
             for n in range(1, rows + 1):
-                count = int(self._rods_in_row(np.float64(n)))
+                count = int(self._rods_in_row(np.array(float(n))))
                 for j in range(count):
                     x, y = (margin + _ROW_STEP * w * n) * along + (2 * j - (count - 1)) * w * across
                     table.append((sector, x, y, w))
@@ -115,7 +115,7 @@ class DerenzoRods(Shape):
 
     @property
     def _diameters(self) -> tuple[float, ...]:
-        return self.rod_diameters  # type: ignore[return-value]
+        return self.rod_diameters
 
     @cached_property
     def _rows(self) -> list[tuple[float, int]]:
@@ -186,7 +186,7 @@ class DerenzoRods(Shape):
             rod, triangles = lathe(
                 np.array([0.0, 1.0, 1.0, 0.0]), np.array([-half, -half, half, half]), w / 2, w / 2, n_sides=24
             )
-            vertices.append(rod + [x, y, 0.0])
+            vertices.append(rod + np.array([x, y, 0.0]))
             faces.append(triangles + i * len(rod))
         return np.concatenate(vertices), np.concatenate(faces).astype(np.int32)
 
@@ -236,7 +236,12 @@ class DerenzoPhantom(Phantom):
 
     def __post_init__(self) -> None:
         set_ = object.__setattr__
-        for name, unit in (("cylinder_radius", "mm"), ("cylinder_height", "mm"), ("background", "kBq/mL"), ("mu", "1/mm")):
+        for name, unit in (
+            ("cylinder_radius", "mm"),
+            ("cylinder_height", "mm"),
+            ("background", "kBq/mL"),
+            ("mu", "1/mm"),
+        ):
             value = float(real_array(getattr(self, name), f"Derenzo {name.replace('_', ' ')}", ()))
             if value < 0:
                 raise InputError(f"Derenzo {name.replace('_', ' ')}: expected 0 or more {unit}, got {value:g}")
@@ -277,7 +282,9 @@ class DerenzoPhantom(Phantom):
     def _water(self) -> list[Shape]:
         if not self.cylinder_radius:
             if self.background or self.cylinder_height:
-                raise InputError("Derenzo cylinder radius: expected more than 0 mm around a background or with a height")
+                raise InputError(
+                    "Derenzo cylinder radius: expected more than 0 mm around a background or with a height"
+                )
             return []
         height = self.cylinder_height or self.height
         if self.cylinder_radius < self.radius or height < self.height:

@@ -67,10 +67,14 @@ class JaszczakPhantom(Phantom):
         if any(self.rod_diameters):
             shapes.append(
                 DerenzoRods(
-                    radius=self.radius, rod_diameters=self.rod_diameters, height=self.rod_height,
-                    position=(0, 0, base + self.rod_height / 2), name="rods",
-                    activity=self.rod_activity, mu=self.mu if self.rod_activity else PMMA_MU,
-                )  # fmt: skip
+                    radius=self.radius,
+                    rod_diameters=self.rod_diameters,
+                    height=self.rod_height,
+                    position=(0, 0, base + self.rod_height / 2),
+                    name="rods",
+                    activity=self.rod_activity,
+                    mu=self.mu if self.rod_activity else PMMA_MU,
+                )
             )
         for i, diameter in enumerate(self.sphere_diameters):
             if diameter:
@@ -78,8 +82,11 @@ class JaszczakPhantom(Phantom):
                 x, y = self.sphere_ring_radius * math.cos(angle), self.sphere_ring_radius * math.sin(angle)
                 shapes.append(
                     Sphere(
-                        radius=diameter / 2, position=(x, y, base + self.sphere_height), name=f"sphere {diameter:g} mm",
-                        activity=self.sphere_activity, mu=self.mu if self.sphere_activity else PMMA_MU,
-                    )  # fmt: skip
+                        radius=diameter / 2,
+                        position=(x, y, base + self.sphere_height),
+                        name=f"sphere {diameter:g} mm",
+                        activity=self.sphere_activity,
+                        mu=self.mu if self.sphere_activity else PMMA_MU,
+                    )
                 )
         return shapes

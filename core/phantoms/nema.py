@@ -6,6 +6,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
 
 from ..isotopes import WATER_MU
 from .phantom import Phantom
@@ -57,11 +58,13 @@ class NemaBody(Phantom):
         """Body, lung insert, spheres."""
         z = _TO_LID - self.length / 2
         y = -(_FRONT_RADIUS - _BACK_RADIUS) / 2  # of the circles' centres
-        water = {"activity": self.background, "mu": self.mu}
+        water: dict[str, Any] = {"activity": self.background, "mu": self.mu}
         half = _BACK_WIDTH / 2
         # The box reaches into the half circle: no seam between them.
         shapes: list[Shape] = [
-            Cylinder(radius=_FRONT_RADIUS, height=self.length, position=(0, y, z), cut=[(0, -1, 0, 0)], name="front", **water),
+            Cylinder(
+                radius=_FRONT_RADIUS, height=self.length, position=(0, y, z), cut=[(0, -1, 0, 0)], name="front", **water
+            ),
             *(
                 Cylinder(radius=_BACK_RADIUS, height=self.length, position=(x, y, z), name=f"{side} back", **water)
                 for x, side in ((-half, "left"), (half, "right"))
@@ -71,17 +74,24 @@ class NemaBody(Phantom):
         if self.lung_diameter:
             shapes.append(
                 Cylinder(
-                    radius=self.lung_diameter / 2, height=self.length, position=(0, 0, z),
-                    activity=0.0, mu=_LUNG_DENSITY * self.mu, name="lung insert",
-                )  # fmt: skip
+                    radius=self.lung_diameter / 2,
+                    height=self.length,
+                    position=(0, 0, z),
+                    activity=0.0,
+                    mu=_LUNG_DENSITY * self.mu,
+                    name="lung insert",
+                )
             )
         for i, diameter in enumerate(self.sphere_diameters):
             if diameter:
                 angle = math.radians(60.0 * (i - 2))
                 shapes.append(
                     Sphere(
-                        radius=diameter / 2, activity=self.sphere_activity, mu=self.mu, name=f"sphere {diameter:g} mm",
+                        radius=diameter / 2,
+                        activity=self.sphere_activity,
+                        mu=self.mu,
+                        name=f"sphere {diameter:g} mm",
                         position=(_RING_RADIUS * math.cos(angle), _RING_RADIUS * math.sin(angle), 0.0),
-                    )  # fmt: skip
+                    )
                 )
         return shapes

@@ -219,7 +219,6 @@ def _next_power_of_2(counts: NDArray[np.int64]) -> NDArray[np.int64]:
     return np.where(counts > 0, 1 << np.ceil(np.log2(np.maximum(counts, 1))).astype(np.int64), 0)
 
 
-
 class _Stroke:
     """What painting the last of some layers over the others does to an image."""
 

@@ -54,8 +54,12 @@ class PointGrid(Phantom):
         concentration = self.point_activity / (4e-3 / 3 * math.pi * radius**3)  # mm^3 to mL
         return [
             Sphere(
-                radius=radius, activity=concentration, name="point " + " ".join(map(str, index)),
-                position=[(i - (n - 1) / 2) * step for i, n, step in zip(index, self.counts, self.spacing, strict=True)],
+                radius=radius,
+                activity=concentration,
+                name="point " + " ".join(map(str, index)),
+                position=[
+                    (i - (n - 1) / 2) * step for i, n, step in zip(index, self.counts, self.spacing, strict=True)
+                ],
             )
             for index in itertools.product(*map(range, self.counts))
-        ]  # fmt: skip
+        ]

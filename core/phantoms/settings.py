@@ -36,7 +36,8 @@ def check_settings(phantom: Any, title: str) -> None:
     InputError
         A setting is not as many finite numbers as its default, or too small.
     """
-    for field in dataclasses.fields(phantom):
+    fields: tuple[Any, ...] = dataclasses.fields(phantom)
+    for field in fields:
         if "unit" not in field.metadata:
             continue
         name = f"{title}: {field.name.replace('_', ' ')}"

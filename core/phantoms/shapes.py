@@ -9,10 +9,10 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from ..checks import positive, real_array
 from ..errors import InputError
@@ -21,6 +21,8 @@ from .surfaces import Surface, clipped, lathe
 
 Real = NDArray[np.floating]
 Points = NDArray[np.float64]
+Vector = Any
+"""Numbers: given as any sequence, kept as a tuple of floats (typed Any: mypy cannot say how many)."""
 
 MODES = ("paint", "add")
 # Lines each way through a shape that is cut: its volume is then right to about 1e-5, or surely seen.
@@ -56,13 +58,13 @@ class Shape:
         A number is not finite or out of range, or the shape holds nothing.
     """
 
-    position: ArrayLike = (0.0, 0.0, 0.0)
-    euler: ArrayLike = (0.0, 0.0, 0.0)
-    axis: ArrayLike | None = None
+    position: Vector = (0.0, 0.0, 0.0)
+    euler: Vector = (0.0, 0.0, 0.0)
+    axis: Vector | None = None
     activity: float | None = None
     mu: float | None = None
     mode: str = "paint"
-    cut: ArrayLike = ()
+    cut: Vector = ()
     name: str = ""
 
     KIND: ClassVar[str] = ""
@@ -72,7 +74,7 @@ class Shape:
         self._set("euler", _numbers(self.euler, "euler", 3))
         if self.axis is not None:
             axis = np.array(_numbers(self.axis, "axis", 3))
-            if any(self.euler):  # type: ignore[arg-type]
+            if any(self.euler):
                 raise InputError("axis: expected either an axis or Euler angles, got both")
             if not axis.any():
                 raise InputError("axis: expected a direction, got 0 0 0")
@@ -104,9 +106,9 @@ class Shape:
     @property
     def pose(self) -> Points:
         """Phantom-from-shape (4, 4), mm."""
-        phi, theta, psi = self.euler  # type: ignore[misc]
+        phi, theta, psi = self.euler
         if self.axis is not None:
-            x, y, z = self.axis  # type: ignore[misc]
+            x, y, z = self.axis
             phi, theta = math.atan2(y, x), math.atan2(math.hypot(x, y), z)
         return euler_pose(phi, theta, psi, self.position)
 
@@ -116,7 +118,7 @@ class Shape:
         Negative inside, and nowhere larger in magnitude than the true distance; of the points' type.
         """
         distance = self._distance(points)
-        for *normal, offset in self.cut:  # type: ignore[union-attr]
+        for *normal, offset in self.cut:
             n_x, n_y, n_z = (points.dtype.type(component) for component in normal)
             plane = n_x * points[0] + n_y * points[1] + n_z * points[2] - points.dtype.type(offset)
             distance = np.maximum(distance, plane)
@@ -128,7 +130,7 @@ class Shape:
         Each (m, N), of m disjoint parts (one where the shape is convex); from ``>=`` to where a line misses the part.
         """
         enter, leave = self._intervals(starts, directions)
-        for *normal, offset in self.cut:  # type: ignore[union-attr]
+        for *normal, offset in self.cut:
             first, last = _below(np.array(normal) @ starts - offset, np.array(normal) @ directions)
             enter, leave = np.maximum(enter, first), np.minimum(leave, last)
         return enter, leave
@@ -168,7 +170,7 @@ class Shape:
     def surface(self) -> Surface:
         """A closed mesh in the shape's frame: vertices (V, 3), mm, and triangles (F, 3), counter-clockwise from outside."""
         surface = self._surface()
-        for *normal, offset in self.cut:  # type: ignore[union-attr]
+        for *normal, offset in self.cut:
             surface = clipped(surface, np.array(normal), offset)
         return surface
 
@@ -203,7 +205,7 @@ class Ellipsoid(Shape):
         Half axes along x, y, z, mm.
     """
 
-    radii: ArrayLike
+    radii: Vector
 
     KIND = "ellipsoid"
 
@@ -224,7 +226,7 @@ class Ellipsoid(Shape):
     @property
     def half_box(self) -> tuple[float, float, float]:
         """Half the sides, mm."""
-        return self.radii  # type: ignore[return-value]
+        return self.radii
 
     @property
     def ball_radius(self) -> float:
@@ -248,7 +250,7 @@ class Sphere(Ellipsoid):
     """
 
     radius: float
-    radii: ArrayLike = field(init=False)
+    radii: Vector = field(init=False)
 
     KIND = "sphere"
 
@@ -269,7 +271,7 @@ class Cylinder(Shape):
         mm.
     """
 
-    radius: ArrayLike
+    radius: Vector
     height: float
 
     KIND = "cylinder"
@@ -469,7 +471,7 @@ class Box(Shape):
         Sides along x, y, z, mm.
     """
 
-    size: ArrayLike
+    size: Vector
 
     KIND = "box"
 
@@ -491,7 +493,7 @@ class Box(Shape):
     @property
     def half_box(self) -> tuple[float, float, float]:
         """Half the sides, mm."""
-        a, b, c = self.size  # type: ignore[misc]
+        a, b, c = self.size
         return a / 2, b / 2, c / 2
 
     @property
@@ -565,23 +567,21 @@ def _ellipse_distance(points: Real, radii: tuple[float, ...]) -> Real:
     return np.where(left > 0, -inside, outside)
 
 
-def _numbers(value: ArrayLike, name: str, count: int) -> tuple[float, ...]:
+def _numbers(value: Vector, name: str, count: int) -> tuple[float, ...]:
     return tuple(real_array(value, name, (count,)).tolist())
 
 
-def _positive_numbers(value: ArrayLike, name: str, count: int) -> tuple[float, ...]:
+def _positive_numbers(value: Vector, name: str, count: int) -> tuple[float, ...]:
     numbers = _numbers(value, name, count)
     for number in numbers:
         positive(number, name, "mm")
     return numbers
 
 
-def _radius(value: ArrayLike, name: str) -> float | tuple[float, ...]:
-    return positive(value, name, "mm") if np.ndim(value) == 0 else _positive_numbers(value, name, 2)  # type: ignore[arg-type]
+def _radius(value: Vector, name: str) -> float | tuple[float, ...]:
+    return positive(value, name, "mm") if np.ndim(value) == 0 else _positive_numbers(value, name, 2)
 
 
-def _pair(radius: ArrayLike) -> tuple[float, float]:
+def _pair(radius: Vector) -> tuple[float, float]:
     a, b = np.broadcast_to(np.asarray(radius, np.float64), 2).tolist()
     return a, b
-
-

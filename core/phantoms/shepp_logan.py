@@ -68,9 +68,13 @@ class SheppLogan(Phantom):
         """The ellipsoids, in the table's order."""
         return [
             Ellipsoid(
-                radii=[self.half_size * r for r in radii], position=[self.half_size * c for c in centre],
-                euler=(math.radians(turn), 0.0, 0.0), mode="add", name=f"ellipsoid {i}",
-                activity=self.activity * (modified if self.contrast == "modified" else density), mu=self.mu * density,
+                radii=[self.half_size * r for r in radii],
+                position=[self.half_size * c for c in centre],
+                euler=(math.radians(turn), 0.0, 0.0),
+                mode="add",
+                name=f"ellipsoid {i}",
+                activity=self.activity * (modified if self.contrast == "modified" else density),
+                mu=self.mu * density,
             )
             for i, (radii, centre, turn, density, modified) in enumerate(_ELLIPSOIDS, 1)
-        ]  # fmt: skip
+        ]

@@ -7,6 +7,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -36,13 +37,13 @@ class CardiacTorso(Phantom):
     its 75 mm.
 
     Lungs, liver, spine and the direction of the heart's axis follow the mathematical adult of M. Cristy and K. F.
-    Eckerman, ORNL/TM-8381 (1987); its body of 400 x 200 mm holds the arms, so that here an ellipse of 330 x 230 mm stands
-    for a chest with the arms up, the liver is 150 and not 165 mm wide to the right, and the spine lies 15 mm further back. The
-    left ventricle is half an ellipsoid inside another, of 120 mL at end-diastole and 45 mL at end-systole with walls of
-    9.5 mm (within the normal ranges of R. M. Lang et al., J Am Soc Echocardiogr 28 (2015) 1-39): 133 g of muscle, whose
-    volume stays when it contracts, the apex where it is. The volume falls along half a cosine for 35 % of the cycle and
-    rises along another. The right ventricle's cavity shrinks with the left's. Ribs, arms, breasts and other organs are left
-    out.
+    Eckerman, ORNL/TM-8381 (1987). Its body of 400 x 200 mm holds the arms: here an ellipse of 330 x 230 mm stands for a
+    chest with the arms up, the liver reaches 150 and not 165 mm to the right, and the spine lies 15 mm further back.
+    The left ventricle is half an ellipsoid inside another, of 120 mL at end-diastole and 45 mL at end-systole with walls
+    of 9.5 mm (within the normal ranges of R. M. Lang et al., J Am Soc Echocardiogr 28 (2015) 1-39): 133 g of muscle,
+    whose volume stays when it contracts, as does the apex's place. The volume falls along half a cosine for 35 % of the
+    cycle and rises along another. The right ventricle's cavity shrinks with the left's. Ribs, arms, breasts and other
+    organs are left out.
 
     Activities are choices for rest, an hour after 1 GBq: 1.2 % of it in the heart (sestamibi's prescribing information)
     make about 90 kBq/mL in 133 g; the other organs are set to ratios as seen in clinical images.
@@ -96,10 +97,15 @@ class CardiacTorso(Phantom):
     def __post_init__(self) -> None:
         super().__post_init__()
         for name, most in (
-            ("phase", 1.0), ("shortening", 0.9), ("defect_severity", 1.0), ("defect_width_degrees", 360.0),
-            ("defect_to", 1.0), ("defect_transmural", 1.0), ("end_systolic_volume", self.end_diastolic_volume),
+            ("phase", 1.0),
+            ("shortening", 0.9),
+            ("defect_severity", 1.0),
+            ("defect_width_degrees", 360.0),
+            ("defect_to", 1.0),
+            ("defect_transmural", 1.0),
+            ("end_systolic_volume", self.end_diastolic_volume),
             ("defect_from", self.defect_to),
-        ):  # fmt: skip
+        ):
             value = getattr(self, name)
             if value > most or (value == most and name in ("phase", "defect_from")):
                 below = "less than" if name in ("phase", "defect_from") else "at most"
@@ -132,45 +138,65 @@ class CardiacTorso(Phantom):
         def at(x: float, y: float, z: float) -> tuple[float, float, float]:
             return x + _AXIS[0], y + _AXIS[1], z - _HEIGHT
 
-        tissue = {"mu": SOFT_TISSUE_MU}
+        tissue: dict[str, Any] = {"mu": SOFT_TISSUE_MU}
         lungs: list[Shape] = [
             Ellipsoid(
-                radii=(50, 75, 240), position=at(x, 0, 435), cut=[(0, 0, -1, 0)], activity=self.lung, mu=LUNG_MU,
+                radii=(50, 75, 240),
+                position=at(x, 0, 435),
+                cut=[(0, 0, -1, 0)],
+                activity=self.lung,
+                mu=LUNG_MU,
                 name=f"{side} lung",
             )
             for side, x in (("right", 85.0), ("left", -85.0))
-        ]  # fmt: skip
+        ]
         # Below the plane x/350 + y/450 - z/430 = -1, x and y to the left and back, here about z = 350.
         plane = np.array([-1 / 350, -1 / 450, -1 / 430])
         offset = (350 / 430 - 1) / float(np.linalg.norm(plane))
         return [
-            Cylinder(radius=self.body_radii, height=440, position=at(0, 0, 460), activity=self.body, name="body", **tissue),
+            Cylinder(
+                radius=self.body_radii, height=440, position=at(0, 0, 460), activity=self.body, name="body", **tissue
+            ),
             *lungs,
             Cylinder(
-                radius=(150, 80), height=160, position=at(0, 0, 350), cut=[(*plane, offset)], activity=self.liver,
-                name="liver", **tissue,
+                radius=(150, 80),
+                height=160,
+                position=at(0, 0, 350),
+                cut=[(*plane, offset)],
+                activity=self.liver,
+                name="liver",
+                **tissue,
             ),
             Cylinder(
                 radius=(20, 25), height=440, position=at(0, -70, 460), activity=self.body, mu=VERTEBRA_MU, name="spine"
             ),
-        ]  # fmt: skip
+        ]
 
     def _heart(self) -> list[Shape]:
         contraction, volume = self._contraction, self.ventricle_volume * 1e3
         full = self.end_diastolic_volume * 1e3
-        muscle = _half_ellipsoid(_radius(full, self.ventricle_length) + self.wall, self.ventricle_length + self.wall) - full
+        muscle = (
+            _half_ellipsoid(_radius(full, self.ventricle_length) + self.wall, self.ventricle_length + self.wall) - full
+        )
         length = self.ventricle_length * (1 - self.shortening * contraction)
         radius = _radius(volume, length)
         wall = _wall(radius, length, volume + muscle)
         # The apex stays; at end-diastole the origin is halfway between it and the base.
         base = (self.ventricle_length + self.wall) / 2 - length - wall
         beat = (volume / full) ** (1 / 3)
-        blood = {"activity": self.blood, "mu": SOFT_TISSUE_MU}
+        blood: dict[str, Any] = {"activity": self.blood, "mu": SOFT_TISSUE_MU}
         upper = (0, 0, -1, 0)
 
-        def cup(radii: tuple[float, float, float], name: str, right: float = 0.0, cut: Sequence = (), **holds: float) -> Shape:
+        def cup(
+            radii: tuple[float, float, float], name: str, right: float = 0.0, cut: Sequence = (), **holds: Any
+        ) -> Shape:
             return Ellipsoid(
-                radii=radii, position=_in_torso(-right, 0, base), euler=_euler_angles(), cut=[upper, *cut], name=name, **holds
+                radii=radii,
+                position=_in_torso(-right, 0, base),
+                euler=_euler_angles(),
+                cut=[upper, *cut],
+                name=name,
+                **holds,
             )
 
         right = (30.0 * beat, 36.0 * beat, 66.0 * beat)
@@ -186,13 +212,15 @@ class CardiacTorso(Phantom):
             ),
             *(
                 cup(
-                    (radius + self.defect_transmural * wall,) * 2 + (length + self.defect_transmural * wall,), "defect",
-                    cut=planes, activity=(1 - self.defect_severity) * self.myocardium,
+                    (radius + self.defect_transmural * wall,) * 2 + (length + self.defect_transmural * wall,),
+                    "defect",
+                    cut=planes,
+                    activity=(1 - self.defect_severity) * self.myocardium,
                 )
                 for planes in self._defect_planes(length + wall)
             ),
             cup((radius, radius, length), "left ventricle", **blood),
-        ]  # fmt: skip
+        ]
 
     def _defect_planes(self, length: float) -> list[list[tuple[float, float, float, float]]]:
         """Planes around each convex piece of the defect, in the heart's frame: two of them beyond half of the way around."""

@@ -96,7 +96,9 @@ def test_any_number_of_sectors(sectors):
 
 
 def test_rods_in_water():
-    phantom = mph.DerenzoPhantom(30, (6, 5, 4, 3.5, 3, 2.5), 24, 0, cylinder_radius=34, cylinder_height=30, background=7)
+    phantom = mph.DerenzoPhantom(
+        30, (6, 5, 4, 3.5, 3, 2.5), 24, 0, cylinder_radius=34, cylinder_height=30, background=7
+    )
     rods = np.pi / 4 * np.sum(phantom.rods()[:, 3] ** 2) * 24
     assert phantom.total_activity == pytest.approx(7e-3 * (np.pi * 34**2 * 30 - rods), rel=1e-3)
     _, x, y, _ = phantom.rods()[0]

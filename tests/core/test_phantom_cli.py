@@ -29,10 +29,16 @@ activity = 40
     ("kind", "phantom"),
     [
         (["nema", "--background", "2"], mph.NemaBody(background=2)),
-        (["jaszczak", "--rod-diameters", "5", "6", "7", "8", "9", "0"], mph.JaszczakPhantom(rod_diameters=(5, 6, 7, 8, 9, 0))),
+        (
+            ["jaszczak", "--rod-diameters", "5", "6", "7", "8", "9", "0"],
+            mph.JaszczakPhantom(rod_diameters=(5, 6, 7, 8, 9, 0)),
+        ),
         (["defrise", "--disks", "3", "--spacing-of-disks", "30"], mph.DefrisePhantom(3, spacing=30)),
         (["shepp-logan", "--contrast", "original"], mph.SheppLogan(contrast="original")),
-        (["points", "--counts", "1", "2", "3", "--spacing-of-points", "9", "8", "7"], mph.PointGrid((1, 2, 3), (9, 8, 7))),
+        (
+            ["points", "--counts", "1", "2", "3", "--spacing-of-points", "9", "8", "7"],
+            mph.PointGrid((1, 2, 3), (9, 8, 7)),
+        ),
         (["torso", "--phase", "0.35", "--defect-severity", "1"], mph.CardiacTorso(phase=0.35, defect_severity=1)),
         (
             ["derenzo", "--rods", "8", "5", "4", "--sectors", "3", "--water", "45", "50", "--background", "3"],
@@ -43,7 +49,10 @@ activity = 40
             mph.ShapePhantom([mph.Cylinder(radius=(30, 20), height=9, activity=100, mu=0)], "cylinder"),
         ),
         (["sphere", "--radius", "3"], mph.ShapePhantom([mph.Sphere(radius=3, activity=100, mu=0)], "sphere")),
-        (["ellipsoid", "--radii", "3", "4", "5"], mph.ShapePhantom([mph.Ellipsoid(radii=(3, 4, 5), activity=100, mu=0)])),
+        (
+            ["ellipsoid", "--radii", "3", "4", "5"],
+            mph.ShapePhantom([mph.Ellipsoid(radii=(3, 4, 5), activity=100, mu=0)]),
+        ),
         (["box", "--size", "3", "4", "5"], mph.ShapePhantom([mph.Box(size=(3, 4, 5), activity=100, mu=0)])),
     ],
     ids=lambda value: value[0] if isinstance(value, list) else "",
@@ -78,7 +87,19 @@ def test_random_instances_are_written_with_their_poses(tmp_path, capsys):
 def test_a_phantom_of_shapes_is_projected(workbook, tmp_path, capsys):
     path = tmp_path / "thorax.toml"
     path.write_text(THORAX)
-    words = ["project", str(workbook), "--phantom", str(path), "--voxels", "40", "--size", "12", "12", "--modules", "1-2"]
+    words = [
+        "project",
+        str(workbook),
+        "--phantom",
+        str(path),
+        "--voxels",
+        "40",
+        "--size",
+        "12",
+        "12",
+        "--modules",
+        "1-2",
+    ]
     assert main([*words, "-o", str(tmp_path / "run.npz")]) == 0
     run = mph.read_run(tmp_path / "run.npz")
     assert run.settings["volume"] == "thorax.toml" and run.settings["phantom"]["name"] == "thorax"

@@ -122,20 +122,17 @@ def _one(shape: Any, names: list[str], arguments: argparse.Namespace) -> Phantom
 
 def _add_settings(parser: argparse.ArgumentParser, kind: Any) -> None:
     """An option for every field of a kind of phantom."""
-    for field in dataclasses.fields(kind):
+    fields: tuple[Any, ...] = dataclasses.fields(kind)
+    for field in fields:
         many = isinstance(field.default, tuple)
-        default = list(field.default) if many else field.default
-        option: dict[str, Any] = {
-            "dest": _DEST + field.name,
-            "default": default,
-            "nargs": len(default) if many else None,
-        }
+        option: dict[str, Any] = {"dest": _DEST + field.name, "default": list(field.default) if many else field.default}
+        option["nargs"] = len(field.default) if many else None
         if "unit" in field.metadata:
             unit = field.metadata["unit"]
             metavar = {"mm": "MM", "kBq/mL": "kBq/mL", "1/mm": "1/mm", "kBq": "kBq", "mL": "mL", "DEG": "DEG"}.get(unit)
             text = field.metadata["text"] if metavar else f"share {unit}, {field.metadata['text']}"
             option |= {"type": float, "metavar": metavar or "SHARE", "help": text}
-        elif isinstance(default, str):
+        elif isinstance(field.default, str):
             option |= {"choices": CONTRASTS, "help": "of the activity"}
         else:
             option |= {"type": int, "metavar": "N", "help": "how many along x y z" if many else "how many"}

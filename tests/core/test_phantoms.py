@@ -11,8 +11,9 @@ import trimesh
 import mphdrr.core as mph
 from mphdrr.core.progress import Cancelled
 
-from .conftest import general_grid
+from .conftest import WORKBOOK, general_grid
 
+EXAMPLES = WORKBOOK.parent / "phantoms"
 CUT = [(1, 0.3, 0.2, 1.5), (0, -1, 0.5, 2)]
 SHAPES = [
     mph.Sphere(radius=7, activity=1),
@@ -232,6 +233,13 @@ def test_names_of_any_letters_survive_as_text(tmp_path):
     shape = mph.Sphere(radius=1 / 3, activity=1e-9, name='a "b" \\ \n\x7f\x00 µ 😀')
     mph.write_phantom(mph.ShapePhantom([shape], name="é"), tmp_path / "a.toml")
     assert mph.read_phantom(tmp_path / "a.toml").shapes == (shape,)
+
+
+@pytest.mark.parametrize("path", sorted(EXAMPLES.glob("*.toml")), ids=lambda path: path.stem)
+def test_the_examples_are_phantoms(path):
+    phantom = mph.read_phantom(path)
+    assert phantom.total_activity > 0 and phantom.name
+    assert len(phantom.shapes) == path.read_text().count("[[shape]]")
 
 
 @pytest.mark.parametrize(

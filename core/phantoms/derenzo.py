@@ -94,6 +94,11 @@ class DerenzoRods(Shape):
         return float(np.sum(np.pi / 4 * self.rods[:, 3] ** 2) * self.height)
 
     @property
+    def n_parts(self) -> int:
+        """How many times at most a line may enter the shape: once for each rod."""
+        return len(self.rods)
+
+    @property
     def finest(self) -> float:
         """Size, mm, of the smallest part."""
         return min(float(self.rods[:, 3].min()), self.height)

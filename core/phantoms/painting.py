@@ -28,14 +28,16 @@ Floats = NDArray[np.float32]
 # Points of one call of a shape's `distance`: small enough that its temporaries stay in the processor's cache.
 _BLOCK = 1 << 15
 _MIN_SAMPLES, _MAX_SAMPLES = 128, 1 << 13  # of a voxel that a surface cuts
-_STRETCHES = 32  # of the sequence: voxels take turns, so that their errors differ and cancel
+_SEQUENCE = 1 << 16  # points of which voxels take stretches by turns, so that their errors differ and cancel
+# Over what is not uniform, few voxels get more samples: so many altogether.
+_SAMPLES_OF_MIXED = 1 << 21
 # In boxes of up to so many voxels a shape's samples are weighed so that they make up exactly its volume.
 _WEIGHED = 1 << 22
 # Shapes whose smallest part is below a voxel, and that touch `_FEW` or fewer, are sampled in their own box.
 _FEW = 1 << 11
 _SAMPLES_OF_FEW = 1 << 10  # per voxel
 _SAMPLES_BENEATH = 1 << 18
-_RAYS = 1 << 14  # at a time
+_RAYS, _PARTS = 1 << 14, 256  # at a time; fewer rays where a shape has more parts
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,19 +81,22 @@ class Layer:
         return 1 if distance < -reach else -1 if distance > reach else 0
 
 
-def _seen_beneath(layers: Sequence[Layer]) -> list[Layer]:
-    """Those of the lower layers that may show in the last one's shape, if that replaces what is beneath it."""
-    *lower, layer = layers
-    seen: list[Layer] = []
-    if layer.adds:
-        return seen
-    for other in lower:
-        relation = other.relation(layer)
-        if relation == 1 and not other.adds:
-            seen = []
-        if relation >= 0:
-            seen.append(other)
-    return seen
+def _seen_beneath(layers: Sequence[Layer]) -> list[list[Layer]]:
+    """For each layer, those below it that may show in its shape, if it replaces what is beneath it."""
+    centers = np.array([layer.pose[:3, 3] for layer in layers]).reshape(-1, 3)
+    radii = np.array([layer.shape.ball_radius * np.linalg.norm(layer.pose[:3, :3], 2) for layer in layers])
+    result = []
+    for i, layer in enumerate(layers):
+        near = np.linalg.norm(centers[:i] - centers[i], axis=1) < radii[:i] + radii[i]
+        seen: list[Layer] = []
+        for j in np.flatnonzero(near) if not layer.adds else ():
+            relation = layers[j].relation(layer)
+            if relation == 1 and not layers[j].adds:
+                seen = []
+            if relation >= 0:
+                seen.append(layers[j])
+        result.append(seen)
+    return result
 
 
 def values_at(layers: Sequence[Layer], points: Points) -> Points:
@@ -106,10 +111,9 @@ def values_at(layers: Sequence[Layer], points: Points) -> Points:
 def integral(layers: Sequence[Layer]) -> float:
     """Value times mm^3 of the whole painting."""
     total = 0.0
-    for i, layer in enumerate(layers):
+    for layer, beneath in zip(layers, _seen_beneath(layers), strict=True):
         volume = layer.shape.volume * abs(float(np.linalg.det(layer.pose[:3, :3])))
         total += volume * layer.value
-        beneath = _seen_beneath(layers[: i + 1])
         if len(beneath) == 1 and beneath[0].relation(layer) == 1:
             total -= volume * beneath[0].value
         elif beneath:
@@ -145,7 +149,7 @@ def paint_voxels(grid: Grid, layers: Sequence[Layer], progress: Progress | None 
     """
     require(4.2 * grid.n_voxels, "a volume of {} x {} x {} voxels".format(*grid.shape))
     image = np.zeros(grid.shape, np.float32)
-    strokes = [_Stroke(grid, layers[: i + 1]) for i in range(len(layers))]
+    strokes = [_Stroke(grid, layer, beneath) for layer, beneath in zip(layers, _seen_beneath(layers), strict=True)]
     total, done = sum(stroke.steps for stroke in strokes), 0
     with ThreadPoolExecutor(os.cpu_count()) as pool:
         for stroke in strokes:
@@ -168,8 +172,9 @@ def paint_voxels(grid: Grid, layers: Sequence[Layer], progress: Progress | None 
 def line_integrals(layers: Sequence[Layer], starts: Points, ends: Points) -> Points:
     """Integrals (N,) of the painting, value x mm, along the lines from `starts` to `ends`, (N, 3) world mm: exact."""
     result = np.empty(len(starts))
-    for first in range(0, len(starts), _RAYS):
-        block = slice(first, first + _RAYS)
+    step = max(1, _RAYS * _PARTS // max(_PARTS, *(layer.shape.n_parts for layer in layers), 1))
+    for first in range(0, len(starts), step):
+        block = slice(first, first + step)
         result[block] = _integrals_of_block(layers, starts[block].T, ends[block].T)
     return result
 
@@ -220,12 +225,10 @@ def _next_power_of_2(counts: NDArray[np.int64]) -> NDArray[np.int64]:
 
 
 class _Stroke:
-    """What painting the last of some layers over the others does to an image."""
+    """What painting a layer over those beneath it does to an image."""
 
-    def __init__(self, grid: Grid, layers: Sequence[Layer]) -> None:
-        self.grid = grid
-        self.layer = layers[-1]
-        self.beneath = _seen_beneath(layers)
+    def __init__(self, grid: Grid, layer: Layer, beneath: Sequence[Layer]) -> None:
+        self.grid, self.layer, self.beneath = grid, layer, beneath
         shape_from_index = self.layer.from_world @ grid.affine
         shape = self.layer.shape
         low, high = _index_box(shape_from_index, shape)
@@ -237,6 +240,8 @@ class _Stroke:
         self.touched = float(np.prod(2 * np.array(shape.half_box) / self.edge + 1))
         self.is_small = shape.finest < self.edge and self.touched < _FEW
         inside = bool(np.all(low >= -0.5) and np.all(high <= np.array(grid.shape) - 0.5))
+        # Whether it matters which part of the shape a voxel holds.
+        self.is_mixed = bool(beneath) and not (len(beneath) == 1 and beneath[0].relation(layer) == 1)
         self.is_weighed = inside and bool(np.prod(self.stop - self.start) <= _WEIGHED)
 
     @property
@@ -254,7 +259,7 @@ class _Stroke:
 
     @property
     def _n_points(self) -> int:
-        return int(_SAMPLES_OF_FEW * max(self.touched, 8))
+        return int(_SAMPLES_OF_FEW * max(self.touched, 8)) * (8 if self.is_mixed else 1)
 
     def _paint_small(self, image: Floats, pool: ThreadPoolExecutor) -> Iterator[None]:
         """Points of the shape, each weighing an equal share of its volume, into the voxels that they fall in."""
@@ -280,7 +285,8 @@ class _Stroke:
         rows, columns = map(slice, self.start[1:], self.stop[1:])
         iy, iz = np.mgrid[rows, columns]
         n_samples = self._n_samples
-        offsets = (r3_sequence(_STRETCHES * n_samples) - 0.5).reshape(3, _STRETCHES, n_samples)
+        stretches = max(1, _SEQUENCE // n_samples)
+        offsets = (r3_sequence(stretches * n_samples) - 0.5).reshape(3, stretches, n_samples)
         own, *lower = (_Sampled(layer, self.grid, offsets) for layer in (self.layer, *self.beneath))
 
         def fill(ix: int) -> tuple[int, NDArray[np.int64], Floats, Floats]:
@@ -318,6 +324,8 @@ class _Stroke:
     def _n_samples(self) -> int:
         shape = self.layer.shape
         for_each = 4 * _MIN_SAMPLES * self.edge / shape.finest
+        if self.is_mixed:
+            for_each = max(for_each, _SAMPLES_OF_MIXED / self.touched)
         # Where samples are not weighed: the error of a cut voxel is about n^(-2/3) / 2 of its volume h^3. With a surface
         # below 6 V / s, s being the smallest part, some 9 V / (s h^2) voxels are cut, whose errors add up at random: so
         # many samples keep their sum below 1/5000 of V.
@@ -346,8 +354,8 @@ class _Sampled:
 
     def inside(self, index: NDArray[np.int64]) -> NDArray[np.bool_]:
         """Which points of voxels (3, n) are inside, (n, samples)."""
-        # Odd numbers: along each axis the voxels go through all stretches.
-        stretch = (np.array([1, 5, 11]) @ index) % _STRETCHES
+        # Along each axis the voxels go through all stretches, whose number these primes seldom divide.
+        stretch = (np.array([1, 53, 211]) @ index) % self._offsets.shape[1]
         points = self._centers(index)[:, :, None] + self._offsets[:, stretch]
         return (self.layer.shape.distance(points.reshape(3, -1)) < 0).reshape(points.shape[1:])
 

@@ -14,7 +14,7 @@ from .phantom import Phantom
 from .settings import setting
 from .shapes import Shape, Sphere
 
-_MOST = 100_000
+_MOST = 10_000
 
 
 @dataclass(frozen=True)

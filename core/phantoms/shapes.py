@@ -153,6 +153,11 @@ class Shape:
         return float(np.maximum(leave - enter, 0.0).sum() / len(u) * width * depth * c)
 
     @property
+    def n_parts(self) -> int:
+        """How many times at most a line may enter the shape."""
+        return 1
+
+    @property
     def finest(self) -> float:
         """Size, mm, of the smallest part."""
         return min(2 * min(self.half_box), self.volume ** (1 / 3))

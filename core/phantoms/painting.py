@@ -6,6 +6,7 @@ layers of the mean of that change, and each layer can be sampled as finely as it
 
 from __future__ import annotations
 
+import math
 import os
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -29,13 +30,14 @@ Floats = NDArray[np.float32]
 _BLOCK = 1 << 15
 _MIN_SAMPLES, _MAX_SAMPLES = 128, 1 << 13  # of a voxel that a surface cuts
 _SEQUENCE = 1 << 16  # points of which voxels take stretches by turns, so that their errors differ and cancel
-# Over what is not uniform, few voxels get more samples: so many altogether.
+# Over what is not uniform, few voxels get more samples: about so many altogether.
 _SAMPLES_OF_MIXED = 1 << 21
 # In boxes of up to so many voxels a shape's samples are weighed so that they make up exactly its volume.
 _WEIGHED = 1 << 22
 # Shapes whose smallest part is below a voxel, and that touch `_FEW` or fewer, are sampled in their own box.
 _FEW = 1 << 11
 _SAMPLES_OF_FEW = 1 << 10  # per voxel
+_BOX_BLOCK = 1 << 13  # of them at a time
 _SAMPLES_BENEATH = 1 << 18
 _RAYS, _PARTS = 1 << 14, 256  # at a time; fewer rays where a shape has more parts
 
@@ -124,7 +126,8 @@ def integral(layers: Sequence[Layer]) -> float:
 def _mean_inside(layer: Layer, beneath: Sequence[Layer]) -> float:
     """The mean of what is painted beneath a layer's shape: exact where it is uniform."""
     total, hits = 0.0, 0
-    for points in _boxed(layer.shape, _SAMPLES_BENEATH):
+    for first in range(0, _SAMPLES_BENEATH, _BOX_BLOCK):
+        points = _box_points(layer.shape, first)
         inside = points[:, layer.shape.distance(points) < 0]
         total += float(values_at(beneath, _moved(layer.pose, inside)).sum())
         hits += inside.shape[1]
@@ -249,7 +252,7 @@ class _Stroke:
         """How many times `paint` yields."""
         if np.any(self.stop <= self.start):
             return 0
-        return -(-self._n_points // _BLOCK) if self.is_small else int(self.stop[0] - self.start[0])
+        return self._n_blocks if self.is_small else int(self.stop[0] - self.start[0])
 
     def paint(self, image: Floats, pool: ThreadPoolExecutor) -> Iterator[None]:
         """Change `image`, step by step."""
@@ -258,8 +261,12 @@ class _Stroke:
         return self._paint_small(image, pool) if self.is_small else self._paint_voxels(image, pool)
 
     @property
-    def _n_points(self) -> int:
-        return int(_SAMPLES_OF_FEW * max(self.touched, 8)) * (8 if self.is_mixed else 1)
+    def _n_blocks(self) -> int:
+        """Of points of a small shape."""
+        points = _SAMPLES_OF_FEW * max(self.touched, 8.0)
+        if self.is_mixed:
+            points = max(points, min(8 * points, _SAMPLES_OF_MIXED))
+        return math.ceil(points / _BOX_BLOCK)
 
     def _paint_small(self, image: Floats, pool: ThreadPoolExecutor) -> Iterator[None]:
         """Points of the shape, each weighing an equal share of its volume, into the voxels that they fall in."""
@@ -267,12 +274,13 @@ class _Stroke:
         total, hits = np.zeros(image[box].shape), 0
         index_from_shape = np.linalg.inv(self.grid.affine) @ self.layer.pose
 
-        def sample(points: Points) -> tuple[NDArray[np.int64], Points]:
+        def sample(block: int) -> tuple[NDArray[np.int64], Points]:
+            points = _box_points(self.layer.shape, block * _BOX_BLOCK)
             inside = points[:, self.layer.shape.distance(points) < 0]
             change = self.layer.value - values_at(self.beneath, _moved(self.layer.pose, inside))
             return np.rint(_moved(index_from_shape, inside)).astype(np.int64), change
 
-        for index, change in pool.map(sample, _boxed(self.layer.shape, self._n_points)):
+        for index, change in pool.map(sample, range(self._n_blocks)):
             hits += len(change)
             index -= self.start[:, None]
             held = np.all((index >= 0) & (index < np.array(total.shape)[:, None]), axis=0)
@@ -390,11 +398,9 @@ def _changes(
     return whole, cut, coverage, change
 
 
-def _boxed(shape: Shape, n: int) -> Iterator[Points]:
-    """`n` points (3, ...) in the box around a shape, in its frame, block by block."""
-    sides = 2 * np.array(shape.half_box)[:, None]
-    for first in range(0, n, _BLOCK):
-        yield (r3_sequence(min(_BLOCK, n - first), first) - 0.5) * sides
+def _box_points(shape: Shape, first: int) -> Points:
+    """A block of points (3, n), from number `first` on, that fill the box around a shape, in its frame."""
+    return (r3_sequence(_BOX_BLOCK, first) - 0.5) * (2 * np.array(shape.half_box)[:, None])
 
 
 def _moved(pose: Points, points: Points) -> Points:

@@ -18,6 +18,7 @@ from ..frames import checked_affine
 from ..grid import Grid
 from ..memory import require
 from ..progress import Progress
+from ..projector.tracing import points as as_points
 from ..views import Views
 from ..volume import Volume
 from .painting import Layer, integral, line_integrals, paint_voxels, values_at
@@ -147,10 +148,7 @@ class Phantom:
             The points' shapes do not fit, or a number is not finite; as of `voxelize`.
         """
         layers = self._layers(quantity, pose)
-        starts, ends = (
-            np.atleast_2d(real_array(points, name, (3,) if np.ndim(points) == 1 else (None, 3)))
-            for points, name in ((sources, "sources"), (targets, "targets"))
-        )
+        starts, ends = as_points(sources, "sources"), as_points(targets, "targets")
         if len(starts) != len(ends) and 1 not in (len(starts), len(ends)):
             raise InputError(f"line_integrals: {len(starts)} sources but {len(ends)} targets")
         starts, ends = np.broadcast_arrays(starts, ends)

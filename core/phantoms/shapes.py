@@ -93,7 +93,7 @@ class Shape:
             raise InputError("activity, mu: expected at least one of them")
         if not isinstance(self.name, str):
             raise InputError(f"name: expected a text, got {self.name!r}")
-        planes = real_array(self.cut, "cut", (None, 4)) if np.size(self.cut) else np.empty((0, 4))
+        planes = np.empty((0, 4)) if _is_empty(self.cut) else real_array(self.cut, "cut", (None, 4))
         lengths = np.linalg.norm(planes[:, :3], axis=1)
         if np.any(lengths == 0):
             raise InputError("cut: expected planes nx ny nz d, got one whose normal is 0 0 0")
@@ -584,7 +584,12 @@ def _positive_numbers(value: Vector, name: str, count: int) -> tuple[float, ...]
 
 
 def _radius(value: Vector, name: str) -> float | tuple[float, ...]:
-    return positive(value, name, "mm") if np.ndim(value) == 0 else _positive_numbers(value, name, 2)
+    many = isinstance(value, list | tuple | np.ndarray)
+    return _positive_numbers(value, name, 2) if many else positive(value, name, "mm")
+
+
+def _is_empty(value: Vector) -> bool:
+    return isinstance(value, list | tuple) and not value
 
 
 def _pair(radius: Vector) -> tuple[float, float]:

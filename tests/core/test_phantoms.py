@@ -124,6 +124,7 @@ def test_line_integrals_are_those_of_the_values(phantom, quantity, rng):
     parts = [phantom.line_integrals(*both, pose, quantity) for both in ((starts, middle), (middle, ends))]
     np.testing.assert_allclose(sum(parts), exact, rtol=1e-9, atol=1e-9 * exact.max())
     assert phantom.line_integrals(starts[0], ends, pose, quantity).shape == (n,)
+    assert phantom.line_integrals(starts[0], np.empty((0, 3)), pose, quantity).shape == (0,)
 
 
 @pytest.mark.parametrize(
@@ -325,6 +326,10 @@ def test_files_that_are_no_text_are_refused(tmp_path):
         (lambda: PAINTING.voxelize(mph.Grid.centered(4, 1), np.zeros((4, 4))), "phantom pose"),
         (lambda: PAINTING.line_integrals(np.zeros((2, 3)), np.zeros((3, 3))), "2 sources but 3 targets"),
         (lambda: PAINTING.line_integrals(np.zeros((2, 2)), np.zeros((2, 3))), "sources: expected shape"),
+        (lambda: PAINTING.line_integrals([[0, 0, 0], [0]], np.zeros((2, 3))), "sources: expected real numbers"),
+        (lambda: mph.Cylinder(radius=[[1], [2, 3]], height=1, mu=1), "radius: expected real numbers"),
+        (lambda: mph.Sphere(radius=1, mu=1, cut=[[1, 0, 0], [0]]), "cut: expected real numbers"),
+        (lambda: mph.random_pose(1, box=[[1], [2, 3]]), "box of random poses: expected real numbers"),
         (lambda: mph.random_pose("x"), "seed: expected a whole number"),
         (lambda: mph.random_pose(1, box=(1, -2, 3)), "box of random poses: expected 0 or more mm, got -2"),
     ],

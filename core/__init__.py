@@ -26,7 +26,17 @@ from .meshes.voxelization import voxelize_mesh
 from .mosaic import as_seen, mosaic
 from .noise import sample_counts
 from .performance import ModulePerformance, isocentre_performance, magnification, resolution, seen, sensitivity
-from .phantoms.derenzo import DerenzoPhantom
+from .phantoms.defrise import DefrisePhantom
+from .phantoms.derenzo import DerenzoPhantom, DerenzoRods
+from .phantoms.jaszczak import JaszczakPhantom
+from .phantoms.language import read_phantom, write_phantom
+from .phantoms.nema import NemaBody
+from .phantoms.phantom import Phantom, PhantomMesh, ShapePhantom
+from .phantoms.points import PointGrid
+from .phantoms.random import random_pose
+from .phantoms.shapes import Box, Capsule, Cone, Cylinder, Ellipsoid, Shape, Sphere
+from .phantoms.shepp_logan import SheppLogan
+from .phantoms.torso import CardiacTorso
 from .presets import c_arm_views, pinhole_views
 from .progress import Cancelled, Progress
 from .project import project_run
@@ -43,8 +53,16 @@ from .workbook import SystemSource, WrittenWorkbook, read_system, write_system
 
 __all__ = [
     "ISOTOPES",
+    "Box",
     "Cancelled",
+    "Capsule",
+    "CardiacTorso",
+    "Cone",
+    "Cylinder",
+    "DefrisePhantom",
     "DerenzoPhantom",
+    "DerenzoRods",
+    "Ellipsoid",
     "Emission",
     "GeometryReport",
     "Grid",
@@ -52,13 +70,22 @@ __all__ = [
     "InputWarning",
     "InverseSquareSum",
     "Isotope",
+    "JaszczakPhantom",
     "Mesh",
     "ModulePerformance",
+    "NemaBody",
+    "Phantom",
+    "PhantomMesh",
     "PinholeSystem",
+    "PointGrid",
     "Progress",
     "ProjectionRun",
     "Projector",
     "RingFit",
+    "Shape",
+    "ShapePhantom",
+    "SheppLogan",
+    "Sphere",
     "SystemSource",
     "Transmission",
     "Views",
@@ -88,8 +115,10 @@ __all__ = [
     "pinhole_views",
     "plate_rings",
     "project_run",
+    "random_pose",
     "read_geometry",
     "read_mesh",
+    "read_phantom",
     "read_run",
     "read_system",
     "read_volume",
@@ -109,6 +138,7 @@ __all__ = [
     "voxelize_mesh",
     "write_geometry",
     "write_mesh",
+    "write_phantom",
     "write_run",
     "write_system",
     "write_volume",

@@ -52,9 +52,22 @@ def add_command(subparsers, name: str, summary: str, example: str) -> argparse.A
 def add_phantom_options(parser: argparse.ArgumentParser) -> None:
     """Size, content and place of the Derenzo phantom, and the grid under it."""
     parser.add_argument("--radius", type=float, default=40.0, metavar="MM", help="radius of the phantom")
-    parser.add_argument("--rods", type=float, nargs=6, default=[8, 6, 5, 4, 3, 2], metavar="MM", help="rod diameters")
+    parser.add_argument("--rods", type=float, nargs="+", default=[8, 6, 5, 4, 3, 2], metavar="MM", help="rod diameters")
+    parser.add_argument("--sectors", type=int, default=6, metavar="N", help="of rods, each of one diameter")
     parser.add_argument("--height", type=float, default=40.0, metavar="MM", help="length of the rods")
-    parser.add_argument("--activity", type=float, default=100.0, metavar="kBq/mL", help="concentration in the rods")
+    parser.add_argument(
+        "--activity", type=float, default=100.0, metavar="kBq/mL", help="concentration in the rods; 0 for cold rods"
+    )
+    parser.add_argument(
+        "--water", type=float, nargs=2, default=[0, 0], metavar=("RADIUS", "HEIGHT"),
+        help="a cylinder of water around the rods, mm; without it, none",
+    )  # fmt: skip
+    parser.add_argument("--background", type=float, default=0.0, metavar="kBq/mL", help="concentration in the water")
+    add_placing_options(parser)
+
+
+def add_placing_options(parser: argparse.ArgumentParser) -> None:
+    """Place of a phantom, and the grid under it."""
     parser.add_argument(
         "--position", type=float, nargs=3, default=[0, 0, 0], metavar="MM", help="middle of the phantom, x y z"
     )

@@ -1,20 +1,56 @@
-"""``mphdrr phantom derenzo -o FILE``."""
+"""``mphdrr phantom KIND -o FILE``."""
 
 from __future__ import annotations
 
 import argparse
 import dataclasses
+import json
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ..checks import whole_shape
+from ..errors import InputError
 from ..frames import euler_pose
 from ..grid import Grid
+from ..phantoms.defrise import DefrisePhantom
 from ..phantoms.derenzo import DerenzoPhantom
-from ..volume import Volume
+from ..phantoms.jaszczak import JaszczakPhantom
+from ..phantoms.language import read_phantom, write_phantom
+from ..phantoms.nema import NemaBody
+from ..phantoms.phantom import QUANTITIES, Phantom, ShapePhantom
+from ..phantoms.points import PointGrid
+from ..phantoms.random import random_pose
+from ..phantoms.shapes import Box, Cylinder, Ellipsoid, Sphere
+from ..phantoms.shepp_logan import CONTRASTS, SheppLogan
+from ..phantoms.torso import CardiacTorso
+from ..volume import UNITS, Volume
 from ..volume_io import VOLUME_FORMATS, write_volume
-from .options import add_command, add_phantom_options, one_or_three, output_path, progress_bar
+from .options import add_command, add_phantom_options, add_placing_options, one_or_three, output_path, progress_bar
+
+_DEST = "of_phantom_"  # before a setting's name, for the voxels have a spacing too
+Make = Callable[[argparse.Namespace], Phantom]
+
+# Name, class, what it is, example options.
+_KINDS = (
+    ("nema", NemaBody, "the NEMA (IEC) body phantom: six spheres", "--sphere-activity 40 --voxels 200"),
+    ("jaszczak", JaszczakPhantom, "a Jaszczak phantom: rods and spheres", "--activity 50"),
+    ("defrise", DefrisePhantom, "a Defrise phantom: hot disks", "--disks 7 --spacing-of-disks 12"),
+    ("shepp-logan", SheppLogan, "the 3-D Shepp-Logan head", "--contrast original"),
+    ("points", PointGrid, "a grid of point sources", "--counts 3 3 3 --spacing-of-points 30 30 30"),
+    ("torso", CardiacTorso, "a cardiac torso", "--defect-severity 0.5 --defect-angle-degrees 90 --quantity activity"),
+)
+# Name, class, and of each dimension its name and how many numbers it takes; all mm.
+_SHAPES = (
+    ("cylinder", Cylinder, (("radius", "+"), ("height", None)), "--radius 100 --height 200 --activity 5 --mu 0.0154"),
+    ("sphere", Sphere, (("radius", None),), "--radius 20 --activity 40"),
+    ("ellipsoid", Ellipsoid, (("radii", 3),), "--radii 30 20 50 --activity 40"),
+    ("box", Box, (("size", 3),), "--size 30 20 50 --activity 40"),
+)
 
 
 def add_parser(subparsers) -> None:  # type: ignore[no-untyped-def]
@@ -28,29 +64,169 @@ def add_parser(subparsers) -> None:  # type: ignore[no-untyped-def]
         "mphdrr phantom derenzo --radius 40 --rods 8 6 5 4 3 2 --euler 30 0 0 -o derenzo.nii.gz",
     )
     add_phantom_options(derenzo)
-    derenzo.add_argument("-o", "--output", required=True, metavar="FILE", help=", ".join(VOLUME_FORMATS))
-    derenzo.set_defaults(run=_run)
+    _add_output(derenzo, _derenzo)
+    for name, kind, summary, example in _KINDS:
+        parser = add_command(kinds, name, f"make {summary}", f"mphdrr phantom {name} {example} -o {name}.nii.gz")
+        _add_settings(parser, kind)
+        add_placing_options(parser)
+        _add_output(parser, partial(_of_kind, kind))
+    for name, shape, dimensions, example in _SHAPES:
+        parser = add_command(kinds, name, f"make one {name}", f"mphdrr phantom {name} {example} -o {name}.nii.gz")
+        for dimension, count in dimensions:
+            parser.add_argument(f"--{dimension}", type=float, nargs=count, required=True, metavar="MM")
+        parser.add_argument("--activity", type=float, default=100.0, metavar="kBq/mL", help="concentration")
+        parser.add_argument("--mu", type=float, default=0.0, metavar="1/mm", help="attenuation coefficient")
+        add_placing_options(parser)
+        _add_output(parser, partial(_one, shape, [dimension for dimension, _ in dimensions]))
+    file = add_command(
+        kinds, "file", "make the phantom that a TOML file describes", "mphdrr phantom file thorax.toml -o thorax.nii.gz"
+    )
+    file.add_argument("file", metavar="TOML", help="shapes in the order of painting, see docs/phantoms.md")
+    add_placing_options(file)
+    _add_output(file, lambda arguments: read_phantom(arguments.file))
 
 
 def derenzo_volume(arguments: argparse.Namespace) -> tuple[Volume, dict[str, Any]]:
     """The phantom that the options of `add_phantom_options` describe, and what it was made from."""
-    phantom = DerenzoPhantom(arguments.radius, tuple(arguments.rods), arguments.height, arguments.activity)
-    voxels = whole_shape(one_or_three(arguments.voxels), "--voxels", 3)
-    spacing = one_or_three(arguments.spacing) if arguments.spacing else phantom.extent / max(1, min(voxels) - 2)
-    grid = Grid.centered(voxels, spacing, arguments.position)
+    phantom = _derenzo(arguments)
+    volume = phantom.voxelize(_grid(phantom, arguments), _pose(arguments), progress_bar("voxelizing"))
+    return volume, _recipe({"kind": "derenzo", **dataclasses.asdict(phantom)}, arguments)
+
+
+def file_volume(path: str, arguments: argparse.Namespace, quantity: str) -> tuple[Volume, dict[str, Any]]:
+    """The phantom of a TOML file at the place of `add_placing_options`, and what it was made from."""
+    phantom = read_phantom(path)
+    grid, pose = _grid(phantom, arguments), _pose(arguments)
+    volume = phantom.voxelize(grid, pose, progress_bar("voxelizing"), quantity=quantity)
+    return volume, _recipe({"kind": "file", "file": Path(path).name, "name": phantom.name}, arguments)
+
+
+def _recipe(phantom: dict[str, Any], arguments: argparse.Namespace) -> dict[str, Any]:
+    return {"phantom": phantom, "position_mm": list(arguments.position), "euler_degrees": list(arguments.euler)}
+
+
+def _derenzo(arguments: argparse.Namespace) -> DerenzoPhantom:
+    radius, height = arguments.water
+    return DerenzoPhantom(
+        arguments.radius, tuple(arguments.rods), arguments.height, arguments.activity, arguments.sectors,
+        cylinder_radius=radius, cylinder_height=height, background=arguments.background,
+    )  # fmt: skip
+
+
+def _one(shape: Any, names: list[str], arguments: argparse.Namespace) -> Phantom:
+    dimensions = {name: getattr(arguments, name) for name in names}
+    if isinstance(dimensions.get("radius"), list) and len(dimensions["radius"]) == 1:
+        (dimensions["radius"],) = dimensions["radius"]
+    return ShapePhantom([shape(**dimensions, activity=arguments.activity, mu=arguments.mu)], name=shape.KIND)
+
+
+def _add_settings(parser: argparse.ArgumentParser, kind: Any) -> None:
+    """An option for every field of a kind of phantom."""
+    fields: tuple[Any, ...] = dataclasses.fields(kind)
+    for field in fields:
+        many = isinstance(field.default, tuple)
+        option: dict[str, Any] = {"dest": _DEST + field.name, "default": list(field.default) if many else field.default}
+        option["nargs"] = len(field.default) if many else None
+        if "unit" in field.metadata:
+            unit = field.metadata["unit"]
+            metavar = {"mm": "MM", "kBq/mL": "kBq/mL", "1/mm": "1/mm", "kBq": "kBq", "mL": "mL", "DEG": "DEG"}.get(unit)
+            text = field.metadata["text"] if metavar else f"share {unit}, {field.metadata['text']}"
+            option |= {"type": float, "metavar": metavar or "SHARE", "help": text}
+        elif isinstance(field.default, str):
+            option |= {"choices": CONTRASTS, "help": "of the activity"}
+        else:
+            option |= {"type": int, "metavar": "N", "help": "how many along x y z" if many else "how many"}
+        parser.add_argument(_option_name(field.name, kind), **option)
+
+
+def _option_name(name: str, kind: Any) -> str:
+    # --spacing is the voxels'.
+    words = {(PointGrid, "spacing"): "spacing-of-points", (DefrisePhantom, "spacing"): "spacing-of-disks"}
+    return "--" + words.get((kind, name), name.replace("_", "-"))
+
+
+def _of_kind(kind: Any, arguments: argparse.Namespace) -> Phantom:
+    return kind(**{field.name: getattr(arguments, _DEST + field.name) for field in dataclasses.fields(kind)})
+
+
+def _add_output(parser: argparse.ArgumentParser, make: Make) -> None:
+    parser.add_argument("--quantity", choices=QUANTITIES, default="activity", help="what the voxels hold")
+    parser.add_argument("--random", type=int, metavar="SEED", help="draw position and Euler angles at random")
+    parser.add_argument(
+        "--box", type=float, nargs="+", default=[0], metavar="MM",
+        help="with --random: sides of the box around --position in which the middle is drawn",
+    )  # fmt: skip
+    parser.add_argument(
+        "--count", type=int, default=1, metavar="N", help="with --random: how many, as FILE-1, FILE-2 …"
+    )
+    parser.add_argument("--json", action="store_true", help="print what was written, with the poses, as JSON")
+    parser.add_argument(
+        "-o", "--output", required=True, metavar="FILE", help=f"{', '.join(VOLUME_FORMATS)}; .toml writes the shapes"
+    )
+    parser.set_defaults(run=_run, make=make)
+
+
+def _pose(arguments: argparse.Namespace) -> NDArray[np.float64]:
     phi, theta, psi = np.deg2rad(arguments.euler)
-    pose = euler_pose(phi, theta, psi, arguments.position)
-    recipe = {
-        "phantom": {"kind": "derenzo", **dataclasses.asdict(phantom)},
-        "position_mm": list(arguments.position),
-        "euler_degrees": list(arguments.euler),
-    }
-    return phantom.voxelize(grid, pose, progress_bar("voxelizing")), recipe
+    return euler_pose(phi, theta, psi, arguments.position)
+
+
+def _grid(phantom: Phantom, arguments: argparse.Namespace, room: float = 0.0) -> Grid:
+    """The grid asked for; the default spacing holds the phantom however it is turned, and `room`, mm, more."""
+    voxels = whole_shape(one_or_three(arguments.voxels), "--voxels", 3)
+    spacing = arguments.spacing
+    extent = phantom.extent + room
+    return Grid.centered(
+        voxels, one_or_three(spacing) if spacing else extent / max(1, min(voxels) - 2), arguments.position
+    )
 
 
 def _run(arguments: argparse.Namespace) -> None:
-    path = output_path(arguments.output, VOLUME_FORMATS)
-    volume, _ = derenzo_volume(arguments)
-    write_volume(volume, path)
-    total = volume.array.sum(dtype=np.float64) * volume.grid.voxel_volume * 1e-3
-    print(f"{path}: {' x '.join(map(str, volume.grid.shape))} voxels, {total:.4g} kBq in all")
+    path = output_path(arguments.output, (*VOLUME_FORMATS, ".toml"))
+    phantom = arguments.make(arguments)
+    if arguments.count < 1:
+        raise InputError(f"--count: expected at least 1, got {arguments.count}")
+    if arguments.random is None and (arguments.count > 1 or any(arguments.box)):
+        raise InputError("--count and --box need --random")
+    if path.suffix.lower() == ".toml":
+        if arguments.random is not None:
+            raise InputError(f"{path}: a random place is the voxels'; expected {', '.join(VOLUME_FORMATS)}")
+        write_phantom(phantom, path)
+        print(f"{path}: {len(phantom.shapes)} shapes, {phantom.total_activity:.4g} kBq in all")
+        return
+    box = one_or_three(arguments.box)
+    grid = _grid(phantom, arguments, room=max(box))
+    rng = None if arguments.random is None else np.random.default_rng(_seed(arguments.random))
+    written = []
+    for number in range(1, arguments.count + 1):
+        pose = _pose(arguments) if rng is None else random_pose(rng, box, arguments.position)
+        volume = phantom.voxelize(grid, pose, progress_bar("voxelizing"), quantity=arguments.quantity)
+        file = path if arguments.count == 1 else _numbered(path, number, arguments.count)
+        write_volume(volume, file)
+        held = _held(volume)
+        written.append({"file": str(file), "pose": pose.tolist(), "quantity": volume.quantity, **held})
+        if not arguments.json:
+            said = (
+                f"{held['total_kBq']:.4g} kBq in all" if "total_kBq" in held else f"mu up to {held['largest']:.4g} 1/mm"
+            )
+            print(f"{file}: {' x '.join(map(str, volume.grid.shape))} voxels, {said}")
+    if arguments.json:
+        print(json.dumps(written, indent=2))
+
+
+def _held(volume: Volume) -> dict[str, float]:
+    """The total of a volume of activity, the largest value of any other."""
+    if UNITS[volume.quantity] == "kBq/mL":
+        return {"total_kBq": float(volume.array.sum(dtype=np.float64) * volume.grid.voxel_volume * 1e-3)}
+    return {"largest": float(volume.array.max())}
+
+
+def _seed(seed: int) -> int:
+    if seed < 0:
+        raise InputError(f"--random: expected a seed of at least 0, got {seed}")
+    return seed
+
+
+def _numbered(path: Path, number: int, count: int) -> Path:
+    suffix = ".nii.gz" if path.name.lower().endswith(".nii.gz") else path.suffix
+    return path.with_name(f"{path.name[: -len(suffix)]}-{number:0{len(str(count))}}{path.name[-len(suffix) :]}")

@@ -31,7 +31,7 @@ from .options import (
     photon_energy,
     progress_bar,
 )
-from .phantom import derenzo_volume
+from .phantom import derenzo_volume, file_volume
 
 _EMISSION = [field.name for field in fields(Emission)]
 
@@ -41,15 +41,17 @@ def add_parser(subparsers) -> None:  # type: ignore[no-untyped-def]
     parser = add_command(
         subparsers,
         "project",
-        "project a volume, or a Derenzo phantom, into every module",
+        "project a volume, or a phantom, into every module",
         "mphdrr project scanner.xlsx --volume ct.nii.gz --size 250 250 -o run.h5\n"
         "example: mphdrr project scanner.xlsx --volume heart.nii.gz --mu ct-mu.nii.gz --emission --isotope Tc-99m "
         "--time 600 --aperture-points 7 --aperture-mu 3.6 --crystal-mu 0.404 --noise 1 -o counts.h5",
     )
     parser.add_argument("workbook", metavar="WORKBOOK", help="geometry workbook (.xlsx, .xlsm)")
-    parser.add_argument(
+    source = parser.add_mutually_exclusive_group()
+    source.add_argument(
         "--volume", metavar="FILE", help="volume or folder of a DICOM series; without it, a Derenzo phantom is made"
     )
+    source.add_argument("--phantom", metavar="FILE", help="a phantom's shapes (.toml), put on the grid given below")
     parser.add_argument(
         "--energy", metavar="KEV",
         help="CT numbers of --volume or --mu become attenuation (1/mm) at this energy, or at an isotope's strongest line",
@@ -70,7 +72,7 @@ def add_parser(subparsers) -> None:  # type: ignore[no-untyped-def]
     )  # fmt: skip
     models.add_argument("--noise", type=int, metavar="SEED", help="draw Poisson counts instead of their means")
     add_emission_options(parser)
-    add_phantom_options(parser.add_argument_group("Derenzo phantom, without --volume"))  # type: ignore[arg-type]
+    add_phantom_options(parser.add_argument_group("Derenzo phantom, without --volume, or place of --phantom"))  # type: ignore[arg-type]
     parser.add_argument("-o", "--output", required=True, metavar="FILE", help=", ".join(FORMATS))
     parser.add_argument("--mosaic", metavar="PNG", help="also write all images in one picture")
     parser.set_defaults(run=_run)
@@ -170,7 +172,10 @@ def _attenuation(path: str, energy: str | None) -> Volume:
 def _volumes(arguments: argparse.Namespace) -> tuple[Volume, Volume | None, dict[str, Any]]:
     """What is projected, what attenuates it, and what a phantom was made from."""
     recipe: dict[str, Any] = {}
-    if not arguments.volume:
+    if arguments.phantom:
+        quantity = "mu" if arguments.photons is not None else "activity"
+        volume, recipe = file_volume(arguments.phantom, arguments, quantity)
+    elif not arguments.volume:
         volume, recipe = derenzo_volume(arguments)
     elif arguments.emission:
         volume = read_volume(arguments.volume, "activity")
@@ -202,7 +207,7 @@ def _run(arguments: argparse.Namespace) -> None:
         backend=arguments.backend,
         threads=arguments.threads,
         settings={
-            "volume": Path(arguments.volume).name if arguments.volume else "Derenzo phantom",
+            "volume": Path(arguments.volume or arguments.phantom or "Derenzo phantom").name,
             **recipe,
             **({"mu_file": Path(arguments.mu).name} if hasattr(arguments, "mu") else {}),
             **({"ct_converted_at_kev": photon_energy(arguments.energy)} if arguments.energy is not None else {}),

@@ -1,0 +1,74 @@
+"""The Defrise phantom: hot disks across the axis, which show where data along the axis are missing."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+from ..checks import whole_shape
+from ..isotopes import WATER_MU
+from .phantom import Phantom
+from .settings import setting
+from .shapes import Cylinder, Shape
+
+
+@dataclass(frozen=True)
+class DefrisePhantom(Phantom):
+    """Hot disks in a cylinder of water, axis along z, centred on the origin.
+
+    After M. Defrise et al., "A solution to the long-object problem in helical cone-beam tomography", Physics in Medicine
+    and Biology 45 (2000) 623-643, and the disks used before that to test cone-beam reconstruction. By default it fills
+    a ball of 75 mm radius.
+
+    Attributes
+    ----------
+    disks : int
+        How many.
+    disk_radius, disk_thickness, spacing : float
+        mm; the spacing is from middle to middle.
+    margin : float
+        Of water around the disks, mm; 0 for disks alone.
+    activity, background : float
+        Of the disks and of the water, kBq/mL.
+    mu : float
+        Of all of it, 1/mm.
+    """
+
+    disks: int = 7
+    disk_radius: float = setting(50.0, "mm", "of the disks")
+    disk_thickness: float = setting(8.0, "mm", "of the disks")
+    spacing: float = setting(16.0, "mm", "from disk to disk, middle to middle")
+    margin: float = setting(5.0, "mm", "of water around the disks; 0 for none", 0.0)
+    activity: float = setting(100.0, "kBq/mL", "of the disks", 0.0)
+    background: float = setting(0.0, "kBq/mL", "of the water", 0.0)
+    mu: float = setting(WATER_MU, "1/mm", "of all of it", 0.0)
+
+    title = "Defrise phantom"
+
+    def __post_init__(self) -> None:
+        (count,) = whole_shape([self.disks], "Defrise phantom: disks", 1)
+        object.__setattr__(self, "disks", count)
+        super().__post_init__()
+
+    @cached_property
+    def shapes(self) -> Sequence[Shape]:
+        """Water, if there is any, and the disks from -z to +z."""
+        height = (self.disks - 1) * self.spacing + self.disk_thickness
+        shapes: list[Shape] = []
+        if self.margin:
+            radius, height = self.disk_radius + self.margin, height + 2 * self.margin
+            shapes.append(Cylinder(radius=radius, height=height, activity=self.background, mu=self.mu, name="water"))
+        for i in range(self.disks):
+            z = (i - (self.disks - 1) / 2) * self.spacing
+            shapes.append(
+                Cylinder(
+                    radius=self.disk_radius,
+                    height=self.disk_thickness,
+                    position=(0, 0, z),
+                    activity=self.activity,
+                    mu=self.mu,
+                    name=f"disk {i + 1}",
+                )
+            )
+        return shapes

@@ -1,0 +1,92 @@
+"""The Jaszczak phantom: rods and spheres, cold as a rule, in a cylinder of active water."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+from ..isotopes import WATER_MU
+from .derenzo import DerenzoRods
+from .materials import PMMA_MU
+from .phantom import Phantom
+from .settings import setting
+from .shapes import Cylinder, Shape, Sphere
+
+
+@dataclass(frozen=True)
+class JaszczakPhantom(Phantom):
+    """The Jaszczak phantom (Deluxe, model ECT/DLX/P), axis along z, the origin in the middle of the cylinder.
+
+    Dimensions as in Data Spectrum's data sheet: the cylinder's inside is 216 mm wide and 186 mm high; rods 88 mm high of
+    4.8, 6.4, 7.9, 9.5, 11.1, 12.7 mm in six sectors, their centres two diameters apart; spheres of 9.5, 12.7, 15.9, 19.1,
+    25.4, 31.8 mm with their centres 127 mm above the base. The rods stand on the base (-z) in the pattern of `DerenzoRods`.
+    The data sheet does not say how far the spheres are from the axis: half the radius here, 60 degrees apart, from -y on
+    counter-clockwise.
+
+    Attributes
+    ----------
+    radius, height : float
+        Of the cylinder, inside, mm.
+    rod_diameters, sphere_diameters : (6,)
+        mm; 0 leaves a sector or a sphere out.
+    rod_height, sphere_height : float
+        Length of the rods, and of the spheres' centres above the base, mm.
+    sphere_ring_radius : float
+        Of the spheres' centres from the axis, mm.
+    activity : float
+        Of the water, kBq/mL.
+    rod_activity, sphere_activity : float
+        kBq/mL; 0 for cold ones.
+    mu : float
+        Of the water, 1/mm. Cold rods and spheres are of PMMA, others of water.
+    """
+
+    radius: float = setting(108.0, "mm", "of the cylinder, inside")
+    height: float = setting(186.0, "mm", "of the cylinder, inside")
+    rod_diameters: tuple[float, ...] = setting((4.8, 6.4, 7.9, 9.5, 11.1, 12.7), "mm", "by sector; 0 for none", 0.0)
+    rod_height: float = setting(88.0, "mm", "length of the rods")
+    sphere_diameters: tuple[float, ...] = setting((9.5, 12.7, 15.9, 19.1, 25.4, 31.8), "mm", "0 for none", 0.0)
+    sphere_height: float = setting(127.0, "mm", "of the spheres' centres above the base")
+    sphere_ring_radius: float = setting(54.0, "mm", "of the spheres' centres from the axis", 0.0)
+    activity: float = setting(50.0, "kBq/mL", "of the water", 0.0)
+    rod_activity: float = setting(0.0, "kBq/mL", "of the rods", 0.0)
+    sphere_activity: float = setting(0.0, "kBq/mL", "of the spheres", 0.0)
+    mu: float = setting(WATER_MU, "1/mm", "of the water", 0.0)
+
+    title = "Jaszczak phantom"
+
+    @cached_property
+    def shapes(self) -> Sequence[Shape]:
+        """Water, rods, spheres."""
+        base = -self.height / 2
+        shapes: list[Shape] = [
+            Cylinder(radius=self.radius, height=self.height, activity=self.activity, mu=self.mu, name="water")
+        ]
+        if any(self.rod_diameters):
+            shapes.append(
+                DerenzoRods(
+                    radius=self.radius,
+                    rod_diameters=self.rod_diameters,
+                    height=self.rod_height,
+                    position=(0, 0, base + self.rod_height / 2),
+                    name="rods",
+                    activity=self.rod_activity,
+                    mu=self.mu if self.rod_activity else PMMA_MU,
+                )
+            )
+        for i, diameter in enumerate(self.sphere_diameters):
+            if diameter:
+                angle = math.radians(-90.0 + 60.0 * i)
+                x, y = self.sphere_ring_radius * math.cos(angle), self.sphere_ring_radius * math.sin(angle)
+                shapes.append(
+                    Sphere(
+                        radius=diameter / 2,
+                        position=(x, y, base + self.sphere_height),
+                        name=f"sphere {diameter:g} mm",
+                        activity=self.sphere_activity,
+                        mu=self.mu if self.sphere_activity else PMMA_MU,
+                    )
+                )
+        return shapes

@@ -1,0 +1,244 @@
+"""Phantoms: what all of them can do, and those that are a list of shapes."""
+
+from __future__ import annotations
+
+import math
+import warnings
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from ..checks import freeze, positive, real_array
+from ..errors import InputError, InputWarning
+from ..frames import checked_affine
+from ..grid import Grid
+from ..memory import require
+from ..progress import Progress
+from ..projector.tracing import points as as_points
+from ..views import Views
+from ..volume import Volume
+from .painting import Layer, integral, line_integrals, paint_voxels, values_at
+from .settings import check_settings
+from .shapes import Shape
+
+QUANTITIES = ("activity", "mu")
+_HELD = 0.98  # of a phantom: with less of it on the grid, the user is told
+
+
+class PhantomMesh(NamedTuple):
+    """One shape of a phantom for the scene.
+
+    Attributes
+    ----------
+    name : str
+        Of the shape.
+    vertices : array (V, 3)
+        mm, in the phantom's frame.
+    faces : array (F, 3)
+        Triangles, counter-clockwise as seen from outside; the mesh is closed.
+    activity, mu : float or None
+        What the shape holds, kBq/mL and 1/mm.
+    """
+
+    name: str
+    vertices: NDArray[np.float64]
+    faces: NDArray[np.int32]
+    activity: float | None
+    mu: float | None
+
+
+class Phantom:
+    """What can be voxelised and seen along lines, exactly: shapes, painted one over the other.
+
+    Its frame has its origin at the phantom's middle; `pose` is world-from-phantom (4, 4), mm (default: where it is), any
+    invertible affine, see `euler_pose`. The `quantity` is ``"activity"`` (kBq/mL) or ``"mu"`` (1/mm, at `mu_energy`).
+    A kind of phantom says what its `shapes` are; all else follows.
+    """
+
+    mu_energy: float = 140.5
+    """Energy, keV, at which mu holds."""
+
+    @property
+    def shapes(self) -> Sequence[Shape]:
+        """What the phantom consists of, from bottom to top."""
+        raise NotImplementedError
+
+    title: str = "phantom"
+    """What to call it."""
+
+    def __post_init__(self) -> None:
+        check_settings(self, self.title)
+        try:
+            len(self.shapes)
+        except InputError as error:
+            raise InputError(f"{self.title}: {error}") from None
+
+    @property
+    def total_activity(self) -> float:
+        """Activity of the whole phantom, kBq.
+
+        From the shapes' volumes. Where one covers a part of another and not all of it, that part is counted at points
+        (to about 1/10000).
+        """
+        return self._totals["activity"] * 1e-3  # kBq/mL times mm^3
+
+    @property
+    def extent(self) -> float:
+        """Diameter, mm, of a ball around the origin that holds the phantom: a grid that holds it however it is turned."""
+        return 2 * max(math.hypot(*shape.position) + shape.ball_radius for shape in self.shapes)
+
+    def voxelize(
+        self, grid: Grid, pose: ArrayLike | None = None, progress: Progress | None = None, quantity: str = "activity"
+    ) -> Volume:
+        """The phantom as a volume on `grid`, anti-aliased: a voxel holds its mean.
+
+        Parameters
+        ----------
+        grid
+            Any grid; what lies outside it is cut off.
+        pose
+            World-from-phantom (4, 4), mm.
+        progress
+            Called as ``progress(done, total)``; may raise `Cancelled`.
+        quantity
+            ``"activity"`` or ``"mu"``.
+
+        Raises
+        ------
+        InputError
+            No grid, no such quantity, the pose is not an invertible 4x4 affine, or the volume does not fit into memory.
+        """
+        if not isinstance(grid, Grid):
+            raise InputError(f"voxelize: expected a Grid, got {type(grid).__name__}")
+        image = paint_voxels(grid, self._layers(quantity, pose), progress)
+        whole = self._totals[quantity] * (1.0 if pose is None else abs(float(np.linalg.det(np.asarray(pose)[:3, :3]))))
+        held = float(image.sum(dtype=np.float64)) * grid.voxel_volume / whole if whole > 0 else 1.0
+        if held < _HELD:
+            warnings.warn(
+                f"{1 - held:.0%} of the {self.title} lies outside the grid: take larger or more voxels",
+                InputWarning,
+                stacklevel=2,
+            )
+        return Volume(freeze(image), grid, quantity)
+
+    def line_integrals(
+        self, sources: ArrayLike, targets: ArrayLike, pose: ArrayLike | None = None, quantity: str = "activity"
+    ) -> NDArray[np.float64]:
+        """Integrals along lines, exact (closed form).
+
+        Parameters
+        ----------
+        sources, targets
+            Ends of the lines, each (N, 3), or (3,) for all lines the same; world mm.
+        pose, quantity
+            As of `voxelize`.
+
+        Returns
+        -------
+        array (N,)
+            Value x mm.
+
+        Raises
+        ------
+        InputError
+            The points' shapes do not fit, or a number is not finite; as of `voxelize`.
+        """
+        layers = self._layers(quantity, pose)
+        starts, ends = as_points(sources, "sources"), as_points(targets, "targets")
+        if len(starts) != len(ends) and 1 not in (len(starts), len(ends)):
+            raise InputError(f"line_integrals: {len(starts)} sources but {len(ends)} targets")
+        starts, ends = np.broadcast_arrays(starts, ends)
+        return line_integrals(layers, starts, ends)
+
+    def project(self, views: Views, pose: ArrayLike | None = None, quantity: str = "activity") -> NDArray[np.float32]:
+        """Line integrals through the pixels' centres of all views, exact: images (M, n_v, n_u), value x mm.
+
+        What `Projector` with `Transmission` approaches as voxels get smaller.
+        """
+        require(4.0 * len(views) * math.prod(views.shape), "a set of projections")
+        images = np.empty((len(views), *views.shape), np.float32)
+        for m, image in enumerate(images):
+            image[...] = self.line_integrals(*views.rays(m), pose, quantity).reshape(views.shape)
+        return images
+
+    def values(
+        self, points: ArrayLike, pose: ArrayLike | None = None, quantity: str = "activity"
+    ) -> NDArray[np.float64]:
+        """The values (N,) at world `points` (N, 3), mm."""
+        return values_at(self._layers(quantity, pose), real_array(points, "points", (None, 3)).T)
+
+    def meshes(self) -> list[PhantomMesh]:
+        """A closed mesh of every shape, in the phantom's frame, from bottom to top; round surfaces are polyhedra."""
+        meshes = []
+        for i, shape in enumerate(self.shapes, 1):
+            vertices, faces = shape.surface()
+            vertices = vertices @ shape.pose[:3, :3].T + shape.pose[:3, 3]
+            name = shape.name or f"{shape.KIND} {i}"
+            meshes.append(PhantomMesh(name, freeze(vertices), freeze(faces), shape.activity, shape.mu))
+        return meshes
+
+    @cached_property
+    def _totals(self) -> dict[str, float]:
+        """Of each quantity, the value times mm^3 of the whole phantom."""
+        return {quantity: integral(self._layers(quantity)) for quantity in QUANTITIES}
+
+    def _layers(self, quantity: str, pose: ArrayLike | None = None) -> list[Layer]:
+        """Every shape that holds the quantity, in the world."""
+        if quantity not in QUANTITIES:
+            raise InputError(f"quantity {quantity!r}: expected one of {', '.join(QUANTITIES)}")
+        world = np.eye(4) if pose is None else checked_affine(pose, "phantom pose")
+        return [
+            Layer(shape, world @ shape.pose, value)
+            for shape in self.shapes
+            if (value := getattr(shape, quantity)) is not None
+        ]
+
+
+@dataclass(frozen=True)
+class ShapePhantom(Phantom):
+    """A phantom that is a list of shapes, in the order of painting: later ones replace what is beneath them.
+
+    Attributes
+    ----------
+    shapes : tuple of Shape
+        From bottom to top.
+    name : str
+        What to call it.
+    mu_energy : float
+        Energy, keV, at which mu holds.
+
+    Raises
+    ------
+    InputError
+        No shapes, or something else among them.
+
+    Examples
+    --------
+    >>> water = Cylinder(radius=100, height=200, activity=5, mu=0.0154)
+    >>> hot = Sphere(radius=10, position=(50, 0, 0), activity=40)
+    >>> ShapePhantom([water, hot]).voxelize(Grid.centered(128, 2.0), quantity="mu")
+    """
+
+    shapes: Sequence[Shape] = ()
+    name: str = ""
+    mu_energy: float = 140.5
+
+    def __post_init__(self) -> None:
+        if isinstance(self.shapes, Shape) or not isinstance(self.shapes, Iterable):
+            raise InputError(f"phantom: expected a list of shapes, got {type(self.shapes).__name__}")
+        shapes = tuple(self.shapes)
+        if not shapes:
+            raise InputError("phantom: expected one shape or more, got none")
+        for i, shape in enumerate(shapes, 1):
+            if not isinstance(shape, Shape):
+                raise InputError(f"phantom: expected shapes, got {type(shape).__name__} as number {i}")
+        if not isinstance(self.name, str):
+            raise InputError(f"phantom name: expected a text, got {self.name!r}")
+        object.__setattr__(self, "shapes", shapes)
+        object.__setattr__(self, "mu_energy", positive(self.mu_energy, "mu_energy", "keV"))
+
+        object.__setattr__(self, "title", self.name or self.title)

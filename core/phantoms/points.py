@@ -1,0 +1,65 @@
+"""Point sources on a lattice, for resolution and calibration."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+from ..checks import whole_shape
+from ..errors import InputError
+from .phantom import Phantom
+from .settings import setting
+from .shapes import Shape, Sphere
+
+_MOST = 10_000
+
+
+@dataclass(frozen=True)
+class PointGrid(Phantom):
+    """Small equal balls on a lattice centred on the origin, in air.
+
+    Attributes
+    ----------
+    counts : (3,)
+        Points along x, y, z.
+    spacing : (3,)
+        mm, from point to point.
+    diameter : float
+        Of a point, mm. On voxels of any size each point holds its whole activity.
+    point_activity : float
+        Of each point, kBq.
+    """
+
+    counts: tuple[int, int, int] = (5, 5, 5)
+    spacing: tuple[float, float, float] = setting((20.0, 20.0, 20.0), "mm", "from point to point along x y z")
+    diameter: float = setting(1.0, "mm", "of a point")
+    point_activity: float = setting(100.0, "kBq", "of each point")
+
+    title = "grid of points"
+
+    def __post_init__(self) -> None:
+        counts = whole_shape(self.counts, "grid of points: counts", 3)
+        if math.prod(counts) > _MOST:
+            raise InputError(f"grid of points: expected at most {_MOST} points, got {math.prod(counts)}")
+        object.__setattr__(self, "counts", counts)
+        super().__post_init__()
+
+    @cached_property
+    def shapes(self) -> Sequence[Shape]:
+        """The balls, the last index running fastest."""
+        radius = self.diameter / 2
+        concentration = self.point_activity / (4e-3 / 3 * math.pi * radius**3)  # mm^3 to mL
+        return [
+            Sphere(
+                radius=radius,
+                activity=concentration,
+                name="point " + " ".join(map(str, index)),
+                position=[
+                    (i - (n - 1) / 2) * step for i, n, step in zip(index, self.counts, self.spacing, strict=True)
+                ],
+            )
+            for index in itertools.product(*map(range, self.counts))
+        ]

@@ -1,0 +1,57 @@
+"""Phantoms thrown at random, as training sets want them."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from ..checks import real_array
+from ..errors import InputError
+from ..frames import euler_pose
+
+
+def random_pose(
+    seed: int | np.random.Generator, box: ArrayLike = (0.0, 0.0, 0.0), center: ArrayLike = (0.0, 0.0, 0.0)
+) -> NDArray[np.float64]:
+    """A pose at random: the middle uniform in a box, the three Euler angles uniform, as the scanner's users draw them.
+
+    phi, theta and psi of `euler_pose` are uniform between 0 and 360 degrees each. (That is not the uniform distribution
+    of rotations, which would have cos(theta) uniform: a phantom's axis points along +z or -z more often.)
+
+    Parameters
+    ----------
+    seed
+        A whole number, the same pose each time; or a generator, the next pose each time.
+    box
+        Sides of the box (3,), mm, or one for all.
+    center
+        Its middle (3,), mm.
+
+    Returns
+    -------
+    array (4, 4)
+        World-from-phantom.
+
+    Raises
+    ------
+    InputError
+        No such seed, a number is not finite, or a side is negative.
+
+    Examples
+    --------
+    >>> rng = np.random.default_rng(7)
+    >>> poses = [random_pose(rng, box=(40, 40, 40)) for _ in range(1000)]
+    """
+    if isinstance(seed, np.random.Generator):
+        rng = seed
+    elif isinstance(seed, int | np.integer) and not isinstance(seed, bool) and seed >= 0:
+        rng = np.random.default_rng(seed)
+    else:
+        raise InputError(f"seed: expected a whole number of at least 0 or a numpy Generator, got {seed!r}")
+    sides = real_array([box] * 3 if isinstance(box, int | float) else box, "box of random poses", (3,))
+    if np.any(sides < 0):
+        raise InputError(f"box of random poses: expected 0 or more mm, got {sides.min():g}")
+    middle = real_array(center, "centre of random poses", (3,))
+    translation = middle + (rng.random(3) - 0.5) * sides
+    phi, theta, psi = rng.uniform(0.0, 2 * np.pi, 3)
+    return euler_pose(phi, theta, psi, translation)

@@ -1,0 +1,597 @@
+"""Solid shapes, placed, with what they hold: the words of which phantoms are made.
+
+A shape lies in a frame of its own, centred on its origin with its axis along z; `pose` places it. Shapes are convex
+unless they say otherwise: a line enters and leaves them once.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import Any, ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..checks import positive, real_array
+from ..errors import InputError
+from ..frames import euler_pose
+from .surfaces import Surface, clipped, lathe
+
+Real = NDArray[np.floating]
+Points = NDArray[np.float64]
+Vector = Any
+"""Numbers: given as any sequence, kept as a tuple of floats (typed Any: mypy cannot say how many)."""
+
+MODES = ("paint", "add")
+# Lines each way through a shape that is cut: its volume is then right to about 1e-5, or surely seen.
+_LINES, _FEWER_LINES = 512, 128
+
+
+@dataclass(frozen=True, kw_only=True)
+class Shape:
+    """What all shapes have: a place, and what they hold.
+
+    Attributes
+    ----------
+    position : (3,)
+        Of the shape's origin in the phantom, mm.
+    euler : (3,)
+        phi, theta, psi in radians, as of `euler_pose`.
+    axis : (3,) or None
+        Instead of `euler`: where the shape's z axis points, of any length.
+    activity : float or None
+        kBq/mL; None leaves the activity beneath as it is.
+    mu : float or None
+        Linear attenuation coefficient, 1/mm; None leaves that beneath as it is.
+    mode : str
+        ``"paint"`` replaces what lies beneath, ``"add"`` adds to it (and may be negative).
+    cut : (n, 4)
+        Planes (nx, ny, nz, d) in the shape's frame: of the shape, the points with ``n . x <= d`` |n| are kept (d in mm).
+    name : str
+        For messages and the scene.
+
+    Raises
+    ------
+    InputError
+        A number is not finite or out of range, or the shape holds nothing.
+    """
+
+    position: Vector = (0.0, 0.0, 0.0)
+    euler: Vector = (0.0, 0.0, 0.0)
+    axis: Vector | None = None
+    activity: float | None = None
+    mu: float | None = None
+    mode: str = "paint"
+    cut: Vector = ()
+    name: str = ""
+
+    KIND: ClassVar[str] = ""
+
+    def __post_init__(self) -> None:
+        self._set("position", _numbers(self.position, "position", 3))
+        self._set("euler", _numbers(self.euler, "euler", 3))
+        if self.axis is not None:
+            axis = np.array(_numbers(self.axis, "axis", 3))
+            if any(self.euler):
+                raise InputError("axis: expected either an axis or Euler angles, got both")
+            if not axis.any():
+                raise InputError("axis: expected a direction, got 0 0 0")
+            self._set("axis", tuple(axis.tolist()))
+        if self.mode not in MODES:
+            raise InputError(f"mode: expected one of {', '.join(MODES)}, got {self.mode!r}")
+        for quantity, unit in (("activity", "kBq/mL"), ("mu", "1/mm")):
+            value = getattr(self, quantity)
+            if value is None:
+                continue
+            value = float(real_array(value, quantity, ()))
+            if value < 0 and self.mode == "paint":
+                raise InputError(f"{quantity}: expected 0 or more {unit}, got {value:g}")
+            self._set(quantity, value)
+        if self.activity is None and self.mu is None:
+            raise InputError("activity, mu: expected at least one of them")
+        if not isinstance(self.name, str):
+            raise InputError(f"name: expected a text, got {self.name!r}")
+        planes = np.empty((0, 4)) if _is_empty(self.cut) else real_array(self.cut, "cut", (None, 4))
+        lengths = np.linalg.norm(planes[:, :3], axis=1)
+        if np.any(lengths == 0):
+            raise InputError("cut: expected planes nx ny nz d, got one whose normal is 0 0 0")
+        planes[:, :3] /= lengths[:, None]
+        self._set("cut", tuple(map(tuple, planes.tolist())))
+        self._check()
+        if self.cut and not self._summed_volume(_FEWER_LINES) > 0:
+            raise InputError("cut: nothing of the shape is left")
+
+    @property
+    def pose(self) -> Points:
+        """Phantom-from-shape (4, 4), mm."""
+        phi, theta, psi = self.euler
+        if self.axis is not None:
+            x, y, z = self.axis
+            phi, theta = math.atan2(y, x), math.atan2(math.hypot(x, y), z)
+        return euler_pose(phi, theta, psi, self.position)
+
+    def distance(self, points: Real) -> Real:
+        """Signed distance (N,), mm, of `points` (3, N) in the shape's frame from its surface.
+
+        Negative inside, and nowhere larger in magnitude than the true distance; of the points' type.
+        """
+        distance = self._distance(points)
+        for *normal, offset in self.cut:
+            n_x, n_y, n_z = (points.dtype.type(component) for component in normal)
+            plane = n_x * points[0] + n_y * points[1] + n_z * points[2] - points.dtype.type(offset)
+            distance = np.maximum(distance, plane)
+        return distance
+
+    def intervals(self, starts: Points, directions: Points) -> tuple[Points, Points]:
+        """Where the lines ``starts + t directions``, (3, N) in the shape's frame, are inside: from and to which t.
+
+        Each (m, N), of m disjoint parts (one where the shape is convex); from ``>=`` to where a line misses the part.
+        """
+        enter, leave = self._intervals(starts, directions)
+        for *normal, offset in self.cut:
+            first, last = _below(np.array(normal) @ starts - offset, np.array(normal) @ directions)
+            enter, leave = np.maximum(enter, first), np.minimum(leave, last)
+        return enter, leave
+
+    @cached_property
+    def volume(self) -> float:
+        """mm^3: in closed form, and of a shape that is cut summed over lines."""
+        return self._summed_volume(_LINES) if self.cut else self._volume
+
+    def _summed_volume(self, n: int) -> float:
+        """The volume summed over n x n lines."""
+        # Aslant: along a plane of the cut the sum would jump from line to line, and converge badly.
+        slant = np.array([0.3, 0.2, 1.0])
+        a, b, c = self.half_box
+        width, depth = 2 * a * (1 + slant[0]), 2 * b * (1 + slant[1])
+        u, v = (np.mgrid[:n, :n].reshape(2, -1) + 0.5) / n - 0.5
+        starts = np.stack([u * width, v * depth, np.zeros_like(u)])
+        directions = np.broadcast_to((slant * [a, b, c])[:, None], starts.shape)
+        enter, leave = self.intervals(starts, directions)
+        return float(np.maximum(leave - enter, 0.0).sum() / len(u) * width * depth * c)
+
+    @property
+    def n_parts(self) -> int:
+        """How many times at most a line may enter the shape."""
+        return 1
+
+    @property
+    def finest(self) -> float:
+        """Size, mm, of the smallest part."""
+        return min(2 * min(self.half_box), self.volume ** (1 / 3))
+
+    @property
+    def half_box(self) -> tuple[float, float, float]:
+        """Half the sides (3,), mm, of a box around the shape's origin that holds it."""
+        raise NotImplementedError
+
+    @property
+    def ball_radius(self) -> float:
+        """Radius, mm, of a ball around the shape's origin that holds it."""
+        raise NotImplementedError
+
+    def surface(self) -> Surface:
+        """A closed mesh in the shape's frame: vertices (V, 3), mm, and triangles (F, 3), counter-clockwise from outside."""
+        surface = self._surface()
+        for *normal, offset in self.cut:
+            surface = clipped(surface, np.array(normal), offset)
+        return surface
+
+    def _check(self) -> None:
+        """Check the shape's own numbers."""
+        raise NotImplementedError
+
+    def _distance(self, points: Real) -> Real:
+        raise NotImplementedError
+
+    def _intervals(self, starts: Points, directions: Points) -> tuple[Points, Points]:
+        raise NotImplementedError
+
+    @property
+    def _volume(self) -> float:
+        raise NotImplementedError
+
+    def _surface(self) -> Surface:
+        raise NotImplementedError
+
+    def _set(self, name: str, value: object) -> None:
+        object.__setattr__(self, name, value)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Ellipsoid(Shape):
+    """An ellipsoid.
+
+    Attributes
+    ----------
+    radii : (3,)
+        Half axes along x, y, z, mm.
+    """
+
+    radii: Vector
+
+    KIND = "ellipsoid"
+
+    def _check(self) -> None:
+        self._set("radii", _positive_numbers(self.radii, "radii", 3))
+
+    def _distance(self, points: Real) -> Real:
+        return _ellipse_distance(points, self.half_box)
+
+    def _intervals(self, starts: Points, directions: Points) -> tuple[Points, Points]:
+        radii = np.array(self.radii)[:, None]
+        return _in_unit_ball(starts / radii, directions / radii)
+
+    @property
+    def _volume(self) -> float:
+        return 4 / 3 * math.pi * math.prod(self.half_box)
+
+    @property
+    def half_box(self) -> tuple[float, float, float]:
+        """Half the sides, mm."""
+        return self.radii
+
+    @property
+    def ball_radius(self) -> float:
+        """mm."""
+        return max(self.half_box)
+
+    def _surface(self) -> Surface:
+        angle = np.linspace(-np.pi / 2, np.pi / 2, 33)
+        a, b, c = self.half_box
+        return lathe(np.cos(angle), c * np.sin(angle), a, b)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Sphere(Ellipsoid):
+    """A sphere.
+
+    Attributes
+    ----------
+    radius : float
+        mm.
+    """
+
+    radius: float
+    radii: Vector = field(init=False)
+
+    KIND = "sphere"
+
+    def _check(self) -> None:
+        self._set("radius", positive(self.radius, "radius", "mm"))
+        self._set("radii", (self.radius,) * 3)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Cylinder(Shape):
+    """A cylinder along z.
+
+    Attributes
+    ----------
+    radius : float or (2,)
+        mm; along x and y where it is elliptic.
+    height : float
+        mm.
+    """
+
+    radius: Vector
+    height: float
+
+    KIND = "cylinder"
+
+    def _check(self) -> None:
+        self._set("radius", _radius(self.radius, "radius"))
+        self._set("height", positive(self.height, "height", "mm"))
+
+    def _distance(self, points: Real) -> Real:
+        a, b, half = self.half_box
+        return np.maximum(_ellipse_distance(points[:2], (a, b)), np.abs(points[2]) - points.dtype.type(half))
+
+    def _intervals(self, starts: Points, directions: Points) -> tuple[Points, Points]:
+        a, b, half = self.half_box
+        radii = np.array([[a], [b]])
+        side = _in_unit_ball(starts[:2] / radii, directions[:2] / radii)
+        return _common(side, _between(starts[2], directions[2], half))
+
+    @property
+    def _volume(self) -> float:
+        a, b, half = self.half_box
+        return 2 * math.pi * a * b * half
+
+    @property
+    def half_box(self) -> tuple[float, float, float]:
+        """Half the sides, mm."""
+        a, b = _pair(self.radius)
+        return a, b, self.height / 2
+
+    @property
+    def ball_radius(self) -> float:
+        """mm."""
+        a, b, half = self.half_box
+        return math.hypot(max(a, b), half)
+
+    def _surface(self) -> Surface:
+        a, b, half = self.half_box
+        return lathe(np.array([0.0, 1.0, 1.0, 0.0]), np.array([-half, -half, half, half]), a, b)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Cone(Shape):
+    """A cone, or what is left of one without its tip, along z.
+
+    Attributes
+    ----------
+    radius, top_radius : float
+        At ``z = -height / 2`` and at ``z = height / 2``, mm; one of them may be 0.
+    height : float
+        mm.
+    """
+
+    radius: float
+    top_radius: float = 0.0
+    height: float
+
+    KIND = "cone"
+
+    def _check(self) -> None:
+        for name in ("radius", "top_radius"):
+            value = float(real_array(getattr(self, name), name, ()))
+            if value < 0:
+                raise InputError(f"{name}: expected 0 or more mm, got {value:g}")
+            self._set(name, value)
+        positive(max(self.radius, self.top_radius), "radius", "mm")
+        self._set("height", positive(self.height, "height", "mm"))
+
+    @property
+    def _slope(self) -> float:
+        return (self.top_radius - self.radius) / self.height
+
+    @property
+    def _middle(self) -> float:
+        """Radius at z = 0, mm."""
+        return (self.radius + self.top_radius) / 2
+
+    def _distance(self, points: Real) -> Real:
+        of_type = points.dtype.type
+        side = np.hypot(points[0], points[1]) - of_type(self._middle) - of_type(self._slope) * points[2]
+        side *= of_type(1 / math.hypot(1, self._slope))
+        return np.maximum(side, np.abs(points[2]) - of_type(self.height / 2))
+
+    def _intervals(self, starts: Points, directions: Points) -> tuple[Points, Points]:
+        # Within the height the quadric x^2 + y^2 <= (m + s z)^2 is convex: a line is inside between two roots, beyond
+        # them, or on one side of one. Cut to the height first, so that the other half of the double cone is no part.
+        first, last = _between(starts[2], directions[2], self.height / 2)
+        first, last = np.clip(first, -_FAR, _FAR), np.clip(last, -_FAR, _FAR)
+        r, dr = self._middle + self._slope * starts[2], self._slope * directions[2]
+        a = directions[0] ** 2 + directions[1] ** 2 - dr**2
+        b = starts[0] * directions[0] + starts[1] * directions[1] - r * dr
+        c = starts[0] ** 2 + starts[1] ** 2 - r**2
+        root = np.sqrt(np.maximum(b**2 - a * c, 0.0))
+        with np.errstate(divide="ignore", invalid="ignore"):
+            # Both roots without cancellation; where a is 0 one of them is at infinity. (Where there are none, these
+            # numbers split the line anywhere: what counts is the sign in the middle of each piece.)
+            q = -(b + np.copysign(root, b))
+            roots = np.sort(np.nan_to_num(np.stack([q / a, c / q]), nan=np.inf, posinf=np.inf, neginf=-np.inf), axis=0)
+        edges = np.sort(np.clip(np.concatenate([first, roots, last]), first, last), axis=0)
+        middle = (edges[:-1] + edges[1:]) / 2
+        inside = (a * middle + 2 * b) * middle + c < 0
+        inside &= edges[1:] > edges[:-1]
+        enter = np.where(inside, edges[:-1], np.inf).min(axis=0)
+        leave = np.where(inside, edges[1:], -np.inf).max(axis=0)
+        return enter[None], leave[None]
+
+    @property
+    def _volume(self) -> float:
+        r, t = self.radius, self.top_radius
+        return math.pi / 3 * self.height * (r * r + r * t + t * t)
+
+    @property
+    def half_box(self) -> tuple[float, float, float]:
+        """Half the sides, mm."""
+        widest = max(self.radius, self.top_radius)
+        return widest, widest, self.height / 2
+
+    @property
+    def ball_radius(self) -> float:
+        """mm."""
+        return math.hypot(max(self.radius, self.top_radius), self.height / 2)
+
+    def _surface(self) -> Surface:
+        half = self.height / 2
+        radii = [self.radius] * (self.radius > 0) + [self.top_radius] * (self.top_radius > 0)
+        heights = [-half] * (self.radius > 0) + [half] * (self.top_radius > 0)
+        return lathe(np.array([0.0, *radii, 0.0]), np.array([-half, *heights, half]), 1.0, 1.0)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Capsule(Shape):
+    """A cylinder along z with half balls on its ends.
+
+    Attributes
+    ----------
+    radius : float
+        mm.
+    height : float
+        Of the cylinder, mm; the whole is longer by 2 radii.
+    """
+
+    radius: float
+    height: float
+
+    KIND = "capsule"
+
+    def _check(self) -> None:
+        self._set("radius", positive(self.radius, "radius", "mm"))
+        self._set("height", positive(self.height, "height", "mm"))
+
+    def _distance(self, points: Real) -> Real:
+        of_type = points.dtype.type
+        beyond = np.maximum(np.abs(points[2]) - of_type(self.height / 2), 0)
+        return np.sqrt(points[0] ** 2 + points[1] ** 2 + beyond**2) - of_type(self.radius)
+
+    def _intervals(self, starts: Points, directions: Points) -> tuple[Points, Points]:
+        half = np.array([0.0, 0.0, self.height / 2])[:, None]
+        side = _in_unit_ball(starts[:2] / self.radius, directions[:2] / self.radius)
+        parts = [
+            _common(side, _between(starts[2], directions[2], self.height / 2)),
+            _in_unit_ball((starts - half) / self.radius, directions / self.radius),
+            _in_unit_ball((starts + half) / self.radius, directions / self.radius),
+        ]
+        # The sum of the parts is convex: one interval, from the first entry to the last exit.
+        missed = [enter >= leave for enter, leave in parts]
+        enter = np.minimum.reduce([np.where(m, np.inf, part[0]) for m, part in zip(missed, parts, strict=True)])
+        leave = np.maximum.reduce([np.where(m, -np.inf, part[1]) for m, part in zip(missed, parts, strict=True)])
+        return enter, leave
+
+    @property
+    def _volume(self) -> float:
+        return math.pi * self.radius**2 * (self.height + 4 / 3 * self.radius)
+
+    @property
+    def half_box(self) -> tuple[float, float, float]:
+        """Half the sides, mm."""
+        return self.radius, self.radius, self.ball_radius
+
+    @property
+    def ball_radius(self) -> float:
+        """mm."""
+        return self.height / 2 + self.radius
+
+    def _surface(self) -> Surface:
+        angle = np.linspace(0, np.pi / 2, 13)
+        r, half = self.radius, self.height / 2
+        radii = r * np.concatenate([np.sin(angle), np.cos(angle)])
+        return lathe(radii, np.concatenate([-half - r * np.cos(angle), half + r * np.sin(angle)]), 1.0, 1.0)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Box(Shape):
+    """A box.
+
+    Attributes
+    ----------
+    size : (3,)
+        Sides along x, y, z, mm.
+    """
+
+    size: Vector
+
+    KIND = "box"
+
+    def _check(self) -> None:
+        self._set("size", _positive_numbers(self.size, "size", 3))
+
+    def _distance(self, points: Real) -> Real:
+        half = np.array(self.half_box, points.dtype)[:, None]
+        return (np.abs(points) - half).max(axis=0)
+
+    def _intervals(self, starts: Points, directions: Points) -> tuple[Points, Points]:
+        x, y, z = (_between(starts[i], directions[i], half) for i, half in enumerate(self.half_box))
+        return _common(_common(x, y), z)
+
+    @property
+    def _volume(self) -> float:
+        return 8 * math.prod(self.half_box)
+
+    @property
+    def half_box(self) -> tuple[float, float, float]:
+        """Half the sides, mm."""
+        a, b, c = self.size
+        return a / 2, b / 2, c / 2
+
+    @property
+    def ball_radius(self) -> float:
+        """mm."""
+        return math.hypot(*self.half_box)
+
+    def _surface(self) -> Surface:
+        a, b, half = self.half_box
+        # A lathe of four sides.
+        radii, heights = np.sqrt(2.0) * np.array([0.0, 1.0, 1.0, 0.0]), np.array([-half, -half, half, half])
+        return lathe(radii, heights, a, b, n_sides=4)
+
+
+_FAR = 1e30  # finite in place of infinity, where a mean of two ends is wanted
+
+
+def _in_unit_ball(starts: Points, directions: Points) -> tuple[Points, Points]:
+    """Where lines (n, N) are inside the unit ball of n dimensions, (1, N) each."""
+    a = np.einsum("in,in->n", directions, directions)
+    b = np.einsum("in,in->n", starts, directions)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        # From the line's point nearest to the middle: no cancellation of large squares.
+        nearest = -b / a
+        miss = starts + directions * nearest
+        left = 1.0 - np.einsum("in,in->n", miss, miss)
+        half = np.sqrt(left / a)
+        enter, leave = nearest - half, nearest + half
+    never = np.isnan(enter)
+    if never.any():  # it misses, or the line is a point seen along the axis: all in or all out
+        still = never & (a == 0) & (np.einsum("in,in->n", starts, starts) < 1)
+        enter[never], leave[never] = np.inf, -np.inf
+        enter[still], leave[still] = -np.inf, np.inf
+    return enter[None], leave[None]
+
+
+def _between(start: Points, direction: Points, half: float) -> tuple[Points, Points]:
+    """Where lines are between -half and half of one coordinate, (1, N) each."""
+    lower = _below(-start - half, -direction)
+    return _common(lower, _below(start - half, direction))
+
+
+def _below(start: Points, direction: Points) -> tuple[Points, Points]:
+    """Where ``start + t direction <= 0``, (1, N) each."""
+    with np.errstate(divide="ignore", invalid="ignore"):
+        crossing = -start / direction
+    enter = np.where(direction < 0, crossing, np.where((direction > 0) | (start <= 0), -np.inf, np.inf))
+    leave = np.where(direction > 0, crossing, np.where((direction < 0) | (start <= 0), np.inf, -np.inf))
+    return enter[None], leave[None]
+
+
+def _common(one: tuple[Points, Points], other: tuple[Points, Points]) -> tuple[Points, Points]:
+    return np.maximum(one[0], other[0]), np.minimum(one[1], other[1])
+
+
+def _ellipse_distance(points: Real, radii: tuple[float, ...]) -> Real:
+    """Bound of the distance (N,) of `points` (n, N) from an ellipse or ellipsoid, exact to first order near it.
+
+    With k(x) = |x / radii| and g = |x / radii^2|: k is convex, so that outside the distance is at least
+    (k - 1) / |grad k| = (k - 1) k / g; a step h moves k^2 by at most 2 g h + h^2 / r^2, r being the smallest radius.
+    """
+    inverse = (1 / np.array(radii)).astype(points.dtype)[:, None]
+    scaled = points * inverse
+    k2 = np.einsum("in,in->n", scaled, scaled)
+    scaled *= inverse
+    g = np.sqrt(np.einsum("in,in->n", scaled, scaled))
+    left = 1 - k2
+    inside = left / (g + np.sqrt(g * g + np.maximum(left, 0) * inverse.max() ** 2))
+    with np.errstate(divide="ignore", invalid="ignore"):
+        outside = (k2 - np.sqrt(k2)) / g
+    return np.where(left > 0, -inside, outside)
+
+
+def _numbers(value: Vector, name: str, count: int) -> tuple[float, ...]:
+    return tuple(real_array(value, name, (count,)).tolist())
+
+
+def _positive_numbers(value: Vector, name: str, count: int) -> tuple[float, ...]:
+    numbers = _numbers(value, name, count)
+    for number in numbers:
+        positive(number, name, "mm")
+    return numbers
+
+
+def _radius(value: Vector, name: str) -> float | tuple[float, ...]:
+    many = isinstance(value, list | tuple | np.ndarray)
+    return _positive_numbers(value, name, 2) if many else positive(value, name, "mm")
+
+
+def _is_empty(value: Vector) -> bool:
+    return isinstance(value, list | tuple) and not value
+
+
+def _pair(radius: Vector) -> tuple[float, float]:
+    a, b = np.broadcast_to(np.asarray(radius, np.float64), 2).tolist()
+    return a, b

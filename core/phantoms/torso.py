@@ -1,0 +1,271 @@
+"""A cardiac torso for this scanner: the left ventricle at the isocentre, beating, with a perfusion defect if wanted."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..checks import whole_shape
+from ..errors import InputError
+from .materials import LUNG_MU, SOFT_TISSUE_MU, VERTEBRA_MU
+from .phantom import Phantom
+from .settings import setting
+from .shapes import Cylinder, Ellipsoid, Shape
+
+# The heart's axes in the torso, rows lateral, anterior, apical: its second, third and first axis in M. Cristy and
+# K. F. Eckerman, ORNL/TM-8381 (1987), whose x and y point to the patient's left and back.
+_HEART = np.array([[-0.5736, -0.8191, 0.0], [-0.4640, 0.3249, 0.8241], [-0.6751, 0.4727, -0.5664]])
+# The torso's axis at ORNL/TM-8381's height 0, as seen from the left ventricle's middle, mm: chosen.
+_AXIS, _HEIGHT = (35.0, -30.0), 490.0
+_SYSTOLE = 0.35  # of the cycle
+_RV_WALL = 4.0  # mm
+
+
+@dataclass(frozen=True)
+class CardiacTorso(Phantom):
+    """A torso of simple shapes around a heart, as for myocardial perfusion with Tc-99m sestamibi.
+
+    Frame: +x the patient's right, +y front, +z head; the origin in the middle of the left ventricle at end-diastole. So
+    the patient's left and front face the modules of the 80-module cardiac scanner, and the ventricle lies well inside
+    its 75 mm.
+
+    Lungs, liver, spine and the direction of the heart's axis follow the mathematical adult of M. Cristy and K. F.
+    Eckerman, ORNL/TM-8381 (1987). Its body of 400 x 200 mm holds the arms: here an ellipse of 330 x 230 mm stands for a
+    chest with the arms up, the liver reaches 150 and not 165 mm to the right, and the spine lies 15 mm further back.
+    The left ventricle is half an ellipsoid inside another, of 120 mL at end-diastole and 45 mL at end-systole with walls
+    of 9.5 mm (within the normal ranges of R. M. Lang et al., J Am Soc Echocardiogr 28 (2015) 1-39): 133 g of muscle,
+    whose volume stays when it contracts, as does the apex's place. The volume falls along half a cosine for 35 % of the
+    cycle and rises along another. The right ventricle's cavity shrinks with the left's. Ribs, arms, breasts and other
+    organs are left out.
+
+    Activities are choices for rest, an hour after 1 GBq: 1.2 % of it in the heart (sestamibi's prescribing information)
+    make about 90 kBq/mL in 133 g; the other organs are set to ratios as seen in clinical images.
+
+    Attributes
+    ----------
+    phase : float
+        Of the heart's cycle: 0 at end-diastole, 0.35 at end-systole, below 1.
+    end_diastolic_volume, end_systolic_volume : float
+        Of the left ventricle's cavity, mL.
+    ventricle_length, wall : float
+        Of that cavity from base to apex, and of its wall, at end-diastole, mm.
+    shortening : float
+        Share by which the length shortens until end-systole.
+    defect_severity : float
+        Share of the muscle's activity that is missing in the defect, 0 (no defect) to 1.
+    defect_angle_degrees, defect_width_degrees : float
+        Its middle, 0 anterior, 90 lateral, 180 inferior, 270 septal; and how far around it reaches in all.
+    defect_from, defect_to : float
+        Where along the muscle it begins and ends, 0 the base, 1 the apex.
+    defect_transmural : float
+        Share of the wall, from the inside, that it takes.
+    body_radii : (2,)
+        Half axes of the body, left-right and front-back, mm.
+    myocardium, right_myocardium, blood, liver, lung, body : float
+        Activities, kBq/mL; the body's also in the spine.
+    """
+
+    phase: float = setting(0.0, "of the cycle", "0 at end-diastole, 0.35 at end-systole, below 1", 0.0)
+    end_diastolic_volume: float = setting(120.0, "mL", "of the left ventricle")
+    end_systolic_volume: float = setting(45.0, "mL", "of the left ventricle")
+    ventricle_length: float = setting(80.0, "mm", "of its cavity at end-diastole")
+    wall: float = setting(9.5, "mm", "of its muscle at end-diastole")
+    shortening: float = setting(0.13, "of the length", "until end-systole", 0.0)
+    defect_severity: float = setting(0.0, "of the activity", "missing in the defect; 0 for none", 0.0)
+    defect_angle_degrees: float = setting(0.0, "DEG", "0 anterior, 90 lateral, 180 inferior, 270 septal", -360.0)
+    defect_width_degrees: float = setting(60.0, "DEG", "how far around the defect reaches")
+    defect_from: float = setting(0.3, "of the way", "from base to apex, where it begins", 0.0)
+    defect_to: float = setting(0.8, "of the way", "from base to apex, where it ends")
+    defect_transmural: float = setting(1.0, "of the wall", "from the inside, that it takes")
+    body_radii: tuple[float, float] = setting((165.0, 115.0), "mm", "half axes, left-right and front-back")
+    myocardium: float = setting(90.0, "kBq/mL", "in the left ventricle's muscle", 0.0)
+    right_myocardium: float = setting(45.0, "kBq/mL", "in the right ventricle's muscle", 0.0)
+    blood: float = setting(5.0, "kBq/mL", "in the heart's cavities", 0.0)
+    liver: float = setting(45.0, "kBq/mL", "in the liver", 0.0)
+    lung: float = setting(3.0, "kBq/mL", "in the lungs", 0.0)
+    body: float = setting(5.0, "kBq/mL", "elsewhere", 0.0)
+
+    title = "cardiac torso"
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        for name, most in (
+            ("phase", 1.0),
+            ("shortening", 0.9),
+            ("defect_severity", 1.0),
+            ("defect_width_degrees", 360.0),
+            ("defect_to", 1.0),
+            ("defect_transmural", 1.0),
+            ("end_systolic_volume", self.end_diastolic_volume),
+            ("defect_from", self.defect_to),
+        ):
+            value = getattr(self, name)
+            if value > most or (value == most and name in ("phase", "defect_from")):
+                below = "less than" if name in ("phase", "defect_from") else "at most"
+                raise InputError(f"{self.title}: {name.replace('_', ' ')}: expected {below} {most:g}, got {value:g}")
+
+    def beating(self, frames: int) -> list[CardiacTorso]:
+        """The torso at as many phases, evenly spaced over the cycle, the first at end-diastole."""
+        (count,) = whole_shape([frames], "frames of the cycle", 1)
+        return [dataclasses.replace(self, phase=i / count) for i in range(count)]
+
+    @property
+    def ventricle_volume(self) -> float:
+        """Of the left ventricle's cavity at this phase, mL."""
+        stroke = self.end_diastolic_volume - self.end_systolic_volume
+        return self.end_diastolic_volume - stroke * self._contraction
+
+    @cached_property
+    def shapes(self) -> Sequence[Shape]:
+        """Body, lungs, liver, spine, atria, right ventricle, left ventricle with its defect."""
+        return [*self._trunk(), *self._heart()]
+
+    @property
+    def _contraction(self) -> float:
+        """0 at end-diastole, 1 at end-systole."""
+        if self.phase < _SYSTOLE:
+            return 0.5 - 0.5 * math.cos(math.pi * self.phase / _SYSTOLE)
+        return 0.5 + 0.5 * math.cos(math.pi * (self.phase - _SYSTOLE) / (1 - _SYSTOLE))
+
+    def _trunk(self) -> list[Shape]:
+        def at(x: float, y: float, z: float) -> tuple[float, float, float]:
+            return x + _AXIS[0], y + _AXIS[1], z - _HEIGHT
+
+        tissue: dict[str, Any] = {"mu": SOFT_TISSUE_MU}
+        lungs: list[Shape] = [
+            Ellipsoid(
+                radii=(50, 75, 240),
+                position=at(x, 0, 435),
+                cut=[(0, 0, -1, 0)],
+                activity=self.lung,
+                mu=LUNG_MU,
+                name=f"{side} lung",
+            )
+            for side, x in (("right", 85.0), ("left", -85.0))
+        ]
+        # Below the plane x/350 + y/450 - z/430 = -1, x and y to the left and back, here about z = 350.
+        plane = np.array([-1 / 350, -1 / 450, -1 / 430])
+        offset = (350 / 430 - 1) / float(np.linalg.norm(plane))
+        return [
+            Cylinder(
+                radius=self.body_radii, height=440, position=at(0, 0, 460), activity=self.body, name="body", **tissue
+            ),
+            *lungs,
+            Cylinder(
+                radius=(150, 80),
+                height=160,
+                position=at(0, 0, 350),
+                cut=[(*plane, offset)],
+                activity=self.liver,
+                name="liver",
+                **tissue,
+            ),
+            Cylinder(
+                radius=(20, 25), height=440, position=at(0, -70, 460), activity=self.body, mu=VERTEBRA_MU, name="spine"
+            ),
+        ]
+
+    def _heart(self) -> list[Shape]:
+        contraction, volume = self._contraction, self.ventricle_volume * 1e3
+        full = self.end_diastolic_volume * 1e3
+        muscle = (
+            _half_ellipsoid(_radius(full, self.ventricle_length) + self.wall, self.ventricle_length + self.wall) - full
+        )
+        length = self.ventricle_length * (1 - self.shortening * contraction)
+        radius = _radius(volume, length)
+        wall = _wall(radius, length, volume + muscle)
+        # The apex stays; at end-diastole the origin is halfway between it and the base.
+        base = (self.ventricle_length + self.wall) / 2 - length - wall
+        beat = (volume / full) ** (1 / 3)
+        blood: dict[str, Any] = {"activity": self.blood, "mu": SOFT_TISSUE_MU}
+        upper = (0, 0, -1, 0)
+
+        def cup(
+            radii: tuple[float, float, float], name: str, right: float = 0.0, cut: Sequence = (), **holds: Any
+        ) -> Shape:
+            return Ellipsoid(
+                radii=radii,
+                position=_in_torso(-right, 0, base),
+                euler=_euler_angles(),
+                cut=[upper, *cut],
+                name=name,
+                **holds,
+            )
+
+        right = (30.0 * beat, 36.0 * beat, 66.0 * beat)
+        outer = tuple(half + _RV_WALL for half in right)
+        return [
+            Ellipsoid(
+                radii=(35, 35, 28), position=_in_torso(-8, 0, base - 20), euler=_euler_angles(), name="atria", **blood
+            ),
+            cup(outer, "right myocardium", 26.0, activity=self.right_myocardium, mu=SOFT_TISSUE_MU),
+            cup(right, "right ventricle", 26.0, **blood),
+            cup(
+                (radius + wall, radius + wall, length + wall), "myocardium", activity=self.myocardium, mu=SOFT_TISSUE_MU
+            ),
+            *(
+                cup(
+                    (radius + self.defect_transmural * wall,) * 2 + (length + self.defect_transmural * wall,),
+                    "defect",
+                    cut=planes,
+                    activity=(1 - self.defect_severity) * self.myocardium,
+                )
+                for planes in self._defect_planes(length + wall)
+            ),
+            cup((radius, radius, length), "left ventricle", **blood),
+        ]
+
+    def _defect_planes(self, length: float) -> list[list[tuple[float, float, float, float]]]:
+        """Planes around each convex piece of the defect, in the heart's frame: two of them beyond half of the way around."""
+        if not self.defect_severity:
+            return []
+        ends = [(0.0, 0.0, -1.0, -self.defect_from * length), (0.0, 0.0, 1.0, self.defect_to * length)]
+        pieces = 1 if self.defect_width_degrees <= 180 else 2
+        half = math.radians(self.defect_width_degrees) / pieces / 2
+        middle = math.radians(self.defect_angle_degrees)
+        sides = []
+        for piece in range(pieces):
+            direction = middle + (2 * piece - (pieces - 1)) * half
+            # Angles run from anterior (y) to lateral (x): the edge at angle a has its outward normal a quarter further.
+            first, last = direction - half - math.pi / 2, direction + half + math.pi / 2
+            sides.append([(math.sin(a), math.cos(a), 0.0, 0.0) for a in (first, last)] + ends)
+        return sides
+
+
+def _half_ellipsoid(radius: float, length: float) -> float:
+    return 2 / 3 * math.pi * radius**2 * length
+
+
+def _radius(volume: float, length: float) -> float:
+    """Of half an ellipsoid of that volume, mm^3, and length, mm."""
+    return math.sqrt(1.5 * volume / (math.pi * length))
+
+
+def _wall(radius: float, length: float, volume: float) -> float:
+    """Thickness w, mm, with which half an ellipsoid of `radius + w` and `length + w` has `volume`, mm^3."""
+    product = 1.5 * volume / math.pi
+    roots = np.roots([1.0, 2 * radius + length, radius**2 + 2 * radius * length, radius**2 * length - product])
+    return float(roots.real[np.argmin(np.abs(roots.imag) + np.where(roots.real > 0, 0.0, np.inf))])
+
+
+def _in_torso(lateral: float, anterior: float, apical: float) -> NDArray[np.float64]:
+    return np.array([lateral, anterior, apical]) @ _orthonormal()
+
+
+def _euler_angles() -> tuple[float, float, float]:
+    """phi, theta, psi of `euler_pose` that turn x, y, z to lateral, anterior, apical."""
+    turn = _orthonormal().T
+    return math.atan2(turn[1, 2], turn[0, 2]), math.acos(turn[2, 2]), math.atan2(turn[2, 1], -turn[2, 0])
+
+
+def _orthonormal() -> NDArray[np.float64]:
+    """The heart's axes, rows, without the rounding of their four digits."""
+    u, _, v = np.linalg.svd(_HEART)
+    return u @ v

@@ -46,7 +46,7 @@ def _mesh_of(item: bpy.types.Object, depsgraph: bpy.types.Depsgraph) -> Mesh:
     faces = faces.reshape(-1, 3)
     if np.linalg.det(pose[:3, :3]) < 0:  # a mirrored object shows the other side of its faces
         faces = faces[:, ::-1]
-    return Mesh(points.reshape(-1, 3).astype(np.float64) @ pose[:3, :3].T + pose[:3, 3], faces)
+    return Mesh(points.reshape(-1, 3).astype(np.float64) @ pose[:3, :3].T + pose[:3, 3], faces.astype(np.int64))
 
 
 def add_mesh(mesh: Mesh, name: str, pose: NDArray[np.float64], collection: bpy.types.Collection) -> bpy.types.Object:

@@ -1,8 +1,8 @@
-"""Core volumes <-> OpenVDB files <-> Blender's Volume objects.
+"""Core volumes <-> Blender's Volume objects.
 
-The .vdb holds every voxel's exact float32 value, the exact float64 affine, the quantity, the unit and where the volume
-came from; a saved .blend can therefore be projected again after it is opened. The object's matrix carries the pose: the
-affine in the file is from voxel index to the object's own space, so that moving the object moves the phantom.
+The voxels lie in a .vdb (see `vdb`), so that a saved .blend can be projected again after it is opened. The object's
+matrix carries the pose: the affine in the file is from voxel index to the object's own space, so that moving the object
+moves the phantom.
 """
 
 from __future__ import annotations
@@ -18,83 +18,15 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..core.errors import InputError
-from ..core.files import replacing
 from ..core.frames import checked_affine
 from ..core.grid import Grid
-from ..core.memory import require
-from ..core.version import VERSION
 from ..core.volume import UNITS, Volume
-from . import ids, storage, volume_materials
+from . import compat, ids, storage, volume_materials
 from .cameras import world_matrix
-from .compat import VDB_CENTER_SHIFT
+from .vdb import read_vdb, write_vdb
 
 MAX_SHOWN_VOXELS = 256**3
 """More non-zero voxels than this are shown as a coarser copy: Blender's window would hang on them."""
-
-
-def write_vdb(volume: Volume, path: Path, provenance: dict[str, Any] | None = None) -> None:
-    """Write a volume as one sparse float grid named after its quantity.
-
-    The transform is that of the running Blender (see `compat.VDB_CENTER_SHIFT`); the metadata hold the exact affine
-    with the voxel-centre convention, so that `read_vdb` gives the same volume in every version.
-    """
-    vdb = _openvdb()
-    grid = vdb.FloatGrid()
-    array, affine = volume.array, volume.grid.affine
-    mirrored = np.linalg.det(affine[:3, :3]) < 0
-    if mirrored:  # 4.5 draws nothing where the transform is left-handed: the same voxels, counted from the other end
-        turn = np.diag([-1.0, 1.0, 1.0, 1.0])
-        turn[0, 3] = array.shape[0] - 1
-        array, affine = array[::-1], affine @ turn
-    # A copy, because it takes neither strides nor read-only arrays.
-    grid.copyFromArray(np.array(array, np.float32, order="C"), tolerance=0.0)
-    grid.name = volume.quantity
-    grid.gridClass = vdb.GridClass.FOG_VOLUME
-    shift = np.eye(4)
-    shift[:3, 3] = VDB_CENTER_SHIFT
-    # OpenVDB's matrices act on row vectors.
-    grid.transform = vdb.createLinearTransform((affine @ shift).T.tolist())
-    grid["mphdrr_quantity"] = volume.quantity
-    grid["mphdrr_unit"] = volume.unit
-    grid["mphdrr_shape"] = json.dumps(volume.grid.shape)
-    grid["mphdrr_affine"] = json.dumps(volume.grid.affine.tolist())
-    grid["mphdrr_mirrored"] = bool(mirrored)
-    grid["mphdrr_center_shift"] = float(VDB_CENTER_SHIFT)
-    grid["mphdrr_provenance"] = json.dumps(provenance or {})
-    grid["mphdrr_version"] = VERSION
-    with replacing(path) as temporary:
-        vdb.write(str(temporary), grids=[grid])
-
-
-def read_vdb(path: Path) -> Volume:
-    """Read back what `write_vdb` wrote: the same values, affine and quantity, to the last bit.
-
-    Raises
-    ------
-    InputError
-        No such file, not one of ours, or damaged.
-    """
-    if not path.is_file():
-        raise InputError(f"{path}: no such file; the volume's voxels are gone, so add the volume again")
-    vdb = _openvdb()
-    try:
-        grid = vdb.readAll(str(path))[0][0]
-        metadata = grid.metadata
-        shape = tuple(json.loads(metadata["mphdrr_shape"]))
-        affine = np.array(json.loads(metadata["mphdrr_affine"]))
-        quantity = metadata["mphdrr_quantity"]
-        mirrored = metadata["mphdrr_mirrored"]
-    except KeyError as error:
-        raise InputError(f"{path}: was not written by mphDRR ({error} is missing)") from None
-    except Exception as error:  # whatever OpenVDB raises on a damaged file
-        raise InputError(f"{path}: cannot be read as an OpenVDB volume ({error})") from error
-    require(4 * np.prod(shape, dtype=float), f"the volume of {' x '.join(map(str, shape))} voxels")
-    array = np.zeros(shape, np.float32)
-    grid.copyToArray(array)
-    if mirrored:
-        array = np.ascontiguousarray(array[::-1])
-    array.flags.writeable = False
-    return Volume(array, Grid(shape, affine), quantity)
 
 
 def add_volume(
@@ -227,11 +159,11 @@ def after_load(*_: Any) -> None:
         if not is_volume(item):
             continue
         settings = getattr(item, ids.OBJECT_VOLUME)
-        if settings.center_shift != VDB_CENTER_SHIFT:
+        if settings.center_shift != compat.VDB_CENTER_SHIFT:
             try:
                 shown = _store(read_vdb(file_of(item)), {})
                 item.data.filepath = storage.stored_path(shown)
-                settings.center_shift = VDB_CENTER_SHIFT
+                settings.center_shift = compat.VDB_CENTER_SHIFT
             except InputError as error:
                 print(f"mphDRR: {item.name} is drawn half a voxel off: {error}")
 
@@ -275,7 +207,7 @@ def _volume_data(
 def _store(local: Volume, provenance: dict[str, Any] | None) -> Path:
     """Write a volume, and a coarser copy if it is large, under names from their content; the path to show."""
     digest = hashlib.sha256(local.array.data)
-    recipe = (local.grid.shape, local.grid.affine.tolist(), local.quantity, VDB_CENTER_SHIFT, provenance or {})
+    recipe = (local.grid.shape, local.grid.affine.tolist(), local.quantity, compat.VDB_CENTER_SHIFT, provenance or {})
     digest.update(json.dumps(recipe).encode())
     stem = f"{local.quantity}-{digest.hexdigest()[:16]}"
     path = storage.folder() / f"{stem}.vdb"
@@ -304,7 +236,7 @@ def _describe(item: bpy.types.Object, volume: Volume, pose: NDArray[np.float64])
     settings.spacing = volume.grid.spacing
     settings.maximum = float(volume.array.max(initial=0.0))
     settings.exact_pose = json.dumps(pose.tolist())
-    settings.center_shift = VDB_CENTER_SHIFT
+    settings.center_shift = compat.VDB_CENTER_SHIFT
 
 
 def _extent(volume: Volume) -> float:
@@ -315,14 +247,3 @@ def _extent(volume: Volume) -> float:
         used = np.flatnonzero(filled.any(axis=tuple(k for k in range(3) if k != axis)))
         sides.append(spacing * (used[-1] - used[0] + 1) if len(used) else spacing)
     return float(max(sides))
-
-
-def _openvdb() -> Any:
-    try:
-        import openvdb
-    except ImportError:
-        if not hasattr(bpy.utils, "expose_bundled_modules"):
-            raise InputError("this Blender has no openvdb module: use 4.5 or later from blender.org") from None
-        bpy.utils.expose_bundled_modules()  # needed by the bpy wheel only
-        import openvdb
-    return openvdb

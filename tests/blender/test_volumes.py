@@ -25,7 +25,7 @@ AFFINES = {
     "anisotropic": np.diag([0.703, 0.703, 2.5, 1.0]),
     "rotated": euler_pose(0.4, 0.7, -0.3, (30.0, -20.0, 10.0)) @ np.diag([1.0, 2.0, 3.0, 1.0]),
     "sheared": euler_pose(0.4, 0.7, -0.3, (5.0, 6.0, 7.0)) @ SHEAR @ np.diag([2.0, 1.5, 1.0, 1.0]),
-    "mirrored": euler_pose(0.1, -0.2, 0.5, (-4.0, 1.0, 2.0)) @ np.diag([-1.5, 2.0, 1.0, 1.0]),
+    "mirrored": euler_pose(1.1, 0.2, 0.5, (4.0, -1.0, 2.0)) @ SHEAR @ np.diag([1.5, -2.0, 1.0, 1.0]),
 }
 
 
@@ -259,10 +259,11 @@ def test_volumes_are_within_eevees_reach(scene):
 
 def test_volume_drawn_for_another_blender_is_rewritten_on_load(tmp_path, sparse_volume, monkeypatch):
     other = -0.5 - compat.VDB_CENTER_SHIFT
-    monkeypatch.setattr(volumes, "VDB_CENTER_SHIFT", other)
+    running = compat.VDB_CENTER_SHIFT
+    monkeypatch.setattr(compat, "VDB_CENTER_SHIFT", other)
     volumes.add_volume(sparse_volume, "Sample")
     bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "a.blend"))
-    monkeypatch.setattr(volumes, "VDB_CENTER_SHIFT", compat.VDB_CENTER_SHIFT)
+    monkeypatch.setattr(compat, "VDB_CENTER_SHIFT", running)
     bpy.ops.wm.open_mainfile(filepath=str(tmp_path / "a.blend"))
     item = bpy.data.objects["Sample"]
     assert item.mphdrr_volume.center_shift == compat.VDB_CENTER_SHIFT

@@ -15,7 +15,11 @@ from .export import read_run, write_run
 from .frames import euler_pose
 from .geometry_checks import GeometryReport, check_geometry
 from .grid import Grid
+from .hounsfield import diffdrr_density, hu_to_mu
 from .isotopes import ISOTOPES, Isotope, isotope
+from .meshes.mesh import Mesh, read_mesh, write_mesh
+from .meshes.surface import volume_to_mesh
+from .meshes.voxelization import voxelize_mesh
 from .mosaic import as_seen, mosaic
 from .noise import sample_counts
 from .performance import ModulePerformance, isocentre_performance, magnification, resolution, seen, sensitivity
@@ -24,6 +28,8 @@ from .presets import c_arm_views, pinhole_views
 from .progress import Cancelled, Progress
 from .project import project_run
 from .projector import Emission, InverseSquareSum, Projector, Transmission, intensity, trace_rays
+from .rearranging import canonical, centered, crop, crop_to_box, pad, split_labels
+from .resampling import resample
 from .run import ProjectionRun
 from .system import PinholeSystem
 from .views import Views
@@ -42,6 +48,7 @@ __all__ = [
     "InputWarning",
     "InverseSquareSum",
     "Isotope",
+    "Mesh",
     "ModulePerformance",
     "PinholeSystem",
     "Progress",
@@ -54,25 +61,38 @@ __all__ = [
     "WrittenWorkbook",
     "as_seen",
     "c_arm_views",
+    "canonical",
+    "centered",
     "check_geometry",
     "collimator_length",
+    "crop",
+    "crop_to_box",
+    "diffdrr_density",
     "euler_pose",
+    "hu_to_mu",
     "intensity",
     "isocentre_performance",
     "isotope",
     "magnification",
     "mosaic",
+    "pad",
     "pinhole_views",
     "project_run",
+    "read_mesh",
     "read_run",
     "read_system",
     "read_volume",
+    "resample",
     "resolution",
     "roi_radius_seen",
     "sample_counts",
     "seen",
     "sensitivity",
+    "split_labels",
     "trace_rays",
+    "volume_to_mesh",
+    "voxelize_mesh",
+    "write_mesh",
     "write_run",
     "write_system",
     "write_volume",

@@ -28,6 +28,7 @@ from torch import Tensor
 from .checks import positive, whole_shape
 from .errors import InputError
 from .grid import Grid
+from .hounsfield import diffdrr_density
 from .projector.tracing import trace_rays
 from .rotations import SIZES, pose_matrix, rotation_matrix, rotation_parameters, se3_exp, se3_log
 from .trilinear import OldTrilinear, Trilinear
@@ -41,7 +42,6 @@ _ORIENTATIONS = {
     "PA": ((1.0, 0.0, 0.0), (0.0, 0.0, 1.0), (0.0, 1.0, 0.0)),
     None: ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)),
 }
-_AIR, _BONE = -800.0, 350.0  # HU, DiffDRR's limits
 _SIDDON_OPTIONS = {"eps", "filter_intersections_outside_volume", "stop_gradients_through_grid_sample"}
 
 
@@ -197,13 +197,7 @@ def read(
 
 def hu_to_density(hu: Tensor, bone_attenuation_multiplier: float = 1.0) -> Tensor:
     """CT numbers to 0..1 as DiffDRR does: air as thin as the thinnest tissue, bone times a factor; no physical unit."""
-    hu = hu.to(torch.float32)
-    tissue = hu[(hu > _AIR) & (hu <= _BONE)]
-    density = torch.where(hu > _BONE, hu * bone_attenuation_multiplier, hu)
-    if tissue.numel():
-        density = torch.where(hu <= _AIR, tissue.min(), density)
-    density = density - density.min()
-    return density / density.max().clamp_min(torch.finfo(torch.float32).tiny)
+    return torch.from_numpy(diffdrr_density(hu.detach().cpu().numpy(), bone_attenuation_multiplier)).to(hu.device)
 
 
 def drr_arguments(views: Views, m: int, orientation: str | None = "AP") -> tuple[dict[str, Any], RigidTransform]:

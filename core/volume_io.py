@@ -1,55 +1,94 @@
-"""Volumes in files: NIfTI, and npz with the exact affine."""
+"""Volumes in files: which format a file is in, and one clear line for every file that is none."""
 
 from __future__ import annotations
 
-import json
-import math
 import os
 from pathlib import Path
 
-import numpy as np
+from numpy.typing import ArrayLike
 
-from .checks import freeze
+from .checks import real_array
 from .errors import InputError
 from .files import replacing
-from .grid import Grid
-from .memory import require
+from .progress import Cancelled, Progress
 from .volume import UNITS, Volume
+from .volume_formats import dicom, hdf5, metaimage, nifti, nrrd, numpy_files
+from .volume_formats.contents import Contents, first_line
 
-VOLUME_FORMATS = (".nii", ".nii.gz", ".npz")
-_MILLIMETRES = {"unknown": 1.0, "mm": 1.0, "meter": 1000.0, "micron": 0.001}
+_READERS = {
+    ".nii": nifti.read,
+    ".nii.gz": nifti.read,
+    ".hdr": nifti.read,
+    ".img": nifti.read,
+    ".npz": numpy_files.read,
+    ".npy": numpy_files.read,
+    ".nrrd": nrrd.read,
+    ".nhdr": nrrd.read,
+    ".mha": metaimage.read,
+    ".mhd": metaimage.read,
+    ".h5": hdf5.read,
+    ".hdf5": hdf5.read,
+}
+_WRITERS = {
+    ".nii": nifti.write,
+    ".nii.gz": nifti.write,
+    ".npz": numpy_files.write,
+    ".nrrd": nrrd.write,
+    ".h5": hdf5.write,
+    ".hdf5": hdf5.write,
+}
+VOLUME_FORMATS = tuple(_WRITERS)
+"""Endings of the names of files that `write_volume` writes."""
+READ_FORMATS = (*_READERS, ".dcm")
+"""Endings of the names of files that `read_volume` reads, beside folders of DICOM files and their files of any name."""
 
 
-def read_volume(path: str | os.PathLike[str], quantity: str | None = None) -> Volume:
-    """Read a volume from NIfTI (.nii, .nii.gz) or .npz.
+def read_volume(
+    path: str | os.PathLike[str],
+    quantity: str | None = None,
+    *,
+    affine: ArrayLike | None = None,
+    series: str | None = None,
+    progress: Progress | None = None,
+) -> Volume:
+    """Read a volume from NIfTI, a DICOM series, MetaImage, NRRD, Analyze, HDF5, .npz or .npy.
+
+    The world's axes are RAS, NIfTI's, whatever the format's are. docs/volumes.md has the formats and conventions.
 
     Parameters
     ----------
     path
-        The file.
+        The file; of a DICOM series its folder, or any file of it.
     quantity
-        What the values are: ``"activity"`` (kBq/mL), ``"mu"`` (1/mm) or ``"hu"``. Default: what the file says;
-        a NIfTI file that says nothing is taken for CT, ``"hu"``.
+        What the values are: one of `UNITS`, such as ``"activity"`` (kBq/mL), ``"mu"`` (1/mm) or ``"hu"``. Default: what
+        the file says; a file that says nothing is taken for CT, ``"hu"``.
+    affine
+        Index to world mm (4, 4), in place of the file's own; .npy files need it.
+    series
+        Of several DICOM series in the folder the one with this number, description or UID.
+    progress
+        Called as ``progress(done, total)`` with the slices of a DICOM series; may raise `Cancelled`.
 
     Raises
     ------
     InputError
-        No such file, not such a file, damaged, not 3-D, not finite, or too large for the memory.
+        No such file, not such a file, damaged, not 3-D, not finite, in another unit, too large for the memory; of a DICOM
+        series: several of them, slices missing, double, unlike each other or tilted.
     """
     path = Path(path)
-    if not path.is_file():
-        raise InputError(f"{path}: no such file")
-    kind = _kind(path)
+    contents = _contents(path, series, progress)
     try:
-        return _read_npz(path, quantity) if kind == ".npz" else _read_nifti(path, quantity)
+        if affine is not None:
+            contents = Contents(contents.array, real_array(affine, "affine", (4, 4)), contents.quantity, contents.unit)
+        if contents.quantity is not None and contents.quantity not in UNITS and quantity is None:
+            raise InputError(f"it holds {contents.quantity!r}: say which quantity that is, one of {', '.join(UNITS)}")
+        return contents.volume(quantity or contents.quantity or "hu")
     except InputError as error:
         raise InputError(f"{path}: {error}") from None
-    except Exception as error:  # whatever numpy, nibabel, zip or gzip raise on a damaged file
-        raise InputError(f"{path}: cannot be read as {kind} ({_first_line(error)})") from error
 
 
 def write_volume(volume: Volume, path: str | os.PathLike[str]) -> None:
-    """Write a volume as NIfTI (.nii, .nii.gz; its affine is rounded to float32) or .npz (exact).
+    """Write a volume as NIfTI (.nii, .nii.gz; its affine is rounded to float32), .npz, .nrrd or .h5 (exact).
 
     Raises
     ------
@@ -57,74 +96,36 @@ def write_volume(volume: Volume, path: str | os.PathLike[str]) -> None:
         Another suffix, or the file cannot be written.
     """
     path = Path(path)
-    kind = _kind(path)
+    write = _WRITERS.get(_ending(path, VOLUME_FORMATS))
+    if write is None:
+        raise InputError(f"{path}: expected a name ending in {', '.join(VOLUME_FORMATS)}")
     with replacing(path) as temporary:
-        if kind == ".npz":
-            with open(temporary, "wb") as file:
-                np.savez_compressed(
-                    file, array=volume.array, affine=volume.grid.affine, quantity=volume.quantity, unit=volume.unit
-                )
-        else:
-            _write_nifti(volume, temporary)
+        write(volume, temporary)
 
 
-def _read_npz(path: Path, quantity: str | None) -> Volume:
-    file = np.load(path, allow_pickle=False)
-    if not isinstance(file, np.lib.npyio.NpzFile):
-        raise InputError("expected an npz archive, found a single array")
-    with file:
-        missing = {"array", "affine", "quantity"} - set(file.files)
-        if missing:
-            raise InputError(f"expected the arrays array, affine and quantity; {', '.join(sorted(missing))} not found")
-        array = file["array"]
-        if array.ndim != 3:
-            raise InputError(f"expected a 3-D array, got shape {array.shape}")
-        n_x, n_y, n_z = array.shape
-        return Volume(freeze(array), Grid((n_x, n_y, n_z), file["affine"]), quantity or str(file["quantity"]))
-
-
-def _read_nifti(path: Path, quantity: str | None) -> Volume:
-    import nibabel
-    from nibabel.filebasedimages import ImageFileError
-
+def _contents(path: Path, series: str | None, progress: Progress | None) -> Contents:
+    """What the file at `path` holds, or `InputError` that names it."""
+    if not path.exists():
+        raise InputError(f"{path}: no such file")
+    ending = _ending(path, READ_FORMATS)
+    is_series = path.is_dir() or ending == ".dcm" or (not ending and dicom.is_dicom(path))
+    if not (ending or is_series):
+        raise InputError(f"{path}: expected a folder of DICOM files, or a name ending in {', '.join(READ_FORMATS)}")
+    if series is not None and not is_series:
+        raise InputError(f"{path}: only folders of DICOM files hold several series")
     try:
-        image = nibabel.load(path)
-    except ImageFileError as error:
-        raise InputError(f"not a NIfTI file ({_first_line(error)})") from None
-    if not isinstance(image, nibabel.Nifti1Image):
-        raise InputError(f"expected NIfTI, found {type(image).__name__}")
-    image = nibabel.squeeze_image(image)  # (x, y, z, 1) is common, and a volume
-    shape = image.shape
-    if len(shape) != 3:
-        raise InputError(f"expected a 3-D image, got shape {' x '.join(map(str, shape))}")
-    if image.get_data_dtype().kind not in "fiu":
-        raise InputError(f"expected real numbers, found {image.get_data_dtype()}")
-    require(8.5 * math.prod(shape), "a volume of {} x {} x {} voxels".format(*shape))
-    unit = image.header.get_xyzt_units()[0]
-    affine = np.array(image.affine, np.float64)
-    affine[:3] *= _MILLIMETRES[unit]
-    array = np.ascontiguousarray(image.get_fdata(dtype=np.float32, caching="unchanged"))
-    named = image.header.get_intent()[2]
-    return Volume(freeze(array), Grid(shape, affine), quantity or (named if named in UNITS else "hu"))
+        return dicom.read(path, series, progress) if is_series else _READERS[ending](path)
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from None
+    except (MemoryError, Cancelled):
+        raise
+    except Exception as error:  # whatever a library raises on a damaged file
+        raise InputError(
+            f"{path}: cannot be read as {'DICOM' if is_series else ending} ({first_line(error)})"
+        ) from error
 
 
-def _write_nifti(volume: Volume, path: Path) -> None:
-    import nibabel
-
-    image = nibabel.Nifti1Image(volume.array, volume.grid.affine)
-    image.header.set_xyzt_units("mm")
-    image.header.set_intent("none", name=volume.quantity)
-    image.header["descrip"] = json.dumps({"quantity": volume.quantity, "unit": volume.unit}).encode()[:79]
-    nibabel.save(image, path)
-
-
-def _kind(path: Path) -> str:
+def _ending(path: Path, endings: tuple[str, ...]) -> str:
+    """The one of `endings` that the name has, or ""."""
     name = path.name.lower()
-    for suffix in VOLUME_FORMATS:
-        if name.endswith(suffix):
-            return suffix
-    raise InputError(f"{path}: expected a name ending in {', '.join(VOLUME_FORMATS)}")
-
-
-def _first_line(error: Exception) -> str:
-    return (str(error) or type(error).__name__).splitlines()[0]
+    return next((ending for ending in endings if name.endswith(ending)), "")

@@ -32,7 +32,7 @@ class _Parser(argparse.ArgumentParser):
 
 def build_parser(more_commands: Sequence[AddParser] = ()) -> argparse.ArgumentParser:
     """The parser of ``mphdrr``, with this package's commands and `more_commands`."""
-    from . import export, geometry, phantom, project
+    from . import export, geometry, phantom, project, volume
 
     parser = _Parser(
         prog="mphdrr",
@@ -41,7 +41,9 @@ def build_parser(more_commands: Sequence[AddParser] = ()) -> argparse.ArgumentPa
     )
     parser.add_argument("--version", action="version", version=f"mphDRR {VERSION}")
     commands = parser.add_subparsers(title="commands", metavar="COMMAND", required=True, parser_class=_Parser)
-    for add_parser in (geometry.add_parser, phantom.add_parser, project.add_parser, export.add_parser, *more_commands):
+    for command in (geometry, phantom, volume, project, export):
+        command.add_parser(commands)
+    for add_parser in more_commands:
         add_parser(commands)
     return parser
 

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from ..errors import InputError
 from ..files import ensure_folder, refuse_folder
+from ..isotopes import ISOTOPES
 from ..progress import Progress
 from ..system import PinholeSystem
 
@@ -109,6 +110,17 @@ def output_path(text: str, suffixes: tuple[str, ...] = ()) -> Path:
     refuse_folder(path)
     ensure_folder(path.parent)
     return path
+
+
+def photon_energy(text: str) -> float:
+    """keV, from a number or from the name of an isotope: the energy of its strongest line."""
+    if text in ISOTOPES:
+        energy, _ = max(ISOTOPES[text].lines, key=lambda line: line[1])
+        return energy
+    try:
+        return float(text)
+    except ValueError:
+        raise InputError(f"energy {text!r}: expected keV, or one of {', '.join(ISOTOPES)}") from None
 
 
 def progress_bar(label: str) -> Progress:

@@ -28,7 +28,7 @@ def add_parser(subparsers) -> None:  # type: ignore[no-untyped-def]
         "mphdrr phantom derenzo --radius 40 --rods 8 6 5 4 3 2 --euler 30 0 0 -o derenzo.nii.gz",
     )
     add_phantom_options(derenzo)
-    derenzo.add_argument("-o", "--output", required=True, metavar="FILE", help=".nii, .nii.gz or .npz")
+    derenzo.add_argument("-o", "--output", required=True, metavar="FILE", help=", ".join(VOLUME_FORMATS))
     derenzo.set_defaults(run=_run)
 
 

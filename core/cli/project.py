@@ -12,14 +12,25 @@ import numpy as np
 
 from ..errors import InputError
 from ..export import FORMATS, write_run
+from ..hounsfield import hu_to_mu
 from ..isotopes import CZT_MU, ISOTOPES, NAI_MU, TUNGSTEN_MU
 from ..mosaic import mosaic, write_png
 from ..project import project_run
 from ..projector import Emission, InverseSquareSum, Model, Transmission
+from ..rearranging import centered
 from ..system import PinholeSystem
+from ..volume import Volume
 from ..volume_io import read_volume
 from ..workbook import read_system
-from .options import add_command, add_phantom_options, add_view_options, chosen_modules, output_path, progress_bar
+from .options import (
+    add_command,
+    add_phantom_options,
+    add_view_options,
+    chosen_modules,
+    output_path,
+    photon_energy,
+    progress_bar,
+)
 from .phantom import derenzo_volume
 
 _EMISSION = [field.name for field in fields(Emission)]
@@ -36,7 +47,16 @@ def add_parser(subparsers) -> None:  # type: ignore[no-untyped-def]
         "--time 600 --aperture-points 7 --aperture-mu 3.6 --crystal-mu 0.404 --noise 1 -o counts.h5",
     )
     parser.add_argument("workbook", metavar="WORKBOOK", help="geometry workbook (.xlsx, .xlsm)")
-    parser.add_argument("--volume", metavar="FILE", help=".nii, .nii.gz or .npz; without it, a Derenzo phantom is made")
+    parser.add_argument(
+        "--volume", metavar="FILE", help="volume or folder of a DICOM series; without it, a Derenzo phantom is made"
+    )
+    parser.add_argument(
+        "--energy", metavar="KEV",
+        help="CT numbers of --volume or --mu become attenuation (1/mm) at this energy, or at an isotope's strongest line",
+    )  # fmt: skip
+    parser.add_argument(
+        "--center", action="store_true", help="move the volume's middle to the isocentre, and --mu as far"
+    )
     add_view_options(parser)
     models = parser.add_argument_group("what pixels hold; without an option, line integrals")
     one = models.add_mutually_exclusive_group()
@@ -69,7 +89,10 @@ def add_emission_options(parser: argparse.ArgumentParser) -> None:
         source, "--window", type=float, nargs=2, metavar=("LOW", "HIGH"),
         help="energies that are counted, keV (default: 10 %% around the isotope's strongest line)",
     )  # fmt: skip
-    option(source, "--mu", metavar="FILE", help="attenuation coefficients, 1/mm, on any grid; without it, none")
+    option(
+        source, "--mu", metavar="FILE",
+        help="attenuation coefficients, 1/mm, on any grid, or with --energy CT numbers; without it, none",
+    )  # fmt: skip
     aperture = parser.add_argument_group("--emission: the pinhole")
     option(
         aperture, "--aperture-points", type=int, metavar="N", help="rays through the hole of each pixel (default: 1)"
@@ -101,35 +124,73 @@ def add_emission_options(parser: argparse.ArgumentParser) -> None:
     option(crystal, "--intrinsic-fwhm", type=float, metavar="MM", help="blur of the detector, mm (default: 0)")
 
 
-def chosen_model(arguments: argparse.Namespace, system: PinholeSystem) -> Model:
-    """The model that `arguments` ask for."""
+def chosen_model(arguments: argparse.Namespace, system: PinholeSystem, mu: Volume | None) -> Model:
+    """The model that `arguments` ask for; `mu` is what --mu holds."""
     given = {name: getattr(arguments, name) for name in _EMISSION if hasattr(arguments, name)}
-    if given and not arguments.emission:
-        raise InputError(f"--{next(iter(given)).replace('_', '-')} needs --emission")
-    if arguments.noise is not None and not arguments.emission and arguments.photons is None:
-        raise InputError("--noise needs --emission or --photons")
     if arguments.inverse_square:
         return InverseSquareSum(system)
     if not arguments.emission:
         return Transmission()
-    if "mu" in given:
-        given["mu"] = read_volume(given["mu"], "mu")
+    if mu is not None:
+        given["mu"] = mu
     if "opening_angle" in given:
         given["opening_angle"] = math.radians(given["opening_angle"])
     return Emission(system, **given)
+
+
+def _require_fitting(arguments: argparse.Namespace) -> None:
+    """Refuse options that mean nothing with the others."""
+    given = [name for name in _EMISSION if hasattr(arguments, name)]
+    if given and not arguments.emission:
+        raise InputError(f"--{given[0].replace('_', '-')} needs --emission")
+    if arguments.noise is not None and not arguments.emission and arguments.photons is None:
+        raise InputError("--noise needs --emission or --photons")
+    if arguments.center and not arguments.volume:
+        raise InputError("--center needs --volume")
+    if arguments.energy is not None and not (hasattr(arguments, "mu") or (arguments.volume and not arguments.emission)):
+        raise InputError("--energy needs a --volume of CT numbers, or with --emission a --mu of them")
+
+
+def _attenuation(path: str, energy: str | None) -> Volume:
+    """The volume of mu in a file: as it is, or from CT numbers at `energy`."""
+    if energy is not None:
+        volume = read_volume(path)
+        if volume.quantity != "hu":
+            raise InputError(f"{path}: it holds {volume.quantity}; --energy is for CT numbers (hu)")
+        return hu_to_mu(volume, photon_energy(energy))
+    volume = read_volume(path, "mu")
+    if volume.array.min() < 0:
+        raise InputError(
+            f"{path}: attenuation is never below 0; if these are CT numbers, give --energy to convert them"
+        )
+    return volume
+
+
+def _volumes(arguments: argparse.Namespace) -> tuple[Volume, Volume | None, dict[str, Any]]:
+    """What is projected, what attenuates it, and what a phantom was made from."""
+    recipe: dict[str, Any] = {}
+    if not arguments.volume:
+        volume, recipe = derenzo_volume(arguments)
+    elif arguments.emission:
+        volume = read_volume(arguments.volume, "activity")
+    elif arguments.photons is not None or arguments.energy is not None:
+        volume = _attenuation(arguments.volume, arguments.energy)
+    else:
+        volume = read_volume(arguments.volume)
+    mu = _attenuation(arguments.mu, arguments.energy) if hasattr(arguments, "mu") else None
+    if arguments.center:
+        if mu is not None:
+            mu = centered(mu, mu.grid.center - volume.grid.center)
+        volume = centered(volume)
+    return volume, mu, recipe
 
 
 def _run(arguments: argparse.Namespace) -> None:
     path = output_path(arguments.output, FORMATS)
     picture = output_path(arguments.mosaic) if arguments.mosaic else None
     system = chosen_modules(read_system(arguments.workbook), arguments.modules)
-    model = chosen_model(arguments, system)
-    recipe: dict[str, Any] = {}
-    if arguments.volume:
-        quantity = "activity" if arguments.emission else "mu" if arguments.photons is not None else None
-        volume = read_volume(arguments.volume, quantity)
-    else:
-        volume, recipe = derenzo_volume(arguments)
+    _require_fitting(arguments)
+    volume, mu, recipe = _volumes(arguments)
     run = project_run(
         system,
         volume,
@@ -143,8 +204,10 @@ def _run(arguments: argparse.Namespace) -> None:
             "volume": Path(arguments.volume).name if arguments.volume else "Derenzo phantom",
             **recipe,
             **({"mu_file": Path(arguments.mu).name} if hasattr(arguments, "mu") else {}),
+            **({"ct_converted_at_kev": photon_energy(arguments.energy)} if arguments.energy is not None else {}),
+            **({"centered": True} if arguments.center else {}),
         },
-        model=model,
+        model=chosen_model(arguments, system, mu),
         photons=arguments.photons,
         noise_seed=arguments.noise,
         progress=progress_bar("projecting"),

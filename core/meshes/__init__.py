@@ -1,0 +1,1 @@
+"""Triangle meshes: read and checked, into volumes and out of them."""

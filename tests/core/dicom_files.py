@@ -1,0 +1,58 @@
+"""Writes a volume of CT numbers as a DICOM series, by pydicom."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from pydicom.dataset import Dataset, FileMetaDataset
+from pydicom.uid import CTImageStorage, ExplicitVRLittleEndian, generate_uid
+
+import mphdrr.core as mph
+
+LPS = np.diag([-1.0, -1.0, 1.0, 1.0])
+
+
+def write_series(
+    volume: mph.Volume, folder: Path, number: int = 1, description: str = "Thorax", names=None
+) -> list[Dataset]:
+    """One file for each plane of iz, with its own slope and intercept; gives the data sets, which know their files."""
+    folder.mkdir(exist_ok=True)
+    affine = LPS @ volume.grid.affine
+    spacing = volume.grid.spacing
+    series, study, frame = generate_uid(), generate_uid(), generate_uid()
+    names = names if names is not None else [f"{number}-{k:04d}.dcm" for k in range(volume.grid.shape[2])]
+    written = []
+    for k, name in enumerate(names):
+        slope, intercept = (1.0, -1024.0) if k % 2 else (0.5, -1000.0)
+        data = Dataset()
+        data.file_meta = FileMetaDataset()
+        data.file_meta.TransferSyntaxUID = ExplicitVRLittleEndian
+        data.SOPClassUID = data.file_meta.MediaStorageSOPClassUID = CTImageStorage
+        data.SOPInstanceUID = data.file_meta.MediaStorageSOPInstanceUID = generate_uid()
+        data.Modality, data.SeriesNumber, data.SeriesDescription, data.InstanceNumber = "CT", number, description, k + 1
+        data.SeriesInstanceUID, data.StudyInstanceUID, data.FrameOfReferenceUID = series, study, frame
+        data.Rows, data.Columns = volume.grid.shape[1], volume.grid.shape[0]
+        data.PixelSpacing = [number_text(spacing[1]), number_text(spacing[0])]
+        data.SliceThickness = number_text(spacing[2])
+        axes = affine[:3, :2] / spacing[:2]
+        data.ImageOrientationPatient = [number_text(x) for x in axes.T.ravel()]
+        data.ImagePositionPatient = [number_text(x) for x in (affine @ [0, 0, k, 1])[:3]]
+        data.RescaleSlope, data.RescaleIntercept, data.RescaleType = slope, intercept, "HU"
+        data.SamplesPerPixel, data.PhotometricInterpretation = 1, "MONOCHROME2"
+        data.BitsAllocated, data.BitsStored, data.HighBit, data.PixelRepresentation = 16, 16, 15, 0
+        stored = np.rint((volume.array[:, :, k].T - intercept) / slope).astype("<u2")
+        data.PixelData = stored.tobytes()
+        data.filename = str(folder / name)
+        save(data)
+        written.append(data)
+    return written
+
+
+def number_text(value: float) -> str:
+    """A number in the 16 characters of a decimal string."""
+    return next(text for digits in range(16, 0, -1) if len(text := f"{value:.{digits}g}") <= 16)
+
+
+def save(data: Dataset) -> None:
+    data.save_as(data.filename, enforce_file_format=True)

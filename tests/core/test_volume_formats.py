@@ -1,0 +1,468 @@
+"""Volumes in every format: round trips, where DICOM and ITK put things, and one clear line for what is no volume."""
+
+from __future__ import annotations
+
+import shutil
+import zlib
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import mphdrr.core as mph
+from mphdrr.core.frames import euler_pose
+
+from .conftest import general_grid
+from .dicom_files import LPS, number_text, save, write_series
+
+CHEST = Path(__file__).parents[3] / "shared" / "data" / "chest_ct_3mm.nii.gz"
+
+
+def turned_grid(shape=(5, 6, 7)) -> mph.Grid:
+    """Oblique, with right angles and iz towards the head: what a series can hold as it is."""
+    affine = euler_pose(0.3, 0.2, -0.1, (10, -20, 30))
+    affine[:3, :3] @= np.diag([0.7, 0.9, 2.5])
+    return mph.Grid(shape, affine)
+
+
+@pytest.fixture
+def ct(rng) -> mph.Volume:
+    grid = turned_grid()
+    return mph.Volume(rng.integers(-1000, 2000, grid.shape), grid, "hu")
+
+
+@pytest.mark.parametrize("name", ["v.npz", "v.nrrd", "v.h5", "v.HDF5"])
+def test_exact_formats_give_back_all_of_a_volume(tmp_path, rng, name):
+    grid = general_grid(rng, (5, 6, 7))
+    volume = mph.Volume(rng.normal(size=grid.shape), grid, "mu")
+    mph.write_volume(volume, tmp_path / name)
+    back = mph.read_volume(tmp_path / name)
+    assert np.array_equal(back.array, volume.array)
+    assert np.array_equal(back.grid.affine, grid.affine)
+    assert back.quantity == "mu"
+    assert [p.name for p in tmp_path.iterdir()] == [name]
+
+
+def test_a_runs_volume_is_read_from_its_file(tmp_path, system, ct):
+    run = mph.project_run(system[:1], mph.hu_to_mu(ct), shape=(4, 4), backend="numpy")
+    mph.write_run(run, tmp_path / "run.h5")
+    back = mph.read_volume(tmp_path / "run.h5")
+    assert np.array_equal(back.array, run.volume.array)
+    assert (back.grid, back.quantity) == (run.volume.grid, "mu")
+
+
+@pytest.mark.parametrize("kind", ["<i2", ">i2", "<f4", "u1"])
+def test_analyze_and_npy(tmp_path, rng, kind):
+    import nibabel
+
+    array = rng.integers(0, 200, (4, 5, 6)).astype(kind)
+    nibabel.save(nibabel.Nifti1Pair(array, turned_grid().affine), tmp_path / "pair.img")
+    assert np.array_equal(mph.read_volume(tmp_path / "pair.hdr").array, array)
+    with pytest.warns(mph.InputWarning, match="do not say where the patient lies"):
+        nibabel.save(nibabel.AnalyzeImage(array.astype("i2"), None), tmp_path / "old.img")
+        assert np.array_equal(mph.read_volume(tmp_path / "old.img").array, array)
+    np.save(tmp_path / "a.npy", array)
+    volume = mph.read_volume(tmp_path / "a.npy", "mu", affine=turned_grid().affine)
+    assert np.array_equal(volume.array, array)
+    assert np.array_equal(volume.grid.affine, turned_grid().affine)
+
+
+def write_meta_image(path: Path, array: np.ndarray, lines: str = "", data: bytes | None = None, **changes: str) -> None:
+    header = {
+        "ObjectType": "Image",
+        "NDims": "3",
+        "BinaryData": "True",
+        "BinaryDataByteOrderMSB": "False",
+        "CompressedData": "False",
+        "TransformMatrix": "0 1 0 -1 0 0 0 0 1",  # axis 0 along y, axis 1 along -x
+        "Offset": "10 20 30",
+        "ElementSpacing": "0.5 2 3",
+        "DimSize": " ".join(map(str, array.shape)),
+        "ElementType": "MET_SHORT",
+        "ElementDataFile": "LOCAL",
+        **changes,
+    }
+    header["ElementDataFile"] = header.pop("ElementDataFile")  # the last line
+    text = "".join(f"{key} = {value}\n" for key, value in header.items() if value)
+    path.write_bytes(text.encode() + (array.tobytes(order="F") if data is None else data))
+
+
+def test_meta_image_lies_where_itk_puts_it(tmp_path, rng):
+    array = rng.integers(-1000, 2000, (3, 4, 5)).astype("<i2")
+    path = tmp_path / "v.mha"
+    write_meta_image(path, array)
+    volume = mph.read_volume(path)
+    assert np.array_equal(volume.array, array)
+    expected = LPS @ [[0, -2, 0, 10], [0.5, 0, 0, 20], [0, 0, 3, 30], [0, 0, 0, 1]]
+    assert np.allclose(volume.grid.affine, expected)
+    write_meta_image(path, array, CompressedData="True", data=zlib.compress(array.tobytes(order="F")))
+    assert np.array_equal(mph.read_volume(path).array, array)
+    raw = array.astype(">i2").tobytes(order="F")
+    (tmp_path / "v.raw").write_bytes(b"12345" + raw)
+    for skip in ("5", "-1"):
+        changes = {"BinaryDataByteOrderMSB": "True", "HeaderSize": skip}
+        write_meta_image(tmp_path / "v.mhd", array, data=b"", **changes, ElementDataFile="")
+        with open(tmp_path / "v.mhd", "a") as file:
+            file.write("ElementDataFile = v.raw\n")
+        assert np.array_equal(mph.read_volume(tmp_path / "v.mhd").array, array)
+
+
+@pytest.mark.parametrize("name", ["v.mha", "v.mhd", "v.nrrd", "v.nii.gz", "series"])
+def test_simpleitk_puts_every_voxel_in_the_same_place(tmp_path, ct, name):
+    itk = pytest.importorskip("SimpleITK", reason="SimpleITK is not installed")
+    image = itk.GetImageFromArray(ct.array.transpose(2, 1, 0))
+    lps = LPS @ ct.grid.affine
+    image.SetSpacing(ct.grid.spacing.tolist())
+    image.SetDirection((lps[:3, :3] / ct.grid.spacing).ravel().tolist())
+    image.SetOrigin(lps[:3, 3].tolist())
+    if name == "series":
+        write_series(ct, tmp_path / name)
+        reader = itk.ImageSeriesReader()
+        reader.SetFileNames(reader.GetGDCMSeriesFileNames(str(tmp_path / name)))
+        back = reader.Execute()
+        assert np.allclose(
+            back.TransformIndexToPhysicalPoint((1, 2, 3)), image.TransformIndexToPhysicalPoint((1, 2, 3))
+        )
+        assert np.array_equal(itk.GetArrayFromImage(back), itk.GetArrayFromImage(image))
+    else:
+        itk.WriteImage(image, str(tmp_path / name), useCompression=name == "v.mha")
+    volume = mph.read_volume(tmp_path / name)
+    assert np.array_equal(volume.array, ct.array)
+    assert np.allclose(volume.grid.affine, ct.grid.affine, rtol=0, atol=1e-5)
+    for suffix in (".nrrd", ".nii"):
+        mph.write_volume(ct, tmp_path / f"ours{suffix}")
+        theirs = itk.ReadImage(str(tmp_path / f"ours{suffix}"))
+        assert np.allclose(theirs.TransformIndexToPhysicalPoint((4, 0, 6)), (lps @ [4, 0, 6, 1])[:3], atol=1e-4)
+        assert np.array_equal(itk.GetArrayFromImage(theirs), ct.array.transpose(2, 1, 0))
+
+
+@pytest.mark.parametrize("space", ["right-anterior-superior", "left-anterior-superior", "LPS", None])
+def test_nrrd_spaces(tmp_path, rng, space):
+    import nrrd
+
+    array = rng.integers(0, 100, (3, 4, 5)).astype(np.int16)
+    header = {"space directions": np.diag([1.0, 2, 3]), "space origin": [10.0, 20, 30]}
+    header |= {"space": space} if space else {"space dimension": 3}
+    nrrd.write(str(tmp_path / "v.nhdr"), array, header, detached_header=True)
+    volume = mph.read_volume(tmp_path / "v.nhdr")
+    signs = {"left-anterior-superior": (-1, 1, 1), "LPS": (-1, -1, 1)}.get(space, (1, 1, 1))
+    expected = np.diag([*signs, 1]) @ [[1, 0, 0, 10], [0, 2, 0, 20], [0, 0, 3, 30], [0, 0, 0, 1]]
+    assert np.array_equal(volume.grid.affine, expected)
+    assert np.array_equal(volume.array, array)
+
+
+def test_a_series_in_any_order_is_the_volume_it_was_written_from(tmp_path, ct, rng):
+    names = [f"IM{n:03d}" for n in rng.permutation(7)]  # no suffix, and the order of names says nothing
+    write_series(ct, tmp_path / "series", names=names)
+    (tmp_path / "series" / "readme.txt").write_text("not an image")
+    seen = []
+    volume = mph.read_volume(tmp_path / "series", progress=lambda done, total: seen.append((done, total)))
+    assert np.array_equal(volume.array, ct.array)
+    assert np.allclose(volume.grid.affine, ct.grid.affine, rtol=0, atol=1e-9)
+    assert volume.quantity == "hu"
+    assert seen == [(k, 7) for k in range(1, 8)]
+    assert mph.read_volume(tmp_path / "series" / names[3]).grid == volume.grid
+
+    def stop(done: int, total: int) -> None:
+        raise mph.Cancelled
+
+    with pytest.raises(mph.Cancelled):
+        mph.read_volume(tmp_path / "series", progress=stop)
+
+
+def test_the_chest_is_the_same_from_nifti_and_from_dicom(tmp_path, workbook):
+    if not CHEST.is_file():
+        pytest.skip(f"no {CHEST.name} beside the checkout")
+    nifti = mph.read_volume(CHEST)
+    write_series(nifti, tmp_path / "series")
+    series = mph.read_volume(tmp_path / "series")
+    assert np.array_equal(series.array, nifti.array)
+    assert np.allclose(series.grid.affine, nifti.grid.affine, rtol=0, atol=1e-9)
+    views = mph.read_system(workbook)[::20].views(shape=(16, 16))
+    images = [
+        mph.Projector(volume.grid, views)(volume) for volume in (mph.hu_to_mu(mph.centered(x)) for x in (nifti, series))
+    ]
+    assert images[0].max() > 1
+    assert np.allclose(images[0], images[1], rtol=1e-6, atol=1e-6)
+
+
+def test_one_of_several_series_is_chosen(tmp_path, ct):
+    write_series(ct, tmp_path / "s", 3, "Soft")
+    other = mph.Volume(ct.array + 1, ct.grid, "hu")
+    written = write_series(other, tmp_path / "s", 4, "Bone")
+    with pytest.raises(mph.InputError, match=r'2 series, choose one: 3 "Soft" \(7 images\); 4 "Bone" \(7 images\)'):
+        mph.read_volume(tmp_path / "s")
+    for name in ("4", "Bone", written[0].SeriesInstanceUID):
+        assert np.array_equal(mph.read_volume(tmp_path / "s", series=name).array, other.array)
+    assert np.array_equal(mph.read_volume(written[2].filename).array, other.array)
+    with pytest.raises(mph.InputError, match="no series '5'"):
+        mph.read_volume(tmp_path / "s", series="5")
+
+
+def test_enhanced_and_run_length_coded_images(tmp_path, ct):
+    from pydicom.dataset import Dataset
+    from pydicom.uid import EnhancedCTImageStorage, RLELossless
+
+    written = write_series(ct, tmp_path / "s")
+    for data in written:
+        data.compress(RLELossless)
+        save(data)
+    assert np.array_equal(mph.read_volume(tmp_path / "s").array, ct.array)
+
+    def sequence_of(**values):
+        item = Dataset()
+        for name, value in values.items():
+            setattr(item, name, value)
+        return [item]
+
+    one = write_series(ct, tmp_path / "e")[0]
+    order = [3, 0, 6, 1, 5, 2, 4]
+    frames = []
+    for k in order:
+        frame = Dataset()
+        position = (LPS @ ct.grid.affine @ [0, 0, k, 1])[:3]
+        frame.PlanePositionSequence = sequence_of(ImagePositionPatient=[number_text(x) for x in position])
+        frames.append(frame)
+    shared = Dataset()
+    shared.PixelMeasuresSequence = sequence_of(PixelSpacing=one.PixelSpacing, SliceThickness="2.5")
+    shared.PlaneOrientationSequence = sequence_of(ImageOrientationPatient=one.ImageOrientationPatient)
+    shared.PixelValueTransformationSequence = sequence_of(RescaleSlope="1", RescaleIntercept="-1000", RescaleType="HU")
+    for name in ("PixelSpacing", "ImageOrientationPatient", "ImagePositionPatient", "RescaleSlope", "RescaleIntercept"):
+        delattr(one, name)
+    one.SOPClassUID = one.file_meta.MediaStorageSOPClassUID = EnhancedCTImageStorage
+    one.PerFrameFunctionalGroupsSequence, one.SharedFunctionalGroupsSequence = frames, [shared]
+    one.NumberOfFrames = 7
+    one.PixelData = (ct.array[:, :, order].transpose(2, 1, 0) + 1000).astype("<u2").tobytes()
+    shutil.rmtree(tmp_path / "e")
+    (tmp_path / "e").mkdir()
+    save(one)
+    volume = mph.read_volume(tmp_path / "e")
+    assert np.array_equal(volume.array, ct.array)
+    assert np.allclose(volume.grid.affine, ct.grid.affine, rtol=0, atol=1e-9)
+
+
+def _series(change):
+    """Bad input: a series after `change(written, folder)`."""
+
+    def make(folder, ct):
+        change(write_series(ct, folder / "series"), folder / "series")
+        return folder / "series"
+
+    return make
+
+
+def _set(k, **values):
+    def change(written, folder):
+        for name, value in values.items():
+            setattr(written[k], name, value)
+        save(written[k])
+
+    return _series(change)
+
+
+def _without(k, name):
+    def change(written, folder):
+        delattr(written[k], name)
+        save(written[k])
+
+    return _series(change)
+
+
+def _remove(written, folder):
+    for k in (2, 3):
+        Path(written[k].filename).unlink()
+
+
+def _copy(written, folder):
+    shutil.copy(written[2].filename, folder / "again.dcm")
+
+
+def _tilt(written, folder):
+    for k, data in enumerate(written):
+        x, y, z = data.ImagePositionPatient
+        data.ImagePositionPatient = [x, y + 0.3 * k, z]
+        save(data)
+
+
+def _cut_short(written, folder):
+    path = Path(written[4].filename)
+    path.write_bytes(path.read_bytes()[:-20])
+
+
+def _several(folder, ct):
+    write_series(ct, folder / "series", 1)
+    write_series(ct, folder / "series", 2)
+    return folder / "series"
+
+
+def _compressed(written, folder):
+    from pydicom.encaps import encapsulate
+    from pydicom.uid import JPEGLSLossless
+
+    for data in written:
+        data.file_meta.TransferSyntaxUID = JPEGLSLossless
+        data.PixelData = encapsulate([b"\xff\xd8 not a picture \xff\xd9"])
+        data["PixelData"].is_undefined_length = True
+        save(data)
+
+
+def _nifti(array):
+    def make(folder, ct):
+        import nibabel
+
+        nibabel.save(nibabel.Nifti1Image(array, np.eye(4)), folder / "v.nii")
+        return folder / "v.nii"
+
+    return make
+
+
+def _truncated(name):
+    def make(folder, ct):
+        mph.write_volume(ct, folder / name)
+        data = (folder / name).read_bytes()
+        (folder / name).write_bytes(data[: len(data) * 2 // 3])
+        return folder / name
+
+    return make
+
+
+def _meta(**changes):
+    def make(folder, ct):
+        write_meta_image(folder / "v.mha", ct.array.astype("<i2"), **changes)
+        return folder / "v.mha"
+
+    return make
+
+
+def _npz(**changes):
+    def make(folder, ct):
+        arrays = {"array": ct.array, "affine": ct.grid.affine, "quantity": "mu", "unit": "1/mm", **changes}
+        np.savez(folder / "v.npz", **arrays)
+        return folder / "v.npz"
+
+    return make
+
+
+def _nrrd(shape=(3, 4, 5), **header):
+    def make(folder, ct):
+        import nrrd
+
+        nrrd.write(str(folder / "v.nrrd"), np.zeros(shape, np.float32), header)
+        return folder / "v.nrrd"
+
+    return make
+
+
+def _hdf5(**datasets):
+    def make(folder, ct):
+        import h5py
+
+        with h5py.File(folder / "v.h5", "w") as file:
+            for name, value in datasets.items():
+                file[name] = value
+        return folder / "v.h5"
+
+    return make
+
+
+def _bytes(name, data):
+    def make(folder, ct):
+        (folder / name).write_bytes(data)
+        return folder / name
+
+    return make
+
+
+def _empty(folder, ct):
+    (folder / "empty").mkdir()
+    return folder / "empty"
+
+
+def _npy(folder, ct):
+    np.save(folder / "v.npy", ct.array)
+    return folder / "v.npy"
+
+
+NAN = np.zeros((3, 3, 3), np.float32)
+NAN[1, 2, 0] = np.nan
+
+BAD = {
+    "two slices missing": (_series(_remove), "2 slices missing between 1-0001.dcm and 1-0004.dcm: 7.5 mm apart"),
+    "a slice twice": (_series(_copy), "lie at the same place"),
+    "mixed sizes": (_set(3, Rows=5, PixelData=b"0" * 50), "1-0003.dcm has 5 x 5 pixels, unlike 1-0000.dcm"),
+    "mixed pixels": (_set(3, PixelSpacing=[1, 1]), "1-0003.dcm has pixels of 1 x 1 mm"),
+    "mixed orientations": (_set(5, ImageOrientationPatient=[1, 0, 0, 0, 1, 0]), "1-0005.dcm has another orientation"),
+    "no right angle": (_set(0, ImageOrientationPatient=[1, 0, 0, 1, 0, 0]), "two unit vectors at right angles"),
+    "several series": (_several, "it holds 2 series, choose one"),
+    "tilt by the header": (_set(0, GantryDetectorTilt="12"), "the gantry is tilted by 12 degrees"),
+    "tilt by the slices": (_series(_tilt), "the gantry is tilted by"),
+    "no position": (_without(2, "ImagePositionPatient"), "1-0002.dcm: it has no ImagePositionPatient"),
+    "colour": (_set(1, SamplesPerPixel=3, PhotometricInterpretation="RGB"), "1-0001.dcm: expected one value per pixel"),
+    "frames without places": (_set(0, NumberOfFrames=2), "2 frames without a place for each"),
+    "truncated slice": (_series(_cut_short), "1-0004.dcm"),
+    "compressed slices": (_series(_compressed), "its pixels are compressed (JPEG-LS"),
+    "magnetic resonance": (
+        _series(
+            lambda written, folder: [
+                (setattr(d, "Modality", "MR"), delattr(d, "RescaleType"), save(d)) for d in written
+            ]
+        ),
+        "it holds 'MR': say which quantity that is",
+    ),
+    "an empty folder": (_empty, "expected a folder with the images of a DICOM series"),
+    "no DICOM": (_bytes("v.dcm", b"hello" * 99), "v.dcm is no DICOM file"),
+    "unknown suffix": (_bytes("v.xyz", b"hello" * 99), "expected a folder of DICOM files, or a name ending in"),
+    "4-D NIfTI": (_nifti(np.zeros((3, 3, 3, 2), np.float32)), "expected a 3-D image, got shape 3 x 3 x 3 x 2"),
+    "NaN": (_nifti(NAN), "nan is not a finite number at index (1, 2, 0)"),
+    "complex NIfTI": (_nifti(np.zeros((3, 3, 3), np.complex64)), "expected real numbers"),
+    "truncated NIfTI": (_truncated("v.nii"), "cannot be read as .nii"),
+    "truncated npz": (_truncated("v.npz"), "cannot be read as .npz"),
+    "truncated NRRD": (_truncated("v.nrrd"), "cannot be read as .nrrd"),
+    "truncated HDF5": (_truncated("v.h5"), "cannot be read as .h5"),
+    "4-D NRRD": (_nrrd((3, 4, 5, 2)), "expected a 3-D image, got shape 3 x 4 x 5 x 2"),
+    "unknown space": (
+        _nrrd(space="scanner-xyz", **{"space directions": np.eye(3)}),
+        "space 'scanner-xyz': expected right-anterior-superior",
+    ),
+    "wrong unit": (_npz(unit="1/cm"), "its values are in 1/cm; expected 1/mm for mu"),
+    "unknown quantity": (_npz(quantity="dose", unit="Gy"), "it holds 'dose': say which quantity that is"),
+    "a singular affine": (_npz(affine=np.diag([1, 1, 0, 1])), "its three axes are not independent"),
+    "an affine of 3 rows": (_npz(affine=np.eye(4)[:3]), "expected shape 4 x 4, got 3 x 4"),
+    "no affine": (_npy, "it has no affine: give one"),
+    "HDF5 without the array": (_hdf5(data=np.zeros((3, 3, 3))), "array not found (there are: data)"),
+    "text in HDF5": (_hdf5(array="abc", affine=np.eye(4)), "expected a 3-D image"),
+    "MetaImage too short": (_meta(DimSize="5 6 8"), "expected 480 bytes of voxels"),
+    "MetaImage too long": (
+        _meta(DimSize="5 6 6"),
+        "expected 360 bytes of voxels (DimSize x ElementType), it holds more",
+    ),
+    "MetaImage of colours": (_meta(ElementNumberOfChannels="3"), "expected one value per voxel, found 3"),
+    "MetaImage of another type": (_meta(ElementType="MET_OTHER"), "ElementType MET_OTHER: expected one of"),
+    "MetaImage without its voxels": (
+        _meta(ElementDataFile="gone.raw"),
+        "its voxels are in gone.raw, which is not beside it",
+    ),
+    "MetaImage of text": (_meta(ElementSpacing="1 a 3"), "ElementSpacing = 1 a 3: expected numbers"),
+    "2-D MetaImage": (_meta(DimSize="5 6", NDims="2"), "expected a 3-D image, got shape 5 x 6"),
+    "MetaImage of nothing": (_bytes("v.mha", b"\x00" * 99), "not a MetaImage file"),
+}
+
+
+@pytest.mark.parametrize("case", BAD)
+def test_bad_input_gets_one_line_that_names_the_place(tmp_path, ct, case):
+    make, expected = BAD[case]
+    path = make(tmp_path, ct)
+    with pytest.raises(mph.InputError) as error:
+        mph.read_volume(path)
+    message = str(error.value)
+    assert expected in message
+    assert message.startswith(f"{path}: ")
+    assert "\n" not in message
+
+
+def test_series_and_affines_are_checked_too(tmp_path, ct):
+    mph.write_volume(ct, tmp_path / "v.nii")
+    with pytest.raises(mph.InputError, match="only folders of DICOM files hold several series"):
+        mph.read_volume(tmp_path / "v.nii", series="1")
+    with pytest.raises(mph.InputError, match="affine: expected shape 4 x 4"):
+        mph.read_volume(tmp_path / "v.nii", affine=np.eye(3))

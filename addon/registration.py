@@ -9,20 +9,23 @@ import bpy
 
 from ..operators import (
     add_derenzo,
+    add_slices,
     aim_modules,
     check_geometry,
     duplicate_modules,
     export_dataset,
     export_geometry,
     import_geometry,
+    import_volume,
     remove_modules,
     render_projections,
     set_numbers,
     show_modules,
     tidy_modules,
+    volume_files,
 )
 from ..panels import design, export, geometry, phantom, projections
-from . import cli, ids, jobs, live, preferences, properties, storage, volumes
+from . import cli, ids, jobs, live, preferences, properties, slices, storage, volumes
 
 # Classes in the order of registration; a panel comes after its parent. To add a class, list it here.
 CLASSES: tuple[type, ...] = (
@@ -42,6 +45,12 @@ CLASSES: tuple[type, ...] = (
     export_geometry.MPHDRR_OT_export_geometry,
     add_derenzo.MPHDRR_OT_add_derenzo,
     add_derenzo.MPHDRR_OT_update_derenzo,
+    import_volume.MPHDRR_OT_import_volume,
+    import_volume.MPHDRR_FH_volume,
+    add_slices.MPHDRR_OT_add_slices,
+    add_slices.MPHDRR_OT_remove_slices,
+    volume_files.MPHDRR_OT_clean_volume_files,
+    volume_files.MPHDRR_OT_find_volume_files,
     render_projections.MPHDRR_OT_render_projections,
     render_projections.MPHDRR_OT_show_projections,
     jobs.MPHDRR_OT_cancel_job,
@@ -61,6 +70,7 @@ CLASSES: tuple[type, ...] = (
 # (menu, draw function): entries in Blender's own menus.
 MENUS: tuple[tuple[Any, Any], ...] = (
     (bpy.types.TOPBAR_MT_file_import, import_geometry.draw_menu),
+    (bpy.types.TOPBAR_MT_file_import, import_volume.draw_menu),
     (bpy.types.TOPBAR_MT_file_export, export_geometry.draw_menu),
     (bpy.types.TOPBAR_MT_file_export, export_dataset.draw_menu),
     (bpy.types.VIEW3D_MT_volume_add, add_derenzo.draw_menu),
@@ -69,6 +79,7 @@ MENUS: tuple[tuple[Any, Any], ...] = (
 # (list in bpy.app.handlers, function): decorate the function with @bpy.app.handlers.persistent.
 HANDLERS: tuple[tuple[list[Any], Any], ...] = (
     (bpy.app.handlers.load_pre, jobs.before_load),
+    (bpy.app.handlers.load_pre, slices.before_load),
     (bpy.app.handlers.load_post, volumes.after_load),
     (bpy.app.handlers.load_post, live.after_load),
     (bpy.app.handlers.depsgraph_update_post, live.after_update),

@@ -7,6 +7,7 @@ moved together. Files made before the first save are copied there when it happen
 from __future__ import annotations
 
 import os
+import re
 import shutil
 from pathlib import Path
 from typing import Any
@@ -16,6 +17,9 @@ import bpy
 from ..core.errors import InputError
 from ..core.files import ensure_folder, replacing
 from . import ids
+
+_OUR_VOLUME = re.compile(r"[a-z]+-[0-9a-f]{16}(\.preview)?(_\d{4})?\.vdb")
+"""Names of the files that this extension writes voxels to: by content."""
 
 # Paths as they were before the save that is running: (owner, attribute, old path).
 _before_save: list[tuple[Any, str, str]] = []
@@ -54,6 +58,50 @@ def full_resolution(path: Path) -> Path:
 def is_preview(path: Path) -> bool:
     """Whether a .vdb is a coarser copy for display."""
     return path.name.endswith(ids.PREVIEW_SUFFIX)
+
+
+def missing_volumes() -> list[bpy.types.Volume]:
+    """Volumes of ours whose file, or the one with every voxel that belongs to it, is not there."""
+    return [
+        data
+        for data in bpy.data.volumes
+        if _OUR_VOLUME.fullmatch(absolute(data.filepath).name) and not all(p.is_file() for p in _files_of(data))
+    ]
+
+
+def relocate(top: Path) -> tuple[list[str], list[str]]:
+    """Look for missing volumes' files by their names, in a folder and all below it.
+
+    Returns
+    -------
+    found, still_missing : list of str
+        Names of the volumes.
+    """
+    missing = missing_volumes()
+    wanted = {path.name for data in missing for path in _files_of(data)}
+    there = {path.name: path for path in sorted(top.rglob("*.vdb"), reverse=True) if path.name in wanted}
+    found = [data for data in missing if all(path.name in there for path in _files_of(data))]
+    for data in found:
+        shown = there[absolute(data.filepath).name]
+        full = full_resolution(shown)
+        if not full.is_file():  # the two were put into different folders
+            raise InputError(f"{shown}: expected {full.name} in the same folder, found it in {there[full.name].parent}")
+        data.filepath = stored_path(shown)
+        data.grids.load()
+    return sorted(data.name for data in found), sorted(data.name for data in missing if data not in found)
+
+
+def unused_volumes() -> list[Path]:
+    """Files of voxels in this .blend's folder that none of its volumes needs."""
+    place = _folder_of(bpy.data.filepath) if bpy.data.filepath else _temporary_folder()
+    used = {path.name for data in bpy.data.volumes for path in _files_of(data)}
+    ours = [path for path in place.glob("*.vdb") if _OUR_VOLUME.fullmatch(path.name)]
+    return sorted(path for path in ours if path.is_file() and path.name not in used)
+
+
+def _files_of(data: bpy.types.Volume) -> set[Path]:
+    shown = absolute(data.filepath)
+    return {shown, full_resolution(shown)}
 
 
 @bpy.app.handlers.persistent

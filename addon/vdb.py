@@ -20,6 +20,7 @@ from ..core.checks import freeze, positive
 from ..core.errors import InputError
 from ..core.files import replacing
 from ..core.grid import Grid
+from ..core.hounsfield import AIR_HU
 from ..core.memory import require
 from ..core.version import VERSION
 from ..core.volume import UNITS, Volume
@@ -28,11 +29,14 @@ from . import compat
 _NUMBERS = ("float", "double", "half", "int32", "int64", "bool")
 """Value types of grids that can become a volume."""
 
+BACKGROUND = {"hu": AIR_HU}
+"""What voxels that take no room in a file hold, where it is not 0: what is drawn around a CT is air, not water."""
+
 
 def write_vdb(
     volumes: Volume | Sequence[Volume], path: str | Path, provenance: dict[str, Any] | None = None
 ) -> None:
-    """Write volumes as sparse float grids, each named after its quantity; voxels of 0 take no room.
+    """Write volumes as sparse float grids, each named after its quantity; voxels of 0 (-1000 HU) take no room.
 
     The transforms are those of the running Blender (see `compat.VDB_CENTER_SHIFT`); the metadata hold the exact affine
     with the voxel-centre convention, so that `read_vdb` gives the same volume in every version.
@@ -120,7 +124,7 @@ def openvdb() -> Any:
 
 def _grid_of(volume: Volume, provenance: dict[str, Any]) -> Any:
     vdb = openvdb()
-    grid = vdb.FloatGrid()
+    grid = vdb.FloatGrid(BACKGROUND.get(volume.quantity, 0.0))
     array, affine = volume.array, volume.grid.affine
     mirrored = bool(np.linalg.det(affine[:3, :3]) < 0)
     if mirrored:  # 4.5 draws nothing where the transform is left-handed: the same voxels, counted from the other end

@@ -10,6 +10,7 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -23,10 +24,48 @@ from ..core.grid import Grid
 from ..core.volume import UNITS, Volume
 from . import compat, ids, storage, volume_materials
 from .cameras import world_matrix
-from .vdb import read_vdb, write_vdb
+from .vdb import BACKGROUND, read_vdb, write_vdb
 
 MAX_SHOWN_VOXELS = 256**3
 """More non-zero voxels than this are shown as a coarser copy: Blender's window would hang on them."""
+
+
+@dataclass(frozen=True)
+class StoredVolume:
+    """A volume whose voxels are in files, ready to be put into the scene.
+
+    Attributes
+    ----------
+    volume : Volume
+        In world mm.
+    pose : array (4, 4)
+        World-from-object matrix.
+    path : Path
+        The .vdb that Blender shows: every voxel, or a coarser copy.
+    low, high : float
+        Smallest and largest value.
+    extent : float
+        Largest side, mm, of the box around the voxels that are not empty.
+    """
+
+    volume: Volume
+    pose: NDArray[np.float64]
+    path: Path
+    low: float
+    high: float
+    extent: float
+
+
+def store_volume(
+    volume: Volume, folder: Path, pose: ArrayLike | None = None, provenance: dict[str, Any] | None = None
+) -> StoredVolume:
+    """Do of `add_volume` what leaves bpy alone and takes long, for a job's thread; `folder` is `storage.folder()`."""
+    pose = _pose_of(volume, pose)
+    local = Volume(volume.array, Grid(volume.grid.shape, np.linalg.inv(pose) @ volume.grid.affine), volume.quantity)
+    path = _store(local, folder, provenance)
+    return StoredVolume(
+        volume, pose, path, float(volume.array.min()), float(volume.array.max()), _extent(volume)
+    )
 
 
 def add_volume(
@@ -52,10 +91,16 @@ def add_volume(
     collection
         Default: the scene's own.
     """
-    data = _volume_data(volume, name, _pose_of(volume, pose), provenance)
-    item = bpy.data.objects.new(name, data)
+    return add_stored(store_volume(volume, storage.folder(), pose, provenance), name, collection)
+
+
+def add_stored(
+    stored: StoredVolume, name: str, collection: bpy.types.Collection | None = None
+) -> bpy.types.Object:
+    """Put a stored volume into the scene; see `add_volume`."""
+    item = bpy.data.objects.new(name, _volume_data(stored, name))
     (collection or bpy.context.scene.collection).objects.link(item)
-    _describe(item, volume, _pose_of(volume, pose))
+    _describe(item, stored)
     return item
 
 
@@ -63,10 +108,14 @@ def replace_volume(
     item: bpy.types.Object, volume: Volume, pose: ArrayLike | None = None, provenance: dict[str, Any] | None = None
 ) -> None:
     """Give a Volume object other voxels (and pose, see `add_volume`); the old datablocks are removed."""
+    replace_stored(item, store_volume(volume, storage.folder(), pose, provenance))
+
+
+def replace_stored(item: bpy.types.Object, stored: StoredVolume) -> None:
+    """Give a Volume object the voxels of a stored volume; see `replace_volume`."""
     old = item.data
-    data = _volume_data(volume, item.name, _pose_of(volume, pose), provenance)
-    item.data = data
-    _describe(item, volume, _pose_of(volume, pose))
+    item.data = data = _volume_data(stored, item.name)
+    _describe(item, stored)
     if old.users == 0:
         materials = [m for m in old.materials if m]
         name = old.name
@@ -75,6 +124,25 @@ def replace_volume(
         for material in materials:
             if material.users == 0:
                 bpy.data.materials.remove(material)
+
+
+def make_active(context: bpy.types.Context, item: bpy.types.Object) -> None:
+    """Select a new volume alone, and let EEVEE draw it."""
+    volume_materials.show_in_eevee(context.scene)
+    for other in context.selected_objects:
+        other.select_set(False)
+    item.select_set(True)
+    context.view_layer.objects.active = item
+
+
+def show_range(item: bpy.types.Object) -> None:
+    """Draw a volume in its display range (`VolumeProperties.display_low` and `display_high`)."""
+    settings = getattr(item, ids.OBJECT_VOLUME)
+    low, high = settings.display_low, max(settings.display_high, settings.display_low + 1e-30)
+    for material in item.data.materials:
+        if material is not None:
+            volume_materials.set_range(material, low, high)
+    volume_materials.set_display(item.data, low, high, settings.extent)
 
 
 def volume_from_object(item: bpy.types.Object) -> Volume:
@@ -142,9 +210,9 @@ def volume_objects(scene: bpy.types.Scene) -> list[bpy.types.Object]:
 
 
 def coarser(volume: Volume, factor: int = 2) -> Volume:
-    """Means over blocks of `factor`^3 voxels, for display; voxels beyond the edge count as 0."""
+    """Means over blocks of `factor`^3 voxels, for display; voxels beyond the edge are empty."""
     padding = [(0, -n % factor) for n in volume.grid.shape]
-    array = np.pad(volume.array, padding) if any(p for _, p in padding) else volume.array
+    array = np.pad(volume.array, padding, constant_values=_empty(volume)) if any(p for _, p in padding) else volume.array
     a, b, c = (n // factor for n in array.shape)
     means = array.reshape(a, factor, b, factor, c, factor).mean(axis=(1, 3, 5), dtype=np.float32)
     blocks = np.diag([factor, factor, factor, 1.0])
@@ -154,14 +222,18 @@ def coarser(volume: Volume, factor: int = 2) -> Volume:
 
 @bpy.app.handlers.persistent
 def after_load(*_: Any) -> None:
-    """Rewrite volumes of a .blend that was saved by a Blender which draws voxels half a voxel elsewhere."""
+    """Rewrite volumes of a .blend that was saved by a Blender which draws voxels half a voxel elsewhere; say what is gone."""
+    missing = storage.missing_volumes()
+    if missing:
+        names = ", ".join(sorted(data.name for data in missing))
+        print(f"mphDRR: the voxel files of {names} are missing: Find Missing Volume Files in the Phantom panel")
     for item in bpy.data.objects:
-        if not is_volume(item):
+        if not is_volume(item) or item.data in missing:
             continue
         settings = getattr(item, ids.OBJECT_VOLUME)
         if settings.center_shift != compat.VDB_CENTER_SHIFT:
             try:
-                shown = _store(read_vdb(file_of(item)), {})
+                shown = _store(read_vdb(file_of(item)), storage.folder(), {})
                 item.data.filepath = storage.stored_path(shown)
                 settings.center_shift = compat.VDB_CENTER_SHIFT
             except InputError as error:
@@ -176,45 +248,39 @@ def _pose_of(volume: Volume, pose: ArrayLike | None) -> NDArray[np.float64]:
     return middle
 
 
-def _volume_data(
-    volume: Volume, name: str, pose: NDArray[np.float64], provenance: dict[str, Any] | None
-) -> bpy.types.Volume:
-    """Volume datablock of `volume`, in the space of an object at `pose`."""
-    local = Volume(volume.array, Grid(volume.grid.shape, np.linalg.inv(pose) @ volume.grid.affine), volume.quantity)
-    path = _store(local, provenance)
+def _volume_data(stored: StoredVolume, name: str) -> bpy.types.Volume:
+    """Volume datablock of a stored volume, with its material."""
+    quantity = stored.volume.quantity
     data = bpy.data.volumes.new(name)
     try:
-        data.filepath = storage.stored_path(path)
+        data.filepath = storage.stored_path(stored.path)
         if not data.grids.load() or data.grids.error_message:
             raise InputError(
-                f"{path}: Blender cannot load the volume ({data.grids.error_message or 'no reason given'})"
+                f"{stored.path}: Blender cannot load the volume ({data.grids.error_message or 'no reason given'})"
             )
-        if volume.quantity not in data.grids:
-            raise InputError(f"{path}: Blender finds no grid {volume.quantity!r} in it")
+        if quantity not in data.grids:
+            raise InputError(f"{stored.path}: Blender finds no grid {quantity!r} in it")
     except Exception:
         bpy.data.volumes.remove(data)
         raise
-    maximum = float(np.abs(volume.array).max(initial=0.0)) or 1.0
-    size = _extent(volume)
     data.render.precision = "FULL"
     data.render.space = "OBJECT"
     data.render.clipping = 0.0  # the default, 0.001, erases mu values and faint activity
-    volume_materials.set_display(data, maximum, size)
-    data.materials.append(volume_materials.new_material(f"{name} {volume.quantity}", volume.quantity, maximum, size))
+    data.materials.append(volume_materials.new_material(f"{name} {quantity}", quantity, stored.extent))
     return data
 
 
-def _store(local: Volume, provenance: dict[str, Any] | None) -> Path:
+def _store(local: Volume, folder: Path, provenance: dict[str, Any] | None) -> Path:
     """Write a volume, and a coarser copy if it is large, under names from their content; the path to show."""
     digest = hashlib.sha256(local.array.data)
     recipe = (local.grid.shape, local.grid.affine.tolist(), local.quantity, compat.VDB_CENTER_SHIFT, provenance or {})
     digest.update(json.dumps(recipe).encode())
     stem = f"{local.quantity}-{digest.hexdigest()[:16]}"
-    path = storage.folder() / f"{stem}.vdb"
+    path = folder / f"{stem}.vdb"
     if not path.exists():
         write_vdb(local, path, provenance)
     shown = local
-    while np.count_nonzero(shown.array) > MAX_SHOWN_VOXELS:
+    while np.count_nonzero(shown.array != _empty(shown)) > MAX_SHOWN_VOXELS:
         shown = coarser(shown)
     if shown is local:
         return path
@@ -224,24 +290,36 @@ def _store(local: Volume, provenance: dict[str, Any] | None) -> Path:
     return preview
 
 
-def _describe(item: bpy.types.Object, volume: Volume, pose: NDArray[np.float64]) -> None:
+def _describe(item: bpy.types.Object, stored: StoredVolume) -> None:
     from mathutils import Matrix
 
-    item.matrix_world = Matrix(pose)
+    volume = stored.volume
+    item.matrix_world = Matrix(stored.pose)
     settings = getattr(item, ids.OBJECT_VOLUME)
+    shown = settings.display_low, settings.display_high
+    usual = volume_materials.usual_range(settings.quantity, settings.minimum, settings.maximum)
+    chosen = settings.is_volume and settings.quantity == volume.quantity and not np.allclose(shown, usual)
     settings.is_volume = True
     settings.quantity = volume.quantity
     settings.unit = UNITS[volume.quantity]
     settings.shape = volume.grid.shape
     settings.spacing = volume.grid.spacing
-    settings.maximum = float(volume.array.max(initial=0.0))
-    settings.exact_pose = json.dumps(pose.tolist())
+    settings.minimum, settings.maximum = stored.low, stored.high
+    settings.extent = stored.extent
+    settings.exact_pose = json.dumps(stored.pose.tolist())
     settings.center_shift = compat.VDB_CENTER_SHIFT
+    settings.display_low, settings.display_high = (
+        shown if chosen else volume_materials.usual_range(volume.quantity, stored.low, stored.high)
+    )
+
+
+def _empty(volume: Volume) -> float:
+    """The value of voxels that nobody sees."""
+    return BACKGROUND.get(volume.quantity, 0.0)
 
 
 def _extent(volume: Volume) -> float:
-    """Largest side, mm, of the box around the voxels that are not 0."""
-    filled = volume.array != 0
+    filled = volume.array != _empty(volume)
     sides = []
     for axis, spacing in enumerate(volume.grid.spacing):
         used = np.flatnonzero(filled.any(axis=tuple(k for k in range(3) if k != axis)))

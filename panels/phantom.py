@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import bpy
 
-from ..addon import ids, volumes
+from ..addon import ids, jobs, slices, storage, volumes
+from ..core.memory import readable_size
 
 
 class MPHDRR_PT_phantom(bpy.types.Panel):
@@ -17,8 +18,16 @@ class MPHDRR_PT_phantom(bpy.types.Panel):
 
     def draw(self, context: bpy.types.Context) -> None:
         layout = self.layout
+        layout.enabled = not jobs.is_running()
         layout.operator_context = "INVOKE_DEFAULT"
-        layout.operator(ids.ADD_DERENZO, text="Add Derenzo Phantom", icon="OUTLINER_DATA_VOLUME")
+        column = layout.column(align=True)
+        column.operator(ids.ADD_DERENZO, text="Add Derenzo Phantom", icon="OUTLINER_DATA_VOLUME")
+        column.operator(ids.IMPORT_VOLUME, text="Import Volume", icon="IMPORT")
+        if storage.missing_volumes():
+            column = layout.column(align=True)
+            column.alert = True
+            column.label(text="Files of voxels are missing", icon="ERROR")
+            column.operator(ids.FIND_VOLUME_FILES, icon="VIEWZOOM")
         item = context.object
         if not volumes.is_volume(item):
             column = layout.column(align=True)
@@ -38,12 +47,34 @@ class MPHDRR_PT_phantom(bpy.types.Panel):
             ("Holds", f"{settings.quantity}, {settings.unit}"),
             ("Voxels", " × ".join(map(str, shape))),
             ("Size", " × ".join(f"{s:.3g}" for s in spacing) + " mm"),
-            ("Maximum", f"{settings.maximum:.4g}"),
+            ("Values", f"{settings.minimum:.4g} to {settings.maximum:.4g}"),
+            ("File", _file_state(item)),
         ):
             names.label(text=name)
             values.label(text=value)
         layout.use_property_split = True
         layout.use_property_decorate = False
+        column = layout.column(align=True)
+        column.prop(settings, "display_low", text=f"Shown from ({settings.unit})")
+        column.prop(settings, "display_high", text="to")
+        if slices.planes_of(item):
+            row = layout.row(align=True)
+            row.use_property_split = False
+            for axis, name in enumerate(slices.names(item)):
+                row.prop(settings, "slices", index=axis, text=name)
+            row.operator(ids.REMOVE_SLICES, text="", icon="X")
+        else:
+            layout.operator(ids.ADD_SLICES, icon="MESH_PLANE")
         if settings.kind == "DERENZO":
             settings.derenzo.draw_settings(layout)
             layout.operator(ids.UPDATE_DERENZO, icon="FILE_REFRESH")
+        layout.operator(ids.CLEAN_VOLUME_FILES, icon="TRASH")
+
+
+def _file_state(item: bpy.types.Object) -> str:
+    path = volumes.file_of(item)
+    if not path.is_file():
+        return "missing"
+    shown = ", coarser copy shown" if storage.is_preview(storage.absolute(item.data.filepath)) else ""
+    kept = "" if bpy.data.filepath else ", until saved"
+    return readable_size(path.stat().st_size) + shown + kept

@@ -255,9 +255,9 @@ class JobOperator:
             name: tuple(value) if isinstance(value, bpy.types.bpy_prop_array) else value
             for name, value in self.as_keywords(ignore=("confirmed",)).items()
         }
-        group, name = self.bl_idname.split(".")
+        group, name = self.bl_idname.split("_OT_")  # an instance has the class's name there
         try:
-            getattr(getattr(bpy.ops, group), name)("INVOKE_DEFAULT", confirmed=True, **given)
+            getattr(getattr(bpy.ops, group.lower()), name)("INVOKE_DEFAULT", confirmed=True, **given)
         except RuntimeError as error:  # what the other one reported
             self.report({"ERROR"}, str(error).removeprefix("Error: ").strip())
         return {"CANCELLED"}

@@ -55,14 +55,13 @@ class MPHDRR_PT_phantom(bpy.types.Panel):
         layout.use_property_split = True
         layout.use_property_decorate = False
         column = layout.column(align=True)
-        column.prop(settings, "display_low", text=f"Shown from ({settings.unit})")
-        column.prop(settings, "display_high", text="to")
+        column.prop(settings, "display_low", text=f"Low, {settings.unit}")
+        column.prop(settings, "display_high", text=f"High, {settings.unit}")
         if slices.planes_of(item):
-            row = layout.row(align=True)
-            row.use_property_split = False
+            column = layout.column(align=True)
             for axis, name in enumerate(slices.names(item)):
-                row.prop(settings, "slices", index=axis, text=name)
-            row.operator(ids.REMOVE_SLICES, text="", icon="X")
+                column.prop(settings, "slices", index=axis, text=name)
+            column.operator(ids.REMOVE_SLICES, icon="X")
         else:
             layout.operator(ids.ADD_SLICES, icon="MESH_PLANE")
         if settings.kind == "DERENZO":

@@ -26,6 +26,8 @@ from ..core.version import VERSION
 from ..core.volume import UNITS, Volume
 from . import compat
 
+_SLAB = 64  # layers handed over at once, whole leaves of 8: what is copied for OpenVDB stays small
+
 _NUMBERS = ("float", "double", "half", "int32", "int64", "bool")
 """Value types of grids that can become a volume."""
 
@@ -129,8 +131,11 @@ def _grid_of(volume: Volume, provenance: dict[str, Any]) -> Any:
     mirrored = bool(np.linalg.det(affine[:3, :3]) < 0)
     if mirrored:  # 4.5 draws nothing where the transform is left-handed: the same voxels, counted from the other end
         array = array[::-1]
-    # A copy, because it takes neither strides nor read-only arrays.
-    grid.copyFromArray(np.array(array, np.float32, order="C"), tolerance=0.0)
+    require(4.0 * array.size, f"writing {' x '.join(map(str, array.shape))} voxels")
+    for first in range(0, len(array), _SLAB):
+        # A copy, because it takes neither strides nor read-only arrays.
+        slab = np.array(array[first : first + _SLAB], np.float32, order="C")
+        grid.copyFromArray(slab, ijk=(first, 0, 0), tolerance=0.0)
     grid.name = volume.quantity
     grid.gridClass = vdb.GridClass.FOG_VOLUME
     shift = float(compat.VDB_CENTER_SHIFT)

@@ -60,7 +60,7 @@ MATERIAL_CRYSTAL = "mphDRR crystal"
 MATERIAL_ROI = "mphDRR ROI"
 MOSAIC = "mphDRR mosaic"
 DERENZO = "Derenzo"
-PREVIEW_SUFFIX = ".preview.vdb"  # coarser copies of large volumes, for display only
+PREVIEW = ".preview"  # in the names of coarser copies of large volumes, for display only
 
 
 def module_name(number: int, n_modules: int = 80) -> str:

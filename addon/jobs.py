@@ -140,7 +140,7 @@ class JobProperties(bpy.types.PropertyGroup):
 
 
 class JobOperator:
-    """Mix into an operator and implement `job`, and `ask` where the user is asked before; add nothing else but properties."""
+    """Mix into an operator and implement `job`, and `ask` where the user is asked first; add nothing else but properties."""
 
     confirmed: BoolProperty(
         name="Confirmed", description="Start without asking", options={"HIDDEN", "SKIP_SAVE"}, default=False

@@ -138,7 +138,9 @@ class VolumeProperties(bpy.types.PropertyGroup):
         default=1.0,
     )  # fmt: skip
     display_low: FloatProperty(
-        name="Low", description="Value, in the volume's unit, at and below which nothing is shown", update=_range_changed
+        name="Low",
+        description="Value, in the volume's unit, at and below which nothing is shown",
+        update=_range_changed,
     )
     display_high: FloatProperty(
         name="High", description="Value, in the volume's unit, that is shown brightest", default=1.0,

@@ -84,6 +84,7 @@ HANDLERS: tuple[tuple[list[Any], Any], ...] = (
     (bpy.app.handlers.load_post, live.after_load),
     (bpy.app.handlers.depsgraph_update_post, live.after_update),
     (bpy.app.handlers.frame_change_post, live.after_update),
+    (bpy.app.handlers.frame_change_post, slices.after_frame_change),
     (bpy.app.handlers.undo_post, live.after_undo),
     (bpy.app.handlers.redo_post, live.after_undo),
     (bpy.app.handlers.save_pre, storage.before_save),

@@ -7,6 +7,7 @@ grids give parallelograms. Planes are named after the patient's, by the world ax
 from __future__ import annotations
 
 import itertools
+import json
 from pathlib import Path
 
 import bpy
@@ -20,7 +21,7 @@ from .compat import enable_nodes
 
 _PLANES = ("Sagittal", "Coronal", "Axial")  # across world x, y, z
 _KEY = "mphdrr_slice"  # custom property: the axis of the grid that a plane lies across
-_FILE = "mphdrr_slice_of"  # custom property: name of the .vdb, which is of its content
+_LATTICE = "mphdrr_slice_of"  # custom property: shape and affine that the planes were made for
 _SHADES = 256
 
 # The volume that slices were last taken of: reading it takes longer than everything else.
@@ -63,8 +64,8 @@ def remove_slices(item: bpy.types.Object) -> None:
 
 
 def planes_of(item: bpy.types.Object) -> list[bpy.types.Object]:
-    """A volume's planes."""
-    return [child for child in item.children if _KEY in child]
+    """A volume's planes, in the order of the grid's axes."""
+    return sorted((child for child in item.children if _KEY in child), key=lambda plane: plane[_KEY])
 
 
 def names(item: bpy.types.Object) -> list[str]:
@@ -84,7 +85,7 @@ def update(item: bpy.types.Object) -> None:
     except InputError as error:
         print(f"mphDRR: the slices of {item.name} are not drawn: {error}")
         return
-    if any(plane[_FILE] != volumes.file_of(item).name for plane in planes):  # other voxels than before
+    if any(plane[_LATTICE] != _lattice(volume) for plane in planes):  # other voxels than before
         add_slices(item)
         return
     for plane in planes:
@@ -102,6 +103,14 @@ def before_load(*_: object) -> None:
     _last = None
 
 
+@bpy.app.handlers.persistent
+def after_frame_change(scene: bpy.types.Scene, *_: object) -> None:
+    """The planes of a sequence show the current frame's state."""
+    for item in volumes.volume_objects(scene):
+        if item.data.is_sequence:
+            update(item)
+
+
 def _stored(item: bpy.types.Object) -> Volume:
     """Every voxel of an object, in its own space."""
     global _last
@@ -110,6 +119,10 @@ def _stored(item: bpy.types.Object) -> Volume:
         _last = None  # frees the other one's memory first
         _last = path, vdb.read_vdb(path)
     return _last[1]
+
+
+def _lattice(volume: Volume) -> str:
+    return json.dumps([volume.grid.shape, volume.grid.affine.tolist()])
 
 
 def _names(world: NDArray[np.float64]) -> list[str]:
@@ -133,7 +146,7 @@ def _plane(item: bpy.types.Object, volume: Volume, axis: int, name: str) -> bpy.
     image = bpy.data.images.new(name, volume.grid.shape[across], volume.grid.shape[up])
     mesh.materials.append(_material(name, image))
     plane = bpy.data.objects.new(name, mesh)
-    plane[_KEY], plane[_FILE] = axis, volumes.file_of(item).name
+    plane[_KEY], plane[_LATTICE] = axis, _lattice(volume)
     plane.parent = item
     for collection in item.users_collection:
         collection.objects.link(plane)

@@ -35,9 +35,7 @@ BACKGROUND = {"hu": AIR_HU}
 """What voxels that take no room in a file hold, where it is not 0: what is drawn around a CT is air, not water."""
 
 
-def write_vdb(
-    volumes: Volume | Sequence[Volume], path: str | Path, provenance: dict[str, Any] | None = None
-) -> None:
+def write_vdb(volumes: Volume | Sequence[Volume], path: str | Path, provenance: dict[str, Any] | None = None) -> None:
     """Write volumes as sparse float grids, each named after its quantity; voxels of 0 (-1000 HU) take no room.
 
     The transforms are those of the running Blender (see `compat.VDB_CENTER_SHIFT`); the metadata hold the exact affine
@@ -68,9 +66,7 @@ def write_vdb(
         openvdb().write(str(temporary), grids=grids)
 
 
-def read_vdb(
-    path: str | Path, quantity: str | None = None, grid: str | None = None, *, unit: float = 1.0
-) -> Volume:
+def read_vdb(path: str | Path, quantity: str | None = None, grid: str | None = None, *, unit: float = 1.0) -> Volume:
     """Read a grid as a volume: one of ours the same to the last bit, any other program's by its transform.
 
     Another program's grid becomes a volume on the box around its active voxels. Grids of float, double, half, int and
@@ -215,12 +211,13 @@ def _volume_of(grid: Any, quantity: str | None, unit: float) -> Volume:
         raise InputError(f"the grid {grid.name!r} has no active voxels")
     affine = np.diag([unit, unit, unit, 1.0]) @ drawn
     affine[:3, 3] += affine[:3, :3] @ first
-    array = _values(grid, first, tuple(int(n) for n in last - first + 1))
+    n_x, n_y, n_z = (int(n) for n in last - first + 1)
+    array = _values(grid, first, (n_x, n_y, n_z))
     if grid.gridClass == openvdb().GridClass.LEVEL_SET:
         # Signed distances in the file's unit; the surface passes through voxels as a plane would.
         size = np.cbrt(abs(np.linalg.det(drawn[:3, :3])))
         array = np.clip(0.5 - array / np.float32(size), 0.0, 1.0)
-    return Volume(freeze(array), Grid(array.shape, affine), quantity)
+    return Volume(freeze(array), Grid((n_x, n_y, n_z), affine), quantity)
 
 
 def _own_lattice(

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -21,6 +21,7 @@ from numpy.typing import ArrayLike, NDArray
 from ..core.errors import InputError
 from ..core.frames import checked_affine
 from ..core.grid import Grid
+from ..core.memory import readable_size
 from ..core.volume import UNITS, Volume
 from . import compat, ids, storage, volume_materials
 from .cameras import world_matrix
@@ -32,39 +33,59 @@ MAX_SHOWN_VOXELS = 256**3
 
 @dataclass(frozen=True)
 class StoredVolume:
-    """A volume whose voxels are in files, ready to be put into the scene.
+    """A volume, or the states of one, whose voxels are in files, ready to be put into the scene.
 
     Attributes
     ----------
-    volume : Volume
+    states : tuple of Volume
         In world mm.
     pose : array (4, 4)
         World-from-object matrix.
     path : Path
-        The .vdb that Blender shows: every voxel, or a coarser copy.
+        The .vdb that Blender shows, of the first state: every voxel, or a coarser copy.
     low, high : float
         Smallest and largest value.
     extent : float
         Largest side, mm, of the box around the voxels that are not empty.
     """
 
-    volume: Volume
+    states: tuple[Volume, ...]
     pose: NDArray[np.float64]
     path: Path
     low: float
     high: float
     extent: float
 
+    @property
+    def volume(self) -> Volume:
+        """The first state, or the only one."""
+        return self.states[0]
+
 
 def store_volume(
-    volume: Volume, folder: Path, pose: ArrayLike | None = None, provenance: dict[str, Any] | None = None
+    volume: Volume | Sequence[Volume],
+    folder: Path,
+    pose: ArrayLike | None = None,
+    provenance: dict[str, Any] | None = None,
 ) -> StoredVolume:
-    """Do of `add_volume` what leaves bpy alone and takes long, for a job's thread; `folder` is `storage.folder()`."""
-    pose = _pose_of(volume, pose)
-    local = Volume(volume.array, Grid(volume.grid.shape, np.linalg.inv(pose) @ volume.grid.affine), volume.quantity)
-    path = _store(local, folder, provenance)
+    """Do of `add_volume`, or `add_volume_sequence`, what leaves bpy alone and takes long, for a job's thread.
+
+    `folder` is `storage.folder()`.
+    """
+    states = (volume,) if isinstance(volume, Volume) else tuple(volume)
+    if len({state.quantity for state in states}) != 1:
+        found = ", ".join(state.quantity for state in states) or "none"
+        raise InputError(f"volume sequence: expected volumes of one quantity, got {found}")
+    pose = _pose_of(states[0], pose)
+    to_object = np.linalg.inv(pose)
+    local = [Volume(v.array, Grid(v.grid.shape, to_object @ v.grid.affine), v.quantity) for v in states]
     return StoredVolume(
-        volume, pose, path, float(volume.array.min()), float(volume.array.max()), _extent(volume)
+        states,
+        pose,
+        _store(local, folder, provenance),
+        min(float(v.array.min()) for v in states),
+        max(float(v.array.max()) for v in states),
+        max(_extent(v) for v in states),
     )
 
 
@@ -94,9 +115,39 @@ def add_volume(
     return add_stored(store_volume(volume, storage.folder(), pose, provenance), name, collection)
 
 
-def add_stored(
-    stored: StoredVolume, name: str, collection: bpy.types.Collection | None = None
+def add_volume_sequence(
+    volumes: Sequence[Volume],
+    name: str,
+    pose: ArrayLike | None = None,
+    provenance: dict[str, Any] | None = None,
+    collection: bpy.types.Collection | None = None,
+    frame_start: int = 1,
 ) -> bpy.types.Object:
+    """Put the states of something that changes into the scene, such as a beating heart: one for each Blender frame.
+
+    From `frame_start` on the states follow each other, and begin anew after the last one (`Volume.sequence_mode`).
+    `volume_from_object` and projections take the state of the scene's current frame.
+
+    Parameters
+    ----------
+    volumes
+        The states, in world mm, of one quantity.
+    name, pose, provenance, collection
+        See `add_volume`; the default pose is the middle of the first state's grid.
+    frame_start
+        Frame of the first state.
+
+    Raises
+    ------
+    InputError
+        No states, or states of several quantities.
+    """
+    item = add_stored(store_volume(tuple(volumes), storage.folder(), pose, provenance), name, collection)
+    item.data.frame_start = frame_start
+    return item
+
+
+def add_stored(stored: StoredVolume, name: str, collection: bpy.types.Collection | None = None) -> bpy.types.Object:
     """Put a stored volume into the scene; see `add_volume`."""
     item = bpy.data.objects.new(name, _volume_data(stored, name))
     (collection or bpy.context.scene.collection).objects.link(item)
@@ -167,6 +218,8 @@ def reader(item: bpy.types.Object) -> Callable[[], Volume]:
     if item is None or item.type != "VOLUME" or not getattr(item, ids.OBJECT_VOLUME).is_volume:
         what = "nothing is chosen" if item is None else f"{item.name!r} is no mphDRR volume"
         raise InputError(f"{what}: add a phantom first, or choose one")
+    if _state(item.data) is None:
+        raise InputError(f"{item.name!r} has no state at frame {bpy.context.scene.frame_current}")
     path, pose = file_of(item), pose_of_object(item)
     if not path.is_file():
         raise InputError(f"{path}: no such file; the voxels of {item.name!r} are gone, so add the volume again")
@@ -179,8 +232,19 @@ def reader(item: bpy.types.Object) -> Callable[[], Volume]:
 
 
 def file_of(item: bpy.types.Object) -> Path:
-    """The .vdb with every voxel of a Volume object."""
-    return storage.full_resolution(storage.absolute(item.data.filepath))
+    """The .vdb with every voxel of a Volume object; of a sequence, that of the current frame."""
+    path = storage.full_resolution(storage.absolute(item.data.filepath))
+    return storage.of_frame(path, _state(item.data) or 1) if item.data.is_sequence else path
+
+
+def file_state(item: bpy.types.Object) -> str:
+    """What there is to say about a Volume object's file: its size, or that it is missing."""
+    path = file_of(item)
+    if not path.is_file():
+        return "missing"
+    shown = ", coarser copy shown" if storage.is_preview(storage.absolute(item.data.filepath)) else ""
+    kept = "" if bpy.data.filepath else ", until saved"
+    return readable_size(path.stat().st_size) + shown + kept
 
 
 def pose_of_object(item: bpy.types.Object) -> NDArray[np.float64]:
@@ -212,7 +276,9 @@ def volume_objects(scene: bpy.types.Scene) -> list[bpy.types.Object]:
 def coarser(volume: Volume, factor: int = 2) -> Volume:
     """Means over blocks of `factor`^3 voxels, for display; voxels beyond the edge are empty."""
     padding = [(0, -n % factor) for n in volume.grid.shape]
-    array = np.pad(volume.array, padding, constant_values=_empty(volume)) if any(p for _, p in padding) else volume.array
+    array = (
+        np.pad(volume.array, padding, constant_values=_empty(volume)) if any(p for _, p in padding) else volume.array
+    )
     a, b, c = (n // factor for n in array.shape)
     means = array.reshape(a, factor, b, factor, c, factor).mean(axis=(1, 3, 5), dtype=np.float32)
     blocks = np.diag([factor, factor, factor, 1.0])
@@ -222,7 +288,7 @@ def coarser(volume: Volume, factor: int = 2) -> Volume:
 
 @bpy.app.handlers.persistent
 def after_load(*_: Any) -> None:
-    """Rewrite volumes of a .blend that was saved by a Blender which draws voxels half a voxel elsewhere; say what is gone."""
+    """Rewrite volumes of a .blend from a Blender which draws voxels half a voxel elsewhere; say which files are gone."""
     missing = storage.missing_volumes()
     if missing:
         names = ", ".join(sorted(data.name for data in missing))
@@ -232,9 +298,12 @@ def after_load(*_: Any) -> None:
             continue
         settings = getattr(item, ids.OBJECT_VOLUME)
         if settings.center_shift != compat.VDB_CENTER_SHIFT:
+            data = item.data
+            path = storage.full_resolution(storage.absolute(data.filepath))
+            count = data.frame_duration if data.is_sequence else 1
             try:
-                shown = _store(read_vdb(file_of(item)), storage.folder(), {})
-                item.data.filepath = storage.stored_path(shown)
+                states = [read_vdb(storage.of_frame(path, k + 1) if data.is_sequence else path) for k in range(count)]
+                data.filepath = storage.stored_path(_store(states, storage.folder(), {}))
                 settings.center_shift = compat.VDB_CENTER_SHIFT
             except InputError as error:
                 print(f"mphDRR: {item.name} is drawn half a voxel off: {error}")
@@ -263,6 +332,8 @@ def _volume_data(stored: StoredVolume, name: str) -> bpy.types.Volume:
     except Exception:
         bpy.data.volumes.remove(data)
         raise
+    if len(stored.states) > 1:  # set after loading, which would look for frame 0 until the scene is evaluated
+        data.is_sequence, data.frame_duration, data.sequence_mode = True, len(stored.states), "REPEAT"
     data.render.precision = "FULL"
     data.render.space = "OBJECT"
     data.render.clipping = 0.0  # the default, 0.001, erases mu values and faint activity
@@ -270,24 +341,55 @@ def _volume_data(stored: StoredVolume, name: str) -> bpy.types.Volume:
     return data
 
 
-def _store(local: Volume, folder: Path, provenance: dict[str, Any] | None) -> Path:
-    """Write a volume, and a coarser copy if it is large, under names from their content; the path to show."""
-    digest = hashlib.sha256(local.array.data)
-    recipe = (local.grid.shape, local.grid.affine.tolist(), local.quantity, compat.VDB_CENTER_SHIFT, provenance or {})
-    digest.update(json.dumps(recipe).encode())
-    stem = f"{local.quantity}-{digest.hexdigest()[:16]}"
-    path = folder / f"{stem}.vdb"
-    if not path.exists():
-        write_vdb(local, path, provenance)
-    shown = local
-    while np.count_nonzero(shown.array != _empty(shown)) > MAX_SHOWN_VOXELS:
-        shown = coarser(shown)
-    if shown is local:
-        return path
-    preview = path.with_name(stem + ids.PREVIEW_SUFFIX)
-    if not preview.exists():
-        write_vdb(shown, preview, {"coarser_copy_of": path.name})
-    return preview
+def _store(states: Sequence[Volume], folder: Path, provenance: dict[str, Any] | None) -> Path:
+    """Write volumes, and coarser copies if they are large, under names from their content; the (first) path to show."""
+    digest = hashlib.sha256()
+    for state in states:
+        digest.update(state.array.data)
+        recipe = (
+            state.grid.shape,
+            state.grid.affine.tolist(),
+            state.quantity,
+            compat.VDB_CENTER_SHIFT,
+            provenance or {},
+        )
+        digest.update(json.dumps(recipe).encode())
+    stem = f"{states[0].quantity}-{digest.hexdigest()[:16]}"
+    paths = _write(states, folder, stem, provenance)
+    shown = list(states)
+    while max(np.count_nonzero(state.array != _empty(state)) for state in shown) > MAX_SHOWN_VOXELS:
+        shown = [coarser(state) for state in shown]
+    if shown[0] is not states[0]:
+        paths = _write(shown, folder, stem + ids.PREVIEW, {"coarser_copy_of": stem})
+    return paths[0]
+
+
+def _write(states: Sequence[Volume], folder: Path, stem: str, provenance: dict[str, Any] | None) -> list[Path]:
+    paths = [folder / f"{stem}{f'_{k:04d}' if len(states) > 1 else ''}.vdb" for k in range(1, len(states) + 1)]
+    for state, path in zip(states, paths, strict=True):
+        if not path.exists():
+            write_vdb(state, path, provenance)
+    return paths
+
+
+def _state(data: bpy.types.Volume) -> int | None:
+    """Number of the file that Blender shows at the current frame, by its own rule; None where it shows none."""
+    count = data.frame_duration
+    if not data.is_sequence:
+        return 0
+    if count == 0:
+        return None
+    frame = bpy.context.scene.frame_current - data.frame_start  # 0: the first
+    if data.sequence_mode == "CLIP" and not 0 <= frame < count:
+        return None
+    if data.sequence_mode == "EXTEND":
+        frame = min(max(frame, 0), count - 1)
+    elif data.sequence_mode == "REPEAT":
+        frame %= count
+    elif data.sequence_mode == "PING_PONG":
+        frame %= max(1, 2 * count - 2)
+        frame = min(frame, 2 * count - 2 - frame)
+    return frame + 1 + data.frame_offset
 
 
 def _describe(item: bpy.types.Object, stored: StoredVolume) -> None:

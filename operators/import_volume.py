@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Generator
 from pathlib import Path
+from typing import Any
 
 import bpy
 from bpy.props import BoolProperty, EnumProperty, FloatProperty, StringProperty
@@ -25,11 +26,16 @@ class MPHDRR_OT_import_volume(jobs.JobOperator, bpy.types.Operator):
 
     bl_idname = ids.IMPORT_VOLUME
     bl_label = "Import Volume"
-    bl_description = "Read a CT, an image or an OpenVDB grid as a volume to project; of a DICOM series choose the folder"
+    bl_description = (
+        "Read a CT, an image or an OpenVDB grid as a volume to project; of a DICOM series choose the folder"
+    )
     bl_options = {"REGISTER", "UNDO"}
 
     filepath: StringProperty(
-        name="File", description="File, or folder of a DICOM series, to read", subtype="FILE_PATH", options={"SKIP_SAVE"}
+        name="File",
+        description="File, or folder of a DICOM series, to read",
+        subtype="FILE_PATH",
+        options={"SKIP_SAVE"},
     )
     filter_glob: StringProperty(default=";".join(f"*{s}" for s in _SUFFIXES), options={"HIDDEN"})
     name: StringProperty(name="Name", description="The object's name. Empty: the file's", options={"SKIP_SAVE"})
@@ -45,7 +51,9 @@ class MPHDRR_OT_import_volume(jobs.JobOperator, bpy.types.Operator):
         name="Centre at Isocentre", description="Move the volume's middle to the world's origin", default=True
     )
     attenuation: BoolProperty(
-        name="CT to Attenuation", description="Convert CT numbers (HU) to attenuation coefficients (1/mm)", default=False
+        name="CT to Attenuation",
+        description="Convert CT numbers (HU) to attenuation coefficients (1/mm)",
+        default=False,
     )
     energy: FloatProperty(
         name="Energy (keV)", description="Of the photons that are attenuated, in keV: 140.5 is Tc-99m's", default=140.5,
@@ -95,7 +103,7 @@ class MPHDRR_OT_import_volume(jobs.JobOperator, bpy.types.Operator):
             else:
                 volume = read_volume(path, quantity, progress=lambda done, total: progress(done, 4 * total))
             progress(1, 4)
-            provenance = {"file": path.name, "read_as": volume.quantity}
+            provenance: dict[str, Any] = {"file": path.name, "read_as": volume.quantity}
             if energy is not None:
                 volume = hu_to_mu(volume, energy)
                 provenance["energy_keV"] = energy

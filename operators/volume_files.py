@@ -29,7 +29,9 @@ class MPHDRR_OT_clean_volume_files(bpy.types.Operator):
 
     def execute(self, context: bpy.types.Context) -> set[str]:
         if bpy.data.filepath and bpy.data.is_dirty:
-            self.report({"ERROR"}, "the .blend has changes that are not saved, and as saved may need these files: save it")
+            self.report(
+                {"ERROR"}, "the .blend has changes that are not saved, and as saved may need these files: save it"
+            )
             return {"CANCELLED"}
         unused = storage.unused_volumes()
         summary = _summary(unused)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import bpy
 
 from ..addon import ids, jobs, slices, storage, volumes
-from ..core.memory import readable_size
 
 
 class MPHDRR_PT_phantom(bpy.types.Panel):
@@ -48,7 +47,7 @@ class MPHDRR_PT_phantom(bpy.types.Panel):
             ("Voxels", " × ".join(map(str, shape))),
             ("Size", " × ".join(f"{s:.3g}" for s in spacing) + " mm"),
             ("Values", f"{settings.minimum:.4g} to {settings.maximum:.4g}"),
-            ("File", _file_state(item)),
+            ("File", volumes.file_state(item)),
         ):
             names.label(text=name)
             values.label(text=value)
@@ -68,12 +67,3 @@ class MPHDRR_PT_phantom(bpy.types.Panel):
             settings.derenzo.draw_settings(layout)
             layout.operator(ids.UPDATE_DERENZO, icon="FILE_REFRESH")
         layout.operator(ids.CLEAN_VOLUME_FILES, icon="TRASH")
-
-
-def _file_state(item: bpy.types.Object) -> str:
-    path = volumes.file_of(item)
-    if not path.is_file():
-        return "missing"
-    shown = ", coarser copy shown" if storage.is_preview(storage.absolute(item.data.filepath)) else ""
-    kept = "" if bpy.data.filepath else ", until saved"
-    return readable_size(path.stat().st_size) + shown + kept

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -11,6 +12,7 @@ bpy = pytest.importorskip("bpy")
 
 from mphdrr.addon import slices, volume_materials, volumes  # noqa: E402
 from mphdrr.addon.vdb import write_vdb  # noqa: E402
+from mphdrr.core.errors import InputError  # noqa: E402
 from mphdrr.core.frames import euler_pose  # noqa: E402
 from mphdrr.core.grid import Grid  # noqa: E402
 from mphdrr.core.hounsfield import hu_to_mu  # noqa: E402
@@ -169,3 +171,58 @@ def test_missing_files_are_found_again(tmp_path, ct, monkeypatch, capfd, large):
     assert item.data.filepath.startswith("//archive/old/") and item.data.grids.is_loaded
     with pytest.raises(RuntimeError, match="expected a folder"):
         bpy.ops.mphdrr.find_volume_files(directory=str(tmp_path / "nowhere"))
+
+
+@pytest.fixture
+def beats(ct) -> list[Volume]:
+    return [Volume(np.roll(ct.array, k, axis=0).copy(), ct.grid, "hu") for k in range(4)]
+
+
+@pytest.mark.parametrize("mode", ["CLIP", "EXTEND", "REPEAT", "PING_PONG"])
+def test_sequence_is_read_as_blender_shows_it(beats, mode):
+    item = volumes.add_volume_sequence(beats, "Heart", frame_start=10)
+    item.data.sequence_mode = mode
+    known = 0
+    for frame in range(3, 25):
+        bpy.context.scene.frame_set(frame)
+        shown = item.data.grids
+        if shown.frame > len(beats):  # Blender's "none"
+            with pytest.raises(InputError, match=f"no state at frame {frame}"):
+                volumes.volume_from_object(item)
+            continue
+        assert shown.load() and volumes.file_of(item) == Path(shown.frame_filepath)
+        assert np.array_equal(volumes.volume_from_object(item).array, beats[shown.frame - 1].array)
+        known += 1
+    assert known == (4 if mode == "CLIP" else 22)
+
+
+@pytest.mark.parametrize("large", [False, True])
+def test_sequence_is_saved_and_cleaned_up_whole(tmp_path, beats, monkeypatch, large):
+    if large:
+        monkeypatch.setattr(volumes, "MAX_SHOWN_VOXELS", 10)
+    volumes.add_volume_sequence(beats, "Heart")
+    bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "a.blend"))
+    bpy.ops.wm.open_mainfile(filepath=str(tmp_path / "a.blend"))
+    bpy.ops.mphdrr.clean_volume_files()
+    assert len(list((tmp_path / "a_mphdrr").iterdir())) == (8 if large else 4)
+    item = bpy.data.objects["Heart"]
+    for k in range(4):
+        bpy.context.scene.frame_set(1 + k)
+        assert item.data.grids.load() and item.data.grids.frame == k + 1
+        assert np.array_equal(volumes.volume_from_object(item).array, beats[k].array)
+
+
+def test_slices_beat_along(beats):
+    item = volumes.add_volume_sequence(beats, "Heart")
+    plane = slices.add_slices(item)[2]
+    first = _pixels(plane)
+    bpy.context.scene.frame_set(3)
+    assert slices.planes_of(item)[2] == plane
+    np.testing.assert_array_equal(_pixels(plane), np.roll(first, 2, axis=1))
+
+
+def test_sequence_of_what_cannot_follow_is_refused(ct):
+    other = Volume(ct.array, ct.grid, "mu")
+    for states in ([], [ct, other]):
+        with pytest.raises(InputError, match="volumes of one quantity"):
+            volumes.add_volume_sequence(states, "Heart")

@@ -142,7 +142,9 @@ def test_what_others_do_to_our_grids_counts(tmp_path):
     vdb.write(str(tmp_path / "b.vdb"), grids=[grid])
     moved = read_vdb(tmp_path / "b.vdb")
     assert moved.quantity == "mu"
-    np.testing.assert_allclose(moved.grid.center, [10.0 + 2 * compat.VDB_CENTER_SHIFT] + [2 * compat.VDB_CENTER_SHIFT] * 2)
+    np.testing.assert_allclose(
+        moved.grid.center, [10.0 + 2 * compat.VDB_CENTER_SHIFT] + [2 * compat.VDB_CENTER_SHIFT] * 2
+    )
 
 
 def _bad(path, kind):
@@ -195,7 +197,11 @@ def test_bad_files_are_refused_in_one_line(tmp_path, kind, message):
 
 def test_arguments_are_checked(tmp_path):
     vdb.write(str(tmp_path / "a.vdb"), grids=[_foreign(vdb.FloatGrid, np.ones((2, 2, 2), np.float32))])
-    for arguments, message in (({"quantity": "dose"}, "activity, mu"), ({"unit": 0.0}, "mm"), ({"grid": "x"}, "density")):
+    for arguments, message in (
+        ({"quantity": "dose"}, "activity, mu"),
+        ({"unit": 0.0}, "mm"),
+        ({"grid": "x"}, "density"),
+    ):
         with pytest.raises(InputError, match=message):
             read_vdb(tmp_path / "a.vdb", **arguments)
     with pytest.raises(InputError, match="no such file"):

@@ -21,6 +21,11 @@ EXPORT_FOR_PROGRAM = "mphdrr.export_for_program"
 VOXELIZE_OBJECTS = "mphdrr.voxelize_objects"
 MESH_FROM_VOLUME = "mphdrr.mesh_from_volume"
 ADD_DERENZO = "mphdrr.add_derenzo"
+IMPORT_VOLUME = "mphdrr.import_volume"
+ADD_SLICES = "mphdrr.add_slices"
+REMOVE_SLICES = "mphdrr.remove_slices"
+CLEAN_VOLUME_FILES = "mphdrr.clean_volume_files"
+FIND_VOLUME_FILES = "mphdrr.find_volume_files"
 RENDER_PROJECTIONS = "mphdrr.render_projections"
 EXPORT_DATASET = "mphdrr.export_dataset"
 UPDATE_DERENZO = "mphdrr.update_derenzo"
@@ -38,6 +43,7 @@ PANEL_PHYSICS = "MPHDRR_PT_physics"
 PANEL_EXPORT = "MPHDRR_PT_export"
 LIST_MODULES = "MPHDRR_UL_modules"
 FILE_HANDLER_WORKBOOK = "MPHDRR_FH_workbook"
+FILE_HANDLER_VOLUME = "MPHDRR_FH_volume"
 ORDER_GEOMETRY, ORDER_PHANTOM, ORDER_PROJECTIONS, ORDER_EXPORT = 0, 10, 20, 30  # bl_order
 
 # --- Properties on Blender's types: `scene.mphdrr_geometry`, `camera_object.mphdrr_module`, ... -------------
@@ -58,7 +64,7 @@ MATERIAL_CRYSTAL = "mphDRR crystal"
 MATERIAL_ROI = "mphDRR ROI"
 MOSAIC = "mphDRR mosaic"
 DERENZO = "Derenzo"
-PREVIEW_SUFFIX = ".preview.vdb"  # coarser copies of large volumes, for display only
+PREVIEW = ".preview"  # in the names of coarser copies of large volumes, for display only
 
 
 def module_name(number: int, n_modules: int = 80) -> str:

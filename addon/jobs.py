@@ -140,23 +140,36 @@ class JobProperties(bpy.types.PropertyGroup):
 
 
 class JobOperator:
-    """Mix into an operator and implement `job`; add nothing else but properties."""
+    """Mix into an operator and implement `job`, and `ask` where the user is asked first; add nothing else but properties."""
 
+    confirmed: BoolProperty(
+        name="Confirmed", description="Start without asking", options={"HIDDEN", "SKIP_SAVE"}, default=False
+    )
+
+    _asked = False
     _run: _Run | None = None
     _finishing: Generator[None, None, str] | None = None
     _timer: bpy.types.Timer | None = None
 
     if TYPE_CHECKING:  # what every bpy.types.Operator has
+        bl_idname: str
         bl_label: str
 
         def report(self, type: set[str], message: str) -> None: ...
+        def as_keywords(self, *, ignore: tuple[str, ...] = ()) -> dict[str, Any]: ...
 
     def job(self, context: bpy.types.Context) -> Job:
         """The work, from the operator's and the scene's settings; raises InputError."""
         raise NotImplementedError
 
+    def ask(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str] | None:
+        """Open a dialog or a file browser, whose button starts the work; None where there is nothing to ask."""
+        return None
+
     def execute(self, context: bpy.types.Context) -> set[str]:
         """Do the work at once and return when it is done."""
+        if self._asked:
+            return self._start_after_asking()
         if is_running():
             self.report({"ERROR"}, "another job is running: wait for it or cancel it")
             return {"CANCELLED"}
@@ -179,6 +192,11 @@ class JobOperator:
         if is_running():
             self.report({"ERROR"}, "another job is running: wait for it or cancel it")
             return {"CANCELLED"}
+        if not self.confirmed:
+            asked = self.ask(context, event)
+            if asked is not None:
+                self._asked = True
+                return asked
         try:
             self._run = _current = _Run(self.job(context))
         except Exception as error:
@@ -230,6 +248,19 @@ class JobOperator:
         if self._run is not None and self._run is _current:
             stop()
         self._end(context)
+
+    def _start_after_asking(self) -> set[str]:
+        """Blender runs what a dialog asked for by `execute`, which cannot become modal: start another of this kind."""
+        given = {
+            name: tuple(value) if isinstance(value, bpy.types.bpy_prop_array) else value
+            for name, value in self.as_keywords(ignore=("confirmed",)).items()
+        }
+        group, name = self.bl_idname.split("_OT_")  # an instance has the class's name there
+        try:
+            getattr(getattr(bpy.ops, group.lower()), name)("INVOKE_DEFAULT", confirmed=True, **given)
+        except RuntimeError as error:  # what the other one reported
+            self.report({"ERROR"}, str(error).removeprefix("Error: ").strip())
+        return {"CANCELLED"}
 
     def _end(self, context: bpy.types.Context) -> None:
         global _current

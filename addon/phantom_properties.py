@@ -74,11 +74,6 @@ class DerenzoSettings:
             "activity_kBq_per_mL": phantom.activity,
         }
 
-    def copy_settings(self, other: Any) -> None:
-        """Take over `other`'s numbers."""
-        for name in DerenzoSettings.__annotations__:
-            setattr(self, name, getattr(other, name))
-
     def draw_settings(self, layout: bpy.types.UILayout) -> None:
         """Draw the numbers into a panel or a dialog."""
         column = layout.column(align=True)
@@ -107,6 +102,20 @@ class DerenzoProperties(DerenzoSettings, bpy.types.PropertyGroup):
     """What a Derenzo object was made from."""
 
 
+# The modules that draw import these properties: they are imported when an edit calls for them.
+def _range_changed(self: VolumeProperties, context: bpy.types.Context) -> None:
+    from . import slices, volumes
+
+    volumes.show_range(self.id_data)
+    slices.update(self.id_data)
+
+
+def _slices_changed(self: VolumeProperties, context: bpy.types.Context) -> None:
+    from . import slices
+
+    slices.update(self.id_data)
+
+
 class VolumeProperties(bpy.types.PropertyGroup):
     """One volume; lives on its object as `Object.mphdrr_volume`."""
 
@@ -122,7 +131,25 @@ class VolumeProperties(bpy.types.PropertyGroup):
     unit: StringProperty(name="Unit", description="Unit of the voxels' values")
     shape: IntVectorProperty(name="Shape", description="Voxels along the grid's axes", size=3)
     spacing: FloatVectorProperty(name="Spacing", description="Voxel size in mm along the grid's axes", size=3)
+    minimum: FloatProperty(name="Minimum", description="Smallest voxel value")
     maximum: FloatProperty(name="Maximum", description="Largest voxel value")
+    extent: FloatProperty(
+        name="Extent", description="Largest side in mm of the box around what is not empty", options={"HIDDEN"},
+        default=1.0,
+    )  # fmt: skip
+    display_low: FloatProperty(
+        name="Low",
+        description="Value, in the volume's unit, at and below which nothing is shown",
+        update=_range_changed,
+    )
+    display_high: FloatProperty(
+        name="High", description="Value, in the volume's unit, that is shown brightest", default=1.0,
+        update=_range_changed,
+    )  # fmt: skip
+    slices: IntVectorProperty(
+        name="Slices", description="Voxel, along each of the grid's axes, that the slice planes lie in; from 0", size=3,
+        min=0, update=_slices_changed,
+    )  # fmt: skip
     exact_pose: StringProperty(
         name="Exact Pose", description="World-from-object matrix in double precision, JSON", options={"HIDDEN"}
     )

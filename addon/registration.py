@@ -10,6 +10,7 @@ import bpy
 from ..operators import (
     add_derenzo,
     add_map,
+    add_slices,
     aim_modules,
     check_geometry,
     duplicate_modules,
@@ -17,15 +18,17 @@ from ..operators import (
     export_for_program,
     export_geometry,
     import_geometry,
+    import_volume,
     remove_modules,
     render_projections,
     set_numbers,
     show_modules,
     tidy_modules,
+    volume_files,
     voxelize_objects,
 )
 from ..panels import design, export, geometry, phantom, projections
-from . import cli, ids, jobs, live, preferences, properties, storage, volumes
+from . import cli, ids, jobs, live, preferences, properties, slices, storage, volumes
 
 # Classes in the order of registration; a panel comes after its parent. To add a class, list it here.
 CLASSES: tuple[type, ...] = (
@@ -49,6 +52,12 @@ CLASSES: tuple[type, ...] = (
     add_derenzo.MPHDRR_OT_update_derenzo,
     voxelize_objects.MPHDRR_OT_voxelize_objects,
     voxelize_objects.MPHDRR_OT_mesh_from_volume,
+    import_volume.MPHDRR_OT_import_volume,
+    import_volume.MPHDRR_FH_volume,
+    add_slices.MPHDRR_OT_add_slices,
+    add_slices.MPHDRR_OT_remove_slices,
+    volume_files.MPHDRR_OT_clean_volume_files,
+    volume_files.MPHDRR_OT_find_volume_files,
     render_projections.MPHDRR_OT_render_projections,
     render_projections.MPHDRR_OT_show_projections,
     jobs.MPHDRR_OT_cancel_job,
@@ -68,6 +77,7 @@ CLASSES: tuple[type, ...] = (
 # (menu, draw function): entries in Blender's own menus.
 MENUS: tuple[tuple[Any, Any], ...] = (
     (bpy.types.TOPBAR_MT_file_import, import_geometry.draw_menu),
+    (bpy.types.TOPBAR_MT_file_import, import_volume.draw_menu),
     (bpy.types.TOPBAR_MT_file_export, export_geometry.draw_menu),
     (bpy.types.TOPBAR_MT_file_export, export_for_program.draw_menu),
     (bpy.types.TOPBAR_MT_file_export, export_dataset.draw_menu),
@@ -78,10 +88,12 @@ MENUS: tuple[tuple[Any, Any], ...] = (
 # (list in bpy.app.handlers, function): decorate the function with @bpy.app.handlers.persistent.
 HANDLERS: tuple[tuple[list[Any], Any], ...] = (
     (bpy.app.handlers.load_pre, jobs.before_load),
+    (bpy.app.handlers.load_pre, slices.before_load),
     (bpy.app.handlers.load_post, volumes.after_load),
     (bpy.app.handlers.load_post, live.after_load),
     (bpy.app.handlers.depsgraph_update_post, live.after_update),
     (bpy.app.handlers.frame_change_post, live.after_frame),
+    (bpy.app.handlers.frame_change_post, slices.after_frame_change),
     (bpy.app.handlers.undo_post, live.after_undo),
     (bpy.app.handlers.redo_post, live.after_undo),
     (bpy.app.handlers.save_pre, storage.before_save),

@@ -7,6 +7,7 @@ moved together. Files made before the first save are copied there when it happen
 from __future__ import annotations
 
 import os
+import re
 import shutil
 from pathlib import Path
 from typing import Any
@@ -16,6 +17,10 @@ import bpy
 from ..core.errors import InputError
 from ..core.files import ensure_folder, replacing
 from . import ids
+
+_OUR_VOLUME = re.compile(r"[a-z]+-[0-9a-f]{16}(\.preview)?(_\d{4})?\.vdb")
+"""Names of the files that this extension writes voxels to: by content."""
+_FRAME = re.compile(r"_\d{4}\.vdb$")  # of a sequence, at the end of the name
 
 # Paths as they were before the save that is running: (owner, attribute, old path).
 _before_save: list[tuple[Any, str, str]] = []
@@ -48,12 +53,63 @@ def absolute(path: str) -> Path:
 
 def full_resolution(path: Path) -> Path:
     """The .vdb with every voxel that belongs to the one that Blender shows (which may be a coarser copy)."""
-    return path.with_name(path.name.removesuffix(ids.PREVIEW_SUFFIX) + ".vdb") if is_preview(path) else path
+    return path.with_name(path.name.replace(ids.PREVIEW, "", 1))
 
 
 def is_preview(path: Path) -> bool:
     """Whether a .vdb is a coarser copy for display."""
-    return path.name.endswith(ids.PREVIEW_SUFFIX)
+    return ids.PREVIEW in path.suffixes or ids.PREVIEW + "_" in path.name
+
+
+def of_frame(path: Path, number: int) -> Path:
+    """The file of a sequence with that number."""
+    return path.with_name(_FRAME.sub(f"_{number:04d}.vdb", path.name))
+
+
+def missing_volumes() -> list[bpy.types.Volume]:
+    """Volumes of ours whose file, or the one with every voxel that belongs to it, is not there."""
+    return [
+        data
+        for data in bpy.data.volumes
+        if _OUR_VOLUME.fullmatch(absolute(data.filepath).name) and not all(p.is_file() for p in _files_of(data))
+    ]
+
+
+def relocate(top: Path) -> tuple[list[str], list[str]]:
+    """Look for missing volumes' files by their names, in a folder and all below it; those of one volume lie together.
+
+    Returns
+    -------
+    found, still_missing : list of str
+        Names of the volumes.
+    """
+    missing = missing_volumes()
+    wanted = {absolute(data.filepath).name for data in missing}
+    there = {path.name: path for path in sorted(top.rglob("*.vdb"), reverse=True) if path.name in wanted}
+    found = []
+    for data in missing:
+        shown = there.get(absolute(data.filepath).name)
+        if shown is not None and all(shown.with_name(path.name).is_file() for path in _files_of(data)):
+            data.filepath = stored_path(shown)
+            data.grids.load()
+            found.append(data)
+    return sorted(data.name for data in found), sorted(data.name for data in missing if data not in found)
+
+
+def unused_volumes() -> list[Path]:
+    """Files of voxels in this .blend's folder that none of its volumes needs."""
+    place = _folder_of(bpy.data.filepath) if bpy.data.filepath else _temporary_folder()
+    used = {path.name for data in bpy.data.volumes for path in _files_of(data)}
+    ours = [path for path in place.glob("*.vdb") if _OUR_VOLUME.fullmatch(path.name)]
+    return sorted(path for path in ours if path.is_file() and path.name not in used)
+
+
+def _files_of(data: bpy.types.Volume) -> set[Path]:
+    """The files that a volume needs: of every state, and those with every voxel."""
+    shown = absolute(data.filepath)
+    first = data.frame_offset + 1
+    states = [of_frame(shown, first + k) for k in range(data.frame_duration)] if data.is_sequence else [shown]
+    return {file for state in states for file in (state, full_resolution(state))}
 
 
 @bpy.app.handlers.persistent
@@ -66,7 +122,7 @@ def before_save(filepath: str, _: Any = None) -> None:
     for volume in bpy.data.volumes:
         source = Path(volume.filepath)
         if _is_temporary(source):
-            for file in {source, full_resolution(source)}:
+            for file in _files_of(volume):
                 _bring(file, target)
             _set(volume, "filepath", f"//{target.name}/{source.name}")
     for scene in bpy.data.scenes:

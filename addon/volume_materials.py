@@ -1,4 +1,8 @@
-"""How volumes look: the volume material, and the density of the solid viewport's smoke."""
+"""How volumes look: the volume material, and the density of the solid viewport's smoke.
+
+Activity glows in the colours of "inferno"; attenuation and CT numbers look like a radiograph, brighter where they are
+higher.
+"""
 
 from __future__ import annotations
 
@@ -15,24 +19,41 @@ _INFERNO = (
     (0.75, (0.8879, 0.1413, 0.0178)),
     (1.00, (0.9200, 0.4600, 0.0220)),
 )
-# Extinction times the volume's size: high enough that a rod of a twentieth of it looks solid.
+_GREYS = ((0.00, (0.02, 0.02, 0.02)), (1.00, (0.80, 0.80, 0.80)))
+_XRAY = ("mu", "hu")
+_CT_WINDOW = (-200.0, 1000.0)  # HU: skin to bone
+# Extinction times the volume's size: high enough that a rod of a twentieth of it looks solid; a patient is looked through.
 _OPACITY = 60.0
+_XRAY_OPACITY = 20.0
 _BRIGHTNESS = 1.0
 # The same for the solid viewport, whose smoke is denser and has no shading: thin enough that rods show behind rods.
 _SMOKE = 15.0
 
 
-def new_material(name: str, grid: str, maximum: float, size: float) -> bpy.types.Material:
-    """Material that shows a grid by colour, glowing and opaque where its values are high.
+_RANGE = "Display Range"  # the node that holds the values at the ramp's ends
+
+
+def ramp(quantity: str) -> tuple[tuple[float, tuple[float, float, float]], ...]:
+    """Positions (0 to 1) and colours (linear RGB) that show a quantity's display range."""
+    return _GREYS if quantity in _XRAY else _INFERNO
+
+
+def usual_range(quantity: str, low: float, high: float) -> tuple[float, float]:
+    """The values to begin the display range with, of a volume with values from `low` to `high`."""
+    if quantity == "hu":
+        return _CT_WINDOW
+    return 0.0, high if high > 0 else max(-low, 1.0)
+
+
+def new_material(name: str, quantity: str, size: float) -> bpy.types.Material:
+    """Material that shows a grid by colour, glowing and opaque where its values are high; `set_range` says where that is.
 
     Parameters
     ----------
     name
         The material's name.
-    grid
-        Grid of the .vdb that drives it.
-    maximum
-        Value at the colour ramp's upper end; the node "Full Scale" holds it.
+    quantity
+        Of the volume; also the name of the .vdb's grid that drives the material.
     size
         Of the volume, mm; the node "Opacity" is set from it.
     """
@@ -48,18 +69,17 @@ def new_material(name: str, grid: str, maximum: float, size: float) -> bpy.types
             setattr(new, key, value)
         return new
 
-    attribute = node("ShaderNodeAttribute", 0, attribute_name=grid)
-    scale = node("ShaderNodeValue", 0, 1, name="Full Scale", label="Full Scale")
-    scale.outputs[0].default_value = maximum
-    relative = node("ShaderNodeMath", 1, operation="DIVIDE", use_clamp=True)
-    ramp = node("ShaderNodeValToRGB", 2, -1)
-    elements = ramp.color_ramp.elements
-    while len(elements) < len(_INFERNO):
+    attribute = node("ShaderNodeAttribute", 0, attribute_name=quantity)
+    relative = node("ShaderNodeMapRange", 1, name=_RANGE, label=_RANGE, clamp=True)
+    colors = ramp(quantity)
+    color = node("ShaderNodeValToRGB", 2, -1)
+    elements = color.color_ramp.elements
+    while len(elements) < len(colors):
         elements.new(0.5)
-    for element, (position, color) in zip(elements, _INFERNO, strict=True):
-        element.position, element.color = position, (*color, 1.0)
-    opacity = node("ShaderNodeValue", 1, 1, name="Opacity", label="Opacity (1/mm)")
-    opacity.outputs[0].default_value = _OPACITY / size
+    for element, (position, rgb) in zip(elements, colors, strict=True):
+        element.position, element.color = position, (*rgb, 1.0)
+    opacity = node("ShaderNodeValue", 1, 1.3, name="Opacity", label="Opacity (1/mm)")
+    opacity.outputs[0].default_value = (_XRAY_OPACITY if quantity in _XRAY else _OPACITY) / size
     extinction = node("ShaderNodeMath", 2, 0.3, operation="MULTIPLY")
     strength = node("ShaderNodeMath", 3, 0, operation="MULTIPLY")
     strength.inputs[1].default_value = _BRIGHTNESS
@@ -70,25 +90,32 @@ def new_material(name: str, grid: str, maximum: float, size: float) -> bpy.types
     output = node("ShaderNodeOutputMaterial", 6)
 
     link = tree.links.new
-    link(attribute.outputs["Fac"], relative.inputs[0])
-    link(scale.outputs[0], relative.inputs[1])
-    link(relative.outputs[0], ramp.inputs["Fac"])
-    link(relative.outputs[0], extinction.inputs[0])
+    link(attribute.outputs["Fac"], relative.inputs["Value"])
+    link(relative.outputs["Result"], color.inputs["Fac"])
+    link(relative.outputs["Result"], extinction.inputs[0])
     link(opacity.outputs[0], extinction.inputs[1])
     link(extinction.outputs[0], strength.inputs[0])
     link(extinction.outputs[0], absorption.inputs["Density"])
-    link(ramp.outputs["Color"], emission.inputs["Color"])
+    link(color.outputs["Color"], emission.inputs["Color"])
     link(strength.outputs[0], emission.inputs["Strength"])
     link(absorption.outputs[0], both.inputs[0])
     link(emission.outputs[0], both.inputs[1])
     link(both.outputs[0], output.inputs["Volume"])
-    material.diffuse_color = (*_INFERNO[-1][1], 1.0)  # of the solid viewport's smoke
+    material.diffuse_color = (*colors[-1][1], 1.0)  # of the solid viewport's smoke
     return material
 
 
-def set_display(data: bpy.types.Volume, maximum: float, size: float) -> None:
+def set_range(material: bpy.types.Material, low: float, high: float) -> None:
+    """Let the colours go from the value `low` to `high`; a material of the user's own making stays as it is."""
+    node = material.node_tree.nodes.get(_RANGE) if material.node_tree else None
+    if node is not None:
+        node.inputs["From Min"].default_value = low
+        node.inputs["From Max"].default_value = high
+
+
+def set_display(data: bpy.types.Volume, low: float, high: float, size: float) -> None:
     """Make the solid viewport draw the volume's values as smoke of a useful density."""
-    data.display.density = _SMOKE / size / maximum
+    data.display.density = _SMOKE / size / max(abs(low), abs(high))
     data.display.wireframe_type = "NONE"
     data.display.interpolation_method = "LINEAR"
 

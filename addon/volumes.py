@@ -1,15 +1,16 @@
-"""Core volumes <-> OpenVDB files <-> Blender's Volume objects.
+"""Core volumes <-> Blender's Volume objects.
 
-The .vdb holds every voxel's exact float32 value, the exact float64 affine, the quantity, the unit and where the volume
-came from; a saved .blend can therefore be projected again after it is opened. The object's matrix carries the pose: the
-affine in the file is from voxel index to the object's own space, so that moving the object moves the phantom.
+The voxels lie in a .vdb (see `vdb`), so that a saved .blend can be projected again after it is opened. The object's
+matrix carries the pose: the affine in the file is from voxel index to the object's own space, so that moving the object
+moves the phantom.
 """
 
 from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -18,84 +19,75 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..core.errors import InputError
-from ..core.files import replacing
 from ..core.frames import checked_affine
 from ..core.grid import Grid
 from ..core.maps import MAPS
-from ..core.memory import require
-from ..core.version import VERSION
+from ..core.memory import readable_size
 from ..core.volume import UNITS, Volume
-from . import ids, storage, volume_materials
+from . import compat, ids, storage, volume_materials
 from .cameras import world_matrix
-from .compat import VDB_CENTER_SHIFT
+from .vdb import BACKGROUND, read_vdb, write_vdb
 
 MAX_SHOWN_VOXELS = 256**3
 """More non-zero voxels than this are shown as a coarser copy: Blender's window would hang on them."""
 
 
-def write_vdb(volume: Volume, path: Path, provenance: dict[str, Any] | None = None) -> None:
-    """Write a volume as one sparse float grid named after its quantity.
+@dataclass(frozen=True)
+class StoredVolume:
+    """A volume, or the states of one, whose voxels are in files, ready to be put into the scene.
 
-    The transform is that of the running Blender (see `compat.VDB_CENTER_SHIFT`); the metadata hold the exact affine
-    with the voxel-centre convention, so that `read_vdb` gives the same volume in every version.
+    Attributes
+    ----------
+    states : tuple of Volume
+        In world mm.
+    pose : array (4, 4)
+        World-from-object matrix.
+    path : Path
+        The .vdb that Blender shows, of the first state: every voxel, or a coarser copy.
+    low, high : float
+        Smallest and largest value.
+    extent : float
+        Largest side, mm, of the box around the voxels that are not empty.
     """
-    vdb = _openvdb()
-    grid = vdb.FloatGrid()
-    array, affine = volume.array, volume.grid.affine
-    mirrored = np.linalg.det(affine[:3, :3]) < 0
-    if mirrored:  # 4.5 draws nothing where the transform is left-handed: the same voxels, counted from the other end
-        turn = np.diag([-1.0, 1.0, 1.0, 1.0])
-        turn[0, 3] = array.shape[0] - 1
-        array, affine = array[::-1], affine @ turn
-    # A copy, because it takes neither strides nor read-only arrays.
-    grid.copyFromArray(np.array(array, np.float32, order="C"), tolerance=0.0)
-    grid.name = volume.quantity
-    grid.gridClass = vdb.GridClass.FOG_VOLUME
-    shift = np.eye(4)
-    shift[:3, 3] = VDB_CENTER_SHIFT
-    # OpenVDB's matrices act on row vectors.
-    grid.transform = vdb.createLinearTransform((affine @ shift).T.tolist())
-    grid["mphdrr_quantity"] = volume.quantity
-    grid["mphdrr_unit"] = volume.unit
-    grid["mphdrr_shape"] = json.dumps(volume.grid.shape)
-    grid["mphdrr_affine"] = json.dumps(volume.grid.affine.tolist())
-    grid["mphdrr_mirrored"] = bool(mirrored)
-    grid["mphdrr_center_shift"] = float(VDB_CENTER_SHIFT)
-    grid["mphdrr_provenance"] = json.dumps(provenance or {})
-    grid["mphdrr_version"] = VERSION
-    with replacing(path) as temporary:
-        vdb.write(str(temporary), grids=[grid])
+
+    states: tuple[Volume, ...]
+    pose: NDArray[np.float64]
+    path: Path
+    low: float
+    high: float
+    extent: float
+
+    @property
+    def volume(self) -> Volume:
+        """The first state, or the only one."""
+        return self.states[0]
 
 
-def read_vdb(path: Path) -> Volume:
-    """Read back what `write_vdb` wrote: the same values, affine and quantity, to the last bit.
+def store_volume(
+    volume: Volume | Sequence[Volume],
+    folder: Path,
+    pose: ArrayLike | None = None,
+    provenance: dict[str, Any] | None = None,
+) -> StoredVolume:
+    """Do of `add_volume`, or `add_volume_sequence`, what leaves bpy alone and takes long, for a job's thread.
 
-    Raises
-    ------
-    InputError
-        No such file, not one of ours, or damaged.
+    `folder` is `storage.folder()`.
     """
-    if not path.is_file():
-        raise InputError(f"{path}: no such file; the volume's voxels are gone, so add the volume again")
-    vdb = _openvdb()
-    try:
-        grid = vdb.readAll(str(path))[0][0]
-        metadata = grid.metadata
-        shape = tuple(json.loads(metadata["mphdrr_shape"]))
-        affine = np.array(json.loads(metadata["mphdrr_affine"]))
-        quantity = metadata["mphdrr_quantity"]
-        mirrored = metadata["mphdrr_mirrored"]
-    except KeyError as error:
-        raise InputError(f"{path}: was not written by mphDRR ({error} is missing)") from None
-    except Exception as error:  # whatever OpenVDB raises on a damaged file
-        raise InputError(f"{path}: cannot be read as an OpenVDB volume ({error})") from error
-    require(4 * np.prod(shape, dtype=float), f"the volume of {' x '.join(map(str, shape))} voxels")
-    array = np.zeros(shape, np.float32)
-    grid.copyToArray(array)
-    if mirrored:
-        array = np.ascontiguousarray(array[::-1])
-    array.flags.writeable = False
-    return Volume(array, Grid(shape, affine), quantity)
+    states = (volume,) if isinstance(volume, Volume) else tuple(volume)
+    if len({state.quantity for state in states}) != 1:
+        found = ", ".join(state.quantity for state in states) or "none"
+        raise InputError(f"volume sequence: expected volumes of one quantity, got {found}")
+    pose = _pose_of(states[0], pose)
+    to_object = np.linalg.inv(pose)
+    local = [Volume(v.array, Grid(v.grid.shape, to_object @ v.grid.affine), v.quantity) for v in states]
+    return StoredVolume(
+        states,
+        pose,
+        _store(local, folder, provenance),
+        min(float(v.array.min()) for v in states),
+        max(float(v.array.max()) for v in states),
+        max(_extent(v) for v in states),
+    )
 
 
 def add_volume(
@@ -121,10 +113,46 @@ def add_volume(
     collection
         Default: the scene's own.
     """
-    data = _volume_data(volume, name, _pose_of(volume, pose), provenance)
-    item = bpy.data.objects.new(name, data)
+    return add_stored(store_volume(volume, storage.folder(), pose, provenance), name, collection)
+
+
+def add_volume_sequence(
+    volumes: Sequence[Volume],
+    name: str,
+    pose: ArrayLike | None = None,
+    provenance: dict[str, Any] | None = None,
+    collection: bpy.types.Collection | None = None,
+    frame_start: int = 1,
+) -> bpy.types.Object:
+    """Put the states of something that changes into the scene, such as a beating heart: one for each Blender frame.
+
+    From `frame_start` on the states follow each other, and begin anew after the last one (`Volume.sequence_mode`).
+    `volume_from_object` and projections take the state of the scene's current frame.
+
+    Parameters
+    ----------
+    volumes
+        The states, in world mm, of one quantity.
+    name, pose, provenance, collection
+        See `add_volume`; the default pose is the middle of the first state's grid.
+    frame_start
+        Frame of the first state.
+
+    Raises
+    ------
+    InputError
+        No states, or states of several quantities.
+    """
+    item = add_stored(store_volume(tuple(volumes), storage.folder(), pose, provenance), name, collection)
+    item.data.frame_start = frame_start
+    return item
+
+
+def add_stored(stored: StoredVolume, name: str, collection: bpy.types.Collection | None = None) -> bpy.types.Object:
+    """Put a stored volume into the scene; see `add_volume`."""
+    item = bpy.data.objects.new(name, _volume_data(stored, name))
     (collection or bpy.context.scene.collection).objects.link(item)
-    _describe(item, volume, _pose_of(volume, pose))
+    _describe(item, stored)
     return item
 
 
@@ -132,10 +160,14 @@ def replace_volume(
     item: bpy.types.Object, volume: Volume, pose: ArrayLike | None = None, provenance: dict[str, Any] | None = None
 ) -> None:
     """Give a Volume object other voxels (and pose, see `add_volume`); the old datablocks are removed."""
+    replace_stored(item, store_volume(volume, storage.folder(), pose, provenance))
+
+
+def replace_stored(item: bpy.types.Object, stored: StoredVolume) -> None:
+    """Give a Volume object the voxels of a stored volume; see `replace_volume`."""
     old = item.data
-    data = _volume_data(volume, item.name, _pose_of(volume, pose), provenance)
-    item.data = data
-    _describe(item, volume, _pose_of(volume, pose))
+    item.data = data = _volume_data(stored, item.name)
+    _describe(item, stored)
     if old.users == 0:
         materials = [m for m in old.materials if m]
         name = old.name
@@ -144,6 +176,25 @@ def replace_volume(
         for material in materials:
             if material.users == 0:
                 bpy.data.materials.remove(material)
+
+
+def make_active(context: bpy.types.Context, item: bpy.types.Object) -> None:
+    """Select a new volume alone, and let EEVEE draw it."""
+    volume_materials.show_in_eevee(context.scene)
+    for other in context.selected_objects:
+        other.select_set(False)
+    item.select_set(True)
+    context.view_layer.objects.active = item
+
+
+def show_range(item: bpy.types.Object) -> None:
+    """Draw a volume in its display range (`VolumeProperties.display_low` and `display_high`)."""
+    settings = getattr(item, ids.OBJECT_VOLUME)
+    low, high = settings.display_low, max(settings.display_high, settings.display_low + 1e-30)
+    for material in item.data.materials:
+        if material is not None:
+            volume_materials.set_range(material, low, high)
+    volume_materials.set_display(item.data, low, high, settings.extent)
 
 
 def volume_from_object(item: bpy.types.Object) -> Volume:
@@ -168,6 +219,8 @@ def reader(item: bpy.types.Object) -> Callable[[], Volume]:
     if item is None or item.type != "VOLUME" or not getattr(item, ids.OBJECT_VOLUME).is_volume:
         what = "nothing is chosen" if item is None else f"{item.name!r} is no mphDRR volume"
         raise InputError(f"{what}: add a phantom first, or choose one")
+    if _state(item.data) is None:
+        raise InputError(f"{item.name!r} has no state at frame {bpy.context.scene.frame_current}")
     path, pose = file_of(item), pose_of_object(item)
     if not path.is_file():
         raise InputError(f"{path}: no such file; the voxels of {item.name!r} are gone, so add the volume again")
@@ -180,8 +233,19 @@ def reader(item: bpy.types.Object) -> Callable[[], Volume]:
 
 
 def file_of(item: bpy.types.Object) -> Path:
-    """The .vdb with every voxel of a Volume object."""
-    return storage.full_resolution(storage.absolute(item.data.filepath))
+    """The .vdb with every voxel of a Volume object; of a sequence, that of the current frame."""
+    path = storage.full_resolution(storage.absolute(item.data.filepath))
+    return storage.of_frame(path, _state(item.data) or 1) if item.data.is_sequence else path
+
+
+def file_state(item: bpy.types.Object) -> str:
+    """What there is to say about a Volume object's file: its size, or that it is missing."""
+    path = file_of(item)
+    if not path.is_file():
+        return "missing"
+    shown = ", coarser copy shown" if storage.is_preview(storage.absolute(item.data.filepath)) else ""
+    kept = "" if bpy.data.filepath else ", until saved"
+    return readable_size(path.stat().st_size) + shown + kept
 
 
 def pose_of_object(item: bpy.types.Object) -> NDArray[np.float64]:
@@ -216,9 +280,11 @@ def volume_objects(scene: bpy.types.Scene) -> list[bpy.types.Object]:
 
 
 def coarser(volume: Volume, factor: int = 2) -> Volume:
-    """Means over blocks of `factor`^3 voxels, for display; voxels beyond the edge count as 0."""
+    """Means over blocks of `factor`^3 voxels, for display; voxels beyond the edge are empty."""
     padding = [(0, -n % factor) for n in volume.grid.shape]
-    array = np.pad(volume.array, padding) if any(p for _, p in padding) else volume.array
+    array = (
+        np.pad(volume.array, padding, constant_values=_empty(volume)) if any(p for _, p in padding) else volume.array
+    )
     a, b, c = (n // factor for n in array.shape)
     means = array.reshape(a, factor, b, factor, c, factor).mean(axis=(1, 3, 5), dtype=np.float32)
     blocks = np.diag([factor, factor, factor, 1.0])
@@ -228,16 +294,23 @@ def coarser(volume: Volume, factor: int = 2) -> Volume:
 
 @bpy.app.handlers.persistent
 def after_load(*_: Any) -> None:
-    """Rewrite volumes of a .blend that was saved by a Blender which draws voxels half a voxel elsewhere."""
+    """Rewrite volumes of a .blend from a Blender which draws voxels half a voxel elsewhere; say which files are gone."""
+    missing = storage.missing_volumes()
+    if missing:
+        names = ", ".join(sorted(data.name for data in missing))
+        print(f"mphDRR: the voxel files of {names} are missing: Find Missing Volume Files in the Phantom panel")
     for item in bpy.data.objects:
-        if not is_volume(item):
+        if not is_volume(item) or item.data in missing:
             continue
         settings = getattr(item, ids.OBJECT_VOLUME)
-        if settings.center_shift != VDB_CENTER_SHIFT:
+        if settings.center_shift != compat.VDB_CENTER_SHIFT:
+            data = item.data
+            path = storage.full_resolution(storage.absolute(data.filepath))
+            count = data.frame_duration if data.is_sequence else 1
             try:
-                shown = _store(read_vdb(file_of(item)), {})
-                item.data.filepath = storage.stored_path(shown)
-                settings.center_shift = VDB_CENTER_SHIFT
+                states = [read_vdb(storage.of_frame(path, k + 1) if data.is_sequence else path) for k in range(count)]
+                data.filepath = storage.stored_path(_store(states, storage.folder(), {}))
+                settings.center_shift = compat.VDB_CENTER_SHIFT
             except InputError as error:
                 print(f"mphDRR: {item.name} is drawn half a voxel off: {error}")
 
@@ -250,85 +323,113 @@ def _pose_of(volume: Volume, pose: ArrayLike | None) -> NDArray[np.float64]:
     return middle
 
 
-def _volume_data(
-    volume: Volume, name: str, pose: NDArray[np.float64], provenance: dict[str, Any] | None
-) -> bpy.types.Volume:
-    """Volume datablock of `volume`, in the space of an object at `pose`."""
-    local = Volume(volume.array, Grid(volume.grid.shape, np.linalg.inv(pose) @ volume.grid.affine), volume.quantity)
-    path = _store(local, provenance)
+def _volume_data(stored: StoredVolume, name: str) -> bpy.types.Volume:
+    """Volume datablock of a stored volume, with its material."""
+    quantity = stored.volume.quantity
     data = bpy.data.volumes.new(name)
     try:
-        data.filepath = storage.stored_path(path)
+        data.filepath = storage.stored_path(stored.path)
         if not data.grids.load() or data.grids.error_message:
             raise InputError(
-                f"{path}: Blender cannot load the volume ({data.grids.error_message or 'no reason given'})"
+                f"{stored.path}: Blender cannot load the volume ({data.grids.error_message or 'no reason given'})"
             )
-        if volume.quantity not in data.grids:
-            raise InputError(f"{path}: Blender finds no grid {volume.quantity!r} in it")
+        if quantity not in data.grids:
+            raise InputError(f"{stored.path}: Blender finds no grid {quantity!r} in it")
     except Exception:
         bpy.data.volumes.remove(data)
         raise
-    maximum = float(np.abs(volume.array).max(initial=0.0)) or 1.0
-    size = _extent(volume)
+    if len(stored.states) > 1:  # set after loading, which would look for frame 0 until the scene is evaluated
+        data.is_sequence, data.frame_duration, data.sequence_mode = True, len(stored.states), "REPEAT"
     data.render.precision = "FULL"
     data.render.space = "OBJECT"
     data.render.clipping = 0.0  # the default, 0.001, erases mu values and faint activity
-    volume_materials.set_display(data, maximum, size)
-    data.materials.append(volume_materials.new_material(f"{name} {volume.quantity}", volume.quantity, maximum, size))
+    data.materials.append(volume_materials.new_material(f"{name} {quantity}", quantity, stored.extent))
     return data
 
 
-def _store(local: Volume, provenance: dict[str, Any] | None) -> Path:
-    """Write a volume, and a coarser copy if it is large, under names from their content; the path to show."""
-    digest = hashlib.sha256(local.array.data)
-    recipe = (local.grid.shape, local.grid.affine.tolist(), local.quantity, VDB_CENTER_SHIFT, provenance or {})
-    digest.update(json.dumps(recipe).encode())
-    stem = f"{local.quantity}-{digest.hexdigest()[:16]}"
-    path = storage.folder() / f"{stem}.vdb"
-    if not path.exists():
-        write_vdb(local, path, provenance)
-    shown = local
-    while np.count_nonzero(shown.array) > MAX_SHOWN_VOXELS:
-        shown = coarser(shown)
-    if shown is local:
-        return path
-    preview = path.with_name(stem + ids.PREVIEW_SUFFIX)
-    if not preview.exists():
-        write_vdb(shown, preview, {"coarser_copy_of": path.name})
-    return preview
+def _store(states: Sequence[Volume], folder: Path, provenance: dict[str, Any] | None) -> Path:
+    """Write volumes, and coarser copies if they are large, under names from their content; the (first) path to show."""
+    digest = hashlib.sha256()
+    for state in states:
+        digest.update(state.array.data)
+        recipe = (
+            state.grid.shape,
+            state.grid.affine.tolist(),
+            state.quantity,
+            compat.VDB_CENTER_SHIFT,
+            provenance or {},
+        )
+        digest.update(json.dumps(recipe).encode())
+    stem = f"{states[0].quantity}-{digest.hexdigest()[:16]}"
+    paths = _write(states, folder, stem, provenance)
+    shown = list(states)
+    while max(np.count_nonzero(state.array != _empty(state)) for state in shown) > MAX_SHOWN_VOXELS:
+        shown = [coarser(state) for state in shown]
+    if shown[0] is not states[0]:
+        paths = _write(shown, folder, stem + ids.PREVIEW, {"coarser_copy_of": stem})
+    return paths[0]
 
 
-def _describe(item: bpy.types.Object, volume: Volume, pose: NDArray[np.float64]) -> None:
+def _write(states: Sequence[Volume], folder: Path, stem: str, provenance: dict[str, Any] | None) -> list[Path]:
+    paths = [folder / f"{stem}{f'_{k:04d}' if len(states) > 1 else ''}.vdb" for k in range(1, len(states) + 1)]
+    for state, path in zip(states, paths, strict=True):
+        if not path.exists():
+            write_vdb(state, path, provenance)
+    return paths
+
+
+def _state(data: bpy.types.Volume) -> int | None:
+    """Number of the file that Blender shows at the current frame, by its own rule; None where it shows none."""
+    count = data.frame_duration
+    if not data.is_sequence:
+        return 0
+    if count == 0:
+        return None
+    frame = bpy.context.scene.frame_current - data.frame_start  # 0: the first
+    if data.sequence_mode == "CLIP" and not 0 <= frame < count:
+        return None
+    if data.sequence_mode == "EXTEND":
+        frame = min(max(frame, 0), count - 1)
+    elif data.sequence_mode == "REPEAT":
+        frame %= count
+    elif data.sequence_mode == "PING_PONG":
+        frame %= max(1, 2 * count - 2)
+        frame = min(frame, 2 * count - 2 - frame)
+    return frame + 1 + data.frame_offset
+
+
+def _describe(item: bpy.types.Object, stored: StoredVolume) -> None:
     from mathutils import Matrix
 
-    item.matrix_world = Matrix(pose)
+    volume = stored.volume
+    item.matrix_world = Matrix(stored.pose)
     settings = getattr(item, ids.OBJECT_VOLUME)
+    shown = settings.display_low, settings.display_high
+    usual = volume_materials.usual_range(settings.quantity, settings.minimum, settings.maximum)
+    chosen = settings.is_volume and settings.quantity == volume.quantity and not np.allclose(shown, usual)
     settings.is_volume = True
     settings.quantity = volume.quantity
     settings.unit = UNITS[volume.quantity]
     settings.shape = volume.grid.shape
     settings.spacing = volume.grid.spacing
-    settings.maximum = float(volume.array.max(initial=0.0))
-    settings.exact_pose = json.dumps(pose.tolist())
-    settings.center_shift = VDB_CENTER_SHIFT
+    settings.minimum, settings.maximum = stored.low, stored.high
+    settings.extent = stored.extent
+    settings.exact_pose = json.dumps(stored.pose.tolist())
+    settings.center_shift = compat.VDB_CENTER_SHIFT
+    settings.display_low, settings.display_high = (
+        shown if chosen else volume_materials.usual_range(volume.quantity, stored.low, stored.high)
+    )
+
+
+def _empty(volume: Volume) -> float:
+    """The value of voxels that nobody sees."""
+    return BACKGROUND.get(volume.quantity, 0.0)
 
 
 def _extent(volume: Volume) -> float:
-    """Largest side, mm, of the box around the voxels that are not 0."""
-    filled = volume.array != 0
+    filled = volume.array != _empty(volume)
     sides = []
     for axis, spacing in enumerate(volume.grid.spacing):
         used = np.flatnonzero(filled.any(axis=tuple(k for k in range(3) if k != axis)))
         sides.append(spacing * (used[-1] - used[0] + 1) if len(used) else spacing)
     return float(max(sides))
-
-
-def _openvdb() -> Any:
-    try:
-        import openvdb
-    except ImportError:
-        if not hasattr(bpy.utils, "expose_bundled_modules"):
-            raise InputError("this Blender has no openvdb module: use 4.5 or later from blender.org") from None
-        bpy.utils.expose_bundled_modules()  # needed by the bpy wheel only
-        import openvdb
-    return openvdb

@@ -34,7 +34,9 @@ def require(n_bytes: float, what: str) -> None:
 
 
 def readable_size(n_bytes: float) -> str:
-    """Bytes as ``"12 MiB"`` or ``"3.4 GiB"``."""
+    """Bytes as ``"34 KiB"``, ``"12 MiB"`` or ``"3.4 GiB"``."""
+    if n_bytes < 2**20:
+        return f"{n_bytes / 2**10:.0f} KiB"
     if n_bytes < 2**30:
         return f"{n_bytes / 2**20:.0f} MiB"
     return f"{n_bytes / 2**30:.3g} GiB"

@@ -2,20 +2,24 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Generator
+from typing import Any
+
 import bpy
 import numpy as np
 from bpy.props import FloatProperty, FloatVectorProperty, StringProperty
+from numpy.typing import NDArray
 
-from ..addon import ids, volume_materials, volumes
+from ..addon import ids, jobs, storage, volumes
 from ..addon.phantom_properties import DerenzoSettings
-from ..addon.reports import warnings_reported
 from ..core.errors import InputError
 from ..core.frames import euler_pose
 from ..core.grid import Grid
+from ..core.progress import Progress
 from ..core.volume import Volume
 
 
-class MPHDRR_OT_add_derenzo(DerenzoSettings, bpy.types.Operator):
+class MPHDRR_OT_add_derenzo(DerenzoSettings, jobs.JobOperator, bpy.types.Operator):
     bl_idname = ids.ADD_DERENZO
     bl_label = "Add Derenzo Phantom"
     bl_description = "Add a phantom of hot rods in six sectors as a volume"
@@ -31,7 +35,7 @@ class MPHDRR_OT_add_derenzo(DerenzoSettings, bpy.types.Operator):
         name="Psi", description="Turn about the phantom's own axis, done first", subtype="ANGLE", default=0.0
     )
 
-    def invoke(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str]:
+    def ask(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str] | None:
         return context.window_manager.invoke_props_dialog(self, width=320, title=self.bl_label, confirm_text="Add")
 
     def draw(self, context: bpy.types.Context) -> None:
@@ -45,20 +49,27 @@ class MPHDRR_OT_add_derenzo(DerenzoSettings, bpy.types.Operator):
         for angle in ("phi", "theta", "psi"):
             column.prop(self, angle)
 
-    def execute(self, context: bpy.types.Context) -> set[str]:
+    def job(self, context: bpy.types.Context) -> jobs.Job:
         if context.mode != "OBJECT":
             bpy.ops.object.mode_set(mode="OBJECT")
-        try:
-            with warnings_reported(self):
-                item = add_derenzo(context, self, euler_pose(self.phi, self.theta, self.psi, self.location), self.name)
-        except (InputError, MemoryError) as error:
-            self.report({"ERROR"}, str(error) or "not enough memory for this grid: choose fewer voxels")
-            return {"CANCELLED"}
-        self.report({"INFO"}, f"Added {item.name!r}: {self.voxels}^3 voxels of {self.grid().spacing[0]:.3g} mm")
-        return {"FINISHED"}
+        voxels, name = self.voxels, self.name
+        chosen = {key: _value(self, key) for key in DerenzoSettings.__annotations__}
+
+        def finish(stored: volumes.StoredVolume) -> Generator[None, None, str]:
+            yield
+            item = volumes.add_stored(stored, name, bpy.context.collection)
+            properties = getattr(item, ids.OBJECT_VOLUME)
+            properties.kind = "DERENZO"
+            for key, value in chosen.items():
+                setattr(properties.derenzo, key, value)
+            volumes.make_active(bpy.context, item)
+            return f"Added {item.name!r}: {voxels}^3 voxels of {stored.volume.grid.spacing[0]:.3g} mm"
+
+        pose = euler_pose(self.phi, self.theta, self.psi, self.location)
+        return jobs.Job("Making a phantom", _work(self, pose), finish)
 
 
-class MPHDRR_OT_update_derenzo(bpy.types.Operator):
+class MPHDRR_OT_update_derenzo(jobs.JobOperator, bpy.types.Operator):
     bl_idname = ids.UPDATE_DERENZO
     bl_label = "Update Phantom"
     bl_description = "Make the active phantom's voxels anew from the numbers above; its place stays"
@@ -68,33 +79,19 @@ class MPHDRR_OT_update_derenzo(bpy.types.Operator):
     def poll(cls, context: bpy.types.Context) -> bool:
         return volumes.is_volume(context.object) and getattr(context.object, ids.OBJECT_VOLUME).kind == "DERENZO"
 
-    def execute(self, context: bpy.types.Context) -> set[str]:
-        item = context.object
-        settings = getattr(item, ids.OBJECT_VOLUME).derenzo
-        try:
-            pose = volumes.pose_of_object(item)
-            with warnings_reported(self):
-                volumes.replace_volume(item, _voxels(settings, pose), pose, settings.recipe())
-        except (InputError, MemoryError) as error:
-            self.report({"ERROR"}, str(error) or "not enough memory for this grid: choose fewer voxels")
-            return {"CANCELLED"}
-        return {"FINISHED"}
+    def job(self, context: bpy.types.Context) -> jobs.Job:
+        name = context.object.name
+        settings = getattr(context.object, ids.OBJECT_VOLUME).derenzo
 
+        def finish(stored: volumes.StoredVolume) -> Generator[None, None, str]:
+            yield
+            item = bpy.data.objects.get(name)
+            if not volumes.is_volume(item):
+                raise InputError(f"the phantom {name!r} is gone")
+            volumes.replace_stored(item, stored)
+            return f"Made {name!r} anew"
 
-def add_derenzo(
-    context: bpy.types.Context, settings: DerenzoSettings, pose: np.ndarray, name: str = ids.DERENZO
-) -> bpy.types.Object:
-    """Add a Derenzo phantom at a world-from-phantom `pose` (4, 4), mm, and make it the active object."""
-    item = volumes.add_volume(_voxels(settings, pose), name, pose, settings.recipe(), context.collection)
-    properties = getattr(item, ids.OBJECT_VOLUME)
-    properties.kind = "DERENZO"
-    properties.derenzo.copy_settings(settings)
-    volume_materials.show_in_eevee(context.scene)
-    for other in context.selected_objects:
-        other.select_set(False)
-    item.select_set(True)
-    context.view_layer.objects.active = item
-    return item
+        return jobs.Job("Making a phantom", _work(settings, volumes.pose_of_object(context.object)), finish)
 
 
 def draw_menu(self: bpy.types.Menu, context: bpy.types.Context) -> None:
@@ -102,7 +99,19 @@ def draw_menu(self: bpy.types.Menu, context: bpy.types.Context) -> None:
     self.layout.operator(ids.ADD_DERENZO, text="Derenzo Phantom", icon="OUTLINER_DATA_VOLUME")
 
 
-def _voxels(settings: DerenzoSettings, pose: np.ndarray) -> Volume:
-    """The phantom on a grid that turns with it, in world mm."""
-    own = settings.phantom().voxelize(settings.grid())
-    return Volume(own.array, Grid(own.grid.shape, pose @ own.grid.affine), own.quantity)
+def _work(settings: DerenzoSettings, pose: NDArray[np.float64]) -> Callable[[Progress], volumes.StoredVolume]:
+    """What makes the phantom at a world-from-phantom `pose` (4, 4), mm, on a grid that turns with it; leaves bpy alone."""
+    phantom, grid, recipe, folder = settings.phantom(), settings.grid(), settings.recipe(), storage.folder()
+
+    def work(progress: Progress) -> volumes.StoredVolume:
+        own = phantom.voxelize(grid, progress=progress)
+        return volumes.store_volume(
+            Volume(own.array, Grid(grid.shape, pose @ grid.affine), own.quantity), folder, pose, recipe
+        )
+
+    return work
+
+
+def _value(settings: DerenzoSettings, name: str) -> Any:
+    value = getattr(settings, name)
+    return tuple(value) if isinstance(value, bpy.types.bpy_prop_array) else value

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import bpy
 
-from ..addon import ids, volumes
+from ..addon import ids, jobs, slices, storage, volumes
 
 
 class MPHDRR_PT_phantom(bpy.types.Panel):
@@ -17,8 +17,16 @@ class MPHDRR_PT_phantom(bpy.types.Panel):
 
     def draw(self, context: bpy.types.Context) -> None:
         layout = self.layout
+        layout.enabled = not jobs.is_running()
         layout.operator_context = "INVOKE_DEFAULT"
-        layout.operator(ids.ADD_DERENZO, text="Add Derenzo Phantom", icon="OUTLINER_DATA_VOLUME")
+        column = layout.column(align=True)
+        column.operator(ids.ADD_DERENZO, text="Add Derenzo Phantom", icon="OUTLINER_DATA_VOLUME")
+        column.operator(ids.IMPORT_VOLUME, text="Import Volume", icon="IMPORT")
+        if storage.missing_volumes():
+            column = layout.column(align=True)
+            column.alert = True
+            column.label(text="Files of voxels are missing", icon="ERROR")
+            column.operator(ids.FIND_VOLUME_FILES, icon="VIEWZOOM")
         item = context.object
         if not volumes.is_volume(item):
             column = layout.column(align=True)
@@ -38,12 +46,24 @@ class MPHDRR_PT_phantom(bpy.types.Panel):
             ("Holds", f"{settings.quantity}, {settings.unit}"),
             ("Voxels", " × ".join(map(str, shape))),
             ("Size", " × ".join(f"{s:.3g}" for s in spacing) + " mm"),
-            ("Maximum", f"{settings.maximum:.4g}"),
+            ("Values", f"{settings.minimum:.4g} to {settings.maximum:.4g}"),
+            ("File", volumes.file_state(item)),
         ):
             names.label(text=name)
             values.label(text=value)
         layout.use_property_split = True
         layout.use_property_decorate = False
+        column = layout.column(align=True)
+        column.prop(settings, "display_low", text=f"Low, {settings.unit}")
+        column.prop(settings, "display_high", text=f"High, {settings.unit}")
+        if slices.planes_of(item):
+            column = layout.column(align=True)
+            for axis, name in enumerate(slices.names(item)):
+                column.prop(settings, "slices", index=axis, text=name)
+            column.operator(ids.REMOVE_SLICES, icon="X")
+        else:
+            layout.operator(ids.ADD_SLICES, icon="MESH_PLANE")
         if settings.kind == "DERENZO":
             settings.derenzo.draw_settings(layout)
             layout.operator(ids.UPDATE_DERENZO, icon="FILE_REFRESH")
+        layout.operator(ids.CLEAN_VOLUME_FILES, icon="TRASH")

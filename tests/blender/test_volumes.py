@@ -25,7 +25,7 @@ AFFINES = {
     "anisotropic": np.diag([0.703, 0.703, 2.5, 1.0]),
     "rotated": euler_pose(0.4, 0.7, -0.3, (30.0, -20.0, 10.0)) @ np.diag([1.0, 2.0, 3.0, 1.0]),
     "sheared": euler_pose(0.4, 0.7, -0.3, (5.0, 6.0, 7.0)) @ SHEAR @ np.diag([2.0, 1.5, 1.0, 1.0]),
-    "mirrored": euler_pose(0.1, -0.2, 0.5, (-4.0, 1.0, 2.0)) @ np.diag([-1.5, 2.0, 1.0, 1.0]),
+    "mirrored": euler_pose(1.1, 0.2, 0.5, (4.0, -1.0, 2.0)) @ SHEAR @ np.diag([1.5, -2.0, 1.0, 1.0]),
 }
 
 
@@ -243,8 +243,10 @@ def test_derenzo_refuses_in_one_line_and_adds_nothing(settings, message):
 
 def test_material_scale_follows_the_data(sparse_volume):
     item = volumes.add_volume(sparse_volume, "Sample")
-    nodes = item.data.materials[0].node_tree.nodes
-    assert nodes["Full Scale"].outputs[0].default_value == pytest.approx(3e30)
+    node = item.data.materials[0].node_tree.nodes["Display Range"]
+    assert (node.inputs["From Min"].default_value, node.inputs["From Max"].default_value) == (0, pytest.approx(3e30))
+    item.mphdrr_volume.display_low, item.mphdrr_volume.display_high = 0.5, 2.0
+    assert (node.inputs["From Min"].default_value, node.inputs["From Max"].default_value) == (0.5, 2.0)
     assert item.data.render.clipping == 0.0
 
 
@@ -259,10 +261,11 @@ def test_volumes_are_within_eevees_reach(scene):
 
 def test_volume_drawn_for_another_blender_is_rewritten_on_load(tmp_path, sparse_volume, monkeypatch):
     other = -0.5 - compat.VDB_CENTER_SHIFT
-    monkeypatch.setattr(volumes, "VDB_CENTER_SHIFT", other)
+    running = compat.VDB_CENTER_SHIFT
+    monkeypatch.setattr(compat, "VDB_CENTER_SHIFT", other)
     volumes.add_volume(sparse_volume, "Sample")
     bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "a.blend"))
-    monkeypatch.setattr(volumes, "VDB_CENTER_SHIFT", compat.VDB_CENTER_SHIFT)
+    monkeypatch.setattr(compat, "VDB_CENTER_SHIFT", running)
     bpy.ops.wm.open_mainfile(filepath=str(tmp_path / "a.blend"))
     item = bpy.data.objects["Sample"]
     assert item.mphdrr_volume.center_shift == compat.VDB_CENTER_SHIFT

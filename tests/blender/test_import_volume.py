@@ -1,0 +1,228 @@
+"""What is imported is what the file holds; how it is drawn follows its quantity; slices show its voxels."""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+bpy = pytest.importorskip("bpy")
+
+from mphdrr.addon import slices, volume_materials, volumes  # noqa: E402
+from mphdrr.addon.vdb import write_vdb  # noqa: E402
+from mphdrr.core.errors import InputError  # noqa: E402
+from mphdrr.core.frames import euler_pose  # noqa: E402
+from mphdrr.core.grid import Grid  # noqa: E402
+from mphdrr.core.hounsfield import hu_to_mu  # noqa: E402
+from mphdrr.core.volume import Volume  # noqa: E402
+from mphdrr.core.volume_io import write_volume  # noqa: E402
+
+AFFINE = euler_pose(0.3, 0.1, -0.2, (40.0, 50.0, 60.0)) @ np.diag([0.7, -0.8, 2.5, 1.0])
+
+
+@pytest.fixture
+def ct() -> Volume:
+    array = np.random.default_rng(3).integers(-1000, 1500, (13, 11, 7)).astype(np.float32)
+    return Volume(array, Grid(array.shape, AFFINE), "hu")
+
+
+@pytest.mark.parametrize("ending", [".nii.gz", ".npz", ".h5", ".vdb"])
+def test_imported_volume_is_the_files(tmp_path, ct, ending):
+    path = tmp_path / f"chest{ending}"
+    (write_vdb if ending == ".vdb" else write_volume)(ct, path)
+    assert bpy.ops.mphdrr.import_volume(filepath=str(path), center=False) == {"FINISHED"}
+    item = bpy.context.object
+    back = volumes.volume_from_object(item)
+    assert item.name == "chest" and back.quantity == "hu" and np.array_equal(back.array, ct.array)
+    np.testing.assert_allclose(back.grid.affine, AFFINE, rtol=0, atol=1e-5)
+    settings = item.mphdrr_volume
+    assert (settings.minimum, settings.maximum) == (ct.array.min(), ct.array.max())
+
+
+def test_import_centres_and_converts(tmp_path, ct):
+    write_volume(ct, tmp_path / "chest.npz")
+    bpy.ops.mphdrr.import_volume(filepath=str(tmp_path / "chest.npz"), attenuation=True, energy=511.0, name="Body")
+    back = volumes.volume_from_object(bpy.context.object)
+    assert bpy.context.object.name == "Body" and back.quantity == "mu"
+    assert np.array_equal(back.array, hu_to_mu(ct, 511.0).array)
+    np.testing.assert_allclose(back.grid.center, 0.0, atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("name", "settings", "message"),
+    [
+        ("none.nii", {}, "no such file"),
+        ("text.nii", {}, "text.nii"),
+        ("text.vdb", {}, "cannot be read"),
+        ("mu.npz", {"attenuation": True}, "expected a volume of hu"),
+        ("picture.png", {}, "expected"),
+    ],
+)
+def test_bad_files_are_refused_in_one_line_and_add_nothing(tmp_path, name, settings, message):
+    for text in ("text.nii", "text.vdb", "picture.png"):
+        (tmp_path / text).write_text("hello")
+    write_volume(Volume(np.ones((2, 2, 2)), Grid.centered(2, 1.0), "mu"), tmp_path / "mu.npz")
+    before = len(bpy.data.objects), len(bpy.data.volumes)
+    with pytest.raises(RuntimeError, match=message) as refusal:
+        bpy.ops.mphdrr.import_volume(filepath=str(tmp_path / name), **settings)
+    assert len(str(refusal.value).strip().splitlines()) == 1
+    assert (len(bpy.data.objects), len(bpy.data.volumes)) == before
+
+
+def test_ct_begins_with_a_window_of_its_own_and_keeps_the_users(ct):
+    item = volumes.add_volume(ct, "CT")
+    settings = item.mphdrr_volume
+    assert (settings.display_low, settings.display_high) == (-200, 1000)
+    settings.display_low = 50.0
+    volumes.replace_volume(item, Volume(ct.array[:5].copy(), Grid((5, 11, 7), AFFINE), "hu"))
+    node = item.data.materials[0].node_tree.nodes["Display Range"]
+    assert node.inputs["From Min"].default_value == 50.0 and node.inputs["From Max"].default_value == 1000.0
+
+
+def _pixels(plane):
+    image = plane.data.materials[0].node_tree.nodes["Slice"].image
+    pixels = np.empty(4 * image.size[0] * image.size[1], np.float32)
+    image.pixels.foreach_get(pixels)
+    return pixels.reshape(image.size[1], image.size[0], 4)
+
+
+def test_slices_show_the_voxels_where_they_are(ct):
+    item = volumes.add_volume(ct, "CT", euler_pose(0.5, 0.1, 0.2, (1.0, 2.0, 3.0)))
+    planes = slices.add_slices(item)
+    item.mphdrr_volume.display_low, item.mphdrr_volume.display_high = -1000.0, 1500.0
+    index = (9, 4, 2)
+    item.mphdrr_volume.slices = index
+    bpy.context.view_layer.update()
+    shades = slices._colors("hu")
+    for axis, plane in enumerate(planes):
+        values = np.take(ct.array, index[axis], axis).T
+        expected = shades[((values + 1000.0) * (255 / 2500.0)).astype(int)]
+        np.testing.assert_allclose(_pixels(plane), expected, atol=1 / 255)
+        corner = np.array(index, float)
+        corner[[a for a in range(3) if a != axis]] = -0.5
+        world = plane.matrix_world @ plane.data.vertices[0].co
+        np.testing.assert_allclose(world, (AFFINE @ [*corner, 1.0])[:3], atol=1e-4)
+    assert [plane.name for plane in planes] == ["CT Sagittal", "CT Coronal", "CT Axial"]
+    item.mphdrr_volume.slices = (1000, 0, 0)  # beyond the edge: the last
+    np.testing.assert_allclose(_pixels(planes[0])[0, 0], shades[int((ct.array[12, 0, 0] + 1000) * 0.102)], atol=0.01)
+
+
+def test_slices_follow_new_voxels_and_go(ct):
+    item = volumes.add_volume(ct, "CT")
+    before = len(bpy.data.objects), len(bpy.data.images), len(bpy.data.meshes), len(bpy.data.materials)
+    slices.add_slices(item)
+    volumes.replace_volume(item, Volume(ct.array[:5].copy(), Grid((5, 11, 7), AFFINE), "hu"))
+    coronal = slices.planes_of(item)[1]
+    assert _pixels(coronal).shape[:2] == (7, 5)
+    slices.remove_slices(item)
+    assert (len(bpy.data.objects), len(bpy.data.images), len(bpy.data.meshes), len(bpy.data.materials)) == before
+
+
+def test_slices_of_a_large_volume_are_quick():
+    array = np.random.default_rng(0).random((256, 256, 256), np.float32)
+    item = volumes.add_volume(Volume(array, Grid.centered(256, 1.0), "activity"), "Large")
+    slices.add_slices(item)
+    took = []
+    for k in range(5):
+        start = time.perf_counter()
+        item.mphdrr_volume.slices[2] = 100 + k
+        took.append(time.perf_counter() - start)
+    assert min(took) < 0.1, took  # all three planes
+
+
+def test_ramps_are_of_the_quantity(ct):
+    assert volume_materials.ramp("hu") == volume_materials.ramp("mu") != volume_materials.ramp("activity")
+
+
+def test_unused_files_are_cleaned_up_and_no_others(tmp_path, ct):
+    item = volumes.add_volume(ct, "CT")
+    volumes.replace_volume(item, Volume(ct.array[:5].copy(), Grid((5, 11, 7), AFFINE), "hu"))
+    bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "a.blend"))
+    volumes.replace_volume(item, Volume(ct.array[:6].copy(), Grid((6, 11, 7), AFFINE), "hu"))
+    bpy.ops.wm.save_mainfile()
+    folder = tmp_path / "a_mphdrr"
+    for name in ("notes.txt", "smoke.vdb", "hu-12.vdb"):
+        (folder / name).write_text("mine")
+    assert len(list(folder.glob("*.vdb"))) == 4
+    assert bpy.ops.mphdrr.clean_volume_files() == {"FINISHED"}
+    kept = {path.name for path in folder.iterdir()}
+    assert kept == {"notes.txt", "smoke.vdb", "hu-12.vdb", volumes.file_of(item).name}
+    assert volumes.volume_from_object(item).grid.shape == (6, 11, 7)
+
+
+@pytest.mark.parametrize("large", [False, True])
+def test_missing_files_are_found_again(tmp_path, ct, monkeypatch, capfd, large):
+    if large:
+        monkeypatch.setattr(volumes, "MAX_SHOWN_VOXELS", 10)
+    volumes.add_volume(ct, "CT")
+    bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "a.blend"))
+    (tmp_path / "archive").mkdir()
+    (tmp_path / "a_mphdrr").rename(tmp_path / "archive" / "old")
+    bpy.ops.wm.open_mainfile(filepath=str(tmp_path / "a.blend"))
+    assert "CT are missing" in capfd.readouterr().out
+    item = bpy.data.objects["CT"]
+    (tmp_path / "elsewhere").mkdir()
+    bpy.ops.mphdrr.find_volume_files(directory=str(tmp_path / "elsewhere"))
+    assert not volumes.file_of(item).is_file()
+    assert bpy.ops.mphdrr.find_volume_files(directory=str(tmp_path)) == {"FINISHED"}
+    assert np.array_equal(volumes.volume_from_object(item).array, ct.array)
+    assert item.data.filepath.startswith("//archive/old/") and item.data.grids.is_loaded
+    with pytest.raises(RuntimeError, match="expected a folder"):
+        bpy.ops.mphdrr.find_volume_files(directory=str(tmp_path / "nowhere"))
+
+
+@pytest.fixture
+def beats(ct) -> list[Volume]:
+    return [Volume(np.roll(ct.array, k, axis=0).copy(), ct.grid, "hu") for k in range(4)]
+
+
+@pytest.mark.parametrize("mode", ["CLIP", "EXTEND", "REPEAT", "PING_PONG"])
+def test_sequence_is_read_as_blender_shows_it(beats, mode):
+    item = volumes.add_volume_sequence(beats, "Heart", frame_start=10)
+    item.data.sequence_mode = mode
+    known = 0
+    for frame in range(3, 25):
+        bpy.context.scene.frame_set(frame)
+        shown = item.data.grids
+        if shown.frame > len(beats):  # Blender's "none"
+            with pytest.raises(InputError, match=f"no state at frame {frame}"):
+                volumes.volume_from_object(item)
+            continue
+        assert shown.load() and volumes.file_of(item) == Path(shown.frame_filepath)
+        assert np.array_equal(volumes.volume_from_object(item).array, beats[shown.frame - 1].array)
+        known += 1
+    assert known == (4 if mode == "CLIP" else 22)
+
+
+@pytest.mark.parametrize("large", [False, True])
+def test_sequence_is_saved_and_cleaned_up_whole(tmp_path, beats, monkeypatch, large):
+    if large:
+        monkeypatch.setattr(volumes, "MAX_SHOWN_VOXELS", 10)
+    volumes.add_volume_sequence(beats, "Heart")
+    bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "a.blend"))
+    bpy.ops.wm.open_mainfile(filepath=str(tmp_path / "a.blend"))
+    bpy.ops.mphdrr.clean_volume_files()
+    assert len(list((tmp_path / "a_mphdrr").iterdir())) == (8 if large else 4)
+    item = bpy.data.objects["Heart"]
+    for k in range(4):
+        bpy.context.scene.frame_set(1 + k)
+        assert item.data.grids.load() and item.data.grids.frame == k + 1
+        assert np.array_equal(volumes.volume_from_object(item).array, beats[k].array)
+
+
+def test_slices_beat_along(beats):
+    item = volumes.add_volume_sequence(beats, "Heart")
+    plane = slices.add_slices(item)[2]
+    first = _pixels(plane)
+    bpy.context.scene.frame_set(3)
+    assert slices.planes_of(item)[2] == plane
+    np.testing.assert_array_equal(_pixels(plane), np.roll(first, 2, axis=1))
+
+
+def test_sequence_of_what_cannot_follow_is_refused(ct):
+    other = Volume(ct.array, ct.grid, "mu")
+    for states in ([], [ct, other]):
+        with pytest.raises(InputError, match="volumes of one quantity"):
+            volumes.add_volume_sequence(states, "Heart")

@@ -1,0 +1,208 @@
+"""OpenVDB files: ours come back to the last bit, other programs' by OpenVDB's own conventions, bad ones in one line."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+bpy = pytest.importorskip("bpy")
+
+from mphdrr.addon import compat  # noqa: E402
+from mphdrr.addon.vdb import openvdb, read_vdb, write_vdb  # noqa: E402
+from mphdrr.core.errors import InputError  # noqa: E402
+from mphdrr.core.frames import euler_pose  # noqa: E402
+from mphdrr.core.grid import Grid  # noqa: E402
+from mphdrr.core.volume import Volume  # noqa: E402
+
+vdb = openvdb()
+
+SHEAR = np.array([[1.0, 0.3, 0.1, 0.0], [0.0, 1.0, -0.2, 0.0], [0.0, 0.0, 1.0, 0.0], [0.0, 0.0, 0.0, 1.0]])
+LINEAR = euler_pose(0.4, 0.7, -0.3, (5.0, 1 / 3, 7.0)) @ SHEAR @ np.diag([2.0, 1.5, 0.1, 1.0])
+
+
+def test_several_volumes_share_a_file(tmp_path):
+    rng = np.random.default_rng(0)
+    activity = Volume(rng.random((4, 5, 6), np.float32), Grid((4, 5, 6), LINEAR), "activity")
+    mu = Volume(rng.random((7, 3, 2), np.float32), Grid.centered((7, 3, 2), 2.5), "mu")
+    write_vdb([activity, mu], tmp_path / "both.vdb", {"made by": "test"})
+    for volume in (activity, mu):
+        for back in (
+            read_vdb(tmp_path / "both.vdb", volume.quantity),
+            read_vdb(str(tmp_path / "both.vdb"), grid=volume.quantity),
+        ):
+            assert np.array_equal(back.array, volume.array) and back.quantity == volume.quantity
+            assert np.array_equal(back.grid.affine, volume.grid.affine)
+    with pytest.raises(InputError, match=r"several grids.*'activity'.*'mu'"):
+        read_vdb(tmp_path / "both.vdb")
+    with pytest.raises(InputError, match="different quantities"):
+        write_vdb([mu, mu], tmp_path / "twice.vdb")
+    grid = vdb.readAllGridMetadata(str(tmp_path / "both.vdb"))[0]
+    assert grid.metadata["mphdrr_unit"] == "kBq/mL" and "made by" in grid.metadata["mphdrr_provenance"]
+
+
+@pytest.mark.parametrize("extreme", [0.0, -0.0, 1e-45, -3.4e38, 1 / 3])
+@pytest.mark.parametrize("mirror", [1, -1])
+def test_every_float_comes_back(tmp_path, extreme, mirror):
+    array = np.zeros((3, 4, 5), np.float32)
+    array[1, 2, 3] = extreme
+    volume = Volume(array, Grid(array.shape, LINEAR @ np.diag([mirror, 1.0, 1.0, 1.0])), "hu")
+    write_vdb(volume, tmp_path / "a.vdb")
+    back = read_vdb(tmp_path / "a.vdb")
+    assert np.array_equal(back.array, array) and np.array_equal(back.grid.affine, volume.grid.affine)
+
+
+def test_empty_space_takes_no_room(tmp_path):
+    array = np.zeros((256, 256, 256), np.float32)
+    array[200:204, 100:104, 50:54] = 1.0
+    write_vdb(Volume(array, Grid.centered((256, 256, 256), 1.0)), tmp_path / "a.vdb")
+    assert (tmp_path / "a.vdb").stat().st_size < 20_000
+    assert np.array_equal(read_vdb(tmp_path / "a.vdb").array, array)
+
+
+def _foreign(cls, values, first=(0, 0, 0), name="density", affine=LINEAR):
+    grid = cls()
+    grid.copyFromArray(np.ascontiguousarray(values), ijk=first)
+    grid.name = name
+    grid.transform = vdb.createLinearTransform(affine.T.tolist())
+    return grid
+
+
+@pytest.mark.parametrize(
+    ("cls", "dtype"),
+    [
+        (vdb.FloatGrid, np.float32),
+        (vdb.DoubleGrid, np.float64),
+        (vdb.Int32Grid, np.int32),
+        (vdb.Int64Grid, np.int64),
+        (vdb.BoolGrid, bool),
+    ],
+)
+def test_grids_of_other_programs_lie_where_their_transform_says(tmp_path, cls, dtype):
+    values = np.arange(1, 61).reshape(3, 4, 5).astype(dtype)
+    first = (-7, 11, 3)
+    vdb.write(str(tmp_path / "a.vdb"), grids=[_foreign(cls, values, first)])
+    volume = read_vdb(tmp_path / "a.vdb", "mu")
+    assert volume.quantity == "mu" and np.array_equal(volume.array, values.astype(np.float32))
+    for index in ((0, 0, 0), (2, 3, 4), (1, 0, 3)):
+        world = LINEAR @ [*(np.array(index) + first), 1.0]
+        np.testing.assert_allclose(volume.grid.affine @ [*index, 1.0], world, rtol=0, atol=1e-13)
+    metres = read_vdb(tmp_path / "a.vdb", unit=1000.0)
+    np.testing.assert_allclose(metres.grid.affine[:3], 1000 * volume.grid.affine[:3], rtol=1e-15)
+
+
+def test_half_floats_and_inactive_voxels(tmp_path):
+    grid = vdb.FloatGrid()
+    grid.fill((0, 0, 0), (15, 15, 15), 0.5, True)  # whole tiles
+    grid.fill((4, 4, 4), (5, 5, 5), 0.25, False)  # inactive, but a value
+    grid.saveFloatAsHalf = True
+    grid.name = "density"
+    vdb.write(str(tmp_path / "a.vdb"), grids=[grid])
+    volume = read_vdb(tmp_path / "a.vdb")
+    assert volume.grid.shape == (16, 16, 16) and volume.quantity == "activity"
+    assert volume.array.sum() == 0.5 * 16**3 - 0.25 * 8
+
+
+def test_level_set_becomes_the_share_inside(tmp_path):
+    sphere = vdb.createLevelSetSphere(radius=20.0, center=(3.0, 4.0, 5.0), voxelSize=1.5)
+    vdb.write(str(tmp_path / "a.vdb"), grids=[sphere])
+    volume = read_vdb(tmp_path / "a.vdb", "mu")
+    assert volume.array.min() == 0.0 and volume.array.max() == 1.0
+    total = volume.array.sum(dtype=float)
+    assert total * volume.grid.voxel_volume == pytest.approx(4 / 3 * np.pi * 20**3, rel=2e-3)
+    places = np.stack(np.meshgrid(*(np.arange(n) for n in volume.grid.shape), indexing="ij"), axis=-1)
+    centroid = (volume.array[..., None] * places).sum(axis=(0, 1, 2)) / total
+    np.testing.assert_allclose(volume.grid.affine @ [*centroid, 1.0], [3.0, 4.0, 5.0, 1.0], atol=5e-3)
+
+
+def test_grids_are_chosen_by_name(tmp_path):
+    values = np.ones((2, 2, 2), np.float32)
+    vectors = _foreign(vdb.Vec3SGrid, np.ones((2, 2, 2, 3), np.float32), name="velocity")
+    grids = [_foreign(vdb.FloatGrid, values * k, name=name) for k, name in enumerate(["", "heat", "heat"], 1)]
+    path = tmp_path / "a.vdb"
+    vdb.write(str(path), grids=[*grids, vectors])
+    assert read_vdb(path, grid="").array.max() == 1
+    assert {read_vdb(path, grid=f"heat[{k}]").array.max() for k in (0, 1)} == {2, 3}
+    for name, message in (
+        (None, r"several grids.*'heat\[1\]'.*velocity"),
+        ("smoke", r"no grid 'smoke'.*'heat\[0\]'"),
+        ("velocity", "vec3s"),
+    ):
+        with pytest.raises(InputError, match=message):
+            read_vdb(path, grid=name)
+    vdb.write(str(path), grids=[grids[1], vectors])
+    assert read_vdb(path).array.max() == 2  # the only one with numbers
+
+
+def test_what_others_do_to_our_grids_counts(tmp_path):
+    """Houdini and the like keep the metadata when they move a grid."""
+    volume = Volume(np.ones((3, 3, 3), np.float32), Grid.centered((3, 3, 3), 2.0), "mu")
+    write_vdb(volume, tmp_path / "a.vdb")
+    grid = vdb.read(str(tmp_path / "a.vdb"), "mu")
+    grid.transform.postTranslate((10.0, 0.0, 0.0))
+    vdb.write(str(tmp_path / "b.vdb"), grids=[grid])
+    moved = read_vdb(tmp_path / "b.vdb")
+    assert moved.quantity == "mu"
+    np.testing.assert_allclose(
+        moved.grid.center, [10.0 + 2 * compat.VDB_CENTER_SHIFT] + [2 * compat.VDB_CENTER_SHIFT] * 2
+    )
+
+
+def _bad(path, kind):
+    good = _foreign(vdb.FloatGrid, np.ones((40, 40, 40), np.float32) * np.arange(40, dtype=np.float32))
+    if kind == "frustum":
+        good.transform = vdb.createFrustumTransform((0, 0, 0), (10, 10, 10), 0.5, 3.0, 1.0)
+    elif kind == "far voxel":
+        good.fill((10**6,) * 3, (10**6,) * 3, 1.0, True)
+    elif kind == "infinite":
+        good.fill((0, 0, 0), (0, 0, 0), float("inf"), True)
+    grids = {
+        "vectors": [_foreign(vdb.Vec3SGrid, np.ones((2, 2, 2, 3), np.float32))],
+        "points": [vdb.PointDataGrid()],
+        "empty": [vdb.FloatGrid()],
+        "no grids": [],
+    }.get(kind, [good])
+    vdb.write(str(path), grids=grids)
+    whole = path.read_bytes()
+    if kind in ("cut in the voxels", "cut in the header"):
+        path.write_bytes(whole[: len(whole) * 2 // 3 if kind == "cut in the voxels" else 60])
+    elif kind == "text":
+        path.write_text("not a volume\n")
+    elif kind == "nothing":
+        path.write_bytes(b"")
+
+
+@pytest.mark.parametrize(
+    ("kind", "message"),
+    [
+        ("frustum", "frustum"),
+        ("vectors", "vec3s"),
+        ("points", "no grid of numbers"),
+        ("empty", "no active voxels"),
+        ("no grids", "holds no grid"),
+        ("far voxel", "memory"),
+        ("infinite", "not a finite number"),
+        ("cut in the voxels", "cannot be read"),
+        ("cut in the header", "holds no grid"),
+        ("text", "cannot be read"),
+        ("nothing", "cannot be read"),
+    ],
+)
+def test_bad_files_are_refused_in_one_line(tmp_path, kind, message):
+    path = tmp_path / "bad.vdb"
+    _bad(path, kind)
+    with pytest.raises(InputError, match=message) as refusal:
+        read_vdb(path)
+    assert "\n" not in str(refusal.value) and str(path) in str(refusal.value)
+
+
+def test_arguments_are_checked(tmp_path):
+    vdb.write(str(tmp_path / "a.vdb"), grids=[_foreign(vdb.FloatGrid, np.ones((2, 2, 2), np.float32))])
+    for arguments, message in (
+        ({"quantity": "dose"}, "activity, mu"),
+        ({"unit": 0.0}, "mm"),
+        ({"grid": "x"}, "density"),
+    ):
+        with pytest.raises(InputError, match=message):
+            read_vdb(tmp_path / "a.vdb", **arguments)
+    with pytest.raises(InputError, match="no such file"):
+        read_vdb(tmp_path / "none.vdb")

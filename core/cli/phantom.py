@@ -19,15 +19,12 @@ from ..frames import euler_pose
 from ..grid import Grid
 from ..phantoms.defrise import DefrisePhantom
 from ..phantoms.derenzo import DerenzoPhantom
-from ..phantoms.jaszczak import JaszczakPhantom
+from ..phantoms.kinds import KINDS
 from ..phantoms.language import read_phantom, write_phantom
-from ..phantoms.nema import NemaBody
 from ..phantoms.phantom import QUANTITIES, Phantom, ShapePhantom
 from ..phantoms.points import PointGrid
 from ..phantoms.random import random_pose
 from ..phantoms.shapes import Box, Cylinder, Ellipsoid, Sphere
-from ..phantoms.shepp_logan import CONTRASTS, SheppLogan
-from ..phantoms.torso import CardiacTorso
 from ..volume import UNITS, Volume
 from ..volume_io import VOLUME_FORMATS, write_volume
 from .options import add_command, add_phantom_options, add_placing_options, one_or_three, output_path, progress_bar
@@ -35,15 +32,15 @@ from .options import add_command, add_phantom_options, add_placing_options, one_
 _DEST = "of_phantom_"  # before a setting's name, for the voxels have a spacing too
 Make = Callable[[argparse.Namespace], Phantom]
 
-# Name, class, what it is, example options.
-_KINDS = (
-    ("nema", NemaBody, "the NEMA (IEC) body phantom: six spheres", "--sphere-activity 40 --voxels 200"),
-    ("jaszczak", JaszczakPhantom, "a Jaszczak phantom: rods and spheres", "--activity 50"),
-    ("defrise", DefrisePhantom, "a Defrise phantom: hot disks", "--disks 7 --spacing-of-disks 12"),
-    ("shepp-logan", SheppLogan, "the 3-D Shepp-Logan head", "--contrast original"),
-    ("points", PointGrid, "a grid of point sources", "--counts 3 3 3 --spacing-of-points 30 30 30"),
-    ("torso", CardiacTorso, "a cardiac torso", "--defect-severity 0.5 --defect-angle-degrees 90 --quantity activity"),
-)
+# Example options of the kinds that have an option for every setting.
+_EXAMPLES = {
+    "nema": "--sphere-activity 40 --voxels 200",
+    "jaszczak": "--activity 50",
+    "defrise": "--disks 7 --spacing-of-disks 12",
+    "shepp-logan": "--contrast original",
+    "points": "--counts 3 3 3 --spacing-of-points 30 30 30",
+    "torso": "--defect-severity 0.5 --defect-angle-degrees 90 --quantity activity",
+}
 # Name, class, and of each dimension its name and how many numbers it takes; all mm.
 _SHAPES = (
     ("cylinder", Cylinder, (("radius", "+"), ("height", None)), "--radius 100 --height 200 --activity 5 --mu 0.0154"),
@@ -65,11 +62,14 @@ def add_parser(subparsers) -> None:  # type: ignore[no-untyped-def]
     )
     add_phantom_options(derenzo)
     _add_output(derenzo, _derenzo)
-    for name, kind, summary, example in _KINDS:
-        parser = add_command(kinds, name, f"make {summary}", f"mphdrr phantom {name} {example} -o {name}.nii.gz")
-        _add_settings(parser, kind)
+    for kind in KINDS:
+        if kind.name not in _EXAMPLES:
+            continue
+        example = f"mphdrr phantom {kind.name} {_EXAMPLES[kind.name]} -o {kind.name}.nii.gz"
+        parser = add_command(kinds, kind.name, f"make {kind.summary}", example)
+        _add_settings(parser, kind.phantom)
         add_placing_options(parser)
-        _add_output(parser, partial(_of_kind, kind))
+        _add_output(parser, partial(_of_kind, kind.phantom))
     for name, shape, dimensions, example in _SHAPES:
         parser = add_command(kinds, name, f"make one {name}", f"mphdrr phantom {name} {example} -o {name}.nii.gz")
         for dimension, count in dimensions:
@@ -132,10 +132,10 @@ def _add_settings(parser: argparse.ArgumentParser, kind: Any) -> None:
             metavar = {"mm": "MM", "kBq/mL": "kBq/mL", "1/mm": "1/mm", "kBq": "kBq", "mL": "mL", "DEG": "DEG"}.get(unit)
             text = field.metadata["text"] if metavar else f"share {unit}, {field.metadata['text']}"
             option |= {"type": float, "metavar": metavar or "SHARE", "help": text}
-        elif isinstance(field.default, str):
-            option |= {"choices": CONTRASTS, "help": "of the activity"}
+        elif "choices" in field.metadata:
+            option |= {"choices": field.metadata["choices"], "help": field.metadata["text"]}
         else:
-            option |= {"type": int, "metavar": "N", "help": "how many along x y z" if many else "how many"}
+            option |= {"type": int, "metavar": "N", "help": field.metadata["text"]}
         parser.add_argument(_option_name(field.name, kind), **option)
 
 

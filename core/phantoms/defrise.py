@@ -9,7 +9,7 @@ from functools import cached_property
 from ..checks import whole_shape
 from ..isotopes import WATER_MU
 from .phantom import Phantom
-from .settings import setting
+from .settings import count, setting
 from .shapes import Cylinder, Shape
 
 
@@ -35,7 +35,7 @@ class DefrisePhantom(Phantom):
         Of all of it, 1/mm.
     """
 
-    disks: int = 7
+    disks: int = count(7, "how many")
     disk_radius: float = setting(50.0, "mm", "of the disks")
     disk_thickness: float = setting(8.0, "mm", "of the disks")
     spacing: float = setting(16.0, "mm", "from disk to disk, middle to middle")
@@ -47,8 +47,8 @@ class DefrisePhantom(Phantom):
     title = "Defrise phantom"
 
     def __post_init__(self) -> None:
-        (count,) = whole_shape([self.disks], "Defrise phantom: disks", 1)
-        object.__setattr__(self, "disks", count)
+        (disks,) = whole_shape([self.disks], "Defrise phantom: disks", 1)
+        object.__setattr__(self, "disks", disks)
         super().__post_init__()
 
     @cached_property

@@ -15,6 +15,7 @@ from ..checks import freeze, positive, real_array
 from ..errors import InputError, InputWarning
 from ..isotopes import WATER_MU
 from .phantom import Phantom
+from .settings import setting
 from .shapes import Cylinder, Points, Real, Shape, Vector
 from .surfaces import Surface, lathe
 
@@ -227,15 +228,15 @@ class DerenzoPhantom(Phantom):
         A number is not finite or out of range, or no rod fits.
     """
 
-    radius: float
-    rod_diameters: tuple[float, ...]
-    height: float
-    activity: float = 1.0
+    radius: float = setting(40.0, "mm", "of the phantom")
+    rod_diameters: tuple[float, ...] = setting((8.0, 6.0, 5.0, 4.0, 3.0, 2.0), "mm", "by sector; 0 for none", 0.0)
+    height: float = setting(40.0, "mm", "length of the rods")
+    activity: float = setting(1.0, "kBq/mL", "in the rods; 0 for cold ones in active water", 0.0)
     sectors: int = SECTORS
-    cylinder_radius: float = 0.0
-    cylinder_height: float = 0.0
-    background: float = 0.0
-    mu: float = WATER_MU
+    cylinder_radius: float = setting(0.0, "mm", "of water around the rods; 0 for none", 0.0)
+    cylinder_height: float = setting(0.0, "mm", "of the water; 0 for the rods' own", 0.0)
+    background: float = setting(0.0, "kBq/mL", "in the water", 0.0)
+    mu: float = setting(WATER_MU, "1/mm", "of the rods and of the water", 0.0)
 
     title = "Derenzo phantom"
 
@@ -272,6 +273,13 @@ class DerenzoPhantom(Phantom):
     def shapes(self) -> Sequence[Shape]:
         """The rods, over the water if there is any."""
         return (*self._water(), self._rods)
+
+    @property
+    def box(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """As of any phantom; the rods' is that of their `radius`, also where none of them reaches the rim."""
+        half = max(self.radius, self.cylinder_radius)
+        corner = np.array([half, half, max(self.height, self.cylinder_height) / 2])
+        return -corner, corner
 
     def rods(self) -> NDArray[np.float64]:
         """Every rod as (sector, x, y, diameter), array (n_rods, 4), mm."""

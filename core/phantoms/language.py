@@ -59,16 +59,27 @@ def read_phantom(path: str | os.PathLike[str]) -> ShapePhantom:
     path = Path(path)
     try:
         text = path.read_text(encoding="utf-8-sig")
-        table = tomllib.loads(text)
     except UnicodeDecodeError:
         raise InputError(f"{path}: expected TOML, a text in UTF-8") from None
-    except (OSError, ValueError) as error:  # a TOMLDecodeError is a ValueError, as is a path that cannot be
-        reason = (error.strerror or error) if isinstance(error, OSError) else f"not TOML: {error}"
-        raise InputError(f"{path}: {reason}") from None
+    except (OSError, ValueError) as error:  # a path that cannot be is a ValueError
+        raise InputError(f"{path}: {getattr(error, 'strerror', None) or error}") from None
+    return parse_phantom(text, str(path))
+
+
+def parse_phantom(text: str, name: str = "phantom") -> ShapePhantom:
+    """The phantom that a text in TOML describes, see `read_phantom`; `name` is what messages call the text.
+
+    Raises
+    ------
+    InputError
+        The text is not TOML, or says something that cannot be: the message names shape and key.
+    """
     try:
-        return _phantom(table)
+        return _phantom(tomllib.loads(text))
+    except tomllib.TOMLDecodeError as error:
+        raise InputError(f"{name}: not TOML: {error}") from None
     except InputError as error:
-        raise InputError(f"{path}: {error}") from None
+        raise InputError(f"{name}: {error}") from None
 
 
 def write_phantom(phantom: Phantom, path: str | os.PathLike[str]) -> None:

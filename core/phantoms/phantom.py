@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 import warnings
 from collections.abc import Iterable, Sequence
@@ -26,6 +27,7 @@ from .settings import check_settings
 from .shapes import Shape
 
 QUANTITIES = ("activity", "mu")
+_ENDS = ((-1.0, 1.0),) * 3
 _HELD = 0.98  # of a phantom: with less of it on the grid, the user is told
 
 
@@ -90,6 +92,17 @@ class Phantom:
     def extent(self) -> float:
         """Diameter, mm, of a ball around the origin that holds the phantom: a grid that holds it however it is turned."""
         return 2 * max(math.hypot(*shape.position) + shape.ball_radius for shape in self.shapes)
+
+    @property
+    def box(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Opposite corners, mm, of a box along the axes of the phantom's own frame that holds it."""
+        low, high = np.full(3, np.inf), np.full(3, -np.inf)
+        for shape in self.shapes:
+            # A cut may leave little of a shape: its polyhedron, a hair smaller than the shape, says how much.
+            corners = shape.surface()[0] if shape.cut else np.array(list(itertools.product(*_ENDS))) * shape.half_box
+            points = corners @ shape.pose[:3, :3].T + shape.pose[:3, 3]
+            low, high = np.minimum(low, points.min(axis=0)), np.maximum(high, points.max(axis=0))
+        return low, high
 
     def voxelize(
         self, grid: Grid, pose: ArrayLike | None = None, progress: Progress | None = None, quantity: str = "activity"

@@ -11,7 +11,7 @@ from functools import cached_property
 from ..checks import whole_shape
 from ..errors import InputError
 from .phantom import Phantom
-from .settings import setting
+from .settings import count, setting
 from .shapes import Shape, Sphere
 
 _MOST = 10_000
@@ -33,7 +33,7 @@ class PointGrid(Phantom):
         Of each point, kBq.
     """
 
-    counts: tuple[int, int, int] = (5, 5, 5)
+    counts: tuple[int, int, int] = count((5, 5, 5), "how many along x y z")
     spacing: tuple[float, float, float] = setting((20.0, 20.0, 20.0), "mm", "from point to point along x y z")
     diameter: float = setting(1.0, "mm", "of a point")
     point_activity: float = setting(100.0, "kBq", "of each point")

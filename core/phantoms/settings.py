@@ -28,6 +28,16 @@ def setting(default: float | tuple[float, ...], unit: str, text: str, least: flo
     return dataclasses.field(default=default, metadata={"unit": unit, "text": text, "least": least})
 
 
+def count(default: int | tuple[int, ...], text: str) -> Any:
+    """A field of a phantom's dataclass: a whole number of 1 or more, or as many as `default` has; its class checks it."""
+    return dataclasses.field(default=default, metadata={"text": text})
+
+
+def choice(default: str, choices: tuple[str, ...], text: str) -> Any:
+    """A field of a phantom's dataclass: one word of several; its class checks it."""
+    return dataclasses.field(default=default, metadata={"choices": choices, "text": text})
+
+
 def check_settings(phantom: Any, title: str) -> None:
     """Check every `setting` of a phantom and turn it into a float, or a tuple of floats.
 

@@ -10,7 +10,7 @@ from functools import cached_property
 from ..errors import InputError
 from ..isotopes import WATER_MU
 from .phantom import Phantom
-from .settings import setting
+from .settings import choice, setting
 from .shapes import Ellipsoid, Shape
 
 # Half axes and centre in units of the head's half size, turn about z in degrees; density and contrast-enhanced value.
@@ -54,7 +54,7 @@ class SheppLogan(Phantom):
     half_size: float = setting(75.0, "mm", "the unit of the tables: the head is 1.84 times as long")
     activity: float = setting(100.0, "kBq/mL", "where the table says 1", 0.0)
     mu: float = setting(WATER_MU, "1/mm", "where the density is 1", 0.0)
-    contrast: str = "modified"
+    contrast: str = choice("modified", CONTRASTS, "of the activity")
 
     title = "Shepp-Logan phantom"
 

@@ -20,7 +20,11 @@ ADD_MAP = "mphdrr.add_map"
 EXPORT_FOR_PROGRAM = "mphdrr.export_for_program"
 VOXELIZE_OBJECTS = "mphdrr.voxelize_objects"
 MESH_FROM_VOLUME = "mphdrr.mesh_from_volume"
-ADD_DERENZO = "mphdrr.add_derenzo"
+ADD_PHANTOM = "mphdrr.add_"  # and the kind: mphdrr.add_derenzo, mphdrr.add_nema, ...
+IMPORT_PHANTOM = "mphdrr.import_phantom"
+UPDATE_PHANTOM = "mphdrr.update_phantom"
+APPLY_PHANTOM_POSE = "mphdrr.apply_phantom_pose"
+SHOW_PHANTOM_OUTLINE = "mphdrr.show_phantom_outline"
 IMPORT_VOLUME = "mphdrr.import_volume"
 ADD_SLICES = "mphdrr.add_slices"
 REMOVE_SLICES = "mphdrr.remove_slices"
@@ -32,7 +36,7 @@ UPDATE_DERENZO = "mphdrr.update_derenzo"
 SHOW_PROJECTIONS = "mphdrr.show_projections"
 CANCEL_JOB = "mphdrr.cancel_job"
 
-# --- Panels, lists and file handlers: class names, drawn in the order of the work ---------------------------
+# --- Panels, lists, menus and file handlers: class names, drawn in the order of the work ---------------------------
 PANEL_GEOMETRY = "MPHDRR_PT_geometry"
 PANEL_MODULES = "MPHDRR_PT_modules"
 PANEL_DESIGN = "MPHDRR_PT_design"
@@ -43,6 +47,8 @@ PANEL_PHYSICS = "MPHDRR_PT_physics"
 PANEL_EXPORT = "MPHDRR_PT_export"
 LIST_MODULES = "MPHDRR_UL_modules"
 FILE_HANDLER_WORKBOOK = "MPHDRR_FH_workbook"
+FILE_HANDLER_PHANTOM = "MPHDRR_FH_phantom"
+MENU_ADD = "MPHDRR_MT_add"
 FILE_HANDLER_VOLUME = "MPHDRR_FH_volume"
 ORDER_GEOMETRY, ORDER_PHANTOM, ORDER_PROJECTIONS, ORDER_EXPORT = 0, 10, 20, 30  # bl_order
 
@@ -63,7 +69,6 @@ MATERIAL_COLLIMATOR = "mphDRR collimator"
 MATERIAL_CRYSTAL = "mphDRR crystal"
 MATERIAL_ROI = "mphDRR ROI"
 MOSAIC = "mphDRR mosaic"
-DERENZO = "Derenzo"
 PREVIEW = ".preview"  # in the names of coarser copies of large volumes, for display only
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from typing import Any
 
 import bpy
@@ -17,89 +18,218 @@ from bpy.props import (
     StringProperty,
 )
 
+from ..core.errors import InputError
 from ..core.grid import Grid
-from ..core.phantoms.derenzo import DerenzoPhantom
+from ..core.phantoms.kinds import KINDS, Kind
+from ..core.phantoms.language import parse_phantom
+from ..core.phantoms.phantom import Phantom
 from ..core.volume import UNITS
 
+FILE = "file"
+"""Beside the names of `KINDS`: a phantom described by a text in TOML."""
 
-class DerenzoSettings:
-    """A Derenzo phantom's numbers; mixed into the operator and into the object's properties."""
+_UNITS = {"mm": "mm", "kBq/mL": "kBq_per_mL", "1/mm": "per_mm", "kBq": "kBq", "mL": "mL"}
+"""Units in names of settings as JSON has them."""
 
-    radius: FloatProperty(
-        name="Radius", description="Radius of the phantom in mm", default=40.0, min=0.1, soft_max=200.0
-    )
-    rod_diameters: FloatVectorProperty(
-        name="Rods", description="Rod diameter in mm of each of the six sectors; 0 leaves a sector empty",
-        size=6, default=(8.0, 6.0, 5.0, 4.0, 3.0, 2.0), min=0.0, soft_max=30.0,
-    )  # fmt: skip
-    height: FloatProperty(name="Height", description="Length of the rods in mm", default=40.0, min=0.1, soft_max=400.0)
-    activity: FloatProperty(
-        name="Activity",
-        description="Activity concentration in the rods in kBq/mL",
-        default=100.0,
-        min=1e-6,
-        soft_max=1e4,
-    )
-    voxels: IntProperty(
-        name="Voxels", description="Voxels along each side of the grid", default=128, min=4, soft_max=512, max=4096
-    )
-    voxel_size: FloatProperty(
-        name="Voxel Size", description="Side of a voxel in mm; 0 fits the grid to the phantom", default=0.0, min=0.0,
-        soft_max=10.0, precision=3,
-    )  # fmt: skip
 
-    def phantom(self) -> DerenzoPhantom:
-        """The phantom; float32 settings are read as the decimal numbers that the user typed."""
-        return DerenzoPhantom(
-            typed(self.radius),
-            tuple(typed(w) for w in self.rod_diameters),
-            typed(self.height),
-            typed(self.activity),
-        )
+class PhantomSettings:
+    """What a phantom is made from, mixed into the operator that adds one and into the properties that its object keeps.
 
-    def grid(self) -> Grid:
-        """The phantom's grid, in its own frame."""
-        # One voxel is kept free all around, so that no rod touches the edge.
-        fitted = max(2 * typed(self.radius), typed(self.height)) / max(1, self.voxels - 2)
-        return Grid.centered((self.voxels,) * 3, typed(self.voxel_size) or fitted)
+    Those of each kind have its dataclass's fields as properties, and those of `_sampling`.
+    """
+
+    @property
+    def names(self) -> list[str]:
+        """Names of the settings, in the order of drawing."""
+        return list(sampling())
+
+    def phantom(self) -> Phantom:
+        """The phantom; raises InputError."""
+        raise NotImplementedError
 
     def recipe(self) -> dict[str, Any]:
         """The settings as JSON can hold them."""
-        phantom = self.phantom()
-        return {
-            "phantom": "derenzo",
-            "radius_mm": phantom.radius,
-            "rod_diameters_mm": list(phantom.rod_diameters),
-            "height_mm": phantom.height,
-            "activity_kBq_per_mL": phantom.activity,
-        }
+        raise NotImplementedError
+
+    def grid(self, phantom: Phantom) -> Grid:
+        """The phantom's grid, in its own frame: as many voxels along every side."""
+        settings: Any = self
+        low, high = phantom.box
+        # One voxel is kept free all around, so that nothing touches the edge.
+        fitted = float((high - low).max()) / max(1, settings.voxels - 2)
+        return Grid.centered((settings.voxels,) * 3, typed(settings.voxel_size) or fitted, (low + high) / 2)
 
     def draw_settings(self, layout: bpy.types.UILayout) -> None:
-        """Draw the numbers into a panel or a dialog."""
+        """Draw the settings into a panel or a dialog."""
         column = layout.column(align=True)
-        column.prop(self, "radius", text="Radius (mm)")
-        column.prop(self, "height", text="Height (mm)")
-        column.prop(self, "activity", text="kBq/mL")
-        grid = layout.column(align=True)
-        grid.use_property_split = False
-        grid.label(text="Rod diameters (mm)")
-        for first in (0, 3):
-            row = grid.row(align=True)
-            for k in range(first, first + 3):
-                row.prop(self, "rod_diameters", index=k, text="")
-        column = layout.column(align=True)
-        column.prop(self, "voxels", text="Voxels per Side")
-        column.prop(self, "voxel_size", text="Voxel Size (mm)")
-        if self.voxel_size == 0:
-            fitted = max(2 * self.radius, self.height) / max(1, self.voxels - 2)
-            row = column.row()
-            row.alignment = "RIGHT"
-            row.active = False
-            row.label(text=f"0 fits the grid: {fitted:.3g} mm")
+        for name in self.names:
+            value = getattr(self, name)
+            if isinstance(value, bpy.types.bpy_prop_array) and len(value) > 3:
+                grid = layout.column(align=True)
+                grid.use_property_split = False
+                grid.label(text=self.bl_rna.properties[name].name)  # type: ignore[attr-defined]
+                for first in range(0, len(value), 3):
+                    row = grid.row(align=True)
+                    for k in range(first, min(first + 3, len(value))):
+                        row.prop(self, name, index=k, text="")
+                column = layout.column(align=True)
+            else:
+                if name == "quantity":
+                    column = layout.column(align=True)
+                column.prop(self, name)
 
 
-class DerenzoProperties(DerenzoSettings, bpy.types.PropertyGroup):
-    """What a Derenzo object was made from."""
+class KindSettings(PhantomSettings):
+    """The settings of one of `KINDS`."""
+
+    kind = KINDS[0]
+
+    @property
+    def names(self) -> list[str]:
+        """The class's fields first."""
+        return [*(field.name for field in _fields(self.kind)), *super().names]
+
+    def phantom(self) -> Phantom:
+        """The phantom; float32 settings are read as the decimal numbers that the user typed."""
+        phantom: Phantom = self.kind.phantom(**self._values())
+        return phantom
+
+    def recipe(self) -> dict[str, Any]:
+        """The class's fields, their units in their names."""
+        recipe: dict[str, Any] = {"phantom": self.kind.name}
+        values = self._values()
+        for field in _fields(self.kind):
+            unit, value = _UNITS.get(field.metadata.get("unit", "")), values[field.name]
+            recipe[f"{field.name}_{unit}" if unit else field.name] = list(value) if isinstance(value, tuple) else value
+        return recipe
+
+    def _values(self) -> dict[str, Any]:
+        return {field.name: _plain(getattr(self, field.name)) for field in _fields(self.kind)}
+
+
+class TextSettings(PhantomSettings):
+    """The settings of a phantom that a text of the .blend describes."""
+
+    @property
+    def names(self) -> list[str]:
+        """The text first."""
+        return ["text", *super().names]
+
+    def phantom(self) -> Phantom:
+        """The text's phantom."""
+        return parse_phantom(*self._text())
+
+    def recipe(self) -> dict[str, Any]:
+        """The whole text, and its name."""
+        text, name = self._text()
+        return {"phantom": FILE, "file": name, "text": text}
+
+    def _text(self) -> tuple[str, str]:
+        text: bpy.types.Text | None = self.text  # type: ignore[attr-defined]
+        if text is None:
+            raise InputError("no text is chosen: choose one that describes a phantom")
+        return text.as_string(), text.name
+
+
+def sampling(update: Any = None) -> dict[str, Any]:
+    """Properties of all phantoms: what the voxels hold, and how many."""
+    return {
+        "quantity": EnumProperty(
+            name="Quantity", description="What the voxels hold", update=update,
+            items=(("activity", "Activity", "In kBq/mL"), ("mu", "Attenuation", "Linear attenuation in 1/mm")),
+        ),
+        "voxels": IntProperty(
+            name="Voxels per Side", description="Voxels along each side of the grid", default=128, min=4, soft_max=512,
+            max=4096, update=update,
+        ),
+        "voxel_size": FloatProperty(
+            name="Voxel Size (mm)", description="Side of a voxel in mm; 0 fits the grid to the phantom", default=0.0,
+            min=0.0, soft_max=10.0, precision=3, update=update,
+        ),
+    }  # fmt: skip
+
+
+def kind_settings(kind: Kind, update: Any = None) -> dict[str, Any]:
+    """Properties of one kind of phantom, by name, for a class's annotations."""
+    return {field.name: _property(field, kind, update) for field in _fields(kind)} | sampling(update)
+
+
+def identifier(kind: Kind) -> str:
+    """A kind's name in Python: of its operator and of its settings."""
+    return kind.name.replace("-", "_")
+
+
+def _fields(kind: Kind) -> list[Any]:
+    """The fields of a kind's class that can be set: those made by `setting`, `count` and `choice`."""
+    return [field for field in dataclasses.fields(kind.phantom) if field.metadata]
+
+
+def _property(field: Any, kind: Kind, update: Any) -> Any:
+    """A field of a phantom's dataclass as a property."""
+    known = field.metadata
+    unit = known.get("unit", "")
+    name = field.name.replace("_", " ").title() if unit != "DEG" else field.name.removesuffix("_degrees").title()
+    default = kind.usual.get(field.name, field.default)
+    text = known["text"][0].upper() + known["text"][1:]
+    options: dict[str, Any] = {"name": name, "description": text, "default": default, "update": update}
+    if "choices" in known:
+        return EnumProperty(**options, items=tuple((word, word.capitalize(), text) for word in known["choices"]))
+    many = {"size": len(default)} if isinstance(default, tuple) else {}
+    if not unit:
+        return (IntVectorProperty if many else IntProperty)(**options, **many, min=1)
+    if unit in _UNITS:
+        options |= {"name": f"{name} ({unit})", "description": f"{text}, in {unit}"}
+    elif unit == "DEG":
+        options |= {"name": f"{name.replace('_', ' ')} (°)", "description": f"{text}, in degrees"}
+    else:
+        options |= {"description": f"Share {unit}, {known['text']}"}
+    # What must be above 0 has no smallest number.
+    options |= {"min": 1e-6 if known["least"] is None else known["least"], "precision": 4 if unit == "1/mm" else 2}
+    return (FloatVectorProperty if many else FloatProperty)(**options, **many)
+
+
+def _phantom_changed(self: Any, context: bpy.types.Context) -> None:
+    from . import phantoms
+
+    phantoms.settings_changed(self.id_data, self)
+
+
+def _group(name: str, mixin: type, members: dict[str, Any]) -> Any:
+    """A PropertyGroup of those properties; they are read from its annotations."""
+    return type(f"{name}Properties", (mixin, bpy.types.PropertyGroup), members)
+
+
+KIND_PROPERTIES = {
+    kind.name: _group(
+        kind.phantom.__name__,
+        KindSettings,
+        {"kind": kind, "__annotations__": kind_settings(kind, _phantom_changed), "__doc__": f"Settings of {kind.summary}."},
+    )
+    for kind in KINDS
+} | {
+    FILE: _group(
+        "PhantomText",
+        TextSettings,
+        {
+            "__annotations__": {
+                "text": PointerProperty(
+                    name="Text", type=bpy.types.Text, update=_phantom_changed,
+                    description="Describes the phantom in TOML; can be edited in a Text Editor",
+                ),
+                **sampling(_phantom_changed),
+            },
+            "__doc__": "Settings of a phantom that a text describes.",
+        },
+    )
+}  # fmt: skip
+"""What objects keep of how they were made: a PropertyGroup for every kind of phantom, by its name."""
+
+
+_KINDS = (
+    ("VOLUME", "Volume", "Voxels from elsewhere", 0),
+    *((identifier(kind).upper(), kind.label, kind.summary, i) for i, kind in enumerate(KINDS, 1)),
+    (FILE.upper(), "Text", "Shapes that a text describes", 1000),
+)
 
 
 # The modules that draw import these properties: they are imported when an edit calls for them.
@@ -122,8 +252,19 @@ class VolumeProperties(bpy.types.PropertyGroup):
     is_volume: BoolProperty(name="Is Volume", options={"HIDDEN"})
     kind: EnumProperty(
         name="Kind", description="What the volume was made as",
-        items=(("VOLUME", "Volume", "Voxels from elsewhere"), ("DERENZO", "Derenzo", "Derenzo phantom")),
+        items=_KINDS,
     )  # fmt: skip
+    with_parent: BoolProperty(
+        name="With Parent",
+        description="Another quantity of the phantom that is this volume's parent",
+        options={"HIDDEN"},
+    )
+    outdated: BoolProperty(
+        name="Outdated",
+        description="The phantom's settings have changed since its voxels were made",
+        options={"HIDDEN"},
+    )
+    message: StringProperty(name="Message", description="What is wrong with the phantom's settings", options={"HIDDEN"})
     quantity: EnumProperty(
         name="Quantity", description="What the voxels hold",
         items=tuple((name, name.capitalize(), f"In {unit}") for name, unit in UNITS.items()),
@@ -157,7 +298,15 @@ class VolumeProperties(bpy.types.PropertyGroup):
         name="Centre Shift", description="Voxels by which the .vdb is shifted for the Blender that wrote it",
         options={"HIDDEN"},
     )  # fmt: skip
-    derenzo: PointerProperty(name="Derenzo", type=DerenzoProperties)
+
+
+# One of them counts: `kind`'s. `Object.mphdrr_volume.derenzo`, `.nema`, ...
+VolumeProperties.__annotations__.update(
+    {
+        name.replace("-", "_"): PointerProperty(name=name.capitalize(), type=group)
+        for name, group in KIND_PROPERTIES.items()
+    }
+)
 
 
 def typed(value: float) -> float:
@@ -165,4 +314,11 @@ def typed(value: float) -> float:
     return float(str(np.float32(value)))
 
 
-CLASSES = (DerenzoProperties, VolumeProperties)
+def _plain(value: Any) -> Any:
+    """A property's value as the phantom's classes take it."""
+    if isinstance(value, bpy.types.bpy_prop_array):
+        return tuple(_plain(item) for item in value)
+    return typed(value) if isinstance(value, float) else value
+
+
+CLASSES = (*KIND_PROPERTIES.values(), VolumeProperties)

@@ -8,12 +8,13 @@ from typing import Any
 import bpy
 
 from ..operators import (
-    add_derenzo,
     add_map,
+    add_phantom,
     add_slices,
     aim_modules,
     check_geometry,
     duplicate_modules,
+    edit_phantom,
     export_dataset,
     export_for_program,
     export_geometry,
@@ -27,7 +28,7 @@ from ..operators import (
     volume_files,
     voxelize_objects,
 )
-from ..panels import design, export, geometry, phantom, projections
+from ..panels import add_menu, design, export, geometry, phantom, projections
 from . import cli, ids, jobs, live, preferences, properties, slices, storage, volumes
 
 # Classes in the order of registration; a panel comes after its parent. To add a class, list it here.
@@ -48,8 +49,13 @@ CLASSES: tuple[type, ...] = (
     export_geometry.MPHDRR_OT_export_geometry,
     export_for_program.MPHDRR_OT_export_for_program,
     add_map.MPHDRR_OT_add_map,
-    add_derenzo.MPHDRR_OT_add_derenzo,
-    add_derenzo.MPHDRR_OT_update_derenzo,
+    *add_phantom.ADD_KINDS,
+    add_phantom.MPHDRR_OT_import_phantom,
+    add_phantom.MPHDRR_FH_phantom,
+    edit_phantom.MPHDRR_OT_update_phantom,
+    edit_phantom.MPHDRR_OT_update_derenzo,
+    edit_phantom.MPHDRR_OT_apply_phantom_pose,
+    edit_phantom.MPHDRR_OT_show_phantom_outline,
     voxelize_objects.MPHDRR_OT_voxelize_objects,
     voxelize_objects.MPHDRR_OT_mesh_from_volume,
     import_volume.MPHDRR_OT_import_volume,
@@ -62,6 +68,7 @@ CLASSES: tuple[type, ...] = (
     render_projections.MPHDRR_OT_show_projections,
     jobs.MPHDRR_OT_cancel_job,
     export_dataset.MPHDRR_OT_export_dataset,
+    add_menu.MPHDRR_MT_add,
     # panels, in the order of the work
     geometry.MPHDRR_UL_modules,
     geometry.MPHDRR_PT_geometry,
@@ -81,7 +88,7 @@ MENUS: tuple[tuple[Any, Any], ...] = (
     (bpy.types.TOPBAR_MT_file_export, export_geometry.draw_menu),
     (bpy.types.TOPBAR_MT_file_export, export_for_program.draw_menu),
     (bpy.types.TOPBAR_MT_file_export, export_dataset.draw_menu),
-    (bpy.types.VIEW3D_MT_volume_add, add_derenzo.draw_menu),
+    (bpy.types.VIEW3D_MT_add, add_menu.draw_menu),
     (bpy.types.VIEW3D_MT_object_convert, voxelize_objects.draw_menu),
 )
 

@@ -9,7 +9,7 @@ from typing import Any
 import bpy
 from bpy.props import StringProperty
 
-from ..addon import ids, images, jobs, runs, scanner, storage, volumes
+from ..addon import ids, images, jobs, phantoms, runs, scanner, storage, volumes
 from ..addon.phantom_properties import typed
 from ..addon.projection_properties import ProjectionSettings, chosen_model
 from ..core.errors import InputError
@@ -52,8 +52,9 @@ class MPHDRR_OT_render_projections(ProjectionSettings, jobs.JobOperator, bpy.typ
         require(9 * n_bytes, f"{len(system)} images of {shape[1]} x {shape[0]} pixels")
         path = storage.folder() / f"{bpy.path.clean_name(scene.name)}-projections.h5"
         settings: dict[str, Any] = {"volume": item.name} | ({} if mu is None else {"mu_volume": mu.name})
-        if getattr(item, ids.OBJECT_VOLUME).kind == "DERENZO":
-            settings |= getattr(item, ids.OBJECT_VOLUME).derenzo.recipe()
+        phantom = phantoms.settings_of(item)
+        if phantom is not None:
+            settings |= phantom.recipe()
         scene_name, item_name, start = scene.name, item.name, time.perf_counter()
 
         def work(progress: Progress) -> ProjectionRun:

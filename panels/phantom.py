@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import bpy
 
-from ..addon import ids, jobs, slices, storage, volumes
+from ..addon import ids, jobs, phantoms, slices, storage, volumes
 
 
 class MPHDRR_PT_phantom(bpy.types.Panel):
@@ -20,7 +22,7 @@ class MPHDRR_PT_phantom(bpy.types.Panel):
         layout.enabled = not jobs.is_running()
         layout.operator_context = "INVOKE_DEFAULT"
         column = layout.column(align=True)
-        column.operator(ids.ADD_DERENZO, text="Add Derenzo Phantom", icon="OUTLINER_DATA_VOLUME")
+        column.menu(ids.MENU_ADD, text="Add Phantom", icon="OUTLINER_DATA_VOLUME")
         column.operator(ids.IMPORT_VOLUME, text="Import Volume", icon="IMPORT")
         if storage.missing_volumes():
             column = layout.column(align=True)
@@ -63,7 +65,28 @@ class MPHDRR_PT_phantom(bpy.types.Panel):
             column.operator(ids.REMOVE_SLICES, icon="X")
         else:
             layout.operator(ids.ADD_SLICES, icon="MESH_PLANE")
-        if settings.kind == "DERENZO":
-            settings.derenzo.draw_settings(layout)
-            layout.operator(ids.UPDATE_DERENZO, icon="FILE_REFRESH")
+        phantom = phantoms.settings_of(item)
+        if phantom is not None:
+            _draw_phantom(layout, item, phantom)
         layout.operator(ids.CLEAN_VOLUME_FILES, icon="TRASH")
+
+
+def _draw_phantom(layout: bpy.types.UILayout, item: bpy.types.Object, phantom: Any) -> None:
+    """A phantom's settings, what is wrong with them, and what can be done to it."""
+    settings = getattr(item, ids.OBJECT_VOLUME)
+    phantom.draw_settings(layout)
+    if settings.message:
+        column = layout.column(align=True)
+        column.alert = settings.outdated
+        column.label(text=settings.message, icon="ERROR" if settings.outdated else "INFO")
+    column = layout.column(align=True)
+    row = column.row(align=True)
+    row.alert = settings.outdated
+    row.operator(
+        ids.UPDATE_PHANTOM, text="Changed: Update" if settings.outdated else "Update Phantom", icon="FILE_REFRESH"
+    )
+    column.operator(ids.APPLY_PHANTOM_POSE, icon="OBJECT_ORIGIN")
+    shown = phantoms.outline_of(item) is not None
+    column.operator(
+        ids.SHOW_PHANTOM_OUTLINE, text="Hide Outline" if shown else "Show Outline", icon="SHADING_WIRE", depress=shown
+    )

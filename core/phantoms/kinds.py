@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from types import MappingProxyType
 from typing import Any, NamedTuple
 
 from .defrise import DefrisePhantom
@@ -26,17 +28,20 @@ class Kind(NamedTuple):
         In menus.
     summary : str
         What it is, for help.
+    usual : mapping
+        What scenes begin with where that is not the class's default.
     """
 
     name: str
     phantom: Any
     label: str
     summary: str
+    usual: Mapping[str, float] = MappingProxyType({})
 
 
 # Saved scenes hold a kind by its place in this table: add new ones at its end.
 KINDS = (
-    Kind("derenzo", DerenzoPhantom, "Derenzo", "a Derenzo phantom: six sectors of hot rods"),
+    Kind("derenzo", DerenzoPhantom, "Derenzo", "a Derenzo phantom: six sectors of hot rods", {"activity": 100.0}),
     Kind("nema", NemaBody, "NEMA Body", "the NEMA (IEC) body phantom: six spheres"),
     Kind("jaszczak", JaszczakPhantom, "Jaszczak", "a Jaszczak phantom: rods and spheres"),
     Kind("defrise", DefrisePhantom, "Defrise", "a Defrise phantom: hot disks"),

@@ -1,0 +1,265 @@
+"""Phantoms in the scene: volumes that know what they were made from, and are made anew when that changes.
+
+The object's matrix is the phantom's pose; the voxels lie in its own frame, so that moving the object moves the phantom. A
+phantom may have children that go with it: a volume of its other quantity, and an outline.
+"""
+
+from __future__ import annotations
+
+import itertools
+import warnings
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import bpy
+import numpy as np
+from numpy.typing import NDArray
+
+from ..core.errors import InputError, InputWarning
+from ..core.grid import Grid
+from ..core.meshes.mesh import Mesh
+from ..core.phantoms.phantom import Phantom
+from ..core.progress import Progress
+from ..core.volume import Volume
+from . import ids, jobs, meshes, storage, volumes
+from .cameras import set_world_matrix
+from .phantom_properties import PhantomSettings
+
+LIVE_VOXELS = 64**3
+"""Up to so many voxels a phantom is made anew at once when a setting changes."""
+
+_OUTLINE = "mphdrr_outline"  # custom property of the mesh that shows a phantom's surfaces
+
+
+@dataclass(frozen=True)
+class Recipe:
+    """What a phantom's settings say, for a thread that leaves bpy alone.
+
+    Attributes
+    ----------
+    phantom : Phantom
+        What it is.
+    grid : Grid
+        Its voxels, in its own frame.
+    settings : dict
+        As JSON can hold them.
+    messages : tuple of str
+        What the phantom's class warned of.
+    """
+
+    phantom: Phantom
+    grid: Grid
+    settings: dict[str, Any]
+    messages: tuple[str, ...]
+
+    def voxelize(
+        self,
+        quantities: Sequence[str],
+        poses: Sequence[NDArray[np.float64]],
+        folder: Path,
+        progress: Progress | None = None,
+        baked: bool = False,
+    ) -> list[volumes.StoredVolume]:
+        """A volume of each quantity in `folder`, its phantom at a world-from-phantom pose (4, 4), mm.
+
+        Its grid turns with the phantom or, if `baked`, lies along the world's axes: then so does the object.
+        """
+        for message in self.messages:
+            warnings.warn(message, InputWarning, stacklevel=2)
+        stored = []
+        for number, (quantity, pose) in enumerate(zip(quantities, poses, strict=True)):
+            report = _part(progress, number, len(quantities))
+            if baked:
+                place = np.eye(4)
+                place[:3, 3] = pose[:3, 3]
+                volume = self.phantom.voxelize(self._world_grid(pose), pose, report, quantity)
+                settings = self.settings | {"pose": pose.tolist()}
+            else:
+                place, settings = pose, self.settings
+                own = self.phantom.voxelize(self.grid, None, report, quantity)
+                volume = Volume(own.array, Grid(own.grid.shape, pose @ own.grid.affine), quantity)
+            stored.append(volumes.store_volume(volume, folder, place, settings))
+        return stored
+
+    def _world_grid(self, pose: NDArray[np.float64]) -> Grid:
+        """A grid along the world's axes that holds the phantom at a pose, with voxels as small as there."""
+        low, high = self.phantom.box
+        corners = np.array(list(itertools.product(*zip(low, high, strict=True)))) @ pose[:3, :3].T + pose[:3, 3]
+        low, high = corners.min(axis=0), corners.max(axis=0)
+        spacing = min(Grid(self.grid.shape, pose @ self.grid.affine).spacing)
+        n_x, n_y, n_z = (int(n) for n in np.ceil((high - low) / spacing) + 2)
+        return Grid.centered((n_x, n_y, n_z), spacing, (low + high) / 2)
+
+
+def recipe_of(settings: PhantomSettings) -> Recipe:
+    """What settings say.
+
+    Raises
+    ------
+    InputError
+        There is no such phantom.
+    """
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always", InputWarning)
+        phantom = settings.phantom()
+    return Recipe(phantom, settings.grid(phantom), settings.recipe(), tuple(str(w.message) for w in caught))
+
+
+def settings_of(item: bpy.types.Object | None) -> Any:
+    """The settings that a volume was made from as a phantom; None where it is none."""
+    if item is None or not volumes.is_volume(item):
+        return None
+    properties = getattr(item, ids.OBJECT_VOLUME)
+    return None if properties.kind == "VOLUME" else getattr(properties, properties.kind.lower())
+
+
+def add(
+    stored: Sequence[volumes.StoredVolume],
+    name: str,
+    kind: str,
+    settings: dict[str, Any],
+    collection: bpy.types.Collection,
+) -> bpy.types.Object:
+    """A phantom's volume in the scene; those of its other quantities become its children.
+
+    `kind` is that of `VolumeProperties`; `settings` are its PropertyGroup's values by name.
+    """
+    item = volumes.add_stored(stored[0], name, collection)
+    properties = getattr(item, ids.OBJECT_VOLUME)
+    group = getattr(properties, kind.lower())
+    for key, value in settings.items():
+        setattr(group, key, value)
+    properties.kind = kind  # last: until then a setting that changes makes nothing anew
+    for other in stored[1:]:
+        child = volumes.add_stored(other, f"{item.name} {other.volume.quantity}", collection)
+        getattr(child, ids.OBJECT_VOLUME).with_parent = True
+        child.parent = item
+        child.matrix_basis.identity()
+    return item
+
+
+def with_children(item: bpy.types.Object) -> list[bpy.types.Object]:
+    """A phantom and the volumes of its other quantities."""
+    children = [o for o in item.children if volumes.is_volume(o) and getattr(o, ids.OBJECT_VOLUME).with_parent]
+    return [item, *sorted(children, key=lambda o: o.name)]
+
+
+def remaking(item: bpy.types.Object, bake: bool = False) -> Callable[[Progress | None], list[volumes.StoredVolume]]:
+    """What makes the voxels of a phantom and its children anew, for `replace`; leaves bpy alone.
+
+    With `bake`, at its pose and on a grid along the world's axes.
+
+    Raises
+    ------
+    InputError
+        The object is no phantom, its settings make none, or its matrix is singular.
+    """
+    settings = settings_of(item)
+    if settings is None:
+        raise InputError("no phantom is active: select one that was added with its settings")
+    recipe, folder = recipe_of(settings), storage.folder()
+    made = with_children(item)
+    quantities = [settings.quantity, *(getattr(o, ids.OBJECT_VOLUME).quantity for o in made[1:])]
+    poses = [volumes.pose_of_object(o) for o in made]
+    return lambda progress: recipe.voxelize(quantities, poses, folder, progress, bake)
+
+
+def replace(item: bpy.types.Object, stored: Sequence[volumes.StoredVolume], baked: bool = False) -> None:
+    """Give a phantom and its children what `remaking` made.
+
+    They stay where they are. If it was baked, they stand along the world's axes and are phantoms no more: their settings
+    would not make these voxels.
+
+    Raises
+    ------
+    InputError
+        Children have come or gone in the meantime.
+    """
+    made = with_children(item)
+    if len(made) != len(stored):
+        raise InputError(f"the volumes of {item.name!r} are not those of before: try again")
+    for volume_object, new in zip(made, stored, strict=True):
+        basis = volume_object.matrix_basis.copy()
+        volumes.replace_stored(volume_object, new)
+        if baked:
+            set_world_matrix(volume_object, new.pose)
+        else:
+            volume_object.matrix_basis = basis  # which a matrix with shear would not survive
+    properties = getattr(item, ids.OBJECT_VOLUME)
+    properties.outdated, properties.message = False, ""
+    if baked:
+        remove_outline(item)
+        properties.kind = "VOLUME"
+        for child in made[1:]:
+            getattr(child, ids.OBJECT_VOLUME).with_parent = False
+    elif outline_of(item) is not None:
+        show_outline(item)
+
+
+def settings_changed(item: Any, settings: PhantomSettings) -> None:
+    """A setting was edited: make small phantoms anew, and say of others, and of what cannot be made, that it is so."""
+    if not isinstance(item, bpy.types.Object) or settings_of(item) != settings:
+        return  # an operator's, or on its way
+    properties = getattr(item, ids.OBJECT_VOLUME)
+    properties.outdated, properties.message = True, ""
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always", InputWarning)
+        try:
+            recipe_of(settings)
+            live = not jobs.is_running() and getattr(settings, "voxels") ** 3 <= LIVE_VOXELS  # noqa: B009
+            if live:
+                replace(item, remaking(item)(None))
+            elif outline_of(item) is not None:
+                show_outline(item)
+        except InputError as error:
+            properties.message = str(error)
+            return
+    messages = [str(w.message) for w in caught if issubclass(w.category, InputWarning)]
+    properties.message = messages[0] if messages else ""
+
+
+def outline_of(item: bpy.types.Object) -> bpy.types.Object | None:
+    """The mesh that shows a phantom's surfaces, if it has one."""
+    return next((child for child in item.children if _OUTLINE in child), None)
+
+
+def show_outline(item: bpy.types.Object) -> bpy.types.Object:
+    """Show the surfaces of a phantom's shapes as wires that go with it, made from its settings as they are now.
+
+    Raises
+    ------
+    InputError
+        The object is no phantom, or its settings make none.
+    """
+    settings = settings_of(item)
+    if settings is None:
+        raise InputError("no phantom is active: select one that was added with its settings")
+    parts = recipe_of(settings).phantom.meshes()
+    starts = np.cumsum([0, *(len(part.vertices) for part in parts)])
+    vertices = np.concatenate([part.vertices for part in parts])
+    faces = np.concatenate([part.faces + start for part, start in zip(parts, starts[:-1], strict=True)])
+    remove_outline(item)
+    collection = item.users_collection[0] if item.users_collection else bpy.context.scene.collection
+    outline = meshes.add_mesh(Mesh(vertices, faces), f"{item.name} outline", np.eye(4), collection)
+    outline[_OUTLINE] = True
+    outline.display_type = "WIRE"
+    outline.hide_render = outline.hide_select = True
+    outline.parent = item
+    return outline
+
+
+def remove_outline(item: bpy.types.Object) -> None:
+    """Remove the mesh that shows a phantom's surfaces; nothing where there is none."""
+    outline = outline_of(item)
+    if outline is not None:
+        mesh = outline.data
+        bpy.data.objects.remove(outline)
+        if mesh.users == 0:
+            bpy.data.meshes.remove(mesh)
+
+
+def _part(progress: Progress | None, number: int, count: int) -> Progress | None:
+    """The progress of one of several equal parts."""
+    return None if progress is None else lambda done, total: progress(number * total + done, count * total)

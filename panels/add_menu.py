@@ -1,0 +1,30 @@
+"""Add > mphDRR: everything that can be put into the scanner."""
+
+from __future__ import annotations
+
+import bpy
+
+from ..addon import ids
+from ..addon.phantom_properties import identifier
+from ..core.phantoms.kinds import KINDS
+
+
+class MPHDRR_MT_add(bpy.types.Menu):
+    bl_idname = ids.MENU_ADD
+    bl_label = "mphDRR"
+
+    def draw(self, context: bpy.types.Context) -> None:
+        layout = self.layout
+        layout.operator_context = "INVOKE_DEFAULT"
+        for kind in KINDS:
+            layout.operator(ids.ADD_PHANTOM + identifier(kind), text=kind.label, icon="OUTLINER_DATA_VOLUME")
+        layout.operator(ids.IMPORT_PHANTOM, text="Phantom from TOML File", icon="FILE_TEXT")
+        layout.separator()
+        layout.operator(ids.IMPORT_VOLUME, text="Volume from File", icon="IMPORT")
+        layout.operator(ids.VOXELIZE_OBJECTS, text="Volume from Meshes", icon="OUTLINER_DATA_MESH")
+        layout.operator(ids.ADD_MAP, text="Map of the Scanner", icon="OUTLINER_DATA_LIGHTPROBE")
+
+
+def draw_menu(self: bpy.types.Menu, context: bpy.types.Context) -> None:
+    """The entry of the 3D viewport's Add menu."""
+    self.layout.menu(ids.MENU_ADD, icon="OUTLINER_DATA_VOLUME")

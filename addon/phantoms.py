@@ -20,15 +20,19 @@ from numpy.typing import NDArray
 from ..core.errors import InputError, InputWarning
 from ..core.grid import Grid
 from ..core.meshes.mesh import Mesh
+from ..core.phantoms.kinds import KINDS
 from ..core.phantoms.phantom import Phantom
 from ..core.progress import Progress
 from ..core.volume import Volume
 from . import ids, jobs, meshes, storage, volumes
 from .cameras import set_world_matrix
-from .phantom_properties import PhantomSettings
+from .phantom_properties import PhantomSettings, identifier
 
 LIVE_VOXELS = 64**3
 """Up to so many voxels a phantom is made anew at once when a setting changes."""
+
+ADDING = tuple((ids.ADD_PHANTOM + identifier(kind), kind.label) for kind in KINDS)
+"""The operators that add a phantom, and what they add."""
 
 _OUTLINE = "mphdrr_outline"  # custom property of the mesh that shows a phantom's surfaces
 

@@ -5,8 +5,7 @@ from __future__ import annotations
 import bpy
 
 from ..addon import ids
-from ..addon.phantom_properties import identifier
-from ..core.phantoms.kinds import KINDS
+from ..addon.phantoms import ADDING
 
 
 class MPHDRR_MT_add(bpy.types.Menu):
@@ -16,8 +15,8 @@ class MPHDRR_MT_add(bpy.types.Menu):
     def draw(self, context: bpy.types.Context) -> None:
         layout = self.layout
         layout.operator_context = "INVOKE_DEFAULT"
-        for kind in KINDS:
-            layout.operator(ids.ADD_PHANTOM + identifier(kind), text=kind.label, icon="OUTLINER_DATA_VOLUME")
+        for operator, label in ADDING:
+            layout.operator(operator, text=label, icon="OUTLINER_DATA_VOLUME")
         layout.operator(ids.IMPORT_PHANTOM, text="Phantom from TOML File", icon="FILE_TEXT")
         layout.separator()
         layout.operator(ids.IMPORT_VOLUME, text="Volume from File", icon="IMPORT")

@@ -1,0 +1,213 @@
+"""Phantoms in the scene: every kind is core's, follows its settings and its object, and can be baked."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+bpy = pytest.importorskip("bpy")
+
+from mathutils import Matrix  # noqa: E402
+
+from mphdrr.addon import cameras, phantom_properties, phantoms, volumes  # noqa: E402
+from mphdrr.core.frames import euler_pose  # noqa: E402
+from mphdrr.core.grid import Grid  # noqa: E402
+from mphdrr.core.phantoms.kinds import KINDS  # noqa: E402
+from mphdrr.core.phantoms.language import read_phantom  # noqa: E402
+from mphdrr.core.phantoms.phantom import Phantom  # noqa: E402
+from mphdrr.core.projector import Projector  # noqa: E402
+from mphdrr.core.volume import Volume  # noqa: E402
+
+THORAX = Path(__file__).parents[2] / "examples" / "phantoms" / "thorax.toml"
+POSE = {"location": (4.0, -5.0, 6.0), "phi": 0.5, "theta": 0.25, "psi": -0.125}  # whole in float32
+
+
+def pose() -> np.ndarray:
+    return euler_pose(POSE["phi"], POSE["theta"], POSE["psi"], POSE["location"])
+
+
+def add(name: str, **arguments):
+    assert getattr(bpy.ops.mphdrr, f"add_{name.replace('-', '_')}")(**arguments) == {"FINISHED"}
+    return bpy.context.object
+
+
+def voxels_of(item) -> np.ndarray:
+    return volumes.volume_from_object(item).array
+
+
+def expected(phantom: Phantom, voxels: int, quantity: str = "activity") -> Volume:
+    """The phantom on a cube that holds its box, in its own frame."""
+    low, high = phantom.box
+    grid = Grid.centered((voxels,) * 3, (high - low).max() / (voxels - 2), (low + high) / 2)
+    return phantom.voxelize(grid, quantity=quantity)
+
+
+def total(volume: Volume) -> float:
+    return float(volume.array.sum(dtype=np.float64)) * volume.grid.voxel_volume * 1e-3
+
+
+@pytest.mark.parametrize("kind", KINDS, ids=lambda kind: kind.name)
+def test_every_kind_is_core_s_at_its_pose(kind):
+    item = add(kind.name, voxels=20, **POSE)
+    settings = phantoms.settings_of(item)
+    assert settings == getattr(item.mphdrr_volume, phantom_properties.identifier(kind))
+    phantom = kind.phantom(**kind.usual)
+    assert dataclasses.asdict(settings.phantom()) == dataclasses.asdict(phantom)
+    volume, own = volumes.volume_from_object(item), expected(phantom, 20)
+    assert np.array_equal(volume.array, own.array)
+    np.testing.assert_allclose(volume.grid.affine, pose() @ own.grid.affine, atol=1e-12)
+    assert total(volume) == pytest.approx(phantom.total_activity, rel=1e-3)
+
+
+def test_arguments_are_the_fields_of_the_class():
+    item = add("points", voxels=16, counts=(1, 2, 3), spacing=(9, 8, 7), diameter=2, point_activity=3)
+    assert phantoms.settings_of(item).phantom() == KINDS[5].phantom((1, 2, 3), (9, 8, 7), 2, 3)
+    item = add("shepp-logan", voxels=16, contrast="original", quantity="mu")
+    assert item.mphdrr_volume.quantity == "mu"
+    assert np.array_equal(voxels_of(item), expected(KINDS[4].phantom(contrast="original"), 16, "mu").array)
+
+
+def test_a_small_phantom_follows_its_settings_where_it_stands():
+    item = add("nema", voxels=24, attenuation=True, **POSE)
+    (child,) = item.children
+    assert child.mphdrr_volume.quantity == "mu" and item.name == "NEMA Body"
+    item.matrix_world = Matrix.Translation((1, 2, 3)) @ item.matrix_world @ Matrix.Scale(2, 4)
+    moved = np.array(item.matrix_basis)
+    settings = item.mphdrr_volume.nema
+    settings.length, settings.sphere_activity, settings.mu = 120, 40, 0.01
+    assert not item.mphdrr_volume.outdated and not item.mphdrr_volume.message
+    phantom = KINDS[1].phantom(length=120, sphere_activity=40, mu=0.01)
+    for one, quantity in ((item, "activity"), (child, "mu")):
+        volume, own = volumes.volume_from_object(one), expected(phantom, 24, quantity)
+        assert np.array_equal(volume.array, own.array)
+        np.testing.assert_allclose(volume.grid.affine, moved @ own.grid.affine, atol=1e-4)
+
+
+def test_a_large_phantom_waits_for_its_update():
+    item = add("derenzo", voxels=72)
+    before, settings = voxels_of(item), item.mphdrr_volume.derenzo
+    settings.radius = 30
+    assert item.mphdrr_volume.outdated and np.array_equal(voxels_of(item), before)
+    assert bpy.ops.mphdrr.update_phantom() == {"FINISHED"}
+    assert not item.mphdrr_volume.outdated
+    assert np.array_equal(voxels_of(item), expected(settings.phantom(), 72).array)
+
+
+def test_settings_that_cannot_be_leave_the_voxels_and_say_why():
+    item = add("torso", voxels=16)
+    before, settings = voxels_of(item), item.mphdrr_volume.torso
+    settings.defect_from = 0.9
+    assert "defect from: expected less than 0.8" in item.mphdrr_volume.message and item.mphdrr_volume.outdated
+    assert np.array_equal(voxels_of(item), before)
+    with pytest.raises(RuntimeError, match="defect from"):
+        bpy.ops.mphdrr.update_phantom()
+    assert np.array_equal(voxels_of(item), before)
+    settings.defect_from, settings.defect_severity = 0.2, 1.0
+    assert not item.mphdrr_volume.message and not np.array_equal(voxels_of(item), before)
+    objects = len(bpy.data.objects)
+    with pytest.raises(RuntimeError, match="defect from"):
+        bpy.ops.mphdrr.add_torso(defect_from=0.9)
+    with pytest.raises(RuntimeError, match="grid of points has no attenuation"):
+        bpy.ops.mphdrr.add_points(voxels=8, attenuation=True)
+    assert len(bpy.data.objects) == objects
+
+
+def test_settings_survive_saving_and_copies_follow_their_own(tmp_path):
+    add("defrise", voxels=16, disks=3, **POSE)
+    bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "a.blend"))
+    bpy.ops.wm.open_mainfile(filepath=str(tmp_path / "a.blend"))
+    item = bpy.data.objects["Defrise"]
+    copy = item.copy()
+    bpy.context.collection.objects.link(copy)
+    copy.mphdrr_volume.defrise.disks = 5
+    for one, disks in ((item, 3), (copy, 5)):
+        assert np.array_equal(voxels_of(one), expected(KINDS[3].phantom(disks), 16).array)
+
+
+def test_toml_becomes_a_text_that_the_phantom_follows(tmp_path):
+    file = tmp_path / "thorax.toml"
+    file.write_text(THORAX.read_text())
+    assert bpy.ops.mphdrr.import_phantom(filepath=str(file), voxels=20, attenuation=True, **POSE) == {"FINISHED"}
+    item, phantom = bpy.context.object, read_phantom(file)
+    file.unlink()
+    assert item.name == phantom.name
+    for one, quantity in ((item, "activity"), (item.children[0], "mu")):
+        assert np.array_equal(voxels_of(one), expected(phantom, 20, quantity).array)
+    text = item.mphdrr_volume.file.text
+    text.from_string('[[shape]]\nkind = "sphere"\nradius = 10\nactivity = 4\n')
+    assert bpy.ops.mphdrr.update_phantom() == {"FINISHED"}
+    assert total(volumes.volume_from_object(item)) == pytest.approx(16 / 3 * np.pi, rel=1e-3)
+    text.from_string('[[shape]]\nkind = "sphere"\n')
+    with pytest.raises(RuntimeError, match=r"thorax.toml: shape 1: radius: missing"):
+        bpy.ops.mphdrr.update_phantom()
+    item.mphdrr_volume.file.text = None
+    assert "no text is chosen" in item.mphdrr_volume.message
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [("[[shape]", "not TOML"), ("name = 3", r"\[\[shape\]\]"), ('[[shape]]\nkind = "cube"', "kind"), (None, "No such")],
+)
+def test_toml_that_is_no_phantom_adds_nothing(text, message, tmp_path):
+    file = tmp_path / "a.toml"
+    if text is not None:
+        file.write_text(text)
+    before = len(bpy.data.objects), len(bpy.data.texts)
+    with pytest.raises(RuntimeError, match=rf"a\.toml.*{message}"):
+        bpy.ops.mphdrr.import_phantom(filepath=str(file))
+    assert (len(bpy.data.objects), len(bpy.data.texts)) == before
+
+
+def test_applied_pose_keeps_activity_and_projections(ring_system):
+    item = add("nema", voxels=40, attenuation=True)
+    phantom = item.mphdrr_volume.nema.phantom()
+    # Scaled and sheared, under a parent.
+    parent = bpy.data.objects.new("Parent", None)
+    bpy.context.collection.objects.link(parent)
+    parent.matrix_basis = Matrix(euler_pose(0.3, 0.2, 0.1, (3, 4, 5)))
+    item.parent = parent
+    item.matrix_basis = Matrix(euler_pose(0.7, 0.4, 0.1, (10, -5, 2)) @ np.diag([0.3, 0.2, 0.25, 1]))
+    placed = volumes.pose_of_object(item)
+    assert bpy.ops.mphdrr.apply_phantom_pose() == {"FINISHED"}
+    volume = volumes.volume_from_object(item)
+    assert total(volume) == pytest.approx(phantom.total_activity * np.linalg.det(placed[:3, :3]), rel=1e-3)
+    np.testing.assert_allclose(volumes.pose_of_object(item)[:3, :3], np.eye(3), atol=1e-6)
+    np.testing.assert_allclose(volumes.pose_of_object(item)[:3, 3], placed[:3, 3], atol=1e-5)
+    np.testing.assert_allclose(
+        volume.grid.affine[:3, :3], np.diag(volume.grid.spacing), atol=1e-6 * volume.grid.spacing[0]
+    )
+    mu = volumes.volume_from_object(item.children[0])
+    np.testing.assert_allclose(mu.grid.affine, volume.grid.affine, atol=1e-5)
+    assert mu.array.max() == pytest.approx(phantom.mu)
+    assert phantoms.settings_of(item) is None and not bpy.ops.mphdrr.update_phantom.poll()
+    views = ring_system.views(shape=(24, 24))
+    exact = phantom.project(views, placed)
+    baked = Projector(volume.grid, views)(volume)
+    assert np.abs(baked - exact).mean() < 0.03 * exact.mean()
+    assert baked.sum() == pytest.approx(exact.sum(), rel=5e-3)
+
+
+def test_moving_the_object_moves_what_is_projected(ring_system):
+    item = add("defrise", voxels=48, disks=3)
+    item.rotation_euler, item.location, item.scale = (0.4, 0.3, 0.2), (5, 6, -7), (0.5, 0.6, 0.4)
+    volume = volumes.volume_from_object(item)
+    views = ring_system.views(shape=(24, 24))
+    exact = item.mphdrr_volume.defrise.phantom().project(views, volumes.pose_of_object(item))
+    found = Projector(volume.grid, views)(volume)
+    assert np.abs(found - exact).mean() < 0.05 * exact.mean()
+
+
+def test_outline_goes_with_the_phantom_and_its_settings():
+    item = add("derenzo", voxels=16, **POSE)
+    assert bpy.ops.mphdrr.show_phantom_outline() == {"FINISHED"}
+    item.mphdrr_volume.derenzo.height = 90
+    outline = phantoms.outline_of(item)
+    assert outline.display_type == "WIRE" and outline.parent == item
+    assert outline.dimensions[2] == pytest.approx(90)
+    np.testing.assert_allclose(cameras.world_matrix(outline), cameras.world_matrix(item), atol=1e-6)
+    meshes = len(bpy.data.meshes)
+    assert bpy.ops.mphdrr.show_phantom_outline() == {"FINISHED"}
+    assert phantoms.outline_of(item) is None and len(bpy.data.meshes) == meshes - 1

@@ -35,13 +35,18 @@ _UNITS = {"mm": "mm", "kBq/mL": "kBq_per_mL", "1/mm": "per_mm", "kBq": "kBq", "m
 class PhantomSettings:
     """What a phantom is made from, mixed into the operator that adds one and into the properties that its object keeps.
 
-    Those of each kind have its dataclass's fields as properties, and those of `_sampling`.
+    Those of each kind have its dataclass's fields as properties, and those of `sampling`.
     """
 
     @property
-    def names(self) -> list[str]:
-        """Names of the settings, in the order of drawing."""
-        return list(sampling())
+    def own_names(self) -> list[str]:
+        """Names of the settings that not every phantom has, in the order of drawing."""
+        return []
+
+    def values(self) -> dict[str, Any]:
+        """Every setting by name, vectors as tuples."""
+        values = {name: getattr(self, name) for name in (*self.own_names, *sampling())}
+        return {k: tuple(v) if isinstance(v, bpy.types.bpy_prop_array) else v for k, v in values.items()}
 
     def phantom(self) -> Phantom:
         """The phantom; raises InputError."""
@@ -61,22 +66,22 @@ class PhantomSettings:
 
     def draw_settings(self, layout: bpy.types.UILayout) -> None:
         """Draw the settings into a panel or a dialog."""
-        column = layout.column(align=True)
-        for name in self.names:
+        own = layout.column(align=True)
+        own.use_property_split = False  # names with units need the whole width
+        for name in self.own_names:
             value = getattr(self, name)
-            if isinstance(value, bpy.types.bpy_prop_array) and len(value) > 3:
-                grid = layout.column(align=True)
-                grid.use_property_split = False
-                grid.label(text=self.bl_rna.properties[name].name)  # type: ignore[attr-defined]
+            if isinstance(value, bpy.types.bpy_prop_array):
+                known = getattr(self, "properties", self).bl_rna.properties  # an operator has them apart
+                own.label(text=known[name].name)
                 for first in range(0, len(value), 3):
-                    row = grid.row(align=True)
+                    row = own.row(align=True)
                     for k in range(first, min(first + 3, len(value))):
                         row.prop(self, name, index=k, text="")
-                column = layout.column(align=True)
             else:
-                if name == "quantity":
-                    column = layout.column(align=True)
-                column.prop(self, name)
+                own.prop(self, name)
+        column = layout.column(align=True)
+        for name in sampling():
+            column.prop(self, name)
 
 
 class KindSettings(PhantomSettings):
@@ -85,9 +90,9 @@ class KindSettings(PhantomSettings):
     kind = KINDS[0]
 
     @property
-    def names(self) -> list[str]:
-        """The class's fields first."""
-        return [*(field.name for field in _fields(self.kind)), *super().names]
+    def own_names(self) -> list[str]:
+        """The class's fields."""
+        return [field.name for field in _fields(self.kind)]
 
     def phantom(self) -> Phantom:
         """The phantom; float32 settings are read as the decimal numbers that the user typed."""
@@ -111,9 +116,9 @@ class TextSettings(PhantomSettings):
     """The settings of a phantom that a text of the .blend describes."""
 
     @property
-    def names(self) -> list[str]:
-        """The text first."""
-        return ["text", *super().names]
+    def own_names(self) -> list[str]:
+        """The text alone."""
+        return ["text"]
 
     def phantom(self) -> Phantom:
         """The text's phantom."""

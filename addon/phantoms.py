@@ -13,6 +13,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import bmesh
 import bpy
 import numpy as np
 from numpy.typing import NDArray
@@ -25,7 +26,7 @@ from ..core.phantoms.phantom import Phantom
 from ..core.progress import Progress
 from ..core.volume import Volume
 from . import ids, jobs, meshes, storage, volumes
-from .cameras import set_world_matrix
+from .cameras import set_world_matrix, world_matrix
 from .phantom_properties import PhantomSettings, identifier
 
 LIVE_VOXELS = 64**3
@@ -69,7 +70,15 @@ class Recipe:
         """A volume of each quantity in `folder`, its phantom at a world-from-phantom pose (4, 4), mm.
 
         Its grid turns with the phantom or, if `baked`, lies along the world's axes: then so does the object.
+
+        Raises
+        ------
+        InputError
+            No part of the phantom holds a quantity, or it does not fit into memory.
         """
+        for quantity in quantities:
+            if all(getattr(shape, quantity) is None for shape in self.phantom.shapes):
+                raise InputError(f"the {self.phantom.title} has no {quantity}")
         for message in self.messages:
             warnings.warn(message, InputWarning, stacklevel=2)
         stored = []
@@ -189,6 +198,9 @@ def replace(item: bpy.types.Object, stored: Sequence[volumes.StoredVolume], bake
         volumes.replace_stored(volume_object, new)
         if baked:
             set_world_matrix(volume_object, new.pose)
+            if not np.allclose(world_matrix(volume_object), new.pose, rtol=1e-5, atol=1e-5):
+                volume_object.parent = None  # sheared, which the object cannot undo
+                set_world_matrix(volume_object, new.pose)
         else:
             volume_object.matrix_basis = basis  # which a matrix with shear would not survive
     properties = getattr(item, ids.OBJECT_VOLUME)
@@ -202,7 +214,7 @@ def replace(item: bpy.types.Object, stored: Sequence[volumes.StoredVolume], bake
         show_outline(item)
 
 
-def settings_changed(item: Any, settings: PhantomSettings) -> None:
+def settings_changed(item: Any, settings: Any) -> None:
     """A setting was edited: make small phantoms anew, and say of others, and of what cannot be made, that it is so."""
     if not isinstance(item, bpy.types.Object) or settings_of(item) != settings:
         return  # an operator's, or on its way
@@ -211,10 +223,9 @@ def settings_changed(item: Any, settings: PhantomSettings) -> None:
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always", InputWarning)
         try:
-            recipe_of(settings)
-            live = not jobs.is_running() and getattr(settings, "voxels") ** 3 <= LIVE_VOXELS  # noqa: B009
-            if live:
-                replace(item, remaking(item)(None))
+            make = remaking(item)  # which finds what cannot be made
+            if settings.voxels**3 <= LIVE_VOXELS and not jobs.is_running():
+                replace(item, make(None))
             elif outline_of(item) is not None:
                 show_outline(item)
         except InputError as error:
@@ -247,6 +258,7 @@ def show_outline(item: bpy.types.Object) -> bpy.types.Object:
     remove_outline(item)
     collection = item.users_collection[0] if item.users_collection else bpy.context.scene.collection
     outline = meshes.add_mesh(Mesh(vertices, faces), f"{item.name} outline", np.eye(4), collection)
+    _merge_flat_faces(outline.data)
     outline[_OUTLINE] = True
     outline.display_type = "WIRE"
     outline.hide_render = outline.hide_select = True
@@ -262,6 +274,17 @@ def remove_outline(item: bpy.types.Object) -> None:
         bpy.data.objects.remove(outline)
         if mesh.users == 0:
             bpy.data.meshes.remove(mesh)
+
+
+def _merge_flat_faces(mesh: bpy.types.Mesh) -> None:
+    """Leave no edges inside of flat faces: they would fill the picture with wires."""
+    shape = bmesh.new()
+    try:
+        shape.from_mesh(mesh)
+        bmesh.ops.dissolve_limit(shape, angle_limit=0.01, verts=shape.verts, edges=shape.edges)
+        shape.to_mesh(mesh)
+    finally:
+        shape.free()
 
 
 def _part(progress: Progress | None, number: int, count: int) -> Progress | None:

@@ -62,11 +62,9 @@ class AddPhantom(PhantomSettings, jobs.JobOperator):
         if bpy.context.mode != "OBJECT":
             bpy.ops.object.mode_set(mode="OBJECT")
         recipe, folder = phantoms.recipe_of(self), storage.folder()
-        kind, kept = self.settings_kind, self._kept()
+        kind, kept = self.settings_kind, self.values()
         pose = euler_pose(self.phi, self.theta, self.psi, self.location)
         quantities = ["activity", "mu"] if self.attenuation and self.quantity == "activity" else [self.quantity]
-        if "mu" in quantities and all(shape.mu is None for shape in recipe.phantom.shapes):
-            raise InputError(f"the {recipe.phantom.title} has no attenuation")
 
         def work(progress: Progress) -> list[volumes.StoredVolume]:
             return recipe.voxelize(quantities, [pose] * len(quantities), folder, progress)
@@ -82,11 +80,6 @@ class AddPhantom(PhantomSettings, jobs.JobOperator):
             return f"Added {item.name!r}: {grid.shape[0]}^3 voxels of {grid.spacing[0]:.3g} mm"
 
         return jobs.Job("Making a phantom", work, finish)
-
-    def _kept(self) -> dict[str, Any]:
-        """The settings that the object keeps, by name."""
-        values = {name: getattr(self, name) for name in self.names}
-        return {k: tuple(v) if isinstance(v, bpy.types.bpy_prop_array) else v for k, v in values.items()}
 
 
 class AddKind(KindSettings, AddPhantom):

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import textwrap
 from typing import Any
 
 import bpy
 
 from ..addon import ids, jobs, phantoms, slices, storage, volumes
+
+_LINE = 32  # letters that fit into the sidebar at its usual width
 
 
 class MPHDRR_PT_phantom(bpy.types.Panel):
@@ -78,7 +81,10 @@ def _draw_phantom(layout: bpy.types.UILayout, item: bpy.types.Object, phantom: A
     if settings.message:
         column = layout.column(align=True)
         column.alert = settings.outdated
-        column.label(text=settings.message, icon="ERROR" if settings.outdated else "INFO")
+        first, *others = textwrap.wrap(settings.message, _LINE)
+        column.label(text=first, icon="ERROR" if settings.outdated else "INFO")
+        for line in others:
+            column.label(text=line, icon="BLANK1")
     column = layout.column(align=True)
     row = column.row(align=True)
     row.alert = settings.outdated

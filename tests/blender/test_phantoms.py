@@ -107,12 +107,15 @@ def test_settings_that_cannot_be_leave_the_voxels_and_say_why():
     assert np.array_equal(voxels_of(item), before)
     settings.defect_from, settings.defect_severity = 0.2, 1.0
     assert not item.mphdrr_volume.message and not np.array_equal(voxels_of(item), before)
-    objects = len(bpy.data.objects)
+    objects = len(bpy.data.objects), len(bpy.data.volumes)
     with pytest.raises(RuntimeError, match="defect from"):
         bpy.ops.mphdrr.add_torso(defect_from=0.9)
-    with pytest.raises(RuntimeError, match="grid of points has no attenuation"):
+    with pytest.raises(RuntimeError, match="grid of points has no mu"):
         bpy.ops.mphdrr.add_points(voxels=8, attenuation=True)
-    assert len(bpy.data.objects) == objects
+    assert (len(bpy.data.objects), len(bpy.data.volumes)) == objects
+    item = add("points", voxels=8)
+    item.mphdrr_volume.points.quantity = "mu"
+    assert "has no mu" in item.mphdrr_volume.message and item.mphdrr_volume.quantity == "activity"
 
 
 def test_settings_survive_saving_and_copies_follow_their_own(tmp_path):
@@ -137,7 +140,7 @@ def test_toml_becomes_a_text_that_the_phantom_follows(tmp_path):
     for one, quantity in ((item, "activity"), (item.children[0], "mu")):
         assert np.array_equal(voxels_of(one), expected(phantom, 20, quantity).array)
     text = item.mphdrr_volume.file.text
-    text.from_string('[[shape]]\nkind = "sphere"\nradius = 10\nactivity = 4\n')
+    text.from_string('[[shape]]\nkind = "sphere"\nradius = 10\nactivity = 4\nmu = 0.01\n')
     assert bpy.ops.mphdrr.update_phantom() == {"FINISHED"}
     assert total(volumes.volume_from_object(item)) == pytest.approx(16 / 3 * np.pi, rel=1e-3)
     text.from_string('[[shape]]\nkind = "sphere"\n')
@@ -161,13 +164,14 @@ def test_toml_that_is_no_phantom_adds_nothing(text, message, tmp_path):
     assert (len(bpy.data.objects), len(bpy.data.texts)) == before
 
 
-def test_applied_pose_keeps_activity_and_projections(ring_system):
+@pytest.mark.parametrize("scale", [(1, 1, 1, 1), (1.2, 0.8, 1, 1)], ids=["turned", "sheared"])
+def test_applied_pose_keeps_activity_and_projections(ring_system, scale):
     item = add("nema", voxels=40, attenuation=True)
     phantom = item.mphdrr_volume.nema.phantom()
-    # Scaled and sheared, under a parent.
+    # Scaled, under a parent that may be scaled too.
     parent = bpy.data.objects.new("Parent", None)
     bpy.context.collection.objects.link(parent)
-    parent.matrix_basis = Matrix(euler_pose(0.3, 0.2, 0.1, (3, 4, 5)))
+    parent.matrix_basis = Matrix(euler_pose(0.3, 0.2, 0.1, (3, 4, 5)) @ np.diag(scale))
     item.parent = parent
     item.matrix_basis = Matrix(euler_pose(0.7, 0.4, 0.1, (10, -5, 2)) @ np.diag([0.3, 0.2, 0.25, 1]))
     placed = volumes.pose_of_object(item)
@@ -211,3 +215,17 @@ def test_outline_goes_with_the_phantom_and_its_settings():
     meshes = len(bpy.data.meshes)
     assert bpy.ops.mphdrr.show_phantom_outline() == {"FINISHED"}
     assert phantoms.outline_of(item) is None and len(bpy.data.meshes) == meshes - 1
+
+
+def test_undo_takes_back_settings_and_voxels_together():
+    item = add("shepp-logan", voxels=16)
+    name, before = item.name, voxels_of(item)
+    bpy.ops.ed.undo_push(message="added")
+    item.mphdrr_volume.shepp_logan.activity = 7
+    bpy.ops.ed.undo_push(message="changed")
+    assert bpy.ops.ed.undo() == {"FINISHED"}
+    item = bpy.data.objects[name]
+    assert item.mphdrr_volume.shepp_logan.activity == 100 and np.array_equal(voxels_of(item), before)
+    assert bpy.ops.ed.redo() == {"FINISHED"}
+    item = bpy.data.objects[name]
+    np.testing.assert_allclose(voxels_of(item), before * 0.07, rtol=1e-6, atol=1e-5)

@@ -71,8 +71,8 @@ class PhantomSettings:
         for name in self.own_names:
             value = getattr(self, name)
             if isinstance(value, bpy.types.bpy_prop_array):
-                known = getattr(self, "properties", self).bl_rna.properties  # an operator has them apart
-                own.label(text=known[name].name)
+                known: Any = getattr(self, "properties", self)  # an operator has them apart
+                own.label(text=known.bl_rna.properties[name].name)
                 for first in range(0, len(value), 3):
                     row = own.row(align=True)
                     for k in range(first, min(first + 3, len(value))):

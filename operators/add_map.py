@@ -73,11 +73,15 @@ class MPHDRR_OT_add_map(jobs.JobOperator, bpy.types.Operator):
             yield
             old = [o for o in volumes.volume_objects(scene) if getattr(o, ids.OBJECT_VOLUME).quantity == quantity]
             if old:
-                volumes.replace_volume(old[0], volume, provenance=recipe)
+                item = old[0]
+                volumes.replace_volume(item, volume, provenance=recipe)
             else:
-                volumes.add_volume(volume, name, provenance=recipe, collection=scene.collection)
+                item = volumes.add_volume(volume, name, provenance=recipe, collection=scene.collection)
                 volume_materials.show_in_eevee(scene)
-            low, high = volume.array[volume.array > 0].min(initial=volume.array.max()), volume.array.max()
+            high = float(volume.array.max())
+            low = float(volume.array[volume.array > 0].min(initial=high))
+            settings = getattr(item, ids.OBJECT_VOLUME)
+            settings.display_low, settings.display_high = low if low < high else 0.0, high
             return f"{name}: {low:.4g} to {high:.4g} {volume.unit}".removesuffix(" 1")
 
         return jobs.Job(f"{name} of {len(system)} modules", work, finish)

@@ -69,8 +69,9 @@ def write_vdb(volumes: Volume | Sequence[Volume], path: str | Path, provenance: 
 def read_vdb(path: str | Path, quantity: str | None = None, grid: str | None = None, *, unit: float = 1.0) -> Volume:
     """Read a grid as a volume: one of ours the same to the last bit, any other program's by its transform.
 
-    Another program's grid becomes a volume on the box around its active voxels. Grids of float, double, half, int and
-    bool give their values in float32, a level set the share of each voxel that lies inside it (0 to 1).
+    Another program's grid becomes a volume on the box around its active voxels; outside of it a volume is 0, whatever the
+    grid's background. Grids of float, double, half, int and bool give all their values in the box, active or not, in
+    float32; a level set gives the share of each voxel that lies inside it (0 to 1).
 
     Parameters
     ----------

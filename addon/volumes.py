@@ -297,6 +297,11 @@ def after_load(*_: Any) -> None:
         if not is_volume(item) or item.data in missing:
             continue
         settings = getattr(item, ids.OBJECT_VOLUME)
+        if not settings.is_property_set("display_high"):  # made by an older version of this extension
+            settings.extent = max(n * s for n, s in zip(settings.shape, settings.spacing, strict=True))
+            settings.display_low, settings.display_high = volume_materials.usual_range(
+                settings.quantity, 0.0, settings.maximum
+            )
         if settings.center_shift != compat.VDB_CENTER_SHIFT:
             data = item.data
             path = storage.full_resolution(storage.absolute(data.filepath))

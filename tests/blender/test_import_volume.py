@@ -81,6 +81,16 @@ def test_ct_begins_with_a_window_of_its_own_and_keeps_the_users(ct):
     assert node.inputs["From Min"].default_value == 50.0 and node.inputs["From Max"].default_value == 1000.0
 
 
+def test_volumes_of_older_files_get_a_range(tmp_path, ct):
+    item = volumes.add_volume(Volume(np.abs(ct.array), ct.grid, "activity"), "Old")
+    for name in ("display_low", "display_high", "extent"):
+        item.mphdrr_volume.property_unset(name)
+    bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "a.blend"))
+    bpy.ops.wm.open_mainfile(filepath=str(tmp_path / "a.blend"))
+    settings = bpy.data.objects["Old"].mphdrr_volume
+    assert settings.display_high == settings.maximum > 1 and settings.extent == pytest.approx(17.5)
+
+
 def _pixels(plane):
     image = plane.data.materials[0].node_tree.nodes["Slice"].image
     pixels = np.empty(4 * image.size[0] * image.size[1], np.float32)

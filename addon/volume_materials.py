@@ -115,7 +115,7 @@ def set_range(material: bpy.types.Material, low: float, high: float) -> None:
 
 def set_display(data: bpy.types.Volume, low: float, high: float, size: float) -> None:
     """Make the solid viewport draw the volume's values as smoke of a useful density."""
-    data.display.density = _SMOKE / size / max(abs(low), abs(high))
+    data.display.density = _SMOKE / size / (high - low)
     data.display.wireframe_type = "NONE"
     data.display.interpolation_method = "LINEAR"
 

@@ -22,7 +22,8 @@ _INFERNO = (
 _GREYS = ((0.00, (0.02, 0.02, 0.02)), (1.00, (0.80, 0.80, 0.80)))
 _XRAY = ("mu", "hu")
 _CT_WINDOW = (-200.0, 1000.0)  # HU: skin to bone
-# Extinction times the volume's size: high enough that a rod of a twentieth of it looks solid; a patient or a map is looked through.
+# Extinction times the volume's size: high enough that a rod of a twentieth of it looks solid; patients and maps are
+# looked through.
 _OPACITY = 60.0
 _OPACITY_THROUGH = 20.0
 _BRIGHTNESS = 1.0

@@ -75,9 +75,9 @@ def sheet(system: mph.PinholeSystem, volumes: dict[str, mph.Volume]) -> Image.Im
         # Seen from above, from the front and from the left; the picture's first row is the top.
         slices = [array[:, :, at[2]].T, array[:, at[1], :].T, array[at[0], :, :].T]
         (image,) = mph.as_seen(mph.Projector(volume.grid, views)(volume))
-        top = MARGIN + row * (TILE + TEXT + MARGIN)
+        left, top = place // rows * width + MARGIN, place % rows * (TILE + TEXT + MARGIN) + MARGIN
         write.text(
-            (MARGIN, top + 4), f"{name}: slices, {volume.unit}; projection of module {MODULE}", fill=(220, 222, 226)
+            (left, top + 4), f"{name}: slices, {volume.unit}; projection of module {MODULE}", fill=(220, 222, 226)
         )
         grey = volume.quantity != "activity"
         for column, picture in enumerate([*(s[::-1] for s in slices), image]):

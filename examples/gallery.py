@@ -63,11 +63,10 @@ def grid_of(phantom: mph.Phantom) -> mph.Grid:
 
 
 def sheet(system: mph.PinholeSystem, volumes: dict[str, mph.Volume]) -> Image.Image:
-    """A row a volume: slices near the middle across z, y and x, and what a module sees."""
+    """Two columns of volumes: slices near the middle across z, y and x of each, and what a module sees."""
     views = system[system.numbers == MODULE].views((TILE, TILE))
-    page = Image.new(
-        "RGB", (4 * (TILE + MARGIN) + MARGIN, len(volumes) * (TILE + TEXT + MARGIN) + MARGIN), (24, 26, 29)
-    )
+    width, height, rows = 4 * (TILE + MARGIN) + MARGIN, TILE + TEXT + MARGIN, -(-len(volumes) // 2)
+    page = Image.new("RGB", (2 * width, rows * height + MARGIN), (24, 26, 29))
     write = ImageDraw.Draw(page)
     for place, (name, volume) in enumerate(volumes.items()):
         array = volume.array
@@ -75,13 +74,11 @@ def sheet(system: mph.PinholeSystem, volumes: dict[str, mph.Volume]) -> Image.Im
         # Seen from above, from the front and from the left; the picture's first row is the top.
         slices = [array[:, :, at[2]].T, array[:, at[1], :].T, array[at[0], :, :].T]
         (image,) = mph.as_seen(mph.Projector(volume.grid, views)(volume))
-        left, top = place // rows * width + MARGIN, place % rows * (TILE + TEXT + MARGIN) + MARGIN
-        write.text(
-            (left, top + 4), f"{name}: slices, {volume.unit}; projection of module {MODULE}", fill=(220, 222, 226)
-        )
-        grey = volume.quantity != "activity"
+        left, top = place // rows * width + MARGIN, place % rows * height + MARGIN
+        title = f"{name}: slices, {volume.unit}; projection of module {MODULE}"
+        write.text((left, top + 4), title, fill=(220, 222, 226))
         for column, picture in enumerate([*(s[::-1] for s in slices), image]):
-            tile = colored(picture, grey).resize((TILE, TILE), Image.Resampling.BILINEAR)
+            tile = colored(picture, volume.quantity != "activity").resize((TILE, TILE), Image.Resampling.BILINEAR)
             page.paste(tile, (left + column * (TILE + MARGIN), top + TEXT))
     return page
 

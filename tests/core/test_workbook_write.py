@@ -475,6 +475,23 @@ def test_libreoffice_tells_whether_a_formula_gives_the_number(template, tmp_path
     np.testing.assert_allclose(read_quietly(tmp_path / "o.xlsx").centers, centers, rtol=1e-12)
 
 
+@pytest.mark.skipif(OFFICE is None, reason="LibreOffice is not installed")
+def test_errors_that_libreoffice_saves_under_another_name_are_not_stored(template, tmp_path, monkeypatch):
+    monkeypatch.setattr(libreoffice, "program", lambda: OFFICE)
+    book = openpyxl.load_workbook(template)
+    other = book.create_sheet("Other")
+    other["A1"] = "=LARGE(Coordinates!B3:B4,IF(Coordinates!B3>400,9,1))"  # #NUM!, which it saves as #VALUE!
+    other["A2"] = "=LARGE(Coordinates!B3:B4,1)"
+    template.write_bytes(libreoffice.recalculated([content_of(book)])[0])
+    system = read_quietly(template)
+    centers = system.centers.copy()
+    centers[0, 0] = 500
+    with pytest.warns(mph.InputWarning, match="Other!A1: the formula's new value could not be calculated"):
+        written = mph.write_system(by_design(changed(system, centers=centers)), tmp_path / "o.xlsx", template)
+    assert written.cleared == ("Other!A1",)
+    assert values_of(tmp_path / "o.xlsx")["Other", "A2"] == 500
+
+
 # Refusals
 
 

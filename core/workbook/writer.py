@@ -85,6 +85,8 @@ def write_system(
     InputWarning
         Formulas that had to be replaced by numbers or store no value, and ranges that leave added modules out.
     """
+    if not isinstance(system, PinholeSystem):
+        raise InputError(f"write_system: expected a PinholeSystem, got {type(system).__name__}")
     target = Path(path)
     suffix = target.suffix.lower()
     if suffix not in KINDS:

@@ -305,6 +305,21 @@ def test_reordered_modules_take_their_rows_along(template, tmp_path):
 
 
 @QUIET
+@pytest.mark.parametrize("order", [[1, 2, 3], [3, 1, 2, 0]])
+def test_a_summary_beside_the_table_stays_where_it_is(template, tmp_path, order):
+    book = openpyxl.load_workbook(template)
+    sheet = book["Coordinates"]
+    first = sheet.max_column + 1
+    sheet.cell(3, first).value, sheet.cell(3, first + 1).value = "highest", "=MAX(B3:B6)"
+    book.save(template)
+    system = read_quietly(template)[order]
+    mph.write_system(system, tmp_path / "o.xlsx", template)
+    cells, values = (openpyxl.load_workbook(tmp_path / "o.xlsx", data_only=d)["Coordinates"] for d in (False, True))
+    assert (cells.cell(3, first).value, cells.cell(3, first + 1).value) == ("highest", "=MAX(B3:B6)")
+    assert values.cell(3, first + 1).value == pytest.approx(system.centers[:, 0].max(), rel=1e-12)
+
+
+@QUIET
 def test_renumbered_modules_keep_their_rows(template, tmp_path):
     system = mph.read_system(template)
     system = changed(system, numbers=system.numbers + 1000)
@@ -509,6 +524,13 @@ def test_impossible_places_are_refused(template, path, message):
         mph.write_system(read_quietly(template), template.parent / path, template)
     with pytest.raises(mph.InputError):
         mph.write_system(read_quietly(template), template.parent / path)
+
+
+def test_only_systems_are_written(tmp_path):
+    with pytest.raises(mph.InputError, match="expected a PinholeSystem, got str"):
+        mph.write_system("scanner.xlsx", tmp_path / "o.xlsx")  # type: ignore[arg-type]
+    with pytest.raises(mph.InputError, match="expected a PinholeSystem, got str"):
+        mph.write_geometry("scanner.xlsx", tmp_path / "o.json", "mphdrr")  # type: ignore[arg-type]
 
 
 def test_bad_templates_are_refused_as_by_the_reader(template, tmp_path):

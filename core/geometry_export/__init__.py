@@ -82,6 +82,8 @@ def write_geometry(
     if format not in FORMATS:
         raise InputError(f"format {format!r}: expected one of {', '.join(FORMATS)}")
     views = system.views() if views is None else views
+    if not isinstance(views, Views):
+        raise InputError(f"views: expected Views, got {type(views).__name__}")
     if len(views) == 0:
         raise InputError("views: expected one or more, got none")
     FORMATS[format].write_whole(system, views, path, options)

@@ -568,4 +568,7 @@ def test_geometry_set_changes_the_chosen_modules(workbook, tmp_path, capsys):
     for wrong in (["--length", "x"], ["--order", "1,2"], ["--roi", "500"], ["--modules", "900"]):
         assert main(["geometry", "set", str(workbook), *wrong, "-o", str(tmp_path / "p.xlsx")]) == 1
         assert capsys.readouterr().err.startswith("mphdrr: ")
+    for wrong in ("1-80", "81"):
+        assert main(["geometry", "set", str(workbook), "--remove", wrong, "-o", str(tmp_path / "p.xlsx")]) == 1
+        assert capsys.readouterr().err.startswith(f"mphdrr: --remove '{wrong}': ")
     assert not (tmp_path / "p.xlsx").exists()

@@ -155,8 +155,8 @@ class _Calculation:
             was = workbook.sheets[place[0]].original.get(place[1:])
             unlike = was is not None and was.value is not None and not _alike(old.value(place), was.value)
             # #NAME? is said of functions that LibreOffice does not know; #VALUE! it saves for most other errors too.
-            error = isinstance(value, CellError) and (value == "#NAME?" or was is None or value != was.value)
-            if value is not None and not error and not unlike:
+            unclear = value == "#NAME?" or (value == "#VALUE!" and (was is None or was.value != value))
+            if value is not None and not unclear and not unlike:
                 values[place] = value
         return values
 

@@ -105,6 +105,9 @@ def write_system(
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", InputWarning)  # said when the system was read
         reading = read(book)
+    unlisted = {column.table.sheet.name for column in reading.columns.values()} - workbook.sheets.keys()
+    if unlisted:
+        raise InputError(f"{workbook.name}: its list of sheets lacks {several(sorted(unlisted))}, expected it saved anew")
     edit = Edit(system, reading, workbook)
     edit.apply()
     return _saved(workbook, system, target, edit.changed, edit.required, workbook.changed, edit.numbered)

@@ -107,7 +107,9 @@ def write_system(
         reading = read(book)
     unlisted = {column.table.sheet.name for column in reading.columns.values()} - workbook.sheets.keys()
     if unlisted:
-        raise InputError(f"{workbook.name}: its list of sheets lacks {several(sorted(unlisted))}, expected it saved anew")
+        raise InputError(
+            f"{workbook.name}: its list of sheets lacks {several(sorted(unlisted))}, expected it saved anew"
+        )
     edit = Edit(system, reading, workbook)
     edit.apply()
     return _saved(workbook, system, target, edit.changed, edit.required, workbook.changed, edit.numbered)

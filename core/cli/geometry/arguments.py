@@ -55,5 +55,7 @@ def resolution_settings(arguments: argparse.Namespace) -> dict[str, Any]:
 
 def _edge(arguments: argparse.Namespace) -> dict[str, Any]:
     if not 0 < arguments.opening_angle < 180:
-        raise InputError(f"--opening-angle {arguments.opening_angle:g}: expected degrees, more than 0 and less than 180")
+        raise InputError(
+            f"--opening-angle {arguments.opening_angle:g}: expected degrees, more than 0 and less than 180"
+        )
     return {"aperture_mu": arguments.aperture_mu, "opening_angle": math.radians(arguments.opening_angle)}

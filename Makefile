@@ -1,6 +1,7 @@
 # make demo    the whole main path on the real workbook, into out/
 # make test    linters, types and tests (tests/core, tests/blender)
 # make bench   speed, accuracy and memory beside other projectors, into docs/; BENCH=--quick: a minute or two, into out/
+# make gallery   the README's pictures of phantoms, of a CT (CT=FILE) and of the scanner's sensitivity, into docs/images
 # make dist    extension zips in dist/, one per platform; PLATFORM=linux-x64 builds that one
 # make test-app   the Linux zip in a real Blender (see tests/app)
 # make test-gate  the Monte Carlo exports with GATE 10 itself; wants an environment of its own (2 GB): VENV=.venvgate
@@ -13,6 +14,7 @@ VENV = .venv
 TORCH = torch==2.13.0
 PLATFORM =
 OUTPUT = out
+CT = $(wildcard ../shared/data/chest_ct_3mm.nii.gz)
 
 BIN = $(VENV)/bin
 # Any Python can make the environment; the one that PYTHON names may be a shim that does not run.
@@ -20,10 +22,13 @@ ANY_PYTHON = $$(for p in "$(PYTHON)" python3 python3.11 python3.13; do "$$p" -c 
 ENVIRONMENT = @p=$(ANY_PYTHON); [ -n "$$p" ] || { echo "no Python found; name one: make PYTHON=/path/to/python3.11"; exit 1; }; \
 	"$$p" tools/environment.py $(VENV) --python "$(PYTHON)"
 
-.PHONY: demo test lint test-app test-gate bench dist clean env env-dev
+.PHONY: demo gallery test lint test-app test-gate bench dist clean env env-dev
 
 demo: env
 	$(BIN)/mphdrr demo --output $(OUTPUT)
+
+gallery: env
+	$(BIN)/python examples/gallery.py docs/images $(CT)
 
 test: lint
 	$(BIN)/python -m pytest

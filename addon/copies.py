@@ -158,7 +158,7 @@ def duplicate(
     places = [
         (camera, place)
         for camera in modules
-        for place in _along_ring(collection, camera, angle * np.arange(1, count + 1), follow_ring)
+        for place in _along_ring(collection, camera, np.linspace(angle, count * angle, count), follow_ring)
     ]
     for camera, place in places:
         if np.linalg.norm(np.array(taken) - place, axis=1).min() < 1e-3:

@@ -38,15 +38,15 @@ def _mesh_of(item: bpy.types.Object, depsgraph: bpy.types.Depsgraph) -> Mesh:
         mesh.calc_loop_triangles()
         points = np.empty(3 * len(mesh.vertices), np.float32)
         mesh.vertices.foreach_get("co", points)
-        faces = np.empty(3 * len(mesh.loop_triangles), np.int32)
-        mesh.loop_triangles.foreach_get("vertices", faces)
+        corners = np.empty(3 * len(mesh.loop_triangles), np.int32)
+        mesh.loop_triangles.foreach_get("vertices", corners)
     finally:
         evaluated.to_mesh_clear()
     pose = world_matrix(item)
-    faces = faces.reshape(-1, 3)
+    faces = corners.reshape(-1, 3).astype(np.int64)
     if np.linalg.det(pose[:3, :3]) < 0:  # a mirrored object shows the other side of its faces
         faces = faces[:, ::-1]
-    return Mesh(points.reshape(-1, 3).astype(np.float64) @ pose[:3, :3].T + pose[:3, 3], faces.astype(np.int64))
+    return Mesh(points.reshape(-1, 3).astype(np.float64) @ pose[:3, :3].T + pose[:3, 3], faces)
 
 
 def add_mesh(mesh: Mesh, name: str, pose: NDArray[np.float64], collection: bpy.types.Collection) -> bpy.types.Object:

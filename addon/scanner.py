@@ -231,18 +231,18 @@ def read_scanner(collection: bpy.types.Collection, *, aimed: bool = False) -> Pi
         if other is not camera:
             raise InputError(
                 f"'{other.name}' and '{camera.name}' both have module number {camera.mphdrr_module.number}: "
-                f"press Tidy Modules in the Geometry panel, or delete one"
+                f"press Tidy Modules in the Design panel, or delete one"
             )
     off = off_aim(found)
     if off and aimed:
         raise InputError(
             f"scanner '{collection.name}': {modules_text(off)} not aimed at the isocentre, which the geometry cannot "
-            "say: press Aim at Isocentre in the Geometry panel"
+            "say: press Aim at Isocentre in the Design panel"
         )
     if off:
         warnings.warn(
             f"scanner '{collection.name}': {modules_text(off)} not aimed at the isocentre in the scene, but "
-            "calculated as if aimed: press Aim at Isocentre in the Geometry panel",
+            "calculated as if aimed: press Aim at Isocentre in the Design panel",
             InputWarning,
             stacklevel=2,
         )

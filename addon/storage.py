@@ -58,7 +58,7 @@ def full_resolution(path: Path) -> Path:
 
 def is_preview(path: Path) -> bool:
     """Whether a .vdb is a coarser copy for display."""
-    return ids.PREVIEW in path.suffixes or ids.PREVIEW + "_" in path.name
+    return path != full_resolution(path)
 
 
 def of_frame(path: Path, number: int) -> Path:

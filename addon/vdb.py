@@ -26,6 +26,9 @@ from ..core.version import VERSION
 from ..core.volume import UNITS, Volume
 from . import compat
 
+SMOKE = "smoke for display"
+"""Name of a grid that only Blender's solid viewport uses."""
+
 _SLAB = 64  # layers handed over at once, whole leaves of 8: what is copied for OpenVDB stays small
 
 _NUMBERS = ("float", "double", "half", "int32", "int64", "bool")
@@ -35,7 +38,13 @@ BACKGROUND = {"hu": AIR_HU}
 """What voxels that take no room in a file hold, where it is not 0: what is drawn around a CT is air, not water."""
 
 
-def write_vdb(volumes: Volume | Sequence[Volume], path: str | Path, provenance: dict[str, Any] | None = None) -> None:
+def write_vdb(
+    volumes: Volume | Sequence[Volume],
+    path: str | Path,
+    provenance: dict[str, Any] | None = None,
+    *,
+    smoke_above: float | None = None,
+) -> None:
     """Write volumes as sparse float grids, each named after its quantity; voxels of 0 (-1000 HU) take no room.
 
     The transforms are those of the running Blender (see `compat.VDB_CENTER_SHIFT`); the metadata hold the exact affine
@@ -49,6 +58,9 @@ def write_vdb(volumes: Volume | Sequence[Volume], path: str | Path, provenance: 
         The file.
     provenance
         What the volumes were made from; kept as JSON in the metadata.
+    smoke_above
+        Also write a grid `SMOKE` of the first volume's values above this one, less it: Blender's solid viewport draws
+        what surrounds values below 0 black. `read_vdb` does not see it.
 
     Raises
     ------
@@ -62,6 +74,11 @@ def write_vdb(volumes: Volume | Sequence[Volume], path: str | Path, provenance: 
         found = ", ".join(names) or "none"
         raise InputError(f"{path}: expected volumes of different quantities, got {found}")
     grids = [_grid_of(volume, provenance or {}) for volume in several]
+    if smoke_above is not None:
+        shown = several[0]
+        above = freeze(np.maximum(shown.array - np.float32(smoke_above), 0))
+        grids.append(_grid_of(Volume(above, shown.grid), {}))
+        grids[-1].name = SMOKE
     with replacing(path) as temporary:
         openvdb().write(str(temporary), grids=grids)
 
@@ -69,8 +86,9 @@ def write_vdb(volumes: Volume | Sequence[Volume], path: str | Path, provenance: 
 def read_vdb(path: str | Path, quantity: str | None = None, grid: str | None = None, *, unit: float = 1.0) -> Volume:
     """Read a grid as a volume: one of ours the same to the last bit, any other program's by its transform.
 
-    Another program's grid becomes a volume on the box around its active voxels. Grids of float, double, half, int and
-    bool give their values in float32, a level set the share of each voxel that lies inside it (0 to 1).
+    Another program's grid becomes a volume on the box around its active voxels; outside of it a volume is 0, whatever the
+    grid's background. Grids of float, double, half, int and bool give all their values in the box, active or not, in
+    float32; a level set gives the share of each voxel that lies inside it (0 to 1).
 
     Parameters
     ----------
@@ -160,7 +178,7 @@ def _drawn(affine: NDArray[np.float64], shape: Sequence[int], mirrored: bool, sh
 
 def _described(path: Path) -> dict[str, Any]:
     """Every grid of a file, without its voxels, by a name that OpenVDB finds it by; names that recur get a number."""
-    grids = openvdb().readAllGridMetadata(str(path))
+    grids = [grid for grid in openvdb().readAllGridMetadata(str(path)) if grid.name != SMOKE]
     names = [grid.name for grid in grids]
     named: dict[str, Any] = {}
     for k, grid in enumerate(grids):

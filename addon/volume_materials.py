@@ -22,9 +22,10 @@ _INFERNO = (
 _GREYS = ((0.00, (0.02, 0.02, 0.02)), (1.00, (0.80, 0.80, 0.80)))
 _XRAY = ("mu", "hu")
 _CT_WINDOW = (-200.0, 1000.0)  # HU: skin to bone
-# Extinction times the volume's size: high enough that a rod of a twentieth of it looks solid; a patient is looked through.
+# Extinction times the volume's size: high enough that a rod of a twentieth of it looks solid; patients and maps are
+# looked through.
 _OPACITY = 60.0
-_XRAY_OPACITY = 20.0
+_OPACITY_THROUGH = 20.0
 _BRIGHTNESS = 1.0
 # The same for the solid viewport, whose smoke is denser and has no shading: thin enough that rods show behind rods.
 _SMOKE = 15.0
@@ -79,7 +80,7 @@ def new_material(name: str, quantity: str, size: float) -> bpy.types.Material:
     for element, (position, rgb) in zip(elements, colors, strict=True):
         element.position, element.color = position, (*rgb, 1.0)
     opacity = node("ShaderNodeValue", 1, 1.3, name="Opacity", label="Opacity (1/mm)")
-    opacity.outputs[0].default_value = (_XRAY_OPACITY if quantity in _XRAY else _OPACITY) / size
+    opacity.outputs[0].default_value = (_OPACITY if quantity == "activity" else _OPACITY_THROUGH) / size
     extinction = node("ShaderNodeMath", 2, 0.3, operation="MULTIPLY")
     strength = node("ShaderNodeMath", 3, 0, operation="MULTIPLY")
     strength.inputs[1].default_value = _BRIGHTNESS
@@ -115,7 +116,7 @@ def set_range(material: bpy.types.Material, low: float, high: float) -> None:
 
 def set_display(data: bpy.types.Volume, low: float, high: float, size: float) -> None:
     """Make the solid viewport draw the volume's values as smoke of a useful density."""
-    data.display.density = _SMOKE / size / max(abs(low), abs(high))
+    data.display.density = _SMOKE / size / (high - low)
     data.display.wireframe_type = "NONE"
     data.display.interpolation_method = "LINEAR"
 

@@ -26,7 +26,7 @@ from ..core.memory import readable_size
 from ..core.volume import UNITS, Volume
 from . import compat, ids, storage, volume_materials
 from .cameras import world_matrix
-from .vdb import BACKGROUND, read_vdb, write_vdb
+from .vdb import BACKGROUND, SMOKE, read_vdb, write_vdb
 
 MAX_SHOWN_VOXELS = 256**3
 """More non-zero voxels than this are shown as a coarser copy: Blender's window would hang on them."""
@@ -303,6 +303,11 @@ def after_load(*_: Any) -> None:
         if not is_volume(item) or item.data in missing:
             continue
         settings = getattr(item, ids.OBJECT_VOLUME)
+        if not settings.is_property_set("display_high"):  # made by an older version of this extension
+            settings.extent = max(n * s for n, s in zip(settings.shape, settings.spacing, strict=True))
+            settings.display_low, settings.display_high = volume_materials.usual_range(
+                settings.quantity, 0.0, settings.maximum
+            )
         if settings.center_shift != compat.VDB_CENTER_SHIFT:
             data = item.data
             path = storage.full_resolution(storage.absolute(data.filepath))
@@ -335,6 +340,8 @@ def _volume_data(stored: StoredVolume, name: str) -> bpy.types.Volume:
             )
         if quantity not in data.grids:
             raise InputError(f"{stored.path}: Blender finds no grid {quantity!r} in it")
+        if SMOKE in data.grids:
+            data.grids.active_index = data.grids.find(SMOKE)  # what the solid viewport draws
     except Exception:
         bpy.data.volumes.remove(data)
         raise
@@ -361,21 +368,29 @@ def _store(states: Sequence[Volume], folder: Path, provenance: dict[str, Any] | 
         )
         digest.update(json.dumps(recipe).encode())
     stem = f"{states[0].quantity}-{digest.hexdigest()[:16]}"
-    paths = _write(states, folder, stem, provenance)
     shown = list(states)
     while max(np.count_nonzero(state.array != _empty(state)) for state in shown) > MAX_SHOWN_VOXELS:
         shown = [coarser(state) for state in shown]
-    if shown[0] is not states[0]:
-        paths = _write(shown, folder, stem + ids.PREVIEW, {"coarser_copy_of": stem})
-    return paths[0]
+    low = min(float(state.array.min()) for state in shown)
+    smoke_above = volume_materials.usual_range(states[0].quantity, low, 1.0)[0] if low < 0 else None
+    if shown[0] is states[0]:
+        return _write(states, folder, stem, provenance, smoke_above)
+    _write(states, folder, stem, provenance)
+    return _write(shown, folder, stem + ids.PREVIEW, {"coarser_copy_of": stem}, smoke_above)
 
 
-def _write(states: Sequence[Volume], folder: Path, stem: str, provenance: dict[str, Any] | None) -> list[Path]:
+def _write(
+    states: Sequence[Volume],
+    folder: Path,
+    stem: str,
+    provenance: dict[str, Any] | None,
+    smoke_above: float | None = None,
+) -> Path:
     paths = [folder / f"{stem}{f'_{k:04d}' if len(states) > 1 else ''}.vdb" for k in range(1, len(states) + 1)]
     for state, path in zip(states, paths, strict=True):
         if not path.exists():
-            write_vdb(state, path, provenance)
-    return paths
+            write_vdb(state, path, provenance, smoke_above=smoke_above)
+    return paths[0]
 
 
 def _state(data: bpy.types.Volume) -> int | None:

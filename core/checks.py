@@ -77,6 +77,14 @@ def whole_shape(value: Any, name: str, length: int) -> Any:
     return whole
 
 
+def whole_number(value: Any, name: str) -> int:
+    """`value` as a whole number of at least 1, or `InputError`."""
+    try:
+        return int(whole_shape([value], name, 1)[0])
+    except InputError:
+        raise InputError(f"{name}: expected a whole number of at least 1, got {_short(value)}") from None
+
+
 def positive(value: Any, name: str, unit: str = "") -> float:
     """`value` as a finite number above 0, or `InputError`."""
     number = float(real_array(value, name, ()))

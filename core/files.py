@@ -16,7 +16,8 @@ from .errors import InputError
 def replacing(path: str | os.PathLike[str]) -> Iterator[Path]:
     """Give a temporary path beside `path`; rename it to `path` on success, remove it on failure.
 
-    Neither killing the program nor a power cut leaves anything but the old file or the new one at `path`.
+    Neither killing the program nor a power cut leaves anything but the old file or the new one at `path`. Where that is
+    a link, the file it leads to is replaced.
 
     Parameters
     ----------
@@ -33,8 +34,8 @@ def replacing(path: str | os.PathLike[str]) -> Iterator[Path]:
     InputError
         The folder is missing or cannot be written, the path is a folder, or the disk is full.
     """
-    target = Path(path).absolute()
-    refuse_folder(target)
+    refuse_folder(Path(path).absolute())
+    target = Path(os.path.realpath(path))
     if not target.parent.is_dir():
         raise InputError(f"{target.parent}: no such folder; make it first or choose another")
     temporary = target.with_name(f".{uuid.uuid4().hex[:8]}-{target.name}")

@@ -13,7 +13,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from .checks import positive, real_array, whole_shape
+from .checks import positive, real_array, whole_number
 from .design import collimator_length as designed_length
 from .errors import InputError
 from .system import PinholeSystem
@@ -22,6 +22,7 @@ Array = NDArray[np.float64]
 Spacing = Literal["angle", "arc"]
 
 _FULL_TURN = 2 * math.pi
+_MOST_MODULES = 10_000
 # Steps of an arc whose length is measured: as a sum of chords that is 1e-9 of it short.
 _ARC_STEPS = 1 << 15
 # An ellipse has five parameters: fewer modules than this say nothing about one.
@@ -135,10 +136,16 @@ def plate_rings(
         raise InputError(f"vertices: expected at least {2 + closed}, got {len(corners)}")
     ends = np.roll(corners, -1, axis=0) if closed else corners[1:]
     starts = corners[: len(ends)]
-    counts = np.broadcast_to(modules, len(starts)) if np.ndim(modules) == 0 else np.asarray(modules)
-    if counts.shape != (len(starts),) or counts.dtype.kind not in "iu" or counts.min() < 0 or counts.max() == 0:
+    try:
+        counts = np.asarray(modules)
+    except ValueError:  # lists of different lengths
+        counts = np.empty(0)
+    counts = np.broadcast_to(counts, len(starts)) if counts.ndim == 0 else counts
+    whole = counts.shape == (len(starts),) and counts.dtype.kind in "iu"
+    if not whole or counts.min() < 0 or not 0 < counts.max() <= _MOST_MODULES:
         raise InputError(
-            f"modules: expected a whole number, or one for each of the {len(starts)} plates, got {modules}"
+            f"modules: expected a whole number up to {_MOST_MODULES}, or one for each of the {len(starts)} plates, "
+            f"got {modules}"
         )
     shares = np.concatenate([(np.arange(n) + 0.5) / n for n in counts if n])[:, None]
     places = (1 - shares) * np.repeat(starts, counts, axis=0) + shares * np.repeat(ends, counts, axis=0)
@@ -171,7 +178,7 @@ def regular_polygon(sides: int, apothem: float, rotation: float = 0.0) -> Array:
     InputError
         A number is of another kind or out of its range.
     """
-    (sides,) = whole_shape([sides], "sides", 1)
+    sides = whole_number(sides, "sides")
     if sides < 3:
         raise InputError(f"sides: expected at least 3, got {sides}")
     angles = float(real_array(rotation, "rotation", ())) + (2 * np.arange(sides) - 1) * math.pi / sides
@@ -414,7 +421,9 @@ def _direct_ellipse(points: Array) -> _Ellipse | None:
 
 
 def _even_azimuths(ellipse: _Ellipse, modules: Any, start: float, end: float, spacing: str) -> Array:
-    (count,) = whole_shape([modules], "modules", 1)
+    count = whole_number(modules, "modules")
+    if count > _MOST_MODULES:
+        raise InputError(f"modules: expected at most {_MOST_MODULES} in a ring, got {count}")
     start, end = (float(real_array(x, name, ())) for x, name in ((start, "start"), (end, "end")))
     turn = abs(end - start)
     closed = abs(turn - _FULL_TURN) < 1e-9

@@ -96,8 +96,8 @@ def hu_to_mu(volume: Volume, energy: float = 140.5, ct_energy: float = CT_ENERGY
     mu = np.empty(volume.grid.shape, np.float32)
     outside = metal = 0
     for hu, slab in zip(volume.array, mu, strict=True):
-        outside += np.count_nonzero(hu < _PADDING_HU)
-        metal += np.count_nonzero(hu > _METAL_HU)
+        outside += int(np.count_nonzero(hu < _PADDING_HU))
+        metal += int(np.count_nonzero(hu > _METAL_HU))
         exact = hu.astype(np.float64)  # air is what remains of two large terms
         below = np.clip(exact, AIR_HU, 0) * ((water - air) / 1000)
         above = np.maximum(exact, 0) * ((bone - water) * ct_water / (ct_bone - ct_water) / 1000)

@@ -71,7 +71,7 @@ def sensitivity_map(
 
 def modules_map(system: PinholeSystem, grid: Grid, *, progress: Progress | None = None) -> Volume:
     """Number of modules that see each voxel (`core.performance.seen`). Arguments and errors as in `sensitivity_map`."""
-    return _map(system, grid, "modules", lambda points: seen(system, points).sum(axis=1), progress)
+    return _map(system, grid, "modules", lambda points: seen(system, points).sum(axis=1, dtype=np.float64), progress)
 
 
 def resolution_map(

@@ -8,13 +8,12 @@ from typing import Any
 import bpy
 from bpy.props import BoolProperty, EnumProperty, FloatProperty, IntProperty
 
-from ..addon import ids, jobs, scanner, selection, volume_materials, volumes
+from ..addon import ids, jobs, scanner, selection, storage, volume_materials, volumes
 from ..addon.phantom_properties import typed
 from ..core.grid import Grid
 from ..core.maps import MAPS, within_roi
 from ..core.memory import require
 from ..core.progress import Progress
-from ..core.volume import Volume
 
 _DESCRIPTIONS = {
     "sensitivity": "Counts per decay of all modules together",
@@ -62,22 +61,26 @@ class MPHDRR_OT_add_map(jobs.JobOperator, bpy.types.Operator):
         grid = Grid.centered((self.voxels,) * 3, side / self.voxels)
         require(_BYTES * grid.n_voxels, f"a map of {self.voxels}^3 voxels")
         quantity, only_roi = self.quantity, self.within_roi
-        name = f"{quantity.capitalize()} map"
+        name, folder = f"{quantity.capitalize()} map", storage.folder()
         recipe: dict[str, Any] = {"map": quantity, "modules": len(system), "scanner": collection.name}
 
-        def work(progress: Progress) -> Volume:
+        def work(progress: Progress) -> volumes.StoredVolume:
             volume = MAPS[quantity](system, grid, progress=progress)
-            return within_roi(volume, system) if only_roi else volume
+            return volumes.store_volume(within_roi(volume, system) if only_roi else volume, folder, provenance=recipe)
 
-        def finish(volume: Volume) -> Generator[None, None, str]:
+        def finish(stored: volumes.StoredVolume) -> Generator[None, None, str]:
             yield
             old = [o for o in volumes.volume_objects(scene) if getattr(o, ids.OBJECT_VOLUME).quantity == quantity]
             if old:
-                volumes.replace_volume(old[0], volume, provenance=recipe)
+                item = old[0]
+                volumes.replace_stored(item, stored)
             else:
-                volumes.add_volume(volume, name, provenance=recipe, collection=scene.collection)
+                item = volumes.add_stored(stored, name, scene.collection)
                 volume_materials.show_in_eevee(scene)
-            low, high = volume.array[volume.array > 0].min(initial=volume.array.max()), volume.array.max()
-            return f"{name}: {low:.4g} to {high:.4g} {volume.unit}".removesuffix(" 1")
+            values, high = stored.volume.array, stored.high
+            low = float(values[values > 0].min(initial=high))
+            settings = getattr(item, ids.OBJECT_VOLUME)
+            settings.display_low, settings.display_high = low if low < high else 0.0, high
+            return f"{name}: {low:.4g} to {high:.4g} {stored.volume.unit}".removesuffix(" 1")
 
         return jobs.Job(f"{name} of {len(system)} modules", work, finish)

@@ -40,7 +40,9 @@ class MPHDRR_OT_export_geometry(ExportHelper, bpy.types.Operator):
     def invoke(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str]:
         workbook = scanner.required_scanner(context.scene).mphdrr_scanner.workbook
         if not self.filepath and workbook:
-            self.filepath = str(storage.absolute(workbook))
+            # Not the master record itself: whoever wants to replace that chooses its name.
+            path = storage.absolute(workbook)
+            self.filepath = str(path.with_stem(f"{path.stem.removesuffix('-edited')}-edited"))
         return super().invoke(context, event)
 
     def check(self, context: bpy.types.Context) -> bool:

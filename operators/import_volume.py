@@ -48,7 +48,9 @@ class MPHDRR_OT_import_volume(jobs.JobOperator, bpy.types.Operator):
         default="AUTO",
     )  # fmt: skip
     center: BoolProperty(
-        name="Centre at Isocentre", description="Move the volume's middle to the world's origin", default=True
+        name="Centre at Isocentre",
+        description="Move the volume's middle to the world's origin; leave it off for volumes that belong together",
+        default=True,
     )
     attenuation: BoolProperty(
         name="CT to Attenuation",
@@ -108,7 +110,10 @@ class MPHDRR_OT_import_volume(jobs.JobOperator, bpy.types.Operator):
                 volume = hu_to_mu(volume, energy)
                 provenance["energy_keV"] = energy
             progress(2, 4)
-            stored = volumes.store_volume(centered(volume) if center else volume, folder, None, provenance)
+            if center:
+                provenance["moved_mm"] = (-volume.grid.center).tolist()
+                volume = centered(volume)
+            stored = volumes.store_volume(volume, folder, None, provenance)
             progress(4, 4)
             return stored
 
@@ -116,7 +121,8 @@ class MPHDRR_OT_import_volume(jobs.JobOperator, bpy.types.Operator):
             yield
             item = volumes.add_stored(stored, name, bpy.context.collection)
             volumes.make_active(bpy.context, item)
-            return f"Imported {item.name!r}: {_described(stored.volume, stored.low, stored.high)}"
+            moved = ", its middle moved to the isocentre" if center else ""
+            return f"Imported {item.name!r}: {_described(stored.volume, stored.low, stored.high)}{moved}"
 
         return jobs.Job("Importing a volume", work, finish)
 
@@ -127,8 +133,8 @@ class MPHDRR_FH_volume(bpy.types.FileHandler):
     bl_idname = ids.FILE_HANDLER_VOLUME
     bl_label = "Volume for Projection"
     bl_import_operator = ids.IMPORT_VOLUME
-    # The last suffix is what Blender compares.
-    bl_file_extensions = ";".join(sorted({"." + suffix.rsplit(".", 1)[1] for suffix in _SUFFIXES}))
+    # The last suffix is what Blender compares. Most files in .hdr are pictures of surroundings, no Analyze images.
+    bl_file_extensions = ";".join(sorted({"." + suffix.rsplit(".", 1)[1] for suffix in _SUFFIXES} - {".hdr"}))
 
     @classmethod
     def poll_drop(cls, context: bpy.types.Context) -> bool:

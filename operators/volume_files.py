@@ -28,7 +28,8 @@ class MPHDRR_OT_clean_volume_files(bpy.types.Operator):
         )  # fmt: skip
 
     def execute(self, context: bpy.types.Context) -> set[str]:
-        if bpy.data.filepath and bpy.data.is_dirty:
+        # Without a window Blender does not keep account of changes.
+        if bpy.data.filepath and bpy.data.is_dirty and not bpy.app.background:
             self.report(
                 {"ERROR"}, "the .blend has changes that are not saved, and as saved may need these files: save it"
             )

@@ -9,7 +9,7 @@ import bpy
 import numpy as np
 from bpy.props import EnumProperty, FloatProperty, IntProperty, StringProperty
 
-from ..addon import ids, jobs, meshes, volume_materials, volumes
+from ..addon import ids, jobs, meshes, storage, volumes
 from ..addon.phantom_properties import typed
 from ..core.errors import InputError
 from ..core.grid import Grid
@@ -18,7 +18,7 @@ from ..core.meshes.mesh import Mesh
 from ..core.meshes.surface import volume_to_mesh
 from ..core.meshes.voxelization import voxelize_mesh
 from ..core.progress import Progress
-from ..core.volume import UNITS, Volume
+from ..core.volume import UNITS
 
 _BYTES = 40.0  # a voxel, while the volume is made and put into the scene
 
@@ -58,11 +58,24 @@ class MPHDRR_OT_voxelize_objects(jobs.JobOperator, bpy.types.Operator):
             return False
         return True
 
+    def ask(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str] | None:
+        return context.window_manager.invoke_props_dialog(self, width=320, title=self.bl_label, confirm_text="Voxelize")
+
+    def draw(self, context: bpy.types.Context) -> None:
+        layout = self.layout
+        layout.use_property_split = True
+        layout.use_property_decorate = False
+        layout.prop(self, "quantity")
+        layout.prop(self, "value", text="kBq/mL" if self.quantity == "activity" else "1/mm")
+        layout.prop(self, "voxels")
+        layout.prop(self, "voxel_size")
+        layout.prop(self, "name")
+
     def job(self, context: bpy.types.Context) -> jobs.Job:
         items = _chosen(context)
         if not items:
             raise InputError("no mesh object is selected: select closed meshes first")
-        scene, quantity = context.scene, self.quantity
+        scene, quantity, folder = context.scene, self.quantity, storage.folder()
         values = [float(item.get(quantity, typed(self.value))) for item in items]
         solids = meshes.meshes_of(items, context.evaluated_depsgraph_get())
         grid = _fitted(solids, self.voxels, typed(self.voxel_size))
@@ -70,14 +83,15 @@ class MPHDRR_OT_voxelize_objects(jobs.JobOperator, bpy.types.Operator):
         name = self.name or f"{items[0].name} {quantity}"
         recipe: dict[str, Any] = {"meshes": [item.name for item in items], "values": values}
 
-        def work(progress: Progress) -> Volume:
-            return voxelize_mesh(solids, grid, values, quantity, progress)
+        def work(progress: Progress) -> volumes.StoredVolume:
+            return volumes.store_volume(
+                voxelize_mesh(solids, grid, values, quantity, progress), folder, provenance=recipe
+            )
 
-        def finish(volume: Volume) -> Generator[None, None, str]:
+        def finish(stored: volumes.StoredVolume) -> Generator[None, None, str]:
             yield
-            volumes.add_volume(volume, name, provenance=recipe, collection=scene.collection)
-            volume_materials.show_in_eevee(scene)
-            content = float(volume.array.sum(dtype=np.float64)) * grid.voxel_volume
+            volumes.make_active(bpy.context, volumes.add_stored(stored, name, scene.collection))
+            content = float(stored.volume.array.sum(dtype=np.float64)) * grid.voxel_volume
             total = f"{content * 1e-3:.4g} kBq" if quantity == "activity" else f"{content:.4g} {UNITS[quantity]} mm^3"
             shape = " x ".join(map(str, grid.shape))
             return f"Added {name!r}: {shape} voxels of {grid.spacing[0]:.3g} mm, {total} in all"
@@ -103,6 +117,9 @@ class MPHDRR_OT_mesh_from_volume(jobs.JobOperator, bpy.types.Operator):
             cls.poll_message_set("Select a volume first")
             return False
         return True
+
+    def ask(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str] | None:
+        return context.window_manager.invoke_props_dialog(self, title=self.bl_label, confirm_text="Make")
 
     def job(self, context: bpy.types.Context) -> jobs.Job:
         item = context.object

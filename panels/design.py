@@ -62,7 +62,7 @@ class MPHDRR_PT_design(_Panel, bpy.types.Panel):
         row.operator(ids.SET_NUMBERS, text="Copy to All").to_all = True
         row = layout.row(align=True)
         row.prop(properties, "keep_aimed", toggle=True, icon="CON_TRACKTO")
-        row.operator(ids.AIM_MODULES, text="Aim All Now")
+        row.operator(ids.AIM_MODULES)
 
     def _draw_module(self, layout: bpy.types.UILayout, camera: bpy.types.Object) -> None:
         module = camera.mphdrr_module

@@ -105,8 +105,8 @@ def one_or_three(values: list) -> list:
     return values * 3 if len(values) == 1 else values
 
 
-def chosen_modules(system: PinholeSystem, text: str | None) -> PinholeSystem:
-    """The modules of `system` whose numbers `text` ("1-40", "1-20,41") lists; all for None."""
+def chosen_modules(system: PinholeSystem, text: str | None, option: str = "--modules") -> PinholeSystem:
+    """The modules of `system` whose numbers `text` ("1-40", "1-20,41"), given by `option`, lists; all for None."""
     if text is None:
         return system
     wanted: list[NDArray[np.int64]] = []
@@ -115,13 +115,13 @@ def chosen_modules(system: PinholeSystem, text: str | None) -> PinholeSystem:
         try:
             low, high = int(first), int(last or first)
         except ValueError:
-            raise InputError(f"--modules {text!r}: expected numbers such as 1-40 or 1-20,41") from None
+            raise InputError(f"{option} {text!r}: expected numbers such as 1-40 or 1-20,41") from None
         found = np.flatnonzero((system.numbers >= low) & (system.numbers <= high))
         if high < low:
-            raise InputError(f"--modules {text!r}: {part.strip()} ends before it begins")
+            raise InputError(f"{option} {text!r}: {part.strip()} ends before it begins")
         if len(found) == 0:
             raise InputError(
-                f"--modules {text!r}: no module {part.strip()}; there are {system.numbers.min()} to {system.numbers.max()}"
+                f"{option} {text!r}: no module {part.strip()}; there are {system.numbers.min()} to {system.numbers.max()}"
             )
         wanted.append(found)
     return system[np.unique(np.concatenate(wanted))]

@@ -47,8 +47,8 @@ def unseen_share(b: float, d: float, slope: float, radius: float) -> float:
     for c in (2.0, 1.0):
         ends += _real_roots(c * slope**2 + 1, -(c * slope * d + 2 * b), c * d**2 / 4 + b**2 - radius**2)
     ends.append(d / (2 * slope))  # the pyramid's apex
-    ends = np.unique(np.clip(ends, b - radius, b + radius))
-    low, high = ends[:-1, None], ends[1:, None]
+    planes = np.unique(np.clip(ends, b - radius, b + radius))
+    low, high = planes[:-1, None], planes[1:, None]
     # Equal steps of an angle: the integrand has square roots at the ends of the pieces.
     angle = (_NODES + 1) * np.pi / 2
     x = low + (high - low) * (1 - np.cos(angle)) / 2

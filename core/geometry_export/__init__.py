@@ -77,9 +77,13 @@ def write_geometry(
         No such format, an option or suffix that it does not have, what it cannot express, or the file cannot be
         written (the old one then stays).
     """
+    if not isinstance(system, PinholeSystem):
+        raise InputError(f"write_geometry: expected a PinholeSystem, got {type(system).__name__}")
     if format not in FORMATS:
         raise InputError(f"format {format!r}: expected one of {', '.join(FORMATS)}")
     views = system.views() if views is None else views
+    if not isinstance(views, Views):
+        raise InputError(f"views: expected Views, got {type(views).__name__}")
     if len(views) == 0:
         raise InputError("views: expected one or more, got none")
     FORMATS[format].write_whole(system, views, path, options)

@@ -9,7 +9,7 @@ import json
 from pathlib import Path
 from typing import Any
 
-from ..checks import whole_shape
+from ..checks import whole_number
 from ..system import PinholeSystem
 from ..views import Views
 from .format import Format
@@ -36,7 +36,7 @@ def write(system: PinholeSystem, views: Views, path: Path, **options: Any) -> No
     InputError
         An option, or what `build_scene` refuses.
     """
-    (threads,) = whole_shape((options.pop("threads", 1),), "threads", 1)
+    threads = whole_number(options.pop("threads", 1), "threads")
     scene = build_scene(system, Simulation(**options))
     record = {"threads": threads, **_record(system, scene), "image_shape": list(views.shape)}
     (path / "simulation.py").write_text(_SCRIPT.read_text(encoding="utf-8"), encoding="utf-8")

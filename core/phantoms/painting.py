@@ -91,7 +91,7 @@ def _seen_beneath(layers: Sequence[Layer]) -> list[list[Layer]]:
     for i, layer in enumerate(layers):
         near = np.linalg.norm(centers[:i] - centers[i], axis=1) < radii[:i] + radii[i]
         seen: list[Layer] = []
-        for j in np.flatnonzero(near) if not layer.adds else ():
+        for j in np.flatnonzero(near).tolist() if not layer.adds else ():
             relation = layers[j].relation(layer)
             if relation == 1 and not layers[j].adds:
                 seen = []

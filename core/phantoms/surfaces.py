@@ -78,6 +78,5 @@ def clipped(surface: Surface, normal: NDArray[np.float64], offset: float) -> Sur
         points.append(np.mean([points[i] for i, _ in rim], axis=0))
         # The face's own edge runs from `leave` to `enter`: the lid's runs the other way.
         triangles += [(len(points) - 1, enter, leave) for enter, leave in rim]
-    faces = np.array(triangles, np.int32).reshape(-1, 3)
-    used, faces = np.unique(faces, return_inverse=True)
-    return np.array(points)[used], faces.reshape(-1, 3).astype(np.int32)
+    used, corners = np.unique(np.array(triangles, np.int32).reshape(-1, 3), return_inverse=True)
+    return np.array(points)[used], corners.reshape(-1, 3).astype(np.int32)

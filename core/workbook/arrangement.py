@@ -11,7 +11,7 @@ from ..errors import InputError
 from ..system import PinholeSystem
 from .headings import Table
 from .sheet_xml import SheetXml
-from .workbook_xml import WorkbookXml
+from .workbook_xml import WorkbookXml, areas_in
 
 
 def matched(system: PinholeSystem, old: PinholeSystem, numbered: bool) -> list[int | None]:
@@ -158,8 +158,8 @@ def arrange(
 def _columns(table: Table, rows: Sequence[int], number_column: int | None) -> list[int]:
     """The columns that go with the modules' rows.
 
-    Those of the known quantities, those filled in half of the rows or more, and what stands right beside them:
-    a summary apart from the table stays where it is.
+    Those of the known quantities, those filled in half of the rows or more, and what stands right beside them. A
+    summary stays where it is: what is apart from the table, or beside it with a formula over several rows.
     """
     sheet, wanted = table.sheet, set(rows)
     cells = {at for cells in (sheet.stored, sheet.formulas) for at in cells if at[0] in wanted}
@@ -167,9 +167,16 @@ def _columns(table: Table, rows: Sequence[int], number_column: int | None) -> li
     own = {column for _, column, _ in table.headings} | {number_column or 0}
     own |= {int(column) for column in np.flatnonzero(2 * filled >= len(rows))}
     used = set(np.flatnonzero(filled).tolist()) | own
+    summing = {column for (row, column), formula in sheet.formulas.items() if row in wanted and _is_over_rows(formula)}
     for step in (-1, 1):
         for column in sorted(own):
-            while column + step in used:
-                column += step
-                own.add(column)
+            beside = []
+            while (column := column + step) in used - own:
+                beside.append(column)
+            if not summing.intersection(beside):
+                own.update(beside)
     return sorted(own - {0})
+
+
+def _is_over_rows(formula: str) -> bool:
+    return any(area.top < area.bottom for area in areas_in(formula))

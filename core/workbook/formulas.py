@@ -187,6 +187,11 @@ def _numbers(arguments: list[Any]) -> list[float]:
     return _items(arguments, (float,), _number)
 
 
+def _same_as_shown(a: float, b: float) -> bool:
+    """Whether numbers are the same in the 15 digits that spreadsheets show and compare: 0.1 + 0.2 is 0.3."""
+    return f"{a:.14e}" == f"{b:.14e}"
+
+
 def _compared(compare: Callable[[Any, Any], bool]) -> Callable[[Any, Any], bool]:
     """Numbers come before texts, texts (whatever their case) before booleans; blank is the other's zero."""
 
@@ -200,6 +205,8 @@ def _compared(compare: Callable[[Any, Any], bool]) -> Callable[[Any, Any], bool]
         zero = {str: "", bool: False}
         a = zero.get(type(b), 0.0) if a is None else a
         b = zero.get(type(a), 0.0) if b is None else b
+        if type(a) is type(b) is float and _same_as_shown(a, b):
+            b = a
         return compare(rank(a), rank(b))
 
     return result
@@ -207,6 +214,10 @@ def _compared(compare: Callable[[Any, Any], bool]) -> Callable[[Any, Any], bool]
 
 def _of_numbers(function: Callable[[float, float], float]) -> Callable[[Any, Any], float]:
     return lambda a, b: function(_number(a), _number(b))
+
+
+def _sum(a: float, b: float) -> float:
+    return 0.0 if _same_as_shown(a, -b) else a + b
 
 
 def _atan2(x: float, y: float) -> float:
@@ -227,7 +238,7 @@ def _rounded(rounding: str) -> Callable[[float, float], float]:
         # Of the decimals that are shown, not of the binary digits behind them: ROUND(2.675,2) is 2.68.
         step = decimal.Decimal(1).scaleb(-int(digits))
         with decimal.localcontext(prec=400):
-            return float(decimal.Decimal(repr(value)).quantize(step, rounding=rounding))
+            return float(decimal.Decimal(f"{value:.15g}").quantize(step, rounding=rounding))
 
     return function
 
@@ -398,7 +409,7 @@ _OPERATORS: list[dict[str, Callable[[Any, Any], Any]]] = [
         ">=": _compared(operator.ge),
     },
     {"&": lambda a, b: _text(a) + _text(b)},
-    {"+": _of_numbers(operator.add), "-": _of_numbers(operator.sub)},
+    {"+": _of_numbers(_sum), "-": _of_numbers(lambda a, b: _sum(a, -b))},
     {"*": _of_numbers(operator.mul), "/": _of_numbers(operator.truediv)},
     {"^": _of_numbers(_power)},
 ]

@@ -154,8 +154,9 @@ class _Calculation:
             value = new.value(place)
             was = workbook.sheets[place[0]].original.get(place[1:])
             unlike = was is not None and was.value is not None and not _alike(old.value(place), was.value)
-            # #NAME? is said of functions that LibreOffice does not know; Err:5xx of much else.
-            if value is not None and value != "#NAME?" and not str(value).startswith("Err:") and not unlike:
+            # #NAME? is said of functions that LibreOffice does not know; #VALUE! it saves for most other errors too.
+            unclear = value == "#NAME?" or (value == "#VALUE!" and (was is None or was.value != value))
+            if value is not None and not unclear and not unlike:
                 values[place] = value
         return values
 

@@ -85,6 +85,8 @@ def write_system(
     InputWarning
         Formulas that had to be replaced by numbers or store no value, and ranges that leave added modules out.
     """
+    if not isinstance(system, PinholeSystem):
+        raise InputError(f"write_system: expected a PinholeSystem, got {type(system).__name__}")
     target = Path(path)
     suffix = target.suffix.lower()
     if suffix not in KINDS:
@@ -103,6 +105,11 @@ def write_system(
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", InputWarning)  # said when the system was read
         reading = read(book)
+    unlisted = {column.table.sheet.name for column in reading.columns.values()} - workbook.sheets.keys()
+    if unlisted:
+        raise InputError(
+            f"{workbook.name}: its list of sheets lacks {several(sorted(unlisted))}, expected it saved anew"
+        )
     edit = Edit(system, reading, workbook)
     edit.apply()
     return _saved(workbook, system, target, edit.changed, edit.required, workbook.changed, edit.numbered)

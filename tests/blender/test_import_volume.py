@@ -11,7 +11,7 @@ import pytest
 bpy = pytest.importorskip("bpy")
 
 from mphdrr.addon import slices, volume_materials, volumes  # noqa: E402
-from mphdrr.addon.vdb import write_vdb  # noqa: E402
+from mphdrr.addon.vdb import openvdb, write_vdb  # noqa: E402
 from mphdrr.core.errors import InputError  # noqa: E402
 from mphdrr.core.frames import euler_pose  # noqa: E402
 from mphdrr.core.grid import Grid  # noqa: E402
@@ -79,6 +79,27 @@ def test_ct_begins_with_a_window_of_its_own_and_keeps_the_users(ct):
     volumes.replace_volume(item, Volume(ct.array[:5].copy(), Grid((5, 11, 7), AFFINE), "hu"))
     node = item.data.materials[0].node_tree.nodes["Display Range"]
     assert node.inputs["From Min"].default_value == 50.0 and node.inputs["From Max"].default_value == 1000.0
+
+
+def test_solid_viewport_gets_no_value_below_0(ct):
+    item = volumes.add_volume(ct, "CT")
+    drawn = item.data.grids[item.data.grids.active_index].name
+    path = str(volumes.file_of(item))
+    smoke = np.zeros(ct.grid.shape, np.float32)
+    openvdb().read(path, drawn).copyToArray(smoke)
+    mirrored = openvdb().read(path, "hu").metadata["mphdrr_mirrored"]
+    np.testing.assert_allclose(smoke[::-1] if mirrored else smoke, np.maximum(ct.array + 200.0, 0.0))
+    assert volumes.volume_from_object(item).quantity == "hu"
+
+
+def test_volumes_of_older_files_get_a_range(tmp_path, ct):
+    item = volumes.add_volume(Volume(np.abs(ct.array), ct.grid, "activity"), "Old")
+    for name in ("display_low", "display_high", "extent"):
+        item.mphdrr_volume.property_unset(name)
+    bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "a.blend"))
+    bpy.ops.wm.open_mainfile(filepath=str(tmp_path / "a.blend"))
+    settings = bpy.data.objects["Old"].mphdrr_volume
+    assert settings.display_high == settings.maximum > 1 and settings.extent == pytest.approx(17.5)
 
 
 def _pixels(plane):

@@ -237,6 +237,8 @@ def test_geometry_performance_adds_up(workbook, capsys):
     assert printed["total"]["sensitivity"] == pytest.approx(1e6 * expected.sum())
     assert printed["total"]["modules_holding_roi"] == 80
     assert all(m["roi_radius_seen"] == pytest.approx(75, abs=1e-3) for m in printed["modules"])
+    assert main(["geometry", "performance", str(workbook), "--opening-angle", "200"]) == 1
+    assert "--opening-angle 200: expected degrees" in capsys.readouterr().err
     assert main(["geometry", "performance", str(workbook), "--point", "0", "0", "900"]) == 0
     assert "from 0 of 80 modules" in capsys.readouterr().out
 

@@ -222,6 +222,20 @@ def test_a_failed_write_leaves_the_old_file_and_nothing_else(tmp_path):
     assert list(tmp_path.iterdir()) == [path]
 
 
+def test_a_link_goes_on_leading_to_the_written_file(tmp_path):
+    path, link = tmp_path / "folder" / "whole.bin", tmp_path / "link.bin"
+    path.parent.mkdir()
+    path.write_bytes(b"old")
+    try:
+        link.symlink_to(path)
+    except OSError as error:
+        pytest.skip(f"no links here ({error})")
+    with replacing(link) as temporary:
+        temporary.write_bytes(b"new")
+    assert link.is_symlink() and path.read_bytes() == b"new"
+    assert [p.name for p in path.parent.iterdir()] == ["whole.bin"]
+
+
 @pytest.mark.skipif(
     os.name == "nt" or (hasattr(os, "geteuid") and os.geteuid() == 0), reason="root may write everywhere"
 )

@@ -142,7 +142,8 @@ def test_rings_that_fit_no_ellipse_get_a_circle(places):
     ("change", "words"),
     [
         ({"modules": 0}, "modules"),
-        ({"modules": 2.5}, "modules"),
+        ({"modules": 2.5}, "modules: expected a whole number of at least 1"),
+        ({"modules": 10**9}, "modules: expected at most 10000"),
         ({"semi_axes": (200, -1)}, "semi_axes"),
         ({"semi_axes": (200, 100, 50)}, "semi_axes"),
         ({"center": (0, 400)}, "isocentre must be inside"),
@@ -162,7 +163,9 @@ def test_what_cannot_be_made_is_refused(change, words):
 
 
 def test_plates_that_cannot_be_are_refused():
-    for modules, vertices, words in ((2, [[1, 2]], "vertices"), ([1, 2], mph.regular_polygon(3, 200), "modules")):
+    triangle = mph.regular_polygon(3, 200)
+    bad = ((2, [[1, 2]], "vertices"), ([1, 2], triangle, "modules"), ([1, [2, 3], 1], triangle, "modules"))
+    for modules, vertices, words in bad:
         with pytest.raises(mph.InputError, match=words):
             mph.plate_rings(modules, vertices, 0.0, **MODULE)
     with pytest.raises(mph.InputError, match="sides"):

@@ -305,6 +305,21 @@ def test_reordered_modules_take_their_rows_along(template, tmp_path):
 
 
 @QUIET
+@pytest.mark.parametrize("order", [[1, 2, 3], [3, 1, 2, 0]])
+def test_a_summary_beside_the_table_stays_where_it_is(template, tmp_path, order):
+    book = openpyxl.load_workbook(template)
+    sheet = book["Coordinates"]
+    first = sheet.max_column + 1
+    sheet.cell(3, first).value, sheet.cell(3, first + 1).value = "highest", "=MAX(B3:B6)"
+    book.save(template)
+    system = read_quietly(template)[order]
+    mph.write_system(system, tmp_path / "o.xlsx", template)
+    cells, values = (openpyxl.load_workbook(tmp_path / "o.xlsx", data_only=d)["Coordinates"] for d in (False, True))
+    assert (cells.cell(3, first).value, cells.cell(3, first + 1).value) == ("highest", "=MAX(B3:B6)")
+    assert values.cell(3, first + 1).value == pytest.approx(system.centers[:, 0].max(), rel=1e-12)
+
+
+@QUIET
 def test_renumbered_modules_keep_their_rows(template, tmp_path):
     system = mph.read_system(template)
     system = changed(system, numbers=system.numbers + 1000)
@@ -475,6 +490,24 @@ def test_libreoffice_tells_whether_a_formula_gives_the_number(template, tmp_path
     np.testing.assert_allclose(read_quietly(tmp_path / "o.xlsx").centers, centers, rtol=1e-12)
 
 
+@pytest.mark.skipif(OFFICE is None, reason="LibreOffice is not installed")
+def test_errors_that_libreoffice_saves_under_another_name_are_not_stored(template, tmp_path, monkeypatch):
+    monkeypatch.setattr(libreoffice, "program", lambda: OFFICE)
+    book = openpyxl.load_workbook(template)
+    other = book.create_sheet("Other")
+    other["A1"] = "=LARGE(Coordinates!B3:B4,IF(Coordinates!B3>400,9,1))"  # #NUM!, which it saves as #VALUE!
+    other["A2"], other["A3"] = "=LARGE(Coordinates!B3:B4,1)", "=IF(Coordinates!B3>400,NA(),1)"
+    template.write_bytes(libreoffice.recalculated([content_of(book)])[0])
+    system = read_quietly(template)
+    centers = system.centers.copy()
+    centers[0, 0] = 500
+    with pytest.warns(mph.InputWarning, match="Other!A1: the formula's new value could not be calculated"):
+        written = mph.write_system(by_design(changed(system, centers=centers)), tmp_path / "o.xlsx", template)
+    assert written.cleared == ("Other!A1",)
+    values = values_of(tmp_path / "o.xlsx")
+    assert (values["Other", "A2"], values["Other", "A3"]) == (500, "#N/A")
+
+
 # Refusals
 
 
@@ -492,6 +525,13 @@ def test_impossible_places_are_refused(template, path, message):
         mph.write_system(read_quietly(template), template.parent / path, template)
     with pytest.raises(mph.InputError):
         mph.write_system(read_quietly(template), template.parent / path)
+
+
+def test_only_systems_are_written(tmp_path):
+    with pytest.raises(mph.InputError, match="expected a PinholeSystem, got str"):
+        mph.write_system("scanner.xlsx", tmp_path / "o.xlsx")  # type: ignore[arg-type]
+    with pytest.raises(mph.InputError, match="expected a PinholeSystem, got str"):
+        mph.write_geometry("scanner.xlsx", tmp_path / "o.json", "mphdrr")  # type: ignore[arg-type]
 
 
 def test_bad_templates_are_refused_as_by_the_reader(template, tmp_path):
@@ -529,4 +569,7 @@ def test_geometry_set_changes_the_chosen_modules(workbook, tmp_path, capsys):
     for wrong in (["--length", "x"], ["--order", "1,2"], ["--roi", "500"], ["--modules", "900"]):
         assert main(["geometry", "set", str(workbook), *wrong, "-o", str(tmp_path / "p.xlsx")]) == 1
         assert capsys.readouterr().err.startswith("mphdrr: ")
+    for wrong in ("1-80", "81"):
+        assert main(["geometry", "set", str(workbook), "--remove", wrong, "-o", str(tmp_path / "p.xlsx")]) == 1
+        assert capsys.readouterr().err.startswith(f"mphdrr: --remove '{wrong}': ")
     assert not (tmp_path / "p.xlsx").exists()

@@ -241,6 +241,16 @@ def test_odd_xml_is_patched_in_place(odd, tmp_path):
     assert written.changed == expected.changed
 
 
+def test_a_list_of_sheets_that_only_the_reader_understands_is_refused(tmp_path):
+    def edit(name: str, data: bytes) -> bytes:
+        return data.replace(SPREADSHEET.encode(), b"urn:other") if name == "xl/workbook.xml" else data
+
+    template = tmp_path / "t.xlsx"
+    template.write_bytes(repacked(content_of(laid_out(Layout(seed=11))), edit))
+    with pytest.raises(mph.InputError, match=r"t\.xlsx: its list of sheets lacks Coordinates"):
+        write_quietly(moved(read_quietly(template)), tmp_path / "o.xlsx", template)
+
+
 def test_texts_that_were_numbers_in_formulas_and_cells_of_any_type_become_numbers(tmp_path):
     content = content_of(laid_out(Layout(seed=2, derived="absent", length="absent")))
 

@@ -6,6 +6,7 @@ import argparse
 import math
 from typing import Any
 
+from ...errors import InputError
 from ...isotopes import CZT_MU, ISOTOPES, NAI_MU, TUNGSTEN_MU, isotope
 
 
@@ -53,4 +54,8 @@ def resolution_settings(arguments: argparse.Namespace) -> dict[str, Any]:
 
 
 def _edge(arguments: argparse.Namespace) -> dict[str, Any]:
+    if not 0 < arguments.opening_angle < 180:
+        raise InputError(
+            f"--opening-angle {arguments.opening_angle:g}: expected degrees, more than 0 and less than 180"
+        )
     return {"aperture_mu": arguments.aperture_mu, "opening_angle": math.radians(arguments.opening_angle)}

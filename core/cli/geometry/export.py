@@ -73,8 +73,9 @@ def _run(arguments: argparse.Namespace) -> None:
 def _format_of(output: str) -> Format:
     fitting = [f for f in FORMATS.values() if f.suffixes and output.lower().endswith(f.suffixes)]
     if len(fitting) != 1:
+        fault = "several formats may be meant" if fitting else "no format has files of that name"
         names = ", ".join(f.name for f in fitting or FORMATS.values())
-        raise InputError(f"{output}: several formats may be meant; choose one by --format: {names}")
+        raise InputError(f"{output}: {fault}; choose one by --format: {names}")
     return fitting[0]
 
 

@@ -13,6 +13,8 @@ from ...workbook import read_system
 from ..options import add_command
 from .arguments import add_workbook
 
+_FOLLOWS = 0.1  # mm off an ellipse that rounding in a workbook may bring about
+
 
 def add_parser(actions) -> None:  # type: ignore[no-untyped-def]
     """Add the action."""
@@ -38,7 +40,8 @@ def _run(arguments: argparse.Namespace) -> None:
         print(f"              centre at x = {x:.3f}, y = {y:.3f} mm")
         print(f"  azimuths    from {azimuths[0]:.4f} to {azimuths[-1]:.4f} degrees")
         print(f"  z           from {min(z):.4f} to {max(z):.4f} mm")
-        print(f"  deviation   {ring['curve_deviation']:.2g} mm at most from the ellipse")
+        verdict = "" if ring["curve_deviation"] <= _FOLLOWS else ": these modules follow no ellipse"
+        print(f"  deviation   {ring['curve_deviation']:.2g} mm at most from the ellipse{verdict}")
         print(
             f"              {ring['even_deviation']:.2g} mm at most if at equal steps of {ring['spacing']} and at one z, "
             f"{np.mean(z):.4f} mm"

@@ -101,7 +101,10 @@ def _changed(system: PinholeSystem, arguments: argparse.Namespace) -> PinholeSys
     lengths = np.where(follows & ~is_by_design(system), designed, system.collimator_length)
     system = dataclasses.replace(system, collimator_length=lengths)
     if arguments.remove is not None:
-        system = system[~np.isin(system.numbers, chosen_modules(system, arguments.remove).numbers)]
+        removed = np.isin(system.numbers, chosen_modules(system, arguments.remove, "--remove").numbers)
+        if removed.all():
+            raise InputError(f"--remove {arguments.remove!r}: are all modules, expected at least one to be left")
+        system = system[~removed]
     return system if arguments.order is None else system[_order(system, arguments.order)]
 
 

@@ -1,0 +1,135 @@
+"""Pictures of every phantom, of a CT and of the scanner's sensitivity: `make gallery` puts them into docs/images.
+
+    python examples/gallery.py FOLDER [CT]
+
+CT is a volume file of CT numbers; without it, its pictures are left out. The pictures in the scanner need Blender's Python
+module (bpy).
+"""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import numpy as np
+from PIL import Image, ImageDraw
+
+import mphdrr.core as mph
+
+HERE = Path(__file__).parent
+TILE, MARGIN, TEXT = 180, 8, 22
+MODULE = 30  # whose projection is shown
+# Matplotlib's "inferno" (CC0) at equal steps.
+INFERNO = (
+    (0, 0, 4),
+    (40, 11, 84),
+    (101, 21, 110),
+    (159, 42, 99),
+    (212, 72, 66),
+    (245, 125, 21),
+    (250, 193, 39),
+    (252, 255, 164),
+)
+
+PHANTOMS = {
+    "Derenzo": mph.DerenzoPhantom(40, (8, 6, 5, 4, 3, 2), 40, 100),
+    "NEMA body": mph.NemaBody(),
+    "Jaszczak": mph.JaszczakPhantom(),
+    "Defrise": mph.DefrisePhantom(),
+    "Shepp-Logan": mph.SheppLogan(),
+    "points": mph.PointGrid(),
+    "cardiac torso": mph.CardiacTorso(),
+    **{path.stem.replace("_", " "): mph.read_phantom(path) for path in sorted((HERE / "phantoms").glob("*.toml"))},
+}
+
+
+def main(folder: Path, ct: Path | None) -> None:
+    """Write all pictures into a folder."""
+    system = mph.read_system(HERE / "dc-spect-80.xlsx")
+    volumes = {name: phantom.voxelize(grid_of(phantom)) for name, phantom in PHANTOMS.items()}
+    hounsfield = None
+    if ct is not None:
+        hounsfield = mph.centered(mph.read_volume(ct))
+        volumes["chest CT"] = mph.hu_to_mu(hounsfield)
+    sheet(system, volumes).save(folder / "gallery.png", optimize=True)
+    print(folder / "gallery.png")
+    in_the_scanner(system, folder, hounsfield)
+
+
+def grid_of(phantom: mph.Phantom) -> mph.Grid:
+    """Voxels that hold a phantom."""
+    voxels = 160
+    return mph.Grid.centered(voxels, phantom.extent / (voxels - 2))
+
+
+def sheet(system: mph.PinholeSystem, volumes: dict[str, mph.Volume]) -> Image.Image:
+    """Two columns of volumes: slices near the middle across z, y and x of each, and what a module sees."""
+    views = system[system.numbers == MODULE].views((TILE, TILE))
+    width, height, rows = 4 * (TILE + MARGIN) + MARGIN, TILE + TEXT + MARGIN, -(-len(volumes) // 2)
+    page = Image.new("RGB", (2 * width, rows * height + MARGIN), (24, 26, 29))
+    write = ImageDraw.Draw(page)
+    for place, (name, volume) in enumerate(volumes.items()):
+        array = volume.array
+        at = telling(array)
+        # Seen from above, from the front and from the left; the picture's first row is the top.
+        slices = [array[:, :, at[2]].T, array[:, at[1], :].T, array[at[0], :, :].T]
+        (image,) = mph.as_seen(mph.Projector(volume.grid, views)(volume))
+        left, top = place // rows * width + MARGIN, place % rows * height + MARGIN
+        title = f"{name}: slices, {volume.unit}; projection of module {MODULE}"
+        write.text((left, top + 4), title, fill=(220, 222, 226))
+        for column, picture in enumerate([*(s[::-1] for s in slices), image]):
+            tile = colored(picture, volume.quantity != "activity").resize((TILE, TILE), Image.Resampling.BILINEAR)
+            page.paste(tile, (left + column * (TILE + MARGIN), top + TEXT))
+    return page
+
+
+def telling(array: np.ndarray) -> list[int]:
+    """Along each axis the slice near the middle with most to see: where values differ most."""
+    places = []
+    for axis in range(3):
+        n = array.shape[axis]
+        near = range(n // 2 - n // 8, n // 2 + n // 8 + 1)
+        places.append(max(near, key=lambda i: (float(array.take(i, axis).std()), -abs(i - n // 2))))
+    return places
+
+
+def colored(picture: np.ndarray, grey: bool) -> Image.Image:
+    """Values as colours, from 0 to nearly the largest."""
+    share = np.clip(picture / max(float(np.quantile(picture, 0.999)), 1e-12), 0, 1)
+    if grey:
+        return Image.fromarray(np.uint8(255 * share)).convert("RGB")
+    steps = np.linspace(0, 1, len(INFERNO))
+    channels = [np.interp(share, steps, [color[k] for color in INFERNO]) for k in range(3)]
+    return Image.fromarray(np.uint8(np.stack(channels, axis=-1)))
+
+
+def in_the_scanner(system: mph.PinholeSystem, folder: Path, ct: mph.Volume | None) -> None:
+    """The sensitivity map, and the CT, between the modules."""
+    try:
+        import bpy
+    except ImportError:
+        print("no bpy: the pictures in the scanner are left out", file=sys.stderr)
+        return
+    import mphdrr
+    from mphdrr.addon import pictures, scanner, volumes
+
+    bpy.ops.wm.read_factory_settings(use_empty=True)
+    mphdrr.register()
+    scene = bpy.context.scene
+    collection = scanner.build_scanner(scene, system)
+    for item in collection.objects:
+        item.hide_render = True  # the ROI's sphere
+    first, last = int(system.numbers.min()), int(system.numbers.max())
+    bpy.ops.mphdrr.add_map(quantity="sensitivity", voxels=128)
+    (shown,) = volumes.volume_objects(scene)
+    pictures.render_scanner(scene, collection, folder / "sensitivity.png", first, last, shown, zoom=1.5)
+    bpy.data.objects.remove(shown)
+    if ct is not None:
+        shown = volumes.add_volume(ct, "chest CT")
+        pictures.render_scanner(scene, collection, folder / "ct.png", first, last, shown, zoom=1.2)
+
+
+if __name__ == "__main__":
+    out = Path(sys.argv[1])
+    out.mkdir(parents=True, exist_ok=True)
+    main(out, Path(sys.argv[2]) if len(sys.argv) > 2 else None)

@@ -173,7 +173,7 @@ def _property(field: Any, kind: Kind, update: Any) -> Any:
     """A field of a phantom's dataclass as a property."""
     known = field.metadata
     unit = known.get("unit", "")
-    name = field.name.replace("_", " ").title() if unit != "DEG" else field.name.removesuffix("_degrees").title()
+    name = field.name.removesuffix("_degrees").replace("_", " ").title()
     default = kind.usual.get(field.name, field.default)
     text = known["text"][0].upper() + known["text"][1:]
     options: dict[str, Any] = {"name": name, "description": text, "default": default, "update": update}
@@ -185,7 +185,7 @@ def _property(field: Any, kind: Kind, update: Any) -> Any:
     if unit in _UNITS:
         options |= {"name": f"{name} ({unit})", "description": f"{text}, in {unit}"}
     elif unit == "DEG":
-        options |= {"name": f"{name.replace('_', ' ')} (°)", "description": f"{text}, in degrees"}
+        options |= {"name": f"{name} (°)", "description": f"{text}, in degrees"}
     else:
         options |= {"description": f"Share {unit}, {known['text']}"}
     # What must be above 0 has no smallest number.

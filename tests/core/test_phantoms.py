@@ -9,6 +9,7 @@ import pytest
 import trimesh
 
 import mphdrr.core as mph
+from mphdrr.core.phantoms import kinds
 from mphdrr.core.progress import Cancelled
 
 from .conftest import WORKBOOK, general_grid
@@ -448,3 +449,13 @@ def test_the_torso_fits_into_the_scanner(workbook):
     assert np.linalg.norm(ventricle.vertices, axis=1).max() < 75
     # The patient's left and front, -x and +y, face the modules.
     assert system.centers[:, 1].mean() > 0 > system.centers[:, 0].mean()
+
+
+@pytest.mark.parametrize("kind", kinds.KINDS, ids=lambda kind: kind.name)
+def test_box_of_every_kind_holds_its_shapes_closely(kind):
+    phantom = kind.phantom(**kind.usual)
+    points = np.concatenate([mesh.vertices for mesh in phantom.meshes()])
+    low, high = phantom.box
+    assert np.all(points >= low - 1e-9) and np.all(points <= high + 1e-9)
+    side = (high - low).max()
+    assert np.ptp(points, axis=0).max() > 0.75 * side

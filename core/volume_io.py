@@ -87,6 +87,31 @@ def read_volume(
         raise InputError(f"{path}: {error}") from None
 
 
+def read_volume_of(path: str | os.PathLike[str], quantity: str, advice: str = "") -> Volume:
+    """Read a volume that has to hold `quantity`: a file that says nothing is taken for it.
+
+    Parameters
+    ----------
+    path, quantity
+        The file; one of `UNITS`.
+    advice
+        Ends the message to a file that says another quantity.
+
+    Raises
+    ------
+    InputError
+        The file says that it holds another quantity; as of `read_volume`.
+    """
+    path = Path(path)
+    contents = _contents(path, None, None)
+    try:
+        if contents.quantity in UNITS and contents.quantity != quantity:
+            raise InputError(f"it holds {contents.quantity}, expected {quantity} in {UNITS[quantity]}{advice}")
+        return contents.volume(quantity)
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from None
+
+
 def write_volume(volume: Volume, path: str | os.PathLike[str]) -> None:
     """Write a volume as NIfTI (.nii, .nii.gz; its affine is rounded to float32), .npz, .nrrd or .h5 (exact).
 

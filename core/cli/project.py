@@ -20,7 +20,7 @@ from ..projector import Emission, InverseSquareSum, Model, Transmission
 from ..rearranging import centered
 from ..system import PinholeSystem
 from ..volume import Volume
-from ..volume_io import read_volume
+from ..volume_io import read_volume, read_volume_of
 from ..workbook import read_system
 from .options import (
     add_command,
@@ -160,7 +160,7 @@ def _attenuation(path: str, energy: str | None) -> Volume:
         if volume.quantity != "hu":
             raise InputError(f"{path}: it holds {volume.quantity}; --energy is for CT numbers (hu)")
         return hu_to_mu(volume, photon_energy(energy))
-    volume = read_volume(path, "mu")
+    volume = read_volume_of(path, "mu", "; of CT numbers, give --energy to convert them")
     lowest = float(volume.array.min())
     if lowest < -1:  # interpolation may leave values a little below 0
         raise InputError(
@@ -178,7 +178,7 @@ def _volumes(arguments: argparse.Namespace) -> tuple[Volume, Volume | None, dict
     elif not arguments.volume:
         volume, recipe = derenzo_volume(arguments)
     elif arguments.emission:
-        volume = read_volume(arguments.volume, "activity")
+        volume = read_volume_of(arguments.volume, "activity")
     elif arguments.photons is not None or arguments.energy is not None:
         volume = _attenuation(arguments.volume, arguments.energy)
     else:

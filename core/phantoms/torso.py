@@ -16,7 +16,7 @@ from ..checks import whole_shape
 from ..errors import InputError
 from .materials import LUNG_MU, SOFT_TISSUE_MU, VERTEBRA_MU
 from .phantom import Phantom
-from .settings import setting
+from .settings import check_settings, setting
 from .shapes import Cylinder, Ellipsoid, Shape
 
 # The heart's axes in the torso, rows lateral, anterior, apical: its second, third and first axis in M. Cristy and
@@ -95,7 +95,7 @@ class CardiacTorso(Phantom):
     title = "cardiac torso"
 
     def __post_init__(self) -> None:
-        super().__post_init__()
+        check_settings(self, self.title)
         for name, most in (
             ("phase", 1.0),
             ("shortening", 0.9),
@@ -110,6 +110,7 @@ class CardiacTorso(Phantom):
             if value > most or (value == most and name in ("phase", "defect_from")):
                 below = "less than" if name in ("phase", "defect_from") else "at most"
                 raise InputError(f"{self.title}: {name.replace('_', ' ')}: expected {below} {most:g}, got {value:g}")
+        super().__post_init__()  # last: it makes the shapes, whose messages would not name the setting
 
     def beating(self, frames: int) -> list[CardiacTorso]:
         """The torso at as many phases, evenly spaced over the cycle, the first at end-diastole."""

@@ -314,6 +314,7 @@ def test_files_that_are_no_text_are_refused(tmp_path):
         (lambda: mph.PointGrid(counts=(1000, 1000, 1000)), "at most 10000 points"),
         (lambda: mph.CardiacTorso(phase=1), "phase: expected less than 1, got 1"),
         (lambda: mph.CardiacTorso(defect_from=0.9), "defect from: expected less than 0.8, got 0.9"),
+        (lambda: mph.CardiacTorso(defect_severity=7), "defect severity: expected at most 1, got 7"),
         (lambda: mph.CardiacTorso(end_systolic_volume=200), "end systolic volume: expected at most 120, got 200"),
         (lambda: mph.CardiacTorso().beating(0), "frames of the cycle"),
         (lambda: mph.DerenzoPhantom(40, (8, 6, 5), 30, sectors=1), "Derenzo sectors: expected a whole number"),

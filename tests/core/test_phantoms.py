@@ -342,6 +342,11 @@ def test_what_cannot_be_is_refused_in_one_line(make, message):
     assert "\n" not in str(error.value)
 
 
+@pytest.mark.parametrize("side", [4, 4.0, np.int64(4), np.float32(4)])
+def test_one_side_of_the_box_of_poses_counts_for_all(side):
+    assert np.array_equal(mph.random_pose(1, box=side), mph.random_pose(1, box=(4, 4, 4)))
+
+
 def test_a_phantom_beyond_the_grid_is_said():
     with pytest.warns(mph.InputWarning, match="of the NEMA body phantom lies outside the grid"):
         mph.NemaBody().voxelize(mph.Grid.centered(16, 4.0))

@@ -98,7 +98,8 @@ def _headers(path: Path) -> list[tuple[Path, Any]]:
 
     files = sorted(path.iterdir()) if path.is_dir() else [path, *sorted(path.parent.iterdir())]
     wanted = None
-    headers = {}
+    headers: dict[Path, Any] = {}
+    others: dict[Path, Any] = {}
     for file in files:
         if file in headers or not (file.is_file() and (is_dicom(file) or file.suffix.lower() in (".dcm", ".ima"))):
             continue
@@ -111,11 +112,23 @@ def _headers(path: Path) -> list[tuple[Path, Any]]:
         if file == path:
             wanted = header.get("SeriesInstanceUID")
         # Directories, reports and plans have no pixels.
-        if "Rows" in header and (wanted is None or header.get("SeriesInstanceUID") == wanted):
+        if "Rows" not in header:
+            others[file] = header
+        elif wanted is None or header.get("SeriesInstanceUID") == wanted:
             headers[file] = header
     if not headers:
         raise InputError("expected a folder with the images of a DICOM series; it has none")
+    # pydicom reads a file that ends early as one with fewer tags, the last of them cut: if it is no report, it is an image.
+    kinds = set(map(_kind, headers.values()))
+    for file, header in others.items():
+        if any(kind.startswith(_kind(header)) for kind in kinds) and wanted in (None, header.get("SeriesInstanceUID", wanted)):
+            raise InputError(f"{file.name}: an image without Rows: the file is cut off or damaged")
     return list(headers.items())
+
+
+def _kind(header: Any) -> str:
+    """The UID of what a file is, such as a CT image, or ""."""
+    return str(header.file_meta.get("MediaStorageSOPClassUID") or header.get("SOPClassUID", ""))
 
 
 def _chosen(headers: list[tuple[Path, Any]], path: Path, series: str | None) -> list[tuple[Path, Any]]:

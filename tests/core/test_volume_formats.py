@@ -284,6 +284,14 @@ def _tilt(written, folder):
         save(data)
 
 
+def _cut_before_its_rows(size):
+    def cut(written, folder):
+        last = Path(written[-1].filename)  # no gap tells that it is missing
+        last.write_bytes(last.read_bytes()[:size])
+
+    return cut
+
+
 def _cut_short(written, folder):
     path = Path(written[4].filename)
     path.write_bytes(path.read_bytes()[:-20])
@@ -399,6 +407,8 @@ BAD = {
     "no position": (_without(2, "ImagePositionPatient"), "1-0002.dcm: it has no ImagePositionPatient"),
     "colour": (_set(1, SamplesPerPixel=3, PhotometricInterpretation="RGB"), "1-0001.dcm: expected one value per pixel"),
     "frames without places": (_set(0, NumberOfFrames=2), "2 frames without a place for each"),
+    "last slice cut in its header": (_series(_cut_before_its_rows(600)), "an image without Rows"),
+    "last slice cut in its first tags": (_series(_cut_before_its_rows(170)), "an image without Rows"),
     "truncated slice": (_series(_cut_short), "1-0004.dcm"),
     "compressed slices": (_series(_compressed), "its pixels are compressed (JPEG-LS"),
     "magnetic resonance": (

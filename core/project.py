@@ -76,6 +76,9 @@ def project_run(
             "the volume holds CT numbers (HU), air being -1000: their line integrals are no radiograph; "
             "convert them to attenuation (mu, 1/mm) first"
         )
+    lowest, highest = float(volume.array.min()), float(volume.array.max())
+    if isinstance(model, Emission) and lowest < -0.1 * abs(highest):  # interpolation leaves less
+        _warn(f"the activity is {lowest:g} to {highest:g} kBq/mL: what is below 0 makes counts below 0")
     views = system.views(shape=shape, detector=detector, magnification=magnification, pitch=pitch)
     _warn_of_unseen(volume, views, ends_at_plane=not isinstance(model, Emission))
     n_v, n_u = views.shape

@@ -121,7 +121,8 @@ def _headers(path: Path) -> list[tuple[Path, Any]]:
     # pydicom reads a file that ends early as one with fewer tags, the last of them cut: if it is no report, it is an image.
     kinds = set(map(_kind, headers.values()))
     for file, header in others.items():
-        if any(kind.startswith(_kind(header)) for kind in kinds) and wanted in (None, header.get("SeriesInstanceUID", wanted)):
+        of_series = wanted in (None, header.get("SeriesInstanceUID", wanted))
+        if of_series and any(kind.startswith(_kind(header)) for kind in kinds):
             raise InputError(f"{file.name}: an image without Rows: the file is cut off or damaged")
     return list(headers.items())
 

@@ -12,7 +12,7 @@ from .errors import InputError
 from .grid import Grid
 from .memory import require
 from .resampling import outside_value
-from .volume import Volume
+from .volume import Volume, require_volume
 
 
 def crop(volume: Volume, start: ArrayLike, stop: ArrayLike) -> Volume:
@@ -23,6 +23,7 @@ def crop(volume: Volume, start: ArrayLike, stop: ArrayLike) -> Volume:
     InputError
         Nothing would be left, or the indices reach beyond the grid.
     """
+    require_volume(volume, "crop")
     low, high = _indices(start, "crop start"), _indices(stop, "crop stop")
     shape = np.array(volume.grid.shape)
     if np.any(low < 0) or np.any(high > shape) or np.any(low >= high):
@@ -41,6 +42,7 @@ def crop_to_box(volume: Volume, low: ArrayLike, high: ArrayLike) -> Volume:
     InputError
         The box has no inside, or the volume is not in it.
     """
+    require_volume(volume, "crop_to_box")
     low, high = real_array(low, "box", (3,)), real_array(high, "box", (3,))
     if np.any(low >= high):
         raise InputError(f"box: expected low below high, got {low.tolist()} to {high.tolist()} mm")
@@ -65,6 +67,7 @@ def pad(volume: Volume, before: ArrayLike, after: ArrayLike, value: float | None
     value
         Of the new voxels. Default: 0, or -1000 of CT numbers.
     """
+    require_volume(volume, "pad")
     low, high = _indices(before, "pad before"), _indices(after, "pad after")
     if np.any(low < 0) or np.any(high < 0):
         raise InputError("pad: expected whole numbers of voxels of at least 0")
@@ -78,6 +81,7 @@ def pad(volume: Volume, before: ArrayLike, after: ArrayLike, value: float | None
 
 def canonical(volume: Volume) -> Volume:
     """The same voxels in the world, indexed along the axes closest to right, front, head (RAS): flipped, transposed."""
+    require_volume(volume, "canonical")
     directions = volume.grid.affine[:3, :3] / volume.grid.spacing
     # The assignment of index axes to world axes with the largest sum of cosines, so that none is taken twice.
     order = max(permutations(range(3)), key=lambda axes: sum(abs(directions[i, axis]) for i, axis in enumerate(axes)))
@@ -93,6 +97,7 @@ def canonical(volume: Volume) -> Volume:
 
 def centered(volume: Volume, point: ArrayLike = (0.0, 0.0, 0.0)) -> Volume:
     """The volume, moved so that its middle lies at `point` (3,), world mm; default the isocentre."""
+    require_volume(volume, "centered")
     affine = volume.grid.affine.copy()
     affine[:3, 3] += real_array(point, "point", (3,)) - volume.grid.center
     return Volume(volume.array, Grid(volume.grid.shape, affine), volume.quantity)
@@ -118,6 +123,7 @@ def split_labels(volume: Volume, labels: Volume | NDArray) -> dict[int, Volume]:
     InputError
         Another grid or shape, or labels that are no whole numbers.
     """
+    require_volume(volume, "split_labels")
     if isinstance(labels, Volume):
         same = labels.grid.shape == volume.grid.shape and np.allclose(
             labels.grid.affine, volume.grid.affine, rtol=0, atol=1e-3 * volume.grid.spacing.min()

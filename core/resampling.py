@@ -13,7 +13,7 @@ from .grid import Grid
 from .hounsfield import AIR_HU
 from .memory import require
 from .progress import Progress
-from .volume import Volume
+from .volume import Volume, require_volume
 
 # Indices of the given grid along an axis, and their weights: (n, taps) each, for n voxels of the new grid.
 _Taps = tuple[NDArray[np.int64], NDArray[np.float32]]
@@ -51,10 +51,13 @@ def resample(
     Raises
     ------
     InputError
-        An unknown method, or the new volume does not fit into memory.
+        No volume, no grid, an unknown method, or the new volume does not fit into memory.
     """
     if method not in ("linear", "nearest", "mean"):
         raise InputError(f"method {method!r}: expected linear, nearest or mean")
+    require_volume(volume, "resample")
+    if not isinstance(grid, Grid):
+        raise InputError(f"resample: expected a Grid, got {type(grid).__name__}")
     beside = np.float32(outside_value(volume) if outside is None else float(real_array(outside, "outside", ())))
     require(4.5 * grid.n_voxels, "a volume of {} x {} x {} voxels".format(*grid.shape))
     index_from_index = volume.grid.index_from_world @ grid.affine  # of the given volume, from the new one

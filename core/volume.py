@@ -69,5 +69,11 @@ class Volume:
         return UNITS[self.quantity]
 
 
+def require_volume(value: object, name: str) -> None:
+    """Raise `InputError` unless `value` is a `Volume`; `name` is what needs one."""
+    if not isinstance(value, Volume):
+        raise InputError(f"{name}: expected a Volume, got {type(value).__name__}")
+
+
 def _is_kept(array: NDArray[np.float32]) -> bool:
     return array.dtype == np.float32 and array.flags.c_contiguous and not array.flags.writeable

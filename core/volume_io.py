@@ -11,7 +11,7 @@ from .checks import real_array
 from .errors import InputError
 from .files import replacing
 from .progress import Cancelled, Progress
-from .volume import UNITS, Volume
+from .volume import UNITS, Volume, require_volume
 from .volume_formats import dicom, hdf5, metaimage, nifti, nrrd, numpy_files
 from .volume_formats.contents import Contents, first_line
 
@@ -118,12 +118,13 @@ def write_volume(volume: Volume, path: str | os.PathLike[str]) -> None:
     Raises
     ------
     InputError
-        Another suffix, or the file cannot be written.
+        No volume, another suffix, or the file cannot be written.
     """
     path = Path(path)
     write = _WRITERS.get(_ending(path, VOLUME_FORMATS))
     if write is None:
         raise InputError(f"{path}: expected a name ending in {', '.join(VOLUME_FORMATS)}")
+    require_volume(volume, "write_volume")
     with replacing(path) as temporary:
         write(volume, temporary)
 

@@ -12,11 +12,12 @@ from itertools import permutations
 import numpy as np
 from numpy.typing import NDArray
 
+from ..checks import real_array
 from ..errors import InputError
 from ..memory import require
 from ..progress import Progress
 from ..resampling import outside_value
-from ..volume import Volume
+from ..volume import Volume, require_volume
 from .mesh import Mesh
 
 # A cube's corners, numbered 4 x + 2 y + z. Each tetrahedron walks from corner 0 to 7 along the three axes in one order.
@@ -44,11 +45,12 @@ def volume_to_mesh(volume: Volume, level: float | None = None, progress: Progres
     Raises
     ------
     InputError
-        The level is not above what is beside the grid, or no voxel reaches it.
+        No volume, the level is no number, not above what is beside the grid, or no voxel reaches it.
     """
+    require_volume(volume, "volume_to_mesh")
     beside = outside_value(volume)
     highest = float(volume.array.max())
-    level = (beside + highest) / 2 if level is None else float(level)
+    level = (beside + highest) / 2 if level is None else float(real_array(level, "level", ()))
     if not beside < level <= highest:
         raise InputError(
             f"level {level:g}: expected above {beside:g}, the value beside the grid, and at most {highest:g}, the largest"

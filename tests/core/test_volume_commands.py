@@ -120,7 +120,10 @@ def test_project_converts_and_centers_a_ct(tmp_path, ct, workbook, capsys):
         (("--volume", tmp_path / "a.nrrd", "--energy", "80"), "it holds activity; --energy is for CT numbers"),
         (("--volume", ct_file, "--emission"), "ct.nrrd: it holds hu, expected activity in kBq/mL"),
         (("--volume", tmp_path / "a.nrrd", "--photons", "100"), "a.nrrd: it holds activity, expected mu in 1/mm"),
-        (("--volume", tmp_path / "a.nrrd", "--emission", "--mu", tmp_path / "a.nrrd"), "it holds activity, expected mu"),
+        (
+            ("--volume", tmp_path / "a.nrrd", "--emission", "--mu", tmp_path / "a.nrrd"),
+            "it holds activity, expected mu",
+        ),
         (("--energy", "80"), "--energy needs a --volume"),
         (("--center",), "--center needs --volume"),
     ):

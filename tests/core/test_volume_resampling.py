@@ -178,3 +178,24 @@ def test_labels_split_a_volume_into_its_parts(rng):
         mph.split_labels(volume, labels + 0.5)
     with pytest.raises(mph.InputError, match="expected 5 x 6 x 7 whole numbers"):
         mph.split_labels(volume, labels[1:])
+
+
+@pytest.mark.parametrize(
+    ("call", "message"),
+    [
+        (lambda array, grid: mph.resample(array, grid), "resample: expected a Volume, got ndarray"),
+        (lambda array, grid: mph.resample(mph.Volume(array, grid), array), "resample: expected a Grid, got ndarray"),
+        (lambda array, grid: mph.crop(array, 0, 1), "crop: expected a Volume"),
+        (lambda array, grid: mph.crop_to_box(array, (0, 0, 0), (1, 1, 1)), "crop_to_box: expected a Volume"),
+        (lambda array, grid: mph.pad(array, 1, 1), "pad: expected a Volume"),
+        (lambda array, grid: mph.canonical(array), "canonical: expected a Volume"),
+        (lambda array, grid: mph.centered(array), "centered: expected a Volume"),
+        (lambda array, grid: mph.split_labels(array, array), "split_labels: expected a Volume"),
+        (lambda array, grid: mph.volume_to_mesh(array), "volume_to_mesh: expected a Volume"),
+        (lambda array, grid: mph.volume_to_mesh(mph.Volume(array, grid), "high"), "level: expected real numbers"),
+        (lambda array, grid: mph.write_volume(array, "volume.npz"), "write_volume: expected a Volume"),
+    ],
+)
+def test_what_is_no_volume_is_said(call, message):
+    with pytest.raises(mph.InputError, match=message):
+        call(np.ones((2, 2, 2)), mph.Grid.centered(2, 1.0))

@@ -48,7 +48,8 @@ def random_pose(
         rng = np.random.default_rng(seed)
     else:
         raise InputError(f"seed: expected a whole number of at least 0 or a numpy Generator, got {seed!r}")
-    sides = real_array([box] * 3 if np.isscalar(box) else box, "box of random poses", (3,))
+    one_side = isinstance(box, int | float | np.integer | np.floating)
+    sides = real_array(np.full(3, box) if one_side else box, "box of random poses", (3,))
     if np.any(sides < 0):
         raise InputError(f"box of random poses: expected 0 or more mm, got {sides.min():g}")
     middle = real_array(center, "centre of random poses", (3,))

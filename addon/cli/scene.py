@@ -8,7 +8,7 @@ from pathlib import Path
 from ...core.cli.options import add_command, chosen_modules, output_path
 from ...core.errors import InputError
 from ...core.export import read_run
-from ...core.volume_io import read_volume
+from ...core.volume_io import read_volume, read_volume_of
 from ...core.workbook import read_system
 
 
@@ -37,7 +37,7 @@ def _run(arguments: argparse.Namespace) -> None:
         raise InputError(f"{path}: expected a name ending in .blend")
     system = chosen_modules(read_system(arguments.workbook), arguments.modules)
     volume = read_volume(arguments.volume) if arguments.volume else None
-    mu = read_volume(arguments.mu, "mu") if arguments.mu else None
+    mu = read_volume_of(arguments.mu, "mu") if arguments.mu else None
     run = read_run(arguments.run_file) if arguments.run_file else None
 
     from .session import new_scene, save_scene

@@ -68,6 +68,13 @@ def test_scene_command_refuses_in_one_line(tmp_path, workbook):
     assert not list(tmp_path.iterdir())
 
 
+def test_scene_command_refuses_activity_as_mu(tmp_path, workbook):
+    mph.write_volume(mph.Volume(np.ones((2, 2, 2)), mph.Grid.centered(2, 1.0), "activity"), tmp_path / "a.nii")
+    done = run("-m", "mphdrr", "scene", workbook, "--mu", tmp_path / "a.nii", "-o", tmp_path / "s.blend", status=1)
+    assert "a.nii: it holds activity, expected mu in 1/mm" in done.stderr
+    assert not (tmp_path / "s.blend").exists()
+
+
 def test_pictures_leave_the_scene_as_it_was(tmp_path, dc_spect, scene):
     from mphdrr.addon import pictures, scanner
 

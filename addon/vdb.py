@@ -25,6 +25,7 @@ from ..core.memory import require
 from ..core.version import VERSION
 from ..core.volume import UNITS, Volume
 from . import compat
+from .vdb_length import missing_bytes
 
 SMOKE = "smoke for display"
 """Name of a grid that only Blender's solid viewport uses."""
@@ -114,6 +115,8 @@ def read_vdb(path: str | Path, quantity: str | None = None, grid: str | None = N
     if quantity is not None and quantity not in UNITS:
         raise InputError(f"quantity {quantity!r}: expected one of {', '.join(UNITS)}")
     unit = positive(unit, "unit of the file's lengths", "mm")
+    if missing := missing_bytes(path):
+        raise InputError(f"{path}: is cut off, {missing} bytes are missing at its end")
     try:
         name = _chosen(_described(path), quantity, grid)
         return _volume_of(openvdb().read(str(path), name), quantity, unit)

@@ -181,7 +181,7 @@ def _bad(path, kind):
         ("no grids", "holds no grid"),
         ("far voxel", "memory"),
         ("infinite", "not a finite number"),
-        ("cut in the voxels", "cannot be read"),
+        ("cut in the voxels", "is cut off, "),
         ("cut in the header", "holds no grid"),
         ("text", "cannot be read"),
         ("nothing", "cannot be read"),
@@ -206,3 +206,20 @@ def test_arguments_are_checked(tmp_path):
             read_vdb(tmp_path / "a.vdb", **arguments)
     with pytest.raises(InputError, match="no such file"):
         read_vdb(tmp_path / "none.vdb")
+
+
+@pytest.mark.parametrize("several", [False, True])
+def test_every_cut_off_file_is_refused(tmp_path, several):
+    rng = np.random.default_rng(3)
+    grid = Grid.centered((13, 11, 17), 2.0)
+    volumes = [Volume(rng.random(grid.shape, dtype=np.float32), grid, name) for name in ("activity", "mu")]
+    path = tmp_path / "whole.vdb"
+    write_vdb(volumes if several else volumes[0], path, {"from": "a test"})
+    whole = path.read_bytes()
+    assert np.array_equal(read_vdb(path, "activity").array, volumes[0].array)
+    cut = tmp_path / "cut.vdb"
+    for length in {*range(len(whole) - 40, len(whole)), *rng.integers(0, len(whole), 100).tolist()}:
+        cut.write_bytes(whole[:length])
+        with pytest.raises(InputError, match=r"cut\.vdb: ") as refused:
+            read_vdb(cut, "activity")
+        assert "\n" not in str(refused.value)

@@ -21,6 +21,8 @@ ROOT = Path(__file__).resolve().parents[2]
 REAL_BLENDER = Path(os.environ.get("REAL_BLENDER", ROOT.parent / "shared/tools/real-blender"))
 OUTPUT = ROOT / "out" / "test-app"
 MODULE = "bl_ext.user_default.mphdrr"
+# Where the script binds the top folder of this repository's path into Blender's root.
+BOUND = Path(os.environ.get("REAL_BLENDER_ROOT", "/opt/real-blender")).joinpath(*ROOT.parts[1:2])
 
 Run = Callable[..., subprocess.CompletedProcess[str]]
 
@@ -32,16 +34,28 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
                 item.add_marker(pytest.mark.skip(reason=f"needs a real Blender: no {REAL_BLENDER}"))
 
 
+def real_blender(
+    *arguments: str | Path, home: Path, network: bool = False, timeout: float = 300
+) -> subprocess.CompletedProcess[str]:
+    """The script with these arguments, with mounts of its own and, unless asked, without network.
+
+    The script leaves its mount of our folder behind, and takes what is mounted there for ours: once the folder was
+    deleted and made anew, it would show the deleted one. Mounts of its own end with it, and begin without an old one.
+    """
+    command = [str(REAL_BLENDER), *map(str, arguments)]
+    if shutil.which("unshare"):
+        afresh = 'while umount --lazy "$0" 2>/dev/null; do :; done; exec "$@"'
+        command = ["unshare", "--mount", *([] if network else ["--net"]), "bash", "-c", afresh, str(BOUND), *command]
+    environment = {**os.environ, "REAL_BLENDER_HOME": str(home)}
+    return subprocess.run(
+        command, cwd=ROOT, env=environment, stdin=subprocess.DEVNULL, capture_output=True, text=True, timeout=timeout
+    )
+
+
 def run_blender(
     *arguments: str | Path, home: Path, check: bool = True, network: bool = False, timeout: float = 300
 ) -> subprocess.CompletedProcess[str]:
-    command = [str(REAL_BLENDER), "run", *map(str, arguments)]
-    if not network and shutil.which("unshare"):
-        command = ["unshare", "--net", *command]
-    environment = {**os.environ, "REAL_BLENDER_HOME": str(home)}
-    done = subprocess.run(
-        command, cwd=ROOT, env=environment, stdin=subprocess.DEVNULL, capture_output=True, text=True, timeout=timeout
-    )
+    done = real_blender("run", *arguments, home=home, network=network, timeout=timeout)
     if check and done.returncode != 0:
         pytest.fail(f"blender ended with status {done.returncode}\n{done.stdout[-4000:]}\n{done.stderr[-4000:]}")
     return done
@@ -112,17 +126,7 @@ def blender_window(home: Path, work_folder: Path) -> Callable[..., Path]:
     def run(text: str, *arguments: str | Path, seconds: float = 12) -> Path:
         script, picture = work_folder / "window.py", work_folder / "window.png"
         script.write_text(text, encoding="utf-8")
-        command = [str(REAL_BLENDER), "screenshot", str(picture), str(script), str(seconds), *map(str, arguments)]
-        environment = {**os.environ, "REAL_BLENDER_HOME": str(home)}
-        done = subprocess.run(
-            command,
-            cwd=ROOT,
-            env=environment,
-            stdin=subprocess.DEVNULL,
-            capture_output=True,
-            text=True,
-            timeout=seconds + 120,
-        )
+        done = real_blender("screenshot", picture, script, str(seconds), *arguments, home=home, timeout=seconds + 120)
         if not picture.is_file():
             pytest.fail(f"no screenshot\n{done.stdout[-4000:]}\n{done.stderr[-4000:]}")
         return picture

@@ -87,7 +87,14 @@ def read_volume(
         raise InputError(f"{path}: {error}") from None
 
 
-def read_volume_of(path: str | os.PathLike[str], quantity: str, advice: str = "") -> Volume:
+def read_volume_of(
+    path: str | os.PathLike[str],
+    quantity: str,
+    advice: str = "",
+    *,
+    series: str | None = None,
+    progress: Progress | None = None,
+) -> Volume:
     """Read a volume that has to hold `quantity`: a file that says nothing is taken for it.
 
     Parameters
@@ -96,6 +103,8 @@ def read_volume_of(path: str | os.PathLike[str], quantity: str, advice: str = ""
         The file; one of `UNITS`.
     advice
         Ends the message to a file that says another quantity.
+    series, progress
+        As of `read_volume`.
 
     Raises
     ------
@@ -103,7 +112,7 @@ def read_volume_of(path: str | os.PathLike[str], quantity: str, advice: str = ""
         The file says that it holds another quantity; as of `read_volume`.
     """
     path = Path(path)
-    contents = _contents(path, None, None)
+    contents = _contents(path, series, progress)
     try:
         if contents.quantity in UNITS and contents.quantity != quantity:
             raise InputError(f"it holds {contents.quantity}, expected {quantity} in {UNITS[quantity]}{advice}")

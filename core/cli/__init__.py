@@ -16,6 +16,7 @@ from typing import Any, NoReturn
 from ..errors import InputError, InputWarning
 from ..progress import Cancelled
 from ..version import VERSION
+from .options import NotingStore
 
 AddParser = Callable[[Any], None]
 
@@ -23,7 +24,12 @@ OK, INPUT_ERROR, USAGE, INTERRUPTED = 0, 1, 2, 130
 
 
 class _Parser(argparse.ArgumentParser):
-    """An argument parser whose errors are one line on standard error, with status 2."""
+    """An argument parser whose errors are one line on standard error, with status 2, and that notes what was typed."""
+
+    def __init__(self, *arguments: Any, **details: Any) -> None:
+        super().__init__(*arguments, **details)
+        for name in (None, "store"):
+            self.register("action", name, NotingStore)
 
     def error(self, message: str) -> NoReturn:
         sys.stderr.write(f"{self.prog}: {message} (see {self.prog} --help)\n")
@@ -64,7 +70,7 @@ def main(argv: Sequence[str] | None = None, more_commands: Sequence[AddParser] =
         except MemoryError:
             return _fail("not enough memory: choose fewer voxels or pixels", INPUT_ERROR)
         except (KeyboardInterrupt, Cancelled):
-            return _fail("cancelled; nothing was written", INTERRUPTED)
+            return _fail("cancelled; no file is left half-written", INTERRUPTED)
         except BrokenPipeError:  # the reader, such as `head`, has had enough
             with contextlib.suppress(OSError):
                 sys.stdout.close()

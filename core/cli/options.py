@@ -6,7 +6,9 @@ import argparse
 import sys
 import textwrap
 import time
+from collections.abc import Iterable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,6 +18,11 @@ from ..files import ensure_folder, refuse_folder
 from ..isotopes import ISOTOPES
 from ..progress import Progress
 from ..system import PinholeSystem
+
+DERENZO_OPTIONS = ("radius", "rods", "sectors", "height", "activity", "water", "background")
+"""Of `add_phantom_options`, those that say what the Derenzo phantom is."""
+PLACING_OPTIONS = ("position", "euler", "voxels", "spacing")
+"""Of `add_placing_options`."""
 
 _HANGING = 15 * " "  # under the second column of lists in descriptions
 
@@ -36,6 +43,25 @@ class _HelpFormatter(argparse.HelpFormatter):
             return action.help
         default = action.default if isinstance(action.default, list) else [action.default]
         return f"{action.help} (default: {' '.join(map(str, default)).replace('%', '%%')})"
+
+
+class NotingStore(argparse.Action):
+    """Stores an option's value, and notes that it was typed, so that `refuse` can tell it from a default."""
+
+    def __call__(
+        self, parser: argparse.ArgumentParser, namespace: argparse.Namespace, values: Any, option_string: Any = None
+    ) -> None:
+        """Called by argparse."""
+        setattr(namespace, self.dest, values)
+        vars(namespace).setdefault("typed", {})[self.dest] = option_string
+
+
+def refuse(arguments: argparse.Namespace, names: Iterable[str], why: str) -> None:
+    """Raise `InputError` if one of the options that are stored as `names` was typed: the option, and `why` not."""
+    noted = getattr(arguments, "typed", {})
+    for name in names:
+        if name in noted or getattr(arguments, name, None) is True:  # a flag
+            raise InputError(f"{noted.get(name, '--' + name.replace('_', '-'))} {why}")
 
 
 def add_command(subparsers, name: str, summary: str, example: str) -> argparse.ArgumentParser:  # type: ignore[no-untyped-def]
@@ -138,6 +164,15 @@ def output_path(text: str, suffixes: tuple[str, ...] = ()) -> Path:
     refuse_folder(path)
     ensure_folder(path.parent)
     return path
+
+
+def numbered_path(path: Path, number: int, count: int) -> Path:
+    """Of `count` files, the one with that number: train-007.nii.gz for train.nii.gz, or `path` itself where it is all."""
+    if count == 1:
+        return path
+    suffix = ".nii.gz" if path.name.lower().endswith(".nii.gz") else path.suffix
+    end = len(path.name) - len(suffix)
+    return path.with_name(f"{path.name[:end]}-{number:0{len(str(count))}}{path.name[end:]}")
 
 
 def photon_energy(text: str) -> float:

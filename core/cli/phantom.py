@@ -27,7 +27,17 @@ from ..phantoms.random import random_pose
 from ..phantoms.shapes import Box, Cylinder, Ellipsoid, Sphere
 from ..volume import UNITS, Volume
 from ..volume_io import VOLUME_FORMATS, write_volume
-from .options import add_command, add_phantom_options, add_placing_options, one_or_three, output_path, progress_bar
+from .options import (
+    PLACING_OPTIONS,
+    add_command,
+    add_phantom_options,
+    add_placing_options,
+    numbered_path,
+    one_or_three,
+    output_path,
+    progress_bar,
+    refuse,
+)
 
 _DEST = "of_phantom_"  # before a setting's name, for the voxels have a spacing too
 Make = Callable[[argparse.Namespace], Phantom]
@@ -68,6 +78,11 @@ def add_parser(subparsers) -> None:  # type: ignore[no-untyped-def]
         example = f"mphdrr phantom {kind.name} {_EXAMPLES[kind.name]} -o {kind.name}.nii.gz"
         parser = add_command(kinds, kind.name, f"make {kind.summary}", example)
         _add_settings(parser, kind.phantom)
+        if hasattr(kind.phantom, "beating"):
+            parser.add_argument(
+                "--frames", type=int, default=argparse.SUPPRESS, metavar="N",
+                help="states of the heart's cycle instead of one --phase, as FILE-1, FILE-2 …",
+            )  # fmt: skip
         add_placing_options(parser)
         _add_output(parser, partial(_of_kind, kind.phantom))
     for name, shape, dimensions, example in _SHAPES:
@@ -86,19 +101,19 @@ def add_parser(subparsers) -> None:  # type: ignore[no-untyped-def]
     _add_output(file, lambda arguments: read_phantom(arguments.file))
 
 
-def derenzo_volume(arguments: argparse.Namespace) -> tuple[Volume, dict[str, Any]]:
-    """The phantom that the options of `add_phantom_options` describe, and what it was made from."""
-    phantom = _derenzo(arguments)
-    volume = phantom.voxelize(_grid(phantom, arguments), _pose(arguments), progress_bar("voxelizing"))
-    return volume, _recipe({"kind": "derenzo", **dataclasses.asdict(phantom)}, arguments)
+def chosen_phantom(arguments: argparse.Namespace, path: str | None) -> tuple[Phantom, dict[str, Any]]:
+    """The phantom of a TOML file, or without one of `add_phantom_options`, and what it was made from."""
+    if path is not None:
+        phantom = read_phantom(path)
+        return phantom, _recipe({"kind": "file", "file": Path(path).name, "name": phantom.name}, arguments)
+    derenzo = _derenzo(arguments)
+    return derenzo, _recipe({"kind": "derenzo", **dataclasses.asdict(derenzo)}, arguments)
 
 
-def file_volume(path: str, arguments: argparse.Namespace, quantity: str) -> tuple[Volume, dict[str, Any]]:
-    """The phantom of a TOML file at the place of `add_placing_options`, and what it was made from."""
-    phantom = read_phantom(path)
+def placed_volume(phantom: Phantom, arguments: argparse.Namespace, quantity: str) -> Volume:
+    """The phantom on the grid and at the place of `add_placing_options`."""
     grid, pose = _grid(phantom, arguments), _pose(arguments)
-    volume = phantom.voxelize(grid, pose, progress_bar("voxelizing"), quantity=quantity)
-    return volume, _recipe({"kind": "file", "file": Path(path).name, "name": phantom.name}, arguments)
+    return phantom.voxelize(grid, pose, progress_bar("voxelizing"), quantity)
 
 
 def _recipe(phantom: dict[str, Any], arguments: argparse.Namespace) -> dict[str, Any]:
@@ -181,30 +196,48 @@ def _grid(phantom: Phantom, arguments: argparse.Namespace, room: float = 0.0) ->
     )
 
 
-def _run(arguments: argparse.Namespace) -> None:
-    path = output_path(arguments.output, (*VOLUME_FORMATS, ".toml"))
-    phantom = arguments.make(arguments)
+def _require_fitting(arguments: argparse.Namespace, is_text: bool) -> None:
+    """Refuse options that would have no effect beside the others."""
     if arguments.count < 1:
         raise InputError(f"--count: expected at least 1, got {arguments.count}")
     if arguments.random is None and (arguments.count > 1 or any(arguments.box)):
         raise InputError("--count and --box need --random")
-    if path.suffix.lower() == ".toml":
-        if arguments.random is not None:
-            raise InputError(f"{path}: a random place is the voxels'; expected {', '.join(VOLUME_FORMATS)}")
+    if arguments.random is not None:
+        refuse(arguments, ("euler",), "has no effect with --random, which draws the angles")
+    if "frames" in arguments:
+        refuse(arguments, (f"{_DEST}phase",), "has no effect with --frames, which takes phases evenly over the cycle")
+    if is_text:
+        refuse(
+            arguments,
+            (*PLACING_OPTIONS, "quantity", "random", "frames", "json"),
+            f"is of voxels, and a .toml holds the shapes alone; expected {', '.join(VOLUME_FORMATS)}",
+        )
+
+
+def _run(arguments: argparse.Namespace) -> None:
+    path = output_path(arguments.output, (*VOLUME_FORMATS, ".toml"))
+    is_text = path.suffix.lower() == ".toml"
+    _require_fitting(arguments, is_text)
+    phantom = arguments.make(arguments)
+    if is_text:
         write_phantom(phantom, path)
         print(f"{path}: {len(phantom.shapes)} shapes, {phantom.total_activity:.4g} kBq in all")
         return
+    states = phantom.beating(arguments.frames) if "frames" in arguments else [phantom]
     box = one_or_three(arguments.box)
-    grid = _grid(phantom, arguments, room=max(box))
+    grid = _grid(max(states, key=lambda state: state.extent), arguments, room=max(box))
     rng = None if arguments.random is None else np.random.default_rng(_seed(arguments.random))
     written = []
-    for number in range(1, arguments.count + 1):
-        pose = _pose(arguments) if rng is None else random_pose(rng, box, arguments.position)
-        volume = phantom.voxelize(grid, pose, progress_bar("voxelizing"), quantity=arguments.quantity)
-        file = path if arguments.count == 1 else _numbered(path, number, arguments.count)
+    for index in range(arguments.count * len(states)):
+        state = states[index % len(states)]
+        if state is states[0]:  # the others lie where the first does
+            pose = _pose(arguments) if rng is None else random_pose(rng, box, arguments.position)
+        volume = state.voxelize(grid, pose, progress_bar("voxelizing"), quantity=arguments.quantity)
+        file = numbered_path(path, index + 1, arguments.count * len(states))
         write_volume(volume, file)
         held = _held(volume)
-        written.append({"file": str(file), "pose": pose.tolist(), "quantity": volume.quantity, **held})
+        about = {"file": str(file), "pose": pose.tolist(), "quantity": volume.quantity, **held}
+        written.append({**about, "phase": state.phase} if len(states) > 1 else about)
         if not arguments.json:
             said = (
                 f"{held['total_kBq']:.4g} kBq in all" if "total_kBq" in held else f"mu up to {held['largest']:.4g} 1/mm"
@@ -225,8 +258,3 @@ def _seed(seed: int) -> int:
     if seed < 0:
         raise InputError(f"--random: expected a seed of at least 0, got {seed}")
     return seed
-
-
-def _numbered(path: Path, number: int, count: int) -> Path:
-    suffix = ".nii.gz" if path.name.lower().endswith(".nii.gz") else path.suffix
-    return path.with_name(f"{path.name[: -len(suffix)]}-{number:0{len(str(count))}}{path.name[-len(suffix) :]}")

@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 import argparse
+import itertools
 import math
+import warnings
+from collections.abc import Iterator, Sequence
 from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from ..errors import InputError
+from ..errors import InputError, InputWarning
 from ..export import FORMATS, write_run
 from ..hounsfield import hu_to_mu
 from ..isotopes import CZT_MU, ISOTOPES, NAI_MU, TUNGSTEN_MU
@@ -23,17 +26,23 @@ from ..volume import Volume
 from ..volume_io import read_volume, read_volume_of
 from ..workbook import read_system
 from .options import (
+    DERENZO_OPTIONS,
+    PLACING_OPTIONS,
     add_command,
     add_phantom_options,
     add_view_options,
     chosen_modules,
+    numbered_path,
     output_path,
     photon_energy,
     progress_bar,
+    refuse,
 )
-from .phantom import derenzo_volume, file_volume
+from .phantom import chosen_phantom, placed_volume
 
 _EMISSION = [field.name for field in fields(Emission)]
+Source = tuple[Volume, Volume | None, dict[str, Any]]
+"""What is projected, what attenuates it, and what to record of them."""
 
 
 def add_parser(subparsers) -> None:  # type: ignore[no-untyped-def]
@@ -44,20 +53,30 @@ def add_parser(subparsers) -> None:  # type: ignore[no-untyped-def]
         "project a volume, or a phantom, into every module",
         "mphdrr project scanner.xlsx --volume ct.nii.gz --size 250 250 -o run.h5\n"
         "example: mphdrr project scanner.xlsx --volume heart.nii.gz --mu ct-mu.nii.gz --emission --isotope Tc-99m "
-        "--time 600 --aperture-points 7 --aperture-mu 3.6 --crystal-mu 0.404 --noise 1 -o counts.h5",
+        "--time 600 --aperture-points 7 --aperture-mu 3.6 --crystal-mu 0.404 --noise 1 -o counts.h5\n"
+        "example: mphdrr project scanner.xlsx --phantom thorax.toml --phantom-mu --emission --isotope Tc-99m -o counts.h5",
     )
     parser.add_argument("workbook", metavar="WORKBOOK", help="geometry workbook (.xlsx, .xlsm)")
     source = parser.add_mutually_exclusive_group()
     source.add_argument(
         "--volume", metavar="FILE", help="volume or folder of a DICOM series; without it, a Derenzo phantom is made"
     )
+    source.add_argument(
+        "--states", nargs="+", metavar="FILE",
+        help="volumes of what changes, such as a beating heart: a run of each, as OUTPUT-1, OUTPUT-2 …",
+    )  # fmt: skip
     source.add_argument("--phantom", metavar="FILE", help="a phantom's shapes (.toml), put on the grid given below")
+    parser.add_argument(
+        "--series", metavar="NAME", help="of several DICOM series in --volume, by number, description or UID"
+    )
     parser.add_argument(
         "--energy", metavar="KEV",
         help="CT numbers of --volume or --mu become attenuation (1/mm) at this energy, or at an isotope's strongest line",
     )  # fmt: skip
     parser.add_argument(
-        "--center", action="store_true", help="move the volume's middle to the isocentre, and --mu as far"
+        "--center",
+        action="store_true",
+        help="move the volume's middle to the isocentre, other --states and --mu as far",
     )
     add_view_options(parser)
     models = parser.add_argument_group("what pixels hold; without an option, line integrals")
@@ -91,10 +110,16 @@ def add_emission_options(parser: argparse.ArgumentParser) -> None:
         source, "--window", type=float, nargs=2, metavar=("LOW", "HIGH"),
         help="energies that are counted, keV (default: 10 %% around the isotope's strongest line)",
     )  # fmt: skip
+    attenuation = source.add_mutually_exclusive_group()
     option(
-        source, "--mu", metavar="FILE",
-        help="attenuation coefficients, 1/mm, on any grid, or with --energy CT numbers; without it, none",
+        attenuation, "--mu", metavar="FILE",
+        help="attenuation coefficients, 1/mm, on any grid, or with --energy CT numbers (a DICOM folder, too); "
+        "without it, none",
     )  # fmt: skip
+    attenuation.add_argument(
+        "--phantom-mu", action="store_true", help="the phantom's own attenuation coefficients, on its activity's grid"
+    )
+    source.add_argument("--mu-series", metavar="NAME", help="of several DICOM series in --mu, as --series")
     aperture = parser.add_argument_group("--emission: the pinhole")
     option(
         aperture, "--aperture-points", type=int, metavar="N", help="rays through the hole of each pixel (default: 1)"
@@ -127,40 +152,54 @@ def add_emission_options(parser: argparse.ArgumentParser) -> None:
 
 
 def chosen_model(arguments: argparse.Namespace, system: PinholeSystem, mu: Volume | None) -> Model:
-    """The model that `arguments` ask for; `mu` is what --mu holds."""
-    given = {name: getattr(arguments, name) for name in _EMISSION if hasattr(arguments, name)}
+    """The model that `arguments` ask for; `mu` is what attenuates."""
+    given = {name: getattr(arguments, name) for name in _EMISSION if hasattr(arguments, name)} | {"mu": mu}
     if arguments.inverse_square:
         return InverseSquareSum(system)
     if not arguments.emission:
         return Transmission()
-    if mu is not None:
-        given["mu"] = mu
     if "opening_angle" in given:
         given["opening_angle"] = math.radians(given["opening_angle"])
     return Emission(system, **given)
 
 
 def _require_fitting(arguments: argparse.Namespace) -> None:
-    """Refuse options that mean nothing with the others."""
-    given = [name for name in _EMISSION if hasattr(arguments, name)]
-    if given and not arguments.emission:
-        raise InputError(f"--{given[0].replace('_', '-')} needs --emission")
-    if arguments.noise is not None and not arguments.emission and arguments.photons is None:
-        raise InputError("--noise needs --emission or --photons")
-    if arguments.center and not arguments.volume:
-        raise InputError("--center needs --volume")
-    if arguments.energy is not None and not (hasattr(arguments, "mu") or (arguments.volume and not arguments.emission)):
-        raise InputError("--energy needs a --volume of CT numbers, or with --emission a --mu of them")
+    """Refuse options that would have no effect beside the others."""
+    if not arguments.emission:
+        refuse(arguments, (*_EMISSION, "phantom_mu", "mu_series"), "needs --emission")
+        if arguments.photons is None:
+            refuse(arguments, ("noise",), "needs --emission or --photons")
+    if arguments.volume or arguments.states:
+        source = "--volume" if arguments.volume else "--states"
+        refuse(arguments, (*DERENZO_OPTIONS, *PLACING_OPTIONS, "phantom_mu"), f"is for a phantom, not for {source}")
+    else:
+        refuse(arguments, ("center",), "needs --volume or --states")
+        if arguments.phantom:
+            refuse(arguments, DERENZO_OPTIONS, "is for the Derenzo phantom, not for --phantom")
+    if not arguments.volume:
+        refuse(arguments, ("series",), "needs --volume")
+    if "mu" not in arguments:
+        refuse(arguments, ("mu_series",), "needs --mu")
+        if arguments.emission or not (arguments.volume or arguments.states):
+            refuse(arguments, ("energy",), "needs a --volume of CT numbers, or with --emission a --mu of them")
+    if "aperture_mu" not in arguments:
+        refuse(arguments, ("edge",), "needs --aperture-mu")
+        if "within_cone" not in arguments:
+            refuse(arguments, ("opening_angle",), "needs --aperture-mu or --within-cone")
+    if arguments.backend in ("cuda", "torch"):
+        refuse(arguments, ("threads",), f"is for numba and numpy: {arguments.backend} has threads of its own")
 
 
-def _attenuation(path: str, energy: str | None) -> Volume:
+def _attenuation(path: str, energy: str | None, series: str | None) -> Volume:
     """The volume of mu in a file: as it is, or from CT numbers at `energy`."""
+    progress = progress_bar("reading")
     if energy is not None:
-        volume = read_volume(path)
+        volume = read_volume(path, series=series, progress=progress)
         if volume.quantity != "hu":
             raise InputError(f"{path}: it holds {volume.quantity}; --energy is for CT numbers (hu)")
         return hu_to_mu(volume, photon_energy(energy))
-    volume = read_volume_of(path, "mu", "; of CT numbers, give --energy to convert them")
+    advice = "; of CT numbers, give --energy to convert them"
+    volume = read_volume_of(path, "mu", advice, series=series, progress=progress)
     lowest = float(volume.array.min())
     if lowest < -1:  # interpolation may leave values a little below 0
         raise InputError(
@@ -169,58 +208,91 @@ def _attenuation(path: str, energy: str | None) -> Volume:
     return volume
 
 
-def _volumes(arguments: argparse.Namespace) -> tuple[Volume, Volume | None, dict[str, Any]]:
-    """What is projected, what attenuates it, and what a phantom was made from."""
-    recipe: dict[str, Any] = {}
-    if arguments.phantom:
-        quantity = "mu" if arguments.photons is not None else "activity"
-        volume, recipe = file_volume(arguments.phantom, arguments, quantity)
-    elif not arguments.volume:
-        volume, recipe = derenzo_volume(arguments)
-    elif arguments.emission:
-        volume = read_volume_of(arguments.volume, "activity")
-    elif arguments.photons is not None or arguments.energy is not None:
-        volume = _attenuation(arguments.volume, arguments.energy)
-    else:
-        volume = read_volume(arguments.volume)
-    mu = _attenuation(arguments.mu, arguments.energy) if hasattr(arguments, "mu") else None
-    if arguments.center:
-        if mu is not None:
-            mu = centered(mu, mu.grid.center - volume.grid.center)
-        volume = centered(volume)
-    return volume, mu, recipe
+def _volume(path: str, arguments: argparse.Namespace) -> Volume:
+    """What a file of --volume or --states holds, as the chosen model takes it."""
+    if arguments.emission:
+        return read_volume_of(path, "activity", series=arguments.series, progress=progress_bar("reading"))
+    if arguments.photons is not None or arguments.energy is not None:
+        return _attenuation(path, arguments.energy, arguments.series)
+    return read_volume(path, series=arguments.series, progress=progress_bar("reading"))
+
+
+def _of_files(files: Sequence[str], mu: Volume | None, arguments: argparse.Namespace) -> Iterator[Source]:
+    """The volumes of --volume or --states, one at a time; with --center all are moved as the first, mu too."""
+    middle = None
+    for file in files:
+        volume = _volume(file, arguments)
+        settings: dict[str, Any] = {"volume": Path(file).name}
+        if arguments.center:
+            if middle is None:
+                middle = volume.grid.center
+                mu = None if mu is None else centered(mu, mu.grid.center - middle)
+            volume = centered(volume, volume.grid.center - middle)
+            settings["centered"] = True
+        yield volume, mu, settings
+
+
+def _of_phantom(mu: Volume | None, model: Model, arguments: argparse.Namespace) -> Iterator[Source]:
+    """The phantom, attenuated by itself with --phantom-mu."""
+    phantom, settings = chosen_phantom(arguments, arguments.phantom)
+    settings = {"volume": Path(arguments.phantom or "Derenzo phantom").name, **settings}
+    if arguments.phantom_mu:
+        if all(shape.mu is None for shape in phantom.shapes):
+            raise InputError(f"--phantom-mu: no shape of the {phantom.title} has a mu")
+        window = model.window if isinstance(model, Emission) else None
+        if window is not None and not window[0] <= phantom.mu_energy <= window[1]:
+            warnings.warn(
+                f"the mu of the {phantom.title} holds at {phantom.mu_energy:g} keV, photons of {window[0]:g} to "
+                f"{window[1]:g} keV are counted",
+                InputWarning,
+                stacklevel=2,
+            )
+        mu = placed_volume(phantom, arguments, "mu")
+        settings["mu_of_phantom_at_kev"] = phantom.mu_energy
+    quantity = "mu" if arguments.phantom and arguments.photons is not None else "activity"
+    yield placed_volume(phantom, arguments, quantity), mu, settings
 
 
 def _run(arguments: argparse.Namespace) -> None:
     path = output_path(arguments.output, FORMATS)
     picture = output_path(arguments.mosaic) if arguments.mosaic else None
-    system = chosen_modules(read_system(arguments.workbook), arguments.modules)
     _require_fitting(arguments)
-    volume, mu, recipe = _volumes(arguments)
-    run = project_run(
-        system,
-        volume,
-        shape=tuple(arguments.size),
-        detector=arguments.detector,
-        magnification=arguments.magnification,
-        pitch=arguments.pitch,
-        backend=arguments.backend,
-        threads=arguments.threads,
-        settings={
-            "volume": Path(arguments.volume or arguments.phantom or "Derenzo phantom").name,
-            **recipe,
-            **({"mu_file": Path(arguments.mu).name} if hasattr(arguments, "mu") else {}),
-            **({"ct_converted_at_kev": photon_energy(arguments.energy)} if arguments.energy is not None else {}),
-            **({"centered": True} if arguments.center else {}),
-        },
-        model=chosen_model(arguments, system, mu),
-        photons=arguments.photons,
-        noise_seed=arguments.noise,
-        progress=progress_bar("projecting"),
-    )
-    write_run(run, path)
-    if picture is not None:
-        write_png(mosaic(run.projections), picture)
-    n_v, n_u = run.views.shape
-    count, largest = len(run.views), float(np.max(run.projections))
-    print(f"{path}: {count} projection{'s' * (count > 1)} of {n_v} x {n_u} pixels, largest {largest:.4g} {run.unit}")
+    system = chosen_modules(read_system(arguments.workbook), arguments.modules)
+    model = chosen_model(arguments, system, None)  # before the long work: it says what cannot be
+    files = arguments.states or ([arguments.volume] if arguments.volume else [])
+    count = max(1, len(files))
+    for number, file in itertools.product(range(1, count + 1), files):
+        if numbered_path(path, number, count).resolve() == Path(file).resolve():
+            raise InputError(f"{file}: the projections would replace what is projected; choose another --output")
+    mu = _attenuation(arguments.mu, arguments.energy, arguments.mu_series) if "mu" in arguments else None
+    sources = _of_files(files, mu, arguments) if files else _of_phantom(mu, model, arguments)
+    for number, (volume, mu_of_it, settings) in enumerate(sources, 1):
+        run = project_run(
+            system,
+            volume,
+            shape=tuple(arguments.size),
+            detector=arguments.detector,
+            magnification=arguments.magnification,
+            pitch=arguments.pitch,
+            backend=arguments.backend,
+            threads=arguments.threads,
+            settings={
+                **settings,
+                **({"mu_file": Path(arguments.mu).name} if "mu" in arguments else {}),
+                **({"ct_converted_at_kev": photon_energy(arguments.energy)} if arguments.energy is not None else {}),
+            },
+            model=chosen_model(arguments, system, mu_of_it),
+            photons=arguments.photons,
+            # Noise of its own for each state.
+            noise_seed=None if arguments.noise is None else arguments.noise + number - 1,
+            progress=progress_bar("projecting"),
+        )
+        file = numbered_path(path, number, count)
+        write_run(run, file)
+        if picture is not None:
+            write_png(mosaic(run.projections), numbered_path(picture, number, count))
+        n_v, n_u = run.views.shape
+        views, largest = len(run.views), float(np.max(run.projections))
+        print(
+            f"{file}: {views} projection{'s' * (views > 1)} of {n_v} x {n_u} pixels, largest {largest:.4g} {run.unit}"
+        )

@@ -1,9 +1,9 @@
 """DICOM series, by pydicom: slices are put in order by their place in the patient, and what does not fit is named.
 
-Classic images (a file for each slice) and enhanced, multi-frame ones are read. The patient's axes in DICOM (part 3,
-C.7.6.2) point left, back and up (LPS); ours right, front and up. The array's axes are columns, rows and slices: ix runs
-along a row of pixels, iy down the rows, and iz along the patient's axis that is closest to the slices' normal, towards
-right, front or head.
+Classic images (a file for each slice), enhanced, multi-frame ones and reconstructed nuclear medicine tomograms, whose
+slices are the frames of one file, are read. The patient's axes in DICOM (part 3, C.7.6.2) point left, back and up (LPS);
+ours right, front and up. The array's axes are columns, rows and slices: ix runs along a row of pixels, iy down the rows,
+and iz along the patient's axis that is closest to the slices' normal, towards right, front or head.
 """
 
 from __future__ import annotations
@@ -21,6 +21,8 @@ from numpy.typing import NDArray
 from ..errors import InputError
 from ..progress import Progress
 from .contents import RAS_FROM_LPS, Contents, first_line, require_voxels
+from .dicom_header import directions, numbers
+from .dicom_tomogram import is_nuclear, tomogram_frames
 
 _SAME_ORIENTATION = 1e-4  # cosines are written with 6 digits
 _SAME_PLACE = 1e-3  # mm
@@ -42,6 +44,7 @@ class _Slice:
     slope: float
     intercept: float
     thickness: float
+    unit: str  # as DICOM codes it; "" where the file does not say
 
     @property
     def name(self) -> str:
@@ -72,9 +75,10 @@ def read(path: Path, series: str | None = None, progress: Progress | None = None
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", module="pydicom")  # about tags that nothing here depends on
         headers = _chosen(_headers(path), path, series)
+        _require_one_volume(headers)
         slices = [one for file, header in headers for one in _slices(file, header)]
         slices, step = _ordered(slices)
-        quantity, factor = _quantity(headers[0][1])
+        quantity, factor = _quantity(headers[0][1], slices[0].unit)
         rows, columns = slices[0].shape
         require_voxels((columns, rows, len(slices)), np.dtype(np.float32))
         array = np.empty((columns, rows, len(slices)), np.float32)
@@ -110,6 +114,8 @@ def _headers(path: Path) -> list[tuple[Path, Any]]:
         except Exception as error:  # whatever pydicom raises on a damaged file
             raise InputError(f"{file.name} cannot be read as DICOM ({first_line(error)})") from None
         if file == path:
+            if "Rows" in header and _is_whole(header):
+                return [(file, header)]
             wanted = header.get("SeriesInstanceUID")
         # Directories, reports and plans have no pixels.
         if "Rows" not in header:
@@ -125,6 +131,11 @@ def _headers(path: Path) -> list[tuple[Path, Any]]:
         if of_series and any(kind.startswith(_kind(header)) for kind in kinds):
             raise InputError(f"{file.name}: an image without Rows: the file is cut off or damaged")
     return list(headers.items())
+
+
+def _is_whole(header: Any) -> bool:
+    """Whether a file is a volume by itself: a nuclear medicine image of several frames."""
+    return is_nuclear(header) and int(header.get("NumberOfFrames") or 1) > 1
 
 
 def _kind(header: Any) -> str:
@@ -146,6 +157,13 @@ def _chosen(headers: list[tuple[Path, Any]], path: Path, series: str | None) -> 
     if len(found) > 1:
         raise InputError(f"it holds {len(found)} series, choose one: {_listed(found)}")
     return next(iter(found.values()))
+
+
+def _require_one_volume(headers: list[tuple[Path, Any]]) -> None:
+    """Raise `InputError` if a series consists of files that are volumes by themselves."""
+    if len(headers) > 1 and any(_is_whole(header) for _, header in headers):
+        names = ", ".join(file.name for file, _ in headers)
+        raise InputError(f"its series has several files of several frames each, choose one: {names}")
 
 
 def _listed(found: dict[str, list[tuple[Path, Any]]]) -> str:
@@ -171,48 +189,35 @@ def _slices(path: Path, header: Any) -> Iterator[_Slice]:
     if "ModalityLUTSequence" in header:
         raise InputError(f"{path.name}: values by a table (ModalityLUTSequence) are not read; expected RescaleSlope")
     count = int(header.get("NumberOfFrames") or 1)
-    frames = _frames(header)
+    frames = _frames(path, header)
     if len(frames) != count:
         raise InputError(
             f"{path.name}: {count} frames without a place for each; expected an enhanced image, or one frame"
         )
     for number, frame in enumerate(frames):
-
-        def numbers(name: str, length: int, default: float | None = None, of: Any = frame) -> NDArray[np.float64]:
-            given = of.get(name)
-            value = default if given is None or given == "" else given
-            if value is None:
-                raise InputError(f"{path.name}: it has no {name}")
-            array = np.array(value, np.float64).reshape(-1)
-            if len(array) != length or not np.isfinite(array).all():
-                raise InputError(f"{path.name}: {name}: expected {length} numbers, got {given}")
-            return array
-
-        spacing = numbers("PixelSpacing", 2)
-        orientation = numbers("ImageOrientationPatient", 6).reshape(2, 3)
+        spacing = numbers(path.name, frame, "PixelSpacing", 2)
         if spacing.min() <= 0:
             raise InputError(f"{path.name}: PixelSpacing: expected more than 0 mm, got {spacing.min():g}")
-        if not np.allclose(orientation @ orientation.T, np.eye(2), atol=1e-3):
-            raise InputError(f"{path.name}: ImageOrientationPatient: expected two unit vectors at right angles")
         yield _Slice(
             path=path,
             frame=number,
             shape=(int(header.Rows), int(header.Columns)),
             spacing=(float(spacing[0]), float(spacing[1])),
-            orientation=_orthonormal(orientation),  # the file's few digits are not exactly that
-            position=numbers("ImagePositionPatient", 3),
-            slope=float(numbers("RescaleSlope", 1, 1.0)[0]),
-            intercept=float(numbers("RescaleIntercept", 1, 0.0)[0]),
-            thickness=float(numbers("SliceThickness", 1, 0.0)[0]),
+            orientation=directions(path.name, frame),
+            position=numbers(path.name, frame, "ImagePositionPatient", 3),
+            slope=float(numbers(path.name, frame, "RescaleSlope", 1, 1.0)[0]),
+            intercept=float(numbers(path.name, frame, "RescaleIntercept", 1, 0.0)[0]),
+            thickness=float(numbers(path.name, frame, "SliceThickness", 1, 0.0)[0]),
+            unit=str(header.get("Units") or frame.get("RescaleType") or ""),
         )
 
 
-def _frames(header: Any) -> list[Any]:
+def _frames(path: Path, header: Any) -> list[Any]:
     """What describes each image of a file: the header, or in an enhanced image the frame's groups and the shared ones."""
     from pydicom.dataset import Dataset
 
     if "PerFrameFunctionalGroupsSequence" not in header:
-        return [header]
+        return tomogram_frames(path.name, header) if is_nuclear(header) else [header]
     shared = header.get("SharedFunctionalGroupsSequence") or []
     frames = []
     for own in header.PerFrameFunctionalGroupsSequence:
@@ -223,12 +228,6 @@ def _frames(header: Any) -> list[Any]:
                     frame.update(group.value[0])
         frames.append(frame)
     return frames
-
-
-def _orthonormal(rows: NDArray[np.float64]) -> NDArray[np.float64]:
-    """The nearest two orthonormal rows."""
-    left, _, right = np.linalg.svd(rows, full_matrices=False)
-    return left @ right
 
 
 def _ordered(slices: list[_Slice]) -> tuple[list[_Slice], NDArray[np.float64]]:
@@ -286,13 +285,12 @@ def _ordered(slices: list[_Slice]) -> tuple[list[_Slice], NDArray[np.float64]]:
     return slices, step
 
 
-def _quantity(header: Any) -> tuple[str, float]:
+def _quantity(header: Any, unit: str) -> tuple[str, float]:
     """What a modality's values are, and what brings them to our unit."""
     modality = header.get("Modality")
     if modality == "CT":
         return "hu", 1.0
-    unit = header.get("Units") if modality == "PT" else header.get("RescaleType")
-    return _UNITS.get(str(unit), (f"{modality} in {unit}" if unit else f"{modality}", 1.0))
+    return _UNITS.get(unit, (f"{modality} in {unit}" if unit else f"{modality}", 1.0))
 
 
 def _pixels(slices: list[_Slice]) -> Iterator[tuple[_Slice, NDArray[Any]]]:

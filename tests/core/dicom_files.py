@@ -1,4 +1,4 @@
-"""Writes a volume of CT numbers as a DICOM series, by pydicom."""
+"""Writes a volume of CT numbers as a DICOM series, and one of counts as a reconstructed tomogram, by pydicom."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 from pydicom.dataset import Dataset, FileMetaDataset
-from pydicom.uid import CTImageStorage, ExplicitVRLittleEndian, generate_uid
+from pydicom.uid import CTImageStorage, ExplicitVRLittleEndian, NuclearMedicineImageStorage, generate_uid
 
 import mphdrr.core as mph
 
@@ -47,6 +47,49 @@ def write_series(
         save(data)
         written.append(data)
     return written
+
+
+def write_tomogram(volume: mph.Volume, path: Path, order=None, **changes) -> Dataset:
+    """A nuclear medicine file whose frame i is the volume's plane `order[i]` of iz; `changes` are tags, None removes one.
+
+    By default the planes follow each other from first to last. SliceVector numbers them in the direction in which the last
+    frame lies from the first.
+    """
+    n_x, n_y, n_z = volume.grid.shape
+    order = np.arange(n_z) if order is None else np.asarray(order)
+    affine, spacing = LPS @ volume.grid.affine, volume.grid.spacing
+    axes = affine[:3, :3] / spacing
+    along = np.sign(np.cross(axes[:, 0], axes[:, 1]) @ axes[:, 2])
+    way = 1 if order[-1] >= order[0] else -1
+    detector = Dataset()
+    detector.ImageOrientationPatient = [number_text(x) for x in axes[:, :2].T.ravel()]
+    detector.ImagePositionPatient = [number_text(x) for x in (affine @ [0, 0, order[0], 1])[:3]]
+    data = Dataset()
+    data.file_meta = FileMetaDataset()
+    data.file_meta.TransferSyntaxUID = ExplicitVRLittleEndian
+    data.SOPClassUID = data.file_meta.MediaStorageSOPClassUID = NuclearMedicineImageStorage
+    data.SOPInstanceUID = data.file_meta.MediaStorageSOPInstanceUID = generate_uid()
+    data.SeriesInstanceUID, data.Modality = generate_uid(), "NM"
+    data.ImageType = ["DERIVED", "PRIMARY", "RECON TOMO", "EMISSION"]
+    data.NumberOfFrames, data.NumberOfSlices = len(order), n_z
+    data.FrameIncrementPointer = 0x00540080
+    data.SliceVector = [int(k if way > 0 else n_z - 1 - k) + 1 for k in order]
+    data.DetectorInformationSequence = [detector]
+    data.SpacingBetweenSlices = number_text(along * way * spacing[2])
+    data.SliceThickness = number_text(spacing[2])
+    data.PixelSpacing = [number_text(spacing[1]), number_text(spacing[0])]
+    data.Rows, data.Columns, data.RescaleSlope, data.RescaleIntercept = n_y, n_x, 2, 1
+    data.SamplesPerPixel, data.PhotometricInterpretation = 1, "MONOCHROME2"
+    data.BitsAllocated, data.BitsStored, data.HighBit, data.PixelRepresentation = 16, 16, 15, 0
+    data.PixelData = np.rint((volume.array[:, :, order].transpose(2, 1, 0) - 1) / 2).astype("<u2").tobytes()
+    for name, value in changes.items():
+        if value is None:
+            delattr(data, name)
+        else:
+            setattr(data, name, value)
+    data.filename = str(path)
+    save(data)
+    return data
 
 
 def number_text(value: float) -> str:

@@ -143,6 +143,34 @@ def test_radiographs_of_mu_and_the_inverse_square_sum(workbook, tmp_path):
     np.testing.assert_allclose(run.projections, expected, rtol=1e-5)
 
 
+NO_EFFECT = [
+    ("--volume X --voxels 8", "--voxels is for a phantom, not for --volume"),
+    ("--volume X --radius 40", "--radius is for a phantom, not for --volume"),  # the default, but typed
+    ("--states X Y --euler 0 0 0", "--euler is for a phantom, not for --states"),
+    ("--volume X --emission --phantom-mu", "--phantom-mu is for a phantom, not for --volume"),
+    ("--phantom X --rods 8", "--rods is for the Derenzo phantom, not for --phantom"),
+    ("--phantom X --center", "--center needs --volume or --states"),
+    ("--series 3", "--series needs --volume"),
+    ("--phantom-mu", "--phantom-mu needs --emission"),
+    ("--mu X", "--mu needs --emission"),
+    ("--emission --mu-series 3", "--mu-series needs --mu"),
+    (
+        "--emission --energy 80 --phantom-mu",
+        "--energy needs a --volume of CT numbers, or with --emission a --mu of them",
+    ),
+    ("--emission --edge paix", "--edge needs --aperture-mu"),
+    ("--emission --opening-angle 80", "--opening-angle needs --aperture-mu or --within-cone"),
+    ("--backend torch --threads 2", "--threads is for numba and numpy: torch has threads of its own"),
+]
+
+
+@pytest.mark.parametrize(("options", "said"), NO_EFFECT)
+def test_options_without_effect_are_refused(options, said, tmp_path, capsys):
+    """Before anything is read: neither the workbook nor X is there."""
+    assert main(["project", "none.xlsx", *options.split(), "-o", str(tmp_path / "run.h5")]) == 1
+    assert capsys.readouterr().err == f"mphdrr: {said}\n"
+
+
 @pytest.mark.parametrize(
     ("command", "said"),
     [

@@ -109,6 +109,64 @@ def test_a_phantom_of_shapes_is_projected(workbook, tmp_path, capsys):
     assert mph.read_run(tmp_path / "photons.npz").unit == "photons"
 
 
+@pytest.mark.parametrize("is_file", [True, False], ids=["file", "Derenzo"])
+def test_a_phantoms_own_mu_attenuates_as_its_volume_would(is_file, workbook, tmp_path, capsys):
+    (tmp_path / "thorax.toml").write_text(THORAX)
+    place = ["--voxels", "30", "28", "26", "--spacing", "4", "--euler", "10", "20", "30", "--position", "3", "2", "1"]
+    water = ["--water", "45", "50", "--background", "20"]
+    make = ["file", str(tmp_path / "thorax.toml"), *place] if is_file else ["derenzo", *water, *place]
+    for quantity in ("activity", "mu"):
+        words = ["phantom", *make, "--quantity", quantity, "-o", str(tmp_path / f"{quantity}.npz")]
+        assert main(words) == 0
+    project = ["project", str(workbook), "--size", "9", "9", "--modules", "1-2", "--emission", "--isotope", "Tc-99m"]
+    files = ["--volume", str(tmp_path / "activity.npz"), "--mu", str(tmp_path / "mu.npz")]
+    source = ["--phantom", str(tmp_path / "thorax.toml"), *place] if is_file else [*water, *place]
+    counts = []
+    for name, more in (("files", files), ("own", [*source, "--phantom-mu"]), ("none", source)):
+        assert main([*project, *more, "-o", str(tmp_path / f"{name}.npz")]) == 0
+        counts.append(mph.read_run(tmp_path / f"{name}.npz").projections)
+    assert capsys.readouterr().err == ""
+    np.testing.assert_array_equal(counts[1], counts[0])
+    assert 0.1 * counts[2].sum() < counts[1].sum() < 0.9 * counts[2].sum()
+    assert mph.read_run(tmp_path / "own.npz").settings["mu_of_phantom_at_kev"] == 140.5
+
+
+def test_a_phantoms_own_mu_is_checked(workbook, tmp_path, capsys):
+    words = ["project", str(workbook), "--size", "9", "9", "--modules", "1", "--voxels", "16", "--emission"]
+    out = str(tmp_path / "run.npz")
+    assert main([*words, "--phantom-mu", "--isotope", "Tl-201", "-o", out]) == 0
+    assert "the mu of the Derenzo phantom holds at 140.5 keV, photons of 63.72 to 77.88 keV" in capsys.readouterr().err
+    (tmp_path / "hot.toml").write_text('name = "hot"\n[[shape]]\nkind = "sphere"\nradius = 9\nactivity = 1\n')
+    assert main([*words, "--phantom", str(tmp_path / "hot.toml"), "--phantom-mu", "-o", out]) == 1
+    assert "--phantom-mu: no shape of the hot has a mu" in capsys.readouterr().err
+    assert main([*words, "--phantom-mu", "--mu", "mu.npz", "-o", out]) == 2
+
+
+def test_a_beating_heart_is_a_run_for_each_state(workbook, tmp_path, capsys):
+    beat = ["phantom", "torso", "--frames", "3", "--voxels", "20", "--spacing", "10", "--position", "9", "8", "7"]
+    assert main([*beat, "--json", "-o", str(tmp_path / "beat.npz")]) == 0
+    assert [entry["phase"] for entry in json.loads(capsys.readouterr().out)] == [0, 1 / 3, 2 / 3]
+    states = [mph.read_volume(tmp_path / f"beat-{k}.npz") for k in (1, 2, 3)]
+    pose = mph.euler_pose(0, 0, 0, (9, 8, 7))
+    for state, torso in zip(states, mph.CardiacTorso().beating(3), strict=True):
+        np.testing.assert_array_equal(state.array, torso.voxelize(state.grid, pose).array)
+
+    files = [str(tmp_path / f"beat-{k}.npz") for k in (1, 2, 3)]
+    project = ["project", str(workbook), "--size", "9", "9", "--modules", "30", "--emission", "--center"]
+    more = ["--noise", "5", "--mosaic", str(tmp_path / "m.png")]
+    assert main([*project, "--states", *files, *more, "-o", str(tmp_path / "run.npz")]) == 0
+    for k, file in enumerate(files):
+        assert main([*project, "--volume", file, "--noise", str(5 + k), "-o", str(tmp_path / "one.npz")]) == 0
+        run, one = mph.read_run(tmp_path / f"run-{k + 1}.npz"), mph.read_run(tmp_path / "one.npz")
+        np.testing.assert_array_equal(run.projections, one.projections)
+        assert run.seed == 5 + k and run.settings["volume"] == f"beat-{k + 1}.npz"
+        assert (tmp_path / f"m-{k + 1}.png").is_file()
+    capsys.readouterr()
+    assert main([*project, "--states", *files, "-o", str(tmp_path / "beat.npz")]) == 1
+    assert "the projections would replace what is projected" in capsys.readouterr().err
+    assert np.array_equal(mph.read_volume(files[0]).array, states[0].array)
+
+
 @pytest.mark.parametrize(
     ("words", "status", "said"),
     [
@@ -120,10 +178,16 @@ def test_a_phantom_of_shapes_is_projected(workbook, tmp_path, capsys):
         (["sphere", "--radius", "3", "--count", "2"], 1, "--count and --box need --random"),
         (["sphere", "--radius", "3", "--random", "-1"], 1, "--random: expected a seed"),
         (["sphere", "--radius", "3", "--random", "1", "--count", "0"], 1, "--count: expected at least 1"),
+        (["torso", "--random", "1", "--euler", "1", "2", "3"], 1, "--euler has no effect with --random"),
+        (["torso", "--frames", "2", "--phase", "0.1"], 1, "--phase has no effect with --frames"),
+        (["torso", "--frames", "0"], 1, "frames of the cycle: expected"),
+        (["sphere", "--radius", "3", "--voxels", "9", "-o", "TOML"], 1, "--voxels is of voxels, and a .toml holds the"),
     ],
 )
 def test_wrong_words_get_one_line(words, status, said, tmp_path, capsys):
-    assert main(["phantom", *words, "-o", str(tmp_path / "p.npz")]) == status
+    words = ["-o", str(tmp_path / "p.npz"), *[str(tmp_path / "p.toml") if word == "TOML" else word for word in words]]
+    words = [*words[2:], *([] if "-o" in words[2:] else words[:2])]
+    assert main(["phantom", *words]) == status
     error = capsys.readouterr().err
     assert said in error and error.count("\n") == 1
     assert not list(tmp_path.iterdir())

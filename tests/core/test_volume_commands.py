@@ -12,6 +12,7 @@ import mphdrr.core as mph
 from mphdrr.core.cli import main
 from mphdrr.core.hounsfield import attenuation
 
+from .dicom_files import write_series, write_tomogram
 from .test_meshes import box
 
 
@@ -125,10 +126,47 @@ def test_project_converts_and_centers_a_ct(tmp_path, ct, workbook, capsys):
             "it holds activity, expected mu",
         ),
         (("--energy", "80"), "--energy needs a --volume"),
-        (("--center",), "--center needs --volume"),
+        (("--center",), "--center needs --volume or --states"),
     ):
         assert run(*common, *arguments, "-o", out) == 1
         assert message in capsys.readouterr().err
+
+
+def test_project_takes_one_series_of_a_dicom_folder(tmp_path, ct, workbook, capsys):
+    """As the radiograph of the volume, and the counts through the mu, that the series was written from."""
+    affine = np.diag([2.0, 2, 3, 1])
+    affine[:3, 3] = ct.grid.affine[:3, 3]
+    ct = mph.Volume(ct.array, mph.Grid(ct.grid.shape, affine), "hu")
+    write_series(mph.Volume(ct.array + 100, ct.grid, "hu"), tmp_path / "dicom", 3, "Soft")
+    write_series(ct, tmp_path / "dicom", 4, "Lung")
+    common = ("project", workbook, "--modules", "1", "--size", 9, 9, "--backend", "numpy", "--center")
+    out, folder = tmp_path / "run.npz", tmp_path / "dicom"
+    options = ("--energy", 80)
+    assert run(*common, "--volume", folder, *options, "-o", out) == 1
+    assert 'it holds 2 series, choose one: 3 "Soft" (16 images); 4 "Lung" (16 images)' in capsys.readouterr().err
+    assert run(*common, "--volume", folder, "--series", "Lung", *options, "-o", out) == 0
+    system = mph.read_system(workbook)[:1]
+    expected = mph.project_run(system, mph.hu_to_mu(mph.centered(ct), 80), shape=(9, 9), backend="numpy")
+    np.testing.assert_allclose(mph.read_run(out).projections, expected.projections, rtol=1e-6)
+
+    activity = mph.Volume(ct.array == 0, ct.grid, "activity")
+    mph.write_volume(activity, tmp_path / "a.npz")
+    through = ("--emission", "--mu", folder, "--mu-series", "4", "--energy", 140.5)
+    assert run(*common, "--volume", tmp_path / "a.npz", *through, "-o", out) == 0
+    model = mph.Emission(system, mu=mph.hu_to_mu(mph.centered(ct)))
+    expected = mph.project_run(system, mph.centered(activity), shape=(9, 9), backend="numpy", model=model)
+    np.testing.assert_allclose(mph.read_run(out).projections, expected.projections, rtol=1e-6)
+    assert run(*common, "--volume", tmp_path / "a.npz", "--series", "4", "-o", out) == 1
+    assert "only folders of DICOM files hold several series" in capsys.readouterr().err
+
+    # A reconstructed tomogram of one file beside them, as activity.
+    write_tomogram(mph.Volume(2 * activity.array + 1, activity.grid), tmp_path / "recon.dcm")
+    assert run(*common, "--volume", tmp_path / "recon.dcm", "--emission", "-o", out) == 0
+    counts = mph.project_run(
+        system, mph.centered(mph.Volume(2 * activity.array + 1, activity.grid)), shape=(9, 9), backend="numpy",
+        model=mph.Emission(system),
+    ).projections  # fmt: skip
+    np.testing.assert_allclose(mph.read_run(out).projections, counts, rtol=1e-6)
 
 
 def test_counts_of_ct_numbers_in_a_file_that_does_not_say_so_are_warned_of(tmp_path, ct, workbook, capsys):

@@ -8,12 +8,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from pydicom.dataset import Dataset
 
 import mphdrr.core as mph
 from mphdrr.core.frames import euler_pose
 
 from .conftest import general_grid
-from .dicom_files import LPS, number_text, save, write_series
+from .dicom_files import LPS, number_text, save, write_series, write_tomogram
 
 CHEST = Path(__file__).parents[3] / "shared" / "data" / "chest_ct_3mm.nii.gz"
 
@@ -241,6 +242,50 @@ def test_enhanced_and_run_length_coded_images(tmp_path, ct):
     assert np.allclose(volume.grid.affine, ct.grid.affine, rtol=0, atol=1e-9)
 
 
+@pytest.mark.parametrize("mirrored", [False, True])
+@pytest.mark.parametrize("order", [range(7), range(6, -1, -1), (2, 0, 5, 1, 4, 6, 3)], ids=["up", "down", "any"])
+def test_a_reconstructed_tomogram_is_the_volume_it_was_written_from(tmp_path, rng, mirrored, order):
+    """By the first frame's place and the signed spacing; mirrored, the slices follow each other against their normal."""
+    grid = turned_grid()
+    if mirrored:
+        grid = mph.Grid(grid.shape, grid.affine @ np.diag([-1, 1, 1, 1]))
+    volume = mph.Volume(2 * rng.integers(0, 30000, grid.shape) + 1, grid, "activity")
+    data = write_tomogram(volume, tmp_path / "recon.dcm", order)
+    with pytest.raises(mph.InputError, match="it holds 'NM': say which quantity that is"):
+        mph.read_volume(tmp_path)
+    for path in (tmp_path, tmp_path / "recon.dcm"):
+        back = mph.read_volume(path, "activity")
+        assert np.array_equal(back.array, volume.array)
+        assert np.allclose(back.grid.affine, grid.affine, rtol=0, atol=1e-9)
+    # Some programs write the place beside the detectors; and values in Bq/mL say so.
+    (detector,) = data.DetectorInformationSequence
+    place = {name: getattr(detector, name) for name in ("ImagePositionPatient", "ImageOrientationPatient")}
+    unit, mapping = Dataset(), Dataset()
+    unit.CodeValue, unit.CodingSchemeDesignator, unit.CodeMeaning = "Bq/ml", "UCUM", "Becquerels/milliliter"
+    mapping.MeasurementUnitsCodeSequence, mapping.RealWorldValueSlope = [unit], 4000.0
+    mapping.RealWorldValueIntercept = 2000.0
+    more = {"DetectorInformationSequence": None, "RealWorldValueMappingSequence": [mapping]}
+    write_tomogram(volume, tmp_path / "recon.dcm", order, **place, **more)
+    back = mph.read_volume(tmp_path / "recon.dcm")
+    assert (back.quantity, back.grid.shape) == ("activity", grid.shape)
+    assert np.allclose(back.array, 2 * volume.array)
+    assert np.allclose(back.grid.affine, grid.affine, rtol=0, atol=1e-9)
+
+
+def test_one_of_several_tomograms_of_a_series_is_chosen_by_its_file(tmp_path, ct):
+    counts = mph.Volume(np.abs(ct.array) * 2 + 1, ct.grid)
+    one = write_tomogram(counts, tmp_path / "a.dcm", SeriesInstanceUID="1.2")
+    write_tomogram(counts, tmp_path / "b.dcm", SeriesInstanceUID="1.2", ImageType=["ORIGINAL", "PRIMARY", "TOMO"])
+    with pytest.raises(mph.InputError, match=r"several files of several frames each, choose one: a\.dcm, b\.dcm"):
+        mph.read_volume(tmp_path)
+    assert np.array_equal(mph.read_volume(one.filename, "activity").array, counts.array)
+    del one.SpacingBetweenSlices
+    save(one)
+    with pytest.warns(mph.InputWarning, match="it has no SpacingBetweenSlices"):
+        back = mph.read_volume(one.filename, "activity")
+    assert np.allclose(back.grid.affine, ct.grid.affine, rtol=0, atol=1e-9)
+
+
 def _series(change):
     """Bad input: a series after `change(written, folder)`."""
 
@@ -391,6 +436,19 @@ def _npy(folder, ct):
     return folder / "v.npy"
 
 
+def _tomogram(**changes):
+    def make(folder, ct):
+        write_tomogram(mph.Volume(np.abs(ct.array), ct.grid), folder / "nm.dcm", **changes)
+        return folder / "nm.dcm"
+
+    return make
+
+
+def _gated(folder, ct):
+    slots = {"TimeSlotVector": [1, 1, 1, 1, 2, 2, 2], "NumberOfTimeSlots": 2, "SliceVector": [1, 2, 3, 4, 1, 2, 3]}
+    return _tomogram(ImageType=["DERIVED", "PRIMARY", "RECON GATED TOMO", "EMISSION"], **slots)(folder, ct)
+
+
 NAN = np.zeros((3, 3, 3), np.float32)
 NAN[1, 2, 0] = np.nan
 
@@ -419,6 +477,21 @@ BAD = {
         ),
         "it holds 'MR': say which quantity that is",
     ),
+    "SPECT projections": (
+        _tomogram(ImageType=["ORIGINAL", "PRIMARY", "TOMO", "EMISSION"], SliceVector=None),
+        "nm.dcm: it holds projections (ImageType TOMO, 7 frames); expected a reconstructed tomogram",
+    ),
+    "planar images": (
+        _tomogram(ImageType=["ORIGINAL", "PRIMARY", "STATIC"]),
+        "it holds planar images (ImageType STATIC",
+    ),
+    "a gated tomogram": (_gated, "the tomogram is gated, in 2 time slots (7 frames); expected one volume"),
+    "energy windows": (_tomogram(NumberOfEnergyWindows=3), "the tomogram is of 3 energy windows"),
+    "slices twice": (_tomogram(SliceVector=[1, 2, 3, 3, 2, 1, 4]), "7 frames of 4 slices; expected one frame of each"),
+    "a slice missing in the middle": (_tomogram(SliceVector=[1, 2, 3, 5, 6, 7, 8]), "1 slice missing between"),
+    "too few slice numbers": (_tomogram(SliceVector=[1, 2, 3]), "SliceVector: expected 7 numbers, got [1, 2, 3]"),
+    "a tomogram nowhere": (_tomogram(DetectorInformationSequence=None), "nm.dcm: it has no ImagePositionPatient"),
+    "slices at one place": (_tomogram(SpacingBetweenSlices=0), "lie at the same place"),
     "an empty folder": (_empty, "expected a folder with the images of a DICOM series"),
     "no DICOM": (_bytes("v.dcm", b"hello" * 99), "v.dcm is no DICOM file"),
     "unknown suffix": (_bytes("v.xyz", b"hello" * 99), "expected a folder of DICOM files, or a name ending in"),

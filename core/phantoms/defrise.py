@@ -9,7 +9,7 @@ from functools import cached_property
 from ..checks import whole_shape
 from ..isotopes import WATER_MU
 from .phantom import Phantom
-from .settings import count, setting
+from .settings import count, require_at_most, setting
 from .shapes import Cylinder, Shape
 
 
@@ -50,6 +50,10 @@ class DefrisePhantom(Phantom):
         (disks,) = whole_shape([self.disks], "Defrise phantom: disks", 1)
         object.__setattr__(self, "disks", disks)
         super().__post_init__()
+        if disks > 1:
+            require_at_most(
+                self.disk_thickness, self.spacing, f"{self.title}: disk thickness", "mm", "from disk to disk"
+            )
 
     @cached_property
     def shapes(self) -> Sequence[Shape]:

@@ -11,7 +11,7 @@ from ..isotopes import WATER_MU
 from .derenzo import DerenzoRods
 from .materials import PMMA_MU
 from .phantom import Phantom
-from .settings import setting
+from .settings import require_apart, require_at_most, setting
 from .shapes import Cylinder, Shape, Sphere
 
 
@@ -56,6 +56,21 @@ class JaszczakPhantom(Phantom):
     mu: float = setting(WATER_MU, "1/mm", "of the water", 0.0)
 
     title = "Jaszczak phantom"
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if any(self.rod_diameters):
+            require_at_most(self.rod_height, self.height, f"{self.title}: rod height", "mm", "in the cylinder")
+        if any(self.sphere_diameters):
+            ring, height = self.sphere_ring_radius, self.sphere_height
+            require_at_most(ring, self.radius, f"{self.title}: sphere ring radius", "mm", "in the cylinder")
+            require_at_most(height, self.height, f"{self.title}: sphere height", "mm", "in the cylinder")
+            diameters, largest = f"{self.title}: sphere diameters", max(self.sphere_diameters)
+            require_at_most(largest, 2 * (self.radius - ring), diameters, "mm", f"at {ring:g} mm from the axis")
+            require_at_most(largest, 2 * height, diameters, "mm", f"at {height:g} mm above the base")
+            below = self.height - height
+            require_at_most(largest, 2 * below, diameters, "mm", f"at {below:g} mm below the top")
+            require_apart(self.sphere_diameters, ring, diameters)
 
     @cached_property
     def shapes(self) -> Sequence[Shape]:

@@ -8,13 +8,15 @@ from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
 
+from ..errors import InputError
 from ..isotopes import WATER_MU
 from .phantom import Phantom
-from .settings import setting
+from .settings import require_apart, require_at_most, setting
 from .shapes import Box, Cylinder, Shape, Sphere
 
 # Inside, mm: the front is half a circle, the back a straight line between two quarters of circles.
 _FRONT_RADIUS, _BACK_RADIUS, _BACK_WIDTH = 147.0, 77.0, 140.0
+_CIRCLES_Y = -(_FRONT_RADIUS - _BACK_RADIUS) / 2  # of the circles' centres
 _RING_RADIUS = 57.2  # of the spheres' centres
 _TO_LID = 70.0  # from the spheres' plane
 _LUNG_DENSITY = 0.3  # g/cm^3
@@ -53,11 +55,31 @@ class NemaBody(Phantom):
 
     title = "NEMA body phantom"
 
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        inside = f"{self.title}: sphere diameters"
+        lung = self.lung_diameter
+        require_at_most(lung, 2 * _room(0.0, 0.0), f"{self.title}: lung diameter", "mm", "in the body")
+        for diameter, (x, y) in zip(self.sphere_diameters, _ring(), strict=True):
+            if not diameter:
+                continue
+            require_at_most(diameter, 2 * _room(x, y), inside, "mm", "in the body")
+            require_at_most(diameter, 2 * _TO_LID, inside, "mm", "beneath the lid")
+            least = _TO_LID + diameter / 2
+            if self.length < least * (1 - 1e-9):
+                raise InputError(
+                    f"{self.title}: length: expected at least {least:g} mm around a sphere of {diameter:g} mm, "
+                    f"got {self.length:g}"
+                )
+            if lung:
+                require_at_most(diameter, 2 * _RING_RADIUS - lung, inside, "mm", f"beside a lung insert of {lung:g} mm")
+        require_apart(self.sphere_diameters, _RING_RADIUS, inside)
+
     @cached_property
     def shapes(self) -> Sequence[Shape]:
         """Body, lung insert, spheres."""
         z = _TO_LID - self.length / 2
-        y = -(_FRONT_RADIUS - _BACK_RADIUS) / 2  # of the circles' centres
+        y = _CIRCLES_Y
         water: dict[str, Any] = {"activity": self.background, "mu": self.mu}
         half = _BACK_WIDTH / 2
         # The box reaches into the half circle: no seam between them.
@@ -82,16 +104,30 @@ class NemaBody(Phantom):
                     name="lung insert",
                 )
             )
-        for i, diameter in enumerate(self.sphere_diameters):
+        for diameter, (x, y) in zip(self.sphere_diameters, _ring(), strict=True):
             if diameter:
-                angle = math.radians(60.0 * (i - 2))
                 shapes.append(
                     Sphere(
                         radius=diameter / 2,
                         activity=self.sphere_activity,
                         mu=self.mu,
                         name=f"sphere {diameter:g} mm",
-                        position=(_RING_RADIUS * math.cos(angle), _RING_RADIUS * math.sin(angle), 0.0),
+                        position=(x, y, 0.0),
                     )
                 )
         return shapes
+
+
+def _ring() -> list[tuple[float, float]]:
+    """x and y of the spheres' centres, mm."""
+    angles = [math.radians(60.0 * (i - 2)) for i in range(6)]
+    return [(_RING_RADIUS * math.cos(angle), _RING_RADIUS * math.sin(angle)) for angle in angles]
+
+
+def _room(x: float, y: float) -> float:
+    """Distance, mm, from a point inside to the body's outline."""
+    x, y = abs(x), y - _CIRCLES_Y
+    front = math.hypot(x, y) if y > 0 else x
+    aside, behind = x - _BACK_WIDTH / 2, -y
+    back = math.hypot(aside, behind) if min(aside, behind) > 0 else max(aside, behind)
+    return min(_FRONT_RADIUS - front, _BACK_RADIUS - back)

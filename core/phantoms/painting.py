@@ -10,7 +10,7 @@ import math
 import os
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
@@ -70,6 +70,11 @@ class Layer:
         """Shape-from-world (4, 4)."""
         return np.linalg.inv(self.pose)
 
+    @cached_property
+    def volume(self) -> float:
+        """mm^3 in the world."""
+        return self.shape.volume * abs(float(np.linalg.det(self.pose[:3, :3])))
+
     def over(self, values: NDArray[Any]) -> NDArray[Any]:
         """What the shape makes of the values beneath it."""
         value = values.dtype.type(self.value)
@@ -111,27 +116,62 @@ def values_at(layers: Sequence[Layer], points: Points) -> Points:
 
 
 def integral(layers: Sequence[Layer]) -> float:
-    """Value times mm^3 of the whole painting."""
+    """Value times mm^3 of the whole painting.
+
+    The layers' own contents, less what each covers of those beneath. What two layers have in common is counted at points
+    of the smaller: so errors are small beside the content of either, and a layer that is covered whole counts nothing.
+    """
+    hidden = {
+        lower
+        for layer, beneath in zip(layers, _seen_beneath(layers), strict=True)
+        for lower in beneath
+        if layer.relation(lower) == 1
+    }
+    shown = [layer for layer in layers if layer not in hidden]
+    over: dict[Layer, list[Layer]] = {layer: [] for layer in shown}
     total = 0.0
-    for layer, beneath in zip(layers, _seen_beneath(layers), strict=True):
-        volume = layer.shape.volume * abs(float(np.linalg.det(layer.pose[:3, :3])))
-        total += volume * layer.value
-        if len(beneath) == 1 and beneath[0].relation(layer) == 1:
-            total -= volume * beneath[0].value
-        elif beneath:
-            total -= volume * _mean_inside(layer, beneath)
+    for layer, beneath in zip(shown, _seen_beneath(shown), strict=True):
+        for lower in beneath:
+            over[lower].append(layer)
+        larger = [lower if lower.volume >= layer.volume else replace(lower, value=0.0) for lower in beneath]
+        total += layer.volume * (layer.value - _mean_inside(layer, larger))
+    for layer, later in over.items():
+        total -= layer.volume * layer.value * _share_covered_by_larger(layer, later)
     return total
 
 
 def _mean_inside(layer: Layer, beneath: Sequence[Layer]) -> float:
     """The mean of what is painted beneath a layer's shape: exact where it is uniform."""
+    if not any(lower.value for lower in beneath):
+        return 0.0
+    if len(beneath) == 1 and beneath[0].relation(layer) == 1:
+        return beneath[0].value
     total, hits = 0.0, 0
+    for inside in points_inside(layer):
+        total += float(values_at(beneath, inside).sum())
+        hits += inside.shape[1]
+    return total / max(hits, 1)
+
+
+def _share_covered_by_larger(layer: Layer, over: Sequence[Layer]) -> float:
+    """The share of a layer's shape that one larger than it is the first of those over it to cover."""
+    if all(other.volume <= layer.volume for other in over):
+        return 0.0
+    covered, hits = 0, 0
+    for free in points_inside(layer):
+        hits += free.shape[1]
+        for other in over:
+            within = other.shape.distance(_moved(other.from_world, free)) < 0
+            covered += int(np.count_nonzero(within)) if other.volume > layer.volume else 0
+            free = free[:, ~within]
+    return covered / max(hits, 1)
+
+
+def points_inside(layer: Layer) -> Iterator[Points]:
+    """Points of the world (3, n) that fill a layer's shape evenly, in blocks."""
     for first in range(0, _SAMPLES_BENEATH, _BOX_BLOCK):
         points = _box_points(layer.shape, first)
-        inside = points[:, layer.shape.distance(points) < 0]
-        total += float(values_at(beneath, _moved(layer.pose, inside)).sum())
-        hits += inside.shape[1]
-    return total / hits if hits else 0.0
+        yield _moved(layer.pose, points[:, layer.shape.distance(points) < 0])
 
 
 def paint_voxels(grid: Grid, layers: Sequence[Layer], progress: Progress | None = None) -> Floats:

@@ -21,8 +21,8 @@ from ..memory import require
 from ..progress import Progress
 from ..projector.tracing import points as as_points
 from ..views import Views
-from ..volume import Volume
-from .painting import Layer, integral, line_integrals, paint_voxels, values_at
+from ..volume import UNITS, Volume
+from .painting import Layer, integral, line_integrals, paint_voxels, points_inside, values_at
 from .settings import check_settings
 from .shapes import Shape
 
@@ -79,14 +79,33 @@ class Phantom:
         except InputError as error:
             raise InputError(f"{self.title}: {error}") from None
 
+    def _require_no_negative_sums(self) -> None:
+        """Raise `InputError` if a shape that takes something away leaves less than nothing, as seen at points of it."""
+        for quantity in QUANTITIES:
+            layers = self._layers(quantity)
+            largest = max((abs(layer.value) for layer in layers), default=0.0)
+            for layer in layers:
+                if layer.value >= 0:
+                    continue
+                points = next(points_inside(layer))
+                values = values_at(layers, points)
+                if values.size and (lowest := float(values.min())) < -1e-9 * largest:
+                    number = next(i for i, shape in enumerate(self.shapes, 1) if shape is layer.shape)
+                    name = f"shape {number}" + (f" {layer.shape.name!r}" if layer.shape.name else "")
+                    place = " ".join(f"{x:.4g}" for x in points[:, values.argmin()])
+                    raise InputError(
+                        f"{name}: {quantity}: {layer.value:g} {UNITS[quantity]} added leaves {lowest:g} at {place} mm; "
+                        "expected 0 or more"
+                    )
+
     @property
     def total_activity(self) -> float:
         """Activity of the whole phantom, kBq.
 
         From the shapes' volumes. Where one covers a part of another and not all of it, that part is counted at points
-        (to about 1/10000).
+        (to about 1/1000 of the smaller's content).
         """
-        return self._totals["activity"] * 1e-3  # kBq/mL times mm^3
+        return self._total("activity") * 1e-3  # kBq/mL times mm^3
 
     @property
     def extent(self) -> float:
@@ -128,7 +147,7 @@ class Phantom:
         if not isinstance(grid, Grid):
             raise InputError(f"voxelize: expected a Grid, got {type(grid).__name__}")
         image = paint_voxels(grid, self._layers(quantity, pose), progress)
-        whole = self._totals[quantity] * (1.0 if pose is None else abs(float(np.linalg.det(np.asarray(pose)[:3, :3]))))
+        whole = self._total(quantity) * (1.0 if pose is None else abs(float(np.linalg.det(np.asarray(pose)[:3, :3]))))
         held = float(image.sum(dtype=np.float64)) * grid.voxel_volume / whole if whole > 0 else 1.0
         if held < _HELD:
             warnings.warn(
@@ -194,10 +213,15 @@ class Phantom:
             meshes.append(PhantomMesh(name, freeze(vertices), freeze(faces), shape.activity, shape.mu))
         return meshes
 
+    def _total(self, quantity: str) -> float:
+        """The value times mm^3 of the whole phantom."""
+        if quantity not in self._totals:
+            self._totals[quantity] = integral(self._layers(quantity))
+        return self._totals[quantity]
+
     @cached_property
     def _totals(self) -> dict[str, float]:
-        """Of each quantity, the value times mm^3 of the whole phantom."""
-        return {quantity: integral(self._layers(quantity)) for quantity in QUANTITIES}
+        return {}
 
     def _layers(self, quantity: str, pose: ArrayLike | None = None) -> list[Layer]:
         """Every shape that holds the quantity, in the world."""
@@ -255,3 +279,4 @@ class ShapePhantom(Phantom):
         object.__setattr__(self, "mu_energy", positive(self.mu_energy, "mu_energy", "keV"))
 
         object.__setattr__(self, "title", self.name or self.title)
+        self._require_no_negative_sums()

@@ -11,7 +11,7 @@ from functools import cached_property
 from ..checks import whole_shape
 from ..errors import InputError
 from .phantom import Phantom
-from .settings import count, setting
+from .settings import count, require_at_most, setting
 from .shapes import Shape, Sphere
 
 _MOST = 10_000
@@ -46,6 +46,9 @@ class PointGrid(Phantom):
             raise InputError(f"grid of points: expected at most {_MOST} points, got {math.prod(counts)}")
         object.__setattr__(self, "counts", counts)
         super().__post_init__()
+        apart = [step for step, n in zip(self.spacing, counts, strict=True) if n > 1]
+        if apart:
+            require_at_most(self.diameter, min(apart), f"{self.title}: diameter", "mm", "from point to point")
 
     @cached_property
     def shapes(self) -> Sequence[Shape]:

@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import dataclasses
+import itertools
+import math
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -58,3 +61,29 @@ def check_settings(phantom: Any, title: str) -> None:
             expected = "more than 0" if least is None else f"{least:g} or more"
             raise InputError(f"{name}: expected {expected} {unit}, got {numbers.min():g}")
         object.__setattr__(phantom, field.name, tuple(numbers.tolist()) if shape else float(numbers))
+
+
+def require_at_most(value: float, most: float, name: str, unit: str, where: str = "") -> None:
+    """Raise `InputError` if `value` is above `most`, by more than rounding; `where` says what sets the limit."""
+    if value > most + 1e-9 * abs(most):
+        raise InputError(f"{name}: expected at most {max(most, 0):.6g} {unit}{where and ' ' + where}, got {value:.6g}")
+
+
+def require_apart(diameters: Sequence[float], ring_radius: float, name: str) -> None:
+    """Raise `InputError` if spheres overlap whose centres divide a circle evenly; diameters of 0 stand for none.
+
+    Parameters
+    ----------
+    diameters
+        In their order around the circle, mm.
+    ring_radius
+        Of the circle, mm.
+    name
+        Of the diameters, for the message.
+    """
+    for (i, first), (j, second) in itertools.combinations(enumerate(diameters), 2):
+        apart = 2 * ring_radius * math.sin(math.pi * (j - i) / len(diameters))
+        if first and second and first + second > 2 * apart * (1 + 1e-9):
+            raise InputError(
+                f"{name}: spheres of {first:g} and {second:g} mm overlap: their centres are {apart:.6g} mm apart"
+            )

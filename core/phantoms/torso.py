@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from ..checks import whole_shape
 from ..errors import InputError
 from .materials import LUNG_MU, SOFT_TISSUE_MU, VERTEBRA_MU
+from .painting import Layer, points_inside
 from .phantom import Phantom
 from .settings import check_settings, setting
 from .shapes import Cylinder, Ellipsoid, Shape
@@ -26,6 +27,7 @@ _HEART = np.array([[-0.5736, -0.8191, 0.0], [-0.4640, 0.3249, 0.8241], [-0.6751,
 _AXIS, _HEIGHT = (35.0, -30.0), 490.0
 _SYSTOLE = 0.35  # of the cycle
 _RV_WALL = 4.0  # mm
+_TRUNK = 4  # lungs, liver and spine, whose sizes are fixed
 
 
 @dataclass(frozen=True)
@@ -110,7 +112,8 @@ class CardiacTorso(Phantom):
             if value > most or (value == most and name in ("phase", "defect_from")):
                 below = "less than" if name in ("phase", "defect_from") else "at most"
                 raise InputError(f"{self.title}: {name.replace('_', ' ')}: expected {below} {most:g}, got {value:g}")
-        super().__post_init__()  # last: it makes the shapes, whose messages would not name the setting
+        super().__post_init__()  # it makes the shapes, whose messages would not name the setting
+        self._require_in_body()
 
     def beating(self, frames: int) -> list[CardiacTorso]:
         """The torso at as many phases, evenly spaced over the cycle, the first at end-diastole."""
@@ -127,6 +130,20 @@ class CardiacTorso(Phantom):
     def shapes(self) -> Sequence[Shape]:
         """Body, lungs, liver, spine, atria, right ventricle, left ventricle with its defect."""
         return [*self._trunk(), *self._heart()]
+
+    def _require_in_body(self) -> None:
+        """Raise `InputError` if an organ reaches out of the body, as seen at points of it."""
+        body, *organs = self.shapes
+        for i, organ in enumerate(organs):
+            points = next(points_inside(Layer(organ, organ.pose, 0.0))) - body.pose[:3, 3:]
+            if np.any(body.distance(points) > 0):
+                settings = (
+                    f"body radii of {self.body_radii[0]:g} and {self.body_radii[1]:g} mm"
+                    if i < _TRUNK
+                    else f"ventricle length of {self.ventricle_length:g} mm, wall of {self.wall:g} mm and end diastolic "
+                    f"volume of {self.end_diastolic_volume:g} mL"
+                )
+                raise InputError(f"{self.title}: {settings}: the {organ.name} reaches out of the body")
 
     @property
     def _contraction(self) -> float:

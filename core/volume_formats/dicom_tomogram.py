@@ -78,8 +78,8 @@ def _require_tomogram(file: str, header: Any, count: int) -> None:
         number = max(int(header.get(f"NumberOf{name}s") or 1), len(np.unique(header.get(f"{name}Vector") or 1)))
         if number > 1:
             raise InputError(
-                f"{file}: the tomogram is {several.format(number)} ({count} frames); expected one volume: save each of them, "
-                "or their sum, as a file of its own"
+                f"{file}: the tomogram is {several.format(number)} ({count} frames); expected one volume: save each, or "
+                "their sum, as a file of its own"
             )
 
 

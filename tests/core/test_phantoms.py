@@ -317,6 +317,35 @@ def test_files_that_are_no_text_are_refused(tmp_path):
         (lambda: mph.CardiacTorso(defect_severity=7), "defect severity: expected at most 1, got 7"),
         (lambda: mph.CardiacTorso(end_systolic_volume=200), "end systolic volume: expected at most 120, got 200"),
         (lambda: mph.CardiacTorso().beating(0), "frames of the cycle"),
+        (
+            lambda: mph.NemaBody(sphere_diameters=(500,) * 6),
+            "NEMA body phantom: sphere diameters: .* in the body, got 500",
+        ),
+        (lambda: mph.NemaBody(sphere_diameters=(10, 13, 17, 22, 55, 60)), "of 55 and 60 mm overlap: .* 57.2 mm apart"),
+        (lambda: mph.NemaBody(sphere_diameters=(0, 0, 150, 0, 0, 0)), "at most 140 mm beneath the lid, got 150"),
+        (
+            lambda: mph.NemaBody(lung_diameter=80),
+            "sphere diameters: expected at most 34.4 mm beside a lung insert of 80",
+        ),
+        (lambda: mph.NemaBody(lung_diameter=300), "lung diameter: expected at most 224 mm in the body, got 300"),
+        (lambda: mph.NemaBody(length=80), "length: expected at least 81 mm around a sphere of 22 mm, got 80"),
+        (lambda: mph.JaszczakPhantom(sphere_ring_radius=120), "sphere ring radius: expected at most 108 mm"),
+        (lambda: mph.JaszczakPhantom(sphere_height=300), "sphere height: expected at most 186 mm in the cylinder"),
+        (lambda: mph.JaszczakPhantom(sphere_height=180), "at most 12 mm at 6 mm below the top, got 31.8"),
+        (lambda: mph.JaszczakPhantom(sphere_height=10), "at most 20 mm at 10 mm above the base, got 31.8"),
+        (lambda: mph.JaszczakPhantom(sphere_ring_radius=20), "spheres of 9.5 and 31.8 mm overlap: .* 20 mm apart"),
+        (lambda: mph.JaszczakPhantom(rod_height=190), "rod height: expected at most 186 mm in the cylinder, got 190"),
+        (lambda: mph.DefrisePhantom(spacing=5), "disk thickness: expected at most 5 mm from disk to disk, got 8"),
+        (lambda: mph.PointGrid((2, 1, 1), (3, 1, 1), 4), "diameter: expected at most 3 mm from point to point, got 4"),
+        (
+            lambda: mph.CardiacTorso(body_radii=(100, 80)),
+            "body radii of 100 and 80 mm: the right lung reaches out of the",
+        ),
+        (lambda: mph.CardiacTorso(ventricle_length=400), "ventricle length of 400 mm, .* reaches out of the body"),
+        (
+            lambda: mph.ShapePhantom([SHAPES[0], mph.Sphere(radius=9, activity=-1, mode="add", name="hole")]),
+            "shape 2 'hole': activity: -1 kBq/mL added leaves -1 at .* mm; expected 0 or more",
+        ),
         (lambda: mph.DerenzoPhantom(40, (8, 6, 5), 30, sectors=1), "Derenzo sectors: expected a whole number"),
         (lambda: mph.DerenzoPhantom(40, (8,) * 6, 30, 0), "or 0 in a cylinder with a background"),
         (lambda: mph.DerenzoPhantom(40, (8,) * 6, 30, background=1), "Derenzo cylinder radius"),
@@ -340,6 +369,56 @@ def test_what_cannot_be_is_refused_in_one_line(make, message):
     with pytest.raises(mph.InputError, match=message) as error:
         make()
     assert "\n" not in str(error.value)
+
+
+def test_what_just_fits_is_made_and_holds_its_parts():
+    body, ball = np.pi * (147**2 + 77**2) / 2 + 140 * 77, np.pi / 6  # mm^2; times the diameter's cube
+    cylinder, none = np.pi * 108**2 * 186, (0,) * 6
+    spheres = mph.JaszczakPhantom(sphere_diameters=(54,) * 6, sphere_height=159, rod_height=132)
+    for phantom, content in (
+        (
+            mph.NemaBody(sphere_diameters=(0, 0, 140, 0, 0, 0), lung_diameter=0, length=140),
+            5.3 * 140 * body + 15.9 * ball * 140**3,
+        ),
+        (
+            mph.NemaBody(sphere_diameters=(57.2,) * 6, lung_diameter=57.2),
+            5.3 * 180 * (body - np.pi * 28.6**2) + 6 * 15.9 * ball * 57.2**3,
+        ),
+        (mph.NemaBody(sphere_diameters=none, lung_diameter=224, length=1), 5.3 * (body - np.pi * 112**2)),
+        (spheres, 50 * (cylinder - spheres.shapes[1].volume - 6 * ball * 54**3)),
+        (
+            mph.JaszczakPhantom(
+                sphere_diameters=(*none[1:], 186), sphere_ring_radius=0, sphere_height=93, rod_diameters=none
+            ),
+            50 * (cylinder - ball * 186**3),
+        ),
+        (mph.DefrisePhantom(4, spacing=8), 100 * 4 * np.pi * 50**2 * 8),
+        (mph.PointGrid((2, 1, 3), (5, 0.1, 5), 5), 6 * 100e3),
+        (mph.ShapePhantom([SHAPES[0], mph.Sphere(radius=7, activity=-1, mode="add")]), 0),
+    ):
+        assert phantom.total_activity == pytest.approx(content * 1e-3, rel=3e-4, abs=1e-9), phantom
+    assert mph.CardiacTorso(body_radii=(155, 105)).shapes[0].radius == (155, 105)
+    assert mph.JaszczakPhantom(rod_height=186, sphere_diameters=none, sphere_height=999).shapes[1].height == 186
+
+
+def test_totals_are_what_the_layers_over_a_shape_leave_of_it():
+    """In closed form: the lens of two balls; and nothing of what is covered whole, however small beside its cover."""
+    r, big, apart = 3.0, 100.0, 101.0
+    lens = np.pi * (big + r - apart) ** 2 * (apart**2 + 2 * apart * (r + big) - 3 * (r - big) ** 2) / (12 * apart)
+    small = mph.Sphere(radius=r, activity=7, position=(1, 2, 3))
+    direction = np.array([2.0, -1, 2]) / 3
+    cover = mph.Sphere(radius=big, activity=0, position=direction * apart + small.position)
+    left = mph.ShapePhantom([small, cover]).total_activity
+    assert left == pytest.approx(7e-3 * (4 / 3 * np.pi * r**3 - lens), rel=2e-3)
+    outer = dataclasses.replace(cover, position=(20, 0, 0))
+    assert mph.ShapePhantom([small, outer]).total_activity == 0
+    # The other way around: the small one over the big one takes its part of it.
+    both = mph.ShapePhantom([dataclasses.replace(cover, activity=1), small])
+    expected = 4 / 3 * np.pi * (big**3 + 7 * r**3) - lens
+    assert 1e3 * both.total_activity == pytest.approx(expected, abs=2e-3 * r**3)
+    many = [dataclasses.replace(small, position=(x, 0, 0)) for x in range(-6, 7, 2)]
+    hot = dataclasses.replace(outer, activity=2)
+    assert mph.ShapePhantom([*many, hot]).total_activity == mph.ShapePhantom([hot]).total_activity
 
 
 @pytest.mark.parametrize("side", [4, 4.0, np.int64(4), np.float32(4)])

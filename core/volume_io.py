@@ -51,7 +51,7 @@ def read_volume(
     series: str | None = None,
     progress: Progress | None = None,
 ) -> Volume:
-    """Read a volume from NIfTI, a DICOM series, MetaImage, NRRD, Analyze, HDF5, .npz or .npy.
+    """Read a volume from NIfTI, a DICOM series or tomogram, MetaImage, NRRD, Analyze, HDF5, .npz or .npy.
 
     The world's axes are RAS, NIfTI's, whatever the format's are. docs/volumes.md has the formats and conventions.
 
@@ -73,7 +73,8 @@ def read_volume(
     ------
     InputError
         No such file, not such a file, damaged, not 3-D, not finite, in another unit, too large for the memory; of a DICOM
-        series: several of them, slices missing, double, unlike each other or tilted.
+        series: several of them, slices missing, double, unlike each other or tilted; of nuclear medicine, something else
+        than one reconstructed tomogram.
     """
     path = Path(path)
     contents = _contents(path, series, progress)

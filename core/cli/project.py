@@ -71,7 +71,8 @@ def add_parser(subparsers) -> None:  # type: ignore[no-untyped-def]
     )
     parser.add_argument(
         "--energy", metavar="KEV",
-        help="CT numbers of --volume or --mu become attenuation (1/mm) at this energy, or at an isotope's strongest line",
+        help="CT numbers of --volume, --states or --mu become attenuation (1/mm) at this energy, or at an isotope's "
+        "strongest line",
     )  # fmt: skip
     parser.add_argument(
         "--center",
@@ -89,7 +90,12 @@ def add_parser(subparsers) -> None:  # type: ignore[no-untyped-def]
         "--inverse-square", action="store_true",
         help="line integrals with each segment times a point source's sensitivity, as 1/h^2: no counts, for comparison",
     )  # fmt: skip
-    models.add_argument("--noise", type=int, metavar="SEED", help="draw Poisson counts instead of their means")
+    models.add_argument(
+        "--noise",
+        type=int,
+        metavar="SEED",
+        help="draw Poisson counts instead of their means; of --states, with SEED, SEED + 1 …",
+    )
     add_emission_options(parser)
     add_phantom_options(parser.add_argument_group("Derenzo phantom, without --volume, or place of --phantom"))  # type: ignore[arg-type]
     parser.add_argument("-o", "--output", required=True, metavar="FILE", help=", ".join(FORMATS))

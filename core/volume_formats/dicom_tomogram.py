@@ -63,7 +63,7 @@ def tomogram_frames(file: str, header: Any) -> list[dict[str, Any]]:
 
 def _require_tomogram(file: str, header: Any, count: int) -> None:
     """Raise `InputError` unless the frames are those of one reconstructed tomogram."""
-    kinds = header.get("ImageType") or ()
+    kinds: Any = header.get("ImageType") or ()
     told = not isinstance(kinds, str) and len(kinds) > 2
     kind = str(kinds[2]) if told else _TOMOGRAMS[0] if "SliceVector" in header else ""
     if kind not in _TOMOGRAMS:

@@ -4,10 +4,9 @@ Half-lives and gamma rays: ENSDF, the Evaluated Nuclear Structure Data File of t
 Brookhaven (nndc.bnl.gov/ensdf), as distributed with paceENSDF 0.6.3. The x rays of Tl-201 and Xe-133 and Tc-99m's gamma
 ray: the decay library UKDD-12, as distributed with actigamma 0.1.5. F-18's photons: European Pharmacopoeia, chapter 5.7.
 
-Lines: the gamma rays of more than 1 % of decays, to the digits given, and of the x rays those that are imaged, the K
-lines of Tl-201 and Xe-133. The others' are left out: from Ga-67 (9 keV) to I-131 (34 keV) no camera counts them, nor
-Lu-177's (54 to 63 keV, 6 % of decays). Evaluations differ by as much as 3 % (Tc-99m: 0.885 to 0.891; Xe-133's 81 keV:
-0.369 to 0.380).
+Lines: the gamma rays of more than 1 % of decays, to the digits given, and the K x rays of Tl-201 and Xe-133. Left out
+are the x rays that are not imaged: the other isotopes' below 35 keV, and Lu-177's (54 to 63 keV, 6 % of decays).
+Evaluations differ by as much as 3 % (Tc-99m: 0.885 to 0.891; Xe-133's 81 keV: 0.369 to 0.380).
 """
 
 from __future__ import annotations

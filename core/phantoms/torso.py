@@ -37,10 +37,11 @@ class CardiacTorso(Phantom):
     its 75 mm.
 
     Lungs, liver, spine and the direction of the heart's axis are after the mathematical adult of M. Cristy and K. F.
-    Eckerman, ORNL/TM-8381 (1987). Confirmed, by their younger phantom in Geant4's human_phantom scaled as the trunks, are
-    trunk, places, liver's and spine's half axes; the lungs' half axes, the liver's lower plane and the heart's axis are
-    not. Its body of 400 x 200 mm holds the arms: here an ellipse of 330 x 230 mm stands for a chest with the arms up,
-    the liver reaches 150 and not 165 mm to the right, and the spine lies 15 mm further back.
+    Eckerman, ORNL/TM-8381 (1987). The trunk, where the organs lie, and the half axes of liver and spine were checked
+    against its 15-year-old in Geant4's human_phantom, scaled; not confirmed are the half axes of the lungs, the plane
+    that cuts the liver, and the heart's axis. Its body of 400 x 200 mm holds the arms: here an ellipse of 330 x 230 mm
+    stands for a chest with the arms up, the liver reaches 150 and not 165 mm to the right, and the spine lies 15 mm
+    further back.
     The left ventricle is half an ellipsoid inside another, of 120 mL at end-diastole and 45 mL at end-systole with walls
     of 9.5 mm (within men's normal ranges, R. M. Lang et al., J Am Soc Echocardiogr 28 (2015) 1-39): 133 g of muscle,
     whose volume stays when it contracts, as does the apex's place. The volume falls along half a cosine for 35 % of the

@@ -137,6 +137,18 @@ def test_simpleitk_puts_every_voxel_in_the_same_place(tmp_path, ct, name):
         assert np.array_equal(itk.GetArrayFromImage(theirs), ct.array.transpose(2, 1, 0))
 
 
+@pytest.mark.parametrize("order", [range(7), range(6, -1, -1)], ids=["up", "down"])
+def test_simpleitk_puts_tomograms_in_the_same_place(tmp_path, ct, order):
+    itk = pytest.importorskip("SimpleITK", reason="SimpleITK is not installed")
+    counts = mph.Volume(2 * np.abs(ct.array) + 1, ct.grid)
+    write_tomogram(counts, tmp_path / "recon.dcm", order)
+    image = itk.ReadImage(str(tmp_path / "recon.dcm"))
+    volume = mph.read_volume(tmp_path / "recon.dcm", "activity")
+    for index in ((0, 0, 0), (4, 1, 6), (2, 5, 3)):
+        place = (LPS @ volume.grid.affine @ [*index, 1])[:3]
+        assert image[image.TransformPhysicalPointToIndex(place.tolist())] == volume.array[index]
+
+
 @pytest.mark.parametrize("space", ["right-anterior-superior", "left-anterior-superior", "LPS", None])
 def test_nrrd_spaces(tmp_path, rng, space):
     import nrrd

@@ -45,9 +45,12 @@ def tomogram_frames(file: str, header: Any) -> list[dict[str, Any]]:
     """
     count = int(header.get("NumberOfFrames") or 1)
     _require_tomogram(file, header, count)
-    slices = numbers(file, header, "SliceVector", count) if "SliceVector" in header else np.arange(1.0, count + 1)
-    if len(np.unique(slices)) < count:
-        raise InputError(f"{file}: {count} frames of {len(np.unique(slices))} slices; expected one frame of each slice")
+    if "SliceVector" in header:
+        slices = numbers(file, header, "SliceVector", count)
+        _require_one_volume(file, header, count, len(np.unique(slices)))
+    else:
+        slices = np.arange(1.0, count + 1)
+        _require_one_volume(file, header, count, int(header.get("NumberOfSlices") or 0))
     shared = {name: header.get(name) for name in ("PixelSpacing", "SliceThickness", "RescaleType")}
     shared |= {name: header.get(name) for name in ("RescaleSlope", "RescaleIntercept")}
     shared |= _in_becquerels(header)
@@ -70,17 +73,26 @@ def _require_tomogram(file: str, header: Any, count: int) -> None:
         said = f"ImageType {kind or 'without a third value'}, {count} frame{'s' * (count > 1)}"
         what = _OTHERS.get(kind, "something else")
         raise InputError(f"{file}: it holds {what} ({said}); expected a reconstructed tomogram (RECON TOMO)")
+
+
+def _require_one_volume(file: str, header: Any, count: int, slices: int) -> None:
+    """Raise `InputError` unless `count` frames are one of each of `slices` (0: the file does not say how many)."""
     for name, several in (
         ("TimeSlot", "gated, in {} time slots"),
         ("RRInterval", "gated, in {} R-R intervals"),
         ("EnergyWindow", "of {} energy windows"),
     ):
-        number = max(int(header.get(f"NumberOf{name}s") or 1), len(np.unique(header.get(f"{name}Vector") or 1)))
+        # A number alone does not say what the frames are: a tomogram may have been made from several windows.
+        number = int(header.get(f"NumberOf{name}s") or 1) if slices != count else 1
+        if f"{name}Vector" in header:
+            number = len(np.unique(header.get(f"{name}Vector")))
         if number > 1:
             raise InputError(
                 f"{file}: the tomogram is {several.format(number)} ({count} frames); expected one volume: save each, or "
                 "their sum, as a file of its own"
             )
+    if slices not in (0, count):
+        raise InputError(f"{file}: {count} frames of {slices} slices; expected one frame of each slice")
 
 
 def _spacing(file: str, header: Any) -> float:

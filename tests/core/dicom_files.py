@@ -71,7 +71,7 @@ def write_tomogram(volume: mph.Volume, path: Path, order=None, **changes) -> Dat
     data.SOPInstanceUID = data.file_meta.MediaStorageSOPInstanceUID = generate_uid()
     data.SeriesInstanceUID, data.Modality = generate_uid(), "NM"
     data.ImageType = ["DERIVED", "PRIMARY", "RECON TOMO", "EMISSION"]
-    data.NumberOfFrames, data.NumberOfSlices = len(order), n_z
+    data.NumberOfFrames, data.NumberOfSlices, data.NumberOfEnergyWindows = len(order), n_z, 2  # one for the scatter
     data.FrameIncrementPointer = 0x00540080
     data.SliceVector = [int(k if way > 0 else n_z - 1 - k) + 1 for k in order]
     data.DetectorInformationSequence = [detector]

@@ -498,8 +498,19 @@ BAD = {
         "it holds planar images (ImageType STATIC",
     ),
     "a gated tomogram": (_gated, "the tomogram is gated, in 2 time slots (7 frames); expected one volume"),
-    "energy windows": (_tomogram(NumberOfEnergyWindows=3), "the tomogram is of 3 energy windows"),
-    "slices twice": (_tomogram(SliceVector=[1, 2, 3, 3, 2, 1, 4]), "7 frames of 4 slices; expected one frame of each"),
+    "a gated tomogram without vectors": (
+        _tomogram(NumberOfTimeSlots=7, NumberOfSlices=1, SliceVector=None),
+        "the tomogram is gated, in 7 time slots (7 frames)",
+    ),
+    "energy windows": (_tomogram(EnergyWindowVector=[1, 1, 1, 1, 2, 2, 2]), "the tomogram is of 2 energy windows"),
+    "more frames than slices": (
+        _tomogram(NumberOfSlices=6, NumberOfEnergyWindows=1, SliceVector=None),
+        "7 frames of 6",
+    ),
+    "slices twice": (
+        _tomogram(SliceVector=[1, 2, 3, 3, 2, 1, 4], NumberOfEnergyWindows=1),
+        "7 frames of 4 slices; expected one frame of each",
+    ),
     "a slice missing in the middle": (_tomogram(SliceVector=[1, 2, 3, 5, 6, 7, 8]), "1 slice missing between"),
     "too few slice numbers": (_tomogram(SliceVector=[1, 2, 3]), "SliceVector: expected 7 numbers, got [1, 2, 3]"),
     "a tomogram nowhere": (_tomogram(DetectorInformationSequence=None), "nm.dcm: it has no ImagePositionPatient"),

@@ -24,6 +24,8 @@ radius = 10
 activity = 40
 """
 
+NUMPY = ["--size", "9", "9", "--backend", "numpy"]  # nothing is compiled for a few rays
+
 
 @pytest.mark.parametrize(
     ("kind", "phantom"),
@@ -113,12 +115,12 @@ def test_a_phantom_of_shapes_is_projected(workbook, tmp_path, capsys):
 def test_a_phantoms_own_mu_attenuates_as_its_volume_would(is_file, workbook, tmp_path, capsys):
     (tmp_path / "thorax.toml").write_text(THORAX)
     place = ["--voxels", "32", "30", "28", "--spacing", "5", "--euler", "10", "20", "30", "--position", "3", "2", "1"]
-    water = ["--water", "45", "50", "--background", "20"]
+    water = ["--rods", "9", "9", "8", "8", "9", "9", "--water", "45", "50", "--background", "20"]
     make = ["file", str(tmp_path / "thorax.toml"), *place] if is_file else ["derenzo", *water, *place]
     for quantity in ("activity", "mu"):
         words = ["phantom", *make, "--quantity", quantity, "-o", str(tmp_path / f"{quantity}.npz")]
         assert main(words) == 0
-    project = ["project", str(workbook), "--size", "9", "9", "--modules", "1-2", "--emission", "--isotope", "Tc-99m"]
+    project = ["project", str(workbook), *NUMPY, "--modules", "1-2", "--emission", "--isotope", "Tc-99m"]
     files = ["--volume", str(tmp_path / "activity.npz"), "--mu", str(tmp_path / "mu.npz")]
     source = ["--phantom", str(tmp_path / "thorax.toml"), *place] if is_file else [*water, *place]
     counts = []
@@ -132,7 +134,7 @@ def test_a_phantoms_own_mu_attenuates_as_its_volume_would(is_file, workbook, tmp
 
 
 def test_a_phantoms_own_mu_is_checked(workbook, tmp_path, capsys):
-    words = ["project", str(workbook), "--size", "9", "9", "--modules", "1", "--voxels", "16", "--emission"]
+    words = ["project", str(workbook), *NUMPY, "--modules", "1", "--voxels", "16", "--emission"]
     out = str(tmp_path / "run.npz")
     assert main([*words, "--phantom-mu", "--isotope", "Tl-201", "-o", out]) == 0
     assert "the mu of the Derenzo phantom holds at 140.5 keV, photons of 63.72 to 77.88 keV" in capsys.readouterr().err
@@ -155,7 +157,7 @@ def test_a_beating_heart_is_a_run_for_each_state(workbook, tmp_path, capsys, mon
     assert [state.array.max() for state in states] == [1, 1.5] and states[0].grid == states[1].grid
 
     files = [str(tmp_path / f"beat-{k}.npz") for k in (1, 2)]
-    project = ["project", str(workbook), "--size", "9", "9", "--modules", "30", "--emission", "--center"]
+    project = ["project", str(workbook), *NUMPY, "--modules", "30", "--emission", "--center"]
     more = ["--noise", "5", "--mosaic", str(tmp_path / "m.png")]
     assert main([*project, "--states", *files, *more, "-o", str(tmp_path / "run.npz")]) == 0
     for k, file in enumerate(files):

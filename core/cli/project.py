@@ -13,7 +13,8 @@ import numpy as np
 from ..errors import InputError
 from ..export import FORMATS, write_run
 from ..hounsfield import hu_to_mu
-from ..isotopes import CZT_MU, ISOTOPES, NAI_MU, TUNGSTEN_MU
+from ..isotopes import ISOTOPES
+from ..materials import APERTURES, CRYSTALS
 from ..mosaic import mosaic, write_png
 from ..project import project_run
 from ..projector import Emission, InverseSquareSum, Model, Transmission
@@ -27,6 +28,7 @@ from .options import (
     add_phantom_options,
     add_view_options,
     chosen_modules,
+    number_or_name,
     output_path,
     photon_energy,
     progress_bar,
@@ -104,8 +106,8 @@ def add_emission_options(parser: argparse.ArgumentParser) -> None:
         help="as many as bring a voxel's image this close, such as 0.1, to that of the whole hole",
     )  # fmt: skip
     option(
-        aperture, "--aperture-mu", type=float, metavar="MU",
-        help=f"of the aperture, 1/mm: {TUNGSTEN_MU} for tungsten at 140.5 keV; without it, nothing penetrates",
+        aperture, "--aperture-mu", type=number_or_name, metavar="MATERIAL",
+        help=f"{', '.join(APERTURES)} at the isotope's photons, or the coefficient, 1/mm; without it, nothing penetrates",
     )  # fmt: skip
     option(aperture, "--opening-angle", type=float, metavar="DEG", help="full angle of the knife edge (default: 90)")
     option(
@@ -117,8 +119,8 @@ def add_emission_options(parser: argparse.ArgumentParser) -> None:
     option(crystal, "--within-walls", action="store_true", help="the collimator's walls stop what misses the front")
     option(crystal, "--within-crystal", action="store_true", help="pixels beyond the crystal's side count nothing")
     option(
-        crystal, "--crystal-mu", type=float, metavar="MU",
-        help=f"of the crystal, 1/mm: {NAI_MU} for NaI, {CZT_MU} for CZT at 140.5 keV; without it, all photons count",
+        crystal, "--crystal-mu", type=number_or_name, metavar="MATERIAL",
+        help=f"{', '.join(CRYSTALS)} at the isotope's photons, or the coefficient, 1/mm; without it, all photons count",
     )  # fmt: skip
     option(
         crystal, "--depth-layers", type=int, metavar="N", help="depths of interaction, for the parallax (default: 1)"

@@ -39,13 +39,13 @@ MATERIALS = {
     "gold": Material(19.32, {"Au": 1.0}),
     "uranium": Material(18.95, {"U": 1.0}),  # depleted or not: a matter of the nucleus, not of its electrons
     # Crystals, by their formulas and the densities that their makers give; without the traces of dopants.
-    "NaI": Material(3.67, {"Na": 0.15343, "I": 0.84657}),
-    "CsI": Material(4.51, {"Cs": 0.51155, "I": 0.48845}),
+    "NaI": Material(3.67, {"Na": 0.15338, "I": 0.84662}),
+    "CsI": Material(4.51, {"Cs": 0.51157, "I": 0.48843}),
     "CZT": Material(5.78, {"Cd": 0.42994, "Zn": 0.02778, "Te": 0.54227}),  # Cd0.9 Zn0.1 Te
     "CdTe": Material(5.85, {"Cd": 0.46836, "Te": 0.53164}),
-    "BGO": Material(7.13, {"Bi": 0.67107, "Ge": 0.17481, "O": 0.15412}),  # Bi4 Ge3 O12
-    "LYSO": Material(7.1, {"Lu": 0.71448, "Y": 0.04033, "Si": 0.06372, "O": 0.18147}),  # Lu1.8 Y0.2 Si O5
-    "GAGG": Material(6.63, {"Gd": 0.509, "Al": 0.0582, "Ga": 0.22566, "O": 0.20715}),  # Gd3 Al2 Ga3 O12
+    "BGO": Material(7.13, {"Bi": 0.67099, "Ge": 0.1749, "O": 0.15411}),  # Bi4 Ge3 O12
+    "LYSO": Material(7.1, {"Lu": 0.71448, "Y": 0.04034, "Si": 0.06371, "O": 0.18147}),  # Lu1.8 Y0.2 Si O5
+    "GAGG": Material(6.63, {"Gd": 0.50897, "Al": 0.05822, "Ga": 0.22567, "O": 0.20714}),  # Gd3 Al2 Ga3 O12
     # The same source, table 2: tissues of ICRU Report 44 (1989); lung as it is inflated.
     "water": Material(1.0, {"H": 0.111898, "O": 0.888102}),
     "air": Material(1.20479e-3, {"C": 0.000124, "N": 0.755268, "O": 0.231781, "Ar": 0.012827}),

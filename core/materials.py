@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from .checks import positive
 from .errors import InputError
 from .mass_attenuation import ELEMENTS, ENERGIES
+from .system import PinholeSystem
 
 
 @dataclass(frozen=True)
@@ -113,54 +114,60 @@ def attenuation(material: str, energy: float) -> float:
     return made.density / 10 * sum(share * _coefficient(symbol, energy) for symbol, share in made.composition.items())
 
 
-def aperture_attenuation(material: str, lines: Sequence[tuple[float, float]], name: str = "material") -> float:
-    """The one coefficient, 1/mm, of an aperture through whose edge photons of several energies pass.
+def module_coefficients(
+    aperture: str | float | None,
+    crystal: str | float | None,
+    lines: Sequence[tuple[float, float]],
+    system: PinholeSystem,
+    opening_angle: float,
+    place: str = "",
+) -> tuple[float | None, float | None]:
+    """The coefficients, 1/mm, of apertures and crystals: of materials, one that stands for all the photons' energies.
 
-    The mean is that of 1/mu: Paix's d_e^2, linear in it, then lets as many photons pass as they do together.
+    With them as many photons pass the apertures, and are stopped by the crystals behind, as do of all lines together:
+    those that come along the axis, by Paix's ``d_e^2 = d (d + 2 / mu tan(alpha / 2))``, with the modules' mean hole and
+    crystal.
 
     Parameters
     ----------
-    material
-        As for `attenuation`.
+    aperture, crystal
+        The materials, as for `attenuation`; numbers and None are given back.
     lines
         Energy, keV, and number of photons, as in `Isotope.lines`.
-    name
-        What to call the material in errors.
+    system
+        The modules.
+    opening_angle
+        Full angle alpha of the knife edge, rad.
+    place
+        What precedes ``aperture_mu`` and ``crystal_mu`` in errors.
 
     Raises
     ------
     InputError
-        There are no lines, or as for `attenuation`.
+        There are no lines to take a material at, or as for `attenuation`.
     """
-    mu, photons = _at_lines(material, lines, name)
-    return float(mu.min() / np.average(mu.min() / mu, weights=photons))
+    photons = np.array([photons for _, photons in lines])
+    if isinstance(aperture, str):
+        mu = _at_lines(aperture, lines, f"{place}aperture_mu")
+        depth = 2 / mu * np.tan(opening_angle / 2)
+        aperture = float(mu.min() / np.average(mu.min() / mu, weights=photons))  # d_e^2 is linear in 1/mu
+        photons = photons * (system.pinhole_diameter.mean() + depth)
+    if isinstance(crystal, str):
+        mu, thickness = _at_lines(crystal, lines, f"{place}crystal_mu"), system.detector_thickness.mean()
+        passed = np.average(np.exp((mu.min() - mu) * thickness), weights=photons)
+        crystal = float(mu.min() - np.log(passed) / thickness)
+    return aperture, crystal
 
 
-def crystal_attenuation(
-    material: str, lines: Sequence[tuple[float, float]], thickness: float, name: str = "material"
-) -> float:
-    """The one coefficient, 1/mm, of a crystal `thickness` mm thick that stops photons of several energies.
-
-    It stops as many of those that come straight as the crystal stops of all of them together. Arguments and errors as
-    for `aperture_attenuation`.
-    """
-    mu, photons = _at_lines(material, lines, name)
-    passed = np.average(np.exp((mu.min() - mu) * thickness), weights=photons)
-    return float(mu.min() - np.log(passed) / thickness)
-
-
-def _at_lines(
-    material: str, lines: Sequence[tuple[float, float]], name: str
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def _at_lines(material: str, lines: Sequence[tuple[float, float]], name: str) -> NDArray[np.float64]:
     if not lines:
         raise InputError(
             f"{name} {material!r}: at which energy? expected an isotope with photons in its window, or a number, 1/mm"
         )
     try:
-        mu = [attenuation(material, energy) for energy, _ in lines]
+        return np.array([attenuation(material, energy) for energy, _ in lines])
     except InputError as error:
         raise InputError(f"{name}: {error}") from None
-    return np.array(mu), np.array([photons for _, photons in lines])
 
 
 def _coefficient(symbol: str, energy: float) -> float:

@@ -13,7 +13,7 @@ from ..checks import positive, real_array
 from ..errors import InputError
 from ..grid import Grid
 from ..isotopes import Isotope, isotope
-from ..materials import aperture_attenuation, crystal_attenuation
+from ..materials import module_coefficients
 from ..system import PinholeSystem
 from ..views import Views
 from ..volume import Volume
@@ -75,10 +75,10 @@ class Emission(Model):
         to that of the whole hole: the absolute differences of the pixels, each counting over its whole area, sum to at
         most this share of the counts. Errors at most add up, so it holds for any activity around the isocentre.
     aperture_mu : float or str, optional
-        The aperture's material (`core.materials`, ``"tungsten"``), which attenuates as it does at the isotope's photons
-        in the window; or its attenuation coefficient at their energy, 1/mm, which the attribute then is for a material,
-        too. Of several lines it is their mean in 1/mu, with which Paix's d_e^2 is exact. None: nothing penetrates it,
-        d_e = d.
+        Attenuation coefficient of the aperture's material at the photons' energy, 1/mm; or the material's name
+        (`core.materials`: ``"tungsten"``), whose coefficient at the isotope's photons in the window takes its place: of
+        several lines, the one with which as many photons pass as do of all together (`materials.module_coefficients`).
+        None: nothing penetrates it, d_e = d.
     opening_angle : float
         Full angle alpha of the knife edge's double cone, rad.
     edge : str
@@ -90,9 +90,8 @@ class Emission(Model):
         correction for its obliquity in either: seen at psi its area is cos(psi) times the disk's, which is in cos^4(psi).
         With one aperture point the edge changes the counts alone; with n, the blur too, by some 4 sqrt(pi n) rays more.
     crystal_mu : float or str, optional
-        The crystal's material (``"NaI"``), or its attenuation coefficient at the photons' energy, 1/mm, as for the
-        aperture. With it ``1 - exp(-crystal_mu Td / cos(psi))`` of the photons are counted; of several lines, as many as
-        of all together where they come straight (Td being the modules' mean). None: all.
+        Attenuation coefficient of the crystal at the photons' energy, 1/mm, or its name (``"NaI"``), as for the aperture.
+        With it ``1 - exp(-crystal_mu Td / cos(psi))`` of the photons are counted. None: all.
     depth_layers : int
         Depths in the crystal, from front to back, at which photons are recorded, with `crystal_mu`: slanted rays are
         recorded the farther out, the deeper they are absorbed (parallax). Number and mean depth are exact for every
@@ -151,13 +150,13 @@ class Emission(Model):
             if self.mu.array.min() < 0:
                 raise InputError(f"emission: mu must not be negative, got {self.mu.array.min():g} 1/mm")
         self._set_photons()
-        self._set_materials()
-        for name in ("time", "opening_angle", "aperture_mu", "crystal_mu", "aperture_tolerance"):
-            value = getattr(self, name)
-            if value is not None or name in ("time", "opening_angle"):
-                self._set(name, positive(value, f"emission: {name}"))
+        for name in ("time", "opening_angle"):
+            self._set(name, positive(getattr(self, name), f"emission: {name}"))
         if self.opening_angle >= math.pi:
             raise InputError(f"emission: opening_angle must be below pi, got {self.opening_angle:g} rad")
+        self._set_materials()
+        if self.aperture_tolerance is not None:
+            self._set("aperture_tolerance", positive(self.aperture_tolerance, "emission: aperture_tolerance"))
         self._set("intrinsic_fwhm", float(real_array(self.intrinsic_fwhm, "emission: intrinsic_fwhm", ())))
         if self.intrinsic_fwhm < 0:
             raise InputError(f"emission: intrinsic_fwhm must not be negative, got {self.intrinsic_fwhm:g} mm")
@@ -201,13 +200,14 @@ class Emission(Model):
         self._set("photons_per_decay", positive(self.photons_per_decay, "emission: photons_per_decay"))
 
     def _set_materials(self) -> None:
-        """Make `aperture_mu` and `crystal_mu` numbers where they are materials."""
+        """Make `aperture_mu` and `crystal_mu` numbers, also where they are materials."""
         lines = () if self.isotope is None else self.isotope.lines_within(*self.window)  # type: ignore[union-attr, misc]
-        if isinstance(self.aperture_mu, str):
-            self._set("aperture_mu", aperture_attenuation(self.aperture_mu, lines, "emission: aperture_mu"))
-        if isinstance(self.crystal_mu, str):
-            thickness = float(self.system.detector_thickness.mean())
-            self._set("crystal_mu", crystal_attenuation(self.crystal_mu, lines, thickness, "emission: crystal_mu"))
+        coefficients = module_coefficients(
+            self.aperture_mu, self.crystal_mu, lines, self.system, self.opening_angle, "emission: "
+        )
+        for name, value in zip(("aperture_mu", "crystal_mu"), coefficients, strict=True):
+            if value is not None:
+                self._set(name, positive(value, f"emission: {name}"))
 
     def record(self) -> dict[str, Any]:
         """The settings, for a run's record; of mu only its grid, of the isotope its name."""

@@ -241,8 +241,8 @@ def test_geometry_performance_adds_up(workbook, capsys):
     assert main(["geometry", "performance", str(workbook), *named]) == 0
     total = json.loads(capsys.readouterr().out)["total"]["sensitivity"]
     assert total == pytest.approx(1e6 * expected.sum(), rel=1e-3)
-    assert main(["geometry", "performance", str(workbook), *named[:4]]) == 1
-    assert "--crystal-mu 'CZT': at which energy" in capsys.readouterr().err
+    assert main(["geometry", "performance", str(workbook), *named[2:4]]) == 1
+    assert "crystal_mu 'CZT': at which energy" in capsys.readouterr().err
     assert main(["geometry", "performance", str(workbook), "--opening-angle", "200"]) == 1
     assert "--opening-angle 200: expected degrees" in capsys.readouterr().err
     assert main(["geometry", "performance", str(workbook), "--point", "0", "0", "900"]) == 0

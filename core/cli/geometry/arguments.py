@@ -8,7 +8,7 @@ from typing import Any
 
 from ...errors import InputError
 from ...isotopes import ISOTOPES, isotope
-from ...materials import APERTURES, CRYSTALS, aperture_attenuation, crystal_attenuation
+from ...materials import APERTURES, CRYSTALS, module_coefficients
 from ...system import PinholeSystem
 from ..options import number_or_name
 
@@ -44,16 +44,16 @@ def add_materials(parser: argparse.ArgumentParser) -> None:
 
 def sensitivity_settings(arguments: argparse.Namespace, system: PinholeSystem) -> dict[str, Any]:
     """The keywords of `sensitivity`."""
-    lines, crystal = _lines(arguments), arguments.crystal_mu
-    if isinstance(crystal, str):
-        crystal = crystal_attenuation(crystal, lines, float(system.detector_thickness.mean()), "--crystal-mu")
+    lines = _lines(arguments)
     photons = 1.0 if arguments.isotope is None else sum(photons for _, photons in lines)
-    return {**_edge(arguments), "crystal_mu": crystal, "photons_per_decay": photons}
+    edge, crystal = _materials(arguments, system)
+    return {**edge, "crystal_mu": crystal, "photons_per_decay": photons}
 
 
-def resolution_settings(arguments: argparse.Namespace) -> dict[str, Any]:
+def resolution_settings(arguments: argparse.Namespace, system: PinholeSystem) -> dict[str, Any]:
     """The keywords of `resolution`."""
-    return {**_edge(arguments), "intrinsic_fwhm": arguments.intrinsic_fwhm}
+    edge, _ = _materials(arguments, system)
+    return {**edge, "intrinsic_fwhm": arguments.intrinsic_fwhm}
 
 
 def _lines(arguments: argparse.Namespace) -> tuple[tuple[float, float], ...]:
@@ -64,12 +64,14 @@ def _lines(arguments: argparse.Namespace) -> tuple[tuple[float, float], ...]:
     return decaying.lines_within(*decaying.window)
 
 
-def _edge(arguments: argparse.Namespace) -> dict[str, Any]:
+def _materials(arguments: argparse.Namespace, system: PinholeSystem) -> tuple[dict[str, Any], float | None]:
+    """The keywords of the aperture's edge, and the crystal's coefficient."""
     if not 0 < arguments.opening_angle < 180:
         raise InputError(
             f"--opening-angle {arguments.opening_angle:g}: expected degrees, more than 0 and less than 180"
         )
-    aperture = arguments.aperture_mu
-    if isinstance(aperture, str):
-        aperture = aperture_attenuation(aperture, _lines(arguments), "--aperture-mu")
-    return {"aperture_mu": aperture, "opening_angle": math.radians(arguments.opening_angle)}
+    angle = math.radians(arguments.opening_angle)
+    aperture, crystal = module_coefficients(
+        arguments.aperture_mu, arguments.crystal_mu, _lines(arguments), system, angle
+    )
+    return {"aperture_mu": aperture, "opening_angle": angle}, crystal

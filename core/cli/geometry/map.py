@@ -63,7 +63,7 @@ def _map(arguments: argparse.Namespace, system: PinholeSystem, grid: Grid) -> Vo
     counting = sensitivity_settings(arguments, system)
     settings = {
         "sensitivity": counting,
-        "resolution": {**resolution_settings(arguments), "crystal_mu": counting["crystal_mu"]},
+        "resolution": {**resolution_settings(arguments, system), "crystal_mu": counting["crystal_mu"]},
     }
     return MAPS[arguments.quantity](
         system, grid, **settings.get(arguments.quantity, {}), progress=progress_bar("mapping")

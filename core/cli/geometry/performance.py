@@ -36,7 +36,7 @@ def _run(arguments: argparse.Namespace) -> None:
     system = read_system(arguments.file)
     points = [arguments.point]
     counts = 1e6 * sensitivity(system, points, **sensitivity_settings(arguments, system))[0]
-    fwhm = resolution(system, points, **resolution_settings(arguments))[0]
+    fwhm = resolution(system, points, **resolution_settings(arguments, system))[0]
     radius = roi_radius_seen(
         system.pinhole_distance, system.pinhole_diameter, system.detector_side, system.collimator_length
     )

@@ -47,7 +47,7 @@ MATERIALS = {
     "BGO": Material(7.13, {"Bi": 0.67099, "Ge": 0.1749, "O": 0.15411}),  # Bi4 Ge3 O12
     "LYSO": Material(7.1, {"Lu": 0.71448, "Y": 0.04034, "Si": 0.06371, "O": 0.18147}),  # Lu1.8 Y0.2 Si O5
     "GAGG": Material(6.63, {"Gd": 0.50897, "Al": 0.05822, "Ga": 0.22567, "O": 0.20714}),  # Gd3 Al2 Ga3 O12
-    # The same source, table 2: tissues of ICRU Report 44 (1989); lung as it is inflated.
+    # NIST's table 2: tissues of ICRU Report 44 (1989), bone cortical, lung as thin as it is inflated.
     "water": Material(1.0, {"H": 0.111898, "O": 0.888102}),
     "air": Material(1.20479e-3, {"C": 0.000124, "N": 0.755268, "O": 0.231781, "Ar": 0.012827}),
     "PMMA": Material(1.19, {"H": 0.080541, "C": 0.599846, "O": 0.319613}),
@@ -66,7 +66,7 @@ MATERIALS = {
         0.26,
         {"H": 0.103, "C": 0.105, "N": 0.031, "O": 0.749, "Na": 0.002, "P": 0.002, "S": 0.003, "Cl": 0.003, "K": 0.002},
     ),
-    "bone": Material(  # cortical
+    "bone": Material(
         1.92,
         {"H": 0.034, "C": 0.155, "N": 0.042, "O": 0.435, "Na": 0.001, "Mg": 0.002, "P": 0.103, "S": 0.003, "Ca": 0.225},
     ),

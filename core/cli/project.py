@@ -46,7 +46,7 @@ def add_parser(subparsers) -> None:  # type: ignore[no-untyped-def]
         "project a volume, or a phantom, into every module",
         "mphdrr project scanner.xlsx --volume ct.nii.gz --size 250 250 -o run.h5\n"
         "example: mphdrr project scanner.xlsx --volume heart.nii.gz --mu ct-mu.nii.gz --emission --isotope Tc-99m "
-        "--time 600 --aperture-points 7 --aperture-mu 3.6 --crystal-mu 0.404 --noise 1 -o counts.h5",
+        "--time 600 --aperture-points 7 --aperture-mu tungsten --crystal-mu CZT --noise 1 -o counts.h5",
     )
     parser.add_argument("workbook", metavar="WORKBOOK", help="geometry workbook (.xlsx, .xlsm)")
     source = parser.add_mutually_exclusive_group()

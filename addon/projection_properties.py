@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING, Any
 import bpy
 from bpy.props import BoolProperty, EnumProperty, FloatProperty, IntProperty, PointerProperty, StringProperty
 
-from ..core.isotopes import CZT_MU, ISOTOPES, NAI_MU, TUNGSTEN_MU
+from ..core.isotopes import ISOTOPES
+from ..core.materials import APERTURES, CRYSTALS
 from ..core.system import PinholeSystem
 from ..core.volume import Volume
 from . import ids, volumes
@@ -16,6 +17,14 @@ from .phantom_properties import typed
 
 if TYPE_CHECKING:
     from ..core.projector import Model
+
+
+def _materials(names: tuple[str, ...], none: str) -> tuple[tuple[str, str, str], ...]:
+    """Items of a choice of material, by name or by its coefficient."""
+    return (
+        ("NUMBER", "By Coefficient", f"By its attenuation coefficient; 0: {none}"),
+        *((name, name[0].upper() + name[1:], "As it attenuates the isotope's photons") for name in names),
+    )
 
 
 class ProjectionSettings:
@@ -53,9 +62,13 @@ class ProjectionSettings:
         name="Aperture Points", description="Points of the hole from which each pixel's rays start; 1: its middle, no "
         "blur, 7 and more: the blur of a hole of this size", default=1, min=1, soft_max=64,
     )  # fmt: skip
+    aperture_material: EnumProperty(
+        name="Aperture", description="Material that photons penetrate at the aperture's edge",
+        items=_materials(APERTURES, "nothing penetrates it"), default="NUMBER",
+    )  # fmt: skip
     aperture_mu: FloatProperty(
-        name="Aperture µ", description="Attenuation coefficient of the aperture in 1/mm, at the photons' energy "
-        f"(tungsten at 140.5 keV: {TUNGSTEN_MU:g}); 0: nothing penetrates it",
+        name="Aperture µ", description="Attenuation coefficient of the aperture in 1/mm, at the photons' energy, "
+        "where no material is chosen; 0: nothing penetrates it",
         default=0.0, min=0.0, soft_max=10.0, precision=3,
     )  # fmt: skip
     opening_angle: FloatProperty(
@@ -71,9 +84,13 @@ class ProjectionSettings:
         ),
         default="PAIX",
     )
+    crystal_material: EnumProperty(
+        name="Crystal", description="Material that stops the photons that are counted",
+        items=_materials(CRYSTALS, "all photons are counted"), default="NUMBER",
+    )  # fmt: skip
     crystal_mu: FloatProperty(
-        name="Crystal µ", description="Attenuation coefficient of the crystal in 1/mm, at the photons' energy (at 140.5 keV "
-        f"NaI: {NAI_MU:g}, CZT: {CZT_MU:g}); 0: all photons are counted",
+        name="Crystal µ", description="Attenuation coefficient of the crystal in 1/mm, at the photons' energy, where no "
+        "material is chosen; 0: all photons are counted",
         default=0.0, min=0.0, soft_max=5.0, precision=3,
     )  # fmt: skip
     depth_layers: IntProperty(
@@ -141,6 +158,9 @@ def chosen_model(settings: dict[str, Any], system: PinholeSystem, mu: Volume | N
     given: dict[str, Any] = {name: settings[name] for name in _EMISSION}
     given |= {name: typed(value) for name, value in given.items() if isinstance(value, float)}
     given |= {name: None for name in _OPTIONAL if given[name] in (0, "NONE")}
+    for part in ("aperture", "crystal"):
+        if settings[f"{part}_material"] != "NUMBER":
+            given[f"{part}_mu"] = settings[f"{part}_material"]
     return Emission(system, mu, **(given | {"edge": given["edge"].lower()}))
 
 

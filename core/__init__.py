@@ -20,6 +20,7 @@ from .grid import Grid
 from .hounsfield import diffdrr_density, hu_to_mu
 from .isotopes import ISOTOPES, Isotope, isotope
 from .maps import completeness_map, modules_map, resolution_map, sensitivity_map
+from .materials import MATERIALS, Material, attenuation
 from .meshes.mesh import Mesh, read_mesh, write_mesh
 from .meshes.surface import volume_to_mesh
 from .meshes.voxelization import voxelize_mesh
@@ -53,6 +54,7 @@ from .workbook import SystemSource, WrittenWorkbook, read_system, write_system
 
 __all__ = [
     "ISOTOPES",
+    "MATERIALS",
     "Box",
     "Cancelled",
     "Capsule",
@@ -71,6 +73,7 @@ __all__ = [
     "InverseSquareSum",
     "Isotope",
     "JaszczakPhantom",
+    "Material",
     "Mesh",
     "ModulePerformance",
     "NemaBody",
@@ -92,6 +95,7 @@ __all__ = [
     "Volume",
     "WrittenWorkbook",
     "as_seen",
+    "attenuation",
     "c_arm_views",
     "canonical",
     "centered",

@@ -13,31 +13,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from .checks import freeze, positive
+from .checks import freeze
 from .errors import InputError, InputWarning
+from .materials import attenuation
 from .memory import require
 from .volume import Volume
-
-# Mass attenuation coefficients with coherent scattering, cm^2/g, at energies in keV: J. H. Hubbell, S. M. Seltzer, "Tables
-# of X-Ray Mass Attenuation Coefficients", NIST Standard Reference Database 126 (1995, table 4), from XCOM. No absorption
-# edge of these materials lies between these energies.
-_ENERGIES = np.array([10.0, 15, 20, 30, 40, 50, 60, 80, 100, 150, 200, 300, 400, 500, 600, 800, 1000])
-_MASS_ATTENUATION = {
-    "water": np.array(
-        [5.329, 1.673, 0.8096, 0.3756, 0.2683, 0.2269, 0.2059, 0.1837, 0.1707, 0.1505, 0.1370, 0.1186, 0.1061, 0.09687,
-         0.08956, 0.07865, 0.07072]
-    ),
-    "air": np.array(
-        [5.120, 1.614, 0.7779, 0.3538, 0.2485, 0.2080, 0.1875, 0.1662, 0.1541, 0.1356, 0.1233, 0.1067, 0.09549, 0.08712,
-         0.08055, 0.07074, 0.06358]
-    ),
-    "bone": np.array(
-        [28.51, 9.032, 4.001, 1.331, 0.6655, 0.4242, 0.3148, 0.2229, 0.1855, 0.1480, 0.1309, 0.1113, 0.09908, 0.09022,
-         0.08332, 0.07308, 0.06566]
-    ),
-}  # fmt: skip
-DENSITIES = {"water": 1.0, "air": 1.20479e-3, "bone": 1.92}
-"""g/cm^3: water, dry air near sea level, cortical bone of ICRU report 44 (1989); table 2 of the same source."""
 
 CT_ENERGY = 70.0
 """keV: the one energy at which a patient attenuates about as a CT's beam of 120 kV. Only the slope of bone depends on it.
@@ -50,23 +30,6 @@ AIR_HU = -1000.0
 _PADDING_HU = -1024.0  # below the 12 bits of a CT: what lies outside the scanned circle
 _METAL_HU = 3071.0  # above the 12 bits of a CT
 DIFFDRR_AIR, DIFFDRR_BONE = -800.0, 350.0  # HU, its limits
-
-
-def attenuation(material: str, energy: float) -> float:
-    """Linear attenuation coefficient, 1/mm, of ``"water"``, ``"air"`` or (cortical) ``"bone"`` at `energy`, keV.
-
-    A cubic through the four nearest energies of NIST's table, in the logarithms: within 0.15 % from 30 keV on and 0.35 %
-    below, where straight lines miss by up to 4 %, and bone's at 70 keV by 2 %. Energies from 10 to 1000 keV.
-    """
-    if material not in _MASS_ATTENUATION:
-        raise InputError(f"material {material!r}: expected one of {', '.join(_MASS_ATTENUATION)}")
-    energy = positive(energy, "energy", "keV")
-    if not _ENERGIES[0] <= energy <= _ENERGIES[-1]:
-        raise InputError(f"energy {energy:g} keV: expected {_ENERGIES[0]:g} to {_ENERGIES[-1]:g} keV")
-    first = np.clip(np.searchsorted(_ENERGIES, energy) - 2, 0, len(_ENERGIES) - 4)
-    nearest = slice(first, first + 4)
-    cubic = np.polyfit(np.log(_ENERGIES[nearest] / energy), np.log(_MASS_ATTENUATION[material][nearest]), 3)
-    return float(np.exp(cubic[-1]) * DENSITIES[material]) / 10  # its value at log(1)
 
 
 def hu_to_mu(volume: Volume, energy: float = 140.5, ct_energy: float = CT_ENERGY) -> Volume:

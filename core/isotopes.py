@@ -17,19 +17,20 @@ from dataclasses import dataclass
 from .checks import positive
 from .errors import InputError
 
-# Linear attenuation coefficients at Tc-99m's 140.5 keV, 1/mm: density times the total mass attenuation coefficient from
-# W. T. Elam et al., Radiation Physics and Chemistry 63 (2002) 121-128 (as in XrayDB 4). At other energies they are far
-# from these: at Tl-201's 71 keV tungsten's is 20.6, just above its K edge (69.5 keV), lead's 3.7, below its own (88.0 keV).
+# Linear attenuation coefficients at Tc-99m's 140.5 keV and at no other energy (`materials.attenuation` is for all), 1/mm:
+# density times the total mass attenuation coefficient from W. T. Elam et al., Radiation Physics and Chemistry 63 (2002)
+# 121-128 (as in XrayDB 4). At Tl-201's 71 keV tungsten's is 20.6, just above its K edge (69.5 keV), lead's 3.7, below its
+# own (88.0 keV).
 TUNGSTEN_MU = 3.60
-"""Tungsten, 19.3 g/cm^3."""
+"""Tungsten, 19.3 g/cm^3, at 140.5 keV."""
 LEAD_MU = 2.69
-"""Lead, 11.35 g/cm^3."""
+"""Lead, 11.35 g/cm^3, at 140.5 keV."""
 NAI_MU = 0.262
-"""Sodium iodide, 3.67 g/cm^3."""
+"""Sodium iodide, 3.67 g/cm^3, at 140.5 keV."""
 CZT_MU = 0.404
-"""Cadmium zinc telluride, Cd0.9 Zn0.1 Te, 5.78 g/cm^3."""
+"""Cadmium zinc telluride, Cd0.9 Zn0.1 Te, 5.78 g/cm^3, at 140.5 keV."""
 WATER_MU = 0.0154
-"""Water, 1 g/cm^3."""
+"""Water, 1 g/cm^3, at 140.5 keV."""
 
 _HOUR = 3600.0
 _DAY = 24 * _HOUR
@@ -61,7 +62,11 @@ class Isotope:
 
     def photons_per_decay(self, low: float, high: float) -> float:
         """Photons per decay in the energy window from `low` to `high`, keV."""
-        return sum(photons for energy, photons in self.lines if low <= energy <= high)
+        return sum(photons for _, photons in self.lines_within(low, high))
+
+    def lines_within(self, low: float, high: float) -> tuple[tuple[float, float], ...]:
+        """The `lines` in the energy window from `low` to `high`, keV."""
+        return tuple((energy, photons) for energy, photons in self.lines if low <= energy <= high)
 
     def mean_decay_time(self, duration: float) -> float:
         """The time, s, in which the activity at the start would make all decays of `duration`, s: what is lost by decay.

@@ -92,7 +92,10 @@ class MPHDRR_OT_render_projections(ProjectionSettings, jobs.JobOperator, bpy.typ
         return jobs.Job("Projecting", work, finish)
 
     def _setting(self, scene: bpy.types.Scene, name: str) -> Any:
-        """A setting as given to the operator, else the panel's."""
+        """A setting as given to the operator, else the panel's; a coefficient that is given is not the panel's material."""
+        coefficient = name.replace("_material", "_mu")
+        if not self.properties.is_property_set(name) and self.properties.is_property_set(coefficient):
+            return "NUMBER"
         return getattr(self if self.properties.is_property_set(name) else getattr(scene, ids.SCENE_PROJECTIONS), name)
 
 

@@ -82,15 +82,19 @@ class MPHDRR_PT_physics(bpy.types.Panel):
             column.prop(settings, "mu", placeholder="None")
             column = layout.column(align=True)
             column.prop(settings, "aperture_points")
-            column.prop(settings, "aperture_mu", text="Edge µ (1/mm)")
+            column.prop(settings, "aperture_material", text="Edge of")
+            if settings.aperture_material == "NUMBER":
+                column.prop(settings, "aperture_mu", text="Edge µ (1/mm)")
             edge = column.column(align=True)
-            edge.active = settings.aperture_mu > 0
+            edge.active = settings.aperture_material != "NUMBER" or settings.aperture_mu > 0
             edge.prop(settings, "edge")
             column.prop(settings, "opening_angle")
             column = layout.column(align=True)
-            column.prop(settings, "crystal_mu", text="Crystal µ (1/mm)")
+            column.prop(settings, "crystal_material")
+            if settings.crystal_material == "NUMBER":
+                column.prop(settings, "crystal_mu", text="Crystal µ (1/mm)")
             depth = column.column(align=True)
-            depth.active = settings.crystal_mu > 0
+            depth.active = settings.crystal_material != "NUMBER" or settings.crystal_mu > 0
             depth.prop(settings, "depth_layers")
             column.prop(settings, "intrinsic_fwhm", text="Blur (mm)")
             column = layout.column(heading="Stopped by", align=True)

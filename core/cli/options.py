@@ -186,6 +186,14 @@ def photon_energy(text: str) -> float:
         raise InputError(f"energy {text!r}: expected keV, or one of {', '.join(ISOTOPES)}") from None
 
 
+def number_or_name(text: str) -> float | str:
+    """What an option's text is that takes a number or the name of something."""
+    try:
+        return float(text)
+    except ValueError:
+        return text
+
+
 def progress_bar(label: str) -> Progress:
     """A progress callback that draws a bar on standard error when that is a terminal, and says nothing otherwise."""
     started = time.monotonic()

@@ -16,7 +16,8 @@ import numpy as np
 from ..errors import InputError, InputWarning
 from ..export import FORMATS, write_run
 from ..hounsfield import hu_to_mu
-from ..isotopes import CZT_MU, ISOTOPES, NAI_MU, TUNGSTEN_MU
+from ..isotopes import ISOTOPES
+from ..materials import APERTURES, CRYSTALS
 from ..mosaic import mosaic, write_png
 from ..project import project_run
 from ..projector import Emission, InverseSquareSum, Model, Transmission
@@ -32,6 +33,7 @@ from .options import (
     add_phantom_options,
     add_view_options,
     chosen_modules,
+    number_or_name,
     numbered_path,
     output_path,
     photon_energy,
@@ -53,7 +55,7 @@ def add_parser(subparsers) -> None:  # type: ignore[no-untyped-def]
         "project a volume, or a phantom, into every module",
         "mphdrr project scanner.xlsx --volume ct.nii.gz --size 250 250 -o run.h5\n"
         "example: mphdrr project scanner.xlsx --volume heart.nii.gz --mu ct-mu.nii.gz --emission --isotope Tc-99m "
-        "--time 600 --aperture-points 7 --aperture-mu 3.6 --crystal-mu 0.404 --noise 1 -o counts.h5\n"
+        "--time 600 --aperture-points 7 --aperture-mu tungsten --crystal-mu CZT --noise 1 -o counts.h5\n"
         "example: mphdrr project scanner.xlsx --phantom thorax.toml --phantom-mu --emission --isotope Tc-99m -o counts.h5",
     )
     parser.add_argument("workbook", metavar="WORKBOOK", help="geometry workbook (.xlsx, .xlsm)")
@@ -135,8 +137,8 @@ def add_emission_options(parser: argparse.ArgumentParser) -> None:
         help="as many as bring a voxel's image this close, such as 0.1, to that of the whole hole",
     )  # fmt: skip
     option(
-        aperture, "--aperture-mu", type=float, metavar="MU",
-        help=f"of the aperture, 1/mm: {TUNGSTEN_MU} for tungsten at 140.5 keV; without it, nothing penetrates",
+        aperture, "--aperture-mu", type=number_or_name, metavar="MATERIAL",
+        help=f"{', '.join(APERTURES)} at the isotope's photons, or the coefficient, 1/mm; without it, nothing penetrates",
     )  # fmt: skip
     option(aperture, "--opening-angle", type=float, metavar="DEG", help="full angle of the knife edge (default: 90)")
     option(
@@ -148,8 +150,8 @@ def add_emission_options(parser: argparse.ArgumentParser) -> None:
     option(crystal, "--within-walls", action="store_true", help="the collimator's walls stop what misses the front")
     option(crystal, "--within-crystal", action="store_true", help="pixels beyond the crystal's side count nothing")
     option(
-        crystal, "--crystal-mu", type=float, metavar="MU",
-        help=f"of the crystal, 1/mm: {NAI_MU} for NaI, {CZT_MU} for CZT at 140.5 keV; without it, all photons count",
+        crystal, "--crystal-mu", type=number_or_name, metavar="MATERIAL",
+        help=f"{', '.join(CRYSTALS)} at the isotope's photons, or the coefficient, 1/mm; without it, all photons count",
     )  # fmt: skip
     option(
         crystal, "--depth-layers", type=int, metavar="N", help="depths of interaction, for the parallax (default: 1)"

@@ -13,6 +13,7 @@ from ..checks import positive, real_array
 from ..errors import InputError
 from ..grid import Grid
 from ..isotopes import Isotope, isotope
+from ..materials import module_coefficients
 from ..system import PinholeSystem
 from ..views import Views
 from ..volume import Volume
@@ -73,9 +74,11 @@ class Emission(Model):
         Instead of `aperture_points`: as few points as keep the image of one of the grid's voxels, at the isocentre, near
         to that of the whole hole: the absolute differences of the pixels, each counting over its whole area, sum to at
         most this share of the counts. Errors at most add up, so it holds for any activity around the isocentre.
-    aperture_mu : float, optional
-        Attenuation coefficient of the aperture's material, 1/mm (`core.isotopes.TUNGSTEN_MU`). None: nothing
-        penetrates it, d_e = d.
+    aperture_mu : float or str, optional
+        Attenuation coefficient of the aperture's material at the photons' energy, 1/mm; or the material's name
+        (`core.materials`: ``"tungsten"``), whose coefficient at the isotope's photons in the window takes its place: of
+        several lines, the one with which as many photons pass as do of all together (`materials.module_coefficients`).
+        None: nothing penetrates it, d_e = d.
     opening_angle : float
         Full angle alpha of the knife edge's double cone, rad.
     edge : str
@@ -86,9 +89,9 @@ class Emission(Model):
         ``d_e^2 = d^2 + 2 d / mu tan(alpha / 2) + 2 / mu^2 tan^2(alpha / 2)`` (Metzler 2001). The hole itself needs no
         correction for its obliquity in either: seen at psi its area is cos(psi) times the disk's, which is in cos^4(psi).
         With one aperture point the edge changes the counts alone; with n, the blur too, by some 4 sqrt(pi n) rays more.
-    crystal_mu : float, optional
-        Attenuation coefficient of the crystal, 1/mm (`core.isotopes.NAI_MU`, `CZT_MU`). With it
-        ``1 - exp(-crystal_mu Td / cos(psi))`` of the photons are counted. None: all.
+    crystal_mu : float or str, optional
+        Attenuation coefficient of the crystal at the photons' energy, 1/mm, or its name (``"NaI"``), as for the aperture.
+        With it ``1 - exp(-crystal_mu Td / cos(psi))`` of the photons are counted. None: all.
     depth_layers : int
         Depths in the crystal, from front to back, at which photons are recorded, with `crystal_mu`: slanted rays are
         recorded the farther out, the deeper they are absorbed (parallax). Number and mean depth are exact for every
@@ -120,9 +123,9 @@ class Emission(Model):
     time: float = 1.0
     photons_per_decay: float = None  # type: ignore[assignment]  # always a number once made
     aperture_points: int = 1
-    aperture_mu: float | None = None
+    aperture_mu: float | str | None = None  # a number once made
     opening_angle: float = math.pi / 2
-    crystal_mu: float | None = None
+    crystal_mu: float | str | None = None  # likewise
     intrinsic_fwhm: float = 0.0
     within_crystal: bool = False
     isotope: Isotope | str | None = None
@@ -147,12 +150,13 @@ class Emission(Model):
             if self.mu.array.min() < 0:
                 raise InputError(f"emission: mu must not be negative, got {self.mu.array.min():g} 1/mm")
         self._set_photons()
-        for name in ("time", "opening_angle", "aperture_mu", "crystal_mu", "aperture_tolerance"):
-            value = getattr(self, name)
-            if value is not None or name in ("time", "opening_angle"):
-                self._set(name, positive(value, f"emission: {name}"))
+        for name in ("time", "opening_angle"):
+            self._set(name, positive(getattr(self, name), f"emission: {name}"))
         if self.opening_angle >= math.pi:
             raise InputError(f"emission: opening_angle must be below pi, got {self.opening_angle:g} rad")
+        self._set_materials()
+        if self.aperture_tolerance is not None:
+            self._set("aperture_tolerance", positive(self.aperture_tolerance, "emission: aperture_tolerance"))
         self._set("intrinsic_fwhm", float(real_array(self.intrinsic_fwhm, "emission: intrinsic_fwhm", ())))
         if self.intrinsic_fwhm < 0:
             raise InputError(f"emission: intrinsic_fwhm must not be negative, got {self.intrinsic_fwhm:g} mm")
@@ -194,6 +198,16 @@ class Emission(Model):
         elif self.photons_per_decay is None:
             self._set("photons_per_decay", 1.0)
         self._set("photons_per_decay", positive(self.photons_per_decay, "emission: photons_per_decay"))
+
+    def _set_materials(self) -> None:
+        """Make `aperture_mu` and `crystal_mu` numbers, also where they are materials."""
+        lines = () if self.isotope is None else self.isotope.lines_within(*self.window)  # type: ignore[union-attr, misc]
+        coefficients = module_coefficients(
+            self.aperture_mu, self.crystal_mu, lines, self.system, self.opening_angle, "emission: "
+        )
+        for name, value in zip(("aperture_mu", "crystal_mu"), coefficients, strict=True):
+            if value is not None:
+                self._set(name, positive(value, f"emission: {name}"))
 
     def record(self) -> dict[str, Any]:
         """The settings, for a run's record; of mu only its grid, of the isotope its name."""
@@ -244,8 +258,8 @@ class Emission(Model):
         """d_e (M,), mm: the opaque hole that lets as many photons pass along the axis."""
         d = self.system.pinhole_diameter
         if self.aperture_mu is None or self.edge == "paix":
-            return paix_diameter(d, self.aperture_mu, self.opening_angle)
-        depth = 2 / self.aperture_mu * self._tangent
+            return paix_diameter(d, self.aperture_mu, self.opening_angle)  # type: ignore[arg-type]
+        depth = 2 / self.aperture_mu * self._tangent  # type: ignore[operator]
         return np.sqrt(d * (d + depth) + depth**2 / 2)
 
     @property
@@ -311,7 +325,7 @@ class Emission(Model):
         weights = self.effective_time * self.photons_per_decay * pitch[0] * pitch[1] * throughput(cosine, distance)
         weights = weights * opening.area(slope_u, slope_v)
         if self.crystal_mu is not None:
-            weights = weights * absorbed_share(cosine, self.crystal_mu, thickness, depths, layer)
+            weights = weights * absorbed_share(cosine, self.crystal_mu, thickness, depths, layer)  # type: ignore[arg-type]
         if self.within_cone:
             weights = weights * within_cone(slope_u, slope_v, self._tangent)
         for along, size, start in ((along_u, pitch[0], opening.x), (along_v, pitch[1], opening.y)):
@@ -348,7 +362,7 @@ class Emission(Model):
         if self.edge == "paix" or self.aperture_mu is None:
             return openings(n, self.effective_diameter[m])
         d = self.system.pinhole_diameter[m]
-        return openings(n, d, KnifeEdge(d / 2, self.aperture_mu, self._tangent))
+        return openings(n, d, KnifeEdge(d / 2, self.aperture_mu, self._tangent))  # type: ignore[arg-type]
 
     def _crystal_scale(self, views: Views, m: int) -> float:
         """A length on the crystal, per length on view m's plane."""

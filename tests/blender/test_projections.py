@@ -100,6 +100,20 @@ def test_physics_of_the_panel_is_that_of_core(scanned, scene, body):
     assert {name: run.settings[name] for name in IN_PYTHON} == IN_PYTHON
 
 
+def test_materials_of_the_panel_are_those_of_core(scanned, scene):
+    """Chosen materials attenuate the isotope's photons; a coefficient that a script gives is not overruled by them."""
+    from mphdrr.core.export import read_run
+
+    settings = scene.mphdrr_projections
+    settings.model, settings.isotope = "EMISSION", "Tl-201"
+    settings.aperture_material, settings.crystal_material = "tungsten", "NaI"
+    model = Emission(scanned, isotope="Tl-201", aperture_mu="tungsten", crystal_mu="NaI")
+    for given, aperture in (({}, model.aperture_mu), ({"aperture_mu": 5.0}, 5.0)):
+        assert bpy.ops.mphdrr.render_projections(width=4, height=4, **given) == {"FINISHED"}
+        record = read_run(storage.absolute(settings.run_file)).settings
+        assert (record["aperture_mu"], record["crystal_mu"]) == (aperture, model.crystal_mu)
+
+
 def test_photons_of_a_radiograph_and_the_inverse_square_sum(scanned, scene, body):
     from mphdrr.core.export import read_run
     from mphdrr.core.projector import InverseSquareSum, intensity
@@ -147,6 +161,7 @@ def test_physics_panel_shows_settings_that_exist(scene, model):
     [
         ({"aperture_points": 2}, "3 or more"),
         ({"edge": "PATH"}, "aperture_mu"),
+        ({"aperture_material": "lead"}, "aperture_mu 'lead': at which energy"),
         ({"depth_layers": 2}, "crystal_mu"),
         ({"mu": "Nope"}, "no volume is named 'Nope'"),
         ({"mu": "Derenzo"}, "volume of mu"),

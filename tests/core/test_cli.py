@@ -110,14 +110,14 @@ def test_every_part_of_the_emission_model_is_an_option(workbook, tmp_path):
     """Options reach the model and the record; those left out are the model's own defaults."""
     run_file = tmp_path / "run.h5"
     options = (
-        "--emission --isotope Tl-201 --window 60 80 --time 300 --aperture-points 3 --aperture-mu 5 --opening-angle 80 "
+        "--emission --isotope Tl-201 --window 60 80 --time 300 --aperture-points 3 --aperture-mu lead --opening-angle 80 "
         "--edge path --within-cone --within-walls --within-crystal --crystal-mu 0.3 --depth-layers 2 --intrinsic-fwhm 3"
     )
     words = [*SMALL, "--modules", "3-4", *options.split(), "-o", str(run_file)]
     assert main(["project", str(workbook), *words]) == 0
     run = mph.read_run(run_file)
     model = mph.Emission(
-        run.system, isotope="Tl-201", window=(60, 80), time=300, aperture_points=3, aperture_mu=5,
+        run.system, isotope="Tl-201", window=(60, 80), time=300, aperture_points=3, aperture_mu="lead",
         opening_angle=np.deg2rad(80), edge="path", within_cone=True, within_walls=True, within_crystal=True,
         crystal_mu=0.3, depth_layers=2, intrinsic_fwhm=3,
     )  # fmt: skip
@@ -265,6 +265,12 @@ def test_geometry_performance_adds_up(workbook, capsys):
     assert printed["total"]["sensitivity"] == pytest.approx(1e6 * expected.sum())
     assert printed["total"]["modules_holding_roi"] == 80
     assert all(m["roi_radius_seen"] == pytest.approx(75, abs=1e-3) for m in printed["modules"])
+    named = ["--aperture-mu", "tungsten", "--crystal-mu", "CZT", "--isotope", "Tc-99m", "--json"]
+    assert main(["geometry", "performance", str(workbook), *named]) == 0
+    total = json.loads(capsys.readouterr().out)["total"]["sensitivity"]
+    assert total == pytest.approx(1e6 * expected.sum(), rel=1e-3)
+    assert main(["geometry", "performance", str(workbook), *named[2:4]]) == 1
+    assert "crystal_mu 'CZT': at which energy" in capsys.readouterr().err
     assert main(["geometry", "performance", str(workbook), "--opening-angle", "200"]) == 1
     assert "--opening-angle 200: expected degrees" in capsys.readouterr().err
     assert main(["geometry", "performance", str(workbook), "--point", "0", "0", "900"]) == 0

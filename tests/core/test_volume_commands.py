@@ -10,7 +10,7 @@ import pytest
 
 import mphdrr.core as mph
 from mphdrr.core.cli import main
-from mphdrr.core.hounsfield import attenuation
+from mphdrr.core.materials import attenuation
 
 from .dicom_files import write_series, write_tomogram
 from .test_meshes import box

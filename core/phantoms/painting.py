@@ -32,7 +32,7 @@ _MIN_SAMPLES, _MAX_SAMPLES = 128, 1 << 13  # of a voxel that a surface cuts
 _SEQUENCE = 1 << 16  # points of which voxels take stretches by turns, so that their errors differ and cancel
 # Over what is not uniform, few voxels get more samples: about so many altogether.
 _SAMPLES_OF_MIXED = 1 << 21
-# In boxes of up to so many voxels a shape's samples are weighed so that they make up exactly its volume.
+# In boxes of up to so many voxels a shape's samples are weighed so that they make up exactly what it changes.
 _WEIGHED = 1 << 22
 # Shapes whose smallest part is below a voxel, and that touch `_FEW` or fewer, are sampled in their own box.
 _FEW = 1 << 11
@@ -110,21 +110,27 @@ def values_at(layers: Sequence[Layer], points: Points) -> Points:
     return values
 
 
-def integral(layers: Sequence[Layer]) -> float:
-    """Value times mm^3 of the whole painting."""
-    total = 0.0
-    for layer, beneath in zip(layers, _seen_beneath(layers), strict=True):
-        volume = layer.shape.volume * abs(float(np.linalg.det(layer.pose[:3, :3])))
-        total += volume * layer.value
-        if len(beneath) == 1 and beneath[0].relation(layer) == 1:
-            total -= volume * beneath[0].value
-        elif beneath:
-            total -= volume * _mean_inside(layer, beneath)
-    return total
+def integral(layers: Sequence[Layer], replaced: Sequence[float]) -> float:
+    """Value times mm^3 of the whole painting; `replaced` as of `means_beneath`."""
+    return sum(
+        layer.shape.volume * abs(float(np.linalg.det(layer.pose[:3, :3]))) * (layer.value - mean)
+        for layer, mean in zip(layers, replaced, strict=True)
+    )
 
 
-def _mean_inside(layer: Layer, beneath: Sequence[Layer]) -> float:
-    """The mean of what is painted beneath a layer's shape: exact where it is uniform."""
+def means_beneath(layers: Sequence[Layer]) -> list[float]:
+    """For each layer the mean of what its shape replaces, wherever the painting lies: exact where it is uniform."""
+    return [_mean_beneath(layer, beneath) for layer, beneath in zip(layers, _seen_beneath(layers), strict=True)]
+
+
+def _is_uniform(layer: Layer, beneath: Sequence[Layer]) -> bool:
+    """Whether all that a layer's shape replaces surely has one value."""
+    return not beneath or (len(beneath) == 1 and beneath[0].relation(layer) == 1)
+
+
+def _mean_beneath(layer: Layer, beneath: Sequence[Layer]) -> float:
+    if _is_uniform(layer, beneath):
+        return beneath[0].value if beneath else 0.0
     total, hits = 0.0, 0
     for first in range(0, _SAMPLES_BENEATH, _BOX_BLOCK):
         points = _box_points(layer.shape, first)
@@ -134,12 +140,14 @@ def _mean_inside(layer: Layer, beneath: Sequence[Layer]) -> float:
     return total / hits if hits else 0.0
 
 
-def paint_voxels(grid: Grid, layers: Sequence[Layer], progress: Progress | None = None) -> Floats:
+def paint_voxels(
+    grid: Grid, layers: Sequence[Layer], replaced: Sequence[float], progress: Progress | None = None
+) -> Floats:
     """The mean of the painting over each voxel, float32 array of the grid's shape.
 
     Voxels farther from a surface than their own half diagonal are all in or all out; the others are sampled at the
-    points of a low-discrepancy sequence, which weigh so much that the shape's volume comes out. The points of a shape
-    that is small beside the voxels fill the shape instead.
+    points of a low-discrepancy sequence, which weigh so much that what the shape changes comes out. The points of a
+    shape that is small beside the voxels fill the shape instead.
 
     Parameters
     ----------
@@ -147,12 +155,17 @@ def paint_voxels(grid: Grid, layers: Sequence[Layer], progress: Progress | None 
         Where the voxels are.
     layers
         From bottom to top.
+    replaced
+        As of `means_beneath`.
     progress
         Called as ``progress(done, total)``.
     """
     require(4.2 * grid.n_voxels, "a volume of {} x {} x {} voxels".format(*grid.shape))
     image = np.zeros(grid.shape, np.float32)
-    strokes = [_Stroke(grid, layer, beneath) for layer, beneath in zip(layers, _seen_beneath(layers), strict=True)]
+    strokes = [
+        _Stroke(grid, layer, beneath, layer.value - mean)
+        for layer, beneath, mean in zip(layers, _seen_beneath(layers), replaced, strict=True)
+    ]
     total, done = sum(stroke.steps for stroke in strokes), 0
     with ThreadPoolExecutor(os.cpu_count()) as pool:
         for stroke in strokes:
@@ -230,8 +243,8 @@ def _next_power_of_2(counts: NDArray[np.int64]) -> NDArray[np.int64]:
 class _Stroke:
     """What painting a layer over those beneath it does to an image."""
 
-    def __init__(self, grid: Grid, layer: Layer, beneath: Sequence[Layer]) -> None:
-        self.grid, self.layer, self.beneath = grid, layer, beneath
+    def __init__(self, grid: Grid, layer: Layer, beneath: Sequence[Layer], mean_change: float) -> None:
+        self.grid, self.layer, self.beneath, self.mean_change = grid, layer, beneath, mean_change
         shape_from_index = self.layer.from_world @ grid.affine
         shape = self.layer.shape
         low, high = _index_box(shape_from_index, shape)
@@ -244,7 +257,7 @@ class _Stroke:
         self.is_small = shape.finest < self.edge and self.touched < _FEW
         inside = bool(np.all(low >= -0.5) and np.all(high <= np.array(grid.shape) - 0.5))
         # Whether it matters which part of the shape a voxel holds.
-        self.is_mixed = bool(beneath) and not (len(beneath) == 1 and beneath[0].relation(layer) == 1)
+        self.is_mixed = not _is_uniform(layer, beneath)
         self.is_weighed = inside and bool(np.prod(self.stop - self.start) <= _WEIGHED)
 
     @property
@@ -297,36 +310,39 @@ class _Stroke:
         offsets = (r3_sequence(stretches * n_samples) - 0.5).reshape(3, stretches, n_samples)
         own, *lower = (_Sampled(layer, self.grid, offsets) for layer in (self.layer, *self.beneath))
 
-        def fill(ix: int) -> tuple[int, NDArray[np.int64], Floats, Floats]:
+        def fill(ix: int) -> tuple[float, NDArray[np.int64], Floats, Floats]:
             slab = image[ix, rows, columns]
             values = slab.ravel()
             index = np.stack([np.full(iy.size, ix), iy.ravel(), iz.ravel()])
-            parts, n_whole = [], 0
+            parts, of_whole = [], 0.0
             for first in range(0, len(values), _BLOCK):
                 block = slice(first, first + _BLOCK)
                 whole, cut, coverage, change = _changes(index[:, block], own, lower)
-                values[block] = np.where(whole, own.layer.over(values[block]), values[block])
+                painted = np.where(whole, own.layer.over(values[block]), values[block])
+                of_whole += float(np.sum(painted - values[block], dtype=np.float64))
+                values[block] = painted
                 parts.append((first + cut, coverage, change))
-                n_whole += int(np.count_nonzero(whole))
             cut, coverage, change = map(np.concatenate, zip(*parts, strict=True))
             if not self.is_weighed:
                 values[cut] += change
             slab[...] = values.reshape(slab.shape)
-            return n_whole, cut, coverage, change
+            return of_whole, cut, coverage, change
 
-        kept, missing, unsure = [], self.layer.shape.volume / self.voxel_volume, 0.0
+        kept, missing, unsure = [], self.mean_change * self.layer.shape.volume / self.voxel_volume, 0.0
         for ix, (whole, cut, coverage, change) in enumerate(
             pool.map(fill, range(self.start[0], self.stop[0])), self.start[0]
         ):
             if self.is_weighed:
                 kept.append((ix, cut, coverage, change))
-                missing -= whole + float(coverage.sum(dtype=np.float64))
-                unsure += float(np.sum(coverage * (1 - coverage), dtype=np.float64))
+                missing -= whole + float(change.sum(dtype=np.float64))
+                unsure += float(np.sum(np.abs(change) * (1 - coverage), dtype=np.float64))
             yield
         # What is missing goes to where the shares c are unsure, as c (1 - c): they stay between 0 and 1.
         weight = np.float32(missing / unsure if unsure else 0.0)
         for ix, cut, coverage, change in kept:
-            image[ix, iy.ravel()[cut], iz.ravel()[cut]] += change * (1 + weight * (1 - coverage))
+            factor = 1 + weight * np.sign(change) * (1 - coverage)
+            factor = np.clip(factor, 0, 1 / np.maximum(coverage, np.float32(1e-6)))
+            image[ix, iy.ravel()[cut], iz.ravel()[cut]] += change * factor
 
     @property
     def _n_samples(self) -> int:

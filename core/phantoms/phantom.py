@@ -22,7 +22,7 @@ from ..progress import Progress
 from ..projector.tracing import points as as_points
 from ..views import Views
 from ..volume import Volume
-from .painting import Layer, integral, line_integrals, paint_voxels, values_at
+from .painting import Layer, integral, line_integrals, means_beneath, paint_voxels, values_at
 from .settings import check_settings
 from .shapes import Shape
 
@@ -127,7 +127,7 @@ class Phantom:
         """
         if not isinstance(grid, Grid):
             raise InputError(f"voxelize: expected a Grid, got {type(grid).__name__}")
-        image = paint_voxels(grid, self._layers(quantity, pose), progress)
+        image = paint_voxels(grid, self._layers(quantity, pose), self._replaced[quantity], progress)
         whole = self._totals[quantity] * (1.0 if pose is None else abs(float(np.linalg.det(np.asarray(pose)[:3, :3]))))
         held = float(image.sum(dtype=np.float64)) * grid.voxel_volume / whole if whole > 0 else 1.0
         if held < _HELD:
@@ -197,7 +197,12 @@ class Phantom:
     @cached_property
     def _totals(self) -> dict[str, float]:
         """Of each quantity, the value times mm^3 of the whole phantom."""
-        return {quantity: integral(self._layers(quantity)) for quantity in QUANTITIES}
+        return {quantity: integral(self._layers(quantity), self._replaced[quantity]) for quantity in QUANTITIES}
+
+    @cached_property
+    def _replaced(self) -> dict[str, list[float]]:
+        """Of each quantity, for each of its layers the mean of what it replaces."""
+        return {quantity: means_beneath(self._layers(quantity)) for quantity in QUANTITIES}
 
     def _layers(self, quantity: str, pose: ArrayLike | None = None) -> list[Layer]:
         """Every shape that holds the quantity, in the world."""

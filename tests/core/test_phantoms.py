@@ -163,15 +163,15 @@ def test_projectors_agree_with_exact_projections(system):
 
 
 @pytest.mark.parametrize("phantom", KINDS, ids=title)
-@pytest.mark.parametrize("voxels", [13, 40])
+@pytest.mark.parametrize("voxels", [6, 40])
 def test_total_activity_does_not_depend_on_grid_or_pose(phantom, voxels, rng):
-    """To 0.1 %, also where voxels are larger than the parts; for activity and for mu."""
+    """To 0.02 %, also where voxels are larger than the parts; for activity and for mu."""
     spacing = phantom.extent / (voxels - 3)
     grid = mph.Grid.centered(voxels, spacing)
     turned = mph.euler_pose(*rng.uniform(-3, 3, 3), translation=rng.uniform(-1, 1, 3) * spacing)
     for pose in (None, turned):
         volume = phantom.voxelize(grid, pose)
-        assert total(volume) == pytest.approx(phantom.total_activity, rel=1e-3)
+        assert total(volume) == pytest.approx(phantom.total_activity, rel=2e-4)
         assert volume.array.min() >= -1e-5 * volume.array.max()
     # And of mu: against the closed forms along many parallel lines.
     volume = phantom.voxelize(grid, turned, quantity="mu")

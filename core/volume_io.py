@@ -131,12 +131,19 @@ def write_volume(volume: Volume, path: str | os.PathLike[str]) -> None:
 
 def _contents(path: Path, series: str | None, progress: Progress | None) -> Contents:
     """What the file at `path` holds, or `InputError` that names it."""
-    if not path.exists():
-        raise InputError(f"{path}: no such file")
+    try:
+        found = path.stat()
+    except (OSError, ValueError) as error:  # a name that cannot be is a ValueError
+        missing = isinstance(error, FileNotFoundError)
+        raise InputError(
+            f"{path}: {'no such file' if missing else getattr(error, 'strerror', None) or error}"
+        ) from None
     ending = _ending(path, READ_FORMATS)
     is_series = path.is_dir() or ending == ".dcm" or (not ending and dicom.is_dicom(path))
     if not (ending or is_series):
         raise InputError(f"{path}: expected a folder of DICOM files, or a name ending in {', '.join(READ_FORMATS)}")
+    if found.st_size == 0 and not path.is_dir():
+        raise InputError(f"{path}: it is empty")
     if series is not None and not is_series:
         raise InputError(f"{path}: only folders of DICOM files hold several series")
     try:

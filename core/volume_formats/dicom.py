@@ -72,7 +72,7 @@ def read(path: Path, series: str | None = None, progress: Progress | None = None
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", module="pydicom")  # about tags that nothing here depends on
         headers = _chosen(_headers(path), path, series)
-        slices = [one for file, header in headers for one in _slices(file, header)]
+        slices = [one for file, header in headers for one in _slices_of(file, header)]
         slices, step = _ordered(slices)
         quantity, factor = _quantity(headers[0][1])
         rows, columns = slices[0].shape
@@ -157,6 +157,16 @@ def _listed(found: dict[str, list[tuple[Path, Any]]]) -> str:
         name = " ".join(str(x) for x in (number, description and f'"{description}"') if x is not None) or uid
         parts.append(f"{name} ({len(of)} images)")
     return "; ".join(parts)
+
+
+def _slices_of(path: Path, header: Any) -> list[_Slice]:
+    """The images of a file, or `InputError` that names it."""
+    try:
+        return list(_slices(path, header))
+    except InputError:
+        raise
+    except Exception as error:  # whatever pydicom raises on a tag that is damaged: it parses them when asked
+        raise InputError(f"{path.name}: cannot be read as DICOM ({first_line(error)})") from None
 
 
 def _slices(path: Path, header: Any) -> Iterator[_Slice]:

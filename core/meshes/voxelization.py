@@ -100,7 +100,7 @@ def mesh_coverage(mesh: Mesh, grid: Grid, progress: Progress | None = None) -> N
     n_x, n_y, n_z = box.shape
     surface = _seen(_slab(_slab(corners - start, 0, 0, n_x), 1, 0, n_y))
     # What is in front of the first voxel covers all of its column, what is behind the last one none of it.
-    in_front = _clip(surface, 2, 0, -1)
+    in_front = _clip(surface[surface[:, :, 2].min(axis=1) < 0], 2, 0, -1)
     in_front[:, :, 2] = 0
     surface = _seen(_joined([in_front, _slab(surface, 2, 0, n_z)]))
     if _fill(box, surface, progress) > 1 + _ROUNDING:

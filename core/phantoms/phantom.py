@@ -171,7 +171,14 @@ class Phantom:
         """Line integrals through the pixels' centres of all views, exact: images (M, n_v, n_u), value x mm.
 
         What `Projector` with `Transmission` approaches as voxels get smaller.
+
+        Raises
+        ------
+        InputError
+            No views, or the images do not fit into memory; as of `voxelize`.
         """
+        if not isinstance(views, Views):
+            raise InputError(f"project: expected Views, got {type(views).__name__}")
         require(4.0 * len(views) * math.prod(views.shape), "a set of projections")
         images = np.empty((len(views), *views.shape), np.float32)
         for m, image in enumerate(images):

@@ -44,7 +44,7 @@ lint: env-dev
 bench: env-dev
 	$(BIN)/python benchmarks/projector.py $(BENCH)
 
-dist: env
+dist: env-dev
 	$(BIN)/python tools/build_extension.py $(addprefix --platform ,$(PLATFORM))
 
 test-app: env-dev

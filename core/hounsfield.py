@@ -40,7 +40,11 @@ DENSITIES = {"water": 1.0, "air": 1.20479e-3, "bone": 1.92}
 """g/cm^3: water, dry air near sea level, cortical bone of ICRU report 44 (1989); table 2 of the same source."""
 
 CT_ENERGY = 70.0
-"""keV: the one energy at which a patient attenuates about as a CT's beam of 120 kV. Only the slope of bone depends on it."""
+"""keV: the one energy at which a patient attenuates about as a CT's beam of 120 kV. Only the slope of bone depends on it.
+
+Spectra calculated with SpekPy 2 (tungsten anode, 6 to 9 mm of aluminium) see bone relative to water as 67 to 72 keV do
+behind 20 to 30 cm of water, and as 61 to 63 keV behind 10 cm.
+"""
 
 AIR_HU = -1000.0
 _PADDING_HU = -1024.0  # below the 12 bits of a CT: what lies outside the scanned circle
@@ -51,15 +55,18 @@ DIFFDRR_AIR, DIFFDRR_BONE = -800.0, 350.0  # HU, its limits
 def attenuation(material: str, energy: float) -> float:
     """Linear attenuation coefficient, 1/mm, of ``"water"``, ``"air"`` or (cortical) ``"bone"`` at `energy`, keV.
 
-    Interpolated in the logarithms, as NIST says. Energies from 10 to 1000 keV.
+    A cubic through the four nearest energies of NIST's table, in the logarithms: within 0.15 % from 30 keV on and 0.35 %
+    below, where straight lines miss by up to 4 %, and bone's at 70 keV by 2 %. Energies from 10 to 1000 keV.
     """
     if material not in _MASS_ATTENUATION:
         raise InputError(f"material {material!r}: expected one of {', '.join(_MASS_ATTENUATION)}")
     energy = positive(energy, "energy", "keV")
     if not _ENERGIES[0] <= energy <= _ENERGIES[-1]:
         raise InputError(f"energy {energy:g} keV: expected {_ENERGIES[0]:g} to {_ENERGIES[-1]:g} keV")
-    mass = np.exp(np.interp(np.log(energy), np.log(_ENERGIES), np.log(_MASS_ATTENUATION[material])))
-    return float(mass * DENSITIES[material]) / 10
+    first = np.clip(np.searchsorted(_ENERGIES, energy) - 2, 0, len(_ENERGIES) - 4)
+    nearest = slice(first, first + 4)
+    cubic = np.polyfit(np.log(_ENERGIES[nearest] / energy), np.log(_MASS_ATTENUATION[material][nearest]), 3)
+    return float(np.exp(cubic[-1]) * DENSITIES[material]) / 10  # its value at log(1)
 
 
 def hu_to_mu(volume: Volume, energy: float = 140.5, ct_energy: float = CT_ENERGY) -> Volume:

@@ -2,9 +2,11 @@
 
 Half-lives and gamma rays: ENSDF, the Evaluated Nuclear Structure Data File of the National Nuclear Data Center,
 Brookhaven (nndc.bnl.gov/ensdf), as distributed with paceENSDF 0.6.3. The x rays of Tl-201 and Xe-133 and Tc-99m's gamma
-ray: the decay library UKDD-12, as distributed with actigamma 0.1.5. Tc-99m's half-life: F. G. Kondev et al., "The
-NUBASE2020 evaluation", Chinese Physics C 45 (2021) 030001. F-18's photons: European Pharmacopoeia, chapter 5.7. Lines of
-more than 1 % of decays, to the digits given. Evaluations differ by about as much as 1 % (Tc-99m: 0.885 to 0.891).
+ray: the decay library UKDD-12, as distributed with actigamma 0.1.5. F-18's photons: European Pharmacopoeia, chapter 5.7.
+
+Lines: the gamma rays of more than 1 % of decays, to the digits given, and the K x rays of Tl-201 and Xe-133. Left out
+are the x rays that are not imaged: the other isotopes' below 35 keV, and Lu-177's (54 to 63 keV, 6 % of decays).
+Evaluations differ by as much as 3 % (Tc-99m: 0.885 to 0.891; Xe-133's 81 keV: 0.369 to 0.380).
 """
 
 from __future__ import annotations
@@ -16,7 +18,8 @@ from .checks import positive
 from .errors import InputError
 
 # Linear attenuation coefficients at Tc-99m's 140.5 keV, 1/mm: density times the total mass attenuation coefficient from
-# W. T. Elam et al., Radiation Physics and Chemistry 63 (2002) 121-128 (as in XrayDB 4).
+# W. T. Elam et al., Radiation Physics and Chemistry 63 (2002) 121-128 (as in XrayDB 4). At other energies they are far
+# from these: at Tl-201's 71 keV tungsten's is 20.6, just above its K edge (69.5 keV), lead's 3.7, below its own (88.0 keV).
 TUNGSTEN_MU = 3.60
 """Tungsten, 19.3 g/cm^3."""
 LEAD_MU = 2.69

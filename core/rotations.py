@@ -51,7 +51,7 @@ def rotation_matrix(
         - ``"axis_angle"``, ``"se3_log_map"``: unit axis times angle, radians.
         - ``"euler_angles"``: three angles about the axes named in `convention`, in that order.
         - ``"quaternion"``: w, x, y, z, of any length but 0.
-        - ``"quaternion_adjugate"``: upper triangle of q q^T, up to scale (Lin et al., arXiv 2205.09116).
+        - ``"quaternion_adjugate"``: upper triangle of q q^T, up to scale (Hanson, Hanson, arXiv 2205.09116).
         - ``"rotation_6d"``: the first two rows, orthonormalised (Zhou et al., CVPR 2019).
         - ``"rotation_9d"``: all three rows; the rotation nearest to them (Levinson et al., NeurIPS 2020).
         - ``"rotation_10d"``: upper triangle of a symmetric matrix whose eigenvector of the smallest eigenvalue is

@@ -41,6 +41,8 @@ PHANTOMS = {
     "cardiac torso": mph.CardiacTorso(),
     **{path.stem.replace("_", " "): mph.read_phantom(path) for path in sorted((HERE / "phantoms").glob("*.toml"))},
 }
+# Where `telling` would miss what matters: the point through which the slices go, mm.
+THROUGH = {"Jaszczak": (0.0, 40.0, -50.0), "cardiac torso": (0.0, 0.0, 0.0)}
 
 
 def main(folder: Path, ct: Path | None) -> None:
@@ -63,7 +65,7 @@ def grid_of(phantom: mph.Phantom) -> mph.Grid:
 
 
 def sheet(system: mph.PinholeSystem, volumes: dict[str, mph.Volume]) -> Image.Image:
-    """Two columns of volumes: slices near the middle across z, y and x of each, and what a module sees."""
+    """Two columns of volumes: slices across z, y and x of each, and what a module sees."""
     views = system[system.numbers == MODULE].views((TILE, TILE))
     width, height, rows = 4 * (TILE + MARGIN) + MARGIN, TILE + TEXT + MARGIN, -(-len(volumes) // 2)
     page = Image.new("RGB", (2 * width, rows * height + MARGIN), (24, 26, 29))
@@ -71,8 +73,12 @@ def sheet(system: mph.PinholeSystem, volumes: dict[str, mph.Volume]) -> Image.Im
     for place, (name, volume) in enumerate(volumes.items()):
         array = volume.array
         at = telling(array)
+        if name in THROUGH:
+            at = np.rint(volume.grid.index_from_world[:3] @ (*THROUGH[name], 1.0)).astype(int).tolist()
         # Seen from above, from the front and from the left; the picture's first row is the top.
-        slices = [array[:, :, at[2]].T, array[:, at[1], :].T, array[at[0], :, :].T]
+        slices = [s.T for s in (array[:, :, at[2]], array[:, at[1], :], array[at[0], :, :])]
+        middle, side = framed(array)
+        slices = [around(s, middle[axes], side) for s, axes in zip(slices, ([1, 0], [2, 0], [2, 1]), strict=True)]
         (image,) = mph.as_seen(mph.Projector(volume.grid, views)(volume))
         left, top = place // rows * width + MARGIN, place % rows * height + MARGIN
         title = f"{name}: slices, {volume.unit}; projection of module {MODULE}"
@@ -91,6 +97,19 @@ def telling(array: np.ndarray) -> list[int]:
         near = range(n // 2 - n // 8, n // 2 + n // 8 + 1)
         places.append(max(near, key=lambda i: (float(array.take(i, axis).std()), -abs(i - n // 2))))
     return places
+
+
+def framed(array: np.ndarray) -> tuple[np.ndarray, int]:
+    """Index in the middle of what is not empty, and the side of a cube around that holds it."""
+    filled = np.argwhere(array > 0.02 * array.max())
+    low, high = filled.min(axis=0), filled.max(axis=0)
+    return (low + high) // 2, int((high - low).max()) + 8
+
+
+def around(picture: np.ndarray, middle: np.ndarray, side: int) -> np.ndarray:
+    """The square of a picture around a pixel, 0 where it ends."""
+    first = middle + side - side // 2  # of the padded picture
+    return np.pad(picture, side)[first[0] : first[0] + side, first[1] : first[1] + side]
 
 
 def colored(picture: np.ndarray, grey: bool) -> Image.Image:

@@ -13,6 +13,7 @@ import subprocess
 import sys
 import tempfile
 import tomllib
+import zipfile
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -78,9 +79,40 @@ def wheels_for(name: str, folder: Path) -> list[Path]:
     tags = [option for tag in platform.tags for option in ("--platform", tag)]
     wheels = download(folder / "any", PURE)
     wheels += download(folder / name / "abi3", STABLE_ABI, *tags, "--python-version", platform.pythons[0])
+    compiled = []
     for python in platform.pythons:
-        wheels += download(folder / name / python, platform.compiled, *tags, "--python-version", python)
-    return wheels
+        compiled += download(folder / name / python, platform.compiled, *tags, "--python-version", python)
+    return wheels + joined(compiled, folder / name / "joined")
+
+
+def joined(wheels: list[Path], folder: Path) -> list[Path]:
+    """Give `wheels` with those that hold the same files for several Pythons as one, retagged, in `folder`.
+
+    So is llvmlite, a third of a zip each time: what is compiled in it knows no Python, and is loaded by ctypes.
+    """
+    same: dict[frozenset[tuple[str, int]], list[Path]] = {}
+    for wheel in wheels:
+        with zipfile.ZipFile(wheel) as archive:
+            files = frozenset((file.filename, file.CRC) for file in archive.infolist())
+        # Only these two tell for which Python a wheel is.
+        same.setdefault(frozenset(f for f in files if Path(f[0]).name not in ("WHEEL", "RECORD")), []).append(wheel)
+    return [alike[0] if len(alike) == 1 else retagged(alike, folder) for alike in same.values()]
+
+
+def retagged(wheels: list[Path], folder: Path) -> Path:
+    """Give one wheel in `folder` for all the Pythons that `wheels` are for, and any ABI."""
+    name, version, _, _, platform = wheels[0].stem.split("-")
+    pythons = ".".join(sorted(wheel.stem.split("-")[2] for wheel in wheels))
+    target = folder / f"{name}-{version}-{pythons}-none-{platform}.whl"
+    if not target.is_file():
+        folder.mkdir(exist_ok=True)
+        with tempfile.TemporaryDirectory(dir=folder) as made:
+            copy = Path(made) / wheels[0].name
+            link_or_copy(wheels[0], copy)
+            tags = ("--python-tag", pythons, "--abi-tag", "none", "--remove")
+            subprocess.run((sys.executable, "-m", "wheel", "tags", *tags, copy), check=True, stdout=subprocess.DEVNULL)
+            next(Path(made).iterdir()).replace(target)
+    return target
 
 
 def source_files() -> list[Path]:

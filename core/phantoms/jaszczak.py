@@ -23,7 +23,7 @@ class JaszczakPhantom(Phantom):
     4.8, 6.4, 7.9, 9.5, 11.1, 12.7 mm in six sectors, their centres two diameters apart; spheres of 9.5, 12.7, 15.9, 19.1,
     25.4, 31.8 mm with their centres 127 mm above the base. The rods stand on the base (-z) in the pattern of `DerenzoRods`.
     The data sheet does not say how far the spheres are from the axis: half the radius here, 60 degrees apart, from -y on
-    counter-clockwise.
+    counter-clockwise. The wall, 3.2 mm thick, is not modelled.
 
     Attributes
     ----------

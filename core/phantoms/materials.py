@@ -11,7 +11,7 @@ SOFT_TISSUE_MU = 0.0161
 """Soft tissue, 1.06 g/cm^3."""
 LUNG_MU = 0.00396
 """Lung, inflated, 0.26 g/cm^3."""
-VERTEBRA_MU = 0.0202
-"""Vertebral column with its cartilage, 1.33 g/cm^3."""
+VERTEBRA_MU = 0.0203
+"""Vertebral column with its cartilage (D6, L3), 1.33 g/cm^3."""
 PMMA_MU = 0.0177
 """Poly(methyl methacrylate), 1.19 g/cm^3: what phantoms are made of."""

@@ -25,10 +25,11 @@ class NemaBody(Phantom):
     """The NEMA (IEC) body phantom: NEMA NU 2-2018 section 7, IEC 61675-1.
 
     Its inside: half a circle of radius 147 mm in front (+y), two quarters of circles of radius 77 mm and a straight line
-    of 140 mm at the back, 180 mm long; spheres of 10, 13, 17, 22, 28, 37 mm around an insert of 50 mm that is filled with
-    beads of 0.3 g/cm^3, on a circle of radius 57.2 mm, 70 mm from the lid (+z). The 17 mm sphere lies towards +x, the
-    others follow counter-clockwise by size, 60 degrees apart. The origin is the middle of the spheres' circle; it lies
-    halfway between front and back (the standard's figure, not its text). Walls are not modelled.
+    of 140 mm at the back, 180 mm long (phantoms that are sold are about 194 mm); spheres of 10, 13, 17, 22, 28,
+    37 mm around an insert of 50 mm that is filled with beads of 0.3 g/cm^3, on a circle of radius 57.2 mm, 70 mm from the
+    lid (+z). The 17 mm sphere lies towards +x, the others follow counter-clockwise by size, 60 degrees apart: in which
+    sense is not confirmed, OpenGATE's run clockwise. The origin is the middle of the spheres' circle; it lies halfway
+    between front and back, 35 mm in front of the circles' centres. Walls are not modelled.
 
     Attributes
     ----------

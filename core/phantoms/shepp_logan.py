@@ -34,9 +34,10 @@ class SheppLogan(Phantom):
     """The Shepp-Logan head in three dimensions: ellipsoids whose values add up.
 
     The ellipses of L. A. Shepp and B. F. Logan, IEEE Transactions on Nuclear Science 21 (1974) 21-43 (A. C. Kak and
-    M. Slaney, "Principles of Computerized Tomographic Imaging", 1988, section 3.1), with the third half axes and heights
-    of M. Schabel's ``phantom3d`` (MATLAB Central 9416); its psi of 10 degrees, which would turn the ventricles about z
-    once more, is left out. Modified values: P. Toft, "The Radon Transform", thesis, 1996, p. 199.
+    M. Slaney, "Principles of Computerized Tomographic Imaging", 1988, section 3.1; one at -0.606 instead of -0.605, as in
+    MATLAB), with the third half axes and heights of M. Schabel's ``phantom3d`` (MATLAB Central 9416). Its psi of 10
+    degrees, which would turn the ventricles about z once more, is left out, and the ellipsoids that Kak and Slaney give
+    for three dimensions are others. Modified values: P. Toft, "The Radon Transform", thesis, 1996, p. 199.
 
     Attributes
     ----------

@@ -19,8 +19,8 @@ from .phantom import Phantom
 from .settings import check_settings, setting
 from .shapes import Cylinder, Ellipsoid, Shape
 
-# The heart's axes in the torso, rows lateral, anterior, apical: its second, third and first axis in M. Cristy and
-# K. F. Eckerman, ORNL/TM-8381 (1987), whose x and y point to the patient's left and back.
+# The heart's axes in the torso, rows lateral, anterior, apical: after its third, second and first axis in M. Cristy and
+# K. F. Eckerman, ORNL/TM-8381 (1987), whose x and y point to the patient's left and back. Not confirmed.
 _HEART = np.array([[-0.5736, -0.8191, 0.0], [-0.4640, 0.3249, 0.8241], [-0.6751, 0.4727, -0.5664]])
 # The torso's axis at ORNL/TM-8381's height 0, as seen from the left ventricle's middle, mm: chosen.
 _AXIS, _HEIGHT = (35.0, -30.0), 490.0
@@ -36,11 +36,14 @@ class CardiacTorso(Phantom):
     the patient's left and front face the modules of the 80-module cardiac scanner, and the ventricle lies well inside
     its 75 mm.
 
-    Lungs, liver, spine and the direction of the heart's axis follow the mathematical adult of M. Cristy and K. F.
-    Eckerman, ORNL/TM-8381 (1987). Its body of 400 x 200 mm holds the arms: here an ellipse of 330 x 230 mm stands for a
-    chest with the arms up, the liver reaches 150 and not 165 mm to the right, and the spine lies 15 mm further back.
+    Lungs, liver, spine and the direction of the heart's axis are after the mathematical adult of M. Cristy and K. F.
+    Eckerman, ORNL/TM-8381 (1987). The trunk, where the organs lie, and the half axes of liver and spine were checked
+    against its 15-year-old in Geant4's human_phantom, scaled; not confirmed are the half axes of the lungs, the plane
+    that cuts the liver, and the heart's axis. Its body of 400 x 200 mm holds the arms: here an ellipse of 330 x 230 mm
+    stands for a chest with the arms up, the liver reaches 150 and not 165 mm to the right, and the spine lies 15 mm
+    further back.
     The left ventricle is half an ellipsoid inside another, of 120 mL at end-diastole and 45 mL at end-systole with walls
-    of 9.5 mm (within the normal ranges of R. M. Lang et al., J Am Soc Echocardiogr 28 (2015) 1-39): 133 g of muscle,
+    of 9.5 mm (within men's normal ranges, R. M. Lang et al., J Am Soc Echocardiogr 28 (2015) 1-39): 133 g of muscle,
     whose volume stays when it contracts, as does the apex's place. The volume falls along half a cosine for 35 % of the
     cycle and rises along another. The right ventricle's cavity shrinks with the left's. Ribs, arms, breasts and other
     organs are left out.

@@ -54,9 +54,12 @@ Array = NDArray[Any]  # of float32 or float64; what the rays have, of float64
 
 # Steps that a tile takes before the next has its turn. Tiles side by side then read the same part of the volume at about the
 # same time, row after row, which is what a processor's memory is fast at; more steps cost that, fewer the changing of tiles.
-_TURN = 6
+_TURN = 12
 # Tiles that take turns: their memory stays in the processor's.
-_TILES = 128
+_TILES = 64
+# Every voxel's neighbour this many steps on is sent for. The other tiles' turns are enough time for it to come from memory;
+# waiting for it would take as long as all the walking, for rays go from row to row as no processor foresees.
+_AHEAD = 2 * _TURN
 
 _NUMBERS = types.Array(types.float64, 2, "C")
 _LINES = types.Array(types.float64, 2, "C", readonly=True)
@@ -209,8 +212,9 @@ def _trace(data, begin, step, start, visit, finish):  # type: ignore[no-untyped-
         What holds all along, in a measure of alpha that is 0 where the walk begins and about 1 where it ends; where that
         is, and how far, from source to target; the first place; how many steps take the tile to its end.
     step(way, place) -> (segment, place)
-        The next segment: alpha of its two ends; of the volume's lattice the voxel's flat index, 1 inside and 0 outside, 1
-        for the axis (x, y, z) whose plane ends the segment, 1 if the lattice ends there; then these four of mu's.
+        The next segment: alpha of its two ends; of the volume's lattice the voxel's place (flat index, and what
+        `_AHEAD` steps add to it), 1 inside and 0 outside, 1 for the axis (x, y, z) whose plane ends the segment, 1 if the
+        lattice ends there; then these four of mu's.
     start(data, r, measure) -> state, finish(data, r, measure, state)
         The model's.
     """
@@ -246,21 +250,21 @@ def _trace(data, begin, step, start, visit, finish):  # type: ignore[no-untyped-
 
 @njit(forceinline=True)
 def _begin(data, r):  # type: ignore[no-untyped-def]
-    """The way of a tile through the volume: (axes, end).
+    """The way of a tile through the volume: (axes, ahead, end).
 
     A lattice's axes are, each for x, y and z: alpha of the first plane, from plane to plane, and what a plane adds to
-    the voxel's flat index.
+    the voxel's flat index; ahead is what `_AHEAD` steps add to it.
     """
     shape, rays = data.shape, data.rays
     enter, leave = _clip(shape, rays, r)
     hits = enter < leave
     begin = where(hits, enter, f64(0.0))
     span = where(hits, leave - enter, f64(1.0))
-    axes, p, stop, crossings = _axes(data.volume, shape, rays, r, hits, begin, begin, span)
+    axes, ahead, p, stop, crossings = _axes(data.volume, shape, rays, r, hits, begin, begin, span)
     zero = zeros_of(data.volume)
     end = where(hits, minimum(alike(1.0, zero), stop), zero)
     measure = begin, _span(hits, span, end)
-    return (axes, end), measure, ((zero, zero, zero), p, zero), largest(where(hits, crossings + i32(1), i32(0)))
+    return (axes, ahead, end), measure, ((zero, zero, zero), p, zero), largest(where(hits, crossings + i32(1), i32(0)))
 
 
 @njit(forceinline=True)
@@ -271,13 +275,13 @@ def _span(hits, span, end):  # type: ignore[no-untyped-def]
 
 @njit(forceinline=True)
 def _step(way, place):  # type: ignore[no-untyped-def]
-    axes, end = way
+    axes, ahead, end = way
     planes, p, alpha = place
     x, y, z = _next_planes(axes, planes)
     stop = minimum(minimum(x, y), minimum(z, end))
     crossed = x <= stop, y <= stop, z <= stop
     planes, following = _cross(axes, planes, p, crossed)
-    here = p, alike(1.0, alpha), _exclusive(crossed, alpha), _flag(stop >= end, alpha)
+    here = (p, ahead), alike(1.0, alpha), _exclusive(crossed, alpha), _flag(stop >= end, alpha)
     return (alpha, stop, here, here), (planes, following, stop)
 
 
@@ -285,8 +289,8 @@ def _step(way, place):  # type: ignore[no-untyped-def]
 def _axes(volume, shape, rays, r, hits, enter, begin, span):  # type: ignore[no-untyped-def]
     """A tile's way through a lattice from `enter` on, in the measure that is 0 at `begin` and 1 after `span`.
 
-    Returns its axes, the voxel's flat index on entering, alpha at which the walk has to stop to stay inside, and how
-    many planes it crosses.
+    Returns its axes, what `_AHEAD` steps add to the voxel's flat index, that index on entering, alpha at which the walk
+    has to stop to stay inside, and how many planes it crosses.
     """
     nx, ny, nz = shape
     x0, dx, gx, px, stop_x, to_cross_x = _axis(volume, nx, ny * nz, 0, rays, r, hits, enter, begin, span)
@@ -295,7 +299,11 @@ def _axes(volume, shape, rays, r, hits, enter, begin, span):  # type: ignore[no-
     # A ray that misses stays in a voxel of its own: sixteen in one voxel would wait for one another in an adjoint.
     p = where(hits, px + py + pz, whole(minimum(numbered(), f64(nx * ny * nz - 1.0))))
     axes = (x0, y0, z0), (dx, dy, dz), (gx, gy, gz)
-    return axes, p, minimum(minimum(stop_x, stop_y), stop_z), whole(to_cross_x + to_cross_y + to_cross_z)
+    crossings = to_cross_x + to_cross_y + to_cross_z
+    share = f64(float(_AHEAD)) / maximum(crossings, f64(1.0))
+    ahead = rint(to_cross_x * share) * alike(gx, share) + rint(to_cross_y * share) * alike(gy, share)
+    ahead = whole(ahead + rint(to_cross_z * share) * alike(gz, share))
+    return axes, ahead, p, minimum(minimum(stop_x, stop_y), stop_z), whole(crossings)
 
 
 @njit(forceinline=True)
@@ -398,14 +406,14 @@ def _begin_both(data, r):  # type: ignore[no-untyped-def]
     enter, mu_enter = where(hits, enter, f64(0.0)), where(hits_mu, mu_enter, f64(0.0))
     begin = where(hits_mu, minimum(enter, mu_enter), enter)
     span = where(hits, leave - begin, f64(1.0))
-    axes, p, stop, crossings = _axes(data.volume, shape, rays, r, hits, enter, begin, span)
-    mu_axes, q, mu_stop, mu_crossings = _axes(data.mu, mu_shape, mu_rays, r, hits_mu, mu_enter, begin, span)
+    axes, ahead, p, stop, crossings = _axes(data.volume, shape, rays, r, hits, enter, begin, span)
+    mu_axes, mu_ahead, q, mu_stop, mu_crossings = _axes(data.mu, mu_shape, mu_rays, r, hits_mu, mu_enter, begin, span)
     zero = zeros_of(data.volume)
     entry = alike((enter - begin) / span, zero)
     mu_entry = where(hits_mu, alike((mu_enter - begin) / span, zero), alike(_NEVER, zero))
     end = where(hits, minimum(alike(1.0, zero), stop), zero)
     mu_end = where(hits_mu, minimum(alike((mu_leave - begin) / span, zero), mu_stop), zero)
-    way, measure = (axes, entry, end, mu_axes, mu_entry, mu_end), (begin, _span(hits, span, end))
+    way, measure = (axes, ahead, entry, end, mu_axes, mu_ahead, mu_entry, mu_end), (begin, _span(hits, span, end))
     place = ((zero, zero, zero), p, (zero, zero, zero), q, zero)
     # The ways in and out are steps too.
     return way, measure, place, largest(where(hits, crossings + mu_crossings + i32(4), i32(0)))
@@ -413,7 +421,7 @@ def _begin_both(data, r):  # type: ignore[no-untyped-def]
 
 @njit(forceinline=True)
 def _step_both(way, place):  # type: ignore[no-untyped-def]
-    axes, entry, end, mu_axes, mu_entry, mu_end = way
+    axes, ahead, entry, end, mu_axes, mu_ahead, mu_entry, mu_end = way
     planes, p, mu_planes, q, alpha = place
     x, y, z = _next_planes(axes, planes)
     mu_x, mu_y, mu_z = _next_planes(mu_axes, mu_planes)
@@ -427,9 +435,9 @@ def _step_both(way, place):  # type: ignore[no-untyped-def]
     mu_crossed = (mu_x <= stop) & inside_mu, (mu_y <= stop) & inside_mu, (mu_z <= stop) & inside_mu
     planes, p_behind = _cross(axes, planes, p, crossed)
     mu_planes, q_behind = _cross(mu_axes, mu_planes, q, mu_crossed)
-    of_volume = p, _flag(inside, alpha), _exclusive(crossed, alpha), _flag(stop >= end, alpha)
+    of_volume = (p, ahead), _flag(inside, alpha), _exclusive(crossed, alpha), _flag(stop >= end, alpha)
     ends_mu = (stop >= mu_end) & inside_mu
-    of_mu = q, _flag(inside_mu, alpha), _exclusive(mu_crossed, alpha), _flag(ends_mu, alpha)
+    of_mu = (q, mu_ahead), _flag(inside_mu, alpha), _exclusive(mu_crossed, alpha), _flag(ends_mu, alpha)
     return (alpha, stop, of_volume, of_mu), (planes, p_behind, mu_planes, q_behind, stop)
 
 

@@ -469,6 +469,20 @@ def test_isotopes():
         assert isotope.photons_per_decay(low, high) >= photons.max()
 
 
+def test_half_lives_and_photons_are_as_evaluated_elsewhere():
+    """Half-lives, h, of ICRP Publication 107 (2008); photons around the strongest line of the library UKDD-12."""
+    others = {
+        "F-18": (1.8295, 1.937), "Ga-67": (78.27, 0.419), "Tc-99m": (6.015, 0.8906), "In-111": (67.31, 0.941),
+        "I-123": (13.27, 0.8325), "I-131": (192.5, 0.812), "Xe-133": (125.8, 0.380), "Lu-177": (159.5, 0.1038),
+        "Tl-201": (72.91, 0.748),
+    }  # fmt: skip
+    assert others.keys() == mph.ISOTOPES.keys()
+    for name, (hours, photons) in others.items():
+        isotope = mph.ISOTOPES[name]
+        assert isotope.half_life / 3600 == pytest.approx(hours, rel=4e-3)
+        assert isotope.photons_per_decay(*isotope.window) == pytest.approx(photons, rel=0.03)
+
+
 def test_an_isotope_counts_its_photons_and_decays(rng):
     """Counts of its lines in the window, from an activity that halves every half-life."""
     system, grid = one_module(), turned_grid((5, 6, 7), 8.0)

@@ -9,7 +9,8 @@ import pytest
 
 import mphdrr.core as mph
 from mphdrr.core.hounsfield import attenuation
-from mphdrr.core.isotopes import WATER_MU
+from mphdrr.core.isotopes import CZT_MU, LEAD_MU, NAI_MU, TUNGSTEN_MU, WATER_MU
+from mphdrr.core.phantoms.materials import LUNG_MU, PMMA_MU, SOFT_TISSUE_MU, VERTEBRA_MU
 
 GRID = mph.Grid((7, 1, 1), np.eye(4))
 
@@ -22,16 +23,50 @@ def converted(hu, **options) -> np.ndarray:
 @pytest.mark.parametrize(
     ("material", "energy", "expected"),
     [
-        # XCOM's own values at energies between those of the table, times the densities, 1/mm.
-        ("water", 140.0, 0.01538),
-        ("water", 511.0, 0.0096),
-        ("water", 70.0, 0.01929),
+        # Between the table's energies: density times the elements' coefficients of Elam et al. (2002), cm^2/g, 1/mm.
+        ("water", 25.0, 0.05082),
+        ("water", 70.0, 0.019285),
+        ("water", 140.0, 0.015383),
+        ("water", 511.0, 0.009599),
+        ("bone", 25.0, 0.4144),
+        ("bone", 70.0, 0.04935),
+        ("bone", 140.5, 0.02931),
         ("bone", 511.0, 0.01716),
-        ("air", 100.0, 0.1541 * 1.20479e-4),
+        ("air", 120.0, 1.7525e-5),
     ],
 )
-def test_coefficients_are_those_of_xcom(material, energy, expected):
-    assert attenuation(material, energy) == pytest.approx(expected, rel=5e-3)
+def test_coefficients_between_the_energies_of_the_table(material, energy, expected):
+    assert attenuation(material, energy) == pytest.approx(expected, rel=1.5e-3 if energy >= 30 else 3.5e-3)
+
+
+@pytest.mark.parametrize("material", ["water", "air", "bone"])
+def test_coefficients_fall_with_energy(material):
+    assert np.diff([attenuation(material, energy) for energy in np.geomspace(10, 1000, 1000)]).max() < 0
+
+
+def test_where_compton_scattering_rules_electrons_count():
+    """At 140.5 keV the coefficients of light materials are to water's as the electrons per volume."""
+    for mu, density, per_gram in ((SOFT_TISSUE_MU, 1.06, 0.5500), (LUNG_MU, 0.26, 0.5505), (PMMA_MU, 1.19, 0.5394)):
+        assert mu / WATER_MU == pytest.approx(density * per_gram / 0.5551, rel=1e-2)
+
+
+@pytest.mark.parametrize(
+    ("mu", "expected"),
+    [
+        # Density times the elements' coefficients of NIST Standard Reference Database 126, interpolated, 1/mm.
+        (TUNGSTEN_MU, 3.596),
+        (LEAD_MU, 2.686),
+        (NAI_MU, 0.2615),
+        (CZT_MU, 0.4040),
+        (WATER_MU, 0.015363),
+        (SOFT_TISSUE_MU, 0.01614),
+        (LUNG_MU, 0.003963),
+        (VERTEBRA_MU, 0.020278),
+        (PMMA_MU, 0.017679),
+    ],
+)
+def test_constants_at_140_keV_are_those_of_nist(mu, expected):
+    assert mu == pytest.approx(expected, rel=3e-3)
 
 
 @pytest.mark.parametrize("energy", [30.0, 70.8, 140.5, 159.0, 511.0])

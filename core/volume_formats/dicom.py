@@ -49,12 +49,9 @@ class _Slice:
 
 
 def is_dicom(path: Path) -> bool:
-    """Whether `path` is a DICOM file: "DICM" stands after its first 128 bytes."""
-    try:
-        with open(path, "rb") as file:
-            return file.read(132)[128:] == b"DICM"
-    except OSError:
-        return False
+    """Whether the file at `path` is DICOM: "DICM" stands after its first 128 bytes."""
+    with open(path, "rb") as file:
+        return file.read(132)[128:] == b"DICM"
 
 
 def read(path: Path, series: str | None = None, progress: Progress | None = None) -> Contents:
@@ -101,9 +98,11 @@ def _headers(path: Path) -> list[tuple[Path, Any]]:
     headers: dict[Path, Any] = {}
     others: dict[Path, Any] = {}
     for file in files:
-        if file in headers or not (file.is_file() and (is_dicom(file) or file.suffix.lower() in (".dcm", ".ima"))):
+        if file in headers or not file.is_file():
             continue
         try:
+            if not (is_dicom(file) or file.suffix.lower() in (".dcm", ".ima")):
+                continue
             header = pydicom.dcmread(file, stop_before_pixels=True)
         except InvalidDicomError:
             raise InputError(f"{file.name} is no DICOM file") from None

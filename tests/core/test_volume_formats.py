@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import errno
+import io
+import os
 import shutil
 import zlib
 from pathlib import Path
@@ -400,6 +403,13 @@ def _empty(folder, ct):
     return folder / "empty"
 
 
+def _pipe(folder, ct):
+    if not hasattr(os, "mkfifo"):
+        pytest.skip("no pipes on this system")
+    os.mkfifo(folder / "v.nii")
+    return folder / "v.nii"
+
+
 def _npy(folder, ct):
     np.save(folder / "v.npy", ct.array)
     return folder / "v.npy"
@@ -436,6 +446,7 @@ BAD = {
         "it holds 'MR': say which quantity that is",
     ),
     "an empty folder": (_empty, "expected a folder with the images of a DICOM series"),
+    "a pipe": (_pipe, "neither a file nor a folder"),
     "an empty file": (_bytes("v.nrrd", b""), "it is empty"),
     "a name that cannot be": (lambda folder, ct: folder / ("v" * 300 + ".nii"), "ame too long"),
     "no numpy file": (_bytes("v.npy", b"hello" * 99), "not a file of numpy"),
@@ -491,6 +502,24 @@ def test_bad_input_gets_one_line_that_names_the_place(tmp_path, ct, case, caplog
     assert message.startswith(f"{path}: ")
     assert "\n" not in message
     assert "nibabel" not in caplog.text  # it would print that on standard error
+
+
+@pytest.mark.parametrize("of_series", [False, True])
+def test_what_may_not_be_read_is_said_and_not_left_out(tmp_path, ct, monkeypatch, of_series):
+    write_series(ct, tmp_path / "s", names=[f"slice{k}" for k in range(7)])
+    mph.write_volume(ct, tmp_path / "v.nii")
+    locked = tmp_path / "s/slice6" if of_series else tmp_path / "v.nii"  # no gap tells of a last slice
+    may_open = io.open
+
+    def open_others(path, *args, **kwargs):
+        if path == locked:
+            raise PermissionError(errno.EACCES, "Permission denied", str(path))
+        return may_open(path, *args, **kwargs)
+
+    monkeypatch.setattr("builtins.open", open_others)
+    monkeypatch.setattr("io.open", open_others)
+    with pytest.raises(mph.InputError, match=f"{locked.name}.*Permission denied"):
+        mph.read_volume(tmp_path / "s" if of_series else locked)
 
 
 def test_series_and_affines_are_checked_too(tmp_path, ct):

@@ -281,7 +281,7 @@ class DerenzoPhantom(Phantom):
     @property
     def box(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """As of any phantom; the rods' is that of their `radius`, also where none of them reaches the rim."""
-        half = max(self.radius, self.cylinder_radius)
+        half = max(self.radius, self.cylinder_radius, self._rods.half_box[0])  # very thin ones reach beyond the rim
         corner = np.array([half, half, max(self.height, self.cylinder_height) / 2])
         return -corner, corner
 

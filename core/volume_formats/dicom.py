@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..errors import InputError
+from ..errors import InputError, InputWarning
 from ..progress import Progress
 from .contents import RAS_FROM_LPS, Contents, first_line, require_voxels
 
@@ -277,6 +277,13 @@ def _ordered(slices: list[_Slice]) -> tuple[list[_Slice], NDArray[np.float64]]:
         raise InputError(
             f"{what} between {slices[k].name} and {slices[k + 1].name}: {gaps[k]:g} mm apart at "
             f"{places[k]:g} mm, the others {usual:g} mm"
+        )
+    if usual > 1.5 * first.thickness > 0:
+        warnings.warn(
+            f"the slices are {first.thickness:g} mm thick and lie {usual:g} mm apart: there are gaps between them, or some "
+            "are missing",
+            InputWarning,
+            stacklevel=2,
         )
     step = (last.position - first.position) / (len(slices) - 1)
     sideways = np.array(

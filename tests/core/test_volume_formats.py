@@ -189,6 +189,14 @@ def test_the_chest_is_the_same_from_nifti_and_from_dicom(tmp_path, workbook):
     assert np.allclose(images[0], images[1], rtol=1e-6, atol=1e-6)
 
 
+def test_every_other_slice_missing_is_warned_of(tmp_path, ct):
+    for data in write_series(ct, tmp_path / "s")[1::2]:
+        Path(data.filename).unlink()
+    with pytest.warns(mph.InputWarning, match=r"the slices are 2\.5 mm thick and lie 5 mm apart"):
+        volume = mph.read_volume(tmp_path / "s")
+    assert np.array_equal(volume.array, ct.array[:, :, ::2])
+
+
 def test_one_of_several_series_is_chosen(tmp_path, ct):
     write_series(ct, tmp_path / "s", 3, "Soft")
     other = mph.Volume(ct.array + 1, ct.grid, "hu")

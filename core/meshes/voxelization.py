@@ -136,11 +136,12 @@ def _rounded(covered: NDArray[np.float64]) -> NDArray[np.float64]:
 def _fill_overlaps(box: NDArray[np.float32], surface: NDArray[np.float64], progress: Progress | None) -> None:
     """Put the coverage into those columns of `box` in which the winding number passes 1."""
     n_x, n_y, n_z = box.shape
+    low, high = surface[:, :, 0].min(axis=1), surface[:, :, 0].max(axis=1)
     step = min(math.sqrt(n_x * n_y / _RAYS), _STEP)
     slab = max(1, min(int(_RAYS * step**2 / n_y), _VOXELS // (n_y * n_z)))
     for first in range(0, n_x, slab):
         last = min(first + slab, n_x)
-        pieces = _slab(surface, 0, first, last) - [first, 0, 0]
+        pieces = _slab(surface[(low < last) & (high > first)], 0, first, last) - [first, 0, 0]
         covered, overlap = _along_rays(pieces, (last - first, n_y, n_z), step)
         box[first:last][overlap] = _rounded(covered[overlap])
         if progress is not None:

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from .checks import freeze
+from .checks import freeze, real_array
 from .errors import InputError, InputWarning
 from .materials import attenuation
 from .memory import require
@@ -92,10 +92,16 @@ def diffdrr_density(hu: Volume | NDArray[Any], bone_attenuation_multiplier: floa
         CT numbers, HU: a volume, or an array of any shape.
     bone_attenuation_multiplier
         Of what is above 350 HU.
+
+    Raises
+    ------
+    InputError
+        Not finite real numbers.
     """
-    hu = np.asarray(hu.array if isinstance(hu, Volume) else hu, np.float32)
+    factor = np.float32(real_array(bone_attenuation_multiplier, "bone_attenuation_multiplier", ()))
+    hu = hu.array if isinstance(hu, Volume) else real_array(hu, "CT numbers", (None,) * np.ndim(hu), np.float32)
     tissue = hu[(hu > DIFFDRR_AIR) & (hu <= DIFFDRR_BONE)]
-    density = np.where(hu > DIFFDRR_BONE, hu * np.float32(bone_attenuation_multiplier), hu)
+    density = np.where(hu > DIFFDRR_BONE, hu * factor, hu)
     if tissue.size:
         density = np.where(hu <= DIFFDRR_AIR, tissue.min(), density)
     density -= density.min()

@@ -141,12 +141,13 @@ def write_volume(volume: Volume, path: str | os.PathLike[str]) -> None:
 
 def _contents(path: Path, series: str | None, progress: Progress | None) -> Contents:
     """What the file at `path` holds, or `InputError` that names it."""
-    if not path.exists():
-        raise InputError(f"{path}: no such file")
+    _require_readable(path)
     ending = _ending(path, READ_FORMATS)
     is_series = path.is_dir() or ending == ".dcm" or (not ending and dicom.is_dicom(path))
     if not (ending or is_series):
         raise InputError(f"{path}: expected a folder of DICOM files, or a name ending in {', '.join(READ_FORMATS)}")
+    if path.is_file() and path.stat().st_size == 0:
+        raise InputError(f"{path}: it is empty")
     if series is not None and not is_series:
         raise InputError(f"{path}: only folders of DICOM files hold several series")
     try:
@@ -159,6 +160,20 @@ def _contents(path: Path, series: str | None, progress: Progress | None) -> Cont
         raise InputError(
             f"{path}: cannot be read as {'DICOM' if is_series else ending} ({first_line(error)})"
         ) from error
+
+
+def _require_readable(path: Path) -> None:
+    """Raise `InputError` unless there is a file or a folder that may be read; libraries say little about that."""
+    try:
+        path.stat()
+        if path.is_file():
+            path.open("rb").close()
+    except FileNotFoundError:
+        raise InputError(f"{path}: no such file") from None
+    except (OSError, ValueError) as error:  # a name that cannot be is a ValueError
+        raise InputError(f"{path}: {getattr(error, 'strerror', None) or error}") from None
+    if not (path.is_file() or path.is_dir()):  # a pipe would keep its reader waiting
+        raise InputError(f"{path}: neither a file nor a folder")
 
 
 def _ending(path: Path, endings: tuple[str, ...]) -> str:

@@ -86,7 +86,7 @@ def read_mesh(path: str | os.PathLike[str], unit: str | None = None) -> Mesh:
     path = Path(path)
     ending = _ending(path)
     factor = _factor(unit, ending)
-    if not path.is_file():
+    if not _is_file(path):
         raise InputError(f"{path}: no such file")
     try:
         mesh = trimesh.load(path, process=False, force="mesh")
@@ -104,13 +104,14 @@ def write_mesh(mesh: Mesh, path: str | os.PathLike[str], unit: str | None = None
     Raises
     ------
     InputError
-        Another suffix, an unknown unit, or the file cannot be written.
+        No mesh, another suffix, an unknown unit, or the file cannot be written.
     """
     import trimesh
 
     path = Path(path)
     ending = _ending(path)
     factor = _factor(unit, ending)
+    mesh = as_mesh(mesh)
     with replacing(path) as temporary:
         trimesh.Trimesh(mesh.vertices / factor, mesh.faces, process=False).export(temporary, file_type=ending[1:])
 
@@ -169,6 +170,13 @@ def require_closed(mesh: Mesh) -> None:
     refuse(
         np.flatnonzero(turns), "faces look to different sides", "expected all to look outwards: recalculate the normals"
     )
+
+
+def _is_file(path: Path) -> bool:
+    try:
+        return path.is_file()
+    except OSError:  # a name that cannot be
+        return False
 
 
 def _ending(path: Path) -> str:

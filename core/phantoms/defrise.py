@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
-from ..checks import whole_shape
+from ..checks import whole_number
 from ..isotopes import WATER_MU
 from .phantom import Phantom
 from .settings import count, require_at_most, setting
@@ -47,10 +47,9 @@ class DefrisePhantom(Phantom):
     title = "Defrise phantom"
 
     def __post_init__(self) -> None:
-        (disks,) = whole_shape([self.disks], "Defrise phantom: disks", 1)
-        object.__setattr__(self, "disks", disks)
+        object.__setattr__(self, "disks", whole_number(self.disks, "Defrise phantom: disks"))
         super().__post_init__()
-        if disks > 1:
+        if self.disks > 1:
             require_at_most(
                 self.disk_thickness, self.spacing, f"{self.title}: disk thickness", "mm", "from disk to disk"
             )

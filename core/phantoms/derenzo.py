@@ -58,7 +58,11 @@ class DerenzoRods(Shape):
         self._set("height", positive(self.height, "Derenzo height", "mm"))
         if isinstance(self.sectors, bool) or not isinstance(self.sectors, int) or self.sectors < 2:
             raise InputError(f"Derenzo sectors: expected a whole number of at least 2, got {self.sectors!r}")
-        diameters = real_array(self.rod_diameters, "Derenzo rod diameters", (self.sectors,))
+        diameters = real_array(self.rod_diameters, "Derenzo rod diameters", (None,))
+        if len(diameters) != self.sectors:
+            raise InputError(
+                f"Derenzo rod diameters: expected one for each of {self.sectors} sectors (0: empty), got {len(diameters)}"
+            )
         if np.any(diameters < 0):
             raise InputError(f"Derenzo rod diameters: expected 0 or more mm, got {diameters.min():g}")
         self._set("rod_diameters", tuple(diameters.tolist()))
@@ -277,7 +281,7 @@ class DerenzoPhantom(Phantom):
     @property
     def box(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """As of any phantom; the rods' is that of their `radius`, also where none of them reaches the rim."""
-        half = max(self.radius, self.cylinder_radius)
+        half = max(self.radius, self.cylinder_radius, self._rods.half_box[0])  # very thin ones reach beyond the rim
         corner = np.array([half, half, max(self.height, self.cylinder_height) / 2])
         return -corner, corner
 

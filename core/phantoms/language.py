@@ -78,6 +78,8 @@ def parse_phantom(text: str, name: str = "phantom") -> ShapePhantom:
         return _phantom(tomllib.loads(text))
     except tomllib.TOMLDecodeError as error:
         raise InputError(f"{name}: not TOML: {error}") from None
+    except RecursionError:
+        raise InputError(f"{name}: its lists are nested too deeply") from None
     except InputError as error:
         raise InputError(f"{name}: {error}") from None
 
@@ -142,9 +144,15 @@ def _radians(value: Any) -> Any:
 
 
 def _refuse_unknown(table: dict[str, Any], known: Any) -> None:
-    for key in table:
+    for key, value in table.items():
         if key not in known:
             raise InputError(f"{key}: no such key; expected {', '.join(known)}")
+        if _has_boolean(value):  # to numpy they are numbers
+            raise InputError(f"{key}: expected numbers or a text, got true or false")
+
+
+def _has_boolean(value: Any) -> bool:
+    return isinstance(value, bool) or (isinstance(value, list) and any(map(_has_boolean, value)))
 
 
 def _entries(shape: Shape) -> dict[str, Any]:

@@ -32,7 +32,7 @@ _MIN_SAMPLES, _MAX_SAMPLES = 128, 1 << 13  # of a voxel that a surface cuts
 _SEQUENCE = 1 << 16  # points of which voxels take stretches by turns, so that their errors differ and cancel
 # Over what is not uniform, few voxels get more samples: about so many altogether.
 _SAMPLES_OF_MIXED = 1 << 21
-# In boxes of up to so many voxels a shape's samples are weighed so that they make up exactly its volume.
+# In boxes of up to so many voxels a shape's samples are weighed so that they make up exactly what it changes.
 _WEIGHED = 1 << 22
 # Shapes whose smallest part is below a voxel, and that touch `_FEW` or fewer, are sampled in their own box.
 _FEW = 1 << 11
@@ -115,36 +115,46 @@ def values_at(layers: Sequence[Layer], points: Points) -> Points:
     return values
 
 
-def integral(layers: Sequence[Layer]) -> float:
-    """Value times mm^3 of the whole painting.
+def integral(layers: Sequence[Layer], replaced: Sequence[float]) -> float:
+    """Value times mm^3 of the whole painting; `replaced` as of `means_beneath`."""
+    return sum(layer.volume * (layer.value - mean) for layer, mean in zip(layers, replaced, strict=True))
 
-    The layers' own contents, less what each covers of those beneath. What two layers have in common is counted at points
-    of the smaller: so errors are small beside the content of either, and a layer that is covered whole counts nothing.
+
+def means_beneath(layers: Sequence[Layer]) -> list[float]:
+    """For each layer the mean of what its shape replaces, wherever the painting lies: exact where it is uniform.
+
+    What two layers have in common is counted at points of the smaller: so errors are small beside the content of either,
+    and of a layer that is covered whole nothing stays.
     """
-    hidden = {
-        lower
-        for layer, beneath in zip(layers, _seen_beneath(layers), strict=True)
-        for lower in beneath
-        if layer.relation(lower) == 1
-    }
-    shown = [layer for layer in layers if layer not in hidden]
-    over: dict[Layer, list[Layer]] = {layer: [] for layer in shown}
-    total = 0.0
-    for layer, beneath in zip(shown, _seen_beneath(shown), strict=True):
-        for lower in beneath:
+    beneath = _seen_beneath(layers)
+    over: dict[Layer, list[Layer]] = {layer: [] for layer in layers}
+    means = {}
+    for layer, seen in zip(layers, beneath, strict=True):
+        for lower in seen:
             over[lower].append(layer)
-        larger = [lower if lower.volume >= layer.volume else replace(lower, value=0.0) for lower in beneath]
-        total += layer.volume * (layer.value - _mean_inside(layer, larger))
-    for layer, later in over.items():
-        total -= layer.volume * layer.value * _share_covered_by_larger(layer, later)
-    return total
+        means[layer] = _mean_inside(
+            layer, [_emptied(lower) if lower.volume < layer.volume else lower for lower in seen]
+        )
+    for lower, later in over.items():
+        for layer, share in _shares_covered_by_larger(lower, later).items():
+            means[layer] += share * lower.value * lower.volume / layer.volume
+    return list(means.values())
+
+
+def _emptied(layer: Layer) -> Layer:
+    return replace(layer, value=0.0)
+
+
+def _is_uniform(layer: Layer, beneath: Sequence[Layer]) -> bool:
+    """Whether all that a layer's shape replaces surely has one value."""
+    return not beneath or (len(beneath) == 1 and beneath[0].relation(layer) == 1)
 
 
 def _mean_inside(layer: Layer, beneath: Sequence[Layer]) -> float:
-    """The mean of what is painted beneath a layer's shape: exact where it is uniform."""
+    """The mean of what is painted beneath a layer's shape."""
     if not any(lower.value for lower in beneath):
         return 0.0
-    if len(beneath) == 1 and beneath[0].relation(layer) == 1:
+    if _is_uniform(layer, beneath):
         return beneath[0].value
     total, hits = 0.0, 0
     for inside in points_inside(layer):
@@ -153,18 +163,21 @@ def _mean_inside(layer: Layer, beneath: Sequence[Layer]) -> float:
     return total / max(hits, 1)
 
 
-def _share_covered_by_larger(layer: Layer, over: Sequence[Layer]) -> float:
-    """The share of a layer's shape that one larger than it is the first of those over it to cover."""
-    if all(other.volume <= layer.volume for other in over):
-        return 0.0
-    covered, hits = 0, 0
+def _shares_covered_by_larger(layer: Layer, over: Sequence[Layer]) -> dict[Layer, float]:
+    """Of the layers over one, those larger than it, with the share of its shape that they are the first to cover."""
+    larger = [other for other in over if other.volume > layer.volume]
+    if not larger or not layer.value:
+        return {}
+    if larger[0] is over[0] and larger[0].relation(layer) == 1:
+        return {larger[0]: 1.0}
+    covered, hits = dict.fromkeys(over, 0), 0
     for free in points_inside(layer):
         hits += free.shape[1]
         for other in over:
             within = other.shape.distance(_moved(other.from_world, free)) < 0
-            covered += int(np.count_nonzero(within)) if other.volume > layer.volume else 0
+            covered[other] += int(np.count_nonzero(within))
             free = free[:, ~within]
-    return covered / max(hits, 1)
+    return {other: covered[other] / max(hits, 1) for other in larger}
 
 
 def points_inside(layer: Layer) -> Iterator[Points]:
@@ -174,12 +187,14 @@ def points_inside(layer: Layer) -> Iterator[Points]:
         yield _moved(layer.pose, points[:, layer.shape.distance(points) < 0])
 
 
-def paint_voxels(grid: Grid, layers: Sequence[Layer], progress: Progress | None = None) -> Floats:
+def paint_voxels(
+    grid: Grid, layers: Sequence[Layer], replaced: Sequence[float], progress: Progress | None = None
+) -> Floats:
     """The mean of the painting over each voxel, float32 array of the grid's shape.
 
     Voxels farther from a surface than their own half diagonal are all in or all out; the others are sampled at the
-    points of a low-discrepancy sequence, which weigh so much that the shape's volume comes out. The points of a shape
-    that is small beside the voxels fill the shape instead.
+    points of a low-discrepancy sequence, which weigh so much that what the shape changes comes out. The points of a
+    shape that is small beside the voxels fill the shape instead.
 
     Parameters
     ----------
@@ -187,12 +202,17 @@ def paint_voxels(grid: Grid, layers: Sequence[Layer], progress: Progress | None 
         Where the voxels are.
     layers
         From bottom to top.
+    replaced
+        As of `means_beneath`.
     progress
         Called as ``progress(done, total)``.
     """
     require(4.2 * grid.n_voxels, "a volume of {} x {} x {} voxels".format(*grid.shape))
     image = np.zeros(grid.shape, np.float32)
-    strokes = [_Stroke(grid, layer, beneath) for layer, beneath in zip(layers, _seen_beneath(layers), strict=True)]
+    strokes = [
+        _Stroke(grid, layer, beneath, layer.value - mean)
+        for layer, beneath, mean in zip(layers, _seen_beneath(layers), replaced, strict=True)
+    ]
     total, done = sum(stroke.steps for stroke in strokes), 0
     with ThreadPoolExecutor(os.cpu_count()) as pool:
         for stroke in strokes:
@@ -270,8 +290,8 @@ def _next_power_of_2(counts: NDArray[np.int64]) -> NDArray[np.int64]:
 class _Stroke:
     """What painting a layer over those beneath it does to an image."""
 
-    def __init__(self, grid: Grid, layer: Layer, beneath: Sequence[Layer]) -> None:
-        self.grid, self.layer, self.beneath = grid, layer, beneath
+    def __init__(self, grid: Grid, layer: Layer, beneath: Sequence[Layer], mean_change: float) -> None:
+        self.grid, self.layer, self.beneath, self.mean_change = grid, layer, beneath, mean_change
         shape_from_index = self.layer.from_world @ grid.affine
         shape = self.layer.shape
         low, high = _index_box(shape_from_index, shape)
@@ -284,7 +304,7 @@ class _Stroke:
         self.is_small = shape.finest < self.edge and self.touched < _FEW
         inside = bool(np.all(low >= -0.5) and np.all(high <= np.array(grid.shape) - 0.5))
         # Whether it matters which part of the shape a voxel holds.
-        self.is_mixed = bool(beneath) and not (len(beneath) == 1 and beneath[0].relation(layer) == 1)
+        self.is_mixed = not _is_uniform(layer, beneath)
         self.is_weighed = inside and bool(np.prod(self.stop - self.start) <= _WEIGHED)
 
     @property
@@ -337,36 +357,39 @@ class _Stroke:
         offsets = (r3_sequence(stretches * n_samples) - 0.5).reshape(3, stretches, n_samples)
         own, *lower = (_Sampled(layer, self.grid, offsets) for layer in (self.layer, *self.beneath))
 
-        def fill(ix: int) -> tuple[int, NDArray[np.int64], Floats, Floats]:
+        def fill(ix: int) -> tuple[float, NDArray[np.int64], Floats, Floats]:
             slab = image[ix, rows, columns]
             values = slab.ravel()
             index = np.stack([np.full(iy.size, ix), iy.ravel(), iz.ravel()])
-            parts, n_whole = [], 0
+            parts, of_whole = [], 0.0
             for first in range(0, len(values), _BLOCK):
                 block = slice(first, first + _BLOCK)
                 whole, cut, coverage, change = _changes(index[:, block], own, lower)
-                values[block] = np.where(whole, own.layer.over(values[block]), values[block])
+                painted = np.where(whole, own.layer.over(values[block]), values[block])
+                of_whole += float(np.sum(painted - values[block], dtype=np.float64))
+                values[block] = painted
                 parts.append((first + cut, coverage, change))
-                n_whole += int(np.count_nonzero(whole))
             cut, coverage, change = map(np.concatenate, zip(*parts, strict=True))
             if not self.is_weighed:
                 values[cut] += change
             slab[...] = values.reshape(slab.shape)
-            return n_whole, cut, coverage, change
+            return of_whole, cut, coverage, change
 
-        kept, missing, unsure = [], self.layer.shape.volume / self.voxel_volume, 0.0
+        kept, missing, unsure = [], self.mean_change * self.layer.shape.volume / self.voxel_volume, 0.0
         for ix, (whole, cut, coverage, change) in enumerate(
             pool.map(fill, range(self.start[0], self.stop[0])), self.start[0]
         ):
             if self.is_weighed:
                 kept.append((ix, cut, coverage, change))
-                missing -= whole + float(coverage.sum(dtype=np.float64))
-                unsure += float(np.sum(coverage * (1 - coverage), dtype=np.float64))
+                missing -= whole + float(change.sum(dtype=np.float64))
+                unsure += float(np.sum(np.abs(change) * (1 - coverage), dtype=np.float64))
             yield
         # What is missing goes to where the shares c are unsure, as c (1 - c): they stay between 0 and 1.
         weight = np.float32(missing / unsure if unsure else 0.0)
         for ix, cut, coverage, change in kept:
-            image[ix, iy.ravel()[cut], iz.ravel()[cut]] += change * (1 + weight * (1 - coverage))
+            factor = 1 + weight * np.sign(change) * (1 - coverage)
+            factor = np.clip(factor, 0, 1 / np.maximum(coverage, np.float32(1e-6)))
+            image[ix, iy.ravel()[cut], iz.ravel()[cut]] += change * factor
 
     @property
     def _n_samples(self) -> int:

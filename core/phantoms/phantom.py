@@ -22,7 +22,7 @@ from ..progress import Progress
 from ..projector.tracing import points as as_points
 from ..views import Views
 from ..volume import UNITS, Volume
-from .painting import Layer, integral, line_integrals, paint_voxels, points_inside, values_at
+from .painting import Layer, integral, line_integrals, means_beneath, paint_voxels, points_inside, values_at
 from .settings import check_settings
 from .shapes import Shape
 
@@ -146,7 +146,7 @@ class Phantom:
         """
         if not isinstance(grid, Grid):
             raise InputError(f"voxelize: expected a Grid, got {type(grid).__name__}")
-        image = paint_voxels(grid, self._layers(quantity, pose), progress)
+        image = paint_voxels(grid, self._layers(quantity, pose), self._replaced(quantity), progress)
         whole = self._total(quantity) * (1.0 if pose is None else abs(float(np.linalg.det(np.asarray(pose)[:3, :3]))))
         held = float(image.sum(dtype=np.float64)) * grid.voxel_volume / whole if whole > 0 else 1.0
         if held < _HELD:
@@ -190,7 +190,14 @@ class Phantom:
         """Line integrals through the pixels' centres of all views, exact: images (M, n_v, n_u), value x mm.
 
         What `Projector` with `Transmission` approaches as voxels get smaller.
+
+        Raises
+        ------
+        InputError
+            No views, or the images do not fit into memory; as of `voxelize`.
         """
+        if not isinstance(views, Views):
+            raise InputError(f"project: expected Views, got {type(views).__name__}")
         require(4.0 * len(views) * math.prod(views.shape), "a set of projections")
         images = np.empty((len(views), *views.shape), np.float32)
         for m, image in enumerate(images):
@@ -215,12 +222,16 @@ class Phantom:
 
     def _total(self, quantity: str) -> float:
         """The value times mm^3 of the whole phantom."""
-        if quantity not in self._totals:
-            self._totals[quantity] = integral(self._layers(quantity))
-        return self._totals[quantity]
+        return integral(self._layers(quantity), self._replaced(quantity))
+
+    def _replaced(self, quantity: str) -> list[float]:
+        """For each layer the mean of what it replaces."""
+        if quantity not in self._means:
+            self._means[quantity] = means_beneath(self._layers(quantity))
+        return self._means[quantity]
 
     @cached_property
-    def _totals(self) -> dict[str, float]:
+    def _means(self) -> dict[str, list[float]]:
         return {}
 
     def _layers(self, quantity: str, pose: ArrayLike | None = None) -> list[Layer]:

@@ -369,7 +369,7 @@ class Cone(Shape):
         b = starts[0] * directions[0] + starts[1] * directions[1] - r * dr
         c = starts[0] ** 2 + starts[1] ** 2 - r**2
         root = np.sqrt(np.maximum(b**2 - a * c, 0.0))
-        with np.errstate(divide="ignore", invalid="ignore"):
+        with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
             # Both roots without cancellation; where a is 0 one of them is at infinity. (Where there are none, these
             # numbers split the line anywhere: what counts is the sign in the middle of each piece.)
             q = -(b + np.copysign(root, b))
@@ -520,7 +520,7 @@ def _in_unit_ball(starts: Points, directions: Points) -> tuple[Points, Points]:
     """Where lines (n, N) are inside the unit ball of n dimensions, (1, N) each."""
     a = np.einsum("in,in->n", directions, directions)
     b = np.einsum("in,in->n", starts, directions)
-    with np.errstate(divide="ignore", invalid="ignore"):
+    with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
         # From the line's point nearest to the middle: no cancellation of large squares.
         nearest = -b / a
         miss = starts + directions * nearest
@@ -543,7 +543,7 @@ def _between(start: Points, direction: Points, half: float) -> tuple[Points, Poi
 
 def _below(start: Points, direction: Points) -> tuple[Points, Points]:
     """Where ``start + t direction <= 0``, (1, N) each."""
-    with np.errstate(divide="ignore", invalid="ignore"):
+    with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
         crossing = -start / direction
     enter = np.where(direction < 0, crossing, np.where((direction > 0) | (start <= 0), -np.inf, np.inf))
     leave = np.where(direction > 0, crossing, np.where((direction < 0) | (start <= 0), np.inf, -np.inf))
@@ -567,7 +567,7 @@ def _ellipse_distance(points: Real, radii: tuple[float, ...]) -> Real:
     g = np.sqrt(np.einsum("in,in->n", scaled, scaled))
     left = 1 - k2
     inside = left / (g + np.sqrt(g * g + np.maximum(left, 0) * inverse.max() ** 2))
-    with np.errstate(divide="ignore", invalid="ignore"):
+    with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
         outside = (k2 - np.sqrt(k2)) / g
     return np.where(left > 0, -inside, outside)
 

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..checks import whole_shape
+from ..checks import whole_number
 from ..errors import InputError
 from .materials import LUNG_MU, SOFT_TISSUE_MU, VERTEBRA_MU
 from .painting import Layer, points_inside
@@ -120,7 +120,7 @@ class CardiacTorso(Phantom):
 
     def beating(self, frames: int) -> list[CardiacTorso]:
         """The torso at as many phases, evenly spaced over the cycle, the first at end-diastole."""
-        (count,) = whole_shape([frames], "frames of the cycle", 1)
+        count = whole_number(frames, "frames of the cycle")
         return [dataclasses.replace(self, phase=i / count) for i in range(count)]
 
     @property

@@ -64,7 +64,7 @@ def require_voxels(shape: Sequence[int], kind: np.dtype[Any]) -> None:
         raise InputError(f"expected a 3-D image, got shape {sizes}")
     if min(shape) < 1:
         raise InputError(f"expected at least one voxel along each axis, got {sizes}")
-    if kind.kind not in "fiu":
+    if kind.kind not in "fiub":
         raise InputError(f"expected real numbers, found {kind}")
     # As the file has them, as float32, and what the check for finite numbers takes.
     require((4.5 + kind.itemsize) * math.prod(int(n) for n in shape), f"a volume of {sizes} voxels")

@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..errors import InputError
+from ..errors import InputError, InputWarning
 from ..progress import Progress
 from .contents import RAS_FROM_LPS, Contents, first_line, require_voxels
 from .dicom_header import directions, numbers
@@ -52,12 +52,9 @@ class _Slice:
 
 
 def is_dicom(path: Path) -> bool:
-    """Whether `path` is a DICOM file: "DICM" stands after its first 128 bytes."""
-    try:
-        with open(path, "rb") as file:
-            return file.read(132)[128:] == b"DICM"
-    except OSError:
-        return False
+    """Whether the file at `path` is DICOM: "DICM" stands after its first 128 bytes."""
+    with open(path, "rb") as file:
+        return file.read(132)[128:] == b"DICM"
 
 
 def read(path: Path, series: str | None = None, progress: Progress | None = None) -> Contents:
@@ -76,7 +73,7 @@ def read(path: Path, series: str | None = None, progress: Progress | None = None
         warnings.filterwarnings("ignore", module="pydicom")  # about tags that nothing here depends on
         headers = _chosen(_headers(path), path, series)
         _require_one_volume(headers)
-        slices = [one for file, header in headers for one in _slices(file, header)]
+        slices = [one for file, header in headers for one in _slices_of(file, header)]
         slices, step = _ordered(slices)
         quantity, factor = _quantity(headers[0][1], slices[0].unit)
         rows, columns = slices[0].shape
@@ -105,9 +102,11 @@ def _headers(path: Path) -> list[tuple[Path, Any]]:
     headers: dict[Path, Any] = {}
     others: dict[Path, Any] = {}
     for file in files:
-        if file in headers or not (file.is_file() and (is_dicom(file) or file.suffix.lower() in (".dcm", ".ima"))):
+        if file in headers or not file.is_file():
             continue
         try:
+            if not (is_dicom(file) or file.suffix.lower() in (".dcm", ".ima")):
+                continue
             header = pydicom.dcmread(file, stop_before_pixels=True)
         except InvalidDicomError:
             raise InputError(f"{file.name} is no DICOM file") from None
@@ -175,6 +174,16 @@ def _listed(found: dict[str, list[tuple[Path, Any]]]) -> str:
         name = " ".join(str(x) for x in (number, description and f'"{description}"') if x is not None) or uid
         parts.append(f"{name} ({len(of)} images)")
     return "; ".join(parts)
+
+
+def _slices_of(path: Path, header: Any) -> list[_Slice]:
+    """The images of a file, or `InputError` that names it."""
+    try:
+        return list(_slices(path, header))
+    except InputError:
+        raise
+    except Exception as error:  # whatever pydicom raises on a tag that is damaged: it parses them when asked
+        raise InputError(f"{path.name}: cannot be read as DICOM ({first_line(error)})") from None
 
 
 def _slices(path: Path, header: Any) -> Iterator[_Slice]:
@@ -267,6 +276,13 @@ def _ordered(slices: list[_Slice]) -> tuple[list[_Slice], NDArray[np.float64]]:
         raise InputError(
             f"{what} between {slices[k].name} and {slices[k + 1].name}: {gaps[k]:g} mm apart at "
             f"{places[k]:g} mm, the others {usual:g} mm"
+        )
+    if usual > 1.5 * first.thickness > 0:
+        warnings.warn(
+            f"the slices are {first.thickness:g} mm thick and lie {usual:g} mm apart: there are gaps between them, or some "
+            "are missing",
+            InputWarning,
+            stacklevel=2,
         )
     step = (last.position - first.position) / (len(slices) - 1)
     sideways = np.array(

@@ -37,7 +37,10 @@ def read(path: Path) -> Contents:
     """Read .mha, or .mhd and the files beside it."""
     with open(path, "rb") as file:
         header = _header(file)
-        shape = tuple(int(n) for n in _numbers(header, ("DimSize",), None))
+        sizes = _numbers(header, ("DimSize",), None)
+        if not (sizes == np.floor(sizes)).all():
+            raise InputError(f"DimSize = {header['DimSize']}: expected whole numbers")
+        shape = tuple(int(n) for n in sizes)
         if int(header.get("ElementNumberOfChannels", 1)) != 1:
             raise InputError(f"expected one value per voxel, found {header['ElementNumberOfChannels']}")
         kind = header.get("ElementType", "nothing")

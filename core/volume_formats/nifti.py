@@ -20,11 +20,15 @@ def read(path: Path) -> Contents:
     """Read .nii, .nii.gz, or a pair .hdr and .img."""
     import nibabel
     from nibabel.filebasedimages import ImageFileError
+    from nibabel.imageglobals import logger
 
+    logger.disabled, before = True, logger.disabled  # it prints what it raises, too
     try:
         image = nibabel.load(path)
     except ImageFileError as error:
         raise InputError(f"not a NIfTI file ({first_line(error)})") from None
+    finally:
+        logger.disabled = before
     if not isinstance(image, nibabel.AnalyzeImage):  # NIfTI's classes are made from it
         raise InputError(f"expected NIfTI, found {type(image).__name__}")
     image = nibabel.squeeze_image(image)  # (x, y, z, 1) is common, and a volume

@@ -30,6 +30,9 @@ def read(path: Path) -> Contents:
     import nrrd
 
     header = nrrd.read_header(str(path))
+    for name in ("type", "sizes"):
+        if name not in header:
+            raise InputError(f"it has no field {name}: it is damaged or ends early")
     kind = header["type"]
     if kind == "block":
         raise InputError("expected real numbers, found blocks of bytes")

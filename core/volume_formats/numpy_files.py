@@ -13,6 +13,9 @@ from .contents import Contents
 
 def read(path: Path) -> Contents:
     """Read .npz with the arrays array, affine, quantity and (if it is there) unit; or .npy, which has no affine."""
+    with open(path, "rb") as start:
+        if not start.read(6).startswith((b"\x93NUMPY", b"PK")):  # numpy takes what is not its own for pickled objects
+            raise InputError("not a file of numpy")
     file = np.load(path, allow_pickle=False)
     if path.suffix.lower() == ".npy":
         if not isinstance(file, np.ndarray):

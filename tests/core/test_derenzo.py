@@ -176,7 +176,7 @@ def test_phantom_outside_the_grid_leaves_it_empty():
     [
         ({"radius": 0}, "Derenzo radius: expected more than 0 mm"),
         ({"radius": np.nan}, "Derenzo radius"),
-        ({"rod_diameters": (1, 2, 3)}, "Derenzo rod diameters: expected shape 6, got 3"),
+        ({"rod_diameters": (1, 2, 3)}, "Derenzo rod diameters: expected one for each of 6 sectors .0: empty., got 3"),
         ({"rod_diameters": (1, 2, 3, 4, 5, -6)}, "expected 0 or more"),
         ({"rod_diameters": (50,) * 6}, "no rod"),
         ({"rod_diameters": (8, 6, 5, 4, 3, 1e-9)}, "more than 100000 rods"),

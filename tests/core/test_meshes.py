@@ -82,14 +82,24 @@ def test_coverage_of_an_oblique_voxel_is_that_of_many_points(rng):
 def test_walls_cavities_and_parts_that_overlap():
     grid = mph.Grid.centered((20, 21, 22), 0.45)
     outer, inner = box((6.0, 6, 6)), box((2.0, 3, 4), (0.3, 0.2, 0.1))
-    assert content(mph.voxelize_mesh(joined(outer, flipped(inner)), grid)) == pytest.approx(216 - 24, rel=1e-6)
-    assert content(mph.voxelize_mesh(joined(outer, inner), grid)) == pytest.approx(216, rel=1e-6)
+    for any_grid in (grid, mph.Grid.centered(20, 0.5)):  # also with faces between voxels
+        assert content(mph.voxelize_mesh(joined(outer, flipped(inner)), any_grid)) == pytest.approx(216 - 24, rel=1e-6)
+    assert content(mph.voxelize_mesh(joined(outer, inner), grid)) == pytest.approx(216, rel=1e-5)
     assert content(mph.voxelize_mesh(flipped(outer), grid)) == pytest.approx(216, rel=1e-6)
     apart = joined(box((2.0, 2, 2), (-2, 0, 0)), flipped(box((2.0, 2, 2), (2, 0, 0))))
     assert content(mph.voxelize_mesh(apart, grid)) == pytest.approx(16, rel=1e-6)
+
+
+def test_what_several_parts_cover_counts_once(rng):
+    """Parts that overlap, share faces or lie in one another, in voxels of any size."""
     crossing = joined(box((4.0, 2, 2), (-0.5, 0, 0)), box((4.0, 2, 2), (0.5, 0.4, 0.3)))
     union = 2 * 16 - 3 * (2 - 0.4) * (2 - 0.3)
-    assert content(mph.voxelize_mesh(crossing, grid)) == pytest.approx(union, rel=1e-2)
+    corner = joined(box((2.0, 2, 2)), box((2.0, 2, 2), (1, 0, 0)), box((2.0, 2, 2), (0, 1, 0)))
+    for mesh, volume in ((crossing, union), (corner, 16), (joined(box((3.0, 2, 1)), box((3.0, 2, 1))), 6)):
+        for grid in (mph.Grid.centered((20, 21, 22), 0.45), mph.Grid.centered(3, 5.0), general_grid(rng, (60, 60, 60))):
+            covered = mph.voxelize_mesh(mesh, grid)
+            assert content(covered) == pytest.approx(volume, rel=1e-4)
+            assert covered.array.min() == 0 and covered.array.max() <= 1
 
 
 def test_later_meshes_replace_earlier_ones():
@@ -182,6 +192,11 @@ def test_what_is_no_mesh_is_refused(tmp_path):
         mph.read_mesh(tmp_path / "m.stl", "ft")
     with pytest.raises(mph.InputError, match="value: expected shape 1"):
         mph.voxelize_mesh(box(), grid, value=[1, 2])
+    with pytest.raises(mph.InputError, match="voxelize_mesh: expected a Grid, got tuple"):
+        mph.voxelize_mesh(box(), (3, 3, 3))
+    with pytest.raises(mph.InputError, match="mesh: expected a mesh, vertices and faces, or a path, got int"):
+        mph.write_mesh(3, tmp_path / "m.stl")
+    assert not list(tmp_path.iterdir())
 
 
 def test_voxelizing_is_cancelled():

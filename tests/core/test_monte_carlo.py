@@ -383,7 +383,7 @@ def test_options(scanner, tmp_path) -> None:
         ({"plate_thickness": 300, "wall_thickness": 400}, "plate_thickness 300 mm is too much"),
         ({"time": 0}, "time: expected more than 0 s"),
         ({"seed": 1.5}, "seed: expected a whole number"),
-        ({"phantom": "derenzo", "rods": (1, 2)}, "Derenzo rod diameters: expected shape 6"),
+        ({"phantom": "derenzo", "rods": (1, 2)}, "Derenzo rod diameters: expected one for each of 6 sectors"),
         ({"position": "here"}, "position: expected real numbers"),
         ({"pose": np.diag([1.0, 1, -1, 1])}, "phantom pose: expected a rotation"),
         ({"phantom": "derenzo", "radius": 250}, "begins inside the phantom"),

@@ -163,15 +163,15 @@ def test_projectors_agree_with_exact_projections(system):
 
 
 @pytest.mark.parametrize("phantom", KINDS, ids=title)
-@pytest.mark.parametrize("voxels", [13, 40])
+@pytest.mark.parametrize("voxels", [6, 40])
 def test_total_activity_does_not_depend_on_grid_or_pose(phantom, voxels, rng):
-    """To 0.1 %, also where voxels are larger than the parts; for activity and for mu."""
+    """To 0.02 %, also where voxels are larger than the parts; for activity and for mu."""
     spacing = phantom.extent / (voxels - 3)
     grid = mph.Grid.centered(voxels, spacing)
     turned = mph.euler_pose(*rng.uniform(-3, 3, 3), translation=rng.uniform(-1, 1, 3) * spacing)
     for pose in (None, turned):
         volume = phantom.voxelize(grid, pose)
-        assert total(volume) == pytest.approx(phantom.total_activity, rel=1e-3)
+        assert total(volume) == pytest.approx(phantom.total_activity, rel=2e-4)
         assert volume.array.min() >= -1e-5 * volume.array.max()
     # And of mu: against the closed forms along many parallel lines.
     volume = phantom.voxelize(grid, turned, quantity="mu")
@@ -275,6 +275,9 @@ def test_the_examples_are_phantoms(path):
         ("[[shape]]\nkind = 'cylinder'\nradius = [1, 2, 3]\nheight = 1\nmu = 1", "radius: expected shape 2, got 3"),
         ("[[shape]]\nkind = 'cone'\nradius = 0\nheight = 1\nmu = 1", "radius: expected more than 0 mm"),
         ("mu_energy = 0\n[[shape]]\nkind = 'sphere'\nradius = 1\nmu = 1", "mu_energy: expected more than 0 keV"),
+        ("[[shape]]\nkind = 'sphere'\nradius = true\nmu = 1", "radius: expected numbers or a text, got true or false"),
+        ("[[shape]]\nkind = 'sphere'\nradius = 1\nmu = 1\nposition = [1, false, 1]", "position: .* got true or false"),
+        (f"name = {'[' * 5000}{']' * 5000}", "its lists are nested too deeply"),
         ("name = 3\n[[shape]]\nkind = 'sphere'\nradius = 1\nmu = 1", "phantom name: expected a text"),
     ],
 )
@@ -309,7 +312,7 @@ def test_files_that_are_no_text_are_refused(tmp_path):
         (lambda: mph.NemaBody(background=-1), "NEMA body phantom: background: expected 0 or more kBq/mL, got -1"),
         (lambda: mph.JaszczakPhantom(radius=0), "Jaszczak phantom: radius: expected more than 0 mm"),
         (lambda: mph.JaszczakPhantom(rod_diameters=(300,) * 6), "Jaszczak phantom: Derenzo phantom: no rod"),
-        (lambda: mph.DefrisePhantom(disks=2.5), "disks: expected 1 whole numbers"),
+        (lambda: mph.DefrisePhantom(disks=2.5), "disks: expected a whole number of at least 1, got 2.5"),
         (lambda: mph.SheppLogan(contrast="high"), "contrast: expected one of modified, original, got 'high'"),
         (lambda: mph.PointGrid(counts=(1000, 1000, 1000)), "at most 10000 points"),
         (lambda: mph.CardiacTorso(phase=1), "phase: expected less than 1, got 1"),
@@ -358,6 +361,7 @@ def test_files_that_are_no_text_are_refused(tmp_path):
         (lambda: PAINTING.line_integrals(np.zeros((2, 3)), np.zeros((3, 3))), "2 sources but 3 targets"),
         (lambda: PAINTING.line_integrals(np.zeros((2, 2)), np.zeros((2, 3))), "sources: expected shape"),
         (lambda: PAINTING.line_integrals([[0, 0, 0], [0]], np.zeros((2, 3))), "sources: expected real numbers"),
+        (lambda: PAINTING.project(None), "project: expected Views, got NoneType"),
         (lambda: mph.Cylinder(radius=[[1], [2, 3]], height=1, mu=1), "radius: expected real numbers"),
         (lambda: mph.Sphere(radius=1, mu=1, cut=[[1, 0, 0], [0]]), "cut: expected real numbers"),
         (lambda: mph.random_pose(1, box=[[1], [2, 3]]), "box of random poses: expected real numbers"),

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import errno
+import io
+import os
 import shutil
 import zlib
 from pathlib import Path
@@ -199,6 +202,14 @@ def test_the_chest_is_the_same_from_nifti_and_from_dicom(tmp_path, workbook):
     assert np.allclose(images[0], images[1], rtol=1e-6, atol=1e-6)
 
 
+def test_every_other_slice_missing_is_warned_of(tmp_path, ct):
+    for data in write_series(ct, tmp_path / "s")[1::2]:
+        Path(data.filename).unlink()
+    with pytest.warns(mph.InputWarning, match=r"the slices are 2\.5 mm thick and lie 5 mm apart"):
+        volume = mph.read_volume(tmp_path / "s")
+    assert np.array_equal(volume.array, ct.array[:, :, ::2])
+
+
 def test_one_of_several_series_is_chosen(tmp_path, ct):
     write_series(ct, tmp_path / "s", 3, "Soft")
     other = mph.Volume(ct.array + 1, ct.grid, "hu")
@@ -349,6 +360,12 @@ def _cut_before_its_rows(size):
     return cut
 
 
+def _text_for_a_number(written, folder):
+    path = Path(written[4].filename)
+    before, tag, after = path.read_bytes().partition(b"(\x00R\x10DS")  # RescaleIntercept
+    path.write_bytes(before + tag + after[:2] + b"nothing!"[: after[0]] + after[2 + after[0] :])
+
+
 def _cut_short(written, folder):
     path = Path(written[4].filename)
     path.write_bytes(path.read_bytes()[:-20])
@@ -379,6 +396,14 @@ def _nifti(array):
         return folder / "v.nii"
 
     return make
+
+
+def _no_type(folder, ct):
+    path = _nifti(np.zeros((3, 3, 3), np.float32))(folder, ct)
+    data = bytearray(path.read_bytes())
+    data[70:72] = (2164).to_bytes(2, "little")
+    path.write_bytes(data)
+    return path
 
 
 def _truncated(name):
@@ -443,6 +468,13 @@ def _empty(folder, ct):
     return folder / "empty"
 
 
+def _pipe(folder, ct):
+    if not hasattr(os, "mkfifo"):
+        pytest.skip("no pipes on this system")
+    os.mkfifo(folder / "v.nii")
+    return folder / "v.nii"
+
+
 def _npy(folder, ct):
     np.save(folder / "v.npy", ct.array)
     return folder / "v.npy"
@@ -479,6 +511,8 @@ BAD = {
     "frames without places": (_set(0, NumberOfFrames=2), "2 frames without a place for each"),
     "last slice cut in its header": (_series(_cut_before_its_rows(600)), "an image without Rows"),
     "last slice cut in its first tags": (_series(_cut_before_its_rows(170)), "an image without Rows"),
+    "text for a number": (_series(_text_for_a_number), "1-0004.dcm: cannot be read as DICOM (could not convert"),
+    "no columns": (_without(3, "Columns"), "1-0003.dcm: cannot be read as DICOM"),
     "truncated slice": (_series(_cut_short), "1-0004.dcm"),
     "compressed slices": (_series(_compressed), "its pixels are compressed (JPEG-LS"),
     "magnetic resonance": (
@@ -516,11 +550,18 @@ BAD = {
     "a tomogram nowhere": (_tomogram(DetectorInformationSequence=None), "nm.dcm: it has no ImagePositionPatient"),
     "slices at one place": (_tomogram(SpacingBetweenSlices=0), "lie at the same place"),
     "an empty folder": (_empty, "expected a folder with the images of a DICOM series"),
+    "a pipe": (_pipe, "neither a file nor a folder"),
+    "an empty file": (_bytes("v.nrrd", b""), "it is empty"),
+    "a name that cannot be": (lambda folder, ct: folder / ("v" * 300 + ".nii"), "ame too long"),
+    "no numpy file": (_bytes("v.npy", b"hello" * 99), "not a file of numpy"),
+    "NRRD cut in its header": (_bytes("v.nrrd", b"NRRD0004\ntype: short\n"), "it has no field sizes"),
+    "half a voxel": (_meta(DimSize="5 6 6.5"), "DimSize = 5 6 6.5: expected whole numbers"),
     "no DICOM": (_bytes("v.dcm", b"hello" * 99), "v.dcm is no DICOM file"),
     "unknown suffix": (_bytes("v.xyz", b"hello" * 99), "expected a folder of DICOM files, or a name ending in"),
     "4-D NIfTI": (_nifti(np.zeros((3, 3, 3, 2), np.float32)), "expected a 3-D image, got shape 3 x 3 x 3 x 2"),
     "NaN": (_nifti(NAN), "nan is not a finite number at index (1, 2, 0)"),
     "complex NIfTI": (_nifti(np.zeros((3, 3, 3), np.complex64)), "expected real numbers"),
+    "NIfTI of no type": (_no_type, "data code 2164 not recognized"),
     "truncated NIfTI": (_truncated("v.nii"), "cannot be read as .nii"),
     "truncated npz": (_truncated("v.npz"), "cannot be read as .npz"),
     "truncated NRRD": (_truncated("v.nrrd"), "its data are damaged or end early; expected 5 x 6 x 7 voxels"),
@@ -555,7 +596,7 @@ BAD = {
 
 
 @pytest.mark.parametrize("case", BAD)
-def test_bad_input_gets_one_line_that_names_the_place(tmp_path, ct, case):
+def test_bad_input_gets_one_line_that_names_the_place(tmp_path, ct, case, caplog):
     make, expected = BAD[case]
     path = make(tmp_path, ct)
     with pytest.raises(mph.InputError) as error:
@@ -564,6 +605,25 @@ def test_bad_input_gets_one_line_that_names_the_place(tmp_path, ct, case):
     assert expected in message
     assert message.startswith(f"{path}: ")
     assert "\n" not in message
+    assert "nibabel" not in caplog.text  # it would print that on standard error
+
+
+@pytest.mark.parametrize("of_series", [False, True])
+def test_what_may_not_be_read_is_said_and_not_left_out(tmp_path, ct, monkeypatch, of_series):
+    write_series(ct, tmp_path / "s", names=[f"slice{k}" for k in range(7)])
+    mph.write_volume(ct, tmp_path / "v.nii")
+    locked = tmp_path / "s/slice6" if of_series else tmp_path / "v.nii"  # no gap tells of a last slice
+    may_open = io.open
+
+    def open_others(path, *args, **kwargs):
+        if path == locked:
+            raise PermissionError(errno.EACCES, "Permission denied", str(path))
+        return may_open(path, *args, **kwargs)
+
+    monkeypatch.setattr("builtins.open", open_others)
+    monkeypatch.setattr("io.open", open_others)
+    with pytest.raises(mph.InputError, match=f"{locked.name}.*Permission denied"):
+        mph.read_volume(tmp_path / "s" if of_series else locked)
 
 
 def test_series_and_affines_are_checked_too(tmp_path, ct):

@@ -72,6 +72,13 @@ def test_density_of_diffdrr():
     volume = mph.Volume(hu.reshape(6, 1, 1), mph.Grid((6, 1, 1), np.eye(4)), "hu")
     assert np.array_equal(mph.diffdrr_density(volume, 2.0).ravel(), density)
     assert np.array_equal(mph.diffdrr_density(np.full(3, 40.0)), np.zeros(3))
+    for given, factor, message in (
+        (None, 1.0, "CT numbers"),
+        ([np.nan], 1.0, "CT numbers"),
+        (hu, "x", "bone_attenuation"),
+    ):
+        with pytest.raises(mph.InputError, match=message):
+            mph.diffdrr_density(given, factor)
 
 
 def test_density_is_the_same_for_tensors(rng):

@@ -45,7 +45,7 @@ class Dependencies:
                 if cell.formula is None:
                     continue
                 try:
-                    areas = self._areas(cell.formula, title)
+                    areas = self._areas(cell.formula, place)
                 except (Unforeseeable, NotComputable):
                     self.unforeseeable.add(place)
                     areas = []
@@ -75,7 +75,7 @@ class Dependencies:
                 for column in range(left, right + 1):
                     self._of_cell[title, row, column].append(place)
 
-    def _areas(self, formula: str, title: str, depth: int = 0) -> list[_Area]:
+    def _areas(self, formula: str, place: Place, depth: int = 0) -> list[_Area]:
         found: list[_Area] = []
         for token in tokens_of(formula):
             if token.type == "FUNC" and token.subtype == "OPEN":
@@ -86,15 +86,15 @@ class Dependencies:
                 continue
             area = reference(token.value)
             if area is not None:
-                sheets = [title] if area.sheet is None else self._workbook.between(area.sheet)
+                sheets = [place[0]] if area.sheet is None else self._workbook.between(area.sheet)
                 found += [(sheet, area.top, area.left, area.bottom, area.right) for sheet in sheets]
             elif _OTHER_FILE.match(token.value):
                 continue  # another file's cell does not change with this one's
             else:
-                meaning = self._workbook.defined_name(title, token.value)
+                meaning = self._workbook.meaning(place, token.value)
                 if meaning is None or depth == _NAMES_DEEP:
                     raise Unforeseeable(token.value)
-                found += self._areas(meaning, title, depth + 1)
+                found += self._areas(meaning, place, depth + 1)
         return found
 
     def of(self, place: Place) -> set[Place]:

@@ -243,13 +243,13 @@ class Edit:
 
     def _warn_of_short_ranges(self, arrangement: Arrangement) -> None:
         name, old = arrangement.table.sheet.name, arrangement.old
-        found = self.workbook.ranges_ending_at(name, min(old), max(old))
+        found = self.workbook.ranges_ending_at(name, max(old))
         own = {self.workbook.text((name, row, column)) for row in arrangement.rows for column in arrangement.columns}
         found = [place for place in found if place not in own]
         if found:
             warnings.warn(
-                f"{self.workbook.name}: {several(found)} end at row {max(old)} of sheet {name}, so the modules added "
-                "below are left out there",
+                f"{self.workbook.name}: {several(found)} end{'s' * (len(found) == 1)} at row {max(old)} of sheet {name}, "
+                "so the modules added below are left out there",
                 InputWarning,
                 stacklevel=4,
             )

@@ -46,6 +46,7 @@ def agree(value: Any, wanted: float) -> bool:
 def recalculate(workbook: WorkbookXml, changed: Iterable[Place], required: Mapping[Place, float]) -> Recalculated:
     """Give every formula of `workbook` that depends on the `changed` cells its new value.
 
+    So are formulas without a value in sheets in which anything changes, as far as our own evaluator knows them.
     `required` are the numbers that cells must have in the end: a formula among them which gives another one, or
     of which that cannot be known, is replaced by the number.
     """
@@ -54,6 +55,7 @@ def recalculate(workbook: WorkbookXml, changed: Iterable[Place], required: Mappi
     if calculation.unknown:
         calculation.by_libreoffice()
     calculation.clear()
+    calculation.fill()
     return calculation.result
 
 
@@ -101,7 +103,7 @@ class _Calculation:
             lookup,
             at=place[1:],
             extent=lambda name: self.workbook.extent(self._title(name, sheet)),
-            name=lambda name: self.workbook.defined_name(sheet, name),
+            name=lambda name: self.workbook.meaning(place, name),
         )
         assert cell.formula is not None, "only formulas are calculated"
         return calculate(cell.formula, surroundings)
@@ -168,6 +170,13 @@ class _Calculation:
             else:
                 self._set(place, replace(cell, value=None))
                 self.result.cleared[place] = why
+
+    def fill(self) -> None:
+        """Formulas that came without values get theirs too, in the sheets that change anyway."""
+        changed = {title for title, sheet in self.workbook.sheets.items() if sheet.changed}
+        for place, value in self.elsewhere.items():
+            if place[0] in changed:
+                self._store(place, value, "formulas")
 
     def _replace(self, place: Place, why: str) -> None:
         self.workbook.sheets[place[0]].refuse_array(place[1:])

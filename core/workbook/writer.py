@@ -33,10 +33,10 @@ class WrittenWorkbook:
     changed : tuple of str
         The cells (``"Coordinates!B3"``) whose numbers or formulas are not the template's.
     recalculated : dict
-        Cell with a formula that depends on these -> who calculated the value it stores now: "formulas" (mphDRR's
-        own evaluator) or "LibreOffice".
+        Cell with a formula that depends on these, or stored no value in a sheet that changes -> who calculated the
+        value it stores now: "formulas" (mphDRR's own evaluator) or "LibreOffice".
     cleared : tuple of str
-        Such cells that store no value now, because neither could calculate it.
+        Cells that depend on these and store no value now, because neither could calculate it.
     """
 
     path: Path
@@ -54,8 +54,9 @@ def write_system(
     as by `read_system`. Formulas stay as long as they give the system's numbers (to 1e-9, relative). Every formula
     of the workbook that depends on a changed cell stores its new value, calculated by `core.workbook.formulas`
     or else, where it is installed, by LibreOffice; else it stores none, and the workbook is marked to be
-    recalculated when opened. All other parts of the file - sheets, formats, charts, images, comments, macros - are
-    byte for byte the template's; if nothing differs, the whole file is.
+    recalculated when opened. In a sheet that changes, formulas that stored no value get theirs too. All other parts
+    of the file - sheets, formats, charts, images, comments, macros - are byte for byte the template's; if nothing
+    differs, the whole file is.
 
     Removed modules leave empty rows, added ones come below the last with copies of its formulas, and modules in
     another order take their rows' contents along.

@@ -165,7 +165,9 @@ class Table:
 
     def in_degrees(self, quantity: str) -> bool:
         """Whether the heading of an angle says so."""
-        return any(_units(self._text(row, column)) & _DEGREES for row, column, name in self.headings if name == quantity)
+        return any(
+            _units(self._text(row, column)) & _DEGREES for row, column, name in self.headings if name == quantity
+        )
 
     def number_columns(self) -> list[int]:
         """Columns that may hold the modules' numbers: those headed so, then unheaded ones at the left."""

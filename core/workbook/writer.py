@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
+from ..checks import instance
 from ..errors import InputError, InputWarning
 from ..files import replacing
 from ..system import PinholeSystem
@@ -86,8 +87,7 @@ def write_system(
     InputWarning
         Formulas that had to be replaced by numbers or store no value, and ranges that leave added modules out.
     """
-    if not isinstance(system, PinholeSystem):
-        raise InputError(f"write_system: expected a PinholeSystem, got {type(system).__name__}")
+    instance(system, PinholeSystem, "write_system")
     target = Path(path)
     suffix = target.suffix.lower()
     if suffix not in KINDS:

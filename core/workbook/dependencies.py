@@ -121,18 +121,36 @@ class Dependencies:
     def in_order(self, places: Iterable[Place]) -> list[Place]:
         """`places` with those that others need before these; those in a circle last."""
         places = set(places)
-        needed_by = {place: self.of(place) & places for place in places}
-        missing = dict.fromkeys(places, 0)
-        for dependents in needed_by.values():
-            for place in dependents:
-                missing[place] += 1
-        ready = sorted((place for place in places if not missing[place]), reverse=True)
-        ordered = []
-        while ready:
-            place = ready.pop()
-            ordered.append(place)
-            for dependent in needed_by[place]:
-                missing[dependent] -= 1
-                if not missing[dependent]:
-                    ready.append(dependent)
+        ordered = _sorted(self._needed_by(places))
         return ordered + sorted(places.difference(ordered))
+
+    def circular(self, places: Iterable[Place]) -> list[Place]:
+        """Those of `places` that need themselves, at once or through others."""
+        needed_by = self._needed_by(set(places))
+        needed_by = self._needed_by(set(needed_by).difference(_sorted(needed_by)))
+        needs: dict[Place, set[Place]] = {place: set() for place in needed_by}
+        for place, dependents in needed_by.items():
+            for dependent in dependents:
+                needs[dependent].add(place)
+        return sorted(set(needs).difference(_sorted(needs)))
+
+    def _needed_by(self, places: set[Place]) -> dict[Place, set[Place]]:
+        return {place: self.of(place) & places for place in places}
+
+
+def _sorted(followers: dict[Place, set[Place]]) -> list[Place]:
+    """Each place before its followers; those left out that never can be."""
+    missing = dict.fromkeys(followers, 0)
+    for places in followers.values():
+        for place in places:
+            missing[place] += 1
+    ready = sorted((place for place in followers if not missing[place]), reverse=True)
+    ordered = []
+    while ready:
+        place = ready.pop()
+        ordered.append(place)
+        for follower in followers[place]:
+            missing[follower] -= 1
+            if not missing[follower]:
+                ready.append(follower)
+    return ordered

@@ -108,7 +108,7 @@ class Edit:
             if row_of and modules.numbers is not None and set(modules.numbers) <= set(row_of):
                 old = [row_of[number] for number in modules.numbers]
                 found[name] = self._arrangement(table, old, max(rows.rows), rows.number_column, row_of)
-            elif len(rows.rows) == len(modules.rows) > 1:
+            elif len(rows.rows) == len(modules.rows):
                 found[name] = self._arrangement(table, rows.rows, max(rows.rows), rows.number_column, {})
         return found
 

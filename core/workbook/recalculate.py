@@ -68,7 +68,12 @@ class _Calculation:
         # What affected formulas refer to may have come without values.
         cells = {place: workbook.cell(place) for place in dependencies.formulas - self.affected}
         valueless = {place for place, cell in cells.items() if cell.value is None}
-        self.waiting = dependencies.in_order(self.affected | valueless)
+        wanted = self.affected | valueless
+        for place in dependencies.circular(wanted):
+            if place in required:
+                self._replace(place, "it refers back to itself")
+                wanted.discard(place)
+        self.waiting = dependencies.in_order(wanted)
         self.not_yet = set(self.waiting)
         self.unknown: dict[Place, str] = {}
         self.elsewhere: dict[Place, Any] = {}

@@ -382,6 +382,26 @@ def test_a_formula_that_gives_the_new_number_stays(template, tmp_path):
     assert "Coordinates!B4" in written.recalculated
 
 
+def test_a_formula_that_comes_to_refer_to_itself_is_replaced_alone(template, tmp_path):
+    """As a spreadsheet sorts, =B$3 of another row comes to stand in B3 itself; what depends on it stays a formula."""
+    book = openpyxl.load_workbook(template)
+    for row in range(4, 7):
+        book["Main"][f"B{row}"] = "=B$3"
+    book["Main"]["B3"] = 2.25
+    book.save(template)
+    system = by_design(changed(read_quietly(template), pinhole_diameter=2.25))
+    with pytest.warns(mph.InputWarning) as caught:
+        mph.write_system(system[[3, 0, 1, 2]], tmp_path / "o.xlsx", template)
+    replaced = [str(w.message) for w in caught if "the formula was replaced" in str(w.message)]
+    assert replaced == [
+        "template.xlsx: Main!B3: the formula was replaced by the system's number (it refers back to itself)"
+    ]
+    cells = values_of(tmp_path / "o.xlsx", data_only=False)
+    assert [cells["Main", f"B{row}"] for row in range(3, 7)] == [2.25, 2.25, "=B$3", "=B$3"]
+    assert str(cells["Coordinates", "F3"]).startswith("=")
+    assert_same(mph.read_system(tmp_path / "o.xlsx"), system[[3, 0, 1, 2]])
+
+
 def test_what_nobody_can_calculate_stores_no_value(template, tmp_path):
     book = openpyxl.load_workbook(template)
     del book["Theta"], book["It's values"]

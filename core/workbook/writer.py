@@ -99,7 +99,7 @@ def write_system(
         cells = {(title, *at): cell for title, sheet in workbook.sheets.items() for at, cell in sheet.cells.items()}
         formulas = [place for place, cell in cells.items() if cell.formula is not None]
         required = {place: number for place, number in numbers_of(system).items() if cells[place].formula is not None}
-        return _saved(workbook, system, target, formulas, required, [])
+        return _saved(workbook, system, target, recalculate(workbook, formulas, required), [])
     book = Book(template)
     workbook = WorkbookXml(book.content, book.path.name)
     _refuse_other_kind(workbook, target, suffix)
@@ -113,7 +113,9 @@ def write_system(
         )
     edit = Edit(system, reading, workbook)
     edit.apply()
-    return _saved(workbook, system, target, edit.changed, edit.required, workbook.changed, edit.numbered)
+    edited = workbook.changed
+    result = recalculate(workbook, edit.changed, edit.required, edit.derived) if edit.changed else Recalculated()
+    return _saved(workbook, system, target, result, edited, edit.numbered)
 
 
 def _refuse_other_kind(workbook: WorkbookXml, target: Path, suffix: str) -> None:
@@ -129,12 +131,10 @@ def _saved(
     workbook: WorkbookXml,
     system: PinholeSystem,
     target: Path,
-    changed: list[Place],
-    required: dict[Place, float],
+    result: Recalculated,
     edited: list[Place],
     numbered: bool = True,
 ) -> WrittenWorkbook:
-    result = recalculate(workbook, changed, required) if changed else Recalculated()
     _warn_of_formulas(workbook, result)
     content = workbook.to_bytes()
     with replacing(target) as temporary:

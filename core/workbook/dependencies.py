@@ -118,16 +118,15 @@ class Dependencies:
             waiting += new
         return found
 
-    def in_order(self, places: Iterable[Place]) -> list[Place]:
-        """`places` with those that others need before these; those in a circle last."""
+    def in_order(self, places: Iterable[Place]) -> tuple[list[Place], list[Place]]:
+        """`places` with those that others need before these; and the rest: in a circle, or in need of such."""
         places = set(places)
         ordered = _sorted(self._needed_by(places))
-        return ordered + sorted(places.difference(ordered))
+        return ordered, sorted(places.difference(ordered))
 
-    def circular(self, places: Iterable[Place]) -> list[Place]:
-        """Those of `places` that need themselves, at once or through others."""
-        needed_by = self._needed_by(set(places))
-        needed_by = self._needed_by(set(needed_by).difference(_sorted(needed_by)))
+    def circular(self, rest: Iterable[Place]) -> list[Place]:
+        """Those of the rest that need themselves, at once or through others."""
+        needed_by = self._needed_by(set(rest))
         needs: dict[Place, set[Place]] = {place: set() for place in needed_by}
         for place, dependents in needed_by.items():
             for dependent in dependents:

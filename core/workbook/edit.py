@@ -245,7 +245,7 @@ class Edit:
                 if was is None or (j is not None and old[name][j] == new[name][i]):
                     continue
                 number = float(new[name][i] * scale)
-                if was.formula is not None and name in _OF_DIMENSIONS:
+                if was.formula is not None and was.array is None and name in _OF_DIMENSIONS:
                     right = float(old[name][arrangement.old.index(source)])
                     shown = column.table.sheet.value(source, column.column)
                     was_right = type(shown) is float and abs(shown - right) <= EXACT * max(abs(right), 1)

@@ -80,12 +80,12 @@ class _Calculation:
         # What affected formulas refer to may have come without values.
         cells = {place: workbook.cell(place) for place in dependencies.formulas - self.affected}
         valueless = {place for place, cell in cells.items() if cell.value is None}
-        wanted = self.affected | valueless
-        for place in dependencies.circular(wanted):
-            if place in required:
-                self._replace(place, "it refers back to itself")
-                wanted.discard(place)
-        self.waiting = dependencies.in_order(wanted)
+        ordered, rest = dependencies.in_order(self.affected | valueless)
+        circular = required.keys() & dependencies.circular(rest)
+        for place in sorted(circular):
+            self._replace(place, "it refers back to itself")
+        more, rest = dependencies.in_order(set(rest) - circular)
+        self.waiting = ordered + more + rest
         self.not_yet = set(self.waiting)
         self.unknown: dict[Place, str] = {}
         self.elsewhere: dict[Place, Any] = {}

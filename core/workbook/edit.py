@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import math
 import warnings
 from collections.abc import Iterable
 
@@ -22,6 +23,8 @@ from .workbook_xml import Place, WorkbookXml
 
 _SHOWN = 3
 """Places that one warning names; it counts the rest."""
+_SAME = {"rel_tol": 1e-12, "abs_tol": 1e-12}
+"""NumPy's last digit of one and the same number may depend on where in memory it lies."""
 _OF_DIMENSIONS = ("H", "x2", "y2", "z2")
 """Derived from l and Td, which other cells hold: their formulas may refer to one cell for all modules."""
 
@@ -242,7 +245,7 @@ class Edit:
             for i, row in enumerate(arrangement.rows):
                 source, j = arrangement.source(i), self.old_of[i]
                 was = sheet.original.get((source, column.column))
-                if was is None or (j is not None and old[name][j] == new[name][i]):
+                if was is None or (j is not None and math.isclose(old[name][j], new[name][i], **_SAME)):
                     continue
                 number = float(new[name][i] * scale)
                 if was.formula is not None and was.array is None and name in _OF_DIMENSIONS:

@@ -58,6 +58,12 @@ def require_finite(array: NDArray[Any], name: str) -> None:
         raise InputError(f"{name}: {array[index]} is not a finite number{where}")
 
 
+def instance(value: object, kind: type, name: str) -> None:
+    """Raise `InputError` unless `value` is a `kind`."""
+    if not isinstance(value, kind):
+        raise InputError(f"{name}: expected a {kind.__name__}, got {type(value).__name__}")
+
+
 def whole_shape(value: Any, name: str, length: int) -> Any:
     """`value` as a tuple of `length` whole numbers of at least 1 (typed Any: mypy cannot say how many).
 

@@ -43,9 +43,9 @@ def collimator_length(b: ArrayLike, d: ArrayLike, Ld: ArrayLike, R: ArrayLike) -
     Raises
     ------
     InputError
-        A number is not finite or out of its range.
+        A number is not finite or out of its range, or the shapes do not go together.
     """
-    b, d, Ld, R = (np.asarray(x, dtype=np.float64) for x in (b, d, Ld, R))
+    b, d, Ld, R = _numbers(b=b, d=d, Ld=Ld, R=R)
     _require("d", d, d > 0, "more than 0")
     _require("Ld", Ld, Ld > d, "more than d")
     _require("R", R, R > 0, "more than 0")
@@ -69,14 +69,23 @@ def roi_radius_seen(b: ArrayLike, d: ArrayLike, Ld: ArrayLike, l: ArrayLike) -> 
     Raises
     ------
     InputError
-        A number is not finite or out of its range.
+        A number is not finite or out of its range, or the shapes do not go together.
     """
-    b, d, Ld, l = (np.asarray(x, dtype=np.float64) for x in (b, d, Ld, l))
+    b, d, Ld, l = _numbers(b=b, d=d, Ld=Ld, l=l)
     _require("d", d, d > 0, "more than 0")
     _require("Ld", Ld, Ld > d, "more than d")
     _require("l", l, l > 0, "more than 0")
     _require("b", b, b > 0, "more than 0")
     return np.maximum((b * (Ld - d) - d * l) / np.hypot(2 * l, Ld - d), 0.0)
+
+
+def _numbers(**given: ArrayLike) -> list[Array]:
+    try:
+        arrays = [np.asarray(x, dtype=np.float64) for x in given.values()]
+        np.broadcast_shapes(*(array.shape for array in arrays))
+    except (TypeError, ValueError):
+        raise InputError(f"{', '.join(given)}: expected real numbers, or arrays of them that broadcast") from None
+    return arrays
 
 
 def _require(name: str, value: Array, good: NDArray[np.bool_], need: str) -> None:

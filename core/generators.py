@@ -13,7 +13,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from .checks import positive, real_array, whole_number
+from .checks import instance, positive, real_array, whole_number
 from .design import collimator_length as designed_length
 from .errors import InputError
 from .system import PinholeSystem
@@ -256,6 +256,7 @@ def fit_rings(system: PinholeSystem) -> list[RingFit]:
     ----------
     R. Halir, J. Flusser, "Numerically stable direct least squares fitting of ellipses", Proc. WSCG (1998) 125-132.
     """
+    instance(system, PinholeSystem, "fit_rings")
     on_axis = np.hypot(*system.centers.T[:2]) <= _ON_AXIS * system.pinhole_distance
     if on_axis.any():
         raise InputError(f"module {system.numbers[np.argmax(on_axis)]}: stands on the z axis, not on a ring around it")

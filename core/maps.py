@@ -11,7 +11,7 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
-from .checks import freeze
+from .checks import freeze, instance
 from .grid import Grid
 from .memory import require
 from .performance import RIGHT_ANGLE, resolution, seen, sensitivity
@@ -155,6 +155,8 @@ def _map(
     system: PinholeSystem, grid: Grid, quantity: str, value: Callable[[Array], Array], progress: Progress | None
 ) -> Volume:
     """The volume of `value` of points (P, 3), a block of voxels at a time."""
+    instance(system, PinholeSystem, "system")
+    instance(grid, Grid, "grid")
     require(4.2 * grid.n_voxels, "a volume of {} x {} x {} voxels".format(*grid.shape))
     values = np.empty(grid.n_voxels, np.float32)
     size = max(1, _BLOCK // len(system))

@@ -18,7 +18,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from .checks import positive, real_array
+from .checks import instance, positive, real_array
 from .design import roi_radius_seen
 from .errors import InputError
 from .projector.aperture import half_value_diameter, paix_diameter
@@ -46,7 +46,7 @@ def seen(system: PinholeSystem, points: ArrayLike) -> NDArray[np.bool_]:
     Raises
     ------
     InputError
-        `points` are not finite numbers of that shape.
+        `system` is none, or `points` are not finite numbers of that shape.
     """
     return _seen(system, *_in_modules(system, _checked(points)))
 
@@ -212,6 +212,7 @@ def isocentre_performance(
 
 def _in_modules(system: PinholeSystem, points: Array) -> tuple[Array, Array, Array]:
     """x_u, x_v and h (P, M), mm, of points (P, 3) in the modules' frames: the pinholes lie on the axes, at -b."""
+    instance(system, PinholeSystem, "system")
     u, v, k = system.frames().transpose(1, 2, 0)
     return points @ u, points @ v, points @ k + system.pinhole_distance
 

@@ -61,8 +61,8 @@ def sampling_gaps(system: PinholeSystem, points: ArrayLike, *, tolerance: float 
     points = real_array(points, "points", (None, 3))
     if positive(tolerance, "tolerance", "rad") < _FINEST:
         raise InputError(f"tolerance: expected at least {_FINEST:g} rad, got {tolerance:g}")
-    gaps = np.empty(len(points))
-    _kernel()(points, system.centers, seen(system, points), float(tolerance), gaps)
+    visible, gaps = seen(system, points), np.empty(len(points))
+    _kernel()(points, system.centers, visible, float(tolerance), gaps)
     return gaps
 
 

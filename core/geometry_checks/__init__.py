@@ -11,6 +11,7 @@ report.py    what was found
 
 from __future__ import annotations
 
+from ..checks import instance
 from ..module_parts import module_parts
 from ..system import PinholeSystem
 from .blocking import find_blocked
@@ -47,6 +48,7 @@ def check_geometry(
     >>> report.ok
     True
     """
+    instance(system, PinholeSystem, "check_geometry")
     parts = module_parts(system, plate_thickness, wall_thickness)
     hulls = Hulls.of(parts)
     return GeometryReport(

@@ -8,6 +8,7 @@ from __future__ import annotations
 import os
 from typing import Any
 
+from ..checks import instance
 from ..errors import InputError
 from ..system import PinholeSystem
 from ..views import Views
@@ -77,8 +78,7 @@ def write_geometry(
         No such format, an option or suffix that it does not have, what it cannot express, or the file cannot be
         written (the old one then stays).
     """
-    if not isinstance(system, PinholeSystem):
-        raise InputError(f"write_geometry: expected a PinholeSystem, got {type(system).__name__}")
+    instance(system, PinholeSystem, "write_geometry")
     if format not in FORMATS:
         raise InputError(f"format {format!r}: expected one of {', '.join(FORMATS)}")
     views = system.views() if views is None else views

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from ..checks import instance
 from ..errors import InputError
 from ..grid import Grid
 from ..system import PinholeSystem
@@ -37,8 +38,7 @@ def volume_geometry(grid: Grid) -> tuple[NDArray[np.int64], NDArray[np.float64]]
     InputError
         The grid's axes are not along +x, +y, +z.
     """
-    if not isinstance(grid, Grid):
-        raise InputError(f"grid: expected a Grid, got {type(grid).__name__}")
+    instance(grid, Grid, "grid")
     axes = grid.affine[:3, :3]
     if np.any(np.abs(axes - np.diag(grid.spacing)) > 1e-9 * grid.spacing.max()):
         raise InputError("format astra: its volumes lie along +x, +y, +z, and this grid's axes do not")

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
+from ..checks import instance
 from ..system import PinholeSystem
 from ..views import Views
 from .arrays import SUFFIXES, write_arrays
@@ -19,6 +20,7 @@ def _write(system: PinholeSystem, views: Views, path: Path, *, in_ndc: bool = Tr
     Screen space has its origin at the outer corner of pixel (0, 0), so that pixel's centre is (0.5, 0.5). NDC spans 2
     over the shorter side, with its origin at the image's middle, x to the left and y up.
     """
+    instance(in_ndc, bool, "in_ndc")
     seen = cameras(views, "pytorch3d")
     half_turn = np.array([-1.0, -1.0, 1.0])  # x right, y down to x left, y up
     focal, principal = seen.focal_lengths, seen.principal_points + 0.5

@@ -84,8 +84,10 @@ def read_geometry(path: str | os.PathLike[str]) -> tuple[PinholeSystem, Views]:
         }
         images: dict[str, Any] = {field: [view[name] for view in document["views"]] for name, field in _VIEW.items()}
         shape = (document["rows"], document["columns"])
-    except (KeyError, TypeError) as error:
+    except KeyError as error:
         raise InputError(f"{path}: incomplete, {error} is missing") from error
+    except TypeError as error:
+        raise InputError(f"{path}: no whole {_KIND}: expected lists of modules and views ({error})") from error
     try:
         return PinholeSystem(**system), Views(**images, shape=shape)
     except InputError as error:

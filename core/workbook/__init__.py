@@ -2,6 +2,7 @@
 
 book.py          the file: opened, refused, its cells as Python values
 references.py    B3, Main!$B$3:$B$82, A:C in formulas
+tables.py        Table1[v], Table1[[#This Row],[x]] in formulas
 formulas.py      values of formulas
 headings.py      which column holds which quantity, found by symbols ("x1") and descriptions
 rows.py          which rows hold the modules

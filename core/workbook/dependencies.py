@@ -45,7 +45,7 @@ class Dependencies:
                 if cell.formula is None:
                     continue
                 try:
-                    areas = self._areas(cell.formula, title)
+                    areas = self._areas(cell.formula, place)
                 except (Unforeseeable, NotComputable):
                     self.unforeseeable.add(place)
                     areas = []
@@ -75,7 +75,7 @@ class Dependencies:
                 for column in range(left, right + 1):
                     self._of_cell[title, row, column].append(place)
 
-    def _areas(self, formula: str, title: str, depth: int = 0) -> list[_Area]:
+    def _areas(self, formula: str, place: Place, depth: int = 0) -> list[_Area]:
         found: list[_Area] = []
         for token in tokens_of(formula):
             if token.type == "FUNC" and token.subtype == "OPEN":
@@ -86,15 +86,15 @@ class Dependencies:
                 continue
             area = reference(token.value)
             if area is not None:
-                sheets = [title] if area.sheet is None else self._workbook.between(area.sheet)
+                sheets = [place[0]] if area.sheet is None else self._workbook.between(area.sheet)
                 found += [(sheet, area.top, area.left, area.bottom, area.right) for sheet in sheets]
             elif _OTHER_FILE.match(token.value):
                 continue  # another file's cell does not change with this one's
             else:
-                meaning = self._workbook.defined_name(title, token.value)
+                meaning = self._workbook.meaning(place, token.value)
                 if meaning is None or depth == _NAMES_DEEP:
                     raise Unforeseeable(token.value)
-                found += self._areas(meaning, title, depth + 1)
+                found += self._areas(meaning, place, depth + 1)
         return found
 
     def of(self, place: Place) -> set[Place]:
@@ -118,21 +118,38 @@ class Dependencies:
             waiting += new
         return found
 
-    def in_order(self, places: Iterable[Place]) -> list[Place]:
-        """`places` with those that others need before these; those in a circle last."""
+    def in_order(self, places: Iterable[Place]) -> tuple[list[Place], list[Place]]:
+        """`places` with those that others need before these; and the rest: in a circle, or in need of such."""
         places = set(places)
-        needed_by = {place: self.of(place) & places for place in places}
-        missing = dict.fromkeys(places, 0)
-        for dependents in needed_by.values():
-            for place in dependents:
-                missing[place] += 1
-        ready = sorted((place for place in places if not missing[place]), reverse=True)
-        ordered = []
-        while ready:
-            place = ready.pop()
-            ordered.append(place)
-            for dependent in needed_by[place]:
-                missing[dependent] -= 1
-                if not missing[dependent]:
-                    ready.append(dependent)
-        return ordered + sorted(places.difference(ordered))
+        ordered = _sorted(self._needed_by(places))
+        return ordered, sorted(places.difference(ordered))
+
+    def circular(self, rest: Iterable[Place]) -> list[Place]:
+        """Those of the rest that need themselves, at once or through others."""
+        needed_by = self._needed_by(set(rest))
+        needs: dict[Place, set[Place]] = {place: set() for place in needed_by}
+        for place, dependents in needed_by.items():
+            for dependent in dependents:
+                needs[dependent].add(place)
+        return sorted(set(needs).difference(_sorted(needs)))
+
+    def _needed_by(self, places: set[Place]) -> dict[Place, set[Place]]:
+        return {place: self.of(place) & places for place in places}
+
+
+def _sorted(followers: dict[Place, set[Place]]) -> list[Place]:
+    """Each place before its followers; those left out that never can be."""
+    missing = dict.fromkeys(followers, 0)
+    for places in followers.values():
+        for place in places:
+            missing[place] += 1
+    ready = sorted((place for place in followers if not missing[place]), reverse=True)
+    ordered = []
+    while ready:
+        place = ready.pop()
+        ordered.append(place)
+        for follower in followers[place]:
+            missing[follower] -= 1
+            if not missing[follower]:
+                ready.append(follower)
+    return ordered

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import math
 import warnings
 from collections.abc import Iterable
 
@@ -13,7 +14,7 @@ from ..errors import InputError, InputWarning
 from ..system import PinholeSystem
 from .arrangement import Arrangement, arrange, matched
 from .cells import module_number
-from .checks import derived, is_by_design
+from .checks import EXACT, derived, is_by_design
 from .headings import DIMENSIONS, POSITION, Table
 from .reader import Reading
 from .recalculate import agree
@@ -22,6 +23,10 @@ from .workbook_xml import Place, WorkbookXml
 
 _SHOWN = 3
 """Places that one warning names; it counts the rest."""
+_SAME = {"rel_tol": 1e-12, "abs_tol": 1e-12}
+"""NumPy's last digit of one and the same number may depend on where in memory it lies."""
+_OF_DIMENSIONS = ("H", "x2", "y2", "z2")
+"""Derived from l and Td, which other cells hold: their formulas may refer to one cell for all modules."""
 
 
 class Edit:
@@ -33,10 +38,12 @@ class Edit:
         Cells on which others may depend.
     required : dict
         Place -> the number that it must have.
+    derived : dict
+        Place of a formula of H, x2, y2 or z2 that was right -> the new number that it should give.
     settled : set of places
-        Those of them that had it when the workbook was read.
+        Those required that were so when the workbook was read.
     module_numbers : set of places
-        Those of them that hold modules' numbers.
+        Those required that hold modules' numbers.
     numbered : bool
         Whether the workbook has the modules' numbers.
     """
@@ -47,6 +54,7 @@ class Edit:
         self.numbered = reading.modules.number_column is not None
         self.old_of = matched(system, self.old, self.numbered)
         self.required: dict[Place, float] = {}
+        self.derived: dict[Place, float] = {}
         self.settled: set[Place] = set()
         self.module_numbers: set[Place] = set()
         self.changed: list[Place] = []
@@ -64,9 +72,10 @@ class Edit:
             self._require_lengths()
         for place, number in self.required.items():
             self._type(place, number)
-        self._type_derived()
+        self._put_derived()
         # A typed number that had to change is among the workbook's changed cells; of a formula it is to be seen.
-        self.changed = list(dict.fromkeys([*self.workbook.changed, *self.required.keys() - self.settled]))
+        to_be_seen = (self.required.keys() - self.settled) | self.derived.keys()
+        self.changed = list(dict.fromkeys([*self.workbook.changed, *to_be_seen]))
         for arrangement in self.arrangements.values():
             if arrangement.added:
                 self._warn_of_short_ranges(arrangement)
@@ -108,7 +117,7 @@ class Edit:
             if row_of and modules.numbers is not None and set(modules.numbers) <= set(row_of):
                 old = [row_of[number] for number in modules.numbers]
                 found[name] = self._arrangement(table, old, max(rows.rows), rows.number_column, row_of)
-            elif len(rows.rows) == len(modules.rows) > 1:
+            elif len(rows.rows) == len(modules.rows):
                 found[name] = self._arrangement(table, rows.rows, max(rows.rows), rows.number_column, {})
         return found
 
@@ -223,8 +232,8 @@ class Edit:
         if not same:
             self.workbook.sheets[place[0]].type(place[1:], number)
 
-    def _type_derived(self) -> None:
-        """Derived numbers (b, H, x2, ..., azimuth) that are typed in: as the formulas give them, where that changed."""
+    def _put_derived(self) -> None:
+        """Derived numbers (b, H, x2, ..., azimuth), where they change: typed ones, and what right formulas have to give."""
         old, new = (derived(s.centers, s.collimator_length, s.detector_thickness) for s in (self.old, self.system))
         for name in new:
             if name not in self.columns:
@@ -234,22 +243,29 @@ class Edit:
             sheet, arrangement = self.workbook.sheets[title], self.arrangements[title]
             scale = 180 / np.pi if column.table.in_degrees(name) else 1.0
             for i, row in enumerate(arrangement.rows):
-                was = sheet.original.get((arrangement.source(i), column.column))
-                if was is None or was.formula is not None or type(was.value) is not float:
+                source, j = arrangement.source(i), self.old_of[i]
+                was = sheet.original.get((source, column.column))
+                if was is None or (j is not None and math.isclose(old[name][j], new[name][i], **_SAME)):
                     continue
-                j = self.old_of[i]
-                if j is None or old[name][j] != new[name][i]:
-                    sheet.type((row, column.column), float(new[name][i] * scale))
+                number = float(new[name][i] * scale)
+                if was.formula is not None and was.array is None and name in _OF_DIMENSIONS:
+                    right = float(old[name][arrangement.old.index(source)])
+                    shown = column.table.sheet.value(source, column.column)
+                    was_right = type(shown) is float and abs(shown - right) <= EXACT * max(abs(right), 1)
+                    if was_right and (j is None or not agree(right, number)):
+                        self.derived[title, row, column.column] = number
+                elif was.formula is None and type(was.value) is float:
+                    sheet.type((row, column.column), number)
 
     def _warn_of_short_ranges(self, arrangement: Arrangement) -> None:
         name, old = arrangement.table.sheet.name, arrangement.old
-        found = self.workbook.ranges_ending_at(name, min(old), max(old))
+        found = self.workbook.ranges_ending_at(name, max(old))
         own = {self.workbook.text((name, row, column)) for row in arrangement.rows for column in arrangement.columns}
         found = [place for place in found if place not in own]
         if found:
             warnings.warn(
-                f"{self.workbook.name}: {several(found)} end at row {max(old)} of sheet {name}, so the modules added "
-                "below are left out there",
+                f"{self.workbook.name}: {several(found)} end{'s' * (len(found) == 1)} at row {max(old)} of sheet {name}, "
+                "so the modules added below are left out there",
                 InputWarning,
                 stacklevel=4,
             )

@@ -44,7 +44,7 @@ class Surroundings:
     extent : callable, or None
         Sheet name or None -> its last row and column with content, which end whole columns and rows.
     name : callable, or None
-        Defined name -> its formula, or None for an unknown one.
+        Defined name, or reference to a table's columns -> its formula, or None for an unknown one.
     """
 
     lookup: Lookup

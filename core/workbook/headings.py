@@ -80,13 +80,23 @@ _OTHER_LENGTHS = {
 }
 _OTHER_LENGTHS |= {"centimeter", "centimeters", "centimetre", "centimetres"}
 _DEGREES = {"deg", "degree", "degrees", "°"}
+_WORDS = "|".join(sorted(map(re.escape, (_MILLIMETRES | _OTHER_LENGTHS | _DEGREES) - {'"'}), key=len, reverse=True))
+# Of the units that are known, also "in cm" and "(all in cm)", and at the end "d, cm", "d/cm", "d_cm" and "d cm".
+_UNITS = (
+    _UNIT,
+    re.compile(rf"[(\[][^)\]]*\s({_WORDS})\.?\s*[)\]]", re.IGNORECASE),
+    re.compile(rf"\bin\s+({_WORDS})(?![\w°])", re.IGNORECASE),
+    re.compile(rf"(?<=\w)(?:\s*[,;:/_]\s*|\s+)({_WORDS})\.?\s*$", re.IGNORECASE),
+)
 
 
 def quantity_of(text: Any) -> str | None:
     """The quantity that a heading names, by symbol or description; None for anything else."""
     if not isinstance(text, str) or len(text) > _LONGEST_HEADING:
         return None
-    plain = " ".join(unicodedata.normalize("NFKC", _UNIT.sub(" ", text)).casefold().split()).strip("'\"` ")
+    for unit in _UNITS:
+        text = unit.sub(" ", text)
+    plain = " ".join(unicodedata.normalize("NFKC", text).casefold().split()).strip("'\"` ")
     if plain in _NUMBER_HEADINGS:
         return "number"
     symbol = re.sub(r"[\s_'\"]", "", plain)
@@ -102,6 +112,10 @@ def quantity_of(text: Any) -> str | None:
         if all(words & set(group.split()) for group in needed) and not words & set(excluded.split()):
             return quantity
     return None
+
+
+def _units(heading: str) -> set[str]:
+    return {match[1].casefold() for unit in _UNITS for match in unit.finditer(heading)}
 
 
 @dataclass(frozen=True)
@@ -151,7 +165,9 @@ class Table:
 
     def in_degrees(self, quantity: str) -> bool:
         """Whether the heading of an angle says so."""
-        return any(self._unit(row, column) in _DEGREES for row, column, name in self.headings if name == quantity)
+        return any(
+            _units(self._text(row, column)) & _DEGREES for row, column, name in self.headings if name == quantity
+        )
 
     def number_columns(self) -> list[int]:
         """Columns that may hold the modules' numbers: those headed so, then unheaded ones at the left."""
@@ -159,17 +175,16 @@ class Table:
         left = min((column for _, column, quantity in self.headings if quantity != "number"), default=1)
         return [*dict.fromkeys(headed), *(column for column in range(1, left) if column not in self.headed)]
 
-    def _unit(self, row: int, column: int) -> str | None:
-        match = _UNIT.search(str(self.sheet.stored.get((row, column), "")))
-        return match[1].casefold() if match else None
+    def _text(self, row: int, column: int) -> str:
+        return str(self.sheet.stored.get((row, column), ""))
 
     def _check_unit(self, quantity: str, headings: list[tuple[int, int]]) -> None:
         for row, column in headings:
-            unit = self._unit(row, column)
-            if quantity in LENGTHS and unit in _OTHER_LENGTHS:
+            units = _units(self._text(row, column)) & _OTHER_LENGTHS
+            if quantity in LENGTHS and units:
                 raise InputError(
                     f"{self.sheet.book.path.name}: {self.sheet.place(row, column)} heads {quantity} in "
-                    f"{unit}, expected millimetres"
+                    f"{min(units)}, expected millimetres"
                 )
 
 

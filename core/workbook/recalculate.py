@@ -43,30 +43,49 @@ def agree(value: Any, wanted: float) -> bool:
     return type(value) is float and abs(value - wanted) <= AGREEING * abs(wanted)
 
 
-def recalculate(workbook: WorkbookXml, changed: Iterable[Place], required: Mapping[Place, float]) -> Recalculated:
+def recalculate(
+    workbook: WorkbookXml,
+    changed: Iterable[Place],
+    required: Mapping[Place, float],
+    derived: Mapping[Place, float] | None = None,
+) -> Recalculated:
     """Give every formula of `workbook` that depends on the `changed` cells its new value.
 
+    So are formulas without a value in sheets in which anything changes, as far as our own evaluator knows them.
     `required` are the numbers that cells must have in the end: a formula among them which gives another one, or
-    of which that cannot be known, is replaced by the number.
+    of which that cannot be known, is replaced by the number. `derived` are the numbers that formulas should give:
+    one that is known to give another one is replaced.
     """
-    calculation = _Calculation(workbook, changed, required)
+    calculation = _Calculation(workbook, changed, required, derived or {})
     calculation.by_formulas()
     if calculation.unknown:
         calculation.by_libreoffice()
     calculation.clear()
+    calculation.fill()
     return calculation.result
 
 
 class _Calculation:
-    def __init__(self, workbook: WorkbookXml, changed: Iterable[Place], required: Mapping[Place, float]) -> None:
-        self.workbook, self.required = workbook, required
+    def __init__(
+        self,
+        workbook: WorkbookXml,
+        changed: Iterable[Place],
+        required: Mapping[Place, float],
+        derived: Mapping[Place, float],
+    ) -> None:
+        self.workbook, self.required, self.derived = workbook, required, derived
         self.result = Recalculated()
         dependencies = Dependencies(workbook)
         self.affected = dependencies.affected(changed)
         # What affected formulas refer to may have come without values.
         cells = {place: workbook.cell(place) for place in dependencies.formulas - self.affected}
         valueless = {place for place, cell in cells.items() if cell.value is None}
-        self.waiting = dependencies.in_order(self.affected | valueless)
+        ordered, rest = dependencies.in_order(self.affected | valueless)
+        circular = required.keys() & dependencies.circular(rest)
+        for place in sorted(circular):
+            self._replace(place, "it refers back to itself")
+        more, rest = dependencies.in_order(set(rest) - circular)
+        self.waiting = ordered + more + rest
         self.not_yet = set(self.waiting)
         self.unknown: dict[Place, str] = {}
         self.elsewhere: dict[Place, Any] = {}
@@ -81,7 +100,7 @@ class _Calculation:
                 self.not_yet.discard(place)
                 continue
             self.not_yet.discard(place)
-            if place in self.required and not agree(value, self.required[place]):
+            if self._is_wrong(place, value):
                 self._replace(place, f"it gives {_shown(value)}")
             elif place in self.affected:
                 self._store(place, self.required.get(place, value), "formulas")
@@ -101,7 +120,7 @@ class _Calculation:
             lookup,
             at=place[1:],
             extent=lambda name: self.workbook.extent(self._title(name, sheet)),
-            name=lambda name: self.workbook.defined_name(sheet, name),
+            name=lambda name: self.workbook.meaning(place, name),
         )
         assert cell.formula is not None, "only formulas are calculated"
         return calculate(cell.formula, surroundings)
@@ -127,9 +146,7 @@ class _Calculation:
         for _ in range(_TRIES):  # once more where formulas had to be replaced, for those that depend on them
             values = self._libreoffice_values()
             wrong = {
-                place: f"it gives {_shown(value)}"
-                for place, value in values.items()
-                if place in self.required and not agree(value, self.required[place])
+                place: f"it gives {_shown(value)}" for place, value in values.items() if self._is_wrong(place, value)
             }
             for place, why in wrong.items():
                 self._replace(place, why)
@@ -169,9 +186,25 @@ class _Calculation:
                 self._set(place, replace(cell, value=None))
                 self.result.cleared[place] = why
 
+    def fill(self) -> None:
+        """Formulas that came without values get theirs too, in the sheets that change anyway."""
+        changed = {title for title, sheet in self.workbook.sheets.items() if sheet.changed}
+        for place, value in self.elsewhere.items():
+            if place[0] in changed:
+                self._store(place, value, "formulas")
+
+    def _is_wrong(self, place: Place, value: Any) -> bool:
+        if place in self.required:
+            return not agree(value, self.required[place])
+        wanted = self.derived.get(place)  # which may be a 0 that rounding has missed
+        return wanted is not None and not (
+            type(value) is float and abs(value - wanted) <= AGREEING * max(abs(wanted), 1)
+        )
+
     def _replace(self, place: Place, why: str) -> None:
         self.workbook.sheets[place[0]].refuse_array(place[1:])
-        self._set(place, self.workbook.cell(place).typed(self.required[place]))
+        number = self.required[place] if place in self.required else self.derived[place]
+        self._set(place, self.workbook.cell(place).typed(number))
         self.result.replaced[place] = why
 
     def _store(self, place: Place, value: Any, by: str) -> None:

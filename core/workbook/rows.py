@@ -10,6 +10,7 @@ from .book import Uncomputed
 from .cells import found, module_number, where
 from .formulas import CellError
 from .headings import DIMENSIONS, POSITION, Table, quantity_of
+from .workbook_xml import areas_in
 
 MAX_MODULES = 10_000
 
@@ -116,20 +117,22 @@ def _rows(table: Table, columns: list[int]) -> Rows:
     below = [row for row in candidates if not _is_note(table, row, columns)]
     number_column = _number_column(table, below)
     if number_column is None:
-        return Rows(table, tuple(below), None, None)
+        return Rows(table, tuple(row for row in below if not _is_summary(table, row, columns)), None, None)
     # A number without values is a row too: its blank cells are to be refused, not the module to be dropped.
     valued = set(below)
     rows = [row for row in candidates if row in valued or module_number(sheet.value(row, number_column)) is not None]
-    numbers = []
+    numbers: dict[int, int] = {}
     for row in rows:
         number = module_number(sheet.value(row, number_column))
         if number is None:
             if len(rows) == 1:
                 return Rows(table, tuple(rows), None, None)
+            if _is_summary(table, row, columns):
+                continue
             at = where(sheet, row, number_column)
             raise InputError(f"{at} {found(sheet, row, number_column)}, expected a module's number")
-        numbers.append(number)
-    return Rows(table, tuple(rows), number_column, tuple(numbers))
+        numbers[row] = number
+    return Rows(table, tuple(numbers), number_column, tuple(numbers.values()))
 
 
 def _is_note(table: Table, row: int, columns: list[int]) -> bool:
@@ -140,6 +143,15 @@ def _is_note(table: Table, row: int, columns: list[int]) -> bool:
         return False
     alone = len(texts) <= 1 and len(columns) > 1
     return alone or not texts or all(quantity_of(t) or t.strip(" ()[]").casefold() == "mm" for t in texts)
+
+
+def _is_summary(table: Table, row: int, columns: list[int]) -> bool:
+    """Whether a row sums up others, as AVERAGE(B3:B82) below a column: one of `columns` refers to several rows of itself."""
+    return any(
+        area.top < area.bottom and area.left <= column <= area.right and area.sheet in (None, table.sheet.name)
+        for column in columns
+        for area in areas_in(table.sheet.formulas.get((row, column), "="))
+    )
 
 
 def _number_column(table: Table, rows: list[int]) -> int | None:

@@ -11,6 +11,7 @@ from .formulas import NotComputable, tokens_of
 from .package import Package
 from .references import Reference, reference
 from .sheet_xml import MAIN, Cell, SheetXml, Unreadable, shared_strings
+from .tables import DataTable, data_table, named_part
 from .xml_parts import Element, elements, spliced, utf8, with_attribute
 
 KINDS = {
@@ -89,8 +90,27 @@ class WorkbookXml:
                 names[sheet, e.attributes.get("name", "").casefold()] = f"={e.text.strip()}"
         return names
 
-    def defined_name(self, sheet: str, name: str) -> str | None:
-        """The formula of a defined name as seen from `sheet`; None where it is unknown or depends on the place."""
+    @cached_property
+    def _tables(self) -> dict[str, DataTable]:
+        """Folded name -> table."""
+        tables = {}
+        for title, part in self.parts.items():
+            for _, kind, member in self.package.relations(part):
+                if kind == "table" and (table := data_table(self._parts_of(member), title)) is not None:
+                    tables[table.name.casefold()] = table
+        return tables
+
+    def meaning(self, place: Place, name: str) -> str | None:
+        """The formula that a name, or a reference to a table's columns, stands for in a formula at `place`.
+
+        None where it is unknown, or a name whose meaning depends on the place.
+        """
+        sheet, row, _ = place
+        named = named_part(name)
+        if named is not None and named[0] in self._tables:
+            table = self._tables[named[0]]
+            part = table.part(named[1], row if table.sheet == sheet else None)
+            return None if part is None else f"={part}"
         own, _, plain = name.rpartition("!")
         scope = self.title(own.strip("'")) if own else sheet
         key = plain.casefold()
@@ -167,32 +187,28 @@ class WorkbookXml:
         at = max(e.end for e in before)
         return spliced(self._data, [(at, at, b'<%bcalcPr fullCalcOnLoad="1"/>' % prefix)])
 
-    def ranges_ending_at(self, sheet: str, first: int, last: int) -> list[str]:
-        """What refers to several rows of `sheet`, of `first` to `last`, the last among them.
+    def ranges_ending_at(self, sheet: str, last: int) -> list[str]:
+        """What refers to several rows of `sheet`, `last` being the last of them.
 
         Defined names, charts, tables and the cells of formulas.
         """
 
         def ends_there(area: Reference | None, own: str) -> bool:
-            if area is None or not first <= area.top < area.bottom == last:
+            if area is None or not area.top < area.bottom == last:
                 return False
             return sheet in (self.between(area.sheet) if area.sheet else [own])
 
         found = [
             f"the name {name}"
             for (_, name), formula in self._names.items()
-            if any(ends_there(area, "") for area in areas_in(formula))
+            if name != "_xlnm._filterdatabase" and any(ends_there(area, "") for area in areas_in(formula))
         ]
-        tables = {member for _, kind, member in self.package.relations(self.parts[sheet]) if kind == "table"}
         for member in self.package.names:
             if member.startswith("xl/charts/") and member.endswith(".xml"):
                 parts = self._parts_of(member)
                 if any(e.name == "f" and ends_there(reference(e.text.strip()), "") for e in parts):
                     found.append(f"the chart {member}")
-            elif member in tables:
-                root = self._parts_of(member)[0]
-                if ends_there(reference(root.attributes.get("ref", "")), sheet):
-                    found.append(f"the table {root.attributes.get('displayName', member)}")
+        found += [f"the table {table.name}" for table in self._tables.values() if ends_there(table.area, "")]
         for title, cells in self.sheets.items():
             for at, cell in cells.cells.items():
                 if cell.formula is not None and any(ends_there(area, title) for area in areas_in(cell.formula)):

@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
+from ..checks import instance
 from ..errors import InputError, InputWarning
 from ..files import replacing
 from ..system import PinholeSystem
@@ -33,10 +34,10 @@ class WrittenWorkbook:
     changed : tuple of str
         The cells (``"Coordinates!B3"``) whose numbers or formulas are not the template's.
     recalculated : dict
-        Cell with a formula that depends on these -> who calculated the value it stores now: "formulas" (mphDRR's
-        own evaluator) or "LibreOffice".
+        Cell with a formula that depends on these, or stored no value in a sheet that changes -> who calculated the
+        value it stores now: "formulas" (mphDRR's own evaluator) or "LibreOffice".
     cleared : tuple of str
-        Such cells that store no value now, because neither could calculate it.
+        Cells that depend on these and store no value now, because neither could calculate it.
     """
 
     path: Path
@@ -54,8 +55,9 @@ def write_system(
     as by `read_system`. Formulas stay as long as they give the system's numbers (to 1e-9, relative). Every formula
     of the workbook that depends on a changed cell stores its new value, calculated by `core.workbook.formulas`
     or else, where it is installed, by LibreOffice; else it stores none, and the workbook is marked to be
-    recalculated when opened. All other parts of the file - sheets, formats, charts, images, comments, macros - are
-    byte for byte the template's; if nothing differs, the whole file is.
+    recalculated when opened. In a sheet that changes, formulas that stored no value get theirs too. All other parts
+    of the file - sheets, formats, charts, images, comments, macros - are byte for byte the template's; if nothing
+    differs, the whole file is.
 
     Removed modules leave empty rows, added ones come below the last with copies of its formulas, and modules in
     another order take their rows' contents along.
@@ -85,8 +87,7 @@ def write_system(
     InputWarning
         Formulas that had to be replaced by numbers or store no value, and ranges that leave added modules out.
     """
-    if not isinstance(system, PinholeSystem):
-        raise InputError(f"write_system: expected a PinholeSystem, got {type(system).__name__}")
+    instance(system, PinholeSystem, "write_system")
     target = Path(path)
     suffix = target.suffix.lower()
     if suffix not in KINDS:
@@ -98,7 +99,7 @@ def write_system(
         cells = {(title, *at): cell for title, sheet in workbook.sheets.items() for at, cell in sheet.cells.items()}
         formulas = [place for place, cell in cells.items() if cell.formula is not None]
         required = {place: number for place, number in numbers_of(system).items() if cells[place].formula is not None}
-        return _saved(workbook, system, target, formulas, required, [])
+        return _saved(workbook, system, target, recalculate(workbook, formulas, required), [])
     book = Book(template)
     workbook = WorkbookXml(book.content, book.path.name)
     _refuse_other_kind(workbook, target, suffix)
@@ -112,7 +113,9 @@ def write_system(
         )
     edit = Edit(system, reading, workbook)
     edit.apply()
-    return _saved(workbook, system, target, edit.changed, edit.required, workbook.changed, edit.numbered)
+    edited = workbook.changed
+    result = recalculate(workbook, edit.changed, edit.required, edit.derived) if edit.changed else Recalculated()
+    return _saved(workbook, system, target, result, edited, edit.numbered)
 
 
 def _refuse_other_kind(workbook: WorkbookXml, target: Path, suffix: str) -> None:
@@ -128,12 +131,10 @@ def _saved(
     workbook: WorkbookXml,
     system: PinholeSystem,
     target: Path,
-    changed: list[Place],
-    required: dict[Place, float],
+    result: Recalculated,
     edited: list[Place],
     numbered: bool = True,
 ) -> WrittenWorkbook:
-    result = recalculate(workbook, changed, required) if changed else Recalculated()
     _warn_of_formulas(workbook, result)
     content = workbook.to_bytes()
     with replacing(target) as temporary:

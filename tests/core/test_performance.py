@@ -135,6 +135,14 @@ def test_the_roi_that_is_seen_is_the_largest(system, rng):
         (lambda s: mph.resolution(s, [[0, 0, 0]], opening_angle=math.pi), "opening_angle"),
         (lambda s: mph.resolution(s, [[0, 0, 0]], intrinsic_fwhm=-3), "intrinsic_fwhm"),
         (lambda s: mph.roi_radius_seen(100, 2, 50, 0), "l, the collimator length"),
+        (lambda s: mph.collimator_length("far", 2, 50, 75), "b, d, Ld, R: expected real numbers"),
+        (lambda s: mph.roi_radius_seen(100, 2, [50, 60, 70], [40, 50]), "b, d, Ld, l: expected real numbers"),
+        (lambda s: mph.sensitivity("scanner.xlsx", [[0, 0, 0]]), "system: expected a PinholeSystem, got str"),
+        (lambda s: mph.sampling_gaps("scanner.xlsx", [[0, 0, 0]]), "system: expected a PinholeSystem, got str"),
+        (lambda s: mph.resolution_map("scanner.xlsx", mph.Grid.centered(3, 1)), "system: expected a PinholeSystem"),
+        (lambda s: mph.modules_map(s, (3, 3, 3)), "grid: expected a Grid, got tuple"),
+        (lambda s: mph.check_geometry("scanner.xlsx"), "check_geometry: expected a PinholeSystem, got str"),
+        (lambda s: mph.fit_rings("scanner.xlsx"), "fit_rings: expected a PinholeSystem, got str"),
     ],
 )
 def test_what_cannot_be_is_refused_by_name(system, call, names):

@@ -336,7 +336,21 @@ def _shuffled_main(main: Worksheet, coordinates: Worksheet) -> None:
             main.cell(i, j, value)
 
 
+def _sums_below(main: Worksheet, coordinates: Worksheet) -> None:
+    coordinates["A10"] = "mean"
+    for letter in "BCD":
+        coordinates[f"{letter}10"] = f"=AVERAGE({letter}3:{letter}6)"
+    main["B10"], main["C10"] = "=SUM(B3:B6)", "=MAX(C3:C6)"
+
+
+def _units_without_brackets(main: Worksheet, coordinates: Worksheet) -> None:
+    coordinates["B1"], coordinates["C1"], coordinates["D1"] = "x1, mm", "y1_mm", "z1 in millimetres"
+    main["B1"], main["C1"], main["D1"] = "d/mm", "R mm", "Ld [mm]"
+
+
 VARIATIONS = [
+    _sums_below,
+    _units_without_brackets,
     _typed,
     _insert_columns,
     _reversed_columns,
@@ -359,6 +373,16 @@ VARIATIONS = [
 
 @pytest.mark.parametrize("edit", VARIATIONS, ids=lambda edit: edit.__name__.strip("_"))
 def test_same_scanner_however_laid_out(edit, tmp_path):
+    assert_plain(read_edited(tmp_path, edit))
+
+
+def test_sums_below_a_table_without_numbers_are_no_module(tmp_path):
+    def edit(main: Worksheet, coordinates: Worksheet) -> None:
+        _sums_below(main, coordinates)
+        for sheet in main, coordinates:
+            for row in range(1, 11):
+                sheet.cell(row, 1).value = None
+
     assert_plain(read_edited(tmp_path, edit))
 
 
@@ -723,6 +747,9 @@ BAD_CELLS = {
     ),
     "too few rows": (_row_missing_without_numbers, "sheet Main has 3 rows of d (Main!A3 to Main!A5), expected one or"),
     "centimetres": (_set("Coordinates", "B1", "x1 (cm)"), "Coordinates!B1 heads x1 in cm, expected millimetres"),
+    "centimetres, last": (_set("Coordinates", "C1", "y1, cm"), "Coordinates!C1 heads y1 in cm, expected millimetres"),
+    "inches": (_set("Main", "B2", "diameter of pinhole (all in inches)"), "Main!B2 heads d in inches, expected milli"),
+    "metres": (_set("Main", "D2", "side in m of the crystal"), "Main!D2 heads Ld in m, expected millimetres"),
     "two columns of one name": (_second_x1, "Coordinates!B1 and Coordinates!R1 are both headed as x1"),
     "headings at odds": (_set("Coordinates", "B1", "y2"), "Coordinates!B2 is headed as x1 but Coordinates!B1 as y2"),
     "two tables": (_copied_table, "sheets A and B both have columns headed x1, y1, z1"),

@@ -31,7 +31,7 @@ from .workbooks import (
 )
 
 try:
-    from hypothesis import HealthCheck, given, settings
+    from hypothesis import HealthCheck, example, given, settings
     from hypothesis import strategies as st
 except ImportError:  # the property tests skip
     st = None
@@ -126,6 +126,9 @@ else:
 
     @settings(max_examples=30, deadline=None, suppress_health_check=list(HealthCheck))
     @given(layouts, st.integers(0, 10**6))
+    # One module becomes three; one cell for all modules becomes one for each, to which formulas of H do not refer.
+    @example(Layout(n=1, numbered=False), 2)
+    @example(Layout(n=4, one_sheet=True, shared=True, inputs=True, top=2, seed=739), 197743)
     def test_any_change_of_any_layout_comes_back(tmp_path_factory, layout, seed):
         folder = tmp_path_factory.mktemp("w")
         system, written = write_changed(folder, layout, seed)
@@ -380,6 +383,26 @@ def test_a_formula_that_gives_the_new_number_stays(template, tmp_path):
     assert (cells["Coordinates", "B3"], cells["Coordinates", "B4"]) == (280.5, "=-B3")
     assert values_of(tmp_path / "o.xlsx")["Coordinates", "B4"] == -280.5
     assert "Coordinates!B4" in written.recalculated
+
+
+def test_a_formula_that_comes_to_refer_to_itself_is_replaced_alone(template, tmp_path):
+    """As a spreadsheet sorts, =B$3 of another row comes to stand in B3 itself; what depends on it stays a formula."""
+    book = openpyxl.load_workbook(template)
+    for row in range(4, 7):
+        book["Main"][f"B{row}"] = "=B$3"
+    book["Main"]["B3"] = 2.25
+    book.save(template)
+    system = by_design(changed(read_quietly(template), pinhole_diameter=2.25))
+    with pytest.warns(mph.InputWarning) as caught:
+        mph.write_system(system[[3, 0, 1, 2]], tmp_path / "o.xlsx", template)
+    replaced = [str(w.message) for w in caught if "the formula was replaced" in str(w.message)]
+    assert replaced == [
+        "template.xlsx: Main!B3: the formula was replaced by the system's number (it refers back to itself)"
+    ]
+    cells = values_of(tmp_path / "o.xlsx", data_only=False)
+    assert [cells["Main", f"B{row}"] for row in range(3, 7)] == [2.25, 2.25, "=B$3", "=B$3"]
+    assert str(cells["Coordinates", "F3"]).startswith("=")
+    assert_same(mph.read_system(tmp_path / "o.xlsx"), system[[3, 0, 1, 2]])
 
 
 def test_what_nobody_can_calculate_stores_no_value(template, tmp_path):

@@ -21,6 +21,7 @@ from openpyxl.comments import Comment
 from openpyxl.drawing.image import Image
 from openpyxl.formatting.rule import ColorScaleRule
 from openpyxl.worksheet.datavalidation import DataValidation
+from openpyxl.worksheet.table import Table
 
 import mphdrr
 import mphdrr.core as mph
@@ -368,8 +369,42 @@ def test_formulas_stay_through_names_sheets_and_whole_columns(tmp_path):
     assert values["Theta", "A5"] == z[1]
     assert values["Theta", "A6"] == 2
     assert values["It's values", "B1"] == pytest.approx(2 * x.sum() + 1, rel=1e-12)
-    assert "Theta!A3" not in written.recalculated  # of the first module's x, which has not moved
+    assert "Coordinates!B3" not in written.changed
+    assert values["Theta", "A3"] == 2 * x[0]  # it has not moved, but had no value
     assert set(written.cleared) == {"Theta!A9", "It's values!B9", "It's values!D1", "Theta!A11", "It's values!B11"}
+
+
+def test_columns_of_tables_are_followed_and_calculated(tmp_path):
+    """References to the columns of Excel's tables, one of the modules and one that has nothing to do with them."""
+    content = content_of(laid_out(Layout(n=5, seed=12)))
+    book = openpyxl.load_workbook(io.BytesIO(content))
+    sheet, other = book["Coordinates"], book.create_sheet("Other")
+    for column in range(1, sheet.max_column + 1):
+        sheet.cell(2, column).value = str(sheet.cell(2, column).value or f"no {column}")
+    sheet.add_table(Table(displayName="Pins", ref=f"A2:{sheet.cell(7, sheet.max_column).coordinate}"))
+    for row in ("k", "a [b]"), (1, 2), (3, 4), ("sum", 6):
+        other.append(row)
+    other.add_table(Table(displayName="Apart", ref="A1:B4", totalsRowCount=1))
+    formulas = {
+        "Other!D1": "SUM(Apart[a '[b']])+Apart[[#Totals],[a '[b']]]+ROWS(Apart)",
+        "Other!D2": "SUM(Pins[x1])",
+        "Other!D3": "COUNTA(Pins[[#Headers],[x1]:[z1]])+MAX(Pins[[#All],[y1]])",
+        "Coordinates!Z4": "SUMSQ(Pins[[#This Row],[x1]:[z1]])",
+    }
+    for place, formula in formulas.items():
+        title, at = place.split("!")
+        book[title][at] = f"={formula}"
+    stored = re.compile(rb"(<f>SUM\(Apart.*?</f>)<v ?(/>|></v>)")
+    template = tmp_path / "t.xlsx"
+    template.write_bytes(repacked(content_of(book), lambda name, data: stored.sub(rb"\1<v>77</v>", data)))
+    system = moved(read_quietly(template))
+    written = write_quietly(system, tmp_path / "o.xlsx", template)
+    values, (x, y, _) = values_of(written.path), system.centers.T
+    assert values["Other", "D1"] == 77  # as it was stored: nothing that it names has changed
+    assert values["Other", "D2"] == pytest.approx(x.sum(), rel=1e-12)
+    assert values["Other", "D3"] == pytest.approx(3 + y.max(), rel=1e-12)
+    assert values["Coordinates", "Z4"] == pytest.approx((system.centers[1] ** 2).sum(), rel=1e-12)
+    assert not formulas.keys() & set(written.cleared)
 
 
 # Killed

@@ -15,7 +15,7 @@ from ..core.collimator_mesh import Solid
 from ..core.errors import InputError
 from . import cameras, collimators, design, ids, scanner
 from .module_values import add_module, module_numbers
-from .phantom_properties import typed
+from .decimals import typed
 from .scanner_parts import module_solids, new_part
 
 _PARTS = ("COLLIMATOR", "CRYSTAL")

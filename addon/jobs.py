@@ -251,10 +251,7 @@ class JobOperator:
 
     def _start_after_asking(self) -> set[str]:
         """Blender runs what a dialog asked for by `execute`, which cannot become modal: start another of this kind."""
-        given = {
-            name: tuple(value) if isinstance(value, bpy.types.bpy_prop_array) else value
-            for name, value in self.as_keywords(ignore=("confirmed",)).items()
-        }
+        given = {name: _argument(value) for name, value in self.as_keywords(ignore=("confirmed",)).items()}
         group, name = self.bl_idname.split("_OT_")  # an instance has the class's name there
         try:
             getattr(getattr(bpy.ops, group.lower()), name)("INVOKE_DEFAULT", confirmed=True, **given)
@@ -313,6 +310,15 @@ def draw_job(layout: bpy.types.UILayout, context: bpy.types.Context) -> None:
     row = layout.row(align=True)
     row.progress(factor=state.progress, type="BAR", text=f"{state.label}  {state.progress:.0%}")
     row.operator(ids.CANCEL_JOB, text="", icon="CANCEL")
+
+
+def _argument(value: Any) -> Any:
+    """An operator's setting, as another operator takes it."""
+    if isinstance(value, bpy.types.bpy_prop_array):
+        return tuple(value)
+    if isinstance(value, bpy.types.bpy_prop_collection):  # of files
+        return [{"name": item.name} for item in value]
+    return value
 
 
 def _last(steps: Generator[None, None, str]) -> str:

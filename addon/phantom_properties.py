@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import dataclasses
-from typing import Any
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
 
 import bpy
 import numpy as np
@@ -24,6 +25,7 @@ from ..core.phantoms.kinds import KINDS, Kind
 from ..core.phantoms.language import parse_phantom
 from ..core.phantoms.phantom import Phantom
 from ..core.volume import UNITS
+from .decimals import typed
 
 FILE = "file"
 """Beside the names of `KINDS`: a phantom described by a text in TOML."""
@@ -52,14 +54,19 @@ class PhantomSettings:
         """The phantom; raises InputError."""
         raise NotImplementedError
 
+    def states(self) -> tuple[Phantom, ...]:
+        """The states of a phantom that moves, one for each frame; of one that does not, itself. Raises InputError."""
+        return (self.phantom(),)
+
     def recipe(self) -> dict[str, Any]:
         """The settings as JSON can hold them."""
         raise NotImplementedError
 
-    def grid(self, phantom: Phantom) -> Grid:
-        """The phantom's grid, in its own frame: as many voxels along every side."""
+    def grid(self, states: Sequence[Phantom]) -> Grid:
+        """The phantom's grid, in its own frame, which holds all its states: as many voxels along every side."""
         settings: Any = self
-        low, high = phantom.box
+        boxes = np.array([phantom.box for phantom in states])
+        low, high = boxes[:, 0].min(axis=0), boxes[:, 1].max(axis=0)
         # One voxel is kept free all around, so that nothing touches the edge.
         fitted = float((high - low).max()) / max(1, settings.voxels - 2)
         return Grid.centered((settings.voxels,) * 3, typed(settings.voxel_size) or fitted, (low + high) / 2)
@@ -89,23 +96,37 @@ class KindSettings(PhantomSettings):
 
     kind = KINDS[0]
 
+    if TYPE_CHECKING:  # of kinds that beat
+        frames: int
+
     @property
     def own_names(self) -> list[str]:
-        """The class's fields."""
-        return [field.name for field in _fields(self.kind)]
+        """The class's fields, and how many frames it beats over."""
+        return [*(field.name for field in _fields(self.kind)), *(["frames"] if _beats(self.kind) else [])]
 
     def phantom(self) -> Phantom:
         """The phantom; float32 settings are read as the decimal numbers that the user typed."""
         phantom: Phantom = self.kind.phantom(**self._values())
         return phantom
 
+    def states(self) -> tuple[Phantom, ...]:
+        """The phases of the heart's cycle, if it beats."""
+        phantom: Any = self.phantom()
+        return tuple(phantom.beating(self.frames)) if self._is_beating else (phantom,)
+
+    @property
+    def _is_beating(self) -> bool:
+        return _beats(self.kind) and self.frames > 1
+
     def recipe(self) -> dict[str, Any]:
-        """The class's fields, their units in their names."""
+        """The class's fields, their units in their names, and the number of frames of one that beats."""
         recipe: dict[str, Any] = {"phantom": self.kind.name}
         values = self._values()
         for field in _fields(self.kind):
             unit, value = _UNITS.get(field.metadata.get("unit", "")), values[field.name]
             recipe[f"{field.name}_{unit}" if unit else field.name] = list(value) if isinstance(value, tuple) else value
+        if self._is_beating:
+            recipe["phase"] = [state.phase for state in self.states()]
         return recipe
 
     def _values(self) -> dict[str, Any]:
@@ -156,12 +177,23 @@ def sampling(update: Any = None) -> dict[str, Any]:
 
 def kind_settings(kind: Kind, update: Any = None) -> dict[str, Any]:
     """Properties of one kind of phantom, by name, for a class's annotations."""
-    return {field.name: _property(field, kind, update) for field in _fields(kind)} | sampling(update)
+    own = {field.name: _property(field, kind, update) for field in _fields(kind)}
+    if _beats(kind):
+        own["frames"] = IntProperty(
+            name="Frames", description="States of the heart's cycle, which follow each other frame by frame; 1: it stands "
+            "still at its phase", default=1, min=1, soft_max=48, max=1000, update=update, options={"SKIP_SAVE"},
+        )  # fmt: skip
+    return own | sampling(update)
 
 
 def identifier(kind: Kind) -> str:
     """A kind's name in Python: of its operator and of its settings."""
     return kind.name.replace("-", "_")
+
+
+def _beats(kind: Kind) -> bool:
+    """Whether a kind of phantom has states that follow each other."""
+    return hasattr(kind.phantom, "beating")
 
 
 def _fields(kind: Kind) -> list[Any]:
@@ -312,11 +344,6 @@ VolumeProperties.__annotations__.update(
         for name, group in KIND_PROPERTIES.items()
     }
 )
-
-
-def typed(value: float) -> float:
-    """The shortest decimal number that a float32 setting stands for: 0.1, not 0.10000000149."""
-    return float(str(np.float32(value)))
 
 
 def _plain(value: Any) -> Any:

@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 
 from ..core.errors import InputError, InputWarning
 from ..core.grid import Grid
+from ..core.memory import require
 from ..core.meshes.mesh import Mesh
 from ..core.phantoms.kinds import KINDS
 from ..core.phantoms.phantom import Phantom
@@ -30,10 +31,15 @@ from .cameras import set_world_matrix, world_matrix
 from .phantom_properties import PhantomSettings, identifier
 
 LIVE_VOXELS = 64**3
-"""Up to so many voxels a phantom is made anew at once when a setting changes."""
+"""Up to so many voxels, of all its states, a phantom is made anew at once when a script changes a setting."""
+
+_SKETCHED = 32  # voxels along each side of a sketch
 
 ADDING = tuple((ids.ADD_PHANTOM + identifier(kind), kind.label) for kind in KINDS)
 """The operators that add a phantom, and what they add."""
+
+BEATING = ids.ADD_PHANTOM + "torso"
+"""The operator whose phantom can beat: its `frames`."""
 
 _OUTLINE = "mphdrr_outline"  # custom property of the mesh that shows a phantom's surfaces
 
@@ -44,8 +50,8 @@ class Recipe:
 
     Attributes
     ----------
-    phantom : Phantom
-        What it is.
+    states : tuple of Phantom
+        What it is; of one that moves, in each frame.
     grid : Grid
         Its voxels, in its own frame.
     settings : dict
@@ -54,7 +60,7 @@ class Recipe:
         What the phantom's class warned of.
     """
 
-    phantom: Phantom
+    states: tuple[Phantom, ...]
     grid: Grid
     settings: dict[str, Any]
     messages: tuple[str, ...]
@@ -76,30 +82,64 @@ class Recipe:
         InputError
             No part of the phantom holds a quantity, or it does not fit into memory.
         """
-        for quantity in quantities:
-            if all(getattr(shape, quantity) is None for shape in self.phantom.shapes):
-                raise InputError(f"the {self.phantom.title} has no {quantity}")
+        self.check(quantities)
         for message in self.messages:
             warnings.warn(message, InputWarning, stacklevel=2)
+        count = len(quantities) * len(self.states)
+        reports = (_part(progress, number, count) for number in range(count))
         stored = []
-        for number, (quantity, pose) in enumerate(zip(quantities, poses, strict=True)):
-            report = _part(progress, number, len(quantities))
+        for quantity, pose in zip(quantities, poses, strict=True):
             if baked:
                 place = np.eye(4)
                 place[:3, 3] = pose[:3, 3]
-                volume = self.phantom.voxelize(self._world_grid(pose), pose, report, quantity)
+                grid = self._world_grid(pose)
+                made = [phantom.voxelize(grid, pose, next(reports), quantity) for phantom in self.states]
                 settings = self.settings | {"pose": pose.tolist()}
             else:
                 place, settings = pose, self.settings
-                own = self.phantom.voxelize(self.grid, None, report, quantity)
-                volume = Volume(own.array, Grid(own.grid.shape, pose @ own.grid.affine), quantity)
-            stored.append(volumes.store_volume(volume, folder, place, settings))
+                own = [phantom.voxelize(self.grid, None, next(reports), quantity) for phantom in self.states]
+                made = [_placed(volume, pose) for volume in own]
+            stored.append(volumes.store_volume(made, folder, place, settings))
         return stored
+
+    def sketch(
+        self, quantities: Sequence[str], poses: Sequence[NDArray[np.float64]], folder: Path
+    ) -> list[volumes.StoredVolume]:
+        """What `voxelize` makes, of the first state, roughly and at once: few voxels, with the values at their centres.
+
+        Raises
+        ------
+        InputError
+            No part of the phantom holds a quantity.
+        """
+        self.check(quantities)
+        voxels = min(_SKETCHED, *self.grid.shape)
+        # Of the same extent, and not far from cubes.
+        grid = Grid.centered((voxels,) * 3, np.multiply(self.grid.shape, self.grid.spacing) / voxels, self.grid.center)
+        points = np.moveaxis(np.indices(grid.shape), 0, -1).reshape(-1, 3) @ grid.affine[:3, :3].T + grid.affine[:3, 3]
+        stored = []
+        for quantity, pose in zip(quantities, poses, strict=True):
+            values = self.states[0].values(points, quantity=quantity).astype(np.float32).reshape(grid.shape)
+            stored.append(
+                volumes.store_volume(_placed(Volume(values, grid, quantity), pose), folder, pose, {"sketch": 1})
+            )
+        return stored
+
+    def check(self, quantities: Sequence[str]) -> None:
+        """Raise `InputError` where no part of the phantom holds a quantity, or all its voxels do not fit into memory."""
+        title = self.states[0].title
+        for quantity in quantities:
+            if all(getattr(shape, quantity) is None for shape in self.states[0].shapes):
+                raise InputError(f"the {title} has no {quantity}")
+        count = len(quantities) * len(self.states)
+        if count > 1:
+            shape = " x ".join(map(str, self.grid.shape))
+            require(4.0 * count * self.grid.n_voxels, f"{title}: {count} volumes of {shape} voxels")
 
     def _world_grid(self, pose: NDArray[np.float64]) -> Grid:
         """A grid along the world's axes that holds the phantom at a pose, with voxels as small as there."""
-        low, high = self.phantom.box
-        corners = np.array(list(itertools.product(*zip(low, high, strict=True)))) @ pose[:3, :3].T + pose[:3, 3]
+        corners = np.concatenate([list(itertools.product(*zip(*phantom.box, strict=True))) for phantom in self.states])
+        corners = corners @ pose[:3, :3].T + pose[:3, 3]
         low, high = corners.min(axis=0), corners.max(axis=0)
         spacing = min(Grid(self.grid.shape, pose @ self.grid.affine).spacing)
         n_x, n_y, n_z = (int(n) for n in np.ceil((high - low) / spacing) + 2)
@@ -116,8 +156,9 @@ def recipe_of(settings: PhantomSettings) -> Recipe:
     """
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always", InputWarning)
-        phantom = settings.phantom()
-    return Recipe(phantom, settings.grid(phantom), settings.recipe(), tuple(str(w.message) for w in caught))
+        states = settings.states()
+        grid = settings.grid(states)
+    return Recipe(states, grid, settings.recipe(), tuple(dict.fromkeys(str(w.message) for w in caught)))
 
 
 def settings_of(item: bpy.types.Object | None) -> Any:
@@ -243,6 +284,8 @@ def outline_of(item: bpy.types.Object) -> bpy.types.Object | None:
 def show_outline(item: bpy.types.Object) -> bpy.types.Object:
     """Show the surfaces of a phantom's shapes as wires that go with it, made from its settings as they are now.
 
+    Of one that moves they are those of its first state.
+
     Raises
     ------
     InputError
@@ -251,7 +294,7 @@ def show_outline(item: bpy.types.Object) -> bpy.types.Object:
     settings = settings_of(item)
     if settings is None:
         raise InputError("no phantom is active: select one that was added with its settings")
-    parts = recipe_of(settings).phantom.meshes()
+    parts = recipe_of(settings).states[0].meshes()
     starts = np.cumsum([0, *(len(part.vertices) for part in parts)])
     vertices = np.concatenate([part.vertices for part in parts])
     faces = np.concatenate([part.faces + start for part, start in zip(parts, starts[:-1], strict=True)])
@@ -285,6 +328,11 @@ def _merge_flat_faces(mesh: bpy.types.Mesh) -> None:
         shape.to_mesh(mesh)
     finally:
         shape.free()
+
+
+def _placed(volume: Volume, pose: NDArray[np.float64]) -> Volume:
+    """A volume in an object's own space, in the world."""
+    return Volume(volume.array, Grid(volume.grid.shape, pose @ volume.grid.affine), volume.quantity)
 
 
 def _part(progress: Progress | None, number: int, count: int) -> Progress | None:

@@ -12,7 +12,7 @@ from ..core.isotopes import CZT_MU, ISOTOPES, NAI_MU, TUNGSTEN_MU
 from ..core.system import PinholeSystem
 from ..core.volume import Volume
 from . import ids, volumes
-from .phantom_properties import typed
+from .decimals import typed
 
 if TYPE_CHECKING:
     from ..core.projector import Model

@@ -59,6 +59,7 @@ CLASSES: tuple[type, ...] = (
     voxelize_objects.MPHDRR_OT_voxelize_objects,
     voxelize_objects.MPHDRR_OT_mesh_from_volume,
     import_volume.MPHDRR_OT_import_volume,
+    import_volume.MPHDRR_OT_import_volume_sequence,
     import_volume.MPHDRR_FH_volume,
     add_slices.MPHDRR_OT_add_slices,
     add_slices.MPHDRR_OT_remove_slices,

@@ -165,7 +165,14 @@ def replace_volume(
 
 def replace_stored(item: bpy.types.Object, stored: StoredVolume) -> None:
     """Give a Volume object the voxels of a stored volume; see `replace_volume`."""
-    old = item.data
+    old, settings = item.data, getattr(item, ids.OBJECT_VOLUME)
+    if old.users == 1 and settings.quantity == stored.volume.quantity:  # in place: what the user set on it stays
+        _show(old, stored)
+        for material in old.materials:
+            if material is not None:
+                volume_materials.resize(material, settings.extent, stored.extent)
+        _describe(item, stored)
+        return
     item.data = data = _volume_data(stored, item.name)
     _describe(item, stored)
     if old.users == 0:
@@ -236,6 +243,12 @@ def file_of(item: bpy.types.Object) -> Path:
     """The .vdb with every voxel of a Volume object; of a sequence, that of the current frame."""
     path = storage.full_resolution(storage.absolute(item.data.filepath))
     return storage.of_frame(path, _state(item.data) or 1) if item.data.is_sequence else path
+
+
+def state_text(item: bpy.types.Object) -> str:
+    """Which state of a sequence the current frame shows: "3 of 8"."""
+    state = _state(item.data)
+    return "none" if state is None else f"{state - item.data.frame_offset} of {item.data.frame_duration}"
 
 
 def file_state(item: bpy.types.Object) -> str:
@@ -332,26 +345,37 @@ def _volume_data(stored: StoredVolume, name: str) -> bpy.types.Volume:
     """Volume datablock of a stored volume, with its material."""
     quantity = stored.volume.quantity
     data = bpy.data.volumes.new(name)
+    data.sequence_mode = "REPEAT"
     try:
-        data.filepath = storage.stored_path(stored.path)
-        if not data.grids.load() or data.grids.error_message:
-            raise InputError(
-                f"{stored.path}: Blender cannot load the volume ({data.grids.error_message or 'no reason given'})"
-            )
-        if quantity not in data.grids:
-            raise InputError(f"{stored.path}: Blender finds no grid {quantity!r} in it")
-        if SMOKE in data.grids:
-            data.grids.active_index = data.grids.find(SMOKE)  # what the solid viewport draws
+        _show(data, stored)
     except Exception:
         bpy.data.volumes.remove(data)
         raise
-    if len(stored.states) > 1:  # set after loading, which would look for frame 0 until the scene is evaluated
-        data.is_sequence, data.frame_duration, data.sequence_mode = True, len(stored.states), "REPEAT"
     data.render.precision = "FULL"
     data.render.space = "OBJECT"
     data.render.clipping = 0.0  # the default, 0.001, erases mu values and faint activity
     data.materials.append(volume_materials.new_material(f"{name} {quantity}", quantity, stored.extent))
     return data
+
+
+def _show(data: bpy.types.Volume, stored: StoredVolume) -> None:
+    """Let a datablock show a stored volume; where Blender cannot load it, it shows what it did."""
+    before = data.is_sequence, data.filepath
+    data.is_sequence, data.filepath = False, storage.stored_path(stored.path)
+    try:
+        if not data.grids.load() or data.grids.error_message:
+            raise InputError(
+                f"{stored.path}: Blender cannot load the volume ({data.grids.error_message or 'no reason given'})"
+            )
+        if stored.volume.quantity not in data.grids:
+            raise InputError(f"{stored.path}: Blender finds no grid {stored.volume.quantity!r} in it")
+    except InputError:
+        data.is_sequence, data.filepath = before
+        raise
+    # What the solid viewport draws.
+    data.grids.active_index = data.grids.find(SMOKE if SMOKE in data.grids else stored.volume.quantity)
+    if len(stored.states) > 1:  # set after loading, which would look for frame 0 until the scene is evaluated
+        data.is_sequence, data.frame_duration = True, len(stored.states)
 
 
 def _store(states: Sequence[Volume], folder: Path, provenance: dict[str, Any] | None) -> Path:

@@ -10,7 +10,7 @@ import bpy
 from bpy.props import StringProperty
 
 from ..addon import ids, images, jobs, phantoms, runs, scanner, storage, volumes
-from ..addon.phantom_properties import typed
+from ..addon.decimals import typed
 from ..addon.projection_properties import ProjectionSettings, chosen_model
 from ..core.errors import InputError
 from ..core.memory import require
@@ -55,6 +55,8 @@ class MPHDRR_OT_render_projections(ProjectionSettings, jobs.JobOperator, bpy.typ
         phantom = phantoms.settings_of(item)
         if phantom is not None:
             settings |= phantom.recipe()
+        if item.data.is_sequence:
+            settings |= {"frame": scene.frame_current, "state": volumes.state_text(item)}
         scene_name, item_name, start = scene.name, item.name, time.perf_counter()
 
         def work(progress: Progress) -> ProjectionRun:

@@ -10,7 +10,7 @@ import numpy as np
 from bpy.props import EnumProperty, FloatProperty, IntProperty, StringProperty
 
 from ..addon import ids, jobs, meshes, storage, volumes
-from ..addon.phantom_properties import typed
+from ..addon.decimals import typed
 from ..core.errors import InputError
 from ..core.grid import Grid
 from ..core.memory import require

@@ -52,6 +52,7 @@ class MPHDRR_PT_phantom(bpy.types.Panel):
             ("Voxels", " × ".join(map(str, shape))),
             ("Size", " × ".join(f"{s:.3g}" for s in spacing) + " mm"),
             ("Values", f"{settings.minimum:.4g} to {settings.maximum:.4g}"),
+            *([("State", volumes.state_text(item))] if item.data.is_sequence else []),
             ("File", volumes.file_state(item)),
         ):
             names.label(text=name)
@@ -61,6 +62,10 @@ class MPHDRR_PT_phantom(bpy.types.Panel):
         column = layout.column(align=True)
         column.prop(settings, "display_low", text=f"Low, {settings.unit}")
         column.prop(settings, "display_high", text=f"High, {settings.unit}")
+        if item.data.is_sequence:
+            column = layout.column(align=True)
+            column.prop(item.data, "frame_start", text="First Frame")
+            column.prop(item.data, "sequence_mode", text="Then")
         if slices.planes_of(item):
             column = layout.column(align=True)
             for axis, name in enumerate(slices.names(item)):

@@ -128,8 +128,11 @@ class Phantom:
         if not isinstance(grid, Grid):
             raise InputError(f"voxelize: expected a Grid, got {type(grid).__name__}")
         image = paint_voxels(grid, self._layers(quantity, pose), progress)
-        whole = self._totals[quantity] * (1.0 if pose is None else abs(float(np.linalg.det(np.asarray(pose)[:3, :3]))))
-        held = float(image.sum(dtype=np.float64)) * grid.voxel_volume / whole if whole > 0 else 1.0
+        held = 1.0
+        if not self._fits(grid, pose):  # the total may take longer than the voxels
+            scale = 1.0 if pose is None else abs(float(np.linalg.det(np.asarray(pose)[:3, :3])))
+            whole = self._totals[quantity] * scale
+            held = float(image.sum(dtype=np.float64)) * grid.voxel_volume / whole if whole > 0 else 1.0
         if held < _HELD:
             warnings.warn(
                 f"{1 - held:.0%} of the {self.title} lies outside the grid: take larger or more voxels",
@@ -198,6 +201,12 @@ class Phantom:
     def _totals(self) -> dict[str, float]:
         """Of each quantity, the value times mm^3 of the whole phantom."""
         return {quantity: integral(self._layers(quantity)) for quantity in QUANTITIES}
+
+    def _fits(self, grid: Grid, pose: ArrayLike | None) -> bool:
+        """Whether the grid holds the whole box around the phantom."""
+        corners = np.array(list(itertools.product(*zip(*self.box, strict=True), [1.0])))
+        places = np.linalg.inv(grid.affine) @ (np.eye(4) if pose is None else np.asarray(pose)) @ corners.T
+        return bool(np.all(places[:3].T >= -0.5) and np.all(places[:3].T <= np.array(grid.shape) - 0.5))
 
     def _layers(self, quantity: str, pose: ArrayLike | None = None) -> list[Layer]:
         """Every shape that holds the quantity, in the world."""

@@ -294,7 +294,10 @@ class MPHDRR_OT_cancel_job(bpy.types.Operator):
     @classmethod
     def poll(cls, context: bpy.types.Context) -> bool:
         """There is a job."""
-        return is_running()
+        if not is_running():
+            cls.poll_message_set("No job is running")
+            return False
+        return True
 
     def execute(self, context: bpy.types.Context) -> set[str]:
         """Ask it to stop."""

@@ -169,6 +169,14 @@ def settings_of(item: bpy.types.Object | None) -> Any:
     return None if properties.kind == "VOLUME" else getattr(properties, properties.kind.lower())
 
 
+def poll_phantom(operator: type[bpy.types.Operator], context: bpy.types.Context) -> bool:
+    """`poll` of operators that need an active phantom."""
+    if settings_of(context.object) is None:
+        operator.poll_message_set("No phantom is active: select one that was added with its settings")
+        return False
+    return True
+
+
 def add(
     stored: Sequence[volumes.StoredVolume],
     name: str,

@@ -287,6 +287,14 @@ def can_be_projected(item: bpy.types.Object | None) -> bool:
     return is_volume(item) and getattr(item, ids.OBJECT_VOLUME).quantity not in MAPS
 
 
+def poll_volume(operator: type[bpy.types.Operator], context: bpy.types.Context) -> bool:
+    """`poll` of operators that need an active volume."""
+    if not is_volume(context.object):
+        operator.poll_message_set("No volume is active: select one first")
+        return False
+    return True
+
+
 def volume_objects(scene: bpy.types.Scene) -> list[bpy.types.Object]:
     """Our volumes in a scene, by name."""
     return sorted((item for item in scene.objects if is_volume(item)), key=lambda item: item.name)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import os
+import itertools
 import re
 from collections.abc import Generator, Sequence
 from pathlib import Path
@@ -197,7 +197,7 @@ class MPHDRR_OT_import_volume_sequence(ReadVolumes, bpy.types.Operator):
                 raise InputError(
                     f"{path}: expected a name ending in {', '.join(_STATES)}; a DICOM series is one volume"
                 )
-        common = os.path.commonprefix([_name(path) for path in paths]).rstrip("0123456789 _-.")
+        common = re.sub(r"[\d _.-]*$", "", _common([_name(path) for path in paths]))
         return self.reading(paths, self.name or common or _name(paths[0]), self.frame_start)
 
 
@@ -234,6 +234,13 @@ def _from(progress: Progress, number: int, count: int) -> Progress:
 def _by_number(name: str) -> list[tuple[int, str]]:
     """What to sort names by so that "beat2" comes before "beat10"."""
     return [(int(part) if part.isdigit() else -1, part.lower()) for part in re.split(r"(\d+)", name)]
+
+
+def _common(names: Sequence[str]) -> str:
+    """What names begin with, all of them."""
+    return "".join(
+        letters[0] for letters in itertools.takewhile(lambda ls: len(set(ls)) == 1, zip(*names, strict=False))
+    )
 
 
 def _described(volume: Volume, low: float, high: float) -> str:

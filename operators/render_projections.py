@@ -105,7 +105,10 @@ class MPHDRR_OT_show_projections(bpy.types.Operator):
 
     @classmethod
     def poll(cls, context: bpy.types.Context) -> bool:
-        return ids.MOSAIC in bpy.data.images
+        if ids.MOSAIC not in bpy.data.images:
+            cls.poll_message_set("No projections yet: render them first")
+            return False
+        return True
 
     def execute(self, context: bpy.types.Context) -> set[str]:
         if not images.show_below(bpy.data.images[ids.MOSAIC], context):

@@ -205,8 +205,8 @@ class Phantom:
     def _fits(self, grid: Grid, pose: ArrayLike | None) -> bool:
         """Whether the grid holds the whole box around the phantom."""
         corners = np.array(list(itertools.product(*zip(*self.box, strict=True), [1.0])))
-        places = np.linalg.inv(grid.affine) @ (np.eye(4) if pose is None else np.asarray(pose)) @ corners.T
-        return bool(np.all(places[:3].T >= -0.5) and np.all(places[:3].T <= np.array(grid.shape) - 0.5))
+        places = (np.linalg.inv(grid.affine) @ (np.eye(4) if pose is None else np.asarray(pose)) @ corners.T)[:3].T
+        return bool(np.all((places >= -0.5) & (places <= np.array(grid.shape) - 0.5)))
 
     def _layers(self, quantity: str, pose: ArrayLike | None = None) -> list[Layer]:
         """Every shape that holds the quantity, in the world."""

@@ -218,7 +218,7 @@ class JobOperator:
             return {"RUNNING_MODAL"}
         if event.type != "TIMER":
             return {"PASS_THROUGH"}
-        _redraw(context)
+        redraw_sidebars()
         if run.alive:
             return {"PASS_THROUGH"}
         if self._finishing is None:
@@ -266,7 +266,7 @@ class JobOperator:
             self._timer = None
         if _current is self._run:
             _current = None
-        _redraw(context)
+        redraw_sidebars()
 
     def _failed(self, error: BaseException) -> set[str]:
         if isinstance(error, Cancelled):
@@ -332,9 +332,9 @@ def _last(steps: Generator[None, None, str]) -> str:
             return end.value
 
 
-def _redraw(context: bpy.types.Context) -> None:
-    # The sidebars only: drawing the scene ten times a second would take the processor from the work.
-    for window in context.window_manager.windows:
+def redraw_sidebars() -> None:
+    """Have the panels drawn: not the scene, which ten times a second would take the processor from the work."""
+    for window in bpy.context.window_manager.windows:
         for area in window.screen.areas:
             for region in area.regions:
                 if area.type == "VIEW_3D" and region.type == "UI":

@@ -45,6 +45,12 @@ class PhantomSettings:
         """Names of the settings that not every phantom has, in the order of drawing."""
         return []
 
+    @property
+    def n_voxels(self) -> int:
+        """How many voxels, of all states, a volume has."""
+        settings: Any = self
+        return int(settings.voxels**3)
+
     def values(self) -> dict[str, Any]:
         """Every setting by name, vectors as tuples."""
         values = {name: getattr(self, name) for name in (*self.own_names, *sampling())}
@@ -115,6 +121,11 @@ class KindSettings(PhantomSettings):
         return tuple(phantom.beating(self.frames)) if self._is_beating else (phantom,)
 
     @property
+    def n_voxels(self) -> int:
+        """How many voxels, of all states, a volume has."""
+        return super().n_voxels * (self.frames if self._is_beating else 1)
+
+    @property
     def _is_beating(self) -> bool:
         return _beats(self.kind) and self.frames > 1
 
@@ -126,7 +137,8 @@ class KindSettings(PhantomSettings):
             unit, value = _UNITS.get(field.metadata.get("unit", "")), values[field.name]
             recipe[f"{field.name}_{unit}" if unit else field.name] = list(value) if isinstance(value, tuple) else value
         if self._is_beating:
-            recipe["phase"] = [state.phase for state in self.states()]
+            states: Any = self.states()
+            recipe["phase"] = [state.phase for state in states]
         return recipe
 
     def _values(self) -> dict[str, Any]:
@@ -226,9 +238,9 @@ def _property(field: Any, kind: Kind, update: Any) -> Any:
 
 
 def _phantom_changed(self: Any, context: bpy.types.Context) -> None:
-    from . import phantoms
+    from . import live_phantoms
 
-    phantoms.settings_changed(self.id_data, self)
+    live_phantoms.settings_changed(self.id_data, self)
 
 
 def _group(name: str, mixin: type, members: dict[str, Any]) -> Any:
@@ -299,6 +311,11 @@ class VolumeProperties(bpy.types.PropertyGroup):
     outdated: BoolProperty(
         name="Outdated",
         description="The phantom's settings have changed since its voxels were made",
+        options={"HIDDEN"},
+    )
+    sketched: BoolProperty(
+        name="Sketched",
+        description="What is shown is a sketch of what the phantom's settings say, not its voxels",
         options={"HIDDEN"},
     )
     message: StringProperty(name="Message", description="What is wrong with the phantom's settings", options={"HIDDEN"})

@@ -26,12 +26,9 @@ from ..core.phantoms.kinds import KINDS
 from ..core.phantoms.phantom import Phantom
 from ..core.progress import Progress
 from ..core.volume import Volume
-from . import ids, jobs, meshes, storage, volumes
+from . import ids, meshes, storage, volumes
 from .cameras import set_world_matrix, world_matrix
 from .phantom_properties import PhantomSettings, identifier
-
-LIVE_VOXELS = 64**3
-"""Up to so many voxels, of all its states, a phantom is made anew at once when a script changes a setting."""
 
 _SKETCHED = 32  # voxels along each side of a sketch
 
@@ -82,9 +79,7 @@ class Recipe:
         InputError
             No part of the phantom holds a quantity, or it does not fit into memory.
         """
-        self.check(quantities)
-        for message in self.messages:
-            warnings.warn(message, InputWarning, stacklevel=2)
+        self._begin(quantities)
         count = len(quantities) * len(self.states)
         reports = (_part(progress, number, count) for number in range(count))
         stored = []
@@ -112,9 +107,8 @@ class Recipe:
         InputError
             No part of the phantom holds a quantity.
         """
-        self.check(quantities)
+        self._begin(quantities)
         voxels = min(_SKETCHED, *self.grid.shape)
-        # Of the same extent, and not far from cubes.
         grid = Grid.centered((voxels,) * 3, np.multiply(self.grid.shape, self.grid.spacing) / voxels, self.grid.center)
         points = np.moveaxis(np.indices(grid.shape), 0, -1).reshape(-1, 3) @ grid.affine[:3, :3].T + grid.affine[:3, 3]
         stored = []
@@ -125,8 +119,8 @@ class Recipe:
             )
         return stored
 
-    def check(self, quantities: Sequence[str]) -> None:
-        """Raise `InputError` where no part of the phantom holds a quantity, or all its voxels do not fit into memory."""
+    def _begin(self, quantities: Sequence[str]) -> None:
+        """Say what there is to say of the settings; raise `InputError` where they make no volumes of these quantities."""
         title = self.states[0].title
         for quantity in quantities:
             if all(getattr(shape, quantity) is None for shape in self.states[0].shapes):
@@ -135,6 +129,8 @@ class Recipe:
         if count > 1:
             shape = " x ".join(map(str, self.grid.shape))
             require(4.0 * count * self.grid.n_voxels, f"{title}: {count} volumes of {shape} voxels")
+        for message in self.messages:
+            warnings.warn(message, InputWarning, stacklevel=3)
 
     def _world_grid(self, pose: NDArray[np.float64]) -> Grid:
         """A grid along the world's axes that holds the phantom at a pose, with voxels as small as there."""
@@ -202,6 +198,20 @@ def add(
     return item
 
 
+def root_of(item: bpy.types.Object) -> bpy.types.Object | None:
+    """The phantom that a volume is, or belongs to as its other quantity; None where there is none."""
+    if getattr(item, ids.OBJECT_VOLUME).with_parent and item.parent is not None:
+        item = item.parent
+    return None if settings_of(item) is None else item
+
+
+def require_current(item: bpy.types.Object) -> None:
+    """Raise `InputError` where a volume is of a phantom whose settings have changed since its voxels were made."""
+    phantom = root_of(item)
+    if phantom is not None and getattr(phantom, ids.OBJECT_VOLUME).outdated:
+        raise InputError(f"{phantom.name!r} has changed since its voxels were made: press Update Phantom first")
+
+
 def with_children(item: bpy.types.Object) -> list[bpy.types.Object]:
     """A phantom and the volumes of its other quantities."""
     children = [o for o in item.children if volumes.is_volume(o) and getattr(o, ids.OBJECT_VOLUME).with_parent]
@@ -218,18 +228,37 @@ def remaking(item: bpy.types.Object, bake: bool = False) -> Callable[[Progress |
     InputError
         The object is no phantom, its settings make none, or its matrix is singular.
     """
-    settings = settings_of(item)
-    if settings is None:
-        raise InputError("no phantom is active: select one that was added with its settings")
-    recipe, folder = recipe_of(settings), storage.folder()
-    made = with_children(item)
-    quantities = [settings.quantity, *(getattr(o, ids.OBJECT_VOLUME).quantity for o in made[1:])]
-    poses = [volumes.pose_of_object(o) for o in made]
+    recipe, quantities, poses = _to_make(item)
+    folder = storage.folder()
     return lambda progress: recipe.voxelize(quantities, poses, folder, progress, bake)
 
 
-def replace(item: bpy.types.Object, stored: Sequence[volumes.StoredVolume], baked: bool = False) -> None:
-    """Give a phantom and its children what `remaking` made.
+def sketch(item: bpy.types.Object) -> None:
+    """Show a phantom and its children roughly as its settings are now, until they get their voxels by `replace`.
+
+    Raises
+    ------
+    InputError
+        The object is no phantom, its settings make none, or its matrix is singular.
+    """
+    recipe, quantities, poses = _to_make(item)
+    replace(item, recipe.sketch(quantities, poses, storage.temporary_folder()), sketched=True)
+
+
+def _to_make(item: bpy.types.Object) -> tuple[Recipe, list[str], list[NDArray[np.float64]]]:
+    """A phantom's recipe, and the quantities and poses of its volumes."""
+    settings = settings_of(item)
+    if settings is None:
+        raise InputError("no phantom is active: select one that was added with its settings")
+    made = with_children(item)
+    quantities = [settings.quantity, *(getattr(o, ids.OBJECT_VOLUME).quantity for o in made[1:])]
+    return recipe_of(settings), quantities, [volumes.pose_of_object(o) for o in made]
+
+
+def replace(
+    item: bpy.types.Object, stored: Sequence[volumes.StoredVolume], baked: bool = False, sketched: bool = False
+) -> None:
+    """Give a phantom and its children what `remaking`, or a sketch, made.
 
     They stay where they are. If it was baked, they stand along the world's axes and are phantoms no more: their settings
     would not make these voxels.
@@ -244,6 +273,7 @@ def replace(item: bpy.types.Object, stored: Sequence[volumes.StoredVolume], bake
         raise InputError(f"the volumes of {item.name!r} are not those of before: try again")
     for volume_object, new in zip(made, stored, strict=True):
         basis = volume_object.matrix_basis.copy()
+        getattr(volume_object, ids.OBJECT_VOLUME).sketched = sketched
         volumes.replace_stored(volume_object, new)
         if baked:
             set_world_matrix(volume_object, new.pose)
@@ -253,35 +283,14 @@ def replace(item: bpy.types.Object, stored: Sequence[volumes.StoredVolume], bake
         else:
             volume_object.matrix_basis = basis  # which a matrix with shear would not survive
     properties = getattr(item, ids.OBJECT_VOLUME)
-    properties.outdated, properties.message = False, ""
+    properties.outdated, properties.message = sketched, ""
     if baked:
         remove_outline(item)
         properties.kind = "VOLUME"
         for child in made[1:]:
             getattr(child, ids.OBJECT_VOLUME).with_parent = False
-    elif outline_of(item) is not None:
-        show_outline(item)
-
-
-def settings_changed(item: Any, settings: Any) -> None:
-    """A setting was edited: make small phantoms anew, and say of others, and of what cannot be made, that it is so."""
-    if not isinstance(item, bpy.types.Object) or settings_of(item) != settings:
-        return  # an operator's, or on its way
-    properties = getattr(item, ids.OBJECT_VOLUME)
-    properties.outdated, properties.message = True, ""
-    with warnings.catch_warnings(record=True) as caught:
-        warnings.simplefilter("always", InputWarning)
-        try:
-            make = remaking(item)  # which finds what cannot be made
-            if settings.voxels**3 <= LIVE_VOXELS and not jobs.is_running():
-                replace(item, make(None))
-            elif outline_of(item) is not None:
-                show_outline(item)
-        except InputError as error:
-            properties.message = str(error)
-            return
-    messages = [str(w.message) for w in caught if issubclass(w.category, InputWarning)]
-    properties.message = messages[0] if messages else ""
+    else:
+        update_outline(item)
 
 
 def outline_of(item: bpy.types.Object) -> bpy.types.Object | None:
@@ -315,6 +324,12 @@ def show_outline(item: bpy.types.Object) -> bpy.types.Object:
     outline.hide_render = outline.hide_select = True
     outline.parent = item
     return outline
+
+
+def update_outline(item: bpy.types.Object) -> None:
+    """Make the mesh that shows a phantom's surfaces anew, where it has one; raises as `show_outline` does."""
+    if outline_of(item) is not None:
+        show_outline(item)
 
 
 def remove_outline(item: bpy.types.Object) -> None:

@@ -226,6 +226,10 @@ def reader(item: bpy.types.Object) -> Callable[[], Volume]:
     if item is None or item.type != "VOLUME" or not getattr(item, ids.OBJECT_VOLUME).is_volume:
         what = "nothing is chosen" if item is None else f"{item.name!r} is no mphDRR volume"
         raise InputError(f"{what}: add a phantom first, or choose one")
+    if getattr(item, ids.OBJECT_VOLUME).sketched:
+        from . import live_phantoms  # which imports this module
+
+        live_phantoms.settle(item)
     if _state(item.data) is None:
         raise InputError(f"{item.name!r} has no state at frame {bpy.context.scene.frame_current}")
     path, pose = file_of(item), pose_of_object(item)
@@ -253,12 +257,12 @@ def state_text(item: bpy.types.Object) -> str:
 
 def file_state(item: bpy.types.Object) -> str:
     """What there is to say about a Volume object's file: its size, or that it is missing."""
-    path = file_of(item)
-    if not path.is_file():
+    size = storage.size_of(file_of(item))
+    if size is None:
         return "missing"
     shown = ", coarser copy shown" if storage.is_preview(storage.absolute(item.data.filepath)) else ""
     kept = "" if bpy.data.filepath else ", until saved"
-    return readable_size(path.stat().st_size) + shown + kept
+    return readable_size(size) + shown + kept
 
 
 def pose_of_object(item: bpy.types.Object) -> NDArray[np.float64]:

@@ -78,8 +78,9 @@ def module_parts(system: PinholeSystem, plate_thickness: float = 2.0, wall_thick
     sizes = (system.pinhole_diameter, system.collimator_length, system.detector_side, system.detector_thickness)
     parts = []
     for number, pose, *size in zip(system.numbers.tolist(), poses, *(s.tolist() for s in sizes), strict=True):
+        d, length, side, thickness = size
         try:
-            collimator, crystal = module_solids(*size, plate, wall)
+            collimator, crystal = module_solids(d, length, side, thickness, plate, wall)
         except InputError as error:
             raise InputError(f"module {number}: {error}") from None
         name = f"Module {number:0{width}d}"

@@ -47,6 +47,9 @@ class MPHDRR_OT_render_projections(ProjectionSettings, jobs.JobOperator, bpy.typ
         mu = _chosen_mu(context, self.mu) if counts else None
         read_mu = None if mu is None else volumes.reader(mu)
         read_volume = volumes.reader(item)
+        for volume in (item, mu):
+            if volume is not None:
+                phantoms.require_current(volume)
         n_bytes = 4.0 * len(system) * shape[0] * shape[1]
         # The array, and Blender's images with four channels in memory and once more, packed.
         require(9 * n_bytes, f"{len(system)} images of {shape[1]} x {shape[0]} pixels")

@@ -80,14 +80,15 @@ def settings_changed(item: Any, settings: Any) -> None:
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always", InputWarning)
         try:
-            make = phantoms.remaking(item)  # which finds what cannot be made
-            if _has_window():
-                if not jobs.is_running():
-                    phantoms.sketch(item)
-                    _wait()
-            elif settings.n_voxels <= LIVE_VOXELS and not jobs.is_running():
-                phantoms.replace(item, make(None))
-            phantoms.update_outline(item)
+            if _has_window() and not jobs.is_running():
+                phantoms.sketch(item)
+                _wait()
+            else:
+                make = phantoms.remaking(item)  # which finds what cannot be made
+                if settings.n_voxels <= LIVE_VOXELS and not jobs.is_running():
+                    phantoms.replace(item, make(None))
+                else:
+                    phantoms.update_outline(item)
         except InputError as error:
             properties.message = str(error)
             return

@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 import bpy
-import numpy as np
 from bpy.props import (
     BoolProperty,
     EnumProperty,
@@ -46,10 +44,15 @@ class PhantomSettings:
         return []
 
     @property
+    def n_states(self) -> int:
+        """How many states there are, one for each frame."""
+        return 1
+
+    @property
     def n_voxels(self) -> int:
         """How many voxels, of all states, a volume has."""
         settings: Any = self
-        return int(settings.voxels**3)
+        return int(settings.voxels**3) * self.n_states
 
     def values(self) -> dict[str, Any]:
         """Every setting by name, vectors as tuples."""
@@ -57,22 +60,17 @@ class PhantomSettings:
         return {k: tuple(v) if isinstance(v, bpy.types.bpy_prop_array) else v for k, v in values.items()}
 
     def phantom(self) -> Phantom:
-        """The phantom; raises InputError."""
+        """The phantom; of one that beats, its first state. Raises InputError."""
         raise NotImplementedError
-
-    def states(self) -> tuple[Phantom, ...]:
-        """The states of a phantom that moves, one for each frame; of one that does not, itself. Raises InputError."""
-        return (self.phantom(),)
 
     def recipe(self) -> dict[str, Any]:
         """The settings as JSON can hold them."""
         raise NotImplementedError
 
-    def grid(self, states: Sequence[Phantom]) -> Grid:
-        """The phantom's grid, in its own frame, which holds all its states: as many voxels along every side."""
+    def grid(self, phantom: Phantom) -> Grid:
+        """The phantom's grid, in its own frame: as many voxels along every side."""
         settings: Any = self
-        boxes = np.array([phantom.box for phantom in states])
-        low, high = boxes[:, 0].min(axis=0), boxes[:, 1].max(axis=0)
+        low, high = phantom.box
         # One voxel is kept free all around, so that nothing touches the edge.
         fitted = float((high - low).max()) / max(1, settings.voxels - 2)
         return Grid.centered((settings.voxels,) * 3, typed(settings.voxel_size) or fitted, (low + high) / 2)
@@ -115,19 +113,10 @@ class KindSettings(PhantomSettings):
         phantom: Phantom = self.kind.phantom(**self._values())
         return phantom
 
-    def states(self) -> tuple[Phantom, ...]:
-        """The phases of the heart's cycle, if it beats."""
-        phantom: Any = self.phantom()
-        return tuple(phantom.beating(self.frames)) if self._is_beating else (phantom,)
-
     @property
-    def n_voxels(self) -> int:
-        """How many voxels, of all states, a volume has."""
-        return super().n_voxels * (self.frames if self._is_beating else 1)
-
-    @property
-    def _is_beating(self) -> bool:
-        return _beats(self.kind) and self.frames > 1
+    def n_states(self) -> int:
+        """How many phases of the heart's cycle."""
+        return self.frames if _beats(self.kind) else 1
 
     def recipe(self) -> dict[str, Any]:
         """The class's fields, their units in their names, and the number of frames of one that beats."""
@@ -136,13 +125,13 @@ class KindSettings(PhantomSettings):
         for field in _fields(self.kind):
             unit, value = _UNITS.get(field.metadata.get("unit", "")), values[field.name]
             recipe[f"{field.name}_{unit}" if unit else field.name] = list(value) if isinstance(value, tuple) else value
-        if self._is_beating:
-            states: Any = self.states()
-            recipe["phase"] = [state.phase for state in states]
+        if self.n_states > 1:
+            recipe["frames"] = self.n_states
         return recipe
 
     def _values(self) -> dict[str, Any]:
-        return {field.name: _plain(getattr(self, field.name)) for field in _fields(self.kind)}
+        values = {field.name: _plain(getattr(self, field.name)) for field in _fields(self.kind)}
+        return values | {"phase": 0.0} if self.n_states > 1 else values
 
 
 class TextSettings(PhantomSettings):

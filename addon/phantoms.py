@@ -10,6 +10,7 @@ import itertools
 import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -47,8 +48,10 @@ class Recipe:
 
     Attributes
     ----------
-    states : tuple of Phantom
-        What it is; of one that moves, in each frame.
+    phantom : Phantom
+        What it is; of one that beats, the first state.
+    n_states : int
+        How many states there are, one for each frame.
     grid : Grid
         Its voxels, in its own frame.
     settings : dict
@@ -57,10 +60,17 @@ class Recipe:
         What the phantom's class warned of.
     """
 
-    states: tuple[Phantom, ...]
+    phantom: Phantom
+    n_states: int
     grid: Grid
     settings: dict[str, Any]
     messages: tuple[str, ...]
+
+    @cached_property
+    def states(self) -> Sequence[Phantom]:
+        """The phantom in each frame."""
+        phantom: Any = self.phantom
+        return (phantom,) if self.n_states == 1 else phantom.beating(self.n_states)
 
     def voxelize(
         self,
@@ -80,7 +90,7 @@ class Recipe:
             No part of the phantom holds a quantity, or it does not fit into memory.
         """
         self._begin(quantities)
-        count = len(quantities) * len(self.states)
+        count = len(quantities) * self.n_states
         reports = (_part(progress, number, count) for number in range(count))
         stored = []
         for quantity, pose in zip(quantities, poses, strict=True):
@@ -113,7 +123,7 @@ class Recipe:
         points = np.moveaxis(np.indices(grid.shape), 0, -1).reshape(-1, 3) @ grid.affine[:3, :3].T + grid.affine[:3, 3]
         stored = []
         for quantity, pose in zip(quantities, poses, strict=True):
-            values = self.states[0].values(points, quantity=quantity).astype(np.float32).reshape(grid.shape)
+            values = self.phantom.values(points, quantity=quantity).astype(np.float32).reshape(grid.shape)
             stored.append(
                 volumes.store_volume(_placed(Volume(values, grid, quantity), pose), folder, pose, {"sketch": 1})
             )
@@ -121,11 +131,11 @@ class Recipe:
 
     def _begin(self, quantities: Sequence[str]) -> None:
         """Say what there is to say of the settings; raise `InputError` where they make no volumes of these quantities."""
-        title = self.states[0].title
+        title = self.phantom.title
         for quantity in quantities:
-            if all(getattr(shape, quantity) is None for shape in self.states[0].shapes):
+            if all(getattr(shape, quantity) is None for shape in self.phantom.shapes):
                 raise InputError(f"the {title} has no {quantity}")
-        count = len(quantities) * len(self.states)
+        count = len(quantities) * self.n_states
         if count > 1:
             shape = " x ".join(map(str, self.grid.shape))
             require(4.0 * count * self.grid.n_voxels, f"{title}: {count} volumes of {shape} voxels")
@@ -134,8 +144,7 @@ class Recipe:
 
     def _world_grid(self, pose: NDArray[np.float64]) -> Grid:
         """A grid along the world's axes that holds the phantom at a pose, with voxels as small as there."""
-        corners = np.concatenate([list(itertools.product(*zip(*phantom.box, strict=True))) for phantom in self.states])
-        corners = corners @ pose[:3, :3].T + pose[:3, 3]
+        corners = list(itertools.product(*zip(*self.phantom.box, strict=True))) @ pose[:3, :3].T + pose[:3, 3]
         low, high = corners.min(axis=0), corners.max(axis=0)
         spacing = min(Grid(self.grid.shape, pose @ self.grid.affine).spacing)
         n_x, n_y, n_z = (int(n) for n in np.ceil((high - low) / spacing) + 2)
@@ -152,9 +161,9 @@ def recipe_of(settings: PhantomSettings) -> Recipe:
     """
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always", InputWarning)
-        states = settings.states()
-        grid = settings.grid(states)
-    return Recipe(states, grid, settings.recipe(), tuple(dict.fromkeys(str(w.message) for w in caught)))
+        phantom = settings.phantom()
+    messages = tuple(str(w.message) for w in caught)
+    return Recipe(phantom, settings.n_states, settings.grid(phantom), settings.recipe(), messages)
 
 
 def settings_of(item: bpy.types.Object | None) -> Any:
@@ -311,7 +320,7 @@ def show_outline(item: bpy.types.Object) -> bpy.types.Object:
     settings = settings_of(item)
     if settings is None:
         raise InputError("no phantom is active: select one that was added with its settings")
-    parts = recipe_of(settings).states[0].meshes()
+    parts = recipe_of(settings).phantom.meshes()
     starts = np.cumsum([0, *(len(part.vertices) for part in parts)])
     vertices = np.concatenate([part.vertices for part in parts])
     faces = np.concatenate([part.faces + start for part, start in zip(parts, starts[:-1], strict=True)])

@@ -159,7 +159,11 @@ def add_stored(stored: StoredVolume, name: str, collection: bpy.types.Collection
 def replace_volume(
     item: bpy.types.Object, volume: Volume, pose: ArrayLike | None = None, provenance: dict[str, Any] | None = None
 ) -> None:
-    """Give a Volume object other voxels (and pose, see `add_volume`); the old datablocks are removed."""
+    """Give a Volume object other voxels (and pose, see `add_volume`).
+
+    Its datablock stays, with what the user has set on it; one of another quantity, or that other objects show too, is
+    replaced, and removed if nothing else needs it.
+    """
     replace_stored(item, store_volume(volume, storage.folder(), pose, provenance))
 
 

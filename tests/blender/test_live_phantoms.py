@@ -39,7 +39,7 @@ def assert_made(item) -> None:
     for one in phantoms.with_children(item):
         properties = one.mphdrr_volume
         volume = volumes.volume_from_object(one)
-        expected = recipe.states[0].voxelize(recipe.grid, quantity=properties.quantity)
+        expected = recipe.phantom.voxelize(recipe.grid, quantity=properties.quantity)
         assert np.array_equal(volume.array, expected.array)
         np.testing.assert_allclose(volume.grid.affine, volumes.pose_of_object(one) @ recipe.grid.affine, atol=1e-5)
         assert not properties.sketched and not item.mphdrr_volume.outdated
@@ -145,13 +145,17 @@ def test_undo_redo_and_files_bring_sketches_that_become_voxels(item, tmp_path):
     assert storage.absolute(item.data.filepath).parent == tmp_path / "a_mphdrr"
 
 
-def test_a_phantom_begins_to_beat():
-    bpy.ops.mphdrr.add_torso(voxels=8)
+def test_a_phantom_begins_to_beat_and_stands_still_again():
+    bpy.ops.mphdrr.add_torso(voxels=8, phase=0.35)
     item = bpy.context.object
-    item.mphdrr_volume.torso.frames = 2
+    still, settings = volumes.file_of(item), item.mphdrr_volume.torso
+    settings.frames = 2
     assert not item.data.is_sequence
     rest()
     assert item.data.is_sequence and item.data.frame_duration == 2 and not item.mphdrr_volume.sketched
+    settings.frames = 1
+    rest()
+    assert not item.data.is_sequence and volumes.file_of(item) == still, "files are named by content"
 
 
 def test_panels_look_at_the_disk_now_and_then(item, monkeypatch):

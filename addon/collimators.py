@@ -119,7 +119,10 @@ def _material(
     if color[3] < 1.0:
         material.surface_render_method = "BLENDED"
     tree = material.node_tree
-    shader = next(node for node in tree.nodes if node.type == "BSDF_PRINCIPLED")  # its name may be translated
+    tree.nodes.clear()  # Blender 4.5 begins with a volume's nodes where a volume is active
+    shader, output = (tree.nodes.new(f"ShaderNode{kind}") for kind in ("BsdfPrincipled", "OutputMaterial"))
+    output.location = (300, 0)
+    tree.links.new(shader.outputs[0], output.inputs["Surface"])
     for socket, value in (
         ("Base Color", (*color[:3], 1.0)),
         ("Metallic", metallic),

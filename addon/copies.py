@@ -11,12 +11,12 @@ import bpy
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core.collimator_mesh import Solid
+from ..core.collimator_mesh import Solid, module_solids
 from ..core.errors import InputError
 from . import cameras, collimators, design, ids, scanner
+from .decimals import typed
 from .module_values import add_module, module_numbers
-from .phantom_properties import typed
-from .scanner_parts import module_solids, new_part
+from .scanner_parts import new_part
 
 _PARTS = ("COLLIMATOR", "CRYSTAL")
 
@@ -111,7 +111,7 @@ def adopt(
 
 def _solids(collection: bpy.types.Collection, camera: bpy.types.Object) -> tuple[Solid, Solid]:
     plate, wall = collection.mphdrr_scanner.plate_thickness, collection.mphdrr_scanner.wall_thickness
-    return module_solids(*module_numbers(camera)[2:6], plate=typed(plate), wall=typed(wall))
+    return module_solids(*module_numbers(camera)[2:6], typed(plate), typed(wall))
 
 
 def _add_parts(collection: bpy.types.Collection, camera: bpy.types.Object) -> None:

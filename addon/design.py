@@ -15,8 +15,8 @@ import numpy as np
 from ..core.collimator_mesh import collimator_solid, crystal_solid
 from ..core.errors import InputError
 from . import cameras, collimators, readouts
+from .decimals import typed
 from .module_values import TYPED, ModuleNumbers, module_numbers, off_aim
-from .phantom_properties import typed
 
 _KEY = "mphdrr_solid"  # custom property of a mesh: the numbers that it was built with
 _writing = 0

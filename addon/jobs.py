@@ -218,7 +218,7 @@ class JobOperator:
             return {"RUNNING_MODAL"}
         if event.type != "TIMER":
             return {"PASS_THROUGH"}
-        _redraw(context)
+        redraw_sidebars()
         if run.alive:
             return {"PASS_THROUGH"}
         if self._finishing is None:
@@ -251,10 +251,7 @@ class JobOperator:
 
     def _start_after_asking(self) -> set[str]:
         """Blender runs what a dialog asked for by `execute`, which cannot become modal: start another of this kind."""
-        given = {
-            name: tuple(value) if isinstance(value, bpy.types.bpy_prop_array) else value
-            for name, value in self.as_keywords(ignore=("confirmed",)).items()
-        }
+        given = {name: _argument(value) for name, value in self.as_keywords(ignore=("confirmed",)).items()}
         group, name = self.bl_idname.split("_OT_")  # an instance has the class's name there
         try:
             getattr(getattr(bpy.ops, group.lower()), name)("INVOKE_DEFAULT", confirmed=True, **given)
@@ -269,7 +266,7 @@ class JobOperator:
             self._timer = None
         if _current is self._run:
             _current = None
-        _redraw(context)
+        redraw_sidebars()
 
     def _failed(self, error: BaseException) -> set[str]:
         if isinstance(error, Cancelled):
@@ -297,7 +294,10 @@ class MPHDRR_OT_cancel_job(bpy.types.Operator):
     @classmethod
     def poll(cls, context: bpy.types.Context) -> bool:
         """There is a job."""
-        return is_running()
+        if not is_running():
+            cls.poll_message_set("No job is running")
+            return False
+        return True
 
     def execute(self, context: bpy.types.Context) -> set[str]:
         """Ask it to stop."""
@@ -315,6 +315,15 @@ def draw_job(layout: bpy.types.UILayout, context: bpy.types.Context) -> None:
     row.operator(ids.CANCEL_JOB, text="", icon="CANCEL")
 
 
+def _argument(value: Any) -> Any:
+    """An operator's setting, as another operator takes it."""
+    if isinstance(value, bpy.types.bpy_prop_array):
+        return tuple(value)
+    if isinstance(value, bpy.types.bpy_prop_collection):  # of files
+        return [{"name": item.name} for item in value]
+    return value
+
+
 def _last(steps: Generator[None, None, str]) -> str:
     while True:
         try:
@@ -323,9 +332,9 @@ def _last(steps: Generator[None, None, str]) -> str:
             return end.value
 
 
-def _redraw(context: bpy.types.Context) -> None:
-    # The sidebars only: drawing the scene ten times a second would take the processor from the work.
-    for window in context.window_manager.windows:
+def redraw_sidebars() -> None:
+    """Have the panels drawn: not the scene, which ten times a second would take the processor from the work."""
+    for window in bpy.context.window_manager.windows:
         for area in window.screen.areas:
             for region in area.regions:
                 if area.type == "VIEW_3D" and region.type == "UI":

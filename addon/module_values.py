@@ -18,7 +18,7 @@ from ..core.design import collimator_length
 from ..core.errors import InputError
 from ..core.system import PinholeSystem
 from . import cameras
-from .phantom_properties import typed
+from .decimals import typed
 
 LENGTHS = ("pinhole_diameter", "collimator_length", "detector_side", "detector_thickness", "roi_radius")
 FROM_ROI, TYPED = "FROM_ROI", "TYPED"  # `mphdrr_module.length_mode`

@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import dataclasses
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import bpy
-import numpy as np
 from bpy.props import (
     BoolProperty,
     EnumProperty,
@@ -24,6 +23,7 @@ from ..core.phantoms.kinds import KINDS, Kind
 from ..core.phantoms.language import parse_phantom
 from ..core.phantoms.phantom import Phantom
 from ..core.volume import UNITS
+from .decimals import typed
 
 FILE = "file"
 """Beside the names of `KINDS`: a phantom described by a text in TOML."""
@@ -43,13 +43,24 @@ class PhantomSettings:
         """Names of the settings that not every phantom has, in the order of drawing."""
         return []
 
+    @property
+    def n_states(self) -> int:
+        """How many states there are, one for each frame."""
+        return 1
+
+    @property
+    def n_voxels(self) -> int:
+        """How many voxels, of all states, a volume has."""
+        settings: Any = self
+        return int(settings.voxels**3) * self.n_states
+
     def values(self) -> dict[str, Any]:
         """Every setting by name, vectors as tuples."""
         values = {name: getattr(self, name) for name in (*self.own_names, *sampling())}
         return {k: tuple(v) if isinstance(v, bpy.types.bpy_prop_array) else v for k, v in values.items()}
 
     def phantom(self) -> Phantom:
-        """The phantom; raises InputError."""
+        """The phantom; of one that beats, its first state. Raises InputError."""
         raise NotImplementedError
 
     def recipe(self) -> dict[str, Any]:
@@ -89,27 +100,38 @@ class KindSettings(PhantomSettings):
 
     kind = KINDS[0]
 
+    if TYPE_CHECKING:  # of kinds that beat
+        frames: int
+
     @property
     def own_names(self) -> list[str]:
-        """The class's fields."""
-        return [field.name for field in _fields(self.kind)]
+        """The class's fields, and how many frames it beats over."""
+        return [*(field.name for field in _fields(self.kind)), *(["frames"] if _beats(self.kind) else [])]
 
     def phantom(self) -> Phantom:
         """The phantom; float32 settings are read as the decimal numbers that the user typed."""
         phantom: Phantom = self.kind.phantom(**self._values())
         return phantom
 
+    @property
+    def n_states(self) -> int:
+        """How many phases of the heart's cycle."""
+        return self.frames if _beats(self.kind) else 1
+
     def recipe(self) -> dict[str, Any]:
-        """The class's fields, their units in their names."""
+        """The class's fields, their units in their names, and the number of frames of one that beats."""
         recipe: dict[str, Any] = {"phantom": self.kind.name}
         values = self._values()
         for field in _fields(self.kind):
             unit, value = _UNITS.get(field.metadata.get("unit", "")), values[field.name]
             recipe[f"{field.name}_{unit}" if unit else field.name] = list(value) if isinstance(value, tuple) else value
+        if self.n_states > 1:
+            recipe["frames"] = self.n_states
         return recipe
 
     def _values(self) -> dict[str, Any]:
-        return {field.name: _plain(getattr(self, field.name)) for field in _fields(self.kind)}
+        values = {field.name: _plain(getattr(self, field.name)) for field in _fields(self.kind)}
+        return values | {"phase": 0.0} if self.n_states > 1 else values
 
 
 class TextSettings(PhantomSettings):
@@ -156,12 +178,23 @@ def sampling(update: Any = None) -> dict[str, Any]:
 
 def kind_settings(kind: Kind, update: Any = None) -> dict[str, Any]:
     """Properties of one kind of phantom, by name, for a class's annotations."""
-    return {field.name: _property(field, kind, update) for field in _fields(kind)} | sampling(update)
+    own = {field.name: _property(field, kind, update) for field in _fields(kind)}
+    if _beats(kind):
+        own["frames"] = IntProperty(
+            name="Frames", description="States of the heart's cycle, which follow each other frame by frame; 1: it stands "
+            "still at its phase", default=1, min=1, soft_max=48, max=1000, update=update, options={"SKIP_SAVE"},
+        )  # fmt: skip
+    return own | sampling(update)
 
 
 def identifier(kind: Kind) -> str:
     """A kind's name in Python: of its operator and of its settings."""
     return kind.name.replace("-", "_")
+
+
+def _beats(kind: Kind) -> bool:
+    """Whether a kind of phantom has states that follow each other."""
+    return hasattr(kind.phantom, "beating")
 
 
 def _fields(kind: Kind) -> list[Any]:
@@ -194,9 +227,9 @@ def _property(field: Any, kind: Kind, update: Any) -> Any:
 
 
 def _phantom_changed(self: Any, context: bpy.types.Context) -> None:
-    from . import phantoms
+    from . import live_phantoms
 
-    phantoms.settings_changed(self.id_data, self)
+    live_phantoms.settings_changed(self.id_data, self)
 
 
 def _group(name: str, mixin: type, members: dict[str, Any]) -> Any:
@@ -269,6 +302,11 @@ class VolumeProperties(bpy.types.PropertyGroup):
         description="The phantom's settings have changed since its voxels were made",
         options={"HIDDEN"},
     )
+    sketched: BoolProperty(
+        name="Sketched",
+        description="What is shown is a sketch of what the phantom's settings say, not its voxels",
+        options={"HIDDEN"},
+    )
     message: StringProperty(name="Message", description="What is wrong with the phantom's settings", options={"HIDDEN"})
     quantity: EnumProperty(
         name="Quantity", description="What the voxels hold",
@@ -312,11 +350,6 @@ VolumeProperties.__annotations__.update(
         for name, group in KIND_PROPERTIES.items()
     }
 )
-
-
-def typed(value: float) -> float:
-    """The shortest decimal number that a float32 setting stands for: 0.1, not 0.10000000149."""
-    return float(str(np.float32(value)))
 
 
 def _plain(value: Any) -> Any:

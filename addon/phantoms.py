@@ -10,6 +10,7 @@ import itertools
 import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -20,20 +21,23 @@ from numpy.typing import NDArray
 
 from ..core.errors import InputError, InputWarning
 from ..core.grid import Grid
+from ..core.memory import require
 from ..core.meshes.mesh import Mesh
 from ..core.phantoms.kinds import KINDS
 from ..core.phantoms.phantom import Phantom
 from ..core.progress import Progress
 from ..core.volume import Volume
-from . import ids, jobs, meshes, storage, volumes
+from . import ids, meshes, storage, volumes
 from .cameras import set_world_matrix, world_matrix
 from .phantom_properties import PhantomSettings, identifier
 
-LIVE_VOXELS = 64**3
-"""Up to so many voxels a phantom is made anew at once when a setting changes."""
+_SKETCHED = 32  # voxels along each side of a sketch
 
 ADDING = tuple((ids.ADD_PHANTOM + identifier(kind), kind.label) for kind in KINDS)
 """The operators that add a phantom, and what they add."""
+
+BEATING = ids.ADD_PHANTOM + "torso"
+"""The operator whose phantom can beat: its `frames`."""
 
 _OUTLINE = "mphdrr_outline"  # custom property of the mesh that shows a phantom's surfaces
 
@@ -45,7 +49,9 @@ class Recipe:
     Attributes
     ----------
     phantom : Phantom
-        What it is.
+        What it is; of one that beats, the first state.
+    n_states : int
+        How many states there are, one for each frame.
     grid : Grid
         Its voxels, in its own frame.
     settings : dict
@@ -55,9 +61,16 @@ class Recipe:
     """
 
     phantom: Phantom
+    n_states: int
     grid: Grid
     settings: dict[str, Any]
     messages: tuple[str, ...]
+
+    @cached_property
+    def states(self) -> Sequence[Phantom]:
+        """The phantom in each frame."""
+        phantom: Any = self.phantom
+        return (phantom,) if self.n_states == 1 else phantom.beating(self.n_states)
 
     def voxelize(
         self,
@@ -76,30 +89,62 @@ class Recipe:
         InputError
             No part of the phantom holds a quantity, or it does not fit into memory.
         """
-        for quantity in quantities:
-            if all(getattr(shape, quantity) is None for shape in self.phantom.shapes):
-                raise InputError(f"the {self.phantom.title} has no {quantity}")
-        for message in self.messages:
-            warnings.warn(message, InputWarning, stacklevel=2)
+        self._begin(quantities)
+        count = len(quantities) * self.n_states
+        reports = (_part(progress, number, count) for number in range(count))
         stored = []
-        for number, (quantity, pose) in enumerate(zip(quantities, poses, strict=True)):
-            report = _part(progress, number, len(quantities))
+        for quantity, pose in zip(quantities, poses, strict=True):
             if baked:
                 place = np.eye(4)
                 place[:3, 3] = pose[:3, 3]
-                volume = self.phantom.voxelize(self._world_grid(pose), pose, report, quantity)
+                grid = self._world_grid(pose)
+                made = [phantom.voxelize(grid, pose, next(reports), quantity) for phantom in self.states]
                 settings = self.settings | {"pose": pose.tolist()}
             else:
                 place, settings = pose, self.settings
-                own = self.phantom.voxelize(self.grid, None, report, quantity)
-                volume = Volume(own.array, Grid(own.grid.shape, pose @ own.grid.affine), quantity)
-            stored.append(volumes.store_volume(volume, folder, place, settings))
+                own = [phantom.voxelize(self.grid, None, next(reports), quantity) for phantom in self.states]
+                made = [_placed(volume, pose) for volume in own]
+            stored.append(volumes.store_volume(made, folder, place, settings))
         return stored
+
+    def sketch(
+        self, quantities: Sequence[str], poses: Sequence[NDArray[np.float64]], folder: Path
+    ) -> list[volumes.StoredVolume]:
+        """What `voxelize` makes, of the first state, roughly and at once: few voxels, with the values at their centres.
+
+        Raises
+        ------
+        InputError
+            No part of the phantom holds a quantity.
+        """
+        self._begin(quantities)
+        voxels = min(_SKETCHED, *self.grid.shape)
+        grid = Grid.centered((voxels,) * 3, np.multiply(self.grid.shape, self.grid.spacing) / voxels, self.grid.center)
+        points = np.moveaxis(np.indices(grid.shape), 0, -1).reshape(-1, 3) @ grid.affine[:3, :3].T + grid.affine[:3, 3]
+        stored = []
+        for quantity, pose in zip(quantities, poses, strict=True):
+            values = self.phantom.values(points, quantity=quantity).astype(np.float32).reshape(grid.shape)
+            stored.append(
+                volumes.store_volume(_placed(Volume(values, grid, quantity), pose), folder, pose, {"sketch": 1})
+            )
+        return stored
+
+    def _begin(self, quantities: Sequence[str]) -> None:
+        """Say what there is to say of the settings; raise `InputError` where they make no volumes of these quantities."""
+        title = self.phantom.title
+        for quantity in quantities:
+            if all(getattr(shape, quantity) is None for shape in self.phantom.shapes):
+                raise InputError(f"the {title} has no {quantity}")
+        count = len(quantities) * self.n_states
+        if count > 1:
+            shape = " x ".join(map(str, self.grid.shape))
+            require(4.0 * count * self.grid.n_voxels, f"{title}: {count} volumes of {shape} voxels")
+        for message in self.messages:
+            warnings.warn(message, InputWarning, stacklevel=3)
 
     def _world_grid(self, pose: NDArray[np.float64]) -> Grid:
         """A grid along the world's axes that holds the phantom at a pose, with voxels as small as there."""
-        low, high = self.phantom.box
-        corners = np.array(list(itertools.product(*zip(low, high, strict=True)))) @ pose[:3, :3].T + pose[:3, 3]
+        corners = list(itertools.product(*zip(*self.phantom.box, strict=True))) @ pose[:3, :3].T + pose[:3, 3]
         low, high = corners.min(axis=0), corners.max(axis=0)
         spacing = min(Grid(self.grid.shape, pose @ self.grid.affine).spacing)
         n_x, n_y, n_z = (int(n) for n in np.ceil((high - low) / spacing) + 2)
@@ -117,7 +162,8 @@ def recipe_of(settings: PhantomSettings) -> Recipe:
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always", InputWarning)
         phantom = settings.phantom()
-    return Recipe(phantom, settings.grid(phantom), settings.recipe(), tuple(str(w.message) for w in caught))
+    messages = tuple(str(w.message) for w in caught)
+    return Recipe(phantom, settings.n_states, settings.grid(phantom), settings.recipe(), messages)
 
 
 def settings_of(item: bpy.types.Object | None) -> Any:
@@ -126,6 +172,14 @@ def settings_of(item: bpy.types.Object | None) -> Any:
         return None
     properties = getattr(item, ids.OBJECT_VOLUME)
     return None if properties.kind == "VOLUME" else getattr(properties, properties.kind.lower())
+
+
+def poll_phantom(operator: type[bpy.types.Operator], context: bpy.types.Context) -> bool:
+    """`poll` of operators that need an active phantom."""
+    if settings_of(context.object) is None:
+        operator.poll_message_set("No phantom is active: select one that was added with its settings")
+        return False
+    return True
 
 
 def add(
@@ -153,6 +207,20 @@ def add(
     return item
 
 
+def root_of(item: bpy.types.Object) -> bpy.types.Object | None:
+    """The phantom that a volume is, or belongs to as its other quantity; None where there is none."""
+    if getattr(item, ids.OBJECT_VOLUME).with_parent and item.parent is not None:
+        item = item.parent
+    return None if settings_of(item) is None else item
+
+
+def require_current(item: bpy.types.Object) -> None:
+    """Raise `InputError` where a volume is of a phantom whose settings have changed since its voxels were made."""
+    phantom = root_of(item)
+    if phantom is not None and getattr(phantom, ids.OBJECT_VOLUME).outdated:
+        raise InputError(f"{phantom.name!r} has changed since its voxels were made: press Update Phantom first")
+
+
 def with_children(item: bpy.types.Object) -> list[bpy.types.Object]:
     """A phantom and the volumes of its other quantities."""
     children = [o for o in item.children if volumes.is_volume(o) and getattr(o, ids.OBJECT_VOLUME).with_parent]
@@ -169,18 +237,37 @@ def remaking(item: bpy.types.Object, bake: bool = False) -> Callable[[Progress |
     InputError
         The object is no phantom, its settings make none, or its matrix is singular.
     """
-    settings = settings_of(item)
-    if settings is None:
-        raise InputError("no phantom is active: select one that was added with its settings")
-    recipe, folder = recipe_of(settings), storage.folder()
-    made = with_children(item)
-    quantities = [settings.quantity, *(getattr(o, ids.OBJECT_VOLUME).quantity for o in made[1:])]
-    poses = [volumes.pose_of_object(o) for o in made]
+    recipe, quantities, poses = _to_make(item)
+    folder = storage.folder()
     return lambda progress: recipe.voxelize(quantities, poses, folder, progress, bake)
 
 
-def replace(item: bpy.types.Object, stored: Sequence[volumes.StoredVolume], baked: bool = False) -> None:
-    """Give a phantom and its children what `remaking` made.
+def sketch(item: bpy.types.Object) -> None:
+    """Show a phantom and its children roughly as its settings are now, until they get their voxels by `replace`.
+
+    Raises
+    ------
+    InputError
+        The object is no phantom, its settings make none, or its matrix is singular.
+    """
+    recipe, quantities, poses = _to_make(item)
+    replace(item, recipe.sketch(quantities, poses, storage.temporary_folder()), sketched=True)
+
+
+def _to_make(item: bpy.types.Object) -> tuple[Recipe, list[str], list[NDArray[np.float64]]]:
+    """A phantom's recipe, and the quantities and poses of its volumes."""
+    settings = settings_of(item)
+    if settings is None:
+        raise InputError("no phantom is active: select one that was added with its settings")
+    made = with_children(item)
+    quantities = [settings.quantity, *(getattr(o, ids.OBJECT_VOLUME).quantity for o in made[1:])]
+    return recipe_of(settings), quantities, [volumes.pose_of_object(o) for o in made]
+
+
+def replace(
+    item: bpy.types.Object, stored: Sequence[volumes.StoredVolume], baked: bool = False, sketched: bool = False
+) -> None:
+    """Give a phantom and its children what `remaking`, or a sketch, made.
 
     They stay where they are. If it was baked, they stand along the world's axes and are phantoms no more: their settings
     would not make these voxels.
@@ -195,6 +282,7 @@ def replace(item: bpy.types.Object, stored: Sequence[volumes.StoredVolume], bake
         raise InputError(f"the volumes of {item.name!r} are not those of before: try again")
     for volume_object, new in zip(made, stored, strict=True):
         basis = volume_object.matrix_basis.copy()
+        getattr(volume_object, ids.OBJECT_VOLUME).sketched = sketched
         volumes.replace_stored(volume_object, new)
         if baked:
             set_world_matrix(volume_object, new.pose)
@@ -204,35 +292,14 @@ def replace(item: bpy.types.Object, stored: Sequence[volumes.StoredVolume], bake
         else:
             volume_object.matrix_basis = basis  # which a matrix with shear would not survive
     properties = getattr(item, ids.OBJECT_VOLUME)
-    properties.outdated, properties.message = False, ""
+    properties.outdated, properties.message = sketched, ""
     if baked:
         remove_outline(item)
         properties.kind = "VOLUME"
         for child in made[1:]:
             getattr(child, ids.OBJECT_VOLUME).with_parent = False
-    elif outline_of(item) is not None:
-        show_outline(item)
-
-
-def settings_changed(item: Any, settings: Any) -> None:
-    """A setting was edited: make small phantoms anew, and say of others, and of what cannot be made, that it is so."""
-    if not isinstance(item, bpy.types.Object) or settings_of(item) != settings:
-        return  # an operator's, or on its way
-    properties = getattr(item, ids.OBJECT_VOLUME)
-    properties.outdated, properties.message = True, ""
-    with warnings.catch_warnings(record=True) as caught:
-        warnings.simplefilter("always", InputWarning)
-        try:
-            make = remaking(item)  # which finds what cannot be made
-            if settings.voxels**3 <= LIVE_VOXELS and not jobs.is_running():
-                replace(item, make(None))
-            elif outline_of(item) is not None:
-                show_outline(item)
-        except InputError as error:
-            properties.message = str(error)
-            return
-    messages = [str(w.message) for w in caught if issubclass(w.category, InputWarning)]
-    properties.message = messages[0] if messages else ""
+    else:
+        update_outline(item)
 
 
 def outline_of(item: bpy.types.Object) -> bpy.types.Object | None:
@@ -242,6 +309,8 @@ def outline_of(item: bpy.types.Object) -> bpy.types.Object | None:
 
 def show_outline(item: bpy.types.Object) -> bpy.types.Object:
     """Show the surfaces of a phantom's shapes as wires that go with it, made from its settings as they are now.
+
+    Of one that moves they are those of its first state.
 
     Raises
     ------
@@ -266,6 +335,12 @@ def show_outline(item: bpy.types.Object) -> bpy.types.Object:
     return outline
 
 
+def update_outline(item: bpy.types.Object) -> None:
+    """Make the mesh that shows a phantom's surfaces anew, where it has one; raises as `show_outline` does."""
+    if outline_of(item) is not None:
+        show_outline(item)
+
+
 def remove_outline(item: bpy.types.Object) -> None:
     """Remove the mesh that shows a phantom's surfaces; nothing where there is none."""
     outline = outline_of(item)
@@ -285,6 +360,11 @@ def _merge_flat_faces(mesh: bpy.types.Mesh) -> None:
         shape.to_mesh(mesh)
     finally:
         shape.free()
+
+
+def _placed(volume: Volume, pose: NDArray[np.float64]) -> Volume:
+    """A volume in an object's own space, in the world."""
+    return Volume(volume.array, Grid(volume.grid.shape, pose @ volume.grid.affine), volume.quantity)
 
 
 def _part(progress: Progress | None, number: int, count: int) -> Progress | None:

@@ -13,7 +13,7 @@ from ..core.materials import APERTURES, CRYSTALS
 from ..core.system import PinholeSystem
 from ..core.volume import Volume
 from . import ids, volumes
-from .phantom_properties import typed
+from .decimals import typed
 
 if TYPE_CHECKING:
     from ..core.projector import Model

@@ -22,6 +22,7 @@ from ..operators import (
     import_volume,
     remove_modules,
     render_projections,
+    renumber_modules,
     set_numbers,
     show_modules,
     tidy_modules,
@@ -29,7 +30,7 @@ from ..operators import (
     voxelize_objects,
 )
 from ..panels import add_menu, design, export, geometry, phantom, projections
-from . import cli, ids, jobs, live, preferences, properties, slices, storage, volumes
+from . import cli, ids, jobs, live, live_phantoms, preferences, properties, slices, storage, volumes
 
 # Classes in the order of registration; a panel comes after its parent. To add a class, list it here.
 CLASSES: tuple[type, ...] = (
@@ -44,6 +45,7 @@ CLASSES: tuple[type, ...] = (
     duplicate_modules.MPHDRR_OT_duplicate_modules,
     remove_modules.MPHDRR_OT_remove_modules,
     tidy_modules.MPHDRR_OT_tidy_modules,
+    renumber_modules.MPHDRR_OT_renumber_modules,
     set_numbers.MPHDRR_OT_set_numbers,
     check_geometry.MPHDRR_OT_check_geometry,
     export_geometry.MPHDRR_OT_export_geometry,
@@ -59,6 +61,7 @@ CLASSES: tuple[type, ...] = (
     voxelize_objects.MPHDRR_OT_voxelize_objects,
     voxelize_objects.MPHDRR_OT_mesh_from_volume,
     import_volume.MPHDRR_OT_import_volume,
+    import_volume.MPHDRR_OT_import_volume_sequence,
     import_volume.MPHDRR_FH_volume,
     add_slices.MPHDRR_OT_add_slices,
     add_slices.MPHDRR_OT_remove_slices,
@@ -96,13 +99,17 @@ MENUS: tuple[tuple[Any, Any], ...] = (
 HANDLERS: tuple[tuple[list[Any], Any], ...] = (
     (bpy.app.handlers.load_pre, jobs.before_load),
     (bpy.app.handlers.load_pre, slices.before_load),
+    (bpy.app.handlers.load_pre, live_phantoms.before_load),
     (bpy.app.handlers.load_post, volumes.after_load),
     (bpy.app.handlers.load_post, live.after_load),
+    (bpy.app.handlers.load_post, live_phantoms.after_undo),
     (bpy.app.handlers.depsgraph_update_post, live.after_update),
     (bpy.app.handlers.frame_change_post, live.after_frame),
     (bpy.app.handlers.frame_change_post, slices.after_frame_change),
     (bpy.app.handlers.undo_post, live.after_undo),
+    (bpy.app.handlers.undo_post, live_phantoms.after_undo),
     (bpy.app.handlers.redo_post, live.after_undo),
+    (bpy.app.handlers.redo_post, live_phantoms.after_undo),
     (bpy.app.handlers.save_pre, storage.before_save),
     (bpy.app.handlers.save_post, storage.after_save),
     (bpy.app.handlers.save_post_fail, storage.after_failed_save),
@@ -143,6 +150,7 @@ def unregister() -> None:
     atexit.unregister(unregister)
     jobs.stop()
     live.stop()
+    live_phantoms.stop()
     while _commands:
         bpy.utils.unregister_cli_command(_commands.pop())
     for handlers, function in reversed(HANDLERS):

@@ -8,7 +8,7 @@ import bpy
 from mathutils import Matrix
 
 from . import cameras
-from .module_values import exact_values, is_edited, is_moved, is_turned
+from .module_values import is_edited, is_moved, is_turned
 
 
 def losses(collection: bpy.types.Collection) -> list[str]:
@@ -85,7 +85,7 @@ def parts_and_others(
         collection.all_objects, key=lambda o: o.name
     ):  # "Module 07" comes before its copy "Module 07.001"
         module = item.mphdrr_module
-        key = (module.part, exact_values(item).get("number", module.number))
+        key = (module.part, module.number)
         if module.part == "NONE" or key in seen:
             others.append(item)
         else:

@@ -17,12 +17,13 @@ import bpy
 import numpy as np
 
 from ..core.errors import InputError, InputWarning
+from ..core.module_parts import module_parts
 from ..core.system import PinholeSystem
 from ..core.workbook import QuantityCells, SystemSource
 from . import cameras, design, ids
 from .module_values import LENGTHS, TYPED, is_edited, is_moved, module_numbers, off_aim, remember
 from .replacement import clear, losses, modules_text
-from .scanner_parts import NewScanner, module_solids
+from .scanner_parts import NewScanner
 
 
 def build_scanner(
@@ -71,16 +72,11 @@ def build_scanner(
         raise InputError(
             f"scanner '{name}' has changed since it was imported ({'; '.join(lost)}): set replace=True to drop this"
         )
-    solids = [
-        module_solids(
-            *(float(getattr(system, name)[m]) for name in LENGTHS[:4]), plate=plate_thickness, wall=wall_thickness
-        )
-        for m in range(len(system))
-    ]
+    parts = module_parts(system, plate_thickness, wall_thickness)
 
     new = NewScanner()
     try:
-        new.make(system, solids)
+        new.make(system, parts)
     except BaseException:
         new.discard()
         raise

@@ -8,7 +8,7 @@ from typing import Any
 import bpy
 import numpy as np
 
-from ..core.collimator_mesh import Solid, collimator_solid, crystal_solid
+from ..core.module_parts import ModulePart
 from ..core.system import PinholeSystem
 from . import cameras, collimators, ids
 from .module_values import write_module
@@ -24,8 +24,8 @@ class NewScanner:
         self._named: list[tuple[bpy.types.ID, str]] = []  # names are free only after the old scanner has gone
         self._materials = {part: collimators.part_material(part) for part in ("COLLIMATOR", "CRYSTAL", "ROI")}
 
-    def make(self, system: PinholeSystem, solids: Sequence[tuple[Solid, Solid]]) -> None:
-        """Make everything; `solids` has each module's collimator and crystal."""
+    def make(self, system: PinholeSystem, parts: Sequence[ModulePart]) -> None:
+        """Make everything; `parts` are the collimators and crystals, as of `module_parts`."""
         rings = system.rings()
         for ring in range(int(rings.max()) + 1):
             collection = self._keep(bpy.data.collections.new(ids.ring_name(ring)), ids.ring_name(ring))
@@ -42,11 +42,12 @@ class NewScanner:
             camera.lock_scale = (True, True, True)  # or its collimator would grow with it
             write_module(camera, system, m, int(rings[m]))
             self.rings[rings[m]].objects.link(camera)
-            for part, solid in zip(("COLLIMATOR", "CRYSTAL"), solids[m], strict=True):
-                child_name = ids.part_name(name, part)
-                mesh = self._keep(collimators.new_mesh(child_name, solid, self._materials[part]), child_name)
-                child = self._keep(new_part(camera, part, child_name, mesh), child_name)
-                self.rings[rings[m]].objects.link(child)
+        for part in parts:
+            camera, kind = self.cameras[part.number], part.kind.upper()
+            name = ids.part_name(ids.module_name(part.number, len(system)), kind)
+            mesh = self._keep(collimators.new_mesh(name, part.solid, self._materials[kind]), name)
+            child = self._keep(new_part(camera, kind, name, mesh), name)
+            self.rings[camera.mphdrr_module.ring].objects.link(child)
         self._make_roi(float(system.roi_radius.max()))
 
     def _make_roi(self, radius: float) -> None:
@@ -85,10 +86,3 @@ def new_part(camera: bpy.types.Object, part: str, name: str, mesh: bpy.types.Mes
     item.lock_location = item.lock_rotation = item.lock_scale = (True, True, True)
     item.mphdrr_module.part, item.mphdrr_module.number = part, camera.mphdrr_module.number
     return item
-
-
-def module_solids(
-    d: float, length: float, side: float, thickness: float, *, plate: float, wall: float
-) -> tuple[Solid, Solid]:
-    """Collimator and crystal of a module, for a plate and walls of that thickness; all in mm."""
-    return collimator_solid(d, length, side, plate, wall), crystal_solid(length, side, thickness)

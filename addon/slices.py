@@ -77,9 +77,9 @@ def names(item: bpy.types.Object) -> list[str]:
 def update(item: bpy.types.Object) -> None:
     """Draw a volume's planes at `VolumeProperties.slices`, in its display range; nothing where it has none."""
     planes = planes_of(item)
-    if not planes:
-        return
     settings = getattr(item, ids.OBJECT_VOLUME)
+    if not planes or settings.sketched:
+        return
     try:
         volume = _stored(item)
     except InputError as error:

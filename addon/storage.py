@@ -6,9 +6,12 @@ moved together. Files made before the first save are copied there when it happen
 
 from __future__ import annotations
 
+import math
 import os
 import re
 import shutil
+import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +25,9 @@ _OUR_VOLUME = re.compile(r"[a-z]+-[0-9a-f]{16}(\.preview)?(_\d{4})?\.vdb")
 """Names of the files that this extension writes voxels to: by content."""
 _FRAME = re.compile(r"_\d{4}\.vdb$")  # of a sequence, at the end of the name
 
+_LOOK = 2.0  # s
+_sizes: dict[Path, tuple[float, int | None]] = {}  # when it was looked at, and what there was
+
 # Paths as they were before the save that is running: (owner, attribute, old path).
 _before_save: list[tuple[Any, str, str]] = []
 
@@ -34,7 +40,15 @@ def folder() -> Path:
     InputError
         It cannot be written.
     """
-    return ensure_folder(_folder_of(bpy.data.filepath) if bpy.data.filepath else _temporary_folder())
+    return ensure_folder(_folder_of(bpy.data.filepath)) if bpy.data.filepath else temporary_folder()
+
+
+def temporary_folder() -> Path:
+    """The folder for files that need not outlive this session, made if need be; raises as `folder` does.
+
+    A .blend that needs one of them when it is saved gets its own copy.
+    """
+    return ensure_folder(_temporary_folder())
 
 
 def stored_path(path: Path) -> str:
@@ -66,13 +80,31 @@ def of_frame(path: Path, number: int) -> Path:
     return path.with_name(_FRAME.sub(f"_{number:04d}.vdb", path.name))
 
 
-def missing_volumes() -> list[bpy.types.Volume]:
+def size_of(path: Path) -> int | None:
+    """Bytes of a file, None where there is none, as a look within the last seconds found it.
+
+    For panels, which are drawn at every movement of the mouse: a look at a disk in the network may take long.
+    """
+    now = time.monotonic()
+    looked, size = _sizes.get(path, (-math.inf, None))
+    if now - looked > _LOOK:
+        size = path.stat().st_size if path.is_file() else None
+        _sizes[path] = now, size
+    return size
+
+
+def missing_volumes(is_there: Callable[[Path], bool] = Path.is_file) -> list[bpy.types.Volume]:
     """Volumes of ours whose file, or the one with every voxel that belongs to it, is not there."""
     return [
         data
         for data in bpy.data.volumes
-        if _OUR_VOLUME.fullmatch(absolute(data.filepath).name) and not all(p.is_file() for p in _files_of(data))
+        if _OUR_VOLUME.fullmatch(absolute(data.filepath).name) and not all(map(is_there, _files_of(data)))
     ]
+
+
+def seems_there(path: Path) -> bool:
+    """Whether there is a file, as `size_of` says."""
+    return size_of(path) is not None
 
 
 def relocate(top: Path) -> tuple[list[str], list[str]]:
@@ -93,6 +125,7 @@ def relocate(top: Path) -> tuple[list[str], list[str]]:
             data.filepath = stored_path(shown)
             data.grids.load()
             found.append(data)
+    _sizes.clear()
     return sorted(data.name for data in found), sorted(data.name for data in missing if data not in found)
 
 

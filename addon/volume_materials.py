@@ -32,6 +32,7 @@ _SMOKE = 15.0
 
 
 _RANGE = "Display Range"  # the node that holds the values at the ramp's ends
+_OPACITY_NODE = "Opacity"
 
 
 def ramp(quantity: str) -> tuple[tuple[float, tuple[float, float, float]], ...]:
@@ -79,7 +80,7 @@ def new_material(name: str, quantity: str, size: float) -> bpy.types.Material:
         elements.new(0.5)
     for element, (position, rgb) in zip(elements, colors, strict=True):
         element.position, element.color = position, (*rgb, 1.0)
-    opacity = node("ShaderNodeValue", 1, 1.3, name="Opacity", label="Opacity (1/mm)")
+    opacity = node("ShaderNodeValue", 1, 1.3, name=_OPACITY_NODE, label="Opacity (1/mm)")
     opacity.outputs[0].default_value = (_OPACITY if quantity == "activity" else _OPACITY_THROUGH) / size
     extinction = node("ShaderNodeMath", 2, 0.3, operation="MULTIPLY")
     strength = node("ShaderNodeMath", 3, 0, operation="MULTIPLY")
@@ -112,6 +113,13 @@ def set_range(material: bpy.types.Material, low: float, high: float) -> None:
     if node is not None:
         node.inputs["From Min"].default_value = low
         node.inputs["From Max"].default_value = high
+
+
+def resize(material: bpy.types.Material, old: float, new: float) -> None:
+    """Keep a volume as opaque as it was when its size, mm, changes from `old` to `new`."""
+    node = material.node_tree.nodes.get(_OPACITY_NODE) if material.node_tree else None
+    if node is not None:
+        node.outputs[0].default_value *= old / new
 
 
 def set_display(data: bpy.types.Volume, low: float, high: float, size: float) -> None:

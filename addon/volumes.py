@@ -159,13 +159,24 @@ def add_stored(stored: StoredVolume, name: str, collection: bpy.types.Collection
 def replace_volume(
     item: bpy.types.Object, volume: Volume, pose: ArrayLike | None = None, provenance: dict[str, Any] | None = None
 ) -> None:
-    """Give a Volume object other voxels (and pose, see `add_volume`); the old datablocks are removed."""
+    """Give a Volume object other voxels (and pose, see `add_volume`).
+
+    Its datablock stays, with what the user has set on it; one of another quantity, or that other objects show too, is
+    replaced, and removed if nothing else needs it.
+    """
     replace_stored(item, store_volume(volume, storage.folder(), pose, provenance))
 
 
 def replace_stored(item: bpy.types.Object, stored: StoredVolume) -> None:
     """Give a Volume object the voxels of a stored volume; see `replace_volume`."""
-    old = item.data
+    old, settings = item.data, getattr(item, ids.OBJECT_VOLUME)
+    if old.users == 1 and settings.quantity == stored.volume.quantity:  # in place: what the user set on it stays
+        _show(old, stored)
+        for material in old.materials:
+            if material is not None:
+                volume_materials.resize(material, settings.extent, stored.extent)
+        _describe(item, stored)
+        return
     item.data = data = _volume_data(stored, item.name)
     _describe(item, stored)
     if old.users == 0:
@@ -219,6 +230,10 @@ def reader(item: bpy.types.Object) -> Callable[[], Volume]:
     if item is None or item.type != "VOLUME" or not getattr(item, ids.OBJECT_VOLUME).is_volume:
         what = "nothing is chosen" if item is None else f"{item.name!r} is no mphDRR volume"
         raise InputError(f"{what}: add a phantom first, or choose one")
+    if getattr(item, ids.OBJECT_VOLUME).sketched:
+        from . import live_phantoms  # which imports this module
+
+        live_phantoms.settle(item)
     if _state(item.data) is None:
         raise InputError(f"{item.name!r} has no state at frame {bpy.context.scene.frame_current}")
     path, pose = file_of(item), pose_of_object(item)
@@ -238,14 +253,20 @@ def file_of(item: bpy.types.Object) -> Path:
     return storage.of_frame(path, _state(item.data) or 1) if item.data.is_sequence else path
 
 
+def state_text(item: bpy.types.Object) -> str:
+    """Which state of a sequence the current frame shows: "3 of 8"."""
+    state = _state(item.data)
+    return "none" if state is None else f"{state - item.data.frame_offset} of {item.data.frame_duration}"
+
+
 def file_state(item: bpy.types.Object) -> str:
     """What there is to say about a Volume object's file: its size, or that it is missing."""
-    path = file_of(item)
-    if not path.is_file():
+    size = storage.size_of(file_of(item))
+    if size is None:
         return "missing"
     shown = ", coarser copy shown" if storage.is_preview(storage.absolute(item.data.filepath)) else ""
     kept = "" if bpy.data.filepath else ", until saved"
-    return readable_size(path.stat().st_size) + shown + kept
+    return readable_size(size) + shown + kept
 
 
 def pose_of_object(item: bpy.types.Object) -> NDArray[np.float64]:
@@ -272,6 +293,14 @@ def is_volume(item: bpy.types.Object | None) -> bool:
 def can_be_projected(item: bpy.types.Object | None) -> bool:
     """Whether an object is a volume of matter or activity, not a map of the scanner."""
     return is_volume(item) and getattr(item, ids.OBJECT_VOLUME).quantity not in MAPS
+
+
+def poll_volume(operator: type[bpy.types.Operator], context: bpy.types.Context) -> bool:
+    """`poll` of operators that need an active volume."""
+    if not is_volume(context.object):
+        operator.poll_message_set("No volume is active: select one first")
+        return False
+    return True
 
 
 def volume_objects(scene: bpy.types.Scene) -> list[bpy.types.Object]:
@@ -332,26 +361,37 @@ def _volume_data(stored: StoredVolume, name: str) -> bpy.types.Volume:
     """Volume datablock of a stored volume, with its material."""
     quantity = stored.volume.quantity
     data = bpy.data.volumes.new(name)
+    data.sequence_mode = "REPEAT"
     try:
-        data.filepath = storage.stored_path(stored.path)
-        if not data.grids.load() or data.grids.error_message:
-            raise InputError(
-                f"{stored.path}: Blender cannot load the volume ({data.grids.error_message or 'no reason given'})"
-            )
-        if quantity not in data.grids:
-            raise InputError(f"{stored.path}: Blender finds no grid {quantity!r} in it")
-        if SMOKE in data.grids:
-            data.grids.active_index = data.grids.find(SMOKE)  # what the solid viewport draws
+        _show(data, stored)
     except Exception:
         bpy.data.volumes.remove(data)
         raise
-    if len(stored.states) > 1:  # set after loading, which would look for frame 0 until the scene is evaluated
-        data.is_sequence, data.frame_duration, data.sequence_mode = True, len(stored.states), "REPEAT"
     data.render.precision = "FULL"
     data.render.space = "OBJECT"
     data.render.clipping = 0.0  # the default, 0.001, erases mu values and faint activity
     data.materials.append(volume_materials.new_material(f"{name} {quantity}", quantity, stored.extent))
     return data
+
+
+def _show(data: bpy.types.Volume, stored: StoredVolume) -> None:
+    """Let a datablock show a stored volume; where Blender cannot load it, it shows what it did."""
+    before = data.is_sequence, data.filepath
+    data.is_sequence, data.filepath = False, storage.stored_path(stored.path)
+    try:
+        if not data.grids.load() or data.grids.error_message:
+            raise InputError(
+                f"{stored.path}: Blender cannot load the volume ({data.grids.error_message or 'no reason given'})"
+            )
+        if stored.volume.quantity not in data.grids:
+            raise InputError(f"{stored.path}: Blender finds no grid {stored.volume.quantity!r} in it")
+    except InputError:
+        data.is_sequence, data.filepath = before
+        raise
+    # What the solid viewport draws.
+    data.grids.active_index = data.grids.find(SMOKE if SMOKE in data.grids else stored.volume.quantity)
+    if len(stored.states) > 1:  # set after loading, which would look for frame 0 until the scene is evaluated
+        data.is_sequence, data.frame_duration = True, len(stored.states)
 
 
 def _store(states: Sequence[Volume], folder: Path, provenance: dict[str, Any] | None) -> Path:

@@ -13,7 +13,7 @@ from .design import collimator_length, roi_radius_seen
 from .errors import InputError, InputWarning
 from .export import read_run, write_run
 from .frames import euler_pose
-from .generators import RingFit, ellipse_rings, fit_rings, plate_rings, regular_polygon
+from .generators import RingFit, ellipse_rings, fit_rings, plate_rings, regular_polygon, ring_order
 from .geometry_checks import GeometryReport, check_geometry
 from .geometry_export import read_geometry, write_geometry
 from .grid import Grid
@@ -130,6 +130,7 @@ __all__ = [
     "resample",
     "resolution",
     "resolution_map",
+    "ring_order",
     "roi_radius_seen",
     "sample_counts",
     "sampling_gaps",

@@ -86,6 +86,21 @@ def crystal_solid(collimator_length: float, detector_side: float, detector_thick
     return vertices, np.array(faces, dtype=np.int32)
 
 
+def module_solids(
+    pinhole_diameter: float,
+    collimator_length: float,
+    detector_side: float,
+    detector_thickness: float,
+    plate_thickness: float,
+    wall_thickness: float,
+) -> tuple[Solid, Solid]:
+    """Collimator and crystal of a module; raises as `collimator_solid` does."""
+    return (
+        collimator_solid(pinhole_diameter, collimator_length, detector_side, plate_thickness, wall_thickness),
+        crystal_solid(collimator_length, detector_side, detector_thickness),
+    )
+
+
 def signed_volume(solid: Solid) -> float:
     """Enclosed volume, mm^3: positive where the faces look outwards."""
     vertices, faces = solid

@@ -265,7 +265,7 @@ def fit_rings(system: PinholeSystem) -> list[RingFit]:
 
 
 def _fit(system: PinholeSystem, which: NDArray[np.intp]) -> RingFit:
-    azimuths, which = _in_order(system, which)
+    azimuths, which = _in_order(system, which, _run_clockwise(system, [which]))
     places, z = system.centers[which, :2], system.centers[which, 2]
     ellipse = _fit_ellipse(places)
     if ellipse is None:
@@ -291,14 +291,36 @@ def _fit(system: PinholeSystem, which: NDArray[np.intp]) -> RingFit:
     )
 
 
-def _in_order(system: PinholeSystem, which: NDArray[np.intp]) -> tuple[Array, NDArray[np.intp]]:
+def ring_order(system: PinholeSystem) -> NDArray[np.intp]:
+    """Places (M,) of the modules in the system, ring by ring along +z, and along the rings the way most run already.
+
+    An open ring begins beside its gap, a closed one at the module that comes first in the system.
+    ``system[ring_order(system)]`` is the system in that order; numbers stay with their modules.
+    """
+    ring_of = system.rings()
+    rings = [np.flatnonzero(ring_of == ring) for ring in range(ring_of.max() + 1)]
+    clockwise = _run_clockwise(system, rings)
+    return np.concatenate([_in_order(system, which, clockwise)[1] for which in rings])
+
+
+def _run_clockwise(system: PinholeSystem, rings: Sequence[NDArray[np.intp]]) -> bool:
+    """Whether azimuths fall along most of the system's rings."""
+    orders = [np.argsort(_azimuths(system, which), kind="stable") for which in rings]
+    falls = sum(np.count_nonzero(np.diff(order) < 0) for order in orders)
+    return bool(2 * falls > sum(len(order) for order in orders))
+
+
+def _azimuths(system: PinholeSystem, which: NDArray[np.intp]) -> Array:
+    return np.arctan2(system.centers[which, 1], system.centers[which, 0])
+
+
+def _in_order(system: PinholeSystem, which: NDArray[np.intp], clockwise: bool) -> tuple[Array, NDArray[np.intp]]:
     """The modules `which` in their order along the ring, and their azimuths without a jump.
 
     An open ring begins beside its gap, a closed one at the module that comes first in the system.
     """
-    azimuths = np.arctan2(system.centers[which, 1], system.centers[which, 0])
+    azimuths = _azimuths(system, which)
     order = np.argsort(azimuths, kind="stable")
-    clockwise = 2 * np.count_nonzero(np.diff(order) < 0) > len(order)
     if clockwise:
         order = order[::-1]
     steps = np.diff(azimuths[order], append=azimuths[order[0]])

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .checks import positive
-from .collimator_mesh import Solid, collimator_solid, crystal_solid
+from .collimator_mesh import Solid, module_solids
 from .errors import InputError
 from .system import PinholeSystem
 
@@ -80,12 +80,12 @@ def module_parts(system: PinholeSystem, plate_thickness: float = 2.0, wall_thick
     for number, pose, *size in zip(system.numbers.tolist(), poses, *(s.tolist() for s in sizes), strict=True):
         d, length, side, thickness = size
         try:
-            collimator = collimator_solid(d, length, side, plate, wall)
+            collimator, crystal = module_solids(d, length, side, thickness, plate, wall)
         except InputError as error:
             raise InputError(f"module {number}: {error}") from None
         name = f"Module {number:0{width}d}"
         parts += [
             ModulePart(number, "collimator", f"{name} collimator", collimator, pose),
-            ModulePart(number, "crystal", f"{name} crystal", crystal_solid(length, side, thickness), pose),
+            ModulePart(number, "crystal", f"{name} crystal", crystal, pose),
         ]
     return parts

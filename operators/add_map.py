@@ -9,7 +9,7 @@ import bpy
 from bpy.props import BoolProperty, EnumProperty, FloatProperty, IntProperty
 
 from ..addon import ids, jobs, scanner, selection, storage, volume_materials, volumes
-from ..addon.phantom_properties import typed
+from ..addon.decimals import typed
 from ..core.grid import Grid
 from ..core.maps import MAPS, within_roi
 from ..core.memory import require

@@ -16,7 +16,7 @@ class MPHDRR_OT_add_slices(bpy.types.Operator):
 
     @classmethod
     def poll(cls, context: bpy.types.Context) -> bool:
-        return volumes.is_volume(context.object)
+        return volumes.poll_volume(cls, context)
 
     def execute(self, context: bpy.types.Context) -> set[str]:
         try:
@@ -39,7 +39,12 @@ class MPHDRR_OT_remove_slices(bpy.types.Operator):
 
     @classmethod
     def poll(cls, context: bpy.types.Context) -> bool:
-        return volumes.is_volume(context.object) and bool(slices.planes_of(context.object))
+        if not volumes.poll_volume(cls, context):
+            return False
+        if not slices.planes_of(context.object):
+            cls.poll_message_set("The active volume has no slices")
+            return False
+        return True
 
     def execute(self, context: bpy.types.Context) -> set[str]:
         slices.remove_slices(context.object)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import bpy
 
-from ..addon import ids, scanner
+from ..addon import ids, scanner, selection
 
 
 class MPHDRR_OT_aim_modules(bpy.types.Operator):
@@ -17,10 +17,7 @@ class MPHDRR_OT_aim_modules(bpy.types.Operator):
 
     @classmethod
     def poll(cls, context: bpy.types.Context) -> bool:
-        if scanner.active_scanner(context.scene) is None:
-            cls.poll_message_set("No scanner in the scene: import a geometry first")
-            return False
-        return True
+        return selection.poll_scanner(cls, context)
 
     def execute(self, context: bpy.types.Context) -> set[str]:
         collection = scanner.active_scanner(context.scene)

@@ -7,7 +7,7 @@ import json
 import bpy
 
 from ..addon import design, ids, scanner, selection
-from ..addon.phantom_properties import typed
+from ..addon.decimals import typed
 from ..addon.reports import warnings_reported
 from ..core.errors import InputError
 

@@ -19,7 +19,7 @@ class _EditPhantom(jobs.JobOperator):
     @classmethod
     def poll(cls, context: bpy.types.Context) -> bool:
         """A phantom is active."""
-        return phantoms.settings_of(context.object) is not None
+        return phantoms.poll_phantom(cls, context)
 
     def job(self, context: bpy.types.Context) -> jobs.Job:
         bake, done, name = self.bake, self.done, context.object.name
@@ -73,7 +73,7 @@ class MPHDRR_OT_show_phantom_outline(bpy.types.Operator):
 
     @classmethod
     def poll(cls, context: bpy.types.Context) -> bool:
-        return phantoms.settings_of(context.object) is not None
+        return phantoms.poll_phantom(cls, context)
 
     def execute(self, context: bpy.types.Context) -> set[str]:
         item = context.object

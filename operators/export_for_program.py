@@ -9,7 +9,7 @@ from bpy.props import EnumProperty, StringProperty
 from bpy_extras.io_utils import ExportHelper
 
 from ..addon import ids, scanner, selection, storage
-from ..addon.phantom_properties import typed
+from ..addon.decimals import typed
 from ..addon.reports import warnings_reported
 from ..core.errors import InputError
 from ..core.geometry_export import FORMATS, write_geometry

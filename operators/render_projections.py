@@ -10,7 +10,7 @@ import bpy
 from bpy.props import StringProperty
 
 from ..addon import ids, images, jobs, phantoms, runs, scanner, storage, volumes
-from ..addon.phantom_properties import typed
+from ..addon.decimals import typed
 from ..addon.projection_properties import ProjectionSettings, chosen_model
 from ..core.errors import InputError
 from ..core.memory import require
@@ -47,6 +47,9 @@ class MPHDRR_OT_render_projections(ProjectionSettings, jobs.JobOperator, bpy.typ
         mu = _chosen_mu(context, self.mu) if counts else None
         read_mu = None if mu is None else volumes.reader(mu)
         read_volume = volumes.reader(item)
+        for volume in (item, mu):
+            if volume is not None:
+                phantoms.require_current(volume)
         n_bytes = 4.0 * len(system) * shape[0] * shape[1]
         # The array, and Blender's images with four channels in memory and once more, packed.
         require(9 * n_bytes, f"{len(system)} images of {shape[1]} x {shape[0]} pixels")
@@ -55,6 +58,8 @@ class MPHDRR_OT_render_projections(ProjectionSettings, jobs.JobOperator, bpy.typ
         phantom = phantoms.settings_of(item)
         if phantom is not None:
             settings |= phantom.recipe()
+        if item.data.is_sequence:
+            settings |= {"frame": scene.frame_current, "state": volumes.state_text(item)}
         scene_name, item_name, start = scene.name, item.name, time.perf_counter()
 
         def work(progress: Progress) -> ProjectionRun:
@@ -106,7 +111,10 @@ class MPHDRR_OT_show_projections(bpy.types.Operator):
 
     @classmethod
     def poll(cls, context: bpy.types.Context) -> bool:
-        return ids.MOSAIC in bpy.data.images
+        if ids.MOSAIC not in bpy.data.images:
+            cls.poll_message_set("No projections yet: render them first")
+            return False
+        return True
 
     def execute(self, context: bpy.types.Context) -> set[str]:
         if not images.show_below(bpy.data.images[ids.MOSAIC], context):

@@ -5,15 +5,8 @@ from __future__ import annotations
 import bpy
 from bpy.props import EnumProperty, IntProperty
 
-from ..addon import ids, scanner
+from ..addon import ids, scanner, selection
 from ..core.errors import InputError
-
-
-def _poll(cls: type[bpy.types.Operator], context: bpy.types.Context) -> bool:
-    if scanner.active_scanner(context.scene) is None:
-        cls.poll_message_set("No scanner in the scene: import a geometry first")
-        return False
-    return True
 
 
 class MPHDRR_OT_show_modules(bpy.types.Operator):
@@ -39,7 +32,7 @@ class MPHDRR_OT_show_modules(bpy.types.Operator):
 
     @classmethod
     def poll(cls, context: bpy.types.Context) -> bool:
-        return _poll(cls, context)
+        return selection.poll_scanner(cls, context)
 
     @classmethod
     def description(cls, context: bpy.types.Context, properties: bpy.types.OperatorProperties) -> str:
@@ -73,7 +66,7 @@ class MPHDRR_OT_look_through_module(bpy.types.Operator):
 
     @classmethod
     def poll(cls, context: bpy.types.Context) -> bool:
-        return _poll(cls, context)
+        return selection.poll_scanner(cls, context)
 
     def execute(self, context: bpy.types.Context) -> set[str]:
         try:

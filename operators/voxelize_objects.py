@@ -10,7 +10,7 @@ import numpy as np
 from bpy.props import EnumProperty, FloatProperty, IntProperty, StringProperty
 
 from ..addon import ids, jobs, meshes, storage, volumes
-from ..addon.phantom_properties import typed
+from ..addon.decimals import typed
 from ..core.errors import InputError
 from ..core.grid import Grid
 from ..core.memory import require
@@ -113,10 +113,7 @@ class MPHDRR_OT_mesh_from_volume(jobs.JobOperator, bpy.types.Operator):
 
     @classmethod
     def poll(cls, context: bpy.types.Context) -> bool:
-        if not volumes.is_volume(context.object):
-            cls.poll_message_set("Select a volume first")
-            return False
-        return True
+        return volumes.poll_volume(cls, context)
 
     def ask(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str] | None:
         return context.window_manager.invoke_props_dialog(self, title=self.bl_label, confirm_text="Make")

@@ -5,7 +5,7 @@ from __future__ import annotations
 import bpy
 
 from ..addon import ids
-from ..addon.phantoms import ADDING
+from ..addon.phantoms import ADDING, BEATING
 
 
 class MPHDRR_MT_add(bpy.types.Menu):
@@ -17,9 +17,11 @@ class MPHDRR_MT_add(bpy.types.Menu):
         layout.operator_context = "INVOKE_DEFAULT"
         for operator, label in ADDING:
             layout.operator(operator, text=label, icon="OUTLINER_DATA_VOLUME")
+        layout.operator(BEATING, text="Beating Cardiac Torso", icon="OUTLINER_DATA_VOLUME").frames = 24
         layout.operator(ids.IMPORT_PHANTOM, text="Phantom from TOML File", icon="FILE_TEXT")
         layout.separator()
         layout.operator(ids.IMPORT_VOLUME, text="Volume from File", icon="IMPORT")
+        layout.operator(ids.IMPORT_VOLUME_SEQUENCE, text="Volume Sequence from Files", icon="RENDER_ANIMATION")
         layout.operator(ids.VOXELIZE_OBJECTS, text="Volume from Meshes", icon="OUTLINER_DATA_MESH")
         layout.operator(ids.ADD_MAP, text="Map of the Scanner", icon="OUTLINER_DATA_LIGHTPROBE")
 

@@ -110,6 +110,7 @@ class MPHDRR_PT_scanner_design(_Panel, bpy.types.Panel):
                 ("See the ROI", f"{properties.n_covering} of {properties.count} modules"),
             ),
         )
+        layout.operator_menu_enum(ids.RENUMBER_MODULES, "order", text="Renumber", icon="LINENUMBERS_ON")
         layout.operator(ids.CHECK_GEOMETRY, icon="CHECKMARK")
         if properties.findings:
             findings = json.loads(properties.findings)

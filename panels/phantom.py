@@ -7,7 +7,7 @@ from typing import Any
 
 import bpy
 
-from ..addon import ids, jobs, phantoms, slices, storage, volumes
+from ..addon import ids, jobs, live_phantoms, phantoms, slices, storage, volumes
 
 _LINE = 32  # letters that fit into the sidebar at its usual width
 
@@ -27,7 +27,7 @@ class MPHDRR_PT_phantom(bpy.types.Panel):
         column = layout.column(align=True)
         column.menu(ids.MENU_ADD, text="Add Phantom", icon="OUTLINER_DATA_VOLUME")
         column.operator(ids.IMPORT_VOLUME, text="Import Volume", icon="IMPORT")
-        if storage.missing_volumes():
+        if storage.missing_volumes(storage.seems_there):
             column = layout.column(align=True)
             column.alert = True
             column.label(text="Files of voxels are missing", icon="ERROR")
@@ -52,6 +52,7 @@ class MPHDRR_PT_phantom(bpy.types.Panel):
             ("Voxels", " × ".join(map(str, shape))),
             ("Size", " × ".join(f"{s:.3g}" for s in spacing) + " mm"),
             ("Values", f"{settings.minimum:.4g} to {settings.maximum:.4g}"),
+            *([("State", volumes.state_text(item))] if item.data.is_sequence else []),
             ("File", volumes.file_state(item)),
         ):
             names.label(text=name)
@@ -61,6 +62,10 @@ class MPHDRR_PT_phantom(bpy.types.Panel):
         column = layout.column(align=True)
         column.prop(settings, "display_low", text=f"Low, {settings.unit}")
         column.prop(settings, "display_high", text=f"High, {settings.unit}")
+        if item.data.is_sequence:
+            column = layout.column(align=True)
+            column.prop(item.data, "frame_start", text="First Frame")
+            column.prop(item.data, "sequence_mode", text="Then")
         if slices.planes_of(item):
             column = layout.column(align=True)
             for axis, name in enumerate(slices.names(item)):
@@ -87,10 +92,10 @@ def _draw_phantom(layout: bpy.types.UILayout, item: bpy.types.Object, phantom: A
             column.label(text=line, icon="BLANK1")
     column = layout.column(align=True)
     row = column.row(align=True)
-    row.alert = settings.outdated
-    row.operator(
-        ids.UPDATE_PHANTOM, text="Changed: Update" if settings.outdated else "Update Phantom", icon="FILE_REFRESH"
-    )
+    coming = live_phantoms.is_coming(item)
+    row.alert = settings.outdated and not coming
+    text = "Changed: Update" if settings.outdated else "Update Phantom"
+    row.operator(ids.UPDATE_PHANTOM, text="Making the Voxels" if coming else text, icon="FILE_REFRESH")
     column.operator(ids.APPLY_PHANTOM_POSE, icon="OBJECT_ORIGIN")
     shown = phantoms.outline_of(item) is not None
     column.operator(

@@ -112,7 +112,7 @@ class Phantom:
         """Diameter, mm, of a ball around the origin that holds the phantom: a grid that holds it however it is turned."""
         return 2 * max(math.hypot(*shape.position) + shape.ball_radius for shape in self.shapes)
 
-    @property
+    @cached_property
     def box(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Opposite corners, mm, of a box along the axes of the phantom's own frame that holds it."""
         low, high = np.full(3, np.inf), np.full(3, -np.inf)
@@ -121,7 +121,7 @@ class Phantom:
             corners = shape.surface()[0] if shape.cut else np.array(list(itertools.product(*_ENDS))) * shape.half_box
             points = corners @ shape.pose[:3, :3].T + shape.pose[:3, 3]
             low, high = np.minimum(low, points.min(axis=0)), np.maximum(high, points.max(axis=0))
-        return low, high
+        return freeze(low), freeze(high)
 
     def voxelize(
         self, grid: Grid, pose: ArrayLike | None = None, progress: Progress | None = None, quantity: str = "activity"

@@ -103,3 +103,14 @@ def test_warnings_are_reported_not_raised():
     assert log.lines[0] == ({"WARNING"}, "cell E0")
     assert log.lines[-1] == ({"WARNING"}, "... and 3 more warnings of this kind")
     assert len(log.lines) == 6
+
+
+def test_every_operator_says_why_it_cannot_run():
+    """In an empty scene; Blender's own words for it are "context is incorrect"."""
+    bpy.data.batch_remove(bpy.data.objects)
+    greyed = [name for name in dir(bpy.ops.mphdrr) if not getattr(bpy.ops.mphdrr, name).poll()]
+    assert {"add_slices", "apply_phantom_pose", "update_phantom", "renumber_modules", "show_projections"} <= set(greyed)
+    for name in greyed:
+        with pytest.raises(RuntimeError) as refusal:
+            getattr(bpy.ops.mphdrr, name)()
+        assert "context is incorrect" not in str(refusal.value), refusal.value

@@ -7,6 +7,8 @@ import math
 
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 import mphdrr.core as mph
 
@@ -178,3 +180,23 @@ def test_a_module_on_the_axis_is_on_no_ring():
         mph.fit_rings(system)
     (alone,) = mph.fit_rings(system[:1])
     assert np.allclose(mph.ellipse_rings(**alone.parameters(), **MODULE).centers, [[200, 0, 0]])
+
+
+@settings(max_examples=20, deadline=None)
+@given(st.permutations(range(17)), st.booleans(), st.floats(-180, 180))
+def test_ring_order_is_along_the_rings_whatever_the_order_was(permutation, closed, start):
+    reach = 2 * np.pi if closed else 2.5
+    azimuth = np.radians(start) + np.linspace(0, reach, 8, endpoint=not closed)
+    rings = [np.column_stack([200 * np.cos(azimuth), 230 * np.sin(azimuth), np.full(8, z)]) for z in (-30.0, 25.0)]
+    centers = np.concatenate([*rings, [[190.0, 10.0, 90.0]]])
+    mixed = mph.PinholeSystem(centers[list(permutation)], 2.3, 60.0, 50.0, 10.0, 75.0)
+    order = mph.ring_order(mixed)
+    ordered = mixed[order]
+    assert sorted(order) == list(range(17)) and np.all(np.diff(ordered.rings()) >= 0)
+    assert np.array_equal(mph.ring_order(ordered), np.arange(17))
+    ways = set()
+    for ring in (0, 8):  # neighbours follow each other
+        steps = np.diff(np.unwrap(np.arctan2(ordered.centers[ring : ring + 8, 1], ordered.centers[ring : ring + 8, 0])))
+        assert np.all(steps * steps[0] > 0) and np.abs(steps).max() < 1.0
+        ways.add(np.sign(steps[0]))
+    assert len(ways) == 1

@@ -1,0 +1,10 @@
+"""Blender's float32 numbers, read as they were typed."""
+
+from __future__ import annotations
+
+import numpy as np
+
+
+def typed(value: float) -> float:
+    """The shortest decimal number that a float32 setting stands for: 0.1, not 0.10000000149."""
+    return float(str(np.float32(value)))

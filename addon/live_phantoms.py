@@ -1,0 +1,214 @@
+"""Phantoms follow their settings as these are edited: a sketch at once, the voxels when the edits rest.
+
+A slider that is dragged changes a setting many times a second, and voxels take longer than that. So every change shows
+a sketch, and once nothing has changed for a moment a thread makes the voxels, which take its place. Nothing reads a
+sketch for voxels: who needs them early has them made at once (`settle`).
+
+Voxels come after Blender has taken its undo step of the edit, so an undo or redo may bring a sketch back: then they are
+made again. Where there is no window nothing runs beside a script, and small phantoms are made anew at once.
+"""
+
+from __future__ import annotations
+
+import threading
+import time
+import traceback
+import warnings
+from dataclasses import dataclass, field
+from typing import Any
+
+import bpy
+
+from ..core.errors import InputError, InputWarning
+from ..core.progress import Cancelled
+from . import ids, jobs, phantoms, volumes
+
+LIVE_VOXELS = 64**3
+"""Up to so many voxels, of all its states, a phantom is made anew at once where there is no window."""
+
+REFINED_VOXELS = 128**3
+"""Up to so many a sketch becomes voxels by itself; more wait for Update Phantom."""
+
+_REST = 0.3  # s without an edit
+_INTERVAL = 0.1  # s between two looks
+_PATIENCE = 10.0  # s that stopping waits for a thread
+
+
+@dataclass
+class _Refinement:
+    """The voxels of one phantom on their way, in a thread."""
+
+    name: str
+    result: list[volumes.StoredVolume] | None = None
+    error: BaseException | None = None
+    caught: list[warnings.WarningMessage] = field(default_factory=list)
+    cancelled: threading.Event = field(default_factory=threading.Event)
+    thread: threading.Thread | None = None
+
+    def start(self, item: bpy.types.Object) -> None:
+        """Raises `InputError` where the settings make no phantom."""
+        make = phantoms.remaking(item)
+        self.thread = threading.Thread(target=self._work, args=(make,), name="mphDRR: refining", daemon=True)
+        self.thread.start()
+
+    def _work(self, make: Any) -> None:
+        try:
+            with warnings.catch_warnings(record=True) as self.caught:
+                warnings.simplefilter("always", InputWarning)
+                self.result = make(self._progress)
+        except BaseException as error:
+            self.error = error
+
+    def _progress(self, done: int, total: int) -> None:
+        if self.cancelled.is_set():
+            raise Cancelled
+
+
+_refinement: _Refinement | None = None
+_last_edit = 0.0  # by time.monotonic
+_given_up: set[str] = set()  # names of phantoms whose voxels cannot be made, until they change
+
+
+def settings_changed(item: Any, settings: Any) -> None:
+    """A setting was edited: show what it does, and say of what cannot be made, or is not made by itself, that it is so."""
+    if not isinstance(item, bpy.types.Object) or phantoms.settings_of(item) != settings:
+        return  # an operator's, or on its way
+    properties = getattr(item, ids.OBJECT_VOLUME)
+    properties.outdated, properties.message = True, ""
+    _cancel()
+    _given_up.discard(item.name)
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always", InputWarning)
+        try:
+            if _has_window() and not jobs.is_running():
+                phantoms.sketch(item)
+                _wait()
+            else:
+                make = phantoms.remaking(item)  # which finds what cannot be made
+                if settings.n_voxels <= LIVE_VOXELS and not jobs.is_running():
+                    phantoms.replace(item, make(None))
+                else:
+                    phantoms.update_outline(item)
+        except InputError as error:
+            properties.message = str(error)
+            return
+    properties.message = _first(caught)
+
+
+def settle(item: bpy.types.Object) -> None:
+    """Give a sketched phantom, or the one that a sketched volume belongs to, its voxels now.
+
+    Raises
+    ------
+    InputError
+        They are so many that this takes a job, or cannot be made.
+    """
+    phantom = phantoms.root_of(item)
+    _cancel()
+    if phantom is None or phantoms.settings_of(phantom).n_voxels > REFINED_VOXELS:
+        raise InputError(f"{item.name!r} is a sketch of what its settings say: press Update Phantom first")
+    phantoms.replace(phantom, phantoms.remaking(phantom)(None))
+
+
+def is_coming(item: bpy.types.Object) -> bool:
+    """Whether the voxels of a sketched phantom will be there by themselves."""
+    properties = getattr(item, ids.OBJECT_VOLUME)
+    settings = phantoms.settings_of(item)
+    is_sketch = properties.sketched and settings is not None and item.library is None
+    return is_sketch and settings.n_voxels <= REFINED_VOXELS and item.name not in _given_up
+
+
+@bpy.app.handlers.persistent
+def after_undo(*_: Any) -> None:
+    """Undo, redo and loading may bring sketches."""
+    _cancel()
+    _given_up.clear()
+    if _has_window() and any(is_coming(item) for item in bpy.data.objects):
+        _wait()
+
+
+@bpy.app.handlers.persistent
+def before_load(*_: Any) -> None:
+    """Nothing waits beyond its file."""
+    stop()
+
+
+def stop() -> None:
+    """Forget what waits: before a file is loaded, or the extension is disabled."""
+    running = _refinement
+    _cancel()
+    if running is not None and running.thread is not None:
+        running.thread.join(_PATIENCE)
+    if bpy.app.timers.is_registered(_look):
+        bpy.app.timers.unregister(_look)
+
+
+def _has_window() -> bool:
+    """Whether Blender's timers run."""
+    return not bpy.app.background
+
+
+def _wait() -> None:
+    global _last_edit
+    _last_edit = time.monotonic()
+    if not bpy.app.timers.is_registered(_look):
+        bpy.app.timers.register(_look, first_interval=_INTERVAL)
+
+
+def _cancel() -> None:
+    """What a thread is making now is of other settings than those that count."""
+    global _refinement
+    if _refinement is not None:
+        _refinement.cancelled.set()
+        _refinement = None
+
+
+def _look() -> float | None:
+    """Take what a thread has made, and start the next one."""
+    global _refinement
+    if time.monotonic() - _last_edit < _REST or jobs.is_running() or bpy.app.is_job_running("RENDER"):
+        return _INTERVAL
+    if _refinement is not None:
+        if _refinement.thread is not None and _refinement.thread.is_alive():
+            return _INTERVAL
+        done, _refinement = _refinement, None
+        _finish(done)
+        jobs.redraw_sidebars()
+    item = next((o for o in bpy.data.objects if is_coming(o)), None)
+    if item is None:
+        return None
+    started = _Refinement(item.name)
+    try:
+        started.start(item)
+        _refinement = started
+    except InputError as error:
+        _give_up(item, str(error))
+    return _INTERVAL
+
+
+def _finish(done: _Refinement) -> None:
+    item = bpy.data.objects.get(done.name)
+    if item is None or phantoms.settings_of(item) is None:
+        return
+    try:
+        if done.error is not None:
+            raise done.error
+        phantoms.replace(item, done.result or [])
+        getattr(item, ids.OBJECT_VOLUME).message = _first(done.caught)
+    except InputError as error:
+        _give_up(item, str(error))
+    except MemoryError:
+        _give_up(item, "not enough memory; choose fewer voxels")
+    except Exception as error:
+        traceback.print_exception(error)
+        _give_up(item, f"{type(error).__name__}: {error} (details in the console)")
+
+
+def _give_up(item: bpy.types.Object, message: str) -> None:
+    _given_up.add(item.name)
+    getattr(item, ids.OBJECT_VOLUME).message = message
+
+
+def _first(caught: list[warnings.WarningMessage]) -> str:
+    """The first of the warnings that are for the user."""
+    return next((str(w.message) for w in caught if issubclass(w.category, InputWarning)), "")

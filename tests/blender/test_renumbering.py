@@ -1,0 +1,107 @@
+"""Modules numbered anew: in the scene, in what is read from it, and in the workbook."""
+
+from __future__ import annotations
+
+import bpy
+import numpy as np
+import pytest
+
+import mphdrr.core as mph
+from mphdrr.addon import copies, scanner
+from mphdrr.core.system import PinholeSystem
+
+
+def names(collection) -> list[tuple[str, str]]:
+    return [(camera.name, camera.data.name) for camera in scanner.modules(collection)]
+
+
+def assert_whole(collection, numbers) -> None:
+    """Every module has its number, and its parts and all names follow it."""
+    found = scanner.modules(collection)
+    assert [camera.mphdrr_module.number for camera in found] == list(numbers)
+    assert [camera.name for camera in found] == [f"Module {n:02d}" for n in numbers]
+    for camera in found:
+        assert camera.data.name == camera.name
+        parts = [c for c in camera.children if c.mphdrr_module.part in {"COLLIMATOR", "CRYSTAL"}]
+        assert len(parts) == 2
+        for part in parts:
+            assert part.mphdrr_module.number == camera.mphdrr_module.number
+            assert part.name == part.data.name == camera.name.replace("Module", part.mphdrr_module.part.capitalize())
+
+
+def test_the_workbook_is_in_order(scene, dc_spect):
+    collection = scanner.build_scanner(scene, dc_spect)
+    assert bpy.ops.mphdrr.renumber_modules(order="RINGS") == {"FINISHED"}
+    read = scanner.read_scanner(collection)
+    assert np.array_equal(read.centers, dc_spect.centers) and read.source == dc_spect.source
+
+
+def test_a_mixed_system_is_sorted_and_nothing_else_changes(scene, dc_spect, tmp_path):
+    rng = np.random.default_rng(0)
+    kept = rng.permutation(80)[:33]
+    mixed = dc_spect[kept]
+    mixed = PinholeSystem(
+        mixed.centers, 2.3, mixed.collimator_length, 50.0, 10.0, 75.0, numbers=rng.permutation(500)[:33] + 1
+    )
+    collection = scanner.build_scanner(scene, mixed, "Mixed")
+    assert bpy.ops.mphdrr.renumber_modules() == {"FINISHED"}
+    assert_whole(collection, range(1, 34))
+    read = scanner.read_scanner(collection)
+    order = mph.ring_order(mixed)
+    assert np.array_equal(read.centers, mixed.centers[order]) and np.array_equal(read.numbers, np.arange(1, 34))
+    assert np.array_equal(read.collimator_length, mixed.collimator_length[order])
+    assert np.all(np.diff(read.rings()) >= 0)
+    before = names(collection)
+    assert bpy.ops.mphdrr.renumber_modules(order="LIST") == {"FINISHED"} and names(collection) == before
+    bpy.ops.mphdrr.export_geometry(filepath=str(tmp_path / "mixed.xlsx"))
+    assert np.array_equal(mph.read_system(tmp_path / "mixed.xlsx").numbers, np.arange(1, 34))
+
+
+def test_added_and_removed_modules_get_the_numbers_between(scene, workbook, tmp_path):
+    bpy.ops.mphdrr.import_geometry(filepath=str(workbook))
+    collection = scanner.active_scanner(scene)
+    system = scanner.read_scanner(collection)
+    gone = [scanner.module(collection, n) for n in (3, 4, 50)]
+    scanner.module(collection, 7).name = "Mine"
+    scanner.module(collection, 80).mphdrr_module.pinhole_diameter = 2.5
+    copies.remove(collection, gone)
+    (added,) = copies.duplicate(collection, [scanner.module(collection, 20)], 1, np.radians(10.0), False)
+    assert added.mphdrr_module.number == 81
+    place = scanner.read_scanner(collection).centers[-1]
+    assert bpy.ops.mphdrr.renumber_modules() == {"FINISHED"}
+    read = scanner.read_scanner(collection)
+    # The copy stands behind the first ring's last module, of which two are gone.
+    assert np.array_equal(read.numbers, np.arange(1, 79)) and read.source is None
+    assert np.array_equal(read.centers[18], place)
+    assert np.array_equal(np.delete(read.centers, 18, axis=0), np.delete(system.centers, [2, 3, 49], axis=0))
+    assert read.pinhole_diameter[-1] == 2.5 and scanner.module(collection, 5).name == "Mine"
+    # A further copy is the scanner's, whatever numbers its modules were imported with.
+    (copy,) = copies.duplicate(collection, [scanner.module(collection, 1)], 1, np.radians(-9.0), False)
+    assert copy.mphdrr_module.number == 79
+    bpy.ops.mphdrr.export_geometry(filepath=str(tmp_path / "new.xlsx"))
+    written = mph.read_system(tmp_path / "new.xlsx")
+    assert np.array_equal(written.numbers, np.arange(1, 80)) and np.allclose(
+        written.centers[:78], read.centers, atol=1e-9
+    )
+    scanner.build_scanner(scene, written, collection.mphdrr_scanner.scanner_name, replace=True)
+    assert len([o for o in scene.objects if o.type == "CAMERA" and o.mphdrr_module.is_module]) == 79
+
+
+def test_renumbering_is_undone_at_once(scene, ring_system):
+    system = PinholeSystem(ring_system.centers[::-1], 2.3, 55.0, 48.0, 9.5, 60.0, numbers=np.arange(11, 19))
+    scanner.build_scanner(scene, system, "Rings")
+    bpy.ops.ed.undo_push(message="built")
+    assert bpy.ops.mphdrr.renumber_modules() == {"FINISHED"}
+    bpy.ops.ed.undo_push(message="renumbered")
+    assert_whole(bpy.data.collections["Rings"], range(1, 9))
+    assert bpy.ops.ed.undo() == {"FINISHED"}
+    assert_whole(bpy.data.collections["Rings"], range(11, 19))
+    assert np.array_equal(scanner.read_scanner(bpy.data.collections["Rings"]).centers, system.centers)
+
+
+def test_copies_are_tidied_first(scene, ring_system):
+    collection = scanner.build_scanner(scene, ring_system)
+    camera = scanner.module(collection, 2)
+    camera.users_collection[0].objects.link(camera.copy())
+    with pytest.raises(RuntimeError, match="1 copied camera: press Tidy Modules"):
+        bpy.ops.mphdrr.renumber_modules()

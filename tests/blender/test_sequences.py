@@ -1,0 +1,128 @@
+"""What beats: states that follow each other frame by frame, shown and projected."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+bpy = pytest.importorskip("bpy")
+
+from mphdrr.addon import scanner, storage, volumes  # noqa: E402
+from mphdrr.core.export import read_run  # noqa: E402
+from mphdrr.core.grid import Grid  # noqa: E402
+from mphdrr.core.phantoms.torso import CardiacTorso  # noqa: E402
+from mphdrr.core.projector import Projector  # noqa: E402
+from mphdrr.core.volume import Volume  # noqa: E402
+from mphdrr.core.volume_io import write_volume  # noqa: E402
+
+
+def state(k: int, count: int, voxels: int, quantity: str = "activity", **settings) -> Volume:
+    """State `k`, from 0, of a beating torso on a cube that holds its box."""
+    torso = CardiacTorso(**settings).beating(count)[k]
+    low, high = torso.box
+    grid = Grid.centered((voxels,) * 3, (high - low).max() / (voxels - 2), (low + high) / 2)
+    return torso.voxelize(grid, quantity=quantity)
+
+
+def test_every_frame_has_its_state_of_the_torso(scene):
+    assert bpy.ops.mphdrr.add_torso(voxels=10, frames=2, attenuation=True) == {"FINISHED"}
+    item = bpy.context.object
+    mu, states = item.children[0], [state(k, 2, 10).array for k in range(2)]
+    for frame in (1, 2, 3):
+        scene.frame_set(frame)
+        assert np.array_equal(volumes.volume_from_object(item).array, states[(frame - 1) % 2])
+        for one in (item, mu):
+            assert one.data.grids.load() and volumes.file_of(one) == Path(one.data.grids.frame_filepath)
+        assert volumes.state_text(mu) == f"{(frame - 1) % 2 + 1} of 2"
+    assert np.array_equal(volumes.volume_from_object(mu).array, state(0, 2, 10, "mu").array)
+
+    # What was set on the sequence stays when its settings change.
+    item.data.frame_start, item.data.sequence_mode = 2, "EXTEND"
+    item.mphdrr_volume.torso.myocardium = 70
+    assert volumes.state_text(item) == "2 of 2"
+    assert np.array_equal(volumes.volume_from_object(item).array, state(1, 2, 10, myocardium=70).array)
+    assert (item.data.frame_start, item.data.sequence_mode) == (2, "EXTEND")
+
+
+def test_the_current_frame_is_projected(scene, ring_system):
+    scanner.build_scanner(scene, ring_system)
+    bpy.ops.mphdrr.add_torso(voxels=16, frames=2)
+    views = ring_system.views(shape=(12, 10))
+    for frame in (1, 2):
+        expected = state(frame - 1, 2, 16)
+        scene.frame_set(frame)
+        assert bpy.ops.mphdrr.render_projections(width=10, height=12) == {"FINISHED"}
+        run = read_run(storage.absolute(scene.mphdrr_projections.run_file))
+        np.testing.assert_allclose(run.projections, Projector(expected.grid, views)(expected), rtol=1e-5, atol=1e-3)
+        assert run.settings["state"] == f"{frame} of 2" and run.settings["frame"] == frame
+        assert run.settings["frames"] == 2
+
+
+@pytest.fixture
+def halves(tmp_path) -> list[dict[str, str]]:
+    """Files whose voxels are bright at low, then at high x, both beside the isocentre; named as numbers sort."""
+    names = []
+    for number, half in ((9, slice(0, 4)), (10, slice(4, 8))):
+        array = np.zeros((8, 8, 8), np.float32)
+        array[half] = 1.0
+        place = np.diag([2.0, 2.0, 2.0, 1.0])
+        place[:3, 3] = 10.0 * number, 5.0, 7.0
+        names.append({"name": f"beat_{number}.npz"})
+        write_volume(Volume(array, Grid(array.shape, place), "activity"), tmp_path / names[-1]["name"])
+    return names[::-1]
+
+
+def test_files_follow_each_other_as_shown(tmp_path, halves, scene):
+    arguments = {"directory": str(tmp_path), "files": halves, "frame_start": 5}
+    assert bpy.ops.mphdrr.import_volume_sequence(**arguments) == {"FINISHED"}
+    item = bpy.context.object
+    assert item.name == "beat" and item.data.frame_duration == 2 and item.data.frame_start == 5
+    bright = {}
+    for frame in (5, 6, 7):
+        scene.frame_set(frame)
+        volume = volumes.volume_from_object(item)
+        # Moved together: the first file's middle lies at the isocentre, the second's 10 mm beside it as it did.
+        np.testing.assert_allclose(volume.grid.center, (10.0 * (frame == 6), 0, 0), atol=1e-9)
+        bright[frame] = _brightness(scene)
+    left, right = bright[5]
+    assert left > 5 * right and bright[7] == bright[5]
+    left, right = bright[6]
+    assert right > 5 * left
+
+
+def _brightness(scene) -> tuple[float, float]:
+    """Of the left and the right half of Cycles' picture from the front, the first file's cube in its middle."""
+    for other in [o for o in scene.objects if o.type != "VOLUME"]:
+        bpy.data.objects.remove(other)
+    camera = bpy.data.objects.new("Camera", bpy.data.cameras.new("Camera"))
+    scene.collection.objects.link(camera)
+    camera.location, camera.rotation_euler = (0, -100, 0), (np.pi / 2, 0, 0)
+    camera.data.type, camera.data.ortho_scale = "ORTHO", 40.0
+    scene.camera, scene.world, scene.render.engine, scene.cycles.samples = camera, None, "CYCLES", 4
+    if hasattr(scene.cycles, "volume_biased"):
+        scene.cycles.volume_biased = True  # 5.2's other way takes a hundred times as long
+    scene.render.resolution_x = scene.render.resolution_y = 16
+    scene.render.resolution_percentage = 100
+    scene.render.filepath = str(Path(bpy.app.tempdir) / "frame.png")
+    bpy.ops.render.render(write_still=True)
+    image = bpy.data.images.load(scene.render.filepath)
+    picture = np.array(image.pixels).reshape(16, 16, 4)[..., :3].sum(axis=(0, 2))
+    bpy.data.images.remove(image)
+    return float(picture[:8].sum()), float(picture[8:].sum())
+
+
+def test_files_that_are_no_sequence_are_refused(tmp_path, halves):
+    def refused(message: str, *names: str) -> None:
+        before = len(bpy.data.objects)
+        with pytest.raises(RuntimeError, match=message):
+            bpy.ops.mphdrr.import_volume_sequence(directory=str(tmp_path), files=[{"name": n} for n in names])
+        assert len(bpy.data.objects) == before
+
+    refused("two files or more")
+    refused("two files or more", "beat_9.npz", "beat_9.npz")
+    refused(r"slice\.dcm: expected a name ending in .*a DICOM series is one volume", "beat_9.npz", "slice.dcm")
+    refused(r"beat_11\.npz: no such file", "beat_9.npz", "beat_11.npz")
+    write_volume(Volume(np.ones((2, 2, 2), np.float32), Grid((2, 2, 2), np.eye(4)), "mu"), tmp_path / "beat_11.npz")
+    refused("volumes of one quantity, got activity, mu", "beat_9.npz", "beat_11.npz")

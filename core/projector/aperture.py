@@ -24,8 +24,8 @@ _GOLDEN_ANGLE = math.pi * (3 - math.sqrt(5))
 _MOST_POINTS = 1000
 # The lattice, points across, that stands for the disk itself where numbers of points are compared.
 _LATTICE = 160
-# Places of a pixel's edge at which an image is looked at: in a pixel at least, and across a whole image.
-_FEWEST_PLACES, _PLACES = 4, 32
+# Places across a whole image at which a pixel's edge may cut it.
+_PLACES = 32
 
 # Gauss-Laguerre nodes and weights beyond the rim: exact on the axis, where transmission falls exponentially.
 _ROOT = math.sqrt(2)
@@ -101,7 +101,7 @@ def _point_images(points: Array, shadow: float, pitch: tuple[float, float], blur
     for middles, size, width in zip(points.T * (shadow / 2), pitch, blur, strict=True):
         extent = 1.2 * shadow + width  # of the image
         size = min(size, extent)  # wider pixels cut it no more often
-        places = max(_FEWEST_PLACES, math.ceil(_PLACES * size / extent))
+        places = math.ceil(_PLACES * size / extent)
         half = math.ceil(extent / 2 / size) + 1
         edges = np.arange(-half * places, half * places) * (size / places)
         before = np.clip((edges - middles[:, None]) / max(width, 1e-9 * size) + 0.5, 0, 1)

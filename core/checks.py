@@ -8,6 +8,10 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from .errors import InputError
+from .memory import require
+
+# Numbers whose copy may not fit into memory.
+_MANY = 2**20
 
 
 def real_array(value: ArrayLike, name: str, shape: tuple[int | None, ...], dtype: Any = np.float64) -> NDArray[Any]:
@@ -27,17 +31,19 @@ def real_array(value: ArrayLike, name: str, shape: tuple[int | None, ...], dtype
     Raises
     ------
     InputError
-        Not numbers, another shape, or not finite (the first bad index is named).
+        Not numbers, another shape, not finite (the first bad index is named), or more than memory holds.
     """
     try:
         raw = np.asarray(value)
         if raw.dtype.kind not in "fiub":
             raise TypeError
-        array = np.array(raw, dtype=dtype, order="C")
     except (TypeError, ValueError, OverflowError):
         raise InputError(f"{name}: expected real numbers, got {type(value).__name__} {_short(value)}") from None
     except RuntimeError as error:  # a torch tensor that is part of a graph: torch says what to do
         raise InputError(f"{name}: {error}") from None
+    if raw.size > _MANY:
+        require(raw.size * np.dtype(dtype).itemsize, f"{name} of {_shape(raw.shape)} numbers")
+    array = np.array(raw, dtype=dtype, order="C")
     if array.ndim != len(shape) or any(n is not None and n != m for n, m in zip(shape, array.shape, strict=True)):
         expected = " x ".join("any" if n is None else str(n) for n in shape) or "one number"
         raise InputError(f"{name}: expected shape {expected}, got {_shape(array.shape)}")

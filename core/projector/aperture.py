@@ -24,6 +24,8 @@ _GOLDEN_ANGLE = math.pi * (3 - math.sqrt(5))
 _MOST_POINTS = 1000
 # The lattice, points across, that stands for the disk itself where numbers of points are compared.
 _LATTICE = 160
+# Places across a whole image at which a pixel's edge may cut it.
+_PLACES = 32
 
 # Gauss-Laguerre nodes and weights beyond the rim: exact on the axis, where transmission falls exponentially.
 _ROOT = math.sqrt(2)
@@ -55,9 +57,9 @@ def disk_points(n: int) -> Array:
 def points_needed(tolerance: float, shadow: float, pitch: tuple[float, float], blur: tuple[float, float]) -> int:
     """The fewest of 1, 3, 4 ... `disk_points` (in steps of a quarter) with which a point's image is good enough.
 
-    The sum over the pixels of the absolute error of its image, as a share of its counts, is at most `tolerance`. The
-    images of many points add up, and so do at most their errors: the bound holds for every activity whose points'
-    shadows are like this one.
+    The sum over the pixels of the absolute error of its image, as a share of its counts, is at most `tolerance`, wherever
+    the pixels' edges cut it. The images of many points add up, and so do at most their errors: the bound holds for every
+    activity whose points' shadows are like this one.
 
     Parameters
     ----------
@@ -77,9 +79,9 @@ def points_needed(tolerance: float, shadow: float, pitch: tuple[float, float], b
     """
     ticks = (np.arange(_LATTICE) + 0.5) / _LATTICE * 2 - 1
     lattice = np.stack(np.meshgrid(ticks, ticks), axis=-1).reshape(-1, 2)
-    exact = _point_image(lattice[(lattice**2).sum(axis=1) < 1], shadow, pitch, blur)
+    exact = _point_images(lattice[(lattice**2).sum(axis=1) < 1], shadow, pitch, blur)
     n = 1
-    while np.abs(_point_image(disk_points(n), shadow, pitch, blur) - exact).sum() > tolerance:
+    while np.abs(_point_images(disk_points(n), shadow, pitch, blur) - exact).sum(axis=(0, 2)).max() > tolerance:
         n = 3 if n == 1 else n + math.ceil(n / 4)
         if n > _MOST_POINTS:
             raise InputError(
@@ -89,15 +91,24 @@ def points_needed(tolerance: float, shadow: float, pitch: tuple[float, float], b
     return n
 
 
-def _point_image(points: Array, shadow: float, pitch: tuple[float, float], blur: tuple[float, float]) -> Array:
-    """Shares of a point's counts in the pixels around it, seen through `points` of the unit disk alike."""
+def _point_images(points: Array, shadow: float, pitch: tuple[float, float], blur: tuple[float, float]) -> Array:
+    """Shares of a point's counts in the pixels around it, seen through `points` of the unit disk alike.
+
+    (n_v, places, n_u, places): for many places of the pixels' edges along v and u, evenly over a pixel.
+    """
     along: list[Array] = []
-    for places, size, width in zip(points.T * (shadow / 2), pitch, blur, strict=True):
-        half = math.ceil((shadow * 0.6 + width / 2) / size) + 1
-        edges = (np.arange(-half, half + 1) + 0.5) * size
-        beyond = np.clip((edges - places[:, None]) / max(width, 1e-9 * size) + 0.5, 0, 1)
-        along.append(np.diff(beyond, axis=1))
-    return along[1].T @ along[0] / len(points)
+    counts: list[int] = []
+    for middles, size, width in zip(points.T * (shadow / 2), pitch, blur, strict=True):
+        extent = 1.2 * shadow + width  # of the image
+        size = min(size, extent)  # wider pixels cut it no more often
+        places = math.ceil(_PLACES * size / extent)
+        half = math.ceil(extent / 2 / size) + 1
+        edges = np.arange(-half * places, half * places) * (size / places)
+        before = np.clip((edges - middles[:, None]) / max(width, 1e-9 * size) + 0.5, 0, 1)
+        along.append(before[:, places:] - before[:, :-places])
+        counts.append(places)
+    images = along[1].T @ along[0] / len(points)
+    return images.reshape(-1, counts[1], images.shape[1] // counts[0], counts[0])
 
 
 @dataclass(frozen=True)

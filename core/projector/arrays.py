@@ -53,8 +53,7 @@ def checked(value: ArrayOrTensor, name: str, shape: tuple[int, ...], float64: bo
 def _checked_tensor(value: Any, name: str, shape: tuple[int, ...], float64: bool) -> Any:
     import torch
 
-    if value.is_complex() or value.is_sparse or value.is_quantized:
-        raise InputError(f"{name}: expected a dense tensor of real numbers, got {value.dtype}, {value.layout}")
+    require_numbers(value, name)
     if tuple(value.shape) != shape:
         raise InputError(f"{name}: expected shape {_times(shape)}, got {_times(value.shape)}")
     if value.dtype != torch.float64:
@@ -62,6 +61,13 @@ def _checked_tensor(value: Any, name: str, shape: tuple[int, ...], float64: bool
     if not bool(torch.isfinite(value.detach().sum())):
         require_finite(value.detach().cpu().numpy(), name)
     return value
+
+
+def require_numbers(tensor: Any, name: str) -> None:
+    """Raise `InputError` unless a tensor holds real numbers, all of them."""
+    if tensor.is_complex() or tensor.is_quantized or tensor.is_meta or str(tensor.layout) != "torch.strided":
+        kind = f"{tensor.dtype}, {tensor.layout}, on {tensor.device}"
+        raise InputError(f"{name}: expected a dense tensor of real numbers, got {kind}")
 
 
 def to_numpy(value: ArrayOrTensor, dtype: Any) -> np.ndarray[Any, Any]:

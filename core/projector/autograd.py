@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from ..errors import InputError
+from .arrays import require_numbers
 from .tracing import Bundle, Ends, fan_vectors, fans, fitting_count, points
 
 if TYPE_CHECKING:
@@ -90,17 +91,18 @@ def trace_rays(volume: Any, sources: Any, targets: Any, mu: Any, tracer: Tracer)
 
 def trace_fans(volume: Any, vectors: Any, shape: tuple[int, int], mu: Any, tracer: Tracer) -> Tensor:
     """Line integrals (..., lines, rays) along the fans of `vectors` (..., 4, 3), likewise."""
-    numbers = _numbers(vectors, fan_vectors)
+    numbers = _numbers(vectors, fan_vectors, "vectors")
     integrals = _Trace.apply(volume, mu, numbers, lambda vectors: fans(vectors, shape), tracer)
     return _of_kind(integrals.reshape(*numbers.shape[:-2], *shape), volume, vectors)
 
 
-def _numbers(value: Any, checked: Callable[..., NDArray[np.float64]], *name: str) -> Tensor:
+def _numbers(value: Any, checked: Callable[[Any, str], NDArray[np.float64]], name: str) -> Tensor:
     """`value`, which is `checked`, as a tensor of float64 on the CPU, where rays are made; still in its graph."""
     if not isinstance(value, Tensor):
-        return torch.from_numpy(checked(value, *name))
-    shape = checked(value.numpy(force=True), *name).shape
-    return value.to("cpu", torch.float64).reshape(shape)
+        return torch.from_numpy(checked(value, name))
+    require_numbers(value, name)
+    value = value.to("cpu", torch.float64)
+    return value.reshape(checked(value.numpy(force=True), name).shape)
 
 
 def _of_kind(integrals: Tensor, volume: Any, *geometry: Any) -> Tensor:

@@ -10,12 +10,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..checks import positive
+from ..checks import positive, real_array
 from ..errors import InputError
 from ..grid import Grid
 from ..views import Views
 from ..volume import Volume
-from .arrays import ArrayOrTensor, namespace
+from .arrays import ArrayOrTensor, is_tensor, namespace
 from .rays import Fan
 
 Array = NDArray[np.float64]
@@ -114,8 +114,11 @@ def intensity(line_integrals: ArrayOrTensor, photons: float) -> ArrayOrTensor:
     Raises
     ------
     InputError
-        `photons` is not a number above 0.
+        `photons` is not a number above 0, or the line integrals are no real, finite numbers.
     """
+    if not is_tensor(line_integrals):
+        kind = np.float32 if getattr(line_integrals, "dtype", None) == np.float32 else np.float64
+        line_integrals = real_array(line_integrals, "line integrals", (None,) * np.ndim(line_integrals), kind)
     return positive(photons, "photons") * namespace(line_integrals).exp(-line_integrals)
 
 

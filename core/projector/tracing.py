@@ -124,7 +124,7 @@ def trace_fans(
         from . import autograd
 
         return autograd.trace_fans(array, vectors, (n_lines, n_rays), mu, tracer)
-    numbers = fan_vectors(vectors)
+    numbers = fan_vectors(vectors, "vectors")
     integrals = tracer.integrals(array, fans(numbers, (n_lines, n_rays)), mu)
     integrals = integrals.reshape(*numbers.shape[:-2], n_lines, n_rays)
     return integrals if backend == "numpy" else integrals.astype(np.float32)
@@ -448,12 +448,13 @@ def fans(vectors: Points, shape: tuple[int, int]) -> list[Fan]:
     ]
 
 
-def fan_vectors(value: ArrayLike) -> Points:
+def fan_vectors(value: ArrayLike, name: str) -> Points:
     """`value` as an array (..., 4, 3) of real, finite numbers, or `InputError`."""
-    shape = np.shape(value)
+    shape = _shape(value)
+    vectors = real_array(value, name, shape)
     if shape[-2:] != (4, 3):
-        raise InputError(f"vectors: expected ... x 4 x 3, got shape {shape}")
-    return real_array(value, "vectors", shape)
+        raise InputError(f"{name}: expected ... x 4 x 3, got shape {shape}")
+    return vectors
 
 
 def _field(
@@ -485,12 +486,17 @@ def fitting_count(n_sources: int, n_targets: int) -> int:
     return n_targets if n_sources == 1 else n_sources
 
 
+def _shape(value: ArrayLike) -> tuple[int, ...]:
+    """The shape of `value`; () of what `real_array` refuses: what is ragged, or tensors of a graph in a list."""
+    try:
+        return np.shape(value)
+    except (ValueError, RuntimeError):
+        return ()
+
+
 def points(value: ArrayLike, name: str) -> Points:
     """`value`, one point (3,) or many (n, 3), as an array (n, 3), or `InputError`."""
-    try:
-        shape = np.shape(value)
-    except ValueError:  # ragged: real_array says so
-        shape = ()
+    shape = _shape(value)
     if shape == (0,):  # an empty list
         return np.empty((0, 3))
     return real_array(value, name, (3,))[None] if len(shape) == 1 else real_array(value, name, (None, 3))

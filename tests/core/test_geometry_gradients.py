@@ -287,6 +287,7 @@ def test_kinds_of_arguments(rng):
     trace_rays(Volume(array, grid), one, targets).sum().backward()
     assert one.grad.shape == (3,) and one.grad.dtype == torch.float32
     assert trace_rays(Volume(array, grid), one, torch.zeros((0, 3))).shape == (0,)
+    assert trace_rays(Volume(array, grid), one.bfloat16(), targets).dtype == torch.bfloat16
     assert trace_fans(Volume(array, grid), torch.zeros((0, 4, 3)), (2, 3)).shape == (0, 2, 3)
 
 
@@ -301,6 +302,8 @@ def test_bad_input_is_one_clear_line():
         (lambda: trace_rays(ones, torch.zeros((2, 3)), torch.zeros((4, 3)), grid=grid), "2 sources"),
         (lambda: trace_rays(ones, point, torch.tensor([0, 0, np.nan]), grid=grid), "targets"),
         (lambda: trace_rays(ones, point, torch.zeros(3, dtype=torch.complex64), grid=grid), "targets"),
+        (lambda: trace_rays(ones, point, torch.zeros(1, 3).to_sparse(), grid=grid), "targets"),
+        (lambda: trace_rays(ones, [torch.zeros(3, requires_grad=True)], point, grid=grid), "detach"),
         (lambda: trace_fans(ones, torch.zeros(2, 3), (2, 2), grid=grid), "4 x 3"),
         (lambda: trace_fans(ones, torch.full((4, 3), np.nan), (2, 2), grid=grid), "vectors"),
         (lambda: trace_fans(ones, torch.zeros(4, 3), (2, 0), grid=grid), "shape"),

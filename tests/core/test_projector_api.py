@@ -174,6 +174,12 @@ def test_what_cannot_fit_is_refused_before_it_starts(monkeypatch):
     refused(lambda: A.T(np.ones(A.shape_out)), "5 x 4 x 3", "memory")
 
 
+def test_a_copy_that_cannot_fit_is_refused_before_it_is_made():
+    grid = Grid.centered((10**5, 10**5, 10**4), 1.0)
+    of_a_number = np.broadcast_to(np.float32(1), grid.shape)
+    refused(lambda: Projector(grid, VIEWS)(of_a_number), "volume of 100000 x 100000 x 10000", "of memory")
+
+
 @needs_numba
 def test_rays_that_cannot_fit_are_refused_before_they_are_made():
     views = Views([[0, 0, -9]], [[0, 0, 9]], [[1, 0, 0]], [[0, 1, 0]], shape=(10**6, 10**6))

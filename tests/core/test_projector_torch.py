@@ -105,6 +105,7 @@ def test_bad_tensors_are_one_clear_line():
         (torch.ones(3, 3, 3), "5 x 4 x 3"),
         (torch.ones(GRID.shape, dtype=torch.complex64), "complex64"),
         (torch.ones(GRID.shape).to_sparse(), "sparse"),
+        (torch.ones(GRID.shape, device="meta"), "meta"),
     ):
         with pytest.raises(InputError) as error:
             A(bad)

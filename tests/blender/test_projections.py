@@ -107,12 +107,13 @@ def test_materials_of_the_panel_are_those_of_core(scanned, scene):
     settings = scene.mphdrr_projections
     settings.model, settings.isotope = "EMISSION", "Tl-201"
     settings.aperture_material, settings.crystal_material = "tungsten", "NaI"
-    model = Emission(scanned, isotope="Tl-201", aperture_mu="tungsten", crystal_mu="NaI")
-    for given, aperture in (({}, model.aperture_mu), ({"aperture_mu": 5.0}, 5.0)):
+    for given, aperture in (({}, "tungsten"), ({"aperture_mu": 5.0}, 5.0)):
+        model = Emission(scanned, isotope="Tl-201", aperture_mu=aperture, crystal_mu="NaI")
         assert bpy.ops.mphdrr.render_projections(width=4, height=4, **given) == {"FINISHED"}
         record = read_run(storage.absolute(settings.run_file)).settings
-        # Weighed with the scene's crystals, which float32 holds.
-        assert (record["aperture_mu"], record["crystal_mu"]) == pytest.approx((aperture, model.crystal_mu), rel=1e-6)
+        # Weighed with the scene's modules, which float32 holds.
+        expected = model.aperture_mu, model.crystal_mu
+        assert (record["aperture_mu"], record["crystal_mu"]) == pytest.approx(expected, rel=1e-6)
 
 
 def test_photons_of_a_radiograph_and_the_inverse_square_sum(scanned, scene, body):

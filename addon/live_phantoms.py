@@ -190,6 +190,8 @@ def _finish(done: _Refinement) -> None:
     item = bpy.data.objects.get(done.name)
     if item is None or phantoms.settings_of(item) is None:
         return
+    if done.result is not None and len(done.result) != len(phantoms.with_children(item)):
+        return  # a volume of it has come or gone in the meantime: it is made once more
     try:
         if done.error is not None:
             raise done.error

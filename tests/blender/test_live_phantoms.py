@@ -120,6 +120,35 @@ def test_nobody_takes_a_sketch_for_voxels(item, scene, ring_system, monkeypatch)
     assert_made(item)
 
 
+def test_a_volume_that_goes_while_it_is_being_made(item):
+    item.mphdrr_volume.shepp_logan.half_size = 50
+    assert live_phantoms._look() is not None
+    bpy.data.objects.remove(item.children[0])
+    rest()
+    assert_made(item)
+
+
+def test_a_setting_that_changes_while_an_update_is_made(item, monkeypatch):
+    remaking, settings = phantoms.remaking, item.mphdrr_volume.shepp_logan
+
+    def edited_meanwhile(*arguments):
+        work = remaking(*arguments)
+
+        def working(progress):
+            made = work(progress)
+            settings.half_size = 55
+            return made
+
+        return working
+
+    monkeypatch.setattr(phantoms, "remaking", edited_meanwhile)
+    assert bpy.ops.mphdrr.update_phantom() == {"FINISHED"}
+    assert item.mphdrr_volume.outdated
+    monkeypatch.undo()
+    assert bpy.ops.mphdrr.update_phantom() == {"FINISHED"}
+    assert_made(item)
+
+
 def test_undo_redo_and_files_bring_sketches_that_become_voxels(item, tmp_path):
     name = item.name
     bpy.ops.ed.undo_push(message="added")

@@ -14,6 +14,7 @@ import threading
 import time
 import traceback
 import warnings
+from contextlib import ExitStack
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -44,20 +45,27 @@ class _Refinement:
     caught: list[warnings.WarningMessage] = field(default_factory=list)
     cancelled: threading.Event = field(default_factory=threading.Event)
     thread: threading.Thread | None = None
+    _catching: ExitStack = field(default_factory=ExitStack)
 
     def start(self, item: bpy.types.Object) -> None:
         """Raises `InputError` where the settings make no phantom."""
         make = phantoms.remaking(item)
+        # Begun and ended by Blender's main thread: of two threads, one would put back what the other had set.
+        self.caught = self._catching.enter_context(warnings.catch_warnings(record=True))
+        warnings.simplefilter("always", InputWarning)
         self.thread = threading.Thread(target=self._work, args=(make,), name="mphDRR: refining", daemon=True)
         self.thread.start()
 
     def _work(self, make: Any) -> None:
         try:
-            with warnings.catch_warnings(record=True) as self.caught:
-                warnings.simplefilter("always", InputWarning)
-                self.result = make(self._progress)
+            self.result = make(self._progress)
         except BaseException as error:
             self.error = error
+
+    def end(self) -> None:
+        """It is done, or nobody waits for it any more."""
+        self.cancelled.set()
+        self._catching.close()
 
     def _progress(self, done: int, total: int) -> None:
         if self.cancelled.is_set():
@@ -156,10 +164,10 @@ def _wait() -> None:
 
 
 def _cancel() -> None:
-    """What a thread is making now is of other settings than those that count."""
+    """What a thread is making now is done, or of other settings than those that count."""
     global _refinement
     if _refinement is not None:
-        _refinement.cancelled.set()
+        _refinement.end()
         _refinement = None
 
 
@@ -171,7 +179,8 @@ def _look() -> float | None:
     if _refinement is not None:
         if _refinement.thread is not None and _refinement.thread.is_alive():
             return _INTERVAL
-        done, _refinement = _refinement, None
+        done = _refinement
+        _cancel()
         _finish(done)
         jobs.redraw_sidebars()
     item = next((o for o in bpy.data.objects if is_coming(o)), None)
@@ -190,6 +199,8 @@ def _finish(done: _Refinement) -> None:
     item = bpy.data.objects.get(done.name)
     if item is None or phantoms.settings_of(item) is None:
         return
+    if done.result is not None and len(done.result) != len(phantoms.with_children(item)):
+        return  # a volume of it has come or gone in the meantime: it is made once more
     try:
         if done.error is not None:
             raise done.error

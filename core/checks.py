@@ -14,7 +14,9 @@ from .memory import require
 _MANY = 2**20
 
 
-def real_array(value: ArrayLike, name: str, shape: tuple[int | None, ...], dtype: Any = np.float64) -> NDArray[Any]:
+def real_array(
+    value: ArrayLike, name: str, shape: tuple[int | None, ...] | None, dtype: Any = np.float64
+) -> NDArray[Any]:
     """`value` as an array of real, finite numbers of `shape`; a new array, never a view of the caller's.
 
     Parameters
@@ -24,7 +26,7 @@ def real_array(value: ArrayLike, name: str, shape: tuple[int | None, ...], dtype
     name
         What to call it in the error.
     shape
-        The shape expected; None stands for any length.
+        The shape expected, in which None stands for any length; None: any shape.
     dtype
         The result's type.
 
@@ -44,7 +46,9 @@ def real_array(value: ArrayLike, name: str, shape: tuple[int | None, ...], dtype
     if raw.size > _MANY:
         require(raw.size * np.dtype(dtype).itemsize, f"{name} of {_shape(raw.shape)} numbers")
     array = np.array(raw, dtype=dtype, order="C")
-    if array.ndim != len(shape) or any(n is not None and n != m for n, m in zip(shape, array.shape, strict=True)):
+    if shape is not None and (
+        array.ndim != len(shape) or any(n is not None and n != m for n, m in zip(shape, array.shape, strict=True))
+    ):
         expected = " x ".join("any" if n is None else str(n) for n in shape) or "one number"
         raise InputError(f"{name}: expected shape {expected}, got {_shape(array.shape)}")
     require_finite(array, name)

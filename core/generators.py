@@ -296,7 +296,13 @@ def ring_order(system: PinholeSystem) -> NDArray[np.intp]:
 
     An open ring begins beside its gap, a closed one at the module that comes first in the system.
     ``system[ring_order(system)]`` is the system in that order; numbers stay with their modules.
+
+    Raises
+    ------
+    InputError
+        It is no system.
     """
+    instance(system, PinholeSystem, "ring_order")
     ring_of = system.rings()
     rings = [np.flatnonzero(ring_of == ring) for ring in range(ring_of.max() + 1)]
     clockwise = _run_clockwise(system, rings)

@@ -96,10 +96,12 @@ def diffdrr_density(hu: Volume | NDArray[Any], bone_attenuation_multiplier: floa
     Raises
     ------
     InputError
-        Not finite real numbers.
+        Not finite real numbers, or none at all.
     """
     factor = np.float32(real_array(bone_attenuation_multiplier, "bone_attenuation_multiplier", ()))
-    hu = hu.array if isinstance(hu, Volume) else real_array(hu, "CT numbers", (None,) * np.ndim(hu), np.float32)
+    hu = hu.array if isinstance(hu, Volume) else real_array(hu, "CT numbers", None, np.float32)
+    if not hu.size:
+        raise InputError("CT numbers: expected at least one")
     tissue = hu[(hu > DIFFDRR_AIR) & (hu <= DIFFDRR_BONE)]
     density = np.where(hu > DIFFDRR_BONE, hu * factor, hu)
     if tissue.size:

@@ -104,13 +104,10 @@ def attenuation(material: str, energy: float) -> float:
     W. T. Elam, B. D. Ravel, J. R. Sieber, "A new atomic database for X-ray spectroscopic calculations", Radiation
     Physics and Chemistry 63 (2002) 121-128.
     """
-    name = _NAMES.get(material.lower().replace("_", " ").replace("-", " ")) if isinstance(material, str) else None
-    if name is None:
-        raise InputError(f"material {material!r}: expected one of {', '.join(MATERIALS)}")
+    made = _known(material)
     energy = positive(energy, "energy", "keV")
     if not ENERGIES[0] <= energy <= ENERGIES[-1]:
         raise InputError(f"energy {energy:g} keV: expected {ENERGIES[0]:g} to {ENERGIES[-1]:g} keV")
-    made = MATERIALS[name]
     return made.density / 10 * sum(share * _coefficient(symbol, energy) for symbol, share in made.composition.items())
 
 
@@ -159,15 +156,24 @@ def module_coefficients(
     return aperture, crystal
 
 
+def _known(material: str) -> Material:
+    name = _NAMES.get(material.lower().replace("_", " ").replace("-", " ")) if isinstance(material, str) else None
+    if name is None:
+        raise InputError(f"material {material!r}: expected one of {', '.join(MATERIALS)}")
+    return MATERIALS[name]
+
+
 def _at_lines(material: str, lines: Sequence[tuple[float, float]], name: str) -> NDArray[np.float64]:
+    try:
+        _known(material)  # also where there are no lines
+        coefficients = [attenuation(material, energy) for energy, _ in lines]
+    except InputError as error:
+        raise InputError(f"{name}: {error}") from None
     if not lines:
         raise InputError(
             f"{name} {material!r}: at which energy? expected an isotope with photons in its window, or a number, 1/mm"
         )
-    try:
-        return np.array([attenuation(material, energy) for energy, _ in lines])
-    except InputError as error:
-        raise InputError(f"{name}: {error}") from None
+    return np.array(coefficients)
 
 
 def _coefficient(symbol: str, energy: float) -> float:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
@@ -39,8 +37,9 @@ def sample_counts(mean: ArrayLike, seed: int) -> NDArray[np.int64]:
     """
     if isinstance(seed, bool) or not isinstance(seed, int | np.integer) or seed < 0:
         raise InputError(f"seed: expected a whole number of at least 0, got {seed!r}")
-    shape: tuple[Any, ...] = (None,) * max(np.ndim(mean), 1)
-    values = real_array(mean, "expected counts", shape)
+    values = real_array(mean, "expected counts", None)
+    if not values.ndim:
+        raise InputError("expected counts: expected an array whose first axis is the views, got one number")
     if values.size and not 0 <= values.min() <= values.max() <= _LARGEST_MEAN:
         raise InputError(
             f"expected counts: must lie from 0 to {_LARGEST_MEAN:g}, got {values.min():g} to {values.max():g}"

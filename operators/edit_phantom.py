@@ -23,15 +23,20 @@ class _EditPhantom(jobs.JobOperator):
 
     def job(self, context: bpy.types.Context) -> jobs.Job:
         bake, done, name = self.bake, self.done, context.object.name
-        work = phantoms.remaking(context.object, bake)
+        work, made_of = phantoms.remaking(context.object, bake), phantoms.settings_of(context.object).values()
 
         def finish(stored: list[volumes.StoredVolume]) -> Generator[None, None, str]:
             yield
             item = bpy.data.objects.get(name)
-            if item is None or phantoms.settings_of(item) is None:
+            settings = phantoms.settings_of(item)
+            if item is None or settings is None:
                 raise InputError(f"the phantom {name!r} is gone")
+            has_changed = settings.values() != made_of
             phantoms.replace(item, stored, bake)
-            return done.format(repr(name))
+            if not has_changed or bake:
+                return done.format(repr(name))
+            getattr(item, ids.OBJECT_VOLUME).outdated = True
+            return f"{done.format(repr(name))}; its settings have changed in the meantime"
 
         return jobs.Job("Making a phantom", work, finish)
 

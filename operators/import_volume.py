@@ -233,7 +233,7 @@ def _from(progress: Progress, number: int, count: int) -> Progress:
 
 def _by_number(name: str) -> list[tuple[int, str]]:
     """What to sort names by so that "beat2" comes before "beat10"."""
-    return [(int(part) if part.isdigit() else -1, part.lower()) for part in re.split(r"(\d+)", name)]
+    return [(int(part) if part.isdecimal() else -1, part.lower()) for part in re.split(r"(\d+)", name)]
 
 
 def _common(names: Sequence[str]) -> str:

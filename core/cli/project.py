@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import itertools
 import math
 import warnings
 from collections.abc import Iterator, Sequence
@@ -269,9 +268,10 @@ def _run(arguments: argparse.Namespace) -> None:
     model = chosen_model(arguments, system, None)  # before the long work: it says what cannot be
     files = arguments.states or ([arguments.volume] if arguments.volume else [])
     count = max(1, len(files))
-    for number, file in itertools.product(range(1, count + 1), files):
-        if numbered_path(path, number, count).resolve() == Path(file).resolve():
-            raise InputError(f"{file}: the projections would replace what is projected; choose another --output")
+    outputs = {numbered_path(path, number, count).resolve() for number in range(1, count + 1)}
+    for file in (*files, *([arguments.mu] if "mu" in arguments else [])):
+        if Path(file).resolve() in outputs:
+            raise InputError(f"{file}: the projections would replace what they are made from; choose another --output")
     mu = _attenuation(arguments.mu, arguments.energy, arguments.mu_series) if "mu" in arguments else None
     sources = _of_files(files, mu, arguments) if files else _of_phantom(mu, model, arguments)
     for number, (volume, mu_of_it, settings) in enumerate(sources, 1):

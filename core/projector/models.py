@@ -118,7 +118,7 @@ def intensity(line_integrals: ArrayOrTensor, photons: float) -> ArrayOrTensor:
     """
     if not is_tensor(line_integrals):
         kind = np.float32 if getattr(line_integrals, "dtype", None) == np.float32 else np.float64
-        line_integrals = real_array(line_integrals, "line integrals", (None,) * np.ndim(line_integrals), kind)
+        line_integrals = real_array(line_integrals, "line integrals", None, kind)
     return positive(photons, "photons") * namespace(line_integrals).exp(-line_integrals)
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+import warnings
 
 import bpy
 import numpy as np
@@ -116,6 +117,53 @@ def test_nobody_takes_a_sketch_for_voxels(item, scene, ring_system, monkeypatch)
         with pytest.raises((InputError, RuntimeError), match="press Update Phantom first"):
             call()
     bpy.context.view_layer.objects.active = item
+    assert bpy.ops.mphdrr.update_phantom() == {"FINISHED"}
+    assert_made(item)
+
+
+def test_python_warns_as_before_whenever_a_thread_ends(item, monkeypatch):
+    filters, settings, sketch = warnings.filters, item.mphdrr_volume.shepp_logan, phantoms.sketch
+    settings.half_size = 50
+    assert live_phantoms._look() is not None
+    first = live_phantoms._refinement
+
+    def sketch_later(one):
+        first.thread.join()
+        sketch(one)
+
+    monkeypatch.setattr(phantoms, "sketch", sketch_later)
+    settings.half_size = 30
+    assert warnings.filters is filters
+    rest()
+    assert_made(item)
+    assert warnings.filters is filters
+
+
+def test_a_volume_that_goes_while_it_is_being_made(item):
+    item.mphdrr_volume.shepp_logan.half_size = 50
+    assert live_phantoms._look() is not None
+    bpy.data.objects.remove(item.children[0])
+    rest()
+    assert_made(item)
+
+
+def test_a_setting_that_changes_while_an_update_is_made(item, monkeypatch):
+    remaking, settings = phantoms.remaking, item.mphdrr_volume.shepp_logan
+
+    def edited_meanwhile(*arguments):
+        work = remaking(*arguments)
+
+        def working(progress):
+            made = work(progress)
+            settings.half_size = 55
+            return made
+
+        return working
+
+    monkeypatch.setattr(phantoms, "remaking", edited_meanwhile)
+    assert bpy.ops.mphdrr.update_phantom() == {"FINISHED"}
+    assert item.mphdrr_volume.outdated
+    monkeypatch.undo()
     assert bpy.ops.mphdrr.update_phantom() == {"FINISHED"}
     assert_made(item)
 

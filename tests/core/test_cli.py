@@ -289,6 +289,10 @@ def test_geometry_map_writes_a_volume(workbook, tmp_path, capsys, quantity):
     make = {"sensitivity": mph.sensitivity_map, "modules": mph.modules_map, "resolution": mph.resolution_map}
     assert np.array_equal(volume.array, make.get(quantity, mph.completeness_map)(system, volume.grid).array)
     assert quantity in capsys.readouterr().out
+    if quantity in ("modules", "completeness"):
+        with_material = ["--quantity", quantity, "--crystal-mu", "CZT", "-o", str(path)]
+        assert main(["geometry", "map", str(workbook), *with_material]) == 1
+        assert f"--crystal-mu has no effect on --quantity {quantity}" in capsys.readouterr().err
 
 
 def test_geometry_of_a_fit_is_generated_again(workbook, tmp_path, capsys):

@@ -450,7 +450,15 @@ def test_a_views_noise_depends_on_the_seed_and_on_itself_only(rng):
     np.testing.assert_array_equal(mph.sample_counts(mean[:3], seed=7), counts[:3])
     assert (mph.sample_counts(mean, seed=8) != counts).any()
     assert (mph.sample_counts(mean[[0, 0]], seed=7)[0] != mph.sample_counts(mean[[0, 0]], seed=7)[1]).any()
-    for bad, seed in ((-mean, 1), (mean, -1), (mean, 1.5), (np.full((1, 2), np.nan), 1), (np.full((1, 2), 1e19), 1)):
+    for bad, seed in (
+        (-mean, 1),
+        (mean, -1),
+        (mean, 1.5),
+        (np.full((1, 2), np.nan), 1),
+        (np.full((1, 2), 1e19), 1),
+        ([[1], [1, 2]], 1),
+        (3.0, 1),
+    ):
         with pytest.raises(InputError):
             mph.sample_counts(bad, seed)
 

@@ -200,3 +200,5 @@ def test_ring_order_is_along_the_rings_whatever_the_order_was(permutation, close
         assert np.all(steps * steps[0] > 0) and np.abs(steps).max() < 1.0
         ways.add(np.sign(steps[0]))
     assert len(ways) == 1
+    with pytest.raises(mph.InputError, match="ring_order: expected a PinholeSystem"):
+        mph.ring_order(centers)

@@ -71,8 +71,9 @@ def test_radiographs_count_photons(photons, rng):
     np.testing.assert_allclose(mph.intensity(lines, photons), photons * np.exp(-lines))
     with pytest.raises(InputError, match="photons"):
         mph.intensity(lines, 0)
-    with pytest.raises(InputError, match="line integrals"):
-        mph.intensity(["air"], photons)
+    for bad in (["air"], [[1], [1, 2]]):
+        with pytest.raises(InputError, match="line integrals"):
+            mph.intensity(bad, photons)
     torch = pytest.importorskip("torch", reason="torch is not installed")
     x = torch.tensor(lines, requires_grad=True)
     assert torch.autograd.gradcheck(lambda x: mph.intensity(x, photons), (x,))

@@ -151,6 +151,7 @@ def test_several_lines_count_as_they_do_together(system):
     ("settings", "message"),
     [
         ({"aperture_mu": "tungsten"}, "aperture_mu 'tungsten': at which energy"),
+        ({"aperture_mu": "tungsen"}, "aperture_mu: material 'tungsen': expected one of"),
         ({"crystal_mu": "NaI", "photons_per_decay": 0.9}, "crystal_mu 'NaI': at which energy"),
         (
             {"crystal_mu": "NaI", "isotope": "Tc-99m", "window": (1, 2), "photons_per_decay": 0.9},

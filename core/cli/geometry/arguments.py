@@ -12,6 +12,9 @@ from ...materials import APERTURES, CRYSTALS, module_coefficients
 from ...system import PinholeSystem
 from ..options import number_or_name
 
+MATERIAL_OPTIONS = ("aperture_mu", "opening_angle", "crystal_mu", "intrinsic_fwhm", "isotope")
+"""Of `add_materials`."""
+
 
 def add_workbook(parser: argparse.ArgumentParser) -> None:
     """The workbook to read, and how to print the answer."""

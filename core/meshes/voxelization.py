@@ -162,7 +162,7 @@ def _along_rays(
     corners = np.array([[0, 0], [n_x, 0], [0, n_y], [n_x, n_y]]) @ np.linalg.inv(lattice)
     start = np.floor(corners.min(axis=0)).astype(np.int64)
     size = np.ceil(corners.max(axis=0)).astype(np.int64) + 1 - start
-    column = np.floor((np.indices(size).reshape(2, -1).T + start) @ lattice).astype(np.int64)
+    column = np.floor((np.indices(tuple(size.tolist())).reshape(2, -1).T + start) @ lattice).astype(np.int64)
     held = ((column >= 0) & (column < (n_x, n_y))).all(axis=1)
     column = np.where(held, column[:, 0] * n_y + column[:, 1], 0)
     n_rays = np.bincount(column[held], minlength=n_x * n_y).reshape(n_x, n_y, 1)

@@ -64,7 +64,7 @@ def steps():
     bpy.ops.mphdrr.import_geometry(filepath=str(WORKBOOK))
     note("imported")
     with context():
-        bpy.ops.mphdrr.add_derenzo(voxels=128)
+        bpy.ops.mphdrr.add_derenzo(voxels=256)
     note("phantom added")
     for area in bpy.context.window_manager.windows[0].screen.areas:
         if area.type == "VIEW_3D":
@@ -80,7 +80,7 @@ def steps():
         yield 0.05
     seen["full"] = {"steps": len(set(progress)), "longest_pause_s": max(b - a for a, b in itertools.pairwise(beats))}
     assert len(ours()) == 81, ours()
-    assert len(set(progress)) > 3, progress
+    assert any(0 < p < 1 for p in progress), progress
     run_file = Path(bpy.context.scene.mphdrr_projections.run_file)
     assert seen["full"]["longest_pause_s"] < 2, seen
     note("first job is done")

@@ -13,6 +13,7 @@ import time
 import traceback
 import warnings
 from collections.abc import Callable, Generator
+from contextlib import ExitStack
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
@@ -51,10 +52,11 @@ class Job:
 
 
 @dataclass
-class _Run:
-    """A job that runs in a thread."""
+class Worker:
+    """Work in a thread of its own, with its progress and its warnings; the main thread starts and ends it."""
 
-    job: Job
+    label: str
+    work: Callable[[Progress], Any]
     done: int = 0
     total: int = 0
     result: Any = None
@@ -62,20 +64,26 @@ class _Run:
     caught: list[warnings.WarningMessage] = field(default_factory=list)
     cancel: threading.Event = field(default_factory=threading.Event)
     thread: threading.Thread | None = None
+    _catching: ExitStack = field(default_factory=ExitStack)
 
     def start(self) -> None:
-        self.thread = threading.Thread(target=self._work, name=f"mphDRR: {self.job.label}", daemon=True)
+        # Begun and ended by Blender's main thread: of two threads, one would put back what the other had set.
+        self.caught = self._catching.enter_context(warnings.catch_warnings(record=True))
+        warnings.simplefilter("always", InputWarning)
+        self.thread = threading.Thread(target=self._work, name=f"mphDRR: {self.label}", daemon=True)
         self.thread.start()
 
     @property
     def alive(self) -> bool:
         return self.thread is not None and self.thread.is_alive()
 
+    def end(self) -> None:
+        """It is done, or nobody waits for it any more."""
+        self._catching.close()
+
     def _work(self) -> None:
         try:
-            with warnings.catch_warnings(record=True) as self.caught:
-                warnings.simplefilter("always", InputWarning)
-                self.result = self.job.work(self._progress)
+            self.result = self.work(self._progress)
         except BaseException as error:
             self.error = error
 
@@ -85,7 +93,7 @@ class _Run:
             raise Cancelled
 
 
-_current: _Run | None = None
+_current: Worker | None = None
 
 
 def is_running() -> bool:
@@ -107,6 +115,7 @@ def stop() -> None:
         run.cancel.set()
         if run.thread is not None:
             run.thread.join(_PATIENCE)
+        run.end()
 
 
 @bpy.app.handlers.persistent
@@ -121,7 +130,7 @@ def _get_running(self: JobProperties) -> bool:
 
 
 def _get_label(self: JobProperties) -> str:
-    return _current.job.label if _current else ""
+    return _current.label if _current else ""
 
 
 def _get_progress(self: JobProperties) -> float:
@@ -147,7 +156,8 @@ class JobOperator:
     )
 
     _asked = False
-    _run: _Run | None = None
+    _job: Job | None = None
+    _run: Worker | None = None
     _finishing: Generator[None, None, str] | None = None
     _timer: bpy.types.Timer | None = None
 
@@ -198,9 +208,10 @@ class JobOperator:
                 self._asked = True
                 return asked
         try:
-            self._run = _current = _Run(self.job(context))
+            self._job = self.job(context)
         except Exception as error:
             return self._failed(error)
+        self._run = _current = Worker(self._job.label, self._job.work)
         self._run.start()
         manager = context.window_manager
         self._timer = manager.event_timer_add(_INTERVAL, window=context.window)
@@ -209,8 +220,8 @@ class JobOperator:
 
     def modal(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str]:
         """Watch the thread; when it is done, finish step by step."""
-        run = self._run
-        if run is None or run is not _current:  # stopped from outside
+        job, run = self._job, self._run
+        if job is None or run is None or run is not _current:  # stopped from outside
             self._end(context)
             return {"CANCELLED"}
         if event.type == "ESC" and event.value == "PRESS":
@@ -222,6 +233,7 @@ class JobOperator:
         if run.alive:
             return {"PASS_THROUGH"}
         if self._finishing is None:
+            run.end()
             for warning in run.caught:
                 if issubclass(warning.category, InputWarning):
                     self.report({"WARNING"}, str(warning.message))
@@ -229,7 +241,7 @@ class JobOperator:
             if error is not None:
                 self._end(context)
                 return self._failed(error)
-            self._finishing = run.job.finish(run.result)
+            self._finishing = job.finish(run.result)
         try:
             enough = time.perf_counter() + _STEP
             while time.perf_counter() < enough:

@@ -10,19 +10,15 @@ made again. Where there is no window nothing runs beside a script, and small pha
 
 from __future__ import annotations
 
-import threading
 import time
 import traceback
 import warnings
-from contextlib import ExitStack
-from dataclasses import dataclass, field
 from typing import Any
 
 import bpy
 
 from ..core.errors import InputError, InputWarning
-from ..core.progress import Cancelled
-from . import ids, jobs, phantoms, volumes
+from . import ids, jobs, phantoms
 
 LIVE_VOXELS = 64**3
 """Up to so many voxels, of all its states, a phantom is made anew at once where there is no window."""
@@ -35,44 +31,7 @@ _INTERVAL = 0.1  # s between two looks
 _PATIENCE = 10.0  # s that stopping waits for a thread
 
 
-@dataclass
-class _Refinement:
-    """The voxels of one phantom on their way, in a thread."""
-
-    name: str
-    result: list[volumes.StoredVolume] | None = None
-    error: BaseException | None = None
-    caught: list[warnings.WarningMessage] = field(default_factory=list)
-    cancelled: threading.Event = field(default_factory=threading.Event)
-    thread: threading.Thread | None = None
-    _catching: ExitStack = field(default_factory=ExitStack)
-
-    def start(self, item: bpy.types.Object) -> None:
-        """Raises `InputError` where the settings make no phantom."""
-        make = phantoms.remaking(item)
-        # Begun and ended by Blender's main thread: of two threads, one would put back what the other had set.
-        self.caught = self._catching.enter_context(warnings.catch_warnings(record=True))
-        warnings.simplefilter("always", InputWarning)
-        self.thread = threading.Thread(target=self._work, args=(make,), name="mphDRR: refining", daemon=True)
-        self.thread.start()
-
-    def _work(self, make: Any) -> None:
-        try:
-            self.result = make(self._progress)
-        except BaseException as error:
-            self.error = error
-
-    def end(self) -> None:
-        """It is done, or nobody waits for it any more."""
-        self.cancelled.set()
-        self._catching.close()
-
-    def _progress(self, done: int, total: int) -> None:
-        if self.cancelled.is_set():
-            raise Cancelled
-
-
-_refinement: _Refinement | None = None
+_refinement: tuple[str, jobs.Worker] | None = None  # the phantom's name, and what makes its voxels
 _last_edit = 0.0  # by time.monotonic
 _given_up: set[str] = set()  # names of phantoms whose voxels cannot be made, until they change
 
@@ -145,8 +104,8 @@ def stop() -> None:
     """Forget what waits: before a file is loaded, or the extension is disabled."""
     running = _refinement
     _cancel()
-    if running is not None and running.thread is not None:
-        running.thread.join(_PATIENCE)
+    if running is not None and running[1].thread is not None:
+        running[1].thread.join(_PATIENCE)
     if bpy.app.timers.is_registered(_look):
         bpy.app.timers.unregister(_look)
 
@@ -167,7 +126,8 @@ def _cancel() -> None:
     """What a thread is making now is done, or of other settings than those that count."""
     global _refinement
     if _refinement is not None:
-        _refinement.end()
+        _refinement[1].cancel.set()
+        _refinement[1].end()
         _refinement = None
 
 
@@ -177,26 +137,27 @@ def _look() -> float | None:
     if time.monotonic() - _last_edit < _REST or jobs.is_running() or bpy.app.is_job_running("RENDER"):
         return _INTERVAL
     if _refinement is not None:
-        if _refinement.thread is not None and _refinement.thread.is_alive():
+        name, worker = _refinement
+        if worker.alive:
             return _INTERVAL
-        done = _refinement
         _cancel()
-        _finish(done)
+        _finish(name, worker)
         jobs.redraw_sidebars()
     item = next((o for o in bpy.data.objects if is_coming(o)), None)
     if item is None:
         return None
-    started = _Refinement(item.name)
     try:
-        started.start(item)
-        _refinement = started
+        worker = jobs.Worker("refining", phantoms.remaking(item))
     except InputError as error:
         _give_up(item, str(error))
+        return _INTERVAL
+    worker.start()
+    _refinement = item.name, worker
     return _INTERVAL
 
 
-def _finish(done: _Refinement) -> None:
-    item = bpy.data.objects.get(done.name)
+def _finish(name: str, done: jobs.Worker) -> None:
+    item = bpy.data.objects.get(name)
     if item is None or phantoms.settings_of(item) is None:
         return
     if done.result is not None and len(done.result) != len(phantoms.with_children(item)):

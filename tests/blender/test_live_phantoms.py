@@ -74,9 +74,9 @@ def test_an_edit_stops_what_is_being_made(item, monkeypatch):
     settings = item.mphdrr_volume.shepp_logan
     settings.half_size = 50
     assert live_phantoms._look() is not None
-    first = live_phantoms._refinement
+    _, first = live_phantoms._refinement
     settings.half_size = 30
-    assert first.cancelled.is_set() and live_phantoms._refinement is None
+    assert first.cancel.is_set() and live_phantoms._refinement is None
     rest()
     assert_made(item)
     item.scale.x = 0
@@ -125,7 +125,7 @@ def test_python_warns_as_before_whenever_a_thread_ends(item, monkeypatch):
     filters, settings, sketch = warnings.filters, item.mphdrr_volume.shepp_logan, phantoms.sketch
     settings.half_size = 50
     assert live_phantoms._look() is not None
-    first = live_phantoms._refinement
+    _, first = live_phantoms._refinement
 
     def sketch_later(one):
         first.thread.join()

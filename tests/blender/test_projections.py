@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+import warnings
 from pathlib import Path
 
 import numpy as np
@@ -283,8 +284,8 @@ def test_foreign_image_of_the_same_name_is_kept(scanned):
     assert tuple(bpy.data.images["mphDRR 01"].size) == (8, 8)
 
 
-def _run_in_thread(work) -> jobs._Run:
-    run = jobs._Run(jobs.Job("Test", work, lambda result: iter(())))
+def _run_in_thread(work) -> jobs.Worker:
+    run = jobs.Worker("Test", work)
     run.start()
     return run
 
@@ -303,6 +304,7 @@ def test_job_stops_at_its_next_step_when_cancelled():
     run.cancel.set()
     go_on.set()
     run.thread.join(5)
+    run.end()
     assert isinstance(run.error, Cancelled) and not run.alive and (run.done, run.total) == (2, 2)
 
 
@@ -311,12 +313,14 @@ def test_stop_ends_the_thread_of_the_running_job(monkeypatch):
         while True:
             progress(0, 1)
 
+    filters = warnings.filters
     run = _run_in_thread(work)
     monkeypatch.setattr(jobs, "_current", run)
     state = bpy.context.window_manager.mphdrr_job
     assert state.running and state.label == "Test"
     jobs.stop()
     assert not run.alive and not state.running and state.progress == 0
+    assert warnings.filters is filters
 
 
 def test_loading_a_file_ends_the_running_job(monkeypatch):

@@ -25,7 +25,7 @@ from ..core.memory import require
 from ..core.meshes.mesh import Mesh
 from ..core.phantoms.kinds import KINDS
 from ..core.phantoms.phantom import Phantom
-from ..core.progress import Progress
+from ..core.progress import Progress, part_of
 from ..core.volume import Volume
 from . import ids, meshes, storage, volumes
 from .cameras import set_world_matrix, world_matrix
@@ -91,7 +91,7 @@ class Recipe:
         """
         self._begin(quantities)
         count = len(quantities) * self.n_states
-        reports = (_part(progress, number, count) for number in range(count))
+        reports = (part_of(progress, number, count) for number in range(count))
         stored = []
         for quantity, pose in zip(quantities, poses, strict=True):
             if baked:
@@ -365,8 +365,3 @@ def _merge_flat_faces(mesh: bpy.types.Mesh) -> None:
 def _placed(volume: Volume, pose: NDArray[np.float64]) -> Volume:
     """A volume in an object's own space, in the world."""
     return Volume(volume.array, Grid(volume.grid.shape, pose @ volume.grid.affine), volume.quantity)
-
-
-def _part(progress: Progress | None, number: int, count: int) -> Progress | None:
-    """The progress of one of several equal parts."""
-    return None if progress is None else lambda done, total: progress(number * total + done, count * total)

@@ -17,6 +17,11 @@ class Cancelled(Exception):
     """Raised by a progress callback to stop the work; nothing half-done is left behind."""
 
 
+def part_of(progress: Progress | None, number: int, count: int) -> Progress | None:
+    """The progress of one of several equal parts, counted from 0."""
+    return None if progress is None else lambda done, total: progress(number * total + done, count * total)
+
+
 def in_threads(work: Callable[[Part], None], parts: Sequence[Part], progress: Progress | None = None) -> None:
     """Call ``work(part)`` for all parts, one thread for each processor core; what `progress` raises stops the rest."""
     with ThreadPoolExecutor(os.cpu_count()) as pool:

@@ -16,7 +16,7 @@ from ..addon.decimals import typed
 from ..core.errors import InputError
 from ..core.hounsfield import hu_to_mu
 from ..core.memory import require
-from ..core.progress import Progress
+from ..core.progress import Progress, part_of
 from ..core.rearranging import centered
 from ..core.volume import UNITS, Volume
 from ..core.volume_io import READ_FORMATS, read_volume
@@ -83,7 +83,7 @@ class ReadVolumes(jobs.JobOperator):
         center, energy = self.center, typed(self.energy) if self.attenuation else None
         grid, unit, folder, count = self.grid or None, typed(self.unit), storage.folder(), len(paths)
 
-        def read(path: Path, progress: Progress) -> Volume:
+        def read(path: Path, progress: Progress | None) -> Volume:
             if path.suffix.lower() == ".vdb":
                 return vdb.read_vdb(path, quantity, grid, unit=unit)
             return read_volume(path, quantity, progress=progress)
@@ -92,7 +92,7 @@ class ReadVolumes(jobs.JobOperator):
             states: list[Volume] = []
             for path in paths:
                 progress(len(states), count + 1)
-                states.append(read(path, _from(progress, len(states), count + 1)))
+                states.append(read(path, part_of(progress, len(states), count + 1)))
                 if len(states) == 1 < count:
                     shape = " x ".join(map(str, states[0].grid.shape))
                     require(4.0 * (count - 1) * states[0].grid.n_voxels, f"{count} volumes of {shape} voxels")
@@ -224,11 +224,6 @@ def draw_menu(self: bpy.types.Menu, context: bpy.types.Context) -> None:
 def _name(path: Path) -> str:
     suffix = next((s for s in sorted(_SUFFIXES, key=len, reverse=True) if path.name.lower().endswith(s)), "")
     return path.name[: len(path.name) - len(suffix)] or path.name
-
-
-def _from(progress: Progress, number: int, count: int) -> Progress:
-    """The progress of one of several equal parts."""
-    return lambda done, total: progress(number * total + done, count * total)
 
 
 def _by_number(name: str) -> list[tuple[int, str]]:

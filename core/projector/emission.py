@@ -17,10 +17,12 @@ from ..materials import module_coefficients
 from ..system import PinholeSystem
 from ..views import Views
 from ..volume import Volume
-from .aperture import KnifeEdge, Opening, openings, paix_diameter, points_needed, within_cone
+from .aperture import KnifeEdge, Opening, openings, paix_diameter, within_cone
+from .aperture import points_needed as hole_points_needed
 from .arrays import ArrayOrTensor, is_tensor, namespace
 from .crystal import absorbed_share, gaussian_blur, layer_depths, share_inside
 from .models import Array, Beam, Model, view_rays
+from .pixel_points import TOLERANCE, expected_error, lattice, offsets, points_needed, require_points, shadow_edges
 from .rays import Fan
 
 # Views may differ from the system they are said to be of by a file's rounding (mm; sine of an angle).
@@ -67,8 +69,16 @@ class Emission(Model):
         Energies, keV, between which the isotope's photons are counted. None: 10 % around its strongest line.
     photons_per_decay : float, optional
         Instead of the isotope's.
+    pixel_points : int, optional
+        Points of each pixel's area, for each point of the hole, from which rays start. None: as many as `tolerance` asks
+        for, which depends on the voxels' size and distance, on the pixels' size, and on the directions from which a module
+        sees the voxels: small voxels on large pixels take many. A number of one's own is taken as it is, with a warning
+        where it is too small for the tolerance. 1, with one point of the hole: the pixels' centres alone.
+    tolerance : float
+        Largest error of the total counts of a single voxel in any module, as a share of them, wherever it lies between
+        the rays: 2 % by default. Larger sources are more accurate.
     aperture_points : int
-        Points of the hole's disk from which rays start, each counting the same: the blur of a hole of diameter d_e.
+        Points of the hole's disk that rays pass, each counting the same: the blur of a hole of diameter d_e.
         With 1 all rays pass the middle, and the hole blurs nothing; else at least 3.
     aperture_tolerance : float, optional
         Instead of `aperture_points`: as few points as keep the image of one of the grid's voxels, at the isocentre, near
@@ -135,6 +145,8 @@ class Emission(Model):
     depth_layers: int = 1
     within_walls: bool = False
     within_cone: bool = False
+    pixel_points: int | None = None
+    tolerance: float = TOLERANCE
 
     name = "emission"
 
@@ -150,7 +162,7 @@ class Emission(Model):
             if self.mu.array.min() < 0:
                 raise InputError(f"emission: mu must not be negative, got {self.mu.array.min():g} 1/mm")
         self._set_photons()
-        for name in ("time", "opening_angle"):
+        for name in ("time", "opening_angle", "tolerance"):
             self._set(name, positive(getattr(self, name), f"emission: {name}"))
         if self.opening_angle >= math.pi:
             raise InputError(f"emission: opening_angle must be below pi, got {self.opening_angle:g} rad")
@@ -169,6 +181,7 @@ class Emission(Model):
             raise InputError(f"emission: edge: expected 'paix' or 'path', got {self.edge!r}")
         if self.edge == "path" and self.aperture_mu is None:
             raise InputError("emission: edge 'path' needs aperture_mu, of the aperture's material")
+        self._set("pixel_points", require_points(self.pixel_points, "emission: pixel_points"))
         self._set("depth_layers", _whole(self.depth_layers, "depth_layers", "1 or more"))
         if self.depth_layers > 1 and self.crystal_mu is None:
             raise InputError("emission: depth_layers needs crystal_mu, of the crystal's material")
@@ -279,15 +292,36 @@ class Emission(Model):
         along_u = (middle @ u + scale * (rays.ray_step @ u) * np.arange(n_u))[None, :]
         # To the plane through the grid's farthest corner.
         depth = max(float(((grid.corners() - pinhole) @ k).max()), l)
-        points = self.openings(m, self.points(views, m, grid))
+        holes = self.openings(m, self.hole_points(views, m, grid))
+        n = self._pixel_points(views, m, grid)
         for layer, z in enumerate(layer_depths(self.depth_layers, self.system.detector_thickness[m])):
             stretch = depth / (l + z)
             steps = stretch * scale * rays.line_step, stretch * scale * rays.ray_step
-            for opening in points:
-                weights = self.pixel_weights(m, along_u, along_v, (pitch_u, pitch_v), l, opening, layer)
+            for hole, opening in enumerate(holes):
                 point = opening.x * u + opening.y * v
+                shift = None
+                if len(holes) > 1:
+                    # The points of all holes together are spread evenly over the pixel, as seen from the isocentre.
+                    seen = (1 + l / self.system.pinhole_distance[m]) * np.array([opening.x, opening.y])
+                    shift = lattice(len(holes))[hole] / math.sqrt(n) - seen / (pitch_u, pitch_v)
+                places = offsets(n, shift) * (pitch_u, pitch_v)
+
+                def weigh(
+                    rows: slice,
+                    columns: slice,
+                    which: slice,
+                    places: Array = places,
+                    opening: Opening = opening,
+                    layer: int = layer,
+                ) -> Array:
+                    u_places, v_places = places[which].T[:, :, None, None]
+                    along, across = along_u[:, columns] + u_places, along_v[rows] + v_places
+                    pitch = pitch_u, pitch_v
+                    return self.pixel_weights(m, along, across, pitch, l, opening, layer, n * len(holes)) / n
+
                 corner = pinhole + point + depth * k + stretch * (middle + point)
-                yield Beam(Fan(pinhole + point, corner, *steps, views.shape), weights)
+                shifts = places[:, ::-1] / (scale * (rays.line_step @ v), scale * (rays.ray_step @ u))
+                yield Beam(Fan(pinhole + point, corner, *steps, views.shape, shifts), weigh)
 
     def pixel_weights(
         self,
@@ -298,6 +332,7 @@ class Emission(Model):
         length: float,
         opening: Opening,
         layer: int = 0,
+        cells: int = 1,
     ) -> ArrayOrTensor:
         """What pixels of module m count per (decay / (s mm^3) mm) along rays that start from one point of the hole.
 
@@ -306,7 +341,8 @@ class Emission(Model):
         m
             The module: its crystal's side and thickness.
         along_u, along_v
-            The pixels' places on the crystal, mm from its middle and point-inverted: arrays or tensors that broadcast.
+            Where in the pixels the rays end on the crystal, mm from its middle and point-inverted: arrays or tensors that
+            broadcast.
         pitch
             The pixels' size on the crystal, mm along u and v.
         length
@@ -315,6 +351,8 @@ class Emission(Model):
             The point.
         layer
             Of `depth_layers`, from the front: where photons are recorded.
+        cells
+            Rays of a pixel: along each side, a ray stands for this part of it where the crystal or a wall ends.
         """
         side, thickness = self.system.detector_side[m], self.system.detector_thickness[m]
         depths = layer_depths(self.depth_layers, thickness)
@@ -330,10 +368,10 @@ class Emission(Model):
             weights = weights * within_cone(slope_u, slope_v, self._tangent)
         for along, size, start in ((along_u, pitch[0], opening.x), (along_v, pitch[1], opening.y)):
             if self.within_crystal:
-                weights = weights * share_inside(along, size, side)
+                weights = weights * share_inside(along, size / cells, side)
             if self.within_walls:
                 shrink = length / distance  # back to where the rays cross the crystal's front
-                weights = weights * share_inside(shrink * along - (1 - shrink) * start, shrink * size, side)
+                weights = weights * share_inside(shrink * along - (1 - shrink) * start, shrink * size / cells, side)
         return weights
 
     def response(self, views: Views, m: int) -> tuple[Array, Array] | None:
@@ -345,8 +383,40 @@ class Emission(Model):
         n_v, n_u = views.shape
         return gaussian_blur(n_v, sigma / pitch_v), gaussian_blur(n_u, sigma / pitch_u)
 
-    def points(self, views: Views, m: int, grid: Grid) -> int:
-        """Points of the hole that rays of view m start from: `aperture_points`, or what `aperture_tolerance` takes."""
+    def rays(self, views: Views, m: int, grid: Grid) -> int:
+        """Rays of each pixel of view m."""
+        holes = len(self.openings(m, self.hole_points(views, m, grid)))
+        return self.depth_layers * holes * self._pixel_points(views, m, grid)
+
+    def caution(self, views: Views, grid: Grid) -> str | None:
+        """A warning where there are too few rays for the tolerance."""
+        worst, module = 0.0, 0
+        for m in range(len(views)):
+            edges = shadow_edges(views, m, grid)
+            n = self._pixel_points(views, m, grid)
+            error = expected_error(edges, n, self.hole_points(views, m, grid))
+            if error > worst:
+                worst, module = error, m
+        if worst <= self.tolerance:
+            return None
+        n, voxel = self._pixel_points(views, module, grid), " x ".join(f"{size:.3g}" for size in grid.spacing)
+        most = "more than 100" if worst > 1 else f"up to {100 * worst:.2g}"
+        advice = "take smaller pixels, or larger voxels"
+        if self.pixel_points is not None:
+            advice = f"pixel_points=None takes as many as keep {100 * self.tolerance:g} %"
+        return (
+            f"emission: {n} point{'s' * (n > 1)} of each pixel are too few for voxels of {voxel} mm: the total counts of "
+            f"a single voxel may be {most} % off (in module {self.system.numbers[module]}), of larger sources less; {advice}"
+        )
+
+    def _pixel_points(self, views: Views, m: int, grid: Grid) -> int:
+        """Points of the pixels of view m, for each point of the hole."""
+        if self.pixel_points is not None:
+            return self.pixel_points
+        return points_needed(shadow_edges(views, m, grid), self.tolerance, self.hole_points(views, m, grid))
+
+    def hole_points(self, views: Views, m: int, grid: Grid) -> int:
+        """Points of the hole that rays of view m pass: `aperture_points`, or what `aperture_tolerance` takes."""
         if self.aperture_tolerance is None:
             return self.aperture_points
         l, b = self.system.collimator_length[m], self.system.pinhole_distance[m]
@@ -355,7 +425,7 @@ class Emission(Model):
         voxel = grid.voxel_volume ** (1 / 3) * l / b
         blur = math.hypot(voxel, _BOX_PER_SIGMA * sigma)
         shadow = self.effective_diameter[m] * (1 + l / b)
-        return points_needed(self.aperture_tolerance, float(shadow), (pitch_u, pitch_v), (blur, blur))
+        return hole_points_needed(self.aperture_tolerance, float(shadow), (pitch_u, pitch_v), (blur, blur))
 
     def openings(self, m: int, n: int) -> list[Opening]:
         """Where rays of module m cross the pinhole's plane: n points of the hole, and those of its edge."""

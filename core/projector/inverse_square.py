@@ -62,7 +62,8 @@ class InverseSquareSum(Model):
         rays, k = view_rays(views, m), self.system.principal_rays[m]
         towards = rays.targets() - rays.source
         sine = (towards @ k / np.linalg.norm(towards, axis=1)).reshape(views.shape)
-        yield Beam(rays, self.system.pinhole_diameter[m] ** 2 / 16 * sine**3)
+        weights = self.system.pinhole_diameter[m] ** 2 / 16 * sine**3
+        yield Beam(rays, lambda lines, rays, shifts: weights[lines, rays])
 
     def voxel_weights(self, views: Views, m: int, grid: Grid) -> Array:
         """``1 / h^2`` at the voxels' centres, 1/mm^2."""

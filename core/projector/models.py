@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Iterator
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -16,6 +16,7 @@ from ..grid import Grid
 from ..views import Views
 from ..volume import Volume
 from .arrays import ArrayOrTensor, is_tensor, namespace
+from .pixel_points import TOLERANCE, offsets, points_needed, require_points, shadow_edges
 from .rays import Fan
 
 Array = NDArray[np.float64]
@@ -23,22 +24,30 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True, eq=False)
 class Beam:
-    """One ray for every pixel of a view.
+    """Rays for every pixel of a view, as many as its fan has shifts, whose weighted integrals add up.
 
     Attributes
     ----------
     rays : Fan
         From the rays' source to the pixels: n_v lines of n_u rays.
-    weights : array (n_v, n_u) or None
-        What the ray's integral counts in its pixel; None: 1 everywhere.
+    weigh : function, optional
+        Of slices of lines, rays and shifts: array that broadcasts to (shifts, lines, rays), what a ray's integral counts
+        in its pixel. None: 1 everywhere.
     """
 
     rays: Fan
-    weights: Array | None = None
+    weigh: Callable[[slice, slice, slice], Array] | None = None
+
+    def part(self, lines: slice, rays: slice, shifts: slice = slice(None)) -> tuple[Fan, Array | None]:
+        """Some of the rays of some of the lines, of some shifts, and their weights."""
+        return self.rays[lines, rays, shifts], None if self.weigh is None else self.weigh(lines, rays, shifts)
 
     def transposed(self) -> Beam:
         """The same rays by columns: n_u lines of n_v rays."""
-        return Beam(self.rays.transposed(), None if self.weights is None else self.weights.T)
+        weigh, rays = self.weigh, self.rays.transposed()
+        if weigh is None:
+            return Beam(rays)
+        return Beam(rays, lambda lines, rays, shifts: np.swapaxes(weigh(rays, lines, shifts), -1, -2))
 
 
 class Model(ABC):
@@ -58,6 +67,10 @@ class Model(ABC):
 
     def check(self, views: Views) -> None:  # noqa: B027  (most have nothing to check)
         """Raise `InputError` where the model is not for these views."""
+
+    def caution(self, views: Views, grid: Grid) -> str | None:
+        """What a user who projects `grid` into `views` should be warned of."""
+        return None
 
     def check_volume(self, volume: Volume) -> None:  # noqa: B027
         """Raise `InputError` where the model is not for such a volume."""
@@ -85,17 +98,47 @@ class Model(ABC):
 
 @dataclass(frozen=True)
 class Transmission(Model):
-    """The line integral of the volume from source to target, value x mm: a digitally reconstructed radiograph."""
+    """The line integral of the volume from source to target, value x mm: a digitally reconstructed radiograph.
+
+    Attributes
+    ----------
+    pixel_points : int or None
+        Points of each pixel's area to which rays run, and whose line integrals are averaged. 1, the default: the pixel's
+        centre alone, as in most programs for radiographs. None: as many as `tolerance` asks for.
+    tolerance : float
+        With automatic points, the share of its sum over the image to which a single voxel is right, wherever it lies.
+
+    Raises
+    ------
+    InputError
+        An argument is of another kind or out of its range.
+    """
+
+    pixel_points: int | None = 1
+    tolerance: float = TOLERANCE
 
     name = "transmission"
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "pixel_points", require_points(self.pixel_points, "transmission: pixel_points"))
+        object.__setattr__(self, "tolerance", positive(self.tolerance, "transmission: tolerance"))
+
+    def record(self) -> dict[str, Any]:
+        """The settings, for a run's record."""
+        return {"pixel_points": self.pixel_points, "tolerance": self.tolerance}
 
     def unit(self, volume: Volume) -> str:
         """Unit of the images of `volume`."""
         return f"{volume.unit} mm"
 
     def beams(self, views: Views, m: int, grid: Grid) -> Iterator[Beam]:
-        """The rays of `views`, each counting 1."""
-        yield Beam(view_rays(views, m))
+        """The rays of `views`, or to more points of their pixels, weights summing to 1."""
+        rays = view_rays(views, m)
+        if self.pixel_points == 1:
+            yield Beam(rays)
+            return
+        n = self.pixel_points or points_needed(shadow_edges(views, m, grid), self.tolerance)
+        yield Beam(replace(rays, shifts=offsets(n)[:, ::-1]), lambda lines, rays, shifts: np.full((1, 1, 1), 1 / n))
 
 
 def intensity(line_integrals: ArrayOrTensor, photons: float) -> ArrayOrTensor:

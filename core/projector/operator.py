@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import copy
 import functools
+import itertools
 import math
 import os
+import warnings
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor, wait
@@ -14,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from ..errors import InputError
+from ..errors import InputError, InputWarning
 from ..grid import Grid
 from ..memory import available, require
 from ..progress import Progress
@@ -33,7 +35,7 @@ from .arrays import (
     zeros,
 )
 from .models import Array, Beam, Model, Transmission, require_model
-from .rays import Attenuation, Fan, IndexFans, RayMapper
+from .rays import Attenuation, IndexFan, IndexFans, RayMapper, window
 
 # Rays handed to a backend at once: enough that a call costs nothing, few enough that their arrays stay in the
 # cache. A GPU wants more (torch cuts them into chunks by itself; cuda takes several views a launch), and a torch on a CPU
@@ -154,6 +156,8 @@ class Projector(LinearOperator):
         self.views = views
         self.model: Model = Transmission() if model is None else require_model(model)
         self.model.check(views)
+        if caution := self.model.caution(views, grid):
+            warnings.warn(caution, InputWarning, stacklevel=2)
         self.backend = backends.choose(backend)
         self.threads = _thread_count(threads)
         self._auto = backend == "auto"
@@ -259,34 +263,29 @@ class Projector(LinearOperator):
         if name == "cuda" and not self.model.weights_voxels:
             yield from self._images_together(box, trace)
             return
-        with _parallel(self._workers(name)) as parallel_map:
+        workers = self._workers(name)
+        with _parallel(workers) as parallel_map:
             # The next view is begun before one is done, so that no thread waits for the others at a view's end.
             before: tuple[int, ArrayOrTensor, Iterable[None]] | None = None
             for m in range(len(self.views)):
-                image, running = zeros(self.views.shape, box), iter(())
-                seen = self._weighted(box, m, trace.origin)
-                for beam, by_columns in self._beams(m):
-                    _wait_for(running)  # the beams of a view add up in the same pixels
-                    lines = image.T if by_columns else image
-                    weights = None if beam.weights is None else alike(beam.weights, box)
+                image, weighted = zeros(self.views.shape, box), self._weighted(box, m, trace.origin)
+                beams, by_columns = self._beams(m)
+                lines, rays = window([beam.rays for beam in beams], _corners(self.grid, box, trace.origin))
 
-                    def project(
-                        block: slice,
-                        rays: Fan = beam.rays,
-                        weights: Any = weights,
-                        lines: Any = lines,
-                        seen: Any = seen,
-                    ) -> None:
-                        index_rays, attenuation = trace(rays[block])
-                        integrals = integrate(seen, index_rays, attenuation).reshape(lines[block].shape)
-                        lines[block] += integrals if weights is None else weights[block] * integrals
+                def project(
+                    block: slice,
+                    beams: list[Beam] = beams,
+                    rays: slice = rays,
+                    lines: ArrayOrTensor = image.T if by_columns else image,
+                    weighted: ArrayOrTensor = weighted,
+                ) -> None:
+                    pixels = lines[block, rays]
+                    for beam, shifts in _bundles(beams, pixels.shape, name):
+                        fan, weights = beam.part(block, rays, shifts)
+                        integrals = integrate(weighted, *trace(fan)).reshape(-1, *pixels.shape)
+                        pixels += (integrals if weights is None else alike(weights, box) * integrals).sum(0)
 
-                    running = iter(
-                        parallel_map(project, _blocks(lines.shape[0], lines.shape[1], name, self._workers(name)))
-                    )
-                    if before is not None:
-                        yield self._completed(*before, x)
-                        before = None
+                running = iter(parallel_map(project, _blocks(lines, rays, name, workers)))
                 if before is not None:
                     yield self._completed(*before, x)
                 before = m, image, running
@@ -325,24 +324,27 @@ class Projector(LinearOperator):
 
     def _fans(
         self, views: range, trace: RayMapper
-    ) -> Iterator[tuple[list[int], bool, Array | None, IndexFans, Attenuation | None]]:
+    ) -> Iterator[tuple[list[int], bool, Array | None, IndexFan | IndexFans, Attenuation | None]]:
         """The beams of several views in groups that cuda takes at once.
 
         Yields which of `views` they are of, whether their lines are the images' columns, weights (as many, lines, rays),
         rays and attenuation.
         """
-        # The first beams of all views, their second, ...
-        for beams in zip(*map(self._beams, views), strict=True):
+        of_views = []
+        for m in views:
+            beams, by_columns = self._beams(m)
+            parts = ((beam, slice(j, j + 1)) for beam in beams for j in range(len(beam.rays.shifts)))
+            of_views.append((parts, by_columns))
+        # The first rays of all views, their second, ...; some views have more than others.
+        for parts_of_views in itertools.zip_longest(*(parts for parts, _ in of_views)):
             for by_columns in (False, True):
-                group = [(k, beam) for k, (beam, columns) in enumerate(beams) if columns == by_columns]
+                group = [(k, p) for k, p in enumerate(parts_of_views) if p is not None and of_views[k][1] == by_columns]
                 if not group:
                     continue
-                rays, attenuations = zip(*(trace(beam.rays) for _, beam in group), strict=True)
-                attenuation = attenuations[0]
-                if attenuation is not None and attenuation.rays is not None:
-                    attenuation = Attenuation(attenuation.mu, IndexFans(tuple(each.rays for each in attenuations)))
-                weights = None if group[0][1].weights is None else np.stack([beam.weights for _, beam in group])
-                yield [k for k, _ in group], by_columns, weights, IndexFans(rays), attenuation
+                parts = [beam.part(slice(None), slice(None), shifts) for _, (beam, shifts) in group]
+                every = [weights for _, weights in parts]
+                weights = None if every[0] is None else np.concatenate(every)
+                yield [k for k, _ in group], by_columns, weights, *trace.together([fan for fan, _ in parts])
 
     def _weighted(self, box: ArrayOrTensor, m: int, origin: tuple[int, int, int] = (0, 0, 0)) -> ArrayOrTensor:
         """A part of a volume, from voxel `origin` on, times view m's voxel weights."""
@@ -356,14 +358,14 @@ class Projector(LinearOperator):
         mu = 0 if self.model.mu is None else self.model.mu.grid.n_voxels
         return wide * mu + (2 * wide + 8) * self.grid.n_voxels * self.model.weights_voxels
 
-    def _beams(self, m: int) -> Iterator[tuple[Beam, bool]]:
+    def _beams(self, m: int) -> tuple[list[Beam], bool]:
         """View m's rays, and whether their lines are the image's columns, not its rows.
 
         Neighbours in a line are neighbours in memory: lines follow the volume's contiguous axis as well as they can.
         """
-        for beam in self.model.beams(self.views, m, self.grid):
-            by_columns = beam.rays.lies_across(self.grid)
-            yield (beam.transposed() if by_columns else beam), by_columns
+        beams = list(self.model.beams(self.views, m, self.grid))
+        by_columns = beams[0].rays.lies_across(self.grid)
+        return ([beam.transposed() for beam in beams] if by_columns else beams), by_columns
 
     def _lattices(
         self, native: ArrayOrTensor, volume: ArrayOrTensor = None, whole_mu: bool = False
@@ -479,19 +481,27 @@ class AdjointProjector(LinearOperator):
                 if response is not None:
                     along_v, along_u = (alike(matrix, image) for matrix in response)
                     image = along_v.T @ image @ along_u
-                for beam, by_columns in A._beams(m):
-                    lines = image.T if by_columns else image
-                    lines = lines if beam.weights is None else alike(beam.weights, image) * lines
-                    blocks = _blocks(lines.shape[0], lines.shape[1], name, workers)
+                beams, by_columns = A._beams(m)
+                lines, rays = window([beam.rays for beam in beams], A.grid.corners())
+                blocks = _blocks(lines, rays, name, workers)
 
-                    def add(worker: int) -> None:
-                        # Always the same blocks, so that the sums' order, and so the result, is always the same.
-                        for block in blocks[worker::workers]:  # noqa: B023
-                            rays, attenuation = trace(beam.rays[block])  # noqa: B023
-                            spread(volumes[worker], lines[block].reshape(-1), rays, attenuation)  # noqa: B023
+                def add(
+                    worker: int,
+                    beams: list[Beam] = beams,
+                    rays: slice = rays,
+                    blocks: list[slice] = blocks,
+                    lines: ArrayOrTensor = image.T if by_columns else image,
+                    spread: Spread = spread,
+                ) -> None:
+                    # Always the same blocks, so that the sums' order, and so the result, is always the same.
+                    for block in blocks[worker::workers]:
+                        pixels = lines[block, rays]
+                        for beam, shifts in _bundles(beams, pixels.shape, name):
+                            fan, weights = beam.part(block, rays, shifts)
+                            values = alike(np.ones(1) if weights is None else weights, pixels) * pixels
+                            spread(volumes[worker], values.reshape(-1), *trace(fan))
 
-                    for _ in parallel_map(add, range(workers)):
-                        pass
+                _wait_for(parallel_map(add, range(workers)))
                 if weighted:  # otherwise in every view: each joins the others weighted
                     total += A._weighted(_sum(volumes), m)
                     for volume in volumes:
@@ -562,12 +572,30 @@ def _sum(volumes: list[ArrayOrTensor]) -> ArrayOrTensor:
     return total
 
 
-def _blocks(n_lines: int, line_length: int, backend: str, workers: int) -> list[slice]:
-    """The lines of rays, cut into what a backend is given at once: two pieces or more for each worker."""
+def _blocks(lines: slice, rays: slice, backend: str, workers: int) -> list[slice]:
+    """The lines, cut into what a backend is given at once: two pieces or more for each worker."""
+    n_lines, line_length = lines.stop - lines.start, rays.stop - rays.start
+    if not n_lines or not line_length:
+        return []
     most = _MOST_RAYS.get(backend, _FEWEST_RAYS)
     rays_at_once = max(min(_FEWEST_RAYS, most), min(most, n_lines * line_length // (2 * workers)))
     size = max(1, rays_at_once // line_length)
-    return [slice(first, first + size) for first in range(0, n_lines, size)]
+    return [slice(first, min(first + size, lines.stop)) for first in range(lines.start, lines.stop, size)]
+
+
+def _bundles(beams: list[Beam], shape: tuple[int, int], backend: str) -> Iterator[tuple[Beam, slice]]:
+    """The beams, and as many of their shifts at once as a backend is given of so many lines and rays each."""
+    at_once = max(1, _MOST_RAYS.get(backend, _FEWEST_RAYS) // math.prod(shape))
+    for beam in beams:
+        n = len(beam.rays.shifts)
+        yield from ((beam, slice(first, min(first + at_once, n))) for first in range(0, n, at_once))
+
+
+def _corners(grid: Grid, box: ArrayOrTensor, origin: tuple[int, int, int]) -> Array:
+    """Corners (8, 3), world mm, of the part of `grid` that is `box`, an array that begins at voxel `origin`."""
+    affine = grid.affine.copy()
+    affine[:3, 3] += affine[:3, :3] @ np.array(origin)
+    return Grid(box.shape, affine).corners()
 
 
 @contextmanager

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -17,11 +17,15 @@ from ..grid import Grid
 SNAP = 1e-9
 
 
+_UNSHIFTED = np.zeros((1, 2))
+
+
 @dataclass(frozen=True, eq=False)
 class Fan:
     """Rays from one point to the points of a lattice on a plane, world mm: all that an image's rays are.
 
-    Ray j of line i goes from `source` to ``corner + i line_step + j ray_step``.
+    Ray j of line i goes from `source` to ``corner + i line_step + j ray_step``; with S shifts there are S such lattices,
+    each moved by so many lines and rays: more points of every pixel.
 
     Attributes
     ----------
@@ -29,6 +33,8 @@ class Fan:
         mm.
     shape : tuple of int
         Lines, and rays of a line.
+    shifts : array (S, 2)
+        In lines and in rays.
     """
 
     source: NDArray[np.float64]
@@ -36,19 +42,30 @@ class Fan:
     line_step: NDArray[np.float64]
     ray_step: NDArray[np.float64]
     shape: tuple[int, int]
+    shifts: NDArray[np.float64] = field(default_factory=lambda: _UNSHIFTED)
 
     def __len__(self) -> int:
-        return self.shape[0] * self.shape[1]
+        return len(self.shifts) * self.shape[0] * self.shape[1]
 
-    def __getitem__(self, lines: slice) -> Fan:
-        """Some of the lines."""
-        first, stop, _ = lines.indices(self.shape[0])
-        corner = self.corner + first * self.line_step
-        return Fan(self.source, corner, self.line_step, self.ray_step, (stop - first, self.shape[1]))
+    def __getitem__(self, which: slice | tuple[slice, slice] | tuple[slice, slice, slice]) -> Fan:
+        """Some of the lines, or of each of these some of the rays, or of these some of the shifts."""
+        lines, rays, shifts = ((*which, slice(None), slice(None)) if isinstance(which, tuple) else (which, *_ALL))[:3]
+        line, last_line, _ = lines.indices(self.shape[0])
+        ray, last_ray, _ = rays.indices(self.shape[1])
+        corner = self.corner + line * self.line_step + ray * self.ray_step
+        return replace(self, corner=corner, shape=(last_line - line, last_ray - ray), shifts=self.shifts[shifts])
+
+    def single(self) -> list[Fan]:
+        """A fan for every shift, without shifts."""
+        if self.shifts is _UNSHIFTED:
+            return [self]
+        corners = self.corner + self.shifts @ np.stack([self.line_step, self.ray_step])
+        return [replace(self, corner=corner, shifts=_UNSHIFTED) for corner in corners]
 
     def transposed(self) -> Fan:
         """The same rays, lines across."""
-        return Fan(self.source, self.corner, self.ray_step, self.line_step, self.shape[::-1])
+        shifts = self.shifts if self.shifts is _UNSHIFTED else self.shifts[:, ::-1]
+        return Fan(self.source, self.corner, self.ray_step, self.line_step, self.shape[::-1], shifts)
 
     def lies_across(self, grid: Grid) -> bool:
         """Whether neighbours in the voxels' memory are rather neighbours in different lines than in one."""
@@ -56,15 +73,48 @@ class Fan:
         return bool(abs(contiguous @ self.line_step) > abs(contiguous @ self.ray_step))
 
     def targets(self) -> NDArray[np.float64]:
-        """Ends of the rays (lines * rays, 3), line by line."""
+        """Ends of the rays (S * lines * rays, 3), shift by shift, line by line."""
         line, ray = (np.arange(n, dtype=np.float64) for n in self.shape)
-        return (self.corner + line[:, None, None] * self.line_step + ray[:, None] * self.ray_step).reshape(-1, 3)
+        lines = line[:, None] + self.shifts[:, 0, None, None]
+        rays = ray + self.shifts[:, 1, None, None]
+        return (self.corner + lines[..., None] * self.line_step + rays[..., None] * self.ray_step).reshape(-1, 3)
 
     def moved(self, affine: NDArray[np.float64]) -> Fan:
         """The fan under a 4x4 affine."""
         linear, translation = affine[:3, :3], affine[:3, 3]
         source, corner = linear @ self.source + translation, linear @ self.corner + translation
-        return Fan(source, corner, linear @ self.line_step, linear @ self.ray_step, self.shape)
+        return Fan(source, corner, linear @ self.line_step, linear @ self.ray_step, self.shape, self.shifts)
+
+
+_ALL = slice(None), slice(None)
+
+
+def window(fans: Sequence[Fan], points: NDArray[np.float64]) -> tuple[slice, slice]:
+    """The lines, and the rays of each, outside of which no ray of any of `fans` meets the convex hull of `points`.
+
+    Parameters
+    ----------
+    fans
+        Of one shape.
+    points
+        (P, 3), in the frame of the fans, mm.
+    """
+    shape = fans[0].shape
+    found = []
+    for fan in fans:
+        axes = np.stack([fan.line_step, fan.ray_step, fan.corner - fan.source], axis=1)
+        # point - source = w (i line_step + j ray_step + corner - source): solved for w (i, j, 1).
+        *places, factor = np.linalg.solve(axes, (points - fan.source).T)
+        if not (factor > 1e-6 * np.abs(factor).max()).all():  # some of it beside or behind the source
+            return slice(0, shape[0]), slice(0, shape[1])
+        place = np.array(places) / factor
+        # A little more than rounding.
+        found.append(
+            (place.min(axis=1) - fan.shifts.max(axis=0) - 0.01, place.max(axis=1) - fan.shifts.min(axis=0) + 0.01)
+        )
+    first = np.clip(np.ceil(np.min([low for low, _ in found], axis=0)), 0, shape).astype(int)
+    stop = np.clip(np.floor(np.max([high for _, high in found], axis=0)) + 1, first, shape).astype(int)
+    return slice(int(first[0]), int(stop[0])), slice(int(first[1]), int(stop[1]))
 
 
 @dataclass(frozen=True, eq=False)
@@ -121,6 +171,10 @@ class IndexFan:
         """The rays one by one, snapped to the planes that they lie in."""
         lengths = np.linalg.norm(self.world.targets() - self.world.source, axis=1)
         return _snapped(np.broadcast_to(self.fan.source, (len(self), 3)), self.fan.targets(), lengths)
+
+    def single(self) -> list[IndexFan]:
+        """A fan for every shift, without shifts."""
+        return [IndexFan(fan, world) for fan, world in zip(self.fan.single(), self.world.single(), strict=True)]
 
 
 @dataclass(frozen=True, eq=False)
@@ -191,6 +245,16 @@ class RayMapper:
     def __call__(self, fan: Fan) -> tuple[IndexFan, Attenuation | None]:
         """The rays of `fan`, and what attenuates them."""
         return self._mapped(index_fan, fan)
+
+    def together(self, fans: Sequence[Fan]) -> tuple[IndexFan | IndexFans, Attenuation | None]:
+        """The rays of several fans of one shape, those of each behind those of the one before, and what attenuates them."""
+        if len(fans) == 1:
+            return self(fans[0])
+        rays, attenuations = zip(*map(self, fans), strict=True)
+        attenuation = attenuations[0]
+        if attenuation is not None and attenuation.rays is not None:
+            attenuation = Attenuation(self.mu, IndexFans(tuple(each.rays for each in attenuations)))
+        return IndexFans(rays), attenuation
 
     def between(
         self, sources: NDArray[np.float64], targets: NDArray[np.float64]

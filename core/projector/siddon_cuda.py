@@ -226,7 +226,7 @@ def _table(rays: Rays) -> tuple[NDArray[np.float64], int, int]:
         table[:, 1] = rays.starts + rays.directions
         table[:, 5, 0] = rays.lengths
         return table, 1, 1
-    fans = (rays,) if isinstance(rays, IndexFan) else rays.fans
+    fans = [single for fan in ((rays,) if isinstance(rays, IndexFan) else rays.fans) for single in fan.single()]
     return np.array([_rows(fan.fan) + _rows(fan.world) for fan in fans]), *fans[0].fan.shape
 
 

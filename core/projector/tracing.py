@@ -321,7 +321,7 @@ class Tracer:
                 bundle, transposed = bundle.transposed(), True
             pieces += [
                 _Piece(number, bundle, lines, transposed)
-                for lines in _blocks(*bundle.shape, self.backend, self._workers)
+                for lines in _blocks(*map(slice, (0, 0), bundle.shape), self.backend, self._workers)
             ]
         return pieces
 

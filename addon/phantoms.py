@@ -171,7 +171,8 @@ def settings_of(item: bpy.types.Object | None) -> Any:
     if item is None or not volumes.is_volume(item):
         return None
     properties = getattr(item, ids.OBJECT_VOLUME)
-    return None if properties.kind == "VOLUME" else getattr(properties, properties.kind.lower())
+    # A kind that only a later version knows is "": its voxels stay as they are.
+    return None if properties.kind in ("VOLUME", "") else getattr(properties, properties.kind.lower())
 
 
 def poll_phantom(operator: type[bpy.types.Operator], context: bpy.types.Context) -> bool:

@@ -22,7 +22,7 @@ from ..project import project_run
 from ..projector import Emission, InverseSquareSum, Model, Transmission
 from ..rearranging import centered
 from ..system import PinholeSystem
-from ..volume import Volume
+from ..volume import LINE_INTEGRALS, Volume
 from ..volume_io import read_volume, read_volume_of
 from ..workbook import read_system
 from .options import (
@@ -41,6 +41,8 @@ from .options import (
 )
 from .phantom import chosen_phantom, placed_volume
 
+_MOST_MU = 500.0
+"""1/mm: more than any material of the tables attenuates photons of 10 keV or more."""
 _EMISSION = [field.name for field in fields(Emission)]
 Source = tuple[Volume, Volume | None, dict[str, Any]]
 """What is projected, what attenuates it, and what to record of them."""
@@ -52,7 +54,7 @@ def add_parser(subparsers) -> None:  # type: ignore[no-untyped-def]
         subparsers,
         "project",
         "project a volume, or a phantom, into every module",
-        "mphdrr project scanner.xlsx --volume ct.nii.gz --size 250 250 -o run.h5\n"
+        "mphdrr project scanner.xlsx --volume ct.nii.gz --energy 60 --size 250 250 -o run.h5\n"
         "example: mphdrr project scanner.xlsx --volume heart.nii.gz --mu ct-mu.nii.gz --emission --isotope Tc-99m "
         "--time 600 --aperture-points 7 --aperture-mu tungsten --crystal-mu CZT --noise 1 -o counts.h5\n"
         "example: mphdrr project scanner.xlsx --phantom thorax.toml --phantom-mu --emission --isotope Tc-99m -o counts.h5",
@@ -70,6 +72,11 @@ def add_parser(subparsers) -> None:  # type: ignore[no-untyped-def]
     parser.add_argument(
         "--series", metavar="NAME", help="of several DICOM series in --volume, by number, description or UID"
     )
+    parser.add_argument(
+        "--quantity", choices=LINE_INTEGRALS,
+        help="what the values of --volume or --states are; default: what the file says; one that says nothing holds "
+        "activity with --emission, mu with --photons, and is else taken for CT numbers",
+    )  # fmt: skip
     parser.add_argument(
         "--energy", metavar="KEV",
         help="CT numbers of --volume, --states or --mu become attenuation (1/mm) at this energy, or at an isotope's "
@@ -185,6 +192,10 @@ def _require_fitting(arguments: argparse.Namespace) -> None:
             refuse(arguments, DERENZO_OPTIONS, "is for the Derenzo phantom, not for --phantom")
     if not arguments.volume:
         refuse(arguments, ("series",), "needs --volume")
+        if not arguments.states:
+            refuse(arguments, ("quantity",), "needs --volume or --states")
+    if arguments.energy is not None and not arguments.emission:
+        refuse(arguments, ("quantity",), "has no effect beside --energy, which takes CT numbers")
     if "mu" not in arguments:
         refuse(arguments, ("mu_series",), "needs --mu")
         if arguments.emission or not (arguments.volume or arguments.states):
@@ -207,21 +218,37 @@ def _attenuation(path: str, energy: str | None, series: str | None) -> Volume:
         return hu_to_mu(volume, photon_energy(energy))
     advice = "; of CT numbers, give --energy to convert them"
     volume = read_volume_of(path, "mu", advice, series=series, progress=progress)
-    lowest = float(volume.array.min())
-    if lowest < -1:  # interpolation may leave values a little below 0
+    lowest, highest = float(volume.array.min()), float(volume.array.max())
+    if lowest < -1 or highest > _MOST_MU:  # interpolation may leave values a little below 0
         raise InputError(
-            f"{path}: {lowest:g} is no attenuation in 1/mm; if it holds CT numbers, give --energy to convert them"
+            f"{path}: {lowest if lowest < -1 else highest:g} is no attenuation in 1/mm; if it holds CT numbers, give "
+            "--energy to convert them"
         )
     return volume
 
 
 def _volume(path: str, arguments: argparse.Namespace) -> Volume:
-    """What a file of --volume or --states holds, as the chosen model takes it."""
+    """What a file of --volume or --states holds; what the chosen model has no meaning for is refused."""
+    if arguments.quantity is not None:
+        return read_volume(path, arguments.quantity, series=arguments.series, progress=progress_bar("reading"))
     if arguments.emission:
-        return read_volume_of(path, "activity", series=arguments.series, progress=progress_bar("reading"))
+        volume = read_volume_of(path, "activity", series=arguments.series, progress=progress_bar("reading"))
+        lowest, highest = float(volume.array.min()), float(volume.array.max())
+        if lowest < -0.1 * highest:  # interpolation leaves less
+            raise InputError(
+                f"{path}: values of {lowest:g} to {highest:g}, as of a CT, are no activity; --quantity activity takes them "
+                "as such"
+            )
+        return volume
     if arguments.photons is not None or arguments.energy is not None:
         return _attenuation(path, arguments.energy, arguments.series)
-    return read_volume(path, series=arguments.series, progress=progress_bar("reading"))
+    volume = read_volume(path, series=arguments.series, progress=progress_bar("reading"))
+    if volume.quantity == "hu":
+        raise InputError(
+            f"{path}: it holds CT numbers (hu), or says nothing and is taken for them; give --energy KEV to convert them "
+            "to attenuation, or --quantity mu or activity if that is what the values are"
+        )
+    return volume
 
 
 def _of_files(files: Sequence[str], mu: Volume | None, arguments: argparse.Namespace) -> Iterator[Source]:

@@ -16,7 +16,7 @@ from ..isotopes import Isotope, isotope
 from ..materials import module_coefficients
 from ..system import PinholeSystem
 from ..views import Views
-from ..volume import Volume
+from ..volume import Volume, require_quantity
 from .aperture import KnifeEdge, Opening, openings, paix_diameter, points_needed, within_cone
 from .arrays import ArrayOrTensor, is_tensor, namespace
 from .crystal import absorbed_share, gaussian_blur, layer_depths, share_inside
@@ -137,6 +137,7 @@ class Emission(Model):
     within_cone: bool = False
 
     name = "emission"
+    takes = ("activity",)
 
     def __post_init__(self) -> None:
         if not isinstance(self.system, PinholeSystem):
@@ -145,8 +146,7 @@ class Emission(Model):
             if not isinstance(self.mu, Volume):
                 hint = "; tensors of it go to the projector, A(x, mu=...)" if is_tensor(self.mu) else ""
                 raise InputError(f"emission: expected mu to be a Volume, got {type(self.mu).__name__}{hint}")
-            if self.mu.quantity != "mu":
-                raise InputError(f"emission: expected a volume of mu, got {self.mu.quantity}")
+            require_quantity(self.mu.quantity, ("mu",), "emission: mu")
             if self.mu.array.min() < 0:
                 raise InputError(f"emission: mu must not be negative, got {self.mu.array.min():g} 1/mm")
         self._set_photons()
@@ -226,11 +226,6 @@ class Emission(Model):
     def unit(self, volume: Volume) -> str:
         """Unit of the images of `volume`."""
         return "counts"
-
-    def check_volume(self, volume: Volume) -> None:
-        """Raise `InputError` unless `volume` holds activity."""
-        if volume.quantity != "activity":
-            raise InputError(f"emission: expected a volume of activity, got {volume.quantity}")
 
     def check(self, views: Views) -> None:
         """Raise `InputError` unless `views` are of this system."""

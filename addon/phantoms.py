@@ -26,6 +26,7 @@ from ..core.meshes.mesh import Mesh
 from ..core.phantoms.kinds import KINDS
 from ..core.phantoms.phantom import Phantom
 from ..core.progress import Progress, part_of
+from ..core.recording import recorded_warnings
 from ..core.volume import Volume
 from . import ids, meshes, storage, volumes
 from .cameras import set_world_matrix, world_matrix
@@ -159,11 +160,9 @@ def recipe_of(settings: PhantomSettings) -> Recipe:
     InputError
         There is no such phantom.
     """
-    with warnings.catch_warnings(record=True) as caught:
-        warnings.simplefilter("always", InputWarning)
+    with recorded_warnings() as caught:
         phantom = settings.phantom()
-    messages = tuple(str(w.message) for w in caught)
-    return Recipe(phantom, settings.n_states, settings.grid(phantom), settings.recipe(), messages)
+    return Recipe(phantom, settings.n_states, settings.grid(phantom), settings.recipe(), tuple(caught))
 
 
 def settings_of(item: bpy.types.Object | None) -> Any:

@@ -13,7 +13,7 @@ from ..addon.decimals import typed
 from ..core.hounsfield import hu_to_mu
 from ..core.memory import require
 from ..core.progress import Progress
-from ..core.volume import UNITS
+from ..core.volume import UNITS, Volume
 
 
 class MPHDRR_OT_ct_to_attenuation(jobs.JobOperator, bpy.types.Operator):
@@ -52,7 +52,7 @@ class MPHDRR_OT_ct_to_attenuation(jobs.JobOperator, bpy.types.Operator):
         frame_start, sequence_mode = item.data.frame_start, item.data.sequence_mode
 
         def work(progress: Progress) -> volumes.StoredVolume:
-            states = []
+            states: list[Volume] = []
             for read in readers:
                 progress(len(states), count + 1)
                 states.append(hu_to_mu(read(), energy))

@@ -453,7 +453,7 @@ def _write(
     paths = [folder / f"{stem}{f'_{k:04d}' if len(states) > 1 else ''}.vdb" for k in range(1, len(states) + 1)]
     for state, path in zip(states, paths, strict=True):
         if not path.exists():
-            write_vdb(state, path, provenance, smoke_above=smoke_above)
+            write_vdb(state, path, provenance, smoke_above=smoke_above, center_shift=compat.VDB_CENTER_SHIFT)
     return paths[0]
 
 

@@ -31,6 +31,7 @@ from ..core.volume import Volume
 from . import ids, meshes, storage, volumes
 from .cameras import set_world_matrix, world_matrix
 from .phantom_properties import PhantomSettings, identifier
+from .vdb import provenance_of
 
 _SKETCHED = 32  # voxels along each side of a sketch
 
@@ -212,6 +213,22 @@ def root_of(item: bpy.types.Object) -> bpy.types.Object | None:
     if getattr(item, ids.OBJECT_VOLUME).with_parent and item.parent is not None:
         item = item.parent
     return None if settings_of(item) is None else item
+
+
+def mu_energy(item: bpy.types.Object) -> float | None:
+    """The photon energy, keV, at which a volume's mu holds: of a phantom, or of a CT that was converted; else None.
+
+    Raises
+    ------
+    InputError
+        The phantom's settings make no phantom.
+    """
+    root = root_of(item)
+    if root is not None:
+        return recipe_of(settings_of(root)).phantom.mu_energy
+    path = volumes.file_of(item)
+    energy = provenance_of(path).get("energy_keV") if path.is_file() else None
+    return None if energy is None else float(energy)
 
 
 def require_current(item: bpy.types.Object) -> None:

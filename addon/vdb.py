@@ -140,6 +140,17 @@ def read_vdb(path: str | Path, quantity: str | None = None, grid: str | None = N
         raise InputError(f"{path}: cannot be read as an OpenVDB volume ({reason})") from error
 
 
+def provenance_of(path: Path) -> dict[str, Any]:
+    """What a file of ours was made from, of its first volume; nothing of other programs' and of damaged files."""
+    try:
+        grids = _described(path).values()
+    except Exception:  # whatever OpenVDB raises; reading it says what is wrong
+        return {}
+    found = next((grid.metadata["mphdrr_provenance"] for grid in grids if "mphdrr_provenance" in grid.metadata), "{}")
+    provenance: dict[str, Any] = json.loads(found)
+    return provenance
+
+
 def openvdb() -> Any:
     """The module, which comes with Blender."""
     try:

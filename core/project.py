@@ -101,6 +101,13 @@ def project_run(
     return ProjectionRun(images, system, views, volume, unit=unit, settings=record, seed=noise_seed)
 
 
+def warn_of_energy(model: Model, energy: float, what: str) -> None:
+    """Warn where mu holds at an energy (keV) whose photons the model does not count; `what` names the mu."""
+    window = model.window if isinstance(model, Emission) else None
+    if window is not None and not window[0] <= energy <= window[1]:
+        _warn(f"{what} holds at {energy:g} keV, photons of {window[0]:g} to {window[1]:g} keV are counted")
+
+
 def _warn_of_unseen(volume: Volume, views: Views, ends_at_plane: bool) -> None:
     """Warn where a volume lies beside the isocentre, or beyond the plane at which the rays end."""
     index = volume.grid.index_from_world[:3, 3]

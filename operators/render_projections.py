@@ -51,6 +51,7 @@ class MPHDRR_OT_render_projections(ProjectionSettings, jobs.JobOperator, bpy.typ
         for volume in (item, mu):
             if volume is not None:
                 phantoms.require_current(volume)
+        energy = None if mu is None else phantoms.mu_energy(mu)
         n_bytes = 4.0 * len(system) * shape[0] * shape[1]
         # The array, and Blender's images with four channels in memory and once more, packed.
         require(9 * n_bytes, f"{len(system)} images of {shape[1]} x {shape[0]} pixels")
@@ -62,12 +63,15 @@ class MPHDRR_OT_render_projections(ProjectionSettings, jobs.JobOperator, bpy.typ
         if item.data.is_sequence:
             settings |= {"frame": scene.frame_current, "state": volumes.state_text(item)}
         scene_name, item_name, start = scene.name, item.name, time.perf_counter()
+        mu_name = None if mu is None else mu.name
 
         def work(progress: Progress) -> ProjectionRun:
             from ..core.export import write_run
-            from ..core.project import project_run
+            from ..core.project import project_run, warn_of_energy
 
             progress(0, len(system))
+            if mu_name is not None and energy is not None:
+                warn_of_energy(model, energy, f"the mu of {mu_name!r}")
             run = project_run(
                 system,
                 read_volume(),

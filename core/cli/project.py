@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import math
-import warnings
 from collections.abc import Iterator, Sequence
 from dataclasses import fields
 from pathlib import Path
@@ -12,13 +11,13 @@ from typing import Any
 
 import numpy as np
 
-from ..errors import InputError, InputWarning
+from ..errors import InputError
 from ..export import FORMATS, write_run
 from ..hounsfield import hu_to_mu
 from ..isotopes import ISOTOPES
 from ..materials import APERTURES, CRYSTALS
 from ..mosaic import mosaic, write_png
-from ..project import project_run
+from ..project import project_run, warn_of_energy
 from ..projector import Emission, InverseSquareSum, Model, Transmission
 from ..rearranging import centered
 from ..system import PinholeSystem
@@ -273,14 +272,7 @@ def _of_phantom(mu: Volume | None, model: Model, arguments: argparse.Namespace) 
     if arguments.phantom_mu:
         if all(shape.mu is None for shape in phantom.shapes):
             raise InputError(f"--phantom-mu: no shape of the {phantom.title} has a mu")
-        window = model.window if isinstance(model, Emission) else None
-        if window is not None and not window[0] <= phantom.mu_energy <= window[1]:
-            warnings.warn(
-                f"the mu of the {phantom.title} holds at {phantom.mu_energy:g} keV, photons of {window[0]:g} to "
-                f"{window[1]:g} keV are counted",
-                InputWarning,
-                stacklevel=2,
-            )
+        warn_of_energy(model, phantom.mu_energy, f"the mu of the {phantom.title}")
         mu = placed_volume(phantom, arguments, "mu")
         settings["mu_of_phantom_at_kev"] = phantom.mu_energy
     quantity = "mu" if arguments.phantom and arguments.photons is not None else "activity"
@@ -300,6 +292,8 @@ def _run(arguments: argparse.Namespace) -> None:
         if Path(file).resolve() in outputs:
             raise InputError(f"{file}: the projections would replace what they are made from; choose another --output")
     mu = _attenuation(arguments.mu, arguments.energy, arguments.mu_series) if "mu" in arguments else None
+    if mu is not None and arguments.energy is not None:
+        warn_of_energy(model, photon_energy(arguments.energy), f"the mu of {Path(arguments.mu).name}")
     sources = _of_files(files, mu, arguments) if files else _of_phantom(mu, model, arguments)
     for number, (volume, mu_of_it, settings) in enumerate(sources, 1):
         run = project_run(

@@ -437,3 +437,22 @@ def test_a_volume_of_the_panel_that_was_deleted_is_missed(scene, scanned, body, 
 def test_only_a_ct_is_converted(scanned):
     with pytest.raises(RuntimeError, match="No CT is active"):
         bpy.ops.mphdrr.ct_to_attenuation()
+
+
+@pytest.mark.parametrize(("isotope", "said"), [("Tc-99m", False), ("I-131", True)])
+@pytest.mark.parametrize("source", ["phantom", "ct"])
+def test_attenuation_at_another_energy_is_said(scanned, scene, source, isotope, said, capfd):
+    if source == "phantom":
+        bpy.ops.mphdrr.add_nema(voxels=16, attenuation=True, name="Body")
+        mu = next(o for o in volumes.volume_objects(scene) if o.mphdrr_volume.quantity == "mu")
+    else:
+        volumes.make_active(
+            bpy.context, volumes.add_volume(Volume(np.zeros((4, 4, 4)), Grid.centered(4, 30.0), "hu"), "CT")
+        )
+        bpy.ops.mphdrr.ct_to_attenuation()
+        mu = bpy.context.object
+    settings = {"model": "EMISSION", "isotope": isotope, "volume": "Derenzo", "mu": mu.name}
+    capfd.readouterr()
+    assert bpy.ops.mphdrr.render_projections(width=4, height=4, last=1, **settings) == {"FINISHED"}
+    out = "".join(capfd.readouterr())
+    assert (f"the mu of '{mu.name}' holds at 140.5 keV" in out) == said

@@ -205,3 +205,13 @@ def test_activity_below_0_is_taken_where_it_is_said_to_be_activity(workbook, tmp
     options = ["--volume", tmp_path / "ct.nii", "--emission", "--quantity", "activity"]
     assert _project(workbook, tmp_path, *options) == 0
     assert "what is below 0 makes counts below 0" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(("energy", "said"), [("I-131", False), ("Tc-99m", True)])
+def test_attenuation_at_another_energy_than_the_photons_is_said(energy, said, ct, workbook, tmp_path, capsys):
+    write_volume(ct, tmp_path / "ct.npz")
+    write_volume(volume_of("activity"), tmp_path / "a.npz")
+    options = ["--volume", tmp_path / "a.npz", "--emission", "--isotope", "I-131", "--mu", tmp_path / "ct.npz"]
+    assert _project(workbook, tmp_path, *options, "--energy", energy) == 0
+    expected = "the mu of ct.npz holds at 140.5 keV, photons of 328.05 to 400.95 keV are counted"
+    assert (expected in capsys.readouterr().err) == said

@@ -11,6 +11,7 @@ import bpy
 import numpy as np
 
 from ..core.errors import InputError, InputWarning
+from ..core.recording import recorded_warnings
 from ..core.system import PinholeSystem
 from . import scanner, storage
 from .module_values import LENGTHS
@@ -47,8 +48,7 @@ def export_scanner(collection: bpy.types.Collection, path: Path, use_template: b
     scanner.refresh_scanner(collection)
     system = scanner.read_scanner(collection, aimed=True)
     write_system(system, path, _template(collection) if use_template else None)
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", InputWarning)  # the writer has said what there is to say of the template
+    with recorded_warnings():  # the writer has said what there is to say of the template
         written = read_system(path)
     different = _difference(system, written)
     if different:

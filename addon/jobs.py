@@ -11,17 +11,16 @@ import sys
 import threading
 import time
 import traceback
-import warnings
 from collections.abc import Callable, Generator
-from contextlib import ExitStack
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
 import bpy
 from bpy.props import BoolProperty, FloatProperty, StringProperty
 
-from ..core.errors import InputError, InputWarning
+from ..core.errors import InputError
 from ..core.progress import Cancelled, Progress
+from ..core.recording import recorded_warnings
 from . import ids
 from .reports import warnings_reported
 
@@ -53,7 +52,7 @@ class Job:
 
 @dataclass
 class Worker:
-    """Work in a thread of its own, with its progress and its warnings; the main thread starts and ends it."""
+    """Work in a thread of its own, with its progress and the warnings it gave; the main thread starts it."""
 
     label: str
     work: Callable[[Progress], Any]
@@ -61,15 +60,11 @@ class Worker:
     total: int = 0
     result: Any = None
     error: BaseException | None = None
-    caught: list[warnings.WarningMessage] = field(default_factory=list)
+    caught: list[str] = field(default_factory=list)
     cancel: threading.Event = field(default_factory=threading.Event)
     thread: threading.Thread | None = None
-    _catching: ExitStack = field(default_factory=ExitStack)
 
     def start(self) -> None:
-        # Begun and ended by Blender's main thread: of two threads, one would put back what the other had set.
-        self.caught = self._catching.enter_context(warnings.catch_warnings(record=True))
-        warnings.simplefilter("always", InputWarning)
         self.thread = threading.Thread(target=self._work, name=f"mphDRR: {self.label}", daemon=True)
         self.thread.start()
 
@@ -77,15 +72,12 @@ class Worker:
     def alive(self) -> bool:
         return self.thread is not None and self.thread.is_alive()
 
-    def end(self) -> None:
-        """It is done, or nobody waits for it any more."""
-        self._catching.close()
-
     def _work(self) -> None:
-        try:
-            self.result = self.work(self._progress)
-        except BaseException as error:
-            self.error = error
+        with recorded_warnings() as self.caught:
+            try:
+                self.result = self.work(self._progress)
+            except BaseException as error:
+                self.error = error
 
     def _progress(self, done: int, total: int) -> None:
         self.done, self.total = done, total
@@ -115,7 +107,6 @@ def stop() -> None:
         run.cancel.set()
         if run.thread is not None:
             run.thread.join(_PATIENCE)
-        run.end()
 
 
 @bpy.app.handlers.persistent
@@ -233,10 +224,8 @@ class JobOperator:
         if run.alive:
             return {"PASS_THROUGH"}
         if self._finishing is None:
-            run.end()
-            for warning in run.caught:
-                if issubclass(warning.category, InputWarning):
-                    self.report({"WARNING"}, str(warning.message))
+            for text in run.caught:
+                self.report({"WARNING"}, text)
             error = run.error or (Cancelled() if run.cancel.is_set() else None)
             if error is not None:
                 self._end(context)

@@ -12,12 +12,12 @@ from __future__ import annotations
 
 import time
 import traceback
-import warnings
 from typing import Any
 
 import bpy
 
-from ..core.errors import InputError, InputWarning
+from ..core.errors import InputError
+from ..core.recording import recorded_warnings
 from . import ids, jobs, phantoms
 
 LIVE_VOXELS = 64**3
@@ -44,8 +44,7 @@ def settings_changed(item: Any, settings: Any) -> None:
     properties.outdated, properties.message = True, ""
     _cancel()
     _given_up.discard(item.name)
-    with warnings.catch_warnings(record=True) as caught:
-        warnings.simplefilter("always", InputWarning)
+    with recorded_warnings() as caught:
         try:
             if _has_window() and not jobs.is_running():
                 phantoms.sketch(item)
@@ -59,7 +58,7 @@ def settings_changed(item: Any, settings: Any) -> None:
         except InputError as error:
             properties.message = str(error)
             return
-    properties.message = _first(caught)
+    properties.message = next(iter(caught), "")
 
 
 def settle(item: bpy.types.Object) -> None:
@@ -127,7 +126,6 @@ def _cancel() -> None:
     global _refinement
     if _refinement is not None:
         _refinement[1].cancel.set()
-        _refinement[1].end()
         _refinement = None
 
 
@@ -166,7 +164,7 @@ def _finish(name: str, done: jobs.Worker) -> None:
         if done.error is not None:
             raise done.error
         phantoms.replace(item, done.result or [])
-        getattr(item, ids.OBJECT_VOLUME).message = _first(done.caught)
+        getattr(item, ids.OBJECT_VOLUME).message = next(iter(done.caught), "")
     except InputError as error:
         _give_up(item, str(error))
     except MemoryError:
@@ -179,8 +177,3 @@ def _finish(name: str, done: jobs.Worker) -> None:
 def _give_up(item: bpy.types.Object, message: str) -> None:
     _given_up.add(item.name)
     getattr(item, ids.OBJECT_VOLUME).message = message
-
-
-def _first(caught: list[warnings.WarningMessage]) -> str:
-    """The first of the warnings that are for the user."""
-    return next((str(w.message) for w in caught if issubclass(w.category, InputWarning)), "")

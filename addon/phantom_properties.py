@@ -23,6 +23,7 @@ from ..core.phantoms.kinds import KINDS, Kind
 from ..core.phantoms.language import parse_phantom
 from ..core.phantoms.phantom import Phantom
 from ..core.volume import UNITS
+from . import choices
 from .decimals import typed
 
 FILE = "file"
@@ -163,7 +164,11 @@ def sampling(update: Any = None) -> dict[str, Any]:
     return {
         "quantity": EnumProperty(
             name="Quantity", description="What the voxels hold", update=update,
-            items=(("activity", "Activity", "In kBq/mL"), ("mu", "Attenuation", "Linear attenuation in 1/mm")),
+            default="activity",
+            items=choices.items(
+                choices.QUANTITIES,
+                (("activity", "Activity", "In kBq/mL"), ("mu", "Attenuation", "Linear attenuation in 1/mm")),
+            ),
         ),
         "voxels": IntProperty(
             name="Voxels per Side", description="Voxels along each side of the grid", default=128, min=4, soft_max=512,
@@ -211,7 +216,8 @@ def _property(field: Any, kind: Kind, update: Any) -> Any:
     text = known["text"][0].upper() + known["text"][1:]
     options: dict[str, Any] = {"name": name, "description": text, "default": default, "update": update}
     if "choices" in known:
-        return EnumProperty(**options, items=tuple((word, word.capitalize(), text) for word in known["choices"]))
+        words = ((word, word.capitalize(), text) for word in known["choices"])
+        return EnumProperty(**options, items=choices.items(choices.PHANTOM_WORDS, words))
     many = {"size": len(default)} if isinstance(default, tuple) else {}
     if not unit:
         return (IntVectorProperty if many else IntProperty)(**options, **many, min=1)
@@ -264,9 +270,9 @@ KIND_PROPERTIES = {
 
 
 _KINDS = (
-    ("VOLUME", "Volume", "Voxels from elsewhere", 0),
-    *((identifier(kind).upper(), kind.label, kind.summary, i) for i, kind in enumerate(KINDS, 1)),
-    (FILE.upper(), "Text", "Shapes that a text describes", 1000),
+    ("VOLUME", "Volume", "Voxels from elsewhere"),
+    *((identifier(kind).upper(), kind.label, kind.summary) for kind in KINDS),
+    (FILE.upper(), "Text", "Shapes that a text describes"),
 )
 
 
@@ -290,7 +296,7 @@ class VolumeProperties(bpy.types.PropertyGroup):
     is_volume: BoolProperty(name="Is Volume", options={"HIDDEN"})
     kind: EnumProperty(
         name="Kind", description="What the volume was made as",
-        items=_KINDS,
+        items=choices.items(choices.KINDS, _KINDS), default="VOLUME",
     )  # fmt: skip
     with_parent: BoolProperty(
         name="With Parent",
@@ -310,7 +316,8 @@ class VolumeProperties(bpy.types.PropertyGroup):
     message: StringProperty(name="Message", description="What is wrong with the phantom's settings", options={"HIDDEN"})
     quantity: EnumProperty(
         name="Quantity", description="What the voxels hold",
-        items=tuple((name, name.capitalize(), f"In {unit}") for name, unit in UNITS.items()),
+        default="activity",
+        items=choices.items(choices.QUANTITIES, ((name, name.capitalize(), f"In {unit}") for name, unit in UNITS.items())),
     )  # fmt: skip
     unit: StringProperty(name="Unit", description="Unit of the voxels' values")
     shape: IntVectorProperty(name="Shape", description="Voxels along the grid's axes", size=3)

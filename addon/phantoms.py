@@ -26,10 +26,12 @@ from ..core.meshes.mesh import Mesh
 from ..core.phantoms.kinds import KINDS
 from ..core.phantoms.phantom import Phantom
 from ..core.progress import Progress, part_of
+from ..core.recording import recorded_warnings
 from ..core.volume import Volume
 from . import ids, meshes, storage, volumes
 from .cameras import set_world_matrix, world_matrix
 from .phantom_properties import PhantomSettings, identifier
+from .vdb import provenance_of
 
 _SKETCHED = 32  # voxels along each side of a sketch
 
@@ -159,11 +161,9 @@ def recipe_of(settings: PhantomSettings) -> Recipe:
     InputError
         There is no such phantom.
     """
-    with warnings.catch_warnings(record=True) as caught:
-        warnings.simplefilter("always", InputWarning)
+    with recorded_warnings() as caught:
         phantom = settings.phantom()
-    messages = tuple(str(w.message) for w in caught)
-    return Recipe(phantom, settings.n_states, settings.grid(phantom), settings.recipe(), messages)
+    return Recipe(phantom, settings.n_states, settings.grid(phantom), settings.recipe(), tuple(caught))
 
 
 def settings_of(item: bpy.types.Object | None) -> Any:
@@ -171,7 +171,8 @@ def settings_of(item: bpy.types.Object | None) -> Any:
     if item is None or not volumes.is_volume(item):
         return None
     properties = getattr(item, ids.OBJECT_VOLUME)
-    return None if properties.kind == "VOLUME" else getattr(properties, properties.kind.lower())
+    # A kind that only a later version knows is "": its voxels stay as they are.
+    return None if properties.kind in ("VOLUME", "") else getattr(properties, properties.kind.lower())
 
 
 def poll_phantom(operator: type[bpy.types.Operator], context: bpy.types.Context) -> bool:
@@ -212,6 +213,22 @@ def root_of(item: bpy.types.Object) -> bpy.types.Object | None:
     if getattr(item, ids.OBJECT_VOLUME).with_parent and item.parent is not None:
         item = item.parent
     return None if settings_of(item) is None else item
+
+
+def mu_energy(item: bpy.types.Object) -> float | None:
+    """The photon energy, keV, at which a volume's mu holds: of a phantom, or of a CT that was converted; else None.
+
+    Raises
+    ------
+    InputError
+        The phantom's settings make no phantom.
+    """
+    root = root_of(item)
+    if root is not None:
+        return recipe_of(settings_of(root)).phantom.mu_energy
+    path = volumes.file_of(item)
+    energy = provenance_of(path).get("energy_keV") if path.is_file() else None
+    return None if energy is None else float(energy)
 
 
 def require_current(item: bpy.types.Object) -> None:

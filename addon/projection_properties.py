@@ -8,23 +8,23 @@ from typing import TYPE_CHECKING, Any
 import bpy
 from bpy.props import BoolProperty, EnumProperty, FloatProperty, IntProperty, PointerProperty, StringProperty
 
+from ..core.errors import InputError
 from ..core.isotopes import ISOTOPES
 from ..core.materials import APERTURES, CRYSTALS
 from ..core.system import PinholeSystem
 from ..core.volume import Volume
-from . import ids, volumes
+from . import choices, ids, volumes
 from .decimals import typed
 
 if TYPE_CHECKING:
     from ..core.projector import Model
 
 
-def _materials(names: tuple[str, ...], none: str) -> tuple[tuple[str, str, str], ...]:
+def _materials(numbers: dict[str, int], names: tuple[str, ...], none: str) -> choices.Items:
     """Items of a choice of material, by name or by its coefficient."""
-    return (
-        ("NUMBER", "By Coefficient", f"By its attenuation coefficient; 0: {none}"),
-        *((name, name[0].upper() + name[1:], "As it attenuates the isotope's photons") for name in names),
-    )
+    by_number = ("NUMBER", "By Coefficient", f"By its attenuation coefficient; 0: {none}")
+    by_name = ((name, name[0].upper() + name[1:], "As it attenuates the isotope's photons") for name in names)
+    return choices.items(numbers, (by_number, *by_name))
 
 
 class ProjectionSettings:
@@ -34,12 +34,13 @@ class ProjectionSettings:
         name="Model",
         description="What a pixel holds",
         items=(
-            ("TRANSMISSION", "Radiograph", "Line integrals of the volume"),
-            ("EMISSION", "SPECT Counts", "Photons of a volume of activity that the crystal counts"),
+            ("TRANSMISSION", "Radiograph", "Line integrals of the volume", 0),
+            ("EMISSION", "SPECT Counts", "Photons of a volume of activity that the crystal counts", 1),
             (
                 "INVERSE_SQUARE",
                 "Inverse Square Sum",
                 "Line integrals with each segment times a point source's sensitivity, as 1/h^2: no counts, for comparison",
+                2,
             ),
         ),
         default="TRANSMISSION",
@@ -52,9 +53,12 @@ class ProjectionSettings:
     isotope: EnumProperty(
         name="Isotope",
         description="What decays: its photons are counted, and its activity falls during the acquisition",
-        items=(
-            ("NONE", "None", "One photon per decay, and an activity that stays"),
-            *((name, name, "Energy window 10 % around its strongest line") for name in ISOTOPES),
+        items=choices.items(
+            choices.ISOTOPES,
+            (
+                ("NONE", "None", "One photon per decay, and an activity that stays"),
+                *((name, name, "Energy window 10 % around its strongest line") for name in ISOTOPES),
+            ),
         ),
         default="NONE",
     )
@@ -64,7 +68,7 @@ class ProjectionSettings:
     )  # fmt: skip
     aperture_material: EnumProperty(
         name="Aperture", description="Material that photons penetrate at the aperture's edge",
-        items=_materials(APERTURES, "nothing penetrates it"), default="NUMBER",
+        items=_materials(choices.APERTURES, APERTURES, "nothing penetrates it"), default="NUMBER",
     )  # fmt: skip
     aperture_mu: FloatProperty(
         name="Aperture µ", description="Attenuation coefficient of the aperture in 1/mm, at the photons' energy, "
@@ -79,14 +83,14 @@ class ProjectionSettings:
         name="Knife Edge",
         description="How photons penetrate the aperture's edge",
         items=(
-            ("PAIX", "Effective Diameter", "As if the hole were wider (Paix 1967)"),
-            ("PATH", "Path Length", "Each by its path through the edge: more rays"),
+            ("PAIX", "Effective Diameter", "As if the hole were wider (Paix 1967)", 0),
+            ("PATH", "Path Length", "Each by its path through the edge: more rays", 1),
         ),
         default="PAIX",
     )
     crystal_material: EnumProperty(
         name="Crystal", description="Material that stops the photons that are counted",
-        items=_materials(CRYSTALS, "all photons are counted"), default="NUMBER",
+        items=_materials(choices.CRYSTALS, CRYSTALS, "all photons are counted"), default="NUMBER",
     )  # fmt: skip
     crystal_mu: FloatProperty(
         name="Crystal µ", description="Attenuation coefficient of the crystal in 1/mm, at the photons' energy, where no "
@@ -114,8 +118,8 @@ class ProjectionSettings:
         name="Detector",
         description="Where the images are taken",
         items=(
-            ("VIRTUAL", "Virtual", "Plane in front of the pinhole: upright, what the module's camera sees"),
-            ("REAL", "Real", "Front face of the crystal behind the pinhole: point-inverted"),
+            ("VIRTUAL", "Virtual", "Plane in front of the pinhole: upright, what the module's camera sees", 0),
+            ("REAL", "Real", "Front face of the crystal behind the pinhole: point-inverted", 1),
         ),
         default="VIRTUAL",
     )
@@ -129,11 +133,11 @@ class ProjectionSettings:
         name="Backend",
         description="What computes the line integrals",
         items=(
-            ("AUTO", "Automatic", "The fastest that works here"),
-            ("NUMBA", "Numba", "Compiled, on the processor"),
-            ("TORCH", "PyTorch", "On the processor or the graphics card"),
-            ("NUMPY", "NumPy", "Float64 reference, slow"),
-            ("CUDA", "CUDA", "On an NVIDIA graphics card; needs warp-lang in Blender's Python"),
+            ("AUTO", "Automatic", "The fastest that works here", 0),
+            ("NUMBA", "Numba", "Compiled, on the processor", 1),
+            ("TORCH", "PyTorch", "On the processor or the graphics card", 2),
+            ("NUMPY", "NumPy", "Float64 reference, slow", 3),
+            ("CUDA", "CUDA", "On an NVIDIA graphics card; needs warp-lang in Blender's Python", 4),
         ),
         default="AUTO",
     )
@@ -155,6 +159,8 @@ def chosen_model(settings: dict[str, Any], system: PinholeSystem, mu: Volume | N
         return Transmission()
     if settings["model"] == "INVERSE_SQUARE":
         return InverseSquareSum(system)
+    if settings["model"] != "EMISSION":  # of a file that a later version wrote
+        raise InputError(f"model {settings['model']!r} is not known to this version: choose what the pixels hold")
     given: dict[str, Any] = {name: settings[name] for name in _EMISSION}
     given |= {name: typed(value) for name, value in given.items() if isinstance(value, float)}
     given |= {name: None for name in _OPTIONAL if given[name] in (0, "NONE")}

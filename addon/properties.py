@@ -20,7 +20,7 @@ from bpy.props import (
     StringProperty,
 )
 
-from . import ids, jobs, phantom_properties, projection_properties
+from . import choices, ids, jobs, phantom_properties, projection_properties
 
 
 # The rebuilding modules import these properties: they are imported when an edit calls for them.
@@ -64,8 +64,8 @@ def _set_visible(self: ModuleProperties, value: bool) -> None:
 
 
 _LENGTH_MODES = [
-    ("FROM_ROI", "From ROI", "l follows b, d, Ld and R: the field of view is tangent to the ROI sphere"),
-    ("TYPED", "Typed", "l stays as it was typed"),
+    ("FROM_ROI", "From ROI", "l follows b, d, Ld and R: the field of view is tangent to the ROI sphere", 0),
+    ("TYPED", "Typed", "l stays as it was typed", 1),
 ]
 # name: (label, description, smallest value); the module's and the scanner's are the same numbers.
 _LENGTHS = {
@@ -93,7 +93,8 @@ class ModuleProperties(bpy.types.PropertyGroup):
     is_module: BoolProperty(name="Is Module", options={"HIDDEN"})
     part: EnumProperty(
         name="Part", description="What the object is in a scanner", options={"HIDDEN"},
-        items=[(part, part.capitalize(), "") for part in ids.PARTS],
+        default="NONE",
+        items=choices.items(choices.PARTS, ((part, part.capitalize(), "") for part in ids.PARTS)),
     )  # fmt: skip
     visible: BoolProperty(
         name="Visible", description="Show the module, its collimator and its crystal, also in renders",

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import json
 import re
-import warnings
 from typing import Literal
 
 import bpy
 import numpy as np
 
-from ..core.errors import InputError, InputWarning
+from ..core.errors import InputError
 from ..core.generators import ring_order
+from ..core.recording import recorded_warnings
 from . import copies, design, ids, scanner
 
 Order = Literal["RINGS", "LIST"]
@@ -44,8 +44,7 @@ def renumber(collection: bpy.types.Collection, order: Order = "RINGS") -> int:
     untidy = copies.untidy_text(collection)
     if untidy:
         raise InputError(f"scanner '{collection.name}': {untidy}: press Tidy Modules in the Design panel first")
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", InputWarning)  # where a camera looks is no matter here
+    with recorded_warnings():  # where a camera looks is no matter here
         system = scanner.read_scanner(collection)
     found = scanner.modules(collection)
     places = ring_order(system) if order == "RINGS" else np.arange(len(found))

@@ -1,13 +1,16 @@
 """OpenVDB files: volumes of ours to the last bit, and grids of other programs.
 
 Files of ours hold every voxel's float32 value, the float64 affine, the quantity, the unit and where the volume came from.
-Of other programs' files the transform counts, with OpenVDB's own convention: an integer index is the voxel's CENTRE.
-That is how Houdini, EmberGen and Blender 5 place them; Blender 4.5 draws them half a voxel farther along every index axis.
+The transform is OpenVDB's own, in which an integer index is the voxel's CENTRE: that is how Houdini, EmberGen and Blender 5
+place grids. Blender 4.5 draws them half a voxel farther along every index axis, so the files that a scene draws are
+shifted back there, and say so in their metadata; what is written for others is not. Of other programs' files the transform
+counts.
 """
 
 from __future__ import annotations
 
 import json
+import warnings
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -17,20 +20,24 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..core.checks import freeze, positive
-from ..core.errors import InputError
+from ..core.errors import InputError, InputWarning
 from ..core.files import replacing
 from ..core.grid import Grid
 from ..core.hounsfield import AIR_HU
 from ..core.memory import require
 from ..core.version import VERSION
 from ..core.volume import UNITS, Volume
-from . import compat
 from .vdb_length import missing_bytes
 
 SMOKE = "smoke for display"
 """Name of a grid that only Blender's solid viewport uses."""
 
 _SLAB = 64  # layers handed over at once, whole leaves of 8: what is copied for OpenVDB stays small
+
+_NOTE = (
+    "Written for a Blender that draws index i over [i, i + 1]: the centre of voxel i is where this transform carries "
+    "i {back:+g} along every axis. File > Export > Volume of mphDRR writes files for other programs."
+)
 
 _NUMBERS = ("float", "double", "half", "int32", "int64", "bool")
 """Value types of grids that can become a volume."""
@@ -45,11 +52,12 @@ def write_vdb(
     provenance: dict[str, Any] | None = None,
     *,
     smoke_above: float | None = None,
+    center_shift: float = 0.0,
 ) -> None:
     """Write volumes as sparse float grids, each named after its quantity; voxels of 0 (-1000 HU) take no room.
 
-    The transforms are those of the running Blender (see `compat.VDB_CENTER_SHIFT`); the metadata hold the exact affine
-    with the voxel-centre convention, so that `read_vdb` gives the same volume in every version.
+    Other programs find each voxel's centre where their transforms carry its integer index. The metadata hold the exact
+    affine, so that `read_vdb` gives the same volume whatever `center_shift` was.
 
     Parameters
     ----------
@@ -62,6 +70,9 @@ def write_vdb(
     smoke_above
         Also write a grid `SMOKE` of the first volume's values above this one, less it: Blender's solid viewport draws
         what surrounds values below 0 black. `read_vdb` does not see it.
+    center_shift
+        Voxels by which the transforms are shifted along every index axis, for files that a Blender draws which places them
+        otherwise (`compat.VDB_CENTER_SHIFT`). For other programs such a file lies that much off.
 
     Raises
     ------
@@ -74,11 +85,11 @@ def write_vdb(
     if not names or len(set(names)) < len(names):
         found = ", ".join(names) or "none"
         raise InputError(f"{path}: expected volumes of different quantities, got {found}")
-    grids = [_grid_of(volume, provenance or {}) for volume in several]
+    grids = [_grid_of(volume, provenance or {}, center_shift) for volume in several]
     if smoke_above is not None:
         shown = several[0]
         above = freeze(np.maximum(shown.array - np.float32(smoke_above), 0))
-        grids.append(_grid_of(Volume(above, shown.grid), {}))
+        grids.append(_grid_of(Volume(above, shown.grid), {}, center_shift))
         grids[-1].name = SMOKE
     with replacing(path) as temporary:
         openvdb().write(str(temporary), grids=grids)
@@ -129,6 +140,17 @@ def read_vdb(path: str | Path, quantity: str | None = None, grid: str | None = N
         raise InputError(f"{path}: cannot be read as an OpenVDB volume ({reason})") from error
 
 
+def provenance_of(path: Path) -> dict[str, Any]:
+    """What a file of ours was made from, of its first volume; nothing of other programs' and of damaged files."""
+    try:
+        grids = _described(path).values()
+    except Exception:  # whatever OpenVDB raises; reading it says what is wrong
+        return {}
+    found = next((grid.metadata["mphdrr_provenance"] for grid in grids if "mphdrr_provenance" in grid.metadata), "{}")
+    provenance: dict[str, Any] = json.loads(found)
+    return provenance
+
+
 def openvdb() -> Any:
     """The module, which comes with Blender."""
     try:
@@ -141,7 +163,7 @@ def openvdb() -> Any:
     return openvdb
 
 
-def _grid_of(volume: Volume, provenance: dict[str, Any]) -> Any:
+def _grid_of(volume: Volume, provenance: dict[str, Any], shift: float) -> Any:
     vdb = openvdb()
     grid = vdb.FloatGrid(BACKGROUND.get(volume.quantity, 0.0))
     array, affine = volume.array, volume.grid.affine
@@ -155,7 +177,6 @@ def _grid_of(volume: Volume, provenance: dict[str, Any]) -> Any:
         grid.copyFromArray(slab, ijk=(first, 0, 0), tolerance=0.0)
     grid.name = volume.quantity
     grid.gridClass = vdb.GridClass.FOG_VOLUME
-    shift = float(compat.VDB_CENTER_SHIFT)
     # OpenVDB's matrices act on row vectors.
     grid.transform = vdb.createLinearTransform(_drawn(affine, volume.grid.shape, mirrored, shift).T.tolist())
     grid["mphdrr_quantity"] = volume.quantity
@@ -164,6 +185,8 @@ def _grid_of(volume: Volume, provenance: dict[str, Any]) -> Any:
     grid["mphdrr_affine"] = json.dumps(affine.tolist())
     grid["mphdrr_mirrored"] = mirrored
     grid["mphdrr_center_shift"] = shift
+    if shift:
+        grid["mphdrr_note"] = _NOTE.format(back=-shift)
     grid["mphdrr_provenance"] = json.dumps(provenance)
     grid["mphdrr_version"] = VERSION
     return grid
@@ -230,7 +253,7 @@ def _volume_of(grid: Any, quantity: str | None, unit: float) -> Volume:
         return Volume(freeze(array[::-1].copy() if mirrored else array), Grid(shape, affine), quantity)
     if np.any(last < first):
         raise InputError(f"the grid {grid.name!r} has no active voxels")
-    affine = np.diag([unit, unit, unit, 1.0]) @ drawn
+    affine = np.diag([unit, unit, unit, 1.0]) @ _centered(grid, drawn)
     affine[:3, 3] += affine[:3, :3] @ first
     n_x, n_y, n_z = (int(n) for n in last - first + 1)
     array = _values(grid, first, (n_x, n_y, n_z))
@@ -258,6 +281,31 @@ def _own_lattice(
     # The metadata outlive what other programs do to the transform and the voxels.
     same = np.allclose(drawn, written, rtol=0, atol=1e-9 * np.abs(written).max())
     return (shape, affine, mirrored) if same and (inside or grid.activeVoxelCount() == 0) else None
+
+
+def _centered(grid: Any, drawn: NDArray[np.float64]) -> NDArray[np.float64]:
+    """From an integer index to the voxel's centre, of a grid whose transform is `drawn`.
+
+    That is the transform itself, but for a grid of ours that was shifted for Blender 4.5 and has been moved since.
+    """
+    known = grid.metadata
+    shift = known.get("mphdrr_center_shift", 0.0)
+    if not shift or "mphdrr_affine" not in known:
+        return drawn
+    before, now = np.array(json.loads(known["mphdrr_affine"]))[:3, :3], drawn[:3, :3]
+    # Voxels as large and as sheared as before; a mirrored grid is stored with its first axis turned round.
+    was, is_now = np.abs(before.T @ before), np.abs(now.T @ now)
+    if not np.allclose(is_now, was, rtol=0, atol=1e-6 * was.max()):
+        warnings.warn(
+            f"the grid {grid.name!r} was written for Blender 4.5, half a voxel off for other programs, and one of them has "
+            "resampled it: it may lie that much off",
+            InputWarning,
+            stacklevel=4,
+        )
+        return drawn
+    centers = np.eye(4)
+    centers[:3, 3] = -shift
+    return drawn @ centers
 
 
 def _affine_of(transform: Any) -> NDArray[np.float64]:

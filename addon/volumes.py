@@ -227,6 +227,24 @@ def reader(item: bpy.types.Object) -> Callable[[], Volume]:
     InputError
         The object is not a volume of ours, or its file is gone.
     """
+    _require_voxels(item)
+    if _state(item.data) is None:
+        raise InputError(f"{item.name!r} has no state at frame {bpy.context.scene.frame_current}")
+    return _reader(item, file_of(item))
+
+
+def state_readers(item: bpy.types.Object) -> list[Callable[[], Volume]]:
+    """`reader` of every state of a sequence, in their order; of any other volume the one of it."""
+    _require_voxels(item)
+    data, path = item.data, storage.full_resolution(storage.absolute(item.data.filepath))
+    if not data.is_sequence:
+        return [_reader(item, path)]
+    numbers = range(data.frame_offset + 1, data.frame_offset + 1 + data.frame_duration)
+    return [_reader(item, storage.of_frame(path, number)) for number in numbers]
+
+
+def _require_voxels(item: bpy.types.Object) -> None:
+    """Refuse what is no volume of ours; give one that is sketched its voxels."""
     if item is None or item.type != "VOLUME" or not getattr(item, ids.OBJECT_VOLUME).is_volume:
         what = "nothing is chosen" if item is None else f"{item.name!r} is no mphDRR volume"
         raise InputError(f"{what}: add a phantom first, or choose one")
@@ -234,9 +252,10 @@ def reader(item: bpy.types.Object) -> Callable[[], Volume]:
         from . import live_phantoms  # which imports this module
 
         live_phantoms.settle(item)
-    if _state(item.data) is None:
-        raise InputError(f"{item.name!r} has no state at frame {bpy.context.scene.frame_current}")
-    path, pose = file_of(item), pose_of_object(item)
+
+
+def _reader(item: bpy.types.Object, path: Path) -> Callable[[], Volume]:
+    pose = pose_of_object(item)
     if not path.is_file():
         raise InputError(f"{path}: no such file; the voxels of {item.name!r} are gone, so add the volume again")
 
@@ -290,9 +309,14 @@ def is_volume(item: bpy.types.Object | None) -> bool:
     return item is not None and item.type == "VOLUME" and getattr(item, ids.OBJECT_VOLUME).is_volume
 
 
+def quantity_of(item: bpy.types.Object) -> str:
+    """What the voxels of one of our volumes hold."""
+    return str(getattr(item, ids.OBJECT_VOLUME).quantity)
+
+
 def can_be_projected(item: bpy.types.Object | None) -> bool:
     """Whether an object is a volume of matter or activity, not a map of the scanner."""
-    return is_volume(item) and getattr(item, ids.OBJECT_VOLUME).quantity not in MAPS
+    return is_volume(item) and item is not None and quantity_of(item) not in MAPS
 
 
 def poll_volume(operator: type[bpy.types.Operator], context: bpy.types.Context) -> bool:
@@ -429,7 +453,7 @@ def _write(
     paths = [folder / f"{stem}{f'_{k:04d}' if len(states) > 1 else ''}.vdb" for k in range(1, len(states) + 1)]
     for state, path in zip(states, paths, strict=True):
         if not path.exists():
-            write_vdb(state, path, provenance, smoke_above=smoke_above)
+            write_vdb(state, path, provenance, smoke_above=smoke_above, center_shift=compat.VDB_CENTER_SHIFT)
     return paths[0]
 
 

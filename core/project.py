@@ -60,9 +60,10 @@ def project_run(
     Raises
     ------
     InputError
-        A setting is out of range, or the images do not fit into memory.
+        A setting is out of range, the volume holds what the model has no meaning for, or the images do not fit into memory.
     """
     model = Transmission() if model is None else model
+    model.check_volume(volume)
     if photons is not None:
         if not isinstance(model, Transmission) or volume.quantity != "mu":
             raise InputError(
@@ -71,11 +72,6 @@ def project_run(
         photons = positive(photons, "photons")
     elif noise_seed is not None and not isinstance(model, Emission):
         raise InputError("noise_seed: only the counts of an Emission, or photons that pass, have noise")
-    if volume.quantity == "hu":
-        _warn(
-            "the volume holds CT numbers (HU), air being -1000: their line integrals are no radiograph; "
-            "convert them to attenuation (mu, 1/mm) first"
-        )
     lowest, highest = float(volume.array.min()), float(volume.array.max())
     if isinstance(model, Emission) and lowest < -0.1 * abs(highest):  # interpolation leaves less
         _warn(f"the activity is {lowest:g} to {highest:g} kBq/mL: what is below 0 makes counts below 0")
@@ -103,6 +99,13 @@ def project_run(
     }
     unit = model.unit(volume) if photons is None else "photons"
     return ProjectionRun(images, system, views, volume, unit=unit, settings=record, seed=noise_seed)
+
+
+def warn_of_energy(model: Model, energy: float, what: str) -> None:
+    """Warn where mu holds at an energy (keV) whose photons the model does not count; `what` names the mu."""
+    window = model.window if isinstance(model, Emission) else None
+    if window is not None and not window[0] <= energy <= window[1]:
+        _warn(f"{what} holds at {energy:g} keV, photons of {window[0]:g} to {window[1]:g} keV are counted")
 
 
 def _warn_of_unseen(volume: Volume, views: Views, ends_at_plane: bool) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -22,6 +23,15 @@ UNITS = {
     "completeness": "1",
 }
 """The unit of each quantity a volume may hold."""
+
+LINE_INTEGRALS = ("activity", "mu")
+"""Quantities whose line integrals mean something: kBq/mL mm of activity, and the attenuation along a ray. Those of CT
+numbers do not, because air is -1000, nor those of maps."""
+
+_CONVERT = (
+    "make mu of its CT numbers first, by hu_to_mu(volume, energy), `mphdrr volume convert FILE --to-mu --energy KEV`, or "
+    "CT to Attenuation in Blender's Phantom panel"
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,6 +77,13 @@ class Volume:
     def unit(self) -> str:
         """The unit of the values."""
         return UNITS[self.quantity]
+
+
+def require_quantity(quantity: str, taken: Sequence[str], name: str) -> None:
+    """Raise `InputError` unless `quantity` is one of those that `name` takes; say what becomes of CT numbers."""
+    if quantity not in taken:
+        advice = f"; {_CONVERT}" if quantity == "hu" and "mu" in taken else ""
+        raise InputError(f"{name}: expected a volume of {' or '.join(taken)}, got {quantity}{advice}")
 
 
 def require_volume(value: object, name: str) -> None:

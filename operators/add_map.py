@@ -8,7 +8,7 @@ from typing import Any
 import bpy
 from bpy.props import BoolProperty, EnumProperty, FloatProperty, IntProperty
 
-from ..addon import ids, jobs, scanner, selection, storage, volume_materials, volumes
+from ..addon import choices, ids, jobs, scanner, selection, storage, volume_materials, volumes
 from ..addon.decimals import typed
 from ..core.grid import Grid
 from ..core.maps import MAPS, within_roi
@@ -21,7 +21,7 @@ _DESCRIPTIONS = {
     "resolution": "FWHM in mm that the projections hold, all modules together",
     "completeness": "Of the angular sampling (Tuy): 1 where every plane through the voxel meets a pinhole. Slow",
 }
-_ITEMS = tuple((name, name.capitalize(), _DESCRIPTIONS[name]) for name in MAPS)
+_ITEMS = choices.items(choices.MAPS, ((name, name.capitalize(), _DESCRIPTIONS[name]) for name in MAPS))
 _BYTES = 40.0  # a voxel, while the map is made and put into the scene
 
 

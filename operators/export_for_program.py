@@ -8,13 +8,13 @@ import bpy
 from bpy.props import EnumProperty, StringProperty
 from bpy_extras.io_utils import ExportHelper
 
-from ..addon import ids, scanner, selection, storage
+from ..addon import choices, ids, scanner, selection, storage
 from ..addon.decimals import typed
 from ..addon.reports import warnings_reported
 from ..core.errors import InputError
 from ..core.geometry_export import FORMATS, write_geometry
 
-_ITEMS = tuple((format.name, format.name, format.title) for format in FORMATS.values())
+_ITEMS = choices.items(choices.GEOMETRY_FORMATS, ((f.name, f.name, f.title) for f in FORMATS.values()))
 
 
 class MPHDRR_OT_export_for_program(ExportHelper, bpy.types.Operator):

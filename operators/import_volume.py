@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import bpy
 from bpy.props import BoolProperty, CollectionProperty, EnumProperty, FloatProperty, IntProperty, StringProperty
 
-from ..addon import ids, jobs, storage, vdb, volumes
+from ..addon import choices, ids, jobs, storage, vdb, volumes
 from ..addon.decimals import typed
 from ..core.errors import InputError
 from ..core.hounsfield import hu_to_mu
@@ -30,9 +30,12 @@ class ReadVolumes(jobs.JobOperator):
 
     quantity: EnumProperty(
         name="Values", description="What the voxels hold",
-        items=(
-            ("AUTO", "As the File Says", "Files that say nothing: OpenVDB's hold activity, others CT numbers"),
-            *((name, name.capitalize(), f"In {unit}") for name, unit in UNITS.items()),
+        items=choices.items(
+            choices.READ_AS,
+            (
+                ("AUTO", "As the File Says", "Files that say nothing: OpenVDB's hold activity, others CT numbers"),
+                *((name, name.capitalize(), f"In {unit}") for name, unit in UNITS.items()),
+            ),
         ),
         default="AUTO",
     )  # fmt: skip

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Generator
+from collections.abc import Generator, Sequence
 from typing import Any
 
 import bpy
@@ -17,6 +17,7 @@ from ..core.memory import require
 from ..core.progress import Progress
 from ..core.run import ProjectionRun
 from ..core.system import PinholeSystem
+from ..core.volume import require_quantity
 
 
 class MPHDRR_OT_render_projections(ProjectionSettings, jobs.JobOperator, bpy.types.Operator):
@@ -39,17 +40,18 @@ class MPHDRR_OT_render_projections(ProjectionSettings, jobs.JobOperator, bpy.typ
         chosen = {name: self._setting(scene, name) for name in ProjectionSettings.__annotations__}
         system = _range(scanner.read_scanner(collection), chosen["first"], chosen["last"])
         shape = (chosen["height"], chosen["width"])
-        chosen_model(chosen, system)  # what cannot be is said before the work begins
+        model = chosen_model(chosen, system)  # what cannot be is said before the work begins
         counts = chosen["model"] == "EMISSION"
         photons = typed(chosen["photons"]) if chosen["model"] == "TRANSMISSION" and chosen["photons"] else None
         noise_seed = chosen["seed"] if chosen["noise"] and (counts or photons) else None
-        item = _chosen_volume(context, self.volume, "activity" if counts else "mu" if photons else None)
+        item = _chosen_volume(context, self.volume, ("mu",) if photons else model.takes, model.name)
         mu = _chosen_mu(context, self.mu) if counts else None
         read_mu = None if mu is None else volumes.reader(mu)
         read_volume = volumes.reader(item)
         for volume in (item, mu):
             if volume is not None:
                 phantoms.require_current(volume)
+        energy = None if mu is None else phantoms.mu_energy(mu)
         n_bytes = 4.0 * len(system) * shape[0] * shape[1]
         # The array, and Blender's images with four channels in memory and once more, packed.
         require(9 * n_bytes, f"{len(system)} images of {shape[1]} x {shape[0]} pixels")
@@ -61,12 +63,15 @@ class MPHDRR_OT_render_projections(ProjectionSettings, jobs.JobOperator, bpy.typ
         if item.data.is_sequence:
             settings |= {"frame": scene.frame_current, "state": volumes.state_text(item)}
         scene_name, item_name, start = scene.name, item.name, time.perf_counter()
+        mu_name = None if mu is None else mu.name
 
         def work(progress: Progress) -> ProjectionRun:
             from ..core.export import write_run
-            from ..core.project import project_run
+            from ..core.project import project_run, warn_of_energy
 
             progress(0, len(system))
+            if mu_name is not None and energy is not None:
+                warn_of_energy(model, energy, f"the mu of {mu_name!r}")
             run = project_run(
                 system,
                 read_volume(),
@@ -134,32 +139,43 @@ def _range(system: PinholeSystem, first: int, last: int) -> PinholeSystem:
     return system[chosen]
 
 
-def _chosen_volume(context: bpy.types.Context, name: str, quantity: str | None) -> bpy.types.Object:
-    """The volume named, else the panel's, else the active one, else the only one; if unnamed, one of a quantity if given."""
-    known = [item for item in volumes.volume_objects(context.scene) if volumes.can_be_projected(item)]
-    if name:
-        return _named(known, name)
-    fitting = [item for item in known if quantity in (None, getattr(item, ids.OBJECT_VOLUME).quantity)]
-    chosen = getattr(context.scene, ids.SCENE_PROJECTIONS).volume
-    if chosen in known:
+def _chosen_volume(context: bpy.types.Context, name: str, taken: Sequence[str], model: str) -> bpy.types.Object:
+    """The volume named, else the panel's, else the active one, else the only one of a quantity that the model takes."""
+    known = volumes.volume_objects(context.scene)
+    chosen = _named(known, name) if name else _of_panel(context, "volume")
+    # A CT that is active is meant, though it has to be converted first; of other volumes a fitting one is looked for.
+    if chosen is None and context.object in known and "mu" in taken and volumes.quantity_of(context.object) == "hu":
+        chosen = context.object
+    if chosen is not None:
+        require_quantity(volumes.quantity_of(chosen), taken, f"{chosen.name!r} for {model}")
         return chosen
+    fitting = [item for item in known if volumes.quantity_of(item) in taken]
     if context.object in fitting:
         return context.object
-    if len(fitting) != 1:
-        what = "volumes" if quantity is None else f"volumes of {quantity}"
-        raise InputError(
-            f"choose what to project: there are {len(fitting)} {what}"
-            if known
-            else "no volume in the scene: add a phantom first"
-        )
+    what = " or ".join(taken)
+    if not fitting:
+        raise InputError(f"no volume of {what} in the scene: add a phantom first")
+    if len(fitting) > 1:
+        raise InputError(f"choose what to project: there are {len(fitting)} volumes of {what}")
     return fitting[0]
 
 
 def _chosen_mu(context: bpy.types.Context, name: str) -> bpy.types.Object | None:
     """The volume of attenuation coefficients named, else the panel's, else None."""
-    known = volumes.volume_objects(context.scene)
-    chosen = _named(known, name) if name else getattr(context.scene, ids.SCENE_PROJECTIONS).mu
-    return chosen if chosen in known else None
+    chosen = _named(volumes.volume_objects(context.scene), name) if name else _of_panel(context, "mu")
+    if chosen is not None:
+        require_quantity(volumes.quantity_of(chosen), ("mu",), f"{chosen.name!r} for attenuation")
+    return chosen
+
+
+def _of_panel(context: bpy.types.Context, name: str) -> bpy.types.Object | None:
+    """The panel's volume, if it has one. Blender keeps one there that the user has deleted."""
+    settings = getattr(context.scene, ids.SCENE_PROJECTIONS)
+    chosen = getattr(settings, name)
+    if chosen is not None and chosen not in volumes.volume_objects(context.scene):
+        label = settings.bl_rna.properties[name].name
+        raise InputError(f"{label} {chosen.name!r} is not in this scene any more: choose another, or none")
+    return chosen
 
 
 def _named(known: list[bpy.types.Object], name: str) -> bpy.types.Object:

@@ -27,8 +27,9 @@ class MPHDRR_OT_renumber_modules(bpy.types.Operator):
                 "RINGS",
                 "By Ring and Azimuth",
                 "Ring by ring along +z, and along each ring from its gap on, the way most run",
+                0,
             ),
-            ("LIST", "As Listed", "In the present order, as in the workbook, those added last"),
+            ("LIST", "As Listed", "In the present order, as in the workbook, those added last", 1),
         ),
     )
 

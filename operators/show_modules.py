@@ -22,10 +22,10 @@ class MPHDRR_OT_show_modules(bpy.types.Operator):
     mode: EnumProperty(
         name="Mode",
         items=[
-            ("ONLY", "Show Only", "Show the modules of the range and hide all others"),
-            ("SHOW", "Show", "Show the modules of the range; the others stay as they are"),
-            ("HIDE", "Hide", "Hide the modules of the range; the others stay as they are"),
-            ("ALL", "Show All", "Show all modules"),
+            ("ONLY", "Show Only", "Show the modules of the range and hide all others", 0),
+            ("SHOW", "Show", "Show the modules of the range; the others stay as they are", 1),
+            ("HIDE", "Hide", "Hide the modules of the range; the others stay as they are", 2),
+            ("ALL", "Show All", "Show all modules", 3),
         ],
         default="ONLY",
     )

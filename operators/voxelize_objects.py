@@ -9,7 +9,7 @@ import bpy
 import numpy as np
 from bpy.props import EnumProperty, FloatProperty, IntProperty, StringProperty
 
-from ..addon import ids, jobs, meshes, storage, volumes
+from ..addon import choices, ids, jobs, meshes, storage, volumes
 from ..addon.decimals import typed
 from ..core.errors import InputError
 from ..core.grid import Grid
@@ -37,7 +37,7 @@ class MPHDRR_OT_voxelize_objects(jobs.JobOperator, bpy.types.Operator):
     quantity: EnumProperty(
         name="Quantity",
         description="What the volume holds",
-        items=(("activity", "Activity", "kBq/mL"), ("mu", "Attenuation", "1/mm")),
+        items=choices.items(choices.QUANTITIES, (("activity", "Activity", "kBq/mL"), ("mu", "Attenuation", "1/mm"))),
     )
     value: FloatProperty(
         name="Value", description="Inside the meshes, in kBq/mL or 1/mm", default=100.0, min=0.0, precision=4

@@ -57,6 +57,8 @@ class MPHDRR_PT_phantom(bpy.types.Panel):
         ):
             names.label(text=name)
             values.label(text=value)
+        if settings.quantity == "hu":
+            layout.operator(ids.CT_TO_ATTENUATION, icon="MOD_FLUIDSIM")
         layout.use_property_split = True
         layout.use_property_decorate = False
         column = layout.column(align=True)

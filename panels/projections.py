@@ -25,6 +25,7 @@ class MPHDRR_PT_projections(bpy.types.Panel):
         column.enabled = not jobs.is_running()
         column.prop(settings, "volume", placeholder="Active volume")
         column.prop(settings, "model")
+        _draw_ct_hint(column, settings, context.object)
         if settings.model == "EMISSION":
             column.prop(settings, "time")
         elif settings.model == "TRANSMISSION":
@@ -55,6 +56,22 @@ class MPHDRR_PT_projections(bpy.types.Panel):
             column.active = False
             for part in settings.run_summary.split(", ", 1):
                 column.label(text=part)
+
+
+def _draw_ct_hint(
+    layout: bpy.types.UILayout, settings: bpy.types.PropertyGroup, active: bpy.types.Object | None
+) -> None:
+    """A CT that would be projected has to be converted first."""
+    item = settings.volume or active
+    if settings.model == "EMISSION" or not volumes.is_volume(item) or volumes.quantity_of(item) != "hu":
+        return
+    column = layout.column(align=True)
+    column.label(text="CT numbers have no radiograph", icon="ERROR")
+    if item == active:
+        column.operator_context = "INVOKE_DEFAULT"
+        column.operator(ids.CT_TO_ATTENUATION)
+    else:
+        column.label(text="Select the CT, convert it", icon="BLANK1")
 
 
 class MPHDRR_PT_physics(bpy.types.Panel):

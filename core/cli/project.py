@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import math
-import warnings
 from collections.abc import Iterator, Sequence
 from dataclasses import fields
 from pathlib import Path
@@ -12,17 +11,17 @@ from typing import Any
 
 import numpy as np
 
-from ..errors import InputError, InputWarning
+from ..errors import InputError
 from ..export import FORMATS, write_run
 from ..hounsfield import hu_to_mu
 from ..isotopes import ISOTOPES
 from ..materials import APERTURES, CRYSTALS
 from ..mosaic import mosaic, write_png
-from ..project import project_run
+from ..project import project_run, warn_of_energy
 from ..projector import Emission, InverseSquareSum, Model, Transmission
 from ..rearranging import centered
 from ..system import PinholeSystem
-from ..volume import Volume
+from ..volume import LINE_INTEGRALS, Volume
 from ..volume_io import read_volume, read_volume_of
 from ..workbook import read_system
 from .options import (
@@ -41,6 +40,8 @@ from .options import (
 )
 from .phantom import chosen_phantom, placed_volume
 
+_MOST_MU = 500.0
+"""1/mm: more than any material of the tables attenuates photons of 10 keV or more."""
 _EMISSION = [field.name for field in fields(Emission)]
 Source = tuple[Volume, Volume | None, dict[str, Any]]
 """What is projected, what attenuates it, and what to record of them."""
@@ -52,7 +53,7 @@ def add_parser(subparsers) -> None:  # type: ignore[no-untyped-def]
         subparsers,
         "project",
         "project a volume, or a phantom, into every module",
-        "mphdrr project scanner.xlsx --volume ct.nii.gz --size 250 250 -o run.h5\n"
+        "mphdrr project scanner.xlsx --volume ct.nii.gz --energy 60 --size 250 250 -o run.h5\n"
         "example: mphdrr project scanner.xlsx --volume heart.nii.gz --mu ct-mu.nii.gz --emission --isotope Tc-99m "
         "--time 600 --aperture-points 7 --aperture-mu tungsten --crystal-mu CZT --noise 1 -o counts.h5\n"
         "example: mphdrr project scanner.xlsx --phantom thorax.toml --phantom-mu --emission --isotope Tc-99m -o counts.h5",
@@ -70,6 +71,11 @@ def add_parser(subparsers) -> None:  # type: ignore[no-untyped-def]
     parser.add_argument(
         "--series", metavar="NAME", help="of several DICOM series in --volume, by number, description or UID"
     )
+    parser.add_argument(
+        "--quantity", choices=LINE_INTEGRALS,
+        help="what the values of --volume or --states are; default: what the file says; one that says nothing holds "
+        "activity with --emission, mu with --photons, and is else taken for CT numbers",
+    )  # fmt: skip
     parser.add_argument(
         "--energy", metavar="KEV",
         help="CT numbers of --volume, --states or --mu become attenuation (1/mm) at this energy, or at an isotope's "
@@ -185,6 +191,10 @@ def _require_fitting(arguments: argparse.Namespace) -> None:
             refuse(arguments, DERENZO_OPTIONS, "is for the Derenzo phantom, not for --phantom")
     if not arguments.volume:
         refuse(arguments, ("series",), "needs --volume")
+        if not arguments.states:
+            refuse(arguments, ("quantity",), "needs --volume or --states")
+    if arguments.energy is not None and not arguments.emission:
+        refuse(arguments, ("quantity",), "has no effect beside --energy, which takes CT numbers")
     if "mu" not in arguments:
         refuse(arguments, ("mu_series",), "needs --mu")
         if arguments.emission or not (arguments.volume or arguments.states):
@@ -207,21 +217,37 @@ def _attenuation(path: str, energy: str | None, series: str | None) -> Volume:
         return hu_to_mu(volume, photon_energy(energy))
     advice = "; of CT numbers, give --energy to convert them"
     volume = read_volume_of(path, "mu", advice, series=series, progress=progress)
-    lowest = float(volume.array.min())
-    if lowest < -1:  # interpolation may leave values a little below 0
+    lowest, highest = float(volume.array.min()), float(volume.array.max())
+    if lowest < -1 or highest > _MOST_MU:  # interpolation may leave values a little below 0
         raise InputError(
-            f"{path}: {lowest:g} is no attenuation in 1/mm; if it holds CT numbers, give --energy to convert them"
+            f"{path}: {lowest if lowest < -1 else highest:g} is no attenuation in 1/mm; if it holds CT numbers, give "
+            "--energy to convert them"
         )
     return volume
 
 
 def _volume(path: str, arguments: argparse.Namespace) -> Volume:
-    """What a file of --volume or --states holds, as the chosen model takes it."""
+    """What a file of --volume or --states holds; what the chosen model has no meaning for is refused."""
+    if arguments.quantity is not None:
+        return read_volume(path, arguments.quantity, series=arguments.series, progress=progress_bar("reading"))
     if arguments.emission:
-        return read_volume_of(path, "activity", series=arguments.series, progress=progress_bar("reading"))
+        volume = read_volume_of(path, "activity", series=arguments.series, progress=progress_bar("reading"))
+        lowest, highest = float(volume.array.min()), float(volume.array.max())
+        if lowest < -0.1 * highest:  # interpolation leaves less
+            raise InputError(
+                f"{path}: values of {lowest:g} to {highest:g}, as of a CT, are no activity; --quantity activity takes them "
+                "as such"
+            )
+        return volume
     if arguments.photons is not None or arguments.energy is not None:
         return _attenuation(path, arguments.energy, arguments.series)
-    return read_volume(path, series=arguments.series, progress=progress_bar("reading"))
+    volume = read_volume(path, series=arguments.series, progress=progress_bar("reading"))
+    if volume.quantity == "hu":
+        raise InputError(
+            f"{path}: it holds CT numbers (hu), or says nothing and is taken for them; give --energy KEV to convert them "
+            "to attenuation, or --quantity mu or activity if that is what the values are"
+        )
+    return volume
 
 
 def _of_files(files: Sequence[str], mu: Volume | None, arguments: argparse.Namespace) -> Iterator[Source]:
@@ -246,14 +272,7 @@ def _of_phantom(mu: Volume | None, model: Model, arguments: argparse.Namespace) 
     if arguments.phantom_mu:
         if all(shape.mu is None for shape in phantom.shapes):
             raise InputError(f"--phantom-mu: no shape of the {phantom.title} has a mu")
-        window = model.window if isinstance(model, Emission) else None
-        if window is not None and not window[0] <= phantom.mu_energy <= window[1]:
-            warnings.warn(
-                f"the mu of the {phantom.title} holds at {phantom.mu_energy:g} keV, photons of {window[0]:g} to "
-                f"{window[1]:g} keV are counted",
-                InputWarning,
-                stacklevel=2,
-            )
+        warn_of_energy(model, phantom.mu_energy, f"the mu of the {phantom.title}")
         mu = placed_volume(phantom, arguments, "mu")
         settings["mu_of_phantom_at_kev"] = phantom.mu_energy
     quantity = "mu" if arguments.phantom and arguments.photons is not None else "activity"
@@ -273,6 +292,8 @@ def _run(arguments: argparse.Namespace) -> None:
         if Path(file).resolve() in outputs:
             raise InputError(f"{file}: the projections would replace what they are made from; choose another --output")
     mu = _attenuation(arguments.mu, arguments.energy, arguments.mu_series) if "mu" in arguments else None
+    if mu is not None and arguments.energy is not None:
+        warn_of_energy(model, photon_energy(arguments.energy), f"the mu of {Path(arguments.mu).name}")
     sources = _of_files(files, mu, arguments) if files else _of_phantom(mu, model, arguments)
     for number, (volume, mu_of_it, settings) in enumerate(sources, 1):
         run = project_run(

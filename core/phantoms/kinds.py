@@ -39,7 +39,6 @@ class Kind(NamedTuple):
     usual: Mapping[str, float] = MappingProxyType({})
 
 
-# Saved scenes hold a kind by its place in this table: add new ones at its end.
 KINDS = (
     Kind("derenzo", DerenzoPhantom, "Derenzo", "a Derenzo phantom: six sectors of hot rods", {"activity": 100.0}),
     Kind("nema", NemaBody, "NEMA Body", "the NEMA (IEC) body phantom: six spheres"),

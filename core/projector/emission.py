@@ -16,7 +16,7 @@ from ..isotopes import Isotope, isotope
 from ..materials import module_coefficients
 from ..system import PinholeSystem
 from ..views import Views
-from ..volume import Volume
+from ..volume import Volume, require_quantity
 from .aperture import KnifeEdge, Opening, openings, paix_diameter, within_cone
 from .aperture import points_needed as hole_points_needed
 from .arrays import ArrayOrTensor, is_tensor, namespace
@@ -149,6 +149,7 @@ class Emission(Model):
     tolerance: float = TOLERANCE
 
     name = "emission"
+    takes = ("activity",)
 
     def __post_init__(self) -> None:
         if not isinstance(self.system, PinholeSystem):
@@ -157,8 +158,7 @@ class Emission(Model):
             if not isinstance(self.mu, Volume):
                 hint = "; tensors of it go to the projector, A(x, mu=...)" if is_tensor(self.mu) else ""
                 raise InputError(f"emission: expected mu to be a Volume, got {type(self.mu).__name__}{hint}")
-            if self.mu.quantity != "mu":
-                raise InputError(f"emission: expected a volume of mu, got {self.mu.quantity}")
+            require_quantity(self.mu.quantity, ("mu",), "emission: mu")
             if self.mu.array.min() < 0:
                 raise InputError(f"emission: mu must not be negative, got {self.mu.array.min():g} 1/mm")
         self._set_photons()
@@ -239,11 +239,6 @@ class Emission(Model):
     def unit(self, volume: Volume) -> str:
         """Unit of the images of `volume`."""
         return "counts"
-
-    def check_volume(self, volume: Volume) -> None:
-        """Raise `InputError` unless `volume` holds activity."""
-        if volume.quantity != "activity":
-            raise InputError(f"emission: expected a volume of activity, got {volume.quantity}")
 
     def check(self, views: Views) -> None:
         """Raise `InputError` unless `views` are of this system."""

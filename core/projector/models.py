@@ -14,7 +14,7 @@ from ..checks import positive, real_array
 from ..errors import InputError
 from ..grid import Grid
 from ..views import Views
-from ..volume import Volume
+from ..volume import LINE_INTEGRALS, Volume, require_quantity
 from .arrays import ArrayOrTensor, is_tensor, namespace
 from .pixel_points import TOLERANCE, offsets, points_needed, require_points, shadow_edges
 from .rays import Fan
@@ -62,6 +62,9 @@ class Model(ABC):
     mu: Volume | None = None
     """What attenuates the rays between the point that is measured and their source, 1/mm."""
 
+    takes: tuple[str, ...] = LINE_INTEGRALS
+    """Quantities of volumes that it has a meaning for; arrays and tensors say none, so that theirs are the caller's."""
+
     weights_voxels: bool = False
     """Whether each view weights the voxels in its own way (`voxel_weights`)."""
 
@@ -72,8 +75,9 @@ class Model(ABC):
         """What a user who projects `grid` into `views` should be warned of."""
         return None
 
-    def check_volume(self, volume: Volume) -> None:  # noqa: B027
+    def check_volume(self, volume: Volume) -> None:
         """Raise `InputError` where the model is not for such a volume."""
+        require_quantity(volume.quantity, self.takes, self.name)
 
     def record(self) -> dict[str, Any]:
         """The model's own settings, for a run's record: anything JSON can hold."""

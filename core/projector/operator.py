@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import copy
 import functools
-import itertools
 import math
 import os
 import warnings
@@ -305,7 +304,7 @@ class Projector(LinearOperator):
             for which, by_columns, weights, rays, attenuation in self._fans(views, trace):
                 lines = images.swapaxes(1, 2) if by_columns else images
                 integrals = integrate(box, rays, attenuation).reshape(-1, *lines.shape[1:])
-                lines[which] += integrals if weights is None else alike(weights, box) * integrals
+                lines[which] += alike(weights, box) * integrals
             yield from map(self._responded, images, views)
 
     def _responded(self, image: ArrayOrTensor, m: int) -> ArrayOrTensor:
@@ -324,27 +323,30 @@ class Projector(LinearOperator):
 
     def _fans(
         self, views: range, trace: RayMapper
-    ) -> Iterator[tuple[list[int], bool, Array | None, IndexFan | IndexFans, Attenuation | None]]:
+    ) -> Iterator[tuple[list[int], bool, Array, IndexFan | IndexFans, Attenuation | None]]:
         """The beams of several views in groups that cuda takes at once.
 
-        Yields which of `views` they are of, whether their lines are the images' columns, weights (as many, lines, rays),
-        rays and attenuation.
+        Yields which of `views` they are of, whether their lines are the images' columns, weights (as many, lines, rays, or
+        what broadcasts to that), rays and attenuation.
         """
         of_views = []
         for m in views:
             beams, by_columns = self._beams(m)
-            parts = ((beam, slice(j, j + 1)) for beam in beams for j in range(len(beam.rays.shifts)))
-            of_views.append((parts, by_columns))
+            single = [(beam, slice(j, j + 1)) for beam in beams for j in range(len(beam.rays.shifts))]
+            of_views.append((single, by_columns))
         # The first rays of all views, their second, ...; some views have more than others.
-        for parts_of_views in itertools.zip_longest(*(parts for parts, _ in of_views)):
+        for j in range(max(len(single) for single, _ in of_views)):
             for by_columns in (False, True):
-                group = [(k, p) for k, p in enumerate(parts_of_views) if p is not None and of_views[k][1] == by_columns]
+                group = [k for k, (single, columns) in enumerate(of_views) if columns == by_columns and j < len(single)]
                 if not group:
                     continue
-                parts = [beam.part(slice(None), slice(None), shifts) for _, (beam, shifts) in group]
-                every = [weights for _, weights in parts]
-                weights = None if every[0] is None else np.concatenate(every)
-                yield [k for k, _ in group], by_columns, weights, *trace.together([fan for fan, _ in parts])
+                fans, weights = [], []
+                for k in group:
+                    beam, shifts = of_views[k][0][j]
+                    fan, of_rays = beam.part(slice(None), slice(None), shifts)
+                    fans.append(fan)
+                    weights.append(np.ones((1, 1, 1)) if of_rays is None else of_rays)
+                yield group, by_columns, np.concatenate(weights), *trace.together(fans)
 
     def _weighted(self, box: ArrayOrTensor, m: int, origin: tuple[int, int, int] = (0, 0, 0)) -> ArrayOrTensor:
         """A part of a volume, from voxel `origin` on, times view m's voxel weights."""
@@ -524,7 +526,7 @@ class AdjointProjector(LinearOperator):
                 some = along_v.swapaxes(1, 2) @ some @ along_u
             for which, by_columns, weights, rays, attenuation in A._fans(views, trace):
                 lines = (some.swapaxes(1, 2) if by_columns else some)[which]
-                values = lines if weights is None else alike(weights, images) * lines
+                values = alike(weights, images) * lines
                 spread(volume, values.reshape(-1), rays, attenuation)
             _report(progress, views.stop, images.shape[0])
 

@@ -17,7 +17,7 @@ from torch import Tensor
 from ..checks import whole_shape
 from ..errors import InputError
 from ..grid import Grid
-from ..volume import Volume
+from ..volume import Volume, require_quantity
 from .aperture import disk_points
 from .crystal import absorbed_share
 from .emission import throughput
@@ -204,6 +204,8 @@ def emission_images(
     >>> counts.sum().backward()
     """
     n_v, n_u = whole_shape(shape, "image shape", 2)
+    if isinstance(volume, Volume):
+        require_quantity(volume.quantity, ("activity",), "emission images")
     within = volume.grid if isinstance(volume, Volume) else grid
     if not isinstance(within, Grid):
         raise InputError(f"emission images: expected a Volume, or also a grid, got {type(volume).__name__}")

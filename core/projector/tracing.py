@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 from ..checks import real_array, whole_shape
 from ..errors import InputError
 from ..grid import Grid
-from ..volume import Volume
+from ..volume import LINE_INTEGRALS, Volume, require_quantity
 from . import backends
 from .arrays import ArrayOrTensor, checked, is_double, is_tensor, like, together, zeros
 from .operator import Spread, _blocks, _parallel, _sum, _thread_count, checked_mu, lattices, volume_workers
@@ -35,7 +35,8 @@ def trace_rays(
     Parameters
     ----------
     volume
-        The voxels; outside them it is 0. A `Volume`, or an array or tensor (n_x, n_y, n_z) on `grid`.
+        The voxels; outside them it is 0. A `Volume` of activity or mu (with `mu`, of activity), or an array or tensor
+        (n_x, n_y, n_z) on `grid`.
     sources, targets
         Ends of the rays, each (N, 3), or (3,) for all rays the same; world mm. Arrays or torch tensors.
     backend
@@ -61,7 +62,8 @@ def trace_rays(
     Raises
     ------
     InputError
-        Not a volume, or the points' shapes do not fit, or a coordinate is not finite; mu is negative; no such backend.
+        Not a volume, or one whose line integrals mean nothing (CT numbers, maps); the points' shapes do not fit, or a
+        coordinate is not finite; mu is negative; no such backend.
 
     Examples
     --------
@@ -321,7 +323,7 @@ class Tracer:
                 bundle, transposed = bundle.transposed(), True
             pieces += [
                 _Piece(number, bundle, lines, transposed)
-                for lines in _blocks(*map(slice, (0, 0), bundle.shape), self.backend, self._workers)
+                for lines in _blocks(slice(0, bundle.shape[0]), slice(0, bundle.shape[1]), self.backend, self._workers)
             ]
         return pieces
 
@@ -427,10 +429,12 @@ def _tracer(
     geometry: tuple[Any, ...],
 ) -> tuple[ArrayOrTensor, ArrayOrTensor, Tracer]:
     """Checked numbers of the volume and of mu, both arrays or both tensors, and what traces rays of that `geometry`."""
+    if isinstance(volume, Volume):  # nothing attenuates attenuation
+        require_quantity(volume.quantity, LINE_INTEGRALS if mu is None else ("activity",), "line integrals")
     array, grid = _field(volume, "volume", grid, None, backend == "numpy")
     if mu is not None:
-        if isinstance(mu, Volume) and mu.quantity != "mu":
-            raise InputError(f"mu: expected a volume of mu, got {mu.quantity}")
+        if isinstance(mu, Volume):
+            require_quantity(mu.quantity, ("mu",), "mu")
         mu, mu_grid = _field(mu, "mu", mu_grid, grid, backend == "numpy")
         array, mu = together(array, checked_mu(mu, mu_grid, backend == "numpy"))
     name = backends.choose(backend)

@@ -265,7 +265,7 @@ def test_no_scanner_and_no_volume_are_clear_errors(scene, ring_system):
     with pytest.raises(RuntimeError, match="no scanner in the scene"):
         bpy.ops.mphdrr.render_projections()
     scanner.build_scanner(scene, ring_system, "Ring")
-    with pytest.raises(RuntimeError, match="no volume in the scene"):
+    with pytest.raises(RuntimeError, match="no volume of activity or mu in the scene"):
         bpy.ops.mphdrr.render_projections()
 
 
@@ -304,7 +304,6 @@ def test_job_stops_at_its_next_step_when_cancelled():
     run.cancel.set()
     go_on.set()
     run.thread.join(5)
-    run.end()
     assert isinstance(run.error, Cancelled) and not run.alive and (run.done, run.total) == (2, 2)
 
 
@@ -313,14 +312,14 @@ def test_stop_ends_the_thread_of_the_running_job(monkeypatch):
         while True:
             progress(0, 1)
 
-    filters = warnings.filters
+    before = warnings.showwarning, list(warnings.filters)
     run = _run_in_thread(work)
     monkeypatch.setattr(jobs, "_current", run)
     state = bpy.context.window_manager.mphdrr_job
     assert state.running and state.label == "Test"
     jobs.stop()
     assert not run.alive and not state.running and state.progress == 0
-    assert warnings.filters is filters
+    assert (warnings.showwarning, list(warnings.filters)) == before
 
 
 def test_loading_a_file_ends_the_running_job(monkeypatch):
@@ -351,3 +350,109 @@ def test_errors_in_the_work_become_readable_reports(scanned, monkeypatch, kind, 
     with pytest.raises(RuntimeError, match=message):
         bpy.ops.mphdrr.render_projections(width=8, height=8)
     assert _ours() == []
+
+
+@pytest.fixture
+def ct(scanned, scene) -> bpy.types.Object:
+    """A CT beside the phantom, active."""
+    array = np.full((9, 10, 11), -1000.0, np.float32)
+    array[2:7, 2:7, 2:7] = 55.0
+    item = volumes.add_volume(Volume(array, Grid.centered(array.shape, 8.0), "hu"), "CT")
+    volumes.make_active(bpy.context, item)
+    return item
+
+
+HOW = r"hu_to_mu\(volume, energy\), .*CT to Attenuation in Blender's Phantom panel"
+
+
+@pytest.mark.parametrize("chosen", ["named", "panel", "active"])
+@pytest.mark.parametrize("settings", [{}, {"photons": 1000.0}, {"model": "INVERSE_SQUARE"}])
+def test_a_ct_is_no_radiograph_until_it_is_converted(scene, scanned, ct, chosen, settings):
+    from mphdrr.core.export import read_run
+    from mphdrr.core.hounsfield import hu_to_mu
+
+    given = {**settings, **({"volume": "CT"} if chosen == "named" else {})}
+    scene.mphdrr_projections.volume = ct if chosen == "panel" else None
+    with pytest.raises(RuntimeError, match=f"'CT' for .*: expected a volume of .*mu, got hu; .*{HOW}"):
+        bpy.ops.mphdrr.render_projections(width=8, height=8, **given)
+    assert _ours() == [] and not scene.mphdrr_projections.run_file
+    scene.mphdrr_projections.volume = None
+    assert bpy.ops.mphdrr.ct_to_attenuation(energy=60.0) == {"FINISHED"}
+    made = bpy.context.object
+    assert made.name == "CT mu" and made.mphdrr_volume.quantity == "mu" and ct.mphdrr_volume.quantity == "hu"
+    mu = volumes.volume_from_object(made)
+    assert np.array_equal(mu.array, hu_to_mu(volumes.volume_from_object(ct), 60.0).array)
+    assert bpy.ops.mphdrr.render_projections(width=8, height=8, **settings) == {"FINISHED"}
+    run = read_run(storage.absolute(scene.mphdrr_projections.run_file))
+    assert run.settings["volume"] == "CT mu" and run.unit == ("photons" if "photons" in settings else "1/mm mm")
+
+
+def test_a_moved_ct_is_converted_where_it_is_and_in_every_state(scene, scanned):
+    states = [Volume(np.full((4, 5, 6), 10.0 * k), Grid.centered((4, 5, 6), 7.0), "hu") for k in range(3)]
+    item = volumes.add_volume_sequence(states, "Breath", frame_start=4)
+    item.location.x += 12.5
+    item.rotation_euler.z = 0.3
+    bpy.context.view_layer.update()
+    volumes.make_active(bpy.context, item)
+    bpy.ops.mphdrr.ct_to_attenuation()
+    made = bpy.context.object
+    assert made.data.is_sequence and made.data.frame_start == 4
+    from mphdrr.core.hounsfield import hu_to_mu
+
+    for k in range(3):
+        scene.frame_set(4 + k)
+        expected, got = hu_to_mu(volumes.volume_from_object(item)), volumes.volume_from_object(made)
+        assert np.array_equal(got.array, expected.array)
+        np.testing.assert_allclose(got.grid.affine, expected.grid.affine, atol=1e-9)
+
+
+def test_counts_are_of_activity_alone(scene, scanned, ct, body):
+    for name in ("CT", "Body"):
+        with pytest.raises(RuntimeError, match=f"'{name}' for emission: expected a volume of activity"):
+            bpy.ops.mphdrr.render_projections(width=8, height=8, model="EMISSION", volume=name)
+    with pytest.raises(RuntimeError, match=f"'CT' for attenuation: expected a volume of mu, got hu; .*{HOW}"):
+        bpy.ops.mphdrr.render_projections(width=8, height=8, model="EMISSION", mu="CT")
+    assert bpy.ops.mphdrr.render_projections(width=8, height=8, model="EMISSION") == {"FINISHED"}  # the phantom's
+
+
+@pytest.mark.parametrize("quantity", ["sensitivity", "modules", "resolution", "completeness"])
+def test_maps_of_the_scanner_are_not_projected(scanned, quantity):
+    volumes.add_volume(Volume(np.ones((4, 4, 4)), Grid.centered(4, 9.0), quantity), "Map")
+    with pytest.raises(
+        RuntimeError, match=f"'Map' for transmission: expected a volume of activity or mu, got {quantity}"
+    ):
+        bpy.ops.mphdrr.render_projections(width=8, height=8, volume="Map")
+
+
+@pytest.mark.parametrize("name", ["volume", "mu"])
+def test_a_volume_of_the_panel_that_was_deleted_is_missed(scene, scanned, body, name):
+    """Blender keeps it in the panel: nothing else is projected, and nothing is left out, in its place."""
+    item = bpy.data.objects["Derenzo" if name == "volume" else "Body"]
+    setattr(scene.mphdrr_projections, name, item)
+    item.users_collection[0].objects.unlink(item)
+    with pytest.raises(RuntimeError, match=f"'{item.name}' is not in this scene any more"):
+        bpy.ops.mphdrr.render_projections(width=8, height=8, model="EMISSION")
+
+
+def test_only_a_ct_is_converted(scanned):
+    with pytest.raises(RuntimeError, match="No CT is active"):
+        bpy.ops.mphdrr.ct_to_attenuation()
+
+
+@pytest.mark.parametrize(("isotope", "said"), [("Tc-99m", False), ("I-131", True)])
+@pytest.mark.parametrize("source", ["phantom", "ct"])
+def test_attenuation_at_another_energy_is_said(scanned, scene, source, isotope, said, capfd):
+    if source == "phantom":
+        bpy.ops.mphdrr.add_nema(voxels=16, attenuation=True, name="Body")
+        mu = next(o for o in volumes.volume_objects(scene) if o.mphdrr_volume.quantity == "mu")
+    else:
+        volumes.make_active(
+            bpy.context, volumes.add_volume(Volume(np.zeros((4, 4, 4)), Grid.centered(4, 30.0), "hu"), "CT")
+        )
+        bpy.ops.mphdrr.ct_to_attenuation()
+        mu = bpy.context.object
+    settings = {"model": "EMISSION", "isotope": isotope, "volume": "Derenzo", "mu": mu.name}
+    capfd.readouterr()
+    assert bpy.ops.mphdrr.render_projections(width=4, height=4, last=1, **settings) == {"FINISHED"}
+    out = "".join(capfd.readouterr())
+    assert (f"the mu of '{mu.name}' holds at 140.5 keV" in out) == said

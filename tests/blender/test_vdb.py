@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import warnings
+
 import numpy as np
 import pytest
 
 bpy = pytest.importorskip("bpy")
 
-from mphdrr.addon import compat  # noqa: E402
+from mphdrr.addon import compat, volumes  # noqa: E402
 from mphdrr.addon.vdb import openvdb, read_vdb, write_vdb  # noqa: E402
 from mphdrr.core.errors import InputError  # noqa: E402
 from mphdrr.core.frames import euler_pose  # noqa: E402
@@ -42,11 +44,12 @@ def test_several_volumes_share_a_file(tmp_path):
 
 @pytest.mark.parametrize("extreme", [0.0, -0.0, 1e-45, -3.4e38, 1 / 3])
 @pytest.mark.parametrize("mirror", [1, -1])
-def test_every_float_comes_back(tmp_path, extreme, mirror):
+@pytest.mark.parametrize("shift", [0.0, -0.5])  # -0.5: all files of version 0.1.0 under Blender 4.5
+def test_every_float_comes_back(tmp_path, extreme, mirror, shift):
     array = np.zeros((3, 4, 5), np.float32)
     array[1, 2, 3] = extreme
     volume = Volume(array, Grid(array.shape, LINEAR @ np.diag([mirror, 1.0, 1.0, 1.0])), "hu")
-    write_vdb(volume, tmp_path / "a.vdb")
+    write_vdb(volume, tmp_path / "a.vdb", center_shift=shift)
     back = read_vdb(tmp_path / "a.vdb")
     assert np.array_equal(back.array, array) and np.array_equal(back.grid.affine, volume.grid.affine)
 
@@ -133,18 +136,94 @@ def test_grids_are_chosen_by_name(tmp_path):
     assert read_vdb(path).array.max() == 2  # the only one with numbers
 
 
-def test_what_others_do_to_our_grids_counts(tmp_path):
-    """Houdini and the like keep the metadata when they move a grid."""
-    volume = Volume(np.ones((3, 3, 3), np.float32), Grid.centered((3, 3, 3), 2.0), "mu")
-    write_vdb(volume, tmp_path / "a.vdb")
+@pytest.mark.parametrize("shift", [0.0, -0.5])
+@pytest.mark.parametrize("mirror", [1, -1])
+def test_what_others_do_to_our_grids_counts(tmp_path, shift, mirror):
+    """Houdini and the like keep the metadata when they move a grid, also one that was written for Blender 4.5's drawing."""
+    volume = Volume(np.ones((3, 3, 3), np.float32), Grid((3, 3, 3), LINEAR @ np.diag([mirror, 1.0, 1.0, 1.0])), "mu")
+    write_vdb(volume, tmp_path / "a.vdb", center_shift=shift)
     grid = vdb.read(str(tmp_path / "a.vdb"), "mu")
     grid.transform.postTranslate((10.0, 0.0, 0.0))
     vdb.write(str(tmp_path / "b.vdb"), grids=[grid])
     moved = read_vdb(tmp_path / "b.vdb")
     assert moved.quantity == "mu"
-    np.testing.assert_allclose(
-        moved.grid.center, [10.0 + 2 * compat.VDB_CENTER_SHIFT] + [2 * compat.VDB_CENTER_SHIFT] * 2
+    np.testing.assert_allclose(moved.grid.center, volume.grid.center + np.array([10.0, 0.0, 0.0]), atol=1e-9)
+    grid.transform = vdb.createLinearTransform((np.diag([2.0, 2.0, 2.0, 1.0]) @ LINEAR).T.tolist())  # as if resampled
+    vdb.write(str(tmp_path / "c.vdb"), grids=[grid])
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        read_vdb(tmp_path / "c.vdb")
+    assert ["it may lie that much off" in str(w.message) for w in caught] == ([True] if shift else [])
+
+
+def _centroid(path, name, spread=0.0):
+    """Where other programs see a grid's content: OpenVDB's own transform of integer indices, as all of them use it."""
+    grid = vdb.read(str(path), name)
+    first, last = grid.evalActiveVoxelBoundingBox()
+    shape = tuple(b - a + 1 for a, b in zip(first, last, strict=True))
+    values = np.zeros(shape, np.float32)
+    grid.copyToArray(values, ijk=first)
+    points = [(np.add(ijk, first) + spread, values[ijk]) for ijk in np.ndindex(shape) if values[ijk]]
+    world = np.array([grid.transform.indexToWorld(tuple(map(float, point))) for point, _ in points])
+    return np.average(world, axis=0, weights=[value for _, value in points])
+
+
+@pytest.mark.parametrize("mirror", [1, -1])
+def test_other_programs_find_voxels_where_they_are(tmp_path, mirror):
+    rng = np.random.default_rng(7)
+    volume = Volume(rng.random((5, 4, 6), np.float32), Grid((5, 4, 6), LINEAR @ np.diag([mirror, 1.0, 1.0, 1.0])), "mu")
+    index = np.stack(np.meshgrid(*map(np.arange, volume.grid.shape), indexing="ij"), axis=-1)
+    expected = (
+        volume.grid.affine[:3, :3]
+        @ np.average(index.reshape(-1, 3), axis=0, weights=volume.array.ravel().astype(float))
+        + volume.grid.affine[:3, 3]
     )
+    write_vdb(volume, tmp_path / "a.vdb")
+    np.testing.assert_allclose(_centroid(tmp_path / "a.vdb", "mu"), expected, atol=1e-5)
+    assert "mphdrr_note" not in vdb.read(str(tmp_path / "a.vdb"), "mu").metadata
+    # What a scene draws is for the running Blender, and says so where that is not for others.
+    item = volumes.add_volume(volume, "Body", pose=euler_pose(0.2, 0.1, 0.4, (9.0, 8.0, 7.0)))
+    shown = item.data.filepath
+    bpy.context.view_layer.update()
+    drawn = np.array(item.matrix_world) @ [*_centroid(shown, "mu", -compat.VDB_CENTER_SHIFT), 1.0]
+    np.testing.assert_allclose(drawn[:3], expected, atol=1e-4)
+    note = vdb.read(shown, "mu").metadata.get("mphdrr_note", "")
+    assert ("where this transform carries i +0.5" in note) == bool(compat.VDB_CENTER_SHIFT)
+
+
+@pytest.mark.parametrize("ending", [".vdb", ".nii.gz", ".npz", ".nrrd"])
+def test_export_writes_a_moved_volume_for_other_programs(tmp_path, ending):
+    from mphdrr.core.volume_io import read_volume
+
+    rng = np.random.default_rng(8)
+    volume = Volume(rng.random((5, 4, 6), np.float32), Grid((5, 4, 6), LINEAR), "activity")
+    item = volumes.add_volume(volume, "Heart")
+    item.location.x += 11.0
+    item.rotation_euler.y = 0.25
+    bpy.context.view_layer.update()
+    volumes.make_active(bpy.context, item)
+    path = tmp_path / f"heart{ending}"
+    assert bpy.ops.mphdrr.export_volume(filepath=str(path)) == {"FINISHED"}
+    stands = volumes.volume_from_object(item)
+    back = (read_vdb if ending == ".vdb" else read_volume)(path)
+    assert back.quantity == "activity" and np.array_equal(back.array, stands.array)
+    np.testing.assert_allclose(back.grid.affine, stands.grid.affine, atol=1e-5)
+    if ending == ".vdb":
+        index = np.stack(np.meshgrid(*map(np.arange, (5, 4, 6)), indexing="ij"), axis=-1).reshape(-1, 3)
+        middle = np.average(index, axis=0, weights=volume.array.ravel().astype(float))
+        expected = stands.grid.affine @ [*middle, 1.0]
+        np.testing.assert_allclose(_centroid(path, "activity"), expected[:3], atol=1e-5)
+
+
+def test_export_refuses_other_endings_and_the_scenes_own_file(tmp_path):
+    item = volumes.add_volume(Volume(np.ones((2, 2, 2)), Grid.centered(2, 3.0)), "Cube")
+    volumes.make_active(bpy.context, item)
+    for path, message in (
+        (tmp_path / "a.txt", r"expected a name ending in \.vdb"),
+        (volumes.file_of(item), "scene's own"),
+    ):
+        with pytest.raises(RuntimeError, match=message):
+            bpy.ops.mphdrr.export_volume(filepath=str(path))
 
 
 def _bad(path, kind):

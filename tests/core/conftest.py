@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
 from mphdrr.core.frames import euler_pose
 from mphdrr.core.grid import Grid
+from mphdrr.core.projector import Emission
 from mphdrr.core.system import PinholeSystem
+from mphdrr.core.volume import Volume
 
 WORKBOOK = Path(__file__).parents[2] / "examples" / "dc-spect-80.xlsx"
 
@@ -47,3 +50,8 @@ def general_grid(rng: np.random.Generator, shape: tuple[int, int, int]) -> Grid:
     affine[:3, :3] @= np.array([[1.3, 0.2, 0.0], [0.0, -0.8, 0.1], [0.0, 0.0, 2.1]])
     affine[:3, 3] -= affine[:3, :3] @ (np.array(shape) - 1) / 2
     return Grid(shape, affine)
+
+
+def emission(system: PinholeSystem, mu: Volume | None = None, **options: Any) -> Emission:
+    """Emission through the pixels' centres alone, for laws of single rays; without the warning that these are few."""
+    return Emission(system, mu, **({"pixel_points": 1, "tolerance": 1e9} | options))

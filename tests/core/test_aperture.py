@@ -12,7 +12,7 @@ import mphdrr.core as mph
 from mphdrr.core.errors import InputError
 from mphdrr.core.projector.aperture import KnifeEdge, openings
 
-from .conftest import general_grid
+from .conftest import emission, general_grid
 from .test_emission import BACKENDS, assert_adjoint, one_module, spot_image, turned_grid
 
 KNIFE = KnifeEdge(radius=1.1, mu=3.0, tangent=0.8)
@@ -81,7 +81,7 @@ def test_an_opaque_edge_leaves_the_hole(n):
 def test_point_source_on_the_axis_counts_what_the_edge_lets_pass(n):
     """Against the solid angle of the hole and the edge, integrated over the plane with each point's own direction."""
     system, mu = one_module(), 3.6
-    model = mph.Emission(system, aperture_points=n, aperture_mu=mu, edge="path")
+    model = emission(system, aperture_points=n, aperture_mu=mu, edge="path")
     image, _ = spot_image(model, (0, 0, 0))
     h = 200.0
     r = (np.arange(400_000) + 0.5) * 1e-5  # to 4 mm
@@ -98,7 +98,7 @@ def voxel_image(n, fwhm):
     """Image on fine pixels, of a sum of 1, of a voxel of 8 mm^3 at the isocentre through n points of the hole."""
     grid, system = turned_grid((1, 1, 1), 2.0), one_module()
     views = system.views((round(SIDE / FINE),) * 2, "real", pitch=FINE)
-    image = mph.Projector(grid, views, mph.Emission(system, aperture_points=n, intrinsic_fwhm=fwhm))(np.ones((1, 1, 1)))
+    image = mph.Projector(grid, views, emission(system, aperture_points=n, intrinsic_fwhm=fwhm))(np.ones((1, 1, 1)))
     return image[0] / image.sum()
 
 
@@ -117,8 +117,8 @@ def test_points_for_a_tolerance_keep_it(fwhm):
 
     for pitch in (0.2, 0.4, 1.6, 4.0):
         for tolerance in (0.1, 0.04):
-            model = mph.Emission(system, aperture_tolerance=tolerance, intrinsic_fwhm=fwhm)
-            n = model.points(system.views((8, 8), "real", pitch=pitch), 0, mph.Grid.centered((1, 1, 1), 2.0))
+            model = emission(system, aperture_tolerance=tolerance, intrinsic_fwhm=fwhm)
+            n = model.hole_points(system.views((8, 8), "real", pitch=pitch), 0, mph.Grid.centered((1, 1, 1), 2.0))
             assert error(n, pitch) < tolerance
             if n > 8:
                 assert error(n // 3, pitch) > tolerance
@@ -135,7 +135,7 @@ def flat_field(model, n=120, pitch=1.0):
 def test_the_cone_lets_a_disk_of_the_crystal_see(edge):
     """Its radius l tan(alpha / 2); inside nothing changes."""
     system, angle = one_module(), np.deg2rad(50)
-    share = flat_field(mph.Emission(system, opening_angle=angle, **edge)) / flat_field(mph.Emission(system))
+    share = flat_field(emission(system, opening_angle=angle, **edge)) / flat_field(emission(system))
     np.testing.assert_allclose(share[share > 0], 1, rtol=1e-6)
     assert (share > 0).sum() == pytest.approx(np.pi * (60 * np.tan(angle / 2)) ** 2, rel=0.01)
 
@@ -143,10 +143,10 @@ def test_the_cone_lets_a_disk_of_the_crystal_see(edge):
 def test_walls_stop_what_would_enter_the_crystals_sides():
     """At depth z what came in by the front lies within (l + z) / l Ld; on the front the walls are the crystal's edges."""
     system = one_module(detector_side=40.0)
-    walls = flat_field(mph.Emission(system, within_walls=True))
-    np.testing.assert_allclose(walls, flat_field(mph.Emission(system, within_crystal=True)), rtol=1e-6)
+    walls = flat_field(emission(system, within_walls=True))
+    np.testing.assert_allclose(walls, flat_field(emission(system, within_crystal=True)), rtol=1e-6)
     deep = {"crystal_mu": 1e-6, "depth_layers": 2}  # absorbed as often at the front as at the back, at 70 mm
-    share = flat_field(mph.Emission(system, within_walls=True, **deep)) / flat_field(mph.Emission(system, **deep))
+    share = flat_field(emission(system, within_walls=True, **deep)) / flat_field(emission(system, **deep))
     places = np.abs(np.arange(120) - 59.5)
     # One of the two layers ends at 20 mm, the other at 20 * 70 / 60, smoothed over a pixel.
     middle = share[60]
@@ -172,7 +172,7 @@ def test_adjoint_of_every_option(backend, options, system, rng):
     A = mph.Projector(
         general_grid(rng, (9, 8, 7)),
         system[3:5].views((10, 11), offset=(20.0, 0.0)),
-        mph.Emission(system[3:5], **options),
+        emission(system[3:5], **options),
         backend,
         threads=2,
     )
@@ -182,7 +182,7 @@ def test_adjoint_of_every_option(backend, options, system, rng):
 def test_real_and_virtual_detector_agree_on_every_option(system, rng):
     grid = general_grid(rng, (9, 8, 7))
     x = rng.random(grid.shape)
-    model = mph.Emission(system, **OPTIONS)
+    model = emission(system, **OPTIONS)
     real = mph.Projector(grid, system.views((9, 10), "real", pitch=4.0), model)(x)
     virtual = mph.Projector(grid, system.views((9, 10), "virtual", 3.0, pitch=12.0), model)(x)
     np.testing.assert_allclose(virtual[:, ::-1, ::-1], real, rtol=1e-5, atol=1e-5 * real.max())
@@ -198,9 +198,9 @@ def test_bad_apertures_are_refused(system):
         ({"depth_layers": 3}, "crystal_mu"),
     ):
         with pytest.raises(InputError, match=word):
-            mph.Emission(system, **arguments)
+            emission(system, **arguments)
     grid = mph.Grid.centered((4, 4, 4), 0.01)
-    A = mph.Projector(grid, system.views((900, 900)), mph.Emission(system, aperture_tolerance=1e-3))
+    A = mph.Projector(grid, system.views((900, 900)), emission(system, aperture_tolerance=1e-3))
     with pytest.raises(InputError, match="more than 1000 points"):
         A(np.ones((4, 4, 4)))
 
@@ -208,7 +208,7 @@ def test_bad_apertures_are_refused(system):
 def test_weights_of_tensors_are_those_of_arrays_and_differentiable():
     """By the pixels' places and the collimator's length, so that poses of cameras that count can be optimised."""
     torch = pytest.importorskip("torch", reason="torch is not installed")
-    model = mph.Emission(one_module(), **OPTIONS)
+    model = emission(one_module(), **OPTIONS)
     u, v = np.linspace(-24, 23, 6)[None], np.linspace(-22, 21, 5)[:, None]
     for opening in model.openings(0, 3)[::4]:
         for layer in range(3):
@@ -228,8 +228,8 @@ def test_memory_is_asked_for_mu_and_for_weights(system, monkeypatch):
     large = mph.Volume(np.zeros((80, 80, 80), np.float32), mph.Grid.centered(80, 2.0), "mu")
     monkeypatch.setattr("mphdrr.core.memory.available", lambda: 600_000)
     for model, fits in (
-        (mph.Emission(system), True),
-        (mph.Emission(system, large), False),
+        (emission(system), True),
+        (emission(system, large), False),
         (mph.InverseSquareSum(system), False),
     ):
         A = mph.Projector(grid, views, model, "numpy")
@@ -263,7 +263,7 @@ def test_the_whole_camera_counts_like_photons_one_by_one(rng):
     seen = chance / chance.sum()
     places = np.stack([x - (60 + depth) * slope_u, y - (60 + depth) * slope_v])
 
-    model = mph.Emission(
+    model = emission(
         system, aperture_points=37, aperture_mu=edge.mu, edge="path", crystal_mu=crystal_mu, depth_layers=9,
         within_walls=True,
     )  # fmt: skip

@@ -56,14 +56,6 @@ def test_from_phantom_to_dataset(workbook, tmp_path, capsys):
     assert (tmp_path / "m.png").stat().st_size > 0
 
 
-def test_projecting_ct_numbers_warns(workbook, tmp_path, capsys):
-    grid = mph.Grid.centered(8, 10.0)
-    mph.write_volume(mph.Volume(np.full(grid.shape, -1000), grid, "hu"), tmp_path / "ct.nii.gz")
-    options = ["--volume", str(tmp_path / "ct.nii.gz"), *SMALL[4:], "--modules", "1", "-o", str(tmp_path / "run.h5")]
-    assert main(["project", str(workbook), *options]) == 0
-    assert "CT numbers" in capsys.readouterr().err
-
-
 @pytest.mark.parametrize(
     ("options", "said"),
     [

@@ -8,6 +8,7 @@ import pytest
 import mphdrr.core as mph
 from mphdrr.core.projector.crystal import absorbed_share, layer_depths
 
+from .conftest import emission
 from .test_emission import one_module, spot_image, turned_grid
 
 
@@ -43,7 +44,7 @@ def test_parallax_shifts_a_point_outwards_by_its_mean_depth(mu, detector):
         u = system.frames()[0, 0] @ place / 200 * 60 * side
         options = {"pitch": 0.04 * abs(side), "offset": (-u, 0.0)}
         views = system.views((60, 400), detector, **options)
-        model = mph.Emission(system, crystal_mu=mu, depth_layers=layers)
+        model = emission(system, crystal_mu=mu, depth_layers=layers)
         image = mph.Projector(grid, views, model)(np.ones((3, 3, 3)))[0].astype(float)
         columns = (np.arange(400) - 199.5) * options["pitch"] - u
         return abs(columns @ image.sum(axis=0)) / image.sum() / abs(side), image.sum()
@@ -59,8 +60,8 @@ def test_parallax_shifts_a_point_outwards_by_its_mean_depth(mu, detector):
 def test_thin_layers_blur_like_the_exponential():
     """The variance along the radius of what is recorded, against that of the depth of absorption."""
     system, mu = one_module(), 0.26
-    sharp, places = spot_image(mph.Emission(system, crystal_mu=mu), (0, 70, 0), pitch=0.05, n=200)
-    deep, _ = spot_image(mph.Emission(system, crystal_mu=mu, depth_layers=12), (0, 70, 0), pitch=0.05, n=200)
+    sharp, places = spot_image(emission(system, crystal_mu=mu), (0, 70, 0), pitch=0.05, n=200)
+    deep, _ = spot_image(emission(system, crystal_mu=mu, depth_layers=12), (0, 70, 0), pitch=0.05, n=200)
 
     def variance(image):
         profile = image.sum(axis=0) / image.sum()

@@ -10,7 +10,7 @@ import pytest
 import mphdrr.core as mph
 from mphdrr.core.errors import InputError
 
-from .conftest import WORKBOOK, general_grid
+from .conftest import WORKBOOK, emission, general_grid
 
 
 def _backend(name):
@@ -87,7 +87,7 @@ def test_point_source_obeys_pinhole_sensitivity_to_a_thousandth_with_fine_pixels
             column, row, factor = matrices[m] @ [*place, 1.0]  # look only at where the voxel's image is
             side = system.detector_side[m]
             views = system[m].views((700, 700), "real", pitch=0.003, offset=np.array([column, row]) / factor * side)
-            total = mph.Projector(grid, views, mph.Emission(system[m]))(np.ones((1, 1, 1))).sum(dtype=float)
+            total = mph.Projector(grid, views, emission(system[m]))(np.ones((1, 1, 1))).sum(dtype=float)
             np.testing.assert_allclose(total, expected[m], rtol=0.001)
 
 
@@ -96,9 +96,9 @@ def test_counts_grow_with_time_and_the_pinholes_area(backend, rng):
     grid = turned_grid((5, 6, 7), 8.0)
     x = rng.random(grid.shape)
     views = one_module().views((8, 9))
-    base = mph.Projector(grid, views, mph.Emission(one_module()), backend)(x)
-    longer = mph.Projector(grid, views, mph.Emission(one_module(), time=20.0, photons_per_decay=0.5), backend)(x)
-    wider = mph.Projector(grid, views, mph.Emission(one_module(pinhole_diameter=6.0)), backend)(x)
+    base = mph.Projector(grid, views, emission(one_module()), backend)(x)
+    longer = mph.Projector(grid, views, emission(one_module(), time=20.0, photons_per_decay=0.5), backend)(x)
+    wider = mph.Projector(grid, views, emission(one_module(pinhole_diameter=6.0)), backend)(x)
     assert base.any()
     np.testing.assert_allclose(longer, 10 * base, rtol=1e-6)
     np.testing.assert_allclose(wider, 9 * base, rtol=1e-6)
@@ -110,7 +110,7 @@ def test_counts_per_solid_angle_follow_the_formula(backend):
     system = one_module()
     grid = mph.Grid.centered((1, 1, 1), (10, 400, 400))
     views = system.views((8, 9), detector="real", pitch=(3.0, 2.0), offset=(4.0, -5.0))
-    counts = mph.Projector(grid, views, mph.Emission(system, time=7.0), backend)(np.full((1, 1, 1), 5.0))[0]
+    counts = mph.Projector(grid, views, emission(system, time=7.0), backend)(np.full((1, 1, 1), 5.0))[0]
     u = (np.arange(9) - 4) * 3.0 + 4.0
     v = (np.arange(8) - 3.5)[:, None] * 2.0 - 5.0
     cosine = 60 / np.sqrt(60**2 + u**2 + v**2)
@@ -123,7 +123,7 @@ def test_real_and_virtual_detector_count_the_same(backend, magnification, system
     """Point-inverted, and wherever the virtual detector stands: in front of, inside or behind the volume."""
     grid = general_grid(rng, (9, 8, 7))
     x = rng.random(grid.shape)
-    model = mph.Emission(system)
+    model = emission(system)
     real = system.views((6, 5), "real", pitch=7.0, offset=(2.0, -3.0))
     virtual = system.views(
         (6, 5), "virtual", magnification, 7.0 * magnification, (-2.0 * magnification, 3.0 * magnification)
@@ -138,7 +138,7 @@ def test_real_and_virtual_detector_count_the_same(backend, magnification, system
 @pytest.mark.parametrize("backend", BACKENDS)
 def test_adjoint_of_the_ideal_pinhole(backend, system, rng):
     grid = general_grid(rng, (9, 8, 7))
-    A = mph.Projector(grid, system[3:6].views((10, 11)), mph.Emission(system[3:6]), backend, threads=2)
+    A = mph.Projector(grid, system[3:6].views((10, 11)), emission(system[3:6]), backend, threads=2)
     assert_adjoint(A, rng)
     a, b = rng.random(grid.shape), rng.random(grid.shape)
     np.testing.assert_allclose(A(2 * a + 3 * b), 2 * A(a) + 3 * A(b), rtol=1e-5, atol=1e-6 * A(a).max())
@@ -150,7 +150,7 @@ def test_views_of_another_system_are_refused(system):
 
     def refused(*words, views=views, **arguments):
         with pytest.raises(InputError) as error:
-            mph.Projector(grid, views, mph.Emission(**({"system": system} | arguments)))
+            mph.Projector(grid, views, emission(**({"system": system} | arguments)))
         assert all(word in str(error.value) for word in words) and "\n" not in str(error.value)
 
     refused("12 modules", "4 views", views=system[:4].views((4, 4)))
@@ -164,7 +164,7 @@ def test_views_of_another_system_are_refused(system):
     refused("PinholeSystem", system=views)
     refused("time", time=0)
     with pytest.raises(InputError, match="activity"):
-        mph.Projector(grid, views, mph.Emission(system))(mph.Volume(np.ones(grid.shape), grid, "hu"))
+        mph.Projector(grid, views, emission(system))(mph.Volume(np.ones(grid.shape), grid, "hu"))
 
 
 def some_mu(rng, grid):
@@ -189,8 +189,8 @@ def test_attenuation_equals_a_fine_sum_along_the_ray(backend, which, rng):
     volume = mph.Volume(rng.random(grid.shape), grid)
     mu = some_mu(rng, mu_grids(grid, rng)[which])
     views = system.views((2, 3), pitch=200.0, magnification=7.0)
-    counts = mph.Projector(grid, views, mph.Emission(system, mu), backend)(volume)
-    ideal = mph.Projector(grid, views, mph.Emission(system), "numpy")(volume)
+    counts = mph.Projector(grid, views, emission(system, mu), backend)(volume)
+    ideal = mph.Projector(grid, views, emission(system), "numpy")(volume)
 
     sources, targets = views.rays(0)
     n = 4000
@@ -212,8 +212,8 @@ def test_uniform_body_counts_in_closed_form(backend, mu):
     for grid in (turned_grid((9, 8, 7), 10.0), turned_grid((3, 2, 1), (30.0, 40.0, 70.0))):
         views = system.views((12, 13))
         chord = mph.trace_rays(mph.Volume(np.ones(grid.shape), grid), *views.rays(0), "numpy").reshape(1, 12, 13)
-        ideal = mph.Projector(grid, views, mph.Emission(system), "numpy")(np.full(grid.shape, 3.0))
-        model = mph.Emission(system, mph.Volume(np.full(grid.shape, mu), grid, "mu"))
+        ideal = mph.Projector(grid, views, emission(system), "numpy")(np.full(grid.shape, 3.0))
+        model = emission(system, mph.Volume(np.full(grid.shape, mu), grid, "mu"))
         counts = mph.Projector(grid, views, model, backend)(np.full(grid.shape, 3.0))
         coefficient = float(np.float32(mu))
         mean = np.where(chord > 0, -np.expm1(-coefficient * chord) / np.maximum(coefficient * chord, 1e-12), 0)
@@ -231,9 +231,9 @@ def test_point_source_in_a_ball_loses_its_radius(backend):
     ball = x[:, None, None] ** 2 + x[:, None] ** 2 + x**2 < radius**2
     spot = turned_grid((3, 3, 3), 1.0)
     views = system.views((40, 40), "real", pitch=0.06)
-    model = mph.Emission(system, mph.Volume(mu * ball, body, "mu"))
+    model = emission(system, mph.Volume(mu * ball, body, "mu"))
     total = mph.Projector(spot, views, model, backend)(np.ones((3, 3, 3))).sum(dtype=float)
-    ideal = mph.Projector(spot, views, mph.Emission(system), backend)(np.ones((3, 3, 3))).sum(dtype=float)
+    ideal = mph.Projector(spot, views, emission(system), backend)(np.ones((3, 3, 3))).sum(dtype=float)
     np.testing.assert_allclose(total / ideal, np.exp(-mu * radius), rtol=0.01)
 
 
@@ -253,7 +253,7 @@ def test_attenuation_depends_on_matter_and_not_on_its_grid(backend, system, rng)
         mph.Volume(mu.repeat(2, 0).repeat(2, 1).repeat(2, 2), mph.Grid((12, 10, 8), grid.affine @ fine), "mu"),
         mph.Volume(np.pad(mu, ((1, 1), (2, 0), (3, 4))), mph.Grid((8, 7, 11), grid.affine @ moved), "mu"),
     ]
-    counts = [mph.Projector(grid, system.views((9, 8)), mph.Emission(system, v), backend)(activity) for v in same]
+    counts = [mph.Projector(grid, system.views((9, 8)), emission(system, v), backend)(activity) for v in same]
     assert counts[0].any()
     for other in counts[1:]:
         np.testing.assert_allclose(other, counts[0], rtol=1e-5, atol=1e-6 * counts[0].max())
@@ -264,7 +264,7 @@ def test_attenuation_depends_on_matter_and_not_on_its_grid(backend, system, rng)
 def test_adjoint_with_attenuation(backend, which, system, rng):
     grid = general_grid(rng, (9, 8, 7))
     mu = some_mu(rng, mu_grids(grid, rng)[which])
-    A = mph.Projector(grid, system[3:6].views((10, 11)), mph.Emission(system[3:6], mu), backend, threads=2)
+    A = mph.Projector(grid, system[3:6].views((10, 11)), emission(system[3:6], mu), backend, threads=2)
     assert_adjoint(A, rng)
 
 
@@ -278,7 +278,7 @@ def test_backends_agree_on_attenuation(backend, which, system, rng):
     straight = mph.PinholeSystem([[150, 0, 0], [0, -140, 0], [0, 30, 130]], 2.0, 60.0, 50.0, 10.0, 60.0)
     for scanner in (system, straight):  # rays along voxel faces too: an odd number of pixels, even voxels
         views = scanner.views((9, 11))
-        reference, y = (mph.Projector(grid, views, mph.Emission(scanner, mu), b)(x) for b in ("numpy", backend))
+        reference, y = (mph.Projector(grid, views, emission(scanner, mu), b)(x) for b in ("numpy", backend))
         np.testing.assert_allclose(y, reference, rtol=2e-5, atol=2e-5 * reference.max())
 
 
@@ -288,7 +288,7 @@ def test_gradient_in_the_activity(backend, which, rng):
     torch = pytest.importorskip("torch", reason="torch is not installed")
     grid = turned_grid((3, 2, 2), 20.0)
     mu = some_mu(rng, mu_grids(grid, rng)[which])
-    A = mph.Projector(grid, one_module().views((3, 3)), mph.Emission(one_module(), mu, time=1e4), backend)
+    A = mph.Projector(grid, one_module().views((3, 3)), emission(one_module(), mu, time=1e4), backend)
     x = torch.rand(grid.shape, dtype=torch.float64, requires_grad=True)
     assert torch.autograd.gradcheck(lambda x: torch.log1p(A(x)), (x,))
 
@@ -301,7 +301,7 @@ def test_mu_that_is_not_mu_is_refused(system):
         (mph.Volume(np.full((2, 2, 2), -0.1), grid, "mu"), "negative"),
     ):
         with pytest.raises(InputError, match=word):
-            mph.Emission(system, mu)
+            emission(system, mu)
 
 
 def spot_image(model, place, pitch=0.05, n=160):
@@ -325,8 +325,8 @@ def width(image, places):
 def test_aperture_blur_is_as_wide_as_the_holes_shadow(n):
     """A disk of diameter D has standard deviation D / 4 along u; at the source D = d (1 + b / l)."""
     system = one_module()
-    sharp, places = spot_image(mph.Emission(system), (0, 0, 0))
-    blurred, _ = spot_image(mph.Emission(system, aperture_points=n), (0, 0, 0))
+    sharp, places = spot_image(emission(system), (0, 0, 0))
+    blurred, _ = spot_image(emission(system, aperture_points=n), (0, 0, 0))
     b, l, d = 200.0, 60.0, 2.0
     diameter = 4 * np.sqrt(width(blurred, places) ** 2 - width(sharp, places) ** 2)  # on the crystal
     assert diameter * b / l == pytest.approx(d * (1 + b / l), rel=0.02)
@@ -347,7 +347,7 @@ def test_disk_points_have_the_moments_of_the_disk():
 def test_virtual_detector_sees_the_finite_aperture_as_the_crystal_does(system, rng):
     grid = general_grid(rng, (9, 8, 7))
     x = rng.random(grid.shape)
-    model = mph.Emission(system, aperture_points=5, crystal_mu=0.1, intrinsic_fwhm=6.0, within_crystal=True)
+    model = emission(system, aperture_points=5, crystal_mu=0.1, intrinsic_fwhm=6.0, within_crystal=True)
     real = mph.Projector(grid, system.views((9, 10), "real", pitch=7.0), model)(x)
     virtual = mph.Projector(grid, system.views((9, 10), "virtual", 3.0, pitch=21.0), model)(x)
     np.testing.assert_allclose(virtual[:, ::-1, ::-1], real, rtol=1e-5, atol=1e-5 * real.max())
@@ -356,13 +356,13 @@ def test_virtual_detector_sees_the_finite_aperture_as_the_crystal_does(system, r
 def test_penetration_widens_the_pinhole():
     """Paix: d_e^2 = d (d + 2 / mu tan(alpha / 2))."""
     system = one_module()
-    model = mph.Emission(system, aperture_mu=3.0, opening_angle=np.deg2rad(90))
+    model = emission(system, aperture_mu=3.0, opening_angle=np.deg2rad(90))
     expected = 2.0 * (2.0 + 2 / 3)
     np.testing.assert_allclose(model.effective_diameter**2, expected)
-    ideal, _ = spot_image(mph.Emission(system), (5, 6, 7))
+    ideal, _ = spot_image(emission(system), (5, 6, 7))
     image, _ = spot_image(model, (5, 6, 7))
     np.testing.assert_allclose(image, ideal * expected / 4, rtol=1e-6)
-    assert mph.Emission(system, aperture_mu=1e9).effective_diameter == pytest.approx(2.0)
+    assert emission(system, aperture_mu=1e9).effective_diameter == pytest.approx(2.0)
 
 
 def test_crystal_counts_what_it_stops():
@@ -370,7 +370,7 @@ def test_crystal_counts_what_it_stops():
     grid = mph.Grid.centered((1, 1, 1), (10, 400, 400))
     views = system.views((8, 9), detector="real", pitch=4.0)
     ideal, counts = (
-        mph.Projector(grid, views, mph.Emission(system, crystal_mu=mu))(np.ones((1, 1, 1)))[0] for mu in (None, 0.06)
+        mph.Projector(grid, views, emission(system, crystal_mu=mu))(np.ones((1, 1, 1)))[0] for mu in (None, 0.06)
     )
     u, v = (np.arange(9) - 4) * 4.0, (np.arange(8) - 3.5)[:, None] * 4.0
     cosine = 60 / np.sqrt(60**2 + u**2 + v**2)
@@ -380,8 +380,8 @@ def test_crystal_counts_what_it_stops():
 @pytest.mark.parametrize("fwhm", [0.3, 3.0])
 def test_intrinsic_blur_has_its_width_and_keeps_the_counts(fwhm):
     system = one_module()
-    sharp, places = spot_image(mph.Emission(system), (0, 0, 0), pitch=0.1)
-    blurred, _ = spot_image(mph.Emission(system, intrinsic_fwhm=fwhm), (0, 0, 0), pitch=0.1)
+    sharp, places = spot_image(emission(system), (0, 0, 0), pitch=0.1)
+    blurred, _ = spot_image(emission(system, intrinsic_fwhm=fwhm), (0, 0, 0), pitch=0.1)
     sigma = np.sqrt(width(blurred, places) ** 2 - width(sharp, places) ** 2)
     # Integrating over a pixel widens by its own variance, pitch^2 / 12.
     assert sigma == pytest.approx(np.hypot(fwhm / 2.35482, 0.1 / np.sqrt(12)), rel=0.01)
@@ -394,7 +394,7 @@ def test_pixels_count_what_falls_on_the_crystal():
     grid = mph.Grid.centered((1, 1, 1), (10, 900, 900))
     views = system.views((20, 20), detector="real", pitch=3.0, offset=(0.7, -0.4))
     everything, inside = (
-        mph.Projector(grid, views, mph.Emission(system, within_crystal=flag))(np.ones((1, 1, 1)))[0]
+        mph.Projector(grid, views, emission(system, within_crystal=flag))(np.ones((1, 1, 1)))[0]
         for flag in (False, True)
     )
     share = inside / everything
@@ -404,7 +404,7 @@ def test_pixels_count_what_falls_on_the_crystal():
 @pytest.mark.parametrize("backend", BACKENDS)
 def test_adjoint_of_the_whole_camera(backend, system, rng):
     grid = general_grid(rng, (9, 8, 7))
-    model = mph.Emission(
+    model = emission(
         system[3:6],
         some_mu(rng, turned_grid((6, 5, 7), 25.0)),
         aperture_points=3,
@@ -428,7 +428,7 @@ def test_bad_detectors_are_refused(system):
         ({"intrinsic_fwhm": -1}, "intrinsic_fwhm"),
     ):
         with pytest.raises(InputError, match=word):
-            mph.Emission(system, **arguments)
+            emission(system, **arguments)
 
 
 def test_counts_are_poisson():
@@ -497,7 +497,7 @@ def test_an_isotope_counts_its_photons_and_decays(rng):
     x = rng.random(grid.shape)
 
     def counts(**options):
-        return mph.Projector(grid, system.views((8, 9)), mph.Emission(system, **options))(x)
+        return mph.Projector(grid, system.views((8, 9)), emission(system, **options))(x)
 
     tl = mph.isotope("Tl-201")
     one = counts()
@@ -506,7 +506,7 @@ def test_an_isotope_counts_its_photons_and_decays(rng):
     two = counts(isotope="Tl-201", time=2 * tl.half_life)
     np.testing.assert_allclose(two, 1.5 * counts(isotope="Tl-201", time=tl.half_life), rtol=1e-5)
     np.testing.assert_allclose(counts(isotope="Tl-201", photons_per_decay=0.5, time=0.01), 0.005 * one, rtol=1e-5)
-    record = mph.Emission(system, isotope="Tc-99m").record()
+    record = emission(system, isotope="Tc-99m").record()
     assert (record["isotope"], record["photons_per_decay"]) == ("Tc-99m", 0.891)
     for options, word in (
         ({"isotope": "Xx-1"}, "Tc-99m"),
@@ -514,10 +514,10 @@ def test_an_isotope_counts_its_photons_and_decays(rng):
         ({"window": (10, 20)}, "needs an isotope"),
     ):
         with pytest.raises(InputError, match=word):
-            mph.Emission(system, **options)
+            emission(system, **options)
 
 
 def test_gradients_in_mu_are_refused(system):
     torch = pytest.importorskip("torch", reason="torch is not installed")
     with pytest.raises(InputError, match=r"A\(x, mu=...\)"):
-        mph.Emission(system, torch.rand(2, 2, 2, requires_grad=True))
+        emission(system, torch.rand(2, 2, 2, requires_grad=True))

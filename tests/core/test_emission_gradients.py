@@ -15,7 +15,7 @@ from mphdrr.core.projector.crystal import gaussian_blur  # noqa: E402
 from mphdrr.core.projector.poses import emission_images  # noqa: E402
 from mphdrr.core.rotations import se3_exp  # noqa: E402
 
-from .conftest import general_grid  # noqa: E402
+from .conftest import emission, general_grid  # noqa: E402
 
 
 def _backend(name):
@@ -58,7 +58,7 @@ def test_mu_given_is_the_models_mu(backend, which, system, rng):
     views = system[3:5].views((10, 11), pitch=5.0)
     mu_grid = grid_of_mu(which, grid, rng)
     mu, other = some_mu(rng, mu_grid), some_mu(rng, mu_grid)
-    A, expected = (mph.Projector(grid, views, mph.Emission(system[3:5], m), backend) for m in (mu, other))
+    A, expected = (mph.Projector(grid, views, emission(system[3:5], m), backend) for m in (mu, other))
     y = expected(x)
     assert np.abs(y - A(x)).max() > 1e-3 * y.max()
     for given in (other.array, torch.tensor(other.array)):
@@ -78,7 +78,7 @@ def test_gradcheck_by_activity_and_mu(backend, which, system, rng):
     """Also of the whole camera, whose rays start in several points and whose images are blurred."""
     grid = general_grid(rng, (3, 2, 4))
     mu = some_mu(rng, grid_of_mu(which, grid, rng))
-    model = mph.Emission(system[3:4], mu, time=1e4, aperture_points=3, crystal_mu=0.1, intrinsic_fwhm=6.0)
+    model = emission(system[3:4], mu, time=1e4, aperture_points=3, crystal_mu=0.1, intrinsic_fwhm=6.0)
     A = mph.Projector(grid, system[3:4].views((3, 3), pitch=10.0), model, backend, threads=2)
     x = torch.tensor(rng.random(grid.shape), requires_grad=True)
     values = torch.tensor(mu.array + 0.01, dtype=torch.float64, requires_grad=True)
@@ -98,7 +98,7 @@ def test_backends_agree_on_gradients_by_mu(backend, which, system, rng):
     weights = torch.rand((3, 12, 13), dtype=torch.float64)
     gradients = []
     for name, threads in (("numpy", 1), ("numpy", 3), (backend, 1), (backend, 3)):
-        A = mph.Projector(grid, views, mph.Emission(system[3:6], mu), name, threads)
+        A = mph.Projector(grid, views, emission(system[3:6], mu), name, threads)
         values = torch.tensor(mu.array, requires_grad=True)
         (A(x, mu=values) * weights).sum().backward()
         gradients.append(values.grad)
@@ -124,8 +124,8 @@ def test_what_is_no_mu_is_refused(system, rng):
     grid = general_grid(rng, (4, 3, 2))
     views, mu = system[:1].views((2, 2)), some_mu(rng, grid)
     x = np.ones(grid.shape)
-    A = mph.Projector(grid, views, mph.Emission(system[:1], mu))
-    without = mph.Projector(grid, views, mph.Emission(system[:1]))
+    A = mph.Projector(grid, views, emission(system[:1], mu))
+    without = mph.Projector(grid, views, emission(system[:1]))
     point = torch.zeros(3)
     for call, word in (
         (lambda: without(x, mu=x), "none"),
@@ -144,7 +144,7 @@ def test_what_is_no_mu_is_refused(system, rng):
 
 def test_gradients_of_gradients_by_mu_are_refused(system, rng):
     grid = general_grid(rng, (4, 3, 2))
-    A = mph.Projector(grid, system[:1].views((4, 4)), mph.Emission(system[:1], some_mu(rng, grid)), "torch")
+    A = mph.Projector(grid, system[:1].views((4, 4)), emission(system[:1], some_mu(rng, grid)), "torch")
     x, mu = (torch.rand(grid.shape, requires_grad=True) for _ in range(2))
     (gradient,) = torch.autograd.grad(A(x, mu=mu).sum(), x, create_graph=True)
     with pytest.raises(InputError, match="create_graph"):
@@ -158,7 +158,7 @@ def test_images_are_those_of_the_projector(backend, which, system, rng):
     grid = general_grid(rng, (9, 8, 7))
     activity = mph.Volume(rng.random(grid.shape), grid, "activity")
     mu = which and some_mu(rng, grid_of_mu(which, grid, rng))
-    model = mph.Emission(
+    model = emission(
         system,
         mu,
         time=20.0,

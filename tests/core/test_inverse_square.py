@@ -8,7 +8,7 @@ import pytest
 import mphdrr.core as mph
 from mphdrr.core.errors import InputError
 
-from .conftest import general_grid
+from .conftest import emission, general_grid
 from .test_emission import BACKENDS, assert_adjoint, one_module, turned_grid
 
 
@@ -61,7 +61,7 @@ def test_it_is_not_the_law_of_a_point_source(rng):
         views = system.views((150, 150), "real", pitch=0.02)
         return mph.Projector(grid, views, model)(np.ones((3, 3, 3))).sum(dtype=float)
 
-    for model, power in ((mph.Emission(system), 2), (mph.InverseSquareSum(system), 4)):
+    for model, power in ((emission(system), 2), (mph.InverseSquareSum(system), 4)):
         assert total(model, 60.0) / total(model, -60.0) == pytest.approx((260 / 140) ** power, rel=0.02)
 
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 
-import nibabel
 import numpy as np
 import pytest
 
@@ -167,11 +166,3 @@ def test_project_takes_one_series_of_a_dicom_folder(tmp_path, ct, workbook, caps
         model=mph.Emission(system),
     ).projections  # fmt: skip
     np.testing.assert_allclose(mph.read_run(out).projections, counts, rtol=1e-6)
-
-
-def test_counts_of_ct_numbers_in_a_file_that_does_not_say_so_are_warned_of(tmp_path, ct, workbook, capsys):
-    image = nibabel.Nifti1Image(ct.array, ct.grid.affine)
-    nibabel.save(image, tmp_path / "said-nothing.nii")
-    common = ("project", workbook, "--modules", "1", "--size", 9, 9, "--backend", "numpy", "--center", "--emission")
-    assert run(*common, "--volume", tmp_path / "said-nothing.nii", "-o", tmp_path / "run.h5") == 0
-    assert "the activity is -1000 to 0 kBq/mL" in capsys.readouterr().err

@@ -5,12 +5,12 @@ from __future__ import annotations
 import argparse
 import json
 import sys
-import warnings
 
 import numpy as np
 
-from ...errors import InputError, InputWarning
+from ...errors import InputError
 from ...geometry_checks import check_geometry
+from ...recording import recorded_warnings
 from ...system import PinholeSystem
 from ...workbook import read_system
 from ..options import add_command
@@ -34,10 +34,8 @@ def add_parser(actions) -> None:  # type: ignore[no-untyped-def]
 
 
 def _run(arguments: argparse.Namespace) -> None:
-    with warnings.catch_warnings(record=True) as caught:
-        warnings.simplefilter("always", InputWarning)
+    with recorded_warnings() as messages:
         system = read_system(arguments.file)
-    messages = [str(w.message) for w in caught if issubclass(w.category, InputWarning)]
     report = check_geometry(system, plate_thickness=arguments.plate, wall_thickness=arguments.wall)
     findings = report.messages()
     total = f"{_count(messages, 'warning')} of the workbook, {_count(findings, 'finding')} in the geometry"

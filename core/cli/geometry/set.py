@@ -6,13 +6,13 @@ import argparse
 import dataclasses
 import json
 import sys
-import warnings
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ...design import collimator_length
-from ...errors import InputError, InputWarning
+from ...errors import InputError
+from ...recording import recorded_warnings
 from ...system import PinholeSystem
 from ...workbook import WrittenWorkbook, read_system, write_system
 from ...workbook.checks import is_by_design
@@ -56,11 +56,9 @@ def add_parser(actions) -> None:  # type: ignore[no-untyped-def]
 
 def _run(arguments: argparse.Namespace) -> None:
     target = output_path(arguments.output, (".xlsx", ".xlsm"))
-    with warnings.catch_warnings(record=True) as caught:
-        warnings.simplefilter("always", InputWarning)
+    with recorded_warnings() as messages:
         system = _changed(read_system(arguments.file), arguments)
         written = write_system(system, target, template=arguments.file)
-    messages = [str(w.message) for w in caught if issubclass(w.category, InputWarning)]
     if arguments.json:
         answer = {**dataclasses.asdict(written), "path": str(written.path), "warnings": messages}
         print(json.dumps(answer, indent=1))

@@ -1,0 +1,54 @@
+"""Numbers by which .blend files and Blender's preferences keep choices.
+
+Blender stores the number of an enumeration's item, not its identifier, and numbers items by their position unless told
+otherwise: an isotope put between two others would make every saved scene count another isotope's photons. So every item
+of every enumeration has a number of its own: here, where the items come from a table of core; beside the item elsewhere.
+
+A number once given stays with its identifier for ever. A new item gets one that no item of its table ever had, wherever
+it stands in the menu; an item that is dropped takes its number with it. tests/blender/test_choices.py holds them all.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+
+Items = tuple[tuple[str, str, str, int], ...]
+"""Identifier, label, description and number of each choice, as EnumProperty takes them."""
+
+PARTS = {"NONE": 0, "CAMERA": 1, "COLLIMATOR": 2, "CRYSTAL": 3, "ROI": 4}
+QUANTITIES = {
+    "activity": 0, "mu": 1, "hu": 2, "sensitivity": 3, "modules": 4, "resolution": 5, "completeness": 6,
+}  # fmt: skip
+READ_AS = {"AUTO": 0} | {name: number + 1 for name, number in QUANTITIES.items()}
+MAPS = {"sensitivity": 0, "modules": 1, "resolution": 2, "completeness": 3}
+KINDS = {
+    "VOLUME": 0, "DERENZO": 1, "NEMA": 2, "JASZCZAK": 3, "DEFRISE": 4, "SHEPP_LOGAN": 5, "POINTS": 6, "TORSO": 7,
+    "FILE": 1000,
+}  # fmt: skip
+PHANTOM_WORDS = {"modified": 0, "original": 1}
+"""Words that settings of phantoms choose from (`core.phantoms.settings.choice`)."""
+ISOTOPES = {
+    "NONE": 0, "F-18": 1, "Ga-67": 2, "Tc-99m": 3, "In-111": 4, "I-123": 5, "I-131": 6, "Xe-133": 7, "Lu-177": 8,
+    "Tl-201": 9,
+}  # fmt: skip
+APERTURES = {"NUMBER": 0, "tungsten": 1, "lead": 2, "gold": 3, "uranium": 4}
+CRYSTALS = {"NUMBER": 0, "NaI": 1, "CsI": 2, "CZT": 3, "CdTe": 4, "BGO": 5, "LYSO": 6, "GAGG": 7}
+GEOMETRY_FORMATS = {
+    "astra": 0, "rtk": 1, "opencv": 2, "kornia": 3, "pytorch3d": 4, "nerf": 5, "leap": 6, "pytomography": 7, "stir": 8,
+    "stl": 9, "stl-parts": 10, "3mf": 11, "glb": 12, "gate9": 13, "gate10": 14, "mphdrr": 15,
+}  # fmt: skip
+
+
+def items(numbers: Mapping[str, int], chosen: Iterable[tuple[str, str, str]]) -> Items:
+    """Items (identifier, label, description) with the numbers of a table above.
+
+    Raises
+    ------
+    KeyError
+        An item has no number yet.
+    """
+    given = tuple(chosen)
+    for identifier, _, _ in given:
+        if identifier not in numbers:
+            raise KeyError(f"choice {identifier!r} has no number: give it a new one in {__name__}")
+    return tuple((identifier, label, text, numbers[identifier]) for identifier, label, text in given)

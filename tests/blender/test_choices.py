@@ -1,0 +1,188 @@
+"""Choices are kept in files by fixed numbers: what was saved is what is opened, whatever has been added since."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+bpy = pytest.importorskip("bpy")
+
+from mphdrr.addon import choices, registration  # noqa: E402
+
+SAVED = Path(__file__).parent / "data" / "choices-0.1.0.blend"
+"""Every choice that a scene can keep, numbered by position as version 0.1.0 did; what they are is in its text."""
+
+QUANTITIES = {
+    "activity": 0, "mu": 1, "hu": 2, "sensitivity": 3, "modules": 4, "resolution": 5, "completeness": 6,
+}  # fmt: skip
+HELD = {"activity": 0, "mu": 1}
+PROJECTIONS = {
+    "model": {"TRANSMISSION": 0, "EMISSION": 1, "INVERSE_SQUARE": 2},
+    "isotope": {
+        "NONE": 0, "F-18": 1, "Ga-67": 2, "Tc-99m": 3, "In-111": 4, "I-123": 5, "I-131": 6, "Xe-133": 7, "Lu-177": 8,
+        "Tl-201": 9,
+    },
+    "aperture_material": {"NUMBER": 0, "tungsten": 1, "lead": 2, "gold": 3, "uranium": 4},
+    "edge": {"PAIX": 0, "PATH": 1},
+    "crystal_material": {"NUMBER": 0, "NaI": 1, "CsI": 2, "CZT": 3, "CdTe": 4, "BGO": 5, "LYSO": 6, "GAGG": 7},
+    "detector": {"VIRTUAL": 0, "REAL": 1},
+    "backend": {"AUTO": 0, "NUMBA": 1, "TORCH": 2, "NUMPY": 3, "CUDA": 4},
+}  # fmt: skip
+PHANTOMS = {
+    "derenzo": {}, "nema": {}, "jaszczak": {}, "defrise": {}, "points": {}, "torso": {},
+    "shepp_logan": {"contrast": {"modified": 0, "original": 1}},
+}  # fmt: skip
+READ_AS = {
+    "AUTO": 0, "activity": 1, "mu": 2, "hu": 3, "sensitivity": 4, "modules": 5, "resolution": 6, "completeness": 7,
+}  # fmt: skip
+
+# Never change a number here, and never give one a second time: files hold them.
+FROZEN = {
+    "ModuleProperties": {
+        "part": {"NONE": 0, "CAMERA": 1, "COLLIMATOR": 2, "CRYSTAL": 3, "ROI": 4},
+        "length_mode": {"FROM_ROI": 0, "TYPED": 1},
+    },
+    "ScannerProperties": {"length_mode": {"FROM_ROI": 0, "TYPED": 1}},
+    "VolumeProperties": {
+        "kind": {
+            "VOLUME": 0, "DERENZO": 1, "NEMA": 2, "JASZCZAK": 3, "DEFRISE": 4, "SHEPP_LOGAN": 5, "POINTS": 6, "TORSO": 7,
+            "FILE": 1000,
+        },
+        "quantity": QUANTITIES,
+    },
+    "DerenzoPhantomProperties": {"quantity": HELD},
+    "NemaBodyProperties": {"quantity": HELD},
+    "JaszczakPhantomProperties": {"quantity": HELD},
+    "DefrisePhantomProperties": {"quantity": HELD},
+    "SheppLoganProperties": {"quantity": HELD, **PHANTOMS["shepp_logan"]},
+    "PointGridProperties": {"quantity": HELD},
+    "CardiacTorsoProperties": {"quantity": HELD},
+    "PhantomTextProperties": {"quantity": HELD},
+    "ProjectionProperties": PROJECTIONS,
+    # Operators' are kept by the preferences, of keys and menus that users make.
+    "MPHDRR_OT_render_projections": PROJECTIONS,
+    "MPHDRR_OT_import_phantom": {"quantity": HELD},
+    **{f"MPHDRR_OT_add_{kind}": {"quantity": HELD, **words} for kind, words in PHANTOMS.items()},
+    "MPHDRR_OT_import_volume": {"quantity": READ_AS},
+    "MPHDRR_OT_import_volume_sequence": {"quantity": READ_AS},
+    "MPHDRR_OT_voxelize_objects": {"quantity": HELD},
+    "MPHDRR_OT_add_map": {"quantity": {"sensitivity": 0, "modules": 1, "resolution": 2, "completeness": 3}},
+    "MPHDRR_OT_show_modules": {"mode": {"ONLY": 0, "SHOW": 1, "HIDE": 2, "ALL": 3}},
+    "MPHDRR_OT_renumber_modules": {"order": {"RINGS": 0, "LIST": 1}},
+    "MPHDRR_OT_export_for_program": {
+        "format": {
+            "astra": 0, "rtk": 1, "opencv": 2, "kornia": 3, "pytorch3d": 4, "nerf": 5, "leap": 6, "pytomography": 7,
+            "stir": 8, "stl": 9, "stl-parts": 10, "3mf": 11, "glb": 12, "gate9": 13, "gate10": 14, "mphdrr": 15,
+        },
+    },
+}  # fmt: skip
+DEFAULTS = {
+    "part": "NONE", "length_mode": "TYPED", "kind": "VOLUME", "contrast": "modified", "model": "TRANSMISSION",
+    "isotope": "NONE", "aperture_material": "NUMBER", "edge": "PAIX", "crystal_material": "NUMBER",
+    "detector": "VIRTUAL", "backend": "AUTO",
+}  # fmt: skip
+"""What files mean that do not hold a choice, because nobody has made it."""
+
+
+def _registered():
+    """Every enumeration of the extension: class, property."""
+    for cls in registration.CLASSES:
+        if issubclass(cls, bpy.types.Operator):
+            group, name = cls.bl_idname.split(".")
+            known = getattr(getattr(bpy.ops, group), name).get_rna_type().properties
+        elif issubclass(cls, bpy.types.PropertyGroup | bpy.types.AddonPreferences):
+            known = cls.bl_rna.properties
+        else:
+            continue
+        for prop in known:
+            if prop.type == "ENUM":
+                yield cls.__name__, prop
+
+
+def test_every_choice_has_the_number_that_files_keep():
+    found = {}
+    for name, prop in _registered():
+        assert not prop.is_enum_flag
+        found.setdefault(name, {})[prop.identifier] = {item.identifier: item.value for item in prop.enum_items}
+    assert found == FROZEN, "a choice was added, moved or renumbered: see addon/choices.py"
+
+
+def test_numbers_are_given_once():
+    for name, numbers in vars(choices).items():
+        if name.isupper():
+            assert len(set(numbers.values())) == len(numbers), name
+    for properties in FROZEN.values():
+        for numbers in properties.values():
+            assert len(set(numbers.values())) == len(numbers)
+
+
+def test_files_without_a_choice_mean_what_they_did():
+    for name, prop in _registered():
+        if "_OT_" not in name:
+            assert prop.default == DEFAULTS.get(prop.identifier, "activity"), f"{name}.{prop.identifier}"
+
+
+def test_a_choice_without_a_number_is_refused():
+    with pytest.raises(KeyError, match=r"'Co-57' has no number: give it a new one in .*choices"):
+        choices.items(choices.ISOTOPES, [("Co-57", "Co-57", "")])
+
+
+# In a Python of its own: enumerations are made when the extension is imported.
+OPEN = """
+import json, sys
+import bpy
+from mphdrr.core import isotopes, materials, volume
+from mphdrr.core.phantoms import kinds
+
+def inserted(known, name, value, place=2):
+    both = list(known.items())
+    return dict([*both[:place], (name, value), *both[place:]])
+
+if sys.argv[2] == "more":
+    isotopes.ISOTOPES = inserted(isotopes.ISOTOPES, "Co-57", isotopes.Isotope("Co-57", 2.35e7, ((122.1, 0.856),)), 1)
+    materials.APERTURES = ("platinum", *materials.APERTURES)
+    materials.CRYSTALS = ("LaBr3", *materials.CRYSTALS)
+    volume.UNITS = inserted(volume.UNITS, "density", "g/cm^3", 0)
+    from mphdrr.addon import choices, ids
+    ids.PARTS = ("PLATE", *ids.PARTS)
+    kinds.KINDS = kinds.KINDS[::-1]
+    for table, name in ((choices.ISOTOPES, "Co-57"), (choices.APERTURES, "platinum"), (choices.CRYSTALS, "LaBr3"),
+                        (choices.QUANTITIES, "density"), (choices.READ_AS, "density"), (choices.PARTS, "PLATE")):
+        table[name] = max(table.values()) + 1
+
+from mphdrr.addon import registration
+registration.register()
+if sys.argv[2] == "more":
+    names = [item.identifier for item in bpy.types.Scene.bl_rna.properties["mphdrr_projections"].fixed_type.properties[
+        "isotope"].enum_items]
+    assert names[:4] == ["NONE", "F-18", "Co-57", "Ga-67"], names
+bpy.ops.wm.open_mainfile(filepath=sys.argv[1], load_ui=False)
+expected = json.loads(bpy.data.texts["expected.json"].as_string())
+read = {}
+for kind, names in expected.items():
+    for name, paths in names.items():
+        for path in paths:
+            owner, _, last = path.rpartition(".")
+            value = getattr(getattr(bpy.data, kind)[name].path_resolve(owner), last)
+            read.setdefault(kind, {}).setdefault(name, {})[path] = value
+print("READ", json.dumps([expected, read]))
+"""
+
+
+@pytest.mark.parametrize("items", ["as they are", "more"])
+def test_a_file_of_the_first_version_opens_with_the_choices_it_was_saved_with(items):
+    done = subprocess.run(
+        [sys.executable, "-c", OPEN, str(SAVED), items], capture_output=True, text=True, timeout=120, check=False
+    )
+    answer = [line for line in done.stdout.splitlines() if line.startswith("READ ")]
+    assert answer, done.stderr
+    expected, read = json.loads(answer[0].removeprefix("READ "))
+    assert read == expected
+    isotopes = {paths["mphdrr_projections.isotope"] for paths in read["scenes"].values()}
+    assert isotopes == set(FROZEN["ProjectionProperties"]["isotope"])
+    materials = {paths["mphdrr_projections.crystal_material"] for paths in read["scenes"].values()}
+    assert materials == set(FROZEN["ProjectionProperties"]["crystal_material"])

@@ -288,17 +288,19 @@ class Emission(Model):
         # To the plane through the grid's farthest corner.
         depth = max(float(((grid.corners() - pinhole) @ k).max()), l)
         holes = self.openings(m, self.hole_points(views, m, grid))
+        inside = sum(opening.hole > 0 for opening in holes)  # and the edge's points, which count less
+        starts = np.concatenate([lattice(k) for k in (inside, len(holes) - inside) if k])
         n = self._pixel_points(views, m, grid)
         for layer, z in enumerate(layer_depths(self.depth_layers, self.system.detector_thickness[m])):
             stretch = depth / (l + z)
             steps = stretch * scale * rays.line_step, stretch * scale * rays.ray_step
-            for hole, opening in enumerate(holes):
+            for opening, start in zip(holes, starts, strict=True):
                 point = opening.x * u + opening.y * v
                 shift = None
                 if len(holes) > 1:
-                    # The points of all holes together are spread evenly over the pixel, as seen from the isocentre.
+                    # As seen from the isocentre, the points of all holes together are spread evenly over the pixel.
                     seen = (1 + l / self.system.pinhole_distance[m]) * np.array([opening.x, opening.y])
-                    shift = lattice(len(holes))[hole] / math.sqrt(n) - seen / (pitch_u, pitch_v)
+                    shift = start / math.sqrt(n) - seen / (pitch_u, pitch_v)
                 places = offsets(n, shift) * (pitch_u, pitch_v)
 
                 def weigh(

@@ -14,14 +14,19 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ..checks import whole_shape
+from ..checks import positive, whole_shape
 from ..errors import InputError
 from ..grid import Grid
+from ..views import Views
 from ..volume import Volume, require_quantity
 from .aperture import disk_points
 from .crystal import absorbed_share
 from .emission import throughput
+from .pixel_points import TOLERANCE, lattice, points_needed, require_points, shadow_edges
 from .tracing import trace_fans
+
+# Rays of a camera that are traced at once.
+_RAYS_AT_ONCE = 2**20
 
 Numbers = Any  # a tensor, an array or numbers
 
@@ -150,6 +155,8 @@ def emission_images(
     *,
     diameter: Numbers,
     aperture_points: int = 1,
+    pixel_points: int | None = None,
+    tolerance: float = TOLERANCE,
     crystal_mu: Numbers | None = None,
     crystal_thickness: Numbers | None = None,
     time: Numbers = 1.0,
@@ -179,8 +186,9 @@ def emission_images(
         Pixels (n_v, n_u): rows, columns.
     diameter
         The hole's effective diameter, mm, (...) or one number.
-    aperture_points
-        As of `Emission`.
+    aperture_points, pixel_points, tolerance
+        As of `Emission`; without a number of pixel points all cameras get as many as the one that needs most. All rays of
+        a camera are in the graph: many points of small images take less memory than few of large ones.
     crystal_mu, crystal_thickness
         Attenuation coefficient, 1/mm, and thickness, mm, of the crystal, (...) or one number: ``1 - exp(-crystal_mu
         crystal_thickness / cos(psi))`` of the photons are counted. Without them all are.
@@ -224,24 +232,55 @@ def emission_images(
     # To the plane through the grid's farthest corner, in pinhole to crystal distances.
     corners = positions.new_tensor(within.corners()) - positions.detach()[..., None, :]
     depth = ((corners @ rotations.detach()[..., 2:])[..., 0].amax(dim=-1) / l.detach()).clamp(min=1.0)
-    area = math.pi / 4 * diameter**2 / aperture_points
-    counts = (time * photons * pitch.prod(dim=-1) * area)[..., None, None]
+    n = require_points(pixel_points, "emission images: pixel_points")
+    if n is None:
+        views = _views(positions, rotations, l, pitch, offset, (n_v, n_u))
+        n = max(
+            points_needed(shadow_edges(views, m, within), positive(tolerance, "tolerance"), aperture_points)
+            for m in range(len(views))
+        )
+    area = math.pi / 4 * diameter**2 / aperture_points / n
+    counts = (time * photons * pitch.prod(dim=-1) * area)[..., None, None, None]
+    distance = positions.norm(dim=-1)  # to the isocentre
     images: Any = 0.0
-    for point in disk_points(aperture_points):
+    for point, start in zip(disk_points(aperture_points), lattice(aperture_points), strict=True):
         hole = diameter[..., None] / 2 * diameter.new_tensor(point)
         sources = positions + (rotations[..., :2] @ hole[..., None])[..., 0]
-        # On the crystal, seen from where k meets it behind this point of the hole.
-        middle = offset + hole
-        v, u = _pixels(pitch, middle, (n_v, n_u))
-        along = l[..., None, None]
-        cosine = along / (v[..., :, None] ** 2 + u[..., None, :] ** 2 + along**2).sqrt()
-        weights = counts * throughput(cosine, along)
-        if crystal_mu is not None:
-            weights = weights * absorbed_share(
-                cosine, mu_c[..., None, None], thickness[..., None, None], np.zeros(1), 0
+        places = pitch.new_tensor(lattice(n)).expand(*pitch.shape[:-1], n, 2)
+        if aperture_points > 1:  # as in `Emission`: spread evenly over the pixel, as seen from the isocentre
+            shift = pitch.new_tensor(start) / math.sqrt(n) - (1 + l / distance)[..., None] * hole / pitch
+            places = (places + shift[..., None, :] + 0.5) % 1 - 0.5
+        for some in places.split(max(1, _RAYS_AT_ONCE // (n_v * n_u)), dim=-2):
+            # On the crystal, seen from where k meets it behind this point of the hole.
+            middle = (offset + hole)[..., None, :] + pitch[..., None, :] * some
+            v, u = _pixels(pitch[..., None, :], middle, (n_v, n_u))
+            along = l[..., None, None, None]
+            cosine = along / (v[..., :, None] ** 2 + u[..., None, :] ** 2 + along**2).sqrt()
+            weights = counts * throughput(cosine, along)
+            if crystal_mu is not None:
+                thick = thickness[..., None, None, None]
+                weights = weights * absorbed_share(cosine, mu_c[..., None, None, None], thick, np.zeros(1), 0)
+            each = middle.shape[:-1]
+            on_plane = (
+                (depth * l)[..., None].expand(each),
+                (depth[..., None] * pitch)[..., None, :].expand(middle.shape),
+                depth[..., None, None] * middle,
             )
-        on_plane = depth * l, depth[..., None] * pitch, depth[..., None] * middle
-        vectors = _fans((n_v, n_u), sources, rotations, *on_plane)
-        integrals = trace_fans(volume, vectors, (n_v, n_u), backend, grid, mu, mu_grid)
-        images = images + weights.to(integrals) * integrals
+            turned = rotations[..., None, :, :].expand(*each, 3, 3)
+            vectors = _fans((n_v, n_u), sources[..., None, :].expand(*each, 3), turned, *on_plane)
+            integrals = trace_fans(volume, vectors, (n_v, n_u), backend, grid, mu, mu_grid)
+            images = images + (weights.to(integrals) * integrals).sum(dim=-3)
     return images
+
+
+def _views(
+    positions: Tensor, rotations: Tensor, distance: Tensor, pitch: Tensor, offset: Tensor, shape: tuple[int, int]
+) -> Views:
+    """The cameras as `Views`, one after the other."""
+    position, rotation, along, size, middle = (
+        x.detach().cpu().double().numpy().reshape(-1, *x.shape[positions.ndim - 1 :])
+        for x in (positions, rotations, distance, pitch, offset)
+    )
+    u, v, k = np.moveaxis(rotation, 2, 0)
+    centers = position + along[:, None] * k + middle[:, :1] * u + middle[:, 1:] * v
+    return Views(position, centers, size[:, :1] * u, size[:, 1:] * v, shape)

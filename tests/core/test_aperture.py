@@ -200,9 +200,8 @@ def test_bad_apertures_are_refused(system):
         with pytest.raises(InputError, match=word):
             emission(system, **arguments)
     grid = mph.Grid.centered((4, 4, 4), 0.01)
-    A = mph.Projector(grid, system.views((900, 900)), emission(system, aperture_tolerance=1e-3))
     with pytest.raises(InputError, match="more than 1000 points"):
-        A(np.ones((4, 4, 4)))
+        mph.Projector(grid, system.views((900, 900)), emission(system, aperture_tolerance=1e-3))
 
 
 def test_weights_of_tensors_are_those_of_arrays_and_differentiable():

@@ -164,6 +164,7 @@ def test_images_are_those_of_the_projector(backend, which, system, rng):
         time=20.0,
         photons_per_decay=0.9,
         aperture_points=4,
+        pixel_points=1,
         aperture_mu=3.0,
         crystal_mu=0.1,
         intrinsic_fwhm=0.8,
@@ -171,7 +172,7 @@ def test_images_are_those_of_the_projector(backend, which, system, rng):
     poses = torch.tensor(system.poses())
     got = emission_images(
         activity, poses[:, :3, 3], poses[:, :3, :3], torch.tensor(system.collimator_length), [0.4, 0.6], (9, 8), [0.1, -0.2],
-        diameter=torch.tensor(model.effective_diameter), aperture_points=4, crystal_mu=0.1,
+        diameter=torch.tensor(model.effective_diameter), aperture_points=4, pixel_points=1, crystal_mu=0.1,
         crystal_thickness=torch.tensor(system.detector_thickness), time=20.0, photons_per_decay=0.9, mu=mu, backend=backend,
     ).numpy()  # fmt: skip
     along_v, along_u = (gaussian_blur(n, 0.8 / 2.35482 / pitch) for n, pitch in ((9, 0.6), (8, 0.4)))
@@ -202,8 +203,8 @@ def test_gradient_by_every_number_of_a_camera(backend, which, system, rng):
         pose = se3_exp(p[:6]) @ base
         image = emission_images(
             activity, pose[:3, 3], pose[:3, :3], l * torch.exp(p[6]), 0.45 * torch.exp(p[7]), (16, 16), p[8:10],
-            diameter=2 * torch.exp(p[10]), aperture_points=3, crystal_mu=0.1, crystal_thickness=10.0, time=1e5, mu=mu,
-            backend=backend,
+            diameter=2 * torch.exp(p[10]), aperture_points=3, pixel_points=2, crystal_mu=0.1, crystal_thickness=10.0,
+            time=1e5, mu=mu, backend=backend,
         )  # fmt: skip
         return (image * weights).sum()
 

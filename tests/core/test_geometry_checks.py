@@ -10,6 +10,7 @@ import pytest
 
 import mphdrr.core as mph
 from mphdrr.core.cli import main
+from mphdrr.core.collimator import Construction
 from mphdrr.core.geometry_checks.blocking import cone_directions, meets
 from mphdrr.core.geometry_checks.coverage import unseen_share
 from mphdrr.core.geometry_checks.hulls import Hulls
@@ -42,11 +43,11 @@ def test_the_real_scanner_can_be_built(workbook):
 
 
 def test_thick_walls_of_the_real_scanner_overlap(workbook):
-    """Independent: with walls of 8 mm, 176 pairs of collimators have a common volume by manifold3d, with 5 mm none."""
+    """Independent: with walls of 8 mm, 188 pairs of collimators have a common volume by manifold3d, with 5 mm none."""
     system = mph.read_system(workbook)
     assert mph.check_geometry(system, wall_thickness=5.0).ok
     report = mph.check_geometry(system, wall_thickness=8.0)
-    assert len(report.overlaps) == len(report.findings) == 176
+    assert len(report.overlaps) == len(report.findings) == 188
     assert {o.first_part for o in report.overlaps} == {o.second_part for o in report.overlaps} == {"collimator"}
 
 
@@ -154,7 +155,7 @@ def test_a_sliver_of_a_thousandth_is_found(rng):
         # The cone's half-angle is 30 degrees; at the depth of 60 mm its radius is 34.64 mm.
         offset = (34.64 + beyond) * np.array([np.cos(angle), np.sin(angle)])
         system = system_of([[200.0, 0, 0], [140, *offset]], 0.5, 5.0, [50.0, 2.0], 1.0, 100.0)
-        hulls = Hulls.of(module_parts(system, 0.5, 1.0))
+        hulls = Hulls.of(module_parts(system, Construction(0.5, 1.0)))
         directions = cone_directions(200_000, np.sqrt(0.75)) @ system.frames()[0]
         fine = np.zeros(200_000, dtype=bool)
         for p in (2, 3):
@@ -233,8 +234,8 @@ def test_command_prints_findings_and_is_strict_on_demand(workbook, capsys):
     capsys.readouterr()
     assert main(["geometry", "check", str(workbook), "--wall", "8"]) == 0
     printed = capsys.readouterr().out
-    assert "modules 1 and 2: collimator and collimator overlap" in printed and "176 findings" in printed
+    assert "modules 1 and 2: collimator and collimator overlap" in printed and "188 findings" in printed
     assert main(["geometry", "check", str(workbook), "--wall", "8", "--json", "--strict"]) == 1
     out, err = capsys.readouterr()
-    assert len(json.loads(out)["geometry"]["overlaps"]) == len(json.loads(out)["findings"]) == 176
-    assert len(err.splitlines()) == 1 and "176 findings" in err
+    assert len(json.loads(out)["geometry"]["overlaps"]) == len(json.loads(out)["findings"]) == 188
+    assert len(err.splitlines()) == 1 and "188 findings" in err

@@ -180,7 +180,7 @@ def check_emitted(data: dict[str, Any], emitted: int) -> None:
     decays = sum(emitter["activity_Bq"] for emitter in data["emitters"]) * -np.expm1(-decay * data["time_s"]) / decay
     if abs(emitted - photons * decays) > 6 * np.sqrt(photons * decays) + 1:
         raise SystemExit(
-            f"{emitted} photons were emitted, expected {photons * decays:.0f}: scale the images, or run this with --threads 1"
+            f"{emitted} photons were emitted, expected {photons * decays:.0f}: do not use images.npy; run with --threads 1"
         )
 
 

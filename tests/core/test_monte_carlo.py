@@ -556,7 +556,7 @@ def test_gate10_chain_and_source(system, tmp_path) -> None:
 
 
 class TrialSource:
-    """A source of an opengate that hands to each thread's `handed(activity, threads)` of its activity; None: has no such call."""
+    """Of an opengate that hands `handed(activity, threads)` to the source of each thread; None: it has no such call."""
 
     def __init__(self, handed, threads: int) -> None:
         self.handed, self.threads, self.activity = handed, threads, 0.0

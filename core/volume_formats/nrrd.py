@@ -65,6 +65,9 @@ def read(path: Path) -> Contents:
         raise InputError("expected real numbers, found blocks of bytes")
     require_voxels(header["sizes"], np.dtype(np.float64 if kind == "double" else np.float32))
     _refuse_quantized(header)
+    where = header.get("data file", "")
+    if where.upper().startswith("LIST") or "%" in where:
+        raise InputError(f"data file: {where}: voxels in several files are not read; convert them to one")
     affine = _affine(header, path)
     try:
         array, _ = nrrd.read(str(path))

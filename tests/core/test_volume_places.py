@@ -149,6 +149,8 @@ REFUSED = {
         {**DIRECTIONS, "space directions": "none (1,0,0) (0,1,0)"}, "space directions: expected a vector for each"),
     "quantized": (
         {**DIRECTIONS, "type": "int", "old min": "0", "old max": "5"}, "old min and old max: quantized values"),
+    "several files": ({**DIRECTIONS, "data file": "v%02d.raw 0 3 1"}, "voxels in several files are not read"),
+    "a list of files": ({**DIRECTIONS, "data file": "LIST 2"}, "data file: LIST 2: voxels in several files"),
     "capitals": ({"Spacings": "1 2 3"}, "field 'Spacings': expected it in small letters"),
     "other values": ({**DIRECTIONS, "sample units": "1/cm"}, "its values are in 1/cm; expected HU"),
     "a nameless space": ({**DIRECTIONS, "space": "left-handed"}, "space 'left-handed': expected"),

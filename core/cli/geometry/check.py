@@ -16,7 +16,7 @@ from ...geometry_checks import check_geometry
 from ...isotopes import ISOTOPES
 from ...system import PinholeSystem
 from ...workbook import read_system
-from ..options import add_command
+from ..options import add_command, refuse
 from .arguments import add_edge, add_workbook, edge_settings
 
 
@@ -34,7 +34,7 @@ def add_parser(actions) -> None:  # type: ignore[no-untyped-def]
     parser.add_argument("--wall", type=float, default=2.0, metavar="MM", help="thickness of the collimators' walls")
     parser.add_argument(
         "--edge-at", choices=get_args(EdgePlace), default="middle",
-        help="where in the plate the knife edge is: front is the face towards the ROI (default: middle)",
+        help="where in the plate the knife edge is; front is the face towards the ROI",
     )  # fmt: skip
     add_edge(parser)
     parser.add_argument(
@@ -45,6 +45,8 @@ def add_parser(actions) -> None:  # type: ignore[no-untyped-def]
 
 
 def _run(arguments: argparse.Namespace) -> None:
+    if arguments.aperture_mu is None:
+        refuse(arguments, ("isotope",), "needs --aperture-mu")
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always", InputWarning)
         system = read_system(arguments.file)

@@ -134,7 +134,8 @@ def construction(scanner: bpy.types.PropertyGroup) -> Construction:
 
 def _construction_numbers(scanner: bpy.types.PropertyGroup) -> _Shape:
     """The arguments of `Construction` as the scanner has them; they may be such that there is none."""
-    return typed(scanner.plate_thickness), typed(scanner.wall_thickness), typed(scanner.opening_angle), scanner.edge_at
+    lengths = typed(scanner.plate_thickness), typed(scanner.wall_thickness)
+    return *lengths, typed(scanner.opening_angle), scanner.edge_at.lower()
 
 
 def _rebuild(

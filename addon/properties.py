@@ -172,11 +172,11 @@ class ScannerProperties(bpy.types.PropertyGroup):
     edge_at: EnumProperty(
         name="Knife Edge", description="Where in the aperture plates the knife edge is; it stays at the pinhole's centre",
         items=[
-            ("middle", "Middle", "In the middle of the plate", 0),
-            ("front", "Front", "On the plate's face towards the ROI", 1),
-            ("back", "Back", "On the plate's face towards the crystal", 2),
+            ("MIDDLE", "Middle", "In the middle of the plate", 0),
+            ("FRONT", "Front", "On the plate's face towards the ROI", 1),
+            ("BACK", "Back", "On the plate's face towards the crystal", 2),
         ],
-        default="middle", update=_scanner_changed,
+        default="MIDDLE", update=_scanner_changed,
     )  # fmt: skip
     intrinsic_fwhm: FloatProperty(
         name="Intrinsic FWHM", description="Resolution of the detectors in mm on the crystal, for the readouts. 0: ideal",

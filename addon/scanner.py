@@ -9,7 +9,7 @@ from __future__ import annotations
 import json
 import warnings
 from collections.abc import Iterable
-from dataclasses import asdict, fields
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -102,8 +102,8 @@ def build_scanner(
 
     properties = collection.mphdrr_scanner
     properties.scanner_name = name
-    for field in fields(construction):
-        setattr(properties, field.name, getattr(construction, field.name))
+    properties.plate_thickness, properties.wall_thickness = plate_thickness, wall_thickness
+    properties.opening_angle, properties.edge_at = opening_angle, edge_at.upper()
     properties.is_scanner = True
     _write_source(properties, system)
     refresh_scanner(collection)

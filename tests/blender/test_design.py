@@ -458,7 +458,7 @@ def test_collimators_of_an_older_file_get_their_knife_edge(collection, tmp_path)
 def test_opening_angle_and_place_of_the_edge_are_drawn_exported_and_checked(collection, tmp_path):
     properties, camera = collection.mphdrr_scanner, scanner.modules(collection)[0]
     radius = camera.mphdrr_module.pinhole_diameter / 2
-    properties.opening_angle, properties.edge_at = np.radians(20), "front"
+    properties.opening_angle, properties.edge_at = np.radians(20), "FRONT"
     slope = np.tan(np.radians(10))
     assert hole_radii(camera) == pytest.approx({0.0: radius, 2.0: radius + 2 * slope}, rel=1e-6)
     bpy.ops.mphdrr.check_geometry()

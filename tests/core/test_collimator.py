@@ -325,3 +325,21 @@ def test_a_plate_that_photons_pass_is_found(scanner):
     )  # the front is a little wider
     assert "lets" in str(report.thin_plates[0])
     assert mph.check_geometry(scanner, aperture_mu=mph.attenuation("tungsten", 140.5)).ok
+
+
+def test_command_names_plates_that_do_not_fit(workbook, tmp_path, capsys):
+    from mphdrr.core.cli import main
+
+    tight = ["--opening-angle", "40", "--plate", "4", "--edge-at", "back"]
+    assert main(["geometry", "check", str(workbook), *tight, "--strict"]) == 1
+    out = capsys.readouterr().out
+    assert "a plate of 4 mm is too thick for an opening angle of 40 degrees" in out and "47.4 are needed" in out
+    lead = ["--aperture-mu", "lead", "--isotope", "I-131"]
+    assert main(["geometry", "check", str(workbook), *lead, "--json"]) == 0
+    geometry = json.loads(capsys.readouterr().out)["geometry"]
+    assert len(geometry["thin_plates"]) == 80 and geometry["vignetted"] == []
+    assert main(["geometry", "check", str(workbook), "--isotope", "I-131"]) == 1
+    assert "--isotope needs --aperture-mu" in capsys.readouterr().err
+    options = ["--format", "stl-parts", "--modules", "3", "--set", "edge_at=front", "--set", "opening_degrees=60"]
+    assert main(["geometry", "export", str(workbook), "-o", str(tmp_path / "stl"), *options]) == 0
+    assert len(list((tmp_path / "stl").iterdir())) == 2

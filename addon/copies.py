@@ -11,10 +11,10 @@ import bpy
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core.collimator_mesh import Solid, module_solids
+from ..core.collimator import Collimator
+from ..core.collimator_mesh import Solid, collimator_solid, crystal_solid
 from ..core.errors import InputError
 from . import cameras, collimators, design, ids, scanner
-from .decimals import typed
 from .module_values import add_module, module_numbers
 from .scanner_parts import new_part
 
@@ -110,8 +110,9 @@ def adopt(
 
 
 def _solids(collection: bpy.types.Collection, camera: bpy.types.Object) -> tuple[Solid, Solid]:
-    plate, wall = collection.mphdrr_scanner.plate_thickness, collection.mphdrr_scanner.wall_thickness
-    return module_solids(*module_numbers(camera)[2:6], typed(plate), typed(wall))
+    _, _, d, l, side, thickness, _ = module_numbers(camera)
+    body = Collimator(d, l, side, design.construction(collection.mphdrr_scanner))
+    return collimator_solid(body), crystal_solid(l, side, thickness)
 
 
 def _add_parts(collection: bpy.types.Collection, camera: bpy.types.Object) -> None:

@@ -12,6 +12,7 @@ from contextlib import contextmanager
 import bpy
 import numpy as np
 
+from ..core.collimator import Collimator, Construction, EdgePlace
 from ..core.collimator_mesh import collimator_solid, crystal_solid
 from ..core.errors import InputError
 from . import cameras, collimators, readouts
@@ -19,6 +20,7 @@ from .decimals import typed
 from .module_values import TYPED, ModuleNumbers, module_numbers, off_aim
 
 _KEY = "mphdrr_solid"  # custom property of a mesh: the numbers that it was built with
+_Shape = tuple[float, float, float, EdgePlace]
 _writing = 0
 
 
@@ -103,16 +105,16 @@ def _refresh_module(
         if aim and scanner.keep_aimed and is_free(camera) and off_aim([camera]) and np.any(place):
             cameras.set_world_matrix(camera, cameras.camera_matrices(place[None])[0])
     numbers, aimed = module_numbers(camera), not off_aim([camera])
-    walls = typed(scanner.plate_thickness), typed(scanner.wall_thickness)
+    shape = _construction_numbers(scanner)
     intrinsic_fwhm = typed(scanner.intrinsic_fwhm)
-    built = repr((*numbers._replace(center=numbers.center.tolist()), aimed, *walls, intrinsic_fwhm))
+    built = repr((*numbers._replace(center=numbers.center.tolist()), aimed, *shape, intrinsic_fwhm))
     changed = module.built != built
     if changed:
         module.built, module.finding = built, ""
         module.collimator_length = numbers.collimator_length
         readouts.update_module(module, numbers, aimed, intrinsic_fwhm)
     # Also of a module that has not changed: an undo may have taken back its numbers and not its meshes.
-    problem = "" if module.problem else _rebuild(camera, numbers, *walls, parts)
+    problem = "" if module.problem else _rebuild(camera, numbers, shape, parts)
     if problem:
         module.problem = problem
     return changed
@@ -125,8 +127,22 @@ def is_free(camera: bpy.types.Object) -> bool:
     return not is_animated and not len(camera.constraints)
 
 
+def construction(scanner: bpy.types.PropertyGroup) -> Construction:
+    """How the scanner's collimators are built, or `InputError`."""
+    return Construction(*_construction_numbers(scanner))
+
+
+def _construction_numbers(scanner: bpy.types.PropertyGroup) -> _Shape:
+    """The arguments of `Construction` as the scanner has them; they may be such that there is none."""
+    lengths = typed(scanner.plate_thickness), typed(scanner.wall_thickness)
+    return *lengths, typed(scanner.opening_angle), scanner.edge_at.lower()
+
+
 def _rebuild(
-    camera: bpy.types.Object, numbers: ModuleNumbers, plate: float, wall: float, parts: Sequence[bpy.types.Object]
+    camera: bpy.types.Object,
+    numbers: ModuleNumbers,
+    shape: _Shape,
+    parts: Sequence[bpy.types.Object],
 ) -> str:
     """Make the camera's view and the parts' meshes those of `numbers`; says why not, if there is no such shape."""
     _, _, d, l, side, thickness, _ = numbers
@@ -135,11 +151,15 @@ def _rebuild(
         camera.data[_KEY] = repr((l, side))
     for part in parts:
         is_collimator = part.mphdrr_module.part == "COLLIMATOR"
-        given = (d, l, side, plate, wall) if is_collimator else (l, side, thickness)
+        given = (d, l, side, *shape) if is_collimator else (l, side, thickness)
         if part.data.is_editmode or not _differs(part.data, given):
             continue
         try:
-            solid = collimator_solid(*given) if is_collimator else crystal_solid(*given)
+            solid = (
+                collimator_solid(Collimator(d, l, side, Construction(*shape)))
+                if is_collimator
+                else crystal_solid(l, side, thickness)
+            )
         except InputError as error:  # e.g. while d is typed before Ld: the last shape stays
             return f"module {numbers.number}: {error}"
         collimators.reshape_mesh(part.data, solid)
@@ -147,7 +167,7 @@ def _rebuild(
     return ""
 
 
-def _differs(data: bpy.types.ID, numbers: tuple[float, ...]) -> bool:
+def _differs(data: bpy.types.ID, numbers: tuple[float | str, ...]) -> bool:
     """Whether a mesh or camera was built from other numbers than these.
 
     One that is shared, as a fresh copy's is, stays as it is until `copies.py` has given it its own.

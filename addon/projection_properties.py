@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from typing import TYPE_CHECKING, Any
 
 import bpy
@@ -74,10 +73,6 @@ class ProjectionSettings:
         name="Aperture µ", description="Attenuation coefficient of the aperture in 1/mm, at the photons' energy, "
         "where no material is chosen; 0: nothing penetrates it",
         default=0.0, min=0.0, soft_max=10.0, precision=3,
-    )  # fmt: skip
-    opening_angle: FloatProperty(
-        name="Opening Angle", description="Full angle of the knife edge's cone", subtype="ANGLE",
-        default=math.pi / 2, min=0.01, max=3.1,
     )  # fmt: skip
     edge: EnumProperty(
         name="Knife Edge",
@@ -152,7 +147,7 @@ _OPTIONAL = ("isotope", "aperture_mu", "crystal_mu")
 
 
 def chosen_model(settings: dict[str, Any], system: PinholeSystem, mu: Volume | None = None) -> Model:
-    """The model that `settings` (`ProjectionSettings`, by name) ask for; leaves bpy alone."""
+    """The model that `settings` (`ProjectionSettings`, and the scanner's opening angle) ask for; leaves bpy alone."""
     from ..core.projector import Emission, InverseSquareSum, Transmission
 
     if settings["model"] == "TRANSMISSION":

@@ -6,6 +6,7 @@ the float64 numbers beside it (see `addon/module_values.py`).
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from typing import Any
 
@@ -165,6 +166,19 @@ class ScannerProperties(bpy.types.PropertyGroup):
     wall_thickness: FloatProperty(
         name="Wall", description="Thickness of the collimators' walls in mm", min=0.0, update=_scanner_changed
     )
+    opening_angle: FloatProperty(
+        name="Opening Angle", description="Full angle of the double cone in which the holes open from their knife edge",
+        subtype="ANGLE", default=math.pi / 2, min=0.01, max=3.1, update=_scanner_changed,
+    )  # fmt: skip
+    edge_at: EnumProperty(
+        name="Knife Edge", description="Where in the aperture plates the knife edge is; it stays at the pinhole's centre",
+        items=[
+            ("MIDDLE", "Middle", "In the middle of the plate", 0),
+            ("FRONT", "Front", "On the plate's face towards the ROI", 1),
+            ("BACK", "Back", "On the plate's face towards the crystal", 2),
+        ],
+        default="MIDDLE", update=_scanner_changed,
+    )  # fmt: skip
     intrinsic_fwhm: FloatProperty(
         name="Intrinsic FWHM", description="Resolution of the detectors in mm on the crystal, for the readouts. 0: ideal",
         min=0.0, soft_max=10.0, step=10, update=_scanner_changed,

@@ -16,6 +16,7 @@ from typing import Any
 import bpy
 import numpy as np
 
+from ..core.collimator import OPENING_ANGLE, Construction, EdgePlace
 from ..core.errors import InputError, InputWarning
 from ..core.module_parts import module_parts
 from ..core.system import PinholeSystem
@@ -33,6 +34,8 @@ def build_scanner(
     *,
     plate_thickness: float = 2.0,
     wall_thickness: float = 2.0,
+    opening_angle: float = OPENING_ANGLE,
+    edge_at: EdgePlace = "middle",
     shape: tuple[int, int] = (256, 256),
     replace: bool = False,
 ) -> bpy.types.Collection:
@@ -48,6 +51,9 @@ def build_scanner(
         Name of the scanner's collection; by default that of the workbook's file.
     plate_thickness, wall_thickness
         Of the aperture plates and the collimators' walls, mm.
+    opening_angle, edge_at
+        Full angle of the holes' double cone, rad, and where in the plate its edge is: "middle", or the face in "front",
+        towards the ROI, or "back".
     shape
         Pixels (n_v, n_u) of the cameras' pictures.
     replace
@@ -72,7 +78,8 @@ def build_scanner(
         raise InputError(
             f"scanner '{name}' has changed since it was imported ({'; '.join(lost)}): set replace=True to drop this"
         )
-    parts = module_parts(system, plate_thickness, wall_thickness)
+    construction = Construction(plate_thickness, wall_thickness, opening_angle, edge_at)
+    parts = module_parts(system, construction)
 
     new = NewScanner()
     try:
@@ -96,6 +103,7 @@ def build_scanner(
     properties = collection.mphdrr_scanner
     properties.scanner_name = name
     properties.plate_thickness, properties.wall_thickness = plate_thickness, wall_thickness
+    properties.opening_angle, properties.edge_at = opening_angle, edge_at.upper()
     properties.is_scanner = True
     _write_source(properties, system)
     refresh_scanner(collection)

@@ -12,9 +12,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .checks import freeze, instance
+from .collimator import OPENING_ANGLE
 from .grid import Grid
 from .memory import require
-from .performance import RIGHT_ANGLE, resolution, seen, sensitivity
+from .performance import resolution, seen, sensitivity
 from .progress import Progress, in_threads
 from .sampling import TOLERANCE, sampling_gaps
 from .system import PinholeSystem
@@ -31,7 +32,7 @@ def sensitivity_map(
     grid: Grid,
     *,
     aperture_mu: float | None = None,
-    opening_angle: float = RIGHT_ANGLE,
+    opening_angle: float = OPENING_ANGLE,
     crystal_mu: float | None = None,
     photons_per_decay: float = 1.0,
     progress: Progress | None = None,
@@ -80,7 +81,7 @@ def resolution_map(
     *,
     intrinsic_fwhm: float = 0.0,
     aperture_mu: float | None = None,
-    opening_angle: float = RIGHT_ANGLE,
+    opening_angle: float = OPENING_ANGLE,
     crystal_mu: float | None = None,
     progress: Progress | None = None,
 ) -> Volume:

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .checks import positive
+from .collimator import edge_slope
 from .errors import InputError
 from .mass_attenuation import ELEMENTS, ENERGIES
 from .system import PinholeSystem
@@ -146,7 +147,7 @@ def module_coefficients(
     photons = np.array([photons for _, photons in lines])
     if isinstance(aperture, str):
         mu = _at_lines(aperture, lines, f"{place}aperture_mu")
-        depth = 2 / mu * np.tan(opening_angle / 2)
+        depth = 2 / mu * edge_slope(opening_angle)
         aperture = float(mu.min() / np.average(mu.min() / mu, weights=photons))  # d_e^2 is linear in 1/mu
         photons = photons * (system.pinhole_diameter.mean() + depth)
     if isinstance(crystal, str):

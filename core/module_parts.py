@@ -8,8 +8,8 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from .checks import positive
-from .collimator_mesh import Solid, module_solids
+from .collimator import Collimator, Construction
+from .collimator_mesh import Solid, collimator_solid, crystal_solid
 from .errors import InputError
 from .system import PinholeSystem
 
@@ -55,37 +55,52 @@ class ModulePart:
         return points @ self.pose[:3, :3].T + self.pose[:3, 3]
 
 
-def module_parts(system: PinholeSystem, plate_thickness: float = 2.0, wall_thickness: float = 2.0) -> list[ModulePart]:
+def module_collimators(system: PinholeSystem, construction: Construction) -> list[Collimator]:
+    """Each module's collimator, in the order of the modules.
+
+    Raises
+    ------
+    InputError
+        One cannot be built so; it names the module.
+    """
+    made = []
+    sizes = (system.pinhole_diameter, system.collimator_length, system.detector_side)
+    for number, d, l, side in zip(system.numbers.tolist(), *(size.tolist() for size in sizes), strict=True):
+        try:
+            made.append(Collimator(d, l, side, construction))
+        except InputError as error:
+            raise InputError(f"module {number}: {error}") from None
+    return made
+
+
+def module_parts(system: PinholeSystem, construction: Construction | None = None) -> list[ModulePart]:
     """Collimator and crystal of each module, in the order of the modules.
 
     Parameters
     ----------
     system
         The modules.
-    plate_thickness, wall_thickness
-        Of the aperture plates and of the collimators' walls, mm.
+    construction
+        Of the collimators; None: `Construction()`.
 
     Raises
     ------
     InputError
-        A thickness is not above 0, or the plate is as thick as a module's collimator is long.
+        A module's collimator cannot be built so.
     """
-    plate = positive(plate_thickness, "aperture plate", "mm")
-    wall = positive(wall_thickness, "collimator wall", "mm")
+    collimators = module_collimators(system, construction or Construction())
     poses = system.poses()
     poses[:, :3, [0, 2]] *= -1  # camera space is X = -u, Y = v, Z = -k
     width = max(2, len(str(system.numbers.max())))
-    sizes = (system.pinhole_diameter, system.collimator_length, system.detector_side, system.detector_thickness)
+    thicknesses = system.detector_thickness.tolist()
     parts = []
-    for number, pose, *size in zip(system.numbers.tolist(), poses, *(s.tolist() for s in sizes), strict=True):
-        d, length, side, thickness = size
-        try:
-            collimator, crystal = module_solids(d, length, side, thickness, plate, wall)
-        except InputError as error:
-            raise InputError(f"module {number}: {error}") from None
+    for number, pose, collimator, thickness in zip(
+        system.numbers.tolist(), poses, collimators, thicknesses, strict=True
+    ):
         name = f"Module {number:0{width}d}"
+        crystal = crystal_solid(collimator.length, collimator.detector_side, thickness)
         parts += [
-            ModulePart(number, "collimator", f"{name} collimator", collimator, pose),
+            ModulePart(number, "collimator", f"{name} collimator", collimator_solid(collimator), pose),
             ModulePart(number, "crystal", f"{name} crystal", crystal, pose),
         ]
     return parts

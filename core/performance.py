@@ -19,6 +19,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from .checks import instance, positive, real_array
+from .collimator import OPENING_ANGLE
 from .design import roi_radius_seen
 from .errors import InputError
 from .projector.aperture import half_value_diameter, paix_diameter
@@ -26,8 +27,6 @@ from .projector.crystal import absorbed_share, layer_depths
 from .system import PinholeSystem
 
 Array = NDArray[np.float64]
-
-RIGHT_ANGLE = math.pi / 2
 
 
 def seen(system: PinholeSystem, points: ArrayLike) -> NDArray[np.bool_]:
@@ -66,7 +65,7 @@ def sensitivity(
     points: ArrayLike,
     *,
     aperture_mu: float | None = None,
-    opening_angle: float = RIGHT_ANGLE,
+    opening_angle: float = OPENING_ANGLE,
     crystal_mu: float | None = None,
     photons_per_decay: float = 1.0,
 ) -> Array:
@@ -115,7 +114,7 @@ def resolution(
     *,
     intrinsic_fwhm: float = 0.0,
     aperture_mu: float | None = None,
-    opening_angle: float = RIGHT_ANGLE,
+    opening_angle: float = OPENING_ANGLE,
 ) -> Array:
     """FWHM in object space (P, M), mm, of each module's image across its axis; NaN where it does not see the point.
 
@@ -180,7 +179,7 @@ def isocentre_performance(
     *,
     intrinsic_fwhm: float = 0.0,
     aperture_mu: float | None = None,
-    opening_angle: float = RIGHT_ANGLE,
+    opening_angle: float = OPENING_ANGLE,
     crystal_mu: float | None = None,
     photons_per_decay: float = 1.0,
 ) -> ModulePerformance:

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import json
+from dataclasses import asdict
 
 import bpy
 
 from ..addon import design, ids, scanner, selection
-from ..addon.decimals import typed
 from ..addon.reports import warnings_reported
 from ..core.errors import InputError
 
@@ -34,11 +34,8 @@ class MPHDRR_OT_check_geometry(bpy.types.Operator):
         properties = collection.mphdrr_scanner
         try:
             with warnings_reported(self):
-                report = check_geometry(
-                    scanner.read_scanner(collection),
-                    plate_thickness=typed(properties.plate_thickness),
-                    wall_thickness=typed(properties.wall_thickness),
-                )
+                built = asdict(design.construction(properties))
+                report = check_geometry(scanner.read_scanner(collection), **built)
         except InputError as error:
             self.report({"ERROR"}, str(error))
             return {"CANCELLED"}

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import math
+from dataclasses import asdict
 from pathlib import Path
 
 import bpy
 from bpy.props import EnumProperty, StringProperty
 from bpy_extras.io_utils import ExportHelper
 
-from ..addon import choices, ids, scanner, selection, storage
+from ..addon import choices, design, ids, scanner, selection, storage
 from ..addon.decimals import typed
 from ..addon.reports import warnings_reported
 from ..core.errors import InputError
@@ -56,14 +58,15 @@ class MPHDRR_OT_export_for_program(ExportHelper, bpy.types.Operator):
                 raise InputError("no file given: set filepath")
             path, format = storage.absolute(self.filepath), FORMATS[self.format]
             collection = scanner.required_scanner(context.scene)
-            images, properties = getattr(context.scene, ids.SCENE_PROJECTIONS), collection.mphdrr_scanner
-            thickness = {name: typed(getattr(properties, name)) for name in ("plate_thickness", "wall_thickness")}
+            images = getattr(context.scene, ids.SCENE_PROJECTIONS)
+            built = asdict(design.construction(collection.mphdrr_scanner))
+            built["opening_degrees"] = typed(math.degrees(built.pop("opening_angle")))
             with warnings_reported(self):
                 system = scanner.read_scanner(collection, aimed=True)
                 views = system.views(
                     (images.height, images.width), images.detector.lower(), magnification=typed(images.magnification)
                 )
-                options = {name: value for name, value in thickness.items() if name in format.options}
+                options = {name: value for name, value in built.items() if name in format.options}
                 write_geometry(system, path, format.name, views=views, **options)
         except InputError as error:
             self.report({"ERROR"}, str(error))

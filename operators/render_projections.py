@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Generator, Sequence
 from typing import Any
 
 import bpy
-from bpy.props import StringProperty
+from bpy.props import FloatProperty, StringProperty
 
 from ..addon import ids, images, jobs, phantoms, runs, scanner, storage, volumes
 from ..addon.decimals import typed
@@ -33,11 +34,17 @@ class MPHDRR_OT_render_projections(ProjectionSettings, jobs.JobOperator, bpy.typ
     mu: StringProperty(
         name="Attenuation", description="Name of the volume object of attenuation coefficients", options={"SKIP_SAVE"}
     )
+    opening_angle: FloatProperty(
+        name="Opening Angle", description="Full angle of the knife edge's cone, instead of the scanner's",
+        subtype="ANGLE", default=math.pi / 2, min=0.01, max=3.1, options={"SKIP_SAVE"},
+    )  # fmt: skip
 
     def job(self, context: bpy.types.Context) -> jobs.Job:
         scene = context.scene
         collection = scanner.required_scanner(scene)
         chosen = {name: self._setting(scene, name) for name in ProjectionSettings.__annotations__}
+        own_angle = self.properties.is_property_set("opening_angle")
+        chosen["opening_angle"] = self.opening_angle if own_angle else collection.mphdrr_scanner.opening_angle
         system = _range(scanner.read_scanner(collection), chosen["first"], chosen["last"])
         shape = (chosen["height"], chosen["width"])
         model = chosen_model(chosen, system)  # what cannot be is said before the work begins

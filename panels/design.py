@@ -101,6 +101,8 @@ class MPHDRR_PT_scanner_design(_Panel, bpy.types.Panel):
         column.separator()
         column.prop(properties, "plate_thickness", text="Plate (mm)")
         column.prop(properties, "wall_thickness", text="Wall (mm)")
+        column.prop(properties, "opening_angle")
+        column.prop(properties, "edge_at")
         column.prop(properties, "intrinsic_fwhm", text="Crystal FWHM")
         _draw_readouts(
             layout,

@@ -105,7 +105,9 @@ class MPHDRR_PT_physics(bpy.types.Panel):
             edge = column.column(align=True)
             edge.active = settings.aperture_material != "NUMBER" or settings.aperture_mu > 0
             edge.prop(settings, "edge")
-            column.prop(settings, "opening_angle")
+            collection = scanner.active_scanner(context.scene)
+            if collection is not None:
+                column.prop(collection.mphdrr_scanner, "opening_angle")
             column = layout.column(align=True)
             column.prop(settings, "crystal_material")
             if settings.crystal_material == "NUMBER":

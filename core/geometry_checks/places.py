@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 
+from ..collimator import Collimator, Construction
 from ..system import PinholeSystem
 from .hulls import TOUCH, Hulls
 from .report import Intrusion, NearPair, SwallowedPinhole
 
 
-def find_near_pairs(system: PinholeSystem, wall_thickness: float) -> tuple[NearPair, ...]:
-    """Modules whose pinholes are closer together than two fronts, of half-width d/2 + wall, side by side."""
-    half = system.pinhole_diameter / 2 + wall_thickness
+def find_near_pairs(system: PinholeSystem, collimators: Sequence[Collimator]) -> tuple[NearPair, ...]:
+    """Modules whose pinholes are closer together than two fronts side by side."""
+    half = np.array([body.front_half_width for body in collimators])
     found = []
     for m, number in enumerate(system.numbers.tolist()):
         distance = np.linalg.norm(system.centers[m + 1 :] - system.centers[m], axis=1)
@@ -32,11 +35,12 @@ def find_swallowed_pinholes(system: PinholeSystem, hulls: Hulls) -> tuple[Swallo
     return tuple(found)
 
 
-def find_intrusions(system: PinholeSystem) -> tuple[Intrusion, ...]:
+def find_intrusions(system: PinholeSystem, construction: Construction) -> tuple[Intrusion, ...]:
     """Modules that reach into the largest ROI.
 
-    A module's front is across its axis, and the axis meets the isocentre: its nearest point is the pinhole, at b.
+    A module's front is across its axis, and the axis meets the isocentre: its nearest point is the middle of the plate's
+    front face.
     """
     radius = float(system.roi_radius.max())
-    depth = radius - system.pinhole_distance
+    depth = radius - (system.pinhole_distance + construction.front)
     return tuple(Intrusion(int(system.numbers[m]), radius, float(depth[m])) for m in np.flatnonzero(depth > TOUCH))

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import asdict, dataclass
 from typing import Any
 
+from ..collimator import EdgePlace
 from ..module_parts import Kind
 
 
@@ -46,7 +48,7 @@ class Overlap:
 
 @dataclass(frozen=True)
 class NearPair:
-    """Two modules are nearly at one place: their fronts, of half-width d/2 + wall, have no room side by side.
+    """Two modules are nearly at one place: their fronts have no room side by side.
 
     Attributes
     ----------
@@ -186,6 +188,74 @@ class Blocked:
 
 
 @dataclass(frozen=True)
+class Vignetted:
+    """The plate shades its hole from a part of the ROI: it is too thick for its opening angle.
+
+    Attributes
+    ----------
+    module : int
+        The module.
+    open_share : float
+        Of the hole's area, as a share of 1: what is open to the rays from the ROI that come in at the steepest.
+    plate_thickness : float
+        mm.
+    opening_angle, needed_angle : float
+        Of the hole's double cone, and from which on no plate shades it, rad.
+    """
+
+    module: int
+    open_share: float
+    plate_thickness: float
+    opening_angle: float
+    needed_angle: float
+
+    @property
+    def modules(self) -> tuple[int, ...]:
+        """Those that it is about."""
+        return (self.module,)
+
+    def __str__(self) -> str:
+        return (
+            f"module {self.module}: only {_percent(self.open_share)} of its hole is open to the rim of its ROI: a plate of "
+            f"{_mm(self.plate_thickness)} is too thick for an opening angle of {math.degrees(self.opening_angle):.4g} "
+            f"degrees, {math.ceil(math.degrees(self.needed_angle) * 10) / 10:g} are needed"
+        )
+
+
+@dataclass(frozen=True)
+class ThinPlate:
+    """The plate around the hole lets so many photons through that the hole's own no longer say what is counted.
+
+    Attributes
+    ----------
+    module : int
+        The module.
+    plate_thickness : float
+        mm.
+    transmission : float
+        Of the plate along the axis, as a share of 1.
+    share : float
+        Photons that pass the plate beside the hole, as a share of those that pass the hole and its edge.
+    """
+
+    module: int
+    plate_thickness: float
+    transmission: float
+    share: float
+
+    @property
+    def modules(self) -> tuple[int, ...]:
+        """Those that it is about."""
+        return (self.module,)
+
+    def __str__(self) -> str:
+        return (
+            f"module {self.module}: its plate of {_mm(self.plate_thickness)} lets {_percent(self.transmission)} of the "
+            f"photons through: beside the hole pass {_percent(self.share)} of those that pass the hole"
+        )
+
+
+@dataclass(frozen=True)
 class OpenMesh:
     """A surface is not closed, not consistently oriented, or looks inwards.
 
@@ -213,7 +283,7 @@ class OpenMesh:
         return f"module {self.module}: {what} {self.fault}"
 
 
-Finding = Overlap | NearPair | SwallowedPinhole | Intrusion | Uncovered | Blocked | OpenMesh
+Finding = Overlap | NearPair | SwallowedPinhole | Intrusion | Uncovered | Blocked | Vignetted | ThinPlate | OpenMesh
 
 
 @dataclass(frozen=True)
@@ -226,19 +296,27 @@ class GeometryReport:
         How many modules were looked at.
     plate_thickness, wall_thickness : float
         With which the solids were built, mm.
-    overlaps, near_pairs, swallowed_pinholes, intrusions, uncovered, blocked, open_meshes : tuple
+    opening_angle : float
+        Of their holes, rad.
+    edge_at : "middle", "front" or "back"
+        Where in the plates the knife edge is.
+    overlaps, near_pairs, swallowed_pinholes, intrusions, uncovered, blocked, vignetted, thin_plates, open_meshes : tuple
         The findings.
     """
 
     n_modules: int
     plate_thickness: float
     wall_thickness: float
+    opening_angle: float
+    edge_at: EdgePlace
     overlaps: tuple[Overlap, ...] = ()
     near_pairs: tuple[NearPair, ...] = ()
     swallowed_pinholes: tuple[SwallowedPinhole, ...] = ()
     intrusions: tuple[Intrusion, ...] = ()
     uncovered: tuple[Uncovered, ...] = ()
     blocked: tuple[Blocked, ...] = ()
+    vignetted: tuple[Vignetted, ...] = ()
+    thin_plates: tuple[ThinPlate, ...] = ()
     open_meshes: tuple[OpenMesh, ...] = ()
 
     @property
@@ -251,6 +329,8 @@ class GeometryReport:
             *self.intrusions,
             *self.uncovered,
             *self.blocked,
+            *self.vignetted,
+            *self.thin_plates,
             *self.open_meshes,
         )
 

@@ -10,15 +10,18 @@ import inspect
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, fields
+from itertools import pairwise
 from typing import Any, Literal, NamedTuple, get_args, get_type_hints
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..checks import positive, real_array
+from ..collimator import Collimator, Construction, EdgePlace, angle_from_degrees
 from ..errors import InputError
 from ..frames import checked_affine, euler_pose
 from ..isotopes import Isotope, isotope
+from ..module_parts import module_collimators
 from ..phantoms.derenzo import DerenzoPhantom
 from ..system import PinholeSystem
 
@@ -110,6 +113,8 @@ class Simulation:
         Of the aperture's plate and the collimator's walls, mm.
     opening_degrees : float
         Full angle of the knife edge's double cone.
+    edge_at : "middle", "front" or "back"
+        Where in the plate the knife edge is; front is the face towards the ROI.
     intrinsic_fwhm : float
         The crystal's resolution, mm; 0: none.
     energy_resolution : float
@@ -141,6 +146,7 @@ class Simulation:
     plate_thickness: float = 2.0
     wall_thickness: float = 2.0
     opening_degrees: float = 90.0
+    edge_at: EdgePlace = "middle"
     intrinsic_fwhm: float = 3.0
     energy_resolution: float = 0.1
     window_percent: float = 20.0
@@ -159,9 +165,6 @@ class Simulation:
         for name, unit in (
             ("activity", "MBq"),
             ("time", "s"),
-            ("plate_thickness", "mm"),
-            ("wall_thickness", "mm"),
-            ("opening_degrees", "degrees"),
             ("window_percent", "%"),
         ):
             set_(self, name, positive(getattr(self, name), name, unit))
@@ -170,10 +173,9 @@ class Simulation:
             if value < 0:
                 raise InputError(f"{name}: expected 0 or more, got {value:g}")
             set_(self, name, value)
-        if self.opening_degrees >= 180:
-            raise InputError(f"opening_degrees: expected less than 180, got {self.opening_degrees:g}")
         if self.window_percent >= 200:
             raise InputError(f"window_percent: expected less than 200, got {self.window_percent:g}")
+        _ = self.construction
         kinds = get_type_hints(Simulation)
         for name in ("crystal", "collimator", "phantom_material"):
             known = get_args(kinds[name])
@@ -209,6 +211,12 @@ class Simulation:
         """World-from-phantom (4, 4), from `pose` or from `position` and `euler_degrees`."""
         assert self.pose is not None
         return self.pose
+
+    @property
+    def construction(self) -> Construction:
+        """How the collimators are built."""
+        angle = angle_from_degrees(self.opening_degrees)
+        return Construction(self.plate_thickness, self.wall_thickness, angle, self.edge_at)
 
     @property
     def becquerels(self) -> float:
@@ -284,7 +292,7 @@ class Rods(NamedTuple):
 class Scene(NamedTuple):
     """All that is simulated.
 
-    `collimators` has one list for each class: the solid and the air in it. `phantom` is None for a point. `world` is the
+    `collimators` has one list for each class: the solid, and the air in it. `phantom` is None for a point. `world` is the
     side of the cube of air.
     """
 
@@ -299,20 +307,18 @@ class Scene(NamedTuple):
 def build_scene(system: PinholeSystem, simulation: Simulation) -> Scene:
     """The scanner and what is in it, as solids.
 
-    A collimator is a solid square frustum around the pyramid that the crystal sees through the hole, from the aperture
-    plate's front to the crystal; cut out of it as air are that pyramid, behind the plate, and the hole: a double cone whose
-    waist, of diameter d, is at the pinhole's centre, in the middle of the plate. The walls are those of
-    `core.collimator_mesh` at the crystal, and nowhere thinner than their thickness.
+    A collimator is the body that `core.collimator` describes: its outside as a solid square frustum, and in it as air the
+    channel and the hole, a cone on either side of the knife edge, or on one where the edge is on a face of the plate.
 
     Raises
     ------
     InputError
-        The hole does not fit into the plate, the plate is longer than the collimator, or a collimator begins in the
-        phantom.
+        There is no such collimator, or one begins in the phantom.
     """
     poses = system.poses()
+    bodies = module_collimators(system, simulation.construction)
     collimators = [
-        _collimator(f"collimator_{i + 1}", system, modules, poses, simulation)
+        _collimator(f"collimator_{i + 1}", modules, poses, bodies[modules[0]], simulation.collimator)
         for i, modules in enumerate(
             _classes(system.collimator_length, system.pinhole_diameter, system.detector_side, system.detector_thickness)
         )
@@ -327,7 +333,7 @@ def build_scene(system: PinholeSystem, simulation: Simulation) -> Scene:
         crystals.append(Crystals(part, modules))
     phantom, rods = _phantom(simulation)
     if phantom is not None:
-        _refuse_inside(system, simulation, phantom)
+        _refuse_inside(system, bodies, phantom)
     outer = [parts[0] for parts in collimators] + [c.part for c in crystals] + ([] if phantom is None else [phantom])
     reach = max([float(np.abs(simulation.place[:3, 3]).max()), *(np.abs(_corners(part)).max() for part in outer)])
     return Scene(simulation, collimators, crystals, phantom, rods, math.ceil(2 * (reach + _SPACE)))
@@ -349,40 +355,27 @@ def _classes(*lengths: NDArray[np.float64]) -> list[NDArray[np.intp]]:
 
 
 def _collimator(
-    name: str, system: PinholeSystem, modules: NDArray[np.intp], poses: NDArray[np.float64], simulation: Simulation
+    name: str, modules: NDArray[np.intp], poses: NDArray[np.float64], body: Collimator, material: str
 ) -> list[Part]:
-    """The solid and the three pieces of air in it, front to back, of one class."""
-    first = modules[0]
-    l, side = system.collimator_length[first], system.detector_side[first]
-    radius = system.pinhole_diameter[first] / 2
-    half, wall = simulation.plate_thickness / 2, simulation.wall_thickness
-    where = f"module {system.numbers[first]}"
-    if half >= l:
-        raise InputError(f"{where}: plate_thickness {2 * half:g} mm is too much for a collimator of {l:g} mm")
-    rim = radius + half * math.tan(math.radians(simulation.opening_degrees) / 2)
-    if rim >= radius + wall:
-        raise InputError(
-            f"{where}: the hole, {2 * rim:g} mm wide at the plate's surface, does not fit into its front of "
-            f"{2 * (radius + wall):g} mm; choose thicker walls, a thinner plate or a smaller opening_degrees"
-        )
-    middle = (l - half) / 2  # depth of the solid's centre
-    behind = radius + (side / 2 - radius) * half / l  # the pyramid's half-width at the plate's back
+    """The solid and the pieces of air in it, front to back, of one class."""
+    built, l, half_side = body.construction, body.length, body.detector_side / 2
+    middle = (l + built.front) / 2  # depth of the solid's centre
 
-    def air(kind: str, shape: str, size: tuple[float, ...], depth: float) -> Part:
-        return Part(f"{kind}_{name}", name, shape, size, "Air", np.array([[0.0, 0.0, middle - depth]]), np.eye(3)[None])
+    def air(kind: str, shape: str, behind: float, before: float, back: float, front: float) -> Part:
+        """Air of widths `behind` and `before` from the depth `back` to `front`."""
+        center = np.array([[0.0, 0.0, middle - (front + back) / 2]])
+        return Part(f"{kind}_{name}", name, shape, (behind, before, back - front), "Air", center, np.eye(3)[None])
 
+    outside = (half_side + built.wall_thickness, body.front_half_width, l - built.front)
+    profile = body.hole_profile
+    cones = [
+        air("front" if back <= 0 else "back", "cone", behind, before, back, front)
+        for (front, before), (back, behind) in pairwise(profile)
+    ]
     return [
-        Part(
-            name,
-            "world",
-            "trd",
-            (side / 2 + wall, radius + wall, l + half),
-            simulation.collimator,
-            *places(poses[modules], middle),
-        ),
-        air("front", "cone", (radius, rim, half), -half / 2),
-        air("back", "cone", (rim, radius, half), half / 2),
-        air("channel", "trd", (side / 2, behind, l - half), (l + half) / 2),
+        Part(name, "world", "trd", outside, material, *places(poses[modules], middle)),
+        *cones,
+        air("channel", "trd", half_side, body.channel_half_width, l, built.back),
     ]
 
 
@@ -406,13 +399,13 @@ def _phantom(simulation: Simulation) -> tuple[Part | None, list[Rods]]:
     return body, rods
 
 
-def _refuse_inside(system: PinholeSystem, simulation: Simulation, phantom: Part) -> None:
+def _refuse_inside(system: PinholeSystem, bodies: list[Collimator], phantom: Part) -> None:
     """Refuse a phantom that a collimator's front reaches into."""
     poses, (radius, height) = system.poses(), phantom.size
-    wide = system.pinhole_diameter / 2 + simulation.wall_thickness
-    corners = np.array([[x, y, simulation.plate_thickness / 2, 1] for x in (-1, 1) for y in (-1, 1)], float)
-    for m in range(len(system)):
-        front = (poses[m] @ (corners * [wide[m], wide[m], 1, 1]).T)[:3].T
+    corners = np.array([[x, y, -1, 1] for x in (-1, 1) for y in (-1, 1)], float)
+    for m, body in enumerate(bodies):
+        wide = body.front_half_width
+        front = (poses[m] @ (corners * [wide, wide, body.construction.front, 1]).T)[:3].T
         local = (front - phantom.centers[0]) @ phantom.rotations[0]
         if np.any((np.hypot(local[:, 0], local[:, 1]) <= radius) & (np.abs(local[:, 2]) <= height / 2)):
             raise InputError(f"module {system.numbers[m]}: its collimator begins inside the phantom; move one of them")

@@ -1,4 +1,4 @@
-"""A multi-pinhole SPECT scanner in GATE 10 (opengate 10.1); its numbers are in simulation.json beside this file.
+"""A multi-pinhole SPECT scanner in GATE 10 (opengate 10.1 or later); its numbers are in simulation.json beside this file.
 
     python simulation.py                  run it: singles.root, then images.npy
     python simulation.py --build-only     build it in Geant4, which checks for overlaps; needs no Geant4 data
@@ -45,8 +45,9 @@ def build(data: dict[str, Any], threads: int = 1) -> Any:
     for particle in ("gamma", "electron", "positron"):
         simulation.physics_manager.set_production_cut("world", particle, 0.1 * units.mm)
 
+    share = activity_for_each_thread(opengate, threads)
     for number, emitter in enumerate(data["emitters"]):
-        add_source(simulation, units, data, number, emitter)
+        add_source(simulation, units, data, number, emitter, share)
     for crystal in data["crystals"]:
         add_digitizer(simulation, units, data["detector"], crystal)
     statistics = simulation.add_actor("SimulationStatisticsActor", "statistics")
@@ -85,8 +86,39 @@ def add_volume(simulation: Any, units: Any, part: dict[str, Any]) -> None:
     volume.rotation = [np.array(rotation) for rotation in part["rotations"]]
 
 
-def add_source(simulation: Any, units: Any, data: dict[str, Any], number: int, emitter: dict[str, Any]) -> None:
-    """A point, or a rod of the phantom."""
+def activity_for_each_thread(opengate: Any, threads: int) -> float:
+    """The share of all activity that a source is to be given so that all threads together emit all of it.
+
+    In opengate 10.0 to 10.1.1 every thread emits what its source is given; later ones divide it among the threads. The
+    number of the version does not tell them apart, so a source is asked what it hands to a thread's.
+    """
+    if threads == 1:
+        return 1.0
+    trial = opengate.Simulation()
+    trial.number_of_threads = threads
+    source = trial.add_source("GenericSource", "trial")
+    source.particle, source.activity = "gamma", 1.0
+    given = {"activity": 1.0}  # what earlier ones than 10.1.1 hand over, whose sources are one with their thread's
+
+    class Listener:
+        def InitializeUserInfo(self, info: Any) -> None:
+            given["activity"] = float(info["activity"])
+
+    if hasattr(source, "initialize_g4_source"):
+        source.initialize_g4_source(Listener(), [[0, 1.0]])
+    for emitted in (1.0, 1.0 / threads):
+        if abs(given["activity"] - emitted) < 1e-9:
+            return 1.0 / (threads * emitted)
+    raise SystemExit(
+        f"opengate {opengate.__version__}: each of {threads} threads would emit {given['activity']:g} of the activity, "
+        f"expected all or 1/{threads} of it: run this with --threads 1, and copies of it with other seeds"
+    )
+
+
+def add_source(
+    simulation: Any, units: Any, data: dict[str, Any], number: int, emitter: dict[str, Any], share: float
+) -> None:
+    """A point, or a rod of the phantom; `share` is that of its activity that opengate is to be told."""
     source = simulation.add_source("GenericSource", f"source_{number}")
     source.attached_to = emitter["mother"]
     source.particle = "gamma"
@@ -94,7 +126,7 @@ def add_source(simulation: Any, units: Any, data: dict[str, Any], number: int, e
     source.energy.type = "spectrum_discrete"
     source.energy.spectrum_energies = (energies * units.keV).tolist()
     source.energy.spectrum_weights = (photons / photons.sum()).tolist()
-    source.activity = emitter["activity_Bq"] * photons.sum() * units.Bq
+    source.activity = emitter["activity_Bq"] * photons.sum() * share * units.Bq
     source.half_life = data["half_life_s"] * units.s
     source.direction.type = "iso"
     source.position.translation = [x * units.mm for x in emitter["center_mm"]]
@@ -139,6 +171,17 @@ def add_digitizer(simulation: Any, units: Any, detector: dict[str, Any], crystal
         actor.authorize_repeated_volumes = True
         actor.root_output.write_to_disk = actor is window
     window.output_filename = f"singles_{crystal}.root"
+
+
+def check_emitted(data: dict[str, Any], emitted: int) -> None:
+    """Stop with an error if not as many photons were emitted as the activity asks for, within 6 standard deviations."""
+    decay = np.log(2) / data["half_life_s"]
+    photons = sum(photons for _, photons in data["lines_keV_photons_per_decay"])
+    decays = sum(emitter["activity_Bq"] for emitter in data["emitters"]) * -np.expm1(-decay * data["time_s"]) / decay
+    if abs(emitted - photons * decays) > 6 * np.sqrt(photons * decays) + 1:
+        raise SystemExit(
+            f"{emitted} photons were emitted, expected {photons * decays:.0f}: do not use images.npy; run with --threads 1"
+        )
 
 
 def images(data: dict[str, Any], positions: NDArray[np.float64]) -> NDArray[np.uint32]:
@@ -186,6 +229,8 @@ def main() -> None:
             return
         simulation.run()
     np.save(FOLDER / "images.npy", images(data, read_positions(data)))
+    if not arguments.images_only:
+        check_emitted(data, int(simulation.get_actor("statistics").counts.events))
 
 
 if __name__ == "__main__":

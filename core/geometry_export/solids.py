@@ -13,6 +13,7 @@ from typing import Any, Literal
 
 import numpy as np
 
+from ..collimator import Construction, EdgePlace, angle_from_degrees
 from ..errors import InputError
 from ..module_parts import ModulePart, module_parts
 from ..system import PinholeSystem
@@ -26,10 +27,18 @@ _KINDS = {"collimators": ("collimator",), "crystals": ("crystal",), "all": ("col
 _MATERIALS = ("collimator", "crystal")
 
 
-def _chosen(system: PinholeSystem, part: Which, plate_thickness: float, wall_thickness: float) -> list[ModulePart]:
+def _chosen(
+    system: PinholeSystem,
+    part: Which,
+    plate_thickness: float,
+    wall_thickness: float,
+    opening_degrees: float,
+    edge_at: EdgePlace,
+) -> list[ModulePart]:
     if part not in _KINDS:
         raise InputError(f"part {part!r}: expected one of {', '.join(_KINDS)}")
-    return [p for p in module_parts(system, plate_thickness, wall_thickness) if p.kind in _KINDS[part]]
+    construction = Construction(plate_thickness, wall_thickness, angle_from_degrees(opening_degrees), edge_at)
+    return [p for p in module_parts(system, construction) if p.kind in _KINDS[part]]
 
 
 def write_stl(
@@ -39,6 +48,8 @@ def write_stl(
     part: Which = "all",
     plate_thickness: float = 2.0,
     wall_thickness: float = 2.0,
+    opening_degrees: float = 90.0,
+    edge_at: EdgePlace = "middle",
 ) -> None:
     """One binary STL file of all chosen parts.
 
@@ -48,8 +59,11 @@ def write_stl(
         ``"collimators"``, ``"crystals"`` or ``"all"``.
     plate_thickness, wall_thickness
         Of the aperture plates and of the collimators' walls, mm.
+    opening_degrees, edge_at
+        Full angle of the holes' double cone, and where in the plate its edge is: ``"middle"``, or the face in ``"front"``,
+        towards the ROI, or ``"back"``.
     """
-    path.write_bytes(_stl(_chosen(system, part, plate_thickness, wall_thickness)))
+    path.write_bytes(_stl(_chosen(system, part, plate_thickness, wall_thickness, opening_degrees, edge_at)))
 
 
 def write_stl_parts(
@@ -59,9 +73,11 @@ def write_stl_parts(
     part: Which = "all",
     plate_thickness: float = 2.0,
     wall_thickness: float = 2.0,
+    opening_degrees: float = 90.0,
+    edge_at: EdgePlace = "middle",
 ) -> None:
     """A binary STL file for each part, named as the part is; options as those of `write_stl`."""
-    for chosen in _chosen(system, part, plate_thickness, wall_thickness):
+    for chosen in _chosen(system, part, plate_thickness, wall_thickness, opening_degrees, edge_at):
         (path / f"{chosen.name}.stl").write_bytes(_stl([chosen]))
 
 
@@ -95,9 +111,11 @@ def write_3mf(
     part: Which = "all",
     plate_thickness: float = 2.0,
     wall_thickness: float = 2.0,
+    opening_degrees: float = 90.0,
+    edge_at: EdgePlace = "middle",
 ) -> None:
     """3MF (Core Specification 1.2) in millimetres, a named object for each part; options as those of `write_stl`."""
-    parts = _chosen(system, part, plate_thickness, wall_thickness)
+    parts = _chosen(system, part, plate_thickness, wall_thickness, opening_degrees, edge_at)
     first = 2  # the materials are resource 1
     lines = [
         '<?xml version="1.0" encoding="UTF-8"?>',
@@ -158,13 +176,15 @@ def write_glb(
     part: Which = "all",
     plate_thickness: float = 2.0,
     wall_thickness: float = 2.0,
+    opening_degrees: float = 90.0,
+    edge_at: EdgePlace = "middle",
 ) -> None:
     """Binary glTF 2.0, a named mesh for each part; options as those of `write_stl`.
 
     The meshes are in world mm. glTF's unit is the metre and its +y points up, so they hang on one node that scales by 0.001
     and turns +z to +y: programs that read glTF show the scanner in its true size.
     """
-    parts = _chosen(system, part, plate_thickness, wall_thickness)
+    parts = _chosen(system, part, plate_thickness, wall_thickness, opening_degrees, edge_at)
     accessors: list[dict[str, Any]] = []
     positions, indices = b"", b""
     for p in parts:

@@ -13,6 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from ..collimator import edge_slope
 from ..errors import InputError
 from .arrays import ArrayOrTensor, namespace
 
@@ -118,7 +119,7 @@ class KnifeEdge:
     Attributes
     ----------
     radius, mu, tangent : float
-        Of the hole, mm; attenuation coefficient, 1/mm; tan(alpha / 2).
+        Of the hole, mm; attenuation coefficient, 1/mm; tan(alpha / 2), `core.collimator.edge_slope`.
     """
 
     radius: float
@@ -224,7 +225,7 @@ def paix_diameter(diameter: Array, mu: float | None, opening_angle: float) -> Ar
     """
     if mu is None:
         return diameter
-    return np.sqrt(diameter * (diameter + 2 / mu * math.tan(opening_angle / 2)))
+    return np.sqrt(diameter * (diameter + 2 / mu * edge_slope(opening_angle)))
 
 
 def half_value_diameter(diameter: Array, mu: float | None, opening_angle: float) -> Array:
@@ -236,7 +237,7 @@ def half_value_diameter(diameter: Array, mu: float | None, opening_angle: float)
     """
     if mu is None:
         return diameter
-    return diameter + math.log(2) / mu * math.tan(opening_angle / 2)
+    return diameter + math.log(2) / mu * edge_slope(opening_angle)
 
 
 def within_cone(slope_u: ArrayOrTensor, slope_v: ArrayOrTensor, tangent: float) -> ArrayOrTensor:

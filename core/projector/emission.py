@@ -10,6 +10,7 @@ from typing import Any, Literal
 import numpy as np
 
 from ..checks import positive, real_array
+from ..collimator import OPENING_ANGLE, edge_slope
 from ..errors import InputError
 from ..grid import Grid
 from ..isotopes import Isotope, isotope
@@ -134,7 +135,7 @@ class Emission(Model):
     photons_per_decay: float = None  # type: ignore[assignment]  # always a number once made
     aperture_points: int = 1
     aperture_mu: float | str | None = None  # a number once made
-    opening_angle: float = math.pi / 2
+    opening_angle: float = OPENING_ANGLE
     crystal_mu: float | str | None = None  # likewise
     intrinsic_fwhm: float = 0.0
     within_crystal: bool = False
@@ -272,7 +273,7 @@ class Emission(Model):
 
     @property
     def _tangent(self) -> float:
-        return math.tan(self.opening_angle / 2)
+        return edge_slope(self.opening_angle)
 
     def beams(self, views: Views, m: int, grid: Grid) -> Iterator[Beam]:
         """Rays from the pinhole through the grid, weighted with counts per (decay / (s mm^3) mm)."""

@@ -24,6 +24,9 @@ def read(path: Path) -> Contents:
                 found = ", ".join(place) or "nothing"
                 raise InputError(f"expected the datasets array and affine; {name} not found (there are: {found})")
         require_voxels(array.shape, array.dtype)
+        length = _text(affine.attrs.get("unit"))
+        if length not in (None, "mm"):
+            raise InputError(f"its affine is in {length}: expected mm")
         quantity = _text(array.attrs.get("quantity", file.attrs.get("volume_quantity")))
         return Contents(array[()], np.asarray(affine[()]), quantity, _text(array.attrs.get("unit")))
 

@@ -6,6 +6,7 @@ Its description: https://itk.org/Wiki/ITK/MetaIO/Documentation
 
 from __future__ import annotations
 
+import warnings
 import zlib
 from pathlib import Path
 from typing import BinaryIO
@@ -13,7 +14,7 @@ from typing import BinaryIO
 import numpy as np
 from numpy.typing import NDArray
 
-from ..errors import InputError
+from ..errors import InputError, InputWarning
 from .contents import RAS_FROM_LPS, Contents, require_voxels
 
 _TYPES = {
@@ -30,6 +31,7 @@ _TYPES = {
     "MET_FLOAT": "f4",
     "MET_DOUBLE": "f8",
 }
+_MILLIMETRES = {"mm": 1.0, "cm": 10.0, "um": 0.001, "?": 1.0}
 _LONGEST_HEADER = 1 << 16
 
 
@@ -49,8 +51,9 @@ def read(path: Path) -> Contents:
         big = _true(header.get("BinaryDataByteOrderMSB", header.get("ElementByteOrderMSB", "False")))
         type_ = np.dtype((">" if big else "<") + _TYPES[kind])
         require_voxels(shape, type_)
+        _refuse_scaled(header)
         values = np.frombuffer(_data(header, file, path, type_.itemsize * int(np.prod(shape, dtype=object))), type_)
-    return Contents(values.reshape(shape, order="F"), _affine(header))
+    return Contents(values.reshape(shape, order="F"), _affine(header, path))
 
 
 def _header(file: BinaryIO) -> dict[str, str]:
@@ -100,13 +103,35 @@ def _unpacked(header: dict[str, str], file: BinaryIO, size: int, name: str) -> b
     return data
 
 
-def _affine(header: dict[str, str]) -> NDArray[np.float64]:
+def _affine(header: dict[str, str], path: Path) -> NDArray[np.float64]:
+    """Index to world mm; warns of what is not in the header."""
+    spacing, offset = ("ElementSpacing", "ElementSize"), ("Offset", "Position", "Origin")
+    turned = ("TransformMatrix", "Rotation", "Orientation")
+    said = "AnatomicalOrientation"  # ITK's programs write it beside the matrix, which is what counts
+    if not header.keys() & set(turned) and header.get(said, "RAI").upper() not in ("RAI", "???"):
+        raise InputError(f"{said} = {header[said]} without a TransformMatrix: expected the matrix, or RAI")
     affine = np.eye(4)
     # Row i of the matrix in the file is the direction of axis i.
-    directions = _numbers(header, ("TransformMatrix", "Rotation", "Orientation"), np.eye(3).ravel()).reshape(3, 3)
-    affine[:3, :3] = directions.T * _numbers(header, ("ElementSpacing", "ElementSize"), np.ones(3))
-    affine[:3, 3] = _numbers(header, ("Offset", "Position", "Origin"), np.zeros(3))
+    directions = _numbers(header, turned, np.eye(3).ravel()).reshape(3, 3)
+    affine[:3, :3] = directions.T * _numbers(header, spacing, np.ones(3))
+    affine[:3, 3] = _numbers(header, offset, np.zeros(3))
+    unit = header.get("DistanceUnits", "?")
+    if unit not in _MILLIMETRES:
+        raise InputError(f"DistanceUnits = {unit}: expected mm, cm or um")
+    affine[:3] *= _MILLIMETRES[unit]
+    assumed = ["voxels of 1 mm"] * (not header.keys() & set(spacing))
+    assumed += ["the first voxel's centre at (0, 0, 0)"] * (not header.keys() & set(offset))
+    if assumed:
+        text = f"{path}: it does not say how it lies; taken as: {'; '.join(assumed)}"
+        warnings.warn(text, InputWarning, stacklevel=4)
     return RAS_FROM_LPS @ affine
+
+
+def _refuse_scaled(header: dict[str, str]) -> None:
+    """Refuse voxels that stand for other values."""
+    for key, plain in (("ElementToIntensityFunctionSlope", 1.0), ("ElementToIntensityFunctionOffset", 0.0)):
+        if _numbers(header, (key,), np.array([plain]))[0] != plain:
+            raise InputError(f"{key} = {header[key]}: values that are to be scaled are not read")
 
 
 def _numbers(header: dict[str, str], keys: tuple[str, ...], default: NDArray[np.float64] | None) -> NDArray[np.float64]:

@@ -16,6 +16,9 @@ from .contents import Contents, first_line, require_voxels
 _MILLIMETRES = {"unknown": 1.0, "mm": 1.0, "meter": 1000.0, "micron": 0.001}
 
 
+_APART = 0.1  # voxels by which the two places that a file may say can differ: quaternions of float32 round
+
+
 def read(path: Path) -> Contents:
     """Read .nii, .nii.gz, or a pair .hdr and .img."""
     import nibabel
@@ -36,10 +39,19 @@ def read(path: Path) -> Contents:
     affine = np.array(image.affine, np.float64)
     if not isinstance(image, nibabel.Nifti1Pair):
         _warn(f"{path}: Analyze files do not say where the patient lies: taken as centred, x from right to left")
+        affine[:3] *= _analyze_unit(image.header)
         return Contents(_values(image), affine)
     header = image.header
     if header["qform_code"] == header["sform_code"] == 0:
         _warn(f"{path}: it does not say where the patient lies: taken as centred, x from right to left")
+    elif header["qform_code"] > 0 and header["sform_code"] > 0:
+        corners, between = (
+            np.array(list(np.ndindex(2, 2, 2))) * (np.array(image.shape) - 1),
+            affine - header.get_qform(),
+        )
+        apart = np.linalg.norm(corners @ between[:3, :3].T + between[:3, 3], axis=1).max() / min(header.get_zooms())
+        if apart > _APART:
+            _warn(f"{path}: its sform and qform lie up to {apart:.3g} voxels apart: taken by the sform")
     affine[:3] *= _MILLIMETRES[header.get_xyzt_units()[0]]
     named = header.get_intent()[2]
     quantity = named if named in UNITS else None
@@ -59,6 +71,15 @@ def write(volume: Volume, path: Path) -> None:
 
 def _values(image: Any) -> Any:
     return np.ascontiguousarray(image.get_fdata(dtype=np.float32, caching="unchanged"))
+
+
+def _analyze_unit(header: Any) -> float:
+    """mm of the unit of lengths in an Analyze header."""
+    unit = bytes(header["vox_units"].item()).decode("latin-1").strip("\0 ").lower()
+    units = {"": 1.0, "mm": 1.0, "cm": 10.0, "m": 1000.0, "um": 0.001}
+    if unit not in units:
+        raise InputError(f"vox_units {unit!r}: expected mm, cm, m or um")
+    return units[unit]
 
 
 def _unit(header: Any) -> str | None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import time
 import warnings
 
@@ -420,6 +421,58 @@ def test_files_with_shared_meshes_are_loaded(collection, tmp_path):
     bpy.ops.wm.save_as_mainfile(filepath=path)
     bpy.ops.wm.open_mainfile(filepath=path)
     assert_consistent(scanner.active_scanner(bpy.context.scene))
+
+
+def hole_radii(camera: bpy.types.Object) -> dict[float, float]:
+    """Radius of the hole by the depth of its corners."""
+    points = np.array([v.co for v in part(camera, "COLLIMATOR").data.vertices])
+    return {
+        float(z): float(np.hypot(*points[points[:, 2] == z, :2].T).min())
+        for z in np.unique(points[:, 2])
+        if z < camera.mphdrr_module.collimator_length
+    }
+
+
+def test_collimators_of_an_older_file_get_their_knife_edge(collection, tmp_path):
+    """Version 0.1.0 drew straight holes, and its scanners know no opening angle."""
+    expected = {}
+    for camera in scanner.modules(collection):
+        mesh, radius = part(camera, "COLLIMATOR").data, camera.mphdrr_module.pinhole_diameter / 2
+        expected[camera.mphdrr_module.number] = {-1.0: radius + 1, 0.0: radius, 1.0: radius + 1}
+        assert hole_radii(camera) == pytest.approx(expected[camera.mphdrr_module.number], rel=1e-6)
+        box = np.array(list(np.ndindex(2, 2, 2)), float)
+        mesh.clear_geometry()
+        mesh.from_pydata(box.tolist(), [], [[0, 1, 3, 2]])
+        mesh["mphdrr_solid"] = "(2.0, 60.0, 50.0, 2.0, 2.0)"
+    for name in ("opening_angle", "edge_at"):
+        collection.mphdrr_scanner.property_unset(name)
+    path = str(tmp_path / "old.blend")
+    bpy.ops.wm.save_as_mainfile(filepath=path)
+    bpy.ops.wm.open_mainfile(filepath=path)
+    loaded = scanner.active_scanner(bpy.context.scene)
+    assert_consistent(loaded)
+    for camera in scanner.modules(loaded):
+        assert hole_radii(camera) == pytest.approx(expected[camera.mphdrr_module.number], rel=1e-6)
+
+
+def test_opening_angle_and_place_of_the_edge_are_drawn_exported_and_checked(collection, tmp_path):
+    properties, camera = collection.mphdrr_scanner, scanner.modules(collection)[0]
+    radius = camera.mphdrr_module.pinhole_diameter / 2
+    properties.opening_angle, properties.edge_at = np.radians(20), "FRONT"
+    slope = np.tan(np.radians(10))
+    assert hole_radii(camera) == pytest.approx({0.0: radius, 2.0: radius + 2 * slope}, rel=1e-6)
+    bpy.ops.mphdrr.check_geometry()
+    assert "too thick for an opening angle of 20 degrees" in properties.findings
+    bpy.ops.mphdrr.export_for_program(format="gate10", filepath=str(tmp_path / "gate"))
+    volumes = json.loads((tmp_path / "gate/simulation.json").read_text())["volumes"]
+    (back,) = [v for v in volumes if v["name"] == "back_collimator_1"]
+    assert back["size_mm"] == pytest.approx([radius + 2 * slope, radius, 2.0], rel=1e-6)
+    bpy.ops.mphdrr.export_for_program(format="stl-parts", filepath=str(tmp_path / "stl"))
+    assert len(list((tmp_path / "stl").iterdir())) == 2 * properties.count
+    properties.opening_angle = 3.0  # with which the hole is wider than the crystal
+    assert "choose a thinner plate or a smaller angle" in camera.mphdrr_module.problem
+    properties.opening_angle = np.radians(90)
+    assert camera.mphdrr_module.problem == ""
 
 
 def test_one_module_follows_at_once_and_eighty_within_a_second(scene, dc_spect):

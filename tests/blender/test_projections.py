@@ -85,8 +85,9 @@ def test_physics_of_the_panel_is_that_of_core(scanned, scene, body):
 
     settings = scene.mphdrr_projections
     settings.model, settings.noise, settings.seed, settings.mu = "EMISSION", True, 5, bpy.data.objects["Body"]
+    shape = scene.mphdrr_geometry.scanner.mphdrr_scanner  # whose collimators are drawn so, too
     for name, value in PHYSICS.items():
-        setattr(settings, name, value)
+        setattr(shape if name == "opening_angle" else settings, name, value)
     assert bpy.ops.mphdrr.render_projections(width=24, height=20) == {"FINISHED"}
     run = read_run(storage.absolute(settings.run_file))
     volume = volumes.volume_from_object(bpy.data.objects["Derenzo"])
@@ -133,7 +134,7 @@ def test_photons_of_a_radiograph_and_the_inverse_square_sum(scanned, scene, body
 
 
 @pytest.mark.parametrize("model", ["TRANSMISSION", "EMISSION", "INVERSE_SQUARE"])
-def test_physics_panel_shows_settings_that_exist(scene, model):
+def test_physics_panel_shows_settings_that_exist(scanned, scene, model):
     from mphdrr.panels.projections import MPHDRR_PT_physics
 
     settings = scene.mphdrr_projections

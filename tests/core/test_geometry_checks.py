@@ -10,6 +10,7 @@ import pytest
 
 import mphdrr.core as mph
 from mphdrr.core.cli import main
+from mphdrr.core.collimator import Collimator, Construction
 from mphdrr.core.geometry_checks.blocking import cone_directions, meets
 from mphdrr.core.geometry_checks.coverage import unseen_share
 from mphdrr.core.geometry_checks.hulls import Hulls
@@ -42,20 +43,20 @@ def test_the_real_scanner_can_be_built(workbook):
 
 
 def test_thick_walls_of_the_real_scanner_overlap(workbook):
-    """Independent: with walls of 8 mm, 176 pairs of collimators have a common volume by manifold3d, with 5 mm none."""
+    """Independent: with walls of 8 mm, 188 pairs of collimators have a common volume by manifold3d, with 5 mm none."""
     system = mph.read_system(workbook)
     assert mph.check_geometry(system, wall_thickness=5.0).ok
     report = mph.check_geometry(system, wall_thickness=8.0)
-    assert len(report.overlaps) == len(report.findings) == 176
+    assert len(report.overlaps) == len(report.findings) == 188
     assert {o.first_part for o in report.overlaps} == {o.second_part for o in report.overlaps} == {"collimator"}
 
 
 @pytest.mark.parametrize("depth", [3e-6, 0.5, 1.75])
 def test_a_front_in_the_crystal_behind_is_as_deep_as_planted(rng, depth):
-    """Two modules on one axis: the first ends at b + l + Td, the second's front begins `depth` before."""
+    """Two modules on one axis: the first ends at b + l + Td, the second's front, 1 mm before its pinhole, `depth` before."""
     axis = rng.normal(size=3)
     axis /= np.linalg.norm(axis)
-    report = mph.check_geometry(system_of([200 * axis, (270 - depth) * axis], numbers=[7, 31]))
+    report = mph.check_geometry(system_of([200 * axis, (271 - depth) * axis], numbers=[7, 31]))
     (overlap,) = report.overlaps
     assert (overlap.first, overlap.first_part, overlap.second, overlap.second_part) == (7, "crystal", 31, "collimator")
     assert overlap.depth == pytest.approx(depth, abs=1e-9)
@@ -69,15 +70,16 @@ def test_a_front_in_the_crystal_behind_is_as_deep_as_planted(rng, depth):
 def test_touching_is_no_overlap(rng, gap):
     axis = rng.normal(size=3)
     axis /= np.linalg.norm(axis)
-    assert mph.check_geometry(system_of([200 * axis, (270 + gap) * axis])).overlaps == ()
+    assert mph.check_geometry(system_of([200 * axis, (271 + gap) * axis])).overlaps == ()
 
 
 @pytest.mark.parametrize("depth", [1e-5, 0.3])
 def test_side_walls_in_each_other_are_as_deep_as_planted(depth):
     """Two collimators mirrored in a plane that their side walls are parallel to, each depth/2 beyond it."""
     d, length, side, wall = 2.0, 60.0, 50.0, 2.0
-    angle = np.arctan((side - d) / 2 / length)
-    half_front = d / 2 + wall
+    front = Collimator(d, length, side, Construction(2.0, wall)).front_half_width
+    angle = np.arctan((side / 2 + wall - front) / (length + 1))  # from the plate's front, 1 mm before the pinhole
+    half_front = front + np.tan(angle)
     b = (half_front * np.cos(angle) - depth / 2) / np.sin(angle)
     centers = b * np.array([[np.cos(angle), s * np.sin(angle), 0] for s in (1, -1)])
     (overlap,) = mph.check_geometry(system_of(centers, d, length, side, radius=5.0), wall_thickness=wall).overlaps
@@ -154,7 +156,7 @@ def test_a_sliver_of_a_thousandth_is_found(rng):
         # The cone's half-angle is 30 degrees; at the depth of 60 mm its radius is 34.64 mm.
         offset = (34.64 + beyond) * np.array([np.cos(angle), np.sin(angle)])
         system = system_of([[200.0, 0, 0], [140, *offset]], 0.5, 5.0, [50.0, 2.0], 1.0, 100.0)
-        hulls = Hulls.of(module_parts(system, 0.5, 1.0))
+        hulls = Hulls.of(module_parts(system, Construction(0.5, 1.0)))
         directions = cone_directions(200_000, np.sqrt(0.75)) @ system.frames()[0]
         fine = np.zeros(200_000, dtype=bool)
         for p in (2, 3):
@@ -198,7 +200,9 @@ def test_pinholes_at_impossible_places():
     assert twice.near_pairs[0].distance == pytest.approx(1.5)
 
     deep = mph.check_geometry(system_of([[100.0, 0, 0], [0, 300, 0]], radius=[90.0, 120.0]))
-    assert [(i.module, i.roi_radius, i.depth) for i in deep.intrusions] == [(1, 120.0, pytest.approx(20.0))]
+    assert [(i.module, i.roi_radius, i.depth) for i in deep.intrusions] == [
+        (1, 120.0, pytest.approx(21.0))
+    ]  # the plate's front
 
 
 def test_open_and_inverted_surfaces_are_found(system):
@@ -233,8 +237,8 @@ def test_command_prints_findings_and_is_strict_on_demand(workbook, capsys):
     capsys.readouterr()
     assert main(["geometry", "check", str(workbook), "--wall", "8"]) == 0
     printed = capsys.readouterr().out
-    assert "modules 1 and 2: collimator and collimator overlap" in printed and "176 findings" in printed
+    assert "modules 1 and 2: collimator and collimator overlap" in printed and "188 findings" in printed
     assert main(["geometry", "check", str(workbook), "--wall", "8", "--json", "--strict"]) == 1
     out, err = capsys.readouterr()
-    assert len(json.loads(out)["geometry"]["overlaps"]) == len(json.loads(out)["findings"]) == 176
-    assert len(err.splitlines()) == 1 and "176 findings" in err
+    assert len(json.loads(out)["geometry"]["overlaps"]) == len(json.loads(out)["findings"]) == 188
+    assert len(err.splitlines()) == 1 and "188 findings" in err

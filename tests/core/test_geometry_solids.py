@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 import mphdrr.core as mph
+from mphdrr.core.collimator import Construction
 from mphdrr.core.geometry_export import write_geometry
 from mphdrr.core.module_parts import module_parts
 
@@ -76,9 +77,9 @@ FILES = [
 
 @pytest.mark.parametrize(("format", "name", "read"), FILES)
 def test_parts_come_back_whole_and_in_their_place(system, tmp_path, format, name, read):
-    write_geometry(system, tmp_path / name, format, plate_thickness=PLATE, wall_thickness=WALL)
+    write_geometry(system, tmp_path / name, format, plate_thickness=PLATE, wall_thickness=WALL, edge_at="back")
     meshes = read(tmp_path / name)
-    expected = {part.name: part for part in module_parts(system, PLATE, WALL)}
+    expected = {part.name: part for part in module_parts(system, Construction(PLATE, WALL, edge_at="back"))}
     assert set(meshes) == set(expected) and len(expected) == 24
     for key, mesh in meshes.items():
         original = trimesh.Trimesh(expected[key].vertices, expected[key].triangles, process=False)
@@ -86,14 +87,15 @@ def test_parts_come_back_whole_and_in_their_place(system, tmp_path, format, name
         assert mesh.volume == pytest.approx(original.volume, rel=1e-5) and mesh.volume > 0
         assert np.allclose(mesh.bounds, original.bounds, atol=MM)
 
-    # The fiducials: rims of the hole in front of and behind the plate, the middle of the crystal's face.
+    # The fiducials: the knife edge, here on the plate's back, the hole's rim on its front, the middle of the crystal's face.
     for m, number in enumerate(system.numbers):
         pinhole, k = system.centers[m], system.principal_rays[m]
         corners = np.unique(meshes[f"Module {number} collimator"].vertices.round(5), axis=0)
-        for depth in (0.0, PLATE):
+        for depth in (0.0, -PLATE):
             middle = pinhole - depth * k
-            rim = corners[np.abs(np.linalg.norm(corners - middle, axis=1) - system.pinhole_diameter[m] / 2) < MM]
-            assert len(rim) == 32
+            radius = system.pinhole_diameter[m] / 2 + abs(depth)  # of a cone of 90 degrees
+            rim = corners[np.abs(np.linalg.norm(corners - middle, axis=1) - radius) < MM]
+            assert len(rim) == 64
             assert np.allclose(rim.mean(axis=0), middle, atol=MM)
             assert np.allclose((rim - middle) @ k, 0, atol=MM)
         corners = np.unique(meshes[f"Module {number} crystal"].vertices.round(5), axis=0)

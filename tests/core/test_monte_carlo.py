@@ -8,6 +8,7 @@ import os
 import re
 import subprocess
 import sys
+import types
 import typing
 from collections import defaultdict
 from pathlib import Path
@@ -379,8 +380,10 @@ def test_options(scanner, tmp_path) -> None:
         ({"phantom": "jaszczak"}, "phantom 'jaszczak': expected point, derenzo"),
         ({"isotope": "Xx-1"}, "isotope 'Xx-1'"),
         ({"crystal": "BGO"}, "crystal 'BGO': expected one of NaI, CZT"),
-        ({"opening_degrees": 160}, "the hole, "),
-        ({"plate_thickness": 300, "wall_thickness": 400}, "plate_thickness 300 mm is too much"),
+        ({"opening_degrees": 180}, "opening_degrees: expected less than 180"),
+        ({"opening_degrees": 175, "plate_thickness": 3}, "its hole is 71.01 mm wide"),
+        ({"plate_thickness": 300}, "aperture plate: expected less than the collimator's"),
+        ({"edge_at": "top"}, "edge_at 'top': expected one of middle, front, back"),
         ({"time": 0}, "time: expected more than 0 s"),
         ({"seed": 1.5}, "seed: expected a whole number"),
         ({"phantom": "derenzo", "rods": (1, 2)}, "Derenzo rod diameters: expected one for each of 6 sectors"),
@@ -463,9 +466,9 @@ json.dump(described, open("described.json", "w"))
 """
 
 
-def run_gate10(folder: Path, *command: str) -> str:
+def run_gate10(folder: Path, *command: str, **variables: str) -> str:
     """What GATE 10 prints; it must not look for Geant4's data, which it would download."""
-    environment = {**os.environ, "GATEONRTD": "1"}
+    environment = {**os.environ, "GATEONRTD": "1", **variables}
     run = subprocess.run(
         [sys.executable, *command], cwd=folder, env=environment, capture_output=True, text=True, timeout=120
     )
@@ -538,7 +541,8 @@ def test_gate10_chain_and_source(system, tmp_path) -> None:
     # Geant4's own units: MeV and ns.
     lines = ISOTOPES["I-123"].lines
     activity, energies, half_life, mother = described["source"]
-    assert activity == pytest.approx(2e6 * sum(p for _, p in lines) * 1e-9)
+    # In opengate 10.1.1 each of the two threads emits what it is given.
+    assert activity == pytest.approx(2e6 / 2 * sum(p for _, p in lines) * 1e-9)
     np.testing.assert_allclose(energies, [e * 1e-3 for e, _ in lines])
     assert half_life == pytest.approx(ISOTOPES["I-123"].half_life * 1e9) and mother == "world"
     assert described["run"] == [5, 2, [[0, 30e9]]]
@@ -549,3 +553,93 @@ def test_gate10_chain_and_source(system, tmp_path) -> None:
     for crystal in data["crystals"]:
         names = [f"{crystal}_{k}" for k in ("hits", "singles", "energy", "place", "window")]
         assert [links[n] for n in names] == [(crystal, None), *((crystal, n) for n in names[:-1])]
+
+
+class TrialSource:
+    """Of an opengate that hands `handed(activity, threads)` to the source of each thread; None: it has no such call."""
+
+    def __init__(self, handed, threads: int) -> None:
+        self.handed, self.threads, self.activity = handed, threads, 0.0
+        if handed is not None:
+            self.initialize_g4_source = self._initialize
+
+    def _initialize(self, listener, intervals) -> None:
+        listener.InitializeUserInfo({"activity": self.handed(self.activity, self.threads)})
+
+
+@pytest.mark.parametrize(
+    ("handed", "share"),
+    [
+        (None, 0.25),  # 10.0 to 10.1.0
+        (lambda activity, threads: activity, 0.25),  # 10.1.1
+        (lambda activity, threads: activity / threads, 1.0),  # after it
+        (lambda activity, threads: activity / 2, None),
+    ],
+)
+def test_the_script_asks_opengate_who_divides_the_activity(system, tmp_path, handed, share) -> None:
+    script, _ = load_script(export(system, tmp_path / "out", "gate10"))
+
+    class Simulation:
+        number_of_threads = 1
+
+        def add_source(self, kind, name):
+            return TrialSource(handed, self.number_of_threads)
+
+    opengate = types.SimpleNamespace(Simulation=Simulation, __version__="11")
+    assert script.activity_for_each_thread(opengate, 1) == 1
+    if share is None:
+        with pytest.raises(SystemExit, match=r"each of 4 threads would emit 0\.5 of the activity"):
+            script.activity_for_each_thread(opengate, 4)
+    else:
+        assert script.activity_for_each_thread(opengate, 4) == share
+
+
+def test_the_script_refuses_a_run_that_emitted_something_else(system, tmp_path) -> None:
+    script, data = load_script(export(system, tmp_path / "out", "gate10", isotope="Tc-99m", activity=1, time=3600))
+    life = ISOTOPES["Tc-99m"].half_life / np.log(2)
+    photons = 1e6 * life * (1 - np.exp(-3600 / life)) * sum(p for _, p in ISOTOPES["Tc-99m"].lines)
+    for right in (0, 5, -5):
+        script.check_emitted(data, round(photons + right * np.sqrt(photons)))
+    for wrong in (photons / 2, photons * 8, photons + 10 * np.sqrt(photons)):
+        with pytest.raises(SystemExit, match="photons were emitted, expected"):
+            script.check_emitted(data, round(wrong))
+
+
+# Geant4's data sets are not needed where photons only fly: empty files in their place, and no physics but decays.
+_RUN = """
+import json, sys
+import opengate, uproot
+import simulation as script
+opengate.physics.PhysicsListBuilder.available_g4_physics_constructors.append("G4DecayPhysics")
+data = json.loads(open("simulation.json").read())
+made = script.build(data, int(sys.argv[1]))
+made.physics_manager.physics_list_name = "G4DecayPhysics"
+made.check_volumes_overlap = False
+made.progress_bar = False
+emitted = made.add_actor("PhaseSpaceActor", "emitted")
+emitted.attached_to, emitted.attributes, emitted.output_filename = "world", ["ThreadID", "EventID"], "emitted.root"
+emitted.steps_to_store = "first"
+made.run()
+counts = made.get_actor("statistics").counts
+script.check_emitted(data, int(counts.events))
+with uproot.open("emitted.root") as file:
+    threads = file["emitted"]["ThreadID"].array(library="np").tolist()
+json.dump([int(counts.events), threads], open("emitted.json", "w"))
+"""
+
+
+@needs_gate10
+@pytest.mark.parametrize("threads", [1, 2, 4])
+def test_gate10_emits_the_activity_whatever_the_number_of_threads(scanner, tmp_path, threads) -> None:
+    """Run by Geant4 itself; every thread emits its part, all together what was asked, within 5 standard deviations."""
+    asked = {"isotope": "Tc-99m", "activity": 2e-3, "time": 3, "seed": 11}
+    folder = export(scanner[:2], tmp_path / "out", "gate10", **asked)
+    (tmp_path / "ENSDFSTATE.dat").touch()
+    variables = dict.fromkeys(("G4ENSDFSTATEDATA", "G4LEVELGAMMADATA"), str(tmp_path))
+    run_gate10(folder, "-c", _RUN, str(threads), **variables)
+    events, threads_of_photons = json.loads((folder / "emitted.json").read_text())
+    expected = 2000 * 3 * sum(p for _, p in ISOTOPES["Tc-99m"].lines)
+    assert abs(events - expected) < 5 * np.sqrt(expected)
+    numbers, each = np.unique(threads_of_photons, return_counts=True)
+    assert len(numbers) == threads and each.sum() == events
+    assert np.all(np.abs(each - expected / threads) < 5 * np.sqrt(expected / threads))

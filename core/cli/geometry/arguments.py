@@ -30,11 +30,7 @@ def add_json(parser: argparse.ArgumentParser) -> None:
 def add_materials(parser: argparse.ArgumentParser) -> None:
     """What the modules are made of and what decays, for `sensitivity_settings` and `resolution_settings`."""
     group = parser.add_argument_group("materials; without an option the module is ideal")
-    group.add_argument(
-        "--aperture-mu", type=number_or_name, metavar="MATERIAL",
-        help=f"{', '.join(APERTURES)} at the isotope's photons, or the coefficient, 1/mm; without it, nothing penetrates",
-    )  # fmt: skip
-    group.add_argument("--opening-angle", type=float, default=90.0, metavar="DEG", help="full angle of the knife edge")
+    add_edge(group)
     group.add_argument(
         "--crystal-mu", type=number_or_name, metavar="MATERIAL",
         help=f"{', '.join(CRYSTALS)} at the isotope's photons, or the coefficient, 1/mm; without it, all photons count",
@@ -43,6 +39,21 @@ def add_materials(parser: argparse.ArgumentParser) -> None:
         "--intrinsic-fwhm", type=float, default=0.0, metavar="MM", help="resolution of the detector, mm on the crystal"
     )
     group.add_argument("--isotope", metavar="NAME", help=f"{', '.join(ISOTOPES)}; without it, one photon per decay")
+
+
+def add_edge(parser: argparse._ActionsContainer) -> None:
+    """What the hole's edge is made of, and its angle, for `edge_settings`; beside an option ``--isotope``."""
+    parser.add_argument(
+        "--aperture-mu", type=number_or_name, metavar="MATERIAL",
+        help=f"{', '.join(APERTURES)} at the isotope's photons, or the coefficient, 1/mm; without it, nothing penetrates",
+    )  # fmt: skip
+    parser.add_argument("--opening-angle", type=float, default=90.0, metavar="DEG", help="full angle of the knife edge")
+
+
+def edge_settings(arguments: argparse.Namespace, system: PinholeSystem) -> dict[str, Any]:
+    """The coefficient of the aperture and the angle of its knife edge, as keywords."""
+    aperture, _ = module_coefficients(arguments.aperture_mu, None, _lines(arguments), system, _angle(arguments))
+    return {"aperture_mu": aperture, "opening_angle": _angle(arguments)}
 
 
 def sensitivity_settings(arguments: argparse.Namespace, system: PinholeSystem) -> dict[str, Any]:
@@ -69,12 +80,17 @@ def _lines(arguments: argparse.Namespace) -> tuple[tuple[float, float], ...]:
 
 def _materials(arguments: argparse.Namespace, system: PinholeSystem) -> tuple[dict[str, Any], float | None]:
     """The keywords of the aperture's edge, and the crystal's coefficient."""
-    if not 0 < arguments.opening_angle < 180:
-        raise InputError(
-            f"--opening-angle {arguments.opening_angle:g}: expected degrees, more than 0 and less than 180"
-        )
-    angle = math.radians(arguments.opening_angle)
+    angle = _angle(arguments)
     aperture, crystal = module_coefficients(
         arguments.aperture_mu, arguments.crystal_mu, _lines(arguments), system, angle
     )
     return {"aperture_mu": aperture, "opening_angle": angle}, crystal
+
+
+def _angle(arguments: argparse.Namespace) -> float:
+    """The knife edge's, rad."""
+    if not 0 < arguments.opening_angle < 180:
+        raise InputError(
+            f"--opening-angle {arguments.opening_angle:g}: expected degrees, more than 0 and less than 180"
+        )
+    return math.radians(arguments.opening_angle)

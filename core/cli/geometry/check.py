@@ -5,16 +5,19 @@ from __future__ import annotations
 import argparse
 import json
 import sys
+from typing import get_args
 
 import numpy as np
 
+from ...collimator import EdgePlace
 from ...errors import InputError
 from ...geometry_checks import check_geometry
+from ...isotopes import ISOTOPES
 from ...recording import recorded_warnings
 from ...system import PinholeSystem
 from ...workbook import read_system
-from ..options import add_command
-from .arguments import add_workbook
+from ..options import add_command, refuse
+from .arguments import add_edge, add_workbook, edge_settings
 
 
 def add_parser(actions) -> None:  # type: ignore[no-untyped-def]
@@ -22,21 +25,37 @@ def add_parser(actions) -> None:  # type: ignore[no-untyped-def]
     parser = add_command(
         actions,
         "check",
-        "compare the workbook with the design formulas, and look for modules that overlap, see too little of the ROI or "
-        "block each other",
+        "compare the workbook with the design formulas, and look for modules that overlap, see too little of the ROI, "
+        "block each other or have unfit plates",
         "mphdrr geometry check scanner.xlsx --wall 3 --strict",
     )
     add_workbook(parser)
     parser.add_argument("--plate", type=float, default=2.0, metavar="MM", help="thickness of the aperture plates")
     parser.add_argument("--wall", type=float, default=2.0, metavar="MM", help="thickness of the collimators' walls")
+    parser.add_argument(
+        "--edge-at", choices=get_args(EdgePlace), default="middle",
+        help="where in the plate the knife edge is; front is the face towards the ROI",
+    )  # fmt: skip
+    add_edge(parser)
+    parser.add_argument(
+        "--isotope", metavar="NAME", help=f"{', '.join(ISOTOPES)}: whose photons the plates of a material must stop"
+    )
     parser.add_argument("--strict", action="store_true", help="exit with status 1 if there is any warning or finding")
     parser.set_defaults(run=_run)
 
 
 def _run(arguments: argparse.Namespace) -> None:
+    if arguments.aperture_mu is None:
+        refuse(arguments, ("isotope",), "needs --aperture-mu")
     with recorded_warnings() as messages:
         system = read_system(arguments.file)
-    report = check_geometry(system, plate_thickness=arguments.plate, wall_thickness=arguments.wall)
+    report = check_geometry(
+        system,
+        plate_thickness=arguments.plate,
+        wall_thickness=arguments.wall,
+        edge_at=arguments.edge_at,
+        **edge_settings(arguments, system),
+    )
     findings = report.messages()
     total = f"{_count(messages, 'warning')} of the workbook, {_count(findings, 'finding')} in the geometry"
     if arguments.json:

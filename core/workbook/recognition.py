@@ -148,6 +148,11 @@ class SheetSeen:
         rows = set(self.rows)
         return {column for row, column in self.sheet.cells if row in rows and _is_number(self.sheet, row, column)}
 
+    @property
+    def label_headings(self) -> dict[str, At]:
+        """The headings of other names of the modules."""
+        return {plain(text).casefold(): at for at, text in self.above.items() if is_label_heading(text)}
+
     def unknown(self) -> list[tuple[At, str]]:
         """The headings over numbers that are none of a known column's."""
         known = {column for column in (self.label_column,) if column is not None}
@@ -460,34 +465,32 @@ def _rows_of(name: str, layout: Layout, seen: SheetSeen, coordinates: SheetSeen,
 
 
 def _joined(modules: Table, table: Table, coordinates: SheetSeen, seen: SheetSeen) -> tuple[int, ...]:
+    """The row of each module in another sheet: by their numbers where both have them, else in order."""
+    file, own, other = modules.sheet.book.path.name, coordinates.label_headings, seen.label_headings
     if modules.labels is not None and table.labels is not None:
         rows = by_label(modules, table)
     else:
         rows = in_order(modules, table)
         if table.numbers is not None and list(table.numbers) != sorted(table.numbers):
             raise InputError(
-                f"{modules.sheet.book.path.name}: the modules of sheet {table.sheet.name} have numbers in no order, those "
-                f"of sheet {modules.sheet.name} none, expected numbers in both; {HELP}"
+                f"{file}: the modules of sheet {table.sheet.name} have numbers in no order, those of sheet "
+                f"{modules.sheet.name} none, expected numbers in both; {HELP}"
             )
-    names = [
-        {plain(s.above[at]).casefold(): at for at in s.above if is_label_heading(s.above[at])}
-        for s in (coordinates, seen)
-    ]
-    for heading, (_, column) in names[1].items():
-        if heading in names[0]:
-            own = names[0][heading][1]
-            for a, b in zip(modules.rows, rows, strict=True):
-                one, other = modules.sheet.value(a, own), table.sheet.value(b, column)
-                if one != other:
-                    raise InputError(
-                        f"{modules.sheet.book.path.name}: {modules.sheet.place(a, own)} is {one!r} but "
-                        f"{table.sheet.place(b, column)}, in the row that belongs to it, {other!r}; {HELP}"
-                    )
-        elif table.labels is None or modules.labels is None:
-            raise InputError(
-                f"{modules.sheet.book.path.name}: the rows of {table.sheet.place(*names[1][heading])} and of sheet "
-                f"{modules.sheet.name} have no number in common, expected a column of numbers in both; {HELP}"
-            )
+        for heading, at in other.items():
+            if heading not in own:
+                raise InputError(
+                    f"{file}: {table.sheet.place(*at)} heads names of modules that sheet {modules.sheet.name} has not, "
+                    f"expected a column in both that says which rows belong together; {HELP}"
+                )
+    for heading in own.keys() & other.keys():
+        for row, its in zip(modules.rows, rows, strict=True):
+            here, there = (row, own[heading][1]), (its, other[heading][1])
+            one, another = modules.sheet.value(*here), table.sheet.value(*there)
+            if one != another:
+                raise InputError(
+                    f"{file}: {modules.sheet.place(*here)} is {one!r} but {table.sheet.place(*there)}, in the row that "
+                    f"belongs to it, is {another!r}, expected the same; {HELP}"
+                )
     return rows
 
 

@@ -98,12 +98,10 @@ class WorkbookXml:
         if not self._styles:
             return []
         parts = self._parts_of(self._styles[0])
-        own = {e.attributes.get("numFmtId"): e.attributes.get("formatCode", "") for e in parts if e.name == "numFmt"}
-        ids = [
-            e.attributes.get("numFmtId", "0")
-            for e in parts
-            if e.name == "xf" and e.parent is not None and e.parent.name == "cellXfs"
-        ]
+        named = [e.attributes for e in parts if e.name == "numFmt"]
+        own = {attributes.get("numFmtId"): attributes.get("formatCode", "") for attributes in named}
+        styles = [e for e in parts if e.name == "xf" and e.parent is not None and e.parent.name == "cellXfs"]
+        ids = [e.attributes.get("numFmtId", "0") for e in styles]
         return [own[i] if i in own else BUILTIN_FORMATS.get(int(i), "") for i in ids]
 
     def number_format(self, cell: Cell) -> str:

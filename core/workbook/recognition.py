@@ -43,6 +43,7 @@ HELP = "a column map can say what is meant (--columns, docs/workbook.md)"
 
 _ROWS_APART = 2
 """A symbol row and a description row that are further apart do not belong together."""
+_SUMMARY = re.compile(r"\b(SUM|AVERAGE|MEAN|MEDIAN|MIN|MAX|COUNT|COUNTA|STDEV|VAR|SUBTOTAL|AGGREGATE)[.SP]*\(", re.I)
 _LITERAL = re.compile(r'"([^"]*)"|\\(.)|\[\$([^\]-]*)[^\]]*\]')
 _SCALED = re.compile(r"[0#?],+(?![0#?,])|%")
 
@@ -106,7 +107,7 @@ class SheetSeen:
             place = self.sheet.place(row, c)
             if heading is None and unit not in QUANTITIES[first.quantity].units:
                 self.doubt(
-                    f"{place} holds {_quoted(text)} in the heading of {first.quantity}, expected nothing but that"
+                    f"{place} holds {_quoted(text)} in the heading of {first.quantity}, expected its name and a unit alone"
                 )
                 continue
             if heading is not None and heading.quantity != first.quantity:
@@ -206,7 +207,7 @@ class SheetSeen:
             values = [(column, self.sheet.value(row, column)) for column in self.wanted]
             texts = [value for _, value in values if type(value) is str]
             filled = [column for column, value in values if value is not None]
-            if not filled or _is_summary(self.sheet, row, filled):
+            if not filled or _is_summary(self.sheet, row, self.wanted):
                 continue
             note = len(filled) == len(texts) == 1 and not re.fullmatch(r"[\d.,eE+\-\s]+", texts[0])
             if not note:
@@ -223,11 +224,7 @@ class SheetSeen:
             row
             for row in self.sheet.rows
             if row in sized
-            or (
-                row >= self.first_row
-                and module_number(self.sheet.value(row, self.label_column)) is not None
-                and not _is_summary(self.sheet, row, self.wanted)
-            )
+            or (row >= self.first_row and module_number(self.sheet.value(row, self.label_column)) is not None)
         )
 
     def table(self) -> Table:
@@ -390,7 +387,7 @@ def recognize(book: Book) -> Recognized:
     """What is seen of the scanner in a workbook, with the doubts."""
     seen = sheets_seen(book)
     taken: dict[str, SheetSeen] = {}
-    doubts = []
+    doubts, missing = [], []
     for name in (*NEEDED, "l"):
         having = [s for s in seen if name in s.columns]
         filled = [s for s in having if s.columns[name][0] in s.numeric]
@@ -402,7 +399,7 @@ def recognize(book: Book) -> Recognized:
         if having:
             taken[name] = (filled or having)[0]
         elif name != "l":
-            doubts.append(_missing(book, name))
+            missing.append(_missing(book, name))
     if (coordinates := taken.get("x1")) is not None:
         taken.update({name: coordinates for name in DERIVED if name in coordinates.columns})
         for name in POSITION:
@@ -414,7 +411,7 @@ def recognize(book: Book) -> Recognized:
     for sheet in dict.fromkeys(taken.values()):
         sheet.look_around({*NEEDED, "l", *(name for name, of in taken.items() if of is sheet)})
         doubts += sheet.doubts
-    return Recognized(book, taken, doubts)
+    return Recognized(book, taken, doubts + missing)
 
 
 def _missing(book: Book, name: str) -> str:
@@ -513,11 +510,17 @@ def _is_number(sheet: Sheet, row: int, column: int) -> bool:
 
 
 def _is_summary(sheet: Sheet, row: int, columns: list[int]) -> bool:
-    """Whether a row sums up others, as AVERAGE(B3:B82) below a column: one of `columns` refers to several rows of itself."""
+    """Whether a row sums up others: each number in `columns` is a sum, mean ... over several rows of its column."""
+    filled = [column for column in columns if sheet.value(row, column) is not None]
+    return bool(filled) and all(_sums_up(sheet, sheet.formula(row, column), column) for column in filled)
+
+
+def _sums_up(sheet: Sheet, formula: str | None, column: int) -> bool:
+    if formula is None or not _SUMMARY.search(formula):
+        return False
     return any(
         area.top < area.bottom and area.left <= column <= area.right and area.sheet in (None, sheet.name)
-        for column in columns
-        for area in areas_in(sheet.formula(row, column) or "=")
+        for area in areas_in(formula)
     )
 
 

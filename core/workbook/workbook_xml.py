@@ -75,7 +75,7 @@ class WorkbookXml:
                 self.parts[title] = member
                 self.sheets[title] = SheetXml(self.package.read(member), texts, title, name)
         self._by_folded_name = {title.casefold(): title for title in self.sheets}
-        self._extents: dict[str, tuple[int, int]] = {}
+        self._extents: dict[tuple[str, int], tuple[int, int]] = {}
 
     @property
     def suffix(self) -> str | None:
@@ -198,9 +198,10 @@ class WorkbookXml:
 
     def extent(self, sheet: str) -> tuple[int, int]:
         """The last row and the last column of `sheet` with content."""
-        if sheet not in self._extents:
-            self._extents[sheet] = self.sheets[sheet].extent
-        return self._extents[sheet]
+        key = sheet, len(self.sheets[sheet].cells)  # which grows where rows are added; emptied cells do no harm
+        if key not in self._extents:
+            self._extents[key] = self.sheets[sheet].extent
+        return self._extents[key]
 
     @staticmethod
     def text(place: Place) -> str:

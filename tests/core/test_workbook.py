@@ -228,9 +228,9 @@ def _moved_down(main: Worksheet, coordinates: Worksheet) -> None:
     _typed(main, coordinates)
     coordinates.insert_rows(1, 14)
     coordinates["A1"] = "Geometry of the scanner: all about each collimator, its length and the detector behind it"
-    coordinates["B3"] = "length of collimator: see below"
+    coordinates["B3"] = "for the review of 2024"
     main.insert_rows(1, 6)
-    main["A1"] = "R"
+    main["A1"] = "Scanner A"
 
 
 def _no_symbols(main: Worksheet, coordinates: Worksheet) -> None:
@@ -246,9 +246,9 @@ def _no_descriptions(main: Worksheet, coordinates: Worksheet) -> None:
 
 
 def _odd_spelling(main: Worksheet, coordinates: Worksheet) -> None:
-    coordinates["B1"], coordinates["C1"], coordinates["D1"] = " X1 ", "y 1", "z₁ (mm)"
+    coordinates["B1"], coordinates["C1"], coordinates["D1"] = " X1 ", "Y1 [mm]", "z₁ (mm)"
     coordinates["B2"] = "X  Coordinate value\nat CENTRE of hole"
-    coordinates["H1"] = "'l + b+Td'"
+    coordinates["H1"] = "l+b + Td"
     main["D1"], main["B2"] = "LD [mm]", "Pinhole diameter (mm)"
 
 
@@ -302,7 +302,6 @@ def _hidden_column_and_format(main: Worksheet, coordinates: Worksheet) -> None:
 def _blank_rows_and_notes(main: Worksheet, coordinates: Worksheet) -> None:
     _typed(main, coordinates)
     coordinates.insert_rows(5, 3)
-    coordinates["A6"] = "upper rings"
     last = coordinates.max_row
     coordinates.cell(last + 2, 1, "Note: measured in 2021")
     coordinates.cell(last + 3, 2, "centres of the holes, not of the plates")
@@ -344,8 +343,8 @@ def _sums_below(main: Worksheet, coordinates: Worksheet) -> None:
 
 
 def _units_without_brackets(main: Worksheet, coordinates: Worksheet) -> None:
-    coordinates["B1"], coordinates["C1"], coordinates["D1"] = "x1, mm", "y1_mm", "z1 in millimetres"
-    main["B1"], main["C1"], main["D1"] = "d/mm", "R mm", "Ld [mm]"
+    coordinates["B1"], coordinates["C1"], coordinates["D1"] = "x1, mm", "y1 / mm", "z1 in millimetres"
+    main["B1"], main["C1"], main["D1"] = "d/mm", "R (in mm)", "Ld [mm]"
 
 
 VARIATIONS = [
@@ -626,9 +625,8 @@ def test_formulas_beyond_arithmetic_are_not_computed(formula):
         ("3D slope", None),
         ("S", None),
         ("l+b+Td", "H"),
-        ("y-position of pinhole", "y1"),
+        ("y position of pinhole", "y1"),
         ("z coordinate value at end of detector", "z2"),
-        ("Module", "number"),
         ("comment", None),
         ("Module length", None),
     ],
@@ -690,7 +688,7 @@ BAD_CELLS = {
     "blank": (_set("Coordinates", "C5", None), "Coordinates!C5 is blank, expected y1 of module 3"),
     "blank dimension": (_set("Main", "D4", None), "Main!D4 is blank, expected Ld of module 2"),
     "boolean": (_set("Main", "B3", True), "Main!B3 is TRUE, expected d"),
-    "date": (_set("Coordinates", "B3", datetime.date(2021, 3, 4)), "Coordinates!B3 is the date or time 2021-03-04"),
+    "date": (_set("Coordinates", "B3", datetime.date(2021, 3, 4)), "Coordinates!B3 is formatted as a date or time (yyyy-mm-dd)"),
     "error": (_set("Coordinates", "B3", "#REF!"), "Coordinates!B3 shows the error #REF!, expected x1"),
     "error in l": (_set("Coordinates", "G4", "#REF!"), "Coordinates!G4 shows the error #REF!, expected l"),
     "error in a check": (_set("Coordinates", "E4", "#NAME?"), "Coordinates!E4 shows the error #NAME?, expected b"),
@@ -739,21 +737,17 @@ BAD_CELLS = {
         "Coordinates!A5 holds the text 'left', expected a module's number",
     ),
     "number is a fraction": (_set("Coordinates", "A5", 2.5), "Coordinates!A5 is 2.5, expected a module's number"),
-    "number without module": (_set("Coordinates", "A7", 5), "Coordinates!B7 is blank, expected x1 of module 5"),
+    "number without module": (_set("Coordinates", "A7", 5), "Coordinates!A7 is module 5, expected a row of it in sheet Main too"),
     "sum below the table": (_sum_below, "Coordinates!A7 holds the text 'mean', expected a module's number"),
     "dimensions of a module missing": (
         _row_missing,
-        "Coordinates!A5 is module 3, expected a row with its d in sheet Main",
+        "Coordinates!A5 is module 3, expected a row of it in sheet Main too, with its d",
     ),
     "too few rows": (_row_missing_without_numbers, "sheet Main has 3 rows of d (Main!A3 to Main!A5), expected one or"),
-    "centimetres": (_set("Coordinates", "B1", "x1 (cm)"), "Coordinates!B1 heads x1 in cm, expected millimetres"),
-    "centimetres, last": (_set("Coordinates", "C1", "y1, cm"), "Coordinates!C1 heads y1 in cm, expected millimetres"),
-    "inches": (_set("Main", "B2", "diameter of pinhole (all in inches)"), "Main!B2 heads d in inches, expected milli"),
-    "metres": (_set("Main", "D2", "side in m of the crystal"), "Main!D2 heads Ld in m, expected millimetres"),
     "two columns of one name": (_second_x1, "Coordinates!B1 and Coordinates!R1 are both headed as x1"),
     "headings at odds": (_set("Coordinates", "B1", "y2"), "Coordinates!B2 is headed as x1 but Coordinates!B1 as y2"),
-    "two tables": (_copied_table, "sheets A and B both have columns headed x1, y1, z1"),
-    "no modules": (_no_rows, "Coordinates!B3 and the rows below hold no modules"),
+    "two tables": (_copied_table, "A!B1 and B!B1, of two sheets, are both headed as x1"),
+    "no modules": (_no_rows, "sheet Coordinates has no modules, expected rows with x1, y1, z1"),
 }
 
 
@@ -777,8 +771,8 @@ def test_without_coordinates_the_sheets_and_headings_are_named(tmp_path):
     with pytest.raises(InputError) as refusal:
         read_system(saved(book, tmp_path))
     assert str(refusal.value) == (
-        "scanner.xlsx: no sheet has a table of pinholes, expected columns headed x1, y1, z1 or "
-        "'x coordinate value at center of hole', ...; its sheets are Values, Notes"
+        "scanner.xlsx: no sheet has a column headed x1 or 'x coordinate value at center of hole'; its sheets are "
+        "Values, Notes; a column map can say what is meant (--columns, docs/workbook.md)"
     )
 
 
@@ -786,7 +780,7 @@ def test_missing_heading_is_named(tmp_path):
     def edit(main, coordinates):
         coordinates["C1"] = coordinates["C2"] = None
 
-    with pytest.raises(InputError, match="sheet Coordinates has no column headed y1 or 'y coordinate value"):
+    with pytest.raises(InputError, match="no sheet has a column headed y1 or 'y coordinate value"):
         read_edited(tmp_path, edit)
     with pytest.raises(InputError, match="no sheet has a column headed Ld or 'length of side of detector crystal'"):
         read_edited(tmp_path, lambda main, coordinates: main.delete_cols(4))
@@ -818,13 +812,13 @@ BAD_FILES: dict[str, tuple[Callable[[Path, bytes], object], str]] = {
         lambda path, real: path.write_bytes(OLE + bytes(600) + "EncryptedPackage".encode("utf-16-le")),
         "protected by a password",
     ),
-    "another zip": (lambda path, real: _zip_of(path, {"a.txt": b"hello"}), "not an .xlsx workbook"),
+    "another zip": (lambda path, real: _zip_of(path, {"a.txt": b"hello"}), "not a whole .xlsx workbook"),
     "OpenDocument": (lambda path, real: _zip_of(path, {"mimetype": b"", "content.xml": b""}), "an OpenDocument file"),
     "binary workbook": (lambda path, real: _zip_of(path, {"xl/workbook.bin": b""}), "a binary .xlsb workbook"),
-    "broken XML": (lambda path, real: _damaged_sheet(path, real, lambda xml: xml[:9000]), "cannot be read"),
+    "broken XML": (lambda path, real: _damaged_sheet(path, real, lambda xml: xml[:9000]), "sheet Coordinates: not readable XML"),
     "not a number": (
         lambda path, real: _damaged_sheet(path, real, lambda xml: xml.replace(b"<v>277.002</v>", b"<v>NaN</v>")),
-        "sheet Coordinates cannot be read",
+        "Coordinates!B3 is nan, expected x1 of module 1, a number",
     ),
     "infinite": (
         lambda path, real: _damaged_sheet(path, real, lambda xml: xml.replace(b"<v>277.002</v>", b"<v>1e999</v>")),
@@ -868,7 +862,7 @@ def test_too_many_rows_are_refused(tmp_path, monkeypatch):
 
 
 def test_too_many_modules_are_refused(tmp_path, monkeypatch):
-    monkeypatch.setattr("mphdrr.core.workbook.rows.MAX_MODULES", 3)
+    monkeypatch.setattr("mphdrr.core.workbook.layout.MAX_MODULES", 3)
     with pytest.raises(InputError, match="sheet Coordinates has 4 modules, expected at most 3"):
         read_edited(tmp_path, lambda main, coordinates: None)
 

@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from functools import cached_property
 from typing import Any
 
 from ..errors import InputError
-from .formulas import NotComputable, tokens_of
+from .formulas import CellError, NotComputable, Surroundings, calculate, tokens_of
 from .package import Package
 from .references import Reference, reference
-from .sheet_xml import MAIN, Cell, SheetXml, Unreadable, shared_strings
+from .sheet_xml import MAIN, STRICT, At, Cell, SheetXml, Unreadable, shared_strings
 from .tables import DataTable, data_table, named_part
 from .xml_parts import Element, elements, spliced, utf8, with_attribute
 
@@ -26,6 +27,30 @@ Place = tuple[str, int, int]
 """Sheet, row, column."""
 
 
+class _Sheets(Mapping[str, SheetXml]):
+    """Sheets by name, each parsed when it is first asked for: users' workbooks carry large ones that nobody asks for."""
+
+    def __init__(self, titles: Iterable[str], parsed: Callable[[str], SheetXml]) -> None:
+        self._titles, self._parsed = dict.fromkeys(titles), parsed
+        self._sheets: dict[str, SheetXml] = {}
+
+    def __getitem__(self, title: str) -> SheetXml:
+        if title not in self._sheets:
+            if title not in self._titles:
+                raise KeyError(title)
+            self._sheets[title] = self._parsed(title)
+        return self._sheets[title]
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._titles)
+
+    def __len__(self) -> int:
+        return len(self._titles)
+
+    def __contains__(self, title: object) -> bool:
+        return title in self._titles
+
+
 class WorkbookXml:
     """The worksheets of a workbook file.
 
@@ -38,7 +63,7 @@ class WorkbookXml:
 
     Attributes
     ----------
-    sheets : dict
+    sheets : mapping
         Name -> `SheetXml`, in the workbook's order; charts' sheets are left out.
     """
 
@@ -50,14 +75,17 @@ class WorkbookXml:
             raise InputError(f"{name}: not a whole .xlsx workbook (it does not say where its sheets are)")
         self._part = found[0]
         self._data, self._back = utf8(self.package.read(self._part), name)
-        self._elements = [e for e in elements(self._data, name) if e.namespace == MAIN]
+        found_elements = elements(self._data, name)
+        if found_elements[0].namespace == STRICT:
+            raise InputError(f"{name}: a 'Strict Open XML Spreadsheet', expected it saved as 'Excel Workbook (*.xlsx)'")
+        self._elements = [e for e in found_elements if e.namespace == MAIN]
         relations = self.package.relations(self._part)
         members = {key: (kind, member) for key, kind, member in relations}
         strings = [member for _, kind, member in relations if kind == "sharedStrings"]
         self._calc_chain = [member for _, kind, member in relations if kind == "calcChain"]
         texts = shared_strings(self.package.read(strings[0]), name) if strings else []
+        self._styles = [member for _, kind, member in relations if kind == "styles"]
         self.all_sheets: list[str] = []
-        self.sheets: dict[str, SheetXml] = {}
         self.parts: dict[str, str] = {}
         for e in self._elements:
             if e.name != "sheet":
@@ -68,15 +96,55 @@ class WorkbookXml:
             kind, member = members.get(key, ("", ""))
             if kind == "worksheet":
                 self.parts[title] = member
-                self.sheets[title] = SheetXml(self.package.read(member), texts, title, name)
+        self.sheets = _Sheets(self.parts, lambda t: SheetXml(self.package.read(self.parts[t]), texts, t, name))
         self._by_folded_name = {title.casefold(): title for title in self.sheets}
-        self._extents: dict[str, tuple[int, int]] = {}
+        self._extents: dict[tuple[str, int], tuple[int, int]] = {}
 
     @property
     def suffix(self) -> str | None:
         """ ".xlsx" or ".xlsm" by what is inside, None for anything else."""
         kind = self.package.content_type(self._part)
         return next((suffix for suffix, content_type in KINDS.items() if kind == content_type), None)
+
+    @property
+    def asks_for_calculation(self) -> bool:
+        """Whether the formulas' stored values are, by what the file says, not to be relied on."""
+        settings = [e.attributes for e in self._elements if e.name == "calcPr"]
+        asked = any(a.get(name) in ("1", "true") for a in settings for name in ("fullCalcOnLoad", "forceFullCalc"))
+        return asked or any(a.get("calcCompleted") in ("0", "false") for a in settings)
+
+    @cached_property
+    def _number_formats(self) -> list[str]:
+        """The number format of each style of cells."""
+        from openpyxl.styles.numbers import BUILTIN_FORMATS
+
+        if not self._styles:
+            return []
+        parts = self._parts_of(self._styles[0])
+        named = [e.attributes for e in parts if e.name == "numFmt"]
+        own = {attributes.get("numFmtId"): attributes.get("formatCode", "") for attributes in named}
+        styles = [e for e in parts if e.name == "xf" and e.parent is not None and e.parent.name == "cellXfs"]
+        ids = [e.attributes.get("numFmtId", "0") for e in styles]
+        return [own[i] if i in own else BUILTIN_FORMATS.get(int(i), "") for i in ids]
+
+    def number_format(self, cell: Cell) -> str:
+        """The number format of a cell, such as ``0.00" mm"``."""
+        style = int(cell.style or 0)
+        return self._number_formats[style] if style < len(self._number_formats) else ""
+
+    def comments(self, sheet: str) -> dict[At, str]:
+        """The comments on a sheet's cells."""
+        found: dict[At, str] = {}
+        for _, kind, member in self.package.relations(self.parts[sheet]):
+            if kind != "comments":
+                continue
+            at = None
+            for e in self._parts_of(member):
+                if e.name == "comment" and (cell := reference(e.attributes.get("ref", ""))) is not None:
+                    at = cell.top, cell.left
+                elif e.name == "t" and at is not None:
+                    found[at] = found.get(at, "") + e.text
+        return found
 
     @cached_property
     def _names(self) -> dict[tuple[str | None, str], str]:
@@ -145,11 +213,32 @@ class WorkbookXml:
             raise NotComputable(f"{self.text(place)} holds {value!r}")
         return value
 
+    def calculated(
+        self, place: Place, formula: str, value_of: Callable[[Place], Any]
+    ) -> float | str | bool | CellError:
+        """What `formula` at `place` gives; `value_of` gives the values of cells, or raises `NotComputable`."""
+        sheet = place[0]
+
+        def title(name: str | None) -> str:
+            found = sheet if name is None else self.title(name)
+            if found is None:
+                raise NotComputable(f"there is no sheet {name}")
+            return found
+
+        surroundings = Surroundings(
+            lambda name, row, column: value_of((title(name), row, column)),
+            at=place[1:],
+            extent=lambda name: self.extent(title(name)),
+            name=lambda name: self.meaning(place, name),
+        )
+        return calculate(formula, surroundings)
+
     def extent(self, sheet: str) -> tuple[int, int]:
         """The last row and the last column of `sheet` with content."""
-        if sheet not in self._extents:
-            self._extents[sheet] = self.sheets[sheet].extent
-        return self._extents[sheet]
+        key = sheet, len(self.sheets[sheet].cells)  # which grows where rows are added; emptied cells do no harm
+        if key not in self._extents:
+            self._extents[key] = self.sheets[sheet].extent
+        return self._extents[key]
 
     @staticmethod
     def text(place: Place) -> str:

@@ -15,9 +15,8 @@ from ...geometry_checks import check_geometry
 from ...isotopes import ISOTOPES
 from ...recording import recorded_warnings
 from ...system import PinholeSystem
-from ...workbook import read_system
-from ..options import add_command, refuse
-from .arguments import add_edge, add_workbook, edge_settings
+from ..options import add_command, add_workbook, read_workbook, refuse
+from .arguments import add_edge, add_json, edge_settings
 
 
 def add_parser(actions) -> None:  # type: ignore[no-untyped-def]
@@ -30,6 +29,7 @@ def add_parser(actions) -> None:  # type: ignore[no-untyped-def]
         "mphdrr geometry check scanner.xlsx --wall 3 --strict",
     )
     add_workbook(parser)
+    add_json(parser)
     parser.add_argument("--plate", type=float, default=2.0, metavar="MM", help="thickness of the aperture plates")
     parser.add_argument("--wall", type=float, default=2.0, metavar="MM", help="thickness of the collimators' walls")
     parser.add_argument(
@@ -48,7 +48,7 @@ def _run(arguments: argparse.Namespace) -> None:
     if arguments.aperture_mu is None:
         refuse(arguments, ("isotope",), "needs --aperture-mu")
     with recorded_warnings() as messages:
-        system = read_system(arguments.file)
+        system = read_workbook(arguments)
     report = check_geometry(
         system,
         plate_thickness=arguments.plate,
@@ -70,7 +70,7 @@ def _run(arguments: argparse.Namespace) -> None:
             print(finding)
         print(total)
     if arguments.strict and (messages or findings):
-        raise InputError(f"{arguments.file}: {total}")
+        raise InputError(f"{arguments.workbook}: {total}")
 
 
 def _count(lines: list[str], name: str) -> str:

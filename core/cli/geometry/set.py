@@ -14,10 +14,10 @@ from ...design import collimator_length
 from ...errors import InputError
 from ...recording import recorded_warnings
 from ...system import PinholeSystem
-from ...workbook import WrittenWorkbook, read_system, write_system
+from ...workbook import WrittenWorkbook, write_system
 from ...workbook.checks import is_by_design
-from ..options import add_command, chosen_modules, output_path
-from .arguments import add_workbook
+from ..options import add_command, add_workbook, chosen_modules, output_path, read_workbook
+from .arguments import add_json
 
 _DIMENSIONS = {
     "diameter": ("pinhole_diameter", "d, pinhole diameter"),
@@ -36,6 +36,7 @@ def add_parser(actions) -> None:  # type: ignore[no-untyped-def]
         "mphdrr geometry set scanner.xlsx --modules 1-20 --diameter 2 -o thinner.xlsx",
     )
     add_workbook(parser)
+    add_json(parser)
     parser.add_argument(
         "-o", "--output", required=True, metavar="OUT", help="workbook to write; FILE itself is replaced"
     )
@@ -51,14 +52,22 @@ def add_parser(actions) -> None:  # type: ignore[no-untyped-def]
     parser.add_argument("--move", type=float, nargs=3, metavar=("X", "Y", "Z"), help="shift of the pinholes, mm")
     parser.add_argument("--remove", metavar="RANGE", help="modules to take out")
     parser.add_argument("--order", metavar="N,N,...", help="the modules' numbers in the order they are to have")
+    parser.add_argument(
+        "--write-columns", metavar="MAP", help="with --columns, also write the column map (.toml) of the new workbook"
+    )
     parser.set_defaults(run=_run)
 
 
 def _run(arguments: argparse.Namespace) -> None:
     target = output_path(arguments.output, (".xlsx", ".xlsm"))
+    if arguments.write_columns is not None and arguments.columns is None:
+        raise InputError("--write-columns: the workbook is read by its headings, expected it with --columns")
+    map_path = None if arguments.write_columns is None else output_path(arguments.write_columns, (".toml",))
     with recorded_warnings() as messages:
-        system = _changed(read_system(arguments.file), arguments)
-        written = write_system(system, target, template=arguments.file)
+        system = _changed(read_workbook(arguments), arguments)
+        written = write_system(system, target, template=arguments.workbook)
+    if map_path is not None and written.columns is not None:
+        written.columns.write(map_path)
     if arguments.json:
         answer = {**dataclasses.asdict(written), "path": str(written.path), "warnings": messages}
         print(json.dumps(answer, indent=1))

@@ -29,7 +29,8 @@ def export_scanner(collection: bpy.types.Collection, path: Path, use_template: b
     path
         The workbook to write, .xlsx or .xlsm.
     use_template
-        Write into a copy of the workbook that the scanner comes from, while it is there: all else in it stays.
+        Write into a copy of the workbook that the scanner comes from, while it is there: all else in it stays. One that
+        was read by a column map is written by it, and the scene keeps the new file's own.
         Otherwise, or where it has gone (`InputWarning`), a complete workbook is made.
 
     Returns
@@ -47,9 +48,12 @@ def export_scanner(collection: bpy.types.Collection, path: Path, use_template: b
 
     scanner.refresh_scanner(collection)
     system = scanner.read_scanner(collection, aimed=True)
-    write_system(system, path, _template(collection) if use_template else None)
+    template = _template(collection) if use_template else None
+    source = scanner.source(collection)
+    columns = source.columns if source is not None and template is not None else None
+    own = write_system(system, path, template, columns).columns
     with recorded_warnings():  # the writer has said what there is to say of the template
-        written = read_system(path)
+        written = read_system(path, own)
     different = _difference(system, written)
     if different:
         raise InputError(f"{path}: was written, but reads back differently ({different}); the scene keeps its numbers")

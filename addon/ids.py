@@ -64,6 +64,7 @@ SCENE_EXPORT = "mphdrr_export"
 OBJECT_MODULE = "mphdrr_module"
 OBJECT_VOLUME = "mphdrr_volume"
 WINDOW_JOB = "mphdrr_job"
+WINDOW_COLUMNS = "mphdrr_columns"
 COLLECTION_SCANNER = "mphdrr_scanner"
 
 # --- Datablocks ---------------------------------------------------------------------------------------------

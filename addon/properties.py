@@ -21,7 +21,7 @@ from bpy.props import (
     StringProperty,
 )
 
-from . import choices, ids, jobs, phantom_properties, projection_properties
+from . import choices, column_maps, ids, jobs, phantom_properties, projection_properties
 
 
 # The rebuilding modules import these properties: they are imported when an edit calls for them.
@@ -248,6 +248,7 @@ CLASSES = (
     *phantom_properties.CLASSES,
     *projection_properties.CLASSES,
     jobs.JobProperties,
+    *column_maps.CLASSES,
 )
 
 # (Blender type, attribute name, group): attached as `PointerProperty(type=group)`; registration.py reads it.
@@ -258,4 +259,5 @@ POINTERS = (
     (bpy.types.Object, ids.OBJECT_VOLUME, phantom_properties.VolumeProperties),
     (bpy.types.Scene, ids.SCENE_PROJECTIONS, projection_properties.ProjectionProperties),
     (bpy.types.WindowManager, ids.WINDOW_JOB, jobs.JobProperties),
+    (bpy.types.WindowManager, ids.WINDOW_COLUMNS, column_maps.ColumnMapProperties),
 )

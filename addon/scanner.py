@@ -125,6 +125,11 @@ def remember_source(collection: bpy.types.Collection, system: PinholeSystem) -> 
     _write_source(collection.mphdrr_scanner, system)
 
 
+def source(collection: bpy.types.Collection) -> SystemSource | None:
+    """The workbook that the scanner was read from or last written to, with its column map, whatever has changed since."""
+    return _source_from_dict(json.loads(collection.mphdrr_scanner.source or "{}"))
+
+
 def _write_source(properties: bpy.types.PropertyGroup, system: PinholeSystem) -> None:
     properties.n_modules = len(system)
     properties.quick_ranges = json.dumps(quick_ranges(system))
@@ -258,7 +263,7 @@ def read_scanner(collection: bpy.types.Collection, *, aimed: bool = False) -> Pi
         centers=np.array([n.center for n in numbers]),
         **{name: np.array([getattr(n, name) for n in numbers]) for name in LENGTHS},
         numbers=np.array(list(by_number), dtype=np.int64),
-        source=_source_from_dict(json.loads(collection.mphdrr_scanner.source or "{}")) if as_imported else None,
+        source=source(collection) if as_imported else None,
     )
 
 

@@ -1,23 +1,29 @@
-"""File > Import > Pinhole Geometry: a workbook becomes a scanner."""
+"""File > Import > Pinhole Geometry: a workbook becomes a scanner.
+
+What the reader does not understand, the user says in the column map dialog, or a script with `columns`.
+"""
 
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Literal
 
 import bpy
 from bpy.props import BoolProperty, FloatProperty, IntVectorProperty, StringProperty
 
-from ..addon import ids, scanner
+from ..addon import column_maps, ids, scanner
 from ..addon.preferences import preferences
 from ..addon.reports import warnings_reported
 from ..core.errors import InputError
 from ..core.system import PinholeSystem
+from ..core.workbook import ColumnMap, read_system
+from . import column_map_dialog
 
 _SUFFIXES = (".xlsx", ".xlsm")
 
 
 class MPHDRR_OT_import_geometry(bpy.types.Operator):
-    """``bpy.ops.mphdrr.import_geometry(filepath="scanner.xlsx")``."""
+    """``bpy.ops.mphdrr.import_geometry(filepath="scanner.xlsx", columns="map.toml")``."""
 
     bl_idname = ids.IMPORT_GEOMETRY
     bl_label = "Import Pinhole Geometry"
@@ -32,6 +38,18 @@ class MPHDRR_OT_import_geometry(bpy.types.Operator):
         name="Name", description="Name of the scanner, which replaces one of the same name. Empty: the file's",
         options={"SKIP_SAVE"},
     )  # fmt: skip
+    columns: StringProperty(
+        name="Column Map", description="File (.toml) that says which columns hold what. Empty: the headings say it",
+        subtype="FILE_PATH", options={"SKIP_SAVE"},
+    )  # fmt: skip
+    choose_columns: BoolProperty(
+        name="Choose Columns",
+        description="Say in a dialog which columns hold what, as when the headings are not understood",
+        options={"SKIP_SAVE"},
+    )
+    chosen_columns: StringProperty(
+        name="Chosen Columns", description="The column map that the dialog gave, TOML", options={"HIDDEN", "SKIP_SAVE"}
+    )
     plate_thickness: FloatProperty(
         name="Plate (mm)", description="Thickness in mm of the aperture plate that holds the pinhole",
         default=2.0, min=0.01, soft_max=20.0,
@@ -68,13 +86,26 @@ class MPHDRR_OT_import_geometry(bpy.types.Operator):
         return self.execute(context)
 
     def execute(self, context: bpy.types.Context) -> set[str]:
+        form = column_maps.settings(context)
         try:
+            if self._dialog == "COLUMNS":
+                self.chosen_columns = column_maps.accept(form).to_toml()
+            elif self.choose_columns and not self.chosen_columns:
+                self._require_window()
+                column_maps.fill(form, self._workbook(), self._columns())
+                return self._ask_columns(context)
             system = self._read()
+        except InputError as error:
+            if self._can_be_mended(form, error):
+                return self._ask_columns(context)
+            self.report({"ERROR"}, str(error))
+            return {"CANCELLED"}
+        try:
             old = scanner.find_scanner(context.scene, self.name or scanner.default_name(system))
-            if old is not None and not self.replace and self.options.is_invoke and not bpy.app.background:
+            if old is not None and not self.replace and self._has_window():
                 self._losses = scanner.losses(old)
                 if self._losses:
-                    return self._ask(context, old)
+                    return self._ask_to_replace(context, old)
             collection = scanner.build_scanner(
                 context.scene,
                 system,
@@ -90,12 +121,20 @@ class MPHDRR_OT_import_geometry(bpy.types.Operator):
         context.view_layer.update()  # so that scripts find the children's matrix_world in place
         if old is None:
             _frame(context, system)
+        self._dialog = ""
+        column_maps.clear(form)
         self.report({"INFO"}, f"Imported {len(system)} modules into '{collection.name}'")
         return {"FINISHED"}
 
+    def cancel(self, context: bpy.types.Context) -> None:
+        column_maps.clear(column_maps.settings(context))
+
     def draw(self, context: bpy.types.Context) -> None:
         layout = self.layout
-        if self._losses:
+        if self._dialog == "COLUMNS":
+            column_map_dialog.draw(layout, column_maps.settings(context))
+            return
+        if self._dialog == "REPLACE":
             layout.label(text="Importing again drops these changes:", icon="ERROR")
             column = layout.column(align=True)
             for line in self._losses:
@@ -108,18 +147,56 @@ class MPHDRR_OT_import_geometry(bpy.types.Operator):
         column.prop(self, "plate_thickness")
         column.prop(self, "wall_thickness")
         layout.prop(self, "image_size")
+        layout.prop(self, "columns")
+        layout.prop(self, "choose_columns")
 
+    _dialog: Literal["", "COLUMNS", "REPLACE"] = ""  # which one is open
     _losses: tuple[str, ...] | list[str] = ()
 
-    def _read(self) -> PinholeSystem:
-        from ..core.workbook import read_system
+    def _has_window(self) -> bool:
+        return self.options.is_invoke and not bpy.app.background
 
+    def _workbook(self) -> Path:
         if not self.filepath:
             raise InputError("no file given: set filepath to a workbook (.xlsx)")
-        with warnings_reported(self):
-            return read_system(Path(bpy.path.abspath(self.filepath)))
+        return Path(bpy.path.abspath(self.filepath))
 
-    def _ask(self, context: bpy.types.Context, old: bpy.types.Collection) -> set[str]:
+    def _columns(self) -> ColumnMap | None:
+        if self.chosen_columns:
+            return ColumnMap.from_toml(self.chosen_columns)
+        return ColumnMap.read(bpy.path.abspath(self.columns)) if self.columns else None
+
+    def _read(self) -> PinholeSystem:
+        with warnings_reported(self):
+            return read_system(self._workbook(), self._columns())
+
+    def _can_be_mended(self, form: column_maps.ColumnMapProperties, error: InputError) -> bool:
+        """Whether the dialog can say what the reader has refused; its settings are then filled."""
+        if self._dialog == "COLUMNS":
+            form.refusal = str(error)
+            return True
+        try:
+            return self._has_window() and column_maps.fill(form, self._workbook(), self._columns())
+        except InputError:
+            return False
+
+    def _require_window(self) -> None:
+        if not self._has_window():
+            raise InputError(
+                "choose_columns opens a dialog, which a script cannot answer: set columns to a column map (.toml) instead"
+            )
+
+    def _ask_columns(self, context: bpy.types.Context) -> set[str]:
+        self._dialog = "COLUMNS"
+        return context.window_manager.invoke_props_dialog(
+            self,
+            width=column_map_dialog.WIDTH,
+            title=f"Columns of {self._workbook().name}",
+            confirm_text="Import",
+        )
+
+    def _ask_to_replace(self, context: bpy.types.Context, old: bpy.types.Collection) -> set[str]:
+        self._dialog = "REPLACE"
         self.replace = True  # the dialog's button runs execute again
         return context.window_manager.invoke_props_dialog(
             self, width=440, title=f"Replace '{old.name}'?", confirm_text="Replace"

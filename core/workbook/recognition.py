@@ -40,7 +40,7 @@ OWN_SHEETS = frozenset(("mdsl cloud import", "theta", "values", "design table"))
 """Sheets that users' workbooks carry beside the scanner's, whatever they hold."""
 ASIDE = frozenset(("s", "3d slope"))
 """Headings of the users' workbooks whose columns are of no concern."""
-HELP = "a column map can say what is meant (--columns, docs/workbook.md)"
+HELP = "a column map can say what is meant (columns='map.toml', --columns map.toml; docs/workbook.md)"
 
 _ROWS_APART = 2
 """A symbol row and a description row that are further apart do not belong together."""

@@ -822,7 +822,7 @@ def test_without_coordinates_the_sheets_and_headings_are_named(tmp_path):
         read_system(saved(book, tmp_path))
     assert str(refusal.value) == (
         "scanner.xlsx: no sheet has a column headed x1 or 'x coordinate value at center of hole'; its sheets are "
-        "Values, Notes; a column map can say what is meant (--columns, docs/workbook.md)"
+        "Values, Notes; a column map can say what is meant (columns='map.toml', --columns map.toml; docs/workbook.md)"
     )
 
 

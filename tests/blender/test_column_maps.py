@@ -1,0 +1,282 @@
+"""Column maps in Blender: the dialog's settings say what the map says, and the scene keeps it for writing back."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import re
+from pathlib import Path
+
+import bpy
+import numpy as np
+import openpyxl
+import pytest
+
+from mphdrr.addon import column_maps, scanner
+from mphdrr.core.errors import InputError
+from mphdrr.core.system import PinholeSystem
+from mphdrr.core.workbook import ColumnMap, draft_column_map, read_system
+from mphdrr.core.workbook.quantities import LENGTH_UNITS
+
+CM = {"x1": "Mitte x (Zentimeter)", "y1": "Mitte y (Zentimeter)", "z1": "Mitte z (Zentimeter)"}
+
+
+@pytest.fixture
+def unread(workbook, tmp_path) -> Path:
+    """The real workbook with its coordinates in cm under headings that the reader does not know."""
+    book = openpyxl.load_workbook(workbook, data_only=True)
+    sheet = book["Coordinates"]
+    for column in range(sheet.max_column, 4, -1):
+        if column != 7:
+            sheet.delete_cols(column)  # columns that follow from the others
+    sheet["E1"], sheet["E2"] = "l", None
+    for column, text in enumerate(CM.values(), start=2):
+        sheet.cell(1, column, text)
+        sheet.cell(2, column, None)
+        for row in range(3, 83):
+            sheet.cell(row, column).value /= 10
+    path = tmp_path / "own.xlsx"
+    book.save(path)
+    return path
+
+
+@pytest.fixture
+def columns(unread) -> ColumnMap:
+    """What a person says of it."""
+    return ColumnMap.from_toml(
+        """
+        [[tables]]
+        sheet = "Coordinates"
+        header_row = 1
+        first_row = 3
+        last_row = 82
+        number = "A"
+        columns.x1 = { column = "B", unit = "cm" }
+        columns.y1 = { column = "C", unit = "cm" }
+        columns.z1 = { column = "D", unit = "cm" }
+        columns.l = { column = "E", unit = "mm" }
+        [[tables]]
+        sheet = "Main"
+        header_row = 1
+        first_row = 3
+        last_row = 82
+        rows = "by number"
+        number = "A"
+        columns.d = { column = "P", unit = "mm" }
+        columns.R = { column = "Q", unit = "mm" }
+        columns.Ld = { column = "S", unit = "mm" }
+        columns.Td = { column = "T", unit = "mm" }
+        """
+    )
+
+
+@pytest.fixture
+def form():
+    return column_maps.settings(bpy.context)
+
+
+def quantity(form, name):
+    return next(quantity for quantity in form.quantities if quantity.name == name)
+
+
+def assert_equal(one: PinholeSystem, other: PinholeSystem) -> None:
+    np.testing.assert_array_equal(one.numbers, other.numbers)
+    for field in dataclasses.fields(PinholeSystem):
+        if field.name not in ("numbers", "source"):
+            np.testing.assert_allclose(getattr(one, field.name), getattr(other, field.name), rtol=1e-9, atol=1e-9)
+
+
+# The settings
+
+
+def test_settings_say_what_the_map_says(form, unread, columns):
+    assert column_maps.fill(form, unread, columns)
+    assert column_maps.column_map(form) == columns
+    assert form.refusal == ""
+
+
+def test_the_draft_of_an_understood_workbook_needs_no_more(form, workbook, dc_spect):
+    assert not column_maps.fill(form, workbook)
+    assert form.refusal == "" and json.loads(form.doubts) == []
+    assert column_maps.column_map(form) == draft_column_map(workbook).columns
+    assert_equal(read_system(workbook, column_maps.accept(form)), dc_spect)
+
+
+def test_every_setting_of_a_table_survives(form, unread, columns):
+    pinholes, dimensions = columns.tables
+    one = dataclasses.replace(dimensions, first_row=9, last_row=9, rows="one for all", number=None)
+    odd = ColumnMap((dataclasses.replace(pinholes, skip_rows=(5, 9, 10), header_row=None), one))
+    column_maps.fill(form, unread, odd)
+    assert column_maps.column_map(form) == odd
+    assert json.loads(form.preview)[0][0] == "Module"
+
+
+def test_what_is_missing_is_asked_for_and_then_read(form, unread, dc_spect):
+    """From the draft to the scanner as a user settles it."""
+    assert column_maps.fill(form, unread)
+    assert any("x1" in doubt for doubt in json.loads(form.doubts))
+    assert form.refusal and form.preview == ""
+    with pytest.raises(InputError, match="column map: "):
+        column_maps.accept(form)
+    for name, column in zip(CM, "BCD", strict=True):
+        quantity(form, name).table, quantity(form, name).column = 1, column
+    form.n_tables = 2
+    first, second = form.tables
+    first.sheet, first.first_row, first.last_row, first.number, first.header_row = "Coordinates", 3, 82, "a", 1
+    second.sheet, second.first_row, second.last_row, second.number = "Main", 3, 82, "A"
+    second.rows = "BY_NUMBER"
+    for name, column in zip(("d", "R", "Ld", "Td"), "PQST", strict=True):
+        quantity(form, name).table, quantity(form, name).column = 2, column
+    quantity(form, "l").table, quantity(form, "l").column = 1, "E"
+    form.unit = "mm"
+    for name in CM:
+        quantity(form, name).unit = "cm"
+    assert form.refusal == ""
+    assert quantity(form, "x1").seen == f"{CM['x1']}: 27.7002"
+    heads, *rows = json.loads(form.preview)
+    assert [row[0] for row in rows] == ["1", "2", "3", "...", "80"]
+    assert float(rows[0][heads.index("x1")]) == pytest.approx(dc_spect.centers[0, 0], abs=1e-3)
+    assert float(rows[-1][heads.index("l")]) == pytest.approx(dc_spect.collimator_length[-1], abs=1e-3)
+    assert_equal(read_system(unread, column_maps.accept(form)), dc_spect)
+
+
+@pytest.mark.parametrize("unit", LENGTH_UNITS)
+def test_every_unit_can_be_chosen_for_all_lengths(unit, form, workbook):
+    column_maps.fill(form, workbook)
+    form.unit = unit
+    units = {c.quantity: c.unit for table in column_maps.column_map(form).tables for c in table.columns}
+    assert units.pop("azimuth") == units.pop("elevation") == "rad"
+    assert set(units.values()) == {unit}
+
+
+def test_a_setting_that_cannot_be_is_refused_at_once_and_can_be_taken_back(form, unread, columns):
+    column_maps.fill(form, unread, columns)
+    x1, (first, second) = quantity(form, "x1"), form.tables
+    for group, name, value, expected in (
+        (x1, "unit", "NONE", "table 1.x1: unit ''"),
+        (x1, "column", "", "has no column x1"),
+        (x1, "column", "C", "column C is table 1.x1 too"),
+        (x1, "table", 3, "x1 is in table 3, expected 1 to 2"),
+        (first, "sheet", "Haupt", "has no sheet Haupt.*Main, Coordinates"),
+        (first, "last_row", 83, "Coordinates!A83 is blank"),
+        (first, "skip_rows", "forty", "table 1: skip rows 'forty', expected numbers"),
+        (first, "skip_rows", "90", "skip_rows has 90"),
+        (second, "rows", "IN_ORDER", ""),
+        (second, "number", "", "by number' without number"),
+    ):
+        before = getattr(group, name)
+        setattr(group, name, value)
+        assert bool(form.refusal) == bool(expected)
+        assert bool(form.preview) != bool(expected)
+        assert re.search(expected, form.refusal), form.refusal
+        setattr(group, name, before)
+        assert form.refusal == "" and form.preview
+
+
+def test_a_wrong_unit_is_warned_of_beside_the_numbers(form, unread, columns):
+    column_maps.fill(form, unread, columns)
+    assert json.loads(form.remarks) == []
+    for name in CM:
+        quantity(form, name).unit = "m"
+    assert form.preview and any("b = " in remark for remark in json.loads(form.remarks))
+
+
+def test_a_map_is_saved_once_and_never_over_a_file(form, unread, columns):
+    column_maps.fill(form, unread, columns)
+    form.save_as = "map.toml"
+    assert column_maps.accept(form) == columns
+    assert ColumnMap.read(unread.with_name("map.toml")) == columns
+    with pytest.raises(InputError, match=r"map\.toml: is there already"):
+        column_maps.accept(form)
+    form.save_as = "map.txt"
+    with pytest.raises(InputError, match=r"ending in \.toml"):
+        column_maps.accept(form)
+
+
+def test_settings_are_emptied(form, unread, columns):
+    empty = column_maps.column_map(form)
+    column_maps.fill(form, unread, columns)
+    column_maps.clear(form)
+    assert column_maps.column_map(form) == empty == ColumnMap(())
+    assert (form.workbook, form.preview, form.unit) == ("", "", "NONE")
+
+
+# The import
+
+
+@pytest.fixture
+def map_file(tmp_path, columns) -> Path:
+    columns.write(tmp_path / "map.toml")
+    return tmp_path / "map.toml"
+
+
+def test_a_refused_workbook_names_the_way_and_a_map_reads_it(scene, unread, map_file, columns, dc_spect):
+    with pytest.raises(RuntimeError, match=r"a column map can say what is meant \(columns='map\.toml'"):
+        bpy.ops.mphdrr.import_geometry(filepath=str(unread))
+    assert scanner.scanners(scene) == []
+    assert bpy.ops.mphdrr.import_geometry(filepath=str(unread), columns=str(map_file)) == {"FINISHED"}
+    collection = scanner.active_scanner(scene)
+    assert_equal(scanner.read_scanner(collection), dc_spect)
+    assert scanner.read_scanner(collection).source.columns == columns
+
+
+def test_a_script_is_told_that_a_dialog_needs_a_window(unread, map_file):
+    with pytest.raises(RuntimeError, match=r"set columns to a column map \(\.toml\) instead"):
+        bpy.ops.mphdrr.import_geometry(filepath=str(unread), choose_columns=True)
+    with pytest.raises(RuntimeError, match=r"none\.toml: no such file"):
+        bpy.ops.mphdrr.import_geometry(filepath=str(unread), columns=str(map_file.with_name("none.toml")))
+
+
+# Writing back
+
+
+@pytest.fixture
+def collection(scene, unread, map_file):
+    bpy.ops.mphdrr.import_geometry(filepath=str(unread), columns=str(map_file))
+    return scanner.active_scanner(scene)
+
+
+def test_an_unchanged_scanner_writes_the_same_file(collection, unread, tmp_path):
+    assert bpy.ops.mphdrr.export_geometry(filepath=str(tmp_path / "same.xlsx")) == {"FINISHED"}
+    assert (tmp_path / "same.xlsx").read_bytes() == unread.read_bytes()
+
+
+@pytest.mark.parametrize("saved", [False, True])
+def test_a_changed_scanner_is_written_by_its_map_in_the_files_unit(saved, collection, scene, tmp_path):
+    if saved:
+        bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "scene.blend"))
+        bpy.ops.wm.open_mainfile(filepath=str(tmp_path / "scene.blend"))
+        scene = bpy.context.scene
+        collection = scanner.active_scanner(scene)
+    scanner.module(collection, 7).location.x += 3.0
+    scanner.module(collection, 9).mphdrr_module.pinhole_diameter = 2.5
+    path = tmp_path / "edited.xlsx"
+    assert bpy.ops.mphdrr.export_geometry(filepath=str(path)) == {"FINISHED"}
+    own = scanner.source(collection).columns
+    written = read_system(path, own)
+    assert_equal(written, scanner.read_scanner(collection))
+    sheet = openpyxl.load_workbook(path)["Coordinates"]
+    assert sheet["B9"].value == pytest.approx(written.centers[6, 0] / 10, rel=1e-12)
+    assert sheet["B1"].value == CM["x1"]
+
+    # And again, now that the scene's workbook is the one written.
+    scanner.module(collection, 9).mphdrr_module.pinhole_diameter = 2.6
+    assert bpy.ops.mphdrr.export_geometry(filepath=str(path)) == {"FINISHED"}
+    assert read_system(path, scanner.source(collection).columns).pinhole_diameter[8] == pytest.approx(2.6, rel=1e-6)
+
+
+def test_the_scene_keeps_the_map_of_the_rows_that_are_written(collection, tmp_path):
+    bpy.data.objects.remove(scanner.module(collection, 80))
+    bpy.data.objects.remove(scanner.module(collection, 40))
+    path = tmp_path / "fewer.xlsx"
+    assert bpy.ops.mphdrr.export_geometry(filepath=str(path)) == {"FINISHED"}
+    own = scanner.source(collection).columns
+    assert [(t.first_row, t.last_row, t.skip_rows) for t in own.tables] == [(3, 81, (42,))] * 2
+    assert_equal(read_system(path, own), scanner.read_scanner(collection))
+
+
+def test_a_new_workbook_needs_no_map(collection, tmp_path):
+    path = tmp_path / "new.xlsx"
+    bpy.ops.mphdrr.export_geometry(filepath=str(path), use_template=False)
+    assert scanner.source(collection).columns is None
+    assert_equal(read_system(path), scanner.read_scanner(collection))

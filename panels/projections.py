@@ -35,6 +35,8 @@ class MPHDRR_PT_projections(bpy.types.Panel):
         size.prop(settings, "height", text="Y")
         column.row().prop(settings, "detector", expand=True)
         column.prop(settings, "magnification")
+        if settings.model != "INVERSE_SQUARE":
+            column.prop(settings, "pixel_points")
         modules = column.column(align=True)
         modules.prop(settings, "first", text="Modules First")
         modules.prop(settings, "last", text="Last")

@@ -43,7 +43,9 @@ from .phantom import chosen_phantom, placed_volume
 
 _MOST_MU = 500.0
 """1/mm: more than any material of the tables attenuates photons of 10 keV or more."""
-_EMISSION = [field.name for field in fields(Emission)]
+_RAYS = [field.name for field in fields(Transmission)]
+"""How many rays a pixel gets, of radiographs and of counts."""
+_EMISSION = [field.name for field in fields(Emission) if field.name not in _RAYS]
 Source = tuple[Volume, Volume | None, dict[str, Any]]
 """What is projected, what attenuates it, and what to record of them."""
 
@@ -104,11 +106,30 @@ def add_parser(subparsers) -> None:  # type: ignore[no-untyped-def]
         metavar="SEED",
         help="draw Poisson counts instead of their means; of --states, with SEED, SEED + 1 …",
     )
+    add_ray_options(parser)
     add_emission_options(parser)
     add_phantom_options(parser.add_argument_group("Derenzo phantom, without --volume, or place of --phantom"))  # type: ignore[arg-type]
     parser.add_argument("-o", "--output", required=True, metavar="FILE", help=", ".join(FORMATS))
     parser.add_argument("--mosaic", metavar="PNG", help="also write all images in one picture")
     parser.set_defaults(run=_run)
+
+
+def add_ray_options(parser: argparse.ArgumentParser) -> None:
+    """How many rays a pixel gets, in the namespace only if it is given."""
+    group = parser.add_argument_group("rays of a pixel")
+    group.add_argument(
+        "--pixel-points", type=_points, metavar="N", default=argparse.SUPPRESS,
+        help="points of each pixel's area, for each of the hole; auto: as many as --tolerance asks for "
+        "(default: auto for --emission, 1 otherwise: the pixels' centres)",
+    )  # fmt: skip
+    group.add_argument(
+        "--tolerance", type=float, metavar="SHARE", default=argparse.SUPPRESS,
+        help="how far off the total of a single voxel may be, in any module (default: 0.02)",
+    )  # fmt: skip
+
+
+def _points(text: str) -> int | None:
+    return None if text == "auto" else int(text)
 
 
 def add_emission_options(parser: argparse.ArgumentParser) -> None:
@@ -135,9 +156,7 @@ def add_emission_options(parser: argparse.ArgumentParser) -> None:
     )
     source.add_argument("--mu-series", metavar="NAME", help="of several DICOM series in --mu, as --series")
     aperture = parser.add_argument_group("--emission: the pinhole")
-    option(
-        aperture, "--aperture-points", type=int, metavar="N", help="rays through the hole of each pixel (default: 1)"
-    )
+    option(aperture, "--aperture-points", type=int, metavar="N", help="points of the hole that rays pass (default: 1)")
     option(
         aperture, "--aperture-tolerance", type=float, metavar="SHARE",
         help="as many as bring a voxel's image this close, such as 0.1, to that of the whole hole",
@@ -167,11 +186,12 @@ def add_emission_options(parser: argparse.ArgumentParser) -> None:
 
 def chosen_model(arguments: argparse.Namespace, system: PinholeSystem, mu: Volume | None) -> Model:
     """The model that `arguments` ask for; `mu` is what attenuates."""
-    given = {name: getattr(arguments, name) for name in _EMISSION if hasattr(arguments, name)} | {"mu": mu}
+    rays = {name: getattr(arguments, name) for name in _RAYS if hasattr(arguments, name)}
     if arguments.inverse_square:
         return InverseSquareSum(system)
     if not arguments.emission:
-        return Transmission()
+        return Transmission(**rays)
+    given = {name: getattr(arguments, name) for name in _EMISSION if hasattr(arguments, name)} | rays | {"mu": mu}
     if "opening_angle" in given:
         given["opening_angle"] = math.radians(given["opening_angle"])
     return Emission(system, **given)
@@ -179,6 +199,8 @@ def chosen_model(arguments: argparse.Namespace, system: PinholeSystem, mu: Volum
 
 def _require_fitting(arguments: argparse.Namespace) -> None:
     """Refuse options that would have no effect beside the others."""
+    if arguments.inverse_square:
+        refuse(arguments, _RAYS, "is not for --inverse-square")
     if not arguments.emission:
         refuse(arguments, (*_EMISSION, "phantom_mu", "mu_series"), "needs --emission")
         if arguments.photons is None:

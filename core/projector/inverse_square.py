@@ -63,7 +63,7 @@ class InverseSquareSum(Model):
         towards = rays.targets() - rays.source
         sine = (towards @ k / np.linalg.norm(towards, axis=1)).reshape(views.shape)
         weights = self.system.pinhole_diameter[m] ** 2 / 16 * sine**3
-        yield Beam(rays, lambda lines, rays, shifts: weights[lines, rays])
+        yield Beam(rays, lambda lines, rays, shifts: weights[None, lines, rays])
 
     def voxel_weights(self, views: Views, m: int, grid: Grid) -> Array:
         """``1 / h^2`` at the voxels' centres, 1/mm^2."""

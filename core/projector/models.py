@@ -31,8 +31,8 @@ class Beam:
     rays : Fan
         From the rays' source to the pixels: n_v lines of n_u rays.
     weigh : function, optional
-        Of slices of lines, rays and shifts: array that broadcasts to (shifts, lines, rays), what a ray's integral counts
-        in its pixel. None: 1 everywhere.
+        Of slices of lines, rays and shifts: array (shifts, lines, rays), with 1 line or ray where all are alike, what a
+        ray's integral counts in its pixel. None: 1 everywhere.
     """
 
     rays: Fan
@@ -142,7 +142,8 @@ class Transmission(Model):
             yield Beam(rays)
             return
         n = self.pixel_points or points_needed(shadow_edges(views, m, grid), self.tolerance)
-        yield Beam(replace(rays, shifts=offsets(n)[:, ::-1]), lambda lines, rays, shifts: np.full((1, 1, 1), 1 / n))
+        weights = np.full((n, 1, 1), 1 / n)
+        yield Beam(replace(rays, shifts=offsets(n)[:, ::-1]), lambda lines, rays, shifts: weights[shifts])
 
 
 def intensity(line_integrals: ArrayOrTensor, photons: float) -> ArrayOrTensor:

@@ -28,19 +28,19 @@ Array = NDArray[np.float64]
 TOLERANCE = 0.02
 """By default the total counts of a single voxel are right to this share of them."""
 
-MOST_POINTS = 1597
+MOST_POINTS = 2584
 """Of a pixel: its rays would take hours."""
 
-_FIBONACCI = (1, 2, 3, 5, 8, 13, 21, 34, 55, 89, 144, 233, 377, 610, 987, MOST_POINTS)
+_FIBONACCI = (1, 2, 3, 5, 8, 13, 21, 34, 55, 89, 144, 233, 377, 610, 987, 1597, MOST_POINTS)
 
-# The largest error, over all places of a voxel between the points, in units of the root mean square over them: a little
-# more than was found for any size, direction and number.
-_LARGEST_ERROR = 3.0
+# The largest error, over all places of a voxel between the points, in units of the root mean square over them. Boxes seen along an
+# axis, the worst, were found to have up to 2.9 on average and seldom more than 4.
+_LARGEST_ERROR = 4.0
 # Voxels looked at along each axis of a grid, and how many of those, the smallest as the detector sees them, decide.
 _VOXELS_ALONG = 9
 _VOXELS = 48
-# Length of the dual lattice's longest vectors, in units of the shortest: the rest adds nothing that matters.
-_DUAL_RADIUS = 6.0
+# Vectors of the dual lattice that are looked at: |k_u k_v| up to this times n, and either up to that times n.
+_DUAL_NEAR, _DUAL_FAR = 6, 3
 
 
 @functools.lru_cache(maxsize=256)
@@ -71,10 +71,14 @@ def _generator(n: int) -> int:
 
 @functools.lru_cache(maxsize=256)
 def _dual(n: int) -> Array:
-    """Vectors (N, 2) of the dual of `lattice(n)`, one of each pair k, -k, without 0: k . x is whole for every point x."""
-    reach = int(_DUAL_RADIUS * math.sqrt(n)) + 1
-    column, row = np.meshgrid(np.arange(reach + 1), np.arange(-reach, reach + 1), indexing="ij")
-    chosen = ((column + _generator(n) * row) % n == 0) & ((column > 0) | (row > 0))
+    """Vectors (N, 2) of the dual of `lattice(n)`, one of each pair k, -k, without 0: k . x is whole for every point x.
+
+    Those that count for boxes, whose transform falls as 1 / (k_u k_v): near the axes the far ones, too.
+    """
+    column, turn = np.meshgrid(np.arange(_DUAL_FAR * n + 1), np.arange(-_DUAL_FAR, _DUAL_FAR), indexing="ij")
+    row = -column * (pow(_generator(n), -1, n) if n > 1 else 0) % n + n * turn
+    chosen = (column * np.abs(row) <= _DUAL_NEAR * n) & (np.abs(row) <= _DUAL_FAR * n)
+    chosen &= (column > 0) | (row > 0)
     return np.stack([column[chosen], row[chosen]], axis=1).astype(np.float64)
 
 

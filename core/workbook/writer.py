@@ -13,6 +13,7 @@ import numpy as np
 from ..checks import instance
 from ..errors import InputError, InputWarning
 from ..files import replacing
+from ..recording import recorded_warnings
 from ..system import PinholeSystem
 from . import libreoffice
 from .book import Book
@@ -114,8 +115,7 @@ def write_system(
     book = Book(template)
     workbook = book.workbook
     _refuse_other_kind(workbook, target, suffix)
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", InputWarning)  # said when the system was read
+    with recorded_warnings():  # said when the system was read
         reading = read(book, said)
     edit = Edit(system, reading, workbook)
     edit.apply()
@@ -159,8 +159,7 @@ def _saved(
 
 def _refuse_unlike(written: Path, name: str, system: PinholeSystem, numbered: bool, columns: ColumnMap | None) -> None:
     """Refuse a workbook that is not read as `system`: a template may be laid out so that it cannot hold it."""
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", InputWarning)
+    with recorded_warnings():
         try:
             back = read(Book(written), columns).system
         except InputError as error:

@@ -47,7 +47,10 @@ FROZEN = {
         "part": {"NONE": 0, "CAMERA": 1, "COLLIMATOR": 2, "CRYSTAL": 3, "ROI": 4},
         "length_mode": {"FROM_ROI": 0, "TYPED": 1},
     },
-    "ScannerProperties": {"length_mode": {"FROM_ROI": 0, "TYPED": 1}},
+    "ScannerProperties": {
+        "length_mode": {"FROM_ROI": 0, "TYPED": 1},
+        "edge_at": {"MIDDLE": 0, "FRONT": 1, "BACK": 2},
+    },
     "VolumeProperties": {
         "kind": {
             "VOLUME": 0, "DERENZO": 1, "NEMA": 2, "JASZCZAK": 3, "DEFRISE": 4, "SHEPP_LOGAN": 5, "POINTS": 6, "TORSO": 7,
@@ -85,7 +88,7 @@ FROZEN = {
     },
 }  # fmt: skip
 DEFAULTS = {
-    "part": "NONE", "length_mode": "TYPED", "kind": "VOLUME", "contrast": "modified", "model": "TRANSMISSION",
+    "part": "NONE", "length_mode": "TYPED", "edge_at": "MIDDLE", "kind": "VOLUME", "contrast": "modified", "model": "TRANSMISSION",
     "isotope": "NONE", "aperture_material": "NUMBER", "edge": "PAIX", "crystal_material": "NUMBER",
     "detector": "VIRTUAL", "backend": "AUTO", "rows": "BY_NUMBER", "unit": "NONE",
 }  # fmt: skip

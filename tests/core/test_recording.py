@@ -138,7 +138,7 @@ def test_an_error_in_the_block_is_raised_and_its_warnings_are_kept():
 
 
 def test_input_warnings_are_recorded_in_one_way_only():
-    """Other recorders of them would overlap with these (workbook/writer.py ignores them within one thread)."""
+    """Other recorders of them would overlap with these."""
     root = Path(__file__).parents[2]
     found = [
         path.relative_to(root).as_posix()
@@ -146,4 +146,4 @@ def test_input_warnings_are_recorded_in_one_way_only():
         for path in (root / part).rglob("*.py")
         if re.search(r"simplefilter\(.*InputWarning", path.read_text(encoding="utf-8"))
     ]
-    assert sorted(found) == ["core/cli/__init__.py", "core/recording.py", "core/workbook/writer.py"]
+    assert sorted(found) == ["core/cli/__init__.py", "core/recording.py"]

@@ -1,0 +1,201 @@
+"""A pixel is an area: the counts of small sources do not depend on where they lie between the rays."""
+
+from __future__ import annotations
+
+import warnings
+
+import numpy as np
+import pytest
+
+import mphdrr.core as mph
+from mphdrr.core.errors import InputError, InputWarning
+from mphdrr.core.projector.pixel_points import expected_error, lattice, offsets, points_needed, shadow_edges
+
+from .conftest import WORKBOOK, general_grid
+from .test_emission import BACKENDS, assert_adjoint, in_ball, one_module, turned_grid
+
+MODULES = mph.read_system(WORKBOOK)[[3, 10, 21, 38, 62]]  # of all rings; two look nearly along an axis
+
+
+def law(system, grid):
+    """Total counts per module of a volume of ones: the point law integrated over the voxels, 27 points in each."""
+    ticks, weights = np.array([-1, 0, 1]) * np.sqrt(0.15), np.array([5, 8, 5]) / 18
+    steps = np.stack(np.meshgrid(ticks, ticks, ticks, indexing="ij"), axis=-1).reshape(-1, 3)
+    share = np.einsum("i,j,k->ijk", weights, weights, weights).ravel()
+    voxels = np.stack(np.meshgrid(*map(np.arange, grid.shape), indexing="ij"), axis=-1).reshape(-1, 1, 3)
+    points = (voxels + steps) @ grid.affine[:3, :3].T + grid.affine[:3, 3]
+    counts = mph.sensitivity(system, points.reshape(-1, 3)).reshape(len(voxels), 27, -1)
+    return np.einsum("vsm,s->m", counts, share) * grid.voxel_volume
+
+
+def totals(grid, n, backend="auto", **options):
+    A = mph.Projector(grid, MODULES.views((n, n), "real"), mph.Emission(MODULES, **options), backend)
+    return A(np.ones(grid.shape)).sum(axis=(1, 2), dtype=float)
+
+
+@pytest.mark.parametrize("n", [64, 128, 256, 512])
+@pytest.mark.parametrize("size", [0.5, 1.0, 4.0])
+def test_a_voxel_anywhere_counts_by_the_point_law(n, size, rng):
+    """Through the ideal pinhole; straight and turned voxels of a fraction of a pixel to several."""
+    places = in_ball(rng, 35, 3 if size < 1 and n == 64 else 6)
+    for grid in [mph.Grid.centered(1, size, place) for place in places[1:]] + [turned_grid((1, 1, 1), size, places[0])]:
+        np.testing.assert_allclose(totals(grid, n), law(MODULES, grid), rtol=0.02)
+
+
+@pytest.mark.parametrize(("n", "size"), [(64, 1.0), (128, 0.5), (256, 1.0)])
+def test_a_voxel_counts_the_same_through_points_of_the_hole(n, size, rng):
+    for place in in_ball(rng, 35, 3):
+        grid = mph.Grid.centered(1, size, place)
+        np.testing.assert_allclose(totals(grid, n, aperture_points=7), law(MODULES, grid), rtol=0.02)
+
+
+@pytest.mark.parametrize("shape", [(1, 1, 60), (60, 1, 1), (1, 40, 40)])
+@pytest.mark.parametrize("points", [1, 7])
+def test_capillaries_and_sheets_of_one_voxel_count_by_the_point_law(shape, points, rng):
+    for place in in_ball(rng, 10, 2):
+        grid = mph.Grid.centered(shape, 1.0, place)
+        np.testing.assert_allclose(totals(grid, 64, aperture_points=points), law(MODULES, grid), rtol=0.02)
+
+
+def test_a_voxel_of_a_large_grid_counts_by_the_point_law(rng):
+    """The number of rays is the whole grid's, for whichever voxel."""
+    grid = mph.Grid.centered(64, 1.5)
+    for index in rng.integers(4, 60, (6, 3)):
+        volume = np.zeros(grid.shape)
+        volume[tuple(index)] = 1
+        place = grid.affine[:3, :3] @ index + grid.affine[:3, 3]
+        A = mph.Projector(grid, MODULES.views((64, 64), "real"), mph.Emission(MODULES))
+        expected = law(MODULES, mph.Grid.centered(1, 1.5, place))
+        np.testing.assert_allclose(A(volume).sum(axis=(1, 2), dtype=float), expected, rtol=0.02)
+        # And the adjoint of ones is the sensitivity of that voxel, without gaps.
+    ones = np.ones(A.shape_out)
+    assert A.T(ones)[tuple(index)] == pytest.approx(law(MODULES, mph.Grid.centered(1, 1.5, place)).sum(), rel=0.02)
+
+
+@pytest.mark.parametrize(
+    "options", [{"pixel_points": 1}, {"pixel_points": 3}, {"pixel_points": 1, "aperture_points": 7}]
+)
+def test_too_few_points_are_warned_of_with_the_error_that_they_make(options):
+    """The error found for many places is at most what the warning says; where the tolerance is met, nothing is said."""
+    views = MODULES.views((64, 64), "real")
+    with pytest.warns(InputWarning, match=r"in module \d+") as caught:
+        mph.Projector(mph.Grid.centered(1, 2.0), views, mph.Emission(MODULES, **options))
+    assert len(caught) == 1 and "\n" not in str(caught[0].message)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        mph.Projector(mph.Grid.centered(1, 2.0), views, mph.Emission(MODULES, tolerance=10.0, **options))
+        mph.Projector(mph.Grid.centered(1, 2.0), views, mph.Emission(MODULES))
+        mph.Projector(mph.Grid.centered(1, 40.0), views, mph.Emission(MODULES, pixel_points=1))
+
+
+def test_what_no_number_of_points_can_do_is_said():
+    with pytest.warns(InputWarning, match="smaller pixels"):
+        mph.Projector(mph.Grid.centered(1, 0.05), MODULES.views((8, 8), "real"), mph.Emission(MODULES))
+
+
+@pytest.mark.parametrize("hole_points", [1, 5])
+def test_expected_error_bounds_the_error_of_a_shadow(hole_points, rng):
+    """Of the sum of a box's chords over the lattice, for many places of the box: against its volume."""
+    for _ in range(30):
+        edges = np.zeros((1, 3, 2))
+        edges[0, :2] = np.diag(rng.uniform(0.1, 0.8, 2))  # seen along an axis: the worst there is
+        n = int(rng.choice([21, 55, 90]))
+        bound = expected_error(edges, n, hole_points)
+        places = np.concatenate([offsets(n, rng.random(2)) for _ in range(hole_points)])
+        size = edges[0].max(axis=0)
+        counts = []
+        for corner in rng.random((300, 2)):
+            counts.append(((places - corner) % 1 < size).all(axis=1).mean() / size.prod())
+        assert np.abs(np.array(counts) - 1).max() < 1.25 * bound
+
+
+def test_points_grow_as_voxels_shrink_and_with_the_distance():
+    views = MODULES.views((64, 64), "real")
+    needed = [points_needed(shadow_edges(views, 0, mph.Grid.centered(1, s)), 0.02) for s in (8.0, 2.0, 1.0, 0.5)]
+    assert needed == sorted(needed) and needed[0] < 10 < 100 < needed[-1]
+    far, near = (mph.Grid.centered(1, 1.0, sign * 60 * MODULES.principal_rays[0]) for sign in (1, -1))
+    assert expected_error(shadow_edges(views, 0, far), 55) > 1.5 * expected_error(shadow_edges(views, 0, near), 55)
+
+
+@pytest.mark.parametrize("n", [1, 2, 3, 7, 21, 100, 987])
+def test_lattices_fill_pixels_evenly(n):
+    points = lattice(n)
+    for side in points.T:
+        np.testing.assert_allclose(np.sort(side), (np.arange(n) + 0.5) / n - 0.5, atol=1e-12)
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_adjoint_with_points_of_pixels_and_hole(backend, system, rng):
+    grid = general_grid(rng, (9, 8, 7))
+    body = turned_grid((6, 5, 7), 25.0)
+    mu = mph.Volume(rng.uniform(0, 0.05, body.shape), body, "mu")
+    for options in (
+        {"pixel_points": 5},
+        {"pixel_points": 3, "aperture_points": 4, "crystal_mu": 0.1, "depth_layers": 2},
+    ):
+        model = mph.Emission(system[3:6], mu, tolerance=1e9, within_crystal=True, within_walls=True, **options)
+        assert_adjoint(mph.Projector(grid, system[3:6].views((10, 11)), model, backend, threads=2), rng)
+    assert_adjoint(mph.Projector(grid, system[3:6].views((10, 11)), mph.Transmission(5), backend), rng)
+
+
+@pytest.mark.parametrize("backend", BACKENDS[1:])
+def test_backends_agree_on_points_of_pixels(backend, system, rng):
+    grid = general_grid(rng, (9, 8, 7))
+    x, views = rng.random(grid.shape), system.views((9, 11))
+    for model in (mph.Emission(system, pixel_points=5, aperture_points=3, tolerance=1e9), mph.Transmission(8)):
+        reference, y = (mph.Projector(grid, views, model, name)(x) for name in ("numpy", backend))
+        assert reference.any()
+        np.testing.assert_allclose(y, reference, rtol=2e-5, atol=2e-5 * reference.max())
+
+
+def test_real_and_virtual_detectors_take_the_same_points(system, rng):
+    grid = general_grid(rng, (9, 8, 7))
+    x = rng.random(grid.shape)
+    model = mph.Emission(system, pixel_points=5, aperture_points=3, tolerance=1e9)
+    real = mph.Projector(grid, system.views((9, 10), "real", pitch=4.0), model)(x)
+    virtual = mph.Projector(grid, system.views((9, 10), "virtual", 3.0, pitch=12.0), model)(x)
+    np.testing.assert_allclose(virtual[:, ::-1, ::-1], real, rtol=1e-5, atol=1e-5 * real.max())
+
+
+def test_points_of_a_pixel_are_those_of_finer_pixels(rng):
+    """An image through many points of each pixel is that of four times finer pixels through their middles, binned."""
+    system = one_module()
+    grid = turned_grid((9, 8, 7), 6.0)
+    x = rng.random(grid.shape)
+    fine = mph.Projector(grid, system.views((240, 240), pitch=5.0), mph.Transmission())(x)[0]
+    area = mph.Projector(grid, system.views((30, 30), pitch=40.0), mph.Transmission(55))(x)[0]
+    binned = fine.reshape(30, 8, 30, 8).mean(axis=(1, 3))
+    np.testing.assert_allclose(area, binned, atol=0.01 * binned.max())
+    centres = mph.Projector(grid, system.views((30, 30), pitch=40.0), mph.Transmission())(x)[0]
+    assert np.abs(centres - binned).max() > 2 * np.abs(area - binned).max()
+
+
+def test_only_pixels_that_can_see_the_volume_are_traced_and_none_is_missed(system, rng):
+    """A few filled voxels in a large grid, and a grid around a pinhole: the same as in the reference without a window."""
+    grid = mph.Grid.centered(24, 8.0)
+    x = np.zeros(grid.shape)
+    x[3:5, 17:20, 11] = rng.random((2, 3))
+    views = system.views((20, 24))
+    for model in (mph.Transmission(), mph.Emission(system, pixel_points=3, tolerance=1e9)):
+        image = mph.Projector(grid, views, model)(x)
+        for m in range(len(system)):
+            sources, targets = views.rays(m)
+            if model.name == "transmission":
+                expected = mph.trace_rays(mph.Volume(x, grid), sources, targets, "numpy").reshape(views.shape)
+                np.testing.assert_allclose(image[m], expected, atol=2e-5 * max(expected.max(), 1))
+        assert image.any() and not mph.Projector(grid, views, model)(np.zeros(grid.shape)).any()
+    around = mph.Grid.centered(6, 30.0, system.centers[0])
+    ones = mph.Volume(np.ones(around.shape), around)
+    expected = mph.trace_rays(ones, *views.rays(0), "numpy").reshape(views.shape)
+    np.testing.assert_allclose(mph.Projector(around, views, mph.Transmission())(ones)[0], expected, rtol=2e-5)
+
+
+def test_bad_numbers_of_points_are_refused(system):
+    for bad in (0, -1, 1.5, True, "many", 10**6):
+        for model in (lambda n: mph.Emission(system, pixel_points=n), mph.Transmission):
+            with pytest.raises(InputError, match="pixel_points") as error:
+                model(bad)
+            assert "\n" not in str(error.value)
+    for bad in (0, -0.1, np.nan, None):
+        with pytest.raises(InputError, match="tolerance"):
+            mph.Emission(system, tolerance=bad)

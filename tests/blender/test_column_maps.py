@@ -32,7 +32,7 @@ def unread(workbook, tmp_path) -> Path:
     sheet["E1"], sheet["E2"] = "l", None
     for column, text in enumerate(CM.values(), start=2):
         sheet.cell(1, column, text)
-        sheet.cell(2, column, None)
+        sheet.cell(2, column).value = None
         for row in range(3, 83):
             sheet.cell(row, column).value /= 10
     path = tmp_path / "own.xlsx"

@@ -11,9 +11,10 @@ from ..addon.column_maps import ColumnMapProperties
 from ..core.workbook.quantities import QUANTITIES
 
 WIDTH = 760  # of the dialog, pixels
-_LINE = 118  # characters that fit in it
-_DOUBTS = 3  # more lines than that push the preview off the screen
+_LINE = 128  # characters that fit in it
+_DOUBTS = 2  # more of them push the preview off the screen
 _REMARKS = 2
+_RESULT = 9  # lines kept for the preview: a dialog that grows moves away from the mouse
 
 
 def draw(layout: bpy.types.UILayout, form: ColumnMapProperties) -> None:
@@ -73,31 +74,35 @@ def _cells(layout: bpy.types.UILayout) -> list[bpy.types.UILayout]:
 
 
 def _result(layout: bpy.types.UILayout, form: ColumnMapProperties) -> None:
-    box = layout.box()
+    box = layout.box().column(align=True)
+    rows = json.loads(form.preview or "[]")
     if form.refusal:
         box.alert = True
-        _lines(box, [form.refusal], 1, "ERROR")
-        return
-    rows = json.loads(form.preview or "[]")
-    if not rows:
-        return
-    box.label(text="Read as, in mm:", icon="CHECKMARK")
-    columns = box.row()
-    for texts in zip(*rows, strict=True):
-        column = columns.column(align=True)
-        for i, text in enumerate(texts):
-            cell = column.row()
-            cell.alignment, cell.active = "RIGHT", i > 0
-            cell.label(text=text)
-    _lines(box, json.loads(form.remarks or "[]"), _REMARKS, "ERROR")
+        used = _lines(box, [form.refusal], 1, "ERROR")
+    else:
+        box.label(text="Read as, in mm:", icon="CHECKMARK")
+        columns = box.row()
+        for texts in zip(*rows, strict=True):
+            column = columns.column(align=True)
+            for i, text in enumerate(texts):
+                cell = column.row()
+                cell.alignment, cell.active = "RIGHT", i > 0
+                cell.label(text=text)
+        used = 1 + len(rows) + _lines(box, json.loads(form.remarks or "[]"), _REMARKS, "ERROR")
+    for _ in range(used, _RESULT):
+        box.label(text="")
 
 
-def _lines(layout: bpy.types.UILayout, texts: list[str], most: int, icon: str) -> None:
-    """Texts of any length, broken into lines."""
+def _lines(layout: bpy.types.UILayout, texts: list[str], most: int, icon: str) -> int:
+    """Texts of any length, broken into lines; says how many."""
     column = layout.column(align=True)
-    column.scale_y = 0.8
-    for text in texts[:most]:
-        for i, line in enumerate(textwrap.wrap(text, _LINE)):
-            column.label(text=line, icon=icon if i == 0 else "BLANK1")
+    lines = [
+        (line, icon if i == 0 else "BLANK1")
+        for text in texts[:most]
+        for i, line in enumerate(textwrap.wrap(text, _LINE))
+    ]
     if len(texts) > most:
-        column.label(text=f"... and {len(texts) - most} more", icon="BLANK1")
+        lines.append((f"... and {len(texts) - most} more", "BLANK1"))
+    for line, sign in lines:
+        column.label(text=line, icon=sign)
+    return len(lines)

@@ -8,9 +8,9 @@ from dataclasses import dataclass, replace
 from ..errors import InputError
 from ..recording import recorded_warnings
 from .book import HEADING_ROWS, Book, Outdated, Sheet, Uncomputed
-from .column_map import ColumnMap, MappedColumn, MappedTable
+from .column_map import ColumnMap, Joined, MappedColumn, MappedTable
 from .layout import Layout, column_map_of
-from .quantities import DIMENSIONS, NEEDED, POSITION, may_mean, understood
+from .quantities import DIMENSIONS, NEEDED, POSITION, is_number_heading, may_mean, understood
 from .recognition import OWN_SHEETS, SheetSeen, recognize, recognized_layout
 
 _LONGEST = 40
@@ -210,8 +210,18 @@ def _guessed(book: Book, missing: list[str], tables: list[MappedTable]) -> list[
     made = []
     for (title, row, first, last), columns in found.items():
         how = None if any(c.quantity in POSITION for c in columns) else "one for all" if first == last else "in order"
-        made.append(MappedTable(title, first, last, tuple(columns), rows=how, header_row=row))  # type: ignore[arg-type]
+        number = None if how == "one for all" else _number_column(book.sheets[title], used)
+        made.append(MappedTable(title, first, last, tuple(columns), number, how, row))  # type: ignore[arg-type]
     return made
+
+
+def _number_column(sheet: Sheet, used: set[tuple[str, str]]) -> str | None:
+    """Letters of the one column of a sheet that is headed as the modules' numbers."""
+    from openpyxl.utils import get_column_letter as letters
+
+    headed = {letters(c) for (r, c), text in sheet.texts.items() if r <= HEADING_ROWS and is_number_heading(text)}
+    headed = {column for column in headed if (sheet.name, column) not in used}
+    return headed.pop() if len(headed) == 1 else None
 
 
 def _merged(tables: list[MappedTable], guessed: list[MappedTable]) -> list[MappedTable]:
@@ -225,7 +235,10 @@ def _merged(tables: list[MappedTable], guessed: list[MappedTable]) -> list[Mappe
         else:
             found.append(table)
     found.sort(key=lambda table: not any(c.quantity in POSITION for c in table.columns))
+    joined: Joined = "by number" if found and found[0].number else "in order"
     return [
-        replace(table, rows=None) if i == 0 else replace(table, rows=table.rows or "in order")
+        replace(table, rows=None)
+        if i == 0
+        else replace(table, rows=table.rows if table.rows == "one for all" else joined if table.number else "in order")
         for i, table in enumerate(found)
     ]

@@ -136,6 +136,7 @@ class ColumnMapProperties(bpy.types.PropertyGroup):
     )  # fmt: skip
     refusal: StringProperty(name="Refusal", description="Why the workbook cannot be read so")
     remarks: StringProperty(name="Remarks", description="The reader's warnings, JSON", options={"HIDDEN"})
+    n_modules: IntProperty(name="Modules", description="How many are read", min=0)
     preview: StringProperty(
         name="Preview", description="Headings, then rows of numbers as they are read, JSON", options={"HIDDEN"}
     )
@@ -171,6 +172,8 @@ def fill(form: ColumnMapProperties, workbook: Path, columns: ColumnMap | None = 
         if table.rows is not None:
             values["rows"] = table.rows.upper().replace(" ", "_")
         _set(form.tables.add(), values)
+    if not form.tables:
+        form.tables.add()
     found = {c.quantity: (i, c) for i, table in enumerate(said.tables[:MAX_TABLES], start=1) for c in table.columns}
     for name in dict.fromkeys((*_ALWAYS, *(name for name in found if name in QUANTITIES))):
         quantity = form.quantities.add()
@@ -232,14 +235,15 @@ def update(form: ColumnMapProperties) -> None:
         for quantity in form.quantities:
             quantity.seen = _seen(form, quantity, workbook)
         with recorded_warnings() as warned:
-            form.preview = json.dumps(preview(workbook, column_map(form)))
+            form.n_modules, rows = preview(workbook, column_map(form))
+        form.preview = json.dumps(rows)
         form.remarks = json.dumps(list(warned))
     except InputError as error:
         form.refusal = str(error)
 
 
-def preview(workbook: Path, columns: ColumnMap) -> list[list[str]]:
-    """Headings, then the numbers of the first modules and the last, mm, as the map has them read.
+def preview(workbook: Path, columns: ColumnMap) -> tuple[int, list[list[str]]]:
+    """How many modules the map has read; headings, then the numbers of the first modules and the last, mm.
 
     Raises
     ------
@@ -257,7 +261,7 @@ def preview(workbook: Path, columns: ColumnMap) -> list[list[str]]:
     ]
     if len(rows) > _FIRST + 1:
         rows[_FIRST:-1] = [["..."] * len(rows[0])] if len(rows) > _FIRST + 2 else rows[_FIRST:-1]
-    return [["Module", "x1", "y1", "z1", "b", "d", "R", "Ld", "Td", "l"], *rows]
+    return len(system), [["Module", "x1", "y1", "z1", "b", "d", "R", "Ld", "Td", "l"], *rows]
 
 
 def accept(form: ColumnMapProperties) -> ColumnMap:
@@ -316,6 +320,8 @@ def _seen(form: ColumnMapProperties, quantity: ColumnMapQuantity, workbook: Path
     """What stands in a quantity's column, as far as it is shown: the heading and the first number."""
     from openpyxl.utils import column_index_from_string
 
+    if quantity.name == "l" and not quantity.column.strip():
+        return "(by the design formula)"
     if quantity.table > len(form.tables):
         return ""
     table = form.tables[quantity.table - 1]

@@ -80,7 +80,7 @@ def _result(layout: bpy.types.UILayout, form: ColumnMapProperties) -> None:
         box.alert = True
         used = _lines(box, [form.refusal], 1, "ERROR")
     else:
-        box.label(text="Read as, in mm:", icon="CHECKMARK")
+        box.label(text=f"{form.n_modules} modules, in mm:", icon="CHECKMARK")
         columns = box.row()
         for texts in zip(*rows, strict=True):
             column = columns.column(align=True)

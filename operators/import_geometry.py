@@ -98,6 +98,7 @@ class MPHDRR_OT_import_geometry(bpy.types.Operator):
         except InputError as error:
             if self._can_be_mended(form, error):
                 return self._ask_columns(context)
+            column_maps.clear(form)
             self.report({"ERROR"}, str(error))
             return {"CANCELLED"}
         try:

@@ -25,8 +25,11 @@ def test_a_refused_workbook_is_imported_by_its_columns(blender_window, work_fold
     path = work_folder / "zentimeter.xlsx"
     book.save(path)
 
-    result, pictures = work_folder / "result.json", [work_folder / "opened.png", work_folder / "settled.png"]
-    blender_window(SCRIPT.read_text(encoding="utf-8"), path, result, *pictures, seconds=45)
+    result, pictures = (
+        work_folder / "result.json",
+        [work_folder / f"{name}.png" for name in ("opened", "complete", "replace")],
+    )
+    blender_window(SCRIPT.read_text(encoding="utf-8"), path, result, *pictures, seconds=60)
     seen = json.loads(result.read_text())
     assert seen["ok"], seen
     assert seen["opened"]["refusal"] and "x1" in seen["opened"]["doubts"]
@@ -34,4 +37,4 @@ def test_a_refused_workbook_is_imported_by_its_columns(blender_window, work_fold
     assert seen["settled"]["refusal"] == "" and '"277.002"' in seen["settled"]["preview"]
     units = {c.quantity: c.unit for table in ColumnMap.from_toml(seen["source"]).tables for c in table.columns}
     assert units == {"x1": "cm", "y1": "cm", "z1": "cm", "d": "mm", "R": "mm", "Ld": "mm", "Td": "mm"}
-    assert seen["emptied"]
+    assert seen["emptied"] and seen["kept"] and seen["moved_back"]

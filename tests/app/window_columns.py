@@ -1,6 +1,7 @@
 """The column map dialog in the window: opened by a workbook that is refused, settled, confirmed.
 
-Arguments after ``--``: the workbook, the file for what was seen, pictures of the dialog as it opens and settled.
+Arguments after ``--``: the workbook, the file for what was seen, three pictures: the dialog as it
+opens, the dialog with a map that is complete, and what comes after it over a scanner that has changed.
 """
 
 from __future__ import annotations
@@ -14,7 +15,7 @@ from pathlib import Path
 
 import bpy
 
-workbook, result_file, *pictures = (Path(word) for word in sys.argv[sys.argv.index("--") + 1 :][:4])
+workbook, result_file, *pictures = (Path(word) for word in sys.argv[sys.argv.index("--") + 1 :][:5])
 bpy.context.preferences.view.show_splash = False
 seen: dict[str, object] = {"ok": False}
 _PATIENCE = 20.0  # s
@@ -26,6 +27,11 @@ def form():
 
 def scanners():
     return [c for c in bpy.data.collections if c.mphdrr_scanner.is_scanner]
+
+
+def module(number: int):
+    found = (o for o in scanners()[0].all_objects if o.mphdrr_module.is_module)
+    return next(o for o in found if o.mphdrr_module.number == number)
 
 
 def press(key: str) -> None:
@@ -59,13 +65,30 @@ def steps():
         quantity.table, quantity.column, quantity.unit = 1, column, "cm"
     yield 1
     seen["settled"] = {"refusal": form().refusal, "preview": form().preview}
-    subprocess.run(["xdotool", "mousemove_relative", "3", "0"], check=True)
-    yield 1
-    picture(pictures[1])
     press("Return")
     yield scanners
+    yield 1
     seen["source"] = json.loads(scanners()[0].mphdrr_scanner.source)["columns"]
     seen["emptied"] = form().workbook == ""
+
+    # Again, over a module that has been moved: the question whether to drop that comes after the columns.
+    place, module(1).location.x = module(1).location.x, 300.0
+    columns = result_file.with_name("columns.toml")
+    columns.write_text(seen["source"])
+    with bpy.context.temp_override(window=window, area=area, region=region):
+        bpy.ops.mphdrr.import_geometry(
+            "INVOKE_DEFAULT", filepath=str(workbook), columns=str(columns), choose_columns=True
+        )
+    yield lambda: form().preview
+    yield 2
+    picture(pictures[1])
+    press("Return")
+    yield 3
+    picture(pictures[2])
+    seen["kept"] = module(1).location.x == 300.0
+    press("Return")
+    yield lambda: scanners() and module(1).location.x != 300.0
+    seen["moved_back"] = abs(module(1).location.x - place) < 1e-4
     seen["ok"] = True
 
 

@@ -132,6 +132,7 @@ def test_what_is_missing_is_asked_for_and_then_read(form, unread, dc_spect):
     for name in CM:
         quantity(form, name).unit = "cm"
     assert form.refusal == ""
+    assert form.n_modules == 80
     assert quantity(form, "x1").seen == f"{CM['x1']}: 27.7002"
     heads, *rows = json.loads(form.preview)
     assert [row[0] for row in rows] == ["1", "2", "3", "...", "80"]

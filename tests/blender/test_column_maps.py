@@ -221,6 +221,13 @@ def test_a_refused_workbook_names_the_way_and_a_map_reads_it(scene, unread, map_
     assert scanner.read_scanner(collection).source.columns == columns
 
 
+def test_an_import_that_is_repeated_does_not_ask_again(scene, unread, columns):
+    """As by Adjust Last Operation, which runs the operator with the properties that it had."""
+    asked = {"choose_columns": True, "chosen_columns": columns.to_toml()}
+    assert bpy.ops.mphdrr.import_geometry(filepath=str(unread), **asked) == {"FINISHED"}
+    assert scanner.source(scanner.active_scanner(scene)).columns == columns
+
+
 def test_a_script_is_told_that_a_dialog_needs_a_window(unread, map_file):
     with pytest.raises(RuntimeError, match=r"set columns to a column map \(\.toml\) instead"):
         bpy.ops.mphdrr.import_geometry(filepath=str(unread), choose_columns=True)

@@ -84,7 +84,8 @@ FROZEN = {
     },
 }  # fmt: skip
 DEFAULTS = {
-    "part": "NONE", "length_mode": "TYPED", "edge_at": "MIDDLE", "kind": "VOLUME", "contrast": "modified", "model": "TRANSMISSION",
+    "part": "NONE", "length_mode": "TYPED", "edge_at": "MIDDLE", "kind": "VOLUME", "contrast": "modified",
+    "model": "TRANSMISSION",
     "isotope": "NONE", "aperture_material": "NUMBER", "edge": "PAIX", "crystal_material": "NUMBER",
     "detector": "VIRTUAL", "backend": "AUTO",
 }  # fmt: skip

@@ -50,7 +50,18 @@ from .system import PinholeSystem
 from .views import Views
 from .volume import Volume
 from .volume_io import read_volume, write_volume
-from .workbook import SystemSource, WrittenWorkbook, read_system, write_system
+from .workbook import (
+    ColumnMap,
+    ColumnMapDraft,
+    MappedColumn,
+    MappedTable,
+    SystemSource,
+    WrittenWorkbook,
+    draft_column_map,
+    preview_workbook,
+    read_system,
+    write_system,
+)
 
 __all__ = [
     "ISOTOPES",
@@ -59,6 +70,8 @@ __all__ = [
     "Cancelled",
     "Capsule",
     "CardiacTorso",
+    "ColumnMap",
+    "ColumnMapDraft",
     "Cone",
     "Cylinder",
     "DefrisePhantom",
@@ -73,6 +86,8 @@ __all__ = [
     "InverseSquareSum",
     "Isotope",
     "JaszczakPhantom",
+    "MappedColumn",
+    "MappedTable",
     "Material",
     "Mesh",
     "ModulePerformance",
@@ -105,6 +120,7 @@ __all__ = [
     "crop",
     "crop_to_box",
     "diffdrr_density",
+    "draft_column_map",
     "ellipse_rings",
     "euler_pose",
     "fit_rings",
@@ -118,6 +134,7 @@ __all__ = [
     "pad",
     "pinhole_views",
     "plate_rings",
+    "preview_workbook",
     "project_run",
     "random_pose",
     "read_geometry",

@@ -4,9 +4,12 @@ book.py          the file: opened, refused, its cells as Python values
 references.py    B3, Main!$B$3:$B$82, A:C in formulas
 tables.py        Table1[v], Table1[[#This Row],[x]] in formulas
 formulas.py      values of formulas
-headings.py      which column holds which quantity, found by symbols ("x1") and descriptions
-rows.py          which rows hold the modules
-checks.py        the sheet's own derived numbers against the formulas
+quantities.py    what the columns are: quantities, their headings and units
+recognition.py   which cells hold them, by the headings; doubts of what is not understood
+column_map.py    `ColumnMap`: what a person says of that instead
+layout.py        which cell holds a quantity of a module, either way
+draft.py         a column map for a person to check, and a preview of the cells
+checks.py        the sheet's own derived numbers against the formulas, and what scanners are like
 reader.py        `read_system`, which joins these
 source.py        `SystemSource`, where each number came from
 
@@ -25,8 +28,22 @@ new_workbook.py  a workbook in the users' layout
 
 from __future__ import annotations
 
+from .column_map import ColumnMap, MappedColumn, MappedTable
+from .draft import ColumnMapDraft, draft_column_map, preview_workbook
 from .reader import read_system
 from .source import QuantityCells, SystemSource
 from .writer import WrittenWorkbook, write_system
 
-__all__ = ["QuantityCells", "SystemSource", "WrittenWorkbook", "read_system", "write_system"]
+__all__ = [
+    "ColumnMap",
+    "ColumnMapDraft",
+    "MappedColumn",
+    "MappedTable",
+    "QuantityCells",
+    "SystemSource",
+    "WrittenWorkbook",
+    "draft_column_map",
+    "preview_workbook",
+    "read_system",
+    "write_system",
+]

@@ -9,7 +9,7 @@ import numpy as np
 
 from ..errors import InputError
 from ..system import PinholeSystem
-from .headings import Table
+from .layout import Table
 from .sheet_xml import SheetXml
 from .workbook_xml import WorkbookXml, areas_in
 
@@ -162,12 +162,13 @@ def _columns(table: Table, rows: Sequence[int], number_column: int | None) -> li
     summary stays where it is: what is apart from the table, or beside it with a formula over several rows.
     """
     sheet, wanted = table.sheet, set(rows)
-    cells = {at for cells in (sheet.stored, sheet.formulas) for at in cells if at[0] in wanted}
+    cells = {at for at, cell in sheet.cells.items() if at[0] in wanted and not cell.blank}
     filled = np.bincount([column for _, column in cells], minlength=1)
-    own = {column for _, column, _ in table.headings} | {number_column or 0}
+    own = {column for column, _ in table.columns.values()} | {number_column or 0}
     own |= {int(column) for column in np.flatnonzero(2 * filled >= len(rows))}
     used = set(np.flatnonzero(filled).tolist()) | own
-    summing = {column for (row, column), formula in sheet.formulas.items() if row in wanted and _is_over_rows(formula)}
+    formulas = {at: cell.formula for at, cell in sheet.cells.items() if at[0] in wanted and cell.formula is not None}
+    summing = {column for (_, column), formula in formulas.items() if _is_over_rows(formula)}
     for step in (-1, 1):
         for column in sorted(own):
             beside = []

@@ -4,33 +4,56 @@ from __future__ import annotations
 
 import hashlib
 import io
-import math
 import os
-import warnings
 import zipfile
-from collections.abc import Iterator
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from ..errors import InputError
-from .formulas import CellError, NotComputable, evaluate
+from .formulas import CellError, NotComputable
+from .sheet_xml import At, Cell, Unreadable
+from .workbook_xml import Place, WorkbookXml
 
 MAX_FILE_BYTES = 256 * 2**20
 MAX_UNPACKED_BYTES = 2**30
 MAX_ROWS = 100_000
 """Rows with something in them, in a sheet that is read."""
+SAME_RESULT = 1e-6
+"""Relative, and absolute: a formula's stored value differs less from what its inputs give."""
+
+HEADING_ROWS = 20
+"""Headings stand in a sheet's first rows."""
 
 _OLE = bytes.fromhex("d0cf11e0a1b11ae1")
 _ENCRYPTED = "EncryptedPackage".encode("utf-16-le")
 
 
 class Uncomputed(str):
-    """Stands for a formula that has no stored value and cannot be computed here; the text says why."""
+    """Stands for a formula that has no value to rely on and cannot be computed here; the text says why."""
+
+
+class Outdated(NamedTuple):
+    """Stands for a formula whose stored value is not what its inputs give."""
+
+    stored: Any
+    computed: Any
 
 
 class Book:
-    """An .xlsx or .xlsm file; `content` is its bytes.
+    """An .xlsx or .xlsm file.
+
+    Attributes
+    ----------
+    path : Path
+    sha256 : str
+        Of the file's bytes, hexadecimal.
+    workbook : WorkbookXml
+    sheets : dict
+        Name -> `Sheet`, in the workbook's order.
+    unverified : dict
+        Formula that cannot be computed here and whose stored value was taken although the file asks for calculation
+        -> why it cannot.
 
     Raises
     ------
@@ -40,133 +63,152 @@ class Book:
 
     def __init__(self, path: str | os.PathLike[str]) -> None:
         self.path = Path(path)
-        self.content = _read(self.path)
-        self.sha256 = hashlib.sha256(self.content).hexdigest()
-        _refuse_other_formats(self.path, self.content)
-        self._values = self._load(data_only=True)
-        self.sheets = {ws.title: Sheet(self, ws.title) for ws in self._values.worksheets}
-        self._by_folded_name = {name.casefold(): sheet for name, sheet in self.sheets.items()}
+        content = _read(self.path)
+        self.sha256 = hashlib.sha256(content).hexdigest()
+        _refuse_other_formats(self.path, content)
+        self.workbook = WorkbookXml(content, self.path.name)
+        self.sheets = {title: Sheet(self, title) for title in self.workbook.sheets}
+        self.unverified: dict[Place, str] = {}
+        self._computed: dict[Place, Any] = {}
 
     def sheet(self, name: str) -> Sheet | None:
         """The sheet called `name` in whatever case, as in a formula."""
-        return self._by_folded_name.get(name.casefold())
+        title = self.workbook.title(name)
+        return None if title is None else self.sheets[title]
 
-    @cached_property
-    def _formulas(self) -> Any:
-        # A second load, only for files in which a wanted cell has no stored value.
-        return self._load(data_only=False)
+    def original(self, place: Place) -> Cell | None:
+        """A cell as it was read."""
+        return self.workbook.sheets[place[0]].original.get(place[1:])
 
-    def _load(self, data_only: bool) -> Any:
-        import openpyxl
+    def computed(self, place: Place) -> Any:
+        """What a formula's inputs give, all the way from what is typed; `Uncomputed` where that is beyond us."""
+        waiting, begun = [place], set()
+        while waiting:
+            current = waiting[-1]
+            if current in self._computed:
+                waiting.pop()
+                continue
+            needed: list[Place] = []
+            result = self._result(current, needed)
+            loop = next((other for other in needed if other == current or other in begun), None)
+            if loop is not None:
+                result = Uncomputed(f"it refers to {self.workbook.text(loop)}, which refers back to it")
+            elif needed:
+                begun.add(current)
+                waiting += needed
+                continue
+            self._computed[current] = result
+        return self._computed[place]
 
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # openpyxl's, about styles and extensions that are of no concern here
-            try:
-                return openpyxl.load_workbook(
-                    io.BytesIO(self.content), read_only=True, data_only=data_only, keep_links=False
-                )
-            except Exception as error:  # whatever openpyxl meets in a damaged file
-                raise InputError(
-                    f"{self.path}: not an .xlsx workbook, or a damaged one ({_one_line(error)})"
-                ) from error
+    def _result(self, place: Place, needed: list[Place]) -> Any:
+        """What a formula gives, or nothing to rely on and, in `needed`, the formulas that must be computed before."""
 
-    def rows(self, sheet: str, data_only: bool = True, last: int | None = None) -> Iterator[tuple[int, list[Any]]]:
-        """(row number, its non-empty openpyxl cells) of each row that has any, up to row `last`."""
-        worksheet = (self._values if data_only else self._formulas)[sheet]
-        worksheet.reset_dimensions()  # the size stated in the file may be wrong, or a million empty rows
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
-            try:
-                for row in worksheet.iter_rows(max_row=last):
-                    # "str" without a value is a formula whose stored value is the empty text.
-                    cells = [cell for cell in row if cell.value is not None or cell.data_type == "str"]
-                    if cells:
-                        yield cells[0].row, cells
-            except Exception as error:
-                raise InputError(f"{self.path.name}: sheet {sheet} cannot be read ({_one_line(error)})") from error
+        def value_of(other: Place) -> Any:
+            cell = self.original(other)
+            if cell is None:
+                return None
+            if isinstance(cell.value, Unreadable):
+                raise NotComputable(f"{self.workbook.text(other)} holds {cell.value!r}")
+            if cell.formula is None:
+                return cell.value
+            if other not in self._computed:
+                needed.append(other)
+                return 0.0
+            value = self.relied_on(other)
+            if isinstance(value, Uncomputed):
+                raise NotComputable(f"it needs {self.workbook.text(other)}, and there: {value}")
+            return value
+
+        cell = self.original(place)
+        assert cell is not None and cell.formula is not None, "only formulas are computed"
+        if cell.array is not None:
+            return Uncomputed("it is an array formula or a data table")
+        try:
+            return self.workbook.calculated(place, cell.formula, value_of)
+        except NotComputable as why:
+            return Uncomputed(str(why))
+
+    def relied_on(self, place: Place) -> Any:
+        """What a formula gives: as computed here, else as stored, else `Uncomputed`."""
+        computed = self.computed(place)
+        cell = self.original(place)
+        if not isinstance(computed, Uncomputed) or cell is None or cell.value is None:
+            return computed
+        if self.workbook.asks_for_calculation:
+            # Programs that cannot calculate, as XlsxWriter, store a 0 for every formula.
+            if cell.value == 0 or cell.value == "":
+                return Uncomputed(f"it stores {cell.value!r} and the file asks to be calculated, but {computed}")
+            self.unverified[place] = str(computed)
+        return cell.value
 
 
 class Sheet:
-    """The cells of one sheet, read when first asked for."""
+    """The cells of one sheet, as they are in the file."""
 
     def __init__(self, book: Book, name: str) -> None:
         self.book = book
         self.name = name
-        self._computed: dict[tuple[int, int], Any] = {}
-        self._computing: set[tuple[int, int]] = set()
 
-    def top(self, last: int) -> dict[tuple[int, int], Any]:
-        """{(row, column): value} of the first `last` rows, both counted from 1."""
-        rows = self.book.rows(self.name, last=last)
-        return {(row, cell.column): _value(cell) for row, cells in rows for cell in cells}
-
-    @cached_property
-    def stored(self) -> dict[tuple[int, int], Any]:
-        """{(row, column): value} of the cells that have a stored value."""
-        return self._read(data_only=True)
-
-    @cached_property
-    def formulas(self) -> dict[tuple[int, int], str]:
-        """{(row, column): formula} of the cells that hold one."""
-        cells = self._read(data_only=False)
-        return {at: value for at, value in cells.items() if isinstance(value, str) and value.startswith("=")}
-
-    def _read(self, data_only: bool) -> dict[tuple[int, int], Any]:
-        found: dict[tuple[int, int], Any] = {}
-        for n, (row, cells) in enumerate(self.book.rows(self.name, data_only)):
-            if n >= MAX_ROWS:
-                raise InputError(
-                    f"{self.book.path.name}: sheet {self.name} has more than {MAX_ROWS} rows with content: "
-                    "expected a row a module"
-                )
-            found.update({(row, cell.column): _value(cell) for cell in cells})
-        return found
+    @property
+    def cells(self) -> dict[At, Cell]:
+        """(row, column) -> cell, both counted from 1."""
+        return self.book.workbook.sheets[self.name].original
 
     @cached_property
     def rows(self) -> list[int]:
-        """The rows with content."""
-        return sorted({row for row, _ in (*self.stored, *self.formulas)})
+        """The rows with content; `InputError` where they are too many for a table of modules."""
+        found = sorted({at[0] for at, cell in self.cells.items() if not cell.blank})
+        if len(found) > MAX_ROWS:
+            raise InputError(
+                f"{self.book.path.name}: sheet {self.name} has more than {MAX_ROWS} rows with content: "
+                "expected a row a module"
+            )
+        return found
+
+    @cached_property
+    def texts(self) -> dict[At, str]:
+        """The cells that show text, typed or a formula's; below the first rows, those of formulas only if stored."""
+        shown = {at: cell.value if at[0] > HEADING_ROWS else self.value(*at) for at, cell in self.cells.items()}
+        return {at: text for at, text in shown.items() if type(text) is str and text.strip()}
+
+    def formula(self, row: int, column: int) -> str | None:
+        """The formula in a cell."""
+        cell = self.cells.get((row, column))
+        return cell.formula if cell is not None else None
 
     def value(self, row: int, column: int) -> Any:
-        """What a cell shows: None if blank, else a float, str, bool, date, `CellError` or `Uncomputed`."""
-        at = (row, column)
-        if at in self.stored:
-            return self.stored[at]
-        if at not in self.formulas:
+        """What a cell holds: None if blank, else a float, str, bool, `CellError`, `Uncomputed`, `Outdated` or `Unreadable`."""
+        cell = self.cells.get((row, column))
+        if cell is None:
             return None
-        if at not in self._computed:
-            self._computed[at] = self._compute(at)
-        return self._computed[at]
+        value = cell.value
+        if cell.formula is not None:
+            place = (self.name, row, column)
+            relied = self.book.relied_on(place)
+            if value is None or isinstance(relied, Uncomputed) or not _same_result(value, relied):
+                value = relied if value is None or isinstance(relied, Uncomputed) else Outdated(value, relied)
+        return None if type(value) is str and not value.strip() else value
 
-    def _compute(self, at: tuple[int, int]) -> Any:
-        if at in self._computing:
-            raise NotComputable(f"{self.place(*at)} refers to itself")
-        self._computing.add(at)
-        try:
-            return evaluate(self.formulas[at], self._referred)
-        except NotComputable as why:
-            return Uncomputed(str(why))
-        except RecursionError:
-            return Uncomputed("its chain of references is too long")
-        except (ArithmeticError, ValueError) as error:
-            return CellError("#DIV/0!" if isinstance(error, ZeroDivisionError) else "#NUM!")
-        finally:
-            self._computing.discard(at)
+    def is_date(self, row: int, column: int) -> bool:
+        """Whether a cell shows its number as a date or a time."""
+        from openpyxl.styles.numbers import is_date_format
 
-    def _referred(self, sheet_name: str | None, row: int, column: int) -> Any:
-        sheet = self if sheet_name is None else self.book.sheet(sheet_name)
-        if sheet is None:
-            raise NotComputable(f"there is no sheet {sheet_name}")
-        value = sheet.value(row, column)
-        if isinstance(value, Uncomputed):
-            raise NotComputable(value)
-        return value
+        cell = self.cells.get((row, column))
+        return cell is not None and is_date_format(self.number_format(row, column))
+
+    def number_format(self, row: int, column: int) -> str:
+        """How a cell shows its number, such as ``0.00" mm"``."""
+        return self.book.workbook.number_format(self.cells[row, column])
 
     def place(self, row: int, column: int) -> str:
         """A cell's name, e.g. ``Coordinates!B3``."""
-        from openpyxl.utils import get_column_letter
+        return self.book.workbook.text((self.name, row, column))
 
-        return f"{self.name}!{get_column_letter(column)}{row}"
+
+def _same_result(stored: Any, computed: Any) -> bool:
+    if type(stored) is float and type(computed) is float:
+        return abs(stored - computed) <= SAME_RESULT * max(1.0, abs(computed))
+    return type(stored) is type(computed) and stored == computed
 
 
 def _read(path: Path) -> bytes:
@@ -206,22 +248,3 @@ def _refuse_other_formats(path: Path, content: bytes) -> None:
         raise InputError(f"{path}: a binary .xlsb workbook, expected it saved as .xlsx")
     if "mimetype" in members and "content.xml" in members:
         raise InputError(f"{path}: an OpenDocument file, expected it saved as .xlsx")
-
-
-def _value(cell: Any) -> Any:
-    value = cell.value
-    if cell.data_type == "e":
-        return CellError(value)
-    if isinstance(value, (int, float)) and not isinstance(value, bool):
-        try:
-            return float(value)
-        except OverflowError:
-            return math.inf
-    if isinstance(value, str):
-        return value if value.strip() else None
-    # openpyxl wraps array formulas; their text is what counts here.
-    return getattr(value, "text", value)
-
-
-def _one_line(error: Exception) -> str:
-    return " ".join(f"{type(error).__name__}: {error}".split())[:160]

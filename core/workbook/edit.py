@@ -15,10 +15,11 @@ from ..system import PinholeSystem
 from .arrangement import Arrangement, arrange, matched
 from .cells import module_number
 from .checks import EXACT, derived, is_by_design
-from .headings import DIMENSIONS, POSITION, Table
+from .column_map import ColumnMap
+from .layout import Column, Table, column_map_of
+from .quantities import DIMENSIONS, POSITION
 from .reader import Reading
 from .recalculate import agree
-from .rows import dimension_rows
 from .workbook_xml import Place, WorkbookXml
 
 _SHOWN = 3
@@ -50,8 +51,9 @@ class Edit:
 
     def __init__(self, system: PinholeSystem, reading: Reading, workbook: WorkbookXml) -> None:
         self.system, self.old, self.workbook = system, reading.system, workbook
-        self.columns, self.modules = reading.columns, reading.modules
-        self.numbered = reading.modules.number_column is not None
+        self.layout, self.given = reading.layout, reading.given
+        self.columns, self.modules = reading.layout.columns, reading.layout.modules
+        self.numbered = self.modules.number_column is not None
         self.old_of = matched(system, self.old, self.numbered)
         self.required: dict[Place, float] = {}
         self.derived: dict[Place, float] = {}
@@ -81,7 +83,7 @@ class Edit:
                 self._warn_of_short_ranges(arrangement)
 
     def _refuse_unheld(self) -> None:
-        file, sheet = self.workbook.name, self.modules.table.sheet.name
+        file, sheet = self.workbook.name, self.modules.sheet.name
         numbers = self.system.numbers
         if not self.numbered and not np.array_equal(numbers, np.arange(1, len(numbers) + 1)):
             warnings.warn(
@@ -101,85 +103,60 @@ class Edit:
 
     # Rows
 
-    def _arranged(self) -> dict[str, Arrangement]:
-        """Sheet -> the rows of its table, of those tables that have a row for each module."""
-        modules = self.modules
-        found = {}
-        last = max(modules.rows)
-        table = modules.table
-        found[table.sheet.name] = self._arrangement(table, modules.rows, last, modules.number_column, {})
-        others = {self.columns[name].table.sheet.name: self.columns[name].table for name in DIMENSIONS}
-        for name, table in others.items():
-            if name in found:
-                continue
-            rows = dimension_rows(table)
-            row_of = dict(zip(rows.numbers, rows.rows, strict=True)) if rows.numbers is not None else {}
-            if row_of and modules.numbers is not None and set(modules.numbers) <= set(row_of):
-                old = [row_of[number] for number in modules.numbers]
-                found[name] = self._arrangement(table, old, max(rows.rows), rows.number_column, row_of)
-            elif len(rows.rows) == len(modules.rows):
-                found[name] = self._arrangement(table, rows.rows, max(rows.rows), rows.number_column, {})
-        return found
+    def _arranged(self) -> dict[Table, Arrangement]:
+        """The rows of those tables that have a row for each module."""
+        return {table: self._arrangement(table, rows) for table, rows in self.layout.rows_of.items()}
 
-    def _arrangement(
-        self, table: Table, old: Iterable[int], last: int, number_column: int | None, row_of: dict[int, int]
-    ) -> Arrangement:
-        shared = [
-            column.column
-            for name, column in self.columns.items()
-            if column.table.sheet is table.sheet and self._is_shared(name)
-        ]
-        old = tuple(old)
+    def _arrangement(self, table: Table, old: tuple[int, ...]) -> Arrangement:
+        shared = [c.column for c in self.columns.values() if c.table.sheet is table.sheet and c.shared]
+        row_of = {} if table is self.modules else dict(zip(table.labels or (), table.rows, strict=False))
         own: list[int | None] = []
         for number, j in zip(self.system.numbers, self.old_of, strict=True):
-            row = row_of.get(int(number))  # of a module that had no coordinates
+            row = row_of.get(int(number)) if self.numbered else None  # of a module that had no coordinates
             own.append(old[j] if j is not None else None if row in old else row)
-        return arrange(table, old, own, filled_to=last, number_column=number_column, kept_columns=shared)
+        return arrange(
+            table, old, own, filled_to=max(table.rows), number_column=table.number_column, kept_columns=shared
+        )
 
-    def _is_shared(self, name: str) -> bool:
-        """Whether one cell holds a quantity of all modules."""
-        rows = self.columns[name].rows
-        return len(rows) > 1 and len(set(rows)) == 1
+    def written_columns(self) -> ColumnMap:
+        """The column map of the workbook as it is now."""
+        return column_map_of(self.layout, {table: found.rows for table, found in self.arrangements.items()})
 
     # Numbers
 
     def _require_numbers(self) -> None:
-        for name, arrangement in self.arrangements.items():
-            table = arrangement.table
-            if table is self.modules.table or self.numbered:
-                own = self.modules if table is self.modules.table else dimension_rows(table)
+        for table, arrangement in self.arrangements.items():
+            if table is self.modules or self.numbered:
                 numbers: Iterable[tuple[int, int]] = enumerate(self.system.numbers)
             else:  # a table whose numbers mean nothing, but must be there
-                own = dimension_rows(table)
                 added = [i for i, j in enumerate(self.old_of) if j is None]
-                numbers = zip(added, itertools.count(max(own.numbers or (0,)) + 1), strict=False)
-            if own.number_column is not None:
+                numbers = zip(added, itertools.count(max(table.numbers or (0,)) + 1), strict=False)
+            if table.number_column is not None:
                 for i, number in numbers:
-                    place = (name, arrangement.rows[i], own.number_column)
+                    place = (table.sheet.name, arrangement.rows[i], table.number_column)
                     self._demand_number(place, number, self._was(i, self.old.numbers))
 
     def _require(self, name: str) -> None:
         column = self.columns[name]
         sheet = column.table.sheet.name
         values, old = values_of(self.system, name), values_of(self.old, name)
-        arrangement = self.arrangements.get(sheet)
-        single = arrangement is None or self._is_shared(name)
+        arrangement = self.arrangements.get(column.table)
+        single = arrangement is None or column.shared
         if single and np.all(values == values[0]):
-            place = (sheet, column.rows[0], column.column)
-            self._demand(place, float(values[0]), float(old[0]))
+            self._demand_length((sheet, column.rows[0], column.column), column, values[0], 0, old)
             return
-        rows = arrangement.rows if arrangement is not None else self._new_rows(column.table, column.column)
+        rows = arrangement.rows if arrangement is not None else self._new_rows(column)
         for i, row in enumerate(rows):
-            self._demand((sheet, row, column.column), float(values[i]), self._was(i, old))
+            self._demand_length((sheet, row, column.column), column, values[i], self.old_of[i], old)
 
-    def _new_rows(self, table: Table, column: int) -> tuple[int, ...]:
+    def _new_rows(self, column: Column) -> tuple[int, ...]:
         """Rows for all modules in a table that had one for all."""
-        rows = dimension_rows(table)
-        first = rows.rows[0]
+        table = column.table
+        first = table.rows[0]
         found = tuple(range(first, first + len(self.system)))
         sheet = self.workbook.sheets[table.sheet.name]
         for i, row in enumerate(found):
-            for c in (column, rows.number_column):
+            for c in (column.column, table.number_column):
                 if c is None:
                     continue
                 place = (table.sheet.name, row, c)
@@ -190,14 +167,15 @@ class Edit:
                     )
                 if i and place not in self.required:
                     sheet.copy_row(sheet.cell((first, c)).typed(None), (first, c), (row, c))
-            if rows.number_column is not None:
-                self._demand_number((table.sheet.name, row, rows.number_column), self.system.numbers[i], None)
+            if table.number_column is not None:
+                self._demand_number((table.sheet.name, row, table.number_column), self.system.numbers[i], None)
         return found
 
     def _require_lengths(self) -> None:
         column = self.columns["l"]
-        arrangement = self.arrangements[column.table.sheet.name]
+        arrangement = self.arrangements[column.table]
         sheet = self.workbook.sheets[column.table.sheet.name]
+        lengths = self.system.collimator_length
         by_design = is_by_design(self.system)
         for i, row in enumerate(arrangement.rows):
             at = (row, column.column)
@@ -205,12 +183,19 @@ class Edit:
             if by_design[i] and sheet.cell(at).blank and (was is None or was.blank):
                 continue  # as the reader takes a blank
             place = (column.table.sheet.name, *at)
-            self._demand(place, float(self.system.collimator_length[i]), self._was(i, self.old.collimator_length))
+            self._demand_length(place, column, lengths[i], self.old_of[i], self.old.collimator_length)
 
     def _was(self, i: int, old: NDArray) -> float | None:
         """The number that was read of a module of the system; None of a new one."""
         j = self.old_of[i]
         return None if j is None else float(old[j])
+
+    def _demand_length(self, place: Place, column: Column, number: float, j: int | None, old: NDArray) -> None:
+        """Demand a length, mm, in the column's unit; `j` is the module's index in the `old` lengths, None of a new one."""
+        given = None if j is None else float(self.given[column.quantity][j])
+        same = j is not None and old[j] == number and given == given
+        was = None if j is None else float(old[j]) / column.factor
+        self._demand(place, float(given if same else number / column.factor), was)  # type: ignore[arg-type]
 
     def _demand(self, place: Place, number: float, was: float | None) -> None:
         self.required[place] = number
@@ -240,16 +225,15 @@ class Edit:
                 continue
             column = self.columns[name]
             title = column.table.sheet.name
-            sheet, arrangement = self.workbook.sheets[title], self.arrangements[title]
-            scale = 180 / np.pi if column.table.in_degrees(name) else 1.0
+            sheet, arrangement = self.workbook.sheets[title], self.arrangements[column.table]
             for i, row in enumerate(arrangement.rows):
                 source, j = arrangement.source(i), self.old_of[i]
                 was = sheet.original.get((source, column.column))
                 if was is None or (j is not None and math.isclose(old[name][j], new[name][i], **_SAME)):
                     continue
-                number = float(new[name][i] * scale)
+                number = float(new[name][i]) / column.factor
                 if was.formula is not None and was.array is None and name in _OF_DIMENSIONS:
-                    right = float(old[name][arrangement.old.index(source)])
+                    right = float(old[name][arrangement.old.index(source)]) / column.factor
                     shown = column.table.sheet.value(source, column.column)
                     was_right = type(shown) is float and abs(shown - right) <= EXACT * max(abs(right), 1)
                     if was_right and (j is None or not agree(right, number)):

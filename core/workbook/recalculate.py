@@ -10,7 +10,7 @@ from typing import Any
 from . import libreoffice
 from .checks import AGREEING
 from .dependencies import Dependencies
-from .formulas import CellError, NotComputable, Surroundings, calculate
+from .formulas import CellError, NotComputable
 from .sheet_xml import Cell
 from .workbook_xml import Place, WorkbookXml
 
@@ -111,25 +111,8 @@ class _Calculation:
     def _calculated(self, place: Place, cell: Cell) -> Any:
         if cell.array is not None:
             raise NotComputable("it is an array formula or a data table")
-        sheet = place[0]
-
-        def lookup(name: str | None, row: int, column: int) -> Any:
-            return self._value((self._title(name, sheet), row, column))
-
-        surroundings = Surroundings(
-            lookup,
-            at=place[1:],
-            extent=lambda name: self.workbook.extent(self._title(name, sheet)),
-            name=lambda name: self.workbook.meaning(place, name),
-        )
         assert cell.formula is not None, "only formulas are calculated"
-        return calculate(cell.formula, surroundings)
-
-    def _title(self, name: str | None, own: str) -> str:
-        title = own if name is None else self.workbook.title(name)
-        if title is None:
-            raise NotComputable(f"there is no sheet {name}")
-        return title
+        return self.workbook.calculated(place, cell.formula, self._value)
 
     def _value(self, place: Place) -> Any:
         if place in self.unknown:

@@ -11,6 +11,7 @@ from .references import Reference, reference
 from .xml_parts import Element, elements, escaped, spliced, utf8, with_attribute
 
 MAIN = "http://schemas.openxmlformats.org/spreadsheetml/2006/main"
+STRICT = "http://purl.oclc.org/ooxml/spreadsheetml/main"
 
 At = tuple[int, int]
 """Row and column, counted from 1."""
@@ -60,6 +61,11 @@ class Cell:
         """Whether there is nothing in it."""
         return self.value is None and self.formula is None and self.array is None
 
+    @property
+    def style(self) -> str | None:
+        """The number of its style, None for the workbook's own."""
+        return self.origin.style if self.origin else None
+
     def typed(self, value: float | None) -> Cell:
         """With a number, or nothing, in place of what it holds."""
         return replace(self, value=value, formula=None, single_array=False)
@@ -85,6 +91,8 @@ class SheetXml:
         (row, column) -> `Cell`; change it as you like, then ask for `to_bytes`.
     original : dict
         The cells as they were read.
+    merged : list of Reference
+        Cells that are shown as one.
     """
 
     def __init__(self, data: bytes, strings: list[str], name: str, file: str) -> None:
@@ -94,6 +102,7 @@ class SheetXml:
         self._rows: list[tuple[int, Element]] = []
         self._in_row: dict[int, list[tuple[int, Element]]] = {}
         self.cells: dict[At, Cell] = {}
+        self.merged: list[Reference] = []
         self._read(elements(self._data, where), strings)
         self.original = dict(self.cells)
 
@@ -126,8 +135,15 @@ class SheetXml:
                 self._sheet_data = e
             elif e.name == "dimension":
                 self._dimension = e
+            elif e.name == "mergeCell" and (area := reference(e.attributes.get("ref", ""))) is not None:
+                self.merged.append(area)
         masters: dict[str, tuple[At, str]] = {}
         for at, element in cells:
+            if at in self.cells:
+                raise InputError(
+                    f"{self._file}: {self.name}!{_name(at)} is stored twice in the file, expected it once; Excel or "
+                    "LibreOffice may repair it"
+                )
             self.cells[at] = self._cell(at, element, inside, strings, masters)
         self._mark_arrays()
 
@@ -370,8 +386,7 @@ _NEW = Cell()
 
 
 def _same(a: Cell, b: Cell) -> bool:
-    styles = [cell.origin.style if cell.origin else None for cell in (a, b)]
-    return a == b and type(a.value) is type(b.value) and (styles[0] == styles[1] or a.origin is b.origin)
+    return a == b and type(a.value) is type(b.value) and (a.style == b.style or a.origin is b.origin)
 
 
 def _value(kind: str, parts: dict[str, Element], inside: dict[int, list[Element]], strings: list[str]) -> Any:

@@ -5,6 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
+from .column_map import ColumnMap
+
 
 @dataclass(frozen=True)
 class QuantityCells:
@@ -46,6 +48,8 @@ class SystemSource:
         The modules' numbers in the order of their rows. A part of a system keeps the whole system's source.
     cells : tuple of QuantityCells
         One for each quantity that has a column.
+    columns : ColumnMap or None
+        The column map that it was read by; None where its headings were understood.
     """
 
     path: Path
@@ -54,6 +58,7 @@ class SystemSource:
     dimensions_sheet: str
     numbers: tuple[int, ...]
     cells: tuple[QuantityCells, ...]
+    columns: ColumnMap | None = None
 
     def cell(self, quantity: str, number: int) -> tuple[str, str] | None:
         """(sheet, cell), e.g. ``("Coordinates", "B3")``, of a module's `quantity`; None without a column."""

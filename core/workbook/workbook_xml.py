@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Callable
 from functools import cached_property
 from typing import Any
 
 from ..errors import InputError
-from .formulas import NotComputable, tokens_of
+from .formulas import CellError, NotComputable, Surroundings, calculate, tokens_of
 from .package import Package
 from .references import Reference, reference
-from .sheet_xml import MAIN, Cell, SheetXml, Unreadable, shared_strings
+from .sheet_xml import MAIN, STRICT, Cell, SheetXml, Unreadable, shared_strings
 from .tables import DataTable, data_table, named_part
 from .xml_parts import Element, elements, spliced, utf8, with_attribute
 
@@ -50,12 +51,16 @@ class WorkbookXml:
             raise InputError(f"{name}: not a whole .xlsx workbook (it does not say where its sheets are)")
         self._part = found[0]
         self._data, self._back = utf8(self.package.read(self._part), name)
-        self._elements = [e for e in elements(self._data, name) if e.namespace == MAIN]
+        found_elements = elements(self._data, name)
+        if found_elements[0].namespace == STRICT:
+            raise InputError(f"{name}: a 'Strict Open XML Spreadsheet', expected it saved as 'Excel Workbook (*.xlsx)'")
+        self._elements = [e for e in found_elements if e.namespace == MAIN]
         relations = self.package.relations(self._part)
         members = {key: (kind, member) for key, kind, member in relations}
         strings = [member for _, kind, member in relations if kind == "sharedStrings"]
         self._calc_chain = [member for _, kind, member in relations if kind == "calcChain"]
         texts = shared_strings(self.package.read(strings[0]), name) if strings else []
+        self._styles = [member for _, kind, member in relations if kind == "styles"]
         self.all_sheets: list[str] = []
         self.sheets: dict[str, SheetXml] = {}
         self.parts: dict[str, str] = {}
@@ -77,6 +82,34 @@ class WorkbookXml:
         """ ".xlsx" or ".xlsm" by what is inside, None for anything else."""
         kind = self.package.content_type(self._part)
         return next((suffix for suffix, content_type in KINDS.items() if kind == content_type), None)
+
+    @property
+    def asks_for_calculation(self) -> bool:
+        """Whether the formulas' stored values are, by what the file says, not to be relied on."""
+        settings = [e.attributes for e in self._elements if e.name == "calcPr"]
+        asked = any(a.get(name) in ("1", "true") for a in settings for name in ("fullCalcOnLoad", "forceFullCalc"))
+        return asked or any(a.get("calcCompleted") in ("0", "false") for a in settings)
+
+    @cached_property
+    def _number_formats(self) -> list[str]:
+        """The number format of each style of cells."""
+        from openpyxl.styles.numbers import BUILTIN_FORMATS
+
+        if not self._styles:
+            return []
+        parts = self._parts_of(self._styles[0])
+        own = {e.attributes.get("numFmtId"): e.attributes.get("formatCode", "") for e in parts if e.name == "numFmt"}
+        ids = [
+            e.attributes.get("numFmtId", "0")
+            for e in parts
+            if e.name == "xf" and e.parent is not None and e.parent.name == "cellXfs"
+        ]
+        return [own[i] if i in own else BUILTIN_FORMATS.get(int(i), "") for i in ids]
+
+    def number_format(self, cell: Cell) -> str:
+        """The number format of a cell, such as ``0.00" mm"``."""
+        style = int(cell.style or 0)
+        return self._number_formats[style] if style < len(self._number_formats) else ""
 
     @cached_property
     def _names(self) -> dict[tuple[str | None, str], str]:
@@ -144,6 +177,26 @@ class WorkbookXml:
         if isinstance(value, Unreadable):
             raise NotComputable(f"{self.text(place)} holds {value!r}")
         return value
+
+    def calculated(
+        self, place: Place, formula: str, value_of: Callable[[Place], Any]
+    ) -> float | str | bool | CellError:
+        """What `formula` at `place` gives; `value_of` gives the values of cells, or raises `NotComputable`."""
+        sheet = place[0]
+
+        def title(name: str | None) -> str:
+            found = sheet if name is None else self.title(name)
+            if found is None:
+                raise NotComputable(f"there is no sheet {name}")
+            return found
+
+        surroundings = Surroundings(
+            lambda name, row, column: value_of((title(name), row, column)),
+            at=place[1:],
+            extent=lambda name: self.extent(title(name)),
+            name=lambda name: self.meaning(place, name),
+        )
+        return calculate(formula, surroundings)
 
     def extent(self, sheet: str) -> tuple[int, int]:
         """The last row and the last column of `sheet` with content."""

@@ -16,9 +16,10 @@ from ..files import replacing
 from ..system import PinholeSystem
 from . import libreoffice
 from .book import Book
+from .column_map import ColumnMap, column_map
 from .edit import Edit, several, values_of
-from .headings import DIMENSIONS, POSITION
 from .new_workbook import new_workbook, numbers_of
+from .quantities import DIMENSIONS, POSITION
 from .reader import read
 from .recalculate import Recalculated, recalculate
 from .workbook_xml import KINDS, Place, WorkbookXml
@@ -38,16 +39,23 @@ class WrittenWorkbook:
         value it stores now: "formulas" (mphDRR's own evaluator) or "LibreOffice".
     cleared : tuple of str
         Cells that depend on these and store no value now, because neither could calculate it.
+    columns : ColumnMap or None
+        The column map that the new file is read by, its rows being those of the modules now; None where its headings
+        are understood.
     """
 
     path: Path
     changed: tuple[str, ...]
     recalculated: dict[str, str]
     cleared: tuple[str, ...]
+    columns: ColumnMap | None = None
 
 
 def write_system(
-    system: PinholeSystem, path: str | os.PathLike[str], template: str | os.PathLike[str] | None = None
+    system: PinholeSystem,
+    path: str | os.PathLike[str],
+    template: str | os.PathLike[str] | None = None,
+    columns: ColumnMap | str | os.PathLike[str] | None = None,
 ) -> WrittenWorkbook:
     """Write a scanner's geometry workbook.
 
@@ -70,6 +78,8 @@ def write_system(
         The file to write, .xlsx or .xlsm as the template; it may be the template, which is then replaced.
     template
         The workbook to change, read anew. Default: a new one in the users' layout, sheets Main and Coordinates.
+    columns
+        The template's column map, or the path of one. Default: the one that the system was read by, if it was.
 
     Returns
     -------
@@ -100,22 +110,18 @@ def write_system(
         formulas = [place for place, cell in cells.items() if cell.formula is not None]
         required = {place: number for place, number in numbers_of(system).items() if cells[place].formula is not None}
         return _saved(workbook, system, target, recalculate(workbook, formulas, required), [])
+    said = column_map(columns) if columns is not None else system.source.columns if system.source else None
     book = Book(template)
-    workbook = WorkbookXml(book.content, book.path.name)
+    workbook = book.workbook
     _refuse_other_kind(workbook, target, suffix)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", InputWarning)  # said when the system was read
-        reading = read(book)
-    unlisted = {column.table.sheet.name for column in reading.columns.values()} - workbook.sheets.keys()
-    if unlisted:
-        raise InputError(
-            f"{workbook.name}: its list of sheets lacks {several(sorted(unlisted))}, expected it saved anew"
-        )
+        reading = read(book, said)
     edit = Edit(system, reading, workbook)
     edit.apply()
     edited = workbook.changed
     result = recalculate(workbook, edit.changed, edit.required, edit.derived) if edit.changed else Recalculated()
-    return _saved(workbook, system, target, result, edited, edit.numbered)
+    return _saved(workbook, system, target, result, edited, edit.numbered, edit.written_columns() if said else None)
 
 
 def _refuse_other_kind(workbook: WorkbookXml, target: Path, suffix: str) -> None:
@@ -134,27 +140,29 @@ def _saved(
     result: Recalculated,
     edited: list[Place],
     numbered: bool = True,
+    columns: ColumnMap | None = None,
 ) -> WrittenWorkbook:
     _warn_of_formulas(workbook, result)
     content = workbook.to_bytes()
     with replacing(target) as temporary:
         temporary.write_bytes(content)
-        _refuse_unlike(temporary, workbook.name, system, numbered)
+        _refuse_unlike(temporary, workbook.name, system, numbered, columns)
     texts = [workbook.text(place) for place in dict.fromkeys([*edited, *result.replaced])]
     return WrittenWorkbook(
         path=target.absolute(),
         changed=tuple(texts),
         recalculated={workbook.text(place): by for place, by in sorted(result.by.items())},
         cleared=tuple(workbook.text(place) for place in sorted(result.cleared)),
+        columns=columns,
     )
 
 
-def _refuse_unlike(written: Path, name: str, system: PinholeSystem, numbered: bool) -> None:
+def _refuse_unlike(written: Path, name: str, system: PinholeSystem, numbered: bool, columns: ColumnMap | None) -> None:
     """Refuse a workbook that is not read as `system`: a template may be laid out so that it cannot hold it."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", InputWarning)
         try:
-            back = read(Book(written)).system
+            back = read(Book(written), columns).system
         except InputError as error:
             why = str(error).replace(str(written), name).replace(written.name, name)
             raise InputError(f"{name} cannot hold this system, with it: {why}") from error

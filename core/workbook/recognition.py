@@ -1,0 +1,527 @@
+"""Which cells hold which quantity, by a workbook's headings: what is understood for certain, and doubts of the rest.
+
+A doubt is whatever may make a number mean something else than its heading says: a heading, a unit or a table that is
+not accounted for. `recognized_layout` refuses a workbook with any; `core.workbook.draft` asks a person.
+"""
+
+from __future__ import annotations
+
+import re
+import warnings
+from collections import defaultdict
+from dataclasses import dataclass, field
+from functools import cached_property
+
+from ..errors import InputError, InputWarning
+from .book import HEADING_ROWS, Book, Sheet
+from .cells import module_number
+from .layout import Column, Layout, Table, by_label, check_modules, in_order
+from .quantities import (
+    DERIVED,
+    DIMENSIONS,
+    LENGTH_UNITS,
+    NEEDED,
+    POSITION,
+    QUANTITIES,
+    Heading,
+    is_label_heading,
+    is_number_heading,
+    may_mean,
+    plain,
+    understood,
+    unit_alone,
+    units_in,
+)
+from .sheet_xml import At
+from .workbook_xml import areas_in
+
+OWN_SHEETS = frozenset(("mdsl cloud import", "theta", "values", "design table"))
+"""Sheets that users' workbooks carry beside the scanner's, whatever they hold."""
+ASIDE = frozenset(("s", "3d slope"))
+"""Headings of the users' workbooks whose columns are of no concern."""
+HELP = "a column map can say what is meant (--columns, docs/workbook.md)"
+
+_ROWS_APART = 2
+"""A symbol row and a description row that are further apart do not belong together."""
+_LITERAL = re.compile(r'"([^"]*)"|\\(.)|\[\$([^\]-]*)[^\]]*\]')
+_SCALED = re.compile(r"[0#?],+(?![0#?,])|%")
+
+
+@dataclass(eq=False)
+class SheetSeen:
+    """A sheet that has headings, and what they say.
+
+    Attributes
+    ----------
+    sheet : Sheet
+    first_heading, last_heading : int
+        The rows with headings.
+    headings : dict
+        Column -> {row: what its heading there says}.
+    doubts : list of str
+    """
+
+    sheet: Sheet
+    first_heading: int
+    last_heading: int
+    headings: dict[int, dict[int, Heading]]
+    doubts: list[str] = field(default_factory=list)
+
+    @cached_property
+    def first_row(self) -> int:
+        """The first row with a number, or with anything else than text, under a heading."""
+        below = (row for row, column in self.sheet.cells if row > self.last_heading and column in self.headings)
+        return next((row for row in sorted(set(below)) if self._has_number(row)), self.last_heading + 1)
+
+    def _has_number(self, row: int) -> bool:
+        return any(_is_number(self.sheet, row, column) for column in self.headings)
+
+    @cached_property
+    def above(self) -> dict[At, str]:
+        """The texts from the first row of headings to the first module."""
+        found = {at: text for at, text in self.sheet.texts.items() if self.first_heading <= at[0] < self.first_row}
+        return dict(sorted(found.items()))
+
+    @cached_property
+    def columns(self) -> dict[str, tuple[int, str]]:
+        """Quantity -> column and unit."""
+        found: dict[str, tuple[int, str]] = {}
+        for column in sorted(self.headings):
+            name, unit = self._column(column)
+            if name in found:
+                first = self._place(found[name][0])
+                self.doubt(f"{first} and {self._place(column)} are both headed as {name}, expected one such column")
+                continue
+            found[name] = column, unit
+        return found
+
+    def _column(self, column: int) -> tuple[str, str]:
+        said = self.headings[column]
+        first = next(iter(said.values()))
+        units = {}
+        for (row, c), text in self.above.items():
+            if c != column:
+                continue
+            heading, unit = said.get(row), unit_alone(text)
+            place = self.sheet.place(row, c)
+            if heading is None and unit not in QUANTITIES[first.quantity].units:
+                self.doubt(
+                    f"{place} holds {_quoted(text)} in the heading of {first.quantity}, expected nothing but that"
+                )
+                continue
+            if heading is not None and heading.quantity != first.quantity:
+                self.doubt(
+                    f"{place} is headed as {heading.quantity} but {self._place(column)} as {first.quantity}, expected "
+                    "one of them"
+                )
+            if (unit := heading.unit if heading is not None else unit) is not None:
+                units[unit] = place
+        if len(units) > 1:
+            (a, place), (b, other) = list(units.items())[:2]
+            self.doubt(f"{place} says {a} but {other} {b}, expected one unit of {first.quantity}")
+        for area in self.sheet.book.workbook.sheets[self.sheet.name].merged:
+            if area.left < area.right and area.left <= column <= area.right and area.top in said:
+                self.doubt(f"{self.sheet.place(area.top, area.left)} heads several columns as {first.quantity}, merged")
+        return first.quantity, next(iter(units), next(iter(QUANTITIES[first.quantity].units)))
+
+    def _place(self, column: int) -> str:
+        return self.sheet.place(next(iter(self.headings[column])), column)
+
+    def doubt(self, text: str) -> None:
+        """Note a doubt about this sheet."""
+        self.doubts.append(f"{self.sheet.book.path.name}: {text}")
+
+    # Columns that are not understood
+
+    @cached_property
+    def aside(self) -> dict[int, list[At]]:
+        """The texts at the head of the other columns."""
+        found: dict[int, list[At]] = defaultdict(list)
+        for at in self.above:
+            if at[1] not in self.headings:
+                found[at[1]].append(at)
+        return found
+
+    @cached_property
+    def numeric(self) -> set[int]:
+        """The columns with numbers in the modules' rows."""
+        rows = set(self.rows)
+        return {column for row, column in self.sheet.cells if row in rows and _is_number(self.sheet, row, column)}
+
+    def unknown(self) -> list[tuple[At, str]]:
+        """The headings over numbers that are none of a known column's."""
+        known = {column for column in (self.label_column,) if column is not None}
+        return [
+            (at, text)
+            for column, places in self.aside.items()
+            if column in self.numeric - known
+            for at in places
+            if not (is_number_heading(text := self.above[at]) or is_label_heading(text))
+            and plain(text).casefold() not in ASIDE
+        ]
+
+    # Rows
+
+    @property
+    def wanted(self) -> list[int]:
+        """The columns that make a row one of the table's."""
+        names = POSITION if self.columns.keys() >= set(POSITION) else (*DIMENSIONS, "l")
+        return sorted(self.columns[name][0] for name in names if name in self.columns)
+
+    @cached_property
+    def label_column(self) -> int | None:
+        """The column of the modules' numbers or names: one that is headed so, or one without heading at the left."""
+        headed = {
+            at[1]: at for at, text in self.above.items() if is_number_heading(text) and at[1] not in self.headings
+        }
+        if len(headed) > 1:
+            places = [self.sheet.place(*at) for at in headed.values()]
+            self.doubt(f"{places[0]} and {places[1]} both head the modules' numbers, expected one such column")
+        filled = [column for column in headed if self._filled(column)]
+        if filled:
+            return filled[0]
+        left = [column for column in range(1, min(self.headings)) if column not in self.aside]
+        numbers = {c: [module_number(value) for value in self._filled(c)] for c in left}
+        size = len(self._sized)
+        whole = [c for c in left if 2 * len(set(numbers[c]) - {None}) > size]
+        named = [c for c in left if len(set(self._filled(c))) == size > 1 and set(numbers[c]) == {None}]
+        return next(iter(whole + [c for c in named if all(type(value) is str for value in self._filled(c))]), None)
+
+    def _filled(self, column: int) -> list[object]:
+        values = (self.sheet.value(row, column) for row in self._sized)
+        return [value for value in values if value is not None]
+
+    @cached_property
+    def _sized(self) -> list[int]:
+        """The rows with numbers, or with several texts in their place, in the wanted columns."""
+        found = []
+        for row in self.sheet.rows:
+            if row < self.first_row:
+                continue
+            values = [(column, self.sheet.value(row, column)) for column in self.wanted]
+            texts = [value for _, value in values if type(value) is str]
+            filled = [column for column, value in values if value is not None]
+            if not filled or _is_summary(self.sheet, row, filled):
+                continue
+            note = len(filled) == len(texts) == 1 and not re.fullmatch(r"[\d.,eE+\-\s]+", texts[0])
+            if not note:
+                found.append(row)
+        return found
+
+    @cached_property
+    def rows(self) -> tuple[int, ...]:
+        """The rows of the modules, those with a number but nothing else included: a blank is to be refused."""
+        if self.label_column is None:
+            return tuple(self._sized)
+        sized = set(self._sized)
+        return tuple(
+            row
+            for row in self.sheet.rows
+            if row in sized
+            or (
+                row >= self.first_row
+                and module_number(self.sheet.value(row, self.label_column)) is not None
+                and not _is_summary(self.sheet, row, self.wanted)
+            )
+        )
+
+    def table(self) -> Table:
+        """The table, as far as it is understood."""
+        return Table(self.sheet, self.columns, self.rows, self.label_column)
+
+    # Doubts
+
+    def look_around(self, quantities: set[str]) -> None:
+        """Note what else in the sheet may concern `quantities`, which are taken from here."""
+        for at, text in self.unknown():
+            about = [name for name in may_mean(text) if name in quantities]
+            if about:
+                self.doubt(
+                    f"{self.sheet.place(*at)} is headed {_quoted(text)}, which is not understood and may mean {about[0]}"
+                )
+        self._other_tables()
+        self._texts_between()
+        used = [self.columns[name] for name in self.columns if name in quantities]
+        lengths = {unit for _, unit in used if unit in LENGTH_UNITS}
+        self._notes(lengths)
+        self._formats(used)
+
+    def _other_tables(self) -> None:
+        """Headings of what is needed that stand apart: a second table, or a second heading."""
+        apart: dict[int, dict[str, int]] = defaultdict(dict)
+        for (row, column), text in self.sheet.texts.items():
+            heading = understood(text)
+            if heading is not None and not self.first_heading <= row < self.first_row:
+                apart[row][heading.quantity] = column
+        for row, found in sorted(apart.items()):
+            over_numbers = any(_is_number(self.sheet, row + 1, column) for column in found.values())
+            if row < self.first_heading or len(found) > 1 or over_numbers:
+                name, column = next(iter(found.items()))
+                self.doubt(
+                    f"{self.sheet.place(row, column)} is headed as {name}, apart from the headings in row "
+                    f"{self.first_heading}, expected one table"
+                )
+                return
+
+    def _texts_between(self) -> None:
+        """Something between the modules' rows: what follows may be another table."""
+        if not self.rows:
+            return
+        columns = {*self.headings, self.label_column or min(self.headings)}
+        modules, blank = set(self.rows), []
+        for row in range(self.rows[0], self.rows[-1] + 1):
+            if row in modules:
+                continue
+            texts = [at for at in self._texts_of_row.get(row, ()) if min(columns) <= at[1] <= max(columns)]
+            if texts and not _is_summary(self.sheet, row, self.wanted):
+                text = _quoted(self.sheet.texts[texts[0]])
+                self.doubt(f"{self.sheet.place(*texts[0])} holds {text} between rows of modules, expected one table")
+                return
+            blank.append(row)
+        if blank and self.label_column is None:
+            warnings.warn(
+                f"{self.sheet.book.path.name}: row {blank[0]} of sheet {self.sheet.name} is no module's, and the rows "
+                "below, which have no numbers to tell, were taken for modules too",
+                InputWarning,
+                stacklevel=2,
+            )
+
+    @cached_property
+    def _texts_of_row(self) -> dict[int, list[At]]:
+        found: dict[int, list[At]] = defaultdict(list)
+        for at in sorted(self.sheet.texts):
+            found[at[0]].append(at)
+        return found
+
+    def _notes(self, lengths: set[str]) -> None:
+        """Units in the sheet's name and in texts that are no heading, and that are not the headings' own."""
+        for unit in units_in(self.sheet.name.replace("_", " ")):
+            if lengths != {unit}:
+                self.doubt(
+                    f"the name of sheet {self.sheet.name} speaks of {unit}, where the headings say {_several(lengths)}"
+                )
+        modules = set(self.rows)
+        for at, text in self.sheet.texts.items():
+            row, column = at
+            if at in self.above and (column in self.headings or column in self.numeric - {self.label_column}):
+                continue
+            for unit in units_in(text, alone=row in modules):
+                if lengths != {unit}:
+                    self.doubt(
+                        f"{self.sheet.place(*at)} holds {_quoted(text)}, where the headings say {_several(lengths)}: "
+                        "expected one unit"
+                    )
+
+    def _formats(self, used: list[tuple[int, str]]) -> None:
+        """Number formats that show another unit, or another number, than the cell's."""
+        for column, unit in used:
+            for row in self.rows:
+                if (row, column) not in self.sheet.cells:
+                    continue
+                shown = self.sheet.number_format(row, column)
+                if not _is_accounted_for(shown, unit):
+                    self.doubt(
+                        f"{self.sheet.place(row, column)} is shown as {_quoted(shown)}, where its heading says {unit}: "
+                        "expected one unit"
+                    )
+                    break
+
+
+def _is_accounted_for(number_format: str, unit: str) -> bool:
+    """Whether a number format shows the number as it is, alone or with its unit."""
+    for literal in _LITERAL.finditer(number_format.split(";")[0]):
+        text = literal[1] or literal[2] or literal[3] or ""
+        if re.sub(r"[\s()+\-:/]", "", text) and unit_alone(text) != unit:
+            return False
+    return not _SCALED.search(_LITERAL.sub("", number_format))
+
+
+def sheets_seen(book: Book) -> list[SheetSeen]:
+    """The sheets with headings, in the workbook's order; those that only accompany users' workbooks left out."""
+    found = [_seen(sheet) for name, sheet in book.sheets.items() if plain(name).casefold() not in OWN_SHEETS]
+    return [seen for seen in found if seen is not None]
+
+
+def _seen(sheet: Sheet) -> SheetSeen | None:
+    rows: dict[int, dict[int, Heading]] = defaultdict(dict)
+    for (row, column), text in sheet.texts.items():
+        if row <= HEADING_ROWS and (heading := understood(text)) is not None:
+            rows[row][column] = heading
+    if not rows:
+        return None
+    main = max(rows, key=lambda row: (len({heading.quantity for heading in rows[row].values()}), -row))
+    chosen = {main}
+    for step in (-1, 1):
+        for row in sorted(rows, key=lambda row: step * row):
+            near = 0 < step * (row - (min(chosen) if step < 0 else max(chosen))) <= _ROWS_APART
+            if near and not any(_is_number(sheet, row, column) for column in rows[main]):
+                chosen.add(row)
+    headings: dict[int, dict[int, Heading]] = defaultdict(dict)
+    for row in sorted(chosen):
+        for column, heading in rows[row].items():
+            headings[column][row] = heading
+    return SheetSeen(sheet, min(chosen), max(chosen), dict(headings))
+
+
+@dataclass(frozen=True, eq=False)
+class Recognized:
+    """What is seen of the scanner in a workbook.
+
+    Attributes
+    ----------
+    book : Book
+    taken : dict
+        Quantity -> the sheet that it is taken from.
+    doubts : list of str
+        What keeps the workbook from being read.
+    """
+
+    book: Book
+    taken: dict[str, SheetSeen]
+    doubts: list[str]
+
+
+def recognize(book: Book) -> Recognized:
+    """What is seen of the scanner in a workbook, with the doubts."""
+    seen = sheets_seen(book)
+    taken: dict[str, SheetSeen] = {}
+    doubts = []
+    for name in (*NEEDED, "l"):
+        having = [s for s in seen if name in s.columns]
+        filled = [s for s in having if s.columns[name][0] in s.numeric]
+        if len(filled) > 1:
+            first, second = (s.sheet.place(s.first_heading, s.columns[name][0]) for s in filled[:2])
+            doubts.append(
+                f"{book.path.name}: {first} and {second}, of two sheets, are both headed as {name}, expected one such column"
+            )
+        if having:
+            taken[name] = (filled or having)[0]
+        elif name != "l":
+            doubts.append(_missing(book, name))
+    if (coordinates := taken.get("x1")) is not None:
+        taken.update({name: coordinates for name in DERIVED if name in coordinates.columns})
+        for name in POSITION:
+            if name in taken and taken[name] is not coordinates:
+                doubts.append(
+                    f"{book.path.name}: x1 is in sheet {coordinates.sheet.name} but {name} in sheet "
+                    f"{taken[name].sheet.name}, expected one table"
+                )
+    for sheet in dict.fromkeys(taken.values()):
+        sheet.look_around({*NEEDED, "l", *(name for name, of in taken.items() if of is sheet)})
+        doubts += sheet.doubts
+    return Recognized(book, taken, doubts)
+
+
+def _missing(book: Book, name: str) -> str:
+    quantity = QUANTITIES[name]
+    close = [
+        f"{sheet.place(*at)} {_quoted(text)}"
+        for title, sheet in book.sheets.items()
+        if plain(title).casefold() not in OWN_SHEETS
+        for at, text in sheet.texts.items()
+        if at[0] <= HEADING_ROWS and name in may_mean(text) and understood(text) is None
+    ]
+    saw = f"not understood: {', '.join(close[:3])}" if close else f"its sheets are {', '.join(book.sheets) or 'none'}"
+    return f"{book.path.name}: no sheet has a column headed {name} or {quantity.headings[1]!r}; {saw}"
+
+
+def recognized_layout(book: Book) -> Layout:
+    """The layout that a workbook's headings state; `InputError` where there is any doubt."""
+    recognized = recognize(book)
+    for doubt in recognized.doubts:
+        raise InputError(f"{doubt}; {HELP}")
+    taken = recognized.taken
+    tables = {seen: seen.table() for seen in dict.fromkeys(taken.values())}
+    modules = tables[taken["x1"]]
+    check_modules(modules)
+    layout = Layout(modules, {}, {modules: modules.rows})
+    for name, seen in taken.items():
+        table = tables[seen]
+        layout.columns[name] = Column(table, name, modules, _rows_of(name, layout, seen, taken["x1"], table))
+    if "l" not in taken:
+        _warn_of_unknown(taken["x1"])
+    return layout
+
+
+def _rows_of(name: str, layout: Layout, seen: SheetSeen, coordinates: SheetSeen, table: Table) -> tuple[int, ...]:
+    """The row of each module; a single value, in the table's first row, stands for all modules."""
+    modules, column = layout.modules, table.columns[name][0]
+    rows = table.rows
+    if not rows:
+        raise InputError(f"{table.sheet.book.path.name}: sheet {table.sheet.name} has no numbers under {name}")
+    shared = name in DIMENSIONS and [r for r in rows if table.sheet.value(r, column) is not None] == [rows[0]]
+    if table not in layout.rows_of and not (shared and len(rows) == 1):
+        try:
+            layout.rows_of[table] = _joined(modules, table, coordinates, seen)
+        except InputError:
+            if not shared:
+                raise
+    return (rows[0],) * len(modules.rows) if shared else layout.rows_of[table]
+
+
+def _joined(modules: Table, table: Table, coordinates: SheetSeen, seen: SheetSeen) -> tuple[int, ...]:
+    if modules.labels is not None and table.labels is not None:
+        rows = by_label(modules, table)
+    else:
+        rows = in_order(modules, table)
+        if table.numbers is not None and list(table.numbers) != sorted(table.numbers):
+            raise InputError(
+                f"{modules.sheet.book.path.name}: the modules of sheet {table.sheet.name} have numbers in no order, those "
+                f"of sheet {modules.sheet.name} none, expected numbers in both; {HELP}"
+            )
+    names = [
+        {plain(s.above[at]).casefold(): at for at in s.above if is_label_heading(s.above[at])}
+        for s in (coordinates, seen)
+    ]
+    for heading, (_, column) in names[1].items():
+        if heading in names[0]:
+            own = names[0][heading][1]
+            for a, b in zip(modules.rows, rows, strict=True):
+                one, other = modules.sheet.value(a, own), table.sheet.value(b, column)
+                if one != other:
+                    raise InputError(
+                        f"{modules.sheet.book.path.name}: {modules.sheet.place(a, own)} is {one!r} but "
+                        f"{table.sheet.place(b, column)}, in the row that belongs to it, {other!r}; {HELP}"
+                    )
+        elif table.labels is None or modules.labels is None:
+            raise InputError(
+                f"{modules.sheet.book.path.name}: the rows of {table.sheet.place(*names[1][heading])} and of sheet "
+                f"{modules.sheet.name} have no number in common, expected a column of numbers in both; {HELP}"
+            )
+    return rows
+
+
+def _warn_of_unknown(seen: SheetSeen) -> None:
+    unknown = seen.unknown()
+    if unknown:
+        at, text = unknown[0]
+        warnings.warn(
+            f"{seen.sheet.book.path.name}: no column is headed l, so the collimator length is the design formula's; "
+            f"{seen.sheet.place(*at)} {_quoted(text)} is not understood",
+            InputWarning,
+            stacklevel=4,
+        )
+
+
+def _is_number(sheet: Sheet, row: int, column: int) -> bool:
+    """Whether a cell holds anything but text or nothing."""
+    value = sheet.value(row, column)
+    return value is not None and type(value) is not str
+
+
+def _is_summary(sheet: Sheet, row: int, columns: list[int]) -> bool:
+    """Whether a row sums up others, as AVERAGE(B3:B82) below a column: one of `columns` refers to several rows of itself."""
+    return any(
+        area.top < area.bottom and area.left <= column <= area.right and area.sheet in (None, sheet.name)
+        for column in columns
+        for area in areas_in(sheet.formula(row, column) or "=")
+    )
+
+
+def _quoted(text: str) -> str:
+    text = plain(text)
+    return repr(text if len(text) <= 60 else text[:59] + "…")
+
+
+def _several(units: set[str]) -> str:
+    return " and ".join(sorted(units))

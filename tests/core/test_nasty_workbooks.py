@@ -71,8 +71,7 @@ else:
             assert not outcome.warnings
         if outcome.system is not None and not outcome.warnings:
             assert draft.truth is not None, "read without a word, though nobody can tell what it means"
-            numbered = bool(recipe.layout.numbers)
-            assert not (wrong := differences(outcome.system, draft.truth, numbered)), wrong
+            assert not (wrong := differences(outcome.system, draft.truth, draft.numbered)), wrong
 
 
 # Written back in the file's own units

@@ -80,7 +80,8 @@ def _sheets() -> None:
             copied = users(scanner(SCANNER.centers * 1.02, 2.4, 76.0, 51.0, 11.0))[name]
             copied.name = other
             made.sheets.append(copied)
-            CASES.add(f"{other!r} is a copy of {name} of other numbers", made, SCANNER, REFUSED, place=(name, other), columns=users_map())
+            known = (RIGHT,) if other == "Values" else ()  # the users' own sheet beside the two
+            CASES.add(f"{other!r} is a copy of {name} of other numbers", made, SCANNER, *known, REFUSED, place=(name, other), columns=users_map())
     same = users()
     copied = users()["Coordinates"]
     copied.name = "Coordinates (2)"

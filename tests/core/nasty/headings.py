@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from .case import REFUSED, RIGHT, WARNED_OF, Catalogue
+from .case import REFUSED, RIGHT, WARNED, WARNED_OF, Catalogue
 from .scanners import (
     BIG,
     DESCRIPTIONS,
@@ -144,7 +144,7 @@ def _words_in_a_heading() -> None:
             return _wrong(one_sheet(BIG, {name: heading}, length=name == "l"), name, factor)
 
         if name == "l":
-            allowed, truth = (REFUSED, RIGHT), BIG  # an unknown column is no l, which is then by design
+            allowed, truth = (REFUSED, WARNED, RIGHT), BIG  # an unknown column is no l, which is then by design
 
             def book_l(heading: str = heading, factor: float = factor) -> Book:
                 return _wrong(one_sheet(BIG, {"l": heading}), "l", factor)
@@ -254,7 +254,7 @@ def _second_candidates() -> None:
                 made.sheets[0][f"J{row}"] = float(quantity(BIG, "x2")[i]) if values is None else values
             return made
 
-        CASES.add(f"a column {other!r} as well", extra, BIG, RIGHT, REFUSED, place=GEOMETRY, columns=one_sheet_map())
+        CASES.add(f"a column {other!r} as well", extra, BIG, RIGHT, WARNED, REFUSED, place=GEOMETRY, columns=one_sheet_map())
     for other in ("serial", "S/N", "material", "operator", "ring", "checked by"):
 
         def plain_extra(other: str = other) -> Book:
@@ -355,7 +355,7 @@ def _symbols_and_descriptions() -> None:
     unstored = users_with(C_B1=Formula('"y"&1', "x1"), C_C1=Formula('"x"&1', "y1"))
     unstored["Coordinates"]["B2"] = unstored["Coordinates"]["C2"] = None
     unstored.calculation = '<calcPr calcId="191029" fullCalcOnLoad="1"/>'
-    CASES.add("headings by stale formulas", unstored, None, REFUSED, WARNED_OF, place=USERS)
+    CASES.add("headings by stale formulas", unstored, None, REFUSED, WARNED_OF, place=("scanner.xlsx",))
     hidden_y = users_with(C_B2=Rich('<r><rPr><strike/></rPr><t>y</t></r><r><t>x coordinate value at center of hole</t></r>'))
     CASES.add("a letter struck out", hidden_y, SCANNER, RIGHT, REFUSED, place=USERS, columns=users_map())
 
@@ -403,7 +403,9 @@ def _other_headings() -> None:
             made.sheets[0].merged.append("B1:I1")
             return made
 
-        CASES.add(f"{word!r} merged above all headings", titled, BIG, REFUSED, WARNED_OF, place=GEOMETRY, columns=one_sheet_map("mm", 3, 6))
+        # What changes no number, a title may say of the whole.
+        harmless = (RIGHT,) if word in ("OBSOLETE", "old design, do not use", "DRAFT - not verified", "nominal values") else ()
+        CASES.add(f"{word!r} merged above all headings", titled, BIG, *harmless, REFUSED, WARNED_OF, place=GEOMETRY, columns=one_sheet_map("mm", 3, 6))
     for word in ("nominal", "old", "from the plate", "× 0.1", "radius", "negative"):
 
         def over_one(word: str = word) -> Book:

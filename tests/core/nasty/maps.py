@@ -38,9 +38,9 @@ def _right() -> None:
     CASES.add("rows far down", far, BIG, RIGHT, columns=one_sheet_map(first=1002, last=1005))
     far = one_sheet(BIG)
     far.sheets[0].moved(right=700)
-    names = ("ZY", "ZZ", "AAA", "AAB", "AAC", "AAD", "AAE", "AAF")
+    names = ("ZZ", "AAA", "AAB", "AAC", "AAD", "AAE", "AAF", "AAG")
     columns = dict(zip(("x1", "y1", "z1", "d", "R", "Ld", "Td", "l"), names, strict=True))
-    CASES.add("columns far to the right", far, BIG, RIGHT, columns=one_sheet_map(columns=columns, number="ZX"))
+    CASES.add("columns far to the right", far, BIG, RIGHT, columns=one_sheet_map(columns=columns, number="ZY"))
 
 
 def _exchanged():

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -50,7 +50,7 @@ class Draft:
     heading_row: int
     first: int
     plain: bool = True
-    said: list[str] = field(default_factory=list)
+    numbered: bool = True
 
     @property
     def last(self) -> int:
@@ -73,10 +73,10 @@ def system_of(layout: Layout) -> PinholeSystem:
     """A scanner that looks like one in centimetres too."""
     rng = np.random.default_rng(layout.seed)
     directions = rng.normal(size=(layout.modules, 3))
-    distances = rng.uniform(450, 1500, (layout.modules, 1))
+    distances = rng.uniform(450, 900, (layout.modules, 1))
     centers = np.round(directions / np.linalg.norm(directions, axis=1)[:, None] * distances, 3)
     many = 1 if layout.shared and len(layout.sheets) == 2 else layout.modules
-    d, R, Ld, Td = (np.resize(np.round(rng.uniform(*r, many), 2), layout.modules) for r in ((1, 6), (60, 200), (40, 150), (5, 30)))
+    d, R, Ld, Td = (np.resize(np.round(rng.uniform(*r, many), 2), layout.modules) for r in ((2, 6), (100, 200), (60, 120), (5, 30)))
     numbers = np.sort(rng.choice(np.arange(1, 99), layout.modules, replace=False)) if layout.numbers else None
     return scanner(centers, d, R, Ld, Td, numbers=numbers)
 
@@ -110,7 +110,7 @@ def laid_out(layout: Layout) -> Draft:
             order = range(layout.modules - 1, -1, -1)
         for row, i in enumerate(order if not once else range(1), start=first):
             sheet[f"{column}{row}"] = float(f"{values[i] / MILLIMETRES[unit or 'mm']:.15g}")
-    draft = Draft(layout, Book(sheets), system, columns, heading_row, first)
+    draft = Draft(layout, Book(sheets), system, columns, heading_row, first, numbered=bool(layout.numbers))
     if layout.numbers:
         column = letter(layout.left + 1)
         for sheet in sheets:
@@ -205,7 +205,8 @@ def extra_column(draft: Draft, heading: str, meaning: str) -> None:
     for row in draft.rows(name):
         if isinstance(value := sheet[f"{column}{row}"], float):
             sheet[f"{free}{row}"] = value * 1.01
-    draft.plain = draft.plain and meaning == "same" and "{" not in heading
+    # Without l, a column of a name that is not known might be it.
+    draft.plain = draft.plain and draft.layout.length and meaning == "same" and "{" not in heading
     _mean(draft, meaning)
 
 
@@ -288,7 +289,7 @@ def labels(draft: Draft, disagree: bool) -> None:
         for row in range(draft.first, draft.last + 1):
             if isinstance(sheet[f"{column}{row}"], int):
                 sheet[f"{column}{row}"] = f"M{sheet[f'{column}{row}']:02d}"
-    draft.plain = False
+    draft.plain = draft.numbered = False
     if disagree and draft.layout.modules > 1:
         draft.book.sheets[1][f"{column}{draft.last}"] = "spare"
         draft.truth = None
@@ -325,7 +326,7 @@ decorations = st.one_of(
     st.tuples(st.just(rows_below), st.sampled_from(["OLD DESIGN, do not use", "spare", "removed", "x1", "99"]), GAPS),
     st.tuples(st.just(total_below), st.sampled_from(["mean", "Sum", "", "5"]), GAPS),
     st.sampled_from([("measured in 2021", "same"), ("all in cm", "cm"), ("cm", "cm"), ("R: ROI", "same")]).map(lambda pair: (note_below, *pair)),
-    st.tuples(st.just(cell), st.sampled_from(["12,5", "12.5 cm", "n/a", True, None, "?", "=B2", "1e3x"])),
+    st.tuples(st.just(cell), st.sampled_from(["12,5", "12.5 cm", "n/a", True, None, "?", "see above", "1e3x"])),
     st.tuples(st.just(formula), st.booleans(), st.booleans()),
     st.tuples(
         st.just(other_sheet),
@@ -392,5 +393,4 @@ def written(recipe: Recipe, path: Path) -> Draft:
 
 
 def _both_speak_of_units(recipe: Recipe) -> bool:
-    meanings = [arguments[-1] for _, *arguments in recipe.added if isinstance(arguments[-1], str)] if recipe.added else []
-    return sum(meaning in MILLIMETRES for meaning in meanings) > 1
+    return sum(added[-1] in tuple(MILLIMETRES) for added in recipe.added) > 1

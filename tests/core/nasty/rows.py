@@ -71,7 +71,7 @@ def _labels() -> None:
     CASES.add("Main in reverse order, by number", _swap(_swap(_labelled([1, 2, 3, 4], [4, 3, 2, 1]), "Main", 3, 6), "Main", 4, 5), VARIED, RIGHT)
     CASES.add("Main without numbers", _labelled([1, 2, 3, 4], [None] * 4), VARIED, RIGHT, REFUSED, place=USERS, columns=users_map(length=False, dimensions={"number": None, "rows": "in order"}))
     CASES.add("Coordinates without numbers", _labelled([None] * 4, [1, 2, 3, 4]), VARIED, RIGHT, REFUSED, place=USERS, columns=users_map(length=False, position={"number": None}, dimensions={"number": None, "rows": "in order"}))
-    CASES.add("Coordinates without numbers, Main in another order", _swap(_labelled([None] * 4, [2, 1, 3, 4]), "Main", 3, 4), VARIED, REFUSED, RIGHT, place=USERS, columns=users_map(length=False, position={"number": None}))
+    CASES.add("Coordinates without numbers, Main in another order", _swap(_labelled([None] * 4, [2, 1, 3, 4]), "Main", 3, 4), VARIED, REFUSED, RIGHT, place=USERS, unmappable="the modules have no numbers of their own")
     CASES.add("both without numbers", _labelled([None] * 4, [None] * 4), VARIED, RIGHT, REFUSED, place=USERS, columns=in_order)
     CASES.add("other numbers in Main", _labelled([1, 2, 3, 4], [5, 6, 7, 8]), None, REFUSED, place=USERS)
     CASES.add("serial numbers in Main", _labelled([1, 2, 3, 4], [1007, 1003, 1012, 1001], ("No.", "serial")), None, REFUSED, place=USERS)
@@ -101,7 +101,7 @@ def _labels() -> None:
     ring["Coordinates"]["X2"] = "ring"
     for i, n in enumerate((1, 1, 2, 2)):
         ring["Coordinates"][f"X{3 + i}"] = n
-    CASES.add("a column of rings", ring, VARIED, RIGHT)
+    CASES.add("a column of rings", ring, VARIED, RIGHT, WARNED, place="Coordinates!X2")
     pandas = one_sheet(BIG, number="")
     for i in range(4):
         pandas.sheets[0][f"A{2 + i}"] = i

@@ -84,7 +84,7 @@ def _in_headings() -> None:
                     made.sheets[0][at] = float(f"{value / factor:.15g}")
             return made
 
-        CASES.add(f"unit ({text})", book, BIG, REFUSED, place=HEADINGS, unmappable=NO_SUCH_UNIT)
+        CASES.add(f"unit ({text})", book, BIG, REFUSED, place="Geometry!", unmappable=NO_SUCH_UNIT)
 
 
 def _of_one_column() -> None:
@@ -299,7 +299,7 @@ def _around() -> None:
         return made
 
     for text, unit in (("in cm", "cm"), ("All in inches!", "in")):
-        CASES.add(f"unit in a note of the heading: {text}", noted(text, unit), BIG, REFUSED, WARNED_OF, place="Geometry!B1", columns=one_sheet_map(unit))
+        CASES.add(f"unit in a note of the heading: {text}", noted(text, unit), BIG, REFUSED, WARNED_OF, place="Geometry!", columns=one_sheet_map(unit))
     CASES.add("note of the heading: measured in mm", noted("measured in mm by CMM, 2021", "mm"), BIG, *READ_OR_MAP, columns=one_sheet_map())
     CASES.add("note of the heading: who and when", noted("J. Smith: checked 2021-03-04", "mm"), BIG, RIGHT)
 
@@ -333,7 +333,7 @@ def _in_number_formats() -> None:
         "0.00\\ \\c\\m": "cm",
         '0.0"cm"': "cm",
         '#,##0.00" in"': "in",
-        '0.0##"""': "in",
+        '0.0##\\"': "in",
         "0.0\\″": "in",
         '0.0" Zoll"': "in",
         '0.000" m"': "m",

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ...core.cli.options import add_command, progress_bar
+from ...core.cli.options import add_command, add_workbook, progress_bar, read_workbook
 from ...core.export import write_run
 from ...core.files import ensure_folder
 from ...core.frames import euler_pose
@@ -19,7 +19,6 @@ from ...core.grid import Grid
 from ...core.mosaic import mosaic, write_png
 from ...core.phantoms.derenzo import DerenzoPhantom
 from ...core.project import project_run
-from ...core.workbook import read_system
 
 EXAMPLE = Path(__file__).parents[2] / "examples" / "dc-spect-80.xlsx"
 EULER_DEGREES = (30.0, 55.0, 0.0)
@@ -34,7 +33,7 @@ def add_parser(subparsers) -> None:  # type: ignore[no-untyped-def]
         "mphdrr demo --output out",
     )
     parser.add_argument("--output", default="out", metavar="FOLDER", help="where the results go")
-    parser.add_argument("--workbook", default=str(EXAMPLE), metavar="FILE", help="geometry workbook")
+    add_workbook(parser, "--workbook", str(EXAMPLE))
     parser.add_argument("--voxels", type=int, default=256, metavar="N", help="voxels along each side of the volume")
     parser.add_argument("--size", type=int, default=256, metavar="N", help="pixels along each side of an image")
     parser.set_defaults(run=_run)
@@ -48,7 +47,7 @@ def _run(arguments: argparse.Namespace) -> None:
     from .. import pictures, runs, scanner, volumes
 
     with _step("geometry"):
-        system = read_system(arguments.workbook)
+        system = read_workbook(arguments)
         collection = scanner.build_scanner(scene, system)
     with _step("phantom"):
         phantom = DerenzoPhantom(radius=40.0, rod_diameters=(8, 6, 5, 4, 3, 2), height=40.0, activity=100.0)

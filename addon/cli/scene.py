@@ -5,11 +5,10 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from ...core.cli.options import add_command, chosen_modules, output_path
+from ...core.cli.options import add_command, add_workbook, chosen_modules, output_path, read_workbook
 from ...core.errors import InputError
 from ...core.export import read_run
 from ...core.volume_io import read_volume, read_volume_of
-from ...core.workbook import read_system
 
 
 def add_parser(subparsers) -> None:  # type: ignore[no-untyped-def]
@@ -20,7 +19,7 @@ def add_parser(subparsers) -> None:  # type: ignore[no-untyped-def]
         "make a Blender scene of the scanner, with a volume and projections",
         "mphdrr scene scanner.xlsx --run run.h5 -o scanner.blend",
     )
-    parser.add_argument("workbook", metavar="WORKBOOK", help="geometry workbook (.xlsx, .xlsm)")
+    add_workbook(parser)
     parser.add_argument("--modules", metavar="RANGE", help="such as 1-40 or 1-20,41; default: all")
     parser.add_argument("--volume", metavar="FILE", help="also put in this volume: .nii, .nii.gz, .npz")
     parser.add_argument(
@@ -35,7 +34,7 @@ def _run(arguments: argparse.Namespace) -> None:
     path = output_path(arguments.output)
     if path.suffix.lower() != ".blend":
         raise InputError(f"{path}: expected a name ending in .blend")
-    system = chosen_modules(read_system(arguments.workbook), arguments.modules)
+    system = chosen_modules(read_workbook(arguments), arguments.modules)
     volume = read_volume(arguments.volume) if arguments.volume else None
     mu = read_volume_of(arguments.mu, "mu") if arguments.mu else None
     run = read_run(arguments.run_file) if arguments.run_file else None

@@ -18,6 +18,7 @@ from ..files import ensure_folder, refuse_folder
 from ..isotopes import ISOTOPES
 from ..progress import Progress
 from ..system import PinholeSystem
+from ..workbook import read_system
 
 DERENZO_OPTIONS = ("radius", "rods", "sectors", "height", "activity", "water", "background")
 """Of `add_phantom_options`, those that say what the Derenzo phantom is."""
@@ -73,6 +74,26 @@ def add_command(subparsers, name: str, summary: str, example: str) -> argparse.A
         epilog=f"example: {example}",
         formatter_class=_HelpFormatter,
     )
+
+
+def add_workbook(parser: argparse.ArgumentParser, name: str = "workbook", default: str | None = None) -> None:
+    """The geometry workbook, for `read_workbook`; `name` may be that of an option, with a default."""
+    what = "geometry workbook (.xlsx, .xlsm)"
+    if name == "workbook":
+        parser.add_argument(name, metavar="FILE", help=what)
+    else:
+        parser.add_argument(name, metavar="FILE", help=what, default=default, dest="workbook")
+    parser.add_argument(
+        "--columns",
+        metavar="MAP",
+        help="column map (.toml): which cells hold what, where the headings do not say it; geometry show --write-columns "
+        "makes a draft",
+    )
+
+
+def read_workbook(arguments: argparse.Namespace) -> PinholeSystem:
+    """The scanner of the workbook of `add_workbook`."""
+    return read_system(arguments.workbook, columns=arguments.columns)
 
 
 def add_phantom_options(parser: argparse.ArgumentParser) -> None:

@@ -24,19 +24,20 @@ from ..rearranging import centered
 from ..system import PinholeSystem
 from ..volume import Volume
 from ..volume_io import read_volume, read_volume_of
-from ..workbook import read_system
 from .options import (
     DERENZO_OPTIONS,
     PLACING_OPTIONS,
     add_command,
     add_phantom_options,
     add_view_options,
+    add_workbook,
     chosen_modules,
     number_or_name,
     numbered_path,
     output_path,
     photon_energy,
     progress_bar,
+    read_workbook,
     refuse,
 )
 from .phantom import chosen_phantom, placed_volume
@@ -57,7 +58,7 @@ def add_parser(subparsers) -> None:  # type: ignore[no-untyped-def]
         "--time 600 --aperture-points 7 --aperture-mu tungsten --crystal-mu CZT --noise 1 -o counts.h5\n"
         "example: mphdrr project scanner.xlsx --phantom thorax.toml --phantom-mu --emission --isotope Tc-99m -o counts.h5",
     )
-    parser.add_argument("workbook", metavar="WORKBOOK", help="geometry workbook (.xlsx, .xlsm)")
+    add_workbook(parser)
     source = parser.add_mutually_exclusive_group()
     source.add_argument(
         "--volume", metavar="FILE", help="volume or folder of a DICOM series; without it, a Derenzo phantom is made"
@@ -264,7 +265,7 @@ def _run(arguments: argparse.Namespace) -> None:
     path = output_path(arguments.output, FORMATS)
     picture = output_path(arguments.mosaic) if arguments.mosaic else None
     _require_fitting(arguments)
-    system = chosen_modules(read_system(arguments.workbook), arguments.modules)
+    system = chosen_modules(read_workbook(arguments), arguments.modules)
     model = chosen_model(arguments, system, None)  # before the long work: it says what cannot be
     files = arguments.states or ([arguments.volume] if arguments.volume else [])
     count = max(1, len(files))

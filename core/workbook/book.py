@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from ..errors import InputError
-from .formulas import CellError, NotComputable
+from .formulas import NotComputable
 from .sheet_xml import At, Cell, Unreadable
 from .workbook_xml import Place, WorkbookXml
 
@@ -177,7 +177,7 @@ class Sheet:
         return cell.formula if cell is not None else None
 
     def value(self, row: int, column: int) -> Any:
-        """What a cell holds: None if blank, else a float, str, bool, `CellError`, `Uncomputed`, `Outdated` or `Unreadable`."""
+        """What a cell holds, None if blank; of a formula that says nothing to rely on, `Uncomputed` or `Outdated`."""
         cell = self.cells.get((row, column))
         if cell is None:
             return None

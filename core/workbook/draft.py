@@ -23,17 +23,16 @@ class ColumnMapDraft:
     ----------
     columns : ColumnMap
         For a person to check; units that nothing states are empty, and what was not found is missing.
-    open : tuple of str
-        What is not certain, a line each; none where the headings are understood.
+    questions : tuple of str
+        What is not certain or missing, a line each; none where the headings are understood.
     """
 
     columns: ColumnMap
-    open: tuple[str, ...]
+    questions: tuple[str, ...]
 
     def write(self, path: str | os.PathLike[str]) -> None:
-        """Write the map as TOML, what is open as comments above it."""
-        lines = ["What the workbook's cells hold, as far as it was seen. Check every line.", *self.open]
-        lines += [fault for fault in self.columns.faults() if fault not in self.open]
+        """Write the map as TOML, the questions as comments above it."""
+        lines = ["What the workbook's cells hold, as far as it was seen. Check every line.", *self.questions]
         self.columns.write(path, "\n".join(lines))
 
 
@@ -77,7 +76,8 @@ def draft_column_map(path: str | os.PathLike[str]) -> ColumnMapDraft:
         sheet = next(iter(book.sheets), "Coordinates")
         guessed = [MappedTable(sheet, 2, 2, ())]
     tables = _merged(tables, guessed)
-    return ColumnMapDraft(ColumnMap(tuple(tables)), tuple(dict.fromkeys(doubts)))
+    columns = ColumnMap(tuple(tables))
+    return ColumnMapDraft(columns, tuple(dict.fromkeys([*doubts, *columns.faults()])))
 
 
 def preview_workbook(

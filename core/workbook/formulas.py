@@ -53,24 +53,6 @@ class Surroundings:
     name: Callable[[str], str | None] | None = None
 
 
-def evaluate(formula: str, lookup: Lookup) -> float | CellError:
-    """The number that `formula` (with its "=") gives, or the error value, e.g. #REF!, of a cell it refers to.
-
-    Raises
-    ------
-    NotComputable
-        It uses a function, name or value beyond those known here, or gives no number.
-    ArithmeticError, ValueError
-        Where the spreadsheet would show #DIV/0! or #NUM!.
-    """
-    value = _result(formula, Surroundings(lookup))
-    if isinstance(value, CellError):
-        return value
-    if isinstance(value, bool) or not isinstance(value, (float, type(None))):
-        raise NotComputable(f"it gives {str(value)!r}, not a number")
-    return value or 0.0
-
-
 def calculate(formula: str, surroundings: Surroundings) -> float | str | bool | CellError:
     """What a spreadsheet shows for `formula` (with its "="): a number, text, a boolean or an error value.
 
@@ -80,7 +62,9 @@ def calculate(formula: str, surroundings: Surroundings) -> float | str | bool | 
         It uses a function, name or value beyond those known here.
     """
     try:
-        value = _result(formula, surroundings)
+        value = _scalar(_parsed(formula, surroundings)())
+    except _ErrorValue as error:
+        return error.args[0]
     except ZeroDivisionError:
         return CellError("#DIV/0!")
     except (ArithmeticError, ValueError):
@@ -90,13 +74,6 @@ def calculate(formula: str, surroundings: Surroundings) -> float | str | bool | 
     if isinstance(value, float) and not math.isfinite(value):
         return CellError("#NUM!")
     return 0.0 if value is None else value
-
-
-def _result(formula: str, surroundings: Surroundings) -> Any:
-    try:
-        return _scalar(_parsed(formula, surroundings)())
-    except _ErrorValue as error:
-        return error.args[0]
 
 
 @lru_cache(maxsize=2**15)  # asked for twice: what a formula refers to, and what it gives
@@ -316,6 +293,8 @@ def _index(cells: _Term, row: _Term, column: _Term = lambda: None) -> Any:
     i, j = int(_number(row())), 1 if wanted is None else int(_number(wanted))
     if wanted is None and len(area) == area.columns:  # one row: the only index counts columns
         i, j = 1, i
+    elif wanted is None and area.columns > 1:
+        raise _ErrorValue(CellError("#REF!"))
     if i == 0 or j == 0:
         raise NotComputable("it uses a whole row or column of a range")
     if i < 0 or j < 0 or j > area.columns or i > len(area) // area.columns:
@@ -372,11 +351,33 @@ def _all_of(function: Callable[[list[bool]], bool]) -> Callable[..., bool]:
     return result
 
 
-def _counted(counts: Callable[[Any], bool]) -> Callable[..., float]:
+def _or_error(term: _Term) -> Any:
+    """A term's value, or the error that it gives: for functions that count errors, or pass over them."""
+    try:
+        return term()
+    except _ErrorValue as error:
+        return error.args[0]
+    except ZeroDivisionError:
+        return CellError("#DIV/0!")
+    except (ArithmeticError, ValueError):
+        return CellError("#NUM!")
+
+
+def _is_counted(value: Any) -> bool:
+    """Whether COUNT counts an argument that is no reference: numbers, booleans, texts of numbers, and a missing one."""
+    if type(value) is str:
+        try:
+            float(value)
+        except ValueError:
+            return False
+    return not isinstance(value, CellError)
+
+
+def _counted(in_area: Callable[[Any], bool], alone: Callable[[Any], bool]) -> Callable[..., float]:
     def result(*terms: _Term) -> float:
-        values = [term() for term in terms]
-        cells = [cell for value in values for cell in (value if isinstance(value, _Cells) else [value])]
-        return float(sum(counts(cell) for cell in cells))
+        values = [_or_error(term) for term in terms]
+        areas, others = ([v for v in values if isinstance(v, _Cells) is wanted] for wanted in (True, False))
+        return float(sum(in_area(cell) for area in areas for cell in area) + sum(map(alone, others)))
 
     return result
 
@@ -385,8 +386,8 @@ def _counted(counts: Callable[[Any], bool]) -> Callable[..., float]:
 _OF_TERMS: dict[str, tuple[int, int, Callable[..., Any]]] = {
     "AND": (1, 255, _all_of(all)),
     "CONCATENATE": (1, 255, lambda *terms: "".join(_text(term()) for term in terms)),
-    "COUNT": (1, 255, _counted(lambda cell: type(cell) is float)),
-    "COUNTA": (1, 255, _counted(lambda cell: cell is not None)),
+    "COUNT": (1, 255, _counted(lambda cell: type(cell) is float, _is_counted)),
+    "COUNTA": (1, 255, _counted(lambda cell: cell is not None, lambda value: True)),
     "FALSE": (0, 0, lambda: False),
     "IF": (2, 3, _if),
     "IFERROR": (2, 2, _if_error),

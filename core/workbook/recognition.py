@@ -43,6 +43,7 @@ HELP = "a column map can say what is meant (--columns, docs/workbook.md)"
 
 _ROWS_APART = 2
 """A symbol row and a description row that are further apart do not belong together."""
+_SUMMARY = re.compile(r"\b(SUM|AVERAGE|MEAN|MEDIAN|MIN|MAX|COUNT|COUNTA|STDEV|VAR|SUBTOTAL|AGGREGATE)[.SP]*\(", re.I)
 _LITERAL = re.compile(r'"([^"]*)"|\\(.)|\[\$([^\]-]*)[^\]]*\]')
 _SCALED = re.compile(r"[0#?],+(?![0#?,])|%")
 
@@ -106,7 +107,7 @@ class SheetSeen:
             place = self.sheet.place(row, c)
             if heading is None and unit not in QUANTITIES[first.quantity].units:
                 self.doubt(
-                    f"{place} holds {_quoted(text)} in the heading of {first.quantity}, expected nothing but that"
+                    f"{place} holds {_quoted(text)} in the heading of {first.quantity}, expected its name and a unit alone"
                 )
                 continue
             if heading is not None and heading.quantity != first.quantity:
@@ -147,6 +148,11 @@ class SheetSeen:
         """The columns with numbers in the modules' rows."""
         rows = set(self.rows)
         return {column for row, column in self.sheet.cells if row in rows and _is_number(self.sheet, row, column)}
+
+    @property
+    def label_headings(self) -> dict[str, At]:
+        """The headings of other names of the modules."""
+        return {plain(text).casefold(): at for at, text in self.above.items() if is_label_heading(text)}
 
     def unknown(self) -> list[tuple[At, str]]:
         """The headings over numbers that are none of a known column's."""
@@ -201,7 +207,7 @@ class SheetSeen:
             values = [(column, self.sheet.value(row, column)) for column in self.wanted]
             texts = [value for _, value in values if type(value) is str]
             filled = [column for column, value in values if value is not None]
-            if not filled or _is_summary(self.sheet, row, filled):
+            if not filled or _is_summary(self.sheet, row, self.wanted):
                 continue
             note = len(filled) == len(texts) == 1 and not re.fullmatch(r"[\d.,eE+\-\s]+", texts[0])
             if not note:
@@ -218,11 +224,7 @@ class SheetSeen:
             row
             for row in self.sheet.rows
             if row in sized
-            or (
-                row >= self.first_row
-                and module_number(self.sheet.value(row, self.label_column)) is not None
-                and not _is_summary(self.sheet, row, self.wanted)
-            )
+            or (row >= self.first_row and module_number(self.sheet.value(row, self.label_column)) is not None)
         )
 
     def table(self) -> Table:
@@ -385,7 +387,7 @@ def recognize(book: Book) -> Recognized:
     """What is seen of the scanner in a workbook, with the doubts."""
     seen = sheets_seen(book)
     taken: dict[str, SheetSeen] = {}
-    doubts = []
+    doubts, missing = [], []
     for name in (*NEEDED, "l"):
         having = [s for s in seen if name in s.columns]
         filled = [s for s in having if s.columns[name][0] in s.numeric]
@@ -397,7 +399,7 @@ def recognize(book: Book) -> Recognized:
         if having:
             taken[name] = (filled or having)[0]
         elif name != "l":
-            doubts.append(_missing(book, name))
+            missing.append(_missing(book, name))
     if (coordinates := taken.get("x1")) is not None:
         taken.update({name: coordinates for name in DERIVED if name in coordinates.columns})
         for name in POSITION:
@@ -409,7 +411,7 @@ def recognize(book: Book) -> Recognized:
     for sheet in dict.fromkeys(taken.values()):
         sheet.look_around({*NEEDED, "l", *(name for name, of in taken.items() if of is sheet)})
         doubts += sheet.doubts
-    return Recognized(book, taken, doubts)
+    return Recognized(book, taken, doubts + missing)
 
 
 def _missing(book: Book, name: str) -> str:
@@ -460,34 +462,32 @@ def _rows_of(name: str, layout: Layout, seen: SheetSeen, coordinates: SheetSeen,
 
 
 def _joined(modules: Table, table: Table, coordinates: SheetSeen, seen: SheetSeen) -> tuple[int, ...]:
+    """The row of each module in another sheet: by their numbers where both have them, else in order."""
+    file, own, other = modules.sheet.book.path.name, coordinates.label_headings, seen.label_headings
     if modules.labels is not None and table.labels is not None:
         rows = by_label(modules, table)
     else:
         rows = in_order(modules, table)
         if table.numbers is not None and list(table.numbers) != sorted(table.numbers):
             raise InputError(
-                f"{modules.sheet.book.path.name}: the modules of sheet {table.sheet.name} have numbers in no order, those "
-                f"of sheet {modules.sheet.name} none, expected numbers in both; {HELP}"
+                f"{file}: the modules of sheet {table.sheet.name} have numbers in no order, those of sheet "
+                f"{modules.sheet.name} none, expected numbers in both; {HELP}"
             )
-    names = [
-        {plain(s.above[at]).casefold(): at for at in s.above if is_label_heading(s.above[at])}
-        for s in (coordinates, seen)
-    ]
-    for heading, (_, column) in names[1].items():
-        if heading in names[0]:
-            own = names[0][heading][1]
-            for a, b in zip(modules.rows, rows, strict=True):
-                one, other = modules.sheet.value(a, own), table.sheet.value(b, column)
-                if one != other:
-                    raise InputError(
-                        f"{modules.sheet.book.path.name}: {modules.sheet.place(a, own)} is {one!r} but "
-                        f"{table.sheet.place(b, column)}, in the row that belongs to it, {other!r}; {HELP}"
-                    )
-        elif table.labels is None or modules.labels is None:
-            raise InputError(
-                f"{modules.sheet.book.path.name}: the rows of {table.sheet.place(*names[1][heading])} and of sheet "
-                f"{modules.sheet.name} have no number in common, expected a column of numbers in both; {HELP}"
-            )
+        for heading, at in other.items():
+            if heading not in own:
+                raise InputError(
+                    f"{file}: {table.sheet.place(*at)} heads names of modules that sheet {modules.sheet.name} has not, "
+                    f"expected a column in both that says which rows belong together; {HELP}"
+                )
+    for heading in own.keys() & other.keys():
+        for row, its in zip(modules.rows, rows, strict=True):
+            here, there = (row, own[heading][1]), (its, other[heading][1])
+            one, another = modules.sheet.value(*here), table.sheet.value(*there)
+            if one != another:
+                raise InputError(
+                    f"{file}: {modules.sheet.place(*here)} is {one!r} but {table.sheet.place(*there)}, in the row that "
+                    f"belongs to it, is {another!r}, expected the same; {HELP}"
+                )
     return rows
 
 
@@ -510,11 +510,17 @@ def _is_number(sheet: Sheet, row: int, column: int) -> bool:
 
 
 def _is_summary(sheet: Sheet, row: int, columns: list[int]) -> bool:
-    """Whether a row sums up others, as AVERAGE(B3:B82) below a column: one of `columns` refers to several rows of itself."""
+    """Whether a row sums up others: each number in `columns` is a sum, mean ... over several rows of its column."""
+    filled = [column for column in columns if sheet.value(row, column) is not None]
+    return bool(filled) and all(_sums_up(sheet, sheet.formula(row, column), column) for column in filled)
+
+
+def _sums_up(sheet: Sheet, formula: str | None, column: int) -> bool:
+    if formula is None or not _SUMMARY.search(formula):
+        return False
     return any(
         area.top < area.bottom and area.left <= column <= area.right and area.sheet in (None, sheet.name)
-        for column in columns
-        for area in areas_in(sheet.formula(row, column) or "=")
+        for area in areas_in(formula)
     )
 
 

@@ -75,7 +75,7 @@ class WorkbookXml:
                 self.parts[title] = member
                 self.sheets[title] = SheetXml(self.package.read(member), texts, title, name)
         self._by_folded_name = {title.casefold(): title for title in self.sheets}
-        self._extents: dict[str, tuple[int, int]] = {}
+        self._extents: dict[tuple[str, int], tuple[int, int]] = {}
 
     @property
     def suffix(self) -> str | None:
@@ -98,12 +98,10 @@ class WorkbookXml:
         if not self._styles:
             return []
         parts = self._parts_of(self._styles[0])
-        own = {e.attributes.get("numFmtId"): e.attributes.get("formatCode", "") for e in parts if e.name == "numFmt"}
-        ids = [
-            e.attributes.get("numFmtId", "0")
-            for e in parts
-            if e.name == "xf" and e.parent is not None and e.parent.name == "cellXfs"
-        ]
+        named = [e.attributes for e in parts if e.name == "numFmt"]
+        own = {attributes.get("numFmtId"): attributes.get("formatCode", "") for attributes in named}
+        styles = [e for e in parts if e.name == "xf" and e.parent is not None and e.parent.name == "cellXfs"]
+        ids = [e.attributes.get("numFmtId", "0") for e in styles]
         return [own[i] if i in own else BUILTIN_FORMATS.get(int(i), "") for i in ids]
 
     def number_format(self, cell: Cell) -> str:
@@ -200,9 +198,10 @@ class WorkbookXml:
 
     def extent(self, sheet: str) -> tuple[int, int]:
         """The last row and the last column of `sheet` with content."""
-        if sheet not in self._extents:
-            self._extents[sheet] = self.sheets[sheet].extent
-        return self._extents[sheet]
+        key = sheet, len(self.sheets[sheet].cells)  # which grows where rows are added; emptied cells do no harm
+        if key not in self._extents:
+            self._extents[key] = self.sheets[sheet].extent
+        return self._extents[key]
 
     @staticmethod
     def text(place: Place) -> str:

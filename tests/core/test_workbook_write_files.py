@@ -242,13 +242,13 @@ def test_odd_xml_is_patched_in_place(odd, tmp_path):
     assert written.changed == expected.changed
 
 
-def test_a_list_of_sheets_that_only_the_reader_understands_is_refused(tmp_path):
+def test_a_list_of_sheets_of_another_kind_is_refused(tmp_path):
     def edit(name: str, data: bytes) -> bytes:
         return data.replace(SPREADSHEET.encode(), b"urn:other") if name == "xl/workbook.xml" else data
 
     template = tmp_path / "t.xlsx"
     template.write_bytes(repacked(content_of(laid_out(Layout(seed=11))), edit))
-    with pytest.raises(mph.InputError, match=r"t\.xlsx: its list of sheets lacks Coordinates"):
+    with pytest.raises(mph.InputError, match=r"t\.xlsx: .* its sheets are none"):
         write_quietly(moved(read_quietly(template)), tmp_path / "o.xlsx", template)
 
 

@@ -16,12 +16,6 @@ MATERIAL_OPTIONS = ("aperture_mu", "opening_angle", "crystal_mu", "intrinsic_fwh
 """Of `add_materials`."""
 
 
-def add_workbook(parser: argparse.ArgumentParser) -> None:
-    """The workbook to read, and how to print the answer."""
-    parser.add_argument("file", metavar="FILE", help="geometry workbook (.xlsx, .xlsm)")
-    add_json(parser)
-
-
 def add_json(parser: argparse.ArgumentParser) -> None:
     """How to print the answer."""
     parser.add_argument("--json", action="store_true", help="print JSON")

@@ -12,9 +12,8 @@ import numpy as np
 from ...errors import InputError, InputWarning
 from ...geometry_checks import check_geometry
 from ...system import PinholeSystem
-from ...workbook import read_system
-from ..options import add_command
-from .arguments import add_workbook
+from ..options import add_command, add_workbook, read_workbook
+from .arguments import add_json
 
 
 def add_parser(actions) -> None:  # type: ignore[no-untyped-def]
@@ -27,6 +26,7 @@ def add_parser(actions) -> None:  # type: ignore[no-untyped-def]
         "mphdrr geometry check scanner.xlsx --wall 3 --strict",
     )
     add_workbook(parser)
+    add_json(parser)
     parser.add_argument("--plate", type=float, default=2.0, metavar="MM", help="thickness of the aperture plates")
     parser.add_argument("--wall", type=float, default=2.0, metavar="MM", help="thickness of the collimators' walls")
     parser.add_argument("--strict", action="store_true", help="exit with status 1 if there is any warning or finding")
@@ -36,7 +36,7 @@ def add_parser(actions) -> None:  # type: ignore[no-untyped-def]
 def _run(arguments: argparse.Namespace) -> None:
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always", InputWarning)
-        system = read_system(arguments.file)
+        system = read_workbook(arguments)
     messages = [str(w.message) for w in caught if issubclass(w.category, InputWarning)]
     report = check_geometry(system, plate_thickness=arguments.plate, wall_thickness=arguments.wall)
     findings = report.messages()
@@ -53,7 +53,7 @@ def _run(arguments: argparse.Namespace) -> None:
             print(finding)
         print(total)
     if arguments.strict and (messages or findings):
-        raise InputError(f"{arguments.file}: {total}")
+        raise InputError(f"{arguments.workbook}: {total}")
 
 
 def _count(lines: list[str], name: str) -> str:

@@ -13,8 +13,7 @@ from ...errors import InputError
 from ...geometry_export import FORMATS, Format, write_geometry
 from ...grid import Grid
 from ...volume_io import read_volume
-from ...workbook import read_system
-from ..options import add_command, add_view_options, chosen_modules, output_path
+from ..options import add_command, add_view_options, add_workbook, chosen_modules, output_path, read_workbook
 
 
 def add_parser(actions) -> None:  # type: ignore[no-untyped-def]
@@ -26,7 +25,7 @@ def add_parser(actions) -> None:  # type: ignore[no-untyped-def]
         "mphdrr geometry export scanner.xlsx -o scanner.xml --size 128 128 --detector real\n"
         "example: mphdrr geometry export scanner.xlsx -o cameras.npz --format pytorch3d --set in_ndc=no",
     )
-    parser.add_argument("file", metavar="FILE", help="geometry workbook (.xlsx, .xlsm)")
+    add_workbook(parser)
     parser.add_argument(
         "-o", "--output", required=True, metavar="OUT", help="the file to write, or the new folder for several"
     )
@@ -64,7 +63,7 @@ def _run(arguments: argparse.Namespace) -> None:
     format = FORMATS[arguments.format] if arguments.format else _format_of(arguments.output)
     options = dict(_setting(format, text) for text in arguments.set)
     path = output_path(arguments.output, format.suffixes) if format.suffixes else Path(arguments.output)
-    system = chosen_modules(read_system(arguments.file), arguments.modules)
+    system = chosen_modules(read_workbook(arguments), arguments.modules)
     views = system.views(tuple(arguments.size), arguments.detector, arguments.magnification, arguments.pitch)
     write_geometry(system, path, format.name, views=views, **options)
     print(f"{path}: {format.title}, {len(system)} module{'s' * (len(system) > 1)}")

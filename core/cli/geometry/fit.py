@@ -9,9 +9,8 @@ from typing import Any
 import numpy as np
 
 from ...generators import RingFit, fit_rings
-from ...workbook import read_system
-from ..options import add_command
-from .arguments import add_workbook
+from ..options import add_command, add_workbook, read_workbook
+from .arguments import add_json
 
 _FOLLOWS = 0.1  # mm off an ellipse that rounding in a workbook may bring about
 
@@ -25,11 +24,12 @@ def add_parser(actions) -> None:  # type: ignore[no-untyped-def]
         "mphdrr geometry fit scanner.xlsx",
     )
     add_workbook(parser)
+    add_json(parser)
     parser.set_defaults(run=_run)
 
 
 def _run(arguments: argparse.Namespace) -> None:
-    rings = [_record(fit) for fit in fit_rings(read_system(arguments.file))]
+    rings = [_record(fit) for fit in fit_rings(read_workbook(arguments))]
     if arguments.json:
         print(json.dumps({"rings": rings, "units": "mm, degrees"}, indent=1))
         return

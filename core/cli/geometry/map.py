@@ -13,9 +13,17 @@ from ...maps import MAPS
 from ...system import PinholeSystem
 from ...volume import Volume
 from ...volume_io import VOLUME_FORMATS, write_volume
-from ...workbook import read_system
-from ..options import add_command, chosen_modules, one_or_three, output_path, progress_bar, refuse
-from .arguments import MATERIAL_OPTIONS, add_materials, add_workbook, resolution_settings, sensitivity_settings
+from ..options import (
+    add_command,
+    add_workbook,
+    chosen_modules,
+    one_or_three,
+    output_path,
+    progress_bar,
+    read_workbook,
+    refuse,
+)
+from .arguments import MATERIAL_OPTIONS, add_json, add_materials, resolution_settings, sensitivity_settings
 
 _OF_MATERIALS = ("sensitivity", "resolution")
 
@@ -42,6 +50,7 @@ def add_parser(actions) -> None:  # type: ignore[no-untyped-def]
     parser.add_argument("-o", "--output", required=True, metavar="FILE", help=", ".join(VOLUME_FORMATS))
     add_materials(parser)
     add_workbook(parser)
+    add_json(parser)
     parser.set_defaults(run=_run)
 
 
@@ -49,7 +58,7 @@ def _run(arguments: argparse.Namespace) -> None:
     path = output_path(arguments.output, VOLUME_FORMATS)
     if arguments.quantity not in _OF_MATERIALS:
         refuse(arguments, MATERIAL_OPTIONS, f"has no effect on --quantity {arguments.quantity}")
-    system = chosen_modules(read_system(arguments.file), arguments.modules)
+    system = chosen_modules(read_workbook(arguments), arguments.modules)
     voxels = whole_shape(one_or_three(arguments.voxels), "--voxels", 3)
     spacing = one_or_three(arguments.spacing) if arguments.spacing else 2 * system.roi_radius.max() / min(voxels)
     volume = _map(arguments, system, Grid.centered(voxels, spacing, arguments.center))

@@ -11,9 +11,8 @@ import numpy as np
 from ...design import roi_radius_seen
 from ...performance import magnification, resolution, sensitivity
 from ...sampling import sampling_gaps
-from ...workbook import read_system
-from ..options import add_command
-from .arguments import add_materials, add_workbook, resolution_settings, sensitivity_settings
+from ..options import add_command, add_workbook, read_workbook
+from .arguments import add_json, add_materials, resolution_settings, sensitivity_settings
 
 
 def add_parser(actions) -> None:  # type: ignore[no-untyped-def]
@@ -29,11 +28,12 @@ def add_parser(actions) -> None:  # type: ignore[no-untyped-def]
     )
     add_materials(parser)
     add_workbook(parser)
+    add_json(parser)
     parser.set_defaults(run=_run)
 
 
 def _run(arguments: argparse.Namespace) -> None:
-    system = read_system(arguments.file)
+    system = read_workbook(arguments)
     points = [arguments.point]
     counts = 1e6 * sensitivity(system, points, **sensitivity_settings(arguments, system))[0]
     fwhm = resolution(system, points, **resolution_settings(arguments, system))[0]

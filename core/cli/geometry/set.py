@@ -14,10 +14,10 @@ from numpy.typing import NDArray
 from ...design import collimator_length
 from ...errors import InputError, InputWarning
 from ...system import PinholeSystem
-from ...workbook import WrittenWorkbook, read_system, write_system
+from ...workbook import WrittenWorkbook, write_system
 from ...workbook.checks import is_by_design
-from ..options import add_command, chosen_modules, output_path
-from .arguments import add_workbook
+from ..options import add_command, add_workbook, chosen_modules, output_path, read_workbook
+from .arguments import add_json
 
 _DIMENSIONS = {
     "diameter": ("pinhole_diameter", "d, pinhole diameter"),
@@ -36,6 +36,7 @@ def add_parser(actions) -> None:  # type: ignore[no-untyped-def]
         "mphdrr geometry set scanner.xlsx --modules 1-20 --diameter 2 -o thinner.xlsx",
     )
     add_workbook(parser)
+    add_json(parser)
     parser.add_argument(
         "-o", "--output", required=True, metavar="OUT", help="workbook to write; FILE itself is replaced"
     )
@@ -58,8 +59,8 @@ def _run(arguments: argparse.Namespace) -> None:
     target = output_path(arguments.output, (".xlsx", ".xlsm"))
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always", InputWarning)
-        system = _changed(read_system(arguments.file), arguments)
-        written = write_system(system, target, template=arguments.file)
+        system = _changed(read_workbook(arguments), arguments)
+        written = write_system(system, target, template=arguments.workbook)
     messages = [str(w.message) for w in caught if issubclass(w.category, InputWarning)]
     if arguments.json:
         answer = {**dataclasses.asdict(written), "path": str(written.path), "warnings": messages}

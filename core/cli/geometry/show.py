@@ -4,14 +4,16 @@ from __future__ import annotations
 
 import argparse
 import json
+import sys
 from typing import Any
 
 import numpy as np
 
+from ...errors import InputError
 from ...system import PinholeSystem
-from ...workbook import read_system
-from ..options import add_command, chosen_modules
-from .arguments import add_workbook
+from ...workbook import draft_column_map
+from ..options import add_command, add_workbook, chosen_modules, output_path, read_workbook
+from .arguments import add_json
 
 
 def add_parser(actions) -> None:  # type: ignore[no-untyped-def]
@@ -21,11 +23,18 @@ def add_parser(actions) -> None:  # type: ignore[no-untyped-def]
     )
     parser.add_argument("--modules", metavar="RANGE", help="such as 1-40 or 1-20,41; default: all")
     add_workbook(parser)
+    add_json(parser)
+    parser.add_argument(
+        "--write-columns", metavar="MAP", help="instead, write a column map (.toml) of what was seen, for you to check"
+    )
     parser.set_defaults(run=_run)
 
 
 def _run(arguments: argparse.Namespace) -> None:
-    system = read_system(arguments.file)
+    if arguments.write_columns is not None:
+        _write_columns(arguments)
+        return
+    system = read_workbook(arguments)
     chosen = set(chosen_modules(system, arguments.modules).numbers.tolist())
     rows = [row for row in _rows(system) if row["number"] in chosen]  # rings are those of the whole scanner
     if arguments.json:
@@ -38,6 +47,22 @@ def _run(arguments: argparse.Namespace) -> None:
             "{d:5.2f} {Ld:6.2f} {Td:6.2f} {R:6.2f}".format(**row)
         )
     print("lengths in mm, angles in radians")
+
+
+def _write_columns(arguments: argparse.Namespace) -> None:
+    path = output_path(arguments.write_columns, (".toml",))
+    if arguments.columns is not None:
+        raise InputError("--write-columns writes what the headings say, expected it without --columns")
+    draft = draft_column_map(arguments.workbook)
+    draft.write(path)
+    if arguments.json:
+        print(json.dumps({"path": str(path), "open": draft.questions}, indent=1))
+        return
+    for question in draft.questions:
+        sys.stderr.write(f"mphdrr: to be settled: {question}\n")
+    print(
+        f"{path}: {len(draft.questions)} to be settled; check it, then: geometry show {arguments.workbook} --columns {path}"
+    )
 
 
 def _rows(system: PinholeSystem) -> list[dict[str, Any]]:

@@ -24,7 +24,7 @@ from .workbooks import by_design, changed
 try:
     from hypothesis import HealthCheck, given, settings
 
-    from .nasty.random_books import recipes, written
+    from .nasty.random_books import map_of, recipes, written
 except ImportError:  # the property test skips
     settings = None
 
@@ -72,6 +72,11 @@ else:
         if outcome.system is not None and not outcome.warnings:
             assert draft.truth is not None, "read without a word, though nobody can tell what it means"
             assert not (wrong := differences(outcome.system, draft.truth, draft.numbered)), wrong
+        columns = map_of(draft)
+        if outcome.system is None and columns is not None:
+            mapped = read(path, columns)
+            assert mapped.system is not None, f"refused with a map too: {mapped.refusal}"
+            assert not (wrong := differences(mapped.system, draft.truth, draft.numbered)), wrong
 
 
 # Written back in the file's own units

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +13,7 @@ from openpyxl.utils import get_column_letter as letter
 
 from mphdrr.core import PinholeSystem
 
-from .scanners import DESCRIPTIONS, MILLIMETRES, SYMBOLS, quantity, scanner
+from .scanners import DESCRIPTIONS, MILLIMETRES, SYMBOLS, column_map, quantity, scanner
 from .sheets import Book, Formula, Sheet, by_hand, by_openpyxl
 
 POSITION, DIMENSIONS = ("x1", "y1", "z1"), ("d", "R", "Ld", "Td")
@@ -38,6 +38,10 @@ class Layout:
     unit: str
     units_of: str  # which quantities are in `unit`, said in their headings: all, position, one
 
+    @property
+    def with_unit(self) -> tuple[str, ...]:
+        return {"all": self.order, "position": POSITION, "one": self.order[:1]}[self.units_of]
+
 
 @dataclass
 class Draft:
@@ -51,6 +55,8 @@ class Draft:
     first: int
     plain: bool = True
     numbered: bool = True
+    said: set[str] = field(default_factory=set)  # the units that decorations speak of
+    units: dict[str, str] = field(default_factory=dict)  # in which the numbers are stored, where it is not mm
 
     @property
     def last(self) -> int:
@@ -87,7 +93,6 @@ def laid_out(layout: Layout) -> Draft:
     names = {name: sheets[-1 if name in DIMENSIONS else 0] for name in layout.order}
     two_rows = layout.style == "both"
     heading_row, first = layout.top + 1, layout.top + 2 + two_rows
-    of_unit = {"all": layout.order, "position": POSITION, "one": layout.order[:1]}[layout.units_of]
     columns: dict[str, tuple[Sheet, str]] = {}
     used = {sheet.name: layout.left + 1 + bool(layout.numbers) for sheet in sheets}
     for name in layout.order:
@@ -95,7 +100,7 @@ def laid_out(layout: Layout) -> Draft:
         column = letter(used[sheet.name])
         used[sheet.name] += 1 + layout.gap
         columns[name] = (sheet, column)
-        unit = layout.unit if name in of_unit else ""
+        unit = layout.unit if name in layout.with_unit else ""
         written = f" ({unit})" if unit else ""
         if two_rows:
             sheet[f"{column}{heading_row}"] = SYMBOLS[name]
@@ -121,6 +126,7 @@ def laid_out(layout: Layout) -> Draft:
                 order.reverse()
             for row, number in enumerate(order if not once else order[:1], start=first):
                 sheet[f"{column}{row}"] = number
+    draft.units = dict.fromkeys(layout.with_unit, layout.unit) if layout.unit else {}
     # One row for all is plain without numbers only: with them it might be the first module's.
     draft.plain = not (layout.shared and layout.numbers and len(sheets) == 2)
     return draft
@@ -129,13 +135,18 @@ def laid_out(layout: Layout) -> Draft:
 # Decorations: each changes the draft, and what a person reads in it.
 
 
-def _other_unit(draft: Draft, unit: str) -> None:
-    """Store the numbers in `unit`, which the headings do not say."""
+def _other_unit(draft: Draft, unit: str, sheets: list[Sheet]) -> None:
+    """Store the numbers of `sheets` in `unit`, but for those whose headings say a unit."""
     for name, (sheet, column) in draft.columns.items():
+        if sheet not in sheets or (draft.layout.unit and name in draft.layout.with_unit):
+            continue
+        draft.units[name] = unit
         for row in draft.rows(name):
             at = f"{column}{row}"
             if isinstance(sheet[at], float):
                 sheet[at] = float(f"{sheet[at] / MILLIMETRES[unit]:.15g}")
+            else:
+                draft.truth = None  # a formula, of a number in mm
 
 
 def title(draft: Draft, text: str, meaning: str) -> None:
@@ -165,7 +176,7 @@ def units_row(draft: Draft, text: str, meaning: str) -> None:
         for sheet, column in draft.columns.values():
             sheet[f"{column}{draft.heading_row - 1}"] = text
         draft.plain = False
-        _mean(draft, meaning)
+        _mean(draft, meaning, everywhere=True)
 
 
 def number_format(draft: Draft, code: str, meaning: str) -> None:
@@ -173,7 +184,7 @@ def number_format(draft: Draft, code: str, meaning: str) -> None:
         for row in draft.rows(name):
             sheet.formats[f"{column}{row}"] = code
     draft.plain &= meaning == "same" and '"' not in code
-    _mean(draft, meaning)
+    _mean(draft, meaning, everywhere=True)
 
 
 def heading_word(draft: Draft, word: str, meaning: str) -> None:
@@ -185,13 +196,17 @@ def heading_word(draft: Draft, word: str, meaning: str) -> None:
     _mean(draft, meaning)
 
 
-def _mean(draft: Draft, meaning: str) -> None:
+def _mean(draft: Draft, meaning: str, everywhere: bool = False) -> None:
+    """What a decoration of the first sheet, or of all, says of the numbers: their unit, nothing, or what nobody can tell."""
     if meaning == "nobody":
         draft.truth = None
     elif meaning != "same":
-        if draft.layout.unit:
-            draft.truth = None  # at odds with the headings
-        _other_unit(draft, meaning)
+        again = meaning in draft.said
+        draft.said.add(meaning)
+        if draft.layout.unit not in ("", meaning) or len(draft.said) > 1:
+            draft.truth = None  # at odds with the headings, or with another decoration
+        if not again:
+            _other_unit(draft, meaning, draft.book.sheets if everywhere else draft.book.sheets[:1])
 
 
 def extra_column(draft: Draft, heading: str, meaning: str) -> None:
@@ -275,7 +290,9 @@ def other_sheet(draft: Draft, name: str, kind: str, state: str) -> None:
                 for row in draft.rows(q):
                     if isinstance(sheet[f"{column}{row}"], float):
                         sheet[f"{column}{row}"] *= 1.02
-        draft.truth, draft.plain = None, False
+        draft.plain = False
+        if name != "Theta" or draft.layout.sheets != ("Coordinates", "Main"):  # beside them it is known to be no table
+            draft.truth = None
     sheet.state = state
     draft.book.sheets.append(sheet)
 
@@ -302,7 +319,7 @@ def backwards(draft: Draft) -> None:
 
 
 UNIT_WORDS = [("cm", "cm"), ("in cm", "cm"), ("all lengths in cm", "cm"), ("Units: cm", "cm"), ("inches", "in"), ("m", "m"), ("dm", "dm"), ("[cm]", "cm"), ("Maße in Zoll", "in"), ("lengths in mm", "same"), ("mm", "same"), ("feet", "ft")]
-OTHER_WORDS = [("OBSOLETE", "nobody"), ("nominal", "nobody"), ("old", "nobody")]
+OTHER_WORDS = [("OBSOLETE", "same"), ("half values", "nobody"), ("mirrored", "nobody"), ("values x 10", "nobody")]
 TITLES = [("DC-SPECT", "same"), ("Geometry of the scanner", "same"), ("2021-03-04", "same")]
 HEADING_WORDS = [
     *(("{} (old)", "nobody"), ("tolerance of {}", "nobody"), ("half {}", "nobody"), ("{} nominal", "nobody"), ("{}²", "nobody")),
@@ -366,10 +383,14 @@ class Recipe:
     program: str
 
 
+def _some(low: int, high: int) -> st.SearchStrategy[tuple]:
+    return st.lists(decorations, min_size=low, max_size=high, unique_by=lambda added: added[0]).map(tuple)
+
+
 recipes = st.builds(
     Recipe,
     layout=layouts,
-    added=st.lists(decorations, max_size=2).map(tuple),
+    added=st.one_of(st.just(()), *(_some(low, high) for low, high in ((1, 1), (1, 2), (2, 3), (3, 4)))),
     program=st.sampled_from(["by hand", "by hand", "openpyxl"]),
 )
 
@@ -379,10 +400,8 @@ def written(recipe: Recipe, path: Path) -> Draft:
     draft = laid_out(recipe.layout)
     for add, *arguments in recipe.added:
         add(draft, *arguments)
-    # Two decorations together may say more than each of them.
-    if len(recipe.added) > 1 and not draft.plain and draft.truth is not None and _both_speak_of_units(recipe):
-        draft.truth = None
-    if recipe.program == "openpyxl":
+    stale = any(add is formula and arguments[0] for add, *arguments in recipe.added)
+    if recipe.program == "openpyxl" and not stale:  # openpyxl stores no values that could be stale
         try:
             by_openpyxl(draft.book, path)
         except ValueError:  # what openpyxl does not write
@@ -392,5 +411,20 @@ def written(recipe: Recipe, path: Path) -> Draft:
     return draft
 
 
-def _both_speak_of_units(recipe: Recipe) -> bool:
-    return sum(added[-1] in tuple(MILLIMETRES) for added in recipe.added) > 1
+def map_of(draft: Draft) -> str | None:
+    """The column map that says what a person sees; None where a map has no words for it."""
+    units = {name: draft.units.get(name, "mm") for name in draft.columns}
+    if draft.truth is None or not set(units.values()) <= {"mm", "cm", "m", "in"}:
+        return None
+    layout, tables = draft.layout, []
+    for i, sheet in enumerate(draft.book.sheets[: len(layout.sheets)]):
+        shared = bool(i) and layout.shared
+        table: dict[str, Any] = {"sheet": sheet.name, "first_row": draft.first}
+        table["last_row"] = draft.first if shared else draft.last
+        if layout.numbers and not shared:
+            table["number"] = letter(layout.left + 1)
+        if i:
+            table["rows"] = "one for all" if shared else "by number" if layout.numbers else "in order"
+        table["columns"] = {name: (c, units[name]) for name, (of, c) in draft.columns.items() if of is sheet}
+        tables.append(table)
+    return column_map(*tables)

@@ -19,7 +19,7 @@ import numpy as np
 from ..core.errors import InputError, InputWarning
 from ..core.module_parts import module_parts
 from ..core.system import PinholeSystem
-from ..core.workbook import QuantityCells, SystemSource
+from ..core.workbook import ColumnMap, QuantityCells, SystemSource
 from . import cameras, design, ids
 from .module_values import LENGTHS, TYPED, is_edited, is_moved, module_numbers, off_aim, remember
 from .replacement import clear, losses, modules_text
@@ -366,11 +366,23 @@ def copy_numbers(
 
 
 def _source_to_dict(source: SystemSource | None) -> dict[str, Any]:
-    return {} if source is None else {**asdict(source), "path": str(source.path)}
+    if source is None:
+        return {}
+    columns = "" if source.columns is None else source.columns.to_toml()
+    return {**asdict(source), "path": str(source.path), "columns": columns}
 
 
 def _source_from_dict(values: dict[str, Any]) -> SystemSource | None:
     if not values:
         return None
     cells = tuple(QuantityCells(**{**c, "rows": tuple(c["rows"])}) for c in values["cells"])
-    return SystemSource(**{**values, "path": Path(values["path"]), "numbers": tuple(values["numbers"]), "cells": cells})
+    columns = values.get("columns")  # files of earlier versions have none
+    return SystemSource(
+        **{
+            **values,
+            "path": Path(values["path"]),
+            "numbers": tuple(values["numbers"]),
+            "cells": cells,
+            "columns": ColumnMap.from_toml(columns) if columns else None,
+        }
+    )

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 from ..errors import InputError
 from .book import HEADING_ROWS, Book, Outdated, Sheet, Uncomputed
 from .column_map import ColumnMap, MappedColumn, MappedTable
-from .layout import column_map_of
+from .layout import Layout, column_map_of
 from .quantities import DIMENSIONS, NEEDED, POSITION, may_mean, understood
 from .recognition import OWN_SHEETS, SheetSeen, recognize, recognized_layout
 
@@ -62,7 +62,7 @@ def draft_column_map(path: str | os.PathLike[str]) -> ColumnMapDraft:
     book = Book(path)
     recognized = recognize(book)
     try:
-        return ColumnMapDraft(column_map_of(recognized_layout(book)), ())
+        return _certain(recognized_layout(book))
     except InputError as error:
         doubts = [doubt.removeprefix(f"{book.path.name}: ") for doubt in recognized.doubts or [str(error)]]
     tables: list[MappedTable] = []
@@ -78,6 +78,20 @@ def draft_column_map(path: str | os.PathLike[str]) -> ColumnMapDraft:
     tables = _merged(tables, guessed)
     columns = ColumnMap(tuple(tables))
     return ColumnMapDraft(columns, tuple(dict.fromkeys([*doubts, *columns.faults()])))
+
+
+def _certain(layout: Layout) -> ColumnMapDraft:
+    """The map of a layout that is understood, without optional columns that are not filled: a map's cells must be."""
+    values = {
+        name: [column.table.sheet.value(row, column.column) for row in column.rows]
+        for name, column in layout.columns.items()
+    }
+    kept = {name for name in values if name in NEEDED or all(type(value) is float for value in values[name])}
+    questions = ()
+    if "l" in values and "l" not in kept and any(value is not None for value in values["l"]):
+        questions = ("l stands in some rows only: in a column map, only rows that hold it can be named",)
+    columns = {name: column for name, column in layout.columns.items() if name in kept}
+    return ColumnMapDraft(column_map_of(replace(layout, columns=columns)), questions)
 
 
 def preview_workbook(

@@ -98,7 +98,9 @@ def read(book: Book, column_map: ColumnMap | None = None) -> Reading:
     for name in _COMPUTED:
         if name in columns:
             # On the z axis a spreadsheet's ATAN2 shows #DIV/0!, and any azimuth is right.
-            given[name] = columns[name].given_or_nan(on_axis if name == "azimuth" else None)
+            may_fail = on_axis if name == "azimuth" else None
+            named = name == "l" and column_map is not None
+            given[name] = columns[name].given() if named else columns[name].given_or_nan(may_fail)
     values["l"] = _collimator_length(columns, values, given)
     for name in (*DIMENSIONS, "l"):
         warn_of_implausible(name, values[name], columns[name if name in columns else "x1"])

@@ -305,7 +305,7 @@ class SheetSeen:
         modules = set(self.rows)
         for at, text in self.sheet.texts.items():
             row, column = at
-            if at in self.above and (column in self.headings or column in self.numeric - {self.label_column}):
+            if at in self.above and (column in self.headings or self._heads_its_own(at)):
                 continue
             for unit in units_in(text, alone=row in modules):
                 if lengths != {unit}:
@@ -313,6 +313,11 @@ class SheetSeen:
                         f"{self.sheet.place(*at)} holds {_quoted(text)}, where the headings say {_several(lengths)}: "
                         "expected one unit"
                     )
+
+    def _heads_its_own(self, at: At) -> bool:
+        """Whether a text is the heading of numbers that are of no concern: its unit is theirs alone."""
+        alone = len(self.aside[at[1]]) == 1 and units_in(self.above[at], alone=True)
+        return at[1] in self.numeric - {self.label_column} and not alone
 
     def _formats(self, used: list[tuple[int, str]]) -> None:
         """Number formats that show another unit, or another number, than the cell's."""

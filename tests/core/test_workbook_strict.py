@@ -1,0 +1,511 @@
+"""What is not understood for certain is refused, naming the cell; what is, is right, in whatever unit."""
+
+from __future__ import annotations
+
+import io
+import re
+import warnings
+import zipfile
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import openpyxl
+import pytest
+from openpyxl.utils import get_column_letter
+from openpyxl.workbook import Workbook
+from openpyxl.worksheet.worksheet import Worksheet
+
+import mphdrr.core as mph
+from mphdrr.core.errors import InputError, InputWarning
+from mphdrr.core.workbook.quantities import LENGTH_UNITS, QUANTITIES, Heading, understood
+
+from .test_workbook import _typed as typed
+from .test_workbook import assert_plain, plain, read_edited, saved
+
+Edit = Callable[[Worksheet, Worksheet], object]
+
+
+@pytest.fixture(autouse=True)
+def warnings_are_errors():
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        yield
+
+
+def _set(**cells: object) -> Edit:
+    """Typed numbers everywhere, then cells such as Coordinates_B1="x1 (cm)"."""
+
+    def edit(main: Worksheet, coordinates: Worksheet) -> None:
+        typed(main, coordinates)
+        for name, value in cells.items():
+            sheet, cell = name.split("_")
+            {"Main": main, "Coordinates": coordinates}[sheet][cell] = value
+
+    return edit
+
+
+def _no_symbols(main: Worksheet, coordinates: Worksheet) -> None:
+    typed(main, coordinates)
+    for sheet in (main, coordinates):
+        for cell in sheet[1]:
+            cell.value = None
+
+
+def _heading(cell: str, text: str) -> Edit:
+    """A heading of its own in row 2, without the symbols in row 1."""
+
+    def edit(main: Worksheet, coordinates: Worksheet) -> None:
+        _no_symbols(main, coordinates)
+        (main if cell[0] == "M" else coordinates)[cell[1:]] = text
+
+    return edit
+
+
+def _also(*edits: Edit) -> Edit:
+    def edit(main: Worksheet, coordinates: Worksheet) -> None:
+        for one in edits:
+            one(main, coordinates)
+
+    return edit
+
+
+def _moved_down(main: Worksheet, coordinates: Worksheet) -> None:
+    typed(main, coordinates)
+    coordinates.insert_rows(1, 3)
+
+
+def _merged(main: Worksheet, coordinates: Worksheet) -> None:
+    _moved_down(main, coordinates)
+    coordinates["B3"] = "cm"
+    coordinates.merge_cells("B3:D3")
+
+
+def _format(cells: str, number_format: str) -> Edit:
+    def edit(main: Worksheet, coordinates: Worksheet) -> None:
+        typed(main, coordinates)
+        for row in coordinates[cells]:
+            for cell in row:
+                cell.number_format = number_format
+
+    return edit
+
+
+def _column(title: str, values: list[object], letter: str = "R") -> Edit:
+    def edit(main: Worksheet, coordinates: Worksheet) -> None:
+        typed(main, coordinates)
+        coordinates[f"{letter}1"] = title
+        for row, value in enumerate(values, start=3):
+            coordinates[f"{letter}{row}"] = value
+
+    return edit
+
+
+def _labels(own: list[object], of_main: list[object], heading: str | None = None) -> Edit:
+    def edit(main: Worksheet, coordinates: Worksheet) -> None:
+        typed(main, coordinates)
+        for sheet, labels in ((coordinates, own), (main, of_main)):
+            if heading is not None:
+                sheet["A2"] = heading
+            for row, label in enumerate(labels, start=3):
+                sheet.cell(row, 1).value = label
+
+    return edit
+
+
+def _second_table(start: int, text: str | None) -> Edit:
+    def edit(main: Worksheet, coordinates: Worksheet) -> None:
+        typed(main, coordinates)
+        if text is not None:
+            coordinates.cell(start, 1).value = text
+        for i, row in enumerate(range(start + 1, start + 4)):
+            for column, value in enumerate((5 + i, 200.0 + i, 10.0 * i, 5.0), start=1):
+                coordinates.cell(row, column).value = value
+            for column, value in enumerate((5 + i, 2.3, 75.0, 50.0, 10.0), start=1):
+                main.cell(7 + i, column).value = value
+
+    return edit
+
+
+def _of_main(title: str, values: list[object]) -> Edit:
+    def edit(main: Worksheet, coordinates: Worksheet) -> None:
+        typed(main, coordinates)
+        for row, value in enumerate([title, None, *values], start=1):
+            main.cell(row, 8).value = value
+
+    return edit
+
+
+def _no_numbers(main: Worksheet, coordinates: Worksheet) -> None:
+    coordinates.delete_cols(1)
+
+
+def _copy_of_coordinates(name: str, state: str = "visible", own_state: str = "visible") -> Edit:
+    def edit(main: Worksheet, coordinates: Worksheet) -> None:
+        typed(main, coordinates)
+        copy = main.parent.copy_worksheet(coordinates)
+        copy.title, copy.sheet_state, coordinates.sheet_state = name, state, own_state
+        copy["B3"] = 300.0
+
+    return edit
+
+
+def _single(main: Worksheet, coordinates: Worksheet) -> None:
+    typed(main, coordinates)
+    main.delete_rows(4, 10)
+
+
+REFUSED: dict[str, tuple[Edit, str]] = {
+    # Units
+    **{
+        f"unit {unit}": (_heading("CB2", f"x1 ({unit})"), "Coordinates!B2")
+        for unit in ("dm", "mil", "Zoll", "0.1 mm", "cm, from isocentre", "cm nominal", "km", "ft", '"', "mm?", "m m")
+    },
+    **{
+        f"heading {text}": (_heading("CB2", text), "Coordinates!B2")
+        for text in ("x1 cm", "x1_cm", "cm x1", "(cm) x1", "x1 (old)", "x1 (nominal)", "x1 = cm", "x1*10", "x1'", "-x1")
+    },
+    "unit beside the symbol": (_set(Coordinates_B1="x1 (Zoll)"), "Coordinates!B1 holds 'x1 (Zoll)'"),
+    "two units": (_set(Coordinates_B1="x1 (cm)", Coordinates_B2="x coordinate at pinhole (mm)"), "says cm but"),
+    "merged unit over headings": (_merged, "Coordinates!B3 holds 'cm'"),
+    "unit in a title": (_also(_moved_down, lambda m, c: c.__setitem__("A1", "all lengths in cm")), "Coordinates!A1"),
+    "unit of a title in words": (
+        _also(_moved_down, lambda m, c: c.__setitem__("E1", "Scanner A, in inches")),
+        "Coordinates!E1",
+    ),
+    "tenths of mm": (_also(_moved_down, lambda m, c: c.__setitem__("A1", "values in 0.1 mm")), "Coordinates!A1"),
+    "a scale": (_also(_moved_down, lambda m, c: c.__setitem__("A1", "scale 1:10")), "Coordinates!A1"),
+    "units line": (
+        _also(_moved_down, lambda m, c: (c.__setitem__("A1", "Units:"), c.__setitem__("B1", "cm"))),
+        "Coordinates!A1",
+    ),
+    "unit below the table": (_set(Coordinates_A9="all lengths in cm"), "Coordinates!A9 holds 'all lengths in cm'"),
+    "unit in the heading row": (_set(Coordinates_A2="[cm]"), "Coordinates!A2 holds '[cm]'"),
+    "unit beside the rows": (_column("unit", ["cm"] * 4, "R"), "Coordinates!R"),
+    "unit in Main's title": (_set(Main_H1="all in cm"), "Main!H1 holds 'all in cm'"),
+    "unit in the sheet's name": (_also(typed, lambda m, c: setattr(c, "title", "Coordinates (cm)")), "speaks of cm"),
+    "unit in a number format": (_format("B3:D6", '0.000" cm"'), "Coordinates!B3 is shown as '0.000\" cm\"'"),
+    "escaped unit in a number format": (_format("C4:C4", "0.0\\ \\c\\m"), "Coordinates!C4"),
+    "unit in a bracket of a number format": (_format("C4:C4", "0.0[$cm]"), "Coordinates!C4"),
+    "percent": (_format("B3:D6", "0.0%"), "Coordinates!B3 is shown as '0.0%'"),
+    "thousands": (_format("B3:D6", "0.000,"), "Coordinates!B3"),
+    # Headings
+    "old beside new": (
+        _also(_heading("CB2", "x1 (old)"), lambda m, c: c.__setitem__("R2", "x1 new")),
+        "Coordinates!B2 is headed 'x1 (old)', which is not understood",
+    ),
+    "nominal beside what is understood": (_column("x1 (nominal)", [1.0] * 4), "Coordinates!R1"),
+    "measured beside": (_column("measured x", [1.0] * 4), "Coordinates!R1 is headed 'measured x'"),
+    "half diameter": (_heading("MB2", "half diameter of pinhole"), "Main!B2 is headed 'half diameter of pinhole'"),
+    "outer diameter": (_heading("MB2", "outer diameter of pinhole insert"), "Main!B2"),
+    "tolerance": (_heading("MD2", "tolerance of side of detector crystal"), "Main!D2"),
+    "window": (_heading("ME2", "thickness of detector window"), "Main!E2"),
+    "another diameter": (_of_main("outer diameter", [4.0] * 4), "Main!H1 is headed 'outer diameter'"),
+    "r": (_also(_no_symbols, lambda m, c: m.__setitem__("C2", "r")), "Main!C2 is headed 'r', which is not understood"),
+    "D": (_also(_no_symbols, lambda m, c: m.__setitem__("B2", "D")), "Main!B2 is headed 'D', which is not understood"),
+    "x1 twice": (_set(Coordinates_R1="x1", Coordinates_R3=1.0), "Coordinates!B1 and Coordinates!R1"),
+    "at odds": (_set(Coordinates_B1="y2"), "Coordinates!B2 is headed as x1 but Coordinates!B1 as y2"),
+    "a note in the heading": (_set(Coordinates_B1="corrected"), "Coordinates!B1 holds 'corrected' in the heading of x1"),
+    "a note between heading and numbers": (
+        _also(typed, lambda m, c: c.insert_rows(3), lambda m, c: c.__setitem__("C3", "see drawing 12")),
+        "Coordinates!C3 holds 'see drawing 12'",
+    ),
+    "merged heading": (_also(typed, lambda m, c: c.merge_cells("B1:D1")), "Coordinates!B1 heads several columns"),
+    "l said otherwise": (_set(Coordinates_G1=None, Coordinates_G2="effective length"), "Coordinates!G2"),
+    # Rows
+    "labels that disagree": (_labels(["M01", "M02", "M03", "M04"], ["A1", "A2", "A3", "A4"]), "Coordinates!A3"),
+    "label and number": (_labels([1, 2, 3, 4], ["A1", "A2", "A3", "A4"]), "Coordinates!A3 is module 1"),
+    "the same label twice": (_labels(["a", "b", "a", "c"], ["a", "b", "c", "d"]), "Coordinates!A5 is module a"),
+    "serials in another order": (_labels(["a", "b", "c", "d"], ["b", "a", "c", "d"], "serial"), "is 'a' but Main!A3"),
+    "serials in one sheet": (_also(_labels([None] * 4, ["a", "b", "c", "d"], "serial"), _no_numbers), "Main!A2"),
+    "a second table below": (_second_table(8, "OLD DESIGN, do not use"), "Coordinates!A8 holds 'OLD DESIGN"),
+    "headings again below": (
+        _also(_second_table(8, None), lambda m, c: [c.cell(8, i, h) for i, h in enumerate(("x1", "y1", "z1"), start=2)]),
+        "Coordinates!B8",
+    ),
+    "a second table beside": (_also(*(_column(f"{a}1", [1.0, 2.0], c) for a, c in zip("xyz", "STU", strict=True))), "S1"),
+    # Sheets
+    "a second sheet": (_copy_of_coordinates("Coordinates (2)"), "Coordinates!B1 and Coordinates (2)!B1"),
+    "a hidden sheet": (_copy_of_coordinates("Coordinates new", own_state="hidden"), "Coordinates!B1 and Coordinates new!B1"),
+    "a hidden copy": (_copy_of_coordinates("old", state="hidden"), "Coordinates!B1 and old!B1"),
+    "d in two sheets": (_column("d", [2.0] * 4), "Main!B1 and Coordinates!R1, of two sheets, are both headed as d"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("kind", REFUSED)
+def test_what_is_not_understood_is_refused_by_its_cell(kind, tmp_path):
+    edit, expected = REFUSED[kind]
+    with pytest.raises(InputError) as refusal:
+        read_edited(tmp_path, edit)
+    message = str(refusal.value)
+    assert message.startswith("scanner.xlsx: ")
+    assert expected in message
+    assert "\n" not in message
+    assert len(message) < 330
+
+
+READ: dict[str, Edit] = {
+    "a title": _also(_moved_down, lambda m, c: c.__setitem__("A1", "Scanner A, 2024")),
+    "a title above x1": _also(_moved_down, lambda m, c: c.__setitem__("B3", "Scanner A, 2024")),
+    "mm in a title": _also(_moved_down, lambda m, c: c.__setitem__("A1", "all lengths in mm, angles in radians")),
+    "mm in the rows above": _also(_moved_down, lambda m, c: (c.__setitem__("A1", "Unit"), c.__setitem__("A1", "mm"))),
+    "mm in a number format": _format("B3:D6", '0.000" mm"'),
+    "coloured, with a sign": _format("B3:D6", "[Red]+0.00;[Blue]-0.00;0"),
+    "grouped": _format("B3:D6", "#,##0.00"),
+    "a column of one's own": _column("serial of the crystal", ["a", "b", "c", "d"]),
+    "numbers of one's own": _column("sensitivity (cps/MBq)", [1.0, 2.0, 3.0, 4.0]),
+    "weights": _column("weight, kg", [1.0, 2.0, 3.0, 4.0]),
+    "left and right": _column("side of the patient", ["L", "R", "R", "L"]),
+    "a note of a module": _column("remark", ["moved by 2 cm", None, "in Munich", None]),
+    "names in both sheets": _labels(["M01", "M02", "M03", "M04"], ["M01", "M02", "M03", "M04"], "Module"),
+    "numbers stored as text": _labels(["1", "2", "3", "4"], [1, 2, 3, 4]),
+    "footnotes": _set(Coordinates_A9="measured in Heidelberg", Coordinates_C10="centres of the holes"),
+    "one row for all": _single,
+    "other sheets": _also(
+        typed,
+        lambda m, c: [
+            [sheet.append(["x1", "y1", "z1", "l", "d", "R"]), sheet.append([1.0] * 6)]
+            for sheet in map(m.parent.create_sheet, ("MDSL cloud import", "Theta", "Values", "Design Table"))
+        ],
+    ),
+    "headings without numbers in another sheet": _also(
+        typed, lambda m, c: m.parent.create_sheet("Read me").append(["d", "is the diameter", "R", "the radius"])
+    ),
+}
+
+
+@pytest.mark.parametrize("kind", READ)
+def test_what_is_understood_is_read(kind, tmp_path):
+    assert_plain(read_edited(tmp_path, READ[kind]))
+
+
+# Units
+
+
+@pytest.mark.parametrize("form", ["{} ({})", "{} [{}]", "{}, {}", "{}/{}", "{} / {}", "{} in {}", "{} (in {})"])
+@pytest.mark.parametrize("unit", ["mm", "cm", "m", "in", "um", "µm", "μm", "CM", "inches", "centimetres", "millimeter"])
+def test_units_are_understood_in_every_form(form, unit):
+    named = {"CM": "cm", "inches": "in", "centimetres": "cm", "millimeter": "mm", "um": "µm", "μm": "µm"}
+    for name in ("x1", "Ld", "R", "l"):
+        assert understood(form.format(name, unit)) == Heading(name, named.get(unit, unit))
+    assert understood(form.format("pinhole azimuth", unit)) is None
+
+
+def in_units(units: dict[str, str]):
+    """The plain workbook, typed, each column in its unit, and its writer's template."""
+
+    def edit(main: Worksheet, coordinates: Worksheet) -> None:
+        typed(main, coordinates)
+        for sheet in (main, coordinates):
+            for column in range(2, sheet.max_column + 1):
+                heading = next((h for r in (1, 2) if (h := understood(sheet.cell(r, column).value))), None)
+                if heading is None or QUANTITIES[heading.quantity].kind != "length":
+                    continue
+                unit = units.get(heading.quantity, units[""])
+                sheet.cell(1, column).value = f"{heading.quantity} ({unit})" if heading.quantity != "range" else None
+                sheet.cell(2, column).value = f"pinhole range [{unit}]" if heading.quantity == "range" else None
+                if heading.quantity == "H":
+                    sheet.cell(1, column).value = f"l+b+Td, {unit}"
+                for row in range(3, sheet.max_row + 1):
+                    sheet.cell(row, column).value /= LENGTH_UNITS[unit]
+
+    return edit
+
+
+@pytest.mark.parametrize(
+    "units",
+    [*({"": unit} for unit in LENGTH_UNITS), {"": "cm", "d": "mm", "z1": "in", "l": "m"}, {"": "mm", "Td": "µm"}],
+)
+def test_lengths_are_converted_and_written_back_in_their_unit(units, tmp_path):
+    system = read_edited(tmp_path, in_units(units))
+    expected = read_edited(tmp_path, in_units({"": "mm"}))
+    for name in (
+        "centers",
+        "collimator_length",
+        "pinhole_diameter",
+        "detector_side",
+        "detector_thickness",
+        "roi_radius",
+    ):
+        np.testing.assert_allclose(getattr(system, name), getattr(expected, name), rtol=1e-14)
+    template = tmp_path / "template.xlsx"
+    book = plain()
+    in_units(units)(book["Main"], book["Coordinates"])
+    book.save(template)
+    system = mph.read_system(template)
+    same = mph.write_system(system, tmp_path / "same.xlsx", template)
+    assert same.path.read_bytes() == template.read_bytes()
+    arrays = {n: getattr(system, n) for n in ("pinhole_diameter", "detector_side", "roi_radius", "detector_thickness")}
+    b = 1.25 * system.pinhole_distance
+    length = mph.collimator_length(b, system.pinhole_diameter, system.detector_side, system.roi_radius)
+    moved = mph.PinholeSystem(system.centers * 1.25, collimator_length=length, **arrays)
+    written = mph.write_system(moved, tmp_path / "moved.xlsx", template)
+    back = mph.read_system(written.path)  # no warning: the derived columns are in their units, too
+    np.testing.assert_allclose(back.centers, moved.centers, rtol=1e-12)
+    np.testing.assert_allclose(back.collimator_length, length, rtol=1e-12)
+    cells = openpyxl.load_workbook(written.path)["Coordinates"]
+    unit = LENGTH_UNITS[units.get("x1", units[""])]
+    assert cells["B3"].value == pytest.approx(system.centers[0, 0] * 1.25 / unit, rel=1e-12)
+
+
+def test_a_row_of_units_counts(tmp_path):
+    def edit(main, coordinates):
+        in_units({"": "cm"})(main, coordinates)
+        for sheet in (main, coordinates):
+            sheet.insert_rows(3)
+            for column in range(2, sheet.max_column + 1):
+                for row in (1, 2):
+                    if (heading := understood(sheet.cell(row, column).value)) is not None and heading.unit == "cm":
+                        sheet.cell(row, column).value = sheet.cell(row, column).value.rstrip("(cm)[], ")
+                        sheet.cell(3, column).value = "[cm]"
+
+    assert_plain_but_rounded(read_edited(tmp_path, edit))
+
+
+def assert_plain_but_rounded(system) -> None:
+    expected = plain()["Coordinates"]
+    centers = [[expected.cell(row, column).value for column in (2, 3, 4)] for row in range(3, 7)]
+    np.testing.assert_allclose(system.centers, centers, rtol=1e-14)
+    np.testing.assert_allclose(system.detector_side, 50, rtol=1e-14)
+
+
+@pytest.mark.parametrize("factor", [0.1, 0.001, 1 / 25.4, 1000 / 25.4])
+def test_a_scanner_in_units_that_nothing_states_is_warned_of(factor, tmp_path):
+    def edit(main, coordinates):
+        typed(main, coordinates)
+        for sheet in (main, coordinates):
+            for column in range(2, min(sheet.max_column, 12) + 1):
+                if column != 6 or sheet is main:
+                    for row in range(3, 7):
+                        sheet.cell(row, column).value *= factor
+
+    with pytest.warns(InputWarning) as caught:
+        read_edited(tmp_path, edit)
+    unlikely = r"makes b = .* which is unlikely, expected 40 to 2000 mm: are the units right\?"
+    assert any(re.search(unlikely, str(w.message)) for w in caught)
+
+
+# Stored values
+
+
+def edited_xml(book: Workbook, path: Path, change: Callable[[str, str], str], settings: str = "") -> Path:
+    """`book` with each sheet's XML as `change(name, xml)` makes it, and these settings of calculation."""
+    content = io.BytesIO()
+    book.save(content)
+    names = {f"xl/worksheets/sheet{i}.xml": name for i, name in enumerate(book.sheetnames, start=1)}
+    with zipfile.ZipFile(content) as old, zipfile.ZipFile(path, "w") as new:
+        for member in old.namelist():
+            data = old.read(member).decode()
+            if member in names:
+                data = change(names[member], data)
+            if member == "xl/workbook.xml":
+                data = re.sub(r"<calcPr[^>]*/>", f"<calcPr {settings}/>", data)
+            new.writestr(member, data)
+    return path
+
+
+def with_values(folder: Path, values: Callable[[str, str], object], settings: str = "", book: Workbook | None = None):
+    """The plain workbook whose formulas store `values(sheet, cell)`."""
+    formula = re.compile(r'<c r="([A-Z]+\d+)"([^>]*)>(<f>.*?</f>)<v\s*/?>(?:</v>)?')
+
+    def change(name: str, xml: str) -> str:
+        return formula.sub(lambda m: f'<c r="{m[1]}"{m[2]}>{m[3]}<v>{values(name, m[1])}</v>', xml)
+
+    return edited_xml(book or plain(), folder / "scanner.xlsx", change, settings)
+
+
+def typed_xml(folder: Path, change: Callable[[str], str], settings: str = "") -> Path:
+    """The plain workbook with typed numbers, the XML of Coordinates as `change` makes it."""
+    book = plain()
+    typed(book["Main"], book["Coordinates"])
+    path = folder / "scanner.xlsx"
+    return edited_xml(book, path, lambda name, xml: change(xml) if name == "Coordinates" else xml, settings)
+
+
+def right_values(folder: Path) -> dict[tuple[str, str], object]:
+    system = mph.read_system(saved(plain(), folder, "right.xlsx"))
+    written = mph.write_system(system[[0, 1, 2, 3]], folder / "new.xlsx")
+    cells = openpyxl.load_workbook(written.path, data_only=True)["Coordinates"]
+    own = {5: "E", 6: "F", 7: "G", 8: "H", 9: "I", 10: "J", 11: "K", 12: "U", 13: "V", 14: "W"}
+    return {
+        ("Coordinates", f"{get_column_letter(column)}{row}"): cells[f"{letter}{row}"].value
+        for column, letter in own.items()
+        for row in range(3, 7)
+    }
+
+
+@pytest.mark.parametrize("settings", ["", 'fullCalcOnLoad="1"', 'calcCompleted="0"', 'calcMode="manual"'])
+def test_stored_values_that_are_right_are_read(settings, tmp_path):
+    right = right_values(tmp_path)
+    assert_plain(mph.read_system(with_values(tmp_path, lambda *at: right[at], settings)))
+
+
+@pytest.mark.parametrize("settings", ["", 'fullCalcOnLoad="1"'])
+def test_a_zero_stored_for_every_formula_is_refused_with_both_numbers(settings, tmp_path):
+    with pytest.raises(InputError, match=r"Coordinates!E3 stores 0, but its formula =SQRT.* gives 294\.229655"):
+        mph.read_system(with_values(tmp_path, lambda *at: 0, settings))
+
+
+def test_a_length_stored_before_its_diameter_changed_is_refused_with_both_numbers(tmp_path):
+    right, book = right_values(tmp_path), plain()
+    book["Main"]["B4"] = 4.6
+    stored = right["Coordinates", "G4"]
+    with pytest.raises(InputError, match=rf"Coordinates!G4 stores {stored:.9g}, but its formula .* gives \d+"):
+        mph.read_system(with_values(tmp_path, lambda *at: right[at], book=book))
+
+
+def _formula(cell: str, formula: str, stored: str) -> Callable[[str], str]:
+    def edit(xml: str) -> str:
+        new = f'<c r="{cell}"><f>{formula}</f><v>{stored}</v></c>'
+        return re.sub(rf'<c r="{cell}"[^>]*>.*?</c>', new, xml)
+
+    return edit
+
+
+def test_a_zero_of_a_formula_beyond_us_is_refused_where_the_file_asks_for_calculation(tmp_path):
+    change = _formula("D6", "XLOOKUP(A6,Z1:Z4,Y1:Y4)", "0")
+    with pytest.raises(InputError, match=r"Coordinates!D6 holds the formula =XLOOKUP.*stores 0"):
+        mph.read_system(typed_xml(tmp_path, change, 'fullCalcOnLoad="1"'))
+
+
+def test_a_number_of_a_formula_beyond_us_is_used_and_warned_of_where_the_file_asks_for_calculation(tmp_path):
+    path = typed_xml(tmp_path, _formula("D6", "XLOOKUP(A6,Z1:Z4,Y1:Y4)", "12"), 'fullCalcOnLoad="1"')
+    with pytest.warns(InputWarning, match=r"Coordinates!D6: the stored value is used, though the file asks"):
+        assert mph.read_system(path).centers[3, 2] == 12
+    assert_plain(mph.read_system(typed_xml(tmp_path, _formula("D6", "XLOOKUP(A6,Z1:Z4,Y1:Y4)", "12"))))
+
+
+# The file
+
+
+def test_rows_stored_out_of_order_are_all_read(tmp_path):
+    def change(xml: str) -> str:
+        rows = re.findall(r"<row .*?</row>", xml)
+        return xml.replace("".join(rows), "".join([rows[4], rows[0], rows[3], rows[1], rows[5], rows[2]]))
+
+    path = typed_xml(tmp_path, change)
+    assert_plain(mph.read_system(path))
+
+
+def test_a_cell_stored_twice_is_refused(tmp_path):
+    def change(xml: str) -> str:
+        cell = re.search(r'<c r="B4"[^>]*>.*?</c>', xml)[0]
+        return xml.replace(cell, cell + cell.replace("155", "555"))
+
+    with pytest.raises(InputError, match=r"Coordinates!B4 is stored twice"):
+        mph.read_system(typed_xml(tmp_path, change))
+
+
+def test_strict_open_xml_is_refused_by_its_name(tmp_path, workbook):
+    path = tmp_path / "strict.xlsx"
+    with zipfile.ZipFile(workbook) as old, zipfile.ZipFile(path, "w") as new:
+        for member in old.namelist():
+            data = old.read(member)
+            for name in (b"spreadsheetml/2006/main", b"officeDocument/2006/relationships"):
+                strict = name.replace(b"/2006", b"")
+                data = data.replace(
+                    b"http://schemas.openxmlformats.org/" + name, b"http://purl.oclc.org/ooxml/" + strict
+                )
+            new.writestr(member, data)
+    with pytest.raises(InputError, match=r"strict\.xlsx: a 'Strict Open XML Spreadsheet', expected it saved as"):
+        mph.read_system(path)

@@ -87,11 +87,11 @@ def _certain(layout: Layout) -> ColumnMapDraft:
         for name, column in layout.columns.items()
     }
     kept = {name for name in values if name in NEEDED or all(type(value) is float for value in values[name])}
-    questions = ()
+    questions = []
     if "l" in values and "l" not in kept and any(value is not None for value in values["l"]):
-        questions = ("l stands in some rows only: in a column map, only rows that hold it can be named",)
+        questions.append("l stands in some rows only and is left out here: the design formula is then used for all")
     columns = {name: column for name, column in layout.columns.items() if name in kept}
-    return ColumnMapDraft(column_map_of(replace(layout, columns=columns)), questions)
+    return ColumnMapDraft(column_map_of(replace(layout, columns=columns)), tuple(questions))
 
 
 def preview_workbook(

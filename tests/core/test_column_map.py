@@ -1,0 +1,405 @@
+"""Column maps: what a person says is what is read and written, and a draft says what was seen."""
+
+from __future__ import annotations
+
+import dataclasses
+import pickle
+import warnings
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import openpyxl
+import pytest
+
+import mphdrr.core as mph
+from mphdrr.core.cli import main
+from mphdrr.core.errors import InputError
+from mphdrr.core.workbook.quantities import LENGTH_UNITS
+
+from .test_workbook import CENTERS, assert_plain, plain, saved
+from .test_workbook import _typed as typed
+from .test_workbook_strict import READ, REFUSED
+from .workbooks import by_design, changed
+
+MAP = """
+[[tables]]
+sheet = "Coordinates"
+header_row = 1
+first_row = 3
+last_row = 6
+number = "A"
+[tables.columns]
+x1 = { column = "B", unit = "mm" }
+y1 = { column = "C", unit = "mm" }
+z1 = { column = "D", unit = "mm" }
+l = { column = "G", unit = "mm" }
+
+[[tables]]
+sheet = "Main"
+first_row = 3
+last_row = 6
+rows = "by number"
+number = "A"
+[tables.columns]
+d = { column = "B", unit = "mm" }
+R = { column = "C", unit = "mm" }
+Ld = { column = "D", unit = "mm" }
+Td = { column = "E", unit = "mm" }
+"""
+
+
+@pytest.fixture(autouse=True)
+def warnings_are_errors():
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        yield
+
+
+def silent(folder: Path, edit: Callable | None = None) -> Path:
+    """The plain workbook, typed, with headings that nobody here understands; edited further."""
+    book = plain()
+    typed(book["Main"], book["Coordinates"])
+    for sheet in book.worksheets:
+        for row in sheet["A1:Z2"]:
+            for cell in row:
+                cell.value = None if cell.value is None else f"Größe {cell.coordinate} (Zoll)"
+    if edit is not None:
+        edit(book["Main"], book["Coordinates"])
+    return saved(book, folder)
+
+
+def test_what_the_map_says_is_read(tmp_path):
+    path = silent(tmp_path)
+    with pytest.raises(InputError, match=r"no sheet has a column headed x1.*a column map can say what is meant"):
+        mph.read_system(path)
+    (tmp_path / "map.toml").write_text(MAP)
+    columns = mph.ColumnMap.from_toml(MAP)
+    for given in (columns, tmp_path / "map.toml", str(tmp_path / "map.toml")):
+        system = mph.read_system(path, columns=given)
+        assert_plain(system)
+        assert system.source.columns == columns
+    assert system.source.cell("l", 4) == ("Coordinates", "G6")
+    assert pickle.loads(pickle.dumps(system.source)) == system.source
+
+
+def test_nothing_but_what_the_map_names_is_read(tmp_path):
+    def edit(main, coordinates):
+        coordinates["E3"] = 1.0  # b, which a map that names it would compare
+        main.append([9, "all in cm", "-", None, None])
+        coordinates["A9"] = "OLD DESIGN"
+        coordinates["B10"] = 1.0
+
+    assert_plain(mph.read_system(silent(tmp_path, edit), columns=mph.ColumnMap.from_toml(MAP)))
+
+
+@pytest.mark.parametrize("unit", LENGTH_UNITS)
+def test_units_of_the_map_are_converted(unit, tmp_path):
+    def edit(main, coordinates):
+        for row in range(3, 7):
+            for column in (2, 3, 4, 7):
+                coordinates.cell(row, column).value /= LENGTH_UNITS[unit]
+
+    columns = MAP.split("[[tables]]")[1].replace('"mm"', f'"{unit}"')
+    text = "[[tables]]".join(["", columns, MAP.split("[[tables]]")[2]])
+    system = mph.read_system(silent(tmp_path, edit), columns=mph.ColumnMap.from_toml(text))
+    np.testing.assert_allclose(system.centers, CENTERS, rtol=1e-14)
+
+
+def test_rows_go_by_number_by_name_in_order_or_one_for_all(tmp_path):
+    def shuffled(main, coordinates):
+        for row, number in enumerate((3, 1, 4, 2), start=3):
+            main.cell(row, 1).value, main.cell(row, 2).value = number, 2.0 + number / 10
+
+    by_number = mph.read_system(
+        silent(tmp_path, shuffled), columns=mph.ColumnMap.from_toml(MAP.replace("l =", "# l ="))
+    )
+    np.testing.assert_allclose(by_number.pinhole_diameter, [2.1, 2.2, 2.3, 2.4])
+    in_order = MAP.replace('rows = "by number"\nnumber = "A"', 'rows = "in order"').replace("l =", "# l =")
+    system = mph.read_system(tmp_path / "scanner.xlsx", columns=mph.ColumnMap.from_toml(in_order))
+    np.testing.assert_allclose(system.pinhole_diameter, [2.3, 2.1, 2.4, 2.2])
+    one = in_order.replace('"in order"', '"one for all"').replace(
+        "first_row = 3\nlast_row = 6\nrows", "first_row = 5\nrows"
+    )
+    system = mph.read_system(tmp_path / "scanner.xlsx", columns=mph.ColumnMap.from_toml(one))
+    np.testing.assert_allclose(system.pinhole_diameter, [2.4] * 4)
+
+    def named(main, coordinates):
+        for row, name in enumerate(("M01", "M02", "M03", "M04"), start=3):
+            coordinates.cell(row, 1).value = name
+            main.cell(9 - row, 1).value, main.cell(9 - row, 2).value = name, 2.0 + row / 10
+
+    system = mph.read_system(silent(tmp_path, named), columns=mph.ColumnMap.from_toml(MAP.replace("l =", "# l =")))
+    np.testing.assert_allclose(system.pinhole_diameter, [2.3, 2.4, 2.5, 2.6])
+    np.testing.assert_array_equal(system.numbers, [1, 2, 3, 4])
+
+
+def test_rows_are_skipped(tmp_path):
+    def edit(main, coordinates):
+        coordinates.insert_rows(5, 2)
+        coordinates["B5"] = "upper rings"
+
+    text = MAP.replace("last_row = 6\nnumber", "last_row = 8\nskip_rows = [5, 6]\nnumber")
+    assert_plain(mph.read_system(silent(tmp_path, edit), columns=mph.ColumnMap.from_toml(text)))
+
+
+def _without(*lines: str) -> str:
+    return "\n".join(line for line in MAP.splitlines() if not line.startswith(lines))
+
+
+BAD_MAPS = {
+    "no TOML": ("[[tables", "not TOML"),
+    "no tables": ("", r"expected \[\[tables\]\]"),
+    "unknown key": (MAP.replace("header_row", "heading_row"), "table 1: unknown key 'heading_row', expected"),
+    "unknown key at the top": (f"unit = 'mm'\n{MAP}", "unknown key 'unit'"),
+    "unknown key of a column": (MAP.replace('"B", unit', '"B", units'), "table 1.x1: unknown key 'units'"),
+    "unknown quantity": (MAP.replace("l =", "length ="), "table 1.length: no such quantity, expected x1, y1"),
+    "unknown unit": (
+        MAP.replace('column = "B", unit = "mm"', 'column = "B", unit = "Zoll"'),
+        "x1: unit 'Zoll', expected mm",
+    ),
+    "no unit": (
+        MAP.replace('column = "B", unit = "mm"', 'column = "B", unit = ""'),
+        "table 1.x1: unit '', expected mm",
+    ),
+    "angle as a length": (MAP.replace("l = {", "azimuth = {"), "table 1.azimuth: unit 'mm', expected rad, deg"),
+    "no column letters": (MAP.replace('column = "B"', 'column = "2"'), "table 1.x1: column '2', expected letters"),
+    "no such column": (MAP.replace('column = "B"', 'column = "XFE"'), "table 1.x1: column 'XFE'"),
+    "overlap": (MAP.replace('column = "C"', 'column = "B"', 1), "table 1.y1: column B is table 1.x1 too"),
+    "overlap with numbers": (MAP.replace('column = "C"', 'column = "A"', 1), "column A is table 1.y1 too"),
+    "missing coordinate": (_without("y1"), "table 1 has no column y1"),
+    "missing dimension": (_without("Td"), "no table has a column Td"),
+    "twice": (MAP + 'l = { column = "H", unit = "mm" }', "table 2.l is in table 1 too, expected each quantity once"),
+    "no sheet": (_without("sheet"), "table 1: has no sheet"),
+    "no last row": (_without("last_row"), "table 1: has no last_row"),
+    "row as text": (
+        MAP.replace("first_row = 3", 'first_row = "3"', 1),
+        "table 1: first_row = '3', expected a whole number",
+    ),
+    "rows the wrong way round": (MAP.replace("last_row = 6", "last_row = 2", 1), "table 1: rows 3 to 2"),
+    "row 0": (MAP.replace("first_row = 3", "first_row = 0", 1), "table 1: rows 0 to 6"),
+    "join of the first": (
+        MAP.replace('number = "A"', 'number = "A"\nrows = "in order"', 1),
+        "table 1 has rows = 'in order'",
+    ),
+    "no join": (_without("rows"), "table 2: rows = None, expected 'by number' or"),
+    "unknown join": (MAP.replace('"by number"', '"somehow"'), "table 2: rows = 'somehow'"),
+    "join by no number": (MAP.replace('rows = "by number"\nnumber = "A"', 'rows = "by number"'), "without number"),
+    "one of several": (MAP.replace('"by number"', '"one for all"'), "'one for all' of several rows"),
+    "skipped row outside": (MAP.replace("last_row = 6", "last_row = 6\nskip_rows = [9]", 1), "skip_rows has 9"),
+    "no such sheet in the file": (MAP.replace('"Main"', '"Haupt"'), "has no sheet Haupt, which the column map names"),
+    "join with unnumbered": (
+        MAP.replace('last_row = 6\nnumber = "A"', "last_row = 6", 1),
+        "its first table has no number",
+    ),
+    "too few rows": (
+        MAP.replace('rows = "by number"', 'rows = "in order"').replace("6\nrows", "5\nrows"),
+        "Main has 3 rows of d",
+    ),
+    "blank row": (MAP.replace("last_row = 6", "last_row = 7"), "Coordinates!A7 is blank, expected a module's number"),
+    "heading as a row": (MAP.replace("first_row = 3", "first_row = 2"), "Coordinates!A2 holds the text 'Größe A2"),
+}
+
+
+@pytest.mark.parametrize("kind", BAD_MAPS)
+def test_a_map_that_cannot_be_followed_is_refused_in_one_line(kind, tmp_path):
+    text, expected = BAD_MAPS[kind]
+    (tmp_path / "map.toml").write_text(text, encoding="utf-8")
+    with pytest.raises(InputError, match=expected) as refusal:
+        mph.read_system(silent(tmp_path), columns=tmp_path / "map.toml")
+    assert "\n" not in str(refusal.value)
+
+
+@pytest.mark.parametrize("cell", ["B4", "D6", "G5"])
+@pytest.mark.parametrize("value", [None, "12,5", True])
+def test_a_cell_that_the_map_names_and_that_holds_no_number_is_refused(cell, value, tmp_path):
+    path = silent(tmp_path, lambda main, coordinates: coordinates.__setitem__(cell, value))
+    with pytest.raises(InputError, match=f"Coordinates!{cell} .*, expected (x1|z1|l) of module"):
+        mph.read_system(path, columns=mph.ColumnMap.from_toml(MAP))
+
+
+def test_maps_come_back_from_their_text(rng):
+    quantities = ["x1", "y1", "z1", "d", "R", "Ld", "Td", "l", "b", "H", "x2", "range"]
+    names = ["Main", 'a "quoted" name', "back\\slash", "Größe 1", "tab\there", "'", "#1"]
+    for _ in range(50):
+        tables = []
+        for i in range(rng.integers(1, 4)):
+            first = int(rng.integers(1, 50))
+            last = first + int(rng.integers(0, 50))
+            tables.append(
+                mph.MappedTable(
+                    sheet=names[rng.integers(len(names))],
+                    first_row=first,
+                    last_row=last,
+                    columns=tuple(
+                        mph.MappedColumn(q, "ABCDEFGH"[rng.integers(8)], ["mm", "µm", "in"][rng.integers(3)])
+                        for q in rng.permutation(quantities)[: rng.integers(1, 6)].tolist()
+                    ),
+                    number=[None, "A", "AB"][rng.integers(3)],
+                    rows=[None, "by number", "in order", "one for all"][rng.integers(4)] if i else None,
+                    header_row=[None, 2][rng.integers(2)],
+                    skip_rows=tuple(range(first + 1, last))[: rng.integers(3)],
+                )
+            )
+        columns = mph.ColumnMap(tuple(tables))
+        assert mph.ColumnMap.from_toml(columns.to_toml()) == columns
+        assert hash(columns) == hash(mph.ColumnMap.from_toml(columns.to_toml()))
+
+
+# Writing
+
+
+def test_a_workbook_is_written_back_by_its_map(tmp_path):
+    path = silent(tmp_path)
+    system = mph.read_system(path, columns=mph.ColumnMap.from_toml(MAP))
+    same = mph.write_system(system, tmp_path / "same.xlsx", path)
+    assert same.path.read_bytes() == path.read_bytes()
+    assert same.columns == dataclasses.replace(
+        system.source.columns,
+        tables=tuple(dataclasses.replace(t, header_row=None) for t in system.source.columns.tables),
+    )
+    thinner = by_design(changed(system, pinhole_diameter=np.array([2.0, 2.1, 2.2, 2.3])))
+    written = mph.write_system(thinner, tmp_path / "thinner.xlsx", path)
+    assert {"Main!B3", "Main!B4", "Main!B5", "Coordinates!G3"} <= set(written.changed)
+    assert {name[:-1] for name in written.changed} == {"Main!B", "Coordinates!G"}
+    back = mph.read_system(written.path, columns=written.columns)
+    np.testing.assert_array_equal(back.pinhole_diameter, thinner.pinhole_diameter)
+    np.testing.assert_allclose(back.collimator_length, thinner.collimator_length, rtol=1e-12)
+
+
+@pytest.mark.parametrize("order", [[0, 1, 3], [1, 2], [3, 1, 0, 2], [0, 2, 3, 1, 1, 2]])
+@pytest.mark.parametrize("shared", [False, True])
+def test_the_written_map_has_the_rows_of_the_modules_now(order, shared, tmp_path):
+    path = silent(tmp_path)
+    text = MAP
+    if shared:
+        text = text.replace('rows = "by number"\nnumber = "A"', 'rows = "one for all"')
+        text = text.replace("last_row = 6\nrows", "last_row = 3\nrows")
+    system = mph.read_system(path, columns=mph.ColumnMap.from_toml(text))
+    arrays = {
+        name: getattr(system, name)[order]
+        for name in (
+            "centers",
+            "collimator_length",
+            "pinhole_diameter",
+            "detector_side",
+            "detector_thickness",
+            "roi_radius",
+        )
+    }
+    numbers = system.numbers[order].copy()
+    for i in range(4, len(order)):
+        arrays["centers"][i] = [0.0, 200.0 + i, 30.0]
+        numbers[i] = 100 + i
+    wanted = by_design(mph.PinholeSystem(**arrays, numbers=numbers, source=system.source))
+    written = mph.write_system(wanted, tmp_path / "o.xlsx", path)
+    back = mph.read_system(written.path, columns=written.columns)
+    np.testing.assert_array_equal(back.numbers, wanted.numbers)
+    np.testing.assert_allclose(back.centers, wanted.centers, rtol=1e-12)
+    np.testing.assert_allclose(back.collimator_length, wanted.collimator_length, rtol=1e-12)
+    again = mph.write_system(back, tmp_path / "again.xlsx", written.path)
+    assert again.path.read_bytes() == written.path.read_bytes()
+
+
+# Drafts
+
+
+@pytest.mark.parametrize("kind", READ)
+def test_the_draft_of_what_is_understood_says_the_same(kind, tmp_path):
+    book = plain()
+    READ[kind](book["Main"], book["Coordinates"])
+    path = saved(book, tmp_path)
+    draft = mph.draft_column_map(path)
+    assert draft.questions == ()
+    assert_plain(mph.read_system(path, columns=draft.columns))
+
+
+def test_the_draft_of_the_real_workbook_says_the_same(workbook, tmp_path):
+    draft = mph.draft_column_map(workbook)
+    draft.write(tmp_path / "map.toml")
+    system, back = mph.read_system(workbook), mph.read_system(workbook, columns=tmp_path / "map.toml")
+    np.testing.assert_array_equal(back.centers, system.centers)
+    np.testing.assert_array_equal(back.collimator_length, system.collimator_length)
+    assert draft.questions == ()
+
+
+@pytest.mark.parametrize("kind", REFUSED)
+def test_what_is_refused_has_a_draft_with_questions(kind, tmp_path):
+    edit, _ = REFUSED[kind]
+    book = plain()
+    edit(book["Main"], book["Coordinates"])
+    draft = mph.draft_column_map(saved(book, tmp_path))
+    assert draft.questions
+    draft.write(tmp_path / "map.toml")
+    assert mph.ColumnMap.read(tmp_path / "map.toml") == draft.columns
+    named = {c.quantity for table in draft.columns.tables for c in table.columns}
+    for name in {"x1", "y1", "z1", "d", "R", "Ld", "Td"} - named:
+        assert any(f"no column {name}" in question for question in draft.questions)
+
+
+def test_a_draft_of_a_workbook_of_which_nothing_is_understood_can_be_written(tmp_path):
+    book = openpyxl.Workbook()
+    book.active["A1"] = "hello"
+    draft = mph.draft_column_map(saved(book, tmp_path))
+    draft.write(tmp_path / "map.toml")
+    assert 'sheet = "Sheet"' in (tmp_path / "map.toml").read_text()
+    with pytest.raises(InputError, match="column map: "):
+        mph.read_system(tmp_path / "scanner.xlsx", columns=tmp_path / "map.toml")
+
+
+def test_a_preview_shows_the_cells(workbook):
+    preview = mph.preview_workbook(workbook, rows=4, columns=7)
+    assert list(preview) == ["Main", "Coordinates"]
+    assert preview["Coordinates"][0] == ("", "x1", "y1", "z1", "b", "S", "l")
+    assert preview["Coordinates"][2][:2] == ("1", "277.002")
+    assert [len(row) for row in preview["Main"]] == [7] * 4
+
+
+# The command line
+
+
+def test_commands_take_a_column_map(tmp_path, capsys):
+    path, columns = silent(tmp_path), tmp_path / "map.toml"
+    columns.write_text(MAP)
+    assert main(["geometry", "show", str(path)]) == 1
+    assert "a column map can say what is meant" in capsys.readouterr().err
+    assert main(["geometry", "show", str(path), "--columns", str(columns)]) == 0
+    assert " 277.00    70.30   -70.00" in capsys.readouterr().out
+    for action in (
+        ["check"],
+        ["fit"],
+        ["performance"],
+        ["export", "-o", str(tmp_path / "s.npz"), "--format", "opencv"],
+    ):
+        assert main(["geometry", action[0], str(path), *action[1:], "--columns", str(columns)]) == 0, action
+    out = tmp_path / "thinner.xlsx"
+    assert main(["geometry", "set", str(path), "--columns", str(columns), "--diameter", "2", "-o", str(out)]) == 0
+    np.testing.assert_array_equal(mph.read_system(out, columns=columns).pinhole_diameter, [2.0] * 4)
+    run = [
+        "project",
+        str(path),
+        "--columns",
+        str(columns),
+        "--voxels",
+        "8",
+        "--size",
+        "8",
+        "8",
+        "-o",
+        str(tmp_path / "r.npz"),
+    ]
+    assert main(run) == 0
+    capsys.readouterr()
+    assert main(["geometry", "show", str(path), "--columns", str(tmp_path / "none.toml")]) == 1
+    assert "none.toml: no such file" in capsys.readouterr().err
+
+
+def test_a_draft_is_written_by_command(tmp_path, workbook, capsys):
+    target = tmp_path / "map.toml"
+    assert main(["geometry", "show", str(workbook), "--write-columns", str(target)]) == 0
+    assert "0 to be settled" in capsys.readouterr().out
+    assert main(["geometry", "show", str(workbook), "--columns", str(target), "--modules", "1"]) == 0
+    capsys.readouterr()
+    assert main(["geometry", "show", str(silent(tmp_path)), "--write-columns", str(target)]) == 0
+    assert "to be settled" in capsys.readouterr().err
+    assert target.read_text().startswith("# ")

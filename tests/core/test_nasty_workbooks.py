@@ -50,6 +50,28 @@ def test_column_map_is_obeyed_or_refused(case: Case, tmp_path):
     assert not (found := fault(case, path, mapped=True)), found
 
 
+DRAFTED = {name: CASES[name] for c in (layouts, by_libreoffice) for name in CASES if name.startswith(c.CASES.topic)}
+
+
+@pytest.mark.filterwarnings("ignore::mphdrr.core.errors.InputWarning")
+@pytest.mark.parametrize("case", DRAFTED.values(), ids=DRAFTED)
+def test_draft_of_a_map_without_questions_reads_what_is_read_without_it(case: Case, tmp_path):
+    path = write(case, tmp_path)
+    try:
+        draft = mph.draft_column_map(path)
+    except mph.InputError:
+        assert read(path).system is None
+        return
+    draft.write(tmp_path / "draft.toml")
+    without = read(path)
+    if draft.questions:
+        return
+    drafted = read(path, (tmp_path / "draft.toml").read_text(encoding="utf-8"))
+    assert (drafted.system is None) == (without.system is None), drafted.refusal or without.refusal
+    if drafted.system is not None:
+        assert not (wrong := differences(drafted.system, without.system)), wrong
+
+
 if settings is None:
 
     def test_random_workbook_is_read_right_or_refused_or_warned_of():
@@ -88,7 +110,10 @@ def _in(unit: str, form: str = "{} (%s)") -> dict[str, str]:
 
 MIXED = {"x1": "cm", "z1": "m", "d": "um", "Ld": "in", "l": "cm"}
 BACK = {
-    **{f"headings in {unit}": (lambda unit=unit: one_sheet(headings=_in(unit), unit=unit), None) for unit in ("cm", "m", "in", "um")},
+    **{
+        f"headings in {unit}": (lambda unit=unit: one_sheet(headings=_in(unit), unit=unit), None)
+        for unit in ("cm", "m", "in", "um")
+    },
     "headings in units of their own": (
         lambda: one_sheet(headings={q: f"{SYMBOLS[q]} ({u})" for q, u in MIXED.items()}, unit=MIXED),
         None,
@@ -105,7 +130,11 @@ BACK = {
     "a map in order": (users, users_map(dimensions={"rows": "in order", "number": None})),
     "the users' workbook": (users, None),
     "words in German": (
-        lambda: one_sheet(headings=dict(zip(ONE_SHEET_COLUMNS, "Lx Ly Lz Loch ROI Seite Dicke Länge".split(), strict=True))),
+        lambda: one_sheet(
+            headings=dict(
+                zip(ONE_SHEET_COLUMNS, ["Lx", "Ly", "Lz", "Loch", "ROI", "Seite", "Dicke", "Länge"], strict=True)
+            )
+        ),
         one_sheet_map(),
     ),
 }

@@ -12,7 +12,18 @@ import tempfile
 from pathlib import Path
 
 from .case import REFUSED, RIGHT, WARNED_OF, Catalogue
-from .scanners import BIG, ONE_SHEET_COLUMNS, SCANNER, SYMBOLS, one_sheet, one_sheet_map, scanner, typed, users, users_map
+from .scanners import (
+    BIG,
+    ONE_SHEET_COLUMNS,
+    SCANNER,
+    SYMBOLS,
+    one_sheet,
+    one_sheet_map,
+    scanner,
+    typed,
+    users,
+    users_map,
+)
 from .sheets import Book, Formula, by_hand
 
 CASES = Catalogue("LibreOffice")
@@ -72,18 +83,53 @@ def _hidden() -> Book:
 
 
 _add("users", _without_values(users()), SCANNER, RIGHT)
-_add("users calculated anew", _stale(), scanner(d=[2.3, 3.1, 2.3, 2.3]), RIGHT, REFUSED, place="Coordinates!", unmappable="stale values")
+_add(
+    "users calculated anew",
+    _stale(),
+    scanner(d=[2.3, 3.1, 2.3, 2.3]),
+    RIGHT,
+    REFUSED,
+    place="Coordinates!",
+    unmappable="stale values",
+)
 _add("one sheet", one_sheet(BIG), BIG, RIGHT)
 _add("headings in cm", one_sheet(BIG, {q: f"{SYMBOLS[q]} (cm)" for q in ONE_SHEET_COLUMNS}, "cm"), BIG, RIGHT)
-_add("number format in cm", _formats('0.000" cm"', "cm"), BIG, RIGHT, REFUSED, place="Geometry!", columns=one_sheet_map("cm"))
-_add("number format in mm", _formats('0.000" mm"', "mm"), BIG, RIGHT, REFUSED, place="Geometry!", columns=one_sheet_map())
-_add("cm merged over the headings", _merged("cm", "cm"), BIG, RIGHT, REFUSED, place="Geometry!", columns=one_sheet_map("cm", 3, 6))
+_add(
+    "number format in cm",
+    _formats('0.000" cm"', "cm"),
+    BIG,
+    RIGHT,
+    REFUSED,
+    place="Geometry!",
+    columns=one_sheet_map("cm"),
+)
+_add(
+    "number format in mm", _formats('0.000" mm"', "mm"), BIG, RIGHT, REFUSED, place="Geometry!", columns=one_sheet_map()
+)
+_add(
+    "cm merged over the headings",
+    _merged("cm", "cm"),
+    BIG,
+    RIGHT,
+    REFUSED,
+    place="Geometry!",
+    columns=one_sheet_map("cm", 3, 6),
+)
 _add("note in cm", _noted(), BIG, REFUSED, WARNED_OF, place="Geometry!B1", columns=one_sheet_map("cm"))
-_add("hidden Coordinates", _hidden(), SCANNER, REFUSED, place="Coordinates", columns=users_map(position={"sheet": "Coordinates 2022"}))
+_add(
+    "hidden Coordinates",
+    _hidden(),
+    SCANNER,
+    REFUSED,
+    place="Coordinates",
+    columns=users_map(position={"sheet": "Coordinates 2022"}),
+)
 _add("users.xls", users(), SCANNER, REFUSED, place="scanner.xlsx", unmappable="an .xls file under another name")
 _add("users.ods", users(), SCANNER, REFUSED, place="scanner.xlsx", unmappable="an .ods file under another name")
 _add("one sheet.csv", one_sheet(BIG), BIG, REFUSED, place="scanner.xlsx", unmappable="a .csv file under another name")
-_add("one sheet.html", one_sheet(BIG), BIG, REFUSED, place="scanner.xlsx", unmappable="an .html file under another name")
+_add(
+    "one sheet.html", one_sheet(BIG), BIG, REFUSED, place="scanner.xlsx", unmappable="an .html file under another name"
+)
 
 
 def make() -> None:
@@ -97,7 +143,9 @@ def make() -> None:
         for suffix in sorted({Path(file).suffix for file in SAVED}):
             files = [given / f"{Path(file).stem}.xlsx" for file in SAVED if file.endswith(suffix)]
             command = ["soffice", f"-env:UserInstallation={(Path(name) / 'profile').as_uri()}", "--headless"]
-            subprocess.run([*command, "--convert-to", suffix[1:], "--outdir", str(FOLDER), *map(str, files)], check=True)
+            subprocess.run(
+                [*command, "--convert-to", suffix[1:], "--outdir", str(FOLDER), *map(str, files)], check=True
+            )
     missing = [file for file in SAVED if not (FOLDER / file).is_file()]
     sys.exit(f"not saved: {missing}" if missing else 0)
 

@@ -149,7 +149,9 @@ def _words_in_a_heading() -> None:
             def book_l(heading: str = heading, factor: float = factor) -> Book:
                 return _wrong(one_sheet(BIG, {"l": heading}), "l", factor)
 
-            CASES.add(f"l: {heading}", book_l, truth, *allowed, place=GEOMETRY, columns=one_sheet_map(columns={"l": ""}))
+            CASES.add(
+                f"l: {heading}", book_l, truth, *allowed, place=GEOMETRY, columns=one_sheet_map(columns={"l": ""})
+            )
         else:
             CASES.add(f"{name}: {heading}", book, None, REFUSED, place=("Geometry", "scanner.xlsx"))
 
@@ -254,7 +256,9 @@ def _second_candidates() -> None:
                 made.sheets[0][f"J{row}"] = float(quantity(BIG, "x2")[i]) if values is None else values
             return made
 
-        CASES.add(f"a column {other!r} as well", extra, BIG, RIGHT, WARNED, REFUSED, place=GEOMETRY, columns=one_sheet_map())
+        CASES.add(
+            f"a column {other!r} as well", extra, BIG, RIGHT, WARNED, REFUSED, place=GEOMETRY, columns=one_sheet_map()
+        )
     for other in ("serial", "S/N", "material", "operator", "ring", "checked by"):
 
         def plain_extra(other: str = other) -> Book:
@@ -295,9 +299,17 @@ def _symbols_and_descriptions() -> None:
     # A person understands these; no word of them is a quantity's.
     understood = {
         "a typing error": {"C_G2": "lenght of collimator"},
-        "center spelt centre": {f"C_{c}2": DESCRIPTIONS[q].replace("center", "centre") for q, c in zip(("x1", "y1", "z1"), "BCD", strict=True)},
-        "descriptions in capitals": {f"C_{c}2": DESCRIPTIONS[q].upper() for q, c in zip(("x1", "y1", "z1"), "BCD", strict=True)},
-        "descriptions of several lines": {"C_B2": "x coordinate value\nat center of hole", "M_P2": "diameter\nof pinhole"},
+        "center spelt centre": {
+            f"C_{c}2": DESCRIPTIONS[q].replace("center", "centre")
+            for q, c in zip(("x1", "y1", "z1"), "BCD", strict=True)
+        },
+        "descriptions in capitals": {
+            f"C_{c}2": DESCRIPTIONS[q].upper() for q, c in zip(("x1", "y1", "z1"), "BCD", strict=True)
+        },
+        "descriptions of several lines": {
+            "C_B2": "x coordinate value\nat center of hole",
+            "M_P2": "diameter\nof pinhole",
+        },
         "a colon": {"C_B1": "x1:", "C_B2": DESCRIPTIONS["x1"] + ":"},
         "blanks around": {"C_B1": "  x1 ", "C_B2": f" {DESCRIPTIONS['x1']}  "},
         "a no-break space": {"C_B2": DESCRIPTIONS["x1"].replace(" ", "\N{NO-BREAK SPACE}")},
@@ -337,7 +349,7 @@ def _symbols_and_descriptions() -> None:
     for name, cells in understood.items():
         CASES.add(f"understood: {name}", users_with(**cells), SCANNER, RIGHT, REFUSED, place=USERS, columns=users_map())
     of_other_kinds = {
-        "fonts": Rich("<r><t>x</t></r><r><rPr><vertAlign val=\"subscript\"/></rPr><t>1</t></r>"),
+        "fonts": Rich('<r><t>x</t></r><r><rPr><vertAlign val="subscript"/></rPr><t>1</t></r>'),
         "a reading of Japanese": Rich('<t>x1</t><rPh sb="0" eb="2"><t>エックスいち</t></rPh><phoneticPr fontId="1"/>'),
         "text in the cell": Raw('<c r="B1" t="inlineStr"><is><t>x1</t></is></c>'),
         "text in the cell, of fonts": Raw('<c r="B1" t="inlineStr"><is><r><t>x</t></r><r><t>1</t></r></is></c>'),
@@ -356,34 +368,77 @@ def _symbols_and_descriptions() -> None:
     unstored["Coordinates"]["B2"] = unstored["Coordinates"]["C2"] = None
     unstored.calculation = '<calcPr calcId="191029" fullCalcOnLoad="1"/>'
     CASES.add("headings by stale formulas", unstored, None, REFUSED, WARNED_OF, place=("scanner.xlsx",))
-    hidden_y = users_with(C_B2=Rich('<r><rPr><strike/></rPr><t>y</t></r><r><t>x coordinate value at center of hole</t></r>'))
+    hidden_y = users_with(
+        C_B2=Rich("<r><rPr><strike/></rPr><t>y</t></r><r><t>x coordinate value at center of hole</t></r>")
+    )
     CASES.add("a letter struck out", hidden_y, SCANNER, RIGHT, REFUSED, place=USERS, columns=users_map())
 
 
 def _other_headings() -> None:
     """Whole rows of headings that a person understands and no vocabulary needs to have."""
-    sets = {
-        "descriptions only": DESCRIPTIONS,
-        "German": dict(x1="x Lochmitte", y1="y Lochmitte", z1="z Lochmitte", d="Lochdurchmesser", R="ROI-Radius", Ld="Kristallseite", Td="Kristalldicke", l="Kollimatorlänge"),
-        "French": dict(x1="x du trou", y1="y du trou", z1="z du trou", d="diamètre du trou", R="rayon de la ROI", Ld="côté du cristal", Td="épaisseur du cristal", l="longueur du collimateur"),
-        "Chinese": dict(x1="孔中心 x", y1="孔中心 y", z1="孔中心 z", d="孔径", R="感兴趣区半径", Ld="晶体边长", Td="晶体厚度", l="准直器长度"),
-        "short words": dict(x1="x", y1="y", z1="z", d="diameter", R="ROI", Ld="crystal", Td="thickness", l="length"),
-        "code": dict(x1="pinhole_x", y1="pinhole_y", z1="pinhole_z", d="pinhole_diameter", R="roi_radius", Ld="detector_side", Td="detector_thickness", l="collimator_length"),
-        "camel case": dict(x1="PinholeX", y1="PinholeY", z1="PinholeZ", d="PinholeDiameter", R="RoiRadius", Ld="DetectorSide", Td="DetectorThickness", l="CollimatorLength"),
-        "brief words": dict(x1="pinhole x", y1="pinhole y", z1="pinhole z", d="pinhole diameter", R="ROI radius", Ld="crystal side", Td="crystal thickness", l="collimator length"),
-        "positions": dict(x1="x position of pinhole", y1="y position of pinhole", z1="z position of pinhole", d="hole diameter", R="radius of ROI", Ld="detector size", Td="detector thickness", l="pinhole to crystal"),
-        "Px": dict(x1="Px", y1="Py", z1="Pz", d="D", R="r_ROI", Ld="W", Td="t", l="F"),
-        "mixed": {**SYMBOLS, "x1": DESCRIPTIONS["x1"], "d": DESCRIPTIONS["d"], "Ld": DESCRIPTIONS["Ld"]},
+    rows = {
+        "German": "Loch x|Loch y|Loch z|Lochdurchmesser|ROI-Radius|Kristallseite|Kristalldicke|Kollimatorlänge",
+        "French": "x du trou|y du trou|z du trou|diamètre du trou|rayon ROI|côté du cristal|épaisseur du cristal|longueur",
+        "Chinese": "孔中心 x|孔中心 y|孔中心 z|孔径|感兴趣区半径|晶体边长|晶体厚度|准直器长度",
+        "short words": "x|y|z|diameter|ROI|crystal|thickness|length",
+        "code": "pinhole_x|pinhole_y|pinhole_z|pinhole_diameter|roi_radius|detector_side|detector_thickness|length",
+        "camel case": "PinholeX|PinholeY|PinholeZ|PinholeDiameter|RoiRadius|DetectorSide|DetectorThickness|Length",
+        "brief words": "pinhole x|pinhole y|pinhole z|pinhole diameter|ROI radius|crystal side|crystal thickness|length",
+        "positions": "x position of pinhole|y position of pinhole|z position of pinhole|hole diameter|radius of ROI|detector size"
+        "|detector thickness|pinhole to crystal",
+        "letters": "Px|Py|Pz|D|r_ROI|W|t|F",
     }
+    sets = {name: dict(zip(ONE_SHEET_COLUMNS, row.split("|"), strict=True)) for name, row in rows.items()}
+    sets["descriptions only"] = DESCRIPTIONS
+    sets["mixed"] = {**SYMBOLS, "x1": DESCRIPTIONS["x1"], "d": DESCRIPTIONS["d"], "Ld": DESCRIPTIONS["Ld"]}
     for name, names in sets.items():
-        CASES.add(f"headings: {name}", one_sheet(BIG, names), BIG, RIGHT, REFUSED, place=("scanner.xlsx",), columns=one_sheet_map())
-    for number in ("", "#", "Nr.", "module", "Module", "camera", "pinhole", "id", "ID", "detector", "head", "index", "Definitions", "serial"):
-        CASES.add(f"numbers headed {number!r}", one_sheet(BIG, number=number), BIG, RIGHT, REFUSED, place=("scanner.xlsx",), columns=one_sheet_map())
+        CASES.add(
+            f"headings: {name}",
+            one_sheet(BIG, names),
+            BIG,
+            RIGHT,
+            REFUSED,
+            place=("scanner.xlsx",),
+            columns=one_sheet_map(),
+        )
+    for number in (
+        "",
+        "#",
+        "Nr.",
+        "module",
+        "Module",
+        "camera",
+        "pinhole",
+        "id",
+        "ID",
+        "detector",
+        "head",
+        "index",
+        "Definitions",
+        "serial",
+    ):
+        CASES.add(
+            f"numbers headed {number!r}",
+            one_sheet(BIG, number=number),
+            BIG,
+            RIGHT,
+            REFUSED,
+            place=("scanner.xlsx",),
+            columns=one_sheet_map(),
+        )
     # Headings in two rows, a common word merged over three letters.
-    for words, truth in ((("pinhole", "crystal"), True), (("hole centre", "detector end"), True), (("old", "new"), False), (("nominal", "measured"), False), (("CAD", "CMM"), False)):
+    for words, truth in (
+        (("pinhole", "crystal"), True),
+        (("hole centre", "detector end"), True),
+        (("old", "new"), False),
+        (("nominal", "measured"), False),
+        (("CAD", "CMM"), False),
+    ):
 
         def grouped(words: tuple[str, str] = words, truth: bool = truth) -> Book:
-            made = one_sheet(BIG, {"x1": "x" if truth else "x1", "y1": "y" if truth else "y1", "z1": "z" if truth else "z1"}, top=2)
+            made = one_sheet(
+                BIG, {"x1": "x" if truth else "x1", "y1": "y" if truth else "y1", "z1": "z" if truth else "z1"}, top=2
+            )
             sheet = made.sheets[0]
             names = ["x", "y", "z"] if truth else ["x1", "y1", "z1"]
             sheet["B1"], sheet["J1"] = words
@@ -394,8 +449,24 @@ def _other_headings() -> None:
                 sheet.put(f"J{3 + i}", [[float(v * scale) for v in BIG.centers[i]]])
             return made
 
-        CASES.add(f"x y z under {words[0]!r} and under {words[1]!r}", grouped, BIG, REFUSED, *([RIGHT] if truth else []), place=GEOMETRY, columns=one_sheet_map("mm", 3, 6))
-    for word in ("OBSOLETE", "old design, do not use", "DRAFT - not verified", "nominal values", "relative to the couch", "mirrored: swap the sign of x", "half values"):
+        CASES.add(
+            f"x y z under {words[0]!r} and under {words[1]!r}",
+            grouped,
+            BIG,
+            REFUSED,
+            *([RIGHT] if truth else []),
+            place=GEOMETRY,
+            columns=one_sheet_map("mm", 3, 6),
+        )
+    for word in (
+        "OBSOLETE",
+        "old design, do not use",
+        "DRAFT - not verified",
+        "nominal values",
+        "relative to the couch",
+        "mirrored: swap the sign of x",
+        "half values",
+    ):
 
         def titled(word: str = word) -> Book:
             made = one_sheet(BIG, top=2)
@@ -404,8 +475,19 @@ def _other_headings() -> None:
             return made
 
         # What changes no number, a title may say of the whole.
-        harmless = (RIGHT,) if word in ("OBSOLETE", "old design, do not use", "DRAFT - not verified", "nominal values") else ()
-        CASES.add(f"{word!r} merged above all headings", titled, BIG, *harmless, REFUSED, WARNED_OF, place=GEOMETRY, columns=one_sheet_map("mm", 3, 6))
+        harmless = (
+            (RIGHT,) if word in ("OBSOLETE", "old design, do not use", "DRAFT - not verified", "nominal values") else ()
+        )
+        CASES.add(
+            f"{word!r} merged above all headings",
+            titled,
+            BIG,
+            *harmless,
+            REFUSED,
+            WARNED_OF,
+            place=GEOMETRY,
+            columns=one_sheet_map("mm", 3, 6),
+        )
     for word in ("nominal", "old", "from the plate", "× 0.1", "radius", "negative"):
 
         def over_one(word: str = word) -> Book:
@@ -423,23 +505,49 @@ def _other_headings() -> None:
             return made
 
         CASES.add(f"{word!r} below d", under_one, BIG, REFUSED, place=GEOMETRY, columns=one_sheet_map("mm", 3, 6))
-    for title in ("DC-SPECT, 80 modules", "Geometry of the scanner", "Version 3, 2021-03-04, J. Smith", "Pinhole geometry", "Table 1"):
+    for title in (
+        "DC-SPECT, 80 modules",
+        "Geometry of the scanner",
+        "Version 3, 2021-03-04, J. Smith",
+        "Pinhole geometry",
+        "Table 1",
+    ):
 
         def with_title(title: str = title) -> Book:
             made = one_sheet(BIG, top=3)
             made.sheets[0]["A1"] = title
             return made
 
-        CASES.add(f"title {title!r} above the table", with_title, BIG, RIGHT, REFUSED, place=GEOMETRY, columns=one_sheet_map("mm", 4, 7))
+        CASES.add(
+            f"title {title!r} above the table",
+            with_title,
+            BIG,
+            RIGHT,
+            REFUSED,
+            place=GEOMETRY,
+            columns=one_sheet_map("mm", 4, 7),
+        )
     far = one_sheet(BIG, top=60)
-    CASES.add("headings far down", far, BIG, RIGHT, REFUSED, place=("scanner.xlsx",), columns=one_sheet_map("mm", 61, 64))
+    CASES.add(
+        "headings far down", far, BIG, RIGHT, REFUSED, place=("scanner.xlsx",), columns=one_sheet_map("mm", 61, 64)
+    )
     right = one_sheet(BIG)
     right.sheets[0].moved(right=700)
-    CASES.add("headings far to the right", right, BIG, RIGHT, REFUSED, place=("scanner.xlsx",), unmappable="tested without")
+    CASES.add(
+        "headings far to the right", right, BIG, RIGHT, REFUSED, place=("scanner.xlsx",), unmappable="tested without"
+    )
     gap = users()
     for sheet in gap.sheets:
         sheet.cells = {at if at[1:] == "1" or at in ("A1",) else _down(at, 1): v for at, v in sheet.cells.items()}
-    CASES.add("a blank row between symbols and descriptions", typed(gap), SCANNER, RIGHT, REFUSED, place=("scanner.xlsx",), columns=users_map("mm", 4, 7))
+    CASES.add(
+        "a blank row between symbols and descriptions",
+        typed(gap),
+        SCANNER,
+        RIGHT,
+        REFUSED,
+        place=("scanner.xlsx",),
+        columns=users_map("mm", 4, 7),
+    )
     swapped = users()
     for sheet in swapped.sheets:
         for column in [*USERS_COLUMNS.values(), "F", "U", "V", "W", "A"]:
@@ -449,18 +557,43 @@ def _other_headings() -> None:
     for sheet in three.sheets:
         sheet.cells = {_down(at, 1): v for at, v in sheet.cells.items()}
         sheet["B1"] = "all about the scanner"
-    CASES.add("a sentence above symbols and descriptions", typed(three), SCANNER, RIGHT, REFUSED, place=USERS, columns=users_map("mm", 4, 7))
+    CASES.add(
+        "a sentence above symbols and descriptions",
+        typed(three),
+        SCANNER,
+        RIGHT,
+        REFUSED,
+        place=USERS,
+        columns=users_map("mm", 4, 7),
+    )
     repeated = one_sheet(BIG)
-    repeated.sheets[0].cells = {at if int(at[1:]) < 4 else _down(at, 1): v for at, v in repeated.sheets[0].cells.items()}
+    repeated.sheets[0].cells = {
+        at if int(at[1:]) < 4 else _down(at, 1): v for at, v in repeated.sheets[0].cells.items()
+    }
     repeated.sheets[0].put("A4", [["No.", "x1", "y1", "z1", "d", "R", "Ld", "Td", "l"]])
-    CASES.add("headings repeated on the next page", repeated, BIG, RIGHT, REFUSED, place=GEOMETRY, unmappable="a row in the middle is none")
+    CASES.add(
+        "headings repeated on the next page",
+        repeated,
+        BIG,
+        RIGHT,
+        REFUSED,
+        place=GEOMETRY,
+        unmappable="a row in the middle is none",
+    )
     changed = one_sheet(BIG)
     changed.sheets[0].cells = {at if int(at[1:]) < 4 else _down(at, 1): v for at, v in changed.sheets[0].cells.items()}
     changed.sheets[0].put("A4", [["No.", "y1", "x1", "z1", "d", "R", "Ld", "Td", "l"]])
     for row in (5, 6):
         sheet = changed.sheets[0]
         sheet[f"B{row}"], sheet[f"C{row}"] = sheet[f"C{row}"], sheet[f"B{row}"]
-    CASES.add("headings in another order on the next page", changed, BIG, REFUSED, place=GEOMETRY, unmappable="two tables in one")
+    CASES.add(
+        "headings in another order on the next page",
+        changed,
+        BIG,
+        REFUSED,
+        place=GEOMETRY,
+        unmappable="two tables in one",
+    )
     for name, area in (("down", "B1:B2"), ("across", "B1:C1")):
 
         def merged(name: str = name, area: str = area) -> Book:
@@ -476,13 +609,37 @@ def _other_headings() -> None:
             return made
 
         first = 3 if name == "down" else 2
-        CASES.add(f"heading merged {name}", merged, BIG, *([RIGHT] if name == "down" else []), REFUSED, place=("scanner.xlsx",), columns=one_sheet_map("mm", first, first + 3))
-    CASES.add("heading missing", one_sheet(BIG, {"y1": ""}), BIG, REFUSED, place=("scanner.xlsx",), columns=one_sheet_map())
-    CASES.add("no headings at all", one_sheet(BIG, dict.fromkeys(ONE_SHEET_COLUMNS, ""), number=""), BIG, REFUSED, place=("scanner.xlsx",), columns=one_sheet_map())
+        CASES.add(
+            f"heading merged {name}",
+            merged,
+            BIG,
+            *([RIGHT] if name == "down" else []),
+            REFUSED,
+            place=("scanner.xlsx",),
+            columns=one_sheet_map("mm", first, first + 3),
+        )
+    CASES.add(
+        "heading missing", one_sheet(BIG, {"y1": ""}), BIG, REFUSED, place=("scanner.xlsx",), columns=one_sheet_map()
+    )
+    CASES.add(
+        "no headings at all",
+        one_sheet(BIG, dict.fromkeys(ONE_SHEET_COLUMNS, ""), number=""),
+        BIG,
+        REFUSED,
+        place=("scanner.xlsx",),
+        columns=one_sheet_map(),
+    )
     transposed = Sheet("Geometry")
     for i, name in enumerate(("number", *ONE_SHEET_COLUMNS), start=1):
         transposed.put(f"A{i}", [[name if name != "number" else "No.", *map(float, quantity(BIG, name))]])
-    CASES.add("modules in columns", Book([transposed]), BIG, REFUSED, place=("scanner.xlsx",), unmappable="a map is of columns")
+    CASES.add(
+        "modules in columns",
+        Book([transposed]),
+        BIG,
+        REFUSED,
+        place=("scanner.xlsx",),
+        unmappable="a map is of columns",
+    )
     shuffled = one_sheet(BIG)
     sheet = shuffled.sheets[0]
     sheet.cells = {f"{'IHGFEDCBA'['ABCDEFGHI'.index(at[0])]}{at[1:]}": v for at, v in sheet.cells.items()}
@@ -491,7 +648,7 @@ def _other_headings() -> None:
 
 def _down(at: str, n: int) -> str:
     letters = at.rstrip("0123456789")
-    return f"{letters}{int(at[len(letters):]) + n}"
+    return f"{letters}{int(at[len(letters) :]) + n}"
 
 
 _words_in_a_heading()

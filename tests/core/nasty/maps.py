@@ -19,12 +19,37 @@ def _right() -> None:
     CASES.add("one row", plain, BIG[3:], RIGHT, columns=one_sheet_map(first=5, last=5))
     CASES.add("without numbers", plain, BIG, RIGHT, columns=one_sheet_map(number=None))
     CASES.add("with the row of headings", plain, BIG, RIGHT, columns=one_sheet_map(header_row=1))
-    CASES.add("columns in small letters", plain, BIG, RIGHT, REFUSED, place=MAP, columns=one_sheet_map().lower().replace("geometry", "Geometry").replace("ld =", "Ld =").replace("td =", "Td =").replace("\nr =", "\nR ="))
+    CASES.add(
+        "columns in small letters",
+        plain,
+        BIG,
+        RIGHT,
+        REFUSED,
+        place=MAP,
+        columns=one_sheet_map()
+        .lower()
+        .replace("geometry", "Geometry")
+        .replace("ld =", "Ld =")
+        .replace("td =", "Td =")
+        .replace("\nr =", "\nR ="),
+    )
     CASES.add("x1 by another column", _exchanged(), BIG, RIGHT, columns=one_sheet_map(columns={"x1": "C", "y1": "B"}))
     CASES.add("users' workbook", users(), SCANNER, RIGHT, columns=users_map())
     CASES.add("users' workbook without l", users(), SCANNER, RIGHT, columns=users_map(length=False))
-    CASES.add("users' workbook in order", users(), SCANNER, RIGHT, columns=users_map(dimensions={"rows": "in order", "number": None}))
-    CASES.add("users' workbook, one row for all", users(), SCANNER, RIGHT, columns=users_map(dimensions={"rows": "one for all", "number": None, "last_row": 3}))
+    CASES.add(
+        "users' workbook in order",
+        users(),
+        SCANNER,
+        RIGHT,
+        columns=users_map(dimensions={"rows": "in order", "number": None}),
+    )
+    CASES.add(
+        "users' workbook, one row for all",
+        users(),
+        SCANNER,
+        RIGHT,
+        columns=users_map(dimensions={"rows": "one for all", "number": None, "last_row": 3}),
+    )
     three = scanner(BIG.centers[:3], 4.0, 150.0, 120.0, 20.0, BIG.collimator_length[:3])
     CASES.add("rows end above a total", _total(), three, RIGHT, columns=one_sheet_map(last=4))
     for unit in ("mm", "cm", "m", "in", "um", "µm", "\N{GREEK SMALL LETTER MU}m"):
@@ -100,15 +125,25 @@ def _wrong() -> None:
         "first_row misspelt": good.replace("first_row", "firstrow"),
         "one column for two quantities": good.replace('y1 = { column = "C"', 'y1 = { column = "B"'),
         "the column of the numbers for x1": good.replace('x1 = { column = "B"', 'x1 = { column = "A"'),
-        "a quantity in two tables": good + column_map({"sheet": "Geometry", "first_row": 2, "last_row": 5, "rows": "in order", "columns": {"d": ("F", "mm")}}),
+        "a quantity in two tables": good
+        + column_map(
+            {"sheet": "Geometry", "first_row": 2, "last_row": 5, "rows": "in order", "columns": {"d": ("F", "mm")}}
+        ),
         "a column as a text": good.replace('{ column = "B", unit = "mm" }', '"B"'),
-        "rows joined in a way that is none": good + column_map({"sheet": "Geometry", "first_row": 2, "last_row": 5, "rows": "by name", "columns": {"b": ("F", "mm")}}),
+        "rows joined in a way that is none": good
+        + column_map(
+            {"sheet": "Geometry", "first_row": 2, "last_row": 5, "rows": "by name", "columns": {"b": ("F", "mm")}}
+        ),
     }.items():
         assert text != good, name
         CASES.add(f"wrong: {name}", plain, None, REFUSED, place=MAP, columns=text)
     for name, text in {
-        "more rows of Main than modules, in order": users_map(dimensions={"rows": "in order", "number": None, "last_row": 7}),
-        "fewer rows of Main than modules, in order": users_map(dimensions={"rows": "in order", "number": None, "last_row": 5}),
+        "more rows of Main than modules, in order": users_map(
+            dimensions={"rows": "in order", "number": None, "last_row": 7}
+        ),
+        "fewer rows of Main than modules, in order": users_map(
+            dimensions={"rows": "in order", "number": None, "last_row": 5}
+        ),
         "several rows for one for all": users_map(dimensions={"rows": "one for all", "number": None}),
         "by number without numbers": users_map(dimensions={"number": None}),
         "by number, none in Coordinates": users_map(position={"number": None}),
@@ -124,32 +159,78 @@ def _wrong() -> None:
     for heading, unit in (("{} (cm)", "mm"), ("{} (mm)", "cm"), ("{} (in)", "cm")):
         said = heading[4:6]
         book = one_sheet(BIG, {q: heading.format(q) for q in ("x1", "y1", "z1", "d", "R", "Ld", "Td", "l")}, said)
-        CASES.add(f"map in {unit}, headings in {said}", book, None, REFUSED, WARNED_OF, place=MAP, columns=one_sheet_map(unit))
+        CASES.add(
+            f"map in {unit}, headings in {said}", book, None, REFUSED, WARNED_OF, place=MAP, columns=one_sheet_map(unit)
+        )
     format_cm = one_sheet(BIG, unit="cm")
     for row in range(2, 6):
         format_cm.sheets[0].formats[f"B{row}"] = '0.0" cm"'
-    CASES.add("map in mm, number format in cm", format_cm, None, REFUSED, WARNED_OF, place=MAP, columns=one_sheet_map("mm"))
-    CASES.add("map of y1 on the column headed x1", plain, None, REFUSED, WARNED_OF, place=MAP, columns=one_sheet_map(columns={"x1": "C", "y1": "B"}))
-    CASES.add("map of d on the column headed R", plain, None, REFUSED, WARNED_OF, place=MAP, columns=one_sheet_map(columns={"d": "F", "R": "E"}))
+    CASES.add(
+        "map in mm, number format in cm", format_cm, None, REFUSED, WARNED_OF, place=MAP, columns=one_sheet_map("mm")
+    )
+    CASES.add(
+        "map of y1 on the column headed x1",
+        plain,
+        None,
+        REFUSED,
+        WARNED_OF,
+        place=MAP,
+        columns=one_sheet_map(columns={"x1": "C", "y1": "B"}),
+    )
+    CASES.add(
+        "map of d on the column headed R",
+        plain,
+        None,
+        REFUSED,
+        WARNED_OF,
+        place=MAP,
+        columns=one_sheet_map(columns={"d": "F", "R": "E"}),
+    )
     # What is wrong with a workbook is so with a map too.
-    for name, value in {"a text": "315", "a blank cell": None, "an error": "#N/A", "a stale formula": Formula("300+20", 315.0)}.items():
+    for name, value in {
+        "a text": "315",
+        "a blank cell": None,
+        "an error": "#N/A",
+        "a stale formula": Formula("300+20", 315.0),
+    }.items():
         book = one_sheet(BIG)
         book.sheets[0]["B3"] = value
         book.calculation = '<calcPr calcId="191029" fullCalcOnLoad="1"/>'
         allowed = (REFUSED, RIGHT) if name == "a text" else (REFUSED,)
-        CASES.add(f"{name} in a mapped column", book, BIG if name == "a text" else None, *allowed, place=("Geometry!B3",), columns=good)
+        CASES.add(
+            f"{name} in a mapped column",
+            book,
+            BIG if name == "a text" else None,
+            *allowed,
+            place=("Geometry!B3",),
+            columns=good,
+        )
     zeros = users()
     for at, value in zeros["Coordinates"].cells.items():
         if isinstance(value, Formula) and at[0] == "G":
             zeros["Coordinates"][at] = Formula(value.text, 0)
     zeros.calculation = '<calcPr calcId="191029" fullCalcOnLoad="1"/>'
-    CASES.add("0 stored for every l in a mapped column", zeros, SCANNER, REFUSED, RIGHT, place=("Coordinates!G3",), columns=users_map())
+    CASES.add(
+        "0 stored for every l in a mapped column",
+        zeros,
+        SCANNER,
+        REFUSED,
+        RIGHT,
+        place=("Coordinates!G3",),
+        columns=users_map(),
+    )
     repeated = one_sheet(BIG)
     repeated.sheets[0]["A4"] = 2
-    CASES.add("a number twice in a mapped column", repeated, None, REFUSED, place=("Geometry!A4", "Geometry!A3"), columns=good)
+    CASES.add(
+        "a number twice in a mapped column", repeated, None, REFUSED, place=("Geometry!A4", "Geometry!A3"), columns=good
+    )
     tiny = one_sheet(BIG)
-    CASES.add("map in m on a sheet in mm", tiny, None, REFUSED, WARNED_OF, place=("Geometry",), columns=one_sheet_map("m"))
-    CASES.add("map in um on a sheet in mm", tiny, None, REFUSED, WARNED_OF, place=("Geometry",), columns=one_sheet_map("um"))
+    CASES.add(
+        "map in m on a sheet in mm", tiny, None, REFUSED, WARNED_OF, place=("Geometry",), columns=one_sheet_map("m")
+    )
+    CASES.add(
+        "map in um on a sheet in mm", tiny, None, REFUSED, WARNED_OF, place=("Geometry",), columns=one_sheet_map("um")
+    )
     CASES.add("map on a hidden sheet", _hidden(), BIG, RIGHT, WARNED, columns=good, place=("Geometry",))
     CASES.add("map where all is plain without one", plain, BIG, RIGHT, columns=good)
 

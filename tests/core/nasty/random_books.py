@@ -82,7 +82,9 @@ def system_of(layout: Layout) -> PinholeSystem:
     distances = rng.uniform(450, 900, (layout.modules, 1))
     centers = np.round(directions / np.linalg.norm(directions, axis=1)[:, None] * distances, 3)
     many = 1 if layout.shared and len(layout.sheets) == 2 else layout.modules
-    d, R, Ld, Td = (np.resize(np.round(rng.uniform(*r, many), 2), layout.modules) for r in ((2, 6), (100, 200), (60, 120), (5, 30)))
+    d, R, Ld, Td = (
+        np.resize(np.round(rng.uniform(*r, many), 2), layout.modules) for r in ((2, 6), (100, 200), (60, 120), (5, 30))
+    )
     numbers = np.sort(rng.choice(np.arange(1, 99), layout.modules, replace=False)) if layout.numbers else None
     return scanner(centers, d, R, Ld, Td, numbers=numbers)
 
@@ -318,18 +320,68 @@ def backwards(draft: Draft) -> None:
     draft.plain = False
 
 
-UNIT_WORDS = [("cm", "cm"), ("in cm", "cm"), ("all lengths in cm", "cm"), ("Units: cm", "cm"), ("inches", "in"), ("m", "m"), ("dm", "dm"), ("[cm]", "cm"), ("Maße in Zoll", "in"), ("lengths in mm", "same"), ("mm", "same"), ("feet", "ft")]
+UNIT_WORDS = [
+    ("cm", "cm"),
+    ("in cm", "cm"),
+    ("all lengths in cm", "cm"),
+    ("Units: cm", "cm"),
+    ("inches", "in"),
+    ("m", "m"),
+    ("dm", "dm"),
+    ("[cm]", "cm"),
+    ("Maße in Zoll", "in"),
+    ("lengths in mm", "same"),
+    ("mm", "same"),
+    ("feet", "ft"),
+]
 OTHER_WORDS = [("OBSOLETE", "same"), ("half values", "nobody"), ("mirrored", "nobody"), ("values x 10", "nobody")]
 TITLES = [("DC-SPECT", "same"), ("Geometry of the scanner", "same"), ("2021-03-04", "same")]
 HEADING_WORDS = [
-    *(("{} (old)", "nobody"), ("tolerance of {}", "nobody"), ("half {}", "nobody"), ("{} nominal", "nobody"), ("{}²", "nobody")),
-    *(("{} (dm)", "nobody"), ("{} (cm, CAD)", "nobody"), ("{} × 10", "nobody"), ("Δ{}", "nobody"), ("{}/2", "nobody"), ("{}, mm or cm", "nobody")),
-    *(("{} of window", "nobody"), ("{} (0.1 mm)", "nobody"), ("-{}", "nobody"), ("{}", "same"), (" {} ", "same"), ("{}:", "same")),
+    *(
+        ("{} (old)", "nobody"),
+        ("tolerance of {}", "nobody"),
+        ("half {}", "nobody"),
+        ("{} nominal", "nobody"),
+        ("{}²", "nobody"),
+    ),
+    *(
+        ("{} (dm)", "nobody"),
+        ("{} (cm, CAD)", "nobody"),
+        ("{} × 10", "nobody"),
+        ("Δ{}", "nobody"),
+        ("{}/2", "nobody"),
+        ("{}, mm or cm", "nobody"),
+    ),
+    *(
+        ("{} of window", "nobody"),
+        ("{} (0.1 mm)", "nobody"),
+        ("-{}", "nobody"),
+        ("{}", "same"),
+        (" {} ", "same"),
+        ("{}:", "same"),
+    ),
 ]
-FORMATS = [("0.00", "same"), ("0.000E+00", "same"), ('0.0" mm"', "same"), ('0.00" cm"', "cm"), ("0.0\\ \\c\\m", "cm"), ('0.0"″"', "in"), ("[$-409]0.0", "same"), ("0.0,", "nobody"), ('"-"0.0', "nobody")]
+FORMATS = [
+    ("0.00", "same"),
+    ("0.000E+00", "same"),
+    ('0.0" mm"', "same"),
+    ('0.00" cm"', "cm"),
+    ("0.0\\ \\c\\m", "cm"),
+    ('0.0"″"', "in"),
+    ("[$-409]0.0", "same"),
+    ("0.0,", "nobody"),
+    ('"-"0.0', "nobody"),
+]
 COLUMNS = [
     *(("serial", "same"), ("S", "same"), ("3D slope", "same"), ("weight (kg)", "same"), ("note", "same")),
-    *(("{0}", "nobody"), ("{0} new", "nobody"), ("{0} (measured)", "nobody"), ("{1}", "nobody"), ("{1} (cm)", "nobody"), ("{0}_corr", "nobody")),
+    *(
+        ("{0}", "nobody"),
+        ("{0} new", "nobody"),
+        ("{0} (measured)", "nobody"),
+        ("{1}", "nobody"),
+        ("{1} (cm)", "nobody"),
+        ("{0}_corr", "nobody"),
+    ),
 ]
 GAPS = st.integers(0, 2)
 
@@ -342,7 +394,9 @@ decorations = st.one_of(
     st.sampled_from(COLUMNS).map(lambda pair: (extra_column, *pair)),
     st.tuples(st.just(rows_below), st.sampled_from(["OLD DESIGN, do not use", "spare", "removed", "x1", "99"]), GAPS),
     st.tuples(st.just(total_below), st.sampled_from(["mean", "Sum", "", "5"]), GAPS),
-    st.sampled_from([("measured in 2021", "same"), ("all in cm", "cm"), ("cm", "cm"), ("R: ROI", "same")]).map(lambda pair: (note_below, *pair)),
+    st.sampled_from([("measured in 2021", "same"), ("all in cm", "cm"), ("cm", "cm"), ("R: ROI", "same")]).map(
+        lambda pair: (note_below, *pair)
+    ),
     st.tuples(st.just(cell), st.sampled_from(["12,5", "12.5 cm", "n/a", True, None, "?", "see above", "1e3x"])),
     st.tuples(st.just(formula), st.booleans(), st.booleans()),
     st.tuples(
@@ -359,7 +413,9 @@ layouts = st.builds(
     Layout,
     modules=st.integers(1, 5),
     seed=st.integers(0, 1000),
-    sheets=st.sampled_from([("Coordinates", "Main"), ("Geometry",), ("Lage", "Größen"), ("Sheet1", "Sheet2"), ("Main",), ("a'b", "c d")]),
+    sheets=st.sampled_from(
+        [("Coordinates", "Main"), ("Geometry",), ("Lage", "Größen"), ("Sheet1", "Sheet2"), ("Main",), ("a'b", "c d")]
+    ),
     top=st.integers(0, 4),
     left=st.integers(0, 2),
     gap=st.integers(0, 1),
@@ -371,7 +427,11 @@ layouts = st.builds(
     shared=st.booleans(),
     unit=st.sampled_from(["", "", "mm", "cm", "m", "in"]),
     units_of=st.sampled_from(["all", "position", "one"]),
-).map(lambda layout: layout if layout.length else dataclasses.replace(layout, order=tuple(q for q in layout.order if q != "l")))
+).map(
+    lambda layout: (
+        layout if layout.length else dataclasses.replace(layout, order=tuple(q for q in layout.order if q != "l"))
+    )
+)
 
 
 @dataclass(frozen=True)

@@ -14,8 +14,19 @@ CENTERS = np.array([[277.0, 70.3, -70.0], [155.0, 158.4, -70.9], [-63.1, -245.8,
 BIG_CENTERS = np.array([[540.0, 70.5, -92.0], [315.0, 416.0, -96.5], [-164.0, -490.5, 104.0], [-25.5, 480.25, 24.0]])
 
 SYMBOLS = {
-    **{"x1": "x1", "y1": "y1", "z1": "z1", "b": "b", "l": "l", "H": "l + b+Td", "x2": "x2", "y2": "y2", "z2": "z2"},
-    **{"d": "d", "R": "R", "Ld": "Ld", "Td": "Td"},
+    "x1": "x1",
+    "y1": "y1",
+    "z1": "z1",
+    "b": "b",
+    "l": "l",
+    "H": "l + b+Td",
+    "x2": "x2",
+    "y2": "y2",
+    "z2": "z2",
+    "d": "d",
+    "R": "R",
+    "Ld": "Ld",
+    "Td": "Td",
 }
 DESCRIPTIONS = {
     "x1": "x coordinate value at center of hole",
@@ -71,8 +82,19 @@ def quantity(system: PinholeSystem, name: str) -> np.ndarray:
 # The workbook of the users: sheets Main and Coordinates, formulas with their values. A module's row is its number + 2.
 
 USERS_COLUMNS = {
-    **{"x1": "B", "y1": "C", "z1": "D", "b": "E", "l": "G", "H": "H", "x2": "I", "y2": "J", "z2": "K"},
-    **{"d": "P", "R": "Q", "Ld": "S", "Td": "T"},
+    "x1": "B",
+    "y1": "C",
+    "z1": "D",
+    "b": "E",
+    "l": "G",
+    "H": "H",
+    "x2": "I",
+    "y2": "J",
+    "z2": "K",
+    "d": "P",
+    "R": "Q",
+    "Ld": "S",
+    "Td": "T",
 }
 
 
@@ -161,6 +183,7 @@ def one_sheet(
 
 
 # Column maps
+
 
 def column_map(*tables: dict[str, Any]) -> str:
     """The TOML of a column map."""

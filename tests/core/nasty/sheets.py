@@ -61,7 +61,7 @@ class Sheet:
     table: str | None = None  # the range of an Excel table ("Format as Table")
     table_totals: bool = False
     after_data: str = ""  # XML behind <sheetData>
-    row_order: Callable[[list[str]], list[str]] = staticmethod(lambda rows: rows)  # of the rows' XML
+    row_order: Callable[[list[str]], list[str]] | None = None  # changes the order of the rows' XML
 
     def __getitem__(self, at: str) -> Any:
         return self.cells.get(at)
@@ -99,7 +99,7 @@ class Book:
     date1904: bool = False
     names: dict[str, str] = field(default_factory=dict)
     members: dict[str, bytes] = field(default_factory=dict)  # added to the file
-    edit: Callable[[dict[str, bytes]], dict[str, bytes]] = staticmethod(lambda members: members)  # before zipping
+    edit: Callable[[dict[str, bytes]], dict[str, bytes]] | None = None  # of the members, before they are zipped
 
     def __getitem__(self, name: str) -> Sheet:
         return next(sheet for sheet in self.sheets if sheet.name == name)
@@ -114,7 +114,7 @@ class Book:
         before = self.edit
 
         def edit(members: dict[str, bytes]) -> dict[str, bytes]:
-            members = before(members)
+            members = before(members) if before else members
             text = members[member].decode()
             assert old in text, f"{old!r} is not in {member}: {text[:500]}"
             return {**members, member: text.replace(old, new, count).encode()}
@@ -227,7 +227,7 @@ def _sheet_xml(sheet: Sheet, n: int, strings: dict[str, int], formats: dict[str,
         [
             f'{_XML}<worksheet xmlns="{_MAIN}" xmlns:r="{_RELATIONS}">',
             f"<cols>{hidden_columns}</cols>" if hidden_columns else "",
-            f"<sheetData>{''.join(sheet.row_order(lines))}</sheetData>",
+            f"<sheetData>{''.join(sheet.row_order(lines) if sheet.row_order else lines)}</sheetData>",
             sheet.after_data,
             f'<mergeCells count="{len(sheet.merged)}">{merged}</mergeCells>' if merged else "",
             '<tableParts count="1"><tablePart r:id="rId1"/></tableParts>' if sheet.table else "",
@@ -303,7 +303,8 @@ def _notes_xml(sheet: Sheet) -> str:
         f'<comment ref="{at}" authorId="0"><text><t>{escape(text)}</t></text></comment>'
         for at, text in sheet.notes.items()
     )
-    return f'{_XML}<comments xmlns="{_MAIN}"><authors><author>A</author></authors><commentList>{notes}</commentList></comments>'
+    notes = f"<commentList>{notes}</commentList>"
+    return f'{_XML}<comments xmlns="{_MAIN}"><authors><author>A</author></authors>{notes}</comments>'
 
 
 def zipped(members: dict[str, bytes], compression: int = zipfile.ZIP_DEFLATED) -> bytes:
@@ -315,7 +316,8 @@ def zipped(members: dict[str, bytes], compression: int = zipfile.ZIP_DEFLATED) -
 
 
 def by_hand(book: Book, path: Path) -> None:
-    path.write_bytes(zipped(book.edit(members_of(book))))
+    members = members_of(book)
+    path.write_bytes(zipped(book.edit(members) if book.edit else members))
 
 
 # By other programs' libraries

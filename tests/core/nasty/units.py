@@ -33,8 +33,13 @@ def _headed(form: str, unit: str, names: dict[str, str] = SYMBOLS) -> Book:
 def _in_headings() -> None:
     # The plain way of writing each unit that the reader knows: read without a map.
     for text, unit in {
-        **{"mm": "mm", "cm": "cm", "m": "m", "in": "in", "um": "um"},
-        **{"µm": "um", "\N{GREEK SMALL LETTER MU}m": "um"},
+        "mm": "mm",
+        "cm": "cm",
+        "m": "m",
+        "in": "in",
+        "um": "um",
+        "µm": "um",
+        "\N{GREEK SMALL LETTER MU}m": "um",
     }.items():
         for form in ("{} (%s)", "{} [%s]"):
             form = form % text
@@ -45,36 +50,131 @@ def _in_headings() -> None:
     for form, unit in {
         **{f"{{}}{join}": "mm" for join in (", mm", "/mm", " / mm", "_mm", " mm", ": mm", "; mm", " in mm", "(mm)")},
         **{f"{{}}{join}": "cm" for join in (", cm", "/cm", " / cm", "_cm", " cm", ": cm", " in cm", "(cm)", " - cm")},
-        **{"cm {}": "cm", "(cm) {}": "cm", "{}\n(cm)": "cm", "{}\ncm": "cm", "{}_in_cm": "cm", "{} {{cm}}": "cm"},
-        **{"{} (millimetres)": "mm", "{} (millimeters)": "mm", "{} in millimetres": "mm", "{} (millimetre)": "mm"},
-        **{"{} (centimetres)": "cm", "{} (centimeters)": "cm", "{} in centimeters": "cm", "{} (cms)": "cm"},
-        **{"{} (metres)": "m", "{} (meters)": "m", "{} (inches)": "in", "{} (inch)": "in", '{} (")': "in"},
-        **{"{} (MM)": "mm", "{} (CM)": "cm", "{} (Cm)": "cm", "{} (cm.)": "cm", "{} (c.m.)": "cm", "{} ( cm )": "cm"},
-        **{"{} (\N{FULLWIDTH LATIN SMALL LETTER C}\N{FULLWIDTH LATIN SMALL LETTER M})": "cm"},
-        **{"{} (\N{SQUARE CM})": "cm", "{} (\N{SQUARE MM})": "mm", "{}\N{NO-BREAK SPACE}(cm)": "cm"},
-        **{"{}\N{ZERO WIDTH SPACE}(cm)": "cm", "{} (c\N{SOFT HYPHEN}m)": "cm"},
-        **{"{}\N{FULLWIDTH LEFT PARENTHESIS}cm\N{FULLWIDTH RIGHT PARENTHESIS}": "cm", "{} <cm>": "cm", "{} |cm|": "cm"},
-        **{"{} (Zentimeter)": "cm", "{} (centimètres)": "cm", "{} (см)": "cm", "{} (мм)": "mm", "{} (厘米)": "cm"},
-        **{"{} (Zoll)": "in", "{} (pouces)": "in", "{}″": "in", "{} ''": "in", '{} "': "in", "{} (microns)": "um"},
-        **{"{} (in.)": "in", "{} (in)": "in", "{} in inches": "in", "{} (Meter)": "m", "{} (mètres)": "m"},
-        **{"{} (cm, from isocentre)": "cm", "{} (cm nominal)": "cm", "{} (cm) nominal": "cm", "{} (cm; CAD)": "cm"},
-        **{"{} (unit: cm)": "cm", "{} (in cm)": "cm", "{} (all in cm)": "cm", "{} (values in cm)": "cm"},
-        **{"{} (10 mm)": "cm", "{} (×10 mm)": "cm", "{} (mm*10)": "cm", "{} (mm/10)": "cm", "{} [10^-2 m]": "cm"},
-        **{"{} (1e-2 m)": "cm", "{} (10⁻² m)": "cm", "{} ×10 (mm)": "cm", "{} (mm x 10)": "cm", "{} (mm·10⁻³)": "m"},
-        **{"{} (cm ≙ 10 mm)": "cm", "{} (mm, not cm)": "mm", "{} (not mm: cm)": "cm", "{} (mm → cm)": "cm"},
-        **{"{} (mm) (cm)": "cm", "{} (mm) in cm": "cm", "{}, mm (cm)": "cm", "{} [cm] (mm)": "cm"},
+        "cm {}": "cm",
+        "(cm) {}": "cm",
+        "{}\n(cm)": "cm",
+        "{}\ncm": "cm",
+        "{}_in_cm": "cm",
+        "{} {{cm}}": "cm",
+        "{} (millimetres)": "mm",
+        "{} (millimeters)": "mm",
+        "{} in millimetres": "mm",
+        "{} (millimetre)": "mm",
+        "{} (centimetres)": "cm",
+        "{} (centimeters)": "cm",
+        "{} in centimeters": "cm",
+        "{} (cms)": "cm",
+        "{} (metres)": "m",
+        "{} (meters)": "m",
+        "{} (inches)": "in",
+        "{} (inch)": "in",
+        '{} (")': "in",
+        "{} (MM)": "mm",
+        "{} (CM)": "cm",
+        "{} (Cm)": "cm",
+        "{} (cm.)": "cm",
+        "{} (c.m.)": "cm",
+        "{} ( cm )": "cm",
+        "{} (\N{FULLWIDTH LATIN SMALL LETTER C}\N{FULLWIDTH LATIN SMALL LETTER M})": "cm",
+        "{} (\N{SQUARE CM})": "cm",
+        "{} (\N{SQUARE MM})": "mm",
+        "{}\N{NO-BREAK SPACE}(cm)": "cm",
+        "{}\N{ZERO WIDTH SPACE}(cm)": "cm",
+        "{} (c\N{SOFT HYPHEN}m)": "cm",
+        "{}\N{FULLWIDTH LEFT PARENTHESIS}cm\N{FULLWIDTH RIGHT PARENTHESIS}": "cm",
+        "{} <cm>": "cm",
+        "{} |cm|": "cm",
+        "{} (Zentimeter)": "cm",
+        "{} (centimètres)": "cm",
+        "{} (см)": "cm",
+        "{} (мм)": "mm",
+        "{} (厘米)": "cm",
+        "{} (Zoll)": "in",
+        "{} (pouces)": "in",
+        "{}″": "in",
+        "{} ''": "in",
+        '{} "': "in",
+        "{} (microns)": "um",
+        "{} (in.)": "in",
+        "{} (in)": "in",
+        "{} in inches": "in",
+        "{} (Meter)": "m",
+        "{} (mètres)": "m",
+        "{} (cm, from isocentre)": "cm",
+        "{} (cm nominal)": "cm",
+        "{} (cm) nominal": "cm",
+        "{} (cm; CAD)": "cm",
+        "{} (unit: cm)": "cm",
+        "{} (in cm)": "cm",
+        "{} (all in cm)": "cm",
+        "{} (values in cm)": "cm",
+        "{} (10 mm)": "cm",
+        "{} (×10 mm)": "cm",
+        "{} (mm*10)": "cm",
+        "{} (mm/10)": "cm",
+        "{} [10^-2 m]": "cm",
+        "{} (1e-2 m)": "cm",
+        "{} (10⁻² m)": "cm",
+        "{} ×10 (mm)": "cm",
+        "{} (mm x 10)": "cm",
+        "{} (mm·10⁻³)": "m",
+        "{} (cm ≙ 10 mm)": "cm",
+        "{} (mm, not cm)": "mm",
+        "{} (not mm: cm)": "cm",
+        "{} (mm → cm)": "cm",
+        "{} (mm) (cm)": "cm",
+        "{} (mm) in cm": "cm",
+        "{}, mm (cm)": "cm",
+        "{} [cm] (mm)": "cm",
     }.items():
         key = f"heading {form}"
         if key not in CASES.cases:
             CASES.add(key, _headed(form, unit), BIG, *READ_OR_MAP, place=HEADINGS, columns=one_sheet_map(unit))
     # Units that the reader does not know.
     for text, factor in {
-        **{"dm": 100, "0.1 mm": 0.1, "0,1 mm": 0.1, "mil": 0.0254, "mils": 0.0254, "thou": 0.0254, "ft": 304.8},
-        **{"feet": 304.8, "'": 304.8, "yd": 914.4, "km": 1e6, "nm": 1e-6, "Å": 1e-7, "pt": 25.4 / 72, "1/10 mm": 0.1},
-        **{"mm × 0.1": 0.1, "mm*2": 2.0, "px": 0.5, "pixels": 2.0, "voxels": 4.0, "a.u.": 3.0, "1/64 in": 25.4 / 64},
-        **{"units of R": 150.0, "R": 150.0, "%": 2.0, "‰": 2.0, "half mm": 0.5, "2 mm pixels": 2.0, "寸": 33.3},
-        **{"hm": 1e5, "Mm": 1e9, "dam": 1e4, "µ": 1e-3, "cm²": 10.0, "mm²": 1.0, "cm^-1": 10.0, "1/mm": 1.0},
-        **{"steps of 5 µm": 5e-3, "encoder counts": 0.01, "m m": 1000.0, "mmm": 1.0, "cmm": 10.0, "?": 10.0},
+        "dm": 100,
+        "0.1 mm": 0.1,
+        "0,1 mm": 0.1,
+        "mil": 0.0254,
+        "mils": 0.0254,
+        "thou": 0.0254,
+        "ft": 304.8,
+        "feet": 304.8,
+        "'": 304.8,
+        "yd": 914.4,
+        "km": 1e6,
+        "nm": 1e-6,
+        "Å": 1e-7,
+        "pt": 25.4 / 72,
+        "1/10 mm": 0.1,
+        "mm × 0.1": 0.1,
+        "mm*2": 2.0,
+        "px": 0.5,
+        "pixels": 2.0,
+        "voxels": 4.0,
+        "a.u.": 3.0,
+        "1/64 in": 25.4 / 64,
+        "units of R": 150.0,
+        "R": 150.0,
+        "%": 2.0,
+        "‰": 2.0,
+        "half mm": 0.5,
+        "2 mm pixels": 2.0,
+        "寸": 33.3,
+        "hm": 1e5,
+        "Mm": 1e9,
+        "dam": 1e4,
+        "µ": 1e-3,
+        "cm²": 10.0,
+        "mm²": 1.0,
+        "cm^-1": 10.0,
+        "1/mm": 1.0,
+        "steps of 5 µm": 5e-3,
+        "encoder counts": 0.01,
+        "m m": 1000.0,
+        "mmm": 1.0,
+        "cmm": 10.0,
+        "?": 10.0,
     }.items():
 
         def book(text: str = text, factor: float = factor) -> Book:
@@ -93,8 +193,8 @@ def _of_one_column() -> None:
         for unit in ("cm", "in", "m"):
             headings = {name: f"{SYMBOLS[name]} ({unit})"}
             CASES.add(f"only {name} in {unit}", one_sheet(BIG, headings, {name: unit}), BIG, RIGHT)
-    headings = {name: f"{SYMBOLS[name]} ({u})" for name, u in zip(ONE_SHEET_COLUMNS, ("mm", "cm", "m", "in") * 3, strict=False)}
-    units = {name: u for name, u in zip(ONE_SHEET_COLUMNS, ("mm", "cm", "m", "in") * 3, strict=False)}
+    units = dict(zip(ONE_SHEET_COLUMNS, ("mm", "cm", "m", "in") * 2, strict=True))
+    headings = {name: f"{SYMBOLS[name]} ({unit})" for name, unit in units.items()}
     CASES.add("every column in a unit of its own", one_sheet(BIG, headings, units), BIG, RIGHT)
     CASES.add(
         "x1 without a unit between columns in cm",
@@ -158,7 +258,13 @@ def _around() -> None:
             )
     CASES.add("units row below: Zoll", rows("Zoll", "in", "below"), BIG, REFUSED, columns=one_sheet_map("in", 3, 6))
     CASES.add("units row below: dm", rows("dm", "cm", "below"), None, REFUSED, place=("Geometry!",))
-    CASES.add("units row above: mm, one cm", *_one_unit_differs(), *READ_OR_MAP, place="Geometry!", columns=one_sheet_map({"z1": "cm"}, 3, 6))
+    CASES.add(
+        "units row above: mm, one cm",
+        *_one_unit_differs(),
+        *READ_OR_MAP,
+        place="Geometry!",
+        columns=one_sheet_map({"z1": "cm"}, 3, 6),
+    )
 
     # A sentence above, beside or below, in merged cells or not.
     sentences = {
@@ -201,19 +307,45 @@ def _around() -> None:
             made.sheets[0]["A1"] = text
             return made
 
-        CASES.add(f"{text!r} above", millimetres, BIG, *READ_OR_MAP, place="Geometry!", columns=one_sheet_map("mm", 4, 7))
+        CASES.add(
+            f"{text!r} above", millimetres, BIG, *READ_OR_MAP, place="Geometry!", columns=one_sheet_map("mm", 4, 7)
+        )
 
     def units_cell(unit: str, left: str = "Units:", at: str = "A1") -> Book:
         made = one_sheet(BIG, unit=unit, top=3)
         made.sheets[0].put(at, [[left, unit]])
         return made
 
-    CASES.add("Units: | cm", units_cell("cm"), BIG, REFUSED, RIGHT, place="Geometry!", columns=one_sheet_map("cm", 4, 7))
+    CASES.add(
+        "Units: | cm", units_cell("cm"), BIG, REFUSED, RIGHT, place="Geometry!", columns=one_sheet_map("cm", 4, 7)
+    )
     CASES.add("Units: | mm", units_cell("mm"), BIG, *READ_OR_MAP, place="Geometry!", columns=one_sheet_map("mm", 4, 7))
-    CASES.add("length | in", units_cell("in", "length"), BIG, REFUSED, RIGHT, place="Geometry!", columns=one_sheet_map("in", 4, 7))
-    CASES.add("Units: | cm, at the right", units_cell("cm", at="K1"), BIG, REFUSED, WARNED_OF, place="Geometry!", columns=one_sheet_map("cm", 4, 7))
+    CASES.add(
+        "length | in",
+        units_cell("in", "length"),
+        BIG,
+        REFUSED,
+        RIGHT,
+        place="Geometry!",
+        columns=one_sheet_map("in", 4, 7),
+    )
+    CASES.add(
+        "Units: | cm, at the right",
+        units_cell("cm", at="K1"),
+        BIG,
+        REFUSED,
+        WARNED_OF,
+        place="Geometry!",
+        columns=one_sheet_map("cm", 4, 7),
+    )
 
-    for text, unit in (("cm", "cm"), ("mm", "mm"), ("Positions [cm]", "cm"), ("Positions (mm)", "mm"), ("in inches", "in")):
+    for text, unit in (
+        ("cm", "cm"),
+        ("mm", "mm"),
+        ("Positions [cm]", "cm"),
+        ("Positions (mm)", "mm"),
+        ("in inches", "in"),
+    ):
         for area, where in (("B1:D1", "the coordinates"), ("A1:I1", "all columns"), ("B1:I1", "all quantities")):
 
             def merged(text: str = text, unit: str = unit, area: str = area) -> Book:
@@ -299,8 +431,22 @@ def _around() -> None:
         return made
 
     for text, unit in (("in cm", "cm"), ("All in inches!", "in")):
-        CASES.add(f"unit in a note of the heading: {text}", noted(text, unit), BIG, REFUSED, WARNED_OF, place="Geometry!", columns=one_sheet_map(unit))
-    CASES.add("note of the heading: measured in mm", noted("measured in mm by CMM, 2021", "mm"), BIG, *READ_OR_MAP, columns=one_sheet_map())
+        CASES.add(
+            f"unit in a note of the heading: {text}",
+            noted(text, unit),
+            BIG,
+            REFUSED,
+            WARNED_OF,
+            place="Geometry!",
+            columns=one_sheet_map(unit),
+        )
+    CASES.add(
+        "note of the heading: measured in mm",
+        noted("measured in mm by CMM, 2021", "mm"),
+        BIG,
+        *READ_OR_MAP,
+        columns=one_sheet_map(),
+    )
     CASES.add("note of the heading: who and when", noted("J. Smith: checked 2021-03-04", "mm"), BIG, RIGHT)
 
 
@@ -321,7 +467,7 @@ def _one_unit_differs():
 
 def _in_number_formats() -> None:
     def formatted(code: str, unit: str = "mm", names: tuple[str, ...] = tuple(ONE_SHEET_COLUMNS)) -> Book:
-        made = one_sheet(BIG, unit={name: unit for name in names})
+        made = one_sheet(BIG, unit=dict.fromkeys(names, unit))
         for name in names:
             for row in range(2, 6):
                 made.sheets[0].formats[f"{ONE_SHEET_COLUMNS[name]}{row}"] = code
@@ -349,7 +495,9 @@ def _in_number_formats() -> None:
         '"("0.00" cm)"': "cm",
         "[$cm] 0.00": "cm",
     }.items():
-        CASES.add(f"number format {code}", formatted(code, unit), BIG, *READ_OR_MAP, place=cells, columns=one_sheet_map(unit))
+        CASES.add(
+            f"number format {code}", formatted(code, unit), BIG, *READ_OR_MAP, place=cells, columns=one_sheet_map(unit)
+        )
     for name in ("x1", "d", "l"):
         CASES.add(
             f"number format in cm of {name} alone",
@@ -383,13 +531,46 @@ def _in_number_formats() -> None:
         columns=one_sheet_map({"x1": "cm"}),
     )
     # Numbers that are shown otherwise than they are: what is shown is what a person reads.
-    for code in ('"-"0.00', '-0.00', "0.00,", "#,##0,", '0.00" k"', "0.00%", "0‰", '"1"0.00', '0"00"', "mm:ss", "[h]:mm", "yyyy-mm-dd"):
+    for code in (
+        '"-"0.00',
+        "-0.00",
+        "0.00,",
+        "#,##0,",
+        '0.00" k"',
+        "0.00%",
+        "0‰",
+        '"1"0.00',
+        '0"00"',
+        "mm:ss",
+        "[h]:mm",
+        "yyyy-mm-dd",
+    ):
         CASES.add(f"shown by {code}", _formats(one_sheet(BIG), code, "B"), None, REFUSED, WARNED_OF, place=cells)
     # Formats without a unit, though some hold its letters.
-    for code in ("0.00", "#,##0.000", "0.00E+00", "[$-409]0.00", "# ?/?", "0.0_m", "0.00_-", "[Red]0.0;[Blue]-0.0", "_-* #,##0.00_-", "0.0;-0.0;0", "@"):
+    for code in (
+        "0.00",
+        "#,##0.000",
+        "0.00E+00",
+        "[$-409]0.00",
+        "# ?/?",
+        "0.0_m",
+        "0.00_-",
+        "[Red]0.0;[Blue]-0.0",
+        "_-* #,##0.00_-",
+        "0.0;-0.0;0",
+        "@",
+    ):
         CASES.add(f"plain number format {code}", _formats(one_sheet(BIG), code, "BCDEI"), BIG, RIGHT)
-    for code in ('0.00" mm"', '0.0\\ \\m\\m', '0.00" mm";-0.00" mm"', '0.0 "mm"', '[$mm]0.0', 'General" mm"'):
-        CASES.add(f"number format {code}", _formats(one_sheet(BIG), code, "BCDEFGHI"), BIG, RIGHT, REFUSED, place=cells, columns=one_sheet_map())
+    for code in ('0.00" mm"', "0.0\\ \\m\\m", '0.00" mm";-0.00" mm"', '0.0 "mm"', "[$mm]0.0", 'General" mm"'):
+        CASES.add(
+            f"number format {code}",
+            _formats(one_sheet(BIG), code, "BCDEFGHI"),
+            BIG,
+            RIGHT,
+            REFUSED,
+            place=cells,
+            columns=one_sheet_map(),
+        )
     for code in ('0.00" mm";-0.00" cm"', '0.00" mm (cm)"'):
         CASES.add(f"number format {code}", _formats(one_sheet(BIG), code, "BCD"), None, REFUSED, place=cells)
 
@@ -433,7 +614,15 @@ def _of_the_users_workbook() -> None:
         CASES.add(f"users' workbook in {unit}", made, BIG, RIGHT)
         made = in_planar(book("{}"))
         made["Coordinates"]["A1"] = made["Main"]["A1"] = f"all in {unit}"
-        CASES.add(f"users' workbook, 'all in {unit}' above", made, BIG, REFUSED, WARNED_OF, place=("!A1",), columns=users_map(unit))
+        CASES.add(
+            f"users' workbook, 'all in {unit}' above",
+            made,
+            BIG,
+            REFUSED,
+            WARNED_OF,
+            place=("!A1",),
+            columns=users_map(unit),
+        )
         # Main alone in another unit: the formulas of the other sheet would mix them, so its values are typed.
         made = typed(users(BIG))
         for at, value in made["Main"].cells.items():
@@ -445,16 +634,28 @@ def _of_the_users_workbook() -> None:
     degrees = users()
     for at, formula in formulas_of(degrees["Coordinates"]).items():
         if at[0] in "VW":
-            degrees["Coordinates"][at] = Formula(f"DEGREES({formula.text})", float(formula.stored) * 180 / 3.141592653589793)
+            degrees["Coordinates"][at] = Formula(
+                f"DEGREES({formula.text})", float(formula.stored) * 180 / 3.141592653589793
+            )
     degrees["Coordinates"]["V2"] = "pinhole azimuth (degrees)"
     degrees["Coordinates"]["W2"] = "pinhole elevation (degrees)"
     CASES.add("angles in degrees, said so", degrees, SCANNER, RIGHT)
     rich = users()
-    rich["Coordinates"]["B1"] = Rich("<r><t>x</t></r><r><rPr><vertAlign val=\"subscript\"/></rPr><t>1</t></r><r><t> (cm)</t></r>")
+    rich["Coordinates"]["B1"] = Rich(
+        '<r><t>x</t></r><r><rPr><vertAlign val="subscript"/></rPr><t>1</t></r><r><t> (cm)</t></r>'
+    )
     for i in range(3, 7):
         rich["Coordinates"][f"B{i}"] = rich["Coordinates"][f"B{i}"] / 10
     typed(rich)
-    CASES.add("unit in a heading of several fonts", rich, SCANNER, RIGHT, REFUSED, place="Coordinates!B1", columns=users_map({"x1": "cm"}))
+    CASES.add(
+        "unit in a heading of several fonts",
+        rich,
+        SCANNER,
+        RIGHT,
+        REFUSED,
+        place="Coordinates!B1",
+        columns=users_map({"x1": "cm"}),
+    )
 
 
 _in_headings()

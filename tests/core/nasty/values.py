@@ -44,9 +44,39 @@ def _cells() -> None:
     for text in ("315", " 315 ", "315.0", "3.15e2", "+315", "315.", "0315", "315\N{NO-BREAK SPACE}", "３１５"):
         CASES.add(f"text {text!r}", _cell("B3", text), BIG, RIGHT, REFUSED, place=at, unmappable=NO_NUMBER)
     for text in (
-        *("315,0", "3,15", "1,315", "1.315,0", "1 315", "1'315", "315 mm", "31.5 cm", "12.4 in", "315mm", "≈315", "~315"),
+        *(
+            "315,0",
+            "3,15",
+            "1,315",
+            "1.315,0",
+            "1 315",
+            "1'315",
+            "315 mm",
+            "31.5 cm",
+            "12.4 in",
+            "315mm",
+            "≈315",
+            "~315",
+        ),
         *("315 ± 0.1", "315(2)", "315*", "315?", "(315)", "<315", "315-316", "315/316", "−315", "3l5", "31S", "O", "x"),
-        *("n/a", "N/A", "-", "—", "TBD", "?", "none", "NaN", "nan", "inf", "Infinity", "1.#INF", "#N/A", "#REF!", "''", '"'),
+        *(
+            "n/a",
+            "N/A",
+            "-",
+            "—",
+            "TBD",
+            "?",
+            "none",
+            "NaN",
+            "nan",
+            "inf",
+            "Infinity",
+            "1.#INF",
+            "#N/A",
+            "#REF!",
+            "''",
+            '"',
+        ),
         *("same", "idem", "see above", "=315", "=B2", "0x13B", "3_1_5", "1e3", "TRUE", "12.05.2021", "5-Dec", "true"),
     ):
         CASES.add(f"text {text!r}", _cell("B3", text), None, REFUSED, place=at)
@@ -100,8 +130,26 @@ def _cells() -> None:
         # Without a word about a unit: mm, but no scanner has this size.
         small = scanner(CENTERS * factor, 2.3 * factor, 75 * factor, 50 * factor, 10 * factor)
         book = one_sheet(small)
-        CASES.add(f"no unit said, a scanner {name}", book, small, WARNED, REFUSED, place=("Geometry",), columns=one_sheet_map())
-    for quantity_name, factor in (("d", 0.1), ("d", 10.0), ("R", 2.0), ("R", 0.1), ("Ld", 0.1), ("Ld", 10.0), ("Td", 10.0), ("l", 0.1), ("l", 10.0)):
+        CASES.add(
+            f"no unit said, a scanner {name}",
+            book,
+            small,
+            WARNED,
+            REFUSED,
+            place=("Geometry",),
+            columns=one_sheet_map(),
+        )
+    for quantity_name, factor in (
+        ("d", 0.1),
+        ("d", 10.0),
+        ("R", 2.0),
+        ("R", 0.1),
+        ("Ld", 0.1),
+        ("Ld", 10.0),
+        ("Td", 10.0),
+        ("l", 0.1),
+        ("l", 10.0),
+    ):
 
         def odd(name: str = quantity_name, factor: float = factor) -> Book:
             made = one_sheet(BIG)
@@ -109,7 +157,9 @@ def _cells() -> None:
                 made.sheets[0][f"{ONE_SHEET_COLUMNS[name]}{row}"] *= factor
             return made
 
-        CASES.add(f"{quantity_name} times {factor:g}, l says so", odd, None, REFUSED, WARNED_OF, place=("Geometry!",)) if quantity_name != "Td" else None
+        CASES.add(
+            f"{quantity_name} times {factor:g}, l says so", odd, None, REFUSED, WARNED_OF, place=("Geometry!",)
+        ) if quantity_name != "Td" else None
     for row, name in ((2, "the first"), (4, "one")):
 
         def one(row: int = row) -> Book:
@@ -131,7 +181,9 @@ def _cells() -> None:
         made = _cell("B3", 315.0)
         made.sheets[0].formats["B3"] = "yyyy-mm-dd"
         made.date1904 = epoch
-        CASES.add(f"a number shown as a date{', 1904' if epoch else ''}", made, BIG, REFUSED, place=at, unmappable=NO_NUMBER)
+        CASES.add(
+            f"a number shown as a date{', 1904' if epoch else ''}", made, BIG, REFUSED, place=at, unmappable=NO_NUMBER
+        )
     plain_1904 = one_sheet(BIG)
     plain_1904.date1904 = True
     CASES.add("dates from 1904, none used", plain_1904, BIG, RIGHT)
@@ -147,13 +199,28 @@ def _dimension_in_main(at: str, value: object, recalculated: bool = False) -> Bo
 
 def _stored_values() -> None:
     """Formulas whose stored values are stale, missing, or of another kind."""
-    for calculation in ("", RECALCULATE, '<calcPr calcId="0" calcMode="manual"/>', '<calcPr calcId="191029" calcCompleted="0" forceFullCalc="1"/>', '<calcPr calcId="191029" iterate="1"/>'):
+    for calculation in (
+        "",
+        RECALCULATE,
+        '<calcPr calcId="0" calcMode="manual"/>',
+        '<calcPr calcId="191029" calcCompleted="0" forceFullCalc="1"/>',
+        '<calcPr calcId="191029" iterate="1"/>',
+    ):
         made = users()
         made.calculation = calculation
         CASES.add(f"right stored values, {calculation or 'no calcPr'}", made, SCANNER, RIGHT)
     full = users()
     full.calculation = '<calcPr calcId="191029" fullPrecision="0"/>'
-    CASES.add("precision as displayed, values of all digits", full, SCANNER, RIGHT, WARNED, REFUSED, place=("!",), unmappable=STALE)
+    CASES.add(
+        "precision as displayed, values of all digits",
+        full,
+        SCANNER,
+        RIGHT,
+        WARNED,
+        REFUSED,
+        place=("!",),
+        unmappable=STALE,
+    )
 
     # Stored l of another d, R, Ld: what the sheet's formula gives is what a person sees on opening it.
     for at, value, name in (("P4", 3.1, "d"), ("Q4", 90.0, "R"), ("S4", 60.0, "Ld"), ("T4", 20.0, "Td")):
@@ -171,7 +238,16 @@ def _stored_values() -> None:
         made = users()
         made["Coordinates"][at] = value
         CASES.add(f"{name} changed, formulas not calculated since", made, None, REFUSED, place=("Coordinates!",))
-    for column, name in (("G", "l"), ("E", "b"), ("H", "l + b+Td"), ("I", "x2"), ("K", "z2"), ("U", "range"), ("V", "azimuth"), ("W", "elevation")):
+    for column, name in (
+        ("G", "l"),
+        ("E", "b"),
+        ("H", "l + b+Td"),
+        ("I", "x2"),
+        ("K", "z2"),
+        ("U", "range"),
+        ("V", "azimuth"),
+        ("W", "elevation"),
+    ):
         for wrong in (0, 1.0):
             for flagged in (False, True):
                 made = users()
@@ -188,14 +264,29 @@ def _stored_values() -> None:
                     place=("Coordinates!",),
                     unmappable=STALE,
                 )
-    for stored, name in ((0, "0"), (1.0, "1"), ("", "empty text"), ("x", "a text"), (Error("#NAME?"), "an error"), (True, "TRUE"), (None, "none")):
-        for column, formula, right in (("D", "-70.9", -70.9), ("B", "100+55", 155.0), ("C", "C3+88.1", 158.4)):
+    for stored, name in (
+        (0, "0"),
+        (1.0, "1"),
+        ("", "empty text"),
+        ("x", "a text"),
+        (Error("#NAME?"), "an error"),
+        (True, "TRUE"),
+        (None, "none"),
+    ):
+        for column, formula in (("D", "-70.9"), ("B", "100+55"), ("C", "C3+88.1")):
             made = users()
             made["Coordinates"][f"{column}4"] = Formula(formula, stored)
             made.calculation = RECALCULATE
             # Nothing stored: the formula is computed. Anything else is not what the formula gives.
             allowed = (RIGHT, REFUSED) if stored is None or stored == "" else (REFUSED,)
-            CASES.add(f"{column}4 ={formula} with {name} stored, calculation asked for", made, SCANNER, *allowed, place=("Coordinates!",), unmappable=STALE)
+            CASES.add(
+                f"{column}4 ={formula} with {name} stored, calculation asked for",
+                made,
+                SCANNER,
+                *allowed,
+                place=("Coordinates!",),
+                unmappable=STALE,
+            )
 
     whole = users()
     for at, formula in formulas_of(whole["Coordinates"]).items():
@@ -203,7 +294,15 @@ def _stored_values() -> None:
     for i in range(4):
         whole["Coordinates"][f"D{3 + i}"] = Formula(f"{float(SCANNER.centers[i, 2])!r}+0", 0)
     whole.calculation = RECALCULATE
-    CASES.add("0 stored for every formula, z1 among them, calculation asked for", whole, SCANNER, REFUSED, RIGHT, place=("Coordinates!",), unmappable=STALE)
+    CASES.add(
+        "0 stored for every formula, z1 among them, calculation asked for",
+        whole,
+        SCANNER,
+        REFUSED,
+        RIGHT,
+        place=("Coordinates!",),
+        unmappable=STALE,
+    )
     unflagged = users()
     for i in range(4):
         unflagged["Coordinates"][f"D{3 + i}"] = Formula(f"{float(SCANNER.centers[i, 2])!r}+0", 0)
@@ -213,7 +312,14 @@ def _stored_values() -> None:
         value = made["Coordinates"][at]
         made["Coordinates"][at] = Formula("AA1*1", value)
         made["Coordinates"]["AA1"] = value * 1.2
-        CASES.add(f"{column} is a formula of a cell that changed since", made, None, REFUSED, WARNED_OF, place=("Coordinates!",))
+        CASES.add(
+            f"{column} is a formula of a cell that changed since",
+            made,
+            None,
+            REFUSED,
+            WARNED_OF,
+            place=("Coordinates!",),
+        )
         same = users()
         same["Coordinates"][at] = Formula("AA1*1", value)
         same["Coordinates"]["AA1"] = value
@@ -222,7 +328,10 @@ def _stored_values() -> None:
     polar = users()
     for i, (x, y, _) in enumerate(SCANNER.centers):
         r = 3 + i
-        polar["Coordinates"][f"Y{r}"], polar["Coordinates"][f"Z{r}"] = float(np.hypot(x, y)), float(np.degrees(np.arctan2(y, x)))
+        polar["Coordinates"][f"Y{r}"], polar["Coordinates"][f"Z{r}"] = (
+            float(np.hypot(x, y)),
+            float(np.degrees(np.arctan2(y, x))),
+        )
         polar["Coordinates"][f"B{r}"] = Formula(f"Y{r}*COS(RADIANS(Z{r}))", float(x))
         polar["Coordinates"][f"C{r}"] = Formula(f"Y{r}*SIN(RADIANS(Z{r}))", float(y))
     CASES.add("x1 and y1 are formulas of polar coordinates", polar, SCANNER, RIGHT)
@@ -231,20 +340,20 @@ def _stored_values() -> None:
         ("XLOOKUP(A4,AA1:AA9,AB1:AB9)", "XLOOKUP"),
         ("_xlfn.XLOOKUP(A4,AA1:AA9,AB1:AB9)", "XLOOKUP as it is stored"),
         ("[1]Sheet1!$B$4", "another workbook"),
-        ("INDIRECT(\"AB4\")", "INDIRECT"),
+        ('INDIRECT("AB4")', "INDIRECT"),
         ("OFFSET(AB1,3,0)", "OFFSET"),
         ("RAND()*300", "RAND"),
         ("NOW()/300", "NOW"),
-        ("IFERROR(__xludf.DUMMYFUNCTION(\"IMPORTRANGE()\"),155)", "Google's stand-in"),
+        ('IFERROR(__xludf.DUMMYFUNCTION("IMPORTRANGE()"),155)', "Google's stand-in"),
         ("myFunction(A4)", "a macro's function"),
         ("_xlfn.LET(_xlpm.a,155,_xlpm.a)", "LET"),
         ("Scanner[@x]", "a table that is not there"),
         ("TABLE(,AA1)", "a data table"),
-        ("CUBEVALUE(\"a\",\"b\")", "a cube"),
-        ("WEBSERVICE(\"http://a\")", "the web"),
+        ('CUBEVALUE("a","b")', "a cube"),
+        ('WEBSERVICE("http://a")', "the web"),
         ("SQRT(-1)", "an error, of which the stored value is none"),
         ("1/0", "a division by zero"),
-        ("\"155\"", "a text"),
+        ('"155"', "a text"),
         ("B4", "itself"),
     ):
         for flagged in (False, True):
@@ -258,7 +367,14 @@ def _stored_values() -> None:
             allowed = (RIGHT, WARNED, REFUSED)
             if name in ("an error, of which the stored value is none", "a division by zero", "itself", "RAND", "NOW"):
                 allowed = (WARNED, REFUSED, *((RIGHT,) if not flagged or name in ("RAND", "NOW") else ()))
-            CASES.add(f"x1 is a formula of {name}{', calculation asked for' if flagged else ''}", made, SCANNER, *allowed, place=("Coordinates!",), unmappable=STALE)
+            CASES.add(
+                f"x1 is a formula of {name}{', calculation asked for' if flagged else ''}",
+                made,
+                SCANNER,
+                *allowed,
+                place=("Coordinates!",),
+                unmappable=STALE,
+            )
     for name, attributes, rows in (
         ("shared", ' t="shared" si="0" ref="E3:E6"', ' t="shared" si="0"'),
         ("array", ' t="array" ref="E3"', None),
@@ -279,19 +395,42 @@ def _stored_values() -> None:
             if rows is None:
                 sheet[f"G{3 + i}"] = Formula(cell.text, None, f' t="array" ref="G{3 + i}"')
             else:
-                sheet[f"G{3 + i}"] = Formula(cell.text if i == 0 else "", None, attributes.replace("E", "G") if i == 0 else rows)
-        CASES.add(f"{name} formulas of l without values", stripped, SCANNER, RIGHT, REFUSED, place=("Coordinates!",), unmappable=STALE)
+                sheet[f"G{3 + i}"] = Formula(
+                    cell.text if i == 0 else "", None, attributes.replace("E", "G") if i == 0 else rows
+                )
+        CASES.add(
+            f"{name} formulas of l without values",
+            stripped,
+            SCANNER,
+            RIGHT,
+            REFUSED,
+            place=("Coordinates!",),
+            unmappable=STALE,
+        )
     stale_shared = users()
     sheet = stale_shared["Coordinates"]
     for i in range(4):
         sheet[f"Y{3 + i}"] = float(SCANNER.centers[i, 0]) / 2 + (10 if i == 2 else 0)
-        sheet[f"B{3 + i}"] = Formula("Y3*2" if i == 0 else "", float(SCANNER.centers[i, 0]), ' t="shared" si="0" ref="B3:B6"' if i == 0 else ' t="shared" si="0"')
-    CASES.add("shared formulas of x1, one stored value stale", stale_shared, None, REFUSED, WARNED_OF, place=("Coordinates!B5",))
+        sheet[f"B{3 + i}"] = Formula(
+            "Y3*2" if i == 0 else "",
+            float(SCANNER.centers[i, 0]),
+            ' t="shared" si="0" ref="B3:B6"' if i == 0 else ' t="shared" si="0"',
+        )
+    CASES.add(
+        "shared formulas of x1, one stored value stale",
+        stale_shared,
+        None,
+        REFUSED,
+        WARNED_OF,
+        place=("Coordinates!B5",),
+    )
     block = users()
     sheet = block["Coordinates"]
     for i in range(4):
         sheet[f"Y{3 + i}"] = float(SCANNER.centers[i, 0]) / 2
-        sheet[f"B{3 + i}"] = Formula("Y3:Y6*2", 277.0, ' t="array" ref="B3:B6"') if i == 0 else float(SCANNER.centers[i, 0])
+        sheet[f"B{3 + i}"] = (
+            Formula("Y3:Y6*2", 277.0, ' t="array" ref="B3:B6"') if i == 0 else float(SCANNER.centers[i, 0])
+        )
     CASES.add("one array formula for all x1", block, SCANNER, RIGHT, REFUSED, place=("Coordinates!",), unmappable=STALE)
     table = users()
     table["Coordinates"]["B4"] = Formula("", 155.0, ' t="dataTable" ref="B4:B4" dt2D="0" dtr="0" r1="AA1"')
@@ -321,7 +460,14 @@ def _stored_values() -> None:
         for column in "HIJK":
             cell = other["Coordinates"][f"{column}{r}"]
             other["Coordinates"][f"{column}{r}"] = Formula(cell.text, None)
-    CASES.add("l by a formula of their own", other, scanner(l=SCANNER.pinhole_distance / 4), WARNED, RIGHT, place=("Coordinates!G",))
+    CASES.add(
+        "l by a formula of their own",
+        other,
+        scanner(l=SCANNER.pinhole_distance / 4),
+        WARNED,
+        RIGHT,
+        place=("Coordinates!G",),
+    )
     chain = users()
     chain["Coordinates"]["AA1"], chain["Main"]["AA1"] = Formula("Main!AA1+5", 100.0), 150.0
     chain["Coordinates"]["B4"] = Formula("AA1+55", 155.0)
@@ -336,7 +482,14 @@ def _stored_values() -> None:
     renamed["Main"]["AA1"] = 65.0
     renamed["Coordinates"]["B4"] = Formula("100+offset", 155.0)
     renamed.calculation = RECALCULATE
-    CASES.add("x1 is a formula of a name, stale, calculation asked for", renamed, None, REFUSED, WARNED_OF, place=("Coordinates!",))
+    CASES.add(
+        "x1 is a formula of a name, stale, calculation asked for",
+        renamed,
+        None,
+        REFUSED,
+        WARNED_OF,
+        place=("Coordinates!",),
+    )
     rounded = users()
     for at, formula in formulas_of(rounded["Coordinates"]).items():
         rounded["Coordinates"][at] = Formula(formula.text, float(f"{formula.stored:.15g}"))
@@ -378,7 +531,13 @@ def _programs() -> None:
         truth = BIG if name == "one sheet" else SCANNER
         CASES.add(f"{name}, by hand", lambda make=make: make(), truth, RIGHT)
         CASES.add(f"{name}, by openpyxl", lambda path, make=make: by_openpyxl(make(), path), truth, RIGHT)
-        CASES.add(f"{name}, by XlsxWriter with values", lambda path, make=make: _xlsxwriter(make(), path, True), truth, RIGHT, needs="xlsxwriter")
+        CASES.add(
+            f"{name}, by XlsxWriter with values",
+            lambda path, make=make: _xlsxwriter(make(), path, True),
+            truth,
+            RIGHT,
+            needs="xlsxwriter",
+        )
         allowed = (RIGHT,) if name == "one sheet" else (RIGHT, REFUSED)
         CASES.add(
             f"{name}, by XlsxWriter without values",
@@ -398,7 +557,10 @@ def _programs() -> None:
         )
         CASES.add(f"{name}, saved again by openpyxl", lambda path, make=make: _saved_again(make(), path), truth, RIGHT)
         CASES.add(
-            f"{name}, values only by openpyxl", lambda path, make=make: _saved_again(make(), path, data_only=True), truth, RIGHT
+            f"{name}, values only by openpyxl",
+            lambda path, make=make: _saved_again(make(), path, data_only=True),
+            truth,
+            RIGHT,
         )
     for column in ("x1", "z1", "l", "d"):
         name = USERS_COLUMNS[column]
@@ -412,7 +574,16 @@ def _programs() -> None:
                 sheet[f"{name}{row}"] = Formula(f"AA{row}*2")
             by_xlsxwriter(book, path)
 
-        CASES.add(f"{column} alone a formula, by XlsxWriter without values", half, SCANNER, RIGHT, REFUSED, place=("!" + name,), unmappable=STALE, needs="xlsxwriter")
+        CASES.add(
+            f"{column} alone a formula, by XlsxWriter without values",
+            half,
+            SCANNER,
+            RIGHT,
+            REFUSED,
+            place=("!" + name,),
+            unmappable=STALE,
+            needs="xlsxwriter",
+        )
 
 
 def _saved_again(book: Book, path: Path, data_only: bool = False) -> None:

@@ -171,6 +171,11 @@ class Sheet:
         shown = {at: cell.value if at[0] > HEADING_ROWS else self.value(*at) for at, cell in self.cells.items()}
         return {at: text for at, text in shown.items() if type(text) is str and text.strip()}
 
+    @property
+    def comments(self) -> dict[At, str]:
+        """The cells' comments."""
+        return self.book.workbook.comments(self.name)
+
     def formula(self, row: int, column: int) -> str | None:
         """The formula in a cell."""
         cell = self.cells.get((row, column))

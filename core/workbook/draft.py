@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import os
+import warnings
 from dataclasses import dataclass, replace
 
-from ..errors import InputError
+from ..errors import InputError, InputWarning
 from .book import HEADING_ROWS, Book, Outdated, Sheet, Uncomputed
 from .column_map import ColumnMap, MappedColumn, MappedTable
 from .layout import Layout, column_map_of
@@ -62,7 +63,9 @@ def draft_column_map(path: str | os.PathLike[str]) -> ColumnMapDraft:
     book = Book(path)
     recognized = recognize(book)
     try:
-        return _certain(recognized_layout(book))
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", InputWarning)  # said when the workbook is read
+            return _certain(recognized_layout(book))
     except InputError as error:
         doubts = [doubt.removeprefix(f"{book.path.name}: ") for doubt in recognized.doubts or [str(error)]]
     tables: list[MappedTable] = []

@@ -30,9 +30,12 @@ _OTHER_UNIT_WORDS = (
     "dm decimeter decimeters decimetre decimetres dezimeter zentimeter millimeter km kilometer kilometers kilometre "
     "kilometres nm nanometer nanometers nanometre nanometres angstrom angstroms å mil mils thou ft foot feet yd yard "
     "yards zoll pouce pouces pollice pollici pulgada pulgadas px pixel pixels voxel voxels unit units einheit "
-    "einheiten unité unités scale scaled scaling maßstab"
+    "einheiten unité unités scale scaled scaling maßstab centímetros centimetros milímetros centimètres millimètres "
+    "centimetri millimetri см мм дюйм дюймы сантиметры миллиметры 厘米 公分 毫米 英寸 センチ ミリ インチ"
 )
 """Words in notes that may say in what the lengths are, and that nothing here can account for."""
+UNIT_WORDS = frozenset(["unit", "units", "einheit", "einheiten", "unité", "unités"])
+"""Of these, those that a unit in the same row accounts for: "Units: mm"."""
 
 
 @dataclass(frozen=True)
@@ -163,7 +166,10 @@ _WITH_UNIT = re.compile(
 _BRACKETED_UNIT = re.compile(r"\((?:in )?([^()]+)\)|\[(?:in )?([^\[\]]+)\]|(.+)")
 _WORD = re.compile(r"[^\W\d_]+")
 _IN_BRACKETS = re.compile(r"[(\[]\s*(in|m|\"|''|″)\.?\s*[)\]]")
-_PART_OF_MILLIMETRE = re.compile(r"(?:\bin|[x×*=/])\s*[\d.,/^-]*\d[\d.,/^-]*\s*mm\b|\bths? (?:of )?(?:a )?mm\b")
+_AT_THE_END = re.compile(r"(?:^|[:=,/]\s*|\bin\s+|\d\s*)(in|m)\b\.?(?!\s*[\w\d])|\s(m)$")
+_PART_OF_MILLIMETRE = re.compile(
+    r"(?:\bin|[x×*/]|\bunits?\b\D*)\s*[\d.,/^-]*\d[\d.,/^-]*\s*mm\b|\bths? (?:of )?(?:a )?mm\b|tenths? of|^[\d.,/^-]+ ?mm$"
+)
 
 
 class Heading(NamedTuple):
@@ -237,12 +243,12 @@ def units_in(text: Any, alone: bool = False) -> list[str]:
         whole = unit_alone(text)
         found = [whole] if whole else [word for word in words[:1] if len(words) == 1 and word in _OTHER_WORDS]
     else:
-        # "in" is a word, too, and single letters are names: these only in brackets, or after "in".
-        plainly = [word for word in words if word != "in" and (word != "m" or re.search(r"(\bin|\d) ?m\b", folded))]
+        # "in" is a word, too, and letters are names: these only in brackets, after a number or "in", or at the end.
+        plainly = [word for word in words if word not in ("in", "m")]
         found = [_UNIT_OF.get(word, word) for word in plainly if word in _UNIT_OF or word in _OTHER_WORDS]
         found += ["in" if mark != "m" else "m" for mark in _IN_BRACKETS.findall(folded)]
-        found += ["in"] * (folded in ("in", "in.") or folded.endswith(" in in"))
-        found += ["m"] * (folded == "m")
+        found += [a or b for a, b in _AT_THE_END.findall(plain(text))]
         if _PART_OF_MILLIMETRE.search(folded):
             found.append(folded)
-    return [unit for unit in dict.fromkeys(found) if unit not in ANGLE_UNITS]
+    units = [unit for unit in dict.fromkeys(found) if unit not in ANGLE_UNITS]
+    return [unit for unit in units if unit not in UNIT_WORDS] or units

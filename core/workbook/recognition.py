@@ -23,6 +23,7 @@ from .quantities import (
     NEEDED,
     POSITION,
     QUANTITIES,
+    UNIT_WORDS,
     Heading,
     is_label_heading,
     is_number_heading,
@@ -45,6 +46,12 @@ _ROWS_APART = 2
 """A symbol row and a description row that are further apart do not belong together."""
 _SUMMARY = re.compile(r"\b(SUM|AVERAGE|MEAN|MEDIAN|MIN|MAX|COUNT|COUNTA|STDEV|VAR|SUBTOTAL|AGGREGATE)[.SP]*\(", re.I)
 _LITERAL = re.compile(r'"([^"]*)"|\\(.)|\[\$([^\]-]*)[^\]]*\]')
+_OF_ALL = re.compile(
+    r"\b(all|every|lengths?|dimensions?|distances?|coordinates?|sizes?|units?|numbers?|values?)\b", re.I
+)
+_NUMERIC = re.compile(r"[\d.,eE+\-\s]+")
+_PLACEHOLDERS = re.compile(r"\[[^\]]*\]|general|standard|e[+-]|[_*].", re.IGNORECASE)
+"""Of number formats: colours and conditions, the general format, exponents, blanks and filling."""
 _SCALED = re.compile(r"[0#?],+(?![0#?,])|%")
 
 
@@ -171,7 +178,7 @@ class SheetSeen:
     @property
     def wanted(self) -> list[int]:
         """The columns that make a row one of the table's."""
-        names = POSITION if self.columns.keys() >= set(POSITION) else (*DIMENSIONS, "l")
+        names = POSITION if self.columns.keys() >= set(POSITION) else (*NEEDED, "l")
         return sorted(self.columns[name][0] for name in names if name in self.columns)
 
     @cached_property
@@ -180,10 +187,10 @@ class SheetSeen:
         headed = {
             at[1]: at for at, text in self.above.items() if is_number_heading(text) and at[1] not in self.headings
         }
-        if len(headed) > 1:
-            places = [self.sheet.place(*at) for at in headed.values()]
-            self.doubt(f"{places[0]} and {places[1]} both head the modules' numbers, expected one such column")
         filled = [column for column in headed if self._filled(column)]
+        if len(filled) > 1:
+            places = [self.sheet.place(*headed[column]) for column in filled]
+            self.doubt(f"{places[0]} and {places[1]} both head the modules' numbers, expected one such column")
         if filled:
             return filled[0]
         left = [column for column in range(1, min(self.headings)) if column not in self.aside]
@@ -199,20 +206,23 @@ class SheetSeen:
 
     @cached_property
     def _sized(self) -> list[int]:
-        """The rows with numbers, or with several texts in their place, in the wanted columns."""
-        found = []
+        """The rows with numbers, or with what cannot be a note, in the wanted columns; or with typed dimensions."""
+        typed = [self.columns[name][0] for name in (*DIMENSIONS, "l") if name in self.columns]
+        found: list[int] = []
         for row in self.sheet.rows:
             if row < self.first_row:
                 continue
-            values = [(column, self.sheet.value(row, column)) for column in self.wanted]
-            texts = [value for _, value in values if type(value) is str]
-            filled = [column for column, value in values if value is not None]
-            if not filled or _is_summary(self.sheet, row, self.wanted):
+            values = [value for column in self.wanted if (value := self.sheet.value(row, column)) is not None]
+            if _is_summary(self.sheet, row, self.wanted):
                 continue
-            note = len(filled) == len(texts) == 1 and not re.fullmatch(r"[\d.,eE+\-\s]+", texts[0])
-            if not note:
+            alone = len(values) == 1 and type(values[0]) is str and not _NUMERIC.fullmatch(values[0])
+            note = alone and len(self.wanted) > 1 and row - 1 not in found[-1:]
+            if (values and not note) or any(self._is_typed(row, column) for column in typed):
                 found.append(row)
         return found
+
+    def _is_typed(self, row: int, column: int) -> bool:
+        return self.sheet.formula(row, column) is None and type(self.sheet.value(row, column)) is float
 
     @cached_property
     def rows(self) -> tuple[int, ...]:
@@ -270,7 +280,7 @@ class SheetSeen:
         if not self.rows:
             return
         columns = {*self.headings, self.label_column or min(self.headings)}
-        modules, blank = set(self.rows), []
+        modules = set(self.rows)
         for row in range(self.rows[0], self.rows[-1] + 1):
             if row in modules:
                 continue
@@ -279,14 +289,6 @@ class SheetSeen:
                 text = _quoted(self.sheet.texts[texts[0]])
                 self.doubt(f"{self.sheet.place(*texts[0])} holds {text} between rows of modules, expected one table")
                 return
-            blank.append(row)
-        if blank and self.label_column is None:
-            warnings.warn(
-                f"{self.sheet.book.path.name}: row {blank[0]} of sheet {self.sheet.name} is no module's, and the rows "
-                "below, which have no numbers to tell, were taken for modules too",
-                InputWarning,
-                stacklevel=2,
-            )
 
     @cached_property
     def _texts_of_row(self) -> dict[int, list[At]]:
@@ -308,11 +310,20 @@ class SheetSeen:
             if at in self.above and (column in self.headings or self._heads_its_own(at)):
                 continue
             for unit in units_in(text, alone=row in modules):
-                if lengths != {unit}:
+                named = unit in UNIT_WORDS and any(
+                    units_in(self.sheet.texts[a]) for a in self._texts_of_row[row] if a != at
+                )
+                if lengths != {unit} and not named:
                     self.doubt(
                         f"{self.sheet.place(*at)} holds {_quoted(text)}, where the headings say {_several(lengths)}: "
                         "expected one unit"
                     )
+        for at, text in self.sheet.comments.items():
+            if at[0] < self.first_row and any(lengths != {unit} for unit in units_in(text)):
+                self.doubt(
+                    f"{self.sheet.place(*at)} has the comment {_quoted(text)}, where the headings say "
+                    f"{_several(lengths)}: expected one unit"
+                )
 
     def _heads_its_own(self, at: At) -> bool:
         """Whether a text is the heading of numbers that are of no concern: its unit is theirs alone."""
@@ -323,7 +334,7 @@ class SheetSeen:
         """Number formats that show another unit, or another number, than the cell's."""
         for column, unit in used:
             for row in self.rows:
-                if (row, column) not in self.sheet.cells:
+                if (row, column) not in self.sheet.cells or self.sheet.is_date(row, column):
                     continue
                 shown = self.sheet.number_format(row, column)
                 if not _is_accounted_for(shown, unit):
@@ -336,11 +347,12 @@ class SheetSeen:
 
 def _is_accounted_for(number_format: str, unit: str) -> bool:
     """Whether a number format shows the number as it is, alone or with its unit."""
-    for literal in _LITERAL.finditer(number_format.split(";")[0]):
+    for literal in _LITERAL.finditer(number_format):
         text = literal[1] or literal[2] or literal[3] or ""
         if re.sub(r"[\s()+\-:/]", "", text) and unit_alone(text) != unit:
             return False
-    return not _SCALED.search(_LITERAL.sub("", number_format))
+    rest = _LITERAL.sub("", number_format)
+    return not _SCALED.search(rest) and not re.search(r"[^\W\d_]", _PLACEHOLDERS.sub("", rest))
 
 
 def sheets_seen(book: Book) -> list[SheetSeen]:
@@ -447,6 +459,8 @@ def recognized_layout(book: Book) -> Layout:
         layout.columns[name] = Column(table, name, modules, _rows_of(name, layout, seen, taken["x1"], table))
     if "l" not in taken:
         _warn_of_unknown(taken["x1"])
+    _warn_of_other_sheets(layout)
+    _warn_of_gap(modules)
     return layout
 
 
@@ -473,6 +487,13 @@ def _joined(modules: Table, table: Table, coordinates: SheetSeen, seen: SheetSee
         rows = by_label(modules, table)
     else:
         rows = in_order(modules, table)
+        for row, its in zip(modules.rows, rows, strict=True):
+            if row - modules.rows[0] != its - rows[0]:
+                raise InputError(
+                    f"{file}: row {row} of sheet {modules.sheet.name} and row {its} of sheet {table.sheet.name} would "
+                    "belong together, expected the modules' numbers in both, as other rows are blank in one than in the "
+                    f"other; {HELP}"
+                )
         if table.numbers is not None and list(table.numbers) != sorted(table.numbers):
             raise InputError(
                 f"{file}: the modules of sheet {table.sheet.name} have numbers in no order, those of sheet "
@@ -506,6 +527,36 @@ def _warn_of_unknown(seen: SheetSeen) -> None:
             InputWarning,
             stacklevel=4,
         )
+
+
+def _warn_of_gap(modules: Table) -> None:
+    gap = sorted(set(range(modules.rows[0], modules.rows[-1])) - set(modules.rows))
+    if gap and modules.labels is None:
+        warnings.warn(
+            f"{modules.sheet.book.path.name}: row {gap[0]} of sheet {modules.sheet.name} is no module's, and the rows "
+            "below, which have no numbers to tell, were taken for modules too",
+            InputWarning,
+            stacklevel=4,
+        )
+
+
+def _warn_of_other_sheets(layout: Layout) -> None:
+    """Warn of a sheet beside the scanner's that says of all lengths what the headings do not."""
+    used = {column.table.sheet.name for column in layout.columns.values()}
+    units = {column.unit for column in layout.columns.values() if column.unit in LENGTH_UNITS}
+    book = layout.modules.sheet.book
+    for name, sheet in book.sheets.items():
+        if name in used or plain(name).casefold() in OWN_SHEETS:
+            continue
+        for at, text in sheet.texts.items():
+            if _OF_ALL.search(text) and any(units != {unit} for unit in units_in(text)):
+                warnings.warn(
+                    f"{book.path.name}: {sheet.place(*at)} says {_quoted(text)}, where the headings of the scanner's "
+                    f"sheets say {_several(units)}, which was used",
+                    InputWarning,
+                    stacklevel=4,
+                )
+                return
 
 
 def _is_number(sheet: Sheet, row: int, column: int) -> bool:

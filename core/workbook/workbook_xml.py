@@ -11,7 +11,7 @@ from ..errors import InputError
 from .formulas import CellError, NotComputable, Surroundings, calculate, tokens_of
 from .package import Package
 from .references import Reference, reference
-from .sheet_xml import MAIN, STRICT, Cell, SheetXml, Unreadable, shared_strings
+from .sheet_xml import MAIN, STRICT, At, Cell, SheetXml, Unreadable, shared_strings
 from .tables import DataTable, data_table, named_part
 from .xml_parts import Element, elements, spliced, utf8, with_attribute
 
@@ -108,6 +108,20 @@ class WorkbookXml:
         """The number format of a cell, such as ``0.00" mm"``."""
         style = int(cell.style or 0)
         return self._number_formats[style] if style < len(self._number_formats) else ""
+
+    def comments(self, sheet: str) -> dict[At, str]:
+        """The comments on a sheet's cells."""
+        found: dict[At, str] = {}
+        for _, kind, member in self.package.relations(self.parts[sheet]):
+            if kind != "comments":
+                continue
+            at = None
+            for e in self._parts_of(member):
+                if e.name == "comment" and (cell := reference(e.attributes.get("ref", ""))) is not None:
+                    at = cell.top, cell.left
+                elif e.name == "t" and at is not None:
+                    found[at] = found.get(at, "") + e.text
+        return found
 
     @cached_property
     def _names(self) -> dict[tuple[str | None, str], str]:

@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 import openpyxl
 import pytest
+from openpyxl.comments import Comment
 from openpyxl.utils import get_column_letter
 from openpyxl.workbook import Workbook
 from openpyxl.worksheet.worksheet import Worksheet
@@ -20,8 +21,8 @@ import mphdrr.core as mph
 from mphdrr.core.errors import InputError, InputWarning
 from mphdrr.core.workbook.quantities import LENGTH_UNITS, QUANTITIES, Heading, understood
 
+from .test_workbook import _one_sheet, assert_plain, plain, read_edited, saved
 from .test_workbook import _typed as typed
-from .test_workbook import assert_plain, plain, read_edited, saved
 
 Edit = Callable[[Worksheet, Worksheet], object]
 
@@ -91,6 +92,14 @@ def _format(cells: str, number_format: str) -> Edit:
     return edit
 
 
+def _comment(cell: str, text: str) -> Edit:
+    def edit(main: Worksheet, coordinates: Worksheet) -> None:
+        typed(main, coordinates)
+        coordinates[cell].comment = Comment(text, "a colleague")
+
+    return edit
+
+
 def _column(title: str, values: list[object], letter: str = "R") -> Edit:
     def edit(main: Worksheet, coordinates: Worksheet) -> None:
         typed(main, coordinates)
@@ -140,6 +149,11 @@ def _no_numbers(main: Worksheet, coordinates: Worksheet) -> None:
     coordinates.delete_cols(1)
 
 
+def _unnumbered(main: Worksheet, coordinates: Worksheet) -> None:
+    main.delete_cols(1)
+    coordinates.delete_cols(1)
+
+
 def _copy_of_coordinates(name: str, state: str = "visible", own_state: str = "visible") -> Edit:
     def edit(main: Worksheet, coordinates: Worksheet) -> None:
         typed(main, coordinates)
@@ -175,9 +189,17 @@ REFUSED: dict[str, tuple[Edit, str]] = {
     ),
     "tenths of mm": (_also(_moved_down, lambda m, c: c.__setitem__("A1", "values in 0.1 mm")), "Coordinates!A1"),
     "a scale": (_also(_moved_down, lambda m, c: c.__setitem__("A1", "scale 1:10")), "Coordinates!A1"),
+    "a row of units in tenths": (
+        _also(_moved_down, lambda m, c: (c.__setitem__("A1", "Units:"), c.__setitem__("B1", "0.1 mm"))),
+        "Coordinates!B1",
+    ),
+    "units that nobody knows": (_also(_moved_down, lambda m, c: c.__setitem__("A1", "Unit: Elle")), "Coordinates!A1"),
+    "unit in a comment": (_comment("B1", "all of these in cm"), "Coordinates!B1 has the comment 'all of these in cm'"),
+    "unit of negative numbers": (_format("B3:D6", '0.00;-0.00" cm"'), "Coordinates!B3 is shown as"),
+    "unquoted letters": (_format("B3:D6", "0.00 k"), "Coordinates!B3 is shown as"),
     "units line": (
         _also(_moved_down, lambda m, c: (c.__setitem__("A1", "Units:"), c.__setitem__("B1", "cm"))),
-        "Coordinates!A1",
+        "Coordinates!B1",
     ),
     "unit below the table": (_set(Coordinates_A9="all lengths in cm"), "Coordinates!A9 holds 'all lengths in cm'"),
     "unit in the heading row": (_set(Coordinates_A2="[cm]"), "Coordinates!A2 holds '[cm]'"),
@@ -224,6 +246,18 @@ REFUSED: dict[str, tuple[Edit, str]] = {
         "Coordinates!B8",
     ),
     "a second table beside": (_also(*(_column(f"{a}1", [1.0, 2.0], c) for a, c in zip("xyz", "STU", strict=True))), "S1"),
+    "a module without coordinates": (
+        _also(_one_sheet, lambda m, c: [c.cell(4, i, None).__setattr__("value", None) for i in range(1, 15)]),
+        "Coordinates!A4 is blank, expected a module's number",
+    ),
+    "text right below the last module": (
+        _also(typed, _unnumbered, lambda m, c: c.__setitem__("A7", "n/a")),
+        "expected one or one for each of the 5 modules of sheet Coordinates",
+    ),
+    "other rows blank in one sheet than in the other": (
+        _also(typed, lambda m, c: (c.insert_rows(4), m.insert_rows(5)), _unnumbered),
+        "row 5 of sheet Coordinates and row 4 of sheet Main would belong together",
+    ),
     # Sheets
     "a second sheet": (_copy_of_coordinates("Coordinates (2)"), "Coordinates!B1 and Coordinates (2)!B1"),
     "a hidden sheet": (_copy_of_coordinates("Coordinates new", own_state="hidden"), "Coordinates!B1 and Coordinates new!B1"),
@@ -249,6 +283,9 @@ READ: dict[str, Edit] = {
     "a title above x1": _also(_moved_down, lambda m, c: c.__setitem__("B3", "Scanner A, 2024")),
     "mm in a title": _also(_moved_down, lambda m, c: c.__setitem__("A1", "all lengths in mm, angles in radians")),
     "mm in the rows above": _also(_moved_down, lambda m, c: (c.__setitem__("A1", "Unit"), c.__setitem__("A1", "mm"))),
+    "Units: mm": _also(_moved_down, lambda m, c: (c.__setitem__("A1", "Units:"), c.__setitem__("B1", "mm"))),
+    "a comment": _comment("B4", "moved by 2 cm in 2021"),
+    "accounting": _format("B3:D6", '_(* #,##0.00_);_(* \\(#,##0.00\\);_(* "-"??_);_(@_)'),
     "mm in a number format": _format("B3:D6", '0.000" mm"'),
     "coloured, with a sign": _format("B3:D6", "[Red]+0.00;[Blue]-0.00;0"),
     "grouped": _format("B3:D6", "#,##0.00"),
@@ -509,3 +546,23 @@ def test_strict_open_xml_is_refused_by_its_name(tmp_path, workbook):
             new.writestr(member, data)
     with pytest.raises(InputError, match=r"strict\.xlsx: a 'Strict Open XML Spreadsheet', expected it saved as"):
         mph.read_system(path)
+
+
+def test_another_sheet_that_speaks_of_another_unit_is_warned_of(tmp_path):
+    def edit(main, coordinates):
+        typed(main, coordinates)
+        main.parent.create_sheet("Read me")["B2"] = "All lengths in cm"
+
+    with pytest.warns(InputWarning, match="Read me!B2 says 'All lengths in cm', where the headings of the scanner's"):
+        assert_plain(read_edited(tmp_path, edit))
+
+
+def test_a_gap_between_modules_without_numbers_is_warned_of(tmp_path):
+    def edit(main, coordinates):
+        typed(main, coordinates)
+        _unnumbered(main, coordinates)
+        main.insert_rows(5, 2)
+        coordinates.insert_rows(5, 2)
+
+    with pytest.warns(InputWarning, match="is no module's, and the rows below, which have no numbers to tell"):
+        assert_plain(read_edited(tmp_path, edit))

@@ -15,7 +15,7 @@ import pytest
 import mphdrr.core as mph
 from mphdrr.core.workbook import libreoffice
 
-from .nasty import books, by_libreoffice, headings, layouts, maps, rows, units, values
+from .nasty import books, by_libreoffice, headings, layouts, maps, real, rows, units, values
 from .nasty.case import Case, differences, fault, read, write
 from .nasty.scanners import ONE_SHEET_COLUMNS, SYMBOLS, one_sheet, one_sheet_map, users, users_map
 from .nasty.sheets import by_hand
@@ -29,7 +29,16 @@ except ImportError:  # the property test skips
     settings = None
 
 EXAMPLES = int(os.environ.get("MPHDRR_TEST_EXAMPLES", "60"))
-CATALOGUES = [units.CASES, headings.CASES, values.CASES, rows.CASES, books.CASES, layouts.CASES, by_libreoffice.CASES]
+CATALOGUES = [
+    real.CASES,
+    units.CASES,
+    headings.CASES,
+    values.CASES,
+    rows.CASES,
+    books.CASES,
+    layouts.CASES,
+    by_libreoffice.CASES,
+]
 CASES = {f"{c.topic}: {name}": case for c in CATALOGUES for name, case in c.cases.items()}
 
 

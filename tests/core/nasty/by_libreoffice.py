@@ -27,6 +27,7 @@ from .scanners import (
 from .sheets import Book, Formula, by_hand
 
 CASES = Catalogue("LibreOffice")
+REAL = Path(__file__).parents[3] / "examples" / "dc-spect-80.xlsx"
 FOLDER = Path(__file__).parent / "files"
 SAVED: dict[str, Book] = {}
 """What LibreOffice was given, by the name of the file that it made of it."""
@@ -140,8 +141,9 @@ def make() -> None:
         given.mkdir()
         for file, book in SAVED.items():
             by_hand(book, given / f"{Path(file).stem}.xlsx")
+        shutil.copy(REAL, given / REAL.name)
         for suffix in sorted({Path(file).suffix for file in SAVED}):
-            files = [given / f"{Path(file).stem}.xlsx" for file in SAVED if file.endswith(suffix)]
+            files = [given / f"{Path(file).stem}.xlsx" for file in [*SAVED, REAL.name] if file.endswith(suffix)]
             command = ["soffice", f"-env:UserInstallation={(Path(name) / 'profile').as_uri()}", "--headless"]
             subprocess.run(
                 [*command, "--convert-to", suffix[1:], "--outdir", str(FOLDER), *map(str, files)], check=True

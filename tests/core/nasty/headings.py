@@ -384,7 +384,7 @@ def _other_headings() -> None:
         "code": "pinhole_x|pinhole_y|pinhole_z|pinhole_diameter|roi_radius|detector_side|detector_thickness|length",
         "camel case": "PinholeX|PinholeY|PinholeZ|PinholeDiameter|RoiRadius|DetectorSide|DetectorThickness|Length",
         "brief words": "pinhole x|pinhole y|pinhole z|pinhole diameter|ROI radius|crystal side|crystal thickness|length",
-        "positions": "x position of pinhole|y position of pinhole|z position of pinhole|hole diameter|radius of ROI|detector size"
+        "positions": "x position of hole|y position of hole|z position of hole|hole diameter|radius of ROI|detector size"
         "|detector thickness|pinhole to crystal",
         "letters": "Px|Py|Pz|D|r_ROI|W|t|F",
     }

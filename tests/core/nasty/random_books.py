@@ -314,6 +314,53 @@ def labels(draft: Draft, disagree: bool) -> None:
         draft.truth = None
 
 
+def note_of_heading(draft: Draft, text: str, meaning: str) -> None:
+    """A comment of the heading of the first column, which speaks of that column."""
+    name = draft.layout.order[0]
+    sheet, column = draft.columns[name]
+    sheet.notes[f"{column}{draft.heading_row}"] = text
+    draft.plain = False
+    said = draft.layout.unit if name in draft.layout.with_unit else ""
+    if meaning not in ("same", said):
+        draft.truth = None  # of this column alone, or of all
+
+
+def beside(draft: Draft, text: str, meaning: str, row: int) -> None:
+    """A text right of the first sheet's table."""
+    draft.book.sheets[0][f"{letter(30)}{draft.heading_row + row}"] = text
+    draft.plain = False
+    _mean(draft, meaning)
+
+
+def name_of_sheet(draft: Draft, form: str, meaning: str) -> None:
+    """The first sheet's name says a unit."""
+    sheet = draft.book.sheets[0]
+    sheet.name = form.format(sheet.name)
+    draft.plain = False
+    _mean(draft, meaning)
+
+
+def number_twice(draft: Draft) -> None:
+    if draft.layout.numbers and draft.layout.modules > 1:
+        column = letter(draft.layout.left + 1)
+        draft.book.sheets[0][f"{column}{draft.last}"] = draft.book.sheets[0][f"{column}{draft.first}"]
+        draft.truth, draft.plain = None, False
+
+
+def hidden_column(draft: Draft, heading: str) -> None:
+    """A hidden column, which may be a second candidate."""
+    name = draft.layout.order[0]
+    sheet = draft.columns[name][0]
+    heading = heading.format(SYMBOLS[name])
+    sheet[f"AC{draft.heading_row}"] = heading
+    sheet.hidden_columns.append("AC")
+    for row in draft.rows(name):
+        sheet[f"AC{row}"] = 1.5
+    draft.plain = False
+    if heading == SYMBOLS[name]:
+        draft.truth = None
+
+
 def backwards(draft: Draft) -> None:
     """Rows stored in reverse order."""
     draft.book.sheets[0].row_order = lambda rows: rows[::-1]
@@ -407,6 +454,17 @@ decorations = st.one_of(
     ),
     st.tuples(st.just(labels), st.booleans()),
     st.tuples(st.just(backwards)),
+    st.tuples(st.just(number_twice)),
+    st.tuples(st.just(hidden_column), st.sampled_from(["{}", "{} old", "serial"])),
+    st.sampled_from([("in cm", "cm"), ("checked by JS", "same"), ("inches", "in")]).map(
+        lambda pair: (note_of_heading, *pair)
+    ),
+    st.tuples(st.sampled_from([("<- in cm", "cm"), ("cm", "cm"), ("see drawing", "same")]), st.integers(0, 2)).map(
+        lambda drawn: (beside, *drawn[0], drawn[1])
+    ),
+    st.sampled_from([("{} (cm)", "cm"), ("{} in inches", "in"), ("{} 2", "same")]).map(
+        lambda pair: (name_of_sheet, *pair)
+    ),
 )
 
 layouts = st.builds(

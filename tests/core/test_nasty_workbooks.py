@@ -59,7 +59,7 @@ def test_column_map_is_obeyed_or_refused(case: Case, tmp_path):
     assert not (found := fault(case, path, mapped=True)), found
 
 
-DRAFTED = {name: CASES[name] for c in (layouts, by_libreoffice) for name in CASES if name.startswith(c.CASES.topic)}
+DRAFTED = dict([item for item in CASES.items() if item[0].startswith(("layouts", "LibreOffice"))][::3])
 
 
 @pytest.mark.filterwarnings("ignore::mphdrr.core.errors.InputWarning")

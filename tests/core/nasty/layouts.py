@@ -240,6 +240,25 @@ def _tables_in_one_sheet() -> None:
     CASES.add(
         "a sheet of x1 and y1 alone, for a plot", plot, SCANNER, RIGHT, REFUSED, place=("Plot",), columns=users_map()
     )
+    for texts, name in (
+        ([f"({i})" for i in range(9)], "texts"),
+        (list(range(1, 10)), "numbers"),
+        (list("ABCDEFGHI"), "letters"),
+    ):
+        counted = one_sheet(BIG, top=1)
+        counted.sheets[0].cells = {
+            at if at[1:] == "1" else f"{at[0]}{int(at[1:]) + 1}": v for at, v in counted.sheets[0].cells.items()
+        }
+        counted.sheets[0].put("A2", [texts])
+        CASES.add(
+            f"a row that counts the columns in {name}",
+            counted,
+            BIG,
+            RIGHT,
+            REFUSED,
+            place=GEOMETRY,
+            columns=one_sheet_map("mm", 3, 6),
+        )
     negative = users(scanner(CENTERS * [1, 1, 0]))
     for row in range(3, 7):
         negative["Coordinates"][f"D{row}"] = -0.0

@@ -6,6 +6,7 @@ import math
 import warnings
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -48,7 +49,7 @@ class Table:
         column = self.label_column
         object.__setattr__(self, "labels", None if column is None else _labels(self.sheet, self.rows, column))
 
-    @property
+    @cached_property
     def numbers(self) -> tuple[int, ...] | None:
         """The modules' numbers, where the table has numbers."""
         labels = self.labels
@@ -59,7 +60,7 @@ class Table:
         """The column of the modules' numbers, where the table has numbers."""
         return None if self.numbers is None else self.label_column
 
-    @property
+    @cached_property
     def names(self) -> tuple[int, ...]:
         """The modules' numbers: those of the table, or 1, 2, ..."""
         return self.numbers or tuple(range(1, len(self.rows) + 1))
@@ -81,17 +82,15 @@ class Column:
         Of the numbers in the cells.
     factor : float
         The unit in mm or rad.
+    shared : bool
+        Whether one cell holds the quantity of several modules.
     """
 
     def __init__(self, table: Table, quantity: str, modules: Table, rows: tuple[int, ...]) -> None:
         self.table, self.quantity, self.modules, self.rows = table, quantity, modules, rows
         self.column, self.unit = table.columns[quantity]
         self.factor = QUANTITIES[quantity].units[self.unit]
-
-    @property
-    def shared(self) -> bool:
-        """Whether one cell holds the quantity of several modules."""
-        return len(self.rows) > 1 and len(set(self.rows)) == 1
+        self.shared = len(rows) > 1 and len(set(rows)) == 1
 
     def where(self, i: int) -> str:
         """File, sheet and cell of module index `i`."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from functools import cached_property
 from typing import Any
 
@@ -27,6 +27,30 @@ Place = tuple[str, int, int]
 """Sheet, row, column."""
 
 
+class _Sheets(Mapping[str, SheetXml]):
+    """Sheets by name, each parsed when it is first asked for: users' workbooks carry large ones that nobody asks for."""
+
+    def __init__(self, titles: Iterable[str], parsed: Callable[[str], SheetXml]) -> None:
+        self._titles, self._parsed = dict.fromkeys(titles), parsed
+        self._sheets: dict[str, SheetXml] = {}
+
+    def __getitem__(self, title: str) -> SheetXml:
+        if title not in self._sheets:
+            if title not in self._titles:
+                raise KeyError(title)
+            self._sheets[title] = self._parsed(title)
+        return self._sheets[title]
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._titles)
+
+    def __len__(self) -> int:
+        return len(self._titles)
+
+    def __contains__(self, title: object) -> bool:
+        return title in self._titles
+
+
 class WorkbookXml:
     """The worksheets of a workbook file.
 
@@ -39,7 +63,7 @@ class WorkbookXml:
 
     Attributes
     ----------
-    sheets : dict
+    sheets : mapping
         Name -> `SheetXml`, in the workbook's order; charts' sheets are left out.
     """
 
@@ -62,7 +86,6 @@ class WorkbookXml:
         texts = shared_strings(self.package.read(strings[0]), name) if strings else []
         self._styles = [member for _, kind, member in relations if kind == "styles"]
         self.all_sheets: list[str] = []
-        self.sheets: dict[str, SheetXml] = {}
         self.parts: dict[str, str] = {}
         for e in self._elements:
             if e.name != "sheet":
@@ -73,7 +96,7 @@ class WorkbookXml:
             kind, member = members.get(key, ("", ""))
             if kind == "worksheet":
                 self.parts[title] = member
-                self.sheets[title] = SheetXml(self.package.read(member), texts, title, name)
+        self.sheets = _Sheets(self.parts, lambda t: SheetXml(self.package.read(self.parts[t]), texts, t, name))
         self._by_folded_name = {title.casefold(): title for title in self.sheets}
         self._extents: dict[tuple[str, int], tuple[int, int]] = {}
 

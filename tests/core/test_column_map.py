@@ -375,6 +375,9 @@ def test_commands_take_a_column_map(tmp_path, capsys):
     out = tmp_path / "thinner.xlsx"
     assert main(["geometry", "set", str(path), "--columns", str(columns), "--diameter", "2", "-o", str(out)]) == 0
     np.testing.assert_array_equal(mph.read_system(out, columns=columns).pinhole_diameter, [2.0] * 4)
+    own = ["--remove", "2", "--write-columns", str(tmp_path / "own.toml"), "-o", str(out)]
+    assert main(["geometry", "set", str(path), "--columns", str(columns), *own]) == 0
+    np.testing.assert_array_equal(mph.read_system(out, columns=tmp_path / "own.toml").numbers, [1, 3, 4])
     run = [
         "project",
         str(path),

@@ -52,15 +52,23 @@ def add_parser(actions) -> None:  # type: ignore[no-untyped-def]
     parser.add_argument("--move", type=float, nargs=3, metavar=("X", "Y", "Z"), help="shift of the pinholes, mm")
     parser.add_argument("--remove", metavar="RANGE", help="modules to take out")
     parser.add_argument("--order", metavar="N,N,...", help="the modules' numbers in the order they are to have")
+    parser.add_argument(
+        "--write-columns", metavar="MAP", help="with --columns, also write the column map (.toml) of the new workbook"
+    )
     parser.set_defaults(run=_run)
 
 
 def _run(arguments: argparse.Namespace) -> None:
     target = output_path(arguments.output, (".xlsx", ".xlsm"))
+    if arguments.write_columns is not None and arguments.columns is None:
+        raise InputError("--write-columns: the workbook is read by its headings, expected it with --columns")
+    map_path = None if arguments.write_columns is None else output_path(arguments.write_columns, (".toml",))
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always", InputWarning)
         system = _changed(read_workbook(arguments), arguments)
         written = write_system(system, target, template=arguments.workbook)
+    if map_path is not None and written.columns is not None:
+        written.columns.write(map_path)
     messages = [str(w.message) for w in caught if issubclass(w.category, InputWarning)]
     if arguments.json:
         answer = {**dataclasses.asdict(written), "path": str(written.path), "warnings": messages}

@@ -89,12 +89,16 @@ def _certain(layout: Layout) -> ColumnMapDraft:
         name: [column.table.sheet.value(row, column.column) for row in column.rows]
         for name, column in layout.columns.items()
     }
-    kept = {name for name in values if name in NEEDED or all(type(value) is float for value in values[name])}
+    kept = {name for name in values if name in NEEDED or not _has_gaps(values[name])}
     questions = []
     if "l" in values and "l" not in kept and any(value is not None for value in values["l"]):
         questions.append("l stands in some rows only and is left out here: the design formula is then used for all")
     columns = {name: column for name, column in layout.columns.items() if name in kept}
     return ColumnMapDraft(column_map_of(replace(layout, columns=columns)), tuple(questions))
+
+
+def _has_gaps(values: list[object]) -> bool:
+    return any(value is None or isinstance(value, Uncomputed) for value in values)
 
 
 def preview_workbook(

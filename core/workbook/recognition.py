@@ -29,10 +29,12 @@ from .quantities import (
     is_number_heading,
     may_mean,
     plain,
+    shown_as_stored,
     understood,
     unit_alone,
     units_in,
 )
+from .references import Reference
 from .sheet_xml import At
 from .workbook_xml import areas_in
 
@@ -45,14 +47,10 @@ HELP = "a column map can say what is meant (--columns, docs/workbook.md)"
 _ROWS_APART = 2
 """A symbol row and a description row that are further apart do not belong together."""
 _SUMMARY = re.compile(r"\b(SUM|AVERAGE|MEAN|MEDIAN|MIN|MAX|COUNT|COUNTA|STDEV|VAR|SUBTOTAL|AGGREGATE)[.SP]*\(", re.I)
-_LITERAL = re.compile(r'"([^"]*)"|\\(.)|\[\$([^\]-]*)[^\]]*\]')
 _OF_ALL = re.compile(
     r"\b(all|every|lengths?|dimensions?|distances?|coordinates?|sizes?|units?|numbers?|values?)\b", re.I
 )
 _NUMERIC = re.compile(r"[\d.,eE+\-\s]+")
-_PLACEHOLDERS = re.compile(r"\[[^\]]*\]|general|standard|e[+-]|[_*].", re.IGNORECASE)
-"""Of number formats: colours and conditions, the general format, exponents, blanks and filling."""
-_SCALED = re.compile(r"[0#?],+(?![0#?,])|%")
 
 
 @dataclass(eq=False)
@@ -127,7 +125,7 @@ class SheetSeen:
         if len(units) > 1:
             (a, place), (b, other) = list(units.items())[:2]
             self.doubt(f"{place} says {a} but {other} {b}, expected one unit of {first.quantity}")
-        for area in self.sheet.book.workbook.sheets[self.sheet.name].merged:
+        for area in self._merged:
             if area.left < area.right and area.left <= column <= area.right and area.top in said:
                 self.doubt(f"{self.sheet.place(area.top, area.left)} heads several columns as {first.quantity}, merged")
         return first.quantity, next(iter(units), next(iter(QUANTITIES[first.quantity].units)))
@@ -257,6 +255,38 @@ class SheetSeen:
         lengths = {unit for _, unit in used if unit in LENGTH_UNITS}
         self._notes(lengths)
         self._formats(used)
+        self._hidden_under_merged(used)
+        self._above_headings(used)
+
+    def _hidden_under_merged(self, used: list[tuple[int, str]]) -> None:
+        """Numbers that a merged cell covers, so that nobody sees them."""
+        rows = set(self.rows)
+        for area in self._merged:
+            for column, _ in used:
+                for row in range(area.top, area.bottom + 1):
+                    covered = area.left <= column <= area.right and (row, column) != (area.top, area.left)
+                    if covered and row in rows and self.sheet.value(row, column) is not None:
+                        self.doubt(
+                            f"{self.sheet.place(row, column)} is hidden under a merged cell, expected it to be seen"
+                        )
+                        return
+
+    def _above_headings(self, used: list[tuple[int, str]]) -> None:
+        """A text right above a heading, or merged over it, which may be part of what it says."""
+        for column, _ in used:
+            at = next(iter(self.headings[column])) - 1, column
+            over = [a for a in self._merged if a.top <= at[0] <= a.bottom and a.left <= column <= a.right]
+            at = (over[0].top, over[0].left) if over else at
+            if at in self.sheet.texts and at not in self.above:
+                text = _quoted(self.sheet.texts[at])
+                self.doubt(
+                    f"{self.sheet.place(*at)} holds {text} right above a heading, expected nothing, or a row between"
+                )
+                return
+
+    @property
+    def _merged(self) -> list[Reference]:
+        return self.sheet.book.workbook.sheets[self.sheet.name].merged
 
     def _other_tables(self) -> None:
         """Headings of what is needed that stand apart: a second table, or a second heading."""
@@ -337,22 +367,12 @@ class SheetSeen:
                 if (row, column) not in self.sheet.cells or self.sheet.is_date(row, column):
                     continue
                 shown = self.sheet.number_format(row, column)
-                if not _is_accounted_for(shown, unit):
+                if not shown_as_stored(shown, unit):
                     self.doubt(
                         f"{self.sheet.place(row, column)} is shown as {_quoted(shown)}, where its heading says {unit}: "
                         "expected one unit"
                     )
                     break
-
-
-def _is_accounted_for(number_format: str, unit: str) -> bool:
-    """Whether a number format shows the number as it is, alone or with its unit."""
-    for literal in _LITERAL.finditer(number_format):
-        text = literal[1] or literal[2] or literal[3] or ""
-        if re.sub(r"[\s()+\-:/]", "", text) and unit_alone(text) != unit:
-            return False
-    rest = _LITERAL.sub("", number_format)
-    return not _SCALED.search(rest) and not re.search(r"[^\W\d_]", _PLACEHOLDERS.sub("", rest))
 
 
 def sheets_seen(book: Book) -> list[SheetSeen]:
@@ -425,10 +445,24 @@ def recognize(book: Book) -> Recognized:
                     f"{book.path.name}: x1 is in sheet {coordinates.sheet.name} but {name} in sheet "
                     f"{taken[name].sheet.name}, expected one table"
                 )
+        doubts += _shown_instead(book, coordinates.sheet)
     for sheet in dict.fromkeys(taken.values()):
         sheet.look_around({*NEEDED, "l", *(name for name, of in taken.items() if of is sheet)})
         doubts += sheet.doubts
     return Recognized(book, taken, doubts + missing)
+
+
+def _shown_instead(book: Book, sheet: Sheet) -> list[str]:
+    """A doubt where the coordinates' sheet is hidden, and another that is shown has such a table."""
+    if sheet.name not in book.workbook.hidden:
+        return []
+    shown = [other for title, other in book.sheets.items() if title not in book.workbook.hidden]
+    for seen in filter(None, map(_seen, shown)):
+        if seen.columns.keys() >= set(POSITION) and seen.rows:
+            return [
+                f"{book.path.name}: sheet {sheet.name} is hidden, but {seen.sheet.name} is shown, expected one of them"
+            ]
+    return []
 
 
 def _missing(book: Book, name: str) -> str:

@@ -110,7 +110,7 @@ def write_system(
         formulas = [place for place, cell in cells.items() if cell.formula is not None]
         required = {place: number for place, number in numbers_of(system).items() if cells[place].formula is not None}
         return _saved(workbook, system, target, recalculate(workbook, formulas, required), [])
-    said = column_map(columns) if columns is not None else system.source.columns if system.source else None
+    said = column_map(columns, template) if columns is not None else system.source.columns if system.source else None
     book = Book(template)
     workbook = book.workbook
     _refuse_other_kind(workbook, target, suffix)

@@ -871,7 +871,7 @@ BAD_FILES: dict[str, tuple[Callable[[Path, bytes], object], str]] = {
     ),
     "not a number": (
         lambda path, real: _damaged_sheet(path, real, lambda xml: xml.replace(b"<v>277.002</v>", b"<v>NaN</v>")),
-        "Coordinates!B3 is nan, expected x1 of module 1, a number",
+        "Coordinates!B3 holds 'NaN', which is no number, expected x1 of module 1",
     ),
     "infinite": (
         lambda path, real: _damaged_sheet(path, real, lambda xml: xml.replace(b"<v>277.002</v>", b"<v>1e999</v>")),

@@ -263,7 +263,9 @@ def cell(draft: Draft, value: Any) -> None:
     name = draft.layout.order[-1]
     sheet, column = draft.columns[name]
     sheet[f"{column}{draft.first}"] = value
-    draft.truth, draft.plain = None, False
+    draft.plain = False
+    if name != "l" or value is not None:  # an l that is missing is by design, as all are
+        draft.truth = None
 
 
 def formula(draft: Draft, stale: bool, asked: bool) -> None:

@@ -11,7 +11,8 @@ from .book import HEADING_ROWS, Book, Outdated, Sheet, Uncomputed
 from .column_map import ColumnMap, MappedColumn, MappedTable
 from .layout import Layout, column_map_of
 from .quantities import DIMENSIONS, NEEDED, POSITION, may_mean, understood
-from .recognition import OWN_SHEETS, SheetSeen, recognize, recognized_layout
+from .recognition import recognize, recognized_layout
+from .sheet_seen import OWN_SHEETS, SheetSeen
 
 _LONGEST = 40
 

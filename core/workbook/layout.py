@@ -15,7 +15,7 @@ from ..errors import InputError, InputWarning
 from .book import HEADING_ROWS, Book, Sheet, Uncomputed
 from .cells import found, length, module_number, where
 from .column_map import ColumnMap, MappedColumn, MappedTable
-from .quantities import POSITION, QUANTITIES, shown_as_stored, understood
+from .quantities import QUANTITIES, shown_as_stored, understood
 
 MAX_MODULES = 10_000
 
@@ -302,8 +302,3 @@ def _labels(sheet: Sheet, rows: tuple[int, ...], column: int) -> tuple[Label, ..
             )
         first[label] = row
     return tuple(label for label in labels if label is not None)
-
-
-def has_all(table: Table, names: tuple[str, ...] = POSITION) -> bool:
-    """Whether a table has columns of all these quantities."""
-    return table.columns.keys() >= set(names)

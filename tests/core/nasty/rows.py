@@ -11,7 +11,9 @@ from .case import REFUSED, RIGHT, WARNED, WARNED_OF, Catalogue
 from .scanners import (
     BIG,
     CENTERS,
+    ONE_SHEET_COLUMNS,
     SCANNER,
+    column_map,
     one_sheet,
     one_sheet_map,
     scanner,
@@ -422,6 +424,25 @@ def _below_and_beside() -> None:
     }.items():
         for gap in (1, 3):
             CASES.add(f"{name} below, gap {gap}", below(row, gap=gap), BIG, RIGHT, REFUSED, **cut)
+    for label, more in (("5", []), ("Sum", [[98, 777.0, 777.0, 777.0]])):
+        shared = one_sheet(BIG, length=False)
+        sheet = shared.sheets[0]
+        dimensions = shared.add("Main")
+        for column in "EFGH":
+            for row in range(1, 6):
+                value = sheet.cells.pop(f"{column}{row}")
+                if row < 3:
+                    dimensions[f"{column}{row}"] = value
+        sheet.put("A6", [[label, *[Formula(f"SUM({c}2:{c}5)", 660.0) for c in "BCD"]], *more])
+        position = {"sheet": "Geometry", "first_row": 2, "last_row": 5, "number": "A"}
+        once = {"sheet": "Main", "first_row": 2, "last_row": 2, "rows": "one for all"}
+        mapped = column_map(
+            {**position, "columns": {q: (ONE_SHEET_COLUMNS[q], "mm") for q in ("x1", "y1", "z1")}},
+            {**once, "columns": {q: (ONE_SHEET_COLUMNS[q], "mm") for q in ("d", "R", "Ld", "Td")}},
+        )
+        what = f"{label!r} before sums{' and a row below them' if more else ''}, one row of dimensions"
+        allowed = (REFUSED, WARNED_OF) if more else (RIGHT, WARNED, REFUSED)
+        CASES.add(what, shared, BIG, *allowed, place=GEOMETRY, columns=mapped)
     beside = one_sheet(BIG)
     beside.sheets[0].put("L1", [heads, *old])
     CASES.add("a second table beside", beside, BIG, REFUSED, **cut)

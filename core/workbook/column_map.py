@@ -32,7 +32,7 @@ class MappedColumn:
     column : str
         Its letters.
     unit : str
-        mm, cm, m, in or µm; rad or deg. Empty in a draft where it is not known.
+        mm, cm, m, in, µm, dm, ft, mil or 0.1 mm; rad or deg. Empty in a draft where it is not known.
     """
 
     quantity: str

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import defaultdict
 
 from .quantities import LENGTH_UNITS, UNIT_WORDS, may_mean, shown_as_stored, understood, units_in
-from .sheet_seen import SheetSeen, is_number, is_summary, quoted, several
+from .sheet_seen import SheetSeen, is_number, quoted, several
 from .sheet_xml import At
 
 
@@ -79,8 +79,12 @@ def _texts_between(seen: SheetSeen) -> None:
     for row in range(seen.rows[0], seen.rows[-1] + 1):
         if row in modules:
             continue
+        if row in seen.summaries:
+            place = seen.sheet.place(*seen.summaries[row])
+            seen.doubt(f"{place} sums up its column between rows of modules, expected sums below the last module")
+            return
         texts = [at for at in seen.texts_of_row.get(row, ()) if min(columns) <= at[1] <= max(columns)]
-        if texts and not is_summary(seen.sheet, row, seen.wanted):
+        if texts:
             text = quoted(seen.sheet.texts[texts[0]])
             seen.doubt(f"{seen.sheet.place(*texts[0])} holds {text} between rows of modules, expected one table")
             return

@@ -12,7 +12,7 @@ from .column_map import ColumnMap, MappedColumn, MappedTable
 from .layout import Layout, column_map_of
 from .quantities import DIMENSIONS, NEEDED, POSITION, may_mean, understood
 from .recognition import recognize, recognized_layout
-from .sheet_seen import OWN_SHEETS, SheetSeen
+from .sheet_seen import SheetSeen
 
 _LONGEST = 40
 
@@ -75,7 +75,7 @@ def draft_column_map(path: str | os.PathLike[str]) -> ColumnMapDraft:
         if seen is not None:
             tables += _tables(seen, [n for n, of in recognized.taken.items() if of is seen], coordinates)
     missing = [name for name in (*NEEDED, "l") if name not in recognized.taken]
-    guessed = _guessed(book, missing, tables)
+    guessed = _guessed(recognized.sheets, missing, tables)
     if missing and not tables and not guessed:
         sheet = next(iter(book.sheets), "Coordinates")
         guessed = [MappedTable(sheet, 2, 2, ())]
@@ -190,16 +190,14 @@ def _tables(seen: SheetSeen, names: list[str], coordinates: SheetSeen | None) ->
     return found
 
 
-def _guessed(book: Book, missing: list[str], tables: list[MappedTable]) -> list[MappedTable]:
+def _guessed(sheets: dict[str, Sheet], missing: list[str], tables: list[MappedTable]) -> list[MappedTable]:
     """For what has no heading that is understood, columns whose headings speak of it."""
     from openpyxl.utils import get_column_letter as letters
 
     used = {(table.sheet, c.column) for table in tables for c in table.columns}
     found: dict[tuple[str, int, int, int], list[MappedColumn]] = {}
     for name in missing:
-        for title, sheet in book.sheets.items():
-            if title.casefold() in OWN_SHEETS:
-                continue
+        for title, sheet in sheets.items():
             for (row, column), text in sorted(sheet.texts.items()):
                 place = (title, letters(column))
                 if row > HEADING_ROWS or place in used or name not in may_mean(text) or understood(text) is not None:

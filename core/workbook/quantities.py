@@ -12,7 +12,13 @@ import unicodedata
 from dataclasses import dataclass
 from typing import Any, Literal, NamedTuple
 
-LENGTH_UNITS = {"mm": 1.0, "cm": 10.0, "m": 1000.0, "in": 25.4, "µm": 1e-3}
+LENGTH_UNITS = {"mm": 1.0, "cm": 10.0, "m": 1000.0, "in": 25.4, "µm": 1e-3} | {
+    # In column maps alone, not in headings.
+    "dm": 100.0,
+    "ft": 304.8,
+    "mil": 0.0254,
+    "0.1 mm": 0.1,
+}
 """Unit -> mm."""
 ANGLE_UNITS = {"rad": 1.0, "deg": math.pi / 180}
 """Unit -> rad."""
@@ -244,7 +250,7 @@ def shown_as_stored(number_format: str, unit: str) -> bool:
     for section in number_format.split(";"):
         for literal in _LITERAL.finditer(section):
             text = literal[1] or literal[2] or literal[3] or ""
-            if re.sub(r"[\s()+\-:/]", "", text) and unit_alone(text) != unit:
+            if re.sub(r"[\s()+\-:/]", "", text) and (unit_alone(text) or plain(text)) != unit:
                 return False
         rest = _PLACEHOLDERS.sub("", _LITERAL.sub("", section))
         if _SCALED.search(rest) or not _DIGITS.fullmatch(rest.replace(";", "")):

@@ -22,11 +22,10 @@ from .quantities import (
     POSITION,
     QUANTITIES,
     may_mean,
-    plain,
     understood,
     units_in,
 )
-from .sheet_seen import OWN_SHEETS, SheetSeen, quoted, several, sheet_seen, sheets_seen
+from .sheet_seen import SheetSeen, quoted, several, sheet_seen, sheets_seen
 
 HELP = "a column map can say what is meant (--columns, docs/workbook.md)"
 
@@ -42,6 +41,8 @@ class Recognized:
     Attributes
     ----------
     book : Book
+    sheets : dict
+        Name -> `Sheet`, of those that may hold the scanner.
     taken : dict
         Quantity -> the sheet that it is taken from.
     doubts : list of str
@@ -49,18 +50,19 @@ class Recognized:
     """
 
     book: Book
+    sheets: dict[str, Sheet]
     taken: dict[str, SheetSeen]
     doubts: list[str]
 
 
 def recognize(book: Book) -> Recognized:
     """What is seen of the scanner in a workbook, with the doubts."""
-    seen = sheets_seen(book)
+    sheets, seen = sheets_seen(book)
     taken: dict[str, SheetSeen] = {}
     doubts, missing = [], []
     for name in (*NEEDED, "l"):
         having = [s for s in seen if name in s.columns]
-        filled = [s for s in having if s.columns[name][0] in s.numeric]
+        filled = [s for s in having if name in s.filled]
         if len(filled) > 1:
             first, second = (s.sheet.place(s.first_heading, s.columns[name][0]) for s in filled[:2])
             doubts.append(
@@ -69,7 +71,7 @@ def recognize(book: Book) -> Recognized:
         if having:
             taken[name] = (filled or having)[0]
         elif name != "l":
-            missing.append(_missing(book, name))
+            missing.append(_missing(book, sheets, name))
     if (coordinates := taken.get("x1")) is not None:
         taken.update({name: coordinates for name in DERIVED if name in coordinates.columns})
         for name in POSITION:
@@ -82,7 +84,7 @@ def recognize(book: Book) -> Recognized:
     for sheet in dict.fromkeys(taken.values()):
         look_around(sheet, {*NEEDED, "l", *(name for name, of in taken.items() if of is sheet)})
         doubts += sheet.doubts
-    return Recognized(book, taken, doubts + missing)
+    return Recognized(book, sheets, taken, doubts + missing)
 
 
 def _shown_instead(book: Book, sheet: Sheet) -> list[str]:
@@ -98,12 +100,11 @@ def _shown_instead(book: Book, sheet: Sheet) -> list[str]:
     return []
 
 
-def _missing(book: Book, name: str) -> str:
+def _missing(book: Book, sheets: dict[str, Sheet], name: str) -> str:
     quantity = QUANTITIES[name]
     close = [
         f"{sheet.place(*at)} {quoted(text)}"
-        for title, sheet in book.sheets.items()
-        if plain(title).casefold() not in OWN_SHEETS
+        for sheet in sheets.values()
         for at, text in sheet.texts.items()
         if at[0] <= HEADING_ROWS and name in may_mean(text) and understood(text) is None
     ]
@@ -126,7 +127,7 @@ def recognized_layout(book: Book) -> Layout:
         layout.columns[name] = Column(table, name, modules, _rows_of(name, layout, seen, taken["x1"], table))
     if "l" not in taken:
         _warn_of_unknown(taken["x1"])
-    _warn_of_other_sheets(layout)
+    _warn_of_other_sheets(layout, recognized.sheets)
     _warn_of_gap(modules)
     return layout
 
@@ -207,13 +208,13 @@ def _warn_of_gap(modules: Table) -> None:
         )
 
 
-def _warn_of_other_sheets(layout: Layout) -> None:
+def _warn_of_other_sheets(layout: Layout, sheets: dict[str, Sheet]) -> None:
     """Warn of a sheet beside the scanner's that says of all lengths what the headings do not."""
     used = {column.table.sheet.name for column in layout.columns.values()}
     units = {column.unit for column in layout.columns.values() if column.unit in LENGTH_UNITS}
     book = layout.modules.sheet.book
-    for name, sheet in book.sheets.items():
-        if name in used or plain(name).casefold() in OWN_SHEETS:
+    for name, sheet in sheets.items():
+        if name in used:
             continue
         for at, text in sheet.texts.items():
             if _OF_ALL.search(text) and any(units != {unit} for unit in units_in(text)):

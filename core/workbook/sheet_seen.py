@@ -26,8 +26,10 @@ from .references import Reference
 from .sheet_xml import At
 from .workbook_xml import areas_in
 
+SCANNER_SHEETS = frozenset(("coordinates", "main"))
+"""Sheets that hold the scanner in the users' workbooks."""
 OWN_SHEETS = frozenset(("mdsl cloud import", "theta", "values", "design table"))
-"""Sheets that users' workbooks carry beside the scanner's, whatever they hold."""
+"""Sheets that users' workbooks carry beside these, whatever they hold."""
 ASIDE = frozenset(("s", "3d slope"))
 """Headings of the users' workbooks whose columns are of no concern."""
 
@@ -139,6 +141,11 @@ class SheetSeen:
         return {column for row, column in self.sheet.cells if row in rows and is_number(self.sheet, row, column)}
 
     @property
+    def filled(self) -> list[str]:
+        """What is needed and has numbers here."""
+        return [name for name in (*NEEDED, "l") if name in self.columns and self.columns[name][0] in self.numeric]
+
+    @property
     def label_headings(self) -> dict[str, At]:
         """The headings of other names of the modules."""
         return {plain(text).casefold(): at for at, text in self.above.items() if is_label_heading(text)}
@@ -191,17 +198,36 @@ class SheetSeen:
         """The rows with numbers, or with what cannot be a note, in the wanted columns; or with typed dimensions."""
         typed = [self.columns[name][0] for name in (*DIMENSIONS, "l") if name in self.columns]
         found: list[int] = []
+        wanted = self.wanted
         for row in self.sheet.rows:
-            if row < self.first_row:
+            if row < self.first_row or row in self.summaries:
                 continue
-            values = [value for column in self.wanted if (value := self.sheet.value(row, column)) is not None]
-            if is_summary(self.sheet, row, self.wanted):
-                continue
+            values = [value for column in wanted if (value := self.sheet.value(row, column)) is not None]
             alone = len(values) == 1 and type(values[0]) is str and not _NUMERIC.fullmatch(values[0])
-            note = alone and len(self.wanted) > 1 and row - 1 not in found[-1:]
+            note = alone and len(wanted) > 1 and row - 1 not in found[-1:]
             if (values and not note) or any(self._is_typed(row, column) for column in typed):
                 found.append(row)
         return found
+
+    @cached_property
+    def summaries(self) -> dict[int, At]:
+        """The rows that sum up others: each number in the wanted columns is a sum, mean ... of its column."""
+        found, wanted = {}, self.wanted
+        for row in self.sheet.rows:
+            filled = [(row, column) for column in wanted if self.sheet.value(row, column) is not None]
+            if filled and row >= self.first_row and all(self._sums_up(*at) for at in filled):
+                found[row] = filled[0]
+        return found
+
+    def _sums_up(self, row: int, column: int) -> bool:
+        """Whether a cell's formula is a sum, mean ... over several rows of its own column."""
+        formula = self.sheet.formula(row, column)
+        if formula is None or not _SUMMARY.search(formula):
+            return False
+        return any(
+            area.top < area.bottom and area.left <= column <= area.right and area.sheet in (None, self.sheet.name)
+            for area in areas_in(formula)
+        )
 
     def _is_typed(self, row: int, column: int) -> bool:
         return self.sheet.formula(row, column) is None and type(self.sheet.value(row, column)) is float
@@ -216,7 +242,11 @@ class SheetSeen:
             row
             for row in self.sheet.rows
             if row in sized
-            or (row >= self.first_row and module_number(self.sheet.value(row, self.label_column)) is not None)
+            or (
+                row >= self.first_row
+                and row not in self.summaries
+                and module_number(self.sheet.value(row, self.label_column)) is not None
+            )
         )
 
     def table(self) -> Table:
@@ -239,10 +269,22 @@ class SheetSeen:
         return found
 
 
-def sheets_seen(book: Book) -> list[SheetSeen]:
-    """The sheets with headings, in the workbook's order; those that only accompany users' workbooks left out."""
-    found = [sheet_seen(sheet) for name, sheet in book.sheets.items() if plain(name).casefold() not in OWN_SHEETS]
-    return [each for each in found if each is not None]
+def sheets_seen(book: Book) -> tuple[dict[str, Sheet], list[SheetSeen]]:
+    """The sheets that may hold the scanner, and those of them with headings, in the workbook's order.
+
+    The users' own sheets are passed over, unless other sheets than the users' Coordinates and Main hold tables.
+    """
+    sheets = {name: sheet for name, sheet in book.sheets.items() if not _is_called(name, OWN_SHEETS)}
+    seen = [found for sheet in sheets.values() if (found := sheet_seen(sheet)) is not None]
+    if all(_is_called(found.sheet.name, SCANNER_SHEETS) for found in seen if found.filled):
+        return sheets, seen
+    every = {found.sheet.name: found for found in seen}
+    every |= {name: found for name in book.sheets.keys() - sheets if (found := sheet_seen(book.sheets[name]))}
+    return book.sheets, [every[name] for name in book.sheets if name in every]
+
+
+def _is_called(name: str, names: frozenset[str]) -> bool:
+    return plain(name).casefold() in names
 
 
 def sheet_seen(sheet: Sheet) -> SheetSeen | None:
@@ -271,21 +313,6 @@ def is_number(sheet: Sheet, row: int, column: int) -> bool:
     """Whether a cell holds anything but text or nothing."""
     value = sheet.value(row, column)
     return value is not None and type(value) is not str
-
-
-def is_summary(sheet: Sheet, row: int, columns: list[int]) -> bool:
-    """Whether a row sums up others: each number in `columns` is a sum, mean ... over several rows of its column."""
-    filled = [column for column in columns if sheet.value(row, column) is not None]
-    return bool(filled) and all(_sums_up(sheet, sheet.formula(row, column), column) for column in filled)
-
-
-def _sums_up(sheet: Sheet, formula: str | None, column: int) -> bool:
-    if formula is None or not _SUMMARY.search(formula):
-        return False
-    return any(
-        area.top < area.bottom and area.left <= column <= area.right and area.sheet in (None, sheet.name)
-        for area in areas_in(formula)
-    )
 
 
 def quoted(text: str) -> str:

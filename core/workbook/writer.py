@@ -162,10 +162,11 @@ def _refuse_unlike(written: Path, name: str, system: PinholeSystem, numbered: bo
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", InputWarning)
         try:
-            back = read(Book(written), columns).system
+            reading = read(Book(written), columns)
         except InputError as error:
             why = str(error).replace(str(written), name).replace(written.name, name)
             raise InputError(f"{name} cannot hold this system, with it: {why}") from error
+    back = reading.system
     if len(back) != len(system) or (numbered and not np.array_equal(back.numbers, system.numbers)):
         raise InputError(
             f"{name} cannot hold this system: its modules {several(system.numbers)} would be read as "
@@ -175,10 +176,12 @@ def _refuse_unlike(written: Path, name: str, system: PinholeSystem, numbered: bo
         wanted, got = values_of(system, quantity), values_of(back, quantity)
         differing = np.flatnonzero(np.abs(got - wanted) > 2e-9 * np.abs(wanted))
         if len(differing):
-            i = differing[0]
+            i = int(differing[0])
+            column = reading.layout.columns.get(quantity)
+            why = f": {column.place(i)} is read for all modules" if column is not None and column.shared else ""
             raise InputError(
                 f"{name} cannot hold this system: {quantity} = {wanted[i]:.9g} mm of module {system.numbers[i]} would be "
-                f"read as {got[i]:.9g} mm"
+                f"read as {got[i]:.9g} mm{why}"
             )
 
 

@@ -910,7 +910,7 @@ def test_file_of_absurd_size_is_refused_unread(workbook, monkeypatch):
 
 def test_too_many_rows_are_refused(tmp_path, monkeypatch):
     monkeypatch.setattr("mphdrr.core.workbook.book.MAX_ROWS", 5)
-    with pytest.raises(InputError, match="sheet Coordinates has more than 5 rows with content"):
+    with pytest.raises(InputError, match="sheet Main has more than 5 rows with content"):
         read_edited(tmp_path, lambda main, coordinates: None)
 
 

@@ -130,7 +130,9 @@ def _in_headings() -> None:
         key = f"heading {form}"
         if key not in CASES.cases:
             CASES.add(key, _headed(form, unit), BIG, *READ_OR_MAP, place=HEADINGS, columns=one_sheet_map(unit))
-    # Units that the reader does not know.
+    # Units that no heading may have; a column map may have some.
+    of_maps = {"mils": "mil", "thou": "mil", "feet": "ft", "0,1 mm": "0.1 mm", "1/10 mm": "0.1 mm"}
+    of_maps |= {unit: unit for unit in ("dm", "ft", "mil", "0.1 mm")}
     for text, factor in {
         "dm": 100,
         "0.1 mm": 0.1,
@@ -184,7 +186,8 @@ def _in_headings() -> None:
                     made.sheets[0][at] = float(f"{value / factor:.15g}")
             return made
 
-        CASES.add(f"unit ({text})", book, BIG, REFUSED, place="Geometry!", unmappable=NO_SUCH_UNIT)
+        known = {"columns": one_sheet_map(of_maps[text])} if text in of_maps else {"unmappable": NO_SUCH_UNIT}
+        CASES.add(f"unit ({text})", book, BIG, REFUSED, place="Geometry!", **known)
 
 
 def _of_one_column() -> None:

@@ -7,6 +7,7 @@ setting that changes calls `update`.
 from __future__ import annotations
 
 import json
+from collections.abc import Iterable
 from functools import lru_cache
 from pathlib import Path
 
@@ -17,7 +18,7 @@ from bpy.props import BoolProperty, CollectionProperty, EnumProperty, IntPropert
 from ..core.errors import InputError
 from ..core.recording import recorded_warnings
 from ..core.workbook import ColumnMap, MappedColumn, MappedTable, draft_column_map, preview_workbook, read_system
-from ..core.workbook.quantities import LENGTH_UNITS, NEEDED, QUANTITIES
+from ..core.workbook.quantities import ANGLE_UNITS, LENGTH_UNITS, NEEDED, QUANTITIES
 from . import choices, ids
 
 MAX_TABLES = 9
@@ -62,6 +63,11 @@ def _sheets(self: ColumnMapTable, context: bpy.types.Context, edit_text: str) ->
     return json.loads(settings(context).sheets or "[]")
 
 
+def _units(*tables: Iterable[str]) -> choices.Items:
+    units = [(unit, unit, "") for table in tables for unit in table]
+    return choices.items(choices.UNITS, [("NONE", "?", "Not known"), *units])
+
+
 class ColumnMapTable(bpy.types.PropertyGroup):
     """Rows of a sheet (`MappedTable`)."""
 
@@ -104,10 +110,7 @@ class ColumnMapQuantity(bpy.types.PropertyGroup):
     column: StringProperty(name="Column", description="The column's letters. Empty: none", update=_changed)
     unit: EnumProperty(
         name="Unit", description="Of the numbers in the column",
-        items=choices.items(
-            choices.UNITS, [("NONE", "?", "Not known"), *((unit, unit, "") for unit in choices.UNITS if unit != "NONE")]
-        ),
-        default="NONE", update=_changed,
+        items=_units(LENGTH_UNITS, ANGLE_UNITS), default="NONE", update=_changed,
     )  # fmt: skip
     seen: StringProperty(name="Seen", description="The column's heading and first number in the workbook")
 
@@ -125,8 +128,7 @@ class ColumnMapProperties(bpy.types.PropertyGroup):
     )  # fmt: skip
     unit: EnumProperty(
         name="All Lengths In", description="Changing it sets the unit of every length below",
-        items=choices.items(choices.UNITS, [("NONE", "?", "Not known"), *((unit, unit, "") for unit in LENGTH_UNITS)]),
-        default="NONE", update=_unit_of_all_changed,
+        items=_units(LENGTH_UNITS), default="NONE", update=_unit_of_all_changed,
     )  # fmt: skip
     tables: CollectionProperty(type=ColumnMapTable, name="Tables")
     quantities: CollectionProperty(type=ColumnMapQuantity, name="Quantities")

@@ -91,7 +91,8 @@ class Ours(Peer):
 
     def emission(self, case: Case) -> Call:
         mu = mph.Volume(case.volume("mu"), case.grid, "mu")
-        A, x = self._projector(case, mph.Emission(case.system, mu)), case.volume("noise")
+        model = mph.Emission(case.system, mu, pixel_points=1, tolerance=1e9)  # one ray a pixel, as all contenders
+        A, x = self._projector(case, model), case.volume("noise")
         return lambda: A(x)
 
     def pose_gradient(self, case: Case) -> Call:

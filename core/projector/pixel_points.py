@@ -33,8 +33,8 @@ MOST_POINTS = 2584
 
 _FIBONACCI = (1, 2, 3, 5, 8, 13, 21, 34, 55, 89, 144, 233, 377, 610, 987, 1597, MOST_POINTS)
 
-# The largest error, over all places of a voxel between the points, in units of the root mean square over them. Boxes seen along an
-# axis, the worst, were found to have up to 2.9 on average and seldom more than 4.
+# The largest error, over all places of a voxel between the points, in units of the root mean square over them. Boxes seen
+# along an axis, the worst, were found to have up to 2.9 on average and seldom more than 4.
 _LARGEST_ERROR = 4.0
 # Voxels looked at along each axis of a grid, and how many of those, the smallest as the detector sees them, decide.
 _VOXELS_ALONG = 9
@@ -128,7 +128,7 @@ def shadow_edges(views: Views, m: int, grid: Grid) -> Array:
     ticks = [np.unique(np.linspace(0, n - 1, min(n, _VOXELS_ALONG)).round()) for n in grid.shape]
     index = np.stack(np.meshgrid(*ticks, indexing="ij"), axis=-1).reshape(-1, 3)
     centers = index @ grid.affine[:3, :3].T + grid.affine[:3, 3]
-    matrix = views.projection_matrices()[m]
+    matrix = views[m].projection_matrices()[0]
     column, row, factor = matrix[:, :3] @ centers.T + matrix[:, 3:]
     nearest = 1e-6 * np.abs(factor).max()  # a voxel at the source has no shadow to speak of
     front = factor > nearest

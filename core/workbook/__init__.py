@@ -5,7 +5,9 @@ references.py    B3, Main!$B$3:$B$82, A:C in formulas
 tables.py        Table1[v], Table1[[#This Row],[x]] in formulas
 formulas.py      values of formulas
 quantities.py    what the columns are: quantities, their headings and units
-recognition.py   which cells hold them, by the headings; doubts of what is not understood
+sheet_seen.py    a sheet's headings, and the columns and rows under them
+doubts.py        what around a table may make its numbers mean something else
+recognition.py   which cells hold which quantity, by the headings
 column_map.py    `ColumnMap`: what a person says of that instead
 layout.py        which cell holds a quantity of a module, either way
 draft.py         a column map for a person to check, and a preview of the cells

@@ -12,7 +12,7 @@ from typing import Any, Literal, get_args
 
 from ..errors import InputError
 from ..files import replacing
-from .quantities import NEEDED, POSITION, QUANTITIES
+from .quantities import NEEDED, POSITION, QUANTITIES, unit_alone
 from .references import MAX_COLUMN, MAX_ROW
 
 Joined = Literal["by number", "in order", "one for all"]
@@ -32,12 +32,15 @@ class MappedColumn:
     column : str
         Its letters.
     unit : str
-        mm, cm, m, in or µm; rad or deg. Empty in a draft where it is not known.
+        mm, cm, m, in, µm, dm, ft, mil or 0.1 mm; rad or deg. Empty in a draft where it is not known.
     """
 
     quantity: str
     column: str
     unit: str
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "unit", unit_alone(self.unit) or self.unit)  # "um" and "inches" are units, too
 
 
 @dataclass(frozen=True)
@@ -135,10 +138,10 @@ class ColumnMap:
                 others.append((rows, _of(i, name)))
         return faults
 
-    def require_complete(self) -> None:
-        """Raise `InputError` with the first of `faults`."""
+    def require_complete(self, name: str = "column map") -> None:
+        """Raise `InputError` with the first of `faults`, calling the map `name`."""
         for fault in self.faults():
-            raise InputError(f"column map: {fault} ({_HELP})")
+            raise InputError(f"{name}: {fault} ({_HELP})")
 
     def to_toml(self) -> str:
         """The map as text, which `from_toml` reads."""
@@ -182,12 +185,17 @@ class ColumnMap:
             temporary.write_text(lines + self.to_toml(), encoding="utf-8")
 
 
-def column_map(columns: ColumnMap | str | os.PathLike[str] | None) -> ColumnMap | None:
-    """The map that `columns` is, or that its file holds, complete."""
+def column_map(
+    columns: ColumnMap | str | os.PathLike[str] | None, workbook: str | os.PathLike[str]
+) -> ColumnMap | None:
+    """The map of `workbook` that `columns` is, or that its file holds, complete."""
     if columns is None:
         return None
-    found = columns if isinstance(columns, ColumnMap) else ColumnMap.read(columns)
-    found.require_complete()
+    if isinstance(columns, ColumnMap):
+        columns.require_complete(f"{Path(workbook).name}: column map")
+        return columns
+    found = ColumnMap.read(columns)
+    found.require_complete(str(columns))
     return found
 
 

@@ -11,7 +11,8 @@ from .book import HEADING_ROWS, Book, Outdated, Sheet, Uncomputed
 from .column_map import ColumnMap, Joined, MappedColumn, MappedTable
 from .layout import Layout, column_map_of
 from .quantities import DIMENSIONS, NEEDED, POSITION, is_number_heading, may_mean, understood
-from .recognition import OWN_SHEETS, SheetSeen, recognize, recognized_layout
+from .recognition import recognize, recognized_layout
+from .sheet_seen import SheetSeen
 
 _LONGEST = 40
 
@@ -73,7 +74,7 @@ def draft_column_map(path: str | os.PathLike[str]) -> ColumnMapDraft:
         if seen is not None:
             tables += _tables(seen, [n for n, of in recognized.taken.items() if of is seen], coordinates)
     missing = [name for name in (*NEEDED, "l") if name not in recognized.taken]
-    guessed = _guessed(book, missing, tables)
+    guessed = _guessed(recognized.sheets, missing, tables)
     if missing and not tables and not guessed:
         sheet = next(iter(book.sheets), "Coordinates")
         guessed = [MappedTable(sheet, 2, 2, ())]
@@ -88,12 +89,16 @@ def _certain(layout: Layout) -> ColumnMapDraft:
         name: [column.table.sheet.value(row, column.column) for row in column.rows]
         for name, column in layout.columns.items()
     }
-    kept = {name for name in values if name in NEEDED or all(type(value) is float for value in values[name])}
+    kept = {name for name in values if name in NEEDED or not _has_gaps(values[name])}
     questions = []
     if "l" in values and "l" not in kept and any(value is not None for value in values["l"]):
         questions.append("l stands in some rows only and is left out here: the design formula is then used for all")
     columns = {name: column for name, column in layout.columns.items() if name in kept}
     return ColumnMapDraft(column_map_of(replace(layout, columns=columns)), tuple(questions))
+
+
+def _has_gaps(values: list[object]) -> bool:
+    return any(value is None or isinstance(value, Uncomputed) for value in values)
 
 
 def preview_workbook(
@@ -184,16 +189,14 @@ def _tables(seen: SheetSeen, names: list[str], coordinates: SheetSeen | None) ->
     return found
 
 
-def _guessed(book: Book, missing: list[str], tables: list[MappedTable]) -> list[MappedTable]:
+def _guessed(sheets: dict[str, Sheet], missing: list[str], tables: list[MappedTable]) -> list[MappedTable]:
     """For what has no heading that is understood, columns whose headings speak of it."""
     from openpyxl.utils import get_column_letter as letters
 
     used = {(table.sheet, c.column) for table in tables for c in table.columns}
     found: dict[tuple[str, int, int, int], list[MappedColumn]] = {}
     for name in missing:
-        for title, sheet in book.sheets.items():
-            if title.casefold() in OWN_SHEETS:
-                continue
+        for title, sheet in sheets.items():
             for (row, column), text in sorted(sheet.texts.items()):
                 place = (title, letters(column))
                 if row > HEADING_ROWS or place in used or name not in may_mean(text) or understood(text) is not None:
@@ -210,7 +213,7 @@ def _guessed(book: Book, missing: list[str], tables: list[MappedTable]) -> list[
     made = []
     for (title, row, first, last), columns in found.items():
         how = None if any(c.quantity in POSITION for c in columns) else "one for all" if first == last else "in order"
-        number = None if how == "one for all" else _number_column(book.sheets[title], used)
+        number = None if how == "one for all" else _number_column(sheets[title], used)
         made.append(MappedTable(title, first, last, tuple(columns), number, how, row))  # type: ignore[arg-type]
     return made
 

@@ -12,10 +12,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import InputError, InputWarning
-from .book import Book, Sheet, Uncomputed
+from .book import HEADING_ROWS, Book, Sheet, Uncomputed
 from .cells import found, length, module_number, where
 from .column_map import ColumnMap, MappedColumn, MappedTable
-from .quantities import POSITION, QUANTITIES
+from .quantities import QUANTITIES, shown_as_stored, understood
 
 MAX_MODULES = 10_000
 
@@ -177,7 +177,33 @@ def _mapped_table(book: Book, said: MappedTable) -> Table:
         )
     columns = {c.quantity: (index(c.column), c.unit) for c in said.columns}
     number = None if said.number is None else index(said.number)
-    return Table(book.sheets[said.sheet], columns, said.row_numbers(), number)
+    table = Table(book.sheets[said.sheet], columns, said.row_numbers(), number)
+    _warn_of_contradictions(table)
+    return table
+
+
+def _warn_of_contradictions(table: Table) -> None:
+    """Warn of the first heading or number format of a mapped column that says another unit or quantity than the map."""
+    sheet, first = table.sheet, table.rows[0]
+    for name, (column, unit) in table.columns.items():
+        for row in range(max(1, first - HEADING_ROWS), first):
+            heading = understood(sheet.texts.get((row, column)))
+            if heading is not None and (heading.quantity != name or heading.unit not in (None, unit)):
+                said = heading.quantity + (f" in {heading.unit}" if heading.unit else "")
+                warnings.warn(
+                    f"{where(sheet, row, column)} says {said}, the column map {name} in {unit}, which is used",
+                    InputWarning,
+                    stacklevel=2,
+                )
+                return
+        shown = sheet.number_format(first, column) if (first, column) in sheet.cells else ""
+        if not shown_as_stored(shown, unit):
+            warnings.warn(
+                f"{where(sheet, first, column)} is shown as {shown!r}, the column map says {name} in {unit}, which is used",
+                InputWarning,
+                stacklevel=2,
+            )
+            return
 
 
 def column_map_of(layout: Layout, rows_of: dict[Table, tuple[int, ...]] | None = None) -> ColumnMap:
@@ -276,8 +302,3 @@ def _labels(sheet: Sheet, rows: tuple[int, ...], column: int) -> tuple[Label, ..
             )
         first[label] = row
     return tuple(label for label in labels if label is not None)
-
-
-def has_all(table: Table, names: tuple[str, ...] = POSITION) -> bool:
-    """Whether a table has columns of all these quantities."""
-    return table.columns.keys() >= set(names)

@@ -12,7 +12,13 @@ import unicodedata
 from dataclasses import dataclass
 from typing import Any, Literal, NamedTuple
 
-LENGTH_UNITS = {"mm": 1.0, "cm": 10.0, "m": 1000.0, "in": 25.4, "µm": 1e-3}
+LENGTH_UNITS = {"mm": 1.0, "cm": 10.0, "m": 1000.0, "in": 25.4, "µm": 1e-3} | {
+    # In column maps alone, not in headings.
+    "dm": 100.0,
+    "ft": 304.8,
+    "mil": 0.0254,
+    "0.1 mm": 0.1,
+}
 """Unit -> mm."""
 ANGLE_UNITS = {"rad": 1.0, "deg": math.pi / 180}
 """Unit -> rad."""
@@ -166,10 +172,19 @@ _WITH_UNIT = re.compile(
 _BRACKETED_UNIT = re.compile(r"\((?:in )?([^()]+)\)|\[(?:in )?([^\[\]]+)\]|(.+)")
 _WORD = re.compile(r"[^\W\d_]+")
 _IN_BRACKETS = re.compile(r"[(\[]\s*(in|m|\"|''|″)\.?\s*[)\]]")
+_FILLERS = frozenset(["in", "all", "are", "is", "lengths", "length", "values", "value", "the"])
 _AT_THE_END = re.compile(r"(?:^|[:=,/]\s*|\bin\s+|\d\s*)(in|m)\b\.?(?!\s*[\w\d])|\s(m)$")
 _PART_OF_MILLIMETRE = re.compile(
-    r"(?:\bin|[x×*/]|\bunits?\b\D*)\s*[\d.,/^-]*\d[\d.,/^-]*\s*mm\b|\bths? (?:of )?(?:a )?mm\b|tenths? of|^[\d.,/^-]+ ?mm$"
+    r"(?:\bin|[x×*/]|\bunits?\b\D*)\s*[\d.,/^-]*\d[\d.,/^-]*\s*mm\b|\bths? (?:of )?(?:a )?mm\b|tenths? of"
+    r"|[x×*/÷] ?[\d.,]+ ?=|^[\d.,/^-]+ ?mm$"
 )
+
+
+_LITERAL = re.compile(r'"([^"]*)"|\\(.)|\[\$([^\]-]*)[^\]]*\]')
+_PLACEHOLDERS = re.compile(r"\[[^\]]*\]|general|standard|e[+-]|[_*].", re.IGNORECASE)
+"""Of number formats: colours and conditions, the general format, exponents, blanks and filling."""
+_DIGITS = re.compile(r"[0#?.,@()+\-/ ]*")
+_SCALED = re.compile(r"[0#?],+(?![0#?,])")
 
 
 class Heading(NamedTuple):
@@ -230,6 +245,20 @@ def may_mean(text: Any) -> list[str]:
     return [name for name, telling in _TELLING.items() if words & telling]
 
 
+def shown_as_stored(number_format: str, unit: str) -> bool:
+    """Whether a number format shows a number as it is, alone or with its unit."""
+    for section in number_format.split(";"):
+        for literal in _LITERAL.finditer(section):
+            text = literal[1] or literal[2] or literal[3] or ""
+            if re.sub(r"[\s()+\-:/]", "", text) and (unit_alone(text) or plain(text)) != unit:
+                return False
+        rest = _PLACEHOLDERS.sub("", _LITERAL.sub("", section))
+        if _SCALED.search(rest) or not _DIGITS.fullmatch(rest.replace(";", "")):
+            return False
+    first = _PLACEHOLDERS.sub("", number_format.split(";")[0].replace('"', "").replace("\\", ""))
+    return not first.lstrip().startswith(("-", "("))
+
+
 def units_in(text: Any, alone: bool = False) -> list[str]:
     """The length units that a note speaks of: "mm" ..., or the word itself where nothing here can account for it.
 
@@ -241,7 +270,9 @@ def units_in(text: Any, alone: bool = False) -> list[str]:
     words = _WORD.findall(re.sub(r"['’](?=\w)", "", folded))
     if alone:
         whole = unit_alone(text)
-        found = [whole] if whole else [word for word in words[:1] if len(words) == 1 and word in _OTHER_WORDS]
+        said = [] if re.search(r"\d", folded) else [word for word in words if word not in _FILLERS]
+        other = [_UNIT_OF.get(word, word) for word in said if word in _UNIT_OF or word in _OTHER_WORDS]
+        found = [whole] if whole else other if len(other) == len(said) else []
     else:
         # "in" is a word, too, and letters are names: these only in brackets, after a number or "in", or at the end.
         plainly = [word for word in words if word not in ("in", "m")]

@@ -65,7 +65,7 @@ def read_system(
     >>> len(system), system.collimator_length[0].round(4)    # doctest: +SKIP
     (80, 89.0702)
     """
-    columns = column_map(columns)  # before the file, which may be large
+    columns = column_map(columns, path)  # before the file, which may be large
     return read(Book(path), columns).system
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -12,6 +13,8 @@ from .xml_parts import Element, elements, escaped, spliced, utf8, with_attribute
 
 MAIN = "http://schemas.openxmlformats.org/spreadsheetml/2006/main"
 STRICT = "http://purl.oclc.org/ooxml/spreadsheetml/main"
+
+_NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?")
 
 At = tuple[int, int]
 """Row and column, counted from 1."""
@@ -156,6 +159,8 @@ class SheetXml:
         masters: dict[str, tuple[At, str]],
     ) -> Cell:
         parts = {e.name: e for e in inside.get(id(element), [])}
+        if len(parts) < len(inside.get(id(element), [])):
+            raise InputError(f"{self._file}: {self.name}!{_name(at)} has several values in the file, expected one")
         value = _value(element.attributes.get("t", "n"), parts, inside, strings)
         formula, group, text = parts.get("f"), None, None
         if formula is not None:
@@ -405,7 +410,7 @@ def _value(kind: str, parts: dict[str, Element], inside: dict[int, list[Element]
             return strings[int(text)]
         if kind == "b":
             return bool(int(text))
-        if kind == "n":
+        if kind == "n" and _NUMBER.fullmatch(text):
             return float(text)
     except (ValueError, IndexError):
         return Unreadable(text)

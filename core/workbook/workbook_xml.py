@@ -86,12 +86,19 @@ class WorkbookXml:
         texts = shared_strings(self.package.read(strings[0]), name) if strings else []
         self._styles = [member for _, kind, member in relations if kind == "styles"]
         self.all_sheets: list[str] = []
+        self.hidden: set[str] = set()
         self.parts: dict[str, str] = {}
         for e in self._elements:
             if e.name != "sheet":
                 continue
             title = e.attributes.get("name", "")
+            if title.casefold() in map(str.casefold, self.all_sheets):
+                raise InputError(
+                    f"{name}: has two sheets called {title}, expected one; Excel or LibreOffice may repair it"
+                )
             self.all_sheets.append(title)
+            if e.attributes.get("state", "visible") != "visible":
+                self.hidden.add(title)
             key = next((value for attribute, value in e.attributes.items() if attribute.endswith(" id")), "")
             kind, member = members.get(key, ("", ""))
             if kind == "worksheet":

@@ -111,7 +111,7 @@ def write_system(
         formulas = [place for place, cell in cells.items() if cell.formula is not None]
         required = {place: number for place, number in numbers_of(system).items() if cells[place].formula is not None}
         return _saved(workbook, system, target, recalculate(workbook, formulas, required), [])
-    said = column_map(columns) if columns is not None else system.source.columns if system.source else None
+    said = column_map(columns, template) if columns is not None else system.source.columns if system.source else None
     book = Book(template)
     workbook = book.workbook
     _refuse_other_kind(workbook, target, suffix)
@@ -161,10 +161,11 @@ def _refuse_unlike(written: Path, name: str, system: PinholeSystem, numbered: bo
     """Refuse a workbook that is not read as `system`: a template may be laid out so that it cannot hold it."""
     with recorded_warnings():
         try:
-            back = read(Book(written), columns).system
+            reading = read(Book(written), columns)
         except InputError as error:
             why = str(error).replace(str(written), name).replace(written.name, name)
             raise InputError(f"{name} cannot hold this system, with it: {why}") from error
+    back = reading.system
     if len(back) != len(system) or (numbered and not np.array_equal(back.numbers, system.numbers)):
         raise InputError(
             f"{name} cannot hold this system: its modules {several(system.numbers)} would be read as "
@@ -174,10 +175,12 @@ def _refuse_unlike(written: Path, name: str, system: PinholeSystem, numbered: bo
         wanted, got = values_of(system, quantity), values_of(back, quantity)
         differing = np.flatnonzero(np.abs(got - wanted) > 2e-9 * np.abs(wanted))
         if len(differing):
-            i = differing[0]
+            i = int(differing[0])
+            column = reading.layout.columns.get(quantity)
+            why = f": {column.place(i)} is read for all modules" if column is not None and column.shared else ""
             raise InputError(
                 f"{name} cannot hold this system: {quantity} = {wanted[i]:.9g} mm of module {system.numbers[i]} would be "
-                f"read as {got[i]:.9g} mm"
+                f"read as {got[i]:.9g} mm{why}"
             )
 
 

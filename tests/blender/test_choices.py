@@ -39,7 +39,9 @@ PHANTOMS = {
 READ_AS = {
     "AUTO": 0, "activity": 1, "mu": 2, "hu": 3, "sensitivity": 4, "modules": 5, "resolution": 6, "completeness": 7,
 }  # fmt: skip
-UNITS = {"NONE": 0, "mm": 1, "cm": 2, "m": 3, "in": 4, "µm": 5, "rad": 6, "deg": 7}
+UNITS = {
+    "NONE": 0, "mm": 1, "cm": 2, "m": 3, "in": 4, "µm": 5, "rad": 6, "deg": 7, "dm": 8, "ft": 9, "mil": 10, "0.1 mm": 11,
+}  # fmt: skip
 
 # Never change a number here, and never give one a second time: files hold them.
 FROZEN = {
@@ -69,7 +71,7 @@ FROZEN = {
     "ProjectionProperties": PROJECTIONS,
     "ColumnMapTable": {"rows": {"BY_NUMBER": 0, "IN_ORDER": 1, "ONE_FOR_ALL": 2}},
     "ColumnMapQuantity": {"unit": UNITS},
-    "ColumnMapProperties": {"unit": {name: UNITS[name] for name in ("NONE", "mm", "cm", "m", "in", "µm")}},
+    "ColumnMapProperties": {"unit": {name: number for name, number in UNITS.items() if name not in ("rad", "deg")}},
     # Operators' are kept by the preferences, of keys and menus that users make.
     "MPHDRR_OT_render_projections": PROJECTIONS,
     "MPHDRR_OT_import_phantom": {"quantity": HELD},
@@ -88,7 +90,8 @@ FROZEN = {
     },
 }  # fmt: skip
 DEFAULTS = {
-    "part": "NONE", "length_mode": "TYPED", "edge_at": "MIDDLE", "kind": "VOLUME", "contrast": "modified", "model": "TRANSMISSION",
+    "part": "NONE", "length_mode": "TYPED", "edge_at": "MIDDLE", "kind": "VOLUME", "contrast": "modified",
+    "model": "TRANSMISSION",
     "isotope": "NONE", "aperture_material": "NUMBER", "edge": "PAIX", "crystal_material": "NUMBER",
     "detector": "VIRTUAL", "backend": "AUTO", "rows": "BY_NUMBER", "unit": "NONE",
 }  # fmt: skip

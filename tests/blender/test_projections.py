@@ -73,7 +73,7 @@ def body(scanned) -> Volume:
 PHYSICS = {
     "isotope": "Tc-99m", "aperture_points": 3, "aperture_mu": 3.6, "opening_angle": np.float32(1.4), "edge": "PATH",
     "crystal_mu": 0.404, "depth_layers": 2, "intrinsic_fwhm": 3.0, "within_cone": True, "within_walls": True,
-    "within_crystal": True, "time": 600.0,
+    "within_crystal": True, "time": 600.0, "pixel_points": 2,
 }  # fmt: skip
 IN_PYTHON = PHYSICS | {"edge": "path", "opening_angle": 1.4}
 

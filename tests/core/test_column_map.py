@@ -301,6 +301,21 @@ def test_the_written_map_has_the_rows_of_the_modules_now(order, shared, tmp_path
     assert again.path.read_bytes() == written.path.read_bytes()
 
 
+def test_what_one_row_for_all_cannot_hold_is_refused_with_its_cell(tmp_path):
+    def first_row_alone(main, coordinates):
+        for row in range(4, 7):
+            main.cell(row, 2).value = None
+
+    path = silent(tmp_path, first_row_alone)
+    text = MAP.replace('rows = "by number"\nnumber = "A"', 'rows = "one for all"')
+    text = text.replace("last_row = 6\nrows", "last_row = 3\nrows")
+    system = mph.read_system(path, columns=mph.ColumnMap.from_toml(text))
+    differing = by_design(changed(system, pinhole_diameter=np.array([2.0, 2.1, 2.2, 2.3])))
+    with pytest.raises(mph.InputError, match=r"d = 2.1 mm of module 2 .*: Main!B3 is read for all modules$"):
+        mph.write_system(differing, tmp_path / "o.xlsx", path)
+    assert not (tmp_path / "o.xlsx").exists()
+
+
 # Drafts
 
 
@@ -343,7 +358,7 @@ def test_a_draft_of_a_workbook_of_which_nothing_is_understood_can_be_written(tmp
     draft = mph.draft_column_map(saved(book, tmp_path))
     draft.write(tmp_path / "map.toml")
     assert 'sheet = "Sheet"' in (tmp_path / "map.toml").read_text()
-    with pytest.raises(InputError, match="column map: "):
+    with pytest.raises(InputError, match=r"map\.toml: table 1 has no columns"):
         mph.read_system(tmp_path / "scanner.xlsx", columns=tmp_path / "map.toml")
 
 

@@ -148,9 +148,9 @@ def test_real_workbook_has_its_80_modules(workbook):
 
 def test_real_workbook_is_read_in_less_than_half_a_second(workbook):
     read_system(workbook)
-    start = time.perf_counter()
+    start = time.process_time()
     read_system(workbook)
-    assert time.perf_counter() - start < 0.5
+    assert time.process_time() - start < 0.5
 
 
 def test_stored_values_make_no_difference(workbook, tmp_path):
@@ -871,7 +871,7 @@ BAD_FILES: dict[str, tuple[Callable[[Path, bytes], object], str]] = {
     ),
     "not a number": (
         lambda path, real: _damaged_sheet(path, real, lambda xml: xml.replace(b"<v>277.002</v>", b"<v>NaN</v>")),
-        "Coordinates!B3 is nan, expected x1 of module 1, a number",
+        "Coordinates!B3 holds 'NaN', which is no number, expected x1 of module 1",
     ),
     "infinite": (
         lambda path, real: _damaged_sheet(path, real, lambda xml: xml.replace(b"<v>277.002</v>", b"<v>1e999</v>")),
@@ -910,7 +910,7 @@ def test_file_of_absurd_size_is_refused_unread(workbook, monkeypatch):
 
 def test_too_many_rows_are_refused(tmp_path, monkeypatch):
     monkeypatch.setattr("mphdrr.core.workbook.book.MAX_ROWS", 5)
-    with pytest.raises(InputError, match="sheet Coordinates has more than 5 rows with content"):
+    with pytest.raises(InputError, match="sheet Main has more than 5 rows with content"):
         read_edited(tmp_path, lambda main, coordinates: None)
 
 

@@ -92,6 +92,11 @@ def _format(cells: str, number_format: str) -> Edit:
     return edit
 
 
+def _merged_over(sheet: Worksheet, cells: str) -> None:
+    """Merged by hand: openpyxl's merge_cells clears what is covered."""
+    sheet.merged_cells.add(cells)
+
+
 def _comment(cell: str, text: str) -> Edit:
     def edit(main: Worksheet, coordinates: Worksheet) -> None:
         typed(main, coordinates)
@@ -194,6 +199,14 @@ REFUSED: dict[str, tuple[Edit, str]] = {
         "Coordinates!B1",
     ),
     "units that nobody knows": (_also(_moved_down, lambda m, c: c.__setitem__("A1", "Unit: Elle")), "Coordinates!A1"),
+    "old right above": (_also(_moved_down, lambda m, c: c.__setitem__("C3", "old")), "Coordinates!C3 holds 'old'"),
+    "a number hidden under a merged cell": (_also(typed, lambda m, c: _merged_over(c, "B4:C4")), "Coordinates!C4 is hidden"),
+    "a hidden sheet beside one of the users' own": (
+        _copy_of_coordinates("MDSL cloud import", own_state="hidden"),
+        "sheet Coordinates is hidden, but MDSL cloud import is shown",
+    ),
+    "a sign in the number format": (_format("B3:D6", '"-"0.00'), "Coordinates!B3 is shown as"),
+    "per mille": (_format("B3:D6", "0‰"), "Coordinates!B3 is shown as"),
     "unit in a comment": (_comment("B1", "all of these in cm"), "Coordinates!B1 has the comment 'all of these in cm'"),
     "unit of negative numbers": (_format("B3:D6", '0.00;-0.00" cm"'), "Coordinates!B3 is shown as"),
     "unquoted letters": (_format("B3:D6", "0.00 k"), "Coordinates!B3 is shown as"),
@@ -280,7 +293,8 @@ def test_what_is_not_understood_is_refused_by_its_cell(kind, tmp_path):
 
 READ: dict[str, Edit] = {
     "a title": _also(_moved_down, lambda m, c: c.__setitem__("A1", "Scanner A, 2024")),
-    "a title above x1": _also(_moved_down, lambda m, c: c.__setitem__("B3", "Scanner A, 2024")),
+    "a title above x1": _also(_moved_down, lambda m, c: c.__setitem__("B2", "Scanner A, 2024")),
+    "a title right above the table": _also(_moved_down, lambda m, c: c.__setitem__("A3", "Scanner A, 2024")),
     "mm in a title": _also(_moved_down, lambda m, c: c.__setitem__("A1", "all lengths in mm, angles in radians")),
     "mm in the rows above": _also(_moved_down, lambda m, c: (c.__setitem__("A1", "Unit"), c.__setitem__("A1", "mm"))),
     "Units: mm": _also(_moved_down, lambda m, c: (c.__setitem__("A1", "Units:"), c.__setitem__("B1", "mm"))),
@@ -351,7 +365,11 @@ def in_units(units: dict[str, str]):
 
 @pytest.mark.parametrize(
     "units",
-    [*({"": unit} for unit in LENGTH_UNITS), {"": "cm", "d": "mm", "z1": "in", "l": "m"}, {"": "mm", "Td": "µm"}],
+    [
+        *({"": unit} for unit in ("mm", "cm", "m", "in", "µm")),
+        {"": "cm", "d": "mm", "z1": "in", "l": "m"},
+        {"": "mm", "Td": "µm"},
+    ],
 )
 def test_lengths_are_converted_and_written_back_in_their_unit(units, tmp_path):
     system = read_edited(tmp_path, in_units(units))

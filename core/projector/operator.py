@@ -485,23 +485,25 @@ class AdjointProjector(LinearOperator):
                     image = along_v.T @ image @ along_u
                 beams, by_columns = A._beams(m)
                 lines, rays = window([beam.rays for beam in beams], A.grid.corners())
-                blocks = _blocks(lines, rays, name, workers)
+                # Always the same parts, so that the sums' order, and so the result, is always the same.
+                parts = [
+                    (block, *bundle)
+                    for block in _blocks(lines, rays, name, workers)
+                    for bundle in _bundles(beams, (block.stop - block.start, rays.stop - rays.start), name, workers)
+                ]
 
                 def add(
                     worker: int,
-                    beams: list[Beam] = beams,
                     rays: slice = rays,
-                    blocks: list[slice] = blocks,
+                    parts: list[tuple[slice, Beam, slice]] = parts,
                     lines: ArrayOrTensor = image.T if by_columns else image,
                     spread: Spread = spread,
                 ) -> None:
-                    # Always the same blocks, so that the sums' order, and so the result, is always the same.
-                    for block in blocks[worker::workers]:
+                    for block, beam, shifts in parts[worker::workers]:
+                        fan, weights = beam.part(block, rays, shifts)
                         pixels = lines[block, rays]
-                        for beam, shifts in _bundles(beams, pixels.shape, name):
-                            fan, weights = beam.part(block, rays, shifts)
-                            values = alike(np.ones(1) if weights is None else weights, pixels) * pixels
-                            spread(volumes[worker], values.reshape(-1), *trace(fan))
+                        values = alike(np.ones(1) if weights is None else weights, pixels) * pixels
+                        spread(volumes[worker], values.reshape(-1), *trace(fan))
 
                 _wait_for(parallel_map(add, range(workers)))
                 if weighted:  # otherwise in every view: each joins the others weighted
@@ -585,11 +587,14 @@ def _blocks(lines: slice, rays: slice, backend: str, workers: int) -> list[slice
     return [slice(first, min(first + size, lines.stop)) for first in range(lines.start, lines.stop, size)]
 
 
-def _bundles(beams: list[Beam], shape: tuple[int, int], backend: str) -> Iterator[tuple[Beam, slice]]:
-    """The beams, and as many of their shifts at once as a backend is given of so many lines and rays each."""
-    at_once = max(1, _MOST_RAYS.get(backend, _FEWEST_RAYS) // math.prod(shape))
+def _bundles(beams: list[Beam], shape: tuple[int, int], backend: str, workers: int = 1) -> Iterator[tuple[Beam, slice]]:
+    """The beams, and as many of their shifts at once as a backend is given of so many lines and rays each.
+
+    Where there are shifts enough, in a piece or more for each worker.
+    """
     for beam in beams:
         n = len(beam.rays.shifts)
+        at_once = max(1, min(_MOST_RAYS.get(backend, _FEWEST_RAYS) // math.prod(shape), math.ceil(n / workers)))
         yield from ((beam, slice(first, min(first + at_once, n))) for first in range(0, n, at_once))
 
 

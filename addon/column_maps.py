@@ -336,4 +336,4 @@ def _seen(form: ColumnMapProperties, quantity: ColumnMapQuantity, workbook: Path
         rows[row - 1][column - 1] for row in (table.header_row, table.first_row) if 0 < row <= len(rows)
         and column <= len(rows[row - 1])
     ]  # fmt: skip
-    return ": ".join(texts)
+    return ": ".join(filter(None, texts))

@@ -7,11 +7,11 @@ import textwrap
 
 import bpy
 
-from ..addon.column_maps import ColumnMapProperties
-from ..core.workbook.quantities import QUANTITIES
+from ..addon.column_maps import ColumnMapProperties, ColumnMapQuantity
+from ..core.workbook.quantities import DERIVED, QUANTITIES
 
-WIDTH = 760  # of the dialog, pixels
-_LINE = 128  # characters that fit in it
+WIDTH = 1000  # of the dialog, pixels
+_LINE = 170  # characters that fit in it
 _DOUBTS = 2  # more of them push the preview off the screen
 _REMARKS = 2
 _RESULT = 9  # lines kept for the preview: a dialog that grows moves away from the mouse
@@ -50,14 +50,25 @@ def _tables(layout: bpy.types.UILayout, form: ColumnMapProperties) -> None:
 
 
 def _quantities(layout: bpy.types.UILayout, form: ColumnMapProperties) -> None:
+    """What is read and, in a column of their own, what is only compared."""
+    compared = [quantity for quantity in form.quantities if quantity.name in DERIVED]
+    read = [quantity for quantity in form.quantities if quantity.name not in DERIVED]
+    if not compared:
+        _columns(layout, "Quantity", read, 0.34)
+        return
+    split = layout.split(factor=0.6)
+    _columns(split, "Quantity", read, 0.38)
+    _columns(split, "Compared", compared, 0.2)
+
+
+def _columns(layout: bpy.types.UILayout, head: str, quantities: list[ColumnMapQuantity], factor: float) -> None:
     box = layout.box().column(align=True)
-    cells = _cells(box)
-    for cell, text in zip(cells, ("Quantity", "Table", "Column", "Unit", "In the workbook"), strict=True):
+    for cell, text in zip(_cells(box, factor), (head, "Table", "Column", "Unit", "In the workbook"), strict=True):
         cell.active = False
         cell.label(text=text)
-    for quantity in form.quantities:
-        name, table, column, unit, seen = _cells(box)
-        described = QUANTITIES[quantity.name].headings[1:2]
+    for quantity in quantities:
+        name, table, column, unit, seen = _cells(box, factor)
+        described = () if quantity.name in DERIVED else QUANTITIES[quantity.name].headings[1:2]
         name.label(text=" ".join([quantity.name, *(f"({text})" for text in described)]))
         table.prop(quantity, "table", text="")
         column.prop(quantity, "column", text="")
@@ -65,10 +76,10 @@ def _quantities(layout: bpy.types.UILayout, form: ColumnMapProperties) -> None:
         seen.label(text=quantity.seen)
 
 
-def _cells(layout: bpy.types.UILayout) -> list[bpy.types.UILayout]:
+def _cells(layout: bpy.types.UILayout, factor: float) -> list[bpy.types.UILayout]:
     """Name, table, column, unit and what is seen, side by side."""
-    first = layout.split(factor=0.34)
-    name, rest = first.row(), first.split(factor=0.5)
+    first = layout.split(factor=factor)
+    name, rest = first.row(), first.split(factor=0.55)
     settings = rest.row(align=True)
     return [name, settings.row(), settings.row(), settings.row(), rest.row()]
 

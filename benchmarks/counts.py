@@ -21,7 +21,7 @@ import numpy as np
 import mphdrr.core as mph
 
 WORKBOOK = Path(__file__).parents[1] / "examples" / "dc-spect-80.xlsx"
-CASES = ((64, 2.0, 64), (128, 1.0, 128), (256, 0.5, 256))  # voxels along an axis, mm, pixels along a side
+CASES = ((64, 2.0, 64), (128, 1.0, 128))  # voxels along an axis, mm, pixels along a side
 MODELS: dict[str, dict[str, Any]] = {
     "automatic": {},
     "1 ray": {"pixel_points": 1},
@@ -29,12 +29,13 @@ MODELS: dict[str, dict[str, Any]] = {
     "7 points of the hole, 1 ray each": {"aperture_points": 7, "pixel_points": 1},
 }
 PLACES = 12
+ENOUGH = 5.0  # s
 
 
 def best(call: Callable[[], Any]) -> float:
-    """Seconds of the faster of two calls."""
-    times = []
-    for _ in range(2):
+    """Seconds of the faster of two calls, or of one that takes long."""
+    times: list[float] = []
+    while len(times) < 2 and (not times or times[0] < ENOUGH):
         started = time.perf_counter()
         call()
         times.append(time.perf_counter() - started)
@@ -70,14 +71,13 @@ def main() -> None:
             rays = [model.rays(views, m, grid) for m in range(len(system))]
             counted = f"{min(rays)} to {max(rays)}" if max(rays) > min(rays) else str(rays[0])
             error = worst_error(system, size, views, model)
-            images = adjoint = "–"
-            if n < 256 or "pixel_points" in options:
-                A = mph.Projector(grid, views, model)
-                y = A(volume)
-                images = f"{best(functools.partial(A, volume)):.2f}"
-                adjoint = f"{best(functools.partial(A.T, y)):.2f}"
+            A = mph.Projector(grid, views, model)
+            y = A(volume)
+            images, adjoint = best(functools.partial(A, volume)), best(functools.partial(A.T, y))
+            times = f"{images:.2f} | {adjoint:.2f}"
             print(
-                f"| {n}^3 of {size:g} mm | {pixels}^2 | {name} | {counted} | {images} | {adjoint} | {100 * error:.2g} % |"
+                f"| {n}^3 of {size:g} mm | {pixels}^2 | {name} | {counted} | {times} | {100 * error:.3g} % |",
+                flush=True,
             )
 
 

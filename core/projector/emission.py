@@ -401,10 +401,10 @@ class Emission(Model):
         most = "more than 100" if worst > 1 else f"up to {100 * worst:.2g}"
         advice = "take smaller pixels, or larger voxels"
         if self.pixel_points is not None:
-            advice = f"pixel_points=None takes as many as keep {100 * self.tolerance:g} %"
+            advice = f"pixel_points=None (--pixel-points auto) takes as many as keep {100 * self.tolerance:g} %"
         return (
-            f"emission: {n} point{'s' * (n > 1)} of each pixel are too few for voxels of {voxel} mm: the total counts of "
-            f"a single voxel may be {most} % off (in module {self.system.numbers[module]}), of larger sources less; {advice}"
+            f"emission: with {n} point{'s' * (n > 1)} of each pixel the total counts of a single voxel of {voxel} mm may be "
+            f"{most} % off (in module {self.system.numbers[module]}), those of larger sources less; {advice}"
         )
 
     def _pixel_points(self, views: Views, m: int, grid: Grid) -> int:

@@ -75,7 +75,8 @@ def steps():
             next(r for r in area.regions if r.type == "UI").active_panel_category = "mphDRR"
     yield 0.5
 
-    start_job(width=500, height=500)
+    # Several rays of each pixel, so that it lasts long enough to be seen half-way.
+    start_job(width=500, height=500, pixel_points=8)
     while job().running:
         yield 0.05
     seen["full"] = {"steps": len(set(progress)), "longest_pause_s": max(b - a for a, b in itertools.pairwise(beats))}
@@ -88,7 +89,7 @@ def steps():
 
     before = run_file.read_bytes()
     pixels = list(bpy.data.images["mphDRR 01"].pixels[:400])
-    start_job(width=768, height=768)
+    start_job(width=768, height=768, pixel_points=8)
     while job().running and job().progress < 0.2:
         yield 0.05
     assert job().running

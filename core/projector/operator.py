@@ -282,7 +282,8 @@ class Projector(LinearOperator):
                     for beam, shifts in _bundles(beams, pixels.shape, name):
                         fan, weights = beam.part(block, rays, shifts)
                         integrals = integrate(weighted, *trace(fan)).reshape(-1, *pixels.shape)
-                        pixels += (integrals if weights is None else alike(weights, box) * integrals).sum(0)
+                        weighed = integrals if weights is None else alike(weights, box) * integrals
+                        pixels += weighed[0] if len(weighed) == 1 else weighed.sum(0)
 
                 running = iter(parallel_map(project, _blocks(lines, rays, name, workers)))
                 if before is not None:

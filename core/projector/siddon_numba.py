@@ -39,6 +39,7 @@ from .lanes import (
     numbered,
     put_aside,
     rint,
+    root,
     scatter_add,
     store,
     take_back,
@@ -148,8 +149,11 @@ def _listed(rays: Rays) -> Array:
         here, world = rays.fan, rays.world
         vectors = [here.source, here.corner, here.line_step, here.ray_step]
         vectors += [world.corner - world.source, world.line_step, world.ray_step]
-        signature = types.void(_NUMBERS, _NUMBERS, types.intp, types.intp, _NUMBERS)
-        compiled(_list_fan, signature)(np.stack(vectors), np.array(here.shifts), *here.shape, lines)
+        if len(here.shifts) == 1 and not here.shifts.any():
+            compiled(_list_fan, types.void(_NUMBERS, types.intp, _NUMBERS))(np.stack(vectors), here.shape[1], lines)
+        else:
+            signature = types.void(_NUMBERS, _NUMBERS, types.intp, types.intp, _NUMBERS)
+            compiled(_list_shifts, signature)(np.stack(vectors), np.array(here.shifts), *here.shape, lines)
     else:
         each = rays.listed()
         lines[:3, :n], lines[3:6, :n], lines[6, :n] = each.starts.T, each.directions.T, each.lengths
@@ -165,8 +169,32 @@ def _padded(values: Array) -> Array:
     return padded
 
 
-def _list_fan(fan, shifts, n_lines, rays_of_a_line, lines):  # type: ignore[no-untyped-def]
-    """`IndexFan.listed`, ray by ray."""
+def _list_fan(fan, rays_of_a_line, lines):  # type: ignore[no-untyped-def]
+    """`IndexFan.listed`, in lanes."""
+    rows = lines.reshape(-1)
+    n = lines.shape[1]
+    for r in range(0, n, WIDTH):
+        number = numbered() + f64(float(r))
+        line = floor((number + f64(0.5)) / f64(float(rays_of_a_line)))
+        ray = number - line * f64(float(rays_of_a_line))
+        squared = f64(0.0)
+        for axis in range(3):
+            start = f64(fan[0, axis])
+            end = multiply_add(ray, f64(fan[3, axis]), multiply_add(line, f64(fan[2, axis]), f64(fan[1, axis])))
+            plane = rint(start)
+            in_plane = (magnitude(start - plane) <= f64(SNAP)) & (magnitude(end - plane) <= f64(SNAP))
+            start = where(in_plane, plane, start)
+            direction = end - start
+            direction = where(in_plane | (magnitude(direction) <= f64(SNAP)), f64(0.0), direction)
+            store(rows, axis * n + r, start)
+            store(rows, (3 + axis) * n + r, direction)
+            along = multiply_add(ray, f64(fan[6, axis]), multiply_add(line, f64(fan[5, axis]), f64(fan[4, axis])))
+            squared = multiply_add(along, along, squared)
+        store(rows, 6 * n + r, root(squared))
+
+
+def _list_shifts(fan, shifts, n_lines, rays_of_a_line, lines):  # type: ignore[no-untyped-def]
+    """`IndexFan.listed` of a fan with shifts, ray by ray."""
     r = 0
     for s in range(len(shifts)):
         for i in range(n_lines):

@@ -1,0 +1,75 @@
+// Line integrals through voxels and what belongs to them: the contract between the kernels and siddon_cpu.py.
+//
+// All coordinates of rays are in index space, where voxel i of an axis fills [i, i + 1) and a lattice's faces lie at 0 and n.
+// A point of a ray is source + alpha (target - source), alpha from 0 to 1. With f the volume, mu what attenuates (0 without
+// it) and L the ray's length in mm, its integral is
+//
+//     L int_0^1 f(alpha) exp(-L int_0^alpha mu) dalpha
+//
+// The kernels allocate nothing, keep nothing and start no thread: a job belongs to the thread that calls. Nothing here is
+// checked; siddon_cpu.py makes only jobs whose arrays are as large as said here, with fewer than 2^31 voxels in a lattice.
+
+#pragma once
+#include <stdint.h>
+
+#define CONTRACT 1 // counted up with every change of this file: siddon_cpu.py takes no other
+
+// Voxels (n[0], n[1], n[2]) in C order, of a job's kind of number.
+typedef struct {
+    void *voxels;
+    int64_t n[3];
+} Lattice;
+
+// Rays from a source to the points corner + i line_step + j ray_step, for i from 0 to lines - 1 and j from 0 to rays - 1.
+// The value of ray (i, j) is values[place + i * line_stride + j * ray_stride].
+typedef struct {
+    double volume[4][3]; // source, corner, line step, ray step in the volume's index space
+    double mu[4][3];     // the same in mu's, where that has a lattice of its own
+    double world[3][3];  // source to corner, line step, ray step in mm
+    int64_t lines, rays;
+    int64_t place, line_stride, ray_stride;
+} Fan;
+
+// Rays one by one, columns of arrays (3, count) and (count).
+typedef struct {
+    const double *starts, *directions;       // in the volume's index space; a direction is source to target
+    const double *mu_starts, *mu_directions; // in mu's, where that has a lattice of its own
+    const double *lengths;                   // mm
+    int64_t count;
+} RayList;
+
+// How mu lies: there is none, it shares the volume's lattice, it has a lattice of its own.
+enum { NO_MU, SAME_LATTICE, OWN_LATTICE };
+
+typedef struct {
+    int64_t is_double; // numbers of voxels and values are float (0) or double (1)
+    int64_t attenuation; // NO_MU, SAME_LATTICE or OWN_LATTICE
+    Lattice volume, mu;
+    const Fan *fans; // the rays of all fans, in order
+    int64_t n_fans;
+    RayList list; // or, where there are no fans, these: ray r's value is values[r]
+    void *values;
+    double *derivatives; // (7 or 14, rays): row after row, rays in order
+    void *gradient; // of mu's shape
+} Job;
+
+// What level of processor the kernels are compiled for; any processor of the platform runs level 0.
+int64_t best_level(void);
+const char *level_name(int64_t level); // null from the first level on that there is not
+
+// CONTRACT, and the bytes of a Job and a Fan: siddon_cpu.py compares them with its own.
+void contract(int64_t numbers[3]);
+
+// values = integrals
+void forward(int64_t level, const Job *job);
+
+// volume += values, each along its ray with the weights of forward
+void backproject(int64_t level, const Job *job);
+
+// derivatives = int_0^1 ... dalpha, then its derivatives by the ray's start (3) and end (3) through the planes of the volume,
+// where f jumps; with mu also by start (3) and end (3), in mu's index space, through the planes of mu, and by L at constant
+// ends. With mu, values are the integrals, as forward gives them.
+void derivatives(int64_t level, const Job *job);
+
+// gradient += the derivative by mu of the sum of values times the integrals; values (2, rays): the values, the integrals
+void mu_gradient(int64_t level, const Job *job);

@@ -34,13 +34,13 @@ from .arrays import (
     zeros,
 )
 from .models import Array, Beam, Model, Transmission, require_model
-from .rays import Attenuation, IndexFan, IndexFans, RayMapper, window
+from .rays import Attenuation, IndexFans, RayMapper, window
 
 # Rays handed to a backend at once: enough that a call costs nothing, few enough that their arrays stay in the
 # cache. A GPU wants more (torch cuts them into chunks by itself; cuda takes several views a launch), and a torch on a CPU
 # has threads of its own.
 _FEWEST_RAYS = 4096
-_MOST_RAYS = {"numba": 2**14, "torch": 2**18, "cuda": 2**22}
+_MOST_RAYS = {"cpu": 2**14, "torch": 2**18, "cuda": 2**22}
 
 # Threads of the adjoint, each with a volume of its own: more would gain little and take much memory.
 _MOST_VOLUMES = 8
@@ -324,7 +324,7 @@ class Projector(LinearOperator):
 
     def _fans(
         self, views: range, trace: RayMapper
-    ) -> Iterator[tuple[list[int], bool, Array, IndexFan | IndexFans, Attenuation | None]]:
+    ) -> Iterator[tuple[list[int], bool, Array, IndexFans, Attenuation | None]]:
         """The beams of several views in groups that cuda takes at once.
 
         Yields which of `views` they are of, whether their lines are the images' columns, weights (as many, lines, rays, or
@@ -347,7 +347,7 @@ class Projector(LinearOperator):
                     fan, of_rays = beam.part(slice(None), slice(None), shifts)
                     fans.append(fan)
                     weights.append(np.ones((1, 1, 1)) if of_rays is None else of_rays)
-                yield group, by_columns, np.concatenate(weights), *trace.together(fans)
+                yield group, by_columns, np.concatenate(weights), *trace(*fans)
 
     def _weighted(self, box: ArrayOrTensor, m: int, origin: tuple[int, int, int] = (0, 0, 0)) -> ArrayOrTensor:
         """A part of a volume, from voxel `origin` on, times view m's voxel weights."""

@@ -55,13 +55,6 @@ class Fan:
         corner = self.corner + line * self.line_step + ray * self.ray_step
         return replace(self, corner=corner, shape=(last_line - line, last_ray - ray), shifts=self.shifts[shifts])
 
-    def single(self) -> list[Fan]:
-        """A fan for every shift, without shifts."""
-        if self.shifts is _UNSHIFTED:
-            return [self]
-        corners = self.corner + self.shifts @ np.stack([self.line_step, self.ray_step])
-        return [replace(self, corner=corner, shifts=_UNSHIFTED) for corner in corners]
-
     def transposed(self) -> Fan:
         """The same rays, lines across."""
         shifts = self.shifts if self.shifts is _UNSHIFTED else self.shifts[:, ::-1]
@@ -72,18 +65,24 @@ class Fan:
         contiguous = grid.index_from_world[2, :3]
         return bool(abs(contiguous @ self.line_step) > abs(contiguous @ self.ray_step))
 
+    def vectors(self) -> NDArray[np.float64]:
+        """Source, corner, line step and ray step of the S lattices, (S, 4, 3)."""
+        vectors = np.empty((len(self.shifts), 4, 3))
+        vectors[:] = self.source, self.corner, self.line_step, self.ray_step
+        if self.shifts is not _UNSHIFTED:
+            vectors[:, 1] += self.shifts @ vectors[0, 2:]
+        return vectors
+
     def targets(self) -> NDArray[np.float64]:
         """Ends of the rays (S * lines * rays, 3), shift by shift, line by line."""
-        line, ray = (np.arange(n, dtype=np.float64) for n in self.shape)
-        lines = line[:, None] + self.shifts[:, 0, None, None]
-        rays = ray + self.shifts[:, 1, None, None]
-        return (self.corner + lines[..., None] * self.line_step + rays[..., None] * self.ray_step).reshape(-1, 3)
+        return _targets(self.vectors(), self.shape)
 
-    def moved(self, affine: NDArray[np.float64]) -> Fan:
-        """The fan under a 4x4 affine."""
-        linear, translation = affine[:3, :3], affine[:3, 3]
-        source, corner = linear @ self.source + translation, linear @ self.corner + translation
-        return Fan(source, corner, linear @ self.line_step, linear @ self.ray_step, self.shape, self.shifts)
+
+def _targets(vectors: NDArray[np.float64], shape: tuple[int, int]) -> NDArray[np.float64]:
+    """Ends of the rays of fans (F, 4, 3), one after the other, (F * lines * rays, 3)."""
+    line, ray = (np.arange(n, dtype=np.float64) for n in shape)
+    corner, line_step, ray_step = vectors[:, 1:, None, None].swapaxes(0, 1)
+    return (corner + line[:, None, None] * line_step + ray[:, None] * ray_step).reshape(-1, 3)
 
 
 _ALL = slice(None), slice(None)
@@ -150,56 +149,32 @@ class IndexRays:
 
 
 @dataclass(frozen=True, eq=False)
-class IndexFan:
-    """A fan in index space: the same rays as `IndexRays`, yet to be listed.
+class IndexFans:
+    """Fans of one shape in index space, the rays of each behind those of the one before: `IndexRays`, yet to be listed.
 
     Attributes
     ----------
-    fan : Fan
-        In index space; nothing is snapped yet.
-    world : Fan
-        The same in world mm: its rays' lengths are theirs.
+    table : array (F, 8, 3)
+        Source, corner, line step and ray step of each in index space, where nothing is snapped yet; the same in world mm.
+    shape : tuple of int
+        Lines, and rays of a line.
     """
 
-    fan: Fan
-    world: Fan
+    table: NDArray[np.float64]
+    shape: tuple[int, int]
 
     def __len__(self) -> int:
-        return len(self.fan)
+        return len(self.table) * self.shape[0] * self.shape[1]
 
     def listed(self) -> IndexRays:
         """The rays one by one, snapped to the planes that they lie in."""
-        lengths = np.linalg.norm(self.world.targets() - self.world.source, axis=1)
-        return _snapped(np.broadcast_to(self.fan.source, (len(self), 3)), self.fan.targets(), lengths)
-
-    def single(self) -> list[IndexFan]:
-        """A fan for every shift, without shifts."""
-        return [IndexFan(fan, world) for fan, world in zip(self.fan.single(), self.world.single(), strict=True)]
+        of_each = self.shape[0] * self.shape[1]
+        starts, sources = (np.repeat(self.table[:, k], of_each, axis=0) for k in (0, 4))
+        ends, targets = (_targets(self.table[:, k : k + 4], self.shape) for k in (0, 4))
+        return _snapped(starts, ends, np.linalg.norm(targets - sources, axis=1))
 
 
-@dataclass(frozen=True, eq=False)
-class IndexFans:
-    """Several fans of one shape in index space, the rays of each behind those of the one before.
-
-    Attributes
-    ----------
-    fans : tuple of IndexFan
-        At least one.
-    """
-
-    fans: tuple[IndexFan, ...]
-
-    def __len__(self) -> int:
-        return sum(map(len, self.fans))
-
-    def listed(self) -> IndexRays:
-        """The rays one by one; see `IndexFan.listed`."""
-        every = [fan.listed() for fan in self.fans]
-        starts, directions = (np.concatenate([getattr(rays, k) for rays in every]) for k in ("starts", "directions"))
-        return IndexRays(starts, directions, np.concatenate([rays.lengths for rays in every]))
-
-
-Rays = IndexRays | IndexFan | IndexFans
+Rays = IndexRays | IndexFans
 
 
 @dataclass(frozen=True, eq=False)
@@ -210,7 +185,7 @@ class Attenuation:
     ----------
     mu : array or tensor (n_x, n_y, n_z)
         Attenuation coefficients, 1/mm, of the backend's kind; outside they are 0.
-    rays : IndexRays, IndexFan, IndexFans or None
+    rays : IndexRays, IndexFans or None
         The same rays in mu's own index space; None where mu shares the volume's lattice.
     """
 
@@ -242,19 +217,10 @@ class RayMapper:
     mu_grid: Grid | None = None
     mu_origin: tuple[int, int, int] = (0, 0, 0)
 
-    def __call__(self, fan: Fan) -> tuple[IndexFan, Attenuation | None]:
-        """The rays of `fan`, and what attenuates them."""
-        return self._mapped(index_fan, fan)
-
-    def together(self, fans: Sequence[Fan]) -> tuple[IndexFan | IndexFans, Attenuation | None]:
-        """The rays of several fans of one shape, those of each behind those of the one before, and what attenuates them."""
-        if len(fans) == 1:
-            return self(fans[0])
-        rays, attenuations = zip(*map(self, fans), strict=True)
-        attenuation = attenuations[0]
-        if attenuation is not None and attenuation.rays is not None:
-            attenuation = Attenuation(self.mu, IndexFans(tuple(each.rays for each in attenuations)))
-        return IndexFans(rays), attenuation
+    def __call__(self, *fans: Fan) -> tuple[IndexFans, Attenuation | None]:
+        """The rays of fans of one shape, those of each behind those of the one before, and what attenuates them."""
+        vectors = fans[0].vectors() if len(fans) == 1 else np.concatenate([fan.vectors() for fan in fans])
+        return self._mapped(index_fans, vectors, fans[0].shape)
 
     def between(
         self, sources: NDArray[np.float64], targets: NDArray[np.float64]
@@ -263,7 +229,7 @@ class RayMapper:
         return self._mapped(index_rays, sources, targets)
 
     def _mapped(self, mapped: Callable[..., Any], *rays: Any) -> tuple[Any, Attenuation | None]:
-        """`rays`, as `index_fan` or `index_rays` takes them between grid and origin."""
+        """`rays`, as `index_fans` or `index_rays` takes them between grid and origin."""
         attenuation = None
         if self.mu is not None:
             mu_rays = None if self.mu_grid is None else mapped(self.mu_grid, *rays, self.mu_origin)
@@ -271,9 +237,16 @@ class RayMapper:
         return mapped(self.grid, *rays, self.origin), attenuation
 
 
-def index_fan(grid: Grid, fan: Fan, origin: tuple[int, int, int] = (0, 0, 0)) -> IndexFan:
-    """`fan` in `grid`'s index space; see `index_rays`."""
-    return IndexFan(fan.moved(_index_from_world(grid, origin)), fan)
+def index_fans(
+    grid: Grid, vectors: NDArray[np.float64], shape: tuple[int, int], origin: tuple[int, int, int] = (0, 0, 0)
+) -> IndexFans:
+    """Fans (F, 4, 3) in world mm, as of `Fan.vectors`, in `grid`'s index space; see `index_rays`."""
+    affine = _index_from_world(grid, origin)
+    table = np.empty((len(vectors), 8, 3))
+    table[:, 4:] = vectors
+    table[:, :4] = np.einsum("fvi,ji->fvj", vectors, affine[:3, :3])
+    table[:, :2] += affine[:3, 3]
+    return IndexFans(table, shape)
 
 
 def index_rays(

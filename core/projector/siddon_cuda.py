@@ -33,7 +33,7 @@ from ..errors import InputError
 from ..memory import readable_size
 from .arrays import ArrayOrTensor, is_tensor, to_numpy
 from .caching import cache_folder
-from .rays import Attenuation, Fan, IndexFan, IndexRays, Rays
+from .rays import Attenuation, IndexRays, Rays
 
 DEVICE_VARIABLE = "MPHDRR_CUDA_DEVICE"
 """Environment variable: the Warp device for arrays, "cuda" if not set. "cpu" runs the kernels without a GPU: for tests."""
@@ -226,12 +226,7 @@ def _table(rays: Rays) -> tuple[NDArray[np.float64], int, int]:
         table[:, 1] = rays.starts + rays.directions
         table[:, 5, 0] = rays.lengths
         return table, 1, 1
-    fans = [single for fan in ((rays,) if isinstance(rays, IndexFan) else rays.fans) for single in fan.single()]
-    return np.array([_rows(fan.fan) + _rows(fan.world) for fan in fans]), *fans[0].fan.shape
-
-
-def _rows(fan: Fan) -> list[NDArray[np.float64]]:
-    return [fan.source, fan.corner, fan.line_step, fan.ray_step]
+    return rays.table, *rays.shape
 
 
 def _copy_back(array: Any, to: ArrayOrTensor) -> None:

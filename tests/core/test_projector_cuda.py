@@ -17,7 +17,7 @@ from mphdrr.core.grid import Grid
 from mphdrr.core.projector import Projector, backends, operator, siddon_cuda, siddon_numpy
 from mphdrr.core.projector import trace_rays as trace
 from mphdrr.core.projector.models import view_rays
-from mphdrr.core.projector.rays import Attenuation, IndexFans, IndexRays, index_fan
+from mphdrr.core.projector.rays import Attenuation, IndexFans, IndexRays, RayMapper
 from mphdrr.core.views import Views
 from mphdrr.core.volume import Volume
 
@@ -224,13 +224,13 @@ def test_projector_agrees_with_the_reference(attenuation, system, rng, monkeypat
 def test_rays_of_fans_are_the_listed_rays(rng, small_pieces):
     grid = Grid(SHAPE, affine(LINEAR["sheared"], SHAPE))
     views = some_views(rng, (7, 30), n=4)
-    fans = IndexFans(tuple(index_fan(grid, view_rays(views, m)) for m in range(4)))
+    fans, _ = RayMapper(grid)(*(view_rays(views, m) for m in range(4)))
     volume = rng.random(SHAPE, dtype=np.float32)
     for function in (siddon_cuda.forward, siddon_cuda.derivatives):
         together = function(volume, fans)
         assert together.any()
         np.testing.assert_allclose(together, function(volume, fans.listed()), rtol=1e-5, atol=1e-6)
-        np.testing.assert_array_equal(together, np.concatenate([function(volume, fan) for fan in fans.fans]))
+        np.testing.assert_array_equal(together, np.concatenate([function(volume, IndexFans(fan[None], fans.shape)) for fan in fans.table]))
 
 
 @pytest.mark.parametrize("rays_at_once", [2**24, 17])
@@ -242,7 +242,7 @@ def test_tensors_on_the_device_are_not_copied(rays_at_once, rng, monkeypatch):
     volume = torch.tensor(rng.random(SHAPE), dtype=torch.float32, device=place)
     assert siddon_cuda.native(volume).data_ptr() == volume.data_ptr()
 
-    fan = index_fan(grid, view_rays(some_views(rng, (9, 5)), 0))
+    fan, _ = RayMapper(grid)(view_rays(some_views(rng, (9, 5)), 0))
     integrals = siddon_cuda.forward(volume, fan)
     assert integrals.device == volume.device and integrals.dtype == torch.float32
     np.testing.assert_allclose(integrals.cpu(), siddon_cuda.forward(volume.cpu().numpy(), fan), rtol=1e-6)
@@ -298,7 +298,7 @@ def test_what_is_missing_is_said_in_one_line(monkeypatch):
 def test_short_memory_means_more_launches(monkeypatch, rng):
     grid = Grid(SHAPE, affine(LINEAR["sheared"], SHAPE))
     views = some_views(rng, (7, 30), n=4)
-    fans = IndexFans(tuple(index_fan(grid, view_rays(views, m)) for m in range(4)))
+    fans, _ = RayMapper(grid)(*(view_rays(views, m) for m in range(4)))
     volume = rng.random(SHAPE, dtype=np.float32)
     launches = []
     launch = warp.launch

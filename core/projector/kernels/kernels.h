@@ -49,8 +49,9 @@ typedef struct {
     int64_t n_fans;
     RayList list; // or, where there are no fans, these: ray r's value is values[r]
     void *values;
-    double *derivatives; // (7 or 14, rays): row after row, rays in order
-    void *gradient; // of mu's shape
+    const void *integrals; // with a task that needs them: as forward gave them, in the values' places
+    double *derivatives;   // (7 or 14, rays): row after row, rays in order
+    void *gradient;        // of mu's shape
 } Job;
 
 // What level of processor the kernels are compiled for; any processor of the platform runs level 0.
@@ -66,10 +67,10 @@ void forward(int64_t level, const Job *job);
 // volume += values, each along its ray with the weights of forward
 void backproject(int64_t level, const Job *job);
 
-// derivatives = int_0^1 ... dalpha, then its derivatives by the ray's start (3) and end (3) through the planes of the volume,
-// where f jumps; with mu also by start (3) and end (3), in mu's index space, through the planes of mu, and by L at constant
-// ends. With mu, values are the integrals, as forward gives them.
-void derivatives(int64_t level, const Job *job);
+// derivatives = integral / L, then its derivatives by the ray's start (3) and end (3) through the planes of the volume, where
+// f jumps; with mu, for which the integrals are needed, also by start (3) and end (3) in mu's index space through the planes
+// of mu, all at constant L, and by L at constant ends.
+void differentiate(int64_t level, const Job *job);
 
-// gradient += the derivative by mu of the sum of values times the integrals; values (2, rays): the values, the integrals
-void mu_gradient(int64_t level, const Job *job);
+// gradient += the derivative by mu of the sum of values times integrals; the integrals are needed
+void differentiate_by_mu(int64_t level, const Job *job);

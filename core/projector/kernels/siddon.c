@@ -1,0 +1,473 @@
+// Siddon's line integrals, and what follows from them, by walking from voxel to voxel as Amanatides and Woo do.
+//
+// A ray crosses a lattice's planes at alphas that are evenly spaced on each axis. From where it enters, at t_enter, each step
+// goes to the nearest of the three next planes and into the voxel behind. Rays are walked a tile at a time, all lanes in
+// step; a lane that has arrived takes steps of no length. Everything is set up in double and walked in REAL, in a measure of
+// alpha, t, that is 0 where the walk begins and 1 where it ends: rounding is relative to the way through the lattice,
+// however far away the source is.
+//
+// Compiled once for every level of processor and for float and double.
+
+#include "lanes.h"
+#include "kernels.h"
+
+#define NEVER 1e30 // t of a plane that is never crossed
+#define SNAP 1e-9  // as in rays.py: a ray this close to a plane lies in it
+
+// Some tiles take turns of some steps. Tiles side by side then read the same part of the volume at about the same time. While
+// the others have their turns, the voxels of a tile's next turn come from memory: each step sends for the one so far ahead.
+#define TILES 64
+#define TURN 24
+
+enum { FORWARD, BACKPROJECT, BY_ENDS, BY_MU };
+
+// A tile's way through a lattice.
+typedef struct {
+    F t_first[3], t_step[3]; // plane k of those ahead is crossed at t_first + k t_step
+    F k[3];                  // number of the next plane
+    I stride[3], voxel;      // what crossing a plane adds to the voxel's index
+    F t_enter, t_exit;
+    int64_t ahead;      // what TURN steps add to the voxel's index
+    I into[3], out[3];  // the axis of the face by which rays enter and leave
+} Way;
+
+typedef struct {
+    Way way, mu_way;
+    F t, sum, left; // left: what attenuation has left of a ray
+    F value, length; // the ray's value; mm of a t of 1
+    F behind, passed; // of the integral, what lies behind t; of the depth, what lies before
+    F f, mu, by_length, jumps[3], moments[3], mu_jumps[3], mu_moments[3]; // for derivatives, see `walk`
+    D begin, span, mm; // alpha where t is 0, and of a t of 1; mm of the whole ray
+    int64_t steps, wide;
+} Tile;
+
+// ---- Rays
+
+typedef struct {
+    D start[3], direction[3], mu_start[3], mu_direction[3], mm;
+    B real; // not beyond the last ray
+} Rays;
+
+// One axis of rays to the points (line, ray) of a fan, which lie in a plane of voxel faces where they nearly do.
+INLINE void aim(const double fan[4][3], int a, D line, D ray, D *start, D *direction) {
+    const D from = fan[0][a], to = ray * fan[3][a] + (line * fan[2][a] + fan[1][a]), plane = rounded(from);
+    const B in_plane = (ABS(from - plane) <= (D)SNAP) & (ABS(to - plane) <= (D)SNAP);
+    *start = in_plane ? plane : from;
+    *direction = (in_plane | (ABS(to - *start) <= (D)SNAP)) ? (D)0 : to - *start;
+}
+
+INLINE void aim_fan(const Fan *fan, D number, const int own, Rays *r) {
+    const D line = whole((number + 0.5) * (1.0 / fan->rays)), ray = number - line * fan->rays;
+    D squared = 0;
+    EACH_AXIS(a) {
+        aim(fan->volume, a, line, ray, &r->start[a], &r->direction[a]);
+        if (own) aim(fan->mu, a, line, ray, &r->mu_start[a], &r->mu_direction[a]);
+        const D mm = ray * fan->world[2][a] + (line * fan->world[1][a] + fan->world[0][a]);
+        squared += mm * mm;
+    }
+    r->mm = __builtin_elementwise_sqrt(squared);
+}
+
+INLINE void take_listed(const RayList *list, const int64_t first, const int own, Rays *r) {
+    EACH_LANE(i) {
+        const int64_t n = first + i < list->count ? first + i : list->count - 1;
+        EACH_AXIS(a) {
+            r->start[a][i] = list->starts[a * list->count + n];
+            r->direction[a][i] = list->directions[a * list->count + n];
+            if (own) r->mu_start[a][i] = list->mu_starts[a * list->count + n];
+            if (own) r->mu_direction[a][i] = list->mu_directions[a * list->count + n];
+        }
+        r->mm[i] = list->lengths[n];
+    }
+}
+
+// ---- The way through a lattice
+
+// Alpha where rays enter and leave a lattice, in all and axis by axis. Where they miss it, enter >= leave.
+INLINE void clip(const Lattice *lattice, const D start[3], const D direction[3], D *enter, D *leave, D in[3], D out[3]) {
+    *enter = 0, *leave = 1;
+    EACH_AXIS(a) {
+        const D n = lattice->n[a];
+        const B parallel = direction[a] == (D)0, within = (start[a] >= (D)0) & (start[a] < n);
+        const D inverse = 1 / (parallel ? (D)1 : direction[a]), low = -start[a] * inverse, high = (n - start[a]) * inverse;
+        in[a] = parallel ? (within ? (D)-NEVER : (D)NEVER) : MIN(low, high);
+        out[a] = parallel ? (within ? (D)NEVER : (D)-NEVER) : MAX(low, high);
+        *enter = MAX(*enter, in[a]);
+        *leave = MIN(*leave, out[a]);
+    }
+}
+
+// The way from alpha `enter` on, where t is 0 at `begin` and 1 after `span`. Returns how many planes are crossed at most.
+//
+// Why a voxel's index never leaves the lattice: from the first voxel, `room` planes can be crossed. Plane k, counted from 0,
+// is crossed at fl(t_first + k t_step), which does not fall with k, for rounding keeps order, and only at a t of at most t_exit,
+// which is below fl(t_first + room t_step): so k < room. The margin covers that this may be rounded once here, twice there.
+INLINE D set_out(Way *way, const Lattice *lattice, const D start[3], const D direction[3], B hits, D enter, D begin, D span) {
+    D crossings = 0, crossed[3];
+    const D per_span = 1 / span;
+    way->voxel = 0;
+    way->t_exit = 1;
+    int64_t stride = 1;
+    UNROLLED for (int a = 2; a >= 0; stride *= lattice->n[a--]) {
+        const D last = lattice->n[a] - 1;
+        const D voxel = whole(MAX(MIN(enter * direction[a] + start[a], last), (D)0));
+        const B up = direction[a] > (D)0, crosses = hits & (direction[a] != (D)0);
+        const D inverse = 1 / (crosses ? direction[a] : (D)1), room = up ? last - voxel : voxel;
+        const D t_first = ((voxel + (up ? (D)1 : (D)0) - start[a]) * inverse - begin) * per_span;
+        const D t_step = ABS(inverse) * per_span;
+        crossed[a] = crosses ? whole(MAX(MIN((1 - t_first) / t_step + 1, room), (D)0)) : (D)0;
+        crossings += crossed[a];
+        way->t_first[a] = AS(F, crosses ? MAX(MIN(t_first, (D)NEVER), (D)-NEVER) : (D)NEVER);
+        way->t_step[a] = AS(F, crosses ? MIN(t_step, (D)NEVER) : (D)0);
+        way->k[a] = 0;
+        way->stride[a] = AS(I, up ? (D)stride : (D)-stride);
+        way->voxel += AS(I, voxel) * (I)stride;
+        const F t_wall = MIN(way->t_first[a] + AS(F, room) * way->t_step[a], (F)NEVER);
+        const F margin = MAX(ABS(t_wall) * (F)(sizeof(REAL) == 8 ? 1e-15 : 3e-7), (F)(1 / NEVER));
+        way->t_exit = MIN(way->t_exit, t_wall - margin);
+    }
+    const I nowhere = MIN(lane_numbers(), (I)(stride - 1)); // a voxel of its own, so that lanes do not wait for each other
+    way->voxel = AS(I, hits) ? way->voxel : nowhere;
+    const int middle = LANES / 2;
+    double ahead = 0; // about: it is only sent for
+    EACH_AXIS(a) {
+        const double planes = whole(crossed[a] * (TURN / MAX(crossings, (D)1)) + 0.5)[middle];
+        ahead += planes * (double)way->stride[a][middle];
+    }
+    way->ahead = (int64_t)ahead;
+    return crossings;
+}
+
+// 1 for the axis of a face, the first of them at an edge.
+INLINE void exclusive(I face[3]) {
+    face[1] &= ~face[0];
+    face[2] &= ~(face[0] | face[1]);
+}
+
+// ---- Voxels
+
+// Element i of indices that are never negative: two at a time, for each way out of a vector register costs.
+typedef uint64_t Pairs __attribute__((ext_vector_type(LANES * sizeof(REAL) / 8)));
+#define INDEX(pairs, i) (sizeof(REAL) == 8 ? pairs[i] : (i) % 2 ? pairs[(i) / 2] >> 32 : pairs[(i) / 2] & 0xffffffff)
+
+INLINE F gather(const REAL *voxels, I index) {
+    const Pairs pairs = (Pairs)index;
+    F values;
+    EACH_LANE(i) values[i] = voxels[INDEX(pairs, i)];
+    return values;
+}
+
+// Lanes in an order in which neighbours, which may add to the same voxel, do not follow each other.
+INLINE void scatter_add(REAL *voxels, I index, F values) {
+    volatile I in_memory = index; // whence single lanes come fastest
+    EACH_LANE(j) {
+        const int i = j * (LANES / 2 + 1) % LANES;
+        voxels[((volatile typeof(index[0]) *)&in_memory)[i]] += values[i];
+    }
+}
+
+// Send for what is some way ahead of the outer lanes, and of some between where they are far apart.
+INLINE void prefetch(const REAL *voxels, I index, const Way *way, int64_t wide, const int writes) {
+    const Pairs pairs = (Pairs)index;
+    const REAL *later = voxels + way->ahead;
+#define FETCH(i) (writes ? __builtin_prefetch(later + INDEX(pairs, i), 1) : __builtin_prefetch(later + INDEX(pairs, i)))
+    FETCH(0);
+    FETCH(LANES - 1);
+    if (wide) UNROLLED for (int i = 5; i < (int)LANES - 1; i += 5) FETCH(i);
+}
+
+// ---- Attenuation: what exp(-depth) does over a segment. Series serve thin segments, as nearly all are.
+
+#define THIN ((REAL)0.25)
+#define TERMS (sizeof(REAL) == 8 ? 12 : 6)
+
+// The mean of exp(-s) for s from 0 to depth.
+INLINE F mean_left(F depth) {
+    F mean = 1;
+    UNROLLED for (int n = TERMS; n > 1; n--) mean = 1 - depth * mean * (F)(1.0 / n);
+    const I thick = depth > (F)THIN;
+    if (ANY(thick)) EACH_LANE(i) if (thick[i]) mean[i] = (REAL)(-__builtin_expm1(-depth[i]) / depth[i]);
+    return mean;
+}
+
+// The integral of s exp(-s) for s from 0 to depth, by depth^2: 1/2 for a depth of 0. `mean` is that of exp(-s).
+INLINE F mean_lag(F depth, F mean) {
+    F lag = (F)0.5;
+    UNROLLED for (int n = TERMS; n > 0; n--) lag = (F)0.5 - depth * lag * (F)((n + 1.0) / (n * (n + 2.0)));
+    return depth > (F)THIN ? (mean - 1 + depth * mean) / depth : lag;
+}
+
+// ---- Tiles
+
+INLINE void begin(Tile *tile, const Job *job, const Rays *r, const int task, const int attenuation) {
+    const int own = attenuation == OWN_LATTICE;
+    Way *way = &tile->way, *mu_way = &tile->mu_way;
+    D enter, leave, in[3], out[3], mu_enter, mu_leave, mu_in[3], mu_out[3], crossings;
+    clip(&job->volume, r->start, r->direction, &enter, &leave, in, out);
+    B hits = (enter < leave) & r->real, meets = hits;
+    D begins = hits ? enter : (D)0;
+    if (own) {
+        clip(&job->mu, r->mu_start, r->mu_direction, &mu_enter, &mu_leave, mu_in, mu_out);
+        meets &= (mu_enter < mu_leave) & (mu_enter < leave);
+        begins = meets ? MIN(begins, mu_enter) : begins;
+    }
+    const D span = hits ? leave - begins : (D)1;
+    crossings = set_out(way, &job->volume, r->start, r->direction, hits, hits ? enter : (D)0, begins, span);
+    const F t_end = MIN(way->t_exit, (F)1);
+    hits &= AS(B, t_end > (F)0);
+    way->t_exit = AS(I, hits) ? t_end : (F)0;
+    tile->begin = begins;
+    tile->span = hits ? span / AS(D, t_end) : (D)0; // the margin of t_exit is no part of the way
+    tile->mm = r->mm;
+    tile->length = AS(F, tile->span * r->mm);
+    tile->t = 0;
+    if (own) {
+        crossings += 4 + set_out(mu_way, &job->mu, r->mu_start, r->mu_direction, meets, meets ? mu_enter : (D)0, begins, span);
+        way->t_enter = AS(F, hits ? (enter - begins) / span : (D)0);
+        mu_way->t_enter = AS(I, meets) ? AS(F, (mu_enter - begins) / span) : (F)NEVER;
+        mu_way->t_exit = AS(I, meets) ? MIN(mu_way->t_exit, AS(F, (mu_leave - begins) / span)) : (F)0;
+    }
+    if (task == BY_ENDS) EACH_AXIS(a) {
+        way->into[a] = AS(I, hits & (enter > (D)0) & (in[a] == enter));
+        way->out[a] = AS(I, hits & (leave < (D)1) & (out[a] == leave));
+        if (own) mu_way->into[a] = AS(I, meets & (mu_enter > (D)0) & (mu_in[a] == mu_enter));
+        if (own) mu_way->out[a] = AS(I, meets & (mu_leave < (D)1) & (mu_out[a] == mu_leave));
+    }
+    if (task == BY_ENDS) exclusive(way->into), exclusive(way->out);
+    if (task == BY_ENDS && own) exclusive(mu_way->into), exclusive(mu_way->out);
+    const D middle = (enter + leave) * 0.5 * r->direction[2] + r->start[2];
+    const double apart = middle[LANES - 1] - middle[0]; // along the axis on which neighbours are neighbours in memory
+    tile->wide = apart > 16 || apart < -16;
+    const D steps = hits ? crossings + 1 : (D)0;
+    tile->steps = (int64_t)__builtin_reduce_max(steps);
+}
+
+// The next plane of each axis, at t, and what follows it. It is made anew from its number, so that rounding never piles up, and
+// ahead of need, so that a step does not wait for it.
+#define NEXT_PLANE(way, a) ((way).k[a] * (way).t_step[a] + (way).t_first[a])
+
+// Cross planes: their axes' next planes and the voxel behind.
+INLINE void cross(Way *way, F next[3], const I crossed[3]) {
+    EACH_AXIS(a) {
+        const F after = (way->k[a] + 1) * way->t_step[a] + way->t_first[a];
+        way->k[a] = ADD_WHERE(crossed[a], way->k[a], (F)1);
+        next[a] = crossed[a] ? after : next[a];
+        way->voxel = ADD_WHERE(crossed[a], way->voxel, way->stride[a]);
+    }
+}
+
+// What moving planes does to an integral: each plane by the jump of the value there, times what its t does. Plane k is crossed
+// at alpha = (k - s) / d, d the ray from s to its end e, so d alpha / ds = (alpha - 1) / d and d alpha / de = -alpha / d. Of
+// each axis the sums of its jumps and of jumps times t are therefore all that is needed.
+INLINE void add_jump(F jumps[3], F moments[3], I plane[3], F jump, F t) {
+    exclusive(plane);
+    EACH_AXIS(a) {
+        jumps[a] = ADD_WHERE(plane[a], jumps[a], jump);
+        moments[a] = ADD_WHERE(plane[a], moments[a], jump * t);
+    }
+}
+
+// Some steps of a tile. A segment goes from t to t_next through a voxel of the volume, where the value is f, and one of mu.
+INLINE void walk(Tile *tile, const Job *job, int64_t steps, const int task, const int attenuation) {
+    const int own = attenuation == OWN_LATTICE, same = attenuation == SAME_LATTICE, weaker = own || same;
+    REAL *const voxels = job->volume.voxels, *const mus = job->mu.voxels, *const gradient = job->gradient;
+    Tile w = *tile;
+    Way *const v = &w.way, *const m = &w.mu_way;
+    F next[3], mu_next[3];
+    EACH_AXIS(a) next[a] = NEXT_PLANE(*v, a);
+    if (own) EACH_AXIS(a) mu_next[a] = NEXT_PLANE(*m, a);
+    for (; steps > 0; steps--) {
+        F t_next = MIN(MIN(next[0], next[1]), MIN(next[2], v->t_exit));
+        I inside = -1, inside_mu = -1;
+        if (own) {
+            inside = w.t >= v->t_enter;
+            inside_mu = (w.t >= m->t_enter) & (w.t < m->t_exit);
+            t_next = inside ? t_next : v->t_enter;
+            const F t_mu = MIN(MIN(mu_next[0], mu_next[1]), MIN(mu_next[2], m->t_exit));
+            t_next = MIN(t_next, inside_mu ? t_mu : w.t < m->t_enter ? m->t_enter : (F)NEVER);
+            t_next = MAX(MIN(t_next, v->t_exit), w.t); // not back: a plane may by rounding lie a hair behind
+        }
+        const I at = v->voxel, at_mu = own ? m->voxel : at;
+        prefetch(voxels, at, v, w.wide, task == BACKPROJECT);
+        if (weaker) prefetch(task == BY_MU ? gradient : mus, at_mu, own ? m : v, w.wide, task == BY_MU);
+        F f = task == BY_ENDS ? w.f : task == BACKPROJECT ? w.value : gather(voxels, at);
+        if (own) f = inside ? f : (F)0;
+        const F part = t_next - w.t; // of the way
+        F seen = part, depth = 0, mean = 1, mu = 0;
+        if (weaker) {
+            mu = task == BY_ENDS ? w.mu : gather(mus, at_mu);
+            if (own) mu = inside_mu ? mu : (F)0;
+            depth = mu * part * w.length;
+            mean = mean_left(depth);
+            seen = part * w.left * mean;
+        }
+        if (task == FORWARD) w.sum += seen * f;
+        if (task == BACKPROJECT) scatter_add(voxels, at, seen * f);
+        if (task == BY_MU) { // more mu weakens what lies behind the segment, and of its own part what has passed on average
+            w.behind -= seen * f;
+            const F within = f * w.left * part * mean_lag(depth, mean);
+            const F change = w.value * part * (w.behind + within);
+            scatter_add(gradient, at_mu, own ? (inside_mu ? change : (F)0) : change);
+        }
+        if (task == BY_ENDS && weaker) {
+            w.by_length += f * w.left * part * (w.passed * mean + depth * mean_lag(depth, mean));
+            w.passed += depth;
+            w.behind -= seen * f;
+        } else if (task == BY_ENDS) w.sum += seen * f;
+        if (weaker) w.left -= w.left * depth * mean;
+        I crossed[3], mu_crossed[3];
+        EACH_AXIS(a) crossed[a] = next[a] <= t_next;
+        if (own) EACH_AXIS(a) crossed[a] &= inside, mu_crossed[a] = (mu_next[a] <= t_next) & inside_mu;
+        cross(v, next, crossed);
+        if (own) cross(m, mu_next, mu_crossed);
+        if (task == BY_ENDS) {
+            I enters = ~inside & (t_next >= v->t_enter), leaves = 0;
+            if (own) EACH_AXIS(a) crossed[a] |= enters & v->into[a];
+            w.f = gather(voxels, v->voxel);
+            if (own) w.f = (inside | enters) ? w.f : (F)0;
+            add_jump(w.jumps, w.moments, crossed, weaker ? w.left * (f - w.f) : f - w.f, t_next);
+            if (own) {
+                enters = (w.t < m->t_enter) & (t_next >= m->t_enter), leaves = inside_mu & (t_next >= m->t_exit);
+                EACH_AXIS(a) mu_crossed[a] |= (enters & m->into[a]) | (leaves & m->out[a]);
+            }
+            if (weaker) w.mu = gather(mus, own ? m->voxel : v->voxel);
+            if (own) w.mu = ((inside_mu & ~leaves) | enters) ? w.mu : (F)0;
+            if (weaker) add_jump(w.mu_jumps, w.mu_moments, own ? mu_crossed : crossed, w.behind * (mu - w.mu), t_next);
+        }
+        w.t = t_next;
+    }
+    *tile = w;
+}
+
+// ---- A task: all rays of a job
+
+// What a tile begins with, at t = 0.
+INLINE void start(Tile *tile, const Job *job, const int64_t places[], const int task, const int attenuation) {
+    const REAL *values = job->values, *integrals = job->integrals;
+    const int own = attenuation == OWN_LATTICE, weaker = attenuation != NO_MU;
+    tile->sum = tile->passed = tile->by_length = tile->value = tile->behind = 0;
+    tile->left = 1;
+    if (task == BACKPROJECT || task == BY_MU) {
+        EACH_LANE(i) if (places[i] >= 0) tile->value[i] = values[places[i]];
+        tile->value *= task == BY_MU ? -tile->length * tile->length : tile->length;
+        if (!ANY(tile->value != (F)0)) tile->steps = 0;
+    }
+    if (task == BY_MU || (task == BY_ENDS && weaker)) {
+        EACH_LANE(i) if (places[i] >= 0) tile->behind[i] = integrals[places[i]];
+        tile->behind = tile->length > (F)0 ? tile->behind / tile->length : (F)0;
+    }
+    if (task != BY_ENDS) return;
+    tile->f = tile->mu = 0;
+    if (tile->steps) {
+        tile->f = gather(job->volume.voxels, tile->way.voxel);
+        if (own) tile->f = tile->way.t_enter <= (F)0 ? tile->f : (F)0;
+        if (weaker) tile->mu = gather(job->mu.voxels, own ? tile->mu_way.voxel : tile->way.voxel);
+        if (own) tile->mu = tile->mu_way.t_enter <= (F)0 ? tile->mu : (F)0;
+    }
+    EACH_AXIS(a) {
+        tile->jumps[a] = tile->way.into[a] ? -tile->f : (F)0;
+        if (weaker) tile->mu_jumps[a] = (own ? tile->mu_way.into[a] : tile->way.into[a]) ? -tile->mu * tile->behind : (F)0;
+        tile->moments[a] = tile->mu_moments[a] = 0;
+    }
+}
+
+// Derivatives by start and end of rays, rows of `n` numbers.
+INLINE void put_by_ends(double *rows, int64_t n, int some, const Tile *t, const F jumps[3], const F moments[3], const D direction[3]) {
+    EACH_AXIS(a) {
+        const D inverse = direction[a] == (D)0 ? (D)0 : 1 / direction[a];
+        const D jump = AS(D, jumps[a]), moment = AS(D, moments[a]) * t->span + jump * t->begin;
+        const D by_start = (moment - jump) * inverse, by_end = -moment * inverse;
+        for (int i = 0; i < some; i++) rows[a * n + i] = by_start[i], rows[(3 + a) * n + i] = by_end[i];
+    }
+}
+
+// What a tile's walk comes to. `rows` are the derivatives of its `some` rays, out of `n`.
+INLINE void finish(Tile *t, const Job *job, const Rays *r, const int64_t places[], double *rows, int64_t n, int some, const int task,
+                   const int attenuation) {
+    const int own = attenuation == OWN_LATTICE, weaker = attenuation != NO_MU;
+    REAL *values = job->values;
+    const REAL *integrals = job->integrals;
+    if (task == FORWARD) {
+        const D integral = AS(D, t->sum) * t->span * t->mm;
+        for (int i = 0; i < some; i++) values[places[i]] = (REAL)integral[i];
+    }
+    if (task == BY_ENDS) {
+        const D per_mm = t->mm > (D)0 ? 1 / t->mm : (D)0, sum = AS(D, t->sum) * t->span;
+        for (int i = 0; i < some; i++) rows[i] = weaker ? integrals[places[i]] * per_mm[i] : sum[i];
+        const F last = weaker ? t->left * t->f : t->f; // the jump at the face by which rays leave
+        EACH_AXIS(a) {
+            t->jumps[a] += t->way.out[a] ? last : (F)0;
+            t->moments[a] += t->way.out[a] ? last * t->t : (F)0;
+            t->mu_jumps[a] *= -t->length;
+            t->mu_moments[a] *= -t->length;
+        }
+        put_by_ends(rows + n, n, some, t, t->jumps, t->moments, r->direction);
+        if (weaker) {
+            put_by_ends(rows + 7 * n, n, some, t, t->mu_jumps, t->mu_moments, own ? r->mu_direction : r->direction);
+            const D by_length = -AS(D, t->by_length) * t->span * per_mm;
+            for (int i = 0; i < some; i++) rows[13 * n + i] = by_length[i];
+        }
+    }
+}
+
+// Lanes of the rays from `first` on, and where their values are: -1 beyond the last ray.
+INLINE void aim_tile(const Job *job, const Fan *fan, int64_t count, int64_t first, const int own, Rays *r, int64_t places[]) {
+    D number;
+    EACH_LANE(i) {
+        const int64_t ray = first + i, line = fan ? ray / fan->rays : 0;
+        places[i] = ray >= count ? -1 : fan ? fan->place + line * fan->line_stride + (ray - line * fan->rays) * fan->ray_stride : ray;
+        number[i] = (double)ray;
+    }
+    if (fan) aim_fan(fan, number, own, r);
+    else take_listed(&job->list, first, own, r);
+    r->real = number < (D)count;
+}
+
+INLINE void trace(const Job *job, const int task, const int attenuation) {
+    const int own = attenuation == OWN_LATTICE;
+    Tile tiles[TILES];
+    int64_t places[TILES][LANES], n = job->list.count, row = 0;
+    for (int64_t f = 0; f < job->n_fans; f++) n += job->fans[f].lines * job->fans[f].rays;
+    for (int64_t f = 0; f < (job->n_fans ? job->n_fans : 1); f++) {
+        const Fan *fan = job->n_fans ? job->fans + f : 0;
+        const int64_t count = fan ? fan->lines * fan->rays : job->list.count;
+        for (int64_t first = 0; first < count; first += TILES * LANES) {
+            Rays rays;
+            int64_t some = (count - first + LANES - 1) / LANES, longest = 0;
+            some = some < TILES ? some : TILES;
+            for (int i = 0; i < some; i++) {
+                aim_tile(job, fan, count, first + i * LANES, own, &rays, places[i]);
+                begin(tiles + i, job, &rays, task, attenuation);
+                start(tiles + i, job, places[i], task, attenuation);
+                longest = tiles[i].steps > longest ? tiles[i].steps : longest;
+            }
+            for (int64_t done = 0; done < longest; done += TURN)
+                for (int i = 0; i < some; i++) {
+                    const int64_t left = tiles[i].steps - done;
+                    if (left > 0) walk(tiles + i, job, left < TURN ? left : TURN, task, attenuation);
+                }
+            for (int i = 0; i < some; i++) {
+                const int64_t begins = first + i * (int64_t)LANES, left = count - begins;
+                if (task == BY_ENDS) aim_tile(job, fan, count, begins, own, &rays, places[i]); // anew: to keep them takes longer
+                finish(tiles + i, job, &rays, places[i], job->derivatives + row + begins, n, left < (int64_t)LANES ? (int)left : (int)LANES,
+                       task, attenuation);
+            }
+        }
+        row += count;
+    }
+}
+
+#define NAME(task) JOINED(task, LEVEL, REAL)
+#define JOINED(task, level, real) JOINED_(task, level, real)
+#define JOINED_(task, level, real) task##_##level##_##real
+#define KERNEL(name, task)                                                     \
+    void NAME(name)(const Job *job) {                                          \
+        if (job->attenuation == OWN_LATTICE) trace(job, task, OWN_LATTICE);    \
+        else if (job->attenuation == SAME_LATTICE) trace(job, task, SAME_LATTICE); \
+        else trace(job, task, NO_MU);                                          \
+    }
+
+KERNEL(forward, FORWARD)
+KERNEL(backproject, BACKPROJECT)
+KERNEL(differentiate, BY_ENDS)
+KERNEL(differentiate_by_mu, BY_MU)

@@ -1,0 +1,175 @@
+"""Siddon's line integrals in C: the default on a CPU.
+
+The kernels are in `kernels`, compiled for each platform and for the levels of its processors; ``kernels.h`` is the contract.
+They run in the thread that calls, without the GIL: the operator calls them on several. Volumes of float64 are traced in
+float64, all others in float32.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import os
+import sys
+from ctypes import POINTER, Structure, c_char_p, c_double, c_int64, c_void_p
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..errors import InputError
+from .rays import Attenuation, IndexFans, Rays
+
+Array = NDArray[Any]  # of float32 or float64
+
+LEVEL_VARIABLE = "MPHDRR_CPU_LEVEL"
+"""Environment variable that names a lower level of processor, `levels`, than this one's."""
+
+_CONTRACT = 1
+_NAMES = {"win32": "siddon.dll", "darwin": "libsiddon.dylib"}
+_MOST_VOXELS = 2**31 - 1  # their indices are of 32 bits
+_MOST_ALONG = 2**24  # planes that float32 can count
+
+_FAN = np.dtype(
+    [
+        ("volume", float, (4, 3)), ("mu", float, (4, 3)), ("world", float, (3, 3)), ("lines", np.int64), ("rays", np.int64),
+        ("place", np.int64), ("line_stride", np.int64), ("ray_stride", np.int64),
+    ]
+)  # fmt: skip
+
+
+class _Lattice(Structure):
+    _fields_ = [("voxels", c_void_p), ("n", c_int64 * 3)]
+
+
+class _RayList(Structure):
+    _fields_ = [
+        *((name, c_void_p) for name in ("starts", "directions", "mu_starts", "mu_directions", "lengths")),
+        ("count", c_int64),
+    ]
+
+
+class _Job(Structure):
+    _fields_ = [
+        ("is_double", c_int64), ("attenuation", c_int64), ("volume", _Lattice), ("mu", _Lattice),
+        ("fans", c_void_p), ("n_fans", c_int64), ("list", _RayList),
+        ("values", c_void_p), ("integrals", c_void_p), ("derivatives", c_void_p), ("gradient", c_void_p),
+    ]  # fmt: skip
+
+
+def _load() -> ctypes.CDLL:
+    """The library in this package."""
+    path = Path(__file__).with_name("kernels") / _NAMES.get(sys.platform, "libsiddon.so")
+    if not path.is_file():
+        raise ImportError(f"no compiled kernels for this platform: {path.name} is not in {path.parent}")
+    library = ctypes.CDLL(str(path))
+    numbers = (c_int64 * 3)()
+    library.contract(numbers)
+    expected = [_CONTRACT, ctypes.sizeof(_Job), _FAN.itemsize]
+    if list(numbers) != expected:
+        raise ImportError(f"{path} belongs to another version of mphDRR: install it anew")
+    library.best_level.restype, library.level_name.restype = c_int64, c_char_p
+    library.level_name.argtypes = [c_int64]
+    for name in ("forward", "backproject", "differentiate", "differentiate_by_mu"):
+        function = getattr(library, name)
+        function.argtypes, function.restype = [c_int64, POINTER(_Job)], None
+    return library
+
+
+_library = _load()
+
+
+def levels() -> list[str]:
+    """Names of the levels of processor that this one has, the lowest first."""
+    return [_library.level_name(level).decode() for level in range(_library.best_level() + 1)]
+
+
+def _level() -> int:
+    has, asked = levels(), os.environ.get(LEVEL_VARIABLE)
+    if asked and asked not in has:
+        raise ImportError(f"{LEVEL_VARIABLE}={asked}: this processor has {', '.join(has)}")
+    return has.index(asked) if asked else len(has) - 1
+
+
+level = _level()
+"""Of the kernels that are used, an index of `levels`."""
+
+
+def forward(volume: Array, rays: Rays, attenuation: Attenuation | None = None) -> Array:
+    """Line integrals (N,), value x mm, of `volume` (n_x, n_y, n_z) along `rays`, attenuated towards their sources."""
+    values = np.empty(len(rays), volume.dtype)
+    _run(_library.forward, volume, rays, attenuation, values)
+    return values
+
+
+def adjoint(volume: Array, values: Array, rays: Rays, attenuation: Attenuation | None = None) -> None:
+    """Add `values` (N,), each along its ray with the weights of `forward`, to `volume` in place."""
+    _run(_library.backproject, volume, rays, attenuation, values)
+
+
+def derivatives(volume: Array, rays: Rays, attenuation: Attenuation | None = None) -> Array:
+    """What the ends of `rays` do to their integrals (N, 7) or (N, 14), as `backends` describes it."""
+    integrals = None if attenuation is None else forward(volume, rays, attenuation)
+    result = np.empty((7 if attenuation is None else 14, len(rays)))
+    _run(_library.differentiate, volume, rays, attenuation, integrals=integrals, derivatives=result)
+    return result.T
+
+
+def mu_gradient(gradient: Array, volume: Array, values: Array, rays: Rays, attenuation: Attenuation) -> None:
+    """Add to `gradient`, of mu's shape, in place what mu's voxels do to the sum of `values` (N,) times the integrals."""
+    integrals = forward(volume, rays, attenuation)
+    _run(_library.differentiate_by_mu, volume, rays, attenuation, values, integrals=integrals, gradient=gradient)
+
+
+def _run(
+    kernel: Any,
+    volume: Array,
+    rays: Rays,
+    attenuation: Attenuation | None,
+    values: Array | None = None,
+    **others: Array | None,
+) -> None:
+    """Run a kernel on all rays."""
+    mu = None if attenuation is None else attenuation.mu
+    mu_rays = None if attenuation is None else attenuation.rays
+    if values is not None:
+        values = np.ascontiguousarray(values, volume.dtype)
+    job = _Job(
+        is_double=volume.dtype == np.float64,
+        attenuation=0 if mu is None else 1 if mu_rays is None else 2,
+        volume=_lattice(volume),
+        mu=_lattice(volume if mu is None else mu),
+        values=None if values is None else values.ctypes.data,
+        **{name: array.ctypes.data for name, array in others.items() if array is not None},
+    )
+    if isinstance(rays, IndexFans):
+        fans = _fans(rays, mu_rays)
+        job.fans, job.n_fans = fans.ctypes.data, len(fans)
+    else:
+        columns = [rays.starts, rays.directions]
+        columns += columns if mu_rays is None else [mu_rays.starts, mu_rays.directions]
+        listed = [np.ascontiguousarray(column.T) for column in (*columns, rays.lengths)]
+        job.list = _RayList(*(column.ctypes.data for column in listed), len(rays))
+    kernel(level, job)
+
+
+def _fans(rays: IndexFans, mu_rays: Rays | None) -> Array:
+    """Fans as the kernels take them, their values one after the other."""
+    fans = np.zeros(len(rays.table), _FAN)
+    fans["volume"], fans["world"] = rays.table[:, :4], rays.table[:, 5:]
+    fans["world"][:, 0] -= rays.table[:, 4]
+    if mu_rays is not None:
+        fans["mu"] = mu_rays.table[:, :4]
+    fans["lines"], fans["rays"] = rays.shape
+    fans["place"] = np.arange(len(fans)) * (rays.shape[0] * rays.shape[1])
+    fans["line_stride"], fans["ray_stride"] = rays.shape[1], 1
+    return fans
+
+
+def _lattice(voxels: Array) -> _Lattice:
+    if voxels.size > _MOST_VOXELS or max(voxels.shape) > _MOST_ALONG:
+        shape = " x ".join(map(str, voxels.shape))
+        raise InputError(
+            f"cpu: a volume of {shape} voxels, but there can be at most {_MOST_VOXELS}, and {_MOST_ALONG} along an axis"
+        )
+    return _Lattice(voxels.ctypes.data, voxels.shape)

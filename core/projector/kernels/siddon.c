@@ -181,12 +181,13 @@ INLINE void prefetch(const REAL *voxels, I index, const Way *way, int64_t wide, 
 #define THIN ((REAL)0.25)
 #define TERMS (sizeof(REAL) == 8 ? 12 : 6)
 
-// The mean of exp(-s) for s from 0 to depth.
+// The mean of exp(-s) for s from 0 to depth. That for twice a depth d follows from that for d: mean (1 + exp(-d)) / 2.
 INLINE F mean_left(F depth) {
+    int halved = 0;
+    for (; ANY(depth > (F)THIN) && halved < 1100; halved++) depth *= (F)0.5;
     F mean = 1;
     UNROLLED for (int n = TERMS; n > 1; n--) mean = 1 - depth * mean * (F)(1.0 / n);
-    const I thick = depth > (F)THIN;
-    if (ANY(thick)) EACH_LANE(i) if (thick[i]) mean[i] = (REAL)(-__builtin_expm1(-depth[i]) / depth[i]);
+    for (; halved > 0; halved--, depth *= 2) mean *= 1 - depth * mean * (F)0.5;
     return mean;
 }
 

@@ -57,29 +57,37 @@ def this_platform() -> str | None:
     return name if name in PLATFORMS else None
 
 
+def zig(*arguments: str | Path, cwd: str | Path) -> None:
+    """Run the compiler; stop where it fails, after its own words."""
+    if subprocess.run((sys.executable, "-m", "ziglang", *arguments), cwd=cwd).returncode != 0:
+        raise SystemExit("the kernels could not be compiled: the compiler's words are above")
+
+
+def compiled(name: str, folder: str | Path, flags: tuple[str, ...] = FLAGS) -> list[str]:
+    """Give the names of the objects of platform `name`'s library, compiled into `folder`."""
+    made_for = PLATFORMS[name]
+    calls: list[tuple[str, str, tuple[str, ...]]] = [("levels.o", "levels.c", ())]
+    for level, options in enumerate(made_for.levels):
+        for real in ("float", "double"):
+            calls.append((f"{real}{level}.o", "siddon.c", (*options, f"-DLEVEL={level}", f"-DREAL={real}")))
+
+    def compile_one(call: tuple[str, str, tuple[str, ...]]) -> str:
+        made, source, options = call
+        zig("cc", "-target", made_for.target, *flags, *options, "-c", KERNELS / source, "-o", made, cwd=folder)
+        return made
+
+    with ThreadPoolExecutor(os.cpu_count()) as pool:
+        return list(pool.map(compile_one, calls))
+
+
 def build(name: str, folder: Path) -> Path:
-    """Give the library of platform `name`, compiled into `folder`, which is made, or stop after the compiler's words.
+    """Give the library of platform `name`, compiled into `folder`, which is made.
 
     The kernels call no C library and none is linked, only the compiler's own functions: to make one of Windows ready takes
     Zig two minutes.
     """
     made_for = PLATFORMS[name]
-    zig = (sys.executable, "-m", "ziglang")
-    calls = [("levels.o", "levels.c", ())]
-    for level, flags in enumerate(made_for.levels):
-        for real in ("float", "double"):
-            calls.append((f"{real}{level}.o", "siddon.c", (*flags, f"-DLEVEL={level}", f"-DREAL={real}")))
-    with tempfile.TemporaryDirectory() as objects, ThreadPoolExecutor(os.cpu_count()) as pool:
-
-        def run(*arguments: str | Path) -> None:
-            if subprocess.run((*zig, *arguments), cwd=objects).returncode != 0:
-                raise SystemExit(f"the kernels could not be compiled for {name}: the compiler's words are above")
-
-        def compiled(made: str, source: str, options: tuple[str, ...]) -> str:
-            run("cc", "-target", made_for.target, *FLAGS, *options, "-c", KERNELS / source, "-o", made)
-            return made
-
-        made = pool.map(lambda call: compiled(*call), calls)
+    with tempfile.TemporaryDirectory() as objects:
         options = (
             "-dynamic",
             "-fcompiler-rt",
@@ -89,7 +97,7 @@ def build(name: str, folder: Path) -> Path:
             "--name",
             "siddon",
         )
-        run("build-lib", "-target", made_for.target, *options, *made)
+        zig("build-lib", "-target", made_for.target, *options, *compiled(name, objects), cwd=objects)
         folder.mkdir(parents=True, exist_ok=True)
         # Not written over: a process may have the one there loaded.
         new = folder / (made_for.library + ".new")

@@ -1,6 +1,7 @@
-"""Build the extension: one zip per platform in dist/, validated, with every wheel it needs, as `make dist` does.
+"""Build what is given away, in dist/, as `make dist` does: the package's wheels and the extension's zips, for each platform.
 
-Run by an environment with bpy, whose own command-line tool builds and validates; no Blender application is needed.
+The C kernels are compiled for all of them here. A zip holds every wheel that it needs. Run by an environment with bpy, whose
+own command-line tool builds and validates; no Blender application is needed.
 """
 
 from __future__ import annotations
@@ -13,15 +14,16 @@ import subprocess
 import sys
 import tempfile
 import tomllib
-import zipfile
 from dataclasses import dataclass
 from pathlib import Path
+
+import build_kernels
 
 ROOT = Path(__file__).resolve().parents[1]
 MANIFEST = ROOT / "blender_manifest.toml"
 
-# Pinned, so that a zip can be built again. numpy is Blender's own: 1.26 in 4.5, 2.2 or later in 5.2; the bounds of
-# numba (1.22 to 2.5) and h5py (1.21.2 on) hold both.
+# Pinned, so that a zip can be built again. numpy is Blender's own: 1.26 in 4.5, 2.2 or later in 5.2; the bounds of h5py
+# (1.21.2 on) hold both.
 PURE = (
     "et-xmlfile==2.0.0",
     "importlib-resources==7.1.0",
@@ -34,18 +36,15 @@ PURE = (
     "typing-extensions==4.16.0",
 )
 STABLE_ABI = ("psutil==7.2.2",)
-COMPILED = ("h5py==3.16.0", "llvmlite==0.50.0", "numba==0.68.1", "pillow==13.0.0")
-# The last numba with wheels for Intel Macs; it takes numpy from 1.22 to 2.3.
-COMPILED_INTEL_MAC = ("h5py==3.16.0", "llvmlite==0.45.1", "numba==0.62.1", "pillow==13.0.0")
+COMPILED = ("h5py==3.16.0", "pillow==13.0.0")
 
 
 @dataclass(frozen=True)
 class Platform:
-    """What pip is asked for: wheel tags, Python versions and packages."""
+    """What pip is asked for: wheel tags and Python versions."""
 
     tags: tuple[str, ...]
     pythons: tuple[str, ...] = ("3.11", "3.13")  # Blender 4.5 and 5.0; 5.1 and later
-    compiled: tuple[str, ...] = COMPILED
 
 
 PLATFORMS = {
@@ -57,7 +56,7 @@ PLATFORMS = {
     "windows-x64": Platform(("win_amd64",)),
     "macos-arm64": Platform(("macosx_12_0_arm64", "macosx_11_0_arm64")),
     # Blender 4.5 is the last for Intel Macs.
-    "macos-x64": Platform(("macosx_10_15_x86_64", "macosx_10_9_x86_64"), ("3.11",), COMPILED_INTEL_MAC),
+    "macos-x64": Platform(("macosx_10_15_x86_64", "macosx_10_9_x86_64"), ("3.11",)),
 }
 
 
@@ -79,40 +78,9 @@ def wheels_for(name: str, folder: Path) -> list[Path]:
     tags = [option for tag in platform.tags for option in ("--platform", tag)]
     wheels = download(folder / "any", PURE)
     wheels += download(folder / name / "abi3", STABLE_ABI, *tags, "--python-version", platform.pythons[0])
-    compiled = []
     for python in platform.pythons:
-        compiled += download(folder / name / python, platform.compiled, *tags, "--python-version", python)
-    return wheels + joined(compiled, folder / name / "joined")
-
-
-def joined(wheels: list[Path], folder: Path) -> list[Path]:
-    """Give `wheels` with those that hold the same files for several Pythons as one, retagged, in `folder`.
-
-    So is llvmlite, a third of a zip each time: what is compiled in it knows no Python, and is loaded by ctypes.
-    """
-    same: dict[frozenset[tuple[str, int]], list[Path]] = {}
-    for wheel in wheels:
-        with zipfile.ZipFile(wheel) as archive:
-            files = frozenset((file.filename, file.CRC) for file in archive.infolist())
-        # Only these two tell for which Python a wheel is.
-        same.setdefault(frozenset(f for f in files if Path(f[0]).name not in ("WHEEL", "RECORD")), []).append(wheel)
-    return [alike[0] if len(alike) == 1 else retagged(alike, folder) for alike in same.values()]
-
-
-def retagged(wheels: list[Path], folder: Path) -> Path:
-    """Give one wheel in `folder` for all the Pythons that `wheels` are for, and any ABI."""
-    name, version, _, _, platform = wheels[0].stem.split("-")
-    pythons = ".".join(sorted(wheel.stem.split("-")[2] for wheel in wheels))
-    target = folder / f"{name}-{version}-{pythons}-none-{platform}.whl"
-    if not target.is_file():
-        folder.mkdir(exist_ok=True)
-        with tempfile.TemporaryDirectory(dir=folder) as made:
-            copy = Path(made) / wheels[0].name
-            link_or_copy(wheels[0], copy)
-            tags = ("--python-tag", pythons, "--abi-tag", "none", "--remove")
-            subprocess.run((sys.executable, "-m", "wheel", "tags", *tags, copy), check=True, stdout=subprocess.DEVNULL)
-            next(Path(made).iterdir()).replace(target)
-    return target
+        wheels += download(folder / name / python, COMPILED, *tags, "--python-version", python)
+    return wheels
 
 
 def source_files() -> list[Path]:
@@ -122,34 +90,47 @@ def source_files() -> list[Path]:
     return [Path(name) for name in names if name and (ROOT / name).is_file()]
 
 
-def stage(folder: Path, platforms: list[str], wheels: list[Path]) -> None:
-    """Lay out the extension's source in `folder`: the tree, the wheels, and the manifest that lists them."""
+def stage(folder: Path) -> None:
+    """Lay out the tree in `folder`."""
     for name in source_files():
         (folder / name).parent.mkdir(parents=True, exist_ok=True)
         shutil.copyfile(ROOT / name, folder / name)
-    (folder / "wheels").mkdir()
+
+
+def build_wheel(name: str, tree: Path, output: Path) -> None:
+    """Build the package's wheel for platform `name` from a copy of the tree."""
+    options = ("--no-build-isolation", "--no-deps", "-qq", "--disable-pip-version-check", "-w", output)
+    asked = f"--config-settings=--build-option=--plat-name={name}"
+    subprocess.run((sys.executable, "-m", "pip", "wheel", *options, asked, tree), check=True)
+
+
+def build_zip(name: str, tree: Path, output: Path) -> Path:
+    """Build the extension's zip for platform `name` from a copy of the tree, which gets what the zip has beside it."""
+    build_kernels.build(name, tree / build_kernels.KERNELS.relative_to(ROOT))
+    wheels = wheels_for(name, ROOT / "wheels")
+    (tree / "wheels").mkdir()
     for wheel in wheels:
-        link_or_copy(wheel, folder / "wheels" / wheel.name)
-    given = MANIFEST.read_text(encoding="utf-8")
+        shutil.copyfile(wheel, tree / "wheels" / wheel.name)
+    manifest = tree / MANIFEST.name
+    given = manifest.read_text(encoding="utf-8")
     declared = f"platforms = {toml_list(tomllib.loads(given)['platforms'])}\n"
     if declared not in given:
         raise SystemExit(f"{MANIFEST.name}: expected the platforms on one line, as in {declared.strip()}")
-    listed = f"platforms = {toml_list(platforms)}\nwheels = [\n"
+    listed = f"platforms = {toml_list([name])}\nwheels = [\n"
     listed += "".join(f'  "./wheels/{wheel.name}",\n' for wheel in wheels) + "]\n"
-    (folder / MANIFEST.name).write_text(given.replace(declared, listed), encoding="utf-8")
+    manifest.write_text(given.replace(declared, listed), encoding="utf-8")
+    tool = (sys.executable, extension_tool())
+    options = ("--source-dir", tree, "--output-dir", output, "--split-platforms")  # so that names tell the platform
+    subprocess.run((*tool, "build", *options), check=True, stdout=subprocess.DEVNULL)
+    version = tomllib.loads(given)["version"]
+    file = output / f"mphdrr-{version}-{name.replace('-', '_')}.zip"
+    subprocess.run((*tool, "validate", file), check=True, stdout=subprocess.DEVNULL)
+    return file
 
 
 def toml_list(values: list[str]) -> str:
     """Write `values` as Blender's manifests do."""
     return "[" + ", ".join(f'"{value}"' for value in values) + "]"
-
-
-def link_or_copy(source: Path, target: Path) -> None:
-    """Link, or copy where the file system cannot: wheels weigh hundreds of megabytes."""
-    try:
-        os.link(source, target)
-    except OSError:
-        shutil.copyfile(source, target)
 
 
 def extension_tool() -> Path:
@@ -161,24 +142,23 @@ def extension_tool() -> Path:
 
 
 def main() -> None:
-    """Build and validate."""
+    """Build for all platforms, or for those named."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--platform", action="append", choices=PLATFORMS, help="build this one only; may be repeated")
-    parser.add_argument("--output", type=Path, default=ROOT / "dist", help="folder of the zips")
+    names = build_kernels.PLATFORMS
+    parser.add_argument("--platform", action="append", choices=names, help="build for this one only; may be repeated")
+    parser.add_argument("--output", type=Path, default=ROOT / "dist", help="folder of the wheels and zips")
     arguments = parser.parse_args()
-    platforms = arguments.platform or list(PLATFORMS)
-    tool = (sys.executable, extension_tool())
-    wheels = {wheel.name: wheel for name in platforms for wheel in wheels_for(name, ROOT / "wheels")}
     arguments.output.mkdir(parents=True, exist_ok=True)
-    with tempfile.TemporaryDirectory(dir=ROOT / "wheels", prefix="stage-") as folder:
-        stage(Path(folder), platforms, sorted(wheels.values(), key=lambda wheel: wheel.name))
-        options = ("--source-dir", folder, "--output-dir", arguments.output, "--split-platforms")
-        subprocess.run((*tool, "build", *options), check=True, stdout=subprocess.DEVNULL)
-    version = tomllib.loads(MANIFEST.read_text(encoding="utf-8"))["version"]
-    for name in platforms:
-        file = arguments.output / f"mphdrr-{version}-{name.replace('-', '_')}.zip"
-        subprocess.run((*tool, "validate", file), check=True, stdout=subprocess.DEVNULL)
-        print(f"{os.path.relpath(file)}: {file.stat().st_size / 1e6:.0f} MB, valid")
+    for name in arguments.platform or names:
+        with tempfile.TemporaryDirectory() as folder:
+            tree = Path(folder)
+            stage(tree)
+            build_wheel(name, tree, arguments.output)
+            if name in PLATFORMS:
+                file = build_zip(name, tree, arguments.output)
+                print(f"{os.path.relpath(file)}: {file.stat().st_size / 1e6:.1f} MB, valid")
+            else:
+                print(f"{name}: a wheel alone, since there is no Blender for it")
 
 
 if __name__ == "__main__":

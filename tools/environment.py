@@ -18,6 +18,7 @@ import time
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
+KERNELS = ROOT / "core/projector/kernels"
 VERSIONS = ("3.11", "3.13")
 VERSION_WITH_TORCH = "3.11"
 
@@ -103,6 +104,13 @@ def add_diffdrr(venv: Path) -> bool:
     return pip(venv, "install", *DIFFDRR_IMPORTS) and pip(venv, "install", "--no-deps", DIFFDRR)
 
 
+def kernels_changed() -> bool:
+    """Say whether the library of the C kernels is missing in the tree, or older than what it is built from."""
+    sources = (ROOT / "tools/build_kernels.py", *KERNELS.glob("*.[ch]"))
+    libraries = [file for file in KERNELS.iterdir() if file.suffix in (".so", ".dylib", ".dll")]
+    return not libraries or libraries[0].stat().st_mtime < max(file.stat().st_mtime for file in sources)
+
+
 def make(venv: Path, name: str, extras: set[str], torch: str | None) -> None:
     """Bring `venv` to what is asked; `torch` is a requirement, "" for an environment without it, None for either."""
     python, version = find_python(name)
@@ -110,14 +118,18 @@ def make(venv: Path, name: str, extras: set[str], torch: str | None) -> None:
         torch = ""
     state_file = venv / "mphdrr-environment.json"
     state = json.loads(state_file.read_text()) if state_file.is_file() else {}
-    digest = hashlib.sha256(b"".join((ROOT / f).read_bytes() for f in ("pyproject.toml", "tools/environment.py")))
+    makers = ("pyproject.toml", "setup.py", "tools/environment.py")
+    digest = hashlib.sha256(b"".join((ROOT / f).read_bytes() for f in makers))
     wanted = {
         "version": version,
         "digest": digest.hexdigest(),
         "extras": sorted(extras | set(state.get("extras", []))),
         "torch": state.get("torch", "") if torch is None else torch,
     }
-    if state == wanted:
+    if state == wanted and not kernels_changed():
+        return
+    if state == wanted and "dev" in wanted["extras"]:  # the others have no compiler: pip gets them one for a moment
+        subprocess.run([str(venv / "bin/python"), str(ROOT / "tools/build_kernels.py")], check=True)
         return
     started = time.monotonic()
     word = "bringing up to date" if state else "installing for the first time, which takes some minutes"

@@ -27,6 +27,7 @@ static const char *const names[] = {"NEON"};
 
 #ifdef _WIN32
 #define EXPORT __declspec(dllexport)
+#pragma clang diagnostic ignored "-Wdll-attribute-on-redeclaration"
 #else
 #define EXPORT __attribute__((visibility("default")))
 #endif
@@ -65,4 +66,9 @@ EXPORT int64_t best_level(void) {
 }
 #else
 EXPORT int64_t best_level(void) { return 0; }
+#endif
+
+#ifdef _WIN32
+// What Windows calls when it loads a library; elsewhere nothing needs to be there.
+int DllMainCRTStartup(void) { return 1; }
 #endif

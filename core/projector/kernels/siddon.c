@@ -15,6 +15,7 @@
 #endif
 
 #define NEVER 1e30 // t of a plane that is never crossed
+#define FAR 1e15   // voxels
 #define SNAP 1e-9  // as in rays.py: a ray this close to a plane lies in it
 
 // Some tiles take turns of some steps. Tiles side by side then read the same part of the volume at about the same time. While
@@ -82,6 +83,16 @@ INLINE void take_listed(const RayList *list, const int64_t first, const int own,
         }
         r->mm[i] = list->lengths[n];
     }
+}
+
+// Rays with ends that are no numbers, or too far away for voxels to be told apart, are moved to where they miss. A direction is
+// 0 or large enough to divide by.
+INLINE void move_aside(D start[3], D direction[3], D *mm) {
+    B sound = *mm < (D)NEVER;
+    EACH_AXIS(a) sound &= ABS(start[a]) + ABS(direction[a]) < (D)FAR;
+    EACH_AXIS(a) start[a] = sound ? start[a] : (D)-1;
+    EACH_AXIS(a) direction[a] = (sound & (ABS(direction[a]) > (D)SNAP)) ? direction[a] : (D)0;
+    *mm = sound ? *mm : (D)0;
 }
 
 // ---- The way through a lattice
@@ -186,12 +197,14 @@ INLINE void prefetch(const REAL *voxels, I index, const Way *way, int64_t wide, 
 #define THIN ((REAL)0.25)
 #define TERMS (sizeof(REAL) == 8 ? 12 : 6)
 
-// The mean of exp(-s) for s from 0 to depth.
-INLINE F mean_left(F depth) {
+// The mean of exp(-s) for s from 0 to depth, and what exp(-depth) leaves. Those for a double depth follow from those for it.
+INLINE F mean_left(F depth, F *left) {
+    int halved = 0;
+    for (; ANY(depth > (F)THIN) && halved < 1100; halved++) depth *= (F)0.5;
     F mean = 1;
     UNROLLED for (int n = TERMS; n > 1; n--) mean = 1 - depth * mean * (F)(1.0 / n);
-    const I thick = depth > (F)THIN;
-    if (ANY(thick)) EACH_LANE(i) if (thick[i]) mean[i] = (REAL)(-__builtin_expm1(-depth[i]) / depth[i]);
+    *left = 1 - depth * mean;
+    for (; halved > 0; halved--) mean *= (1 + *left) * (F)0.5, *left *= *left;
     return mean;
 }
 
@@ -221,6 +234,7 @@ INLINE void begin(Tile *tile, const Job *job, const Rays *r, const int task, con
     const F t_end = MIN(way->t_exit, (F)1);
     hits &= AS(B, t_end > (F)0);
     way->t_exit = AS(I, hits) ? t_end : (F)0;
+    EACH_AXIS(a) way->t_first[a] = AS(I, hits) ? way->t_first[a] : (F)NEVER; // no way, no planes
     tile->begin = begins;
     tile->span = hits ? span / AS(D, t_end) : (D)0; // the margin of t_exit is no part of the way
     tile->mm = r->mm;
@@ -298,12 +312,12 @@ INLINE void walk(Tile *tile, const Job *job, int64_t steps, const int task, cons
         F f = task == BY_ENDS ? w.f : task == BACKPROJECT ? w.value : gather(voxels, at);
         if (own) f = inside ? f : (F)0;
         const F part = t_next - w.t; // of the way
-        F seen = part, depth = 0, mean = 1, mu = 0;
+        F seen = part, depth = 0, mean = 1, left = 1, mu = 0;
         if (weaker) {
             mu = task == BY_ENDS ? w.mu : gather(mus, at_mu);
             if (own) mu = inside_mu ? mu : (F)0;
             depth = mu * part * w.length;
-            mean = mean_left(depth);
+            mean = mean_left(depth, &left);
             seen = part * w.left * mean;
         }
         if (task == FORWARD) w.sum += seen * f;
@@ -319,7 +333,7 @@ INLINE void walk(Tile *tile, const Job *job, int64_t steps, const int task, cons
             w.passed += depth;
             w.behind -= seen * f;
         } else if (task == BY_ENDS) w.sum += seen * f;
-        if (weaker) w.left -= w.left * depth * mean;
+        if (weaker) w.left *= left;
         I crossed[3], mu_crossed[3];
         EACH_AXIS(a) crossed[a] = next[a] <= t_next;
         if (own) EACH_AXIS(a) crossed[a] &= inside, mu_crossed[a] = (mu_next[a] <= t_next) & inside_mu;
@@ -426,6 +440,8 @@ INLINE void aim_tile(const Job *job, const Fan *fan, int64_t count, int64_t firs
     if (fan) aim_fan(fan, number, own, r);
     else take_listed(&job->list, first, own, r);
     r->real = number < (D)count;
+    move_aside(r->start, r->direction, &r->mm);
+    if (own) move_aside(r->mu_start, r->mu_direction, &r->mm);
 }
 
 INLINE void trace(const Job *job, const int task, const int attenuation) {

@@ -1,0 +1,104 @@
+// Runs the kernels without Python: bundles of rays from the file "jobs", what comes of them into the file "results".
+//
+// A bundle is a Header and arrays, each padded to 8 bytes: voxels of the volume, voxels of mu if there is mu, the fans or the
+// list's columns, values. Its results are what forward, backproject into an empty volume, differentiate and, with mu,
+// differentiate_by_mu give, in this order. test_kernels.py writes and reads the files.
+
+#include "../../core/projector/kernels/kernels.h"
+#include <stdio.h>
+#include <stdlib.h>
+#include <string.h>
+
+typedef struct {
+    int64_t level, is_double, attenuation, n[3], mu_n[3], n_fans, count;
+} Header;
+
+// Arrays of a bundle. Each ends where memory ends, or begins where it begins, bundle by bundle; the address sanitizer and
+// Windows get plain ones.
+static struct {
+    void *base;
+    size_t bytes;
+} blocks[20];
+static int n_blocks, n_bundles;
+
+#if defined(_WIN32) || __has_feature(address_sanitizer)
+static void *block(size_t bytes) {
+    blocks[n_blocks].base = malloc(bytes + !bytes);
+    return memset(blocks[n_blocks++].base, 0, bytes);
+}
+static void give_back(void) {
+    while (n_blocks) free(blocks[--n_blocks].base);
+}
+#else
+#include <sys/mman.h>
+static void *block(size_t bytes) {
+    const size_t page = 65536, inner = (bytes + page - 1) / page * page;
+    char *base = mmap(0, inner + 2 * page, PROT_NONE, MAP_PRIVATE | MAP_ANONYMOUS, -1, 0);
+    if (base == MAP_FAILED || mprotect(base + page, inner, PROT_READ | PROT_WRITE)) abort();
+    blocks[n_blocks].base = base, blocks[n_blocks++].bytes = inner + 2 * page;
+    return base + page + (n_bundles % 2 ? 0 : inner - bytes);
+}
+static void give_back(void) {
+    while (n_blocks--) munmap(blocks[n_blocks].base, blocks[n_blocks].bytes);
+    n_blocks = 0;
+}
+#endif
+
+static FILE *jobs, *results;
+
+static void *taken(size_t bytes) {
+    char *array = block(bytes), padding[8];
+    if (fread(array, 1, bytes, jobs) != bytes) abort();
+    fread(padding, 1, -bytes % 8, jobs);
+    return array;
+}
+
+static void run(const Header *h) {
+    const size_t real = h->is_double ? 8 : 4, voxels = h->n[0] * h->n[1] * h->n[2], count = h->count;
+    const size_t mus = h->attenuation ? h->mu_n[0] * h->mu_n[1] * h->mu_n[2] : 0;
+    const int64_t levels = best_level() + 1, level = h->level % levels;
+    Job job = {.is_double = h->is_double, .attenuation = h->attenuation, .n_fans = h->n_fans};
+    memcpy(job.volume.n, h->n, sizeof h->n);
+    memcpy(job.mu.n, h->mu_n, sizeof h->mu_n);
+    void *const volume = taken(voxels * real), *const empty = block(voxels * real);
+    if (mus) job.mu.voxels = taken(mus * real);
+    if (h->n_fans) job.fans = taken(h->n_fans * sizeof(Fan));
+    else {
+        job.list.count = count;
+        const double **columns = &job.list.starts;
+        for (int i = 0; i < 5; i++)
+            if (i < 2 || i == 4 || h->attenuation == OWN_LATTICE) columns[i] = taken((i < 4 ? 3 : 1) * count * 8);
+    }
+    void *const values = taken(count * real), *const integrals = block(count * real);
+    job.volume.voxels = volume, job.values = integrals;
+    forward(level, &job);
+    fwrite(integrals, real, count, results);
+    job.volume.voxels = empty, job.values = values;
+    backproject(level, &job);
+    fwrite(empty, real, voxels, results);
+    const size_t rows = mus ? 14 : 7;
+    job.volume.voxels = volume, job.values = 0, job.integrals = integrals, job.derivatives = block(rows * count * 8);
+    differentiate(level, &job);
+    fwrite(job.derivatives, 8, rows * count, results);
+    if (!mus) return;
+    job.values = values, job.gradient = block(mus * real);
+    differentiate_by_mu(level, &job);
+    fwrite(job.gradient, real, mus, results);
+}
+
+static int all(void) {
+    Header header;
+    jobs = fopen("jobs", "rb"), results = fopen("results", "wb");
+    if (!jobs || !results) return 1;
+    for (; fread(&header, sizeof header, 1, jobs); n_bundles++) {
+        run(&header);
+        give_back();
+    }
+    return fclose(results);
+}
+
+#ifdef ENTRY // without the C runtime that calls main, which Zig would have to compile first
+void ENTRY(void) { exit(all()); }
+#else
+int main(void) { return all(); }
+#endif

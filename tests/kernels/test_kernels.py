@@ -1,0 +1,232 @@
+"""The kernels without Python around them, on hostile rays: under sanitizers, for arm64 under qemu, for Windows under Wine.
+
+check.c runs thousands of bundles of rays from a file. Their results are compared with the float64 reference in numpy; that
+nothing is read or written outside its array is seen by sanitizers, and elsewhere by pages that cannot be touched.
+"""
+
+from __future__ import annotations
+
+import shutil
+import subprocess
+import sys
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from mphdrr.core.projector import siddon_numpy
+from mphdrr.core.projector.rays import Attenuation, IndexFans, IndexRays
+from mphdrr.core.projector.siddon_cpu import _fans
+
+ROOT = Path(__file__).resolve().parents[2]
+sys.path.insert(0, str(ROOT / "tools"))
+import build_kernels  # noqa: E402
+
+Array = np.ndarray[Any, Any]
+
+BUNDLES = 10_000
+SANITIZERS = ("-O1", "-g", "-std=gnu11", "-fPIC", "-fsanitize=address,undefined", "-fno-sanitize-recover=undefined")
+QEMU_ROOT = Path("/usr/aarch64-linux-gnu")
+WINE = Path("/usr/lib/x86_64-linux-gnu/wine/x86_64-windows")
+
+
+@dataclass
+class Bundle:
+    """A job of the kernels: all its arrays are of one kind of number; rays are in the index space of their lattice."""
+
+    volume: Array
+    rays: IndexRays | IndexFans
+    attenuation: Attenuation | None
+    values: Array
+    tame: Array  # which rays the reference has an answer for
+    by_ends: bool  # whether derivatives by the ends are compared: where edges are met, they jump
+    tolerance: float
+
+
+def lattice(rng: np.random.Generator, kind: type) -> Array:
+    """Voxels, often few, with zeros among them."""
+    shape = rng.integers(1, rng.choice([2, 4, 12]), 3, endpoint=True)
+    return (rng.random(shape) * (rng.random(shape) < 0.8)).astype(kind)
+
+
+def points(rng: np.random.Generator, count: int, shape: tuple[int, ...]) -> Array:
+    """Ends of rays in and around a lattice."""
+    return rng.uniform(-1.0, 2.0, (count, 3)) * shape
+
+
+def hostile(rng: np.random.Generator, starts: Array, ends: Array, shape: tuple[int, ...], kind: str) -> Array:
+    """Change some of the rays in place; say which."""
+    changed = rng.random(len(starts)) < 0.5
+    for i in np.flatnonzero(changed):
+        a, b = rng.permutation(3)[:2]
+        if kind == "awkward":  # through edges and corners, along faces and edges, of no length
+            which = rng.integers(5)
+            corner = rng.integers(-1, np.array(shape) + 2).astype(float)
+            if which == 0:
+                starts[i], ends[i] = corner, rng.integers(-1, np.array(shape) + 2)
+            elif which == 1:
+                starts[i], ends[i] = corner - 20, corner + 20
+            elif which == 4:
+                ends[i] = starts[i]
+            else:
+                starts[i, a] = ends[i, a] = corner[a]
+                if which == 3:
+                    starts[i, b] = ends[i, b] = corner[b]
+        elif kind == "far":
+            starts[i] += rng.choice([-1e9, 1e9, 1e6])
+            if rng.random() < 0.5:
+                ends[i] += ends[i] - starts[i]
+        else:
+            bad = [np.nan, np.inf, -np.inf, 1e300, -1e300, 5e-324, -1e-310, 0.0, -0.0, 1e30, 2.0**31, -(2.0**63)]
+            (starts if rng.random() < 0.5 else ends)[i, a] = rng.choice(bad)
+            if rng.random() < 0.3:
+                starts[i, b], ends[i, b] = rng.choice(bad, 2)
+    return changed
+
+
+def bundles() -> Iterator[Bundle]:
+    rng = np.random.default_rng(20)
+    for i in range(BUNDLES):
+        number = (np.float32, np.float64)[i % 2]
+        volume = lattice(rng, number)
+        attenuated = ("no", "same", "own")[i // 2 % 3]
+        mu = None if attenuated == "no" else lattice(rng, number) if attenuated == "own" else np.empty_like(volume)
+        if mu is not None:
+            mu[:] = rng.random(mu.shape) * rng.choice([0.02, 0.3, 20])
+        kind = rng.choice(["ordinary", "awkward", "far", "wild"])
+        tolerance = 2e-5 if number == np.float32 else 1e-9
+        if rng.random() < 0.3:  # fans
+            shape = tuple(rng.integers(1, 9, 2))
+            vectors = rng.uniform(-1, 1, (rng.integers(1, 4), 4, 3)) * [[30], [6], [2], [2]]
+            vectors[:, :2] += np.array(volume.shape) / 2
+            table = np.concatenate([vectors, vectors * 1.5], axis=1)
+            rays: IndexRays | IndexFans = IndexFans(table, shape)
+            mu_rays: IndexRays | IndexFans | None = None
+            if attenuated == "own":
+                mu_table = table.copy()
+                mu_table[:, :4] = table[:, :4] * 0.7
+                mu_table[:, :2] += 0.3
+                mu_rays = IndexFans(mu_table, shape)
+            tame, by_ends = np.ones(len(rays), bool), True
+        else:
+            count = int(rng.integers(1, 40))
+            starts, ends = points(rng, count, volume.shape), points(rng, count, volume.shape)
+            changed = np.zeros(count, bool) if kind == "ordinary" else hostile(rng, starts, ends, volume.shape, kind)
+            with np.errstate(all="ignore"):
+                lengths = np.linalg.norm(ends - starts, axis=1) * 1.5
+                rays = IndexRays(starts, ends - starts, lengths)
+                # mu's lattice lies a little elsewhere and is coarser.
+                mu_rays = IndexRays(starts * 0.7 + 0.3, (ends - starts) * 0.7, lengths) if attenuated == "own" else None
+            tame, by_ends = ~changed if kind == "wild" else np.ones(count, bool), kind == "ordinary"
+            if kind == "far" and number == np.float64:
+                tolerance = 1e-6  # the rounding of coordinates of 1e9 is a part of that of a voxel
+        values = rng.random(len(rays)).astype(number)
+        attenuation = None if mu is None else Attenuation(mu, mu_rays)
+        yield Bundle(volume, rays, attenuation, values, tame, by_ends, tolerance)
+
+
+def packed(bundle: Bundle, level: int) -> bytes:
+    """A bundle as check.c reads it."""
+    rays, attenuation = bundle.rays, bundle.attenuation
+    mu = bundle.volume if attenuation is None else attenuation.mu
+    mu_rays = None if attenuation is None else attenuation.rays
+    how = 0 if attenuation is None else 1 if mu_rays is None else 2
+    fans = len(rays.table) if isinstance(rays, IndexFans) else 0
+    header = (level, bundle.volume.itemsize == 8, how, *bundle.volume.shape, *mu.shape, fans, len(rays))
+    arrays = [np.array(header, np.int64), bundle.volume]
+    if attenuation is not None:
+        arrays.append(mu)
+    if isinstance(rays, IndexFans):
+        arrays.append(_fans(rays, mu_rays))
+    else:
+        arrays += [column.T for r in (rays, mu_rays) if r is not None for column in (r.starts, r.directions)]
+        arrays.append(rays.lengths)
+    arrays.append(bundle.values)
+    return b"".join(data + bytes(-len(data) % 8) for data in (array.tobytes() for array in arrays))
+
+
+def expected(bundle: Bundle) -> list[tuple[Array, bool]]:
+    """What comes of a bundle by the reference: arrays in check.c's order, each with whether it is compared."""
+    volume, rays = bundle.volume.astype(float), bundle.rays.listed()
+    attenuation = None if bundle.attenuation is None else bundle.attenuation.listed()
+    tame = bundle.tame
+    all_tame = bool(tame.all())
+    results = [(np.full(len(rays), np.nan), True), (np.zeros(volume.shape), all_tame)]
+    rows = np.zeros((len(rays), 7 if attenuation is None else 14))
+    results.append((rows.T, bundle.by_ends))
+    some = IndexRays(rays.starts[tame], rays.directions[tame], rays.lengths[tame])
+    if attenuation is not None:
+        mu_rays = attenuation.rays and IndexRays(attenuation.rays.starts[tame], attenuation.rays.directions[tame], some.lengths)
+        attenuation = Attenuation(attenuation.mu.astype(float), mu_rays)
+        results.append((np.zeros(attenuation.mu.shape), all_tame))
+    results[0][0][tame] = siddon_numpy.forward(volume, some, attenuation)
+    if all_tame:
+        siddon_numpy.adjoint(results[1][0], bundle.values.astype(float), some, attenuation)
+        if attenuation is not None:
+            siddon_numpy.mu_gradient(results[3][0], volume, bundle.values.astype(float), some, attenuation)
+    if bundle.by_ends:
+        rows[:] = siddon_numpy.derivatives(volume, some, attenuation)
+    return results
+
+
+@pytest.fixture(scope="module")
+def jobs() -> list[tuple[Bundle, bytes, list[tuple[Array, bool]]]]:
+    return [(bundle, packed(bundle, i // 6), expected(bundle)) for i, bundle in enumerate(bundles())]
+
+
+def compare(jobs: list[Any], command: list[str | Path], folder: Path, **options: Any) -> None:
+    """Run all `jobs` in `folder` and compare."""
+    (folder / "jobs").write_bytes(b"".join(data for _, data, _ in jobs))
+    done = subprocess.run(command, cwd=folder, capture_output=True, text=True, timeout=600, **options)
+    assert done.returncode == 0, f"{done.returncode}\n{done.stderr[-6000:]}"
+    read = (folder / "results").read_bytes()
+    at = 0
+    for i, (bundle, _, arrays) in enumerate(jobs):
+        for k, (right, compared) in enumerate(arrays):
+            kind = np.dtype(float) if k == 2 else bundle.volume.dtype
+            given = np.frombuffer(read, kind, right.size, at).reshape(right.shape)
+            at += given.nbytes
+            if compared:
+                known = ~np.isnan(right)
+                error = np.abs(given - right)[known].max(initial=0.0)
+                largest = np.abs(right)[known].max(initial=0.0)
+                assert error <= bundle.tolerance * largest, f"bundle {i}, result {k}: off by {error} of {largest}"
+    assert at == len(read)
+
+
+def compile_driver(name: str, folder: Path, *links: str | Path, entry: str) -> None:
+    """Compile check.c for a platform into `folder`, beside the library; it calls the platform's own C library."""
+    target = build_kernels.PLATFORMS[name].target
+    library = build_kernels.build(name, folder)
+    options = ("-O2", "-fno-sanitize=undefined", f"-DENTRY={entry}", "-nostdlib", "-o", "check.exe")
+    build_kernels.zig("cc", "-target", target, *options, ROOT / "tests/kernels/check.c", library, *links, cwd=folder)
+
+
+def test_no_sanitizer_objects(jobs, tmp_path):
+    if sys.platform != "linux" or not shutil.which("gcc"):
+        pytest.skip("needs gcc, whose sanitizers are linked")
+    objects = build_kernels.compiled("linux-x64", tmp_path, SANITIZERS)
+    target = build_kernels.PLATFORMS["linux-x64"].target
+    driver = ROOT / "tests/kernels/check.c"
+    build_kernels.zig("cc", "-target", target, *SANITIZERS, "-c", driver, "-o", "check.o", cwd=tmp_path)
+    command = ("gcc", "-fsanitize=address,undefined", *objects, "check.o", "-o", "check")
+    subprocess.run(command, cwd=tmp_path, check=True)
+    compare(jobs, ["./check"], tmp_path)
+
+
+def test_arm64_under_qemu(jobs, tmp_path):
+    if not shutil.which("qemu-aarch64") or not QEMU_ROOT.is_dir():
+        pytest.skip("needs Debian's qemu-user and libc6-arm64-cross")
+    compile_driver("linux-arm64", tmp_path, QEMU_ROOT / "lib/libc.so.6", "-Wl,-rpath,$ORIGIN", entry="_start")
+    compare(jobs[::5], ["qemu-aarch64", "-L", QEMU_ROOT, "./check.exe"], tmp_path)
+
+
+def test_windows_under_wine(jobs, tmp_path):
+    if not shutil.which("wine") or not WINE.is_dir():
+        pytest.skip("needs Debian's wine and wine64")
+    compile_driver("windows-x64", tmp_path, WINE / "ucrtbase.dll", entry="wWinMainCRTStartup")
+    home = {"WINEPREFIX": str(tmp_path / "wine"), "WINEDEBUG": "-all", "PATH": "/usr/bin:/bin", "HOME": str(tmp_path)}
+    compare(jobs[::5], ["wine", "check.exe"], tmp_path, env=home)

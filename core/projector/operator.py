@@ -42,6 +42,9 @@ from .rays import Attenuation, IndexFans, RayMapper, window
 _FEWEST_RAYS = 4096
 _MOST_RAYS = {"cpu": 2**14, "torch": 2**18, "cuda": 2**22}
 
+# Rays of what the threads of the adjoint do before they wait for each other.
+_RAYS_OF_A_ROUND = 2**19
+
 # Rays of a pixel that are kept from call to call: few images are done before their rays would be made.
 _BEAMS_KEPT = 16
 
@@ -484,60 +487,68 @@ class AdjointProjector(LinearOperator):
         require(volume_bytes + extra_bytes, f"the adjoint into {_times(grid.shape)} voxels")
         _require_rays(A.views)
         workers = volume_workers(A._workers(name), volume_bytes, extra_bytes)
-        volumes = [zeros(grid.shape, images) for _ in range(workers)]
-        total: ArrayOrTensor = zeros(grid.shape, images) if weighted else None
-        n_views = len(A.views)
+        n_views, groups = len(A.views), A._groups(name)
+        if not groups:
+            groups = [range(m, m + 1) for m in range(n_views)]
+        # Between rounds the threads wait for each other: seldom, but often enough to tell how far the work is.
+        of_round = 1 if weighted else max(workers, _RAYS_OF_A_ROUND // (len(groups[0]) * math.prod(A.views.shape)))
         _report(progress, 0, n_views)
-        groups = A._groups(name)
         with _parallel(workers) as parallel_map:
-            for first in range(0, len(groups), workers):
-                some = groups[first : first + workers]
-                # Always the same views into the same volume, so that the sums' order, and so the result, is always the same.
-                together = functools.partial(self._spread_together, images, spread=of_view(0), trace=trace)
-                _wait_for(parallel_map(lambda each, add=together: add(*each), zip(some, volumes, strict=False)))
-                _report(progress, some[-1].stop, n_views)
-            if groups:
-                return _sum(volumes)
-            for m in range(n_views):
-                image, spread = images[m], of_view(m)
-                response = A.model.response(A.views, m)
-                if response is not None:
-                    along_v, along_u = (alike(matrix, image) for matrix in response)
-                    image = along_v.T @ image @ along_u
-                beams, by_columns = A._beams(m)
-                lines, rays = window([beam.rays for beam in beams], A.grid.corners())
-                # Always the same parts, so that the sums' order, and so the result, is always the same.
-                parts = [
-                    (block, *bundle)
-                    for block in _blocks(lines, rays, name, workers)
-                    for bundle in _bundles(beams, (block.stop - block.start, rays.stop - rays.start), name, workers)
-                ]
+            volumes = list(parallel_map(lambda _: zeros(grid.shape, images), range(workers)))
+            total: ArrayOrTensor = zeros(grid.shape, images) if weighted else None
+            for first in range(0, len(groups), of_round):
+                # Always the same parts into the same volume, so that the sums' order, and so the result, is always the same.
+                some = groups[first : first + of_round]
+                parts = [part for views in some for part in self._parts(images, views, name, workers, of_view, trace)]
 
-                def add(
-                    worker: int,
-                    rays: slice = rays,
-                    parts: list[tuple[slice, Beam, slice]] = parts,
-                    lines: ArrayOrTensor = image.T if by_columns else image,
-                    spread: Spread = spread,
-                ) -> None:
-                    for block, beam, shifts in parts[worker::workers]:
-                        fan, weights = beam.part(block, rays, shifts)
-                        pixels = lines[block, rays]
-                        values = alike(np.ones(1) if weights is None else weights, pixels) * pixels
-                        spread(volumes[worker], values.reshape(-1), *trace(fan))
+                def add(worker: int, parts: list[Callable[[ArrayOrTensor], None]] = parts) -> None:
+                    for part in parts[worker::workers]:
+                        part(volumes[worker])
 
                 _wait_for(parallel_map(add, range(workers)))
-                if weighted:  # otherwise in every view: each joins the others weighted
-                    total += A._weighted(_sum(volumes), m)
+                if weighted:  # each view joins the others weighted
+                    total += A._weighted(_sum(volumes, parallel_map), some[0].start)
                     for volume in volumes:
                         volume[:] = 0
-                _report(progress, m + 1, n_views)
-        if not weighted:
-            total = _sum(volumes)
-        return total
+                _report(progress, some[-1].stop, n_views)
+            return total if weighted else _sum(volumes, parallel_map)
+
+    def _parts(
+        self,
+        images: ArrayOrTensor,
+        views: range,
+        name: str,
+        workers: int,
+        of_view: Callable[[int], Spread],
+        trace: RayMapper,
+    ) -> list[Callable[[ArrayOrTensor], None]]:
+        """What there is to be added to volumes from the images of `views`, as much at once as a backend is given."""
+        A, m = self._projector, views.start
+        if len(views) > 1:
+            return [functools.partial(self._spread_together, images, views, of_view(m), trace)]
+        image, spread = images[m], of_view(m)
+        response = A.model.response(A.views, m)
+        if response is not None:
+            along_v, along_u = (alike(matrix, image) for matrix in response)
+            image = along_v.T @ image @ along_u
+        beams, by_columns = A._beams(m)
+        lines = image.T if by_columns else image
+        blocks, rays = window([beam.rays for beam in beams], A.grid.corners())
+
+        def add(block: slice, beam: Beam, shifts: slice, volume: ArrayOrTensor) -> None:
+            fan, weights = beam.part(block, rays, shifts)
+            pixels = lines[block, rays]
+            values = alike(np.ones(1) if weights is None else weights, pixels) * pixels
+            spread(volume, values.reshape(-1), *trace(fan))
+
+        return [
+            functools.partial(add, block, *bundle)
+            for block in _blocks(blocks, rays, name, workers)
+            for bundle in _bundles(beams, (block.stop - block.start, rays.stop - rays.start), name, workers)
+        ]
 
     def _spread_together(
-        self, images: ArrayOrTensor, views: range, volume: ArrayOrTensor, spread: Spread, trace: RayMapper
+        self, images: ArrayOrTensor, views: range, spread: Spread, trace: RayMapper, volume: ArrayOrTensor
     ) -> None:
         """`_spread` of several views at once."""
         A = self._projector
@@ -588,12 +599,17 @@ def volume_workers(workers: int, volume_bytes: int, extra_bytes: int = 0) -> int
     return min(workers, _MOST_VOLUMES, max(1, (available() - extra_bytes) // (2 * volume_bytes)))
 
 
-def _sum(volumes: list[ArrayOrTensor]) -> ArrayOrTensor:
+def _sum(volumes: list[ArrayOrTensor], parallel_map: ParallelMap) -> ArrayOrTensor:
     """Their sum, in the first of them."""
-    total = volumes[0]
-    for volume in volumes[1:]:
-        total += volume
-    return total
+    total, *others = (volume.reshape(-1) for volume in volumes)
+    size = -(-len(total) // len(volumes))
+
+    def add(first: int) -> None:
+        for other in others:
+            total[first : first + size] += other[first : first + size]
+
+    _wait_for(parallel_map(add, range(0, len(total), size) if others else []))
+    return volumes[0]
 
 
 def _blocks(lines: slice, rays: slice, backend: str, workers: int) -> list[slice]:

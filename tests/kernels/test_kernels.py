@@ -27,8 +27,9 @@ import build_kernels  # noqa: E402
 
 Array = np.ndarray[Any, Any]
 
+DRIVER = ROOT / "tests/kernels/check.c"
 BUNDLES = 10_000
-SANITIZERS = ("-O1", "-g", "-std=gnu11", "-fPIC", "-fsanitize=address,undefined", "-fno-sanitize-recover=undefined")
+SANITIZERS = ("-O0", "-g", "-std=gnu11", "-fPIC", "-fsanitize=address,undefined", "-fno-sanitize-recover=undefined")
 QEMU_ROOT = Path("/usr/aarch64-linux-gnu")
 WINE = Path("/usr/lib/x86_64-linux-gnu/wine/x86_64-windows")
 
@@ -95,9 +96,10 @@ def bundles() -> Iterator[Bundle]:
         attenuated = ("no", "same", "own")[i // 2 % 3]
         mu = None if attenuated == "no" else lattice(rng, number) if attenuated == "own" else np.empty_like(volume)
         if mu is not None:
-            mu[:] = rng.random(mu.shape) * rng.choice([0.02, 0.3, 20])
+            mu[:] = rng.random(mu.shape) * rng.choice([0.02, 0.3, 3])
         kind = rng.choice(["ordinary", "awkward", "far", "wild"])
-        tolerance = 2e-5 if number == np.float32 else 1e-9
+        # Coordinates of 1e9 are rounded to 1e-7 voxels, in the reference as well.
+        tolerance = 1e-9 if number == np.float64 and kind != "far" else 2e-5
         if rng.random() < 0.3:  # fans
             shape = tuple(rng.integers(1, 9, 2))
             vectors = rng.uniform(-1, 1, (rng.integers(1, 4), 4, 3)) * [[30], [6], [2], [2]]
@@ -121,8 +123,6 @@ def bundles() -> Iterator[Bundle]:
                 # mu's lattice lies a little elsewhere and is coarser.
                 mu_rays = IndexRays(starts * 0.7 + 0.3, (ends - starts) * 0.7, lengths) if attenuated == "own" else None
             tame, by_ends = ~changed if kind == "wild" else np.ones(count, bool), kind == "ordinary"
-            if kind == "far" and number == np.float64:
-                tolerance = 1e-6  # the rounding of coordinates of 1e9 is a part of that of a voxel
         values = rng.random(len(rays)).astype(number)
         attenuation = None if mu is None else Attenuation(mu, mu_rays)
         yield Bundle(volume, rays, attenuation, values, tame, by_ends, tolerance)
@@ -148,70 +148,78 @@ def packed(bundle: Bundle, level: int) -> bytes:
     return b"".join(data + bytes(-len(data) % 8) for data in (array.tobytes() for array in arrays))
 
 
-def expected(bundle: Bundle) -> list[tuple[Array, bool]]:
-    """What comes of a bundle by the reference: arrays in check.c's order, each with whether it is compared."""
-    volume, rays = bundle.volume.astype(float), bundle.rays.listed()
+def expected(bundle: Bundle) -> list[tuple[Array, float]]:
+    """What comes of a bundle by the reference: arrays in check.c's order, each with the size of what is summed up in it.
+
+    NaN is not compared.
+    """
+    volume, rays, values = bundle.volume.astype(float), bundle.rays.listed(), bundle.values.astype(float)
     attenuation = None if bundle.attenuation is None else bundle.attenuation.listed()
-    tame = bundle.tame
-    all_tame = bool(tame.all())
-    results = [(np.full(len(rays), np.nan), True), (np.zeros(volume.shape), all_tame)]
-    rows = np.zeros((len(rays), 7 if attenuation is None else 14))
-    results.append((rows.T, bundle.by_ends))
-    some = IndexRays(rays.starts[tame], rays.directions[tame], rays.lengths[tame])
+    some = _of(rays, bundle.tame)
     if attenuation is not None:
-        mu_rays = attenuation.rays and IndexRays(attenuation.rays.starts[tame], attenuation.rays.directions[tame], some.lengths)
+        mu_rays = None if attenuation.rays is None else _of(attenuation.rays, bundle.tame)
         attenuation = Attenuation(attenuation.mu.astype(float), mu_rays)
-        results.append((np.zeros(attenuation.mu.shape), all_tame))
-    results[0][0][tame] = siddon_numpy.forward(volume, some, attenuation)
-    if all_tame:
-        siddon_numpy.adjoint(results[1][0], bundle.values.astype(float), some, attenuation)
+    integrals = np.full(len(rays), np.nan)
+    integrals[bundle.tame] = siddon_numpy.forward(volume, some, attenuation)
+    back = np.full(volume.shape, np.nan)
+    rows = np.full((7 if attenuation is None else 14, len(rays)), np.nan)
+    gradient = np.full(() if attenuation is None else attenuation.mu.shape, np.nan)
+    behind = 0.0  # derivatives by mu are differences of what lies behind
+    if bundle.tame.all():
+        back[:] = 0.0
+        siddon_numpy.adjoint(back, values, rays, attenuation)
+        if bundle.by_ends:
+            rows[:] = siddon_numpy.derivatives(volume, rays, attenuation).T
         if attenuation is not None:
-            siddon_numpy.mu_gradient(results[3][0], volume, bundle.values.astype(float), some, attenuation)
-    if bundle.by_ends:
-        rows[:] = siddon_numpy.derivatives(volume, some, attenuation)
-    return results
+            gradient[:] = 0.0
+            siddon_numpy.mu_gradient(gradient, volume, values, rays, attenuation)
+            behind = np.max(values * integrals * rays.lengths, initial=0.0)
+    arrays = [integrals, back, rows] + ([] if attenuation is None else [gradient])
+    return [(a, max(np.max(np.abs(a), where=~np.isnan(a), initial=0.0), behind * (a is gradient))) for a in arrays]
+
+
+def _of(rays: IndexRays, which: Array) -> IndexRays:
+    return IndexRays(rays.starts[which], rays.directions[which], rays.lengths[which])
 
 
 @pytest.fixture(scope="module")
-def jobs() -> list[tuple[Bundle, bytes, list[tuple[Array, bool]]]]:
+def jobs() -> list[tuple[Bundle, bytes, list[tuple[Array, float]]]]:
     return [(bundle, packed(bundle, i // 6), expected(bundle)) for i, bundle in enumerate(bundles())]
 
 
 def compare(jobs: list[Any], command: list[str | Path], folder: Path, **options: Any) -> None:
-    """Run all `jobs` in `folder` and compare."""
+    """Run all `jobs` in `folder` and compare; derivatives by the ends are sums of differences, which round more."""
     (folder / "jobs").write_bytes(b"".join(data for _, data, _ in jobs))
     done = subprocess.run(command, cwd=folder, capture_output=True, text=True, timeout=600, **options)
     assert done.returncode == 0, f"{done.returncode}\n{done.stderr[-6000:]}"
     read = (folder / "results").read_bytes()
     at = 0
     for i, (bundle, _, arrays) in enumerate(jobs):
-        for k, (right, compared) in enumerate(arrays):
+        for k, (right, size) in enumerate(arrays):
             kind = np.dtype(float) if k == 2 else bundle.volume.dtype
             given = np.frombuffer(read, kind, right.size, at).reshape(right.shape)
             at += given.nbytes
-            if compared:
-                known = ~np.isnan(right)
-                error = np.abs(given - right)[known].max(initial=0.0)
-                largest = np.abs(right)[known].max(initial=0.0)
-                assert error <= bundle.tolerance * largest, f"bundle {i}, result {k}: off by {error} of {largest}"
+            error = np.max(np.abs(given - right), where=~np.isnan(right), initial=0.0)
+            allowed = bundle.tolerance * size * (10 if k == 2 else 1) + np.finfo(bundle.volume.dtype).tiny
+            assert error <= allowed, f"bundle {i}, result {k}: off by {error} where {size} is summed up"
     assert at == len(read)
 
 
 def compile_driver(name: str, folder: Path, *links: str | Path, entry: str) -> None:
     """Compile check.c for a platform into `folder`, beside the library; it calls the platform's own C library."""
-    target = build_kernels.PLATFORMS[name].target
+    cc = ("cc", "-target", build_kernels.PLATFORMS[name].target)
     library = build_kernels.build(name, folder)
-    options = ("-O2", "-fno-sanitize=undefined", f"-DENTRY={entry}", "-nostdlib", "-o", "check.exe")
-    build_kernels.zig("cc", "-target", target, *options, ROOT / "tests/kernels/check.c", library, *links, cwd=folder)
+    options = ("-O2", "-fno-sanitize=undefined", f"-DENTRY={entry}")
+    build_kernels.zig(*cc, *options, "-c", DRIVER, "-o", "check.o", cwd=folder)
+    build_kernels.zig(*cc, "-nostdlib", "check.o", library, *links, "-o", "check.exe", cwd=folder)
 
 
-def test_no_sanitizer_objects(jobs, tmp_path):
+def test_sanitizers_find_nothing(jobs, tmp_path):
     if sys.platform != "linux" or not shutil.which("gcc"):
         pytest.skip("needs gcc, whose sanitizers are linked")
     objects = build_kernels.compiled("linux-x64", tmp_path, SANITIZERS)
     target = build_kernels.PLATFORMS["linux-x64"].target
-    driver = ROOT / "tests/kernels/check.c"
-    build_kernels.zig("cc", "-target", target, *SANITIZERS, "-c", driver, "-o", "check.o", cwd=tmp_path)
+    build_kernels.zig("cc", "-target", target, *SANITIZERS, "-c", DRIVER, "-o", "check.o", cwd=tmp_path)
     command = ("gcc", "-fsanitize=address,undefined", *objects, "check.o", "-o", "check")
     subprocess.run(command, cwd=tmp_path, check=True)
     compare(jobs, ["./check"], tmp_path)
@@ -221,7 +229,7 @@ def test_arm64_under_qemu(jobs, tmp_path):
     if not shutil.which("qemu-aarch64") or not QEMU_ROOT.is_dir():
         pytest.skip("needs Debian's qemu-user and libc6-arm64-cross")
     compile_driver("linux-arm64", tmp_path, QEMU_ROOT / "lib/libc.so.6", "-Wl,-rpath,$ORIGIN", entry="_start")
-    compare(jobs[::5], ["qemu-aarch64", "-L", QEMU_ROOT, "./check.exe"], tmp_path)
+    compare(jobs, ["qemu-aarch64", "-L", QEMU_ROOT, "./check.exe"], tmp_path)
 
 
 def test_windows_under_wine(jobs, tmp_path):
@@ -229,4 +237,4 @@ def test_windows_under_wine(jobs, tmp_path):
         pytest.skip("needs Debian's wine and wine64")
     compile_driver("windows-x64", tmp_path, WINE / "ucrtbase.dll", entry="wWinMainCRTStartup")
     home = {"WINEPREFIX": str(tmp_path / "wine"), "WINEDEBUG": "-all", "PATH": "/usr/bin:/bin", "HOME": str(tmp_path)}
-    compare(jobs[::5], ["wine", "check.exe"], tmp_path, env=home)
+    compare(jobs, ["wine", "check.exe"], tmp_path, env=home)

@@ -470,7 +470,8 @@ INLINE void trace(const Job *job, const int task, const int attenuation) {
             for (int i = 0; i < some; i++) {
                 const int64_t begins = first + i * (int64_t)LANES, left = count - begins;
                 if (task == BY_ENDS) aim_tile(job, fan, count, begins, own, &rays, places[i]); // anew: to keep them takes longer
-                finish(tiles + i, job, &rays, places[i], job->derivatives + row + begins, n, left < (int64_t)LANES ? (int)left : (int)LANES,
+                double *const rows = task == BY_ENDS ? job->derivatives + row + begins : 0;
+                finish(tiles + i, job, &rays, places[i], rows, n, left < (int64_t)LANES ? (int)left : (int)LANES,
                        task, attenuation);
             }
         }

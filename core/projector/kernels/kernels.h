@@ -1,13 +1,14 @@
 // Line integrals through voxels and what belongs to them: the contract between the kernels and siddon_cpu.py.
 //
-// All coordinates of rays are in index space, where voxel i of an axis fills [i, i + 1) and a lattice's faces lie at 0 and n.
-// A point of a ray is source + alpha (target - source), alpha from 0 to 1. With f the volume, mu what attenuates (0 without
-// it) and L the ray's length in mm, its integral is
+// All coordinates of rays are in index space, where voxel i of an axis fills [i, i + 1) and a lattice's faces lie at 0
+// and n. A point of a ray is source + alpha (target - source), alpha from 0 to 1. With f the volume, mu what attenuates
+// (0 without it) and L the ray's length in mm, its integral is
 //
 //     L int_0^1 f(alpha) exp(-L int_0^alpha mu) dalpha
 //
-// The kernels allocate nothing, keep nothing and start no thread: a job belongs to the thread that calls. Nothing here is
-// checked; siddon_cpu.py makes only jobs whose arrays are as large as said here, with fewer than 2^31 voxels in a lattice.
+// The kernels allocate nothing, keep nothing and start no thread: a job belongs to the thread that calls. Nothing here
+// is checked; siddon_cpu.py makes only jobs whose arrays are as large as said here, with fewer than 2^31 voxels in a
+// lattice.
 
 #pragma once
 #include <stdint.h>
@@ -20,21 +21,21 @@ typedef struct {
     int64_t n[3];
 } Lattice;
 
-// Rays from a source to the points corner + i line_step + j ray_step, for i from 0 to lines - 1 and j from 0 to rays - 1.
-// The value of ray (i, j) is values[place + i * line_stride + j * ray_stride].
+// Rays from a source to the points corner + i line_step + j ray_step, for i from 0 to lines - 1 and j from 0 to rays
+// - 1. The value of ray (i, j) is values[place + i * line_stride + j * ray_stride].
 typedef struct {
     double volume[4][3]; // source, corner, line step, ray step in the volume's index space
-    double mu[4][3];     // the same in mu's, where that has a lattice of its own
-    double world[3][3];  // source to corner, line step, ray step in mm
+    double mu[4][3]; // the same in mu's, where that has a lattice of its own
+    double world[3][3]; // source to corner, line step, ray step in mm
     int64_t lines, rays;
     int64_t place, line_stride, ray_stride;
 } Fan;
 
 // Rays one by one, columns of arrays (3, count) and (count).
 typedef struct {
-    const double *starts, *directions;       // in the volume's index space; a direction is source to target
+    const double *starts, *directions; // in the volume's index space; a direction is source to target
     const double *mu_starts, *mu_directions; // in mu's, where that has a lattice of its own
-    const double *lengths;                   // mm
+    const double *lengths; // mm
     int64_t count;
 } RayList;
 
@@ -50,8 +51,8 @@ typedef struct {
     RayList list; // or, where there are no fans, these: ray r's value is values[r]
     void *values;
     const void *integrals; // with a task that needs them: as forward gave them, in the values' places
-    double *derivatives;   // (7 or 14, rays): row after row, rays in order
-    void *gradient;        // of mu's shape
+    double *derivatives; // (7 or 14, rays): row after row, rays in order
+    void *gradient; // of mu's shape
 } Job;
 
 // What level of processor the kernels are compiled for; any processor of the platform runs level 0.
@@ -67,9 +68,9 @@ void forward(int64_t level, const Job *job);
 // volume += values, each along its ray with the weights of forward
 void backproject(int64_t level, const Job *job);
 
-// derivatives = integral / L, then its derivatives by the ray's start (3) and end (3) through the planes of the volume, where
-// f jumps; with mu, for which the integrals are needed, also by start (3) and end (3) in mu's index space through the planes
-// of mu, all at constant L, and by L at constant ends.
+// derivatives = integral / L, then its derivatives by the ray's start (3) and end (3) through the planes of the volume,
+// where f jumps; with mu, for which the integrals are needed, also by start (3) and end (3) in mu's index space through
+// the planes of mu, all at constant L, and by L at constant ends.
 void differentiate(int64_t level, const Job *job);
 
 // gradient += the derivative by mu of the sum of values times integrals; the integrals are needed

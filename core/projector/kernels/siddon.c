@@ -1,10 +1,10 @@
 // Siddon's line integrals, and what follows from them, by walking from voxel to voxel as Amanatides and Woo do.
 //
-// A ray crosses a lattice's planes at alphas that are evenly spaced on each axis. From where it enters, at t_enter, each step
-// goes to the nearest of the three next planes and into the voxel behind. Rays are walked a tile at a time, all lanes in
-// step; a lane that has arrived takes steps of no length. Everything is set up in double and walked in REAL, in a measure of
-// alpha, t, that is 0 where the walk begins and 1 where it ends: rounding is relative to the way through the lattice,
-// however far away the source is.
+// A ray crosses a lattice's planes at alphas that are evenly spaced on each axis. From where it enters, at t_enter,
+// each step goes to the nearest of the three next planes and into the voxel behind. Rays are walked a tile at a time,
+// all lanes in step; a lane that has arrived takes steps of no length. Everything is set up in double and walked in
+// REAL, in a measure of alpha, t, that is 0 where the walk begins and 1 where it ends: rounding is relative to the way
+// through the lattice, however far away the source is.
 //
 // Compiled once for every level of processor and for float and double.
 
@@ -15,11 +15,12 @@
 #endif
 
 #define NEVER 1e30 // t of a plane that is never crossed
-#define FAR 1e15   // voxels
-#define SNAP 1e-9  // as in rays.py: a ray this close to a plane lies in it
+#define FAR 1e15 // voxels
+#define SNAP 1e-9 // as in rays.py: a ray this close to a plane lies in it
 
-// Some tiles take turns of some steps. Tiles side by side then read the same part of the volume at about the same time. While
-// the others have their turns, the voxels of a tile's next turn come from memory: each step sends for the one so far ahead.
+// Some tiles take turns of some steps. Tiles side by side then read the same part of the volume at about the same time.
+// While the others have their turns, the voxels of a tile's next turn come from memory: each step sends for the one so
+// far ahead.
 #define TILES 64
 #define TURN 24
 
@@ -28,11 +29,11 @@ enum { FORWARD, BACKPROJECT, BY_ENDS, BY_MU };
 // A tile's way through a lattice.
 typedef struct {
     F t_first[3], t_step[3]; // plane k of those ahead is crossed at t_first + k t_step
-    F k[3];                  // number of the plane behind the next one
-    I stride[3], voxel;      // what crossing a plane adds to the voxel's index
+    F k[3]; // number of the plane behind the next one
+    I stride[3], voxel; // what crossing a plane adds to the voxel's index
     F t_enter, t_exit;
-    int64_t ahead;      // what TURN steps add to the voxel's index
-    I into[3], out[3];  // the axis of the face by which rays enter and leave
+    int64_t ahead; // what TURN steps add to the voxel's index
+    I into[3], out[3]; // the axis of the face by which rays enter and leave
 } Way;
 
 typedef struct {
@@ -85,8 +86,8 @@ INLINE void take_listed(const RayList *list, const int64_t first, const int own,
     }
 }
 
-// Rays with ends that are no numbers, or too far away for voxels to be told apart, are moved to where they miss. A direction is
-// 0 or large enough to divide by.
+// Rays with ends that are no numbers, or too far away for voxels to be told apart, are moved to where they miss. A
+// direction is 0 or large enough to divide by.
 INLINE void move_aside(D start[3], D direction[3], D *mm) {
     B sound = *mm < (D)NEVER;
     EACH_AXIS(a) sound &= ABS(start[a]) + ABS(direction[a]) < (D)FAR;
@@ -98,12 +99,14 @@ INLINE void move_aside(D start[3], D direction[3], D *mm) {
 // ---- The way through a lattice
 
 // Alpha where rays enter and leave a lattice, in all and axis by axis. Where they miss it, enter >= leave.
-INLINE void clip(const Lattice *lattice, const D start[3], const D direction[3], D *enter, D *leave, D in[3], D out[3]) {
+INLINE void clip(const Lattice *lattice, const D start[3], const D direction[3], D *enter, D *leave, D in[3],
+                 D out[3]) {
     *enter = 0, *leave = 1;
     EACH_AXIS(a) {
         const D n = lattice->n[a];
         const B parallel = direction[a] == (D)0, within = (start[a] >= (D)0) & (start[a] < n);
-        const D inverse = 1 / (parallel ? (D)1 : direction[a]), low = -start[a] * inverse, high = (n - start[a]) * inverse;
+        const D inverse = 1 / (parallel ? (D)1 : direction[a]), low = -start[a] * inverse,
+                high = (n - start[a]) * inverse;
         in[a] = parallel ? (within ? (D)-NEVER : (D)NEVER) : MIN(low, high);
         out[a] = parallel ? (within ? (D)NEVER : (D)-NEVER) : MAX(low, high);
         *enter = MAX(*enter, in[a]);
@@ -111,12 +114,15 @@ INLINE void clip(const Lattice *lattice, const D start[3], const D direction[3],
     }
 }
 
-// The way from alpha `enter` on, where t is 0 at `begin` and 1 after `span`. Returns how many planes are crossed at most.
+// The way from alpha `enter` on, where t is 0 at `begin` and 1 after `span`. Returns how many planes are crossed at
+// most.
 //
-// Why a voxel's index never leaves the lattice: from the first voxel, `room` planes can be crossed. Plane k, counted from 0,
-// is crossed at fl(t_first + k t_step), which does not fall with k, for rounding keeps order, and only at a t of at most t_exit,
-// which is below fl(t_first + room t_step): so k < room. The margin covers that this may be rounded once here, twice there.
-INLINE D set_out(Way *way, const Lattice *lattice, const D start[3], const D direction[3], B hits, D enter, D begin, D span) {
+// Why a voxel's index never leaves the lattice: from the first voxel, `room` planes can be crossed. Plane k, counted
+// from 0, is crossed at fl(t_first + k t_step), which does not fall with k, for rounding keeps order, and only at a t
+// of at most t_exit, which is below fl(t_first + room t_step): so k < room. The margin covers that this may be rounded
+// once here, twice there.
+INLINE D set_out(Way *way, const Lattice *lattice, const D start[3], const D direction[3], B hits, D enter, D begin,
+                 D span) {
     D crossings = 0, crossed[3];
     const D per_span = 1 / span;
     way->voxel = 0;

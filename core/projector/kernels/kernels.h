@@ -6,9 +6,8 @@
 //
 //     L int_0^1 f(alpha) exp(-L int_0^alpha mu) dalpha
 //
-// The kernels allocate nothing, keep nothing and start no thread: a job belongs to the thread that calls. Nothing here
-// is checked; siddon_cpu.py makes only jobs whose arrays are as large as said here, with fewer than 2^31 voxels in a
-// lattice.
+// The kernels allocate nothing, keep nothing and start no thread: a job belongs to the thread that calls. Nothing here is
+// checked; siddon_cpu.py makes only jobs whose arrays are as large as said here, of fewer than 2^31 voxels in a lattice.
 
 #pragma once
 #include <stdint.h>
@@ -21,21 +20,21 @@ typedef struct {
     int64_t n[3];
 } Lattice;
 
-// Rays from a source to the points corner + i line_step + j ray_step, for i from 0 to lines - 1 and j from 0 to rays
-// - 1. The value of ray (i, j) is values[place + i * line_stride + j * ray_stride].
+// Rays from a source to the points corner + i line_step + j ray_step, with 0 <= i < lines and 0 <= j < rays.
+// The value of ray (i, j) is values[place + i * line_stride + j * ray_stride].
 typedef struct {
     double volume[4][3]; // source, corner, line step, ray step in the volume's index space
-    double mu[4][3]; // the same in mu's, where that has a lattice of its own
-    double world[3][3]; // source to corner, line step, ray step in mm
+    double mu[4][3];     // the same in mu's, where that has a lattice of its own
+    double world[3][3];  // source to corner, line step, ray step in mm
     int64_t lines, rays;
     int64_t place, line_stride, ray_stride;
 } Fan;
 
 // Rays one by one, columns of arrays (3, count) and (count).
 typedef struct {
-    const double *starts, *directions; // in the volume's index space; a direction is source to target
+    const double *starts, *directions;       // in the volume's index space; a direction is source to target
     const double *mu_starts, *mu_directions; // in mu's, where that has a lattice of its own
-    const double *lengths; // mm
+    const double *lengths;                   // mm
     int64_t count;
 } RayList;
 
@@ -51,8 +50,8 @@ typedef struct {
     RayList list; // or, where there are no fans, these: ray r's value is values[r]
     void *values;
     const void *integrals; // with a task that needs them: as forward gave them, in the values' places
-    double *derivatives; // (7 or 14, rays): row after row, rays in order
-    void *gradient; // of mu's shape
+    double *derivatives;   // (7 or 14, rays): row after row, rays in order
+    void *gradient;        // of mu's shape
 } Job;
 
 // What level of processor the kernels are compiled for; any processor of the platform runs level 0.

@@ -8,29 +8,21 @@
 #define LEVELS 1
 #endif
 
-#define DECLARE(level)                                                                            \
-    void forward_##level##_float(const Job *), forward_##level##_double(const Job *);             \
-    void backproject_##level##_float(const Job *), backproject_##level##_double(const Job *);     \
+#define DECLARE(level)                                                                       \
+    void forward_##level##_float(const Job *), forward_##level##_double(const Job *);         \
+    void backproject_##level##_float(const Job *), backproject_##level##_double(const Job *); \
     void differentiate_##level##_float(const Job *), differentiate_##level##_double(const Job *); \
     void differentiate_by_mu_##level##_float(const Job *), differentiate_by_mu_##level##_double(const Job *);
 
 typedef void Kernel(const Job *);
 #if LEVELS == 3
-DECLARE(0)
-DECLARE(1) DECLARE(2)
-#define KERNELS(name)                                                                                             \
-    {                                                                                                             \
-        {name##_0_float, name##_0_double}, {name##_1_float, name##_1_double}, { name##_2_float, name##_2_double } \
-    }
-    static const char *const names[] = {"SSE2", "AVX2", "AVX-512"};
+DECLARE(0) DECLARE(1) DECLARE(2)
+#define LEVEL(name, level) {name##_##level##_float, name##_##level##_double}
+#define KERNELS(name) {LEVEL(name, 0), LEVEL(name, 1), LEVEL(name, 2)}
+static const char *const names[] = {"SSE2", "AVX2", "AVX-512"};
 #else
 DECLARE(0)
-#define KERNELS(name)                       \
-    {                                       \
-        {                                   \
-            name##_0_float, name##_0_double \
-        }                                   \
-    }
+#define KERNELS(name) {{name##_0_float, name##_0_double}}
 static const char *const names[] = {"NEON"};
 #endif
 
@@ -40,10 +32,10 @@ static const char *const names[] = {"NEON"};
 #else
 #define EXPORT __attribute__((visibility("default")))
 #endif
-#define DISPATCH(name)                                           \
-    EXPORT void name(int64_t level, const Job *job) {            \
+#define DISPATCH(name)                                        \
+    EXPORT void name(int64_t level, const Job *job) {         \
         static Kernel *const kernels[LEVELS][2] = KERNELS(name); \
-        kernels[level][job->is_double](job);                     \
+        kernels[level][job->is_double](job);                  \
     }
 
 DISPATCH(forward)
@@ -62,8 +54,7 @@ EXPORT void contract(int64_t numbers[3]) {
 #if LEVELS == 3
 #include <cpuid.h>
 
-// Asked of the processor itself: compilers' own functions for it need a runtime that shared libraries do not always
-// have.
+// Asked of the processor itself: compilers' own functions for it need a runtime that not all shared libraries have.
 EXPORT int64_t best_level(void) {
     unsigned a, b, c, d, low, high;
     if (!__get_cpuid(1, &a, &b, &c, &d)) return 0;

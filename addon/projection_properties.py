@@ -134,7 +134,7 @@ class ProjectionSettings:
         description="What computes the line integrals",
         items=(
             ("AUTO", "Automatic", "The fastest that works here", 0),
-            ("NUMBA", "Numba", "Compiled, on the processor", 1),
+            ("CPU", "CPU", "Compiled, on the processor", 1),
             ("TORCH", "PyTorch", "On the processor or the graphics card", 2),
             ("NUMPY", "NumPy", "Float64 reference, slow", 3),
             ("CUDA", "CUDA", "On an NVIDIA graphics card; needs warp-lang in Blender's Python", 4),

@@ -1,6 +1,6 @@
 """Speed, accuracy and memory of the projector beside its peers, on the same rays, in one run: `make bench`.
 
-    python benchmarks/projector.py [--quick] [--no-growth] [--only numba,c,rtk] [--output FOLDER]
+    python benchmarks/projector.py [--quick] [--no-growth] [--only cpu,c,rtk] [--output FOLDER]
 
 Every contender (`peers.py`) works in a process of its own (`worker.py`), with one thread and with one per core. They take
 turns, one at a time, several rounds; the best time of each counts. The slow ones get one view and few turns.
@@ -118,7 +118,7 @@ def main() -> None:
         workers, missing = start(arguments.only, cores())
         rows = compare(workers, case, arguments.rounds)
         check_others(workers, case, rows)
-        scaled = {w.name: w for w in workers if w.name in ("numba", "c") and w.threads == len(cores())}
+        scaled = {w.name: w for w in workers if w.name in ("cpu", "c") and w.threads == len(cores())}
         for worker in workers:
             if worker not in scaled.values():
                 worker.close()

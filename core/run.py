@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import platform
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -20,13 +21,14 @@ from .volume import Volume
 
 
 def versions() -> dict[str, str]:
-    """Versions of mphDRR, Python and the packages that the numbers depend on."""
+    """Versions of mphDRR, Python and what the numbers depend on; "cpu" is the level of the compiled kernels."""
     found = {"mphdrr": VERSION, "python": platform.python_version(), "numpy": np.__version__}
-    for package in ("numba", "torch"):
-        try:
-            found[package] = metadata.version(package)
-        except metadata.PackageNotFoundError:
-            continue
+    with contextlib.suppress(metadata.PackageNotFoundError):
+        found["torch"] = metadata.version("torch")
+    with contextlib.suppress(ImportError, OSError):  # there is none for this platform
+        from .projector import siddon_cpu
+
+        found["cpu"] = siddon_cpu.levels()[siddon_cpu.level]
     return found
 
 

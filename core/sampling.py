@@ -15,8 +15,8 @@ numerical algorithm for assessing sampling completeness", IEEE Transactions on N
 
 from __future__ import annotations
 
+import functools
 import math
-from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -32,10 +32,13 @@ TOLERANCE = math.radians(0.1)
 """How far below the true angle a gap may be, rad, unless another tolerance is asked for."""
 
 _FINEST = 1e-6  # rad
-# Squares along each side of a face of the cube at the start.
-_COARSE = 4
-# So many patches wait at most: three more with every halving, of which the finest tolerance takes about 20.
-_PATCHES = 3 * (_COARSE**2 + 40)
+# Patches along each side of a face of the cube at the start: as small as the gaps of many scanners, 4 degrees.
+_SIDE = 16
+# Points whose planes are searched together, and numbers of an array: what lies in the processor's cache.
+_POINTS = 64
+_NUMBERS = 1 << 15
+# A patch's quarters: from its middle by half of its half sides.
+_QUARTERS = np.array([[-0.5, -0.5], [-0.5, 0.5], [0.5, -0.5], [0.5, 0.5]])
 
 
 def sampling_gaps(system: PinholeSystem, points: ArrayLike, *, tolerance: float = TOLERANCE) -> Array:
@@ -61,88 +64,73 @@ def sampling_gaps(system: PinholeSystem, points: ArrayLike, *, tolerance: float 
     points = real_array(points, "points", (None, 3))
     if positive(tolerance, "tolerance", "rad") < _FINEST:
         raise InputError(f"tolerance: expected at least {_FINEST:g} rad, got {tolerance:g}")
-    visible, gaps = seen(system, points), np.empty(len(points))
-    _kernel()(points, system.centers, visible, float(tolerance), gaps)
+    visible, gaps = seen(system, points), np.full(len(points), math.pi / 2)
+    somewhere = np.flatnonzero(visible.any(axis=1))
+    for first in range(0, len(somewhere), _POINTS):
+        block = somewhere[first : first + _POINTS]
+        gaps[block] = _gaps(_towards(system.centers, points[block], visible[block]), tolerance)
     return gaps
 
 
-def _kernel() -> Any:
-    try:
-        from numba import types  # not before it is needed: it takes a second
-    except ImportError as error:
-        raise InputError("completeness of the sampling: needs numba (pip install numba)") from error
-
-    from .projector.compiling import compiled
-
-    vectors = types.Array(types.float64, 2, "C", readonly=True)
-    visible = types.Array(types.boolean, 2, "C", readonly=True)
-    return compiled(_gaps, types.void(vectors, vectors, visible, types.float64, types.float64[::1]))
+def _towards(centers: Array, points: Array, visible: NDArray[np.bool_]) -> Array:
+    """Unit vectors (P, 3, K) from each point towards the pinholes that see it; where those are fewer, one is repeated."""
+    order = np.argsort(~visible, axis=1, kind="stable")[:, : visible.sum(axis=1).max()]
+    order = np.where(np.take_along_axis(visible, order, axis=1), order, order[:, :1])
+    vectors = centers[order] - points[:, None]
+    return np.ascontiguousarray((vectors / _lengths(vectors)[..., None]).swapaxes(1, 2))
 
 
-def _gaps(points, centers, visible, tolerance, gaps):  # type: ignore[no-untyped-def]  # compiled by numba
-    """Branch and bound over the normals n.
+def _gaps(towards: Array, tolerance: float) -> Array:
+    """The largest gap (P,), rad, between `towards` (P, 3, K): branch and bound over the normals n.
 
     The angle of a plane to the nearest pinhole changes at most as fast as n turns. So a patch of normals around n holds no
     larger gap than that of n plus the patch's radius, and patches that cannot beat the best by more than `tolerance` are
-    left out. n and -n are one plane: three faces of a cube, cut into ever smaller squares, hold all.
+    left out; the others are cut into quarters.
     """
-    towards = np.empty((len(centers), 3))
-    faces = np.empty(_PATCHES, np.int64)
-    patches = np.empty((_PATCHES, 3))  # the middle's two coordinates on the face, and half the side
-    best_n, n = np.array([0.0, 0.0, 1.0]), np.empty(3)
-    for p in range(len(points)):
-        count = 0
-        for m in range(len(centers)):
-            if visible[p, m]:
-                x, y, z = centers[m, 0] - points[p, 0], centers[m, 1] - points[p, 1], centers[m, 2] - points[p, 2]
-                length = math.sqrt(x * x + y * y + z * z)
-                towards[count, 0], towards[count, 1], towards[count, 2] = x / length, y / length, z / length
-                count += 1
-        if count == 0:
-            gaps[p] = math.pi / 2
-            continue
-        # The last point's worst plane is a good one to begin with.
-        sine = 1.0
-        for k in range(count):
-            sine = min(sine, abs(best_n[0] * towards[k, 0] + best_n[1] * towards[k, 1] + best_n[2] * towards[k, 2]))
-        best = math.asin(sine)
-        top = 0
-        for face in range(3):
-            for i in range(_COARSE):
-                for j in range(_COARSE):
-                    faces[top] = face
-                    patches[top, 0], patches[top, 1] = (2 * i + 1) / _COARSE - 1, (2 * j + 1) / _COARSE - 1
-                    patches[top, 2] = 1 / _COARSE
-                    top += 1
-        while top > 0:
-            top -= 1
-            face = faces[top]
-            a, b, half = patches[top, 0], patches[top, 1], patches[top, 2]
-            # Seen from the cube's middle, what is on its face turns at most by length over distance.
-            near_a, near_b = max(abs(a) - half, 0.0), max(abs(b) - half, 0.0)
-            radius = half * math.sqrt(2.0 / (1.0 + near_a * near_a + near_b * near_b))
-            enough = best + tolerance - radius
-            least = math.sin(min(enough, math.pi / 2)) if enough > 0 else -1.0
-            norm = math.sqrt(1.0 + a * a + b * b)
-            n[face], n[(face + 1) % 3], n[(face + 2) % 3] = 1.0 / norm, a / norm, b / norm
-            sine = 1.0
-            for k in range(count):
-                sine = min(sine, abs(n[0] * towards[k, 0] + n[1] * towards[k, 1] + n[2] * towards[k, 2]))
-                if sine <= least:
-                    for i in range(3):  # what rules out this patch will likely rule out the next: look at it first
-                        towards[k, i], towards[0, i] = towards[0, i], towards[k, i]
-                    break
-            if sine <= least:
-                continue
-            angle = math.asin(sine)
-            if angle > best:
-                best = angle
-                best_n[:] = n
-            half /= 2
-            for i in range(2):
-                for j in range(2):
-                    faces[top] = face
-                    patches[top, 0], patches[top, 1] = a + (2 * i - 1) * half, b + (2 * j - 1) * half
-                    patches[top, 2] = half
-                    top += 1
-        gaps[p] = best
+    best = np.zeros(len(towards))
+    whole = _patches()
+    bounds = _bounds(whole, towards, np.arange(len(towards)), best)
+    likeliest = bounds == bounds.max(axis=1, keepdims=True)
+    for some in (likeliest, ~likeliest):  # what is found in one rules out many others
+        point, patch = np.nonzero(some & (bounds > best[:, None] + tolerance))
+        patches = whole[0, patch]
+        while len(point):
+            quarters = np.repeat(patches[:, None], 4, axis=1)
+            quarters[:, :, 0] += _QUARTERS @ patches[:, 1:]
+            quarters[:, :, 1:] /= 2
+            parent, child = np.nonzero(_bounds(quarters, towards, point, best) > best[point, None] + tolerance)
+            point, patches = point[parent], quarters[parent, child]
+    return best
+
+
+@functools.cache
+def _patches() -> Array:
+    """Patches (1, N, 3, 3) that hold a normal of every plane: middle, and two half sides, on three faces of a cube.
+
+    n and -n are one plane, so three faces hold all. Seen from the cube's middle the patches are of one size, nearly.
+    """
+    edges = np.tan(np.linspace(-math.pi / 4, math.pi / 4, _SIDE + 1))
+    a, b = np.meshgrid((edges[1:] + edges[:-1]) / 2, (edges[1:] + edges[:-1]) / 2)
+    half_a, half_b = np.meshgrid(np.diff(edges) / 2, np.diff(edges) / 2)
+    zero = np.zeros_like(a)
+    face = np.stack([[zero + 1, a, b], [zero, half_a, zero], [zero, zero, half_b]]).reshape(3, 3, -1).transpose(2, 0, 1)
+    return np.concatenate([np.roll(face, axis, axis=2) for axis in range(3)])[None]
+
+
+def _bounds(patches: Array, towards: Array, point: NDArray[np.intp], best: Array) -> Array:
+    """Bounds (A, N) of the gaps in patches (A or 1, N, 3, 3) of points; `best` (P,) learns the gaps in their middle."""
+    middles, sines = patches[:, :, 0], np.empty((len(point), patches.shape[1]))
+    size = max(1, _NUMBERS // (patches.shape[1] * towards.shape[2]))
+    for first in range(0, len(point), size):
+        some = slice(first, first + size)
+        across = (middles if len(middles) == 1 else middles[some]) @ towards[point[some]]
+        np.abs(across, out=across).min(axis=2, out=sines[some])
+    distance, radius = _lengths(middles), _lengths(patches[:, :, 1] + patches[:, :, 2])
+    angles = np.arcsin(np.minimum(sines / distance, 1))
+    np.maximum.at(best, point, angles.max(axis=1))
+    # Seen from the cube's middle, what is on its face turns at most by length over distance.
+    return angles + radius / np.maximum(1, distance - radius)
+
+
+def _lengths(vectors: Array) -> Array:
+    return np.sqrt(np.einsum("...i,...i", vectors, vectors))

@@ -143,7 +143,7 @@ def add_view_options(parser: argparse.ArgumentParser, computing: bool = True) ->
     parser.add_argument("--modules", metavar="RANGE", help="such as 1-40 or 1-20,41; default: all")
     if not computing:
         return
-    parser.add_argument("--backend", default="auto", help="auto, numba, cuda, torch or numpy")
+    parser.add_argument("--backend", default="auto", help="auto, cpu, cuda, torch or numpy")
     parser.add_argument("--threads", type=int, metavar="N", help="processor threads; default: all")
 
 

@@ -227,7 +227,7 @@ def _require_fitting(arguments: argparse.Namespace) -> None:
         if "within_cone" not in arguments:
             refuse(arguments, ("opening_angle",), "needs --aperture-mu or --within-cone")
     if arguments.backend in ("cuda", "torch"):
-        refuse(arguments, ("threads",), f"is for numba and numpy: {arguments.backend} has threads of its own")
+        refuse(arguments, ("threads",), f"is for cpu and numpy: {arguments.backend} has threads of its own")
 
 
 def _attenuation(path: str, energy: str | None, series: str | None) -> Volume:

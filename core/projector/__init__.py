@@ -3,8 +3,8 @@
 `operator` holds what is the same for every backend: checks, the loop over views, threads, memory. `tracing` takes rays
 by their ends, or as fans, instead of as views. `rays` maps rays into index space, once for all backends. Each
 ``siddon_*`` module integrates along such rays, spreads values back along them and tells how the integrals move with the
-rays' ends; `backends` chooses among them, `autograd` makes them steps of torch's graph. Neither numba nor torch is
-imported before it is needed.
+rays' ends; `backends` chooses among them, `autograd` makes them steps of torch's graph. torch is not imported before it
+is needed.
 """
 
 from __future__ import annotations

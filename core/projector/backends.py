@@ -13,7 +13,7 @@ import numpy as np
 from ..errors import InputError, InputWarning
 from .arrays import ArrayOrTensor, to_numpy, to_tensor
 
-BACKENDS = ("numba", "torch", "numpy", "cuda")
+BACKENDS = ("cpu", "torch", "numpy", "cuda")
 """Names of the backends. ``siddon_<name>`` is the module of each.
 
 Such a module has four functions. Line integrals are ``L int_0^1 f(alpha) exp(-L int_0^alpha mu) dalpha`` with L the
@@ -35,28 +35,32 @@ on one device for "torch", numpy arrays or tensors on the GPU for "cuda" (see it
 others. "cuda" is handed several views at once, as `IndexFans`.
 """
 
-_AUTOMATIC = ("numba", "torch", "numpy")
+_AUTOMATIC = ("cpu", "torch", "numpy")
 """What "auto" chooses from, the one that it prefers first; for a tensor on a GPU see `for_tensor`."""
 
-_PACKAGES = {"cuda": "warp-lang"}
+_OLD_NAMES = {"numba": "cpu"}
+"""What files and scripts of version 0.1 call a backend."""
+
+_PACKAGES = {"torch": "torch", "cuda": "warp-lang"}
 
 
 def choose(name: str) -> str:
-    """The backend that `name` ("auto" or one of `BACKENDS`) stands for on this machine, loaded.
+    """The backend that `name` ("auto", one of `BACKENDS` or an old name) stands for on this machine, loaded.
 
     Raises
     ------
     InputError
         No such backend, or the library or the GPU that it needs is missing.
     """
+    name = _OLD_NAMES.get(name, name)
     if name != "auto" and name not in BACKENDS:
         raise InputError(f"backend {name!r}: expected one of auto, {', '.join(BACKENDS)}")
     if name != "auto":
         try:
             module = load(name)
         except _CANNOT_LOAD as error:
-            package = _PACKAGES.get(name, name)
-            raise InputError(f"backend {name!r} needs {package} ({_reason(error)}): pip install {package}") from None
+            remedy = f": pip install {_PACKAGES[name]}" if name in _PACKAGES else ""
+            raise InputError(f"backend {name!r} cannot be used ({_reason(error)}){remedy}") from None
         if name == "cuda":
             module.device()
         return name
@@ -64,10 +68,10 @@ def choose(name: str) -> str:
         try:
             load(candidate)
         except _CANNOT_LOAD as error:
-            if candidate == "numba":
+            if candidate == "cpu":
                 reason = _reason(error)
             continue
-        if candidate != "numba":
+        if candidate != "cpu":
             _warn_slower(candidate, reason)
         return candidate
     raise AssertionError("numpy is always there")
@@ -104,7 +108,7 @@ def load(name: str) -> ModuleType:
     return importlib.import_module(f".siddon_{name}", __package__)
 
 
-# A library may be absent, refuse its surroundings (numba: another numpy) or fail to load its binaries.
+# A library may be absent, be none for this platform or fail to load its binaries.
 _CANNOT_LOAD = (ImportError, OSError)
 
 
@@ -115,7 +119,7 @@ def _reason(error: BaseException) -> str:
 @functools.cache
 def _warn_slower(name: str, reason: str) -> None:
     warnings.warn(
-        f"projections run with {name}, many times slower than with numba ({reason}): pip install numba",
+        f"projections run with {name}, many times slower than with the backend cpu ({reason})",
         InputWarning,
         stacklevel=4,
     )

@@ -42,6 +42,12 @@ class Beam:
         """Some of the rays of some of the lines, of some shifts, and their weights."""
         return self.rays[lines, rays, shifts], None if self.weigh is None else self.weigh(lines, rays, shifts)
 
+    def weights(self) -> Array:
+        """What the integrals of all rays count in their pixels, (shifts, lines, rays)."""
+        every = slice(None)
+        weights = np.ones(1) if self.weigh is None else self.weigh(every, every, every)
+        return np.broadcast_to(weights, (len(self.rays.shifts), *self.rays.shape))
+
     def transposed(self) -> Beam:
         """The same rays by columns: n_u lines of n_v rays."""
         weigh, rays = self.weigh, self.rays.transposed()

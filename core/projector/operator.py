@@ -42,6 +42,12 @@ from .rays import Attenuation, IndexFans, RayMapper, window
 _FEWEST_RAYS = 4096
 _MOST_RAYS = {"cpu": 2**14, "torch": 2**18, "cuda": 2**22}
 
+# Rays of what the threads of the adjoint do before they wait for each other.
+_RAYS_OF_A_ROUND = 2**19
+
+# Rays of a pixel that are kept from call to call: few images are done before their rays would be made.
+_BEAMS_KEPT = 16
+
 # Threads of the adjoint, each with a volume of its own: more would gain little and take much memory.
 _MOST_VOLUMES = 8
 
@@ -160,6 +166,7 @@ class Projector(LinearOperator):
         self.backend = backends.choose(backend)
         self.threads = _thread_count(threads)
         self._auto = backend == "auto"
+        self._kept_beams: dict[int, tuple[list[Beam], bool]] = {}
         self._mu: ArrayOrTensor = None if self.model.mu is None else self.model.mu.array
         self._adjoint = AdjointProjector(self)
 
@@ -259,11 +266,13 @@ class Projector(LinearOperator):
         integrate = backends.load(name).forward
         native = self._native(x, name)
         box, trace = self._lattices(native, native)
-        if name == "cuda" and not self.model.weights_voxels:
-            yield from self._images_together(box, trace)
-            return
-        workers = self._workers(name)
+        workers, groups = self._workers(name), self._groups(name)
         with _parallel(workers) as parallel_map:
+            if groups:
+                images_of = functools.partial(self._images_together, box=box, trace=trace, integrate=integrate)
+                for of_group in parallel_map(images_of, groups):
+                    yield from (self._finished(image, x) for image in of_group)
+                return
             # The next view is begun before one is done, so that no thread waits for the others at a view's end.
             before: tuple[int, ArrayOrTensor, Iterable[None]] | None = None
             for m in range(len(self.views)):
@@ -297,16 +306,22 @@ class Projector(LinearOperator):
         _wait_for(running)
         return self._finished(self._responded(image, m), x)
 
-    def _images_together(self, box: ArrayOrTensor, trace: RayMapper) -> Iterator[ArrayOrTensor]:
-        """`_images` for the backend that takes several views at once."""
-        integrate = backends.load("cuda").forward
-        for views in self._views_together():
-            images = zeros((len(views), *self.views.shape), box)
-            for which, by_columns, weights, rays, attenuation in self._fans(views, trace):
-                lines = images.swapaxes(1, 2) if by_columns else images
-                integrals = integrate(box, rays, attenuation).reshape(-1, *lines.shape[1:])
-                lines[which] += alike(weights, box) * integrals
-            yield from map(self._responded, images, views)
+    def _images_together(
+        self, views: range, box: ArrayOrTensor, trace: RayMapper, integrate: Callable[..., ArrayOrTensor]
+    ) -> list[ArrayOrTensor]:
+        """The images of several views at once."""
+        images = zeros((len(views), *self.views.shape), box)
+        for which, by_columns, weights, rays, attenuation in self._rays_together(views, trace):
+            lines = images.swapaxes(1, 2) if by_columns else images
+            integrals = integrate(box, rays, attenuation).reshape(-1, *lines.shape[1:])
+            if weights is not None:
+                integrals = alike(weights, box) * integrals
+            if len(set(which)) == len(which):
+                lines[which] = alike(integrals, images)
+            else:
+                for k, integral in zip(which, integrals, strict=True):
+                    lines[k] += integral
+        return [self._responded(image, m) for image, m in zip(images, views, strict=True)]
 
     def _responded(self, image: ArrayOrTensor, m: int) -> ArrayOrTensor:
         """View m's image with the detector's response."""
@@ -316,38 +331,34 @@ class Projector(LinearOperator):
         along_v, along_u = (alike(matrix, image) for matrix in response)
         return along_v @ image @ along_u.T
 
-    def _views_together(self) -> Iterator[range]:
-        """The views, as many at once as cuda is given."""
+    def _groups(self, backend: str) -> list[range]:
+        """The views, several at a time where all rays of these are not too many for a backend; else none."""
         n_views, n_v, n_u = self.shape_out
-        at_once = max(1, _MOST_RAYS["cuda"] // (n_v * n_u))
-        return (range(m, min(m + at_once, n_views)) for m in range(0, n_views, at_once))
+        if not n_views or self.model.weights_voxels:  # then every view is of a volume of its own
+            return []
+        rays = n_v * n_u * sum(len(beam.rays.shifts) for beam in self._beams(0)[0])
+        most = _MOST_RAYS.get(backend, _FEWEST_RAYS)
+        at_once = min(most // rays, max(_FEWEST_RAYS // rays, n_views // (2 * self._workers(backend))))
+        return [range(m, min(m + at_once, n_views)) for m in range(0, n_views, at_once)] if at_once > 1 else []
 
-    def _fans(
+    def _rays_together(
         self, views: range, trace: RayMapper
-    ) -> Iterator[tuple[list[int], bool, Array, IndexFans, Attenuation | None]]:
-        """The beams of several views in groups that cuda takes at once.
+    ) -> Iterator[tuple[list[int], bool, Array | None, IndexFans, Attenuation | None]]:
+        """All rays of several views: those whose lines are the images' rows, and those whose lines are their columns.
 
-        Yields which of `views` they are of, whether their lines are the images' columns, weights (as many, lines, rays, or
-        what broadcasts to that), rays and attenuation.
+        Yields of which of `views` each fan is, whether lines are columns, weights (fans, lines, rays), None where all are 1,
+        rays and attenuation.
         """
-        of_views = []
-        for m in views:
-            beams, by_columns = self._beams(m)
-            single = [(beam, slice(j, j + 1)) for beam in beams for j in range(len(beam.rays.shifts))]
-            of_views.append((single, by_columns))
-        # The first rays of all views, their second, ...; some views have more than others.
-        for j in range(max(len(single) for single, _ in of_views)):
-            for by_columns in (False, True):
-                group = [k for k, (single, columns) in enumerate(of_views) if columns == by_columns and j < len(single)]
-                if not group:
-                    continue
-                fans, weights = [], []
-                for k in group:
-                    beam, shifts = of_views[k][0][j]
-                    fan, of_rays = beam.part(slice(None), slice(None), shifts)
-                    fans.append(fan)
-                    weights.append(np.ones((1, 1, 1)) if of_rays is None else of_rays)
-                yield group, by_columns, np.concatenate(weights), *trace(*fans)
+        of_views = [self._beams(m) for m in views]
+        for by_columns in (False, True):
+            beams = [(k, beam) for k, (own, columns) in enumerate(of_views) if columns == by_columns for beam in own]
+            if not beams:
+                continue
+            which = [k for k, beam in beams for _ in beam.rays.shifts]
+            weights = None
+            if any(beam.weigh for _, beam in beams):
+                weights = np.concatenate([beam.weights() for _, beam in beams])
+            yield which, by_columns, weights, *trace(*(beam.rays for _, beam in beams))
 
     def _weighted(self, box: ArrayOrTensor, m: int, origin: tuple[int, int, int] = (0, 0, 0)) -> ArrayOrTensor:
         """A part of a volume, from voxel `origin` on, times view m's voxel weights."""
@@ -366,9 +377,15 @@ class Projector(LinearOperator):
 
         Neighbours in a line are neighbours in memory: lines follow the volume's contiguous axis as well as they can.
         """
+        if m in self._kept_beams:
+            return self._kept_beams[m]
         beams = list(self.model.beams(self.views, m, self.grid))
         by_columns = beams[0].rays.lies_across(self.grid)
-        return ([beam.transposed() for beam in beams] if by_columns else beams), by_columns
+        if by_columns:
+            beams = [beam.transposed() for beam in beams]
+        if sum(len(beam.rays.shifts) for beam in beams) <= _BEAMS_KEPT:
+            self._kept_beams[m] = beams, by_columns
+        return beams, by_columns
 
     def _lattices(
         self, native: ArrayOrTensor, volume: ArrayOrTensor = None, whole_mu: bool = False
@@ -470,68 +487,81 @@ class AdjointProjector(LinearOperator):
         require(volume_bytes + extra_bytes, f"the adjoint into {_times(grid.shape)} voxels")
         _require_rays(A.views)
         workers = volume_workers(A._workers(name), volume_bytes, extra_bytes)
-        volumes = [zeros(grid.shape, images) for _ in range(workers)]
-        total: ArrayOrTensor = zeros(grid.shape, images) if weighted else None
-        n_views = len(A.views)
+        n_views, groups = len(A.views), A._groups(name)
+        if not groups:
+            groups = [range(m, m + 1) for m in range(n_views)]
+        # Between rounds the threads wait for each other: seldom, but often enough to tell how far the work is.
+        of_round = 1 if weighted else max(workers, _RAYS_OF_A_ROUND // (len(groups[0]) * math.prod(A.views.shape)))
         _report(progress, 0, n_views)
-        if name == "cuda" and not A.model.weights_voxels:  # else every view is of a volume of its own
-            self._spread_together(images, volumes[0], of_view(0), trace, progress)
-            return volumes[0]
         with _parallel(workers) as parallel_map:
-            for m in range(n_views):
-                image, spread = images[m], of_view(m)
-                response = A.model.response(A.views, m)
-                if response is not None:
-                    along_v, along_u = (alike(matrix, image) for matrix in response)
-                    image = along_v.T @ image @ along_u
-                beams, by_columns = A._beams(m)
-                lines, rays = window([beam.rays for beam in beams], A.grid.corners())
-                # Always the same parts, so that the sums' order, and so the result, is always the same.
-                parts = [
-                    (block, *bundle)
-                    for block in _blocks(lines, rays, name, workers)
-                    for bundle in _bundles(beams, (block.stop - block.start, rays.stop - rays.start), name, workers)
-                ]
+            volumes = list(parallel_map(lambda _: zeros(grid.shape, images), range(workers)))
+            total: ArrayOrTensor = zeros(grid.shape, images) if weighted else None
+            for first in range(0, len(groups), of_round):
+                # Always the same parts into the same volume, so that the sums' order, and so the result, is always the same.
+                some = groups[first : first + of_round]
+                parts = [part for views in some for part in self._parts(images, views, name, workers, of_view, trace)]
 
-                def add(
-                    worker: int,
-                    rays: slice = rays,
-                    parts: list[tuple[slice, Beam, slice]] = parts,
-                    lines: ArrayOrTensor = image.T if by_columns else image,
-                    spread: Spread = spread,
-                ) -> None:
-                    for block, beam, shifts in parts[worker::workers]:
-                        fan, weights = beam.part(block, rays, shifts)
-                        pixels = lines[block, rays]
-                        values = alike(np.ones(1) if weights is None else weights, pixels) * pixels
-                        spread(volumes[worker], values.reshape(-1), *trace(fan))
+                def add(worker: int, parts: list[Callable[[ArrayOrTensor], None]] = parts) -> None:
+                    for part in parts[worker::workers]:
+                        part(volumes[worker])
 
                 _wait_for(parallel_map(add, range(workers)))
-                if weighted:  # otherwise in every view: each joins the others weighted
-                    total += A._weighted(_sum(volumes), m)
+                if weighted:  # each view joins the others weighted
+                    total += A._weighted(_sum(volumes, parallel_map), some[0].start)
                     for volume in volumes:
                         volume[:] = 0
-                _report(progress, m + 1, n_views)
-        if not weighted:
-            total = _sum(volumes)
-        return total
+                _report(progress, some[-1].stop, n_views)
+            return total if weighted else _sum(volumes, parallel_map)
+
+    def _parts(
+        self,
+        images: ArrayOrTensor,
+        views: range,
+        name: str,
+        workers: int,
+        of_view: Callable[[int], Spread],
+        trace: RayMapper,
+    ) -> list[Callable[[ArrayOrTensor], None]]:
+        """What there is to be added to volumes from the images of `views`, as much at once as a backend is given."""
+        A, m = self._projector, views.start
+        if len(views) > 1:
+            return [functools.partial(self._spread_together, images, views, of_view(m), trace)]
+        image, spread = images[m], of_view(m)
+        response = A.model.response(A.views, m)
+        if response is not None:
+            along_v, along_u = (alike(matrix, image) for matrix in response)
+            image = along_v.T @ image @ along_u
+        beams, by_columns = A._beams(m)
+        lines = image.T if by_columns else image
+        blocks, rays = window([beam.rays for beam in beams], A.grid.corners())
+
+        def add(block: slice, beam: Beam, shifts: slice, volume: ArrayOrTensor) -> None:
+            fan, weights = beam.part(block, rays, shifts)
+            pixels = lines[block, rays]
+            values = alike(np.ones(1) if weights is None else weights, pixels) * pixels
+            spread(volume, values.reshape(-1), *trace(fan))
+
+        return [
+            functools.partial(add, block, *bundle)
+            for block in _blocks(blocks, rays, name, workers)
+            for bundle in _bundles(beams, (block.stop - block.start, rays.stop - rays.start), name, workers)
+        ]
 
     def _spread_together(
-        self, images: ArrayOrTensor, volume: ArrayOrTensor, spread: Spread, trace: RayMapper, progress: Progress | None
+        self, images: ArrayOrTensor, views: range, spread: Spread, trace: RayMapper, volume: ArrayOrTensor
     ) -> None:
-        """`_spread` into `volume` for the backend that takes several views at once."""
+        """`_spread` of several views at once."""
         A = self._projector
-        for views in A._views_together():
-            some = images[views.start : views.stop]
-            responses = [A.model.response(A.views, m) for m in views]
-            if responses and responses[0] is not None:
-                along_v, along_u = (alike(np.stack(matrices), images) for matrices in zip(*responses, strict=True))
-                some = along_v.swapaxes(1, 2) @ some @ along_u
-            for which, by_columns, weights, rays, attenuation in A._fans(views, trace):
-                lines = (some.swapaxes(1, 2) if by_columns else some)[which]
-                values = alike(weights, images) * lines
-                spread(volume, values.reshape(-1), rays, attenuation)
-            _report(progress, views.stop, images.shape[0])
+        some = images[views.start : views.stop]
+        responses = [A.model.response(A.views, m) for m in views]
+        if responses[0] is not None:
+            along_v, along_u = (alike(np.stack(matrices), images) for matrices in zip(*responses, strict=True))
+            some = along_v.swapaxes(1, 2) @ some @ along_u
+        for which, by_columns, weights, rays, attenuation in A._rays_together(views, trace):
+            values = (some.swapaxes(1, 2) if by_columns else some)[which]
+            if weights is not None:
+                values = alike(weights, images) * values
+            spread(volume, values.reshape(-1), rays, attenuation)
 
 
 def lattices(
@@ -569,12 +599,17 @@ def volume_workers(workers: int, volume_bytes: int, extra_bytes: int = 0) -> int
     return min(workers, _MOST_VOLUMES, max(1, (available() - extra_bytes) // (2 * volume_bytes)))
 
 
-def _sum(volumes: list[ArrayOrTensor]) -> ArrayOrTensor:
+def _sum(volumes: list[ArrayOrTensor], parallel_map: ParallelMap) -> ArrayOrTensor:
     """Their sum, in the first of them."""
-    total = volumes[0]
-    for volume in volumes[1:]:
-        total += volume
-    return total
+    total, *others = (volume.reshape(-1) for volume in volumes)
+    size = -(-len(total) // len(volumes))
+
+    def add(first: int) -> None:
+        for other in others:
+            total[first : first + size] += other[first : first + size]
+
+    _wait_for(parallel_map(add, range(0, len(total), size) if others else []))
+    return volumes[0]
 
 
 def _blocks(lines: slice, rays: slice, backend: str, workers: int) -> list[slice]:

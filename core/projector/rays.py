@@ -99,21 +99,22 @@ def window(fans: Sequence[Fan], points: NDArray[np.float64]) -> tuple[slice, sli
         (P, 3), in the frame of the fans, mm.
     """
     shape = fans[0].shape
-    found = []
-    for fan in fans:
-        axes = np.stack([fan.line_step, fan.ray_step, fan.corner - fan.source], axis=1)
-        # point - source = w (i line_step + j ray_step + corner - source): solved for w (i, j, 1).
-        *places, factor = np.linalg.solve(axes, (points - fan.source).T)
-        if not (factor > 1e-6 * np.abs(factor).max()).all():  # some of it beside or behind the source
-            return slice(0, shape[0]), slice(0, shape[1])
-        place = np.array(places) / factor
-        # A little more than rounding.
-        found.append(
-            (place.min(axis=1) - fan.shifts.max(axis=0) - 0.01, place.max(axis=1) - fan.shifts.min(axis=0) + 0.01)
-        )
-    first = np.clip(np.ceil(np.min([low for low, _ in found], axis=0)), 0, shape).astype(int)
-    stop = np.clip(np.floor(np.max([high for _, high in found], axis=0)) + 1, first, shape).astype(int)
-    return slice(int(first[0]), int(stop[0])), slice(int(first[1]), int(stop[1]))
+    source, corner, line_step, ray_step = np.concatenate([fan.vectors() for fan in fans]).swapaxes(0, 1)
+    to_corner = corner - source
+    # point - source = w (i line_step + j ray_step + to_corner), solved for w i, w j and w by Cramer's rule. Not by LAPACK,
+    # whose threads would go on waiting, busily, beside ours.
+    across = np.stack([np.cross(ray_step, to_corner), np.cross(to_corner, line_step), np.cross(line_step, ray_step)])
+    w_line, w_ray, w = np.einsum("kfi,fpi->kfp", across, points - source[:, None])
+    volume = np.einsum("fi,fi->f", line_step, across[0])[:, None]
+    w = w / volume
+    if not (w > 1e-6 * np.abs(w).max(axis=1, keepdims=True)).all():  # some of it beside or behind a source
+        return slice(0, shape[0]), slice(0, shape[1])
+    windows = []
+    for places, n in ((w_line / volume / w, shape[0]), (w_ray / volume / w, shape[1])):
+        first, last = places.min() - 0.01, places.max() + 0.01  # a little more than rounding
+        start = int(np.clip(np.ceil(first), 0, n))
+        windows.append(slice(start, int(np.clip(np.floor(last) + 1, start, n))))
+    return windows[0], windows[1]
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,8 +1,8 @@
 """Siddon's line integrals on an NVIDIA GPU, one thread a ray, several views a launch: the kernels are `warp_kernels`.
 
 Why NVIDIA Warp: one wheel for each of Linux, Windows and macOS without bounds on numpy, which brings its own compilers
-and runs the very same kernels on the CPU, where they are tested. numba-cuda's simulator interprets Python, nothing that a
-GPU runs, and binds numpy; Triton has no official wheel for Windows, and its programs are of blocks, not of rays that walk.
+and runs the very same kernels on the CPU, where they are tested. Triton has no official wheel for Windows, and its programs
+are of blocks, not of rays that walk.
 
 The volume is on the device as a whole. The rays are made there, from their fans; they are launched in pieces that leave
 half of the free memory alone. An array is copied to the device and the results back at every call, a tensor on the device
@@ -22,6 +22,7 @@ import tempfile
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
+from pathlib import Path
 from types import ModuleType
 from typing import Any
 
@@ -32,7 +33,6 @@ from numpy.typing import NDArray
 from ..errors import InputError
 from ..memory import readable_size
 from .arrays import ArrayOrTensor, is_tensor, to_numpy
-from .caching import cache_folder
 from .rays import Attenuation, IndexRays, Rays
 
 DEVICE_VARIABLE = "MPHDRR_CUDA_DEVICE"
@@ -99,7 +99,7 @@ def device() -> Any:
     """
     name = os.environ.get(DEVICE_VARIABLE, "cuda")
     if name != "cpu" and not has_driver():
-        raise InputError("backend 'cuda': no NVIDIA driver found on this machine; use backend 'auto' or 'numba'")
+        raise InputError("backend 'cuda': no NVIDIA driver found on this machine; use backend 'auto' or 'cpu'")
     with _loading, _quiet():
         _initialize()
         try:
@@ -253,9 +253,9 @@ def _kernels(device: Any) -> ModuleType:
 
 
 def _initialize() -> None:
-    """Start Warp with its cache in `cache_folder`, unless the user has chosen another or has started it already."""
+    """Start Warp with its cache in `_cache_folder`, unless the user has chosen another or has started it already."""
     if wp.config.kernel_cache_dir is None and "WARP_CACHE_PATH" not in os.environ:
-        folder = str(cache_folder("warp"))
+        folder = str(_cache_folder())
         try:
             os.makedirs(folder, exist_ok=True)
             tempfile.TemporaryFile(dir=folder).close()
@@ -265,6 +265,17 @@ def _initialize() -> None:
             folder = _scratch_folder()
         wp.config.kernel_cache_dir = folder
     wp.init()
+
+
+def _cache_folder() -> Path:
+    """The folder of this user in which Warp may keep what it can make again."""
+    if sys.platform == "win32":
+        base = os.environ.get("LOCALAPPDATA") or Path.home() / "AppData" / "Local"
+    elif sys.platform == "darwin":
+        base = Path.home() / "Library" / "Caches"
+    else:
+        base = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
+    return Path(base) / "mphdrr" / "warp"
 
 
 @functools.cache

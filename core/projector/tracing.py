@@ -283,18 +283,18 @@ class Tracer:
     ) -> ArrayOrTensor:
         """What ``add(volume, values, rays, attenuation)`` adds to a volume on `grid`, on several threads."""
         workers = volume_workers(self._workers, (8 if self.float64 else 4) * grid.n_voxels)
-        volumes = [zeros(grid.shape, values) for _ in range(workers)]
         pieces = self._pieces(bundles)
-
-        def work(worker: int) -> None:
-            # Always the same pieces, so that the result is always the same.
-            for piece in pieces[worker::workers]:
-                add(volumes[worker], piece.of(values).reshape(-1), *piece.on(mapper))
-
         with _parallel(workers) as parallel_map:
+            volumes = list(parallel_map(lambda _: zeros(grid.shape, values), range(workers)))
+
+            def work(worker: int) -> None:
+                # Always the same pieces, so that the result is always the same.
+                for piece in pieces[worker::workers]:
+                    add(volumes[worker], piece.of(values).reshape(-1), *piece.on(mapper))
+
             for _ in parallel_map(work, range(workers)):
                 pass
-        return _sum(volumes)
+            return _sum(volumes, parallel_map)
 
     def _run(
         self,

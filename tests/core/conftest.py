@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib.util
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +16,10 @@ from mphdrr.core.system import PinholeSystem
 from mphdrr.core.volume import Volume
 
 WORKBOOK = Path(__file__).parents[2] / "examples" / "dc-spect-80.xlsx"
+
+_needs_torch = pytest.mark.skipif(importlib.util.find_spec("torch") is None, reason="torch is not installed")
+BACKENDS = ["numpy", pytest.param("torch", marks=_needs_torch), "cpu"]
+"""Parameters of what holds of every backend on the processor."""
 
 
 @pytest.fixture

@@ -152,7 +152,7 @@ NO_EFFECT = [
     ),
     ("--emission --edge paix", "--edge needs --aperture-mu"),
     ("--emission --opening-angle 80", "--opening-angle needs --aperture-mu or --within-cone"),
-    ("--backend torch --threads 2", "--threads is for numba and numpy: torch has threads of its own"),
+    ("--backend torch --threads 2", "--threads is for cpu and numpy: torch has threads of its own"),
 ]
 
 
@@ -175,7 +175,7 @@ def test_options_without_effect_are_refused(options, said, tmp_path, capsys):
         (["phantom", "derenzo", "--voxels", "99999", "-o", "FOLDER/a.npz"], "of memory"),
         (["phantom", "derenzo", "--voxels", "9", "9", "-o", "FOLDER/a.npz"], "--voxels"),
         (["project", "WORKBOOK", "-o", "FOLDER/a.txt"], "expected a name ending in"),
-        (["project", "WORKBOOK", *SMALL, "--backend", "magic", "-o", "FOLDER/a.h5"], "numba"),
+        (["project", "WORKBOOK", *SMALL, "--backend", "magic", "-o", "FOLDER/a.h5"], "auto, cpu, torch"),
         (["project", "WORKBOOK", *SMALL, "--magnification", "0", "-o", "FOLDER/a.h5"], "magnification"),
         (["project", "WORKBOOK", *SMALL, "--noise", "1", "-o", "FOLDER/a.h5"], "--noise needs --emission"),
         (["project", "WORKBOOK", *SMALL, "--edge", "path", "-o", "FOLDER/a.h5"], "--edge needs --emission"),
@@ -240,7 +240,7 @@ def test_an_interrupt_leaves_nothing(workbook, tmp_path, monkeypatch, capsys):
 def test_the_package_is_imported_without_its_heavy_parts():
     code = (
         "import sys, mphdrr.core, mphdrr.addon.cli; "
-        "heavy = {'torch', 'numba', 'h5py', 'openpyxl', 'PIL', 'trimesh', 'nibabel', 'bpy'} & set(sys.modules); "
+        "heavy = {'torch', 'h5py', 'openpyxl', 'PIL', 'trimesh', 'nibabel', 'bpy'} & set(sys.modules); "
         "sys.exit(f'imported: {heavy}' if heavy else 0)"
     )
     subprocess.run([sys.executable, "-c", code], check=True)

@@ -2,24 +2,15 @@
 
 from __future__ import annotations
 
-import importlib.util
-
 import numpy as np
 import pytest
 
 import mphdrr.core as mph
 from mphdrr.core.errors import InputError
 
-from .conftest import WORKBOOK, emission, general_grid
+from .conftest import BACKENDS, WORKBOOK, emission, general_grid
 
-
-def _backend(name):
-    missing = name != "numpy" and importlib.util.find_spec(name) is None
-    return pytest.param(name, marks=pytest.mark.skipif(missing, reason=f"{name} is not installed"))
-
-
-BACKENDS = [_backend(name) for name in ("numpy", "torch", "numba")]
-TOLERANCE = {"numpy": 1e-12, "torch": 1e-5, "numba": 1e-5}
+TOLERANCE = {"numpy": 1e-12, "torch": 1e-5, "cpu": 1e-5}
 
 
 def one_module(**changes):

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import importlib.util
-
 import numpy as np
 import pytest
 
@@ -15,15 +13,7 @@ from mphdrr.core.projector.crystal import gaussian_blur  # noqa: E402
 from mphdrr.core.projector.poses import emission_images  # noqa: E402
 from mphdrr.core.rotations import se3_exp  # noqa: E402
 
-from .conftest import emission, general_grid  # noqa: E402
-
-
-def _backend(name):
-    reason = f"{name} is not installed" if importlib.util.find_spec(name) is None else ""
-    return pytest.param(name, marks=pytest.mark.skipif(bool(reason), reason=reason))
-
-
-BACKENDS = [_backend(name) for name in ("numpy", "torch", "numba")]
+from .conftest import BACKENDS, emission, general_grid  # noqa: E402
 
 
 def grid_of_mu(which, grid, rng):

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import importlib.util
-
 import numpy as np
 import pytest
 
@@ -16,14 +14,8 @@ from mphdrr.core.projector.tracing import trace_fans  # noqa: E402
 from mphdrr.core.views import Views  # noqa: E402
 from mphdrr.core.volume import Volume  # noqa: E402
 
-from .conftest import general_grid  # noqa: E402
+from .conftest import BACKENDS, general_grid  # noqa: E402
 
-BACKENDS = [
-    pytest.param(
-        name, marks=pytest.mark.skipif(importlib.util.find_spec(name) is None, reason=f"{name} is not installed")
-    )
-    for name in ("numpy", "torch", "numba")
-]
 MU = [None, "shared", "own"]
 SHAPES = [(7, 5, 6), (1, 6, 4), (5, 1, 3), (4, 5, 1), (1, 1, 1)]
 

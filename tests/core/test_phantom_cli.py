@@ -24,7 +24,7 @@ radius = 10
 activity = 40
 """
 
-NUMPY = ["--size", "9", "9", "--backend", "numpy"]  # nothing is compiled for a few rays
+NUMPY = ["--size", "9", "9", "--backend", "numpy"]
 
 
 @pytest.mark.parametrize(

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import importlib.util
-
 import numpy as np
 import pytest
 
@@ -14,14 +12,7 @@ from mphdrr.core.projector import Projector  # noqa: E402
 from mphdrr.core.projector.poses import pinhole_images, pinhole_rays  # noqa: E402
 from mphdrr.core.volume import Volume  # noqa: E402
 
-from .conftest import general_grid  # noqa: E402
-
-BACKENDS = [
-    pytest.param(
-        name, marks=pytest.mark.skipif(importlib.util.find_spec(name) is None, reason=f"{name} is not installed")
-    )
-    for name in ("numpy", "torch", "numba")
-]
+from .conftest import BACKENDS, general_grid  # noqa: E402
 
 
 def cameras(system):

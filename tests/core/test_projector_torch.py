@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import importlib.util
-
 import numpy as np
 import pytest
 
@@ -15,12 +13,8 @@ from mphdrr.core.projector import Projector  # noqa: E402
 from mphdrr.core.views import Views  # noqa: E402
 from mphdrr.core.volume import Volume  # noqa: E402
 
-BACKENDS = [
-    pytest.param(
-        name, marks=pytest.mark.skipif(importlib.util.find_spec(name) is None, reason=f"{name} is not installed")
-    )
-    for name in ("numpy", "torch", "numba")
-]
+from .conftest import BACKENDS  # noqa: E402
+
 GRID = Grid.centered((5, 4, 3), 1.0)
 VIEWS = Views(
     [[0.1, 0.3, -20], [2, -20, 1]], [[0, 0, 20], [0, 20, 0]], [[1, 0, 0], [1, 0, 0]], [[0, 1, 0], [0, 0, 1]], (4, 5)

@@ -80,7 +80,6 @@ def test_bad_input_is_one_clear_line():
 @pytest.mark.skipif(not CHEST.is_file(), reason="the chest CT is not there")
 def test_example_on_the_chest_ct():
     """From 10 degrees and 20 mm away to within 0.2 degrees and 0.5 mm."""
-    pytest.importorskip("numba")
     command = [sys.executable, str(ROOT / "examples/register_pose.py"), str(CHEST), "--pixels", "96"]
     lines = subprocess.run(command, check=True, capture_output=True, text=True, timeout=120).stdout.splitlines()
     start, found = (dict(zip(("degrees", "mm"), (float(x) for x in (line.split()[1], line.split()[3])), strict=True))

@@ -10,6 +10,9 @@
 
 #include "lanes.h"
 #include "kernels.h"
+#if LEVEL == 2
+#include <immintrin.h>
+#endif
 
 #define NEVER 1e30 // t of a plane that is never crossed
 #define FAR 1e15   // voxels
@@ -25,7 +28,7 @@ enum { FORWARD, BACKPROJECT, BY_ENDS, BY_MU };
 // A tile's way through a lattice.
 typedef struct {
     F t_first[3], t_step[3]; // plane k of those ahead is crossed at t_first + k t_step
-    F k[3];                  // number of the next plane
+    F k[3];                  // number of the plane behind the next one
     I stride[3], voxel;      // what crossing a plane adds to the voxel's index
     F t_enter, t_exit;
     int64_t ahead;      // what TURN steps add to the voxel's index
@@ -130,7 +133,7 @@ INLINE D set_out(Way *way, const Lattice *lattice, const D start[3], const D dir
         crossings += crossed[a];
         way->t_first[a] = AS(F, crosses ? MAX(MIN(t_first, (D)NEVER), (D)-NEVER) : (D)NEVER);
         way->t_step[a] = AS(F, crosses ? MIN(t_step, (D)NEVER) : (D)0);
-        way->k[a] = 0;
+        way->k[a] = 1;
         way->stride[a] = AS(I, up ? (D)stride : (D)-stride);
         way->voxel += AS(I, voxel) * (I)stride;
         const F t_wall = MIN(way->t_first[a] + AS(F, room) * way->t_step[a], (F)NEVER);
@@ -162,19 +165,21 @@ typedef uint64_t Pairs __attribute__((ext_vector_type(LANES * sizeof(REAL) / 8))
 #define INDEX(pairs, i) (sizeof(REAL) == 8 ? pairs[i] : (i) % 2 ? pairs[(i) / 2] >> 32 : pairs[(i) / 2] & 0xffffffff)
 
 INLINE F gather(const REAL *voxels, I index) {
+#if LEVEL == 2 // has an instruction for it that is worth while
+    return sizeof(REAL) == 8 ? (F)_mm512_i64gather_pd((__m512i)index, voxels, 8)
+                             : (F)_mm512_i32gather_ps((__m512i)index, voxels, 4);
+#else
     const Pairs pairs = (Pairs)index;
     F values;
     EACH_LANE(i) values[i] = voxels[INDEX(pairs, i)];
     return values;
+#endif
 }
 
-// Lanes in an order in which neighbours, which may add to the same voxel, do not follow each other.
+// Lane after lane: several may add to the same voxel.
 INLINE void scatter_add(REAL *voxels, I index, F values) {
-    volatile I in_memory = index; // whence single lanes come fastest
-    EACH_LANE(j) {
-        const int i = j * (LANES / 2 + 1) % LANES;
-        voxels[((volatile typeof(index[0]) *)&in_memory)[i]] += values[i];
-    }
+    const Pairs pairs = (Pairs)index;
+    EACH_LANE(i) voxels[INDEX(pairs, i)] += values[i];
 }
 
 // Send for what is some way ahead of the outer lanes, and of some between where they are far apart.
@@ -258,12 +263,12 @@ INLINE void begin(Tile *tile, const Job *job, const Rays *r, const int task, con
 
 // The next plane of each axis, at t, and what follows it. It is made anew from its number, so that rounding never piles up, and
 // ahead of need, so that a step does not wait for it.
-#define NEXT_PLANE(way, a) ((way).k[a] * (way).t_step[a] + (way).t_first[a])
+#define NEXT_PLANE(way, a) (((way).k[a] - 1) * (way).t_step[a] + (way).t_first[a])
 
 // Cross planes: their axes' next planes and the voxel behind.
 INLINE void cross(Way *way, F next[3], const I crossed[3]) {
     EACH_AXIS(a) {
-        const F after = (way->k[a] + 1) * way->t_step[a] + way->t_first[a];
+        const F after = way->k[a] * way->t_step[a] + way->t_first[a];
         way->k[a] = ADD_WHERE(crossed[a], way->k[a], (F)1);
         next[a] = crossed[a] ? after : next[a];
         way->voxel = ADD_WHERE(crossed[a], way->voxel, way->stride[a]);

@@ -2,8 +2,9 @@
 # make test    linters, types and tests (tests/core, tests/blender)
 # make bench   speed, accuracy and memory beside other projectors, into docs/; BENCH=--quick: a minute or two, into out/
 # make gallery   the README's pictures of phantoms, of a CT (CT=FILE) and of the scanner's sensitivity, into docs/images
-# make dist    extension zips in dist/, one per platform; PLATFORM=linux-x64 builds that one
+# make dist    the package's wheels and the extension's zips in dist/, one per platform; PLATFORM=linux-x64 builds for that one
 # make test-app   the Linux zip in a real Blender (see tests/app)
+# make test-kernels   the C kernels under sanitizers, for arm64 under qemu, for Windows under Wine (see tests/kernels)
 # make test-gate  the Monte Carlo exports with GATE 10 itself; wants an environment of its own (2 GB): VENV=.venvgate
 # make clean   removes what the others made, environments included
 #
@@ -22,7 +23,7 @@ ANY_PYTHON = $$(for p in "$(PYTHON)" python3 python3.11 python3.13; do "$$p" -c 
 ENVIRONMENT = @p=$(ANY_PYTHON); [ -n "$$p" ] || { echo "no Python found; name one: make PYTHON=/path/to/python3.11"; exit 1; }; \
 	"$$p" tools/environment.py $(VENV) --python "$(PYTHON)"
 
-.PHONY: demo gallery test lint test-app test-gate bench dist clean env env-dev
+.PHONY: demo gallery test lint test-app test-kernels test-gate bench dist clean env env-dev
 
 demo: env
 	$(BIN)/mphdrr demo --output $(OUTPUT)
@@ -51,6 +52,9 @@ test-app: env-dev
 	$(BIN)/python tools/build_extension.py --platform linux-x64
 	$(BIN)/python -m pytest tests/app
 
+test-kernels: env-dev
+	$(BIN)/python -m pytest tests/kernels
+
 test-gate:
 	$(ENVIRONMENT) --extras dev,gate
 	$(BIN)/python -m pytest tests/core/test_monte_carlo.py
@@ -62,5 +66,6 @@ env-dev:
 	$(ENVIRONMENT) --extras blender,dev --torch "$(TORCH)"
 
 clean:
+	rm -f core/projector/kernels/*.so core/projector/kernels/*.dylib core/projector/kernels/*.dll
 	rm -rf out dist build wheels .venv* *.egg-info .pytest_cache .mypy_cache .ruff_cache .import_linter_cache .hypothesis
 	find . -name __pycache__ -prune -exec rm -rf {} +

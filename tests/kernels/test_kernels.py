@@ -214,15 +214,30 @@ def compile_driver(name: str, folder: Path, *links: str | Path, entry: str) -> N
     build_kernels.zig(*cc, "-nostdlib", "check.o", library, *links, "-o", "check.exe", cwd=folder)
 
 
-def test_sanitizers_find_nothing(jobs, tmp_path):
-    if sys.platform != "linux" or not shutil.which("gcc"):
-        pytest.skip("needs gcc, whose sanitizers are linked")
-    objects = build_kernels.compiled("linux-x64", tmp_path, SANITIZERS)
+needs_gcc = pytest.mark.skipif(
+    sys.platform != "linux" or not shutil.which("gcc"), reason="needs Debian's gcc, which links"
+)
+
+
+def link_with_gcc(flags: tuple[str, ...], objects: list[str], folder: Path) -> None:
+    """Compile check.c and link it with `objects`, on Linux."""
     target = build_kernels.PLATFORMS["linux-x64"].target
-    build_kernels.zig("cc", "-target", target, *SANITIZERS, "-c", DRIVER, "-o", "check.o", cwd=tmp_path)
-    command = ("gcc", "-fsanitize=address,undefined", *objects, "check.o", "-o", "check")
-    subprocess.run(command, cwd=tmp_path, check=True)
-    compare(jobs, ["./check"], tmp_path)
+    build_kernels.zig("cc", "-target", target, *flags, "-c", DRIVER, "-o", "check.o", cwd=folder)
+    sanitizers = [flag for flag in flags if flag.startswith("-fsanitize")]
+    command = ("gcc", *sanitizers, "check.o", *objects, "-Wl,-rpath,$ORIGIN", "-o", "check.exe")
+    subprocess.run(command, cwd=folder, check=True)
+
+
+@needs_gcc
+def test_sanitizers_find_nothing(jobs, tmp_path):
+    link_with_gcc(SANITIZERS, build_kernels.compiled("linux-x64", tmp_path, SANITIZERS), tmp_path)
+    compare(jobs, ["./check.exe"], tmp_path)
+
+
+@needs_gcc
+def test_library_stays_within_its_arrays(jobs, tmp_path):
+    link_with_gcc(build_kernels.FLAGS, [build_kernels.build("linux-x64", tmp_path).name], tmp_path)
+    compare(jobs, ["./check.exe"], tmp_path)
 
 
 def test_arm64_under_qemu(jobs, tmp_path):

@@ -37,8 +37,8 @@ PURE = (
     "typing-extensions==4.16.0",
 )
 STABLE_ABI = ("psutil==7.2.2",)
-# For Python 3.11 and the others: pylibjpeg-openjpeg asks for numpy 2 from 2.4 on.
-COMPILED_311 = ("h5py==3.16.0", "pylibjpeg-openjpeg==2.3.0")
+# For Python 3.11 and for the others: from 2.4 on pylibjpeg-openjpeg asks for numpy 2, and 2.3 for macOS 14.
+COMPILED_311 = ("h5py==3.16.0", "pylibjpeg-openjpeg==2.2.1")
 COMPILED = ("h5py==3.16.0", "pylibjpeg-openjpeg==2.6.0")
 
 
@@ -59,7 +59,7 @@ PLATFORMS = {
     "windows-x64": Platform(("win_amd64",)),
     "macos-arm64": Platform(("macosx_12_0_arm64", "macosx_11_0_arm64")),
     # Blender 4.5 is the last for Intel Macs.
-    "macos-x64": Platform(("macosx_10_15_x86_64", "macosx_10_9_x86_64"), ("3.11",)),
+    "macos-x64": Platform(("macosx_12_0_x86_64", "macosx_10_15_x86_64", "macosx_10_9_x86_64"), ("3.11",)),
 }
 
 

@@ -10,7 +10,7 @@ from __future__ import annotations
 import ctypes
 import os
 import sys
-from ctypes import POINTER, Structure, c_char_p, c_double, c_int64, c_void_p
+from ctypes import POINTER, Structure, c_char_p, c_int64, c_void_p
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import InputError
-from .rays import Attenuation, IndexFans, Rays
+from .rays import Attenuation, IndexFans, IndexRays, Rays
 
 Array = NDArray[Any]  # of float32 or float64
 
@@ -33,7 +33,6 @@ _MOST_ALONG = 2**24  # planes that float32 can count
 _FAN = np.dtype(
     [
         ("volume", float, (4, 3)), ("mu", float, (4, 3)), ("world", float, (3, 3)), ("lines", np.int64), ("rays", np.int64),
-        ("place", np.int64), ("line_stride", np.int64), ("ray_stride", np.int64),
     ]
 )  # fmt: skip
 
@@ -87,7 +86,7 @@ def levels() -> list[str]:
 def _level() -> int:
     has, asked = levels(), os.environ.get(LEVEL_VARIABLE)
     if asked and asked not in has:
-        raise ImportError(f"{LEVEL_VARIABLE}={asked}: this processor has {', '.join(has)}")
+        raise InputError(f"{LEVEL_VARIABLE}: expected a level that this processor has, {', '.join(has)}; got {asked}")
     return has.index(asked) if asked else len(has) - 1
 
 
@@ -137,39 +136,44 @@ def _run(
     job = _Job(
         is_double=volume.dtype == np.float64,
         attenuation=0 if mu is None else 1 if mu_rays is None else 2,
-        volume=_lattice(volume),
-        mu=_lattice(volume if mu is None else mu),
+        volume=_lattice(volume, volume.dtype),
+        mu=_Lattice() if mu is None else _lattice(mu, volume.dtype),
         values=None if values is None else values.ctypes.data,
         **{name: array.ctypes.data for name, array in others.items() if array is not None},
     )
+    arrays = [_fans(rays, mu_rays)] if isinstance(rays, IndexFans) else _columns(rays, mu_rays)
+    addresses = [array.ctypes.data for array in arrays]  # of what lives until the kernel is done
     if isinstance(rays, IndexFans):
-        fans = _fans(rays, mu_rays)
-        job.fans, job.n_fans = fans.ctypes.data, len(fans)
+        job.fans, job.n_fans = *addresses, len(rays.table)
     else:
-        columns = [rays.starts, rays.directions]
-        columns += columns if mu_rays is None else [mu_rays.starts, mu_rays.directions]
-        listed = [np.ascontiguousarray(column.T) for column in (*columns, rays.lengths)]
-        job.list = _RayList(*(column.ctypes.data for column in listed), len(rays))
+        job.list = _RayList(*addresses, len(rays))
     kernel(level, job)
 
 
-def _fans(rays: IndexFans, mu_rays: Rays | None) -> Array:
-    """Fans as the kernels take them, their values one after the other."""
+def _columns(rays: IndexRays, mu_rays: Any) -> list[Array]:
+    """Starts, directions and lengths as the kernels take them."""
+    every = [rays] if mu_rays is None else [rays, mu_rays]
+    columns = [np.ascontiguousarray(column.T) for each in every for column in (each.starts, each.directions)]
+    return [*(columns * 2)[:4], np.ascontiguousarray(rays.lengths)]
+
+
+def _fans(rays: IndexFans, mu_rays: Any) -> Array:
+    """Fans as the kernels take them."""
     fans = np.zeros(len(rays.table), _FAN)
     fans["volume"], fans["world"] = rays.table[:, :4], rays.table[:, 5:]
     fans["world"][:, 0] -= rays.table[:, 4]
     if mu_rays is not None:
         fans["mu"] = mu_rays.table[:, :4]
     fans["lines"], fans["rays"] = rays.shape
-    fans["place"] = np.arange(len(fans)) * (rays.shape[0] * rays.shape[1])
-    fans["line_stride"], fans["ray_stride"] = rays.shape[1], 1
     return fans
 
 
-def _lattice(voxels: Array) -> _Lattice:
+def _lattice(voxels: Array, kind: Any) -> _Lattice:
     if voxels.size > _MOST_VOXELS or max(voxels.shape) > _MOST_ALONG:
         shape = " x ".join(map(str, voxels.shape))
         raise InputError(
             f"cpu: a volume of {shape} voxels, but there can be at most {_MOST_VOXELS}, and {_MOST_ALONG} along an axis"
         )
+    if voxels.dtype != kind or not voxels.flags.c_contiguous:
+        raise TypeError(f"expected C-ordered voxels of {kind}, got {voxels.dtype} with strides {voxels.strides}")
     return _Lattice(voxels.ctypes.data, voxels.shape)

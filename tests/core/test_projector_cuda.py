@@ -230,9 +230,8 @@ def test_rays_of_fans_are_the_listed_rays(rng, small_pieces):
         together = function(volume, fans)
         assert together.any()
         np.testing.assert_allclose(together, function(volume, fans.listed()), rtol=1e-5, atol=1e-6)
-        np.testing.assert_array_equal(
-            together, np.concatenate([function(volume, IndexFans(fan[None], fans.shape)) for fan in fans.table])
-        )
+        single = [function(volume, IndexFans(fan[None], fans.shape)) for fan in fans.table]
+        np.testing.assert_array_equal(together, np.concatenate(single))
 
 
 @pytest.mark.parametrize("rays_at_once", [2**24, 17])

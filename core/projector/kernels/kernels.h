@@ -20,14 +20,12 @@ typedef struct {
     int64_t n[3];
 } Lattice;
 
-// Rays from a source to the points corner + i line_step + j ray_step, with 0 <= i < lines and 0 <= j < rays.
-// The value of ray (i, j) is values[place + i * line_stride + j * ray_stride].
+// Rays from a source to the points corner + i line_step + j ray_step, with 0 <= i < lines and 0 <= j < rays, line by line.
 typedef struct {
     double volume[4][3]; // source, corner, line step, ray step in the volume's index space
     double mu[4][3];     // the same in mu's, where that has a lattice of its own
     double world[3][3];  // source to corner, line step, ray step in mm
     int64_t lines, rays;
-    int64_t place, line_stride, ray_stride;
 } Fan;
 
 // Rays one by one, columns of arrays (3, count) and (count).
@@ -47,9 +45,9 @@ typedef struct {
     Lattice volume, mu;
     const Fan *fans; // the rays of all fans, in order
     int64_t n_fans;
-    RayList list; // or, where there are no fans, these: ray r's value is values[r]
-    void *values;
-    const void *integrals; // with a task that needs them: as forward gave them, in the values' places
+    RayList list; // or, where there are no fans, these
+    void *values; // one for every ray, in order
+    const void *integrals; // with a task that needs them: as forward gave them
     double *derivatives;   // (7 or 14, rays): row after row, rays in order
     void *gradient;        // of mu's shape
 } Job;

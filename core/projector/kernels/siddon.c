@@ -146,7 +146,8 @@ INLINE D set_out(Way *way, const Lattice *lattice, const D start[3], const D dir
         const F margin = MAX(ABS(t_wall) * (F)(sizeof(REAL) == 8 ? 1e-15 : 3e-7), (F)(1 / NEVER));
         way->t_exit = MIN(way->t_exit, t_wall - margin);
     }
-    const I nowhere = MIN(lane_numbers(), (I)(stride - 1)); // a voxel of its own, so that lanes do not wait for each other
+    // Lanes that miss have a voxel each, so that they do not wait for each other.
+    const I nowhere = MIN(lane_numbers(), (I)(stride - 1));
     way->voxel = AS(I, hits) ? way->voxel : nowhere;
     const int middle = LANES / 2;
     double ahead = 0; // about: it is only sent for
@@ -203,7 +204,7 @@ INLINE void prefetch(const REAL *voxels, I index, const Way *way, int64_t wide, 
 #define THIN ((REAL)0.25)
 #define TERMS (sizeof(REAL) == 8 ? 12 : 6)
 
-// The mean of exp(-s) for s from 0 to depth, and what exp(-depth) leaves. Those for a double depth follow from those for it.
+// The mean of exp(-s) for s from 0 to depth, and exp(-depth). Those for twice a depth follow from those for it.
 INLINE F mean_left(F depth, F *left) {
     int halved = 0;
     for (; ANY(depth > (F)THIN) && halved < 1100; halved++) depth *= (F)0.5;
@@ -247,7 +248,8 @@ INLINE void begin(Tile *tile, const Job *job, const Rays *r, const int task, con
     tile->length = AS(F, tile->span * r->mm);
     tile->t = 0;
     if (own) {
-        crossings += 4 + set_out(mu_way, &job->mu, r->mu_start, r->mu_direction, meets, meets ? mu_enter : (D)0, begins, span);
+        const D from = meets ? mu_enter : (D)0;
+        crossings += 4 + set_out(mu_way, &job->mu, r->mu_start, r->mu_direction, meets, from, begins, span);
         way->t_enter = AS(F, hits ? (enter - begins) / span : (D)0);
         mu_way->t_enter = AS(I, meets) ? AS(F, (mu_enter - begins) / span) : (F)NEVER;
         mu_way->t_exit = AS(I, meets) ? MIN(mu_way->t_exit, AS(F, (mu_leave - begins) / span)) : (F)0;
@@ -267,7 +269,7 @@ INLINE void begin(Tile *tile, const Job *job, const Rays *r, const int task, con
     tile->steps = (int64_t)__builtin_reduce_max(steps);
 }
 
-// The next plane of each axis, at t, and what follows it. It is made anew from its number, so that rounding never piles up, and
+// The next plane of each axis. Its t is made anew from its number, so that rounding never piles up, and
 // ahead of need, so that a step does not wait for it.
 #define NEXT_PLANE(way, a) (((way).k[a] - 1) * (way).t_step[a] + (way).t_first[a])
 
@@ -281,8 +283,8 @@ INLINE void cross(Way *way, F next[3], const I crossed[3]) {
     }
 }
 
-// What moving planes does to an integral: each plane by the jump of the value there, times what its t does. Plane k is crossed
-// at alpha = (k - s) / d, d the ray from s to its end e, so d alpha / ds = (alpha - 1) / d and d alpha / de = -alpha / d. Of
+// What moving planes does to an integral: each plane by the jump of the value there, times what its t does. Plane k is
+// crossed at alpha = (k - s) / d, d the ray from s to its end e: d alpha / ds = (alpha - 1) / d, d alpha / de = -alpha / d. Of
 // each axis the sums of its jumps and of jumps times t are therefore all that is needed.
 INLINE void add_jump(F jumps[3], F moments[3], I plane[3], F jump, F t) {
     exclusive(plane);
@@ -292,7 +294,7 @@ INLINE void add_jump(F jumps[3], F moments[3], I plane[3], F jump, F t) {
     }
 }
 
-// Some steps of a tile. A segment goes from t to t_next through a voxel of the volume, where the value is f, and one of mu.
+// Some steps of a tile. A segment goes from t to t_next through a voxel of the volume, of value f, and one of mu.
 INLINE void walk(Tile *tile, const Job *job, int64_t steps, const int task, const int attenuation) {
     const int own = attenuation == OWN_LATTICE, same = attenuation == SAME_LATTICE, weaker = own || same;
     REAL *const voxels = job->volume.voxels, *const mus = job->mu.voxels, *const gradient = job->gradient;
@@ -328,7 +330,7 @@ INLINE void walk(Tile *tile, const Job *job, int64_t steps, const int task, cons
         }
         if (task == FORWARD) w.sum += seen * f;
         if (task == BACKPROJECT) scatter_add(voxels, at, seen * f);
-        if (task == BY_MU) { // more mu weakens what lies behind the segment, and of its own part what has passed on average
+        if (task == BY_MU) { // more mu weakens what lies behind the segment, and half or so of what is in it
             w.behind -= seen * f;
             const F within = f * w.left * part * mean_lag(depth, mean);
             const F change = w.value * part * (w.behind + within);
@@ -366,20 +368,24 @@ INLINE void walk(Tile *tile, const Job *job, int64_t steps, const int task, cons
 
 // ---- A task: all rays of a job
 
-// What a tile begins with, at t = 0.
-INLINE void start(Tile *tile, const Job *job, const int64_t places[], const int task, const int attenuation) {
-    const REAL *values = job->values, *integrals = job->integrals;
+INLINE F take(const void *numbers, int64_t first, int some) {
+    F taken = 0;
+    for (int i = 0; i < some; i++) taken[i] = ((const REAL *)numbers)[first + i];
+    return taken;
+}
+
+// What a tile of `some` rays, `first` and on, begins with at t = 0.
+INLINE void start(Tile *tile, const Job *job, int64_t first, int some, const int task, const int attenuation) {
     const int own = attenuation == OWN_LATTICE, weaker = attenuation != NO_MU;
-    tile->sum = tile->passed = tile->by_length = tile->value = tile->behind = 0;
+    tile->sum = tile->passed = tile->by_length = tile->behind = 0;
     tile->left = 1;
     if (task == BACKPROJECT || task == BY_MU) {
-        EACH_LANE(i) if (places[i] >= 0) tile->value[i] = values[places[i]];
-        tile->value *= task == BY_MU ? -tile->length * tile->length : tile->length;
+        tile->value = take(job->values, first, some) * (task == BY_MU ? -tile->length * tile->length : tile->length);
         if (!ANY(tile->value != (F)0)) tile->steps = 0;
     }
     if (task == BY_MU || (task == BY_ENDS && weaker)) {
-        EACH_LANE(i) if (places[i] >= 0) tile->behind[i] = integrals[places[i]];
-        tile->behind = tile->length > (F)0 ? tile->behind / tile->length : (F)0;
+        const F integral = take(job->integrals, first, some);
+        tile->behind = tile->length > (F)0 ? integral / tile->length : (F)0;
     }
     if (task != BY_ENDS) return;
     tile->f = tile->mu = 0;
@@ -390,99 +396,101 @@ INLINE void start(Tile *tile, const Job *job, const int64_t places[], const int 
         if (own) tile->mu = tile->mu_way.t_enter <= (F)0 ? tile->mu : (F)0;
     }
     EACH_AXIS(a) {
+        const I into_mu = own ? tile->mu_way.into[a] : tile->way.into[a];
         tile->jumps[a] = tile->way.into[a] ? -tile->f : (F)0;
-        if (weaker) tile->mu_jumps[a] = (own ? tile->mu_way.into[a] : tile->way.into[a]) ? -tile->mu * tile->behind : (F)0;
+        if (weaker) tile->mu_jumps[a] = into_mu ? -tile->mu * tile->behind : (F)0;
         tile->moments[a] = tile->mu_moments[a] = 0;
     }
 }
 
-// Derivatives by start and end of rays, rows of `n` numbers.
-INLINE void put_by_ends(double *rows, int64_t n, int some, const Tile *t, const F jumps[3], const F moments[3], const D direction[3]) {
+INLINE void put(double *row, int some, D numbers) {
+    for (int i = 0; i < some; i++) row[i] = numbers[i];
+}
+
+// Derivatives by start and end of rays, into rows of n numbers.
+INLINE void put_by_ends(double *rows, int64_t n, int some, const Tile *t, const F jumps[3], const F moments[3],
+                        const D direction[3]) {
     EACH_AXIS(a) {
         const D inverse = direction[a] == (D)0 ? (D)0 : 1 / direction[a];
         const D jump = AS(D, jumps[a]), moment = AS(D, moments[a]) * t->span + jump * t->begin;
-        const D by_start = (moment - jump) * inverse, by_end = -moment * inverse;
-        for (int i = 0; i < some; i++) rows[a * n + i] = by_start[i], rows[(3 + a) * n + i] = by_end[i];
+        put(rows + a * n, some, (moment - jump) * inverse);
+        put(rows + (3 + a) * n, some, -moment * inverse);
     }
 }
 
-// What a tile's walk comes to. `rows` are the derivatives of its `some` rays, out of `n`.
-INLINE void finish(Tile *t, const Job *job, const Rays *r, const int64_t places[], double *rows, int64_t n, int some, const int task,
-                   const int attenuation) {
+// Derivatives of a tile of `some` rays, `first` and on, out of n.
+INLINE void put_derivatives(Tile *t, const Job *job, const Rays *r, int64_t first, int some, int64_t n,
+                            const int attenuation) {
     const int own = attenuation == OWN_LATTICE, weaker = attenuation != NO_MU;
-    REAL *values = job->values;
-    const REAL *integrals = job->integrals;
-    if (task == FORWARD) {
-        const D integral = AS(D, t->sum) * t->span * t->mm;
-        for (int i = 0; i < some; i++) values[places[i]] = (REAL)integral[i];
+    double *const rows = job->derivatives + first;
+    const D per_mm = t->mm > (D)0 ? 1 / t->mm : (D)0;
+    put(rows, some, weaker ? AS(D, take(job->integrals, first, some)) * per_mm : AS(D, t->sum) * t->span);
+    const F last = weaker ? t->left * t->f : t->f; // the jump at the face by which rays leave
+    EACH_AXIS(a) {
+        t->jumps[a] += t->way.out[a] ? last : (F)0;
+        t->moments[a] += t->way.out[a] ? last * t->t : (F)0;
     }
-    if (task == BY_ENDS) {
-        const D per_mm = t->mm > (D)0 ? 1 / t->mm : (D)0, sum = AS(D, t->sum) * t->span;
-        for (int i = 0; i < some; i++) rows[i] = weaker ? integrals[places[i]] * per_mm[i] : sum[i];
-        const F last = weaker ? t->left * t->f : t->f; // the jump at the face by which rays leave
-        EACH_AXIS(a) {
-            t->jumps[a] += t->way.out[a] ? last : (F)0;
-            t->moments[a] += t->way.out[a] ? last * t->t : (F)0;
-            t->mu_jumps[a] *= -t->length;
-            t->mu_moments[a] *= -t->length;
-        }
-        put_by_ends(rows + n, n, some, t, t->jumps, t->moments, r->direction);
-        if (weaker) {
-            put_by_ends(rows + 7 * n, n, some, t, t->mu_jumps, t->mu_moments, own ? r->mu_direction : r->direction);
-            const D by_length = -AS(D, t->by_length) * t->span * per_mm;
-            for (int i = 0; i < some; i++) rows[13 * n + i] = by_length[i];
-        }
+    put_by_ends(rows + n, n, some, t, t->jumps, t->moments, r->direction);
+    if (!weaker) return;
+    EACH_AXIS(a) {
+        t->mu_jumps[a] *= -t->length;
+        t->mu_moments[a] *= -t->length;
     }
+    put_by_ends(rows + 7 * n, n, some, t, t->mu_jumps, t->mu_moments, own ? r->mu_direction : r->direction);
+    put(rows + 13 * n, some, -AS(D, t->by_length) * t->span * per_mm);
 }
 
-// Lanes of the rays from `first` on, and where their values are: -1 beyond the last ray.
-INLINE void aim_tile(const Job *job, const Fan *fan, int64_t count, int64_t first, const int own, Rays *r, int64_t places[]) {
-    D number;
-    EACH_LANE(i) {
-        const int64_t ray = first + i, line = fan ? ray / fan->rays : 0;
-        places[i] = ray >= count ? -1 : fan ? fan->place + line * fan->line_stride + (ray - line * fan->rays) * fan->ray_stride : ray;
-        number[i] = (double)ray;
-    }
+// Lanes of the rays of a fan, or of the list, from number `begin` on.
+INLINE void aim_tile(const Job *job, const Fan *fan, int64_t begin, int64_t count, const int own, Rays *r) {
+    const D number = (double)begin + AS(D, lane_numbers());
     if (fan) aim_fan(fan, number, own, r);
-    else take_listed(&job->list, first, own, r);
+    else take_listed(&job->list, begin, own, r);
     r->real = number < (D)count;
     move_aside(r->start, r->direction, &r->mm);
     if (own) move_aside(r->mu_start, r->mu_direction, &r->mm);
 }
 
-INLINE void trace(const Job *job, const int task, const int attenuation) {
-    const int own = attenuation == OWN_LATTICE;
+// The rays of a fan, or of the list, whose first is ray `row` out of n.
+INLINE void trace_bundle(const Job *job, const Fan *fan, int64_t count, int64_t row, int64_t n, const int task,
+                         const int attenuation) {
+    const int own = attenuation == OWN_LATTICE, width = LANES;
     Tile tiles[TILES];
-    int64_t places[TILES][LANES], n = job->list.count, row = 0;
-    for (int64_t f = 0; f < job->n_fans; f++) n += job->fans[f].lines * job->fans[f].rays;
-    for (int64_t f = 0; f < (job->n_fans ? job->n_fans : 1); f++) {
-        const Fan *fan = job->n_fans ? job->fans + f : 0;
-        const int64_t count = fan ? fan->lines * fan->rays : job->list.count;
-        for (int64_t first = 0; first < count; first += TILES * LANES) {
-            Rays rays;
-            int64_t some = (count - first + LANES - 1) / LANES, longest = 0;
-            some = some < TILES ? some : TILES;
-            for (int i = 0; i < some; i++) {
-                aim_tile(job, fan, count, first + i * LANES, own, &rays, places[i]);
-                begin(tiles + i, job, &rays, task, attenuation);
-                start(tiles + i, job, places[i], task, attenuation);
-                longest = tiles[i].steps > longest ? tiles[i].steps : longest;
+    Rays rays;
+    for (int64_t begins = 0; begins < count; begins += TILES * width) {
+        const int64_t left = count - begins, n_tiles = left < TILES * width ? (left + width - 1) / width : TILES;
+        int64_t longest = 0;
+        for (int i = 0; i < n_tiles; i++) {
+            const int some = left - i * width < width ? (int)(left - i * width) : width;
+            aim_tile(job, fan, begins + i * width, count, own, &rays);
+            begin(tiles + i, job, &rays, task, attenuation);
+            start(tiles + i, job, row + begins + i * width, some, task, attenuation);
+            longest = tiles[i].steps > longest ? tiles[i].steps : longest;
+        }
+        for (int64_t done = 0; done < longest; done += TURN)
+            for (int i = 0; i < n_tiles; i++) {
+                const int64_t steps = tiles[i].steps - done;
+                if (steps > 0) walk(tiles + i, job, steps < TURN ? steps : TURN, task, attenuation);
             }
-            for (int64_t done = 0; done < longest; done += TURN)
-                for (int i = 0; i < some; i++) {
-                    const int64_t left = tiles[i].steps - done;
-                    if (left > 0) walk(tiles + i, job, left < TURN ? left : TURN, task, attenuation);
-                }
-            for (int i = 0; i < some; i++) {
-                const int64_t begins = first + i * (int64_t)LANES, left = count - begins;
-                if (task == BY_ENDS) aim_tile(job, fan, count, begins, own, &rays, places[i]); // anew: to keep them takes longer
-                double *const rows = task == BY_ENDS ? job->derivatives + row + begins : 0;
-                finish(tiles + i, job, &rays, places[i], rows, n, left < (int64_t)LANES ? (int)left : (int)LANES,
-                       task, attenuation);
+        for (int i = 0; i < n_tiles && (task == FORWARD || task == BY_ENDS); i++) {
+            const int some = left - i * width < width ? (int)(left - i * width) : width;
+            const int64_t first = row + begins + i * width;
+            if (task == FORWARD) {
+                const F integral = AS(F, AS(D, tiles[i].sum) * tiles[i].span * tiles[i].mm);
+                for (int j = 0; j < some; j++) ((REAL *)job->values)[first + j] = integral[j];
+            } else {
+                aim_tile(job, fan, begins + i * width, count, own, &rays); // anew: to keep them takes longer
+                put_derivatives(tiles + i, job, &rays, first, some, n, attenuation);
             }
         }
-        row += count;
     }
+}
+
+INLINE void trace(const Job *job, const int task, const int attenuation) {
+    int64_t n = job->list.count, row = 0;
+    for (int64_t f = 0; f < job->n_fans; f++) n += job->fans[f].lines * job->fans[f].rays;
+    for (const Fan *fan = job->fans; fan < job->fans + job->n_fans; row += fan->lines * fan->rays, fan++)
+        trace_bundle(job, fan, fan->lines * fan->rays, row, n, task, attenuation);
+    if (!job->n_fans) trace_bundle(job, 0, n, 0, n, task, attenuation);
 }
 
 #define NAME(task) JOINED(task, LEVEL, REAL)

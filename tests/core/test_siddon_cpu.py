@@ -1,0 +1,145 @@
+"""The binding of the C kernels: every level of processor, what is loaded, what is refused. See also tests/kernels."""
+
+from __future__ import annotations
+
+import itertools
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from mphdrr.core.errors import InputError
+from mphdrr.core.grid import Grid
+from mphdrr.core.projector import siddon_cpu, siddon_numpy
+from mphdrr.core.projector.models import view_rays
+from mphdrr.core.projector.rays import RayMapper
+
+from .test_projector import LINEAR, SHAPES, affine, nasty_rays, random_rays, some_views
+
+LEVELS = siddon_cpu.levels()
+TOLERANCE = {np.float32: 2e-5, np.float64: 1e-9}
+
+
+@pytest.fixture(params=LEVELS)
+def level(request, monkeypatch):
+    monkeypatch.setattr(siddon_cpu, "level", LEVELS.index(request.param))
+
+
+def mappers(rng, kind, shape=(7, 6, 9)):
+    """A volume, and what maps rays to it: without mu, with mu on its lattice, with mu on another's."""
+    grid = Grid(shape, affine(LINEAR["rotated"], shape))
+    other = Grid((5, 8, 4), affine(LINEAR["sheared"] * 1.2, (5, 8, 4)))
+    volume = rng.random(shape).astype(kind)
+    mu, other_mu = (0.2 * rng.random(n).astype(kind) for n in (shape, other.shape))
+    yield volume, RayMapper(grid)
+    yield volume, RayMapper(grid, mu=mu)
+    yield volume, RayMapper(grid, mu=other_mu, mu_grid=other)
+
+
+def as_double(mapped):
+    rays, attenuation = mapped
+    if attenuation is not None:
+        attenuation = type(attenuation)(attenuation.mu.astype(float), attenuation.rays)
+    return rays, attenuation
+
+
+def close(values, expected, kind):
+    np.testing.assert_allclose(values, expected, rtol=0, atol=TOLERANCE[kind] * np.abs(expected).max())
+
+
+@pytest.mark.parametrize("kind", TOLERANCE)
+def test_every_level_agrees_with_the_reference(level, kind, rng):
+    for volume, mapper in mappers(rng, kind):
+        fans = (view_rays(some_views(rng, (11, 13)), m) for m in range(3))
+        for mapped in (mapper(*fans), mapper.between(*random_rays(rng, mapper.grid, 500))):
+            values = rng.random(len(mapped[0])).astype(kind)
+            expected = siddon_numpy.forward(volume.astype(float), *as_double(mapped))
+            assert expected.any()
+            close(siddon_cpu.forward(volume, *mapped), expected, kind)
+            sums, expected = np.zeros_like(volume), np.zeros(volume.shape)
+            siddon_cpu.adjoint(sums, values, *mapped)
+            siddon_numpy.adjoint(expected, values, *as_double(mapped))
+            close(sums, expected, kind)
+            close(
+                siddon_cpu.derivatives(volume, *mapped),
+                siddon_numpy.derivatives(volume.astype(float), *as_double(mapped)),
+                kind,
+            )
+            if mapper.mu is not None:
+                sums, expected = np.zeros_like(mapper.mu), np.zeros(mapper.mu.shape)
+                siddon_cpu.mu_gradient(sums, volume, values, *mapped)
+                siddon_numpy.mu_gradient(expected, volume.astype(float), values, *as_double(mapped))
+                close(sums, expected, kind)
+
+
+@pytest.mark.parametrize("kind", TOLERANCE)
+def test_every_level_takes_rays_along_faces_edges_and_corners(level, kind, rng):
+    for shape, linear in itertools.product(SHAPES, LINEAR.values()):
+        mapper, volume = RayMapper(Grid(shape, affine(linear, shape))), rng.random(shape).astype(kind)
+        mapped = mapper.between(*nasty_rays(mapper.grid, rng))
+        close(siddon_cpu.forward(volume, *mapped), siddon_numpy.forward(volume.astype(float), *mapped), kind)
+
+
+def test_no_rays():
+    mapped = RayMapper(Grid.centered(4, 1.0)).between(np.empty((0, 3)), np.empty((0, 3)))
+    assert siddon_cpu.forward(np.ones((4, 4, 4)), *mapped).shape == (0,)
+    assert siddon_cpu.derivatives(np.ones((4, 4, 4)), *mapped).shape == (0, 7)
+
+
+def run(code, **options):
+    environment = {**os.environ, **options.pop("environment", {})}
+    return subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, env=environment, **options)
+
+
+PRINT_LEVEL = "from mphdrr.core.projector import siddon_cpu; print(siddon_cpu.levels()[siddon_cpu.level])"
+
+
+@pytest.mark.parametrize("name", LEVELS)
+def test_the_environment_names_a_level(name):
+    done = run(PRINT_LEVEL, environment={siddon_cpu.LEVEL_VARIABLE: name})
+    assert done.stdout.strip() == name, done.stderr
+
+
+def test_a_level_that_there_is_not_is_refused():
+    done = run(PRINT_LEVEL, environment={siddon_cpu.LEVEL_VARIABLE: "AVX-1024"})
+    assert "InputError" in done.stderr and LEVELS[0] in done.stderr and "AVX-1024" in done.stderr
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="the names are those of other systems")
+def test_the_library_is_the_packages_own(tmp_path):
+    """Not one of its name in the working folder, or in one that the environment names."""
+    for name in ("libsiddon.so", "libsiddon.dylib"):
+        (tmp_path / name).write_text("not a library")
+    paths = dict.fromkeys(
+        ("LD_LIBRARY_PATH", "DYLD_LIBRARY_PATH", "PATH"), f"{tmp_path}{os.pathsep}{os.environ['PATH']}"
+    )
+    done = run(
+        "from mphdrr.core.projector import siddon_cpu; print(siddon_cpu._library._name)",
+        cwd=tmp_path,
+        environment=paths,
+    )
+    assert Path(done.stdout.strip()).parent == Path(siddon_cpu.__file__).with_name("kernels"), done.stderr
+
+
+def test_a_library_of_another_version_is_not_used(monkeypatch):
+    monkeypatch.setattr(siddon_cpu, "_CONTRACT", -1)
+    with pytest.raises(ImportError, match="another version"):
+        siddon_cpu._load()
+
+
+@pytest.mark.parametrize("shape", [(2**11, 2**10, 2**10), (1, 1, 2**24 + 1)])
+def test_volumes_too_large_for_the_indices_are_refused(shape):
+    volume = np.broadcast_to(np.float32(1), shape)
+    mapped = RayMapper(Grid.centered(shape, 1.0)).between(np.array([[0.0, 0, -9]]), np.array([[0.0, 0, 9]]))
+    with pytest.raises(InputError, match=" x ".join(map(str, shape))):
+        siddon_cpu.forward(volume, *mapped)
+
+
+def test_voxels_in_another_order_are_not_taken():
+    volume = np.asfortranarray(np.ones((3, 4, 5)))
+    mapped = RayMapper(Grid.centered((3, 4, 5), 1.0)).between(np.array([[0.0, 0, -9]]), np.array([[0.0, 0, 9]]))
+    with pytest.raises(TypeError, match="C-ordered"):
+        siddon_cpu.forward(volume, *mapped)

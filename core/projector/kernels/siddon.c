@@ -50,8 +50,8 @@ typedef struct {
 typedef struct {
     Way way, mu_way;
     State state;
-    F value, length;    // of the ray; mm of a t of 1
-    D begin, span, mm;  // alpha where t is 0, and of a t of 1; mm of the whole ray
+    F value, length; // of the ray; mm of a t of 1
+    D begin, span, mm; // alpha where t is 0, and of a t of 1; mm of the whole ray
     int64_t steps, wide;
     Jumps jumps;
 } Tile;
@@ -159,13 +159,9 @@ INLINE D set_out(Way *way, const Lattice *lattice, const D start[3], const D dir
     // Lanes that miss have a voxel each, so that they do not wait for each other.
     const I nowhere = MIN(lane_numbers(), (I)(stride - 1));
     way->voxel = AS(I, hits) ? way->voxel : nowhere;
-    const int middle = LANES / 2;
-    double ahead = 0; // about: it is only sent for
-    EACH_AXIS(a) {
-        const double planes = whole(crossed[a] * (TURN / MAX(crossings, (D)1)) + 0.5)[middle];
-        ahead += planes * (double)way->stride[a][middle];
-    }
-    way->ahead = (int64_t)ahead;
+    D ahead = 0; // about that of the middle lane for all: it is only sent for
+    EACH_AXIS(a) ahead += whole(crossed[a] * (TURN / MAX(crossings, (D)1)) + 0.5) * AS(D, way->stride[a]);
+    way->ahead = (int64_t)ahead[LANES / 2];
     return crossings;
 }
 
@@ -175,9 +171,18 @@ INLINE void exclusive(I face[3]) {
     face[2] &= ~(face[0] | face[1]);
 }
 
+INLINE void find_faces(Way *way, B hits, D enter, D leave, const D in[3], const D out[3]) {
+    EACH_AXIS(a) {
+        way->into[a] = AS(I, hits & (enter > (D)0) & (in[a] == enter));
+        way->out[a] = AS(I, hits & (leave < (D)1) & (out[a] == leave));
+    }
+    exclusive(way->into);
+    exclusive(way->out);
+}
+
 // ---- Voxels
 
-// Element i of indices that are never negative: two at a time, for each way out of a vector register costs.
+// Element i of indices, which are never negative: two at a time, for each way out of a vector register costs.
 typedef uint64_t Pairs __attribute__((ext_vector_type(LANES * sizeof(REAL) / 8)));
 #define INDEX(pairs, i) (sizeof(REAL) == 8 ? pairs[i] : (i) % 2 ? pairs[(i) / 2] >> 32 : pairs[(i) / 2] & 0xffffffff)
 
@@ -264,14 +269,8 @@ INLINE void begin(Tile *tile, const Job *job, const Rays *r, const int task, con
         mu_way->t_enter = AS(I, meets) ? AS(F, (mu_enter - begins) / span) : (F)NEVER;
         mu_way->t_exit = AS(I, meets) ? MIN(mu_way->t_exit, AS(F, (mu_leave - begins) / span)) : (F)0;
     }
-    if (task == BY_ENDS) EACH_AXIS(a) {
-        way->into[a] = AS(I, hits & (enter > (D)0) & (in[a] == enter));
-        way->out[a] = AS(I, hits & (leave < (D)1) & (out[a] == leave));
-        if (own) mu_way->into[a] = AS(I, meets & (mu_enter > (D)0) & (mu_in[a] == mu_enter));
-        if (own) mu_way->out[a] = AS(I, meets & (mu_leave < (D)1) & (mu_out[a] == mu_leave));
-    }
-    if (task == BY_ENDS) exclusive(way->into), exclusive(way->out);
-    if (task == BY_ENDS && own) exclusive(mu_way->into), exclusive(mu_way->out);
+    if (task == BY_ENDS) find_faces(way, hits, enter, leave, in, out);
+    if (task == BY_ENDS && own) find_faces(mu_way, meets, mu_enter, mu_leave, mu_in, mu_out);
     const D middle = (enter + leave) * 0.5 * r->direction[2] + r->start[2];
     const double apart = middle[LANES - 1] - middle[0]; // along the axis on which neighbours are neighbours in memory
     tile->wide = apart > 16 || apart < -16;

@@ -28,7 +28,7 @@ ENVIRONMENT = @p=$(ANY_PYTHON); [ -n "$$p" ] || { echo "no Python found; name on
 demo: env
 	$(BIN)/mphdrr demo --output $(OUTPUT)
 
-gallery: env
+gallery: env-dev
 	$(BIN)/python examples/gallery.py docs/images $(CT)
 
 test: lint

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import os
+import struct
+import zlib
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -57,10 +59,18 @@ def write_png(picture: ArrayLike, path: str | os.PathLike[str]) -> None:
     InputError
         The file cannot be written.
     """
-    from PIL import Image
-
     picture = np.asarray(picture, np.float32)
     low, high = float(picture.min(initial=0.0)), float(picture.max(initial=0.0))
     grey = np.rint((picture - low) / ((high - low) or 1.0) * 255).astype(np.uint8)
     with replacing(path) as temporary:
-        Image.fromarray(grey).save(temporary, format="PNG")
+        temporary.write_bytes(_png(grey))
+
+
+def _png(grey: NDArray[np.uint8]) -> bytes:
+    """A picture (rows, columns) as a PNG file."""
+    header = struct.pack(">2I5B", grey.shape[1], grey.shape[0], 8, 0, 0, 0, 0)  # 8 bits, grey
+    rows = zlib.compress(np.pad(grey, ((0, 0), (1, 0))).tobytes())  # a 0 before each: it is stored as it is
+    chunks = [(b"IHDR", header), (b"IDAT", rows), (b"IEND", b"")]
+    return b"\x89PNG\r\n\x1a\n" + b"".join(
+        struct.pack(">I", len(data)) + name + data + struct.pack(">I", zlib.crc32(name + data)) for name, data in chunks
+    )

@@ -31,12 +31,15 @@ PURE = (
     "openpyxl==3.1.5",
     "packaging==26.3",
     "pydicom==3.0.2",
+    "pylibjpeg==2.1.0",
     "pynrrd==1.1.3",
     "trimesh==5.2.0",
     "typing-extensions==4.16.0",
 )
 STABLE_ABI = ("psutil==7.2.2",)
-COMPILED = ("h5py==3.16.0", "pillow==13.0.0")
+# For Python 3.11 and for the others: from 2.4 on pylibjpeg-openjpeg asks for numpy 2, and 2.3 for macOS 14.
+COMPILED_311 = ("h5py==3.16.0", "pylibjpeg-openjpeg==2.2.1")
+COMPILED = ("h5py==3.16.0", "pylibjpeg-openjpeg==2.6.0")
 
 
 @dataclass(frozen=True)
@@ -56,7 +59,7 @@ PLATFORMS = {
     "windows-x64": Platform(("win_amd64",)),
     "macos-arm64": Platform(("macosx_12_0_arm64", "macosx_11_0_arm64")),
     # Blender 4.5 is the last for Intel Macs.
-    "macos-x64": Platform(("macosx_10_15_x86_64", "macosx_10_9_x86_64"), ("3.11",)),
+    "macos-x64": Platform(("macosx_12_0_x86_64", "macosx_10_15_x86_64", "macosx_10_9_x86_64"), ("3.11",)),
 }
 
 
@@ -79,7 +82,8 @@ def wheels_for(name: str, folder: Path) -> list[Path]:
     wheels = download(folder / "any", PURE)
     wheels += download(folder / name / "abi3", STABLE_ABI, *tags, "--python-version", platform.pythons[0])
     for python in platform.pythons:
-        wheels += download(folder / name / python, COMPILED, *tags, "--python-version", python)
+        compiled = COMPILED_311 if python == "3.11" else COMPILED
+        wheels += download(folder / name / python, compiled, *tags, "--python-version", python)
     return wheels
 
 

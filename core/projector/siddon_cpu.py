@@ -30,11 +30,7 @@ _NAMES = {"win32": "siddon.dll", "darwin": "libsiddon.dylib"}
 _MOST_VOXELS = 2**31 - 1  # their indices are of 32 bits
 _MOST_ALONG = 2**24  # planes that float32 can count
 
-_FAN = np.dtype(
-    [
-        ("volume", float, (4, 3)), ("mu", float, (4, 3)), ("world", float, (3, 3)), ("lines", np.int64), ("rays", np.int64),
-    ]
-)  # fmt: skip
+_FAN = np.dtype([("volume", "(4,3)f8"), ("mu", "(4,3)f8"), ("world", "(3,3)f8"), ("lines", "i8"), ("rays", "i8")])
 
 
 class _Lattice(Structure):

@@ -70,7 +70,7 @@ def extension_zip() -> Path:
         pytest.fail(f"{path.name} is not in dist/; run: make dist PLATFORM=linux-x64")
     with zipfile.ZipFile(path) as archive:
         for name in archive.namelist():
-            if name.endswith(".py") and archive.read(name) != (ROOT / name).read_bytes():
+            if name.endswith((".py", "siddon.so")) and archive.read(name) != (ROOT / name).read_bytes():
                 pytest.fail(f"{path.name} is older than {name}; run: make dist PLATFORM=linux-x64")
     return path
 

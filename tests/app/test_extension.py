@@ -10,18 +10,32 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).resolve().parents[2]
+KERNELS = "core/projector/kernels"
 MODULE = "bl_ext.user_default.mphdrr"
 
 
 def test_zip_holds_the_extension_and_no_tests(extension_zip: Path):
+    assert extension_zip.stat().st_size < 30e6
     with zipfile.ZipFile(extension_zip) as archive:
         names = archive.namelist()
         manifest = tomllib.loads(archive.read("blender_manifest.toml").decode())
     tops = {name.split("/")[0] for name in names}
     assert {"__init__.py", "LICENSE", "addon", "core", "operators", "panels", "examples", "wheels"} <= tops
-    assert not tops & {"tests", "docs", "benchmarks", "tools", "out", "dist", ".ci", ".gitignore", "pyproject.toml"}
+    assert not tops & {
+        "tests",
+        "docs",
+        "benchmarks",
+        "tools",
+        "out",
+        "dist",
+        ".ci",
+        ".gitignore",
+        "pyproject.toml",
+        "setup.py",
+    }
     assert not [name for name in names if re.search(r"(^|/)(test_|conftest|__pycache__|\.)", name)]
     assert "examples/dc-spect-80.xlsx" in names
+    assert [name for name in names if name.startswith(KERNELS)] == [f"{KERNELS}/libsiddon.so"]
     generated = manifest["build"]["generated"]
     assert generated["platforms"] == ["linux-x64"]
     assert sorted(generated["wheels"]) == sorted(f"./{name}" for name in names if name.startswith("wheels/"))
@@ -31,8 +45,16 @@ def test_zip_holds_the_extension_and_no_tests(extension_zip: Path):
 def test_zip_holds_compiled_wheels_for_the_pythons_of_both_blenders(extension_zip: Path, python: str):
     with zipfile.ZipFile(extension_zip) as archive:
         wheels = [Path(name).name.split("-") for name in archive.namelist() if name.endswith(".whl")]
-    assert {name for name, _, tag, *_ in wheels if python in tag.split(".")} == {"h5py", "llvmlite", "numba", "pillow"}
+    assert {name for name, _, tag, *_ in wheels if python in tag.split(".")} == {"h5py", "pylibjpeg_openjpeg"}
     assert not [name for name, *_ in wheels if name == "numpy"]  # Blender's own
+
+
+def test_wheel_is_for_every_python_and_holds_the_kernels(extension_zip: Path):
+    version = extension_zip.name.split("-")[1]
+    name = f"mphdrr-{version}-py3-none-manylinux_2_17_x86_64.manylinux2014_x86_64.whl"
+    with zipfile.ZipFile(extension_zip.with_name(name)) as archive:
+        suffixes = (".so", ".dll", ".dylib", ".pyd", ".c", ".h")
+        assert [name for name in archive.namelist() if name.endswith(suffixes)] == [f"mphdrr/{KERNELS}/libsiddon.so"]
 
 
 def test_installs_and_enables_without_network(blender_script):
@@ -40,9 +62,11 @@ def test_installs_and_enables_without_network(blender_script):
 import importlib, sys, bpy
 assert "{MODULE}" in bpy.context.preferences.addons, list(bpy.context.preferences.addons.keys())
 assert hasattr(bpy.ops, "mphdrr") and "MPHDRR_PT_geometry" in dir(bpy.types)
-for name in ("numba", "h5py", "PIL", "psutil", "openpyxl", "nibabel", "trimesh"):
+for name in ("h5py", "openjpeg", "psutil", "openpyxl", "nibabel", "trimesh"):
     module = importlib.import_module(name)
     assert ".local" in module.__file__, module.__file__  # from the extension's wheels, not from the machine
+cpu = importlib.import_module("{MODULE}.core.projector.siddon_cpu")
+assert cpu.levels(), "the kernels"
 print("ENABLED", sys.modules["{MODULE}"].__file__)
 """)
     assert "ENABLED" in said.stdout

@@ -26,6 +26,12 @@ def test_version_is_the_same_everywhere():
     assert toml("blender_manifest.toml")["version"] == VERSION
 
 
+def test_one_compiler_builds_the_kernels_everywhere():
+    project = toml("pyproject.toml")
+    required = [*project["build-system"]["requires"], *project["project"]["optional-dependencies"]["dev"]]
+    assert len({text.split(";")[0].strip() for text in required if text.startswith("ziglang")}) == 1
+
+
 def test_pyproject_lists_every_package():
     folders = {path.parent for path in SOURCES}
     names = {"mphdrr"} | {".".join(("mphdrr", *folder.relative_to(ROOT).parts)) for folder in folders}

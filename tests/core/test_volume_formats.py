@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from pydicom.dataset import Dataset
+from pydicom.uid import JPEG2000Lossless
 
 import mphdrr.core as mph
 from mphdrr.core.frames import euler_pose
@@ -208,6 +209,14 @@ def test_every_other_slice_missing_is_warned_of(tmp_path, ct):
     with pytest.warns(mph.InputWarning, match=r"the slices are 2\.5 mm thick and lie 5 mm apart"):
         volume = mph.read_volume(tmp_path / "s")
     assert np.array_equal(volume.array, ct.array[:, :, ::2])
+
+
+def test_a_series_in_jpeg_2000_is_the_same_volume(tmp_path, rng):
+    ct = mph.Volume(rng.integers(-1000, 3000, (40, 36, 3)).astype(np.float32), turned_grid((40, 36, 3)), quantity="hu")
+    for data in write_series(ct, tmp_path / "series"):
+        data.compress(JPEG2000Lossless)
+        save(data)
+    assert np.array_equal(mph.read_volume(tmp_path / "series").array, ct.array)
 
 
 def test_one_of_several_series_is_chosen(tmp_path, ct):

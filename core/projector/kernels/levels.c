@@ -2,27 +2,14 @@
 
 #include "kernels.h"
 
-#ifdef __x86_64__
-#define LEVELS 3
-#else
-#define LEVELS 1
-#endif
-
-#define DECLARE(level)                                                                       \
-    void forward_##level##_float(const Job *), forward_##level##_double(const Job *);         \
-    void backproject_##level##_float(const Job *), backproject_##level##_double(const Job *); \
-    void differentiate_##level##_float(const Job *), differentiate_##level##_double(const Job *); \
-    void differentiate_by_mu_##level##_float(const Job *), differentiate_by_mu_##level##_double(const Job *);
-
 typedef void Kernel(const Job *);
-#if LEVELS == 3
-DECLARE(0) DECLARE(1) DECLARE(2)
-#define LEVEL(name, level) {name##_##level##_float, name##_##level##_double}
-#define KERNELS(name) {LEVEL(name, 0), LEVEL(name, 1), LEVEL(name, 2)}
+
+// Level by level, what siddon.c is compiled to.
+#ifdef __x86_64__
+#define EACH(name) name##_0_float, name##_0_double, name##_1_float, name##_1_double, name##_2_float, name##_2_double
 static const char *const names[] = {"SSE2", "AVX2", "AVX-512"};
 #else
-DECLARE(0)
-#define KERNELS(name) {{name##_0_float, name##_0_double}}
+#define EACH(name) name##_0_float, name##_0_double
 static const char *const names[] = {"NEON"};
 #endif
 
@@ -32,10 +19,11 @@ static const char *const names[] = {"NEON"};
 #else
 #define EXPORT __attribute__((visibility("default")))
 #endif
-#define DISPATCH(name)                                        \
-    EXPORT void name(int64_t level, const Job *job) {         \
-        static Kernel *const kernels[LEVELS][2] = KERNELS(name); \
-        kernels[level][job->is_double](job);                  \
+#define DISPATCH(name)                                  \
+    Kernel EACH(name);                                  \
+    EXPORT void name(int64_t level, const Job *job) {   \
+        static Kernel *const kernels[] = {EACH(name)};  \
+        kernels[2 * level + job->is_double](job);       \
     }
 
 DISPATCH(forward)
@@ -43,7 +31,9 @@ DISPATCH(backproject)
 DISPATCH(differentiate)
 DISPATCH(differentiate_by_mu)
 
-EXPORT const char *level_name(int64_t level) { return level < LEVELS ? names[level] : 0; }
+EXPORT const char *level_name(int64_t level) {
+    return level < (int64_t)(sizeof(names) / sizeof(names[0])) ? names[level] : 0;
+}
 
 EXPORT void contract(int64_t numbers[3]) {
     numbers[0] = CONTRACT;
@@ -51,7 +41,7 @@ EXPORT void contract(int64_t numbers[3]) {
     numbers[2] = sizeof(Fan);
 }
 
-#if LEVELS == 3
+#ifdef __x86_64__
 #include <cpuid.h>
 
 // Asked of the processor itself: compilers' own functions for it need a runtime that not all shared libraries have.

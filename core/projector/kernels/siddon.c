@@ -36,14 +36,24 @@ typedef struct {
     I into[3], out[3]; // the axis of the face by which rays enter and leave
 } Way;
 
+// What changes as a tile walks.
+typedef struct {
+    F t, sum;
+    F left, behind; // of the ray, by attenuation; of the integral, what lies behind t
+} State;
+
+// What its derivatives need besides: values of the voxels at t, depth passed, and the sums that `walk` explains.
+typedef struct {
+    F f, mu, passed, by_length, jumps[3], moments[3], mu_jumps[3], mu_moments[3];
+} Jumps;
+
 typedef struct {
     Way way, mu_way;
-    F t, sum, left; // left: what attenuation has left of a ray
-    F value, length; // the ray's value; mm of a t of 1
-    F behind, passed; // of the integral, what lies behind t; of the depth, what lies before
-    F f, mu, by_length, jumps[3], moments[3], mu_jumps[3], mu_moments[3]; // for derivatives, see `walk`
+    State state;
+    F value, length; // of the ray; mm of a t of 1
     D begin, span, mm; // alpha where t is 0, and of a t of 1; mm of the whole ray
     int64_t steps, wide;
+    Jumps jumps;
 } Tile;
 
 // ---- Rays
@@ -149,13 +159,9 @@ INLINE D set_out(Way *way, const Lattice *lattice, const D start[3], const D dir
     // Lanes that miss have a voxel each, so that they do not wait for each other.
     const I nowhere = MIN(lane_numbers(), (I)(stride - 1));
     way->voxel = AS(I, hits) ? way->voxel : nowhere;
-    const int middle = LANES / 2;
-    double ahead = 0; // about: it is only sent for
-    EACH_AXIS(a) {
-        const double planes = whole(crossed[a] * (TURN / MAX(crossings, (D)1)) + 0.5)[middle];
-        ahead += planes * (double)way->stride[a][middle];
-    }
-    way->ahead = (int64_t)ahead;
+    D ahead = 0; // about that of the middle lane for all: it is only sent for
+    EACH_AXIS(a) ahead += whole(crossed[a] * (TURN / MAX(crossings, (D)1)) + 0.5) * AS(D, way->stride[a]);
+    way->ahead = (int64_t)ahead[LANES / 2];
     return crossings;
 }
 
@@ -165,9 +171,18 @@ INLINE void exclusive(I face[3]) {
     face[2] &= ~(face[0] | face[1]);
 }
 
+INLINE void find_faces(Way *way, B hits, D enter, D leave, const D in[3], const D out[3]) {
+    EACH_AXIS(a) {
+        way->into[a] = AS(I, hits & (enter > (D)0) & (in[a] == enter));
+        way->out[a] = AS(I, hits & (leave < (D)1) & (out[a] == leave));
+    }
+    exclusive(way->into);
+    exclusive(way->out);
+}
+
 // ---- Voxels
 
-// Element i of indices that are never negative: two at a time, for each way out of a vector register costs.
+// Element i of indices, which are never negative: two at a time, for each way out of a vector register costs.
 typedef uint64_t Pairs __attribute__((ext_vector_type(LANES * sizeof(REAL) / 8)));
 #define INDEX(pairs, i) (sizeof(REAL) == 8 ? pairs[i] : (i) % 2 ? pairs[(i) / 2] >> 32 : pairs[(i) / 2] & 0xffffffff)
 
@@ -246,7 +261,7 @@ INLINE void begin(Tile *tile, const Job *job, const Rays *r, const int task, con
     tile->span = hits ? span / AS(D, t_end) : (D)0; // the margin of t_exit is no part of the way
     tile->mm = r->mm;
     tile->length = AS(F, tile->span * r->mm);
-    tile->t = 0;
+    tile->state.t = 0;
     if (own) {
         const D from = meets ? mu_enter : (D)0;
         crossings += 4 + set_out(mu_way, &job->mu, r->mu_start, r->mu_direction, meets, from, begins, span);
@@ -254,14 +269,8 @@ INLINE void begin(Tile *tile, const Job *job, const Rays *r, const int task, con
         mu_way->t_enter = AS(I, meets) ? AS(F, (mu_enter - begins) / span) : (F)NEVER;
         mu_way->t_exit = AS(I, meets) ? MIN(mu_way->t_exit, AS(F, (mu_leave - begins) / span)) : (F)0;
     }
-    if (task == BY_ENDS) EACH_AXIS(a) {
-        way->into[a] = AS(I, hits & (enter > (D)0) & (in[a] == enter));
-        way->out[a] = AS(I, hits & (leave < (D)1) & (out[a] == leave));
-        if (own) mu_way->into[a] = AS(I, meets & (mu_enter > (D)0) & (mu_in[a] == mu_enter));
-        if (own) mu_way->out[a] = AS(I, meets & (mu_leave < (D)1) & (mu_out[a] == mu_leave));
-    }
-    if (task == BY_ENDS) exclusive(way->into), exclusive(way->out);
-    if (task == BY_ENDS && own) exclusive(mu_way->into), exclusive(mu_way->out);
+    if (task == BY_ENDS) find_faces(way, hits, enter, leave, in, out);
+    if (task == BY_ENDS && own) find_faces(mu_way, meets, mu_enter, mu_leave, mu_in, mu_out);
     const D middle = (enter + leave) * 0.5 * r->direction[2] + r->start[2];
     const double apart = middle[LANES - 1] - middle[0]; // along the axis on which neighbours are neighbours in memory
     tile->wide = apart > 16 || apart < -16;
@@ -298,33 +307,36 @@ INLINE void add_jump(F jumps[3], F moments[3], I plane[3], F jump, F t) {
 INLINE void walk(Tile *tile, const Job *job, int64_t steps, const int task, const int attenuation) {
     const int own = attenuation == OWN_LATTICE, same = attenuation == SAME_LATTICE, weaker = own || same;
     REAL *const voxels = job->volume.voxels, *const mus = job->mu.voxels, *const gradient = job->gradient;
-    Tile w = *tile;
-    Way *const v = &w.way, *const m = &w.mu_way;
+    const F value = tile->value, length = tile->length;
+    Way v = tile->way, m = tile->mu_way;
+    State w = tile->state;
+    Jumps d;
+    if (task == BY_ENDS) d = tile->jumps;
     F next[3], mu_next[3];
-    EACH_AXIS(a) next[a] = NEXT_PLANE(*v, a);
-    if (own) EACH_AXIS(a) mu_next[a] = NEXT_PLANE(*m, a);
+    EACH_AXIS(a) next[a] = NEXT_PLANE(v, a);
+    if (own) EACH_AXIS(a) mu_next[a] = NEXT_PLANE(m, a);
     for (; steps > 0; steps--) {
-        F t_next = MIN(MIN(next[0], next[1]), MIN(next[2], v->t_exit));
+        F t_next = MIN(MIN(next[0], next[1]), MIN(next[2], v.t_exit));
         I inside = -1, inside_mu = -1;
         if (own) {
-            inside = w.t >= v->t_enter;
-            inside_mu = (w.t >= m->t_enter) & (w.t < m->t_exit);
-            t_next = inside ? t_next : v->t_enter;
-            const F t_mu = MIN(MIN(mu_next[0], mu_next[1]), MIN(mu_next[2], m->t_exit));
-            t_next = MIN(t_next, inside_mu ? t_mu : w.t < m->t_enter ? m->t_enter : (F)NEVER);
-            t_next = MAX(MIN(t_next, v->t_exit), w.t); // not back: a plane may by rounding lie a hair behind
+            inside = w.t >= v.t_enter;
+            inside_mu = (w.t >= m.t_enter) & (w.t < m.t_exit);
+            t_next = inside ? t_next : v.t_enter;
+            const F t_mu = MIN(MIN(mu_next[0], mu_next[1]), MIN(mu_next[2], m.t_exit));
+            t_next = MIN(t_next, inside_mu ? t_mu : w.t < m.t_enter ? m.t_enter : (F)NEVER);
+            t_next = MAX(MIN(t_next, v.t_exit), w.t); // not back: a plane may by rounding lie a hair behind
         }
-        const I at = v->voxel, at_mu = own ? m->voxel : at;
-        prefetch(voxels, at, v, w.wide, task == BACKPROJECT);
-        if (weaker) prefetch(task == BY_MU ? gradient : mus, at_mu, own ? m : v, w.wide, task == BY_MU);
-        F f = task == BY_ENDS ? w.f : task == BACKPROJECT ? w.value : gather(voxels, at);
+        const I at = v.voxel, at_mu = own ? m.voxel : at;
+        prefetch(voxels, at, &v, tile->wide, task == BACKPROJECT);
+        if (weaker) prefetch(task == BY_MU ? gradient : mus, at_mu, own ? &m : &v, tile->wide, task == BY_MU);
+        F f = task == BY_ENDS ? d.f : task == BACKPROJECT ? value : gather(voxels, at);
         if (own) f = inside ? f : (F)0;
         const F part = t_next - w.t; // of the way
         F seen = part, depth = 0, mean = 1, left = 1, mu = 0;
         if (weaker) {
-            mu = task == BY_ENDS ? w.mu : gather(mus, at_mu);
+            mu = task == BY_ENDS ? d.mu : gather(mus, at_mu);
             if (own) mu = inside_mu ? mu : (F)0;
-            depth = mu * part * w.length;
+            depth = mu * part * length;
             mean = mean_left(depth, &left);
             seen = part * w.left * mean;
         }
@@ -333,37 +345,42 @@ INLINE void walk(Tile *tile, const Job *job, int64_t steps, const int task, cons
         if (task == BY_MU) { // more mu weakens what lies behind the segment, and half or so of what is in it
             w.behind -= seen * f;
             const F within = f * w.left * part * mean_lag(depth, mean);
-            const F change = w.value * part * (w.behind + within);
+            const F change = value * part * (w.behind + within);
             scatter_add(gradient, at_mu, own ? (inside_mu ? change : (F)0) : change);
         }
         if (task == BY_ENDS && weaker) {
-            w.by_length += f * w.left * part * (w.passed * mean + depth * mean_lag(depth, mean));
-            w.passed += depth;
+            d.by_length += f * w.left * part * (d.passed * mean + depth * mean_lag(depth, mean));
+            d.passed += depth;
             w.behind -= seen * f;
         } else if (task == BY_ENDS) w.sum += seen * f;
         if (weaker) w.left *= left;
         I crossed[3], mu_crossed[3];
         EACH_AXIS(a) crossed[a] = next[a] <= t_next;
         if (own) EACH_AXIS(a) crossed[a] &= inside, mu_crossed[a] = (mu_next[a] <= t_next) & inside_mu;
-        cross(v, next, crossed);
-        if (own) cross(m, mu_next, mu_crossed);
+        cross(&v, next, crossed);
+        if (own) cross(&m, mu_next, mu_crossed);
         if (task == BY_ENDS) {
-            I enters = ~inside & (t_next >= v->t_enter), leaves = 0;
-            if (own) EACH_AXIS(a) crossed[a] |= enters & v->into[a];
-            w.f = gather(voxels, v->voxel);
-            if (own) w.f = (inside | enters) ? w.f : (F)0;
-            add_jump(w.jumps, w.moments, crossed, weaker ? w.left * (f - w.f) : f - w.f, t_next);
+            I enters = ~inside & (t_next >= v.t_enter), leaves = 0;
+            if (own) EACH_AXIS(a) crossed[a] |= enters & v.into[a];
+            d.f = gather(voxels, v.voxel);
+            if (own) d.f = (inside | enters) ? d.f : (F)0;
+            add_jump(d.jumps, d.moments, crossed, weaker ? w.left * (f - d.f) : f - d.f, t_next);
             if (own) {
-                enters = (w.t < m->t_enter) & (t_next >= m->t_enter), leaves = inside_mu & (t_next >= m->t_exit);
-                EACH_AXIS(a) mu_crossed[a] |= (enters & m->into[a]) | (leaves & m->out[a]);
+                enters = (w.t < m.t_enter) & (t_next >= m.t_enter), leaves = inside_mu & (t_next >= m.t_exit);
+                EACH_AXIS(a) mu_crossed[a] |= (enters & m.into[a]) | (leaves & m.out[a]);
             }
-            if (weaker) w.mu = gather(mus, own ? m->voxel : v->voxel);
-            if (own) w.mu = ((inside_mu & ~leaves) | enters) ? w.mu : (F)0;
-            if (weaker) add_jump(w.mu_jumps, w.mu_moments, own ? mu_crossed : crossed, w.behind * (mu - w.mu), t_next);
+            if (weaker) d.mu = gather(mus, own ? m.voxel : v.voxel);
+            if (own) d.mu = ((inside_mu & ~leaves) | enters) ? d.mu : (F)0;
+            if (weaker) add_jump(d.mu_jumps, d.mu_moments, own ? mu_crossed : crossed, w.behind * (mu - d.mu), t_next);
         }
         w.t = t_next;
     }
-    *tile = w;
+    tile->state = w;
+    EACH_AXIS(a) tile->way.k[a] = v.k[a];
+    tile->way.voxel = v.voxel;
+    if (own) EACH_AXIS(a) tile->mu_way.k[a] = m.k[a];
+    if (own) tile->mu_way.voxel = m.voxel;
+    if (task == BY_ENDS) tile->jumps = d;
 }
 
 // ---- A task: all rays of a job
@@ -377,29 +394,29 @@ INLINE F take(const void *numbers, int64_t first, int some) {
 // What a tile of `some` rays, `first` and on, begins with at t = 0.
 INLINE void start(Tile *tile, const Job *job, int64_t first, int some, const int task, const int attenuation) {
     const int own = attenuation == OWN_LATTICE, weaker = attenuation != NO_MU;
-    tile->sum = tile->passed = tile->by_length = tile->behind = 0;
-    tile->left = 1;
+    tile->state.sum = tile->state.behind = tile->jumps.passed = tile->jumps.by_length = 0;
+    tile->state.left = 1;
     if (task == BACKPROJECT || task == BY_MU) {
         tile->value = take(job->values, first, some) * (task == BY_MU ? -tile->length * tile->length : tile->length);
         if (!ANY(tile->value != (F)0)) tile->steps = 0;
     }
     if (task == BY_MU || (task == BY_ENDS && weaker)) {
         const F integral = take(job->integrals, first, some);
-        tile->behind = tile->length > (F)0 ? integral / tile->length : (F)0;
+        tile->state.behind = tile->length > (F)0 ? integral / tile->length : (F)0;
     }
     if (task != BY_ENDS) return;
-    tile->f = tile->mu = 0;
+    tile->jumps.f = tile->jumps.mu = 0;
     if (tile->steps) {
-        tile->f = gather(job->volume.voxels, tile->way.voxel);
-        if (own) tile->f = tile->way.t_enter <= (F)0 ? tile->f : (F)0;
-        if (weaker) tile->mu = gather(job->mu.voxels, own ? tile->mu_way.voxel : tile->way.voxel);
-        if (own) tile->mu = tile->mu_way.t_enter <= (F)0 ? tile->mu : (F)0;
+        tile->jumps.f = gather(job->volume.voxels, tile->way.voxel);
+        if (own) tile->jumps.f = tile->way.t_enter <= (F)0 ? tile->jumps.f : (F)0;
+        if (weaker) tile->jumps.mu = gather(job->mu.voxels, own ? tile->mu_way.voxel : tile->way.voxel);
+        if (own) tile->jumps.mu = tile->mu_way.t_enter <= (F)0 ? tile->jumps.mu : (F)0;
     }
     EACH_AXIS(a) {
         const I into_mu = own ? tile->mu_way.into[a] : tile->way.into[a];
-        tile->jumps[a] = tile->way.into[a] ? -tile->f : (F)0;
-        if (weaker) tile->mu_jumps[a] = into_mu ? -tile->mu * tile->behind : (F)0;
-        tile->moments[a] = tile->mu_moments[a] = 0;
+        tile->jumps.jumps[a] = tile->way.into[a] ? -tile->jumps.f : (F)0;
+        if (weaker) tile->jumps.mu_jumps[a] = into_mu ? -tile->jumps.mu * tile->state.behind : (F)0;
+        tile->jumps.moments[a] = tile->jumps.mu_moments[a] = 0;
     }
 }
 
@@ -424,20 +441,20 @@ INLINE void put_derivatives(Tile *t, const Job *job, const Rays *r, int64_t firs
     const int own = attenuation == OWN_LATTICE, weaker = attenuation != NO_MU;
     double *const rows = job->derivatives + first;
     const D per_mm = t->mm > (D)0 ? 1 / t->mm : (D)0;
-    put(rows, some, weaker ? AS(D, take(job->integrals, first, some)) * per_mm : AS(D, t->sum) * t->span);
-    const F last = weaker ? t->left * t->f : t->f; // the jump at the face by which rays leave
+    put(rows, some, weaker ? AS(D, take(job->integrals, first, some)) * per_mm : AS(D, t->state.sum) * t->span);
+    const F last = weaker ? t->state.left * t->jumps.f : t->jumps.f; // the jump at the face by which rays leave
     EACH_AXIS(a) {
-        t->jumps[a] += t->way.out[a] ? last : (F)0;
-        t->moments[a] += t->way.out[a] ? last * t->t : (F)0;
+        t->jumps.jumps[a] += t->way.out[a] ? last : (F)0;
+        t->jumps.moments[a] += t->way.out[a] ? last * t->state.t : (F)0;
     }
-    put_by_ends(rows + n, n, some, t, t->jumps, t->moments, r->direction);
+    put_by_ends(rows + n, n, some, t, t->jumps.jumps, t->jumps.moments, r->direction);
     if (!weaker) return;
     EACH_AXIS(a) {
-        t->mu_jumps[a] *= -t->length;
-        t->mu_moments[a] *= -t->length;
+        t->jumps.mu_jumps[a] *= -t->length;
+        t->jumps.mu_moments[a] *= -t->length;
     }
-    put_by_ends(rows + 7 * n, n, some, t, t->mu_jumps, t->mu_moments, own ? r->mu_direction : r->direction);
-    put(rows + 13 * n, some, -AS(D, t->by_length) * t->span * per_mm);
+    put_by_ends(rows + 7 * n, n, some, t, t->jumps.mu_jumps, t->jumps.mu_moments, own ? r->mu_direction : r->direction);
+    put(rows + 13 * n, some, -AS(D, t->jumps.by_length) * t->span * per_mm);
 }
 
 // Lanes of the rays of a fan, or of the list, from number `begin` on.
@@ -475,7 +492,7 @@ INLINE void trace_bundle(const Job *job, const Fan *fan, int64_t count, int64_t 
             const int some = left - i * width < width ? (int)(left - i * width) : width;
             const int64_t first = row + begins + i * width;
             if (task == FORWARD) {
-                const F integral = AS(F, AS(D, tiles[i].sum) * tiles[i].span * tiles[i].mm);
+                const F integral = AS(F, AS(D, tiles[i].state.sum) * tiles[i].span * tiles[i].mm);
                 for (int j = 0; j < some; j++) ((REAL *)job->values)[first + j] = integral[j];
             } else {
                 aim_tile(job, fan, begins + i * width, count, own, &rays); // anew: to keep them takes longer
@@ -488,9 +505,12 @@ INLINE void trace_bundle(const Job *job, const Fan *fan, int64_t count, int64_t 
 INLINE void trace(const Job *job, const int task, const int attenuation) {
     int64_t n = job->list.count, row = 0;
     for (int64_t f = 0; f < job->n_fans; f++) n += job->fans[f].lines * job->fans[f].rays;
-    for (const Fan *fan = job->fans; fan < job->fans + job->n_fans; row += fan->lines * fan->rays, fan++)
-        trace_bundle(job, fan, fan->lines * fan->rays, row, n, task, attenuation);
-    if (!job->n_fans) trace_bundle(job, 0, n, 0, n, task, attenuation);
+    for (int64_t f = 0; f < (job->n_fans ? job->n_fans : 1); f++) {
+        const Fan *fan = job->n_fans ? job->fans + f : 0;
+        const int64_t count = fan ? fan->lines * fan->rays : n;
+        trace_bundle(job, fan, count, row, n, task, attenuation);
+        row += count;
+    }
 }
 
 #define NAME(task) JOINED(task, LEVEL, REAL)

@@ -30,9 +30,8 @@ ray's length in mm, f the volume and mu what attenuates, if anything.
 - ``mu_gradient(gradient, volume, values, rays, attenuation)`` adds to `gradient` (of mu's shape) in place the sum over
   the rays of their values times the derivative of the line integral by mu.
 
-`rays` are `IndexRays` or an `IndexFan`, what weakens them an `Attenuation`; volumes, values, mu and gradients are tensors
-on one device for "torch", numpy arrays or tensors on the GPU for "cuda" (see its `native`), and numpy arrays for the
-others. "cuda" is handed several views at once, as `IndexFans`.
+`rays` are `IndexRays` or `IndexFans`, what weakens them an `Attenuation`; volumes, values, mu and gradients are tensors on
+one device for "torch", numpy arrays or tensors on the GPU for "cuda" (see its `native`), and numpy arrays for the others.
 """
 
 _AUTOMATIC = ("cpu", "torch", "numpy")

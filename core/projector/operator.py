@@ -36,9 +36,8 @@ from .arrays import (
 from .models import Array, Beam, Model, Transmission, require_model
 from .rays import Attenuation, IndexFans, RayMapper, window
 
-# Rays handed to a backend at once: enough that a call costs nothing, few enough that their arrays stay in the
-# cache. A GPU wants more (torch cuts them into chunks by itself; cuda takes several views a launch), and a torch on a CPU
-# has threads of its own.
+# Rays handed to a backend at once: enough that a call costs nothing, few enough that their arrays stay in the cache. A GPU
+# wants more (torch cuts them into chunks by itself), and a torch on a CPU has threads of its own.
 _FEWEST_RAYS = 4096
 _MOST_RAYS = {"cpu": 2**14, "torch": 2**18, "cuda": 2**22}
 
@@ -113,12 +112,12 @@ class Projector(LinearOperator):
     model : Transmission or Emission
         What a pixel measures; by default the line integral.
     backend : str
-        ``"numpy"`` (the float64 reference), ``"torch"`` (on the device of a tensor), ``"numba"`` (compiled,
-        CPU), ``"cuda"`` (NVIDIA GPUs; ``pip install warp-lang``), or ``"auto"``: numba if it can be imported, else
-        torch, else numpy; for a tensor on a GPU cuda if it works there, else torch. Arrays go to a GPU only
+        ``"numpy"`` (the float64 reference), ``"torch"`` (on the device of a tensor), ``"cpu"`` (compiled, on the
+        processor), ``"cuda"`` (NVIDIA GPUs; ``pip install warp-lang``), or ``"auto"``: cpu where there are kernels for the
+        platform, else torch, else numpy; for a tensor on a GPU cuda if it works there, else torch. Arrays go to a GPU only
         when asked.
     threads : int, optional
-        Threads of numba and numpy, by default one per core (torch has a setting of its own, cuda needs none). The images do
+        Threads of cpu and numpy, by default one per core (torch has a setting of its own, cuda needs none). The images do
         not depend on it; the adjoint does by float32 rounding, and is the same every time for a given number.
         The adjoint takes a volume per thread, so it uses at most 8, and fewer when memory is short.
 
@@ -221,7 +220,10 @@ class Projector(LinearOperator):
         return self._adjoint
 
     def iter_views(self, volume: Volume | ArrayOrTensor) -> Iterator[ArrayOrTensor]:
-        """The images one by one, each (n_v, n_u): work between which a job can stop. Gradients are not recorded."""
+        """The images one by one, each (n_v, n_u): work between which a job can stop. Gradients are not recorded.
+
+        Leave the volume as it is until the last: images are made ahead of need.
+        """
         volume = self._check(volume)
         return (like(image, volume) for image in self._images(volume))
 
@@ -270,8 +272,9 @@ class Projector(LinearOperator):
         with _parallel(workers) as parallel_map:
             if groups:
                 images_of = functools.partial(self._images_together, box=box, trace=trace, integrate=integrate)
-                for of_group in parallel_map(images_of, groups):
-                    yield from (self._finished(image, x) for image in of_group)
+                for first in range(0, len(groups), 4 * workers):  # some at a time, whose images are held at once
+                    for of_group in parallel_map(images_of, groups[first : first + 4 * workers]):
+                        yield from (self._finished(image, x) for image in of_group)
                 return
             # The next view is begun before one is done, so that no thread waits for the others at a view's end.
             before: tuple[int, ArrayOrTensor, Iterable[None]] | None = None
@@ -333,13 +336,18 @@ class Projector(LinearOperator):
 
     def _groups(self, backend: str) -> list[range]:
         """The views, several at a time where all rays of these are not too many for a backend; else none."""
-        n_views, n_v, n_u = self.shape_out
+        n_views = len(self.views)
         if not n_views or self.model.weights_voxels:  # then every view is of a volume of its own
             return []
-        rays = n_v * n_u * sum(len(beam.rays.shifts) for beam in self._beams(0)[0])
+        rays = self._rays_of_a_view
         most = _MOST_RAYS.get(backend, _FEWEST_RAYS)
         at_once = min(most // rays, max(_FEWEST_RAYS // rays, n_views // (2 * self._workers(backend))))
         return [range(m, min(m + at_once, n_views)) for m in range(0, n_views, at_once)] if at_once > 1 else []
+
+    @property
+    def _rays_of_a_view(self) -> int:
+        """How many there are, about: those of the first."""
+        return math.prod(self.views.shape) * sum(len(beam.rays.shifts) for beam in self._beams(0)[0])
 
     def _rays_together(
         self, views: range, trace: RayMapper
@@ -488,10 +496,12 @@ class AdjointProjector(LinearOperator):
         _require_rays(A.views)
         workers = volume_workers(A._workers(name), volume_bytes, extra_bytes)
         n_views, groups = len(A.views), A._groups(name)
-        if not groups:
-            groups = [range(m, m + 1) for m in range(n_views)]
+        if not n_views:
+            return zeros(grid.shape, images)
         # Between rounds the threads wait for each other: seldom, but often enough to tell how far the work is.
-        of_round = 1 if weighted else max(workers, _RAYS_OF_A_ROUND // (len(groups[0]) * math.prod(A.views.shape)))
+        views_of_round = 1 if weighted else max(1, _RAYS_OF_A_ROUND // A._rays_of_a_view)
+        of_round = max(workers, views_of_round // len(groups[0])) if groups else views_of_round
+        groups = groups or [range(m, m + 1) for m in range(n_views)]
         _report(progress, 0, n_views)
         with _parallel(workers) as parallel_map:
             volumes = list(parallel_map(lambda _: zeros(grid.shape, images), range(workers)))
@@ -510,7 +520,8 @@ class AdjointProjector(LinearOperator):
                     total += A._weighted(_sum(volumes, parallel_map), some[0].start)
                     for volume in volumes:
                         volume[:] = 0
-                _report(progress, some[-1].stop, n_views)
+                for done in range(some[0].start, some[-1].stop):
+                    _report(progress, done + 1, n_views)
             return total if weighted else _sum(volumes, parallel_map)
 
     def _parts(
@@ -651,7 +662,7 @@ def _parallel(workers: int) -> Iterator[ParallelMap]:
 
     def parallel_map(function: Callable[[Any], Any], items: Iterable[Any]) -> Iterable[Any]:
         started = [_pool(workers).submit(function, item) for item in items]
-        tasks.extend(started)
+        tasks[:] = [task for task in tasks if not task.done()] + started
         return (task.result() for task in started)
 
     try:

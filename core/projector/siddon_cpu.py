@@ -28,7 +28,7 @@ LEVEL_VARIABLE = "MPHDRR_CPU_LEVEL"
 _CONTRACT = 1
 _NAMES = {"win32": "siddon.dll", "darwin": "libsiddon.dylib"}
 _MOST_VOXELS = 2**31 - 1  # their indices are of 32 bits
-_MOST_ALONG = 2**24  # planes that float32 can count
+_MOST_ALONG = 2**12  # where float32 knows the length of a segment to 0.1 %
 
 _FAN = np.dtype([("volume", "(4,3)f8"), ("mu", "(4,3)f8"), ("world", "(3,3)f8"), ("lines", "i8"), ("rays", "i8")])
 
@@ -117,30 +117,28 @@ def mu_gradient(gradient: Array, volume: Array, values: Array, rays: Rays, atten
 
 
 def _run(
-    kernel: Any,
-    volume: Array,
-    rays: Rays,
-    attenuation: Attenuation | None,
-    values: Array | None = None,
-    **others: Array | None,
+    kernel: Any, volume: Array, rays: Rays, attenuation: Attenuation | None, values: Array | None = None, **others: Any
 ) -> None:
     """Run a kernel on all rays."""
     mu = None if attenuation is None else attenuation.mu
     mu_rays = None if attenuation is None else attenuation.rays
     if values is not None:
-        values = np.ascontiguousarray(values, volume.dtype)
+        others["values"] = values = np.ascontiguousarray(values, volume.dtype)
+        if len(values) != len(rays):
+            raise ValueError(f"expected a value for each of {len(rays)} rays, got {len(values)}")
+    if mu is not None and mu_rays is None and mu.shape != volume.shape:
+        raise ValueError(f"expected mu on the volume's lattice {volume.shape}, got {mu.shape}")
     job = _Job(
         is_double=volume.dtype == np.float64,
         attenuation=0 if mu is None else 1 if mu_rays is None else 2,
-        volume=_lattice(volume, volume.dtype),
-        mu=_Lattice() if mu is None else _lattice(mu, volume.dtype),
-        values=None if values is None else values.ctypes.data,
+        volume=_lattice(volume, volume, kernel is _library.backproject),
+        mu=_Lattice() if mu is None else _lattice(mu, volume),
         **{name: array.ctypes.data for name, array in others.items() if array is not None},
     )
     arrays = [_fans(rays, mu_rays)] if isinstance(rays, IndexFans) else _columns(rays, mu_rays)
     addresses = [array.ctypes.data for array in arrays]  # of what lives until the kernel is done
     if isinstance(rays, IndexFans):
-        job.fans, job.n_fans = *addresses, len(rays.table)
+        job.fans, job.n_fans = addresses[0], len(rays.table)
     else:
         job.list = _RayList(*addresses, len(rays))
     kernel(level, job)
@@ -148,9 +146,8 @@ def _run(
 
 def _columns(rays: IndexRays, mu_rays: Any) -> list[Array]:
     """Starts, directions and lengths as the kernels take them."""
-    every = [rays] if mu_rays is None else [rays, mu_rays]
-    columns = [np.ascontiguousarray(column.T) for each in every for column in (each.starts, each.directions)]
-    return [*(columns * 2)[:4], np.ascontiguousarray(rays.lengths)]
+    columns = (column.T for each in (rays, mu_rays or rays) for column in (each.starts, each.directions))
+    return [np.ascontiguousarray(column) for column in (*columns, rays.lengths)]
 
 
 def _fans(rays: IndexFans, mu_rays: Any) -> Array:
@@ -164,12 +161,20 @@ def _fans(rays: IndexFans, mu_rays: Any) -> Array:
     return fans
 
 
-def _lattice(voxels: Array, kind: Any) -> _Lattice:
-    if voxels.size > _MOST_VOXELS or max(voxels.shape) > _MOST_ALONG:
-        shape = " x ".join(map(str, voxels.shape))
+def _lattice(voxels: Array, alike: Array, written: bool = False) -> _Lattice:
+    """Voxels of the kind of `alike`."""
+    most_along = _MOST_ALONG if voxels.dtype == np.float32 else _MOST_VOXELS
+    if voxels.size > _MOST_VOXELS or max(voxels.shape) > most_along:
         raise InputError(
-            f"cpu: a volume of {shape} voxels, but there can be at most {_MOST_VOXELS}, and {_MOST_ALONG} along an axis"
+            f"backend 'cpu': {' x '.join(map(str, voxels.shape))} voxels, but there can be at most {_MOST_VOXELS}, and "
+            f"{_MOST_ALONG} along an axis in float32; use the backend numpy"
         )
-    if voxels.dtype != kind or not voxels.flags.c_contiguous:
-        raise TypeError(f"expected C-ordered voxels of {kind}, got {voxels.dtype} with strides {voxels.strides}")
+    flags, kind = voxels.flags, voxels.dtype
+    if (
+        kind not in (np.float32, np.float64)
+        or kind != alike.dtype
+        or not flags.c_contiguous
+        or written > flags.writeable
+    ):
+        raise TypeError(f"expected C-ordered voxels of {alike.dtype}, got {kind}, strides {voxels.strides}")
     return _Lattice(voxels.ctypes.data, voxels.shape)

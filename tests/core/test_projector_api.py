@@ -11,13 +11,16 @@ import warnings
 import numpy as np
 import pytest
 
+import mphdrr.core as mph
 import mphdrr.core.memory
 from mphdrr.core.errors import InputError, InputWarning
 from mphdrr.core.grid import Grid
 from mphdrr.core.progress import Cancelled
-from mphdrr.core.projector import Projector, Transmission, backends, trace_rays
+from mphdrr.core.projector import Projector, Transmission, backends, siddon_cpu, trace_rays
 from mphdrr.core.views import Views
 from mphdrr.core.volume import Volume
+
+from .conftest import WORKBOOK, emission
 
 GRID = Grid.centered((5, 4, 3), 1.0)
 VIEWS = Views(
@@ -226,3 +229,39 @@ def test_forked_processes_project_too():
     """The threads of a process stay behind when it forks, as the workers of data loaders do."""
     done = run_python(FORK)
     assert done.stdout.strip() == "1", done.stderr
+
+
+def test_the_adjoint_of_no_views():
+    images = np.ones((0, *VIEWS.shape))
+    np.testing.assert_array_equal(Projector(GRID, VIEWS[:0]).T(images), np.zeros(GRID.shape))
+
+
+@pytest.mark.parametrize("pixel_points", [1, 150])
+def test_progress_comes_as_often_however_many_rays_a_pixel_has(pixel_points, monkeypatch):
+    n_views, shape = (40, (128, 128)) if pixel_points == 1 else (8, (64, 64))
+    u, v = np.tile([[0.5, 0, 0]], (n_views, 1)), np.tile([[0, 0.5, 0]], (n_views, 1))
+    views = Views(np.tile([[0, 0, -50.0]], (n_views, 1)), np.tile([[0, 0, 50.0]], (n_views, 1)), u, v, shape)
+    A = Projector(GRID, views, Transmission(pixel_points), threads=2)
+    traced, before = [0], [0]
+    adjoint = siddon_cpu.adjoint
+
+    def counted(volume, values, rays, attenuation=None):
+        traced[0] += len(rays)
+        adjoint(volume, values, rays, attenuation)
+
+    def look(done, total):
+        assert traced[0] - before[0] <= 2**20
+        before[0] = traced[0]
+
+    monkeypatch.setattr(siddon_cpu, "adjoint", counted)
+    A.T(np.ones(A.shape_out), look)
+    assert traced[0] > 0
+
+
+def test_images_do_not_depend_on_threads_where_they_are_attenuated():
+    system = mph.read_system(WORKBOOK)[::10]
+    mu = Volume(np.random.default_rng(0).random(GRID.shape) * 0.6, GRID, "mu")
+    first, second = (
+        Projector(GRID, system.views((72, 72)), emission(system, mu), threads=threads)(ONES) for threads in (1, 6)
+    )
+    np.testing.assert_array_equal(first, second)

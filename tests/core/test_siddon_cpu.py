@@ -130,16 +130,42 @@ def test_a_library_of_another_version_is_not_used(monkeypatch):
         siddon_cpu._load()
 
 
-@pytest.mark.parametrize("shape", [(2**11, 2**10, 2**10), (1, 1, 2**24 + 1)])
+@pytest.mark.parametrize("kind", TOLERANCE)
+def test_the_last_voxel_of_a_long_way_counts_whole(level, kind):
+    grid = Grid.centered((8, 8, 512), 1.0)
+    volume = np.zeros(grid.shape, kind)
+    volume[..., -1] = 1
+    ends = np.array([[1.3, -0.4, 900.0], [-2.2, 3.1, 700.0]])
+    mapped = RayMapper(grid).between(-ends, ends)
+    close(siddon_cpu.forward(volume, *mapped), siddon_numpy.forward(volume.astype(float), *mapped), kind)
+    sums, expected = np.zeros_like(volume), np.zeros(grid.shape)
+    siddon_cpu.adjoint(sums, np.ones(2, kind), *mapped)
+    siddon_numpy.adjoint(expected, np.ones(2), *mapped)
+    close(sums, expected, kind)
+
+
+def test_what_does_not_fit_is_not_taken():
+    volume = np.ones((3, 4, 5), np.float32)
+    mapped = RayMapper(Grid.centered(volume.shape, 1.0)).between(np.array([[0.0, 0, -9]]), np.array([[0.0, 0, 9]]))
+    shared = type("Attenuation", (), {"mu": volume[:2], "rays": None})
+    read_only = volume.copy()
+    read_only.flags.writeable = False
+    for call in (
+        lambda: siddon_cpu.forward(volume.astype(np.int32), *mapped),
+        lambda: siddon_cpu.forward(volume.astype(np.float16), *mapped),
+        lambda: siddon_cpu.forward(volume.astype(">f4"), *mapped),
+        lambda: siddon_cpu.forward(np.asfortranarray(volume), *mapped),
+        lambda: siddon_cpu.forward(volume, mapped[0], shared),
+        lambda: siddon_cpu.adjoint(volume, np.ones(0, np.float32), *mapped),
+        lambda: siddon_cpu.adjoint(read_only, np.ones(1, np.float32), *mapped),
+    ):
+        with pytest.raises((TypeError, ValueError), match="expected"):
+            call()
+
+
+@pytest.mark.parametrize("shape", [(2**11, 2**10, 2**10), (1, 1, 2**12 + 1)])
 def test_volumes_too_large_for_the_indices_are_refused(shape):
     volume = np.broadcast_to(np.float32(1), shape)
     mapped = RayMapper(Grid.centered(shape, 1.0)).between(np.array([[0.0, 0, -9]]), np.array([[0.0, 0, 9]]))
     with pytest.raises(InputError, match=" x ".join(map(str, shape))):
-        siddon_cpu.forward(volume, *mapped)
-
-
-def test_voxels_in_another_order_are_not_taken():
-    volume = np.asfortranarray(np.ones((3, 4, 5)))
-    mapped = RayMapper(Grid.centered((3, 4, 5), 1.0)).between(np.array([[0.0, 0, -9]]), np.array([[0.0, 0, 9]]))
-    with pytest.raises(TypeError, match="C-ordered"):
         siddon_cpu.forward(volume, *mapped)

@@ -6,8 +6,9 @@
 //
 //     L int_0^1 f(alpha) exp(-L int_0^alpha mu) dalpha
 //
-// The kernels allocate nothing, keep nothing and start no thread: a job belongs to the thread that calls. Nothing here is
-// checked; siddon_cpu.py makes only jobs whose arrays are as large as said here, of fewer than 2^31 voxels in a lattice.
+// The kernels allocate nothing, keep nothing and start no thread: a job belongs to the thread that calls, which needs
+// 400 kB of stack. Nothing here is checked; siddon_cpu.py makes only jobs whose arrays are as large as said here, of
+// fewer than 2^31 voxels in a lattice.
 
 #pragma once
 #include <stdint.h>
@@ -20,7 +21,7 @@ typedef struct {
     int64_t n[3];
 } Lattice;
 
-// Rays from a source to the points corner + i line_step + j ray_step, with 0 <= i < lines and 0 <= j < rays, line by line.
+// Rays from a source to the points corner + i line_step + j ray_step, 0 <= i < lines and 0 <= j < rays, line by line.
 typedef struct {
     double volume[4][3]; // source, corner, line step, ray step in the volume's index space
     double mu[4][3];     // the same in mu's, where that has a lattice of its own

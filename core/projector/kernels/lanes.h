@@ -25,13 +25,6 @@ typedef __typeof__((D)0 < (D)0) B; // as wide as D
 #define AS(type, x) __builtin_convertvector(x, type)
 #define ANY(mask) __builtin_reduce_or(mask)
 
-// 0, 1, 2, ...
-INLINE I lane_numbers(void) {
-    I numbers;
-    EACH_LANE(i) numbers[i] = i;
-    return numbers;
-}
-
 // x rounded down; x from 0 to 2^31 - 1.
 INLINE D whole(D x) {
     typedef int Int __attribute__((ext_vector_type(LANES)));

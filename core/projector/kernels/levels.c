@@ -8,7 +8,7 @@ typedef void Kernel(const Job *);
 #ifdef __x86_64__
 #define EACH(name) name##_0_float, name##_0_double, name##_1_float, name##_1_double, name##_2_float, name##_2_double
 static const char *const names[] = {"SSE2", "AVX2", "AVX-512"};
-#else
+#else // arm64
 #define EACH(name) name##_0_float, name##_0_double
 static const char *const names[] = {"NEON"};
 #endif

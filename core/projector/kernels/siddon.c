@@ -18,9 +18,8 @@
 #define FAR 1e15 // voxels
 #define SNAP 1e-9 // as in rays.py: a ray this close to a plane lies in it
 
-// Some tiles take turns of some steps. Tiles side by side then read the same part of the volume at about the same time.
-// While the others have their turns, the voxels of a tile's next turn come from memory: each step sends for the one so
-// far ahead.
+// Some tiles take turns of some steps. Tiles side by side then read the same part of the volume at about the same time,
+// and a tile's next voxels, sent for a turn ahead, come from memory while the others have their turns.
 #define TILES 64
 #define TURN 24
 
@@ -29,7 +28,7 @@ enum { FORWARD, BACKPROJECT, BY_ENDS, BY_MU };
 // A tile's way through a lattice.
 typedef struct {
     F t_first[3], t_step[3]; // plane k of those ahead is crossed at t_first + k t_step
-    F k[3]; // number of the plane behind the next one
+    F k[3]; // number of the plane after the next
     I stride[3], voxel; // what crossing a plane adds to the voxel's index
     F t_enter, t_exit;
     int64_t ahead; // what TURN steps add to the voxel's index
@@ -52,11 +51,10 @@ typedef struct {
     State state;
     F value, length; // of the ray; mm of a t of 1
     D begin, span, mm; // alpha where t is 0, and of a t of 1; mm of the whole ray
-    int64_t steps, wide;
+    int64_t steps, wide; // steps to its end; whether its rays are far apart
+    int some; // rays
     Jumps jumps;
 } Tile;
-
-// ---- Rays
 
 typedef struct {
     D start[3], direction[3], mu_start[3], mu_direction[3], mm;
@@ -87,17 +85,15 @@ INLINE void take_listed(const RayList *list, const int64_t first, const int own,
     EACH_LANE(i) {
         const int64_t n = first + i < list->count ? first + i : list->count - 1;
         EACH_AXIS(a) {
-            r->start[a][i] = list->starts[a * list->count + n];
-            r->direction[a][i] = list->directions[a * list->count + n];
-            if (own) r->mu_start[a][i] = list->mu_starts[a * list->count + n];
-            if (own) r->mu_direction[a][i] = list->mu_directions[a * list->count + n];
+            const int64_t at = a * list->count + n;
+            r->start[a][i] = list->starts[at], r->direction[a][i] = list->directions[at];
+            if (own) r->mu_start[a][i] = list->mu_starts[at], r->mu_direction[a][i] = list->mu_directions[at];
         }
         r->mm[i] = list->lengths[n];
     }
 }
 
-// Rays with ends that are no numbers, or too far away for voxels to be told apart, are moved to where they miss. A
-// direction is 0 or large enough to divide by.
+// Moves rays whose ends are no numbers, or too far away for voxels to be told apart, to where they miss.
 INLINE void move_aside(D start[3], D direction[3], D *mm) {
     B sound = *mm < (D)NEVER;
     EACH_AXIS(a) sound &= ABS(start[a]) + ABS(direction[a]) < (D)FAR;
@@ -105,8 +101,6 @@ INLINE void move_aside(D start[3], D direction[3], D *mm) {
     EACH_AXIS(a) direction[a] = (sound & (ABS(direction[a]) > (D)SNAP)) ? direction[a] : (D)0;
     *mm = sound ? *mm : (D)0;
 }
-
-// ---- The way through a lattice
 
 // Alpha where rays enter and leave a lattice, in all and axis by axis. Where they miss it, enter >= leave.
 INLINE void clip(const Lattice *lattice, const D start[3], const D direction[3], D *enter, D *leave, D in[3],
@@ -156,9 +150,9 @@ INLINE D set_out(Way *way, const Lattice *lattice, const D start[3], const D dir
         const F margin = MAX(ABS(t_wall) * (F)(sizeof(REAL) == 8 ? 1e-15 : 3e-7), (F)(1 / NEVER));
         way->t_exit = MIN(way->t_exit, t_wall - margin);
     }
-    // Lanes that miss have a voxel each, so that they do not wait for each other.
-    const I nowhere = MIN(lane_numbers(), (I)(stride - 1));
-    way->voxel = AS(I, hits) ? way->voxel : nowhere;
+    I idle; // lanes that miss have a voxel each, so that they do not wait for each other
+    EACH_LANE(i) idle[i] = i < stride ? i : 0;
+    way->voxel = AS(I, hits) ? way->voxel : idle;
     D ahead = 0; // about that of the middle lane for all: it is only sent for
     EACH_AXIS(a) ahead += whole(crossed[a] * (TURN / MAX(crossings, (D)1)) + 0.5) * AS(D, way->stride[a]);
     way->ahead = (int64_t)ahead[LANES / 2];
@@ -179,8 +173,6 @@ INLINE void find_faces(Way *way, B hits, D enter, D leave, const D in[3], const 
     exclusive(way->into);
     exclusive(way->out);
 }
-
-// ---- Voxels
 
 // Element i of indices, which are never negative: two at a time, for each way out of a vector register costs.
 typedef uint64_t Pairs __attribute__((ext_vector_type(LANES * sizeof(REAL) / 8)));
@@ -214,19 +206,27 @@ INLINE void prefetch(const REAL *voxels, I index, const Way *way, int64_t wide, 
     if (wide) UNROLLED for (int i = 5; i < (int)LANES - 1; i += 5) FETCH(i);
 }
 
-// ---- Attenuation: what exp(-depth) does over a segment. Series serve thin segments, as nearly all are.
-
+// What exp(-depth) does over a segment: by series for thin segments, as nearly all are.
 #define THIN ((REAL)0.25)
 #define TERMS (sizeof(REAL) == 8 ? 12 : 6)
 
 // The mean of exp(-s) for s from 0 to depth, and exp(-depth). Those for twice a depth follow from those for it.
 INLINE F mean_left(F depth, F *left) {
-    int halved = 0;
-    for (; ANY(depth > (F)THIN) && halved < 1100; halved++) depth *= (F)0.5;
+    I halved = 0;
+    int most = 0;
+    for (; ANY(depth > (F)THIN) && most < 1100; most++) {
+        const I thick = depth > (F)THIN;
+        depth = thick ? depth * (F)0.5 : depth;
+        halved -= thick;
+    }
     F mean = 1;
     UNROLLED for (int n = TERMS; n > 1; n--) mean = 1 - depth * mean * (F)(1.0 / n);
     *left = 1 - depth * mean;
-    for (; halved > 0; halved--) mean *= (1 + *left) * (F)0.5, *left *= *left;
+    for (; most > 0; most--) {
+        const I again = halved >= most;
+        mean = again ? mean * (1 + *left) * (F)0.5 : mean;
+        *left = again ? *left * *left : *left;
+    }
     return mean;
 }
 
@@ -237,19 +237,17 @@ INLINE F mean_lag(F depth, F mean) {
     return depth > (F)THIN ? (mean - 1 + depth * mean) / depth : lag;
 }
 
-// ---- Tiles
-
 INLINE void begin(Tile *tile, const Job *job, const Rays *r, const int task, const int attenuation) {
     const int own = attenuation == OWN_LATTICE;
     Way *way = &tile->way, *mu_way = &tile->mu_way;
     D enter, leave, in[3], out[3], mu_enter, mu_leave, mu_in[3], mu_out[3], crossings;
     clip(&job->volume, r->start, r->direction, &enter, &leave, in, out);
-    B hits = (enter < leave) & r->real, meets = hits;
+    B hits = (enter < leave) & r->real, hits_mu = hits;
     D begins = hits ? enter : (D)0;
     if (own) {
         clip(&job->mu, r->mu_start, r->mu_direction, &mu_enter, &mu_leave, mu_in, mu_out);
-        meets &= (mu_enter < mu_leave) & (mu_enter < leave);
-        begins = meets ? MIN(begins, mu_enter) : begins;
+        hits_mu &= (mu_enter < mu_leave) & (mu_enter < leave);
+        begins = hits_mu ? MIN(begins, mu_enter) : begins;
     }
     const D span = hits ? leave - begins : (D)1;
     crossings = set_out(way, &job->volume, r->start, r->direction, hits, hits ? enter : (D)0, begins, span);
@@ -258,19 +256,19 @@ INLINE void begin(Tile *tile, const Job *job, const Rays *r, const int task, con
     way->t_exit = AS(I, hits) ? t_end : (F)0;
     EACH_AXIS(a) way->t_first[a] = AS(I, hits) ? way->t_first[a] : (F)NEVER; // no way, no planes
     tile->begin = begins;
-    tile->span = hits ? span / AS(D, t_end) : (D)0; // the margin of t_exit is no part of the way
+    tile->span = hits ? span : (D)0;
     tile->mm = r->mm;
     tile->length = AS(F, tile->span * r->mm);
     tile->state.t = 0;
     if (own) {
-        const D from = meets ? mu_enter : (D)0;
-        crossings += 4 + set_out(mu_way, &job->mu, r->mu_start, r->mu_direction, meets, from, begins, span);
+        const D from = hits_mu ? mu_enter : (D)0;
+        crossings += 4 + set_out(mu_way, &job->mu, r->mu_start, r->mu_direction, hits_mu, from, begins, span);
         way->t_enter = AS(F, hits ? (enter - begins) / span : (D)0);
-        mu_way->t_enter = AS(I, meets) ? AS(F, (mu_enter - begins) / span) : (F)NEVER;
-        mu_way->t_exit = AS(I, meets) ? MIN(mu_way->t_exit, AS(F, (mu_leave - begins) / span)) : (F)0;
+        mu_way->t_enter = AS(I, hits_mu) ? AS(F, (mu_enter - begins) / span) : (F)NEVER;
+        mu_way->t_exit = AS(I, hits_mu) ? MIN(mu_way->t_exit, AS(F, (mu_leave - begins) / span)) : (F)0;
     }
     if (task == BY_ENDS) find_faces(way, hits, enter, leave, in, out);
-    if (task == BY_ENDS && own) find_faces(mu_way, meets, mu_enter, mu_leave, mu_in, mu_out);
+    if (task == BY_ENDS && own) find_faces(mu_way, hits_mu, mu_enter, mu_leave, mu_in, mu_out);
     const D middle = (enter + leave) * 0.5 * r->direction[2] + r->start[2];
     const double apart = middle[LANES - 1] - middle[0]; // along the axis on which neighbours are neighbours in memory
     tile->wide = apart > 16 || apart < -16;
@@ -293,8 +291,8 @@ INLINE void cross(Way *way, F next[3], const I crossed[3]) {
 }
 
 // What moving planes does to an integral: each plane by the jump of the value there, times what its t does. Plane k is
-// crossed at alpha = (k - s) / d, d the ray from s to its end e: d alpha / ds = (alpha - 1) / d, d alpha / de = -alpha / d. Of
-// each axis the sums of its jumps and of jumps times t are therefore all that is needed.
+// crossed at alpha = (k - s) / d, d the ray from s to its end e: d alpha / ds = (alpha - 1) / d, d alpha / de = -alpha
+// / d. Of each axis the sums of its jumps and of jumps times t are therefore all that is needed.
 INLINE void add_jump(F jumps[3], F moments[3], I plane[3], F jump, F t) {
     exclusive(plane);
     EACH_AXIS(a) {
@@ -305,7 +303,7 @@ INLINE void add_jump(F jumps[3], F moments[3], I plane[3], F jump, F t) {
 
 // Some steps of a tile. A segment goes from t to t_next through a voxel of the volume, of value f, and one of mu.
 INLINE void walk(Tile *tile, const Job *job, int64_t steps, const int task, const int attenuation) {
-    const int own = attenuation == OWN_LATTICE, same = attenuation == SAME_LATTICE, weaker = own || same;
+    const int own = attenuation == OWN_LATTICE, same = attenuation == SAME_LATTICE, attenuated = own || same;
     REAL *const voxels = job->volume.voxels, *const mus = job->mu.voxels, *const gradient = job->gradient;
     const F value = tile->value, length = tile->length;
     Way v = tile->way, m = tile->mu_way;
@@ -328,12 +326,12 @@ INLINE void walk(Tile *tile, const Job *job, int64_t steps, const int task, cons
         }
         const I at = v.voxel, at_mu = own ? m.voxel : at;
         prefetch(voxels, at, &v, tile->wide, task == BACKPROJECT);
-        if (weaker) prefetch(task == BY_MU ? gradient : mus, at_mu, own ? &m : &v, tile->wide, task == BY_MU);
+        if (attenuated) prefetch(task == BY_MU ? gradient : mus, at_mu, own ? &m : &v, tile->wide, task == BY_MU);
         F f = task == BY_ENDS ? d.f : task == BACKPROJECT ? value : gather(voxels, at);
         if (own) f = inside ? f : (F)0;
         const F part = t_next - w.t; // of the way
         F seen = part, depth = 0, mean = 1, left = 1, mu = 0;
-        if (weaker) {
+        if (attenuated) {
             mu = task == BY_ENDS ? d.mu : gather(mus, at_mu);
             if (own) mu = inside_mu ? mu : (F)0;
             depth = mu * part * length;
@@ -348,12 +346,12 @@ INLINE void walk(Tile *tile, const Job *job, int64_t steps, const int task, cons
             const F change = value * part * (w.behind + within);
             scatter_add(gradient, at_mu, own ? (inside_mu ? change : (F)0) : change);
         }
-        if (task == BY_ENDS && weaker) {
+        if (task == BY_ENDS && attenuated) {
             d.by_length += f * w.left * part * (d.passed * mean + depth * mean_lag(depth, mean));
             d.passed += depth;
             w.behind -= seen * f;
         } else if (task == BY_ENDS) w.sum += seen * f;
-        if (weaker) w.left *= left;
+        if (attenuated) w.left *= left;
         I crossed[3], mu_crossed[3];
         EACH_AXIS(a) crossed[a] = next[a] <= t_next;
         if (own) EACH_AXIS(a) crossed[a] &= inside, mu_crossed[a] = (mu_next[a] <= t_next) & inside_mu;
@@ -364,14 +362,15 @@ INLINE void walk(Tile *tile, const Job *job, int64_t steps, const int task, cons
             if (own) EACH_AXIS(a) crossed[a] |= enters & v.into[a];
             d.f = gather(voxels, v.voxel);
             if (own) d.f = (inside | enters) ? d.f : (F)0;
-            add_jump(d.jumps, d.moments, crossed, weaker ? w.left * (f - d.f) : f - d.f, t_next);
+            add_jump(d.jumps, d.moments, crossed, attenuated ? w.left * (f - d.f) : f - d.f, t_next);
             if (own) {
                 enters = (w.t < m.t_enter) & (t_next >= m.t_enter), leaves = inside_mu & (t_next >= m.t_exit);
                 EACH_AXIS(a) mu_crossed[a] |= (enters & m.into[a]) | (leaves & m.out[a]);
             }
-            if (weaker) d.mu = gather(mus, own ? m.voxel : v.voxel);
+            if (attenuated) d.mu = gather(mus, own ? m.voxel : v.voxel);
             if (own) d.mu = ((inside_mu & ~leaves) | enters) ? d.mu : (F)0;
-            if (weaker) add_jump(d.mu_jumps, d.mu_moments, own ? mu_crossed : crossed, w.behind * (mu - d.mu), t_next);
+            I *const at_planes = own ? mu_crossed : crossed;
+            if (attenuated) add_jump(d.mu_jumps, d.mu_moments, at_planes, w.behind * (mu - d.mu), t_next);
         }
         w.t = t_next;
     }
@@ -383,7 +382,14 @@ INLINE void walk(Tile *tile, const Job *job, int64_t steps, const int task, cons
     if (task == BY_ENDS) tile->jumps = d;
 }
 
-// ---- A task: all rays of a job
+// What is left then: the margin of t_exit, from which no plane is crossed any more.
+INLINE void close(Tile *tile) {
+    Way *way = &tile->way, *mu_way = &tile->mu_way;
+    EACH_AXIS(a) way->t_first[a] = mu_way->t_first[a] = (F)NEVER;
+    way->t_exit = tile->length > (F)0 ? (F)1 : (F)0;
+    mu_way->t_enter = tile->state.t < mu_way->t_enter ? (F)NEVER : mu_way->t_enter;
+    mu_way->t_exit = tile->state.t < mu_way->t_exit ? (F)NEVER : mu_way->t_exit;
+}
 
 INLINE F take(const void *numbers, int64_t first, int some) {
     F taken = 0;
@@ -393,14 +399,14 @@ INLINE F take(const void *numbers, int64_t first, int some) {
 
 // What a tile of `some` rays, `first` and on, begins with at t = 0.
 INLINE void start(Tile *tile, const Job *job, int64_t first, int some, const int task, const int attenuation) {
-    const int own = attenuation == OWN_LATTICE, weaker = attenuation != NO_MU;
+    const int own = attenuation == OWN_LATTICE, attenuated = attenuation != NO_MU;
     tile->state.sum = tile->state.behind = tile->jumps.passed = tile->jumps.by_length = 0;
     tile->state.left = 1;
     if (task == BACKPROJECT || task == BY_MU) {
         tile->value = take(job->values, first, some) * (task == BY_MU ? -tile->length * tile->length : tile->length);
         if (!ANY(tile->value != (F)0)) tile->steps = 0;
     }
-    if (task == BY_MU || (task == BY_ENDS && weaker)) {
+    if (task == BY_MU || (task == BY_ENDS && attenuated)) {
         const F integral = take(job->integrals, first, some);
         tile->state.behind = tile->length > (F)0 ? integral / tile->length : (F)0;
     }
@@ -409,13 +415,13 @@ INLINE void start(Tile *tile, const Job *job, int64_t first, int some, const int
     if (tile->steps) {
         tile->jumps.f = gather(job->volume.voxels, tile->way.voxel);
         if (own) tile->jumps.f = tile->way.t_enter <= (F)0 ? tile->jumps.f : (F)0;
-        if (weaker) tile->jumps.mu = gather(job->mu.voxels, own ? tile->mu_way.voxel : tile->way.voxel);
+        if (attenuated) tile->jumps.mu = gather(job->mu.voxels, own ? tile->mu_way.voxel : tile->way.voxel);
         if (own) tile->jumps.mu = tile->mu_way.t_enter <= (F)0 ? tile->jumps.mu : (F)0;
     }
     EACH_AXIS(a) {
         const I into_mu = own ? tile->mu_way.into[a] : tile->way.into[a];
         tile->jumps.jumps[a] = tile->way.into[a] ? -tile->jumps.f : (F)0;
-        if (weaker) tile->jumps.mu_jumps[a] = into_mu ? -tile->jumps.mu * tile->state.behind : (F)0;
+        if (attenuated) tile->jumps.mu_jumps[a] = into_mu ? -tile->jumps.mu * tile->state.behind : (F)0;
         tile->jumps.moments[a] = tile->jumps.mu_moments[a] = 0;
     }
 }
@@ -438,28 +444,26 @@ INLINE void put_by_ends(double *rows, int64_t n, int some, const Tile *t, const 
 // Derivatives of a tile of `some` rays, `first` and on, out of n.
 INLINE void put_derivatives(Tile *t, const Job *job, const Rays *r, int64_t first, int some, int64_t n,
                             const int attenuation) {
-    const int own = attenuation == OWN_LATTICE, weaker = attenuation != NO_MU;
+    const int own = attenuation == OWN_LATTICE, attenuated = attenuation != NO_MU;
     double *const rows = job->derivatives + first;
     const D per_mm = t->mm > (D)0 ? 1 / t->mm : (D)0;
-    put(rows, some, weaker ? AS(D, take(job->integrals, first, some)) * per_mm : AS(D, t->state.sum) * t->span);
-    const F last = weaker ? t->state.left * t->jumps.f : t->jumps.f; // the jump at the face by which rays leave
+    put(rows, some, attenuated ? AS(D, take(job->integrals, first, some)) * per_mm : AS(D, t->state.sum) * t->span);
+    const F last = attenuated ? t->state.left * t->jumps.f : t->jumps.f; // the jump at the face by which rays leave
     EACH_AXIS(a) {
         t->jumps.jumps[a] += t->way.out[a] ? last : (F)0;
         t->jumps.moments[a] += t->way.out[a] ? last * t->state.t : (F)0;
     }
     put_by_ends(rows + n, n, some, t, t->jumps.jumps, t->jumps.moments, r->direction);
-    if (!weaker) return;
-    EACH_AXIS(a) {
-        t->jumps.mu_jumps[a] *= -t->length;
-        t->jumps.mu_moments[a] *= -t->length;
-    }
+    if (!attenuated) return;
+    EACH_AXIS(a) t->jumps.mu_jumps[a] *= -t->length, t->jumps.mu_moments[a] *= -t->length;
     put_by_ends(rows + 7 * n, n, some, t, t->jumps.mu_jumps, t->jumps.mu_moments, own ? r->mu_direction : r->direction);
     put(rows + 13 * n, some, -AS(D, t->jumps.by_length) * t->span * per_mm);
 }
 
 // Lanes of the rays of a fan, or of the list, from number `begin` on.
 INLINE void aim_tile(const Job *job, const Fan *fan, int64_t begin, int64_t count, const int own, Rays *r) {
-    const D number = (double)begin + AS(D, lane_numbers());
+    D number;
+    EACH_LANE(i) number[i] = (double)(begin + i);
     if (fan) aim_fan(fan, number, own, r);
     else take_listed(&job->list, begin, own, r);
     r->real = number < (D)count;
@@ -474,22 +478,24 @@ INLINE void trace_bundle(const Job *job, const Fan *fan, int64_t count, int64_t 
     Tile tiles[TILES];
     Rays rays;
     for (int64_t begins = 0; begins < count; begins += TILES * width) {
-        const int64_t left = count - begins, n_tiles = left < TILES * width ? (left + width - 1) / width : TILES;
+        const int64_t rest = count - begins, n_tiles = rest < TILES * width ? (rest + width - 1) / width : TILES;
         int64_t longest = 0;
         for (int i = 0; i < n_tiles; i++) {
-            const int some = left - i * width < width ? (int)(left - i * width) : width;
+            const int some = tiles[i].some = rest - i * width < width ? rest - i * width : width;
             aim_tile(job, fan, begins + i * width, count, own, &rays);
             begin(tiles + i, job, &rays, task, attenuation);
             start(tiles + i, job, row + begins + i * width, some, task, attenuation);
             longest = tiles[i].steps > longest ? tiles[i].steps : longest;
         }
-        for (int64_t done = 0; done < longest; done += TURN)
+        for (int64_t done = 0; done < longest + TURN; done += TURN)
             for (int i = 0; i < n_tiles; i++) {
                 const int64_t steps = tiles[i].steps - done;
-                if (steps > 0) walk(tiles + i, job, steps < TURN ? steps : TURN, task, attenuation);
+                if (!tiles[i].steps || steps <= -TURN) continue;
+                if (steps <= 0) close(tiles + i);
+                walk(tiles + i, job, steps > TURN ? TURN : steps > 0 ? steps : 1, task, attenuation);
             }
         for (int i = 0; i < n_tiles && (task == FORWARD || task == BY_ENDS); i++) {
-            const int some = left - i * width < width ? (int)(left - i * width) : width;
+            const int some = tiles[i].some;
             const int64_t first = row + begins + i * width;
             if (task == FORWARD) {
                 const F integral = AS(F, AS(D, tiles[i].state.sum) * tiles[i].span * tiles[i].mm);

@@ -54,6 +54,9 @@ test-app: env-dev
 
 test-kernels: env-dev
 	$(BIN)/python -m pytest tests/kernels
+	@for level in $$($(BIN)/python -c "from mphdrr.core.projector import siddon_cpu; print(*siddon_cpu.levels())"); do \
+		echo "accuracy of $$level"; MPHDRR_CPU_LEVEL=$$level $(BIN)/python -m pytest -k cpu tests/core/test_projector.py \
+		tests/core/test_emission.py tests/core/test_emission_gradients.py tests/core/test_geometry_gradients.py || exit 1; done
 
 test-gate:
 	$(ENVIRONMENT) --extras dev,gate

@@ -341,6 +341,8 @@ class Projector(LinearOperator):
             return []
         rays = self._rays_of_a_view
         most = _MOST_RAYS.get(backend, _FEWEST_RAYS)
+        if backend == "torch":  # slow enough: work between which a job can stop stays short
+            most = _FEWEST_RAYS
         at_once = min(most // rays, max(_FEWEST_RAYS // rays, n_views // (2 * self._workers(backend))))
         return [range(m, min(m + at_once, n_views)) for m in range(0, n_views, at_once)] if at_once > 1 else []
 

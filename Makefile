@@ -69,6 +69,6 @@ env-dev:
 	$(ENVIRONMENT) --extras blender,dev --torch "$(TORCH)"
 
 clean:
-	rm -f core/projector/kernels/*.so core/projector/kernels/*.dylib core/projector/kernels/*.dll
+	rm -f core/projector/backends/kernels/*.so core/projector/backends/kernels/*.dylib core/projector/backends/kernels/*.dll
 	rm -rf out dist build wheels .venv* *.egg-info .pytest_cache .mypy_cache .ruff_cache .import_linter_cache .hypothesis
 	find . -name __pycache__ -prune -exec rm -rf {} +

@@ -11,9 +11,9 @@ import numpy as np
 from mathutils import Matrix
 from numpy.typing import NDArray
 
-from ..core.frames import module_poses
-from ..core.system import PinholeSystem
-from ..core.views import Views
+from ..core.geometry.frames import module_poses
+from ..core.geometry.system import PinholeSystem
+from ..core.geometry.views import Views
 
 _CAMERA_FROM_MODULE = np.diag([-1.0, 1.0, -1.0, 1.0])
 _SMALLEST = 1.0  # Blender silently clamps Camera.lens and Camera.sensor_width below this

@@ -8,7 +8,7 @@ import bmesh
 import bpy
 import numpy as np
 
-from ..core.collimator_mesh import Solid, check_watertight
+from ..core.geometry.collimator_mesh import Solid, check_watertight
 from . import compat, ids
 
 

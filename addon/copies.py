@@ -11,9 +11,9 @@ import bpy
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core.collimator import Collimator
-from ..core.collimator_mesh import Solid, collimator_solid, crystal_solid
 from ..core.errors import InputError
+from ..core.geometry.collimator import Collimator
+from ..core.geometry.collimator_mesh import Solid, collimator_solid, crystal_solid
 from . import cameras, collimators, design, ids, scanner
 from .module_values import add_module, module_numbers
 from .scanner_parts import new_part

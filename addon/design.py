@@ -12,9 +12,9 @@ from contextlib import contextmanager
 import bpy
 import numpy as np
 
-from ..core.collimator import Collimator, Construction, EdgePlace
-from ..core.collimator_mesh import collimator_solid, crystal_solid
 from ..core.errors import InputError
+from ..core.geometry.collimator import Collimator, Construction, EdgePlace
+from ..core.geometry.collimator_mesh import collimator_solid, crystal_solid
 from . import cameras, collimators, readouts
 from .decimals import typed
 from .module_values import TYPED, ModuleNumbers, module_numbers, off_aim

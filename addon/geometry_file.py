@@ -11,8 +11,8 @@ import bpy
 import numpy as np
 
 from ..core.errors import InputError, InputWarning
+from ..core.geometry.system import PinholeSystem
 from ..core.recording import recorded_warnings
-from ..core.system import PinholeSystem
 from . import scanner, storage
 from .module_values import LENGTHS
 

@@ -12,7 +12,7 @@ import bpy
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core.mosaic import as_seen, mosaic
+from ..core.runs.mosaic import as_seen, mosaic
 from . import ids
 
 _KEY = "mphdrr_projection"  # custom property: marks the images that a new run replaces

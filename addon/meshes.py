@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..core.errors import InputError
-from ..core.meshes.mesh import Mesh, require_closed
+from ..core.volumes.meshes.mesh import Mesh, require_closed
 from .cameras import world_matrix
 
 

@@ -14,9 +14,9 @@ import bpy
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core.design import collimator_length
 from ..core.errors import InputError
-from ..core.system import PinholeSystem
+from ..core.geometry.design_formulas import collimator_length
+from ..core.geometry.system import PinholeSystem
 from . import cameras
 from .decimals import typed
 

@@ -18,11 +18,11 @@ from bpy.props import (
 )
 
 from ..core.errors import InputError
-from ..core.grid import Grid
+from ..core.geometry.grid import Grid
 from ..core.phantoms.kinds import KINDS, Kind
 from ..core.phantoms.language import parse_phantom
 from ..core.phantoms.phantom import Phantom
-from ..core.volume import UNITS
+from ..core.volumes.volume import UNITS
 from . import choices
 from .decimals import typed
 

@@ -20,14 +20,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..core.errors import InputError, InputWarning
-from ..core.grid import Grid
+from ..core.geometry.grid import Grid
 from ..core.memory import require
-from ..core.meshes.mesh import Mesh
 from ..core.phantoms.kinds import KINDS
 from ..core.phantoms.phantom import Phantom
 from ..core.progress import Progress, part_of
 from ..core.recording import recorded_warnings
-from ..core.volume import Volume
+from ..core.volumes.meshes.mesh import Mesh
+from ..core.volumes.volume import Volume
 from . import ids, meshes, storage, volumes
 from .cameras import set_world_matrix, world_matrix
 from .phantom_properties import PhantomSettings, identifier

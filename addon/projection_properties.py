@@ -8,10 +8,10 @@ import bpy
 from bpy.props import BoolProperty, EnumProperty, FloatProperty, IntProperty, PointerProperty, StringProperty
 
 from ..core.errors import InputError
-from ..core.isotopes import ISOTOPES
-from ..core.materials import APERTURES, CRYSTALS
-from ..core.system import PinholeSystem
-from ..core.volume import Volume
+from ..core.geometry.system import PinholeSystem
+from ..core.physics.isotopes import ISOTOPES
+from ..core.physics.materials import APERTURES, CRYSTALS
+from ..core.volumes.volume import Volume
 from . import choices, ids, volumes
 from .decimals import typed
 

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import bpy
 
 from ..core.errors import InputError
-from ..core.performance import isocentre_performance
+from ..core.physics.performance import isocentre_performance
 from .module_values import LENGTHS, ModuleNumbers
 
 _COVERED = 1 - 1e-6  # share of R: an `l` from the ROI sees R up to rounding

@@ -10,7 +10,7 @@ import bpy
 import numpy as np
 
 from ..core.errors import InputError
-from ..core.generators import ring_order
+from ..core.geometry.generators import ring_order
 from ..core.recording import recorded_warnings
 from . import copies, design, ids, scanner
 

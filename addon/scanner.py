@@ -16,10 +16,10 @@ from typing import Any
 import bpy
 import numpy as np
 
-from ..core.collimator import OPENING_ANGLE, Construction, EdgePlace
 from ..core.errors import InputError, InputWarning
-from ..core.module_parts import module_parts
-from ..core.system import PinholeSystem
+from ..core.geometry.collimator import OPENING_ANGLE, Construction, EdgePlace
+from ..core.geometry.module_parts import module_parts
+from ..core.geometry.system import PinholeSystem
 from ..core.workbook import ColumnMap, QuantityCells, SystemSource
 from . import cameras, design, ids
 from .module_values import LENGTHS, TYPED, is_edited, is_moved, module_numbers, off_aim, remember

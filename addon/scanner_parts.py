@@ -8,8 +8,8 @@ from typing import Any
 import bpy
 import numpy as np
 
-from ..core.module_parts import ModulePart
-from ..core.system import PinholeSystem
+from ..core.geometry.module_parts import ModulePart
+from ..core.geometry.system import PinholeSystem
 from . import cameras, collimators, ids
 from .module_values import write_module
 

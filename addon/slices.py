@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..core.errors import InputError
-from ..core.volume import Volume
+from ..core.volumes.volume import Volume
 from . import ids, vdb, volume_materials, volumes
 from .compat import enable_nodes
 

@@ -19,14 +19,14 @@ import bpy
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core.checks import freeze, positive
 from ..core.errors import InputError, InputWarning
 from ..core.files import replacing
-from ..core.grid import Grid
-from ..core.hounsfield import AIR_HU
+from ..core.geometry.grid import Grid
 from ..core.memory import require
+from ..core.physics.ct_numbers import AIR_HU
+from ..core.validation import freeze, positive
 from ..core.version import VERSION
-from ..core.volume import UNITS, Volume
+from ..core.volumes.volume import UNITS, Volume
 from .vdb_length import missing_bytes
 
 SMOKE = "smoke for display"

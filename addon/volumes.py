@@ -19,11 +19,11 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..core.errors import InputError
-from ..core.frames import checked_affine
-from ..core.grid import Grid
-from ..core.maps import MAPS
+from ..core.geometry.frames import checked_affine
+from ..core.geometry.grid import Grid
 from ..core.memory import readable_size
-from ..core.volume import UNITS, Volume
+from ..core.physics.maps import MAPS
+from ..core.volumes.volume import UNITS, Volume
 from . import compat, ids, storage, volume_materials
 from .cameras import world_matrix
 from .vdb import BACKGROUND, SMOKE, read_vdb, write_vdb

@@ -478,7 +478,7 @@ def _pose_gradient(case: Case, integrate: Callable[[int, Any], Any]) -> Call:
     """The call of a differentiable renderer ``integrate(m, (position, rotation, distance, pitch))``."""
     import torch
 
-    from mphdrr.core.rotations import se3_exp
+    from mphdrr.core.geometry.rotations import se3_exp
 
     poses = torch.from_numpy(case.system.poses()).float()  # as its users optimise them
     distances = np.linalg.norm(case.views.detector_centers - case.views.sources, axis=1)

@@ -13,7 +13,7 @@ import numpy as np
 import psutil
 from case import SIDE, Case
 
-from mphdrr.core.run import versions
+from mphdrr.core.runs.run import versions
 from mphdrr.core.version import VERSION
 
 if TYPE_CHECKING:

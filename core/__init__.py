@@ -9,24 +9,17 @@
 
 from __future__ import annotations
 
-from .design import collimator_length, roi_radius_seen
 from .errors import InputError, InputWarning
-from .export import read_run, write_run
-from .frames import euler_pose
-from .generators import RingFit, ellipse_rings, fit_rings, plate_rings, regular_polygon, ring_order
-from .geometry_checks import GeometryReport, check_geometry
-from .geometry_export import read_geometry, write_geometry
-from .grid import Grid
-from .hounsfield import diffdrr_density, hu_to_mu
-from .isotopes import ISOTOPES, Isotope, isotope
-from .maps import completeness_map, modules_map, resolution_map, sensitivity_map
-from .materials import MATERIALS, Material, attenuation
-from .meshes.mesh import Mesh, read_mesh, write_mesh
-from .meshes.surface import volume_to_mesh
-from .meshes.voxelization import voxelize_mesh
-from .mosaic import as_seen, mosaic
-from .noise import sample_counts
-from .performance import ModulePerformance, isocentre_performance, magnification, resolution, seen, sensitivity
+from .exchange import read_geometry, write_geometry
+from .geometry.checks import GeometryReport, check_geometry
+from .geometry.design_formulas import collimator_length, roi_radius_seen
+from .geometry.frames import euler_pose
+from .geometry.generators import RingFit, ellipse_rings, fit_rings, plate_rings, regular_polygon, ring_order
+from .geometry.grid import Grid
+from .geometry.presets import c_arm_views, pinhole_views
+from .geometry.system import PinholeSystem
+from .geometry.views import Views
+from .moved import keep_old_paths
 from .phantoms.defrise import DefrisePhantom
 from .phantoms.derenzo import DerenzoPhantom, DerenzoRods
 from .phantoms.jaszczak import JaszczakPhantom
@@ -38,18 +31,26 @@ from .phantoms.random import random_pose
 from .phantoms.shapes import Box, Capsule, Cone, Cylinder, Ellipsoid, Shape, Sphere
 from .phantoms.shepp_logan import SheppLogan
 from .phantoms.torso import CardiacTorso
-from .presets import c_arm_views, pinhole_views
+from .physics.ct_numbers import diffdrr_density, hu_to_mu
+from .physics.isotopes import ISOTOPES, Isotope, isotope
+from .physics.maps import completeness_map, modules_map, resolution_map, sensitivity_map
+from .physics.materials import MATERIALS, Material, attenuation
+from .physics.noise import sample_counts
+from .physics.performance import ModulePerformance, isocentre_performance, magnification, resolution, seen, sensitivity
+from .physics.sampling import sampling_gaps
 from .progress import Cancelled, Progress
-from .project import project_run
 from .projector import Emission, InverseSquareSum, Projector, Transmission, intensity, trace_rays
-from .rearranging import canonical, centered, crop, crop_to_box, pad, split_labels
-from .resampling import resample
-from .run import ProjectionRun
-from .sampling import sampling_gaps
-from .system import PinholeSystem
-from .views import Views
-from .volume import Volume
-from .volume_io import read_volume, write_volume
+from .runs.files import read_run, write_run
+from .runs.mosaic import as_seen, mosaic
+from .runs.projecting import project_run
+from .runs.run import ProjectionRun
+from .volumes.meshes.mesh import Mesh, read_mesh, write_mesh
+from .volumes.meshes.surface import volume_to_mesh
+from .volumes.meshes.voxelization import voxelize_mesh
+from .volumes.rearranging import canonical, centered, crop, crop_to_box, pad, split_labels
+from .volumes.resampling import resample
+from .volumes.volume import Volume
+from .volumes.volume_files import read_volume, write_volume
 from .workbook import (
     ColumnMap,
     ColumnMapDraft,
@@ -62,6 +63,8 @@ from .workbook import (
     read_system,
     write_system,
 )
+
+keep_old_paths()
 
 __all__ = [
     "ISOTOPES",

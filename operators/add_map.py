@@ -10,9 +10,9 @@ from bpy.props import BoolProperty, EnumProperty, FloatProperty, IntProperty
 
 from ..addon import choices, ids, jobs, scanner, selection, storage, volume_materials, volumes
 from ..addon.decimals import typed
-from ..core.grid import Grid
-from ..core.maps import MAPS, within_roi
+from ..core.geometry.grid import Grid
 from ..core.memory import require
+from ..core.physics.maps import MAPS, within_roi
 from ..core.progress import Progress
 
 _DESCRIPTIONS = {

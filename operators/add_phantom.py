@@ -12,7 +12,7 @@ from bpy.props import BoolProperty, FloatProperty, FloatVectorProperty, StringPr
 from ..addon import ids, jobs, phantoms, storage, volumes
 from ..addon.phantom_properties import FILE, KindSettings, PhantomSettings, identifier, kind_settings, sampling
 from ..core.errors import InputError
-from ..core.frames import euler_pose
+from ..core.geometry.frames import euler_pose
 from ..core.phantoms.kinds import KINDS, Kind
 from ..core.phantoms.language import read_phantom
 from ..core.phantoms.phantom import Phantom

@@ -28,7 +28,7 @@ class MPHDRR_OT_check_geometry(bpy.types.Operator):
         return selection.poll_scanner(cls, context)
 
     def execute(self, context: bpy.types.Context) -> set[str]:
-        from ..core.geometry_checks import check_geometry
+        from ..core.geometry.checks import check_geometry
 
         collection = scanner.required_scanner(context.scene)
         properties = collection.mphdrr_scanner

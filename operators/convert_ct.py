@@ -10,10 +10,10 @@ from bpy.props import FloatProperty
 
 from ..addon import ids, jobs, storage, volumes
 from ..addon.decimals import typed
-from ..core.hounsfield import hu_to_mu
 from ..core.memory import require
+from ..core.physics.ct_numbers import hu_to_mu
 from ..core.progress import Progress
-from ..core.volume import UNITS, Volume
+from ..core.volumes.volume import UNITS, Volume
 
 
 class MPHDRR_OT_ct_to_attenuation(jobs.JobOperator, bpy.types.Operator):

@@ -53,7 +53,7 @@ def export_dataset(scene: bpy.types.Scene, filepath: str) -> Path:
     InputError
         There is no run, its file is gone, or the new one cannot be written.
     """
-    from ..core.export import read_run, write_run
+    from ..core.runs.files import read_run, write_run
 
     run_file = getattr(scene, ids.SCENE_PROJECTIONS).run_file
     if not run_file:

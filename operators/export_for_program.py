@@ -14,7 +14,7 @@ from ..addon import choices, design, ids, scanner, selection, storage
 from ..addon.decimals import typed
 from ..addon.reports import warnings_reported
 from ..core.errors import InputError
-from ..core.geometry_export import FORMATS, write_geometry
+from ..core.exchange import FORMATS, write_geometry
 
 _ITEMS = choices.items(choices.GEOMETRY_FORMATS, ((f.name, f.name, f.title) for f in FORMATS.values()))
 

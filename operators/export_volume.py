@@ -12,7 +12,7 @@ from bpy.props import StringProperty
 from ..addon import ids, jobs, phantoms, storage, vdb, volumes
 from ..core.errors import InputError
 from ..core.progress import Progress
-from ..core.volume_io import VOLUME_FORMATS, write_volume
+from ..core.volumes.volume_files import VOLUME_FORMATS, write_volume
 
 _SUFFIXES = (".vdb", *VOLUME_FORMATS)
 

@@ -15,7 +15,7 @@ from ..addon import column_maps, ids, scanner
 from ..addon.preferences import preferences
 from ..addon.reports import warnings_reported
 from ..core.errors import InputError
-from ..core.system import PinholeSystem
+from ..core.geometry.system import PinholeSystem
 from ..core.workbook import ColumnMap, read_system
 from . import column_map_dialog
 

@@ -14,12 +14,12 @@ from bpy.props import BoolProperty, CollectionProperty, EnumProperty, FloatPrope
 from ..addon import choices, ids, jobs, storage, vdb, volumes
 from ..addon.decimals import typed
 from ..core.errors import InputError
-from ..core.hounsfield import hu_to_mu
 from ..core.memory import require
+from ..core.physics.ct_numbers import hu_to_mu
 from ..core.progress import Progress, part_of
-from ..core.rearranging import centered
-from ..core.volume import UNITS, Volume
-from ..core.volume_io import READ_FORMATS, read_volume
+from ..core.volumes.rearranging import centered
+from ..core.volumes.volume import UNITS, Volume
+from ..core.volumes.volume_files import READ_FORMATS, read_volume
 
 _SUFFIXES = (*READ_FORMATS, ".vdb")
 _STATES = tuple(suffix for suffix in _SUFFIXES if suffix != ".dcm")  # of files that hold one volume each

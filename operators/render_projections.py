@@ -10,15 +10,15 @@ from typing import Any
 import bpy
 from bpy.props import FloatProperty, StringProperty
 
-from ..addon import ids, images, jobs, phantoms, runs, scanner, storage, volumes
+from ..addon import ids, images, jobs, last_run, phantoms, scanner, storage, volumes
 from ..addon.decimals import typed
 from ..addon.projection_properties import ProjectionSettings, chosen_model
 from ..core.errors import InputError
+from ..core.geometry.system import PinholeSystem
 from ..core.memory import require
 from ..core.progress import Progress
-from ..core.run import ProjectionRun
-from ..core.system import PinholeSystem
-from ..core.volume import require_quantity
+from ..core.runs.run import ProjectionRun
+from ..core.volumes.volume import require_quantity
 
 
 class MPHDRR_OT_render_projections(ProjectionSettings, jobs.JobOperator, bpy.types.Operator):
@@ -73,8 +73,8 @@ class MPHDRR_OT_render_projections(ProjectionSettings, jobs.JobOperator, bpy.typ
         mu_name = None if mu is None else mu.name
 
         def work(progress: Progress) -> ProjectionRun:
-            from ..core.export import write_run
-            from ..core.project import project_run, warn_of_energy
+            from ..core.runs.files import write_run
+            from ..core.runs.projecting import project_run, warn_of_energy
 
             progress(0, len(system))
             if mu_name is not None and energy is not None:
@@ -101,7 +101,7 @@ class MPHDRR_OT_render_projections(ProjectionSettings, jobs.JobOperator, bpy.typ
             scene = bpy.data.scenes.get(scene_name)
             if scene is None:
                 raise InputError(f"the scene {scene_name!r} is gone; its projections are in {path}")
-            runs.record_run(scene, run, path)
+            last_run.record_run(scene, run, path)
             seconds = time.perf_counter() - start
             where = path if bpy.data.filepath else f"{path} until the .blend is saved"
             return f"Projected {item_name!r} into {len(run.views)} modules in {seconds:.1f} s: {where}"

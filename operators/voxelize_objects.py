@@ -12,13 +12,13 @@ from bpy.props import EnumProperty, FloatProperty, IntProperty, StringProperty
 from ..addon import choices, ids, jobs, meshes, storage, volumes
 from ..addon.decimals import typed
 from ..core.errors import InputError
-from ..core.grid import Grid
+from ..core.geometry.grid import Grid
 from ..core.memory import require
-from ..core.meshes.mesh import Mesh
-from ..core.meshes.surface import volume_to_mesh
-from ..core.meshes.voxelization import voxelize_mesh
 from ..core.progress import Progress
-from ..core.volume import UNITS
+from ..core.volumes.meshes.mesh import Mesh
+from ..core.volumes.meshes.surface import volume_to_mesh
+from ..core.volumes.meshes.voxelization import voxelize_mesh
+from ..core.volumes.volume import UNITS
 
 _BYTES = 40.0  # a voxel, while the volume is made and put into the scene
 

@@ -1,7 +1,7 @@
 """Compile the C kernels of the projector into the library of one platform, by the compiler that the package ziglang has.
 
-Zig compiles for every platform on any other. What is compiled is core/projector/kernels/; siddon.c once for each level of
-processor and kind of number.
+Zig compiles for every platform on any other. What is compiled is core/projector/backends/kernels/; siddon.c once for each
+level of processor and kind of number.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 
-KERNELS = Path(__file__).resolve().parents[1] / "core/projector/kernels"
+KERNELS = Path(__file__).resolve().parents[1] / "core/projector/backends/kernels"
 AVX2 = ("-mavx2", "-mfma", "-mprfchw")
 AVX512 = (*AVX2, "-mavx512f", "-mavx512vl", "-mavx512dq", "-mavx512bw")
 # No -ffast-math: linked into a library, it switches denormal numbers off for the whole process that loads it.

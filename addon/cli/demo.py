@@ -12,13 +12,13 @@ from pathlib import Path
 import numpy as np
 
 from ...core.cli.options import add_command, add_workbook, progress_bar, read_workbook
-from ...core.export import write_run
 from ...core.files import ensure_folder
-from ...core.frames import euler_pose
-from ...core.grid import Grid
-from ...core.mosaic import mosaic, write_png
+from ...core.geometry.frames import euler_pose
+from ...core.geometry.grid import Grid
 from ...core.phantoms.derenzo import DerenzoPhantom
-from ...core.project import project_run
+from ...core.runs.files import write_run
+from ...core.runs.mosaic import mosaic, write_png
+from ...core.runs.projecting import project_run
 
 EXAMPLE = Path(__file__).parents[2] / "examples" / "dc-spect-80.xlsx"
 EULER_DEGREES = (30.0, 55.0, 0.0)
@@ -44,7 +44,7 @@ def _run(arguments: argparse.Namespace) -> None:
     from .session import new_scene, quiet, save_scene
 
     scene = new_scene()  # before the long work: without Blender the demo stops here
-    from .. import pictures, runs, scanner, volumes
+    from .. import last_run, pictures, scanner, volumes
 
     with _step("geometry"):
         system = read_workbook(arguments)
@@ -68,7 +68,7 @@ def _run(arguments: argparse.Namespace) -> None:
         write_run(run, out / "run.h5")
         write_png(mosaic(run.projections), out / "mosaic.png")
     with _step("scene"):
-        runs.show_run(scene, run, out / "run.h5")
+        last_run.show_run(scene, run, out / "run.h5")
         save_scene(out / "scanner.blend")
     with _step("pictures"), quiet():
         for first, last in scanner.quick_ranges(system):

@@ -7,8 +7,8 @@ from pathlib import Path
 
 from ...core.cli.options import add_command, add_workbook, chosen_modules, output_path, read_workbook
 from ...core.errors import InputError
-from ...core.export import read_run
-from ...core.volume_io import read_volume, read_volume_of
+from ...core.runs.files import read_run
+from ...core.volumes.volume_files import read_volume, read_volume_of
 
 
 def add_parser(subparsers) -> None:  # type: ignore[no-untyped-def]
@@ -42,7 +42,7 @@ def _run(arguments: argparse.Namespace) -> None:
     from .session import new_scene, save_scene
 
     blender_scene = new_scene()
-    from .. import ids, runs, scanner, volumes
+    from .. import ids, last_run, scanner, volumes
 
     scanner.build_scanner(blender_scene, system)
     if volume is not None:
@@ -51,6 +51,6 @@ def _run(arguments: argparse.Namespace) -> None:
         getattr(blender_scene, ids.SCENE_PROJECTIONS).mu = volumes.add_volume(mu, Path(arguments.mu).name)
     if run is not None:
         volumes.add_volume(run.volume, "Projected volume")
-        runs.show_run(blender_scene, run, Path(arguments.run_file))
+        last_run.show_run(blender_scene, run, Path(arguments.run_file))
     save_scene(path)
     print(path)

@@ -5,8 +5,8 @@ from __future__ import annotations
 import argparse
 
 from ..errors import InputError
-from ..export import FORMATS, read_run, write_run
-from ..mosaic import mosaic, write_png
+from ..runs.files import FORMATS, read_run, write_run
+from ..runs.mosaic import mosaic, write_png
 from .options import add_command, output_path
 
 

@@ -15,9 +15,9 @@ from numpy.typing import NDArray
 
 from ..errors import InputError
 from ..files import ensure_folder, refuse_folder
-from ..isotopes import ISOTOPES
+from ..geometry.system import PinholeSystem
+from ..physics.isotopes import ISOTOPES
 from ..progress import Progress
-from ..system import PinholeSystem
 from ..workbook import read_system
 
 DERENZO_OPTIONS = ("radius", "rods", "sectors", "height", "activity", "water", "background")

@@ -13,10 +13,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..checks import whole_shape
 from ..errors import InputError
-from ..frames import euler_pose
-from ..grid import Grid
+from ..geometry.frames import euler_pose
+from ..geometry.grid import Grid
 from ..phantoms.defrise import DefrisePhantom
 from ..phantoms.derenzo import DerenzoPhantom
 from ..phantoms.kinds import KINDS
@@ -25,8 +24,9 @@ from ..phantoms.phantom import QUANTITIES, Phantom, ShapePhantom
 from ..phantoms.points import PointGrid
 from ..phantoms.random import random_pose
 from ..phantoms.shapes import Box, Cylinder, Ellipsoid, Sphere
-from ..volume import UNITS, Volume
-from ..volume_io import VOLUME_FORMATS, write_volume
+from ..validation import whole_shape
+from ..volumes.volume import UNITS, Volume
+from ..volumes.volume_files import VOLUME_FORMATS, write_volume
 from .options import (
     PLACING_OPTIONS,
     add_command,

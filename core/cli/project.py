@@ -12,17 +12,17 @@ from typing import Any
 import numpy as np
 
 from ..errors import InputError
-from ..export import FORMATS, write_run
-from ..hounsfield import hu_to_mu
-from ..isotopes import ISOTOPES
-from ..materials import APERTURES, CRYSTALS
-from ..mosaic import mosaic, write_png
-from ..project import project_run, warn_of_energy
+from ..geometry.system import PinholeSystem
+from ..physics.ct_numbers import hu_to_mu
+from ..physics.isotopes import ISOTOPES
+from ..physics.materials import APERTURES, CRYSTALS
 from ..projector import Emission, InverseSquareSum, Model, Transmission
-from ..rearranging import centered
-from ..system import PinholeSystem
-from ..volume import LINE_INTEGRALS, Volume
-from ..volume_io import read_volume, read_volume_of
+from ..runs.files import FORMATS, write_run
+from ..runs.mosaic import mosaic, write_png
+from ..runs.projecting import project_run, warn_of_energy
+from ..volumes.rearranging import centered
+from ..volumes.volume import LINE_INTEGRALS, Volume
+from ..volumes.volume_files import read_volume, read_volume_of
 from .options import (
     DERENZO_OPTIONS,
     PLACING_OPTIONS,

@@ -6,8 +6,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
-from ..checks import whole_number
-from ..isotopes import WATER_MU
+from ..physics.isotopes import WATER_MU
+from ..validation import whole_number
 from .phantom import Phantom
 from .settings import count, require_at_most, setting
 from .shapes import Cylinder, Shape

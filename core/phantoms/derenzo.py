@@ -11,9 +11,9 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from ..checks import freeze, positive, real_array
 from ..errors import InputError, InputWarning
-from ..isotopes import WATER_MU
+from ..physics.isotopes import WATER_MU
+from ..validation import freeze, positive, real_array
 from .phantom import Phantom
 from .settings import setting
 from .shapes import Cylinder, Points, Real, Shape, Vector

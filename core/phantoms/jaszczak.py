@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
-from ..isotopes import WATER_MU
+from ..physics.isotopes import WATER_MU
 from .derenzo import DerenzoRods
 from .materials import PMMA_MU
 from .phantom import Phantom

@@ -9,7 +9,7 @@ from functools import cached_property
 from typing import Any
 
 from ..errors import InputError
-from ..isotopes import WATER_MU
+from ..physics.isotopes import WATER_MU
 from .phantom import Phantom
 from .settings import require_apart, require_at_most, setting
 from .shapes import Box, Cylinder, Shape, Sphere

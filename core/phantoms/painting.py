@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..grid import Grid
+from ..geometry.grid import Grid
 from ..memory import require
 from ..progress import Progress
 from .sequences import r3_sequence

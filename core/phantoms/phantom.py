@@ -13,15 +13,15 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ..checks import freeze, positive, real_array
 from ..errors import InputError, InputWarning
-from ..frames import checked_affine
-from ..grid import Grid
+from ..geometry.frames import checked_affine
+from ..geometry.grid import Grid
+from ..geometry.views import Views
 from ..memory import require
 from ..progress import Progress
 from ..projector.tracing import points as as_points
-from ..views import Views
-from ..volume import UNITS, Volume
+from ..validation import freeze, positive, real_array
+from ..volumes.volume import UNITS, Volume
 from .painting import Layer, integral, line_integrals, means_beneath, paint_voxels, points_inside, values_at
 from .settings import check_settings
 from .shapes import Shape

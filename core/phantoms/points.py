@@ -8,8 +8,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
-from ..checks import whole_shape
 from ..errors import InputError
+from ..validation import whole_shape
 from .phantom import Phantom
 from .settings import count, require_at_most, setting
 from .shapes import Shape, Sphere

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ..checks import real_array
 from ..errors import InputError
-from ..frames import euler_pose
+from ..geometry.frames import euler_pose
+from ..validation import real_array
 
 
 def random_pose(

@@ -10,8 +10,8 @@ from typing import Any
 
 import numpy as np
 
-from ..checks import real_array
 from ..errors import InputError
+from ..validation import real_array
 
 
 def setting(default: float | tuple[float, ...], unit: str, text: str, least: float | None = None) -> Any:

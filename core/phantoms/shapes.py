@@ -14,9 +14,9 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from ..checks import positive, real_array
 from ..errors import InputError
-from ..frames import euler_pose
+from ..geometry.frames import euler_pose
+from ..validation import positive, real_array
 from .surfaces import Surface, clipped, lathe
 
 Real = NDArray[np.floating]

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from functools import cached_property
 
 from ..errors import InputError
-from ..isotopes import WATER_MU
+from ..physics.isotopes import WATER_MU
 from .phantom import Phantom
 from .settings import choice, setting
 from .shapes import Ellipsoid, Shape

@@ -12,8 +12,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..checks import whole_number
 from ..errors import InputError
+from ..validation import whole_number
 from .materials import LUNG_MU, SOFT_TISSUE_MU, VERTEBRA_MU
 from .painting import Layer, points_inside
 from .phantom import Phantom

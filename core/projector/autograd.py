@@ -11,8 +11,8 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from ..arrays import require_numbers
 from ..errors import InputError
-from .arrays import require_numbers
 from .tracing import Bundle, Ends, fan_vectors, fans, fitting_count, points
 
 if TYPE_CHECKING:

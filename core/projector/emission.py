@@ -9,19 +9,19 @@ from typing import Any, Literal
 
 import numpy as np
 
-from ..checks import positive, real_array
-from ..collimator import OPENING_ANGLE, edge_slope
+from ..arrays import ArrayOrTensor, is_tensor, namespace
 from ..errors import InputError
-from ..grid import Grid
-from ..isotopes import Isotope, isotope
-from ..materials import module_coefficients
-from ..system import PinholeSystem
-from ..views import Views
-from ..volume import Volume, require_quantity
-from .aperture import KnifeEdge, Opening, openings, paix_diameter, within_cone
-from .aperture import points_needed as hole_points_needed
-from .arrays import ArrayOrTensor, is_tensor, namespace
-from .crystal import absorbed_share, gaussian_blur, layer_depths, share_inside
+from ..geometry.collimator import OPENING_ANGLE, edge_slope
+from ..geometry.grid import Grid
+from ..geometry.system import PinholeSystem
+from ..geometry.views import Views
+from ..physics.aperture import KnifeEdge, Opening, openings, paix_diameter, within_cone
+from ..physics.aperture import points_needed as hole_points_needed
+from ..physics.crystal import absorbed_share, gaussian_blur, layer_depths, share_inside
+from ..physics.isotopes import Isotope, isotope
+from ..physics.materials import module_coefficients
+from ..validation import positive, real_array
+from ..volumes.volume import Volume, require_quantity
 from .models import Array, Beam, Model, view_rays
 from .pixel_points import TOLERANCE, expected_error, lattice, offsets, points_needed, require_points, shadow_edges
 from .rays import Fan

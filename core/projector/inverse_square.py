@@ -8,10 +8,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..errors import InputError
-from ..grid import Grid
-from ..system import PinholeSystem
-from ..views import Views
-from ..volume import Volume
+from ..geometry.grid import Grid
+from ..geometry.system import PinholeSystem
+from ..geometry.views import Views
+from ..volumes.volume import Volume
 from .emission import Emission
 from .models import Array, Beam, Model, view_rays
 

@@ -10,12 +10,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..checks import positive, real_array
+from ..arrays import ArrayOrTensor, is_tensor, namespace
 from ..errors import InputError
-from ..grid import Grid
-from ..views import Views
-from ..volume import LINE_INTEGRALS, Volume, require_quantity
-from .arrays import ArrayOrTensor, is_tensor, namespace
+from ..geometry.grid import Grid
+from ..geometry.views import Views
+from ..validation import positive, real_array
+from ..volumes.volume import LINE_INTEGRALS, Volume, require_quantity
 from .pixel_points import TOLERANCE, offsets, points_needed, require_points, shadow_edges
 from .rays import Fan
 

@@ -15,24 +15,14 @@ from typing import Any
 
 import numpy as np
 
+from ..arrays import ArrayOrTensor, alike, checked, cropped, is_double, is_tensor, like, together, zeros
 from ..errors import InputError, InputWarning
-from ..grid import Grid
+from ..geometry.grid import Grid
+from ..geometry.views import Views
 from ..memory import available, require
 from ..progress import Progress
-from ..views import Views
-from ..volume import Volume
+from ..volumes.volume import Volume
 from . import backends
-from .arrays import (
-    ArrayOrTensor,
-    alike,
-    checked,
-    cropped,
-    is_double,
-    is_tensor,
-    like,
-    together,
-    zeros,
-)
 from .models import Array, Beam, Model, Transmission, require_model
 from .rays import Attenuation, IndexFans, RayMapper, window
 

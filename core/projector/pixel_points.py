@@ -20,8 +20,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import InputError
-from ..grid import Grid
-from ..views import Views
+from ..geometry.grid import Grid
+from ..geometry.views import Views
 
 Array = NDArray[np.float64]
 

@@ -14,13 +14,13 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ..checks import positive, whole_shape
 from ..errors import InputError
-from ..grid import Grid
-from ..views import Views
-from ..volume import Volume, require_quantity
-from .aperture import disk_points
-from .crystal import absorbed_share
+from ..geometry.grid import Grid
+from ..geometry.views import Views
+from ..physics.aperture import disk_points
+from ..physics.crystal import absorbed_share
+from ..validation import positive, whole_shape
+from ..volumes.volume import Volume, require_quantity
 from .emission import throughput
 from .pixel_points import TOLERANCE, lattice, points_needed, require_points, shadow_edges
 from .tracing import trace_fans

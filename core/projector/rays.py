@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..grid import Grid
+from ..geometry.grid import Grid
 
 # Rounding moves a coordinate by some 1e-12 voxels (a rotated grid, a source thousands of voxels away). A ray
 # this close to a plane of voxel faces along its whole way lies in the plane; one this steady along an axis is

@@ -9,12 +9,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ..checks import real_array, whole_shape
+from ..arrays import ArrayOrTensor, checked, is_double, is_tensor, like, together, zeros
 from ..errors import InputError
-from ..grid import Grid
-from ..volume import LINE_INTEGRALS, Volume, require_quantity
+from ..geometry.grid import Grid
+from ..validation import real_array, whole_shape
+from ..volumes.volume import LINE_INTEGRALS, Volume, require_quantity
 from . import backends
-from .arrays import ArrayOrTensor, checked, is_double, is_tensor, like, together, zeros
 from .operator import Spread, _blocks, _parallel, _sum, _thread_count, checked_mu, lattices, volume_workers
 from .rays import Attenuation, Fan, RayMapper, Rays
 

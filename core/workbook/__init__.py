@@ -30,10 +30,10 @@ new_workbook.py  a workbook in the users' layout
 
 from __future__ import annotations
 
+from ..system_source import QuantityCells, SystemSource
 from .column_map import ColumnMap, MappedColumn, MappedTable
 from .draft import ColumnMapDraft, draft_column_map, preview_workbook
 from .reader import read_system
-from .source import QuantityCells, SystemSource
 from .writer import WrittenWorkbook, write_system
 
 __all__ = [

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..errors import InputError
-from ..system import PinholeSystem
+from ..geometry.system import PinholeSystem
 from .layout import Table
 from .sheet_xml import SheetXml
 from .workbook_xml import WorkbookXml, areas_in

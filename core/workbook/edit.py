@@ -11,12 +11,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import InputError, InputWarning
-from ..system import PinholeSystem
+from ..geometry.system import PinholeSystem
 from .arrangement import Arrangement, arrange, matched
 from .cells import module_number
-from .checks import EXACT, derived, is_by_design
 from .column_map import ColumnMap
 from .layout import Column, Table, column_map_of
+from .plausibility import EXACT, derived, is_by_design
 from .quantities import DIMENSIONS, POSITION
 from .reader import Reading
 from .recalculate import agree

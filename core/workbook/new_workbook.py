@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import io
 
-from ..system import PinholeSystem
-from .checks import is_by_design
+from ..geometry.system import PinholeSystem
+from .plausibility import is_by_design
 from .workbook_xml import Place, WorkbookXml
 
 # Column -> symbol, description.

@@ -10,16 +10,16 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ..design import collimator_length
 from ..errors import InputError, InputWarning
-from ..system import PinholeSystem
+from ..geometry.design_formulas import collimator_length
+from ..geometry.system import PinholeSystem
+from ..system_source import QuantityCells, SystemSource
 from .book import Book
-from .checks import derived, tolerance, warn_of_differences, warn_of_implausible
 from .column_map import ColumnMap, column_map
 from .layout import Column, Layout, mapped_layout
+from .plausibility import derived, tolerance, warn_of_differences, warn_of_implausible
 from .quantities import DERIVED, DIMENSIONS, NEEDED, POSITION
 from .recognition import recognized_layout
-from .source import QuantityCells, SystemSource
 
 _COMPUTED = ("b", "l", *DERIVED[1:])
 """Columns that may hold formulas, causes before effects, so that the cause of an error is the cell refused."""

@@ -8,9 +8,9 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 from . import libreoffice
-from .checks import AGREEING
 from .dependencies import Dependencies
 from .formulas import CellError, NotComputable
+from .plausibility import AGREEING
 from .sheet_xml import Cell
 from .workbook_xml import Place, WorkbookXml
 

@@ -10,11 +10,11 @@ from pathlib import Path
 
 import numpy as np
 
-from ..checks import instance
 from ..errors import InputError, InputWarning
 from ..files import replacing
+from ..geometry.system import PinholeSystem
 from ..recording import recorded_warnings
-from ..system import PinholeSystem
+from ..validation import instance
 from . import libreoffice
 from .book import Book
 from .column_map import ColumnMap, column_map

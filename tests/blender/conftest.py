@@ -10,7 +10,7 @@ import pytest
 bpy = pytest.importorskip("bpy", reason="needs Blender's Python module: pip install mphdrr[blender]")
 
 from mphdrr.addon import registration  # noqa: E402
-from mphdrr.core.system import PinholeSystem  # noqa: E402
+from mphdrr.core.geometry.system import PinholeSystem  # noqa: E402
 
 WORKBOOK = Path(__file__).parents[2] / "examples" / "dc-spect-80.xlsx"
 

@@ -14,7 +14,7 @@ import pytest
 
 from mphdrr.addon import column_maps, scanner
 from mphdrr.core.errors import InputError
-from mphdrr.core.system import PinholeSystem
+from mphdrr.core.geometry.system import PinholeSystem
 from mphdrr.core.workbook import ColumnMap, draft_column_map, read_system
 from mphdrr.core.workbook.quantities import LENGTH_UNITS
 

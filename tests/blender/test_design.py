@@ -14,7 +14,7 @@ import mphdrr.core as mph
 from mphdrr.addon import cameras, copies, design, live, registration, scanner
 from mphdrr.addon.module_values import module_numbers
 from mphdrr.core.errors import InputError, InputWarning
-from mphdrr.core.system import PinholeSystem
+from mphdrr.core.geometry.system import PinholeSystem
 
 
 @pytest.fixture

@@ -8,7 +8,7 @@ import pytest
 bpy = pytest.importorskip("bpy")
 
 from mphdrr.addon import scanner, volumes  # noqa: E402
-from mphdrr.core.export import read_run  # noqa: E402
+from mphdrr.core.runs.files import read_run  # noqa: E402
 
 
 @pytest.fixture

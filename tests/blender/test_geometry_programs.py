@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from mphdrr.addon import scanner
-from mphdrr.core.geometry_export import FORMATS, read_geometry
+from mphdrr.core.exchange import FORMATS, read_geometry
 
 ONE_RING_ONLY = ("pytomography", "stir")
 

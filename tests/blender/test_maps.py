@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from mphdrr.addon import ids, scanner, volumes
-from mphdrr.core.maps import sensitivity_map
-from mphdrr.core.performance import sensitivity
+from mphdrr.core.physics.maps import sensitivity_map
+from mphdrr.core.physics.performance import sensitivity
 
 
 @pytest.fixture

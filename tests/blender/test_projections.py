@@ -14,12 +14,12 @@ bpy = pytest.importorskip("bpy")
 from mphdrr.addon import ids, images, jobs, scanner, storage, volumes  # noqa: E402
 from mphdrr.core import memory  # noqa: E402
 from mphdrr.core.errors import InputError  # noqa: E402
-from mphdrr.core.grid import Grid  # noqa: E402
-from mphdrr.core.mosaic import as_seen  # noqa: E402
+from mphdrr.core.geometry.grid import Grid  # noqa: E402
+from mphdrr.core.geometry.system import PinholeSystem  # noqa: E402
 from mphdrr.core.progress import Cancelled  # noqa: E402
 from mphdrr.core.projector import Emission, Projector  # noqa: E402
-from mphdrr.core.system import PinholeSystem  # noqa: E402
-from mphdrr.core.volume import Volume  # noqa: E402
+from mphdrr.core.runs.mosaic import as_seen  # noqa: E402
+from mphdrr.core.volumes.volume import Volume  # noqa: E402
 
 
 @pytest.fixture
@@ -48,7 +48,7 @@ def test_images_hold_exactly_what_core_projects(scanned, scene, detector):
 
 
 def test_emission_makes_counts(scanned, scene):
-    from mphdrr.core.export import read_run
+    from mphdrr.core.runs.files import read_run
 
     assert bpy.ops.mphdrr.render_projections(width=24, height=20, model="EMISSION", time=60) == {"FINISHED"}
     run = read_run(storage.absolute(getattr(scene, ids.SCENE_PROJECTIONS).run_file))
@@ -80,8 +80,8 @@ IN_PYTHON = PHYSICS | {"edge": "path", "opening_angle": 1.4}
 
 def test_physics_of_the_panel_is_that_of_core(scanned, scene, body):
     """Images equal core's, and the run records every setting, the volume of mu and the seed."""
-    from mphdrr.core.export import read_run
-    from mphdrr.core.noise import sample_counts
+    from mphdrr.core.physics.noise import sample_counts
+    from mphdrr.core.runs.files import read_run
 
     settings = scene.mphdrr_projections
     settings.model, settings.noise, settings.seed, settings.mu = "EMISSION", True, 5, bpy.data.objects["Body"]
@@ -104,7 +104,7 @@ def test_physics_of_the_panel_is_that_of_core(scanned, scene, body):
 
 def test_materials_of_the_panel_are_those_of_core(scanned, scene):
     """Chosen materials attenuate the isotope's photons; a coefficient that a script gives is not overruled by them."""
-    from mphdrr.core.export import read_run
+    from mphdrr.core.runs.files import read_run
 
     settings = scene.mphdrr_projections
     settings.model, settings.isotope = "EMISSION", "Tl-201"
@@ -119,8 +119,8 @@ def test_materials_of_the_panel_are_those_of_core(scanned, scene):
 
 
 def test_photons_of_a_radiograph_and_the_inverse_square_sum(scanned, scene, body):
-    from mphdrr.core.export import read_run
     from mphdrr.core.projector import InverseSquareSum, intensity
+    from mphdrr.core.runs.files import read_run
 
     views = scanned.views((20, 24))
     bpy.ops.mphdrr.render_projections(width=24, height=20, photons=1000)  # the only volume of mu
@@ -201,7 +201,7 @@ def test_rendering_again_replaces_the_images(scanned):
 
 
 def test_images_and_arrays_survive_save_and_reopen(scanned, scene, tmp_path):
-    from mphdrr.core.export import read_run
+    from mphdrr.core.runs.files import read_run
 
     bpy.ops.mphdrr.render_projections(width=24, height=20)
     name = ids.projection_name(scanned.numbers[0], 8)
@@ -371,8 +371,8 @@ HOW = r"hu_to_mu\(volume, energy\), .*CT to Attenuation in Blender's Phantom pan
 @pytest.mark.parametrize("chosen", ["named", "panel", "active"])
 @pytest.mark.parametrize("settings", [{}, {"photons": 1000.0}, {"model": "INVERSE_SQUARE"}])
 def test_a_ct_is_no_radiograph_until_it_is_converted(scene, scanned, ct, chosen, settings):
-    from mphdrr.core.export import read_run
-    from mphdrr.core.hounsfield import hu_to_mu
+    from mphdrr.core.physics.ct_numbers import hu_to_mu
+    from mphdrr.core.runs.files import read_run
 
     given = {**settings, **({"volume": "CT"} if chosen == "named" else {})}
     scene.mphdrr_projections.volume = ct if chosen == "panel" else None
@@ -400,7 +400,7 @@ def test_a_moved_ct_is_converted_where_it_is_and_in_every_state(scene, scanned):
     bpy.ops.mphdrr.ct_to_attenuation()
     made = bpy.context.object
     assert made.data.is_sequence and made.data.frame_start == 4
-    from mphdrr.core.hounsfield import hu_to_mu
+    from mphdrr.core.physics.ct_numbers import hu_to_mu
 
     for k in range(3):
         scene.frame_set(4 + k)

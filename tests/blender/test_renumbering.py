@@ -8,7 +8,7 @@ import pytest
 
 import mphdrr.core as mph
 from mphdrr.addon import copies, scanner
-from mphdrr.core.system import PinholeSystem
+from mphdrr.core.geometry.system import PinholeSystem
 
 
 def names(collection) -> list[tuple[str, str]]:

@@ -13,7 +13,7 @@ import pytest
 
 from mphdrr.addon import cameras, ids, registration, scanner
 from mphdrr.core.errors import InputError, InputWarning
-from mphdrr.core.system import PinholeSystem
+from mphdrr.core.geometry.system import PinholeSystem
 
 LENGTHS = ("pinhole_diameter", "collimator_length", "detector_side", "detector_thickness", "roi_radius")
 

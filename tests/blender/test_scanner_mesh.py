@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 
 from mphdrr.addon import scanner
-from mphdrr.core.collimator import Collimator, Construction
-from mphdrr.core.collimator_mesh import check_watertight, collimator_solid, crystal_solid, signed_volume
 from mphdrr.core.errors import InputError
+from mphdrr.core.geometry.collimator import Collimator, Construction
+from mphdrr.core.geometry.collimator_mesh import check_watertight, collimator_solid, crystal_solid, signed_volume
 
 trimesh = pytest.importorskip("trimesh")
 

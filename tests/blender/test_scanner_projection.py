@@ -9,8 +9,8 @@ from bpy_extras.object_utils import world_to_camera_view
 from mathutils import Vector
 
 from mphdrr.addon import cameras, scanner
-from mphdrr.core.system import PinholeSystem
-from mphdrr.core.views import Views
+from mphdrr.core.geometry.system import PinholeSystem
+from mphdrr.core.geometry.views import Views
 
 
 def project(views: Views, points: np.ndarray) -> np.ndarray:

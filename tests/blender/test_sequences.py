@@ -10,12 +10,12 @@ import pytest
 bpy = pytest.importorskip("bpy")
 
 from mphdrr.addon import scanner, storage, volumes  # noqa: E402
-from mphdrr.core.export import read_run  # noqa: E402
-from mphdrr.core.grid import Grid  # noqa: E402
+from mphdrr.core.geometry.grid import Grid  # noqa: E402
 from mphdrr.core.phantoms.torso import CardiacTorso  # noqa: E402
 from mphdrr.core.projector import Projector  # noqa: E402
-from mphdrr.core.volume import Volume  # noqa: E402
-from mphdrr.core.volume_io import write_volume  # noqa: E402
+from mphdrr.core.runs.files import read_run  # noqa: E402
+from mphdrr.core.volumes.volume import Volume  # noqa: E402
+from mphdrr.core.volumes.volume_files import write_volume  # noqa: E402
 
 
 def state(k: int, count: int, voxels: int, quantity: str = "activity", **settings) -> Volume:

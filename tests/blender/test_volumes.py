@@ -14,10 +14,10 @@ from mathutils import Matrix  # noqa: E402
 
 from mphdrr.addon import compat, volume_materials, volumes  # noqa: E402
 from mphdrr.core.errors import InputError  # noqa: E402
-from mphdrr.core.frames import euler_pose  # noqa: E402
-from mphdrr.core.grid import Grid  # noqa: E402
+from mphdrr.core.geometry.frames import euler_pose  # noqa: E402
+from mphdrr.core.geometry.grid import Grid  # noqa: E402
 from mphdrr.core.phantoms.derenzo import DerenzoPhantom  # noqa: E402
-from mphdrr.core.volume import Volume  # noqa: E402
+from mphdrr.core.volumes.volume import Volume  # noqa: E402
 
 SHEAR = np.array([[1.0, 0.3, 0.0, 0.0], [0.0, 1.0, -0.2, 0.0], [0.0, 0.0, 1.0, 0.0], [0.0, 0.0, 0.0, 1.0]])
 AFFINES = {

@@ -9,11 +9,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from mphdrr.core.frames import euler_pose
-from mphdrr.core.grid import Grid
+from mphdrr.core.geometry.frames import euler_pose
+from mphdrr.core.geometry.grid import Grid
+from mphdrr.core.geometry.system import PinholeSystem
 from mphdrr.core.projector import Emission
-from mphdrr.core.system import PinholeSystem
-from mphdrr.core.volume import Volume
+from mphdrr.core.volumes.volume import Volume
 
 WORKBOOK = Path(__file__).parents[2] / "examples" / "dc-spect-80.xlsx"
 

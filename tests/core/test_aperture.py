@@ -10,7 +10,7 @@ import pytest
 
 import mphdrr.core as mph
 from mphdrr.core.errors import InputError
-from mphdrr.core.projector.aperture import KnifeEdge, openings
+from mphdrr.core.physics.aperture import KnifeEdge, openings
 
 from .conftest import emission, general_grid
 from .test_emission import BACKENDS, assert_adjoint, one_module, spot_image, turned_grid

@@ -14,11 +14,11 @@ import numpy as np
 import pytest
 
 import mphdrr.core as mph
-from mphdrr.core.collimator import Collimator, Construction
-from mphdrr.core.geometry_checks.plates import needed_angle
-from mphdrr.core.geometry_export import write_geometry
-from mphdrr.core.module_parts import module_parts
-from mphdrr.core.projector.aperture import KnifeEdge
+from mphdrr.core.exchange import write_geometry
+from mphdrr.core.geometry.checks.plates import needed_angle
+from mphdrr.core.geometry.collimator import Collimator, Construction
+from mphdrr.core.geometry.module_parts import module_parts
+from mphdrr.core.physics.aperture import KnifeEdge
 
 from .test_monte_carlo import Macros
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import mphdrr.core as mph
-from mphdrr.core.projector.crystal import absorbed_share, layer_depths
+from mphdrr.core.physics.crystal import absorbed_share, layer_depths
 
 from .conftest import emission
 from .test_emission import one_module, spot_image, turned_grid

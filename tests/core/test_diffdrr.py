@@ -14,15 +14,24 @@ import pytest
 torch = pytest.importorskip("torch", reason="torch is not installed")
 pytest.importorskip("roma", reason="roma is not installed")
 
-from mphdrr.core import trilinear  # noqa: E402
-from mphdrr.core.diffdrr import DRR, Registration, RigidTransform, Subject, convert, drr_arguments, hu_to_density, read  # noqa: E402
 from mphdrr.core.errors import InputError  # noqa: E402
-from mphdrr.core.grid import Grid  # noqa: E402
-from mphdrr.core.presets import c_arm_views  # noqa: E402
+from mphdrr.core.exchange import trilinear  # noqa: E402
+from mphdrr.core.exchange.diffdrr import (  # noqa: E402
+    DRR,
+    Registration,
+    RigidTransform,
+    Subject,
+    convert,
+    drr_arguments,
+    hu_to_density,
+    read,
+)
+from mphdrr.core.geometry.grid import Grid  # noqa: E402
+from mphdrr.core.geometry.presets import c_arm_views  # noqa: E402
+from mphdrr.core.geometry.rotations import rotation_parameters, se3_exp  # noqa: E402
+from mphdrr.core.geometry.views import Views  # noqa: E402
 from mphdrr.core.projector import Projector, trace_rays  # noqa: E402
-from mphdrr.core.rotations import rotation_parameters, se3_exp  # noqa: E402
-from mphdrr.core.views import Views  # noqa: E402
-from mphdrr.core.volume import Volume  # noqa: E402
+from mphdrr.core.volumes.volume import Volume  # noqa: E402
 
 from .conftest import general_grid  # noqa: E402
 

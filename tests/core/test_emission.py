@@ -325,7 +325,7 @@ def test_aperture_blur_is_as_wide_as_the_holes_shadow(n):
 
 
 def test_disk_points_have_the_moments_of_the_disk():
-    from mphdrr.core.projector.aperture import disk_points
+    from mphdrr.core.physics.aperture import disk_points
 
     assert not disk_points(1).any()
     for n in (3, 4, 7, 19, 50, 200):

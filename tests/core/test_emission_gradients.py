@@ -9,9 +9,9 @@ torch = pytest.importorskip("torch", reason="torch is not installed")
 
 import mphdrr.core as mph  # noqa: E402
 from mphdrr.core.errors import InputError  # noqa: E402
-from mphdrr.core.projector.crystal import gaussian_blur  # noqa: E402
+from mphdrr.core.geometry.rotations import se3_exp  # noqa: E402
+from mphdrr.core.physics.crystal import gaussian_blur  # noqa: E402
 from mphdrr.core.projector.poses import emission_images  # noqa: E402
-from mphdrr.core.rotations import se3_exp  # noqa: E402
 
 from .conftest import BACKENDS, emission, general_grid  # noqa: E402
 

@@ -9,8 +9,8 @@ import pytest
 
 import mphdrr.core as mph
 from mphdrr.core.files import replacing
-from mphdrr.core.mosaic import write_png
-from mphdrr.core.run import ProjectionRun
+from mphdrr.core.runs.mosaic import write_png
+from mphdrr.core.runs.run import ProjectionRun
 
 from .conftest import general_grid
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import mphdrr.core as mph
-from mphdrr.core.frames import module_frames, module_poses
+from mphdrr.core.geometry.frames import module_frames, module_poses
 
 
 def test_frames_are_right_handed_and_aim_at_the_isocentre(rng):

@@ -10,13 +10,13 @@ import pytest
 
 import mphdrr.core as mph
 from mphdrr.core.cli import main
-from mphdrr.core.collimator import Collimator, Construction
-from mphdrr.core.geometry_checks.blocking import cone_directions, meets
-from mphdrr.core.geometry_checks.coverage import unseen_share
-from mphdrr.core.geometry_checks.hulls import Hulls
-from mphdrr.core.geometry_checks.meshes import find_open_meshes
-from mphdrr.core.geometry_checks.overlaps import penetration_depths
-from mphdrr.core.module_parts import module_parts
+from mphdrr.core.geometry.checks.blocking import cone_directions, meets
+from mphdrr.core.geometry.checks.coverage import unseen_share
+from mphdrr.core.geometry.checks.hulls import Hulls
+from mphdrr.core.geometry.checks.meshes import find_open_meshes
+from mphdrr.core.geometry.checks.overlaps import penetration_depths
+from mphdrr.core.geometry.collimator import Collimator, Construction
+from mphdrr.core.geometry.module_parts import module_parts
 
 
 def system_of(centers, d=2.0, length=60.0, side=50.0, thickness=10.0, radius=40.0, **more) -> mph.PinholeSystem:

@@ -11,8 +11,8 @@ import pytest
 
 import mphdrr.core as mph
 from mphdrr.core.cli import main
-from mphdrr.core.frames import euler_pose
-from mphdrr.core.geometry_export import FORMATS
+from mphdrr.core.exchange import FORMATS
+from mphdrr.core.geometry.frames import euler_pose
 
 
 def arrays(path):

@@ -8,11 +8,11 @@ import pytest
 torch = pytest.importorskip("torch", reason="torch is not installed")
 
 from mphdrr.core.errors import InputError  # noqa: E402
-from mphdrr.core.grid import Grid  # noqa: E402
+from mphdrr.core.geometry.grid import Grid  # noqa: E402
+from mphdrr.core.geometry.views import Views  # noqa: E402
 from mphdrr.core.projector import Projector, operator, trace_rays  # noqa: E402
 from mphdrr.core.projector.tracing import trace_fans  # noqa: E402
-from mphdrr.core.views import Views  # noqa: E402
-from mphdrr.core.volume import Volume  # noqa: E402
+from mphdrr.core.volumes.volume import Volume  # noqa: E402
 
 from .conftest import BACKENDS, general_grid  # noqa: E402
 

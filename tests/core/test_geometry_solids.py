@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 import mphdrr.core as mph
-from mphdrr.core.collimator import Construction
-from mphdrr.core.geometry_export import write_geometry
-from mphdrr.core.module_parts import module_parts
+from mphdrr.core.exchange import write_geometry
+from mphdrr.core.geometry.collimator import Construction
+from mphdrr.core.geometry.module_parts import module_parts
 
 trimesh = pytest.importorskip("trimesh")
 

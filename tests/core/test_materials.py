@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 import mphdrr.core as mph
-from mphdrr.core.isotopes import CZT_MU, LEAD_MU, NAI_MU, TUNGSTEN_MU, WATER_MU
-from mphdrr.core.mass_attenuation import ELEMENTS
-from mphdrr.core.materials import APERTURES, CRYSTALS
 from mphdrr.core.phantoms.materials import LUNG_MU, PMMA_MU, SOFT_TISSUE_MU, VERTEBRA_MU
+from mphdrr.core.physics.isotopes import CZT_MU, LEAD_MU, NAI_MU, TUNGSTEN_MU, WATER_MU
+from mphdrr.core.physics.mass_attenuation import ELEMENTS
+from mphdrr.core.physics.materials import APERTURES, CRYSTALS
 
 TC, TL = 140.5, 70.8
 

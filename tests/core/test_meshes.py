@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import mphdrr.core as mph
-from mphdrr.core.meshes.mesh import MESH_FORMATS
+from mphdrr.core.volumes.meshes.mesh import MESH_FORMATS
 
 from .conftest import general_grid
 

@@ -18,8 +18,8 @@ import numpy as np
 import pytest
 
 from mphdrr.core import ISOTOPES, DerenzoPhantom, InputError, PinholeSystem, euler_pose, read_system
-from mphdrr.core.geometry_export import FORMATS, write_geometry
-from mphdrr.core.geometry_export.gate9 import MOST_LINES, angle_and_axis
+from mphdrr.core.exchange import FORMATS, write_geometry
+from mphdrr.core.exchange.gate9 import MOST_LINES, angle_and_axis
 
 SHAPE = (40, 60)
 POSE = euler_pose(0.4, 0.9, -0.3, (3.0, -5.0, 8.0))

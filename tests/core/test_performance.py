@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import mphdrr.core as mph
-from mphdrr.core.frames import module_poses
+from mphdrr.core.geometry.frames import module_poses
 
 EDGE = {"aperture_mu": 3.4, "opening_angle": 1.2}
 

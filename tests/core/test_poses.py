@@ -10,7 +10,7 @@ torch = pytest.importorskip("torch", reason="torch is not installed")
 from mphdrr.core.errors import InputError  # noqa: E402
 from mphdrr.core.projector import Projector  # noqa: E402
 from mphdrr.core.projector.poses import pinhole_images, pinhole_rays  # noqa: E402
-from mphdrr.core.volume import Volume  # noqa: E402
+from mphdrr.core.volumes.volume import Volume  # noqa: E402
 
 from .conftest import BACKENDS, general_grid  # noqa: E402
 

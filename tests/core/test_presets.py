@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from mphdrr.core.errors import InputError
-from mphdrr.core.presets import c_arm_views, pinhole_views
+from mphdrr.core.geometry.presets import c_arm_views, pinhole_views
 
 
 def test_pinhole_views_start_at_the_pinholes(system):

@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from mphdrr.core.grid import Grid
+from mphdrr.core.geometry.grid import Grid
+from mphdrr.core.geometry.views import Views
 from mphdrr.core.projector import Projector, trace_rays
-from mphdrr.core.views import Views
-from mphdrr.core.volume import Volume
+from mphdrr.core.volumes.volume import Volume
 
 from .conftest import BACKENDS
 

@@ -14,11 +14,12 @@ import pytest
 import mphdrr.core as mph
 import mphdrr.core.memory
 from mphdrr.core.errors import InputError, InputWarning
-from mphdrr.core.grid import Grid
+from mphdrr.core.geometry.grid import Grid
+from mphdrr.core.geometry.views import Views
 from mphdrr.core.progress import Cancelled
-from mphdrr.core.projector import Projector, Transmission, backends, siddon_cpu, trace_rays
-from mphdrr.core.views import Views
-from mphdrr.core.volume import Volume
+from mphdrr.core.projector import Projector, Transmission, backends, trace_rays
+from mphdrr.core.projector.backends import siddon_cpu
+from mphdrr.core.volumes.volume import Volume
 
 from .conftest import WORKBOOK, emission
 
@@ -117,7 +118,7 @@ def without(monkeypatch, *missing):
     def load(name):
         if name in missing:
             raise ImportError(f"no kernels and no {name}")
-        return importlib.import_module(f"mphdrr.core.projector.siddon_{name}")
+        return importlib.import_module(f"mphdrr.core.projector.backends.siddon_{name}")
 
     monkeypatch.setattr(backends, "load", load)
     backends._warn_slower.cache_clear()
@@ -212,9 +213,9 @@ def test_import_does_not_load_torch():
 
 FORK = """
 import multiprocessing, numpy as np
-from mphdrr.core.grid import Grid
+from mphdrr.core.geometry.grid import Grid
 from mphdrr.core.projector import Projector
-from mphdrr.core.views import Views
+from mphdrr.core.geometry.views import Views
 grid = Grid.centered(8, 1.0)
 A = Projector(grid, Views([[0, 0, -50]], [[0, 0, 50]], [[0.2, 0, 0]], [[0, 0.2, 0]], (60, 60)), threads=2)
 def total(_): return float(A(np.ones(grid.shape)).sum())

@@ -13,13 +13,14 @@ pytest.importorskip("warp", reason="warp-lang is not installed")
 import warp
 
 from mphdrr.core.errors import InputError
-from mphdrr.core.grid import Grid
-from mphdrr.core.projector import Projector, backends, operator, siddon_cuda, siddon_numpy
+from mphdrr.core.geometry.grid import Grid
+from mphdrr.core.geometry.views import Views
+from mphdrr.core.projector import Projector, backends, operator
 from mphdrr.core.projector import trace_rays as trace
+from mphdrr.core.projector.backends import siddon_cuda, siddon_numpy
 from mphdrr.core.projector.models import view_rays
 from mphdrr.core.projector.rays import Attenuation, IndexFans, IndexRays, RayMapper
-from mphdrr.core.views import Views
-from mphdrr.core.volume import Volume
+from mphdrr.core.volumes.volume import Volume
 
 from .conftest import emission, general_grid
 from .test_projector import LINEAR, SHAPES, affine, nasty_rays, random_rays, some_views
@@ -313,7 +314,7 @@ def test_short_memory_means_more_launches(monkeypatch, rng):
 
 @pytest.mark.skipif(sys.platform == "darwin", reason="Warp has no CUDA on macOS")
 def test_kernels_compile_for_gpus_without_one(tmp_path):
-    from mphdrr.core.projector import warp_kernels
+    from mphdrr.core.projector.backends import warp_kernels
 
     siddon_cuda.device()
     (compiled,) = warp.compile_aot_module(warp_kernels, arch=75, module_dir=tmp_path, use_ptx=True)

@@ -8,10 +8,10 @@ import pytest
 torch = pytest.importorskip("torch", reason="torch is not installed")
 
 from mphdrr.core.errors import InputError  # noqa: E402
-from mphdrr.core.grid import Grid  # noqa: E402
+from mphdrr.core.geometry.grid import Grid  # noqa: E402
+from mphdrr.core.geometry.views import Views  # noqa: E402
 from mphdrr.core.projector import Projector  # noqa: E402
-from mphdrr.core.views import Views  # noqa: E402
-from mphdrr.core.volume import Volume  # noqa: E402
+from mphdrr.core.volumes.volume import Volume  # noqa: E402
 
 from .conftest import BACKENDS  # noqa: E402
 

@@ -10,11 +10,11 @@ import pytest
 import mphdrr.core as mph
 from mphdrr.core.cli import main
 from mphdrr.core.errors import InputError
-from mphdrr.core.hounsfield import diffdrr_density
-from mphdrr.core.project import project_run
+from mphdrr.core.physics.ct_numbers import diffdrr_density
 from mphdrr.core.projector.tracing import trace_fans
-from mphdrr.core.volume import UNITS
-from mphdrr.core.volume_io import write_volume
+from mphdrr.core.runs.projecting import project_run
+from mphdrr.core.volumes.volume import UNITS
+from mphdrr.core.volumes.volume_files import write_volume
 
 GRID = mph.Grid.centered(6, 12.0)
 LINES = {"activity", "mu"}
@@ -49,7 +49,7 @@ def _poses(name, **settings):
 def _diffdrr(name, *arguments):
     def use(volume):
         pytest.importorskip("torch")
-        from mphdrr.core import diffdrr
+        from mphdrr.core.exchange import diffdrr
 
         return getattr(diffdrr, name)(volume, *arguments)
 

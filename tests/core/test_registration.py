@@ -13,11 +13,11 @@ torch = pytest.importorskip("torch", reason="torch is not installed")
 pytest.importorskip("roma", reason="roma is not installed")
 
 from mphdrr.core.errors import InputError  # noqa: E402
-from mphdrr.core.grid import Grid  # noqa: E402
+from mphdrr.core.geometry.grid import Grid  # noqa: E402
+from mphdrr.core.geometry.rotations import pose_matrix, se3_exp  # noqa: E402
+from mphdrr.core.projector.pose_search import local_ncc, multiscale_ncc, ncc, pose_error, register_pose  # noqa: E402
 from mphdrr.core.projector.poses import pinhole_images  # noqa: E402
-from mphdrr.core.registration import local_ncc, multiscale_ncc, ncc, pose_error, register_pose  # noqa: E402
-from mphdrr.core.rotations import pose_matrix, se3_exp  # noqa: E402
-from mphdrr.core.volume import Volume  # noqa: E402
+from mphdrr.core.volumes.volume import Volume  # noqa: E402
 
 ROOT = Path(__file__).resolve().parents[2]
 CHEST = ROOT.parent / "shared/data/chest_ct_3mm.nii.gz"

@@ -11,8 +11,8 @@ torch = pytest.importorskip("torch", reason="torch is not installed")
 pytest.importorskip("roma", reason="roma is not installed")
 transform = pytest.importorskip("scipy.spatial.transform", reason="scipy is not installed")
 
-from mphdrr.core import rotations  # noqa: E402
 from mphdrr.core.errors import InputError  # noqa: E402
+from mphdrr.core.geometry import rotations  # noqa: E402
 
 CONVENTIONS = [
     "".join(c) for axes in ("XYZ", "xyz") for c in itertools.product(axes, repeat=3) if c[1] not in (c[0], c[2])

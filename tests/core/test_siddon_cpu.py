@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 
 from mphdrr.core.errors import InputError
-from mphdrr.core.grid import Grid
-from mphdrr.core.projector import siddon_cpu, siddon_numpy
+from mphdrr.core.geometry.grid import Grid
+from mphdrr.core.projector.backends import siddon_cpu, siddon_numpy
 from mphdrr.core.projector.models import view_rays
 from mphdrr.core.projector.rays import RayMapper
 

@@ -9,7 +9,7 @@ import pytest
 
 import mphdrr.core as mph
 from mphdrr.core.cli import main
-from mphdrr.core.materials import attenuation
+from mphdrr.core.physics.materials import attenuation
 
 from .dicom_files import write_series, write_tomogram
 from .test_meshes import box

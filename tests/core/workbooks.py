@@ -13,7 +13,7 @@ from openpyxl.workbook import Workbook
 from openpyxl.workbook.defined_name import DefinedName
 
 from mphdrr.core import PinholeSystem, collimator_length
-from mphdrr.core.workbook.checks import derived
+from mphdrr.core.workbook.plausibility import derived
 
 DIMENSIONS = {"d": "pinhole_diameter", "R": "roi_radius", "Ld": "detector_side", "Td": "detector_thickness"}
 

@@ -4,7 +4,7 @@
 // list's columns, values. Its results are what forward, backproject into an empty volume, differentiate and, with mu,
 // differentiate_by_mu give, in this order. test_kernels.py writes and reads the files.
 
-#include "../../core/projector/kernels/kernels.h"
+#include "../../core/projector/backends/kernels/kernels.h"
 #include <stdio.h>
 #include <stdlib.h>
 #include <string.h>

@@ -17,9 +17,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from mphdrr.core.projector import siddon_numpy
+from mphdrr.core.projector.backends import siddon_numpy
+from mphdrr.core.projector.backends.siddon_cpu import _fans
 from mphdrr.core.projector.rays import Attenuation, IndexFans, IndexRays
-from mphdrr.core.projector.siddon_cpu import _fans
 
 ROOT = Path(__file__).resolve().parents[2]
 sys.path.insert(0, str(ROOT / "tools"))

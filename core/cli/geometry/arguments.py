@@ -7,9 +7,9 @@ import math
 from typing import Any
 
 from ...errors import InputError
-from ...isotopes import ISOTOPES, isotope
-from ...materials import APERTURES, CRYSTALS, module_coefficients
-from ...system import PinholeSystem
+from ...geometry.system import PinholeSystem
+from ...physics.isotopes import ISOTOPES, isotope
+from ...physics.materials import APERTURES, CRYSTALS, module_coefficients
 from ..options import number_or_name
 
 MATERIAL_OPTIONS = ("aperture_mu", "opening_angle", "crystal_mu", "intrinsic_fwhm", "isotope")

@@ -9,12 +9,12 @@ from typing import get_args
 
 import numpy as np
 
-from ...collimator import EdgePlace
 from ...errors import InputError
-from ...geometry_checks import check_geometry
-from ...isotopes import ISOTOPES
+from ...geometry.checks import check_geometry
+from ...geometry.collimator import EdgePlace
+from ...geometry.system import PinholeSystem
+from ...physics.isotopes import ISOTOPES
 from ...recording import recorded_warnings
-from ...system import PinholeSystem
 from ..options import add_command, add_workbook, read_workbook, refuse
 from .arguments import add_edge, add_json, edge_settings
 

@@ -10,9 +10,9 @@ from types import UnionType
 from typing import Any
 
 from ...errors import InputError
-from ...geometry_export import FORMATS, Format, write_geometry
-from ...grid import Grid
-from ...volume_io import read_volume
+from ...exchange import FORMATS, Format, write_geometry
+from ...geometry.grid import Grid
+from ...volumes.volume_files import read_volume
 from ..options import add_command, add_view_options, add_workbook, chosen_modules, output_path, read_workbook
 
 

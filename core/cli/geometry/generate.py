@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 
 from ...errors import InputError
-from ...generators import ellipse_rings, plate_rings, regular_polygon
-from ...system import PinholeSystem
+from ...geometry.generators import ellipse_rings, plate_rings, regular_polygon
+from ...geometry.system import PinholeSystem
 from ...workbook import write_system
 from ..options import add_command, output_path
 

@@ -7,12 +7,12 @@ import json
 
 import numpy as np
 
-from ...checks import whole_shape
-from ...grid import Grid
-from ...maps import MAPS
-from ...system import PinholeSystem
-from ...volume import Volume
-from ...volume_io import VOLUME_FORMATS, write_volume
+from ...geometry.grid import Grid
+from ...geometry.system import PinholeSystem
+from ...physics.maps import MAPS
+from ...validation import whole_shape
+from ...volumes.volume import Volume
+from ...volumes.volume_files import VOLUME_FORMATS, write_volume
 from ..options import (
     add_command,
     add_workbook,

@@ -8,9 +8,9 @@ import math
 
 import numpy as np
 
-from ...design import roi_radius_seen
-from ...performance import magnification, resolution, sensitivity
-from ...sampling import sampling_gaps
+from ...geometry.design_formulas import roi_radius_seen
+from ...physics.performance import magnification, resolution, sensitivity
+from ...physics.sampling import sampling_gaps
 from ..options import add_command, add_workbook, read_workbook
 from .arguments import add_json, add_materials, resolution_settings, sensitivity_settings
 

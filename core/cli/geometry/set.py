@@ -10,12 +10,12 @@ import sys
 import numpy as np
 from numpy.typing import NDArray
 
-from ...design import collimator_length
 from ...errors import InputError
+from ...geometry.design_formulas import collimator_length
+from ...geometry.system import PinholeSystem
 from ...recording import recorded_warnings
-from ...system import PinholeSystem
 from ...workbook import WrittenWorkbook, write_system
-from ...workbook.checks import is_by_design
+from ...workbook.plausibility import is_by_design
 from ..options import add_command, add_workbook, chosen_modules, output_path, read_workbook
 from .arguments import add_json
 

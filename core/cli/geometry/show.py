@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from ...errors import InputError
-from ...system import PinholeSystem
+from ...geometry.system import PinholeSystem
 from ...workbook import draft_column_map
 from ..options import add_command, add_workbook, chosen_modules, output_path, read_workbook
 from .arguments import add_json

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import argparse
 
-from ...volume import UNITS, Volume
-from ...volume_io import read_volume
+from ...volumes.volume import UNITS, Volume
+from ...volumes.volume_files import read_volume
 from ..options import progress_bar
 
 

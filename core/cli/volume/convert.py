@@ -7,12 +7,12 @@ import argparse
 import numpy as np
 
 from ...errors import InputError
-from ...grid import Grid
-from ...hounsfield import hu_to_mu
-from ...rearranging import canonical, centered, crop_to_box, pad
-from ...resampling import resample
-from ...volume import Volume
-from ...volume_io import VOLUME_FORMATS, write_volume
+from ...geometry.grid import Grid
+from ...physics.ct_numbers import hu_to_mu
+from ...volumes.rearranging import canonical, centered, crop_to_box, pad
+from ...volumes.resampling import resample
+from ...volumes.volume import Volume
+from ...volumes.volume_files import VOLUME_FORMATS, write_volume
 from ..options import add_command, output_path, photon_energy, progress_bar
 from .arguments import add_input, read_input
 

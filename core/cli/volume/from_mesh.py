@@ -6,13 +6,13 @@ import argparse
 
 import numpy as np
 
-from ...checks import real_array
 from ...errors import InputError
-from ...grid import Grid
-from ...meshes.mesh import MESH_FORMATS, MILLIMETRES, Mesh, read_mesh
-from ...meshes.voxelization import voxelize_mesh
-from ...volume import UNITS
-from ...volume_io import VOLUME_FORMATS, write_volume
+from ...geometry.grid import Grid
+from ...validation import real_array
+from ...volumes.meshes.mesh import MESH_FORMATS, MILLIMETRES, Mesh, read_mesh
+from ...volumes.meshes.voxelization import voxelize_mesh
+from ...volumes.volume import UNITS
+from ...volumes.volume_files import VOLUME_FORMATS, write_volume
 from ..options import add_command, output_path, progress_bar
 
 

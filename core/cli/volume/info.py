@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from ...volume import Volume
+from ...volumes.volume import Volume
 from ..options import add_command
 from .arguments import add_input, read_input
 

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import argparse
 
-from ...meshes.mesh import MESH_FORMATS, MILLIMETRES, write_mesh
-from ...meshes.surface import volume_to_mesh
+from ...volumes.meshes.mesh import MESH_FORMATS, MILLIMETRES, write_mesh
+from ...volumes.meshes.surface import volume_to_mesh
 from ..options import add_command, output_path, progress_bar
 from .arguments import add_input, read_input
 

@@ -1,0 +1,177 @@
+"""Numpy arrays and torch tensors: checked on the way in, of the caller's kind on the way out."""
+
+from __future__ import annotations
+
+import sys
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .errors import InputError
+from .validation import real_array, require_finite
+
+ArrayOrTensor = Any  # a numpy array or a torch tensor; torch may not be installed
+
+
+def is_tensor(value: object) -> bool:
+    """Whether `value` is a torch tensor (torch is not imported to find out)."""
+    torch = sys.modules.get("torch")
+    return torch is not None and isinstance(value, torch.Tensor)
+
+
+def namespace(value: ArrayOrTensor) -> Any:
+    """The library, torch or numpy, whose functions take `value`."""
+    return sys.modules["torch"] if is_tensor(value) else np
+
+
+def is_double(value: object) -> bool:
+    """Whether `value` is a torch tensor of float64."""
+    return is_tensor(value) and str(value.dtype) == "torch.float64"  # type: ignore[attr-defined]
+
+
+def checked(value: ArrayOrTensor, name: str, shape: tuple[int, ...], float64: bool) -> ArrayOrTensor:
+    """`value` as float32 or float64 numbers, still an array or still a tensor on its device; not copied without need.
+
+    A float64 tensor stays float64.
+
+    Raises
+    ------
+    InputError
+        Not real numbers, another shape, or a value that is not finite (its index is named).
+    """
+    if is_tensor(value):
+        return _checked_tensor(value, name, shape, float64)
+    dtype = np.float64 if float64 else np.float32
+    if isinstance(value, np.ndarray) and value.dtype == dtype and value.shape == shape and value.flags.c_contiguous:
+        require_finite(value, name)
+        return value
+    with np.errstate(over="ignore"):  # what overflows float32 is refused as not finite
+        return real_array(value, name, shape, dtype)
+
+
+def _checked_tensor(value: Any, name: str, shape: tuple[int, ...], float64: bool) -> Any:
+    import torch
+
+    require_numbers(value, name)
+    if tuple(value.shape) != shape:
+        raise InputError(f"{name}: expected shape {_times(shape)}, got {_times(value.shape)}")
+    if value.dtype != torch.float64:
+        value = value.to(torch.float64 if float64 else torch.float32)
+    if not bool(torch.isfinite(value.detach().sum())):
+        require_finite(value.detach().cpu().numpy(), name)
+    return value
+
+
+def require_numbers(tensor: Any, name: str) -> None:
+    """Raise `InputError` unless a tensor holds real numbers, all of them."""
+    if tensor.is_complex() or tensor.is_quantized or tensor.is_meta or str(tensor.layout) != "torch.strided":
+        kind = f"{tensor.dtype}, {tensor.layout}, on {tensor.device}"
+        raise InputError(f"{name}: expected a dense tensor of real numbers, got {kind}")
+
+
+def to_numpy(value: ArrayOrTensor, dtype: Any) -> np.ndarray[Any, Any]:
+    """As a C-ordered, aligned array (compiled kernels take no other)."""
+    if is_tensor(value):
+        value = value.numpy(force=True)
+    return np.require(value, dtype, ["C", "A"])
+
+
+def to_tensor(value: ArrayOrTensor) -> Any:
+    """As a contiguous tensor: a tensor on its own device, an array on torch's default device."""
+    import torch
+
+    if is_tensor(value):
+        return value.detach().contiguous()
+    if not value.flags.writeable:
+        value = value.copy()  # torch has no read-only tensors
+    return torch.from_numpy(np.ascontiguousarray(value)).to(torch.get_default_device())
+
+
+def like(result: ArrayOrTensor, given: ArrayOrTensor) -> ArrayOrTensor:
+    """`result` of the kind of `given`: a tensor on its device, or a numpy array."""
+    if is_tensor(given):
+        import torch
+
+        return torch.as_tensor(result, device=given.device)
+    return result.cpu().numpy() if is_tensor(result) else result
+
+
+def zeros(shape: tuple[int, ...], beside: ArrayOrTensor) -> ArrayOrTensor:
+    """Zeros of the kind, type and device of `beside`."""
+    if is_tensor(beside):
+        return beside.new_zeros(shape)
+    array = np.empty(
+        shape, beside.dtype
+    )  # which, unlike np.zeros, gets large pages of memory: half the time of an adjoint
+    array.fill(0)
+    return array
+
+
+def alike(values: ArrayOrTensor, beside: ArrayOrTensor) -> ArrayOrTensor:
+    """`values` of the kind, type and device of `beside`; not part of a graph."""
+    if not is_tensor(beside):
+        return to_numpy(values, beside.dtype) if is_tensor(values) else np.asarray(values, dtype=beside.dtype)
+    if is_tensor(values):
+        return values.detach().to(beside).contiguous()
+    import torch
+
+    return torch.tensor(values, dtype=beside.dtype, device=beside.device)
+
+
+def together(first: ArrayOrTensor, second: ArrayOrTensor) -> tuple[ArrayOrTensor, ArrayOrTensor]:
+    """Both as tensors of one type and device if either is a tensor, still part of their graphs; else as they are."""
+    if not (is_tensor(first) or is_tensor(second)):
+        return first, second
+    import torch
+
+    one, other = (x if is_tensor(x) else torch.tensor(x) for x in (first, second))
+    kind = torch.promote_types(one.dtype, other.dtype)
+    device = one.device if is_tensor(first) else other.device
+    return one.to(device, kind), other.to(device, kind)
+
+
+def cropped(*volumes: ArrayOrTensor) -> tuple[list[ArrayOrTensor], tuple[int, int, int]]:
+    """The smallest box of `volumes` (of one shape) that holds all that is not 0, and the index of its first voxel."""
+    find = _filled_ranges_of_tensors if is_tensor(volumes[0]) else _filled_ranges
+    ranges = find(volumes)
+    boxes = [volume[tuple(slice(first, last) for first, last in ranges)] for volume in volumes]
+    boxes = [box.contiguous() if is_tensor(box) else np.ascontiguousarray(box) for box in boxes]
+    return boxes, (ranges[0][0], ranges[1][0], ranges[2][0])
+
+
+def _filled_ranges(volumes: tuple[NDArray[Any], ...]) -> list[tuple[int, int]]:
+    """First and last + 1 index of what is not 0, along each axis. Takes a pass over the empty margins, not the volumes."""
+    ranges: list[tuple[int, int]] = []
+    for axis in (0, 1):
+        slabs = [np.moveaxis(volume, axis, 0) for volume in volumes]
+        indices = range(len(slabs[0]))
+        first = next((i for i in indices if any(slab[i].any() for slab in slabs)), None)
+        if first is None:
+            return [(0, 1)] * 3
+        last = next(i for i in reversed(indices) if any(slab[i].any() for slab in slabs))
+        ranges.append((first, last + 1))
+        volumes = tuple(np.moveaxis(slab[first : last + 1], 0, axis) for slab in slabs)
+    n = volumes[0].shape[2]
+    if not all(
+        any(volume[..., i].any() for volume in volumes) for i in (0, n - 1)
+    ):  # one line of voxels is far from the next
+        filled = np.flatnonzero(np.any([(volume != 0).any(axis=0).any(axis=0) for volume in volumes], axis=0))
+        return [*ranges, (int(filled[0]), int(filled[-1]) + 1)]
+    return [*ranges, (0, n)]
+
+
+def _filled_ranges_of_tensors(volumes: tuple[Any, ...]) -> list[tuple[int, int]]:
+    """The same, in few steps: each waits for the GPU."""
+    filled = [volume != 0 for volume in volumes]
+    # Whether a line along y, or along x, holds anything: fast, for along z neighbours in memory would be joined.
+    along_x, along_y = ([flags.any(axis) for flags in filled] for axis in (0, 1))
+    ranges: list[tuple[int, int]] = []
+    for lines, across in ((along_y, 1), (along_x, 1), (along_x, 0)):
+        where = np.concatenate([np.flatnonzero(flags.any(across).cpu().numpy()) for flags in lines])
+        ranges.append((int(where.min()), int(where.max()) + 1) if len(where) else (0, 1))
+    return ranges
+
+
+def _times(shape: tuple[int, ...]) -> str:
+    return " x ".join(map(str, shape)) or "one number"

@@ -1,0 +1,73 @@
+"""Aperture plates that are too thick for the angle of their hole's cone, or too thin for the photons.
+
+`Emission` treats a plate as infinitely thick: of the material that its knife edge cuts, a photon meets all. So it is right
+for plates that neither shade their hole from the ROI nor let photons through beside it, and this is where others are named.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+
+from ...physics.aperture import paix_diameter
+from ...validation import positive
+from ..collimator import Collimator
+from ..system import PinholeSystem
+from .report import ThinPlate, Vignetted
+
+FEWEST_OPEN = 0.99
+"""Share of a hole that must be open to every ray from its ROI."""
+MOST_THROUGH = 0.01
+"""Photons that may pass a plate beside its hole, as a share of those that pass the hole."""
+
+
+def find_vignetted(system: PinholeSystem, collimators: Sequence[Collimator]) -> tuple[Vignetted, ...]:
+    """Modules whose plate leaves less than `FEWEST_OPEN` of the hole open to the steepest rays from their ROI."""
+    found = []
+    b, radius = system.pinhole_distance.tolist(), system.roi_radius.tolist()
+    for m, body in enumerate(collimators):
+        if radius[m] >= b[m]:  # the pinhole is in the ROI, and named as an intrusion
+            continue
+        needed = needed_angle(b[m], body.diameter, radius[m])
+        share = body.open_share(math.tan(needed / 2))
+        if share < FEWEST_OPEN:
+            built = body.construction
+            number = int(system.numbers[m])
+            found.append(Vignetted(number, share, built.plate_thickness, built.opening_angle, needed))
+    return tuple(found)
+
+
+def needed_angle(b: float, d: float, radius: float) -> float:
+    """The least opening angle, rad, at which a plate of any thickness leaves the whole hole open to the whole ROI.
+
+    Twice the angle to the axis of the steepest ray: tangent to the sphere, through the farther side of the hole's rim.
+
+    Parameters
+    ----------
+    b, d, radius
+        Pinhole centre to isocentre, hole's diameter and ROI's radius, mm; radius below b.
+    """
+    return 2 * (math.atan(d / (2 * b)) + math.asin(radius / math.hypot(b, d / 2)))
+
+
+def find_thin_plates(
+    system: PinholeSystem, collimators: Sequence[Collimator], aperture_mu: float
+) -> tuple[ThinPlate, ...]:
+    """Modules of which more than `MOST_THROUGH` pass the plate beside the hole, along the axis.
+
+    Beside the hole means: from where the plate has its full thickness to the rim of its front.
+    """
+    mu = positive(aperture_mu, "aperture_mu", "1/mm")
+    found = []
+    for number, body in zip(system.numbers.tolist(), collimators, strict=True):
+        built = body.construction
+        transmission = math.exp(-mu * built.plate_thickness)
+        widest = max(body.hole_radius(built.front), body.hole_radius(built.back))
+        beside = (2 * body.front_half_width) ** 2 - math.pi * widest**2
+        hole = math.pi / 4 * float(paix_diameter(np.array(body.diameter), mu, built.opening_angle)) ** 2
+        share = transmission * beside / hole
+        if share > MOST_THROUGH:
+            found.append(ThinPlate(number, built.plate_thickness, transmission, share))
+    return tuple(found)

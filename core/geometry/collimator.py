@@ -1,0 +1,197 @@
+"""A module's collimator: a plate with a knife-edged pinhole, and walls behind it. The one description of its shape.
+
+The mesh (`core.collimator_mesh`), the solids of files and of Monte Carlo programs, the geometry checks and the physics
+of the knife edge take their shapes from here. Depths are along the module's axis, mm from the pinhole's centre, positive
+towards the crystal. Looked at from the axis, front to back:
+
+- The hole is narrowest at depth 0, where its diameter is d, and opens as a double cone of full angle alpha through the
+  whole plate: its radius at depth s is ``d/2 + |s| tan(alpha/2)``.
+- The plate's faces are at `Construction.front` and `Construction.back`. The knife edge lies in the plate's middle, or on
+  the face towards the ROI (front) or towards the crystal (back).
+- Behind the plate is a channel, a square frustum that ends at the crystal's front face with the crystal's side. It is never
+  narrower than the pyramid that the crystal sees through the hole, of half-width ``d/2 + (Ld - d)/2 * s/l``.
+- The outside is a square frustum, everywhere at least a wall's thickness outside the hole and the channel.
+
+So a ray from the front that crosses depth 0 in the hole, no steeper than the cone, and meets the crystal's front face
+touches nothing; and what reaches that face in any other way goes through the plate or a wall.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Literal, get_args
+
+import numpy as np
+
+from ..errors import InputError
+from ..validation import positive
+
+EdgePlace = Literal["middle", "front", "back"]
+
+OPENING_ANGLE = math.pi / 2
+"""Full angle of the knife edge's double cone, rad, where none is given."""
+
+_SHOULDER = 0.01  # share of the room beside the hole by which the channel, where it begins, is wider than the hole
+
+
+def edge_slope(opening_angle: float) -> float:
+    """``tan(alpha / 2)``: by how much the radius of a knife-edged hole grows with the distance from its edge."""
+    return math.tan(opening_angle / 2)
+
+
+def angle_from_degrees(opening_degrees: float) -> float:
+    """The opening angle, rad, of an option in degrees.
+
+    Raises
+    ------
+    InputError
+        It is not between 0 and 180 degrees.
+    """
+    degrees = positive(opening_degrees, "opening_degrees", "degrees")
+    if degrees >= 180:
+        raise InputError(f"opening_degrees: expected less than 180, got {degrees:g}")
+    return math.radians(degrees)
+
+
+@dataclass(frozen=True)
+class Construction:
+    """How the collimators of a scanner are built.
+
+    Attributes
+    ----------
+    plate_thickness, wall_thickness : float
+        Of the aperture plates and of the collimators' walls, mm.
+    opening_angle : float
+        Full angle alpha of the hole's double cone, rad.
+    edge_at : "middle", "front" or "back"
+        Where in the plate the knife edge is: front is the face towards the ROI. The edge itself is always at the
+        pinhole's centre, so this moves the plate.
+
+    Raises
+    ------
+    InputError
+        A length is not above 0, the angle is not between 0 and pi, or the place is none of these.
+    """
+
+    plate_thickness: float = 2.0
+    wall_thickness: float = 2.0
+    opening_angle: float = OPENING_ANGLE
+    edge_at: EdgePlace = "middle"
+
+    def __post_init__(self) -> None:
+        for name, value, _unit in (
+            ("plate_thickness", positive(self.plate_thickness, "aperture plate", "mm"), "mm"),
+            ("wall_thickness", positive(self.wall_thickness, "collimator wall", "mm"), "mm"),
+            ("opening_angle", positive(self.opening_angle, "opening_angle", "rad"), "rad"),
+        ):
+            object.__setattr__(self, name, value)
+        if self.opening_angle >= math.pi:
+            raise InputError(f"opening_angle: expected less than pi, got {self.opening_angle:g} rad")
+        if self.edge_at not in get_args(EdgePlace):
+            raise InputError(f"edge_at {self.edge_at!r}: expected one of {', '.join(get_args(EdgePlace))}")
+
+    @property
+    def front(self) -> float:
+        """Depth of the plate's face towards the ROI, mm: 0 or less."""
+        return {"middle": -0.5, "front": 0.0, "back": -1.0}[self.edge_at] * self.plate_thickness
+
+    @property
+    def back(self) -> float:
+        """Depth of the plate's face towards the crystal, mm: 0 or more."""
+        return self.front + self.plate_thickness
+
+    @property
+    def slope(self) -> float:
+        """``tan(alpha / 2)``."""
+        return edge_slope(self.opening_angle)
+
+
+@dataclass(frozen=True)
+class Collimator:
+    """One module's collimator.
+
+    Attributes
+    ----------
+    diameter, length, detector_side : float
+        d of the hole, l from the pinhole's centre to the crystal's front face, and Ld of the crystal, mm.
+    construction : Construction
+        Plate, walls and knife edge.
+
+    Raises
+    ------
+    InputError
+        There is no such body.
+    """
+
+    diameter: float
+    length: float
+    detector_side: float
+    construction: Construction = Construction()
+
+    def __post_init__(self) -> None:
+        plate, angle = self.construction.plate_thickness, math.degrees(self.construction.opening_angle)
+        if not plate < self.length:
+            raise InputError(
+                f"aperture plate: expected less than the collimator's {self.length:g} mm, got {plate:g} mm"
+            )
+        if not 0 < self.diameter < self.detector_side:
+            raise InputError(
+                f"pinhole diameter: expected more than 0 and less than the crystal's {self.detector_side:g} mm, "
+                f"got {self.diameter:g} mm"
+            )
+        width = 2 * max(radius for _, radius in self.hole_profile)
+        if not width < self.detector_side:
+            raise InputError(
+                f"aperture plate: with {plate:g} mm and an opening angle of {angle:g} degrees its hole is {width:.4g} mm "
+                f"wide, expected less than the crystal's {self.detector_side:g} mm; choose a thinner plate or a smaller "
+                "angle"
+            )
+
+    def hole_radius(self, depth: float) -> float:
+        """Radius of the hole, mm, at a depth within the plate: ``d/2 + |s| tan(alpha/2)``."""
+        return self.diameter / 2 + abs(depth) * self.construction.slope
+
+    @property
+    def hole_profile(self) -> list[tuple[float, float]]:
+        """The corners (depth, radius), mm, of the hole's profile from the plate's front to its back: 2 or 3."""
+        faces = (self.construction.front, 0.0, self.construction.back)
+        return [(depth, self.hole_radius(depth)) for depth in dict.fromkeys(faces)]
+
+    @property
+    def channel_half_width(self) -> float:
+        """Half-width, mm, of the channel where it begins, at the plate's back; at the crystal it is Ld/2."""
+        back, d = self.construction.back, self.diameter
+        return max(d / 2 + (self.detector_side - d) / 2 * back / self.length, self._shoulder)
+
+    @property
+    def front_half_width(self) -> float:
+        """Half-width, mm, of the plate's front face; at the crystal the outside is Ld/2 + wall."""
+        return max(self.hole_radius(self.construction.front), self._shoulder) + self.construction.wall_thickness
+
+    @property
+    def _shoulder(self) -> float:
+        """Half-width, mm, of the narrowest square around the hole's rim at the plate's back that does not touch it."""
+        rim = self.hole_radius(self.construction.back)
+        return rim + _SHOULDER * (self.detector_side / 2 - rim)
+
+    def open_share(self, slope: float) -> float:
+        """Share of the hole's area that is open to parallel rays.
+
+        A ray passes if it is within the hole at the edge and at both faces of the plate: in between it then is, too, for
+        the hole is a cone. So the share is the area that three discs have in common, shifted along the rays.
+
+        Parameters
+        ----------
+        slope
+            Of the rays, mm across the axis per mm along it, 0 or more.
+        """
+        n = 512
+        across = self.diameter / 2 * np.sin((np.arange(n) + 0.5) / n * np.pi / 2)  # half of the disc: it is symmetric
+        low, high = np.full(n, -np.inf), np.full(n, np.inf)
+        for depth, radius in self.hole_profile:
+            half = np.sqrt(np.maximum(radius**2 - across**2, 0.0))
+            low, high = np.maximum(low, -depth * slope - half), np.minimum(high, -depth * slope + half)
+        # Equal steps of an angle: the chords' lengths have a square root at the disc's rim.
+        steps = self.diameter / 2 * np.cos((np.arange(n) + 0.5) / n * np.pi / 2) * (np.pi / 2 / n)
+        return float(2 * (np.maximum(high - low, 0.0) * steps).sum() / (np.pi / 4 * self.diameter**2))

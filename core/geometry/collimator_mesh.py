@@ -1,0 +1,91 @@
+"""Solid shapes of a module as vertices and faces: the collimator with its aperture plate, and the crystal.
+
+Everything is in the module's camera space, mm: the pinhole at the origin, X = -u, Y = v, Z = -k, so that the
+crystal is at Z from l to l + Td and the collimator in front of it, around the pinhole.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..errors import InputError
+from .collimator import Collimator
+
+Solid = tuple[NDArray[np.float64], NDArray[np.int32]]
+"""Vertices (V, 3), mm, and quads (F, 4), counter-clockwise as seen from outside."""
+
+_N = 64
+"""Points on a ring: a multiple of 8, so that the squares have points at their corners.
+
+The hole's polygon has its corners on the circle: 99.84 % of its area is open, and nothing beyond it.
+"""
+
+
+def collimator_solid(collimator: Collimator) -> Solid:
+    """The body that `core.collimator` describes.
+
+    One closed surface of genus 1: rings of points along the hole from the plate's front to its back, then the channel's
+    square at the plate and at the crystal, then the outside's at the crystal and in front, joined by quads, the last ring
+    to the first.
+    """
+    angle = 2 * np.pi * np.arange(_N) / _N
+    circle = np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    square = circle / np.abs(circle).max(axis=1, keepdims=True)  # half-width 1, at the same angles
+    built, l = collimator.construction, collimator.length
+    rings = (
+        *((circle * radius, depth) for depth, radius in collimator.hole_profile),
+        (square * collimator.channel_half_width, built.back),
+        (square * collimator.detector_side / 2, l),
+        (square * (collimator.detector_side / 2 + built.wall_thickness), l),
+        (square * collimator.front_half_width, built.front),
+    )
+    vertices = np.concatenate([np.column_stack([xy, np.full(_N, z)]) for xy, z in rings])
+    ring, point = np.divmod(np.arange(len(rings) * _N), _N)
+    following_ring, following_point = (ring + 1) % len(rings), (point + 1) % _N
+    faces = np.stack(
+        [
+            ring * _N + point,
+            following_ring * _N + point,
+            following_ring * _N + following_point,
+            ring * _N + following_point,
+        ],
+        axis=1,
+    )
+    return vertices, faces.astype(np.int32)
+
+
+def crystal_solid(collimator_length: float, detector_side: float, detector_thickness: float) -> Solid:
+    """The crystal: a box of side Ld from s = l to s = l + Td."""
+    h = detector_side / 2
+    front, back = collimator_length, collimator_length + detector_thickness
+    vertices = np.array([[x, y, z] for z in (front, back) for x, y in ((-h, -h), (h, -h), (h, h), (-h, h))])
+    faces = [[0, 3, 2, 1], [4, 5, 6, 7], [0, 1, 5, 4], [1, 2, 6, 5], [2, 3, 7, 6], [3, 0, 4, 7]]
+    return vertices, np.array(faces, dtype=np.int32)
+
+
+def signed_volume(solid: Solid) -> float:
+    """Enclosed volume, mm^3: positive where the faces look outwards."""
+    vertices, faces = solid
+    a, b, c, d = (vertices[faces[:, i]] for i in range(4))
+    return float((np.einsum("ij,ij->i", a, np.cross(b, c)) + np.einsum("ij,ij->i", a, np.cross(c, d))).sum() / 6)
+
+
+def check_watertight(solid: Solid) -> None:
+    """Refuse a surface that is not closed and consistently oriented, or that looks inwards.
+
+    Raises
+    ------
+    InputError
+        An edge does not belong to exactly two faces that run along it in opposite directions, or the volume
+        is not positive.
+    """
+    vertices, faces = solid
+    starts, ends = faces.ravel().astype(np.int64), np.roll(faces, -1, axis=1).ravel().astype(np.int64)
+    n = len(vertices)
+    forward, backward = np.sort(starts * n + ends), np.sort(ends * n + starts)
+    if np.any(np.diff(forward) == 0) or not np.array_equal(forward, backward):
+        raise InputError("collimator mesh: it is not closed (an edge is not shared by exactly two faces)")
+    volume = signed_volume(solid)
+    if not volume > 0:
+        raise InputError(f"collimator mesh: its volume is {volume:g} mm^3, expected more than 0")

@@ -1,0 +1,89 @@
+"""Module frames, rotations and 4x4 poses. World: right-handed, mm, origin at the isocentre, +z along the patient."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from ..errors import InputError
+from ..validation import real_array
+
+# Below this sine of the angle between z and the principal ray they count as parallel.
+_PARALLEL = 1e-9
+
+
+def principal_rays(centers: ArrayLike) -> NDArray[np.float64]:
+    """Unit vectors (M, 3) from pinhole `centers` (M, 3), mm, to the isocentre at the origin."""
+    centers = real_array(centers, "pinhole centres", (None, 3))
+    distance = np.linalg.norm(centers, axis=1)
+    if np.any(distance == 0):
+        raise InputError(f"pinhole {int(np.argmin(distance))} lies at the isocentre: it has no principal ray")
+    return -centers / distance[:, None]
+
+
+def module_frames(centers: ArrayLike) -> NDArray[np.float64]:
+    """Module frames (M, 3, 3), rows u, v, k, of pinholes at `centers` (M, 3), mm.
+
+    k points from the pinhole to the isocentre, ``u = normalize(z_hat x k)`` (x_hat where z_hat is parallel to k)
+    and ``v = k x u``: right-handed and orthonormal. With +v up, +u is to the LEFT as seen from the pinhole.
+    """
+    k = principal_rays(centers)
+    u = np.cross([0.0, 0.0, 1.0], k)
+    length = np.linalg.norm(u, axis=1)
+    parallel = length < _PARALLEL
+    if parallel.any():
+        u[parallel] = np.cross([1.0, 0.0, 0.0], k[parallel])
+        length = np.linalg.norm(u, axis=1)
+    u /= length[:, None]
+    return np.stack([u, np.cross(k, u), k], axis=1)
+
+
+def module_poses(centers: ArrayLike) -> NDArray[np.float64]:
+    """World-from-module poses (M, 4, 4) of pinholes at `centers` (M, 3), mm: columns u, v, k and the centre."""
+    frames = module_frames(centers)
+    poses = np.zeros((len(frames), 4, 4))
+    poses[:, :3, :3] = frames.transpose(0, 2, 1)
+    poses[:, :3, 3] = centers
+    poses[:, 3, 3] = 1.0
+    return poses
+
+
+def euler_pose(
+    phi: float = 0.0, theta: float = 0.0, psi: float = 0.0, translation: ArrayLike = (0.0, 0.0, 0.0)
+) -> NDArray[np.float64]:
+    """World-from-object pose (4, 4) of a phantom turned by three Euler angles and then moved.
+
+    Parameters
+    ----------
+    phi, theta, psi
+        Radians: psi turns about the object's own z axis, then theta about world y, then phi about world z.
+    translation
+        mm, applied last.
+    """
+    angles = real_array([phi, theta, psi], "Euler angles", (3,))
+    pose = np.eye(4)
+    pose[:3, :3] = _about_z(angles[0]) @ _about_y(angles[1]) @ _about_z(angles[2])
+    pose[:3, 3] = real_array(translation, "translation", (3,))
+    return pose
+
+
+def checked_affine(affine: ArrayLike, name: str) -> NDArray[np.float64]:
+    """`affine` as an invertible (4, 4) float64 matrix acting on column vectors, or `InputError`."""
+    matrix = real_array(affine, name, (4, 4))
+    if not np.array_equal(matrix[3], [0.0, 0.0, 0.0, 1.0]):
+        raise InputError(f"{name}: expected 0 0 0 1 as the last row, got {' '.join(f'{x:g}' for x in matrix[3])}")
+    lengths = np.linalg.norm(matrix[:3, :3], axis=0)
+    # Scaled to unit columns, so that small voxels do not count as singular.
+    if np.any(lengths == 0) or abs(np.linalg.det(matrix[:3, :3] / lengths)) < 1e-10:
+        raise InputError(f"{name}: its three axes are not independent, so it cannot be inverted")
+    return matrix
+
+
+def _about_z(angle: float) -> NDArray[np.float64]:
+    c, s = np.cos(angle), np.sin(angle)
+    return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+
+
+def _about_y(angle: float) -> NDArray[np.float64]:
+    c, s = np.cos(angle), np.sin(angle)
+    return np.array([[c, 0.0, s], [0.0, 1.0, 0.0], [-s, 0.0, c]])

@@ -1,0 +1,99 @@
+"""The lattice of voxels: shape and affine."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from ..errors import InputError
+from ..validation import freeze, real_array, whole_shape
+from .frames import checked_affine
+
+
+@dataclass(frozen=True, eq=False)
+class Grid:
+    """A lattice of voxels.
+
+    Attributes
+    ----------
+    shape : tuple of int
+        Voxels (n_x, n_y, n_z) along the index axes.
+    affine : array (4, 4)
+        Index to world mm, on column vectors; an integer index is the voxel's CENTRE. Any invertible affine:
+        rotated, sheared, anisotropic, mirrored.
+
+    Raises
+    ------
+    InputError
+        The shape is not three whole numbers of at least 1, or the affine is not an invertible 4x4 affine.
+    """
+
+    shape: tuple[int, int, int]
+    affine: NDArray[np.float64]
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "shape", whole_shape(self.shape, "grid shape", 3))
+        object.__setattr__(self, "affine", freeze(checked_affine(self.affine, "grid affine")))
+
+    @classmethod
+    def centered(cls, shape: ArrayLike, spacing: ArrayLike, center: ArrayLike = (0.0, 0.0, 0.0)) -> Grid:
+        """An axis-aligned grid whose middle lies at `center`.
+
+        Parameters
+        ----------
+        shape
+            Voxels along x, y, z; one number means the same along all.
+        spacing
+            Voxel size, mm; one number or three.
+        center
+            World mm.
+        """
+        counts = whole_shape(np.broadcast_to(np.asarray(shape), 3) if np.ndim(shape) == 0 else shape, "grid shape", 3)
+        spacing = real_array(np.broadcast_to(spacing, 3) if np.ndim(spacing) == 0 else spacing, "voxel spacing", (3,))
+        if np.any(spacing <= 0):
+            raise InputError(f"voxel spacing: expected more than 0 mm, got {spacing.min():g}")
+        affine = np.diag([*spacing, 1.0])
+        affine[:3, 3] = real_array(center, "grid centre", (3,)) - spacing * (np.array(counts) - 1) / 2
+        return cls(counts, affine)
+
+    @property
+    def spacing(self) -> NDArray[np.float64]:
+        """Voxel size (3,), mm, along each index axis."""
+        return np.linalg.norm(self.affine[:3, :3], axis=0)
+
+    @property
+    def voxel_volume(self) -> float:
+        """Volume of one voxel, mm^3."""
+        return float(abs(np.linalg.det(self.affine[:3, :3])))
+
+    @property
+    def n_voxels(self) -> int:
+        """Number of voxels."""
+        return int(np.prod(self.shape, dtype=object))
+
+    @cached_property  # asked for every piece of every image
+    def index_from_world(self) -> NDArray[np.float64]:
+        """World mm to index, (4, 4), on column vectors."""
+        return freeze(np.linalg.inv(self.affine))
+
+    @property
+    def center(self) -> NDArray[np.float64]:
+        """World point (3,), mm, of the grid's middle."""
+        return (self.affine @ [*((np.array(self.shape) - 1) / 2), 1.0])[:3]
+
+    def corners(self) -> NDArray[np.float64]:
+        """World points (8, 3), mm, of the box's outer corners (voxel faces, not centres)."""
+        unit = np.stack(np.meshgrid([0, 1], [0, 1], [0, 1], indexing="ij"), axis=-1).reshape(8, 3)
+        index = unit * np.array(self.shape) - 0.5
+        return index @ self.affine[:3, :3].T + self.affine[:3, 3]
+
+    def __eq__(self, other: object) -> bool:
+        if not isinstance(other, Grid):
+            return NotImplemented
+        return self.shape == other.shape and np.array_equal(self.affine, other.affine)
+
+    def __hash__(self) -> int:
+        return hash((self.shape, self.affine.tobytes()))

@@ -1,0 +1,106 @@
+"""The solids of all modules in the world: what checks look at and what is written to files."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..errors import InputError
+from .collimator import Collimator, Construction
+from .collimator_mesh import Solid, collimator_solid, crystal_solid
+from .system import PinholeSystem
+
+Kind = Literal["collimator", "crystal"]
+
+
+@dataclass(frozen=True, eq=False)
+class ModulePart:
+    """A collimator, with its aperture plate, or a crystal.
+
+    Attributes
+    ----------
+    number : int
+        The module's number.
+    kind : "collimator" or "crystal"
+    name : str
+        "Module 07 collimator": the names of a scanner sort as its numbers do.
+    solid : Solid
+        In the module's camera space (`core.collimator_mesh`).
+    pose : array (4, 4)
+        World from camera space, mm.
+    """
+
+    number: int
+    kind: Kind
+    name: str
+    solid: Solid
+    pose: NDArray[np.float64]
+
+    @property
+    def vertices(self) -> NDArray[np.float64]:
+        """(V, 3), world mm."""
+        return self.to_world(self.solid[0])
+
+    @property
+    def triangles(self) -> NDArray[np.int32]:
+        """(F, 3), counter-clockwise as seen from outside."""
+        quads = self.solid[1]
+        return quads[:, [0, 1, 2, 0, 2, 3]].reshape(-1, 3)
+
+    def to_world(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Points (N, 3) of camera space in the world, mm."""
+        return points @ self.pose[:3, :3].T + self.pose[:3, 3]
+
+
+def module_collimators(system: PinholeSystem, construction: Construction) -> list[Collimator]:
+    """Each module's collimator, in the order of the modules.
+
+    Raises
+    ------
+    InputError
+        One cannot be built so; it names the module.
+    """
+    made = []
+    sizes = (system.pinhole_diameter, system.collimator_length, system.detector_side)
+    for number, d, l, side in zip(system.numbers.tolist(), *(size.tolist() for size in sizes), strict=True):
+        try:
+            made.append(Collimator(d, l, side, construction))
+        except InputError as error:
+            raise InputError(f"module {number}: {error}") from None
+    return made
+
+
+def module_parts(system: PinholeSystem, construction: Construction | None = None) -> list[ModulePart]:
+    """Collimator and crystal of each module, in the order of the modules.
+
+    Parameters
+    ----------
+    system
+        The modules.
+    construction
+        Of the collimators; None: `Construction()`.
+
+    Raises
+    ------
+    InputError
+        A module's collimator cannot be built so.
+    """
+    collimators = module_collimators(system, construction or Construction())
+    poses = system.poses()
+    poses[:, :3, [0, 2]] *= -1  # camera space is X = -u, Y = v, Z = -k
+    width = max(2, len(str(system.numbers.max())))
+    thicknesses = system.detector_thickness.tolist()
+    parts = []
+    for number, pose, collimator, thickness in zip(
+        system.numbers.tolist(), poses, collimators, thicknesses, strict=True
+    ):
+        name = f"Module {number:0{width}d}"
+        crystal = crystal_solid(collimator.length, collimator.detector_side, thickness)
+        parts += [
+            ModulePart(number, "collimator", f"{name} collimator", collimator_solid(collimator), pose),
+            ModulePart(number, "crystal", f"{name} crystal", crystal, pose),
+        ]
+    return parts

@@ -1,0 +1,197 @@
+"""The scanner: all pinhole modules and their common isocentre."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+from typing import TYPE_CHECKING, Literal
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from ..errors import InputError
+from ..validation import freeze, positive, real_array, whole_shape
+from .frames import module_frames, module_poses, principal_rays
+from .views import Views
+
+if TYPE_CHECKING:
+    from ..workbook import SystemSource
+
+Detector = Literal["virtual", "real"]
+
+# Modules whose pinholes differ less than this share of the crystal's side along z belong to one ring.
+_RING_GAP = 0.2
+
+
+@dataclass(frozen=True, eq=False)
+class PinholeSystem:
+    """M pinhole modules aimed at the isocentre, which is the world's origin.
+
+    Attributes
+    ----------
+    centers : array (M, 3)
+        Pinhole centres p, world mm.
+    pinhole_diameter, collimator_length, detector_side, detector_thickness, roi_radius : array (M,)
+        d, l, Ld, Td and R, mm; one number stands for all modules.
+    numbers : int array (M,)
+        The modules' numbers as their users know them; 1, 2, ... unless given.
+    source : SystemSource or None
+        The workbook that it was read from.
+
+    Raises
+    ------
+    InputError
+        A shape is wrong, a number is not finite or not positive, d is not below Ld, a pinhole lies inside the
+        ROI, or two modules have the same number or place.
+    """
+
+    centers: NDArray[np.float64]
+    pinhole_diameter: NDArray[np.float64]
+    collimator_length: NDArray[np.float64]
+    detector_side: NDArray[np.float64]
+    detector_thickness: NDArray[np.float64]
+    roi_radius: NDArray[np.float64]
+    numbers: NDArray[np.int64] = None  # type: ignore[assignment]  # always an array once made
+    source: SystemSource | None = None
+
+    def __post_init__(self) -> None:
+        centers = real_array(self.centers, "pinhole centres", (None, 3))
+        n = len(centers)
+        if n == 0:
+            raise InputError("a pinhole system needs at least one module, got none")
+        numbers = np.arange(1, n + 1) if self.numbers is None else real_array(self.numbers, "numbers", (n,), np.int64)
+        if self.numbers is not None and not np.array_equal(numbers, self.numbers):
+            raise InputError("numbers: expected whole numbers")
+        self._set("centers", centers)
+        self._set("numbers", numbers)
+        for name in _LENGTHS:
+            value = getattr(self, name)
+            if np.ndim(value) == 0:
+                value = np.full(n, real_array(value, name, ()))
+            value = real_array(value, name, (n,))
+            self._refuse(
+                value <= 0, lambda i, name=name, value=value: f"{name} must be more than 0 mm, got {value[i]:g}"
+            )
+            self._set(name, value)
+        b = self.pinhole_distance
+        self._refuse(
+            self.pinhole_diameter >= self.detector_side,
+            lambda i: (
+                f"pinhole_diameter {self.pinhole_diameter[i]:g} mm must be less than detector_side "
+                f"{self.detector_side[i]:g} mm"
+            ),
+        )
+        self._refuse(
+            b <= self.roi_radius,
+            lambda i: f"its pinhole is {b[i]:g} mm from the isocentre, inside the ROI of {self.roi_radius[i]:g} mm",
+        )
+        for what, values in (("number", numbers[:, None]), ("pinhole centre", centers)):
+            _, first, inverse = np.unique(values, axis=0, return_index=True, return_inverse=True)
+            repeated = first[inverse.reshape(-1)] != np.arange(n)
+            self._refuse(repeated, lambda i, what=what: f"another module has the same {what}")
+
+    def _set(self, name: str, array: NDArray) -> None:
+        object.__setattr__(self, name, freeze(array))
+
+    def _refuse(self, bad: NDArray[np.bool_], why) -> None:  # type: ignore[no-untyped-def]
+        if bad.any():
+            i = int(np.argmax(bad))
+            raise InputError(f"module {self.numbers[i]}: {why(i)}")
+
+    def __len__(self) -> int:
+        return len(self.centers)
+
+    def __getitem__(self, which: int | slice | NDArray) -> PinholeSystem:
+        """The modules `which` (an index from 0, a slice, or an array of indices or booleans), again as a system."""
+        index = np.atleast_1d(np.arange(len(self))[which])
+        if len(index) == 0:
+            raise InputError(f"no module chosen: there are {len(self)}")
+        arrays = {f.name: getattr(self, f.name)[index] for f in fields(self) if f.name != "source"}
+        return PinholeSystem(**arrays, source=self.source)
+
+    @property
+    def pinhole_distance(self) -> NDArray[np.float64]:
+        """b (M,), mm: pinhole centre to isocentre."""
+        return np.linalg.norm(self.centers, axis=1)
+
+    @property
+    def principal_rays(self) -> NDArray[np.float64]:
+        """k (M, 3): unit vectors from pinhole to isocentre."""
+        return principal_rays(self.centers)
+
+    def frames(self) -> NDArray[np.float64]:
+        """Module frames (M, 3, 3), rows u, v, k (`core.frames.module_frames`)."""
+        return module_frames(self.centers)
+
+    def poses(self) -> NDArray[np.float64]:
+        """World-from-module poses (M, 4, 4): columns u, v, k and the pinhole centre, mm."""
+        return module_poses(self.centers)
+
+    def rings(self) -> NDArray[np.int64]:
+        """Ring (M,) of each module, counted from 0 along +z: pinholes at about one z form a ring."""
+        z = self.centers[:, 2]
+        order = np.argsort(z, kind="stable")
+        starts = np.diff(z[order], prepend=z[order[0]]) > _RING_GAP * self.detector_side[order]
+        rings = np.empty(len(self), dtype=np.int64)
+        rings[order] = np.cumsum(starts)
+        return rings
+
+    def views(
+        self,
+        shape: tuple[int, int] = (256, 256),
+        detector: Detector = "virtual",
+        magnification: float = 10.0,
+        pitch: ArrayLike | None = None,
+        offset: ArrayLike = (0.0, 0.0),
+    ) -> Views:
+        """The modules' images as `Views`.
+
+        Both detectors see by the same rays, from the pinhole to the virtual detector's plane at
+        ``magnification * l`` in front of it: crystal point (-u, -v)/magnification is virtual pixel (u, v).
+        The real detector's image is that of the crystal's front face behind the pinhole, so it is point-inverted.
+
+        Parameters
+        ----------
+        shape
+            Pixels (n_v, n_u): rows, columns.
+        detector
+            ``"virtual"`` or ``"real"``.
+        magnification
+            Distance of the virtual detector in units of the collimator length l.
+        pitch
+            Pixel size on that detector, mm: one number, or (pitch_u, pitch_v). Default: the crystal's whole side
+            is covered (Ld / n on the real, magnification * Ld / n on the virtual detector).
+        offset
+            (x0, y0), mm along u and v, of the image's middle on that detector.
+
+        Raises
+        ------
+        InputError
+            A shape, number or name is not as above.
+        """
+        n_v, n_u = whole_shape(shape, "image shape", 2)
+        magnification = positive(magnification, "magnification")
+        if detector not in ("virtual", "real"):
+            raise InputError(f"detector {detector!r}: expected 'virtual' or 'real'")
+        # A length on the real detector spans -magnification times as much, inverted, on the virtual plane.
+        to_virtual = 1.0 if detector == "virtual" else -magnification
+        if pitch is None:
+            side = abs(magnification / to_virtual) * self.detector_side[:, None]
+            pitches = side / np.array([n_u, n_v])
+        else:
+            both = real_array(np.broadcast_to(pitch, 2) if np.ndim(pitch) == 0 else pitch, "pixel pitch", (2,))
+            if np.any(both <= 0):
+                raise InputError(f"pixel pitch: expected more than 0 mm, got {both.min():g}")
+            pitches = np.broadcast_to(both, (len(self), 2))
+        x0, y0 = real_array(offset, "image offset", (2,)) * to_virtual
+        u, v, k = self.frames().transpose(1, 0, 2)
+        distance = magnification * self.collimator_length[:, None]
+        return Views(
+            sources=self.centers,
+            detector_centers=self.centers + distance * k + x0 * u + y0 * v,
+            u_steps=to_virtual * pitches[:, :1] * u,
+            v_steps=to_virtual * pitches[:, 1:] * v,
+            shape=(n_v, n_u),
+        )
+
+
+_LENGTHS = ("pinhole_diameter", "collimator_length", "detector_side", "detector_thickness", "roi_radius")

@@ -1,0 +1,98 @@
+"""Views: what each camera's rays are, as sources, detector centres and pixel steps."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..errors import InputError
+from ..validation import freeze, real_array, whole_shape
+
+
+@dataclass(frozen=True, eq=False)
+class Views:
+    """M images of one shape: the cone_vec description (ASTRA's), in world mm.
+
+    Pixel (row i, column j) of view m has its centre at
+    ``detector_centers[m] + (j - (n_u - 1)/2) u_steps[m] + (i - (n_v - 1)/2) v_steps[m]``; its ray runs from
+    ``sources[m]`` to there.
+
+    Attributes
+    ----------
+    sources : array (M, 3)
+        Pinholes (or X-ray sources), mm.
+    detector_centers : array (M, 3)
+        Middles of the detectors, mm.
+    u_steps, v_steps : array (M, 3)
+        From one pixel to the next along a row (column index + 1) and along a column (row index + 1), mm.
+    shape : tuple of int
+        Pixels (n_v, n_u): rows, columns.
+
+    Raises
+    ------
+    InputError
+        A shape is wrong, a number is not finite, or a source lies in its detector's plane.
+    """
+
+    sources: NDArray[np.float64]
+    detector_centers: NDArray[np.float64]
+    u_steps: NDArray[np.float64]
+    v_steps: NDArray[np.float64]
+    shape: tuple[int, int]
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "shape", whole_shape(self.shape, "image shape", 2))
+        sources = real_array(self.sources, "sources", (None, 3))
+        object.__setattr__(self, "sources", freeze(sources))
+        for name in ("detector_centers", "u_steps", "v_steps"):
+            value = real_array(getattr(self, name), name, (len(sources), 3))
+            object.__setattr__(self, name, freeze(value))
+        axes = self._axes()
+        lengths = np.linalg.norm(axes, axis=1, keepdims=True)
+        with np.errstate(invalid="ignore", divide="ignore"):
+            flat = ~(np.abs(np.linalg.det(axes / lengths)) > 1e-12)
+        if flat.any():
+            raise InputError(
+                f"view {int(np.argmax(flat))}: its source lies in the detector's plane, or its pixel steps are parallel"
+            )
+
+    def __len__(self) -> int:
+        return len(self.sources)
+
+    def __getitem__(self, which: int | slice | NDArray[np.integer]) -> Views:
+        """The views `which` (an index, a slice or an array of indices), again as Views."""
+        index = np.arange(len(self))[which]
+        index = np.atleast_1d(index)
+        return Views(
+            self.sources[index], self.detector_centers[index], self.u_steps[index], self.v_steps[index], self.shape
+        )
+
+    def rays(self, m: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Ends of view m's rays: sources and targets, each (n_v * n_u, 3) in mm, row by row.
+
+        The sources are one point, repeated (a read-only array without a copy).
+        """
+        n_v, n_u = self.shape
+        column = (np.arange(n_u) - (n_u - 1) / 2)[None, :, None]
+        row = (np.arange(n_v) - (n_v - 1) / 2)[:, None, None]
+        targets = self.detector_centers[m] + row * self.v_steps[m] + column * self.u_steps[m]
+        return np.broadcast_to(self.sources[m], (n_v * n_u, 3)), targets.reshape(-1, 3)
+
+    def projection_matrices(self) -> NDArray[np.float64]:
+        """Matrices (M, 3, 4) from homogeneous world points, mm, to ``(column, row, 1)`` times a factor.
+
+        Columns and rows are in pixels with 0 at the centre of pixel 0; the factor is the depth in units of the
+        distance from source to detector: 1 on the detector, positive on its side of the source.
+        """
+        n_v, n_u = self.shape
+        from_detector = np.array([[1.0, 0.0, (n_u - 1) / 2], [0.0, 1.0, (n_v - 1) / 2], [0.0, 0.0, 1.0]])
+        # x - source = t (a u_step + b v_step + (center - source)): solve for t (a, b, 1).
+        linear = from_detector @ np.linalg.inv(self._axes())
+        offset = -np.einsum("mij,mj->mi", linear, self.sources)
+        return np.concatenate([linear, offset[:, :, None]], axis=2)
+
+    def _axes(self) -> NDArray[np.float64]:
+        """(M, 3, 3) with columns u_step, v_step and source-to-detector."""
+        return np.stack([self.u_steps, self.v_steps, self.detector_centers - self.sources], axis=2)

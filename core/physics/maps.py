@@ -1,0 +1,180 @@
+"""What a system does in every voxel of a grid, as volumes that can be seen, written and exported like any other.
+
+A voxel's value is that at its centre. Where no module sees it, all of them are 0.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..geometry.collimator import OPENING_ANGLE
+from ..geometry.grid import Grid
+from ..geometry.system import PinholeSystem
+from ..memory import require
+from ..progress import Progress, in_threads
+from ..validation import freeze, instance
+from ..volumes.volume import Volume
+from .performance import resolution, seen, sensitivity
+from .sampling import TOLERANCE, sampling_gaps
+
+Array = NDArray[np.float64]
+
+# Points times modules of one block: its temporaries stay in the processor's cache.
+_BLOCK = 1 << 17
+
+
+def sensitivity_map(
+    system: PinholeSystem,
+    grid: Grid,
+    *,
+    aperture_mu: float | None = None,
+    opening_angle: float = OPENING_ANGLE,
+    crystal_mu: float | None = None,
+    photons_per_decay: float = 1.0,
+    progress: Progress | None = None,
+) -> Volume:
+    """Total sensitivity, counts per decay: the sum of `sensitivity` over the modules. 1e6 times that are cps/MBq.
+
+    Parameters
+    ----------
+    system
+        The modules.
+    grid
+        Where the voxels are.
+    aperture_mu, opening_angle, crystal_mu, photons_per_decay
+        As in `core.performance.sensitivity`.
+    progress
+        Called as ``progress(done, total)`` between blocks of voxels; may raise `Cancelled`.
+
+    Raises
+    ------
+    InputError
+        A number is not finite or out of its range, or the volume does not fit into memory.
+    """
+
+    def total(points: Array) -> Array:
+        counts = sensitivity(
+            system,
+            points,
+            aperture_mu=aperture_mu,
+            opening_angle=opening_angle,
+            crystal_mu=crystal_mu,
+            photons_per_decay=photons_per_decay,
+        )
+        return counts.sum(axis=1)
+
+    return _map(system, grid, "sensitivity", total, progress)
+
+
+def modules_map(system: PinholeSystem, grid: Grid, *, progress: Progress | None = None) -> Volume:
+    """Number of modules that see each voxel (`core.performance.seen`). Arguments and errors as in `sensitivity_map`."""
+    return _map(system, grid, "modules", lambda points: seen(system, points).sum(axis=1, dtype=np.float64), progress)
+
+
+def resolution_map(
+    system: PinholeSystem,
+    grid: Grid,
+    *,
+    intrinsic_fwhm: float = 0.0,
+    aperture_mu: float | None = None,
+    opening_angle: float = OPENING_ANGLE,
+    crystal_mu: float | None = None,
+    progress: Progress | None = None,
+) -> Volume:
+    """Expected resolution, FWHM in mm: the root mean square of the modules' `resolution`, weighted by their counts.
+
+    Every photon brings a spread of its module's; the variance of all photons together is the mean of theirs. It is what
+    the projections hold: a reconstruction that models the blur may do better, few counts may force it to do worse.
+
+    Parameters
+    ----------
+    system, grid, progress
+        As in `sensitivity_map`.
+    intrinsic_fwhm, aperture_mu, opening_angle, crystal_mu
+        As in `core.performance.resolution` and `core.performance.sensitivity`.
+
+    Raises
+    ------
+    InputError
+        As in `sensitivity_map`.
+    """
+
+    def combined(points: Array) -> Array:
+        fwhm = resolution(
+            system, points, intrinsic_fwhm=intrinsic_fwhm, aperture_mu=aperture_mu, opening_angle=opening_angle
+        )
+        counts = sensitivity(
+            system, points, aperture_mu=aperture_mu, opening_angle=opening_angle, crystal_mu=crystal_mu
+        )
+        total = counts.sum(axis=1)
+        return np.sqrt((counts * np.nan_to_num(fwhm) ** 2).sum(axis=1) / np.where(total > 0, total, 1))
+
+    return _map(system, grid, "resolution", combined, progress)
+
+
+def completeness_map(
+    system: PinholeSystem, grid: Grid, *, tolerance: float = TOLERANCE, progress: Progress | None = None
+) -> Volume:
+    """Completeness of the angular sampling, from 0 to 1: 1 - gap / 90 degrees, of `core.sampling.sampling_gaps`.
+
+    1 where every plane through the voxel meets a pinhole that sees it (Tuy's condition), 0 where one module or none sees it.
+
+    Parameters
+    ----------
+    system, grid, progress
+        As in `sensitivity_map`.
+    tolerance
+        Of the gap, rad.
+
+    Raises
+    ------
+    InputError
+        As in `sensitivity_map`.
+    """
+
+    def share(points: Array) -> Array:
+        return 1 - sampling_gaps(system, points, tolerance=tolerance) / (math.pi / 2)
+
+    return _map(system, grid, "completeness", share, progress)
+
+
+def within_roi(volume: Volume, system: PinholeSystem) -> Volume:
+    """A map with 0 in voxels whose centres lie outside the largest ROI sphere: what the scanner is designed for."""
+    squares = np.zeros(volume.grid.shape)
+    axes = np.ogrid[tuple(slice(n) for n in volume.grid.shape)]
+    for row in volume.grid.affine[:3]:
+        squares += (sum(a * x for a, x in zip(row[:3], axes, strict=True)) + row[3]) ** 2
+    inside = squares <= system.roi_radius.max() ** 2
+    return Volume(freeze(np.where(inside, volume.array, np.float32(0))), volume.grid, volume.quantity)
+
+
+def _map(
+    system: PinholeSystem, grid: Grid, quantity: str, value: Callable[[Array], Array], progress: Progress | None
+) -> Volume:
+    """The volume of `value` of points (P, 3), a block of voxels at a time."""
+    instance(system, PinholeSystem, "system")
+    instance(grid, Grid, "grid")
+    require(4.2 * grid.n_voxels, "a volume of {} x {} x {} voxels".format(*grid.shape))
+    values = np.empty(grid.n_voxels, np.float32)
+    size = max(1, _BLOCK // len(system))
+
+    def fill(first: int) -> None:
+        voxels = np.arange(first, min(first + size, grid.n_voxels))
+        index = np.stack(np.unravel_index(voxels, grid.shape), axis=1)
+        values[voxels] = value(index @ grid.affine[:3, :3].T + grid.affine[:3, 3])
+
+    in_threads(fill, range(0, grid.n_voxels, size), progress)
+    return Volume(freeze(values.reshape(grid.shape)), grid, quantity)
+
+
+MAPS: dict[str, Callable[..., Volume]] = {
+    "sensitivity": sensitivity_map,
+    "modules": modules_map,
+    "resolution": resolution_map,
+    "completeness": completeness_map,
+}
+"""The maps by their quantity."""

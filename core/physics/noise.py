@@ -1,0 +1,51 @@
+"""Counting statistics, apart from the mean."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from ..errors import InputError
+from ..validation import real_array
+
+# numpy draws no Poisson number of a larger mean.
+_LARGEST_MEAN = 9e18
+
+
+def sample_counts(mean: ArrayLike, seed: int) -> NDArray[np.int64]:
+    """Counts drawn from the Poisson distributions of given means.
+
+    Every view has a random generator of its own, made from the seed and the view's place in `mean`: its counts do not
+    depend on what the other views hold, nor on how many follow.
+
+    Parameters
+    ----------
+    mean
+        Expected counts, (M, n_v, n_u) or any array whose first axis is the views.
+    seed
+        A whole number of at least 0; the same seed gives the same counts.
+
+    Returns
+    -------
+    int64 array
+        Counts, of the shape of `mean`.
+
+    Raises
+    ------
+    InputError
+        A mean is negative, not finite, or too large; the seed is not a whole number.
+    """
+    if isinstance(seed, bool) or not isinstance(seed, int | np.integer) or seed < 0:
+        raise InputError(f"seed: expected a whole number of at least 0, got {seed!r}")
+    values = real_array(mean, "expected counts", None)
+    if not values.ndim:
+        raise InputError("expected counts: expected an array whose first axis is the views, got one number")
+    if values.size and not 0 <= values.min() <= values.max() <= _LARGEST_MEAN:
+        raise InputError(
+            f"expected counts: must lie from 0 to {_LARGEST_MEAN:g}, got {values.min():g} to {values.max():g}"
+        )
+    counts = np.empty(values.shape, np.int64)
+    for view, expected in enumerate(values):
+        generator = np.random.default_rng(np.random.SeedSequence(int(seed), spawn_key=(view,)))
+        counts[view] = generator.poisson(expected)
+    return counts

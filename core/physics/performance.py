@@ -1,0 +1,244 @@
+"""What modules do with photons from any point: whether they see it, how many they count, how sharply.
+
+In a module's frame a point at (x_u, x_v) across the axis and at height h in front of the pinhole's plane is seen at the
+angle psi to the axis, with ``cos(psi) = h / sqrt(h^2 + x_u^2 + x_v^2)``, the sine of its elevation theta above that plane.
+
+References
+----------
+D. Paix, "Pinhole imaging of gamma rays", Physics in Medicine and Biology 12 (1967) 489-500.
+R. Accorsi, S. D. Metzler, "Analytic determination of the resolution-equivalent effective diameter of a pinhole
+collimator", IEEE Transactions on Medical Imaging 23 (2004) 750-763.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from ..errors import InputError
+from ..geometry.collimator import OPENING_ANGLE
+from ..geometry.design_formulas import roi_radius_seen
+from ..geometry.system import PinholeSystem
+from ..validation import instance, positive, real_array
+from .aperture import half_value_diameter, paix_diameter
+from .crystal import absorbed_share, layer_depths
+
+Array = NDArray[np.float64]
+
+
+def seen(system: PinholeSystem, points: ArrayLike) -> NDArray[np.bool_]:
+    """Whether each module sees each point: (P, M).
+
+    A module sees a point in front of its pinhole if the ray from there through the pinhole's centre meets the crystal's
+    front face, ``l max(|x_u|, |x_v|) <= Ld h / 2``.
+
+    Parameters
+    ----------
+    system
+        M modules.
+    points
+        (P, 3), world mm.
+
+    Raises
+    ------
+    InputError
+        `system` is none, or `points` are not finite numbers of that shape.
+    """
+    return _seen(system, *_in_modules(system, _checked(points)))
+
+
+def magnification(system: PinholeSystem, points: ArrayLike) -> Array:
+    """Magnification l / h (P, M) of the crystal's image at each point; NaN where it is not in front of the pinhole.
+
+    Arguments and errors as in `seen`.
+    """
+    _, _, h = _in_modules(system, _checked(points))
+    with np.errstate(divide="ignore"):
+        return np.where(h > 0, system.collimator_length / h, np.nan)
+
+
+def sensitivity(
+    system: PinholeSystem,
+    points: ArrayLike,
+    *,
+    aperture_mu: float | None = None,
+    opening_angle: float = OPENING_ANGLE,
+    crystal_mu: float | None = None,
+    photons_per_decay: float = 1.0,
+) -> Array:
+    """Counts per decay (P, M) of a point source, each module on its own: 1e6 times that are cps/MBq.
+
+    Where the module sees the point it is ``photons_per_decay d_e^2 sin^3(theta) / (16 h^2)``, times the share
+    ``1 - exp(-crystal_mu Td / sin(theta))`` that the crystal stops; elsewhere 0. `Emission` counts the same, pixel by
+    pixel, with its edge "paix".
+
+    Parameters
+    ----------
+    system
+        M modules.
+    points
+        (P, 3), world mm.
+    aperture_mu, opening_angle
+        Of the aperture's material, 1/mm, and of its knife edge, rad: Paix's ``d_e^2 = d (d + 2 / mu tan(alpha / 2))``.
+        None: nothing penetrates, d_e = d.
+    crystal_mu
+        Of the crystal, 1/mm. None: it stops all photons.
+    photons_per_decay
+        That are counted if they are stopped.
+
+    Raises
+    ------
+    InputError
+        A shape is wrong, or a number is not finite or out of its range.
+    """
+    points = _checked(points)
+    _check_edge(aperture_mu, opening_angle)
+    if crystal_mu is not None:
+        crystal_mu = positive(crystal_mu, "crystal_mu", "1/mm")
+    photons_per_decay = positive(photons_per_decay, "photons_per_decay")
+    x_u, x_v, h = _in_modules(system, points)
+    visible = _seen(system, x_u, x_v, h)
+    h[~visible] = 1.0  # what is not seen must not divide by zero
+    cosine = h / np.sqrt(x_u**2 + x_v**2 + h**2)
+    counts = _point_law(h, cosine, paix_diameter(system.pinhole_diameter, aperture_mu, opening_angle))
+    counts *= photons_per_decay * visible
+    return counts if crystal_mu is None else counts * _stopped(cosine, crystal_mu, system.detector_thickness)
+
+
+def resolution(
+    system: PinholeSystem,
+    points: ArrayLike,
+    *,
+    intrinsic_fwhm: float = 0.0,
+    aperture_mu: float | None = None,
+    opening_angle: float = OPENING_ANGLE,
+) -> Array:
+    """FWHM in object space (P, M), mm, of each module's image across its axis; NaN where it does not see the point.
+
+    ``R^2 = (d_re (1 + h / l))^2 + (R_i h / l)^2`` with ``d_re = d + ln(2) / mu tan(alpha / 2)``, the diameter at which
+    the knife edge lets half of the photons pass (Accorsi and Metzler 2004, along the axis).
+
+    Parameters
+    ----------
+    system
+        M modules.
+    points
+        (P, 3), world mm.
+    intrinsic_fwhm
+        R_i of the detector, mm on the crystal.
+    aperture_mu, opening_angle
+        As in `sensitivity`. None: d_re = d.
+
+    Raises
+    ------
+    InputError
+        A shape is wrong, or a number is not finite or out of its range.
+    """
+    points = _checked(points)
+    _check_edge(aperture_mu, opening_angle)
+    intrinsic_fwhm = float(real_array(intrinsic_fwhm, "intrinsic_fwhm", ()))
+    if intrinsic_fwhm < 0:
+        raise InputError(f"intrinsic_fwhm: expected 0 mm or more, got {intrinsic_fwhm:g}")
+    x_u, x_v, h = _in_modules(system, points)
+    diameter = half_value_diameter(system.pinhole_diameter, aperture_mu, opening_angle)
+    fwhm = _fwhm(h / system.collimator_length, diameter, intrinsic_fwhm)
+    fwhm[~_seen(system, x_u, x_v, h)] = np.nan
+    return fwhm
+
+
+class ModulePerformance(NamedTuple):
+    """What a module does at the isocentre.
+
+    Attributes
+    ----------
+    sensitivity : array
+        Counts per decay.
+    resolution : array
+        FWHM in object space, mm.
+    magnification : array
+        l / b.
+    roi_radius_seen : array
+        Radius of the largest sphere that it sees whole, mm.
+    """
+
+    sensitivity: Array
+    resolution: Array
+    magnification: Array
+    roi_radius_seen: Array
+
+
+def isocentre_performance(
+    b: ArrayLike,
+    d: ArrayLike,
+    l: ArrayLike,
+    Ld: ArrayLike,
+    Td: ArrayLike,
+    *,
+    intrinsic_fwhm: float = 0.0,
+    aperture_mu: float | None = None,
+    opening_angle: float = OPENING_ANGLE,
+    crystal_mu: float | None = None,
+    photons_per_decay: float = 1.0,
+) -> ModulePerformance:
+    """`sensitivity`, `resolution` and the rest at the isocentre, of one module or of many, from their numbers alone.
+
+    Parameters
+    ----------
+    b, d, l, Ld, Td
+        Pinhole to isocentre, hole's diameter, collimator's length, crystal's side and thickness, mm: numbers or arrays
+        that broadcast.
+    intrinsic_fwhm, aperture_mu, opening_angle, crystal_mu, photons_per_decay
+        As in `sensitivity` and `resolution`, but not checked: this is for readouts that must not wait.
+
+    Raises
+    ------
+    InputError
+        b, d, l or Ld is not finite or out of its range.
+    """
+    radius = roi_radius_seen(b, d, Ld, l)
+    b, d, l, Td = (np.asarray(x, dtype=np.float64) for x in (b, d, l, Td))
+    counts = photons_per_decay * _point_law(b, np.ones(()), paix_diameter(d, aperture_mu, opening_angle))
+    return ModulePerformance(
+        counts if crystal_mu is None else counts * _stopped(np.ones(()), crystal_mu, Td),
+        _fwhm(b / l, half_value_diameter(d, aperture_mu, opening_angle), intrinsic_fwhm),
+        l / b,
+        radius,
+    )
+
+
+def _in_modules(system: PinholeSystem, points: Array) -> tuple[Array, Array, Array]:
+    """x_u, x_v and h (P, M), mm, of points (P, 3) in the modules' frames: the pinholes lie on the axes, at -b."""
+    instance(system, PinholeSystem, "system")
+    u, v, k = system.frames().transpose(1, 2, 0)
+    return points @ u, points @ v, points @ k + system.pinhole_distance
+
+
+def _seen(system: PinholeSystem, x_u: Array, x_v: Array, h: Array) -> NDArray[np.bool_]:
+    reach = system.detector_side / (2 * system.collimator_length) * h
+    return (h > 0) & (np.abs(x_u) <= reach) & (np.abs(x_v) <= reach)
+
+
+def _point_law(h: Array, cosine: Array, diameter: Array) -> Array:
+    return (diameter / h) ** 2 * cosine * cosine * cosine / 16
+
+
+def _stopped(cosine: Array, mu: float, thickness: Array) -> Array:
+    return absorbed_share(cosine, mu, thickness, layer_depths(1, 0.0), 0)  # type: ignore[arg-type]  # M of them
+
+
+def _fwhm(h_per_l: Array, diameter: Array, intrinsic_fwhm: float) -> Array:
+    return np.hypot(diameter * (1 + h_per_l), intrinsic_fwhm * h_per_l)
+
+
+def _checked(points: ArrayLike) -> Array:
+    return real_array(points, "points", (None, 3))
+
+
+def _check_edge(aperture_mu: float | None, opening_angle: float) -> None:
+    if aperture_mu is not None:
+        positive(aperture_mu, "aperture_mu", "1/mm")
+    if positive(opening_angle, "opening_angle", "rad") >= math.pi:
+        raise InputError(f"opening_angle: expected less than pi, got {opening_angle:g} rad")

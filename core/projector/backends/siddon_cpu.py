@@ -1,0 +1,180 @@
+"""Siddon's line integrals in C: the default on a CPU.
+
+The kernels are in `kernels`, compiled for each platform and for the levels of its processors; ``kernels.h`` is the contract.
+They run in the thread that calls, without the GIL: the operator calls them on several. Volumes of float64 are traced in
+float64, all others in float32.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import os
+import sys
+from ctypes import POINTER, Structure, c_char_p, c_int64, c_void_p
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ...errors import InputError
+from ..rays import Attenuation, IndexFans, IndexRays, Rays
+
+Array = NDArray[Any]  # of float32 or float64
+
+LEVEL_VARIABLE = "MPHDRR_CPU_LEVEL"
+"""Environment variable that names a lower level of processor, `levels`, than this one's."""
+
+_CONTRACT = 1
+_NAMES = {"win32": "siddon.dll", "darwin": "libsiddon.dylib"}
+_MOST_VOXELS = 2**31 - 1  # their indices are of 32 bits
+_MOST_ALONG = 2**12  # where float32 knows the length of a segment to 0.1 %
+
+_FAN = np.dtype([("volume", "(4,3)f8"), ("mu", "(4,3)f8"), ("world", "(3,3)f8"), ("lines", "i8"), ("rays", "i8")])
+
+
+class _Lattice(Structure):
+    _fields_ = [("voxels", c_void_p), ("n", c_int64 * 3)]
+
+
+class _RayList(Structure):
+    _fields_ = [
+        *((name, c_void_p) for name in ("starts", "directions", "mu_starts", "mu_directions", "lengths")),
+        ("count", c_int64),
+    ]
+
+
+class _Job(Structure):
+    _fields_ = [
+        ("is_double", c_int64), ("attenuation", c_int64), ("volume", _Lattice), ("mu", _Lattice),
+        ("fans", c_void_p), ("n_fans", c_int64), ("list", _RayList),
+        ("values", c_void_p), ("integrals", c_void_p), ("derivatives", c_void_p), ("gradient", c_void_p),
+    ]  # fmt: skip
+
+
+def _load() -> ctypes.CDLL:
+    """The library in this package."""
+    path = Path(__file__).with_name("kernels") / _NAMES.get(sys.platform, "libsiddon.so")
+    if not path.is_file():
+        raise ImportError(f"no compiled kernels for this platform: {path.name} is not in {path.parent}")
+    library = ctypes.CDLL(str(path))
+    numbers = (c_int64 * 3)()
+    library.contract(numbers)
+    expected = [_CONTRACT, ctypes.sizeof(_Job), _FAN.itemsize]
+    if list(numbers) != expected:
+        raise ImportError(f"{path} belongs to another version of mphDRR: install it anew")
+    library.best_level.restype, library.level_name.restype = c_int64, c_char_p
+    library.level_name.argtypes = [c_int64]
+    for name in ("forward", "backproject", "differentiate", "differentiate_by_mu"):
+        function = getattr(library, name)
+        function.argtypes, function.restype = [c_int64, POINTER(_Job)], None
+    return library
+
+
+_library = _load()
+
+
+def levels() -> list[str]:
+    """Names of the levels of processor that this one has, the lowest first."""
+    return [_library.level_name(level).decode() for level in range(_library.best_level() + 1)]
+
+
+def _level() -> int:
+    has, asked = levels(), os.environ.get(LEVEL_VARIABLE)
+    if asked and asked not in has:
+        raise InputError(f"{LEVEL_VARIABLE}: expected a level that this processor has, {', '.join(has)}; got {asked}")
+    return has.index(asked) if asked else len(has) - 1
+
+
+level = _level()
+"""Of the kernels that are used, an index of `levels`."""
+
+
+def forward(volume: Array, rays: Rays, attenuation: Attenuation | None = None) -> Array:
+    """Line integrals (N,), value x mm, of `volume` (n_x, n_y, n_z) along `rays`, attenuated towards their sources."""
+    values = np.empty(len(rays), volume.dtype)
+    _run(_library.forward, volume, rays, attenuation, values)
+    return values
+
+
+def adjoint(volume: Array, values: Array, rays: Rays, attenuation: Attenuation | None = None) -> None:
+    """Add `values` (N,), each along its ray with the weights of `forward`, to `volume` in place."""
+    _run(_library.backproject, volume, rays, attenuation, values)
+
+
+def derivatives(volume: Array, rays: Rays, attenuation: Attenuation | None = None) -> Array:
+    """What the ends of `rays` do to their integrals (N, 7) or (N, 14), as `backends` describes it."""
+    integrals = None if attenuation is None else forward(volume, rays, attenuation)
+    result = np.empty((7 if attenuation is None else 14, len(rays)))
+    _run(_library.differentiate, volume, rays, attenuation, integrals=integrals, derivatives=result)
+    return result.T
+
+
+def mu_gradient(gradient: Array, volume: Array, values: Array, rays: Rays, attenuation: Attenuation) -> None:
+    """Add to `gradient`, of mu's shape, in place what mu's voxels do to the sum of `values` (N,) times the integrals."""
+    integrals = forward(volume, rays, attenuation)
+    _run(_library.differentiate_by_mu, volume, rays, attenuation, values, integrals=integrals, gradient=gradient)
+
+
+def _run(
+    kernel: Any, volume: Array, rays: Rays, attenuation: Attenuation | None, values: Array | None = None, **others: Any
+) -> None:
+    """Run a kernel on all rays."""
+    mu = None if attenuation is None else attenuation.mu
+    mu_rays = None if attenuation is None else attenuation.rays
+    if values is not None:
+        others["values"] = values = np.ascontiguousarray(values, volume.dtype)
+        if len(values) != len(rays):
+            raise ValueError(f"expected a value for each of {len(rays)} rays, got {len(values)}")
+    if mu is not None and mu_rays is None and mu.shape != volume.shape:
+        raise ValueError(f"expected mu on the volume's lattice {volume.shape}, got {mu.shape}")
+    job = _Job(
+        is_double=volume.dtype == np.float64,
+        attenuation=0 if mu is None else 1 if mu_rays is None else 2,
+        volume=_lattice(volume, volume, kernel is _library.backproject),
+        mu=_Lattice() if mu is None else _lattice(mu, volume),
+        **{name: array.ctypes.data for name, array in others.items() if array is not None},
+    )
+    arrays = [_fans(rays, mu_rays)] if isinstance(rays, IndexFans) else _columns(rays, mu_rays)
+    addresses = [array.ctypes.data for array in arrays]  # of what lives until the kernel is done
+    if isinstance(rays, IndexFans):
+        job.fans, job.n_fans = addresses[0], len(rays.table)
+    else:
+        job.list = _RayList(*addresses, len(rays))
+    kernel(level, job)
+
+
+def _columns(rays: IndexRays, mu_rays: Any) -> list[Array]:
+    """Starts, directions and lengths as the kernels take them."""
+    columns = (column.T for each in (rays, mu_rays or rays) for column in (each.starts, each.directions))
+    return [np.ascontiguousarray(column) for column in (*columns, rays.lengths)]
+
+
+def _fans(rays: IndexFans, mu_rays: Any) -> Array:
+    """Fans as the kernels take them."""
+    fans = np.zeros(len(rays.table), _FAN)
+    fans["volume"], fans["world"] = rays.table[:, :4], rays.table[:, 5:]
+    fans["world"][:, 0] -= rays.table[:, 4]
+    if mu_rays is not None:
+        fans["mu"] = mu_rays.table[:, :4]
+    fans["lines"], fans["rays"] = rays.shape
+    return fans
+
+
+def _lattice(voxels: Array, alike: Array, written: bool = False) -> _Lattice:
+    """Voxels of the kind of `alike`."""
+    most_along = _MOST_ALONG if voxels.dtype == np.float32 else _MOST_VOXELS
+    if voxels.size > _MOST_VOXELS or max(voxels.shape) > most_along:
+        raise InputError(
+            f"backend 'cpu': {' x '.join(map(str, voxels.shape))} voxels, but there can be at most {_MOST_VOXELS}, and "
+            f"{_MOST_ALONG} along an axis in float32; use the backend numpy"
+        )
+    flags, kind = voxels.flags, voxels.dtype
+    if (
+        kind not in (np.float32, np.float64)
+        or kind != alike.dtype
+        or not flags.c_contiguous
+        or written > flags.writeable
+    ):
+        raise TypeError(f"expected C-ordered voxels of {alike.dtype}, got {kind}, strides {voxels.strides}")
+    return _Lattice(voxels.ctypes.data, voxels.shape)

@@ -1,0 +1,297 @@
+"""Siddon's line integrals on an NVIDIA GPU, one thread a ray, several views a launch: the kernels are `warp_kernels`.
+
+Why NVIDIA Warp: one wheel for each of Linux, Windows and macOS without bounds on numpy, which brings its own compilers
+and runs the very same kernels on the CPU, where they are tested. Triton has no official wheel for Windows, and its programs
+are of blocks, not of rays that walk.
+
+The volume is on the device as a whole. The rays are made there, from their fans; they are launched in pieces that leave
+half of the free memory alone. An array is copied to the device and the results back at every call, a tensor on the device
+is worked on where it is, on torch's stream.
+"""
+
+from __future__ import annotations
+
+import atexit
+import ctypes
+import functools
+import math
+import os
+import shutil
+import sys
+import tempfile
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import numpy as np
+import warp as wp
+from numpy.typing import NDArray
+
+from ...arrays import ArrayOrTensor, is_tensor, to_numpy
+from ...errors import InputError
+from ...memory import readable_size
+from ..rays import Attenuation, IndexRays, Rays
+
+DEVICE_VARIABLE = "MPHDRR_CUDA_DEVICE"
+"""Environment variable: the Warp device for arrays, "cuda" if not set. "cpu" runs the kernels without a GPU: for tests."""
+
+_RAYS_AT_ONCE = 2**24
+_FEWEST_RAYS = 2**14  # some megabytes; torch may hold memory that it does not use
+_BYTES_OF_A_FAN = 2 * 8 * 24  # in the index space of the volume and of mu
+_BYTES_OF_A_PLANE = 2**31  # Warp's strides are 32 bits wide; offsets are 64
+
+_ROOM_FOR_KERNELS = 16 * 2**20
+
+_loading = threading.Lock()
+_loaded: set[str] = set()
+
+
+def forward(volume: ArrayOrTensor, rays: Rays, attenuation: Attenuation | None = None) -> ArrayOrTensor:
+    """Line integrals (N,), value x mm, of `volume` (n_x, n_y, n_z) along `rays`, attenuated towards their sources."""
+    name = "integrate" if attenuation is None else "integrate_attenuated"
+    with _Call(volume, rays, attenuation) as call:
+        return call.rows(name, [call.on_device(volume, "the volume")])
+
+
+def adjoint(volume: ArrayOrTensor, values: ArrayOrTensor, rays: Rays, attenuation: Attenuation | None = None) -> None:
+    """Add `values` (N,), each along its ray with the weights of `forward`, to `volume` in place, in no fixed order."""
+    name = "spread" if attenuation is None else "spread_attenuated"
+    with _Call(volume, rays, attenuation) as call:
+        filled = call.on_device(volume, "the volume")
+        call.spread(name, [filled], values)
+        _copy_back(filled, volume)
+
+
+def derivatives(volume: ArrayOrTensor, rays: Rays, attenuation: Attenuation | None = None) -> ArrayOrTensor:
+    """What the ends of `rays` do to their integrals (N, 7), or attenuated (N, 14), as `backends` describes it."""
+    name, columns = ("differentiate", 7) if attenuation is None else ("differentiate_attenuated", 14)
+    with _Call(volume, rays, attenuation) as call:
+        return call.rows(name, [call.on_device(volume, "the volume")], columns)
+
+
+def mu_gradient(
+    gradient: ArrayOrTensor, volume: ArrayOrTensor, values: ArrayOrTensor, rays: Rays, attenuation: Attenuation
+) -> None:
+    """Add to `gradient`, of mu's shape, each of `values` (N,) times its line integral's derivatives by mu."""
+    with _Call(volume, rays, attenuation) as call:
+        filled = call.on_device(gradient, "the gradient")
+        call.spread("spread_on_mu", [filled, call.on_device(volume, "the volume")], values)
+        _copy_back(filled, gradient)
+
+
+def native(x: ArrayOrTensor) -> ArrayOrTensor:
+    """`x` as float32: a tensor that is on the device stays there, all else becomes an array."""
+    if is_tensor(x) and (x.is_cuda or (x.device.type == "cpu" and device().is_cpu)):
+        return x.detach().float().resolve_neg().contiguous()  # Warp does not see torch's lazy minus sign
+    return to_numpy(x, np.float32)
+
+
+def device() -> Any:
+    """The device for arrays (a `warp.Device`).
+
+    Raises
+    ------
+    InputError
+        This machine has no NVIDIA GPU, or no driver for it.
+    """
+    name = os.environ.get(DEVICE_VARIABLE, "cuda")
+    if name != "cpu" and not has_driver():
+        raise InputError("backend 'cuda': no NVIDIA driver found on this machine; use backend 'auto' or 'cpu'")
+    with _loading, _quiet():
+        _initialize()
+        try:
+            return wp.get_device(name)
+        except (RuntimeError, ValueError) as error:
+            reason = str(error).splitlines()[0]
+            raise InputError(f"backend 'cuda': no NVIDIA GPU that can be used ({name}: {reason})") from None
+
+
+def has_driver() -> bool:
+    """Whether NVIDIA's driver is there; Warp complains on standard error if it has to find that out by itself."""
+    names = ("nvcuda.dll",) if sys.platform == "win32" else ("libcuda.so", "libcuda.so.1")
+    return any(map(_loads, names))
+
+
+@functools.cache
+def _loads(library: str) -> bool:
+    try:
+        ctypes.CDLL(library)
+    except OSError:
+        return False
+    return True
+
+
+class _Call:
+    """Rays on their way through the device: what is needed of a call, and its launches."""
+
+    def __init__(self, volume: ArrayOrTensor, rays: Rays, attenuation: Attenuation | None) -> None:
+        self._stream: Any = None
+        if is_tensor(volume):
+            self._device = wp.device_from_torch(volume.device)
+            if volume.is_cuda:
+                self._stream = wp.ScopedStream(wp.stream_from_torch(volume.device))
+        else:
+            self._device = device()
+        self._like = volume
+        self._kernels = _kernels(self._device)
+        self._fans, self._lines, self._rays = _table(rays)
+        self._attenuation = attenuation
+        self._mu_fans = self._fans
+        if attenuation is not None and attenuation.rays is not None:
+            self._mu_fans = _table(attenuation.rays)[0]
+
+    def __enter__(self) -> _Call:
+        if self._stream is not None:
+            self._stream.__enter__()
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, traceback: Any) -> None:
+        if self._stream is not None:
+            self._stream.__exit__(kind, error, traceback)
+        if isinstance(error, RuntimeError) and "Failed to allocate" in str(error):
+            free = readable_size(self._device.free_memory)
+            raise InputError(f"backend 'cuda': {self._device.name} has too little free memory, {free}") from error
+
+    def on_device(self, array: ArrayOrTensor, what: str) -> Any:
+        """`array` as an array of Warp, copied only where it is not on the device."""
+        if array.shape[1] * array.shape[2] * 4 >= _BYTES_OF_A_PLANE:
+            raise InputError(f"backend 'cuda': {what} has {array.shape[1]} x {array.shape[2]} voxels a plane, too many")
+        if is_tensor(array):
+            return wp.from_torch(array)
+        free = self._device.free_memory
+        if array.nbytes > free:
+            raise InputError(
+                f"backend 'cuda': {what} takes {readable_size(array.nbytes)}, but {readable_size(free)} are free on "
+                f"{self._device.name}"
+            )
+        return wp.array(array, dtype=wp.float32, device=self._device)
+
+    def rows(self, name: str, volumes: list[Any], *columns: int) -> ArrayOrTensor:
+        """What a kernel writes, (N,), or (N, columns)."""
+        volumes += self._mu()
+        shape = (len(self._fans), self._lines, self._rays, *columns)
+        result = self._like.new_empty(shape) if is_tensor(self._like) else np.empty(shape, np.float32)
+        for fans, lines in self._pieces(math.prod(columns)):
+            piece = result[fans, lines]
+            out = wp.from_torch(piece) if is_tensor(piece) else wp.empty(piece.shape, wp.float32, device=self._device)
+            self._launch(name, fans, lines, volumes, out)
+            _copy_back(out, piece)
+        return result.reshape(-1, *columns)
+
+    def spread(self, name: str, volumes: list[Any], values: ArrayOrTensor) -> None:
+        """Launch a kernel that adds each ray's value of `values` (N,) to the first of `volumes`."""
+        volumes += self._mu()
+        values = values.reshape(len(self._fans), self._lines, self._rays)
+        for fans, lines in self._pieces(1):
+            piece = values[fans, lines]
+            if is_tensor(piece):
+                piece = wp.from_torch(native(piece))
+            else:
+                piece = wp.array(np.ascontiguousarray(piece, np.float32), dtype=wp.float32, device=self._device)
+            self._launch(name, fans, lines, volumes, piece)
+
+    def _mu(self) -> list[Any]:
+        return [] if self._attenuation is None else [self.on_device(self._attenuation.mu, "mu")]
+
+    def _pieces(self, columns: int) -> Iterator[tuple[slice, slice]]:
+        """Which fans, and which of their lines, are launched together."""
+        bytes_of_a_ray = 4 * columns + _BYTES_OF_A_FAN / (self._lines * self._rays)
+        affordable = max(_FEWEST_RAYS, int(self._device.free_memory / 2 / bytes_of_a_ray))
+        at_once = min(_RAYS_AT_ONCE, affordable)
+        fans = max(1, at_once // (self._lines * self._rays))
+        lines = self._lines if fans > 1 else min(self._lines, max(1, at_once // self._rays))
+        for fan in range(0, len(self._fans), fans):
+            for line in range(0, self._lines, lines):
+                yield slice(fan, min(fan + fans, len(self._fans))), slice(line, min(line + lines, self._lines))
+
+    def _launch(self, name: str, fans: slice, lines: slice, volumes: list[Any], numbers: Any) -> None:
+        rays = [wp.array(self._fans[fans], dtype=wp.vec3d, device=self._device)]
+        if self._attenuation is not None:
+            apart = self._mu_fans is not self._fans
+            mu_rays = wp.array(self._mu_fans[fans], dtype=wp.vec3d, device=self._device) if apart else rays[0]
+            rays += [mu_rays, int(apart)]
+        dim = (fans.stop - fans.start, lines.stop - lines.start, self._rays)
+        kernel = getattr(self._kernels, name)
+        wp.launch(kernel, dim, inputs=[*volumes, *rays, lines.start, numbers], device=self._device)
+
+
+def _table(rays: Rays) -> tuple[NDArray[np.float64], int, int]:
+    """Rays as the kernels take them: fans (F, 8, 3), their lines and the rays of a line. A single ray is a fan, too."""
+    if isinstance(rays, IndexRays):
+        table = np.zeros((len(rays), 8, 3))
+        table[:, 0] = rays.starts
+        table[:, 1] = rays.starts + rays.directions
+        table[:, 5, 0] = rays.lengths
+        return table, 1, 1
+    return rays.table, *rays.shape
+
+
+def _copy_back(array: Any, to: ArrayOrTensor) -> None:
+    """What is on the device into the array that it is for; a tensor has it already."""
+    if not is_tensor(to):
+        to[...] = array.numpy()
+
+
+def _kernels(device: Any) -> ModuleType:
+    """The kernels, compiled for `device`: from the cache on disk where that is possible."""
+    from . import warp_kernels
+
+    with _loading:
+        if device.alias not in _loaded:
+            with _quiet():
+                try:
+                    wp.load_module(warp_kernels, device=device)
+                except Exception:  # a full disk, a damaged file: that only costs the time of compiling
+                    wp.config.kernel_cache_dir = _scratch_folder()
+                    wp.get_module(warp_kernels.__name__).unload()
+                    wp.load_module(warp_kernels, device=device)
+            _loaded.add(device.alias)
+    return warp_kernels
+
+
+def _initialize() -> None:
+    """Start Warp with its cache in `_cache_folder`, unless the user has chosen another or has started it already."""
+    if wp.config.kernel_cache_dir is None and "WARP_CACHE_PATH" not in os.environ:
+        folder = str(_cache_folder())
+        try:
+            os.makedirs(folder, exist_ok=True)
+            tempfile.TemporaryFile(dir=folder).close()
+            if shutil.disk_usage(folder).free < _ROOM_FOR_KERNELS:  # on a full disk Warp's compiler aborts
+                folder = _scratch_folder()
+        except OSError:
+            folder = _scratch_folder()
+        wp.config.kernel_cache_dir = folder
+    wp.init()
+
+
+def _cache_folder() -> Path:
+    """The folder of this user in which Warp may keep what it can make again."""
+    if sys.platform == "win32":
+        base = os.environ.get("LOCALAPPDATA") or Path.home() / "AppData" / "Local"
+    elif sys.platform == "darwin":
+        base = Path.home() / "Library" / "Caches"
+    else:
+        base = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
+    return Path(base) / "mphdrr" / "warp"
+
+
+@functools.cache
+def _scratch_folder() -> str:
+    """A folder for the time that Python runs."""
+    folder = tempfile.mkdtemp(prefix="mphdrr-warp-")
+    atexit.register(shutil.rmtree, folder, ignore_errors=True)
+    return folder
+
+
+@contextmanager
+def _quiet() -> Iterator[None]:
+    """No words from Warp but warnings: it tells of every start and of every module."""
+    level = wp.config.log_level
+    wp.config.log_level = max(level, wp.LOG_WARNING)
+    try:
+        yield
+    finally:
+        wp.config.log_level = level

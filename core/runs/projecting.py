@@ -1,0 +1,124 @@
+"""From a system and a volume to a projection run: the main job, as one call."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from ..errors import InputError, InputWarning
+from ..geometry.system import Detector, PinholeSystem
+from ..geometry.views import Views
+from ..memory import require
+from ..physics.noise import sample_counts
+from ..progress import Progress
+from ..projector import Emission, Model, Projector, Transmission, intensity
+from ..validation import positive
+from ..volumes.volume import Volume
+from .run import ProjectionRun
+
+
+def project_run(
+    system: PinholeSystem,
+    volume: Volume,
+    shape: tuple[int, int] = (256, 256),
+    detector: Detector = "virtual",
+    magnification: float = 10.0,
+    pitch: ArrayLike | None = None,
+    backend: str = "auto",
+    threads: int | None = None,
+    settings: Mapping[str, Any] | None = None,
+    model: Model | None = None,
+    photons: float | None = None,
+    noise_seed: int | None = None,
+    progress: Progress | None = None,
+) -> ProjectionRun:
+    """Project `volume` into every module of `system`.
+
+    Parameters
+    ----------
+    system, volume
+        What sees, and what is seen.
+    shape, detector, magnification, pitch
+        The images, see `PinholeSystem.views`.
+    backend, threads
+        See `Projector`.
+    settings
+        More to record in the run.
+    model
+        `Transmission` (the default), an `Emission` or an `InverseSquareSum` of the same system.
+    photons
+        Of an X-ray source, per pixel: the run of a volume of mu holds those that pass (`intensity`), not line integrals.
+    noise_seed
+        With an `Emission` or `photons`: the run holds counts drawn with this seed (`sample_counts`), not their means.
+    progress
+        Called as ``progress(done, total)`` after every view; may raise `Cancelled`.
+
+    Raises
+    ------
+    InputError
+        A setting is out of range, the volume holds what the model has no meaning for, or the images do not fit into memory.
+    """
+    model = Transmission() if model is None else model
+    model.check_volume(volume)
+    if photons is not None:
+        if not isinstance(model, Transmission) or volume.quantity != "mu":
+            raise InputError(
+                f"photons: expected the transmission of a volume of mu, got {model.name} of {volume.quantity}"
+            )
+        photons = positive(photons, "photons")
+    elif noise_seed is not None and not isinstance(model, Emission):
+        raise InputError("noise_seed: only the counts of an Emission, or photons that pass, have noise")
+    lowest, highest = float(volume.array.min()), float(volume.array.max())
+    if isinstance(model, Emission) and lowest < -0.1 * abs(highest):  # interpolation leaves less
+        _warn(f"the activity is {lowest:g} to {highest:g} kBq/mL: what is below 0 makes counts below 0")
+    views = system.views(shape=shape, detector=detector, magnification=magnification, pitch=pitch)
+    _warn_of_unseen(volume, views, ends_at_plane=not isinstance(model, Emission))
+    n_v, n_u = views.shape
+    require(4.0 * len(views) * n_v * n_u, f"a set of {len(views)} projections of {n_v} x {n_u} pixels")
+    projector = Projector(volume.grid, views, model=model, backend=backend, threads=threads)
+    images = np.empty((len(views), n_v, n_u), np.float32)
+    for m, image in enumerate(projector.iter_views(volume)):
+        images[m] = image if photons is None else intensity(image, photons)
+        if progress is not None:
+            progress(m + 1, len(views))
+    if noise_seed is not None:
+        images = sample_counts(images, noise_seed).astype(np.float32)
+    record = {
+        "detector": detector,
+        "magnification": float(magnification),
+        "pitch_mm": None if pitch is None else np.broadcast_to(pitch, 2).tolist(),
+        "model": model.name,
+        **model.record(),
+        **({} if photons is None else {"photons": photons}),
+        "backend": projector.backend,
+        **(settings or {}),
+    }
+    unit = model.unit(volume) if photons is None else "photons"
+    return ProjectionRun(images, system, views, volume, unit=unit, settings=record, seed=noise_seed)
+
+
+def warn_of_energy(model: Model, energy: float, what: str) -> None:
+    """Warn where mu holds at an energy (keV) whose photons the model does not count; `what` names the mu."""
+    window = model.window if isinstance(model, Emission) else None
+    if window is not None and not window[0] <= energy <= window[1]:
+        _warn(f"{what} holds at {energy:g} keV, photons of {window[0]:g} to {window[1]:g} keV are counted")
+
+
+def _warn_of_unseen(volume: Volume, views: Views, ends_at_plane: bool) -> None:
+    """Warn where a volume lies beside the isocentre, or beyond the plane at which the rays end."""
+    index = volume.grid.index_from_world[:3, 3]
+    if np.any(index < -0.5) or np.any(index > np.array(volume.grid.shape) - 0.5):
+        _warn("the isocentre, at which the modules aim, lies outside the volume's grid: check the volume's position")
+    corners = np.concatenate([volume.grid.corners(), np.ones((8, 1))], axis=1)
+    depth = corners @ views.projection_matrices()[:, 2].T  # (8, M), 1 at the virtual detector's plane
+    cut = int(np.any(depth > 1, axis=0).sum())
+    if ends_at_plane and cut:
+        _warn(f"{cut} of {len(views)} virtual detectors stand in front of parts of the volume: raise the magnification")
+
+
+def _warn(text: str) -> None:
+    warnings.warn(text, InputWarning, stacklevel=4)

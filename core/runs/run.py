@@ -1,0 +1,101 @@
+"""A projection run: the images, and everything they were made from."""
+
+from __future__ import annotations
+
+import contextlib
+import platform
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from importlib import metadata
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..errors import InputError
+from ..geometry.system import PinholeSystem
+from ..geometry.views import Views
+from ..validation import freeze, real_array
+from ..version import VERSION
+from ..volumes.volume import Volume
+
+
+def versions() -> dict[str, str]:
+    """Versions of mphDRR, Python and what the numbers depend on; "cpu" is the level of the compiled kernels."""
+    found = {"mphdrr": VERSION, "python": platform.python_version(), "numpy": np.__version__}
+    with contextlib.suppress(metadata.PackageNotFoundError):
+        found["torch"] = metadata.version("torch")
+    with contextlib.suppress(ImportError, OSError):  # there is none for this platform
+        from ..projector.backends import siddon_cpu
+
+        found["cpu"] = siddon_cpu.levels()[siddon_cpu.level]
+    return found
+
+
+@dataclass(frozen=True, eq=False)
+class ProjectionRun:
+    """The images of one run, with geometry, volume and provenance.
+
+    Attributes
+    ----------
+    projections : float32 array (M, n_v, n_u)
+        Column index along +u, row index along +v.
+    system : PinholeSystem
+        The M modules.
+    views : Views
+        The M images' rays.
+    volume : Volume
+        What was projected.
+    unit : str
+        Of the projections, such as ``"kBq/mL mm"``.
+    settings : mapping
+        How they were made (detector, magnification, model, backend, phantom ...): anything JSON can hold.
+    seed : int or None
+        Of the random numbers drawn, None where none were.
+    workbook, workbook_sha256 : str
+        Name and SHA-256 of the geometry workbook; empty where there is none.
+    versions : mapping
+        Of mphDRR and what it ran on.
+
+    Raises
+    ------
+    InputError
+        The parts do not fit together.
+    """
+
+    projections: NDArray[np.float32]
+    system: PinholeSystem
+    views: Views
+    volume: Volume
+    unit: str = ""
+    settings: Mapping[str, Any] = field(default_factory=dict)
+    seed: int | None = None
+    workbook: str = ""
+    workbook_sha256: str = ""
+    versions: Mapping[str, str] = field(default_factory=versions)
+
+    def __post_init__(self) -> None:
+        if len(self.views) != len(self.system):
+            raise InputError(f"run: {len(self.system)} modules, but {len(self.views)} views")
+        shape = (len(self.views), *self.views.shape)
+        projections = self.projections
+        if not (isinstance(projections, np.ndarray) and projections.dtype == np.float32):
+            projections = real_array(projections, "projections", shape, np.float32)
+        if projections.shape != shape:
+            raise InputError(f"run: expected projections of shape {shape}, got {projections.shape}")
+        object.__setattr__(self, "projections", freeze(projections.view()))
+        if not self.unit:
+            object.__setattr__(self, "unit", f"{self.volume.unit} mm")
+        source = self.system.source
+        if source is not None and not self.workbook_sha256:
+            object.__setattr__(self, "workbook", source.path.name)
+            object.__setattr__(self, "workbook_sha256", source.sha256)
+
+    def intrinsics(self) -> NDArray[np.float64]:
+        """Camera matrices K (M, 3, 3), pixels: ``K @ (x_u, x_v, x_k)`` is a multiple of ``(column, row, 1)``.
+
+        (x_u, x_v, x_k) is a point in the module's frame, mm from the pinhole.
+        """
+        rotations = self.system.poses()[:, :3, :3]
+        matrices = self.views.projection_matrices()[:, :, :3] @ rotations
+        return matrices / matrices[:, 2:, 2:]

@@ -1,0 +1,76 @@
+"""What a file of voxels holds, before it is a `Volume`.
+
+The world's axes are NIfTI's: +x to the patient's right, +y to the front (anterior), +z to the head (superior): RAS. DICOM
+and ITK's formats have theirs to the left, the back (posterior) and the head: LPS.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ...errors import InputError
+from ...geometry.grid import Grid
+from ...memory import require
+from ...validation import freeze
+from ..volume import UNITS, Volume
+
+RAS_FROM_LPS = np.diag([-1.0, -1.0, 1.0, 1.0])
+"""World mm of DICOM and ITK to ours, on column vectors."""
+
+
+@dataclass(frozen=True)
+class Contents:
+    """A file's voxels.
+
+    Attributes
+    ----------
+    array : array (n_x, n_y, n_z)
+        The values, of any real type.
+    affine : array (4, 4) or None
+        Index to world mm; None where the file does not say.
+    quantity, unit : str or None
+        What the file says that the values are.
+    """
+
+    array: NDArray[Any]
+    affine: NDArray[np.float64] | None
+    quantity: str | None = None
+    unit: str | None = None
+
+    def volume(self, quantity: str) -> Volume:
+        """The volume, its values taken as `quantity`."""
+        require_voxels(self.array.shape, self.array.dtype)
+        if self.affine is None:
+            raise InputError("it has no affine: give one (index to world mm, 4 x 4)")
+        expected = UNITS.get(self.quantity or quantity)
+        if self.unit and expected and self.unit != expected:
+            raise InputError(f"its values are in {self.unit}; expected {expected} for {self.quantity or quantity}")
+        n_x, n_y, n_z = self.array.shape
+        with np.errstate(over="ignore"):  # what overflows float32 is refused as not finite
+            array = np.ascontiguousarray(self.array, np.float32)
+        return Volume(freeze(array), Grid((n_x, n_y, n_z), self.affine), quantity)
+
+
+def require_voxels(shape: Sequence[int], kind: np.dtype[Any]) -> None:
+    """Raise `InputError` unless an image of `shape` and of type `kind` is 3-D, of real numbers, and fits into memory."""
+    sizes = " x ".join(map(str, shape)) or "of one value"
+    if len(shape) != 3:
+        raise InputError(f"expected a 3-D image, got shape {sizes}")
+    if min(shape) < 1:
+        raise InputError(f"expected at least one voxel along each axis, got {sizes}")
+    if kind.kind not in "fiub":
+        raise InputError(f"expected real numbers, found {kind}")
+    # As the file has them, as float32, and what the check for finite numbers takes.
+    require((4.5 + kind.itemsize) * math.prod(int(n) for n in shape), f"a volume of {sizes} voxels")
+
+
+def first_line(error: BaseException) -> str:
+    """What a library said, as one line."""
+    lines = [line.strip() for line in str(error).splitlines() if line.strip()]
+    return lines[0] if lines else type(error).__name__

@@ -1,0 +1,47 @@
+"""HDF5: datasets ``array`` and ``affine``, the quantity and the unit as attributes of the array. A run's volume, too."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ...errors import InputError
+from ..volume import Volume
+from .contents import Contents, require_voxels
+
+
+def read(path: Path) -> Contents:
+    """Read .h5 or .hdf5: the volume at the file's root, or in the group ``volume`` as in a run."""
+    import h5py
+
+    with h5py.File(path, "r") as file:
+        place = file["volume"] if isinstance(file.get("volume"), h5py.Group) else file
+        array, affine = place.get("array"), place.get("affine")
+        for name, dataset in (("array", array), ("affine", affine)):
+            if not isinstance(dataset, h5py.Dataset):
+                found = ", ".join(place) or "nothing"
+                raise InputError(f"expected the datasets array and affine; {name} not found (there are: {found})")
+        require_voxels(array.shape, array.dtype)
+        length = _text(affine.attrs.get("unit"))
+        if length not in (None, "mm"):
+            raise InputError(f"its affine is in {length}: expected mm")
+        quantity = _text(array.attrs.get("quantity", file.attrs.get("volume_quantity")))
+        return Contents(array[()], np.asarray(affine[()]), quantity, _text(array.attrs.get("unit")))
+
+
+def write(volume: Volume, path: Path) -> None:
+    """Write the volume at the file's root."""
+    import h5py
+
+    with h5py.File(path, "w") as file:
+        array = file.create_dataset("array", data=volume.array, compression="gzip", compression_opts=1, shuffle=True)
+        array.attrs.update(quantity=volume.quantity, unit=volume.unit)
+        file.create_dataset("affine", data=volume.grid.affine).attrs.update(
+            unit="mm", description="index to world, on column vectors; an integer index is a voxel's centre"
+        )
+
+
+def _text(value: Any) -> str | None:
+    return value.decode() if isinstance(value, bytes) else None if value is None else str(value)

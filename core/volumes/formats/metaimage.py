@@ -1,0 +1,154 @@
+"""MetaImage, ITK's format: a header of ``Key = Value`` lines, and raw or zlib-compressed voxels in it or beside it.
+
+Of Python's libraries only ITK and SimpleITK read it, at 50 MB for each platform; the format is short enough to be read here.
+Its description: https://itk.org/Wiki/ITK/MetaIO/Documentation
+"""
+
+from __future__ import annotations
+
+import warnings
+import zlib
+from pathlib import Path
+from typing import BinaryIO
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ...errors import InputError, InputWarning
+from .contents import RAS_FROM_LPS, Contents, require_voxels
+
+_TYPES = {
+    "MET_CHAR": "i1",
+    "MET_UCHAR": "u1",
+    "MET_SHORT": "i2",
+    "MET_USHORT": "u2",
+    "MET_INT": "i4",
+    "MET_UINT": "u4",
+    "MET_LONG": "i4",
+    "MET_ULONG": "u4",
+    "MET_LONG_LONG": "i8",
+    "MET_ULONG_LONG": "u8",
+    "MET_FLOAT": "f4",
+    "MET_DOUBLE": "f8",
+}
+_MILLIMETRES = {"mm": 1.0, "cm": 10.0, "um": 0.001, "?": 1.0}
+_LONGEST_HEADER = 1 << 16
+
+
+def read(path: Path) -> Contents:
+    """Read .mha, or .mhd and the files beside it."""
+    with open(path, "rb") as file:
+        header = _header(file)
+        sizes = _numbers(header, ("DimSize",), None)
+        if not (sizes == np.floor(sizes)).all():
+            raise InputError(f"DimSize = {header['DimSize']}: expected whole numbers")
+        shape = tuple(int(n) for n in sizes)
+        if int(header.get("ElementNumberOfChannels", 1)) != 1:
+            raise InputError(f"expected one value per voxel, found {header['ElementNumberOfChannels']}")
+        kind = header.get("ElementType", "nothing")
+        if kind not in _TYPES:
+            raise InputError(f"ElementType {kind}: expected one of {', '.join(_TYPES)}")
+        big = _true(header.get("BinaryDataByteOrderMSB", header.get("ElementByteOrderMSB", "False")))
+        type_ = np.dtype((">" if big else "<") + _TYPES[kind])
+        require_voxels(shape, type_)
+        _refuse_scaled(header)
+        values = np.frombuffer(_data(header, file, path, type_.itemsize * int(np.prod(shape, dtype=object))), type_)
+    return Contents(values.reshape(shape, order="F"), _affine(header, path))
+
+
+def _header(file: BinaryIO) -> dict[str, str]:
+    """The keys and values up to ElementDataFile, the last one; `file` is left where the voxels may begin."""
+    header: dict[str, str] = {}
+    while "ElementDataFile" not in header:
+        line = file.readline(_LONGEST_HEADER)
+        key, equals, value = line.decode("latin-1").partition("=")
+        if not equals:
+            raise InputError("not a MetaImage file: expected lines of Key = Value up to ElementDataFile")
+        header[key.strip()] = value.strip()
+    if header.get("ObjectType", "Image") != "Image":
+        raise InputError(f"expected ObjectType = Image, found {header['ObjectType']}")
+    return header
+
+
+def _data(header: dict[str, str], file: BinaryIO, path: Path, size: int) -> bytes:
+    """The `size` bytes of voxels."""
+    where = header["ElementDataFile"]
+    if where.upper().startswith("LIST") or "%" in where:
+        raise InputError(f"ElementDataFile = {where}: voxels in several files are not read; convert them to one")
+    if not _true(header.get("BinaryData", "True")):
+        raise InputError("BinaryData = False: voxels written as text are not read")
+    if where.upper() != "LOCAL":
+        beside = path.parent / where
+        if not beside.is_file():
+            raise InputError(f"its voxels are in {where}, which is not beside it")
+        with open(beside, "rb") as raw:
+            return _unpacked(header, raw, size, where)
+    return _unpacked(header, file, size, "it")
+
+
+def _unpacked(header: dict[str, str], file: BinaryIO, size: int, name: str) -> bytes:
+    skip = int(header.get("HeaderSize", 0))
+    if _true(header.get("CompressedData", "False")):
+        # One byte more than expected, so that too much data shows.
+        data = zlib.decompressobj(zlib.MAX_WBITS | 32).decompress(file.read(), size + 1)
+    else:
+        if skip == -1:  # the voxels are the last bytes of the file
+            file.seek(-size, 2)
+        elif skip:
+            file.seek(skip, 1)
+        data = file.read(size + 1)
+    if len(data) != size:
+        more = "more" if len(data) > size else f"{len(data)}"
+        raise InputError(f"expected {size} bytes of voxels (DimSize x ElementType), {name} holds {more}")
+    return data
+
+
+def _affine(header: dict[str, str], path: Path) -> NDArray[np.float64]:
+    """Index to world mm; warns of what is not in the header."""
+    spacing, offset = ("ElementSpacing", "ElementSize"), ("Offset", "Position", "Origin")
+    turned = ("TransformMatrix", "Rotation", "Orientation")
+    said = "AnatomicalOrientation"  # ITK's programs write it beside the matrix, which is what counts
+    if not header.keys() & set(turned) and header.get(said, "RAI").upper() not in ("RAI", "???"):
+        raise InputError(f"{said} = {header[said]} without a TransformMatrix: expected the matrix, or RAI")
+    affine = np.eye(4)
+    # Row i of the matrix in the file is the direction of axis i.
+    directions = _numbers(header, turned, np.eye(3).ravel()).reshape(3, 3)
+    affine[:3, :3] = directions.T * _numbers(header, spacing, np.ones(3))
+    affine[:3, 3] = _numbers(header, offset, np.zeros(3))
+    unit = header.get("DistanceUnits", "?")
+    if unit not in _MILLIMETRES:
+        raise InputError(f"DistanceUnits = {unit}: expected mm, cm or um")
+    affine[:3] *= _MILLIMETRES[unit]
+    assumed = ["voxels of 1 mm"] * (not header.keys() & set(spacing))
+    assumed += ["the first voxel's centre at (0, 0, 0)"] * (not header.keys() & set(offset))
+    if assumed:
+        text = f"{path}: it does not say how it lies; taken as: {'; '.join(assumed)}"
+        warnings.warn(text, InputWarning, stacklevel=4)
+    return RAS_FROM_LPS @ affine
+
+
+def _refuse_scaled(header: dict[str, str]) -> None:
+    """Refuse voxels that stand for other values."""
+    for key, plain in (("ElementToIntensityFunctionSlope", 1.0), ("ElementToIntensityFunctionOffset", 0.0)):
+        if _numbers(header, (key,), np.array([plain]))[0] != plain:
+            raise InputError(f"{key} = {header[key]}: values that are to be scaled are not read")
+
+
+def _numbers(header: dict[str, str], keys: tuple[str, ...], default: NDArray[np.float64] | None) -> NDArray[np.float64]:
+    """The numbers of the first of `keys` that there is, as many as `default` has."""
+    text = next((header[key] for key in keys if key in header), None)
+    if text is None:
+        if default is None:
+            raise InputError(f"it has no {keys[0]}")
+        return default
+    try:
+        numbers = np.array(text.split(), np.float64)
+    except ValueError:
+        raise InputError(f"{keys[0]} = {text}: expected numbers") from None
+    if default is not None and len(numbers) != len(default):
+        raise InputError(f"{keys[0]} = {text}: expected {len(default)} numbers")
+    return numbers
+
+
+def _true(text: str) -> bool:
+    return text.strip().lower() in ("true", "t", "1", "yes")

@@ -1,0 +1,240 @@
+"""NRRD, by pynrrd."""
+
+from __future__ import annotations
+
+import warnings
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ...errors import InputError, InputWarning
+from ..volume import Volume
+from .contents import Contents, first_line, require_voxels
+
+# The signs that turn a space's axes into right, anterior, superior. A space without a name is taken as that.
+_SPACES = {
+    None: (1, 1, 1),
+    "right-anterior-superior": (1, 1, 1),
+    "ras": (1, 1, 1),
+    "left-anterior-superior": (-1, 1, 1),
+    "las": (-1, 1, 1),
+    "left-posterior-superior": (-1, -1, 1),
+    "lps": (-1, -1, 1),
+    "3d-right-handed": (1, 1, 1),
+}
+# Units of length; an empty one is unknown, and taken as mm like one that is not there.
+_MILLIMETRES = {
+    **dict.fromkeys(("", "mm", "millimeter", "millimeters", "millimetre", "millimetres"), 1.0),
+    **dict.fromkeys(("cm", "centimeter", "centimeters", "centimetre", "centimetres"), 10.0),
+    **dict.fromkeys(("m", "meter", "meters", "metre", "metres"), 1000.0),
+    **dict.fromkeys(("um", "µm", "micron", "microns", "micrometer", "micrometers"), 0.001),
+}
+# The kinds of an axis along which a volume extends; "???" and "none" say nothing.
+_SPATIAL = ("domain", "space", "none", "???")
+_UNITS = {
+    "hounsfield": "HU",
+    "hounsfield unit": "HU",
+    "hounsfield units": "HU",
+    "hu": "HU",
+    "mm-1": "1/mm",
+    "mm^-1": "1/mm",
+}
+# Fields that say what the values are or where they lie, by the names that pynrrd knows.
+_SYNONYMS = {
+    "axismins": "axis mins", "axismaxs": "axis maxs", "centers": "centerings", "oldmin": "old min", "oldmax": "old max",
+    "lineskip": "line skip", "byteskip": "byte skip", "datafile": "data file",
+}  # fmt: skip
+_FIELDS = (
+    "space", "space dimension", "space units", "space origin", "space directions", "spacings", "units", "kinds",
+    "sample units", *_SYNONYMS.values(),
+)  # fmt: skip
+_SAME = 1e-6  # by how much, of a spacing, two statements of one length may differ: they are rounded decimals
+
+
+def read(path: Path) -> Contents:
+    """Read .nrrd, or .nhdr and the file beside it."""
+    import nrrd
+
+    header = _known_names(nrrd.read_header(str(path)))
+    for name in ("type", "sizes"):
+        if name not in header:
+            raise InputError(f"it has no field {name}: it is damaged or ends early")
+    kind = header["type"]
+    if kind == "block":
+        raise InputError("expected real numbers, found blocks of bytes")
+    require_voxels(header["sizes"], np.dtype(np.float64 if kind == "double" else np.float32))
+    _refuse_quantized(header)
+    where = header.get("data file", "")
+    if where.upper().startswith("LIST") or "%" in where:
+        raise InputError(f"data file: {where}: voxels in several files are not read; convert them to one")
+    affine = _affine(header, path)
+    try:
+        array, _ = nrrd.read(str(path))
+    except Exception as error:  # of what is not there, pynrrd says little or nothing
+        sizes = " x ".join(map(str, header["sizes"]))
+        raise InputError(f"its data are damaged or end early; expected {sizes} voxels ({first_line(error)})") from error
+    unit = header.get("unit") or header.get("sample units")
+    return Contents(array, affine, header.get("quantity"), _UNITS.get(unit.lower(), unit) if unit else None)
+
+
+def write(volume: Volume, path: Path) -> None:
+    """Write .nrrd with the exact affine."""
+    import nrrd
+
+    affine = volume.grid.affine
+    header = {
+        "space": "right-anterior-superior",
+        "space directions": affine[:3, :3].T,
+        "space origin": affine[:3, 3],
+        "space units": ["mm"] * 3,
+        "encoding": "gzip",
+        "quantity": volume.quantity,
+        "unit": volume.unit,
+    }
+    nrrd.write(str(path), volume.array, header, compression_level=1)
+
+
+def _known_names(header: dict[str, Any]) -> dict[str, Any]:
+    """The header with one name for each field.
+
+    Raises
+    ------
+    InputError
+        A field is there under a name that pynrrd leaves unread, such as "Spacings".
+    """
+    found: dict[str, Any] = {}
+    for name, value in header.items():
+        known = _SYNONYMS.get(name.lower(), name.lower())
+        if known in _FIELDS and name != name.lower():
+            raise InputError(f"field {name!r}: expected it in small letters, {known!r}")
+        found[known if known in _FIELDS else name] = value
+    return found
+
+
+def _refuse_quantized(header: dict[str, Any]) -> None:
+    """Refuse whole numbers that stand for others, from "old min" to "old max"."""
+    ends = [header[name] for name in ("old min", "old max") if np.isfinite(float(header.get(name, np.nan)))]
+    if ends and header["type"] not in ("float", "double"):
+        raise InputError("old min and old max: quantized values are not read; unquantize them (unu unquantize)")
+
+
+def _affine(header: dict[str, Any], path: Path) -> np.ndarray:
+    """Index to world mm; warns of what is not in the header."""
+    space = header.get("space")
+    name = None if space is None else space.lower()
+    if name not in _SPACES:
+        raise InputError(
+            f"space {space!r}: expected right-anterior-superior, left-posterior-superior or another of 3-D"
+        )
+    kinds = header.get("kinds", ["space"] * 3)
+    if any(kind.lower() not in _SPATIAL for kind in kinds):
+        raise InputError(f"kinds {' '.join(kinds)}: expected three axes of space or domain")
+    affine, assumed = np.eye(4), [] if name else ["axes right, anterior, superior"]
+    origin = None if "space origin" not in header else np.asarray(header["space origin"], np.float64)
+    space_units = _scales(header, "space units", None)
+    if "space directions" in header:
+        affine[:3, :3] = _of_space(header, np.asarray(header["space directions"], np.float64))
+        units = _scales(header, "units", None)
+        if space_units is None and units is not None and np.ptp(units) == 0:
+            space_units = units
+        elif units is not None and np.any(units != (1.0 if space_units is None else space_units)):
+            raise InputError("units: the axes' own differ from the space's; expected space units alone")
+        scale = np.ones(3) if space_units is None else space_units
+    else:
+        scale = np.ones(3) if space_units is None else space_units
+        own = _scales(header, "units", scale)
+        spacings, first, said = _of_axes(header)
+        assumed += said
+        affine[:3, :3] = np.diag(spacings * own / scale)
+        if first is not None:
+            first = first * own / scale
+            if origin is not None and np.any(np.abs(first - origin) > _SAME * np.abs(spacings * own / scale)):
+                raise InputError(f"axis mins and space origin say different places: {_text(first)} and {_text(origin)}")
+            origin = first
+    if origin is None:
+        assumed.append("the first voxel's centre at (0, 0, 0)")
+    else:
+        affine[:3, 3] = origin
+    affine[:3] *= scale[:, None]
+    if assumed:
+        warnings.warn(
+            f"{path}: it does not say how it lies; taken as: {'; '.join(assumed)}", InputWarning, stacklevel=4
+        )
+    return np.diag([*map(float, _SPACES[name]), 1.0]) @ affine
+
+
+def _of_space(header: dict[str, Any], directions: np.ndarray) -> np.ndarray:
+    """The directions as columns; the format allows no statements of the axes' own beside them: these must be the same."""
+    if directions.shape != (3, 3) or not np.isfinite(directions).all():
+        raise InputError("space directions: expected a vector for each of three axes")
+    if any(np.isfinite(_numbers(header, name)).any() for name in ("axis mins", "axis maxs")):
+        raise InputError("axis mins or axis maxs beside space directions: expected space origin alone")
+    spacings, lengths = _numbers(header, "spacings"), np.linalg.norm(directions, axis=1)
+    if np.any(np.abs(spacings - lengths) > _SAME * lengths):
+        raise InputError(f"spacings and space directions say different lengths: {_text(spacings)} and {_text(lengths)}")
+    return directions.T
+
+
+def _of_axes(header: dict[str, Any]) -> tuple[np.ndarray, np.ndarray | None, list[str]]:
+    """The axes' own spacings and the centre of the first voxel, if there is one; and what has been assumed.
+
+    "axis mins" and "axis maxs" are the outer faces of the first and the last voxel where an axis is cell-centred, and these
+    voxels' centres where it is node-centred.
+    """
+    spacings, low, high = (_numbers(header, name) for name in ("spacings", "axis mins", "axis maxs"))
+    assumed: list[str] = []
+    if not np.isfinite(low).any():
+        if np.isfinite(high).any():
+            raise InputError("axis maxs: expected axis mins beside them")
+        if np.isfinite(spacings).any():
+            return _all_of(spacings, "spacings"), None, assumed
+        return np.ones(3), None, ["voxels of 1 mm"]
+    low = _all_of(low, "axis mins")
+    centerings = header.get("centerings", ["???"] * 3)
+    centerings = [c.lower() for c in (centerings.split() if isinstance(centerings, str) else centerings)]
+    if len(centerings) != 3 or not set(centerings) <= {"cell", "node", "none", "???"}:
+        raise InputError(f"centerings {' '.join(centerings)}: expected cell or node for each of three axes")
+    if not set(centerings) <= {"cell", "node"}:
+        assumed = ["axis mins at the first voxel's face (centerings: cell)"]
+    node = np.array([c == "node" for c in centerings])
+    if np.isfinite(high).any():
+        steps = np.asarray(header["sizes"]) - node
+        if np.any(steps < 1):
+            raise InputError("axis maxs: an axis of one node has no spacing; expected spacings and axis mins")
+        between = (_all_of(high, "axis maxs") - low) / steps
+        if np.any(np.abs(spacings - between) > _SAME * np.abs(between)):
+            raise InputError(
+                f"spacings and axis mins and maxs say different lengths: {_text(spacings)} and {_text(between)}"
+            )
+        spacings = between
+    spacings = _all_of(spacings, "spacings")
+    return spacings, low + np.where(node, 0.0, spacings / 2), assumed
+
+
+def _numbers(header: dict[str, Any], name: str) -> np.ndarray:
+    """A field's three numbers, NaN for those that it does not say."""
+    numbers = np.asarray(header.get(name, [np.nan] * 3), np.float64)
+    if numbers.shape != (3,):
+        raise InputError(f"{name}: expected 3 numbers, got {_text(np.atleast_1d(numbers))}")
+    return numbers
+
+
+def _all_of(numbers: np.ndarray, name: str) -> np.ndarray:
+    if not np.isfinite(numbers).all():
+        raise InputError(f"{name}: expected 3 numbers, got {_text(numbers)}")
+    return numbers
+
+
+def _scales(header: dict[str, Any], name: str, default: np.ndarray | None) -> np.ndarray | None:
+    """mm of a field's three units."""
+    units = header.get(name)
+    if units is None:
+        return default
+    if len(units) != 3 or any(unit.strip() not in _MILLIMETRES for unit in units):
+        raise InputError(f"{name} {' '.join(units)}: expected mm, cm, m or um for each of three axes")
+    return np.array([_MILLIMETRES[unit.strip()] for unit in units])
+
+
+def _text(numbers: np.ndarray) -> str:
+    return " ".join(f"{x:g}" for x in numbers.ravel())

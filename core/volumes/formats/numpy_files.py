@@ -1,0 +1,39 @@
+"""npz with the exact affine, and bare npy arrays."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from ...errors import InputError
+from ..volume import Volume
+from .contents import Contents
+
+
+def read(path: Path) -> Contents:
+    """Read .npz with the arrays array, affine, quantity and (if it is there) unit; or .npy, which has no affine."""
+    with open(path, "rb") as start:
+        if not start.read(6).startswith((b"\x93NUMPY", b"PK")):  # numpy takes what is not its own for pickled objects
+            raise InputError("not a file of numpy")
+    file = np.load(path, allow_pickle=False)
+    if path.suffix.lower() == ".npy":
+        if not isinstance(file, np.ndarray):
+            raise InputError("expected a single array, found an npz archive")
+        return Contents(file, None)
+    if not isinstance(file, np.lib.npyio.NpzFile):
+        raise InputError("expected an npz archive, found a single array")
+    with file:
+        missing = {"array", "affine", "quantity"} - set(file.files)
+        if missing:
+            raise InputError(f"expected the arrays array, affine and quantity; {', '.join(sorted(missing))} not found")
+        unit = str(file["unit"]) if "unit" in file.files else None
+        return Contents(file["array"], file["affine"], str(file["quantity"]), unit)
+
+
+def write(volume: Volume, path: Path) -> None:
+    """Write .npz."""
+    with open(path, "wb") as file:
+        np.savez_compressed(
+            file, array=volume.array, affine=volume.grid.affine, quantity=volume.quantity, unit=volume.unit
+        )

@@ -1,0 +1,193 @@
+"""Closed triangle meshes: what they are, their files, and where they are open."""
+
+from __future__ import annotations
+
+import os
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from ...errors import InputError
+from ...files import replacing
+from ...geometry.frames import checked_affine
+from ...validation import freeze, real_array
+
+MESH_FORMATS = (".stl", ".obj", ".ply", ".glb")
+"""Endings of the names of mesh files."""
+MILLIMETRES = {"um": 0.001, "mm": 1.0, "cm": 10.0, "m": 1000.0, "in": 25.4}
+"""Units of length in which meshes are written."""
+
+# Corners closer than this share of the mesh's size are one: files keep six digits or more.
+_SAME_POINT = 1e-7
+
+
+@dataclass(frozen=True, eq=False)
+class Mesh:
+    """A surface of triangles.
+
+    Attributes
+    ----------
+    vertices : array (V, 3)
+        World mm.
+    faces : int array (F, 3)
+        Indices of vertices, counter-clockwise as seen from outside.
+    """
+
+    vertices: NDArray[np.float64]
+    faces: NDArray[np.int64]
+
+    def __post_init__(self) -> None:
+        vertices = real_array(self.vertices, "mesh vertices", (None, 3))
+        faces = np.asarray(self.faces)
+        if faces.ndim != 2 or faces.shape[1] != 3 or faces.dtype.kind not in "iu":
+            raise InputError(
+                f"mesh faces: expected F x 3 indices of vertices, got {faces.dtype} of shape {faces.shape}"
+            )
+        if len(faces) == 0:
+            raise InputError("mesh: it has no faces")
+        if faces.min() < 0 or faces.max() >= len(vertices):
+            raise InputError(f"mesh faces: expected indices from 0 to {len(vertices) - 1}")
+        object.__setattr__(self, "vertices", freeze(vertices))
+        object.__setattr__(self, "faces", freeze(faces.astype(np.int64)))
+
+    @property
+    def volume(self) -> float:
+        """Enclosed volume, mm^3: positive where the faces look outwards."""
+        # About the middle, so that a far-away mesh loses no digits.
+        a, b, c = ((self.vertices - self.vertices.mean(axis=0))[self.faces[:, i]] for i in range(3))
+        return float(np.einsum("ij,ij->", a, np.cross(b, c)) / 6)
+
+    def transformed(self, pose: ArrayLike) -> Mesh:
+        """The mesh after an affine world-from-mesh transform (4, 4)."""
+        matrix = checked_affine(pose, "pose")
+        return Mesh(self.vertices @ matrix[:3, :3].T + matrix[:3, 3], self.faces)
+
+
+def read_mesh(path: str | os.PathLike[str], unit: str | None = None) -> Mesh:
+    """Read the triangles of a mesh file, all its objects as one.
+
+    Parameters
+    ----------
+    path
+        .stl, .obj, .ply or .glb.
+    unit
+        Of the file's lengths: one of `MILLIMETRES`. Default: mm; of .glb m, as its standard says.
+
+    Raises
+    ------
+    InputError
+        No such file, damaged, no triangles, or an unknown unit.
+    """
+    import trimesh
+
+    path = Path(path)
+    ending = _ending(path)
+    factor = _factor(unit, ending)
+    if not _is_file(path):
+        raise InputError(f"{path}: no such file")
+    try:
+        mesh = trimesh.load(path, process=False, force="mesh")
+        return Mesh(np.asarray(mesh.vertices) * factor, np.asarray(mesh.faces))
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from None
+    except Exception as error:  # whatever trimesh raises on a damaged file
+        said = (str(error).strip() or type(error).__name__).splitlines()[0]
+        raise InputError(f"{path}: cannot be read as {ending} ({said})") from error
+
+
+def write_mesh(mesh: Mesh, path: str | os.PathLike[str], unit: str | None = None) -> None:
+    """Write a mesh as .stl, .obj, .ply or .glb, in `unit` as of `read_mesh`.
+
+    Raises
+    ------
+    InputError
+        No mesh, another suffix, an unknown unit, or the file cannot be written.
+    """
+    import trimesh
+
+    path = Path(path)
+    ending = _ending(path)
+    factor = _factor(unit, ending)
+    mesh = as_mesh(mesh)
+    with replacing(path) as temporary:
+        trimesh.Trimesh(mesh.vertices / factor, mesh.faces, process=False).export(temporary, file_type=ending[1:])
+
+
+def as_mesh(given: Any) -> Mesh:
+    """What the caller gave as a `Mesh`: one, a trimesh mesh or scene, (vertices, faces), or the path of a file."""
+    if isinstance(given, Mesh):
+        return given
+    if isinstance(given, str | os.PathLike):
+        return read_mesh(given)
+    if hasattr(given, "to_mesh"):  # a trimesh scene: its objects where they are
+        given = given.to_mesh()
+    if hasattr(given, "vertices") and hasattr(given, "faces"):
+        return Mesh(given.vertices, given.faces)
+    try:
+        vertices, faces = given
+    except (TypeError, ValueError):
+        raise InputError(f"mesh: expected a mesh, vertices and faces, or a path, got {type(given).__name__}") from None
+    return Mesh(vertices, faces)
+
+
+def require_closed(mesh: Mesh) -> None:
+    """Refuse a surface that is not closed, or whose faces do not all look to the same side.
+
+    Raises
+    ------
+    InputError
+        Names the number of bad edges and the middle of one of them, world mm.
+    """
+    vertices = mesh.vertices
+    size = float(np.ptp(vertices, axis=0).max())
+    # Files such as .stl have each triangle's corners for itself.
+    steps = np.round((vertices - vertices.min(axis=0)) / (_SAME_POINT * size or 1.0))
+    order = np.lexsort(steps.T)
+    new = np.append(True, (np.diff(steps[order], axis=0) != 0).any(axis=1))
+    first, merged = order[new], np.empty(len(vertices), np.int64)
+    merged[order] = np.cumsum(new) - 1
+    corners = merged[mesh.faces]
+    # A triangle with two corners in one has no area, and its edges cancel.
+    corners = corners[(corners != np.roll(corners, 1, axis=1)).all(axis=1)]
+    start, end = corners.ravel(), np.roll(corners, -1, axis=1).ravel()
+    key, index = np.unique(np.minimum(start, end) * len(first) + np.maximum(start, end), return_inverse=True)
+    edge = np.stack(np.divmod(key, len(first)))
+    uses = np.bincount(index)
+    turns = np.bincount(index, np.where(start < end, 1, -1))
+
+    def refuse(bad: NDArray[np.int64], what: str, remedy: str) -> None:
+        if len(bad):
+            x, y, z = vertices[first[edge[:, bad[0]]]].mean(axis=0)
+            count = f"{len(bad)} edge{'s' * (len(bad) > 1)}"
+            raise InputError(f"mesh: {what} at {count}, the first at ({x:.4g}, {y:.4g}, {z:.4g}) mm; {remedy}")
+
+    refuse(
+        np.flatnonzero(uses % 2), "it is not closed", "expected an even number of faces at each edge: fill the holes"
+    )
+    refuse(
+        np.flatnonzero(turns), "faces look to different sides", "expected all to look outwards: recalculate the normals"
+    )
+
+
+def _is_file(path: Path) -> bool:
+    try:
+        return path.is_file()
+    except OSError:  # a name that cannot be
+        return False
+
+
+def _ending(path: Path) -> str:
+    ending = path.suffix.lower()
+    if ending not in MESH_FORMATS:
+        raise InputError(f"{path}: expected a name ending in {', '.join(MESH_FORMATS)}")
+    return ending
+
+
+def _factor(unit: str | None, ending: str) -> float:
+    unit = unit or ("m" if ending == ".glb" else "mm")
+    if unit not in MILLIMETRES:
+        raise InputError(f"unit {unit!r}: expected one of {', '.join(MILLIMETRES)}")
+    return MILLIMETRES[unit]

@@ -1,0 +1,135 @@
+"""Volumes to meshes: the surface at a level, for display and print.
+
+Marching tetrahedra (A. Doi, A. Koide, IEICE Trans. E74 (1991) 214-224): each cube between eight voxels' centres is cut into
+the six tetrahedra of H. Kuhn, alike in all cubes, so that the surface is closed whatever the values are, which the tables of
+marching cubes do not promise. A compiled library would be faster, and one more wheel for every platform.
+"""
+
+from __future__ import annotations
+
+from itertools import permutations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ...errors import InputError
+from ...memory import require
+from ...progress import Progress
+from ...validation import real_array
+from ..resampling import outside_value
+from ..volume import Volume, require_volume
+from .mesh import Mesh
+
+# A cube's corners, numbered 4 x + 2 y + z. Each tetrahedron walks from corner 0 to 7 along the three axes in one order.
+_WALKS = list(permutations((4, 2, 1)))
+_TETRAHEDRA = [np.cumsum((0, *walk)) for walk in _WALKS]
+_MIRRORED = [walk in ((4, 1, 2), (2, 4, 1), (1, 2, 4)) for walk in _WALKS]  # odd orders of the axes
+_CORNERS = np.array([[n >> 2 & 1, n >> 1 & 1, n & 1] for n in range(8)])
+
+
+def volume_to_mesh(volume: Volume, level: float | None = None, progress: Progress | None = None) -> Mesh:
+    """The closed surface around the voxels of at least `level`.
+
+    It runs where the volume, interpolated between the voxels' centres, has that value. Beside the grid the volume is 0 (CT
+    numbers: -1000): what the grid cuts off is closed there.
+
+    Parameters
+    ----------
+    volume
+        Any quantity.
+    level
+        In its unit. Default: halfway between what is beside the grid and the largest value.
+    progress
+        Called as ``progress(done, total)`` with slabs; may raise `Cancelled`.
+
+    Raises
+    ------
+    InputError
+        No volume, the level is no number, not above what is beside the grid, or no voxel reaches it.
+    """
+    require_volume(volume, "volume_to_mesh")
+    beside = outside_value(volume)
+    highest = float(volume.array.max())
+    level = (beside + highest) / 2 if level is None else float(real_array(level, "level", ()))
+    if not beside < level <= highest:
+        raise InputError(
+            f"level {level:g}: expected above {beside:g}, the value beside the grid, and at most {highest:g}, the largest"
+        )
+    array = volume.array
+    shape = np.array(array.shape) + 2  # with a margin of one voxel
+    strides = np.array([shape[1] * shape[2], shape[2], 1])
+    planes = [_plane(array, i, beside) for i in (-1, 0)]
+    keys, shares = [], []
+    for i in range(shape[0] - 1):
+        for new_keys, new_shares in _triangles(planes[0], planes[1], level, i * strides[0], strides):
+            keys.append(new_keys)
+            shares.append(new_shares)
+        planes = [planes[1], _plane(array, i + 1, beside)]
+        if progress is not None:
+            progress(i + 1, int(shape[0]) - 1)
+    key = np.concatenate(keys)
+    require(200.0 * key.size, f"a mesh of {len(key)} triangles")
+    edges, first, faces = np.unique(key, return_index=True, return_inverse=True)
+    corner, direction = np.divmod(edges, 8)
+    index = np.stack(np.unravel_index(corner, shape), axis=1) - 1.0
+    index += np.concatenate(shares).reshape(-1)[first, None] * _CORNERS[direction]
+    affine = volume.grid.affine
+    faces = faces.reshape(-1, 3)
+    if np.linalg.det(affine[:3, :3]) < 0:
+        faces = faces[:, ::-1]
+    return Mesh(index @ affine[:3, :3].T + affine[:3, 3], faces)
+
+
+def _plane(array: NDArray[np.float32], i: int, beside: float) -> NDArray[np.float64]:
+    """The values of one plane with its margin."""
+    if 0 <= i < len(array):
+        return np.pad(array[i].astype(np.float64), 1, constant_values=beside)
+    return np.full((array.shape[1] + 2, array.shape[2] + 2), beside)
+
+
+def _triangles(
+    below: NDArray[np.float64], above: NDArray[np.float64], level: float, first: int, strides: NDArray[np.int64]
+) -> list[tuple[NDArray[np.int64], NDArray[np.float64]]]:
+    """Triangles between two planes: their corners' edges (N, 3), and where on these they lie (N, 3), 0 to 1.
+
+    An edge is 8 times its lower corner's flat index plus the corner of the cube that it points to.
+    """
+    values = np.stack(
+        [plane[y : y - 1 or None, z : z - 1 or None] for plane in (below, above) for y in (0, 1) for z in (0, 1)]
+    )
+    inside = values >= level
+    j, k = np.nonzero(inside.any(axis=0) & ~inside.all(axis=0))
+    values, inside = values[:, j, k], inside[:, j, k]
+    corner = first + j * strides[1] + k * strides[2] + (_CORNERS @ strides)[:, None]
+    found = []
+    for tetrahedron, mirrored in zip(_TETRAHEDRA, _MIRRORED, strict=True):
+        case = (1 << np.arange(4)) @ inside[tetrahedron]
+        for number, triangles in _CASES.items():
+            cubes = np.flatnonzero(case == number)
+            for triangle in triangles if len(cubes) else ():
+                ends = tetrahedron[np.array(triangle[::-1] if mirrored else triangle)]  # (3, 2)
+                low, high = ends.min(axis=1), ends.max(axis=1)
+                start, stop = values[low][:, cubes], values[high][:, cubes]
+                keys = corner[low][:, cubes] * 8 + (high - low)[:, None]
+                found.append((keys.T, ((level - start) / (stop - start)).T))
+    return found
+
+
+def _cases() -> dict[int, list[list[tuple[int, int]]]]:
+    """For each set of a tetrahedron's corners that are inside, as bits: triangles of edges, seen from outside."""
+    points = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [1, 1, 1]])  # of the first walk
+    cases = {}
+    for number in range(1, 15):
+        inside = [n for n in range(4) if number >> n & 1]
+        outside = [n for n in range(4) if not number >> n & 1]
+        edges = [(a, b) for a in inside for b in outside]
+        if len(edges) == 4:  # around the quadrilateral
+            edges[2:] = edges[:1:-1]
+        a, b, c = (points[list(edge)].mean(axis=0) for edge in edges[:3])
+        if np.cross(b - a, c - a) @ (points[outside].mean(axis=0) - points[inside].mean(axis=0)) < 0:
+            edges.reverse()
+        cases[number] = [[edges[0], edges[n], edges[n + 1]] for n in range(1, len(edges) - 1)]
+    return cases
+
+
+_CASES = _cases()

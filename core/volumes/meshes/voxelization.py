@@ -1,0 +1,307 @@
+"""Closed meshes to volumes: the share of every voxel that lies inside, exactly.
+
+The triangles are cut along all planes between voxels. Each piece then bounds a prism that reaches from it to the end of
+its column of voxels: of the piece's own voxel it takes a part that is known exactly, of the further ones the piece's area.
+Summed with the sign of the side that the piece looks to, the prisms give the mean winding number of each voxel (the
+divergence theorem). That is the covered share, unless the mesh runs through itself: a voxel at such a place may hold parts
+with the winding numbers 0 and 2. There the share is the mean over many rays along z, of each the length that is inside.
+"""
+
+from __future__ import annotations
+
+import math
+import os
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from ...errors import InputError
+from ...geometry.grid import Grid
+from ...memory import require
+from ...progress import Progress
+from ...validation import freeze, real_array
+from ..volume import Volume
+from .mesh import Mesh, as_mesh, require_closed
+
+_VOXELS, _POLYGONS = 1 << 21, 1 << 14  # at once
+_FEWEST = 16  # voxels across a mesh
+# Where a mesh runs through itself: rays for all of it (and at once), at the most voxels from one to the next, and triangles
+# times rays to look at at once.
+_RAYS, _STEP, _CANDIDATES = 1 << 18, 0.25, 1 << 20
+_ROUNDING = 1e-9  # shares closer than this to 0 and 1 are that
+
+
+def voxelize_mesh(
+    mesh: Any,
+    grid: Grid,
+    value: ArrayLike = 1.0,
+    quantity: str = "activity",
+    progress: Progress | None = None,
+) -> Volume:
+    """The volume of one closed mesh, or of several.
+
+    Parameters
+    ----------
+    mesh
+        A `Mesh`, a trimesh mesh or scene, ``(vertices (V, 3), faces (F, 3))`` in world mm, or the path of a file (see
+        `read_mesh`); or a list of these, of which later ones replace what they cover of earlier ones.
+    grid
+        Where the voxels are; any affine. What of the mesh lies beside it is left out.
+    value
+        Inside, in the quantity's unit: one number, or one for each mesh. 0 outside.
+    quantity
+        What the values are.
+    progress
+        Called as ``progress(done, total)`` between slabs; may raise `Cancelled`.
+
+    Raises
+    ------
+    InputError
+        A mesh is open or its faces look to different sides, and where; or it is no mesh.
+    """
+    if not isinstance(grid, Grid):
+        raise InputError(f"voxelize_mesh: expected a Grid, got {type(grid).__name__}")
+    several = isinstance(mesh, Sequence) and not isinstance(mesh, str) and not _is_pair(mesh)
+    meshes = [as_mesh(one) for one in (mesh if several else [mesh])]
+    if not meshes:
+        raise InputError("voxelize_mesh: expected at least one mesh")
+    values = real_array(np.broadcast_to(value, len(meshes)) if np.ndim(value) == 0 else value, "value", (len(meshes),))
+    require(8.5 * grid.n_voxels, "a volume of {} x {} x {} voxels".format(*grid.shape))
+    array = np.zeros(grid.shape, np.float32)
+    for i, (one, inside) in enumerate(zip(meshes, values, strict=True)):
+
+        def report(done: int, total: int, i: int = i) -> None:
+            if progress is not None:
+                progress(i * total + done, len(meshes) * total)
+
+        covered = mesh_coverage(one, grid, report)
+        array += covered * (np.float32(inside) - array)
+    return Volume(freeze(array), grid, quantity)
+
+
+def mesh_coverage(mesh: Mesh, grid: Grid, progress: Progress | None = None) -> NDArray[np.float32]:
+    """Share of each voxel that lies inside a closed mesh, 0 to 1, float32 array of the grid's shape.
+
+    Where the mesh runs through itself, what any part of it encloses is inside; the shares of voxels at such places are only
+    near the exact ones, their sum to about 1/10000.
+    """
+    require_closed(mesh)
+    coverage = np.zeros(grid.shape, np.float32)
+    back = grid.index_from_world
+    # Voxel i lies between the planes i and i + 1.
+    corners = (mesh.vertices @ back[:3, :3].T + back[:3, 3] + 0.5)[mesh.faces]
+    start = np.floor(corners.min(axis=(0, 1))).clip(0, grid.shape).astype(int)
+    stop = np.ceil(corners.max(axis=(0, 1))).clip(0, grid.shape).astype(int)
+    if np.any(start >= stop):
+        return coverage
+    box = coverage[tuple(slice(a, b) for a, b in zip(start, stop, strict=True))]
+    n_x, n_y, n_z = box.shape
+    surface = _seen(_slab(_slab(corners - start, 0, 0, n_x), 1, 0, n_y))
+    # What is in front of the first voxel covers all of its column, what is behind the last one none of it.
+    in_front = _clip(surface[surface[:, :, 2].min(axis=1) < 0], 2, 0, -1)
+    in_front[:, :, 2] = 0
+    surface = _seen(_joined([in_front, _slab(surface, 2, 0, n_z)]))
+    if _fill(box, surface, progress) > 1 + _ROUNDING:
+        _fill_overlaps(box, surface, progress)
+    return coverage
+
+
+def _fill(box: NDArray[np.float32], surface: NDArray[np.float64], progress: Progress | None) -> float:
+    """Put the coverage into `box`; gives the largest winding number."""
+    n_x, n_y, n_z = box.shape
+    finer = -(-_FEWEST // max(box.shape))  # smaller voxels, so that overlaps show in few, large ones, too
+    low, high = surface[:, :, 0].min(axis=1), surface[:, :, 0].max(axis=1)
+    slab = max(1, _VOXELS // (n_y * n_z * finer**3))
+    most = 0.0
+    for first in range(0, n_x, slab):
+        last = min(first + slab, n_x)
+        pieces = _slab(surface[(low < last) & (high > first)], 0, first, last) - [first, 0, 0]
+        shape = ((last - first) * finer, n_y * finer, n_z * finer)
+        winding = np.abs(_winding(pieces * finer, shape))
+        most = max(most, float(winding.max()))
+        covered = np.minimum(winding, 1).reshape(last - first, finer, n_y, finer, n_z, finer).mean(axis=(1, 3, 5))
+        box[first:last] = _rounded(covered)
+        if progress is not None:
+            progress(last, n_x)
+    return most
+
+
+def _rounded(covered: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Shares without what rounding leaves of 0 and 1."""
+    return np.where(covered < _ROUNDING, 0, np.where(covered > 1 - _ROUNDING, 1, covered))
+
+
+def _fill_overlaps(box: NDArray[np.float32], surface: NDArray[np.float64], progress: Progress | None) -> None:
+    """Put the coverage into those columns of `box` in which the winding number passes 1."""
+    n_x, n_y, n_z = box.shape
+    low, high = surface[:, :, 0].min(axis=1), surface[:, :, 0].max(axis=1)
+    step = min(math.sqrt(n_x * n_y / _RAYS), _STEP)
+    slab = max(1, min(int(_RAYS * step**2 / n_y), _VOXELS // (n_y * n_z)))
+    for first in range(0, n_x, slab):
+        last = min(first + slab, n_x)
+        pieces = _slab(surface[(low < last) & (high > first)], 0, first, last) - [first, 0, 0]
+        covered, overlap = _along_rays(pieces, (last - first, n_y, n_z), step)
+        box[first:last][overlap] = _rounded(covered[overlap])
+        if progress is not None:
+            progress(last, n_x)
+
+
+def _along_rays(
+    surface: NDArray[np.float64], shape: tuple[int, int, int], step: float
+) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+    """The coverage of voxels by the polygons (N, V, 3) among them, from rays along z, `step` voxels apart.
+
+    Also in which columns of voxels (n_x, n_y) the winding number passes 1.
+    """
+    n_x, n_y, n_z = shape
+    # A square lattice whose rows run along no axis: so walls along the voxels are met at many different places.
+    slope = (math.sqrt(5) - 1) / 2
+    lattice = step / math.hypot(1, slope) * np.array([[1, slope], [-slope, 1]])  # its two steps, in voxels
+    corners = np.array([[0, 0], [n_x, 0], [0, n_y], [n_x, n_y]]) @ np.linalg.inv(lattice)
+    start = np.floor(corners.min(axis=0)).astype(np.int64)
+    size = np.ceil(corners.max(axis=0)).astype(np.int64) + 1 - start
+    column = np.floor((np.indices(tuple(size.tolist())).reshape(2, -1).T + start) @ lattice).astype(np.int64)
+    held = ((column >= 0) & (column < (n_x, n_y))).all(axis=1)
+    column = np.where(held, column[:, 0] * n_y + column[:, 1], 0)
+    n_rays = np.bincount(column[held], minlength=n_x * n_y).reshape(n_x, n_y, 1)
+
+    triangles = np.concatenate([surface[:, [0, i, i + 1]] for i in range(1, surface.shape[1] - 1)])
+    ray, z, side = _crossings(triangles, triangles[:, :, :2] @ np.linalg.inv(lattice) - start, size)
+    order = np.lexsort((z, ray))
+    ray, z, side = ray[order], z[order], side[order]
+    after = np.cumsum(side)  # the winding number, but for what the rays before have left
+    _, firsts, counts = np.unique(ray, return_index=True, return_counts=True)
+    after -= np.repeat((after - side)[firsts], counts)
+    enters = (after != 0).astype(np.int64) - (after != side)  # 1 where the ray enters, -1 where it leaves
+    voxel = np.floor(z).astype(np.int64).clip(0, n_z - 1)
+    place, own = column[ray] * (n_z + 1) + voxel, enters * (voxel + 1 - z)
+    steps = np.zeros(n_x * n_y * (n_z + 1))
+    np.add.at(steps, place, own)
+    np.add.at(steps, place + 1, enters - own)
+    covered = np.cumsum(steps.reshape(n_x, n_y, n_z + 1), axis=2)[:, :, :n_z] / n_rays
+    overlap = np.bincount(column[ray], np.abs(after) > 1, n_x * n_y).reshape(n_x, n_y) > 0
+    return covered, overlap
+
+
+def _crossings(
+    triangles: NDArray[np.float64], seen: NDArray[np.float64], size: NDArray[np.int64]
+) -> tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.int64]]:
+    """Where rays along z meet `triangles` (N, 3, 3): the ray's number, z, and 1 or -1 for the side of the triangle.
+
+    The rays stand on a lattice of `size` (2,); `seen` (N, 3, 2) are the corners in the lattice's steps.
+    """
+    low = np.ceil(seen.min(axis=1)).astype(np.int64).clip(0, size)
+    extent = (np.floor(seen.max(axis=1)).astype(np.int64).clip(-1, size - 1) - low + 1).clip(0)
+    number = extent.prod(axis=1)
+    found = []
+    for some in np.split(np.arange(len(number)), np.flatnonzero(np.diff(np.cumsum(number) // _CANDIDATES)) + 1):
+        of = np.repeat(some, number[some])
+        nth = np.arange(len(of)) - np.repeat(np.cumsum(number[some]) - number[some], number[some])
+        at = low[of] + np.stack(np.divmod(nth, extent[of, 1]), axis=1)
+        a, b, c = (seen[of] - at[:, None]).transpose(1, 2, 0)
+        # Twice the areas between the ray and each side.
+        parts = np.stack([p[0] * q[1] - p[1] * q[0] for p, q in ((b, c), (c, a), (a, b))])
+        hit = (parts > 0).all(axis=0) | (parts < 0).all(axis=0)
+        parts = parts[:, hit]
+        whole = parts.sum(axis=0)
+        z = np.einsum("in,ni->n", parts, triangles[of[hit], :, 2]) / whole
+        found.append((at[hit] @ [size[1], 1], z, np.sign(whole).astype(np.int64)))
+    ray, z, side = map(np.concatenate, zip(*found, strict=True))
+    return ray, z, side
+
+
+def _winding(surface: NDArray[np.float64], shape: tuple[int, int, int]) -> NDArray[np.float64]:
+    """Mean winding number of each voxel from the polygons (N, V, 3) of a surface among them."""
+    n_x, n_y, n_z = shape
+    steps = np.zeros(n_x * n_y * (n_z + 1))  # of the winding number, from each voxel to the next
+    for first in range(0, len(surface), _POLYGONS):
+        pieces = surface[first : first + _POLYGONS]
+        cells = np.zeros((len(pieces), 3), np.int64)
+        for axis in range(3):
+            pieces, cells = _split(pieces, cells, axis, shape[axis])
+        area, moment = np.zeros(len(pieces)), np.zeros(len(pieces))
+        tip = pieces[:, 0]
+        for i in range(1, pieces.shape[1] - 1):  # a fan of triangles
+            left, right = pieces[:, i] - tip, pieces[:, i + 1] - tip
+            seen_along_z = (left[:, 0] * right[:, 1] - left[:, 1] * right[:, 0]) / 2  # with the sign of its side
+            area += seen_along_z
+            moment += seen_along_z * (tip[:, 2] + (left[:, 2] + right[:, 2]) / 3)
+        own = area * (cells[:, 2] + 1) - moment
+        voxel = (cells[:, 0] * n_y + cells[:, 1]) * (n_z + 1) + cells[:, 2]
+        np.add.at(steps, voxel, own)
+        np.add.at(steps, voxel + 1, area - own)
+    return np.cumsum(steps.reshape(n_x, n_y, n_z + 1), axis=2)[:, :, :n_z]
+
+
+def _split(
+    pieces: NDArray[np.float64], cells: NDArray[np.int64], axis: int, n: int
+) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+    """The `pieces` (N, V, 3) cut at the whole numbers along `axis`, and `cells` (N, 3), along that axis theirs."""
+    low = np.floor(pieces[:, :, axis].min(axis=1)).astype(np.int64).clip(0, n - 1)
+    high = np.ceil(pieces[:, :, axis].max(axis=1)).astype(np.int64).clip(low + 1, n)
+    counts = high - low
+    whole, several = np.flatnonzero(counts == 1), np.flatnonzero(counts > 1)
+    of = np.repeat(several, counts[several])
+    before = np.cumsum(counts[several]) - counts[several]
+    cell = low[of] + np.arange(len(of)) - np.repeat(before, counts[several])
+    parts = _slab(pieces[of], axis, cell, cell + 1)
+    cells = cells[np.concatenate([whole, of])]
+    cells[:, axis] = np.concatenate([low[whole], cell])
+    return _joined([pieces[whole], parts]), cells
+
+
+def _joined(pieces: list[NDArray[np.float64]]) -> NDArray[np.float64]:
+    """Pieces of different numbers of corners in one array; the last corner is repeated."""
+    corners = max(part.shape[1] for part in pieces)
+    return np.concatenate([part[:, np.minimum(np.arange(corners), part.shape[1] - 1)] for part in pieces])
+
+
+def _slab(pieces: NDArray[np.float64], axis: int, low: ArrayLike, high: ArrayLike) -> NDArray[np.float64]:
+    """What of `pieces` lies between two planes each."""
+    return _clip(_clip(pieces, axis, low, 1), axis, high, -1)
+
+
+def _seen(pieces: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Those of `pieces` that have an area as seen along z; the others cover nothing."""
+    return pieces[(np.ptp(pieces[:, :, :2], axis=1) > 0).all(axis=1)]
+
+
+def _clip(pieces: NDArray[np.float64], axis: int, plane: ArrayLike, side: int) -> NDArray[np.float64]:
+    """What of convex `pieces` (N, V, 3) lies above (`side` 1) or below (-1) each one's `plane`: (N, W, 3).
+
+    I. Sutherland, G. Hodgman, "Reentrant polygon clipping", CACM 17 (1974). Corners to spare repeat the last one; what lies
+    on the other side altogether becomes a point.
+    """
+    n, corners = pieces.shape[:2]
+    plane = np.broadcast_to(plane, n)
+    depth = side * (pieces[:, :, axis] - plane[:, None])
+    if not (depth < 0).any():
+        return pieces
+    following = np.roll(depth, -1, axis=1)
+    crosses = (depth > 0) & (following < 0) | (depth < 0) & (following > 0)
+    of, corner = np.nonzero(crosses)
+    start, end = pieces[of, corner], pieces[of, (corner + 1) % corners]
+    share = depth[of, corner] / (depth[of, corner] - following[of, corner])
+    points = np.stack([pieces, pieces], axis=2)  # each corner, and what lies on the edge from it
+    points[of, corner, 1] = start + share[:, None] * (end - start)
+    points[of, corner, 1, axis] = plane[of]
+    points = points.reshape(n, 2 * corners, 3)
+    kept = np.stack([depth >= 0, crosses], axis=2).reshape(n, 2 * corners)
+    place = np.cumsum(kept, axis=1)
+    count = place[:, -1:]
+    width = max(3, int(count.max(initial=0)))
+    result = np.zeros((n, width, 3))
+    of, corner = np.nonzero(kept)
+    result[of, place[of, corner] - 1] = points[of, corner]
+    spare = np.arange(width) >= count
+    last = result[np.arange(n), np.maximum(count[:, 0] - 1, 0)]
+    return np.where(spare[:, :, None], last[:, None], result)
+
+
+def _is_pair(given: Sequence[Any]) -> bool:
+    """Whether `given` is (vertices, faces) rather than a sequence of meshes."""
+    if len(given) != 2 or any(isinstance(part, str | os.PathLike | Mesh) or hasattr(part, "faces") for part in given):
+        return False
+    return np.ndim(given[0]) == 2

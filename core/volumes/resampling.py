@@ -1,0 +1,191 @@
+"""A volume's values on another grid."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..errors import InputError
+from ..geometry.grid import Grid
+from ..memory import require
+from ..physics.ct_numbers import AIR_HU
+from ..progress import Progress
+from ..validation import freeze, real_array
+from .volume import Volume, require_volume
+
+# Indices of the given grid along an axis, and their weights: (n, taps) each, for n voxels of the new grid.
+_Taps = tuple[NDArray[np.int64], NDArray[np.float32]]
+
+_PARALLEL = 1e-9  # of a voxel per voxel: axes that turn by less are parallel
+_SLAB = 1 << 20  # samples at once
+
+
+def outside_value(volume: Volume) -> float:
+    """What lies outside a volume's grid: air, -1000, for CT numbers, and 0 of everything else."""
+    return AIR_HU if volume.quantity == "hu" else 0.0
+
+
+def resample(
+    volume: Volume, grid: Grid, method: str = "linear", outside: float | None = None, progress: Progress | None = None
+) -> Volume:
+    """`volume` on `grid`.
+
+    Parameters
+    ----------
+    volume
+        Of any grid; voxels reach half a step beyond their centres.
+    grid
+        The new one: any affine.
+    method
+        ``"linear"``: trilinear interpolation between the voxels' centres. ``"nearest"``: of the voxel that holds the new
+        voxel's centre (labels). ``"mean"``: the mean over the new voxel, for coarser grids: the sum of value x volume is
+        kept. It is exact where the grids' axes are parallel; else it is that of points in each new voxel, at least two
+        along each axis and about one for each old voxel.
+    outside
+        The value beside the old grid. Default: 0, or -1000 of CT numbers.
+    progress
+        Called as ``progress(done, total)`` with slabs; may raise `Cancelled`.
+
+    Raises
+    ------
+    InputError
+        No volume, no grid, an unknown method, or the new volume does not fit into memory.
+    """
+    if method not in ("linear", "nearest", "mean"):
+        raise InputError(f"method {method!r}: expected linear, nearest or mean")
+    require_volume(volume, "resample")
+    if not isinstance(grid, Grid):
+        raise InputError(f"resample: expected a Grid, got {type(grid).__name__}")
+    beside = np.float32(outside_value(volume) if outside is None else float(real_array(outside, "outside", ())))
+    require(4.5 * grid.n_voxels, "a volume of {} x {} x {} voxels".format(*grid.shape))
+    index_from_index = volume.grid.index_from_world @ grid.affine  # of the given volume, from the new one
+    result = np.empty(grid.shape, np.float32)
+    fill = _along_axes if _is_parallel(index_from_index) else _at_points
+    fill(volume.array, beside, index_from_index, method, result, progress or (lambda done, total: None))
+    return Volume(freeze(result), grid, volume.quantity)
+
+
+def _is_parallel(index_from_index: NDArray[np.float64]) -> bool:
+    """Whether each new axis runs along one old axis."""
+    along = np.abs(index_from_index[:3, :3]) > _PARALLEL
+    return bool((along.sum(axis=0) == 1).all() and (along.sum(axis=1) == 1).all())
+
+
+def _along_axes(
+    array: NDArray[np.float32],
+    beside: np.float32,
+    index_from_index: NDArray[np.float64],
+    method: str,
+    result: NDArray[np.float32],
+    progress: Callable[[int, int], None],
+) -> None:
+    """Fill `result` one axis after the other."""
+    old_axes = np.abs(index_from_index[:3, :3]).argmax(axis=0)  # of each new axis
+    taps = []
+    for new, old in enumerate(old_axes):
+        at = index_from_index[old, new] * np.arange(result.shape[new]) + index_from_index[old, 3]
+        taps.append(_TAPS[method](at, abs(index_from_index[old, new]), array.shape[old]))
+    array = array.transpose(old_axes)  # now its axes are the new ones
+    plane = max(array.shape[1] * array.shape[2], result.shape[1] * max(array.shape[2], result.shape[2]))
+    slab = max(1, _SLAB // plane)
+    for first in range(0, result.shape[0], slab):
+        part = slice(first, first + slab)
+        index, weight = taps[0]
+        values = _apply(array, beside, (index[part], weight[part]), 0)
+        for axis in (1, 2):
+            values = _apply(values, np.float32(0), taps[axis], axis)
+        result[part] = values + beside
+        progress(min(first + slab, result.shape[0]), result.shape[0])
+
+
+def _apply(array: NDArray[np.float32], beside: np.float32, taps: _Taps, axis: int) -> NDArray[np.float32]:
+    """Sums of ``(array - beside)`` times weights along one axis."""
+    index, weight = taps
+    shape = [1, 1, 1]
+    shape[axis] = len(index)
+    return sum((np.take(array, i, axis) - beside) * w.reshape(shape) for i, w in zip(index.T, weight.T, strict=True))
+
+
+def _nearest_taps(at: NDArray[np.float64], step: float, n: int) -> _Taps:
+    index = np.floor(at + 0.5).astype(np.int64)
+    inside = (index >= 0) & (index < n)
+    return index.clip(0, n - 1)[:, None], inside.astype(np.float32)[:, None]
+
+
+def _linear_taps(at: NDArray[np.float64], step: float, n: int) -> _Taps:
+    inside = (at >= -0.5) & (at <= n - 0.5)
+    at = at.clip(0, n - 1)
+    low = np.floor(at).astype(np.int64)
+    share = at - low
+    weight = np.stack([1 - share, share], axis=1) * inside[:, None]
+    return np.stack([low, np.minimum(low + 1, n - 1)], axis=1), weight.astype(np.float32)
+
+
+def _mean_taps(at: NDArray[np.float64], step: float, n: int) -> _Taps:
+    """Shares of the new voxel, from ``at - step/2`` to ``at + step/2``, that lie in each old one."""
+    low, high = at - step / 2 + 0.5, at + step / 2 + 0.5  # voxel i reaches from i to i + 1
+    index = np.floor(low).astype(np.int64)[:, None] + np.arange(int(np.ceil(step)) + 1)
+    overlap = np.minimum(high[:, None], index + 1) - np.maximum(low[:, None], index)
+    weight = np.where((index >= 0) & (index < n), overlap.clip(0) / step, 0)
+    return index.clip(0, n - 1), weight.astype(np.float32)
+
+
+_TAPS = {"nearest": _nearest_taps, "linear": _linear_taps, "mean": _mean_taps}
+
+
+def _at_points(
+    array: NDArray[np.float32],
+    beside: np.float32,
+    index_from_index: NDArray[np.float64],
+    method: str,
+    result: NDArray[np.float32],
+    progress: Callable[[int, int], None],
+) -> None:
+    """Fill `result` from points of its voxels: the centres, or for means several in each."""
+    linear, origin = index_from_index[:3, :3], index_from_index[:3, 3]
+    counts = [1, 1, 1]
+    if method == "mean":
+        counts = [max(2, int(np.ceil(length))) for length in np.abs(linear).max(axis=0)]
+    fractions = [(np.arange(count) + 0.5) / count - 0.5 for count in counts]
+    shifts = np.stack(np.meshgrid(*fractions, indexing="ij"), axis=-1).reshape(-1, 3) @ linear.T
+    sample = _linear_samples if method == "linear" else _nearest_samples
+    j, k = np.meshgrid(np.arange(result.shape[1]), np.arange(result.shape[2]), indexing="ij")
+    in_plane = linear[:, 1:] @ np.stack([j.ravel(), k.ravel()]) + origin[:, None]
+    for i, plane in enumerate(result):
+        values = plane.reshape(-1)
+        for first in range(0, values.size, _SLAB):
+            part = slice(first, first + _SLAB)
+            points = in_plane[:, part] + (linear[:, 0] * i)[:, None]
+            total = np.zeros(points.shape[1], np.float32)
+            for shift in shifts:
+                total += sample(array, beside, points + shift[:, None])
+            values[part] = total / len(shifts) + beside
+        progress(i + 1, len(result))
+
+
+def _nearest_samples(
+    array: NDArray[np.float32], beside: np.float32, points: NDArray[np.float64]
+) -> NDArray[np.float32]:
+    """``array - beside`` at `points` (3, N), indices; 0 outside."""
+    index = np.floor(points + 0.5).astype(np.int64)
+    size = np.array(array.shape)[:, None]
+    inside = ((index >= 0) & (index < size)).all(axis=0)
+    return (array[tuple(index.clip(0, size - 1))] - beside) * inside
+
+
+def _linear_samples(array: NDArray[np.float32], beside: np.float32, points: NDArray[np.float64]) -> NDArray[np.float32]:
+    """As `_nearest_samples`, interpolated."""
+    size = np.array(array.shape)[:, None]
+    inside = ((points >= -0.5) & (points <= size - 0.5)).all(axis=0)
+    points = points.clip(0, size - 1)
+    low = np.floor(points).astype(np.int64)
+    share = (points - low).astype(np.float32)
+    high = np.minimum(low + 1, size - 1)
+    total = np.zeros(points.shape[1], np.float32)
+    for corner in np.ndindex(2, 2, 2):
+        index = tuple(high[axis] if up else low[axis] for axis, up in enumerate(corner))
+        weight = np.prod([share[axis] if up else 1 - share[axis] for axis, up in enumerate(corner)], axis=0)
+        total += weight * (array[index] - beside)
+    return total * inside

@@ -1,4 +1,4 @@
-"""The programs themselves, where they are installed, see points where the views see them."""
+"""The programs themselves read what was exported: `make test-peers` runs these tests with all of them installed."""
 
 from __future__ import annotations
 
@@ -8,6 +8,8 @@ import numpy as np
 import pytest
 
 import mphdrr.core as mph
+from mphdrr.core.geometry.collimator import Construction
+from mphdrr.core.geometry.module_parts import module_parts
 
 from .test_geometry_export import arrays, fiducials, general_views, project
 
@@ -70,7 +72,7 @@ def detector_of(path):
 
 
 def test_rtk_projects_alike(workbook, rng, tmp_path):
-    """RTK's Joseph projector, on a smooth volume: the arrays are RTK's as they stand, whatever the sign of its distances."""
+    """RTK's Joseph projector on a smooth volume: it takes the arrays as they are, whatever the sign of its distances."""
     itk, rtk = imported_rtk()
     system = mph.read_system(workbook)[::16]
     for detector in ("virtual", "real"):
@@ -107,3 +109,26 @@ def test_astra_takes_the_geometry(views, system, rng, tmp_path):
     assert astra.geom_size(volume) == (10, 6, 4)
     identifier = astra.data3d.create("-sino", geometry)  # refused unless ASTRA finds the vectors good
     astra.data3d.delete(identifier)
+
+
+def test_lib3mf_reads_the_solids_in_strict_mode(workbook, tmp_path):
+    """Every part is a closed, oriented surface with its name, in millimetres, and nothing is worth a warning."""
+    wrapper = pytest.importorskip("lib3mf", reason="no lib3mf").get_wrapper()
+    system = mph.read_system(workbook)[::10]
+    mph.write_geometry(system, tmp_path / "a.3mf", "3mf", edge_at="front")
+    model = wrapper.CreateModel()
+    reader = model.QueryReader("3mf")
+    reader.SetStrictModeActive(True)
+    reader.ReadFromFile(str(tmp_path / "a.3mf"))
+    assert reader.GetWarningCount() == 0
+    assert model.GetUnit().name == "MilliMeter"
+    expected = {part.name: part for part in module_parts(system, Construction(edge_at="front"))}
+    objects = model.GetMeshObjects()
+    while objects.MoveNext():
+        seen = objects.GetCurrentMeshObject()
+        part = expected.pop(seen.GetName())
+        assert seen.IsManifoldAndOriented()
+        box = seen.GetOutbox()
+        assert np.allclose(box.MinCoordinate, part.vertices.min(axis=0), atol=1e-4)
+        assert np.allclose(box.MaxCoordinate, part.vertices.max(axis=0), atol=1e-4)
+    assert not expected

@@ -39,13 +39,8 @@ def _write(system: PinholeSystem, views: Views, path: Path, **options: Any) -> N
     (path / "GateMaterials.db").write_text(material_database(), encoding="ascii", newline="\n")
 
 
-GATE10 = Format(
-    "gate10",
-    "GATE 10 (opengate) script: a folder, to run by python simulation.py",
-    (),
-    _write,
-    options_of=Gate10Simulation,
-)
+_TITLE = "GATE 10 (opengate) script: a folder, to run by python simulation.py"
+GATE10 = Format("gate10", _TITLE, (), _write, options_of=Gate10Simulation)
 
 
 def _json(record: dict[str, Any]) -> str:

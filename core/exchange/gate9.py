@@ -49,6 +49,8 @@ def _write(system: PinholeSystem, views: Views, path: Path, **options: Any) -> N
         parts = (setup.phantom, *(rods.solids for rods in setup.rods))
         geometry.append(folder.macro("geometry/phantom", [x for part in parts for x in _repeated(folder, part)]))
     cuts = _under("/gate/physics", *(f"{p}/SetCutInRegion world 0.1 mm" for p in ("Gamma", "Electron", "Positron")))
+    flags = ("setRootHitFlag 0", "setRootNtupleFlag 0", "setRootSinglesFlag 1")
+    singles = _under("/gate/output/root", "enable", "setFileName singles", *flags)
     main = [
         f"# {len(system)} pinhole modules in GATE 9.3 or later. Run it from this folder: Gate main.mac",
         "/gate/geometry/setMaterialDatabase GateMaterials.db",
@@ -59,7 +61,7 @@ def _write(system: PinholeSystem, views: Views, path: Path, **options: Any) -> N
             [folder.list("digitizer/all", [_digitizer(folder, c.solids.name, simulation) for c in setup.crystals])]
         ),
         *_execute([folder.macro("source", _source(folder, setup, simulation))]),
-        *_execute([folder.macro("output", _output())]),
+        *_execute([folder.macro("output", singles)]),
         *(_execute([folder.macro("projections", _projections(setup.crystals[0], views))]) if one else []),
         "/gate/random/setEngineName MersenneTwister",
         f"/gate/random/setEngineSeed {int(simulation.seed)}",
@@ -289,11 +291,6 @@ def _source(folder: _Folder, setup: Setup, simulation: Simulation) -> list[str]:
         )
         macros.append(folder.macro(f"sources/{name}", lines))
     return _execute(macros)
-
-
-def _output() -> list[str]:
-    flags = ("setRootHitFlag 0", "setRootNtupleFlag 0", "setRootSinglesFlag 1")
-    return _under("/gate/output/root", "enable", "setFileName singles", *flags)
 
 
 def _projections(crystals: Crystals, views: Views) -> list[str]:

@@ -16,12 +16,12 @@ def collection(scene, workbook):
     return scanner.active_scanner(scene)
 
 
-@pytest.mark.parametrize("name", FORMATS)
-def test_every_format(collection, name, tmp_path):
-    path = tmp_path / f"scanner{(FORMATS[name].suffixes or ('',))[0]}"
-    assert bpy.ops.mphdrr.export_for_program(format=name, filepath=str(path)) == {"FINISHED"}
-    files = list(path.iterdir()) if path.is_dir() else [path]
-    assert files and all(file.stat().st_size > 0 for file in files)
+def test_every_format(collection, tmp_path):
+    for name, format in FORMATS.items():
+        path = tmp_path / f"{name}{(format.suffixes or ('',))[0]}"
+        assert bpy.ops.mphdrr.export_for_program(format=name, filepath=str(path)) == {"FINISHED"}
+        files = list(path.iterdir()) if path.is_dir() else [path]
+        assert files and all(file.stat().st_size > 0 for file in files)
 
 
 def test_it_is_the_scene_as_it_stands(collection, scene, tmp_path):

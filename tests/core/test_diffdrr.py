@@ -240,6 +240,9 @@ def test_generation_before_04(rng):
     image = drr(rotation, translation, parameterization="euler_angles", convention="ZYX")
     assert image.shape == (1, 1, 8, 11)
     assert torch.equal(image, drr(rotation, translation))
+    drr.reshape = False
+    assert torch.equal(drr(rotation, translation), image.reshape(1, 88))
+    drr.reshape = True
     turn = se3_exp(torch.tensor([[0, 0, 0, 0, 0, 0.4]])) @ se3_exp(torch.tensor([[0, 0, 0, 0, -0.3, 0]]))
     turn = (turn @ se3_exp(torch.tensor([[0, 0, 0, 0.2, 0, 0]])))[0, :3, :3].double()
     row, column = 6, 2

@@ -14,8 +14,8 @@ from ...geometry.grid import Grid
 from ...volumes.volume_files import read_volume
 from ..options import add_command, add_view_options, add_workbook, chosen_modules, output_path, read_workbook
 
-_WORDS = {bool: "yes|no", int: "N", float: "NUMBER", str: "TEXT", Grid: "VOLUME-FILE"}
-"""How a value of each type is shown in the help."""
+_WORDS = {bool: "yes|no", int: "N", float: "NUMBER", str: "TEXT", tuple: "NUMBER,NUMBER,...", Grid: "VOLUME-FILE"}
+"""How a value of each type is shown in the help; options of other types are for scripts."""
 
 
 def add_parser(actions) -> None:  # type: ignore[no-untyped-def]
@@ -61,67 +61,51 @@ def _format_of(output: str) -> Format:
     raise InputError(f"{output}: {problem}; choose one by --format: {names}")
 
 
+def _options(format: Format) -> dict[str, tuple[Any, Any]]:
+    """Type and default of the options that can be typed; where there are several types, the first."""
+    options = {}
+    for name, (type_, default) in format.options.items():
+        if typing.get_origin(type_) in (UnionType, typing.Union):
+            type_ = typing.get_args(type_)[0]
+        if _word(type_):
+            options[name] = type_, default
+    return options
+
+
+def _word(type_: Any) -> str:
+    if typing.get_origin(type_) is Literal:
+        return "|".join(typing.get_args(type_))
+    return _WORDS.get(typing.get_origin(type_) or type_, "")
+
+
 def _described(format: Format) -> str:
     """The format and its options, for the help."""
-    options = []
-    for name, (type_, default) in format.options.items():
+    shown = []
+    for name, (type_, default) in _options(format).items():
         word = _word(type_)
-        shown = word if default is None or "|" in word else _typed(default)
-        options += [f"{name}={shown}"] * bool(word)
+        if default is not None and "|" not in word:
+            word = ",".join(f"{x:g}" for x in default) if isinstance(default, tuple) else str(default)
+        shown.append(f"{name}={word}")
     text = f"  {format.name:<13}{format.title} ({', '.join(format.suffixes) or 'folder'})"
-    return text + f"\n{'':15}{'; '.join(options)}" * bool(options)
-
-
-def _typed(default: Any) -> str:
-    return ",".join(f"{x:g}" for x in default) if isinstance(default, tuple) else str(default)
+    return text + f"\n{'':15}{'; '.join(shown)}" * bool(shown)
 
 
 def _option(format: Format, text: str) -> tuple[str, Any]:
     """Name and value of a ``NAME=VALUE``."""
     name, equals, value = text.partition("=")
-    options = format.options
+    options = _options(format)
     if not equals or name not in options:
         raise InputError(
             f"--set {text!r}: expected NAME=VALUE, format {format.name} has {', '.join(options) or 'none'}"
         )
-    for type_ in _alternatives(options[name][0]):
-        try:
-            return name, _parsed(value, type_)
-        except ValueError as error:
-            if isinstance(error, InputError):
-                raise
-    raise InputError(f"--set {text!r}: expected {name}={_word(options[name][0])}")
-
-
-def _alternatives(type_: Any) -> list[Any]:
-    """The members of a union, without None."""
-    members = typing.get_args(type_) if typing.get_origin(type_) in (UnionType, typing.Union) else (type_,)
-    return [member for member in members if member is not type(None)]
-
-
-def _parsed(text: str, type_: Any) -> Any:
-    """`text` as a value of the type; ValueError if it is not one."""
+    type_, _ = options[name]
     if type_ is Grid:
-        return read_volume(text).grid
-    if type_ is bool:
-        return ("no", "yes").index(text) == 1
-    if typing.get_origin(type_) is Literal:
-        return typing.get_args(type_)[typing.get_args(type_).index(text)]
-    if typing.get_origin(type_) is tuple:
-        return tuple(_parsed(part, typing.get_args(type_)[0]) for part in text.split(","))
-    if type_ in (int, float, str):
-        return type_(text)
-    raise ValueError(text)
-
-
-def _word(type_: Any) -> str:
-    """How a value of the type is typed; empty if it cannot be."""
-    words: list[str] = []
-    for member in _alternatives(type_):
-        if typing.get_origin(member) is Literal:
-            words += typing.get_args(member)
-        elif typing.get_origin(member) is tuple:
-            words.append(",".join([_word(typing.get_args(member)[0])] * 2))
-        elif member in _WORDS:
-            words.append(_WORDS[member])
-    return "|".join(words)
+        return name, read_volume(value).grid
+    try:
+        if type_ is bool:
+            return name, {"yes": True, "no": False}[value]
+        if typing.get_origin(type_) is tuple:
+            return name, tuple(float(part) for part in value.split(","))
+        return name, value if typing.get_origin(type_) is Literal else type_(value)  # the format knows its choices
+    except (KeyError, ValueError):
+        raise InputError(f"--set {text!r}: expected {name}={_word(type_)}") from None

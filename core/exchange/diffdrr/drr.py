@@ -254,15 +254,16 @@ class Registration(torch.nn.Module):
 
     def forward(self, **options: Any) -> Tensor:
         """The radiograph from the present pose; `options` are those of `DRR.forward`."""
-        kind = {"parameterization": self.parameterization, "convention": self.convention}
-        return self.drr(self.rotation, self.translation, **kind, **options)
+        return self.drr(self.rotation, self.translation, **self._kind, **options)
 
     @property
     def pose(self) -> RigidTransform:
         """The present pose."""
-        return convert(
-            self.rotation, self.translation, parameterization=self.parameterization, convention=self.convention
-        )
+        return convert(self.rotation, self.translation, **self._kind)
+
+    @property
+    def _kind(self) -> dict[str, Any]:
+        return {"parameterization": self.parameterization, "convention": self.convention}
 
     @property
     def rotation(self) -> Tensor:

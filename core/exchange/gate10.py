@@ -55,9 +55,9 @@ def _json(record: dict[str, Any]) -> str:
 
 
 def _record(system: PinholeSystem, setup: Setup, simulation: Gate10Simulation) -> dict[str, Any]:
-    parts = [part for parts in setup.collimators for part in parts] + [c.solids for c in setup.crystals]
+    parts = [part for parts in setup.collimators for part in parts] + [solids for solids, _ in setup.crystals]
     if setup.phantom is not None:
-        parts += [setup.phantom, *(rods.solids for rods in setup.rods)]
+        parts += [setup.phantom, *(rods for rods, _ in setup.rods)]
     return {
         "threads": int(simulation.threads),
         "seed": int(simulation.seed),
@@ -73,7 +73,7 @@ def _record(system: PinholeSystem, setup: Setup, simulation: Gate10Simulation) -
             "window_keV": list(simulation.window),
         },
         "emitters": _emitters(setup, simulation),
-        "crystals": [c.solids.name for c in setup.crystals],
+        "crystals": [solids.name for solids, _ in setup.crystals],
         "modules": _modules(system, setup),
         "volumes": [_volume(part) for part in parts],
     }

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from ..geometry.system import PinholeSystem
 from ..geometry.views import Views
 from .format import Format
-from .monte_carlo import REFERENCE_ENERGY, Crystals, Placed, Setup, Simulation, build_setup, material_database
+from .monte_carlo import REFERENCE_ENERGY, Placed, Setup, Simulation, build_setup, material_database
 
 MOST_LINES = 100
 """No macro is longer. Placements are data, one line each, and may be any number."""
@@ -38,7 +38,7 @@ def _write(system: PinholeSystem, views: Views, path: Path, **options: Any) -> N
     folder = _Folder(path)
     folder.write("GateMaterials.db", material_database())
     one = len(setup.crystals) == 1
-    heads = [_head(folder, c, "SPECThead" if one else f"head{i + 1}") for i, c in enumerate(setup.crystals)]
+    heads = [_head(folder, c, "SPECThead" if one else f"head{i + 1}") for i, (c, _) in enumerate(setup.crystals)]
     world = _under("/gate/world", *(f"geometry/set{axis}Length {_n(setup.world)} mm" for axis in "XYZ"))
     geometry = [
         folder.macro("geometry/world", [*world, "/gate/world/setMaterial Air"]),
@@ -46,7 +46,7 @@ def _write(system: PinholeSystem, views: Views, path: Path, **options: Any) -> N
         folder.list("geometry/collimators", [_collimator(folder, parts) for parts in setup.collimators]),
     ]
     if setup.phantom is not None:
-        parts = (setup.phantom, *(rods.solids for rods in setup.rods))
+        parts = (setup.phantom, *(rods for rods, _ in setup.rods))
         geometry.append(folder.macro("geometry/phantom", [x for part in parts for x in _repeated(folder, part)]))
     cuts = _under("/gate/physics", *(f"{p}/SetCutInRegion world 0.1 mm" for p in ("Gamma", "Electron", "Positron")))
     flags = ("setRootHitFlag 0", "setRootNtupleFlag 0", "setRootSinglesFlag 1")
@@ -57,12 +57,10 @@ def _write(system: PinholeSystem, views: Views, path: Path, **options: Any) -> N
         *_execute(geometry),
         *_execute([folder.macro("physics", ["/gate/physics/addPhysicsList emstandard_opt4", *cuts])]),
         "/gate/run/initialize",
-        *_execute(
-            [folder.list("digitizer/all", [_digitizer(folder, c.solids.name, simulation) for c in setup.crystals])]
-        ),
+        *_execute([folder.list("digitizer/all", [_digitizer(folder, c.name, simulation) for c, _ in setup.crystals])]),
         *_execute([folder.macro("source", _source(folder, setup, simulation))]),
         *_execute([folder.macro("output", singles)]),
-        *(_execute([folder.macro("projections", _projections(setup.crystals[0], views))]) if one else []),
+        *(_execute([folder.macro("projections", _projections(setup.crystals[0][0], views))]) if one else []),
         "/gate/random/setEngineName MersenneTwister",
         f"/gate/random/setEngineSeed {int(simulation.seed)}",
         f"/gate/application/setTimeSlice {_n(simulation.time)} s",
@@ -71,7 +69,7 @@ def _write(system: PinholeSystem, views: Views, path: Path, **options: Any) -> N
         "/gate/application/startDAQ",
     ]
     folder.macro("main", main)
-    copies = sorted((m, c.solids.name, copy) for c in setup.crystals for copy, m in enumerate(c.modules))
+    copies = sorted((m, c.name, copy) for c, modules in setup.crystals for copy, m in enumerate(modules))
     table = ["# module, its crystal's volume, the copy of that crystal's head from 0"]
     table += [f"{system.numbers[m]} {crystal} {copy}" for m, crystal, copy in copies]
     folder.write("modules.txt", "\n".join(table) + "\n")
@@ -186,9 +184,8 @@ def _repeated(folder: _Folder, part: Placed) -> list[str]:
     )
 
 
-def _head(folder: _Folder, crystals: Crystals, name: str) -> str:
+def _head(folder: _Folder, crystal: Placed, name: str) -> str:
     """The system's base, a box of air close around the crystal, and the crystal in it."""
-    crystal = crystals.solids
     side, _, thickness = crystal.size
     size = (side + 2 * _MARGIN, side + 2 * _MARGIN, thickness + _MARGIN)
     k = crystal.rotations[:, :, 2]
@@ -293,8 +290,8 @@ def _source(folder: _Folder, setup: Setup, simulation: Simulation) -> list[str]:
     return _execute(macros)
 
 
-def _projections(crystals: Crystals, views: Views) -> list[str]:
-    (n_v, n_u), (side, _, _) = views.shape, crystals.solids.size
+def _projections(crystal: Placed, views: Views) -> list[str]:
+    (n_v, n_u), (side, _, _) = views.shape, crystal.size
     return _under(
         "/gate/output/projection",
         "enable",

@@ -219,31 +219,27 @@ class Placed(NamedTuple):
     rotations: NDArray[np.float64]
 
 
-class Crystals(NamedTuple):
-    """Crystals of one size, and the indices of their modules."""
-
-    solids: Placed
-    modules: NDArray[np.intp]
-
-
-class Rods(NamedTuple):
-    """One sector's rods in the phantom, and their total activity, Bq."""
-
-    solids: Placed
-    activity: float
-
-
 class Setup(NamedTuple):
     """All that is simulated.
 
-    `collimators` has a list for each kind: the solid, and the air in it. `phantom` is None for a point. `world` is the side
-    of the surrounding cube of air, mm.
+    Attributes
+    ----------
+    collimators : list of lists
+        For each kind of module its collimators, and the pieces of air in one of them.
+    crystals : list of tuples
+        For each size the crystals, and the indices of their modules.
+    phantom : Placed or None
+        The phantom's body; None for a point.
+    rods : list of tuples
+        For each sector the rods in the phantom, and their total activity, Bq.
+    world : float
+        Side of the surrounding cube of air, mm.
     """
 
     collimators: list[list[Placed]]
-    crystals: list[Crystals]
+    crystals: list[tuple[Placed, NDArray[np.intp]]]
     phantom: Placed | None
-    rods: list[Rods]
+    rods: list[tuple[Placed, float]]
     world: float
 
 
@@ -271,12 +267,13 @@ def build_setup(system: PinholeSystem, simulation: Simulation) -> Setup:
         size = (side[modules[0]], side[modules[0]], thickness[modules[0]])
         places = _behind_pinholes(poses[modules], l[modules] + size[2] / 2)
         name = "crystal" if len(sizes) == 1 else f"crystal{i + 1}"
-        crystals.append(Crystals(Placed(name, "world", "box", size, simulation.crystal, *places), modules))
+        crystals.append((Placed(name, "world", "box", size, simulation.crystal, *places), modules))
+    outer = [parts[0] for parts in collimators] + [solids for solids, _ in crystals]
     phantom, rods = _phantom(simulation)
     if phantom is not None:
         _refuse_overlap(system, bodies, phantom)
-    outer = [parts[0] for parts in collimators] + [c.solids for c in crystals] + [phantom] * (phantom is not None)
-    reach = max(np.abs(simulation.world_from_phantom[:3, 3]).max(), *(_reach(solids) for solids in outer if solids))
+        outer.append(phantom)
+    reach = max(np.abs(simulation.world_from_phantom[:3, 3]).max(), *map(_reach, outer))
     return Setup(collimators, crystals, phantom, rods, math.ceil(2 * (reach + _SPACE)))
 
 
@@ -314,7 +311,7 @@ def _collimator(name: str, poses: NDArray[np.float64], body: Collimator, materia
     ]
 
 
-def _phantom(simulation: Simulation) -> tuple[Placed | None, list[Rods]]:
+def _phantom(simulation: Simulation) -> tuple[Placed | None, list[tuple[Placed, float]]]:
     """The phantom's body, 1 mm larger than the rods, and the rods sector by sector."""
     if simulation.derenzo is None:
         return None, []
@@ -331,7 +328,7 @@ def _phantom(simulation: Simulation) -> tuple[Placed | None, list[Rods]]:
         rotations = np.broadcast_to(np.eye(3), (len(centers), 3, 3))
         size = (diameter[own][0] / 2, height)
         solids = Placed(f"rods_{int(number)}", "phantom", "cylinder", size, material, centers, rotations)
-        rods.append(Rods(solids, simulation.becquerels * (diameter[own] ** 2).sum() / (diameter**2).sum()))
+        rods.append((solids, float(simulation.becquerels * (diameter[own] ** 2).sum() / (diameter**2).sum())))
     return body, rods
 
 

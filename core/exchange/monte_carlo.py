@@ -70,63 +70,30 @@ def material_database() -> str:
 
 @dataclass(frozen=True, kw_only=True)
 class Simulation:
-    """The options of the Monte Carlo formats.
+    """The options of the Monte Carlo formats; `InputError` for an impossible one."""
 
-    Attributes
-    ----------
-    phantom : str or DerenzoPhantom
-        ``"point"``, ``"derenzo"`` (of `radius`, `rods` and `height`), or a phantom.
-    radius, rods, height : float, 6 floats, float
-        The phantom ``"derenzo"``: its radius, the rods' diameters and their length, mm.
-    position, euler_degrees : 3 floats
-        Middle of the point or phantom, mm, and the phantom's Euler angles phi, theta, psi (`euler_pose`).
-    pose : array (4, 4) or None
-        World from phantom, a rotation and a translation, instead of both.
-    isotope : str or Isotope
-        Its photons are emitted, each on its own.
-    activity : float or None
-        Total activity at the start, MBq. None: 1 MBq, or that of the `DerenzoPhantom`.
-    time : float
-        s.
-    crystal, collimator, phantom_material : str
-        Their materials; a phantom of air hardly attenuates.
-    plate_thickness, wall_thickness, opening_degrees, edge_at
-        Of the collimators: `Construction`, the angle in degrees.
-    intrinsic_fwhm : float
-        The crystal's resolution, mm; 0: perfect.
-    energy_resolution : float
-        FWHM at 140.5 keV as a share of the energy; it falls with the square root of the energy. 0: perfect.
-    window_percent : float
-        Full width of the energy window around the isotope's strongest line.
-    seed : int
-        Of the random numbers.
-
-    Raises
-    ------
-    InputError
-        An option has an impossible value.
-    """
-
-    phantom: str | DerenzoPhantom = "point"
-    radius: float = 40.0
-    rods: tuple[float, ...] = (8.0, 6.0, 5.0, 4.0, 3.0, 2.0)
-    height: float = 40.0
-    position: tuple[float, ...] = (0.0, 0.0, 0.0)
-    euler_degrees: tuple[float, ...] = (0.0, 0.0, 0.0)
-    pose: NDArray[np.float64] | None = None
-    isotope: str | Isotope = "Tc-99m"
-    activity: float | None = None
-    time: float = 1.0
+    phantom: str | DerenzoPhantom = "point"  # "point", "derenzo" of the next three numbers, or a phantom
+    radius: float = 40.0  # of the phantom "derenzo", mm
+    rods: tuple[float, ...] = (8.0, 6.0, 5.0, 4.0, 3.0, 2.0)  # their diameters, mm
+    height: float = 40.0  # the rods' length, mm
+    position: tuple[float, ...] = (0.0, 0.0, 0.0)  # middle of the point or phantom, mm
+    euler_degrees: tuple[float, ...] = (0.0, 0.0, 0.0)  # the phantom's phi, theta, psi, as of `euler_pose`
+    pose: NDArray[np.float64] | None = None  # world from phantom (4, 4), rigid, instead of both
+    isotope: str | Isotope = "Tc-99m"  # its photons are emitted, each on its own
+    activity: float | None = None  # total at the start, MBq; None: 1, or that of a `DerenzoPhantom`
+    time: float = 1.0  # s
     crystal: Literal["NaI", "CZT"] = "NaI"
     collimator: Literal["Tungsten", "Lead"] = "Tungsten"
-    phantom_material: Literal["Air", "Water", "PMMA"] = "Air"
-    plate_thickness: float = 2.0
-    wall_thickness: float = 2.0
+    phantom_material: Literal["Air", "Water", "PMMA"] = "Air"  # air hardly attenuates
+    plate_thickness: float = 2.0  # mm; this and the next three as of `Construction`
+    wall_thickness: float = 2.0  # mm
     opening_degrees: float = 90.0
     edge_at: EdgePlace = "middle"
-    intrinsic_fwhm: float = 3.0
-    energy_resolution: float = 0.1
-    window_percent: float = 20.0
+    intrinsic_fwhm: float = 3.0  # the crystal's resolution, mm; 0: perfect
+    energy_resolution: float = (
+        0.1  # FWHM / energy at `REFERENCE_ENERGY`, falling with the energy's square root; 0: perfect
+    )
+    window_percent: float = 20.0  # full width of the energy window around the strongest line
     seed: int = 1
 
     def __post_init__(self) -> None:
@@ -220,27 +187,13 @@ class Placed(NamedTuple):
 
 
 class Setup(NamedTuple):
-    """All that is simulated.
+    """All that is simulated."""
 
-    Attributes
-    ----------
-    collimators : list of lists
-        For each kind of module its collimators, and the pieces of air in one of them.
-    crystals : list of tuples
-        For each size the crystals, and the indices of their modules.
-    phantom : Placed or None
-        The phantom's body; None for a point.
-    rods : list of tuples
-        For each sector the rods in the phantom, and their total activity, Bq.
-    world : float
-        Side of the surrounding cube of air, mm.
-    """
-
-    collimators: list[list[Placed]]
-    crystals: list[tuple[Placed, NDArray[np.intp]]]
-    phantom: Placed | None
-    rods: list[tuple[Placed, float]]
-    world: float
+    collimators: list[list[Placed]]  # kind by kind: the collimators, and the pieces of air in one of them
+    crystals: list[tuple[Placed, NDArray[np.intp]]]  # size by size: the crystals, and the indices of their modules
+    phantom: Placed | None  # its body; None for a point
+    rods: list[tuple[Placed, float]]  # sector by sector: the rods in the phantom, and their total activity, Bq
+    world: float  # side of the surrounding cube of air, mm
 
 
 def build_setup(system: PinholeSystem, simulation: Simulation) -> Setup:

@@ -17,9 +17,9 @@ from .subject import Subject, as_subject, hu_to_density
 
 @dataclass(frozen=True, eq=False)
 class Arguments:
-    """What both generations' arguments come to; `given` is the subject as the caller gave it."""
+    """What both generations' arguments come to."""
 
-    given: Any
+    given: Any  # the subject as the caller gave it
     subject: Subject
     detector: Detector
     p_subsample: float | None
@@ -52,56 +52,46 @@ def _since_04(
     y0: float = 0.0,
     p_subsample: float | None = None,
     reshape: bool = True,
-    reverse_x_axis: bool = True,
+    reverse_x_axis: bool | None = None,
     patch_size: int | None = None,
     renderer: str = "siddon",
     voxel_shift: float = 0.5,
     persistent: bool = True,
     compile_renderer: bool = False,
     checkpoint_gradients: bool = False,
-    whole_line: bool = True,
+    whole_line: bool | None = None,
     backend: str = "auto",
     affine: Any = None,
+    old: bool = False,
     **options: Any,
 ) -> Arguments:
     width, dely = height if width is None else width, delx if dely is None else dely
-    detector = Detector(sdd, height, width, delx, dely, x0, y0, reverse_x_axis, old=False)
+    reverse_x_axis = not old if reverse_x_axis is None else reverse_x_axis
     known = as_subject(subject, affine)
     matrix = np.array(known.affine, dtype=np.float64)
     matrix[:3, 3] += matrix[:3, :3] @ np.full(3, 0.5 - voxel_shift)
-    stop = _stop_gradients(renderer, options)
-    return Arguments(subject, replace(known, affine=matrix), detector, p_subsample, reshape, whole_line, stop, backend)
+    return Arguments(
+        given=subject,
+        subject=replace(known, affine=matrix),
+        detector=Detector(sdd, height, width, delx, dely, x0, y0, reverse_x_axis, old),
+        p_subsample=p_subsample,
+        reshape=reshape,
+        whole_line=not old if whole_line is None else whole_line,
+        stop_gradients=_stop_gradients(renderer, options),
+        backend=backend,
+    )
 
 
 def _before_04(
-    volume: Any,
-    spacing: Any,
-    sdr: float,
-    height: int,
-    delx: float,
-    width: int | None = None,
-    dely: float | None = None,
-    x0: float = 0.0,
-    y0: float = 0.0,
-    p_subsample: float | None = None,
-    reshape: bool = True,
-    reverse_x_axis: bool = False,
-    patch_size: int | None = None,
-    bone_attenuation_multiplier: float = 1.0,
-    renderer: str = "siddon",
-    whole_line: bool = False,
-    backend: str = "auto",
-    **options: Any,
+    volume: Any, spacing: Any, sdr: float, *args: Any, bone_attenuation_multiplier: float = 1.0, **kwargs: Any
 ) -> Arguments:
-    width, dely = height if width is None else width, delx if dely is None else dely
-    detector = Detector(2 * sdr, height, width, delx, dely, x0, y0, reverse_x_axis, old=True)
+    """CT numbers, the voxel size and half of `sdd` stood in the place of `subject` and `sdd`."""
     hu = torch.as_tensor(np.array(volume) if not isinstance(volume, Tensor) else volume).flip([0])
     size = np.array([positive(s, "voxel spacing", "mm") for s in np.asarray(spacing).tolist()])
     affine = np.diag([*size, 1.0])
     affine[:3, 3] = size / 2
     subject = Subject(hu_to_density(hu, bone_attenuation_multiplier), affine, torch.eye(4), hu)
-    stop = _stop_gradients(renderer, options)
-    return Arguments(volume, subject, detector, p_subsample, reshape, whole_line, stop, backend)
+    return _since_04(subject, 2 * sdr, *args, **{**kwargs, "old": True})
 
 
 def _stop_gradients(renderer: str, options: dict[str, Any]) -> bool:

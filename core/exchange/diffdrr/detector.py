@@ -18,38 +18,17 @@ from .subject import reorientation
 
 @dataclass(frozen=True, eq=False)
 class Detector:
-    """A C-arm's pixels, in the camera's frame.
+    """A C-arm's pixels, in the camera's frame; `InputError` for a size that is not above 0."""
 
-    Attributes
-    ----------
-    sdd : float
-        Source to detector, mm.
-    height, width : int
-        Rows and columns.
-    delx, dely : float
-        Pixel sizes, mm (before 0.4, `delx` is that along the height).
-    x0, y0 : float
-        Principal point, mm, as given to `DRR`.
-    reverse_x_axis : bool
-        Whether the columns run the other way.
-    old : bool
-        Whether the geometry is that before 0.4.
-
-    Raises
-    ------
-    InputError
-        A size is not above 0.
-    """
-
-    sdd: float
-    height: int
-    width: int
-    delx: float
+    sdd: float  # source to detector, mm
+    height: int  # rows
+    width: int  # columns
+    delx: float  # pixel sizes, mm; before 0.4, this one is along the height
     dely: float
-    x0: float
+    x0: float  # principal point, mm, as given to `DRR`
     y0: float
-    reverse_x_axis: bool
-    old: bool
+    reverse_x_axis: bool  # whether the columns run the other way
+    old: bool  # whether the geometry is that before 0.4
 
     def __post_init__(self) -> None:
         whole_shape((self.height, self.width), "detector's height and width", 2)

@@ -72,7 +72,7 @@ def camera_model(views: Views, format: str, mirrored: bool = True) -> CameraMode
         The pixel steps are not perpendicular, or an image is mirrored and must not be.
     """
     pitches, (x, y) = pixel_axes(views)
-    refuse_oblique(views, format)
+    _refuse_oblique(views, format)
     z = np.cross(x, y)
     to_detector = views.detector_centers - views.sources
     distance = np.einsum("mi,mi->m", z, to_detector)
@@ -104,7 +104,7 @@ def pixel_axes(views: Views) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     return pitches, np.stack([x, y / np.linalg.norm(y, axis=1, keepdims=True)])
 
 
-def refuse_oblique(views: Views, format: str) -> None:
+def _refuse_oblique(views: Views, format: str) -> None:
     """Raise `InputError` naming the first view whose pixel rows are not perpendicular to its columns."""
     pitches, _ = pixel_axes(views)
     cosine = np.einsum("mi,mi->m", views.u_steps, views.v_steps) / pitches.prod(axis=1)
@@ -129,7 +129,7 @@ def with_common_pitch(views: Views, format: str) -> tuple[Views, tuple[float, fl
     InputError
         The pixel steps are not perpendicular, or two views' pixels have different proportions.
     """
-    refuse_oblique(views, format)
+    _refuse_oblique(views, format)
     pitches, _ = pixel_axes(views)
     proportion = pitches[:, 1] / pitches[:, 0]
     m = _first_beyond_tolerance(np.abs(proportion / proportion[0] - 1) * max(views.shape) / 2)

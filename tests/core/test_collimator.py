@@ -120,7 +120,7 @@ def assert_only_the_hole_is_open(through: Rays, past: Rays, cut) -> None:
 @pytest.mark.parametrize("place", PLACES)
 def test_every_roi_ray_passes_the_mesh_and_the_stl_file_through_the_hole_alone(scanner, tmp_path, rng, place):
     trimesh = pytest.importorskip("trimesh")
-    chosen = scanner if place == "middle" else scanner[::9]
+    chosen = scanner[::9]
     write_geometry(chosen, tmp_path / "stl", "stl-parts", part="collimators", edge_at=place)
     parts = [p for p in module_parts(chosen, Construction(edge_at=place)) if p.kind == "collimator"]
     for m, part in enumerate(parts):
@@ -129,7 +129,6 @@ def test_every_roi_ray_passes_the_mesh_and_the_stl_file_through_the_hole_alone(s
         through, past = rays_of(rng, chosen, m)
         drawn = world_to_module(chosen, m, part.vertices[part.triangles])
         written = world_to_module(chosen, m, np.asarray(read.triangles))
-        assert_only_the_hole_is_open(through, past, lambda rays, shape=drawn: cut_by_triangles(rays, shape))
         for shape in (drawn, written):
             assert_only_the_hole_is_open(through, past, lambda rays, shape=shape: cut_by_triangles(rays, shape))
 

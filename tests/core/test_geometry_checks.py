@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import json
 
 import numpy as np
@@ -10,12 +9,11 @@ import pytest
 
 import mphdrr.core as mph
 from mphdrr.core.cli import main
-from mphdrr.core.geometry.checks.blocking import cone_directions, meets
-from mphdrr.core.geometry.checks.coverage import unseen_share
+from mphdrr.core.geometry.checks.field_of_view import cone_directions, hits, unseen_share
 from mphdrr.core.geometry.checks.hulls import Hulls
-from mphdrr.core.geometry.checks.meshes import find_open_meshes
 from mphdrr.core.geometry.checks.overlaps import penetration_depths
 from mphdrr.core.geometry.collimator import Collimator, Construction
+from mphdrr.core.geometry.collimator_mesh import surface_fault
 from mphdrr.core.geometry.module_parts import module_parts
 
 
@@ -160,7 +158,7 @@ def test_a_sliver_of_a_thousandth_is_found(rng):
         directions = cone_directions(200_000, np.sqrt(0.75)) @ system.frames()[0]
         fine = np.zeros(200_000, dtype=bool)
         for p in (2, 3):
-            fine |= meets(hulls, p, system.centers[0], directions, np.full(200_000, 100.0))
+            fine |= hits(hulls, p, system.centers[0], directions, np.full(200_000, 100.0))
         blocked = mph.check_geometry(system, plate_thickness=0.5, wall_thickness=1.0).blocked
         shares = {b.module: b.share for b in blocked}
         assert shares.get(1, 0.0) == pytest.approx(fine.mean(), abs=5e-4)
@@ -177,7 +175,7 @@ def test_rays_meet_hulls_where_points_along_them_are_inside(rng):
     points = origin + steps * lengths[:, None] * directions
     for p in range(len(hulls)):
         depth = (hulls.offsets[p] - points @ hulls.normals[p].T).min(axis=2).max(axis=0)
-        hit = meets(hulls, p, origin, directions, lengths)
+        hit = hits(hulls, p, origin, directions, lengths)
         assert np.all(hit[depth > 0])
         assert not np.any(hit[depth < -0.5])  # the points are less than 0.4 mm apart
 
@@ -206,14 +204,11 @@ def test_pinholes_at_impossible_places():
 
 
 def test_open_and_inverted_surfaces_are_found(system):
-    parts = module_parts(system)
-    assert find_open_meshes(parts) == ()
-    vertices, faces = parts[3].solid
-    parts[3] = dataclasses.replace(parts[3], solid=(vertices, faces[1:]))
-    vertices, faces = parts[4].solid
-    parts[4] = dataclasses.replace(parts[4], solid=(vertices, faces[:, ::-1]))
-    found = [(f.module, f.part, f.fault.split()[0]) for f in find_open_meshes(parts)]
-    assert found[:3] == [(102, "crystal", "is"), (102, "module", "is"), (103, "collimator", "has")]
+    for part in module_parts(system)[:4]:
+        vertices, faces = part.solid
+        assert surface_fault(part.solid) is None
+        assert surface_fault((vertices, faces[1:])).startswith("is not closed")
+        assert surface_fault((vertices, faces[:, ::-1])).startswith("has a volume of -")
 
 
 def test_report_is_json(rng):

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from ...geometry.generators import RingFit, fit_rings
+from ...geometry.ring_fits import RingFit, fit_rings
 from ..options import add_command, add_workbook, read_workbook
 from .arguments import add_json
 

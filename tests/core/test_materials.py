@@ -8,10 +8,20 @@ import numpy as np
 import pytest
 
 import mphdrr.core as mph
-from mphdrr.core.phantoms.materials import LUNG_MU, PMMA_MU, SOFT_TISSUE_MU, VERTEBRA_MU
-from mphdrr.core.physics.isotopes import CZT_MU, LEAD_MU, NAI_MU, TUNGSTEN_MU, WATER_MU
-from mphdrr.core.physics.mass_attenuation import ELEMENTS
-from mphdrr.core.physics.materials import APERTURES, CRYSTALS
+from mphdrr.core.physics.mass_attenuation import table
+from mphdrr.core.physics.materials import (
+    APERTURES,
+    CRYSTALS,
+    CZT_MU,
+    LEAD_MU,
+    LUNG_MU,
+    NAI_MU,
+    PMMA_MU,
+    SOFT_TISSUE_MU,
+    TUNGSTEN_MU,
+    VERTEBRA_MU,
+    WATER_MU,
+)  # fmt: skip
 
 TC, TL = 140.5, 70.8
 
@@ -53,7 +63,7 @@ def test_coefficients_are_the_published_ones(material, energy, expected):
 
 def test_coefficients_fall_with_energy_and_rise_at_the_edges():
     for name, material in mph.MATERIALS.items():
-        edges = [edge for symbol in material.composition for edge, *_ in ELEMENTS[symbol][1]]
+        edges = [edge for symbol in material.composition for edge, *_ in table()[symbol][1]]
         energies = np.union1d(np.geomspace(10, 1000, 50), [*edges, *np.multiply(edges, 1 - 1e-9)])
         rises = energies[1:][np.diff([mph.attenuation(name, energy) for energy in energies]) > 0]
         assert rises == pytest.approx(sorted(edges), rel=1e-12)

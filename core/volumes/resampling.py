@@ -1,4 +1,4 @@
-"""A volume's values on another grid."""
+"""Resampling of volumes onto other grids."""
 
 from __future__ import annotations
 
@@ -10,57 +10,47 @@ from numpy.typing import NDArray
 from ..errors import InputError
 from ..geometry.grid import Grid
 from ..memory import require
-from ..physics.ct_numbers import AIR_HU
 from ..progress import Progress
-from ..validation import freeze, real_array
-from .volume import Volume, require_volume
+from ..validation import freeze, instance, real_array
+from .volume import Volume, outside_value
 
-# Indices of the given grid along an axis, and their weights: (n, taps) each, for n voxels of the new grid.
+# For n voxels of the new grid along an axis: indices of the old grid and their weights, (n, taps) each.
 _Taps = tuple[NDArray[np.int64], NDArray[np.float32]]
 
-_PARALLEL = 1e-9  # of a voxel per voxel: axes that turn by less are parallel
+_PARALLEL = 1e-9  # voxels per voxel: axes that deviate by less are parallel
 _SLAB = 1 << 20  # samples at once
-
-
-def outside_value(volume: Volume) -> float:
-    """What lies outside a volume's grid: air, -1000, for CT numbers, and 0 of everything else."""
-    return AIR_HU if volume.quantity == "hu" else 0.0
 
 
 def resample(
     volume: Volume, grid: Grid, method: str = "linear", outside: float | None = None, progress: Progress | None = None
 ) -> Volume:
-    """`volume` on `grid`.
+    """Resample `volume` onto `grid`; both may have any affine.
 
     Parameters
     ----------
-    volume
-        Of any grid; voxels reach half a step beyond their centres.
-    grid
-        The new one: any affine.
+    volume, grid
     method
-        ``"linear"``: trilinear interpolation between the voxels' centres. ``"nearest"``: of the voxel that holds the new
-        voxel's centre (labels). ``"mean"``: the mean over the new voxel, for coarser grids: the sum of value x volume is
-        kept. It is exact where the grids' axes are parallel; else it is that of points in each new voxel, at least two
-        along each axis and about one for each old voxel.
+        ``"linear"``: trilinear interpolation between voxel centres. ``"nearest"``: the voxel that holds the new voxel's
+        centre (for labels). ``"mean"``: the mean over the new voxel, which keeps the sum of value x volume (for coarser
+        grids); it is exact if the grids' axes are parallel, and otherwise the mean of points in the new voxel, at least
+        two along each axis and about one for each old voxel.
     outside
-        The value beside the old grid. Default: 0, or -1000 of CT numbers.
+        Value outside the old grid. Default: 0, or -1000 for CT numbers.
     progress
-        Called as ``progress(done, total)`` with slabs; may raise `Cancelled`.
+        Called as ``progress(done, total)`` between slabs; may raise `Cancelled`.
 
     Raises
     ------
     InputError
-        No volume, no grid, an unknown method, or the new volume does not fit into memory.
+        Not a volume or a grid, an unknown method, or the new volume does not fit into memory.
     """
     if method not in ("linear", "nearest", "mean"):
         raise InputError(f"method {method!r}: expected linear, nearest or mean")
-    require_volume(volume, "resample")
-    if not isinstance(grid, Grid):
-        raise InputError(f"resample: expected a Grid, got {type(grid).__name__}")
+    instance(volume, Volume, "resample")
+    instance(grid, Grid, "resample")
     beside = np.float32(outside_value(volume) if outside is None else float(real_array(outside, "outside", ())))
     require(4.5 * grid.n_voxels, "a volume of {} x {} x {} voxels".format(*grid.shape))
-    index_from_index = volume.grid.index_from_world @ grid.affine  # of the given volume, from the new one
+    index_from_index = volume.grid.index_from_world @ grid.affine  # index in the old grid from index in the new one
     result = np.empty(grid.shape, np.float32)
     fill = _along_axes if _is_parallel(index_from_index) else _at_points
     fill(volume.array, beside, index_from_index, method, result, progress or (lambda done, total: None))
@@ -81,8 +71,8 @@ def _along_axes(
     result: NDArray[np.float32],
     progress: Callable[[int, int], None],
 ) -> None:
-    """Fill `result` one axis after the other."""
-    old_axes = np.abs(index_from_index[:3, :3]).argmax(axis=0)  # of each new axis
+    """Fill `result`, one axis after the other."""
+    old_axes = np.abs(index_from_index[:3, :3]).argmax(axis=0)  # the old axis of each new one
     taps = []
     for new, old in enumerate(old_axes):
         at = index_from_index[old, new] * np.arange(result.shape[new]) + index_from_index[old, 3]
@@ -101,7 +91,7 @@ def _along_axes(
 
 
 def _apply(array: NDArray[np.float32], beside: np.float32, taps: _Taps, axis: int) -> NDArray[np.float32]:
-    """Sums of ``(array - beside)`` times weights along one axis."""
+    """Weighted sums of ``array - beside`` along one axis."""
     index, weight = taps
     shape = [1, 1, 1]
     shape[axis] = len(index)
@@ -124,7 +114,7 @@ def _linear_taps(at: NDArray[np.float64], step: float, n: int) -> _Taps:
 
 
 def _mean_taps(at: NDArray[np.float64], step: float, n: int) -> _Taps:
-    """Shares of the new voxel, from ``at - step/2`` to ``at + step/2``, that lie in each old one."""
+    """Fractions of the new voxel, from ``at - step/2`` to ``at + step/2``, that lie in each old voxel."""
     low, high = at - step / 2 + 0.5, at + step / 2 + 0.5  # voxel i reaches from i to i + 1
     index = np.floor(low).astype(np.int64)[:, None] + np.arange(int(np.ceil(step)) + 1)
     overlap = np.minimum(high[:, None], index + 1) - np.maximum(low[:, None], index)
@@ -143,7 +133,7 @@ def _at_points(
     result: NDArray[np.float32],
     progress: Callable[[int, int], None],
 ) -> None:
-    """Fill `result` from points of its voxels: the centres, or for means several in each."""
+    """Fill `result` from sample points: its voxels' centres, or several points in each voxel for means."""
     linear, origin = index_from_index[:3, :3], index_from_index[:3, 3]
     counts = [1, 1, 1]
     if method == "mean":
@@ -168,7 +158,7 @@ def _at_points(
 def _nearest_samples(
     array: NDArray[np.float32], beside: np.float32, points: NDArray[np.float64]
 ) -> NDArray[np.float32]:
-    """``array - beside`` at `points` (3, N), indices; 0 outside."""
+    """``array - beside`` at index coordinates `points` (3, N); 0 outside."""
     index = np.floor(points + 0.5).astype(np.int64)
     size = np.array(array.shape)[:, None]
     inside = ((index >= 0) & (index < size)).all(axis=0)
@@ -176,7 +166,7 @@ def _nearest_samples(
 
 
 def _linear_samples(array: NDArray[np.float32], beside: np.float32, points: NDArray[np.float64]) -> NDArray[np.float32]:
-    """As `_nearest_samples`, interpolated."""
+    """As `_nearest_samples`, but interpolated."""
     size = np.array(array.shape)[:, None]
     inside = ((points >= -0.5) & (points <= size - 0.5)).all(axis=0)
     points = points.clip(0, size - 1)

@@ -10,10 +10,10 @@ from numpy.typing import ArrayLike
 from ..errors import InputError
 from ..files import replacing
 from ..progress import Cancelled, Progress
-from ..validation import real_array
+from ..validation import instance, real_array
 from .formats import dicom, hdf5, metaimage, nifti, nrrd, numpy_files
 from .formats.contents import Contents, first_line
-from .volume import UNITS, Volume, require_volume
+from .volume import UNITS, Volume
 
 _READERS = {
     ".nii": nifti.read,
@@ -72,9 +72,9 @@ def read_volume(
     Raises
     ------
     InputError
-        No such file, not such a file, damaged, not 3-D, not finite, in another unit, too large for the memory; of a DICOM
-        series: several of them, slices missing, double, unlike each other or tilted; of nuclear medicine, something else
-        than one reconstructed tomogram.
+        No such file, not such a file, damaged, not 3-D, not finite, in another unit, too large for the memory; of a
+        DICOM series: several of them, slices missing, double, unlike each other or tilted; of nuclear medicine,
+        something else than one reconstructed tomogram.
     """
     path = Path(path)
     contents = _contents(path, series, progress)
@@ -134,7 +134,7 @@ def write_volume(volume: Volume, path: str | os.PathLike[str]) -> None:
     write = _WRITERS.get(_ending(path, VOLUME_FORMATS))
     if write is None:
         raise InputError(f"{path}: expected a name ending in {', '.join(VOLUME_FORMATS)}")
-    require_volume(volume, "write_volume")
+    instance(volume, Volume, "write_volume")
     with replacing(path) as temporary:
         write(volume, temporary)
 

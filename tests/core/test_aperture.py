@@ -117,7 +117,7 @@ def test_points_for_a_tolerance_keep_it(fwhm):
         shifted = (np.roll(fine, shift, axis=(0, 1)) for shift in itertools.product(begins, begins))
         return max(np.abs(image.reshape(pixels + pixels).sum(axis=(1, 3))).sum() for image in shifted)
 
-    for pitch in (0.2, 0.4, 1.6, 4.0):
+    for pitch in (0.2, 1.6, 4.0):
         for tolerance in (0.1, 0.04):
             model = emission(system, aperture_tolerance=tolerance, intrinsic_fwhm=fwhm)
             n = model.hole_points(system.views((8, 8), "real", pitch=pitch), 0, mph.Grid.centered((1, 1, 1), 2.0))

@@ -1,8 +1,8 @@
 """Volumes to meshes: the surface at a level, for display and print.
 
-Marching tetrahedra (A. Doi, A. Koide, IEICE Trans. E74 (1991) 214-224): each cube between eight voxels' centres is cut into
-the six tetrahedra of H. Kuhn, alike in all cubes, so that the surface is closed whatever the values are, which the tables of
-marching cubes do not promise. A compiled library would be faster, and one more wheel for every platform.
+Marching tetrahedra (A. Doi, A. Koide, IEICE Trans. E74 (1991) 214-224): each cube between eight voxels' centres is cut
+into the six tetrahedra of H. Kuhn, alike in all cubes, so that the surface is closed whatever the values are, which the
+tables of marching cubes do not promise. A compiled library would be faster, and one more wheel for every platform.
 """
 
 from __future__ import annotations
@@ -15,9 +15,8 @@ from numpy.typing import NDArray
 from ...errors import InputError
 from ...memory import require
 from ...progress import Progress
-from ...validation import real_array
-from ..resampling import outside_value
-from ..volume import Volume, require_volume
+from ...validation import instance, real_array
+from ..volume import Volume, outside_value
 from .mesh import Mesh
 
 # A cube's corners, numbered 4 x + 2 y + z. Each tetrahedron walks from corner 0 to 7 along the three axes in one order.
@@ -30,8 +29,8 @@ _CORNERS = np.array([[n >> 2 & 1, n >> 1 & 1, n & 1] for n in range(8)])
 def volume_to_mesh(volume: Volume, level: float | None = None, progress: Progress | None = None) -> Mesh:
     """The closed surface around the voxels of at least `level`.
 
-    It runs where the volume, interpolated between the voxels' centres, has that value. Beside the grid the volume is 0 (CT
-    numbers: -1000): what the grid cuts off is closed there.
+    It runs where the volume, interpolated between the voxels' centres, has that value. Beside the grid the volume is 0
+    (CT numbers: -1000): what the grid cuts off is closed there.
 
     Parameters
     ----------
@@ -47,7 +46,7 @@ def volume_to_mesh(volume: Volume, level: float | None = None, progress: Progres
     InputError
         No volume, the level is no number, not above what is beside the grid, or no voxel reaches it.
     """
-    require_volume(volume, "volume_to_mesh")
+    instance(volume, Volume, "volume_to_mesh")
     beside = outside_value(volume)
     highest = float(volume.array.max())
     level = (beside + highest) / 2 if level is None else float(real_array(level, "level", ()))

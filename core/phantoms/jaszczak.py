@@ -8,8 +8,8 @@ from dataclasses import dataclass
 from functools import cached_property
 
 from ..physics.isotopes import WATER_MU
+from ..physics.materials import attenuation
 from .derenzo import DerenzoRods
-from .materials import PMMA_MU
 from .phantom import Phantom
 from .settings import require_apart, require_at_most, setting
 from .shapes import Cylinder, Shape, Sphere
@@ -19,11 +19,11 @@ from .shapes import Cylinder, Shape, Sphere
 class JaszczakPhantom(Phantom):
     """The Jaszczak phantom (Deluxe, model ECT/DLX/P), axis along z, the origin in the middle of the cylinder.
 
-    Dimensions as in Data Spectrum's data sheet: the cylinder's inside is 216 mm wide and 186 mm high; rods 88 mm high of
-    4.8, 6.4, 7.9, 9.5, 11.1, 12.7 mm in six sectors, their centres two diameters apart; spheres of 9.5, 12.7, 15.9, 19.1,
-    25.4, 31.8 mm with their centres 127 mm above the base. The rods stand on the base (-z) in the pattern of `DerenzoRods`.
-    The data sheet does not say how far the spheres are from the axis: half the radius here, 60 degrees apart, from -y on
-    counter-clockwise. The wall, 3.2 mm thick, is not modelled.
+    Dimensions as in Data Spectrum's data sheet: the cylinder's inside is 216 mm wide and 186 mm high; rods 88 mm high
+    of 4.8, 6.4, 7.9, 9.5, 11.1, 12.7 mm in six sectors, their centres two diameters apart; spheres of 9.5, 12.7, 15.9,
+    19.1, 25.4, 31.8 mm with their centres 127 mm above the base. The rods stand on the base (-z) in the pattern of
+    `DerenzoRods`. The data sheet does not say how far the spheres are from the axis: half the radius here, 60 degrees
+    apart, from -y on counter-clockwise. The wall, 3.2 mm thick, is not modelled.
 
     Attributes
     ----------
@@ -75,7 +75,7 @@ class JaszczakPhantom(Phantom):
     @cached_property
     def shapes(self) -> Sequence[Shape]:
         """Water, rods, spheres."""
-        base = -self.height / 2
+        base, plastic = -self.height / 2, attenuation("PMMA", self.mu_energy)
         shapes: list[Shape] = [
             Cylinder(radius=self.radius, height=self.height, activity=self.activity, mu=self.mu, name="water")
         ]
@@ -88,7 +88,7 @@ class JaszczakPhantom(Phantom):
                     position=(0, 0, base + self.rod_height / 2),
                     name="rods",
                     activity=self.rod_activity,
-                    mu=self.mu if self.rod_activity else PMMA_MU,
+                    mu=self.mu if self.rod_activity else plastic,
                 )
             )
         for i, diameter in enumerate(self.sphere_diameters):
@@ -101,7 +101,7 @@ class JaszczakPhantom(Phantom):
                         position=(x, y, base + self.sphere_height),
                         name=f"sphere {diameter:g} mm",
                         activity=self.sphere_activity,
-                        mu=self.mu if self.sphere_activity else PMMA_MU,
+                        mu=self.mu if self.sphere_activity else plastic,
                     )
                 )
         return shapes

@@ -39,7 +39,7 @@ from .derenzo import DerenzoRods
 from .phantom import Phantom, ShapePhantom
 from .shapes import Box, Capsule, Cone, Cylinder, Ellipsoid, Shape, Sphere
 
-KINDS: dict[str, type[Shape]] = {
+SHAPES: dict[str, type[Shape]] = {
     shape.KIND: shape for shape in (Box, Capsule, Cone, Cylinder, DerenzoRods, Ellipsoid, Sphere)
 }
 """The shapes by the names of their kinds."""
@@ -123,16 +123,16 @@ def _shape(number: int, entries: dict[str, Any]) -> Shape:
     try:
         entries = dict(entries)
         kind = entries.pop("kind", None)
-        if not isinstance(kind, str) or kind not in KINDS:
-            raise InputError(f"kind: expected one of {', '.join(KINDS)}, got {kind!r}")
-        fields = [field for field in dataclasses.fields(KINDS[kind]) if field.init]
+        if not isinstance(kind, str) or kind not in SHAPES:
+            raise InputError(f"kind: expected one of {', '.join(SHAPES)}, got {kind!r}")
+        fields = [field for field in dataclasses.fields(SHAPES[kind]) if field.init]
         _refuse_unknown(entries, [_EULER if field.name == "euler" else field.name for field in fields])
         for field in fields:
             if field.default is dataclasses.MISSING and field.name not in entries:
                 raise InputError(f"{field.name}: missing; a {kind} needs one")
         if _EULER in entries:
             entries["euler"] = _radians(entries.pop(_EULER))
-        return KINDS[kind](**entries)
+        return SHAPES[kind](**entries)
     except InputError as error:
         raise InputError(f"{where}: {error}") from None
 

@@ -19,7 +19,6 @@ from ..geometry.grid import Grid
 from ..geometry.views import Views
 from ..memory import require
 from ..progress import Progress
-from ..projector.tracing import points as as_points
 from ..validation import freeze, positive, real_array
 from ..volumes.volume import UNITS, Volume
 from .painting import Layer, integral, line_integrals, means_beneath, paint_voxels, points_inside, values_at
@@ -56,9 +55,9 @@ class PhantomMesh(NamedTuple):
 class Phantom:
     """What can be voxelised and seen along lines, exactly: shapes, painted one over the other.
 
-    Its frame has its origin at the phantom's middle; `pose` is world-from-phantom (4, 4), mm (default: where it is), any
-    invertible affine, see `euler_pose`. The `quantity` is ``"activity"`` (kBq/mL) or ``"mu"`` (1/mm, at `mu_energy`).
-    A kind of phantom says what its `shapes` are; all else follows.
+    Its frame has its origin at the phantom's middle; `pose` is world-from-phantom (4, 4), mm (default: where it is),
+    any invertible affine, see `euler_pose`. The `quantity` is ``"activity"`` (kBq/mL) or ``"mu"`` (1/mm, at
+    `mu_energy`). A kind of phantom says what its `shapes` are; all else follows.
     """
 
     mu_energy: float = 140.5
@@ -180,7 +179,7 @@ class Phantom:
             The points' shapes do not fit, or a number is not finite; as of `voxelize`.
         """
         layers = self._layers(quantity, pose)
-        starts, ends = as_points(sources, "sources"), as_points(targets, "targets")
+        starts, ends = _points(sources, "sources"), _points(targets, "targets")
         if len(starts) != len(ends) and 1 not in (len(starts), len(ends)):
             raise InputError(f"line_integrals: {len(starts)} sources but {len(ends)} targets")
         starts, ends = np.broadcast_arrays(starts, ends)
@@ -244,6 +243,12 @@ class Phantom:
             for shape in self.shapes
             if (value := getattr(shape, quantity)) is not None
         ]
+
+
+def _points(value: ArrayLike, name: str) -> NDArray[np.float64]:
+    """One point (3,) or many (N, 3) as an array (N, 3)."""
+    array = real_array(value, name, None)
+    return real_array(array[None] if array.ndim == 1 else array, name, (None, 3))
 
 
 @dataclass(frozen=True)

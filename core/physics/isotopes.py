@@ -2,10 +2,11 @@
 
 Half-lives and gamma rays: ENSDF, the Evaluated Nuclear Structure Data File of the National Nuclear Data Center,
 Brookhaven (nndc.bnl.gov/ensdf), as distributed with paceENSDF 0.6.3. The x rays of Tl-201 and Xe-133 and Tc-99m's gamma
-ray: the decay library UKDD-12, as distributed with actigamma 0.1.5. F-18's photons: European Pharmacopoeia, chapter 5.7.
+ray: the decay library UKDD-12, as distributed with actigamma 0.1.5. F-18's photons: European Pharmacopoeia, chapter
+5.7.
 
-Lines are the gamma rays of more than 1 % of decays and the K x rays of Tl-201 and Xe-133. X rays that are not imaged are
-left out: the other isotopes' below 35 keV, and Lu-177's (54 to 63 keV, 6 % of decays).
+Lines are the gamma rays of more than 1 % of decays and the K x rays of Tl-201 and Xe-133. X rays that are not imaged
+are left out: the other isotopes' below 35 keV, and Lu-177's (54 to 63 keV, 6 % of decays).
 Evaluations differ by as much as 3 % (Tc-99m: 0.885 to 0.891; Xe-133's 81 keV: 0.369 to 0.380).
 """
 
@@ -16,7 +17,11 @@ from dataclasses import dataclass
 
 from ..errors import InputError
 from ..validation import positive
-from .materials import CZT_MU, LEAD_MU, NAI_MU, TUNGSTEN_MU, WATER_MU  # noqa: F401  # version 0.1.0 had them here
+from .materials import CZT_MU as CZT_MU  # coefficients that version 0.1.0 had here
+from .materials import LEAD_MU as LEAD_MU
+from .materials import NAI_MU as NAI_MU
+from .materials import TUNGSTEN_MU as TUNGSTEN_MU
+from .materials import WATER_MU as WATER_MU
 
 _HOUR = 3600.0
 _DAY = 24 * _HOUR

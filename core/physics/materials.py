@@ -26,6 +26,12 @@ class Material:
     composition: dict[str, float]
 
 
+# ICRU Report 46 (1992): vertebral column with its cartilage (D6, L3).
+_VERTEBRA = {
+    "H": 0.07, "C": 0.287, "N": 0.038, "O": 0.437, "Mg": 0.001, "P": 0.051, "S": 0.002, "Cl": 0.001, "K": 0.001, "Ca": 0.111,
+    "Fe": 0.001,
+}  # fmt: skip
+
 MATERIALS = {
     # Elements and their densities: NIST Standard Reference Database 126, table 1.
     "tungsten": Material(19.3, {"W": 1.0}),
@@ -59,6 +65,7 @@ MATERIALS = {
         0.26,
         {"H": 0.103, "C": 0.105, "N": 0.031, "O": 0.749, "Na": 0.002, "P": 0.002, "S": 0.003, "Cl": 0.003, "K": 0.002},
     ),
+    "vertebra": Material(1.33, _VERTEBRA),
     "bone": Material(
         1.92,
         {"H": 0.034, "C": 0.155, "N": 0.042, "O": 0.435, "Na": 0.001, "Mg": 0.002, "P": 0.103, "S": 0.003, "Ca": 0.225},
@@ -66,12 +73,9 @@ MATERIALS = {
 }
 """The materials by name."""
 
-# Linear attenuation coefficients at Tc-99m's 140.5 keV and no other energy, 1/mm, rounded: the defaults of phantoms. Density
-# times the total mass attenuation coefficient of W. T. Elam et al., Radiation Physics and Chemistry 63 (2002) 121-128 (as
-# in XrayDB 4). Tissues as above; the vertebral column with cartilage (D6, L3; 1.33 g/cm^3) is of ICRU Report 46 (1992).
-TUNGSTEN_MU, LEAD_MU, NAI_MU, CZT_MU = 3.60, 2.69, 0.262, 0.404
-WATER_MU, PMMA_MU = 0.0154, 0.0177
-SOFT_TISSUE_MU, LUNG_MU, VERTEBRA_MU = 0.0161, 0.00396, 0.0203
+# Linear attenuation coefficients at Tc-99m's 140.5 keV and no other energy, 1/mm, rounded: density times the total mass
+# attenuation coefficient of W. T. Elam et al., Radiation Physics and Chemistry 63 (2002) 121-128 (as in XrayDB 4).
+TUNGSTEN_MU, LEAD_MU, NAI_MU, CZT_MU, WATER_MU = 3.60, 2.69, 0.262, 0.404, 0.0154
 
 APERTURES = ("tungsten", "lead", "gold", "uranium")
 CRYSTALS = ("NaI", "CsI", "CZT", "CdTe", "BGO", "LYSO", "GAGG")
@@ -87,8 +91,8 @@ def attenuation(material: str, energy: float) -> float:
     Parameters
     ----------
     material
-        One of `MATERIALS`, in upper or lower case: ``"tungsten"``, ``"NaI"``, ``"soft tissue"``. At another density, the
-        coefficient is in proportion.
+        One of `MATERIALS`, in upper or lower case: ``"tungsten"``, ``"NaI"``, ``"soft tissue"``. At another density,
+        the coefficient is in proportion.
     energy
         keV, from 10 to 1000.
 

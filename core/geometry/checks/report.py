@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import asdict, dataclass
-from typing import Any
+from typing import Any, ClassVar
 
 from ..collimator import EdgePlace
 from ..module_parts import Kind
@@ -12,6 +12,11 @@ from ..module_parts import Kind
 
 class Finding:
     """Something wrong with one module or with a pair of modules; ``str`` gives it in one line."""
+
+    message: ClassVar[str]
+
+    def __str__(self) -> str:
+        return self.message.format(self)
 
     @property
     def modules(self) -> tuple[int, ...]:
@@ -32,13 +37,10 @@ class Overlap(Finding):
     second_part: Kind
     depth: float
     point: tuple[float, float, float]
-
-    def __str__(self) -> str:
-        at = ", ".join(f"{x:.1f}" for x in self.point)
-        return (
-            f"modules {self.first} and {self.second}: {self.first_part} and {self.second_part} overlap, "
-            f"{_mm(self.depth)} deep at ({at}) mm"
-        )
+    message = (
+        "modules {0.first} and {0.second}: {0.first_part} and {0.second_part} overlap, {0.depth:.4g} mm deep at "
+        "({0.point[0]:.1f}, {0.point[1]:.1f}, {0.point[2]:.1f}) mm"
+    )
 
 
 @dataclass(frozen=True)
@@ -48,9 +50,7 @@ class NearPair(Finding):
     first: int
     second: int
     distance: float
-
-    def __str__(self) -> str:
-        return f"modules {self.first} and {self.second}: nearly at one place, pinholes {_mm(self.distance)} apart"
+    message = "modules {0.first} and {0.second}: nearly at one place, pinholes {0.distance:.4g} mm apart"
 
 
 @dataclass(frozen=True)
@@ -61,9 +61,7 @@ class SwallowedPinhole(Finding):
     by: int
     part: Kind
     depth: float
-
-    def __str__(self) -> str:
-        return f"module {self.module}: its pinhole lies {_mm(self.depth)} inside module {self.by}'s {self.part}"
+    message = "module {0.module}: its pinhole lies {0.depth:.4g} mm inside module {0.by}'s {0.part}"
 
 
 @dataclass(frozen=True)
@@ -73,34 +71,30 @@ class Intrusion(Finding):
     module: int
     roi_radius: float
     depth: float
-
-    def __str__(self) -> str:
-        return f"module {self.module}: its collimator reaches {_mm(self.depth)} into the ROI of {_mm(self.roi_radius)}"
+    message = "module {0.module}: its collimator reaches {0.depth:.4g} mm into the ROI of {0.roi_radius:.4g} mm"
 
 
 @dataclass(frozen=True)
 class Uncovered(Finding):
     """A module's field of view does not hold its ROI.
 
-    `seen_radius`, mm, is that of the largest sphere at the isocentre in the field of view, and `unseen_share` the fraction
-    of the ROI's volume outside the field of view.
+    `seen_radius`, mm, is that of the largest sphere at the isocentre in the field of view, and `unseen_share` the
+    fraction of the ROI's volume outside the field of view.
     """
 
     module: int
     roi_radius: float
     seen_radius: float
     unseen_share: float
+    message = (
+        "module {0.module}: sees {0.seen_radius:.4g} mm around the isocentre, {0.shortage:.4g} mm less than its ROI radius; "
+        "{0.unseen_share:.3%} of the ROI is outside its field of view"
+    )
 
     @property
     def shortage(self) -> float:
         """Missing radius, mm."""
         return self.roi_radius - self.seen_radius
-
-    def __str__(self) -> str:
-        return (
-            f"module {self.module}: sees {_mm(self.seen_radius)} around the isocentre, {_mm(self.shortage)} less than "
-            f"its ROI radius; {_percent(self.unseen_share)} of the ROI is outside its field of view"
-        )
 
 
 @dataclass(frozen=True)
@@ -110,17 +104,15 @@ class Blocked(Finding):
     module: int
     by: int
     share: float
-
-    def __str__(self) -> str:
-        return f"module {self.module}: module {self.by} blocks {_percent(self.share)} of the rays from its ROI"
+    message = "module {0.module}: module {0.by} blocks {0.share:.2%} of the rays from its ROI"
 
 
 @dataclass(frozen=True)
 class Vignetted(Finding):
     """The plate is too thick for the hole's opening angle and shades the hole from part of the ROI.
 
-    Only the fraction `open_share` of the hole's area is open to the steepest rays from the ROI; with `needed_angle`, rad,
-    a plate of any thickness would leave the hole open.
+    Only the fraction `open_share` of the hole's area is open to the steepest rays from the ROI; with `needed_angle`,
+    rad, a plate of any thickness would leave the hole open.
     """
 
     module: int
@@ -128,32 +120,33 @@ class Vignetted(Finding):
     plate_thickness: float
     opening_angle: float
     needed_angle: float
+    message = (
+        "module {0.module}: only {0.open_share:.1%} of its hole is open to the rim of its ROI: a plate of "
+        "{0.plate_thickness:.4g} mm is too thick for an opening angle of {1:.4g} degrees, {2:.1f} are needed"
+    )
 
     def __str__(self) -> str:
-        return (
-            f"module {self.module}: only {_percent(self.open_share)} of its hole is open to the rim of its ROI: a plate of "
-            f"{_mm(self.plate_thickness)} is too thick for an opening angle of {math.degrees(self.opening_angle):.4g} "
-            f"degrees, {math.ceil(math.degrees(self.needed_angle) * 10) / 10:g} are needed"
-        )
+        # Rounded up, so that a plate of that angle passes.
+        needed = math.ceil(math.degrees(self.needed_angle) * 10) / 10
+        return self.message.format(self, math.degrees(self.opening_angle), needed)
 
 
 @dataclass(frozen=True)
 class ThinPlate(Finding):
     """The plate lets through a fraction `transmission` of the photons along the axis.
 
-    `share` is the number of photons that pass the plate beside the hole, relative to those that pass the hole and its edge.
+    `share` is the number of photons that pass the plate beside the hole, relative to those that pass the hole and its
+    edge.
     """
 
     module: int
     plate_thickness: float
     transmission: float
     share: float
-
-    def __str__(self) -> str:
-        return (
-            f"module {self.module}: its plate of {_mm(self.plate_thickness)} lets {_percent(self.transmission)} of the "
-            f"photons through: {_percent(self.share)} as many pass beside the hole as pass the hole"
-        )
+    message = (
+        "module {0.module}: its plate of {0.plate_thickness:.4g} mm lets {0.transmission:.2%} of the photons through: "
+        "{0.share:.2%} as many pass beside the hole as pass the hole"
+    )
 
 
 @dataclass(frozen=True)
@@ -163,9 +156,7 @@ class OpenMesh(Finding):
     module: int
     part: Kind
     fault: str
-
-    def __str__(self) -> str:
-        return f"module {self.module}: its {self.part}'s mesh {self.fault}"
+    message = "module {0.module}: its {0.part}'s mesh {0.fault}"
 
 
 @dataclass(frozen=True)
@@ -178,7 +169,8 @@ class GeometryReport:
         Number of modules checked.
     plate_thickness, wall_thickness, opening_angle, edge_at
         The construction that was checked: mm, mm, rad, and "middle", "front" or "back".
-    overlaps, near_pairs, swallowed_pinholes, intrusions, uncovered, blocked, vignetted, thin_plates, open_meshes : tuple
+    overlaps, near_pairs, swallowed_pinholes, intrusions, uncovered, blocked, vignetted, thin_plates, open_meshes :
+    tuple
         The findings of each kind, in the order of the modules.
     """
 
@@ -214,11 +206,3 @@ class GeometryReport:
     def as_dict(self) -> dict[str, Any]:
         """The report as numbers, strings and lists, for JSON."""
         return {**asdict(self), "ok": self.ok}
-
-
-def _mm(value: float) -> str:
-    return f"{value:.4g} mm"
-
-
-def _percent(share: float) -> str:
-    return f"{100 * share:.3g} %"

@@ -12,12 +12,9 @@ from ...errors import InputError
 
 
 def numbers(file: str, header: Any, name: str, length: int, default: float | None = None) -> NDArray[np.float64]:
-    """The `length` finite numbers of the tag `name`, or `default` where it is missing or empty.
+    """The `length` finite numbers of the tag `name`, or `default` if it is missing or empty.
 
-    Raises
-    ------
-    InputError
-        It is missing without a default, or holds something else; the message names `file` and the tag.
+    `InputError` names `file` and the tag, where there is no default or the tag holds something else.
     """
     given = header.get(name)
     value = default if given is None or given == "" else given
@@ -30,15 +27,12 @@ def numbers(file: str, header: Any, name: str, length: int, default: float | Non
 
 
 def directions(file: str, header: Any) -> NDArray[np.float64]:
-    """ImageOrientationPatient as two orthonormal rows (2, 3): along a row of pixels and down the rows.
+    """ImageOrientationPatient as two orthonormal rows (2, 3): along a row of pixels, and down the rows.
 
-    Raises
-    ------
-    InputError
-        It is missing, or the two are not unit vectors at right angles.
+    `InputError` if it is missing or does not hold two unit vectors at right angles.
     """
     rows = numbers(file, header, "ImageOrientationPatient", 6).reshape(2, 3)
     if not np.allclose(rows @ rows.T, np.eye(2), atol=1e-3):
         raise InputError(f"{file}: ImageOrientationPatient: expected two unit vectors at right angles")
     left, _, right = np.linalg.svd(rows, full_matrices=False)
-    return left @ right  # the nearest: the file's few digits are not exactly that
+    return left @ right  # the nearest orthonormal rows: the file has few digits

@@ -55,7 +55,7 @@ def _run(arguments: argparse.Namespace) -> None:
         "sensitivity": float(counts.sum()),
         "resolution": rms,
         "modules_seeing": int(seeing.sum()),
-        # To what a workbook's rounding leaves of the design formula.
+        # Up to the rounding of l in the workbook.
         "modules_holding_roi": int(np.count_nonzero(radius >= system.roi_radius - 1e-3)),
         "sampling_gap_degrees": math.degrees(sampling_gaps(system, points)[0]),
     }

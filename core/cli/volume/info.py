@@ -53,7 +53,7 @@ def _facts(volume: Volume) -> dict[str, Any]:
 
 
 def _axes(affine: np.ndarray) -> str:
-    """Where each index axis leads in the patient, as in ``RAS``; the closest of right, left, front, back, head, feet."""
+    """The direction of each index axis in the patient, such as ``RAS``: the closest of R, L, A, P, S, I."""
     letters = []
     for axis in affine[:3, :3].T:
         world = int(np.abs(axis).argmax())

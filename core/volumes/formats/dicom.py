@@ -266,10 +266,8 @@ def _ordered(slices: list[_Slice]) -> tuple[list[_Slice], NDArray[np.float64]]:
             f"{places[k]:g} mm, the others {usual:g} mm"
         )
     if usual > 1.5 * first.thickness > 0:
-        text = (
-            f"the slices are {first.thickness:g} mm thick and {usual:g} mm apart: there are gaps, or slices are missing"
-        )
-        warnings.warn(text, InputWarning, stacklevel=2)
+        text = f"the slices are {first.thickness:g} mm thick and lie {usual:g} mm apart: there are gaps between them, "
+        warnings.warn(f"{text}or some are missing", InputWarning, stacklevel=2)
     step = (last.position - first.position) / (len(slices) - 1)
     sideways = np.array(
         [one.position - first.position - (one.position - first.position) @ normal * normal for one in slices]

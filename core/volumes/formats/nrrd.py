@@ -12,7 +12,7 @@ from ..volume import Volume
 from .contents import Contents, first_line, refuse_several_files, require_voxels, warn_of_assumed
 
 # Signs that turn a space's axes to right, anterior, superior, which are assumed for a space without a name.
-_SPACES = {
+_SPACES: dict[str | None, tuple[int, int, int]] = {
     **dict.fromkeys((None, "right-anterior-superior", "ras", "3d-right-handed"), (1, 1, 1)),
     **dict.fromkeys(("left-anterior-superior", "las"), (-1, 1, 1)),
     **dict.fromkeys(("left-posterior-superior", "lps"), (-1, -1, 1)),

@@ -150,7 +150,7 @@ def test_a_module_in_front_blocks_the_rays_that_meet_it():
 def test_a_sliver_of_a_thousandth_is_found(rng):
     """Small modules that just reach over the silhouette of the ROI, at any place around it."""
     found = []
-    for angle, beyond in zip(rng.uniform(0, 2 * np.pi, 20), rng.uniform(-1.5, 1.0, 20), strict=True):
+    for angle, beyond in zip(rng.uniform(0, 2 * np.pi, 12), rng.uniform(-1.5, 1.0, 12), strict=True):
         # The cone's half-angle is 30 degrees; at the depth of 60 mm its radius is 34.64 mm.
         offset = (34.64 + beyond) * np.array([np.cos(angle), np.sin(angle)])
         system = system_of([[200.0, 0, 0], [140, *offset]], 0.5, 5.0, [50.0, 2.0], 1.0, 100.0)
@@ -163,14 +163,14 @@ def test_a_sliver_of_a_thousandth_is_found(rng):
         shares = {b.module: b.share for b in blocked}
         assert shares.get(1, 0.0) == pytest.approx(fine.mean(), abs=5e-4)
         found.append(fine.mean())
-    assert np.count_nonzero((np.array(found) > 2e-4) & (np.array(found) < 1.5e-3)) > 5  # such slivers they were
+    assert np.count_nonzero((np.array(found) > 2e-4) & (np.array(found) < 1.5e-3)) > 3  # such slivers they were
 
 
 def test_rays_meet_hulls_where_points_along_them_are_inside(rng):
     hulls = Hulls.of(module_parts(crowd(rng, 4)))
     origin = np.array([10.0, -20.0, 5.0])
-    directions = cone_directions(2000, -1.0)
-    lengths = rng.uniform(100, 250, 2000)
+    directions = cone_directions(1000, -1.0)
+    lengths = rng.uniform(100, 250, 1000)
     steps = np.linspace(0, 1, 800)[:, None, None]
     points = origin + steps * lengths[:, None] * directions
     for p in range(len(hulls)):

@@ -140,7 +140,7 @@ def _at_points(
         counts = [max(2, int(np.ceil(length))) for length in np.abs(linear).max(axis=0)]
     fractions = [(np.arange(count) + 0.5) / count - 0.5 for count in counts]
     shifts = np.stack(np.meshgrid(*fractions, indexing="ij"), axis=-1).reshape(-1, 3) @ linear.T
-    sample = _linear_samples if method == "linear" else _nearest_samples
+    taps = _linear_taps if method == "linear" else _nearest_taps
     j, k = np.meshgrid(np.arange(result.shape[1]), np.arange(result.shape[2]), indexing="ij")
     in_plane = linear[:, 1:] @ np.stack([j.ravel(), k.ravel()]) + origin[:, None]
     for i, plane in enumerate(result):
@@ -150,32 +150,19 @@ def _at_points(
             points = in_plane[:, part] + (linear[:, 0] * i)[:, None]
             total = np.zeros(points.shape[1], np.float32)
             for shift in shifts:
-                total += sample(array, beside, points + shift[:, None])
+                total += _samples(array, beside, points + shift[:, None], taps)
             values[part] = total / len(shifts) + beside
         progress(i + 1, len(result))
 
 
-def _nearest_samples(
-    array: NDArray[np.float32], beside: np.float32, points: NDArray[np.float64]
+def _samples(
+    array: NDArray[np.float32], beside: np.float32, points: NDArray[np.float64], taps: Callable[..., _Taps]
 ) -> NDArray[np.float32]:
-    """``array - beside`` at index coordinates `points` (3, N); 0 outside."""
-    index = np.floor(points + 0.5).astype(np.int64)
-    size = np.array(array.shape)[:, None]
-    inside = ((index >= 0) & (index < size)).all(axis=0)
-    return (array[tuple(index.clip(0, size - 1))] - beside) * inside
-
-
-def _linear_samples(array: NDArray[np.float32], beside: np.float32, points: NDArray[np.float64]) -> NDArray[np.float32]:
-    """As `_nearest_samples`, but interpolated."""
-    size = np.array(array.shape)[:, None]
-    inside = ((points >= -0.5) & (points <= size - 0.5)).all(axis=0)
-    points = points.clip(0, size - 1)
-    low = np.floor(points).astype(np.int64)
-    share = (points - low).astype(np.float32)
-    high = np.minimum(low + 1, size - 1)
+    """``array - beside`` at index coordinates `points` (3, N), from the voxels and weights of `taps`; 0 outside."""
+    (x, x_weight), (y, y_weight), (z, z_weight) = (
+        [part.T.copy() for part in taps(at, 1.0, n)] for at, n in zip(points, array.shape, strict=True)
+    )
     total = np.zeros(points.shape[1], np.float32)
-    for corner in np.ndindex(2, 2, 2):
-        index = tuple(high[axis] if up else low[axis] for axis, up in enumerate(corner))
-        weight = np.prod([share[axis] if up else 1 - share[axis] for axis, up in enumerate(corner)], axis=0)
-        total += weight * (array[index] - beside)
-    return total * inside
+    for i, j, k in np.ndindex(len(x), len(y), len(z)):
+        total += x_weight[i] * y_weight[j] * z_weight[k] * (array[x[i], y[j], z[k]] - beside)
+    return total

@@ -57,7 +57,8 @@ def real_array(
 
 def require_finite(array: NDArray[Any], name: str) -> None:
     """Raise `InputError` naming the first index at which `array` is not finite."""
-    # A finite sum proves that all numbers are, in one pass without a mask. The sum of finite numbers may still overflow.
+    # A finite sum proves that all numbers are, in one pass without a mask. The sum of finite numbers may still
+    # overflow.
     with np.errstate(over="ignore", invalid="ignore"):
         if np.isfinite(array.sum()):
             return
@@ -103,9 +104,14 @@ def positive(value: Any, name: str, unit: str = "") -> float:
     return number
 
 
+def one_for_all(value: ArrayLike, name: str, n: int) -> NDArray[np.float64]:
+    """`value` as `n` numbers, where one number stands for all, or `InputError`."""
+    return real_array(np.broadcast_to(value, n) if np.ndim(value) == 0 else value, name, (n,))
+
+
 def lengths(value: ArrayLike, name: str, n: int) -> NDArray[np.float64]:
-    """`value` as `n` lengths above 0 mm, of which one number stands for all, or `InputError`."""
-    array = real_array(np.broadcast_to(value, n) if np.ndim(value) == 0 else value, name, (n,))
+    """`value` as `n` lengths above 0 mm, where one number stands for all, or `InputError`."""
+    array = one_for_all(value, name, n)
     if array.min() <= 0:
         raise InputError(f"{name}: expected more than 0 mm, got {array.min():g}")
     return array

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass, fields
 from typing import TYPE_CHECKING, Literal
 
@@ -9,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..errors import InputError
-from ..validation import freeze, lengths, positive, real_array, whole_shape
+from ..validation import freeze, lengths, one_for_all, positive, real_array, whole_shape
 from .frames import module_frames, module_poses, principal_rays
 from .views import Views
 
@@ -40,8 +41,8 @@ class PinholeSystem:
     Raises
     ------
     InputError
-        A shape is wrong, a number is not finite or not positive, d is not below Ld, a pinhole lies inside the ROI, or two
-        modules have the same number or place.
+        A shape is wrong, a number is not finite or not positive, d is not below Ld, a pinhole lies inside the ROI, or
+        two modules have the same number or place.
     """
 
     centers: NDArray[np.float64]
@@ -64,35 +65,26 @@ class PinholeSystem:
         object.__setattr__(self, "centers", freeze(centers))
         object.__setattr__(self, "numbers", freeze(numbers))
         for name in _LENGTHS:
-            value = getattr(self, name)
-            if np.ndim(value) == 0:
-                value = np.full(n, real_array(value, name, ()))
-            value = real_array(value, name, (n,))
-            self._refuse(
-                value <= 0, lambda i, name=name, value=value: f"{name} must be more than 0 mm, got {value[i]:g}"
-            )
-            object.__setattr__(self, name, freeze(value))
-        b = self.pinhole_distance
+            object.__setattr__(self, name, freeze(one_for_all(getattr(self, name), name, n)))
+            self._refuse(getattr(self, name) <= 0, f"{name} must be more than 0 mm, got {{{name}:g}}")
         self._refuse(
             self.pinhole_diameter >= self.detector_side,
-            lambda i: (
-                f"pinhole_diameter {self.pinhole_diameter[i]:g} mm must be less than detector_side "
-                f"{self.detector_side[i]:g} mm"
-            ),
+            "pinhole_diameter {pinhole_diameter:g} mm must be less than detector_side {detector_side:g} mm",
         )
         self._refuse(
-            b <= self.roi_radius,
-            lambda i: f"its pinhole is {b[i]:g} mm from the isocentre, inside the ROI of {self.roi_radius[i]:g} mm",
+            self.pinhole_distance <= self.roi_radius,
+            "its pinhole is {pinhole_distance:g} mm from the isocentre, inside the ROI of {roi_radius:g} mm",
         )
         for what, values in (("number", numbers[:, None]), ("pinhole centre", centers)):
             _, first, inverse = np.unique(values, axis=0, return_index=True, return_inverse=True)
-            repeated = first[inverse.reshape(-1)] != np.arange(n)
-            self._refuse(repeated, lambda i, what=what: f"another module has the same {what}")
+            self._refuse(first[inverse.reshape(-1)] != np.arange(n), f"another module has the same {what}")
 
-    def _refuse(self, bad: NDArray[np.bool_], why) -> None:  # type: ignore[no-untyped-def]
+    def _refuse(self, bad: NDArray[np.bool_], message: str) -> None:
+        """Refuse the first module that is `bad`; `message` is a template of its dimensions."""
         if bad.any():
             i = int(np.argmax(bad))
-            raise InputError(f"module {self.numbers[i]}: {why(i)}")
+            own = {name: np.ravel(getattr(self, name))[i] for name in re.findall(r"{(\w+)", message)}
+            raise InputError(f"module {self.numbers[i]}: {message.format(**own)}")
 
     def __len__(self) -> int:
         return len(self.centers)

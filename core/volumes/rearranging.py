@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 from ..errors import InputError
 from ..geometry.grid import Grid
 from ..memory import require
-from ..validation import freeze, instance, real_array
+from ..validation import freeze, instance, one_for_all, real_array
 from .volume import Volume, outside_value
 
 
@@ -134,7 +134,7 @@ def split_labels(volume: Volume, labels: Volume | NDArray) -> dict[int, Volume]:
 
 
 def _indices(value: ArrayLike, name: str) -> NDArray[np.int64]:
-    numbers = real_array(np.broadcast_to(value, 3) if np.ndim(value) == 0 else value, name, (3,))
+    numbers = one_for_all(value, name, 3)
     if not (numbers == np.floor(numbers)).all():
         raise InputError(f"{name}: expected whole numbers of voxels, got {numbers.tolist()}")
     return numbers.astype(np.int64)

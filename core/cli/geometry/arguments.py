@@ -6,6 +6,8 @@ import argparse
 import math
 from typing import Any
 
+from numpy.typing import NDArray
+
 from ...errors import InputError
 from ...geometry.system import PinholeSystem
 from ...physics.isotopes import ISOTOPES, isotope
@@ -19,6 +21,12 @@ MATERIAL_OPTIONS = ("aperture_mu", "opening_angle", "crystal_mu", "intrinsic_fwh
 def add_json(parser: argparse.ArgumentParser) -> None:
     """Add ``--json``."""
     parser.add_argument("--json", action="store_true", help="print JSON")
+
+
+def table_rows(columns: dict[str, NDArray[Any]]) -> list[dict[str, Any]]:
+    """The rows of a table given by its columns, in Python's numbers."""
+    values = (column.tolist() for column in columns.values())
+    return [dict(zip(columns, row, strict=True)) for row in zip(*values, strict=True)]
 
 
 def add_materials(parser: argparse.ArgumentParser) -> None:

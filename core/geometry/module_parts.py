@@ -13,7 +13,7 @@ from .collimator import Collimator, Construction
 from .collimator_mesh import Solid, collimator_solid, crystal_solid
 from .system import PinholeSystem
 
-Kind = Literal["collimator", "crystal"]
+PartKind = Literal["collimator", "crystal"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -34,7 +34,7 @@ class ModulePart:
     """
 
     number: int
-    kind: Kind
+    kind: PartKind
     name: str
     solid: Solid
     pose: NDArray[np.float64]

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..collimator_mesh import Solid
-from ..module_parts import Kind, ModulePart
+from ..module_parts import ModulePart, PartKind
 
 TOUCH = 1e-6
 """Bodies that penetrate each other by less than this, mm, only touch."""
@@ -39,7 +39,7 @@ class Hulls:
     """
 
     numbers: NDArray[np.int64]
-    kinds: tuple[Kind, ...]
+    kinds: tuple[PartKind, ...]
     vertices: NDArray[np.float64]
     normals: NDArray[np.float64]
     offsets: NDArray[np.float64]

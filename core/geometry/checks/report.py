@@ -7,7 +7,7 @@ from dataclasses import asdict, dataclass
 from typing import Any, ClassVar
 
 from ..collimator import EdgePlace
-from ..module_parts import Kind
+from ..module_parts import PartKind
 
 
 class Finding:
@@ -32,9 +32,9 @@ class Overlap(Finding):
     """
 
     first: int
-    first_part: Kind
+    first_part: PartKind
     second: int
-    second_part: Kind
+    second_part: PartKind
     depth: float
     point: tuple[float, float, float]
     message = (
@@ -59,7 +59,7 @@ class SwallowedPinhole(Finding):
 
     module: int
     by: int
-    part: Kind
+    part: PartKind
     depth: float
     message = "module {0.module}: its pinhole lies {0.depth:.4g} mm inside module {0.by}'s {0.part}"
 
@@ -154,7 +154,7 @@ class OpenMesh(Finding):
     """The surface of a part is not closed, not consistently wound, or inside out."""
 
     module: int
-    part: Kind
+    part: PartKind
     fault: str
     message = "module {0.module}: its {0.part}'s mesh {0.fault}"
 

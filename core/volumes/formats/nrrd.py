@@ -112,33 +112,31 @@ def _affine(header: dict[str, Any], path: Path) -> np.ndarray:
     kinds = header.get("kinds", ["space"] * 3)
     if any(kind.lower() not in _SPATIAL for kind in kinds):
         raise InputError(f"kinds {' '.join(kinds)}: expected three axes of space or domain")
-    affine, assumed = np.eye(4), [] if name else ["axes right, anterior, superior"]
-    origin = None if "space origin" not in header else np.asarray(header["space origin"], np.float64)
-    space_units = _scales(header, "space units", None)
+    assumed = [] if name else ["axes right, anterior, superior"]
+    space_units, units = _scales(header, "space units"), _scales(header, "units")
+    scale, first = np.ones(3) if space_units is None else space_units, None
     if "space directions" in header:
-        affine[:3, :3] = _of_space(header, np.asarray(header["space directions"], np.float64))
-        units = _scales(header, "units", None)
         if space_units is None and units is not None and np.ptp(units) == 0:
-            space_units = units
-        elif units is not None and np.any(units != (1.0 if space_units is None else space_units)):
+            scale = units
+        elif units is not None and np.any(units != scale):
             raise InputError("units: the axes' own differ from the space's; expected space units alone")
-        scale = np.ones(3) if space_units is None else space_units
+        axes = scale[:, None] * _of_space(header, np.asarray(header["space directions"], np.float64))
     else:
-        scale = np.ones(3) if space_units is None else space_units
-        own = _scales(header, "units", scale)
         spacings, first, said = _of_axes(header)
         assumed += said
-        affine[:3, :3] = np.diag(spacings * own / scale)
-        if first is not None:
-            first = first * own / scale
-            if origin is not None and np.any(np.abs(first - origin) > _SAME * np.abs(spacings * own / scale)):
-                raise InputError(f"axis mins and space origin say different places: {_text(first)} and {_text(origin)}")
-            origin = first
-    if origin is None:
-        assumed.append("the first voxel's centre at (0, 0, 0)")
+        own = scale if units is None else units
+        axes, first = np.diag(spacings * own), None if first is None else first * own
+    if "space origin" in header:
+        origin = scale * np.asarray(header["space origin"], np.float64)
+        if first is not None and np.any(np.abs(first - origin) > _SAME * np.abs(np.diag(axes))):
+            raise InputError(f"axis mins and space origin say different places: {_text(first)} and {_text(origin)} mm")
+    elif first is not None:
+        origin = first
     else:
-        affine[:3, 3] = origin
-    affine[:3] *= scale[:, None]
+        assumed.append("the first voxel's centre at (0, 0, 0)")
+        origin = np.zeros(3)
+    affine = np.eye(4)
+    affine[:3, :3], affine[:3, 3] = axes, origin
     warn_of_assumed(path, assumed)
     return np.diag([*map(float, _SPACES[name]), 1.0]) @ affine
 
@@ -205,11 +203,11 @@ def _all_of(numbers: np.ndarray, name: str) -> np.ndarray:
     return numbers
 
 
-def _scales(header: dict[str, Any], name: str, default: np.ndarray | None) -> np.ndarray | None:
-    """A field's three units of length, in mm."""
+def _scales(header: dict[str, Any], name: str) -> np.ndarray | None:
+    """A field's three units of length, in mm, or None if it is not there."""
     units = header.get(name)
     if units is None:
-        return default
+        return None
     if len(units) != 3 or any(unit.strip() not in _MILLIMETRES for unit in units):
         raise InputError(f"{name} {' '.join(units)}: expected mm, cm, m or um for each of three axes")
     return np.array([_MILLIMETRES[unit.strip()] for unit in units])

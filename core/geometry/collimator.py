@@ -1,13 +1,15 @@
 """A module's collimator: a plate with a knife-edged pinhole, and walls behind it. The one description of its shape.
 
-The mesh, the solids in files and in Monte Carlo programs, the geometry checks and the physics of the knife edge all use it.
-Depths are along the module's axis, mm from the pinhole's centre, positive towards the crystal. From front to back:
+The mesh, the solids in files and in Monte Carlo programs, the geometry checks and the physics of the knife edge all use
+it. Depths are along the module's axis, mm from the pinhole's centre, positive towards the crystal. From front to back:
 
 - The hole is narrowest at depth 0, where its diameter is d, and opens as a double cone of full angle alpha through the
   whole plate: its radius at depth s is ``d/2 + |s| tan(alpha/2)``.
-- The plate's faces are at `Construction.front` and `Construction.back`. The knife edge lies in the plate's middle, or on
+- The plate's faces are at `Construction.front` and `Construction.back`. The knife edge lies in the plate's middle, or
+on
   the face towards the ROI (front) or towards the crystal (back).
-- Behind the plate is a channel, a square frustum that ends at the crystal's front face with the crystal's side. It is never
+- Behind the plate is a channel, a square frustum that ends at the crystal's front face with the crystal's side. It is
+never
   narrower than the pyramid that the crystal sees through the hole, of half-width ``d/2 + (Ld - d)/2 * s/l``.
 - The outside is a square frustum, everywhere at least a wall's thickness outside the hole and the channel.
 
@@ -31,7 +33,7 @@ EdgePlace = Literal["middle", "front", "back"]
 OPENING_ANGLE = math.pi / 2
 """Default full angle of the knife edge's double cone, rad."""
 
-_SHOULDER = 0.01  # fraction of the room beside the hole by which the channel begins wider than the hole
+_SHOULDER = 0.01  # the channel begins wider than the hole by this fraction of the free width around the hole
 
 
 def edge_slope(opening_angle: float) -> float:
@@ -58,8 +60,8 @@ class Construction:
     opening_angle : float
         Full angle alpha of the hole's double cone, rad.
     edge_at : "middle", "front" or "back"
-        Where in the plate the knife edge is; front is the face towards the ROI. The edge is always at the pinhole's centre,
-        so this moves the plate.
+        Where in the plate the knife edge is; front is the face towards the ROI. The edge is always at the pinhole's
+        centre, so this moves the plate.
 
     Raises
     ------
@@ -168,8 +170,8 @@ class Collimator:
     def open_share(self, slope: float) -> float:
         """Fraction of the hole's area that is open to parallel rays of a slope, mm across the axis per mm along it (>= 0).
 
-        A ray passes if it is within the hole at the edge and at both faces of the plate, because the hole consists of cones.
-        So the open area is the intersection of three discs, shifted along the rays.
+        A ray passes if it is within the hole at the edge and at both faces of the plate, because the hole consists of
+        cones. So the open area is the intersection of three discs, shifted along the rays.
         """
         n = 512
         across = self.diameter / 2 * np.sin((np.arange(n) + 0.5) / n * np.pi / 2)  # half of the symmetric disc

@@ -62,7 +62,7 @@ def euler_pose(
     """
     angles = real_array([phi, theta, psi], "Euler angles", (3,))
     pose = np.eye(4)
-    pose[:3, :3] = _about_z(angles[0]) @ _about_y(angles[1]) @ _about_z(angles[2])
+    pose[:3, :3] = _rotation(2, angles[0]) @ _rotation(1, angles[1]) @ _rotation(2, angles[2])
     pose[:3, 3] = real_array(translation, "translation", (3,))
     return pose
 
@@ -79,11 +79,11 @@ def checked_affine(affine: ArrayLike, name: str) -> NDArray[np.float64]:
     return matrix
 
 
-def _about_z(angle: float) -> NDArray[np.float64]:
-    c, s = np.cos(angle), np.sin(angle)
-    return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
-
-
-def _about_y(angle: float) -> NDArray[np.float64]:
-    c, s = np.cos(angle), np.sin(angle)
-    return np.array([[c, 0.0, s], [0.0, 1.0, 0.0], [-s, 0.0, c]])
+def _rotation(axis: int, angle: float) -> NDArray[np.float64]:
+    """Rotation matrix (3, 3) about a coordinate axis."""
+    i, j = (axis + 1) % 3, (axis + 2) % 3
+    matrix = np.eye(3)
+    matrix[i, i] = matrix[j, j] = np.cos(angle)
+    matrix[j, i] = np.sin(angle)
+    matrix[i, j] = -matrix[j, i]
+    return matrix

@@ -50,9 +50,9 @@ def ellipse_rings(
     modules
         Number of evenly spaced modules in each ring; or the azimuths themselves, rad, (M,) or (rings, M).
     semi_axes
-        Of the ellipse through the pinholes, mm: (along x, along y) before rotation, or one number for a circle.
+        Semi-axes of the ellipse through the pinholes, mm: along x and y before rotation, or one number for a circle.
     z
-        Of the rings, mm: one number, (rings,), or (rings, M) where it differs from module to module.
+        z of the rings, mm: one number, (rings,), or (rings, M) if it differs from module to module.
     pinhole_diameter, detector_side, detector_thickness, roi_radius
         d, Ld, Td and R, mm; one number, or one for each module of the system.
     collimator_length
@@ -63,9 +63,9 @@ def ellipse_rings(
     spacing
         ``"angle"``: equal steps in azimuth; ``"arc"``: equal lengths along the ellipse.
     center
-        Of the ellipse, (x, y) mm. The isocentre must be inside the ellipse.
+        Centre (x, y) of the ellipse, mm. The isocentre must be inside the ellipse.
     rotation
-        Of the ellipse about its centre, rad.
+        Rotation of the ellipse about its centre, rad.
     mirrored
         Append the rings' mirror images at z = 0, beginning with that of the last ring.
 

@@ -48,7 +48,7 @@ def hu_to_mu(volume: Volume, energy: float = 140.5, ct_energy: float = CT_ENERGY
     volume
         CT numbers, HU.
     energy
-        Of the photons, keV, 10 to 1000: 140.5 for Tc-99m, 71 and 80 for Tl-201, 159 for I-123, 511 for F-18.
+        Photon energy, keV, 10 to 1000: 140.5 for Tc-99m, 71 and 80 for Tl-201, 159 for I-123, 511 for F-18.
     ct_energy
         Effective energy of the CT, keV.
 

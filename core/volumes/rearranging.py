@@ -126,9 +126,9 @@ def split_labels(volume: Volume, labels: Volume | NDArray) -> dict[int, Volume]:
     if not (found == np.floor(found)).all():
         raise InputError(f"labels: expected whole numbers, got {found[found != np.floor(found)][0]:g}")
     require(4.0 * array.size * len(found), f"a volume for each of {len(found)} labels")
-    beside = np.float32(outside_value(volume))
+    background = np.float32(outside_value(volume))
     return {
-        int(label): Volume(freeze(np.where(array == label, volume.array, beside)), volume.grid, volume.quantity)
+        int(label): Volume(freeze(np.where(array == label, volume.array, background)), volume.grid, volume.quantity)
         for label in found
     }
 

@@ -48,12 +48,12 @@ def resample(
         raise InputError(f"method {method!r}: expected linear, nearest or mean")
     instance(volume, Volume, "resample")
     instance(grid, Grid, "resample")
-    beside = np.float32(outside_value(volume) if outside is None else float(real_array(outside, "outside", ())))
+    background = np.float32(outside_value(volume) if outside is None else float(real_array(outside, "outside", ())))
     require(4.5 * grid.n_voxels, "a volume of {} x {} x {} voxels".format(*grid.shape))
     index_from_index = volume.grid.index_from_world @ grid.affine  # index in the old grid from index in the new one
     result = np.empty(grid.shape, np.float32)
     fill = _along_axes if _is_parallel(index_from_index) else _at_points
-    fill(volume.array, beside, index_from_index, method, result, progress or (lambda done, total: None))
+    fill(volume.array, background, index_from_index, method, result, progress or (lambda done, total: None))
     return Volume(freeze(result), grid, volume.quantity)
 
 
@@ -65,7 +65,7 @@ def _is_parallel(index_from_index: NDArray[np.float64]) -> bool:
 
 def _along_axes(
     array: NDArray[np.float32],
-    beside: np.float32,
+    background: np.float32,
     index_from_index: NDArray[np.float64],
     method: str,
     result: NDArray[np.float32],
@@ -83,19 +83,21 @@ def _along_axes(
     for first in range(0, result.shape[0], slab):
         part = slice(first, first + slab)
         index, weight = taps[0]
-        values = _apply(array, beside, (index[part], weight[part]), 0)
+        values = _apply(array, background, (index[part], weight[part]), 0)
         for axis in (1, 2):
             values = _apply(values, np.float32(0), taps[axis], axis)
-        result[part] = values + beside
+        result[part] = values + background
         progress(min(first + slab, result.shape[0]), result.shape[0])
 
 
-def _apply(array: NDArray[np.float32], beside: np.float32, taps: _Taps, axis: int) -> NDArray[np.float32]:
-    """Weighted sums of ``array - beside`` along one axis."""
+def _apply(array: NDArray[np.float32], background: np.float32, taps: _Taps, axis: int) -> NDArray[np.float32]:
+    """Weighted sums of ``array - background`` along one axis."""
     index, weight = taps
     shape = [1, 1, 1]
     shape[axis] = len(index)
-    return sum((np.take(array, i, axis) - beside) * w.reshape(shape) for i, w in zip(index.T, weight.T, strict=True))
+    return sum(
+        (np.take(array, i, axis) - background) * w.reshape(shape) for i, w in zip(index.T, weight.T, strict=True)
+    )
 
 
 def _nearest_taps(at: NDArray[np.float64], step: float, n: int) -> _Taps:
@@ -127,7 +129,7 @@ _TAPS = {"nearest": _nearest_taps, "linear": _linear_taps, "mean": _mean_taps}
 
 def _at_points(
     array: NDArray[np.float32],
-    beside: np.float32,
+    background: np.float32,
     index_from_index: NDArray[np.float64],
     method: str,
     result: NDArray[np.float32],
@@ -150,19 +152,19 @@ def _at_points(
             points = in_plane[:, part] + (linear[:, 0] * i)[:, None]
             total = np.zeros(points.shape[1], np.float32)
             for shift in shifts:
-                total += _samples(array, beside, points + shift[:, None], taps)
-            values[part] = total / len(shifts) + beside
+                total += _samples(array, background, points + shift[:, None], taps)
+            values[part] = total / len(shifts) + background
         progress(i + 1, len(result))
 
 
 def _samples(
-    array: NDArray[np.float32], beside: np.float32, points: NDArray[np.float64], taps: Callable[..., _Taps]
+    array: NDArray[np.float32], background: np.float32, points: NDArray[np.float64], taps: Callable[..., _Taps]
 ) -> NDArray[np.float32]:
-    """``array - beside`` at index coordinates `points` (3, N), from the voxels and weights of `taps`; 0 outside."""
+    """``array - background`` at index coordinates `points` (3, N), from the voxels and weights of `taps`; 0 outside."""
     (x, x_weight), (y, y_weight), (z, z_weight) = (
         [part.T.copy() for part in taps(at, 1.0, n)] for at, n in zip(points, array.shape, strict=True)
     )
     total = np.zeros(points.shape[1], np.float32)
     for i, j, k in np.ndindex(len(x), len(y), len(z)):
-        total += x_weight[i] * y_weight[j] * z_weight[k] * (array[x[i], y[j], z[k]] - beside)
+        total += x_weight[i] * y_weight[j] * z_weight[k] * (array[x[i], y[j], z[k]] - background)
     return total

@@ -47,28 +47,28 @@ def read_volume(
 ) -> Volume:
     """Read a volume from NIfTI, a DICOM series or tomogram, MetaImage, NRRD, Analyze, HDF5, .npz or .npy.
 
-    The world's axes are RAS, NIfTI's, whatever the format's are. docs/volumes.md has the formats and conventions.
+    World axes are always NIfTI's, RAS. docs/volumes.md describes the formats and conventions.
 
     Parameters
     ----------
     path
-        The file; of a DICOM series its folder, or any file of it.
+        The file. For a DICOM series: its folder, or any of its files.
     quantity
         What the values are: one of `UNITS`, such as ``"activity"`` (kBq/mL), ``"mu"`` (1/mm) or ``"hu"``. Default: what
-        the file says; a file that says nothing is taken for CT, ``"hu"``.
+        the file says, or ``"hu"`` if it says nothing.
     affine
-        Index to world mm (4, 4), in place of the file's own; .npy files need it.
+        Index to world mm (4, 4), instead of the file's own; .npy files need it.
     series
-        Of several DICOM series in the folder the one with this number, description or UID.
+        Number, description or UID of one of several DICOM series in the folder.
     progress
         Called as ``progress(done, total)`` with the slices of a DICOM series; may raise `Cancelled`.
 
     Raises
     ------
     InputError
-        No such file, not such a file, damaged, not 3-D, not finite, in another unit, too large for the memory; of a
-        DICOM series: several of them, slices missing, double, unlike each other or tilted; of nuclear medicine,
-        something else than one reconstructed tomogram.
+        The file does not exist, is damaged, not 3-D, not finite, in another unit or too large for the memory; a DICOM
+        series is not unique, or slices are missing, duplicate, inconsistent or tilted; a nuclear medicine file is not a
+        single reconstructed tomogram.
     """
     path = Path(path)
     contents = _contents(path, series, progress)

@@ -1,4 +1,4 @@
-"""What a file of voxels holds, before it becomes a `Volume`, and what the readers share.
+"""The contents of a volume's file before they become a `Volume`, and helpers that the readers share.
 
 World axes are NIfTI's: +x to the patient's right, +y to the front (anterior), +z to the head (superior), RAS for short.
 Those of DICOM and ITK point left, back (posterior) and to the head: LPS.

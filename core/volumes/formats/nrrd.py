@@ -30,7 +30,7 @@ _UNITS = {
     **dict.fromkeys(("hounsfield", "hounsfield unit", "hounsfield units", "hu"), "HU"),
     **dict.fromkeys(("mm-1", "mm^-1"), "1/mm"),
 }
-# Fields that say what the values are or where they lie, by the names that pynrrd understands.
+# Fields about the values or their places, by the names that pynrrd understands.
 _SYNONYMS = {
     "axismins": "axis mins", "axismaxs": "axis maxs", "centers": "centerings", "oldmin": "old min", "oldmax": "old max",
     "lineskip": "line skip", "byteskip": "byte skip", "datafile": "data file",
@@ -142,7 +142,7 @@ def _affine(header: dict[str, Any], path: Path) -> np.ndarray:
 
 
 def _of_space(header: dict[str, Any], directions: np.ndarray) -> np.ndarray:
-    """The directions as columns. The format allows no lengths of the axes beside them, so these must agree."""
+    """The directions as columns. The format allows no other lengths of the axes with them, so those must agree."""
     if directions.shape != (3, 3) or not np.isfinite(directions).all():
         raise InputError("space directions: expected a vector for each of three axes")
     if any(np.isfinite(_numbers(header, name)).any() for name in ("axis mins", "axis maxs")):

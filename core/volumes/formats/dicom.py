@@ -165,11 +165,11 @@ def _listed(found: dict[str, list[tuple[Path, Any]]]) -> str:
 
 
 def _slices_of(path: Path, header: Any) -> list[_Slice]:
-    """The images of a file, or `InputError` that names it."""
+    """The images of a file; `InputError` names it."""
     try:
         return list(_slices(path, header))
-    except InputError:
-        raise
+    except InputError as error:
+        raise InputError(f"{path.name}: {error}") from None
     except Exception as error:  # whatever pydicom raises on a damaged tag; it parses tags on access
         raise InputError(f"{path.name}: cannot be read as DICOM ({first_line(error)})") from None
 
@@ -177,44 +177,42 @@ def _slices_of(path: Path, header: Any) -> list[_Slice]:
 def _slices(path: Path, header: Any) -> Iterator[_Slice]:
     """The images of a file."""
     if header.get("SamplesPerPixel", 1) != 1:
-        raise InputError(f"{path.name}: expected one value per pixel, found {header.SamplesPerPixel} (a colour image)")
+        raise InputError(f"expected one value per pixel, found {header.SamplesPerPixel} (a colour image)")
     tilt = float(header.get("GantryDetectorTilt") or 0.0)
     if abs(tilt) > 0.01:
         raise InputError(
-            f"{path.name}: the gantry is tilted by {tilt:g} degrees; expected upright slices: resample the series first"
+            f"the gantry is tilted by {tilt:g} degrees; expected upright slices: resample the series first"
         )
     if "ModalityLUTSequence" in header:
-        raise InputError(f"{path.name}: values by a table (ModalityLUTSequence) are not read; expected RescaleSlope")
+        raise InputError("values by a table (ModalityLUTSequence) are not read; expected RescaleSlope")
     count = int(header.get("NumberOfFrames") or 1)
-    frames = _frames(path, header)
+    frames = _frames(header)
     if len(frames) != count:
-        raise InputError(
-            f"{path.name}: {count} frames without a place for each; expected an enhanced image, or one frame"
-        )
+        raise InputError(f"{count} frames without a place for each; expected an enhanced image, or one frame")
     for number, frame in enumerate(frames):
-        spacing = numbers(path.name, frame, "PixelSpacing", 2)
+        spacing = numbers(frame, "PixelSpacing", 2)
         if spacing.min() <= 0:
-            raise InputError(f"{path.name}: PixelSpacing: expected more than 0 mm, got {spacing.min():g}")
+            raise InputError(f"PixelSpacing: expected more than 0 mm, got {spacing.min():g}")
         yield _Slice(
             path=path,
             frame=number,
             shape=(int(header.Rows), int(header.Columns)),
             spacing=(float(spacing[0]), float(spacing[1])),
-            orientation=directions(path.name, frame),
-            position=numbers(path.name, frame, "ImagePositionPatient", 3),
-            slope=float(numbers(path.name, frame, "RescaleSlope", 1, 1.0)[0]),
-            intercept=float(numbers(path.name, frame, "RescaleIntercept", 1, 0.0)[0]),
-            thickness=float(numbers(path.name, frame, "SliceThickness", 1, 0.0)[0]),
+            orientation=directions(frame),
+            position=numbers(frame, "ImagePositionPatient", 3),
+            slope=float(numbers(frame, "RescaleSlope", 1, 1.0)[0]),
+            intercept=float(numbers(frame, "RescaleIntercept", 1, 0.0)[0]),
+            thickness=float(numbers(frame, "SliceThickness", 1, 0.0)[0]),
             unit=str(header.get("Units") or frame.get("RescaleType") or ""),
         )
 
 
-def _frames(path: Path, header: Any) -> list[Any]:
+def _frames(header: Any) -> list[Any]:
     """The description of each image of a file: the header; in an enhanced image the shared groups and the frame's own."""
     from pydicom.dataset import Dataset
 
     if "PerFrameFunctionalGroupsSequence" not in header:
-        return tomogram_frames(path.name, header) if is_nuclear(header) else [header]
+        return tomogram_frames(header) if is_nuclear(header) else [header]
     shared = header.get("SharedFunctionalGroupsSequence") or []
     frames = []
     for own in header.PerFrameFunctionalGroupsSequence:
@@ -247,7 +245,8 @@ def _ordered(slices: list[_Slice]) -> tuple[list[_Slice], NDArray[np.float64]]:
         if not first.thickness > 0:
             raise InputError(f"{first.name}: a single slice without a SliceThickness")
         return slices, normal * first.thickness
-    places = np.array([one.position @ normal for one in slices])
+    positions = np.array([one.position for one in slices])
+    places = positions @ normal
     gaps = np.diff(places)
     if gaps.min() < _SAME_PLACE:
         k = int(gaps.argmin())
@@ -269,9 +268,8 @@ def _ordered(slices: list[_Slice]) -> tuple[list[_Slice], NDArray[np.float64]]:
         text = f"the slices are {first.thickness:g} mm thick and lie {usual:g} mm apart: there are gaps between them, "
         warnings.warn(f"{text}or some are missing", InputWarning, stacklevel=2)
     step = (last.position - first.position) / (len(slices) - 1)
-    sideways = np.array(
-        [one.position - first.position - (one.position - first.position) @ normal * normal for one in slices]
-    )
+    moved = positions - first.position
+    sideways = moved - np.outer(moved @ normal, normal)
     tilt = float(np.linalg.norm(sideways[-1]) / (places[-1] - places[0]))
     if tilt > _UPRIGHT:
         raise InputError(

@@ -114,7 +114,7 @@ def test_a_phantom_of_shapes_is_projected(workbook, tmp_path, capsys):
 @pytest.mark.parametrize("is_file", [True, False], ids=["file", "Derenzo"])
 def test_a_phantoms_own_mu_attenuates_as_its_volume_would(is_file, workbook, tmp_path, capsys):
     (tmp_path / "thorax.toml").write_text(THORAX)
-    place = ["--voxels", "20", "19", "18", "--spacing", "8.5", "--euler", "10", "20", "30", "--position", "3", "2", "1"]
+    place = ["--voxels", "22", "21", "22", "--spacing", "7.5", "--euler", "10", "20", "30", "--position", "3", "2", "1"]
     water = ["--rods", "9", "9", "8", "8", "9", "9", "--water", "45", "50", "--background", "20"]
     make = ["file", str(tmp_path / "thorax.toml"), *place] if is_file else ["derenzo", *water, *place]
     for quantity in ("activity", "mu"):

@@ -502,7 +502,7 @@ def test_the_heart_beats_with_its_muscle_and_apex_kept():
     volumes = [frame.ventricle_volume for frame in frames]
     assert volumes[0] == 120 and volumes[7] == pytest.approx(45) and np.argmin(volumes) == 7
     muscles, apexes = [], []
-    for frame in frames[::4] + [frames[7]]:
+    for frame in (*frames[::4], frames[7]):
         parts = {shape.name: shape for shape in frame.shapes}
         assert parts["left ventricle"].volume == pytest.approx(frame.ventricle_volume * 1e3, rel=1e-4)
         muscles.append(parts["myocardium"].volume - parts["left ventricle"].volume)

@@ -79,7 +79,7 @@ class DerenzoRods(Shape):
             )
 
     def empty_sectors(self) -> list[float]:
-        """Diameters, mm, of the sectors into which none of their rods fits."""
+        """Diameters, mm, of the sectors that have no room for any of their rods."""
         return [w for w, (_, n) in zip(self.rod_diameters, self._rows, strict=True) if w > 0 and n == 0]
 
     @cached_property

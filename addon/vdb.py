@@ -1,10 +1,10 @@
 """OpenVDB files: volumes of ours to the last bit, and grids of other programs.
 
-Files of ours hold every voxel's float32 value, the float64 affine, the quantity, the unit and where the volume came
-from. The transform is OpenVDB's own, in which an integer index is the voxel's CENTRE: that is how Houdini, EmberGen and
-Blender 5 place grids. Blender 4.5 draws them half a voxel farther along every index axis, so the files that a scene
-draws are shifted back there, and say so in their metadata; what is written for others is not. Of other programs' files
-the transform counts.
+Files of ours hold every voxel's float32 value, the float64 affine, the quantity, the unit and where the volume came from.
+The transform is OpenVDB's own, in which an integer index is the voxel's CENTRE: that is how Houdini, EmberGen and Blender 5
+place grids. Blender 4.5 draws them half a voxel farther along every index axis, so the files that a scene draws are
+shifted back there, and say so in their metadata; what is written for others is not. Of other programs' files the transform
+counts.
 """
 
 from __future__ import annotations
@@ -70,8 +70,8 @@ def write_vdb(
         Also write a grid `SMOKE` of the first volume's values above this one, less it: Blender's solid viewport draws
         what surrounds values below 0 black. `read_vdb` does not see it.
     center_shift
-        Voxels by which the transforms are shifted along every index axis, for files that a Blender draws which places
-        them otherwise (`compat.VDB_CENTER_SHIFT`). For other programs such a file lies that much off.
+        Voxels by which the transforms are shifted along every index axis, for files that a Blender draws which places them
+        otherwise (`compat.VDB_CENTER_SHIFT`). For other programs such a file lies that much off.
 
     Raises
     ------
@@ -97,9 +97,9 @@ def write_vdb(
 def read_vdb(path: str | Path, quantity: str | None = None, grid: str | None = None, *, unit: float = 1.0) -> Volume:
     """Read a grid as a volume: one of ours the same to the last bit, any other program's by its transform.
 
-    Another program's grid becomes a volume on the box around its active voxels; outside of it a volume is 0, whatever
-    the grid's background. Grids of float, double, half, int and bool give all their values in the box, active or not,
-    in float32; a level set gives the share of each voxel that lies inside it (0 to 1).
+    Another program's grid becomes a volume on the box around its active voxels; outside of it a volume is 0, whatever the
+    grid's background. Grids of float, double, half, int and bool give all their values in the box, active or not, in
+    float32; a level set gives the share of each voxel that lies inside it (0 to 1).
 
     Parameters
     ----------

@@ -20,8 +20,8 @@ from .phantom import Phantom
 from .settings import check_settings, setting
 from .shapes import Cylinder, Ellipsoid, Shape
 
-# Rows: the heart's lateral, anterior and apical axis in the torso, after its third, second and first axis in M. Cristy
-# and K. F. Eckerman, ORNL/TM-8381 (1987), whose x and y point to the patient's left and back. Not confirmed.
+# Rows: the heart's lateral, anterior and apical axis in the torso, after its third, second and first axis in M. Cristy and
+# K. F. Eckerman, ORNL/TM-8381 (1987), whose x and y point to the patient's left and back. Not confirmed.
 _HEART = np.array([[-0.5736, -0.8191, 0.0], [-0.4640, 0.3249, 0.8241], [-0.6751, 0.4727, -0.5664]])
 # Where ORNL/TM-8381's axis (x, y) and its height 0 lie from the left ventricle's middle, mm: chosen.
 _AXIS, _HEIGHT = (35.0, -30.0), 490.0
@@ -41,14 +41,14 @@ class CardiacTorso(Phantom):
     Lungs, liver, spine and the direction of the heart's axis follow the mathematical adult of M. Cristy and K. F.
     Eckerman, ORNL/TM-8381 (1987). The trunk, the places of the organs and the half axes of liver and spine were checked
     against its 15-year-old in Geant4's human_phantom, scaled. The half axes of the lungs, the plane that cuts the liver
-    and the heart's axis are not confirmed. The report's body of 400 x 200 mm includes the arms; here an ellipse of 330
-    x 230 mm stands for a chest with the arms up, the liver reaches 150 instead of 165 mm to the right, and the spine
-    lies 15 mm further back.
+    and the heart's axis are not confirmed. The report's body of 400 x 200 mm includes the arms; here an ellipse of 330 x
+    230 mm stands for a chest with the arms up, the liver reaches 150 instead of 165 mm to the right, and the spine lies
+    15 mm further back.
     The left ventricle's cavity and outer surface are half ellipsoids. The cavity holds 120 mL at end-diastole and 45 mL
     at end-systole, the wall is 9.5 mm thick (within men's normal ranges, R. M. Lang et al., J Am Soc Echocardiogr 28
     (2015) 1-39): 133 g of muscle. The muscle's volume and the apex stay the same over the cycle. The cavity's volume
-    falls along half a cosine for 35 % of the cycle and rises along another; the right ventricle's shrinks with it.
-    Ribs, arms, breasts and other organs are left out.
+    falls along half a cosine for 35 % of the cycle and rises along another; the right ventricle's shrinks with it. Ribs,
+    arms, breasts and other organs are left out.
 
     The activities are choices for rest, an hour after 1 GBq: 1.2 % of it in the heart (sestamibi's prescribing
     information) is about 90 kBq/mL in 133 g; the other organs are set to ratios seen in clinical images.

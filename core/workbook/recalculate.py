@@ -7,16 +7,11 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any
 
-from . import libreoffice
 from .dependencies import Dependencies
 from .formulas import CellError, NotComputable
 from .plausibility import AGREEING
 from .sheet_xml import Cell
 from .workbook_xml import Place, WorkbookXml
-
-_TRIES = 4
-_ALIKE = 1e-6
-"""Relative: another program's result of the same formula differs less."""
 
 
 @dataclass
@@ -26,14 +21,14 @@ class Recalculated:
     Attributes
     ----------
     by : dict
-        Cell -> "formulas" (our own evaluator) or "LibreOffice", which gave its new value.
+        Cell -> its new value.
     cleared : dict
         Cell whose value nobody could calculate, and which therefore stores none -> why.
     replaced : dict
         Cell whose formula does not give the number that it must -> why; it holds that number now.
     """
 
-    by: dict[Place, str] = field(default_factory=dict)
+    by: dict[Place, Any] = field(default_factory=dict)
     cleared: dict[Place, str] = field(default_factory=dict)
     replaced: dict[Place, str] = field(default_factory=dict)
 
@@ -58,8 +53,6 @@ def recalculate(
     """
     calculation = _Calculation(workbook, changed, required, derived or {})
     calculation.by_formulas()
-    if calculation.unknown:
-        calculation.by_libreoffice()
     calculation.clear()
     calculation.fill()
     return calculation.result
@@ -103,7 +96,7 @@ class _Calculation:
             if self._is_wrong(place, value):
                 self._replace(place, f"it gives {_shown(value)}")
             elif place in self.affected:
-                self._store(place, self.required.get(place, value), "formulas")
+                self._store(place, self.required.get(place, value))
             else:
                 self.elsewhere[place] = value
         self.unknown = {place: why for place, why in self.unknown.items() if place in self.affected}
@@ -125,41 +118,6 @@ class _Calculation:
             return self.elsewhere[place]
         return self.workbook.value(place)
 
-    def by_libreoffice(self) -> None:
-        for _ in range(_TRIES):  # once more where formulas had to be replaced, for those that depend on them
-            values = self._libreoffice_values()
-            wrong = {
-                place: f"it gives {_shown(value)}" for place, value in values.items() if self._is_wrong(place, value)
-            }
-            for place, why in wrong.items():
-                self._replace(place, why)
-                del self.unknown[place]
-            if not wrong:
-                for place, value in values.items():
-                    self._store(place, self.required.get(place, value), "LibreOffice")
-                    del self.unknown[place]
-                return
-
-    def _libreoffice_values(self) -> dict[Place, Any]:
-        """What LibreOffice makes of the unknown formulas, those left out which it calculates otherwise than stored."""
-        workbook, name = self.workbook, f"{self.workbook.name}, recalculated by LibreOffice"
-        contents = libreoffice.recalculated([workbook.to_bytes(), workbook.package.content], workbook.suffix or ".xlsx")
-        if contents[0] is None or contents[1] is None:
-            return {}
-        new, old = (WorkbookXml(content, name) for content in contents if content is not None)
-        values = {}
-        for place in self.unknown:
-            if place[0] not in new.sheets:
-                continue
-            value = new.value(place)
-            was = workbook.sheets[place[0]].original.get(place[1:])
-            unlike = was is not None and was.value is not None and not _alike(old.value(place), was.value)
-            # #NAME? is said of functions that LibreOffice does not know; #VALUE! it saves for most other errors too.
-            unclear = value == "#NAME?" or (value == "#VALUE!" and (was is None or was.value != value))
-            if value is not None and not unclear and not unlike:
-                values[place] = value
-        return values
-
     def clear(self) -> None:
         for place, why in self.unknown.items():
             cell = self.workbook.cell(place)
@@ -174,7 +132,7 @@ class _Calculation:
         changed = {title for title, sheet in self.workbook.sheets.items() if sheet.changed}
         for place, value in self.elsewhere.items():
             if place[0] in changed:
-                self._store(place, value, "formulas")
+                self._store(place, value)
 
     def _is_wrong(self, place: Place, value: Any) -> bool:
         if place in self.required:
@@ -190,11 +148,11 @@ class _Calculation:
         self._set(place, self.workbook.cell(place).typed(number))
         self.result.replaced[place] = why
 
-    def _store(self, place: Place, value: Any, by: str) -> None:
+    def _store(self, place: Place, value: Any) -> None:
         cell = self.workbook.cell(place)
         if not _identical(cell.value, value):
             self._set(place, replace(cell, value=value))
-        self.result.by[place] = by
+        self.result.by[place] = value
 
     def _set(self, place: Place, cell: Cell) -> None:
         self.workbook.sheets[place[0]].cells[place[1:]] = cell
@@ -202,12 +160,6 @@ class _Calculation:
 
 def _identical(a: Any, b: Any) -> bool:
     return type(a) is type(b) and a == b
-
-
-def _alike(a: Any, b: Any) -> bool:
-    if type(a) is float and type(b) is float:
-        return math.isclose(a, b, rel_tol=_ALIKE, abs_tol=_ALIKE)
-    return _identical(a, b)
 
 
 def _shown(value: Any) -> str:

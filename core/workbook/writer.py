@@ -15,7 +15,6 @@ from ..files import replacing
 from ..geometry.system import PinholeSystem
 from ..recording import recorded_warnings
 from ..validation import instance
-from . import libreoffice
 from .book import Book
 from .column_map import ColumnMap, column_map
 from .edit import Edit, several, values_of
@@ -36,10 +35,9 @@ class WrittenWorkbook:
     changed : tuple of str
         The cells (``"Coordinates!B3"``) whose numbers or formulas are not the template's.
     recalculated : dict
-        Cell with a formula that depends on these, or stored no value in a sheet that changes -> who calculated the
-        value it stores now: "formulas" (mphDRR's own evaluator) or "LibreOffice".
+        Cell with a formula that depends on these, or stored no value in a sheet that changes -> the value it stores now.
     cleared : tuple of str
-        Cells that depend on these and store no value now, because neither could calculate it.
+        Cells that depend on these and store no value now, because it could not be calculated here.
     columns : ColumnMap or None
         The column map that the new file is read by, its rows being those of the modules now; None where its headings
         are understood.
@@ -62,11 +60,10 @@ def write_system(
 
     Into a copy of `template` only what differs is written: its modules are found by their numbers, their cells
     as by `read_system`. Formulas stay as long as they give the system's numbers (to 1e-9, relative). Every formula
-    of the workbook that depends on a changed cell stores its new value, calculated by `core.workbook.formulas`
-    or else, where it is installed, by LibreOffice; else it stores none, and the workbook is marked to be
-    recalculated when opened. In a sheet that changes, formulas that stored no value get theirs too. All other parts
-    of the file - sheets, formats, charts, images, comments, macros - are byte for byte the template's; if nothing
-    differs, the whole file is.
+    of the workbook that depends on a changed cell stores its new value if `core.workbook.formulas` can calculate it,
+    else none, and the workbook is marked to be recalculated when opened. In a sheet that changes, formulas that
+    stored no value get theirs too. All other parts of the file - sheets, formats, charts, images, comments, macros -
+    are byte for byte the template's; if nothing differs, the whole file is.
 
     Removed modules leave empty rows, added ones come below the last with copies of its formulas, and modules in
     another order take their rows' contents along.
@@ -197,10 +194,9 @@ def _warn_of_formulas(workbook: WorkbookXml, result: Recalculated) -> None:
         )
     if result.cleared:
         places = list(result.cleared)  # causes before effects
-        missing = "" if libreoffice.program() else "; LibreOffice, which may know it, is not installed"
         warnings.warn(
             f"{workbook.name}: {_cell_and_more(workbook, places)}: the formula's new value could not be "
-            f"calculated ({result.cleared[places[0]]}{missing}); opening the workbook in Excel or LibreOffice and saving "
+            f"calculated ({result.cleared[places[0]]}); opening the workbook in Excel or LibreOffice and saving "
             "it stores the value",
             InputWarning,
             stacklevel=4,

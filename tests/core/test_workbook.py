@@ -23,10 +23,12 @@ from openpyxl.worksheet.worksheet import Worksheet
 
 from mphdrr.core.errors import InputError, InputWarning
 from mphdrr.core.geometry.design_formulas import collimator_length
-from mphdrr.core.workbook import libreoffice, read_system
+from mphdrr.core.workbook import read_system
 from mphdrr.core.workbook.formulas import CellError, NotComputable, Surroundings, calculate
 from mphdrr.core.workbook.plausibility import tolerance
 from mphdrr.core.workbook.quantities import understood
+
+from . import libreoffice
 
 try:
     from hypothesis import HealthCheck, given, settings
@@ -602,6 +604,7 @@ def test_formulas_give_what_a_spreadsheet_shows(formula, value):
 
 
 @pytest.mark.skipif(libreoffice.program() is None, reason="LibreOffice is not installed")
+@pytest.mark.long
 def test_counts_of_errors_are_those_of_libreoffice():
     formulas = [
         *(

@@ -25,17 +25,10 @@ from openpyxl.worksheet.table import Table
 
 import mphdrr
 import mphdrr.core as mph
-from mphdrr.core.workbook import libreoffice
 
 from .workbooks import Layout, by_design, changed, content_of, laid_out, values_of
 
 SPREADSHEET = "http://schemas.openxmlformats.org/spreadsheetml/2006/main"
-
-
-@pytest.fixture(autouse=True)
-def without_libreoffice(monkeypatch):
-    """It takes seconds; what it calculates is tested in test_workbook_write.py."""
-    monkeypatch.setattr(libreoffice, "program", lambda: None)
 
 
 def members_of(path: Path) -> dict[str, bytes]:

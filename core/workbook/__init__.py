@@ -2,7 +2,6 @@
 
 book.py          the file: opened, refused, its cells as Python values
 references.py    B3, Main!$B$3:$B$82, A:C in formulas
-tables.py        Table1[v], Table1[[#This Row],[x]] in formulas
 formulas.py      values of formulas
 quantities.py    what the columns are: quantities, their headings and units
 sheet_seen.py    a sheet's headings, and the columns and rows under them

@@ -210,11 +210,14 @@ def _areas_read(workbook: WorkbookXml, place: Place, formula: str, depth: int = 
         if area is None:
             if _OTHER_FILE.match(text):
                 continue  # another file's cells do not change with this one's
-            meaning = workbook.meaning(place, text)
-            areas = None if meaning is None else _areas_read(workbook, place, meaning, depth + 1)
-            if areas is None:
+            table = workbook.tables.get(text.partition("[")[0].casefold())
+            meaning = workbook.meaning(place[0], text)
+            if table is not None:
+                found.append(table)  # whichever of its cells are meant
+            elif meaning is None or (areas := _areas_read(workbook, place, meaning, depth + 1)) is None:
                 return None
-            found += areas
+            else:
+                found += areas
         elif area.sheet is not None and ":" in area.sheet:
             return None  # through several sheets
         elif (title := place[0] if area.sheet is None else workbook.title(area.sheet)) is not None:

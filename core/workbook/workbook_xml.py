@@ -12,7 +12,6 @@ from .formulas import CellError, NotComputable, Surroundings, areas_in, calculat
 from .package import Package
 from .references import Reference, reference
 from .sheet_xml import MAIN, STRICT, At, Cell, SheetXml, Unreadable, cell_name, shared_strings
-from .tables import DataTable, data_table, table_area
 from .xml_parts import Element, elements, spliced, utf8, with_attribute
 
 KINDS = {
@@ -175,9 +174,15 @@ class WorkbookXml:
         return names
 
     @cached_property
-    def _tables(self) -> list[DataTable]:
-        found = (data_table(self._parts_of(m), title) for title in self.parts for m in self._related_to(title, "table"))
-        return [table for table in found if table is not None]
+    def tables(self) -> dict[str, Reference]:
+        """Case-folded name of an Excel table -> its cells."""
+        found = {}
+        for title in self.parts:
+            for member in self._related_to(title, "table"):
+                attributes = self._parts_of(member)[0].attributes
+                if (area := reference(attributes.get("ref", ""))) is not None:
+                    found[attributes.get("displayName", "").casefold()] = area._replace(sheet=title)
+        return found
 
     def _related_to(self, sheet: str, kind: str) -> list[str]:
         return [member for _, its, member in self.package.relations(self.parts[sheet]) if its == kind]
@@ -216,15 +221,8 @@ class WorkbookXml:
             raise NotComputable(f"{self.text(place)} holds {value!r}")
         return value
 
-    def meaning(self, place: Place, name: str) -> str | None:
-        """The formula that a name, or a reference to a table's columns, stands for in a formula at `place`.
-
-        None if it is unknown, or a name whose meaning depends on the place.
-        """
-        sheet, row, _ = place
-        area = table_area(name, self._tables, sheet, row)
-        if area is not None:
-            return f"={area}"
+    def meaning(self, sheet: str, name: str) -> str | None:
+        """The formula that a defined name stands for on `sheet`; None if it is unknown or depends on the cell."""
         own, _, plain = name.rpartition("!")
         scope, key = self.title(own.strip("'")) if own else sheet, plain.casefold()
         formula = self._names.get((scope, key)) or self._names.get((None, key))
@@ -246,7 +244,7 @@ class WorkbookXml:
             lambda name, row, column: value_of((title(name), row, column)),
             at=place[1:],
             extent=lambda name: self.extent(title(name)),
-            name=lambda name: self.meaning(place, name),
+            name=lambda name: self.meaning(sheet, name),
         )
         return calculate(formula, surroundings)
 
@@ -272,7 +270,7 @@ class WorkbookXml:
             if member.startswith("xl/charts/") and member.endswith(".xml"):
                 series = [reference(e.text.strip()) for e in self._parts_of(member) if e.name == "f"]
                 found += [f"the chart {member}"] * any(map(ends_there, series))
-        found += [f"the table {table.name}" for table in self._tables if ends_there(table.area)]
+        found += [f"the table {name}" for name, area in self.tables.items() if ends_there(area)]
         for title, cells in self.sheets.items():
             for at, cell in cells.cells.items():
                 if cell.formula is not None and any(ends_there(area, title) for area in areas_in(cell.formula)):

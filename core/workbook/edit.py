@@ -57,9 +57,10 @@ class Edit:
     """
 
     def __init__(self, system: PinholeSystem, reading: Reading, workbook: WorkbookXml) -> None:
-        self.system, self.old, self.workbook = system, reading.system, workbook
-        self.layout, self.given = reading.layout, reading.given
-        self.columns, self.modules = reading.layout.columns, reading.layout.modules
+        self.system = system
+        self.old, self.given, self.layout = reading.system, reading.given, reading.layout
+        self.columns, self.modules = self.layout.columns, self.layout.modules
+        self.workbook = workbook
         self.numbered = self.modules.number_column is not None
         self.old_of = matched(system, self.old, self.numbered)
         self.required: dict[Place, float] = {}

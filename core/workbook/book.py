@@ -1,43 +1,34 @@
-"""A workbook file and its cells' values. The file is read once, into memory, and never opened for writing."""
+"""A workbook file and the values of its cells. The file is read once, into memory, and never opened for writing."""
 
 from __future__ import annotations
 
 import hashlib
 import io
+import math
 import os
 import zipfile
 from functools import cached_property
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 from ..errors import InputError
+from .cells import Outdated, Uncomputed, description
 from .formulas import NotComputable
+from .references import Reference
 from .sheet_xml import At, Cell, Unreadable
 from .workbook_xml import Place, WorkbookXml
 
 MAX_FILE_BYTES = 256 * 2**20
 MAX_UNPACKED_BYTES = 2**30
 MAX_ROWS = 100_000
-"""Rows with something in them, in a sheet that is read."""
-SAME_RESULT = 1e-6
-"""Relative, and absolute: a formula's stored value differs less from what its inputs give."""
-
+"""Rows with content in a sheet that is read."""
 HEADING_ROWS = 20
 """Headings stand in a sheet's first rows."""
+_SAME_RESULT = 1e-6
+"""Largest difference, relative and absolute, between a formula's stored value and what it gives."""
 
 _OLE = bytes.fromhex("d0cf11e0a1b11ae1")
 _ENCRYPTED = "EncryptedPackage".encode("utf-16-le")
-
-
-class Uncomputed(str):
-    """Stands for a formula that has no value to rely on and cannot be computed here; the text says why."""
-
-
-class Outdated(NamedTuple):
-    """Stands for a formula whose stored value is not what its inputs give."""
-
-    stored: Any
-    computed: Any
 
 
 class Book:
@@ -52,8 +43,8 @@ class Book:
     sheets : dict
         Name -> `Sheet`, in the workbook's order.
     unverified : dict
-        Formula that cannot be computed here and whose stored value was taken although the file asks for calculation
-        -> why it cannot.
+        Formulas that cannot be computed here and whose stored value was used although the file asks to be calculated
+        -> why they cannot.
 
     Raises
     ------
@@ -71,17 +62,24 @@ class Book:
         self.unverified: dict[Place, str] = {}
         self._computed: dict[Place, Any] = {}
 
-    def sheet(self, name: str) -> Sheet | None:
-        """The sheet called `name` in whatever case, as in a formula."""
-        title = self.workbook.title(name)
-        return None if title is None else self.sheets[title]
+    def formula_value(self, place: Place) -> Any:
+        """The value of a formula: computed here, else as stored, else `Uncomputed`."""
+        computed, stored = self._compute(place), self._cell(place).value
+        if not isinstance(computed, Uncomputed) or stored is None:
+            return computed
+        if self.workbook.asks_for_calculation:
+            # Programs that cannot calculate, such as XlsxWriter, store a 0 for every formula.
+            if stored == 0 or stored == "":
+                return Uncomputed(f"it stores {stored!r} and the file asks to be calculated, but {computed}")
+            self.unverified[place] = str(computed)
+        return stored
 
-    def original(self, place: Place) -> Cell | None:
+    def _cell(self, place: Place) -> Cell:
         """A cell as it was read."""
-        return self.workbook.sheets[place[0]].original.get(place[1:])
+        return self.workbook.sheets[place[0]].original.get(place[1:], Cell())
 
-    def computed(self, place: Place) -> Any:
-        """What a formula's inputs give, all the way from what is typed; `Uncomputed` where that is beyond us."""
+    def _compute(self, place: Place) -> Any:
+        """What a formula gives, computed from typed cells without recursion; `Uncomputed` where that is impossible."""
         waiting, begun = [place], set()
         while waiting:
             current = waiting[-1]
@@ -89,7 +87,7 @@ class Book:
                 waiting.pop()
                 continue
             needed: list[Place] = []
-            result = self._result(current, needed)
+            result = self._evaluate(current, needed)
             loop = next((other for other in needed if other == current or other in begun), None)
             if loop is not None:
                 result = Uncomputed(f"it refers to {self.workbook.text(loop)}, which refers back to it")
@@ -100,13 +98,11 @@ class Book:
             self._computed[current] = result
         return self._computed[place]
 
-    def _result(self, place: Place, needed: list[Place]) -> Any:
-        """What a formula gives, or nothing to rely on and, in `needed`, the formulas that must be computed before."""
+    def _evaluate(self, place: Place, needed: list[Place]) -> Any:
+        """What a formula gives; meaningless if formulas that must be computed first were added to `needed`."""
 
         def value_of(other: Place) -> Any:
-            cell = self.original(other)
-            if cell is None:
-                return None
+            cell = self._cell(other)
             if isinstance(cell.value, Unreadable):
                 raise NotComputable(f"{self.workbook.text(other)} holds {cell.value!r}")
             if cell.formula is None:
@@ -114,13 +110,13 @@ class Book:
             if other not in self._computed:
                 needed.append(other)
                 return 0.0
-            value = self.relied_on(other)
+            value = self.formula_value(other)
             if isinstance(value, Uncomputed):
                 raise NotComputable(f"it needs {self.workbook.text(other)}, and there: {value}")
             return value
 
-        cell = self.original(place)
-        assert cell is not None and cell.formula is not None, "only formulas are computed"
+        cell = self._cell(place)
+        assert cell.formula is not None, "only formulas are computed"
         if cell.array is not None:
             return Uncomputed("it is an array formula or a data table")
         try:
@@ -128,26 +124,12 @@ class Book:
         except NotComputable as why:
             return Uncomputed(str(why))
 
-    def relied_on(self, place: Place) -> Any:
-        """What a formula gives: as computed here, else as stored, else `Uncomputed`."""
-        computed = self.computed(place)
-        cell = self.original(place)
-        if not isinstance(computed, Uncomputed) or cell is None or cell.value is None:
-            return computed
-        if self.workbook.asks_for_calculation:
-            # Programs that cannot calculate, as XlsxWriter, store a 0 for every formula.
-            if cell.value == 0 or cell.value == "":
-                return Uncomputed(f"it stores {cell.value!r} and the file asks to be calculated, but {computed}")
-            self.unverified[place] = str(computed)
-        return cell.value
-
 
 class Sheet:
     """The cells of one sheet, as they are in the file."""
 
     def __init__(self, book: Book, name: str) -> None:
-        self.book = book
-        self.name = name
+        self.book, self.name = book, name
 
     @property
     def cells(self) -> dict[At, Cell]:
@@ -156,7 +138,7 @@ class Sheet:
 
     @cached_property
     def rows(self) -> list[int]:
-        """The rows with content; `InputError` where they are too many for a table of modules."""
+        """The rows with content; `InputError` if they are too many for a table of modules."""
         found = sorted({at[0] for at, cell in self.cells.items() if not cell.blank})
         if len(found) > MAX_ROWS:
             raise InputError(
@@ -167,52 +149,75 @@ class Sheet:
 
     @cached_property
     def texts(self) -> dict[At, str]:
-        """The cells that show text, typed or a formula's; below the first rows, those of formulas only if stored."""
+        """The cells that show text, sorted; below the rows of headings, the text of a formula only as stored."""
         shown = {at: cell.value if at[0] > HEADING_ROWS else self.value(*at) for at, cell in self.cells.items()}
-        return {at: text for at, text in shown.items() if type(text) is str and text.strip()}
+        return {at: text for at, text in sorted(shown.items()) if type(text) is str and text.strip()}
 
     @property
     def comments(self) -> dict[At, str]:
         """The cells' comments."""
         return self.book.workbook.comments(self.name)
 
-    def formula(self, row: int, column: int) -> str | None:
-        """The formula in a cell."""
-        cell = self.cells.get((row, column))
-        return cell.formula if cell is not None else None
+    @property
+    def merged(self) -> list[Reference]:
+        """Cells that are shown as one."""
+        return self.book.workbook.sheets[self.name].merged
 
     def value(self, row: int, column: int) -> Any:
-        """What a cell holds, None if blank; of a formula that says nothing to rely on, `Uncomputed` or `Outdated`."""
+        """What a cell holds, None if blank; `Uncomputed` or `Outdated` for a formula without a reliable value."""
         cell = self.cells.get((row, column))
         if cell is None:
             return None
         value = cell.value
         if cell.formula is not None:
-            place = (self.name, row, column)
-            relied = self.book.relied_on(place)
-            if value is None or isinstance(relied, Uncomputed) or not _same_result(value, relied):
-                value = relied if value is None or isinstance(relied, Uncomputed) else Outdated(value, relied)
+            given = self.book.formula_value((self.name, row, column))
+            if value is None or isinstance(given, Uncomputed):
+                value = given
+            elif not _same_result(value, given):
+                value = Outdated(value, given)
         return None if type(value) is str and not value.strip() else value
+
+    def number(self, row: int, column: int, expected: str) -> float:
+        """The number in a cell; `InputError` if it holds none, saying what was `expected`."""
+        value = self.value(row, column)
+        if isinstance(value, float) and math.isfinite(value) and not self.is_date(row, column):
+            return value
+        raise InputError(f"{self.where(row, column)} {self.found(row, column)}, expected {expected}, a number")
+
+    def formula(self, row: int, column: int) -> str | None:
+        """The formula in a cell."""
+        return self.cells.get((row, column), Cell()).formula
 
     def is_date(self, row: int, column: int) -> bool:
         """Whether a cell shows its number as a date or a time."""
         from openpyxl.styles.numbers import is_date_format
 
-        cell = self.cells.get((row, column))
-        return cell is not None and is_date_format(self.number_format(row, column))
+        return is_date_format(self.number_format(row, column))
 
     def number_format(self, row: int, column: int) -> str:
-        """How a cell shows its number, such as ``0.00" mm"``."""
-        return self.book.workbook.number_format(self.cells[row, column])
+        """How a cell shows its number, such as ``0.00" mm"``; "" for a cell that does not exist."""
+        cell = self.cells.get((row, column))
+        return "" if cell is None else self.book.workbook.number_format(cell)
 
     def place(self, row: int, column: int) -> str:
         """A cell's name, e.g. ``Coordinates!B3``."""
         return self.book.workbook.text((self.name, row, column))
 
+    def where(self, row: int, column: int) -> str:
+        """File and cell: how every message about a cell begins."""
+        return f"{self.book.path.name}: {self.place(row, column)}"
+
+    def found(self, row: int, column: int) -> str:
+        """What is in a cell, as the predicate of a message."""
+        value = self.value(row, column)
+        if isinstance(value, float) and self.is_date(row, column):
+            return f"is formatted as a date or time ({self.number_format(row, column)})"
+        return description(value, self.formula(row, column))
+
 
 def _same_result(stored: Any, computed: Any) -> bool:
     if type(stored) is float and type(computed) is float:
-        return abs(stored - computed) <= SAME_RESULT * max(1.0, abs(computed))
+        return abs(stored - computed) <= _SAME_RESULT * max(1.0, abs(computed))
     return type(stored) is type(computed) and stored == computed
 
 

@@ -760,7 +760,7 @@ BAD_CELLS = {
     "same number in Main": (_set("Main", "A5", 2), "Main!A5 is module 2, as is Main!A4"),
     "same place": (
         _center(6, *CENTERS[1]),
-        "Coordinates!B6 and y1, z1 put the pinhole of module 4 where that of module 2",
+        "Coordinates!B6 and y1, z1 put the pinhole of module 4 at the place of module 2",
     ),
     "number missing": (_set("Coordinates", "A5", None), "Coordinates!A5 is blank, expected a module's number"),
     "number is text": (
@@ -770,12 +770,12 @@ BAD_CELLS = {
     "number is a fraction": (_set("Coordinates", "A5", 2.5), "Coordinates!A5 is 2.5, expected a module's number"),
     "number without module": (
         _set("Coordinates", "A7", 5),
-        "Coordinates!A7 is module 5, expected a row of it in sheet Main too",
+        "Coordinates!A7 is module 5, expected a row for it in sheet Main too",
     ),
     "sum below the table": (_sum_below, "Coordinates!A7 holds the text 'mean', expected a module's number"),
     "dimensions of a module missing": (
         _row_missing,
-        "Coordinates!A5 is module 3, expected a row of it in sheet Main too, with its d",
+        "Coordinates!A5 is module 3, expected a row for it in sheet Main too, with its d",
     ),
     "too few rows": (_row_missing_without_numbers, "sheet Main has 3 rows of d (Main!A3 to Main!A5), expected one or"),
     "two columns of one name": (_second_x1, "Coordinates!B1 and Coordinates!R1 are both headed as x1"),
@@ -855,7 +855,7 @@ BAD_FILES: dict[str, tuple[Callable[[Path, bytes], object], str]] = {
     ),
     "not a number": (
         lambda path, real: _damaged_sheet(path, real, lambda xml: xml.replace(b"<v>277.002</v>", b"<v>NaN</v>")),
-        "Coordinates!B3 holds 'NaN', which is no number, expected x1 of module 1",
+        "Coordinates!B3 holds 'NaN', which is not a number, expected x1 of module 1",
     ),
     "infinite": (
         lambda path, real: _damaged_sheet(path, real, lambda xml: xml.replace(b"<v>277.002</v>", b"<v>1e999</v>")),

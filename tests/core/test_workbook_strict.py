@@ -583,5 +583,5 @@ def test_a_gap_between_modules_without_numbers_is_warned_of(tmp_path):
         main.insert_rows(5, 2)
         coordinates.insert_rows(5, 2)
 
-    with pytest.warns(InputWarning, match="is no module's, and the rows below, which have no numbers to tell"):
+    with pytest.warns(InputWarning, match="holds no module; the rows below have no numbers"):
         assert_plain(read_edited(tmp_path, edit))

@@ -61,6 +61,7 @@ class Edit:
         self.old, self.given, self.layout = reading.system, reading.given, reading.layout
         self.columns, self.modules = self.layout.columns, self.layout.modules
         self.workbook = workbook
+        self.by_design = is_by_design(system)
         self.numbered = self.modules.number_column is not None
         self.old_of = matched(system, self.old, self.numbered)
         self.required: dict[Place, float] = {}
@@ -100,7 +101,7 @@ class Edit:
                 stacklevel=4,
             )
         if "l" not in self.columns:
-            differing = np.flatnonzero(~is_by_design(self.system))
+            differing = np.flatnonzero(~self.by_design)
             if len(differing):
                 i = differing[0]
                 raise InputError(
@@ -170,9 +171,8 @@ class Edit:
             places = self._rows_of_all(column)
         else:
             places = rows.new
-        by_design = is_by_design(self.system) if name == "l" else np.zeros(len(new), bool)
         for i, row in enumerate(places):
-            if by_design[i] and self._is_left_blank(column, i, row):
+            if name == "l" and self.by_design[i] and self._is_left_blank(column, i, row):
                 continue
             j = old_of[i]
             number, was = float(new[i] / column.factor), None if j is None else float(old[j] / column.factor)

@@ -35,8 +35,6 @@ class _Sheets(Mapping[str, SheetXml]):
 
     def __getitem__(self, title: str) -> SheetXml:
         if title not in self.parsed:
-            if title not in self._titles:
-                raise KeyError(title)
             self.parsed[title] = self._parse(title)
         return self.parsed[title]
 
@@ -45,9 +43,6 @@ class _Sheets(Mapping[str, SheetXml]):
 
     def __len__(self) -> int:
         return len(self._titles)
-
-    def __contains__(self, title: object) -> bool:
-        return title in self._titles
 
 
 class WorkbookXml:

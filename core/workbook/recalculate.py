@@ -5,8 +5,8 @@ from __future__ import annotations
 import math
 import re
 from collections import defaultdict
-from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field, replace
+from collections.abc import Collection, Iterable, Mapping
+from dataclasses import replace
 from typing import Any
 
 from .formulas import CellError, NotComputable, operands, tokens_of
@@ -21,9 +21,26 @@ _FEW = 64
 _OTHER_FILE = re.compile(r"'?[^!]*\[[^\]]+\][^!]*'?!")
 
 
-@dataclass
-class Recalculated:
-    """What became of the formulas.
+def agree(value: Any, wanted: float) -> bool:
+    """Whether a cell's value is the number `wanted`."""
+    return type(value) is float and abs(value - wanted) <= AGREEING * abs(wanted)
+
+
+class Recalculation:
+    """New values for every formula of a workbook that depends on changed cells, stored in its cells.
+
+    Formulas that stored no value get theirs too, in the sheets that change anyway.
+
+    Parameters
+    ----------
+    workbook
+        It is changed.
+    changed
+        The cells that the formulas may depend on.
+    required
+        The numbers that cells must hold: a formula that gives another one, or cannot be calculated, is replaced.
+    expected
+        The numbers that other formulas should give: one that gives another one is replaced.
 
     Attributes
     ----------
@@ -35,70 +52,35 @@ class Recalculated:
         Cell whose formula was replaced by the number that it must hold -> why.
     """
 
-    values: dict[Place, Any] = field(default_factory=dict)
-    cleared: dict[Place, str] = field(default_factory=dict)
-    replaced: dict[Place, str] = field(default_factory=dict)
-
-
-def agree(value: Any, wanted: float) -> bool:
-    """Whether a cell's value is the number `wanted`."""
-    return type(value) is float and abs(value - wanted) <= AGREEING * abs(wanted)
-
-
-def recalculate(
-    workbook: WorkbookXml, changed: Iterable[Place], required: Mapping[Place, float], expected: Mapping[Place, float]
-) -> Recalculated:
-    """Give every formula of `workbook` that depends on the `changed` cells its new value, or none.
-
-    Parameters
-    ----------
-    required
-        The numbers that cells must hold: a formula that gives another one, or cannot be calculated, is replaced.
-    expected
-        The numbers that other formulas should give: one that gives another one is replaced.
-    """
-    formulas = workbook.formulas
-    stale = _dependents(workbook, formulas, changed)
-    without_value = {place for place, cell in formulas.items() if cell.value is None}
-    calculation = _Calculation(workbook, stale, stale | without_value, required, expected)
-    for place in sorted(stale | without_value):
-        calculation.calculate(place)
-    edited = {title for title, _, _ in workbook.changed}
-    for place in without_value - stale:
-        if place[0] in edited and not isinstance(calculation.outcomes[place], NotComputable):
-            calculation.store(place, calculation.outcomes[place])
-    return calculation.result
-
-
-class _Calculation:
-    """The values of the `waiting` formulas; all other cells hold the right ones.
-
-    Attributes
-    ----------
-    outcomes : dict
-        Formula -> its value, or the `NotComputable` that says why it has none.
-    result : Recalculated
-    """
-
     def __init__(
         self,
         workbook: WorkbookXml,
-        stale: set[Place],
-        waiting: set[Place],
+        changed: Collection[Place],
         required: Mapping[Place, float],
         expected: Mapping[Place, float],
     ) -> None:
-        self.workbook, self.stale, self.waiting = workbook, stale, waiting
-        self.required, self.expected = required, expected
-        self.outcomes: dict[Place, Any] = {}
-        self.result = Recalculated()
+        self.values: dict[Place, Any] = {}
+        self.cleared: dict[Place, str] = {}
+        self.replaced: dict[Place, str] = {}
+        self._workbook, self._required, self._expected = workbook, required, expected
+        formulas = workbook.formulas if changed else {}
+        without_value = {place for place, cell in formulas.items() if cell.value is None}
+        self._stale = _dependents(workbook, formulas, changed)
+        self._waiting = self._stale | without_value
+        self._outcomes: dict[Place, Any] = {}  # a value, or the `NotComputable` that says why there is none
+        for place in sorted(self._waiting):
+            self._calculate(place)
+        edited = {title for title, _, _ in workbook.changed}
+        for place in sorted(without_value - self._stale):
+            if place[0] in edited and not isinstance(self._outcomes[place], NotComputable):
+                self._store(place, self._outcomes[place])
 
-    def calculate(self, place: Place) -> None:
+    def _calculate(self, place: Place) -> None:
         """Calculate a formula and before it those that it needs, without recursion."""
         pending, begun = [place], set()
         while pending:
             current = pending[-1]
-            if current in self.outcomes:
+            if current in self._outcomes:
                 pending.pop()
                 continue
             begun.add(current)
@@ -106,61 +88,59 @@ class _Calculation:
             outcome = self._outcome(current, missing)
             loop = next((other for other in missing if other in begun), None)
             if loop is not None:
-                other = f"to {self.workbook.text(loop)}, which refers back to it"
+                other = f"to {self._workbook.text(loop)}, which refers back to it"
                 outcome = NotComputable(f"it refers {'back to itself' if loop == current else other}")
             elif missing:
                 pending += missing
                 continue
-            self.outcomes[current] = self._settled(current, outcome) if current in self.stale else outcome
+            self._outcomes[current] = self._settled(current, outcome) if current in self._stale else outcome
 
     def _outcome(self, place: Place, missing: list[Place]) -> Any:
         """A formula's value; meaningless if formulas that have to be calculated before it are added to `missing`."""
 
         def value_of(other: Place) -> Any:
-            if other not in self.waiting:
-                return self.workbook.value(other)
-            if other not in self.outcomes:
+            if other not in self._waiting:
+                return self._workbook.value(other)
+            if other not in self._outcomes:
                 missing.append(other)
                 return 0.0
-            value = self.outcomes[other]
+            value = self._outcomes[other]
             if isinstance(value, NotComputable):
-                raise NotComputable(f"it needs {self.workbook.text(other)}, and there: {value}")
+                raise NotComputable(f"it needs {self._workbook.text(other)}, and there: {value}")
             return value
 
-        cell = self.workbook.cell(place)
+        cell = self._workbook.cell(place)
         if cell.array is not None or cell.formula is None:
             return NotComputable("it is an array formula or a data table")
         try:
-            return self.workbook.calculated(place, cell.formula, value_of)
+            return self._workbook.calculated(place, cell.formula, value_of)
         except NotComputable as why:
             return why
 
     def _settled(self, place: Place, outcome: Any) -> Any:
         """What a stale formula's cell holds from now on: its value, nothing, or a number instead of the formula."""
-        unknown = isinstance(outcome, NotComputable)
-        number = self.required.get(place, self.expected.get(place, math.nan))
-        if place in self.required:
+        unknown, wrong = isinstance(outcome, NotComputable), False
+        number = self._required.get(place, self._expected.get(place, math.nan))
+        if place in self._required:
             wrong = unknown or not agree(outcome, number)
-        elif place in self.expected and not unknown:  # perhaps a 0 that rounding errors miss
+        elif place in self._expected and not unknown:  # perhaps a 0 that rounding errors miss
             wrong = type(outcome) is not float or abs(outcome - number) > AGREEING * max(abs(number), 1)
-        else:
-            wrong = False
         if wrong:
-            self.workbook.sheets[place[0]].type(place[1:], number)
-            self.result.replaced[place] = str(outcome) if unknown else f"it gives {_shown(outcome)}"
+            self._workbook.sheets[place[0]].type(place[1:], number)
+            self.replaced[place] = str(outcome) if unknown else f"it gives {_shown(outcome)}"
             return number
         if unknown:
-            self.workbook.put(place, replace(self.workbook.cell(place), value=None))
-            self.result.cleared[place] = str(outcome)
+            self._workbook.put(place, replace(self._workbook.cell(place), value=None))
+            self.cleared[place] = str(outcome)
             return outcome
-        return self.store(place, self.required.get(place, outcome))
+        return self._store(place, self._required.get(place, outcome))
 
-    def store(self, place: Place, value: Any) -> Any:
+    def _store(self, place: Place, value: Any) -> Any:
         """Store a formula's value."""
-        cell = self.workbook.cell(place)
+        cell = self._workbook.cell(place)
         if type(cell.value) is not type(value) or cell.value != value:
-            self.workbook.put(place, replace(cell, value=value))
-        self.result.values[place] = value
+            self._workbook.put(place, replace(cell, value=value))
+        self.values[place] = value
         return value
 
 

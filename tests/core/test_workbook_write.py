@@ -548,6 +548,15 @@ def test_bad_templates_are_refused_as_by_the_reader(template, tmp_path):
             mph.write_system(system, tmp_path / "o.xlsx", tmp_path / "bad.xlsx")
 
 
+def test_a_system_that_would_be_refused_is_not_written(template, tmp_path):
+    system = read_quietly(template)
+    twice = changed(system, centers=system.centers[[0, 0, 2, 3]])
+    for source, name in ((template, "template.xlsx"), (None, "the new workbook")):
+        with pytest.raises(mph.InputError, match=f"^{name} cannot hold this system, with it: {name}: Coordinates!B4 "):
+            mph.write_system(by_design(twice), tmp_path / "o.xlsx", source)
+    assert not (tmp_path / "o.xlsx").exists()
+
+
 # The command line
 
 

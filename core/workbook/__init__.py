@@ -16,11 +16,9 @@ reader.py        `read_system`, which joins these
 source.py        `SystemSource`, where each number came from
 
 writer.py        `write_system`: the system's numbers into a copy of a workbook
-edit.py          the system's numbers in the cells
-arrangement.py   rows that are moved, emptied and added with the modules
+edit.py          the system's numbers put into the cells
+rows.py          rows that move, are emptied or are added with the modules
 recalculate.py   new values for formulas that depend on changed cells
-dependencies.py  which formulas these are
-libreoffice.py   LibreOffice as their calculator
 workbook_xml.py  a workbook file as cells that can be changed
 sheet_xml.py     a worksheet as cells that can be changed
 xml_parts.py     XML that is changed in a few places

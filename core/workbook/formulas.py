@@ -1,8 +1,8 @@
-"""Values of spreadsheet formulas: for files that store none (openpyxl writes such), and after cells have changed.
+"""An evaluator of spreadsheet formulas.
 
-The libraries for this were weighed: `formulas` (EUPL) brings scipy and the compiled regex, `xlcalculator` pandas,
-`pycel` a networkx of 2021. A geometry table needs arithmetic over cells and a little logic: openpyxl's tokenizer
-and the precedence below are enough. What is beyond them is `NotComputable`, never a guess.
+A geometry table needs arithmetic over cells and a little logic: openpyxl's tokenizer and the precedence below are
+enough. The libraries for this were weighed: `formulas` (EUPL) brings scipy, `xlcalculator` pandas, and `pycel` a networkx
+of 2021. A formula that needs more raises `NotComputable`; nothing is guessed.
 """
 
 from __future__ import annotations
@@ -10,13 +10,12 @@ from __future__ import annotations
 import decimal
 import math
 import operator
-import statistics
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any
 
-from .references import reference
+from .references import Reference, reference
 
 Lookup = Callable[[str | None, int, int], Any]
 """(sheet name or None for the formula's own, row, column) -> the cell's value, None if blank."""
@@ -29,12 +28,12 @@ class CellError(str):
 
 
 class NotComputable(Exception):
-    """The formula needs something that is not here; the message says what."""
+    """The formula needs something that is not known here; the message says what."""
 
 
 @dataclass(frozen=True)
 class Surroundings:
-    """What a formula may ask for beside other cells' values.
+    """What a formula refers to.
 
     Attributes
     ----------
@@ -42,9 +41,9 @@ class Surroundings:
     at : (row, column), or None
         The formula's own cell, for ``ROW()``.
     extent : callable, or None
-        Sheet name or None -> its last row and column with content, which end whole columns and rows.
+        Sheet name or None -> its last row and column with content, at which whole columns and rows end.
     name : callable, or None
-        Defined name, or reference to a table's columns -> its formula, or None for an unknown one.
+        Defined name, or reference to a table's columns -> its formula, None if unknown.
     """
 
     lookup: Lookup
@@ -59,7 +58,7 @@ def calculate(formula: str, surroundings: Surroundings) -> float | str | bool | 
     Raises
     ------
     NotComputable
-        It uses a function, name or value beyond those known here.
+        It uses a function, a name or a value that is not known here.
     """
     try:
         value = _scalar(_parsed(formula, surroundings)())
@@ -76,20 +75,33 @@ def calculate(formula: str, surroundings: Surroundings) -> float | str | bool | 
     return 0.0 if value is None else value
 
 
-@lru_cache(maxsize=2**15)  # asked for twice: what a formula refers to, and what it gives
+@lru_cache(maxsize=2**15)  # each is asked for twice: for what a formula refers to, and for its value
 def tokens_of(formula: str) -> tuple[Any, ...]:
-    """The tokens (`openpyxl.formula.tokenizer.Token`) of `formula`, which begins with "="; `NotComputable` if bad."""
+    """The tokens (`openpyxl.formula.tokenizer.Token`) of `formula`; `NotComputable` if it is malformed."""
     from openpyxl.formula import Tokenizer
     from openpyxl.formula.tokenizer import TokenizerError
 
     try:
         return tuple(token for token in Tokenizer(formula).items if token.type != "WHITE-SPACE")
-    except (TokenizerError, IndexError) as error:  # the latter where a parenthesis closes nothing
+    except (TokenizerError, IndexError) as error:  # the latter for a parenthesis that closes nothing
         raise NotComputable("it is not a formula") from error
 
 
+def operands(formula: str) -> list[str]:
+    """The references and names in a formula, none if it is malformed."""
+    try:
+        return [token.value for token in tokens_of(formula) if (token.type, token.subtype) == ("OPERAND", "RANGE")]
+    except NotComputable:
+        return []
+
+
+def areas_in(formula: str) -> list[Reference]:
+    """The areas that a formula names."""
+    return [area for text in operands(formula) if (area := reference(text)) is not None]
+
+
 class _ErrorValue(Exception):
-    """An operand is an error value; so is the result."""
+    """The value of an operand is an error, and so is the result."""
 
 
 class _Cells(list):  # type: ignore[type-arg]
@@ -101,7 +113,7 @@ class _Cells(list):  # type: ignore[type-arg]
 
 
 _Term = Callable[[], Any]
-"""A part of a formula, computed when called: the branch of an IF that is not taken must not be."""
+"""A part of a formula, computed when called: the branch of an IF that is not taken must not be computed."""
 
 
 def _scalar(value: Any) -> Any:
@@ -145,32 +157,27 @@ def _truth(value: Any) -> bool:
     return bool(value)
 
 
-def _items(arguments: list[Any], kinds: tuple[type, ...], single: Callable[[Any], Any]) -> list[Any]:
-    """Of areas, the cells of `kinds` alone, as a spreadsheet takes them; `single` of each other argument."""
+def _numbers(arguments: list[Any]) -> list[float]:
+    """The numbers among the cells of areas, and every other argument as a number."""
     found = []
     for argument in arguments:
-        if not isinstance(argument, _Cells):
-            found.append(single(argument))
-            continue
-        for cell in argument:
-            if isinstance(cell, CellError):
-                raise _ErrorValue(cell)
-            if type(cell) in kinds:
-                found.append(cell)
+        if isinstance(argument, _Cells):
+            errors = [cell for cell in argument if isinstance(cell, CellError)]
+            if errors:
+                raise _ErrorValue(errors[0])
+            found += [cell for cell in argument if type(cell) is float]
+        else:
+            found.append(_number(argument))
     return found
 
 
-def _numbers(arguments: list[Any]) -> list[float]:
-    return _items(arguments, (float,), _number)
-
-
 def _same_as_shown(a: float, b: float) -> bool:
-    """Whether numbers are the same in the 15 digits that spreadsheets show and compare: 0.1 + 0.2 is 0.3."""
+    """Whether numbers agree in the 15 digits that spreadsheets show and compare: 0.1 + 0.2 is 0.3."""
     return f"{a:.14e}" == f"{b:.14e}"
 
 
 def _compared(compare: Callable[[Any, Any], bool]) -> Callable[[Any, Any], bool]:
-    """Numbers come before texts, texts (whatever their case) before booleans; blank is the other's zero."""
+    """A comparison: numbers are less than texts (case aside), texts less than booleans; a blank is the other's zero."""
 
     def rank(value: Any) -> tuple[int, Any]:
         if isinstance(value, bool):
@@ -212,7 +219,7 @@ def _power(base: float, exponent: float) -> float:
 
 def _rounded(rounding: str) -> Callable[[float, float], float]:
     def function(value: float, digits: float) -> float:
-        # Of the decimals that are shown, not of the binary digits behind them: ROUND(2.675,2) is 2.68.
+        # Spreadsheets round the decimals that they show, not the binary digits: ROUND(2.675,2) is 2.68.
         step = decimal.Decimal(1).scaleb(-int(digits))
         with decimal.localcontext(prec=400):
             return float(decimal.Decimal(f"{value:.15g}").quantize(step, rounding=rounding))
@@ -220,16 +227,7 @@ def _rounded(rounding: str) -> Callable[[float, float], float]:
     return function
 
 
-def _spread(function: Callable[[list[float]], float]) -> Callable[[list[float]], float]:
-    def result(xs: list[float]) -> float:
-        if len(xs) < 2:
-            raise ZeroDivisionError
-        return function(xs)
-
-    return result
-
-
-# Name -> (fewest, most) arguments, and the function of these.
+# Name -> fewest and most arguments, and a function of numbers.
 _OF_NUMBERS: dict[str, tuple[int, int, Callable[..., float]]] = {
     "ABS": (1, 1, abs),
     "ACOS": (1, 1, math.acos),
@@ -258,15 +256,10 @@ _OF_NUMBERS: dict[str, tuple[int, int, Callable[..., float]]] = {
 _OF_RANGES: dict[str, Callable[[list[float]], float]] = {
     "AVERAGE": lambda xs: math.fsum(xs) / len(xs),
     "MAX": lambda xs: max(xs, default=0.0),
-    "MEDIAN": statistics.median,
     "MIN": lambda xs: min(xs, default=0.0),
     "PRODUCT": lambda xs: math.prod(xs) if xs else 0.0,
-    "STDEV": _spread(statistics.stdev),
-    "STDEV.S": _spread(statistics.stdev),
     "SUM": math.fsum,
     "SUMSQ": lambda xs: math.fsum(x * x for x in xs),
-    "VAR": _spread(statistics.variance),
-    "VAR.S": _spread(statistics.variance),
 }
 
 
@@ -331,75 +324,34 @@ def _vlookup(wanted: _Term, cells: _Term, column: _Term, nearest: _Term = lambda
     return _scalar(area[_position(wanted(), area[:: area.columns]) * area.columns + j - 1])
 
 
-def _sum_product(*terms: _Term) -> float:
-    areas = [_area(term) for term in terms]
-    if len({(len(area), area.columns) for area in areas}) > 1:
-        raise _ErrorValue(CellError("#VALUE!"))
-    for cell in (cell for area in areas for cell in area if isinstance(cell, CellError)):
-        raise _ErrorValue(cell)
-    columns = zip(*areas, strict=True)
-    return math.fsum(math.prod(x if type(x) is float else 0.0 for x in factors) for factors in columns)
+def _logicals(terms: tuple[_Term, ...]) -> list[bool]:
+    values = [_scalar(term()) for term in terms]
+    if not all(isinstance(value, (bool, float)) for value in values):
+        raise NotComputable("it uses a text or a blank as a truth value")
+    return [bool(value) for value in values]
 
 
-def _all_of(function: Callable[[list[bool]], bool]) -> Callable[..., bool]:
-    def result(*terms: _Term) -> bool:
-        found = _items([term() for term in terms], (bool, float), _truth)
-        if not found:
-            raise _ErrorValue(CellError("#VALUE!"))
-        return function([bool(x) for x in found])
-
-    return result
+def _count(is_counted: Callable[[Any], bool]) -> Callable[..., float]:
+    """A count of cells; errors among them are no matter."""
+    return lambda *terms: float(sum(is_counted(cell) for term in terms for cell in _area(term)))
 
 
-def _or_error(term: _Term) -> Any:
-    """A term's value, or the error that it gives: for functions that count errors, or pass over them."""
-    try:
-        return term()
-    except _ErrorValue as error:
-        return error.args[0]
-    except ZeroDivisionError:
-        return CellError("#DIV/0!")
-    except (ArithmeticError, ValueError):
-        return CellError("#NUM!")
-
-
-def _is_counted(value: Any) -> bool:
-    """Whether COUNT counts an argument that is no reference: numbers, booleans, texts of numbers, and a missing one."""
-    if type(value) is str:
-        try:
-            float(value)
-        except ValueError:
-            return False
-    return not isinstance(value, CellError)
-
-
-def _counted(in_area: Callable[[Any], bool], alone: Callable[[Any], bool]) -> Callable[..., float]:
-    def result(*terms: _Term) -> float:
-        values = [_or_error(term) for term in terms]
-        areas, others = ([v for v in values if isinstance(v, _Cells) is wanted] for wanted in (True, False))
-        return float(sum(in_area(cell) for area in areas for cell in area) + sum(map(alone, others)))
-
-    return result
-
-
-# Name -> (fewest, most) arguments, and the function of these as terms.
+# Name -> fewest and most arguments, and a function of terms.
 _OF_TERMS: dict[str, tuple[int, int, Callable[..., Any]]] = {
-    "AND": (1, 255, _all_of(all)),
-    "CONCATENATE": (1, 255, lambda *terms: "".join(_text(term()) for term in terms)),
-    "COUNT": (1, 255, _counted(lambda cell: type(cell) is float, _is_counted)),
-    "COUNTA": (1, 255, _counted(lambda cell: cell is not None, lambda value: True)),
+    "AND": (1, 255, lambda *terms: all(_logicals(terms))),
+    "COUNT": (1, 255, _count(lambda cell: type(cell) is float)),
+    "COUNTA": (1, 255, _count(lambda cell: cell is not None)),
     "FALSE": (0, 0, lambda: False),
     "IF": (2, 3, _if),
     "IFERROR": (2, 2, _if_error),
     "INDEX": (2, 3, _index),
     "MATCH": (2, 3, _match),
     "NOT": (1, 1, lambda term: not _truth(term())),
-    "OR": (1, 255, _all_of(any)),
-    "SUMPRODUCT": (1, 255, _sum_product),
+    "OR": (1, 255, lambda *terms: any(_logicals(terms))),
     "TRUE": (0, 0, lambda: True),
     "VLOOKUP": (3, 4, _vlookup),
 }
-# Loosest first; all group from the left, and a minus sign in front binds tightest: -2^2 is 4.
+# From loosest to tightest; all group from the left, and a sign in front binds tighter: -2^2 is 4.
 _OPERATORS: list[dict[str, Callable[[Any, Any], Any]]] = [
     {
         "=": _compared(operator.eq),
@@ -421,6 +373,8 @@ def _parsed(formula: str, surroundings: Surroundings) -> _Term:
 
 
 class _Parser:
+    """A recursive descent through the tokens; each method returns the term that it has passed."""
+
     def __init__(self, tokens: tuple[Any, ...], surroundings: Surroundings) -> None:
         self.tokens = tokens
         self.surroundings = surroundings
@@ -532,11 +486,9 @@ class _Parser:
         if area.sheet is not None and ":" in area.sheet:
             raise NotComputable(f"it uses {text}, through several sheets")
         bottom, right = area.bottom, area.right
-        if self.surroundings.extent and (bottom, right) != (area.top, area.left):
-            last_row, last_column = self.surroundings.extent(area.sheet)
-            whole = (area.bottom - area.top + 1) * (area.right - area.left + 1) > _MAX_RANGE
-            if whole:  # nothing but blanks lies beyond
-                bottom, right = max(area.top, min(bottom, last_row)), max(area.left, min(right, last_column))
+        if self.surroundings.extent and (bottom - area.top + 1) * (right - area.left + 1) > _MAX_RANGE:
+            last_row, last_column = self.surroundings.extent(area.sheet)  # beyond which all cells are blank
+            bottom, right = max(area.top, min(bottom, last_row)), max(area.left, min(right, last_column))
         if (bottom - area.top + 1) * (right - area.left + 1) > _MAX_RANGE:
             raise NotComputable(f"it uses the large range {text}")
         lookup = self.surroundings.lookup

@@ -9,11 +9,11 @@ from functools import cached_property
 
 from .book import HEADING_ROWS, Book, Sheet
 from .cells import module_number
+from .formulas import areas_in
 from .headings import Heading, heading_of, is_label_heading, is_number_heading, plain, unit_of
 from .layout import Table
 from .quantities import DIMENSIONS, POSITION, QUANTITIES, TYPED
 from .sheet_xml import At
-from .workbook_xml import areas_in
 
 SCANNER_SHEETS = frozenset(("coordinates", "main"))
 """Sheets that hold the scanner in the users' workbooks."""

@@ -43,7 +43,7 @@ class Reference(NamedTuple):
 
 @lru_cache(maxsize=2**15)
 def reference(text: str) -> Reference | None:
-    """What `text` refers to; None where it is a name, another file's cell or anything else."""
+    """What `text` refers to; None for a name, a cell of another file or anything else."""
     from openpyxl.utils import column_index_from_string as column
 
     match = next((found for area in _AREAS if (found := area.fullmatch(text))), None)

@@ -1,4 +1,4 @@
-"""Excel's tables, and what references to their columns mean: Table1[v], Table1[[#This Row],[x]:[z]]."""
+"""Excel's tables, and references to their columns: Table1[v], Table1[[#This Row],[x]:[z]]."""
 
 from __future__ import annotations
 
@@ -9,8 +9,8 @@ from .references import Reference, reference
 from .xml_parts import Element
 
 _REFERENCE = re.compile(r"([^\s\[\]!']+)(?:\[(.*)\])?", re.DOTALL)
-_BRACKETS = r"\[((?:[^\[\]']|'.)*)\]"
-_SPECIFIER = re.compile(rf"\s*{_BRACKETS}(?:\s*:\s*{_BRACKETS})?\s*(?:,|$)", re.DOTALL)
+_NAME = r"\[((?:[^\[\]']|'.)*)\]"
+_SPECIFIER = re.compile(rf"\s*{_NAME}(?:\s*:\s*{_NAME})?\s*(?:,|$)", re.DOTALL)
 
 
 class DataTable(NamedTuple):
@@ -18,27 +18,30 @@ class DataTable(NamedTuple):
 
     Attributes
     ----------
-    name, sheet : str
+    name : str
     area : Reference
-        All of it in the workbook, with its rows of headers and totals.
+        All of it, including its rows of headers and totals.
     columns : tuple of str
-        Their names, case folded.
+        Their names, case-folded.
     headers, totals : int
-        How many rows of these there are.
+        The numbers of these rows.
     """
 
     name: str
-    sheet: str
     area: Reference
     columns: tuple[str, ...]
     headers: int
     totals: int
 
     def part(self, specifiers: str, row: int | None) -> Reference | None:
-        """The area that the text in the outer brackets means in `row` of this sheet; None where it means none."""
-        found = _split(specifiers)
-        if found is None:
+        """The area that the text in the outer brackets means in `row` of this sheet; None if it is not understood."""
+        if specifiers.strip() and not specifiers.lstrip().startswith("["):
+            specifiers = f"[{specifiers}]"
+        if _SPECIFIER.sub("", specifiers).strip():
             return None
+        found = [
+            [_plain(name) for name in match.groups() if name is not None] for match in _SPECIFIER.finditer(specifiers)
+        ]
         sheet, top, left, bottom, right = self.area
         rows = {
             "#all": (top, bottom),
@@ -48,8 +51,8 @@ class DataTable(NamedTuple):
         }
         if row is not None and rows["#data"][0] <= row <= rows["#data"][1]:
             rows["#this row"] = row, row
-        items = [first for first, _ in found if first.startswith("#")] or ["#data"]
-        columns = [name for pair in found if not pair[0].startswith("#") for name in pair]
+        items = [names[0] for names in found if names[0].startswith("#")] or ["#data"]
+        columns = [name for names in found if not names[0].startswith("#") for name in names]
         if not set(items) <= set(rows) or not set(columns) <= set(self.columns):
             return None
         first, last = min(rows[item][0] for item in items), max(rows[item][1] for item in items)
@@ -58,37 +61,23 @@ class DataTable(NamedTuple):
 
 
 def data_table(parts: list[Element], sheet: str) -> DataTable | None:
-    """The table of a table's part on `sheet`, None if it does not say where."""
+    """The table that a table's part describes on `sheet`, None if it does not say where."""
     root = parts[0].attributes
     area = reference(root.get("ref", ""))
     if area is None:
         return None
     columns = tuple(e.attributes.get("name", "").casefold() for e in parts if e.name == "tableColumn")
     headers, totals = int(root.get("headerRowCount", 1)), int(root.get("totalsRowCount", 0))
-    return DataTable(root.get("displayName", ""), sheet, area._replace(sheet=sheet), columns, headers, totals)
+    return DataTable(root.get("displayName", ""), area._replace(sheet=sheet), columns, headers, totals)
 
 
-def named_part(text: str) -> tuple[str, str] | None:
-    """The table's name, case folded, and the text in the outer brackets of a reference; None for anything else."""
+def table_area(text: str, tables: list[DataTable], sheet: str, row: int) -> Reference | None:
+    """The area that a reference to a table means in a formula in `row` of `sheet`; None for anything else."""
     match = _REFERENCE.fullmatch(text)
-    return None if match is None else (match[1].casefold(), match[2] or "")
-
-
-def _split(specifiers: str) -> list[tuple[str, str]] | None:
-    """(first, last) of each, the same where it is one alone."""
-    if not specifiers.strip():
-        return []
-    if not specifiers.lstrip().startswith("["):
-        specifiers = f"[{specifiers}]"
-    found, at = [], 0
-    while at < len(specifiers):
-        match = _SPECIFIER.match(specifiers, at)
-        if match is None:
-            return None
-        first, last = match[1], match[1] if match[2] is None else match[2]
-        found.append((_plain(first), _plain(last)))
-        at = match.end()
-    return found
+    table = next((t for t in tables if match is not None and t.name.casefold() == match[1].casefold()), None)
+    if match is None or table is None:
+        return None
+    return table.part(match[2] or "", row if table.area.sheet == sheet else None)
 
 
 def _plain(name: str) -> str:

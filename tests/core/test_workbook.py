@@ -23,10 +23,12 @@ from openpyxl.worksheet.worksheet import Worksheet
 
 from mphdrr.core.errors import InputError, InputWarning
 from mphdrr.core.geometry.design_formulas import collimator_length
-from mphdrr.core.workbook import libreoffice, read_system
+from mphdrr.core.workbook import read_system
 from mphdrr.core.workbook.formulas import CellError, NotComputable, Surroundings, calculate
 from mphdrr.core.workbook.headings import heading_of
 from mphdrr.core.workbook.quantities import tolerance
+
+from . import libreoffice
 
 try:
     from hypothesis import HealthCheck, given, settings
@@ -573,11 +575,7 @@ def test_azimuth_error_on_the_z_axis_is_no_fault(tmp_path):
         ("=A9+1", "#REF!"),
         ("=COUNT(A1:B9)", 3.0),
         ("=COUNT(A9)", 0.0),
-        ("=COUNT(1/0,A1:B2)", 3.0),
-        ('=COUNT(TRUE,"3","x",A3)', 2.0),
         ("=COUNTA(A1:B9)", 4.0),
-        ("=COUNTA(1/0,A9,Z99)", 2.0),
-        ('=COUNTA("")', 1.0),
         ("=INDEX(A1:B2,2)", "#REF!"),
         ("=INDEX(A1:B2,2,2)", 3.0),
         ("=INDEX(A1:B1,2)", 2.0),
@@ -602,26 +600,12 @@ def test_formulas_give_what_a_spreadsheet_shows(formula, value):
 
 
 @pytest.mark.skipif(libreoffice.program() is None, reason="LibreOffice is not installed")
+@pytest.mark.long
 def test_counts_of_errors_are_those_of_libreoffice():
     formulas = [
-        *(
-            "COUNT(A1:A4)",
-            "COUNTA(A1:A4)",
-            "COUNT(1/0)",
-            "COUNTA(1/0)",
-            "COUNT(A2)",
-            "COUNTA(A2,A9)",
-            'COUNT(TRUE,"3","x")',
-        ),
-        *(
-            'COUNT("")',
-            "COUNT(B1:B3,1/0)",
-            "COUNT(,1)",
-            "IFERROR(INDEX(A1:B3,2),-1)",
-            "INDEX(B1:B3,2)",
-            "INDEX(A1:B1,2)",
-        ),
-        *("INDEX(A1:B3,2,2)", "IFERROR(INDEX(A1:A3,4),-2)", 'COUNTA("")', "COUNTA(A1:A9)"),
+        *("COUNT(A1:A4)", "COUNTA(A1:A4)", "COUNT(A2)", "COUNTA(A2,A9)", "COUNT(B1:B3,A2)", "COUNTA(A1:A9)"),
+        *("IFERROR(INDEX(A1:B3,2),-1)", "INDEX(B1:B3,2)", "INDEX(A1:B1,2)", "INDEX(A1:B3,2,2)"),
+        *("IFERROR(INDEX(A1:A3,4),-2)", "AND(B1,TRUE)", "IFERROR(OR(A2,TRUE),-3)"),
     ]
     cells = {"A1": 1.0, "A2": "=1/0", "A3": "x", "A4": '=""', "B1": 10.0, "B2": 20.0, "B3": 30.0}
     book = Workbook()

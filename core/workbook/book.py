@@ -32,31 +32,21 @@ _ENCRYPTED = "EncryptedPackage".encode("utf-16-le")
 
 
 class Book:
-    """An .xlsx or .xlsm file.
+    """An .xlsx or .xlsm file; `InputError` if it is missing, unreadable, too large or not a workbook.
 
     Attributes
     ----------
-    path : Path
-    sha256 : str
-        Of the file's bytes, hexadecimal.
-    workbook : WorkbookXml
     sheets : dict
         Name -> `Sheet`, in the workbook's order.
     unverified : dict
         Formulas that cannot be computed here and whose stored value was used although the file asks to be calculated
         -> why they cannot.
-
-    Raises
-    ------
-    InputError
-        The file is missing, unreadable, too large or not a workbook.
     """
 
     def __init__(self, path: str | os.PathLike[str]) -> None:
         self.path = Path(path)
         content = _read(self.path)
         self.sha256 = hashlib.sha256(content).hexdigest()
-        _refuse_other_formats(self.path, content)
         self.workbook = WorkbookXml(content, self.path.name)
         self.sheets = {title: Sheet(self, title) for title in self.workbook.sheets}
         self.unverified: dict[Place, str] = {}
@@ -75,7 +65,6 @@ class Book:
         return stored
 
     def _cell(self, place: Place) -> Cell:
-        """A cell as it was read."""
         return self.workbook.sheets[place[0]].original.get(place[1:], Cell())
 
     def _compute(self, place: Place) -> Any:
@@ -222,39 +211,41 @@ def _same_result(stored: Any, computed: Any) -> bool:
 
 
 def _read(path: Path) -> bytes:
+    """The bytes of a file that has the looks of an .xlsx workbook; `InputError` for any other."""
     try:
-        if path.is_dir():
-            raise InputError(f"{path}: is a folder, expected an .xlsx workbook")
-        size = path.stat().st_size
-        if size > MAX_FILE_BYTES:
-            raise InputError(f"{path}: {size} bytes, expected a workbook of at most {MAX_FILE_BYTES} bytes")
-        return path.read_bytes()
+        folder, size = path.is_dir(), path.stat().st_size
+        if not folder and size <= MAX_FILE_BYTES:
+            content = path.read_bytes()
     except FileNotFoundError as error:
         raise InputError(f"{path}: no such file") from error
     except OSError as error:
         raise InputError(f"{path}: cannot be read ({error.strerror or error})") from error
     except ValueError as error:
-        if isinstance(error, InputError):
-            raise
         raise InputError(f"{str(path)!r}: not a file name ({error})") from error
+    if folder:
+        raise InputError(f"{path}: is a folder, expected an .xlsx workbook")
+    if size > MAX_FILE_BYTES:
+        raise InputError(f"{path}: {size} bytes, expected a workbook of at most {MAX_FILE_BYTES} bytes")
+    if (other := _other_format(path.name, content)) is not None:
+        raise InputError(f"{path}: {other}")
+    return content
 
 
-def _refuse_other_formats(path: Path, content: bytes) -> None:
-    if path.name.startswith("~$"):
-        raise InputError(f"{path}: this is Excel's lock file, expected the workbook {path.name[2:]}")
+def _other_format(name: str, content: bytes) -> str | None:
+    """What a file is instead of an .xlsx workbook."""
+    if name.startswith("~$"):
+        return f"this is Excel's lock file, expected the workbook {name[2:]}"
+    if content.startswith(_OLE) and _ENCRYPTED in content:
+        return "the workbook is protected by a password, expected one saved without it"
     if content.startswith(_OLE):
-        if _ENCRYPTED in content:
-            raise InputError(f"{path}: the workbook is protected by a password, expected one saved without it")
-        raise InputError(f"{path}: an old Excel .xls file (or another OLE document), expected it saved as .xlsx")
+        return "an old Excel .xls file (or another OLE document), expected it saved as .xlsx"
     try:
         with zipfile.ZipFile(io.BytesIO(content)) as archive:
             members = {info.filename: info.file_size for info in archive.infolist()}
-    except (zipfile.BadZipFile, NotImplementedError, ValueError) as error:
-        found = "an empty file" if not content else "not a zip archive, or a truncated one"
-        raise InputError(f"{path}: not an .xlsx workbook ({found})") from error
+    except (zipfile.BadZipFile, NotImplementedError, ValueError):
+        return f"not an .xlsx workbook ({'not a zip archive, or a truncated one' if content else 'an empty file'})"
     if sum(members.values()) > MAX_UNPACKED_BYTES:
-        raise InputError(f"{path}: unpacks to {sum(members.values())} bytes, expected at most {MAX_UNPACKED_BYTES}")
+        return f"unpacks to {sum(members.values())} bytes, expected at most {MAX_UNPACKED_BYTES}"
     if "xl/workbook.bin" in members:
-        raise InputError(f"{path}: a binary .xlsb workbook, expected it saved as .xlsx")
-    if "mimetype" in members and "content.xml" in members:
-        raise InputError(f"{path}: an OpenDocument file, expected it saved as .xlsx")
+        return "a binary .xlsb workbook, expected it saved as .xlsx"
+    return "an OpenDocument file, expected it saved as .xlsx" if {"mimetype", "content.xml"} <= members.keys() else None

@@ -10,11 +10,11 @@ from ..errors import InputError
 from ..recording import recorded_warnings
 from .book import HEADING_ROWS, Book, Sheet
 from .cells import Outdated, Uncomputed, shortened
-from .column_map import ColumnMap, MappedTable
+from .column_map import ColumnMap, Joined, MappedTable
 from .headed_table import HeadedTable
 from .headings import heading_of, is_number_heading, may_mean
-from .layout import Layout, column_map_of, mapped_table
-from .quantities import DIMENSIONS, NEEDED, POSITION, TYPED
+from .layout import mapped_table
+from .quantities import NEEDED, POSITION, QUANTITIES, TYPED
 from .recognition import recognize, recognized_layout
 
 
@@ -64,59 +64,50 @@ def draft_column_map(path: str | os.PathLike[str]) -> ColumnMapDraft:
     """
     book = Book(path)
     found = recognize(book)
+    questions, certain = found.doubts, True
     try:
         with recorded_warnings():  # given when the workbook is read
-            return _certain_draft(recognized_layout(book))
+            recognized_layout(book)
     except InputError as error:
-        doubts = found.doubts or [str(error).removeprefix(f"{book.path.name}: ")]
-    tables = [mapped for table in dict.fromkeys(found.tables.values()) for mapped in _mapped(table, found.tables)]
+        questions, certain = questions or [str(error).removeprefix(f"{book.path.name}: ")], False
+    optional = found.tables.keys() - set(NEEDED) if certain else ()
+    partial = {name for name in optional if _has_gaps(found.tables[name], name)}
+    chosen = {name: table for name, table in found.tables.items() if name not in partial}
+    tables = [mapped for table in dict.fromkeys(chosen.values()) for mapped in _mapped(table, chosen, certain)]
+    if "l" in partial and "l" in found.tables["l"].filled:
+        questions.append("l stands in some rows only and is left out here: the design formula is then used for all")
     missing = [name for name in TYPED if name not in found.tables]
-    _add_guesses(tables, found.sheets, missing)
+    _add_guesses(tables, found.sheets, missing if not certain else [])
     if missing and not tables:
         tables = [MappedTable(next(iter(book.sheets), "Coordinates"), 2, 2, ())]
-    has_position = [any(c.quantity in POSITION for c in table.columns) for table in tables]
-    tables = [table for first in (True, False) for table, has in zip(tables, has_position, strict=True) if has is first]
-    own_numbers = bool(tables) and tables[0].number is not None
+    tables.sort(key=lambda table: not any(c.quantity in POSITION for c in table.columns))
     for i, table in enumerate(tables):
-        joined = "by number" if own_numbers and table.number else "in order"
-        tables[i] = replace(table, rows=None if i == 0 else table.rows or joined)  # type: ignore[arg-type]
+        joined: Joined = "by number" if tables[0].number and table.number else "in order"
+        tables[i] = replace(table, rows=None if i == 0 else table.rows or joined)
     columns = ColumnMap(tuple(tables))
-    return ColumnMapDraft(columns, tuple(dict.fromkeys([*doubts, *columns.faults()])))
+    return ColumnMapDraft(columns, tuple(dict.fromkeys([*questions, *columns.faults()])))
 
 
-def _certain_draft(layout: Layout) -> ColumnMapDraft:
-    """The map of a layout that is understood, without optional columns that have gaps, which a map does not allow."""
-    kept, questions = {}, []
-    for name, column in layout.columns.items():
-        values = [column.table.sheet.value(row, column.column) for row in column.rows]
-        if name in NEEDED or not any(value is None or isinstance(value, Uncomputed) for value in values):
-            kept[name] = column
-        elif name == "l" and any(value is not None for value in values):
-            questions.append("l stands in some rows only and is left out here: the design formula is then used for all")
-    return ColumnMapDraft(column_map_of(replace(layout, columns=kept)), tuple(questions))
+def _has_gaps(table: HeadedTable, name: str) -> bool:
+    """Whether cells of a column are blank or cannot be computed, which a map does not allow."""
+    values = [table.sheet.value(row, table.columns[name][0]) for row in table.rows]
+    return any(value is None or isinstance(value, Uncomputed) for value in values)
 
 
-def _mapped(table: HeadedTable, tables: dict[str, HeadedTable]) -> Iterator[MappedTable]:
+def _mapped(table: HeadedTable, chosen: dict[str, HeadedTable], certain: bool) -> Iterator[MappedTable]:
     """A table's part in the map: its rows, and apart from these what a single row gives for all modules."""
     rows, sheet = table.rows or (table.first_row,), table.sheet
-    columns = {
-        name: (column, unit if table.units(column) else "")
-        for name, (column, unit) in table.columns.items()
-        if tables.get(name) is table
-    }
-    once = {
-        name
-        for name in columns
-        if name in DIMENSIONS
-        and [row for row in rows if sheet.value(row, columns[name][0]) is not None] == [rows[0]]
-        and (len(rows) > 1 or table is not tables.get("x1"))
-    }
-    each = {name: cells for name, cells in columns.items() if name not in once}
+    each: dict[str, tuple[int, str]] = {}
+    once: dict[str, tuple[int, str]] = {}
+    for name in QUANTITIES:
+        if chosen.get(name) is table:
+            column, unit = table.columns[name]
+            is_single = table.is_single(name) and (len(rows) > 1 or table is not chosen.get("x1"))
+            (once if is_single else each)[name] = column, unit if certain or table.units(column) else ""
     if each:
         yield mapped_table(sheet, rows, each, table.label_column, None, table.first_heading)
     if once:
-        shared = {name: columns[name] for name in columns if name in once}
-        yield mapped_table(sheet, rows[:1], shared, None, "one for all", table.first_heading)
+        yield mapped_table(sheet, rows[:1], once, None, "one for all", table.first_heading)
 
 
 def _add_guesses(tables: list[MappedTable], sheets: dict[str, Sheet], missing: list[str]) -> None:

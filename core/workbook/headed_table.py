@@ -219,6 +219,12 @@ class HeadedTable:
             )
         )
 
+    def is_single(self, quantity: str) -> bool:
+        """Whether a dimension is given once for all modules, in the table's first row."""
+        column = self.columns[quantity][0]
+        filled = [row for row in self.rows if self.sheet.value(row, column) is not None]
+        return quantity in DIMENSIONS and filled == [*self.rows[:1]]
+
     def table(self) -> Table:
         """The table; `InputError` if the modules' numbers are unclear."""
         return Table(self.sheet, self.columns, self.rows, self.label_column)

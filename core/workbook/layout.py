@@ -30,10 +30,8 @@ class Table:
 
     Attributes
     ----------
-    sheet : Sheet
     columns : dict
         Quantity -> column and unit.
-    rows : tuple of int
     label_column : int or None
         The column of the modules' numbers or names.
     labels : tuple of Label, or None
@@ -70,21 +68,8 @@ class Table:
 class Column:
     """The cells of one quantity, one for each module.
 
-    Attributes
-    ----------
-    table : Table
-    quantity : str
-    modules : Table
-        The table of x1, y1, z1.
-    rows : tuple of int
-        The row of each module; all the same if one cell holds for all.
-    column : int
-    unit : str
-        Of the numbers in the cells.
-    factor : float
-        The unit in mm or rad.
-    shared : bool
-        Whether one cell holds for several modules.
+    `rows` has the row of each module of the table of `modules`, all the same if one cell holds for all (`shared`);
+    `factor` is the cells' unit in mm or rad.
     """
 
     def __init__(self, table: Table, quantity: str, modules: Table, rows: tuple[int, ...]) -> None:
@@ -130,14 +115,7 @@ class Column:
 class Layout:
     """Where a workbook's numbers are.
 
-    Attributes
-    ----------
-    modules : Table
-        The table of x1, y1, z1.
-    columns : dict
-        Quantity -> `Column`, for each that has one.
-    rows_of : dict
-        Table -> the row of each module, for each table with a row for each module.
+    `modules` is the table of x1, y1, z1, and `rows_of` has the row of each module in every table with a row for each.
     """
 
     modules: Table

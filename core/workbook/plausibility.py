@@ -94,18 +94,9 @@ def differences(
     expected: NDArray[np.float64],
     slack: NDArray[np.float64] | float = 0.0,
 ) -> Iterator[str]:
-    """The first modules whose number in the sheet differs from the formula's.
+    """The first modules whose number `given` (M,) in the sheet, in its unit, is not as `expected` (M,), mm or rad.
 
-    Parameters
-    ----------
-    column
-        Where the numbers stand.
-    given
-        (M,) in the column's unit, NaN where there is none.
-    expected
-        (M,) mm or rad.
-    slack
-        mm; added to the tolerance, for rounding of the numbers behind `expected`.
+    The tolerance is larger by `slack`, mm, for rounding of the numbers behind `expected`.
     """
     name, unit = column.quantity, column.unit
     expected, slack = expected / column.factor, np.broadcast_to(slack, given.shape) / column.factor

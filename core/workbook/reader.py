@@ -28,13 +28,12 @@ def read_system(
 ) -> PinholeSystem:
     """The scanner in a geometry workbook.
 
-    Sheets, heading rows and columns are found by their headings, symbols (x1 y1 z1 l d R Ld Td ...) or descriptions
-    ("x coordinate value at center of hole", ...), listed in `core.workbook.quantities`, with their units. Anything that
-    is not understood for certain is refused; `columns` then says what is meant. The pinhole centres, d, R, Ld and Td
-    are needed, a number for each module or one for all. l comes from its column, and where that is blank from
-    `collimator_length`. Formulas may have stored values or not; a stored value that is not what its formula gives is
-    refused. The sheet's other numbers are only checked: one that differs from the formulas by more than 1e-6
-    (relative, mm or radians) and by more than rounding in its last decimal is an `InputWarning`.
+    Tables are found by their headings, symbols (x1 y1 z1 l d R Ld Td ...) or descriptions, listed in
+    `core.workbook.quantities`, with their units. Anything that is not understood for certain is refused; `columns` then
+    says what is meant. The pinhole centres, d, R, Ld and Td are needed, a number for each module or one for all. l comes
+    from its column, and where that is blank from `collimator_length`. A stored value that is not what its formula gives
+    is refused. Numbers that follow from the others are only checked: one that differs by more than 1e-6 (relative, mm or
+    radians) and by more than rounding in its last decimal is an `InputWarning`.
 
     Parameters
     ----------
@@ -67,15 +66,7 @@ def read_system(
 
 @dataclass(frozen=True)
 class Reading:
-    """What is read from a workbook.
-
-    Attributes
-    ----------
-    layout : Layout
-    given : dict
-        Quantity -> its numbers (M,) in the cells, in the cells' unit, NaN where there is none.
-    system : PinholeSystem
-    """
+    """What is read from a workbook; `given` are the numbers in the cells, in their units, NaN where there is none."""
 
     layout: Layout
     given: Numbers

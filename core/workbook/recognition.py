@@ -17,7 +17,7 @@ from .doubts import doubts_about, listed
 from .headed_table import HeadedTable, headed_table, headed_tables
 from .headings import heading_of, may_mean, quoted, units_mentioned
 from .layout import Column, Layout, Table, by_label, in_order
-from .quantities import DERIVED, DIMENSIONS, LENGTH_UNITS, NEEDED, POSITION, QUANTITIES, TYPED
+from .quantities import DERIVED, LENGTH_UNITS, NEEDED, POSITION, QUANTITIES, TYPED
 
 _HELP = "a column map can say what is meant (columns='map.toml', --columns map.toml; docs/workbook.md)"
 
@@ -88,13 +88,12 @@ def recognized_layout(book: Book) -> Layout:
     recognized = recognize(book)
     for doubt in recognized.doubts:
         raise _unclear(book, doubt)
-    tables = {headed: headed.table() for headed in dict.fromkeys(recognized.tables.values())}
     coordinates = recognized.tables["x1"]
+    tables = {headed: headed.table() for headed in dict.fromkeys(recognized.tables.values())}
     layout = Layout(tables[coordinates])
     for name, headed in recognized.tables.items():
-        table = tables[headed]
-        rows = _rows_of(name, layout, headed, coordinates, table)
-        layout.columns[name] = Column(table, name, layout.modules, rows)
+        rows = _rows_of(name, layout, headed, coordinates, tables[headed])
+        layout.columns[name] = Column(tables[headed], name, layout.modules, rows)
     notes = [*_unknown_length(recognized), *_units_in_other_sheets(layout, recognized.sheets), *_gap(layout.modules)]
     for note in notes:
         warnings.warn(f"{book.path.name}: {note}", InputWarning, stacklevel=4)
@@ -107,10 +106,9 @@ def _unclear(book: Book, doubt: str) -> InputError:
 
 def _rows_of(name: str, layout: Layout, headed: HeadedTable, coordinates: HeadedTable, table: Table) -> tuple[int, ...]:
     """The row of each module; a single value, in the table's first row, holds for all modules."""
-    rows, column = table.rows, table.columns[name][0]
+    rows, once = table.rows, headed.is_single(name)
     if not rows:
         raise InputError(f"{table.sheet.book.path.name}: sheet {table.sheet.name} has no numbers under {name}")
-    once = name in DIMENSIONS and [r for r in rows if table.sheet.value(r, column) is not None] == [rows[0]]
     if table not in layout.rows_of and not (once and len(rows) == 1):
         try:
             layout.rows_of[table] = _matched_rows(layout.modules, table, coordinates, headed)
@@ -122,42 +120,32 @@ def _rows_of(name: str, layout: Layout, headed: HeadedTable, coordinates: Headed
 
 def _matched_rows(modules: Table, table: Table, coordinates: HeadedTable, headed: HeadedTable) -> tuple[int, ...]:
     """The row of each module in another sheet: by the modules' numbers or names if both have them, else in order."""
-    book = modules.sheet.book
-    own, other = coordinates.label_headings, headed.label_headings
+    book, own, other = modules.sheet.book, coordinates.label_headings, headed.label_headings
+    sheets = f"sheet {modules.sheet.name}", f"sheet {table.sheet.name}"
     if modules.labels is not None and table.labels is not None:
         rows = by_label(modules, table)
     else:
         rows = in_order(modules, table)
         for row, its in zip(modules.rows, rows, strict=True):
             if row - modules.rows[0] != its - rows[0]:
-                raise _unclear(
-                    book,
-                    f"row {row} of sheet {modules.sheet.name} and row {its} of sheet {table.sheet.name} would belong "
-                    "together, but other rows are blank in one than in the other: expected the modules' numbers in both",
-                )
+                together = f"row {row} of {sheets[0]} and row {its} of {sheets[1]} would belong together"
+                raise _unclear(book, f"{together}, but blank rows differ: expected the modules' numbers in both")
         if table.numbers is not None and list(table.numbers) != sorted(table.numbers):
             raise _unclear(
                 book,
-                f"the modules of sheet {table.sheet.name} have numbers in no order, those of sheet "
-                f"{modules.sheet.name} have none, expected numbers in both",
+                f"the modules' numbers in {sheets[1]} are in no order, {sheets[0]} has none, expected numbers in both",
             )
         for heading, at in other.items():
             if heading not in own:
-                raise _unclear(
-                    book,
-                    f"{table.sheet.place(*at)} heads names of modules that sheet {modules.sheet.name} does not have, "
-                    "expected a column in both that says which rows belong together",
-                )
+                heads = f"{table.sheet.place(*at)} heads names of modules, which {sheets[0]} does not have"
+                raise _unclear(book, f"{heads}, expected a column in both that says which rows belong together")
     for heading in own.keys() & other.keys():
         for row, its in zip(modules.rows, rows, strict=True):
             here, there = (row, own[heading][1]), (its, other[heading][1])
             one, another = modules.sheet.value(*here), table.sheet.value(*there)
             if one != another:
-                raise _unclear(
-                    book,
-                    f"{modules.sheet.place(*here)} is {one!r} but {table.sheet.place(*there)}, in the matching row, is "
-                    f"{another!r}, expected the same",
-                )
+                is_one = f"{modules.sheet.place(*here)} is {one!r} but {table.sheet.place(*there)}"
+                raise _unclear(book, f"{is_one}, in the matching row, is {another!r}, expected the same")
     return rows
 
 

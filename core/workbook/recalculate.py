@@ -9,6 +9,8 @@ from collections.abc import Collection, Iterable, Mapping
 from dataclasses import replace
 from typing import Any
 
+from .calculation import Calculation
+from .cells import Uncomputed
 from .formulas import CellError, NotComputable, operands, tokens_of
 from .plausibility import AGREEING
 from .references import Reference, reference
@@ -66,74 +68,33 @@ class Recalculation:
         formulas = workbook.formulas if changed else {}
         without_value = {place for place, cell in formulas.items() if cell.value is None}
         self._stale = _dependents(workbook, formulas, changed)
-        self._waiting = self._stale | without_value
-        self._outcomes: dict[Place, Any] = {}  # a value, or the `NotComputable` that says why there is none
-        for place in sorted(self._waiting):
-            self._calculate(place)
+        waiting = self._stale | without_value
+        calculation = Calculation(workbook, workbook.cell, lambda place, _: place in waiting, self._settled)
+        values = {place: calculation.value(place) for place in sorted(waiting)}
         edited = {title for title, _, _ in workbook.changed}
         for place in sorted(without_value - self._stale):
-            if place[0] in edited and not isinstance(self._outcomes[place], NotComputable):
-                self._store(place, self._outcomes[place])
+            if place[0] in edited and not isinstance(values[place], Uncomputed):
+                self._store(place, values[place])
 
-    def _calculate(self, place: Place) -> None:
-        """Calculate a formula and before it those that it needs, without recursion."""
-        pending, begun = [place], set()
-        while pending:
-            current = pending[-1]
-            if current in self._outcomes:
-                pending.pop()
-                continue
-            begun.add(current)
-            missing: list[Place] = []
-            outcome = self._outcome(current, missing)
-            loop = next((other for other in missing if other in begun), None)
-            if loop is not None:
-                other = f"to {self._workbook.text(loop)}, which refers back to it"
-                outcome = NotComputable(f"it refers {'back to itself' if loop == current else other}")
-            elif missing:
-                pending += missing
-                continue
-            self._outcomes[current] = self._settled(current, outcome) if current in self._stale else outcome
-
-    def _outcome(self, place: Place, missing: list[Place]) -> Any:
-        """A formula's value; meaningless if formulas that have to be calculated before it are added to `missing`."""
-
-        def value_of(other: Place) -> Any:
-            if other not in self._waiting:
-                return self._workbook.value(other)
-            if other not in self._outcomes:
-                missing.append(other)
-                return 0.0
-            value = self._outcomes[other]
-            if isinstance(value, NotComputable):
-                raise NotComputable(f"it needs {self._workbook.text(other)}, and there: {value}")
-            return value
-
-        cell = self._workbook.cell(place)
-        if cell.array is not None or cell.formula is None:
-            return NotComputable("it is an array formula or a data table")
-        try:
-            return self._workbook.calculated(place, cell.formula, value_of)
-        except NotComputable as why:
-            return why
-
-    def _settled(self, place: Place, outcome: Any) -> Any:
+    def _settled(self, place: Place, value: Any) -> Any:
         """What a stale formula's cell holds from now on: its value, nothing, or a number instead of the formula."""
-        unknown, wrong = isinstance(outcome, NotComputable), False
+        if place not in self._stale:
+            return value
+        unknown, wrong = isinstance(value, Uncomputed), False
         number = self._required.get(place, self._expected.get(place, math.nan))
         if place in self._required:
-            wrong = unknown or not agree(outcome, number)
+            wrong = unknown or not agree(value, number)
         elif place in self._expected and not unknown:  # perhaps a 0 that rounding errors miss
-            wrong = type(outcome) is not float or abs(outcome - number) > AGREEING * max(abs(number), 1)
+            wrong = type(value) is not float or abs(value - number) > AGREEING * max(abs(number), 1)
         if wrong:
             self._workbook.sheets[place[0]].type(place[1:], number)
-            self.replaced[place] = str(outcome) if unknown else f"it gives {_shown(outcome)}"
+            self.replaced[place] = str(value) if unknown else f"it gives {_shown(value)}"
             return number
         if unknown:
             self._workbook.put(place, replace(self._workbook.cell(place), value=None))
-            self.cleared[place] = str(outcome)
-            return outcome
-        return self._store(place, self._required.get(place, outcome))
+            self.cleared[place] = str(value)
+            return value
+        return self._store(place, self._required.get(place, value))
 
     def _store(self, place: Place, value: Any) -> Any:
         """Store a formula's value."""

@@ -5,13 +5,12 @@ from __future__ import annotations
 import re
 from collections.abc import Callable, Iterator, Mapping
 from functools import cached_property
-from typing import Any
 
 from ..errors import InputError
-from .formulas import CellError, NotComputable, Surroundings, areas_in, calculate, operands
+from .formulas import areas_in, operands
 from .package import Package
 from .references import Reference, reference
-from .sheet_xml import MAIN, STRICT, At, Cell, SheetXml, Unreadable, cell_name, shared_strings
+from .sheet_xml import MAIN, STRICT, At, Cell, SheetXml, cell_name, shared_strings
 from .xml_parts import Element, elements, spliced, utf8, with_attribute
 
 KINDS = {
@@ -209,39 +208,12 @@ class WorkbookXml:
             if cell.formula is not None or cell.array is not None
         }
 
-    def value(self, place: Place) -> Any:
-        """A cell's value as it is now; `NotComputable` if it is of an unusual kind."""
-        value = self.cell(place).value
-        if isinstance(value, Unreadable):
-            raise NotComputable(f"{self.text(place)} holds {value!r}")
-        return value
-
     def meaning(self, sheet: str, name: str) -> str | None:
         """The formula that a defined name stands for on `sheet`; None if it is unknown or depends on the cell."""
         own, _, plain = name.rpartition("!")
         scope, key = self.title(own.strip("'")) if own else sheet, plain.casefold()
         formula = self._names.get((scope, key)) or self._names.get((None, key))
         return formula if formula is not None and _is_absolute(formula) else None
-
-    def calculated(
-        self, place: Place, formula: str, value_of: Callable[[Place], Any]
-    ) -> float | str | bool | CellError:
-        """What `formula` at `place` gives; `value_of` gives the values of cells, or raises `NotComputable`."""
-        sheet = place[0]
-
-        def title(name: str | None) -> str:
-            found = sheet if name is None else self.title(name)
-            if found is None:
-                raise NotComputable(f"there is no sheet {name}")
-            return found
-
-        surroundings = Surroundings(
-            lambda name, row, column: value_of((title(name), row, column)),
-            at=place[1:],
-            extent=lambda name: self.extent(title(name)),
-            name=lambda name: self.meaning(sheet, name),
-        )
-        return calculate(formula, surroundings)
 
     def extent(self, sheet: str) -> At:
         """The last row and the last column of `sheet` with content."""

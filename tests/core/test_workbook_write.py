@@ -429,7 +429,7 @@ def test_a_system_is_read_back_from_formulas_without_values(template, tmp_path):
     system = by_design(changed(system, centers=system.centers * 1.1))
     with pytest.warns(mph.InputWarning) as caught:
         written = mph.write_system(system, tmp_path / "o.xlsx", template)
-    replaced, cleared = sorted(str(w.message) for w in caught)[::-1]
+    replaced, cleared = sorted(str(w.message) for w in caught)
     assert replaced.startswith(f"template.xlsx: Coordinates!{length}4: the formula was replaced by the system's number")
     assert cleared.startswith(f"template.xlsx: Coordinates!{end}3 and ")
     assert {f"Coordinates!{end}{row}" for row in range(3, 7)} <= set(written.cleared)
@@ -550,7 +550,9 @@ def test_bad_templates_are_refused_as_by_the_reader(template, tmp_path):
 
 def test_a_system_that_would_be_refused_is_not_written(template, tmp_path):
     system = read_quietly(template)
-    twice = changed(system, centers=system.centers[[0, 0, 2, 3]])
+    centers = system.centers.copy()
+    centers[1] = centers[0] + 1e-9  # one place, as far as a workbook can tell
+    twice = changed(system, centers=centers)
     for source, name in ((template, "template.xlsx"), (None, "the new workbook")):
         with pytest.raises(mph.InputError, match=f"^{name} cannot hold this system, with it: {name}: Coordinates!B4 "):
             mph.write_system(by_design(twice), tmp_path / "o.xlsx", source)

@@ -17,6 +17,7 @@ from mphdrr.core.cli import main
 from mphdrr.core.errors import InputError
 from mphdrr.core.workbook.quantities import LENGTH_UNITS
 
+from .nasty.case import sample
 from .test_workbook import CENTERS, assert_plain, plain, saved
 from .test_workbook import _typed as typed
 from .test_workbook_strict import READ, REFUSED
@@ -319,7 +320,7 @@ def test_what_one_row_for_all_cannot_hold_is_refused_with_its_cell(tmp_path):
 # Drafts
 
 
-@pytest.mark.parametrize("kind", READ)
+@pytest.mark.parametrize("kind", sample(READ, 2))
 def test_the_draft_of_what_is_understood_says_the_same(kind, tmp_path):
     book = plain()
     READ[kind](book["Main"], book["Coordinates"])
@@ -338,7 +339,7 @@ def test_the_draft_of_the_real_workbook_says_the_same(workbook, tmp_path):
     assert draft.questions == ()
 
 
-@pytest.mark.parametrize("kind", REFUSED)
+@pytest.mark.parametrize("kind", sample(REFUSED, 6))
 def test_what_is_refused_has_a_draft_with_questions(kind, tmp_path):
     edit, _ = REFUSED[kind]
     book = plain()

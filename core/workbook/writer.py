@@ -1,4 +1,4 @@
-"""`write_system`: a `PinholeSystem` into a copy of a geometry workbook, of which nothing else changes."""
+"""`write_system`: a `PinholeSystem` into a copy of a geometry workbook in which nothing else changes."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ import warnings
 from collections import defaultdict
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -35,17 +36,16 @@ class WrittenWorkbook:
     changed : tuple of str
         The cells (``"Coordinates!B3"``) whose numbers or formulas are not the template's.
     recalculated : dict
-        Cell with a formula that depends on these, or stored no value in a sheet that changes -> the value it stores now.
+        Cell -> the value that its formula stores now, of each that depends on these or stored no value before.
     cleared : tuple of str
-        Cells that depend on these and store no value now, because it could not be calculated here.
+        The cells whose formulas store no value now, because they cannot be calculated here.
     columns : ColumnMap or None
-        The column map that the new file is read by, its rows being those of the modules now; None where its headings
-        are understood.
+        The column map of the new file, with the modules' rows; None if its headings are understood without one.
     """
 
     path: Path
     changed: tuple[str, ...]
-    recalculated: dict[str, str]
+    recalculated: dict[str, Any]
     cleared: tuple[str, ...]
     columns: ColumnMap | None = None
 
@@ -58,26 +58,25 @@ def write_system(
 ) -> WrittenWorkbook:
     """Write a scanner's geometry workbook.
 
-    Into a copy of `template` only what differs is written: its modules are found by their numbers, their cells
-    as by `read_system`. Formulas stay as long as they give the system's numbers (to 1e-9, relative). Every formula
-    of the workbook that depends on a changed cell stores its new value if `core.workbook.formulas` can calculate it,
-    else none, and the workbook is marked to be recalculated when opened. In a sheet that changes, formulas that
-    stored no value get theirs too. All other parts of the file - sheets, formats, charts, images, comments, macros -
-    are byte for byte the template's; if nothing differs, the whole file is.
+    In a copy of `template`, only the cells that differ are written; modules are found by their numbers, and cells as by
+    `read_system`. A formula stays if it still gives the system's number (to 1e-9, relative). Each formula that depends on
+    a changed cell stores its new value if `core.workbook.formulas` can calculate it, otherwise none, and the workbook is
+    marked to be recalculated when it is opened. All other parts of the file - sheets, formats, charts, images, comments,
+    macros - stay byte for byte the template's; if nothing differs, the whole file does.
 
     Removed modules leave empty rows, added ones come below the last with copies of its formulas, and modules in
-    another order take their rows' contents along.
+    another order take the contents of their rows along.
 
     Parameters
     ----------
     system
-        The scanner. Of a workbook with a column of modules' numbers, these are compared; else their order is.
+        The scanner. If the workbook has no column of modules' numbers, its modules are found by their order.
     path
-        The file to write, .xlsx or .xlsm as the template; it may be the template, which is then replaced.
+        The file to write, .xlsx or .xlsm like the template; it may be the template, which is then replaced.
     template
-        The workbook to change, read anew. Default: a new one in the users' layout, sheets Main and Coordinates.
+        The workbook to copy. Default: a new one in the users' layout, with the sheets Main and Coordinates.
     columns
-        The template's column map, or the path of one. Default: the one that the system was read by, if it was.
+        The template's column map, or the path of one. Default: the one that the system was read by, if any.
 
     Returns
     -------
@@ -120,10 +119,10 @@ def write_system(
         edited = [] if template is None else workbook.changed
         to_recalculate = workbook.formulas if template is None else edit.changed
         recalculated = Recalculation(workbook, to_recalculate, edit.required, edit.expected)
-        _warn_of_formulas(workbook, recalculated)
         temporary.write_bytes(workbook.to_bytes())
         own = edit.column_map() if said is not None else None
         _refuse_other_system(_read_written(temporary, name, own), name, system, edit.numbered)
+    _warn_of_formulas(workbook, recalculated)
     return WrittenWorkbook(
         path=target.absolute(),
         changed=tuple(workbook.text(place) for place in dict.fromkeys([*edited, *recalculated.replaced])),

@@ -213,8 +213,18 @@ def _edit(system: mph.PinholeSystem) -> mph.PinholeSystem:
     return by_design(mph.PinholeSystem(centers, numbers=np.append(part.numbers, 999), collimator_length=1.0, **arrays))
 
 
+@pytest.fixture(scope="module")
+def plain_written(tmp_path_factory):
+    """A system and what is written of it into a workbook with usual XML."""
+    folder = tmp_path_factory.mktemp("plain")
+    plain = folder / "plain.xlsx"
+    plain.write_bytes(content_of(laid_out(Layout(seed=11))))
+    system = _edit(read_quietly(plain))
+    return system, write_quietly(system, folder / "written.xlsx", plain)
+
+
 @pytest.mark.parametrize("odd", [*ODD, *ENCODINGS])
-def test_odd_xml_is_patched_in_place(odd, tmp_path):
+def test_odd_xml_is_patched_in_place(odd, plain_written, tmp_path):
     def edit(name: str, data: bytes) -> bytes:
         if not name.startswith("xl/worksheets/sheet"):
             return data
@@ -223,13 +233,10 @@ def test_odd_xml_is_patched_in_place(odd, tmp_path):
             return ENCODINGS[odd](xml)
         return ODD[odd](xml).encode()
 
+    system, expected = plain_written
     template = tmp_path / "t.xlsx"
     template.write_bytes(repacked(content_of(laid_out(Layout(seed=11))), edit))
-    plain = tmp_path / "plain.xlsx"
-    plain.write_bytes(content_of(laid_out(Layout(seed=11))))
-    system = _edit(read_quietly(plain))
     written = write_quietly(system, tmp_path / "o.xlsx", template)
-    expected = write_quietly(system, tmp_path / "e.xlsx", plain)
     for data_only in (True, False):
         assert values_of(written.path, data_only) == values_of(expected.path, data_only)
     assert written.changed == expected.changed

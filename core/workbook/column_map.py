@@ -254,17 +254,9 @@ def _table(values: dict[str, Any], where: str) -> MappedTable:
     skipped = values.get("skip_rows", [])
     if not all(type(row) is int for row in skipped):
         raise InputError(f"{where}: skip_rows = {skipped!r}, expected whole numbers")
-    columns = [_column(name, column, f"{where}.{name}") for name, column in values["columns"].items()]
-    return MappedTable(
-        values["sheet"],
-        values["first_row"],
-        values["last_row"],
-        tuple(columns),
-        values["number"].upper() if "number" in values else None,
-        values.get("rows"),
-        values.get("header_row"),
-        tuple(skipped),
-    )
+    columns = tuple(_column(name, column, f"{where}.{name}") for name, column in values["columns"].items())
+    number = values["number"].upper() if "number" in values else None
+    return MappedTable(**{**values, "columns": columns, "number": number, "skip_rows": tuple(skipped)})
 
 
 def _column(name: str, values: Any, where: str) -> MappedColumn:

@@ -14,7 +14,7 @@ from .column_map import ColumnMap, Joined, MappedTable
 from .headed_table import HeadedTable
 from .headings import heading_of, is_number_heading, may_mean
 from .layout import mapped_table
-from .quantities import NEEDED, POSITION, QUANTITIES, TYPED
+from .quantities import DERIVED, NEEDED, POSITION, TYPED
 from .recognition import recognize, recognized_layout
 
 
@@ -99,7 +99,7 @@ def _mapped(table: HeadedTable, chosen: dict[str, HeadedTable], certain: bool) -
     rows, sheet = table.rows or (table.first_row,), table.sheet
     each: dict[str, tuple[int, str]] = {}
     once: dict[str, tuple[int, str]] = {}
-    for name in QUANTITIES:
+    for name in (*TYPED, *DERIVED):
         if chosen.get(name) is table:
             column, unit = table.columns[name]
             is_single = table.is_single(name) and (len(rows) > 1 or table is not chosen.get("x1"))

@@ -86,23 +86,19 @@ class Column:
         """Sheet and cell of module index `i`."""
         return self.table.sheet.place(self.rows[i], self.column)
 
-    def numbers(self) -> NDArray[np.float64]:
-        """The numbers (M,) in the cells, in their unit; `InputError` if one holds no number."""
-        return np.array([self._number(i) for i in range(len(self.rows))])
+    def numbers(self, optional: bool = False, may_fail: NDArray[np.bool_] | None = None) -> NDArray[np.float64]:
+        """The numbers (M,) in the cells, in their unit; `InputError` if one holds no number.
 
-    def numbers_or_nan(self, may_fail: NDArray[np.bool_] | None = None) -> NDArray[np.float64]:
-        """The same with NaN where a cell is blank or cannot be computed, and anything else that `may_fail` (M,)."""
+        If they are `optional`, NaN where a cell is blank or cannot be computed, or holds anything else and `may_fail`.
+        """
         numbers = np.full(len(self.rows), math.nan)
         for i, row in enumerate(self.rows):
             value = self.table.sheet.value(row, self.column)
-            optional = value is None or isinstance(value, Uncomputed) or (may_fail is not None and may_fail[i])
-            if isinstance(value, float) or not optional:
-                numbers[i] = self._number(i)
+            absent = value is None or isinstance(value, Uncomputed) or (may_fail is not None and may_fail[i])
+            if isinstance(value, float) or not (optional and absent):
+                of = "" if self.shared else f" of module {self.modules.module_numbers[i]}"
+                numbers[i] = self.table.sheet.number(row, self.column, self.quantity + of)
         return numbers
-
-    def _number(self, i: int) -> float:
-        of = "" if self.shared else f" of module {self.modules.module_numbers[i]}"
-        return self.table.sheet.number(self.rows[i], self.column, self.quantity + of)
 
     def refuse(self, bad: NDArray[np.bool_], why: Callable[[int], str]) -> None:
         """Raise `InputError` for the first module of `bad` (M,), if any."""

@@ -12,10 +12,10 @@ from pathlib import Path
 from typing import Any
 
 from ..errors import InputError
+from .calculation import Calculation
 from .cells import Outdated, Uncomputed, description
-from .formulas import NotComputable
 from .references import Reference
-from .sheet_xml import At, Cell, Unreadable
+from .sheet_xml import At, Cell
 from .workbook_xml import Place, WorkbookXml
 
 MAX_FILE_BYTES = 256 * 2**20
@@ -50,11 +50,16 @@ class Book:
         self.workbook = WorkbookXml(content, self.path.name)
         self.sheets = {title: Sheet(self, title) for title in self.workbook.sheets}
         self.unverified: dict[Place, str] = {}
-        self._computed: dict[Place, Any] = {}
+        self._calculation = Calculation(
+            self.workbook, self._cell, lambda _, cell: cell.formula is not None, self._relied_on
+        )
 
     def formula_value(self, place: Place) -> Any:
         """The value of a formula: computed here, else as stored, else `Uncomputed`."""
-        computed, stored = self._compute(place), self._cell(place).value
+        return self._calculation.value(place)
+
+    def _relied_on(self, place: Place, computed: Any) -> Any:
+        stored = self._cell(place).value
         if not isinstance(computed, Uncomputed) or stored is None:
             return computed
         if self.workbook.asks_for_calculation:
@@ -66,52 +71,6 @@ class Book:
 
     def _cell(self, place: Place) -> Cell:
         return self.workbook.sheets[place[0]].original.get(place[1:], Cell())
-
-    def _compute(self, place: Place) -> Any:
-        """What a formula gives, computed from typed cells without recursion; `Uncomputed` where that is impossible."""
-        waiting, begun = [place], set()
-        while waiting:
-            current = waiting[-1]
-            if current in self._computed:
-                waiting.pop()
-                continue
-            needed: list[Place] = []
-            result = self._evaluate(current, needed)
-            loop = next((other for other in needed if other == current or other in begun), None)
-            if loop is not None:
-                result = Uncomputed(f"it refers to {self.workbook.text(loop)}, which refers back to it")
-            elif needed:
-                begun.add(current)
-                waiting += needed
-                continue
-            self._computed[current] = result
-        return self._computed[place]
-
-    def _evaluate(self, place: Place, needed: list[Place]) -> Any:
-        """What a formula gives; meaningless if formulas that must be computed first were added to `needed`."""
-
-        def value_of(other: Place) -> Any:
-            cell = self._cell(other)
-            if isinstance(cell.value, Unreadable):
-                raise NotComputable(f"{self.workbook.text(other)} holds {cell.value!r}")
-            if cell.formula is None:
-                return cell.value
-            if other not in self._computed:
-                needed.append(other)
-                return 0.0
-            value = self.formula_value(other)
-            if isinstance(value, Uncomputed):
-                raise NotComputable(f"it needs {self.workbook.text(other)}, and there: {value}")
-            return value
-
-        cell = self._cell(place)
-        assert cell.formula is not None, "only formulas are computed"
-        if cell.array is not None:
-            return Uncomputed("it is an array formula or a data table")
-        try:
-            return self.workbook.calculated(place, cell.formula, value_of)
-        except NotComputable as why:
-            return Uncomputed(str(why))
 
 
 class Sheet:

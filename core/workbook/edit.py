@@ -57,9 +57,11 @@ class Edit:
     """
 
     def __init__(self, system: PinholeSystem, reading: Reading, workbook: WorkbookXml) -> None:
-        self.system, self.old, self.workbook = system, reading.system, workbook
-        self.layout, self.given = reading.layout, reading.given
-        self.columns, self.modules = reading.layout.columns, reading.layout.modules
+        self.system = system
+        self.old, self.given, self.layout = reading.system, reading.given, reading.layout
+        self.columns, self.modules = self.layout.columns, self.layout.modules
+        self.workbook = workbook
+        self.by_design = is_by_design(system)
         self.numbered = self.modules.number_column is not None
         self.old_of = matched(system, self.old, self.numbered)
         self.required: dict[Place, float] = {}
@@ -99,7 +101,7 @@ class Edit:
                 stacklevel=4,
             )
         if "l" not in self.columns:
-            differing = np.flatnonzero(~is_by_design(self.system))
+            differing = np.flatnonzero(~self.by_design)
             if len(differing):
                 i = differing[0]
                 raise InputError(
@@ -116,7 +118,14 @@ class Edit:
         for number, j in zip(self.system.numbers, self.old_of, strict=True):
             row = row_of.get(int(number)) if self.numbered else None  # of a module that had no coordinates
             own.append(old[j] if j is not None else None if row in old else row)
-        return rows_after(table, old, own, table.number_column, shared)
+        # Without numbers, rows of several sheets belong together by their distance from the first.
+        spread = not self.numbered and any(self._is_spread(column) for column in self.columns.values())
+        return rows_after(table, old, own, table.number_column, shared, keep_first=bool(shared) or spread)
+
+    def _is_spread(self, column: Column) -> bool:
+        """Whether the modules need different numbers in place of one cell of a table with one row for all."""
+        new = QUANTITIES[column.quantity].of(self.system)
+        return column.table not in self.layout.rows_of and bool(np.any(new != new[0]))
 
     def _number_modules(self) -> None:
         for table, rows in self.rows.items():
@@ -132,10 +141,10 @@ class Edit:
                     self._demand((table.sheet.name, rows.new[i], table.number_column), float(number), was)
 
     def _rows_of_all(self, column: Column) -> tuple[int, ...]:
-        """Rows for all modules in a table that had one row for all; they lie as those of the coordinates."""
+        """Rows for all modules in a table that had one row for all; without numbers, as far apart as the coordinates'."""
         sheet, table, first = self.workbook.sheets[column.table.sheet.name], column.table, column.table.rows[0]
-        modules = self.rows[self.modules]
-        found = tuple(first + row - min(modules.old) for row in modules.new)
+        coordinates = self.rows[self.modules].new
+        found = tuple(first + (i if self.numbered else row - coordinates[0]) for i, row in enumerate(coordinates))
         for c in (column.column, table.number_column):
             if c is None:
                 continue
@@ -151,8 +160,6 @@ class Edit:
                     sheet.copy(model.typed(None), (first, c), (row, c))
                 if c == table.number_column:
                     self._demand(place, float(self.system.numbers[i]), None)
-            if first not in found:
-                sheet.type((first, c), None)
         return found
 
     # Numbers
@@ -163,15 +170,14 @@ class Edit:
         new, old = (QUANTITIES[name].of(system) for system in (self.system, self.old))
         rows = self.rows.get(column.table)
         old_of = self.old_of
-        if (rows is None or column.shared) and np.all(new == new[0]):
-            places, old_of = column.rows[:1], [0]
-        elif rows is None:
+        if rows is None and self._is_spread(column):
             places = self._rows_of_all(column)
+        elif rows is None or (column.shared and np.all(new == new[0])):
+            places, old_of = column.rows[:1], [0]
         else:
             places = rows.new
-        by_design = is_by_design(self.system) if name == "l" else np.zeros(len(new), bool)
         for i, row in enumerate(places):
-            if by_design[i] and self._is_left_blank(column, i, row):
+            if name == "l" and self.by_design[i] and self._is_left_blank(column, i, row):
                 continue
             j = old_of[i]
             number, was = float(new[i] / column.factor), None if j is None else float(old[j] / column.factor)

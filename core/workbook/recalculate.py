@@ -5,10 +5,12 @@ from __future__ import annotations
 import math
 import re
 from collections import defaultdict
-from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field, replace
+from collections.abc import Collection, Iterable, Mapping
+from dataclasses import replace
 from typing import Any
 
+from .calculation import Calculation
+from .cells import Uncomputed
 from .formulas import CellError, NotComputable, operands, tokens_of
 from .plausibility import AGREEING
 from .references import Reference, reference
@@ -21,9 +23,26 @@ _FEW = 64
 _OTHER_FILE = re.compile(r"'?[^!]*\[[^\]]+\][^!]*'?!")
 
 
-@dataclass
-class Recalculated:
-    """What became of the formulas.
+def agree(value: Any, wanted: float) -> bool:
+    """Whether a cell's value is the number `wanted`."""
+    return type(value) is float and abs(value - wanted) <= AGREEING * abs(wanted)
+
+
+class Recalculation:
+    """New values for every formula of a workbook that depends on changed cells, stored in its cells.
+
+    Formulas that stored no value get theirs too, in the sheets that change anyway.
+
+    Parameters
+    ----------
+    workbook
+        It is changed.
+    changed
+        The cells that the formulas may depend on.
+    required
+        The numbers that cells must hold: a formula that gives another one, or cannot be calculated, is replaced.
+    expected
+        The numbers that other formulas should give: one that gives another one is replaced.
 
     Attributes
     ----------
@@ -35,132 +54,54 @@ class Recalculated:
         Cell whose formula was replaced by the number that it must hold -> why.
     """
 
-    values: dict[Place, Any] = field(default_factory=dict)
-    cleared: dict[Place, str] = field(default_factory=dict)
-    replaced: dict[Place, str] = field(default_factory=dict)
-
-
-def agree(value: Any, wanted: float) -> bool:
-    """Whether a cell's value is the number `wanted`."""
-    return type(value) is float and abs(value - wanted) <= AGREEING * abs(wanted)
-
-
-def recalculate(
-    workbook: WorkbookXml, changed: Iterable[Place], required: Mapping[Place, float], expected: Mapping[Place, float]
-) -> Recalculated:
-    """Give every formula of `workbook` that depends on the `changed` cells its new value, or none.
-
-    Parameters
-    ----------
-    required
-        The numbers that cells must hold: a formula that gives another one, or cannot be calculated, is replaced.
-    expected
-        The numbers that other formulas should give: one that gives another one is replaced.
-    """
-    formulas = workbook.formulas
-    stale = _dependents(workbook, formulas, changed)
-    without_value = {place for place, cell in formulas.items() if cell.value is None}
-    calculation = _Calculation(workbook, stale, stale | without_value, required, expected)
-    for place in sorted(stale | without_value):
-        calculation.calculate(place)
-    edited = {title for title, _, _ in workbook.changed}
-    for place in without_value - stale:
-        if place[0] in edited and not isinstance(calculation.outcomes[place], NotComputable):
-            calculation.store(place, calculation.outcomes[place])
-    return calculation.result
-
-
-class _Calculation:
-    """The values of the `waiting` formulas; all other cells hold the right ones.
-
-    Attributes
-    ----------
-    outcomes : dict
-        Formula -> its value, or the `NotComputable` that says why it has none.
-    result : Recalculated
-    """
-
     def __init__(
         self,
         workbook: WorkbookXml,
-        stale: set[Place],
-        waiting: set[Place],
+        changed: Collection[Place],
         required: Mapping[Place, float],
         expected: Mapping[Place, float],
     ) -> None:
-        self.workbook, self.stale, self.waiting = workbook, stale, waiting
-        self.required, self.expected = required, expected
-        self.outcomes: dict[Place, Any] = {}
-        self.result = Recalculated()
+        self.values: dict[Place, Any] = {}
+        self.cleared: dict[Place, str] = {}
+        self.replaced: dict[Place, str] = {}
+        self._workbook, self._required, self._expected = workbook, required, expected
+        formulas = workbook.formulas if changed else {}
+        without_value = {place for place, cell in formulas.items() if cell.value is None}
+        self._stale = _dependents(workbook, formulas, changed)
+        waiting = self._stale | without_value
+        calculation = Calculation(workbook, workbook.cell, lambda place, _: place in waiting, self._settled)
+        values = {place: calculation.value(place) for place in sorted(waiting)}
+        edited = {title for title, _, _ in workbook.changed}
+        for place in sorted(without_value - self._stale):
+            if place[0] in edited and not isinstance(values[place], Uncomputed):
+                self._store(place, values[place])
 
-    def calculate(self, place: Place) -> None:
-        """Calculate a formula and before it those that it needs, without recursion."""
-        pending, begun = [place], set()
-        while pending:
-            current = pending[-1]
-            if current in self.outcomes:
-                pending.pop()
-                continue
-            begun.add(current)
-            missing: list[Place] = []
-            outcome = self._outcome(current, missing)
-            loop = next((other for other in missing if other in begun), None)
-            if loop is not None:
-                other = f"to {self.workbook.text(loop)}, which refers back to it"
-                outcome = NotComputable(f"it refers {'back to itself' if loop == current else other}")
-            elif missing:
-                pending += missing
-                continue
-            self.outcomes[current] = self._settled(current, outcome) if current in self.stale else outcome
-
-    def _outcome(self, place: Place, missing: list[Place]) -> Any:
-        """A formula's value; meaningless if formulas that have to be calculated before it are added to `missing`."""
-
-        def value_of(other: Place) -> Any:
-            if other not in self.waiting:
-                return self.workbook.value(other)
-            if other not in self.outcomes:
-                missing.append(other)
-                return 0.0
-            value = self.outcomes[other]
-            if isinstance(value, NotComputable):
-                raise NotComputable(f"it needs {self.workbook.text(other)}, and there: {value}")
-            return value
-
-        cell = self.workbook.cell(place)
-        if cell.array is not None or cell.formula is None:
-            return NotComputable("it is an array formula or a data table")
-        try:
-            return self.workbook.calculated(place, cell.formula, value_of)
-        except NotComputable as why:
-            return why
-
-    def _settled(self, place: Place, outcome: Any) -> Any:
+    def _settled(self, place: Place, value: Any) -> Any:
         """What a stale formula's cell holds from now on: its value, nothing, or a number instead of the formula."""
-        unknown = isinstance(outcome, NotComputable)
-        number = self.required.get(place, self.expected.get(place, math.nan))
-        if place in self.required:
-            wrong = unknown or not agree(outcome, number)
-        elif place in self.expected and not unknown:  # perhaps a 0 that rounding errors miss
-            wrong = type(outcome) is not float or abs(outcome - number) > AGREEING * max(abs(number), 1)
-        else:
-            wrong = False
+        if place not in self._stale:
+            return value
+        unknown, wrong = isinstance(value, Uncomputed), False
+        number = self._required.get(place, self._expected.get(place, math.nan))
+        if place in self._required:
+            wrong = unknown or not agree(value, number)
+        elif place in self._expected and not unknown:  # perhaps a 0 that rounding errors miss
+            wrong = type(value) is not float or abs(value - number) > AGREEING * max(abs(number), 1)
         if wrong:
-            self.workbook.sheets[place[0]].type(place[1:], number)
-            self.result.replaced[place] = str(outcome) if unknown else f"it gives {_shown(outcome)}"
+            self._workbook.sheets[place[0]].type(place[1:], number)
+            self.replaced[place] = str(value) if unknown else f"it gives {_shown(value)}"
             return number
         if unknown:
-            self.workbook.put(place, replace(self.workbook.cell(place), value=None))
-            self.result.cleared[place] = str(outcome)
-            return outcome
-        return self.store(place, self.required.get(place, outcome))
+            self._workbook.put(place, replace(self._workbook.cell(place), value=None))
+            self.cleared[place] = str(value)
+            return value
+        return self._store(place, self._required.get(place, value))
 
-    def store(self, place: Place, value: Any) -> Any:
+    def _store(self, place: Place, value: Any) -> Any:
         """Store a formula's value."""
-        cell = self.workbook.cell(place)
+        cell = self._workbook.cell(place)
         if type(cell.value) is not type(value) or cell.value != value:
-            self.workbook.put(place, replace(cell, value=value))
-        self.result.values[place] = value
+            self._workbook.put(place, replace(cell, value=value))
+        self.values[place] = value
         return value
 
 
@@ -210,11 +151,14 @@ def _areas_read(workbook: WorkbookXml, place: Place, formula: str, depth: int = 
         if area is None:
             if _OTHER_FILE.match(text):
                 continue  # another file's cells do not change with this one's
-            meaning = workbook.meaning(place, text)
-            areas = None if meaning is None else _areas_read(workbook, place, meaning, depth + 1)
-            if areas is None:
+            table = workbook.tables.get(text.partition("[")[0].casefold())
+            meaning = workbook.meaning(place[0], text)
+            if table is not None:
+                found.append(table)  # whichever of its cells are meant
+            elif meaning is None or (areas := _areas_read(workbook, place, meaning, depth + 1)) is None:
                 return None
-            found += areas
+            else:
+                found += areas
         elif area.sheet is not None and ":" in area.sheet:
             return None  # through several sheets
         elif (title := place[0] if area.sheet is None else workbook.title(area.sheet)) is not None:

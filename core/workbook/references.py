@@ -32,14 +32,6 @@ class Reference(NamedTuple):
     bottom: int
     right: int
 
-    def __str__(self) -> str:
-        """As it is written, absolute: ``'Main'!$B$3:$B$82``."""
-        from openpyxl.utils import get_column_letter as letters
-
-        sheet = "" if self.sheet is None else "'{}'!".format(self.sheet.replace("'", "''"))
-        first, last = f"${letters(self.left)}${self.top}", f"${letters(self.right)}${self.bottom}"
-        return sheet + (first if first == last else f"{first}:{last}")
-
 
 @lru_cache(maxsize=2**15)
 def reference(text: str) -> Reference | None:

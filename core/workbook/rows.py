@@ -117,6 +117,7 @@ def rows_after(
     own: Sequence[int | None],
     number_column: int | None,
     shared_columns: set[int],
+    keep_first: bool,
 ) -> Rows:
     """The rows that the system's modules get in `table`: those that they have, if these are in the modules' order.
 
@@ -130,12 +131,14 @@ def rows_after(
         The column of the modules' numbers.
     shared_columns
         Columns with one value for all modules, which stays in the first row.
+    keep_first
+        Whether the first row must remain a module's.
     """
     last = max((row for row in own if row is not None), default=min(old) - 1)
     below = max(*table.rows, *old)
     free = iter([*(row for row in sorted(old) if row > last), *range(below + 1, below + 1 + list(own).count(None))])
     wanted = [next(free) if row is None else row for row in own]
-    if shared_columns and min(old) not in wanted:
+    if keep_first and min(old) not in wanted:
         wanted[wanted.index(min(wanted))] = min(old)
     # Rows that are not in the order of the coordinates are found by their numbers, and stay.
     in_order = list(old) == sorted(old) and set(own) <= {*old, None}

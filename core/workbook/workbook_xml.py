@@ -5,14 +5,12 @@ from __future__ import annotations
 import re
 from collections.abc import Callable, Iterator, Mapping
 from functools import cached_property
-from typing import Any
 
 from ..errors import InputError
-from .formulas import CellError, NotComputable, Surroundings, areas_in, calculate, operands
+from .formulas import areas_in, operands
 from .package import Package
 from .references import Reference, reference
-from .sheet_xml import MAIN, STRICT, At, Cell, SheetXml, Unreadable, cell_name, shared_strings
-from .tables import DataTable, data_table, table_area
+from .sheet_xml import MAIN, STRICT, At, Cell, SheetXml, cell_name, shared_strings
 from .xml_parts import Element, elements, spliced, utf8, with_attribute
 
 KINDS = {
@@ -36,8 +34,6 @@ class _Sheets(Mapping[str, SheetXml]):
 
     def __getitem__(self, title: str) -> SheetXml:
         if title not in self.parsed:
-            if title not in self._titles:
-                raise KeyError(title)
             self.parsed[title] = self._parse(title)
         return self.parsed[title]
 
@@ -46,9 +42,6 @@ class _Sheets(Mapping[str, SheetXml]):
 
     def __len__(self) -> int:
         return len(self._titles)
-
-    def __contains__(self, title: object) -> bool:
-        return title in self._titles
 
 
 class WorkbookXml:
@@ -175,9 +168,15 @@ class WorkbookXml:
         return names
 
     @cached_property
-    def _tables(self) -> list[DataTable]:
-        found = (data_table(self._parts_of(m), title) for title in self.parts for m in self._related_to(title, "table"))
-        return [table for table in found if table is not None]
+    def tables(self) -> dict[str, Reference]:
+        """Case-folded name of an Excel table -> its cells."""
+        found = {}
+        for title in self.parts:
+            for member in self._related_to(title, "table"):
+                attributes = self._parts_of(member)[0].attributes
+                if (area := reference(attributes.get("ref", ""))) is not None:
+                    found[attributes.get("displayName", "").casefold()] = area._replace(sheet=title)
+        return found
 
     def _related_to(self, sheet: str, kind: str) -> list[str]:
         return [member for _, its, member in self.package.relations(self.parts[sheet]) if its == kind]
@@ -209,46 +208,12 @@ class WorkbookXml:
             if cell.formula is not None or cell.array is not None
         }
 
-    def value(self, place: Place) -> Any:
-        """A cell's value as it is now; `NotComputable` if it is of an unusual kind."""
-        value = self.cell(place).value
-        if isinstance(value, Unreadable):
-            raise NotComputable(f"{self.text(place)} holds {value!r}")
-        return value
-
-    def meaning(self, place: Place, name: str) -> str | None:
-        """The formula that a name, or a reference to a table's columns, stands for in a formula at `place`.
-
-        None if it is unknown, or a name whose meaning depends on the place.
-        """
-        sheet, row, _ = place
-        area = table_area(name, self._tables, sheet, row)
-        if area is not None:
-            return f"={area}"
+    def meaning(self, sheet: str, name: str) -> str | None:
+        """The formula that a defined name stands for on `sheet`; None if it is unknown or depends on the cell."""
         own, _, plain = name.rpartition("!")
         scope, key = self.title(own.strip("'")) if own else sheet, plain.casefold()
         formula = self._names.get((scope, key)) or self._names.get((None, key))
         return formula if formula is not None and _is_absolute(formula) else None
-
-    def calculated(
-        self, place: Place, formula: str, value_of: Callable[[Place], Any]
-    ) -> float | str | bool | CellError:
-        """What `formula` at `place` gives; `value_of` gives the values of cells, or raises `NotComputable`."""
-        sheet = place[0]
-
-        def title(name: str | None) -> str:
-            found = sheet if name is None else self.title(name)
-            if found is None:
-                raise NotComputable(f"there is no sheet {name}")
-            return found
-
-        surroundings = Surroundings(
-            lambda name, row, column: value_of((title(name), row, column)),
-            at=place[1:],
-            extent=lambda name: self.extent(title(name)),
-            name=lambda name: self.meaning(place, name),
-        )
-        return calculate(formula, surroundings)
 
     def extent(self, sheet: str) -> At:
         """The last row and the last column of `sheet` with content."""
@@ -272,7 +237,7 @@ class WorkbookXml:
             if member.startswith("xl/charts/") and member.endswith(".xml"):
                 series = [reference(e.text.strip()) for e in self._parts_of(member) if e.name == "f"]
                 found += [f"the chart {member}"] * any(map(ends_there, series))
-        found += [f"the table {table.name}" for table in self._tables if ends_there(table.area)]
+        found += [f"the table {name}" for name, area in self.tables.items() if ends_there(area)]
         for title, cells in self.sheets.items():
             for at, cell in cells.cells.items():
                 if cell.formula is not None and any(ends_there(area, title) for area in areas_in(cell.formula)):

@@ -21,7 +21,7 @@ from .edit import Edit, several
 from .new_workbook import new_workbook
 from .quantities import QUANTITIES, TYPED
 from .reader import Reading, read
-from .recalculate import Recalculated, recalculate
+from .recalculate import Recalculation
 from .workbook_xml import KINDS, Place, WorkbookXml
 
 
@@ -113,19 +113,17 @@ def write_system(
         book = Book(temporary if template is None else template)
         workbook = book.workbook
         _refuse_other_kind(workbook, target, suffix)
+        name = "the new workbook" if template is None else workbook.name
         with recorded_warnings():  # they were given when the system was read
-            reading = read(book, said)
+            reading = read(book, said) if template is not None else _read_written(temporary, name, None)
         edit = Edit(system, reading, workbook)
         edited = [] if template is None else workbook.changed
-        recalculated = Recalculated()
-        if template is None:
-            recalculated = recalculate(workbook, workbook.formulas, edit.required, {})
-        elif edit.changed:
-            recalculated = recalculate(workbook, edit.changed, edit.required, edit.expected)
+        to_recalculate = workbook.formulas if template is None else edit.changed
+        recalculated = Recalculation(workbook, to_recalculate, edit.required, edit.expected)
         _warn_of_formulas(workbook, recalculated)
         temporary.write_bytes(workbook.to_bytes())
         own = edit.column_map() if said is not None else None
-        _refuse_other_system(_read_back(temporary, workbook.name, own), workbook.name, system, edit.numbered)
+        _refuse_other_system(_read_written(temporary, name, own), name, system, edit.numbered)
     return WrittenWorkbook(
         path=target.absolute(),
         changed=tuple(workbook.text(place) for place in dict.fromkeys([*edited, *recalculated.replaced])),
@@ -144,13 +142,14 @@ def _refuse_other_kind(workbook: WorkbookXml, target: Path, suffix: str) -> None
         raise InputError(f"{target}: the template {workbook.name} {has}, expected a name ending in {kind}")
 
 
-def _read_back(written: Path, name: str, columns: ColumnMap | None) -> Reading:
-    with recorded_warnings():
-        try:
-            return read(Book(written), columns)
-        except InputError as error:
-            why = str(error).replace(str(written), name).replace(written.name, name)
-            raise InputError(f"{name} cannot hold this system, with it: {why}") from error
+def _read_written(path: Path, name: str, columns: ColumnMap | None) -> Reading:
+    """A written workbook as it will be read; messages call it `name`."""
+    try:
+        with recorded_warnings():
+            return read(Book(path), columns)
+    except InputError as error:
+        why = str(error).replace(str(path), name).replace(path.name, name)
+        raise InputError(f"{name} cannot hold this system, with it: {why}") from error
 
 
 def _refuse_other_system(back: Reading, name: str, system: PinholeSystem, numbered: bool) -> None:
@@ -173,7 +172,7 @@ def _refuse_other_system(back: Reading, name: str, system: PinholeSystem, number
             )
 
 
-def _warn_of_formulas(workbook: WorkbookXml, recalculated: Recalculated) -> None:
+def _warn_of_formulas(workbook: WorkbookXml, recalculated: Recalculation) -> None:
     by_column: dict[tuple[str, int], list[Place]] = defaultdict(list)
     for place in sorted(recalculated.replaced):
         by_column[place[0], place[2]].append(place)

@@ -122,7 +122,7 @@ def write_system(
         recalculated = Recalculation(workbook, to_recalculate, edit.required, edit.expected)
         _warn_of_formulas(workbook, recalculated)
         temporary.write_bytes(workbook.to_bytes())
-        own = edit.column_map() if said is not None else None
+        own = edit.column_map(said) if said is not None else None
         _refuse_other_system(_read_written(temporary, name, own), name, system, edit.numbered)
     return WrittenWorkbook(
         path=target.absolute(),

@@ -6,8 +6,8 @@ import json
 import os
 import re
 import tomllib
-from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import dataclass
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal, get_args
 
@@ -84,6 +84,11 @@ class MappedTable:
         """The rows of the modules."""
         skipped = set(self.skip_rows)
         return tuple(row for row in range(self.first_row, self.last_row + 1) if row not in skipped)
+
+    def with_rows(self, rows: Sequence[int]) -> MappedTable:
+        """The table with other rows, which are in ascending order."""
+        skipped = sorted(set(range(rows[0], rows[-1])).difference(rows))
+        return replace(self, first_row=rows[0], last_row=rows[-1], skip_rows=tuple(skipped))
 
 
 @dataclass(frozen=True)
@@ -254,17 +259,9 @@ def _table(values: dict[str, Any], where: str) -> MappedTable:
     skipped = values.get("skip_rows", [])
     if not all(type(row) is int for row in skipped):
         raise InputError(f"{where}: skip_rows = {skipped!r}, expected whole numbers")
-    columns = [_column(name, column, f"{where}.{name}") for name, column in values["columns"].items()]
-    return MappedTable(
-        values["sheet"],
-        values["first_row"],
-        values["last_row"],
-        tuple(columns),
-        values["number"].upper() if "number" in values else None,
-        values.get("rows"),
-        values.get("header_row"),
-        tuple(skipped),
-    )
+    columns = tuple(_column(name, column, f"{where}.{name}") for name, column in values["columns"].items())
+    number = values["number"].upper() if "number" in values else None
+    return MappedTable(**{**values, "columns": columns, "number": number, "skip_rows": tuple(skipped)})
 
 
 def _column(name: str, values: Any, where: str) -> MappedColumn:

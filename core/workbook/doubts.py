@@ -19,7 +19,9 @@ def doubts_about(table: HeadedTable, quantities: set[str]) -> Iterator[str]:
     for at, text in table.unknown():
         for name in [name for name in may_mean(text) if name in quantities][:1]:
             yield f"{table.sheet.place(*at)} is headed {quoted(text)}, which is not understood and may mean {name}"
-    yield from _number_columns(table)
+    numbers = [table.sheet.place(*at) for at in table.number_columns.values()]
+    if len(numbers) > 1:
+        yield f"{numbers[0]} and {numbers[1]} both head the modules' numbers, expected one such column"
     yield from _other_tables(table)
     yield from _texts_between_modules(table)
     yield from _notes_with_units(table, lengths)
@@ -61,12 +63,6 @@ def _headings(table: HeadedTable) -> Iterator[str]:
         first, _ = table.columns[quantity]
         if first != column:
             yield f"{table.heading_place(first)} and {place} are both headed as {quantity}, expected one such column"
-
-
-def _number_columns(table: HeadedTable) -> Iterator[str]:
-    places = [table.sheet.place(*at) for at in table.number_columns.values()]
-    if len(places) > 1:
-        yield f"{places[0]} and {places[1]} both head the modules' numbers, expected one such column"
 
 
 def _other_tables(table: HeadedTable) -> Iterator[str]:

@@ -3,18 +3,17 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
 from ..errors import InputError
 from ..recording import recorded_warnings
 from .book import HEADING_ROWS, Book, Sheet
 from .cells import Outdated, Uncomputed, shortened
-from .column_map import ColumnMap, Joined, MappedTable
+from .column_map import ColumnMap, Joined, MappedColumn, MappedTable
 from .headed_table import HeadedTable
 from .headings import heading_of, is_number_heading, may_mean
-from .layout import mapped_table
-from .quantities import NEEDED, POSITION, QUANTITIES, TYPED
+from .quantities import DERIVED, NEEDED, POSITION, TYPED
 from .recognition import recognize, recognized_layout
 
 
@@ -99,15 +98,30 @@ def _mapped(table: HeadedTable, chosen: dict[str, HeadedTable], certain: bool) -
     rows, sheet = table.rows or (table.first_row,), table.sheet
     each: dict[str, tuple[int, str]] = {}
     once: dict[str, tuple[int, str]] = {}
-    for name in QUANTITIES:
+    for name in (*TYPED, *DERIVED):
         if chosen.get(name) is table:
             column, unit = table.columns[name]
             is_single = table.is_single(name) and (len(rows) > 1 or table is not chosen.get("x1"))
             (once if is_single else each)[name] = column, unit if certain or table.units(column) else ""
     if each:
-        yield mapped_table(sheet, rows, each, table.label_column, None, table.first_heading)
+        yield _mapped_table(sheet, rows, each, table.first_heading, table.label_column)
     if once:
-        yield mapped_table(sheet, rows[:1], once, None, "one for all", table.first_heading)
+        yield _mapped_table(sheet, rows[:1], once, table.first_heading, rows_are="one for all")
+
+
+def _mapped_table(
+    sheet: Sheet,
+    rows: Sequence[int],
+    columns: dict[str, tuple[int, str]],
+    header_row: int,
+    number: int | None = None,
+    rows_are: Joined | None = None,
+) -> MappedTable:
+    from openpyxl.utils import get_column_letter as letters
+
+    mapped = tuple(MappedColumn(name, letters(column), unit) for name, (column, unit) in columns.items())
+    table = MappedTable(sheet.name, 0, 0, mapped, None if number is None else letters(number), rows_are, header_row)
+    return table.with_rows(rows)
 
 
 def _add_guesses(tables: list[MappedTable], sheets: dict[str, Sheet], missing: list[str]) -> None:
@@ -139,7 +153,7 @@ def _guesses(sheet: Sheet, name: str) -> Iterator[MappedTable]:
             if below:
                 once = below[0] == below[-1] and name not in POSITION
                 rows = range(below[0], below[-1] + 1)
-                yield mapped_table(sheet, rows, {name: (column, "")}, None, "one for all" if once else None, row)
+                yield _mapped_table(sheet, rows, {name: (column, "")}, row, rows_are="one for all" if once else None)
 
 
 def _number_column(sheet: Sheet) -> str | None:

@@ -13,7 +13,7 @@ from ..errors import InputError, InputWarning
 from ..geometry.system import PinholeSystem
 from .cells import module_number
 from .column_map import ColumnMap
-from .layout import Column, Table, column_map_of
+from .layout import Column, Table, map_with_rows
 from .plausibility import is_by_design
 from .quantities import DERIVED, EXACT, NEEDED, QUANTITIES
 from .reader import Reading
@@ -86,9 +86,9 @@ class Edit:
         """The cells whose formulas, and those that depend on them, have to be recalculated."""
         return list(dict.fromkeys([*self.workbook.changed, *sorted(self.unsettled)]))
 
-    def column_map(self) -> ColumnMap:
-        """The column map of the workbook as it is now."""
-        return column_map_of(self.layout, {table: rows.new for table, rows in self.rows.items()})
+    def column_map(self, read_by: ColumnMap) -> ColumnMap:
+        """The column map of the workbook as it is now, from the one that it was read by."""
+        return map_with_rows(read_by, self.layout, {table: rows.new for table, rows in self.rows.items()})
 
     def _refuse_unheld(self) -> None:
         file, sheet = self.workbook.name, self.modules.sheet.name

@@ -57,11 +57,8 @@ class HeadedTable:
     @cached_property
     def first_row(self) -> int:
         """The first row below with something other than text under a heading."""
-        below = sorted({row for row, column in self.sheet.cells if row > self.last_heading and column in self.headings})
-        return next((row for row in below if self._has_number(row)), self.last_heading + 1)
-
-    def _has_number(self, row: int) -> bool:
-        return any(is_number(self.sheet, row, column) for column in self.headings)
+        below = ((row, c) for row, c in sorted(self.sheet.cells) if row > self.last_heading and c in self.headings)
+        return next((row for row, column in below if is_number(self.sheet, row, column)), self.last_heading + 1)
 
     @cached_property
     def head(self) -> dict[At, str]:
@@ -176,7 +173,8 @@ class HeadedTable:
             values = [value for column in self._key_columns if (value := self.sheet.value(row, column)) is not None]
             alone = len(values) == 1 and type(values[0]) is str and not _NUMERIC.fullmatch(values[0])
             note = alone and len(self._key_columns) > 1 and row - 1 not in found[-1:]
-            if (values and not note) or any(self._is_typed(row, column) for column in typed):
+            dimensions = [self.sheet.value(row, c) for c in typed if self.sheet.formula(row, c) is None]
+            if (values and not note) or any(type(value) is float for value in dimensions):
                 found.append(row)
         return found
 
@@ -198,9 +196,6 @@ class HeadedTable:
             area.top < area.bottom and area.left <= column <= area.right and area.sheet in (None, self.sheet.name)
             for area in areas_in(formula)
         )
-
-    def _is_typed(self, row: int, column: int) -> bool:
-        return self.sheet.formula(row, column) is None and type(self.sheet.value(row, column)) is float
 
     @cached_property
     def rows(self) -> tuple[int, ...]:

@@ -13,18 +13,14 @@ from typing import Any, NamedTuple
 
 from .quantities import ANGLE_UNITS, QUANTITIES
 
-NUMBER_HEADINGS = frozenset(
-    (
-        *("definitions", "number", "no", "no.", "nr", "nr.", "#", "module", "modules", "module number", "module no"),
-        *("module no.", "module #", "pinhole number", "pinhole no", "pinhole no.", "camera", "camera number"),
-    )
+_NUMBER_HEADINGS = (
+    "definitions, number, no, no., nr, nr., #, module, modules, module number, module no, module no., module #, "
+    "pinhole number, pinhole no, pinhole no., camera, camera number"
 )
 """Head the column of the modules' numbers."""
-LABEL_HEADINGS = frozenset(
-    (
-        *("serial", "serial number", "serial no", "serial no.", "s/n", "sn", "label", "name", "id", "identifier"),
-        *("code", "tag", "module id", "module name", "pinhole id", "pinhole name", "camera id", "camera name"),
-    )
+_LABEL_HEADINGS = (
+    "serial, serial number, serial no, serial no., s/n, sn, label, name, id, identifier, code, tag, module id, "
+    "module name, pinhole id, pinhole name, camera id, camera name"
 )
 """Head a column that also says which module a row belongs to: two sheets must agree in it."""
 UNIT_WORDS = frozenset(["unit", "units", "einheit", "einheiten", "unité", "unités"])
@@ -128,12 +124,12 @@ def unit_of(text: Any) -> str | None:
 
 def is_number_heading(text: Any) -> bool:
     """Whether a text heads the modules' numbers."""
-    return isinstance(text, str) and plain(text).casefold() in NUMBER_HEADINGS
+    return isinstance(text, str) and plain(text).casefold() in _NUMBER_HEADINGS.split(", ")
 
 
 def is_label_heading(text: Any) -> bool:
     """Whether a text heads other names of the modules."""
-    return isinstance(text, str) and plain(text).casefold() in LABEL_HEADINGS
+    return isinstance(text, str) and plain(text).casefold() in _LABEL_HEADINGS.split(", ")
 
 
 def may_mean(text: Any) -> list[str]:

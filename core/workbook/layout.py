@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import warnings
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
 
@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from ..errors import InputError, InputWarning
 from .book import HEADING_ROWS, Book, Sheet
 from .cells import Uncomputed, module_number
-from .column_map import ColumnMap, Joined, MappedColumn, MappedTable
+from .column_map import ColumnMap, MappedTable
 from .headings import heading_of, shows_as_stored
 from .quantities import QUANTITIES
 
@@ -86,23 +86,19 @@ class Column:
         """Sheet and cell of module index `i`."""
         return self.table.sheet.place(self.rows[i], self.column)
 
-    def numbers(self) -> NDArray[np.float64]:
-        """The numbers (M,) in the cells, in their unit; `InputError` if one holds no number."""
-        return np.array([self._number(i) for i in range(len(self.rows))])
+    def numbers(self, optional: bool = False, may_fail: NDArray[np.bool_] | None = None) -> NDArray[np.float64]:
+        """The numbers (M,) in the cells, in their unit; `InputError` if one holds no number.
 
-    def numbers_or_nan(self, may_fail: NDArray[np.bool_] | None = None) -> NDArray[np.float64]:
-        """The same with NaN where a cell is blank or cannot be computed, and anything else that `may_fail` (M,)."""
+        If they are `optional`, NaN where a cell is blank or cannot be computed, or holds anything else and `may_fail`.
+        """
         numbers = np.full(len(self.rows), math.nan)
         for i, row in enumerate(self.rows):
             value = self.table.sheet.value(row, self.column)
-            optional = value is None or isinstance(value, Uncomputed) or (may_fail is not None and may_fail[i])
-            if isinstance(value, float) or not optional:
-                numbers[i] = self._number(i)
+            absent = value is None or isinstance(value, Uncomputed) or (may_fail is not None and may_fail[i])
+            if isinstance(value, float) or not (optional and absent):
+                of = "" if self.shared else f" of module {self.modules.module_numbers[i]}"
+                numbers[i] = self.table.sheet.number(row, self.column, self.quantity + of)
         return numbers
-
-    def _number(self, i: int) -> float:
-        of = "" if self.shared else f" of module {self.modules.module_numbers[i]}"
-        return self.table.sheet.number(self.rows[i], self.column, self.quantity + of)
 
     def refuse(self, bad: NDArray[np.bool_], why: Callable[[int], str]) -> None:
         """Raise `InputError` for the first module of `bad` (M,), if any."""
@@ -186,45 +182,13 @@ def _contradictions(table: Table) -> Iterable[str]:
             yield f"{sheet.where(first, column)} is shown as {shown!r}, {used}"
 
 
-def column_map_of(layout: Layout, rows_of: dict[Table, tuple[int, ...]] | None = None) -> ColumnMap:
-    """The map that describes a layout; `rows_of` gives tables other rows than they have."""
-    said: list[MappedTable] = []
-    for table in dict.fromkeys([layout.modules, *(column.table for column in layout.columns.values())]):
-        columns = {name: c for name, c in layout.columns.items() if c.table is table}
-        rows = {**layout.rows_of, **(rows_of or {})}.get(table, table.rows)
-        once = {name for name, c in columns.items() if c.shared or (table is not layout.modules and len(rows) == 1)}
-        joined: Joined = "by number" if table.labels and layout.modules.labels else "in order"
-        cells = {name: (c.column, c.unit) for name, c in columns.items()}
-        each = {name: cell for name, cell in cells.items() if name not in once}
-        if each:
-            how = None if table is layout.modules else joined
-            said.append(mapped_table(table.sheet, sorted(rows), each, table.label_column, how))
-        if once:
-            row = next(c.rows[0] for name, c in columns.items() if name in once)
-            said.append(
-                mapped_table(table.sheet, [row], {n: c for n, c in cells.items() if n in once}, None, "one for all")
-            )
-    return ColumnMap(tuple(said))
-
-
-def mapped_table(
-    sheet: Sheet,
-    rows: Iterable[int],
-    columns: dict[str, tuple[int, str]],
-    number: int | None,
-    joined: Joined | None,
-    header_row: int | None = None,
-) -> MappedTable:
-    """A table of a column map, from its rows in ascending order, {quantity: (column, unit)} and the number's column."""
-    from openpyxl.utils import get_column_letter as letters
-
-    used = tuple(rows)
-    first, last = used[0], used[-1]
-    mapped = tuple(MappedColumn(name, letters(column), unit) for name, (column, unit) in columns.items())
-    skipped = tuple(sorted(set(range(first, last)) - set(used)))
-    return MappedTable(
-        sheet.name, first, last, mapped, None if number is None else letters(number), joined, header_row, skipped
-    )
+def map_with_rows(columns: ColumnMap, layout: Layout, rows_of: Mapping[Table, Iterable[int]]) -> ColumnMap:
+    """The column map of a layout after its tables have got the rows in `rows_of`."""
+    found = []
+    for said in columns.tables:
+        table = layout.columns[said.columns[0].quantity].table
+        found.append(said.with_rows(sorted(rows_of.get(table, table.rows))))
+    return ColumnMap(tuple(found))
 
 
 def by_label(modules: Table, table: Table) -> tuple[int, ...]:

@@ -31,8 +31,7 @@ def refuse_impossible(columns: dict[str, Column], values: Numbers) -> None:
         refuse_not_positive(columns[name], values[name])
     d, side, roi = values["d"], values["Ld"], values["R"]
     columns["d"].refuse(
-        d >= side,
-        lambda i: f"has d = {d[i]:g} mm, expected less than Ld = {side[i]:g} mm in {columns['Ld'].place(i)}",
+        d >= side, lambda i: f"has d = {d[i]:g} mm, expected less than Ld = {side[i]:g} mm in {columns['Ld'].place(i)}"
     )
     x1 = columns["x1"]
     with np.errstate(over="ignore"):
@@ -89,10 +88,7 @@ def implausible(system: PinholeSystem, columns: dict[str, Column]) -> Iterator[s
 
 
 def differences(
-    column: Column,
-    given: NDArray[np.float64],
-    expected: NDArray[np.float64],
-    slack: NDArray[np.float64] | float = 0.0,
+    column: Column, given: NDArray[np.float64], expected: NDArray[np.float64], slack: NDArray[np.float64] | float = 0.0
 ) -> Iterator[str]:
     """The first modules whose number `given` (M,) in the sheet, in its unit, is not as `expected` (M,), mm or rad.
 

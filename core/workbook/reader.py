@@ -82,11 +82,9 @@ def read(book: Book, columns: ColumnMap | None = None) -> Reading:
     on_axis = np.hypot(values["x1"], values["y1"]) == 0
     for name in QUANTITIES:
         if name in layout.columns and name not in NEEDED:
-            column = layout.columns[name]
             # On the z axis a spreadsheet's ATAN2 shows #DIV/0!, and any azimuth is right.
             may_fail = on_axis if name == "azimuth" else None
-            named = name == "l" and columns is not None
-            given[name] = column.numbers() if named else column.numbers_or_nan(may_fail)
+            given[name] = layout.columns[name].numbers(name != "l" or columns is None, may_fail)
     designed = collimator_length(
         np.sqrt(sum(values[name] ** 2 for name in POSITION)), values["d"], values["Ld"], values["R"]
     )
@@ -111,11 +109,7 @@ def read(book: Book, columns: ColumnMap | None = None) -> Reading:
 
 
 def _doubtful(
-    book: Book,
-    columns: dict[str, Column],
-    given: Numbers,
-    system: PinholeSystem,
-    designed: NDArray[np.float64],
+    book: Book, columns: dict[str, Column], given: Numbers, system: PinholeSystem, designed: NDArray[np.float64]
 ) -> Iterator[str]:
     """What is read but may be wrong, as texts of warnings; `designed` is the design formula's l (M,)."""
     rounding_of_l: NDArray[np.float64] | float = 0.0

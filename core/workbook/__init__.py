@@ -1,31 +1,31 @@
 """The users' geometry workbook (.xlsx): the pinholes' coordinates and their dimensions.
 
-book.py          the file: opened, refused, its cells as Python values
-references.py    B3, Main!$B$3:$B$82, A:C in formulas
-tables.py        Table1[v], Table1[[#This Row],[x]] in formulas
-formulas.py      values of formulas
-quantities.py    what the columns are: quantities, their headings and units
-sheet_seen.py    a sheet's headings, and the columns and rows under them
-doubts.py        what around a table may make its numbers mean something else
+quantities.py    the table of what the columns may hold: headings, units, formulas
+headings.py      what texts say: headings, units in notes, number formats
+book.py          the file, and the values of its cells
+headed_table.py  a table as a sheet's headings describe it
+doubts.py        what in a table or around it may give its numbers another meaning
 recognition.py   which cells hold which quantity, by the headings
-column_map.py    `ColumnMap`: what a person says of that instead
-layout.py        which cell holds a quantity of a module, either way
+column_map.py    `ColumnMap`: the same, said by a person
+layout.py        which cells hold which quantity of which module, either way
+reader.py        `read_system`, from the layout to the numbers to the system
+plausibility.py  whether the numbers are possible, plausible, and agree with the formulas
 draft.py         a column map for a person to check, and a preview of the cells
-checks.py        the sheet's own derived numbers against the formulas, and what scanners are like
-reader.py        `read_system`, which joins these
-source.py        `SystemSource`, where each number came from
 
-writer.py        `write_system`: the system's numbers into a copy of a workbook
-edit.py          the system's numbers in the cells
-arrangement.py   rows that are moved, emptied and added with the modules
-recalculate.py   new values for formulas that depend on changed cells
-dependencies.py  which formulas these are
-libreoffice.py   LibreOffice as their calculator
-workbook_xml.py  a workbook file as cells that can be changed
-sheet_xml.py     a worksheet as cells that can be changed
-xml_parts.py     XML that is changed in a few places
-package.py       the zip archive's members
+writer.py        `write_system`
 new_workbook.py  a workbook in the users' layout
+edit.py          a system's numbers put into the cells
+rows.py          rows that move, are emptied or are added with the modules
+recalculate.py   new values for the formulas that depend on changed cells
+
+calculation.py   the values of formulas that refer to each other
+formulas.py      the value of one formula
+references.py    B3, Main!$B$3:$B$82 and A:C in formulas
+cells.py         what a cell may hold besides a number, and how messages describe it
+workbook_xml.py  the sheets of a workbook file
+sheet_xml.py     the cells of a sheet; only the bytes of changed ones are replaced
+xml_parts.py     XML that is changed in a few places
+package.py       the zip archive
 """
 
 from __future__ import annotations

@@ -1,24 +1,31 @@
-"""A column map: what a person says of a workbook that its headings do not say. Kept as TOML."""
+"""A column map: what a person says about the cells of a workbook where its headings do not. Kept as TOML."""
 
 from __future__ import annotations
 
+import json
 import os
 import re
 import tomllib
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal, get_args
 
 from ..errors import InputError
 from ..files import replacing
-from .quantities import NEEDED, POSITION, QUANTITIES, unit_alone
+from .headings import unit_of
+from .quantities import DIMENSIONS, POSITION, QUANTITIES
 from .references import MAX_COLUMN, MAX_ROW
 
 Joined = Literal["by number", "in order", "one for all"]
 
-_LETTERS = re.compile("[A-Z]{1,3}")
 _HELP = "see docs/workbook.md"
+_KEYS = {"sheet": str, "header_row": int, "first_row": int, "last_row": int, "skip_rows": list} | {
+    "rows": str,
+    "number": str,
+    "columns": dict,
+}
+_COLUMN = '{ column = "B", unit = "mm" }'
 
 
 @dataclass(frozen=True)
@@ -32,7 +39,7 @@ class MappedColumn:
     column : str
         Its letters.
     unit : str
-        mm, cm, m, in, µm, dm, ft, mil or 0.1 mm; rad or deg. Empty in a draft where it is not known.
+        mm, cm, m, in, µm, dm, ft, mil or 0.1 mm; rad or deg. Empty in a draft if it is not known.
     """
 
     quantity: str
@@ -40,7 +47,7 @@ class MappedColumn:
     unit: str
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "unit", unit_alone(self.unit) or self.unit)  # "um" and "inches" are units, too
+        object.__setattr__(self, "unit", unit_of(self.unit) or self.unit)  # "um" and "inches" are units, too
 
 
 @dataclass(frozen=True)
@@ -51,17 +58,17 @@ class MappedTable:
     ----------
     sheet : str
     first_row, last_row : int
-        Every row from one to the other is of a module, but for `skip_rows`.
+        Every row from the first to the last holds a module, except `skip_rows`.
     columns : tuple of MappedColumn
     number : str or None
-        Letters of the column of the modules' numbers or names. Without, the first table's modules are 1, 2, ...
+        Letters of the column with the modules' numbers or names. Without it, the first table's modules are 1, 2, ...
     rows : "by number", "in order", "one for all" or None
-        How the rows belong to those of the first table: by what stands in the two `number` columns, in the same order,
-        or one row for all modules. None in the first table itself.
+        How the rows are matched with those of the first table: by the contents of the two `number` columns, in the
+        same order, or one row for all modules. None in the first table itself.
     header_row : int or None
         For people.
     skip_rows : tuple of int
-        Rows between the first and the last that are none of the table's.
+        Rows between the first and the last that do not belong to the table.
     """
 
     sheet: str
@@ -78,15 +85,20 @@ class MappedTable:
         skipped = set(self.skip_rows)
         return tuple(row for row in range(self.first_row, self.last_row + 1) if row not in skipped)
 
+    def with_rows(self, rows: Sequence[int]) -> MappedTable:
+        """The table with other rows, which are in ascending order."""
+        skipped = sorted(set(range(rows[0], rows[-1])).difference(rows))
+        return replace(self, first_row=rows[0], last_row=rows[-1], skip_rows=tuple(skipped))
+
 
 @dataclass(frozen=True)
 class ColumnMap:
-    """Which cells of a workbook hold which quantity, said by a person instead of read from its headings.
+    """Which cells of a workbook hold which quantity, given by a person instead of its headings.
 
     Attributes
     ----------
     tables : tuple of MappedTable
-        The first holds x1, y1 and z1. d, R, Ld and Td must be in some table; without l it is the design formula's.
+        The first holds x1, y1 and z1. d, R, Ld and Td must be in some table; without l, the design formula is used.
 
     Examples
     --------
@@ -98,7 +110,7 @@ class ColumnMap:
     tables: tuple[MappedTable, ...]
 
     def faults(self) -> list[str]:
-        """What keeps the map from being used, a line each; empty where it is complete."""
+        """Why the map cannot be used, a line for each reason; empty if it is complete."""
         if not self.tables:
             return ["the column map has no [[tables]], expected one with x1, y1, z1 first"]
         faults = [fault for i, table in enumerate(self.tables) for fault in _table_faults(table, i)]
@@ -108,24 +120,16 @@ class ColumnMap:
                 if c.quantity in places:
                     faults.append(f"{_of(i, c.quantity)} is in {places[c.quantity]} too, expected each quantity once")
                 places.setdefault(c.quantity, _of(i))
-        first = {c.quantity for c in self.tables[0].columns}
-        faults += [
-            f"{_of(0)} has no column {name}, expected x1, y1, z1 in the first table"
-            for name in POSITION
-            if name not in first and name not in places
-        ]
-        faults += [
-            f"{places[name]} has {name}, expected x1, y1, z1 in the first table"
-            for name in POSITION
-            if name not in first and name in places
-        ]
-        faults += [f"no table has a column {name}" for name in NEEDED[len(POSITION) :] if name not in places]
-        faults += self._overlaps()
-        return faults
+        for name in POSITION:
+            if places.get(name) != _of(0):
+                found = f"{places[name]} has {name}" if name in places else f"{_of(0)} has no column {name}"
+                faults.append(f"{found}, expected x1, y1, z1 in the first table")
+        faults += [f"no table has a column {name}" for name in DIMENSIONS if name not in places]
+        return faults + list(self._overlaps())
 
-    def _overlaps(self) -> list[str]:
+    def _overlaps(self) -> Iterator[str]:
+        """The columns that are used twice in the same rows, other than for the modules' numbers."""
         used: dict[tuple[str, str], list[tuple[set[int], str]]] = {}
-        faults = []
         for i, table in enumerate(self.tables):
             rows = set(range(max(table.first_row, 1), min(table.last_row, MAX_ROW) + 1))
             names = [(c.quantity, c.column) for c in table.columns]
@@ -134,14 +138,8 @@ class ColumnMap:
                 others = used.setdefault((table.sheet.casefold(), column), [])
                 for other_rows, other in others:
                     if rows & other_rows and not (name == "number" and other.endswith(".number")):
-                        faults.append(f"{_of(i, name)}: column {column} is {other} too, expected another column")
+                        yield f"{_of(i, name)}: column {column} is {other} too, expected another column"
                 others.append((rows, _of(i, name)))
-        return faults
-
-    def require_complete(self, name: str = "column map") -> None:
-        """Raise `InputError` with the first of `faults`, calling the map `name`."""
-        for fault in self.faults():
-            raise InputError(f"{name}: {fault} ({_HELP})")
 
     def to_toml(self) -> str:
         """The map as text, which `from_toml` reads."""
@@ -149,12 +147,12 @@ class ColumnMap:
 
     @classmethod
     def from_toml(cls, text: str, name: str = "column map") -> ColumnMap:
-        """The map that `to_toml` wrote, or a person; `name` is how messages call it.
+        """The map in a text that `to_toml` or a person wrote; messages call it `name`.
 
         Raises
         ------
         InputError
-            Not TOML, or with keys or values that a map has not. Whether it is complete, `faults` says.
+            The text is not TOML, or has unknown keys or values. Whether the map is complete is told by `faults`.
         """
         try:
             values = tomllib.loads(text)
@@ -168,7 +166,7 @@ class ColumnMap:
 
     @classmethod
     def read(cls, path: str | os.PathLike[str]) -> ColumnMap:
-        """The map of a .toml file; `InputError` where it cannot be read."""
+        """The map in a .toml file; `InputError` if it cannot be read."""
         path = Path(path)
         try:
             text = path.read_text(encoding="utf-8")
@@ -179,7 +177,7 @@ class ColumnMap:
         return cls.from_toml(text, str(path))
 
     def write(self, path: str | os.PathLike[str], comment: str = "") -> None:
-        """Write the map to a .toml file, under the lines of a comment."""
+        """Write the map to a .toml file, below the lines of a comment."""
         lines = "".join(f"# {line}\n" for line in comment.splitlines())
         with replacing(Path(path)) as temporary:
             temporary.write_text(lines + self.to_toml(), encoding="utf-8")
@@ -188,123 +186,105 @@ class ColumnMap:
 def column_map(
     columns: ColumnMap | str | os.PathLike[str] | None, workbook: str | os.PathLike[str]
 ) -> ColumnMap | None:
-    """The map of `workbook` that `columns` is, or that its file holds, complete."""
+    """The column map of `workbook`, given as such or as the path of its file; `InputError` if it is not complete."""
     if columns is None:
         return None
+    name = str(columns)
     if isinstance(columns, ColumnMap):
-        columns.require_complete(f"{Path(workbook).name}: column map")
-        return columns
-    found = ColumnMap.read(columns)
-    found.require_complete(str(columns))
-    return found
+        name = f"{Path(workbook).name}: column map"
+    else:
+        columns = ColumnMap.read(columns)
+    for fault in columns.faults():
+        raise InputError(f"{name}: {fault} ({_HELP})")
+    return columns
 
 
 def _of(i: int, name: str = "") -> str:
     return f"table {i + 1}" + (f".{name}" if name else "")
 
 
-def _table_faults(table: MappedTable, i: int) -> list[str]:
-    faults = []
+def _table_faults(table: MappedTable, i: int) -> Iterator[str]:
     if not 1 <= table.first_row <= table.last_row <= MAX_ROW:
-        faults.append(f"{_of(i)}: rows {table.first_row} to {table.last_row}, expected the first row, then the last")
+        yield f"{_of(i)}: rows {table.first_row} to {table.last_row}, expected the first row, then the last"
     elif not table.row_numbers():
-        faults.append(f"{_of(i)}: skip_rows leaves no row")
-    faults += [
-        f"{_of(i)}: skip_rows has {row}, expected rows between {table.first_row} and {table.last_row}"
-        for row in table.skip_rows
-        if not table.first_row < row < table.last_row
-    ]
+        yield f"{_of(i)}: skip_rows leaves no row"
+    for row in table.skip_rows:
+        if not table.first_row < row < table.last_row:
+            yield f"{_of(i)}: skip_rows has {row}, expected rows between {table.first_row} and {table.last_row}"
     if not table.columns:
-        faults.append(f"{_of(i)} has no columns")
+        yield f"{_of(i)} has no columns"
     for c in table.columns:
         quantity = QUANTITIES.get(c.quantity)
         if quantity is None:
-            faults.append(f"{_of(i, c.quantity)}: no such quantity, expected {', '.join(QUANTITIES)}")
+            yield f"{_of(i, c.quantity)}: no such quantity, expected {', '.join(QUANTITIES)}"
         elif c.unit not in quantity.units:
-            faults.append(f"{_of(i, c.quantity)}: unit {c.unit!r}, expected {', '.join(quantity.units)}")
+            yield f"{_of(i, c.quantity)}: unit {c.unit!r}, expected {', '.join(quantity.units)}"
         if not _is_column(c.column):
-            faults.append(f"{_of(i, c.quantity)}: column {c.column!r}, expected letters such as B")
+            yield f"{_of(i, c.quantity)}: column {c.column!r}, expected letters such as B"
     if table.number is not None and not _is_column(table.number):
-        faults.append(f"{_of(i)}: number {table.number!r}, expected a column's letters such as A")
+        yield f"{_of(i)}: number {table.number!r}, expected a column's letters such as A"
     if i == 0 and table.rows is not None:
-        faults.append(f"{_of(0)} has rows = {table.rows!r}, expected it in the tables after the first alone")
+        yield f"{_of(0)} has rows = {table.rows!r}, which only the tables after the first may have"
     if i > 0 and table.rows not in get_args(Joined):
-        faults.append(f"{_of(i)}: rows = {table.rows!r}, expected {' or '.join(map(repr, get_args(Joined)))}")
+        yield f"{_of(i)}: rows = {table.rows!r}, expected {' or '.join(map(repr, get_args(Joined)))}"
     if i > 0 and table.rows == "by number" and table.number is None:
-        faults.append(f"{_of(i)}: rows = 'by number' without number, expected the column of the numbers")
+        yield f"{_of(i)}: rows = 'by number' without number, expected the column of the numbers"
     if table.rows == "one for all" and len(table.row_numbers()) != 1:
-        faults.append(f"{_of(i)}: rows = 'one for all' of several rows, expected first_row = last_row")
-    return faults
+        yield f"{_of(i)}: rows = 'one for all' of several rows, expected first_row = last_row"
 
 
 def _is_column(letters: str) -> bool:
     from openpyxl.utils import column_index_from_string
 
-    return bool(_LETTERS.fullmatch(letters)) and column_index_from_string(letters) <= MAX_COLUMN
+    return bool(re.fullmatch("[A-Z]{1,3}", letters)) and column_index_from_string(letters) <= MAX_COLUMN
 
 
-def _refuse_unknown(values: Mapping[str, Any], known: set[str], where: str) -> None:
+def _refuse_unknown(values: Mapping[str, Any], known: Iterable[str], where: str) -> None:
     for key in values:
         if key not in known:
             raise InputError(f"{where}: unknown key {key!r}, expected {', '.join(sorted(known))}")
 
 
 def _table(values: dict[str, Any], where: str) -> MappedTable:
-    known = {"sheet", "header_row", "first_row", "last_row", "skip_rows", "number", "rows", "columns"}
-    _refuse_unknown(values, known, where)
-
-    def get(key: str, kind: type, default: Any = ...) -> Any:
-        value = values.get(key, default)
-        if value is ...:
+    _refuse_unknown(values, _KEYS, where)
+    if values.get("rows") == "one for all" and "first_row" in values:
+        values = {"last_row": values["first_row"], **values}
+    for key in ("sheet", "first_row", "last_row", "columns"):
+        if key not in values:
             raise InputError(f"{where}: has no {key} ({_HELP})")
-        if value is not default and type(value) is not kind:
-            what = {int: "a whole number", str: "text in quotes", dict: "a table", list: "a list"}[kind]
+    for key, value in values.items():
+        if type(value) is not _KEYS[key]:
+            what = {int: "a whole number", str: "text in quotes", dict: "a table", list: "a list"}[_KEYS[key]]
             raise InputError(f"{where}: {key} = {value!r}, expected {what}")
-        return value
-
-    skipped = get("skip_rows", list, [])
+    skipped = values.get("skip_rows", [])
     if not all(type(row) is int for row in skipped):
         raise InputError(f"{where}: skip_rows = {skipped!r}, expected whole numbers")
-    first = get("first_row", int)
-    rows = get("rows", str, None)
-    columns = []
-    for name, column in get("columns", dict).items():
-        if not isinstance(column, dict):
-            raise InputError(f'{where}.{name}: expected {{ column = "B", unit = "mm" }}')
-        _refuse_unknown(column, {"column", "unit"}, f"{where}.{name}")
-        for key in ("column", "unit"):
-            if not isinstance(column.get(key), str):
-                raise InputError(f'{where}.{name}: has no {key}, expected {{ column = "B", unit = "mm" }}')
-        columns.append(MappedColumn(name, column["column"].upper(), column["unit"]))
-    number = get("number", str, None)
-    return MappedTable(
-        sheet=get("sheet", str),
-        first_row=first,
-        last_row=get("last_row", int, first if rows == "one for all" else ...),
-        columns=tuple(columns),
-        number=None if number is None else number.upper(),
-        rows=rows,
-        header_row=get("header_row", int, None),
-        skip_rows=tuple(skipped),
-    )
+    columns = tuple(_column(name, column, f"{where}.{name}") for name, column in values["columns"].items())
+    number = values["number"].upper() if "number" in values else None
+    return MappedTable(**{**values, "columns": columns, "number": number, "skip_rows": tuple(skipped)})
+
+
+def _column(name: str, values: Any, where: str) -> MappedColumn:
+    if not isinstance(values, dict):
+        raise InputError(f"{where}: expected {_COLUMN}")
+    _refuse_unknown(values, ("column", "unit"), where)
+    for key in ("column", "unit"):
+        if not isinstance(values.get(key), str):
+            raise InputError(f"{where}: has no {key}, expected {_COLUMN}")
+    return MappedColumn(name, values["column"].upper(), values["unit"])
 
 
 def _table_toml(table: MappedTable) -> str:
-    lines = ["[[tables]]", f"sheet = {_quoted(table.sheet)}"]
-    if table.header_row is not None:
-        lines.append(f"header_row = {table.header_row}")
-    lines += [f"first_row = {table.first_row}", f"last_row = {table.last_row}"]
-    if table.skip_rows:
-        lines.append(f"skip_rows = [{', '.join(map(str, table.skip_rows))}]")
-    if table.rows is not None:
-        lines.append(f"rows = {_quoted(table.rows)}")
-    if table.number is not None:
-        lines.append(f"number = {_quoted(table.number)}")
+    lines = ["[[tables]]"]
+    for key in _KEYS:
+        value = getattr(table, key)
+        if key != "columns" and value not in (None, ()):
+            lines.append(f"{key} = {_toml(value)}")
     lines.append("[tables.columns]")
-    lines += [f"{c.quantity} = {{ column = {_quoted(c.column)}, unit = {_quoted(c.unit)} }}" for c in table.columns]
+    lines += [f"{c.quantity} = {{ column = {_toml(c.column)}, unit = {_toml(c.unit)} }}" for c in table.columns]
     return "\n".join(lines) + "\n"
 
 
-def _quoted(text: str) -> str:
-    marked = text.replace("\\", "\\\\").replace('"', '\\"')
-    return '"' + "".join(c if c >= " " and c != "\x7f" else f"\\u{ord(c):04x}" for c in marked) + '"'
+def _toml(value: int | str | tuple[int, ...]) -> str:
+    """A value as TOML, which writes it as JSON does."""
+    return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")

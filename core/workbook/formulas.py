@@ -1,8 +1,8 @@
-"""Values of spreadsheet formulas: for files that store none (openpyxl writes such), and after cells have changed.
+"""An evaluator of spreadsheet formulas.
 
-The libraries for this were weighed: `formulas` (EUPL) brings scipy and the compiled regex, `xlcalculator` pandas,
-`pycel` a networkx of 2021. A geometry table needs arithmetic over cells and a little logic: openpyxl's tokenizer
-and the precedence below are enough. What is beyond them is `NotComputable`, never a guess.
+A geometry table needs arithmetic over cells and a little logic: openpyxl's tokenizer and the precedence below are
+enough. The libraries for this were weighed: `formulas` (EUPL) brings scipy, `xlcalculator` pandas, and `pycel` a networkx
+of 2021. A formula that needs more raises `NotComputable`; nothing is guessed.
 """
 
 from __future__ import annotations
@@ -10,13 +10,12 @@ from __future__ import annotations
 import decimal
 import math
 import operator
-import statistics
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any
 
-from .references import reference
+from .references import Reference, reference
 
 Lookup = Callable[[str | None, int, int], Any]
 """(sheet name or None for the formula's own, row, column) -> the cell's value, None if blank."""
@@ -29,12 +28,12 @@ class CellError(str):
 
 
 class NotComputable(Exception):
-    """The formula needs something that is not here; the message says what."""
+    """The formula needs something that is not known here; the message says what."""
 
 
 @dataclass(frozen=True)
 class Surroundings:
-    """What a formula may ask for beside other cells' values.
+    """What a formula refers to.
 
     Attributes
     ----------
@@ -42,9 +41,9 @@ class Surroundings:
     at : (row, column), or None
         The formula's own cell, for ``ROW()``.
     extent : callable, or None
-        Sheet name or None -> its last row and column with content, which end whole columns and rows.
+        Sheet name or None -> its last row and column with content, at which whole columns and rows end.
     name : callable, or None
-        Defined name, or reference to a table's columns -> its formula, or None for an unknown one.
+        Defined name -> its formula, None if unknown.
     """
 
     lookup: Lookup
@@ -59,10 +58,10 @@ def calculate(formula: str, surroundings: Surroundings) -> float | str | bool | 
     Raises
     ------
     NotComputable
-        It uses a function, name or value beyond those known here.
+        It uses a function, a name or a value that is not known here.
     """
     try:
-        value = _scalar(_parsed(formula, surroundings)())
+        value = _scalar(_Parser(tokens_of(formula), surroundings).whole()())
     except _ErrorValue as error:
         return error.args[0]
     except ZeroDivisionError:
@@ -76,20 +75,36 @@ def calculate(formula: str, surroundings: Surroundings) -> float | str | bool | 
     return 0.0 if value is None else value
 
 
-@lru_cache(maxsize=2**15)  # asked for twice: what a formula refers to, and what it gives
+@lru_cache(maxsize=2**15)  # each is asked for twice: for what a formula refers to, and for its value
 def tokens_of(formula: str) -> tuple[Any, ...]:
-    """The tokens (`openpyxl.formula.tokenizer.Token`) of `formula`, which begins with "="; `NotComputable` if bad."""
+    """The tokens (`openpyxl.formula.tokenizer.Token`) of `formula`; `NotComputable` if it is malformed."""
     from openpyxl.formula import Tokenizer
     from openpyxl.formula.tokenizer import TokenizerError
 
     try:
         return tuple(token for token in Tokenizer(formula).items if token.type != "WHITE-SPACE")
-    except (TokenizerError, IndexError) as error:  # the latter where a parenthesis closes nothing
+    except (TokenizerError, IndexError) as error:  # the latter for a parenthesis that closes nothing
         raise NotComputable("it is not a formula") from error
 
 
+def operands(formula: str) -> list[str]:
+    """The references and names in a formula, none if it is malformed."""
+    try:
+        return [token.value for token in tokens_of(formula) if (token.type, token.subtype) == ("OPERAND", "RANGE")]
+    except NotComputable:
+        return []
+
+
+def areas_in(formula: str) -> list[Reference]:
+    """The areas that a formula names."""
+    return [area for text in operands(formula) if (area := reference(text)) is not None]
+
+
+# Values
+
+
 class _ErrorValue(Exception):
-    """An operand is an error value; so is the result."""
+    """The value of an operand is an error, and so is the result."""
 
 
 class _Cells(list):  # type: ignore[type-arg]
@@ -101,7 +116,7 @@ class _Cells(list):  # type: ignore[type-arg]
 
 
 _Term = Callable[[], Any]
-"""A part of a formula, computed when called: the branch of an IF that is not taken must not be."""
+"""A part of a formula, computed when called: the branch of an IF that is not taken must not be computed."""
 
 
 def _scalar(value: Any) -> Any:
@@ -145,32 +160,44 @@ def _truth(value: Any) -> bool:
     return bool(value)
 
 
-def _items(arguments: list[Any], kinds: tuple[type, ...], single: Callable[[Any], Any]) -> list[Any]:
-    """Of areas, the cells of `kinds` alone, as a spreadsheet takes them; `single` of each other argument."""
+def _truths(terms: tuple[_Term, ...]) -> list[bool]:
+    values = [_scalar(term()) for term in terms]
+    if not all(isinstance(value, (bool, float)) for value in values):
+        raise NotComputable("it uses a text or a blank as a truth value")
+    return [bool(value) for value in values]
+
+
+def _area(term: _Term) -> _Cells:
+    value = term()
+    if not isinstance(value, _Cells):
+        raise NotComputable("it uses a value where a range belongs")
+    return value
+
+
+def _numbers(terms: tuple[_Term, ...]) -> list[float]:
+    """The numbers among the cells of areas, and every other argument as a number."""
     found = []
-    for argument in arguments:
-        if not isinstance(argument, _Cells):
-            found.append(single(argument))
-            continue
-        for cell in argument:
-            if isinstance(cell, CellError):
-                raise _ErrorValue(cell)
-            if type(cell) in kinds:
-                found.append(cell)
+    for value in [term() for term in terms]:
+        if isinstance(value, _Cells):
+            for cell in value:
+                if isinstance(cell, CellError):
+                    raise _ErrorValue(cell)
+            found += [cell for cell in value if type(cell) is float]
+        else:
+            found.append(_number(value))
     return found
 
 
-def _numbers(arguments: list[Any]) -> list[float]:
-    return _items(arguments, (float,), _number)
+# Operators
 
 
 def _same_as_shown(a: float, b: float) -> bool:
-    """Whether numbers are the same in the 15 digits that spreadsheets show and compare: 0.1 + 0.2 is 0.3."""
+    """Whether numbers agree in the 15 digits that spreadsheets show and compare: 0.1 + 0.2 is 0.3."""
     return f"{a:.14e}" == f"{b:.14e}"
 
 
 def _compared(compare: Callable[[Any, Any], bool]) -> Callable[[Any, Any], bool]:
-    """Numbers come before texts, texts (whatever their case) before booleans; blank is the other's zero."""
+    """A comparison: numbers are less than texts (case aside), texts less than booleans; a blank is the other's zero."""
 
     def rank(value: Any) -> tuple[int, Any]:
         if isinstance(value, bool):
@@ -189,18 +216,12 @@ def _compared(compare: Callable[[Any, Any], bool]) -> Callable[[Any, Any], bool]
     return result
 
 
-def _of_numbers(function: Callable[[float, float], float]) -> Callable[[Any, Any], float]:
+def _of_two_numbers(function: Callable[[float, float], float]) -> Callable[[Any, Any], float]:
     return lambda a, b: function(_number(a), _number(b))
 
 
 def _sum(a: float, b: float) -> float:
     return 0.0 if _same_as_shown(a, -b) else a + b
-
-
-def _atan2(x: float, y: float) -> float:
-    if x == y == 0:
-        raise ZeroDivisionError
-    return math.atan2(y, x)
 
 
 def _power(base: float, exponent: float) -> float:
@@ -210,64 +231,40 @@ def _power(base: float, exponent: float) -> float:
     return result
 
 
+# From loosest to tightest; all group from the left, and a sign in front binds tighter: -2^2 is 4.
+_OPERATORS: list[dict[str, Callable[[Any, Any], Any]]] = [
+    {
+        "=": _compared(operator.eq),
+        "<>": _compared(operator.ne),
+        "<": _compared(operator.lt),
+        "<=": _compared(operator.le),
+        ">": _compared(operator.gt),
+        ">=": _compared(operator.ge),
+    },
+    {"&": lambda a, b: _text(a) + _text(b)},
+    {"+": _of_two_numbers(_sum), "-": _of_two_numbers(lambda a, b: _sum(a, -b))},
+    {"*": _of_two_numbers(operator.mul), "/": _of_two_numbers(operator.truediv)},
+    {"^": _of_two_numbers(_power)},
+]
+
+
+# Functions
+
+
+def _atan2(x: float, y: float) -> float:
+    if x == y == 0:
+        raise ZeroDivisionError
+    return math.atan2(y, x)
+
+
 def _rounded(rounding: str) -> Callable[[float, float], float]:
     def function(value: float, digits: float) -> float:
-        # Of the decimals that are shown, not of the binary digits behind them: ROUND(2.675,2) is 2.68.
+        # Spreadsheets round the decimals that they show, not the binary digits: ROUND(2.675,2) is 2.68.
         step = decimal.Decimal(1).scaleb(-int(digits))
         with decimal.localcontext(prec=400):
             return float(decimal.Decimal(f"{value:.15g}").quantize(step, rounding=rounding))
 
     return function
-
-
-def _spread(function: Callable[[list[float]], float]) -> Callable[[list[float]], float]:
-    def result(xs: list[float]) -> float:
-        if len(xs) < 2:
-            raise ZeroDivisionError
-        return function(xs)
-
-    return result
-
-
-# Name -> (fewest, most) arguments, and the function of these.
-_OF_NUMBERS: dict[str, tuple[int, int, Callable[..., float]]] = {
-    "ABS": (1, 1, abs),
-    "ACOS": (1, 1, math.acos),
-    "ASIN": (1, 1, math.asin),
-    "ATAN": (1, 1, math.atan),
-    "ATAN2": (2, 2, _atan2),  # x comes first
-    "COS": (1, 1, math.cos),
-    "DEGREES": (1, 1, math.degrees),
-    "EXP": (1, 1, math.exp),
-    "INT": (1, 1, math.floor),
-    "LN": (1, 1, math.log),
-    "LOG": (1, 2, lambda x, base=10.0: math.log10(x) if base == 10 else math.log(x) / math.log(base)),
-    "LOG10": (1, 1, math.log10),
-    "MOD": (2, 2, lambda x, divisor: x - divisor * math.floor(x / divisor)),
-    "PI": (0, 0, lambda: math.pi),
-    "POWER": (2, 2, _power),
-    "RADIANS": (1, 1, math.radians),
-    "ROUND": (2, 2, _rounded(decimal.ROUND_HALF_UP)),
-    "ROUNDDOWN": (2, 2, _rounded(decimal.ROUND_DOWN)),
-    "ROUNDUP": (2, 2, _rounded(decimal.ROUND_UP)),
-    "SIGN": (1, 1, lambda x: (x > 0) - (x < 0)),
-    "SIN": (1, 1, math.sin),
-    "SQRT": (1, 1, math.sqrt),
-    "TAN": (1, 1, math.tan),
-}
-_OF_RANGES: dict[str, Callable[[list[float]], float]] = {
-    "AVERAGE": lambda xs: math.fsum(xs) / len(xs),
-    "MAX": lambda xs: max(xs, default=0.0),
-    "MEDIAN": statistics.median,
-    "MIN": lambda xs: min(xs, default=0.0),
-    "PRODUCT": lambda xs: math.prod(xs) if xs else 0.0,
-    "STDEV": _spread(statistics.stdev),
-    "STDEV.S": _spread(statistics.stdev),
-    "SUM": math.fsum,
-    "SUMSQ": lambda xs: math.fsum(x * x for x in xs),
-    "VAR": _spread(statistics.variance),
-    "VAR.S": _spread(statistics.variance),
-}
 
 
 def _if(condition: _Term, then: _Term, otherwise: _Term = lambda: False) -> Any:
@@ -281,17 +278,10 @@ def _if_error(value: _Term, otherwise: _Term) -> Any:
         return _scalar(otherwise())
 
 
-def _area(term: _Term) -> _Cells:
-    value = term()
-    if not isinstance(value, _Cells):
-        raise NotComputable("it uses a value where a range belongs")
-    return value
-
-
 def _index(cells: _Term, row: _Term, column: _Term = lambda: None) -> Any:
     area, wanted = _area(cells), column()
     i, j = int(_number(row())), 1 if wanted is None else int(_number(wanted))
-    if wanted is None and len(area) == area.columns:  # one row: the only index counts columns
+    if wanted is None and len(area) == area.columns:  # in one row, the only index counts columns
         i, j = 1, i
     elif wanted is None and area.columns > 1:
         raise _ErrorValue(CellError("#REF!"))
@@ -302,8 +292,11 @@ def _index(cells: _Term, row: _Term, column: _Term = lambda: None) -> Any:
     return _scalar(area[(i - 1) * area.columns + j - 1])
 
 
-def _position(wanted: Any, cells: list[Any]) -> int:
+def _position(wanted: Any, cells: list[Any], mode: Any) -> int:
+    """The index of the first cell that equals `wanted`; `mode` is the last argument of MATCH or VLOOKUP."""
     wanted = _scalar(wanted)
+    if _number(mode) != 0:
+        raise NotComputable("it looks up the nearest value")
     if isinstance(wanted, str) and set(wanted) & set("*?~"):
         raise NotComputable("it looks for a pattern")
     same = _compared(operator.eq)
@@ -313,118 +306,63 @@ def _position(wanted: Any, cells: list[Any]) -> int:
     raise _ErrorValue(CellError("#N/A"))
 
 
-def _exact(mode: Any) -> None:
-    if _number(mode) != 0:
-        raise NotComputable("it looks up the nearest value")
-
-
 def _match(wanted: _Term, cells: _Term, mode: _Term = lambda: 1.0) -> float:
-    _exact(mode())
-    return _position(wanted(), _area(cells)) + 1.0
+    return _position(wanted(), _area(cells), mode()) + 1.0
 
 
-def _vlookup(wanted: _Term, cells: _Term, column: _Term, nearest: _Term = lambda: 1.0) -> Any:
-    _exact(nearest())
+def _vlookup(wanted: _Term, cells: _Term, column: _Term, mode: _Term = lambda: 1.0) -> Any:
     area, j = _area(cells), int(_number(column()))
     if not 1 <= j <= area.columns:
         raise _ErrorValue(CellError("#REF!" if j > 0 else "#VALUE!"))
-    return _scalar(area[_position(wanted(), area[:: area.columns]) * area.columns + j - 1])
+    return _scalar(area[_position(wanted(), area[:: area.columns], mode()) * area.columns + j - 1])
 
 
-def _sum_product(*terms: _Term) -> float:
-    areas = [_area(term) for term in terms]
-    if len({(len(area), area.columns) for area in areas}) > 1:
-        raise _ErrorValue(CellError("#VALUE!"))
-    for cell in (cell for area in areas for cell in area if isinstance(cell, CellError)):
-        raise _ErrorValue(cell)
-    columns = zip(*areas, strict=True)
-    return math.fsum(math.prod(x if type(x) is float else 0.0 for x in factors) for factors in columns)
-
-
-def _all_of(function: Callable[[list[bool]], bool]) -> Callable[..., bool]:
-    def result(*terms: _Term) -> bool:
-        found = _items([term() for term in terms], (bool, float), _truth)
-        if not found:
-            raise _ErrorValue(CellError("#VALUE!"))
-        return function([bool(x) for x in found])
-
-    return result
-
-
-def _or_error(term: _Term) -> Any:
-    """A term's value, or the error that it gives: for functions that count errors, or pass over them."""
-    try:
-        return term()
-    except _ErrorValue as error:
-        return error.args[0]
-    except ZeroDivisionError:
-        return CellError("#DIV/0!")
-    except (ArithmeticError, ValueError):
-        return CellError("#NUM!")
-
-
-def _is_counted(value: Any) -> bool:
-    """Whether COUNT counts an argument that is no reference: numbers, booleans, texts of numbers, and a missing one."""
-    if type(value) is str:
-        try:
-            float(value)
-        except ValueError:
-            return False
-    return not isinstance(value, CellError)
-
-
-def _counted(in_area: Callable[[Any], bool], alone: Callable[[Any], bool]) -> Callable[..., float]:
-    def result(*terms: _Term) -> float:
-        values = [_or_error(term) for term in terms]
-        areas, others = ([v for v in values if isinstance(v, _Cells) is wanted] for wanted in (True, False))
-        return float(sum(in_area(cell) for area in areas for cell in area) + sum(map(alone, others)))
-
-    return result
-
-
-# Name -> (fewest, most) arguments, and the function of these as terms.
-_OF_TERMS: dict[str, tuple[int, int, Callable[..., Any]]] = {
-    "AND": (1, 255, _all_of(all)),
-    "CONCATENATE": (1, 255, lambda *terms: "".join(_text(term()) for term in terms)),
-    "COUNT": (1, 255, _counted(lambda cell: type(cell) is float, _is_counted)),
-    "COUNTA": (1, 255, _counted(lambda cell: cell is not None, lambda value: True)),
-    "FALSE": (0, 0, lambda: False),
-    "IF": (2, 3, _if),
-    "IFERROR": (2, 2, _if_error),
-    "INDEX": (2, 3, _index),
-    "MATCH": (2, 3, _match),
-    "NOT": (1, 1, lambda term: not _truth(term())),
-    "OR": (1, 255, _all_of(any)),
-    "SUMPRODUCT": (1, 255, _sum_product),
-    "TRUE": (0, 0, lambda: True),
-    "VLOOKUP": (3, 4, _vlookup),
+_OF_NUMBERS: dict[str, Callable[..., float]] = {
+    name: getattr(math, name.lower())
+    for name in ("ACOS", "ASIN", "ATAN", "COS", "DEGREES", "EXP", "LOG10", "RADIANS", "SIN", "SQRT", "TAN")
+} | {
+    "ABS": abs,
+    "ATAN2": _atan2,  # x comes first
+    "INT": math.floor,
+    "LN": lambda x: math.log(x),
+    "LOG": lambda x, base=10.0: math.log10(x) if base == 10 else math.log(x) / math.log(base),
+    "MOD": lambda x, divisor: x - divisor * math.floor(x / divisor),
+    "PI": lambda: math.pi,
+    "POWER": _power,
+    "ROUND": _rounded(decimal.ROUND_HALF_UP),
+    "ROUNDDOWN": _rounded(decimal.ROUND_DOWN),
+    "ROUNDUP": _rounded(decimal.ROUND_UP),
+    "SIGN": lambda x: (x > 0) - (x < 0),
 }
-# Loosest first; all group from the left, and a minus sign in front binds tightest: -2^2 is 4.
-_OPERATORS: list[dict[str, Callable[[Any, Any], Any]]] = [
-    {
-        "=": _compared(operator.eq),
-        "<>": _compared(operator.ne),
-        "<": _compared(operator.lt),
-        "<=": _compared(operator.le),
-        ">": _compared(operator.gt),
-        ">=": _compared(operator.ge),
-    },
-    {"&": lambda a, b: _text(a) + _text(b)},
-    {"+": _of_numbers(_sum), "-": _of_numbers(lambda a, b: _sum(a, -b))},
-    {"*": _of_numbers(operator.mul), "/": _of_numbers(operator.truediv)},
-    {"^": _of_numbers(_power)},
-]
-
-
-def _parsed(formula: str, surroundings: Surroundings) -> _Term:
-    return _Parser(tokens_of(formula), surroundings).whole()
+_OF_RANGES: dict[str, Callable[[list[float]], float]] = {
+    "AVERAGE": lambda xs: math.fsum(xs) / len(xs),
+    "MAX": lambda xs: max(xs, default=0.0),
+    "MIN": lambda xs: min(xs, default=0.0),
+    "PRODUCT": lambda xs: math.prod(xs) if xs else 0.0,
+    "SUM": math.fsum,
+    "SUMSQ": lambda xs: math.fsum(x * x for x in xs),
+}
+_OF_TERMS: dict[str, Callable[..., Any]] = {
+    "AND": lambda first, *more: all(_truths((first, *more))),
+    "COUNT": lambda cells: float(sum(type(cell) is float for cell in _area(cells))),
+    "COUNTA": lambda cells: float(sum(cell is not None for cell in _area(cells))),
+    "FALSE": lambda: False,
+    "IF": _if,
+    "IFERROR": _if_error,
+    "INDEX": _index,
+    "MATCH": _match,
+    "NOT": lambda term: not _truth(term()),
+    "OR": lambda first, *more: any(_truths((first, *more))),
+    "TRUE": lambda: True,
+    "VLOOKUP": _vlookup,
+}
 
 
 class _Parser:
+    """A recursive descent through the tokens; its methods return the terms that they pass."""
+
     def __init__(self, tokens: tuple[Any, ...], surroundings: Surroundings) -> None:
-        self.tokens = tokens
-        self.surroundings = surroundings
-        self.at = 0
+        self.tokens, self.surroundings, self.at = tokens, surroundings, 0
 
     def whole(self) -> _Term:
         term = self.operation(0)
@@ -444,6 +382,11 @@ class _Parser:
         self.at += 1
         return self.tokens[self.at - 1]
 
+    def close(self, kind: str) -> None:
+        if not self.is_next(kind, "CLOSE"):
+            raise NotComputable("a parenthesis is not closed")
+        self.take()
+
     def operation(self, level: int) -> _Term:
         if level == len(_OPERATORS):
             return self.signed()
@@ -460,34 +403,29 @@ class _Parser:
         term = self.operand()
         while self.is_next("OPERATOR-POSTFIX"):
             self.take()
-            term = _applied(_of_numbers(operator.truediv), term, lambda: 100.0)
+            term = _applied(_of_two_numbers(operator.truediv), term, lambda: 100.0)
         return term
 
     def operand(self) -> _Term:
         token = self.take()
-        if token.type == "OPERAND":
-            return self.value(token)
-        if token.type == "PAREN" and token.subtype == "OPEN":
+        text, kind = token.value, (token.type, token.subtype)
+        if kind == ("PAREN", "OPEN"):
             term = self.operation(0)
             self.close("PAREN")
             return term
-        if token.type == "FUNC" and token.subtype == "OPEN":
-            return self.call(token.value[:-1].upper().removeprefix("_XLFN."))
-        raise NotComputable(f"it uses {token.value!r}")
-
-    def value(self, token: Any) -> _Term:
-        text = token.value
-        if token.subtype == "RANGE":
+        if kind == ("FUNC", "OPEN"):
+            return self.call(text[:-1].upper().removeprefix("_XLFN."))
+        if kind == ("OPERAND", "RANGE"):
             return lambda: self.cells(text)
-        if token.subtype == "NUMBER":
-            return lambda: float(text)
-        if token.subtype == "TEXT":
-            return lambda: text[1:-1].replace('""', '"')
-        if token.subtype == "LOGICAL":
-            return lambda: text.upper() == "TRUE"
-        if token.subtype == "ERROR":
-            return lambda: CellError(text)
-        raise NotComputable(f"it uses {text!r}")
+        constants: dict[tuple[str, str], Callable[[], Any]] = {
+            ("OPERAND", "NUMBER"): lambda: float(text),
+            ("OPERAND", "TEXT"): lambda: text[1:-1].replace('""', '"'),
+            ("OPERAND", "LOGICAL"): lambda: text.upper() == "TRUE",
+            ("OPERAND", "ERROR"): lambda: CellError(text),
+        }
+        if kind not in constants:
+            raise NotComputable(f"it uses {text!r}")
+        return constants[kind]
 
     def call(self, name: str) -> _Term:
         terms: list[_Term] = []
@@ -498,29 +436,23 @@ class _Parser:
                 break
             self.take()
         self.close("FUNC")
-        if name in ("ROW", "COLUMN"):
-            return lambda: self.place(name, terms)
+        return lambda: self.called(name, tuple(terms))
+
+    def called(self, name: str, terms: tuple[_Term, ...]) -> Any:
+        if name in ("ROW", "COLUMN") and len(terms) < 2:
+            at = _area(terms[0]).first if terms else self.surroundings.at
+            if at is not None:
+                return float(at[name == "COLUMN"])
         if name in _OF_RANGES:
-            return lambda: float(_OF_RANGES[name](_numbers([term() for term in terms])))
-        if name not in _OF_NUMBERS and name not in _OF_TERMS:
-            return lambda: _not_known(name)
-        fewest, most, function = _OF_NUMBERS[name] if name in _OF_NUMBERS else _OF_TERMS[name]
-        if not fewest <= len(terms) <= most:
-            raise NotComputable(f"{name} has {len(terms)} arguments instead of {fewest}")
-        if name in _OF_NUMBERS:
-            return lambda: float(function(*(_number(term()) for term in terms)))
-        return lambda: function(*terms)
-
-    def close(self, kind: str) -> None:
-        if not self.is_next(kind, "CLOSE"):
-            raise NotComputable("a parenthesis is not closed")
-        self.take()
-
-    def place(self, name: str, terms: list[_Term]) -> float:
-        first = _area(terms[0]).first if terms else self.surroundings.at
-        if first is None or len(terms) > 1:
-            raise NotComputable(f"it uses the function {name}")
-        return float(first[name == "COLUMN"])
+            return float(_OF_RANGES[name](_numbers(terms)))
+        try:
+            if name in _OF_NUMBERS:
+                return float(_OF_NUMBERS[name](*(_number(term()) for term in terms)))
+            if name in _OF_TERMS:
+                return _OF_TERMS[name](*terms)
+        except TypeError as error:
+            raise NotComputable(f"it uses {name} with {len(terms)} arguments") from error
+        raise NotComputable(f"it uses the function {name}")
 
     def cells(self, text: str) -> Any:
         area = reference(text)
@@ -528,26 +460,19 @@ class _Parser:
             formula = self.surroundings.name(text) if self.surroundings.name else None
             if formula is None:
                 raise NotComputable(f"it uses {text}")
-            return _parsed(formula, self.surroundings)()
-        if area.sheet is not None and ":" in area.sheet:
+            return _Parser(tokens_of(formula), self.surroundings).whole()()
+        sheet, top, left, bottom, right = area
+        if sheet is not None and ":" in sheet:
             raise NotComputable(f"it uses {text}, through several sheets")
-        bottom, right = area.bottom, area.right
-        if self.surroundings.extent and (bottom, right) != (area.top, area.left):
-            last_row, last_column = self.surroundings.extent(area.sheet)
-            whole = (area.bottom - area.top + 1) * (area.right - area.left + 1) > _MAX_RANGE
-            if whole:  # nothing but blanks lies beyond
-                bottom, right = max(area.top, min(bottom, last_row)), max(area.left, min(right, last_column))
-        if (bottom - area.top + 1) * (right - area.left + 1) > _MAX_RANGE:
+        if self.surroundings.extent and (bottom - top + 1) * (right - left + 1) > _MAX_RANGE:
+            last_row, last_column = self.surroundings.extent(sheet)  # beyond which all cells are blank
+            bottom, right = max(top, min(bottom, last_row)), max(left, min(right, last_column))
+        if (bottom - top + 1) * (right - left + 1) > _MAX_RANGE:
             raise NotComputable(f"it uses the large range {text}")
-        lookup = self.surroundings.lookup
-        rows, columns = range(area.top, bottom + 1), range(area.left, right + 1)
-        values = [lookup(area.sheet, row, column) for row in rows for column in columns]
-        return _Cells(values, len(columns), (area.top, area.left))
+        rows, columns = range(top, bottom + 1), range(left, right + 1)
+        values = [self.surroundings.lookup(sheet, row, column) for row in rows for column in columns]
+        return _Cells(values, len(columns), (top, left))
 
 
 def _applied(function: Callable[[Any, Any], Any], left: _Term, right: _Term) -> _Term:
     return lambda: function(left(), right())
-
-
-def _not_known(name: str) -> Any:
-    raise NotComputable(f"it uses the function {name}")

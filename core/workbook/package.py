@@ -1,4 +1,4 @@
-"""The zip archive that a workbook is: its members as bytes, a few of them replaced, all others as they were."""
+"""The zip archive that a workbook is. A copy with new bytes for a few members keeps all others as they were."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import posixpath
 import re
 import warnings
 import zipfile
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 
 from ..errors import InputError
 from .xml_parts import elements, spliced, utf8
@@ -24,49 +24,38 @@ class Package:
     content
         The file's bytes.
     name
-        How messages call the file.
+        The file's name in messages.
     """
 
     def __init__(self, content: bytes, name: str) -> None:
         self.name = name
         self.content = content
         self._archive = zipfile.ZipFile(io.BytesIO(content))
-        self._members = {info.filename: info for info in self._archive.infolist()}
-        self._by_folded_name = {name.casefold(): name for name in self._members}
-        self._replaced: dict[str, bytes] = {}
-        self._removed: set[str] = set()
+        self._members = {info.filename.casefold(): info for info in self._archive.infolist()}
 
     @property
     def names(self) -> list[str]:
         """The members' names in the archive's order."""
-        return list(self._members)
+        return [info.filename for info in self._members.values()]
 
     def read(self, name: str) -> bytes:
-        """A member's bytes; `InputError` where it is missing or damaged."""
-        name = self._by_folded_name.get(name.casefold(), name)
-        if name in self._replaced:
-            return self._replaced[name]
+        """A member's bytes; `InputError` if it is missing or damaged."""
         try:
-            return self._archive.read(self._members[name])
+            return self._archive.read(self._members[name.casefold()])
         except KeyError as error:
             raise InputError(f"{self.name}: not a whole .xlsx workbook (it has no {name})") from error
         except (zipfile.BadZipFile, RuntimeError, NotImplementedError, EOFError, OSError) as error:
             raise InputError(f"{self.name}: its part {name} cannot be read ({error})") from error
-        except Exception as error:  # zlib.error and its like, which have no common name
+        except Exception as error:  # zlib.error and its like have no common name
             raise InputError(f"{self.name}: its part {name} is damaged ({error})") from error
-
-    def replace(self, name: str, data: bytes) -> None:
-        """Give a member other bytes."""
-        self._replaced[self._by_folded_name[name.casefold()]] = data
 
     def relations(self, part: str) -> list[tuple[str, str, str]]:
         """(id, last word of the type, member) of what `part` ("" for the package) refers to inside the package."""
-        folder, base = posixpath.split(part)
-        name = posixpath.join(folder, "_rels", f"{base}.rels")
-        if name.casefold() not in self._by_folded_name:
+        name = _relations_part(part)
+        if name.casefold() not in self._members:
             return []
         return [
-            (e.attributes.get("Id", ""), _kind(e.attributes), _member(folder, e.attributes.get("Target", "")))
+            (e.attributes.get("Id", ""), e.attributes.get("Type", "").rpartition("/")[2], _target(part, e.attributes))
             for e in elements(utf8(self.read(name), name)[0], name)
             if e.name == "Relationship" and e.attributes.get("TargetMode") != "External"
         ]
@@ -82,42 +71,46 @@ class Package:
                 found = e.attributes.get("ContentType", "")
         return found
 
-    def remove(self, part: str, owner: str) -> None:
-        """Take out `part`, the relationship that `owner` has to it, and its content type."""
-        folder, base = posixpath.split(owner)
-        rels = posixpath.join(folder, "_rels", f"{base}.rels")
-        same = part.casefold()
-        self._cut(rels, "Relationship", lambda of: _member(folder, of.get("Target", "")).casefold() == same)
-        self._cut(_CONTENT_TYPES, "Override", lambda of: of.get("PartName", "").lstrip("/").casefold() == same)
-        self._removed.add(self._by_folded_name[part.casefold()])
+    def with_parts(self, parts: dict[str, bytes], removed: Iterable[str] = (), owner: str = "") -> bytes:
+        """The archive with other bytes for `parts` and without the `removed` members that `owner` refers to.
 
-    def _cut(self, name: str, element: str, is_meant: Callable[[dict[str, str]], bool]) -> None:
-        data, back = utf8(self.read(name), name)
-        cuts = [(e.start, e.end, b"") for e in elements(data, name) if e.name == element and is_meant(e.attributes)]
-        self.replace(name, back(spliced(data, cuts)))
-
-    def to_bytes(self) -> bytes:
-        """The archive: the members that were not replaced have the bytes, order, dates and attributes they had."""
-        if not self._replaced:
-            return self.content
+        All other members keep their bytes, order, dates and attributes.
+        """
+        new_data = {part.casefold(): data for part, data in parts.items()}
+        gone = {part.casefold() for part in removed}
+        if gone:
+            relations = _relations_part(owner)
+            new_data[relations.casefold()] = self._without(
+                relations, "Relationship", lambda attributes: _target(owner, attributes).casefold() in gone
+            )
+            new_data[_CONTENT_TYPES.casefold()] = self._without(
+                _CONTENT_TYPES, "Override", lambda a: a.get("PartName", "").lstrip("/").casefold() in gone
+            )
         out = io.BytesIO()
         with zipfile.ZipFile(out, "w") as new, warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # zipfile's, of names that are there twice
+            warnings.simplefilter("ignore")  # zipfile's, about names that occur twice
             new.comment = self._archive.comment
             for info in self._archive.infolist():
-                if info.filename in self._removed:
+                if (key := info.filename.casefold()) in gone:
                     continue
-                data = self._replaced.get(info.filename)
                 member = copy.copy(info)
-                new.writestr(member, self._archive.read(info) if data is None else data)
-                member.external_attr = info.external_attr  # zipfile makes 0 a file mode
+                new.writestr(member, new_data[key] if key in new_data else self._archive.read(info))
+                member.external_attr = info.external_attr  # zipfile makes a file mode of 0
         return out.getvalue()
 
+    def _without(self, name: str, element: str, is_meant: Callable[[dict[str, str]], bool]) -> bytes:
+        data, to_encoding = utf8(self.read(name), name)
+        cuts = [(e.start, e.end, b"") for e in elements(data, name) if e.name == element and is_meant(e.attributes)]
+        return to_encoding(spliced(data, cuts))
 
-def _kind(attributes: dict[str, str]) -> str:
-    return attributes.get("Type", "").rpartition("/")[2]
+
+def _relations_part(part: str) -> str:
+    folder, base = posixpath.split(part)
+    return posixpath.join(folder, "_rels", f"{base}.rels")
 
 
-def _member(folder: str, target: str) -> str:
-    path = target[1:] if target.startswith("/") else posixpath.join(folder, target)
+def _target(part: str, attributes: dict[str, str]) -> str:
+    """The member that a relationship of `part` points to."""
+    target = attributes.get("Target", "")
+    path = target[1:] if target.startswith("/") else posixpath.join(posixpath.dirname(part), target)
     return re.sub(r"^(\.\./)+", "", posixpath.normpath(path))

@@ -1,36 +1,66 @@
-"""The sheet's numbers against the formulas, and against what scanners are like."""
+"""Whether the numbers of a workbook are possible, are like those of scanners, and agree with the formulas."""
 
 from __future__ import annotations
 
 import math
-import warnings
+from collections.abc import Iterator
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ..errors import InputWarning
+from ..errors import InputError
 from ..geometry.design_formulas import collimator_length
 from ..geometry.system import PinholeSystem
 from .layout import Column
-from .quantities import LENGTH_UNITS, QUANTITIES
+from .quantities import DIMENSIONS, POSITION, QUANTITIES, tolerance
 
-EXACT = 1e-6
-"""Relative, and absolute in mm or radians: stored results of formulas agree far better."""
-_COARSEST = {**{unit: 0.005 / factor for unit, factor in LENGTH_UNITS.items()}, "rad": 0.0005, "deg": 0.005}
-"""A number may be rounded in its last decimal, by no more than this in its unit."""
 AGREEING = 1e-9
 """Relative: a formula's result nearer to a number than this gives that number."""
-SHOWN = 5
+_SAME_PLACE = 1e-6
+"""mm; two pinholes closer than this are one."""
+_SHOWN = 5
 """Warnings of one column; the last one counts the rest."""
 
+Numbers = dict[str, NDArray[np.float64]]
+"""Quantity -> its numbers (M,)."""
 
-def tolerance(value: float, expected: float, unit: str) -> float:
-    """By how much `value` may differ from `expected`: `EXACT`, or half a unit of its last decimal; all in `unit`."""
-    text = f"{value:.12g}"
-    decimals = len(text.partition(".")[2]) if "e" not in text else 12
-    # Trailing zeros are lost: 89.1 may be 89.10, so few decimals stand for the coarsest rounding.
-    rounding = min(0.5 * 10.0**-decimals, _COARSEST[unit])
-    return max(EXACT * max(1.0 / LENGTH_UNITS.get(unit, 1.0), abs(expected)), rounding * (1 + 1e-9))
+
+def refuse_impossible(columns: dict[str, Column], values: Numbers) -> None:
+    """Raise `InputError` if no scanner can have the typed `values`, mm, naming the cell."""
+    for name in DIMENSIONS:
+        refuse_not_positive(columns[name], values[name])
+    d, side, roi = values["d"], values["Ld"], values["R"]
+    columns["d"].refuse(
+        d >= side, lambda i: f"has d = {d[i]:g} mm, expected less than Ld = {side[i]:g} mm in {columns['Ld'].place(i)}"
+    )
+    x1 = columns["x1"]
+    with np.errstate(over="ignore"):
+        b = np.sqrt(sum(values[name] ** 2 for name in POSITION))
+
+    def refuse_places(bad: NDArray[np.bool_], text: str) -> None:
+        def why(i: int) -> str:
+            places = {"b": f"{b[i]:g} mm", "roi": f"{roi[i]:g} mm in {columns['R'].place(i)}"}
+            return f"and y1, z1 put the pinhole of module {x1.modules.module_numbers[i]} {text.format(**places)}"
+
+        x1.refuse(bad, why)
+
+    refuse_places(b == 0, "at the isocentre, expected outside the ROI")
+    refuse_places(np.isinf(b), "too far away to compute, expected millimetres")
+    refuse_places(b <= roi, "{b} from the isocentre, expected outside the ROI of {roi}")
+    first: dict[tuple[int, ...], int] = {}
+    for i, position in enumerate(zip(*(values[name] for name in POSITION), strict=True)):
+        j = first.setdefault(tuple(round(x / _SAME_PLACE) for x in position), i)
+        if j != i:
+            numbers = x1.modules.module_numbers
+            raise InputError(
+                f"{x1.where(i)} and y1, z1 put the pinhole of module {numbers[i]} at the place of module {numbers[j]} "
+                f"({x1.place(j)}), expected another place"
+            )
+
+
+def refuse_not_positive(column: Column, values: NDArray[np.float64]) -> None:
+    """Raise `InputError` if a length (M,), mm, is not positive."""
+    column.refuse(values <= 0, lambda i: f"has {column.quantity} = {values[i]:g} mm, expected more than 0")
 
 
 def is_by_design(system: PinholeSystem) -> NDArray[np.bool_]:
@@ -41,48 +71,28 @@ def is_by_design(system: PinholeSystem) -> NDArray[np.bool_]:
     return np.abs(length - system.collimator_length) <= AGREEING * system.collimator_length
 
 
-def derived(
-    centers: NDArray[np.float64],
-    collimator_length: NDArray[np.float64],
-    detector_thickness: NDArray[np.float64],
-) -> dict[str, NDArray[np.float64]]:
-    """What the sheet's derived columns should hold, mm and radians, of pinholes (M, 3) with l and Td (M,)."""
-    x, y, z = centers.T
-    b = np.linalg.norm(centers, axis=1)
-    end = b + collimator_length + detector_thickness
-    x2, y2, z2 = (centers * (end / b)[:, None]).T
-    planar = np.hypot(x, y)
-    azimuth, elevation = np.arctan2(y, x), np.arctan2(z, planar)
-    return {
-        "b": b,
-        "H": end,
-        "x2": x2,
-        "y2": y2,
-        "z2": z2,
-        "range": planar,
-        "azimuth": azimuth,
-        "elevation": elevation,
-    }
+def implausible(system: PinholeSystem, columns: dict[str, Column]) -> Iterator[str]:
+    """For each quantity, the first module whose number is unlike that of any scanner."""
+    for name, quantity in QUANTITIES.items():
+        low, high = quantity.plausible
+        values = quantity.of(system)
+        column = columns[name if name in columns and quantity.role != "derived" else "x1"]
+        odd = np.flatnonzero((values < low) | (values > high))
+        if len(odd):
+            several = len(set(column.rows)) > 1 and len(odd) > 1
+            more = f" (so it is for {len(odd) - 1} more modules)" if several else ""
+            yield (
+                f"{column.where(int(odd[0]))} makes {name} = {values[odd[0]]:.6g} mm{more}, which is unlikely, expected "
+                f"{low:g} to {high:g} mm: are the units right?"
+            )
 
 
-def warn_of_differences(
-    column: Column,
-    given: NDArray[np.float64],
-    expected: NDArray[np.float64],
-    slack: NDArray[np.float64] | float = 0.0,
-) -> None:
-    """Warn of each module whose number in the sheet differs from the formula's.
+def differences(
+    column: Column, given: NDArray[np.float64], expected: NDArray[np.float64], slack: NDArray[np.float64] | float = 0.0
+) -> Iterator[str]:
+    """The first modules whose number `given` (M,) in the sheet, in its unit, is not as `expected` (M,), mm or rad.
 
-    Parameters
-    ----------
-    column
-        Where the numbers stand.
-    given
-        (M,) in the column's unit, NaN where there is none.
-    expected
-        (M,) mm or rad.
-    slack
-        mm; added to the tolerance: what rounding of the numbers behind `expected` may make of it.
+    The tolerance is larger by `slack`, mm, for rounding of the numbers behind `expected`.
     """
     name, unit = column.quantity, column.unit
     expected, slack = expected / column.factor, np.broadcast_to(slack, given.shape) / column.factor
@@ -91,31 +101,14 @@ def warn_of_differences(
         turn = 2 * math.pi / column.factor
         difference = np.abs((given - expected + turn / 2) % turn - turn / 2)
     differing = [
-        i
+        int(i)
         for i in np.flatnonzero(np.isfinite(given))
         if difference[i] > tolerance(given[i], expected[i], unit) + slack[i]
     ]
-    for n, i in enumerate(differing[:SHOWN], start=1):
-        more = f"; so do {len(differing) - SHOWN} more cells of this column" if n == SHOWN < len(differing) else ""
-        used = "the sheet's is used" if name == "l" else "the formula's is used"
-        warnings.warn(
-            f"{column.where(int(i))} has {name} = {given[i]:.9g} {unit}, "
-            f"the formula gives {expected[i]:.9g} {unit} ({used}{more})",
-            InputWarning,
-            stacklevel=4,
-        )
-
-
-def warn_of_implausible(name: str, values: NDArray[np.float64], column: Column) -> None:
-    """Warn of the first module of which a length (M,), mm, that comes from `column` is unlike any scanner's."""
-    low, high = QUANTITIES[name].plausible or (0.0, math.inf)
-    odd = np.flatnonzero((values < low) | (values > high))
-    if len(odd):
-        several = len(set(column.rows)) > 1 and len(odd) > 1
-        more = f" (so it is for {len(odd) - 1} more modules)" if several else ""
-        warnings.warn(
-            f"{column.where(int(odd[0]))} makes {name} = {values[odd[0]]:.6g} mm{more}, which is unlikely, expected "
-            f"{low:g} to {high:g} mm: are the units right?",
-            InputWarning,
-            stacklevel=4,
+    used = "the sheet's is used" if name == "l" else "the formula's is used"
+    for n, i in enumerate(differing[:_SHOWN], start=1):
+        more = f"; so do {len(differing) - _SHOWN} more cells of this column" if n == _SHOWN < len(differing) else ""
+        yield (
+            f"{column.where(i)} has {name} = {given[i]:.9g} {unit}, the formula gives {expected[i]:.9g} {unit} "
+            f"({used}{more})"
         )

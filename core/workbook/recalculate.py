@@ -1,41 +1,26 @@
-"""New stored values for the formulas that depend on changed cells."""
+"""New stored values for the formulas that depend on changed cells, and for those that store none."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field, replace
+import re
+from collections import defaultdict
+from collections.abc import Collection, Iterable, Mapping
+from dataclasses import replace
 from typing import Any
 
-from . import libreoffice
-from .dependencies import Dependencies
-from .formulas import CellError, NotComputable
+from .calculation import Calculation
+from .cells import Uncomputed
+from .formulas import CellError, NotComputable, operands, tokens_of
 from .plausibility import AGREEING
+from .references import Reference, reference
 from .sheet_xml import Cell
 from .workbook_xml import Place, WorkbookXml
 
-_TRIES = 4
-_ALIKE = 1e-6
-"""Relative: another program's result of the same formula differs less."""
-
-
-@dataclass
-class Recalculated:
-    """What became of the formulas.
-
-    Attributes
-    ----------
-    by : dict
-        Cell -> "formulas" (our own evaluator) or "LibreOffice", which gave its new value.
-    cleared : dict
-        Cell whose value nobody could calculate, and which therefore stores none -> why.
-    replaced : dict
-        Cell whose formula does not give the number that it must -> why; it holds that number now.
-    """
-
-    by: dict[Place, str] = field(default_factory=dict)
-    cleared: dict[Place, str] = field(default_factory=dict)
-    replaced: dict[Place, str] = field(default_factory=dict)
+_NAMES_DEEP = 20
+_FEW = 64
+"""Cells of an area that are indexed one by one; a larger area is compared with each stale cell."""
+_OTHER_FILE = re.compile(r"'?[^!]*\[[^\]]+\][^!]*'?!")
 
 
 def agree(value: Any, wanted: float) -> bool:
@@ -43,174 +28,145 @@ def agree(value: Any, wanted: float) -> bool:
     return type(value) is float and abs(value - wanted) <= AGREEING * abs(wanted)
 
 
-def recalculate(
-    workbook: WorkbookXml,
-    changed: Iterable[Place],
-    required: Mapping[Place, float],
-    derived: Mapping[Place, float] | None = None,
-) -> Recalculated:
-    """Give every formula of `workbook` that depends on the `changed` cells its new value.
+class Recalculation:
+    """New values for every formula of a workbook that depends on changed cells, stored in its cells.
 
-    So are formulas without a value in sheets in which anything changes, as far as our own evaluator knows them.
-    `required` are the numbers that cells must have in the end: a formula among them which gives another one, or
-    of which that cannot be known, is replaced by the number. `derived` are the numbers that formulas should give:
-    one that is known to give another one is replaced.
+    Formulas that stored no value get theirs too, in the sheets that change anyway.
+
+    Parameters
+    ----------
+    workbook
+        It is changed.
+    changed
+        The cells that the formulas may depend on.
+    required
+        The numbers that cells must hold: a formula that gives another one, or cannot be calculated, is replaced.
+    expected
+        The numbers that other formulas should give: one that gives another one is replaced.
+
+    Attributes
+    ----------
+    values : dict
+        Formula -> the value that it stores now.
+    cleared : dict
+        Formula that stores no value now -> why it cannot be calculated; causes before effects.
+    replaced : dict
+        Cell whose formula was replaced by the number that it must hold -> why.
     """
-    calculation = _Calculation(workbook, changed, required, derived or {})
-    calculation.by_formulas()
-    if calculation.unknown:
-        calculation.by_libreoffice()
-    calculation.clear()
-    calculation.fill()
-    return calculation.result
 
-
-class _Calculation:
     def __init__(
         self,
         workbook: WorkbookXml,
-        changed: Iterable[Place],
+        changed: Collection[Place],
         required: Mapping[Place, float],
-        derived: Mapping[Place, float],
+        expected: Mapping[Place, float],
     ) -> None:
-        self.workbook, self.required, self.derived = workbook, required, derived
-        self.result = Recalculated()
-        dependencies = Dependencies(workbook)
-        self.affected = dependencies.affected(changed)
-        # What affected formulas refer to may have come without values.
-        cells = {place: workbook.cell(place) for place in dependencies.formulas - self.affected}
-        valueless = {place for place, cell in cells.items() if cell.value is None}
-        ordered, rest = dependencies.in_order(self.affected | valueless)
-        circular = required.keys() & dependencies.circular(rest)
-        for place in sorted(circular):
-            self._replace(place, "it refers back to itself")
-        more, rest = dependencies.in_order(set(rest) - circular)
-        self.waiting = ordered + more + rest
-        self.not_yet = set(self.waiting)
-        self.unknown: dict[Place, str] = {}
-        self.elsewhere: dict[Place, Any] = {}
+        self.values: dict[Place, Any] = {}
+        self.cleared: dict[Place, str] = {}
+        self.replaced: dict[Place, str] = {}
+        self._workbook, self._required, self._expected = workbook, required, expected
+        formulas = workbook.formulas if changed else {}
+        without_value = {place for place, cell in formulas.items() if cell.value is None}
+        self._stale = _dependents(workbook, formulas, changed)
+        waiting = self._stale | without_value
+        calculation = Calculation(workbook, workbook.cell, lambda place, _: place in waiting, self._settled)
+        values = {place: calculation.value(place) for place in sorted(waiting)}
+        edited = {title for title, _, _ in workbook.changed}
+        for place in sorted(without_value - self._stale):
+            if place[0] in edited and not isinstance(values[place], Uncomputed):
+                self._store(place, values[place])
 
-    def by_formulas(self) -> None:
-        for place in self.waiting:
-            cell = self.workbook.cell(place)
-            try:
-                value = self._calculated(place, cell)
-            except NotComputable as why:
-                self.unknown[place] = str(why)
-                self.not_yet.discard(place)
+    def _settled(self, place: Place, value: Any) -> Any:
+        """What a stale formula's cell holds from now on: its value, nothing, or a number instead of the formula."""
+        if place not in self._stale:
+            return value
+        unknown, wrong = isinstance(value, Uncomputed), False
+        number = self._required.get(place, self._expected.get(place, math.nan))
+        if place in self._required:
+            wrong = unknown or not agree(value, number)
+        elif place in self._expected and not unknown:  # perhaps a 0 that rounding errors miss
+            wrong = type(value) is not float or abs(value - number) > AGREEING * max(abs(number), 1)
+        if wrong:
+            self._workbook.sheets[place[0]].type(place[1:], number)
+            self.replaced[place] = str(value) if unknown else f"it gives {_shown(value)}"
+            return number
+        if unknown:
+            self._workbook.put(place, replace(self._workbook.cell(place), value=None))
+            self.cleared[place] = str(value)
+            return value
+        return self._store(place, self._required.get(place, value))
+
+    def _store(self, place: Place, value: Any) -> Any:
+        """Store a formula's value."""
+        cell = self._workbook.cell(place)
+        if type(cell.value) is not type(value) or cell.value != value:
+            self._workbook.put(place, replace(cell, value=value))
+        self.values[place] = value
+        return value
+
+
+def _dependents(workbook: WorkbookXml, formulas: Mapping[Place, Cell], changed: Iterable[Place]) -> set[Place]:
+    """The formulas that depend on the `changed` cells, however far, or may do so; those that changed are among them."""
+    readers: dict[Place, list[Place]] = defaultdict(list)
+    readers_of_area: dict[str, dict[Reference, list[Place]]] = defaultdict(lambda: defaultdict(list))
+    pending = list(changed)
+    found = {place for place in pending if place in formulas}
+    for place, cell in formulas.items():
+        first = cell if cell.array is None else workbook.cell((place[0], cell.array.top, cell.array.left))
+        areas = None if first.formula is None else _areas_read(workbook, place, first.formula)
+        if areas is None and place not in found:
+            found.add(place)
+            pending.append(place)
+        for area in areas or ():
+            sheet, top, left, bottom, right = area
+            assert sheet is not None, "the areas that a formula reads are on known sheets"
+            if (bottom - top + 1) * (right - left + 1) > _FEW:
+                readers_of_area[sheet][area].append(place)
                 continue
-            self.not_yet.discard(place)
-            if self._is_wrong(place, value):
-                self._replace(place, f"it gives {_shown(value)}")
-            elif place in self.affected:
-                self._store(place, self.required.get(place, value), "formulas")
+            for row in range(top, bottom + 1):
+                for column in range(left, right + 1):
+                    readers[sheet, row, column].append(place)
+    while pending:
+        sheet, row, column = place = pending.pop()
+        large = readers_of_area[sheet]
+        hit = [area for area in large if area.top <= row <= area.bottom and area.left <= column <= area.right]
+        for reader in [*readers.pop(place, ()), *(reader for area in hit for reader in large.pop(area))]:
+            if reader not in found:
+                found.add(reader)
+                pending.append(reader)
+    return found
+
+
+def _areas_read(workbook: WorkbookXml, place: Place, formula: str, depth: int = 0) -> list[Reference] | None:
+    """The areas that a formula at `place` reads, None if it does not say which."""
+    try:
+        functions = [token.value[:-1].upper() for token in tokens_of(formula) if token.type == "FUNC"]
+    except NotComputable:
+        return None
+    if depth == _NAMES_DEEP or any(name in ("INDIRECT", "OFFSET") or ":" in name for name in functions):
+        return None
+    found: list[Reference] = []
+    for text in operands(formula):
+        area = reference(text)
+        if area is None:
+            if _OTHER_FILE.match(text):
+                continue  # another file's cells do not change with this one's
+            table = workbook.tables.get(text.partition("[")[0].casefold())
+            meaning = workbook.meaning(place[0], text)
+            if table is not None:
+                found.append(table)  # whichever of its cells are meant
+            elif meaning is None or (areas := _areas_read(workbook, place, meaning, depth + 1)) is None:
+                return None
             else:
-                self.elsewhere[place] = value
-        self.unknown = {place: why for place, why in self.unknown.items() if place in self.affected}
-
-    def _calculated(self, place: Place, cell: Cell) -> Any:
-        if cell.array is not None:
-            raise NotComputable("it is an array formula or a data table")
-        assert cell.formula is not None, "only formulas are calculated"
-        return self.workbook.calculated(place, cell.formula, self._value)
-
-    def _value(self, place: Place) -> Any:
-        if place in self.unknown:
-            if place in self.required:  # whether by its formula or as a number, this it will be
-                return self.required[place]
-            raise NotComputable(f"it needs {self.workbook.text(place)}, and there: {self.unknown[place]}")
-        if place in self.not_yet:
-            raise NotComputable(f"it refers to {self.workbook.text(place)}, which refers back to it")
-        if place in self.elsewhere:
-            return self.elsewhere[place]
-        return self.workbook.value(place)
-
-    def by_libreoffice(self) -> None:
-        for _ in range(_TRIES):  # once more where formulas had to be replaced, for those that depend on them
-            values = self._libreoffice_values()
-            wrong = {
-                place: f"it gives {_shown(value)}" for place, value in values.items() if self._is_wrong(place, value)
-            }
-            for place, why in wrong.items():
-                self._replace(place, why)
-                del self.unknown[place]
-            if not wrong:
-                for place, value in values.items():
-                    self._store(place, self.required.get(place, value), "LibreOffice")
-                    del self.unknown[place]
-                return
-
-    def _libreoffice_values(self) -> dict[Place, Any]:
-        """What LibreOffice makes of the unknown formulas, those left out which it calculates otherwise than stored."""
-        workbook, name = self.workbook, f"{self.workbook.name}, recalculated by LibreOffice"
-        contents = libreoffice.recalculated([workbook.to_bytes(), workbook.package.content], workbook.suffix or ".xlsx")
-        if contents[0] is None or contents[1] is None:
-            return {}
-        new, old = (WorkbookXml(content, name) for content in contents if content is not None)
-        values = {}
-        for place in self.unknown:
-            if place[0] not in new.sheets:
-                continue
-            value = new.value(place)
-            was = workbook.sheets[place[0]].original.get(place[1:])
-            unlike = was is not None and was.value is not None and not _alike(old.value(place), was.value)
-            # #NAME? is said of functions that LibreOffice does not know; #VALUE! it saves for most other errors too.
-            unclear = value == "#NAME?" or (value == "#VALUE!" and (was is None or was.value != value))
-            if value is not None and not unclear and not unlike:
-                values[place] = value
-        return values
-
-    def clear(self) -> None:
-        for place, why in self.unknown.items():
-            cell = self.workbook.cell(place)
-            if place in self.required:
-                self._replace(place, f"its value is not known: {why}")
-            else:
-                self._set(place, replace(cell, value=None))
-                self.result.cleared[place] = why
-
-    def fill(self) -> None:
-        """Formulas that came without values get theirs too, in the sheets that change anyway."""
-        changed = {title for title, sheet in self.workbook.sheets.items() if sheet.changed}
-        for place, value in self.elsewhere.items():
-            if place[0] in changed:
-                self._store(place, value, "formulas")
-
-    def _is_wrong(self, place: Place, value: Any) -> bool:
-        if place in self.required:
-            return not agree(value, self.required[place])
-        wanted = self.derived.get(place)  # which may be a 0 that rounding has missed
-        return wanted is not None and not (
-            type(value) is float and abs(value - wanted) <= AGREEING * max(abs(wanted), 1)
-        )
-
-    def _replace(self, place: Place, why: str) -> None:
-        self.workbook.sheets[place[0]].refuse_array(place[1:])
-        number = self.required[place] if place in self.required else self.derived[place]
-        self._set(place, self.workbook.cell(place).typed(number))
-        self.result.replaced[place] = why
-
-    def _store(self, place: Place, value: Any, by: str) -> None:
-        cell = self.workbook.cell(place)
-        if not _identical(cell.value, value):
-            self._set(place, replace(cell, value=value))
-        self.result.by[place] = by
-
-    def _set(self, place: Place, cell: Cell) -> None:
-        self.workbook.sheets[place[0]].cells[place[1:]] = cell
-
-
-def _identical(a: Any, b: Any) -> bool:
-    return type(a) is type(b) and a == b
-
-
-def _alike(a: Any, b: Any) -> bool:
-    if type(a) is float and type(b) is float:
-        return math.isclose(a, b, rel_tol=_ALIKE, abs_tol=_ALIKE)
-    return _identical(a, b)
+                found += areas
+        elif area.sheet is not None and ":" in area.sheet:
+            return None  # through several sheets
+        elif (title := place[0] if area.sheet is None else workbook.title(area.sheet)) is not None:
+            found.append(area._replace(sheet=title))
+    return found
 
 
 def _shown(value: Any) -> str:
-    if type(value) is float and math.isfinite(value):
+    if type(value) is float:
         return f"{value:.9g}"
     return str(value) if isinstance(value, CellError) else repr(value)

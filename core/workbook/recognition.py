@@ -1,227 +1,184 @@
-"""Which cells hold which quantity, by a workbook's headings: what is understood for certain, and doubts of the rest.
+"""Which cells hold which quantity, by a workbook's headings, and the doubts about that.
 
-A doubt is whatever may make a number mean something else than its heading says: a heading, a unit or a table that is
-not accounted for. `recognized_layout` refuses a workbook with any; `core.workbook.draft` asks a person.
+A doubt is anything that may make a number mean something else than its heading says: a heading, a unit or a table that
+is unaccounted for. `recognized_layout` refuses a workbook with any; `core.workbook.draft` asks a person.
 """
 
 from __future__ import annotations
 
 import re
 import warnings
-from dataclasses import dataclass
+from collections.abc import Iterator
+from typing import NamedTuple
 
 from ..errors import InputError, InputWarning
 from .book import HEADING_ROWS, Book, Sheet
-from .doubts import look_around
-from .layout import Column, Layout, Table, by_label, check_modules, in_order
-from .quantities import (
-    DERIVED,
-    DIMENSIONS,
-    LENGTH_UNITS,
-    NEEDED,
-    POSITION,
-    QUANTITIES,
-    may_mean,
-    understood,
-    units_in,
-)
-from .sheet_seen import SheetSeen, quoted, several, sheet_seen, sheets_seen
+from .doubts import doubts_about, listed
+from .headed_table import HeadedTable, headed_table, headed_tables
+from .headings import heading_of, may_mean, quoted, units_mentioned
+from .layout import Column, Layout, Table, by_label, in_order
+from .quantities import DERIVED, LENGTH_UNITS, NEEDED, POSITION, QUANTITIES, TYPED
 
-HELP = "a column map can say what is meant (columns='map.toml', --columns map.toml; docs/workbook.md)"
+_HELP = "a column map can say what is meant (columns='map.toml', --columns map.toml; docs/workbook.md)"
 
-_OF_ALL = re.compile(
+_ABOUT_ALL = re.compile(
     r"\b(all|every|lengths?|dimensions?|distances?|coordinates?|sizes?|units?|numbers?|values?)\b", re.I
 )
 
 
-@dataclass(frozen=True, eq=False)
-class Recognized:
-    """What is seen of the scanner in a workbook.
+class Recognized(NamedTuple):
+    """What the headings say: the sheets that may hold the scanner, quantity -> its table, and the doubts."""
 
-    Attributes
-    ----------
-    book : Book
-    sheets : dict
-        Name -> `Sheet`, of those that may hold the scanner.
-    taken : dict
-        Quantity -> the sheet that it is taken from.
-    doubts : list of str
-        What keeps the workbook from being read.
-    """
-
-    book: Book
     sheets: dict[str, Sheet]
-    taken: dict[str, SheetSeen]
+    tables: dict[str, HeadedTable]
     doubts: list[str]
 
 
 def recognize(book: Book) -> Recognized:
-    """What is seen of the scanner in a workbook, with the doubts."""
-    sheets, seen = sheets_seen(book)
-    taken: dict[str, SheetSeen] = {}
+    """Find the tables of the scanner in a workbook, and collect the doubts about them."""
+    sheets, candidates = headed_tables(book)
+    tables: dict[str, HeadedTable] = {}
     doubts, missing = [], []
-    for name in (*NEEDED, "l"):
-        having = [s for s in seen if name in s.columns]
-        filled = [s for s in having if name in s.filled]
+    for name in TYPED:
+        having = [table for table in candidates if name in table.columns]
+        filled = [table for table in having if name in table.filled]
         if len(filled) > 1:
-            first, second = (s.sheet.place(s.first_heading, s.columns[name][0]) for s in filled[:2])
-            doubts.append(
-                f"{book.path.name}: {first} and {second}, of two sheets, are both headed as {name}, expected one such column"
-            )
+            first, second = (t.sheet.place(t.first_heading, t.columns[name][0]) for t in filled[:2])
+            doubts.append(f"{first} and {second}, of two sheets, are both headed as {name}, expected one such column")
         if having:
-            taken[name] = (filled or having)[0]
-        elif name != "l":
+            tables[name] = (filled or having)[0]
+        elif name in NEEDED:
             missing.append(_missing(book, sheets, name))
-    if (coordinates := taken.get("x1")) is not None:
-        taken.update({name: coordinates for name in DERIVED if name in coordinates.columns})
+    if (modules := tables.get("x1")) is not None:
+        tables.update({name: modules for name in DERIVED if name in modules.columns})
         for name in POSITION:
-            if name in taken and taken[name] is not coordinates:
+            if name in tables and tables[name] is not modules:
                 doubts.append(
-                    f"{book.path.name}: x1 is in sheet {coordinates.sheet.name} but {name} in sheet "
-                    f"{taken[name].sheet.name}, expected one table"
+                    f"x1 is in sheet {modules.sheet.name} but {name} in sheet {tables[name].sheet.name}, expected one table"
                 )
-        doubts += _shown_instead(book, coordinates.sheet)
-    for sheet in dict.fromkeys(taken.values()):
-        look_around(sheet, {*NEEDED, "l", *(name for name, of in taken.items() if of is sheet)})
-        doubts += sheet.doubts
-    return Recognized(book, sheets, taken, doubts + missing)
+        doubts += _shown_instead(book, modules.sheet)
+    for table in dict.fromkeys(tables.values()):
+        doubts += doubts_about(table, {*TYPED, *(name for name, its in tables.items() if its is table)})
+    return Recognized(sheets, tables, doubts + missing)
 
 
-def _shown_instead(book: Book, sheet: Sheet) -> list[str]:
-    """A doubt where the coordinates' sheet is hidden, and another that is shown has such a table."""
-    if sheet.name not in book.workbook.hidden:
-        return []
-    shown = [other for title, other in book.sheets.items() if title not in book.workbook.hidden]
-    for seen in filter(None, map(sheet_seen, shown)):
-        if seen.columns.keys() >= set(POSITION) and seen.rows:
-            return [
-                f"{book.path.name}: sheet {sheet.name} is hidden, but {seen.sheet.name} is shown, expected one of them"
-            ]
-    return []
+def _shown_instead(book: Book, sheet: Sheet) -> Iterator[str]:
+    """A doubt if the sheet of the coordinates is hidden, and a visible one has such a table."""
+    hidden = book.workbook.hidden
+    for other in book.sheets.values() if sheet.name in hidden else ():
+        table = None if other.name in hidden else headed_table(other)
+        if table is not None and table.columns.keys() >= set(POSITION) and table.rows:
+            yield f"sheet {sheet.name} is hidden, but {other.name} is shown, expected one of them"
+            return
 
 
 def _missing(book: Book, sheets: dict[str, Sheet], name: str) -> str:
-    quantity = QUANTITIES[name]
     close = [
         f"{sheet.place(*at)} {quoted(text)}"
         for sheet in sheets.values()
         for at, text in sheet.texts.items()
-        if at[0] <= HEADING_ROWS and name in may_mean(text) and understood(text) is None
+        if at[0] <= HEADING_ROWS and name in may_mean(text) and heading_of(text) is None
     ]
     saw = f"not understood: {', '.join(close[:3])}" if close else f"its sheets are {', '.join(book.sheets) or 'none'}"
-    return f"{book.path.name}: no sheet has a column headed {name} or {quantity.headings[1]!r}; {saw}"
+    return f"no sheet has a column headed {name} or {QUANTITIES[name].headings[1]!r}; {saw}"
 
 
 def recognized_layout(book: Book) -> Layout:
-    """The layout that a workbook's headings state; `InputError` where there is any doubt."""
+    """The layout that a workbook's headings describe; `InputError` if there is any doubt."""
     recognized = recognize(book)
     for doubt in recognized.doubts:
-        raise InputError(f"{doubt}; {HELP}")
-    taken = recognized.taken
-    tables = {seen: seen.table() for seen in dict.fromkeys(taken.values())}
-    modules = tables[taken["x1"]]
-    check_modules(modules)
-    layout = Layout(modules, {}, {modules: modules.rows})
-    for name, seen in taken.items():
-        table = tables[seen]
-        layout.columns[name] = Column(table, name, modules, _rows_of(name, layout, seen, taken["x1"], table))
-    if "l" not in taken:
-        _warn_of_unknown(taken["x1"])
-    _warn_of_other_sheets(layout, recognized.sheets)
-    _warn_of_gap(modules)
+        raise _unclear(book, doubt)
+    coordinates = recognized.tables["x1"]
+    tables = {headed: headed.table() for headed in dict.fromkeys(recognized.tables.values())}
+    layout = Layout(tables[coordinates])
+    for name, headed in recognized.tables.items():
+        rows = _rows_of(name, layout, headed, coordinates, tables[headed])
+        layout.columns[name] = Column(tables[headed], name, layout.modules, rows)
+    notes = [*_unknown_length(recognized), *_units_in_other_sheets(layout, recognized.sheets), *_gap(layout.modules)]
+    for note in notes:
+        warnings.warn(f"{book.path.name}: {note}", InputWarning, stacklevel=4)
     return layout
 
 
-def _rows_of(name: str, layout: Layout, seen: SheetSeen, coordinates: SheetSeen, table: Table) -> tuple[int, ...]:
-    """The row of each module; a single value, in the table's first row, stands for all modules."""
-    modules, column = layout.modules, table.columns[name][0]
-    rows = table.rows
+def _unclear(book: Book, doubt: str) -> InputError:
+    return InputError(f"{book.path.name}: {doubt}; {_HELP}")
+
+
+def _rows_of(name: str, layout: Layout, headed: HeadedTable, coordinates: HeadedTable, table: Table) -> tuple[int, ...]:
+    """The row of each module; a single value, in the table's first row, holds for all modules."""
+    rows, once = table.rows, headed.is_single(name)
     if not rows:
         raise InputError(f"{table.sheet.book.path.name}: sheet {table.sheet.name} has no numbers under {name}")
-    shared = name in DIMENSIONS and [r for r in rows if table.sheet.value(r, column) is not None] == [rows[0]]
-    if table not in layout.rows_of and not (shared and len(rows) == 1):
+    if table not in layout.rows_of and not (once and len(rows) == 1):
         try:
-            layout.rows_of[table] = _joined(modules, table, coordinates, seen)
+            layout.rows_of[table] = _matched_rows(layout.modules, table, coordinates, headed)
         except InputError:
-            if not shared:
+            if not once:
                 raise
-    return (rows[0],) * len(modules.rows) if shared else layout.rows_of[table]
+    return (rows[0],) * len(layout.modules.rows) if once else layout.rows_of[table]
 
 
-def _joined(modules: Table, table: Table, coordinates: SheetSeen, seen: SheetSeen) -> tuple[int, ...]:
-    """The row of each module in another sheet: by their numbers where both have them, else in order."""
-    file, own, other = modules.sheet.book.path.name, coordinates.label_headings, seen.label_headings
+def _matched_rows(modules: Table, table: Table, coordinates: HeadedTable, headed: HeadedTable) -> tuple[int, ...]:
+    """The row of each module in another sheet: by the modules' numbers or names if both have them, else in order."""
+    book, own, other = modules.sheet.book, coordinates.label_headings, headed.label_headings
+    sheets = f"sheet {modules.sheet.name}", f"sheet {table.sheet.name}"
     if modules.labels is not None and table.labels is not None:
         rows = by_label(modules, table)
     else:
         rows = in_order(modules, table)
         for row, its in zip(modules.rows, rows, strict=True):
             if row - modules.rows[0] != its - rows[0]:
-                raise InputError(
-                    f"{file}: row {row} of sheet {modules.sheet.name} and row {its} of sheet {table.sheet.name} would "
-                    "belong together, expected the modules' numbers in both, as other rows are blank in one than in the "
-                    f"other; {HELP}"
-                )
+                together = f"row {row} of {sheets[0]} and row {its} of {sheets[1]} would belong together"
+                raise _unclear(book, f"{together}, but blank rows differ: expected the modules' numbers in both")
         if table.numbers is not None and list(table.numbers) != sorted(table.numbers):
-            raise InputError(
-                f"{file}: the modules of sheet {table.sheet.name} have numbers in no order, those of sheet "
-                f"{modules.sheet.name} none, expected numbers in both; {HELP}"
+            raise _unclear(
+                book,
+                f"the modules' numbers in {sheets[1]} are in no order, {sheets[0]} has none, expected numbers in both",
             )
         for heading, at in other.items():
             if heading not in own:
-                raise InputError(
-                    f"{file}: {table.sheet.place(*at)} heads names of modules that sheet {modules.sheet.name} has not, "
-                    f"expected a column in both that says which rows belong together; {HELP}"
-                )
+                heads = f"{table.sheet.place(*at)} heads names of modules, which {sheets[0]} does not have"
+                raise _unclear(book, f"{heads}, expected a column in both that says which rows belong together")
     for heading in own.keys() & other.keys():
         for row, its in zip(modules.rows, rows, strict=True):
             here, there = (row, own[heading][1]), (its, other[heading][1])
             one, another = modules.sheet.value(*here), table.sheet.value(*there)
             if one != another:
-                raise InputError(
-                    f"{file}: {modules.sheet.place(*here)} is {one!r} but {table.sheet.place(*there)}, in the row that "
-                    f"belongs to it, is {another!r}, expected the same; {HELP}"
-                )
+                is_one = f"{modules.sheet.place(*here)} is {one!r} but {table.sheet.place(*there)}"
+                raise _unclear(book, f"{is_one}, in the matching row, is {another!r}, expected the same")
     return rows
 
 
-def _warn_of_unknown(seen: SheetSeen) -> None:
-    unknown = seen.unknown()
-    if unknown:
-        at, text = unknown[0]
-        warnings.warn(
-            f"{seen.sheet.book.path.name}: no column is headed l, so the collimator length is the design formula's; "
-            f"{seen.sheet.place(*at)} {quoted(text)} is not understood",
-            InputWarning,
-            stacklevel=4,
-        )
+def _unknown_length(recognized: Recognized) -> Iterator[str]:
+    """A heading that is not understood, if no column is headed l."""
+    table = recognized.tables["x1"]
+    if "l" not in recognized.tables:
+        for at, text in table.unknown()[:1]:
+            yield (
+                "no column is headed l, so the collimator length is the design formula's; "
+                f"{table.sheet.place(*at)} {quoted(text)} is not understood"
+            )
 
 
-def _warn_of_gap(modules: Table) -> None:
-    gap = sorted(set(range(modules.rows[0], modules.rows[-1])) - set(modules.rows))
-    if gap and modules.labels is None:
-        warnings.warn(
-            f"{modules.sheet.book.path.name}: row {gap[0]} of sheet {modules.sheet.name} is no module's, and the rows "
-            "below, which have no numbers to tell, were taken for modules too",
-            InputWarning,
-            stacklevel=4,
-        )
-
-
-def _warn_of_other_sheets(layout: Layout, sheets: dict[str, Sheet]) -> None:
-    """Warn of a sheet beside the scanner's that says of all lengths what the headings do not."""
+def _units_in_other_sheets(layout: Layout, sheets: dict[str, Sheet]) -> Iterator[str]:
+    """A sheet that is not the scanner's but says of all lengths what the headings do not."""
     used = {column.table.sheet.name for column in layout.columns.values()}
     units = {column.unit for column in layout.columns.values() if column.unit in LENGTH_UNITS}
-    book = layout.modules.sheet.book
     for name, sheet in sheets.items():
-        if name in used:
-            continue
-        for at, text in sheet.texts.items():
-            if _OF_ALL.search(text) and any(units != {unit} for unit in units_in(text)):
-                warnings.warn(
-                    f"{book.path.name}: {sheet.place(*at)} says {quoted(text)}, where the headings of the scanner's "
-                    f"sheets say {several(units)}, which was used",
-                    InputWarning,
-                    stacklevel=4,
+        for at, text in sheet.texts.items() if name not in used else ():
+            if _ABOUT_ALL.search(text) and any(units != {unit} for unit in units_mentioned(text)):
+                yield (
+                    f"{sheet.place(*at)} says {quoted(text)}, where the headings of the scanner's sheets say "
+                    f"{listed(units)}, which was used"
                 )
                 return
+
+
+def _gap(modules: Table) -> Iterator[str]:
+    """A row between modules that have no numbers."""
+    gap = sorted(set(range(modules.rows[0], modules.rows[-1])) - set(modules.rows))
+    if gap and modules.labels is None:
+        yield (
+            f"row {gap[0]} of sheet {modules.sheet.name} holds no module; the rows below have no numbers and were taken "
+            "for modules too"
+        )

@@ -32,18 +32,10 @@ class Reference(NamedTuple):
     bottom: int
     right: int
 
-    def __str__(self) -> str:
-        """As it is written, absolute: ``'Main'!$B$3:$B$82``."""
-        from openpyxl.utils import get_column_letter as letters
-
-        sheet = "" if self.sheet is None else "'{}'!".format(self.sheet.replace("'", "''"))
-        first, last = f"${letters(self.left)}${self.top}", f"${letters(self.right)}${self.bottom}"
-        return sheet + (first if first == last else f"{first}:{last}")
-
 
 @lru_cache(maxsize=2**15)
 def reference(text: str) -> Reference | None:
-    """What `text` refers to; None where it is a name, another file's cell or anything else."""
+    """What `text` refers to; None for a name, a cell of another file or anything else."""
     from openpyxl.utils import column_index_from_string as column
 
     match = next((found for area in _AREAS if (found := area.fullmatch(text))), None)

@@ -1,4 +1,4 @@
-"""A worksheet's XML as cells that can be changed, and back with only the changed cells' bytes replaced."""
+"""The cells of a worksheet's XML, which can be changed; writing replaces only the bytes of changed cells."""
 
 from __future__ import annotations
 
@@ -21,34 +21,33 @@ At = tuple[int, int]
 
 
 class Unreadable(str):
-    """A stored value of a kind that formulas are not computed with here; its text."""
+    """The text of a stored value that is neither number, text, boolean nor error."""
 
 
 @dataclass(frozen=True)
 class _Origin:
-    """The XML a cell was read from."""
+    """The XML that a cell was read from; `group` is the index of its shared formula."""
 
     at: At
     element: Element
     formula: Element | None
     text: str | None
     value: Any
-    style: str | None
     group: str | None
 
 
 @dataclass(frozen=True)
 class Cell:
-    """What is in a cell.
+    """The content of a cell.
 
     Attributes
     ----------
-    value : float, str, bool, CellError or None
-        Typed in, or the stored result of the formula.
+    value : float, str, bool, CellError, Unreadable or None
+        The typed value, or the stored result of the formula.
     formula : str or None
         With its "="; a shared formula as it reads in this cell.
     array : Reference or None
-        The cells of the array formula or data table that this one is of, if they are more than this one.
+        The area of the array formula or data table that the cell belongs to, if that has several cells.
     single_array : bool
         Whether the formula is an array formula of this cell alone.
     """
@@ -61,17 +60,20 @@ class Cell:
 
     @property
     def blank(self) -> bool:
-        """Whether there is nothing in it."""
+        """Whether the cell is empty."""
         return self.value is None and self.formula is None and self.array is None
 
     @property
     def style(self) -> str | None:
-        """The number of its style, None for the workbook's own."""
-        return self.origin.style if self.origin else None
+        """The number of its style, None for the default."""
+        return self.origin.element.attributes.get("s") if self.origin else None
 
     def typed(self, value: float | None) -> Cell:
-        """With a number, or nothing, in place of what it holds."""
+        """The cell with a number, or nothing, instead of its content."""
         return replace(self, value=value, formula=None, single_array=False)
+
+
+_BLANK = Cell()
 
 
 class SheetXml:
@@ -86,24 +88,26 @@ class SheetXml:
     name
         The sheet's name.
     file
-        How messages call the workbook.
+        The workbook's name in messages.
 
     Attributes
     ----------
     cells : dict
-        (row, column) -> `Cell`; change it as you like, then ask for `to_bytes`.
+        (row, column) -> `Cell`, to be changed before `to_bytes`.
     original : dict
-        The cells as they were read.
+        The cells as read.
     merged : list of Reference
-        Cells that are shown as one.
+        The merged areas.
     """
 
     def __init__(self, data: bytes, strings: list[str], name: str, file: str) -> None:
         self.name, self._file = name, file
         where = f"{file}: sheet {name}"
-        self._data, self._back = utf8(data, where)
-        self._rows: list[tuple[int, Element]] = []
+        self._data, self._to_encoding = utf8(data, where)
+        self._rows: dict[int, Element] = {}
         self._in_row: dict[int, list[tuple[int, Element]]] = {}
+        self._sheet_data: Element | None = None
+        self._dimension: Element | None = None
         self.cells: dict[At, Cell] = {}
         self.merged: list[Reference] = []
         self._read(elements(self._data, where), strings)
@@ -114,25 +118,22 @@ class SheetXml:
     def _read(self, found: list[Element], strings: list[str]) -> None:
         inside: dict[int, list[Element]] = {}
         cells: list[tuple[At, Element]] = []
-        self._sheet_data: Element | None = None
-        self._dimension: Element | None = None
         row = column = 0
         for e in found:
-            parent = e.parent.name if e.parent is not None else ""
             if e.namespace != MAIN:
                 continue
+            parent = e.parent.name if e.parent is not None else ""
             if e.name == "row" and parent == "sheetData":
-                row = int(e.attributes.get("r", row + 1))
-                column = 0
-                self._rows.append((row, e))
+                row, column = int(e.attributes.get("r", row + 1)), 0
+                self._rows.setdefault(row, e)
             elif e.name == "c" and parent == "row":
                 named = reference(e.attributes["r"]) if "r" in e.attributes else None
-                # A cell's own name counts, whatever row it is in, as in spreadsheet programs.
-                place = (named.top, named.left) if named else (row, column + 1)
-                column = place[1]
-                cells.append((place, e))
+                # As in spreadsheet programs, a cell's own name counts, whatever row it is in.
+                at = (named.top, named.left) if named else (row, column + 1)
+                column = at[1]
+                cells.append((at, e))
                 self._in_row.setdefault(row, []).append((column, e))
-            elif parent in ("c", "is", "r") and e.parent is not None:
+            elif parent in ("c", "is", "r"):
                 inside.setdefault(id(e.parent), []).append(e)
             elif e.name == "sheetData":
                 self._sheet_data = e
@@ -144,7 +145,7 @@ class SheetXml:
         for at, element in cells:
             if at in self.cells:
                 raise InputError(
-                    f"{self._file}: {self.name}!{_name(at)} is stored twice in the file, expected it once; Excel or "
+                    f"{self._file}: {self.name}!{cell_name(at)} is stored twice in the file, expected it once; Excel or "
                     "LibreOffice may repair it"
                 )
             self.cells[at] = self._cell(at, element, inside, strings, masters)
@@ -158,23 +159,22 @@ class SheetXml:
         strings: list[str],
         masters: dict[str, tuple[At, str]],
     ) -> Cell:
-        parts = {e.name: e for e in inside.get(id(element), [])}
-        if len(parts) < len(inside.get(id(element), [])):
-            raise InputError(f"{self._file}: {self.name}!{_name(at)} has several values in the file, expected one")
+        content = inside.get(id(element), [])
+        parts = {e.name: e for e in content}
+        if len(parts) < len(content):
+            raise InputError(f"{self._file}: {self.name}!{cell_name(at)} has several values in the file, expected one")
         value = _value(element.attributes.get("t", "n"), parts, inside, strings)
         formula, group, text = parts.get("f"), None, None
         if formula is not None:
-            text = formula.text.strip() or None
+            text = f"={formula.text.strip()}" if formula.text.strip() else None
             if formula.attributes.get("t") == "shared":
                 group = formula.attributes.get("si", "")
                 if text is not None:
                     masters[group] = at, text
                 elif group in masters:
-                    text = _translated(masters[group][1], masters[group][0], at)
-            if text is not None:
-                text = f"={text}"
-        origin = _Origin(at, element, formula, text, value, element.attributes.get("s"), group)
-        return Cell(value, text, origin=origin)
+                    start, text = masters[group]
+                    text = moved(text, start, at)
+        return Cell(value, text, origin=_Origin(at, element, formula, text, value, group))
 
     def _mark_arrays(self) -> None:
         for at, cell in list(self.cells.items()):
@@ -187,9 +187,8 @@ class SheetXml:
                 continue
             for row in range(area.top, area.bottom + 1):
                 for column in range(area.left, area.right + 1):
-                    member = self.cells.get((row, column))
-                    if member is not None:
-                        self.cells[row, column] = replace(member, array=area)
+                    if (row, column) in self.cells:
+                        self.cells[row, column] = replace(self.cells[row, column], array=area)
             self.cells[at] = replace(self.cells[at], array=area)
 
     @property
@@ -201,193 +200,150 @@ class SheetXml:
     # Changing
 
     def cell(self, at: At) -> Cell:
-        """The cell, a new one where there is none."""
-        return self.cells.get(at, _NEW)
+        """The cell, a blank one if the sheet has none there."""
+        return self.cells.get(at, _BLANK)
 
     def type(self, at: At, value: float | None) -> None:
         """Put a number, or nothing, into a cell."""
         self.refuse_array(at)
         self.cells[at] = self.cell(at).typed(value)
 
-    def copy_row(self, cell: Cell, start: At, to: At) -> None:
-        """Put `cell`, which stood at `start`, at `to`: relative references of its formula move along."""
-        self.cells[to] = replace(cell, formula=_moved(cell.formula, start, to))
-
-    def formula_at(self, start: At, to: At) -> str | None:
-        """The formula of the cell at `start` as it would read at `to`."""
-        return _moved(self.cell(start).formula, start, to)
+    def copy(self, cell: Cell, start: At, to: At) -> None:
+        """Put `cell`, which stood at `start`, at `to`; the relative references of its formula move along."""
+        self.refuse_array(start)
+        self.refuse_array(to)
+        self.cells[to] = replace(cell, formula=moved(cell.formula, start, to))
 
     def refuse_array(self, at: At) -> None:
-        """Raise `InputError` where a cell is one of several of an array formula: these change only together."""
+        """Raise `InputError` for a cell of an array formula of several cells: these change only together."""
         area = self.cell(at).array
         if area is not None:
-            first, last = _name((area.top, area.left)), _name((area.bottom, area.right))
             raise InputError(
-                f"{self._file}: {self.name}!{_name(at)} is one cell of the array formula or data table {first}:{last}, "
-                "expected a cell of its own: its number cannot be changed alone"
+                f"{self._file}: {self.name}!{cell_name(at)} is one cell of the array formula or data table "
+                f"{_area_name(*area[1:])}, expected a cell of its own: its number cannot be changed alone"
             )
 
     @property
     def changed(self) -> list[At]:
-        """The cells that are not as they were read, row by row."""
-        return sorted(at for at, cell in self.cells.items() if not _same(cell, self.original.get(at, _NEW)))
+        """The cells that are not as read, row by row."""
+        return sorted(at for at, cell in self.cells.items() if not _same(cell, self.original.get(at, _BLANK)))
 
     @property
-    def formulas_moved(self) -> bool:
-        """Whether a cell that held a formula holds none now, or the other way round."""
-        return any(
-            (cell.formula is None) != (self.original.get(at, _NEW).formula is None) for at, cell in self.cells.items()
-        )
+    def formulas_added_or_removed(self) -> bool:
+        """Whether other cells have formulas than when read."""
+        return any((self.cells[at].formula is None) != (self._was(at).formula is None) for at in self.changed)
+
+    def _was(self, at: At) -> Cell:
+        return self.original.get(at, _BLANK)
 
     # Writing
 
     def to_bytes(self) -> bytes:
         """The part with the changed cells."""
-        changed = {at: self._xml(at, self.cells[at]) for at in self.changed}
-        changed.update(self._handed_on())
-        old = {at: self.original[at].origin for at in changed if at in self.original}
-        changes = [(o.element.start, o.element.end, changed[at]) for at, o in old.items() if o is not None]
+        changed = self.changed
+        split = {group for at in changed if (group := self._group_without_text(at)) is not None}
+        members = [at for at, cell in self.cells.items() if cell.origin and cell.origin.group in split]
+        changes: list[tuple[int, int, bytes]] = []
         added: dict[int, list[tuple[int, bytes]]] = {}
-        for (row, column), xml in sorted(changed.items()):
-            if (row, column) not in old:
-                added.setdefault(row, []).append((column, xml))
-        elements_of = dict(self._rows)
+        for at in sorted({*changed, *members}):
+            xml, old = self._xml(at, split), self._was(at).origin
+            if old is None:
+                added.setdefault(at[0], []).append((at[1], xml))
+            else:
+                changes.append((old.element.start, old.element.end, xml))
         for row, cells in added.items():
-            element = elements_of.get(row)
-            changes += self._new_row(row, cells) if element is None else self._into_row(row, element, cells)
-        return self._back(spliced(self._data, self._grown(changes, list(added))))
+            changes += self._into_row(self._rows[row], row, cells) if row in self._rows else [self._new_row(row, cells)]
+        if added and self._dimension is not None:
+            changes += self._grown(self._dimension)
+        return self._to_encoding(spliced(self._data, changes))
 
-    def _xml(self, at: At, cell: Cell, shared: str | None = None) -> bytes:
-        """A cell's element; `shared`, the cells of the shared formula that it is made the first of."""
-        origin, data = cell.origin, self._data
-        prefix = self._prefix
-        if origin is None:
-            tag = b"<%bc>" % prefix
-            same_value = False
-        else:
-            element = origin.element
-            tag = data[element.start : element.inner]
+    def _group_without_text(self, at: At) -> str | None:
+        """The shared formula whose text the cell held and holds no longer."""
+        was, cell = self._was(at), self.cells[at]
+        if was.origin is None or was.origin.group is None or was.origin.formula is None:
+            return None
+        kept = cell.formula == was.formula and cell.origin is was.origin
+        return None if kept or not was.origin.formula.text.strip() else was.origin.group
+
+    def _xml(self, at: At, split: set[str]) -> bytes:
+        """A cell's element; shared formulas of the groups in `split` become formulas of their own."""
+        cell = self.cells[at]
+        origin, data, prefix = cell.origin, self._data, self._prefix
+        tag, value_kept = b"<%bc>" % prefix, False
+        if origin is not None:
+            tag = data[origin.element.start : origin.element.inner]
             tag = tag[:-2].rstrip() + b">" if tag.endswith(b"/>") else tag
-            same_value = cell.value is origin.value
+            value_kept = cell.value is origin.value
         if origin is None or origin.at != at:
-            tag = with_attribute(tag, "r", _name(at))
-        if not same_value or cell.value is None:
+            tag = with_attribute(tag, "r", cell_name(at))
+        if not value_kept or cell.value is None:
             tag = with_attribute(with_attribute(tag, "t", _type(cell.value)), "vm", None)
         if cell.formula is None:
             tag = with_attribute(tag, "cm", None)
-        content = self._formula_xml(at, cell, shared)
-        if same_value and origin is not None:
-            f = origin.formula
-            inner = data[origin.element.inner : origin.element.close]
+        content = self._formula_xml(at, cell, split)
+        if value_kept and origin is not None:
+            inner, f = data[origin.element.inner : origin.element.close], origin.formula
             if f is not None:
-                skip = f.start - origin.element.inner
-                inner = inner[:skip] + inner[skip + f.end - f.start :]
+                inner = inner[: f.start - origin.element.inner] + inner[f.end - origin.element.inner :]
             content += inner.strip()
         elif cell.value is not None:
             content += b"<%bv>%b</%bv>" % (prefix, escaped(_stored(cell.value)), prefix)
-        if not content:
-            return tag[:-1] + b"/>"
-        return tag + content + b"</%bc>" % prefix
+        return tag + content + b"</%bc>" % prefix if content else tag[:-1] + b"/>"
 
-    def _formula_xml(self, at: At, cell: Cell, shared: str | None) -> bytes:
+    def _formula_xml(self, at: At, cell: Cell, split: set[str]) -> bytes:
         origin = cell.origin
-        kept = origin is not None and origin.formula is not None and origin.text == cell.formula
-        if kept and origin is not None and origin.formula is not None and shared is None:
+        if origin is not None and origin.formula is not None and origin.text == cell.formula:
             plain = origin.formula.attributes.get("t", "normal") == "normal"
-            if plain or origin.at == at:
+            if plain or (origin.at == at and origin.group not in split):
                 return self._data[origin.formula.start : origin.formula.end]
         if cell.formula is None:
             return b""
-        attributes = b""
-        if shared is not None and origin is not None:
-            attributes = b' t="shared" ref="%b" si="%b"' % (shared.encode(), escaped(origin.group or ""))
-        elif cell.single_array:
-            attributes = b' t="array" ref="%b"' % _name(at).encode()
+        attributes = b' t="array" ref="%b"' % cell_name(at).encode() if cell.single_array else b""
         text = cell.formula[1:]
         if text != text.strip():
             attributes += b' xml:space="preserve"'
         return b"<%bf%b>%b</%bf>" % (self._prefix, attributes, escaped(text), self._prefix)
 
-    def _handed_on(self) -> dict[At, bytes]:
-        """The first cell left of each shared formula whose first cell holds it no more, with the formula."""
-        left: dict[str, list[At]] = {}
-        lost: set[str] = set()
-        for at, was in self.original.items():
-            group = was.origin.group if was.origin else None
-            if group is None or was.formula is None:
-                continue
-            cell = self.cells[at]
-            if cell.formula == was.formula and cell.origin is was.origin:
-                left.setdefault(group, []).append(at)
-            elif was.origin is not None and was.origin.formula is not None and was.origin.formula.text.strip():
-                lost.add(group)
-        handed = {}
-        for group in lost & set(left):
-            rows, columns = zip(*left[group], strict=True)
-            area = f"{_name((min(rows), min(columns)))}:{_name((max(rows), max(columns)))}"
-            first = min(left[group], key=lambda at: self._place(at))
-            handed[first] = self._xml(first, self.cells[first], area)
-        return handed
-
-    def _place(self, at: At) -> int:
-        origin = self.original[at].origin
-        return origin.element.start if origin is not None else 0
-
-    def _into_row(self, row: int, element: Element, cells: list[tuple[int, bytes]]) -> list[tuple[int, int, bytes]]:
-        tag = self._data[element.start : element.inner]
-        spans = [int(x) for x in element.attributes.get("spans", "").replace(":", " ").split() if x.isdigit()]
-        new_tag = tag
-        if spans and not all(min(spans) <= column <= max(spans) for column, _ in cells):
-            new_tag = with_attribute(tag, "spans", None)
-        if element.close == element.inner == element.end and tag.endswith(b"/>"):
-            inner = b"".join(xml for _, xml in cells)
-            whole = new_tag[:-2].rstrip() + b">" + inner + b"</%brow>" % self._prefix
+    def _into_row(self, element: Element, row: int, cells: list[tuple[int, bytes]]) -> list[tuple[int, int, bytes]]:
+        tag = with_attribute(self._data[element.start : element.inner], "spans", None)
+        if tag.endswith(b"/>"):
+            whole = tag[:-2].rstrip() + b">" + b"".join(xml for _, xml in cells) + b"</%brow>" % self._prefix
             return [(element.start, element.end, whole)]
-        changes = [(element.start, element.inner, new_tag)] if new_tag != tag else []
+        changes = [(element.start, element.inner, tag)]
         for column, xml in cells:
-            after = [e.start for c, e in self._in_row.get(row, []) if c > column]
-            at = min(after, default=element.close)
+            at = min((e.start for c, e in self._in_row.get(row, []) if c > column), default=element.close)
             changes.append((at, at, xml))
         return changes
 
-    def _new_row(self, row: int, cells: list[tuple[int, bytes]]) -> list[tuple[int, int, bytes]]:
+    def _new_row(self, row: int, cells: list[tuple[int, bytes]]) -> tuple[int, int, bytes]:
+        """The XML of a row, which is formatted as the one above."""
         assert self._sheet_data is not None, "a sheet with cells has their element"
-        above = [(n, e) for n, e in self._rows if n < row]
         tag = b"<%brow>" % self._prefix
-        if above:
-            model = max(above, key=lambda pair: pair[0])[1]
-            tag = self._data[model.start : model.inner]
+        above = max((n for n in self._rows if n < row), default=None)
+        if above is not None:
+            tag = self._data[self._rows[above].start : self._rows[above].inner]
             tag = tag[:-2].rstrip() + b">" if tag.endswith(b"/>") else tag
         for attribute in ("spans", "hidden", "collapsed", "outlineLevel"):
             tag = with_attribute(tag, attribute, None)
-        tag = with_attribute(tag, "r", str(row))
-        xml = tag + b"".join(xml for _, xml in cells) + b"</%brow>" % self._prefix
-        below = [e.start for n, e in self._rows if n > row]
-        at = min(below, default=self._sheet_data.close)
-        return [(at, at, xml)]
+        xml = with_attribute(tag, "r", str(row)) + b"".join(xml for _, xml in cells) + b"</%brow>" % self._prefix
+        at = min((e.start for n, e in self._rows.items() if n > row), default=self._sheet_data.close)
+        return at, at, xml
 
-    def _grown(self, changes: list[tuple[int, int, bytes]], rows: list[int]) -> list[tuple[int, int, bytes]]:
-        """The changes, and one to the stated size of the sheet where cells were added beyond it."""
-        e = self._dimension
-        area = reference(e.attributes.get("ref", "")) if e is not None else None
-        if e is None or area is None or not rows:
-            return changes
-        added = [at for at in self.cells if at not in self.original]
-        top, bottom = min(area.top, *(r for r, _ in added)), max(area.bottom, *(r for r, _ in added))
-        left, right = min(area.left, *(c for _, c in added)), max(area.right, *(c for _, c in added))
-        if (top, left, bottom, right) == area[1:]:
-            return changes
-        name = f"{_name((top, left))}:{_name((bottom, right))}"
-        return [*changes, (e.start, e.inner, with_attribute(self._data[e.start : e.inner], "ref", name))]
+    def _grown(self, e: Element) -> list[tuple[int, int, bytes]]:
+        """The stated size of the sheet, made to hold its new cells."""
+        area = reference(e.attributes.get("ref", ""))
+        if area is None:
+            return []
+        rows, columns = zip(*(at for at in self.cells if at not in self.original), strict=True)
+        top, bottom = min(area.top, *rows), max(area.bottom, *rows)
+        left, right = min(area.left, *columns), max(area.right, *columns)
+        tag = with_attribute(self._data[e.start : e.inner], "ref", _area_name(top, left, bottom, right))
+        return [(e.start, e.inner, tag)]
 
     @property
     def _prefix(self) -> bytes:
         assert self._sheet_data is not None, "a sheet with cells has their element"
-        tag = self._data[self._sheet_data.start + 1 : self._sheet_data.inner].split(b"sheetData", 1)[0]
-        return tag
-
-
-_NEW = Cell()
+        return self._data[self._sheet_data.start + 1 : self._sheet_data.inner].split(b"sheetData", 1)[0]
 
 
 def _same(a: Cell, b: Cell) -> bool:
@@ -419,12 +375,11 @@ def _value(kind: str, parts: dict[str, Element], inside: dict[int, list[Element]
 
 def _rich_text(element: Element, inside: dict[int, list[Element]]) -> str:
     runs = inside.get(id(element), [])
-    texts = [e.text if e.name == "t" else _rich_text(e, inside) for e in runs if e.name in ("t", "r")]
-    return "".join(texts)
+    return "".join(e.text if e.name == "t" else _rich_text(e, inside) for e in runs if e.name in ("t", "r"))
 
 
 def shared_strings(data: bytes, name: str) -> list[str]:
-    """The texts of the part of shared strings, phonetic hints left out."""
+    """The texts of the part of shared strings, without phonetic hints."""
     strings: list[str] = []
     for e in elements(utf8(data, name)[0], name):
         if e.namespace != MAIN:
@@ -436,25 +391,27 @@ def shared_strings(data: bytes, name: str) -> list[str]:
     return strings
 
 
-def _moved(formula: str | None, start: At, to: At) -> str | None:
-    return formula and "=" + _translated(formula[1:], start, to)
-
-
-def _translated(formula: str, start: At, to: At) -> str:
+def moved(formula: str | None, start: At, to: At) -> str | None:
+    """A formula as it reads when copied from `start` to `to`."""
     from openpyxl.formula.translate import Translator, TranslatorError
 
-    if start == to:
+    if formula is None or start == to:
         return formula
     try:
-        return Translator(f"={formula}", origin=_name(start)).translate_formula(_name(to))[1:]
+        return str(Translator(formula, cell_name(start)).translate_formula(cell_name(to)))
     except TranslatorError:
-        return "#REF!"
+        return "=#REF!"
 
 
-def _name(at: At) -> str:
+def cell_name(at: At) -> str:
+    """E.g. ``B3``."""
     from openpyxl.utils import get_column_letter
 
     return f"{get_column_letter(at[1])}{at[0]}"
+
+
+def _area_name(top: int, left: int, bottom: int, right: int) -> str:
+    return f"{cell_name((top, left))}:{cell_name((bottom, right))}"
 
 
 def _type(value: Any) -> str | None:
@@ -468,6 +425,4 @@ def _type(value: Any) -> str | None:
 def _stored(value: Any) -> str:
     if isinstance(value, bool):
         return str(int(value))
-    if isinstance(value, float):
-        return repr(value).removesuffix(".0")
-    return str(value)
+    return repr(value).removesuffix(".0") if isinstance(value, float) else str(value)

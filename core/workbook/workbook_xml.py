@@ -1,18 +1,16 @@
-"""A workbook file's sheets as cells that can be changed, and the file with the changes."""
+"""The sheets of a workbook file as cells that can be changed, and the file with the changes."""
 
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from functools import cached_property
-from typing import Any
 
 from ..errors import InputError
-from .formulas import CellError, NotComputable, Surroundings, calculate, tokens_of
+from .formulas import areas_in, operands
 from .package import Package
 from .references import Reference, reference
-from .sheet_xml import MAIN, STRICT, At, Cell, SheetXml, Unreadable, shared_strings
-from .tables import DataTable, data_table, named_part
+from .sheet_xml import MAIN, STRICT, At, Cell, SheetXml, cell_name, shared_strings
 from .xml_parts import Element, elements, spliced, utf8, with_attribute
 
 KINDS = {
@@ -28,27 +26,22 @@ Place = tuple[str, int, int]
 
 
 class _Sheets(Mapping[str, SheetXml]):
-    """Sheets by name, each parsed when it is first asked for: users' workbooks carry large ones that nobody asks for."""
+    """Sheets by name. Each is parsed when it is first asked for: users' workbooks carry large ones that nobody needs."""
 
-    def __init__(self, titles: Iterable[str], parsed: Callable[[str], SheetXml]) -> None:
-        self._titles, self._parsed = dict.fromkeys(titles), parsed
-        self._sheets: dict[str, SheetXml] = {}
+    def __init__(self, titles: list[str], parse: Callable[[str], SheetXml]) -> None:
+        self._titles, self._parse = titles, parse
+        self.parsed: dict[str, SheetXml] = {}
 
     def __getitem__(self, title: str) -> SheetXml:
-        if title not in self._sheets:
-            if title not in self._titles:
-                raise KeyError(title)
-            self._sheets[title] = self._parsed(title)
-        return self._sheets[title]
+        if title not in self.parsed:
+            self.parsed[title] = self._parse(title)
+        return self.parsed[title]
 
     def __iter__(self) -> Iterator[str]:
         return iter(self._titles)
 
     def __len__(self) -> int:
         return len(self._titles)
-
-    def __contains__(self, title: object) -> bool:
-        return title in self._titles
 
 
 class WorkbookXml:
@@ -59,12 +52,18 @@ class WorkbookXml:
     content
         The file's bytes.
     name
-        How messages call the file.
+        The file's name in messages.
 
     Attributes
     ----------
     sheets : mapping
-        Name -> `SheetXml`, in the workbook's order; charts' sheets are left out.
+        Name -> `SheetXml`, in the workbook's order; chart sheets are left out.
+    all_sheets : list of str
+        The names of all sheets.
+    hidden : set of str
+        The sheets that are not shown.
+    parts : dict
+        Sheet -> its member of the package.
     """
 
     def __init__(self, content: bytes, name: str) -> None:
@@ -74,20 +73,22 @@ class WorkbookXml:
         if not found:
             raise InputError(f"{name}: not a whole .xlsx workbook (it does not say where its sheets are)")
         self._part = found[0]
-        self._data, self._back = utf8(self.package.read(self._part), name)
+        self._data, self._to_encoding = utf8(self.package.read(self._part), name)
         found_elements = elements(self._data, name)
         if found_elements[0].namespace == STRICT:
             raise InputError(f"{name}: a 'Strict Open XML Spreadsheet', expected it saved as 'Excel Workbook (*.xlsx)'")
         self._elements = [e for e in found_elements if e.namespace == MAIN]
         relations = self.package.relations(self._part)
-        members = {key: (kind, member) for key, kind, member in relations}
-        strings = [member for _, kind, member in relations if kind == "sharedStrings"]
-        self._calc_chain = [member for _, kind, member in relations if kind == "calcChain"]
-        texts = shared_strings(self.package.read(strings[0]), name) if strings else []
-        self._styles = [member for _, kind, member in relations if kind == "styles"]
+        self._related = {kind: member for _, kind, member in reversed(relations)}
+        texts = (
+            shared_strings(self.package.read(self._related["sharedStrings"]), name)
+            if "sharedStrings" in self._related
+            else []
+        )
         self.all_sheets: list[str] = []
         self.hidden: set[str] = set()
         self.parts: dict[str, str] = {}
+        worksheets = {key: member for key, kind, member in relations if kind == "worksheet"}
         for e in self._elements:
             if e.name != "sheet":
                 continue
@@ -100,22 +101,25 @@ class WorkbookXml:
             if e.attributes.get("state", "visible") != "visible":
                 self.hidden.add(title)
             key = next((value for attribute, value in e.attributes.items() if attribute.endswith(" id")), "")
-            kind, member = members.get(key, ("", ""))
-            if kind == "worksheet":
-                self.parts[title] = member
-        self.sheets = _Sheets(self.parts, lambda t: SheetXml(self.package.read(self.parts[t]), texts, t, name))
+            if key in worksheets:
+                self.parts[title] = worksheets[key]
+        self.sheets = _Sheets(
+            list(self.parts), lambda title: SheetXml(self.package.read(self.parts[title]), texts, title, name)
+        )
         self._by_folded_name = {title.casefold(): title for title in self.sheets}
-        self._extents: dict[tuple[str, int], tuple[int, int]] = {}
+        self._extents: dict[tuple[str, int], At] = {}
+
+    # What the file says
 
     @property
     def suffix(self) -> str | None:
-        """ ".xlsx" or ".xlsm" by what is inside, None for anything else."""
+        """ ".xlsx" or ".xlsm" by the content, None for anything else."""
         kind = self.package.content_type(self._part)
         return next((suffix for suffix, content_type in KINDS.items() if kind == content_type), None)
 
     @property
     def asks_for_calculation(self) -> bool:
-        """Whether the formulas' stored values are, by what the file says, not to be relied on."""
+        """Whether the file says that the formulas' stored values are not to be relied on."""
         settings = [e.attributes for e in self._elements if e.name == "calcPr"]
         asked = any(a.get(name) in ("1", "true") for a in settings for name in ("fullCalcOnLoad", "forceFullCalc"))
         return asked or any(a.get("calcCompleted") in ("0", "false") for a in settings)
@@ -125,9 +129,9 @@ class WorkbookXml:
         """The number format of each style of cells."""
         from openpyxl.styles.numbers import BUILTIN_FORMATS
 
-        if not self._styles:
+        if "styles" not in self._related:
             return []
-        parts = self._parts_of(self._styles[0])
+        parts = self._parts_of(self._related["styles"])
         named = [e.attributes for e in parts if e.name == "numFmt"]
         own = {attributes.get("numFmtId"): attributes.get("formatCode", "") for attributes in named}
         styles = [e for e in parts if e.name == "xf" and e.parent is not None and e.parent.name == "cellXfs"]
@@ -142,9 +146,7 @@ class WorkbookXml:
     def comments(self, sheet: str) -> dict[At, str]:
         """The comments on a sheet's cells."""
         found: dict[At, str] = {}
-        for _, kind, member in self.package.relations(self.parts[sheet]):
-            if kind != "comments":
-                continue
+        for member in self._related_to(sheet, "comments"):
             at = None
             for e in self._parts_of(member):
                 if e.name == "comment" and (cell := reference(e.attributes.get("ref", ""))) is not None:
@@ -155,7 +157,7 @@ class WorkbookXml:
 
     @cached_property
     def _names(self) -> dict[tuple[str | None, str], str]:
-        """(sheet or None, folded defined name) -> formula."""
+        """(sheet or None, case-folded defined name) -> formula."""
         names = {}
         for e in self._elements:
             if e.name == "definedName" and e.text.strip():
@@ -166,111 +168,105 @@ class WorkbookXml:
         return names
 
     @cached_property
-    def _tables(self) -> dict[str, DataTable]:
-        """Folded name -> table."""
-        tables = {}
-        for title, part in self.parts.items():
-            for _, kind, member in self.package.relations(part):
-                if kind == "table" and (table := data_table(self._parts_of(member), title)) is not None:
-                    tables[table.name.casefold()] = table
-        return tables
+    def tables(self) -> dict[str, Reference]:
+        """Case-folded name of an Excel table -> its cells."""
+        found = {}
+        for title in self.parts:
+            for member in self._related_to(title, "table"):
+                attributes = self._parts_of(member)[0].attributes
+                if (area := reference(attributes.get("ref", ""))) is not None:
+                    found[attributes.get("displayName", "").casefold()] = area._replace(sheet=title)
+        return found
 
-    def meaning(self, place: Place, name: str) -> str | None:
-        """The formula that a name, or a reference to a table's columns, stands for in a formula at `place`.
+    def _related_to(self, sheet: str, kind: str) -> list[str]:
+        return [member for _, its, member in self.package.relations(self.parts[sheet]) if its == kind]
 
-        None where it is unknown, or a name whose meaning depends on the place.
-        """
-        sheet, row, _ = place
-        named = named_part(name)
-        if named is not None and named[0] in self._tables:
-            table = self._tables[named[0]]
-            part = table.part(named[1], row if table.sheet == sheet else None)
-            return None if part is None else f"={part}"
-        own, _, plain = name.rpartition("!")
-        scope = self.title(own.strip("'")) if own else sheet
-        key = plain.casefold()
-        formula = self._names.get((scope, key)) or self._names.get((None, key))
-        return formula if formula is not None and _is_absolute(formula) else None
+    def _parts_of(self, member: str) -> list[Element]:
+        return elements(utf8(self.package.read(member), self.name)[0], self.name)
 
     def title(self, name: str | None) -> str | None:
-        """A sheet's name as it is written in the workbook."""
+        """A sheet's name as the workbook writes it, given in whatever case."""
         return None if name is None else self._by_folded_name.get(name.casefold())
 
-    def between(self, name: str) -> list[str]:
-        """The sheets that "Sheet" or "First:Last" means; none where there are no such."""
-        first, _, last = name.partition(":")
-        folded = [title.casefold() for title in self.all_sheets]
-        if name.casefold() in folded or not last:
-            titles = [name]
-        elif {first.casefold(), last.casefold()} <= set(folded):
-            i, j = sorted((folded.index(first.casefold()), folded.index(last.casefold())))
-            titles = self.all_sheets[i : j + 1]
-        else:
-            return []
-        return [title for found in titles if (title := self.title(found)) is not None]
+    # Cells and formulas
 
     def cell(self, place: Place) -> Cell:
         """A cell as it is now."""
         return self.sheets[place[0]].cell(place[1:])
 
-    def value(self, place: Place) -> Any:
-        """A cell's value as it is now; `NotComputable` where it is of an unusual kind."""
-        value = self.cell(place).value
-        if isinstance(value, Unreadable):
-            raise NotComputable(f"{self.text(place)} holds {value!r}")
-        return value
+    def put(self, place: Place, cell: Cell) -> None:
+        """Give a place another content."""
+        self.sheets[place[0]].cells[place[1:]] = cell
 
-    def calculated(
-        self, place: Place, formula: str, value_of: Callable[[Place], Any]
-    ) -> float | str | bool | CellError:
-        """What `formula` at `place` gives; `value_of` gives the values of cells, or raises `NotComputable`."""
-        sheet = place[0]
+    @property
+    def formulas(self) -> dict[Place, Cell]:
+        """The cells with formulas, or of array formulas, of all sheets."""
+        return {
+            (title, *at): cell
+            for title, sheet in self.sheets.items()
+            for at, cell in sheet.cells.items()
+            if cell.formula is not None or cell.array is not None
+        }
 
-        def title(name: str | None) -> str:
-            found = sheet if name is None else self.title(name)
-            if found is None:
-                raise NotComputable(f"there is no sheet {name}")
-            return found
+    def meaning(self, sheet: str, name: str) -> str | None:
+        """The formula that a defined name stands for on `sheet`; None if it is unknown or depends on the cell."""
+        own, _, plain = name.rpartition("!")
+        scope, key = self.title(own.strip("'")) if own else sheet, plain.casefold()
+        formula = self._names.get((scope, key)) or self._names.get((None, key))
+        return formula if formula is not None and _is_absolute(formula) else None
 
-        surroundings = Surroundings(
-            lambda name, row, column: value_of((title(name), row, column)),
-            at=place[1:],
-            extent=lambda name: self.extent(title(name)),
-            name=lambda name: self.meaning(place, name),
-        )
-        return calculate(formula, surroundings)
-
-    def extent(self, sheet: str) -> tuple[int, int]:
+    def extent(self, sheet: str) -> At:
         """The last row and the last column of `sheet` with content."""
-        key = sheet, len(self.sheets[sheet].cells)  # which grows where rows are added; emptied cells do no harm
+        key = sheet, len(self.sheets[sheet].cells)  # which grows when rows are added; emptied cells do no harm
         if key not in self._extents:
             self._extents[key] = self.sheets[sheet].extent
         return self._extents[key]
 
+    def ranges_ending_at(self, sheet: str, last: int) -> list[str]:
+        """The names, charts, tables and formulas that refer to several rows of `sheet` of which `last` is the last."""
+
+        def ends_there(area: Reference | None, own: str = "") -> bool:
+            return area is not None and area.top < area.bottom == last and sheet == (self.title(area.sheet) or own)
+
+        found = [
+            f"the name {name}"
+            for (_, name), formula in self._names.items()
+            if name != "_xlnm._filterdatabase" and any(map(ends_there, areas_in(formula)))
+        ]
+        for member in self.package.names:
+            if member.startswith("xl/charts/") and member.endswith(".xml"):
+                series = [reference(e.text.strip()) for e in self._parts_of(member) if e.name == "f"]
+                found += [f"the chart {member}"] * any(map(ends_there, series))
+        found += [f"the table {name}" for name, area in self.tables.items() if ends_there(area)]
+        for title, cells in self.sheets.items():
+            for at, cell in cells.cells.items():
+                if cell.formula is not None and any(ends_there(area, title) for area in areas_in(cell.formula)):
+                    found.append(self.text((title, *at)))
+        return found
+
     @staticmethod
     def text(place: Place) -> str:
         """E.g. ``Coordinates!B3``."""
-        from openpyxl.utils import get_column_letter
+        return f"{place[0]}!{cell_name(place[1:])}"
 
-        return f"{place[0]}!{get_column_letter(place[2])}{place[1]}"
+    # Writing
 
     @property
     def changed(self) -> list[Place]:
         """The cells that are not as they were read."""
-        return [(title, *at) for title, sheet in self.sheets.items() for at in sheet.changed]
+        return [(title, *at) for title, sheet in self.sheets.parsed.items() for at in sheet.changed]
 
     def to_bytes(self) -> bytes:
-        """The file: the same bytes if no cell has changed; else with the changes, to be recalculated when opened."""
-        changed = {title: sheet for title, sheet in self.sheets.items() if sheet.changed}
+        """The workbook with the changed cells; spreadsheet programs will recalculate it when they open it."""
+        changed = {title: sheet for title, sheet in self.sheets.parsed.items() if sheet.changed}
         if not changed:
-            return self.package.to_bytes()
-        for title, sheet in changed.items():
-            self.package.replace(self.parts[title], sheet.to_bytes())
-        self.package.replace(self._part, self._back(self._recalculated_on_load()))
-        if any(sheet.formulas_moved for sheet in changed.values()):
-            while self._calc_chain:
-                self.package.remove(self._calc_chain.pop(), self._part)
-        return self.package.to_bytes()
+            return self.package.content
+        parts = {self.parts[title]: sheet.to_bytes() for title, sheet in changed.items()}
+        parts[self._part] = self._to_encoding(self._recalculated_on_load())
+        removed = []
+        if any(sheet.formulas_added_or_removed for sheet in changed.values()):
+            removed = [self._related["calcChain"]] if "calcChain" in self._related else []
+        return self.package.with_parts(parts, removed, self._part)
 
     def _recalculated_on_load(self) -> bytes:
         root = self._elements[0]
@@ -278,57 +274,12 @@ class WorkbookXml:
             if e.name == "calcPr" and e.parent is root:
                 tag = with_attribute(self._data[e.start : e.inner], "fullCalcOnLoad", "1")
                 return spliced(self._data, [(e.start, e.inner, tag)])
-        before = [e for e in self._elements if e.parent is root and e.name in _BEFORE_CALC_PR]
+        at = max(e.end for e in self._elements if e.parent is root and e.name in _BEFORE_CALC_PR)
         prefix = self._data[root.start + 1 : root.inner].split(b"workbook", 1)[0]
-        at = max(e.end for e in before)
         return spliced(self._data, [(at, at, b'<%bcalcPr fullCalcOnLoad="1"/>' % prefix)])
-
-    def ranges_ending_at(self, sheet: str, last: int) -> list[str]:
-        """What refers to several rows of `sheet`, `last` being the last of them.
-
-        Defined names, charts, tables and the cells of formulas.
-        """
-
-        def ends_there(area: Reference | None, own: str) -> bool:
-            if area is None or not area.top < area.bottom == last:
-                return False
-            return sheet in (self.between(area.sheet) if area.sheet else [own])
-
-        found = [
-            f"the name {name}"
-            for (_, name), formula in self._names.items()
-            if name != "_xlnm._filterdatabase" and any(ends_there(area, "") for area in areas_in(formula))
-        ]
-        for member in self.package.names:
-            if member.startswith("xl/charts/") and member.endswith(".xml"):
-                parts = self._parts_of(member)
-                if any(e.name == "f" and ends_there(reference(e.text.strip()), "") for e in parts):
-                    found.append(f"the chart {member}")
-        found += [f"the table {table.name}" for table in self._tables.values() if ends_there(table.area, "")]
-        for title, cells in self.sheets.items():
-            for at, cell in cells.cells.items():
-                if cell.formula is not None and any(ends_there(area, title) for area in areas_in(cell.formula)):
-                    found.append(self.text((title, *at)))
-        return found
-
-    def _parts_of(self, member: str) -> list[Element]:
-        return elements(utf8(self.package.read(member), self.name)[0], self.name)
-
-
-def areas_in(formula: str) -> list[Reference]:
-    """The areas that a formula names."""
-    return [area for text in _operands(formula) if (area := reference(text)) is not None]
-
-
-def _operands(formula: str) -> list[str]:
-    try:
-        tokens = tokens_of(formula)
-    except NotComputable:
-        return []
-    return [token.value for token in tokens if token.type == "OPERAND" and token.subtype == "RANGE"]
 
 
 def _is_absolute(formula: str) -> bool:
     """Whether the formula of a name means the same wherever the name is used: ``Main!$B$3``, not ``Main!B3``."""
-    cells = [text.rpartition("!")[2] for text in _operands(formula) if reference(text) is not None]
+    cells = [text.rpartition("!")[2] for text in operands(formula) if reference(text) is not None]
     return all(text.count("$") == len(re.findall(r"[A-Za-z]+|\d+", text)) for text in cells)

@@ -1,4 +1,4 @@
-"""`write_system`: a `PinholeSystem` into a copy of a geometry workbook, of which nothing else changes."""
+"""`write_system`: a `PinholeSystem` into a copy of a geometry workbook in which nothing else changes."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ import warnings
 from collections import defaultdict
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -15,14 +16,13 @@ from ..files import replacing
 from ..geometry.system import PinholeSystem
 from ..recording import recorded_warnings
 from ..validation import instance
-from . import libreoffice
 from .book import Book
 from .column_map import ColumnMap, column_map
-from .edit import Edit, several, values_of
-from .new_workbook import new_workbook, numbers_of
-from .quantities import DIMENSIONS, POSITION
-from .reader import read
-from .recalculate import Recalculated, recalculate
+from .edit import Edit, several
+from .new_workbook import new_workbook
+from .quantities import QUANTITIES, TYPED
+from .reader import Reading, read
+from .recalculate import Recalculation
 from .workbook_xml import KINDS, Place, WorkbookXml
 
 
@@ -36,18 +36,16 @@ class WrittenWorkbook:
     changed : tuple of str
         The cells (``"Coordinates!B3"``) whose numbers or formulas are not the template's.
     recalculated : dict
-        Cell with a formula that depends on these, or stored no value in a sheet that changes -> who calculated the
-        value it stores now: "formulas" (mphDRR's own evaluator) or "LibreOffice".
+        Cell -> the value that its formula stores now, of each that depends on these or stored no value before.
     cleared : tuple of str
-        Cells that depend on these and store no value now, because neither could calculate it.
+        The cells whose formulas store no value now, because they cannot be calculated here.
     columns : ColumnMap or None
-        The column map that the new file is read by, its rows being those of the modules now; None where its headings
-        are understood.
+        The column map of the new file, with the modules' rows; None if its headings are understood without one.
     """
 
     path: Path
     changed: tuple[str, ...]
-    recalculated: dict[str, str]
+    recalculated: dict[str, Any]
     cleared: tuple[str, ...]
     columns: ColumnMap | None = None
 
@@ -60,27 +58,25 @@ def write_system(
 ) -> WrittenWorkbook:
     """Write a scanner's geometry workbook.
 
-    Into a copy of `template` only what differs is written: its modules are found by their numbers, their cells
-    as by `read_system`. Formulas stay as long as they give the system's numbers (to 1e-9, relative). Every formula
-    of the workbook that depends on a changed cell stores its new value, calculated by `core.workbook.formulas`
-    or else, where it is installed, by LibreOffice; else it stores none, and the workbook is marked to be
-    recalculated when opened. In a sheet that changes, formulas that stored no value get theirs too. All other parts
-    of the file - sheets, formats, charts, images, comments, macros - are byte for byte the template's; if nothing
-    differs, the whole file is.
+    In a copy of `template`, only the cells that differ are written; modules are found by their numbers, and cells as by
+    `read_system`. A formula stays if it still gives the system's number (to 1e-9, relative). Each formula that depends on
+    a changed cell stores its new value if `core.workbook.formulas` can calculate it, otherwise none, and the workbook is
+    marked to be recalculated when it is opened. All other parts of the file - sheets, formats, charts, images, comments,
+    macros - stay byte for byte the template's; if nothing differs, the whole file does.
 
     Removed modules leave empty rows, added ones come below the last with copies of its formulas, and modules in
-    another order take their rows' contents along.
+    another order take the contents of their rows along.
 
     Parameters
     ----------
     system
-        The scanner. Of a workbook with a column of modules' numbers, these are compared; else their order is.
+        The scanner. If the workbook has no column of modules' numbers, its modules are found by their order.
     path
-        The file to write, .xlsx or .xlsm as the template; it may be the template, which is then replaced.
+        The file to write, .xlsx or .xlsm like the template; it may be the template, which is then replaced.
     template
-        The workbook to change, read anew. Default: a new one in the users' layout, sheets Main and Coordinates.
+        The workbook to copy. Default: a new one in the users' layout, with the sheets Main and Coordinates.
     columns
-        The template's column map, or the path of one. Default: the one that the system was read by, if it was.
+        The template's column map, or the path of one. Default: the one that the system was read by, if any.
 
     Returns
     -------
@@ -103,25 +99,37 @@ def write_system(
     suffix = target.suffix.lower()
     if suffix not in KINDS:
         raise InputError(f"{target}: expected a name ending in {' or '.join(KINDS)}")
-    if template is None:
-        if suffix != ".xlsx":
-            raise InputError(f"{target}: a workbook without a template has no macros, expected a name ending in .xlsx")
-        workbook = new_workbook(system)
-        cells = {(title, *at): cell for title, sheet in workbook.sheets.items() for at, cell in sheet.cells.items()}
-        formulas = [place for place, cell in cells.items() if cell.formula is not None]
-        required = {place: number for place, number in numbers_of(system).items() if cells[place].formula is not None}
-        return _saved(workbook, system, target, recalculate(workbook, formulas, required), [])
-    said = column_map(columns, template) if columns is not None else system.source.columns if system.source else None
-    book = Book(template)
-    workbook = book.workbook
-    _refuse_other_kind(workbook, target, suffix)
-    with recorded_warnings():  # said when the system was read
-        reading = read(book, said)
-    edit = Edit(system, reading, workbook)
-    edit.apply()
-    edited = workbook.changed
-    result = recalculate(workbook, edit.changed, edit.required, edit.derived) if edit.changed else Recalculated()
-    return _saved(workbook, system, target, result, edited, edit.numbered, edit.written_columns() if said else None)
+    if template is None and suffix != ".xlsx":
+        raise InputError(f"{target}: a workbook without a template has no macros, expected a name ending in .xlsx")
+    said: ColumnMap | None = None
+    if template is not None and columns is not None:
+        said = column_map(columns, template)
+    elif template is not None and system.source is not None:
+        said = system.source.columns
+    with replacing(target) as temporary:
+        if template is None:
+            temporary.write_bytes(new_workbook(system))
+        book = Book(temporary if template is None else template)
+        workbook = book.workbook
+        _refuse_other_kind(workbook, target, suffix)
+        name = "the new workbook" if template is None else workbook.name
+        with recorded_warnings():  # they were given when the system was read
+            reading = read(book, said) if template is not None else _read_written(temporary, name, None)
+        edit = Edit(system, reading, workbook)
+        edited = [] if template is None else workbook.changed
+        to_recalculate = workbook.formulas if template is None else edit.changed
+        recalculated = Recalculation(workbook, to_recalculate, edit.required, edit.expected)
+        temporary.write_bytes(workbook.to_bytes())
+        own = edit.column_map(said) if said is not None else None
+        _refuse_other_system(_read_written(temporary, name, own), name, system, edit.numbered)
+    _warn_of_formulas(workbook, recalculated)
+    return WrittenWorkbook(
+        path=target.absolute(),
+        changed=tuple(workbook.text(place) for place in dict.fromkeys([*edited, *recalculated.replaced])),
+        recalculated={workbook.text(place): value for place, value in sorted(recalculated.values.items())},
+        cleared=tuple(workbook.text(place) for place in sorted(recalculated.cleared)),
+        columns=own,
+    )
 
 
 def _refuse_other_kind(workbook: WorkbookXml, target: Path, suffix: str) -> None:
@@ -133,50 +141,29 @@ def _refuse_other_kind(workbook: WorkbookXml, target: Path, suffix: str) -> None
         raise InputError(f"{target}: the template {workbook.name} {has}, expected a name ending in {kind}")
 
 
-def _saved(
-    workbook: WorkbookXml,
-    system: PinholeSystem,
-    target: Path,
-    result: Recalculated,
-    edited: list[Place],
-    numbered: bool = True,
-    columns: ColumnMap | None = None,
-) -> WrittenWorkbook:
-    _warn_of_formulas(workbook, result)
-    content = workbook.to_bytes()
-    with replacing(target) as temporary:
-        temporary.write_bytes(content)
-        _refuse_unlike(temporary, workbook.name, system, numbered, columns)
-    texts = [workbook.text(place) for place in dict.fromkeys([*edited, *result.replaced])]
-    return WrittenWorkbook(
-        path=target.absolute(),
-        changed=tuple(texts),
-        recalculated={workbook.text(place): by for place, by in sorted(result.by.items())},
-        cleared=tuple(workbook.text(place) for place in sorted(result.cleared)),
-        columns=columns,
-    )
+def _read_written(path: Path, name: str, columns: ColumnMap | None) -> Reading:
+    """A written workbook as it will be read; messages call it `name`."""
+    try:
+        with recorded_warnings():
+            return read(Book(path), columns)
+    except InputError as error:
+        why = str(error).replace(str(path), name).replace(path.name, name)
+        raise InputError(f"{name} cannot hold this system, with it: {why}") from error
 
 
-def _refuse_unlike(written: Path, name: str, system: PinholeSystem, numbered: bool, columns: ColumnMap | None) -> None:
-    """Refuse a workbook that is not read as `system`: a template may be laid out so that it cannot hold it."""
-    with recorded_warnings():
-        try:
-            reading = read(Book(written), columns)
-        except InputError as error:
-            why = str(error).replace(str(written), name).replace(written.name, name)
-            raise InputError(f"{name} cannot hold this system, with it: {why}") from error
-    back = reading.system
-    if len(back) != len(system) or (numbered and not np.array_equal(back.numbers, system.numbers)):
+def _refuse_other_system(back: Reading, name: str, system: PinholeSystem, numbered: bool) -> None:
+    """Refuse a workbook that would be read as another system: a template may be laid out so that it cannot hold it."""
+    if len(back.system) != len(system) or (numbered and not np.array_equal(back.system.numbers, system.numbers)):
         raise InputError(
             f"{name} cannot hold this system: its modules {several(system.numbers)} would be read as "
-            f"{several(back.numbers)}"
+            f"{several(back.system.numbers)}"
         )
-    for quantity in (*POSITION, *DIMENSIONS, "l"):
-        wanted, got = values_of(system, quantity), values_of(back, quantity)
+    for quantity in TYPED:
+        wanted, got = (QUANTITIES[quantity].of(s) for s in (system, back.system))
         differing = np.flatnonzero(np.abs(got - wanted) > 2e-9 * np.abs(wanted))
         if len(differing):
             i = int(differing[0])
-            column = reading.layout.columns.get(quantity)
+            column = back.layout.columns.get(quantity)
             why = f": {column.place(i)} is read for all modules" if column is not None and column.shared else ""
             raise InputError(
                 f"{name} cannot hold this system: {quantity} = {wanted[i]:.9g} mm of module {system.numbers[i]} would be "
@@ -184,28 +171,25 @@ def _refuse_unlike(written: Path, name: str, system: PinholeSystem, numbered: bo
             )
 
 
-def _warn_of_formulas(workbook: WorkbookXml, result: Recalculated) -> None:
+def _warn_of_formulas(workbook: WorkbookXml, recalculated: Recalculation) -> None:
     by_column: dict[tuple[str, int], list[Place]] = defaultdict(list)
-    for place in sorted(result.replaced):
+    for place in sorted(recalculated.replaced):
         by_column[place[0], place[2]].append(place)
-    for places in by_column.values():
-        warnings.warn(
-            f"{workbook.name}: {_cell_and_more(workbook, places)}: the formula was replaced by the system's number "
-            f"({result.replaced[places[0]]})",
-            InputWarning,
-            stacklevel=4,
+    messages = [
+        f"{_and_more(workbook, places)}: the formula was replaced by the system's number "
+        f"({recalculated.replaced[places[0]]})"
+        for places in by_column.values()
+    ]
+    if recalculated.cleared:
+        places = list(recalculated.cleared)
+        messages.append(
+            f"{_and_more(workbook, places)}: the formula's new value could not be calculated "
+            f"({recalculated.cleared[places[0]]}); opening the workbook in Excel or LibreOffice and saving it stores the "
+            "value"
         )
-    if result.cleared:
-        places = list(result.cleared)  # causes before effects
-        missing = "" if libreoffice.program() else "; LibreOffice, which may know it, is not installed"
-        warnings.warn(
-            f"{workbook.name}: {_cell_and_more(workbook, places)}: the formula's new value could not be "
-            f"calculated ({result.cleared[places[0]]}{missing}); opening the workbook in Excel or LibreOffice and saving "
-            "it stores the value",
-            InputWarning,
-            stacklevel=4,
-        )
+    for message in messages:
+        warnings.warn(f"{workbook.name}: {message}", InputWarning, stacklevel=3)
 
 
-def _cell_and_more(workbook: WorkbookXml, places: list[Place]) -> str:
+def _and_more(workbook: WorkbookXml, places: list[Place]) -> str:
     return workbook.text(places[0]) + (f" and {len(places) - 1} more" if len(places) > 1 else "")

@@ -1,4 +1,4 @@
-"""XML that is changed in a few places and otherwise kept byte for byte."""
+"""XML elements and the places of their bytes, so that a few can be replaced and all others kept."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ _DECLARED = re.compile(rb"""<\?xml[^>]*?encoding\s*=\s*["']([\w.-]+)["']""")
 
 
 class Element:
-    """An element and where its bytes are.
+    """An element and the place of its bytes.
 
     Attributes
     ----------
@@ -23,12 +23,13 @@ class Element:
         Without prefix.
     namespace : str
     attributes : dict
-        Those with a prefix are called "namespace name".
+        The key of one with a prefix is "namespace name".
     parent : Element or None
     start, inner, close, end : int
-        Where the start tag begins and ends and where the end tag does; all of an empty element's are the tag's.
+        The offsets of the start tag, of the content, of the end tag, and of what follows. In an empty element without
+        end tag, the last three are the same.
     text : str
-        Of the element itself, without that of elements inside.
+        Its own text, without that of elements inside.
     """
 
     __slots__ = ("attributes", "close", "end", "inner", "name", "namespace", "parent", "start", "text")
@@ -42,7 +43,7 @@ class Element:
 
 
 def utf8(data: bytes, name: str) -> tuple[bytes, Callable[[bytes], bytes]]:
-    """A part's text as UTF-8 without a mark at its beginning, and the function that brings it back."""
+    """A part as UTF-8 without byte order mark, and the function that brings new text back to the part's encoding."""
     declared = _DECLARED.match(data)
     encodings = {codecs.BOM_UTF8: "utf-8", codecs.BOM_UTF16_LE: "utf-16-le", codecs.BOM_UTF16_BE: "utf-16-be"}
     mark = next((mark for mark in encodings if data.startswith(mark)), b"")
@@ -56,7 +57,7 @@ def utf8(data: bytes, name: str) -> tuple[bytes, Callable[[bytes], bytes]]:
 
 
 def elements(data: bytes, name: str) -> list[Element]:
-    """All elements of UTF-8 `data` in the order of their beginnings; `InputError`, calling it `name`, if malformed."""
+    """All elements of UTF-8 `data` in document order; `InputError`, which names `name`, if it is malformed."""
     parser = expat.ParserCreate("utf-8", " ")
     parser.buffer_text = True
     found: list[Element] = []
@@ -80,7 +81,7 @@ def elements(data: bytes, name: str) -> list[Element]:
         opened[-1].text += characters
 
     def doctype(*_: Any) -> None:
-        raise InputError(f"{name}: has a document type, which workbooks have not")
+        raise InputError(f"{name}: has a document type, expected none in a workbook")
 
     parser.StartElementHandler, parser.EndElementHandler = start, end
     parser.CharacterDataHandler, parser.StartDoctypeDeclHandler = text, doctype
@@ -92,7 +93,7 @@ def elements(data: bytes, name: str) -> list[Element]:
 
 
 def spliced(data: bytes, changes: list[tuple[int, int, bytes]]) -> bytes:
-    """`data` with each (start, end, new bytes) put in; those of one place in the list's order."""
+    """`data` with the bytes from start to end replaced by others, for each of `changes`: (start, end, new bytes)."""
     pieces, at = [], 0
     for start, end, new in sorted(changes, key=lambda change: change[:2]):
         pieces += [data[at:start], new]
@@ -101,7 +102,7 @@ def spliced(data: bytes, changes: list[tuple[int, int, bytes]]) -> bytes:
 
 
 def with_attribute(tag: bytes, name: str, value: str | None) -> bytes:
-    """A start tag with the unprefixed attribute set; None takes it out."""
+    """A start tag with another value of an attribute without prefix; None removes the attribute."""
     attribute = re.compile(rb"""\s+%b\s*=\s*("[^"]*"|'[^']*')""" % name.encode())
     if value is None:
         return attribute.sub(b"", tag, count=1)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import pickle
 import warnings
 from collections.abc import Callable
@@ -17,6 +16,7 @@ from mphdrr.core.cli import main
 from mphdrr.core.errors import InputError
 from mphdrr.core.workbook.quantities import LENGTH_UNITS
 
+from .nasty.case import sample
 from .test_workbook import CENTERS, assert_plain, plain, saved
 from .test_workbook import _typed as typed
 from .test_workbook_strict import READ, REFUSED
@@ -254,10 +254,7 @@ def test_a_workbook_is_written_back_by_its_map(tmp_path):
     system = mph.read_system(path, columns=mph.ColumnMap.from_toml(MAP))
     same = mph.write_system(system, tmp_path / "same.xlsx", path)
     assert same.path.read_bytes() == path.read_bytes()
-    assert same.columns == dataclasses.replace(
-        system.source.columns,
-        tables=tuple(dataclasses.replace(t, header_row=None) for t in system.source.columns.tables),
-    )
+    assert same.columns == system.source.columns
     thinner = by_design(changed(system, pinhole_diameter=np.array([2.0, 2.1, 2.2, 2.3])))
     written = mph.write_system(thinner, tmp_path / "thinner.xlsx", path)
     assert {"Main!B3", "Main!B4", "Main!B5", "Coordinates!G3"} <= set(written.changed)
@@ -319,7 +316,7 @@ def test_what_one_row_for_all_cannot_hold_is_refused_with_its_cell(tmp_path):
 # Drafts
 
 
-@pytest.mark.parametrize("kind", READ)
+@pytest.mark.parametrize("kind", sample(READ, 2))
 def test_the_draft_of_what_is_understood_says_the_same(kind, tmp_path):
     book = plain()
     READ[kind](book["Main"], book["Coordinates"])
@@ -338,7 +335,7 @@ def test_the_draft_of_the_real_workbook_says_the_same(workbook, tmp_path):
     assert draft.questions == ()
 
 
-@pytest.mark.parametrize("kind", REFUSED)
+@pytest.mark.parametrize("kind", sample(REFUSED, 6))
 def test_what_is_refused_has_a_draft_with_questions(kind, tmp_path):
     edit, _ = REFUSED[kind]
     book = plain()

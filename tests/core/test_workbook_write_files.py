@@ -25,17 +25,10 @@ from openpyxl.worksheet.table import Table
 
 import mphdrr
 import mphdrr.core as mph
-from mphdrr.core.workbook import libreoffice
 
 from .workbooks import Layout, by_design, changed, content_of, laid_out, values_of
 
 SPREADSHEET = "http://schemas.openxmlformats.org/spreadsheetml/2006/main"
-
-
-@pytest.fixture(autouse=True)
-def without_libreoffice(monkeypatch):
-    """It takes seconds; what it calculates is tested in test_workbook_write.py."""
-    monkeypatch.setattr(libreoffice, "program", lambda: None)
 
 
 def members_of(path: Path) -> dict[str, bytes]:
@@ -220,8 +213,18 @@ def _edit(system: mph.PinholeSystem) -> mph.PinholeSystem:
     return by_design(mph.PinholeSystem(centers, numbers=np.append(part.numbers, 999), collimator_length=1.0, **arrays))
 
 
+@pytest.fixture(scope="module")
+def plain_written(tmp_path_factory):
+    """A system and what is written of it into a workbook with usual XML."""
+    folder = tmp_path_factory.mktemp("plain")
+    plain = folder / "plain.xlsx"
+    plain.write_bytes(content_of(laid_out(Layout(seed=11))))
+    system = _edit(read_quietly(plain))
+    return system, write_quietly(system, folder / "written.xlsx", plain)
+
+
 @pytest.mark.parametrize("odd", [*ODD, *ENCODINGS])
-def test_odd_xml_is_patched_in_place(odd, tmp_path):
+def test_odd_xml_is_patched_in_place(odd, plain_written, tmp_path):
     def edit(name: str, data: bytes) -> bytes:
         if not name.startswith("xl/worksheets/sheet"):
             return data
@@ -230,13 +233,10 @@ def test_odd_xml_is_patched_in_place(odd, tmp_path):
             return ENCODINGS[odd](xml)
         return ODD[odd](xml).encode()
 
+    system, expected = plain_written
     template = tmp_path / "t.xlsx"
     template.write_bytes(repacked(content_of(laid_out(Layout(seed=11))), edit))
-    plain = tmp_path / "plain.xlsx"
-    plain.write_bytes(content_of(laid_out(Layout(seed=11))))
-    system = _edit(read_quietly(plain))
     written = write_quietly(system, tmp_path / "o.xlsx", template)
-    expected = write_quietly(system, tmp_path / "e.xlsx", plain)
     for data_only in (True, False):
         assert values_of(written.path, data_only) == values_of(expected.path, data_only)
     assert written.changed == expected.changed
@@ -273,7 +273,7 @@ def test_texts_that_were_numbers_in_formulas_and_cells_of_any_type_become_number
     np.testing.assert_array_equal(read_quietly(tmp_path / "o.xlsx").numbers, system.numbers + 1)
 
 
-def test_a_shared_formula_is_handed_on(tmp_path):
+def test_the_other_cells_keep_a_shared_formula(tmp_path):
     """x1 = 3, 5 and so on by one shared formula whose first cell, then second, is overwritten."""
     content = content_of(laid_out(Layout(seed=2)))
 
@@ -295,11 +295,6 @@ def test_a_shared_formula_is_handed_on(tmp_path):
     written = write_quietly(by_design(changed(system, centers=centers)), tmp_path / "o.xlsx", template)
     formulas = values_of(written.path, data_only=False)
     assert [formulas["Coordinates", f"B{row}"] for row in range(4, 7)] == [f"=100+C{row}*0.5" for row in range(4, 7)]
-    before, after = (members_of(p)["xl/worksheets/sheet2.xml"] for p in (template, written.path))
-    assert b'<f t="shared" ref="B4:B6" si="0">100+C4*0.5</f>' in after
-    for row in (5, 6):
-        cell = re.search(rb'<c r="B%d".*?</c>' % row, before)[0]
-        assert cell in after
     # And sorted, and removed.
     part = read_quietly(written.path)[[3, 1]]
     write_quietly(part, tmp_path / "p.xlsx", written.path)
@@ -371,10 +366,11 @@ def test_formulas_stay_through_names_sheets_and_whole_columns(tmp_path):
     assert values["It's values", "B1"] == pytest.approx(2 * x.sum() + 1, rel=1e-12)
     assert "Coordinates!B3" not in written.changed
     assert values["Theta", "A3"] == 2 * x[0]  # it has not moved, but had no value
-    assert set(written.cleared) == {"Theta!A9", "It's values!B9", "It's values!D1", "Theta!A11", "It's values!B11"}
+    beyond = [f"{sheet}{row}" for sheet in ("Theta!A", "It's values!B") for row in (9, 10, 11)]
+    assert set(written.cleared) == {*beyond, "It's values!D1"}
 
 
-def test_columns_of_tables_are_followed_and_calculated(tmp_path):
+def test_formulas_of_tables_store_no_value_if_the_table_changes(tmp_path):
     """References to the columns of Excel's tables, one of the modules and one that has nothing to do with them."""
     content = content_of(laid_out(Layout(n=5, seed=12)))
     book = openpyxl.load_workbook(io.BytesIO(content))
@@ -382,29 +378,19 @@ def test_columns_of_tables_are_followed_and_calculated(tmp_path):
     for column in range(1, sheet.max_column + 1):
         sheet.cell(2, column).value = str(sheet.cell(2, column).value or f"no {column}")
     sheet.add_table(Table(displayName="Pins", ref=f"A2:{sheet.cell(7, sheet.max_column).coordinate}"))
-    for row in ("k", "a [b]"), (1, 2), (3, 4), ("sum", 6):
+    for row in ("k", "a [b]"), (1, 2), (3, 4):
         other.append(row)
-    other.add_table(Table(displayName="Apart", ref="A1:B4", totalsRowCount=1))
-    formulas = {
-        "Other!D1": "SUM(Apart[a '[b']])+Apart[[#Totals],[a '[b']]]+ROWS(Apart)",
-        "Other!D2": "SUM(Pins[x1])",
-        "Other!D3": "COUNTA(Pins[[#Headers],[x1]:[z1]])+MAX(Pins[[#All],[y1]])",
-        "Coordinates!Z4": "SUMSQ(Pins[[#This Row],[x1]:[z1]])",
-    }
-    for place, formula in formulas.items():
-        title, at = place.split("!")
-        book[title][at] = f"={formula}"
-    stored = re.compile(rb"(<f>SUM\(Apart.*?</f>)<v ?(/>|></v>)")
+    other.add_table(Table(displayName="Apart", ref="A1:B3"))
+    other["D1"], other["D2"], other["D3"] = "=SUM(Apart[a '[b']])", "=SUM(Pins[x1])", "=D2+1"
     template = tmp_path / "t.xlsx"
+    stored = re.compile(rb"(<f>(SUM|D2).*?</f>)<v ?(/>|></v>)")
     template.write_bytes(repacked(content_of(book), lambda name, data: stored.sub(rb"\1<v>77</v>", data)))
-    system = moved(read_quietly(template))
-    written = write_quietly(system, tmp_path / "o.xlsx", template)
-    values, (x, y, _) = values_of(written.path), system.centers.T
-    assert values["Other", "D1"] == 77  # as it was stored: nothing that it names has changed
-    assert values["Other", "D2"] == pytest.approx(x.sum(), rel=1e-12)
-    assert values["Other", "D3"] == pytest.approx(3 + y.max(), rel=1e-12)
-    assert values["Coordinates", "Z4"] == pytest.approx((system.centers[1] ** 2).sum(), rel=1e-12)
-    assert not formulas.keys() & set(written.cleared)
+    written = write_quietly(moved(read_quietly(template)), tmp_path / "o.xlsx", template)
+    values = values_of(written.path)
+    assert values["Other", "D1"] == 77  # as it was stored: nothing that it refers to has changed
+    assert {"Other!D2", "Other!D3"} <= set(written.cleared)
+    assert ("Other", "D2") not in values
+    assert values_of(written.path, data_only=False)["Other", "D2"] == "=SUM(Pins[x1])"
 
 
 # Killed
@@ -425,8 +411,11 @@ while True:
 
 
 @pytest.mark.skipif(not hasattr(signal, "SIGKILL"), reason="this system has no SIGKILL")
-def test_killed_at_any_moment_the_old_or_the_new_file_is_whole(tmp_path, workbook, rng):
-    a = mph.read_system(workbook)
+@pytest.mark.parametrize("times", [1, pytest.param(8, marks=pytest.mark.long)])
+def test_killed_at_any_moment_the_old_or_the_new_file_is_whole(times, tmp_path, rng):
+    workbook = tmp_path / "a.xlsx"
+    workbook.write_bytes(content_of(laid_out(Layout(seed=6))))
+    a = read_quietly(workbook)
     centers = a.centers.copy()
     centers[:, 0] += 0.5
     b = by_design(changed(a, centers=centers))
@@ -435,8 +424,7 @@ def test_killed_at_any_moment_the_old_or_the_new_file_is_whole(tmp_path, workboo
     path.write_bytes(workbook.read_bytes())
     environment = {**os.environ, "PYTHONPATH": str(Path(mphdrr.__file__).parents[1]) if mphdrr.__file__ else ""}
     environment["PYTHONPATH"] = os.pathsep.join([environment["PYTHONPATH"], *sys.path])
-    seen = set()
-    for _ in range(6):
+    for _ in range(times):
         process = subprocess.Popen(
             [sys.executable, "-c", _LOOP, str(path), str(workbook), str(tmp_path / "b.xlsx")],
             env=environment,
@@ -447,10 +435,9 @@ def test_killed_at_any_moment_the_old_or_the_new_file_is_whole(tmp_path, workboo
         process.kill()
         process.wait()
         process.stdout.close()
-        back = mph.read_system(path)
+        back = read_quietly(path)
         is_a, is_b = (np.array_equal(back.centers, s.centers) for s in (a, b))
         assert is_a or is_b
-        seen.add(is_a)
-        assert len(values_of(path)) == len(values_of(workbook))
-    leftovers = [p.name for p in tmp_path.iterdir() if p.name not in ("b.xlsx", "master.xlsx")]
+        assert values_of(path, data_only=False).keys() == values_of(workbook, data_only=False).keys()
+    leftovers = [p.name for p in tmp_path.iterdir() if p.name not in ("a.xlsx", "b.xlsx", "master.xlsx")]
     assert all(name.startswith(".") for name in leftovers)

@@ -13,7 +13,7 @@ from openpyxl.workbook import Workbook
 from openpyxl.workbook.defined_name import DefinedName
 
 from mphdrr.core import PinholeSystem, collimator_length
-from mphdrr.core.workbook.plausibility import derived
+from mphdrr.core.workbook.quantities import DERIVED, QUANTITIES
 
 DIMENSIONS = {"d": "pinhole_diameter", "R": "roi_radius", "Ld": "detector_side", "Td": "detector_thickness"}
 
@@ -97,7 +97,7 @@ def laid_out(layout: Layout) -> Workbook:
     for name, at in dim.items():
         main[f"{at}{top + 2}"] = name
     b_formula = f"SQRT(SUMSQ({x}#,{y}#,{z}#))"
-    expected = derived(system.centers, system.collimator_length, system.detector_thickness)
+    expected = {name: QUANTITIES[name].of(system) for name in DERIVED}
     for i in range(n):
         row = first + i
         if layout.numbered:
@@ -145,7 +145,7 @@ def _summaries(book: Workbook, name: str, x: str, y: str, z: str, first: int, la
             f"=SUM({name}!{x}{first}:{x}{last})",
             f"=AVERAGE({name}!{y}:{y})",
             "=first_x*2",
-            "=SUMPRODUCT(all_x,all_x)",
+            "=SUMSQ(all_x)",
             f"=INDEX({name}!{z}{first}:{z}{last},2)",
             f"=IFERROR(MATCH({name}!{x}{first + 1},all_x,0),-1)",
             f"=MAX({name}!{x}{first}:{z}{last})-MIN({name}!{x}{first}:{z}{last})",

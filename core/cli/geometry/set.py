@@ -78,9 +78,7 @@ def _run(arguments: argparse.Namespace) -> None:
 
 
 def _summary(written: WrittenWorkbook) -> str:
-    by = list(written.recalculated.values())
-    counts = [f"{len(written.changed)} cells changed"]
-    counts += [f"{by.count(who)} recalculated by {who}" for who in dict.fromkeys(by)]
+    counts = [f"{len(written.changed)} cells changed", f"{len(written.recalculated)} recalculated"]
     if written.cleared:
         counts.append(f"{len(written.cleared)} without a value")
     return f"{written.path}: {', '.join(counts)}"

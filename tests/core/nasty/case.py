@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import inspect
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -94,6 +94,13 @@ def write(case: Case, folder: Path) -> Path:
     else:
         by_hand(case.make(), path)
     return path
+
+
+def sample(names: Iterable[str], every: int) -> list[Any]:
+    """Parameters for pytest: every so many of the names, evenly spread, in the short run, the rest in the long one."""
+    return [
+        pytest.param(name, marks=() if i % every == 0 else pytest.mark.long, id=name) for i, name in enumerate(names)
+    ]
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""LibreOffice, where it is installed, as the calculator of formulas that are beyond `formulas.py`."""
+"""LibreOffice, where it is installed: an independent calculator of whole workbooks."""
 
 from __future__ import annotations
 

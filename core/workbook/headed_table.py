@@ -1,0 +1,265 @@
+"""A table as a sheet's headings describe it: which columns it has, and which rows hold modules."""
+
+from __future__ import annotations
+
+import re
+from collections import defaultdict
+from dataclasses import dataclass
+from functools import cached_property
+
+from .book import HEADING_ROWS, Book, Sheet
+from .cells import module_number
+from .formulas import areas_in
+from .headings import Heading, heading_of, is_label_heading, is_number_heading, plain, unit_of
+from .layout import Table
+from .quantities import DIMENSIONS, POSITION, QUANTITIES, TYPED
+from .sheet_xml import At
+
+SCANNER_SHEETS = frozenset(("coordinates", "main"))
+"""Sheets that hold the scanner in the users' workbooks."""
+OTHER_SHEETS = frozenset(("mdsl cloud import", "theta", "values", "design table"))
+"""Sheets that users' workbooks have beside these, whatever they hold."""
+IGNORED_HEADINGS = frozenset(("s", "3d slope"))
+"""Headings in the users' workbooks whose columns are not read."""
+
+_ROWS_APART = 2
+"""A row of symbols and a row of descriptions that are further apart do not belong together."""
+_SUMMARY = re.compile(r"\b(SUM|AVERAGE|MEAN|MEDIAN|MIN|MAX|COUNT|COUNTA|STDEV|VAR|SUBTOTAL|AGGREGATE)[.SP]*\(", re.I)
+_NUMERIC = re.compile(r"[\d.,eE+\-\s]+")
+
+
+@dataclass(eq=False)
+class HeadedTable:
+    """A sheet with headings that are understood, and what is under them.
+
+    Attributes
+    ----------
+    sheet : Sheet
+    headings : dict
+        Column -> {row: what the heading there says}.
+    """
+
+    sheet: Sheet
+    headings: dict[int, dict[int, Heading]]
+
+    # Headings
+
+    @cached_property
+    def first_heading(self) -> int:
+        """The first row with a heading."""
+        return min(row for said in self.headings.values() for row in said)
+
+    @cached_property
+    def last_heading(self) -> int:
+        """The last row with a heading."""
+        return max(row for said in self.headings.values() for row in said)
+
+    @cached_property
+    def first_row(self) -> int:
+        """The first row below with something other than text under a heading."""
+        below = ((row, c) for row, c in sorted(self.sheet.cells) if row > self.last_heading and c in self.headings)
+        return next((row for row, column in below if is_number(self.sheet, row, column)), self.last_heading + 1)
+
+    @cached_property
+    def head(self) -> dict[At, str]:
+        """The texts from the first row of headings down to the first module, row by row."""
+        return {at: text for at, text in self.sheet.texts.items() if self.first_heading <= at[0] < self.first_row}
+
+    @cached_property
+    def columns(self) -> dict[str, tuple[int, str]]:
+        """Quantity -> its first column, and the unit."""
+        found: dict[str, tuple[int, str]] = {}
+        for column in sorted(self.headings):
+            quantity = self.quantity(column)
+            units = [*self.units(column), *QUANTITIES[quantity].units]
+            found.setdefault(quantity, (column, units[0]))
+        return found
+
+    def quantity(self, column: int) -> str:
+        """The quantity that the first heading of a column names."""
+        return next(iter(self.headings[column].values())).quantity
+
+    def units(self, column: int) -> dict[str, At]:
+        """The units that the headings of a column name, and a unit in a row of its own."""
+        found: dict[str, At] = {}
+        for at, text in self.head.items():
+            if at[1] == column:
+                heading = self.headings[column].get(at[0])
+                unit = unit_of(text) if heading is None else heading.unit
+                if unit is not None and unit in QUANTITIES[self.quantity(column)].units:
+                    found.setdefault(unit, at)
+        return found
+
+    def heading_place(self, column: int) -> str:
+        """The first heading of a column, as a cell's name."""
+        return self.sheet.place(next(iter(self.headings[column])), column)
+
+    # Other columns
+
+    @cached_property
+    def other_heads(self) -> dict[int, list[At]]:
+        """The texts at the head of the columns without a quantity."""
+        found: dict[int, list[At]] = defaultdict(list)
+        for at in self.head:
+            if at[1] not in self.headings:
+                found[at[1]].append(at)
+        return found
+
+    @cached_property
+    def numeric(self) -> set[int]:
+        """The columns with numbers in the modules' rows."""
+        rows = set(self.rows)
+        return {column for row, column in self.sheet.cells if row in rows and is_number(self.sheet, row, column)}
+
+    @property
+    def filled(self) -> list[str]:
+        """The typed quantities that have numbers here."""
+        return [name for name in TYPED if name in self.columns and self.columns[name][0] in self.numeric]
+
+    @property
+    def label_headings(self) -> dict[str, At]:
+        """The headings of other names of the modules."""
+        return {plain(text).casefold(): at for at, text in self.head.items() if is_label_heading(text)}
+
+    def unknown(self) -> list[tuple[At, str]]:
+        """The headings over numbers that are not understood."""
+        return [
+            (at, text)
+            for column, places in self.other_heads.items()
+            if column in self.numeric and column != self.label_column
+            for at in places
+            if not (is_number_heading(text := self.head[at]) or is_label_heading(text))
+            and plain(text).casefold() not in IGNORED_HEADINGS
+        ]
+
+    # Rows
+
+    @cached_property
+    def _key_columns(self) -> list[int]:
+        """The columns that make a row one of the table's: x1, y1, z1, or whatever typed quantities there are."""
+        names = POSITION if self.columns.keys() >= set(POSITION) else TYPED
+        return sorted(self.columns[name][0] for name in names if name in self.columns)
+
+    @cached_property
+    def number_columns(self) -> dict[int, At]:
+        """The columns headed as the modules' numbers, with something under the heading, and these headings."""
+        heads = {at[1]: at for at, text in self.head.items() if is_number_heading(text) and at[1] not in self.headings}
+        return {column: at for column, at in heads.items() if self._values(column)}
+
+    @cached_property
+    def label_column(self) -> int | None:
+        """The column of the modules' numbers or names: one that is headed so, or one without heading at the left."""
+        if self.number_columns:
+            return next(iter(self.number_columns))
+        left = [column for column in range(1, min(self.headings)) if column not in self.other_heads]
+        numbers = {c: [module_number(value) for value in self._values(c)] for c in left}
+        size = len(self._filled_rows)
+        whole = [c for c in left if 2 * len(set(numbers[c]) - {None}) > size]
+        named = [c for c in left if len(set(self._values(c))) == size > 1 and set(numbers[c]) == {None}]
+        return next(iter(whole + [c for c in named if all(type(value) is str for value in self._values(c))]), None)
+
+    def _values(self, column: int) -> list[object]:
+        values = (self.sheet.value(row, column) for row in self._filled_rows)
+        return [value for value in values if value is not None]
+
+    @cached_property
+    def _filled_rows(self) -> list[int]:
+        """The rows with anything but a note in the key columns, or with typed dimensions."""
+        typed = [self.columns[name][0] for name in (*DIMENSIONS, "l") if name in self.columns]
+        found: list[int] = []
+        for row in self.sheet.rows:
+            if row < self.first_row or row in self.summaries:
+                continue
+            values = [value for column in self._key_columns if (value := self.sheet.value(row, column)) is not None]
+            alone = len(values) == 1 and type(values[0]) is str and not _NUMERIC.fullmatch(values[0])
+            note = alone and len(self._key_columns) > 1 and row - 1 not in found[-1:]
+            dimensions = [self.sheet.value(row, c) for c in typed if self.sheet.formula(row, c) is None]
+            if (values and not note) or any(type(value) is float for value in dimensions):
+                found.append(row)
+        return found
+
+    @cached_property
+    def summaries(self) -> dict[int, At]:
+        """The rows whose key columns hold nothing but sums, means ... of their columns, and the first of these cells."""
+        found = {}
+        for row in self.sheet.rows:
+            filled = [(row, column) for column in self._key_columns if self.sheet.value(row, column) is not None]
+            if filled and row >= self.first_row and all(self._is_summary(*at) for at in filled):
+                found[row] = filled[0]
+        return found
+
+    def _is_summary(self, row: int, column: int) -> bool:
+        formula = self.sheet.formula(row, column)
+        if formula is None or not _SUMMARY.search(formula):
+            return False
+        return any(
+            area.top < area.bottom and area.left <= column <= area.right and area.sheet in (None, self.sheet.name)
+            for area in areas_in(formula)
+        )
+
+    @cached_property
+    def rows(self) -> tuple[int, ...]:
+        """The rows of the modules, including those with a number and nothing else: a blank is to be refused."""
+        if self.label_column is None:
+            return tuple(self._filled_rows)
+        filled = set(self._filled_rows)
+        return tuple(
+            row
+            for row in self.sheet.rows
+            if row in filled
+            or (
+                row >= self.first_row
+                and row not in self.summaries
+                and module_number(self.sheet.value(row, self.label_column)) is not None
+            )
+        )
+
+    def is_single(self, quantity: str) -> bool:
+        """Whether a dimension is given once for all modules, in the table's first row."""
+        column = self.columns[quantity][0]
+        filled = [row for row in self.rows if self.sheet.value(row, column) is not None]
+        return quantity in DIMENSIONS and filled == [*self.rows[:1]]
+
+    def table(self) -> Table:
+        """The table; `InputError` if the modules' numbers are unclear."""
+        return Table(self.sheet, self.columns, self.rows, self.label_column)
+
+
+def headed_tables(book: Book) -> tuple[dict[str, Sheet], list[HeadedTable]]:
+    """The sheets that may hold the scanner, and the tables in them, in the workbook's order.
+
+    `OTHER_SHEETS` are passed over, unless sheets other than `SCANNER_SHEETS` hold tables.
+    """
+    sheets = {name: sheet for name, sheet in book.sheets.items() if plain(name).casefold() not in OTHER_SHEETS}
+    tables = [table for sheet in sheets.values() if (table := headed_table(sheet)) is not None]
+    if all(plain(table.sheet.name).casefold() in SCANNER_SHEETS for table in tables if table.filled):
+        return sheets, tables
+    return book.sheets, [table for sheet in book.sheets.values() if (table := headed_table(sheet)) is not None]
+
+
+def headed_table(sheet: Sheet) -> HeadedTable | None:
+    """A sheet's table, None if it has no heading: the row with most headings, and the rows close to it."""
+    rows: dict[int, dict[int, Heading]] = defaultdict(dict)
+    for (row, column), text in sheet.texts.items():
+        if row <= HEADING_ROWS and (heading := heading_of(text)) is not None:
+            rows[row][column] = heading
+    if not rows:
+        return None
+    main = max(rows, key=lambda row: (len({heading.quantity for heading in rows[row].values()}), -row))
+    chosen = {main}
+    for step in (-1, 1):
+        for row in sorted(rows, key=lambda row: step * row):
+            near = 0 < step * (row - (min(chosen) if step < 0 else max(chosen))) <= _ROWS_APART
+            if near and not any(is_number(sheet, row, column) for column in rows[main]):
+                chosen.add(row)
+    headings: dict[int, dict[int, Heading]] = defaultdict(dict)
+    for row in sorted(chosen):
+        for column, heading in rows[row].items():
+            headings[column][row] = heading
+    return HeadedTable(sheet, dict(headings))
+
+
+def is_number(sheet: Sheet, row: int, column: int) -> bool:
+    """Whether a cell holds anything but text or nothing."""
+    value = sheet.value(row, column)
+    return value is not None and type(value) is not str

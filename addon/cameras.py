@@ -25,7 +25,7 @@ def camera_matrices(centers: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def euler_angles(matrix: NDArray[np.float64]) -> tuple[float, float, float]:
-    """XYZ Euler angles, radians, of a camera matrix; Blender's own, in float32, show -0.000007 degrees for 0."""
+    """XYZ Euler angles, radians, of a camera matrix, in float64: Blender's float32 angles show -0.000007 degrees for 0."""
     r = matrix[:3, :3]
     y = -np.arcsin(np.clip(r[2, 0], -1.0, 1.0))
     return (
@@ -59,9 +59,9 @@ def set_render_shape(scene: bpy.types.Scene, shape: tuple[int, int], pitch_ratio
 
 
 def match_views(scene: bpy.types.Scene, cameras: list[bpy.types.Object], views: Views) -> None:
-    """Give `cameras` the fields of view of `views`, and the scene their shape: a render shows the same image.
+    """Make renders show the same images as `views`: fields of view of `cameras`, render resolution of the scene.
 
-    For any shape, pitch and offset on a virtual detector; the poses stay as they are.
+    Shape, pitch and offset may be any on a virtual detector. The cameras stay where they are.
     """
     _, n_u = views.shape
     pitch_u, pitch_v = np.linalg.norm(views.u_steps, axis=1), np.linalg.norm(views.v_steps, axis=1)
@@ -77,7 +77,7 @@ def match_views(scene: bpy.types.Scene, cameras: list[bpy.types.Object], views: 
 
 
 def set_up_camera(camera: bpy.types.Camera, system: PinholeSystem, m: int) -> None:
-    """Make camera data that of module `m`: its field of view is that of the default virtual detector."""
+    """Set up camera data for module `m`, with the field of view of the default virtual detector."""
     set_field_of_view(camera, float(system.detector_side[m]), float(system.collimator_length[m]))
     b, radius = float(system.pinhole_distance[m]), float(system.roi_radius[m])
     camera.clip_start = min(1.0, 0.01 * b)
@@ -89,16 +89,14 @@ def set_up_camera(camera: bpy.types.Camera, system: PinholeSystem, m: int) -> No
 def world_matrix(item: bpy.types.Object) -> NDArray[np.float64]:
     """World matrix (4, 4) of an object as it stands now, in float64.
 
-    `Object.matrix_world` is stale after a script has set a location, and is never updated while the object is
-    hidden; so it is used only where constraints have their say.
+    `Object.matrix_world` is out of date after a script has set a location, and while the object is hidden: it is used
+    only for objects with constraints or a parent that is not a plain object.
     """
-    if any(not c.mute for c in item.constraints):
+    if any(not c.mute for c in item.constraints) or (item.parent is not None and item.parent_type != "OBJECT"):
         return np.array(item.matrix_world, dtype=np.float64)
     local = np.array(item.matrix_basis, dtype=np.float64)
     if item.parent is None:
         return local
-    if item.parent_type != "OBJECT":
-        return np.array(item.matrix_world, dtype=np.float64)
     return world_matrix(item.parent) @ np.array(item.matrix_parent_inverse, dtype=np.float64) @ local
 
 
@@ -110,3 +108,10 @@ def set_world_matrix(item: bpy.types.Object, matrix: NDArray[np.float64]) -> Non
     item.matrix_basis = Matrix(matrix)
     if item.parent is None and item.rotation_mode == "XYZ":
         item.rotation_euler = euler_angles(matrix)
+
+
+def unparent(item: bpy.types.Object) -> None:
+    """Take an object off its parent and leave it where it is."""
+    matrix = world_matrix(item)
+    item.parent = None
+    set_world_matrix(item, matrix)

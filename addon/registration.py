@@ -11,10 +11,7 @@ from ..operators import (
     add_map,
     add_phantom,
     add_slices,
-    aim_modules,
-    check_geometry,
     convert_ct,
-    duplicate_modules,
     edit_phantom,
     export_dataset,
     export_for_program,
@@ -22,17 +19,27 @@ from ..operators import (
     export_volume,
     import_geometry,
     import_volume,
-    remove_modules,
+    modules,
     render_projections,
-    renumber_modules,
-    set_numbers,
-    show_modules,
-    tidy_modules,
     volume_files,
     voxelize_objects,
 )
 from ..panels import add_menu, design, export, geometry, phantom, projections
-from . import cli, ids, jobs, live, live_phantoms, preferences, properties, slices, storage, volumes
+from . import (
+    cli,
+    ids,
+    jobs,
+    live_phantoms,
+    live_scanner,
+    preferences,
+    properties,
+    scanner,
+    selection,
+    slices,
+    storage,
+    updates,
+    volumes,
+)
 
 # Classes in the order of registration; a panel comes after its parent. To add a class, list it here.
 CLASSES: tuple[type, ...] = (
@@ -41,15 +48,15 @@ CLASSES: tuple[type, ...] = (
     # operators
     import_geometry.MPHDRR_OT_import_geometry,
     import_geometry.MPHDRR_FH_workbook,
-    show_modules.MPHDRR_OT_show_modules,
-    show_modules.MPHDRR_OT_look_through_module,
-    aim_modules.MPHDRR_OT_aim_modules,
-    duplicate_modules.MPHDRR_OT_duplicate_modules,
-    remove_modules.MPHDRR_OT_remove_modules,
-    tidy_modules.MPHDRR_OT_tidy_modules,
-    renumber_modules.MPHDRR_OT_renumber_modules,
-    set_numbers.MPHDRR_OT_set_numbers,
-    check_geometry.MPHDRR_OT_check_geometry,
+    modules.MPHDRR_OT_show_modules,
+    modules.MPHDRR_OT_look_through_module,
+    modules.MPHDRR_OT_aim_modules,
+    modules.MPHDRR_OT_duplicate_modules,
+    modules.MPHDRR_OT_remove_modules,
+    modules.MPHDRR_OT_tidy_modules,
+    modules.MPHDRR_OT_renumber_modules,
+    modules.MPHDRR_OT_set_numbers,
+    modules.MPHDRR_OT_check_geometry,
     export_geometry.MPHDRR_OT_export_geometry,
     export_for_program.MPHDRR_OT_export_for_program,
     add_map.MPHDRR_OT_add_map,
@@ -106,19 +113,29 @@ HANDLERS: tuple[tuple[list[Any], Any], ...] = (
     (bpy.app.handlers.load_pre, slices.before_load),
     (bpy.app.handlers.load_pre, live_phantoms.before_load),
     (bpy.app.handlers.load_post, volumes.after_load),
-    (bpy.app.handlers.load_post, live.after_load),
+    (bpy.app.handlers.load_post, live_scanner.after_load),
     (bpy.app.handlers.load_post, live_phantoms.after_undo),
-    (bpy.app.handlers.depsgraph_update_post, live.after_update),
-    (bpy.app.handlers.frame_change_post, live.after_frame),
+    (bpy.app.handlers.depsgraph_update_post, live_scanner.after_update),
+    (bpy.app.handlers.frame_change_post, live_scanner.after_frame),
     (bpy.app.handlers.frame_change_post, slices.after_frame_change),
-    (bpy.app.handlers.undo_post, live.after_undo),
+    (bpy.app.handlers.undo_post, live_scanner.after_undo),
     (bpy.app.handlers.undo_post, live_phantoms.after_undo),
-    (bpy.app.handlers.redo_post, live.after_undo),
+    (bpy.app.handlers.redo_post, live_scanner.after_undo),
     (bpy.app.handlers.redo_post, live_phantoms.after_undo),
     (bpy.app.handlers.save_pre, storage.before_save),
     (bpy.app.handlers.save_post, storage.after_save),
     (bpy.app.handlers.save_post_fail, storage.after_failed_save),
 )
+
+# What edited properties call, by the names that `addon/updates.py` knows.
+UPDATES = {
+    "module": scanner.refresh_module,
+    "length": scanner.length_typed,
+    "visible": scanner.set_visible,
+    "scanner": scanner.refresh_scanner,
+    "all_modules": scanner.set_for_all,
+    "active_module": selection.select_active,
+}
 
 # What Blender gave for ``blender --command mphdrr``, to take it back with.
 _commands: list[Any] = []
@@ -127,6 +144,7 @@ _commands: list[Any] = []
 def register() -> None:
     """Register everything, or, if something fails, undo what was done and raise."""
     undo: list[tuple[Any, tuple[Any, ...]]] = []
+    updates.FUNCTIONS.update(UPDATES)
     try:
         for cls in CLASSES:
             bpy.utils.register_class(cls)
@@ -154,7 +172,7 @@ def unregister() -> None:
     """Take back what `register` did, in reverse order."""
     atexit.unregister(unregister)
     jobs.stop()
-    live.stop()
+    live_scanner.stop()
     live_phantoms.stop()
     while _commands:
         bpy.utils.unregister_cli_command(_commands.pop())

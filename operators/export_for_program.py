@@ -10,7 +10,7 @@ import bpy
 from bpy.props import EnumProperty, StringProperty
 from bpy_extras.io_utils import ExportHelper
 
-from ..addon import choices, design, ids, scanner, selection, storage
+from ..addon import choices, following, ids, scanner, selection, storage
 from ..addon.decimals import typed
 from ..addon.reports import warnings_reported
 from ..core.errors import InputError
@@ -59,7 +59,7 @@ class MPHDRR_OT_export_for_program(ExportHelper, bpy.types.Operator):
             path, format = storage.absolute(self.filepath), FORMATS[self.format]
             collection = scanner.required_scanner(context.scene)
             images = getattr(context.scene, ids.SCENE_PROJECTIONS)
-            built = asdict(design.construction(collection.mphdrr_scanner))
+            built = asdict(following.construction(collection.mphdrr_scanner))
             built["opening_degrees"] = typed(math.degrees(built.pop("opening_angle")))
             with warnings_reported(self):
                 system = scanner.read_scanner(collection, aimed=True)

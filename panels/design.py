@@ -1,6 +1,6 @@
 """Sidebar, Geometry > Design: the active module's numbers and what they do, and those of all modules.
 
-Drawing shows readouts that were calculated when something changed (`addon/readouts.py`).
+Drawing shows readouts that were calculated when something changed (`addon/following.py`).
 """
 
 from __future__ import annotations
@@ -9,7 +9,7 @@ import json
 
 import bpy
 
-from ..addon import ids, jobs, readouts, scanner, selection
+from ..addon import ids, jobs, scanner, selection
 
 _LABELS = (
     ("pinhole_diameter", "Hole d"),
@@ -79,7 +79,7 @@ class MPHDRR_PT_design(_Panel, bpy.types.Panel):
                 ("Resolution", f"{module.resolution:.2f} mm FWHM"),
                 ("Magnification", f"{module.magnification:.3f}"),
                 ("Radius seen", f"{module.roi_seen:.2f} mm"),
-                ("ROI", "seen whole" if readouts.covers_roi(module) else "not seen whole"),
+                ("ROI", "seen whole" if module.sees_roi else "not seen whole"),
             ),
         )
 

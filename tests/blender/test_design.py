@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 import mphdrr.core as mph
-from mphdrr.addon import cameras, copies, design, live, registration, scanner
+from mphdrr.addon import cameras, copies, following, live_scanner, registration, scanner
 from mphdrr.addon.module_values import module_numbers
 from mphdrr.core.errors import InputError, InputWarning
 from mphdrr.core.geometry.system import PinholeSystem
@@ -215,7 +215,7 @@ def test_hidden_parented_and_animated_modules(scene, collection):
 
 def test_nothing_is_done_when_something_else_moves_or_nothing_has_changed(scene, collection, monkeypatch):
     calls = []
-    monkeypatch.setattr(design, "refresh", lambda *args, **kwargs: calls.append(args))
+    monkeypatch.setattr(following, "refresh", lambda *args, **kwargs: calls.append(args))
     scene.objects["Cube"].location.x += 1.0
     update()
     assert calls == []
@@ -266,12 +266,12 @@ def test_after_an_undo_everything_agrees_again(collection):
     camera.location.x *= 1.2
     module.detector_side = 40.0
     update()
-    with design.writing():
+    with following.writing():
         camera.matrix_basis = matrix
         for name, value in kept.items():
             setattr(module, name, value)
     assert depth(camera)[0] != pytest.approx(module.collimator_length, rel=1e-6)
-    live.after_undo()
+    live_scanner.after_undo()
     assert_consistent(collection)
 
 

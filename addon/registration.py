@@ -1,8 +1,10 @@
-"""What the extension registers with Blender, explicitly; the only file that imports operators and panels."""
+"""What the extension registers with Blender; the only file that imports operators and panels."""
 
 from __future__ import annotations
 
 import atexit
+from collections.abc import Callable
+from types import ModuleType
 from typing import Any
 
 import bpy
@@ -14,7 +16,6 @@ from ..operators import (
     convert_ct,
     edit_phantom,
     export_dataset,
-    export_for_program,
     export_geometry,
     export_volume,
     import_geometry,
@@ -41,58 +42,38 @@ from . import (
     volumes,
 )
 
-# Classes in the order of registration; a panel comes after its parent. To add a class, list it here.
+# Where the classes are. Those of one module are registered in the order in which they stand in it: a panel after its
+# parent. Panels are drawn in the order of the work.
+_OPERATORS = (
+    import_geometry,
+    modules,
+    export_geometry,
+    add_map,
+    add_phantom,
+    edit_phantom,
+    voxelize_objects,
+    import_volume,
+    export_volume,
+    convert_ct,
+    add_slices,
+    volume_files,
+    render_projections,
+    jobs,
+    export_dataset,
+)
+_PANELS = (add_menu, geometry, design, phantom, projections, export)
+
+
+def _classes(module: ModuleType) -> list[type]:
+    """The classes of a module that Blender registers: those named `MPHDRR_...`."""
+    found = [cls for name, cls in vars(module).items() if name.startswith("MPHDRR_") and isinstance(cls, type)]
+    return [cls for cls in found if cls.__module__ == module.__name__]
+
+
 CLASSES: tuple[type, ...] = (
     *properties.CLASSES,
-    preferences.MPHDRR_Preferences,
-    # operators
-    import_geometry.MPHDRR_OT_import_geometry,
-    import_geometry.MPHDRR_FH_workbook,
-    modules.MPHDRR_OT_show_modules,
-    modules.MPHDRR_OT_look_through_module,
-    modules.MPHDRR_OT_aim_modules,
-    modules.MPHDRR_OT_duplicate_modules,
-    modules.MPHDRR_OT_remove_modules,
-    modules.MPHDRR_OT_tidy_modules,
-    modules.MPHDRR_OT_renumber_modules,
-    modules.MPHDRR_OT_set_numbers,
-    modules.MPHDRR_OT_check_geometry,
-    export_geometry.MPHDRR_OT_export_geometry,
-    export_for_program.MPHDRR_OT_export_for_program,
-    add_map.MPHDRR_OT_add_map,
     *add_phantom.ADD_KINDS,
-    add_phantom.MPHDRR_OT_import_phantom,
-    add_phantom.MPHDRR_FH_phantom,
-    edit_phantom.MPHDRR_OT_update_phantom,
-    edit_phantom.MPHDRR_OT_update_derenzo,
-    edit_phantom.MPHDRR_OT_apply_phantom_pose,
-    edit_phantom.MPHDRR_OT_show_phantom_outline,
-    voxelize_objects.MPHDRR_OT_voxelize_objects,
-    voxelize_objects.MPHDRR_OT_mesh_from_volume,
-    import_volume.MPHDRR_OT_import_volume,
-    import_volume.MPHDRR_OT_import_volume_sequence,
-    import_volume.MPHDRR_FH_volume,
-    export_volume.MPHDRR_OT_export_volume,
-    convert_ct.MPHDRR_OT_ct_to_attenuation,
-    add_slices.MPHDRR_OT_add_slices,
-    add_slices.MPHDRR_OT_remove_slices,
-    volume_files.MPHDRR_OT_clean_volume_files,
-    volume_files.MPHDRR_OT_find_volume_files,
-    render_projections.MPHDRR_OT_render_projections,
-    render_projections.MPHDRR_OT_show_projections,
-    jobs.MPHDRR_OT_cancel_job,
-    export_dataset.MPHDRR_OT_export_dataset,
-    add_menu.MPHDRR_MT_add,
-    # panels, in the order of the work
-    geometry.MPHDRR_UL_modules,
-    geometry.MPHDRR_PT_geometry,
-    geometry.MPHDRR_PT_modules,
-    design.MPHDRR_PT_design,
-    design.MPHDRR_PT_scanner_design,
-    phantom.MPHDRR_PT_phantom,
-    projections.MPHDRR_PT_projections,
-    projections.MPHDRR_PT_physics,
-    export.MPHDRR_PT_export,
+    *(cls for module in (preferences, *_OPERATORS, *_PANELS) for cls in _classes(module)),
 )
 
 # (menu, draw function): entries in Blender's own menus.
@@ -100,7 +81,6 @@ MENUS: tuple[tuple[Any, Any], ...] = (
     (bpy.types.TOPBAR_MT_file_import, import_geometry.draw_menu),
     (bpy.types.TOPBAR_MT_file_import, import_volume.draw_menu),
     (bpy.types.TOPBAR_MT_file_export, export_geometry.draw_menu),
-    (bpy.types.TOPBAR_MT_file_export, export_for_program.draw_menu),
     (bpy.types.TOPBAR_MT_file_export, export_volume.draw_menu),
     (bpy.types.TOPBAR_MT_file_export, export_dataset.draw_menu),
     (bpy.types.VIEW3D_MT_add, add_menu.draw_menu),
@@ -127,8 +107,8 @@ HANDLERS: tuple[tuple[list[Any], Any], ...] = (
     (bpy.app.handlers.save_post_fail, storage.after_failed_save),
 )
 
-# What edited properties call, by the names that `addon/updates.py` knows.
-UPDATES = {
+# What edited properties call (`addon/updates.py`).
+UPDATES: dict[str, Callable[..., None]] = {
     "module": scanner.refresh_module,
     "length": scanner.length_typed,
     "visible": scanner.set_visible,
@@ -137,12 +117,12 @@ UPDATES = {
     "active_module": selection.select_active,
 }
 
-# What Blender gave for ``blender --command mphdrr``, to take it back with.
+# Blender's handle for the command line, ``blender --command mphdrr``.
 _commands: list[Any] = []
 
 
 def register() -> None:
-    """Register everything, or, if something fails, undo what was done and raise."""
+    """Register everything; if something fails, take back what was registered and raise."""
     undo: list[tuple[Any, tuple[Any, ...]]] = []
     updates.FUNCTIONS.update(UPDATES)
     try:

@@ -103,7 +103,7 @@ def build_scanner(
     _write_source(properties, system)
     refresh_scanner(collection)
 
-    _prepare_scene(scene, system, shape)
+    _prepare_scene(scene, system, shape, is_new=old is None)
     first = next(iter(new.cameras.values()))
     if scene.camera is None:
         scene.camera = first
@@ -163,17 +163,19 @@ def quick_ranges(system: PinholeSystem) -> list[tuple[int, int]]:
     return ranges
 
 
-def _prepare_scene(scene: bpy.types.Scene, system: PinholeSystem, shape: tuple[int, int]) -> None:
+def _prepare_scene(scene: bpy.types.Scene, system: PinholeSystem, shape: tuple[int, int], is_new: bool) -> None:
+    """Set units, render resolution and clipping for the scanner; look at the whole of one that is new."""
     units = scene.unit_settings
     units.system, units.scale_length, units.length_unit = "METRIC", 0.001, "MILLIMETERS"
     cameras.set_render_shape(scene, shape)
-    reach = 2.0 * float(system.pinhole_distance.max() + system.collimator_length.max())
-    for screen in bpy.data.screens:
-        for area in screen.areas:
-            for space in area.spaces:
-                if space.type == "VIEW_3D":
-                    space.clip_start = max(space.clip_start, 1.0)
-                    space.clip_end = max(space.clip_end, 10.0 * reach)
+    reach = float((system.pinhole_distance + system.collimator_length).max())
+    for space in (space for screen in bpy.data.screens for area in screen.areas for space in area.spaces):
+        if space.type == "VIEW_3D":
+            space.clip_start = max(space.clip_start, 1.0)
+            space.clip_end = max(space.clip_end, 20.0 * reach)
+            # The scanner's size is far from that of Blender's default scene.
+            if is_new and space.region_3d is not None and space.region_3d.view_perspective != "CAMERA":
+                space.region_3d.view_location, space.region_3d.view_distance = (0.0, 0.0, 0.0), 2.6 * reach
 
 
 def scanners(scene: bpy.types.Scene) -> list[bpy.types.Collection]:

@@ -8,14 +8,14 @@ import bpy
 from bpy.props import BoolProperty, EnumProperty, StringProperty
 from bpy_extras.io_utils import ExportHelper
 
-from ..addon import choices, ids, scanner, scanner_files, selection, storage
+from ..addon import ids, scanner, scanner_files, selection, storage
 from ..addon.decimals import typed
 from ..addon.reports import run_reported
 from ..addon.scanner_files import WORKBOOK_SUFFIXES
 from ..core.errors import InputError
-from ..core.exchange import FORMATS
+from ..core.exchange import FORMAT_NUMBERS, FORMATS
 
-_ITEMS = choices.items(choices.GEOMETRY_FORMATS, ((f.name, f.name, f.title) for f in FORMATS.values()))
+_FORMATS = tuple((f.name, f.name, f.title, FORMAT_NUMBERS[f.name]) for f in FORMATS.values())
 
 
 class MPHDRR_OT_export_geometry(ExportHelper, bpy.types.Operator):
@@ -82,7 +82,7 @@ class MPHDRR_OT_export_for_program(ExportHelper, bpy.types.Operator):
         name="File", description="File to write, or new folder for formats of several files", subtype="FILE_PATH",
         options={"SKIP_SAVE"},
     )  # fmt: skip
-    format: EnumProperty(name="Format", description="What is written", items=_ITEMS)
+    format: EnumProperty(name="Format", description="What is written", items=_FORMATS)
 
     @classmethod
     def poll(cls, context: bpy.types.Context) -> bool:

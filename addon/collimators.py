@@ -10,7 +10,7 @@ import numpy as np
 
 from ..core.geometry.collimator import Collimator, Construction
 from ..core.geometry.collimator_mesh import Solid, check_watertight, collimator_solid, crystal_solid
-from . import compat, ids
+from . import compat
 from .module_values import ModuleNumbers
 
 
@@ -24,9 +24,9 @@ class Look(NamedTuple):
 
 
 LOOKS = {
-    "COLLIMATOR": Look(ids.MATERIAL_COLLIMATOR, (0.36, 0.39, 0.43, 1.0), metallic=0.85, roughness=0.42),  # grey metal
-    "CRYSTAL": Look(ids.MATERIAL_CRYSTAL, (1.0, 0.48, 0.06, 0.85), metallic=0.0, roughness=0.12),  # amber
-    "ROI": Look(ids.MATERIAL_ROI, (0.25, 0.62, 1.0, 0.12), metallic=0.0, roughness=0.5),  # pale blue
+    "COLLIMATOR": Look("mphDRR collimator", (0.36, 0.39, 0.43, 1.0), metallic=0.85, roughness=0.42),  # grey metal
+    "CRYSTAL": Look("mphDRR crystal", (1.0, 0.48, 0.06, 0.85), metallic=0.0, roughness=0.12),  # amber
+    "ROI": Look("mphDRR ROI", (0.25, 0.62, 1.0, 0.12), metallic=0.0, roughness=0.5),  # pale blue
 }
 """Looks of a scanner's parts, by `Object.mphdrr_module.part`."""
 

@@ -65,9 +65,8 @@ _PANELS = (add_menu, geometry, design, phantom, projections, export)
 
 
 def _classes(module: ModuleType) -> list[type]:
-    """The classes of a module that Blender registers: those named `MPHDRR_...`."""
-    found = [cls for name, cls in vars(module).items() if name.startswith("MPHDRR_") and isinstance(cls, type)]
-    return [cls for cls in found if cls.__module__ == module.__name__]
+    """The classes of a module that Blender registers: its `MPHDRR_...`."""
+    return [cls for name, cls in vars(module).items() if name.startswith("MPHDRR_") and isinstance(cls, type)]
 
 
 CLASSES: tuple[type, ...] = (
@@ -117,34 +116,33 @@ UPDATES: dict[str, Callable[..., None]] = {
     "active_module": selection.select_active,
 }
 
-# Blender's handle for the command line, ``blender --command mphdrr``.
-_commands: list[Any] = []
+# How to take back what was registered: (function, arguments).
+_undo: list[tuple[Callable[..., Any], tuple[Any, ...]]] = []
 
 
 def register() -> None:
     """Register everything; if something fails, take back what was registered and raise."""
-    undo: list[tuple[Any, tuple[Any, ...]]] = []
     updates.FUNCTIONS.update(UPDATES)
     try:
         for cls in CLASSES:
             bpy.utils.register_class(cls)
-            undo.append((bpy.utils.unregister_class, (cls,)))
+            _undo.append((bpy.utils.unregister_class, (cls,)))
         for owner, name, group in properties.POINTERS:
             setattr(owner, name, bpy.props.PointerProperty(type=group))
-            undo.append((delattr, (owner, name)))
+            _undo.append((delattr, (owner, name)))
         for menu, draw in MENUS:
             menu.append(draw)
-            undo.append((menu.remove, (draw,)))
+            _undo.append((menu.remove, (draw,)))
         for handlers, function in HANDLERS:
             handlers.append(function)
-            undo.append((handlers.remove, (function,)))
-        _commands.append(bpy.utils.register_cli_command(ids.PREFIX, cli.main))
+            _undo.append((_remove_handler, (handlers, function)))
+        command = bpy.utils.register_cli_command(ids.PREFIX, cli.main)
+        _undo.append((bpy.utils.unregister_cli_command, (command,)))
     except Exception:
-        for function, arguments in reversed(undo):
-            function(*arguments)
+        _take_back()
         raise
     if bpy.app.module:
-        # Registered classes keep Python's bpy module alive, so that Blender 4.5 waits for ever when Python ends.
+        # Registered classes keep Python's bpy module alive: Blender 4.5 would wait for ever when Python ends.
         atexit.register(unregister)
 
 
@@ -154,14 +152,15 @@ def unregister() -> None:
     jobs.stop()
     live_scanner.stop()
     live_phantoms.stop()
-    while _commands:
-        bpy.utils.unregister_cli_command(_commands.pop())
-    for handlers, function in reversed(HANDLERS):
-        if function in handlers:  # loading a file drops handlers that are not persistent
-            handlers.remove(function)
-    for menu, draw in reversed(MENUS):
-        menu.remove(draw)
-    for owner, name, _ in reversed(properties.POINTERS):
-        delattr(owner, name)
-    for cls in reversed(CLASSES):
-        bpy.utils.unregister_class(cls)
+    _take_back()
+
+
+def _take_back() -> None:
+    while _undo:
+        function, arguments = _undo.pop()
+        function(*arguments)
+
+
+def _remove_handler(handlers: list[Any], function: Any) -> None:
+    if function in handlers:  # loading a file drops handlers that are not persistent
+        handlers.remove(function)

@@ -1,7 +1,7 @@
-"""The scanner in the scene: `PinholeSystem` to collection and back.
+"""The scanner in the scene: built from a `PinholeSystem`, found, read back and changed.
 
-A scanner is a collection with a sub-collection per ring; a module is a camera object (`Object.mphdrr_module`)
-whose children are its collimator and its crystal.
+A scanner is a collection with a sub-collection for each ring; a module is a camera object (`Object.mphdrr_module`) whose
+children are its collimator and its crystal.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ import numpy as np
 
 from ..core.errors import InputError, InputWarning
 from ..core.geometry import checks
-from ..core.geometry.collimator import OPENING_ANGLE, Construction, EdgePlace
+from ..core.geometry.collimator import Construction
 from ..core.geometry.module_parts import module_parts
 from ..core.geometry.system import PinholeSystem
 from ..core.workbook import ColumnMap, QuantityCells, SystemSource
@@ -26,20 +26,19 @@ from .module_values import LENGTHS, TYPED, is_edited, is_moved, module_numbers, 
 from .replacement import clear, losses, modules_text
 from .scanner_parts import NewScanner
 
+_DEFAULT = Construction()
+
 
 def build_scanner(
     scene: bpy.types.Scene,
     system: PinholeSystem,
     name: str = "",
     *,
-    plate_thickness: float = 2.0,
-    wall_thickness: float = 2.0,
-    opening_angle: float = OPENING_ANGLE,
-    edge_at: EdgePlace = "middle",
+    construction: Construction = _DEFAULT,
     shape: tuple[int, int] = (256, 256),
     replace: bool = False,
 ) -> bpy.types.Collection:
-    """Put a scanner into the scene; one of the same name is replaced.
+    """Put a scanner into the scene, replacing one of the same name; returns its collection.
 
     Parameters
     ----------
@@ -49,18 +48,13 @@ def build_scanner(
         The modules.
     name
         Name of the scanner's collection; by default that of the workbook's file.
-    plate_thickness, wall_thickness, opening_angle, edge_at
-        How the collimators are built (`core.geometry.collimator.Construction`): mm and rad.
+    construction
+        How the collimators are built.
     shape
         Pixels (n_v, n_u) of the cameras' pictures.
     replace
         Replace a scanner of the same name even if `losses` finds changes. Objects that are not the scanner's are never
         deleted: they move to the scene's own collection.
-
-    Returns
-    -------
-    bpy.types.Collection
-        The scanner's collection.
 
     Raises
     ------
@@ -74,15 +68,7 @@ def build_scanner(
         raise InputError(
             f"scanner '{name}' has changed since it was imported ({'; '.join(lost)}): set replace=True to drop the changes"
         )
-    construction = Construction(plate_thickness, wall_thickness, opening_angle, edge_at)
-    parts = module_parts(system, construction)
-
-    new = NewScanner()
-    try:
-        new.make(system, parts)
-    except BaseException:
-        new.discard()
-        raise
+    new = NewScanner(system, module_parts(system, construction))
     hidden: set[int] = set()
     if old is None:
         collection = bpy.data.collections.new(name)
@@ -97,8 +83,8 @@ def build_scanner(
 
     properties = collection.mphdrr_scanner
     properties.scanner_name = name
-    properties.plate_thickness, properties.wall_thickness = plate_thickness, wall_thickness
-    properties.opening_angle, properties.edge_at = opening_angle, edge_at.upper()
+    for setting, value in asdict(construction).items():
+        setattr(properties, setting, value.upper() if isinstance(value, str) else value)
     properties.is_scanner = True
     _write_source(properties, system)
     refresh_scanner(collection)

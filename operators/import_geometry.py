@@ -16,6 +16,7 @@ from ..addon.preferences import preferences
 from ..addon.reports import run_reported, warnings_reported
 from ..addon.scanner_files import WORKBOOK_SUFFIXES
 from ..core.errors import InputError
+from ..core.geometry.collimator import Construction
 from ..core.geometry.system import PinholeSystem
 from ..core.workbook import ColumnMap, read_system
 from . import column_map_dialog
@@ -108,8 +109,7 @@ class MPHDRR_OT_import_geometry(bpy.types.Operator):
             context.scene,
             system,
             self.name,
-            plate_thickness=self.plate_thickness,
-            wall_thickness=self.wall_thickness,
+            construction=Construction(self.plate_thickness, self.wall_thickness),
             shape=(self.image_size[1], self.image_size[0]),
             replace=self.replace,
         )

@@ -9,6 +9,7 @@ from bpy_extras.object_utils import world_to_camera_view
 from mathutils import Vector
 
 from mphdrr.addon import cameras, scanner
+from mphdrr.core.geometry.collimator import Construction
 from mphdrr.core.geometry.system import PinholeSystem
 from mphdrr.core.geometry.views import Views
 
@@ -60,7 +61,7 @@ def test_cameras_match_views_of_any_pitch_and_offset(scene, dc_spect, options):
 def test_modules_smaller_than_blenders_smallest_camera(scene):
     """Lens and sensor below 1 are silently clamped by Blender: both are scaled up."""
     system = PinholeSystem([[30.0, 4.0, 5.0], [-3.0, 40.0, -6.0]], 0.1, [0.4, 0.8], 0.5, 1.0, 5.0)
-    collection = scanner.build_scanner(scene, system, plate_thickness=0.1, wall_thickness=0.1)
+    collection = scanner.build_scanner(scene, system, construction=Construction(0.1, 0.1))
     assert all(c.data.lens >= 1.0 and c.data.sensor_width >= 1.0 for c in scanner.modules(collection))
     assert_blender_agrees(scene, collection, system.views())
 

@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 
 from ..core.geometry.frames import module_poses
 from ..core.geometry.system import PinholeSystem
-from ..core.geometry.views import Views
 
 _CAMERA_FROM_MODULE = np.diag([-1.0, 1.0, -1.0, 1.0])
 _SMALLEST = 1.0  # Blender silently clamps Camera.lens and Camera.sensor_width below this
@@ -46,34 +45,12 @@ def set_field_of_view(camera: bpy.types.Camera, width: float, distance: float) -
     camera.shift_x = camera.shift_y = 0.0
 
 
-def set_render_shape(scene: bpy.types.Scene, shape: tuple[int, int], pitch_ratio: float | None = None) -> None:
-    """Set the scene's render resolution to an image shape (n_v, n_u).
-
-    `pitch_ratio` is pitch_u / pitch_v; by default that of a square detector, n_v / n_u.
-    """
+def set_render_shape(scene: bpy.types.Scene, shape: tuple[int, int]) -> None:
+    """Set the scene's render resolution to an image shape (n_v, n_u) of a square detector."""
     n_v, n_u = shape
-    ratio = n_v / n_u if pitch_ratio is None else pitch_ratio
     render = scene.render
     render.resolution_x, render.resolution_y, render.resolution_percentage = n_u, n_v, 100
-    render.pixel_aspect_x, render.pixel_aspect_y = max(1.0, ratio), max(1.0, 1 / ratio)
-
-
-def match_views(scene: bpy.types.Scene, cameras: list[bpy.types.Object], views: Views) -> None:
-    """Make renders show the same images as `views`: fields of view of `cameras`, render resolution of the scene.
-
-    Shape, pitch and offset may be any on a virtual detector. The cameras stay where they are.
-    """
-    _, n_u = views.shape
-    pitch_u, pitch_v = np.linalg.norm(views.u_steps, axis=1), np.linalg.norm(views.v_steps, axis=1)
-    axis = views.detector_centers - views.sources
-    for m, camera_object in enumerate(cameras):
-        u, v = views.u_steps[m] / pitch_u[m], views.v_steps[m] / pitch_v[m]
-        width = n_u * pitch_u[m]
-        set_field_of_view(camera_object.data, width, float(abs(np.dot(np.cross(u, v), axis[m]))))
-        # Blender scales both shifts by the picture's width; its X is -u.
-        camera_object.data.shift_x = -np.dot(u, axis[m]) / width
-        camera_object.data.shift_y = np.dot(v, axis[m]) / width
-    set_render_shape(scene, views.shape, float(pitch_u[0] / pitch_v[0]))
+    render.pixel_aspect_x, render.pixel_aspect_y = max(1.0, n_v / n_u), max(1.0, n_u / n_v)
 
 
 def set_up_camera(camera: bpy.types.Camera, system: PinholeSystem, m: int) -> None:

@@ -81,7 +81,7 @@ def tidy(collection: bpy.types.Collection) -> tuple[list[int], int]:
     for camera in bare_cameras(collection):
         _add_parts(collection, camera)
     make_single_users(collection)
-    scanner.refresh_scanner(collection)
+    following.refresh(collection)
     collection.mphdrr_scanner.untidy = untidy_text(collection)
     return numbers, len(orphans)
 
@@ -182,7 +182,7 @@ def duplicate(
         cameras.set_world_matrix(copy, cameras.camera_matrices(place[None])[0])
         adopt(collection, copy, place)
         made.append(copy)
-    scanner.refresh_scanner(collection)
+    following.refresh(collection)
     return made
 
 
@@ -226,7 +226,7 @@ def remove(collection: bpy.types.Collection, modules: Sequence[bpy.types.Object]
         if child not in parts:
             cameras.unparent(child)
     _remove([*parts, *modules])
-    scanner.refresh_scanner(collection)
+    following.refresh(collection)
 
 
 def _remove(items: Sequence[bpy.types.Object]) -> None:

@@ -17,7 +17,7 @@ from ..core.geometry.collimator import Construction, EdgePlace
 from ..core.physics.performance import isocentre_performance
 from . import cameras, collimators
 from .decimals import typed
-from .module_values import LENGTHS, ModuleNumbers, module_numbers, off_aim
+from .module_values import LENGTHS, TYPED, ModuleNumbers, module_numbers, off_aim
 
 PARTS = ("COLLIMATOR", "CRYSTAL")  # what hangs on a module's camera: `Object.mphdrr_module.part`
 _KEY = "mphdrr_solid"  # custom property of a mesh or camera: the numbers that it was built from
@@ -41,13 +41,19 @@ def is_writing() -> bool:
     return bool(_writing)
 
 
+def modules(collection: bpy.types.Collection) -> list[bpy.types.Object]:
+    """A scanner's camera objects, in the order of `read_scanner`'s system."""
+    found = [o for o in collection.all_objects if o.mphdrr_module.is_module]
+    return sorted(found, key=lambda o: (o.mphdrr_module.index, o.mphdrr_module.number, o.name))
+
+
 def parts_of(
-    collection: bpy.types.Collection, modules: Sequence[bpy.types.Object]
+    collection: bpy.types.Collection, found: Sequence[bpy.types.Object]
 ) -> dict[bpy.types.Object, list[bpy.types.Object]]:
     """Each module's collimator and crystal."""
     # `Object.children` searches all objects: once for one module, but not once for each of eighty.
-    items = modules[0].children if len(modules) == 1 else collection.all_objects
-    parts: dict[bpy.types.Object, list[bpy.types.Object]] = {camera: [] for camera in modules}
+    items = found[0].children if len(found) == 1 else collection.all_objects
+    parts: dict[bpy.types.Object, list[bpy.types.Object]] = {camera: [] for camera in found}
     for item in items:
         if item.mphdrr_module.part in PARTS and item.parent in parts:
             parts[item.parent].append(item)
@@ -60,11 +66,7 @@ def construction(scanner: bpy.types.PropertyGroup) -> Construction:
 
 
 def refresh(
-    collection: bpy.types.Collection,
-    modules: Sequence[bpy.types.Object],
-    changed: Iterable[bpy.types.Object],
-    totals: bool = False,
-    aim: bool = True,
+    collection: bpy.types.Collection, changed: Sequence[bpy.types.Object] | None = None, aim: bool = True
 ) -> None:
     """Make modules, and their scanner's totals, follow their places and numbers.
 
@@ -72,25 +74,62 @@ def refresh(
     ----------
     collection
         The scanner.
-    modules
-        All of its camera objects, in order.
     changed
-        Those that may have changed. One that has not costs next to nothing.
-    totals
-        Calculate the totals even where no module has changed: after an undo.
+        The camera objects that may have changed: one that has not costs next to nothing. By default all, and the
+        totals are calculated in any case, as is necessary after an undo.
     aim
         Aim modules that have been moved, if the scanner is set to keep them aimed.
     """
-    if is_writing():
-        return
-    changed = list(changed)
     scanner = collection.mphdrr_scanner
+    if is_writing() or not scanner.is_scanner:
+        return
+    found = modules(collection)
     with writing():
-        parts = parts_of(collection, changed)
-        rebuilt = [_refresh_module(camera, scanner, parts[camera], aim) for camera in changed]
-        if totals or any(rebuilt) or scanner.count != len(modules):
-            _update_totals(scanner, [camera.mphdrr_module for camera in modules])
-            _resize_roi(collection, modules)
+        parts = parts_of(collection, found if changed is None else changed)
+        rebuilt = [_refresh_module(camera, scanner, own, aim) for camera, own in parts.items()]
+        if changed is None or any(rebuilt) or scanner.count != len(found):
+            _update_totals(scanner, [camera.mphdrr_module for camera in found])
+            _resize_roi(collection, found)
+
+
+def refresh_module(camera: bpy.types.Object) -> None:
+    """Make one module follow: one of its numbers was edited."""
+    if not camera.mphdrr_module.is_module or is_writing():
+        return
+    for collection in bpy.data.collections:
+        if collection.mphdrr_scanner.is_scanner and camera.name in collection.all_objects:
+            refresh(collection, [camera])
+
+
+def length_typed(camera: bpy.types.Object) -> None:
+    """Keep a module's `l` as the user has typed it, whatever the ROI."""
+    if camera.mphdrr_module.is_module and not is_writing():
+        with writing():
+            camera.mphdrr_module.length_mode = TYPED
+        refresh_module(camera)
+
+
+def set_for_all(collection: bpy.types.Collection, name: str) -> None:
+    """Give all modules the scanner's number called `name` (or its "length_mode"): it was edited."""
+    if not collection.mphdrr_scanner.is_scanner or is_writing():
+        return
+    with writing():
+        for camera in modules(collection):
+            setattr(camera.mphdrr_module, name, getattr(collection.mphdrr_scanner, name))
+            if name == "collimator_length":
+                camera.mphdrr_module.length_mode = TYPED
+    refresh(collection)
+
+
+def copy_numbers(
+    collection: bpy.types.Collection, source: bpy.types.Object, targets: Iterable[bpy.types.Object]
+) -> None:
+    """Give modules the lengths of another, and its choice whether `l` follows the ROI."""
+    with writing():
+        for camera in targets:
+            for name in (*LENGTHS, "length_mode"):
+                setattr(camera.mphdrr_module, name, getattr(source.mphdrr_module, name))
+    refresh(collection)
 
 
 def _refresh_module(

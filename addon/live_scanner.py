@@ -50,8 +50,7 @@ def _follow(scene: bpy.types.Scene, depsgraph: bpy.types.Depsgraph, aim: bool) -
         return
     for collection in _local(scanner.scanners(scene)):
         found = scanner.modules(collection)
-        changed = found if structure else [camera for camera in found if camera in moved]
-        following.refresh(collection, found, changed, aim=aim)
+        following.refresh(collection, found if structure else [camera for camera in found if camera in moved], aim)
         if structure:
             _look_for_copies(collection)
 
@@ -61,7 +60,7 @@ def after_undo(*_: Any) -> None:
     """Undo and redo restore some datablocks and leave others: make everything agree again."""
     _undone.clear()
     for collection in _local(bpy.data.collections):
-        scanner.refresh_scanner(collection)
+        following.refresh(collection)
         with following.writing():
             collection.mphdrr_scanner.untidy = copies.untidy_text(collection)
         _undone[collection.name] = collection.mphdrr_scanner.untidy

@@ -28,6 +28,7 @@ from ..operators import (
 from ..panels import add_menu, design, export, geometry, phantom, projections
 from . import (
     cli,
+    following,
     ids,
     jobs,
     live_phantoms,
@@ -108,11 +109,11 @@ HANDLERS: tuple[tuple[list[Any], Any], ...] = (
 
 # What edited properties call (`addon/updates.py`).
 UPDATES: dict[str, Callable[..., None]] = {
-    "module": scanner.refresh_module,
-    "length": scanner.length_typed,
+    "module": following.refresh_module,
+    "length": following.length_typed,
     "visible": scanner.set_visible,
-    "scanner": scanner.refresh_scanner,
-    "all_modules": scanner.set_for_all,
+    "scanner": following.refresh,
+    "all_modules": following.set_for_all,
     "active_module": selection.select_active,
 }
 

@@ -68,5 +68,5 @@ def renumber(collection: bpy.types.Collection, order: Order = "RINGS") -> int:
         item.name = f"{name} renumbered"  # what another has now is free afterwards
     for item, name in names:
         item.name = name
-    scanner.refresh_scanner(collection)
+    following.refresh(collection)
     return int(np.count_nonzero(system.numbers[places] != ordered.numbers))

@@ -22,7 +22,8 @@ from ..core.geometry.module_parts import module_parts
 from ..core.geometry.system import PinholeSystem
 from ..core.workbook import ColumnMap, QuantityCells, SystemSource
 from . import cameras, following, ids
-from .module_values import LENGTHS, TYPED, is_edited, is_moved, module_numbers, off_aim, remember
+from .following import modules
+from .module_values import LENGTHS, is_edited, is_moved, module_numbers, off_aim, remember
 from .replacement import clear, losses, modules_text
 from .scanner_parts import NewScanner
 
@@ -87,7 +88,7 @@ def build_scanner(
         setattr(properties, setting, value.upper() if isinstance(value, str) else value)
     properties.is_scanner = True
     _write_source(properties, system)
-    refresh_scanner(collection)
+    following.refresh(collection)
 
     _prepare_scene(scene, system, shape, is_new=old is None)
     first = next(iter(new.cameras.values()))
@@ -191,26 +192,12 @@ def required_scanner(scene: bpy.types.Scene) -> bpy.types.Collection:
     return collection
 
 
-def modules(collection: bpy.types.Collection) -> list[bpy.types.Object]:
-    """The scanner's camera objects in the order of the system, which is that of `read_scanner`."""
-    found = [o for o in collection.all_objects if o.mphdrr_module.is_module]
-    return sorted(found, key=lambda o: (o.mphdrr_module.index, o.mphdrr_module.number, o.name))
-
-
 def module(collection: bpy.types.Collection, number: int) -> bpy.types.Object:
     """The camera object of a module; raises `InputError` where there is none."""
     for camera in modules(collection):
         if camera.mphdrr_module.number == number:
             return camera
     raise InputError(f"scanner '{collection.name}' has no module {number}")
-
-
-def scanner_of(camera: bpy.types.Object) -> bpy.types.Collection | None:
-    """The scanner that an object belongs to."""
-    for collection in bpy.data.collections:
-        if collection.mphdrr_scanner.is_scanner and camera.name in collection.all_objects:
-            return collection
-    return None
 
 
 def read_scanner(collection: bpy.types.Collection, *, aimed: bool = False) -> PinholeSystem:
@@ -289,7 +276,7 @@ def aim_modules(collection: bpy.types.Collection) -> list[int]:
         if camera.mphdrr_module.number in off:
             center = cameras.world_matrix(camera)[None, :3, 3]
             cameras.set_world_matrix(camera, cameras.camera_matrices(center)[0])
-    refresh_scanner(collection)
+    following.refresh(collection)
     return sorted(off)
 
 
@@ -335,49 +322,3 @@ def _set_hidden(items: Iterable[bpy.types.Object], hide: bool) -> None:
             item.hide_viewport = hide
         if item.hide_render != hide:
             item.hide_render = hide
-
-
-def refresh_module(camera: bpy.types.Object) -> None:
-    """Make a module's camera, collimator, crystal and readouts follow its numbers (called when one is edited)."""
-    collection = scanner_of(camera) if camera.mphdrr_module.is_module and not following.is_writing() else None
-    if collection is not None:
-        following.refresh(collection, modules(collection), [camera])
-
-
-def refresh_scanner(collection: bpy.types.Collection) -> None:
-    """Make all modules follow their places and numbers, and the scanner's totals follow them."""
-    if collection.mphdrr_scanner.is_scanner:
-        found = modules(collection)
-        following.refresh(collection, found, found, totals=True)
-
-
-def length_typed(camera: bpy.types.Object) -> None:
-    """The user has typed a module's `l`: it stays as typed."""
-    if camera.mphdrr_module.is_module and not following.is_writing():
-        with following.writing():
-            camera.mphdrr_module.length_mode = TYPED
-        refresh_module(camera)
-
-
-def set_for_all(collection: bpy.types.Collection, name: str) -> None:
-    """Give all modules the scanner's number called `name` (or its "length_mode")."""
-    if not collection.mphdrr_scanner.is_scanner or following.is_writing():
-        return
-    value = getattr(collection.mphdrr_scanner, name)
-    with following.writing():
-        for camera in modules(collection):
-            setattr(camera.mphdrr_module, name, value)
-            if name == "collimator_length":
-                camera.mphdrr_module.length_mode = TYPED
-    refresh_scanner(collection)
-
-
-def copy_numbers(
-    collection: bpy.types.Collection, source: bpy.types.Object, targets: Iterable[bpy.types.Object]
-) -> None:
-    """Give modules the lengths of another, and its choice whether `l` follows the ROI."""
-    with following.writing():
-        for camera in targets:
-            for name in (*LENGTHS, "length_mode"):
-                setattr(camera.mphdrr_module, name, getattr(source.mphdrr_module, name))
-    refresh_scanner(collection)

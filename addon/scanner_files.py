@@ -49,7 +49,7 @@ def export_scanner(collection: bpy.types.Collection, path: Path, use_template: b
         A camera does not look at the isocentre, the modules' numbers are impossible, or the file cannot be written. The
         scanner stays as it was.
     """
-    scanner.refresh_scanner(collection)
+    following.refresh(collection)
     system = scanner.read_scanner(collection, aimed=True)
     template = _template(collection) if use_template else None
     source = scanner.source(collection)

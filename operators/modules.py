@@ -7,7 +7,7 @@ import math
 import bpy
 from bpy.props import BoolProperty, EnumProperty, FloatProperty, IntProperty
 
-from ..addon import copies, ids, renumbering, scanner, selection
+from ..addon import copies, following, ids, renumbering, scanner, selection
 from ..addon.replacement import modules_text
 from ..addon.reports import run_reported
 
@@ -194,7 +194,7 @@ class MPHDRR_OT_set_numbers(_OnModules, bpy.types.Operator):
         selected = selection.selected_modules(context)
         source = selection.active_module(context) or selected[0]
         targets = {*(scanner.modules(collection) if self.to_all else selected), source}
-        scanner.copy_numbers(collection, source, targets - {source})
+        following.copy_numbers(collection, source, targets - {source})
         return f"{len(targets)} modules have the numbers of {source.name}"
 
 

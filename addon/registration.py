@@ -14,6 +14,7 @@ from ..operators import (
     aim_modules,
     check_geometry,
     convert_ct,
+    dropped_files,
     duplicate_modules,
     edit_phantom,
     export_dataset,
@@ -32,7 +33,7 @@ from ..operators import (
     voxelize_objects,
 )
 from ..panels import add_menu, design, export, geometry, phantom, projections
-from . import cli, ids, jobs, live, live_phantoms, preferences, properties, slices, storage, volumes
+from . import cli, ids, jobs, live, live_phantoms, preferences, properties, slices, storage, updates, volumes
 
 # Classes in the order of registration; a panel comes after its parent. To add a class, list it here.
 CLASSES: tuple[type, ...] = (
@@ -40,7 +41,6 @@ CLASSES: tuple[type, ...] = (
     preferences.MPHDRR_Preferences,
     # operators
     import_geometry.MPHDRR_OT_import_geometry,
-    import_geometry.MPHDRR_FH_workbook,
     show_modules.MPHDRR_OT_show_modules,
     show_modules.MPHDRR_OT_look_through_module,
     aim_modules.MPHDRR_OT_aim_modules,
@@ -55,7 +55,6 @@ CLASSES: tuple[type, ...] = (
     add_map.MPHDRR_OT_add_map,
     *add_phantom.ADD_KINDS,
     add_phantom.MPHDRR_OT_import_phantom,
-    add_phantom.MPHDRR_FH_phantom,
     edit_phantom.MPHDRR_OT_update_phantom,
     edit_phantom.MPHDRR_OT_update_derenzo,
     edit_phantom.MPHDRR_OT_apply_phantom_pose,
@@ -64,7 +63,7 @@ CLASSES: tuple[type, ...] = (
     voxelize_objects.MPHDRR_OT_mesh_from_volume,
     import_volume.MPHDRR_OT_import_volume,
     import_volume.MPHDRR_OT_import_volume_sequence,
-    import_volume.MPHDRR_FH_volume,
+    *dropped_files.CLASSES,
     export_volume.MPHDRR_OT_export_volume,
     convert_ct.MPHDRR_OT_ct_to_attenuation,
     add_slices.MPHDRR_OT_add_slices,
@@ -104,20 +103,25 @@ MENUS: tuple[tuple[Any, Any], ...] = (
 HANDLERS: tuple[tuple[list[Any], Any], ...] = (
     (bpy.app.handlers.load_pre, jobs.before_load),
     (bpy.app.handlers.load_pre, slices.before_load),
-    (bpy.app.handlers.load_pre, live_phantoms.before_load),
     (bpy.app.handlers.load_post, volumes.after_load),
     (bpy.app.handlers.load_post, live.after_load),
-    (bpy.app.handlers.load_post, live_phantoms.after_undo),
     (bpy.app.handlers.depsgraph_update_post, live.after_update),
     (bpy.app.handlers.frame_change_post, live.after_frame),
     (bpy.app.handlers.frame_change_post, slices.after_frame_change),
     (bpy.app.handlers.undo_post, live.after_undo),
-    (bpy.app.handlers.undo_post, live_phantoms.after_undo),
     (bpy.app.handlers.redo_post, live.after_undo),
-    (bpy.app.handlers.redo_post, live_phantoms.after_undo),
     (bpy.app.handlers.save_pre, storage.before_save),
     (bpy.app.handlers.save_post, storage.after_save),
     (bpy.app.handlers.save_post_fail, storage.after_failed_save),
+)
+
+# What edited properties call; see `updates`.
+updates.FUNCTIONS.update(
+    {
+        "phantom": live_phantoms.settings_changed,
+        "display range": slices.range_changed,
+        "slices": slices.update,
+    }
 )
 
 # What Blender gave for ``blender --command mphdrr``, to take it back with.

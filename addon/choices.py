@@ -36,10 +36,6 @@ JOINED = {"BY_NUMBER": 0, "IN_ORDER": 1, "ONE_FOR_ALL": 2}
 UNITS = {
     "NONE": 0, "mm": 1, "cm": 2, "m": 3, "in": 4, "µm": 5, "rad": 6, "deg": 7, "dm": 8, "ft": 9, "mil": 10, "0.1 mm": 11,
 }  # fmt: skip
-GEOMETRY_FORMATS = {
-    "astra": 0, "rtk": 1, "opencv": 2, "kornia": 3, "pytorch3d": 4, "nerf": 5, "leap": 6, "pytomography": 7, "stir": 8,
-    "stl": 9, "stl-parts": 10, "3mf": 11, "glb": 12, "gate9": 13, "gate10": 14, "mphdrr": 15,
-}  # fmt: skip
 
 
 def number(numbers: Mapping[str, int], identifier: str) -> int:

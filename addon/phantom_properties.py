@@ -322,11 +322,11 @@ class VolumeProperties(bpy.types.PropertyGroup):
     )  # fmt: skip
     display_low: FloatProperty(
         name="Low", description="Value, in the volume's unit, at and below which nothing is shown",
-        update=on_edit("display range"),
+        update=on_edit("display_range"),
     )  # fmt: skip
     display_high: FloatProperty(
         name="High", description="Value, in the volume's unit, that is shown brightest", default=1.0,
-        update=on_edit("display range"),
+        update=on_edit("display_range"),
     )  # fmt: skip
     slices: IntVectorProperty(
         name="Slices", description="Voxel, along each of the grid's axes, that the slice planes lie in; from 0", size=3,

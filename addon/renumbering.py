@@ -12,7 +12,7 @@ import numpy as np
 from ..core.errors import InputError
 from ..core.geometry.generators import ring_order
 from ..core.recording import recorded_warnings
-from . import copies, design, ids, scanner
+from . import copies, following, ids, scanner
 
 Order = Literal["RINGS", "LIST"]
 
@@ -48,9 +48,9 @@ def renumber(collection: bpy.types.Collection, order: Order = "RINGS") -> int:
         system = scanner.read_scanner(collection)
     found = scanner.modules(collection)
     places = ring_order(system) if order == "RINGS" else np.arange(len(found))
-    parts = design.parts_of(collection, found)
+    parts = following.parts_of(collection, found)
     names: list[tuple[bpy.types.ID, str]] = []
-    with design.writing():
+    with following.writing():
         for index, camera in enumerate(found[place] for place in places):
             camera.mphdrr_module.number, camera.mphdrr_module.index = index + 1, index
             name = ids.module_name(index + 1, len(found))
@@ -68,5 +68,5 @@ def renumber(collection: bpy.types.Collection, order: Order = "RINGS") -> int:
         item.name = f"{name} renumbered"  # what another has now is free afterwards
     for item, name in names:
         item.name = name
-    scanner.refresh_scanner(collection)
+    following.refresh(collection)
     return int(np.count_nonzero(system.numbers[places] != ordered.numbers))

@@ -1,11 +1,10 @@
-"""Where in which workbook a system's numbers stand."""
+"""Where in which workbook a system's numbers are."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-
-from .workbook.column_map import ColumnMap
+from typing import Any
 
 
 @dataclass(frozen=True)
@@ -15,13 +14,13 @@ class QuantityCells:
     Attributes
     ----------
     quantity : str
-        The symbol: "number", "x1", "y1", "z1", "b", "l", "H", "x2", "y2", "z2", "range", "azimuth",
-        "elevation", "d", "R", "Ld" or "Td".
+        The symbol: "number", "x1", "y1", "z1", "b", "l", "H", "x2", "y2", "z2", "range", "azimuth", "elevation", "d",
+        "R", "Ld" or "Td".
     sheet : str
     column : str
         The column's letters.
     rows : tuple of int
-        The row of each module of `SystemSource.numbers`, in their order; the same where one value stands for all.
+        The row of each module of `SystemSource.numbers`, in their order; all the same if one value holds for all.
     """
 
     quantity: str
@@ -32,7 +31,7 @@ class QuantityCells:
 
 @dataclass(frozen=True)
 class SystemSource:
-    """The workbook a system was read from.
+    """The workbook that a system was read from.
 
     Attributes
     ----------
@@ -43,13 +42,13 @@ class SystemSource:
     coordinates_sheet : str
         The sheet of x1, y1, z1.
     dimensions_sheet : str
-        The sheet of the pinhole diameter d; `cells` knows those of R, Ld and Td, should they differ.
+        The sheet of the pinhole diameter d; those of R, Ld and Td, which may differ, are in `cells`.
     numbers : tuple of int
         The modules' numbers in the order of their rows. A part of a system keeps the whole system's source.
     cells : tuple of QuantityCells
         One for each quantity that has a column.
     columns : ColumnMap or None
-        The column map that it was read by; None where its headings were understood.
+        The column map that it was read by; None if its headings were understood.
     """
 
     path: Path
@@ -58,10 +57,10 @@ class SystemSource:
     dimensions_sheet: str
     numbers: tuple[int, ...]
     cells: tuple[QuantityCells, ...]
-    columns: ColumnMap | None = None
+    columns: Any = None  # a ColumnMap: of the workbook's room, which a system's own room does not know
 
     def cell(self, quantity: str, number: int) -> tuple[str, str] | None:
-        """(sheet, cell), e.g. ``("Coordinates", "B3")``, of a module's `quantity`; None without a column."""
+        """(sheet, cell) of a module's `quantity`, e.g. ``("Coordinates", "B3")``; None without a column."""
         row_of_module = self.numbers.index(number)
         for cells in self.cells:
             if cells.quantity == quantity:

@@ -2,22 +2,11 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import bpy
 
 from ..addon import ids
+from ..addon.scanner_files import WORKBOOK_SUFFIXES
 from ..addon.volume_import import READ_ENDINGS
-
-# Blender compares the last suffix only. Most .hdr files are pictures of surroundings, not Analyze images.
-_VOLUMES = sorted({"." + ending.rsplit(".", 1)[1] for ending in READ_ENDINGS} - {".hdr"})
-
-# Class, label, operator, endings.
-_DROPPED = (
-    (ids.FILE_HANDLER_WORKBOOK, "Pinhole Geometry", ids.IMPORT_GEOMETRY, [".xlsx", ".xlsm"]),
-    (ids.FILE_HANDLER_VOLUME, "Volume for Projection", ids.IMPORT_VOLUME, _VOLUMES),
-    (ids.FILE_HANDLER_PHANTOM, "Phantom", ids.IMPORT_PHANTOM, [".toml"]),
-)
 
 
 class _Dropped:
@@ -26,14 +15,23 @@ class _Dropped:
         return context.area is not None and context.area.type in {"VIEW_3D", "OUTLINER"}
 
 
-def _handler(name: str, label: str, operator: str, endings: list[str]) -> Any:
-    members = {
-        "bl_idname": name,
-        "bl_label": label,
-        "bl_import_operator": operator,
-        "bl_file_extensions": ";".join(endings),
-    }
-    return type(name, (_Dropped, bpy.types.FileHandler), members)
+class MPHDRR_FH_workbook(_Dropped, bpy.types.FileHandler):
+    bl_idname = ids.FILE_HANDLER_WORKBOOK
+    bl_label = "Pinhole Geometry"
+    bl_import_operator = ids.IMPORT_GEOMETRY
+    bl_file_extensions = ";".join(WORKBOOK_SUFFIXES)
 
 
-CLASSES = tuple(_handler(*row) for row in _DROPPED)
+class MPHDRR_FH_phantom(_Dropped, bpy.types.FileHandler):
+    bl_idname = ids.FILE_HANDLER_PHANTOM
+    bl_label = "Phantom"
+    bl_import_operator = ids.IMPORT_PHANTOM
+    bl_file_extensions = ".toml"
+
+
+class MPHDRR_FH_volume(_Dropped, bpy.types.FileHandler):
+    bl_idname = ids.FILE_HANDLER_VOLUME
+    bl_label = "Volume for Projection"
+    bl_import_operator = ids.IMPORT_VOLUME
+    # Blender compares the last suffix only. Most .hdr files are pictures of surroundings, not Analyze images.
+    bl_file_extensions = ";".join(sorted({"." + ending.rsplit(".", 1)[1] for ending in READ_ENDINGS} - {".hdr"}))

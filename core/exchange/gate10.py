@@ -6,6 +6,7 @@ Rotations are the solids' own: opengate hands them to ``G4PVPlacement(G4Transfor
 from __future__ import annotations
 
 import json
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -13,12 +14,28 @@ from ..geometry.system import PinholeSystem
 from ..geometry.views import Views
 from ..validation import whole_number
 from .format import Format
-from .monte_carlo import REFERENCE_ENERGY, Part, Scene, Simulation, build_scene, material_database, simulation_options
+from .monte_carlo import REFERENCE_ENERGY, Part, Scene, Simulation, build_scene, material_database
 
-_SCRIPT = Path(__file__).with_name("simulation_script.py")
+_SCRIPT = Path(__file__).with_name("gate10_script.py")
 
 
-@simulation_options(threads=1)
+@dataclass(frozen=True, kw_only=True)
+class Gate10Simulation(Simulation):
+    """A simulation by several threads.
+
+    Attributes
+    ----------
+    threads : int
+        All together emit the activity.
+    """
+
+    threads: int = 1
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        whole_number(self.threads, "threads")
+
+
 def write(system: PinholeSystem, views: Views, path: Path, **options: Any) -> None:
     """Write ``simulation.py``, ``simulation.json`` and ``GateMaterials.db`` into the folder `path`.
 
@@ -36,15 +53,21 @@ def write(system: PinholeSystem, views: Views, path: Path, **options: Any) -> No
     InputError
         An option, or what `build_scene` refuses.
     """
-    threads = whole_number(options.pop("threads", 1), "threads")
-    scene = build_scene(system, Simulation(**options))
-    record = {"threads": threads, **_record(system, scene), "image_shape": list(views.shape)}
+    simulation = Gate10Simulation(**options)
+    scene = build_scene(system, simulation)
+    record = {"threads": simulation.threads, **_record(system, scene), "image_shape": list(views.shape)}
     (path / "simulation.py").write_text(_SCRIPT.read_text(encoding="utf-8"), encoding="utf-8")
     (path / "simulation.json").write_text(_json(record), encoding="utf-8")
     (path / "GateMaterials.db").write_text(material_database(), encoding="ascii", newline="\n")
 
 
-GATE10 = Format("gate10", "GATE 10 (opengate) script: a folder, to run by python simulation.py", (), write)
+GATE10 = Format(
+    "gate10",
+    "GATE 10 (opengate) script: a folder, to run by python simulation.py",
+    (),
+    write,
+    options_of=Gate10Simulation,
+)
 
 
 def _json(record: dict[str, Any]) -> str:

@@ -30,7 +30,6 @@ from .monte_carlo import (
     Simulation,
     build_scene,
     material_database,
-    simulation_options,
 )
 
 MOST_LINES = 100
@@ -39,7 +38,6 @@ MOST_LINES = 100
 _MARGIN = 0.1  # mm by which a head's box is larger than its crystal, at the sides and behind it
 
 
-@simulation_options()
 def write(system: PinholeSystem, views: Views, path: Path, **options: Any) -> None:
     """Write the macros into the folder `path`.
 
@@ -91,7 +89,7 @@ def write(system: PinholeSystem, views: Views, path: Path, **options: Any) -> No
     folder.write("modules.txt", _modules(system, scene))
 
 
-GATE9 = Format("gate9", "GATE 9.3 macros: a folder, to run by Gate main.mac", (), write)
+GATE9 = Format("gate9", "GATE 9.3 macros: a folder, to run by Gate main.mac", (), write, options_of=Simulation)
 
 
 class _Folder:

@@ -6,12 +6,10 @@ is at (x, y) where `PinholeSystem.views(detector="real")` has it. Lengths mm, ti
 
 from __future__ import annotations
 
-import inspect
 import math
-from collections.abc import Callable
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from itertools import pairwise
-from typing import Any, Literal, NamedTuple, get_args, get_type_hints
+from typing import Literal, NamedTuple, get_args, get_type_hints
 
 import numpy as np
 from numpy.typing import NDArray
@@ -87,7 +85,7 @@ def material_database() -> str:
     return "\n".join(["[Elements]", *elements, "", "[Materials]", _MATERIALS])
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Simulation:
     """What is simulated: the options of the Monte Carlo formats.
 
@@ -235,27 +233,6 @@ class Simulation:
     def photons_per_decay(self) -> float:
         """Of all lines together."""
         return sum(photons for _, photons in self.nuclide.lines)
-
-
-def simulation_options(**more: Any) -> Callable[[Callable[..., None]], Callable[..., None]]:
-    """Let ``write(system, views, path, **options)`` of a format show `Simulation`'s options, and `more`, with defaults."""
-
-    kinds = get_type_hints(Simulation)
-    options = {f.name: (kinds[f.name], f.default) for f in fields(Simulation)}
-    options |= {name: (type(default), default) for name, default in more.items()}
-
-    def named(write: Callable[..., None]) -> Callable[..., None]:
-        signature = inspect.signature(write)
-        first = [p for p in signature.parameters.values() if p.kind is not p.VAR_KEYWORD]
-        last = [
-            inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=default, annotation=kind)
-            for name, (kind, default) in options.items()
-        ]
-        write.__signature__ = signature.replace(parameters=first + last)  # type: ignore[attr-defined]
-        write.__annotations__ |= {name: kind for name, (kind, _) in options.items()}
-        return write
-
-    return named
 
 
 class Part(NamedTuple):

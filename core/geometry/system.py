@@ -3,18 +3,16 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, fields
-from typing import TYPE_CHECKING, Literal
+from typing import Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..errors import InputError
+from ..system_source import SystemSource
 from ..validation import freeze, positive, real_array, whole_shape
 from .frames import module_frames, module_poses, principal_rays
 from .views import Views
-
-if TYPE_CHECKING:
-    from ..workbook import SystemSource
 
 Detector = Literal["virtual", "real"]
 

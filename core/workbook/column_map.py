@@ -12,7 +12,8 @@ from typing import Any, Literal, get_args
 
 from ..errors import InputError
 from ..files import replacing
-from .quantities import NEEDED, POSITION, QUANTITIES, unit_alone
+from .headings import unit_of
+from .quantities import NEEDED, POSITION, QUANTITIES
 from .references import MAX_COLUMN, MAX_ROW
 
 Joined = Literal["by number", "in order", "one for all"]
@@ -40,7 +41,7 @@ class MappedColumn:
     unit: str
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "unit", unit_alone(self.unit) or self.unit)  # "um" and "inches" are units, too
+        object.__setattr__(self, "unit", unit_of(self.unit) or self.unit)  # "um" and "inches" are units, too
 
 
 @dataclass(frozen=True)

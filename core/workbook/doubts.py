@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from collections import defaultdict
 
-from .quantities import LENGTH_UNITS, UNIT_WORDS, may_mean, shown_as_stored, understood, units_in
-from .sheet_seen import SheetSeen, is_number, quoted, several
+from .headings import UNIT_WORDS, heading_of, may_mean, quoted, shows_as_stored, units_mentioned
+from .quantities import LENGTH_UNITS
+from .sheet_seen import SheetSeen, is_number, several
 from .sheet_xml import At
 
 
@@ -56,7 +57,7 @@ def _other_tables(seen: SheetSeen) -> None:
     """Headings of what is needed that stand apart: a second table, or a second heading."""
     apart: dict[int, dict[str, int]] = defaultdict(dict)
     for (row, column), text in seen.sheet.texts.items():
-        heading = understood(text)
+        heading = heading_of(text)
         if heading is not None and not seen.first_heading <= row < seen.first_row:
             apart[row][heading.quantity] = column
     for row, found in sorted(apart.items()):
@@ -92,7 +93,7 @@ def _texts_between(seen: SheetSeen) -> None:
 
 def _notes(seen: SheetSeen, lengths: set[str]) -> None:
     """Units in the sheet's name and in texts that are no heading, and that are not the headings' own."""
-    for unit in units_in(seen.sheet.name.replace("_", " ")):
+    for unit in units_mentioned(seen.sheet.name.replace("_", " ")):
         if lengths != {unit}:
             seen.doubt(
                 f"the name of sheet {seen.sheet.name} speaks of {unit}, where the headings say {several(lengths)}"
@@ -102,15 +103,17 @@ def _notes(seen: SheetSeen, lengths: set[str]) -> None:
         row, column = at
         if at in seen.above and (column in seen.headings or _heads_its_own(seen, at)):
             continue
-        for unit in units_in(text, alone=row in modules):
-            named = unit in UNIT_WORDS and any(units_in(seen.sheet.texts[a]) for a in seen.texts_of_row[row] if a != at)
+        for unit in units_mentioned(text, alone=row in modules):
+            named = unit in UNIT_WORDS and any(
+                units_mentioned(seen.sheet.texts[a]) for a in seen.texts_of_row[row] if a != at
+            )
             if lengths != {unit} and not named:
                 seen.doubt(
                     f"{seen.sheet.place(*at)} holds {quoted(text)}, where the headings say {several(lengths)}: "
                     "expected one unit"
                 )
     for at, text in seen.sheet.comments.items():
-        if at[0] < seen.first_row and any(lengths != {unit} for unit in units_in(text)):
+        if at[0] < seen.first_row and any(lengths != {unit} for unit in units_mentioned(text)):
             seen.doubt(
                 f"{seen.sheet.place(*at)} has the comment {quoted(text)}, where the headings say "
                 f"{several(lengths)}: expected one unit"
@@ -119,7 +122,7 @@ def _notes(seen: SheetSeen, lengths: set[str]) -> None:
 
 def _heads_its_own(seen: SheetSeen, at: At) -> bool:
     """Whether a text is the heading of numbers that are of no concern: its unit is theirs alone."""
-    alone = len(seen.aside[at[1]]) == 1 and units_in(seen.above[at], alone=True)
+    alone = len(seen.aside[at[1]]) == 1 and units_mentioned(seen.above[at], alone=True)
     return at[1] in seen.numeric - {seen.label_column} and not alone
 
 
@@ -130,7 +133,7 @@ def _formats(seen: SheetSeen, used: list[tuple[int, str]]) -> None:
             if (row, column) not in seen.sheet.cells or seen.sheet.is_date(row, column):
                 continue
             shown = seen.sheet.number_format(row, column)
-            if not shown_as_stored(shown, unit):
+            if not shows_as_stored(shown, unit):
                 seen.doubt(
                     f"{seen.sheet.place(row, column)} is shown as {quoted(shown)}, where its heading says {unit}: "
                     "expected one unit"

@@ -9,8 +9,9 @@ from ..errors import InputError
 from ..recording import recorded_warnings
 from .book import HEADING_ROWS, Book, Outdated, Sheet, Uncomputed
 from .column_map import ColumnMap, Joined, MappedColumn, MappedTable
+from .headings import heading_of, is_number_heading, may_mean
 from .layout import Layout, column_map_of
-from .quantities import DIMENSIONS, NEEDED, POSITION, is_number_heading, may_mean, understood
+from .quantities import DIMENSIONS, NEEDED, POSITION
 from .recognition import recognize, recognized_layout
 from .sheet_seen import SheetSeen
 
@@ -84,7 +85,7 @@ def draft_column_map(path: str | os.PathLike[str]) -> ColumnMapDraft:
 
 
 def _certain(layout: Layout) -> ColumnMapDraft:
-    """The map of a layout that is understood, without optional columns that are not filled: a map's cells must be."""
+    """The map of a layout that is heading_of, without optional columns that are not filled: a map's cells must be."""
     values = {
         name: [column.table.sheet.value(row, column.column) for row in column.rows]
         for name, column in layout.columns.items()
@@ -190,7 +191,7 @@ def _tables(seen: SheetSeen, names: list[str], coordinates: SheetSeen | None) ->
 
 
 def _guessed(sheets: dict[str, Sheet], missing: list[str], tables: list[MappedTable]) -> list[MappedTable]:
-    """For what has no heading that is understood, columns whose headings speak of it."""
+    """For what has no heading that is heading_of, columns whose headings speak of it."""
     from openpyxl.utils import get_column_letter as letters
 
     used = {(table.sheet, c.column) for table in tables for c in table.columns}
@@ -199,7 +200,7 @@ def _guessed(sheets: dict[str, Sheet], missing: list[str], tables: list[MappedTa
         for title, sheet in sheets.items():
             for (row, column), text in sorted(sheet.texts.items()):
                 place = (title, letters(column))
-                if row > HEADING_ROWS or place in used or name not in may_mean(text) or understood(text) is not None:
+                if row > HEADING_ROWS or place in used or name not in may_mean(text) or heading_of(text) is not None:
                     continue
                 below = [r for r in sheet.rows if r > row and type(sheet.value(r, column)) is float]
                 if below:

@@ -16,8 +16,8 @@ from .arrangement import Arrangement, arrange, matched
 from .cells import module_number
 from .column_map import ColumnMap
 from .layout import Column, Table, column_map_of
-from .plausibility import EXACT, derived, is_by_design
-from .quantities import DIMENSIONS, POSITION
+from .plausibility import derived, is_by_design
+from .quantities import DIMENSIONS, EXACT, POSITION
 from .reader import Reading
 from .recalculate import agree
 from .workbook_xml import Place, WorkbookXml

@@ -15,7 +15,8 @@ from ..errors import InputError, InputWarning
 from .book import HEADING_ROWS, Book, Sheet, Uncomputed
 from .cells import found, length, module_number, where
 from .column_map import ColumnMap, MappedColumn, MappedTable
-from .quantities import QUANTITIES, shown_as_stored, understood
+from .headings import heading_of, shows_as_stored
+from .quantities import QUANTITIES
 
 MAX_MODULES = 10_000
 
@@ -187,7 +188,7 @@ def _warn_of_contradictions(table: Table) -> None:
     sheet, first = table.sheet, table.rows[0]
     for name, (column, unit) in table.columns.items():
         for row in range(max(1, first - HEADING_ROWS), first):
-            heading = understood(sheet.texts.get((row, column)))
+            heading = heading_of(sheet.texts.get((row, column)))
             if heading is not None and (heading.quantity != name or heading.unit not in (None, unit)):
                 said = heading.quantity + (f" in {heading.unit}" if heading.unit else "")
                 warnings.warn(
@@ -197,7 +198,7 @@ def _warn_of_contradictions(table: Table) -> None:
                 )
                 return
         shown = sheet.number_format(first, column) if (first, column) in sheet.cells else ""
-        if not shown_as_stored(shown, unit):
+        if not shows_as_stored(shown, unit):
             warnings.warn(
                 f"{where(sheet, first, column)} is shown as {shown!r}, the column map says {name} in {unit}, which is used",
                 InputWarning,

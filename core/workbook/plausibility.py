@@ -12,25 +12,12 @@ from ..errors import InputWarning
 from ..geometry.design_formulas import collimator_length
 from ..geometry.system import PinholeSystem
 from .layout import Column
-from .quantities import LENGTH_UNITS, QUANTITIES
+from .quantities import QUANTITIES, tolerance
 
-EXACT = 1e-6
-"""Relative, and absolute in mm or radians: stored results of formulas agree far better."""
-_COARSEST = {**{unit: 0.005 / factor for unit, factor in LENGTH_UNITS.items()}, "rad": 0.0005, "deg": 0.005}
-"""A number may be rounded in its last decimal, by no more than this in its unit."""
 AGREEING = 1e-9
 """Relative: a formula's result nearer to a number than this gives that number."""
 SHOWN = 5
 """Warnings of one column; the last one counts the rest."""
-
-
-def tolerance(value: float, expected: float, unit: str) -> float:
-    """By how much `value` may differ from `expected`: `EXACT`, or half a unit of its last decimal; all in `unit`."""
-    text = f"{value:.12g}"
-    decimals = len(text.partition(".")[2]) if "e" not in text else 12
-    # Trailing zeros are lost: 89.1 may be 89.10, so few decimals stand for the coarsest rounding.
-    rounding = min(0.5 * 10.0**-decimals, _COARSEST[unit])
-    return max(EXACT * max(1.0 / LENGTH_UNITS.get(unit, 1.0), abs(expected)), rounding * (1 + 1e-9))
 
 
 def is_by_design(system: PinholeSystem) -> NDArray[np.bool_]:
@@ -108,7 +95,7 @@ def warn_of_differences(
 
 def warn_of_implausible(name: str, values: NDArray[np.float64], column: Column) -> None:
     """Warn of the first module of which a length (M,), mm, that comes from `column` is unlike any scanner's."""
-    low, high = QUANTITIES[name].plausible or (0.0, math.inf)
+    low, high = QUANTITIES[name].plausible
     odd = np.flatnonzero((values < low) | (values > high))
     if len(odd):
         several = len(set(column.rows)) > 1 and len(odd) > 1

@@ -17,8 +17,8 @@ from ..system_source import QuantityCells, SystemSource
 from .book import Book
 from .column_map import ColumnMap, column_map
 from .layout import Column, Layout, mapped_layout
-from .plausibility import derived, tolerance, warn_of_differences, warn_of_implausible
-from .quantities import DERIVED, DIMENSIONS, NEEDED, POSITION
+from .plausibility import derived, warn_of_differences, warn_of_implausible
+from .quantities import DERIVED, DIMENSIONS, NEEDED, POSITION, tolerance
 from .recognition import recognized_layout
 
 _COMPUTED = ("b", "l", *DERIVED[1:])

@@ -13,6 +13,7 @@ from dataclasses import dataclass
 from ..errors import InputError, InputWarning
 from .book import HEADING_ROWS, Book, Sheet
 from .doubts import look_around
+from .headings import heading_of, may_mean, quoted, units_mentioned
 from .layout import Column, Layout, Table, by_label, check_modules, in_order
 from .quantities import (
     DERIVED,
@@ -21,11 +22,8 @@ from .quantities import (
     NEEDED,
     POSITION,
     QUANTITIES,
-    may_mean,
-    understood,
-    units_in,
 )
-from .sheet_seen import SheetSeen, quoted, several, sheet_seen, sheets_seen
+from .sheet_seen import SheetSeen, several, sheet_seen, sheets_seen
 
 HELP = "a column map can say what is meant (columns='map.toml', --columns map.toml; docs/workbook.md)"
 
@@ -106,7 +104,7 @@ def _missing(book: Book, sheets: dict[str, Sheet], name: str) -> str:
         f"{sheet.place(*at)} {quoted(text)}"
         for sheet in sheets.values()
         for at, text in sheet.texts.items()
-        if at[0] <= HEADING_ROWS and name in may_mean(text) and understood(text) is None
+        if at[0] <= HEADING_ROWS and name in may_mean(text) and heading_of(text) is None
     ]
     saw = f"not understood: {', '.join(close[:3])}" if close else f"its sheets are {', '.join(book.sheets) or 'none'}"
     return f"{book.path.name}: no sheet has a column headed {name} or {quantity.headings[1]!r}; {saw}"
@@ -217,7 +215,7 @@ def _warn_of_other_sheets(layout: Layout, sheets: dict[str, Sheet]) -> None:
         if name in used:
             continue
         for at, text in sheet.texts.items():
-            if _OF_ALL.search(text) and any(units != {unit} for unit in units_in(text)):
+            if _OF_ALL.search(text) and any(units != {unit} for unit in units_mentioned(text)):
                 warnings.warn(
                     f"{book.path.name}: {sheet.place(*at)} says {quoted(text)}, where the headings of the scanner's "
                     f"sheets say {several(units)}, which was used",

@@ -9,19 +9,9 @@ from functools import cached_property
 
 from .book import HEADING_ROWS, Book, Sheet
 from .cells import module_number
+from .headings import Heading, heading_of, is_label_heading, is_number_heading, plain, quoted, unit_of
 from .layout import Table
-from .quantities import (
-    DIMENSIONS,
-    NEEDED,
-    POSITION,
-    QUANTITIES,
-    Heading,
-    is_label_heading,
-    is_number_heading,
-    plain,
-    understood,
-    unit_alone,
-)
+from .quantities import DIMENSIONS, NEEDED, POSITION, QUANTITIES
 from .references import Reference
 from .sheet_xml import At
 from .workbook_xml import areas_in
@@ -94,7 +84,7 @@ class SheetSeen:
         for (row, c), text in self.above.items():
             if c != column:
                 continue
-            heading, unit = said.get(row), unit_alone(text)
+            heading, unit = said.get(row), unit_of(text)
             place = self.sheet.place(row, c)
             if heading is None and unit not in QUANTITIES[first.quantity].units:
                 self.doubt(
@@ -291,7 +281,7 @@ def sheet_seen(sheet: Sheet) -> SheetSeen | None:
     """A sheet's headings, None where it has none."""
     rows: dict[int, dict[int, Heading]] = defaultdict(dict)
     for (row, column), text in sheet.texts.items():
-        if row <= HEADING_ROWS and (heading := understood(text)) is not None:
+        if row <= HEADING_ROWS and (heading := heading_of(text)) is not None:
             rows[row][column] = heading
     if not rows:
         return None
@@ -313,12 +303,6 @@ def is_number(sheet: Sheet, row: int, column: int) -> bool:
     """Whether a cell holds anything but text or nothing."""
     value = sheet.value(row, column)
     return value is not None and type(value) is not str
-
-
-def quoted(text: str) -> str:
-    """A text as messages show it."""
-    text = plain(text)
-    return repr(text if len(text) <= 60 else text[:59] + "…")
 
 
 def several(units: set[str]) -> str:

@@ -72,7 +72,7 @@ def columns(unread) -> ColumnMap:
 
 @pytest.fixture
 def form():
-    return column_maps.settings(bpy.context)
+    return bpy.context.window_manager.mphdrr_columns
 
 
 def quantity(form, name):
@@ -187,7 +187,7 @@ def test_a_map_is_saved_once_and_never_over_a_file(form, unread, columns):
     form.save_as = "map.toml"
     assert column_maps.accept(form) == columns
     assert ColumnMap.read(unread.with_name("map.toml")) == columns
-    with pytest.raises(InputError, match=r"map\.toml: is there already"):
+    with pytest.raises(InputError, match=r"map\.toml: exists already"):
         column_maps.accept(form)
     form.save_as = "map.txt"
     with pytest.raises(InputError, match=r"ending in \.toml"):

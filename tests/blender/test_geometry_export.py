@@ -115,7 +115,7 @@ def test_template_that_has_gone_is_said(collection, own, tmp_path):
     own.unlink()
     scanner.module(collection, 3).mphdrr_module.pinhole_diameter = 2.9
     system = scanner.read_scanner(collection)
-    from mphdrr.addon.geometry_file import export_scanner
+    from mphdrr.addon.scanner_files import export_scanner
 
     with pytest.warns(InputWarning, match=r"own\.xlsx has gone"):
         export_scanner(collection, tmp_path / "new.xlsx")

@@ -13,6 +13,7 @@ import pytest
 
 from mphdrr.addon import cameras, ids, registration, scanner
 from mphdrr.core.errors import InputError, InputWarning
+from mphdrr.core.geometry.collimator import Construction
 from mphdrr.core.geometry.system import PinholeSystem
 
 LENGTHS = ("pinhole_diameter", "collimator_length", "detector_side", "detector_thickness", "roi_radius")
@@ -243,7 +244,7 @@ def test_failed_build_leaves_the_scene_as_it_was(scene, ring_system, monkeypatch
     scanner.build_scanner(scene, ring_system)
     before = counts()
     with pytest.raises(InputError, match="aperture plate"):
-        scanner.build_scanner(scene, ring_system, plate_thickness=60.0)
+        scanner.build_scanner(scene, ring_system, construction=Construction(60.0))
     monkeypatch.setattr(cameras, "set_field_of_view", lambda *args: 1 / 0)
     with pytest.raises(ZeroDivisionError):
         scanner.build_scanner(scene, ring_system, "Other")

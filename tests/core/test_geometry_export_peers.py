@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import re
 
 import numpy as np
@@ -108,24 +107,3 @@ def test_astra_takes_the_geometry(views, system, rng, tmp_path):
     assert astra.geom_size(volume) == (10, 6, 4)
     identifier = astra.data3d.create("-sino", geometry)  # refused unless ASTRA finds the vectors good
     astra.data3d.delete(identifier)
-
-
-def test_pytomography_places_pixels_alike(rng, tmp_path):
-    torch = pytest.importorskip("torch", reason="no torch")
-    metadata = pytest.importorskip("pytomography.metadata.CT", reason="no PyTomography", exc_type=ImportError)
-    azimuth = rng.uniform(-np.pi, np.pi, 5)
-    centers = 210 * np.stack([np.cos(azimuth), np.sin(azimuth), 0 * azimuth], axis=1)
-    system = mph.PinholeSystem(centers, 2.3, 60.0, 50.0, 10.0, 75.0)
-    views = system.views(shape=(11, 16), pitch=(3.0, 4.0))
-    mph.write_geometry(system, tmp_path / "a.json", "pytomography", views=views)
-    a = json.loads((tmp_path / "a.json").read_text())
-    columns, rows = a.pop("flip_columns"), a.pop("flip_rows")
-    meta = metadata.CTConeBeamFlatPanelProjMeta(
-        **a | {"angles": torch.tensor(a["angles"]), "z_locations": torch.tensor(a["z_locations"])}
-    )
-    for m in range(len(views)):
-        pixels = meta._get_detector_coordinates(m).cpu().numpy()  # columns, rows
-        pixels = pixels[::-1] if columns else pixels
-        pixels = pixels[:, ::-1] if rows else pixels
-        assert np.abs(pixels.transpose(1, 0, 2).reshape(-1, 3) - views.rays(m)[1]).max() < 1e-3  # it counts in float32
-        assert np.allclose(meta.beam_locations[m].cpu(), views.sources[m], atol=1e-4)

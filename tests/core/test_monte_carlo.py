@@ -369,8 +369,8 @@ def test_options(scanner, tmp_path) -> None:
     assert numbers == [SHAPE[1], SHAPE[0]]
     assert np.multiply(sizes, numbers) == pytest.approx(scanner.detector_side[0])
     assert {"phantom", "isotope", "activity", "seed", "plate_thickness"} < set(FORMATS["gate9"].options)
-    hints = typing.get_type_hints(FORMATS["gate9"].write)  # what the command line reads values by
-    assert hints["time"] is float and hints["seed"] is int and typing.get_args(hints["crystal"]) == ("NaI", "CZT")
+    types = {name: type_ for name, (type_, _) in FORMATS["gate9"].options.items()}
+    assert types["time"] is float and types["seed"] is int and typing.get_args(types["crystal"]) == ("NaI", "CZT")
     assert set(FORMATS["gate10"].options) - set(FORMATS["gate9"].options) == {"threads"}
 
 

@@ -25,8 +25,8 @@ from mphdrr.core.errors import InputError, InputWarning
 from mphdrr.core.geometry.design_formulas import collimator_length
 from mphdrr.core.workbook import libreoffice, read_system
 from mphdrr.core.workbook.formulas import CellError, NotComputable, Surroundings, calculate
-from mphdrr.core.workbook.plausibility import tolerance
-from mphdrr.core.workbook.quantities import understood
+from mphdrr.core.workbook.headings import heading_of
+from mphdrr.core.workbook.quantities import tolerance
 
 try:
     from hypothesis import HealthCheck, given, settings
@@ -676,7 +676,7 @@ def test_formulas_beyond_arithmetic_are_not_computed(formula):
     ],
 )
 def test_headings_name_quantities(heading, quantity):
-    assert (understood(heading) or (None,))[0] == quantity
+    assert (heading_of(heading) or (None,))[0] == quantity
 
 
 # Refusals

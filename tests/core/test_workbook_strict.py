@@ -19,7 +19,8 @@ from openpyxl.worksheet.worksheet import Worksheet
 
 import mphdrr.core as mph
 from mphdrr.core.errors import InputError, InputWarning
-from mphdrr.core.workbook.quantities import LENGTH_UNITS, QUANTITIES, Heading, understood
+from mphdrr.core.workbook.headings import Heading, heading_of
+from mphdrr.core.workbook.quantities import LENGTH_UNITS, QUANTITIES
 
 from .test_workbook import _one_sheet, assert_plain, plain, read_edited, saved
 from .test_workbook import _typed as typed
@@ -338,8 +339,8 @@ def test_what_is_understood_is_read(kind, tmp_path):
 def test_units_are_understood_in_every_form(form, unit):
     named = {"CM": "cm", "inches": "in", "centimetres": "cm", "millimeter": "mm", "um": "µm", "μm": "µm"}
     for name in ("x1", "Ld", "R", "l"):
-        assert understood(form.format(name, unit)) == Heading(name, named.get(unit, unit))
-    assert understood(form.format("pinhole azimuth", unit)) is None
+        assert heading_of(form.format(name, unit)) == Heading(name, named.get(unit, unit))
+    assert heading_of(form.format("pinhole azimuth", unit)) is None
 
 
 def in_units(units: dict[str, str]):
@@ -349,7 +350,7 @@ def in_units(units: dict[str, str]):
         typed(main, coordinates)
         for sheet in (main, coordinates):
             for column in range(2, sheet.max_column + 1):
-                heading = next((h for r in (1, 2) if (h := understood(sheet.cell(r, column).value))), None)
+                heading = next((h for r in (1, 2) if (h := heading_of(sheet.cell(r, column).value))), None)
                 if heading is None or QUANTITIES[heading.quantity].kind != "length":
                     continue
                 unit = units.get(heading.quantity, units[""])
@@ -410,7 +411,7 @@ def test_a_row_of_units_counts(tmp_path):
             sheet.insert_rows(3)
             for column in range(2, sheet.max_column + 1):
                 for row in (1, 2):
-                    if (heading := understood(sheet.cell(row, column).value)) is not None and heading.unit == "cm":
+                    if (heading := heading_of(sheet.cell(row, column).value)) is not None and heading.unit == "cm":
                         sheet.cell(row, column).value = sheet.cell(row, column).value.rstrip("(cm)[], ")
                         sheet.cell(3, column).value = "[cm]"
 

@@ -1,0 +1,186 @@
+"""What the texts of a geometry workbook say: headings, units, notes and number formats.
+
+A heading is understood as a whole or not at all: it is one of the texts in the table of quantities (blanks and case
+aside), alone or with a known unit: "x1 (mm)", "x1 [cm]", "x1, cm", "x1/cm", "x1 in cm".
+"""
+
+from __future__ import annotations
+
+import re
+import unicodedata
+from collections.abc import Iterable
+from typing import Any, NamedTuple
+
+from .quantities import ANGLE_UNITS, QUANTITIES
+
+NUMBER_HEADINGS = frozenset(
+    (
+        *("definitions", "number", "no", "no.", "nr", "nr.", "#", "module", "modules", "module number", "module no"),
+        *("module no.", "module #", "pinhole number", "pinhole no", "pinhole no.", "camera", "camera number"),
+    )
+)
+"""Head the column of the modules' numbers."""
+LABEL_HEADINGS = frozenset(
+    (
+        *("serial", "serial number", "serial no", "serial no.", "s/n", "sn", "label", "name", "id", "identifier"),
+        *("code", "tag", "module id", "module name", "pinhole id", "pinhole name", "camera id", "camera name"),
+    )
+)
+"""Head a column that also says which module a row belongs to: two sheets must agree in it."""
+UNIT_WORDS = frozenset(["unit", "units", "einheit", "einheiten", "unité", "unités"])
+"""Words of notes that a unit in the same row explains: "Units: mm"."""
+
+_UNIT_WORDS = {
+    "mm": "mm millimeter millimeters millimetre millimetres",
+    "cm": "cm centimeter centimeters centimetre centimetres",
+    "m": "m meter meters metre metres",
+    "in": "in inch inches",
+    "µm": "µm um micrometer micrometers micrometre micrometres micron microns",
+    "rad": "rad radian radians",
+    "deg": "deg degree degrees °",
+}
+_OTHER_UNIT_WORDS = (
+    "dm decimeter decimeters decimetre decimetres dezimeter zentimeter millimeter km kilometer kilometers kilometre "
+    "kilometres nm nanometer nanometers nanometre nanometres angstrom angstroms å mil mils thou ft foot feet yd yard "
+    "yards zoll pouce pouces pollice pollici pulgada pulgadas px pixel pixels voxel voxels unit units einheit "
+    "einheiten unité unités scale scaled scaling maßstab centímetros centimetros milímetros centimètres millimètres "
+    "centimetri millimetri см мм дюйм дюймы сантиметры миллиметры 厘米 公分 毫米 英寸 センチ ミリ インチ"
+)
+"""Words that speak of a unit or a scale which is not supported."""
+
+_QUANTITY_OF = {
+    text if len(text) == 1 else text.casefold(): quantity.name
+    for quantity in QUANTITIES.values()
+    for text in quantity.headings
+}
+_UNIT_OF = {
+    unicodedata.normalize("NFKC", word).casefold(): unit
+    for unit, words in _UNIT_WORDS.items()
+    for word in words.split()
+}
+_OTHER_WORDS = frozenset(_OTHER_UNIT_WORDS.split()) - set(_UNIT_OF)
+_HINTS = {name: frozenset(quantity.hints.split()) for name, quantity in QUANTITIES.items()}
+
+_WITH_UNIT = re.compile(
+    r"(?P<name>.+?)\s*(?:\((?:in )?(?P<a>[^()]+)\)|\[(?:in )?(?P<b>[^\[\]]+)\]|[,/]\s*(?P<c>\S+)|\sin\s(?P<d>\S+))"
+)
+_BRACKETED_UNIT = re.compile(r"\((?:in )?([^()]+)\)|\[(?:in )?([^\[\]]+)\]|(.+)")
+_WORD = re.compile(r"[^\W\d_]+")
+_FILLERS = frozenset(["in", "all", "are", "is", "lengths", "length", "values", "value", "the"])
+# "in" is also a word and "m" a letter: they are units in brackets, or after a number or "in", or at the end.
+_IN_BRACKETS = re.compile(r"[(\[]\s*(in|m|\"|''|″)\.?\s*[)\]]")
+_AT_THE_END = re.compile(r"(?:^|[:=,/]\s*|\bin\s+|\d\s*)(in|m)\b\.?(?!\s*[\w\d])|\s(m)$")
+_PART_OF_MILLIMETRE = re.compile(
+    r"(?:\bin|[x×*/]|\bunits?\b\D*)\s*[\d.,/^-]*\d[\d.,/^-]*\s*mm\b|\bths? (?:of )?(?:a )?mm\b|tenths? of"
+    r"|[x×*/÷] ?[\d.,]+ ?=|^[\d.,/^-]+ ?mm$"
+)
+
+# Of number formats
+_LITERAL = re.compile(r'"([^"]*)"|\\(.)|\[\$([^\]-]*)[^\]]*\]')
+_PLACEHOLDERS = re.compile(r"\[[^\]]*\]|general|standard|e[+-]|[_*].", re.IGNORECASE)
+"""Colours and conditions, the general format, exponents, blanks and filling."""
+_DIGITS = re.compile(r"[0#?.,@()+\-/ ]*")
+_SCALED = re.compile(r"[0#?],+(?![0#?,])")
+
+
+class Heading(NamedTuple):
+    """What a heading says: the quantity, and its unit if it names one."""
+
+    quantity: str
+    unit: str | None
+
+
+def plain(text: str) -> str:
+    """A text without differences that do not matter, except for its case: characters and blanks normalised."""
+    return " ".join(unicodedata.normalize("NFKC", text).split())
+
+
+def quoted(text: str) -> str:
+    """A text as messages show it."""
+    text = plain(text)
+    return repr(text if len(text) <= 60 else text[:59] + "…")
+
+
+def heading_of(text: Any) -> Heading | None:
+    """What a heading says, None if it is not understood as a whole."""
+    if not isinstance(text, str):
+        return None
+    text = plain(text)
+    if (name := _quantity_of(text)) is not None:
+        return Heading(name, None)
+    match = _WITH_UNIT.fullmatch(text)
+    if match is None or (name := _quantity_of(match["name"])) is None:
+        return None
+    unit = _UNIT_OF.get((match["a"] or match["b"] or match["c"] or match["d"]).strip().casefold())
+    return Heading(name, unit) if unit in QUANTITIES[name].units else None
+
+
+def _quantity_of(text: str) -> str | None:
+    text = re.sub(r"\s*\+\s*", "+", text)
+    return _QUANTITY_OF.get(text if len(text) == 1 else text.casefold())
+
+
+def unit_of(text: Any) -> str | None:
+    """The unit that a text consists of: "mm", "[mm]", "(in mm)"."""
+    match = _BRACKETED_UNIT.fullmatch(plain(text).casefold()) if isinstance(text, str) else None
+    return None if match is None else _UNIT_OF.get((match[1] or match[2] or match[3]).strip())
+
+
+def is_number_heading(text: Any) -> bool:
+    """Whether a text heads the modules' numbers."""
+    return isinstance(text, str) and plain(text).casefold() in NUMBER_HEADINGS
+
+
+def is_label_heading(text: Any) -> bool:
+    """Whether a text heads other names of the modules."""
+    return isinstance(text, str) and plain(text).casefold() in LABEL_HEADINGS
+
+
+def may_mean(text: Any) -> list[str]:
+    """The quantities that a heading may be about, by its words."""
+    if not isinstance(text, str):
+        return []
+    words = set(re.findall(r"[^\W_]+", plain(text).casefold()))
+    return [name for name, hints in _HINTS.items() if words & hints]
+
+
+def units_mentioned(text: Any, alone: bool = False) -> list[str]:
+    """The length units that a note speaks of: "mm" ..., or its own word for one that is not supported.
+
+    With `alone`, only if the note says nothing else.
+    """
+    if not isinstance(text, str):
+        return []
+    folded = plain(text).casefold()
+    words = _WORD.findall(re.sub(r"['’](?=\w)", "", folded))
+    if alone:
+        whole = unit_of(text)
+        said = [] if re.search(r"\d", folded) else [word for word in words if word not in _FILLERS]
+        known = _units_among(said)
+        found = [whole] if whole else known if len(known) == len(said) else []
+    else:
+        found = _units_among(word for word in words if word not in ("in", "m"))
+        found += ["in" if mark != "m" else "m" for mark in _IN_BRACKETS.findall(folded)]
+        found += [a or b for a, b in _AT_THE_END.findall(plain(text))]
+        if _PART_OF_MILLIMETRE.search(folded):
+            found.append(folded)
+    units = [unit for unit in dict.fromkeys(found) if unit not in ANGLE_UNITS]
+    return [unit for unit in units if unit not in UNIT_WORDS] or units
+
+
+def _units_among(words: Iterable[str]) -> list[str]:
+    return [_UNIT_OF.get(word, word) for word in words if word in _UNIT_OF or word in _OTHER_WORDS]
+
+
+def shows_as_stored(number_format: str, unit: str) -> bool:
+    """Whether a number format shows a number as it is stored, alone or with its unit."""
+    for section in number_format.split(";"):
+        for literal in _LITERAL.finditer(section):
+            text = literal[1] or literal[2] or literal[3] or ""
+            if re.sub(r"[\s()+\-:/]", "", text) and (unit_of(text) or plain(text)) != unit:
+                return False
+        rest = _PLACEHOLDERS.sub("", _LITERAL.sub("", section))
+        if _SCALED.search(rest) or not _DIGITS.fullmatch(rest.replace(";", "")):
+            return False
+    first = _PLACEHOLDERS.sub("", number_format.split(";")[0].replace('"', "").replace("\\", ""))
+    return not first.lstrip().startswith(("-", "("))

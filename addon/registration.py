@@ -14,6 +14,7 @@ from ..operators import (
     add_phantom,
     add_slices,
     convert_ct,
+    dropped_files,
     edit_phantom,
     export_dataset,
     export_geometry,
@@ -61,6 +62,7 @@ _OPERATORS = (
     render_projections,
     jobs,
     export_dataset,
+    dropped_files,
 )
 _PANELS = (add_menu, geometry, design, phantom, projections, export)
 
@@ -91,17 +93,13 @@ MENUS: tuple[tuple[Any, Any], ...] = (
 HANDLERS: tuple[tuple[list[Any], Any], ...] = (
     (bpy.app.handlers.load_pre, jobs.before_load),
     (bpy.app.handlers.load_pre, slices.before_load),
-    (bpy.app.handlers.load_pre, live_phantoms.before_load),
     (bpy.app.handlers.load_post, volumes.after_load),
     (bpy.app.handlers.load_post, live_scanner.after_load),
-    (bpy.app.handlers.load_post, live_phantoms.after_undo),
     (bpy.app.handlers.depsgraph_update_post, live_scanner.after_update),
     (bpy.app.handlers.frame_change_post, live_scanner.after_frame),
     (bpy.app.handlers.frame_change_post, slices.after_frame_change),
     (bpy.app.handlers.undo_post, live_scanner.after_undo),
-    (bpy.app.handlers.undo_post, live_phantoms.after_undo),
     (bpy.app.handlers.redo_post, live_scanner.after_undo),
-    (bpy.app.handlers.redo_post, live_phantoms.after_undo),
     (bpy.app.handlers.save_pre, storage.before_save),
     (bpy.app.handlers.save_post, storage.after_save),
     (bpy.app.handlers.save_post_fail, storage.after_failed_save),
@@ -115,6 +113,9 @@ UPDATES: dict[str, Callable[..., None]] = {
     "scanner": following.refresh,
     "all_modules": following.set_for_all,
     "active_module": selection.select_active,
+    "phantom": live_phantoms.settings_changed,
+    "display_range": slices.range_changed,
+    "slices": slices.update,
 }
 
 # How to take back what was registered: (function, arguments).

@@ -182,19 +182,6 @@ class MPHDRR_OT_import_geometry(bpy.types.Operator):
         )
 
 
-class MPHDRR_FH_workbook(bpy.types.FileHandler):
-    """A workbook dropped on the viewport or the outliner is imported."""
-
-    bl_idname = ids.FILE_HANDLER_WORKBOOK
-    bl_label = "Pinhole Geometry (.xlsx)"
-    bl_import_operator = ids.IMPORT_GEOMETRY
-    bl_file_extensions = ";".join(WORKBOOK_SUFFIXES)
-
-    @classmethod
-    def poll_drop(cls, context: bpy.types.Context) -> bool:
-        return context.area is not None and context.area.type in {"VIEW_3D", "OUTLINER"}
-
-
 def draw_menu(self: bpy.types.Menu, context: bpy.types.Context) -> None:
     """The entry of File > Import."""
     self.layout.operator(ids.IMPORT_GEOMETRY, text="Pinhole Geometry (.xlsx)")

@@ -10,7 +10,7 @@ import pytest
 
 bpy = pytest.importorskip("bpy")
 
-from mphdrr.addon import slices, volume_materials, volumes  # noqa: E402
+from mphdrr.addon import slices, stored_volumes, volume_materials, volumes  # noqa: E402
 from mphdrr.addon.vdb import openvdb, write_vdb  # noqa: E402
 from mphdrr.core.errors import InputError  # noqa: E402
 from mphdrr.core.geometry.frames import euler_pose  # noqa: E402
@@ -176,7 +176,7 @@ def test_unused_files_are_cleaned_up_and_no_others(tmp_path, ct):
 @pytest.mark.parametrize("large", [False, True])
 def test_missing_files_are_found_again(tmp_path, ct, monkeypatch, capfd, large):
     if large:
-        monkeypatch.setattr(volumes, "MAX_SHOWN_VOXELS", 10)
+        monkeypatch.setattr(stored_volumes, "MAX_SHOWN_VOXELS", 10)
     volumes.add_volume(ct, "CT")
     bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "a.blend"))
     (tmp_path / "archive").mkdir()
@@ -220,7 +220,7 @@ def test_sequence_is_read_as_blender_shows_it(beats, mode):
 @pytest.mark.parametrize("large", [False, True])
 def test_sequence_is_saved_and_cleaned_up_whole(tmp_path, beats, monkeypatch, large):
     if large:
-        monkeypatch.setattr(volumes, "MAX_SHOWN_VOXELS", 10)
+        monkeypatch.setattr(stored_volumes, "MAX_SHOWN_VOXELS", 10)
     volumes.add_volume_sequence(beats, "Heart")
     bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "a.blend"))
     bpy.ops.wm.open_mainfile(filepath=str(tmp_path / "a.blend"))

@@ -202,14 +202,12 @@ class JobOperator:
             return self._start_after_asking()
         try:
             _require_idle()
-            job = self.job(context)
             with warnings_reported(self):
-                text = run(job, _console(job.label) if bpy.app.background else _cursor(context))
+                job = self.job(context)
+                text = run(job, _console(job.label))
             self.report({"INFO"}, text)
         except BaseException as error:
             return self._failed(error)
-        finally:
-            context.window_manager.progress_end()
         return {"FINISHED"}
 
     def invoke(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str]:
@@ -223,7 +221,8 @@ class JobOperator:
             if asked is not None:
                 self._asked = True
                 return asked
-            self._job = self.job(context)
+            with warnings_reported(self):
+                self._job = self.job(context)
         except Exception as error:
             return self._failed(error)
         self._run = _current = Worker(self._job.label, self._job.work)
@@ -370,8 +369,3 @@ def _console(label: str) -> Progress:
             print(f"mphDRR: {label} {percent} % ({done} of {total})", file=sys.stderr, flush=True)
 
     return progress
-
-
-def _cursor(context: bpy.types.Context) -> Progress:
-    context.window_manager.progress_begin(0, 1000)
-    return lambda done, total: context.window_manager.progress_update(1000 * done // max(1, total))

@@ -7,7 +7,6 @@ phantom may have children that go with it: a volume of its other quantity, and a
 from __future__ import annotations
 
 import itertools
-import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -18,12 +17,11 @@ import bpy
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core.errors import InputError, InputWarning
+from ..core.errors import InputError
 from ..core.geometry.grid import Grid
 from ..core.memory import require
 from ..core.phantoms.phantom import Phantom
 from ..core.progress import Progress, part_of
-from ..core.recording import recorded_warnings
 from . import jobs, outlines, storage, volumes
 from .cameras import set_world_matrix, world_matrix
 from .phantom_properties import FILE, PhantomSettings
@@ -45,15 +43,12 @@ class Recipe:
         Its voxels, in its own frame.
     settings : dict
         As JSON can hold them.
-    messages : tuple of str
-        What the phantom's class warned of.
     """
 
     phantom: Phantom
     n_states: int
     grid: Grid
     settings: dict[str, Any]
-    messages: tuple[str, ...]
 
     @cached_property
     def states(self) -> Sequence[Phantom]:
@@ -105,8 +100,6 @@ class Recipe:
         if count > 1:
             shape = " x ".join(map(str, self.grid.shape))
             require(4.0 * count * self.grid.n_voxels, f"{title}: {count} volumes of {shape} voxels")
-        for message in self.messages:
-            warnings.warn(message, InputWarning, stacklevel=3)
 
     def _world_grid(self, pose: NDArray[np.float64]) -> Grid:
         """A grid along the world's axes that holds the phantom at a pose, with voxels as small as its own."""
@@ -119,9 +112,8 @@ class Recipe:
 
 def recipe_of(settings: PhantomSettings) -> Recipe:
     """What settings say; raises `InputError` where there is no such phantom."""
-    with recorded_warnings() as caught:
-        phantom = settings.phantom()
-    return Recipe(phantom, settings.n_states, settings.grid(phantom), settings.recipe(), tuple(caught))
+    phantom = settings.phantom()
+    return Recipe(phantom, settings.n_states, settings.grid(phantom), settings.recipe())
 
 
 def settings_of(item: bpy.types.Object | None) -> Any:
@@ -298,21 +290,19 @@ def require_current(item: bpy.types.Object) -> None:
         raise InputError(f"{phantom.name!r} has changed since its voxels were made: press Update Phantom first")
 
 
-def show_outline(item: bpy.types.Object) -> None:
-    """Show the surfaces of a phantom, of one that beats in its first state, as wires that go with it.
+def toggle_outline(item: bpy.types.Object) -> str:
+    """Show the surfaces of a phantom (of one that beats, in its first state) as wires that go with it, or hide them.
 
-    Raises
-    ------
-    InputError
-        The object is no phantom, or its settings make none.
+    Returns which of the two it did; raises `InputError` where the settings make no phantom.
     """
-    settings = settings_of(item)
-    if settings is None:
-        raise InputError("no phantom is active: select one that was added with its settings")
-    outlines.show(item, recipe_of(settings).phantom.meshes())
+    if outlines.of(item) is not None:
+        outlines.remove(item)
+        return f"Removed the outline of {item.name!r}"
+    outlines.show(item, recipe_of(settings_of(item)).phantom.meshes())
+    return f"Added the outline of {item.name!r}"
 
 
 def update_outline(item: bpy.types.Object) -> None:
-    """Make a phantom's outline again, where it has one; raises as `show_outline` does."""
+    """Make a phantom's outline again, where it has one; raises as `toggle_outline` does."""
     if outlines.of(item) is not None:
-        show_outline(item)
+        outlines.show(item, recipe_of(settings_of(item)).phantom.meshes())

@@ -11,14 +11,16 @@ import os
 import re
 import shutil
 import time
+import warnings
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import bpy
 
-from ..core.errors import InputError
+from ..core.errors import InputError, InputWarning
 from ..core.files import ensure_folder, replacing
+from ..core.memory import readable_size
 from . import ids
 
 _OUR_VOLUME = re.compile(r"[a-z]+-[0-9a-f]{16}(\.preview)?(_\d{4})?\.vdb")
@@ -99,14 +101,19 @@ def seems_there(path: Path) -> bool:
     return size_of(path) is not None
 
 
-def relocate(top: Path) -> tuple[list[str], list[str]]:
-    """Look for missing volumes' files by their names, in a folder and all below it; one volume's files are in one folder.
+def relocate(directory: str) -> str:
+    """Look for missing volumes' files by their names, in a folder and all below it; returns which volumes' were found.
 
-    Returns
-    -------
-    found, still_missing : list of str
-        Names of the volumes.
+    The files of one volume are in one folder.
+
+    Raises
+    ------
+    InputError
+        No such folder.
     """
+    top = absolute(directory)
+    if not directory or not top.is_dir():
+        raise InputError(f"{directory or 'no folder given'}: expected a folder to look in")
     missing = missing_volumes()
     wanted = {absolute(data.filepath).name for data in missing}
     there = {path.name: path for path in sorted(top.rglob("*.vdb"), reverse=True) if path.name in wanted}
@@ -116,9 +123,11 @@ def relocate(top: Path) -> tuple[list[str], list[str]]:
         if shown is not None and all(shown.with_name(path.name).is_file() for path in _files_of(data)):
             data.filepath = stored_path(shown)
             data.grids.load()
-            found.append(data)
+            found.append(data.name)
     _sizes.clear()
-    return sorted(data.name for data in found), sorted(data.name for data in missing if data not in found)
+    if absent := sorted(data.name for data in missing if data.name not in found):
+        warnings.warn(f"{top}: the files of {', '.join(absent)} are not there either", InputWarning, stacklevel=2)
+    return f"Found the files of {', '.join(sorted(found)) or 'no volume'}"
 
 
 def unused_volumes() -> list[Path]:
@@ -126,6 +135,33 @@ def unused_volumes() -> list[Path]:
     used = {path.name for data in bpy.data.volumes for path in _files_of(data)}
     ours = [path for path in _folder().glob("*.vdb") if _OUR_VOLUME.fullmatch(path.name)]
     return sorted(path for path in ours if path.is_file() and path.name not in used)
+
+
+def remove_unused() -> str:
+    """Remove the `unused_volumes`; returns how many there were.
+
+    Raises
+    ------
+    InputError
+        The .blend, as it is saved, may need them, or they cannot be removed.
+    """
+    # Without a window Blender does not keep account of changes.
+    if bpy.data.filepath and bpy.data.is_dirty and not bpy.app.background:
+        raise InputError("the .blend has changes that are not saved, and as saved may need these files: save it")
+    unused = unused_volumes()
+    text = f"Removed {summary(unused)}" if unused else "No file of voxels is unused"
+    for path in unused:
+        try:
+            path.unlink(missing_ok=True)
+        except OSError as error:
+            raise InputError(f"{path}: cannot be removed ({error.strerror or error})") from error
+    return text
+
+
+def summary(files: list[Path]) -> str:
+    """How many unused files there are, and how large they are."""
+    size = readable_size(sum(path.stat().st_size for path in files))
+    return f"{len(files)} unused file{'s' if len(files) != 1 else ''} of voxels ({size})"
 
 
 def files_of_states(data: bpy.types.Volume) -> list[Path]:

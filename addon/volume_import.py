@@ -82,7 +82,8 @@ def importing(
 
     def finish(stored: StoredVolume) -> str:
         item = volumes.add_stored(stored, name or name_of(paths[0]), bpy.context.collection)
-        item.data.frame_start = frame_start
+        if item.data.is_sequence:
+            item.data.frame_start = frame_start
         volumes.make_active(bpy.context, item)
         volume, states = stored.volume, f"{count} states of " if count > 1 else ""
         voxels = " x ".join(map(str, volume.grid.shape))

@@ -29,40 +29,37 @@ from .vdb import SMOKE, read_vdb
 
 
 def add_volume(
-    volume: Volume,
-    name: str,
-    pose: ArrayLike | None = None,
-    provenance: dict[str, Any] | None = None,
-    collection: bpy.types.Collection | None = None,
-) -> bpy.types.Object:
-    """Put a volume, in world mm, into the scene as a Volume object with a material.
-
-    Blender numbers the object's name if it is taken. The `collection` is by default the scene's own; see `store_volume` for
-    `pose` and `provenance`.
-    """
-    return add_stored(store_volume(volume, storage.folder(), pose, provenance), name, collection)
-
-
-def add_volume_sequence(
-    volumes: Sequence[Volume],
+    volume: Volume | Sequence[Volume],
     name: str,
     pose: ArrayLike | None = None,
     provenance: dict[str, Any] | None = None,
     collection: bpy.types.Collection | None = None,
     frame_start: int = 1,
 ) -> bpy.types.Object:
-    """Put the states of something that changes into the scene, such as a beating heart: one for each Blender frame.
+    """Put a volume into the scene as a Volume object with a material.
 
-    The states follow each other from `frame_start` on and begin again after the last one (`Volume.sequence_mode`).
-    `volume_from_object` and projections take the state of the scene's current frame. See `add_volume` for the rest.
+    The states of something that changes, such as a beating heart, follow each other frame by frame and begin again after the
+    last one (`Volume.sequence_mode`). `volume_from_object` and projections take the state of the scene's current frame.
+
+    Parameters
+    ----------
+    volume, pose, provenance
+        See `store_volume`.
+    name
+        The object's name; Blender numbers it if it is taken.
+    collection
+        Default: the scene's own.
+    frame_start
+        Frame of the first state.
 
     Raises
     ------
     InputError
         No states, or states of several quantities.
     """
-    item = add_stored(store_volume(tuple(volumes), storage.folder(), pose, provenance), name, collection)
-    item.data.frame_start = frame_start
+    item = add_stored(store_volume(volume, storage.folder(), pose, provenance), name, collection)
+    if item.data.is_sequence:
+        item.data.frame_start = frame_start
     return item
 
 
@@ -74,19 +71,12 @@ def add_stored(stored: StoredVolume, name: str, collection: bpy.types.Collection
     return item
 
 
-def replace_volume(
-    item: bpy.types.Object, volume: Volume, pose: ArrayLike | None = None, provenance: dict[str, Any] | None = None
-) -> None:
-    """Give a Volume object other voxels (and pose, see `store_volume`).
+def replace_stored(item: bpy.types.Object, stored: StoredVolume) -> None:
+    """Give a Volume object the voxels and the pose of a stored volume.
 
     Its datablock stays, with what the user has set on it. One of another quantity, or that other objects show too, is
     replaced, and removed if nothing else needs it.
     """
-    replace_stored(item, store_volume(volume, storage.folder(), pose, provenance))
-
-
-def replace_stored(item: bpy.types.Object, stored: StoredVolume) -> None:
-    """Give a Volume object the voxels of a stored volume; see `replace_volume`."""
     old, settings = item.data, item.mphdrr_volume
     if old.users == 1 and settings.quantity == stored.volume.quantity:  # in place: what the user set on it stays
         _show(old, stored)

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import bpy
 
-from ..addon import ids, jobs, outlines, phantoms
-from ..core.errors import InputError
+from ..addon import ids, jobs, phantoms
+from ..addon.reports import run_reported
 
 
 class _EditPhantom(jobs.JobOperator):
@@ -58,12 +58,4 @@ class MPHDRR_OT_show_phantom_outline(bpy.types.Operator):
         return phantoms.poll_phantom(cls, context)
 
     def execute(self, context: bpy.types.Context) -> set[str]:
-        if outlines.of(context.object) is not None:
-            outlines.remove(context.object)
-            return {"FINISHED"}
-        try:
-            phantoms.show_outline(context.object)
-        except InputError as error:
-            self.report({"ERROR"}, str(error))
-            return {"CANCELLED"}
-        return {"FINISHED"}
+        return run_reported(self, lambda: phantoms.toggle_outline(context.object))

@@ -106,9 +106,9 @@ def test_settings_that_cannot_be_leave_the_voxels_and_say_why():
     item = add("defrise", voxels=8)
     before, settings = voxels_of(item), item.mphdrr_volume.defrise
     settings.spacing = 1.0
-    assert "spacing" in item.mphdrr_volume.message and item.mphdrr_volume.outdated
+    assert "disk thickness" in item.mphdrr_volume.message and item.mphdrr_volume.outdated
     assert np.array_equal(voxels_of(item), before)
-    with pytest.raises(RuntimeError, match="spacing"):
+    with pytest.raises(RuntimeError, match="disk thickness"):
         bpy.ops.mphdrr.update_phantom()
     assert np.array_equal(voxels_of(item), before)
     settings.spacing = 9.0

@@ -48,13 +48,13 @@ def test_a_volume_begins_to_beat_and_stands_still_again(beats):
     volumes.replace_stored(item, store_volume(beats[::-1], storage.folder()))
     assert (item.data.frame_start, item.data.sequence_mode) == (2, "EXTEND"), "what was set on it stays"
     assert np.array_equal(volumes.volume_from_object(item).array, beats[1].array)
-    volumes.replace_volume(item, beats[0])
+    volumes.replace_stored(item, store_volume(beats[0], storage.folder()))
     assert not item.data.is_sequence and volumes.file_of(item) == still, "files are named by content"
 
 
 def test_the_current_frame_is_projected(scene, ring_system, beats):
     scanner.build_scanner(scene, ring_system)
-    volumes.add_volume_sequence(beats, "Heart")
+    volumes.add_volume(beats, "Heart")
     views = ring_system.views(shape=(12, 10))
     for frame, expected in enumerate(beats, 1):
         scene.frame_set(frame)

@@ -12,7 +12,7 @@ bpy = pytest.importorskip("bpy")
 
 from mathutils import Matrix  # noqa: E402
 
-from mphdrr.addon import compat, stored_volumes, volume_materials, volumes  # noqa: E402
+from mphdrr.addon import compat, storage, stored_volumes, volume_materials, volumes  # noqa: E402
 from mphdrr.core.errors import InputError  # noqa: E402
 from mphdrr.core.geometry.frames import euler_pose  # noqa: E402
 from mphdrr.core.geometry.grid import Grid  # noqa: E402
@@ -127,7 +127,7 @@ def test_replacing_a_volume_leaves_no_orphans(sparse_volume):
     item = volumes.add_volume(sparse_volume, "Sample")
     before = len(bpy.data.volumes), len(bpy.data.materials)
     other = Volume(sparse_volume.array[:5].copy(), Grid((5, 14, 9), np.eye(4)), "mu")
-    volumes.replace_volume(item, other)
+    volumes.replace_stored(item, stored_volumes.store_volume(other, storage.folder()))
     assert (len(bpy.data.volumes), len(bpy.data.materials)) == before
     assert volumes.volume_from_object(item).grid.shape == (5, 14, 9)
 

@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 
 from ..core.geometry.frames import module_poses
 from ..core.geometry.system import PinholeSystem
-from ..core.geometry.views import Views
 
 _CAMERA_FROM_MODULE = np.diag([-1.0, 1.0, -1.0, 1.0])
 _SMALLEST = 1.0  # Blender silently clamps Camera.lens and Camera.sensor_width below this
@@ -25,7 +24,7 @@ def camera_matrices(centers: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def euler_angles(matrix: NDArray[np.float64]) -> tuple[float, float, float]:
-    """XYZ Euler angles, radians, of a camera matrix; Blender's own, in float32, show -0.000007 degrees for 0."""
+    """XYZ Euler angles, radians, of a camera matrix, in float64: Blender's float32 angles show -0.000007 degrees for 0."""
     r = matrix[:3, :3]
     y = -np.arcsin(np.clip(r[2, 0], -1.0, 1.0))
     return (
@@ -46,38 +45,16 @@ def set_field_of_view(camera: bpy.types.Camera, width: float, distance: float) -
     camera.shift_x = camera.shift_y = 0.0
 
 
-def set_render_shape(scene: bpy.types.Scene, shape: tuple[int, int], pitch_ratio: float | None = None) -> None:
-    """Set the scene's render resolution to an image shape (n_v, n_u).
-
-    `pitch_ratio` is pitch_u / pitch_v; by default that of a square detector, n_v / n_u.
-    """
+def set_render_shape(scene: bpy.types.Scene, shape: tuple[int, int]) -> None:
+    """Set the scene's render resolution to an image shape (n_v, n_u) of a square detector."""
     n_v, n_u = shape
-    ratio = n_v / n_u if pitch_ratio is None else pitch_ratio
     render = scene.render
     render.resolution_x, render.resolution_y, render.resolution_percentage = n_u, n_v, 100
-    render.pixel_aspect_x, render.pixel_aspect_y = max(1.0, ratio), max(1.0, 1 / ratio)
-
-
-def match_views(scene: bpy.types.Scene, cameras: list[bpy.types.Object], views: Views) -> None:
-    """Give `cameras` the fields of view of `views`, and the scene their shape: a render shows the same image.
-
-    For any shape, pitch and offset on a virtual detector; the poses stay as they are.
-    """
-    _, n_u = views.shape
-    pitch_u, pitch_v = np.linalg.norm(views.u_steps, axis=1), np.linalg.norm(views.v_steps, axis=1)
-    axis = views.detector_centers - views.sources
-    for m, camera_object in enumerate(cameras):
-        u, v = views.u_steps[m] / pitch_u[m], views.v_steps[m] / pitch_v[m]
-        width = n_u * pitch_u[m]
-        set_field_of_view(camera_object.data, width, float(abs(np.dot(np.cross(u, v), axis[m]))))
-        # Blender scales both shifts by the picture's width; its X is -u.
-        camera_object.data.shift_x = -np.dot(u, axis[m]) / width
-        camera_object.data.shift_y = np.dot(v, axis[m]) / width
-    set_render_shape(scene, views.shape, float(pitch_u[0] / pitch_v[0]))
+    render.pixel_aspect_x, render.pixel_aspect_y = max(1.0, n_v / n_u), max(1.0, n_u / n_v)
 
 
 def set_up_camera(camera: bpy.types.Camera, system: PinholeSystem, m: int) -> None:
-    """Make camera data that of module `m`: its field of view is that of the default virtual detector."""
+    """Set up camera data for module `m`, with the field of view of the default virtual detector."""
     set_field_of_view(camera, float(system.detector_side[m]), float(system.collimator_length[m]))
     b, radius = float(system.pinhole_distance[m]), float(system.roi_radius[m])
     camera.clip_start = min(1.0, 0.01 * b)
@@ -89,16 +66,14 @@ def set_up_camera(camera: bpy.types.Camera, system: PinholeSystem, m: int) -> No
 def world_matrix(item: bpy.types.Object) -> NDArray[np.float64]:
     """World matrix (4, 4) of an object as it stands now, in float64.
 
-    `Object.matrix_world` is stale after a script has set a location, and is never updated while the object is
-    hidden; so it is used only where constraints have their say.
+    `Object.matrix_world` is out of date after a script has set a location, and while the object is hidden: it is used
+    only for objects with constraints or a parent that is not a plain object.
     """
-    if any(not c.mute for c in item.constraints):
+    if any(not c.mute for c in item.constraints) or (item.parent is not None and item.parent_type != "OBJECT"):
         return np.array(item.matrix_world, dtype=np.float64)
     local = np.array(item.matrix_basis, dtype=np.float64)
     if item.parent is None:
         return local
-    if item.parent_type != "OBJECT":
-        return np.array(item.matrix_world, dtype=np.float64)
     return world_matrix(item.parent) @ np.array(item.matrix_parent_inverse, dtype=np.float64) @ local
 
 
@@ -110,3 +85,10 @@ def set_world_matrix(item: bpy.types.Object, matrix: NDArray[np.float64]) -> Non
     item.matrix_basis = Matrix(matrix)
     if item.parent is None and item.rotation_mode == "XYZ":
         item.rotation_euler = euler_angles(matrix)
+
+
+def unparent(item: bpy.types.Object) -> None:
+    """Take an object off its parent and leave it where it is."""
+    matrix = world_matrix(item)
+    item.parent = None
+    set_world_matrix(item, matrix)

@@ -1,16 +1,14 @@
 """Numbers by which .blend files and Blender's preferences keep choices.
 
-Blender stores the number of an enumeration's item, not its identifier, and numbers items by their position unless told
-otherwise: an isotope put between two others would make every saved scene count another isotope's photons. So every item
-of every enumeration has a number of its own: here, where the items come from a table of core; beside the item elsewhere
-(`core.exchange` numbers the formats of geometry).
-
-A number once given stays with its identifier for ever. A new item gets one that no item of its table ever had, wherever
-it stands in the menu; an item that is dropped takes its number with it. tests/blender/test_choices.py holds them all.
+Blender stores the number of an enumeration's item, not its identifier, and by default numbers items by position: an isotope
+put between two others would make every saved scene count another isotope's photons. So every item has a number of its own:
+in the tables below, the one it had in version 0.1.0; of a later item, a checksum of its identifier. Items may therefore be
+added, moved and removed without a change here.
 """
 
 from __future__ import annotations
 
+import zlib
 from collections.abc import Iterable, Mapping
 
 Items = tuple[tuple[str, str, str, int], ...]
@@ -40,16 +38,11 @@ UNITS = {
 }  # fmt: skip
 
 
-def items(numbers: Mapping[str, int], chosen: Iterable[tuple[str, str, str]]) -> Items:
-    """Items (identifier, label, description) with the numbers of a table above.
+def number(numbers: Mapping[str, int], identifier: str) -> int:
+    """The number of a choice: that of a table above, or else a checksum of its identifier."""
+    return numbers.get(identifier, zlib.crc32(identifier.encode()) & 0x7FFFFFFF)
 
-    Raises
-    ------
-    KeyError
-        An item has no number yet.
-    """
-    given = tuple(chosen)
-    for identifier, _, _ in given:
-        if identifier not in numbers:
-            raise KeyError(f"choice {identifier!r} has no number: give it a new one in {__name__}")
-    return tuple((identifier, label, text, numbers[identifier]) for identifier, label, text in given)
+
+def items(numbers: Mapping[str, int], chosen: Iterable[tuple[str, str, str]]) -> Items:
+    """Items (identifier, label, description) with their numbers, of which a table above holds the old ones."""
+    return tuple((identifier, label, text, number(numbers, identifier)) for identifier, label, text in chosen)

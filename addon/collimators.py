@@ -1,19 +1,36 @@
-"""Mesh datablocks of a module: its collimator and crystal, and the sphere that all modules must see."""
+"""How modules look: the meshes of collimators, crystals and the ROI sphere, and their colours."""
 
 from __future__ import annotations
-
-from collections.abc import Callable
 
 import bmesh
 import bpy
 import numpy as np
 
-from ..core.geometry.collimator_mesh import Solid, check_watertight
-from . import compat, ids
+from ..core.geometry import module_parts
+from ..core.geometry.collimator import Collimator, Construction
+from ..core.geometry.collimator_mesh import Solid, check_watertight, collimator_solid, crystal_solid
+from ..core.geometry.module_parts import Look
+from . import compat
+from .module_values import ModuleNumbers
+
+# By `Object.mphdrr_module.part`: the material's name, and its colour and gloss. Exported solids look the same.
+LOOKS = {
+    "COLLIMATOR": ("mphDRR collimator", module_parts.LOOKS["collimator"]),
+    "CRYSTAL": ("mphDRR crystal", module_parts.LOOKS["crystal"]),
+    "ROI": ("mphDRR ROI", Look((0.25, 0.62, 1.0, 0.12), metallic=0.0, roughness=0.5)),  # pale blue
+}
+
+
+def part_solid(part: str, numbers: ModuleNumbers, construction: Construction) -> Solid:
+    """The solid of a module's "COLLIMATOR" or "CRYSTAL"; raises `InputError` where it cannot be built."""
+    _, _, d, l, side, thickness, _ = numbers
+    if part == "COLLIMATOR":
+        return collimator_solid(Collimator(d, l, side, construction))
+    return crystal_solid(l, side, thickness)
 
 
 def new_mesh(name: str, solid: Solid, material: bpy.types.Material) -> bpy.types.Mesh:
-    """A mesh datablock of a solid, checked watertight, with one material."""
+    """A mesh datablock of a solid, checked to be watertight, with one material."""
     check_watertight(solid)
     mesh = bpy.data.meshes.new(name)
     _fill(mesh, solid)
@@ -22,7 +39,7 @@ def new_mesh(name: str, solid: Solid, material: bpy.types.Material) -> bpy.types
 
 
 def reshape_mesh(mesh: bpy.types.Mesh, solid: Solid) -> None:
-    """Give a mesh the shape of `solid`: in place, so that no datablock comes or goes and undo has an easy time."""
+    """Give a mesh the shape of `solid`, in place: undo needs the same datablock."""
     vertices, faces = solid
     if len(mesh.vertices) == len(vertices) and len(mesh.polygons) == len(faces):
         mesh.vertices.foreach_set("co", vertices.astype(np.float32).ravel())
@@ -67,69 +84,37 @@ def resize_sphere(mesh: bpy.types.Mesh, radius: float) -> None:
 
 
 def part_material(part: str) -> bpy.types.Material:
-    """The material of a scanner's parts of one kind ("COLLIMATOR", "CRYSTAL" or "ROI")."""
-    return {"COLLIMATOR": collimator_material, "CRYSTAL": crystal_material, "ROI": roi_material}[part]()
-
-
-def collimator_material() -> bpy.types.Material:
-    """Tungsten: grey metal."""
-    return _material(ids.MATERIAL_COLLIMATOR, (0.36, 0.39, 0.43, 1.0), metallic=0.85, roughness=0.42)
-
-
-def crystal_material() -> bpy.types.Material:
-    """Scintillator: amber and clear."""
-    return _material(ids.MATERIAL_CRYSTAL, (1.0, 0.48, 0.06, 0.85), roughness=0.12)
-
-
-def roi_material() -> bpy.types.Material:
-    """The ROI's sphere: hardly there but for its rim."""
-
-    def rim(nodes: bpy.types.Nodes, links: bpy.types.NodeLinks, shader: bpy.types.Node) -> None:
-        weight = nodes.new("ShaderNodeLayerWeight")
-        weight.inputs["Blend"].default_value = 0.25
-        weight.location = (-520, 0)
-        scale = nodes.new("ShaderNodeMath")
-        scale.operation = "MULTIPLY"
-        scale.inputs[1].default_value = 0.35
-        scale.location = (-260, 0)
-        links.new(weight.outputs["Facing"], scale.inputs[0])
-        links.new(scale.outputs[0], shader.inputs["Alpha"])
-
-    return _material(ids.MATERIAL_ROI, (0.25, 0.62, 1.0, 0.12), roughness=0.5, extend=rim)
-
-
-def _material(
-    name: str,
-    color: tuple[float, float, float, float],
-    metallic: float = 0.0,
-    roughness: float = 0.5,
-    extend: Callable[..., None] | None = None,
-) -> bpy.types.Material:
-    """The material of that name, made when it is missing: the user's own changes to it stay."""
+    """The material of a scanner's parts of one kind; an existing one keeps what the user has changed."""
+    name, look = LOOKS[part]
     material = bpy.data.materials.get(name)
     if material is not None:
         return material
     material = bpy.data.materials.new(name)
     compat.enable_nodes(material)
-    material.diffuse_color, material.metallic, material.roughness = (
-        color,
-        0.3 * metallic,
-        roughness,
-    )  # in Solid view
-    if color[3] < 1.0:
+    # In Solid view:
+    material.diffuse_color, material.metallic, material.roughness = look.color, 0.3 * look.metallic, look.roughness
+    if look.color[3] < 1.0:
         material.surface_render_method = "BLENDED"
-    tree = material.node_tree
-    tree.nodes.clear()  # Blender 4.5 begins with a volume's nodes where a volume is active
-    shader, output = (tree.nodes.new(f"ShaderNode{kind}") for kind in ("BsdfPrincipled", "OutputMaterial"))
+    nodes, links = material.node_tree.nodes, material.node_tree.links
+    nodes.clear()  # Blender 4.5 begins with a volume's nodes where a volume is active
+    shader, output = nodes.new("ShaderNodeBsdfPrincipled"), nodes.new("ShaderNodeOutputMaterial")
     output.location = (300, 0)
-    tree.links.new(shader.outputs[0], output.inputs["Surface"])
-    for socket, value in (
-        ("Base Color", (*color[:3], 1.0)),
-        ("Metallic", metallic),
-        ("Roughness", roughness),
-    ):
-        shader.inputs[socket].default_value = value
-    shader.inputs["Alpha"].default_value = color[3]
-    if extend is not None:
-        extend(tree.nodes, tree.links, shader)
+    links.new(shader.outputs[0], output.inputs["Surface"])
+    shader.inputs["Base Color"].default_value = (*look.color[:3], 1.0)
+    shader.inputs["Metallic"].default_value = look.metallic
+    shader.inputs["Roughness"].default_value = look.roughness
+    shader.inputs["Alpha"].default_value = look.color[3]
+    if part == "ROI":
+        _show_rim_only(nodes, links, shader)
     return material
+
+
+def _show_rim_only(nodes: bpy.types.Nodes, links: bpy.types.NodeLinks, shader: bpy.types.Node) -> None:
+    """Make a sphere transparent but for its rim."""
+    weight, scale = nodes.new("ShaderNodeLayerWeight"), nodes.new("ShaderNodeMath")
+    weight.location, scale.location = (-520, 0), (-260, 0)
+    weight.inputs["Blend"].default_value = 0.25
+    scale.operation = "MULTIPLY"
+    scale.inputs[1].default_value = 0.35
+    links.new(weight.outputs["Facing"], scale.inputs[0])
+    links.new(scale.outputs[0], shader.inputs["Alpha"])

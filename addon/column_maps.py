@@ -1,7 +1,7 @@
-"""The column map dialog's settings: filled with a draft, read as a `ColumnMap`, previewed as the reader reads it.
+"""The settings of the column map dialog: filled from a draft, read as a `ColumnMap`, shown as the reader reads them.
 
-They live on the window manager while the dialog is open. Nothing is read from the workbook while the dialog is drawn: a
-setting that changes calls `update`.
+They live on the window manager while the dialog is open. Drawing reads nothing from the workbook: a setting that changes
+calls `update`.
 """
 
 from __future__ import annotations
@@ -12,28 +12,21 @@ from functools import lru_cache
 from pathlib import Path
 
 import bpy
-import numpy as np
 from bpy.props import BoolProperty, CollectionProperty, EnumProperty, IntProperty, StringProperty
 
 from ..core.errors import InputError
 from ..core.recording import recorded_warnings
 from ..core.workbook import ColumnMap, MappedColumn, MappedTable, draft_column_map, preview_workbook, read_system
-from ..core.workbook.quantities import ANGLE_UNITS, LENGTH_UNITS, NEEDED, QUANTITIES
-from . import choices, ids
+from ..core.workbook.quantities import ANGLE_UNITS, LENGTH_UNITS, POSITION, QUANTITIES, TYPED
+from . import choices
 
 MAX_TABLES = 9
-_ALWAYS = (*NEEDED, "l")
 _FIRST = 3  # modules previewed at the top
 _SEEN = 80  # rows and columns whose texts are shown beside the settings
 
 
-def settings(context: bpy.types.Context) -> ColumnMapProperties:
-    """The settings of the dialog."""
-    return getattr(context.window_manager, ids.WINDOW_COLUMNS)
-
-
 def _changed(self: bpy.types.PropertyGroup, context: bpy.types.Context) -> None:
-    update(settings(context))
+    update(context.window_manager.mphdrr_columns)
 
 
 def _number_of_tables_changed(self: ColumnMapProperties, context: bpy.types.Context) -> None:
@@ -42,16 +35,16 @@ def _number_of_tables_changed(self: ColumnMapProperties, context: bpy.types.Cont
     while len(self.tables) > self.n_tables:
         self.tables.remove(len(self.tables) - 1)
     while len(self.tables) < self.n_tables:
-        last = self.tables[-1]
-        values = {name: getattr(last, name) for name in ("sheet", "header_row", "first_row", "last_row", "number")}
-        _set(self.tables.add(), values)
+        last, new = self.tables[-1], self.tables.add()
+        for name in ("sheet", "header_row", "first_row", "last_row", "number"):
+            setattr(new, name, getattr(last, name))
     update(self)
 
 
 def _unit_of_all_changed(self: ColumnMapProperties, context: bpy.types.Context) -> None:
     if not self.filled:
         return
-    self.filled = False
+    self.filled = False  # until all units are set
     for quantity in self.quantities:
         if QUANTITIES[quantity.name].kind == "length":
             quantity.unit = self.unit
@@ -60,7 +53,7 @@ def _unit_of_all_changed(self: ColumnMapProperties, context: bpy.types.Context) 
 
 
 def _sheets(self: ColumnMapTable, context: bpy.types.Context, edit_text: str) -> list[str]:
-    return json.loads(settings(context).sheets or "[]")
+    return json.loads(context.window_manager.mphdrr_columns.sheets or "[]")
 
 
 def _units(*tables: Iterable[str]) -> choices.Items:
@@ -73,26 +66,27 @@ class ColumnMapTable(bpy.types.PropertyGroup):
 
     sheet: StringProperty(name="Sheet", description="Name of the sheet", search=_sheets, update=_changed)
     header_row: IntProperty(
-        name="Header Row", description="Row of the headings that are shown below; they are not read. 0: none", min=0,
+        name="Header Row", description="Row of the headings shown below; they are not read. 0: none", min=0,
         update=_changed,
     )  # fmt: skip
     first_row: IntProperty(name="First Row", description="Row of the first module", default=2, min=1, update=_changed)
     last_row: IntProperty(name="Last Row", description="Row of the last module", default=2, min=1, update=_changed)
     skip_rows: StringProperty(
-        name="Skip Rows", description="Rows between these that are of no module, such as 43, 50-52", update=_changed
+        name="Skip Rows", description="Rows in between that hold no module, such as 43, 50-52", update=_changed
     )
     number: StringProperty(
         name="Number Column",
-        description="Letters of the column of the modules' numbers or names. Empty: row by row 1, 2, ...", update=_changed,
-    )  # fmt: skip
+        description="Letters of the column of module numbers or names. Empty: the rows are modules 1, 2, ...",
+        update=_changed,
+    )
     rows: EnumProperty(
         name="Rows",
-        description="How the rows belong to those of table 1",
+        description="Which modules of table 1 the rows belong to",
         items=choices.items(
             choices.JOINED,
             (
-                ("BY_NUMBER", "By Number", "A row is of the module whose number, or name, it has"),
-                ("IN_ORDER", "In Order", "The first row is of the first module, and so on"),
+                ("BY_NUMBER", "By Number", "A row belongs to the module with its number or name"),
+                ("IN_ORDER", "In Order", "The first row belongs to the first module, and so on"),
                 ("ONE_FOR_ALL", "One for All", "The first row holds what all modules share"),
             ),
         ),
@@ -118,12 +112,12 @@ class ColumnMapQuantity(bpy.types.PropertyGroup):
 class ColumnMapProperties(bpy.types.PropertyGroup):
     """The dialog's settings and what they give; `WindowManager.mphdrr_columns`."""
 
-    filled: BoolProperty(name="Filled", description="A change of a setting updates the preview", options={"HIDDEN"})
-    workbook: StringProperty(name="Workbook", description="File that the settings are of", subtype="FILE_PATH")
+    filled: BoolProperty(name="Filled", description="A changed setting updates the preview", options={"HIDDEN"})
+    workbook: StringProperty(name="Workbook", description="File that the settings are for", subtype="FILE_PATH")
     sheets: StringProperty(name="Sheets", description="Names of its sheets, JSON", options={"HIDDEN"})
     doubts: StringProperty(name="Doubts", description="What the reader did not understand, JSON", options={"HIDDEN"})
     n_tables: IntProperty(
-        name="Tables", description="Ranges of rows: the first holds x1, y1 and z1, further ones the dimensions",
+        name="Tables", description="Ranges of rows: the first holds x1, y1 and z1, the others dimensions",
         default=2, min=1, max=MAX_TABLES, update=_number_of_tables_changed,
     )  # fmt: skip
     unit: EnumProperty(
@@ -133,10 +127,10 @@ class ColumnMapProperties(bpy.types.PropertyGroup):
     tables: CollectionProperty(type=ColumnMapTable, name="Tables")
     quantities: CollectionProperty(type=ColumnMapQuantity, name="Quantities")
     save_as: StringProperty(
-        name="Save Map As", description="Also write the column map to this new .toml file. Without a folder: beside the "
-        "workbook",
-    )  # fmt: skip
-    refusal: StringProperty(name="Refusal", description="Why the workbook cannot be read so")
+        name="Save Map As",
+        description="Also write the column map to this new .toml file, beside the workbook unless a folder is given",
+    )
+    refusal: StringProperty(name="Refusal", description="Why the workbook cannot be read with these settings")
     remarks: StringProperty(name="Remarks", description="The reader's warnings, JSON", options={"HIDDEN"})
     n_modules: IntProperty(name="Modules", description="How many are read", min=0)
     preview: StringProperty(
@@ -148,41 +142,34 @@ CLASSES = (ColumnMapTable, ColumnMapQuantity, ColumnMapProperties)
 
 
 def fill(form: ColumnMapProperties, workbook: Path, columns: ColumnMap | None = None) -> bool:
-    """Fill the settings with a column map, or with a draft of what is seen in the workbook.
+    """Fill the settings from a column map, by default from a draft made of the workbook's headings.
 
-    Returns
-    -------
-    bool
-        Whether the dialog can help: something in the workbook is not understood without a map, or one was given.
-
-    Raises
-    ------
-    InputError
-        The file is no workbook; the settings are then empty.
+    Returns whether the dialog can help: the reader has questions about the workbook, or a map was given. Raises
+    InputError where the file is not a workbook; the settings are then empty.
     """
     clear(form)
     draft = draft_column_map(workbook)
-    said = draft.columns if columns is None else columns
+    shown = draft.columns if columns is None else columns
     faults = draft.columns.faults()
     form.workbook, form.sheets = str(workbook), json.dumps(list(_cells(workbook)))
     form.doubts = json.dumps([question for question in draft.questions if question not in faults])
-    for table in said.tables[:MAX_TABLES]:
-        values = {
-            "sheet": table.sheet, "header_row": table.header_row or 0, "first_row": table.first_row,
-            "last_row": table.last_row, "skip_rows": ", ".join(map(str, table.skip_rows)), "number": table.number or "",
-        }  # fmt: skip
+    known: dict[str, tuple[int, MappedColumn]] = {}
+    for i, table in enumerate(shown.tables[:MAX_TABLES], start=1):
+        row = form.tables.add()
+        row.sheet, row.header_row, row.number = table.sheet, table.header_row or 0, table.number or ""
+        row.first_row, row.last_row = table.first_row, table.last_row
+        row.skip_rows = ", ".join(map(str, table.skip_rows))
         if table.rows is not None:
-            values["rows"] = table.rows.upper().replace(" ", "_")
-        _set(form.tables.add(), values)
+            row.rows = table.rows.upper().replace(" ", "_")
+        known |= {column.quantity: (i, column) for column in table.columns if column.quantity in QUANTITIES}
     if not form.tables:
         form.tables.add()
-    found = {c.quantity: (i, c) for i, table in enumerate(said.tables[:MAX_TABLES], start=1) for c in table.columns}
-    for name in dict.fromkeys((*_ALWAYS, *(name for name in found if name in QUANTITIES))):
+    for name in dict.fromkeys((*TYPED, *known)):
         quantity = form.quantities.add()
         quantity.name = name
-        quantity.table = 1 if name in _ALWAYS[:3] else len(form.tables)
-        if name in found:
-            quantity.table, column = found[name]
+        quantity.table = 1 if name in POSITION else len(form.tables)
+        if name in known:
+            quantity.table, column = known[name]
             quantity.column = column.column
             quantity.unit = column.unit if column.unit in choices.UNITS else "NONE"
     form.n_tables = len(form.tables)
@@ -192,7 +179,7 @@ def fill(form: ColumnMapProperties, workbook: Path, columns: ColumnMap | None = 
 
 
 def clear(form: ColumnMapProperties) -> None:
-    """Empty the settings: they are of no workbook."""
+    """Empty the settings, so that they are for no workbook."""
     form.filled = False
     for prop in form.bl_rna.properties:
         if not prop.is_readonly or prop.type == "COLLECTION":
@@ -200,24 +187,23 @@ def clear(form: ColumnMapProperties) -> None:
 
 
 def column_map(form: ColumnMapProperties) -> ColumnMap:
-    """The column map that the settings say, complete or not; `InputError` where they cannot be understood."""
-    found: list[list[MappedColumn]] = [[] for _ in form.tables]
+    """The column map that the settings describe, complete or not; raises `InputError` where they make no sense."""
+    columns: list[list[MappedColumn]] = [[] for _ in form.tables]
     for quantity in form.quantities:
-        if not quantity.column.strip():
-            continue
-        if quantity.table > len(found):
-            raise InputError(f"{quantity.name} is in table {quantity.table}, expected 1 to {len(found)}")
-        unit = "" if quantity.unit == "NONE" else quantity.unit
-        found[quantity.table - 1].append(MappedColumn(quantity.name, quantity.column.strip().upper(), unit))
+        letters, unit = quantity.column.strip().upper(), "" if quantity.unit == "NONE" else quantity.unit
+        if letters and quantity.table > len(columns):
+            raise InputError(f"{quantity.name} is in table {quantity.table}, expected 1 to {len(columns)}")
+        if letters:
+            columns[quantity.table - 1].append(MappedColumn(quantity.name, letters, unit))
     tables = []
-    for i, (table, columns) in enumerate(zip(form.tables, found, strict=True)):
+    for i, table in enumerate(form.tables):
         one = i > 0 and table.rows == "ONE_FOR_ALL"
         tables.append(
             MappedTable(
                 sheet=table.sheet,
                 first_row=table.first_row,
                 last_row=table.first_row if one else table.last_row,
-                columns=tuple(columns),
+                columns=tuple(columns[i]),
                 number=None if one else table.number.strip().upper() or None,
                 rows=None if i == 0 else table.rows.lower().replace("_", " "),
                 header_row=table.header_row or None,
@@ -228,7 +214,7 @@ def column_map(form: ColumnMapProperties) -> ColumnMap:
 
 
 def update(form: ColumnMapProperties) -> None:
-    """Read the workbook by the settings: the preview, or why it is refused."""
+    """Read the workbook with the settings, and show the modules' numbers or why it is refused."""
     if not form.filled:
         return
     workbook = Path(form.workbook)
@@ -237,42 +223,30 @@ def update(form: ColumnMapProperties) -> None:
         for quantity in form.quantities:
             quantity.seen = _seen(form, quantity, workbook)
         with recorded_warnings() as warned:
-            form.n_modules, rows = preview(workbook, column_map(form))
-        form.preview = json.dumps(rows)
-        form.remarks = json.dumps(list(warned))
+            form.n_modules, rows = _preview(workbook, column_map(form))
+        form.preview, form.remarks = json.dumps(rows), json.dumps(list(warned))
     except InputError as error:
         form.refusal = str(error)
 
 
-def preview(workbook: Path, columns: ColumnMap) -> tuple[int, list[list[str]]]:
-    """How many modules the map has read; headings, then the numbers of the first modules and the last, mm.
-
-    Raises
-    ------
-    InputError
-        What the reader says of a workbook that it refuses.
-    """
+def _preview(workbook: Path, columns: ColumnMap) -> tuple[int, list[list[str]]]:
+    """How many modules the workbook has; headings, then the numbers of the first modules and the last, mm."""
     system = read_system(workbook, columns)
-    lengths = [
-        *system.centers.T, system.pinhole_distance, system.pinhole_diameter, system.roi_radius, system.detector_side,
-        system.detector_thickness, system.collimator_length,
-    ]  # fmt: skip
+    names = [name for name in QUANTITIES if name in (*TYPED, "b")]
+    numbers = zip(*(QUANTITIES[name].of(system).tolist() for name in names), strict=True)
     rows = [
-        [str(number), *(f"{value:.3f}" for value in values)]
-        for number, *values in zip(system.numbers.tolist(), *(np.asarray(x).tolist() for x in lengths), strict=True)
+        [str(module), *(f"{value:.3f}" for value in values)]
+        for module, values in zip(system.numbers.tolist(), numbers, strict=True)
     ]
-    if len(rows) > _FIRST + 1:
-        rows[_FIRST:-1] = [["..."] * len(rows[0])] if len(rows) > _FIRST + 2 else rows[_FIRST:-1]
-    return len(system), [["Module", "x1", "y1", "z1", "b", "d", "R", "Ld", "Td", "l"], *rows]
+    if len(rows) > _FIRST + 2:
+        rows[_FIRST:-1] = [["..."] * len(rows[0])]
+    return len(system), [["Module", *names], *rows]
 
 
 def accept(form: ColumnMapProperties) -> ColumnMap:
-    """The column map that the settings say, by which the workbook can be read; saved, where they ask for that.
+    """The column map that the settings describe, also saved where they ask for that.
 
-    Raises
-    ------
-    InputError
-        The workbook is refused, or the map cannot be saved.
+    Raises InputError where the workbook is refused or the map cannot be saved.
     """
     update(form)
     if form.refusal:
@@ -283,14 +257,9 @@ def accept(form: ColumnMapProperties) -> ColumnMap:
         if path.suffix.lower() != ".toml":
             raise InputError(f"{path}: expected a name ending in .toml")
         if path.exists():
-            raise InputError(f"{path}: is there already, expected a new name")
+            raise InputError(f"{path}: exists already, expected a new name")
         columns.write(path, f"Columns of {Path(form.workbook).name}.")
     return columns
-
-
-def _set(group: bpy.types.PropertyGroup, values: dict[str, object]) -> None:
-    for name, value in values.items():
-        setattr(group, name, value)
 
 
 def _rows(text: str, i: int) -> tuple[int, ...]:
@@ -306,34 +275,30 @@ def _rows(text: str, i: int) -> tuple[int, ...]:
 
 
 @lru_cache(maxsize=1)
-def _shown(workbook: Path, changed: int) -> dict[str, tuple[tuple[str, ...], ...]]:
+def _cells_at(workbook: Path, changed: int) -> dict[str, tuple[tuple[str, ...], ...]]:
     return preview_workbook(workbook, _SEEN, _SEEN)
 
 
 def _cells(workbook: Path) -> dict[str, tuple[tuple[str, ...], ...]]:
-    try:
-        changed = workbook.stat().st_mtime_ns
-    except OSError:
-        changed = 0  # what is wrong with it, the reader says
-    return _shown(workbook, changed)
+    """Sheet -> rows of texts; read again only when the file has changed."""
+    # The reader says what is wrong with a file that is not there.
+    return _cells_at(workbook, workbook.stat().st_mtime_ns if workbook.is_file() else 0)
 
 
 def _seen(form: ColumnMapProperties, quantity: ColumnMapQuantity, workbook: Path) -> str:
-    """What stands in a quantity's column, as far as it is shown: the heading and the first number."""
+    """The heading and the first number in a quantity's column."""
     from openpyxl.utils import column_index_from_string
 
-    if quantity.name == "l" and not quantity.column.strip():
+    letters = quantity.column.strip().upper()
+    if quantity.name == "l" and not letters:
         return "(by the design formula)"
     if quantity.table > len(form.tables):
         return ""
     table = form.tables[quantity.table - 1]
     try:
-        column = column_index_from_string(quantity.column.strip().upper())
+        column = column_index_from_string(letters) - 1
     except ValueError:
         return ""
-    rows = _cells(workbook).get(table.sheet, ())
-    texts = [
-        rows[row - 1][column - 1] for row in (table.header_row, table.first_row) if 0 < row <= len(rows)
-        and column <= len(rows[row - 1])
-    ]  # fmt: skip
-    return ": ".join(filter(None, texts))
+    cells = _cells(workbook).get(table.sheet, ())
+    rows = [cells[row - 1] for row in (table.header_row, table.first_row) if 0 < row <= len(cells)]
+    return ": ".join(row[column] for row in rows if column < len(row) and row[column])

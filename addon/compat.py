@@ -4,11 +4,8 @@ from __future__ import annotations
 
 import bpy
 
-# The engine was renamed in 5.0.
-EEVEE = "BLENDER_EEVEE" if bpy.app.version >= (5, 0, 0) else "BLENDER_EEVEE_NEXT"
-
-# Where voxel index i of an OpenVDB grid is drawn: over [i, i + 1] in 4.5, centred on i in 5.0 and later. Add
-# this (in voxels) to the translation of a .vdb transform that means centres.
+# Voxel index i of an OpenVDB grid is drawn over [i, i + 1] in 4.5, centred on i in 5.0 and later. Files that a scene draws
+# have this (in voxels) added to their transforms.
 VDB_CENTER_SHIFT = 0.0 if bpy.app.version >= (5, 0, 0) else -0.5
 
 

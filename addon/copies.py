@@ -1,6 +1,6 @@
-"""Modules made and removed in the scene: duplicates, copied cameras, and what is left of deleted ones.
+"""Modules made and removed in the scene: duplicates, copied cameras, and parts whose camera was deleted.
 
-Everything here makes or removes datablocks: it is for operators, which are undo steps, not for handlers.
+All of this makes or removes datablocks: it is for operators, which are undo steps, not for handlers.
 """
 
 from __future__ import annotations
@@ -12,112 +12,110 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..core.errors import InputError
-from ..core.geometry.collimator import Collimator
-from ..core.geometry.collimator_mesh import Solid, collimator_solid, crystal_solid
-from . import cameras, collimators, design, ids, scanner
+from . import cameras, collimators, following, ids, scanner
+from .following import PARTS
 from .module_values import add_module, module_numbers
 from .scanner_parts import new_part
 
-_PARTS = ("COLLIMATOR", "CRYSTAL")
-
 
 def copied_cameras(collection: bpy.types.Collection) -> list[bpy.types.Object]:
-    """Cameras with the number of another: copies that Blender made. "Module 07" comes before "Module 07.001"."""
+    """Cameras with another camera's module number: Blender copied them. "Module 07.001" is the copy of "Module 07"."""
     seen: set[int] = set()
-    copies = []
+    copied = []
     for camera in sorted(scanner.modules(collection), key=lambda o: (len(o.name), o.name)):
         number = camera.mphdrr_module.number
         if number in seen:
-            copies.append(camera)
+            copied.append(camera)
         seen.add(number)
-    return copies
+    return copied
 
 
-def leftovers(collection: bpy.types.Collection) -> list[bpy.types.Object]:
-    """Collimators and crystals whose camera has gone."""
+def orphan_parts(collection: bpy.types.Collection) -> list[bpy.types.Object]:
+    """Collimators and crystals whose camera was deleted."""
     return [
         item
         for item in collection.all_objects
-        if item.mphdrr_module.part in _PARTS
+        if item.mphdrr_module.part in PARTS
         and not (item.parent is not None and item.parent.mphdrr_module.is_module and item.parent.users_collection)
     ]
 
 
 def bare_cameras(collection: bpy.types.Collection) -> list[bpy.types.Object]:
-    """Modules with neither collimator nor crystal: copies whose original has gone."""
-    parts = design.parts_of(collection, scanner.modules(collection))
+    """Modules with neither collimator nor crystal: copies whose original was deleted."""
+    parts = following.parts_of(collection, scanner.modules(collection))
     return [camera for camera, own in parts.items() if not own]
 
 
 def untidy_text(collection: bpy.types.Collection) -> str:
-    """What `tidy` would do, in words; empty where all is in order."""
-    copies = copied_cameras(collection)
-    bare = [camera for camera in bare_cameras(collection) if camera not in copies]
-    left = leftovers(collection)
+    """What `tidy` would put in order, in words; empty where all is in order."""
+    copied = copied_cameras(collection)
+    bare = [camera for camera in bare_cameras(collection) if camera not in copied]
+    orphans = orphan_parts(collection)
     texts = (
-        f"{len(copies)} copied camera{'s' * (len(copies) > 1)}" if copies else "",
+        f"{len(copied)} copied camera{'s' * (len(copied) > 1)}" if copied else "",
         f"{len(bare)} bare camera{'s' * (len(bare) > 1)}" if bare else "",
-        f"{len(left)} part{'s' * (len(left) > 1)} without a camera" if left else "",
+        f"{len(orphans)} part{'s' * (len(orphans) > 1)} without a camera" if orphans else "",
     )
     return ", ".join(text for text in texts if text)
 
 
 def tidy(collection: bpy.types.Collection) -> tuple[list[int], int]:
-    """Make modules of copied cameras, and remove parts without a camera: the new numbers, and how many parts.
+    """Make modules of copied cameras, and remove parts without a camera.
 
-    Raises
-    ------
-    InputError
-        The shapes of a copy cannot be built: its numbers, or its original's, have to be cured first.
+    Returns the new modules' numbers, and how many parts were removed. Raises InputError where a copy's shapes cannot be
+    built, and leaves the scene as it was.
     """
-    copies, left, numbers = copied_cameras(collection), leftovers(collection), []
-    for camera in {*copies, *bare_cameras(collection)}:
-        _solids(collection, camera)  # what cannot be built is said before anything is changed
-    _remove(left)
-    for camera in copies:
+    copied, orphans, numbers = copied_cameras(collection), orphan_parts(collection), []
+    _require_solids(collection, [*copied, *bare_cameras(collection)])
+    _remove(orphans)
+    for camera in copied:
         adopt(collection, camera)
         numbers.append(camera.mphdrr_module.number)
     for camera in bare_cameras(collection):
         _add_parts(collection, camera)
     make_single_users(collection)
-    scanner.refresh_scanner(collection)
+    following.refresh(collection)
     collection.mphdrr_scanner.untidy = untidy_text(collection)
-    return numbers, len(left)
+    return numbers, len(orphans)
 
 
 def adopt(
     collection: bpy.types.Collection, camera: bpy.types.Object, center: NDArray[np.float64] | None = None
 ) -> None:
-    """Make the copy of a module's camera a module with a free number, a collimator and a crystal.
+    """Make the copy of a module's camera a module with a new number, a collimator and a crystal.
 
-    `center` is its pinhole, (3,) in mm, to more digits than Blender keeps.
+    `center` is its pinhole (3,), mm, in float64; by default it is where the camera stands.
     """
     found = [o for o in scanner.modules(collection) if o != camera]
     number = max(o.mphdrr_module.number for o in found) + 1
-    own = design.parts_of(collection, [camera])[camera]
-    if not own:
+    if not following.parts_of(collection, [camera])[camera]:
         _add_parts(collection, camera)
-        own = design.parts_of(collection, [camera])[camera]
     add_module(camera, number, max(o.mphdrr_module.index for o in found) + 1, center)
     camera.name = ids.module_name(number, len(found) + 1)
     if camera.data.users > 1:
         camera.data = camera.data.copy()
     camera.data.name = camera.name
-    for part in own:
+    for part in following.parts_of(collection, [camera])[camera]:
         part.name, part.mphdrr_module.number = ids.part_name(camera.name, part.mphdrr_module.part), number
         if part.data.users == 1:
             part.data.name = part.name
 
 
-def _solids(collection: bpy.types.Collection, camera: bpy.types.Object) -> tuple[Solid, Solid]:
-    _, _, d, l, side, thickness, _ = module_numbers(camera)
-    body = Collimator(d, l, side, design.construction(collection.mphdrr_scanner))
-    return collimator_solid(body), crystal_solid(l, side, thickness)
+def _require_solids(collection: bpy.types.Collection, modules: Sequence[bpy.types.Object]) -> None:
+    """Raise InputError where a module's parts cannot be built, before anything is changed."""
+    for camera in modules:
+        construction = following.construction(collection.mphdrr_scanner)
+        for part in PARTS:
+            collimators.part_solid(part, module_numbers(camera), construction)
 
 
 def _add_parts(collection: bpy.types.Collection, camera: bpy.types.Object) -> None:
-    for part, solid in zip(_PARTS, _solids(collection, camera), strict=True):
-        name = ids.part_name(camera.name, part)
+    construction = following.construction(collection.mphdrr_scanner)
+    for part in PARTS:
+        name, solid = (
+            ids.part_name(camera.name, part),
+            collimators.part_solid(part, module_numbers(camera), construction),
+        )
         item = new_part(camera, part, name, collimators.new_mesh(name, solid, collimators.part_material(part)))
         item.hide_viewport, item.hide_render = camera.hide_viewport, camera.hide_render
         for home in camera.users_collection:
@@ -127,34 +125,24 @@ def _add_parts(collection: bpy.types.Collection, camera: bpy.types.Object) -> No
 def duplicate(
     collection: bpy.types.Collection, modules: Sequence[bpy.types.Object], count: int, angle: float, follow_ring: bool
 ) -> list[bpy.types.Object]:
-    """Copy modules along their ring.
+    """Copy modules along their ring; returns the new camera objects.
 
     Parameters
     ----------
-    collection
-        The scanner.
-    modules
-        The camera objects to copy.
-    count
-        How many copies of each.
-    angle
-        From one to the next, radians about the world's z axis.
+    collection, modules
+        The scanner, and those of its camera objects to copy.
+    count, angle
+        How many copies of each, and the angle from one to the next, radians about the world's z axis.
     follow_ring
-        Keep to the ring's arc: the copy's distance from the z axis, and its z, are those of the ring at its azimuth,
-        linear between neighbours and beyond the arc's ends as at the end. Otherwise the copy is turned about z.
-
-    Returns
-    -------
-    list
-        The new camera objects.
+        Keep to the ring's arc: a copy's z and distance from the z axis are those of the ring at its azimuth, linear
+        between neighbours and constant beyond the arc's ends. Otherwise the copy is turned about z.
 
     Raises
     ------
     InputError
-        A copy would stand where a module stands already, or has no shape. The scene is as it was.
+        A copy would stand where a module already stands, or its shapes cannot be built. The scene is as it was.
     """
-    for camera in modules:
-        _solids(collection, camera)
+    _require_solids(collection, modules)
     taken = [module_numbers(o).center for o in scanner.modules(collection)]
     places = [
         (camera, place)
@@ -178,7 +166,7 @@ def duplicate(
         cameras.set_world_matrix(copy, cameras.camera_matrices(place[None])[0])
         adopt(collection, copy, place)
         made.append(copy)
-    scanner.refresh_scanner(collection)
+    following.refresh(collection)
     return made
 
 
@@ -186,47 +174,40 @@ def _along_ring(
     collection: bpy.types.Collection, camera: bpy.types.Object, angles: NDArray[np.float64], follow_ring: bool
 ) -> NDArray[np.float64]:
     """Places (N, 3), mm, at `angles` (N,) about z from a module."""
-    x, y, z = module_numbers(camera).center
-    azimuth, radius, height = np.arctan2(y, x), np.hypot(x, y), z
-    turned = azimuth + angles
+    x, y, height = module_numbers(camera).center
+    azimuth, radius = np.arctan2(y, x), np.hypot(x, y)
     if follow_ring:
-        ring = np.array(
-            [
-                module_numbers(o).center
-                for o in scanner.modules(collection)
-                if o.mphdrr_module.ring == camera.mphdrr_module.ring
-            ]
-        )
-        # Azimuths from the module itself, so that an arc across +-pi stays in one piece.
-        others = np.arctan2(ring[:, 1], ring[:, 0]) - azimuth
-        others = (others + np.pi) % (2 * np.pi) - np.pi
+        in_ring = [o for o in scanner.modules(collection) if o.mphdrr_module.ring == camera.mphdrr_module.ring]
+        ring = np.array([module_numbers(o).center for o in in_ring])
+        # Azimuths relative to the module, so that an arc across +-pi stays in one piece.
+        others = _wrapped(np.arctan2(ring[:, 1], ring[:, 0]) - azimuth)
         order = np.argsort(others)
-        at = (angles + np.pi) % (2 * np.pi) - np.pi
         radius, height = (
-            np.interp(at, others[order], values[order]) for values in (np.hypot(*ring[:, :2].T), ring[:, 2])
+            np.interp(_wrapped(angles), others[order], values[order])
+            for values in (np.hypot(*ring[:, :2].T), ring[:, 2])
         )
+    turned = azimuth + angles
     return np.column_stack(np.broadcast_arrays(radius * np.cos(turned), radius * np.sin(turned), height))
 
 
-def remove(collection: bpy.types.Collection, modules: Sequence[bpy.types.Object]) -> None:
-    """Remove modules with their collimators and crystals; what else hangs on them stays where it is.
+def _wrapped(angles: NDArray[np.float64]) -> NDArray[np.float64]:
+    return (angles + np.pi) % (2 * np.pi) - np.pi
 
-    Raises
-    ------
-    InputError
-        No module would be left.
+
+def remove(collection: bpy.types.Collection, modules: Sequence[bpy.types.Object]) -> None:
+    """Remove modules with their collimators and crystals; other objects parented to them stay where they are.
+
+    Raises InputError where no module would be left.
     """
     if len(modules) >= len(scanner.modules(collection)):
-        raise InputError("a scanner needs at least one module: leave one, or delete the scanner's collection")
-    parts = [o for camera in modules for o in camera.children if o.mphdrr_module.part in _PARTS]
-    for camera in modules:
-        for child in camera.children:
-            if child not in parts:
-                matrix = cameras.world_matrix(child)
-                child.parent = None
-                cameras.set_world_matrix(child, matrix)
+        raise InputError("a scanner needs at least one module: keep one, or delete the scanner's collection")
+    children = [child for camera in modules for child in camera.children]
+    parts = [child for child in children if child.mphdrr_module.part in PARTS]
+    for child in children:
+        if child not in parts:
+            cameras.unparent(child)
     _remove([*parts, *modules])
-    scanner.refresh_scanner(collection)
+    following.refresh(collection)
 
 
 def _remove(items: Sequence[bpy.types.Object]) -> None:
@@ -236,8 +217,8 @@ def _remove(items: Sequence[bpy.types.Object]) -> None:
 
 
 def make_single_users(collection: bpy.types.Collection) -> None:
-    """Give every module a camera and meshes of its own, which it can reshape."""
+    """Give every module a camera and meshes of its own, which can be reshaped."""
     for item in collection.all_objects:
         module = item.mphdrr_module
-        if (module.is_module or module.part in _PARTS) and item.data.users > 1:
+        if (module.is_module or module.part in PARTS) and item.data.users > 1:
             item.data = item.data.copy()

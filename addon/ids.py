@@ -1,4 +1,4 @@
-"""Every idname, datablock name and prefix of the extension, in one place. Needs no Blender."""
+"""Every idname, datablock name and prefix of the extension. Needs no Blender."""
 
 from __future__ import annotations
 
@@ -56,11 +56,9 @@ MENU_ADD = "MPHDRR_MT_add"
 FILE_HANDLER_VOLUME = "MPHDRR_FH_volume"
 ORDER_GEOMETRY, ORDER_PHANTOM, ORDER_PROJECTIONS, ORDER_EXPORT = 0, 10, 20, 30  # bl_order
 
-# --- Properties on Blender's types: `scene.mphdrr_geometry`, `camera_object.mphdrr_module`, ... -------------
+# --- Properties on Blender's types; code reads them as attributes: `scene.mphdrr_geometry` ------------------
 SCENE_GEOMETRY = "mphdrr_geometry"
-SCENE_PHANTOM = "mphdrr_phantom"
 SCENE_PROJECTIONS = "mphdrr_projections"
-SCENE_EXPORT = "mphdrr_export"
 OBJECT_MODULE = "mphdrr_module"
 OBJECT_VOLUME = "mphdrr_volume"
 WINDOW_JOB = "mphdrr_job"
@@ -70,15 +68,12 @@ COLLECTION_SCANNER = "mphdrr_scanner"
 # --- Datablocks ---------------------------------------------------------------------------------------------
 SCANNER = "Scanner"  # default name of a scanner's collection
 PARTS = ("NONE", "CAMERA", "COLLIMATOR", "CRYSTAL", "ROI")  # `Object.mphdrr_module.part`
-MATERIAL_COLLIMATOR = "mphDRR collimator"
-MATERIAL_CRYSTAL = "mphDRR crystal"
-MATERIAL_ROI = "mphDRR ROI"
 MOSAIC = "mphDRR mosaic"
 PREVIEW = ".preview"  # in the names of coarser copies of large volumes, for display only
 
 
 def module_name(number: int, n_modules: int = 80) -> str:
-    """Name of a module's camera object: "Module 07"; wide enough that names sort as numbers do."""
+    """Name of a module's camera object: "Module 07", padded so that names sort as numbers do."""
     return f"Module {number:0{max(2, len(str(n_modules)))}d}"
 
 
@@ -93,5 +88,5 @@ def ring_name(ring: int) -> str:
 
 
 def projection_name(number: int, n_modules: int = 80) -> str:
-    """Name of a module's projection image: "mphDRR 07"; wide enough that names sort as numbers do."""
-    return f"mphDRR {number:0{max(2, len(str(n_modules)))}d}"
+    """Name of a module's projection image: "mphDRR 07", padded as `module_name`."""
+    return module_name(number, n_modules).replace("Module", "mphDRR")

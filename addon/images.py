@@ -1,7 +1,7 @@
 """Projections as Blender images, shown as the pinhole sees them: +v up, +u left.
 
-The arrays have column index along +u; an image's columns are therefore reversed (and Blender's pixel rows, like the
-arrays', start at the bottom). Module images hold the exact float32 values in R, G and B; the mosaic is scaled for display.
+The arrays' column index grows along +u, so an image's columns are reversed; its rows start at the bottom, as the arrays' do.
+Module images hold the exact float32 values in R, G and B; the mosaic is scaled for display.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ _MOSAIC_PIXELS = 6e6  # 80 views of 256 x 256 are shown pixel by pixel, larger o
 
 
 def store_projections(projections: NDArray[np.float32], numbers: Iterable[int], columns: int = 20) -> bpy.types.Image:
-    """Make one float image per module and the mosaic, packed into the .blend; images of an earlier run are replaced.
+    """Make a float image of each module and the mosaic, packed into the .blend, in place of those of an earlier run.
 
     Parameters
     ----------
@@ -36,18 +36,15 @@ def store_projections(projections: NDArray[np.float32], numbers: Iterable[int], 
     Image
         The mosaic, scaled so that its largest value is white.
     """
-    steps = storing(projections, numbers, columns)
-    while True:
-        try:
-            next(steps)
-        except StopIteration as end:
-            return end.value
+    for _ in storing(projections, numbers, columns):
+        pass
+    return bpy.data.images[ids.MOSAIC]
 
 
 def storing(
     projections: NDArray[np.float32], numbers: Iterable[int], columns: int = 20
 ) -> Generator[None, None, bpy.types.Image]:
-    """`store_projections` in small steps, so that a window can be drawn in between; returns the mosaic."""
+    """`store_projections` in small steps, between which a window can be drawn; returns the mosaic."""
     numbers = [int(number) for number in numbers]
     names = [ids.projection_name(number, max(numbers)) for number in numbers]
     for picture, name in zip(as_seen(projections), names, strict=True):
@@ -63,7 +60,7 @@ def storing(
 
 
 def _reduced(projections: NDArray[np.float32], columns: int) -> NDArray[np.float32]:
-    """Means over blocks of pixels where the mosaic would get too large to look at."""
+    """Means over blocks of pixels, if the mosaic would be too large to look at."""
     count, n_v, n_u = projections.shape
     pixels = -(-count // columns) * columns * n_v * n_u
     factor = min(int(np.ceil(np.sqrt(pixels / _MOSAIC_PIXELS))), n_v, n_u)
@@ -83,7 +80,7 @@ def projection_array(image: bpy.types.Image) -> NDArray[np.float32]:
 
 
 def show(image: bpy.types.Image, context: bpy.types.Context) -> bool:
-    """Show an image in the Image Editors that show none, or one of ours; False where no such editor is open."""
+    """Show an image in the Image Editors that show none or one of ours; False if no such editor is open."""
     shown = False
     for window in context.window_manager.windows:
         for area in window.screen.areas:
@@ -96,7 +93,7 @@ def show(image: bpy.types.Image, context: bpy.types.Context) -> bool:
 
 
 def show_below(image: bpy.types.Image, context: bpy.types.Context) -> bool:
-    """Like `show`, opening an Image Editor below the largest 3D view where none is open; False without a window."""
+    """Like `show`, but open an Image Editor below the largest 3D view if none is open; False without a window."""
     if show(image, context):
         return True
     window = context.window
@@ -132,7 +129,7 @@ def _fit(context: bpy.types.Context, window: bpy.types.Window, area: bpy.types.A
 
 
 def _store(name: str, picture: NDArray[np.float32], *, exact: bool) -> bpy.types.Image:
-    """Image `name` from a picture whose row 0 is the top, in place of the one of that name if it is ours."""
+    """Make or replace our image `name`, from a picture whose row 0 is the top."""
     height, width = picture.shape
     old = bpy.data.images.get(name)
     image = old

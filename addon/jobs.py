@@ -1,8 +1,9 @@
 """Long work that leaves the window alive: a thread does it, a modal operator watches it.
 
-An operator that inherits from `JobOperator` gives its work as a `Job`. Called from the window (INVOKE) it runs as a
-modal job with a progress bar, cancelled by Esc or by the panel's button; called from a script (EXEC) or in
-background mode the same work runs at once and the operator returns when it is done. The work must not touch bpy.
+What a task does is a function of `addon` that returns a `Job`; an operator that inherits from `JobOperator` calls that
+function. Started from the window (INVOKE), the job runs in a thread, with a progress bar, until Esc or the panel's button
+cancels it. Called from a script (EXEC) or without a window, the operator returns when the job is done. Scripts can also do
+a job themselves, with `run`.
 """
 
 from __future__ import annotations
@@ -25,8 +26,8 @@ from . import ids
 from .reports import warnings_reported
 
 _INTERVAL = 0.1  # s between two looks at the thread
-_STEP = 0.05  # s of the main thread's time for finishing, each time
-_PATIENCE = 10.0  # s that stopping waits for a thread
+_STEP = 0.05  # s that finishing may take of the main thread before the window is drawn again
+_PATIENCE = 10.0  # s that `stop` waits for a thread
 
 
 @dataclass
@@ -36,23 +37,38 @@ class Job:
     Attributes
     ----------
     label : str
-        What the progress bar calls it.
+        Shown in the progress bar.
     work : callable
-        ``work(progress)`` runs in a thread and must not touch bpy. It calls ``progress(done, total)`` between its
-        steps, where `Cancelled` is raised when the user wants so.
+        ``work(progress)`` runs in a thread and must not touch bpy. It calls ``progress(done, total)`` between its steps,
+        which raises `Cancelled` when the user wants to stop.
     finish : callable
-        ``finish(result)`` is a generator that runs in Blender's main thread: it yields between small steps, so that
-        the window can be drawn, and returns the line to report.
+        ``finish(result)`` runs in the main thread and returns the line to report; if that takes long, it is a generator
+        that yields between its steps, so that the window can be drawn.
     """
 
     label: str
     work: Callable[[Progress], Any]
-    finish: Callable[[Any], Generator[None, None, str]]
+    finish: Callable[[Any], str | Generator[None, None, str]]
+
+
+def run(job: Job, progress: Progress = lambda done, total: None) -> str:
+    """Do a job now; returns the line to report, raises what the work raises."""
+    steps = _finishing(job, job.work(progress))
+    while True:
+        try:
+            next(steps)
+        except StopIteration as end:
+            return str(end.value)
+
+
+def _finishing(job: Job, result: Any) -> Generator[None, None, str]:
+    finished = job.finish(result)
+    return (yield from finished) if isinstance(finished, Generator) else finished
 
 
 @dataclass
 class Worker:
-    """Work in a thread of its own, with its progress and the warnings it gave; the main thread starts it."""
+    """Work in a thread of its own, with its progress and the warnings that it gave."""
 
     label: str
     work: Callable[[Progress], Any]
@@ -102,11 +118,11 @@ def cancel() -> None:
 def stop() -> None:
     """Stop the running job and wait for its thread: before a file is loaded, or the extension is disabled."""
     global _current
-    run, _current = _current, None
-    if run is not None:
-        run.cancel.set()
-        if run.thread is not None:
-            run.thread.join(_PATIENCE)
+    worker, _current = _current, None
+    if worker is not None:
+        worker.cancel.set()
+        if worker.thread is not None:
+            worker.thread.join(_PATIENCE)
 
 
 @bpy.app.handlers.persistent
@@ -140,7 +156,7 @@ class JobProperties(bpy.types.PropertyGroup):
 
 
 class JobOperator:
-    """Mix into an operator and implement `job`, and `ask` where the user is asked first; add nothing else but properties."""
+    """Mix into an operator and implement `job`, and `ask` where the user is asked first."""
 
     confirmed: BoolProperty(
         name="Confirmed", description="Start without asking", options={"HIDDEN", "SKIP_SAVE"}, default=False
@@ -160,46 +176,53 @@ class JobOperator:
         def as_keywords(self, *, ignore: tuple[str, ...] = ()) -> dict[str, Any]: ...
 
     def job(self, context: bpy.types.Context) -> Job:
-        """The work, from the operator's and the scene's settings; raises InputError."""
+        """The job, from the operator's and the scene's settings; raises InputError."""
         raise NotImplementedError
 
     def ask(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str] | None:
-        """Open a dialog or a file browser, whose button starts the work; None where there is nothing to ask."""
+        """Open a dialog or a file browser, whose button starts the job; None where there is nothing to ask."""
         return None
 
+    def ask_in_dialog(self, context: bpy.types.Context, confirm_text: str, width: int = 300) -> set[str]:
+        """`ask` with a dialog of the operator's properties."""
+        return context.window_manager.invoke_props_dialog(
+            self, title=self.bl_label, confirm_text=confirm_text, width=width
+        )
+
+    def ask_for_file(self, context: bpy.types.Context, is_given: bool) -> set[str] | None:
+        """`ask` with a file browser, unless the file is given, as by dropping it on the window."""
+        if is_given:
+            return None
+        context.window_manager.fileselect_add(self)
+        return {"RUNNING_MODAL"}
+
     def execute(self, context: bpy.types.Context) -> set[str]:
-        """Do the work at once and return when it is done."""
+        """Do the job at once and return when it is done."""
         if self._asked:
             return self._start_after_asking()
-        if is_running():
-            self.report({"ERROR"}, "another job is running: wait for it or cancel it")
-            return {"CANCELLED"}
         try:
-            job = self.job(context)
+            _require_idle()
             with warnings_reported(self):
-                result = job.work(_console(job.label) if bpy.app.background else _cursor(context))
-            self.report({"INFO"}, _last(job.finish(result)))
+                job = self.job(context)
+                text = run(job, _console(job.label))
+            self.report({"INFO"}, text)
         except BaseException as error:
             return self._failed(error)
-        finally:
-            context.window_manager.progress_end()
         return {"FINISHED"}
 
     def invoke(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str]:
-        """Start the work in a thread; without a window, do it at once."""
+        """Start the job in a thread; without a window, do it at once."""
         global _current
         if bpy.app.background or context.window is None:
             return self.execute(context)
-        if is_running():
-            self.report({"ERROR"}, "another job is running: wait for it or cancel it")
-            return {"CANCELLED"}
-        if not self.confirmed:
-            asked = self.ask(context, event)
+        try:
+            _require_idle()
+            asked = None if self.confirmed else self.ask(context, event)
             if asked is not None:
                 self._asked = True
                 return asked
-        try:
-            self._job = self.job(context)
+            with warnings_reported(self):
+                self._job = self.job(context)
         except Exception as error:
             return self._failed(error)
         self._run = _current = Worker(self._job.label, self._job.work)
@@ -211,8 +234,8 @@ class JobOperator:
 
     def modal(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str]:
         """Watch the thread; when it is done, finish step by step."""
-        job, run = self._job, self._run
-        if job is None or run is None or run is not _current:  # stopped from outside
+        job, worker = self._job, self._run
+        if job is None or worker is None or worker is not _current:  # stopped from outside
             self._end(context)
             return {"CANCELLED"}
         if event.type == "ESC" and event.value == "PRESS":
@@ -221,17 +244,15 @@ class JobOperator:
         if event.type != "TIMER":
             return {"PASS_THROUGH"}
         redraw_sidebars()
-        if run.alive:
+        if worker.alive:
             return {"PASS_THROUGH"}
-        if self._finishing is None:
-            for text in run.caught:
-                self.report({"WARNING"}, text)
-            error = run.error or (Cancelled() if run.cancel.is_set() else None)
-            if error is not None:
-                self._end(context)
-                return self._failed(error)
-            self._finishing = job.finish(run.result)
         try:
+            if self._finishing is None:
+                for text in worker.caught:
+                    self.report({"WARNING"}, text)
+                if worker.error is not None or worker.cancel.is_set():
+                    raise worker.error or Cancelled()
+                self._finishing = _finishing(job, worker.result)
             enough = time.perf_counter() + _STEP
             while time.perf_counter() < enough:
                 next(self._finishing)
@@ -239,7 +260,7 @@ class JobOperator:
             self._end(context)
             self.report({"INFO"}, end.value)
             return {"FINISHED"}
-        except Exception as error:
+        except BaseException as error:
             self._end(context)
             return self._failed(error)
         return {"PASS_THROUGH"}
@@ -251,7 +272,7 @@ class JobOperator:
         self._end(context)
 
     def _start_after_asking(self) -> set[str]:
-        """Blender runs what a dialog asked for by `execute`, which cannot become modal: start another of this kind."""
+        """Blender calls `execute` after a dialog, which cannot become modal: start another operator of this kind."""
         given = {name: _argument(value) for name, value in self.as_keywords(ignore=("confirmed",)).items()}
         group, name = self.bl_idname.split("_OT_")  # an instance has the class's name there
         try:
@@ -284,9 +305,12 @@ class JobOperator:
         return {"CANCELLED"}
 
 
-class MPHDRR_OT_cancel_job(bpy.types.Operator):
-    """Cancel the running job: the progress bar's button, and a script's way."""
+def _require_idle() -> None:
+    if is_running():
+        raise InputError("another job is running: wait for it or cancel it")
 
+
+class MPHDRR_OT_cancel_job(bpy.types.Operator):
     bl_idname = ids.CANCEL_JOB
     bl_label = "Cancel"
     bl_description = "Stop the running job; the scene stays as it was"
@@ -310,7 +334,7 @@ def draw_job(layout: bpy.types.UILayout, context: bpy.types.Context) -> None:
     """Draw the running job's progress bar and Cancel button; nothing where there is none."""
     if not is_running():
         return
-    state = getattr(context.window_manager, ids.WINDOW_JOB)
+    state = context.window_manager.mphdrr_job
     row = layout.row(align=True)
     row.progress(factor=state.progress, type="BAR", text=f"{state.label}  {state.progress:.0%}")
     row.operator(ids.CANCEL_JOB, text="", icon="CANCEL")
@@ -325,16 +349,8 @@ def _argument(value: Any) -> Any:
     return value
 
 
-def _last(steps: Generator[None, None, str]) -> str:
-    while True:
-        try:
-            next(steps)
-        except StopIteration as end:
-            return end.value
-
-
 def redraw_sidebars() -> None:
-    """Have the panels drawn: not the scene, which ten times a second would take the processor from the work."""
+    """Have the panels drawn, but not the scene: ten times a second, that would slow the work down."""
     for window in bpy.context.window_manager.windows:
         for area in window.screen.areas:
             for region in area.regions:
@@ -353,8 +369,3 @@ def _console(label: str) -> Progress:
             print(f"mphDRR: {label} {percent} % ({done} of {total})", file=sys.stderr, flush=True)
 
     return progress
-
-
-def _cursor(context: bpy.types.Context) -> Progress:
-    context.window_manager.progress_begin(0, 1000)
-    return lambda done, total: context.window_manager.progress_update(1000 * done // max(1, total))

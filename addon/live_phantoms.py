@@ -1,112 +1,50 @@
-"""Phantoms follow their settings as these are edited: a sketch at once, the voxels when the edits rest.
-
-A slider that is dragged changes a setting many times a second, and voxels take longer than that. So every change shows
-a sketch, and once nothing has changed for a moment a thread makes the voxels, which take its place. Nothing reads a
-sketch for voxels: who needs them early has them made at once (`settle`).
-
-Voxels come after Blender has taken its undo step of the edit, so an undo or redo may bring a sketch back: then they are
-made again. Where there is no window nothing runs beside a script, and small phantoms are made anew at once.
-"""
+"""Phantoms follow their settings: small ones at once, others, in a window, once the settings rest; large ones on Update."""
 
 from __future__ import annotations
-
-import time
-import traceback
-from typing import Any
 
 import bpy
 
 from ..core.errors import InputError
 from ..core.recording import recorded_warnings
-from . import ids, jobs, phantoms
+from . import jobs, phantoms
 
-LIVE_VOXELS = 64**3
-"""Up to so many voxels, of all its states, a phantom is made anew at once where there is no window."""
+QUICK_VOXELS = 64**3
+"""Up to so many voxels, of all its states, a phantom is made again at every edit."""
 
-REFINED_VOXELS = 128**3
-"""Up to so many a sketch becomes voxels by itself; more wait for Update Phantom."""
+RESTED_VOXELS = 128**3
+"""Up to so many it is made again by a job when its settings rest."""
 
-_REST = 0.3  # s without an edit
-_INTERVAL = 0.1  # s between two looks
-_PATIENCE = 10.0  # s that stopping waits for a thread
+_REST = 0.5  # s without an edit
 
-
-_refinement: tuple[str, jobs.Worker] | None = None  # the phantom's name, and what makes its voxels
-_last_edit = 0.0  # by time.monotonic
-_given_up: set[str] = set()  # names of phantoms whose voxels cannot be made, until they change
+_edited = ""  # name of the phantom that `_rested` is about
 
 
-def settings_changed(item: Any, settings: Any) -> None:
-    """A setting was edited: show what it does, and say of what cannot be made, or is not made by itself, that it is so."""
-    if not isinstance(item, bpy.types.Object) or phantoms.settings_of(item) != settings:
-        return  # an operator's, or on its way
-    properties = getattr(item, ids.OBJECT_VOLUME)
+def settings_changed(item: bpy.types.ID) -> None:
+    """A phantom's setting was edited: make its voxels again, or mark them as outdated and say what is wrong."""
+    settings = phantoms.settings_of(item) if isinstance(item, bpy.types.Object) else None
+    if settings is None:  # it is being added
+        return
+    properties = item.mphdrr_volume
     properties.outdated, properties.message = True, ""
-    _cancel()
-    _given_up.discard(item.name)
     with recorded_warnings() as caught:
         try:
-            if _has_window() and not jobs.is_running():
-                phantoms.sketch(item)
-                _wait()
+            make = phantoms.remaking(item)
+            if settings.n_voxels <= QUICK_VOXELS and not jobs.is_running():
+                phantoms.replace(item, make(None))
             else:
-                make = phantoms.remaking(item)  # which finds what cannot be made
-                if settings.n_voxels <= LIVE_VOXELS and not jobs.is_running():
-                    phantoms.replace(item, make(None))
-                else:
-                    phantoms.update_outline(item)
+                phantoms.update_outline(item)
         except InputError as error:
             properties.message = str(error)
             return
     properties.message = next(iter(caught), "")
-
-
-def settle(item: bpy.types.Object) -> None:
-    """Give a sketched phantom, or the one that a sketched volume belongs to, its voxels now.
-
-    Raises
-    ------
-    InputError
-        They are so many that this takes a job, or cannot be made.
-    """
-    phantom = phantoms.root_of(item)
-    _cancel()
-    if phantom is None or phantoms.settings_of(phantom).n_voxels > REFINED_VOXELS:
-        raise InputError(f"{item.name!r} is a sketch of what its settings say: press Update Phantom first")
-    phantoms.replace(phantom, phantoms.remaking(phantom)(None))
-
-
-def is_coming(item: bpy.types.Object) -> bool:
-    """Whether the voxels of a sketched phantom will be there by themselves."""
-    properties = getattr(item, ids.OBJECT_VOLUME)
-    settings = phantoms.settings_of(item)
-    is_sketch = properties.sketched and settings is not None and item.library is None
-    return is_sketch and settings.n_voxels <= REFINED_VOXELS and item.name not in _given_up
-
-
-@bpy.app.handlers.persistent
-def after_undo(*_: Any) -> None:
-    """Undo, redo and loading may bring sketches."""
-    _cancel()
-    _given_up.clear()
-    if _has_window() and any(is_coming(item) for item in bpy.data.objects):
-        _wait()
-
-
-@bpy.app.handlers.persistent
-def before_load(*_: Any) -> None:
-    """Nothing waits beyond its file."""
-    stop()
+    if properties.outdated and settings.n_voxels <= RESTED_VOXELS and _has_window():
+        _wait_for(item)
 
 
 def stop() -> None:
-    """Forget what waits: before a file is loaded, or the extension is disabled."""
-    running = _refinement
-    _cancel()
-    if running is not None and running[1].thread is not None:
-        running[1].thread.join(_PATIENCE)
-    if bpy.app.timers.is_registered(_look):
-        bpy.app.timers.unregister(_look)
+    """Forget what waits: the extension is disabled."""
+    if bpy.app.timers.is_registered(_rested):
+        bpy.app.timers.unregister(_rested)
 
 
 def _has_window() -> bool:
@@ -114,66 +52,20 @@ def _has_window() -> bool:
     return not bpy.app.background
 
 
-def _wait() -> None:
-    global _last_edit
-    _last_edit = time.monotonic()
-    if not bpy.app.timers.is_registered(_look):
-        bpy.app.timers.register(_look, first_interval=_INTERVAL)
+def _wait_for(item: bpy.types.Object) -> None:
+    global _edited
+    _edited = item.name
+    stop()
+    bpy.app.timers.register(_rested, first_interval=_REST)
 
 
-def _cancel() -> None:
-    """What a thread is making now is done, or of other settings than those that count."""
-    global _refinement
-    if _refinement is not None:
-        _refinement[1].cancel.set()
-        _refinement = None
-
-
-def _look() -> float | None:
-    """Take what a thread has made, and start the next one."""
-    global _refinement
-    if time.monotonic() - _last_edit < _REST or jobs.is_running() or bpy.app.is_job_running("RENDER"):
-        return _INTERVAL
-    if _refinement is not None:
-        name, worker = _refinement
-        if worker.alive:
-            return _INTERVAL
-        _cancel()
-        _finish(name, worker)
-        jobs.redraw_sidebars()
-    item = next((o for o in bpy.data.objects if is_coming(o)), None)
-    if item is None:
-        return None
-    try:
-        worker = jobs.Worker("refining", phantoms.remaking(item))
-    except InputError as error:
-        _give_up(item, str(error))
-        return _INTERVAL
-    worker.start()
-    _refinement = item.name, worker
-    return _INTERVAL
-
-
-def _finish(name: str, done: jobs.Worker) -> None:
-    item = bpy.data.objects.get(name)
-    if item is None or phantoms.settings_of(item) is None:
-        return
-    if done.result is not None and len(done.result) != len(phantoms.with_children(item)):
-        return  # a volume of it has come or gone in the meantime: it is made once more
-    try:
-        if done.error is not None:
-            raise done.error
-        phantoms.replace(item, done.result or [])
-        getattr(item, ids.OBJECT_VOLUME).message = next(iter(done.caught), "")
-    except InputError as error:
-        _give_up(item, str(error))
-    except MemoryError:
-        _give_up(item, "not enough memory; choose fewer voxels")
-    except Exception as error:
-        traceback.print_exception(error)
-        _give_up(item, f"{type(error).__name__}: {error} (details in the console)")
-
-
-def _give_up(item: bpy.types.Object, message: str) -> None:
-    _given_up.add(item.name)
-    getattr(item, ids.OBJECT_VOLUME).message = message
+def _rested() -> float | None:
+    """Press Update Phantom for the phantom that was edited last; later, if a job is running."""
+    if jobs.is_running() or bpy.app.is_job_running("RENDER"):
+        return _REST
+    item = bpy.data.objects.get(_edited)
+    if item is not None and phantoms.settings_of(item) is not None and item.mphdrr_volume.outdated:
+        window = bpy.context.window_manager.windows[0]
+        with bpy.context.temp_override(window=window, object=item):
+            bpy.ops.mphdrr.update_phantom("INVOKE_DEFAULT")
+    return None

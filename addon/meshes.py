@@ -1,4 +1,4 @@
-"""Mesh objects of the scene <-> core meshes."""
+"""Mesh objects of the scene as core's meshes and back, and the jobs that make volumes of them or them of volumes."""
 
 from __future__ import annotations
 
@@ -6,20 +6,107 @@ from collections.abc import Sequence
 
 import bpy
 import numpy as np
+from mathutils import Matrix
 from numpy.typing import NDArray
 
 from ..core.errors import InputError
+from ..core.geometry.grid import Grid
+from ..core.memory import require
+from ..core.progress import Progress
 from ..core.volumes.meshes.mesh import Mesh, require_closed
+from ..core.volumes.meshes.surface import volume_to_mesh
+from ..core.volumes.meshes.voxelization import voxelize_mesh
+from ..core.volumes.volume import UNITS
+from . import jobs, storage, volumes
 from .cameras import world_matrix
+from .stored_volumes import StoredVolume, store_volume
+
+_BYTES = 40.0  # a voxel, while the volume is made and put into the scene
 
 
-def meshes_of(items: Sequence[bpy.types.Object], depsgraph: bpy.types.Depsgraph) -> list[Mesh]:
-    """What objects look like, modifiers and all, in world mm.
+def voxelizing(
+    items: Sequence[bpy.types.Object],
+    value: float = 100.0,
+    quantity: str = "activity",
+    voxels: int = 128,
+    voxel_size: float = 0.0,
+    name: str = "",
+) -> jobs.Job:
+    """The job that makes a volume of closed mesh objects, modifiers included: a voxel holds the share that they cover.
+
+    Parameters
+    ----------
+    items
+        Later ones cover earlier ones.
+    value
+        Inside the meshes, in the quantity's unit; an object's custom property of the quantity's name counts instead.
+    quantity
+        ``"activity"`` or ``"mu"``.
+    voxels
+        Along the longest side.
+    voxel_size
+        mm; 0 takes it from the number of voxels.
+    name
+        The object's name; by default the first mesh's.
 
     Raises
     ------
     InputError
-        One has no faces, or its mesh is open: it names the object, and where.
+        No objects, one without faces or with an open mesh, or the memory is too small.
+    """
+    if not items:
+        raise InputError("no mesh object is selected: select closed meshes first")
+    values = [float(item.get(quantity, value)) for item in items]
+    solids = meshes_of(items, bpy.context.evaluated_depsgraph_get())
+    low = np.min([solid.vertices.min(axis=0) for solid in solids], axis=0)
+    high = np.max([solid.vertices.max(axis=0) for solid in solids], axis=0)
+    spacing = voxel_size or float((high - low).max()) / max(1, voxels - 2)
+    # One voxel is kept free on every side.
+    grid = Grid.centered(tuple(int(n) for n in np.ceil((high - low) / spacing) + 2), spacing, (low + high) / 2)
+    shape = " x ".join(map(str, grid.shape))
+    require(_BYTES * grid.n_voxels, f"a volume of {shape} voxels")
+    name = name or f"{items[0].name} {quantity}"
+    folder, provenance = storage.folder(), {"meshes": [item.name for item in items], "values": values}
+
+    def work(progress: Progress) -> StoredVolume:
+        return store_volume(voxelize_mesh(solids, grid, values, quantity, progress), folder, provenance=provenance)
+
+    def finish(stored: StoredVolume) -> str:
+        volumes.make_active(bpy.context, volumes.add_stored(stored, name))
+        content = float(stored.volume.array.sum(dtype=np.float64)) * grid.voxel_volume
+        total = f"{content * 1e-3:.4g} kBq" if quantity == "activity" else f"{content:.4g} {UNITS[quantity]} mm^3"
+        return f"Added {name!r}: {shape} voxels of {grid.spacing[0]:.3g} mm, {total} in all"
+
+    return jobs.Job("Voxelizing meshes", work, finish)
+
+
+def extracting(item: bpy.types.Object, level: float | None = None) -> jobs.Job:
+    """The job that makes a closed mesh of a volume's surface of one value (default: half of the maximum).
+
+    Raises
+    ------
+    InputError
+        The object is no volume, or its file is gone.
+    """
+    read, pose, name = volumes.reader(item), volumes.pose_of_object(item), f"{item.name} surface"
+
+    def work(progress: Progress) -> Mesh:
+        return volume_to_mesh(read(), level, progress)
+
+    def finish(mesh: Mesh) -> str:
+        add_mesh(mesh, name, pose, bpy.context.collection)
+        return f"Added {name!r}: {len(mesh.faces)} triangles around {abs(mesh.volume):.4g} mm^3"
+
+    return jobs.Job("Mesh from volume", work, finish)
+
+
+def meshes_of(items: Sequence[bpy.types.Object], depsgraph: bpy.types.Depsgraph) -> list[Mesh]:
+    """What objects look like, modifiers included, in world mm.
+
+    Raises
+    ------
+    InputError
+        One has no faces, or its mesh is open; the message names the object, and where.
     """
     meshes = []
     for item in items:
@@ -51,8 +138,6 @@ def _mesh_of(item: bpy.types.Object, depsgraph: bpy.types.Depsgraph) -> Mesh:
 
 def add_mesh(mesh: Mesh, name: str, pose: NDArray[np.float64], collection: bpy.types.Collection) -> bpy.types.Object:
     """A mesh object with its origin and axes at world-from-object `pose` (4, 4)."""
-    from mathutils import Matrix
-
     back = np.linalg.inv(pose)
     data = bpy.data.meshes.new(name)
     vertices = mesh.vertices @ back[:3, :3].T + back[:3, 3]

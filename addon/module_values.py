@@ -1,7 +1,7 @@
-"""A module's numbers on its camera object, exact and as the user has changed them.
+"""A module's numbers on its camera object, in float64.
 
-Blender keeps places and properties as float32. `Object.mphdrr_module.exact` has the float64 numbers beside them,
-which count as long as the visible ones are their roundings. A number that was typed counts as the decimal typed.
+Blender keeps places and properties as float32. `Object.mphdrr_module.exact` has the float64 numbers beside them; each is
+valid as long as the visible one is its rounding. A number that the user has typed is read as the decimal typed.
 """
 
 from __future__ import annotations
@@ -23,11 +23,11 @@ from .decimals import typed
 LENGTHS = ("pinhole_diameter", "collimator_length", "detector_side", "detector_thickness", "roi_radius")
 FROM_ROI, TYPED = "FROM_ROI", "TYPED"  # `mphdrr_module.length_mode`
 _TURNED = 1e-4  # rad: rotations kept as float32 angles agree to better than 1e-6
-_FORMULA = 1e-9  # share of l: an imported l that is that close to the design formula was calculated with it
+_FORMULA = 1e-9  # of l: an imported l this close to the design formula's was calculated with it
 
 
 class ModuleNumbers(NamedTuple):
-    """What a module is, in float64 and mm."""
+    """A module's number, place and lengths, in float64 and mm."""
 
     number: int
     center: NDArray[np.float64]  # (3,), world
@@ -43,13 +43,13 @@ class ModuleNumbers(NamedTuple):
         return float(np.linalg.norm(self.center))
 
     def system(self) -> PinholeSystem:
-        """A system of this module alone, or `InputError`."""
+        """A system of this module alone; raises `InputError` where the numbers are impossible."""
         lengths = {name: np.array([getattr(self, name)]) for name in LENGTHS}
         return PinholeSystem(self.center[None], **lengths, numbers=np.array([self.number]), source=None)
 
 
 def write_module(camera: bpy.types.Object, system: PinholeSystem, m: int, ring: int) -> None:
-    """Make an object the camera of module `m`; `l` follows the ROI where it was calculated so."""
+    """Make an object the camera of module `m`; `l` follows the ROI where the design formula gives it."""
     module = camera.mphdrr_module
     values = {name: float(getattr(system, name)[m]) for name in LENGTHS}
     for name, value in values.items():  # before is_module, which lets an edit rebuild the module
@@ -63,7 +63,7 @@ def write_module(camera: bpy.types.Object, system: PinholeSystem, m: int, ring: 
 
 
 def remember(camera: bpy.types.Object, system: PinholeSystem, m: int) -> None:
-    """Take module `m` of `system` for what the camera's module was when it was imported or saved."""
+    """Store module `m` of `system` as what the camera's module was when it was imported or saved."""
     module = camera.mphdrr_module
     module.number, module.index, module.added = int(np.asarray(system.numbers)[m]), m, False
     _write_exact(
@@ -73,7 +73,7 @@ def remember(camera: bpy.types.Object, system: PinholeSystem, m: int) -> None:
 
 
 def add_module(camera: bpy.types.Object, number: int, index: int, center: NDArray[np.float64] | None = None) -> None:
-    """Make the copy of a module's camera a module of its own, at `center` (3,), mm, or where it stands."""
+    """Make the copy of a module's camera a module of its own, at `center` (3,), mm, by default where it stands."""
     module, numbers = camera.mphdrr_module, module_numbers(camera)
     numbers = numbers._replace(number=number, center=numbers.center if center is None else center)
     if module.length_mode == FROM_ROI:
@@ -88,15 +88,15 @@ def _write_exact(camera: bpy.types.Object, numbers: ModuleNumbers) -> None:
 
 
 def exact_values(camera: bpy.types.Object) -> dict[str, Any]:
-    """What was imported, in float64: the fields of `ModuleNumbers` and "mode"; empty on other objects."""
+    """The numbers as imported, in float64: the fields of `ModuleNumbers` and "mode"; empty on other objects."""
     return json.loads(camera.mphdrr_module.exact or "{}")
 
 
 def module_numbers(camera: bpy.types.Object) -> ModuleNumbers:
     """The module as it stands now.
 
-    Numbers that nobody changed are as imported. An `l` that follows the ROI is calculated in float64 once a number of
-    its formula has changed; where there is none (a pinhole inside the ROI) it is the last one that there was.
+    Numbers that have not changed are as imported. An `l` that follows the ROI is calculated in float64 once a number in
+    its formula has changed; where the formula has no solution (a pinhole inside the ROI) `l` keeps its last value.
     """
     module, exact = camera.mphdrr_module, exact_values(camera)
     center = _center(camera, exact.get("center"))
@@ -118,16 +118,12 @@ def _with_length(numbers: ModuleNumbers) -> ModuleNumbers:
         return numbers  # `read_scanner` and the module's `problem` say what is wrong
 
 
-def pinhole_center(camera: bpy.types.Object) -> NDArray[np.float64]:
-    """Pinhole centre (3,), mm: float64 numbers as long as the camera stands there."""
-    return _center(camera, exact_values(camera).get("center"))
-
-
 def _length(visible: float, exact: float | None) -> float:
     return exact if exact is not None and float(np.float32(exact)) == visible else typed(visible)
 
 
 def _center(camera: bpy.types.Object, exact: list[float] | None) -> NDArray[np.float64]:
+    """Pinhole centre (3,), mm: the coordinates of `exact` as long as they are those of the camera."""
     place = cameras.world_matrix(camera)[:3, 3]
     if camera.parent is None and not len(camera.constraints):
         place = np.array([typed(x) for x in place])
@@ -138,31 +134,25 @@ def _center(camera: bpy.types.Object, exact: list[float] | None) -> NDArray[np.f
 
 
 def is_moved(camera: bpy.types.Object) -> bool:
-    """Whether the pinhole is elsewhere than it was imported."""
-    return pinhole_center(camera).tolist() != exact_values(camera).get("center")
-
-
-def is_turned(camera: bpy.types.Object) -> bool:
-    """Whether the camera does not look at the isocentre, or is rolled."""
-    return bool(off_aim([camera]))
+    """Whether the pinhole is not where it was imported."""
+    center = exact_values(camera).get("center")
+    return _center(camera, center).tolist() != center
 
 
 def is_edited(camera: bpy.types.Object) -> bool:
-    """Whether the module has another number, or other lengths, than were imported."""
+    """Whether the module's number, or one of its lengths, is not as it was imported."""
     exact, numbers = exact_values(camera), module_numbers(camera)
     return any(getattr(numbers, name) != exact.get(name) for name in ("number", *LENGTHS))
 
 
 def off_aim(cameras_: Iterable[bpy.types.Object]) -> list[int]:
     """Numbers of the modules whose cameras do not look at the isocentre, or are rolled."""
-    off = []
-    for camera in cameras_:
-        matrix = cameras.world_matrix(camera)
-        if not np.any(matrix[:3, 3]):
-            off.append(camera.mphdrr_module.number)  # at the isocentre nothing can be aimed
-            continue
-        rotation = matrix[:3, :3] / np.linalg.norm(matrix[:3, :3], axis=0)
-        aimed = cameras.camera_matrices(matrix[None, :3, 3])[0, :3, :3]
-        if np.abs(rotation - aimed).max() > _TURNED:
-            off.append(camera.mphdrr_module.number)
-    return off
+    return [camera.mphdrr_module.number for camera in cameras_ if not _is_aimed(cameras.world_matrix(camera))]
+
+
+def _is_aimed(matrix: NDArray[np.float64]) -> bool:
+    if not np.any(matrix[:3, 3]):
+        return False  # at the isocentre there is no direction to it
+    rotation = matrix[:3, :3] / np.linalg.norm(matrix[:3, :3], axis=0)
+    aimed = cameras.camera_matrices(matrix[None, :3, 3])[0, :3, :3]
+    return bool(np.abs(rotation - aimed).max() <= _TURNED)

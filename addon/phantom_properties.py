@@ -1,9 +1,12 @@
-"""Settings of phantoms and volumes: what the operator asks for is what the object keeps."""
+"""Settings of phantoms and volumes: what an operator asks for is what the object keeps.
+
+The settings of each kind of phantom follow from the fields of its class (`core.phantoms.kinds`).
+"""
 
 from __future__ import annotations
 
 import dataclasses
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import bpy
 from bpy.props import (
@@ -25,24 +28,28 @@ from ..core.phantoms.phantom import Phantom
 from ..core.volumes.volume import UNITS
 from . import choices
 from .decimals import typed
+from .updates import on_edit
 
 FILE = "file"
-"""Beside the names of `KINDS`: a phantom described by a text in TOML."""
+"""Beside the names of `KINDS`: a phantom that a text in TOML describes."""
 
 _UNITS = {"mm": "mm", "kBq/mL": "kBq_per_mL", "1/mm": "per_mm", "kBq": "kBq", "mL": "mL"}
-"""Units in names of settings as JSON has them."""
+"""Units as they are written in the names of JSON's keys."""
 
 
 class PhantomSettings:
-    """What a phantom is made from, mixed into the operator that adds one and into the properties that its object keeps.
+    """What a phantom is made from: mixed into the operator that adds one and into the properties that its object keeps.
 
-    Those of each kind have its dataclass's fields as properties, and those of `sampling`.
+    The properties themselves are those of `kind_settings`, or a text, and those of `sampling`.
     """
 
-    @property
-    def own_names(self) -> list[str]:
-        """Names of the settings that not every phantom has, in the order of drawing."""
-        return []
+    identifier = ""
+    """The kind's name in Python: of its operator and of its settings in `VolumeProperties`."""
+    own_names: tuple[str, ...] = ()
+    """Names of the settings beside those of `sampling`, in the order of drawing."""
+
+    voxels: Any
+    voxel_size: Any
 
     @property
     def n_states(self) -> int:
@@ -51,9 +58,8 @@ class PhantomSettings:
 
     @property
     def n_voxels(self) -> int:
-        """How many voxels, of all states, a volume has."""
-        settings: Any = self
-        return int(settings.voxels**3) * self.n_states
+        """How many voxels a volume has, of all states."""
+        return int(self.voxels**3) * self.n_states
 
     def values(self) -> dict[str, Any]:
         """Every setting by name, vectors as tuples."""
@@ -70,11 +76,10 @@ class PhantomSettings:
 
     def grid(self, phantom: Phantom) -> Grid:
         """The phantom's grid, in its own frame: as many voxels along every side."""
-        settings: Any = self
         low, high = phantom.box
         # One voxel is kept free all around, so that nothing touches the edge.
-        fitted = float((high - low).max()) / max(1, settings.voxels - 2)
-        return Grid.centered((settings.voxels,) * 3, typed(settings.voxel_size) or fitted, (low + high) / 2)
+        fitted = float((high - low).max()) / max(1, self.voxels - 2)
+        return Grid.centered((self.voxels,) * 3, typed(self.voxel_size) or fitted, (low + high) / 2)
 
     def draw_settings(self, layout: bpy.types.UILayout) -> None:
         """Draw the settings into a panel or a dialog."""
@@ -83,7 +88,7 @@ class PhantomSettings:
         for name in self.own_names:
             value = getattr(self, name)
             if isinstance(value, bpy.types.bpy_prop_array):
-                known: Any = getattr(self, "properties", self)  # an operator has them apart
+                known: Any = getattr(self, "properties", self)  # an operator keeps them apart
                 own.label(text=known.bl_rna.properties[name].name)
                 for first in range(0, len(value), 3):
                     row = own.row(align=True)
@@ -101,36 +106,25 @@ class KindSettings(PhantomSettings):
 
     kind = KINDS[0]
 
-    if TYPE_CHECKING:  # of kinds that beat
-        frames: int
-
-    @property
-    def own_names(self) -> list[str]:
-        """The class's fields, and how many frames it beats over."""
-        return [*(field.name for field in _fields(self.kind)), *(["frames"] if _beats(self.kind) else [])]
-
-    def phantom(self) -> Phantom:
-        """The phantom; float32 settings are read as the decimal numbers that the user typed."""
-        phantom: Phantom = self.kind.phantom(**self._values())
-        return phantom
-
     @property
     def n_states(self) -> int:
         """How many phases of the heart's cycle."""
-        return self.frames if _beats(self.kind) else 1
+        return int(self.frames) if _beats(self.kind) else 1  # type: ignore[attr-defined]
+
+    def phantom(self) -> Phantom:
+        """The phantom; float32 settings are read as the decimal numbers that the user typed."""
+        phantom: Phantom = self.kind.phantom(**self._arguments())
+        return phantom
 
     def recipe(self) -> dict[str, Any]:
         """The class's fields, their units in their names, and the number of frames of one that beats."""
         recipe: dict[str, Any] = {"phantom": self.kind.name}
-        values = self._values()
         for field in _fields(self.kind):
-            unit, value = _UNITS.get(field.metadata.get("unit", "")), values[field.name]
+            unit, value = _UNITS.get(field.metadata.get("unit", "")), self._arguments()[field.name]
             recipe[f"{field.name}_{unit}" if unit else field.name] = list(value) if isinstance(value, tuple) else value
-        if self.n_states > 1:
-            recipe["frames"] = self.n_states
-        return recipe
+        return recipe | {"frames": self.n_states} if self.n_states > 1 else recipe
 
-    def _values(self) -> dict[str, Any]:
+    def _arguments(self) -> dict[str, Any]:
         values = {field.name: _plain(getattr(self, field.name)) for field in _fields(self.kind)}
         return values | {"phase": 0.0} if self.n_states > 1 else values
 
@@ -138,33 +132,31 @@ class KindSettings(PhantomSettings):
 class TextSettings(PhantomSettings):
     """The settings of a phantom that a text of the .blend describes."""
 
-    @property
-    def own_names(self) -> list[str]:
-        """The text alone."""
-        return ["text"]
+    identifier = FILE
+    own_names = ("text",)
+    text: Any
 
     def phantom(self) -> Phantom:
         """The text's phantom."""
-        return parse_phantom(*self._text())
+        return parse_phantom(*self.described())
 
     def recipe(self) -> dict[str, Any]:
         """The whole text, and its name."""
-        text, name = self._text()
+        text, name = self.described()
         return {"phantom": FILE, "file": name, "text": text}
 
-    def _text(self) -> tuple[str, str]:
-        text: bpy.types.Text | None = self.text  # type: ignore[attr-defined]
-        if text is None:
+    def described(self) -> tuple[str, str]:
+        """The text in TOML, and its name. Raises InputError."""
+        if self.text is None:
             raise InputError("no text is chosen: choose one that describes a phantom")
-        return text.as_string(), text.name
+        return self.text.as_string(), self.text.name
 
 
 def sampling(update: Any = None) -> dict[str, Any]:
-    """Properties of all phantoms: what the voxels hold, and how many."""
+    """Properties of all phantoms: what the voxels hold, and how many there are."""
     return {
         "quantity": EnumProperty(
-            name="Quantity", description="What the voxels hold", update=update,
-            default="activity",
+            name="Quantity", description="What the voxels hold", default="activity", update=update,
             items=choices.items(
                 choices.QUANTITIES,
                 (("activity", "Activity", "In kBq/mL"), ("mu", "Attenuation", "Linear attenuation in 1/mm")),
@@ -181,24 +173,53 @@ def sampling(update: Any = None) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def kind_settings(kind: Kind, update: Any = None) -> dict[str, Any]:
-    """Properties of one kind of phantom, by name, for a class's annotations."""
+def settings_class(kind: Kind, name: str, bases: tuple[type, ...], update: Any = None, **members: Any) -> Any:
+    """A class for Blender, of `KindSettings` and other bases, with the settings of one kind as properties."""
     own = {field.name: _property(field, kind, update) for field in _fields(kind)}
     if _beats(kind):
         own["frames"] = IntProperty(
-            name="Frames", description="States of the heart's cycle, which follow each other frame by frame; 1: it stands "
-            "still at its phase", default=1, min=1, soft_max=48, max=1000, update=update, options={"SKIP_SAVE"},
+            name="Frames", description="States of the heart's cycle, one for each frame; 1: it stands still at its phase",
+            default=1, min=1, soft_max=48, max=1000, update=update, options={"SKIP_SAVE"},
         )  # fmt: skip
-    return own | sampling(update)
+    members["__annotations__"] = members.get("__annotations__", {}) | own | sampling(update)
+    members |= {"kind": kind, "identifier": identifier(kind), "own_names": tuple(own)}
+    return type(name, (KindSettings, *bases), members)
+
+
+def plain_settings(name: str, **values: Any) -> KindSettings:
+    """Settings of the kind with that name, for scripts: its defaults, and the values given.
+
+    Raises
+    ------
+    InputError
+        No kind, or no setting of it, has such a name.
+    """
+    kind = next((kind for kind in KINDS if name in (kind.name, identifier(kind))), None)
+    if kind is None:
+        raise InputError(f"phantom {name!r}: expected one of {', '.join(kind.name for kind in KINDS)}")
+    settings = KindSettings()
+    known = {field.name: kind.usual.get(field.name, field.default) for field in _fields(kind)}
+    known |= {"frames": 1} if _beats(kind) else {}
+    settings.kind, settings.identifier, settings.own_names = kind, identifier(kind), tuple(known)
+    known |= {"quantity": "activity", "voxels": 128, "voxel_size": 0.0}
+    if unknown := values.keys() - known.keys():
+        raise InputError(f"{kind.label}: no setting {min(unknown)!r}; expected some of {', '.join(known)}")
+    vars(settings).update(known | values)
+    return settings
 
 
 def identifier(kind: Kind) -> str:
-    """A kind's name in Python: of its operator and of its settings."""
+    """A kind's name in Python."""
     return kind.name.replace("-", "_")
 
 
+def menu_entries() -> list[tuple[str, str, bool]]:
+    """Identifier and label of each kind, and whether it can beat."""
+    return [(identifier(kind), kind.label, _beats(kind)) for kind in KINDS]
+
+
 def _beats(kind: Kind) -> bool:
-    """Whether a kind of phantom has states that follow each other."""
+    """Whether a kind of phantom has states, one for each frame."""
     return hasattr(kind.phantom, "beating")
 
 
@@ -232,42 +253,33 @@ def _property(field: Any, kind: Kind, update: Any) -> Any:
     return (FloatVectorProperty if many else FloatProperty)(**options, **many)
 
 
-def _phantom_changed(self: Any, context: bpy.types.Context) -> None:
-    from . import live_phantoms
-
-    live_phantoms.settings_changed(self.id_data, self)
-
-
-def _group(name: str, mixin: type, members: dict[str, Any]) -> Any:
-    """A PropertyGroup of those properties; they are read from its annotations."""
-    return type(f"{name}Properties", (mixin, bpy.types.PropertyGroup), members)
+def _plain(value: Any) -> Any:
+    """A setting as the phantom's classes take it."""
+    if isinstance(value, bpy.types.bpy_prop_array | tuple):
+        return tuple(_plain(item) for item in value)
+    return typed(value) if isinstance(value, float) else value
 
 
-KIND_PROPERTIES = {
-    kind.name: _group(
-        kind.phantom.__name__,
-        KindSettings,
-        {"kind": kind, "__annotations__": kind_settings(kind, _phantom_changed), "__doc__": f"Settings of {kind.summary}."},
+class PhantomTextProperties(TextSettings, bpy.types.PropertyGroup):
+    """Settings of a phantom that a text describes."""
+
+    __annotations__ = {
+        "text": PointerProperty(
+            name="Text", type=bpy.types.Text, update=on_edit("phantom"),
+            description="Describes the phantom in TOML; can be edited in a Text Editor",
+        ),
+        **sampling(on_edit("phantom")),
+    }  # fmt: skip
+
+
+_GROUPS = {
+    identifier(kind): settings_class(
+        kind, f"{kind.phantom.__name__}Properties", (bpy.types.PropertyGroup,), on_edit("phantom"),
+        __doc__=f"Settings of {kind.summary}.",
     )
     for kind in KINDS
-} | {
-    FILE: _group(
-        "PhantomText",
-        TextSettings,
-        {
-            "__annotations__": {
-                "text": PointerProperty(
-                    name="Text", type=bpy.types.Text, update=_phantom_changed,
-                    description="Describes the phantom in TOML; can be edited in a Text Editor",
-                ),
-                **sampling(_phantom_changed),
-            },
-            "__doc__": "Settings of a phantom that a text describes.",
-        },
-    )
-}  # fmt: skip
-"""What objects keep of how they were made: a PropertyGroup for every kind of phantom, by its name."""
-
+} | {FILE: PhantomTextProperties}  # fmt: skip
+"""What objects keep of how they were made: the settings of every kind of phantom."""
 
 _KINDS = (
     ("VOLUME", "Volume", "Voxels from elsewhere"),
@@ -276,26 +288,12 @@ _KINDS = (
 )
 
 
-# The modules that draw import these properties: they are imported when an edit calls for them.
-def _range_changed(self: VolumeProperties, context: bpy.types.Context) -> None:
-    from . import slices, volumes
-
-    volumes.show_range(self.id_data)
-    slices.update(self.id_data)
-
-
-def _slices_changed(self: VolumeProperties, context: bpy.types.Context) -> None:
-    from . import slices
-
-    slices.update(self.id_data)
-
-
 class VolumeProperties(bpy.types.PropertyGroup):
-    """One volume; lives on its object as `Object.mphdrr_volume`."""
+    """One volume; lives on its object as `Object.mphdrr_volume`, with the settings of every kind (`.derenzo`, ...)."""
 
     is_volume: BoolProperty(name="Is Volume", options={"HIDDEN"})
     kind: EnumProperty(
-        name="Kind", description="What the volume was made as",
+        name="Kind", description="What the volume was made as: the kind whose settings count",
         items=choices.items(choices.KINDS, _KINDS), default="VOLUME",
     )  # fmt: skip
     with_parent: BoolProperty(
@@ -308,15 +306,9 @@ class VolumeProperties(bpy.types.PropertyGroup):
         description="The phantom's settings have changed since its voxels were made",
         options={"HIDDEN"},
     )
-    sketched: BoolProperty(
-        name="Sketched",
-        description="What is shown is a sketch of what the phantom's settings say, not its voxels",
-        options={"HIDDEN"},
-    )
     message: StringProperty(name="Message", description="What is wrong with the phantom's settings", options={"HIDDEN"})
     quantity: EnumProperty(
-        name="Quantity", description="What the voxels hold",
-        default="activity",
+        name="Quantity", description="What the voxels hold", default="activity",
         items=choices.items(choices.QUANTITIES, ((name, name.capitalize(), f"In {unit}") for name, unit in UNITS.items())),
     )  # fmt: skip
     unit: StringProperty(name="Unit", description="Unit of the voxels' values")
@@ -325,21 +317,20 @@ class VolumeProperties(bpy.types.PropertyGroup):
     minimum: FloatProperty(name="Minimum", description="Smallest voxel value")
     maximum: FloatProperty(name="Maximum", description="Largest voxel value")
     extent: FloatProperty(
-        name="Extent", description="Largest side in mm of the box around what is not empty", options={"HIDDEN"},
-        default=1.0,
+        name="Extent", description="Largest side in mm of the box around the voxels that are not empty", default=1.0,
+        options={"HIDDEN"},
     )  # fmt: skip
     display_low: FloatProperty(
-        name="Low",
-        description="Value, in the volume's unit, at and below which nothing is shown",
-        update=_range_changed,
-    )
+        name="Low", description="Value, in the volume's unit, at and below which nothing is shown",
+        update=on_edit("display_range"),
+    )  # fmt: skip
     display_high: FloatProperty(
         name="High", description="Value, in the volume's unit, that is shown brightest", default=1.0,
-        update=_range_changed,
+        update=on_edit("display_range"),
     )  # fmt: skip
     slices: IntVectorProperty(
         name="Slices", description="Voxel, along each of the grid's axes, that the slice planes lie in; from 0", size=3,
-        min=0, update=_slices_changed,
+        min=0, update=on_edit("slices"),
     )  # fmt: skip
     exact_pose: StringProperty(
         name="Exact Pose", description="World-from-object matrix in double precision, JSON", options={"HIDDEN"}
@@ -350,20 +341,8 @@ class VolumeProperties(bpy.types.PropertyGroup):
     )  # fmt: skip
 
 
-# One of them counts: `kind`'s. `Object.mphdrr_volume.derenzo`, `.nema`, ...
 VolumeProperties.__annotations__.update(
-    {
-        name.replace("-", "_"): PointerProperty(name=name.capitalize(), type=group)
-        for name, group in KIND_PROPERTIES.items()
-    }
+    {name: PointerProperty(name=name.capitalize(), type=group) for name, group in _GROUPS.items()}
 )
 
-
-def _plain(value: Any) -> Any:
-    """A property's value as the phantom's classes take it."""
-    if isinstance(value, bpy.types.bpy_prop_array):
-        return tuple(_plain(item) for item in value)
-    return typed(value) if isinstance(value, float) else value
-
-
-CLASSES = (*KIND_PROPERTIES.values(), VolumeProperties)
+CLASSES = (*_GROUPS.values(), VolumeProperties)

@@ -1,47 +1,32 @@
-"""Phantoms in the scene: volumes that know what they were made from, and are made anew when that changes.
+"""Phantoms in the scene: volumes that know what they were made from, and are made again when that changes.
 
-The object's matrix is the phantom's pose; the voxels lie in its own frame, so that moving the object moves the phantom. A
+The object's matrix is the phantom's pose. The voxels are in its own frame, so that moving the object moves the phantom. A
 phantom may have children that go with it: a volume of its other quantity, and an outline.
 """
 
 from __future__ import annotations
 
 import itertools
-import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-import bmesh
 import bpy
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core.errors import InputError, InputWarning
+from ..core.errors import InputError
 from ..core.geometry.grid import Grid
 from ..core.memory import require
-from ..core.phantoms.kinds import KINDS
 from ..core.phantoms.phantom import Phantom
 from ..core.progress import Progress, part_of
-from ..core.recording import recorded_warnings
-from ..core.volumes.meshes.mesh import Mesh
-from ..core.volumes.volume import Volume
-from . import ids, meshes, storage, volumes
+from . import jobs, outlines, storage, volumes
 from .cameras import set_world_matrix, world_matrix
-from .phantom_properties import PhantomSettings, identifier
+from .phantom_properties import FILE, PhantomSettings
+from .stored_volumes import StoredVolume, moved, store_volume
 from .vdb import provenance_of
-
-_SKETCHED = 32  # voxels along each side of a sketch
-
-ADDING = tuple((ids.ADD_PHANTOM + identifier(kind), kind.label) for kind in KINDS)
-"""The operators that add a phantom, and what they add."""
-
-BEATING = ids.ADD_PHANTOM + "torso"
-"""The operator whose phantom can beat: its `frames`."""
-
-_OUTLINE = "mphdrr_outline"  # custom property of the mesh that shows a phantom's surfaces
 
 
 @dataclass(frozen=True)
@@ -51,22 +36,19 @@ class Recipe:
     Attributes
     ----------
     phantom : Phantom
-        What it is; of one that beats, the first state.
+        Of one that beats, the first state.
     n_states : int
         How many states there are, one for each frame.
     grid : Grid
         Its voxels, in its own frame.
     settings : dict
         As JSON can hold them.
-    messages : tuple of str
-        What the phantom's class warned of.
     """
 
     phantom: Phantom
     n_states: int
     grid: Grid
     settings: dict[str, Any]
-    messages: tuple[str, ...]
 
     @cached_property
     def states(self) -> Sequence[Phantom]:
@@ -81,17 +63,17 @@ class Recipe:
         folder: Path,
         progress: Progress | None = None,
         baked: bool = False,
-    ) -> list[volumes.StoredVolume]:
-        """A volume of each quantity in `folder`, its phantom at a world-from-phantom pose (4, 4), mm.
+    ) -> list[StoredVolume]:
+        """A volume of each quantity, stored in `folder`, its phantom at a world-from-phantom pose (4, 4), mm.
 
-        Its grid turns with the phantom or, if `baked`, lies along the world's axes: then so does the object.
+        Its grid turns with the phantom or, if `baked`, its grid and its object are along the world's axes.
 
         Raises
         ------
         InputError
             No part of the phantom holds a quantity, or it does not fit into memory.
         """
-        self._begin(quantities)
+        self._check(quantities)
         count = len(quantities) * self.n_states
         reports = (part_of(progress, number, count) for number in range(count))
         stored = []
@@ -105,34 +87,11 @@ class Recipe:
             else:
                 place, settings = pose, self.settings
                 own = [phantom.voxelize(self.grid, None, next(reports), quantity) for phantom in self.states]
-                made = [_placed(volume, pose) for volume in own]
-            stored.append(volumes.store_volume(made, folder, place, settings))
+                made = [moved(volume, pose) for volume in own]
+            stored.append(store_volume(made, folder, place, settings))
         return stored
 
-    def sketch(
-        self, quantities: Sequence[str], poses: Sequence[NDArray[np.float64]], folder: Path
-    ) -> list[volumes.StoredVolume]:
-        """What `voxelize` makes, of the first state, roughly and at once: few voxels, with the values at their centres.
-
-        Raises
-        ------
-        InputError
-            No part of the phantom holds a quantity.
-        """
-        self._begin(quantities)
-        voxels = min(_SKETCHED, *self.grid.shape)
-        grid = Grid.centered((voxels,) * 3, np.multiply(self.grid.shape, self.grid.spacing) / voxels, self.grid.center)
-        points = np.moveaxis(np.indices(grid.shape), 0, -1).reshape(-1, 3) @ grid.affine[:3, :3].T + grid.affine[:3, 3]
-        stored = []
-        for quantity, pose in zip(quantities, poses, strict=True):
-            values = self.phantom.values(points, quantity=quantity).astype(np.float32).reshape(grid.shape)
-            stored.append(
-                volumes.store_volume(_placed(Volume(values, grid, quantity), pose), folder, pose, {"sketch": 1})
-            )
-        return stored
-
-    def _begin(self, quantities: Sequence[str]) -> None:
-        """Say what there is to say of the settings; raise `InputError` where they make no volumes of these quantities."""
+    def _check(self, quantities: Sequence[str]) -> None:
         title = self.phantom.title
         for quantity in quantities:
             if all(getattr(shape, quantity) is None for shape in self.phantom.shapes):
@@ -141,11 +100,9 @@ class Recipe:
         if count > 1:
             shape = " x ".join(map(str, self.grid.shape))
             require(4.0 * count * self.grid.n_voxels, f"{title}: {count} volumes of {shape} voxels")
-        for message in self.messages:
-            warnings.warn(message, InputWarning, stacklevel=3)
 
     def _world_grid(self, pose: NDArray[np.float64]) -> Grid:
-        """A grid along the world's axes that holds the phantom at a pose, with voxels as small as there."""
+        """A grid along the world's axes that holds the phantom at a pose, with voxels as small as its own."""
         corners = list(itertools.product(*zip(*self.phantom.box, strict=True))) @ pose[:3, :3].T + pose[:3, 3]
         low, high = corners.min(axis=0), corners.max(axis=0)
         spacing = min(Grid(self.grid.shape, pose @ self.grid.affine).spacing)
@@ -154,23 +111,16 @@ class Recipe:
 
 
 def recipe_of(settings: PhantomSettings) -> Recipe:
-    """What settings say.
-
-    Raises
-    ------
-    InputError
-        There is no such phantom.
-    """
-    with recorded_warnings() as caught:
-        phantom = settings.phantom()
-    return Recipe(phantom, settings.n_states, settings.grid(phantom), settings.recipe(), tuple(caught))
+    """What settings say; raises `InputError` where there is no such phantom."""
+    phantom = settings.phantom()
+    return Recipe(phantom, settings.n_states, settings.grid(phantom), settings.recipe())
 
 
 def settings_of(item: bpy.types.Object | None) -> Any:
     """The settings that a volume was made from as a phantom; None where it is none."""
     if item is None or not volumes.is_volume(item):
         return None
-    properties = getattr(item, ids.OBJECT_VOLUME)
+    properties = item.mphdrr_volume
     # A kind that only a later version knows is "": its voxels stay as they are.
     return None if properties.kind in ("VOLUME", "") else getattr(properties, properties.kind.lower())
 
@@ -183,36 +133,138 @@ def poll_phantom(operator: type[bpy.types.Operator], context: bpy.types.Context)
     return True
 
 
-def add(
-    stored: Sequence[volumes.StoredVolume],
-    name: str,
-    kind: str,
-    settings: dict[str, Any],
-    collection: bpy.types.Collection,
-) -> bpy.types.Object:
-    """A phantom's volume in the scene; those of its other quantities become its children.
+def adding(
+    settings: PhantomSettings, name: str, pose: NDArray[np.float64] | None = None, attenuation: bool = False
+) -> jobs.Job:
+    """The job that adds a phantom to the scene.
 
-    `kind` is that of `VolumeProperties`; `settings` are its PropertyGroup's values by name.
+    Parameters
+    ----------
+    settings
+        An operator's, or `phantom_properties.plain_settings`.
+    name
+        The object's name.
+    pose
+        World-from-phantom matrix (4, 4), mm. Default: the world's axes.
+    attenuation
+        Also add the mu of a phantom of activity, as a child.
+
+    Raises
+    ------
+    InputError
+        There is no such phantom.
     """
-    item = volumes.add_stored(stored[0], name, collection)
-    properties = getattr(item, ids.OBJECT_VOLUME)
-    group = getattr(properties, kind.lower())
-    for key, value in settings.items():
-        setattr(group, key, value)
-    properties.kind = kind  # last: until then a setting that changes makes nothing anew
-    for other in stored[1:]:
-        child = volumes.add_stored(other, f"{item.name} {other.volume.quantity}", collection)
-        getattr(child, ids.OBJECT_VOLUME).with_parent = True
-        child.parent = item
-        child.matrix_basis.identity()
-    return item
+    recipe, folder, values = recipe_of(settings), storage.folder(), settings.values()
+    kind, quantity = settings.identifier, values["quantity"]
+    quantities = ["activity", "mu"] if attenuation and quantity == "activity" else [quantity]
+    poses = [np.eye(4) if pose is None else pose] * len(quantities)
+
+    def work(progress: Progress) -> list[StoredVolume]:
+        return recipe.voxelize(quantities, poses, folder, progress)
+
+    def finish(stored: list[StoredVolume]) -> str:
+        if kind == FILE and "text" not in values:
+            values["text"] = bpy.data.texts.new(recipe.settings["file"])
+            values["text"].from_string(recipe.settings["text"])
+        collection = bpy.context.collection
+        item = volumes.add_stored(stored[0], name, collection)
+        properties = item.mphdrr_volume
+        for key, value in values.items():
+            setattr(getattr(properties, kind), key, value)
+        properties.kind = kind.upper()  # last: until then no change of a setting makes the voxels again
+        for other in stored[1:]:
+            child = volumes.add_stored(other, f"{item.name} {other.volume.quantity}", collection)
+            child.mphdrr_volume.with_parent = True
+            child.parent = item
+            child.matrix_basis.identity()
+        volumes.make_active(bpy.context, item)
+        grid = recipe.grid
+        return f"Added {item.name!r}: {grid.shape[0]}^3 voxels of {grid.spacing[0]:.3g} mm"
+
+    return jobs.Job("Making a phantom", work, finish)
+
+
+def updating(item: bpy.types.Object, bake: bool = False) -> jobs.Job:
+    """The job that makes a phantom's voxels, and its children's, again from its settings.
+
+    With `bake`, at its pose and on a grid along the world's axes; then it is a phantom no more, but a volume like any other.
+
+    Raises
+    ------
+    InputError
+        The object is no phantom, its settings make none, or its matrix is singular.
+    """
+    work, name, before = remaking(item, bake), item.name, settings_of(item).values()
+
+    def finish(stored: list[StoredVolume]) -> str:
+        item = bpy.data.objects.get(name)
+        settings = settings_of(item)
+        if item is None or settings is None:
+            raise InputError(f"the phantom {name!r} is gone")
+        has_changed = settings.values() != before
+        replace(item, stored, bake)
+        if bake:
+            return f"Applied the pose of {name!r}"
+        item.mphdrr_volume.outdated = has_changed
+        return f"Updated {name!r}" + ("; its settings have changed in the meantime" if has_changed else "")
+
+    return jobs.Job("Making a phantom", work, finish)
+
+
+def remaking(item: bpy.types.Object, bake: bool = False) -> Callable[[Progress | None], list[StoredVolume]]:
+    """The work of `updating`, whose result is for `replace`; leaves bpy alone. Raises as that does."""
+    settings = settings_of(item)
+    if settings is None:
+        raise InputError("no phantom is active: select one that was added with its settings")
+    recipe, folder, made = recipe_of(settings), storage.folder(), with_children(item)
+    quantities = [settings.quantity, *(volumes.quantity_of(child) for child in made[1:])]
+    poses = [volumes.pose_of_object(one) for one in made]
+    return lambda progress: recipe.voxelize(quantities, poses, folder, progress, bake)
+
+
+def replace(item: bpy.types.Object, stored: Sequence[StoredVolume], baked: bool = False) -> None:
+    """Give a phantom and its children the voxels that `remaking` made; they stay where they are.
+
+    Raises
+    ------
+    InputError
+        Children have come or gone in the meantime.
+    """
+    made = with_children(item)
+    if len(made) != len(stored):
+        raise InputError(f"the volumes of {item.name!r} are not those of before: try again")
+    for volume_object, new in zip(made, stored, strict=True):
+        basis = volume_object.matrix_basis.copy()
+        volumes.replace_stored(volume_object, new)
+        if not baked:
+            volume_object.matrix_basis = basis  # a sheared world matrix would not set it back
+            continue
+        set_world_matrix(volume_object, new.pose)
+        if not np.allclose(world_matrix(volume_object), new.pose, rtol=1e-5, atol=1e-5):
+            volume_object.parent = None  # its shear cannot be undone by the object's own matrix
+            set_world_matrix(volume_object, new.pose)
+    properties = item.mphdrr_volume
+    properties.outdated, properties.message = False, ""
+    if not baked:
+        update_outline(item)
+        return
+    outlines.remove(item)
+    properties.kind = "VOLUME"
+    for child in made[1:]:
+        child.mphdrr_volume.with_parent = False
 
 
 def root_of(item: bpy.types.Object) -> bpy.types.Object | None:
     """The phantom that a volume is, or belongs to as its other quantity; None where there is none."""
-    if getattr(item, ids.OBJECT_VOLUME).with_parent and item.parent is not None:
+    if item.mphdrr_volume.with_parent and item.parent is not None:
         item = item.parent
     return None if settings_of(item) is None else item
+
+
+def with_children(item: bpy.types.Object) -> list[bpy.types.Object]:
+    """A phantom and the volumes of its other quantities."""
+    children = [child for child in item.children if volumes.is_volume(child) and child.mphdrr_volume.with_parent]
+    return [item, *sorted(children, key=lambda child: child.name)]
 
 
 def mu_energy(item: bpy.types.Object) -> float | None:
@@ -234,151 +286,23 @@ def mu_energy(item: bpy.types.Object) -> float | None:
 def require_current(item: bpy.types.Object) -> None:
     """Raise `InputError` where a volume is of a phantom whose settings have changed since its voxels were made."""
     phantom = root_of(item)
-    if phantom is not None and getattr(phantom, ids.OBJECT_VOLUME).outdated:
+    if phantom is not None and phantom.mphdrr_volume.outdated:
         raise InputError(f"{phantom.name!r} has changed since its voxels were made: press Update Phantom first")
 
 
-def with_children(item: bpy.types.Object) -> list[bpy.types.Object]:
-    """A phantom and the volumes of its other quantities."""
-    children = [o for o in item.children if volumes.is_volume(o) and getattr(o, ids.OBJECT_VOLUME).with_parent]
-    return [item, *sorted(children, key=lambda o: o.name)]
+def toggle_outline(item: bpy.types.Object) -> str:
+    """Show the surfaces of a phantom (of one that beats, in its first state) as wires that go with it, or hide them.
 
-
-def remaking(item: bpy.types.Object, bake: bool = False) -> Callable[[Progress | None], list[volumes.StoredVolume]]:
-    """What makes the voxels of a phantom and its children anew, for `replace`; leaves bpy alone.
-
-    With `bake`, at its pose and on a grid along the world's axes.
-
-    Raises
-    ------
-    InputError
-        The object is no phantom, its settings make none, or its matrix is singular.
+    Returns which of the two it did; raises `InputError` where the settings make no phantom.
     """
-    recipe, quantities, poses = _to_make(item)
-    folder = storage.folder()
-    return lambda progress: recipe.voxelize(quantities, poses, folder, progress, bake)
-
-
-def sketch(item: bpy.types.Object) -> None:
-    """Show a phantom and its children roughly as its settings are now, until they get their voxels by `replace`.
-
-    Raises
-    ------
-    InputError
-        The object is no phantom, its settings make none, or its matrix is singular.
-    """
-    recipe, quantities, poses = _to_make(item)
-    replace(item, recipe.sketch(quantities, poses, storage.temporary_folder()), sketched=True)
-
-
-def _to_make(item: bpy.types.Object) -> tuple[Recipe, list[str], list[NDArray[np.float64]]]:
-    """A phantom's recipe, and the quantities and poses of its volumes."""
-    settings = settings_of(item)
-    if settings is None:
-        raise InputError("no phantom is active: select one that was added with its settings")
-    made = with_children(item)
-    quantities = [settings.quantity, *(getattr(o, ids.OBJECT_VOLUME).quantity for o in made[1:])]
-    return recipe_of(settings), quantities, [volumes.pose_of_object(o) for o in made]
-
-
-def replace(
-    item: bpy.types.Object, stored: Sequence[volumes.StoredVolume], baked: bool = False, sketched: bool = False
-) -> None:
-    """Give a phantom and its children what `remaking`, or a sketch, made.
-
-    They stay where they are. If it was baked, they stand along the world's axes and are phantoms no more: their settings
-    would not make these voxels.
-
-    Raises
-    ------
-    InputError
-        Children have come or gone in the meantime.
-    """
-    made = with_children(item)
-    if len(made) != len(stored):
-        raise InputError(f"the volumes of {item.name!r} are not those of before: try again")
-    for volume_object, new in zip(made, stored, strict=True):
-        basis = volume_object.matrix_basis.copy()
-        getattr(volume_object, ids.OBJECT_VOLUME).sketched = sketched
-        volumes.replace_stored(volume_object, new)
-        if baked:
-            set_world_matrix(volume_object, new.pose)
-            if not np.allclose(world_matrix(volume_object), new.pose, rtol=1e-5, atol=1e-5):
-                volume_object.parent = None  # sheared, which the object cannot undo
-                set_world_matrix(volume_object, new.pose)
-        else:
-            volume_object.matrix_basis = basis  # which a matrix with shear would not survive
-    properties = getattr(item, ids.OBJECT_VOLUME)
-    properties.outdated, properties.message = sketched, ""
-    if baked:
-        remove_outline(item)
-        properties.kind = "VOLUME"
-        for child in made[1:]:
-            getattr(child, ids.OBJECT_VOLUME).with_parent = False
-    else:
-        update_outline(item)
-
-
-def outline_of(item: bpy.types.Object) -> bpy.types.Object | None:
-    """The mesh that shows a phantom's surfaces, if it has one."""
-    return next((child for child in item.children if _OUTLINE in child), None)
-
-
-def show_outline(item: bpy.types.Object) -> bpy.types.Object:
-    """Show the surfaces of a phantom's shapes as wires that go with it, made from its settings as they are now.
-
-    Of one that moves they are those of its first state.
-
-    Raises
-    ------
-    InputError
-        The object is no phantom, or its settings make none.
-    """
-    settings = settings_of(item)
-    if settings is None:
-        raise InputError("no phantom is active: select one that was added with its settings")
-    parts = recipe_of(settings).phantom.meshes()
-    starts = np.cumsum([0, *(len(part.vertices) for part in parts)])
-    vertices = np.concatenate([part.vertices for part in parts])
-    faces = np.concatenate([part.faces + start for part, start in zip(parts, starts[:-1], strict=True)])
-    remove_outline(item)
-    collection = item.users_collection[0] if item.users_collection else bpy.context.scene.collection
-    outline = meshes.add_mesh(Mesh(vertices, faces), f"{item.name} outline", np.eye(4), collection)
-    _merge_flat_faces(outline.data)
-    outline[_OUTLINE] = True
-    outline.display_type = "WIRE"
-    outline.hide_render = outline.hide_select = True
-    outline.parent = item
-    return outline
+    if outlines.of(item) is not None:
+        outlines.remove(item)
+        return f"Removed the outline of {item.name!r}"
+    outlines.show(item, recipe_of(settings_of(item)).phantom.meshes())
+    return f"Added the outline of {item.name!r}"
 
 
 def update_outline(item: bpy.types.Object) -> None:
-    """Make the mesh that shows a phantom's surfaces anew, where it has one; raises as `show_outline` does."""
-    if outline_of(item) is not None:
-        show_outline(item)
-
-
-def remove_outline(item: bpy.types.Object) -> None:
-    """Remove the mesh that shows a phantom's surfaces; nothing where there is none."""
-    outline = outline_of(item)
-    if outline is not None:
-        mesh = outline.data
-        bpy.data.objects.remove(outline)
-        if mesh.users == 0:
-            bpy.data.meshes.remove(mesh)
-
-
-def _merge_flat_faces(mesh: bpy.types.Mesh) -> None:
-    """Leave no edges inside of flat faces: they would fill the picture with wires."""
-    shape = bmesh.new()
-    try:
-        shape.from_mesh(mesh)
-        bmesh.ops.dissolve_limit(shape, angle_limit=0.01, verts=shape.verts, edges=shape.edges)
-        shape.to_mesh(mesh)
-    finally:
-        shape.free()
-
-
-def _placed(volume: Volume, pose: NDArray[np.float64]) -> Volume:
-    """A volume in an object's own space, in the world."""
-    return Volume(volume.array, Grid(volume.grid.shape, pose @ volume.grid.affine), volume.quantity)
+    """Make a phantom's outline again, where it has one; raises as `toggle_outline` does."""
+    if outlines.of(item) is not None:
+        outlines.show(item, recipe_of(settings_of(item)).phantom.meshes())

@@ -1,7 +1,7 @@
 """The extension's property groups: what the panels show and what is stored in the .blend file.
 
-Blender's FloatProperty is a float32: 100 mm is kept to 8e-6 mm only. `ModuleProperties.exact` therefore holds
-the float64 numbers beside it (see `addon/module_values.py`).
+Blender's FloatProperty is a float32: 100 mm is kept to 8e-6 mm only. `ModuleProperties.exact` therefore holds the
+float64 numbers beside it (`module_values.py`). Names and enumeration numbers must stay as they are: old files have them.
 """
 
 from __future__ import annotations
@@ -22,53 +22,22 @@ from bpy.props import (
 )
 
 from . import choices, column_maps, ids, jobs, phantom_properties, projection_properties
+from .updates import FUNCTIONS, on_edit
 
 
-# The rebuilding modules import these properties: they are imported when an edit calls for them.
-def _module_changed(self: ModuleProperties, context: bpy.types.Context) -> None:
-    from . import scanner
-
-    scanner.refresh_module(self.id_data)
-
-
-def _length_changed(self: ModuleProperties, context: bpy.types.Context) -> None:
-    from . import design, scanner
-
-    if self.is_module and not design.is_writing():
-        design.type_length(self.id_data)
-        scanner.refresh_module(self.id_data)
-
-
-def _scanner_changed(self: ScannerProperties, context: bpy.types.Context) -> None:
-    from . import scanner
-
-    scanner.refresh_scanner(self.id_data)
-
-
-def _for_all(name: str) -> Callable[[ScannerProperties, bpy.types.Context], None]:
-    def changed(self: ScannerProperties, context: bpy.types.Context) -> None:
-        from . import scanner
-
-        scanner.set_for_all(self.id_data, name)
-
-    return changed
-
-
-def _get_visible(self: ModuleProperties) -> bool:
+def _is_visible(self: ModuleProperties) -> bool:
     return not self.id_data.hide_viewport
 
 
 def _set_visible(self: ModuleProperties, value: bool) -> None:
-    from . import scanner
-
-    scanner.set_visible(self.id_data, value)
+    FUNCTIONS["visible"](self.id_data, value)
 
 
 _LENGTH_MODES = [
     ("FROM_ROI", "From ROI", "l follows b, d, Ld and R: the field of view is tangent to the ROI sphere", 0),
     ("TYPED", "Typed", "l stays as it was typed", 1),
 ]
-# name: (label, description, smallest value); the module's and the scanner's are the same numbers.
+# name: (label, description, smallest value), of a module and of all modules.
 _LENGTHS = {
     "pinhole_diameter": ("Pinhole Diameter", "d: diameter of the hole in mm", 0.0),
     "collimator_length": ("Collimator Length", "l: from the pinhole to the crystal's front face, in mm", 1e-3),
@@ -76,13 +45,17 @@ _LENGTHS = {
     "detector_thickness": ("Detector Thickness", "Td: thickness of the crystal in mm", 0.0),
     "roi_radius": ("ROI Radius", "R: radius in mm of the sphere that the module must see", 0.0),
 }
+_SEES_ROI = 1 - 1e-6  # of R: an `l` from the ROI sees R up to rounding
 
 
-def _length(name: str, changed: Callable[..., None], suffix: str = "") -> Any:
-    label, description, low = _LENGTHS[name]
-    return FloatProperty(
-        name=label, description=description + suffix, min=low, step=10, precision=3, unit="NONE", update=changed
-    )
+def _lengths(edited: Callable[[str], Any], suffix: str = "") -> dict[str, Any]:
+    """Properties for d, l, Ld, Td and R, with the callback that `edited` gives for each name."""
+    return {
+        name: FloatProperty(
+            name=label, description=text + suffix, min=low, step=10, precision=3, unit="NONE", update=edited(name)
+        )
+        for name, (label, text, low) in _LENGTHS.items()
+    }
 
 
 class ModuleProperties(bpy.types.PropertyGroup):
@@ -99,48 +72,42 @@ class ModuleProperties(bpy.types.PropertyGroup):
     )  # fmt: skip
     visible: BoolProperty(
         name="Visible", description="Show the module, its collimator and its crystal, also in renders",
-        get=_get_visible, set=_set_visible,
+        get=_is_visible, set=_set_visible,
     )  # fmt: skip
     number: IntProperty(name="Number", description="Module number, as in the workbook")
     index: IntProperty(name="Index", description="Place of the module in its system, from 0", min=0, options={"HIDDEN"})
     ring: IntProperty(name="Ring", description="Ring of the module, counted from 0", min=0)
     added: BoolProperty(name="Added", description="The module is not in the workbook", options={"HIDDEN"})
-    pinhole_diameter: _length("pinhole_diameter", _module_changed)
-    collimator_length: _length("collimator_length", _length_changed)
-    detector_side: _length("detector_side", _module_changed)
-    detector_thickness: _length("detector_thickness", _module_changed)
-    roi_radius: _length("roi_radius", _module_changed)
     length_mode: EnumProperty(
         name="Length", description="Where the collimator's length l comes from", items=_LENGTH_MODES, default="TYPED",
-        update=_module_changed,
+        update=on_edit("module"),
     )  # fmt: skip
     exact: StringProperty(
-        name="Exact Values",
-        description="The numbers and the pinhole's place as imported, in double precision, JSON",
-        options={"HIDDEN"},
+        name="Exact Values", description="Numbers and place as imported, float64 JSON", options={"HIDDEN"}
     )
-    placed: FloatVectorProperty(
-        name="Placed", description="Where the pinhole was when the module was last built, mm", size=3,
-        options={"HIDDEN"},
-    )  # fmt: skip
-    built: StringProperty(name="Built", description="The numbers that the readouts are of", options={"HIDDEN"})
-    # Readouts: what the panels show, written by readouts.py.
-    pinhole_distance: FloatProperty(
-        name="Pinhole Distance", description="b: from the pinhole to the isocentre, in mm", min=0.0
-    )
-    sensitivity: FloatProperty(
-        name="Sensitivity", description="Of an ideal pinhole for a point source at the isocentre, cps/MBq"
-    )
+    placed: FloatVectorProperty(name="Placed", description="Where it was last built, mm", size=3, options={"HIDDEN"})
+    built: StringProperty(name="Built", description="The numbers that the readouts belong to", options={"HIDDEN"})
+    # Readouts: what the panels show, written by following.py.
+    pinhole_distance: FloatProperty(name="Pinhole Distance", description="b: from the pinhole to the isocentre, in mm")
+    sensitivity: FloatProperty(name="Sensitivity", description="Of an ideal pinhole at the isocentre, cps/MBq")
     resolution: FloatProperty(
         name="Resolution", description="FWHM in mm at the isocentre, of the hole and the detector"
     )
     magnification: FloatProperty(name="Magnification", description="l / b: of the image on the crystal")
-    roi_seen: FloatProperty(
-        name="Radius Seen", description="Radius in mm of the largest sphere around the isocentre that it sees whole"
-    )
+    roi_seen: FloatProperty(name="Radius Seen", description="Radius in mm of the largest sphere that it sees whole")
     aimed: BoolProperty(name="Aimed", description="The camera looks at the isocentre", default=True)
-    problem: StringProperty(name="Problem", description="Why the module cannot be as its numbers say")
+    problem: StringProperty(name="Problem", description="Why the module's numbers are impossible")
     finding: StringProperty(name="Finding", description="What the last check of the geometry found at this module")
+
+    @property
+    def sees_roi(self) -> bool:
+        """Whether the module sees its whole ROI sphere."""
+        return not self.problem and self.roi_seen >= _SEES_ROI * self.roi_radius
+
+
+ModuleProperties.__annotations__ |= _lengths(
+    lambda name: on_edit("length" if name == "collimator_length" else "module")
+)
 
 
 class ScannerProperties(bpy.types.PropertyGroup):
@@ -148,27 +115,23 @@ class ScannerProperties(bpy.types.PropertyGroup):
 
     is_scanner: BoolProperty(name="Is Scanner", options={"HIDDEN"})
     is_ring: BoolProperty(name="Is Ring", description="The collection is a ring of a scanner", options={"HIDDEN"})
-    scanner_name: StringProperty(
-        name="Scanner Name", description="What the scanner was imported as: the same name replaces it"
-    )
-    workbook: StringProperty(
-        name="Workbook", description="File that the scanner was read from or last written to", subtype="FILE_PATH"
-    )
+    scanner_name: StringProperty(name="Scanner Name", description="Its name in the import: the same name replaces it")
+    workbook: StringProperty(name="Workbook", description="File last read from or written to", subtype="FILE_PATH")
     sha256: StringProperty(name="SHA-256", description="Checksum of the workbook when it was read")
     n_modules: IntProperty(name="Modules", description="Number of modules when it was imported", min=0)
     quick_ranges: StringProperty(
-        name="Quick Ranges", description="Module ranges with a button of their own, JSON", options={"HIDDEN"}
+        name="Quick Ranges", description="Module ranges with a button, JSON", options={"HIDDEN"}
     )
     source: StringProperty(name="Source", description="Where the numbers come from, JSON", options={"HIDDEN"})
     plate_thickness: FloatProperty(
-        name="Plate", description="Thickness of the aperture plates in mm", min=0.0, update=_scanner_changed
+        name="Plate", description="Thickness of the aperture plates in mm", min=0.0, update=on_edit("scanner")
     )
     wall_thickness: FloatProperty(
-        name="Wall", description="Thickness of the collimators' walls in mm", min=0.0, update=_scanner_changed
+        name="Wall", description="Thickness of the collimators' walls in mm", min=0.0, update=on_edit("scanner")
     )
     opening_angle: FloatProperty(
         name="Opening Angle", description="Full angle of the double cone in which the holes open from their knife edge",
-        subtype="ANGLE", default=math.pi / 2, min=0.01, max=3.1, update=_scanner_changed,
+        subtype="ANGLE", default=math.pi / 2, min=0.01, max=3.1, update=on_edit("scanner"),
     )  # fmt: skip
     edge_at: EnumProperty(
         name="Knife Edge", description="Where in the aperture plates the knife edge is; it stays at the pinhole's centre",
@@ -177,70 +140,56 @@ class ScannerProperties(bpy.types.PropertyGroup):
             ("FRONT", "Front", "On the plate's face towards the ROI", 1),
             ("BACK", "Back", "On the plate's face towards the crystal", 2),
         ],
-        default="MIDDLE", update=_scanner_changed,
+        default="MIDDLE", update=on_edit("scanner"),
     )  # fmt: skip
     intrinsic_fwhm: FloatProperty(
         name="Intrinsic FWHM", description="Resolution of the detectors in mm on the crystal, for the readouts. 0: ideal",
-        min=0.0, soft_max=10.0, step=10, update=_scanner_changed,
+        min=0.0, soft_max=10.0, step=10, update=on_edit("scanner"),
     )  # fmt: skip
     keep_aimed: BoolProperty(
         name="Keep Aimed",
-        description="Turn a module that is moved so that it goes on looking at the isocentre. One that is only turned "
-        "stays as it was turned, and is marked",
-        default=True, update=_scanner_changed,
+        description="Turn a module that is moved so that it keeps looking at the isocentre. One that is only turned "
+        "stays turned, and is marked",
+        default=True, update=on_edit("scanner"),
     )  # fmt: skip
-    # For all modules at once; where they differ, the first one's, and the name stands in `mixed`.
-    pinhole_diameter: _length("pinhole_diameter", _for_all("pinhole_diameter"), ". Changing it sets all modules")
-    collimator_length: _length("collimator_length", _for_all("collimator_length"), ". Changing it sets all modules")
-    detector_side: _length("detector_side", _for_all("detector_side"), ". Changing it sets all modules")
-    detector_thickness: _length("detector_thickness", _for_all("detector_thickness"), ". Changing it sets all modules")
-    roi_radius: _length("roi_radius", _for_all("roi_radius"), ". Changing it sets all modules")
+    # With the five lengths below: the first module's numbers. `mixed` names those that differ between modules.
     length_mode: EnumProperty(
         name="Length", description="Where the collimators' lengths come from. Changing it sets all modules",
-        items=_LENGTH_MODES, default="TYPED", update=_for_all("length_mode"),
+        items=_LENGTH_MODES, default="TYPED", update=on_edit("all_modules", "length_mode"),
     )  # fmt: skip
     mixed: StringProperty(name="Mixed", description="Names of the numbers that differ between modules")
-    # Readouts of all modules together, written by readouts.py.
+    # Readouts of all modules together, written by following.py.
     count: IntProperty(name="Modules", description="Number of modules now", min=0)
-    sensitivity: FloatProperty(
-        name="Sensitivity", description="Of all modules together, for a point source at the isocentre, cps/MBq"
-    )
+    sensitivity: FloatProperty(name="Sensitivity", description="Of all modules together, at the isocentre, cps/MBq")
     resolution: FloatProperty(name="Resolution", description="Mean FWHM in mm of the modules at the isocentre")
     n_covering: IntProperty(name="Covering", description="Number of modules that see their whole ROI sphere")
-    problem: StringProperty(name="Problem", description="Why the scanner cannot be used as it stands")
-    untidy: StringProperty(name="Untidy", description="Copied cameras and left-over parts, in words")
+    untidy: StringProperty(name="Untidy", description="Copied cameras and parts without a camera, in words")
     findings: StringProperty(name="Findings", description="What the last check of the geometry found, JSON")
+
+
+ScannerProperties.__annotations__ |= _lengths(
+    lambda name: on_edit("all_modules", name), ". Changing it sets all modules"
+)
 
 
 def _is_scanner(self: GeometryProperties, collection: bpy.types.Collection) -> bool:
     return collection.mphdrr_scanner.is_scanner
 
 
-def _active_changed(self: GeometryProperties, context: bpy.types.Context) -> None:
-    from . import scanner
-
-    scanner.select_active(context)
-
-
 class GeometryProperties(bpy.types.PropertyGroup):
     """State of the Geometry panel; `Scene.mphdrr_geometry`."""
 
     scanner: PointerProperty(
-        name="Scanner",
-        description="The scanner that the panels work on",
-        type=bpy.types.Collection,
-        poll=_is_scanner,
+        name="Scanner", description="The scanner that the panels work on", type=bpy.types.Collection, poll=_is_scanner
     )
     active_index: IntProperty(
-        name="Active Module",
-        description="Index of the module among the scanner's objects",
-        update=_active_changed,
+        name="Active Module", description="Its index among the scanner's objects", update=on_edit("active_module")
     )
     first: IntProperty(name="First", description="First module number of the range", default=1)
     last: IntProperty(name="Last", description="Last module number of the range", default=40)
 
 
-# Every property group, in order: a group comes after those it points to. registration.py reads this.
+# Every property group; a group comes after those that it points to.
 CLASSES = (
     ModuleProperties,
     ScannerProperties,
@@ -251,7 +200,7 @@ CLASSES = (
     *column_maps.CLASSES,
 )
 
-# (Blender type, attribute name, group): attached as `PointerProperty(type=group)`; registration.py reads it.
+# (Blender type, attribute name, group): `registration.py` attaches a `PointerProperty` of the group to the type.
 POINTERS = (
     (bpy.types.Object, ids.OBJECT_MODULE, ModuleProperties),
     (bpy.types.Collection, ids.COLLECTION_SCANNER, ScannerProperties),

@@ -1,8 +1,10 @@
-"""What the extension registers with Blender, explicitly; the only file that imports operators and panels."""
+"""What the extension registers with Blender; the only file that imports operators and panels."""
 
 from __future__ import annotations
 
 import atexit
+from collections.abc import Callable
+from types import ModuleType
 from typing import Any
 
 import bpy
@@ -11,81 +13,69 @@ from ..operators import (
     add_map,
     add_phantom,
     add_slices,
-    aim_modules,
-    check_geometry,
     convert_ct,
-    duplicate_modules,
+    dropped_files,
     edit_phantom,
     export_dataset,
-    export_for_program,
     export_geometry,
     export_volume,
     import_geometry,
     import_volume,
-    remove_modules,
+    modules,
     render_projections,
-    renumber_modules,
-    set_numbers,
-    show_modules,
-    tidy_modules,
     volume_files,
     voxelize_objects,
 )
 from ..panels import add_menu, design, export, geometry, phantom, projections
-from . import cli, ids, jobs, live, live_phantoms, preferences, properties, slices, storage, volumes
+from . import (
+    cli,
+    following,
+    ids,
+    jobs,
+    live_phantoms,
+    live_scanner,
+    preferences,
+    properties,
+    scanner,
+    selection,
+    slices,
+    storage,
+    updates,
+    volumes,
+)
 
-# Classes in the order of registration; a panel comes after its parent. To add a class, list it here.
+# Where the classes are. Those of one module are registered in the order in which they stand in it: a panel after its
+# parent. Panels are drawn in the order of the work.
+_OPERATORS = (
+    import_geometry,
+    modules,
+    export_geometry,
+    add_map,
+    add_phantom,
+    edit_phantom,
+    voxelize_objects,
+    import_volume,
+    export_volume,
+    convert_ct,
+    add_slices,
+    volume_files,
+    render_projections,
+    jobs,
+    export_dataset,
+    dropped_files,
+)
+_PANELS = (add_menu, geometry, design, phantom, projections, export)
+
+
+def _classes(module: ModuleType) -> list[type]:
+    """The classes of a module that Blender registers: its `MPHDRR_...`."""
+    return [cls for name, cls in vars(module).items() if name.startswith("MPHDRR_") and isinstance(cls, type)]
+
+
 CLASSES: tuple[type, ...] = (
     *properties.CLASSES,
-    preferences.MPHDRR_Preferences,
-    # operators
-    import_geometry.MPHDRR_OT_import_geometry,
-    import_geometry.MPHDRR_FH_workbook,
-    show_modules.MPHDRR_OT_show_modules,
-    show_modules.MPHDRR_OT_look_through_module,
-    aim_modules.MPHDRR_OT_aim_modules,
-    duplicate_modules.MPHDRR_OT_duplicate_modules,
-    remove_modules.MPHDRR_OT_remove_modules,
-    tidy_modules.MPHDRR_OT_tidy_modules,
-    renumber_modules.MPHDRR_OT_renumber_modules,
-    set_numbers.MPHDRR_OT_set_numbers,
-    check_geometry.MPHDRR_OT_check_geometry,
-    export_geometry.MPHDRR_OT_export_geometry,
-    export_for_program.MPHDRR_OT_export_for_program,
-    add_map.MPHDRR_OT_add_map,
     *add_phantom.ADD_KINDS,
-    add_phantom.MPHDRR_OT_import_phantom,
-    add_phantom.MPHDRR_FH_phantom,
-    edit_phantom.MPHDRR_OT_update_phantom,
-    edit_phantom.MPHDRR_OT_update_derenzo,
-    edit_phantom.MPHDRR_OT_apply_phantom_pose,
-    edit_phantom.MPHDRR_OT_show_phantom_outline,
-    voxelize_objects.MPHDRR_OT_voxelize_objects,
-    voxelize_objects.MPHDRR_OT_mesh_from_volume,
-    import_volume.MPHDRR_OT_import_volume,
-    import_volume.MPHDRR_OT_import_volume_sequence,
-    import_volume.MPHDRR_FH_volume,
-    export_volume.MPHDRR_OT_export_volume,
-    convert_ct.MPHDRR_OT_ct_to_attenuation,
-    add_slices.MPHDRR_OT_add_slices,
-    add_slices.MPHDRR_OT_remove_slices,
-    volume_files.MPHDRR_OT_clean_volume_files,
-    volume_files.MPHDRR_OT_find_volume_files,
-    render_projections.MPHDRR_OT_render_projections,
-    render_projections.MPHDRR_OT_show_projections,
-    jobs.MPHDRR_OT_cancel_job,
-    export_dataset.MPHDRR_OT_export_dataset,
-    add_menu.MPHDRR_MT_add,
-    # panels, in the order of the work
-    geometry.MPHDRR_UL_modules,
-    geometry.MPHDRR_PT_geometry,
-    geometry.MPHDRR_PT_modules,
-    design.MPHDRR_PT_design,
-    design.MPHDRR_PT_scanner_design,
-    phantom.MPHDRR_PT_phantom,
-    projections.MPHDRR_PT_projections,
-    projections.MPHDRR_PT_physics,
-    export.MPHDRR_PT_export,
+    *(cls for module in (preferences, *_OPERATORS, *_PANELS) for cls in _classes(module)),
 )
 
 # (menu, draw function): entries in Blender's own menus.
@@ -93,7 +83,6 @@ MENUS: tuple[tuple[Any, Any], ...] = (
     (bpy.types.TOPBAR_MT_file_import, import_geometry.draw_menu),
     (bpy.types.TOPBAR_MT_file_import, import_volume.draw_menu),
     (bpy.types.TOPBAR_MT_file_export, export_geometry.draw_menu),
-    (bpy.types.TOPBAR_MT_file_export, export_for_program.draw_menu),
     (bpy.types.TOPBAR_MT_file_export, export_volume.draw_menu),
     (bpy.types.TOPBAR_MT_file_export, export_dataset.draw_menu),
     (bpy.types.VIEW3D_MT_add, add_menu.draw_menu),
@@ -104,49 +93,58 @@ MENUS: tuple[tuple[Any, Any], ...] = (
 HANDLERS: tuple[tuple[list[Any], Any], ...] = (
     (bpy.app.handlers.load_pre, jobs.before_load),
     (bpy.app.handlers.load_pre, slices.before_load),
-    (bpy.app.handlers.load_pre, live_phantoms.before_load),
     (bpy.app.handlers.load_post, volumes.after_load),
-    (bpy.app.handlers.load_post, live.after_load),
-    (bpy.app.handlers.load_post, live_phantoms.after_undo),
-    (bpy.app.handlers.depsgraph_update_post, live.after_update),
-    (bpy.app.handlers.frame_change_post, live.after_frame),
+    (bpy.app.handlers.load_post, live_scanner.after_load),
+    (bpy.app.handlers.depsgraph_update_post, live_scanner.after_update),
+    (bpy.app.handlers.frame_change_post, live_scanner.after_frame),
     (bpy.app.handlers.frame_change_post, slices.after_frame_change),
-    (bpy.app.handlers.undo_post, live.after_undo),
-    (bpy.app.handlers.undo_post, live_phantoms.after_undo),
-    (bpy.app.handlers.redo_post, live.after_undo),
-    (bpy.app.handlers.redo_post, live_phantoms.after_undo),
+    (bpy.app.handlers.undo_post, live_scanner.after_undo),
+    (bpy.app.handlers.redo_post, live_scanner.after_undo),
     (bpy.app.handlers.save_pre, storage.before_save),
     (bpy.app.handlers.save_post, storage.after_save),
     (bpy.app.handlers.save_post_fail, storage.after_failed_save),
 )
 
-# What Blender gave for ``blender --command mphdrr``, to take it back with.
-_commands: list[Any] = []
+# What edited properties call (`addon/updates.py`).
+UPDATES: dict[str, Callable[..., None]] = {
+    "module": following.refresh_module,
+    "length": following.length_typed,
+    "visible": scanner.set_visible,
+    "scanner": following.refresh,
+    "all_modules": following.set_for_all,
+    "active_module": selection.select_active,
+    "phantom": live_phantoms.settings_changed,
+    "display_range": slices.range_changed,
+    "slices": slices.update,
+}
+
+# How to take back what was registered: (function, arguments).
+_undo: list[tuple[Callable[..., Any], tuple[Any, ...]]] = []
 
 
 def register() -> None:
-    """Register everything, or, if something fails, undo what was done and raise."""
-    undo: list[tuple[Any, tuple[Any, ...]]] = []
+    """Register everything; if something fails, take back what was registered and raise."""
+    updates.FUNCTIONS.update(UPDATES)
     try:
         for cls in CLASSES:
             bpy.utils.register_class(cls)
-            undo.append((bpy.utils.unregister_class, (cls,)))
+            _undo.append((bpy.utils.unregister_class, (cls,)))
         for owner, name, group in properties.POINTERS:
             setattr(owner, name, bpy.props.PointerProperty(type=group))
-            undo.append((delattr, (owner, name)))
+            _undo.append((delattr, (owner, name)))
         for menu, draw in MENUS:
             menu.append(draw)
-            undo.append((menu.remove, (draw,)))
+            _undo.append((menu.remove, (draw,)))
         for handlers, function in HANDLERS:
             handlers.append(function)
-            undo.append((handlers.remove, (function,)))
-        _commands.append(bpy.utils.register_cli_command(ids.PREFIX, cli.main))
+            _undo.append((_remove_handler, (handlers, function)))
+        command = bpy.utils.register_cli_command(ids.PREFIX, cli.main)
+        _undo.append((bpy.utils.unregister_cli_command, (command,)))
     except Exception:
-        for function, arguments in reversed(undo):
-            function(*arguments)
+        _take_back()
         raise
     if bpy.app.module:
-        # Registered classes keep Python's bpy module alive, so that Blender 4.5 waits for ever when Python ends.
+        # Registered classes keep Python's bpy module alive: Blender 4.5 would wait for ever when Python ends.
         atexit.register(unregister)
 
 
@@ -154,16 +152,17 @@ def unregister() -> None:
     """Take back what `register` did, in reverse order."""
     atexit.unregister(unregister)
     jobs.stop()
-    live.stop()
+    live_scanner.stop()
     live_phantoms.stop()
-    while _commands:
-        bpy.utils.unregister_cli_command(_commands.pop())
-    for handlers, function in reversed(HANDLERS):
-        if function in handlers:  # loading a file drops handlers that are not persistent
-            handlers.remove(function)
-    for menu, draw in reversed(MENUS):
-        menu.remove(draw)
-    for owner, name, _ in reversed(properties.POINTERS):
-        delattr(owner, name)
-    for cls in reversed(CLASSES):
-        bpy.utils.unregister_class(cls)
+    _take_back()
+
+
+def _take_back() -> None:
+    while _undo:
+        function, arguments = _undo.pop()
+        function(*arguments)
+
+
+def _remove_handler(handlers: list[Any], function: Any) -> None:
+    if function in handlers:  # loading a file drops handlers that are not persistent
+        handlers.remove(function)

@@ -1,4 +1,4 @@
-"""New numbers for a scanner's modules: 1, 2, ... in an order, in the properties and in the names."""
+"""New numbers 1, 2, ... for a scanner's modules, in their properties and names."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ import numpy as np
 from ..core.errors import InputError
 from ..core.geometry.ring_fits import ring_order
 from ..core.recording import recorded_warnings
-from . import copies, design, ids, scanner
+from . import copies, following, ids, scanner
 
 Order = Literal["RINGS", "LIST"]
 
@@ -20,16 +20,16 @@ _OURS = re.compile(r"(Module|Collimator|Crystal) \d+(\.\d+)?")  # a name that th
 
 
 def renumber(collection: bpy.types.Collection, order: Order = "RINGS") -> int:
-    """Number a scanner's modules 1, 2, ...; in that order they are listed, projected and exported from now on.
+    """Number a scanner's modules 1, 2, ...; they are listed, projected and exported in that order from now on.
 
-    Names that the extension gave follow; names of the user's own stay.
+    Names that the extension gave follow; names that the user gave stay.
 
     Parameters
     ----------
     collection
         The scanner.
     order
-        ``"RINGS"``: as `core.geometry.ring_fits.ring_order` has them; ``"LIST"``: as they are listed now.
+        ``"RINGS"``: that of `core.geometry.ring_fits.ring_order`; ``"LIST"``: the present one.
 
     Returns
     -------
@@ -39,18 +39,18 @@ def renumber(collection: bpy.types.Collection, order: Order = "RINGS") -> int:
     Raises
     ------
     InputError
-        Copies or left-overs are to be tidied first, or the modules make no system. The scanner stays as it was.
+        The scanner is untidy (`copies.untidy_text`), or its numbers are impossible. It stays as it was.
     """
     untidy = copies.untidy_text(collection)
     if untidy:
         raise InputError(f"scanner '{collection.name}': {untidy}: press Tidy Modules in the Design panel first")
-    with recorded_warnings():  # where a camera looks is no matter here
+    with recorded_warnings():  # where the cameras look does not matter here
         system = scanner.read_scanner(collection)
     found = scanner.modules(collection)
     places = ring_order(system) if order == "RINGS" else np.arange(len(found))
-    parts = design.parts_of(collection, found)
+    parts = following.parts_of(collection, found)
     names: list[tuple[bpy.types.ID, str]] = []
-    with design.writing():
+    with following.writing():
         for index, camera in enumerate(found[place] for place in places):
             camera.mphdrr_module.number, camera.mphdrr_module.index = index + 1, index
             name = ids.module_name(index + 1, len(found))
@@ -65,8 +65,8 @@ def renumber(collection: bpy.types.Collection, order: Order = "RINGS") -> int:
         collection.mphdrr_scanner.quick_ranges = json.dumps(scanner.quick_ranges(ordered))
     names = [(item, name) for item, name in names if item.name != name and _OURS.fullmatch(item.name)]
     for item, name in names:
-        item.name = f"{name} renumbered"  # what another has now is free afterwards
+        item.name = f"{name} renumbered"  # so that the new names are free
     for item, name in names:
         item.name = name
-    scanner.refresh_scanner(collection)
+    following.refresh(collection)
     return int(np.count_nonzero(system.numbers[places] != ordered.numbers))

@@ -1,34 +1,30 @@
-"""What replacing a scanner would lose, and taking the old one out of the scene without touching what is the user's."""
+"""What replacing a scanner would lose, and removing the old one while keeping everything that is the user's."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 
 import bpy
-from mathutils import Matrix
 
 from . import cameras
-from .module_values import is_edited, is_moved, is_turned
+from .module_values import is_edited, is_moved, off_aim
 
 
 def losses(collection: bpy.types.Collection) -> list[str]:
-    """What replacing the scanner would undo, a phrase each; empty if it is as it was imported."""
+    """The changes that replacing the scanner would undo, a phrase each; empty if it is as it was imported."""
     parts, others = parts_and_others(collection)
     found = [o for o in parts if o.mphdrr_module.is_module]
-    moved = [o.mphdrr_module.number for o in found if is_moved(o) or is_turned(o)]
-    changed = [o.mphdrr_module.number for o in found if is_edited(o)]
-    added = [o.mphdrr_module.number for o in found if o.mphdrr_module.added]
-    animated = [o.mphdrr_module.number for o in found if o.animation_data is not None or len(o.constraints)]
-    gone = collection.mphdrr_scanner.n_modules - (len(found) - len(added))
     lost = []
-    if moved:
-        lost.append(f"{modules_text(moved)} moved or turned")
-    if changed:
-        lost.append(f"{modules_text(changed)} with changed numbers")
-    if added:
-        lost.append(f"{modules_text(added)} added")
-    if animated:
-        lost.append(f"{modules_text(animated)} with animation or constraints")
+    for what, is_lost in (
+        ("moved or turned", lambda o: is_moved(o) or off_aim([o])),
+        ("with changed numbers", is_edited),
+        ("added", lambda o: o.mphdrr_module.added),
+        ("with animation or constraints", lambda o: o.animation_data is not None or len(o.constraints)),
+    ):
+        numbers = [o.mphdrr_module.number for o in found if is_lost(o)]
+        if numbers:
+            lost.append(f"{modules_text(numbers)} {what}")
+    gone = collection.mphdrr_scanner.n_modules - sum(not o.mphdrr_module.added for o in found)
     if gone > 0:
         lost.append(f"{gone} module{'s' * (gone > 1)} deleted or moved out")
     names = [o.name for o in others] + [c.name for c in _own_collections(collection)]
@@ -40,7 +36,7 @@ def losses(collection: bpy.types.Collection) -> list[str]:
 def clear(scene: bpy.types.Scene, collection: bpy.types.Collection, replacements: dict[int, bpy.types.Object]) -> None:
     """Remove the scanner's objects and rings; `replacements` are the new cameras by module number.
 
-    What is the user's moves out, and what pointed at an old camera points at the new one.
+    The user's objects move out of the scanner, and whatever referred to an old camera refers to the new one.
     """
     parts, others = parts_and_others(collection)
     homes = [collection, *_rings(collection)]
@@ -61,9 +57,7 @@ def clear(scene: bpy.types.Scene, collection: bpy.types.Collection, replacements
     new_of = {o: replacements.get(o.mphdrr_module.number) for o in parts if o.mphdrr_module.is_module}
     for item in bpy.data.objects:
         if item.parent in ours and item not in ours and new_of.get(item.parent) is None:
-            matrix = cameras.world_matrix(item)
-            item.parent = None
-            item.matrix_basis = Matrix(matrix)
+            cameras.unparent(item)
 
     datas = {o.data for o in parts if o.data is not None}
     bpy.data.batch_remove([o for o in parts if o not in new_of])
@@ -78,12 +72,10 @@ def clear(scene: bpy.types.Scene, collection: bpy.types.Collection, replacements
 def parts_and_others(
     collection: bpy.types.Collection,
 ) -> tuple[list[bpy.types.Object], list[bpy.types.Object]]:
-    """The scanner's own objects, and the user's: strangers and copies of parts."""
+    """The scanner's own objects, and the user's: other objects, and copies of the scanner's."""
     parts, others = [], []
     seen: set[tuple[str, int]] = set()
-    for item in sorted(
-        collection.all_objects, key=lambda o: o.name
-    ):  # "Module 07" comes before its copy "Module 07.001"
+    for item in sorted(collection.all_objects, key=lambda o: o.name):  # "Module 07" before its copy "Module 07.001"
         module = item.mphdrr_module
         key = (module.part, module.number)
         if module.part == "NONE" or key in seen:

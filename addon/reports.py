@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
 import bpy
 
+from ..core.errors import InputError
 from ..core.recording import recorded_warnings
 
-_MOST = 5  # more lines than that nobody reads
+_MOST = 5  # nobody reads more lines than that
 
 
 @contextmanager
@@ -23,3 +24,21 @@ def warnings_reported(operator: bpy.types.Operator) -> Iterator[None]:
                 operator.report({"WARNING"}, text)
             if len(caught) > _MOST:
                 operator.report({"WARNING"}, f"... and {len(caught) - _MOST} more warnings of this kind")
+
+
+def run_reported(operator: bpy.types.Operator, action: Callable[[], str]) -> set[str]:
+    """Run an operator's work: report the line that `action` returns, its warnings, and an `InputError` as {'ERROR'}.
+
+    Returns
+    -------
+    set
+        {'FINISHED'}, or {'CANCELLED'} after an `InputError`.
+    """
+    try:
+        with warnings_reported(operator):
+            text = action()
+    except InputError as error:
+        operator.report({"ERROR"}, str(error))
+        return {"CANCELLED"}
+    operator.report({"INFO"}, text)
+    return {"FINISHED"}

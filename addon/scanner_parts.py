@@ -6,7 +6,6 @@ from collections.abc import Sequence
 from typing import Any
 
 import bpy
-import numpy as np
 
 from ..core.geometry.module_parts import ModulePart
 from ..core.geometry.system import PinholeSystem
@@ -15,24 +14,33 @@ from .module_values import write_module
 
 
 class NewScanner:
-    """Datablocks of a scanner that is not in the scene yet: `make`, then `name_and_link` or `discard`."""
+    """The datablocks of a scanner that is not in the scene yet: `cameras` by module number, `rings` and the `roi` sphere.
 
-    def __init__(self) -> None:
-        self.cameras: dict[int, bpy.types.Object] = {}  # by module number
+    `parts` are the modules' collimators and crystals, as of `module_parts`.
+    """
+
+    def __init__(self, system: PinholeSystem, parts: Sequence[ModulePart]) -> None:
+        self.cameras: dict[int, bpy.types.Object] = {}
         self.rings: list[bpy.types.Collection] = []
-        self.roi: bpy.types.Object | None = None
         self._named: list[tuple[bpy.types.ID, str]] = []  # names are free only after the old scanner has gone
-        self._materials = {part: collimators.part_material(part) for part in ("COLLIMATOR", "CRYSTAL", "ROI")}
+        self._materials = {part: collimators.part_material(part) for part in collimators.LOOKS}
+        try:
+            self._make_cameras(system)
+            self._make_parts(system, parts)
+            self.roi = self._make_roi(float(system.roi_radius.max()))
+        except BaseException:
+            bpy.data.batch_remove([datablock for datablock, _ in self._named])
+            bpy.data.batch_remove([m for m in self._materials.values() if m.users == 0])
+            raise
 
-    def make(self, system: PinholeSystem, parts: Sequence[ModulePart]) -> None:
-        """Make everything; `parts` are the collimators and crystals, as of `module_parts`."""
+    def _make_cameras(self, system: PinholeSystem) -> None:
         rings = system.rings()
         for ring in range(int(rings.max()) + 1):
             collection = self._keep(bpy.data.collections.new(ids.ring_name(ring)), ids.ring_name(ring))
             collection.mphdrr_scanner.is_ring = True
             self.rings.append(collection)
         matrices = cameras.camera_matrices(system.centers)
-        for m, number in enumerate(np.asarray(system.numbers).tolist()):
+        for m, number in enumerate(system.numbers.tolist()):
             name = ids.module_name(number, len(system))
             data = self._keep(bpy.data.cameras.new(name), name)
             cameras.set_up_camera(data, system, m)
@@ -42,23 +50,25 @@ class NewScanner:
             camera.lock_scale = (True, True, True)  # or its collimator would grow with it
             write_module(camera, system, m, int(rings[m]))
             self.rings[rings[m]].objects.link(camera)
+
+    def _make_parts(self, system: PinholeSystem, parts: Sequence[ModulePart]) -> None:
         for part in parts:
             camera, kind = self.cameras[part.number], part.kind.upper()
             name = ids.part_name(ids.module_name(part.number, len(system)), kind)
             mesh = self._keep(collimators.new_mesh(name, part.solid, self._materials[kind]), name)
             child = self._keep(new_part(camera, kind, name, mesh), name)
             self.rings[camera.mphdrr_module.ring].objects.link(child)
-        self._make_roi(float(system.roi_radius.max()))
 
-    def _make_roi(self, radius: float) -> None:
+    def _make_roi(self, radius: float) -> bpy.types.Object:
         mesh = self._keep(collimators.new_sphere("ROI", radius, self._materials["ROI"]), "ROI")
-        self.roi = self._keep(bpy.data.objects.new("ROI", mesh), "ROI")
-        self.roi.mphdrr_module.part = "ROI"
-        self.roi.hide_select = True
+        roi = self._keep(bpy.data.objects.new("ROI", mesh), "ROI")
+        roi.mphdrr_module.part = "ROI"
+        roi.hide_select = True
         # Circles: the solid viewport draws no volume behind or inside a transparent surface. Renders show the sphere.
-        self.roi.display_type, self.roi.display_bounds_type = "BOUNDS", "SPHERE"
-        self.roi.lock_location = self.roi.lock_rotation = self.roi.lock_scale = (True, True, True)
-        self.roi.visible_shadow = False
+        roi.display_type, roi.display_bounds_type = "BOUNDS", "SPHERE"
+        roi.lock_location = roi.lock_rotation = roi.lock_scale = (True, True, True)
+        roi.visible_shadow = False
+        return roi
 
     def _keep(self, datablock: Any, name: str) -> Any:
         self._named.append((datablock, name))
@@ -73,14 +83,9 @@ class NewScanner:
             collection.children.link(ring)
         collection.objects.link(self.roi)
 
-    def discard(self) -> None:
-        """Remove everything again."""
-        bpy.data.batch_remove([datablock for datablock, _ in self._named])
-        bpy.data.batch_remove([m for m in self._materials.values() if m.users == 0])
-
 
 def new_part(camera: bpy.types.Object, part: str, name: str, mesh: bpy.types.Mesh) -> bpy.types.Object:
-    """A module's collimator or crystal, hanging on its camera. Each has a mesh of its own, which its module reshapes."""
+    """A module's collimator or crystal, parented to its camera. Its mesh is its own, so that it can be reshaped."""
     item = bpy.data.objects.new(name, mesh)
     item.parent = camera
     item.lock_location = item.lock_rotation = item.lock_scale = (True, True, True)

@@ -1,4 +1,4 @@
-"""Which modules an operator or a panel is about: the active one and the selected ones."""
+"""Which modules an operator or a panel works on: the active one and the selected ones."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from . import scanner
 
 
 def active_module(context: bpy.types.Context) -> bpy.types.Object | None:
-    """The camera of the active scanner's module that is active in the viewport, itself or a part of it, else in the list."""
+    """The camera of the active scanner's module that is active in the viewport (or a part of it is), else in the list."""
     collection = scanner.active_scanner(context.scene)
     if collection is None:
         return None
@@ -23,7 +23,7 @@ def active_module(context: bpy.types.Context) -> bpy.types.Object | None:
 
 
 def selected_modules(context: bpy.types.Context) -> list[bpy.types.Object]:
-    """Cameras of the active scanner's modules that are selected, themselves or a part, in order; else the active one."""
+    """Cameras of the active scanner's modules that are selected (or a part of them is), in order; else the active one."""
     collection = scanner.active_scanner(context.scene)
     if collection is None:
         return []
@@ -40,7 +40,7 @@ def module_of(item: bpy.types.Object | None) -> bpy.types.Object | None:
 
 
 def select(context: bpy.types.Context, modules: Iterable[bpy.types.Object]) -> None:
-    """Select these modules' cameras, as far as they are visible, and nothing else; the first becomes active."""
+    """Select those of these modules' cameras that are visible, and nothing else; the first becomes active."""
     if context.mode != "OBJECT":
         return
     layer = context.view_layer
@@ -52,6 +52,14 @@ def select(context: bpy.types.Context, modules: Iterable[bpy.types.Object]) -> N
         camera.select_set(True, view_layer=layer)
     if shown:
         layer.objects.active = shown[0]
+
+
+def select_active(scene: bpy.types.Scene) -> None:
+    """Select the module that is active in the panel's list, as a click on its camera would."""
+    collection, index = scanner.active_scanner(scene), scene.mphdrr_geometry.active_index
+    camera = collection.all_objects[index] if collection and 0 <= index < len(collection.all_objects) else None
+    if camera is not None and camera.visible_get(view_layer=bpy.context.view_layer):
+        select(bpy.context, [camera])
 
 
 def poll_scanner(operator: type[bpy.types.Operator], context: bpy.types.Context) -> bool:

@@ -1,7 +1,7 @@
-"""Slice planes: three pictures of a volume's voxels, along its grid's axes, that go with the object.
+"""Slice planes: three pictures of a volume's voxels, across its grid's axes, that go with the object.
 
-Each plane is a mesh object, child of the volume's, with an image of the slice in the display range's colours; sheared
-grids give parallelograms. Planes are named after the patient's, by the world axis that they are nearest across.
+Each plane is a mesh object, a child of the volume's, with an image of the slice in the colours of the display range; on a
+sheared grid it is a parallelogram. Planes are named sagittal, coronal and axial by the world axis closest to their normal.
 """
 
 from __future__ import annotations
@@ -16,20 +16,20 @@ from numpy.typing import NDArray
 
 from ..core.errors import InputError
 from ..core.volumes.volume import Volume
-from . import ids, vdb, volume_materials, volumes
+from . import vdb, volume_materials, volumes
 from .compat import enable_nodes
 
 _PLANES = ("Sagittal", "Coronal", "Axial")  # across world x, y, z
-_KEY = "mphdrr_slice"  # custom property: the axis of the grid that a plane lies across
+_KEY = "mphdrr_slice"  # custom property: the axis of the grid that a plane is across
 _LATTICE = "mphdrr_slice_of"  # custom property: shape and affine that the planes were made for
 _SHADES = 256
 
-# The volume that slices were last taken of: reading it takes longer than everything else.
+# The volume that slices were last taken of: reading it takes longer than all the rest.
 _last: tuple[Path, Volume] | None = None
 
 
 def add_slices(item: bpy.types.Object) -> list[bpy.types.Object]:
-    """Three planes through a volume's middle, in the order of the grid's axes; planes that it has are made anew.
+    """Three planes through a volume's middle, in the order of the grid's axes, in place of those that it has.
 
     Raises
     ------
@@ -42,12 +42,12 @@ def add_slices(item: bpy.types.Object) -> list[bpy.types.Object]:
     remove_slices(item)
     names = _names(volumes.pose_of_object(item) @ volume.grid.affine)
     planes = [_plane(item, volume, axis, names[axis]) for axis in range(3)]
-    getattr(item, ids.OBJECT_VOLUME).slices = [n // 2 for n in volume.grid.shape]  # which paints them
+    item.mphdrr_volume.slices = [n // 2 for n in volume.grid.shape]  # which paints them
     return planes
 
 
 def remove_slices(item: bpy.types.Object) -> None:
-    """Remove a volume's planes with all that is theirs."""
+    """Remove a volume's planes, with their meshes, materials and images."""
     for plane in planes_of(item):
         mesh = plane.data
         materials = list(mesh.materials)
@@ -74,18 +74,23 @@ def names(item: bpy.types.Object) -> list[str]:
     return [by_axis.get(axis, "") for axis in range(3)]
 
 
+def range_changed(item: bpy.types.Object) -> None:
+    """Draw a volume and its planes in its display range."""
+    volumes.show_range(item)
+    update(item)
+
+
 def update(item: bpy.types.Object) -> None:
-    """Draw a volume's planes at `VolumeProperties.slices`, in its display range; nothing where it has none."""
-    planes = planes_of(item)
-    settings = getattr(item, ids.OBJECT_VOLUME)
-    if not planes or settings.sketched:
+    """Draw a volume's planes, if it has some, at `VolumeProperties.slices` and in its display range."""
+    planes, settings = planes_of(item), item.mphdrr_volume
+    if not planes:
         return
     try:
         volume = _stored(item)
     except InputError as error:
         print(f"mphDRR: the slices of {item.name} are not drawn: {error}")
         return
-    if any(plane[_LATTICE] != _lattice(volume) for plane in planes):  # other voxels than before
+    if any(plane[_LATTICE] != _lattice(volume) for plane in planes):  # the volume has other voxels now
         add_slices(item)
         return
     for plane in planes:

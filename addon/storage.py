@@ -1,7 +1,7 @@
-"""Where the scene's large files live: beside the saved .blend, or in Blender's temporary folder until it is saved.
+"""Where the scene's large files are: beside the saved .blend, or in Blender's temporary folder until it is saved.
 
-A .blend named `study.blend` has them in `study_mphdrr/` next to it and points there by `//` paths, so that both can be
-moved together. Files made before the first save are copied there when it happens. Packing does not keep volumes.
+`study.blend` has them in `study_mphdrr/` next to it and points there by `//` paths, so that both can be moved together.
+Files made before the first save are copied there when it happens. Packing a .blend does not include volumes.
 """
 
 from __future__ import annotations
@@ -11,22 +11,24 @@ import os
 import re
 import shutil
 import time
+import warnings
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import bpy
 
-from ..core.errors import InputError
+from ..core.errors import InputError, InputWarning
 from ..core.files import ensure_folder, replacing
+from ..core.memory import readable_size
 from . import ids
 
 _OUR_VOLUME = re.compile(r"[a-z]+-[0-9a-f]{16}(\.preview)?(_\d{4})?\.vdb")
-"""Names of the files that this extension writes voxels to: by content."""
+"""Names of the files that `stored_volumes` writes, made from their content."""
 _FRAME = re.compile(r"_\d{4}\.vdb$")  # of a sequence, at the end of the name
 
-_LOOK = 2.0  # s
-_sizes: dict[Path, tuple[float, int | None]] = {}  # when it was looked at, and what there was
+_LOOK = 2.0  # s that a file's size, once read, is shown
+_sizes: dict[Path, tuple[float, int | None]] = {}  # when a file was looked at, and its size
 
 # Paths as they were before the save that is running: (owner, attribute, old path).
 _before_save: list[tuple[Any, str, str]] = []
@@ -40,15 +42,7 @@ def folder() -> Path:
     InputError
         It cannot be written.
     """
-    return ensure_folder(_folder_of(bpy.data.filepath)) if bpy.data.filepath else temporary_folder()
-
-
-def temporary_folder() -> Path:
-    """The folder for files that need not outlive this session, made if need be; raises as `folder` does.
-
-    A .blend that needs one of them when it is saved gets its own copy.
-    """
-    return ensure_folder(_temporary_folder())
+    return ensure_folder(_folder())
 
 
 def stored_path(path: Path) -> str:
@@ -81,9 +75,9 @@ def of_frame(path: Path, number: int) -> Path:
 
 
 def size_of(path: Path) -> int | None:
-    """Bytes of a file, None where there is none, as a look within the last seconds found it.
+    """Bytes of a file, None where there is none; looked up every two seconds at most.
 
-    For panels, which are drawn at every movement of the mouse: a look at a disk in the network may take long.
+    For panels, which are drawn at every movement of the mouse: a look at a network disk may take long.
     """
     now = time.monotonic()
     looked, size = _sizes.get(path, (-math.inf, None))
@@ -94,7 +88,7 @@ def size_of(path: Path) -> int | None:
 
 
 def missing_volumes(is_there: Callable[[Path], bool] = Path.is_file) -> list[bpy.types.Volume]:
-    """Volumes of ours whose file, or the one with every voxel that belongs to it, is not there."""
+    """Volumes of ours of which a file, shown or with every voxel, is missing."""
     return [
         data
         for data in bpy.data.volumes
@@ -103,18 +97,23 @@ def missing_volumes(is_there: Callable[[Path], bool] = Path.is_file) -> list[bpy
 
 
 def seems_there(path: Path) -> bool:
-    """Whether there is a file, as `size_of` says."""
+    """Whether there is a file, by `size_of`."""
     return size_of(path) is not None
 
 
-def relocate(top: Path) -> tuple[list[str], list[str]]:
-    """Look for missing volumes' files by their names, in a folder and all below it; those of one volume lie together.
+def relocate(directory: str) -> str:
+    """Look for missing volumes' files by their names, in a folder and all below it; returns which volumes' were found.
 
-    Returns
-    -------
-    found, still_missing : list of str
-        Names of the volumes.
+    The files of one volume are in one folder.
+
+    Raises
+    ------
+    InputError
+        No such folder.
     """
+    top = absolute(directory)
+    if not directory or not top.is_dir():
+        raise InputError(f"{directory or 'no folder given'}: expected a folder to look in")
     missing = missing_volumes()
     wanted = {absolute(data.filepath).name for data in missing}
     there = {path.name: path for path in sorted(top.rglob("*.vdb"), reverse=True) if path.name in wanted}
@@ -124,30 +123,66 @@ def relocate(top: Path) -> tuple[list[str], list[str]]:
         if shown is not None and all(shown.with_name(path.name).is_file() for path in _files_of(data)):
             data.filepath = stored_path(shown)
             data.grids.load()
-            found.append(data)
+            found.append(data.name)
     _sizes.clear()
-    return sorted(data.name for data in found), sorted(data.name for data in missing if data not in found)
+    if absent := sorted(data.name for data in missing if data.name not in found):
+        warnings.warn(f"{top}: the files of {', '.join(absent)} are not there either", InputWarning, stacklevel=2)
+    return f"Found the files of {', '.join(sorted(found)) or 'no volume'}"
 
 
 def unused_volumes() -> list[Path]:
     """Files of voxels in this .blend's folder that none of its volumes needs."""
-    place = _folder_of(bpy.data.filepath) if bpy.data.filepath else _temporary_folder()
     used = {path.name for data in bpy.data.volumes for path in _files_of(data)}
-    ours = [path for path in place.glob("*.vdb") if _OUR_VOLUME.fullmatch(path.name)]
+    ours = [path for path in _folder().glob("*.vdb") if _OUR_VOLUME.fullmatch(path.name)]
     return sorted(path for path in ours if path.is_file() and path.name not in used)
 
 
+def remove_unused() -> str:
+    """Remove the `unused_volumes`; returns how many there were.
+
+    Raises
+    ------
+    InputError
+        The .blend, as it is saved, may need them, or they cannot be removed.
+    """
+    # Without a window Blender does not keep account of changes.
+    if bpy.data.filepath and bpy.data.is_dirty and not bpy.app.background:
+        raise InputError("the .blend has changes that are not saved, and as saved may need these files: save it")
+    unused = unused_volumes()
+    text = f"Removed {summary(unused)}" if unused else "No file of voxels is unused"
+    for path in unused:
+        try:
+            path.unlink(missing_ok=True)
+        except OSError as error:
+            raise InputError(f"{path}: cannot be removed ({error.strerror or error})") from error
+    return text
+
+
+def summary(files: list[Path]) -> str:
+    """How many unused files there are, and how large they are."""
+    size = readable_size(sum(path.stat().st_size for path in files))
+    return f"{len(files)} unused file{'s' if len(files) != 1 else ''} of voxels ({size})"
+
+
+def files_of_states(data: bpy.types.Volume) -> list[Path]:
+    """The .vdb with every voxel, of each state of a sequence."""
+    return _of_states(data, full_resolution(absolute(data.filepath)))
+
+
 def _files_of(data: bpy.types.Volume) -> set[Path]:
-    """The files that a volume needs: of every state, and those with every voxel."""
-    shown = absolute(data.filepath)
-    first = data.frame_offset + 1
-    states = [of_frame(shown, first + k) for k in range(data.frame_duration)] if data.is_sequence else [shown]
-    return {file for state in states for file in (state, full_resolution(state))}
+    """The files that a volume needs: of every state, the one that is shown and the one with every voxel."""
+    return {*files_of_states(data), *_of_states(data, absolute(data.filepath))}
+
+
+def _of_states(data: bpy.types.Volume, path: Path) -> list[Path]:
+    if not data.is_sequence:
+        return [path]
+    return [of_frame(path, data.frame_offset + 1 + k) for k in range(data.frame_duration)]
 
 
 @bpy.app.handlers.persistent
 def before_save(filepath: str, _: Any = None) -> None:
-    """Bring files along from the temporary folder, and keep paths that Blender does not know of up to date."""
+    """Copy files from the temporary folder, and keep paths up to date that Blender does not know of."""
     _before_save.clear()
     if not filepath:
         return
@@ -159,7 +194,7 @@ def before_save(filepath: str, _: Any = None) -> None:
                 _bring(file, target)
             _set(volume, "filepath", f"//{target.name}/{source.name}")
     for scene in bpy.data.scenes:
-        settings = getattr(scene, ids.SCENE_PROJECTIONS)
+        settings = scene.mphdrr_projections
         if not settings.run_file:
             continue
         source = absolute(settings.run_file)
@@ -172,12 +207,12 @@ def before_save(filepath: str, _: Any = None) -> None:
 
 @bpy.app.handlers.persistent
 def after_save(filepath: str, _: Any = None) -> None:
-    """Take the new paths back after "Save Copy", when this session still belongs to another file or to none."""
+    """Set paths back after "Save Copy", when this session still belongs to another file or to none."""
     if not filepath or bpy.data.filepath != filepath:
         _restore()
     else:
         for owner, name, _ in _before_save:
-            # `//` did not lead there yet when the path was set, so the voxels could not be read: have it done again.
+            # `//` did not lead there yet when the path was set, so Blender could not read the voxels: set it again.
             if isinstance(owner, bpy.types.Volume):
                 setattr(owner, name, getattr(owner, name))
     _before_save.clear()
@@ -185,7 +220,7 @@ def after_save(filepath: str, _: Any = None) -> None:
 
 @bpy.app.handlers.persistent
 def after_failed_save(*_: Any) -> None:
-    """Take the new paths back when Blender could not write the .blend."""
+    """Set paths back when Blender could not write the .blend."""
     _restore()
     _before_save.clear()
 
@@ -210,6 +245,10 @@ def _bring(file: Path, target: Path) -> None:
         return  # named by its content
     with replacing(destination) as temporary:
         shutil.copyfile(file, temporary)
+
+
+def _folder() -> Path:
+    return _folder_of(bpy.data.filepath) if bpy.data.filepath else _temporary_folder()
 
 
 def _folder_of(blend: str) -> Path:

@@ -1,10 +1,9 @@
-"""OpenVDB files: volumes of ours to the last bit, and grids of other programs.
+"""OpenVDB files: our own volumes, exact to the last bit, and grids of other programs.
 
-Files of ours hold every voxel's float32 value, the float64 affine, the quantity, the unit and where the volume came from.
-The transform is OpenVDB's own, in which an integer index is the voxel's CENTRE: that is how Houdini, EmberGen and Blender 5
-place grids. Blender 4.5 draws them half a voxel farther along every index axis, so the files that a scene draws are
-shifted back there, and say so in their metadata; what is written for others is not. Of other programs' files the transform
-counts.
+Our files hold every voxel's float32 value, the float64 affine, the quantity, the unit and where the volume came from. The
+transform is OpenVDB's own, in which an integer index is the voxel's CENTRE: Houdini, EmberGen and Blender 5 place grids so.
+Blender 4.5 draws them half a voxel farther along every index axis. So the files that a scene draws are shifted back there,
+and say so in their metadata; files written for other programs are not shifted.
 """
 
 from __future__ import annotations
@@ -31,18 +30,15 @@ from .vdb_length import missing_bytes
 SMOKE = "smoke for display"
 """Name of a grid that only Blender's solid viewport uses."""
 
-_SLAB = 64  # layers handed over at once, whole leaves of 8: what is copied for OpenVDB stays small
+BACKGROUND = {"hu": AIR_HU}
+"""Value of the voxels that take no room in a file, where it is not 0: around a CT there is air, not water."""
 
+_NUMBERS = ("float", "double", "half", "int32", "int64", "bool")  # value types that can become a volume
+_SLAB = 64  # layers copied to OpenVDB at once: the copy stays small
 _NOTE = (
     "Written for a Blender that draws index i over [i, i + 1]: the centre of voxel i is where this transform carries "
     "i {back:+g} along every axis. File > Export > Volume of mphDRR writes files for other programs."
 )
-
-_NUMBERS = ("float", "double", "half", "int32", "int64", "bool")
-"""Value types of grids that can become a volume."""
-
-BACKGROUND = {"hu": AIR_HU}
-"""What voxels that take no room in a file hold, where it is not 0: what is drawn around a CT is air, not water."""
 
 
 def write_vdb(
@@ -55,51 +51,46 @@ def write_vdb(
 ) -> None:
     """Write volumes as sparse float grids, each named after its quantity; voxels of 0 (-1000 HU) take no room.
 
-    Other programs find each voxel's centre where their transforms carry its integer index. The metadata hold the exact
-    affine, so that `read_vdb` gives the same volume whatever `center_shift` was.
-
     Parameters
     ----------
     volumes
-        One, or several of different quantities, such as activity and mu; their grids need not be the same.
+        One, or several of different quantities, such as activity and mu; their grids may differ.
     path
         The file.
     provenance
-        What the volumes were made from; kept as JSON in the metadata.
+        What the volumes were made from, kept as JSON in the metadata.
     smoke_above
-        Also write a grid `SMOKE` of the first volume's values above this one, less it: Blender's solid viewport draws
-        what surrounds values below 0 black. `read_vdb` does not see it.
+        Also write a grid `SMOKE` of the first volume's values above this one, minus it: Blender's solid viewport draws
+        the surroundings of values below 0 black. `read_vdb` ignores it.
     center_shift
-        Voxels by which the transforms are shifted along every index axis, for files that a Blender draws which places them
-        otherwise (`compat.VDB_CENTER_SHIFT`). For other programs such a file lies that much off.
+        Voxels by which the transforms are shifted along every index axis, for files that a Blender draws which places
+        them otherwise (`compat.VDB_CENTER_SHIFT`). `read_vdb` gives the same volume whatever the shift was.
 
     Raises
     ------
     InputError
-        Nothing to write, two volumes of one quantity, or the file cannot be written.
+        No volumes, two of one quantity, or the file cannot be written.
     """
     several = [volumes] if isinstance(volumes, Volume) else list(volumes)
     path = Path(path)
     names = [volume.quantity for volume in several]
     if not names or len(set(names)) < len(names):
-        found = ", ".join(names) or "none"
-        raise InputError(f"{path}: expected volumes of different quantities, got {found}")
+        raise InputError(f"{path}: expected volumes of different quantities, got {', '.join(names) or 'none'}")
     grids = [_grid_of(volume, provenance or {}, center_shift) for volume in several]
     if smoke_above is not None:
-        shown = several[0]
-        above = freeze(np.maximum(shown.array - np.float32(smoke_above), 0))
-        grids.append(_grid_of(Volume(above, shown.grid), {}, center_shift))
+        above = freeze(np.maximum(several[0].array - np.float32(smoke_above), 0))
+        grids.append(_grid_of(Volume(above, several[0].grid), {}, center_shift))
         grids[-1].name = SMOKE
     with replacing(path) as temporary:
         openvdb().write(str(temporary), grids=grids)
 
 
 def read_vdb(path: str | Path, quantity: str | None = None, grid: str | None = None, *, unit: float = 1.0) -> Volume:
-    """Read a grid as a volume: one of ours the same to the last bit, any other program's by its transform.
+    """Read a grid as a volume: our own exactly, another program's by its transform.
 
-    Another program's grid becomes a volume on the box around its active voxels; outside of it a volume is 0, whatever the
-    grid's background. Grids of float, double, half, int and bool give all their values in the box, active or not, in
-    float32; a level set gives the share of each voxel that lies inside it (0 to 1).
+    Another program's grid becomes a volume on the box around its active voxels, with all values in the box, active or not,
+    in float32; outside of it a volume is 0, whatever the grid's background. A level set gives the share (0 to 1) of each
+    voxel that lies inside it.
 
     Parameters
     ----------
@@ -140,18 +131,18 @@ def read_vdb(path: str | Path, quantity: str | None = None, grid: str | None = N
 
 
 def provenance_of(path: Path) -> dict[str, Any]:
-    """What a file of ours was made from, of its first volume; nothing of other programs' and of damaged files."""
+    """What our file's first volume was made from; empty for damaged files and those of other programs."""
     try:
         grids = _described(path).values()
-    except Exception:  # whatever OpenVDB raises; reading it says what is wrong
+    except Exception:  # whatever OpenVDB raises; `read_vdb` says what is wrong
         return {}
-    found = next((grid.metadata["mphdrr_provenance"] for grid in grids if "mphdrr_provenance" in grid.metadata), "{}")
-    provenance: dict[str, Any] = json.loads(found)
+    texts = (grid.metadata.get("mphdrr_provenance") for grid in grids)
+    provenance: dict[str, Any] = json.loads(next((text for text in texts if text), "{}"))
     return provenance
 
 
 def openvdb() -> Any:
-    """The module, which comes with Blender."""
+    """OpenVDB's Python module, which comes with Blender."""
     try:
         import openvdb
     except ImportError:
@@ -167,32 +158,34 @@ def _grid_of(volume: Volume, provenance: dict[str, Any], shift: float) -> Any:
     grid = vdb.FloatGrid(BACKGROUND.get(volume.quantity, 0.0))
     array, affine = volume.array, volume.grid.affine
     mirrored = bool(np.linalg.det(affine[:3, :3]) < 0)
-    if mirrored:  # 4.5 draws nothing where the transform is left-handed: the same voxels, counted from the other end
+    if mirrored:  # Blender 4.5 draws nothing with a left-handed transform: count voxels from the other end
         array = array[::-1]
     require(4.0 * array.size, f"writing {' x '.join(map(str, array.shape))} voxels")
     for first in range(0, len(array), _SLAB):
-        # A copy, because it takes neither strides nor read-only arrays.
+        # A copy, because OpenVDB takes neither strides nor read-only arrays.
         slab = np.array(array[first : first + _SLAB], np.float32, order="C")
         grid.copyFromArray(slab, ijk=(first, 0, 0), tolerance=0.0)
     grid.name = volume.quantity
     grid.gridClass = vdb.GridClass.FOG_VOLUME
     # OpenVDB's matrices act on row vectors.
     grid.transform = vdb.createLinearTransform(_drawn(affine, volume.grid.shape, mirrored, shift).T.tolist())
-    grid["mphdrr_quantity"] = volume.quantity
-    grid["mphdrr_unit"] = volume.unit
-    grid["mphdrr_shape"] = json.dumps(volume.grid.shape)
-    grid["mphdrr_affine"] = json.dumps(affine.tolist())
-    grid["mphdrr_mirrored"] = mirrored
-    grid["mphdrr_center_shift"] = shift
-    if shift:
-        grid["mphdrr_note"] = _NOTE.format(back=-shift)
-    grid["mphdrr_provenance"] = json.dumps(provenance)
-    grid["mphdrr_version"] = VERSION
+    known = {
+        "quantity": volume.quantity,
+        "unit": volume.unit,
+        "shape": json.dumps(volume.grid.shape),
+        "affine": json.dumps(affine.tolist()),
+        "mirrored": mirrored,
+        "center_shift": shift,
+        "provenance": json.dumps(provenance),
+        "version": VERSION,
+    } | ({"note": _NOTE.format(back=-shift)} if shift else {})
+    for key, value in known.items():
+        grid[f"mphdrr_{key}"] = value
     return grid
 
 
 def _drawn(affine: NDArray[np.float64], shape: Sequence[int], mirrored: bool, shift: float) -> NDArray[np.float64]:
-    """The transform, on column vectors, of a .vdb that shows voxels of this affine where they are."""
+    """The transform, on column vectors, of a .vdb that shows voxels with this affine in their place."""
     stored = np.eye(4)
     if mirrored:
         stored[0, 0], stored[0, 3] = -1.0, shape[0] - 1
@@ -202,7 +195,7 @@ def _drawn(affine: NDArray[np.float64], shape: Sequence[int], mirrored: bool, sh
 
 
 def _described(path: Path) -> dict[str, Any]:
-    """Every grid of a file, without its voxels, by a name that OpenVDB finds it by; names that recur get a number."""
+    """The grids of a file, without voxels, by the names that OpenVDB reads them by: those that recur have a number."""
     grids = [grid for grid in openvdb().readAllGridMetadata(str(path)) if grid.name != SMOKE]
     names = [grid.name for grid in grids]
     named: dict[str, Any] = {}
@@ -213,7 +206,6 @@ def _described(path: Path) -> dict[str, Any]:
 
 
 def _chosen(grids: dict[str, Any], quantity: str | None, name: str | None) -> str:
-    """The name of the grid to read."""
     if not grids:
         raise InputError("it holds no grid, or ends before the first")
     listed = ", ".join(f"{key!r} ({grid.valueTypeName})" for key, grid in grids.items())
@@ -234,7 +226,7 @@ def _chosen(grids: dict[str, Any], quantity: str | None, name: str | None) -> st
 
 
 def _quantity_of(grid: Any) -> str | None:
-    """What a grid says that it holds."""
+    """The quantity that a grid's metadata or name says it holds."""
     named = grid.metadata.get("mphdrr_quantity", grid.name)
     return named if named in UNITS else None
 
@@ -257,7 +249,7 @@ def _volume_of(grid: Any, quantity: str | None, unit: float) -> Volume:
     n_x, n_y, n_z = (int(n) for n in last - first + 1)
     array = _values(grid, first, (n_x, n_y, n_z))
     if grid.gridClass == openvdb().GridClass.LEVEL_SET:
-        # Signed distances in the file's unit; the surface passes through voxels as a plane would.
+        # Signed distances in the file's unit; inside a voxel the surface is taken for a plane.
         size = np.cbrt(abs(np.linalg.det(drawn[:3, :3])))
         array = np.clip(0.5 - array / np.float32(size), 0.0, 1.0)
     return Volume(freeze(array), Grid((n_x, n_y, n_z), affine), quantity)
@@ -266,7 +258,7 @@ def _volume_of(grid: Any, quantity: str | None, unit: float) -> Volume:
 def _own_lattice(
     grid: Any, drawn: NDArray[np.float64]
 ) -> tuple[tuple[int, int, int], NDArray[np.float64], bool] | None:
-    """Shape, affine and whether it is stored mirrored, of a grid of ours that no other program has changed since."""
+    """Shape, affine and whether it is stored mirrored, of our own grid that no other program has changed."""
     known = grid.metadata
     if not {"mphdrr_shape", "mphdrr_affine", "mphdrr_mirrored", "mphdrr_center_shift"} <= known.keys():
         return None
@@ -283,16 +275,13 @@ def _own_lattice(
 
 
 def _centered(grid: Any, drawn: NDArray[np.float64]) -> NDArray[np.float64]:
-    """From an integer index to the voxel's centre, of a grid whose transform is `drawn`.
-
-    That is the transform itself, but for a grid of ours that was shifted for Blender 4.5 and has been moved since.
-    """
+    """From an integer index to the voxel's centre: the transform, unless it is shifted for Blender 4.5."""
     known = grid.metadata
     shift = known.get("mphdrr_center_shift", 0.0)
     if not shift or "mphdrr_affine" not in known:
         return drawn
     before, now = np.array(json.loads(known["mphdrr_affine"]))[:3, :3], drawn[:3, :3]
-    # Voxels as large and as sheared as before; a mirrored grid is stored with its first axis turned round.
+    # Has it been resampled? Compare the voxels' sizes and shears; a mirrored grid has its first axis turned round.
     was, is_now = np.abs(before.T @ before), np.abs(now.T @ now)
     if not np.allclose(is_now, was, rtol=0, atol=1e-6 * was.max()):
         warnings.warn(
@@ -309,7 +298,7 @@ def _centered(grid: Any, drawn: NDArray[np.float64]) -> NDArray[np.float64]:
 
 def _affine_of(transform: Any) -> NDArray[np.float64]:
     """A linear transform as a matrix (4, 4) on column vectors."""
-    far = 2.0**20  # so that subtracting the origin costs no digits
+    far = 2.0**20  # index units: far enough that subtracting the origin costs no digits
     origin = np.array(transform.indexToWorld((0.0, 0.0, 0.0)))
     affine = np.eye(4)
     affine[:3, 3] = origin
@@ -321,7 +310,7 @@ def _affine_of(transform: Any) -> NDArray[np.float64]:
 
 
 def _values(grid: Any, first: NDArray[Any], shape: tuple[int, ...]) -> NDArray[np.float32]:
-    """The grid's values, from the voxel `first` on, active or not."""
+    """The grid's values from the voxel `first` on, active or not."""
     require(4.0 * np.prod(shape, dtype=float), f"the volume of {' x '.join(map(str, shape))} voxels")
     array = np.zeros(shape, np.float32)
     grid.copyToArray(array, ijk=tuple(int(i) for i in first))

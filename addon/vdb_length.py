@@ -1,4 +1,4 @@
-"""Whether an OpenVDB file ends before its last grid does: OpenVDB itself reads on past a missing end, as other values."""
+"""Whether an OpenVDB file is cut off: OpenVDB itself reads past a missing end and takes what it finds for values."""
 
 from __future__ import annotations
 
@@ -13,16 +13,16 @@ _MOST_GRIDS = 10_000
 
 
 def missing_bytes(path: Path) -> int:
-    """How many bytes are missing at a file's end; 0 also of files that are laid out otherwise or say nothing of it.
+    """How many bytes are missing at a file's end; 0 also where the file's layout does not say.
 
-    OpenVDB's `io::Archive`: a header, the file's metadata, then each grid after a descriptor with the places where its
+    OpenVDB's `io::Archive`: a header, the file's metadata, then each grid after a descriptor with the offsets at which its
     parts begin and end.
     """
     length = path.stat().st_size
     with path.open("rb") as file:
         try:
             return max(0, _last_end(file) - length)
-        except (struct.error, _OtherLayout):  # a file so short is refused by OpenVDB
+        except (struct.error, _OtherLayout):  # OpenVDB itself refuses a file that is cut off in its header
             return 0
 
 
@@ -37,11 +37,11 @@ def _last_end(file: BinaryIO) -> int:
     file.seek(_UUID_CHARACTERS, 1)
     (count,) = _numbers(file, "I")
     for _ in range(_at_most(count, _MOST_GRIDS)):
-        _skip_texts(file, 3)  # of metadata name, type and value, which has its length before it too
+        _skip_texts(file, 3)  # name, type and value of metadata, each after its length
     (count,) = _numbers(file, "I")
     end = 0
     for _ in range(_at_most(count, _MOST_GRIDS)):
-        _skip_texts(file, 3)  # of the grid: name, type and instance parent
+        _skip_texts(file, 3)  # the grid's name, type and instance parent
         _begin, _blocks, end = _numbers(file, "qqq")
         file.seek(max(end, 0))
     return end

@@ -1,7 +1,6 @@
 """How volumes look: the volume material, and the density of the solid viewport's smoke.
 
-Activity glows in the colours of "inferno"; attenuation and CT numbers look like a radiograph, brighter where they are
-higher.
+Activity glows in the colours of "inferno"; attenuation and CT numbers look like a radiograph, the higher the brighter.
 """
 
 from __future__ import annotations
@@ -10,8 +9,7 @@ import bpy
 
 from .compat import enable_nodes
 
-# Positions and colours (linear RGB) of the ramp: Matplotlib's "inferno" (CC0), perceptually even, without its pale end,
-# which tone mapping bleaches.
+# Positions and linear RGB of Matplotlib's "inferno" (CC0), without its pale end, which tone mapping would bleach.
 _INFERNO = (
     (0.00, (0.0119, 0.0025, 0.0461)),
     (0.25, (0.0953, 0.0052, 0.1513)),
@@ -22,15 +20,9 @@ _INFERNO = (
 _GREYS = ((0.00, (0.02, 0.02, 0.02)), (1.00, (0.80, 0.80, 0.80)))
 _XRAY = ("mu", "hu")
 _CT_WINDOW = (-200.0, 1000.0)  # HU: skin to bone
-# Extinction times the volume's size: high enough that a rod of a twentieth of it looks solid; patients and maps are
-# looked through.
-_OPACITY = 60.0
-_OPACITY_THROUGH = 20.0
-_BRIGHTNESS = 1.0
-# The same for the solid viewport, whose smoke is denser and has no shading: thin enough that rods show behind rods.
-_SMOKE = 15.0
-
-
+# Extinction times the volume's size: a rod of a twentieth of it looks solid; attenuation and maps can be looked through.
+_OPACITY, _OPACITY_THROUGH = 60.0, 20.0
+_SMOKE = 15.0  # the same for the solid viewport's smoke, which is denser: thin enough that rods show behind rods
 _RANGE = "Display Range"  # the node that holds the values at the ramp's ends
 _OPACITY_NODE = "Opacity"
 
@@ -41,23 +33,16 @@ def ramp(quantity: str) -> tuple[tuple[float, tuple[float, float, float]], ...]:
 
 
 def usual_range(quantity: str, low: float, high: float) -> tuple[float, float]:
-    """The values to begin the display range with, of a volume with values from `low` to `high`."""
+    """The display range that a volume with values from `low` to `high` begins with."""
     if quantity == "hu":
         return _CT_WINDOW
     return 0.0, high if high > 0 else max(-low, 1.0)
 
 
 def new_material(name: str, quantity: str, size: float) -> bpy.types.Material:
-    """Material that shows a grid by colour, glowing and opaque where its values are high; `set_range` says where that is.
+    """A material that glows and is opaque where the values of the .vdb's grid `quantity` are high (see `set_range`).
 
-    Parameters
-    ----------
-    name
-        The material's name.
-    quantity
-        Of the volume; also the name of the .vdb's grid that drives the material.
-    size
-        Of the volume, mm; the node "Opacity" is set from it.
+    The volume's `size`, mm, sets the node "Opacity".
     """
     material = bpy.data.materials.new(name)
     enable_nodes(material)
@@ -83,8 +68,6 @@ def new_material(name: str, quantity: str, size: float) -> bpy.types.Material:
     opacity = node("ShaderNodeValue", 1, 1.3, name=_OPACITY_NODE, label="Opacity (1/mm)")
     opacity.outputs[0].default_value = (_OPACITY if quantity == "activity" else _OPACITY_THROUGH) / size
     extinction = node("ShaderNodeMath", 2, 0.3, operation="MULTIPLY")
-    strength = node("ShaderNodeMath", 3, 0, operation="MULTIPLY")
-    strength.inputs[1].default_value = _BRIGHTNESS
     absorption = node("ShaderNodeVolumeAbsorption", 4, 0.6)
     absorption.inputs["Color"].default_value = (0.0, 0.0, 0.0, 1.0)
     emission = node("ShaderNodeEmission", 4, -0.4)
@@ -96,10 +79,9 @@ def new_material(name: str, quantity: str, size: float) -> bpy.types.Material:
     link(relative.outputs["Result"], color.inputs["Fac"])
     link(relative.outputs["Result"], extinction.inputs[0])
     link(opacity.outputs[0], extinction.inputs[1])
-    link(extinction.outputs[0], strength.inputs[0])
     link(extinction.outputs[0], absorption.inputs["Density"])
     link(color.outputs["Color"], emission.inputs["Color"])
-    link(strength.outputs[0], emission.inputs["Strength"])
+    link(extinction.outputs[0], emission.inputs["Strength"])
     link(absorption.outputs[0], both.inputs[0])
     link(emission.outputs[0], both.inputs[1])
     link(both.outputs[0], output.inputs["Volume"])
@@ -108,7 +90,7 @@ def new_material(name: str, quantity: str, size: float) -> bpy.types.Material:
 
 
 def set_range(material: bpy.types.Material, low: float, high: float) -> None:
-    """Let the colours go from the value `low` to `high`; a material of the user's own making stays as it is."""
+    """Spread the colours from the value `low` to `high`; a material that the user made is left alone."""
     node = material.node_tree.nodes.get(_RANGE) if material.node_tree else None
     if node is not None:
         node.inputs["From Min"].default_value = low
@@ -116,7 +98,7 @@ def set_range(material: bpy.types.Material, low: float, high: float) -> None:
 
 
 def resize(material: bpy.types.Material, old: float, new: float) -> None:
-    """Keep a volume as opaque as it was when its size, mm, changes from `old` to `new`."""
+    """Keep a volume as opaque as before when its size, mm, changes from `old` to `new`."""
     node = material.node_tree.nodes.get(_OPACITY_NODE) if material.node_tree else None
     if node is not None:
         node.outputs[0].default_value *= old / new
@@ -130,7 +112,7 @@ def set_display(data: bpy.types.Volume, low: float, high: float, size: float) ->
 
 
 def show_in_eevee(scene: bpy.types.Scene) -> None:
-    """Let EEVEE draw volumes at a scanner's distances: its own limit is 100 units. Settings that were changed stay."""
+    """Let EEVEE draw volumes beyond its default limit of 100 units, finely; settings that were changed are kept."""
     eevee = scene.eevee
     if eevee.use_volume_custom_range and eevee.volumetric_end == 100.0:
         eevee.use_volume_custom_range = False

@@ -141,11 +141,11 @@ def in_the_scanner(system: mph.PinholeSystem, folder: Path, ct: mph.Volume | Non
     first, last = int(system.numbers.min()), int(system.numbers.max())
     bpy.ops.mphdrr.add_map(quantity="sensitivity", voxels=128)
     (shown,) = volumes.volume_objects(scene)
-    pictures.render_scanner(scene, collection, folder / "sensitivity.png", first, last, shown, zoom=1.5)
+    pictures.render_scanner(collection, folder / "sensitivity.png", first, last, shown, zoom=1.5)
     bpy.data.objects.remove(shown)
     if ct is not None:
         shown = volumes.add_volume(ct, "chest CT")
-        pictures.render_scanner(scene, collection, folder / "ct.png", first, last, shown, zoom=1.2)
+        pictures.render_scanner(collection, folder / "ct.png", first, last, shown, zoom=1.2)
 
 
 if __name__ == "__main__":

@@ -2,27 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Generator
-from typing import Any
-
 import bpy
 from bpy.props import BoolProperty, EnumProperty, FloatProperty, IntProperty
 
-from ..addon import choices, ids, jobs, scanner, selection, storage, volume_materials, volumes
+from ..addon import ids, jobs, maps, selection
 from ..addon.decimals import typed
-from ..core.geometry.grid import Grid
-from ..core.memory import require
-from ..core.physics.maps import MAPS, within_roi
-from ..core.progress import Progress
-
-_DESCRIPTIONS = {
-    "sensitivity": "Counts per decay of all modules together",
-    "modules": "Number of modules that see a voxel",
-    "resolution": "FWHM in mm that the projections hold, all modules together",
-    "completeness": "Of the angular sampling (Tuy): 1 where every plane through the voxel meets a pinhole. Slow",
-}
-_ITEMS = choices.items(choices.MAPS, ((name, name.capitalize(), _DESCRIPTIONS[name]) for name in MAPS))
-_BYTES = 40.0  # a voxel, while the map is made and put into the scene
 
 
 class MPHDRR_OT_add_map(jobs.JobOperator, bpy.types.Operator):
@@ -36,11 +20,7 @@ class MPHDRR_OT_add_map(jobs.JobOperator, bpy.types.Operator):
     )
     bl_options = {"REGISTER", "UNDO"}
 
-    quantity: EnumProperty(
-        name="Quantity",
-        description="What is mapped",
-        items=_ITEMS,
-    )
+    quantity: EnumProperty(name="Quantity", description="What is mapped", items=maps.QUANTITIES)
     voxels: IntProperty(
         name="Voxels", description="Voxels along each side of the map", default=64, min=2, soft_max=256, max=1024
     )
@@ -55,32 +35,4 @@ class MPHDRR_OT_add_map(jobs.JobOperator, bpy.types.Operator):
         return selection.poll_scanner(cls, context)
 
     def job(self, context: bpy.types.Context) -> jobs.Job:
-        scene, collection = context.scene, scanner.required_scanner(context.scene)
-        system = scanner.read_scanner(collection)
-        side = typed(self.side) or 2 * float(system.roi_radius.max())
-        grid = Grid.centered((self.voxels,) * 3, side / self.voxels)
-        require(_BYTES * grid.n_voxels, f"a map of {self.voxels}^3 voxels")
-        quantity, only_roi = self.quantity, self.within_roi
-        name, folder = f"{quantity.capitalize()} map", storage.folder()
-        recipe: dict[str, Any] = {"map": quantity, "modules": len(system), "scanner": collection.name}
-
-        def work(progress: Progress) -> volumes.StoredVolume:
-            volume = MAPS[quantity](system, grid, progress=progress)
-            return volumes.store_volume(within_roi(volume, system) if only_roi else volume, folder, provenance=recipe)
-
-        def finish(stored: volumes.StoredVolume) -> Generator[None, None, str]:
-            yield
-            old = [o for o in volumes.volume_objects(scene) if getattr(o, ids.OBJECT_VOLUME).quantity == quantity]
-            if old:
-                item = old[0]
-                volumes.replace_stored(item, stored)
-            else:
-                item = volumes.add_stored(stored, name, scene.collection)
-                volume_materials.show_in_eevee(scene)
-            values, high = stored.volume.array, stored.high
-            low = float(values[values > 0].min(initial=high))
-            settings = getattr(item, ids.OBJECT_VOLUME)
-            settings.display_low, settings.display_high = low if low < high else 0.0, high
-            return f"{name}: {low:.4g} to {high:.4g} {stored.volume.unit}".removesuffix(" 1")
-
-        return jobs.Job(f"{name} of {len(system)} modules", work, finish)
+        return maps.mapping(context.scene, self.quantity, self.voxels, typed(self.side), self.within_roi)

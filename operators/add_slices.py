@@ -5,7 +5,7 @@ from __future__ import annotations
 import bpy
 
 from ..addon import ids, slices, volumes
-from ..core.errors import InputError
+from ..addon.reports import run_reported
 
 
 class MPHDRR_OT_add_slices(bpy.types.Operator):
@@ -19,16 +19,10 @@ class MPHDRR_OT_add_slices(bpy.types.Operator):
         return volumes.poll_volume(cls, context)
 
     def execute(self, context: bpy.types.Context) -> set[str]:
-        try:
-            slices.add_slices(context.object)
-        except InputError as error:
-            self.report({"ERROR"}, str(error))
-            return {"CANCELLED"}
         for area in context.screen.areas if context.screen else ():
-            space = area.spaces.active
-            if space.type == "VIEW_3D":
-                space.shading.color_type = "TEXTURE"  # the solid viewport's default shows no pictures
-        return {"FINISHED"}
+            if area.type == "VIEW_3D":
+                area.spaces.active.shading.color_type = "TEXTURE"  # the solid viewport's default shows no pictures
+        return run_reported(self, lambda: f"Added {len(slices.add_slices(context.object))} slices")
 
 
 class MPHDRR_OT_remove_slices(bpy.types.Operator):
@@ -39,12 +33,7 @@ class MPHDRR_OT_remove_slices(bpy.types.Operator):
 
     @classmethod
     def poll(cls, context: bpy.types.Context) -> bool:
-        if not volumes.poll_volume(cls, context):
-            return False
-        if not slices.planes_of(context.object):
-            cls.poll_message_set("The active volume has no slices")
-            return False
-        return True
+        return volumes.poll_volume(cls, context)
 
     def execute(self, context: bpy.types.Context) -> set[str]:
         slices.remove_slices(context.object)

@@ -1,4 +1,4 @@
-"""How the column map dialog of the import looks."""
+"""The column map dialog of the import, drawn."""
 
 from __future__ import annotations
 
@@ -12,14 +12,13 @@ from ..core.workbook.quantities import DERIVED, QUANTITIES
 
 WIDTH = 1000  # of the dialog, pixels
 _LINE = 170  # characters that fit in it
-_DOUBTS = 2  # more of them push the preview off the screen
-_REMARKS = 2
-_RESULT = 9  # lines kept for the preview: a dialog that grows moves away from the mouse
+_MOST = 2  # doubts and remarks shown; more would push the preview off the screen
+_RESULT = 9  # lines reserved for the preview: a dialog that grows moves away from the mouse
 
 
 def draw(layout: bpy.types.UILayout, form: ColumnMapProperties) -> None:
-    """The settings, and beneath them what they give."""
-    _lines(layout, json.loads(form.doubts or "[]"), _DOUBTS, "INFO")
+    """Draw the settings, and below them what is read with them."""
+    _lines(layout, json.loads(form.doubts or "[]"), "INFO")
     row = layout.row()
     row.prop(form, "n_tables")
     row.prop(form, "unit")
@@ -50,15 +49,13 @@ def _tables(layout: bpy.types.UILayout, form: ColumnMapProperties) -> None:
 
 
 def _quantities(layout: bpy.types.UILayout, form: ColumnMapProperties) -> None:
-    """What is read and, in a column of their own, what is only compared."""
+    """Draw the quantities that are read and, beside them, those that are only compared."""
     compared = [quantity for quantity in form.quantities if quantity.name in DERIVED]
     read = [quantity for quantity in form.quantities if quantity.name not in DERIVED]
-    if not compared:
-        _columns(layout, "Quantity", read, 0.34)
-        return
-    split = layout.split(factor=0.6)
+    split = layout.split(factor=0.6) if compared else layout
     _columns(split, "Quantity", read, 0.38)
-    _columns(split, "Compared", compared, 0.2)
+    if compared:
+        _columns(split, "Compared", compared, 0.2)
 
 
 def _columns(layout: bpy.types.UILayout, head: str, quantities: list[ColumnMapQuantity], factor: float) -> None:
@@ -89,7 +86,7 @@ def _result(layout: bpy.types.UILayout, form: ColumnMapProperties) -> None:
     rows = json.loads(form.preview or "[]")
     if form.refusal:
         box.alert = True
-        used = _lines(box, [form.refusal], 1, "ERROR")
+        used = _lines(box, [form.refusal], "ERROR")
     else:
         box.label(text=f"{form.n_modules} modules, in mm:", icon="CHECKMARK")
         columns = box.row()
@@ -99,21 +96,21 @@ def _result(layout: bpy.types.UILayout, form: ColumnMapProperties) -> None:
                 cell = column.row()
                 cell.alignment, cell.active = "RIGHT", i > 0
                 cell.label(text=text)
-        used = 1 + len(rows) + _lines(box, json.loads(form.remarks or "[]"), _REMARKS, "ERROR")
+        used = 1 + len(rows) + _lines(box, json.loads(form.remarks or "[]"), "ERROR")
     for _ in range(used, _RESULT):
         box.label(text="")
 
 
-def _lines(layout: bpy.types.UILayout, texts: list[str], most: int, icon: str) -> int:
-    """Texts of any length, broken into lines; says how many."""
-    column = layout.column(align=True)
+def _lines(layout: bpy.types.UILayout, texts: list[str], icon: str) -> int:
+    """Draw texts of any length, broken into lines; returns how many lines."""
     lines = [
         (line, icon if i == 0 else "BLANK1")
-        for text in texts[:most]
+        for text in texts[:_MOST]
         for i, line in enumerate(textwrap.wrap(text, _LINE))
     ]
-    if len(texts) > most:
-        lines.append((f"... and {len(texts) - most} more", "BLANK1"))
+    if len(texts) > _MOST:
+        lines.append((f"... and {len(texts) - _MOST} more", "BLANK1"))
+    column = layout.column(align=True)
     for line, sign in lines:
         column.label(text=line, icon=sign)
     return len(lines)

@@ -2,18 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Generator
-from typing import Any
-
 import bpy
 from bpy.props import FloatProperty
 
-from ..addon import ids, jobs, storage, volumes
+from ..addon import ids, jobs, volume_import, volumes
 from ..addon.decimals import typed
-from ..core.memory import require
-from ..core.physics.ct_numbers import hu_to_mu
-from ..core.progress import Progress
-from ..core.volumes.volume import UNITS, Volume
 
 
 class MPHDRR_OT_ct_to_attenuation(jobs.JobOperator, bpy.types.Operator):
@@ -22,7 +15,7 @@ class MPHDRR_OT_ct_to_attenuation(jobs.JobOperator, bpy.types.Operator):
     bl_idname = ids.CT_TO_ATTENUATION
     bl_label = "CT to Attenuation"
     bl_description = (
-        "Make a volume of attenuation coefficients (1/mm) of the active volume of CT numbers, for radiographs and for SPECT "
+        "Make a volume of attenuation coefficients (1/mm) from the active volume of CT numbers, for radiographs and SPECT "
         "counts; the CT stays"
     )
     bl_options = {"REGISTER", "UNDO"}
@@ -40,30 +33,7 @@ class MPHDRR_OT_ct_to_attenuation(jobs.JobOperator, bpy.types.Operator):
         return True
 
     def ask(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str] | None:
-        return context.window_manager.invoke_props_dialog(self, title=self.bl_label, confirm_text="Convert")
+        return self.ask_in_dialog(context, "Convert")
 
     def job(self, context: bpy.types.Context) -> jobs.Job:
-        item, energy = context.object, typed(self.energy)
-        readers, pose, folder = volumes.state_readers(item), volumes.pose_of_object(item), storage.folder()
-        name, collection, count = f"{item.name} mu", item.users_collection[0], len(readers)
-        n_x, n_y, n_z = getattr(item, ids.OBJECT_VOLUME).shape
-        require(8.0 * count * n_x * n_y * n_z, f"the attenuation of {count * n_x * n_y * n_z} voxels")
-        recipe: dict[str, Any] = {"ct": item.name, "energy_keV": energy}
-        frame_start, sequence_mode = item.data.frame_start, item.data.sequence_mode
-
-        def work(progress: Progress) -> volumes.StoredVolume:
-            states: list[Volume] = []
-            for read in readers:
-                progress(len(states), count + 1)
-                states.append(hu_to_mu(read(), energy))
-            progress(count, count + 1)
-            return volumes.store_volume(states, folder, pose, recipe)
-
-        def finish(stored: volumes.StoredVolume) -> Generator[None, None, str]:
-            yield
-            made = volumes.add_stored(stored, name, collection)
-            made.data.frame_start, made.data.sequence_mode = frame_start, sequence_mode
-            volumes.make_active(bpy.context, made)
-            return f"Added {made.name!r}: {stored.low:.4g} to {stored.high:.4g} {UNITS['mu']} at {energy:g} keV"
-
-        return jobs.Job("CT to attenuation", work, finish)
+        return volume_import.converting(context.object, typed(self.energy))

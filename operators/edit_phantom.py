@@ -1,59 +1,37 @@
-"""What is done to a phantom in the scene: made anew, its pose applied, its outline shown."""
+"""What is done to a phantom in the scene: its voxels made again, its pose applied, its outline shown."""
 
 from __future__ import annotations
 
-from collections.abc import Generator
-
 import bpy
 
-from ..addon import ids, jobs, phantoms, volumes
-from ..core.errors import InputError
+from ..addon import ids, jobs, phantoms
+from ..addon.reports import run_reported
 
 
 class _EditPhantom(jobs.JobOperator):
     """Mix into an operator that makes the active phantom's voxels."""
 
     bake = False
-    done = "Made {} anew"
 
     @classmethod
     def poll(cls, context: bpy.types.Context) -> bool:
-        """A phantom is active."""
         return phantoms.poll_phantom(cls, context)
 
     def job(self, context: bpy.types.Context) -> jobs.Job:
-        bake, done, name = self.bake, self.done, context.object.name
-        work, made_of = phantoms.remaking(context.object, bake), phantoms.settings_of(context.object).values()
-
-        def finish(stored: list[volumes.StoredVolume]) -> Generator[None, None, str]:
-            yield
-            item = bpy.data.objects.get(name)
-            settings = phantoms.settings_of(item)
-            if item is None or settings is None:
-                raise InputError(f"the phantom {name!r} is gone")
-            has_changed = settings.values() != made_of
-            phantoms.replace(item, stored, bake)
-            if not has_changed or bake:
-                return done.format(repr(name))
-            getattr(item, ids.OBJECT_VOLUME).outdated = True
-            return f"{done.format(repr(name))}; its settings have changed in the meantime"
-
-        return jobs.Job("Making a phantom", work, finish)
+        return phantoms.updating(context.object, self.bake)
 
 
 class MPHDRR_OT_update_phantom(_EditPhantom, bpy.types.Operator):
     bl_idname = ids.UPDATE_PHANTOM
     bl_label = "Update Phantom"
-    bl_description = "Make the active phantom's voxels anew from its settings; its place stays"
+    bl_description = "Make the active phantom's voxels again from its settings; its place stays"
     bl_options = {"REGISTER", "UNDO"}
 
 
 class MPHDRR_OT_update_derenzo(_EditPhantom, bpy.types.Operator):
-    """The name that `MPHDRR_OT_update_phantom` has in older scripts."""
-
-    bl_idname = ids.UPDATE_DERENZO
+    bl_idname = ids.UPDATE_DERENZO  # what older scripts call it
     bl_label = "Update Phantom"
-    bl_description = "Make the active phantom's voxels anew from its settings; its place stays"
+    bl_description = MPHDRR_OT_update_phantom.bl_description
     bl_options = {"INTERNAL", "UNDO"}
 
 
@@ -61,13 +39,12 @@ class MPHDRR_OT_apply_phantom_pose(_EditPhantom, bpy.types.Operator):
     bl_idname = ids.APPLY_PHANTOM_POSE
     bl_label = "Apply Pose"
     bl_description = (
-        "Make the active phantom's voxels anew where it stands, on a grid along the world's axes. It becomes a volume "
+        "Make the active phantom's voxels again where it stands, on a grid along the world's axes. It becomes a volume "
         "like any other: its settings are given up"
     )
     bl_options = {"REGISTER", "UNDO"}
 
     bake = True
-    done = "Applied the pose of {}"
 
 
 class MPHDRR_OT_show_phantom_outline(bpy.types.Operator):
@@ -81,13 +58,4 @@ class MPHDRR_OT_show_phantom_outline(bpy.types.Operator):
         return phantoms.poll_phantom(cls, context)
 
     def execute(self, context: bpy.types.Context) -> set[str]:
-        item = context.object
-        if phantoms.outline_of(item) is not None:
-            phantoms.remove_outline(item)
-            return {"FINISHED"}
-        try:
-            phantoms.show_outline(item)
-        except InputError as error:
-            self.report({"ERROR"}, str(error))
-            return {"CANCELLED"}
-        return {"FINISHED"}
+        return run_reported(self, lambda: phantoms.toggle_outline(context.object))

@@ -1,18 +1,21 @@
-"""File > Export > Pinhole Geometry: the scanner becomes a workbook."""
+"""File > Export > Pinhole Geometry: the scanner as a workbook, or as another program's file."""
 
 from __future__ import annotations
 
 from pathlib import Path
 
 import bpy
-from bpy.props import BoolProperty, StringProperty
+from bpy.props import BoolProperty, EnumProperty, StringProperty
 from bpy_extras.io_utils import ExportHelper
 
-from ..addon import geometry_file, ids, scanner, selection, storage
-from ..addon.reports import warnings_reported
+from ..addon import ids, scanner, scanner_files, selection, storage
+from ..addon.decimals import typed
+from ..addon.reports import run_reported
+from ..addon.scanner_files import WORKBOOK_SUFFIXES
 from ..core.errors import InputError
+from ..core.exchange import FORMAT_NUMBERS, FORMATS
 
-_SUFFIXES = (".xlsx", ".xlsm")
+_FORMATS = tuple((f.name, f.name, f.title, FORMAT_NUMBERS[f.name]) for f in FORMATS.values())
 
 
 class MPHDRR_OT_export_geometry(ExportHelper, bpy.types.Operator):
@@ -25,7 +28,7 @@ class MPHDRR_OT_export_geometry(ExportHelper, bpy.types.Operator):
 
     filename_ext = ".xlsx"
     filepath: StringProperty(name="File", description="Workbook to write", subtype="FILE_PATH", options={"SKIP_SAVE"})
-    filter_glob: StringProperty(default=";".join(f"*{s}" for s in _SUFFIXES), options={"HIDDEN"})
+    filter_glob: StringProperty(default=";".join(f"*{s}" for s in WORKBOOK_SUFFIXES), options={"HIDDEN"})
     use_template: BoolProperty(
         name="Keep Workbook",
         description="Write into a copy of the workbook that the scanner was imported from: its other sheets, formulas, "
@@ -40,34 +43,88 @@ class MPHDRR_OT_export_geometry(ExportHelper, bpy.types.Operator):
     def invoke(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str]:
         workbook = scanner.required_scanner(context.scene).mphdrr_scanner.workbook
         if not self.filepath and workbook:
-            # Not the master record itself: whoever wants to replace that chooses its name.
+            # Not the workbook itself: overwriting it takes typing its name.
             path = storage.absolute(workbook)
             self.filepath = str(path.with_stem(f"{path.stem.removesuffix('-edited')}-edited"))
         return super().invoke(context, event)
 
     def check(self, context: bpy.types.Context) -> bool:
-        """Give a name without one of the suffixes the default one."""
-        if Path(self.filepath).suffix.lower() in _SUFFIXES:
+        """Add the default suffix to a name without one."""
+        if Path(self.filepath).suffix.lower() in WORKBOOK_SUFFIXES:
             return False
         self.filepath += self.filename_ext
         return True
 
     def execute(self, context: bpy.types.Context) -> set[str]:
-        try:
+        def export() -> str:
             if not self.filepath:
                 raise InputError("no file given: set filepath to a name ending in .xlsx")
             path = storage.absolute(self.filepath)
-            with warnings_reported(self):
-                system = geometry_file.export_scanner(
-                    scanner.required_scanner(context.scene), path, use_template=self.use_template
-                )
-        except InputError as error:
-            self.report({"ERROR"}, str(error))
-            return {"CANCELLED"}
-        self.report({"INFO"}, f"Wrote {len(system)} modules to {path}")
-        return {"FINISHED"}
+            collection = scanner.required_scanner(context.scene)
+            system = scanner_files.export_scanner(collection, path, self.use_template)
+            return f"Wrote {len(system)} modules to {path}"
+
+        return run_reported(self, export)
+
+
+class MPHDRR_OT_export_for_program(ExportHelper, bpy.types.Operator):
+    """``bpy.ops.mphdrr.export_for_program(format="astra", filepath="scanner.npz")``."""
+
+    bl_idname = ids.EXPORT_FOR_PROGRAM
+    bl_label = "Export Geometry for a Program"
+    bl_description = (
+        "Write the scanner as it stands in the scene for another program: cameras for reconstruction codes, solids to "
+        "print, Monte Carlo simulations. Images are those of the Projections panel"
+    )
+
+    filename_ext = ""
+    filepath: StringProperty(
+        name="File", description="File to write, or new folder for formats of several files", subtype="FILE_PATH",
+        options={"SKIP_SAVE"},
+    )  # fmt: skip
+    format: EnumProperty(name="Format", description="What is written", items=_FORMATS)
+
+    @classmethod
+    def poll(cls, context: bpy.types.Context) -> bool:
+        return selection.poll_scanner(cls, context)
+
+    def check(self, context: bpy.types.Context) -> bool:
+        """Give the name the format's suffix."""
+        path, suffixes = Path(self.filepath), FORMATS[self.format].suffixes
+        if not path.name or path.name.lower().endswith(suffixes or ()):
+            return False
+        known = {suffix for format in FORMATS.values() for suffix in format.suffixes}
+        stem = path.with_suffix("") if path.suffix.lower() in known else path
+        before, self.filepath = self.filepath, str(stem) + (suffixes[0] if suffixes else "")
+        return before != self.filepath
+
+    def execute(self, context: bpy.types.Context) -> set[str]:
+        def export() -> str:
+            if not self.filepath:
+                raise InputError("no file given: set filepath")
+            path, images = storage.absolute(self.filepath), context.scene.mphdrr_projections
+            system = scanner_files.export_for_program(
+                scanner.required_scanner(context.scene),
+                path,
+                self.format,
+                (images.height, images.width),
+                images.detector.lower(),
+                typed(images.magnification),
+            )
+            return f"Wrote {len(system)} modules to {path}"
+
+        return run_reported(self, export)
+
+    def draw(self, context: bpy.types.Context) -> None:
+        layout = self.layout
+        layout.prop(self, "format")
+        format = FORMATS[self.format]
+        column = layout.column(align=True)
+        for line in (format.title, f"Suffix {', '.join(format.suffixes)}" if format.suffixes else "A new folder"):
+            column.label(text=line, icon="DOT")
 
 
 def draw_menu(self: bpy.types.Menu, context: bpy.types.Context) -> None:
     """The entry of File > Export."""
     self.layout.operator(ids.EXPORT_GEOMETRY, text="Pinhole Geometry (.xlsx)")
+    self.layout.operator(ids.EXPORT_FOR_PROGRAM, text="Pinhole Geometry for Programs")

@@ -1,6 +1,6 @@
 """File > Import > Pinhole Geometry: a workbook becomes a scanner.
 
-What the reader does not understand, the user says in the column map dialog, or a script with `columns`.
+Where the reader does not understand the headings, the user answers in the column map dialog; a script sets `columns`.
 """
 
 from __future__ import annotations
@@ -13,13 +13,13 @@ from bpy.props import BoolProperty, FloatProperty, IntVectorProperty, StringProp
 
 from ..addon import column_maps, ids, scanner
 from ..addon.preferences import preferences
-from ..addon.reports import warnings_reported
+from ..addon.reports import run_reported, warnings_reported
+from ..addon.scanner_files import WORKBOOK_SUFFIXES
 from ..core.errors import InputError
+from ..core.geometry.collimator import Construction
 from ..core.geometry.system import PinholeSystem
 from ..core.workbook import ColumnMap, read_system
 from . import column_map_dialog
-
-_SUFFIXES = (".xlsx", ".xlsm")
 
 
 class MPHDRR_OT_import_geometry(bpy.types.Operator):
@@ -33,18 +33,18 @@ class MPHDRR_OT_import_geometry(bpy.types.Operator):
     bl_options = {"REGISTER", "UNDO"}
 
     filepath: StringProperty(name="File", description="Workbook to read", subtype="FILE_PATH", options={"SKIP_SAVE"})
-    filter_glob: StringProperty(default=";".join(f"*{s}" for s in _SUFFIXES), options={"HIDDEN"})
+    filter_glob: StringProperty(default=";".join(f"*{s}" for s in WORKBOOK_SUFFIXES), options={"HIDDEN"})
     name: StringProperty(
         name="Name", description="Name of the scanner, which replaces one of the same name. Empty: the file's",
         options={"SKIP_SAVE"},
     )  # fmt: skip
     columns: StringProperty(
-        name="Column Map", description="File (.toml) that says which columns hold what. Empty: the headings say it",
+        name="Column Map", description="File (.toml) that says which columns hold what. Empty: read the headings",
         subtype="FILE_PATH", options={"SKIP_SAVE"},
     )  # fmt: skip
     choose_columns: BoolProperty(
         name="Choose Columns",
-        description="Say in a dialog which columns hold what, as when the headings are not understood",
+        description="Say in a dialog which columns hold what. It opens by itself where the headings are not understood",
         options={"SKIP_SAVE"},
     )
     chosen_columns: StringProperty(
@@ -55,19 +55,11 @@ class MPHDRR_OT_import_geometry(bpy.types.Operator):
         default=2.0, min=0.01, soft_max=20.0,
     )  # fmt: skip
     wall_thickness: FloatProperty(
-        name="Wall (mm)",
-        description="Thickness in mm of the collimator's walls",
-        default=2.0,
-        min=0.01,
-        soft_max=20.0,
-    )
+        name="Wall (mm)", description="Thickness in mm of the collimator's walls", default=2.0, min=0.01, soft_max=20.0,
+    )  # fmt: skip
     image_size: IntVectorProperty(
-        name="Image Size",
-        description="Pixels of the cameras' pictures: columns, rows",
-        size=2,
-        default=(256, 256),
-        min=1,
-    )
+        name="Image Size", description="Pixels of the cameras' pictures: columns, rows", size=2, default=(256, 256), min=1,
+    )  # fmt: skip
     replace: BoolProperty(
         name="Replace Changed Scanner",
         description="Replace a scanner of the same name even if it has been changed since it was imported",
@@ -86,54 +78,53 @@ class MPHDRR_OT_import_geometry(bpy.types.Operator):
         return self.execute(context)
 
     def execute(self, context: bpy.types.Context) -> set[str]:
-        form = column_maps.settings(context)
+        form = context.window_manager.mphdrr_columns
         try:
             if self._dialog == "COLUMNS":
                 self.chosen_columns = column_maps.accept(form).to_toml()
             elif self.choose_columns and not self.chosen_columns:
-                self._require_window()
+                if not self._has_window():  # a script cannot answer
+                    raise InputError(
+                        "choose_columns opens a dialog: in a script set columns to a column map (.toml) instead"
+                    )
                 column_maps.fill(form, self._workbook(), self._columns())
                 return self._ask_columns(context)
-            system = self._read()
+            with warnings_reported(self):
+                system = read_system(self._workbook(), self._columns())
         except InputError as error:
-            if self._can_be_mended(form, error):
+            if self._dialog_can_help(form, error):
                 return self._ask_columns(context)
             column_maps.clear(form)
             self.report({"ERROR"}, str(error))
             return {"CANCELLED"}
-        try:
-            old = scanner.find_scanner(context.scene, self.name or scanner.default_name(system))
-            if old is not None and not self.replace and self._has_window():
-                self._losses = scanner.losses(old)
-                if self._losses:
-                    return self._ask_to_replace(context, old)
-            collection = scanner.build_scanner(
-                context.scene,
-                system,
-                self.name,
-                plate_thickness=self.plate_thickness,
-                wall_thickness=self.wall_thickness,
-                shape=(self.image_size[1], self.image_size[0]),
-                replace=self.replace,
-            )
-        except InputError as error:
-            self.report({"ERROR"}, str(error))
-            return {"CANCELLED"}
+        old = scanner.find_scanner(context.scene, self.name or scanner.default_name(system))
+        if old is not None and not self.replace and self._has_window():
+            self._losses = scanner.losses(old)
+            if self._losses:
+                return self._ask_to_replace(context, old)
+        return run_reported(self, lambda: self._build(context, system))
+
+    def _build(self, context: bpy.types.Context, system: PinholeSystem) -> str:
+        collection = scanner.build_scanner(
+            context.scene,
+            system,
+            self.name,
+            construction=Construction(self.plate_thickness, self.wall_thickness),
+            shape=(self.image_size[1], self.image_size[0]),
+            replace=self.replace,
+        )
         context.view_layer.update()  # so that scripts find the children's matrix_world in place
-        if old is None:
-            _frame(context, system)
         self._dialog = ""
-        column_maps.clear(form)
-        self.report({"INFO"}, f"Imported {len(system)} modules into '{collection.name}'")
-        return {"FINISHED"}
+        column_maps.clear(context.window_manager.mphdrr_columns)
+        return f"Imported {len(system)} modules into '{collection.name}'"
 
     def cancel(self, context: bpy.types.Context) -> None:
-        column_maps.clear(column_maps.settings(context))
+        column_maps.clear(context.window_manager.mphdrr_columns)
 
     def draw(self, context: bpy.types.Context) -> None:
         layout = self.layout
         if self._dialog == "COLUMNS":
-            column_map_dialog.draw(layout, column_maps.settings(context))
+            column_map_dialog.draw(layout, context.window_manager.mphdrr_columns)
             return
         if self._dialog == "REPLACE":
             layout.label(text="Importing again drops these changes:", icon="ERROR")
@@ -152,7 +143,7 @@ class MPHDRR_OT_import_geometry(bpy.types.Operator):
         layout.prop(self, "choose_columns")
 
     _dialog: Literal["", "COLUMNS", "REPLACE"] = ""  # which one is open
-    _losses: tuple[str, ...] | list[str] = ()
+    _losses: list[str] | tuple[str, ...] = ()
 
     def _has_window(self) -> bool:
         return self.options.is_invoke and not bpy.app.background
@@ -167,12 +158,8 @@ class MPHDRR_OT_import_geometry(bpy.types.Operator):
             return ColumnMap.from_toml(self.chosen_columns)
         return ColumnMap.read(bpy.path.abspath(self.columns)) if self.columns else None
 
-    def _read(self) -> PinholeSystem:
-        with warnings_reported(self):
-            return read_system(self._workbook(), self._columns())
-
-    def _can_be_mended(self, form: column_maps.ColumnMapProperties, error: InputError) -> bool:
-        """Whether the dialog can say what the reader has refused; its settings are then filled."""
+    def _dialog_can_help(self, form: column_maps.ColumnMapProperties, error: InputError) -> bool:
+        """Whether the column map dialog can answer what the reader refused; its settings are then filled."""
         if self._dialog == "COLUMNS":
             form.refusal = str(error)
             return True
@@ -181,52 +168,20 @@ class MPHDRR_OT_import_geometry(bpy.types.Operator):
         except InputError:
             return False
 
-    def _require_window(self) -> None:
-        if not self._has_window():
-            raise InputError(
-                "choose_columns opens a dialog, which a script cannot answer: set columns to a column map (.toml) instead"
-            )
-
     def _ask_columns(self, context: bpy.types.Context) -> set[str]:
         self._dialog = "COLUMNS"
         return context.window_manager.invoke_props_dialog(
-            self,
-            width=column_map_dialog.WIDTH,
-            title=f"Columns of {self._workbook().name}",
-            confirm_text="Import",
+            self, width=column_map_dialog.WIDTH, title=f"Columns of {self._workbook().name}", confirm_text="Import"
         )
 
     def _ask_to_replace(self, context: bpy.types.Context, old: bpy.types.Collection) -> set[str]:
         self._dialog = "REPLACE"
-        self.replace = True  # the dialog's button runs execute again
+        self.replace = True  # the dialog's button calls execute again
         return context.window_manager.invoke_props_dialog(
             self, width=440, title=f"Replace '{old.name}'?", confirm_text="Replace"
         )
 
 
-class MPHDRR_FH_workbook(bpy.types.FileHandler):
-    """A workbook dropped on the viewport or the outliner is imported."""
-
-    bl_idname = ids.FILE_HANDLER_WORKBOOK
-    bl_label = "Pinhole Geometry (.xlsx)"
-    bl_import_operator = ids.IMPORT_GEOMETRY
-    bl_file_extensions = ";".join(_SUFFIXES)
-
-    @classmethod
-    def poll_drop(cls, context: bpy.types.Context) -> bool:
-        return context.area is not None and context.area.type in {"VIEW_3D", "OUTLINER"}
-
-
 def draw_menu(self: bpy.types.Menu, context: bpy.types.Context) -> None:
     """The entry of File > Import."""
     self.layout.operator(ids.IMPORT_GEOMETRY, text="Pinhole Geometry (.xlsx)")
-
-
-def _frame(context: bpy.types.Context, system: PinholeSystem) -> None:
-    """Look at the whole scanner in the 3D views: its size is far from that of Blender's default scene."""
-    reach = float((system.pinhole_distance + system.collimator_length).max())
-    for area in context.screen.areas if context.screen else ():
-        space = area.spaces.active
-        if space.type == "VIEW_3D" and space.region_3d is not None and space.region_3d.view_perspective != "CAMERA":
-            space.region_3d.view_location = (0.0, 0.0, 0.0)
-            space.region_3d.view_distance = 2.6 * reach

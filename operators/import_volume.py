@@ -1,28 +1,23 @@
-"""File > Import > Volume for Projection, Volume Sequence: CTs, SPECT images and OpenVDB grids become volumes, as a job."""
+"""File > Import > Volume for Projection, Volume Sequence: CTs, SPECT images and OpenVDB grids become volumes."""
 
 from __future__ import annotations
 
-import itertools
+import os
 import re
-from collections.abc import Generator, Sequence
+from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import bpy
 from bpy.props import BoolProperty, CollectionProperty, EnumProperty, FloatProperty, IntProperty, StringProperty
 
-from ..addon import choices, ids, jobs, storage, vdb, volumes
+from ..addon import choices, ids, jobs, storage
 from ..addon.decimals import typed
+from ..addon.volume_import import READ_ENDINGS, importing, name_of
 from ..core.errors import InputError
-from ..core.memory import require
-from ..core.physics.ct_numbers import hu_to_mu
-from ..core.progress import Progress, part_of
-from ..core.volumes.rearranging import centered
-from ..core.volumes.volume import UNITS, Volume
-from ..core.volumes.volume_files import READ_FORMATS, read_volume
+from ..core.volumes.volume import UNITS
 
-_SUFFIXES = (*READ_FORMATS, ".vdb")
-_STATES = tuple(suffix for suffix in _SUFFIXES if suffix != ".dcm")  # of files that hold one volume each
+_STATES = tuple(ending for ending in READ_ENDINGS if ending != ".dcm")  # of files that hold one volume each
 
 
 class ReadVolumes(jobs.JobOperator):
@@ -80,50 +75,17 @@ class ReadVolumes(jobs.JobOperator):
         column.prop(self, "grid")
         column.prop(self, "unit")
 
-    def reading(self, paths: Sequence[Path], name: str, frame_start: int = 1) -> jobs.Job:
-        """The job that reads files as a volume, or as the states of one from `frame_start` on."""
-        quantity = None if self.quantity == "AUTO" else self.quantity
-        center, energy = self.center, typed(self.energy) if self.attenuation else None
-        grid, unit, folder, count = self.grid or None, typed(self.unit), storage.folder(), len(paths)
-
-        def read(path: Path, progress: Progress | None) -> Volume:
-            if path.suffix.lower() == ".vdb":
-                return vdb.read_vdb(path, quantity, grid, unit=unit)
-            return read_volume(path, quantity, progress=progress)
-
-        def work(progress: Progress) -> volumes.StoredVolume:
-            states: list[Volume] = []
-            for path in paths:
-                progress(len(states), count + 1)
-                states.append(read(path, part_of(progress, len(states), count + 1)))
-                if len(states) == 1 < count:
-                    shape = " x ".join(map(str, states[0].grid.shape))
-                    require(4.0 * (count - 1) * states[0].grid.n_voxels, f"{count} volumes of {shape} voxels")
-            names = [path.name for path in paths]
-            provenance: dict[str, Any] = {"file": names[0]} if count == 1 else {"files": names}
-            provenance["read_as"] = states[0].quantity
-            if energy is not None:
-                states = [hu_to_mu(volume, energy) for volume in states]
-                provenance["energy_keV"] = energy
-            if center:  # all by as much as the first
-                middle = states[0].grid.center
-                provenance["moved_mm"] = (-middle).tolist()
-                states = [centered(volume, volume.grid.center - middle) for volume in states]
-            progress(count, count + 1)
-            stored = volumes.store_volume(states, folder, None, provenance)
-            progress(count + 1, count + 1)
-            return stored
-
-        def finish(stored: volumes.StoredVolume) -> Generator[None, None, str]:
-            yield
-            item = volumes.add_stored(stored, name, bpy.context.collection)
-            item.data.frame_start = frame_start
-            volumes.make_active(bpy.context, item)
-            states = f"{count} states of " if count > 1 else ""
-            moved = ", its middle moved to the isocentre" if center else ""
-            return f"Imported {item.name!r}: {states}{_described(stored.volume, stored.low, stored.high)}{moved}"
-
-        return jobs.Job("Importing a volume" if count == 1 else f"Importing {count} volumes", work, finish)
+    def importing(self, paths: Sequence[Path], name: str, frame_start: int = 1) -> jobs.Job:
+        return importing(
+            paths,
+            name,
+            quantity=None if self.quantity == "AUTO" else self.quantity,
+            center=self.center,
+            energy=typed(self.energy) if self.attenuation else None,
+            grid=self.grid or None,
+            unit=typed(self.unit),
+            frame_start=frame_start,
+        )
 
 
 class MPHDRR_OT_import_volume(ReadVolumes, bpy.types.Operator):
@@ -137,25 +99,19 @@ class MPHDRR_OT_import_volume(ReadVolumes, bpy.types.Operator):
     bl_options = {"REGISTER", "UNDO"}
 
     filepath: StringProperty(
-        name="File",
-        description="File, or folder of a DICOM series, to read",
-        subtype="FILE_PATH",
+        name="File", description="File, or folder of a DICOM series, to read", subtype="FILE_PATH",
         options={"SKIP_SAVE"},
-    )
-    filter_glob: StringProperty(default=";".join(f"*{s}" for s in _SUFFIXES), options={"HIDDEN"})
+    )  # fmt: skip
+    filter_glob: StringProperty(default=";".join(f"*{ending}" for ending in READ_ENDINGS), options={"HIDDEN"})
     name: StringProperty(name="Name", description="The object's name. Empty: the file's", options={"SKIP_SAVE"})
 
     def ask(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str] | None:
-        if self.filepath:
-            return None
-        context.window_manager.fileselect_add(self)
-        return {"RUNNING_MODAL"}
+        return self.ask_for_file(context, bool(self.filepath))
 
     def job(self, context: bpy.types.Context) -> jobs.Job:
         if not self.filepath:
             raise InputError("no file given: set filepath to a volume's file, or to the folder of a DICOM series")
-        path = Path(bpy.path.abspath(self.filepath))
-        return self.reading([path], self.name or _name(path))
+        return self.importing([storage.absolute(self.filepath)], self.name)
 
 
 class MPHDRR_OT_import_volume_sequence(ReadVolumes, bpy.types.Operator):
@@ -176,7 +132,7 @@ class MPHDRR_OT_import_volume_sequence(ReadVolumes, bpy.types.Operator):
         name="Files", description="Of one volume for each frame", type=bpy.types.OperatorFileListElement,
         options={"SKIP_SAVE"},
     )  # fmt: skip
-    filter_glob: StringProperty(default=";".join(f"*{s}" for s in _STATES), options={"HIDDEN"})
+    filter_glob: StringProperty(default=";".join(f"*{ending}" for ending in _STATES), options={"HIDDEN"})
     name: StringProperty(
         name="Name", description="The object's name. Empty: what the files' names have in common", options={"SKIP_SAVE"}
     )
@@ -185,13 +141,10 @@ class MPHDRR_OT_import_volume_sequence(ReadVolumes, bpy.types.Operator):
     own_names = ("name", "frame_start")
 
     def ask(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str] | None:
-        if self.files:
-            return None
-        context.window_manager.fileselect_add(self)
-        return {"RUNNING_MODAL"}
+        return self.ask_for_file(context, bool(self.files))
 
     def job(self, context: bpy.types.Context) -> jobs.Job:
-        folder = Path(bpy.path.abspath(self.directory))
+        folder = storage.absolute(self.directory)
         paths = [folder / name for name in sorted({file.name for file in self.files if file.name}, key=_by_number)]
         if len(paths) < 2:
             raise InputError(f"{folder}: expected two files or more, one for each frame; choose them all")
@@ -200,22 +153,8 @@ class MPHDRR_OT_import_volume_sequence(ReadVolumes, bpy.types.Operator):
                 raise InputError(
                     f"{path}: expected a name ending in {', '.join(_STATES)}; a DICOM series is one volume"
                 )
-        common = re.sub(r"[\d _.-]*$", "", _common([_name(path) for path in paths]))
-        return self.reading(paths, self.name or common or _name(paths[0]), self.frame_start)
-
-
-class MPHDRR_FH_volume(bpy.types.FileHandler):
-    """A volume's file dropped on the viewport is imported."""
-
-    bl_idname = ids.FILE_HANDLER_VOLUME
-    bl_label = "Volume for Projection"
-    bl_import_operator = ids.IMPORT_VOLUME
-    # The last suffix is what Blender compares. Most files in .hdr are pictures of surroundings, no Analyze images.
-    bl_file_extensions = ";".join(sorted({"." + suffix.rsplit(".", 1)[1] for suffix in _SUFFIXES} - {".hdr"}))
-
-    @classmethod
-    def poll_drop(cls, context: bpy.types.Context) -> bool:
-        return context.area is not None and context.area.type == "VIEW_3D"
+        common = re.sub(r"[\d _.-]*$", "", os.path.commonprefix([name_of(path) for path in paths]))  # noqa: RUF071
+        return self.importing(paths, self.name or common, self.frame_start)
 
 
 def draw_menu(self: bpy.types.Menu, context: bpy.types.Context) -> None:
@@ -224,23 +163,6 @@ def draw_menu(self: bpy.types.Menu, context: bpy.types.Context) -> None:
     self.layout.operator(ids.IMPORT_VOLUME_SEQUENCE, text="Volume Sequence (.nii, .nrrd, .vdb, ...)")
 
 
-def _name(path: Path) -> str:
-    suffix = next((s for s in sorted(_SUFFIXES, key=len, reverse=True) if path.name.lower().endswith(s)), "")
-    return path.name[: len(path.name) - len(suffix)] or path.name
-
-
 def _by_number(name: str) -> list[tuple[int, str]]:
     """What to sort names by so that "beat2" comes before "beat10"."""
     return [(int(part) if part.isdecimal() else -1, part.lower()) for part in re.split(r"(\d+)", name)]
-
-
-def _common(names: Sequence[str]) -> str:
-    """What names begin with, all of them."""
-    return "".join(
-        letters[0] for letters in itertools.takewhile(lambda ls: len(set(ls)) == 1, zip(*names, strict=False))
-    )
-
-
-def _described(volume: Volume, low: float, high: float) -> str:
-    voxels = " x ".join(map(str, volume.grid.shape))
-    return f"{voxels} voxels of {volume.quantity}, {low:.4g} to {high:.4g} {volume.unit}"

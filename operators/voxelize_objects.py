@@ -2,25 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Generator
-from typing import Any
-
 import bpy
-import numpy as np
 from bpy.props import EnumProperty, FloatProperty, IntProperty, StringProperty
 
-from ..addon import choices, ids, jobs, meshes, storage, volumes
+from ..addon import choices, ids, jobs, meshes, volumes
 from ..addon.decimals import typed
-from ..core.errors import InputError
-from ..core.geometry.grid import Grid
-from ..core.memory import require
-from ..core.progress import Progress
-from ..core.volumes.meshes.mesh import Mesh
-from ..core.volumes.meshes.surface import volume_to_mesh
-from ..core.volumes.meshes.voxelization import voxelize_mesh
-from ..core.volumes.volume import UNITS
-
-_BYTES = 40.0  # a voxel, while the volume is made and put into the scene
 
 
 class MPHDRR_OT_voxelize_objects(jobs.JobOperator, bpy.types.Operator):
@@ -59,7 +45,7 @@ class MPHDRR_OT_voxelize_objects(jobs.JobOperator, bpy.types.Operator):
         return True
 
     def ask(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str] | None:
-        return context.window_manager.invoke_props_dialog(self, width=320, title=self.bl_label, confirm_text="Voxelize")
+        return self.ask_in_dialog(context, "Voxelize", width=320)
 
     def draw(self, context: bpy.types.Context) -> None:
         layout = self.layout
@@ -72,31 +58,9 @@ class MPHDRR_OT_voxelize_objects(jobs.JobOperator, bpy.types.Operator):
         layout.prop(self, "name")
 
     def job(self, context: bpy.types.Context) -> jobs.Job:
-        items = _chosen(context)
-        if not items:
-            raise InputError("no mesh object is selected: select closed meshes first")
-        scene, quantity, folder = context.scene, self.quantity, storage.folder()
-        values = [float(item.get(quantity, typed(self.value))) for item in items]
-        solids = meshes.meshes_of(items, context.evaluated_depsgraph_get())
-        grid = _fitted(solids, self.voxels, typed(self.voxel_size))
-        require(_BYTES * grid.n_voxels, "a volume of {} x {} x {} voxels".format(*grid.shape))
-        name = self.name or f"{items[0].name} {quantity}"
-        recipe: dict[str, Any] = {"meshes": [item.name for item in items], "values": values}
-
-        def work(progress: Progress) -> volumes.StoredVolume:
-            return volumes.store_volume(
-                voxelize_mesh(solids, grid, values, quantity, progress), folder, provenance=recipe
-            )
-
-        def finish(stored: volumes.StoredVolume) -> Generator[None, None, str]:
-            yield
-            volumes.make_active(bpy.context, volumes.add_stored(stored, name, scene.collection))
-            content = float(stored.volume.array.sum(dtype=np.float64)) * grid.voxel_volume
-            total = f"{content * 1e-3:.4g} kBq" if quantity == "activity" else f"{content:.4g} {UNITS[quantity]} mm^3"
-            shape = " x ".join(map(str, grid.shape))
-            return f"Added {name!r}: {shape} voxels of {grid.spacing[0]:.3g} mm, {total} in all"
-
-        return jobs.Job("Voxelizing meshes", work, finish)
+        return meshes.voxelizing(
+            _chosen(context), typed(self.value), self.quantity, self.voxels, typed(self.voxel_size), self.name
+        )
 
 
 class MPHDRR_OT_mesh_from_volume(jobs.JobOperator, bpy.types.Operator):
@@ -116,22 +80,10 @@ class MPHDRR_OT_mesh_from_volume(jobs.JobOperator, bpy.types.Operator):
         return volumes.poll_volume(cls, context)
 
     def ask(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str] | None:
-        return context.window_manager.invoke_props_dialog(self, title=self.bl_label, confirm_text="Make")
+        return self.ask_in_dialog(context, "Make")
 
     def job(self, context: bpy.types.Context) -> jobs.Job:
-        item = context.object
-        read, pose, name = volumes.reader(item), volumes.pose_of_object(item), f"{item.name} surface"
-        level, collection = typed(self.level) or None, context.collection
-
-        def work(progress: Progress) -> Mesh:
-            return volume_to_mesh(read(), level, progress)
-
-        def finish(mesh: Mesh) -> Generator[None, None, str]:
-            yield
-            meshes.add_mesh(mesh, name, pose, collection)
-            return f"Added {name!r}: {len(mesh.faces)} triangles around {abs(mesh.volume):.4g} mm^3"
-
-        return jobs.Job("Mesh from volume", work, finish)
+        return meshes.extracting(context.object, typed(self.level) or None)
 
 
 def draw_menu(self: bpy.types.Menu, context: bpy.types.Context) -> None:
@@ -143,15 +95,6 @@ def draw_menu(self: bpy.types.Menu, context: bpy.types.Context) -> None:
 
 
 def _chosen(context: bpy.types.Context) -> list[bpy.types.Object]:
-    """The selected mesh objects by name; the scanner's own are none of them."""
+    """The selected mesh objects by name, without the scanner's own."""
     found = [o for o in context.selected_objects if o.type == "MESH" and o.mphdrr_module.part == "NONE"]
     return sorted(found, key=lambda o: o.name)
-
-
-def _fitted(solids: list[Mesh], voxels: int, voxel_size: float) -> Grid:
-    """A grid along the world's axes around meshes, with a voxel to spare on every side."""
-    low = np.min([solid.vertices.min(axis=0) for solid in solids], axis=0)
-    high = np.max([solid.vertices.max(axis=0) for solid in solids], axis=0)
-    spacing = voxel_size or float((high - low).max()) / max(1, voxels - 2)
-    shape = tuple(int(n) for n in np.ceil((high - low) / spacing) + 2)
-    return Grid.centered(shape, spacing, (low + high) / 2)

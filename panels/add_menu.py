@@ -5,7 +5,7 @@ from __future__ import annotations
 import bpy
 
 from ..addon import ids
-from ..addon.phantoms import ADDING, BEATING
+from ..addon.phantom_properties import menu_entries
 
 
 class MPHDRR_MT_add(bpy.types.Menu):
@@ -15,9 +15,13 @@ class MPHDRR_MT_add(bpy.types.Menu):
     def draw(self, context: bpy.types.Context) -> None:
         layout = self.layout
         layout.operator_context = "INVOKE_DEFAULT"
-        for operator, label in ADDING:
-            layout.operator(operator, text=label, icon="OUTLINER_DATA_VOLUME")
-        layout.operator(BEATING, text="Beating Cardiac Torso", icon="OUTLINER_DATA_VOLUME").frames = 24
+        for kind, label, _ in menu_entries():
+            layout.operator(ids.ADD_PHANTOM + kind, text=label, icon="OUTLINER_DATA_VOLUME")
+        for kind, label, beats in menu_entries():
+            if beats:
+                layout.operator(
+                    ids.ADD_PHANTOM + kind, text=f"Beating {label}", icon="OUTLINER_DATA_VOLUME"
+                ).frames = 24
         layout.operator(ids.IMPORT_PHANTOM, text="Phantom from TOML File", icon="FILE_TEXT")
         layout.separator()
         layout.operator(ids.IMPORT_VOLUME, text="Volume from File", icon="IMPORT")

@@ -1,15 +1,18 @@
 """Sidebar, Geometry > Design: the active module's numbers and what they do, and those of all modules.
 
-Drawing shows readouts that were calculated when something changed (`addon/readouts.py`).
+Drawing shows readouts that were calculated when something changed (`addon/following.py`).
 """
 
 from __future__ import annotations
 
 import json
+import textwrap
+from collections.abc import Sequence
 
 import bpy
 
-from ..addon import ids, jobs, readouts, scanner, selection
+from ..addon import ids, jobs, selection
+from .geometry import ScannerPanel, draw_facts
 
 _LABELS = (
     ("pinhole_diameter", "Hole d"),
@@ -18,31 +21,17 @@ _LABELS = (
     ("roi_radius", "ROI R"),
 )
 _MOST_FINDINGS = 8
+_LINE = 32  # letters that fit into the sidebar at its usual width
 
 
-class _Panel:
-    bl_space_type = "VIEW_3D"
-    bl_region_type = "UI"
-    bl_category = ids.CATEGORY
-    bl_options = {"DEFAULT_CLOSED"}
-
-    @classmethod
-    def poll(cls, context: bpy.types.Context) -> bool:
-        return scanner.active_scanner(context.scene) is not None
-
-
-class MPHDRR_PT_design(_Panel, bpy.types.Panel):
+class MPHDRR_PT_design(ScannerPanel, bpy.types.Panel):
     """The active module."""
 
     bl_idname = ids.PANEL_DESIGN
-    bl_parent_id = ids.PANEL_GEOMETRY
     bl_label = "Design"
 
-    def draw(self, context: bpy.types.Context) -> None:
+    def draw_scanner(self, context: bpy.types.Context, collection: bpy.types.Collection) -> None:
         layout = self.layout
-        collection = scanner.active_scanner(context.scene)
-        if collection is None:  # poll says so too, but the scene may have changed since
-            return
         properties = collection.mphdrr_scanner
         if properties.untidy:
             box = layout.box().column(align=True)
@@ -52,7 +41,7 @@ class MPHDRR_PT_design(_Panel, bpy.types.Panel):
         if camera is None:
             layout.label(text="Select a module's camera", icon="INFO")
         else:
-            self._draw_module(layout, camera)
+            _draw_module(layout, camera)
         row = layout.row(align=True)
         row.operator_context = "INVOKE_DEFAULT"
         row.operator(ids.DUPLICATE_MODULES, text="Duplicate", icon="DUPLICATE")
@@ -64,38 +53,15 @@ class MPHDRR_PT_design(_Panel, bpy.types.Panel):
         row.prop(properties, "keep_aimed", toggle=True, icon="CON_TRACKTO")
         row.operator(ids.AIM_MODULES)
 
-    def _draw_module(self, layout: bpy.types.UILayout, camera: bpy.types.Object) -> None:
-        module = camera.mphdrr_module
-        layout.label(text=camera.name, icon="OUTLINER_OB_CAMERA")
-        _draw_numbers(layout, module, mixed=())
-        for text in (module.problem, module.finding, "" if module.aimed else "Not aimed at the isocentre"):
-            if text:
-                _draw_text(layout, text)
-        _draw_readouts(
-            layout,
-            (
-                ("Distance b", f"{module.pinhole_distance:.2f} mm"),
-                ("Sensitivity", f"{module.sensitivity:.2f} cps/MBq"),
-                ("Resolution", f"{module.resolution:.2f} mm FWHM"),
-                ("Magnification", f"{module.magnification:.3f}"),
-                ("Radius seen", f"{module.roi_seen:.2f} mm"),
-                ("ROI", "seen whole" if readouts.covers_roi(module) else "not seen whole"),
-            ),
-        )
 
-
-class MPHDRR_PT_scanner_design(_Panel, bpy.types.Panel):
-    """All modules at once, checks, and the way back to the workbook."""
+class MPHDRR_PT_scanner_design(ScannerPanel, bpy.types.Panel):
+    """All modules at once, checks and exports."""
 
     bl_idname = ids.PANEL_SCANNER_DESIGN
-    bl_parent_id = ids.PANEL_GEOMETRY
     bl_label = "All Modules"
 
-    def draw(self, context: bpy.types.Context) -> None:
+    def draw_scanner(self, context: bpy.types.Context, collection: bpy.types.Collection) -> None:
         layout = self.layout
-        collection = scanner.active_scanner(context.scene)
-        if collection is None:
-            return
         properties = collection.mphdrr_scanner
         column = _draw_numbers(layout, properties, properties.mixed.split())
         column.separator()
@@ -104,13 +70,11 @@ class MPHDRR_PT_scanner_design(_Panel, bpy.types.Panel):
         column.prop(properties, "opening_angle")
         column.prop(properties, "edge_at")
         column.prop(properties, "intrinsic_fwhm", text="Crystal FWHM")
-        _draw_readouts(
-            layout,
-            (
-                ("Sensitivity", f"{properties.sensitivity:.1f} cps/MBq"),
-                ("Mean FWHM", f"{properties.resolution:.2f} mm"),
-                ("See the ROI", f"{properties.n_covering} of {properties.count} modules"),
-            ),
+        draw_facts(
+            layout.box().split(factor=0.42),
+            ("Sensitivity", f"{properties.sensitivity:.1f} cps/MBq"),
+            ("Mean FWHM", f"{properties.resolution:.2f} mm"),
+            ("See the ROI", f"{properties.n_covering} of {properties.count} modules"),
         )
         layout.operator_menu_enum(ids.RENUMBER_MODULES, "order", text="Renumber", icon="LINENUMBERS_ON")
         layout.operator(ids.CHECK_GEOMETRY, icon="CHECKMARK")
@@ -132,9 +96,28 @@ class MPHDRR_PT_scanner_design(_Panel, bpy.types.Panel):
         column.operator(ids.EXPORT_FOR_PROGRAM, text="Export for a Program", icon="EXPORT")
 
 
+def _draw_module(layout: bpy.types.UILayout, camera: bpy.types.Object) -> None:
+    module = camera.mphdrr_module
+    layout.label(text=camera.name, icon="OUTLINER_OB_CAMERA")
+    _draw_numbers(layout, module, mixed=())
+    for text in (module.problem, module.finding, "" if module.aimed else "Not aimed at the isocentre"):
+        if text:
+            _draw_text(layout, text)
+    draw_facts(
+        layout.box().split(factor=0.42),
+        ("Distance b", f"{module.pinhole_distance:.2f} mm"),
+        ("Sensitivity", f"{module.sensitivity:.2f} cps/MBq"),
+        ("Resolution", f"{module.resolution:.2f} mm FWHM"),
+        ("Magnification", f"{module.magnification:.3f}"),
+        ("Radius seen", f"{module.roi_seen:.2f} mm"),
+        ("ROI", "seen whole" if module.sees_roi else "not seen whole"),
+    )
+
+
 def _draw_numbers(
-    layout: bpy.types.UILayout, numbers: bpy.types.PropertyGroup, mixed: tuple[str, ...] | list[str]
+    layout: bpy.types.UILayout, numbers: bpy.types.PropertyGroup, mixed: Sequence[str]
 ) -> bpy.types.UILayout:
+    """Draw d, Ld, Td, R and l; "mixed" stands beside those that differ between modules."""
     column = layout.column(align=True)
     column.use_property_split = True
     column.use_property_decorate = False
@@ -154,22 +137,8 @@ def _label(text: str, is_mixed: bool) -> str:
     return f"{text}, mixed" if is_mixed else f"{text} (mm)"
 
 
-def _draw_readouts(layout: bpy.types.UILayout, lines: tuple[tuple[str, str], ...]) -> None:
-    split = layout.box().split(factor=0.42)
-    names, values = split.column(align=True), split.column(align=True)
-    names.active = False
-    for name, value in lines:
-        names.label(text=name)
-        values.label(text=value)
-
-
-def _draw_text(layout: bpy.types.UILayout, text: str, width: int = 32) -> None:
-    """Text in lines that fit a narrow sidebar."""
-    lines = [""]
-    for word in text.split():
-        if lines[-1] and len(lines[-1]) + len(word) >= width:
-            lines.append("")
-        lines[-1] = f"{lines[-1]} {word}".strip()
+def _draw_text(layout: bpy.types.UILayout, text: str) -> None:
+    """Draw a text in lines that fit into a narrow sidebar."""
     column = layout.column(align=True)
-    for i, line in enumerate(lines):
+    for i, line in enumerate(textwrap.wrap(text, _LINE)):
         column.label(text=line, icon="BLANK1" if i else "ERROR")

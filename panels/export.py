@@ -18,7 +18,7 @@ class MPHDRR_PT_export(bpy.types.Panel):
     def draw(self, context: bpy.types.Context) -> None:
         layout = self.layout
         layout.operator_context = "INVOKE_DEFAULT"
-        run_file = getattr(context.scene, ids.SCENE_PROJECTIONS).run_file
+        run_file = context.scene.mphdrr_projections.run_file
         row = layout.row()
         row.enabled = bool(run_file)
         row.operator(ids.EXPORT_DATASET, text="Export Dataset", icon="EXPORT")

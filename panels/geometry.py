@@ -15,17 +15,9 @@ class MPHDRR_UL_modules(bpy.types.UIList):
     bl_idname = ids.LIST_MODULES
 
     def draw_item(
-        self,
-        context: bpy.types.Context,
-        layout: bpy.types.UILayout,
-        data: bpy.types.Collection,
-        item: bpy.types.Object,
-        icon: int,
-        active_data: bpy.types.PropertyGroup,
-        active_property: str,
-        index: int = 0,
-        flt_flag: int = 0,
-    ) -> None:
+        self, context: bpy.types.Context, layout: bpy.types.UILayout, data: bpy.types.Collection, item: bpy.types.Object,
+        icon: int, active_data: bpy.types.PropertyGroup, active_property: str, index: int = 0, flt_flag: int = 0,
+    ) -> None:  # fmt: skip
         module = item.mphdrr_module
         row = layout.row(align=True)
         row.active = module.visible
@@ -54,17 +46,14 @@ class MPHDRR_UL_modules(bpy.types.UIList):
         return flags, order
 
 
-class _Panel:
-    bl_space_type = "VIEW_3D"
-    bl_region_type = "UI"
-    bl_category = ids.CATEGORY
-
-
-class MPHDRR_PT_geometry(_Panel, bpy.types.Panel):
+class MPHDRR_PT_geometry(bpy.types.Panel):
     """Import, which scanner it is, and which part of it is shown."""
 
     bl_idname = ids.PANEL_GEOMETRY
     bl_label = "Geometry"
+    bl_space_type = "VIEW_3D"
+    bl_region_type = "UI"
+    bl_category = ids.CATEGORY
     bl_order = ids.ORDER_GEOMETRY
 
     def draw(self, context: bpy.types.Context) -> None:
@@ -82,41 +71,51 @@ class MPHDRR_PT_geometry(_Panel, bpy.types.Panel):
         if len(scanner.scanners(context.scene)) > 1:
             layout.prop(context.scene.mphdrr_geometry, "scanner", text="")
         properties = collection.mphdrr_scanner
-        split = layout.split(factor=0.34)
-        names, values = split.column(align=True), split.column(align=True)
-        names.active = False
-        for name, value in (
+        n_rings = sum(c.mphdrr_scanner.is_ring for c in collection.children)
+        draw_facts(
+            layout.split(factor=0.34),
             ("Scanner", collection.name),
             ("Workbook", bpy.path.basename(properties.workbook) or "none"),
-            ("Modules", f"{properties.count} in {_n_rings(collection)} rings"),
-        ):
-            names.label(text=name)
-            values.label(text=value)
+            ("Modules", f"{properties.count} in {n_rings} rings"),
+        )
         row = layout.row(align=True)
         for first, last in json.loads(properties.quick_ranges or "[]"):
             _show(row, f"{first}-{last}", first, last, "ONLY")
         _show(row, "All", 0, 0, "ALL")
 
 
-class MPHDRR_PT_modules(_Panel, bpy.types.Panel):
-    """The modules: which are shown, and looking through one."""
+class ScannerPanel:
+    """Mixed into panels inside Geometry that need a scanner; they draw by `draw_scanner`."""
 
-    bl_idname = ids.PANEL_MODULES
     bl_parent_id = ids.PANEL_GEOMETRY
-    bl_label = "Modules"
-    bl_options = {"DEFAULT_CLOSED"}  # the list is long: Phantom and Projections shall be in sight
+    bl_space_type = "VIEW_3D"
+    bl_region_type = "UI"
+    bl_category = ids.CATEGORY
+    bl_options = {"DEFAULT_CLOSED"}  # so that Phantom and Projections are in sight
 
     @classmethod
     def poll(cls, context: bpy.types.Context) -> bool:
         return scanner.active_scanner(context.scene) is not None
 
     def draw(self, context: bpy.types.Context) -> None:
-        layout = self.layout
         collection = scanner.active_scanner(context.scene)
-        if collection is None:  # poll says so too, but the scene may have changed since
-            return
-        state = context.scene.mphdrr_geometry
+        if collection is not None:  # the scene may have changed since poll
+            self.draw_scanner(context, collection)
 
+    def draw_scanner(self, context: bpy.types.Context, collection: bpy.types.Collection) -> None:
+        """Draw the panel for the active scanner."""
+        raise NotImplementedError
+
+
+class MPHDRR_PT_modules(ScannerPanel, bpy.types.Panel):
+    """The modules: which are shown, and looking through one."""
+
+    bl_idname = ids.PANEL_MODULES
+    bl_label = "Modules"
+
+    def draw_scanner(self, context: bpy.types.Context, collection: bpy.types.Collection) -> None:
+        layout = self.layout
+        state = context.scene.mphdrr_geometry
         column = layout.column(align=True)
         row = column.row(align=True)
         row.prop(state, "first")
@@ -136,12 +135,19 @@ class MPHDRR_PT_modules(_Panel, bpy.types.Panel):
         items = collection.all_objects
         active = items[state.active_index] if 0 <= state.active_index < len(items) else None
         if active is not None and active.mphdrr_module.is_module:
-            module = active.mphdrr_module
-            look = layout.operator(
-                ids.LOOK_THROUGH_MODULE, text=f"Look Through {active.name}", icon="OUTLINER_OB_CAMERA"
-            )
-            look.number = module.number
+            text = f"Look Through {active.name}"
+            look = layout.operator(ids.LOOK_THROUGH_MODULE, text=text, icon="OUTLINER_OB_CAMERA")
+            look.number = active.mphdrr_module.number
         layout.operator(ids.AIM_MODULES, icon="CON_TRACKTO")
+
+
+def draw_facts(split: bpy.types.UILayout, *facts: tuple[str, str]) -> None:
+    """Draw names and their values, side by side."""
+    names, values = split.column(align=True), split.column(align=True)
+    names.active = False
+    for name, value in facts:
+        names.label(text=name)
+        values.label(text=value)
 
 
 def _columns(layout: bpy.types.UILayout, name: str, *numbers: str) -> None:
@@ -156,7 +162,3 @@ def _columns(layout: bpy.types.UILayout, name: str, *numbers: str) -> None:
 def _show(layout: bpy.types.UILayout, text: str, first: int, last: int, mode: str, icon: str = "NONE") -> None:
     button = layout.operator(ids.SHOW_MODULES, text=text, icon=icon)
     button.first, button.last, button.mode = first, last, mode
-
-
-def _n_rings(collection: bpy.types.Collection) -> int:
-    return sum(c.mphdrr_scanner.is_ring for c in collection.children)

@@ -7,7 +7,7 @@ from typing import Any
 
 import bpy
 
-from ..addon import ids, jobs, live_phantoms, phantoms, slices, storage, volumes
+from ..addon import ids, jobs, outlines, phantoms, slices, storage, volumes
 
 _LINE = 32  # letters that fit into the sidebar at its usual width
 
@@ -22,13 +22,16 @@ class MPHDRR_PT_phantom(bpy.types.Panel):
 
     def draw(self, context: bpy.types.Context) -> None:
         layout = self.layout
-        layout.enabled = not jobs.is_running()
         layout.operator_context = "INVOKE_DEFAULT"
-        column = layout.column(align=True)
+        layout.use_property_split = True
+        layout.use_property_decorate = False
+        adding = layout.column()
+        adding.enabled = not jobs.is_running()
+        column = adding.column(align=True)
         column.menu(ids.MENU_ADD, text="Add Phantom", icon="OUTLINER_DATA_VOLUME")
         column.operator(ids.IMPORT_VOLUME, text="Import Volume", icon="IMPORT")
         if storage.missing_volumes(storage.seems_there):
-            column = layout.column(align=True)
+            column = adding.column(align=True)
             column.alert = True
             column.label(text="Files of voxels are missing", icon="ERROR")
             column.operator(ids.FIND_VOLUME_FILES, icon="VIEWZOOM")
@@ -41,49 +44,55 @@ class MPHDRR_PT_phantom(bpy.types.Panel):
                 text="Select a volume to see its numbers." if known else "No volume in the scene.", icon="INFO"
             )
             return
-        settings = getattr(item, ids.OBJECT_VOLUME)
-        split = layout.split(factor=0.34)
-        names, values = split.column(align=True), split.column(align=True)
-        names.active = False
-        shape, spacing = settings.shape, settings.spacing
-        for name, value in (
-            ("Volume", item.name),
-            ("Holds", f"{settings.quantity}, {settings.unit}"),
-            ("Voxels", " × ".join(map(str, shape))),
-            ("Size", " × ".join(f"{s:.3g}" for s in spacing) + " mm"),
-            ("Values", f"{settings.minimum:.4g} to {settings.maximum:.4g}"),
-            *([("State", volumes.state_text(item))] if item.data.is_sequence else []),
-            ("File", volumes.file_state(item)),
-        ):
-            names.label(text=name)
-            values.label(text=value)
-        if settings.quantity == "hu":
-            layout.operator(ids.CT_TO_ATTENUATION, icon="MOD_FLUIDSIM")
-        layout.use_property_split = True
-        layout.use_property_decorate = False
-        column = layout.column(align=True)
-        column.prop(settings, "display_low", text=f"Low, {settings.unit}")
-        column.prop(settings, "display_high", text=f"High, {settings.unit}")
-        if item.data.is_sequence:
-            column = layout.column(align=True)
-            column.prop(item.data, "frame_start", text="First Frame")
-            column.prop(item.data, "sequence_mode", text="Then")
-        if slices.planes_of(item):
-            column = layout.column(align=True)
-            for axis, name in enumerate(slices.names(item)):
-                column.prop(settings, "slices", index=axis, text=name)
-            column.operator(ids.REMOVE_SLICES, icon="X")
-        else:
-            layout.operator(ids.ADD_SLICES, icon="MESH_PLANE")
+        _draw_numbers(layout, item)
+        _draw_display(layout, item)
         phantom = phantoms.settings_of(item)
         if phantom is not None:
             _draw_phantom(layout, item, phantom)
         layout.operator(ids.CLEAN_VOLUME_FILES, icon="TRASH")
 
 
+def _draw_numbers(layout: bpy.types.UILayout, item: bpy.types.Object) -> None:
+    settings = item.mphdrr_volume
+    split = layout.split(factor=0.34)
+    names, values = split.column(align=True), split.column(align=True)
+    names.active = False
+    for name, value in (
+        ("Volume", item.name),
+        ("Holds", f"{settings.quantity}, {settings.unit}"),
+        ("Voxels", " × ".join(map(str, settings.shape))),
+        ("Size", " × ".join(f"{s:.3g}" for s in settings.spacing) + " mm"),
+        ("Values", f"{settings.minimum:.4g} to {settings.maximum:.4g}"),
+        *([("State", volumes.state_text(item))] if item.data.is_sequence else []),
+        ("File", volumes.file_state(item)),
+    ):
+        names.label(text=name)
+        values.label(text=value)
+
+
+def _draw_display(layout: bpy.types.UILayout, item: bpy.types.Object) -> None:
+    settings = item.mphdrr_volume
+    if settings.quantity == "hu":
+        layout.operator(ids.CT_TO_ATTENUATION, icon="MOD_FLUIDSIM")
+    column = layout.column(align=True)
+    column.prop(settings, "display_low", text=f"Low, {settings.unit}")
+    column.prop(settings, "display_high", text=f"High, {settings.unit}")
+    if item.data.is_sequence:
+        column = layout.column(align=True)
+        column.prop(item.data, "frame_start", text="First Frame")
+        column.prop(item.data, "sequence_mode", text="Then")
+    if slices.planes_of(item):
+        column = layout.column(align=True)
+        for axis, name in enumerate(slices.names(item)):
+            column.prop(settings, "slices", index=axis, text=name)
+        column.operator(ids.REMOVE_SLICES, icon="X")
+    else:
+        layout.operator(ids.ADD_SLICES, icon="MESH_PLANE")
+
+
 def _draw_phantom(layout: bpy.types.UILayout, item: bpy.types.Object, phantom: Any) -> None:
     """A phantom's settings, what is wrong with them, and what can be done to it."""
-    settings = getattr(item, ids.OBJECT_VOLUME)
+    settings = item.mphdrr_volume
     phantom.draw_settings(layout)
     if settings.message:
         column = layout.column(align=True)
@@ -93,13 +102,14 @@ def _draw_phantom(layout: bpy.types.UILayout, item: bpy.types.Object, phantom: A
         for line in others:
             column.label(text=line, icon="BLANK1")
     column = layout.column(align=True)
+    column.enabled = not jobs.is_running()
     row = column.row(align=True)
-    coming = live_phantoms.is_coming(item)
-    row.alert = settings.outdated and not coming
-    text = "Changed: Update" if settings.outdated else "Update Phantom"
-    row.operator(ids.UPDATE_PHANTOM, text="Making the Voxels" if coming else text, icon="FILE_REFRESH")
+    row.alert = settings.outdated
+    row.operator(
+        ids.UPDATE_PHANTOM, text="Changed: Update" if settings.outdated else "Update Phantom", icon="FILE_REFRESH"
+    )
     column.operator(ids.APPLY_PHANTOM_POSE, icon="OBJECT_ORIGIN")
-    shown = phantoms.outline_of(item) is not None
+    shown = outlines.of(item) is not None
     column.operator(
         ids.SHOW_PHANTOM_OUTLINE, text="Hide Outline" if shown else "Show Outline", icon="SHADING_WIRE", depress=shown
     )

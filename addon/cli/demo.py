@@ -72,9 +72,9 @@ def _run(arguments: argparse.Namespace) -> None:
         save_scene(out / "scanner.blend")
     with _step("pictures"), quiet():
         for first, last in scanner.quick_ranges(system):
-            pictures.render_scanner(scene, collection, out / f"modules-{first}-{last}.png", first, last)
+            pictures.render_scanner(collection, out / f"modules-{first}-{last}.png", first, last)
         first, last = int(system.numbers.min()), int(system.numbers.max())
-        pictures.render_scanner(scene, collection, out / "phantom.png", first, last, volume_object, zoom=1.5)
+        pictures.render_scanner(collection, out / "phantom.png", first, last, volume_object, zoom=1.5)
     print(f"{out}: {', '.join(sorted(p.name for p in out.iterdir() if p.suffix in ('.blend', '.h5', '.png')))}")
 
 

@@ -90,7 +90,7 @@ def test_pictures_leave_the_scene_as_it_was(tmp_path, dc_spect, scene):
         return counts, visible, render.engine, render.resolution_x, render.filepath, scene.camera, scene.world
 
     before = state()
-    pictures.render_scanner(scene, collection, tmp_path / "p.png", 1, 20, samples=1)
+    pictures.render_scanner(collection, tmp_path / "p.png", 1, 20, samples=1)
     assert state() == before
     assert (tmp_path / "p.png").stat().st_size > 10_000
 

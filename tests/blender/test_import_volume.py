@@ -10,7 +10,7 @@ import pytest
 
 bpy = pytest.importorskip("bpy")
 
-from mphdrr.addon import slices, volume_materials, volumes  # noqa: E402
+from mphdrr.addon import slices, storage, stored_volumes, volume_materials, volumes  # noqa: E402
 from mphdrr.addon.vdb import openvdb, write_vdb  # noqa: E402
 from mphdrr.core.errors import InputError  # noqa: E402
 from mphdrr.core.geometry.frames import euler_pose  # noqa: E402
@@ -76,7 +76,7 @@ def test_ct_begins_with_a_window_of_its_own_and_keeps_the_users(ct):
     settings = item.mphdrr_volume
     assert (settings.display_low, settings.display_high) == (-200, 1000)
     settings.display_low = 50.0
-    volumes.replace_volume(item, Volume(ct.array[:5].copy(), Grid((5, 11, 7), AFFINE), "hu"))
+    _replace(item, Volume(ct.array[:5].copy(), Grid((5, 11, 7), AFFINE), "hu"))
     node = item.data.materials[0].node_tree.nodes["Display Range"]
     assert node.inputs["From Min"].default_value == 50.0 and node.inputs["From Max"].default_value == 1000.0
 
@@ -100,6 +100,10 @@ def test_volumes_of_older_files_get_a_range(tmp_path, ct):
     bpy.ops.wm.open_mainfile(filepath=str(tmp_path / "a.blend"))
     settings = bpy.data.objects["Old"].mphdrr_volume
     assert settings.display_high == settings.maximum > 1 and settings.extent == pytest.approx(17.5)
+
+
+def _replace(item, volume: Volume) -> None:
+    volumes.replace_stored(item, stored_volumes.store_volume(volume, storage.folder()))
 
 
 def _pixels(plane):
@@ -134,7 +138,7 @@ def test_slices_follow_new_voxels_and_go(ct):
     item = volumes.add_volume(ct, "CT")
     before = len(bpy.data.objects), len(bpy.data.images), len(bpy.data.meshes), len(bpy.data.materials)
     slices.add_slices(item)
-    volumes.replace_volume(item, Volume(ct.array[:5].copy(), Grid((5, 11, 7), AFFINE), "hu"))
+    _replace(item, Volume(ct.array[:5].copy(), Grid((5, 11, 7), AFFINE), "hu"))
     coronal = slices.planes_of(item)[1]
     assert _pixels(coronal).shape[:2] == (7, 5)
     slices.remove_slices(item)
@@ -159,9 +163,9 @@ def test_ramps_are_of_the_quantity(ct):
 
 def test_unused_files_are_cleaned_up_and_no_others(tmp_path, ct):
     item = volumes.add_volume(ct, "CT")
-    volumes.replace_volume(item, Volume(ct.array[:5].copy(), Grid((5, 11, 7), AFFINE), "hu"))
+    _replace(item, Volume(ct.array[:5].copy(), Grid((5, 11, 7), AFFINE), "hu"))
     bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "a.blend"))
-    volumes.replace_volume(item, Volume(ct.array[:6].copy(), Grid((6, 11, 7), AFFINE), "hu"))
+    _replace(item, Volume(ct.array[:6].copy(), Grid((6, 11, 7), AFFINE), "hu"))
     bpy.ops.wm.save_mainfile()
     folder = tmp_path / "a_mphdrr"
     for name in ("notes.txt", "smoke.vdb", "hu-12.vdb"):
@@ -176,7 +180,7 @@ def test_unused_files_are_cleaned_up_and_no_others(tmp_path, ct):
 @pytest.mark.parametrize("large", [False, True])
 def test_missing_files_are_found_again(tmp_path, ct, monkeypatch, capfd, large):
     if large:
-        monkeypatch.setattr(volumes, "MAX_SHOWN_VOXELS", 10)
+        monkeypatch.setattr(stored_volumes, "MAX_SHOWN_VOXELS", 10)
     volumes.add_volume(ct, "CT")
     bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "a.blend"))
     (tmp_path / "archive").mkdir()
@@ -201,7 +205,7 @@ def beats(ct) -> list[Volume]:
 
 @pytest.mark.parametrize("mode", ["CLIP", "EXTEND", "REPEAT", "PING_PONG"])
 def test_sequence_is_read_as_blender_shows_it(beats, mode):
-    item = volumes.add_volume_sequence(beats, "Heart", frame_start=10)
+    item = volumes.add_volume(beats, "Heart", frame_start=10)
     item.data.sequence_mode = mode
     known = 0
     for frame in range(3, 25):
@@ -220,8 +224,8 @@ def test_sequence_is_read_as_blender_shows_it(beats, mode):
 @pytest.mark.parametrize("large", [False, True])
 def test_sequence_is_saved_and_cleaned_up_whole(tmp_path, beats, monkeypatch, large):
     if large:
-        monkeypatch.setattr(volumes, "MAX_SHOWN_VOXELS", 10)
-    volumes.add_volume_sequence(beats, "Heart")
+        monkeypatch.setattr(stored_volumes, "MAX_SHOWN_VOXELS", 10)
+    volumes.add_volume(beats, "Heart")
     bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "a.blend"))
     bpy.ops.wm.open_mainfile(filepath=str(tmp_path / "a.blend"))
     bpy.ops.mphdrr.clean_volume_files()
@@ -234,7 +238,7 @@ def test_sequence_is_saved_and_cleaned_up_whole(tmp_path, beats, monkeypatch, la
 
 
 def test_slices_beat_along(beats):
-    item = volumes.add_volume_sequence(beats, "Heart")
+    item = volumes.add_volume(beats, "Heart")
     plane = slices.add_slices(item)[2]
     first = _pixels(plane)
     bpy.context.scene.frame_set(3)
@@ -246,4 +250,4 @@ def test_sequence_of_what_cannot_follow_is_refused(ct):
     other = Volume(ct.array, ct.grid, "mu")
     for states in ([], [ct, other]):
         with pytest.raises(InputError, match="volumes of one quantity"):
-            volumes.add_volume_sequence(states, "Heart")
+            volumes.add_volume(states, "Heart")

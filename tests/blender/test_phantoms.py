@@ -12,7 +12,8 @@ bpy = pytest.importorskip("bpy")
 
 from mathutils import Matrix  # noqa: E402
 
-from mphdrr.addon import cameras, phantom_properties, phantoms, volumes  # noqa: E402
+from mphdrr.addon import cameras, jobs, outlines, phantom_properties, phantoms, volumes  # noqa: E402
+from mphdrr.core.errors import InputError  # noqa: E402
 from mphdrr.core.geometry.frames import euler_pose  # noqa: E402
 from mphdrr.core.geometry.grid import Grid  # noqa: E402
 from mphdrr.core.phantoms.kinds import KINDS  # noqa: E402
@@ -70,42 +71,47 @@ def test_arguments_are_the_fields_of_the_class():
     assert np.array_equal(voxels_of(item), expected(KINDS[4].phantom(contrast="original"), 16, "mu").array)
 
 
-def test_a_small_phantom_follows_its_settings_where_it_stands():
-    item = add("nema", voxels=24, attenuation=True, **POSE)
+def test_a_phantom_follows_its_settings_where_it_stands():
+    item = add("shepp-logan", voxels=12, attenuation=True, **POSE)
     (child,) = item.children
-    assert child.mphdrr_volume.quantity == "mu" and item.name == "NEMA Body"
+    assert child.mphdrr_volume.quantity == "mu" and item.name == "Shepp-Logan Head"
     item.matrix_world = Matrix.Translation((1, 2, 3)) @ item.matrix_world @ Matrix.Scale(2, 4)
     moved = np.array(item.matrix_basis)
-    settings = item.mphdrr_volume.nema
-    settings.length, settings.sphere_activity, settings.mu = 120, 40, 0.01
+    settings = item.mphdrr_volume.shepp_logan
+    settings.half_size, settings.activity = 75, 40
     assert not item.mphdrr_volume.outdated and not item.mphdrr_volume.message
-    phantom = KINDS[1].phantom(length=120, sphere_activity=40, mu=0.01)
+    phantom = KINDS[4].phantom(half_size=75, activity=40)
     for one, quantity in ((item, "activity"), (child, "mu")):
-        volume, own = volumes.volume_from_object(one), expected(phantom, 24, quantity)
+        volume, own = volumes.volume_from_object(one), expected(phantom, 12, quantity)
         assert np.array_equal(volume.array, own.array)
         np.testing.assert_allclose(volume.grid.affine, moved @ own.grid.affine, atol=1e-4)
 
 
-def test_a_large_phantom_waits_for_its_update():
-    item = add("derenzo", voxels=72)
-    before, settings = voxels_of(item), item.mphdrr_volume.derenzo
-    settings.radius = 30
-    assert item.mphdrr_volume.outdated and np.array_equal(voxels_of(item), before)
-    assert bpy.ops.mphdrr.update_phantom() == {"FINISHED"}
-    assert not item.mphdrr_volume.outdated
-    assert np.array_equal(voxels_of(item), expected(settings.phantom(), 72).array)
+def test_scripts_add_what_operators_add():
+    arguments = {"half_size": 60.0, "voxels": 12, "contrast": "original"}
+    added = add("shepp-logan", attenuation=True, **POSE, **arguments)
+    settings = phantom_properties.plain_settings("shepp-logan", **arguments)
+    assert "Head" in jobs.run(phantoms.adding(settings, "Head", pose(), attenuation=True))
+    item = bpy.context.object
+    assert phantoms.settings_of(item).values() == phantoms.settings_of(added).values()
+    for one, other in zip(phantoms.with_children(item), phantoms.with_children(added), strict=True):
+        assert volumes.file_of(one) == volumes.file_of(other), "files are named by content"
+    with pytest.raises(InputError, match="no setting 'size'"):
+        phantom_properties.plain_settings("shepp-logan", size=3)
+    with pytest.raises(InputError, match="expected one of derenzo"):
+        phantom_properties.plain_settings("head")
 
 
 def test_settings_that_cannot_be_leave_the_voxels_and_say_why():
-    item = add("torso", voxels=16)
-    before, settings = voxels_of(item), item.mphdrr_volume.torso
-    settings.defect_from = 0.9
-    assert "defect from: expected less than 0.8" in item.mphdrr_volume.message and item.mphdrr_volume.outdated
+    item = add("defrise", voxels=8)
+    before, settings = voxels_of(item), item.mphdrr_volume.defrise
+    settings.spacing = 1.0
+    assert "disk thickness" in item.mphdrr_volume.message and item.mphdrr_volume.outdated
     assert np.array_equal(voxels_of(item), before)
-    with pytest.raises(RuntimeError, match="defect from"):
+    with pytest.raises(RuntimeError, match="disk thickness"):
         bpy.ops.mphdrr.update_phantom()
     assert np.array_equal(voxels_of(item), before)
-    settings.defect_from, settings.defect_severity = 0.2, 1.0
+    settings.spacing = 9.0
     assert not item.mphdrr_volume.message and not np.array_equal(voxels_of(item), before)
     objects = len(bpy.data.objects), len(bpy.data.volumes)
     with pytest.raises(RuntimeError, match="defect from"):
@@ -119,15 +125,15 @@ def test_settings_that_cannot_be_leave_the_voxels_and_say_why():
 
 
 def test_settings_survive_saving_and_copies_follow_their_own(tmp_path):
-    add("defrise", voxels=16, disks=3, **POSE)
+    add("shepp-logan", voxels=8, activity=3, **POSE)
     bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "a.blend"))
     bpy.ops.wm.open_mainfile(filepath=str(tmp_path / "a.blend"))
-    item = bpy.data.objects["Defrise"]
+    item = bpy.data.objects["Shepp-Logan Head"]
     copy = item.copy()
     bpy.context.collection.objects.link(copy)
-    copy.mphdrr_volume.defrise.disks = 5
-    for one, disks in ((item, 3), (copy, 5)):
-        assert np.array_equal(voxels_of(one), expected(KINDS[3].phantom(disks), 16).array)
+    copy.mphdrr_volume.shepp_logan.activity = 5
+    for one, activity in ((item, 3), (copy, 5)):
+        assert np.array_equal(voxels_of(one), expected(KINDS[4].phantom(activity=activity), 8).array)
 
 
 def test_toml_becomes_a_text_that_the_phantom_follows(tmp_path):
@@ -166,15 +172,15 @@ def test_toml_that_is_no_phantom_adds_nothing(text, message, tmp_path):
 
 @pytest.mark.parametrize("scale", [(1, 1, 1, 1), (1.2, 0.8, 1, 1)], ids=["turned", "sheared"])
 def test_applied_pose_keeps_activity_and_projections(ring_system, scale):
-    item = add("nema", voxels=40, attenuation=True)
-    phantom = item.mphdrr_volume.nema.phantom()
+    item = add("shepp-logan", voxels=120, attenuation=True)
+    phantom = item.mphdrr_volume.shepp_logan.phantom()
     # Scaled, under a parent that may be scaled too.
     parent = bpy.data.objects.new("Parent", None)
     bpy.context.collection.objects.link(parent)
     parent.matrix_basis = Matrix(euler_pose(0.3, 0.2, 0.1, (3, 4, 5)) @ np.diag(scale))
     item.parent = parent
     item.matrix_basis = Matrix(euler_pose(0.7, 0.4, 0.1, (10, -5, 2)) @ np.diag([0.3, 0.2, 0.25, 1]))
-    placed = volumes.pose_of_object(item)
+    placed, largest_mu = volumes.pose_of_object(item), voxels_of(item.children[0]).max()
     assert bpy.ops.mphdrr.apply_phantom_pose() == {"FINISHED"}
     volume = volumes.volume_from_object(item)
     assert total(volume) == pytest.approx(phantom.total_activity * np.linalg.det(placed[:3, :3]), rel=1e-3)
@@ -185,7 +191,7 @@ def test_applied_pose_keeps_activity_and_projections(ring_system, scale):
     )
     mu = volumes.volume_from_object(item.children[0])
     np.testing.assert_allclose(mu.grid.affine, volume.grid.affine, atol=1e-5)
-    assert mu.array.max() == pytest.approx(phantom.mu)
+    assert mu.array.max() == pytest.approx(largest_mu)
     assert phantoms.settings_of(item) is None and not bpy.ops.mphdrr.update_phantom.poll()
     views = ring_system.views(shape=(24, 24))
     exact = phantom.project(views, placed)
@@ -208,24 +214,10 @@ def test_outline_goes_with_the_phantom_and_its_settings():
     item = add("derenzo", voxels=16, **POSE)
     assert bpy.ops.mphdrr.show_phantom_outline() == {"FINISHED"}
     item.mphdrr_volume.derenzo.height = 90
-    outline = phantoms.outline_of(item)
+    outline = outlines.of(item)
     assert outline.display_type == "WIRE" and outline.parent == item
     assert outline.dimensions[2] == pytest.approx(90)
     np.testing.assert_allclose(cameras.world_matrix(outline), cameras.world_matrix(item), atol=1e-6)
     meshes = len(bpy.data.meshes)
     assert bpy.ops.mphdrr.show_phantom_outline() == {"FINISHED"}
-    assert phantoms.outline_of(item) is None and len(bpy.data.meshes) == meshes - 1
-
-
-def test_undo_takes_back_settings_and_voxels_together():
-    item = add("shepp-logan", voxels=16)
-    name, before = item.name, voxels_of(item)
-    bpy.ops.ed.undo_push(message="added")
-    item.mphdrr_volume.shepp_logan.activity = 7
-    bpy.ops.ed.undo_push(message="changed")
-    assert bpy.ops.ed.undo() == {"FINISHED"}
-    item = bpy.data.objects[name]
-    assert item.mphdrr_volume.shepp_logan.activity == 100 and np.array_equal(voxels_of(item), before)
-    assert bpy.ops.ed.redo() == {"FINISHED"}
-    item = bpy.data.objects[name]
-    np.testing.assert_allclose(voxels_of(item), before * 0.07, rtol=1e-6, atol=1e-5)
+    assert outlines.of(item) is None and len(bpy.data.meshes) == meshes - 1

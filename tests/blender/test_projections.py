@@ -392,7 +392,7 @@ def test_a_ct_is_no_radiograph_until_it_is_converted(scene, scanned, ct, chosen,
 
 def test_a_moved_ct_is_converted_where_it_is_and_in_every_state(scene, scanned):
     states = [Volume(np.full((4, 5, 6), 10.0 * k), Grid.centered((4, 5, 6), 7.0), "hu") for k in range(3)]
-    item = volumes.add_volume_sequence(states, "Breath", frame_start=4)
+    item = volumes.add_volume(states, "Breath", frame_start=4)
     item.location.x += 12.5
     item.rotation_euler.z = 0.3
     bpy.context.view_layer.update()

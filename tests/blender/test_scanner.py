@@ -13,6 +13,7 @@ import pytest
 
 from mphdrr.addon import cameras, ids, registration, scanner
 from mphdrr.core.errors import InputError, InputWarning
+from mphdrr.core.geometry.collimator import Construction
 from mphdrr.core.geometry.system import PinholeSystem
 
 LENGTHS = ("pinhole_diameter", "collimator_length", "detector_side", "detector_thickness", "roi_radius")
@@ -162,12 +163,12 @@ def test_edited_module_is_rebuilt_with_its_numbers(scene, ring_system):
         scanner.read_scanner(collection)
 
 
-def test_importing_again_leaves_no_orphans(scene, dc_spect):
-    scanner.build_scanner(scene, dc_spect)
+def test_importing_again_leaves_no_orphans(scene, ring_system):
+    scanner.build_scanner(scene, ring_system)
     before = counts()
     names = sorted(o.name for o in bpy.data.objects)
-    for _ in range(3):
-        scanner.build_scanner(scene, dc_spect)
+    for _ in range(2):
+        scanner.build_scanner(scene, ring_system)
     assert counts() == before
     assert sorted(o.name for o in bpy.data.objects) == names
     assert all(mesh.users for mesh in bpy.data.meshes)
@@ -243,7 +244,7 @@ def test_failed_build_leaves_the_scene_as_it_was(scene, ring_system, monkeypatch
     scanner.build_scanner(scene, ring_system)
     before = counts()
     with pytest.raises(InputError, match="aperture plate"):
-        scanner.build_scanner(scene, ring_system, plate_thickness=60.0)
+        scanner.build_scanner(scene, ring_system, construction=Construction(60.0))
     monkeypatch.setattr(cameras, "set_field_of_view", lambda *args: 1 / 0)
     with pytest.raises(ZeroDivisionError):
         scanner.build_scanner(scene, ring_system, "Other")
@@ -279,6 +280,6 @@ def test_modules_are_shown_by_range(scene, ring_system):
 
 
 def test_python_ends_with_the_extension_registered():
-    """Blender 4.5's module waited for ever when classes were still registered as Python ended."""
+    """Blender 4.5's module waits for ever where classes are still registered as Python ends."""
     script = "from mphdrr.addon import registration as r; r.register(); r.unregister(); r.register()"
     subprocess.run([sys.executable, "-c", script], check=True, timeout=60)

@@ -8,7 +8,8 @@ import pytest
 from bpy_extras.object_utils import world_to_camera_view
 from mathutils import Vector
 
-from mphdrr.addon import cameras, scanner
+from mphdrr.addon import scanner
+from mphdrr.core.geometry.collimator import Construction
 from mphdrr.core.geometry.system import PinholeSystem
 from mphdrr.core.geometry.views import Views
 
@@ -36,31 +37,16 @@ def assert_blender_agrees(scene, collection, views: Views) -> None:
         assert np.abs(got - expected).max() < 1e-3
 
 
-@pytest.mark.parametrize("shape", [(256, 256), (128, 200), (300, 96)])
+@pytest.mark.parametrize("shape", [(256, 256), (128, 200)])
 def test_all_modules_project_as_their_views(scene, dc_spect, shape):
     collection = scanner.build_scanner(scene, dc_spect, shape=shape)
     assert_blender_agrees(scene, collection, dc_spect.views(shape=shape))
 
 
-@pytest.mark.parametrize(
-    "options",
-    [
-        {"pitch": 10.0, "shape": (128, 128)},
-        {"pitch": (2.5, 4.0), "shape": (150, 220)},
-        {"pitch": 3.0, "shape": (100, 160), "offset": (12.0, -31.0), "magnification": 7.0},
-    ],
-)
-def test_cameras_match_views_of_any_pitch_and_offset(scene, dc_spect, options):
-    collection = scanner.build_scanner(scene, dc_spect)
-    views = dc_spect.views(**options)
-    cameras.match_views(scene, scanner.modules(collection), views)
-    assert_blender_agrees(scene, collection, views)
-
-
 def test_modules_smaller_than_blenders_smallest_camera(scene):
     """Lens and sensor below 1 are silently clamped by Blender: both are scaled up."""
     system = PinholeSystem([[30.0, 4.0, 5.0], [-3.0, 40.0, -6.0]], 0.1, [0.4, 0.8], 0.5, 1.0, 5.0)
-    collection = scanner.build_scanner(scene, system, plate_thickness=0.1, wall_thickness=0.1)
+    collection = scanner.build_scanner(scene, system, construction=Construction(0.1, 0.1))
     assert all(c.data.lens >= 1.0 and c.data.sensor_width >= 1.0 for c in scanner.modules(collection))
     assert_blender_agrees(scene, collection, system.views())
 
@@ -71,7 +57,7 @@ def test_module_on_the_axis(scene):
     assert_blender_agrees(scene, scanner.build_scanner(scene, system), system.views())
 
 
-@pytest.mark.parametrize("number", [1, 14, 47, 80])
+@pytest.mark.parametrize("number", [14, 47])
 def test_markers_rendered_by_cycles_land_where_views_say(scene, dc_spect, number, tmp_path):
     """Not mirrored and not upside down: the markers differ in size and are not symmetric in any way."""
     shape = (96, 128)

@@ -9,7 +9,9 @@ import pytest
 
 bpy = pytest.importorskip("bpy")
 
-from mphdrr.addon import scanner, storage, volumes  # noqa: E402
+from mphdrr.addon import phantoms, scanner, storage, volumes  # noqa: E402
+from mphdrr.addon.phantom_properties import plain_settings  # noqa: E402
+from mphdrr.addon.stored_volumes import store_volume  # noqa: E402
 from mphdrr.core.geometry.grid import Grid  # noqa: E402
 from mphdrr.core.phantoms.torso import CardiacTorso  # noqa: E402
 from mphdrr.core.projector import Projector  # noqa: E402
@@ -18,46 +20,48 @@ from mphdrr.core.volumes.volume import Volume  # noqa: E402
 from mphdrr.core.volumes.volume_files import write_volume  # noqa: E402
 
 
-def state(k: int, count: int, voxels: int, quantity: str = "activity", **settings) -> Volume:
-    """State `k`, from 0, of a beating torso on a cube that holds its box."""
-    torso = CardiacTorso(**settings).beating(count)[k]
-    low, high = torso.box
-    grid = Grid.centered((voxels,) * 3, (high - low).max() / (voxels - 2), (low + high) / 2)
-    return torso.voxelize(grid, quantity=quantity)
+@pytest.fixture
+def beats() -> list[Volume]:
+    """Two states of random voxels."""
+    arrays = np.random.default_rng(5).random((2, 9, 8, 7), np.float32)
+    return [Volume(array, Grid.centered(array.shape, 10.0)) for array in arrays]
 
 
 def test_every_frame_has_its_state_of_the_torso(scene):
-    assert bpy.ops.mphdrr.add_torso(voxels=10, frames=2, attenuation=True) == {"FINISHED"}
-    item = bpy.context.object
-    mu, states = item.children[0], [state(k, 2, 10).array for k in range(2)]
+    assert bpy.ops.mphdrr.add_torso(voxels=8, frames=2) == {"FINISHED"}
+    item, recipe = bpy.context.object, phantoms.recipe_of(plain_settings("torso", voxels=8, frames=2))
+    assert recipe.settings["frames"] == 2 and list(recipe.states) == list(CardiacTorso().beating(2))
+    states = [state.voxelize(recipe.grid).array for state in recipe.states]
     for frame in (1, 2, 3):
         scene.frame_set(frame)
         assert np.array_equal(volumes.volume_from_object(item).array, states[(frame - 1) % 2])
-        for one in (item, mu):
-            assert one.data.grids.load() and volumes.file_of(one) == Path(one.data.grids.frame_filepath)
-        assert volumes.state_text(mu) == f"{(frame - 1) % 2 + 1} of 2"
-    assert np.array_equal(volumes.volume_from_object(mu).array, state(0, 2, 10, "mu").array)
+        assert item.data.grids.load() and volumes.file_of(item) == Path(item.data.grids.frame_filepath)
+        assert volumes.state_text(item) == f"{(frame - 1) % 2 + 1} of 2"
 
-    # What was set on the sequence stays when its settings change.
+
+def test_a_volume_begins_to_beat_and_stands_still_again(beats):
+    item = volumes.add_volume(beats[0], "Heart")
+    still = volumes.file_of(item)
+    volumes.replace_stored(item, store_volume(beats, storage.folder()))
     item.data.frame_start, item.data.sequence_mode = 2, "EXTEND"
-    item.mphdrr_volume.torso.myocardium = 70
-    assert volumes.state_text(item) == "2 of 2"
-    assert np.array_equal(volumes.volume_from_object(item).array, state(1, 2, 10, myocardium=70).array)
-    assert (item.data.frame_start, item.data.sequence_mode) == (2, "EXTEND")
+    assert item.data.is_sequence and item.data.frame_duration == 2
+    volumes.replace_stored(item, store_volume(beats[::-1], storage.folder()))
+    assert (item.data.frame_start, item.data.sequence_mode) == (2, "EXTEND"), "what was set on it stays"
+    assert np.array_equal(volumes.volume_from_object(item).array, beats[1].array)
+    volumes.replace_stored(item, store_volume(beats[0], storage.folder()))
+    assert not item.data.is_sequence and volumes.file_of(item) == still, "files are named by content"
 
 
-def test_the_current_frame_is_projected(scene, ring_system):
+def test_the_current_frame_is_projected(scene, ring_system, beats):
     scanner.build_scanner(scene, ring_system)
-    bpy.ops.mphdrr.add_torso(voxels=16, frames=2)
+    volumes.add_volume(beats, "Heart")
     views = ring_system.views(shape=(12, 10))
-    for frame in (1, 2):
-        expected = state(frame - 1, 2, 16)
+    for frame, expected in enumerate(beats, 1):
         scene.frame_set(frame)
         assert bpy.ops.mphdrr.render_projections(width=10, height=12) == {"FINISHED"}
         run = read_run(storage.absolute(scene.mphdrr_projections.run_file))
         np.testing.assert_allclose(run.projections, Projector(expected.grid, views)(expected), rtol=1e-5, atol=1e-3)
         assert run.settings["state"] == f"{frame} of 2" and run.settings["frame"] == frame
-        assert run.settings["frames"] == 2
 
 
 @pytest.fixture

@@ -12,7 +12,7 @@ bpy = pytest.importorskip("bpy")
 
 from mathutils import Matrix  # noqa: E402
 
-from mphdrr.addon import compat, volume_materials, volumes  # noqa: E402
+from mphdrr.addon import compat, storage, stored_volumes, volume_materials, volumes  # noqa: E402
 from mphdrr.core.errors import InputError  # noqa: E402
 from mphdrr.core.geometry.frames import euler_pose  # noqa: E402
 from mphdrr.core.geometry.grid import Grid  # noqa: E402
@@ -91,7 +91,7 @@ def test_saving_a_copy_leaves_the_session_usable(tmp_path, sparse_volume):
 
 
 def test_large_volume_is_shown_coarser_but_kept_whole(monkeypatch):
-    monkeypatch.setattr(volumes, "MAX_SHOWN_VOXELS", 20**3)
+    monkeypatch.setattr(stored_volumes, "MAX_SHOWN_VOXELS", 20**3)
     array = np.random.default_rng(1).random((31, 32, 33), dtype=np.float32)
     volume = Volume(array, Grid.centered(array.shape, 1.5, (1.0, 2.0, 3.0)), "activity")
     item = volumes.add_volume(volume, "Large")
@@ -106,7 +106,7 @@ def test_large_volume_is_shown_coarser_but_kept_whole(monkeypatch):
 
 
 def test_coarser_copy_moves_beside_the_blend_with_the_full_one(tmp_path, monkeypatch):
-    monkeypatch.setattr(volumes, "MAX_SHOWN_VOXELS", 10)
+    monkeypatch.setattr(stored_volumes, "MAX_SHOWN_VOXELS", 10)
     array = np.ones((8, 8, 8), np.float32)
     item = volumes.add_volume(Volume(array, Grid.centered((8, 8, 8), 1.0)), "Large")
     bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "a.blend"))
@@ -127,7 +127,7 @@ def test_replacing_a_volume_leaves_no_orphans(sparse_volume):
     item = volumes.add_volume(sparse_volume, "Sample")
     before = len(bpy.data.volumes), len(bpy.data.materials)
     other = Volume(sparse_volume.array[:5].copy(), Grid((5, 14, 9), np.eye(4)), "mu")
-    volumes.replace_volume(item, other)
+    volumes.replace_stored(item, stored_volumes.store_volume(other, storage.folder()))
     assert (len(bpy.data.volumes), len(bpy.data.materials)) == before
     assert volumes.volume_from_object(item).grid.shape == (5, 14, 9)
 

@@ -1,8 +1,8 @@
-"""Handlers: the scanner follows when cameras move, also after undo, redo and loading.
+"""Handlers: scanners follow when cameras move, after undo and redo, and when a file is loaded.
 
-What follows is only ever changed in place (`design.refresh`). Copies and left-overs of the user's own Shift+D and X need
-datablocks made and removed; that waits until Blender is idle and is an undo step of its own. One that the user has undone
-is not done again: the panel offers it.
+Following only changes things in place (`following.refresh`). Cameras that the user copied or deleted with Blender's own
+Shift+D and X need datablocks made and removed: that waits until Blender is idle, and is an undo step of its own. What an
+undo has made untidy again is left so; the panel offers to tidy it.
 """
 
 from __future__ import annotations
@@ -13,28 +13,28 @@ from typing import Any
 
 import bpy
 
-from . import copies, design, scanner
+from . import copies, following, scanner
 
 _INTERVAL = 0.2  # s between two looks whether a tool is still running
 _overlooked = False  # something happened while rendering or playing
-_undone: dict[str, str] = {}  # what an undo left untidy, in words, by scanner: the user wants it so
+_undone: dict[str, str] = {}  # by scanner: what the last undo left untidy, in words
 
 
 @bpy.app.handlers.persistent
 def after_update(scene: bpy.types.Scene, depsgraph: bpy.types.Depsgraph) -> None:
-    """Something was evaluated: modules that have moved are rebuilt; nothing else costs more than a look at the list."""
+    """Blender has evaluated the scene: modules that moved are rebuilt."""
     _follow(scene, depsgraph, aim=True)
 
 
 @bpy.app.handlers.persistent
 def after_frame(scene: bpy.types.Scene, depsgraph: bpy.types.Depsgraph) -> None:
-    """Another frame: what an animation moves is rebuilt, and looks where the animation has it look."""
+    """The frame has changed: modules that an animation moved are rebuilt, and keep the aim that it gives them."""
     _follow(scene, depsgraph, aim=False)
 
 
 def _follow(scene: bpy.types.Scene, depsgraph: bpy.types.Depsgraph, aim: bool) -> None:
     global _overlooked
-    if depsgraph.mode != "VIEWPORT" or design.is_writing():
+    if depsgraph.mode != "VIEWPORT" or following.is_writing():
         return
     moved, structure = set(), _overlooked
     for update in depsgraph.updates:
@@ -45,39 +45,43 @@ def _follow(scene: bpy.types.Scene, depsgraph: bpy.types.Depsgraph, aim: bool) -
             moved.add(item)
     if not (moved or structure):
         return
-    if _is_busy():
-        _overlooked = True
+    _overlooked = _is_busy()
+    if _overlooked:
         return
-    _overlooked = False
-    for collection in _own(scanner.scanners(scene)):
+    for collection in _local(scanner.scanners(scene)):
         found = scanner.modules(collection)
-        changed = found if structure else [camera for camera in found if camera in moved]
-        design.refresh(collection, found, changed, aim=aim)
+        following.refresh(collection, found if structure else [camera for camera in found if camera in moved], aim)
         if structure:
             _look_for_copies(collection)
 
 
 @bpy.app.handlers.persistent
 def after_undo(*_: Any) -> None:
-    """Undo and redo bring back some datablocks and leave others: make everything agree again."""
+    """Undo and redo restore some datablocks and leave others: make everything agree again."""
     _undone.clear()
-    for collection in _own(bpy.data.collections):
-        scanner.refresh_scanner(collection)
-        with design.writing():
+    for collection in _local(bpy.data.collections):
+        following.refresh(collection)
+        with following.writing():
             collection.mphdrr_scanner.untidy = copies.untidy_text(collection)
         _undone[collection.name] = collection.mphdrr_scanner.untidy
 
 
 @bpy.app.handlers.persistent
 def after_load(*_: Any) -> None:
-    """Modules of a file made by an older version share meshes and have no readouts. Nothing is tidied unasked."""
-    for collection in _own(bpy.data.collections):
+    """A file was opened; one of an older version has shared meshes and no readouts. Nothing is tidied unasked."""
+    for collection in _local(bpy.data.collections):
         copies.make_single_users(collection)
     after_undo()
 
 
-def _own(collections: Iterable[bpy.types.Collection]) -> list[bpy.types.Collection]:
-    """The scanners that are of this file, not linked from another."""
+def stop() -> None:
+    """Forget what waits: the extension is disabled."""
+    if bpy.app.timers.is_registered(_tidy):
+        bpy.app.timers.unregister(_tidy)
+
+
+def _local(collections: Iterable[bpy.types.Collection]) -> list[bpy.types.Collection]:
+    """The scanners that are not linked from another file."""
     return [c for c in collections if c.mphdrr_scanner.is_scanner and c.library is None]
 
 
@@ -90,7 +94,7 @@ def _look_for_copies(collection: bpy.types.Collection) -> None:
     text = copies.untidy_text(collection)
     properties = collection.mphdrr_scanner
     if properties.untidy != text:
-        with design.writing():
+        with following.writing():
             properties.untidy = text
     if _undone.get(collection.name) != text:
         _undone.pop(collection.name, None)
@@ -99,7 +103,7 @@ def _look_for_copies(collection: bpy.types.Collection) -> None:
 
 
 def _tidy() -> float | None:
-    """Tidy once no tool is running, e.g. the move that follows Shift+D."""
+    """Tidy once no tool is running, e.g. the move that follows Shift+D. The operator makes an undo step of it."""
     windows = bpy.context.window_manager.windows
     if any(len(window.modal_operators) for window in windows) or _is_busy():
         return _INTERVAL
@@ -108,11 +112,6 @@ def _tidy() -> float | None:
             bpy.ops.mphdrr.tidy_modules("EXEC_DEFAULT", True)
         except RuntimeError as error:
             print(f"mphDRR: {error}", file=sys.stderr)
-            _undone.update((c.name, c.mphdrr_scanner.untidy) for c in _own(bpy.data.collections))  # not over and over
+            # Not again and again:
+            _undone.update((c.name, c.mphdrr_scanner.untidy) for c in _local(bpy.data.collections))
     return None
-
-
-def stop() -> None:
-    """Forget what waits: the extension is disabled."""
-    if bpy.app.timers.is_registered(_tidy):
-        bpy.app.timers.unregister(_tidy)

@@ -1,0 +1,239 @@
+"""Modules follow their numbers: cameras are aimed, collimators and crystals reshaped, readouts calculated.
+
+Everything is changed in place (vertices, properties, rotations). No datablock is made or removed: this also runs after
+Blender has stored an undo step, and undo expects the datablocks that it stored. `copies.py` makes and removes modules.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager
+
+import bpy
+import numpy as np
+
+from ..core.errors import InputError
+from ..core.geometry.collimator import Construction, EdgePlace
+from ..core.physics.performance import isocentre_performance
+from . import cameras, collimators
+from .decimals import typed
+from .module_values import LENGTHS, TYPED, ModuleNumbers, module_numbers, off_aim
+
+PARTS = ("COLLIMATOR", "CRYSTAL")  # what hangs on a module's camera: `Object.mphdrr_module.part`
+_KEY = "mphdrr_solid"  # custom property of a mesh or camera: the numbers that it was built from
+_ConstructionNumbers = tuple[float, float, float, EdgePlace]
+_writing = 0
+
+
+@contextmanager
+def writing() -> Iterator[None]:
+    """Within this block the extension itself writes properties: their edits rebuild nothing."""
+    global _writing
+    _writing += 1
+    try:
+        yield
+    finally:
+        _writing -= 1
+
+
+def is_writing() -> bool:
+    """Whether the extension itself is writing properties now."""
+    return bool(_writing)
+
+
+def modules(collection: bpy.types.Collection) -> list[bpy.types.Object]:
+    """A scanner's camera objects, in the order of `read_scanner`'s system."""
+    found = [o for o in collection.all_objects if o.mphdrr_module.is_module]
+    return sorted(found, key=lambda o: (o.mphdrr_module.index, o.mphdrr_module.number, o.name))
+
+
+def parts_of(
+    collection: bpy.types.Collection, found: Sequence[bpy.types.Object]
+) -> dict[bpy.types.Object, list[bpy.types.Object]]:
+    """Each module's collimator and crystal."""
+    # `Object.children` searches all objects: once for one module, but not once for each of eighty.
+    items = found[0].children if len(found) == 1 else collection.all_objects
+    parts: dict[bpy.types.Object, list[bpy.types.Object]] = {camera: [] for camera in found}
+    for item in items:
+        if item.mphdrr_module.part in PARTS and item.parent in parts:
+            parts[item.parent].append(item)
+    return parts
+
+
+def construction(scanner: bpy.types.PropertyGroup) -> Construction:
+    """How the scanner's collimators are built; raises `InputError` where they cannot be."""
+    return Construction(*_construction_numbers(scanner))
+
+
+def refresh(
+    collection: bpy.types.Collection, changed: Sequence[bpy.types.Object] | None = None, aim: bool = True
+) -> None:
+    """Make a scanner's modules, and its totals, follow their places and numbers.
+
+    `changed` are the camera objects that may have changed; by default all, and the totals are calculated in any case, as
+    is necessary after an undo. `aim` aims modules that have been moved, if the scanner is set to keep them aimed.
+    """
+    scanner = collection.mphdrr_scanner
+    if is_writing() or not scanner.is_scanner:
+        return
+    found = modules(collection)
+    with writing():
+        parts = parts_of(collection, found if changed is None else changed)
+        rebuilt = [_refresh_module(camera, scanner, own, aim) for camera, own in parts.items()]
+        if changed is None or any(rebuilt) or scanner.count != len(found):
+            _update_totals(scanner, [camera.mphdrr_module for camera in found])
+            _resize_roi(collection, found)
+
+
+def refresh_module(camera: bpy.types.Object) -> None:
+    """Make one module follow: one of its numbers was edited."""
+    if not camera.mphdrr_module.is_module or is_writing():
+        return
+    for collection in bpy.data.collections:
+        if collection.mphdrr_scanner.is_scanner and camera.name in collection.all_objects:
+            refresh(collection, [camera])
+
+
+def length_typed(camera: bpy.types.Object) -> None:
+    """Keep a module's `l` as the user has typed it, whatever the ROI."""
+    if camera.mphdrr_module.is_module and not is_writing():
+        with writing():
+            camera.mphdrr_module.length_mode = TYPED
+        refresh_module(camera)
+
+
+def set_for_all(collection: bpy.types.Collection, name: str) -> None:
+    """Give all modules the scanner's number called `name` (or its "length_mode"): it was edited."""
+    if not collection.mphdrr_scanner.is_scanner or is_writing():
+        return
+    with writing():
+        for camera in modules(collection):
+            setattr(camera.mphdrr_module, name, getattr(collection.mphdrr_scanner, name))
+            if name == "collimator_length":
+                camera.mphdrr_module.length_mode = TYPED
+    refresh(collection)
+
+
+def copy_numbers(
+    collection: bpy.types.Collection, source: bpy.types.Object, targets: Iterable[bpy.types.Object]
+) -> None:
+    """Give modules the lengths of another, and its choice whether `l` follows the ROI."""
+    with writing():
+        for camera in targets:
+            for name in (*LENGTHS, "length_mode"):
+                setattr(camera.mphdrr_module, name, getattr(source.mphdrr_module, name))
+    refresh(collection)
+
+
+def _refresh_module(
+    camera: bpy.types.Object, scanner: bpy.types.PropertyGroup, parts: Sequence[bpy.types.Object], aim: bool
+) -> bool:
+    """Make one module follow; returns whether its readouts have changed."""
+    module = camera.mphdrr_module
+    place = cameras.world_matrix(camera)[:3, 3]
+    if np.any(np.array(module.placed, np.float32) != place.astype(np.float32)):
+        is_new = not module.built
+        module.placed = place
+        if aim and not is_new and scanner.keep_aimed and _is_free(camera) and off_aim([camera]) and np.any(place):
+            cameras.set_world_matrix(camera, cameras.camera_matrices(place[None])[0])
+    numbers, aimed = module_numbers(camera), not off_aim([camera])
+    built_as = _construction_numbers(scanner)
+    intrinsic_fwhm = typed(scanner.intrinsic_fwhm)
+    built = repr((*numbers._replace(center=numbers.center.tolist()), aimed, *built_as, intrinsic_fwhm))
+    changed = module.built != built
+    if changed:
+        module.built, module.finding = built, ""
+        module.collimator_length = numbers.collimator_length
+        _update_readouts(module, numbers, aimed, intrinsic_fwhm)
+    # Even where nothing has changed: an undo may have restored the numbers and not the meshes.
+    problem = "" if module.problem else _rebuild(camera, numbers, built_as, parts)
+    if problem:
+        module.problem = problem
+    return changed
+
+
+def _is_free(camera: bpy.types.Object) -> bool:
+    """Whether only the user turns the camera: no animation, driver or constraint."""
+    data = camera.animation_data
+    is_animated = data is not None and (data.action is not None or len(data.drivers) or len(data.nla_tracks))
+    return not is_animated and not len(camera.constraints)
+
+
+def _construction_numbers(scanner: bpy.types.PropertyGroup) -> _ConstructionNumbers:
+    """The arguments of `Construction`, which may refuse them."""
+    lengths = typed(scanner.plate_thickness), typed(scanner.wall_thickness)
+    return *lengths, typed(scanner.opening_angle), scanner.edge_at.lower()
+
+
+def _rebuild(
+    camera: bpy.types.Object,
+    numbers: ModuleNumbers,
+    built_as: _ConstructionNumbers,
+    parts: Sequence[bpy.types.Object],
+) -> str:
+    """Give the camera's view and the parts' meshes the shape of `numbers`; returns why not, or an empty text."""
+    _, _, d, l, side, thickness, _ = numbers
+    if _differs(camera.data, (l, side)):
+        cameras.set_field_of_view(camera.data, side, l)
+        camera.data[_KEY] = repr((l, side))
+    for item in parts:
+        part = item.mphdrr_module.part
+        given = (d, l, side, *built_as) if part == "COLLIMATOR" else (l, side, thickness)
+        if item.data.is_editmode or not _differs(item.data, given):
+            continue
+        try:
+            solid = collimators.part_solid(part, numbers, Construction(*built_as))
+        except InputError as error:  # e.g. while d is typed before Ld: the last shape stays
+            return f"module {numbers.number}: {error}"
+        collimators.reshape_mesh(item.data, solid)
+        item.data[_KEY] = repr(given)
+    return ""
+
+
+def _differs(data: bpy.types.ID, numbers: tuple[float | str, ...]) -> bool:
+    """Whether a mesh or camera was built from other numbers than these.
+
+    One that is shared, as a fresh copy's is, stays as it is until `copies.py` has made it single-user.
+    """
+    return data.users == 1 and data.get(_KEY) != repr(numbers)
+
+
+def _resize_roi(collection: bpy.types.Collection, modules: Sequence[bpy.types.Object]) -> None:
+    radius = max((camera.mphdrr_module.roi_radius for camera in modules), default=0.0)
+    for item in collection.objects:
+        if item.mphdrr_module.part == "ROI" and radius > 0:
+            collimators.resize_sphere(item.data, radius)
+
+
+def _update_readouts(
+    module: bpy.types.PropertyGroup, numbers: ModuleNumbers, aimed: bool, intrinsic_fwhm: float
+) -> None:
+    """Write a module's readouts; where its numbers are impossible they are 0, and `problem` says why."""
+    module.pinhole_distance, module.aimed = numbers.pinhole_distance, aimed
+    _, _, d, l, side, thickness, _ = numbers
+    try:
+        numbers.system()  # refuses impossible numbers
+        at = isocentre_performance(numbers.pinhole_distance, d, l, side, thickness, intrinsic_fwhm=intrinsic_fwhm)
+    except InputError as error:
+        module.problem = str(error)
+        module.sensitivity = module.resolution = module.magnification = module.roi_seen = 0.0
+        return
+    module.problem = ""
+    module.sensitivity, module.resolution = 1e6 * float(at.sensitivity), float(at.resolution)
+    module.magnification, module.roi_seen = float(at.magnification), float(at.roi_radius_seen)
+
+
+def _update_totals(scanner: bpy.types.PropertyGroup, modules: Sequence[bpy.types.PropertyGroup]) -> None:
+    """Write the readouts of all modules together, and the numbers that they share."""
+    good = [module for module in modules if not module.problem]
+    scanner.count = len(modules)
+    scanner.sensitivity = sum(module.sensitivity for module in good)
+    scanner.resolution = sum(module.resolution for module in good) / max(1, len(good))
+    scanner.n_covering = sum(module.sees_roi for module in good)
+    scanner.findings = ""
+    mixed = []
+    for name in (*LENGTHS, "length_mode") if modules else ():
+        setattr(scanner, name, getattr(modules[0], name))
+        if len({getattr(module, name) for module in modules}) > 1:
+            mixed.append(name)
+    scanner.mixed = " ".join(mixed)

@@ -1,0 +1,74 @@
+"""Maps of what the scanner does in every voxel, as volumes in the scene."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import bpy
+
+from ..core.geometry.grid import Grid
+from ..core.memory import require
+from ..core.physics.maps import MAPS, within_roi
+from ..core.progress import Progress
+from . import choices, jobs, scanner, storage, volume_materials, volumes
+from .stored_volumes import StoredVolume, store_volume
+
+_DESCRIPTIONS = {
+    "sensitivity": "Counts per decay of all modules together",
+    "modules": "Number of modules that see a voxel",
+    "resolution": "FWHM in mm that the projections hold, all modules together",
+    "completeness": "Of the angular sampling (Tuy): 1 where every plane through the voxel meets a pinhole. Slow",
+}
+QUANTITIES = choices.items(choices.MAPS, ((name, name.capitalize(), _DESCRIPTIONS.get(name, "")) for name in MAPS))
+"""What can be mapped, as items of an enumeration."""
+_BYTES = 40.0  # a voxel, while the map is made and put into the scene
+
+
+def mapping(
+    scene: bpy.types.Scene, quantity: str, voxels: int = 64, side: float = 0.0, only_roi: bool = True
+) -> jobs.Job:
+    """The job that adds a map of the scene's scanner, with ideal modules, or replaces the last one of its quantity.
+
+    Parameters
+    ----------
+    scene
+        With a scanner.
+    quantity
+        One of `core.physics.maps.MAPS`.
+    voxels
+        Along each side of the map's cube around the isocentre.
+    side
+        Of the cube, mm; 0 takes the diameter of the ROI.
+    only_roi
+        Leave out what lies outside the ROI sphere.
+
+    Raises
+    ------
+    InputError
+        No scanner in the scene, or the memory is too small.
+    """
+    collection = scanner.required_scanner(scene)
+    system = scanner.read_scanner(collection)
+    grid = Grid.centered((voxels,) * 3, (side or 2 * float(system.roi_radius.max())) / voxels)
+    require(_BYTES * grid.n_voxels, f"a map of {voxels}^3 voxels")
+    name, folder = f"{quantity.capitalize()} map", storage.folder()
+    provenance: dict[str, Any] = {"map": quantity, "modules": len(system), "scanner": collection.name}
+
+    def work(progress: Progress) -> StoredVolume:
+        volume = MAPS[quantity](system, grid, progress=progress)
+        return store_volume(within_roi(volume, system) if only_roi else volume, folder, provenance=provenance)
+
+    def finish(stored: StoredVolume) -> str:
+        old = [item for item in volumes.volume_objects(scene) if volumes.quantity_of(item) == quantity]
+        if old:
+            item = old[0]
+            volumes.replace_stored(item, stored)
+        else:
+            item = volumes.add_stored(stored, name, scene.collection)
+            volume_materials.show_in_eevee(scene)
+        values, high = stored.volume.array, stored.high
+        low = float(values[values > 0].min(initial=high))
+        item.mphdrr_volume.display_low, item.mphdrr_volume.display_high = low if low < high else 0.0, high
+        return f"{name}: {low:.4g} to {high:.4g} {stored.volume.unit}".removesuffix(" 1")
+
+    return jobs.Job(f"{name} of {len(system)} modules", work, finish)

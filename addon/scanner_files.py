@@ -1,0 +1,131 @@
+"""Scanners from workbooks, and the scene's scanner as a workbook or as another program's file."""
+
+from __future__ import annotations
+
+import hashlib
+import math
+import warnings
+from dataclasses import asdict, replace
+from pathlib import Path
+
+import bpy
+import numpy as np
+
+from ..core.errors import InputError, InputWarning
+from ..core.exchange import FORMATS, write_geometry
+from ..core.geometry.system import Detector, PinholeSystem
+from ..core.recording import recorded_warnings
+from ..core.workbook import read_system, write_system
+from . import following, scanner, storage
+from .decimals import typed
+from .module_values import LENGTHS
+
+WORKBOOK_SUFFIXES = (".xlsx", ".xlsm")
+_EQUAL = 1e-9  # mm, or share of a length above 1 mm
+
+
+def export_scanner(collection: bpy.types.Collection, path: Path, use_template: bool = True) -> PinholeSystem:
+    """Write the scanner as it stands in the scene to a workbook, which becomes the scanner's own.
+
+    Parameters
+    ----------
+    collection
+        The scanner.
+    path
+        The workbook to write, .xlsx or .xlsm.
+    use_template
+        Write into a copy of the scanner's present workbook, so that all else in it stays. If that was read by a column
+        map, it is written by the map, and the scene keeps the new file's own map. Otherwise, or if the workbook has gone
+        (`InputWarning`), a new one is made.
+
+    Returns
+    -------
+    PinholeSystem
+        The system that was written, with the new file as its source.
+
+    Raises
+    ------
+    InputError
+        A camera does not look at the isocentre, the modules' numbers are impossible, or the file cannot be written. The
+        scanner stays as it was.
+    """
+    following.refresh(collection)
+    system = scanner.read_scanner(collection, aimed=True)
+    template = _template(collection) if use_template else None
+    source = scanner.source(collection)
+    columns = source.columns if source is not None and template is not None else None
+    own = write_system(system, path, template, columns).columns
+    with recorded_warnings():  # the writer has already warned of the template's doubts
+        written = read_system(path, own)
+    different = _difference(system, written)
+    if different:
+        raise InputError(f"{path}: was written, but reads back differently ({different}); the scene keeps its numbers")
+    # The scene's own float64 numbers, which may differ in the last digit.
+    written = replace(system, source=written.source)
+    scanner.remember_source(collection, written)
+    return written
+
+
+def export_for_program(
+    collection: bpy.types.Collection,
+    path: Path,
+    format: str,
+    shape: tuple[int, int],
+    detector: Detector = "virtual",
+    magnification: float = 10.0,
+) -> PinholeSystem:
+    """Write the scanner as it stands in the scene in one of `FORMATS`, with its collimators as they are built.
+
+    Parameters
+    ----------
+    collection
+        The scanner.
+    path
+        The file to write, or a new folder for formats of several files.
+    format
+        A name in `core.exchange.FORMATS`.
+    shape, detector, magnification
+        The images to describe (`PinholeSystem.views`).
+
+    Raises
+    ------
+    InputError
+        A camera does not look at the isocentre, the format cannot express the scanner, or the file cannot be written.
+    """
+    options = asdict(following.construction(collection.mphdrr_scanner))
+    options["opening_degrees"] = typed(math.degrees(options.pop("opening_angle")))
+    system = scanner.read_scanner(collection, aimed=True)
+    views = system.views(shape, detector, magnification=magnification)
+    known = {name: value for name, value in options.items() if name in FORMATS[format].options}
+    write_geometry(system, path, format, views=views, **known)
+    return system
+
+
+def _template(collection: bpy.types.Collection) -> Path | None:
+    properties = collection.mphdrr_scanner
+    if not properties.workbook:
+        return None
+    path = storage.absolute(properties.workbook)
+    if not path.is_file():
+        warnings.warn(f"{path} has gone: made a new workbook instead of a copy of it", InputWarning, stacklevel=3)
+        return None
+    if properties.sha256 and hashlib.sha256(path.read_bytes()).hexdigest() != properties.sha256:
+        warnings.warn(
+            f"{path} has changed since the scanner was read from it: the modules' cells are overwritten, all else is "
+            "kept as it is now",
+            InputWarning,
+            stacklevel=3,
+        )
+    return path
+
+
+def _difference(one: PinholeSystem, other: PinholeSystem) -> str:
+    """Where two systems differ, in words."""
+    if not np.array_equal(one.numbers, other.numbers):
+        return "the modules' numbers"
+    for name in ("centers", *LENGTHS):
+        a, b = (getattr(system, name).reshape(len(one), -1) for system in (one, other))
+        wrong = (np.abs(a - b) > _EQUAL * np.maximum(1.0, np.abs(a))).any(axis=1)
+        if wrong.any():
+            return f"{name} of module {one.numbers[int(wrong.argmax())]}"
+    return ""

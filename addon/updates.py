@@ -1,0 +1,23 @@
+"""What an edited property calls: functions by name, so that property groups import nothing that draws or rebuilds.
+
+`registration.py`, which knows every module, fills the table.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import bpy
+
+FUNCTIONS: dict[str, Callable[..., None]] = {}
+"""Each takes the object, collection or scene that holds the property, and what was given to `on_edit`."""
+
+
+def on_edit(name: str, *arguments: Any) -> Callable[[bpy.types.PropertyGroup, bpy.types.Context], None]:
+    """A property's ``update=``: calls ``FUNCTIONS[name](group.id_data, *arguments)``."""
+
+    def edited(group: bpy.types.PropertyGroup, context: bpy.types.Context) -> None:
+        FUNCTIONS[name](group.id_data, *arguments)
+
+    return edited

@@ -1,0 +1,37 @@
+"""Files dropped on the 3D viewport or the outliner: which operator opens which endings."""
+
+from __future__ import annotations
+
+import bpy
+
+from ..addon import ids
+from ..addon.scanner_files import WORKBOOK_SUFFIXES
+from ..addon.volume_import import READ_ENDINGS
+
+
+class _Dropped:
+    @classmethod
+    def poll_drop(cls, context: bpy.types.Context) -> bool:
+        return context.area is not None and context.area.type in {"VIEW_3D", "OUTLINER"}
+
+
+class MPHDRR_FH_workbook(_Dropped, bpy.types.FileHandler):
+    bl_idname = ids.FILE_HANDLER_WORKBOOK
+    bl_label = "Pinhole Geometry"
+    bl_import_operator = ids.IMPORT_GEOMETRY
+    bl_file_extensions = ";".join(WORKBOOK_SUFFIXES)
+
+
+class MPHDRR_FH_phantom(_Dropped, bpy.types.FileHandler):
+    bl_idname = ids.FILE_HANDLER_PHANTOM
+    bl_label = "Phantom"
+    bl_import_operator = ids.IMPORT_PHANTOM
+    bl_file_extensions = ".toml"
+
+
+class MPHDRR_FH_volume(_Dropped, bpy.types.FileHandler):
+    bl_idname = ids.FILE_HANDLER_VOLUME
+    bl_label = "Volume for Projection"
+    bl_import_operator = ids.IMPORT_VOLUME
+    # Blender compares the last suffix only. Most .hdr files are pictures of surroundings, not Analyze images.
+    bl_file_extensions = ";".join(sorted({"." + ending.rsplit(".", 1)[1] for ending in READ_ENDINGS} - {".hdr"}))

@@ -1,0 +1,213 @@
+"""What a user does with modules: show, aim, duplicate, remove, tidy and renumber them, copy their numbers, check them."""
+
+from __future__ import annotations
+
+import math
+
+import bpy
+from bpy.props import BoolProperty, EnumProperty, FloatProperty, IntProperty
+
+from ..addon import copies, following, ids, renumbering, scanner, selection
+from ..addon.replacement import modules_text
+from ..addon.reports import run_reported
+
+
+class _OnScanner:
+    """Mixed into operators that change the scanner that the panels work on."""
+
+    bl_options = {"REGISTER", "UNDO"}
+
+    @classmethod
+    def poll(cls, context: bpy.types.Context) -> bool:
+        return selection.poll_scanner(cls, context)
+
+    def execute(self, context: bpy.types.Context) -> set[str]:
+        return run_reported(self, lambda: self.change(context, scanner.required_scanner(context.scene)))
+
+    def change(self, context: bpy.types.Context, collection: bpy.types.Collection) -> str:
+        """Do the work and return the line to report; raises InputError."""
+        raise NotImplementedError
+
+
+class _OnModules(_OnScanner):
+    """Mixed into operators that work on the selected modules."""
+
+    @classmethod
+    def poll(cls, context: bpy.types.Context) -> bool:
+        return selection.poll_module(cls, context)
+
+
+class MPHDRR_OT_show_modules(_OnScanner, bpy.types.Operator):
+    """``bpy.ops.mphdrr.show_modules(first=1, last=40, mode="ONLY")``."""
+
+    bl_idname = ids.SHOW_MODULES
+    bl_label = "Show Modules"
+    bl_description = "Show or hide modules with their collimators and crystals, in the viewport and in renders"
+
+    first: IntProperty(name="First", description="First module number of the range", default=1)
+    last: IntProperty(name="Last", description="Last module number of the range", default=1)
+    mode: EnumProperty(
+        name="Mode",
+        items=[
+            ("ONLY", "Show Only", "Show the modules of the range and hide all others", 0),
+            ("SHOW", "Show", "Show the modules of the range; the others stay as they are", 1),
+            ("HIDE", "Hide", "Hide the modules of the range; the others stay as they are", 2),
+            ("ALL", "Show All", "Show all modules", 3),
+        ],
+        default="ONLY",
+    )
+
+    @classmethod
+    def description(cls, context: bpy.types.Context, properties: bpy.types.OperatorProperties) -> str:
+        modules = f"modules {properties.first} to {properties.last}"
+        return {
+            "ONLY": f"Show {modules} and hide all others, in the viewport and in renders",
+            "SHOW": f"Show {modules}",
+            "HIDE": f"Hide {modules}",
+            "ALL": "Show all modules",
+        }[properties.mode]
+
+    def change(self, context: bpy.types.Context, collection: bpy.types.Collection) -> str:
+        return f"{scanner.show_modules(collection, self.first, self.last, self.mode)} modules visible"
+
+
+class MPHDRR_OT_look_through_module(_OnScanner, bpy.types.Operator):
+    """``bpy.ops.mphdrr.look_through_module(number=7)``."""
+
+    bl_idname = ids.LOOK_THROUGH_MODULE
+    bl_label = "Look Through Module"
+    bl_description = "Make the module's pinhole camera the scene's camera, and look through it"
+
+    number: IntProperty(name="Number", description="Module number", default=1)
+
+    def change(self, context: bpy.types.Context, collection: bpy.types.Collection) -> str:
+        context.scene.camera = scanner.module(collection, self.number)
+        if context.area is not None and context.area.type == "VIEW_3D":
+            context.area.spaces.active.region_3d.view_perspective = "CAMERA"
+        return f"Looking through {context.scene.camera.name}"
+
+
+class MPHDRR_OT_aim_modules(_OnScanner, bpy.types.Operator):
+    """``bpy.ops.mphdrr.aim_modules()``."""
+
+    bl_idname = ids.AIM_MODULES
+    bl_label = "Aim at Isocentre"
+    bl_description = "Turn every module that does not look at the isocentre, without moving it"
+
+    def change(self, context: bpy.types.Context, collection: bpy.types.Collection) -> str:
+        aimed = scanner.aim_modules(collection)
+        return f"Turned {modules_text(aimed)}" if aimed else "All modules aim at the isocentre"
+
+
+class MPHDRR_OT_duplicate_modules(_OnModules, bpy.types.Operator):
+    """``bpy.ops.mphdrr.duplicate_modules(count=3, angle=math.radians(9))``: the selected modules."""
+
+    bl_idname = ids.DUPLICATE_MODULES
+    bl_label = "Duplicate Along Ring"
+    bl_description = "Copy the selected modules, with collimators and crystals, to further places on their rings"
+
+    count: IntProperty(name="Copies", description="Number of copies of each module", default=1, min=1, soft_max=40)
+    angle: FloatProperty(
+        name="Angle", description="From one copy to the next, about the z axis", subtype="ANGLE",
+        default=math.radians(9.0), min=-math.pi, max=math.pi,
+    )  # fmt: skip
+    follow_ring: BoolProperty(
+        name="Follow Ring",
+        description="Take z and the distance from the z axis from the ring's other modules at the new azimuth, so that "
+        "copies stay on an elliptic arc. Otherwise the module is turned about z",
+    )
+
+    def change(self, context: bpy.types.Context, collection: bpy.types.Collection) -> str:
+        modules = selection.selected_modules(context)
+        made = copies.duplicate(collection, modules, self.count, self.angle, self.follow_ring)
+        selection.select(context, made)
+        return f"Made {modules_text([o.mphdrr_module.number for o in made])}"
+
+
+class MPHDRR_OT_remove_modules(_OnModules, bpy.types.Operator):
+    """``bpy.ops.mphdrr.remove_modules()``: the selected modules."""
+
+    bl_idname = ids.REMOVE_MODULES
+    bl_label = "Remove Modules"
+    bl_description = "Delete the selected modules with their collimators and crystals"
+
+    def change(self, context: bpy.types.Context, collection: bpy.types.Collection) -> str:
+        modules = selection.selected_modules(context)
+        text = modules_text([o.mphdrr_module.number for o in modules])
+        copies.remove(collection, modules)
+        return f"Removed {text}"
+
+
+class MPHDRR_OT_tidy_modules(_OnScanner, bpy.types.Operator):
+    """``bpy.ops.mphdrr.tidy_modules()``: in all scanners of the scene."""
+
+    bl_idname = ids.TIDY_MODULES
+    bl_label = "Tidy Modules"
+    bl_description = (
+        "Make modules of copied cameras, with numbers, collimators and crystals of their own, and remove collimators "
+        "and crystals whose camera was deleted"
+    )
+
+    def change(self, context: bpy.types.Context, collection: bpy.types.Collection) -> str:
+        tidied = [copies.tidy(each) for each in scanner.scanners(context.scene)]
+        made, removed = [n for numbers, _ in tidied for n in numbers], sum(n for _, n in tidied)
+        done = [f"made {modules_text(made)}"] if made else []
+        done += [f"removed {removed} parts without a camera"] if removed else []
+        return " and ".join(done).capitalize() or "All modules are in order"
+
+
+class MPHDRR_OT_renumber_modules(_OnScanner, bpy.types.Operator):
+    """``bpy.ops.mphdrr.renumber_modules(order="RINGS")``."""
+
+    bl_idname = ids.RENUMBER_MODULES
+    bl_label = "Renumber Modules"
+    bl_description = "Number all modules 1, 2, ...; they are listed, projected and exported in that order from now on"
+
+    order: EnumProperty(
+        name="Order",
+        description="What the numbers follow",
+        items=(
+            ("RINGS", "By Ring and Azimuth", "Ring by ring along +z, and along each ring from its largest gap on", 0),
+            ("LIST", "As Listed", "The present order: that of the workbook, then added modules", 1),
+        ),
+    )
+
+    def change(self, context: bpy.types.Context, collection: bpy.types.Collection) -> str:
+        changed = renumbering.renumber(collection, self.order)
+        return f"Numbered {len(scanner.modules(collection))} modules: {changed} have another number than before"
+
+
+class MPHDRR_OT_set_numbers(_OnModules, bpy.types.Operator):
+    """``bpy.ops.mphdrr.set_numbers(to_all=True)``."""
+
+    bl_idname = ids.SET_NUMBERS
+    bl_label = "Copy Numbers to Selected"
+    bl_description = "Give the selected modules, or all, the active module's d, l, Ld, Td and R"
+
+    to_all: BoolProperty(name="All", description="Give them to all modules of the scanner", options={"SKIP_SAVE"})
+
+    def change(self, context: bpy.types.Context, collection: bpy.types.Collection) -> str:
+        selected = selection.selected_modules(context)
+        source = selection.active_module(context) or selected[0]
+        targets = {*(scanner.modules(collection) if self.to_all else selected), source}
+        following.copy_numbers(collection, source, targets - {source})
+        return f"{len(targets)} modules have the numbers of {source.name}"
+
+
+class MPHDRR_OT_check_geometry(_OnScanner, bpy.types.Operator):
+    """``bpy.ops.mphdrr.check_geometry()``."""
+
+    bl_idname = ids.CHECK_GEOMETRY
+    bl_label = "Check Geometry"
+    bl_description = (
+        "Look for collimators and crystals that overlap, holes that another module blocks, and modules that do not see "
+        "their ROI; select the modules concerned"
+    )
+
+    def change(self, context: bpy.types.Context, collection: bpy.types.Collection) -> str:
+        found, concerned = scanner.check_geometry(collection)
+        if not found:
+            return "Nothing found"
+        if concerned:
+            selection.select(context, concerned)
+        return f"{len(found)} findings at {len(concerned)} modules: see the Design panel"

@@ -2,33 +2,23 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
-
 import bmesh
 import bpy
 import numpy as np
 
+from ..core.geometry import module_parts
 from ..core.geometry.collimator import Collimator, Construction
 from ..core.geometry.collimator_mesh import Solid, check_watertight, collimator_solid, crystal_solid
+from ..core.geometry.module_parts import Look
 from . import compat
 from .module_values import ModuleNumbers
 
-
-class Look(NamedTuple):
-    """A part's material: its datablock's name, linear RGBA colour, metallic and roughness."""
-
-    name: str
-    color: tuple[float, float, float, float]
-    metallic: float
-    roughness: float
-
-
+# By `Object.mphdrr_module.part`: the material's name, and its colour and gloss. Exported solids look the same.
 LOOKS = {
-    "COLLIMATOR": Look("mphDRR collimator", (0.36, 0.39, 0.43, 1.0), metallic=0.85, roughness=0.42),  # grey metal
-    "CRYSTAL": Look("mphDRR crystal", (1.0, 0.48, 0.06, 0.85), metallic=0.0, roughness=0.12),  # amber
-    "ROI": Look("mphDRR ROI", (0.25, 0.62, 1.0, 0.12), metallic=0.0, roughness=0.5),  # pale blue
+    "COLLIMATOR": ("mphDRR collimator", module_parts.LOOKS["collimator"]),
+    "CRYSTAL": ("mphDRR crystal", module_parts.LOOKS["crystal"]),
+    "ROI": ("mphDRR ROI", Look((0.25, 0.62, 1.0, 0.12), metallic=0.0, roughness=0.5)),  # pale blue
 }
-"""Looks of a scanner's parts, by `Object.mphdrr_module.part`."""
 
 
 def part_solid(part: str, numbers: ModuleNumbers, construction: Construction) -> Solid:
@@ -95,11 +85,11 @@ def resize_sphere(mesh: bpy.types.Mesh, radius: float) -> None:
 
 def part_material(part: str) -> bpy.types.Material:
     """The material of a scanner's parts of one kind; an existing one keeps what the user has changed."""
-    look = LOOKS[part]
-    material = bpy.data.materials.get(look.name)
+    name, look = LOOKS[part]
+    material = bpy.data.materials.get(name)
     if material is not None:
         return material
-    material = bpy.data.materials.new(look.name)
+    material = bpy.data.materials.new(name)
     compat.enable_nodes(material)
     # In Solid view:
     material.diffuse_color, material.metallic, material.roughness = look.color, 0.3 * look.metallic, look.roughness

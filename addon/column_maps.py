@@ -144,15 +144,8 @@ CLASSES = (ColumnMapTable, ColumnMapQuantity, ColumnMapProperties)
 def fill(form: ColumnMapProperties, workbook: Path, columns: ColumnMap | None = None) -> bool:
     """Fill the settings from a column map, by default from a draft made of the workbook's headings.
 
-    Returns
-    -------
-    bool
-        Whether the dialog can help: the reader has questions about the workbook, or a map was given.
-
-    Raises
-    ------
-    InputError
-        The file is not a workbook; the settings are then empty.
+    Returns whether the dialog can help: the reader has questions about the workbook, or a map was given. Raises
+    InputError where the file is not a workbook; the settings are then empty.
     """
     clear(form)
     draft = draft_column_map(workbook)
@@ -251,12 +244,9 @@ def _preview(workbook: Path, columns: ColumnMap) -> tuple[int, list[list[str]]]:
 
 
 def accept(form: ColumnMapProperties) -> ColumnMap:
-    """The column map that the settings describe, with which the workbook can be read; saved, if a name is set.
+    """The column map that the settings describe, also saved where they ask for that.
 
-    Raises
-    ------
-    InputError
-        The workbook is refused, or the map cannot be saved.
+    Raises InputError where the workbook is refused or the map cannot be saved.
     """
     update(form)
     if form.refusal:

@@ -62,15 +62,8 @@ def untidy_text(collection: bpy.types.Collection) -> str:
 def tidy(collection: bpy.types.Collection) -> tuple[list[int], int]:
     """Make modules of copied cameras, and remove parts without a camera.
 
-    Returns
-    -------
-    numbers, n_removed : list of int, int
-        The new modules' numbers, and how many parts were removed.
-
-    Raises
-    ------
-    InputError
-        A copy's shapes cannot be built: correct its numbers, or its original's, first. The scene is as it was.
+    Returns the new modules' numbers, and how many parts were removed. Raises InputError where a copy's shapes cannot be
+    built, and leaves the scene as it was.
     """
     copied, orphans, numbers = copied_cameras(collection), orphan_parts(collection), []
     _require_solids(collection, [*copied, *bare_cameras(collection)])
@@ -132,26 +125,17 @@ def _add_parts(collection: bpy.types.Collection, camera: bpy.types.Object) -> No
 def duplicate(
     collection: bpy.types.Collection, modules: Sequence[bpy.types.Object], count: int, angle: float, follow_ring: bool
 ) -> list[bpy.types.Object]:
-    """Copy modules along their ring.
+    """Copy modules along their ring; returns the new camera objects.
 
     Parameters
     ----------
-    collection
-        The scanner.
-    modules
-        The camera objects to copy.
-    count
-        How many copies of each.
-    angle
-        From one copy to the next, radians about the world's z axis.
+    collection, modules
+        The scanner, and those of its camera objects to copy.
+    count, angle
+        How many copies of each, and the angle from one to the next, radians about the world's z axis.
     follow_ring
         Keep to the ring's arc: a copy's z and distance from the z axis are those of the ring at its azimuth, linear
         between neighbours and constant beyond the arc's ends. Otherwise the copy is turned about z.
-
-    Returns
-    -------
-    list
-        The new camera objects.
 
     Raises
     ------
@@ -213,10 +197,7 @@ def _wrapped(angles: NDArray[np.float64]) -> NDArray[np.float64]:
 def remove(collection: bpy.types.Collection, modules: Sequence[bpy.types.Object]) -> None:
     """Remove modules with their collimators and crystals; other objects parented to them stay where they are.
 
-    Raises
-    ------
-    InputError
-        No module would be left.
+    Raises InputError where no module would be left.
     """
     if len(modules) >= len(scanner.modules(collection)):
         raise InputError("a scanner needs at least one module: keep one, or delete the scanner's collection")

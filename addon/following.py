@@ -68,17 +68,10 @@ def construction(scanner: bpy.types.PropertyGroup) -> Construction:
 def refresh(
     collection: bpy.types.Collection, changed: Sequence[bpy.types.Object] | None = None, aim: bool = True
 ) -> None:
-    """Make modules, and their scanner's totals, follow their places and numbers.
+    """Make a scanner's modules, and its totals, follow their places and numbers.
 
-    Parameters
-    ----------
-    collection
-        The scanner.
-    changed
-        The camera objects that may have changed: one that has not costs next to nothing. By default all, and the
-        totals are calculated in any case, as is necessary after an undo.
-    aim
-        Aim modules that have been moved, if the scanner is set to keep them aimed.
+    `changed` are the camera objects that may have changed; by default all, and the totals are calculated in any case, as
+    is necessary after an undo. `aim` aims modules that have been moved, if the scanner is set to keep them aimed.
     """
     scanner = collection.mphdrr_scanner
     if is_writing() or not scanner.is_scanner:

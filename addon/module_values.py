@@ -147,14 +147,12 @@ def is_edited(camera: bpy.types.Object) -> bool:
 
 def off_aim(cameras_: Iterable[bpy.types.Object]) -> list[int]:
     """Numbers of the modules whose cameras do not look at the isocentre, or are rolled."""
-    off = []
-    for camera in cameras_:
-        matrix = cameras.world_matrix(camera)
-        if not np.any(matrix[:3, 3]):
-            off.append(camera.mphdrr_module.number)  # at the isocentre nothing can be aimed
-            continue
-        rotation = matrix[:3, :3] / np.linalg.norm(matrix[:3, :3], axis=0)
-        aimed = cameras.camera_matrices(matrix[None, :3, 3])[0, :3, :3]
-        if np.abs(rotation - aimed).max() > _TURNED:
-            off.append(camera.mphdrr_module.number)
-    return off
+    return [camera.mphdrr_module.number for camera in cameras_ if not _is_aimed(cameras.world_matrix(camera))]
+
+
+def _is_aimed(matrix: NDArray[np.float64]) -> bool:
+    if not np.any(matrix[:3, 3]):
+        return False  # at the isocentre there is no direction to it
+    rotation = matrix[:3, :3] / np.linalg.norm(matrix[:3, :3], axis=0)
+    aimed = cameras.camera_matrices(matrix[None, :3, 3])[0, :3, :3]
+    return bool(np.abs(rotation - aimed).max() <= _TURNED)

@@ -83,31 +83,20 @@ class ModuleProperties(bpy.types.PropertyGroup):
         update=on_edit("module"),
     )  # fmt: skip
     exact: StringProperty(
-        name="Exact Values",
-        description="The numbers and the pinhole's place as imported, in double precision, JSON",
-        options={"HIDDEN"},
+        name="Exact Values", description="Numbers and place as imported, float64 JSON", options={"HIDDEN"}
     )
-    placed: FloatVectorProperty(
-        name="Placed", description="Where the pinhole was when the module was last built, mm", size=3,
-        options={"HIDDEN"},
-    )  # fmt: skip
-    built: StringProperty(name="Built", description="The numbers that the readouts are of", options={"HIDDEN"})
+    placed: FloatVectorProperty(name="Placed", description="Where it was last built, mm", size=3, options={"HIDDEN"})
+    built: StringProperty(name="Built", description="The numbers that the readouts belong to", options={"HIDDEN"})
     # Readouts: what the panels show, written by following.py.
-    pinhole_distance: FloatProperty(
-        name="Pinhole Distance", description="b: from the pinhole to the isocentre, in mm", min=0.0
-    )
-    sensitivity: FloatProperty(
-        name="Sensitivity", description="Of an ideal pinhole for a point source at the isocentre, cps/MBq"
-    )
+    pinhole_distance: FloatProperty(name="Pinhole Distance", description="b: from the pinhole to the isocentre, in mm")
+    sensitivity: FloatProperty(name="Sensitivity", description="Of an ideal pinhole at the isocentre, cps/MBq")
     resolution: FloatProperty(
         name="Resolution", description="FWHM in mm at the isocentre, of the hole and the detector"
     )
     magnification: FloatProperty(name="Magnification", description="l / b: of the image on the crystal")
-    roi_seen: FloatProperty(
-        name="Radius Seen", description="Radius in mm of the largest sphere around the isocentre that it sees whole"
-    )
+    roi_seen: FloatProperty(name="Radius Seen", description="Radius in mm of the largest sphere that it sees whole")
     aimed: BoolProperty(name="Aimed", description="The camera looks at the isocentre", default=True)
-    problem: StringProperty(name="Problem", description="Why the module cannot be as its numbers say")
+    problem: StringProperty(name="Problem", description="Why the module's numbers are impossible")
     finding: StringProperty(name="Finding", description="What the last check of the geometry found at this module")
 
     @property
@@ -126,16 +115,12 @@ class ScannerProperties(bpy.types.PropertyGroup):
 
     is_scanner: BoolProperty(name="Is Scanner", options={"HIDDEN"})
     is_ring: BoolProperty(name="Is Ring", description="The collection is a ring of a scanner", options={"HIDDEN"})
-    scanner_name: StringProperty(
-        name="Scanner Name", description="What the scanner was imported as: the same name replaces it"
-    )
-    workbook: StringProperty(
-        name="Workbook", description="File that the scanner was read from or last written to", subtype="FILE_PATH"
-    )
+    scanner_name: StringProperty(name="Scanner Name", description="Its name in the import: the same name replaces it")
+    workbook: StringProperty(name="Workbook", description="File last read from or written to", subtype="FILE_PATH")
     sha256: StringProperty(name="SHA-256", description="Checksum of the workbook when it was read")
     n_modules: IntProperty(name="Modules", description="Number of modules when it was imported", min=0)
     quick_ranges: StringProperty(
-        name="Quick Ranges", description="Module ranges with a button of their own, JSON", options={"HIDDEN"}
+        name="Quick Ranges", description="Module ranges with a button, JSON", options={"HIDDEN"}
     )
     source: StringProperty(name="Source", description="Where the numbers come from, JSON", options={"HIDDEN"})
     plate_thickness: FloatProperty(
@@ -163,8 +148,8 @@ class ScannerProperties(bpy.types.PropertyGroup):
     )  # fmt: skip
     keep_aimed: BoolProperty(
         name="Keep Aimed",
-        description="Turn a module that is moved so that it goes on looking at the isocentre. One that is only turned "
-        "stays as it was turned, and is marked",
+        description="Turn a module that is moved so that it keeps looking at the isocentre. One that is only turned "
+        "stays turned, and is marked",
         default=True, update=on_edit("scanner"),
     )  # fmt: skip
     # With the five lengths below: the first module's numbers. `mixed` names those that differ between modules.
@@ -175,13 +160,10 @@ class ScannerProperties(bpy.types.PropertyGroup):
     mixed: StringProperty(name="Mixed", description="Names of the numbers that differ between modules")
     # Readouts of all modules together, written by following.py.
     count: IntProperty(name="Modules", description="Number of modules now", min=0)
-    sensitivity: FloatProperty(
-        name="Sensitivity", description="Of all modules together, for a point source at the isocentre, cps/MBq"
-    )
+    sensitivity: FloatProperty(name="Sensitivity", description="Of all modules together, at the isocentre, cps/MBq")
     resolution: FloatProperty(name="Resolution", description="Mean FWHM in mm of the modules at the isocentre")
     n_covering: IntProperty(name="Covering", description="Number of modules that see their whole ROI sphere")
-    problem: StringProperty(name="Problem", description="Why the scanner cannot be used as it stands")
-    untidy: StringProperty(name="Untidy", description="Copied cameras and left-over parts, in words")
+    untidy: StringProperty(name="Untidy", description="Copied cameras and parts without a camera, in words")
     findings: StringProperty(name="Findings", description="What the last check of the geometry found, JSON")
 
 
@@ -198,15 +180,10 @@ class GeometryProperties(bpy.types.PropertyGroup):
     """State of the Geometry panel; `Scene.mphdrr_geometry`."""
 
     scanner: PointerProperty(
-        name="Scanner",
-        description="The scanner that the panels work on",
-        type=bpy.types.Collection,
-        poll=_is_scanner,
+        name="Scanner", description="The scanner that the panels work on", type=bpy.types.Collection, poll=_is_scanner
     )
     active_index: IntProperty(
-        name="Active Module",
-        description="Index of the module among the scanner's objects",
-        update=on_edit("active_module"),
+        name="Active Module", description="Its index among the scanner's objects", update=on_edit("active_module")
     )
     first: IntProperty(name="First", description="First module number of the range", default=1)
     last: IntProperty(name="Last", description="Last module number of the range", default=40)

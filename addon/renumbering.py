@@ -1,4 +1,4 @@
-"""New numbers for a scanner's modules: 1, 2, ... in an order, in the properties and in the names."""
+"""New numbers 1, 2, ... for a scanner's modules, in their properties and names."""
 
 from __future__ import annotations
 
@@ -20,16 +20,16 @@ _OURS = re.compile(r"(Module|Collimator|Crystal) \d+(\.\d+)?")  # a name that th
 
 
 def renumber(collection: bpy.types.Collection, order: Order = "RINGS") -> int:
-    """Number a scanner's modules 1, 2, ...; in that order they are listed, projected and exported from now on.
+    """Number a scanner's modules 1, 2, ...; they are listed, projected and exported in that order from now on.
 
-    Names that the extension gave follow; names of the user's own stay.
+    Names that the extension gave follow; names that the user gave stay.
 
     Parameters
     ----------
     collection
         The scanner.
     order
-        ``"RINGS"``: as `core.generators.ring_order` has them; ``"LIST"``: as they are listed now.
+        ``"RINGS"``: that of `core.geometry.generators.ring_order`; ``"LIST"``: the present one.
 
     Returns
     -------
@@ -39,12 +39,12 @@ def renumber(collection: bpy.types.Collection, order: Order = "RINGS") -> int:
     Raises
     ------
     InputError
-        Copies or left-overs are to be tidied first, or the modules make no system. The scanner stays as it was.
+        The scanner is untidy (`copies.untidy_text`), or its numbers are impossible. It stays as it was.
     """
     untidy = copies.untidy_text(collection)
     if untidy:
         raise InputError(f"scanner '{collection.name}': {untidy}: press Tidy Modules in the Design panel first")
-    with recorded_warnings():  # where a camera looks is no matter here
+    with recorded_warnings():  # where the cameras look does not matter here
         system = scanner.read_scanner(collection)
     found = scanner.modules(collection)
     places = ring_order(system) if order == "RINGS" else np.arange(len(found))
@@ -65,7 +65,7 @@ def renumber(collection: bpy.types.Collection, order: Order = "RINGS") -> int:
         collection.mphdrr_scanner.quick_ranges = json.dumps(scanner.quick_ranges(ordered))
     names = [(item, name) for item, name in names if item.name != name and _OURS.fullmatch(item.name)]
     for item, name in names:
-        item.name = f"{name} renumbered"  # what another has now is free afterwards
+        item.name = f"{name} renumbered"  # so that the new names are free
     for item, name in names:
         item.name = name
     following.refresh(collection)

@@ -244,18 +244,10 @@ def read_scanner(collection: bpy.types.Collection, *, aimed: bool = False) -> Pi
 
 
 def check_geometry(collection: bpy.types.Collection) -> tuple[list[str], list[bpy.types.Object]]:
-    """Check the scanner for overlaps, blocked holes and ROIs that are not seen, and show the findings on its modules.
+    """Check the scanner for overlaps, blocked holes and ROIs that are not seen, and store the findings at its modules.
 
-    Returns
-    -------
-    findings : list of str
-    modules : list
-        The camera objects of the modules that the findings are about.
-
-    Raises
-    ------
-    InputError
-        The modules' numbers are impossible, or a collimator cannot be built.
+    Returns the findings, and the camera objects of the modules concerned. Raises InputError where the modules' numbers
+    are impossible or a collimator cannot be built.
     """
     construction = following.construction(collection.mphdrr_scanner)
     report = checks.check_geometry(read_scanner(collection), **asdict(construction))
@@ -286,22 +278,10 @@ def set_visible(camera: bpy.types.Object, visible: bool) -> None:
 
 
 def show_modules(collection: bpy.types.Collection, first: int, last: int, mode: str = "ONLY") -> int:
-    """Show modules first..last (their numbers, both included).
+    """Show modules by their numbers, first to last; returns how many are visible now.
 
-    Parameters
-    ----------
-    mode
-        ``"SHOW"`` or ``"HIDE"`` those and leave the others, ``"ONLY"`` those, or ``"ALL"``.
-
-    Returns
-    -------
-    int
-        How many modules are visible now.
-
-    Raises
-    ------
-    InputError
-        No module has a number in that range.
+    `mode` is ``"SHOW"`` or ``"HIDE"``, which leave the other modules, ``"ONLY"``, or ``"ALL"``, which needs no range. Raises
+    InputError where no module has a number in the range.
     """
     found = modules(collection)
     inside = {o for o in found if mode == "ALL" or first <= o.mphdrr_module.number <= last}

@@ -57,8 +57,9 @@ def select(context: bpy.types.Context, modules: Iterable[bpy.types.Object]) -> N
 def select_active(scene: bpy.types.Scene) -> None:
     """Select the module that is active in the panel's list, as a click on its camera would."""
     collection, index = scanner.active_scanner(scene), scene.mphdrr_geometry.active_index
-    if collection is not None and 0 <= index < len(collection.all_objects):
-        select(bpy.context, [collection.all_objects[index]])
+    camera = collection.all_objects[index] if collection and 0 <= index < len(collection.all_objects) else None
+    if camera is not None and camera.visible_get(view_layer=bpy.context.view_layer):
+        select(bpy.context, [camera])
 
 
 def poll_scanner(operator: type[bpy.types.Operator], context: bpy.types.Context) -> bool:

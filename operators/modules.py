@@ -182,13 +182,9 @@ class MPHDRR_OT_set_numbers(_OnModules, bpy.types.Operator):
 
     bl_idname = ids.SET_NUMBERS
     bl_label = "Copy Numbers to Selected"
-    bl_description = "Give the selected modules the active module's d, l, Ld, Td and R"
+    bl_description = "Give the selected modules, or all, the active module's d, l, Ld, Td and R"
 
     to_all: BoolProperty(name="All", description="Give them to all modules of the scanner", options={"SKIP_SAVE"})
-
-    @classmethod
-    def description(cls, context: bpy.types.Context, properties: bpy.types.OperatorProperties) -> str:
-        return f"Give {'all' if properties.to_all else 'the selected'} modules the active module's d, l, Ld, Td and R"
 
     def change(self, context: bpy.types.Context, collection: bpy.types.Collection) -> str:
         selected = selection.selected_modules(context)

@@ -12,7 +12,7 @@ from collections.abc import Sequence
 import bpy
 
 from ..addon import ids, jobs, selection
-from .geometry import ScannerPanel
+from .geometry import ScannerPanel, draw_facts
 
 _LABELS = (
     ("pinhole_diameter", "Hole d"),
@@ -70,13 +70,11 @@ class MPHDRR_PT_scanner_design(ScannerPanel, bpy.types.Panel):
         column.prop(properties, "opening_angle")
         column.prop(properties, "edge_at")
         column.prop(properties, "intrinsic_fwhm", text="Crystal FWHM")
-        _draw_readouts(
-            layout,
-            (
-                ("Sensitivity", f"{properties.sensitivity:.1f} cps/MBq"),
-                ("Mean FWHM", f"{properties.resolution:.2f} mm"),
-                ("See the ROI", f"{properties.n_covering} of {properties.count} modules"),
-            ),
+        draw_facts(
+            layout.box().split(factor=0.42),
+            ("Sensitivity", f"{properties.sensitivity:.1f} cps/MBq"),
+            ("Mean FWHM", f"{properties.resolution:.2f} mm"),
+            ("See the ROI", f"{properties.n_covering} of {properties.count} modules"),
         )
         layout.operator_menu_enum(ids.RENUMBER_MODULES, "order", text="Renumber", icon="LINENUMBERS_ON")
         layout.operator(ids.CHECK_GEOMETRY, icon="CHECKMARK")
@@ -105,16 +103,14 @@ def _draw_module(layout: bpy.types.UILayout, camera: bpy.types.Object) -> None:
     for text in (module.problem, module.finding, "" if module.aimed else "Not aimed at the isocentre"):
         if text:
             _draw_text(layout, text)
-    _draw_readouts(
-        layout,
-        (
-            ("Distance b", f"{module.pinhole_distance:.2f} mm"),
-            ("Sensitivity", f"{module.sensitivity:.2f} cps/MBq"),
-            ("Resolution", f"{module.resolution:.2f} mm FWHM"),
-            ("Magnification", f"{module.magnification:.3f}"),
-            ("Radius seen", f"{module.roi_seen:.2f} mm"),
-            ("ROI", "seen whole" if module.sees_roi else "not seen whole"),
-        ),
+    draw_facts(
+        layout.box().split(factor=0.42),
+        ("Distance b", f"{module.pinhole_distance:.2f} mm"),
+        ("Sensitivity", f"{module.sensitivity:.2f} cps/MBq"),
+        ("Resolution", f"{module.resolution:.2f} mm FWHM"),
+        ("Magnification", f"{module.magnification:.3f}"),
+        ("Radius seen", f"{module.roi_seen:.2f} mm"),
+        ("ROI", "seen whole" if module.sees_roi else "not seen whole"),
     )
 
 
@@ -139,15 +135,6 @@ def _draw_numbers(
 
 def _label(text: str, is_mixed: bool) -> str:
     return f"{text}, mixed" if is_mixed else f"{text} (mm)"
-
-
-def _draw_readouts(layout: bpy.types.UILayout, lines: tuple[tuple[str, str], ...]) -> None:
-    split = layout.box().split(factor=0.42)
-    names, values = split.column(align=True), split.column(align=True)
-    names.active = False
-    for name, value in lines:
-        names.label(text=name)
-        values.label(text=value)
 
 
 def _draw_text(layout: bpy.types.UILayout, text: str) -> None:

@@ -71,16 +71,13 @@ class MPHDRR_PT_geometry(bpy.types.Panel):
         if len(scanner.scanners(context.scene)) > 1:
             layout.prop(context.scene.mphdrr_geometry, "scanner", text="")
         properties = collection.mphdrr_scanner
-        split = layout.split(factor=0.34)
-        names, values = split.column(align=True), split.column(align=True)
-        names.active = False
-        for name, value in (
+        n_rings = sum(c.mphdrr_scanner.is_ring for c in collection.children)
+        draw_facts(
+            layout.split(factor=0.34),
             ("Scanner", collection.name),
             ("Workbook", bpy.path.basename(properties.workbook) or "none"),
-            ("Modules", f"{properties.count} in {sum(c.mphdrr_scanner.is_ring for c in collection.children)} rings"),
-        ):
-            names.label(text=name)
-            values.label(text=value)
+            ("Modules", f"{properties.count} in {n_rings} rings"),
+        )
         row = layout.row(align=True)
         for first, last in json.loads(properties.quick_ranges or "[]"):
             _show(row, f"{first}-{last}", first, last, "ONLY")
@@ -142,6 +139,15 @@ class MPHDRR_PT_modules(ScannerPanel, bpy.types.Panel):
             look = layout.operator(ids.LOOK_THROUGH_MODULE, text=text, icon="OUTLINER_OB_CAMERA")
             look.number = active.mphdrr_module.number
         layout.operator(ids.AIM_MODULES, icon="CON_TRACKTO")
+
+
+def draw_facts(split: bpy.types.UILayout, *facts: tuple[str, str]) -> None:
+    """Draw names and their values, side by side."""
+    names, values = split.column(align=True), split.column(align=True)
+    names.active = False
+    for name, value in facts:
+        names.label(text=name)
+        values.label(text=value)
 
 
 def _columns(layout: bpy.types.UILayout, name: str, *numbers: str) -> None:

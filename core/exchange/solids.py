@@ -15,7 +15,7 @@ import numpy as np
 
 from ..errors import InputError
 from ..geometry.collimator import Construction, EdgePlace, angle_from_degrees
-from ..geometry.module_parts import ModulePart, module_parts
+from ..geometry.module_parts import LOOKS, ModulePart, module_parts
 from ..geometry.system import PinholeSystem
 from ..geometry.views import Views
 from ..version import VERSION
@@ -83,12 +83,12 @@ def _save_3mf(path: Path, parts: list[ModulePart]) -> None:
         '<model unit="millimeter" xml:lang="en-US" xmlns="http://schemas.microsoft.com/3dmanufacturing/core/2015/02">',
         f'<metadata name="Application">mphDRR {VERSION}</metadata>',
         '<resources><basematerials id="1">',
-        '<base name="collimator" displaycolor="#A2A8B0"/><base name="crystal" displaycolor="#FFB845"/>',
+        *(f'<base name="{kind}" displaycolor="{_srgb(look.color)}"/>' for kind, look in LOOKS.items()),
         "</basematerials>",
     ]
     numbered = list(enumerate(parts, start=2))  # the materials are resource 1
     for number, p in numbered:
-        material = _KINDS["all"].index(p.kind)
+        material = list(LOOKS).index(p.kind)
         lines.append(f'<object id="{number}" type="model" name="{p.name}" pid="1" pindex="{material}"><mesh><vertices>')
         lines += [f'<vertex x="{x:.7f}" y="{y:.7f}" z="{z:.7f}"/>' for x, y, z in p.vertices.tolist()]
         lines.append("</vertices><triangles>")
@@ -101,6 +101,12 @@ def _save_3mf(path: Path, parts: list[ModulePart]) -> None:
         package.writestr("3D/3dmodel.model", "\n".join(lines))
 
 
+def _srgb(color: tuple[float, float, float, float]) -> str:
+    """A linear colour as sRGB's "#A2A8AF"."""
+    shares = (1.055 * share ** (1 / 2.4) - 0.055 if share > 0.0031308 else 12.92 * share for share in color[:3])
+    return "#" + "".join(f"{round(255 * share):02X}" for share in shares)
+
+
 def _save_glb(path: Path, parts: list[ModulePart]) -> None:
     """Binary glTF 2.0, a named mesh for each part.
 
@@ -111,12 +117,16 @@ def _save_glb(path: Path, parts: list[ModulePart]) -> None:
     from trimesh.visual import TextureVisuals
     from trimesh.visual.material import PBRMaterial
 
-    # Tungsten and scintillator, as in the scene. Colours are linear.
-    tungsten = PBRMaterial("collimator", baseColorFactor=[92, 99, 110, 255], metallicFactor=0.85, roughnessFactor=0.42)
-    scintillator = PBRMaterial(
-        "crystal", baseColorFactor=[255, 122, 15, 217], metallicFactor=0.0, roughnessFactor=0.12, alphaMode="BLEND"
-    )
-    materials = {"collimator": tungsten, "crystal": scintillator}
+    materials = {
+        kind: PBRMaterial(
+            kind,
+            baseColorFactor=[round(255 * share) for share in look.color],
+            metallicFactor=look.metallic,
+            roughnessFactor=look.roughness,
+            alphaMode="OPAQUE" if look.color[3] == 1.0 else "BLEND",
+        )
+        for kind, look in LOOKS.items()
+    }
     to_metres = np.diag([0.001, 0.001, 0.001, 1.0])
     to_metres[1:3, 1:3] = [[0.0, 0.001], [-0.001, 0.0]]
     scene = trimesh.Scene()

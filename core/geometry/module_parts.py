@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,6 +14,21 @@ from .collimator_mesh import Solid, collimator_solid, crystal_solid
 from .system import PinholeSystem
 
 Kind = Literal["collimator", "crystal"]
+
+
+class Look(NamedTuple):
+    """How a part is shown: linear RGBA colour, metallic and roughness from 0 to 1."""
+
+    color: tuple[float, float, float, float]
+    metallic: float
+    roughness: float
+
+
+LOOKS: dict[Kind, Look] = {
+    "collimator": Look((0.36, 0.39, 0.43, 1.0), metallic=0.85, roughness=0.42),  # tungsten: grey metal
+    "crystal": Look((1.0, 0.48, 0.06, 0.85), metallic=0.0, roughness=0.12),  # scintillator: clear amber
+}
+"""In Blender and in exported solids."""
 
 
 @dataclass(frozen=True, eq=False)

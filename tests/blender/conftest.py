@@ -37,6 +37,16 @@ def dc_spect() -> PinholeSystem:
     return read_system(WORKBOOK)
 
 
+@pytest.fixture(scope="session")
+def small_workbook(dc_spect, tmp_path_factory) -> Path:
+    """The real scanner's first 16 modules in a workbook of the same layout."""
+    from mphdrr.core.workbook import write_system
+
+    path = tmp_path_factory.mktemp("workbook") / "small.xlsx"
+    write_system(dc_spect[:16], path)
+    return path
+
+
 @pytest.fixture
 def ring_system() -> PinholeSystem:
     """Two rings of four modules of different sizes: small, and nothing in it symmetric."""

@@ -22,9 +22,9 @@ CM = {"x1": "Mitte x (Zentimeter)", "y1": "Mitte y (Zentimeter)", "z1": "Mitte z
 
 
 @pytest.fixture
-def unread(workbook, tmp_path) -> Path:
-    """The real workbook with its coordinates in cm under headings that the reader does not know."""
-    book = openpyxl.load_workbook(workbook, data_only=True)
+def unread(small_workbook, tmp_path) -> Path:
+    """The small workbook with its coordinates in cm under headings that the reader does not know."""
+    book = openpyxl.load_workbook(small_workbook, data_only=True)
     sheet = book["Coordinates"]
     for column in range(sheet.max_column, 4, -1):
         if column != 7:
@@ -33,11 +33,16 @@ def unread(workbook, tmp_path) -> Path:
     for column, text in enumerate(CM.values(), start=2):
         sheet.cell(1, column, text)
         sheet.cell(2, column).value = None
-        for row in range(3, 83):
+        for row in range(3, 19):
             sheet.cell(row, column).value /= 10
     path = tmp_path / "own.xlsx"
     book.save(path)
     return path
+
+
+@pytest.fixture
+def small(small_workbook) -> PinholeSystem:
+    return read_system(small_workbook)
 
 
 @pytest.fixture
@@ -49,7 +54,7 @@ def columns(unread) -> ColumnMap:
         sheet = "Coordinates"
         header_row = 1
         first_row = 3
-        last_row = 82
+        last_row = 18
         number = "A"
         columns.x1 = { column = "B", unit = "cm" }
         columns.y1 = { column = "C", unit = "cm" }
@@ -59,7 +64,7 @@ def columns(unread) -> ColumnMap:
         sheet = "Main"
         header_row = 1
         first_row = 3
-        last_row = 82
+        last_row = 18
         rows = "by number"
         number = "A"
         columns.d = { column = "P", unit = "mm" }
@@ -95,11 +100,11 @@ def test_settings_say_what_the_map_says(form, unread, columns):
     assert form.refusal == ""
 
 
-def test_the_draft_of_an_understood_workbook_needs_no_more(form, workbook, dc_spect):
+def test_the_draft_of_an_understood_workbook_needs_no_more(form, workbook):
     assert not column_maps.fill(form, workbook)
     assert form.refusal == "" and json.loads(form.doubts) == []
     assert column_maps.column_map(form) == draft_column_map(workbook).columns
-    assert_equal(read_system(workbook, column_maps.accept(form)), dc_spect)
+    assert_equal(read_system(workbook, column_maps.accept(form)), read_system(workbook))
 
 
 def test_every_setting_of_a_table_survives(form, unread, columns):
@@ -111,7 +116,7 @@ def test_every_setting_of_a_table_survives(form, unread, columns):
     assert json.loads(form.preview)[0][0] == "Module"
 
 
-def test_what_is_missing_is_asked_for_and_then_read(form, unread, dc_spect):
+def test_what_is_missing_is_asked_for_and_then_read(form, unread, small):
     """From the draft to the scanner as a user settles it."""
     assert column_maps.fill(form, unread)
     assert any("x1" in doubt for doubt in json.loads(form.doubts))
@@ -122,8 +127,8 @@ def test_what_is_missing_is_asked_for_and_then_read(form, unread, dc_spect):
         quantity(form, name).table, quantity(form, name).column = 1, column
     form.n_tables = 2
     first, second = form.tables
-    first.sheet, first.first_row, first.last_row, first.number, first.header_row = "Coordinates", 3, 82, "a", 1
-    second.sheet, second.first_row, second.last_row, second.number = "Main", 3, 82, "A"
+    first.sheet, first.first_row, first.last_row, first.number, first.header_row = "Coordinates", 3, 18, "a", 1
+    second.sheet, second.first_row, second.last_row, second.number = "Main", 3, 18, "A"
     second.rows = "BY_NUMBER"
     for name, column in zip(("d", "R", "Ld", "Td"), "PQST", strict=True):
         quantity(form, name).table, quantity(form, name).column = 2, column
@@ -132,22 +137,22 @@ def test_what_is_missing_is_asked_for_and_then_read(form, unread, dc_spect):
     for name in CM:
         quantity(form, name).unit = "cm"
     assert form.refusal == ""
-    assert form.n_modules == 80
+    assert form.n_modules == 16
     assert quantity(form, "x1").seen == f"{CM['x1']}: 27.7002"
     heads, *rows = json.loads(form.preview)
-    assert [row[0] for row in rows] == ["1", "2", "3", "...", "80"]
-    assert float(rows[0][heads.index("x1")]) == pytest.approx(dc_spect.centers[0, 0], abs=1e-3)
-    assert float(rows[-1][heads.index("l")]) == pytest.approx(dc_spect.collimator_length[-1], abs=1e-3)
-    assert_equal(read_system(unread, column_maps.accept(form)), dc_spect)
+    assert [row[0] for row in rows] == ["1", "2", "3", "...", "16"]
+    assert float(rows[0][heads.index("x1")]) == pytest.approx(small.centers[0, 0], abs=1e-3)
+    assert float(rows[-1][heads.index("l")]) == pytest.approx(small.collimator_length[-1], abs=1e-3)
+    assert_equal(read_system(unread, column_maps.accept(form)), small)
 
 
-@pytest.mark.parametrize("unit", LENGTH_UNITS)
-def test_every_unit_can_be_chosen_for_all_lengths(unit, form, workbook):
-    column_maps.fill(form, workbook)
-    form.unit = unit
-    units = {c.quantity: c.unit for table in column_maps.column_map(form).tables for c in table.columns}
-    assert units.pop("azimuth") == units.pop("elevation") == "rad"
-    assert set(units.values()) == {unit}
+def test_every_unit_can_be_chosen_for_all_lengths(form, small_workbook):
+    column_maps.fill(form, small_workbook)
+    for unit in LENGTH_UNITS:
+        form.unit = unit
+        units = {c.quantity: c.unit for table in column_maps.column_map(form).tables for c in table.columns}
+        assert units.pop("azimuth") == units.pop("elevation") == "rad"
+        assert set(units.values()) == {unit}
 
 
 def test_a_setting_that_cannot_be_is_refused_at_once_and_can_be_taken_back(form, unread, columns):
@@ -159,7 +164,7 @@ def test_a_setting_that_cannot_be_is_refused_at_once_and_can_be_taken_back(form,
         (x1, "column", "C", "column C is table 1.x1 too"),
         (x1, "table", 3, "x1 is in table 3, expected 1 to 2"),
         (first, "sheet", "Haupt", "has no sheet Haupt.*Main, Coordinates"),
-        (first, "last_row", 83, "Coordinates!A83 is blank"),
+        (first, "last_row", 19, "Coordinates!A19 is blank"),
         (first, "skip_rows", "forty", "table 1: skip rows 'forty', expected numbers"),
         (first, "skip_rows", "90", "skip_rows has 90"),
         (second, "rows", "IN_ORDER", ""),
@@ -211,13 +216,13 @@ def map_file(tmp_path, columns) -> Path:
     return tmp_path / "map.toml"
 
 
-def test_a_refused_workbook_names_the_way_and_a_map_reads_it(scene, unread, map_file, columns, dc_spect):
+def test_a_refused_workbook_names_the_way_and_a_map_reads_it(scene, unread, map_file, columns, small):
     with pytest.raises(RuntimeError, match=r"a column map can say what is meant \(columns='map\.toml'"):
         bpy.ops.mphdrr.import_geometry(filepath=str(unread))
     assert scanner.scanners(scene) == []
     assert bpy.ops.mphdrr.import_geometry(filepath=str(unread), columns=str(map_file)) == {"FINISHED"}
     collection = scanner.active_scanner(scene)
-    assert_equal(scanner.read_scanner(collection), dc_spect)
+    assert_equal(scanner.read_scanner(collection), small)
     assert scanner.read_scanner(collection).source.columns == columns
 
 
@@ -274,12 +279,12 @@ def test_a_changed_scanner_is_written_by_its_map_in_the_files_unit(saved, collec
 
 
 def test_the_scene_keeps_the_map_of_the_rows_that_are_written(collection, tmp_path):
-    bpy.data.objects.remove(scanner.module(collection, 80))
-    bpy.data.objects.remove(scanner.module(collection, 40))
+    bpy.data.objects.remove(scanner.module(collection, 16))
+    bpy.data.objects.remove(scanner.module(collection, 10))
     path = tmp_path / "fewer.xlsx"
     assert bpy.ops.mphdrr.export_geometry(filepath=str(path)) == {"FINISHED"}
     own = scanner.source(collection).columns
-    assert [(t.first_row, t.last_row, t.skip_rows) for t in own.tables] == [(3, 81, (42,))] * 2
+    assert [(t.first_row, t.last_row, t.skip_rows) for t in own.tables] == [(3, 17, (12,))] * 2
     assert_equal(read_system(path, own), scanner.read_scanner(collection))
 
 

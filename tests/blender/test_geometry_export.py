@@ -18,8 +18,8 @@ LENGTHS = ("pinhole_diameter", "collimator_length", "detector_side", "detector_t
 
 
 @pytest.fixture
-def own(workbook, tmp_path) -> Path:
-    return Path(shutil.copy(workbook, tmp_path / "own.xlsx"))
+def own(small_workbook, tmp_path) -> Path:
+    return Path(shutil.copy(small_workbook, tmp_path / "own.xlsx"))
 
 
 @pytest.fixture
@@ -34,10 +34,11 @@ def assert_equal(one, other) -> None:
         assert np.allclose(getattr(one, name), getattr(other, name), rtol=1e-9, atol=1e-9), name
 
 
-def test_unchanged_scanner_writes_the_same_file(collection, own, tmp_path):
-    path = tmp_path / "again.xlsx"
+def test_unchanged_scanner_writes_the_same_file(scene, workbook, tmp_path):
+    bpy.ops.mphdrr.import_geometry(filepath=str(workbook))
+    collection, path = scanner.active_scanner(scene), tmp_path / "again.xlsx"
     assert bpy.ops.mphdrr.export_geometry(filepath=str(path)) == {"FINISHED"}
-    assert path.read_bytes() == own.read_bytes()
+    assert path.read_bytes() == workbook.read_bytes()
     assert collection.mphdrr_scanner.workbook == str(path)
 
 
@@ -65,7 +66,7 @@ def random_edits(rng: np.random.Generator, collection: bpy.types.Collection) -> 
         bpy.context.view_layer.update()
 
 
-@pytest.mark.parametrize(("seed", "use_template"), [(0, True), (1, True), (2, False)])
+@pytest.mark.parametrize(("seed", "use_template"), [(0, True), (2, False)])
 def test_random_edits_come_back_from_the_workbook(scene, collection, tmp_path, seed, use_template):
     rng = np.random.default_rng(seed)
     with warnings.catch_warnings():
@@ -87,8 +88,8 @@ def test_modules_keep_the_order_of_the_workbook_and_added_ones_come_last(collect
     copies.duplicate(collection, [scanner.module(collection, 5)], 1, 0.02, follow_ring=False)
     copies.remove(collection, [scanner.module(collection, 2)])
     bpy.ops.mphdrr.export_geometry(filepath=str(tmp_path / "a.xlsx"))
-    assert read_system(tmp_path / "a.xlsx").numbers.tolist() == [1, *range(3, 82)]
-    assert not scanner.module(collection, 81).mphdrr_module.added
+    assert read_system(tmp_path / "a.xlsx").numbers.tolist() == [1, *range(3, 18)]
+    assert not scanner.module(collection, 17).mphdrr_module.added
 
 
 def test_camera_off_aim_is_refused_by_its_number(collection, own, tmp_path):

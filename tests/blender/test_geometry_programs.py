@@ -11,8 +11,8 @@ from mphdrr.core.exchange import FORMATS, read_geometry
 
 
 @pytest.fixture
-def collection(scene, workbook):
-    bpy.ops.mphdrr.import_geometry(filepath=str(workbook))
+def collection(scene, small_workbook):
+    bpy.ops.mphdrr.import_geometry(filepath=str(small_workbook))
     return scanner.active_scanner(scene)
 
 

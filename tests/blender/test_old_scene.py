@@ -50,7 +50,7 @@ def test_settings_are_there(old_scene):
     for name, value in {
         "scanner_name": "Three", "n_modules": 3, "plate_thickness": 3.5, "wall_thickness": 1.25, "edge_at": "BACK",
         "opening_angle": np.radians(60), "intrinsic_fwhm": 3.2, "keep_aimed": False,
-        "mixed": "pinhole_diameter collimator_length length_mode", "count": 3, "untidy": "", "problem": "",
+        "mixed": "pinhole_diameter collimator_length length_mode", "count": 3, "untidy": "",
     }.items():  # fmt: skip
         assert getattr(built, name) == (pytest.approx(value) if isinstance(value, float) else value), name
     rendered = old_scene.mphdrr_projections

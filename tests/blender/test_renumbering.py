@@ -57,34 +57,34 @@ def test_a_mixed_system_is_sorted_and_nothing_else_changes(scene, dc_spect, tmp_
     assert np.array_equal(mph.read_system(tmp_path / "mixed.xlsx").numbers, np.arange(1, 34))
 
 
-def test_added_and_removed_modules_get_the_numbers_between(scene, workbook, tmp_path):
-    bpy.ops.mphdrr.import_geometry(filepath=str(workbook))
+def test_added_and_removed_modules_get_the_numbers_between(scene, small_workbook, tmp_path):
+    bpy.ops.mphdrr.import_geometry(filepath=str(small_workbook))
     collection = scanner.active_scanner(scene)
     system = scanner.read_scanner(collection)
-    gone = [scanner.module(collection, n) for n in (3, 4, 50)]
+    gone = [scanner.module(collection, n) for n in (3, 4, 15)]
     scanner.module(collection, 7).name = "Mine"
-    scanner.module(collection, 80).mphdrr_module.pinhole_diameter = 2.5
+    scanner.module(collection, 14).mphdrr_module.pinhole_diameter = 2.5
     copies.remove(collection, gone)
-    (added,) = copies.duplicate(collection, [scanner.module(collection, 20)], 1, np.radians(10.0), False)
-    assert added.mphdrr_module.number == 81
-    place = scanner.read_scanner(collection).centers[-1]
+    (added,) = copies.duplicate(collection, [scanner.module(collection, 16)], 1, np.radians(10.0), False)
+    assert added.mphdrr_module.number == 17
+    copies.duplicate(collection, [scanner.module(collection, 2)], 1, np.radians(10.0), False)
+    places = scanner.read_scanner(collection).centers[-2:]
     assert bpy.ops.mphdrr.renumber_modules() == {"FINISHED"}
     read = scanner.read_scanner(collection)
-    # The copy stands behind the first ring's last module, of which two are gone.
-    assert np.array_equal(read.numbers, np.arange(1, 79)) and read.source is None
-    assert np.array_equal(read.centers[18], place)
-    assert np.array_equal(np.delete(read.centers, 18, axis=0), np.delete(system.centers, [2, 3, 49], axis=0))
-    assert read.pinhole_diameter[-1] == 2.5 and scanner.module(collection, 5).name == "Mine"
-    # A further copy is the scanner's, whatever numbers its modules were imported with.
+    assert np.array_equal(read.numbers, np.arange(1, 16)) and read.source is None
+    assert np.array_equal(read.centers[[14, 2]], places), "behind the ring's last module, and in the gap"
+    others = np.delete(read.centers, [2, 14], axis=0)
+    assert np.array_equal(others, np.delete(system.centers, [2, 3, 14], axis=0))
+    assert read.pinhole_diameter[12] == 2.5 and scanner.module(collection, 6).name == "Mine"
+    # A further copy belongs to the scanner, whatever numbers its modules were imported with.
     (copy,) = copies.duplicate(collection, [scanner.module(collection, 1)], 1, np.radians(-9.0), False)
-    assert copy.mphdrr_module.number == 79
+    assert copy.mphdrr_module.number == 16
     bpy.ops.mphdrr.export_geometry(filepath=str(tmp_path / "new.xlsx"))
     written = mph.read_system(tmp_path / "new.xlsx")
-    assert np.array_equal(written.numbers, np.arange(1, 80)) and np.allclose(
-        written.centers[:78], read.centers, atol=1e-9
-    )
+    assert np.array_equal(written.numbers, np.arange(1, 17))
+    assert np.allclose(written.centers[:15], read.centers, atol=1e-9)
     scanner.build_scanner(scene, written, collection.mphdrr_scanner.scanner_name, replace=True)
-    assert len([o for o in scene.objects if o.type == "CAMERA" and o.mphdrr_module.is_module]) == 79
+    assert len([o for o in scene.objects if o.type == "CAMERA" and o.mphdrr_module.is_module]) == 16
 
 
 def test_renumbering_is_undone_at_once(scene, ring_system):

@@ -106,8 +106,8 @@ def test_open_and_inverted_surfaces_are_refused():
         check_watertight((vertices, faces[:, ::-1]))
 
 
-def test_meshes_in_blender_are_closed_and_look_outwards(scene, dc_spect):
-    collection = scanner.build_scanner(scene, dc_spect)
+def test_meshes_in_blender_are_closed_and_look_outwards(scene, ring_system):
+    collection = scanner.build_scanner(scene, ring_system)
     meshes = {o.data for o in collection.all_objects if o.mphdrr_module.part in {"COLLIMATOR", "CRYSTAL"}}
     for mesh in meshes:
         assert not mesh.validate(), "Blender had nothing to correct"

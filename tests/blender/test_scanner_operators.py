@@ -21,16 +21,16 @@ def test_import_equals_build_scanner(scene, workbook, dc_spect):
     assert (scene.render.resolution_x, scene.render.resolution_y) == (256, 256)
 
 
-def test_import_refuses_to_drop_changes_unless_told(scene, workbook):
-    bpy.ops.mphdrr.import_geometry(filepath=str(workbook), name="S", image_size=(200, 100))
+def test_import_refuses_to_drop_changes_unless_told(scene, small_workbook):
+    bpy.ops.mphdrr.import_geometry(filepath=str(small_workbook), name="S", image_size=(200, 100))
     assert (scene.render.resolution_x, scene.render.resolution_y) == (200, 100)
     camera = scanner.module(scanner.find_scanner(scene, "S"), 7)
     camera.location.x += 3.0
     with pytest.raises(RuntimeError, match="module 7 moved"):
-        bpy.ops.mphdrr.import_geometry(filepath=str(workbook), name="S")
-    bpy.ops.mphdrr.import_geometry(filepath=str(workbook), name="S", replace=True)
+        bpy.ops.mphdrr.import_geometry(filepath=str(small_workbook), name="S")
+    bpy.ops.mphdrr.import_geometry(filepath=str(small_workbook), name="S", replace=True)
     assert scanner.losses(scanner.find_scanner(scene, "S")) == []
-    assert bpy.ops.mphdrr.import_geometry(filepath=str(workbook), name="S") == {"FINISHED"}
+    assert bpy.ops.mphdrr.import_geometry(filepath=str(small_workbook), name="S") == {"FINISHED"}
 
 
 @pytest.mark.parametrize("content", [None, b"not a workbook"])
@@ -52,21 +52,21 @@ def test_import_without_a_file_says_so():
         bpy.ops.mphdrr.import_geometry()
 
 
-def test_show_and_look_through(scene, workbook):
-    bpy.ops.mphdrr.import_geometry(filepath=str(workbook))
-    bpy.ops.mphdrr.show_modules(first=21, last=60, mode="ONLY")
+def test_show_and_look_through(scene, small_workbook):
+    bpy.ops.mphdrr.import_geometry(filepath=str(small_workbook))
+    bpy.ops.mphdrr.show_modules(first=5, last=12, mode="ONLY")
     found = scanner.modules(scanner.active_scanner(scene))
-    assert [o.mphdrr_module.number for o in found if not o.hide_render] == list(range(21, 61))
-    bpy.ops.mphdrr.look_through_module(number=33)
-    assert scene.camera.name == "Module 33"
+    assert [o.mphdrr_module.number for o in found if not o.hide_render] == list(range(5, 13))
+    bpy.ops.mphdrr.look_through_module(number=11)
+    assert scene.camera.name == "Module 11"
     with pytest.raises(RuntimeError, match="no module 99"):
         bpy.ops.mphdrr.look_through_module(number=99)
     with pytest.raises(RuntimeError, match="no module between"):
         bpy.ops.mphdrr.show_modules(first=100, last=120)
 
 
-def test_aim_turns_moved_modules_back(scene, workbook):
-    bpy.ops.mphdrr.import_geometry(filepath=str(workbook))
+def test_aim_turns_moved_modules_back(scene, small_workbook):
+    bpy.ops.mphdrr.import_geometry(filepath=str(small_workbook))
     collection = scanner.active_scanner(scene)
     scanner.module(collection, 12).rotation_euler.y += 0.2
     assert scanner.off_aim(scanner.modules(collection)) == [12]

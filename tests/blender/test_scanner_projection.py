@@ -37,7 +37,7 @@ def assert_blender_agrees(scene, collection, views: Views) -> None:
         assert np.abs(got - expected).max() < 1e-3
 
 
-@pytest.mark.parametrize("shape", [(256, 256), (128, 200), (300, 96)])
+@pytest.mark.parametrize("shape", [(256, 256), (128, 200)])
 def test_all_modules_project_as_their_views(scene, dc_spect, shape):
     collection = scanner.build_scanner(scene, dc_spect, shape=shape)
     assert_blender_agrees(scene, collection, dc_spect.views(shape=shape))

@@ -130,7 +130,7 @@ def in_the_scanner(system: mph.PinholeSystem, folder: Path, ct: mph.Volume | Non
         print("no bpy: the pictures in the scanner are left out", file=sys.stderr)
         return
     import mphdrr
-    from mphdrr.addon import pictures, scanner, volumes
+    from mphdrr.addon import jobs, maps, pictures, scanner, volumes
 
     bpy.ops.wm.read_factory_settings(use_empty=True)
     mphdrr.register()
@@ -139,7 +139,7 @@ def in_the_scanner(system: mph.PinholeSystem, folder: Path, ct: mph.Volume | Non
     for item in collection.objects:
         item.hide_render = True  # the ROI's sphere
     first, last = int(system.numbers.min()), int(system.numbers.max())
-    bpy.ops.mphdrr.add_map(quantity="sensitivity", voxels=128)
+    jobs.run(maps.mapping(scene, "sensitivity", voxels=128))
     (shown,) = volumes.volume_objects(scene)
     pictures.render_scanner(collection, folder / "sensitivity.png", first, last, shown, zoom=1.5)
     bpy.data.objects.remove(shown)

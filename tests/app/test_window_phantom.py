@@ -14,10 +14,10 @@ def test_phantom_follows_its_slider_and_beats_in_the_window(blender_window, work
     seen = json.loads(result.read_text())
     assert seen["ok"], seen
     before, rested = seen["before"], seen["rested"]
-    assert seen["dragging"]["outdated"] and seen["dragging"]["size"] == before["size"]
+    assert seen["dragging"]["outdated"] and seen["dragging"]["file"] == before["file"]
     assert seen["seconds"][len(seen["seconds"]) // 2] < 0.1
     for name, length in (("before", 180), ("rested", 260), ("small", 220), ("undone", 180)):
         assert seen[name]["length"] == length and seen[name]["loads"] and not seen[name]["outdated"]
         assert len(seen[name]["planes"]) == 3
-    assert rested["size"] > before["size"] and seen["undone"] == before
+    assert rested["file"] != before["file"] and seen["undone"] == before
     assert seen["frames"] == [1, 2, 3]

@@ -44,8 +44,7 @@ def state() -> dict[str, object]:
     planes = sorted(o.name for o in phantom().children if "mphdrr_slice" in o)
     return {
         "length": properties.nema.length,
-        "size": round(properties.spacing[0] * properties.shape[0], 3),
-        "shape": list(properties.shape),
+        "file": phantom().data.filepath,  # named by its content
         "outdated": properties.outdated,
         "loads": phantom().data.grids.load(),
         "planes": planes,

@@ -10,7 +10,7 @@ import bpy
 import numpy as np
 
 from ..core.errors import InputError
-from ..core.geometry.generators import ring_order
+from ..core.geometry.ring_fits import ring_order
 from ..core.recording import recorded_warnings
 from . import copies, design, ids, scanner
 
@@ -29,7 +29,7 @@ def renumber(collection: bpy.types.Collection, order: Order = "RINGS") -> int:
     collection
         The scanner.
     order
-        ``"RINGS"``: as `core.generators.ring_order` has them; ``"LIST"``: as they are listed now.
+        ``"RINGS"``: as `core.geometry.ring_fits.ring_order` has them; ``"LIST"``: as they are listed now.
 
     Returns
     -------

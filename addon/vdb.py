@@ -23,10 +23,9 @@ from ..core.errors import InputError, InputWarning
 from ..core.files import replacing
 from ..core.geometry.grid import Grid
 from ..core.memory import require
-from ..core.physics.ct_numbers import AIR_HU
 from ..core.validation import freeze, positive
 from ..core.version import VERSION
-from ..core.volumes.volume import UNITS, Volume
+from ..core.volumes.volume import AIR_HU, UNITS, Volume
 from .vdb_length import missing_bytes
 
 SMOKE = "smoke for display"

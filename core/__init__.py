@@ -14,9 +14,10 @@ from .exchange import read_geometry, write_geometry
 from .geometry.checks import GeometryReport, check_geometry
 from .geometry.design_formulas import collimator_length, roi_radius_seen
 from .geometry.frames import euler_pose
-from .geometry.generators import RingFit, ellipse_rings, fit_rings, plate_rings, regular_polygon, ring_order
+from .geometry.generators import ellipse_rings, plate_rings, regular_polygon
 from .geometry.grid import Grid
 from .geometry.presets import c_arm_views, pinhole_views
+from .geometry.ring_fits import RingFit, fit_rings, ring_order
 from .geometry.system import PinholeSystem
 from .geometry.views import Views
 from .moved import keep_old_paths

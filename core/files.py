@@ -1,4 +1,4 @@
-"""Write files so that the old one or the new one is there, whole, whatever happens in between."""
+"""Writing files such that the old or the new one is always there, whole."""
 
 from __future__ import annotations
 
@@ -16,18 +16,18 @@ from .errors import InputError
 def replacing(path: str | os.PathLike[str]) -> Iterator[Path]:
     """Give a temporary path beside `path`; rename it to `path` on success, remove it on failure.
 
-    Neither killing the program nor a power cut leaves anything but the old file or the new one at `path`. Where that is
-    a link, the file it leads to is replaced.
+    Even if the program is killed or the power fails, there is either the old or the new file at `path`. If `path` is a
+    link, the file it points to is replaced.
 
     Parameters
     ----------
     path
-        The file to write. Its folder must exist and be writable.
+        The file to write, in an existing folder.
 
     Yields
     ------
     Path
-        A path that does not exist yet, in the same folder and with the same suffixes.
+        A path that does not exist yet, with the same folder and suffixes.
 
     Raises
     ------
@@ -40,7 +40,7 @@ def replacing(path: str | os.PathLike[str]) -> Iterator[Path]:
         raise InputError(f"{target.parent}: no such folder; make it first or choose another")
     temporary = target.with_name(f".{uuid.uuid4().hex[:8]}-{target.name}")
     try:
-        # Tried here and not by os.access, which does not know of read-only disks or Windows' rights.
+        # Tried, because os.access knows neither read-only disks nor Windows' permissions.
         with open(temporary, "xb"):
             pass
         temporary.unlink()
@@ -49,7 +49,7 @@ def replacing(path: str | os.PathLike[str]) -> Iterator[Path]:
             shutil.copymode(target, temporary)
         _to_disk(temporary)
         os.replace(temporary, target)
-        with suppress(OSError):  # Windows opens no folders, some disks don't know the request
+        with suppress(OSError):  # not possible on Windows and on some file systems
             _to_disk(target.parent)
     except OSError as error:
         raise InputError(f"{target}: cannot be written ({error.strerror or error})") from error
@@ -58,8 +58,8 @@ def replacing(path: str | os.PathLike[str]) -> Iterator[Path]:
 
 
 def _to_disk(path: Path) -> None:
-    """Have the system write what it still holds back, so that a power cut after the renaming finds the new file whole."""
-    # A folder can only be opened to read; Windows flushes only what is open to write.
+    """Flush a file or folder to the disk, so that a power cut after the renaming finds the new file whole."""
+    # Folders can only be opened for reading, and Windows flushes only what is open for writing.
     descriptor = os.open(path, os.O_RDONLY if path.is_dir() else os.O_RDWR)
     try:
         os.fsync(descriptor)
@@ -68,7 +68,7 @@ def _to_disk(path: Path) -> None:
 
 
 def refuse_folder(path: Path) -> None:
-    """Raise `InputError` where `path` is a folder or cannot be the name of a file."""
+    """Raise `InputError` if `path` is a folder or cannot be the name of a file."""
     if "\0" in str(path):
         raise InputError(f"{str(path)!r}: not a file name (it holds a NUL)")
     try:
@@ -80,13 +80,7 @@ def refuse_folder(path: Path) -> None:
 
 
 def ensure_folder(path: str | os.PathLike[str]) -> Path:
-    """Make the folder `path` (and its parents) unless it is there.
-
-    Raises
-    ------
-    InputError
-        It cannot be made, or cannot be written into.
-    """
+    """Make the folder `path` and its parents unless they exist; `InputError` if it cannot be made or written to."""
     folder = Path(path).absolute()
     probe = folder / f".{uuid.uuid4().hex[:8]}"
     try:

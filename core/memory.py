@@ -1,30 +1,22 @@
-"""Ask for memory before using it, so that a job that cannot fit says so in one line."""
+"""Checks that a job fits into memory before it begins."""
 
 from __future__ import annotations
 
 from .errors import InputError
 
-# Leave this share of what is available to everything else that runs.
+# The rest is left to other programs.
 _USABLE_SHARE = 0.9
 
 
 def available() -> int:
-    """Bytes of memory that can be taken without swapping."""
+    """Bytes of memory that can be used without swapping."""
     import psutil
 
     return int(psutil.virtual_memory().available)
 
 
 def require(n_bytes: float, what: str) -> None:
-    """Raise `InputError` when `what` needs more memory than there is.
-
-    Parameters
-    ----------
-    n_bytes
-        Bytes that will be taken.
-    what
-        The thing that needs them, as the sentence's subject: ``"a grid of 4096 x 4096 x 4096 voxels"``.
-    """
+    """Raise `InputError` if `n_bytes` do not fit; `what` needs them, such as ``"a volume of 9 x 9 x 9 voxels"``."""
     usable = _USABLE_SHARE * available()
     if n_bytes > usable:
         raise InputError(

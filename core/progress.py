@@ -1,4 +1,4 @@
-"""Progress of long work, and how it is stopped."""
+"""Progress and cancellation of long work."""
 
 from __future__ import annotations
 
@@ -10,20 +10,20 @@ from typing import TypeVar
 Part = TypeVar("Part")
 
 Progress = Callable[[int, int], None]
-"""Called as ``progress(done, total)`` between the steps of long work; may raise `Cancelled` to stop it."""
+"""Called as ``progress(done, total)`` between steps; may raise `Cancelled` to stop the work."""
 
 
 class Cancelled(Exception):
-    """Raised by a progress callback to stop the work; nothing half-done is left behind."""
+    """Raised by a progress callback to stop the work. Nothing half-done is left behind."""
 
 
 def part_of(progress: Progress | None, number: int, count: int) -> Progress | None:
-    """The progress of one of several equal parts, counted from 0."""
+    """The progress of part `number`, from 0, of `count` equal parts."""
     return None if progress is None else lambda done, total: progress(number * total + done, count * total)
 
 
 def in_threads(work: Callable[[Part], None], parts: Sequence[Part], progress: Progress | None = None) -> None:
-    """Call ``work(part)`` for all parts, one thread for each processor core; what `progress` raises stops the rest."""
+    """Call ``work(part)`` for all parts, in a thread for each processor core; an exception of `progress` stops the rest."""
     with ThreadPoolExecutor(os.cpu_count()) as pool:
         for done, _ in enumerate(pool.map(work, parts), 1):
             if progress is not None:

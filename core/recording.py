@@ -1,8 +1,8 @@
-"""Warnings for the user, recorded: in any thread, and in whatever order recorders begin and end.
+"""Recording of warnings for the user, by thread.
 
-`warnings.catch_warnings` puts back, when it ends, what it found when it began. Of two that overlap, as those of two threads
-do, the one that ends last so brings back the other's record, long given up, and all later warnings go there. Here nothing is
-put back until no recorder is left, and a warning goes to the recorder of the thread that gives it.
+`warnings.catch_warnings` is not safe for threads: of two that overlap, the one that ends last restores the other's
+record, and all later warnings go there. Here each warning goes to a recorder of its own thread, and the original state
+is restored when no recorder is left.
 """
 
 from __future__ import annotations
@@ -16,16 +16,16 @@ from typing import Any
 from .errors import InputWarning
 
 _lock = threading.Lock()
-_recorders: list[tuple[int, list[str]]] = []  # thread and record, in the order they began
+_recorders: list[tuple[int, list[str]]] = []  # thread and record, oldest first
 _filters: list[Any] = []  # the lists that `_ALWAYS` was put into
 _ALWAYS = ("always", None, InputWarning, None, 0)
 
 
 @contextmanager
 def recorded_warnings() -> Iterator[list[str]]:
-    """The texts of every `InputWarning` that this thread gives in the block, as they come; other warnings go on as before.
+    """Collect the texts of all `InputWarning` that this thread gives in the block; other warnings are shown as usual.
 
-    Of several recorders in one thread the one that began last takes them.
+    Of nested recorders in a thread the innermost collects them.
     """
     mine = (threading.get_ident(), list[str]())
     with _lock:
@@ -41,7 +41,7 @@ def recorded_warnings() -> Iterator[list[str]]:
 
 
 class _Route:
-    """In place of `warnings.showwarning`: to the recorder of the thread, or on to what was there before."""
+    """Replaces `warnings.showwarning`: passes warnings to the thread's recorder, or to what was there before."""
 
     def __init__(self, before: Callable[..., Any]) -> None:
         self.before = before
@@ -58,17 +58,17 @@ class _Route:
 
 
 def _install() -> None:
-    if not isinstance(warnings.showwarning, _Route):  # else another recorder's serves
+    if not isinstance(warnings.showwarning, _Route):
         warnings.showwarning = _Route(warnings.showwarning)
-    warnings.simplefilter("always", InputWarning)  # Python shows a warning once for each place otherwise
+    warnings.simplefilter("always", InputWarning)  # by default Python shows each only once
     _filters.append(warnings.filters)
 
 
 def _uninstall() -> None:
-    # Where another program has put its own in its place, it is that one's to put back, and passes on what reaches it.
+    # If another program has replaced it since, that program restores it.
     if isinstance(warnings.showwarning, _Route):
         warnings.showwarning = warnings.showwarning.before
-    for filters in (*_filters, warnings.filters):  # `catch_warnings` of other programs works on copies
+    for filters in (*_filters, warnings.filters):  # catch_warnings of others works on copies
         while _ALWAYS in filters:
             filters.remove(_ALWAYS)
     _filters.clear()

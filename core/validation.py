@@ -1,4 +1,4 @@
-"""Checks of arrays at the package's boundaries: shape, realness, finiteness."""
+"""Checks of arguments where they enter the package."""
 
 from __future__ import annotations
 
@@ -10,30 +10,30 @@ from numpy.typing import ArrayLike, NDArray
 from .errors import InputError
 from .memory import require
 
-# Numbers whose copy may not fit into memory.
+# Copies of fewer numbers always fit into memory.
 _MANY = 2**20
 
 
 def real_array(
     value: ArrayLike, name: str, shape: tuple[int | None, ...] | None, dtype: Any = np.float64
 ) -> NDArray[Any]:
-    """`value` as an array of real, finite numbers of `shape`; a new array, never a view of the caller's.
+    """A copy of `value` as a C-ordered array of real, finite numbers.
 
     Parameters
     ----------
     value
-        What the caller gave.
+        The caller's argument.
     name
-        What to call it in the error.
+        Its name in error messages.
     shape
-        The shape expected, in which None stands for any length; None: any shape.
+        The expected shape, with None for any length; None for any shape.
     dtype
-        The result's type.
+        Of the result.
 
     Raises
     ------
     InputError
-        Not numbers, another shape, not finite (the first bad index is named), or more than memory holds.
+        Not numbers, another shape, not finite (the message names the first bad index), or too large for the memory.
     """
     try:
         raw = np.asarray(value)
@@ -41,7 +41,7 @@ def real_array(
             raise TypeError
     except (TypeError, ValueError, OverflowError):
         raise InputError(f"{name}: expected real numbers, got {type(value).__name__} {_short(value)}") from None
-    except RuntimeError as error:  # a torch tensor that is part of a graph: torch says what to do
+    except RuntimeError as error:  # a torch tensor that requires gradients; torch says what to do
         raise InputError(f"{name}: {error}") from None
     if raw.size > _MANY:
         require(raw.size * np.dtype(dtype).itemsize, f"{name} of {_shape(raw.shape)} numbers")
@@ -57,7 +57,8 @@ def real_array(
 
 def require_finite(array: NDArray[Any], name: str) -> None:
     """Raise `InputError` naming the first index at which `array` is not finite."""
-    # A NaN or infinity anywhere makes the sum non-finite: one pass, no mask, on the good path. A sum may also overflow.
+    # A finite sum proves that all numbers are, in one pass without a mask. The sum of finite numbers may still
+    # overflow.
     with np.errstate(over="ignore", invalid="ignore"):
         if np.isfinite(array.sum()):
             return
@@ -75,13 +76,7 @@ def instance(value: object, kind: type, name: str) -> None:
 
 
 def whole_shape(value: Any, name: str, length: int) -> Any:
-    """`value` as a tuple of `length` whole numbers of at least 1 (typed Any: mypy cannot say how many).
-
-    Raises
-    ------
-    InputError
-        Another length, not whole numbers, or below 1.
-    """
+    """`value` as a tuple of `length` whole numbers of at least 1, or `InputError`."""
     try:
         numbers = tuple(value)
         whole = tuple(int(n) for n in numbers)
@@ -107,6 +102,19 @@ def positive(value: Any, name: str, unit: str = "") -> float:
     if number <= 0:
         raise InputError(f"{name}: expected more than 0{' ' + unit if unit else ''}, got {number:g}")
     return number
+
+
+def one_for_all(value: ArrayLike, name: str, n: int) -> NDArray[np.float64]:
+    """`value` as `n` numbers, where one number stands for all, or `InputError`."""
+    return real_array(np.broadcast_to(value, n) if np.ndim(value) == 0 else value, name, (n,))
+
+
+def lengths(value: ArrayLike, name: str, n: int) -> NDArray[np.float64]:
+    """`value` as `n` lengths above 0 mm, where one number stands for all, or `InputError`."""
+    array = one_for_all(value, name, n)
+    if array.min() <= 0:
+        raise InputError(f"{name}: expected more than 0 mm, got {array.min():g}")
+    return array
 
 
 def freeze(array: NDArray[Any]) -> NDArray[Any]:

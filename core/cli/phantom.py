@@ -16,12 +16,10 @@ from numpy.typing import NDArray
 from ..errors import InputError
 from ..geometry.frames import euler_pose
 from ..geometry.grid import Grid
-from ..phantoms.defrise import DefrisePhantom
 from ..phantoms.derenzo import DerenzoPhantom
 from ..phantoms.kinds import KINDS
 from ..phantoms.language import read_phantom, write_phantom
 from ..phantoms.phantom import QUANTITIES, Phantom, ShapePhantom
-from ..phantoms.points import PointGrid
 from ..phantoms.random import random_pose
 from ..phantoms.shapes import Box, Cylinder, Ellipsoid, Sphere
 from ..validation import whole_shape
@@ -39,24 +37,15 @@ from .options import (
     refuse,
 )
 
-_DEST = "of_phantom_"  # before a setting's name, for the voxels have a spacing too
+_DEST = "of_phantom_"  # before the name of a phantom's setting: the voxels have a spacing, too
 Make = Callable[[argparse.Namespace], Phantom]
 
-# Example options of the kinds that have an option for every setting.
-_EXAMPLES = {
-    "nema": "--sphere-activity 40 --voxels 200",
-    "jaszczak": "--activity 50",
-    "defrise": "--disks 7 --spacing-of-disks 12",
-    "shepp-logan": "--contrast original",
-    "points": "--counts 3 3 3 --spacing-of-points 30 30 30",
-    "torso": "--defect-severity 0.5 --defect-angle-degrees 90 --quantity activity",
-}
-# Name, class, and of each dimension its name and how many numbers it takes; all mm.
+# Single shapes: class, how many numbers (mm) each of its dimensions takes, and an example.
 _SHAPES = (
-    ("cylinder", Cylinder, (("radius", "+"), ("height", None)), "--radius 100 --height 200 --activity 5 --mu 0.0154"),
-    ("sphere", Sphere, (("radius", None),), "--radius 20 --activity 40"),
-    ("ellipsoid", Ellipsoid, (("radii", 3),), "--radii 30 20 50 --activity 40"),
-    ("box", Box, (("size", 3),), "--size 30 20 50 --activity 40"),
+    (Cylinder, {"radius": "+", "height": None}, "--radius 100 --height 200 --activity 5 --mu 0.0154"),
+    (Sphere, {"radius": None}, "--radius 20 --activity 40"),
+    (Ellipsoid, {"radii": 3}, "--radii 30 20 50 --activity 40"),
+    (Box, {"size": 3}, "--size 30 20 50 --activity 40"),
 )
 
 
@@ -64,19 +53,16 @@ def add_parser(subparsers) -> None:  # type: ignore[no-untyped-def]
     """Add the command."""
     phantom = add_command(subparsers, "phantom", "make a phantom volume", "mphdrr phantom derenzo -o derenzo.nii.gz")
     kinds = phantom.add_subparsers(metavar="KIND", required=True)
-    derenzo = add_command(
-        kinds,
-        "derenzo",
-        "make a Derenzo phantom: six sectors of hot rods",
-        "mphdrr phantom derenzo --radius 40 --rods 8 6 5 4 3 2 --euler 30 0 0 -o derenzo.nii.gz",
-    )
-    add_phantom_options(derenzo)
-    _add_output(derenzo, _derenzo)
+
+    def add(name: str, summary: str, example: str) -> argparse.ArgumentParser:
+        return add_command(kinds, name, summary, f"mphdrr phantom {name} {example} -o {name}.nii.gz")
+
     for kind in KINDS:
-        if kind.name not in _EXAMPLES:
+        parser = add(kind.name, f"make {kind.summary}", kind.example)
+        if kind.phantom is DerenzoPhantom:  # with the options that `mphdrr project` has for it
+            add_phantom_options(parser)
+            _add_output(parser, _derenzo)
             continue
-        example = f"mphdrr phantom {kind.name} {_EXAMPLES[kind.name]} -o {kind.name}.nii.gz"
-        parser = add_command(kinds, kind.name, f"make {kind.summary}", example)
         _add_settings(parser, kind.phantom)
         if hasattr(kind.phantom, "beating"):
             parser.add_argument(
@@ -85,14 +71,14 @@ def add_parser(subparsers) -> None:  # type: ignore[no-untyped-def]
             )  # fmt: skip
         add_placing_options(parser)
         _add_output(parser, partial(_of_kind, kind.phantom))
-    for name, shape, dimensions, example in _SHAPES:
-        parser = add_command(kinds, name, f"make one {name}", f"mphdrr phantom {name} {example} -o {name}.nii.gz")
-        for dimension, count in dimensions:
+    for shape, dimensions, example in _SHAPES:
+        parser = add(shape.KIND, f"make one {shape.KIND}", example)
+        for dimension, count in dimensions.items():
             parser.add_argument(f"--{dimension}", type=float, nargs=count, required=True, metavar="MM")
         parser.add_argument("--activity", type=float, default=100.0, metavar="kBq/mL", help="concentration")
         parser.add_argument("--mu", type=float, default=0.0, metavar="1/mm", help="attenuation coefficient")
         add_placing_options(parser)
-        _add_output(parser, partial(_one, shape, [dimension for dimension, _ in dimensions]))
+        _add_output(parser, partial(_of_shape, shape, list(dimensions)))
     file = add_command(
         kinds, "file", "make the phantom that a TOML file describes", "mphdrr phantom file thorax.toml -o thorax.nii.gz"
     )
@@ -102,22 +88,19 @@ def add_parser(subparsers) -> None:  # type: ignore[no-untyped-def]
 
 
 def chosen_phantom(arguments: argparse.Namespace, path: str | None) -> tuple[Phantom, dict[str, Any]]:
-    """The phantom of a TOML file, or without one of `add_phantom_options`, and what it was made from."""
-    if path is not None:
-        phantom = read_phantom(path)
-        return phantom, _recipe({"kind": "file", "file": Path(path).name, "name": phantom.name}, arguments)
-    derenzo = _derenzo(arguments)
-    return derenzo, _recipe({"kind": "derenzo", **dataclasses.asdict(derenzo)}, arguments)
+    """The phantom of a TOML file or, without one, of `add_phantom_options`; and a record of what it was made from."""
+    place = {"position_mm": list(arguments.position), "euler_degrees": list(arguments.euler)}
+    if path is None:
+        derenzo = _derenzo(arguments)
+        return derenzo, {"phantom": {"kind": "derenzo", **dataclasses.asdict(derenzo)}, **place}
+    phantom = read_phantom(path)
+    return phantom, {"phantom": {"kind": "file", "file": Path(path).name, "name": phantom.name}, **place}
 
 
 def placed_volume(phantom: Phantom, arguments: argparse.Namespace, quantity: str) -> Volume:
     """The phantom on the grid and at the place of `add_placing_options`."""
     grid, pose = _grid(phantom, arguments), _pose(arguments)
     return phantom.voxelize(grid, pose, progress_bar("voxelizing"), quantity)
-
-
-def _recipe(phantom: dict[str, Any], arguments: argparse.Namespace) -> dict[str, Any]:
-    return {"phantom": phantom, "position_mm": list(arguments.position), "euler_degrees": list(arguments.euler)}
 
 
 def _derenzo(arguments: argparse.Namespace) -> DerenzoPhantom:
@@ -128,40 +111,33 @@ def _derenzo(arguments: argparse.Namespace) -> DerenzoPhantom:
     )  # fmt: skip
 
 
-def _one(shape: Any, names: list[str], arguments: argparse.Namespace) -> Phantom:
+def _of_shape(shape: Any, names: list[str], arguments: argparse.Namespace) -> Phantom:
     dimensions = {name: getattr(arguments, name) for name in names}
     if isinstance(dimensions.get("radius"), list) and len(dimensions["radius"]) == 1:
         (dimensions["radius"],) = dimensions["radius"]
     return ShapePhantom([shape(**dimensions, activity=arguments.activity, mu=arguments.mu)], name=shape.KIND)
 
 
+def _of_kind(kind: Any, arguments: argparse.Namespace) -> Phantom:
+    return kind(**{field.name: getattr(arguments, _DEST + field.name) for field in dataclasses.fields(kind)})
+
+
 def _add_settings(parser: argparse.ArgumentParser, kind: Any) -> None:
     """An option for every field of a kind of phantom."""
     fields: tuple[Any, ...] = dataclasses.fields(kind)
     for field in fields:
-        many = isinstance(field.default, tuple)
-        option: dict[str, Any] = {"dest": _DEST + field.name, "default": list(field.default) if many else field.default}
-        option["nargs"] = len(field.default) if many else None
-        if "unit" in field.metadata:
-            unit = field.metadata["unit"]
-            metavar = {"mm": "MM", "kBq/mL": "kBq/mL", "1/mm": "1/mm", "kBq": "kBq", "mL": "mL", "DEG": "DEG"}.get(unit)
-            text = field.metadata["text"] if metavar else f"share {unit}, {field.metadata['text']}"
-            option |= {"type": float, "metavar": metavar or "SHARE", "help": text}
-        elif "choices" in field.metadata:
-            option |= {"choices": field.metadata["choices"], "help": field.metadata["text"]}
+        known, many = field.metadata, isinstance(field.default, tuple)
+        option: dict[str, Any] = {"dest": _DEST + field.name, "help": known["text"]}
+        option |= {"default": list(field.default), "nargs": len(field.default)} if many else {"default": field.default}
+        if "choices" in known:
+            option["choices"] = known["choices"]
+        elif "unit" not in known:
+            option |= {"type": int, "metavar": "N"}
+        elif known["unit"].startswith("of "):
+            option |= {"type": float, "metavar": "FRACTION", "help": f"fraction {known['unit']}, {known['text']}"}
         else:
-            option |= {"type": int, "metavar": "N", "help": field.metadata["text"]}
-        parser.add_argument(_option_name(field.name, kind), **option)
-
-
-def _option_name(name: str, kind: Any) -> str:
-    # --spacing is the voxels'.
-    words = {(PointGrid, "spacing"): "spacing-of-points", (DefrisePhantom, "spacing"): "spacing-of-disks"}
-    return "--" + words.get((kind, name), name.replace("_", "-"))
-
-
-def _of_kind(kind: Any, arguments: argparse.Namespace) -> Phantom:
-    return kind(**{field.name: getattr(arguments, _DEST + field.name) for field in dataclasses.fields(kind)})
+            option |= {"type": float, "metavar": "MM" if known["unit"] == "mm" else known["unit"]}
+        parser.add_argument("--" + (known.get("option") or field.name.replace("_", "-")), **option)
 
 
 def _add_output(parser: argparse.ArgumentParser, make: Make) -> None:
@@ -187,22 +163,22 @@ def _pose(arguments: argparse.Namespace) -> NDArray[np.float64]:
 
 
 def _grid(phantom: Phantom, arguments: argparse.Namespace, room: float = 0.0) -> Grid:
-    """The grid asked for; the default spacing holds the phantom however it is turned, and `room`, mm, more."""
+    """The grid asked for; by default it holds the phantom however it is turned, and moved by up to `room` / 2 mm."""
     voxels = whole_shape(one_or_three(arguments.voxels), "--voxels", 3)
-    spacing = arguments.spacing
-    extent = phantom.extent + room
-    return Grid.centered(
-        voxels, one_or_three(spacing) if spacing else extent / max(1, min(voxels) - 2), arguments.position
-    )
+    fitted = (phantom.extent + room) / max(1, min(voxels) - 2)
+    return Grid.centered(voxels, one_or_three(arguments.spacing or [fitted]), arguments.position)
 
 
 def _require_fitting(arguments: argparse.Namespace, is_text: bool) -> None:
-    """Refuse options that would have no effect beside the others."""
+    """Refuse options that contradict each other or would have no effect."""
     if arguments.count < 1:
         raise InputError(f"--count: expected at least 1, got {arguments.count}")
-    if arguments.random is None and (arguments.count > 1 or any(arguments.box)):
-        raise InputError("--count and --box need --random")
-    if arguments.random is not None:
+    if arguments.random is None:
+        if arguments.count > 1 or any(arguments.box):
+            raise InputError("--count and --box need --random")
+    elif arguments.random < 0:
+        raise InputError(f"--random: expected a seed of at least 0, got {arguments.random}")
+    else:
         refuse(arguments, ("euler",), "has no effect with --random, which draws the angles")
     if "frames" in arguments:
         refuse(arguments, (f"{_DEST}phase",), "has no effect with --frames, which takes phases evenly over the cycle")
@@ -210,7 +186,7 @@ def _require_fitting(arguments: argparse.Namespace, is_text: bool) -> None:
         refuse(
             arguments,
             (*PLACING_OPTIONS, "quantity", "random", "frames", "json"),
-            f"is of voxels, and a .toml holds the shapes alone; expected {', '.join(VOLUME_FORMATS)}",
+            f"is of voxels, but a .toml holds only the shapes; expected {', '.join(VOLUME_FORMATS)}",
         )
 
 
@@ -226,35 +202,24 @@ def _run(arguments: argparse.Namespace) -> None:
     states = phantom.beating(arguments.frames) if "frames" in arguments else [phantom]
     box = one_or_three(arguments.box)
     grid = _grid(max(states, key=lambda state: state.extent), arguments, room=max(box))
-    rng = None if arguments.random is None else np.random.default_rng(_seed(arguments.random))
-    written = []
-    for index in range(arguments.count * len(states)):
+    rng = None if arguments.random is None else np.random.default_rng(arguments.random)
+    n_files, written = arguments.count * len(states), []
+    for index in range(n_files):
         state = states[index % len(states)]
-        if state is states[0]:  # the others lie where the first does
+        if state is states[0]:  # the other states take the same pose
             pose = _pose(arguments) if rng is None else random_pose(rng, box, arguments.position)
         volume = state.voxelize(grid, pose, progress_bar("voxelizing"), quantity=arguments.quantity)
-        file = numbered_path(path, index + 1, arguments.count * len(states))
+        file = numbered_path(path, index + 1, n_files)
         write_volume(volume, file)
-        held = _held(volume)
-        about = {"file": str(file), "pose": pose.tolist(), "quantity": volume.quantity, **held}
-        written.append({**about, "phase": state.phase} if len(states) > 1 else about)
+        entry = {"file": str(file), "pose": pose.tolist(), "quantity": volume.quantity}
+        if UNITS[volume.quantity] == "kBq/mL":
+            total = float(volume.array.sum(dtype=np.float64) * volume.grid.voxel_volume * 1e-3)
+            entry["total_kBq"], content = total, f"{total:.4g} kBq in all"
+        else:
+            entry["largest"] = float(volume.array.max())
+            content = f"mu up to {entry['largest']:.4g} 1/mm"
+        written.append({**entry, "phase": state.phase} if len(states) > 1 else entry)
         if not arguments.json:
-            said = (
-                f"{held['total_kBq']:.4g} kBq in all" if "total_kBq" in held else f"mu up to {held['largest']:.4g} 1/mm"
-            )
-            print(f"{file}: {' x '.join(map(str, volume.grid.shape))} voxels, {said}")
+            print(f"{file}: {' x '.join(map(str, volume.grid.shape))} voxels, {content}")
     if arguments.json:
         print(json.dumps(written, indent=2))
-
-
-def _held(volume: Volume) -> dict[str, float]:
-    """The total of a volume of activity, the largest value of any other."""
-    if UNITS[volume.quantity] == "kBq/mL":
-        return {"total_kBq": float(volume.array.sum(dtype=np.float64) * volume.grid.voxel_volume * 1e-3)}
-    return {"largest": float(volume.array.max())}
-
-
-def _seed(seed: int) -> int:
-    if seed < 0:
-        raise InputError(f"--random: expected a seed of at least 0, got {seed}")
-    return seed

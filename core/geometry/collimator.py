@@ -1,19 +1,20 @@
 """A module's collimator: a plate with a knife-edged pinhole, and walls behind it. The one description of its shape.
 
-The mesh (`core.collimator_mesh`), the solids of files and of Monte Carlo programs, the geometry checks and the physics
-of the knife edge take their shapes from here. Depths are along the module's axis, mm from the pinhole's centre, positive
-towards the crystal. Looked at from the axis, front to back:
+The mesh, the solids in files and in Monte Carlo programs, the geometry checks and the physics of the knife edge all use
+it. Depths are along the module's axis, mm from the pinhole's centre, positive towards the crystal. From front to back:
 
 - The hole is narrowest at depth 0, where its diameter is d, and opens as a double cone of full angle alpha through the
   whole plate: its radius at depth s is ``d/2 + |s| tan(alpha/2)``.
-- The plate's faces are at `Construction.front` and `Construction.back`. The knife edge lies in the plate's middle, or on
+- The plate's faces are at `Construction.front` and `Construction.back`. The knife edge lies in the plate's middle, or
+on
   the face towards the ROI (front) or towards the crystal (back).
-- Behind the plate is a channel, a square frustum that ends at the crystal's front face with the crystal's side. It is never
+- Behind the plate is a channel, a square frustum that ends at the crystal's front face with the crystal's side. It is
+never
   narrower than the pyramid that the crystal sees through the hole, of half-width ``d/2 + (Ld - d)/2 * s/l``.
 - The outside is a square frustum, everywhere at least a wall's thickness outside the hole and the channel.
 
-So a ray from the front that crosses depth 0 in the hole, no steeper than the cone, and meets the crystal's front face
-touches nothing; and what reaches that face in any other way goes through the plate or a wall.
+So a ray from the front that passes the hole at depth 0, is no steeper than the cone and meets the crystal's front face
+touches nothing. Any other way to that face leads through the plate or a wall.
 """
 
 from __future__ import annotations
@@ -30,27 +31,21 @@ from ..validation import positive
 EdgePlace = Literal["middle", "front", "back"]
 
 OPENING_ANGLE = math.pi / 2
-"""Full angle of the knife edge's double cone, rad, where none is given."""
+"""Default full angle of the knife edge's double cone, rad."""
 
-_SHOULDER = 0.01  # share of the room beside the hole by which the channel, where it begins, is wider than the hole
+_SHOULDER = 0.01  # the channel begins wider than the hole by this fraction of the free width around the hole
 
 
 def edge_slope(opening_angle: float) -> float:
-    """``tan(alpha / 2)``: by how much the radius of a knife-edged hole grows with the distance from its edge."""
+    """``tan(alpha / 2)``: growth of a knife-edged hole's radius per distance from the edge."""
     return math.tan(opening_angle / 2)
 
 
-def angle_from_degrees(opening_degrees: float) -> float:
-    """The opening angle, rad, of an option in degrees.
-
-    Raises
-    ------
-    InputError
-        It is not between 0 and 180 degrees.
-    """
-    degrees = positive(opening_degrees, "opening_degrees", "degrees")
+def angle_from_degrees(degrees: float, name: str = "opening_degrees") -> float:
+    """The opening angle, rad, of an option in degrees; `InputError` unless it is between 0 and 180."""
+    degrees = positive(degrees, name, "degrees")
     if degrees >= 180:
-        raise InputError(f"opening_degrees: expected less than 180, got {degrees:g}")
+        raise InputError(f"{name}: expected less than 180 degrees, got {degrees:g}")
     return math.radians(degrees)
 
 
@@ -61,17 +56,17 @@ class Construction:
     Attributes
     ----------
     plate_thickness, wall_thickness : float
-        Of the aperture plates and of the collimators' walls, mm.
+        Of the aperture plates and the collimators' walls, mm.
     opening_angle : float
         Full angle alpha of the hole's double cone, rad.
     edge_at : "middle", "front" or "back"
-        Where in the plate the knife edge is: front is the face towards the ROI. The edge itself is always at the
-        pinhole's centre, so this moves the plate.
+        Where in the plate the knife edge is; front is the face towards the ROI. The edge is always at the pinhole's
+        centre, so this moves the plate.
 
     Raises
     ------
     InputError
-        A length is not above 0, the angle is not between 0 and pi, or the place is none of these.
+        A length is not above 0, the angle is not between 0 and pi, or the place is not one of these.
     """
 
     plate_thickness: float = 2.0
@@ -80,12 +75,9 @@ class Construction:
     edge_at: EdgePlace = "middle"
 
     def __post_init__(self) -> None:
-        for name, value, _unit in (
-            ("plate_thickness", positive(self.plate_thickness, "aperture plate", "mm"), "mm"),
-            ("wall_thickness", positive(self.wall_thickness, "collimator wall", "mm"), "mm"),
-            ("opening_angle", positive(self.opening_angle, "opening_angle", "rad"), "rad"),
-        ):
-            object.__setattr__(self, name, value)
+        object.__setattr__(self, "plate_thickness", positive(self.plate_thickness, "aperture plate", "mm"))
+        object.__setattr__(self, "wall_thickness", positive(self.wall_thickness, "collimator wall", "mm"))
+        object.__setattr__(self, "opening_angle", positive(self.opening_angle, "opening_angle", "rad"))
         if self.opening_angle >= math.pi:
             raise InputError(f"opening_angle: expected less than pi, got {self.opening_angle:g} rad")
         if self.edge_at not in get_args(EdgePlace):
@@ -93,12 +85,12 @@ class Construction:
 
     @property
     def front(self) -> float:
-        """Depth of the plate's face towards the ROI, mm: 0 or less."""
+        """Depth of the plate's face towards the ROI, mm, at most 0."""
         return {"middle": -0.5, "front": 0.0, "back": -1.0}[self.edge_at] * self.plate_thickness
 
     @property
     def back(self) -> float:
-        """Depth of the plate's face towards the crystal, mm: 0 or more."""
+        """Depth of the plate's face towards the crystal, mm, at least 0."""
         return self.front + self.plate_thickness
 
     @property
@@ -121,7 +113,7 @@ class Collimator:
     Raises
     ------
     InputError
-        There is no such body.
+        The plate, the hole and the crystal do not fit together.
     """
 
     diameter: float
@@ -160,38 +152,33 @@ class Collimator:
 
     @property
     def channel_half_width(self) -> float:
-        """Half-width, mm, of the channel where it begins, at the plate's back; at the crystal it is Ld/2."""
+        """Half-width, mm, of the channel at the plate's back, where it begins; at the crystal it is Ld/2."""
         back, d = self.construction.back, self.diameter
         return max(d / 2 + (self.detector_side - d) / 2 * back / self.length, self._shoulder)
 
     @property
     def front_half_width(self) -> float:
-        """Half-width, mm, of the plate's front face; at the crystal the outside is Ld/2 + wall."""
+        """Half-width, mm, of the plate's front face; at the crystal that of the outside is Ld/2 + wall."""
         return max(self.hole_radius(self.construction.front), self._shoulder) + self.construction.wall_thickness
 
     @property
     def _shoulder(self) -> float:
-        """Half-width, mm, of the narrowest square around the hole's rim at the plate's back that does not touch it."""
+        """Half-width, mm, of a square slightly wider than the hole's rim at the plate's back."""
         rim = self.hole_radius(self.construction.back)
         return rim + _SHOULDER * (self.detector_side / 2 - rim)
 
     def open_share(self, slope: float) -> float:
-        """Share of the hole's area that is open to parallel rays.
+        """Fraction of the hole's area that is open to parallel rays of a slope, mm across the axis per mm along it (>= 0).
 
-        A ray passes if it is within the hole at the edge and at both faces of the plate: in between it then is, too, for
-        the hole is a cone. So the share is the area that three discs have in common, shifted along the rays.
-
-        Parameters
-        ----------
-        slope
-            Of the rays, mm across the axis per mm along it, 0 or more.
+        A ray passes if it is within the hole at the edge and at both faces of the plate, because the hole consists of
+        cones. So the open area is the intersection of three discs, shifted along the rays.
         """
         n = 512
-        across = self.diameter / 2 * np.sin((np.arange(n) + 0.5) / n * np.pi / 2)  # half of the disc: it is symmetric
+        across = self.diameter / 2 * np.sin((np.arange(n) + 0.5) / n * np.pi / 2)  # half of the symmetric disc
         low, high = np.full(n, -np.inf), np.full(n, np.inf)
         for depth, radius in self.hole_profile:
             half = np.sqrt(np.maximum(radius**2 - across**2, 0.0))
             low, high = np.maximum(low, -depth * slope - half), np.minimum(high, -depth * slope + half)
-        # Equal steps of an angle: the chords' lengths have a square root at the disc's rim.
+        # In steps of an angle, because the chords' lengths behave like a square root at the disc's rim.
         steps = self.diameter / 2 * np.cos((np.arange(n) + 0.5) / n * np.pi / 2) * (np.pi / 2 / n)
         return float(2 * (np.maximum(high - low, 0.0) * steps).sum() / (np.pi / 4 * self.diameter**2))

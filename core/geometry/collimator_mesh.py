@@ -1,7 +1,7 @@
-"""Solid shapes of a module as vertices and faces: the collimator with its aperture plate, and the crystal.
+"""Meshes of a module's solids: the collimator with its aperture plate, and the crystal.
 
-Everything is in the module's camera space, mm: the pinhole at the origin, X = -u, Y = v, Z = -k, so that the
-crystal is at Z from l to l + Td and the collimator in front of it, around the pinhole.
+Coordinates are those of the module's camera space, mm: the pinhole at the origin, X = -u, Y = v, Z = -k. So the crystal
+reaches from Z = l to l + Td, and the collimator stands in front of it, around the pinhole.
 """
 
 from __future__ import annotations
@@ -13,21 +13,18 @@ from ..errors import InputError
 from .collimator import Collimator
 
 Solid = tuple[NDArray[np.float64], NDArray[np.int32]]
-"""Vertices (V, 3), mm, and quads (F, 4), counter-clockwise as seen from outside."""
+"""Vertices (V, 3), mm, and quads (F, 4), counter-clockwise seen from outside."""
 
+# Points on a ring: a multiple of 8, so that squares have points at their corners. The polygon is inscribed in the hole's
+# circle: 99.84 % of the area is open.
 _N = 64
-"""Points on a ring: a multiple of 8, so that the squares have points at their corners.
-
-The hole's polygon has its corners on the circle: 99.84 % of its area is open, and nothing beyond it.
-"""
 
 
 def collimator_solid(collimator: Collimator) -> Solid:
-    """The body that `core.collimator` describes.
+    """The collimator's surface: one closed surface of genus 1.
 
-    One closed surface of genus 1: rings of points along the hole from the plate's front to its back, then the channel's
-    square at the plate and at the crystal, then the outside's at the crystal and in front, joined by quads, the last ring
-    to the first.
+    Its rings of points run along the hole from the plate's front to its back, along the channel to the crystal, and along
+    the outside back to the front; quads join each ring to the next and the last to the first.
     """
     angle = 2 * np.pi * np.arange(_N) / _N
     circle = np.stack([np.cos(angle), np.sin(angle)], axis=1)
@@ -56,7 +53,7 @@ def collimator_solid(collimator: Collimator) -> Solid:
 
 
 def crystal_solid(collimator_length: float, detector_side: float, detector_thickness: float) -> Solid:
-    """The crystal: a box of side Ld from s = l to s = l + Td."""
+    """The crystal: a box of side Ld, from depth l to l + Td."""
     h = detector_side / 2
     front, back = collimator_length, collimator_length + detector_thickness
     vertices = np.array([[x, y, z] for z in (front, back) for x, y in ((-h, -h), (h, -h), (h, h), (-h, h))])
@@ -64,28 +61,21 @@ def crystal_solid(collimator_length: float, detector_side: float, detector_thick
     return vertices, np.array(faces, dtype=np.int32)
 
 
-def signed_volume(solid: Solid) -> float:
-    """Enclosed volume, mm^3: positive where the faces look outwards."""
-    vertices, faces = solid
-    a, b, c, d = (vertices[faces[:, i]] for i in range(4))
-    return float((np.einsum("ij,ij->i", a, np.cross(b, c)) + np.einsum("ij,ij->i", a, np.cross(c, d))).sum() / 6)
-
-
-def check_watertight(solid: Solid) -> None:
-    """Refuse a surface that is not closed and consistently oriented, or that looks inwards.
-
-    Raises
-    ------
-    InputError
-        An edge does not belong to exactly two faces that run along it in opposite directions, or the volume
-        is not positive.
-    """
+def surface_fault(solid: Solid) -> str | None:
+    """What is wrong with a surface: it is not closed and consistently oriented, or it is inside out. None if nothing is."""
     vertices, faces = solid
     starts, ends = faces.ravel().astype(np.int64), np.roll(faces, -1, axis=1).ravel().astype(np.int64)
     n = len(vertices)
     forward, backward = np.sort(starts * n + ends), np.sort(ends * n + starts)
     if np.any(np.diff(forward) == 0) or not np.array_equal(forward, backward):
-        raise InputError("collimator mesh: it is not closed (an edge is not shared by exactly two faces)")
-    volume = signed_volume(solid)
-    if not volume > 0:
-        raise InputError(f"collimator mesh: its volume is {volume:g} mm^3, expected more than 0")
+        return "is not closed (an edge is not shared by exactly two faces)"
+    a, b, c, d = (vertices[faces[:, i]] for i in range(4))
+    volume = (np.einsum("ij,ij->i", a, np.cross(b, c)) + np.einsum("ij,ij->i", a, np.cross(c, d))).sum() / 6
+    return None if volume > 0 else f"has a volume of {volume:g} mm^3, expected more than 0"
+
+
+def check_watertight(solid: Solid) -> None:
+    """Raise `InputError` if the surface has a `surface_fault`."""
+    fault = surface_fault(solid)
+    if fault:
+        raise InputError(f"collimator mesh: it {fault}")

@@ -22,7 +22,7 @@ def collimator_length(b: ArrayLike, d: ArrayLike, Ld: ArrayLike, R: ArrayLike) -
     """Collimator length l, mm, at which the module's field of view is tangent to the ROI sphere.
 
     With ``s = (Ld - d) / (2 l)`` tangency means ``b s - d/2 = R sqrt(1 + s^2)``, hence
-    ``l = (Ld - d)(b^2 - R^2) / (b d + 2 R sqrt(b^2 - R^2 + d^2/4))``: column G of the users' workbook.
+    ``l = (Ld - d)(b^2 - R^2) / (b d + 2 R sqrt(b^2 - R^2 + d^2/4))``, which is column G of the users' workbook.
 
     Parameters
     ----------
@@ -38,12 +38,12 @@ def collimator_length(b: ArrayLike, d: ArrayLike, Ld: ArrayLike, R: ArrayLike) -
     Returns
     -------
     array
-        l, mm, of the arguments' common (broadcast) shape.
+        l, mm, of the broadcast shape.
 
     Raises
     ------
     InputError
-        A number is not finite or out of its range, or the shapes do not go together.
+        A number is not finite or out of range, or the shapes do not broadcast.
     """
     b, d, Ld, R = _numbers(b=b, d=d, Ld=Ld, R=R)
     _require("d", d, d > 0, "more than 0")
@@ -54,22 +54,11 @@ def collimator_length(b: ArrayLike, d: ArrayLike, Ld: ArrayLike, R: ArrayLike) -
 
 
 def roi_radius_seen(b: ArrayLike, d: ArrayLike, Ld: ArrayLike, l: ArrayLike) -> Array:
-    """Radius R, mm, of the largest sphere at the isocentre that the module's field of view holds.
+    """Radius R, mm, of the largest sphere at the isocentre that the module's field of view holds, or 0.
 
-    The inverse of `collimator_length`: ``R = (b (Ld - d) - d l) / sqrt(4 l^2 + (Ld - d)^2)``. Every ray from such a
-    sphere through any point of the hole meets the crystal's front. Where there is no such ray it is 0.
-
-    Parameters
-    ----------
-    b, d, Ld
-        As in `collimator_length`.
-    l
-        Collimator length, mm.
-
-    Raises
-    ------
-    InputError
-        A number is not finite or out of its range, or the shapes do not go together.
+    The inverse of `collimator_length`: ``R = (b (Ld - d) - d l) / sqrt(4 l^2 + (Ld - d)^2)``. Every ray from this sphere
+    through any point of the hole meets the crystal's front face. Parameters and errors are as there, with the collimator
+    length l, mm.
     """
     b, d, Ld, l = _numbers(b=b, d=d, Ld=Ld, l=l)
     _require("d", d, d > 0, "more than 0")

@@ -8,7 +8,7 @@ from numpy.typing import ArrayLike, NDArray
 from ..errors import InputError
 from ..validation import real_array
 
-# Below this sine of the angle between z and the principal ray they count as parallel.
+# z and a principal ray are parallel if the sine of the angle between them is below this.
 _PARALLEL = 1e-9
 
 
@@ -51,18 +51,18 @@ def module_poses(centers: ArrayLike) -> NDArray[np.float64]:
 def euler_pose(
     phi: float = 0.0, theta: float = 0.0, psi: float = 0.0, translation: ArrayLike = (0.0, 0.0, 0.0)
 ) -> NDArray[np.float64]:
-    """World-from-object pose (4, 4) of a phantom turned by three Euler angles and then moved.
+    """World-from-object pose (4, 4): a rotation by three Euler angles, then a translation.
 
     Parameters
     ----------
     phi, theta, psi
-        Radians: psi turns about the object's own z axis, then theta about world y, then phi about world z.
+        Radians: a rotation by psi about the object's z axis, then by theta about world y, then by phi about world z.
     translation
         mm, applied last.
     """
     angles = real_array([phi, theta, psi], "Euler angles", (3,))
     pose = np.eye(4)
-    pose[:3, :3] = _about_z(angles[0]) @ _about_y(angles[1]) @ _about_z(angles[2])
+    pose[:3, :3] = _rotation(2, angles[0]) @ _rotation(1, angles[1]) @ _rotation(2, angles[2])
     pose[:3, 3] = real_array(translation, "translation", (3,))
     return pose
 
@@ -73,17 +73,17 @@ def checked_affine(affine: ArrayLike, name: str) -> NDArray[np.float64]:
     if not np.array_equal(matrix[3], [0.0, 0.0, 0.0, 1.0]):
         raise InputError(f"{name}: expected 0 0 0 1 as the last row, got {' '.join(f'{x:g}' for x in matrix[3])}")
     lengths = np.linalg.norm(matrix[:3, :3], axis=0)
-    # Scaled to unit columns, so that small voxels do not count as singular.
+    # Scaled to unit columns, so that a grid of small voxels is not taken for singular.
     if np.any(lengths == 0) or abs(np.linalg.det(matrix[:3, :3] / lengths)) < 1e-10:
         raise InputError(f"{name}: its three axes are not independent, so it cannot be inverted")
     return matrix
 
 
-def _about_z(angle: float) -> NDArray[np.float64]:
-    c, s = np.cos(angle), np.sin(angle)
-    return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
-
-
-def _about_y(angle: float) -> NDArray[np.float64]:
-    c, s = np.cos(angle), np.sin(angle)
-    return np.array([[c, 0.0, s], [0.0, 1.0, 0.0], [-s, 0.0, c]])
+def _rotation(axis: int, angle: float) -> NDArray[np.float64]:
+    """Rotation matrix (3, 3) about a coordinate axis."""
+    i, j = (axis + 1) % 3, (axis + 2) % 3
+    matrix = np.eye(3)
+    matrix[i, i] = matrix[j, j] = np.cos(angle)
+    matrix[j, i] = np.sin(angle)
+    matrix[i, j] = -matrix[j, i]
+    return matrix

@@ -8,8 +8,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ..errors import InputError
-from ..validation import freeze, real_array, whole_shape
+from ..validation import freeze, lengths, real_array, whole_shape
 from .frames import checked_affine
 
 
@@ -40,21 +39,12 @@ class Grid:
 
     @classmethod
     def centered(cls, shape: ArrayLike, spacing: ArrayLike, center: ArrayLike = (0.0, 0.0, 0.0)) -> Grid:
-        """An axis-aligned grid whose middle lies at `center`.
+        """An axis-aligned grid with its middle at `center`, world mm.
 
-        Parameters
-        ----------
-        shape
-            Voxels along x, y, z; one number means the same along all.
-        spacing
-            Voxel size, mm; one number or three.
-        center
-            World mm.
+        `shape`, in voxels, and `spacing`, in mm, are three numbers along x, y, z or one for all.
         """
         counts = whole_shape(np.broadcast_to(np.asarray(shape), 3) if np.ndim(shape) == 0 else shape, "grid shape", 3)
-        spacing = real_array(np.broadcast_to(spacing, 3) if np.ndim(spacing) == 0 else spacing, "voxel spacing", (3,))
-        if np.any(spacing <= 0):
-            raise InputError(f"voxel spacing: expected more than 0 mm, got {spacing.min():g}")
+        spacing = lengths(spacing, "voxel spacing", 3)
         affine = np.diag([*spacing, 1.0])
         affine[:3, 3] = real_array(center, "grid centre", (3,)) - spacing * (np.array(counts) - 1) / 2
         return cls(counts, affine)
@@ -74,9 +64,9 @@ class Grid:
         """Number of voxels."""
         return int(np.prod(self.shape, dtype=object))
 
-    @cached_property  # asked for every piece of every image
+    @cached_property  # needed for every part of every image
     def index_from_world(self) -> NDArray[np.float64]:
-        """World mm to index, (4, 4), on column vectors."""
+        """Matrix (4, 4) from world mm to index, on column vectors."""
         return freeze(np.linalg.inv(self.affine))
 
     @property

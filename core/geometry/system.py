@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass, fields
 from typing import Literal
 
@@ -10,13 +11,13 @@ from numpy.typing import ArrayLike, NDArray
 
 from ..errors import InputError
 from ..system_source import SystemSource
-from ..validation import freeze, positive, real_array, whole_shape
+from ..validation import freeze, lengths, one_for_all, positive, real_array, whole_shape
 from .frames import module_frames, module_poses, principal_rays
 from .views import Views
 
 Detector = Literal["virtual", "real"]
 
-# Modules whose pinholes differ less than this share of the crystal's side along z belong to one ring.
+# Pinholes that differ in z by less than this fraction of the crystal's side belong to one ring.
 _RING_GAP = 0.2
 
 
@@ -31,15 +32,15 @@ class PinholeSystem:
     pinhole_diameter, collimator_length, detector_side, detector_thickness, roi_radius : array (M,)
         d, l, Ld, Td and R, mm; one number stands for all modules.
     numbers : int array (M,)
-        The modules' numbers as their users know them; 1, 2, ... unless given.
+        The modules' numbers in the users' workbook; default 1, 2, ...
     source : SystemSource or None
-        The workbook that it was read from.
+        The workbook that the system was read from.
 
     Raises
     ------
     InputError
-        A shape is wrong, a number is not finite or not positive, d is not below Ld, a pinhole lies inside the
-        ROI, or two modules have the same number or place.
+        A shape is wrong, a number is not finite or not positive, d is not below Ld, a pinhole lies inside the ROI, or
+        two modules have the same number or place.
     """
 
     centers: NDArray[np.float64]
@@ -59,47 +60,35 @@ class PinholeSystem:
         numbers = np.arange(1, n + 1) if self.numbers is None else real_array(self.numbers, "numbers", (n,), np.int64)
         if self.numbers is not None and not np.array_equal(numbers, self.numbers):
             raise InputError("numbers: expected whole numbers")
-        self._set("centers", centers)
-        self._set("numbers", numbers)
+        object.__setattr__(self, "centers", freeze(centers))
+        object.__setattr__(self, "numbers", freeze(numbers))
         for name in _LENGTHS:
-            value = getattr(self, name)
-            if np.ndim(value) == 0:
-                value = np.full(n, real_array(value, name, ()))
-            value = real_array(value, name, (n,))
-            self._refuse(
-                value <= 0, lambda i, name=name, value=value: f"{name} must be more than 0 mm, got {value[i]:g}"
-            )
-            self._set(name, value)
-        b = self.pinhole_distance
+            object.__setattr__(self, name, freeze(one_for_all(getattr(self, name), name, n)))
+            self._refuse(getattr(self, name) <= 0, f"{name} must be more than 0 mm, got {{{name}:g}}")
         self._refuse(
             self.pinhole_diameter >= self.detector_side,
-            lambda i: (
-                f"pinhole_diameter {self.pinhole_diameter[i]:g} mm must be less than detector_side "
-                f"{self.detector_side[i]:g} mm"
-            ),
+            "pinhole_diameter {pinhole_diameter:g} mm must be less than detector_side {detector_side:g} mm",
         )
         self._refuse(
-            b <= self.roi_radius,
-            lambda i: f"its pinhole is {b[i]:g} mm from the isocentre, inside the ROI of {self.roi_radius[i]:g} mm",
+            self.pinhole_distance <= self.roi_radius,
+            "its pinhole is {pinhole_distance:g} mm from the isocentre, inside the ROI of {roi_radius:g} mm",
         )
         for what, values in (("number", numbers[:, None]), ("pinhole centre", centers)):
             _, first, inverse = np.unique(values, axis=0, return_index=True, return_inverse=True)
-            repeated = first[inverse.reshape(-1)] != np.arange(n)
-            self._refuse(repeated, lambda i, what=what: f"another module has the same {what}")
+            self._refuse(first[inverse.reshape(-1)] != np.arange(n), f"another module has the same {what}")
 
-    def _set(self, name: str, array: NDArray) -> None:
-        object.__setattr__(self, name, freeze(array))
-
-    def _refuse(self, bad: NDArray[np.bool_], why) -> None:  # type: ignore[no-untyped-def]
+    def _refuse(self, bad: NDArray[np.bool_], message: str) -> None:
+        """Refuse the first module that is `bad`; `message` is a template of its dimensions."""
         if bad.any():
             i = int(np.argmax(bad))
-            raise InputError(f"module {self.numbers[i]}: {why(i)}")
+            own = {name: np.ravel(getattr(self, name))[i] for name in re.findall(r"{(\w+)", message)}
+            raise InputError(f"module {self.numbers[i]}: {message.format(**own)}")
 
     def __len__(self) -> int:
         return len(self.centers)
 
     def __getitem__(self, which: int | slice | NDArray) -> PinholeSystem:
-        """The modules `which` (an index from 0, a slice, or an array of indices or booleans), again as a system."""
+        """The modules `which` (an index from 0, a slice, or an array of indices or booleans) as a system."""
         index = np.atleast_1d(np.arange(len(self))[which])
         if len(index) == 0:
             raise InputError(f"no module chosen: there are {len(self)}")
@@ -117,7 +106,7 @@ class PinholeSystem:
         return principal_rays(self.centers)
 
     def frames(self) -> NDArray[np.float64]:
-        """Module frames (M, 3, 3), rows u, v, k (`core.frames.module_frames`)."""
+        """Module frames (M, 3, 3), rows u, v, k (see `core.geometry.frames.module_frames`)."""
         return module_frames(self.centers)
 
     def poses(self) -> NDArray[np.float64]:
@@ -125,7 +114,7 @@ class PinholeSystem:
         return module_poses(self.centers)
 
     def rings(self) -> NDArray[np.int64]:
-        """Ring (M,) of each module, counted from 0 along +z: pinholes at about one z form a ring."""
+        """Index (M,) of each module's ring, from 0 along +z. Pinholes at about the same z form a ring."""
         z = self.centers[:, 2]
         order = np.argsort(z, kind="stable")
         starts = np.diff(z[order], prepend=z[order[0]]) > _RING_GAP * self.detector_side[order]
@@ -143,9 +132,9 @@ class PinholeSystem:
     ) -> Views:
         """The modules' images as `Views`.
 
-        Both detectors see by the same rays, from the pinhole to the virtual detector's plane at
-        ``magnification * l`` in front of it: crystal point (-u, -v)/magnification is virtual pixel (u, v).
-        The real detector's image is that of the crystal's front face behind the pinhole, so it is point-inverted.
+        Both detectors use the same rays, from the pinhole to the virtual detector's plane at ``magnification * l`` in
+        front of it: the crystal point (-u, -v)/magnification and the virtual pixel (u, v) lie on the same ray. The real
+        detector is the crystal's front face behind the pinhole, so its image is point-inverted.
 
         Parameters
         ----------
@@ -156,30 +145,27 @@ class PinholeSystem:
         magnification
             Distance of the virtual detector in units of the collimator length l.
         pitch
-            Pixel size on that detector, mm: one number, or (pitch_u, pitch_v). Default: the crystal's whole side
-            is covered (Ld / n on the real, magnification * Ld / n on the virtual detector).
+            Pixel size on that detector, mm: one number, or (pitch_u, pitch_v). Default: the image covers the crystal
+            (Ld / n on the real, magnification * Ld / n on the virtual detector).
         offset
-            (x0, y0), mm along u and v, of the image's middle on that detector.
+            Place (x0, y0) of the image's middle on that detector, mm along u and v.
 
         Raises
         ------
         InputError
-            A shape, number or name is not as above.
+            A shape, number or name is not one of these.
         """
         n_v, n_u = whole_shape(shape, "image shape", 2)
         magnification = positive(magnification, "magnification")
         if detector not in ("virtual", "real"):
             raise InputError(f"detector {detector!r}: expected 'virtual' or 'real'")
-        # A length on the real detector spans -magnification times as much, inverted, on the virtual plane.
+        # A length on the real detector is -magnification times as long on the virtual one.
         to_virtual = 1.0 if detector == "virtual" else -magnification
         if pitch is None:
             side = abs(magnification / to_virtual) * self.detector_side[:, None]
             pitches = side / np.array([n_u, n_v])
         else:
-            both = real_array(np.broadcast_to(pitch, 2) if np.ndim(pitch) == 0 else pitch, "pixel pitch", (2,))
-            if np.any(both <= 0):
-                raise InputError(f"pixel pitch: expected more than 0 mm, got {both.min():g}")
-            pitches = np.broadcast_to(both, (len(self), 2))
+            pitches = np.broadcast_to(lengths(pitch, "pixel pitch", 2), (len(self), 2))
         x0, y0 = real_array(offset, "image offset", (2,)) * to_virtual
         u, v, k = self.frames().transpose(1, 0, 2)
         distance = magnification * self.collimator_length[:, None]

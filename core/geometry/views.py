@@ -1,4 +1,4 @@
-"""Views: what each camera's rays are, as sources, detector centres and pixel steps."""
+"""Views: the rays of each camera, as sources, detector centres and pixel steps."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from ..validation import freeze, real_array, whole_shape
 
 @dataclass(frozen=True, eq=False)
 class Views:
-    """M images of one shape: the cone_vec description (ASTRA's), in world mm.
+    """M images of one shape, described like ASTRA's cone_vec geometries, in world mm.
 
     Pixel (row i, column j) of view m has its centre at
     ``detector_centers[m] + (j - (n_u - 1)/2) u_steps[m] + (i - (n_v - 1)/2) v_steps[m]``; its ray runs from
@@ -62,9 +62,8 @@ class Views:
         return len(self.sources)
 
     def __getitem__(self, which: int | slice | NDArray[np.integer]) -> Views:
-        """The views `which` (an index, a slice or an array of indices), again as Views."""
-        index = np.arange(len(self))[which]
-        index = np.atleast_1d(index)
+        """The views `which` (an index, a slice or an array of indices) as Views."""
+        index = np.atleast_1d(np.arange(len(self))[which])
         return Views(
             self.sources[index], self.detector_centers[index], self.u_steps[index], self.v_steps[index], self.shape
         )
@@ -72,7 +71,7 @@ class Views:
     def rays(self, m: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Ends of view m's rays: sources and targets, each (n_v * n_u, 3) in mm, row by row.
 
-        The sources are one point, repeated (a read-only array without a copy).
+        All sources are the same point (a read-only view).
         """
         n_v, n_u = self.shape
         column = (np.arange(n_u) - (n_u - 1) / 2)[None, :, None]
@@ -83,8 +82,8 @@ class Views:
     def projection_matrices(self) -> NDArray[np.float64]:
         """Matrices (M, 3, 4) from homogeneous world points, mm, to ``(column, row, 1)`` times a factor.
 
-        Columns and rows are in pixels with 0 at the centre of pixel 0; the factor is the depth in units of the
-        distance from source to detector: 1 on the detector, positive on its side of the source.
+        Columns and rows are in pixels, 0 at the centre of pixel 0. The factor is the depth in units of the distance from
+        source to detector: 1 on the detector, positive on its side of the source.
         """
         n_v, n_u = self.shape
         from_detector = np.array([[1.0, 0.0, (n_u - 1) / 2], [0.0, 1.0, (n_v - 1) / 2], [0.0, 0.0, 1.0]])

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
+
+import numpy as np
 
 from ..physics.isotopes import WATER_MU
 from ..validation import whole_number
@@ -15,11 +17,10 @@ from .shapes import Cylinder, Shape
 
 @dataclass(frozen=True)
 class DefrisePhantom(Phantom):
-    """Hot disks in a cylinder of water, axis along z, centred on the origin.
+    """Hot disks in a cylinder of water along z, centred on the origin.
 
     After M. Defrise et al., "A solution to the long-object problem in helical cone-beam tomography", Physics in Medicine
-    and Biology 45 (2000) 623-643, and the disks used before that to test cone-beam reconstruction. By default it fills
-    a ball of 75 mm radius.
+    and Biology 45 (2000) 623-643. By default it fills a ball of 75 mm radius.
 
     Attributes
     ----------
@@ -28,7 +29,7 @@ class DefrisePhantom(Phantom):
     disk_radius, disk_thickness, spacing : float
         mm; the spacing is from middle to middle.
     margin : float
-        Of water around the disks, mm; 0 for disks alone.
+        Of water around the disks, mm; 0 for disks without water.
     activity, background : float
         Of the disks and of the water, kBq/mL.
     mu : float
@@ -38,7 +39,7 @@ class DefrisePhantom(Phantom):
     disks: int = count(7, "how many")
     disk_radius: float = setting(50.0, "mm", "of the disks")
     disk_thickness: float = setting(8.0, "mm", "of the disks")
-    spacing: float = setting(16.0, "mm", "from disk to disk, middle to middle")
+    spacing: float = setting(16.0, "mm", "from disk to disk, middle to middle", option="spacing-of-disks")
     margin: float = setting(5.0, "mm", "of water around the disks; 0 for none", 0.0)
     activity: float = setting(100.0, "kBq/mL", "of the disks", 0.0)
     background: float = setting(0.0, "kBq/mL", "of the water", 0.0)
@@ -50,9 +51,8 @@ class DefrisePhantom(Phantom):
         object.__setattr__(self, "disks", whole_number(self.disks, "Defrise phantom: disks"))
         super().__post_init__()
         if self.disks > 1:
-            require_at_most(
-                self.disk_thickness, self.spacing, f"{self.title}: disk thickness", "mm", "from disk to disk"
-            )
+            name = f"{self.title}: disk thickness"
+            require_at_most(self.disk_thickness, self.spacing, name, "from disk to disk")
 
     @cached_property
     def shapes(self) -> Sequence[Shape]:
@@ -62,16 +62,6 @@ class DefrisePhantom(Phantom):
         if self.margin:
             radius, height = self.disk_radius + self.margin, height + 2 * self.margin
             shapes.append(Cylinder(radius=radius, height=height, activity=self.background, mu=self.mu, name="water"))
-        for i in range(self.disks):
-            z = (i - (self.disks - 1) / 2) * self.spacing
-            shapes.append(
-                Cylinder(
-                    radius=self.disk_radius,
-                    height=self.disk_thickness,
-                    position=(0, 0, z),
-                    activity=self.activity,
-                    mu=self.mu,
-                    name=f"disk {i + 1}",
-                )
-            )
-        return shapes
+        disk = Cylinder(radius=self.disk_radius, height=self.disk_thickness, activity=self.activity, mu=self.mu)
+        heights = (np.arange(self.disks) - (self.disks - 1) / 2) * self.spacing
+        return shapes + [replace(disk, position=(0, 0, z), name=f"disk {i}") for i, z in enumerate(heights, 1)]

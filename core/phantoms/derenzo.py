@@ -1,12 +1,12 @@
-"""The Derenzo phantom: sectors of parallel rods, each sector of one diameter, alone or in a cylinder of water."""
+"""The Derenzo phantom: parallel rods, of one diameter in each sector, alone or in a cylinder of water."""
 
 from __future__ import annotations
 
-import math
 import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,9 +14,10 @@ from numpy.typing import NDArray
 from ..errors import InputError, InputWarning
 from ..physics.isotopes import WATER_MU
 from ..validation import freeze, positive, real_array
+from .intervals import Interval, Points, Real
 from .phantom import Phantom
 from .settings import setting
-from .shapes import Cylinder, Points, Real, Shape, Vector
+from .shapes import Cylinder, Shape, Vector
 from .surfaces import Surface, lathe
 
 SECTORS = 6
@@ -30,9 +31,9 @@ class DerenzoRods(Shape):
     """The rods of a Derenzo phantom, along z: a shape of many parts.
 
     A sector of rod diameter w has rows at ``0.1 R + sqrt(3) w n`` from the axis (n = 1, 2, ...); row n holds n rods
-    2 w apart, centred; ``n <= floor((R - 0.2 R - w) / (sqrt(3) w))``. Where one row at most would fit, the margins of
-    0.1 R are dropped and the rows counted again. Sector 0 runs along -y; sector k of S is turned by 360 k / S degrees,
-    counter-clockwise as seen from +z. Where S is above 6, a row holds the rods that its sector has room for.
+    2 w apart, centred; ``n <= floor((R - 0.2 R - w) / (sqrt(3) w))``. Where at most one row would fit, the margins of
+    0.1 R are dropped and the rows counted again. Sector 0 points along -y; sector k of S is turned by 360 k / S degrees,
+    counter-clockwise as seen from +z. With more than 6 sectors, a row holds as many rods as its sector has room for.
 
     Attributes
     ----------
@@ -54,8 +55,8 @@ class DerenzoRods(Shape):
     KIND = "derenzo_rods"
 
     def _check(self) -> None:
-        self._set("radius", positive(self.radius, "Derenzo radius", "mm"))
-        self._set("height", positive(self.height, "Derenzo height", "mm"))
+        for name in ("radius", "height"):
+            self._set(name, positive(getattr(self, name), f"Derenzo {name}", "mm"))
         if isinstance(self.sectors, bool) or not isinstance(self.sectors, int) or self.sectors < 2:
             raise InputError(f"Derenzo sectors: expected a whole number of at least 2, got {self.sectors!r}")
         diameters = real_array(self.rod_diameters, "Derenzo rod diameters", (None,))
@@ -78,14 +79,14 @@ class DerenzoRods(Shape):
             )
 
     def empty_sectors(self) -> list[float]:
-        """Diameters, mm, of the sectors into which none of their rods fits."""
-        return [w for w, (_, n) in zip(self._diameters, self._rows, strict=True) if w > 0 and n == 0]
+        """Diameters, mm, of the sectors that have no room for any of their rods."""
+        return [w for w, (_, n) in zip(self.rod_diameters, self._rows, strict=True) if w > 0 and n == 0]
 
     @cached_property
     def rods(self) -> NDArray[np.float64]:
         """Every rod as (sector, x, y, diameter), array (n_rods, 4), mm."""
         table = []
-        for sector, (w, (margin, rows)) in enumerate(zip(self._diameters, self._rows, strict=True)):
+        for sector, (w, (margin, rows)) in enumerate(zip(self.rod_diameters, self._rows, strict=True)):
             along, across = self._axes[sector]
             for n in range(1, rows + 1):
                 count = int(self._rods_in_row(np.array(float(n))))
@@ -100,38 +101,29 @@ class DerenzoRods(Shape):
 
     @property
     def n_parts(self) -> int:
-        """How many times at most a line may enter the shape: once for each rod."""
+        """As of `Shape`: one for each rod."""
         return len(self.rods)
 
     @property
     def finest(self) -> float:
-        """Size, mm, of the smallest part."""
+        """As of `Shape`."""
         return min(float(self.rods[:, 3].min()), self.height)
 
     @property
     def half_box(self) -> tuple[float, float, float]:
-        """Half the sides, mm."""
-        return self._reach, self._reach, self.height / 2
+        """As of `Shape`."""
+        return self._outermost, self._outermost, self.height / 2
 
     @property
-    def ball_radius(self) -> float:
-        """mm."""
-        return math.hypot(self._reach, self.height / 2)
-
-    @property
-    def _reach(self) -> float:
+    def _outermost(self) -> float:
         """Distance, mm, from the axis to the rods' farthest point."""
         return float(np.max(np.linalg.norm(self.rods[:, 1:3], axis=1) + self.rods[:, 3] / 2))
-
-    @property
-    def _diameters(self) -> tuple[float, ...]:
-        return self.rod_diameters
 
     @cached_property
     def _rows(self) -> list[tuple[float, int]]:
         """Margin, mm, and number of rows of each sector."""
         table = []
-        for w in self._diameters:
+        for w in self.rod_diameters:
             margin = _MARGIN * self.radius
             rows = _count_rows(self.radius, margin, w)
             if rows <= 1:
@@ -151,15 +143,15 @@ class DerenzoRods(Shape):
         return n if self.sectors <= SECTORS else np.floor(_ROW_STEP * np.tan(np.pi / self.sectors) * n + 1e-6)
 
     def _distance(self, points: Real) -> Real:
-        """Exact for points that are nearest to a rod of their own sector.
+        """Exact for points whose nearest rod lies in their own sector.
 
-        Rods keep a distance of 0.36 w or more from their sector's borders, so that the sign is always right, and a point
-        near a border gets a bound from it.
+        Rods stay 0.36 w or more away from their sector's borders: the sign is always right, and a point near a border gets
+        its bound from the border.
         """
         kind = points.dtype.type
         x, y, z = points
         margins, rows = (np.array(column, kind) for column in zip(*self._rows, strict=True))
-        diameters, axes = np.array(self._diameters, kind), self._axes.astype(kind)
+        diameters, axes = np.array(self.rod_diameters, kind), self._axes.astype(kind)
         turns = np.arctan2(y, x) * kind(self.sectors / (2 * np.pi)) + kind(self.sectors / 4 + 0.5)
         sector = np.floor(turns).astype(np.intp) % self.sectors
         w, margin, last = diameters[sector], margins[sector], np.maximum(rows, 1)[sector]
@@ -181,7 +173,7 @@ class DerenzoRods(Shape):
         distance = np.where(distance > 0, np.minimum(distance, border), distance)
         return np.maximum(distance, np.abs(z) - kind(self.height / 2))
 
-    def _intervals(self, starts: Points, directions: Points) -> tuple[Points, Points]:
+    def _intervals(self, starts: Points, directions: Points) -> Interval:
         parts = []
         for _, x, y, w in self.rods:
             rod = Cylinder(radius=w / 2, height=self.height, activity=0.0)
@@ -203,7 +195,7 @@ class DerenzoRods(Shape):
 
 @dataclass(frozen=True)
 class DerenzoPhantom(Phantom):
-    """Rods along z, in sectors of one rod diameter each, centred on the origin; see `DerenzoRods` for their places.
+    """Rods along z, centred on the origin, of one diameter in each sector; for their places see `DerenzoRods`.
 
     Attributes
     ----------
@@ -216,11 +208,11 @@ class DerenzoPhantom(Phantom):
     activity : float
         Activity concentration in the rods, kBq/mL; 0 for cold rods in active water.
     sectors : int
-        How many; 6 as its users know it.
+        How many; usually 6.
     cylinder_radius : float
-        Of a cylinder of water around the rods, mm; 0 for none, the rods being all there is.
+        Of a cylinder of water around the rods, mm; 0 for rods alone.
     cylinder_height : float
-        mm; 0 for the rods' own.
+        mm; 0 for the height of the rods.
     background : float
         Activity concentration in the water, kBq/mL.
     mu : float
@@ -245,43 +237,48 @@ class DerenzoPhantom(Phantom):
     title = "Derenzo phantom"
 
     def __post_init__(self) -> None:
-        set_ = object.__setattr__
-        for name, unit in (
-            ("cylinder_radius", "mm"),
-            ("cylinder_height", "mm"),
-            ("background", "kBq/mL"),
-            ("mu", "1/mm"),
-        ):
+        for name in ("activity", "cylinder_radius", "cylinder_height", "background", "mu"):
             value = float(real_array(getattr(self, name), f"Derenzo {name.replace('_', ' ')}", ()))
             if value < 0:
-                raise InputError(f"Derenzo {name.replace('_', ' ')}: expected 0 or more {unit}, got {value:g}")
-            set_(self, name, value)
-        activity = float(real_array(self.activity, "Derenzo activity", ()))
-        if activity < 0 or (activity == 0 and not (self.background and self.cylinder_radius)):
+                raise InputError(f"Derenzo {name.replace('_', ' ')}: expected 0 or more, got {value:g}")
+            object.__setattr__(self, name, value)
+        for name in ("radius", "rod_diameters", "height"):  # the rods check them
+            object.__setattr__(self, name, getattr(self._rods, name))
+        if self.activity == 0 and not (self.background and self.cylinder_radius):
             raise InputError(
-                f"Derenzo activity: expected more than 0 kBq/mL, or 0 in a cylinder with a background, got {activity:g}"
+                "Derenzo activity: expected more than 0 kBq/mL, or 0 in a cylinder with a background, got "
+                f"{self.activity:g}"
             )
-        rods = self._rods
-        for name in ("radius", "rod_diameters", "height", "activity"):
-            set_(self, name, getattr(rods, name))
-        empty = [f"{w:g}" for w in rods.empty_sectors()]
+        empty = [f"{w:g}" for w in self._rods.empty_sectors()]
         if empty:
             warnings.warn(
                 f"no rod of {', '.join(empty)} mm fits into a radius of {self.radius:g} mm: such sectors stay empty",
                 InputWarning,
                 stacklevel=3,
             )
-        self._water()  # checks it
+        if not self.cylinder_radius:
+            if self.background or self.cylinder_height:
+                raise InputError(
+                    "Derenzo cylinder radius: expected more than 0 mm around a background or with a height"
+                )
+        elif self.cylinder_radius < self.radius or self._water_height < self.height:
+            raise InputError(
+                f"Derenzo cylinder: expected a radius of {self.radius:g} mm and a height of {self.height:g} mm or more, "
+                f"got {self.cylinder_radius:g} and {self._water_height:g}"
+            )
 
     @cached_property
     def shapes(self) -> Sequence[Shape]:
         """The rods, over the water if there is any."""
-        return (*self._water(), self._rods)
+        if not self.cylinder_radius:
+            return (self._rods,)
+        content: dict[str, Any] = {"activity": self.background, "mu": self.mu, "name": "water"}
+        return (Cylinder(radius=self.cylinder_radius, height=self._water_height, **content), self._rods)
 
     @property
     def box(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """As of any phantom; the rods' is that of their `radius`, also where none of them reaches the rim."""
-        half = max(self.radius, self.cylinder_radius, self._rods.half_box[0])  # very thin ones reach beyond the rim
+        """As of any phantom; the rods' box is that of their `radius`, even if none of them reaches the rim."""
+        half = max(self.radius, self.cylinder_radius, self._rods.half_box[0])  # very thin rods reach beyond the rim
         corner = np.array([half, half, max(self.height, self.cylinder_height) / 2])
         return -corner, corner
 
@@ -296,22 +293,9 @@ class DerenzoPhantom(Phantom):
             activity=self.activity, mu=self.mu, name="rods",
         )  # fmt: skip
 
-    def _water(self) -> list[Shape]:
-        if not self.cylinder_radius:
-            if self.background or self.cylinder_height:
-                raise InputError(
-                    "Derenzo cylinder radius: expected more than 0 mm around a background or with a height"
-                )
-            return []
-        height = self.cylinder_height or self.height
-        if self.cylinder_radius < self.radius or height < self.height:
-            raise InputError(
-                f"Derenzo cylinder: expected a radius of {self.radius:g} mm and a height of {self.height:g} mm or more, "
-                f"got {self.cylinder_radius:g} and {height:g}"
-            )
-        return [
-            Cylinder(radius=self.cylinder_radius, height=height, activity=self.background, mu=self.mu, name="water")
-        ]
+    @property
+    def _water_height(self) -> float:
+        return self.cylinder_height or self.height
 
 
 def _count_rows(radius: float, margin: float, w: float) -> int:

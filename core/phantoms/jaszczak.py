@@ -8,8 +8,8 @@ from dataclasses import dataclass
 from functools import cached_property
 
 from ..physics.isotopes import WATER_MU
+from ..physics.materials import attenuation
 from .derenzo import DerenzoRods
-from .materials import PMMA_MU
 from .phantom import Phantom
 from .settings import require_apart, require_at_most, setting
 from .shapes import Cylinder, Shape, Sphere
@@ -17,13 +17,12 @@ from .shapes import Cylinder, Shape, Sphere
 
 @dataclass(frozen=True)
 class JaszczakPhantom(Phantom):
-    """The Jaszczak phantom (Deluxe, model ECT/DLX/P), axis along z, the origin in the middle of the cylinder.
+    """The Jaszczak phantom (Deluxe, model ECT/DLX/P) along z, the origin in the middle of the cylinder.
 
-    Dimensions as in Data Spectrum's data sheet: the cylinder's inside is 216 mm wide and 186 mm high; rods 88 mm high of
-    4.8, 6.4, 7.9, 9.5, 11.1, 12.7 mm in six sectors, their centres two diameters apart; spheres of 9.5, 12.7, 15.9, 19.1,
-    25.4, 31.8 mm with their centres 127 mm above the base. The rods stand on the base (-z) in the pattern of `DerenzoRods`.
-    The data sheet does not say how far the spheres are from the axis: half the radius here, 60 degrees apart, from -y on
-    counter-clockwise. The wall, 3.2 mm thick, is not modelled.
+    Dimensions are those of Data Spectrum's data sheet: a cylinder 216 mm wide and 186 mm high inside; rods in six sectors,
+    88 mm high, their centres two diameters apart; spheres with their centres 127 mm above the base. The rods stand on the
+    base (-z) in the pattern of `DerenzoRods`. The data sheet does not give the spheres' distance from the axis: here it is
+    half the radius, and they lie 60 degrees apart, counter-clockwise from -y. The wall, 3.2 mm thick, is not modelled.
 
     Attributes
     ----------
@@ -40,7 +39,7 @@ class JaszczakPhantom(Phantom):
     rod_activity, sphere_activity : float
         kBq/mL; 0 for cold ones.
     mu : float
-        Of the water, 1/mm. Cold rods and spheres are of PMMA, others of water.
+        Of the water, 1/mm. Cold rods and spheres are made of PMMA, others of water.
     """
 
     radius: float = setting(108.0, "mm", "of the cylinder, inside")
@@ -60,48 +59,40 @@ class JaszczakPhantom(Phantom):
     def __post_init__(self) -> None:
         super().__post_init__()
         if any(self.rod_diameters):
-            require_at_most(self.rod_height, self.height, f"{self.title}: rod height", "mm", "in the cylinder")
+            require_at_most(self.rod_height, self.height, f"{self.title}: rod height", "in the cylinder")
         if any(self.sphere_diameters):
             ring, height = self.sphere_ring_radius, self.sphere_height
-            require_at_most(ring, self.radius, f"{self.title}: sphere ring radius", "mm", "in the cylinder")
-            require_at_most(height, self.height, f"{self.title}: sphere height", "mm", "in the cylinder")
+            require_at_most(ring, self.radius, f"{self.title}: sphere ring radius", "in the cylinder")
+            require_at_most(height, self.height, f"{self.title}: sphere height", "in the cylinder")
             diameters, largest = f"{self.title}: sphere diameters", max(self.sphere_diameters)
-            require_at_most(largest, 2 * (self.radius - ring), diameters, "mm", f"at {ring:g} mm from the axis")
-            require_at_most(largest, 2 * height, diameters, "mm", f"at {height:g} mm above the base")
+            require_at_most(largest, 2 * (self.radius - ring), diameters, f"at {ring:g} mm from the axis")
+            require_at_most(largest, 2 * height, diameters, f"at {height:g} mm above the base")
             below = self.height - height
-            require_at_most(largest, 2 * below, diameters, "mm", f"at {below:g} mm below the top")
+            require_at_most(largest, 2 * below, diameters, f"at {below:g} mm below the top")
             require_apart(self.sphere_diameters, ring, diameters)
 
     @cached_property
     def shapes(self) -> Sequence[Shape]:
         """Water, rods, spheres."""
-        base = -self.height / 2
+        base, plastic = -self.height / 2, attenuation("PMMA", self.mu_energy)
         shapes: list[Shape] = [
             Cylinder(radius=self.radius, height=self.height, activity=self.activity, mu=self.mu, name="water")
         ]
         if any(self.rod_diameters):
-            shapes.append(
-                DerenzoRods(
-                    radius=self.radius,
-                    rod_diameters=self.rod_diameters,
-                    height=self.rod_height,
-                    position=(0, 0, base + self.rod_height / 2),
-                    name="rods",
-                    activity=self.rod_activity,
-                    mu=self.mu if self.rod_activity else PMMA_MU,
-                )
-            )
+            rods = DerenzoRods(
+                radius=self.radius, rod_diameters=self.rod_diameters, height=self.rod_height, name="rods",
+                position=(0, 0, base + self.rod_height / 2), activity=self.rod_activity,
+                mu=self.mu if self.rod_activity else plastic,
+            )  # fmt: skip
+            shapes.append(rods)
+        mu = self.mu if self.sphere_activity else plastic
         for i, diameter in enumerate(self.sphere_diameters):
             if diameter:
                 angle = math.radians(-90.0 + 60.0 * i)
                 x, y = self.sphere_ring_radius * math.cos(angle), self.sphere_ring_radius * math.sin(angle)
-                shapes.append(
-                    Sphere(
-                        radius=diameter / 2,
-                        position=(x, y, base + self.sphere_height),
-                        name=f"sphere {diameter:g} mm",
-                        activity=self.sphere_activity,
-                        mu=self.mu if self.sphere_activity else PMMA_MU,
-                    )
-                )
+                sphere = Sphere(
+                    radius=diameter / 2, position=(x, y, base + self.sphere_height), name=f"sphere {diameter:g} mm",
+                    activity=self.sphere_activity, mu=mu,
+                )  # fmt: skip
+                shapes.append(sphere)
         return shapes

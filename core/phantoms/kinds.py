@@ -1,4 +1,7 @@
-"""The kinds of phantoms that are made from a few numbers: one table for the command line and for Blender."""
+"""The kinds of phantoms, one line each; command line and Blender follow from this table and from the classes' fields.
+
+A new kind is a file with its dataclass, whose fields are made by `settings.setting`, `count` and `choice`, and a line here.
+"""
 
 from __future__ import annotations
 
@@ -23,28 +26,40 @@ class Kind(NamedTuple):
     name : str
         On the command line.
     phantom : type
-        Its class, a dataclass whose fields are made by `settings.setting`, `count` and `choice`.
+        Its class.
     label : str
         In menus.
     summary : str
-        What it is, for help.
+        One line of help.
+    example : str
+        Options of an example on the command line.
     usual : mapping
-        What scenes begin with where that is not the class's default.
+        Settings with which Blender begins where they differ from the class's defaults.
     """
 
     name: str
     phantom: Any
     label: str
     summary: str
+    example: str = ""
     usual: Mapping[str, float] = MappingProxyType({})
 
 
 KINDS = (
-    Kind("derenzo", DerenzoPhantom, "Derenzo", "a Derenzo phantom: six sectors of hot rods", {"activity": 100.0}),
-    Kind("nema", NemaBody, "NEMA Body", "the NEMA (IEC) body phantom: six spheres"),
-    Kind("jaszczak", JaszczakPhantom, "Jaszczak", "a Jaszczak phantom: rods and spheres"),
-    Kind("defrise", DefrisePhantom, "Defrise", "a Defrise phantom: hot disks"),
-    Kind("shepp-logan", SheppLogan, "Shepp-Logan Head", "the 3-D Shepp-Logan head"),
-    Kind("points", PointGrid, "Point Grid", "a grid of point sources"),
-    Kind("torso", CardiacTorso, "Cardiac Torso", "a cardiac torso"),
+    Kind(
+        "derenzo",
+        DerenzoPhantom,
+        "Derenzo",
+        "a Derenzo phantom: six sectors of hot rods",
+        "--rods 8 6 5 4 3 2",
+        {"activity": 100.0},
+    ),
+    Kind(
+        "nema", NemaBody, "NEMA Body", "the NEMA (IEC) body phantom: six spheres", "--sphere-activity 40 --voxels 200"
+    ),
+    Kind("jaszczak", JaszczakPhantom, "Jaszczak", "a Jaszczak phantom: rods and spheres", "--activity 50"),
+    Kind("defrise", DefrisePhantom, "Defrise", "a Defrise phantom: hot disks", "--disks 7 --spacing-of-disks 12"),
+    Kind("shepp-logan", SheppLogan, "Shepp-Logan Head", "the 3-D Shepp-Logan head", "--contrast original"),
+    Kind("points", PointGrid, "Point Grid", "a grid of point sources", "--counts 3 3 3 --spacing-of-points 30 30 30"),
+    Kind("torso", CardiacTorso, "Cardiac Torso", "a cardiac torso", "--defect-severity 0.5 --defect-angle-degrees 90"),
 )

@@ -13,7 +13,7 @@
     activity = 5                       # kBq/mL
     mu = 0.0154                        # 1/mm
 
-    [[shape]]                          # replaces what it covers; its mu is left out: the water's stays
+    [[shape]]                          # replaces what it covers; without a mu, the water's stays
     kind = "sphere"
     radius = 10
     position = [50, 0, 0]              # mm
@@ -25,6 +25,7 @@ Keys are the attributes of the shapes; angles are degrees, ``euler_degrees = [ph
 from __future__ import annotations
 
 import dataclasses
+import json
 import math
 import os
 import tomllib
@@ -39,7 +40,7 @@ from .derenzo import DerenzoRods
 from .phantom import Phantom, ShapePhantom
 from .shapes import Box, Capsule, Cone, Cylinder, Ellipsoid, Shape, Sphere
 
-KINDS: dict[str, type[Shape]] = {
+SHAPES: dict[str, type[Shape]] = {
     shape.KIND: shape for shape in (Box, Capsule, Cone, Cylinder, DerenzoRods, Ellipsoid, Sphere)
 }
 """The shapes by the names of their kinds."""
@@ -49,31 +50,25 @@ _EULER = "euler_degrees"
 
 
 def read_phantom(path: str | os.PathLike[str]) -> ShapePhantom:
-    """The phantom that a TOML file describes; see this module's text for an example.
+    """The phantom that a TOML file describes; for an example see `core.phantoms.language`.
 
     Raises
     ------
     InputError
-        The file cannot be read or is not TOML, or says something that cannot be: the message names file, shape and key.
+        The file cannot be read, is not TOML or has wrong entries; the message names file, shape and key.
     """
     path = Path(path)
     try:
         text = path.read_text(encoding="utf-8-sig")
     except UnicodeDecodeError:
         raise InputError(f"{path}: expected TOML, a text in UTF-8") from None
-    except (OSError, ValueError) as error:  # a path that cannot be is a ValueError
+    except (OSError, ValueError) as error:  # an impossible path is a ValueError
         raise InputError(f"{path}: {getattr(error, 'strerror', None) or error}") from None
     return parse_phantom(text, str(path))
 
 
 def parse_phantom(text: str, name: str = "phantom") -> ShapePhantom:
-    """The phantom that a text in TOML describes, see `read_phantom`; `name` is what messages call the text.
-
-    Raises
-    ------
-    InputError
-        The text is not TOML, or says something that cannot be: the message names shape and key.
-    """
+    """The phantom that a text in TOML describes, see `read_phantom`; messages call the text `name`."""
     try:
         return _phantom(tomllib.loads(text))
     except tomllib.TOMLDecodeError as error:
@@ -85,13 +80,7 @@ def parse_phantom(text: str, name: str = "phantom") -> ShapePhantom:
 
 
 def write_phantom(phantom: Phantom, path: str | os.PathLike[str]) -> None:
-    """Write the shapes of any phantom as a TOML file that `read_phantom` reads back to the same shapes.
-
-    Raises
-    ------
-    InputError
-        Not a phantom, the name does not end in .toml, or the file cannot be written.
-    """
+    """Write the shapes of any phantom as a .toml file; `read_phantom` gives the same shapes back."""
     if not isinstance(phantom, Phantom):
         raise InputError(f"write_phantom: expected a phantom, got {type(phantom).__name__}")
     path = Path(path)
@@ -117,30 +106,26 @@ def _phantom(table: dict[str, Any]) -> ShapePhantom:
     )
 
 
-def _shape(number: int, entries: dict[str, Any]) -> Shape:
-    name = entries.get("name", "")
-    where = f"shape {number}" + (f" {name!r}" if name else "")
+def _shape(number: int, given: dict[str, Any]) -> Shape:
     try:
-        entries = dict(entries)
+        entries = dict(given)
         kind = entries.pop("kind", None)
-        if not isinstance(kind, str) or kind not in KINDS:
-            raise InputError(f"kind: expected one of {', '.join(KINDS)}, got {kind!r}")
-        fields = [field for field in dataclasses.fields(KINDS[kind]) if field.init]
+        if not isinstance(kind, str) or kind not in SHAPES:
+            raise InputError(f"kind: expected one of {', '.join(SHAPES)}, got {kind!r}")
+        fields = [field for field in dataclasses.fields(SHAPES[kind]) if field.init]
         _refuse_unknown(entries, [_EULER if field.name == "euler" else field.name for field in fields])
         for field in fields:
             if field.default is dataclasses.MISSING and field.name not in entries:
                 raise InputError(f"{field.name}: missing; a {kind} needs one")
         if _EULER in entries:
-            entries["euler"] = _radians(entries.pop(_EULER))
-        return KINDS[kind](**entries)
+            angles = entries.pop(_EULER)
+            if not isinstance(angles, list) or not all(type(angle) in (int, float) for angle in angles):
+                raise InputError(f"{_EULER}: expected 3 numbers, got {angles!r}")
+            entries["euler"] = [math.radians(angle) for angle in angles]
+        return SHAPES[kind](**entries)
     except InputError as error:
-        raise InputError(f"{where}: {error}") from None
-
-
-def _radians(value: Any) -> Any:
-    if not isinstance(value, list) or not all(type(angle) in (int, float) for angle in value):
-        raise InputError(f"{_EULER}: expected 3 numbers, got {value!r}")
-    return [math.radians(angle) for angle in value]
+        name = given.get("name", "")
+        raise InputError(f"shape {number}{f' {name!r}' if name else ''}: {error}") from None
 
 
 def _refuse_unknown(table: dict[str, Any], known: Any) -> None:
@@ -156,7 +141,7 @@ def _has_boolean(value: Any) -> bool:
 
 
 def _entries(shape: Shape) -> dict[str, Any]:
-    """What was given to make the shape, less what is as by default."""
+    """The attributes that were given to make the shape and differ from the defaults."""
     entries = {}
     for field in dataclasses.fields(shape):
         value = getattr(shape, field.name)
@@ -168,7 +153,7 @@ def _entries(shape: Shape) -> dict[str, Any]:
 
 
 def _degrees(angle: float) -> float:
-    """Degrees that are read back as exactly `angle`, radians: conversions to and fro may differ in the last digit."""
+    """Degrees that convert back to exactly `angle`, radians; plain conversion may change the last digit."""
     degrees = math.degrees(angle)
     for candidate in (degrees, np.nextafter(degrees, np.inf), np.nextafter(degrees, -np.inf)):
         if math.radians(candidate) == angle:
@@ -179,9 +164,7 @@ def _degrees(angle: float) -> float:
 def _text(value: Any) -> str:
     """A value as TOML."""
     if isinstance(value, str):
-        # TOML's basic strings: JSON's escapes, but for DEL, which may not stand for itself.
-        import json
-
+        # TOML's basic strings have JSON's escapes, but DEL must be escaped, too.
         return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")
     if isinstance(value, tuple):
         return f"[{', '.join(map(_text, value))}]"

@@ -14,9 +14,9 @@ from .phantom import Phantom
 from .settings import require_apart, require_at_most, setting
 from .shapes import Box, Cylinder, Shape, Sphere
 
-# Inside, mm: the front is half a circle, the back a straight line between two quarters of circles.
+# Inside, mm: the front is a half circle, the back a straight line between two quarter circles.
 _FRONT_RADIUS, _BACK_RADIUS, _BACK_WIDTH = 147.0, 77.0, 140.0
-_CIRCLES_Y = -(_FRONT_RADIUS - _BACK_RADIUS) / 2  # of the circles' centres
+_CIRCLES_Y = -(_FRONT_RADIUS - _BACK_RADIUS) / 2  # of these circles' centres
 _RING_RADIUS = 57.2  # of the spheres' centres
 _TO_LID = 70.0  # from the spheres' plane
 _LUNG_DENSITY = 0.3  # g/cm^3
@@ -26,19 +26,19 @@ _LUNG_DENSITY = 0.3  # g/cm^3
 class NemaBody(Phantom):
     """The NEMA (IEC) body phantom: NEMA NU 2-2018 section 7, IEC 61675-1.
 
-    Its inside: half a circle of radius 147 mm in front (+y), two quarters of circles of radius 77 mm and a straight line
-    of 140 mm at the back, 180 mm long (phantoms that are sold are about 194 mm); spheres of 10, 13, 17, 22, 28,
-    37 mm around an insert of 50 mm that is filled with beads of 0.3 g/cm^3, on a circle of radius 57.2 mm, 70 mm from the
-    lid (+z). The 17 mm sphere lies towards +x, the others follow counter-clockwise by size, 60 degrees apart: in which
-    sense is not confirmed, OpenGATE's run clockwise. The origin is the middle of the spheres' circle; it lies halfway
-    between front and back, 35 mm in front of the circles' centres. Walls are not modelled.
+    The inside of the body is a half circle of radius 147 mm in front (+y), and two quarter circles of radius 77 mm with a
+    straight line of 140 mm between them at the back; it is 180 mm long (commercial phantoms: about 194 mm). An insert of
+    50 mm holds beads of 0.3 g/cm^3. The spheres lie around it, 70 mm from the lid (+z), on a circle of radius 57.2 mm: that
+    of 17 mm towards +x, the others counter-clockwise by size, 60 degrees apart. That sense is not confirmed; OpenGATE's run
+    clockwise. The origin is the middle of the spheres' circle, halfway between front and back, 35 mm in front of the
+    body's circles' centres. Walls are not modelled.
 
     Attributes
     ----------
     sphere_diameters : (6,)
         mm; 0 leaves one out.
     sphere_activity, background : float
-        kBq/mL; NU 2 asks for 4 to 1 (or 8 to 1) over 5.3 kBq/mL.
+        kBq/mL; NU 2 asks for a ratio of 4 (or 8) to 1 over a background of 5.3 kBq/mL.
     lung_diameter : float
         mm; 0 leaves the insert out.
     length : float
@@ -60,12 +60,12 @@ class NemaBody(Phantom):
         super().__post_init__()
         inside = f"{self.title}: sphere diameters"
         lung = self.lung_diameter
-        require_at_most(lung, 2 * _room(0.0, 0.0), f"{self.title}: lung diameter", "mm", "in the body")
+        require_at_most(lung, 2 * _room(0.0, 0.0), f"{self.title}: lung diameter", "in the body")
         for diameter, (x, y) in zip(self.sphere_diameters, _ring(), strict=True):
             if not diameter:
                 continue
-            require_at_most(diameter, 2 * _room(x, y), inside, "mm", "in the body")
-            require_at_most(diameter, 2 * _TO_LID, inside, "mm", "beneath the lid")
+            require_at_most(diameter, 2 * _room(x, y), inside, "in the body")
+            require_at_most(diameter, 2 * _TO_LID, inside, "beneath the lid")
             least = _TO_LID + diameter / 2
             if self.length < least * (1 - 1e-9):
                 raise InputError(
@@ -73,48 +73,30 @@ class NemaBody(Phantom):
                     f"got {self.length:g}"
                 )
             if lung:
-                require_at_most(diameter, 2 * _RING_RADIUS - lung, inside, "mm", f"beside a lung insert of {lung:g} mm")
+                require_at_most(diameter, 2 * _RING_RADIUS - lung, inside, f"beside a lung insert of {lung:g} mm")
         require_apart(self.sphere_diameters, _RING_RADIUS, inside)
 
     @cached_property
     def shapes(self) -> Sequence[Shape]:
         """Body, lung insert, spheres."""
-        z = _TO_LID - self.length / 2
-        y = _CIRCLES_Y
+        y, z, half = _CIRCLES_Y, _TO_LID - self.length / 2, _BACK_WIDTH / 2
         water: dict[str, Any] = {"activity": self.background, "mu": self.mu}
-        half = _BACK_WIDTH / 2
-        # The box reaches into the half circle: no seam between them.
+        tube: dict[str, Any] = {"height": self.length, **water}
         shapes: list[Shape] = [
-            Cylinder(
-                radius=_FRONT_RADIUS, height=self.length, position=(0, y, z), cut=[(0, -1, 0, 0)], name="front", **water
-            ),
-            *(
-                Cylinder(radius=_BACK_RADIUS, height=self.length, position=(x, y, z), name=f"{side} back", **water)
-                for x, side in ((-half, "left"), (half, "right"))
-            ),
+            Cylinder(radius=_FRONT_RADIUS, position=(0, y, z), cut=[(0, -1, 0, 0)], name="front", **tube),
+            Cylinder(radius=_BACK_RADIUS, position=(-half, y, z), name="left back", **tube),
+            Cylinder(radius=_BACK_RADIUS, position=(half, y, z), name="right back", **tube),
+            # The box reaches into the half circle, so that there is no seam between them.
             Box(size=(_BACK_WIDTH, 2 * _BACK_RADIUS, self.length), position=(0, y, z), name="back", **water),
         ]
         if self.lung_diameter:
-            shapes.append(
-                Cylinder(
-                    radius=self.lung_diameter / 2,
-                    height=self.length,
-                    position=(0, 0, z),
-                    activity=0.0,
-                    mu=_LUNG_DENSITY * self.mu,
-                    name="lung insert",
-                )
-            )
+            lung: dict[str, Any] = {"activity": 0.0, "mu": _LUNG_DENSITY * self.mu, "name": "lung insert"}
+            shapes.append(Cylinder(radius=self.lung_diameter / 2, height=self.length, position=(0, 0, z), **lung))
         for diameter, (x, y) in zip(self.sphere_diameters, _ring(), strict=True):
             if diameter:
+                holds: dict[str, Any] = {"activity": self.sphere_activity, "mu": self.mu}
                 shapes.append(
-                    Sphere(
-                        radius=diameter / 2,
-                        activity=self.sphere_activity,
-                        mu=self.mu,
-                        name=f"sphere {diameter:g} mm",
-                        position=(x, y, 0.0),
-                    )
+                    Sphere(radius=diameter / 2, position=(x, y, 0.0), name=f"sphere {diameter:g} mm", **holds)
                 )
         return shapes
 
@@ -126,7 +108,7 @@ def _ring() -> list[tuple[float, float]]:
 
 
 def _room(x: float, y: float) -> float:
-    """Distance, mm, from a point inside to the body's outline."""
+    """Distance, mm, from a point inside the body to its outline."""
     x, y = abs(x), y - _CIRCLES_Y
     front = math.hypot(x, y) if y > 0 else x
     aside, behind = x - _BACK_WIDTH / 2, -y

@@ -1,16 +1,15 @@
 """Shapes painted one over the other: the mean over each voxel, the values at points, the integrals along lines.
 
-Painting layer i changes what layers 0 to i - 1 have left only inside its shape. So a voxel's mean is the sum over the
-layers of the mean of that change, and each layer can be sampled as finely as its own size asks.
+Each shape changes what the shapes before it left only inside itself. A voxel's mean is therefore the sum, over the
+shapes, of the mean of that change, and each shape is sampled as finely as its own size asks.
 """
 
 from __future__ import annotations
 
-import math
 import os
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
 
@@ -20,25 +19,22 @@ from numpy.typing import NDArray
 from ..geometry.grid import Grid
 from ..memory import require
 from ..progress import Progress
-from .sequences import r3_sequence
 from .shapes import Shape
 
 Points = NDArray[np.float64]
 Floats = NDArray[np.float32]
 
-# Points of one call of a shape's `distance`: small enough that its temporaries stay in the processor's cache.
+# Points of one call of a shape's `distance`: few enough that its temporaries stay in the processor's cache.
 _BLOCK = 1 << 15
 _MIN_SAMPLES, _MAX_SAMPLES = 128, 1 << 13  # of a voxel that a surface cuts
-_SEQUENCE = 1 << 16  # points of which voxels take stretches by turns, so that their errors differ and cancel
-# Over what is not uniform, few voxels get more samples: about so many altogether.
+_SEQUENCE = 1 << 16  # points that voxels take their samples from, each another stretch, so that their errors cancel
+# Over several values beneath, few voxels get more samples: about so many altogether.
 _SAMPLES_OF_MIXED = 1 << 21
-# In boxes of up to so many voxels a shape's samples are weighed so that they make up exactly what it changes.
-_WEIGHED = 1 << 22
-# Shapes whose smallest part is below a voxel, and that touch `_FEW` or fewer, are sampled in their own box.
+# A shape with parts smaller than a voxel that touches at most `_FEW` voxels is sampled in its own box.
 _FEW = 1 << 11
 _SAMPLES_OF_FEW = 1 << 10  # per voxel
-_BOX_BLOCK = 1 << 13  # of them at a time
-_SAMPLES_BENEATH = 1 << 18
+_BOX_BLOCK = 1 << 13  # points at a time
+_SAMPLES_OF_OVERLAP = 1 << 18
 _RAYS, _PARTS = 1 << 14, 256  # at a time; fewer rays where a shape has more parts
 
 
@@ -62,7 +58,7 @@ class Layer:
 
     @property
     def adds(self) -> bool:
-        """Whether the value is added to what is beneath, and does not replace it."""
+        """Whether the value is added to what is beneath instead of replacing it."""
         return self.shape.mode == "add"
 
     @cached_property
@@ -75,17 +71,78 @@ class Layer:
         """mm^3 in the world."""
         return self.shape.volume * abs(float(np.linalg.det(self.pose[:3, :3])))
 
+    def contains(self, points: Points) -> NDArray[np.bool_]:
+        """Which of the world `points` (3, N), mm, lie inside."""
+        return self.shape.distance(_moved(self.from_world, points)) < 0
+
     def over(self, values: NDArray[Any]) -> NDArray[Any]:
-        """What the shape makes of the values beneath it."""
+        """The values after painting this layer over `values`."""
         value = values.dtype.type(self.value)
         return values + value if self.adds else np.full_like(values, value)
 
     def relation(self, other: Layer) -> int:
-        """1 where the shape surely covers all of the other's, -1 where they surely do not touch, 0 else."""
+        """1 if the shape certainly contains the other's, -1 if they certainly do not touch, 0 otherwise."""
         from_other = self.from_world @ other.pose
-        reach = other.shape.ball_radius * float(np.linalg.norm(from_other[:3, :3], 2))
+        radius = other.shape.ball_radius * float(np.linalg.norm(from_other[:3, :3], 2))
         distance = float(self.shape.distance(from_other[:3, 3:])[0])
-        return 1 if distance < -reach else -1 if distance > reach else 0
+        return 1 if distance < -radius else -1 if distance > radius else 0
+
+
+def values_at(layers: Sequence[Layer], points: Points) -> Points:
+    """The painting's values (N,) at world `points` (3, N), mm."""
+    values = np.zeros(points.shape[1])
+    for layer in layers:
+        values = np.where(layer.contains(points), layer.over(values), values)
+    return values
+
+
+def points_inside(layer: Layer) -> Iterator[Points]:
+    """World points (3, n) that fill a layer's shape evenly, block by block."""
+    for first in range(0, _SAMPLES_OF_OVERLAP, _BOX_BLOCK):
+        yield _moved(layer.pose, _shape_points(layer.shape, first))
+
+
+def mean_changes(layers: Sequence[Layer]) -> list[float]:
+    """By how much painting each layer changes, on average over its shape, what the layers beneath it left there.
+
+    The overlap of two layers is counted at points of the smaller one. Errors are therefore small beside the content of
+    either, and nothing remains of a layer that is covered completely.
+    """
+    changes = [layer.value for layer in layers]
+    for number, layer in enumerate(layers):
+        for other, share in _overlaps(layers, number).items():
+            upper, lower = max(number, other), min(number, other)
+            changes[upper] -= share * layer.volume * layers[lower].value / layers[upper].volume
+    return changes
+
+
+def _overlaps(layers: Sequence[Layer], number: int) -> dict[int, float]:
+    """Shares of one layer's volume: for each larger layer above, what it is the first to cover; for each larger layer
+    beneath, what this layer covers of it as the first.
+    """
+    layer = layers[number]
+    relations = {k: other.relation(layer) for k, other in enumerate(layers) if k != number}
+    above = [k for k, relation in relations.items() if k > number and relation >= 0 and not layers[k].adds]
+    beneath = [k for k, relation in relations.items() if k < number and relation >= 0 and not layer.adds][::-1]
+    larger = [k for k in (*above, *beneath) if (layers[k].volume, k) > (layer.volume, number)]
+    counted = {k: 0 for k in larger if layers[min(k, number)].value}
+    if not counted:
+        return {}
+    sampled = any(relations[k] == 0 for k in (*above, *beneath))
+    hits = 0
+    for points in points_inside(layer):
+        hits += points.shape[1]
+        for order in (above, beneath):
+            free = points
+            for k in order:
+                inside = np.ones(free.shape[1], bool) if relations[k] else layers[k].contains(free)
+                if k in counted:
+                    counted[k] += int(np.count_nonzero(inside))
+                if not layers[k].adds:
+                    free = free[:, ~inside]
+        if hits and not sampled:  # any points tell
+            break
+    return {k: count / max(hits, 1) for k, count in counted.items()}
 
 
 def _seen_beneath(layers: Sequence[Layer]) -> list[list[Layer]]:
@@ -106,95 +163,14 @@ def _seen_beneath(layers: Sequence[Layer]) -> list[list[Layer]]:
     return result
 
 
-def values_at(layers: Sequence[Layer], points: Points) -> Points:
-    """What was painted at world `points` (3, N), mm: (N,)."""
-    values = np.zeros(points.shape[1])
-    for layer in layers:
-        inside = layer.shape.distance(_moved(layer.from_world, points)) < 0
-        values = np.where(inside, layer.over(values), values)
-    return values
-
-
-def integral(layers: Sequence[Layer], replaced: Sequence[float]) -> float:
-    """Value times mm^3 of the whole painting; `replaced` as of `means_beneath`."""
-    return sum(layer.volume * (layer.value - mean) for layer, mean in zip(layers, replaced, strict=True))
-
-
-def means_beneath(layers: Sequence[Layer]) -> list[float]:
-    """For each layer the mean of what its shape replaces, wherever the painting lies: exact where it is uniform.
-
-    What two layers have in common is counted at points of the smaller: so errors are small beside the content of either,
-    and of a layer that is covered whole nothing stays.
-    """
-    beneath = _seen_beneath(layers)
-    over: dict[Layer, list[Layer]] = {layer: [] for layer in layers}
-    means = {}
-    for layer, seen in zip(layers, beneath, strict=True):
-        for lower in seen:
-            over[lower].append(layer)
-        means[layer] = _mean_inside(
-            layer, [_emptied(lower) if lower.volume < layer.volume else lower for lower in seen]
-        )
-    for lower, later in over.items():
-        for layer, share in _shares_covered_by_larger(lower, later).items():
-            means[layer] += share * lower.value * lower.volume / layer.volume
-    return list(means.values())
-
-
-def _emptied(layer: Layer) -> Layer:
-    return replace(layer, value=0.0)
-
-
-def _is_uniform(layer: Layer, beneath: Sequence[Layer]) -> bool:
-    """Whether all that a layer's shape replaces surely has one value."""
-    return not beneath or (len(beneath) == 1 and beneath[0].relation(layer) == 1)
-
-
-def _mean_inside(layer: Layer, beneath: Sequence[Layer]) -> float:
-    """The mean of what is painted beneath a layer's shape."""
-    if not any(lower.value for lower in beneath):
-        return 0.0
-    if _is_uniform(layer, beneath):
-        return beneath[0].value
-    total, hits = 0.0, 0
-    for inside in points_inside(layer):
-        total += float(values_at(beneath, inside).sum())
-        hits += inside.shape[1]
-    return total / max(hits, 1)
-
-
-def _shares_covered_by_larger(layer: Layer, over: Sequence[Layer]) -> dict[Layer, float]:
-    """Of the layers over one, those larger than it, with the share of its shape that they are the first to cover."""
-    larger = [other for other in over if other.volume > layer.volume]
-    if not larger or not layer.value:
-        return {}
-    if larger[0] is over[0] and larger[0].relation(layer) == 1:
-        return {larger[0]: 1.0}
-    covered, hits = dict.fromkeys(over, 0), 0
-    for free in points_inside(layer):
-        hits += free.shape[1]
-        for other in over:
-            within = other.shape.distance(_moved(other.from_world, free)) < 0
-            covered[other] += int(np.count_nonzero(within))
-            free = free[:, ~within]
-    return {other: covered[other] / max(hits, 1) for other in larger}
-
-
-def points_inside(layer: Layer) -> Iterator[Points]:
-    """Points of the world (3, n) that fill a layer's shape evenly, in blocks."""
-    for first in range(0, _SAMPLES_BENEATH, _BOX_BLOCK):
-        points = _box_points(layer.shape, first)
-        yield _moved(layer.pose, points[:, layer.shape.distance(points) < 0])
-
-
 def paint_voxels(
-    grid: Grid, layers: Sequence[Layer], replaced: Sequence[float], progress: Progress | None = None
+    grid: Grid, layers: Sequence[Layer], changes: Sequence[float], progress: Progress | None = None
 ) -> Floats:
     """The mean of the painting over each voxel, float32 array of the grid's shape.
 
-    Voxels farther from a surface than their own half diagonal are all in or all out; the others are sampled at the
-    points of a low-discrepancy sequence, which weigh so much that what the shape changes comes out. The points of a
-    shape that is small beside the voxels fill the shape instead.
+    A voxel farther from a surface than its own half diagonal lies inside or outside as a whole. Of the others, the share
+    that a shape covers is counted at points of a low-discrepancy sequence; the shares are then corrected so that the total
+    change is the known one. For a shape that is small beside the voxels, the points fill the shape instead.
 
     Parameters
     ----------
@@ -202,17 +178,14 @@ def paint_voxels(
         Where the voxels are.
     layers
         From bottom to top.
-    replaced
-        As of `means_beneath`.
+    changes
+        Those of `mean_changes`.
     progress
         Called as ``progress(done, total)``.
     """
-    require(4.2 * grid.n_voxels, "a volume of {} x {} x {} voxels".format(*grid.shape))
+    require(5.0 * grid.n_voxels, "a volume of {} x {} x {} voxels".format(*grid.shape))
     image = np.zeros(grid.shape, np.float32)
-    strokes = [
-        _Stroke(grid, layer, beneath, layer.value - mean)
-        for layer, beneath, mean in zip(layers, _seen_beneath(layers), replaced, strict=True)
-    ]
+    strokes = [_Stroke(grid, *each) for each in zip(layers, _seen_beneath(layers), changes, strict=True)]
     total, done = sum(stroke.steps for stroke in strokes), 0
     with ThreadPoolExecutor(os.cpu_count()) as pool:
         for stroke in strokes:
@@ -224,12 +197,161 @@ def paint_voxels(
                     except BaseException:
                         pool.shutdown(wait=False, cancel_futures=True)
                         raise
-    # What is painted with different samples may miss by a little what it shall replace.
+    # Where layers were sampled at different points, one may replace a little more than there was.
     values = [layer.value for layer in layers]
     if min(values, default=0.0) >= 0:
         highest = None if any(layer.adds for layer in layers) else max(values, default=0.0)
         np.clip(image, 0.0, highest, out=image)
     return image
+
+
+class _Stroke:
+    """Painting one layer over those beneath it."""
+
+    def __init__(self, grid: Grid, layer: Layer, beneath: Sequence[Layer], mean_change: float) -> None:
+        self.grid, self.layer, self.beneath, self.mean_change = grid, layer, beneath, mean_change
+        shape, shape_from_index = layer.shape, layer.from_world @ grid.affine
+        low, high = _index_box(shape_from_index, shape)
+        # Clipped as floats: a far-away box must not overflow the integers.
+        self.start = np.clip(np.floor(low + 0.5), 0, grid.shape).astype(np.int64)
+        self.stop = np.clip(np.floor(high + 0.5) + 1, self.start, grid.shape).astype(np.int64)
+        self.in_grid = bool(np.all(low >= -0.5) and np.all(high <= np.array(grid.shape) - 0.5))
+        self.in_voxels = shape.volume / abs(float(np.linalg.det(shape_from_index[:3, :3])))  # the shape's volume
+        edge = float(np.linalg.norm(shape_from_index[:3, :3], axis=0).max())
+        touched = float(np.prod(2 * np.array(shape.half_box) / edge + 1))
+        self.is_small = shape.finest < edge and touched < _FEW
+        # What the shape covers is mixed unless one layer surely lies beneath all of it.
+        is_mixed = len(beneath) > 1 or (len(beneath) == 1 and beneath[0].relation(layer) != 1)
+        if self.is_small:
+            points = _SAMPLES_OF_FEW * max(touched, 8.0)
+            if is_mixed:
+                points = max(points, min(8 * points, _SAMPLES_OF_MIXED))
+            self.n_blocks = int(np.ceil(points / _BOX_BLOCK))
+        else:
+            samples = 4 * _MIN_SAMPLES * edge / shape.finest
+            if is_mixed:
+                samples = max(samples, _SAMPLES_OF_MIXED / touched)
+            if not self.in_grid:
+                # No known total corrects the shares c. With n samples their errors are about n^(-2/3) / 2. A surface below
+                # 6 V / s, s being the smallest part, cuts some 9 V / (s h^2) voxels of h^3: this n keeps the sum of
+                # their random errors below 1/5000 of V.
+                samples = max(samples, (7500 * edge**2 / float(np.sqrt(shape.finest * shape.volume))) ** 1.5)
+            self.n_samples = int(np.clip(samples, _MIN_SAMPLES, _MAX_SAMPLES))
+
+    @property
+    def steps(self) -> int:
+        """How many times `paint` yields."""
+        if np.any(self.stop <= self.start):
+            return 0
+        return self.n_blocks if self.is_small else int(self.stop[0] - self.start[0])
+
+    def paint(self, image: Floats, pool: ThreadPoolExecutor) -> Iterator[None]:
+        """Change `image`, step by step."""
+        if not self.steps:
+            return iter(())
+        box = image[tuple(map(slice, self.start, self.stop))]
+        return self._paint_small(box, pool) if self.is_small else self._paint_voxels(box, pool)
+
+    def _paint_small(self, box: Floats, pool: ThreadPoolExecutor) -> Iterator[None]:
+        """Points of the shape, each with an equal share of its volume, are added to the voxels that they fall into."""
+        total, hits = np.zeros(box.shape), 0
+        index_from_shape = np.linalg.inv(self.grid.affine) @ self.layer.pose
+
+        def sample(block: int) -> tuple[NDArray[np.int64], Points]:
+            points = _shape_points(self.layer.shape, block * _BOX_BLOCK)
+            change = self.layer.value - values_at(self.beneath, _moved(self.layer.pose, points))
+            return np.rint(_moved(index_from_shape, points)).astype(np.int64), change
+
+        for index, change in pool.map(sample, range(self.n_blocks)):
+            hits += len(change)
+            index -= self.start[:, None]
+            held = np.all((index >= 0) & (index < np.array(total.shape)[:, None]), axis=0)
+            np.add.at(total, tuple(index[:, held]), change[held])
+            yield
+        box += total * (self.in_voxels / max(hits, 1))
+
+    def _paint_voxels(self, box: Floats, pool: ThreadPoolExecutor) -> Iterator[None]:
+        """Voxels inside the shape are filled; those that its surface cuts are sampled."""
+        stretches = max(1, _SEQUENCE // self.n_samples)
+        offsets = (_r3_sequence(stretches * self.n_samples) - 0.5).reshape(3, stretches, self.n_samples)
+        own, *lower = (_Sampled(layer, self.grid, offsets) for layer in (self.layer, *self.beneath))
+
+        def fill(slab: int) -> tuple[float, list[tuple[NDArray[np.int64], Floats, Floats]]]:
+            of_whole, cuts, values = 0.0, [], box[slab].ravel()
+            for first in range(0, values.size, _BLOCK):
+                number = slab * values.size + np.arange(first, min(first + _BLOCK, values.size))
+                index = np.stack(np.unravel_index(number, box.shape)) + self.start[:, None]
+                whole, cut = own.sort(index)
+                block = values[first : first + _BLOCK]
+                painted = self.layer.over(block[whole])
+                of_whole += float(np.sum(painted - block[whole], dtype=np.float64))
+                block[whole] = painted
+                cuts.append((number[cut], *_coverage(index[:, cut], own, lower)))
+            box[slab] = values.reshape(box[slab].shape)
+            return of_whole, cuts
+
+        missing, cuts = self.mean_change * self.in_voxels, []
+        for of_whole, of_slab in pool.map(fill, range(len(box))):
+            missing -= of_whole
+            cuts += of_slab
+            yield
+        cut, coverage, change = map(np.concatenate, zip(*cuts, strict=True))
+        if self.in_grid:
+            # What is missing goes to where the shares c are uncertain, as c (1 - c): so they stay between 0 and 1.
+            missing -= float(change.sum(dtype=np.float64))
+            uncertain = float(np.sum(np.abs(change) * (1 - coverage), dtype=np.float64))
+            factor = 1 + np.float32(missing / uncertain if uncertain else 0.0) * np.sign(change) * (1 - coverage)
+            change *= np.clip(factor, 0, 1 / np.maximum(coverage, np.float32(1e-6)))
+        box[np.unravel_index(cut, box.shape)] += change
+
+
+class _Sampled:
+    """A layer's shape and sample points of voxels."""
+
+    def __init__(self, layer: Layer, grid: Grid, offsets: Points) -> None:
+        """Of points at `offsets` (3, stretches, n), in voxels, from the voxels' centres."""
+        shape_from_index = layer.from_world @ grid.affine
+        self.layer = layer
+        self._linear, self._origin = shape_from_index[:3, :3], shape_from_index[:3, 3:]
+        self.n_samples = offsets.shape[2]
+        self._offsets = np.tensordot(self._linear, offsets, 1).astype(np.float32)
+        # The distance of a voxel's farthest corner from its centre, over the four diagonals of a parallelepiped.
+        signs = np.array([[1, 1, 1], [1, 1, -1], [1, -1, 1], [-1, 1, 1]])
+        self._half_diagonal = 0.5 * np.linalg.norm(signs @ self._linear.T, axis=1).max() * (1 + 1e-5)
+
+    def sort(self, index: NDArray[np.int64]) -> tuple[NDArray[np.bool_], NDArray[np.int64]]:
+        """Which voxels (3, n) are inside, (n,), and the numbers of those that the surface may cut."""
+        distance = self.layer.shape.distance(self._centers(index))
+        return distance < -self._half_diagonal, np.flatnonzero(np.abs(distance) <= self._half_diagonal)
+
+    def inside(self, index: NDArray[np.int64]) -> NDArray[np.bool_]:
+        """Which points of voxels (3, n) are inside, (n, samples)."""
+        # The factors are primes that seldom divide the number of stretches: neighbours along any axis take different ones.
+        stretch = (np.array([1, 53, 211]) @ index) % self._offsets.shape[1]
+        points = self._centers(index)[:, :, None] + self._offsets[:, stretch]
+        return (self.layer.shape.distance(points.reshape(3, -1)) < 0).reshape(points.shape[1:])
+
+    def _centers(self, index: NDArray[np.int64]) -> Floats:
+        return (self._linear @ index + self._origin).astype(np.float32)
+
+
+def _coverage(index: NDArray[np.int64], own: _Sampled, lower: Sequence[_Sampled]) -> tuple[Floats, Floats]:
+    """For voxels (3, n): the share that the shape covers, and the change of the mean that painting it makes."""
+    coverage, change = np.empty((2, index.shape[1]), np.float32)
+    step = max(1, _BLOCK // own.n_samples)
+    for first in range(0, index.shape[1], step):
+        some = slice(first, first + step)
+        inside = own.inside(index[:, some])
+        beneath = np.zeros(inside.shape, np.float32)
+        for layer in lower:
+            filled, crossed = layer.sort(index[:, some])
+            beneath[filled] = layer.layer.over(beneath[filled])
+            if len(crossed):
+                within = layer.inside(index[:, some][:, crossed])
+                beneath[crossed] = np.where(within, layer.layer.over(beneath[crossed]), beneath[crossed])
+        coverage[some] = inside.mean(axis=1)
+        change[some] = np.where(inside, np.float32(own.layer.value) - beneath, 0).mean(axis=1)
+    return coverage, change
 
 
 def line_integrals(layers: Sequence[Layer], starts: Points, ends: Points) -> Points:
@@ -287,195 +409,33 @@ def _next_power_of_2(counts: NDArray[np.int64]) -> NDArray[np.int64]:
     return np.where(counts > 0, 1 << np.ceil(np.log2(np.maximum(counts, 1))).astype(np.int64), 0)
 
 
-class _Stroke:
-    """What painting a layer over those beneath it does to an image."""
-
-    def __init__(self, grid: Grid, layer: Layer, beneath: Sequence[Layer], mean_change: float) -> None:
-        self.grid, self.layer, self.beneath, self.mean_change = grid, layer, beneath, mean_change
-        shape_from_index = self.layer.from_world @ grid.affine
-        shape = self.layer.shape
-        low, high = _index_box(shape_from_index, shape)
-        # Clipped as floats: a far-away box must not overflow the integers.
-        self.start = np.clip(np.floor(low + 0.5), 0, grid.shape).astype(np.int64)
-        self.stop = np.clip(np.floor(high + 0.5) + 1, self.start, grid.shape).astype(np.int64)
-        self.voxel_volume = abs(float(np.linalg.det(shape_from_index[:3, :3])))
-        self.edge = float(np.linalg.norm(shape_from_index[:3, :3], axis=0).max())
-        self.touched = float(np.prod(2 * np.array(shape.half_box) / self.edge + 1))
-        self.is_small = shape.finest < self.edge and self.touched < _FEW
-        inside = bool(np.all(low >= -0.5) and np.all(high <= np.array(grid.shape) - 0.5))
-        # Whether it matters which part of the shape a voxel holds.
-        self.is_mixed = not _is_uniform(layer, beneath)
-        self.is_weighed = inside and bool(np.prod(self.stop - self.start) <= _WEIGHED)
-
-    @property
-    def steps(self) -> int:
-        """How many times `paint` yields."""
-        if np.any(self.stop <= self.start):
-            return 0
-        return self._n_blocks if self.is_small else int(self.stop[0] - self.start[0])
-
-    def paint(self, image: Floats, pool: ThreadPoolExecutor) -> Iterator[None]:
-        """Change `image`, step by step."""
-        if not self.steps:
-            return iter(())
-        return self._paint_small(image, pool) if self.is_small else self._paint_voxels(image, pool)
-
-    @property
-    def _n_blocks(self) -> int:
-        """Of points of a small shape."""
-        points = _SAMPLES_OF_FEW * max(self.touched, 8.0)
-        if self.is_mixed:
-            points = max(points, min(8 * points, _SAMPLES_OF_MIXED))
-        return math.ceil(points / _BOX_BLOCK)
-
-    def _paint_small(self, image: Floats, pool: ThreadPoolExecutor) -> Iterator[None]:
-        """Points of the shape, each weighing an equal share of its volume, into the voxels that they fall in."""
-        box = tuple(map(slice, self.start, self.stop))
-        total, hits = np.zeros(image[box].shape), 0
-        index_from_shape = np.linalg.inv(self.grid.affine) @ self.layer.pose
-
-        def sample(block: int) -> tuple[NDArray[np.int64], Points]:
-            points = _box_points(self.layer.shape, block * _BOX_BLOCK)
-            inside = points[:, self.layer.shape.distance(points) < 0]
-            change = self.layer.value - values_at(self.beneath, _moved(self.layer.pose, inside))
-            return np.rint(_moved(index_from_shape, inside)).astype(np.int64), change
-
-        for index, change in pool.map(sample, range(self._n_blocks)):
-            hits += len(change)
-            index -= self.start[:, None]
-            held = np.all((index >= 0) & (index < np.array(total.shape)[:, None]), axis=0)
-            np.add.at(total, tuple(index[:, held]), change[held])
-            yield
-        image[box] += total * (self.layer.shape.volume / self.voxel_volume / max(hits, 1))
-
-    def _paint_voxels(self, image: Floats, pool: ThreadPoolExecutor) -> Iterator[None]:
-        """Points of the voxels that the shape's surface cuts, slab by slab."""
-        rows, columns = map(slice, self.start[1:], self.stop[1:])
-        iy, iz = np.mgrid[rows, columns]
-        n_samples = self._n_samples
-        stretches = max(1, _SEQUENCE // n_samples)
-        offsets = (r3_sequence(stretches * n_samples) - 0.5).reshape(3, stretches, n_samples)
-        own, *lower = (_Sampled(layer, self.grid, offsets) for layer in (self.layer, *self.beneath))
-
-        def fill(ix: int) -> tuple[float, NDArray[np.int64], Floats, Floats]:
-            slab = image[ix, rows, columns]
-            values = slab.ravel()
-            index = np.stack([np.full(iy.size, ix), iy.ravel(), iz.ravel()])
-            parts, of_whole = [], 0.0
-            for first in range(0, len(values), _BLOCK):
-                block = slice(first, first + _BLOCK)
-                whole, cut, coverage, change = _changes(index[:, block], own, lower)
-                painted = np.where(whole, own.layer.over(values[block]), values[block])
-                of_whole += float(np.sum(painted - values[block], dtype=np.float64))
-                values[block] = painted
-                parts.append((first + cut, coverage, change))
-            cut, coverage, change = map(np.concatenate, zip(*parts, strict=True))
-            if not self.is_weighed:
-                values[cut] += change
-            slab[...] = values.reshape(slab.shape)
-            return of_whole, cut, coverage, change
-
-        kept, missing, unsure = [], self.mean_change * self.layer.shape.volume / self.voxel_volume, 0.0
-        for ix, (whole, cut, coverage, change) in enumerate(
-            pool.map(fill, range(self.start[0], self.stop[0])), self.start[0]
-        ):
-            if self.is_weighed:
-                kept.append((ix, cut, coverage, change))
-                missing -= whole + float(change.sum(dtype=np.float64))
-                unsure += float(np.sum(np.abs(change) * (1 - coverage), dtype=np.float64))
-            yield
-        # What is missing goes to where the shares c are unsure, as c (1 - c): they stay between 0 and 1.
-        weight = np.float32(missing / unsure if unsure else 0.0)
-        for ix, cut, coverage, change in kept:
-            factor = 1 + weight * np.sign(change) * (1 - coverage)
-            factor = np.clip(factor, 0, 1 / np.maximum(coverage, np.float32(1e-6)))
-            image[ix, iy.ravel()[cut], iz.ravel()[cut]] += change * factor
-
-    @property
-    def _n_samples(self) -> int:
-        shape = self.layer.shape
-        for_each = 4 * _MIN_SAMPLES * self.edge / shape.finest
-        if self.is_mixed:
-            for_each = max(for_each, _SAMPLES_OF_MIXED / self.touched)
-        # Where samples are not weighed: the error of a cut voxel is about n^(-2/3) / 2 of its volume h^3. With a surface
-        # below 6 V / s, s being the smallest part, some 9 V / (s h^2) voxels are cut, whose errors add up at random: so
-        # many samples keep their sum below 1/5000 of V.
-        for_sum = 0.0 if self.is_weighed else (7500 * self.edge**2 / np.sqrt(shape.finest * shape.volume)) ** 1.5
-        return int(np.clip(max(for_sum, for_each), _MIN_SAMPLES, _MAX_SAMPLES))
+def _shape_points(shape: Shape, first: int) -> Points:
+    """Points (3, n) of a shape, in its frame: those of a block that fills its box, from number `first` on."""
+    points = (_r3_sequence(_BOX_BLOCK, first) - 0.5) * (2 * np.array(shape.half_box)[:, None])
+    return points[:, shape.distance(points) < 0]
 
 
-class _Sampled:
-    """A layer's shape, asked about voxels and about points in them."""
+def _r3_sequence(n: int, first: int = 0) -> Points:
+    """`n` points of the unit cube from number `first` on, (3, n).
 
-    def __init__(self, layer: Layer, grid: Grid, offsets: Points) -> None:
-        """Of points at `offsets` (3, stretches, n), in voxels, from the voxels' centres."""
-        shape_from_index = layer.from_world @ grid.affine
-        self.layer = layer
-        self._linear, self._origin = shape_from_index[:3, :3], shape_from_index[:3, 3:]
-        self.n_samples = offsets.shape[2]
-        self._offsets = np.tensordot(self._linear, offsets, 1).astype(np.float32)
-        # A voxel's farthest corner from its centre, over the four diagonals of a parallelepiped.
-        signs = np.array([[1, 1, 1], [1, 1, -1], [1, -1, 1], [-1, 1, 1]])
-        self._half_diagonal = 0.5 * np.linalg.norm(signs @ self._linear.T, axis=1).max() * (1 + 1e-5)
-
-    def sort(self, index: NDArray[np.int64]) -> tuple[NDArray[np.bool_], NDArray[np.int64]]:
-        """Which voxels (3, n) are inside, (n,), and the numbers of those that the surface may cut."""
-        distance = self.layer.shape.distance(self._centers(index))
-        return distance < -self._half_diagonal, np.flatnonzero(np.abs(distance) <= self._half_diagonal)
-
-    def inside(self, index: NDArray[np.int64]) -> NDArray[np.bool_]:
-        """Which points of voxels (3, n) are inside, (n, samples)."""
-        # Along each axis the voxels go through all stretches, whose number these primes seldom divide.
-        stretch = (np.array([1, 53, 211]) @ index) % self._offsets.shape[1]
-        points = self._centers(index)[:, :, None] + self._offsets[:, stretch]
-        return (self.layer.shape.distance(points.reshape(3, -1)) < 0).reshape(points.shape[1:])
-
-    def _centers(self, index: NDArray[np.int64]) -> Floats:
-        return (self._linear @ index + self._origin).astype(np.float32)
-
-
-def _changes(
-    index: NDArray[np.int64], own: _Sampled, lower: Sequence[_Sampled]
-) -> tuple[NDArray[np.bool_], NDArray[np.int64], Floats, Floats]:
-    """What painting one layer more does to voxels (3, n).
-
-    Which of them are inside, (n,); the numbers of those that the surface cuts, and of these the share that is inside
-    and by how much the mean changes.
+    M. Roberts' R3, a low-discrepancy (Kronecker) sequence of the generalised golden ratio: any stretch of it is the
+    first one, shifted, and two consecutive stretches fill the cube as evenly as one of twice the length.
     """
-    whole, cut = own.sort(index)
-    coverage, change = np.empty(len(cut), np.float32), np.empty(len(cut), np.float32)
-    step = max(1, _BLOCK // own.n_samples)
-    for first in range(0, len(cut), step):
-        some = slice(first, first + step)
-        at = index[:, cut[some]]
-        inside = own.inside(at)
-        beneath = np.zeros(inside.shape, np.float32)
-        for layer in lower:
-            filled, crossed = layer.sort(at)
-            beneath[filled] = layer.layer.over(beneath[filled])
-            if len(crossed):
-                within = layer.inside(at[:, crossed])
-                beneath[crossed] = np.where(within, layer.layer.over(beneath[crossed]), beneath[crossed])
-        coverage[some] = inside.mean(axis=1)
-        change[some] = np.where(inside, np.float32(own.layer.value) - beneath, 0).mean(axis=1)
-    return whole, cut, coverage, change
-
-
-def _box_points(shape: Shape, first: int) -> Points:
-    """A block of points (3, n), from number `first` on, that fill the box around a shape, in its frame."""
-    return (r3_sequence(_BOX_BLOCK, first) - 0.5) * (2 * np.array(shape.half_box)[:, None])
+    ratio = 1.2207440846057596  # the real root of x^4 = x + 1
+    steps = ratio ** -np.arange(1.0, 4.0)
+    return (0.5 + np.outer(steps, np.arange(first + 1, first + n + 1))) % 1.0
 
 
 def _moved(pose: Points, points: Points) -> Points:
-    """`points` (3, N) by a pose (4, 4)."""
+    """`points` (3, N) transformed by a pose (4, 4)."""
     return pose[:3, :3] @ points + pose[:3, 3:]
 
 
 def _index_box(shape_from_index: Points, shape: Shape) -> tuple[Points, Points]:
-    """Lowest and highest index (3,) of any of a shape's points, or beyond."""
+    """Lower and upper bounds (3,) of the indices of a shape's points."""
     index_from_shape = np.linalg.inv(shape_from_index)
     linear, middle = index_from_shape[:3, :3], index_from_shape[:3, 3]
     of_box = np.abs(linear) @ np.array(shape.half_box)
     of_ball = np.linalg.norm(linear, axis=1) * shape.ball_radius
-    reach = np.minimum(of_box, of_ball)
-    return middle - reach, middle + reach
+    half = np.minimum(of_box, of_ball)
+    return middle - half, middle + half

@@ -1,4 +1,4 @@
-"""Phantoms: what all of them can do, and those that are a list of shapes."""
+"""Phantoms: what all kinds have in common, and those given as a list of shapes."""
 
 from __future__ import annotations
 
@@ -19,31 +19,30 @@ from ..geometry.grid import Grid
 from ..geometry.views import Views
 from ..memory import require
 from ..progress import Progress
-from ..projector.tracing import points as as_points
 from ..validation import freeze, positive, real_array
 from ..volumes.volume import UNITS, Volume
-from .painting import Layer, integral, line_integrals, means_beneath, paint_voxels, points_inside, values_at
+from .painting import Layer, line_integrals, mean_changes, paint_voxels, points_inside, values_at
 from .settings import check_settings
 from .shapes import Shape
 
 QUANTITIES = ("activity", "mu")
 _ENDS = ((-1.0, 1.0),) * 3
-_HELD = 0.98  # of a phantom: with less of it on the grid, the user is told
+_HELD = 0.98  # with a smaller fraction of the phantom on the grid, a warning is given
 
 
 class PhantomMesh(NamedTuple):
-    """One shape of a phantom for the scene.
+    """One shape of a phantom as a mesh.
 
     Attributes
     ----------
     name : str
-        Of the shape.
+        The shape's name.
     vertices : array (V, 3)
         mm, in the phantom's frame.
     faces : array (F, 3)
         Triangles, counter-clockwise as seen from outside; the mesh is closed.
     activity, mu : float or None
-        What the shape holds, kBq/mL and 1/mm.
+        The shape's content, kBq/mL and 1/mm.
     """
 
     name: str
@@ -54,11 +53,11 @@ class PhantomMesh(NamedTuple):
 
 
 class Phantom:
-    """What can be voxelised and seen along lines, exactly: shapes, painted one over the other.
+    """Shapes painted one over the other, with exact line integrals, voxels on any grid, and meshes.
 
-    Its frame has its origin at the phantom's middle; `pose` is world-from-phantom (4, 4), mm (default: where it is), any
-    invertible affine, see `euler_pose`. The `quantity` is ``"activity"`` (kBq/mL) or ``"mu"`` (1/mm, at `mu_energy`).
-    A kind of phantom says what its `shapes` are; all else follows.
+    The frame's origin is the phantom's middle; `pose` is world-from-phantom (4, 4), mm, any invertible affine (default:
+    identity), see `euler_pose`. The `quantity` is ``"activity"`` (kBq/mL) or ``"mu"`` (1/mm, at `mu_energy`).
+    A kind of phantom defines its `shapes`; everything else follows.
     """
 
     mu_energy: float = 140.5
@@ -66,11 +65,11 @@ class Phantom:
 
     @property
     def shapes(self) -> Sequence[Shape]:
-        """What the phantom consists of, from bottom to top."""
+        """The shapes, from bottom to top."""
         raise NotImplementedError
 
     title: str = "phantom"
-    """What to call it."""
+    """The phantom's name in messages."""
 
     def __post_init__(self) -> None:
         check_settings(self, self.title)
@@ -80,7 +79,7 @@ class Phantom:
             raise InputError(f"{self.title}: {error}") from None
 
     def _require_no_negative_sums(self) -> None:
-        """Raise `InputError` if a shape that takes something away leaves less than nothing, as seen at points of it."""
+        """Raise `InputError` if a shape with a negative value makes the sum negative at one of its points."""
         for quantity in QUANTITIES:
             layers = self._layers(quantity)
             largest = max((abs(layer.value) for layer in layers), default=0.0)
@@ -102,22 +101,21 @@ class Phantom:
     def total_activity(self) -> float:
         """Activity of the whole phantom, kBq.
 
-        From the shapes' volumes. Where one covers a part of another and not all of it, that part is counted at points
-        (to about 1/1000 of the smaller's content).
+        From the shapes' volumes. Partial overlaps are counted at points (to about 1/1000 of the smaller shape's content).
         """
         return self._total("activity") * 1e-3  # kBq/mL times mm^3
 
     @property
     def extent(self) -> float:
-        """Diameter, mm, of a ball around the origin that holds the phantom: a grid that holds it however it is turned."""
+        """Diameter, mm, of a ball around the origin that contains the phantom, however it is turned."""
         return 2 * max(math.hypot(*shape.position) + shape.ball_radius for shape in self.shapes)
 
     @cached_property
     def box(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Opposite corners, mm, of a box along the axes of the phantom's own frame that holds it."""
+        """Opposite corners, mm, of a box along the axes of the phantom's own frame that contains it."""
         low, high = np.full(3, np.inf), np.full(3, -np.inf)
         for shape in self.shapes:
-            # A cut may leave little of a shape: its polyhedron, a hair smaller than the shape, says how much.
+            # A cut may leave little of a shape: its polyhedron, slightly smaller than the shape, shows how much.
             corners = shape.surface()[0] if shape.cut else np.array(list(itertools.product(*_ENDS))) * shape.half_box
             points = corners @ shape.pose[:3, :3].T + shape.pose[:3, 3]
             low, high = np.minimum(low, points.min(axis=0)), np.maximum(high, points.max(axis=0))
@@ -126,12 +124,12 @@ class Phantom:
     def voxelize(
         self, grid: Grid, pose: ArrayLike | None = None, progress: Progress | None = None, quantity: str = "activity"
     ) -> Volume:
-        """The phantom as a volume on `grid`, anti-aliased: a voxel holds its mean.
+        """The phantom as a volume on `grid`; a voxel holds the mean over its volume.
 
         Parameters
         ----------
         grid
-            Any grid; what lies outside it is cut off.
+            Any grid; parts outside it are cut off.
         pose
             World-from-phantom (4, 4), mm.
         progress
@@ -146,7 +144,7 @@ class Phantom:
         """
         if not isinstance(grid, Grid):
             raise InputError(f"voxelize: expected a Grid, got {type(grid).__name__}")
-        image = paint_voxels(grid, self._layers(quantity, pose), self._replaced(quantity), progress)
+        image = paint_voxels(grid, self._layers(quantity, pose), self._changes(quantity), progress)
         whole = self._total(quantity) * (1.0 if pose is None else abs(float(np.linalg.det(np.asarray(pose)[:3, :3]))))
         held = float(image.sum(dtype=np.float64)) * grid.voxel_volume / whole if whole > 0 else 1.0
         if held < _HELD:
@@ -165,9 +163,9 @@ class Phantom:
         Parameters
         ----------
         sources, targets
-            Ends of the lines, each (N, 3), or (3,) for all lines the same; world mm.
+            Ends of the lines, (N, 3) each, or (3,) for one that all lines share; world mm.
         pose, quantity
-            As of `voxelize`.
+            As for `voxelize`.
 
         Returns
         -------
@@ -177,24 +175,24 @@ class Phantom:
         Raises
         ------
         InputError
-            The points' shapes do not fit, or a number is not finite; as of `voxelize`.
+            The numbers of points do not match, or a coordinate is not finite; as for `voxelize`.
         """
         layers = self._layers(quantity, pose)
-        starts, ends = as_points(sources, "sources"), as_points(targets, "targets")
+        starts, ends = _points(sources, "sources"), _points(targets, "targets")
         if len(starts) != len(ends) and 1 not in (len(starts), len(ends)):
             raise InputError(f"line_integrals: {len(starts)} sources but {len(ends)} targets")
         starts, ends = np.broadcast_arrays(starts, ends)
         return line_integrals(layers, starts, ends)
 
     def project(self, views: Views, pose: ArrayLike | None = None, quantity: str = "activity") -> NDArray[np.float32]:
-        """Line integrals through the pixels' centres of all views, exact: images (M, n_v, n_u), value x mm.
+        """Exact line integrals to the pixels' centres of all views: images (M, n_v, n_u), value x mm.
 
-        What `Projector` with `Transmission` approaches as voxels get smaller.
+        `Projector` with `Transmission` converges to them as voxels get smaller.
 
         Raises
         ------
         InputError
-            No views, or the images do not fit into memory; as of `voxelize`.
+            No views, or the images do not fit into memory; as for `voxelize`.
         """
         if not isinstance(views, Views):
             raise InputError(f"project: expected Views, got {type(views).__name__}")
@@ -207,11 +205,11 @@ class Phantom:
     def values(
         self, points: ArrayLike, pose: ArrayLike | None = None, quantity: str = "activity"
     ) -> NDArray[np.float64]:
-        """The values (N,) at world `points` (N, 3), mm."""
+        """Values (N,) at world `points` (N, 3), mm."""
         return values_at(self._layers(quantity, pose), real_array(points, "points", (None, 3)).T)
 
     def meshes(self) -> list[PhantomMesh]:
-        """A closed mesh of every shape, in the phantom's frame, from bottom to top; round surfaces are polyhedra."""
+        """A closed mesh of every shape, in the phantom's frame, from bottom to top; round surfaces become polyhedra."""
         meshes = []
         for i, shape in enumerate(self.shapes, 1):
             vertices, faces = shape.surface()
@@ -222,20 +220,21 @@ class Phantom:
 
     def _total(self, quantity: str) -> float:
         """The value times mm^3 of the whole phantom."""
-        return integral(self._layers(quantity), self._replaced(quantity))
+        layers = self._layers(quantity)
+        return sum(x.volume * change for x, change in zip(layers, self._changes(quantity), strict=True))
 
-    def _replaced(self, quantity: str) -> list[float]:
-        """For each layer the mean of what it replaces."""
-        if quantity not in self._means:
-            self._means[quantity] = means_beneath(self._layers(quantity))
-        return self._means[quantity]
+    def _changes(self, quantity: str) -> list[float]:
+        """`mean_changes` of the shapes that hold the quantity; any pose leaves them as they are."""
+        if quantity not in self._known_changes:
+            self._known_changes[quantity] = mean_changes(self._layers(quantity))
+        return self._known_changes[quantity]
 
     @cached_property
-    def _means(self) -> dict[str, list[float]]:
+    def _known_changes(self) -> dict[str, list[float]]:
         return {}
 
     def _layers(self, quantity: str, pose: ArrayLike | None = None) -> list[Layer]:
-        """Every shape that holds the quantity, in the world."""
+        """The shapes that have the quantity, placed in the world."""
         if quantity not in QUANTITIES:
             raise InputError(f"quantity {quantity!r}: expected one of {', '.join(QUANTITIES)}")
         world = np.eye(4) if pose is None else checked_affine(pose, "phantom pose")
@@ -246,23 +245,29 @@ class Phantom:
         ]
 
 
+def _points(value: ArrayLike, name: str) -> NDArray[np.float64]:
+    """One point (3,) or many (N, 3) as an array (N, 3)."""
+    array = real_array(value, name, None)
+    return real_array(array[None] if array.ndim == 1 else array, name, (None, 3))
+
+
 @dataclass(frozen=True)
 class ShapePhantom(Phantom):
-    """A phantom that is a list of shapes, in the order of painting: later ones replace what is beneath them.
+    """A phantom given as a list of shapes, in the order of painting: later ones replace what is beneath them.
 
     Attributes
     ----------
     shapes : tuple of Shape
         From bottom to top.
     name : str
-        What to call it.
+        The phantom's name.
     mu_energy : float
         Energy, keV, at which mu holds.
 
     Raises
     ------
     InputError
-        No shapes, or something else among them.
+        There are no shapes, or something else is among them.
 
     Examples
     --------

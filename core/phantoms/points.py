@@ -5,8 +5,10 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
+
+import numpy as np
 
 from ..errors import InputError
 from ..validation import whole_shape
@@ -19,7 +21,7 @@ _MOST = 10_000
 
 @dataclass(frozen=True)
 class PointGrid(Phantom):
-    """Small equal balls on a lattice centred on the origin, in air.
+    """Equal small balls on a lattice centred on the origin, in air.
 
     Attributes
     ----------
@@ -28,13 +30,15 @@ class PointGrid(Phantom):
     spacing : (3,)
         mm, from point to point.
     diameter : float
-        Of a point, mm. On voxels of any size each point holds its whole activity.
+        Of a point, mm. Each point holds its whole activity on voxels of any size.
     point_activity : float
         Of each point, kBq.
     """
 
     counts: tuple[int, int, int] = count((5, 5, 5), "how many along x y z")
-    spacing: tuple[float, float, float] = setting((20.0, 20.0, 20.0), "mm", "from point to point along x y z")
+    spacing: tuple[float, float, float] = setting(
+        (20.0, 20.0, 20.0), "mm", "from point to point along x y z", option="spacing-of-points"
+    )
     diameter: float = setting(1.0, "mm", "of a point")
     point_activity: float = setting(100.0, "kBq", "of each point")
 
@@ -48,21 +52,15 @@ class PointGrid(Phantom):
         super().__post_init__()
         apart = [step for step, n in zip(self.spacing, counts, strict=True) if n > 1]
         if apart:
-            require_at_most(self.diameter, min(apart), f"{self.title}: diameter", "mm", "from point to point")
+            require_at_most(self.diameter, min(apart), f"{self.title}: diameter", "from point to point")
 
     @cached_property
     def shapes(self) -> Sequence[Shape]:
         """The balls, the last index running fastest."""
         radius = self.diameter / 2
-        concentration = self.point_activity / (4e-3 / 3 * math.pi * radius**3)  # mm^3 to mL
+        ball = Sphere(radius=radius, activity=self.point_activity / (4e-3 / 3 * math.pi * radius**3))  # mm^3 to mL
+        middle, spacing = (np.array(self.counts) - 1) / 2, np.array(self.spacing)
         return [
-            Sphere(
-                radius=radius,
-                activity=concentration,
-                name="point " + " ".join(map(str, index)),
-                position=[
-                    (i - (n - 1) / 2) * step for i, n, step in zip(index, self.counts, self.spacing, strict=True)
-                ],
-            )
+            replace(ball, position=(index - middle) * spacing, name="point " + " ".join(map(str, index)))
             for index in itertools.product(*map(range, self.counts))
         ]

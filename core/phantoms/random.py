@@ -1,4 +1,4 @@
-"""Phantoms thrown at random, as training sets want them."""
+"""Random poses, for training sets."""
 
 from __future__ import annotations
 
@@ -13,15 +13,15 @@ from ..validation import real_array
 def random_pose(
     seed: int | np.random.Generator, box: ArrayLike = (0.0, 0.0, 0.0), center: ArrayLike = (0.0, 0.0, 0.0)
 ) -> NDArray[np.float64]:
-    """A pose at random: the middle uniform in a box, the three Euler angles uniform, as the scanner's users draw them.
+    """A random pose: the middle uniform in a box, each Euler angle of `euler_pose` uniform between 0 and 360 degrees.
 
-    phi, theta and psi of `euler_pose` are uniform between 0 and 360 degrees each. (That is not the uniform distribution
-    of rotations, which would have cos(theta) uniform: a phantom's axis points along +z or -z more often.)
+    This is not the uniform distribution of rotations, for which cos(theta) would be uniform: a phantom's axis points along
+    +z or -z more often.
 
     Parameters
     ----------
     seed
-        A whole number, the same pose each time; or a generator, the next pose each time.
+        A whole number gives the same pose each time, a generator the next one.
     box
         Sides of the box (3,), mm, or one for all.
     center
@@ -31,11 +31,6 @@ def random_pose(
     -------
     array (4, 4)
         World-from-phantom.
-
-    Raises
-    ------
-    InputError
-        No such seed, a number is not finite, or a side is negative.
 
     Examples
     --------

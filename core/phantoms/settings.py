@@ -1,4 +1,4 @@
-"""Numbers that a kind of phantom is made from: their defaults, units and checks, said once."""
+"""Settings of a kind of phantom: the fields of its dataclass with their units, help and checks."""
 
 from __future__ import annotations
 
@@ -14,40 +14,44 @@ from ..errors import InputError
 from ..validation import real_array
 
 
-def setting(default: float | tuple[float, ...], unit: str, text: str, least: float | None = None) -> Any:
-    """A field of a phantom's dataclass: a number, or as many as `default` has.
+def setting(
+    default: float | tuple[float, ...], unit: str, text: str, least: float | None = None, option: str = ""
+) -> Any:
+    """A field of a phantom's dataclass: one number, or as many as `default` has.
 
     Parameters
     ----------
     default
         The default.
     unit
-        For messages and help.
+        For messages and help; a fraction's says what it is a fraction of (``"of the wall"``).
     text
         One line of help.
     least
         The smallest value; None for anything above 0.
+    option
+        On the command line, where that is not the field's name.
     """
-    return dataclasses.field(default=default, metadata={"unit": unit, "text": text, "least": least})
+    return dataclasses.field(default=default, metadata={"unit": unit, "text": text, "least": least, "option": option})
 
 
 def count(default: int | tuple[int, ...], text: str) -> Any:
-    """A field of a phantom's dataclass: a whole number of 1 or more, or as many as `default` has; its class checks it."""
+    """A field of a phantom's dataclass: a whole number of at least 1, or several; the class checks it."""
     return dataclasses.field(default=default, metadata={"text": text})
 
 
 def choice(default: str, choices: tuple[str, ...], text: str) -> Any:
-    """A field of a phantom's dataclass: one word of several; its class checks it."""
+    """A field of a phantom's dataclass: one of several words; the class checks it."""
     return dataclasses.field(default=default, metadata={"choices": choices, "text": text})
 
 
 def check_settings(phantom: Any, title: str) -> None:
-    """Check every `setting` of a phantom and turn it into a float, or a tuple of floats.
+    """Check every `setting` of a phantom and turn it into a float or a tuple of floats.
 
     Raises
     ------
     InputError
-        A setting is not as many finite numbers as its default, or too small.
+        A setting has the wrong number of values, one that is not finite, or one that is too small.
     """
     fields: tuple[Any, ...] = dataclasses.fields(phantom)
     for field in fields:
@@ -63,24 +67,14 @@ def check_settings(phantom: Any, title: str) -> None:
         object.__setattr__(phantom, field.name, tuple(numbers.tolist()) if shape else float(numbers))
 
 
-def require_at_most(value: float, most: float, name: str, unit: str, where: str = "") -> None:
-    """Raise `InputError` if `value` is above `most`, by more than rounding; `where` says what sets the limit."""
+def require_at_most(value: float, most: float, name: str, where: str) -> None:
+    """Raise `InputError` if `value` exceeds `most`, mm, by more than rounding; `where` says what sets the limit."""
     if value > most + 1e-9 * abs(most):
-        raise InputError(f"{name}: expected at most {max(most, 0):.6g} {unit}{where and ' ' + where}, got {value:.6g}")
+        raise InputError(f"{name}: expected at most {max(most, 0):.6g} mm {where}, got {value:.6g}")
 
 
 def require_apart(diameters: Sequence[float], ring_radius: float, name: str) -> None:
-    """Raise `InputError` if spheres overlap whose centres divide a circle evenly; diameters of 0 stand for none.
-
-    Parameters
-    ----------
-    diameters
-        In their order around the circle, mm.
-    ring_radius
-        Of the circle, mm.
-    name
-        Of the diameters, for the message.
-    """
+    """Raise `InputError` if spheres, mm, overlap whose centres divide a circle evenly; a diameter of 0 is no sphere."""
     for (i, first), (j, second) in itertools.combinations(enumerate(diameters), 2):
         apart = 2 * ring_radius * math.sin(math.pi * (j - i) / len(diameters))
         if first and second and first + second > 2 * apart * (1 + 1e-9):

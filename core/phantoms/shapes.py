@@ -1,7 +1,7 @@
-"""Solid shapes, placed, with what they hold: the words of which phantoms are made.
+"""Solid shapes with a place and a content: what phantoms are made of.
 
-A shape lies in a frame of its own, centred on its origin with its axis along z; `pose` places it. Shapes are convex
-unless they say otherwise: a line enters and leaves them once.
+A shape lies in its own frame, centred on the origin with its axis along z; `pose` places it. Shapes are convex unless they
+say otherwise: a line enters and leaves them once.
 """
 
 from __future__ import annotations
@@ -12,35 +12,33 @@ from functools import cached_property
 from typing import Any, ClassVar
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..errors import InputError
 from ..geometry.frames import euler_pose
 from ..validation import positive, real_array
+from .intervals import Interval, Points, Real, below, between, common, ellipse_distance, in_cone, in_unit_ball
 from .surfaces import Surface, clipped, lathe
 
-Real = NDArray[np.floating]
-Points = NDArray[np.float64]
 Vector = Any
 """Numbers: given as any sequence, kept as a tuple of floats (typed Any: mypy cannot say how many)."""
 
 MODES = ("paint", "add")
-# Lines each way through a shape that is cut: its volume is then right to about 1e-5, or surely seen.
+# Lines each way through a shape with a cut: enough for its volume to about 1e-5, and to find whether anything remains.
 _LINES, _FEWER_LINES = 512, 128
 
 
 @dataclass(frozen=True, kw_only=True)
 class Shape:
-    """What all shapes have: a place, and what they hold.
+    """What all shapes have: a place and a content.
 
     Attributes
     ----------
     position : (3,)
         Of the shape's origin in the phantom, mm.
     euler : (3,)
-        phi, theta, psi in radians, as of `euler_pose`.
+        phi, theta, psi in radians, as for `euler_pose`.
     axis : (3,) or None
-        Instead of `euler`: where the shape's z axis points, of any length.
+        Instead of `euler`: the direction of the shape's z axis, of any length.
     activity : float or None
         kBq/mL; None leaves the activity beneath as it is.
     mu : float or None
@@ -48,14 +46,14 @@ class Shape:
     mode : str
         ``"paint"`` replaces what lies beneath, ``"add"`` adds to it (and may be negative).
     cut : (n, 4)
-        Planes (nx, ny, nz, d) in the shape's frame: of the shape, the points with ``n . x <= d`` |n| are kept (d in mm).
+        Planes (nx, ny, nz, d) in the shape's frame: the points with ``n . x <= d`` |n| are kept, d in mm.
     name : str
         For messages and the scene.
 
     Raises
     ------
     InputError
-        A number is not finite or out of range, or the shape holds nothing.
+        A number is not finite or out of range, or the shape has neither activity nor mu.
     """
 
     position: Vector = (0.0, 0.0, 0.0)
@@ -93,7 +91,11 @@ class Shape:
             raise InputError("activity, mu: expected at least one of them")
         if not isinstance(self.name, str):
             raise InputError(f"name: expected a text, got {self.name!r}")
-        planes = np.empty((0, 4)) if _is_empty(self.cut) else real_array(self.cut, "cut", (None, 4))
+        planes = (
+            np.empty((0, 4))
+            if isinstance(self.cut, list | tuple) and not self.cut
+            else real_array(self.cut, "cut", (None, 4))
+        )
         lengths = np.linalg.norm(planes[:, :3], axis=1)
         if np.any(lengths == 0):
             raise InputError("cut: expected planes nx ny nz d, got one whose normal is 0 0 0")
@@ -113,9 +115,9 @@ class Shape:
         return euler_pose(phi, theta, psi, self.position)
 
     def distance(self, points: Real) -> Real:
-        """Signed distance (N,), mm, of `points` (3, N) in the shape's frame from its surface.
+        """Signed distance (N,), mm, of `points` (3, N) in the shape's frame from its surface, of the points' type.
 
-        Negative inside, and nowhere larger in magnitude than the true distance; of the points' type.
+        Negative inside, and nowhere larger in magnitude than the true distance.
         """
         distance = self._distance(points)
         for *normal, offset in self.cut:
@@ -124,25 +126,24 @@ class Shape:
             distance = np.maximum(distance, plane)
         return distance
 
-    def intervals(self, starts: Points, directions: Points) -> tuple[Points, Points]:
-        """Where the lines ``starts + t directions``, (3, N) in the shape's frame, are inside: from and to which t.
+    def intervals(self, starts: Points, directions: Points) -> Interval:
+        """From and to which t the lines ``starts + t directions``, (3, N) in the shape's frame, are inside.
 
         Each (m, N), of m disjoint parts (one where the shape is convex); from ``>=`` to where a line misses the part.
         """
-        enter, leave = self._intervals(starts, directions)
+        interval = self._intervals(starts, directions)
         for *normal, offset in self.cut:
-            first, last = _below(np.array(normal) @ starts - offset, np.array(normal) @ directions)
-            enter, leave = np.maximum(enter, first), np.minimum(leave, last)
-        return enter, leave
+            interval = common(interval, below(np.array(normal) @ starts - offset, np.array(normal) @ directions))
+        return interval
 
     @cached_property
     def volume(self) -> float:
-        """mm^3: in closed form, and of a shape that is cut summed over lines."""
+        """mm^3: in closed form, or with a cut summed over lines."""
         return self._summed_volume(_LINES) if self.cut else self._volume
 
     def _summed_volume(self, n: int) -> float:
         """The volume summed over n x n lines."""
-        # Aslant: along a plane of the cut the sum would jump from line to line, and converge badly.
+        # Aslant: along a plane of the cut the sum would jump from line to line and converge badly.
         slant = np.array([0.3, 0.2, 1.0])
         a, b, c = self.half_box
         width, depth = 2 * a * (1 + slant[0]), 2 * b * (1 + slant[1])
@@ -164,13 +165,14 @@ class Shape:
 
     @property
     def half_box(self) -> tuple[float, float, float]:
-        """Half the sides (3,), mm, of a box around the shape's origin that holds it."""
+        """Half the sides, mm, of a box around the shape's origin that contains it."""
         raise NotImplementedError
 
     @property
     def ball_radius(self) -> float:
-        """Radius, mm, of a ball around the shape's origin that holds it."""
-        raise NotImplementedError
+        """Radius, mm, of a ball around the shape's origin that contains it; here of a shape that is round about z."""
+        a, b, c = self.half_box
+        return math.hypot(max(a, b), c)
 
     def surface(self) -> Surface:
         """A closed mesh in the shape's frame: vertices (V, 3), mm, and triangles (F, 3), counter-clockwise from outside."""
@@ -186,7 +188,7 @@ class Shape:
     def _distance(self, points: Real) -> Real:
         raise NotImplementedError
 
-    def _intervals(self, starts: Points, directions: Points) -> tuple[Points, Points]:
+    def _intervals(self, starts: Points, directions: Points) -> Interval:
         raise NotImplementedError
 
     @property
@@ -198,6 +200,10 @@ class Shape:
 
     def _set(self, name: str, value: object) -> None:
         object.__setattr__(self, name, value)
+
+    def _set_positive(self, *names: str) -> None:
+        for name in names:
+            self._set(name, positive(getattr(self, name), name, "mm"))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -218,11 +224,11 @@ class Ellipsoid(Shape):
         self._set("radii", _positive_numbers(self.radii, "radii", 3))
 
     def _distance(self, points: Real) -> Real:
-        return _ellipse_distance(points, self.half_box)
+        return ellipse_distance(points, self.half_box)
 
-    def _intervals(self, starts: Points, directions: Points) -> tuple[Points, Points]:
+    def _intervals(self, starts: Points, directions: Points) -> Interval:
         radii = np.array(self.radii)[:, None]
-        return _in_unit_ball(starts / radii, directions / radii)
+        return in_unit_ball(starts / radii, directions / radii)
 
     @property
     def _volume(self) -> float:
@@ -230,12 +236,12 @@ class Ellipsoid(Shape):
 
     @property
     def half_box(self) -> tuple[float, float, float]:
-        """Half the sides, mm."""
+        """As of `Shape`."""
         return self.radii
 
     @property
     def ball_radius(self) -> float:
-        """mm."""
+        """As of `Shape`."""
         return max(self.half_box)
 
     def _surface(self) -> Surface:
@@ -260,7 +266,7 @@ class Sphere(Ellipsoid):
     KIND = "sphere"
 
     def _check(self) -> None:
-        self._set("radius", positive(self.radius, "radius", "mm"))
+        self._set_positive("radius")
         self._set("radii", (self.radius,) * 3)
 
 
@@ -282,18 +288,21 @@ class Cylinder(Shape):
     KIND = "cylinder"
 
     def _check(self) -> None:
-        self._set("radius", _radius(self.radius, "radius"))
-        self._set("height", positive(self.height, "height", "mm"))
+        if isinstance(self.radius, list | tuple | np.ndarray):
+            self._set("radius", _positive_numbers(self.radius, "radius", 2))
+        else:
+            self._set_positive("radius")
+        self._set_positive("height")
 
     def _distance(self, points: Real) -> Real:
         a, b, half = self.half_box
-        return np.maximum(_ellipse_distance(points[:2], (a, b)), np.abs(points[2]) - points.dtype.type(half))
+        return np.maximum(ellipse_distance(points[:2], (a, b)), np.abs(points[2]) - points.dtype.type(half))
 
-    def _intervals(self, starts: Points, directions: Points) -> tuple[Points, Points]:
+    def _intervals(self, starts: Points, directions: Points) -> Interval:
         a, b, half = self.half_box
         radii = np.array([[a], [b]])
-        side = _in_unit_ball(starts[:2] / radii, directions[:2] / radii)
-        return _common(side, _between(starts[2], directions[2], half))
+        side = in_unit_ball(starts[:2] / radii, directions[:2] / radii)
+        return common(side, between(starts[2], directions[2], half))
 
     @property
     def _volume(self) -> float:
@@ -302,15 +311,9 @@ class Cylinder(Shape):
 
     @property
     def half_box(self) -> tuple[float, float, float]:
-        """Half the sides, mm."""
-        a, b = _pair(self.radius)
+        """As of `Shape`."""
+        a, b = self.radius if isinstance(self.radius, tuple) else (self.radius, self.radius)
         return a, b, self.height / 2
-
-    @property
-    def ball_radius(self) -> float:
-        """mm."""
-        a, b, half = self.half_box
-        return math.hypot(max(a, b), half)
 
     def _surface(self) -> Surface:
         a, b, half = self.half_box
@@ -319,7 +322,7 @@ class Cylinder(Shape):
 
 @dataclass(frozen=True, kw_only=True)
 class Cone(Shape):
-    """A cone, or what is left of one without its tip, along z.
+    """A cone along z, with or without its tip.
 
     Attributes
     ----------
@@ -342,7 +345,7 @@ class Cone(Shape):
                 raise InputError(f"{name}: expected 0 or more mm, got {value:g}")
             self._set(name, value)
         positive(max(self.radius, self.top_radius), "radius", "mm")
-        self._set("height", positive(self.height, "height", "mm"))
+        self._set_positive("height")
 
     @property
     def _slope(self) -> float:
@@ -359,28 +362,8 @@ class Cone(Shape):
         side *= of_type(1 / math.hypot(1, self._slope))
         return np.maximum(side, np.abs(points[2]) - of_type(self.height / 2))
 
-    def _intervals(self, starts: Points, directions: Points) -> tuple[Points, Points]:
-        # Within the height the quadric x^2 + y^2 <= (m + s z)^2 is convex: a line is inside between two roots, beyond
-        # them, or on one side of one. Cut to the height first, so that the other half of the double cone is no part.
-        first, last = _between(starts[2], directions[2], self.height / 2)
-        first, last = np.clip(first, -_FAR, _FAR), np.clip(last, -_FAR, _FAR)
-        r, dr = self._middle + self._slope * starts[2], self._slope * directions[2]
-        a = directions[0] ** 2 + directions[1] ** 2 - dr**2
-        b = starts[0] * directions[0] + starts[1] * directions[1] - r * dr
-        c = starts[0] ** 2 + starts[1] ** 2 - r**2
-        root = np.sqrt(np.maximum(b**2 - a * c, 0.0))
-        with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
-            # Both roots without cancellation; where a is 0 one of them is at infinity. (Where there are none, these
-            # numbers split the line anywhere: what counts is the sign in the middle of each piece.)
-            q = -(b + np.copysign(root, b))
-            roots = np.sort(np.nan_to_num(np.stack([q / a, c / q]), nan=np.inf, posinf=np.inf, neginf=-np.inf), axis=0)
-        edges = np.sort(np.clip(np.concatenate([first, roots, last]), first, last), axis=0)
-        middle = (edges[:-1] + edges[1:]) / 2
-        inside = (a * middle + 2 * b) * middle + c < 0
-        inside &= edges[1:] > edges[:-1]
-        enter = np.where(inside, edges[:-1], np.inf).min(axis=0)
-        leave = np.where(inside, edges[1:], -np.inf).max(axis=0)
-        return enter[None], leave[None]
+    def _intervals(self, starts: Points, directions: Points) -> Interval:
+        return in_cone(starts, directions, self._middle, self._slope, self.height / 2)
 
     @property
     def _volume(self) -> float:
@@ -389,14 +372,9 @@ class Cone(Shape):
 
     @property
     def half_box(self) -> tuple[float, float, float]:
-        """Half the sides, mm."""
+        """As of `Shape`."""
         widest = max(self.radius, self.top_radius)
         return widest, widest, self.height / 2
-
-    @property
-    def ball_radius(self) -> float:
-        """mm."""
-        return math.hypot(max(self.radius, self.top_radius), self.height / 2)
 
     def _surface(self) -> Surface:
         half = self.height / 2
@@ -423,21 +401,20 @@ class Capsule(Shape):
     KIND = "capsule"
 
     def _check(self) -> None:
-        self._set("radius", positive(self.radius, "radius", "mm"))
-        self._set("height", positive(self.height, "height", "mm"))
+        self._set_positive("radius", "height")
 
     def _distance(self, points: Real) -> Real:
         of_type = points.dtype.type
         beyond = np.maximum(np.abs(points[2]) - of_type(self.height / 2), 0)
         return np.sqrt(points[0] ** 2 + points[1] ** 2 + beyond**2) - of_type(self.radius)
 
-    def _intervals(self, starts: Points, directions: Points) -> tuple[Points, Points]:
+    def _intervals(self, starts: Points, directions: Points) -> Interval:
         half = np.array([0.0, 0.0, self.height / 2])[:, None]
-        side = _in_unit_ball(starts[:2] / self.radius, directions[:2] / self.radius)
+        side = in_unit_ball(starts[:2] / self.radius, directions[:2] / self.radius)
         parts = [
-            _common(side, _between(starts[2], directions[2], self.height / 2)),
-            _in_unit_ball((starts - half) / self.radius, directions / self.radius),
-            _in_unit_ball((starts + half) / self.radius, directions / self.radius),
+            common(side, between(starts[2], directions[2], self.height / 2)),
+            in_unit_ball((starts - half) / self.radius, directions / self.radius),
+            in_unit_ball((starts + half) / self.radius, directions / self.radius),
         ]
         # The sum of the parts is convex: one interval, from the first entry to the last exit.
         missed = [enter >= leave for enter, leave in parts]
@@ -451,12 +428,12 @@ class Capsule(Shape):
 
     @property
     def half_box(self) -> tuple[float, float, float]:
-        """Half the sides, mm."""
+        """As of `Shape`."""
         return self.radius, self.radius, self.ball_radius
 
     @property
     def ball_radius(self) -> float:
-        """mm."""
+        """As of `Shape`."""
         return self.height / 2 + self.radius
 
     def _surface(self) -> Surface:
@@ -487,9 +464,9 @@ class Box(Shape):
         half = np.array(self.half_box, points.dtype)[:, None]
         return (np.abs(points) - half).max(axis=0)
 
-    def _intervals(self, starts: Points, directions: Points) -> tuple[Points, Points]:
-        x, y, z = (_between(starts[i], directions[i], half) for i, half in enumerate(self.half_box))
-        return _common(_common(x, y), z)
+    def _intervals(self, starts: Points, directions: Points) -> Interval:
+        x, y, z = (between(starts[i], directions[i], half) for i, half in enumerate(self.half_box))
+        return common(common(x, y), z)
 
     @property
     def _volume(self) -> float:
@@ -497,13 +474,13 @@ class Box(Shape):
 
     @property
     def half_box(self) -> tuple[float, float, float]:
-        """Half the sides, mm."""
+        """As of `Shape`."""
         a, b, c = self.size
         return a / 2, b / 2, c / 2
 
     @property
     def ball_radius(self) -> float:
-        """mm."""
+        """As of `Shape`."""
         return math.hypot(*self.half_box)
 
     def _surface(self) -> Surface:
@@ -513,85 +490,9 @@ class Box(Shape):
         return lathe(radii, heights, a, b, n_sides=4)
 
 
-_FAR = 1e30  # finite in place of infinity, where a mean of two ends is wanted
-
-
-def _in_unit_ball(starts: Points, directions: Points) -> tuple[Points, Points]:
-    """Where lines (n, N) are inside the unit ball of n dimensions, (1, N) each."""
-    a = np.einsum("in,in->n", directions, directions)
-    b = np.einsum("in,in->n", starts, directions)
-    with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
-        # From the line's point nearest to the middle: no cancellation of large squares.
-        nearest = -b / a
-        miss = starts + directions * nearest
-        left = 1.0 - np.einsum("in,in->n", miss, miss)
-        half = np.sqrt(left / a)
-        enter, leave = nearest - half, nearest + half
-    never = np.isnan(enter)
-    if never.any():  # it misses, or the line is a point seen along the axis: all in or all out
-        still = never & (a == 0) & (np.einsum("in,in->n", starts, starts) < 1)
-        enter[never], leave[never] = np.inf, -np.inf
-        enter[still], leave[still] = -np.inf, np.inf
-    return enter[None], leave[None]
-
-
-def _between(start: Points, direction: Points, half: float) -> tuple[Points, Points]:
-    """Where lines are between -half and half of one coordinate, (1, N) each."""
-    lower = _below(-start - half, -direction)
-    return _common(lower, _below(start - half, direction))
-
-
-def _below(start: Points, direction: Points) -> tuple[Points, Points]:
-    """Where ``start + t direction <= 0``, (1, N) each."""
-    with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
-        crossing = -start / direction
-    enter = np.where(direction < 0, crossing, np.where((direction > 0) | (start <= 0), -np.inf, np.inf))
-    leave = np.where(direction > 0, crossing, np.where((direction < 0) | (start <= 0), np.inf, -np.inf))
-    return enter[None], leave[None]
-
-
-def _common(one: tuple[Points, Points], other: tuple[Points, Points]) -> tuple[Points, Points]:
-    return np.maximum(one[0], other[0]), np.minimum(one[1], other[1])
-
-
-def _ellipse_distance(points: Real, radii: tuple[float, ...]) -> Real:
-    """Bound of the distance (N,) of `points` (n, N) from an ellipse or ellipsoid, exact to first order near it.
-
-    With k(x) = |x / radii| and g = |x / radii^2|: k is convex, so that outside the distance is at least
-    (k - 1) / |grad k| = (k - 1) k / g; a step h moves k^2 by at most 2 g h + h^2 / r^2, r being the smallest radius.
-    """
-    inverse = (1 / np.array(radii)).astype(points.dtype)[:, None]
-    scaled = points * inverse
-    k2 = np.einsum("in,in->n", scaled, scaled)
-    scaled *= inverse
-    g = np.sqrt(np.einsum("in,in->n", scaled, scaled))
-    left = 1 - k2
-    inside = left / (g + np.sqrt(g * g + np.maximum(left, 0) * inverse.max() ** 2))
-    with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
-        outside = (k2 - np.sqrt(k2)) / g
-    return np.where(left > 0, -inside, outside)
-
-
 def _numbers(value: Vector, name: str, count: int) -> tuple[float, ...]:
     return tuple(real_array(value, name, (count,)).tolist())
 
 
 def _positive_numbers(value: Vector, name: str, count: int) -> tuple[float, ...]:
-    numbers = _numbers(value, name, count)
-    for number in numbers:
-        positive(number, name, "mm")
-    return numbers
-
-
-def _radius(value: Vector, name: str) -> float | tuple[float, ...]:
-    many = isinstance(value, list | tuple | np.ndarray)
-    return _positive_numbers(value, name, 2) if many else positive(value, name, "mm")
-
-
-def _is_empty(value: Vector) -> bool:
-    return isinstance(value, list | tuple) and not value
-
-
-def _pair(radius: Vector) -> tuple[float, float]:
-    a, b = np.broadcast_to(np.asarray(radius, np.float64), 2).tolist()
-    return a, b
+    return tuple(positive(number, name, "mm") for number in _numbers(value, name, count))

@@ -13,7 +13,7 @@ from .phantom import Phantom
 from .settings import choice, setting
 from .shapes import Ellipsoid, Shape
 
-# Half axes and centre in units of the head's half size, turn about z in degrees; density and contrast-enhanced value.
+# Half axes and centre in units of `half_size`, turn about z in degrees; density, and value of the modified phantom.
 _ELLIPSOIDS = (
     ((0.6900, 0.920, 0.810), (0.0, 0.0, 0.0), 0.0, 2.00, 1.0),
     ((0.6624, 0.874, 0.780), (0.0, -0.0184, 0.0), 0.0, -0.98, -0.8),
@@ -35,21 +35,21 @@ class SheppLogan(Phantom):
 
     The ellipses of L. A. Shepp and B. F. Logan, IEEE Transactions on Nuclear Science 21 (1974) 21-43 (A. C. Kak and
     M. Slaney, "Principles of Computerized Tomographic Imaging", 1988, section 3.1; one at -0.606 instead of -0.605, as in
-    MATLAB), with the third half axes and heights of M. Schabel's ``phantom3d`` (MATLAB Central 9416). Its psi of 10
-    degrees, which would turn the ventricles about z once more, is left out, and the ellipsoids that Kak and Slaney give
-    for three dimensions are others. Modified values: P. Toft, "The Radon Transform", thesis, 1996, p. 199.
+    MATLAB), with the third half axes and heights of M. Schabel's ``phantom3d`` (MATLAB Central 9416), but without its psi
+    of 10 degrees, which would turn the ventricles about z a second time. Kak and Slaney's own ellipsoids for three
+    dimensions differ. Modified values: P. Toft, "The Radon Transform", thesis, 1996, p. 199.
 
     Attributes
     ----------
     half_size : float
-        What the unit of the tables is, mm: the head is 1.38 x 1.84 x 1.62 of it.
+        The tables' unit of length, mm: the head measures 1.38 x 1.84 x 1.62 of it.
     activity : float
         kBq/mL where the table says 1: the skull of the modified phantom.
     mu : float
         1/mm where the original's density is 1; water's by default.
     contrast : str
-        Of the activity: ``"modified"``, which can be seen, or ``"original"`` (1 % between the parts of the brain). The
-        mu always has the original densities.
+        Of the activity: ``"modified"`` (visible) or ``"original"`` (1 % between the parts of the brain). The mu always
+        has the original densities.
     """
 
     half_size: float = setting(75.0, "mm", "the unit of the tables: the head is 1.84 times as long")

@@ -10,16 +10,9 @@ Surface = tuple[NDArray[np.float64], NDArray[np.int32]]
 
 
 def lathe(radii: NDArray[np.float64], heights: NDArray[np.float64], a: float, b: float, n_sides: int = 64) -> Surface:
-    """A profile turned about z and stretched by `a` along x and by `b` along y.
+    """A profile turned about z in `n_sides` sides, stretched by `a` along x and by `b` along y.
 
-    Parameters
-    ----------
-    radii, heights
-        The profile from bottom to top, (n,) each; first and last lie on the axis.
-    a, b
-        Factors.
-    n_sides
-        Around the axis; the first corner lies half a side from +x.
+    The profile's `radii` and `heights` (n,) run from bottom to top and begin and end on the axis.
     """
     angle = 2 * np.pi * (np.arange(n_sides) + 0.5) / n_sides
     circle = np.stack([a * np.cos(angle), b * np.sin(angle)], axis=1)
@@ -41,10 +34,7 @@ def lathe(radii: NDArray[np.float64], heights: NDArray[np.float64], a: float, b:
 
 
 def clipped(surface: Surface, normal: NDArray[np.float64], offset: float) -> Surface:
-    """What of a closed convex `surface` lies at ``normal . x <= offset``, closed again by a lid.
-
-    Sutherland and Hodgman's clipping, triangle by triangle; the lid is a fan around the middle of the cut.
-    """
+    """The part of a closed convex `surface` at ``normal . x <= offset``, closed by a fan around the middle of the cut."""
     vertices, faces = surface
     height = vertices @ normal - offset
     # A vertex in the plane would give slivers without area.

@@ -13,17 +13,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import InputError
+from ..physics.materials import attenuation
 from ..validation import whole_number
-from .materials import LUNG_MU, SOFT_TISSUE_MU, VERTEBRA_MU
 from .painting import Layer, points_inside
 from .phantom import Phantom
 from .settings import check_settings, setting
 from .shapes import Cylinder, Ellipsoid, Shape
 
-# The heart's axes in the torso, rows lateral, anterior, apical: after its third, second and first axis in M. Cristy and
+# Rows: the heart's lateral, anterior and apical axis in the torso, after its third, second and first axis in M. Cristy and
 # K. F. Eckerman, ORNL/TM-8381 (1987), whose x and y point to the patient's left and back. Not confirmed.
 _HEART = np.array([[-0.5736, -0.8191, 0.0], [-0.4640, 0.3249, 0.8241], [-0.6751, 0.4727, -0.5664]])
-# The torso's axis at ORNL/TM-8381's height 0, as seen from the left ventricle's middle, mm: chosen.
+# Where ORNL/TM-8381's axis (x, y) and its height 0 lie from the left ventricle's middle, mm: chosen.
 _AXIS, _HEIGHT = (35.0, -30.0), 490.0
 _SYSTOLE = 0.35  # of the cycle
 _RV_WALL = 4.0  # mm
@@ -34,24 +34,24 @@ _TRUNK = 4  # lungs, liver and spine, whose sizes are fixed
 class CardiacTorso(Phantom):
     """A torso of simple shapes around a heart, as for myocardial perfusion with Tc-99m sestamibi.
 
-    Frame: +x the patient's right, +y front, +z head; the origin in the middle of the left ventricle at end-diastole. So
-    the patient's left and front face the modules of the 80-module cardiac scanner, and the ventricle lies well inside
-    its 75 mm.
+    Frame: +x is the patient's right, +y the front, +z the head; the origin is the middle of the left ventricle at
+    end-diastole. The patient's left and front thus face the modules of the 80-module cardiac scanner, and the ventricle
+    lies well inside its 75 mm.
 
-    Lungs, liver, spine and the direction of the heart's axis are after the mathematical adult of M. Cristy and K. F.
-    Eckerman, ORNL/TM-8381 (1987). The trunk, where the organs lie, and the half axes of liver and spine were checked
-    against its 15-year-old in Geant4's human_phantom, scaled; not confirmed are the half axes of the lungs, the plane
-    that cuts the liver, and the heart's axis. Its body of 400 x 200 mm holds the arms: here an ellipse of 330 x 230 mm
-    stands for a chest with the arms up, the liver reaches 150 and not 165 mm to the right, and the spine lies 15 mm
-    further back.
-    The left ventricle is half an ellipsoid inside another, of 120 mL at end-diastole and 45 mL at end-systole with walls
-    of 9.5 mm (within men's normal ranges, R. M. Lang et al., J Am Soc Echocardiogr 28 (2015) 1-39): 133 g of muscle,
-    whose volume stays when it contracts, as does the apex's place. The volume falls along half a cosine for 35 % of the
-    cycle and rises along another. The right ventricle's cavity shrinks with the left's. Ribs, arms, breasts and other
-    organs are left out.
+    Lungs, liver, spine and the direction of the heart's axis follow the mathematical adult of M. Cristy and K. F.
+    Eckerman, ORNL/TM-8381 (1987). The trunk, the places of the organs and the half axes of liver and spine were checked
+    against its 15-year-old in Geant4's human_phantom, scaled. The half axes of the lungs, the plane that cuts the liver
+    and the heart's axis are not confirmed. The report's body of 400 x 200 mm includes the arms; here an ellipse of 330 x
+    230 mm stands for a chest with the arms up, the liver reaches 150 instead of 165 mm to the right, and the spine lies
+    15 mm further back.
+    The left ventricle's cavity and outer surface are half ellipsoids. The cavity holds 120 mL at end-diastole and 45 mL
+    at end-systole, the wall is 9.5 mm thick (within men's normal ranges, R. M. Lang et al., J Am Soc Echocardiogr 28
+    (2015) 1-39): 133 g of muscle. The muscle's volume and the apex stay the same over the cycle. The cavity's volume
+    falls along half a cosine for 35 % of the cycle and rises along another; the right ventricle's shrinks with it. Ribs,
+    arms, breasts and other organs are left out.
 
-    Activities are choices for rest, an hour after 1 GBq: 1.2 % of it in the heart (sestamibi's prescribing information)
-    make about 90 kBq/mL in 133 g; the other organs are set to ratios as seen in clinical images.
+    The activities are choices for rest, an hour after 1 GBq: 1.2 % of it in the heart (sestamibi's prescribing
+    information) is about 90 kBq/mL in 133 g; the other organs are set to ratios seen in clinical images.
 
     Attributes
     ----------
@@ -60,17 +60,17 @@ class CardiacTorso(Phantom):
     end_diastolic_volume, end_systolic_volume : float
         Of the left ventricle's cavity, mL.
     ventricle_length, wall : float
-        Of that cavity from base to apex, and of its wall, at end-diastole, mm.
+        Of the cavity from base to apex, and of the wall, at end-diastole, mm.
     shortening : float
-        Share by which the length shortens until end-systole.
+        Fraction by which the length shortens until end-systole.
     defect_severity : float
-        Share of the muscle's activity that is missing in the defect, 0 (no defect) to 1.
+        Fraction of the muscle's activity that is missing in the defect, 0 (no defect) to 1.
     defect_angle_degrees, defect_width_degrees : float
-        Its middle, 0 anterior, 90 lateral, 180 inferior, 270 septal; and how far around it reaches in all.
+        The defect's middle, 0 anterior, 90 lateral, 180 inferior, 270 septal; and its full angular width.
     defect_from, defect_to : float
         Where along the muscle it begins and ends, 0 the base, 1 the apex.
     defect_transmural : float
-        Share of the wall, from the inside, that it takes.
+        Fraction of the wall, from the inside, that it takes.
     body_radii : (2,)
         Half axes of the body, left-right and front-back, mm.
     myocardium, right_myocardium, blood, liver, lung, body : float
@@ -159,92 +159,75 @@ class CardiacTorso(Phantom):
         def at(x: float, y: float, z: float) -> tuple[float, float, float]:
             return x + _AXIS[0], y + _AXIS[1], z - _HEIGHT
 
-        tissue: dict[str, Any] = {"mu": SOFT_TISSUE_MU}
-        lungs: list[Shape] = [
-            Ellipsoid(
-                radii=(50, 75, 240),
-                position=at(x, 0, 435),
-                cut=[(0, 0, -1, 0)],
-                activity=self.lung,
-                mu=LUNG_MU,
-                name=f"{side} lung",
-            )
-            for side, x in (("right", 85.0), ("left", -85.0))
-        ]
-        # Below the plane x/350 + y/450 - z/430 = -1, x and y to the left and back, here about z = 350.
+        soft, lung, bone = (attenuation(name, self.mu_energy) for name in ("soft tissue", "lung", "vertebra"))
+        # The liver lies below the plane x/350 + y/450 - z/430 = -1, x and y to the left and back, here about z = 350.
         plane = np.array([-1 / 350, -1 / 450, -1 / 430])
-        offset = (350 / 430 - 1) / float(np.linalg.norm(plane))
+        liver = [(*plane, (350 / 430 - 1) / float(np.linalg.norm(plane)))]
+        lungs: dict[str, Any] = {"radii": (50, 75, 240), "cut": [(0, 0, -1, 0)], "activity": self.lung, "mu": lung}
+        body: dict[str, Any] = {"height": 440, "activity": self.body}
         return [
+            Cylinder(name="body", radius=self.body_radii, position=at(0, 0, 460), mu=soft, **body),
+            Ellipsoid(name="right lung", position=at(85, 0, 435), **lungs),
+            Ellipsoid(name="left lung", position=at(-85, 0, 435), **lungs),
             Cylinder(
-                radius=self.body_radii, height=440, position=at(0, 0, 460), activity=self.body, name="body", **tissue
-            ),
-            *lungs,
-            Cylinder(
+                name="liver",
                 radius=(150, 80),
                 height=160,
                 position=at(0, 0, 350),
-                cut=[(*plane, offset)],
+                cut=liver,
                 activity=self.liver,
-                name="liver",
-                **tissue,
+                mu=soft,
             ),
-            Cylinder(
-                radius=(20, 25), height=440, position=at(0, -70, 460), activity=self.body, mu=VERTEBRA_MU, name="spine"
-            ),
+            Cylinder(name="spine", radius=(20, 25), position=at(0, -70, 460), mu=bone, **body),
         ]
 
     def _heart(self) -> list[Shape]:
-        contraction, volume = self._contraction, self.ventricle_volume * 1e3
-        full = self.end_diastolic_volume * 1e3
-        muscle = (
-            _half_ellipsoid(_radius(full, self.ventricle_length) + self.wall, self.ventricle_length + self.wall) - full
-        )
-        length = self.ventricle_length * (1 - self.shortening * contraction)
-        radius = _radius(volume, length)
-        wall = _wall(radius, length, volume + muscle)
-        # The apex stays; at end-diastole the origin is halfway between it and the base.
+        muscle, cavity = self._muscle_volume, self.ventricle_volume * 1e3
+        length = self.ventricle_length * (1 - self.shortening * self._contraction)
+        radius = _radius(cavity, length)
+        wall = _wall(radius, length, cavity + muscle)
+        # The apex stays where it is; at end-diastole the origin is halfway between it and the base.
         base = (self.ventricle_length + self.wall) / 2 - length - wall
-        beat = (volume / full) ** (1 / 3)
-        blood: dict[str, Any] = {"activity": self.blood, "mu": SOFT_TISSUE_MU}
-        upper = (0, 0, -1, 0)
+        soft = attenuation("soft tissue", self.mu_energy)
+        blood: dict[str, Any] = {"activity": self.blood, "mu": soft}
 
-        def cup(
-            radii: tuple[float, float, float], name: str, right: float = 0.0, cut: Sequence = (), **holds: Any
-        ) -> Shape:
-            return Ellipsoid(
-                radii=radii,
-                position=_in_torso(-right, 0, base),
-                euler=_euler_angles(),
-                cut=[upper, *cut],
-                name=name,
-                **holds,
+        def half(name: str, *radii: float, right: float = 0.0, cut: Sequence = (), **holds: Any) -> Shape:
+            """The apical half of an ellipsoid whose middle lies at the base, `right` mm towards the right ventricle."""
+            place: dict[str, Any] = {"position": _in_torso(-right, 0, base), "euler": _euler_angles()}
+            return Ellipsoid(name=name, radii=radii, cut=[(0, 0, -1, 0), *cut], **place, **holds)
+
+        beat = (self.ventricle_volume / self.end_diastolic_volume) ** (1 / 3)
+        right = [30.0 * beat, 36.0 * beat, 66.0 * beat]
+        layer = self.defect_transmural * wall
+        defect = [
+            half(
+                "defect", radius + layer, radius + layer, length + layer, cut=planes,
+                activity=(1 - self.defect_severity) * self.myocardium,
             )
-
-        right = (30.0 * beat, 36.0 * beat, 66.0 * beat)
-        outer = tuple(half + _RV_WALL for half in right)
+            for planes in self._defect_planes(length + wall)
+        ]  # fmt: skip
+        outer = (radius + wall, radius + wall, length + wall)
+        right_outer = [r + _RV_WALL for r in right]
         return [
             Ellipsoid(
-                radii=(35, 35, 28), position=_in_torso(-8, 0, base - 20), euler=_euler_angles(), name="atria", **blood
+                name="atria", radii=(35, 35, 28), position=_in_torso(-8, 0, base - 20), euler=_euler_angles(), **blood
             ),
-            cup(outer, "right myocardium", 26.0, activity=self.right_myocardium, mu=SOFT_TISSUE_MU),
-            cup(right, "right ventricle", 26.0, **blood),
-            cup(
-                (radius + wall, radius + wall, length + wall), "myocardium", activity=self.myocardium, mu=SOFT_TISSUE_MU
-            ),
-            *(
-                cup(
-                    (radius + self.defect_transmural * wall,) * 2 + (length + self.defect_transmural * wall,),
-                    "defect",
-                    cut=planes,
-                    activity=(1 - self.defect_severity) * self.myocardium,
-                )
-                for planes in self._defect_planes(length + wall)
-            ),
-            cup((radius, radius, length), "left ventricle", **blood),
+            half("right myocardium", *right_outer, right=26.0, activity=self.right_myocardium, mu=soft),
+            half("right ventricle", *right, right=26.0, **blood),
+            half("myocardium", *outer, activity=self.myocardium, mu=soft),
+            *defect,
+            half("left ventricle", radius, radius, length, **blood),
         ]
 
+    @property
+    def _muscle_volume(self) -> float:
+        """mm^3 of the left ventricle's muscle, at every phase."""
+        full = self.end_diastolic_volume * 1e3
+        radius = _radius(full, self.ventricle_length) + self.wall
+        return 2 / 3 * math.pi * radius**2 * (self.ventricle_length + self.wall) - full
+
     def _defect_planes(self, length: float) -> list[list[tuple[float, float, float, float]]]:
-        """Planes around each convex piece of the defect, in the heart's frame: two of them beyond half of the way around."""
+        """Planes around each convex piece of the defect, in the heart's frame; beyond 180 degrees there are two pieces."""
         if not self.defect_severity:
             return []
         ends = [(0.0, 0.0, -1.0, -self.defect_from * length), (0.0, 0.0, 1.0, self.defect_to * length)]
@@ -260,33 +243,29 @@ class CardiacTorso(Phantom):
         return sides
 
 
-def _half_ellipsoid(radius: float, length: float) -> float:
-    return 2 / 3 * math.pi * radius**2 * length
-
-
 def _radius(volume: float, length: float) -> float:
-    """Of half an ellipsoid of that volume, mm^3, and length, mm."""
+    """Radius, mm, of half an ellipsoid of `volume` mm^3 and `length` mm."""
     return math.sqrt(1.5 * volume / (math.pi * length))
 
 
 def _wall(radius: float, length: float, volume: float) -> float:
-    """Thickness w, mm, with which half an ellipsoid of `radius + w` and `length + w` has `volume`, mm^3."""
+    """Thickness w, mm, with which half an ellipsoid of `radius + w` and `length + w` has `volume` mm^3."""
     product = 1.5 * volume / math.pi
     roots = np.roots([1.0, 2 * radius + length, radius**2 + 2 * radius * length, radius**2 * length - product])
-    return float(roots.real[np.argmin(np.abs(roots.imag) + np.where(roots.real > 0, 0.0, np.inf))])
+    return float(roots.real.max())  # the only positive one
 
 
 def _in_torso(lateral: float, anterior: float, apical: float) -> NDArray[np.float64]:
-    return np.array([lateral, anterior, apical]) @ _orthonormal()
+    return np.array([lateral, anterior, apical]) @ _heart_axes()
 
 
 def _euler_angles() -> tuple[float, float, float]:
     """phi, theta, psi of `euler_pose` that turn x, y, z to lateral, anterior, apical."""
-    turn = _orthonormal().T
+    turn = _heart_axes().T
     return math.atan2(turn[1, 2], turn[0, 2]), math.acos(turn[2, 2]), math.atan2(turn[2, 1], -turn[2, 0])
 
 
-def _orthonormal() -> NDArray[np.float64]:
-    """The heart's axes, rows, without the rounding of their four digits."""
+def _heart_axes() -> NDArray[np.float64]:
+    """`_HEART` made orthonormal: its digits are rounded to four."""
     u, _, v = np.linalg.svd(_HEART)
     return u @ v

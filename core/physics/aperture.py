@@ -1,6 +1,6 @@
-"""The pinhole: points of its plane that stand for the open hole and for its edge, and what they let pass.
+"""The pinhole: sample points in the hole and in its knife edge, and what they transmit.
 
-Formulas of a pixel's weight are functions of arrays or of tensors alike.
+Functions of slopes take arrays or tensors.
 """
 
 from __future__ import annotations
@@ -23,26 +23,22 @@ _GOLDEN_ANGLE = math.pi * (3 - math.sqrt(5))
 
 # More points than this would take hours.
 _MOST_POINTS = 1000
-# The lattice, points across, that stands for the disk itself where numbers of points are compared.
+# Points across the fine lattice that other point sets are compared with.
 _LATTICE = 160
-# Places across a whole image at which a pixel's edge may cut it.
+# Positions of the pixels' edges that are tried across an image.
 _PLACES = 32
 
-# Gauss-Laguerre nodes and weights beyond the rim: exact on the axis, where transmission falls exponentially.
+# Gauss-Laguerre nodes and weights beyond the rim: exact along the axis, where transmission falls exponentially.
 _ROOT = math.sqrt(2)
 _EDGE_RINGS = ((2 - _ROOT, (2 + _ROOT) / 4), (2 + _ROOT, (2 - _ROOT) / 4))
 _FEWEST_EDGE_ANGLES = 7
 
 
 def disk_points(n: int) -> Array:
-    """n points (n, 2) that stand for equal parts of the unit disk: Vogel's spiral, as in the head of a sunflower.
+    """n points (n, 2) of equal weight in the unit disk: Vogel's spiral (Mathematical Biosciences 44 (1979) 179-189).
 
-    Shifted and stretched a little, so that their mean is the disk's, 0, and their variance too, 1/4 along every
-    direction: the blur has the right width however few the points. 1 point is the middle; 2 have no such variance.
-
-    References
-    ----------
-    H. Vogel, "A better way to construct the sunflower head", Mathematical Biosciences 44 (1979) 179-189.
+    The points are shifted and stretched slightly to have the disk's mean, 0, and its variance, 1/4 in every direction,
+    so that even a few give a blur of the right width. One point is the centre; two cannot have this variance.
     """
     if n == 1:
         return np.zeros((1, 2))
@@ -56,11 +52,11 @@ def disk_points(n: int) -> Array:
 
 @functools.lru_cache(maxsize=4096)
 def points_needed(tolerance: float, shadow: float, pitch: tuple[float, float], blur: tuple[float, float]) -> int:
-    """The fewest of 1, 3, 4 ... `disk_points` (in steps of a quarter) with which a point's image is good enough.
+    """The smallest number of `disk_points` (1, 3, 4, ... in steps of a quarter) that images a point source accurately.
 
-    The sum over the pixels of the absolute error of its image, as a share of its counts, is at most `tolerance`, wherever
-    the pixels' edges cut it. The images of many points add up, and so do at most their errors: the bound holds for every
-    activity whose points' shadows are like this one.
+    The absolute errors of the image's pixels add up to at most a fraction `tolerance` of its counts, wherever the
+    pixels' edges lie. Errors of many point sources add up to at most the same fraction, so the bound holds for any
+    activity whose points cast such shadows.
 
     Parameters
     ----------
@@ -69,9 +65,9 @@ def points_needed(tolerance: float, shadow: float, pitch: tuple[float, float], b
     shadow
         Diameter of the hole's shadow on the crystal, mm.
     pitch
-        Size of a pixel along u and v, mm.
+        Pixel size along u and v, mm.
     blur
-        What else blurs there, as the sides of a rectangle, mm along u and v: the image of a voxel, the detector.
+        Sides along u and v, mm, of a rectangle that stands for all other blur: a voxel's image, the detector.
 
     Raises
     ------
@@ -93,15 +89,15 @@ def points_needed(tolerance: float, shadow: float, pitch: tuple[float, float], b
 
 
 def _point_images(points: Array, shadow: float, pitch: tuple[float, float], blur: tuple[float, float]) -> Array:
-    """Shares of a point's counts in the pixels around it, seen through `points` of the unit disk alike.
+    """Image of a point source through equally weighted `points` of the unit disk, as fractions of its counts.
 
-    (n_v, places, n_u, places): for many places of the pixels' edges along v and u, evenly over a pixel.
+    Its shape is (n_v, places, n_u, places), for evenly spaced positions of the pixels' edges along v and u.
     """
     along: list[Array] = []
     counts: list[int] = []
     for middles, size, width in zip(points.T * (shadow / 2), pitch, blur, strict=True):
         extent = 1.2 * shadow + width  # of the image
-        size = min(size, extent)  # wider pixels cut it no more often
+        size = min(size, extent)  # a wider pixel cuts the image no more often
         places = math.ceil(_PLACES * size / extent)
         half = math.ceil(extent / 2 / size) + 1
         edges = np.arange(-half * places, half * places) * (size / places)
@@ -114,12 +110,9 @@ def _point_images(points: Array, shadow: float, pitch: tuple[float, float], blur
 
 @dataclass(frozen=True)
 class KnifeEdge:
-    """The edge of a hole: what fills r > radius + |z| tan(alpha / 2), a double cone in an infinitely thick plate.
+    """A double-cone hole in an infinitely thick plate: material fills r > radius + |z| tan(alpha / 2).
 
-    Attributes
-    ----------
-    radius, mu, tangent : float
-        Of the hole, mm; attenuation coefficient, 1/mm; tan(alpha / 2), `core.collimator.edge_slope`.
+    `radius` is that of the hole, mm, `mu` the attenuation coefficient, 1/mm, and `tangent` is tan(alpha / 2).
     """
 
     radius: float
@@ -127,17 +120,16 @@ class KnifeEdge:
     tangent: float
 
     def transmission(self, x: float, y: float, slope_u: ArrayOrTensor, slope_v: ArrayOrTensor) -> ArrayOrTensor:
-        """Share of the photons, exp(-mu path), that pass the edge where they cross the plane z = 0 beyond the rim.
+        """Fraction exp(-mu path) of the photons that pass the edge on lines that cross z = 0 outside the hole.
 
-        A line that crosses the plane beyond the rim is in the edge from one cone to the other; one that is steeper than
-        the cone never leaves it.
+        Such a line is inside the material between the two cones; one that is steeper than the cone never leaves it.
 
         Parameters
         ----------
         x, y
-            Where the line crosses the plane, mm from the hole's middle: at least `radius` from it.
+            Point of crossing, mm from the hole's centre, at least `radius` away.
         slope_u, slope_v
-            Arrays or tensors: mm along u and v per mm along the axis.
+            mm along u and v per mm along the axis.
         """
         library = namespace(slope_u)
         slope = slope_u**2 + slope_v**2
@@ -152,18 +144,13 @@ class KnifeEdge:
         return library.where(passes, library.exp(-self.mu * depth * library.sqrt(1 + slope)), 0.0)
 
     def points(self, n: int) -> list[tuple[float, float, float]]:
-        """Points beyond the rim, (x, y) mm, and the area, mm^2, for which each stands.
+        """Sample points beyond the rim: (x, y) in mm, and the area, mm^2, that each represents.
 
-        They stand about as close as `n` points in the hole. The sum of area times transmission is exact along the axis;
-        aslant it is about 0.1 % of the hole's area off at 0.7 of the cone's slope, and 1 % shortly before it.
-
-        Parameters
-        ----------
-        n
-            Points in the hole.
+        They are about as dense as `n` points in the hole. The sum of area times transmission is exact along the axis.
+        At 0.7 of the cone's slope it is about 0.1 % of the hole's area off, and close to the cone 1 %.
         """
-        depth = self.tangent / (2 * self.mu)  # from the rim to where exp(-1) of the rays along the axis pass
-        # An odd number: opposite places let the same share pass, and no two of these are opposite.
+        depth = self.tangent / (2 * self.mu)  # where a fraction exp(-1) of the rays along the axis pass
+        # An odd number, so that no two points are opposite: opposite points transmit the same.
         angles = max(_FEWEST_EDGE_ANGLES, math.ceil(2 * math.sqrt(math.pi * n)) | 1)
         points: list[tuple[float, float, float]] = []
         for ring, (node, weight) in enumerate(_EDGE_RINGS):
@@ -176,18 +163,18 @@ class KnifeEdge:
 
 @dataclass(frozen=True)
 class Opening:
-    """A point of the pinhole's plane from which rays start, and for how much of the plane they stand.
+    """A point of the pinhole's plane that rays start from, and the area that it represents.
 
     Attributes
     ----------
     x, y : float
-        mm from the hole's middle along u and v.
+        mm from the hole's centre along u and v.
     hole : float
-        Area of the hole, mm^2, for which the point stands.
+        Represented area of the hole, mm^2.
     knife : KnifeEdge, optional
-        None: the hole is open to every direction.
+        Without one the hole is open to every direction.
     beyond : sequence of (x, y, area)
-        Points of the edge for which it stands too.
+        Represented points of the edge.
     """
 
     x: float
@@ -197,7 +184,7 @@ class Opening:
     beyond: Sequence[tuple[float, float, float]] = ()
 
     def area(self, slope_u: ArrayOrTensor, slope_v: ArrayOrTensor) -> ArrayOrTensor:
-        """Area, mm^2, open to photons of a slope (mm along u and v per mm along the axis; arrays or tensors)."""
+        """Area, mm^2, open to photons with slopes in mm along u and v per mm along the axis."""
         if self.knife is None:
             return self.hole
         area = self.hole * within_cone(slope_u, slope_v, self.knife.tangent)
@@ -207,11 +194,11 @@ class Opening:
 
 
 def openings(n: int, diameter: float, knife: KnifeEdge | None = None) -> list[Opening]:
-    """The points that stand for a hole of a diameter (mm), `n` of them in it, and for its edge."""
+    """Points that represent a hole of the given diameter, mm, by `n` points, and its edge."""
     points = diameter / 2 * disk_points(n)
     hole = math.pi / 4 * diameter**2 / n
     beyond = [] if knife is None else knife.points(n)
-    if n == 1:  # all from the middle
+    if n == 1:  # all rays start from the centre
         return [Opening(0.0, 0.0, hole, knife, beyond)]
     in_hole = [Opening(float(x), float(y), hole, knife) for x, y in points]
     return in_hole + [Opening(x, y, 0.0, knife, ((x, y, area),)) for x, y, area in beyond]
@@ -220,8 +207,8 @@ def openings(n: int, diameter: float, knife: KnifeEdge | None = None) -> list[Op
 def paix_diameter(diameter: Array, mu: float | None, opening_angle: float) -> Array:
     """Paix's effective diameter ``sqrt(d (d + 2 / mu tan(alpha / 2)))``, mm, of knife-edge holes of diameter d, mm.
 
-    The opaque hole that lets as many photons pass. `mu`, 1/mm, is the material's (None: opaque, d itself), and
-    `opening_angle`, rad, the full angle alpha of the edge's double cone.
+    An opaque hole of this diameter transmits as many photons. `mu` is the material's coefficient, 1/mm (None: opaque,
+    so d itself), and `opening_angle` the full angle alpha of the edge's double cone, rad.
     """
     if mu is None:
         return diameter
@@ -229,11 +216,10 @@ def paix_diameter(diameter: Array, mu: float | None, opening_angle: float) -> Ar
 
 
 def half_value_diameter(diameter: Array, mu: float | None, opening_angle: float) -> Array:
-    """Diameter ``d + ln(2) / mu tan(alpha / 2)``, mm, at which a knife edge lets half of the axial photons pass.
+    """Diameter ``d + ln(2) / mu tan(alpha / 2)``, mm, at which a knife edge transmits half of the axial photons.
 
-    Beyond the rim of a hole of diameter d, mm, at radius r, the edge is ``2 (r - d / 2) / tan(alpha / 2)`` thick. So it
-    is the full width at half maximum of the hole's shadow: the resolution-equivalent diameter of Accorsi and Metzler.
-    Arguments as in `paix_diameter`.
+    At radius r the edge is ``2 (r - d / 2) / tan(alpha / 2)`` thick. So this is the full width at half maximum of the
+    hole's shadow: Accorsi and Metzler's resolution-equivalent diameter. Parameters as in `paix_diameter`.
     """
     if mu is None:
         return diameter
@@ -241,6 +227,6 @@ def half_value_diameter(diameter: Array, mu: float | None, opening_angle: float)
 
 
 def within_cone(slope_u: ArrayOrTensor, slope_v: ArrayOrTensor, tangent: float) -> ArrayOrTensor:
-    """1 where lines are less steep than a cone, tan(psi) < tangent, else 0."""
+    """1 where lines are less steep than the cone, tan(psi) < tangent, else 0."""
     slope = slope_u**2 + slope_v**2
     return namespace(slope).ones_like(slope) * (slope < tangent**2)

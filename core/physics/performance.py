@@ -1,7 +1,8 @@
-"""What modules do with photons from any point: whether they see it, how many they count, how sharply.
+"""Visibility, magnification, sensitivity and resolution of modules for points anywhere.
 
-In a module's frame a point at (x_u, x_v) across the axis and at height h in front of the pinhole's plane is seen at the
-angle psi to the axis, with ``cos(psi) = h / sqrt(h^2 + x_u^2 + x_v^2)``, the sine of its elevation theta above that plane.
+In a module's frame a point (x_u, x_v) off the axis and at height h in front of the pinhole's plane is seen at the angle
+psi to the axis, with ``cos(psi) = h / sqrt(h^2 + x_u^2 + x_v^2)``, which is the sine of its elevation theta above that
+plane.
 
 References
 ----------
@@ -30,32 +31,22 @@ Array = NDArray[np.float64]
 
 
 def seen(system: PinholeSystem, points: ArrayLike) -> NDArray[np.bool_]:
-    """Whether each module sees each point: (P, M).
+    """Whether each of the M modules sees each of the `points` (P, 3), world mm: (P, M).
 
     A module sees a point in front of its pinhole if the ray from there through the pinhole's centre meets the crystal's
     front face, ``l max(|x_u|, |x_v|) <= Ld h / 2``.
 
-    Parameters
-    ----------
-    system
-        M modules.
-    points
-        (P, 3), world mm.
-
     Raises
     ------
     InputError
-        `system` is none, or `points` are not finite numbers of that shape.
+        `system` is not a `PinholeSystem`, or `points` are not finite numbers of that shape.
     """
-    return _seen(system, *_in_modules(system, _checked(points)))
+    return _seen(system, *_in_modules(system, real_array(points, "points", (None, 3))))
 
 
 def magnification(system: PinholeSystem, points: ArrayLike) -> Array:
-    """Magnification l / h (P, M) of the crystal's image at each point; NaN where it is not in front of the pinhole.
-
-    Arguments and errors as in `seen`.
-    """
-    _, _, h = _in_modules(system, _checked(points))
+    """Magnification l / h (P, M) at each point; NaN behind the pinhole. Parameters and errors as in `seen`."""
+    _, _, h = _in_modules(system, real_array(points, "points", (None, 3)))
     with np.errstate(divide="ignore"):
         return np.where(h > 0, system.collimator_length / h, np.nan)
 
@@ -69,39 +60,37 @@ def sensitivity(
     crystal_mu: float | None = None,
     photons_per_decay: float = 1.0,
 ) -> Array:
-    """Counts per decay (P, M) of a point source, each module on its own: 1e6 times that are cps/MBq.
+    """Counts per decay (P, M) of a point source in each module; times 1e6 that is cps/MBq.
 
-    Where the module sees the point it is ``photons_per_decay d_e^2 sin^3(theta) / (16 h^2)``, times the share
-    ``1 - exp(-crystal_mu Td / sin(theta))`` that the crystal stops; elsewhere 0. `Emission` counts the same, pixel by
-    pixel, with its edge "paix".
+    Where a module sees the point this is ``photons_per_decay d_e^2 sin^3(theta) / (16 h^2)`` times the fraction
+    ``1 - exp(-crystal_mu Td / sin(theta))`` that the crystal stops; elsewhere it is 0. `Emission` with ``edge="paix"``
+    counts the same, pixel by pixel.
 
     Parameters
     ----------
-    system
-        M modules.
-    points
-        (P, 3), world mm.
+    system, points
+        As in `seen`.
     aperture_mu, opening_angle
-        Of the aperture's material, 1/mm, and of its knife edge, rad: Paix's ``d_e^2 = d (d + 2 / mu tan(alpha / 2))``.
-        None: nothing penetrates, d_e = d.
+        Attenuation coefficient of the aperture, 1/mm, and full angle of its knife edge, rad, for Paix's
+        ``d_e^2 = d (d + 2 / mu tan(alpha / 2))``. Without a coefficient nothing penetrates and d_e = d.
     crystal_mu
-        Of the crystal, 1/mm. None: it stops all photons.
+        Attenuation coefficient of the crystal, 1/mm. Default: it stops all photons.
     photons_per_decay
-        That are counted if they are stopped.
+        Photons that are counted if they are stopped.
 
     Raises
     ------
     InputError
-        A shape is wrong, or a number is not finite or out of its range.
+        A shape is wrong, or a number is not finite or out of range.
     """
-    points = _checked(points)
+    points = real_array(points, "points", (None, 3))
     _check_edge(aperture_mu, opening_angle)
     if crystal_mu is not None:
         crystal_mu = positive(crystal_mu, "crystal_mu", "1/mm")
     photons_per_decay = positive(photons_per_decay, "photons_per_decay")
     x_u, x_v, h = _in_modules(system, points)
     visible = _seen(system, x_u, x_v, h)
-    h[~visible] = 1.0  # what is not seen must not divide by zero
+    h[~visible] = 1.0  # avoids dividing by zero
     cosine = h / np.sqrt(x_u**2 + x_v**2 + h**2)
     counts = _point_law(h, cosine, paix_diameter(system.pinhole_diameter, aperture_mu, opening_angle))
     counts *= photons_per_decay * visible
@@ -116,28 +105,13 @@ def resolution(
     aperture_mu: float | None = None,
     opening_angle: float = OPENING_ANGLE,
 ) -> Array:
-    """FWHM in object space (P, M), mm, of each module's image across its axis; NaN where it does not see the point.
+    """FWHM in object space (P, M), mm, across each module's axis; NaN where the module does not see the point.
 
     ``R^2 = (d_re (1 + h / l))^2 + (R_i h / l)^2`` with ``d_re = d + ln(2) / mu tan(alpha / 2)``, the diameter at which
-    the knife edge lets half of the photons pass (Accorsi and Metzler 2004, along the axis).
-
-    Parameters
-    ----------
-    system
-        M modules.
-    points
-        (P, 3), world mm.
-    intrinsic_fwhm
-        R_i of the detector, mm on the crystal.
-    aperture_mu, opening_angle
-        As in `sensitivity`. None: d_re = d.
-
-    Raises
-    ------
-    InputError
-        A shape is wrong, or a number is not finite or out of its range.
+    the knife edge transmits half of the photons (Accorsi and Metzler 2004, along the axis). `intrinsic_fwhm` is R_i, mm
+    on the crystal; the other parameters, and the errors, are as in `sensitivity`.
     """
-    points = _checked(points)
+    points = real_array(points, "points", (None, 3))
     _check_edge(aperture_mu, opening_angle)
     intrinsic_fwhm = float(real_array(intrinsic_fwhm, "intrinsic_fwhm", ()))
     if intrinsic_fwhm < 0:
@@ -150,18 +124,10 @@ def resolution(
 
 
 class ModulePerformance(NamedTuple):
-    """What a module does at the isocentre.
+    """Performance at the isocentre.
 
-    Attributes
-    ----------
-    sensitivity : array
-        Counts per decay.
-    resolution : array
-        FWHM in object space, mm.
-    magnification : array
-        l / b.
-    roi_radius_seen : array
-        Radius of the largest sphere that it sees whole, mm.
+    `sensitivity` is in counts per decay, `resolution` (FWHM in object space) in mm, `magnification` is l / b, and
+    `roi_radius_seen` is the radius of the largest sphere that is seen whole, mm.
     """
 
     sensitivity: Array
@@ -183,20 +149,20 @@ def isocentre_performance(
     crystal_mu: float | None = None,
     photons_per_decay: float = 1.0,
 ) -> ModulePerformance:
-    """`sensitivity`, `resolution` and the rest at the isocentre, of one module or of many, from their numbers alone.
+    """Performance of one module or many at the isocentre, from their dimensions alone. It is fast, for live readouts.
 
     Parameters
     ----------
     b, d, l, Ld, Td
-        Pinhole to isocentre, hole's diameter, collimator's length, crystal's side and thickness, mm: numbers or arrays
-        that broadcast.
+        Pinhole to isocentre, diameter of the hole, collimator length, and side and thickness of the crystal, mm:
+        numbers or arrays that broadcast.
     intrinsic_fwhm, aperture_mu, opening_angle, crystal_mu, photons_per_decay
-        As in `sensitivity` and `resolution`, but not checked: this is for readouts that must not wait.
+        As in `sensitivity` and `resolution`, but not checked.
 
     Raises
     ------
     InputError
-        b, d, l or Ld is not finite or out of its range.
+        b, d, l or Ld is not finite or out of range.
     """
     radius = roi_radius_seen(b, d, Ld, l)
     b, d, l, Td = (np.asarray(x, dtype=np.float64) for x in (b, d, l, Td))
@@ -210,7 +176,7 @@ def isocentre_performance(
 
 
 def _in_modules(system: PinholeSystem, points: Array) -> tuple[Array, Array, Array]:
-    """x_u, x_v and h (P, M), mm, of points (P, 3) in the modules' frames: the pinholes lie on the axes, at -b."""
+    """x_u, x_v and h (P, M), mm, of points (P, 3) in the modules' frames."""
     instance(system, PinholeSystem, "system")
     u, v, k = system.frames().transpose(1, 2, 0)
     return points @ u, points @ v, points @ k + system.pinhole_distance
@@ -231,10 +197,6 @@ def _stopped(cosine: Array, mu: float, thickness: Array) -> Array:
 
 def _fwhm(h_per_l: Array, diameter: Array, intrinsic_fwhm: float) -> Array:
     return np.hypot(diameter * (1 + h_per_l), intrinsic_fwhm * h_per_l)
-
-
-def _checked(points: ArrayLike) -> Array:
-    return real_array(points, "points", (None, 3))
 
 
 def _check_edge(aperture_mu: float | None, opening_angle: float) -> None:

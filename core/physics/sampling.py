@@ -1,10 +1,9 @@
 """How completely a system samples the directions around a point.
 
-Tuy: a point's neighbourhood can be reconstructed if every plane through the point meets a source, here a pinhole that sees
-it. Orlov's condition for parallel rays is the same, of great circles and directions. Metzler, Bowsher and Jaszczak show
-how alike they are: as seen from the point, a plane is a great circle on the sphere of directions, and the pinholes are
-points on it. A scanner that stands still has a few pinholes, which planes in general miss; so the measure is by what angle
-they miss them at most.
+By Tuy's condition a point's neighbourhood can be reconstructed if every plane through the point meets a source, here a
+pinhole that sees it. Seen from the point, a plane is a great circle and the pinholes are points on the sphere of
+directions; Orlov's condition for parallel rays has the same form (Metzler, Bowsher and Jaszczak). A stationary scanner
+has few pinholes, and most planes miss them all. The measure is the largest angle by which a plane does.
 
 References
 ----------
@@ -29,37 +28,35 @@ from .performance import seen
 Array = NDArray[np.float64]
 
 TOLERANCE = math.radians(0.1)
-"""How far below the true angle a gap may be, rad, unless another tolerance is asked for."""
+"""Default accuracy of a gap, rad: it may be this much below the true angle."""
 
 _FINEST = 1e-6  # rad
-# Patches along each side of a face of the cube at the start: as small as the gaps of many scanners, 4 degrees.
+# Patches along each side of a cube face at the start: about 6 degrees wide, like the gaps of many scanners.
 _SIDE = 16
-# Points whose planes are searched together, and numbers of an array: what lies in the processor's cache.
+# Points that are searched together, and numbers in an array, such that they stay in the processor's cache.
 _POINTS = 64
 _NUMBERS = 1 << 15
-# A patch's quarters: from its middle by half of its half sides.
+# Middles of a patch's quarters, in units of its half sides.
 _QUARTERS = np.array([[-0.5, -0.5], [-0.5, 0.5], [0.5, -0.5], [0.5, 0.5]])
 
 
 def sampling_gaps(system: PinholeSystem, points: ArrayLike, *, tolerance: float = TOLERANCE) -> Array:
     """The largest angle (P,), rad, by which a plane through each point misses every pinhole that sees the point.
 
-    With unit vectors n across the plane and d_k from the point towards the pinholes it is
-    ``max over n of min over k of asin |n . d_k|``: 0 if the sampling is complete, pi/2 for a single pinhole, or for none.
+    With unit vectors n normal to the plane and d_k from the point to the pinholes it is
+    ``max over n of min over k of asin |n . d_k|``: 0 for complete sampling, pi/2 for a single pinhole or none.
 
     Parameters
     ----------
-    system
-        The modules; which of them see a point, `seen` says.
-    points
-        (P, 3), world mm.
+    system, points
+        As in `seen`.
     tolerance
-        By how much the result may fall short of the maximum, rad.
+        Accuracy, rad: the result may be this much below the true maximum.
 
     Raises
     ------
     InputError
-        A shape is wrong, or a number is not finite or out of its range.
+        A shape is wrong, or a number is not finite or out of range.
     """
     points = real_array(points, "points", (None, 3))
     if positive(tolerance, "tolerance", "rad") < _FINEST:
@@ -73,7 +70,7 @@ def sampling_gaps(system: PinholeSystem, points: ArrayLike, *, tolerance: float 
 
 
 def _towards(centers: Array, points: Array, visible: NDArray[np.bool_]) -> Array:
-    """Unit vectors (P, 3, K) from each point towards the pinholes that see it; where those are fewer, one is repeated."""
+    """Unit vectors (P, 3, K) from each point to the pinholes that see it; one is repeated where there are fewer than K."""
     order = np.argsort(~visible, axis=1, kind="stable")[:, : visible.sum(axis=1).max()]
     order = np.where(np.take_along_axis(visible, order, axis=1), order, order[:, :1])
     vectors = centers[order] - points[:, None]
@@ -81,17 +78,17 @@ def _towards(centers: Array, points: Array, visible: NDArray[np.bool_]) -> Array
 
 
 def _gaps(towards: Array, tolerance: float) -> Array:
-    """The largest gap (P,), rad, between `towards` (P, 3, K): branch and bound over the normals n.
+    """The largest gap (P,), rad, for unit vectors `towards` (P, 3, K), by branch and bound over the normals n.
 
-    The angle of a plane to the nearest pinhole changes at most as fast as n turns. So a patch of normals around n holds no
-    larger gap than that of n plus the patch's radius, and patches that cannot beat the best by more than `tolerance` are
-    left out; the others are cut into quarters.
+    When n turns by an angle, the gap changes by at most that angle. So no normal in a patch around n has a gap larger
+    than that of n plus the patch's radius. Patches that cannot beat the best gap by more than `tolerance` are dropped;
+    the others are quartered.
     """
     best = np.zeros(len(towards))
     whole = _patches()
     bounds = _bounds(whole, towards, np.arange(len(towards)), best)
     likeliest = bounds == bounds.max(axis=1, keepdims=True)
-    for some in (likeliest, ~likeliest):  # what is found in one rules out many others
+    for some in (likeliest, ~likeliest):  # the likeliest patch first: its gap rules out many others
         point, patch = np.nonzero(some & (bounds > best[:, None] + tolerance))
         patches = whole[0, patch]
         while len(point):
@@ -105,9 +102,10 @@ def _gaps(towards: Array, tolerance: float) -> Array:
 
 @functools.cache
 def _patches() -> Array:
-    """Patches (1, N, 3, 3) that hold a normal of every plane: middle, and two half sides, on three faces of a cube.
+    """Patches (1, N, 3, 3) of a cube's surface, each a middle and two half sides, that cover the normals of all planes.
 
-    n and -n are one plane, so three faces hold all. Seen from the cube's middle the patches are of one size, nearly.
+    As n and -n describe the same plane, three faces are enough. Seen from the cube's centre the patches are about
+    equal.
     """
     edges = np.tan(np.linspace(-math.pi / 4, math.pi / 4, _SIDE + 1))
     a, b = np.meshgrid((edges[1:] + edges[:-1]) / 2, (edges[1:] + edges[:-1]) / 2)
@@ -118,7 +116,7 @@ def _patches() -> Array:
 
 
 def _bounds(patches: Array, towards: Array, point: NDArray[np.intp], best: Array) -> Array:
-    """Bounds (A, N) of the gaps in patches (A or 1, N, 3, 3) of points; `best` (P,) learns the gaps in their middle."""
+    """Upper bounds (A, N) of the gaps in patches (A or 1, N, 3, 3) of points; raises `best` (P,) to the middles' gaps."""
     middles, sines = patches[:, :, 0], np.empty((len(point), patches.shape[1]))
     size = max(1, _NUMBERS // (patches.shape[1] * towards.shape[2]))
     for first in range(0, len(point), size):
@@ -128,7 +126,7 @@ def _bounds(patches: Array, towards: Array, point: NDArray[np.intp], best: Array
     distance, radius = _lengths(middles), _lengths(patches[:, :, 1] + patches[:, :, 2])
     angles = np.arcsin(np.minimum(sines / distance, 1))
     np.maximum.at(best, point, angles.max(axis=1))
-    # Seen from the cube's middle, what is on its face turns at most by length over distance.
+    # Seen from the cube's centre, a length on its face spans at most the angle length / distance.
     return angles + radius / np.maximum(1, distance - radius)
 
 

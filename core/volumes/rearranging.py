@@ -1,4 +1,4 @@
-"""Changes of a volume that leave its voxels' values as they are: crop, pad, turn, move, and split by labels."""
+"""Changes that keep the voxels' values: crop, pad, reorient, move, and split by labels."""
 
 from __future__ import annotations
 
@@ -10,20 +10,16 @@ from numpy.typing import ArrayLike, NDArray
 from ..errors import InputError
 from ..geometry.grid import Grid
 from ..memory import require
-from ..validation import freeze, real_array
-from .resampling import outside_value
-from .volume import Volume, require_volume
+from ..validation import freeze, instance, one_for_all, real_array
+from .volume import Volume, outside_value
 
 
 def crop(volume: Volume, start: ArrayLike, stop: ArrayLike) -> Volume:
-    """The voxels with indices from `start` (3,) up to but without `stop` (3,), where they are.
+    """The part from index `start` (3,) up to, but without, `stop` (3,); its place in the world stays the same.
 
-    Raises
-    ------
-    InputError
-        Nothing would be left, or the indices reach beyond the grid.
+    `InputError` if the part is empty or reaches beyond the grid.
     """
-    require_volume(volume, "crop")
+    instance(volume, Volume, "crop")
     low, high = _indices(start, "crop start"), _indices(stop, "crop stop")
     shape = np.array(volume.grid.shape)
     if np.any(low < 0) or np.any(high > shape) or np.any(low >= high):
@@ -35,21 +31,18 @@ def crop(volume: Volume, start: ArrayLike, stop: ArrayLike) -> Volume:
 
 
 def crop_to_box(volume: Volume, low: ArrayLike, high: ArrayLike) -> Volume:
-    """The fewest voxels that hold all of the volume in the box from `low` (3,) to `high` (3,), world mm.
+    """The smallest part that holds all of the volume inside the box from `low` (3,) to `high` (3,), world mm.
 
-    Raises
-    ------
-    InputError
-        The box has no inside, or the volume is not in it.
+    `InputError` if the box is empty or does not meet the volume.
     """
-    require_volume(volume, "crop_to_box")
+    instance(volume, Volume, "crop_to_box")
     low, high = real_array(low, "box", (3,)), real_array(high, "box", (3,))
     if np.any(low >= high):
         raise InputError(f"box: expected low below high, got {low.tolist()} to {high.tolist()} mm")
     corners = np.stack(np.meshgrid(*zip(low, high, strict=True), indexing="ij"), axis=-1).reshape(-1, 3)
     back = volume.grid.index_from_world
     index = corners @ back[:3, :3].T + back[:3, 3]
-    # What only touches a voxel's face, to rounding, does not need the voxel.
+    # A box that only touches a voxel's face, up to rounding, does not include the voxel.
     start = np.clip(np.floor(index.min(axis=0) + 0.5 + 1e-6), 0, volume.grid.shape).astype(int)
     stop = np.clip(np.ceil(index.max(axis=0) + 0.5 - 1e-6), 0, volume.grid.shape).astype(int)
     if np.any(start >= stop):
@@ -58,16 +51,11 @@ def crop_to_box(volume: Volume, low: ArrayLike, high: ArrayLike) -> Volume:
 
 
 def pad(volume: Volume, before: ArrayLike, after: ArrayLike, value: float | None = None) -> Volume:
-    """`before` (3,) voxels more in front and `after` (3,) more behind, along each index axis.
+    """The volume with `before` (3,) more voxels at the front and `after` (3,) at the back of each index axis.
 
-    Parameters
-    ----------
-    volume, before, after
-        What is padded, and by how many voxels; one number means the same along all axes.
-    value
-        Of the new voxels. Default: 0, or -1000 of CT numbers.
+    One number stands for all axes. `value` fills the new voxels; default 0, or -1000 for CT numbers.
     """
-    require_volume(volume, "pad")
+    instance(volume, Volume, "pad")
     low, high = _indices(before, "pad before"), _indices(after, "pad after")
     if np.any(low < 0) or np.any(high < 0):
         raise InputError("pad: expected whole numbers of voxels of at least 0")
@@ -80,10 +68,10 @@ def pad(volume: Volume, before: ArrayLike, after: ArrayLike, value: float | None
 
 
 def canonical(volume: Volume) -> Volume:
-    """The same voxels in the world, indexed along the axes closest to right, front, head (RAS): flipped, transposed."""
-    require_volume(volume, "canonical")
+    """The volume flipped and transposed so that its index axes are closest to right, front and head (RAS)."""
+    instance(volume, Volume, "canonical")
     directions = volume.grid.affine[:3, :3] / volume.grid.spacing
-    # The assignment of index axes to world axes with the largest sum of cosines, so that none is taken twice.
+    # Of all assignments of index axes to world axes the one with the largest sum of cosines.
     order = max(permutations(range(3)), key=lambda axes: sum(abs(directions[i, axis]) for i, axis in enumerate(axes)))
     array, affine = volume.array.transpose(order), volume.grid.affine[:, [*order, 3]].copy()
     for axis in range(3):
@@ -96,34 +84,33 @@ def canonical(volume: Volume) -> Volume:
 
 
 def centered(volume: Volume, point: ArrayLike = (0.0, 0.0, 0.0)) -> Volume:
-    """The volume, moved so that its middle lies at `point` (3,), world mm; default the isocentre."""
-    require_volume(volume, "centered")
+    """The volume, moved so that its middle is at `point` (3,), world mm."""
+    instance(volume, Volume, "centered")
     affine = volume.grid.affine.copy()
     affine[:3, 3] += real_array(point, "point", (3,)) - volume.grid.center
     return Volume(volume.array, Grid(volume.grid.shape, affine), volume.quantity)
 
 
 def split_labels(volume: Volume, labels: Volume | NDArray) -> dict[int, Volume]:
-    """One volume for each structure: the values where `labels` is that label, and outside 0, or -1000 of CT numbers.
+    """One volume for each label, with the values where `labels` has that label, and elsewhere 0, or -1000 for CT numbers.
 
     Parameters
     ----------
     volume
-        What is split.
     labels
         Whole numbers: a volume on the same grid, or an array of its shape.
 
     Returns
     -------
     dict
-        Volumes by label, all that there are, 0 (which usually is the background) too.
+        Volumes by label; 0, usually the background, is included.
 
     Raises
     ------
     InputError
-        Another grid or shape, or labels that are no whole numbers.
+        The grid or shape differs, or labels are not whole numbers.
     """
-    require_volume(volume, "split_labels")
+    instance(volume, Volume, "split_labels")
     if isinstance(labels, Volume):
         same = labels.grid.shape == volume.grid.shape and np.allclose(
             labels.grid.affine, volume.grid.affine, rtol=0, atol=1e-3 * volume.grid.spacing.min()
@@ -139,22 +126,22 @@ def split_labels(volume: Volume, labels: Volume | NDArray) -> dict[int, Volume]:
     if not (found == np.floor(found)).all():
         raise InputError(f"labels: expected whole numbers, got {found[found != np.floor(found)][0]:g}")
     require(4.0 * array.size * len(found), f"a volume for each of {len(found)} labels")
-    beside = np.float32(outside_value(volume))
+    background = np.float32(outside_value(volume))
     return {
-        int(label): Volume(freeze(np.where(array == label, volume.array, beside)), volume.grid, volume.quantity)
+        int(label): Volume(freeze(np.where(array == label, volume.array, background)), volume.grid, volume.quantity)
         for label in found
     }
 
 
 def _indices(value: ArrayLike, name: str) -> NDArray[np.int64]:
-    numbers = real_array(np.broadcast_to(value, 3) if np.ndim(value) == 0 else value, name, (3,))
+    numbers = one_for_all(value, name, 3)
     if not (numbers == np.floor(numbers)).all():
         raise InputError(f"{name}: expected whole numbers of voxels, got {numbers.tolist()}")
     return numbers.astype(np.int64)
 
 
 def _moved(volume: Volume, array: NDArray[np.float32], start: NDArray[np.int64]) -> Volume:
-    """`array`, whose first voxel has the index `start` in `volume`."""
+    """`array` as a volume whose first voxel has the index `start` in `volume`."""
     affine = volume.grid.affine.copy()
     affine[:3, 3] += affine[:3, :3] @ start
     n_x, n_y, n_z = array.shape

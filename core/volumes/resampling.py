@@ -1,4 +1,4 @@
-"""A volume's values on another grid."""
+"""Resampling of volumes onto other grids."""
 
 from __future__ import annotations
 
@@ -10,60 +10,50 @@ from numpy.typing import NDArray
 from ..errors import InputError
 from ..geometry.grid import Grid
 from ..memory import require
-from ..physics.ct_numbers import AIR_HU
 from ..progress import Progress
-from ..validation import freeze, real_array
-from .volume import Volume, require_volume
+from ..validation import freeze, instance, real_array
+from .volume import Volume, outside_value
 
-# Indices of the given grid along an axis, and their weights: (n, taps) each, for n voxels of the new grid.
+# For n voxels of the new grid along an axis: indices of the old grid and their weights, (n, taps) each.
 _Taps = tuple[NDArray[np.int64], NDArray[np.float32]]
 
-_PARALLEL = 1e-9  # of a voxel per voxel: axes that turn by less are parallel
+_PARALLEL = 1e-9  # voxels per voxel: axes that deviate by less are parallel
 _SLAB = 1 << 20  # samples at once
-
-
-def outside_value(volume: Volume) -> float:
-    """What lies outside a volume's grid: air, -1000, for CT numbers, and 0 of everything else."""
-    return AIR_HU if volume.quantity == "hu" else 0.0
 
 
 def resample(
     volume: Volume, grid: Grid, method: str = "linear", outside: float | None = None, progress: Progress | None = None
 ) -> Volume:
-    """`volume` on `grid`.
+    """Resample `volume` onto `grid`; both may have any affine.
 
     Parameters
     ----------
-    volume
-        Of any grid; voxels reach half a step beyond their centres.
-    grid
-        The new one: any affine.
+    volume, grid
     method
-        ``"linear"``: trilinear interpolation between the voxels' centres. ``"nearest"``: of the voxel that holds the new
-        voxel's centre (labels). ``"mean"``: the mean over the new voxel, for coarser grids: the sum of value x volume is
-        kept. It is exact where the grids' axes are parallel; else it is that of points in each new voxel, at least two
-        along each axis and about one for each old voxel.
+        ``"linear"``: trilinear interpolation between voxel centres. ``"nearest"``: the voxel that holds the new voxel's
+        centre (for labels). ``"mean"``: the mean over the new voxel, which keeps the sum of value x volume (for coarser
+        grids); it is exact if the grids' axes are parallel, and otherwise the mean of points in the new voxel, at least
+        two along each axis and about one for each old voxel.
     outside
-        The value beside the old grid. Default: 0, or -1000 of CT numbers.
+        Value outside the old grid. Default: 0, or -1000 for CT numbers.
     progress
-        Called as ``progress(done, total)`` with slabs; may raise `Cancelled`.
+        Called as ``progress(done, total)`` between slabs; may raise `Cancelled`.
 
     Raises
     ------
     InputError
-        No volume, no grid, an unknown method, or the new volume does not fit into memory.
+        Not a volume or a grid, an unknown method, or the new volume does not fit into memory.
     """
     if method not in ("linear", "nearest", "mean"):
         raise InputError(f"method {method!r}: expected linear, nearest or mean")
-    require_volume(volume, "resample")
-    if not isinstance(grid, Grid):
-        raise InputError(f"resample: expected a Grid, got {type(grid).__name__}")
-    beside = np.float32(outside_value(volume) if outside is None else float(real_array(outside, "outside", ())))
+    instance(volume, Volume, "resample")
+    instance(grid, Grid, "resample")
+    background = np.float32(outside_value(volume) if outside is None else float(real_array(outside, "outside", ())))
     require(4.5 * grid.n_voxels, "a volume of {} x {} x {} voxels".format(*grid.shape))
-    index_from_index = volume.grid.index_from_world @ grid.affine  # of the given volume, from the new one
+    index_from_index = volume.grid.index_from_world @ grid.affine  # index in the old grid from index in the new one
     result = np.empty(grid.shape, np.float32)
     fill = _along_axes if _is_parallel(index_from_index) else _at_points
-    fill(volume.array, beside, index_from_index, method, result, progress or (lambda done, total: None))
+    fill(volume.array, background, index_from_index, method, result, progress or (lambda done, total: None))
     return Volume(freeze(result), grid, volume.quantity)
 
 
@@ -75,14 +65,14 @@ def _is_parallel(index_from_index: NDArray[np.float64]) -> bool:
 
 def _along_axes(
     array: NDArray[np.float32],
-    beside: np.float32,
+    background: np.float32,
     index_from_index: NDArray[np.float64],
     method: str,
     result: NDArray[np.float32],
     progress: Callable[[int, int], None],
 ) -> None:
-    """Fill `result` one axis after the other."""
-    old_axes = np.abs(index_from_index[:3, :3]).argmax(axis=0)  # of each new axis
+    """Fill `result`, one axis after the other."""
+    old_axes = np.abs(index_from_index[:3, :3]).argmax(axis=0)  # the old axis of each new one
     taps = []
     for new, old in enumerate(old_axes):
         at = index_from_index[old, new] * np.arange(result.shape[new]) + index_from_index[old, 3]
@@ -93,19 +83,21 @@ def _along_axes(
     for first in range(0, result.shape[0], slab):
         part = slice(first, first + slab)
         index, weight = taps[0]
-        values = _apply(array, beside, (index[part], weight[part]), 0)
+        values = _apply(array, background, (index[part], weight[part]), 0)
         for axis in (1, 2):
             values = _apply(values, np.float32(0), taps[axis], axis)
-        result[part] = values + beside
+        result[part] = values + background
         progress(min(first + slab, result.shape[0]), result.shape[0])
 
 
-def _apply(array: NDArray[np.float32], beside: np.float32, taps: _Taps, axis: int) -> NDArray[np.float32]:
-    """Sums of ``(array - beside)`` times weights along one axis."""
+def _apply(array: NDArray[np.float32], background: np.float32, taps: _Taps, axis: int) -> NDArray[np.float32]:
+    """Weighted sums of ``array - background`` along one axis."""
     index, weight = taps
     shape = [1, 1, 1]
     shape[axis] = len(index)
-    return sum((np.take(array, i, axis) - beside) * w.reshape(shape) for i, w in zip(index.T, weight.T, strict=True))
+    return sum(
+        (np.take(array, i, axis) - background) * w.reshape(shape) for i, w in zip(index.T, weight.T, strict=True)
+    )
 
 
 def _nearest_taps(at: NDArray[np.float64], step: float, n: int) -> _Taps:
@@ -124,7 +116,7 @@ def _linear_taps(at: NDArray[np.float64], step: float, n: int) -> _Taps:
 
 
 def _mean_taps(at: NDArray[np.float64], step: float, n: int) -> _Taps:
-    """Shares of the new voxel, from ``at - step/2`` to ``at + step/2``, that lie in each old one."""
+    """Fractions of the new voxel, from ``at - step/2`` to ``at + step/2``, that lie in each old voxel."""
     low, high = at - step / 2 + 0.5, at + step / 2 + 0.5  # voxel i reaches from i to i + 1
     index = np.floor(low).astype(np.int64)[:, None] + np.arange(int(np.ceil(step)) + 1)
     overlap = np.minimum(high[:, None], index + 1) - np.maximum(low[:, None], index)
@@ -137,20 +129,20 @@ _TAPS = {"nearest": _nearest_taps, "linear": _linear_taps, "mean": _mean_taps}
 
 def _at_points(
     array: NDArray[np.float32],
-    beside: np.float32,
+    background: np.float32,
     index_from_index: NDArray[np.float64],
     method: str,
     result: NDArray[np.float32],
     progress: Callable[[int, int], None],
 ) -> None:
-    """Fill `result` from points of its voxels: the centres, or for means several in each."""
+    """Fill `result` from sample points: its voxels' centres, or several points in each voxel for means."""
     linear, origin = index_from_index[:3, :3], index_from_index[:3, 3]
     counts = [1, 1, 1]
     if method == "mean":
         counts = [max(2, int(np.ceil(length))) for length in np.abs(linear).max(axis=0)]
     fractions = [(np.arange(count) + 0.5) / count - 0.5 for count in counts]
     shifts = np.stack(np.meshgrid(*fractions, indexing="ij"), axis=-1).reshape(-1, 3) @ linear.T
-    sample = _linear_samples if method == "linear" else _nearest_samples
+    taps = _linear_taps if method == "linear" else _nearest_taps
     j, k = np.meshgrid(np.arange(result.shape[1]), np.arange(result.shape[2]), indexing="ij")
     in_plane = linear[:, 1:] @ np.stack([j.ravel(), k.ravel()]) + origin[:, None]
     for i, plane in enumerate(result):
@@ -160,32 +152,19 @@ def _at_points(
             points = in_plane[:, part] + (linear[:, 0] * i)[:, None]
             total = np.zeros(points.shape[1], np.float32)
             for shift in shifts:
-                total += sample(array, beside, points + shift[:, None])
-            values[part] = total / len(shifts) + beside
+                total += _samples(array, background, points + shift[:, None], taps)
+            values[part] = total / len(shifts) + background
         progress(i + 1, len(result))
 
 
-def _nearest_samples(
-    array: NDArray[np.float32], beside: np.float32, points: NDArray[np.float64]
+def _samples(
+    array: NDArray[np.float32], background: np.float32, points: NDArray[np.float64], taps: Callable[..., _Taps]
 ) -> NDArray[np.float32]:
-    """``array - beside`` at `points` (3, N), indices; 0 outside."""
-    index = np.floor(points + 0.5).astype(np.int64)
-    size = np.array(array.shape)[:, None]
-    inside = ((index >= 0) & (index < size)).all(axis=0)
-    return (array[tuple(index.clip(0, size - 1))] - beside) * inside
-
-
-def _linear_samples(array: NDArray[np.float32], beside: np.float32, points: NDArray[np.float64]) -> NDArray[np.float32]:
-    """As `_nearest_samples`, interpolated."""
-    size = np.array(array.shape)[:, None]
-    inside = ((points >= -0.5) & (points <= size - 0.5)).all(axis=0)
-    points = points.clip(0, size - 1)
-    low = np.floor(points).astype(np.int64)
-    share = (points - low).astype(np.float32)
-    high = np.minimum(low + 1, size - 1)
+    """``array - background`` at index coordinates `points` (3, N), from the voxels and weights of `taps`; 0 outside."""
+    (x, x_weight), (y, y_weight), (z, z_weight) = (
+        [part.T.copy() for part in taps(at, 1.0, n)] for at, n in zip(points, array.shape, strict=True)
+    )
     total = np.zeros(points.shape[1], np.float32)
-    for corner in np.ndindex(2, 2, 2):
-        index = tuple(high[axis] if up else low[axis] for axis, up in enumerate(corner))
-        weight = np.prod([share[axis] if up else 1 - share[axis] for axis, up in enumerate(corner)], axis=0)
-        total += weight * (array[index] - beside)
-    return total * inside
+    for i, j, k in np.ndindex(len(x), len(y), len(z)):
+        total += x_weight[i] * y_weight[j] * z_weight[k] * (array[x[i], y[j], z[k]] - background)
+    return total

@@ -1,8 +1,11 @@
-"""Volumes in files: which format a file is in, and one clear line for every file that is none."""
+"""Volumes in files: the formats by their endings, and one clear line for every file that cannot be read."""
 
 from __future__ import annotations
 
 import os
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 
 from numpy.typing import ArrayLike
@@ -10,37 +13,28 @@ from numpy.typing import ArrayLike
 from ..errors import InputError
 from ..files import replacing
 from ..progress import Cancelled, Progress
-from ..validation import real_array
+from ..validation import instance, real_array
 from .formats import dicom, hdf5, metaimage, nifti, nrrd, numpy_files
 from .formats.contents import Contents, first_line
-from .volume import UNITS, Volume, require_volume
+from .volume import UNITS, Volume
 
 _READERS = {
-    ".nii": nifti.read,
-    ".nii.gz": nifti.read,
-    ".hdr": nifti.read,
-    ".img": nifti.read,
-    ".npz": numpy_files.read,
-    ".npy": numpy_files.read,
-    ".nrrd": nrrd.read,
-    ".nhdr": nrrd.read,
-    ".mha": metaimage.read,
-    ".mhd": metaimage.read,
-    ".h5": hdf5.read,
-    ".hdf5": hdf5.read,
+    **dict.fromkeys((".nii", ".nii.gz", ".hdr", ".img"), nifti.read),
+    **dict.fromkeys((".npz", ".npy"), numpy_files.read),
+    **dict.fromkeys((".nrrd", ".nhdr"), nrrd.read),
+    **dict.fromkeys((".mha", ".mhd"), metaimage.read),
+    **dict.fromkeys((".h5", ".hdf5"), hdf5.read),
 }
 _WRITERS = {
-    ".nii": nifti.write,
-    ".nii.gz": nifti.write,
+    **dict.fromkeys((".nii", ".nii.gz"), nifti.write),
     ".npz": numpy_files.write,
     ".nrrd": nrrd.write,
-    ".h5": hdf5.write,
-    ".hdf5": hdf5.write,
+    **dict.fromkeys((".h5", ".hdf5"), hdf5.write),
 }
 VOLUME_FORMATS = tuple(_WRITERS)
-"""Endings of the names of files that `write_volume` writes."""
+"""Endings that `write_volume` writes."""
 READ_FORMATS = (*_READERS, ".dcm")
-"""Endings of the names of files that `read_volume` reads, beside folders of DICOM files and their files of any name."""
+"""Endings that `read_volume` reads, besides folders of DICOM files and DICOM files of any name."""
 
 
 def read_volume(
@@ -53,39 +47,37 @@ def read_volume(
 ) -> Volume:
     """Read a volume from NIfTI, a DICOM series or tomogram, MetaImage, NRRD, Analyze, HDF5, .npz or .npy.
 
-    The world's axes are RAS, NIfTI's, whatever the format's are. docs/volumes.md has the formats and conventions.
+    World axes are always NIfTI's, RAS. docs/volumes.md describes the formats and conventions.
 
     Parameters
     ----------
     path
-        The file; of a DICOM series its folder, or any file of it.
+        The file. For a DICOM series: its folder, or any of its files.
     quantity
         What the values are: one of `UNITS`, such as ``"activity"`` (kBq/mL), ``"mu"`` (1/mm) or ``"hu"``. Default: what
-        the file says; a file that says nothing is taken for CT, ``"hu"``.
+        the file says, or ``"hu"`` if it says nothing.
     affine
-        Index to world mm (4, 4), in place of the file's own; .npy files need it.
+        Index to world mm (4, 4), instead of the file's own; .npy files need it.
     series
-        Of several DICOM series in the folder the one with this number, description or UID.
+        Number, description or UID of one of several DICOM series in the folder.
     progress
         Called as ``progress(done, total)`` with the slices of a DICOM series; may raise `Cancelled`.
 
     Raises
     ------
     InputError
-        No such file, not such a file, damaged, not 3-D, not finite, in another unit, too large for the memory; of a DICOM
-        series: several of them, slices missing, double, unlike each other or tilted; of nuclear medicine, something else
-        than one reconstructed tomogram.
+        The file does not exist, is damaged, not 3-D, not finite, in another unit or too large for the memory; a DICOM
+        series is not unique, or slices are missing, duplicate, inconsistent or tilted; a nuclear medicine file is not a
+        single reconstructed tomogram.
     """
     path = Path(path)
     contents = _contents(path, series, progress)
-    try:
+    with _naming(path):
         if affine is not None:
-            contents = Contents(contents.array, real_array(affine, "affine", (4, 4)), contents.quantity, contents.unit)
+            contents = replace(contents, affine=real_array(affine, "affine", (4, 4)))
         if contents.quantity is not None and contents.quantity not in UNITS and quantity is None:
             raise InputError(f"it holds {contents.quantity!r}: say which quantity that is, one of {', '.join(UNITS)}")
         return contents.volume(quantity or contents.quantity or "hu")
-    except InputError as error:
-        raise InputError(f"{path}: {error}") from None
 
 
 def read_volume_of(
@@ -96,30 +88,17 @@ def read_volume_of(
     series: str | None = None,
     progress: Progress | None = None,
 ) -> Volume:
-    """Read a volume that has to hold `quantity`: a file that says nothing is taken for it.
+    """Read a volume that has to hold `quantity`; a file that does not say what it holds is taken for that.
 
-    Parameters
-    ----------
-    path, quantity
-        The file; one of `UNITS`.
-    advice
-        Ends the message to a file that says another quantity.
-    series, progress
-        As of `read_volume`.
-
-    Raises
-    ------
-    InputError
-        The file says that it holds another quantity; as of `read_volume`.
+    Parameters and errors are as in `read_volume`. A file that says another quantity is refused; `advice` ends the
+    message.
     """
     path = Path(path)
     contents = _contents(path, series, progress)
-    try:
+    with _naming(path):
         if contents.quantity in UNITS and contents.quantity != quantity:
             raise InputError(f"it holds {contents.quantity}, expected {quantity} in {UNITS[quantity]}{advice}")
         return contents.volume(quantity)
-    except InputError as error:
-        raise InputError(f"{path}: {error}") from None
 
 
 def write_volume(volume: Volume, path: str | os.PathLike[str]) -> None:
@@ -128,55 +107,62 @@ def write_volume(volume: Volume, path: str | os.PathLike[str]) -> None:
     Raises
     ------
     InputError
-        No volume, another suffix, or the file cannot be written.
+        Not a volume, another ending, or the file cannot be written.
     """
     path = Path(path)
     write = _WRITERS.get(_ending(path, VOLUME_FORMATS))
     if write is None:
         raise InputError(f"{path}: expected a name ending in {', '.join(VOLUME_FORMATS)}")
-    require_volume(volume, "write_volume")
+    instance(volume, Volume, "write_volume")
     with replacing(path) as temporary:
         write(volume, temporary)
 
 
+@contextmanager
+def _naming(path: Path) -> Iterator[None]:
+    """Put the file's name before the messages of input errors."""
+    try:
+        yield
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from None
+
+
 def _contents(path: Path, series: str | None, progress: Progress | None) -> Contents:
-    """What the file at `path` holds, or `InputError` that names it."""
+    """What the file or folder at `path` holds."""
     _require_readable(path)
     ending = _ending(path, READ_FORMATS)
     is_series = path.is_dir() or ending == ".dcm" or (not ending and dicom.is_dicom(path))
-    if not (ending or is_series):
-        raise InputError(f"{path}: expected a folder of DICOM files, or a name ending in {', '.join(READ_FORMATS)}")
-    if path.is_file() and path.stat().st_size == 0:
-        raise InputError(f"{path}: it is empty")
-    if series is not None and not is_series:
-        raise InputError(f"{path}: only folders of DICOM files hold several series")
-    try:
-        return dicom.read(path, series, progress) if is_series else _READERS[ending](path)
-    except InputError as error:
-        raise InputError(f"{path}: {error}") from None
-    except (MemoryError, Cancelled):
-        raise
-    except Exception as error:  # whatever a library raises on a damaged file
-        raise InputError(
-            f"{path}: cannot be read as {'DICOM' if is_series else ending} ({first_line(error)})"
-        ) from error
+    with _naming(path):
+        if not (ending or is_series):
+            raise InputError(f"expected a folder of DICOM files, or a name ending in {', '.join(READ_FORMATS)}")
+        if path.is_file() and path.stat().st_size == 0:
+            raise InputError("it is empty")
+        if series is not None and not is_series:
+            raise InputError("only folders of DICOM files hold several series")
+        try:
+            return dicom.read(path, series, progress) if is_series else _READERS[ending](path)
+        except (InputError, MemoryError, Cancelled):
+            raise
+        except Exception as error:  # whatever a library raises on a damaged file
+            kind = "DICOM" if is_series else ending
+            raise InputError(f"cannot be read as {kind} ({first_line(error)})") from error
 
 
 def _require_readable(path: Path) -> None:
-    """Raise `InputError` unless there is a file or a folder that may be read; libraries say little about that."""
+    """Raise `InputError` unless `path` is a file or folder that may be read; libraries say little about that."""
     try:
         path.stat()
         if path.is_file():
             path.open("rb").close()
     except FileNotFoundError:
         raise InputError(f"{path}: no such file") from None
-    except (OSError, ValueError) as error:  # a name that cannot be is a ValueError
+    except (OSError, ValueError) as error:  # an impossible name is a ValueError
         raise InputError(f"{path}: {getattr(error, 'strerror', None) or error}") from None
-    if not (path.is_file() or path.is_dir()):  # a pipe would keep its reader waiting
+    if not (path.is_file() or path.is_dir()):  # reading a pipe would block
         raise InputError(f"{path}: neither a file nor a folder")
 
 
 def _ending(path: Path, endings: tuple[str, ...]) -> str:
-    """The one of `endings` that the name has, or ""."""
+    """Which of `endings` the name has, or ""."""
     name = path.name.lower()
     return next((ending for ending in endings if name.endswith(ending)), "")

@@ -9,7 +9,7 @@ import pytest
 from mphdrr.addon import scanner
 from mphdrr.core.errors import InputError
 from mphdrr.core.geometry.collimator import Collimator, Construction
-from mphdrr.core.geometry.collimator_mesh import check_watertight, collimator_solid, crystal_solid, signed_volume
+from mphdrr.core.geometry.collimator_mesh import check_watertight, collimator_solid, crystal_solid
 
 trimesh = pytest.importorskip("trimesh")
 
@@ -43,7 +43,7 @@ def test_collimator_is_watertight_with_one_hole(size):
     mesh = as_trimesh(*solid)
     assert mesh.is_watertight and mesh.is_winding_consistent
     assert mesh.euler_number == 0  # genus 1: the hole goes through
-    assert mesh.volume > 0 and mesh.volume == pytest.approx(signed_volume(solid))
+    assert mesh.volume > 0
 
 
 @pytest.mark.parametrize("size", SIZES)
@@ -70,7 +70,7 @@ def test_collimator_has_the_volume_of_its_walls(size):
         - cone(front)
         - cone(back)
     )
-    assert signed_volume(collimator_solid(body(*size))) == pytest.approx(expected)
+    assert as_trimesh(*collimator_solid(body(*size))).volume == pytest.approx(expected)
 
 
 def test_crystal_is_a_box_behind_the_collimator():

@@ -35,7 +35,7 @@ def ellipse_area(length, slope):
 
 
 def test_path_through_the_edge_equals_a_fine_walk_along_the_line(rng):
-    for _ in range(40):
+    for _ in range(12):
         radius, angle, slope_u, slope_v = rng.uniform((1.1, 0, -0.5, -0.5), (2.5, 7, 0.5, 0.5))
         x, y = radius * np.cos(angle), radius * np.sin(angle)
         z = np.linspace(-60, 60, 1_200_001)
@@ -117,7 +117,7 @@ def test_points_for_a_tolerance_keep_it(fwhm):
         shifted = (np.roll(fine, shift, axis=(0, 1)) for shift in itertools.product(begins, begins))
         return max(np.abs(image.reshape(pixels + pixels).sum(axis=(1, 3))).sum() for image in shifted)
 
-    for pitch in (0.2, 0.4, 1.6, 4.0):
+    for pitch in (0.2, 1.6, 4.0):
         for tolerance in (0.1, 0.04):
             model = emission(system, aperture_tolerance=tolerance, intrinsic_fwhm=fwhm)
             n = model.hole_points(system.views((8, 8), "real", pitch=pitch), 0, mph.Grid.centered((1, 1, 1), 2.0))
@@ -212,7 +212,7 @@ def test_weights_of_tensors_are_those_of_arrays_and_differentiable():
     model = emission(one_module(), **OPTIONS)
     u, v = np.linspace(-24, 23, 6)[None], np.linspace(-22, 21, 5)[:, None]
     for opening in model.openings(0, 3)[::4]:
-        for layer in range(3):
+        for layer in (0, 2):
             expected = model.pixel_weights(0, u, v, (0.5, 0.4), 60.0, opening, layer)
             given = [torch.tensor(x, dtype=torch.float64, requires_grad=True) for x in (u, v, 60.0)]
 

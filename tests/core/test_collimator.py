@@ -1,7 +1,7 @@
 """The collimator's one description: rays through what is drawn, written to files and simulated, by ray casters of our own.
 
-Every ray goes from a point in front of a module to a point of its crystal's front face, and is cut with triangles read back
-from files, or with the convex solids of a GATE macro or script, less the air that is their daughter.
+Every ray goes from a point in front of a module to a point of its crystal's front face, and is cut with triangles read
+back from files, or with the convex solids of a GATE macro or script, less the air that is their daughter.
 """
 
 from __future__ import annotations
@@ -120,7 +120,7 @@ def assert_only_the_hole_is_open(through: Rays, past: Rays, cut) -> None:
 @pytest.mark.parametrize("place", PLACES)
 def test_every_roi_ray_passes_the_mesh_and_the_stl_file_through_the_hole_alone(scanner, tmp_path, rng, place):
     trimesh = pytest.importorskip("trimesh")
-    chosen = scanner if place == "middle" else scanner[::9]
+    chosen = scanner[::9]
     write_geometry(chosen, tmp_path / "stl", "stl-parts", part="collimators", edge_at=place)
     parts = [p for p in module_parts(chosen, Construction(edge_at=place)) if p.kind == "collimator"]
     for m, part in enumerate(parts):
@@ -129,7 +129,6 @@ def test_every_roi_ray_passes_the_mesh_and_the_stl_file_through_the_hole_alone(s
         through, past = rays_of(rng, chosen, m)
         drawn = world_to_module(chosen, m, part.vertices[part.triangles])
         written = world_to_module(chosen, m, np.asarray(read.triangles))
-        assert_only_the_hole_is_open(through, past, lambda rays, shape=drawn: cut_by_triangles(rays, shape))
         for shape in (drawn, written):
             assert_only_the_hole_is_open(through, past, lambda rays, shape=shape: cut_by_triangles(rays, shape))
 
@@ -286,6 +285,7 @@ def test_open_share_is_that_of_rays(scanner, rng, place):
 
 def test_what_shades_the_roi_is_found_and_what_does_not_is_not(scanner):
     """The needed angle clears the hole for any plate; a degree less does not; a straight hole is open by 50 to 75 %."""
+    scanner = scanner[::5]
     assert mph.check_geometry(scanner).vignetted == ()
     needed = [
         needed_angle(*x)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import json
 
 import numpy as np
@@ -10,12 +9,11 @@ import pytest
 
 import mphdrr.core as mph
 from mphdrr.core.cli import main
-from mphdrr.core.geometry.checks.blocking import cone_directions, meets
-from mphdrr.core.geometry.checks.coverage import unseen_share
+from mphdrr.core.geometry.checks.field_of_view import cone_directions, hits, unseen_share
 from mphdrr.core.geometry.checks.hulls import Hulls
-from mphdrr.core.geometry.checks.meshes import find_open_meshes
 from mphdrr.core.geometry.checks.overlaps import penetration_depths
 from mphdrr.core.geometry.collimator import Collimator, Construction
+from mphdrr.core.geometry.collimator_mesh import surface_fault
 from mphdrr.core.geometry.module_parts import module_parts
 
 
@@ -152,7 +150,7 @@ def test_a_module_in_front_blocks_the_rays_that_meet_it():
 def test_a_sliver_of_a_thousandth_is_found(rng):
     """Small modules that just reach over the silhouette of the ROI, at any place around it."""
     found = []
-    for angle, beyond in zip(rng.uniform(0, 2 * np.pi, 20), rng.uniform(-1.5, 1.0, 20), strict=True):
+    for angle, beyond in zip(rng.uniform(0, 2 * np.pi, 12), rng.uniform(-1.5, 1.0, 12), strict=True):
         # The cone's half-angle is 30 degrees; at the depth of 60 mm its radius is 34.64 mm.
         offset = (34.64 + beyond) * np.array([np.cos(angle), np.sin(angle)])
         system = system_of([[200.0, 0, 0], [140, *offset]], 0.5, 5.0, [50.0, 2.0], 1.0, 100.0)
@@ -160,24 +158,24 @@ def test_a_sliver_of_a_thousandth_is_found(rng):
         directions = cone_directions(200_000, np.sqrt(0.75)) @ system.frames()[0]
         fine = np.zeros(200_000, dtype=bool)
         for p in (2, 3):
-            fine |= meets(hulls, p, system.centers[0], directions, np.full(200_000, 100.0))
+            fine |= hits(hulls, p, system.centers[0], directions, np.full(200_000, 100.0))
         blocked = mph.check_geometry(system, plate_thickness=0.5, wall_thickness=1.0).blocked
         shares = {b.module: b.share for b in blocked}
         assert shares.get(1, 0.0) == pytest.approx(fine.mean(), abs=5e-4)
         found.append(fine.mean())
-    assert np.count_nonzero((np.array(found) > 2e-4) & (np.array(found) < 1.5e-3)) > 5  # such slivers they were
+    assert np.count_nonzero((np.array(found) > 2e-4) & (np.array(found) < 1.5e-3)) > 3  # such slivers they were
 
 
 def test_rays_meet_hulls_where_points_along_them_are_inside(rng):
     hulls = Hulls.of(module_parts(crowd(rng, 4)))
     origin = np.array([10.0, -20.0, 5.0])
-    directions = cone_directions(2000, -1.0)
-    lengths = rng.uniform(100, 250, 2000)
+    directions = cone_directions(1000, -1.0)
+    lengths = rng.uniform(100, 250, 1000)
     steps = np.linspace(0, 1, 800)[:, None, None]
     points = origin + steps * lengths[:, None] * directions
     for p in range(len(hulls)):
         depth = (hulls.offsets[p] - points @ hulls.normals[p].T).min(axis=2).max(axis=0)
-        hit = meets(hulls, p, origin, directions, lengths)
+        hit = hits(hulls, p, origin, directions, lengths)
         assert np.all(hit[depth > 0])
         assert not np.any(hit[depth < -0.5])  # the points are less than 0.4 mm apart
 
@@ -206,14 +204,11 @@ def test_pinholes_at_impossible_places():
 
 
 def test_open_and_inverted_surfaces_are_found(system):
-    parts = module_parts(system)
-    assert find_open_meshes(parts) == ()
-    vertices, faces = parts[3].solid
-    parts[3] = dataclasses.replace(parts[3], solid=(vertices, faces[1:]))
-    vertices, faces = parts[4].solid
-    parts[4] = dataclasses.replace(parts[4], solid=(vertices, faces[:, ::-1]))
-    found = [(f.module, f.part, f.fault.split()[0]) for f in find_open_meshes(parts)]
-    assert found[:3] == [(102, "crystal", "is"), (102, "module", "is"), (103, "collimator", "has")]
+    for part in module_parts(system)[:4]:
+        vertices, faces = part.solid
+        assert surface_fault(part.solid) is None
+        assert surface_fault((vertices, faces[1:])).startswith("is not closed")
+        assert surface_fault((vertices, faces[:, ::-1])).startswith("has a volume of -")
 
 
 def test_report_is_json(rng):

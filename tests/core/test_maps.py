@@ -135,7 +135,7 @@ def test_pinholes_all_around_leave_no_gap(rng):
 
 def test_gap_is_the_largest_of_all_planes(system, rng):
     """Against a million normals, within the tolerance and their own distance."""
-    points = rng.uniform(-60, 60, (5, 3))
+    points = rng.uniform(-60, 60, (3, 3))
     normals = rng.normal(size=(1_000_000, 3))
     normals /= np.linalg.norm(normals, axis=1)[:, None]
     for point, gap in zip(points, mph.sampling_gaps(system, points), strict=True):
@@ -166,17 +166,17 @@ def test_a_map_can_be_written_and_read(system, tmp_path):
 
 
 def test_progress_is_told_and_can_stop(system):
-    grid = mph.Grid.centered(48, 4.0)
+    grid = mph.Grid.centered(36, 5.0)
     told = []
     mph.sensitivity_map(system, grid, progress=lambda done, total: told.append((done, total)))
     assert told == [(i + 1, len(told)) for i in range(len(told))]
-    assert len(told) > 3
+    assert len(told) > 2
 
     def stop(done, total):
         raise mph.Cancelled
 
     with pytest.raises(mph.Cancelled):
-        mph.completeness_map(system, grid, progress=stop)
+        mph.modules_map(system, grid, progress=stop)
 
 
 def test_bad_settings_are_refused(system):

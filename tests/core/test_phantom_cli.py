@@ -62,7 +62,7 @@ NUMPY = ["--size", "9", "9", "--backend", "numpy"]
 def test_every_kind_is_made_as_asked(kind, phantom, tmp_path, capsys):
     assert main(["phantom", *kind, "-o", str(tmp_path / "p.toml")]) == 0
     assert mph.read_phantom(tmp_path / "p.toml").shapes == tuple(phantom.shapes)
-    if kind[0] in ("sphere", "torso"):
+    if kind[0] == "sphere":
         placed = ["--voxels", "30", "--euler", "10", "20", "30", "--position", "1", "2", "3"]
         for quantity in ("activity", "mu"):
             assert main(["phantom", *kind, *placed, "--quantity", quantity, "-o", str(tmp_path / "p.npz")]) == 0
@@ -114,13 +114,13 @@ def test_a_phantom_of_shapes_is_projected(workbook, tmp_path, capsys):
 @pytest.mark.parametrize("is_file", [True, False], ids=["file", "Derenzo"])
 def test_a_phantoms_own_mu_attenuates_as_its_volume_would(is_file, workbook, tmp_path, capsys):
     (tmp_path / "thorax.toml").write_text(THORAX)
-    place = ["--voxels", "32", "30", "28", "--spacing", "5", "--euler", "10", "20", "30", "--position", "3", "2", "1"]
+    place = ["--voxels", "22", "21", "22", "--spacing", "7.5", "--euler", "10", "20", "30", "--position", "3", "2", "1"]
     water = ["--rods", "9", "9", "8", "8", "9", "9", "--water", "45", "50", "--background", "20"]
     make = ["file", str(tmp_path / "thorax.toml"), *place] if is_file else ["derenzo", *water, *place]
     for quantity in ("activity", "mu"):
         words = ["phantom", *make, "--quantity", quantity, "-o", str(tmp_path / f"{quantity}.npz")]
         assert main(words) == 0
-    project = ["project", str(workbook), *NUMPY, "--modules", "1-2", "--emission", "--isotope", "Tc-99m"]
+    project = ["project", str(workbook), *NUMPY, "--modules", "1", "--emission", "--isotope", "Tc-99m"]
     files = ["--volume", str(tmp_path / "activity.npz"), "--mu", str(tmp_path / "mu.npz")]
     source = ["--phantom", str(tmp_path / "thorax.toml"), *place] if is_file else [*water, *place]
     counts = []
@@ -194,7 +194,11 @@ def test_a_beating_heart_is_a_run_for_each_state(workbook, tmp_path, capsys, mon
         (["torso", "--random", "1", "--euler", "1", "2", "3"], 1, "--euler has no effect with --random"),
         (["torso", "--frames", "2", "--phase", "0.1"], 1, "--phase has no effect with --frames"),
         (["torso", "--frames", "0"], 1, "frames of the cycle: expected"),
-        (["sphere", "--radius", "3", "--voxels", "9", "-o", "TOML"], 1, "--voxels is of voxels, and a .toml holds the"),
+        (
+            ["sphere", "--radius", "3", "--voxels", "9", "-o", "TOML"],
+            1,
+            "--voxels is of voxels, but a .toml holds only",
+        ),
     ],
 )
 def test_wrong_words_get_one_line(words, status, said, tmp_path, capsys):

@@ -163,20 +163,20 @@ def test_projectors_agree_with_exact_projections(system):
 
 
 @pytest.mark.parametrize("phantom", KINDS, ids=title)
-@pytest.mark.parametrize("voxels", [6, 40])
-def test_total_activity_does_not_depend_on_grid_or_pose(phantom, voxels, rng):
-    """To 0.02 %, also where voxels are larger than the parts; for activity and for mu."""
-    spacing = phantom.extent / (voxels - 3)
-    grid = mph.Grid.centered(voxels, spacing)
-    turned = mph.euler_pose(*rng.uniform(-3, 3, 3), translation=rng.uniform(-1, 1, 3) * spacing)
-    for pose in (None, turned):
-        volume = phantom.voxelize(grid, pose)
-        assert total(volume) == pytest.approx(phantom.total_activity, rel=2e-4)
-        assert volume.array.min() >= -1e-5 * volume.array.max()
-    # And of mu: against the closed forms along many parallel lines.
+def test_total_activity_does_not_depend_on_grid_or_pose(phantom, rng):
+    """To 0.01 %, also where voxels are larger than the parts; for activity and for mu."""
+    for voxels in (28, 6):
+        spacing = phantom.extent / (voxels - 3)
+        grid = mph.Grid.centered(voxels, spacing)
+        turned = mph.euler_pose(*rng.uniform(-3, 3, 3), translation=rng.uniform(-1, 1, 3) * spacing)
+        for pose in (None, turned) if voxels == 6 else (turned,):
+            volume = phantom.voxelize(grid, pose)
+            assert total(volume) == pytest.approx(phantom.total_activity, rel=1e-4)
+            assert volume.array.min() >= -1e-5 * volume.array.max()
+    # The same for mu, against the closed forms along many parallel lines.
     volume = phantom.voxelize(grid, turned, quantity="mu")
     assert volume.quantity == "mu"
-    side = np.linspace(-0.5, 0.5, 301)[1:] - 0.5 / 300
+    side = np.linspace(-0.5, 0.5, 201)[1:] - 0.5 / 200
     v, w = (phantom.extent + 2 * spacing) * np.stack(np.meshgrid(side, side)).reshape(2, -1)
     far = np.full_like(v, phantom.extent)
     sums = phantom.line_integrals(np.stack([-far, v, w], 1), np.stack([far, v, w], 1), turned, "mu").mean()
@@ -502,14 +502,14 @@ def test_the_heart_beats_with_its_muscle_and_apex_kept():
     volumes = [frame.ventricle_volume for frame in frames]
     assert volumes[0] == 120 and volumes[7] == pytest.approx(45) and np.argmin(volumes) == 7
     muscles, apexes = [], []
-    for frame in frames:
+    for frame in (*frames[::4], frames[7]):
         parts = {shape.name: shape for shape in frame.shapes}
         assert parts["left ventricle"].volume == pytest.approx(frame.ventricle_volume * 1e3, rel=1e-4)
         muscles.append(parts["myocardium"].volume - parts["left ventricle"].volume)
         pose = parts["myocardium"].pose
         apexes.append(pose[:3, 3] + pose[:3, 2] * parts["myocardium"].radii[2])
     np.testing.assert_allclose(muscles, muscles[0], rtol=1e-4)
-    np.testing.assert_allclose(apexes, np.broadcast_to(apexes[0], (20, 3)), atol=1e-9)
+    np.testing.assert_allclose(apexes, np.broadcast_to(apexes[0], (6, 3)), atol=1e-9)
     assert muscles[0] * 1.05e-3 == pytest.approx(133, abs=1)  # g
 
 

@@ -75,9 +75,10 @@ MODELS = {
 }
 
 
-@pytest.mark.parametrize("quantity", UNITS)
 @pytest.mark.parametrize("model", MODELS)
-@pytest.mark.parametrize("use", [_projector, _run])
+@pytest.mark.parametrize(
+    ("use", "quantity"), [*((_projector, name) for name in UNITS), (_run, "hu"), (_run, "activity")]
+)
 def test_a_model_takes_the_quantities_it_has_a_meaning_for(use, model, quantity, system):
     make, taken = MODELS[model]
     project, volume = use(make), volume_of(quantity)
@@ -146,8 +147,7 @@ def _project(workbook, folder, *options) -> int:
     return main(["project", str(workbook), *SMALL, *map(str, options), "-o", str(folder / "run.h5")])
 
 
-@pytest.mark.parametrize("labelled", [True, False])
-@pytest.mark.parametrize("option", ["--volume", "--states"])
+@pytest.mark.parametrize(("option", "labelled"), [("--volume", False), ("--states", True)])
 def test_ct_numbers_are_no_radiograph_but_converted_they_are(option, labelled, ct, workbook, tmp_path, capsys):
     path = tmp_path / "ct.nii.gz"
     (write_volume if labelled else _said_nothing)(ct, path)

@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 
 import mphdrr.core as mph
-from mphdrr.core.physics.isotopes import WATER_MU
-from mphdrr.core.physics.materials import attenuation
+from mphdrr.core.physics.materials import WATER_MU, attenuation
 
 GRID = mph.Grid((7, 1, 1), np.eye(4))
 

@@ -1,10 +1,12 @@
-"""Arguments that the actions share."""
+"""Options that the actions share."""
 
 from __future__ import annotations
 
 import argparse
 import math
 from typing import Any
+
+from numpy.typing import NDArray
 
 from ...errors import InputError
 from ...geometry.system import PinholeSystem
@@ -13,16 +15,22 @@ from ...physics.materials import APERTURES, CRYSTALS, module_coefficients
 from ..options import number_or_name
 
 MATERIAL_OPTIONS = ("aperture_mu", "opening_angle", "crystal_mu", "intrinsic_fwhm", "isotope")
-"""Of `add_materials`."""
+"""Destinations of the options of `add_materials`."""
 
 
 def add_json(parser: argparse.ArgumentParser) -> None:
-    """How to print the answer."""
+    """Add ``--json``."""
     parser.add_argument("--json", action="store_true", help="print JSON")
 
 
+def table_rows(columns: dict[str, NDArray[Any]]) -> list[dict[str, Any]]:
+    """The rows of a table given by its columns, in Python's numbers."""
+    values = (column.tolist() for column in columns.values())
+    return [dict(zip(columns, row, strict=True)) for row in zip(*values, strict=True)]
+
+
 def add_materials(parser: argparse.ArgumentParser) -> None:
-    """What the modules are made of and what decays, for `sensitivity_settings` and `resolution_settings`."""
+    """Add the materials and the isotope, for `sensitivity_settings` and `resolution_settings`."""
     group = parser.add_argument_group("materials; without an option the module is ideal")
     add_edge(group)
     group.add_argument(
@@ -36,7 +44,7 @@ def add_materials(parser: argparse.ArgumentParser) -> None:
 
 
 def add_edge(parser: argparse._ActionsContainer) -> None:
-    """What the hole's edge is made of, and its angle, for `edge_settings`; beside an option ``--isotope``."""
+    """Add the knife edge's material and angle, for `edge_settings`, which needs an option ``--isotope`` too."""
     parser.add_argument(
         "--aperture-mu", type=number_or_name, metavar="MATERIAL",
         help=f"{', '.join(APERTURES)} at the isotope's photons, or the coefficient, 1/mm; without it, nothing penetrates",
@@ -45,46 +53,36 @@ def add_edge(parser: argparse._ActionsContainer) -> None:
 
 
 def edge_settings(arguments: argparse.Namespace, system: PinholeSystem) -> dict[str, Any]:
-    """The coefficient of the aperture and the angle of its knife edge, as keywords."""
-    aperture, _ = module_coefficients(arguments.aperture_mu, None, _lines(arguments), system, _angle(arguments))
-    return {"aperture_mu": aperture, "opening_angle": _angle(arguments)}
+    """Attenuation coefficient of the aperture and angle of its knife edge, as keywords."""
+    angle = _angle(arguments)
+    aperture, _ = module_coefficients(arguments.aperture_mu, None, _lines(arguments), system, angle)
+    return {"aperture_mu": aperture, "opening_angle": angle}
 
 
 def sensitivity_settings(arguments: argparse.Namespace, system: PinholeSystem) -> dict[str, Any]:
     """The keywords of `sensitivity`."""
-    lines = _lines(arguments)
+    lines, angle = _lines(arguments), _angle(arguments)
+    aperture, crystal = module_coefficients(arguments.aperture_mu, arguments.crystal_mu, lines, system, angle)
     photons = 1.0 if arguments.isotope is None else sum(photons for _, photons in lines)
-    edge, crystal = _materials(arguments, system)
-    return {**edge, "crystal_mu": crystal, "photons_per_decay": photons}
+    return {"aperture_mu": aperture, "opening_angle": angle, "crystal_mu": crystal, "photons_per_decay": photons}
 
 
 def resolution_settings(arguments: argparse.Namespace, system: PinholeSystem) -> dict[str, Any]:
     """The keywords of `resolution`."""
-    edge, _ = _materials(arguments, system)
-    return {**edge, "intrinsic_fwhm": arguments.intrinsic_fwhm}
+    return {**edge_settings(arguments, system), "intrinsic_fwhm": arguments.intrinsic_fwhm}
 
 
 def _lines(arguments: argparse.Namespace) -> tuple[tuple[float, float], ...]:
-    """The isotope's lines in its window."""
+    """The isotope's lines in its energy window."""
     if arguments.isotope is None:
         return ()
     decaying = isotope(arguments.isotope)
     return decaying.lines_within(*decaying.window)
 
 
-def _materials(arguments: argparse.Namespace, system: PinholeSystem) -> tuple[dict[str, Any], float | None]:
-    """The keywords of the aperture's edge, and the crystal's coefficient."""
-    angle = _angle(arguments)
-    aperture, crystal = module_coefficients(
-        arguments.aperture_mu, arguments.crystal_mu, _lines(arguments), system, angle
-    )
-    return {"aperture_mu": aperture, "opening_angle": angle}, crystal
-
-
 def _angle(arguments: argparse.Namespace) -> float:
-    """The knife edge's, rad."""
-    if not 0 < arguments.opening_angle < 180:
-        raise InputError(
-            f"--opening-angle {arguments.opening_angle:g}: expected degrees, more than 0 and less than 180"
-        )
-    return math.radians(arguments.opening_angle)
+    """The knife edge's opening angle, rad."""
+    degrees = arguments.opening_angle
+    if not 0 < degrees < 180:
+        raise InputError(f"--opening-angle {degrees:g}: expected degrees, more than 0 and less than 180")
+    return math.radians(degrees)

@@ -24,8 +24,8 @@ def add_parser(actions) -> None:  # type: ignore[no-untyped-def]
     parser = add_command(
         actions,
         "check",
-        "compare the workbook with the design formulas, and look for modules that overlap, see too little of the ROI, "
-        "block each other or have unfit plates",
+        "compare the workbook with the design formulas, and find modules that overlap, do not see their ROI, block each "
+        "other or have unsuitable plates",
         "mphdrr geometry check scanner.xlsx --wall 3 --strict",
     )
     add_workbook(parser)
@@ -38,7 +38,7 @@ def add_parser(actions) -> None:  # type: ignore[no-untyped-def]
     )  # fmt: skip
     add_edge(parser)
     parser.add_argument(
-        "--isotope", metavar="NAME", help=f"{', '.join(ISOTOPES)}: whose photons the plates of a material must stop"
+        "--isotope", metavar="NAME", help=f"{', '.join(ISOTOPES)}: its photons must be stopped by the plates"
     )
     parser.add_argument("--strict", action="store_true", help="exit with status 1 if there is any warning or finding")
     parser.set_defaults(run=_run)

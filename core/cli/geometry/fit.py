@@ -8,11 +8,11 @@ from typing import Any
 
 import numpy as np
 
-from ...geometry.generators import RingFit, fit_rings
+from ...geometry.ring_fits import RingFit, fit_rings
 from ..options import add_command, add_workbook, read_workbook
 from .arguments import add_json
 
-_FOLLOWS = 0.1  # mm off an ellipse that rounding in a workbook may bring about
+_FOLLOWS = 0.1  # mm off the ellipse that rounding in a workbook explains
 
 
 def add_parser(actions) -> None:  # type: ignore[no-untyped-def]
@@ -20,7 +20,7 @@ def add_parser(actions) -> None:  # type: ignore[no-untyped-def]
     parser = add_command(
         actions,
         "fit",
-        "find the ellipse that each ring of modules follows, and how far off its modules are",
+        "find the ellipse that each ring of modules follows, and the modules' distances from it",
         "mphdrr geometry fit scanner.xlsx",
     )
     add_workbook(parser)
@@ -34,7 +34,7 @@ def _run(arguments: argparse.Namespace) -> None:
         print(json.dumps({"rings": rings, "units": "mm, degrees"}, indent=1))
         return
     for i, ring in enumerate(rings, 1):
-        (a, b), (x, y), azimuths, z = ring["semi_axes"], ring["center"], ring["azimuths"], ring["z"]
+        (a, b), (x, y), azimuths, z = (ring[name] for name in ("semi_axes", "center", "azimuths", "z"))
         print(f"ring {i}: {len(azimuths)} modules, {ring['numbers'][0]} to {ring['numbers'][-1]}")
         print(f"  ellipse     semi-axes {a:.3f} and {b:.3f} mm, turned by {ring['rotation']:.4f} degrees")
         print(f"              centre at x = {x:.3f}, y = {y:.3f} mm")
@@ -49,14 +49,5 @@ def _run(arguments: argparse.Namespace) -> None:
 
 
 def _record(fit: RingFit) -> dict[str, Any]:
-    return {
-        "numbers": fit.numbers.tolist(),
-        "semi_axes": fit.semi_axes.tolist(),
-        "center": fit.center.tolist(),
-        "rotation": float(np.degrees(fit.rotation)),
-        "azimuths": np.degrees(fit.azimuths).tolist(),
-        "z": fit.z.tolist(),
-        "spacing": fit.spacing,
-        "curve_deviation": fit.curve_deviation,
-        "even_deviation": fit.even_deviation,
-    }
+    record = {name: value.tolist() if isinstance(value, np.ndarray) else value for name, value in vars(fit).items()}
+    return {**record, "rotation": float(np.degrees(fit.rotation)), "azimuths": np.degrees(fit.azimuths).tolist()}

@@ -86,16 +86,14 @@ def _add_modules(parser: argparse.ArgumentParser) -> None:
 
 def _run(arguments: argparse.Namespace) -> None:
     path = output_path(arguments.output, (".xlsx",))
-    modules = {
-        "z": arguments.z,
-        "mirrored": arguments.mirrored,
+    sizes = {
         "pinhole_diameter": arguments.d,
         "detector_side": arguments.Ld,
         "detector_thickness": arguments.Td,
         "roi_radius": arguments.R,
         "collimator_length": arguments.l,
     }
-    system = arguments.generate(arguments, modules)
+    system = arguments.generate(arguments, {"z": arguments.z, "mirrored": arguments.mirrored, **sizes})
     write_system(system, path)
     b, l = system.pinhole_distance, system.collimator_length
     print(f"{path}: {len(system)} modules, b {b.min():.2f} to {b.max():.2f} mm, l {l.min():.2f} to {l.max():.2f} mm")

@@ -12,7 +12,7 @@ from ...geometry.design_formulas import roi_radius_seen
 from ...physics.performance import magnification, resolution, sensitivity
 from ...physics.sampling import sampling_gaps
 from ..options import add_command, add_workbook, read_workbook
-from .arguments import add_json, add_materials, resolution_settings, sensitivity_settings
+from .arguments import add_json, add_materials, resolution_settings, sensitivity_settings, table_rows
 
 
 def add_parser(actions) -> None:  # type: ignore[no-untyped-def]
@@ -55,19 +55,19 @@ def _run(arguments: argparse.Namespace) -> None:
         "sensitivity": float(counts.sum()),
         "resolution": rms,
         "modules_seeing": int(seeing.sum()),
-        # To what a workbook's rounding leaves of the design formula.
+        # Up to the rounding of l in the workbook.
         "modules_holding_roi": int(np.count_nonzero(radius >= system.roi_radius - 1e-3)),
         "sampling_gap_degrees": math.degrees(sampling_gaps(system, points)[0]),
     }
-    rows = list(zip(*(c.tolist() for c in columns.values()), strict=True))
+    rows = table_rows(columns)
     if arguments.json:
-        modules = [{k: None if v != v else v for k, v in zip(columns, row, strict=True)} for row in rows]
+        modules = [{name: None if x != x else x for name, x in row.items()} for row in rows]  # no NaN in JSON
         units = "sensitivity cps/MBq; resolution and radii mm"
         print(json.dumps({"point": arguments.point, "modules": modules, "total": total, "units": units}, indent=1))
         return
     print(" module  ring  cps/MBq  FWHM mm  magnification  sees R mm     R mm")
     for row in rows:
-        print("{:7d} {:5d} {:8.3f} {:8.2f} {:14.4f} {:10.2f} {:8.2f}".format(*row))
+        print("{:7d} {:5d} {:8.3f} {:8.2f} {:14.4f} {:10.2f} {:8.2f}".format(*row.values()))
     print(f"total {total['sensitivity']:.1f} cps/MBq from {total['modules_seeing']} of {len(system)} modules")
     if rms is not None:
         print(f"resolution {rms:.2f} mm FWHM, the modules' root mean square weighted by counts")

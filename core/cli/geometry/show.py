@@ -13,7 +13,7 @@ from ...errors import InputError
 from ...geometry.system import PinholeSystem
 from ...workbook import draft_column_map
 from ..options import add_command, add_workbook, chosen_modules, output_path, read_workbook
-from .arguments import add_json
+from .arguments import add_json, table_rows
 
 
 def add_parser(actions) -> None:  # type: ignore[no-untyped-def]
@@ -67,12 +67,8 @@ def _write_columns(arguments: argparse.Namespace) -> None:
 
 def _rows(system: PinholeSystem) -> list[dict[str, Any]]:
     x, y, z = system.centers.T
-    columns = {
-        "number": system.numbers,
-        "ring": system.rings() + 1,
-        "x": x,
-        "y": y,
-        "z": z,
+    places = {"number": system.numbers, "ring": system.rings() + 1, "x": x, "y": y, "z": z}
+    sizes = {
         "b": system.pinhole_distance,
         "l": system.collimator_length,
         "azimuth": np.arctan2(y, x),
@@ -82,6 +78,4 @@ def _rows(system: PinholeSystem) -> list[dict[str, Any]]:
         "Td": system.detector_thickness,
         "R": system.roi_radius,
     }
-    return [
-        dict(zip(columns, values, strict=True)) for values in zip(*(c.tolist() for c in columns.values()), strict=True)
-    ]
+    return table_rows({**places, **sizes})

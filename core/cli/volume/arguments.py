@@ -1,4 +1,4 @@
-"""Arguments that the actions share, and what they mean."""
+"""Options that the actions share."""
 
 from __future__ import annotations
 
@@ -10,22 +10,22 @@ from ..options import progress_bar
 
 
 def add_input(parser: argparse.ArgumentParser) -> None:
-    """The volume to read."""
+    """Add the volume to read."""
     parser.add_argument(
         "file",
         metavar="FILE",
         help="volume, folder of a DICOM series, or any file of one (docs/volumes.md has the formats)",
     )
     parser.add_argument(
-        "--quantity", choices=tuple(UNITS), help="what its values are; default: what it says, else CT numbers, hu"
+        "--quantity", choices=tuple(UNITS), help="what its values are; default: what the file says, else CT numbers, hu"
     )
-    parser.add_argument("--series", metavar="NAME", help="of several DICOM series, by number, description or UID")
+    parser.add_argument("--series", metavar="NAME", help="one of several DICOM series, by number, description or UID")
     parser.add_argument(
         "--affine",
         type=float,
         nargs=16,
         metavar="A",
-        help="index to world mm, row by row, in place of the file's; for .npy",
+        help="index to world mm, row by row, instead of the file's; .npy needs it",
     )
 
 

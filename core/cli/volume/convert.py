@@ -22,7 +22,7 @@ def add_parser(actions) -> None:  # type: ignore[no-untyped-def]
     parser = add_command(
         actions,
         "convert",
-        "write a volume in another format, cut, moved, resampled, or as attenuation",
+        "convert a volume to another format, and crop, move, resample it or convert it to attenuation",
         "mphdrr volume convert dicom_folder --center --spacing 2 --to-mu --energy Tc-99m -o mu.nii.gz",
     )
     add_input(parser)
@@ -80,7 +80,7 @@ def _run(arguments: argparse.Namespace) -> None:
 
 
 def _respaced(volume: Volume, spacing: list[float], method: str | None) -> Volume:
-    """The volume on a grid of the same axes, the same first face and at least the same extent."""
+    """The volume on a grid with the same axes and first faces, and at least the same extent."""
     if len(spacing) not in (1, 3) or not min(spacing) > 0:
         raise InputError(f"--spacing: expected one or three numbers above 0, got {' '.join(f'{x:g}' for x in spacing)}")
     old = volume.grid
@@ -90,6 +90,6 @@ def _respaced(volume: Volume, spacing: list[float], method: str | None) -> Volum
     index[:3, 3] = (steps - 1) / 2
     grid = Grid((n_x, n_y, n_z), old.affine @ index)
     method = method or ("mean" if steps.max() > 1 else "linear")
-    # Labels come without a quantity, so that they pass for CT numbers: beside them is 0, not air.
+    # Label files say no quantity and are taken for CT numbers, but outside them is 0 and not air.
     outside = 0.0 if method == "nearest" and volume.array.min() >= 0 else None
     return resample(volume, grid, method, outside, progress_bar("resampling"))

@@ -8,7 +8,7 @@ import numpy as np
 
 from ...errors import InputError
 from ...geometry.grid import Grid
-from ...validation import real_array
+from ...validation import positive, real_array
 from ...volumes.meshes.mesh import MESH_FORMATS, MILLIMETRES, Mesh, read_mesh
 from ...volumes.meshes.voxelization import voxelize_mesh
 from ...volumes.volume import UNITS
@@ -46,18 +46,18 @@ def _run(arguments: argparse.Namespace) -> None:
         raise InputError(f"--value: expected one number, or one for each of {len(arguments.mesh)} meshes")
     values = real_array(np.broadcast_to(arguments.value, len(arguments.mesh)), "--value", (None,))
     meshes = [read_mesh(file, arguments.unit) for file in arguments.mesh]
-    spacing = arguments.spacing
-    grid = Grid.centered(arguments.voxels, spacing) if arguments.voxels else _around(meshes, spacing)
+    grid = _grid(meshes, arguments)
     volume = voxelize_mesh(meshes, grid, values, arguments.quantity, progress_bar("voxelizing"))
     write_volume(volume, path)
     covered = np.count_nonzero(volume.array) * grid.voxel_volume * 1e-3
-    print(f"{path}: {' x '.join(map(str, grid.shape))} voxels, {covered:.4g} mL of them not empty")
+    print(f"{path}: {' x '.join(map(str, grid.shape))} voxels, {covered:.4g} mL of them not 0")
 
 
-def _around(meshes: list[Mesh], spacing: float) -> Grid:
-    """A grid around the meshes, with a voxel to spare on each side."""
-    if not spacing > 0:
-        raise InputError(f"--spacing: expected more than 0 mm, got {spacing:g}")
+def _grid(meshes: list[Mesh], arguments: argparse.Namespace) -> Grid:
+    """The grid asked for; by default around the meshes with a margin of one voxel."""
+    spacing = positive(arguments.spacing, "--spacing", "mm")
+    if arguments.voxels:
+        return Grid.centered(arguments.voxels, spacing)
     low = np.min([mesh.vertices.min(axis=0) for mesh in meshes], axis=0)
     high = np.max([mesh.vertices.max(axis=0) for mesh in meshes], axis=0)
     return Grid.centered(np.ceil((high - low) / spacing) + 2, spacing, (low + high) / 2)

@@ -15,7 +15,7 @@ from .arguments import add_input, read_input
 
 def add_parser(actions) -> None:  # type: ignore[no-untyped-def]
     """Add the action."""
-    parser = add_command(actions, "info", "show where a volume lies and what it holds", "mphdrr volume info ct.nii.gz")
+    parser = add_command(actions, "info", "show a volume's place, grid and values", "mphdrr volume info ct.nii.gz")
     add_input(parser)
     parser.add_argument("--json", action="store_true", help="print JSON")
     parser.set_defaults(run=_run)
@@ -53,7 +53,7 @@ def _facts(volume: Volume) -> dict[str, Any]:
 
 
 def _axes(affine: np.ndarray) -> str:
-    """Where each index axis leads in the patient, as in ``RAS``; the closest of right, left, front, back, head, feet."""
+    """The direction of each index axis in the patient, such as ``RAS``: the closest of R, L, A, P, S, I."""
     letters = []
     for axis in affine[:3, :3].T:
         world = int(np.abs(axis).argmax())

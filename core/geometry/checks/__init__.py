@@ -1,29 +1,24 @@
-"""Can the scanner be built, and does every module see what it should?
+"""Checks of a scanner: can it be built, and does every module see its ROI?
 
-hulls.py     the parts' convex hulls
-overlaps.py  parts that penetrate each other, by separating axes
-coverage.py  the field of view beside the ROI
-plates.py    holes that their plate shades from the ROI, and plates that let photons through
-blocking.py  rays from the ROI that meet another module
-places.py    pinholes and modules where none can be
-meshes.py    closed surfaces, by trimesh
-report.py    what was found
+hulls.py          convex hulls of the modules' parts
+overlaps.py       parts that overlap, pinholes in other modules, collimators in the ROI
+field_of_view.py  ROIs outside the field of view, modules in the way
+plates.py         aperture plates that are too thick or too thin
+report.py         the findings
 """
 
 from __future__ import annotations
 
 from ...validation import instance
 from ..collimator import OPENING_ANGLE, Construction, EdgePlace
+from ..collimator_mesh import surface_fault
 from ..module_parts import module_collimators, module_parts
 from ..system import PinholeSystem
-from .blocking import find_blocked
-from .coverage import find_uncovered
+from .field_of_view import find_blocked, find_uncovered
 from .hulls import Hulls
-from .meshes import find_open_meshes
-from .overlaps import find_overlaps
-from .places import find_intrusions, find_near_pairs, find_swallowed_pinholes
+from .overlaps import find_intrusions, find_near_pairs, find_overlaps, find_swallowed_pinholes
 from .plates import find_thin_plates, find_vignetted
-from .report import GeometryReport
+from .report import GeometryReport, OpenMesh
 
 __all__ = ["GeometryReport", "check_geometry"]
 
@@ -37,25 +32,22 @@ def check_geometry(
     edge_at: EdgePlace = "middle",
     aperture_mu: float | None = None,
 ) -> GeometryReport:
-    """Look for parts that overlap, an ROI that is not seen, blocked holes, unfit plates, and surfaces that are not closed.
+    """Find parts that overlap, ROIs that are not seen whole, blocked holes, unsuitable plates and open surfaces.
 
     Parameters
     ----------
     system
-        The modules.
-    plate_thickness, wall_thickness
-        Of the aperture plates and of the collimators' walls, mm: the solids are those of `core.collimator`.
-    opening_angle, edge_at
-        Full angle of the holes' double cone, rad, and where in the plate its edge is: "middle", or the face in "front",
-        towards the ROI, or "back".
+    plate_thickness, wall_thickness, opening_angle, edge_at
+        How the collimators are built, as in `core.geometry.collimator.Construction`: mm, mm, rad, and the place of the knife
+        edge in the plate ("middle", "front" or "back").
     aperture_mu
-        Of the plates' material at the photons' energy, 1/mm (`attenuation`): to see whether they are thick enough. None:
-        they stop everything.
+        Attenuation coefficient of the plates, 1/mm (see `attenuation`), to find plates that are too thin. Default: the
+        plates stop everything.
 
     Raises
     ------
     InputError
-        The collimators cannot be built so.
+        A collimator cannot be built like that.
 
     Examples
     --------
@@ -68,6 +60,7 @@ def check_geometry(
     collimators = module_collimators(system, construction)
     parts = module_parts(system, construction)
     hulls = Hulls.of(parts)
+    faults = [(part, surface_fault(part.solid)) for part in parts]
     return GeometryReport(
         n_modules=len(system),
         plate_thickness=construction.plate_thickness,
@@ -82,5 +75,5 @@ def check_geometry(
         blocked=find_blocked(system, hulls),
         vignetted=find_vignetted(system, collimators),
         thin_plates=() if aperture_mu is None else find_thin_plates(system, collimators, aperture_mu),
-        open_meshes=find_open_meshes(parts),
+        open_meshes=tuple(OpenMesh(part.number, part.kind, fault) for part, fault in faults if fault),
     )

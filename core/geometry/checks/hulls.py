@@ -9,14 +9,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..collimator_mesh import Solid
-from ..module_parts import Kind, ModulePart
+from ..module_parts import ModulePart, PartKind
 
 TOUCH = 1e-6
-"""Lengths, mm, up to which bodies only touch."""
+"""Bodies that penetrate each other by less than this, mm, only touch."""
 
 _SQUARE = np.array([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]])
 _FACES = np.array([[0, 3, 2, 1], [4, 5, 6, 7], [0, 1, 5, 4], [1, 2, 6, 5], [2, 3, 7, 6], [3, 0, 4, 7]])
-_EDGES = np.array([[0, 1], [0, 3], [0, 4], [1, 5], [2, 6], [3, 7]])  # one of each direction
+_EDGES = np.array([[0, 1], [0, 3], [0, 4], [1, 5], [2, 6], [3, 7]])  # one for each direction
 
 
 @dataclass(frozen=True, eq=False)
@@ -26,20 +26,20 @@ class Hulls:
     Attributes
     ----------
     numbers : int array (P,)
-        The parts' modules.
+        Module numbers.
     kinds : tuple of P names
-        The parts.
+        "collimator" or "crystal".
     vertices : array (P, 8, 3)
     normals, offsets : arrays (P, 6, 3), (P, 6)
         The faces: a point x is inside where ``normals @ x <= offsets``.
     edges : array (P, 6, 3)
         Unit vectors along the edges.
     centers, radii : arrays (P, 3), (P,)
-        Spheres around them.
+        Bounding spheres.
     """
 
     numbers: NDArray[np.int64]
-    kinds: tuple[Kind, ...]
+    kinds: tuple[PartKind, ...]
     vertices: NDArray[np.float64]
     normals: NDArray[np.float64]
     offsets: NDArray[np.float64]
@@ -70,7 +70,7 @@ class Hulls:
 
 
 def _corners(solid: Solid) -> NDArray[np.float64]:
-    """The hull's corners (8, 3): both solids end in squares around Z, the outermost at either end."""
+    """Corners (8, 3) of the hull: both ends of the solid are squares around Z, of which the outermost count."""
     vertices, _ = solid
     corners = []
     for z in (vertices[:, 2].min(), vertices[:, 2].max()):

@@ -1,24 +1,27 @@
-"""Parts that penetrate each other, and how deep.
+"""Parts that penetrate each other and how deep, pinholes inside other modules, and collimators inside the ROI.
 
-Two convex bodies are apart if their shadows on some axis are, and of polyhedra these axes are enough: the normals of
-either's faces and the cross products of either's edges (S. Gottschalk, M. C. Lin, D. Manocha, "OBBTree", SIGGRAPH 1996).
-They are also the normals of the bodies' Minkowski difference, so the least overlap of the shadows is the shortest
-translation that separates the bodies (S. Cameron, R. K. Culley, IEEE ICRA 1986).
+Two convex bodies are apart if their projections on some axis are. For polyhedra it is enough to try the normals of both
+bodies' faces and the cross products of their edges (S. Gottschalk, M. C. Lin, D. Manocha, "OBBTree", SIGGRAPH 1996). These
+are also the normals of the Minkowski difference, so the smallest overlap of the projections is the shortest translation that
+separates the bodies (S. Cameron, R. K. Culley, IEEE ICRA 1986).
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from itertools import combinations
 
 import numpy as np
 from numpy.typing import NDArray
 
+from ..collimator import Collimator, Construction
+from ..system import PinholeSystem
 from .hulls import TOUCH, Hulls
-from .report import Overlap
+from .report import Intrusion, NearPair, Overlap, SwallowedPinhole
 
-_CHUNK = 500  # pairs at a time: some 50 MB
+_CHUNK = 500  # pairs at a time, which take about 50 MB
 _PARALLEL = 1e-12  # sine of the angle between edges that span no plane
-_TRIPLES = np.array(list(combinations(range(12), 3)))  # of two bodies' faces: where they may have a corner
+_TRIPLES = np.array(list(combinations(range(12), 3)))  # faces of two bodies that may meet in a corner
 
 
 def find_overlaps(hulls: Hulls) -> tuple[Overlap, ...]:
@@ -37,7 +40,7 @@ def find_overlaps(hulls: Hulls) -> tuple[Overlap, ...]:
 
 
 def penetration_depths(hulls: Hulls, i: NDArray[np.intp], j: NDArray[np.intp]) -> NDArray[np.float64]:
-    """Shortest translations (N,) that separate hulls `i` from hulls `j`, mm; 0 or less where they are apart."""
+    """Shortest translations (N,), mm, that separate hulls `i` from hulls `j`; 0 or less where they are apart."""
     across = np.cross(hulls.edges[i][:, :, None], hulls.edges[j][:, None]).reshape(len(i), -1, 3)
     axes = np.concatenate([hulls.normals[i], hulls.normals[j], across], axis=1)
     lengths = np.linalg.norm(axes, axis=2)
@@ -50,7 +53,7 @@ def penetration_depths(hulls: Hulls, i: NDArray[np.intp], j: NDArray[np.intp]) -
 
 
 def _near_pairs(hulls: Hulls) -> NDArray[np.intp]:
-    """Pairs (N, 2) of parts of different modules whose spheres meet."""
+    """Pairs (N, 2) of parts of different modules whose bounding spheres meet."""
     pairs = []
     for p in range(len(hulls) - 1):
         distance = np.linalg.norm(hulls.centers[p + 1 :] - hulls.centers[p], axis=1)
@@ -62,7 +65,7 @@ def _near_pairs(hulls: Hulls) -> NDArray[np.intp]:
 
 
 def _common_points(hulls: Hulls, i: NDArray[np.intp], j: NDArray[np.intp]) -> NDArray[np.float64]:
-    """A point (N, 3) inside hulls `i` and `j` that overlap: the mean of the common body's corners."""
+    """Points (N, 3) inside both hull `i` and hull `j`, which overlap: the mean corner of the intersection."""
     normals = np.concatenate([hulls.normals[i], hulls.normals[j]], axis=1)
     offsets = np.concatenate([hulls.offsets[i], hulls.offsets[j]], axis=1)
     planes = normals[:, _TRIPLES]
@@ -72,3 +75,36 @@ def _common_points(hulls: Hulls, i: NDArray[np.intp], j: NDArray[np.intp]) -> ND
     outside = (corners @ normals.transpose(0, 2, 1) - offsets[:, None]).max(axis=2)
     weights = (meet & (outside < 0.1 * TOUCH)).astype(np.float64)
     return np.einsum("nc,ncx->nx", weights, corners) / weights.sum(axis=1)[:, None]
+
+
+def find_near_pairs(system: PinholeSystem, collimators: Sequence[Collimator]) -> tuple[NearPair, ...]:
+    """Modules whose pinholes are closer together than their fronts can stand side by side."""
+    half = np.array([body.front_half_width for body in collimators])
+    found = []
+    for m, number in enumerate(system.numbers.tolist()):
+        distance = np.linalg.norm(system.centers[m + 1 :] - system.centers[m], axis=1)
+        near = np.flatnonzero(distance < half[m + 1 :] + half[m] - TOUCH)
+        found += [NearPair(number, int(system.numbers[m + 1 + n]), float(distance[n])) for n in near]
+    return tuple(found)
+
+
+def find_swallowed_pinholes(system: PinholeSystem, hulls: Hulls) -> tuple[SwallowedPinhole, ...]:
+    """Pinhole centres more than `TOUCH` inside another module's part."""
+    found = []
+    for number, center in zip(system.numbers.tolist(), system.centers, strict=True):
+        depth = (hulls.offsets - hulls.normals @ center).min(axis=1)
+        found += [
+            SwallowedPinhole(number, int(hulls.numbers[p]), hulls.kinds[p], float(depth[p]))
+            for p in np.flatnonzero((depth > TOUCH) & (hulls.numbers != number))
+        ]
+    return tuple(found)
+
+
+def find_intrusions(system: PinholeSystem, construction: Construction) -> tuple[Intrusion, ...]:
+    """Modules that reach into the largest ROI.
+
+    The axis meets the isocentre, so the nearest point of a module is the middle of its plate's front face.
+    """
+    radius = float(system.roi_radius.max())
+    depth = radius - (system.pinhole_distance + construction.front)
+    return tuple(Intrusion(int(system.numbers[m]), radius, float(depth[m])) for m in np.flatnonzero(depth > TOUCH))

@@ -1,7 +1,7 @@
-"""Aperture plates that are too thick for the angle of their hole's cone, or too thin for the photons.
+"""Aperture plates that are too thick for the opening angle of their hole, or too thin to stop the photons.
 
-`Emission` treats a plate as infinitely thick: of the material that its knife edge cuts, a photon meets all. So it is right
-for plates that neither shade their hole from the ROI nor let photons through beside it, and this is where others are named.
+`Emission` treats the plate as infinitely thick, which is right for plates that neither shade their hole from the ROI nor let
+photons through beside it. All others are found here.
 """
 
 from __future__ import annotations
@@ -18,9 +18,9 @@ from ..system import PinholeSystem
 from .report import ThinPlate, Vignetted
 
 FEWEST_OPEN = 0.99
-"""Share of a hole that must be open to every ray from its ROI."""
+"""Fraction of a hole that must be open to every ray from its ROI."""
 MOST_THROUGH = 0.01
-"""Photons that may pass a plate beside its hole, as a share of those that pass the hole."""
+"""Photons that may pass a plate beside its hole, relative to those that pass the hole."""
 
 
 def find_vignetted(system: PinholeSystem, collimators: Sequence[Collimator]) -> tuple[Vignetted, ...]:
@@ -28,7 +28,7 @@ def find_vignetted(system: PinholeSystem, collimators: Sequence[Collimator]) -> 
     found = []
     b, radius = system.pinhole_distance.tolist(), system.roi_radius.tolist()
     for m, body in enumerate(collimators):
-        if radius[m] >= b[m]:  # the pinhole is in the ROI, and named as an intrusion
+        if radius[m] >= b[m]:  # the pinhole is inside the ROI, which is found as an intrusion
             continue
         needed = needed_angle(b[m], body.diameter, radius[m])
         share = body.open_share(math.tan(needed / 2))
@@ -40,14 +40,10 @@ def find_vignetted(system: PinholeSystem, collimators: Sequence[Collimator]) -> 
 
 
 def needed_angle(b: float, d: float, radius: float) -> float:
-    """The least opening angle, rad, at which a plate of any thickness leaves the whole hole open to the whole ROI.
+    """The smallest opening angle, rad, at which a plate of any thickness leaves the whole hole open to the whole ROI.
 
-    Twice the angle to the axis of the steepest ray: tangent to the sphere, through the farther side of the hole's rim.
-
-    Parameters
-    ----------
-    b, d, radius
-        Pinhole centre to isocentre, hole's diameter and ROI's radius, mm; radius below b.
+    It is twice the steepest ray's angle to the axis; that ray is tangent to the ROI and passes the hole's far rim.
+    `b`, `d` and `radius` (below b) are in mm.
     """
     return 2 * (math.atan(d / (2 * b)) + math.asin(radius / math.hypot(b, d / 2)))
 
@@ -55,9 +51,9 @@ def needed_angle(b: float, d: float, radius: float) -> float:
 def find_thin_plates(
     system: PinholeSystem, collimators: Sequence[Collimator], aperture_mu: float
 ) -> tuple[ThinPlate, ...]:
-    """Modules of which more than `MOST_THROUGH` pass the plate beside the hole, along the axis.
+    """Modules where more than `MOST_THROUGH` of the photons along the axis pass the plate beside the hole.
 
-    Beside the hole means: from where the plate has its full thickness to the rim of its front.
+    Beside the hole is where the plate has its full thickness, out to the rim of its front.
     """
     mu = positive(aperture_mu, "aperture_mu", "1/mm")
     found = []

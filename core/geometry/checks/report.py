@@ -1,206 +1,118 @@
-"""What the checks found: plain numbers, modules by the numbers that their users know."""
+"""The findings of the checks, as numbers and as one line each. Modules are named by their users' numbers."""
 
 from __future__ import annotations
 
 import math
 from dataclasses import asdict, dataclass
-from typing import Any
+from typing import Any, ClassVar
 
 from ..collimator import EdgePlace
-from ..module_parts import Kind
+from ..module_parts import PartKind
 
 
-@dataclass(frozen=True)
-class Overlap:
-    """Two parts of different modules penetrate each other.
+class Finding:
+    """Something wrong with one module or with a pair of modules; ``str`` gives it in one line."""
 
-    Attributes
-    ----------
-    first, second : int
-        The modules.
-    first_part, second_part : "collimator" or "crystal"
-        Their parts, as convex bodies: a collimator is filled.
-    depth : float
-        The shortest translation that separates them, mm.
-    point : (x, y, z)
-        A point inside both, world mm: the mean of the common body's corners.
-    """
+    message: ClassVar[str]
 
-    first: int
-    first_part: Kind
-    second: int
-    second_part: Kind
-    depth: float
-    point: tuple[float, float, float]
+    def __str__(self) -> str:
+        return self.message.format(self)
 
     @property
     def modules(self) -> tuple[int, ...]:
-        """Those that it is about."""
-        return self.first, self.second
-
-    def __str__(self) -> str:
-        at = ", ".join(f"{x:.1f}" for x in self.point)
-        return (
-            f"modules {self.first} and {self.second}: {self.first_part} and {self.second_part} overlap, "
-            f"{_mm(self.depth)} deep at ({at}) mm"
-        )
+        """Numbers of the modules concerned."""
+        return tuple(getattr(self, name) for name in ("first", "second", "module", "by") if hasattr(self, name))
 
 
 @dataclass(frozen=True)
-class NearPair:
-    """Two modules are nearly at one place: their fronts have no room side by side.
+class Overlap(Finding):
+    """Parts of two modules, taken as convex bodies, penetrate each other.
 
-    Attributes
-    ----------
-    first, second : int
-        The modules.
-    distance : float
-        Between their pinhole centres, mm.
+    `depth`, mm, is the shortest translation that separates them, and `point`, world mm, lies inside both.
     """
+
+    first: int
+    first_part: PartKind
+    second: int
+    second_part: PartKind
+    depth: float
+    point: tuple[float, float, float]
+    message = (
+        "modules {0.first} and {0.second}: {0.first_part} and {0.second_part} overlap, {0.depth:.4g} mm deep at "
+        "({0.point[0]:.1f}, {0.point[1]:.1f}, {0.point[2]:.1f}) mm"
+    )
+
+
+@dataclass(frozen=True)
+class NearPair(Finding):
+    """Two pinholes are `distance` mm apart, which is too close for their fronts to stand side by side."""
 
     first: int
     second: int
     distance: float
-
-    @property
-    def modules(self) -> tuple[int, ...]:
-        """Those that it is about."""
-        return self.first, self.second
-
-    def __str__(self) -> str:
-        return f"modules {self.first} and {self.second}: nearly at one place, pinholes {_mm(self.distance)} apart"
+    message = "modules {0.first} and {0.second}: nearly at one place, pinholes {0.distance:.4g} mm apart"
 
 
 @dataclass(frozen=True)
-class SwallowedPinhole:
-    """A pinhole's centre lies inside another module's part.
-
-    Attributes
-    ----------
-    module, by : int
-        The pinhole's module and the other one.
-    part : "collimator" or "crystal"
-        Of the other one, as a convex body.
-    depth : float
-        From the pinhole centre to that body's surface, mm.
-    """
+class SwallowedPinhole(Finding):
+    """A pinhole's centre lies `depth` mm below the surface of another module's part, taken as a convex body."""
 
     module: int
     by: int
-    part: Kind
+    part: PartKind
     depth: float
-
-    @property
-    def modules(self) -> tuple[int, ...]:
-        """Those that it is about."""
-        return self.module, self.by
-
-    def __str__(self) -> str:
-        return f"module {self.module}: its pinhole lies {_mm(self.depth)} inside module {self.by}'s {self.part}"
+    message = "module {0.module}: its pinhole lies {0.depth:.4g} mm inside module {0.by}'s {0.part}"
 
 
 @dataclass(frozen=True)
-class Intrusion:
-    """A module's collimator reaches into the ROI, the largest of the modules'.
-
-    Attributes
-    ----------
-    module : int
-        The module.
-    roi_radius : float
-        R of that ROI, mm.
-    depth : float
-        How far the collimator reaches into it, mm.
-    """
+class Intrusion(Finding):
+    """A module's collimator reaches `depth` mm into the largest ROI, whose radius is `roi_radius` mm."""
 
     module: int
     roi_radius: float
     depth: float
-
-    @property
-    def modules(self) -> tuple[int, ...]:
-        """Those that it is about."""
-        return (self.module,)
-
-    def __str__(self) -> str:
-        return f"module {self.module}: its collimator reaches {_mm(self.depth)} into the ROI of {_mm(self.roi_radius)}"
+    message = "module {0.module}: its collimator reaches {0.depth:.4g} mm into the ROI of {0.roi_radius:.4g} mm"
 
 
 @dataclass(frozen=True)
-class Uncovered:
+class Uncovered(Finding):
     """A module's field of view does not hold its ROI.
 
-    Attributes
-    ----------
-    module : int
-        The module.
-    roi_radius, seen_radius : float
-        R, and the radius of the largest sphere at the isocentre that the field of view holds, mm; 0 if none.
-    unseen_share : float
-        The ROI's volume outside the field of view, as a share of 1.
+    `seen_radius`, mm, is that of the largest sphere at the isocentre in the field of view, and `unseen_share` the
+    fraction of the ROI's volume outside the field of view.
     """
 
     module: int
     roi_radius: float
     seen_radius: float
     unseen_share: float
+    message = (
+        "module {0.module}: sees {0.seen_radius:.4g} mm around the isocentre, {0.shortage:.4g} mm less than its ROI radius; "
+        "{0.unseen_share:.3%} of the ROI is outside its field of view"
+    )
 
     @property
     def shortage(self) -> float:
-        """By how much the radius falls short, mm."""
+        """Missing radius, mm."""
         return self.roi_radius - self.seen_radius
-
-    @property
-    def modules(self) -> tuple[int, ...]:
-        """Those that it is about."""
-        return (self.module,)
-
-    def __str__(self) -> str:
-        return (
-            f"module {self.module}: sees {_mm(self.seen_radius)} around the isocentre, {_mm(self.shortage)} less than "
-            f"its ROI radius; {_percent(self.unseen_share)} of the ROI is outside its field of view"
-        )
 
 
 @dataclass(frozen=True)
-class Blocked:
-    """Another module stands between a pinhole and its ROI.
-
-    Attributes
-    ----------
-    module, by : int
-        The pinhole's module and the one in its way.
-    share : float
-        Rays of the pinhole's ROI that meet the other module, as a share of 1 (of the solid angle).
-    """
+class Blocked(Finding):
+    """Another module stands in the way of a fraction `share` of the rays (of the solid angle) from ROI to pinhole."""
 
     module: int
     by: int
     share: float
-
-    @property
-    def modules(self) -> tuple[int, ...]:
-        """Those that it is about."""
-        return self.module, self.by
-
-    def __str__(self) -> str:
-        return f"module {self.module}: module {self.by} blocks {_percent(self.share)} of the rays from its ROI"
+    message = "module {0.module}: module {0.by} blocks {0.share:.2%} of the rays from its ROI"
 
 
 @dataclass(frozen=True)
-class Vignetted:
-    """The plate shades its hole from a part of the ROI: it is too thick for its opening angle.
+class Vignetted(Finding):
+    """The plate is too thick for the hole's opening angle and shades the hole from part of the ROI.
 
-    Attributes
-    ----------
-    module : int
-        The module.
-    open_share : float
-        Of the hole's area, as a share of 1: what is open to the rays from the ROI that come in at the steepest.
-    plate_thickness : float
-        mm.
-    opening_angle, needed_angle : float
-        Of the hole's double cone, and from which on no plate shades it, rad.
+    Only the fraction `open_share` of the hole's area is open to the steepest rays from the ROI; with `needed_angle`,
+    rad, a plate of any thickness would leave the hole open.
     """
 
     module: int
@@ -208,100 +120,58 @@ class Vignetted:
     plate_thickness: float
     opening_angle: float
     needed_angle: float
-
-    @property
-    def modules(self) -> tuple[int, ...]:
-        """Those that it is about."""
-        return (self.module,)
+    message = (
+        "module {0.module}: only {0.open_share:.1%} of its hole is open to the rim of its ROI: a plate of "
+        "{0.plate_thickness:.4g} mm is too thick for an opening angle of {1:.4g} degrees, {2:.1f} are needed"
+    )
 
     def __str__(self) -> str:
-        return (
-            f"module {self.module}: only {_percent(self.open_share)} of its hole is open to the rim of its ROI: a plate of "
-            f"{_mm(self.plate_thickness)} is too thick for an opening angle of {math.degrees(self.opening_angle):.4g} "
-            f"degrees, {math.ceil(math.degrees(self.needed_angle) * 10) / 10:g} are needed"
-        )
+        # Rounded up, so that a plate of that angle passes.
+        needed = math.ceil(math.degrees(self.needed_angle) * 10) / 10
+        return self.message.format(self, math.degrees(self.opening_angle), needed)
 
 
 @dataclass(frozen=True)
-class ThinPlate:
-    """The plate around the hole lets so many photons through that the hole's own no longer say what is counted.
+class ThinPlate(Finding):
+    """The plate lets through a fraction `transmission` of the photons along the axis.
 
-    Attributes
-    ----------
-    module : int
-        The module.
-    plate_thickness : float
-        mm.
-    transmission : float
-        Of the plate along the axis, as a share of 1.
-    share : float
-        Photons that pass the plate beside the hole, as a share of those that pass the hole and its edge.
+    `share` is the number of photons that pass the plate beside the hole, relative to those that pass the hole and its
+    edge.
     """
 
     module: int
     plate_thickness: float
     transmission: float
     share: float
-
-    @property
-    def modules(self) -> tuple[int, ...]:
-        """Those that it is about."""
-        return (self.module,)
-
-    def __str__(self) -> str:
-        return (
-            f"module {self.module}: its plate of {_mm(self.plate_thickness)} lets {_percent(self.transmission)} of the "
-            f"photons through: beside the hole pass {_percent(self.share)} of those that pass the hole"
-        )
+    message = (
+        "module {0.module}: its plate of {0.plate_thickness:.4g} mm lets {0.transmission:.2%} of the photons through: "
+        "{0.share:.2%} as many pass beside the hole as pass the hole"
+    )
 
 
 @dataclass(frozen=True)
-class OpenMesh:
-    """A surface is not closed, not consistently oriented, or looks inwards.
-
-    Attributes
-    ----------
-    module : int
-        The module.
-    part : str
-        "collimator", "crystal" or "module" for both together.
-    fault : str
-        What is wrong with it.
-    """
+class OpenMesh(Finding):
+    """The surface of a part is not closed, not consistently wound, or inside out."""
 
     module: int
-    part: str
+    part: PartKind
     fault: str
-
-    @property
-    def modules(self) -> tuple[int, ...]:
-        """Those that it is about."""
-        return (self.module,)
-
-    def __str__(self) -> str:
-        what = "its mesh" if self.part == "module" else f"its {self.part}'s mesh"
-        return f"module {self.module}: {what} {self.fault}"
-
-
-Finding = Overlap | NearPair | SwallowedPinhole | Intrusion | Uncovered | Blocked | Vignetted | ThinPlate | OpenMesh
+    message = "module {0.module}: its {0.part}'s mesh {0.fault}"
 
 
 @dataclass(frozen=True)
 class GeometryReport:
-    """What `check_geometry` found, each kind in the order of the modules.
+    """What `check_geometry` found.
 
     Attributes
     ----------
     n_modules : int
-        How many modules were looked at.
-    plate_thickness, wall_thickness : float
-        With which the solids were built, mm.
-    opening_angle : float
-        Of their holes, rad.
-    edge_at : "middle", "front" or "back"
-        Where in the plates the knife edge is.
-    overlaps, near_pairs, swallowed_pinholes, intrusions, uncovered, blocked, vignetted, thin_plates, open_meshes : tuple
-        The findings.
+        Number of modules checked.
+    plate_thickness, wall_thickness, opening_angle, edge_at
+        The construction that was checked: mm, mm, rad, and "middle", "front" or "back".
+    overlaps, near_pairs, swallowed_pinholes, intrusions, uncovered, blocked, vignetted, thin_plates, open_meshes :
+    tuple
+        The findings of each kind, in the order of the modules.
     """
 
     n_modules: int
@@ -321,18 +191,8 @@ class GeometryReport:
 
     @property
     def findings(self) -> tuple[Finding, ...]:
-        """All of them."""
-        return (
-            *self.overlaps,
-            *self.near_pairs,
-            *self.swallowed_pinholes,
-            *self.intrusions,
-            *self.uncovered,
-            *self.blocked,
-            *self.vignetted,
-            *self.thin_plates,
-            *self.open_meshes,
-        )
+        """All findings."""
+        return tuple(finding for kind in vars(self).values() if isinstance(kind, tuple) for finding in kind)
 
     @property
     def ok(self) -> bool:
@@ -340,17 +200,9 @@ class GeometryReport:
         return not self.findings
 
     def messages(self, module: int | None = None) -> list[str]:
-        """One line for each finding; only those about the module of that number if one is given."""
-        return [str(f) for f in self.findings if module is None or module in f.modules]
+        """One line for each finding, or only for those that concern the module of the given number."""
+        return [str(finding) for finding in self.findings if module is None or module in finding.modules]
 
     def as_dict(self) -> dict[str, Any]:
-        """Everything as numbers, strings and lists, for JSON."""
+        """The report as numbers, strings and lists, for JSON."""
         return {**asdict(self), "ok": self.ok}
-
-
-def _mm(value: float) -> str:
-    return f"{value:.4g} mm"
-
-
-def _percent(share: float) -> str:
-    return f"{100 * share:.3g} %"

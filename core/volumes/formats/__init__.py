@@ -1,5 +1,5 @@
-"""Volumes in files.
+"""Formats of volumes in files.
 
-A format is a module here with ``read(path) -> Contents`` and, where it is written too, ``write(volume, path)``. `volume_io`
-chooses among them by the file's name.
+Each format is a module with ``read(path) -> Contents`` and, if it is also written, ``write(volume, path)``.
+`core.volumes.volume_files` chooses among them by the file's name.
 """

@@ -1,20 +1,22 @@
-"""What a file of voxels holds, before it is a `Volume`.
+"""The contents of a volume's file before they become a `Volume`, and helpers that the readers share.
 
-The world's axes are NIfTI's: +x to the patient's right, +y to the front (anterior), +z to the head (superior): RAS. DICOM
-and ITK's formats have theirs to the left, the back (posterior) and the head: LPS.
+World axes are NIfTI's: +x to the patient's right, +y to the front (anterior), +z to the head (superior), RAS for short.
+Those of DICOM and ITK point left, back (posterior) and to the head: LPS.
 """
 
 from __future__ import annotations
 
 import math
+import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ...errors import InputError
+from ...errors import InputError, InputWarning
 from ...geometry.grid import Grid
 from ...memory import require
 from ...validation import freeze
@@ -33,9 +35,9 @@ class Contents:
     array : array (n_x, n_y, n_z)
         The values, of any real type.
     affine : array (4, 4) or None
-        Index to world mm; None where the file does not say.
+        Index to world mm, or None if the file does not say.
     quantity, unit : str or None
-        What the file says that the values are.
+        Those of the values, if the file says them.
     """
 
     array: NDArray[Any]
@@ -44,7 +46,7 @@ class Contents:
     unit: str | None = None
 
     def volume(self, quantity: str) -> Volume:
-        """The volume, its values taken as `quantity`."""
+        """The volume, with its values taken as `quantity`."""
         require_voxels(self.array.shape, self.array.dtype)
         if self.affine is None:
             raise InputError("it has no affine: give one (index to world mm, 4 x 4)")
@@ -58,7 +60,7 @@ class Contents:
 
 
 def require_voxels(shape: Sequence[int], kind: np.dtype[Any]) -> None:
-    """Raise `InputError` unless an image of `shape` and of type `kind` is 3-D, of real numbers, and fits into memory."""
+    """Raise `InputError` unless an image of `shape` and type `kind` is 3-D, real and fits into memory."""
     sizes = " x ".join(map(str, shape)) or "of one value"
     if len(shape) != 3:
         raise InputError(f"expected a 3-D image, got shape {sizes}")
@@ -66,11 +68,28 @@ def require_voxels(shape: Sequence[int], kind: np.dtype[Any]) -> None:
         raise InputError(f"expected at least one voxel along each axis, got {sizes}")
     if kind.kind not in "fiub":
         raise InputError(f"expected real numbers, found {kind}")
-    # As the file has them, as float32, and what the check for finite numbers takes.
+    # The file's values, their float32 copy, and the check that they are finite.
     require((4.5 + kind.itemsize) * math.prod(int(n) for n in shape), f"a volume of {sizes} voxels")
 
 
+def refuse_several_files(field: str, where: str) -> None:
+    """Raise `InputError` if the header's `field` says that the voxels are in several files."""
+    if where.upper().startswith("LIST") or "%" in where:
+        raise InputError(f"{field} {where}: voxels in several files are not read; convert them to one")
+
+
+def warn(path: Path, text: str) -> None:
+    """Give an `InputWarning` about a file."""
+    warnings.warn(f"{path}: {text}", InputWarning, stacklevel=3)
+
+
+def warn_of_assumed(path: Path, assumed: Sequence[str]) -> None:
+    """Warn of what was `assumed` about the volume's place because the header does not say it, if anything."""
+    if assumed:
+        warn(path, f"it does not say how it lies; taken as: {'; '.join(assumed)}")
+
+
 def first_line(error: BaseException) -> str:
-    """What a library said, as one line."""
+    """A library's error message, as one line."""
     lines = [line.strip() for line in str(error).splitlines() if line.strip()]
     return lines[0] if lines else type(error).__name__

@@ -1,9 +1,8 @@
-"""DICOM series, by pydicom: slices are put in order by their place in the patient, and what does not fit is named.
+"""DICOM series, by pydicom: slices are sorted by their place in the patient, and whatever does not fit is named.
 
-Classic images (a file for each slice), enhanced, multi-frame ones and reconstructed nuclear medicine tomograms, whose
-slices are the frames of one file, are read. The patient's axes in DICOM (part 3, C.7.6.2) point left, back and up (LPS);
-ours right, front and up. The array's axes are columns, rows and slices: ix runs along a row of pixels, iy down the rows,
-and iz along the patient's axis that is closest to the slices' normal, towards right, front or head.
+Classic images (a file for each slice), enhanced, multi-frame images and reconstructed nuclear medicine tomograms, whose
+frames are the slices. Index axes run along a row of pixels, down the rows, and from slice to slice: towards right,
+front or head, whichever is closest to the slices' normal.
 """
 
 from __future__ import annotations
@@ -24,9 +23,9 @@ from .contents import RAS_FROM_LPS, Contents, first_line, require_voxels
 from .dicom_header import directions, numbers
 from .dicom_tomogram import is_nuclear, tomogram_frames
 
-_SAME_ORIENTATION = 1e-4  # cosines are written with 6 digits
+_SAME_ORIENTATION = 1e-4  # direction cosines are written with 6 digits
 _SAME_PLACE = 1e-3  # mm
-_SAME_SPACING = 0.02  # share of the spacing; scanners round positions
+_SAME_SPACING = 0.02  # relative; scanners round positions
 _UPRIGHT = 0.01  # tangent of the tilt; 0.6 degrees
 _UNITS = {"BQML": ("activity", 1e-3), "HU": ("hu", 1.0)}
 
@@ -44,7 +43,7 @@ class _Slice:
     slope: float
     intercept: float
     thickness: float
-    unit: str  # as DICOM codes it; "" where the file does not say
+    unit: str  # DICOM's code, or ""
 
     @property
     def name(self) -> str:
@@ -52,27 +51,23 @@ class _Slice:
 
 
 def is_dicom(path: Path) -> bool:
-    """Whether the file at `path` is DICOM: "DICM" stands after its first 128 bytes."""
+    """Whether the file at `path` is DICOM, by the letters "DICM" after its first 128 bytes."""
     with open(path, "rb") as file:
         return file.read(132)[128:] == b"DICM"
 
 
 def read(path: Path, series: str | None = None, progress: Progress | None = None) -> Contents:
-    """Read the series in a folder, or the one in its folder that a file belongs to.
+    """Read the series in a folder, or the series that a file belongs to.
 
-    Parameters
-    ----------
-    path
-        The folder, or any file of the series.
-    series
-        Which of several series in the folder: its number, its description or its UID.
-    progress
-        Called as ``progress(done, total)`` with slices.
+    `series` is the number, description or UID of one of several series in the folder. `progress(done, total)` counts
+    slices.
     """
     with warnings.catch_warnings():
-        warnings.filterwarnings("ignore", module="pydicom")  # about tags that nothing here depends on
+        warnings.filterwarnings("ignore", module="pydicom")  # about tags that are not used here
         headers = _chosen(_headers(path), path, series)
-        _require_one_volume(headers)
+        if len(headers) > 1 and any(_is_whole(header) for _, header in headers):
+            names = ", ".join(file.name for file, _ in headers)
+            raise InputError(f"its series has several files of several frames each, choose one: {names}")
         slices = [one for file, header in headers for one in _slices_of(file, header)]
         slices, step = _ordered(slices)
         quantity, factor = _quantity(headers[0][1], slices[0].unit)
@@ -93,7 +88,7 @@ def read(path: Path, series: str | None = None, progress: Progress | None = None
 
 
 def _headers(path: Path) -> list[tuple[Path, Any]]:
-    """The images in the folder, or those of a file's series, without their pixels."""
+    """The images in the folder, or those of a file's series, without pixels."""
     import pydicom
     from pydicom.errors import InvalidDicomError
 
@@ -123,7 +118,7 @@ def _headers(path: Path) -> list[tuple[Path, Any]]:
             headers[file] = header
     if not headers:
         raise InputError("expected a folder with the images of a DICOM series; it has none")
-    # pydicom reads a file that ends early as one with fewer tags, the last of them cut: if it is no report, it is an image.
+    # pydicom reads a truncated file as one with fewer tags. If it is of the same kind as the images, it is one of them.
     kinds = set(map(_kind, headers.values()))
     for file, header in others.items():
         of_series = wanted in (None, header.get("SeriesInstanceUID", wanted))
@@ -133,12 +128,12 @@ def _headers(path: Path) -> list[tuple[Path, Any]]:
 
 
 def _is_whole(header: Any) -> bool:
-    """Whether a file is a volume by itself: a nuclear medicine image of several frames."""
+    """Whether a file alone is a volume: a nuclear medicine image of several frames."""
     return is_nuclear(header) and int(header.get("NumberOfFrames") or 1) > 1
 
 
 def _kind(header: Any) -> str:
-    """The UID of what a file is, such as a CT image, or ""."""
+    """The UID of the kind of file, such as CT image, or ""."""
     return str(header.file_meta.get("MediaStorageSOPClassUID") or header.get("SOPClassUID", ""))
 
 
@@ -158,15 +153,8 @@ def _chosen(headers: list[tuple[Path, Any]], path: Path, series: str | None) -> 
     return next(iter(found.values()))
 
 
-def _require_one_volume(headers: list[tuple[Path, Any]]) -> None:
-    """Raise `InputError` if a series consists of files that are volumes by themselves."""
-    if len(headers) > 1 and any(_is_whole(header) for _, header in headers):
-        names = ", ".join(file.name for file, _ in headers)
-        raise InputError(f"its series has several files of several frames each, choose one: {names}")
-
-
 def _listed(found: dict[str, list[tuple[Path, Any]]]) -> str:
-    """Series by number, description and count, as in ``3 "Thorax 1.0" (133 images)``."""
+    """The series by number, description and count, such as ``3 "Thorax 1.0" (133 images)``."""
     parts = []
     for uid, of in found.items():
         header = of[0][1]
@@ -177,56 +165,54 @@ def _listed(found: dict[str, list[tuple[Path, Any]]]) -> str:
 
 
 def _slices_of(path: Path, header: Any) -> list[_Slice]:
-    """The images of a file, or `InputError` that names it."""
+    """The images of a file; `InputError` names it."""
     try:
         return list(_slices(path, header))
-    except InputError:
-        raise
-    except Exception as error:  # whatever pydicom raises on a tag that is damaged: it parses them when asked
+    except InputError as error:
+        raise InputError(f"{path.name}: {error}") from None
+    except Exception as error:  # whatever pydicom raises on a damaged tag; it parses tags on access
         raise InputError(f"{path.name}: cannot be read as DICOM ({first_line(error)})") from None
 
 
 def _slices(path: Path, header: Any) -> Iterator[_Slice]:
     """The images of a file."""
     if header.get("SamplesPerPixel", 1) != 1:
-        raise InputError(f"{path.name}: expected one value per pixel, found {header.SamplesPerPixel} (a colour image)")
+        raise InputError(f"expected one value per pixel, found {header.SamplesPerPixel} (a colour image)")
     tilt = float(header.get("GantryDetectorTilt") or 0.0)
     if abs(tilt) > 0.01:
         raise InputError(
-            f"{path.name}: the gantry is tilted by {tilt:g} degrees; expected upright slices: resample the series first"
+            f"the gantry is tilted by {tilt:g} degrees; expected upright slices: resample the series first"
         )
     if "ModalityLUTSequence" in header:
-        raise InputError(f"{path.name}: values by a table (ModalityLUTSequence) are not read; expected RescaleSlope")
+        raise InputError("values by a table (ModalityLUTSequence) are not read; expected RescaleSlope")
     count = int(header.get("NumberOfFrames") or 1)
-    frames = _frames(path, header)
+    frames = _frames(header)
     if len(frames) != count:
-        raise InputError(
-            f"{path.name}: {count} frames without a place for each; expected an enhanced image, or one frame"
-        )
+        raise InputError(f"{count} frames without a place for each; expected an enhanced image, or one frame")
     for number, frame in enumerate(frames):
-        spacing = numbers(path.name, frame, "PixelSpacing", 2)
+        spacing = numbers(frame, "PixelSpacing", 2)
         if spacing.min() <= 0:
-            raise InputError(f"{path.name}: PixelSpacing: expected more than 0 mm, got {spacing.min():g}")
+            raise InputError(f"PixelSpacing: expected more than 0 mm, got {spacing.min():g}")
         yield _Slice(
             path=path,
             frame=number,
             shape=(int(header.Rows), int(header.Columns)),
             spacing=(float(spacing[0]), float(spacing[1])),
-            orientation=directions(path.name, frame),
-            position=numbers(path.name, frame, "ImagePositionPatient", 3),
-            slope=float(numbers(path.name, frame, "RescaleSlope", 1, 1.0)[0]),
-            intercept=float(numbers(path.name, frame, "RescaleIntercept", 1, 0.0)[0]),
-            thickness=float(numbers(path.name, frame, "SliceThickness", 1, 0.0)[0]),
+            orientation=directions(frame),
+            position=numbers(frame, "ImagePositionPatient", 3),
+            slope=float(numbers(frame, "RescaleSlope", 1, 1.0)[0]),
+            intercept=float(numbers(frame, "RescaleIntercept", 1, 0.0)[0]),
+            thickness=float(numbers(frame, "SliceThickness", 1, 0.0)[0]),
             unit=str(header.get("Units") or frame.get("RescaleType") or ""),
         )
 
 
-def _frames(path: Path, header: Any) -> list[Any]:
-    """What describes each image of a file: the header, or in an enhanced image the frame's groups and the shared ones."""
+def _frames(header: Any) -> list[Any]:
+    """The description of each image of a file: the header; in an enhanced image the shared groups and the frame's own."""
     from pydicom.dataset import Dataset
 
     if "PerFrameFunctionalGroupsSequence" not in header:
-        return tomogram_frames(path.name, header) if is_nuclear(header) else [header]
+        return tomogram_frames(header) if is_nuclear(header) else [header]
     shared = header.get("SharedFunctionalGroupsSequence") or []
     frames = []
     for own in header.PerFrameFunctionalGroupsSequence:
@@ -240,7 +226,7 @@ def _frames(path: Path, header: Any) -> list[Any]:
 
 
 def _ordered(slices: list[_Slice]) -> tuple[list[_Slice], NDArray[np.float64]]:
-    """The slices by place, and the step (3,), mm, from one to the next."""
+    """The slices sorted by place, and the step (3,), mm, from one to the next."""
     first = slices[0]
     for one in slices:
         for name, same in (
@@ -249,7 +235,7 @@ def _ordered(slices: list[_Slice]) -> tuple[list[_Slice], NDArray[np.float64]]:
             ("another orientation", np.allclose(one.orientation, first.orientation, atol=_SAME_ORIENTATION)),
         ):
             if not same:
-                raise InputError(f"{one.name} has {name}, unlike {first.name}: expected one stack of like slices")
+                raise InputError(f"{one.name} has {name}, unlike {first.name}: expected one stack of equal slices")
     normal = np.cross(*first.orientation)
     towards = RAS_FROM_LPS[:3, :3] @ normal
     normal = normal * np.sign(towards[np.abs(towards).argmax()])
@@ -259,7 +245,8 @@ def _ordered(slices: list[_Slice]) -> tuple[list[_Slice], NDArray[np.float64]]:
         if not first.thickness > 0:
             raise InputError(f"{first.name}: a single slice without a SliceThickness")
         return slices, normal * first.thickness
-    places = np.array([one.position @ normal for one in slices])
+    positions = np.array([one.position for one in slices])
+    places = positions @ normal
     gaps = np.diff(places)
     if gaps.min() < _SAME_PLACE:
         k = int(gaps.argmin())
@@ -278,16 +265,11 @@ def _ordered(slices: list[_Slice]) -> tuple[list[_Slice], NDArray[np.float64]]:
             f"{places[k]:g} mm, the others {usual:g} mm"
         )
     if usual > 1.5 * first.thickness > 0:
-        warnings.warn(
-            f"the slices are {first.thickness:g} mm thick and lie {usual:g} mm apart: there are gaps between them, or some "
-            "are missing",
-            InputWarning,
-            stacklevel=2,
-        )
+        text = f"the slices are {first.thickness:g} mm thick and lie {usual:g} mm apart: there are gaps between them, "
+        warnings.warn(f"{text}or some are missing", InputWarning, stacklevel=2)
     step = (last.position - first.position) / (len(slices) - 1)
-    sideways = np.array(
-        [one.position - first.position - (one.position - first.position) @ normal * normal for one in slices]
-    )
+    moved = positions - first.position
+    sideways = moved - np.outer(moved @ normal, normal)
     tilt = float(np.linalg.norm(sideways[-1]) / (places[-1] - places[0]))
     if tilt > _UPRIGHT:
         raise InputError(
@@ -302,7 +284,7 @@ def _ordered(slices: list[_Slice]) -> tuple[list[_Slice], NDArray[np.float64]]:
 
 
 def _quantity(header: Any, unit: str) -> tuple[str, float]:
-    """What a modality's values are, and what brings them to our unit."""
+    """The quantity of the values, and the factor to its unit."""
     modality = header.get("Modality")
     if modality == "CT":
         return "hu", 1.0
@@ -310,7 +292,7 @@ def _quantity(header: Any, unit: str) -> tuple[str, float]:
 
 
 def _pixels(slices: list[_Slice]) -> Iterator[tuple[_Slice, NDArray[Any]]]:
-    """Each slice with its stored values (rows, columns); of a multi-frame file, which is decoded once."""
+    """Each slice with its stored values (rows, columns). A multi-frame file is decoded once."""
     import pydicom
 
     path, frames = None, np.empty(0)
@@ -320,7 +302,7 @@ def _pixels(slices: list[_Slice]) -> Iterator[tuple[_Slice, NDArray[Any]]]:
             data = pydicom.dcmread(path)
             try:
                 frames = data.pixel_array
-            except Exception as error:  # truncated, or compressed in a way for which nothing is installed
+            except Exception as error:  # truncated, or compressed by a method that is not installed
                 syntax = data.file_meta.TransferSyntaxUID
                 if syntax.is_compressed:
                     raise InputError(

@@ -11,34 +11,28 @@ from numpy.typing import NDArray
 from ...errors import InputError
 
 
-def numbers(file: str, header: Any, name: str, length: int, default: float | None = None) -> NDArray[np.float64]:
-    """The `length` finite numbers of the tag `name`, or `default` where it is missing or empty.
+def numbers(header: Any, name: str, length: int, default: float | None = None) -> NDArray[np.float64]:
+    """The `length` finite numbers of the tag `name`, or `default` if it is missing or empty.
 
-    Raises
-    ------
-    InputError
-        It is missing without a default, or holds something else; the message names `file` and the tag.
+    `InputError` names the tag if there is no default or the tag holds something else.
     """
     given = header.get(name)
     value = default if given is None or given == "" else given
     if value is None:
-        raise InputError(f"{file}: it has no {name}")
+        raise InputError(f"it has no {name}")
     array = np.array(value, np.float64).reshape(-1)
     if len(array) != length or not np.isfinite(array).all():
-        raise InputError(f"{file}: {name}: expected {length} numbers, got {textwrap.shorten(str(given), 60)}")
+        raise InputError(f"{name}: expected {length} numbers, got {textwrap.shorten(str(given), 60)}")
     return array
 
 
-def directions(file: str, header: Any) -> NDArray[np.float64]:
-    """ImageOrientationPatient as two orthonormal rows (2, 3): along a row of pixels and down the rows.
+def directions(header: Any) -> NDArray[np.float64]:
+    """ImageOrientationPatient as two orthonormal rows (2, 3): along a row of pixels, and down the rows.
 
-    Raises
-    ------
-    InputError
-        It is missing, or the two are not unit vectors at right angles.
+    `InputError` if it is missing or does not hold two unit vectors at right angles.
     """
-    rows = numbers(file, header, "ImageOrientationPatient", 6).reshape(2, 3)
+    rows = numbers(header, "ImageOrientationPatient", 6).reshape(2, 3)
     if not np.allclose(rows @ rows.T, np.eye(2), atol=1e-3):
-        raise InputError(f"{file}: ImageOrientationPatient: expected two unit vectors at right angles")
+        raise InputError("ImageOrientationPatient: expected two unit vectors at right angles")
     left, _, right = np.linalg.svd(rows, full_matrices=False)
-    return left @ right  # the nearest: the file's few digits are not exactly that
+    return left @ right  # the nearest orthonormal rows: the file has few digits

@@ -1,4 +1,4 @@
-"""HDF5: datasets ``array`` and ``affine``, the quantity and the unit as attributes of the array. A run's volume, too."""
+"""HDF5: datasets ``array``, with the attributes quantity and unit, and ``affine``. Run files are read, too."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from .contents import Contents, require_voxels
 
 
 def read(path: Path) -> Contents:
-    """Read .h5 or .hdf5: the volume at the file's root, or in the group ``volume`` as in a run."""
+    """Read .h5 or .hdf5: the volume at the file's root, or in the group ``volume`` of a run file."""
     import h5py
 
     with h5py.File(path, "r") as file:
@@ -32,7 +32,7 @@ def read(path: Path) -> Contents:
 
 
 def write(volume: Volume, path: Path) -> None:
-    """Write the volume at the file's root."""
+    """Write the volume to the file's root."""
     import h5py
 
     with h5py.File(path, "w") as file:

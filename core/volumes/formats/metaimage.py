@@ -1,12 +1,11 @@
-"""MetaImage, ITK's format: a header of ``Key = Value`` lines, and raw or zlib-compressed voxels in it or beside it.
+"""MetaImage, ITK's format: a header of ``Key = Value`` lines, and raw or zlib-compressed voxels behind or beside it.
 
-Of Python's libraries only ITK and SimpleITK read it, at 50 MB for each platform; the format is short enough to be read here.
-Its description: https://itk.org/Wiki/ITK/MetaIO/Documentation
+Only ITK and SimpleITK read it in Python, and they are too large to depend on (50 MB). The format is described at
+https://itk.org/Wiki/ITK/MetaIO/Documentation
 """
 
 from __future__ import annotations
 
-import warnings
 import zlib
 from pathlib import Path
 from typing import BinaryIO
@@ -14,23 +13,14 @@ from typing import BinaryIO
 import numpy as np
 from numpy.typing import NDArray
 
-from ...errors import InputError, InputWarning
-from .contents import RAS_FROM_LPS, Contents, require_voxels
+from ...errors import InputError
+from .contents import RAS_FROM_LPS, Contents, refuse_several_files, require_voxels, warn_of_assumed
 
 _TYPES = {
-    "MET_CHAR": "i1",
-    "MET_UCHAR": "u1",
-    "MET_SHORT": "i2",
-    "MET_USHORT": "u2",
-    "MET_INT": "i4",
-    "MET_UINT": "u4",
-    "MET_LONG": "i4",
-    "MET_ULONG": "u4",
-    "MET_LONG_LONG": "i8",
-    "MET_ULONG_LONG": "u8",
-    "MET_FLOAT": "f4",
-    "MET_DOUBLE": "f8",
-}
+    "MET_CHAR": "i1", "MET_SHORT": "i2", "MET_INT": "i4", "MET_LONG": "i4", "MET_LONG_LONG": "i8",
+    "MET_UCHAR": "u1", "MET_USHORT": "u2", "MET_UINT": "u4", "MET_ULONG": "u4", "MET_ULONG_LONG": "u8",
+    "MET_FLOAT": "f4", "MET_DOUBLE": "f8",
+}  # fmt: skip
 _MILLIMETRES = {"mm": 1.0, "cm": 10.0, "um": 0.001, "?": 1.0}
 _LONGEST_HEADER = 1 << 16
 
@@ -57,7 +47,7 @@ def read(path: Path) -> Contents:
 
 
 def _header(file: BinaryIO) -> dict[str, str]:
-    """The keys and values up to ElementDataFile, the last one; `file` is left where the voxels may begin."""
+    """The keys and values up to the last key, ElementDataFile; the voxels may follow in `file`."""
     header: dict[str, str] = {}
     while "ElementDataFile" not in header:
         line = file.readline(_LONGEST_HEADER)
@@ -73,8 +63,7 @@ def _header(file: BinaryIO) -> dict[str, str]:
 def _data(header: dict[str, str], file: BinaryIO, path: Path, size: int) -> bytes:
     """The `size` bytes of voxels."""
     where = header["ElementDataFile"]
-    if where.upper().startswith("LIST") or "%" in where:
-        raise InputError(f"ElementDataFile = {where}: voxels in several files are not read; convert them to one")
+    refuse_several_files("ElementDataFile", where)
     if not _true(header.get("BinaryData", "True")):
         raise InputError("BinaryData = False: voxels written as text are not read")
     if where.upper() != "LOCAL":
@@ -89,29 +78,29 @@ def _data(header: dict[str, str], file: BinaryIO, path: Path, size: int) -> byte
 def _unpacked(header: dict[str, str], file: BinaryIO, size: int, name: str) -> bytes:
     skip = int(header.get("HeaderSize", 0))
     if _true(header.get("CompressedData", "False")):
-        # One byte more than expected, so that too much data shows.
+        # One byte more than expected, to notice too much data.
         data = zlib.decompressobj(zlib.MAX_WBITS | 32).decompress(file.read(), size + 1)
     else:
-        if skip == -1:  # the voxels are the last bytes of the file
+        if skip == -1:  # the voxels end the file
             file.seek(-size, 2)
         elif skip:
             file.seek(skip, 1)
         data = file.read(size + 1)
     if len(data) != size:
-        more = "more" if len(data) > size else f"{len(data)}"
+        more = "more" if len(data) > size else len(data)
         raise InputError(f"expected {size} bytes of voxels (DimSize x ElementType), {name} holds {more}")
     return data
 
 
 def _affine(header: dict[str, str], path: Path) -> NDArray[np.float64]:
-    """Index to world mm; warns of what is not in the header."""
+    """Index to world mm, with a warning of what the header does not say."""
     spacing, offset = ("ElementSpacing", "ElementSize"), ("Offset", "Position", "Origin")
     turned = ("TransformMatrix", "Rotation", "Orientation")
-    said = "AnatomicalOrientation"  # ITK's programs write it beside the matrix, which is what counts
+    said = "AnatomicalOrientation"  # ITK's programs write it beside the matrix, which takes precedence
     if not header.keys() & set(turned) and header.get(said, "RAI").upper() not in ("RAI", "???"):
         raise InputError(f"{said} = {header[said]} without a TransformMatrix: expected the matrix, or RAI")
     affine = np.eye(4)
-    # Row i of the matrix in the file is the direction of axis i.
+    # Row i of the matrix is the direction of axis i.
     directions = _numbers(header, turned, np.eye(3).ravel()).reshape(3, 3)
     affine[:3, :3] = directions.T * _numbers(header, spacing, np.ones(3))
     affine[:3, 3] = _numbers(header, offset, np.zeros(3))
@@ -121,21 +110,19 @@ def _affine(header: dict[str, str], path: Path) -> NDArray[np.float64]:
     affine[:3] *= _MILLIMETRES[unit]
     assumed = ["voxels of 1 mm"] * (not header.keys() & set(spacing))
     assumed += ["the first voxel's centre at (0, 0, 0)"] * (not header.keys() & set(offset))
-    if assumed:
-        text = f"{path}: it does not say how it lies; taken as: {'; '.join(assumed)}"
-        warnings.warn(text, InputWarning, stacklevel=4)
+    warn_of_assumed(path, assumed)
     return RAS_FROM_LPS @ affine
 
 
 def _refuse_scaled(header: dict[str, str]) -> None:
-    """Refuse voxels that stand for other values."""
+    """Refuse voxels whose values are to be scaled."""
     for key, plain in (("ElementToIntensityFunctionSlope", 1.0), ("ElementToIntensityFunctionOffset", 0.0)):
         if _numbers(header, (key,), np.array([plain]))[0] != plain:
             raise InputError(f"{key} = {header[key]}: values that are to be scaled are not read")
 
 
 def _numbers(header: dict[str, str], keys: tuple[str, ...], default: NDArray[np.float64] | None) -> NDArray[np.float64]:
-    """The numbers of the first of `keys` that there is, as many as `default` has."""
+    """The numbers of the first of `keys` in the header, as many as `default` has."""
     text = next((header[key] for key in keys if key in header), None)
     if text is None:
         if default is None:

@@ -3,20 +3,18 @@
 from __future__ import annotations
 
 import json
-import warnings
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from ...errors import InputError, InputWarning
+from ...errors import InputError
 from ..volume import UNITS, Volume
-from .contents import Contents, first_line, require_voxels
+from .contents import Contents, first_line, require_voxels, warn
 
 _MILLIMETRES = {"unknown": 1.0, "mm": 1.0, "meter": 1000.0, "micron": 0.001}
-
-
-_APART = 0.1  # voxels by which the two places that a file may say can differ: quaternions of float32 round
+_ANALYZE_MILLIMETRES = {"": 1.0, "mm": 1.0, "cm": 10.0, "m": 1000.0, "um": 0.001}
+_APART = 0.1  # voxels by which sform and qform may differ, because quaternions of float32 are rounded
 
 
 def read(path: Path) -> Contents:
@@ -25,37 +23,36 @@ def read(path: Path) -> Contents:
     from nibabel.filebasedimages import ImageFileError
     from nibabel.imageglobals import logger
 
-    logger.disabled, before = True, logger.disabled  # it prints what it raises, too
+    logger.disabled, before = True, logger.disabled  # nibabel prints what it raises
     try:
         image = nibabel.load(path)
     except ImageFileError as error:
         raise InputError(f"not a NIfTI file ({first_line(error)})") from None
     finally:
         logger.disabled = before
-    if not isinstance(image, nibabel.AnalyzeImage):  # NIfTI's classes are made from it
+    if not isinstance(image, nibabel.AnalyzeImage):  # the base class of NIfTI's
         raise InputError(f"expected NIfTI, found {type(image).__name__}")
-    image = nibabel.squeeze_image(image)  # (x, y, z, 1) is common, and a volume
+    image = nibabel.squeeze_image(image)  # (x, y, z, 1) is common
     require_voxels(image.shape, image.get_data_dtype())
-    affine = np.array(image.affine, np.float64)
+    affine, header = np.array(image.affine, np.float64), image.header
     if not isinstance(image, nibabel.Nifti1Pair):
-        _warn(f"{path}: Analyze files do not say where the patient lies: taken as centred, x from right to left")
-        affine[:3] *= _analyze_unit(image.header)
+        warn(path, "Analyze files do not say where the patient lies: taken as centred, x from right to left")
+        unit = bytes(header["vox_units"].item()).decode("latin-1").strip("\0 ").lower()
+        if unit not in _ANALYZE_MILLIMETRES:
+            raise InputError(f"vox_units {unit!r}: expected mm, cm, m or um")
+        affine[:3] *= _ANALYZE_MILLIMETRES[unit]
         return Contents(_values(image), affine)
-    header = image.header
     if header["qform_code"] == header["sform_code"] == 0:
-        _warn(f"{path}: it does not say where the patient lies: taken as centred, x from right to left")
+        warn(path, "it does not say where the patient lies: taken as centred, x from right to left")
     elif header["qform_code"] > 0 and header["sform_code"] > 0:
-        corners, between = (
-            np.array(list(np.ndindex(2, 2, 2))) * (np.array(image.shape) - 1),
-            affine - header.get_qform(),
-        )
+        corners = np.array(list(np.ndindex(2, 2, 2))) * (np.array(image.shape) - 1)
+        between = affine - header.get_qform()
         apart = np.linalg.norm(corners @ between[:3, :3].T + between[:3, 3], axis=1).max() / min(header.get_zooms())
         if apart > _APART:
-            _warn(f"{path}: its sform and qform lie up to {apart:.3g} voxels apart: taken by the sform")
+            warn(path, f"its sform and qform lie up to {apart:.3g} voxels apart: taken by the sform")
     affine[:3] *= _MILLIMETRES[header.get_xyzt_units()[0]]
     named = header.get_intent()[2]
-    quantity = named if named in UNITS else None
-    return Contents(_values(image), affine, quantity, _unit(header))
+    return Contents(_values(image), affine, named if named in UNITS else None, _unit(header))
 
 
 def write(volume: Volume, path: Path) -> None:
@@ -73,22 +70,9 @@ def _values(image: Any) -> Any:
     return np.ascontiguousarray(image.get_fdata(dtype=np.float32, caching="unchanged"))
 
 
-def _analyze_unit(header: Any) -> float:
-    """mm of the unit of lengths in an Analyze header."""
-    unit = bytes(header["vox_units"].item()).decode("latin-1").strip("\0 ").lower()
-    units = {"": 1.0, "mm": 1.0, "cm": 10.0, "m": 1000.0, "um": 0.001}
-    if unit not in units:
-        raise InputError(f"vox_units {unit!r}: expected mm, cm, m or um")
-    return units[unit]
-
-
 def _unit(header: Any) -> str | None:
-    """The unit in the description that `write` leaves."""
+    """The unit in a description that `write` left."""
     try:
         return json.loads(bytes(header["descrip"].item()).decode()).get("unit")
     except (ValueError, AttributeError):
         return None
-
-
-def _warn(text: str) -> None:
-    warnings.warn(text, InputWarning, stacklevel=4)

@@ -2,45 +2,35 @@
 
 from __future__ import annotations
 
-import warnings
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from ...errors import InputError, InputWarning
+from ...errors import InputError
 from ..volume import Volume
-from .contents import Contents, first_line, require_voxels
+from .contents import Contents, first_line, refuse_several_files, require_voxels, warn_of_assumed
 
-# The signs that turn a space's axes into right, anterior, superior. A space without a name is taken as that.
-_SPACES = {
-    None: (1, 1, 1),
-    "right-anterior-superior": (1, 1, 1),
-    "ras": (1, 1, 1),
-    "left-anterior-superior": (-1, 1, 1),
-    "las": (-1, 1, 1),
-    "left-posterior-superior": (-1, -1, 1),
-    "lps": (-1, -1, 1),
-    "3d-right-handed": (1, 1, 1),
+# Signs that turn a space's axes to right, anterior, superior, which are assumed for a space without a name.
+_SPACES: dict[str | None, tuple[int, int, int]] = {
+    **dict.fromkeys((None, "right-anterior-superior", "ras", "3d-right-handed"), (1, 1, 1)),
+    **dict.fromkeys(("left-anterior-superior", "las"), (-1, 1, 1)),
+    **dict.fromkeys(("left-posterior-superior", "lps"), (-1, -1, 1)),
 }
-# Units of length; an empty one is unknown, and taken as mm like one that is not there.
+# Units of length. An empty one is unknown and, like a missing one, taken as mm.
 _MILLIMETRES = {
     **dict.fromkeys(("", "mm", "millimeter", "millimeters", "millimetre", "millimetres"), 1.0),
     **dict.fromkeys(("cm", "centimeter", "centimeters", "centimetre", "centimetres"), 10.0),
     **dict.fromkeys(("m", "meter", "meters", "metre", "metres"), 1000.0),
     **dict.fromkeys(("um", "µm", "micron", "microns", "micrometer", "micrometers"), 0.001),
 }
-# The kinds of an axis along which a volume extends; "???" and "none" say nothing.
+# Kinds of a spatial axis; "???" and "none" say nothing.
 _SPATIAL = ("domain", "space", "none", "???")
 _UNITS = {
-    "hounsfield": "HU",
-    "hounsfield unit": "HU",
-    "hounsfield units": "HU",
-    "hu": "HU",
-    "mm-1": "1/mm",
-    "mm^-1": "1/mm",
+    **dict.fromkeys(("hounsfield", "hounsfield unit", "hounsfield units", "hu"), "HU"),
+    **dict.fromkeys(("mm-1", "mm^-1"), "1/mm"),
 }
-# Fields that say what the values are or where they lie, by the names that pynrrd knows.
+# Fields about the values or their places, by the names that pynrrd understands.
 _SYNONYMS = {
     "axismins": "axis mins", "axismaxs": "axis maxs", "centers": "centerings", "oldmin": "old min", "oldmax": "old max",
     "lineskip": "line skip", "byteskip": "byte skip", "datafile": "data file",
@@ -49,7 +39,7 @@ _FIELDS = (
     "space", "space dimension", "space units", "space origin", "space directions", "spacings", "units", "kinds",
     "sample units", *_SYNONYMS.values(),
 )  # fmt: skip
-_SAME = 1e-6  # by how much, of a spacing, two statements of one length may differ: they are rounded decimals
+_SAME = 1e-6  # relative difference of two statements of a length that rounded decimals explain
 
 
 def read(path: Path) -> Contents:
@@ -65,13 +55,11 @@ def read(path: Path) -> Contents:
         raise InputError("expected real numbers, found blocks of bytes")
     require_voxels(header["sizes"], np.dtype(np.float64 if kind == "double" else np.float32))
     _refuse_quantized(header)
-    where = header.get("data file", "")
-    if where.upper().startswith("LIST") or "%" in where:
-        raise InputError(f"data file: {where}: voxels in several files are not read; convert them to one")
+    refuse_several_files("data file:", header.get("data file", ""))
     affine = _affine(header, path)
     try:
         array, _ = nrrd.read(str(path))
-    except Exception as error:  # of what is not there, pynrrd says little or nothing
+    except Exception as error:  # pynrrd says little or nothing of missing data
         sizes = " x ".join(map(str, header["sizes"]))
         raise InputError(f"its data are damaged or end early; expected {sizes} voxels ({first_line(error)})") from error
     unit = header.get("unit") or header.get("sample units")
@@ -96,13 +84,7 @@ def write(volume: Volume, path: Path) -> None:
 
 
 def _known_names(header: dict[str, Any]) -> dict[str, Any]:
-    """The header with one name for each field.
-
-    Raises
-    ------
-    InputError
-        A field is there under a name that pynrrd leaves unread, such as "Spacings".
-    """
+    """The header with one name for each field; `InputError` for a name that pynrrd ignores, such as "Spacings"."""
     found: dict[str, Any] = {}
     for name, value in header.items():
         known = _SYNONYMS.get(name.lower(), name.lower())
@@ -113,14 +95,14 @@ def _known_names(header: dict[str, Any]) -> dict[str, Any]:
 
 
 def _refuse_quantized(header: dict[str, Any]) -> None:
-    """Refuse whole numbers that stand for others, from "old min" to "old max"."""
+    """Refuse whole numbers that encode others between "old min" and "old max"."""
     ends = [header[name] for name in ("old min", "old max") if np.isfinite(float(header.get(name, np.nan)))]
     if ends and header["type"] not in ("float", "double"):
         raise InputError("old min and old max: quantized values are not read; unquantize them (unu unquantize)")
 
 
 def _affine(header: dict[str, Any], path: Path) -> np.ndarray:
-    """Index to world mm; warns of what is not in the header."""
+    """Index to world mm, with a warning of what the header does not say."""
     space = header.get("space")
     name = None if space is None else space.lower()
     if name not in _SPACES:
@@ -130,42 +112,37 @@ def _affine(header: dict[str, Any], path: Path) -> np.ndarray:
     kinds = header.get("kinds", ["space"] * 3)
     if any(kind.lower() not in _SPATIAL for kind in kinds):
         raise InputError(f"kinds {' '.join(kinds)}: expected three axes of space or domain")
-    affine, assumed = np.eye(4), [] if name else ["axes right, anterior, superior"]
-    origin = None if "space origin" not in header else np.asarray(header["space origin"], np.float64)
-    space_units = _scales(header, "space units", None)
+    assumed = [] if name else ["axes right, anterior, superior"]
+    space_units, units = _scales(header, "space units"), _scales(header, "units")
+    scale, first = np.ones(3) if space_units is None else space_units, None
     if "space directions" in header:
-        affine[:3, :3] = _of_space(header, np.asarray(header["space directions"], np.float64))
-        units = _scales(header, "units", None)
         if space_units is None and units is not None and np.ptp(units) == 0:
-            space_units = units
-        elif units is not None and np.any(units != (1.0 if space_units is None else space_units)):
+            scale = units
+        elif units is not None and np.any(units != scale):
             raise InputError("units: the axes' own differ from the space's; expected space units alone")
-        scale = np.ones(3) if space_units is None else space_units
+        axes = scale[:, None] * _of_space(header, np.asarray(header["space directions"], np.float64))
     else:
-        scale = np.ones(3) if space_units is None else space_units
-        own = _scales(header, "units", scale)
         spacings, first, said = _of_axes(header)
         assumed += said
-        affine[:3, :3] = np.diag(spacings * own / scale)
-        if first is not None:
-            first = first * own / scale
-            if origin is not None and np.any(np.abs(first - origin) > _SAME * np.abs(spacings * own / scale)):
-                raise InputError(f"axis mins and space origin say different places: {_text(first)} and {_text(origin)}")
-            origin = first
-    if origin is None:
-        assumed.append("the first voxel's centre at (0, 0, 0)")
+        own = scale if units is None else units
+        axes, first = np.diag(spacings * own), None if first is None else first * own
+    if "space origin" in header:
+        origin = scale * np.asarray(header["space origin"], np.float64)
+        if first is not None and np.any(np.abs(first - origin) > _SAME * np.abs(np.diag(axes))):
+            raise InputError(f"axis mins and space origin say different places: {_text(first)} and {_text(origin)} mm")
+    elif first is not None:
+        origin = first
     else:
-        affine[:3, 3] = origin
-    affine[:3] *= scale[:, None]
-    if assumed:
-        warnings.warn(
-            f"{path}: it does not say how it lies; taken as: {'; '.join(assumed)}", InputWarning, stacklevel=4
-        )
+        assumed.append("the first voxel's centre at (0, 0, 0)")
+        origin = np.zeros(3)
+    affine = np.eye(4)
+    affine[:3, :3], affine[:3, 3] = axes, origin
+    warn_of_assumed(path, assumed)
     return np.diag([*map(float, _SPACES[name]), 1.0]) @ affine
 
 
 def _of_space(header: dict[str, Any], directions: np.ndarray) -> np.ndarray:
-    """The directions as columns; the format allows no statements of the axes' own beside them: these must be the same."""
+    """The directions as columns. The format allows no other lengths of the axes with them, so those must agree."""
     if directions.shape != (3, 3) or not np.isfinite(directions).all():
         raise InputError("space directions: expected a vector for each of three axes")
     if any(np.isfinite(_numbers(header, name)).any() for name in ("axis mins", "axis maxs")):
@@ -177,10 +154,10 @@ def _of_space(header: dict[str, Any], directions: np.ndarray) -> np.ndarray:
 
 
 def _of_axes(header: dict[str, Any]) -> tuple[np.ndarray, np.ndarray | None, list[str]]:
-    """The axes' own spacings and the centre of the first voxel, if there is one; and what has been assumed.
+    """The axes' own spacings, the centre of the first voxel (or None), and what has been assumed.
 
-    "axis mins" and "axis maxs" are the outer faces of the first and the last voxel where an axis is cell-centred, and these
-    voxels' centres where it is node-centred.
+    "axis mins" and "axis maxs" are the outer faces of the first and last voxels of a cell-centred axis, and their
+    centres on a node-centred one.
     """
     spacings, low, high = (_numbers(header, name) for name in ("spacings", "axis mins", "axis maxs"))
     assumed: list[str] = []
@@ -213,7 +190,7 @@ def _of_axes(header: dict[str, Any]) -> tuple[np.ndarray, np.ndarray | None, lis
 
 
 def _numbers(header: dict[str, Any], name: str) -> np.ndarray:
-    """A field's three numbers, NaN for those that it does not say."""
+    """A field's three numbers, with NaN for those it does not say."""
     numbers = np.asarray(header.get(name, [np.nan] * 3), np.float64)
     if numbers.shape != (3,):
         raise InputError(f"{name}: expected 3 numbers, got {_text(np.atleast_1d(numbers))}")
@@ -226,11 +203,11 @@ def _all_of(numbers: np.ndarray, name: str) -> np.ndarray:
     return numbers
 
 
-def _scales(header: dict[str, Any], name: str, default: np.ndarray | None) -> np.ndarray | None:
-    """mm of a field's three units."""
+def _scales(header: dict[str, Any], name: str) -> np.ndarray | None:
+    """A field's three units of length, in mm, or None if it is not there."""
     units = header.get(name)
     if units is None:
-        return default
+        return None
     if len(units) != 3 or any(unit.strip() not in _MILLIMETRES for unit in units):
         raise InputError(f"{name} {' '.join(units)}: expected mm, cm, m or um for each of three axes")
     return np.array([_MILLIMETRES[unit.strip()] for unit in units])

@@ -1,4 +1,4 @@
-"""npz with the exact affine, and bare npy arrays."""
+"""numpy's files: npz with the exact affine, and bare npy arrays."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ from .contents import Contents
 
 
 def read(path: Path) -> Contents:
-    """Read .npz with the arrays array, affine, quantity and (if it is there) unit; or .npy, which has no affine."""
+    """Read .npz with the arrays array, affine, quantity and optionally unit; or .npy, which has no affine."""
     with open(path, "rb") as start:
-        if not start.read(6).startswith((b"\x93NUMPY", b"PK")):  # numpy takes what is not its own for pickled objects
+        if not start.read(6).startswith((b"\x93NUMPY", b"PK")):  # numpy would take it for pickled objects
             raise InputError("not a file of numpy")
     file = np.load(path, allow_pickle=False)
     if path.suffix.lower() == ".npy":
@@ -33,7 +33,6 @@ def read(path: Path) -> Contents:
 
 def write(volume: Volume, path: Path) -> None:
     """Write .npz."""
+    arrays = {"array": volume.array, "affine": volume.grid.affine, "quantity": volume.quantity, "unit": volume.unit}
     with open(path, "wb") as file:
-        np.savez_compressed(
-            file, array=volume.array, affine=volume.grid.affine, quantity=volume.quantity, unit=volume.unit
-        )
+        np.savez_compressed(file, **arrays)  # type: ignore[arg-type]

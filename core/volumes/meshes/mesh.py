@@ -1,4 +1,4 @@
-"""Closed triangle meshes: what they are, their files, and where they are open."""
+"""Triangle meshes, their files, and the check that they are closed."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ from ...geometry.frames import checked_affine
 from ...validation import freeze, real_array
 
 MESH_FORMATS = (".stl", ".obj", ".ply", ".glb")
-"""Endings of the names of mesh files."""
+"""Suffixes of mesh files."""
 MILLIMETRES = {"um": 0.001, "mm": 1.0, "cm": 10.0, "m": 1000.0, "in": 25.4}
-"""Units of length in which meshes are written."""
+"""Millimetres per unit of length of a mesh file."""
 
-# Corners closer than this share of the mesh's size are one: files keep six digits or more.
+# Corners closer than this fraction of the mesh's size are one corner: files keep six digits or more.
 _SAME_POINT = 1e-7
 
 
@@ -56,7 +56,7 @@ class Mesh:
     @property
     def volume(self) -> float:
         """Enclosed volume, mm^3: positive where the faces look outwards."""
-        # About the middle, so that a far-away mesh loses no digits.
+        # About the mesh's middle: far from the origin no digits are lost.
         a, b, c = ((self.vertices - self.vertices.mean(axis=0))[self.faces[:, i]] for i in range(3))
         return float(np.einsum("ij,ij->", a, np.cross(b, c)) / 6)
 
@@ -84,45 +84,43 @@ def read_mesh(path: str | os.PathLike[str], unit: str | None = None) -> Mesh:
     import trimesh
 
     path = Path(path)
-    ending = _ending(path)
-    factor = _factor(unit, ending)
-    if not _is_file(path):
-        raise InputError(f"{path}: no such file")
+    suffix, factor = _suffix_and_factor(path, unit)
     try:
+        if not path.is_file():
+            raise InputError("no such file")
         mesh = trimesh.load(path, process=False, force="mesh")
         return Mesh(np.asarray(mesh.vertices) * factor, np.asarray(mesh.faces))
     except InputError as error:
         raise InputError(f"{path}: {error}") from None
     except Exception as error:  # whatever trimesh raises on a damaged file
         said = (str(error).strip() or type(error).__name__).splitlines()[0]
-        raise InputError(f"{path}: cannot be read as {ending} ({said})") from error
+        raise InputError(f"{path}: cannot be read as {suffix} ({said})") from error
 
 
 def write_mesh(mesh: Mesh, path: str | os.PathLike[str], unit: str | None = None) -> None:
-    """Write a mesh as .stl, .obj, .ply or .glb, in `unit` as of `read_mesh`.
+    """Write a mesh as .stl, .obj, .ply or .glb; `unit` as for `read_mesh`.
 
     Raises
     ------
     InputError
-        No mesh, another suffix, an unknown unit, or the file cannot be written.
+        Not a mesh, another suffix, an unknown unit, or the file cannot be written.
     """
     import trimesh
 
     path = Path(path)
-    ending = _ending(path)
-    factor = _factor(unit, ending)
+    suffix, factor = _suffix_and_factor(path, unit)
     mesh = as_mesh(mesh)
     with replacing(path) as temporary:
-        trimesh.Trimesh(mesh.vertices / factor, mesh.faces, process=False).export(temporary, file_type=ending[1:])
+        trimesh.Trimesh(mesh.vertices / factor, mesh.faces, process=False).export(temporary, file_type=suffix[1:])
 
 
 def as_mesh(given: Any) -> Mesh:
-    """What the caller gave as a `Mesh`: one, a trimesh mesh or scene, (vertices, faces), or the path of a file."""
+    """A `Mesh` from a mesh, a trimesh mesh or scene, (vertices, faces), or the path of a file."""
     if isinstance(given, Mesh):
         return given
     if isinstance(given, str | os.PathLike):
         return read_mesh(given)
-    if hasattr(given, "to_mesh"):  # a trimesh scene: its objects where they are
+    if hasattr(given, "to_mesh"):  # a trimesh scene
         given = given.to_mesh()
     if hasattr(given, "vertices") and hasattr(given, "faces"):
         return Mesh(given.vertices, given.faces)
@@ -134,23 +132,20 @@ def as_mesh(given: Any) -> Mesh:
 
 
 def require_closed(mesh: Mesh) -> None:
-    """Refuse a surface that is not closed, or whose faces do not all look to the same side.
+    """Raise `InputError` if the surface is open or its faces look to different sides.
 
-    Raises
-    ------
-    InputError
-        Names the number of bad edges and the middle of one of them, world mm.
+    The message gives the number of bad edges and the middle of one of them, world mm.
     """
     vertices = mesh.vertices
     size = float(np.ptp(vertices, axis=0).max())
-    # Files such as .stl have each triangle's corners for itself.
+    # In .stl and other files every triangle has its own copy of its corners.
     steps = np.round((vertices - vertices.min(axis=0)) / (_SAME_POINT * size or 1.0))
     order = np.lexsort(steps.T)
     new = np.append(True, (np.diff(steps[order], axis=0) != 0).any(axis=1))
     first, merged = order[new], np.empty(len(vertices), np.int64)
     merged[order] = np.cumsum(new) - 1
     corners = merged[mesh.faces]
-    # A triangle with two corners in one has no area, and its edges cancel.
+    # A triangle two of whose corners are one has no area, and its edges cancel.
     corners = corners[(corners != np.roll(corners, 1, axis=1)).all(axis=1)]
     start, end = corners.ravel(), np.roll(corners, -1, axis=1).ravel()
     key, index = np.unique(np.minimum(start, end) * len(first) + np.maximum(start, end), return_inverse=True)
@@ -172,22 +167,12 @@ def require_closed(mesh: Mesh) -> None:
     )
 
 
-def _is_file(path: Path) -> bool:
-    try:
-        return path.is_file()
-    except OSError:  # a name that cannot be
-        return False
-
-
-def _ending(path: Path) -> str:
-    ending = path.suffix.lower()
-    if ending not in MESH_FORMATS:
+def _suffix_and_factor(path: Path, unit: str | None) -> tuple[str, float]:
+    """The path's suffix, and the millimetres per unit of length of the file."""
+    suffix = path.suffix.lower()
+    if suffix not in MESH_FORMATS:
         raise InputError(f"{path}: expected a name ending in {', '.join(MESH_FORMATS)}")
-    return ending
-
-
-def _factor(unit: str | None, ending: str) -> float:
-    unit = unit or ("m" if ending == ".glb" else "mm")
+    unit = unit or ("m" if suffix == ".glb" else "mm")
     if unit not in MILLIMETRES:
         raise InputError(f"unit {unit!r}: expected one of {', '.join(MILLIMETRES)}")
-    return MILLIMETRES[unit]
+    return suffix, MILLIMETRES[unit]

@@ -1,8 +1,8 @@
 """Volumes to meshes: the surface at a level, for display and print.
 
 Marching tetrahedra (A. Doi, A. Koide, IEICE Trans. E74 (1991) 214-224): each cube between eight voxels' centres is cut into
-the six tetrahedra of H. Kuhn, alike in all cubes, so that the surface is closed whatever the values are, which the tables of
-marching cubes do not promise. A compiled library would be faster, and one more wheel for every platform.
+H. Kuhn's six tetrahedra, in the same way in all cubes. The surface is therefore closed whatever the values are, which the
+tables of marching cubes do not guarantee. A compiled library would be faster, but one more wheel for every platform.
 """
 
 from __future__ import annotations
@@ -15,56 +15,55 @@ from numpy.typing import NDArray
 from ...errors import InputError
 from ...memory import require
 from ...progress import Progress
-from ...validation import real_array
-from ..resampling import outside_value
-from ..volume import Volume, require_volume
+from ...validation import instance, real_array
+from ..volume import Volume, outside_value
 from .mesh import Mesh
 
-# A cube's corners, numbered 4 x + 2 y + z. Each tetrahedron walks from corner 0 to 7 along the three axes in one order.
+# A cube's corners are numbered 4 x + 2 y + z. Each tetrahedron goes from corner 0 to 7 along the axes in one order.
 _WALKS = list(permutations((4, 2, 1)))
 _TETRAHEDRA = [np.cumsum((0, *walk)) for walk in _WALKS]
-_MIRRORED = [walk in ((4, 1, 2), (2, 4, 1), (1, 2, 4)) for walk in _WALKS]  # odd orders of the axes
+_MIRRORED = [walk in ((4, 1, 2), (2, 4, 1), (1, 2, 4)) for walk in _WALKS]  # odd permutations
 _CORNERS = np.array([[n >> 2 & 1, n >> 1 & 1, n & 1] for n in range(8)])
 
 
 def volume_to_mesh(volume: Volume, level: float | None = None, progress: Progress | None = None) -> Mesh:
     """The closed surface around the voxels of at least `level`.
 
-    It runs where the volume, interpolated between the voxels' centres, has that value. Beside the grid the volume is 0 (CT
-    numbers: -1000): what the grid cuts off is closed there.
+    The surface lies where the volume, interpolated between the voxels' centres, has that value. Outside the grid the volume
+    counts as 0 (CT numbers: -1000), so that the surface is closed at the grid's border.
 
     Parameters
     ----------
     volume
         Any quantity.
     level
-        In its unit. Default: halfway between what is beside the grid and the largest value.
+        In the volume's unit. Default: halfway between the value outside the grid and the largest value.
     progress
         Called as ``progress(done, total)`` with slabs; may raise `Cancelled`.
 
     Raises
     ------
     InputError
-        No volume, the level is no number, not above what is beside the grid, or no voxel reaches it.
+        Not a volume; the level is not a number, not above the value outside the grid, or above all voxels.
     """
-    require_volume(volume, "volume_to_mesh")
-    beside = outside_value(volume)
+    instance(volume, Volume, "volume_to_mesh")
+    outside = outside_value(volume)
     highest = float(volume.array.max())
-    level = (beside + highest) / 2 if level is None else float(real_array(level, "level", ()))
-    if not beside < level <= highest:
+    level = (outside + highest) / 2 if level is None else float(real_array(level, "level", ()))
+    if not outside < level <= highest:
         raise InputError(
-            f"level {level:g}: expected above {beside:g}, the value beside the grid, and at most {highest:g}, the largest"
+            f"level {level:g}: expected above {outside:g}, the value outside the grid, and at most {highest:g}, the largest"
         )
     array = volume.array
     shape = np.array(array.shape) + 2  # with a margin of one voxel
     strides = np.array([shape[1] * shape[2], shape[2], 1])
-    planes = [_plane(array, i, beside) for i in (-1, 0)]
+    planes = [_plane(array, i, outside) for i in (-1, 0)]
     keys, shares = [], []
     for i in range(shape[0] - 1):
         for new_keys, new_shares in _triangles(planes[0], planes[1], level, i * strides[0], strides):
             keys.append(new_keys)
             shares.append(new_shares)
-        planes = [planes[1], _plane(array, i + 1, beside)]
+        planes = [planes[1], _plane(array, i + 1, outside)]
         if progress is not None:
             progress(i + 1, int(shape[0]) - 1)
     key = np.concatenate(keys)
@@ -80,19 +79,19 @@ def volume_to_mesh(volume: Volume, level: float | None = None, progress: Progres
     return Mesh(index @ affine[:3, :3].T + affine[:3, 3], faces)
 
 
-def _plane(array: NDArray[np.float32], i: int, beside: float) -> NDArray[np.float64]:
-    """The values of one plane with its margin."""
+def _plane(array: NDArray[np.float32], i: int, outside: float) -> NDArray[np.float64]:
+    """The values of one plane of voxels with a margin of one voxel."""
     if 0 <= i < len(array):
-        return np.pad(array[i].astype(np.float64), 1, constant_values=beside)
-    return np.full((array.shape[1] + 2, array.shape[2] + 2), beside)
+        return np.pad(array[i].astype(np.float64), 1, constant_values=outside)
+    return np.full((array.shape[1] + 2, array.shape[2] + 2), outside)
 
 
 def _triangles(
     below: NDArray[np.float64], above: NDArray[np.float64], level: float, first: int, strides: NDArray[np.int64]
 ) -> list[tuple[NDArray[np.int64], NDArray[np.float64]]]:
-    """Triangles between two planes: their corners' edges (N, 3), and where on these they lie (N, 3), 0 to 1.
+    """Triangles between two planes: the edges (N, 3) on which their corners lie, and where on them (N, 3), 0 to 1.
 
-    An edge is 8 times its lower corner's flat index plus the corner of the cube that it points to.
+    An edge is 8 times the flat index of its lower corner plus the corner of the cube that it points to.
     """
     values = np.stack(
         [plane[y : y - 1 or None, z : z - 1 or None] for plane in (below, above) for y in (0, 1) for z in (0, 1)]
@@ -116,7 +115,7 @@ def _triangles(
 
 
 def _cases() -> dict[int, list[list[tuple[int, int]]]]:
-    """For each set of a tetrahedron's corners that are inside, as bits: triangles of edges, seen from outside."""
+    """Triangles of edges, as seen from outside, for each set of corners (bits) of a tetrahedron that are inside."""
     points = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [1, 1, 1]])  # of the first walk
     cases = {}
     for number in range(1, 15):

@@ -1,10 +1,10 @@
 """Closed meshes to volumes: the share of every voxel that lies inside, exactly.
 
-The triangles are cut along all planes between voxels. Each piece then bounds a prism that reaches from it to the end of
-its column of voxels: of the piece's own voxel it takes a part that is known exactly, of the further ones the piece's area.
-Summed with the sign of the side that the piece looks to, the prisms give the mean winding number of each voxel (the
-divergence theorem). That is the covered share, unless the mesh runs through itself: a voxel at such a place may hold parts
-with the winding numbers 0 and 2. There the share is the mean over many rays along z, of each the length that is inside.
+The triangles are cut at all planes between voxels. Each piece then bounds a prism that reaches from it to the end of its
+column of voxels: it covers a known part of the piece's own voxel, and the piece's area of each further voxel. The prisms,
+summed with the sign of the side to which the piece looks, give the mean winding number of each voxel (the divergence
+theorem). That is the covered share, unless the mesh intersects itself: a voxel there may hold parts of winding number 0 and
+2. In columns of voxels with such places the share is the mean over many rays along z of the length inside.
 """
 
 from __future__ import annotations
@@ -27,10 +27,10 @@ from .mesh import Mesh, as_mesh, require_closed
 
 _VOXELS, _POLYGONS = 1 << 21, 1 << 14  # at once
 _FEWEST = 16  # voxels across a mesh
-# Where a mesh runs through itself: rays for all of it (and at once), at the most voxels from one to the next, and triangles
-# times rays to look at at once.
+# Where a mesh intersects itself: rays for all of it, their largest distance in voxels, and pairs of triangle and ray to
+# test at once.
 _RAYS, _STEP, _CANDIDATES = 1 << 18, 0.25, 1 << 20
-_ROUNDING = 1e-9  # shares closer than this to 0 and 1 are that
+_ROUNDING = 1e-9  # shares this close to 0 and 1 are 0 and 1
 
 
 def voxelize_mesh(
@@ -40,26 +40,26 @@ def voxelize_mesh(
     quantity: str = "activity",
     progress: Progress | None = None,
 ) -> Volume:
-    """The volume of one closed mesh, or of several.
+    """A volume filled by one closed mesh or by several.
 
     Parameters
     ----------
     mesh
         A `Mesh`, a trimesh mesh or scene, ``(vertices (V, 3), faces (F, 3))`` in world mm, or the path of a file (see
-        `read_mesh`); or a list of these, of which later ones replace what they cover of earlier ones.
+        `read_mesh`); or a list of these, in which later ones replace what they cover of earlier ones.
     grid
-        Where the voxels are; any affine. What of the mesh lies beside it is left out.
+        Where the voxels are; any affine. Parts of the mesh outside it are cut off.
     value
-        Inside, in the quantity's unit: one number, or one for each mesh. 0 outside.
+        Inside, in the quantity's unit: one number, or one for each mesh. Outside, the volume is 0.
     quantity
         What the values are.
     progress
-        Called as ``progress(done, total)`` between slabs; may raise `Cancelled`.
+        Called as ``progress(done, total)``; may raise `Cancelled`.
 
     Raises
     ------
     InputError
-        A mesh is open or its faces look to different sides, and where; or it is no mesh.
+        A mesh is open or its faces look to different sides (with the place), or it is not a mesh.
     """
     if not isinstance(grid, Grid):
         raise InputError(f"voxelize_mesh: expected a Grid, got {type(grid).__name__}")
@@ -84,8 +84,8 @@ def voxelize_mesh(
 def mesh_coverage(mesh: Mesh, grid: Grid, progress: Progress | None = None) -> NDArray[np.float32]:
     """Share of each voxel that lies inside a closed mesh, 0 to 1, float32 array of the grid's shape.
 
-    Where the mesh runs through itself, what any part of it encloses is inside; the shares of voxels at such places are only
-    near the exact ones, their sum to about 1/10000.
+    Where the mesh intersects itself, everything that any part of it encloses is inside; there the shares are approximate,
+    their sum to about 1/10000.
     """
     require_closed(mesh)
     coverage = np.zeros(grid.shape, np.float32)
@@ -99,64 +99,38 @@ def mesh_coverage(mesh: Mesh, grid: Grid, progress: Progress | None = None) -> N
     box = coverage[tuple(slice(a, b) for a, b in zip(start, stop, strict=True))]
     n_x, n_y, n_z = box.shape
     surface = _seen(_slab(_slab(corners - start, 0, 0, n_x), 1, 0, n_y))
-    # What is in front of the first voxel covers all of its column, what is behind the last one none of it.
+    # A piece in front of a column covers all of the column; a piece behind it, nothing.
     in_front = _clip(surface[surface[:, :, 2].min(axis=1) < 0], 2, 0, -1)
     in_front[:, :, 2] = 0
     surface = _seen(_joined([in_front, _slab(surface, 2, 0, n_z)]))
-    if _fill(box, surface, progress) > 1 + _ROUNDING:
-        _fill_overlaps(box, surface, progress)
-    return coverage
-
-
-def _fill(box: NDArray[np.float32], surface: NDArray[np.float64], progress: Progress | None) -> float:
-    """Put the coverage into `box`; gives the largest winding number."""
-    n_x, n_y, n_z = box.shape
-    finer = -(-_FEWEST // max(box.shape))  # smaller voxels, so that overlaps show in few, large ones, too
-    low, high = surface[:, :, 0].min(axis=1), surface[:, :, 0].max(axis=1)
-    slab = max(1, _VOXELS // (n_y * n_z * finer**3))
-    most = 0.0
-    for first in range(0, n_x, slab):
-        last = min(first + slab, n_x)
-        pieces = _slab(surface[(low < last) & (high > first)], 0, first, last) - [first, 0, 0]
-        shape = ((last - first) * finer, n_y * finer, n_z * finer)
-        winding = np.abs(_winding(pieces * finer, shape))
-        most = max(most, float(winding.max()))
-        covered = np.minimum(winding, 1).reshape(last - first, finer, n_y, finer, n_z, finer).mean(axis=(1, 3, 5))
-        box[first:last] = _rounded(covered)
-        if progress is not None:
-            progress(last, n_x)
-    return most
-
-
-def _rounded(covered: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Shares without what rounding leaves of 0 and 1."""
-    return np.where(covered < _ROUNDING, 0, np.where(covered > 1 - _ROUNDING, 1, covered))
-
-
-def _fill_overlaps(box: NDArray[np.float32], surface: NDArray[np.float64], progress: Progress | None) -> None:
-    """Put the coverage into those columns of `box` in which the winding number passes 1."""
-    n_x, n_y, n_z = box.shape
-    low, high = surface[:, :, 0].min(axis=1), surface[:, :, 0].max(axis=1)
+    finer = -(-_FEWEST // max(box.shape))  # smaller voxels, so that overlaps also show in few, large voxels
     step = min(math.sqrt(n_x * n_y / _RAYS), _STEP)
-    slab = max(1, min(int(_RAYS * step**2 / n_y), _VOXELS // (n_y * n_z)))
-    for first in range(0, n_x, slab):
-        last = min(first + slab, n_x)
+    thickness = max(1, min(_VOXELS // (n_y * n_z * finer**3), int(_RAYS * step**2 / n_y)))
+    low, high = surface[:, :, 0].min(axis=1), surface[:, :, 0].max(axis=1)
+    for first in range(0, n_x, thickness):
+        last = min(first + thickness, n_x)
+        n = last - first
         pieces = _slab(surface[(low < last) & (high > first)], 0, first, last) - [first, 0, 0]
-        covered, overlap = _along_rays(pieces, (last - first, n_y, n_z), step)
-        box[first:last][overlap] = _rounded(covered[overlap])
+        winding = np.abs(_winding(pieces * finer, (n * finer, n_y * finer, n_z * finer)))
+        covered = np.minimum(winding, 1).reshape(n, finer, n_y, finer, n_z, finer).mean(axis=(1, 3, 5))
+        if winding.max() > 1 + _ROUNDING:
+            by_rays, overlap = _along_rays(pieces, (n, n_y, n_z), step)
+            covered[overlap] = by_rays[overlap]
+        box[first:last] = np.where(covered < _ROUNDING, 0, np.where(covered > 1 - _ROUNDING, 1, covered))
         if progress is not None:
             progress(last, n_x)
+    return coverage
 
 
 def _along_rays(
     surface: NDArray[np.float64], shape: tuple[int, int, int], step: float
 ) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
-    """The coverage of voxels by the polygons (N, V, 3) among them, from rays along z, `step` voxels apart.
+    """The shares of voxels inside the surface of polygons (N, V, 3), from rays along z that are `step` voxels apart.
 
-    Also in which columns of voxels (n_x, n_y) the winding number passes 1.
+    Also the columns of voxels (n_x, n_y) in which the winding number exceeds 1.
     """
     n_x, n_y, n_z = shape
-    # A square lattice whose rows run along no axis: so walls along the voxels are met at many different places.
+    # A square lattice whose rows follow no axis, so that walls along the voxels are met at many different places.
     slope = (math.sqrt(5) - 1) / 2
     lattice = step / math.hypot(1, slope) * np.array([[1, slope], [-slope, 1]])  # its two steps, in voxels
     corners = np.array([[0, 0], [n_x, 0], [0, n_y], [n_x, n_y]]) @ np.linalg.inv(lattice)
@@ -171,7 +145,7 @@ def _along_rays(
     ray, z, side = _crossings(triangles, triangles[:, :, :2] @ np.linalg.inv(lattice) - start, size)
     order = np.lexsort((z, ray))
     ray, z, side = ray[order], z[order], side[order]
-    after = np.cumsum(side)  # the winding number, but for what the rays before have left
+    after = np.cumsum(side)  # the winding number, up to the sum over the rays before
     _, firsts, counts = np.unique(ray, return_index=True, return_counts=True)
     after -= np.repeat((after - side)[firsts], counts)
     enters = (after != 0).astype(np.int64) - (after != side)  # 1 where the ray enters, -1 where it leaves
@@ -190,7 +164,7 @@ def _crossings(
 ) -> tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.int64]]:
     """Where rays along z meet `triangles` (N, 3, 3): the ray's number, z, and 1 or -1 for the side of the triangle.
 
-    The rays stand on a lattice of `size` (2,); `seen` (N, 3, 2) are the corners in the lattice's steps.
+    The rays form a lattice of `size` (2,); `seen` (N, 3, 2) are the corners in lattice coordinates.
     """
     low = np.ceil(seen.min(axis=1)).astype(np.int64).clip(0, size)
     extent = (np.floor(seen.max(axis=1)).astype(np.int64).clip(-1, size - 1) - low + 1).clip(0)
@@ -213,9 +187,9 @@ def _crossings(
 
 
 def _winding(surface: NDArray[np.float64], shape: tuple[int, int, int]) -> NDArray[np.float64]:
-    """Mean winding number of each voxel from the polygons (N, V, 3) of a surface among them."""
+    """Mean winding number of each voxel with respect to a surface of polygons (N, V, 3)."""
     n_x, n_y, n_z = shape
-    steps = np.zeros(n_x * n_y * (n_z + 1))  # of the winding number, from each voxel to the next
+    steps = np.zeros(n_x * n_y * (n_z + 1))  # in the winding number, from each voxel to the next
     for first in range(0, len(surface), _POLYGONS):
         pieces = surface[first : first + _POLYGONS]
         cells = np.zeros((len(pieces), 3), np.int64)
@@ -225,7 +199,9 @@ def _winding(surface: NDArray[np.float64], shape: tuple[int, int, int]) -> NDArr
         tip = pieces[:, 0]
         for i in range(1, pieces.shape[1] - 1):  # a fan of triangles
             left, right = pieces[:, i] - tip, pieces[:, i + 1] - tip
-            seen_along_z = (left[:, 0] * right[:, 1] - left[:, 1] * right[:, 0]) / 2  # with the sign of its side
+            seen_along_z = (
+                left[:, 0] * right[:, 1] - left[:, 1] * right[:, 0]
+            ) / 2  # positive or negative, by its side
             area += seen_along_z
             moment += seen_along_z * (tip[:, 2] + (left[:, 2] + right[:, 2]) / 3)
         own = area * (cells[:, 2] + 1) - moment
@@ -238,7 +214,7 @@ def _winding(surface: NDArray[np.float64], shape: tuple[int, int, int]) -> NDArr
 def _split(
     pieces: NDArray[np.float64], cells: NDArray[np.int64], axis: int, n: int
 ) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-    """The `pieces` (N, V, 3) cut at the whole numbers along `axis`, and `cells` (N, 3), along that axis theirs."""
+    """The `pieces` (N, V, 3) cut at the whole numbers along `axis`, and `cells` (N, 3) with their index along it."""
     low = np.floor(pieces[:, :, axis].min(axis=1)).astype(np.int64).clip(0, n - 1)
     high = np.ceil(pieces[:, :, axis].max(axis=1)).astype(np.int64).clip(low + 1, n)
     counts = high - low
@@ -253,26 +229,26 @@ def _split(
 
 
 def _joined(pieces: list[NDArray[np.float64]]) -> NDArray[np.float64]:
-    """Pieces of different numbers of corners in one array; the last corner is repeated."""
+    """Pieces with different numbers of corners in one array; the last corner is repeated."""
     corners = max(part.shape[1] for part in pieces)
     return np.concatenate([part[:, np.minimum(np.arange(corners), part.shape[1] - 1)] for part in pieces])
 
 
 def _slab(pieces: NDArray[np.float64], axis: int, low: ArrayLike, high: ArrayLike) -> NDArray[np.float64]:
-    """What of `pieces` lies between two planes each."""
+    """The parts of `pieces` between two planes each."""
     return _clip(_clip(pieces, axis, low, 1), axis, high, -1)
 
 
 def _seen(pieces: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Those of `pieces` that have an area as seen along z; the others cover nothing."""
+    """Those `pieces` that have an area as seen along z; the others cover nothing."""
     return pieces[(np.ptp(pieces[:, :, :2], axis=1) > 0).all(axis=1)]
 
 
 def _clip(pieces: NDArray[np.float64], axis: int, plane: ArrayLike, side: int) -> NDArray[np.float64]:
-    """What of convex `pieces` (N, V, 3) lies above (`side` 1) or below (-1) each one's `plane`: (N, W, 3).
+    """The parts of convex `pieces` (N, V, 3) above (`side` 1) or below (-1) each one's `plane`: (N, W, 3).
 
-    I. Sutherland, G. Hodgman, "Reentrant polygon clipping", CACM 17 (1974). Corners to spare repeat the last one; what lies
-    on the other side altogether becomes a point.
+    I. Sutherland, G. Hodgman, "Reentrant polygon clipping", CACM 17 (1974). Spare corners repeat the last one; a piece that
+    lies on the other side completely becomes a point.
     """
     n, corners = pieces.shape[:2]
     plane = np.broadcast_to(plane, n)
@@ -284,7 +260,7 @@ def _clip(pieces: NDArray[np.float64], axis: int, plane: ArrayLike, side: int) -
     of, corner = np.nonzero(crosses)
     start, end = pieces[of, corner], pieces[of, (corner + 1) % corners]
     share = depth[of, corner] / (depth[of, corner] - following[of, corner])
-    points = np.stack([pieces, pieces], axis=2)  # each corner, and what lies on the edge from it
+    points = np.stack([pieces, pieces], axis=2)  # each corner, and the crossing on the edge from it
     points[of, corner, 1] = start + share[:, None] * (end - start)
     points[of, corner, 1, axis] = plane[of]
     points = points.reshape(n, 2 * corners, 3)
@@ -301,7 +277,7 @@ def _clip(pieces: NDArray[np.float64], axis: int, plane: ArrayLike, side: int) -
 
 
 def _is_pair(given: Sequence[Any]) -> bool:
-    """Whether `given` is (vertices, faces) rather than a sequence of meshes."""
+    """Whether `given` is (vertices, faces) and not a list of meshes."""
     if len(given) != 2 or any(isinstance(part, str | os.PathLike | Mesh) or hasattr(part, "faces") for part in given):
         return False
     return np.ndim(given[0]) == 2

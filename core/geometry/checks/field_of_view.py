@@ -1,0 +1,144 @@
+"""ROIs that lie partly outside the field of view, and modules that stand between a pinhole and its ROI.
+
+**Coverage.** A module sees a point fully if the rays from it through every point of the hole meet the crystal. At depth x in
+front of the pinhole these are the points within ``w(x) = x s - d/2`` of the axis along u and v, with ``s = (Ld - d)/(2 l)``.
+The largest sphere at the isocentre that fits has the radius `roi_radius_seen`.
+
+**Blocking.** `RAYS` rays run from each pinhole's centre over the cone of its ROI; each stands for the same solid angle (a
+spiral by the golden angle: H. Vogel, Math. Biosci. 44 (1979) 179-189). About ten of them fall into a thousandth of the cone.
+A ray counts from the pinhole to where it leaves the ROI, and is cut exactly by the hulls of the other modules. Hulls hide no
+more than the parts do: a ray that enters a collimator through its hole ends in its wall or in the crystal.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..design_formulas import roi_radius_seen
+from ..system import PinholeSystem
+from .hulls import TOUCH, Hulls
+from .report import Blocked, Uncovered
+
+SLACK = 0.01
+"""Shortfall of the field of view, mm of radius, that is accepted: l may be rounded to 0.01 mm."""
+RAYS = 10_000
+
+_NODES, _WEIGHTS = np.polynomial.legendre.leggauss(64)  # type: ignore[no-untyped-call]
+
+
+def find_uncovered(system: PinholeSystem) -> tuple[Uncovered, ...]:
+    """Modules whose field of view is smaller than their ROI by more than `SLACK`."""
+    b, d, radius = system.pinhole_distance, system.pinhole_diameter, system.roi_radius
+    slope = (system.detector_side - d) / (2 * system.collimator_length)
+    seen = roi_radius_seen(b, d, system.detector_side, system.collimator_length)
+    return tuple(
+        Uncovered(
+            module=int(system.numbers[m]),
+            roi_radius=float(radius[m]),
+            seen_radius=float(seen[m]),
+            unseen_share=unseen_share(float(b[m]), float(d[m]), float(slope[m]), float(radius[m])),
+        )
+        for m in np.flatnonzero(radius - seen > SLACK)
+    )
+
+
+def unseen_share(b: float, d: float, slope: float, radius: float) -> float:
+    """Fraction of the volume of the sphere of `radius`, mm, at the isocentre that is outside the field of view.
+
+    The volume is integrated over planes across the axis: in each, the field of view is a square of half-width w(x) and the
+    sphere a concentric disc.
+    """
+    ends = [b - radius, b + radius]
+    # The square's corners and sides reach the rim of the disc where c w^2 = radius^2 - (x - b)^2, with c = 2 and 1.
+    for c in (2.0, 1.0):
+        ends += _real_roots(c * slope**2 + 1, -(c * slope * d + 2 * b), c * d**2 / 4 + b**2 - radius**2)
+    ends.append(d / (2 * slope))  # the pyramid's apex
+    planes = np.unique(np.clip(ends, b - radius, b + radius))
+    low, high = planes[:-1, None], planes[1:, None]
+    # In steps of an angle, because the integrand behaves like a square root at the ends of the pieces.
+    angle = (_NODES + 1) * np.pi / 2
+    x = low + (high - low) * (1 - np.cos(angle)) / 2
+    weight = (high - low) / 2 * np.sin(angle) * _WEIGHTS * np.pi / 2
+    unseen = _outside_square(np.sqrt(np.maximum(radius**2 - (x - b) ** 2, 0.0)), x * slope - d / 2)
+    return float((weight * unseen).sum() / (4 / 3 * np.pi * radius**3))
+
+
+def _outside_square(disc: NDArray[np.float64], half: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Area of discs of radius `disc` outside the concentric squares of half-width `half`, mm^2."""
+    inside = np.clip(half, 0.0, disc)
+    with np.errstate(invalid="ignore"):
+        segments = 4 * (disc**2 * np.arccos(inside / disc) - inside * np.sqrt(disc**2 - inside**2))
+    return np.where(inside**2 * 2 <= disc**2, np.pi * disc**2 - 4 * inside**2, segments)
+
+
+def _real_roots(a: float, b: float, c: float) -> list[float]:
+    """Roots of a x^2 + b x + c."""
+    under = b * b - 4 * a * c
+    return [] if under < 0 else [(-b - np.sqrt(under)) / (2 * a), (-b + np.sqrt(under)) / (2 * a)]
+
+
+def find_blocked(system: PinholeSystem, hulls: Hulls) -> tuple[Blocked, ...]:
+    """Pairs of a module and another one that some of its rays hit."""
+    found = []
+    b, frames = system.pinhole_distance, system.frames()
+    for m, number in enumerate(system.numbers.tolist()):
+        radius, pinhole = system.roi_radius[m], system.centers[m]
+        parts = _candidates(hulls, pinhole, frames[m, 2], b[m], radius)
+        parts = parts[hulls.numbers[parts] != number]
+        if len(parts) == 0:
+            continue
+        local = cone_directions(RAYS, np.sqrt(1 - (radius / b[m]) ** 2))
+        along = b[m] * local[:, 2]
+        leaves = along + np.sqrt(np.maximum(radius**2 - (b[m] ** 2 - along**2), 0.0))
+        directions = local @ frames[m]
+        for other in dict.fromkeys(hulls.numbers[parts].tolist()):
+            hit = np.zeros(RAYS, dtype=bool)
+            for p in parts[hulls.numbers[parts] == other]:
+                hit |= hits(hulls, p, pinhole, directions, leaves)
+            if hit.any():
+                found.append(Blocked(number, other, float(hit.mean())))
+    return tuple(found)
+
+
+def cone_directions(n: int, cosine: float) -> NDArray[np.float64]:
+    """`n` unit vectors (n, 3), spread evenly over the cone around z whose half-angle has the given cosine."""
+    index = np.arange(n)
+    z = 1 - (1 - cosine) * (index + 0.5) / n
+    angle = index * np.pi * (3 - np.sqrt(5))
+    across = np.sqrt(1 - z**2)
+    return np.stack([across * np.cos(angle), across * np.sin(angle), z], axis=1)
+
+
+def hits(
+    hulls: Hulls,
+    p: int,
+    origin: NDArray[np.float64],
+    directions: NDArray[np.float64],
+    lengths: NDArray[np.float64],
+) -> NDArray[np.bool_]:
+    """Which rays (N,) from `origin` along unit `directions` (N, 3), with `lengths` (N,), pass through hull `p`."""
+    towards = hulls.normals[p] @ directions.T
+    towards[towards == 0] = -np.finfo(np.float64).tiny  # parallel to a face
+    outside = hulls.offsets[p] - hulls.normals[p] @ origin  # below 0: outside this face
+    with np.errstate(over="ignore"):
+        at = outside[:, None] / towards
+    # Clipped to the ray, which begins at 0 and ends at its length.
+    enters = np.where(towards < 0, at, 0.0).max(axis=0)
+    leaves = np.where(towards > 0, at, lengths).min(axis=0)
+    return leaves - enters > TOUCH
+
+
+def _candidates(
+    hulls: Hulls, pinhole: NDArray[np.float64], axis: NDArray[np.float64], b: float, radius: float
+) -> NDArray[np.intp]:
+    """Parts with a corner in front of the pinhole, whose bounding sphere meets the cone of the ROI."""
+    in_front = ((hulls.vertices - pinhole) @ axis).max(axis=1) > 0
+    to = hulls.centers - pinhole
+    distance = np.linalg.norm(to, axis=1)
+    near = distance - hulls.radii < b + radius
+    around = distance <= hulls.radii
+    with np.errstate(divide="ignore", invalid="ignore"):
+        angle = np.arccos(np.clip(to @ axis / distance, -1, 1))
+        width = np.arcsin(np.minimum(hulls.radii / distance, 1.0))
+    return np.flatnonzero(in_front & near & (around | (angle < np.arcsin(radius / b) + width)))

@@ -86,9 +86,11 @@ class Edit:
         """The cells whose formulas, and those that depend on them, have to be recalculated."""
         return list(dict.fromkeys([*self.workbook.changed, *sorted(self.unsettled)]))
 
-    def column_map(self, read_by: ColumnMap) -> ColumnMap:
-        """The column map of the workbook as it is now, from the one that it was read by."""
-        return map_with_rows(read_by, self.layout, {table: rows.new for table, rows in self.rows.items()})
+    def column_map(self) -> ColumnMap | None:
+        """The column map that the workbook was read by, if any, with the rows that the modules have now."""
+        read_by = self.old.source.columns if self.old.source else None
+        rows = {table: rows.new for table, rows in self.rows.items()}
+        return None if read_by is None else map_with_rows(read_by, self.layout, rows)
 
     def _refuse_unheld(self) -> None:
         file, sheet = self.workbook.name, self.modules.sheet.name

@@ -120,7 +120,7 @@ def write_system(
         to_recalculate = workbook.formulas if template is None else edit.changed
         recalculated = Recalculation(workbook, to_recalculate, edit.required, edit.expected)
         temporary.write_bytes(workbook.to_bytes())
-        own = edit.column_map(said) if said is not None else None
+        own = edit.column_map()
         _refuse_other_system(_read_written(temporary, name, own), name, system, edit.numbered)
     _warn_of_formulas(workbook, recalculated)
     return WrittenWorkbook(

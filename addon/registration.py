@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import atexit
+from collections.abc import Callable
 from typing import Any
 
 import bpy
@@ -22,6 +23,7 @@ from ..operators import (
     export_volume,
     import_geometry,
     import_volume,
+    load_recipe,
     remove_modules,
     render_projections,
     renumber_modules,
@@ -32,7 +34,7 @@ from ..operators import (
     voxelize_objects,
 )
 from ..panels import add_menu, design, export, geometry, phantom, projections
-from . import cli, ids, jobs, live, live_phantoms, preferences, properties, slices, storage, volumes
+from . import ids, jobs, live, live_phantoms, preferences, properties, slices, storage, volumes
 
 # Classes in the order of registration; a panel comes after its parent. To add a class, list it here.
 CLASSES: tuple[type, ...] = (
@@ -73,6 +75,7 @@ CLASSES: tuple[type, ...] = (
     volume_files.MPHDRR_OT_find_volume_files,
     render_projections.MPHDRR_OT_render_projections,
     render_projections.MPHDRR_OT_show_projections,
+    load_recipe.MPHDRR_OT_load_recipe,
     jobs.MPHDRR_OT_cancel_job,
     export_dataset.MPHDRR_OT_export_dataset,
     add_menu.MPHDRR_MT_add,
@@ -124,8 +127,11 @@ HANDLERS: tuple[tuple[list[Any], Any], ...] = (
 _commands: list[Any] = []
 
 
-def register() -> None:
-    """Register everything, or, if something fails, undo what was done and raise."""
+def register(command: Callable[..., int] | None = None) -> None:
+    """Register everything, or, if something fails, undo what was done and raise.
+
+    `command` is what ``blender --command mphdrr`` calls.
+    """
     undo: list[tuple[Any, tuple[Any, ...]]] = []
     try:
         for cls in CLASSES:
@@ -140,7 +146,8 @@ def register() -> None:
         for handlers, function in HANDLERS:
             handlers.append(function)
             undo.append((handlers.remove, (function,)))
-        _commands.append(bpy.utils.register_cli_command(ids.PREFIX, cli.main))
+        if command is not None:
+            _commands.append(bpy.utils.register_cli_command(ids.PREFIX, command))
     except Exception:
         for function, arguments in reversed(undo):
             function(*arguments)

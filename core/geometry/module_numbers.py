@@ -10,7 +10,7 @@ from .system import PinholeSystem
 
 
 def chosen_modules(system: PinholeSystem, text: str | None, name: str = "--modules") -> PinholeSystem:
-    """The modules of `system` whose numbers `text` lists ("1-40", "1-20,41"); all for None.
+    """The modules of `system` whose numbers `text` lists ("1-40", "1-20,41", "60-"); all for None.
 
     Parameters
     ----------
@@ -28,9 +28,10 @@ def chosen_modules(system: PinholeSystem, text: str | None, name: str = "--modul
         return system
     wanted: list[NDArray[np.int64]] = []
     for part in text.split(","):
-        first, _, last = part.strip().partition("-")
+        first, dash, last = part.strip().partition("-")
         try:
-            low, high = int(first), int(last or first)
+            low = int(first) if first or not dash else int(system.numbers.min())
+            high = int(last) if last else int(system.numbers.max()) if dash else low
         except ValueError:
             raise InputError(f"{name} {text!r}: expected numbers such as 1-40 or 1-20,41") from None
         found = np.flatnonzero((system.numbers >= low) & (system.numbers <= high))

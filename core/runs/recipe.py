@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import os
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -64,7 +64,7 @@ class Recipe:
             for key in ("phantom.matrix", *_PLACED):
                 if key not in changes:
                     values.pop(key, None)
-        return _fitting(values, frozenset(changes))
+        return fitting_recipe(values, changes)
 
     def fields(self, table: str, cls: Any) -> dict[str, Any]:
         """Given values of a table that are arguments of the dataclass `cls`, by their names."""
@@ -77,7 +77,7 @@ class Recipe:
     def complete(self) -> Recipe:
         """This recipe with the defaults, too, of all settings of the images that have an effect in it."""
         defaults = {key: s.default for key, s in SETTINGS.items() if key.startswith(_OF_IMAGES)}
-        return _fitting({**defaults, **self.given}, frozenset(self.given))
+        return fitting_recipe({**defaults, **self.given}, self.given)
 
     def tables(self) -> dict[str, dict[str, Any]]:
         """The values by table and name, as JSON and TOML hold them."""
@@ -88,9 +88,25 @@ class Recipe:
         return {name: tables[name] for name in TABLES if name in tables}
 
 
-def recipe_fitting(values: Mapping[str, Any]) -> Recipe:
-    """The recipe of those values, None aside, that have an effect beside each other."""
-    return _fitting(values, frozenset())
+def fitting_recipe(values: Mapping[str, Any], kept: Collection[str] = ()) -> Recipe:
+    """The recipe of those values, None aside, that have an effect beside each other.
+
+    Raises
+    ------
+    InputError
+        As `Recipe`, and where a value of `kept` has no effect.
+    """
+    values = {key: value for key, value in values.items() if value is not None}
+
+    def is_stale(key: str) -> bool:
+        if key not in SETTINGS and key.partition(".")[2] not in _phantom_fields(values.get("phantom.kind", "derenzo")):
+            return True
+        return _unmet(values, key) is not None
+
+    while stale := [key for key in values if key not in kept and is_stale(key)]:
+        for key in stale:
+            del values[key]
+    return Recipe(values)
 
 
 def recipe_of_tables(tables: Mapping[str, Any]) -> Recipe:
@@ -120,7 +136,7 @@ def read_recipe(path: str | os.PathLike[str]) -> Recipe:
     folder = Path(path).parent
     tables = read_toml(path)
     try:
-        return _with_paths(recipe_of_tables(tables), lambda name: str(folder / name))
+        return _with_paths(recipe_of_tables(tables), lambda name: os.path.normpath(folder / name))
     except InputError as error:
         raise InputError(f"{path}: {error}") from None
 
@@ -188,12 +204,18 @@ def _unmet(values: Mapping[str, Any], key: str) -> str | None:
     else:
         needs = ("no phantom.file", "no phantom.text", *SETTINGS["phantom.position"].needs)
     for need in needs:
-        if need.startswith("no "):
-            if _holds(values, need[3:]):
+        if not is_met(values, need):
+            if need.startswith("no "):
                 return f"does not go with {_said(need[3:])}"
-        elif not any(_holds(values, term) for term in need.split(" or ")):
             return f"needs {' or '.join(map(_said, need.split(' or ')))}"
     return None
+
+
+def is_met(values: Mapping[str, Any], need: str) -> bool:
+    """Whether given values meet a condition of `Setting.needs`."""
+    if need.startswith("no "):
+        return not _holds(values, need[3:])
+    return any(_holds(values, term) for term in need.split(" or "))
 
 
 def _holds(values: Mapping[str, Any], term: str) -> bool:
@@ -208,21 +230,6 @@ def _said(term: str) -> str:
     if key == "model.kind":
         return f"{key} = {word} (--{word})"
     return f"{key} = {word}" if word else _called(key)
-
-
-def _fitting(values: Mapping[str, Any], kept: frozenset[str]) -> Recipe:
-    """The recipe of `values` less None and less what has no effect, but for those of `kept`."""
-    values = {key: value for key, value in values.items() if value is not None}
-
-    def is_stale(key: str) -> bool:
-        if key not in SETTINGS and key.partition(".")[2] not in _phantom_fields(values.get("phantom.kind", "derenzo")):
-            return True
-        return _unmet(values, key) is not None
-
-    while stale := [key for key in values if key not in kept and is_stale(key)]:
-        for key in stale:
-            del values[key]
-    return Recipe(values)
 
 
 def _with_paths(recipe: Recipe, change: Any) -> Recipe:

@@ -271,7 +271,7 @@ _DECLARED = (
     Setting(
         "model.window", float, None, "Energies that are counted, from and to",
         "10 % around the isotope's strongest line",
-        unit="keV", least=0, slider=1000, sizes=(2,), needs=("model.isotope",), label="Energy Window (keV)",
+        unit="keV", least=0, slider=1000, sizes=(2,), needs=(*_COUNTS, "model.isotope"), label="Energy Window (keV)",
     ),
     Setting(
         "model.aperture_points", int, 1, "Points of the hole that rays pass; 1: its middle, no blur, 7 and more: "

@@ -145,7 +145,7 @@ def test_a_choice_without_a_number_is_refused():
 
 # In a Python of its own: enumerations are made when the extension is imported.
 OPEN = """
-import json, sys
+import importlib, json, sys
 import bpy
 from mphdrr.core import isotopes, materials, volume
 from mphdrr.core.phantoms import kinds
@@ -162,6 +162,7 @@ if sys.argv[2] == "more":
     from mphdrr.addon import choices, ids
     ids.PARTS = ("PLATE", *ids.PARTS)
     kinds.KINDS = kinds.KINDS[::-1]
+    importlib.reload(importlib.import_module("mphdrr.core.runs.settings"))  # whose words are these tables'
     for table, name in ((choices.ISOTOPES, "Co-57"), (choices.APERTURES, "platinum"), (choices.CRYSTALS, "LaBr3"),
                         (choices.QUANTITIES, "density"), (choices.READ_AS, "density"), (choices.PARTS, "PLATE")):
         table[name] = max(table.values()) + 1

@@ -68,12 +68,11 @@ def _properties() -> dict[str, Any]:
     for name, setting in PROPERTIES.items():
         absent = f"; 0: {setting.absent}" if setting.default is None else ""
         common: dict[str, Any] = {"name": setting.label, "description": setting.text + absent}
-        least = 0 if setting.default is None else setting.least
-        limits = {"min": least, "max": setting.most, "soft_max": setting.slider}
-        if setting.kind is not int:
-            limits["precision"] = 3
-            limits["min"] = 1e-6 if setting.above and setting.default is not None else least
-        common |= {key: value for key, value in limits.items() if value is not None and setting.kind in (int, float)}
+        if setting.kind in (int, float):
+            least = 1e-6 if setting.least is None else setting.least
+            limits = {"min": 0 if setting.default is None else least, "max": setting.most, "soft_max": setting.slider}
+            limits["precision"] = 3 if setting.kind is float else None
+            common |= {key: value for key, value in limits.items() if value is not None}
         material = _material(name, setting)
         if material is not None:
             none = ("NUMBER", "By Coefficient", f"By its attenuation coefficient{absent}")

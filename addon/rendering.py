@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Generator, Sequence
-from dataclasses import dataclass
+import time
+from collections.abc import Generator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +12,6 @@ import bpy
 
 from ..core.errors import InputError
 from ..core.geometry.module_numbers import chosen_modules
-from ..core.geometry.system import PinholeSystem
 from ..core.memory import require
 from ..core.progress import Progress
 from ..core.runs.files import read_run, write_run
@@ -21,75 +20,13 @@ from ..core.runs.projecting import warn_of_energy
 from ..core.runs.recipe import Recipe, read_recipe
 from ..core.runs.run import ProjectionRun
 from ..core.runs.run_recipe import recipe_model, run_recipe
-from ..core.volumes.volume import Volume, require_quantity
-from . import ids, images, phantoms, scanner, storage, volumes
+from ..core.volumes.volume import require_quantity
+from . import ids, images, jobs, phantoms, scanner, storage, volumes
 from .projection_properties import OPENING_ANGLE, set_panel
 
 
-@dataclass(frozen=True)
-class Rendering:
-    """One run to be made of a scene.
-
-    Attributes
-    ----------
-    scene_name, volume_name : str
-        The scene, and the volume that is projected.
-    recipe : Recipe
-        How, and what the volume is.
-    system : PinholeSystem
-        The scene's modules.
-    read_volume, read_mu : callable
-        Read the voxels without bpy; `read_mu` is None where nothing attenuates.
-    mu_energy : float or None
-        keV, at which the attenuation holds, if that is known.
-    path : Path
-        The run's file.
-    """
-
-    scene_name: str
-    volume_name: str
-    recipe: Recipe
-    system: PinholeSystem
-    read_volume: Callable[[], Volume]
-    read_mu: Callable[[], Volume] | None
-    mu_energy: float | None
-    path: Path
-
-    def work(self, progress: Progress) -> ProjectionRun:
-        """Make the run and write its file, in any thread.
-
-        Raises
-        ------
-        InputError
-            The voxels cannot be read, the model has no meaning for them, or the file cannot be written.
-        """
-        progress(0, len(self.system))
-        if self.mu_energy is not None:
-            model = recipe_model(self.recipe, self.system)
-            warn_of_energy(model, self.mu_energy, f"the mu of {self.recipe['attenuation.object']!r}")
-        mu = None if self.read_mu is None else self.read_mu()
-        (run,) = run_recipe(self.recipe, self.system, self.read_volume(), mu, lambda stage: progress)
-        write_run(run, self.path)
-        return run
-
-    def finish(self, run: ProjectionRun) -> Generator[None, None, None]:
-        """Make images of the run in small steps, and show it as the scene's last.
-
-        Raises
-        ------
-        InputError
-            The scene is gone.
-        """
-        mosaic = yield from images.storing(run.projections, run.system.numbers)
-        images.show(mosaic, bpy.context)
-        scene = bpy.data.scenes.get(self.scene_name)
-        if scene is None:
-            raise InputError(f"the scene {self.scene_name!r} is gone; its projections are in {self.path}")
-        _record_run(scene, run, self.path)
-
-
-def prepare(context: bpy.types.Context, recipe: Recipe, volume: str = "", mu: str = "") -> Rendering:
-    """What is to be rendered of the context's scene.
+def render_job(context: bpy.types.Context, recipe: Recipe, volume: str = "", mu: str = "") -> jobs.Job:
+    """The job that projects a volume of the context's scene into its scanner's modules.
 
     Parameters
     ----------
@@ -117,17 +54,32 @@ def prepare(context: bpy.types.Context, recipe: Recipe, volume: str = "", mu: st
     rows, columns = recipe["detector.rows"], recipe["detector.columns"]
     # The array, and Blender's images with four channels in memory and once more, packed.
     require(36.0 * len(system) * rows * columns, f"{len(system)} images of {columns} x {rows} pixels")
-    objects = {"volume.object": item.name, "attenuation.object": None if mu_item is None else mu_item.name}
-    return Rendering(
-        scene.name,
-        item.name,
-        _described(recipe.updated(objects), item),
-        system,
-        volumes.reader(item),
-        None if mu_item is None else volumes.reader(mu_item),
-        None if mu_item is None else phantoms.mu_energy(mu_item),
-        storage.folder() / f"{bpy.path.clean_name(scene.name)}-projections.h5",
-    )
+    recipe = recipe.updated({"volume.object": item.name, "attenuation.object": mu_item and mu_item.name})
+    recipe = _with_volume(recipe, item)
+    read_volume, read_mu = volumes.reader(item), mu_item and volumes.reader(mu_item)
+    energy = mu_item and phantoms.mu_energy(mu_item)
+    path = storage.folder() / f"{bpy.path.clean_name(scene.name)}-projections.h5"
+    scene_name, start = scene.name, time.perf_counter()
+
+    def work(progress: Progress) -> ProjectionRun:
+        progress(0, len(system))
+        if energy is not None:
+            warn_of_energy(model, energy, f"the mu of {recipe['attenuation.object']!r}")
+        (run,) = run_recipe(recipe, system, read_volume(), read_mu and read_mu(), lambda stage: progress)
+        write_run(run, path)
+        return run
+
+    def finish(run: ProjectionRun) -> Generator[None, None, str]:
+        images.show((yield from images.storing(run.projections, run.system.numbers)), bpy.context)
+        scene = bpy.data.scenes.get(scene_name)
+        if scene is None:
+            raise InputError(f"the scene {scene_name!r} is gone; its projections are in {path}")
+        _record_run(scene, run, path)
+        where = path if bpy.data.filepath else f"{path} until the .blend is saved"
+        seconds = time.perf_counter() - start
+        return f"Projected {recipe['volume.object']!r} into {len(run.views)} modules in {seconds:.1f} s: {where}"
+
+    return jobs.Job("Projecting", work, finish)
 
 
 def load_recipe(scene: bpy.types.Scene, path: Path) -> None:
@@ -162,7 +114,7 @@ def _record_run(scene: bpy.types.Scene, run: ProjectionRun, path: Path) -> None:
     state.run_summary = ", ".join([f"{len(run.views)} views of {n_u} × {n_v}", *(text for text in what if text)])
 
 
-def _described(recipe: Recipe, item: bpy.types.Object) -> Recipe:
+def _with_volume(recipe: Recipe, item: bpy.types.Object) -> Recipe:
     """The recipe with what the volume's object is: its state and its phantom."""
     state = 0
     if item.data.is_sequence:

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import math
-import time
-from collections.abc import Generator
 from typing import Any
 
 import bpy
@@ -13,7 +11,6 @@ from bpy.props import FloatProperty, StringProperty
 from ..addon import ids, images, jobs, rendering, scanner
 from ..addon.decimals import typed
 from ..addon.projection_properties import OPENING_ANGLE, ProjectionSettings, settings_recipe
-from ..core.runs.run import ProjectionRun
 
 
 class MPHDRR_OT_render_projections(ProjectionSettings, jobs.JobOperator, bpy.types.Operator):
@@ -43,16 +40,7 @@ class MPHDRR_OT_render_projections(ProjectionSettings, jobs.JobOperator, bpy.typ
             self.properties.is_property_set,
             {OPENING_ANGLE: math.degrees(typed(angle))},
         )
-        task = rendering.prepare(context, recipe, self.volume, self.mu)
-        start = time.perf_counter()
-
-        def finish(run: ProjectionRun) -> Generator[None, None, str]:
-            yield from task.finish(run)
-            seconds = time.perf_counter() - start
-            where = task.path if bpy.data.filepath else f"{task.path} until the .blend is saved"
-            return f"Projected {task.volume_name!r} into {len(run.views)} modules in {seconds:.1f} s: {where}"
-
-        return jobs.Job("Projecting", task.work, finish)
+        return rendering.render_job(context, recipe, self.volume, self.mu)
 
     def _setting(self, scene: bpy.types.Scene, name: str) -> Any:
         """A setting given to the operator, else the panel's; a coefficient that is given replaces the panel's material."""

@@ -18,8 +18,6 @@ from ..physics.isotopes import photon_energy as photon_energy
 from ..progress import Progress
 from ..workbook import read_system
 
-DERENZO_OPTIONS = ("radius", "rods", "sectors", "height", "activity", "water", "background")
-"""Of `add_phantom_options`, those that say what the Derenzo phantom is."""
 PLACING_OPTIONS = ("position", "euler", "voxels", "spacing")
 """Of `add_placing_options`."""
 

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import argparse
 import tomllib
-from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -29,6 +28,8 @@ _LISTED = (
     "compute.backend", "compute.threads",
 )  # fmt: skip
 """Settings whose options the help lists; the others it leaves to --set and the recipe."""
+
+_BY_HAND = ("model.kind", "model.photons", "detector.rows", "detector.columns", "volume.energy")
 
 # Options of the Derenzo phantom by the settings that they stand for.
 _DERENZO = {
@@ -59,22 +60,22 @@ def add_parser(subparsers) -> None:  # type: ignore[no-untyped-def]
         "are taken",
     )  # fmt: skip
     for setting in SETTINGS.values():
-        if setting.key not in ("model.kind", "model.photons", "detector.rows", "detector.columns", "volume.energy"):
-            _add_option(parser, setting)
-    _option(parser, "--size", ("detector.rows", "detector.columns"), int, "pixels: rows and columns (default: 256 256)")
-    _option(parser, "--energy", ("energy",), number_or_name, SETTINGS["volume.energy"].help)
+        if setting.key not in _BY_HAND:
+            _add_setting(parser, setting)
+    _add(
+        parser, "--size", ("detector.rows", "detector.columns"), "Pixels, rows and columns (default: 256 256)", nargs=2
+    )
+    _add(parser, "--energy", ("energy",), SETTINGS["volume.energy"].help, metavar="KEV")
     kind = parser.add_mutually_exclusive_group()
     for word in SETTINGS["model.kind"].words:
         kind.add_argument(
             f"--{word}", dest="model.kind", action="store_const", const=word, default=argparse.SUPPRESS,
             help=SETTINGS["model.kind"].words[word][1],
         )  # fmt: skip
-    kind.add_argument(
-        "--photons", dest="model.photons", type=float, metavar="N", default=argparse.SUPPRESS,
-        help=SETTINGS["model.photons"].help,
-    )  # fmt: skip
+    _add(kind, "--photons", ("model.photons",), SETTINGS["model.photons"].help)
     for option, keys in _DERENZO.items():
-        _option(parser, option, keys, number_or_name, argparse.SUPPRESS)
+        nargs = "+" if option == "--rods" else len(keys) if len(keys) > 1 else None
+        _add(parser, option, keys, argparse.SUPPRESS, nargs=nargs)
     parser.add_argument(
         "--set", action="append", default=[], metavar="KEY=VALUE", dest="entries",
         help="any entry of a recipe, such as model.aperture_points=7; KEY= takes it away",
@@ -89,64 +90,44 @@ def add_parser(subparsers) -> None:  # type: ignore[no-untyped-def]
 
 
 class _Store(argparse.Action):
-    """Stores the values of an option under one key of the recipe, or one under each of several."""
-
-    def __init__(self, *words: Any, keys: tuple[str, ...], **details: Any) -> None:
-        super().__init__(*words, **details)
-        self.keys = keys
+    """Stores the value of an option under its key in the recipe, or its values one under each of several keys."""
 
     def __call__(self, parser: Any, namespace: argparse.Namespace, values: Any, option_string: Any = None) -> None:
         """Called by argparse."""
-        for key, value in zip(self.keys, values if len(self.keys) > 1 else [values], strict=True):
+        keys = self.dest.split()
+        for key, value in zip(keys, values if len(keys) > 1 else [values], strict=True):
             setattr(namespace, key, value)
 
 
-def _option(
-    parser: Any, option: str, keys: tuple[str, ...], parse: Callable[[str], Any], text: str, **details: Any
-) -> None:
-    """An option for entries of a recipe, in the namespace only where it is typed."""
-    if len(keys) > 1:
-        details["nargs"] = len(keys)
-    elif option == "--rods":
-        details["nargs"] = "+"
-    details |= {"metavar": "VALUE"} if "metavar" not in details else {}
-    parser.add_argument(
-        option, action=_Store, keys=keys, type=parse, default=argparse.SUPPRESS, help=text.replace("%", "%%"), **details
-    )
+def _add(parser: Any, option: str, keys: tuple[str, ...], text: str, **details: Any) -> None:
+    """Add an option for entries of the recipe; they are in the namespace only where it is typed."""
+    details = {"type": _value, "metavar": "VALUE", **details}
+    text = text if text == argparse.SUPPRESS else text.replace("%", "%%")
+    parser.add_argument(option, action=_Store, dest=" ".join(keys), default=argparse.SUPPRESS, help=text, **details)
 
 
-def _add_option(parser: argparse.ArgumentParser, setting: Setting) -> None:
-    text = setting.help if setting.key in _LISTED else argparse.SUPPRESS
-    if setting.default not in (None, False) and text != argparse.SUPPRESS:
-        text += f" (default: {setting.default})"
+def _add_setting(parser: argparse.ArgumentParser, setting: Setting) -> None:
+    text = argparse.SUPPRESS
+    if setting.key in _LISTED:
+        text = setting.help + (f" (default: {setting.default})" if setting.default not in (None, False) else "")
     if setting.kind is bool:
         parser.add_argument(
             setting.option, dest=setting.key, action="store_true", default=argparse.SUPPRESS, help=text
         )  # fmt: skip
         return
-    details: dict[str, Any] = {"metavar": "FILE" if setting.is_path else (setting.unit or "VALUE").upper()}
+    details: dict[str, Any] = {"type": str} if setting.kind is str else {}
     if setting.sizes is not None or setting.kind is list:
         details["nargs"] = "+"
-    parsers: dict[type, Callable[[str], Any]] = {int: _whole_or_name, float: number_or_name, str: str, list: float}
-    _option(parser, setting.option, (setting.key,), parsers[setting.kind], text, **details)
+    metavar = "FILE" if setting.is_path else "NAME" if setting.kind is str else setting.unit.upper() or "VALUE"
+    _add(parser, setting.option, (setting.key,), text, metavar=metavar, **details)
 
 
-def _whole_or_name(text: str) -> int | str:
+def _value(text: str) -> Any:
+    """A value as in TOML, or a text without quotes."""
     try:
-        return int(text)
-    except ValueError:
-        return text
-
-
-def _entry(text: str) -> tuple[str, Any]:
-    """Key and value of ``--set KEY=VALUE``: the value as in TOML, or a text without quotes; None for an empty one."""
-    key, equals, value = text.partition("=")
-    if not equals:
-        raise InputError(f"--set {text}: expected KEY=VALUE, such as model.aperture_points=7")
-    try:
-        return key.strip(), tomllib.loads(f"value = {value}")["value"]
+        return tomllib.loads(f"value = {text}")["value"]
     except tomllib.TOMLDecodeError:
-        return key.strip(), value.strip() or None
+        return number_or_name(text.strip())
 
 
 def _changes(arguments: argparse.Namespace, recipe: Recipe) -> dict[str, Any]:
@@ -154,7 +135,10 @@ def _changes(arguments: argparse.Namespace, recipe: Recipe) -> dict[str, Any]:
     typed = vars(arguments)
     changes = {key: value for key, value in typed.items() if "." in key}
     for entry in arguments.entries:
-        changes |= dict([_entry(entry)])
+        key, equals, text = entry.partition("=")
+        if not equals:
+            raise InputError(f"--set {entry}: expected KEY=VALUE, such as model.aperture_points=7")
+        changes[key.strip()] = _value(text) if text.strip() else None
     if "model.photons" in changes:
         changes.setdefault("model.kind", "transmission")
     if "energy" in typed:
@@ -181,20 +165,17 @@ def _chosen(arguments: argparse.Namespace) -> tuple[Recipe, ProjectionRun | None
     return recipe.updated(_changes(arguments, recipe)), run
 
 
-def _of_run(run: ProjectionRun | None, recipe: Recipe) -> Mapping[str, Any]:
-    """What of a run is used again: its scanner and its volume, unless the recipe has others by now."""
+def _kept(run: ProjectionRun | None, recipe: Recipe) -> dict[str, Any]:
+    """The scanner and the volume of a run, unless the recipe says others than the run's own."""
     if run is None:
         return {}
-    used: dict[str, Any] = {}
-
-    def is_same(*tables: str) -> bool:
-        return all(recipe.tables().get(table) == run.recipe.tables().get(table) for table in tables)
-
-    if is_same("system"):
-        used["system"] = run.system
-    if is_same("volume", "phantom"):
-        used["volume"] = run.volume
-    return used
+    now, then = recipe.tables(), run.recipe.tables()
+    kept: dict[str, Any] = {}
+    if now.get("system") == then.get("system"):
+        kept["system"] = run.system
+    if all(now.get(table) == then.get(table) for table in ("volume", "phantom")):
+        kept["volume"] = run.volume
+    return kept
 
 
 def _run(arguments: argparse.Namespace) -> None:
@@ -215,7 +196,7 @@ def _run(arguments: argparse.Namespace) -> None:
     for file in (*states, recipe["volume.file"], recipe["attenuation.file"]):
         if file is not None and Path(file).resolve() in outputs:
             raise InputError(f"{file}: the projections would replace what they are made from; choose another --output")
-    for number, made in enumerate(run_recipe(recipe, **_of_run(run, recipe), stages=progress_bar), 1):
+    for number, made in enumerate(run_recipe(recipe, **_kept(run, recipe), stages=progress_bar), 1):
         file = numbered_path(path, number, count)
         write_run(made, file)
         if picture is not None:

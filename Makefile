@@ -1,5 +1,6 @@
 # make demo    the whole main path on the real workbook, into out/
 # make test    linters, types and tests (tests/core, tests/blender)
+# make test-long   the tests that take minutes: long property runs, workbooks through LibreOffice
 # make bench   speed, accuracy and memory beside other projectors, into docs/; BENCH=--quick: a minute or two, into out/
 # make gallery   the README's pictures of phantoms, of a CT (CT=FILE) and of the scanner's sensitivity, into docs/images
 # make dist    the package's wheels and the extension's zips in dist/, one per platform; PLATFORM=linux-x64 builds for that one
@@ -23,7 +24,7 @@ ANY_PYTHON = $$(for p in "$(PYTHON)" python3 python3.11 python3.13; do "$$p" -c 
 ENVIRONMENT = @p=$(ANY_PYTHON); [ -n "$$p" ] || { echo "no Python found; name one: make PYTHON=/path/to/python3.11"; exit 1; }; \
 	"$$p" tools/environment.py $(VENV) --python "$(PYTHON)"
 
-.PHONY: demo gallery test lint test-app test-kernels test-gate bench dist clean env env-dev
+.PHONY: demo gallery test test-long lint test-app test-kernels test-gate bench dist clean env env-dev
 
 demo: env
 	$(BIN)/mphdrr demo --output $(OUTPUT)
@@ -32,7 +33,10 @@ gallery: env-dev
 	$(BIN)/python examples/gallery.py docs/images $(CT)
 
 test: lint
-	$(BIN)/python -m pytest
+	$(BIN)/python -m pytest -n auto --dist worksteal
+
+test-long: env-dev
+	$(BIN)/python -m pytest -m long -n auto --dist worksteal
 
 lint: env-dev
 	@$(BIN)/ruff check -q
@@ -54,7 +58,7 @@ test-app: env-dev
 
 test-kernels: env-dev
 	$(BIN)/python -m pytest tests/kernels
-	@for level in $$($(BIN)/python -c "from mphdrr.core.projector import siddon_cpu; print(*siddon_cpu.levels())"); do \
+	@for level in $$($(BIN)/python -c "from mphdrr.core.projector.backends import cpu; print(*cpu.levels())"); do \
 		echo "accuracy of $$level"; MPHDRR_CPU_LEVEL=$$level $(BIN)/python -m pytest -k cpu tests/core/test_projector.py \
 		tests/core/test_emission.py tests/core/test_emission_gradients.py tests/core/test_geometry_gradients.py || exit 1; done
 

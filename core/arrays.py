@@ -88,7 +88,7 @@ def to_tensor(value: ArrayOrTensor) -> Any:
     return torch.from_numpy(np.ascontiguousarray(value)).to(torch.get_default_device())
 
 
-def like(result: ArrayOrTensor, given: ArrayOrTensor) -> ArrayOrTensor:
+def to_caller(result: ArrayOrTensor, given: ArrayOrTensor) -> ArrayOrTensor:
     """`result` of the kind of `given`: a tensor on its device, or a numpy array."""
     if is_tensor(given):
         import torch
@@ -97,29 +97,28 @@ def like(result: ArrayOrTensor, given: ArrayOrTensor) -> ArrayOrTensor:
     return result.cpu().numpy() if is_tensor(result) else result
 
 
-def zeros(shape: tuple[int, ...], beside: ArrayOrTensor) -> ArrayOrTensor:
-    """Zeros of the kind, type and device of `beside`."""
-    if is_tensor(beside):
-        return beside.new_zeros(shape)
-    array = np.empty(
-        shape, beside.dtype
-    )  # which, unlike np.zeros, gets large pages of memory: half the time of an adjoint
+def zeros(shape: tuple[int, ...], like: ArrayOrTensor) -> ArrayOrTensor:
+    """Zeros of the kind, type and device of `like`."""
+    if is_tensor(like):
+        return like.new_zeros(shape)
+    # Unlike np.zeros, np.empty gets large pages of memory: a backprojection takes half the time.
+    array = np.empty(shape, like.dtype)
     array.fill(0)
     return array
 
 
-def alike(values: ArrayOrTensor, beside: ArrayOrTensor) -> ArrayOrTensor:
-    """`values` of the kind, type and device of `beside`; not part of a graph."""
-    if not is_tensor(beside):
-        return to_numpy(values, beside.dtype) if is_tensor(values) else np.asarray(values, dtype=beside.dtype)
+def cast_like(values: ArrayOrTensor, like: ArrayOrTensor) -> ArrayOrTensor:
+    """`values` of the kind, type and device of `like`; not part of a graph."""
+    if not is_tensor(like):
+        return to_numpy(values, like.dtype) if is_tensor(values) else np.asarray(values, dtype=like.dtype)
     if is_tensor(values):
-        return values.detach().to(beside).contiguous()
+        return values.detach().to(like).contiguous()
     import torch
 
-    return torch.tensor(values, dtype=beside.dtype, device=beside.device)
+    return torch.tensor(values, dtype=like.dtype, device=like.device)
 
 
-def together(first: ArrayOrTensor, second: ArrayOrTensor) -> tuple[ArrayOrTensor, ArrayOrTensor]:
+def promote(first: ArrayOrTensor, second: ArrayOrTensor) -> tuple[ArrayOrTensor, ArrayOrTensor]:
     """Both as tensors of one type and device if either is a tensor, still part of their graphs; else as they are."""
     if not (is_tensor(first) or is_tensor(second)):
         return first, second
@@ -132,7 +131,7 @@ def together(first: ArrayOrTensor, second: ArrayOrTensor) -> tuple[ArrayOrTensor
 
 
 def cropped(*volumes: ArrayOrTensor) -> tuple[list[ArrayOrTensor], tuple[int, int, int]]:
-    """The smallest box of `volumes` (of one shape) that holds all that is not 0, and the index of its first voxel."""
+    """The smallest box that holds all nonzero voxels of `volumes` (of one shape), and the index of its first voxel."""
     find = _filled_ranges_of_tensors if is_tensor(volumes[0]) else _filled_ranges
     ranges = find(volumes)
     boxes = [volume[tuple(slice(first, last) for first, last in ranges)] for volume in volumes]
@@ -141,7 +140,7 @@ def cropped(*volumes: ArrayOrTensor) -> tuple[list[ArrayOrTensor], tuple[int, in
 
 
 def _filled_ranges(volumes: tuple[NDArray[Any], ...]) -> list[tuple[int, int]]:
-    """First and last + 1 index of what is not 0, along each axis. Takes a pass over the empty margins, not the volumes."""
+    """First and last + 1 index of nonzero voxels along each axis. Reads the empty margins, not whole volumes."""
     ranges: list[tuple[int, int]] = []
     for axis in (0, 1):
         slabs = [np.moveaxis(volume, axis, 0) for volume in volumes]
@@ -153,22 +152,20 @@ def _filled_ranges(volumes: tuple[NDArray[Any], ...]) -> list[tuple[int, int]]:
         ranges.append((first, last + 1))
         volumes = tuple(np.moveaxis(slab[first : last + 1], 0, axis) for slab in slabs)
     n = volumes[0].shape[2]
-    if not all(
-        any(volume[..., i].any() for volume in volumes) for i in (0, n - 1)
-    ):  # one line of voxels is far from the next
+    if not all(any(volume[..., i].any() for volume in volumes) for i in (0, n - 1)):
         filled = np.flatnonzero(np.any([(volume != 0).any(axis=0).any(axis=0) for volume in volumes], axis=0))
         return [*ranges, (int(filled[0]), int(filled[-1]) + 1)]
     return [*ranges, (0, n)]
 
 
 def _filled_ranges_of_tensors(volumes: tuple[Any, ...]) -> list[tuple[int, int]]:
-    """The same, in few steps: each waits for the GPU."""
+    """The same in few steps, since each waits for the GPU."""
     filled = [volume != 0 for volume in volumes]
-    # Whether a line along y, or along x, holds anything: fast, for along z neighbours in memory would be joined.
+    # Whether anything is in a row along y, or along x: fast, as neighbours in memory (along z) are not joined.
     along_x, along_y = ([flags.any(axis) for flags in filled] for axis in (0, 1))
     ranges: list[tuple[int, int]] = []
-    for lines, across in ((along_y, 1), (along_x, 1), (along_x, 0)):
-        where = np.concatenate([np.flatnonzero(flags.any(across).cpu().numpy()) for flags in lines])
+    for rows, across in ((along_y, 1), (along_x, 1), (along_x, 0)):
+        where = np.concatenate([np.flatnonzero(flags.any(across).cpu().numpy()) for flags in rows])
         ranges.append((int(where.min()), int(where.max()) + 1) if len(where) else (0, 1))
     return ranges
 

@@ -23,6 +23,7 @@ MOVED = {
     "materials": "physics.materials",
     "mosaic": "runs.mosaic",
     "presets": "geometry.presets",
+    "projector.siddon_cpu": "projector.backends.cpu",
     "registration": "projector.pose_search",
     "rotations": "geometry.rotations",
     "run": "runs.run",
@@ -39,10 +40,11 @@ class _OldPaths(MetaPathFinder, Loader):
     def find_spec(
         self, name: str, path: Sequence[str] | None = None, target: ModuleType | None = None
     ) -> ModuleSpec | None:
-        head, *tail = name.removeprefix(f"{__package__}.").split(".")
-        if not name.startswith(f"{__package__}.") or head not in MOVED:
+        old = name.removeprefix(f"{__package__}.")
+        head = next((moved for moved in MOVED if f"{old}.".startswith(f"{moved}.")), None)
+        if head is None or old == name:
             return None
-        module = importlib.import_module(".".join(["", MOVED[head], *tail]), __package__)
+        module = importlib.import_module(f".{MOVED[head]}{old.removeprefix(head)}", __package__)
         return ModuleSpec(name, self, loader_state=(module, module.__spec__))
 
     def create_module(self, spec: ModuleSpec) -> ModuleType:

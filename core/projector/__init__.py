@@ -1,9 +1,8 @@
 """Line integrals of volumes along rays, and their exact adjoint.
 
-`operator` holds what is the same for every backend: checks, the loop over views, threads, memory. `tracing` takes rays
-by their ends, or as fans, instead of as views. `rays` maps rays into index space, once for all backends. Each
-``siddon_*`` module integrates along such rays, spreads values back along them and tells how the integrals move with the
-rays' ends; `backends` chooses among them, `autograd` makes them steps of torch's graph. torch is not imported before it
+`operator` has the projector and its adjoint, `tracing` rays given by their ends or as fans. Both describe their rays as
+`bundles`, which `execution` cuts up and gives to one of the `backends` on several threads. `rays` maps rays into index
+space, `lattices` crops volumes to what is filled, `autograd` makes steps of torch's graph. torch is not imported before it
 is needed.
 """
 

@@ -22,7 +22,8 @@ from ..physics.isotopes import Isotope, isotope
 from ..physics.materials import module_coefficients
 from ..validation import positive, real_array
 from ..volumes.volume import Volume, require_quantity
-from .models import Array, Beam, Model, view_rays
+from .bundles import Beam
+from .models import Array, Model, view_rays
 from .pixel_points import TOLERANCE, expected_error, lattice, offsets, points_needed, require_points, shadow_edges
 from .rays import Fan
 
@@ -284,8 +285,8 @@ class Emission(Model):
         middle = scale * (rays.corner - pinhole) - l * k
         pitch_u, pitch_v = self._crystal_pitch(views, m)
         n_v, n_u = views.shape
-        along_v = (middle @ v + scale * (rays.line_step @ v) * np.arange(n_v))[:, None]
-        along_u = (middle @ u + scale * (rays.ray_step @ u) * np.arange(n_u))[None, :]
+        along_v = (middle @ v + scale * (rays.row_step @ v) * np.arange(n_v))[:, None]
+        along_u = (middle @ u + scale * (rays.column_step @ u) * np.arange(n_u))[None, :]
         # To the plane through the grid's farthest corner.
         depth = max(float(((grid.corners() - pinhole) @ k).max()), l)
         holes = self.openings(m, self.hole_points(views, m, grid))
@@ -294,7 +295,7 @@ class Emission(Model):
         n = self._pixel_points(views, m, grid)
         for layer, z in enumerate(layer_depths(self.depth_layers, self.system.detector_thickness[m])):
             stretch = depth / (l + z)
-            steps = stretch * scale * rays.line_step, stretch * scale * rays.ray_step
+            steps = stretch * scale * rays.row_step, stretch * scale * rays.column_step
             for opening, start in zip(holes, starts, strict=True):
                 point = opening.x * u + opening.y * v
                 shift = None
@@ -318,7 +319,7 @@ class Emission(Model):
                     return self.pixel_weights(m, along, across, pitch, l, opening, layer, n * len(holes)) / n
 
                 corner = pinhole + point + depth * k + stretch * (middle + point)
-                shifts = places[:, ::-1] / (scale * (rays.line_step @ v), scale * (rays.ray_step @ u))
+                shifts = places[:, ::-1] / (scale * (rays.row_step @ v), scale * (rays.column_step @ u))
                 yield Beam(Fan(pinhole + point, corner, *steps, views.shape, shifts), weigh)
 
     def pixel_weights(

@@ -12,8 +12,9 @@ from ..geometry.grid import Grid
 from ..geometry.system import PinholeSystem
 from ..geometry.views import Views
 from ..volumes.volume import Volume
+from .bundles import Beam
 from .emission import Emission
-from .models import Array, Beam, Model, view_rays
+from .models import Array, Model, view_rays
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,7 +64,7 @@ class InverseSquareSum(Model):
         towards = rays.targets() - rays.source
         sine = (towards @ k / np.linalg.norm(towards, axis=1)).reshape(views.shape)
         weights = self.system.pinhole_diameter[m] ** 2 / 16 * sine**3
-        yield Beam(rays, lambda lines, rays, shifts: weights[None, lines, rays])
+        yield Beam(rays, lambda rows, columns, shifts: weights[None, rows, columns])
 
     def voxel_weights(self, views: Views, m: int, grid: Grid) -> Array:
         """``1 / h^2`` at the voxels' centres, 1/mm^2."""

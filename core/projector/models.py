@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -16,44 +16,11 @@ from ..geometry.grid import Grid
 from ..geometry.views import Views
 from ..validation import positive, real_array
 from ..volumes.volume import LINE_INTEGRALS, Volume, require_quantity
+from .bundles import Beam
 from .pixel_points import TOLERANCE, offsets, points_needed, require_points, shadow_edges
 from .rays import Fan
 
 Array = NDArray[np.float64]
-
-
-@dataclass(frozen=True, eq=False)
-class Beam:
-    """Rays for every pixel of a view, as many as its fan has shifts, whose weighted integrals add up.
-
-    Attributes
-    ----------
-    rays : Fan
-        From the rays' source to the pixels: n_v lines of n_u rays.
-    weigh : function, optional
-        Of slices of lines, rays and shifts: array (shifts, lines, rays), with 1 line or ray where all are alike, what a
-        ray's integral counts in its pixel. None: 1 everywhere.
-    """
-
-    rays: Fan
-    weigh: Callable[[slice, slice, slice], Array] | None = None
-
-    def part(self, lines: slice, rays: slice, shifts: slice = slice(None)) -> tuple[Fan, Array | None]:
-        """Some of the rays of some of the lines, of some shifts, and their weights."""
-        return self.rays[lines, rays, shifts], None if self.weigh is None else self.weigh(lines, rays, shifts)
-
-    def weights(self) -> Array:
-        """What the integrals of all rays count in their pixels, (shifts, lines, rays)."""
-        every = slice(None)
-        weights = np.ones(1) if self.weigh is None else self.weigh(every, every, every)
-        return np.broadcast_to(weights, (len(self.rays.shifts), *self.rays.shape))
-
-    def transposed(self) -> Beam:
-        """The same rays by columns: n_u lines of n_v rays."""
-        weigh, rays = self.weigh, self.rays.transposed()
-        if weigh is None:
-            return Beam(rays)
-        return Beam(rays, lambda lines, rays, shifts: np.swapaxes(weigh(rays, lines, shifts), -1, -2))
 
 
 class Model(ABC):
@@ -149,7 +116,7 @@ class Transmission(Model):
             return
         n = self.pixel_points or points_needed(shadow_edges(views, m, grid), self.tolerance)
         weights = np.full((n, 1, 1), 1 / n)
-        yield Beam(replace(rays, shifts=offsets(n)[:, ::-1]), lambda lines, rays, shifts: weights[shifts])
+        yield Beam(replace(rays, shifts=offsets(n)[:, ::-1]), lambda rows, columns, shifts: weights[shifts])
 
 
 def intensity(line_integrals: ArrayOrTensor, photons: float) -> ArrayOrTensor:
@@ -177,7 +144,7 @@ def intensity(line_integrals: ArrayOrTensor, photons: float) -> ArrayOrTensor:
 
 
 def view_rays(views: Views, m: int) -> Fan:
-    """The rays of view m, from its source to the pixels' centres: a line for every row."""
+    """The rays of view m, from its source to the pixels' centres: a row for every row of pixels."""
     n_v, n_u = views.shape
     u_step, v_step = views.u_steps[m], views.v_steps[m]
     corner = views.detector_centers[m] - (n_u - 1) / 2 * u_step - (n_v - 1) / 2 * v_step

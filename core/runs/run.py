@@ -27,9 +27,9 @@ def versions() -> dict[str, str]:
     with contextlib.suppress(metadata.PackageNotFoundError):
         found["torch"] = metadata.version("torch")
     with contextlib.suppress(ImportError, OSError):  # there is none for this platform
-        from ..projector.backends import siddon_cpu
+        from ..projector.backends import cpu
 
-        found["cpu"] = siddon_cpu.levels()[siddon_cpu.level]
+        found["cpu"] = cpu.levels()[cpu.level]
     return found
 
 

@@ -65,7 +65,7 @@ assert hasattr(bpy.ops, "mphdrr") and "MPHDRR_PT_geometry" in dir(bpy.types)
 for name in ("h5py", "openjpeg", "psutil", "openpyxl", "nibabel", "trimesh"):
     module = importlib.import_module(name)
     assert ".local" in module.__file__, module.__file__  # from the extension's wheels, not from the machine
-cpu = importlib.import_module("{MODULE}.core.projector.backends.siddon_cpu")
+cpu = importlib.import_module("{MODULE}.core.projector.backends.cpu")
 assert cpu.levels(), "the kernels"
 print("ENABLED", sys.modules["{MODULE}"].__file__)
 """)

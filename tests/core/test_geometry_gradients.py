@@ -10,7 +10,7 @@ torch = pytest.importorskip("torch", reason="torch is not installed")
 from mphdrr.core.errors import InputError  # noqa: E402
 from mphdrr.core.geometry.grid import Grid  # noqa: E402
 from mphdrr.core.geometry.views import Views  # noqa: E402
-from mphdrr.core.projector import Projector, operator, trace_rays  # noqa: E402
+from mphdrr.core.projector import Projector, execution, trace_rays  # noqa: E402
 from mphdrr.core.projector.tracing import trace_fans  # noqa: E402
 from mphdrr.core.volumes.volume import Volume  # noqa: E402
 
@@ -211,7 +211,7 @@ def test_gradcheck_by_everything(backend, which, rng):
 @pytest.mark.parametrize("which", MU)
 def test_fans_are_their_rays(backend, which, rng, monkeypatch):
     """Integrals and all gradients: lines along either axis, cut into blocks, from outside and from inside; arrays too."""
-    monkeypatch.setattr(operator, "_FEWEST_RAYS", 16)
+    monkeypatch.setattr(execution, "_FEWEST_RAYS", 16)
     grid = general_grid(rng, (9, 8, 7))
     mu_grid = (some_mu(rng, grid, which) or Volume(np.ones(grid.shape), grid)).grid
     shape = (9, 5)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib
 import os
 import subprocess
 import sys
@@ -18,7 +17,7 @@ from mphdrr.core.geometry.grid import Grid
 from mphdrr.core.geometry.views import Views
 from mphdrr.core.progress import Cancelled
 from mphdrr.core.projector import Projector, Transmission, backends, trace_rays
-from mphdrr.core.projector.backends import siddon_cpu
+from mphdrr.core.projector.backends import cpu
 from mphdrr.core.volumes.volume import Volume
 
 from .conftest import WORKBOOK, emission
@@ -115,12 +114,14 @@ def test_unknown_backend_lists_the_choices():
 
 
 def without(monkeypatch, *missing):
-    def load(name):
-        if name in missing:
-            raise ImportError(f"no kernels and no {name}")
-        return importlib.import_module(f"mphdrr.core.projector.backends.siddon_{name}")
+    require = backends._require
 
-    monkeypatch.setattr(backends, "load", load)
+    def found(backend):
+        if backend.name in missing:
+            raise ImportError(f"no kernels and no {backend.name}")
+        require(backend)
+
+    monkeypatch.setattr(backends, "_require", found)
     backends._warn_slower.cache_clear()
 
 
@@ -196,7 +197,7 @@ def test_rays_that_cannot_fit_are_refused_before_they_are_made():
 def test_adjoint_uses_fewer_threads_when_memory_is_short(monkeypatch):
     images = np.random.default_rng(0).random((2, 6, 7))
     expected = Projector(GRID, VIEWS, threads=1).T(images)
-    monkeypatch.setattr("mphdrr.core.projector.operator.available", lambda: 1)
+    monkeypatch.setattr("mphdrr.core.projector.execution.available", lambda: 1)
     np.testing.assert_array_equal(Projector(GRID, VIEWS, threads=4).T(images), expected)
 
 
@@ -244,17 +245,17 @@ def test_progress_comes_as_often_however_many_rays_a_pixel_has(pixel_points, mon
     views = Views(np.tile([[0, 0, -50.0]], (n_views, 1)), np.tile([[0, 0, 50.0]], (n_views, 1)), u, v, shape)
     A = Projector(GRID, views, Transmission(pixel_points), threads=2)
     traced, before = [0], [0]
-    adjoint = siddon_cpu.adjoint
+    backproject = cpu.backproject
 
     def counted(volume, values, rays, attenuation=None):
         traced[0] += len(rays)
-        adjoint(volume, values, rays, attenuation)
+        backproject(volume, values, rays, attenuation)
 
     def look(done, total):
         assert traced[0] - before[0] <= 2**20
         before[0] = traced[0]
 
-    monkeypatch.setattr(siddon_cpu, "adjoint", counted)
+    monkeypatch.setattr(cpu, "backproject", counted)
     A.T(np.ones(A.shape_out), look)
     assert traced[0] > 0
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import sys
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -15,11 +16,12 @@ import warp
 from mphdrr.core.errors import InputError
 from mphdrr.core.geometry.grid import Grid
 from mphdrr.core.geometry.views import Views
-from mphdrr.core.projector import Projector, backends, operator
+from mphdrr.core.projector import Projector, backends
 from mphdrr.core.projector import trace_rays as trace
-from mphdrr.core.projector.backends import siddon_cuda, siddon_numpy
+from mphdrr.core.projector.backends import cuda, reference
+from mphdrr.core.projector.lattices import Lattices
 from mphdrr.core.projector.models import view_rays
-from mphdrr.core.projector.rays import Attenuation, IndexFans, IndexRays, RayMapper
+from mphdrr.core.projector.rays import Attenuation, IndexFans, IndexRays
 from mphdrr.core.volumes.volume import Volume
 
 from .conftest import emission, general_grid
@@ -30,13 +32,13 @@ SHAPE, MU_SHAPE = (6, 7, 5), (5, 4, 8)
 
 @pytest.fixture(autouse=True)
 def device(monkeypatch):
-    monkeypatch.setenv(siddon_cuda.DEVICE_VARIABLE, os.environ.get(siddon_cuda.DEVICE_VARIABLE, "cpu"))
+    monkeypatch.setenv(cuda.DEVICE_VARIABLE, os.environ.get(cuda.DEVICE_VARIABLE, "cpu"))
 
 
 @pytest.fixture
 def small_pieces(monkeypatch):
     """Launches of 17 rays: lines and fans in several pieces."""
-    monkeypatch.setattr(siddon_cuda, "_RAYS_AT_ONCE", 17)
+    monkeypatch.setattr(cuda, "_RAYS_AT_ONCE", 17)
 
 
 @pytest.mark.parametrize("shape", SHAPES)
@@ -71,8 +73,8 @@ def test_thousands_of_voxels_do_not_add_up_errors():
     starts, along = np.array([[-7.0, 0.4, 0.4]]), np.array([[6011.0, 0.1, 0.2]])
     rays = IndexRays(starts, along, np.linalg.norm(along, axis=1))
     for mu in (None, np.full(volume.shape, 3e-4, np.float32)):
-        expected = siddon_numpy.forward(volume.astype(float), rays, weakened(mu, None))
-        np.testing.assert_allclose(siddon_cuda.forward(volume, rays, weakened(mu, None)), expected, rtol=5e-7)
+        expected = reference.forward(volume.astype(float), rays, weakened(mu, None))
+        np.testing.assert_allclose(cuda.forward(volume, rays, weakened(mu, None)), expected, rtol=5e-7)
 
 
 @pytest.mark.parametrize("kind", LINEAR)
@@ -133,7 +135,7 @@ def test_derivatives_are_finite_differences(lattices):
         """The integral over alpha, with mu's rays moved on their own, and the exponent's length."""
         changed = IndexRays(rays.starts, rays.directions, length * longer)
         changed, behind = moved(changed, *ends), moved(changed if same else mu_rays, *mu_ends)
-        return siddon_numpy.forward(volume, changed, weakened(mu, behind)) / changed.lengths
+        return reference.forward(volume, changed, weakened(mu, behind)) / changed.lengths
 
     expected = [integral()]
     for which in ("ends", "mu_ends")[: 1 if mu is None else 2]:
@@ -143,7 +145,7 @@ def test_derivatives_are_finite_differences(lattices):
         expected.append((integral(longer=1 + h) - integral(longer=1 - h)) / (2 * h * length))
 
     volume, mu = single(volume, mu)
-    got = siddon_cuda.derivatives(volume, rays, weakened(mu, mu_rays))
+    got = cuda.derivatives(volume, rays, weakened(mu, mu_rays))
     assert got.shape == (300, 7 if mu is None else 14)
     for column, (a, b) in enumerate(zip(got.T, expected, strict=True)):
         wrong = np.abs(a - b) > 2e-5 * np.abs(b).max()
@@ -158,7 +160,7 @@ def test_derivatives_depend_on_mu_and_not_on_its_grid(rounding, rng):
     mu[0], mu[:, :, 3:] = 0, 0
     starts, ends = rng.normal(size=(2, 3000, 3)) * 6 + np.array(SHAPE) / 2
     lengths = np.linalg.norm(ends - starts, axis=1)
-    expected = siddon_cuda.derivatives(volume, IndexRays(starts, ends - starts, lengths), Attenuation(mu))
+    expected = cuda.derivatives(volume, IndexRays(starts, ends - starts, lengths), Attenuation(mu))
     if rounding:
         linear = rng.normal(size=(3, 3))
         starts, ends = (points @ linear @ np.linalg.inv(linear) for points in (starts, ends))
@@ -168,7 +170,7 @@ def test_derivatives_depend_on_mu_and_not_on_its_grid(rounding, rng):
         (mu[1:, :, :3].copy(), 1, (-1, 0, 0)),
     ):
         behind = IndexRays(starts * factor + shift, (ends - starts) * factor, lengths)
-        got = siddon_cuda.derivatives(volume, IndexRays(starts, ends - starts, lengths), Attenuation(array, behind))
+        got = cuda.derivatives(volume, IndexRays(starts, ends - starts, lengths), Attenuation(array, behind))
         got[:, 7:13] *= factor
         assert np.count_nonzero(got[:, 7:13]) > 2000
         scale = np.abs(expected).max(axis=0)
@@ -180,10 +182,10 @@ def test_gradient_by_mu_is_a_finite_difference(lattices, rng, small_pieces):
     volume, rays, mu, mu_rays = lattices
     values, h = rng.normal(size=300), 1e-6
     gradient = np.ones(mu.shape, np.float32)
-    siddon_cuda.mu_gradient(gradient, *single(volume, values), rays, weakened(*single(mu), mu_rays))
+    cuda.mu_gradient(gradient, *single(volume, values), rays, weakened(*single(mu), mu_rays))
     for _ in range(3):
         step = rng.normal(size=mu.shape)
-        ahead, back = (siddon_numpy.forward(volume, rays, weakened(mu + k * step, mu_rays)) for k in (h, -h))
+        ahead, back = (reference.forward(volume, rays, weakened(mu + k * step, mu_rays)) for k in (h, -h))
         np.testing.assert_allclose(((gradient - 1) * step).sum(), (ahead - back) @ values / (2 * h), rtol=1e-4)
 
 
@@ -191,11 +193,11 @@ def test_adjoint_has_the_weights_of_the_integrals(lattices, rng):
     volume, rays, mu, mu_rays = lattices
     x, y, mu32 = single(volume, rng.normal(size=300), mu)
     spread = np.ones(SHAPE, np.float32)
-    siddon_cuda.adjoint(spread, y, rays, weakened(mu32, mu_rays))
+    cuda.backproject(spread, y, rays, weakened(mu32, mu_rays))
     expected = np.ones(SHAPE)
-    siddon_numpy.adjoint(expected, y.astype(float), rays, weakened(mu, mu_rays))
+    reference.backproject(expected, y.astype(float), rays, weakened(mu, mu_rays))
     np.testing.assert_allclose(spread, expected, rtol=2e-5, atol=2e-5 * np.abs(expected).max())
-    product = siddon_cuda.forward(x, rays, weakened(mu32, mu_rays)).astype(float) @ y
+    product = cuda.forward(x, rays, weakened(mu32, mu_rays)).astype(float) @ y
     assert abs(product - np.vdot(x, spread - 1.0)) < 1e-5 * np.linalg.norm(y) * np.linalg.norm(x)
 
 
@@ -207,13 +209,14 @@ def test_projector_agrees_with_the_reference(attenuation, system, rng, monkeypat
     mu = Volume(rng.uniform(0, 0.02, mu_grid.shape), mu_grid, "mu") if attenuation else None
     model = emission(system, mu=mu, aperture_points=3, crystal_mu=0.2, intrinsic_fwhm=4.0)
     A, reference = (Projector(grid, system.views((9, 8)), model, backend=name) for name in ("cuda", "numpy"))
-    assert {A._beams(m)[1] for m in range(12)} == {True, False}
+    assert {A._bundles[m].transposed for m in range(12)} == {True, False}
     x, y = rng.random(A.shape_in, dtype=np.float32), rng.random(A.shape_out, dtype=np.float32)
     expected, expected_T = reference(x), reference.T(y)
     assert np.count_nonzero(expected) > 0.5 * expected.size
     for rays_together, rays_at_once in ((2**22, 2**24), (5 * 72, 2**24), (2**22, 100), (2**22, 20)):
-        monkeypatch.setitem(operator._MOST_RAYS, "cuda", rays_together)
-        monkeypatch.setattr(siddon_cuda, "_RAYS_AT_ONCE", rays_at_once)
+        few = replace(backends.BACKENDS["cuda"], rays_at_once=rays_together, rays_of_images=rays_together)
+        monkeypatch.setattr(A, "_backend", few)
+        monkeypatch.setattr(cuda, "_RAYS_AT_ONCE", rays_at_once)
         Ax, ATy = A(x), A.T(y)
         assert Ax.dtype == ATy.dtype == np.float32
         np.testing.assert_allclose(Ax, expected, rtol=2e-5, atol=2e-5 * expected.max())
@@ -225,9 +228,9 @@ def test_projector_agrees_with_the_reference(attenuation, system, rng, monkeypat
 def test_rays_of_fans_are_the_listed_rays(rng, small_pieces):
     grid = Grid(SHAPE, affine(LINEAR["sheared"], SHAPE))
     views = some_views(rng, (7, 30), n=4)
-    fans, _ = RayMapper(grid)(*(view_rays(views, m) for m in range(4)))
+    fans, _ = Lattices(grid).fans(np.concatenate([view_rays(views, m).vectors() for m in range(4)]), views.shape)
     volume = rng.random(SHAPE, dtype=np.float32)
-    for function in (siddon_cuda.forward, siddon_cuda.derivatives):
+    for function in (cuda.forward, cuda.derivatives):
         together = function(volume, fans)
         assert together.any()
         np.testing.assert_allclose(together, function(volume, fans.listed()), rtol=1e-5, atol=1e-6)
@@ -237,20 +240,20 @@ def test_rays_of_fans_are_the_listed_rays(rng, small_pieces):
 
 @pytest.mark.parametrize("rays_at_once", [2**24, 17])
 def test_tensors_on_the_device_are_not_copied(rays_at_once, rng, monkeypatch):
-    monkeypatch.setattr(siddon_cuda, "_RAYS_AT_ONCE", rays_at_once)
+    monkeypatch.setattr(cuda, "_RAYS_AT_ONCE", rays_at_once)
     torch = pytest.importorskip("torch", reason="torch is not installed")
     grid = Grid(SHAPE, affine(LINEAR["rotated"], SHAPE))
-    place = "cuda" if os.environ[siddon_cuda.DEVICE_VARIABLE] != "cpu" else "cpu"
+    place = "cuda" if os.environ[cuda.DEVICE_VARIABLE] != "cpu" else "cpu"
     volume = torch.tensor(rng.random(SHAPE), dtype=torch.float32, device=place)
-    assert siddon_cuda.native(volume).data_ptr() == volume.data_ptr()
+    assert cuda.to_backend(volume).data_ptr() == volume.data_ptr()
 
-    fan, _ = RayMapper(grid)(view_rays(some_views(rng, (9, 5)), 0))
-    integrals = siddon_cuda.forward(volume, fan)
+    fan, _ = Lattices(grid).fans(view_rays(some_views(rng, (9, 5)), 0).vectors(), (9, 5))
+    integrals = cuda.forward(volume, fan)
     assert integrals.device == volume.device and integrals.dtype == torch.float32
-    np.testing.assert_allclose(integrals.cpu(), siddon_cuda.forward(volume.cpu().numpy(), fan), rtol=1e-6)
-    torch.testing.assert_close(siddon_cuda.forward(siddon_cuda.native(torch._neg_view(volume)), fan), -integrals)
+    np.testing.assert_allclose(integrals.cpu(), cuda.forward(volume.cpu().numpy(), fan), rtol=1e-6)
+    torch.testing.assert_close(cuda.forward(cuda.to_backend(torch._neg_view(volume)), fan), -integrals)
     filled = torch.zeros_like(volume)
-    siddon_cuda.adjoint(filled, integrals, fan)
+    cuda.backproject(filled, integrals, fan)
     torch.testing.assert_close((filled * volume).sum(), (integrals**2).sum())
 
     A = Projector(grid, some_views(rng), backend="cuda")
@@ -284,14 +287,14 @@ def test_what_is_missing_is_said_in_one_line(monkeypatch):
         raise ModuleNotFoundError("No module named 'warp'")
 
     with monkeypatch.context() as patch:
-        patch.setenv(siddon_cuda.DEVICE_VARIABLE, "cuda")
-        patch.setattr(siddon_cuda, "has_driver", lambda: False)
+        patch.setenv(cuda.DEVICE_VARIABLE, "cuda")
+        patch.setattr(cuda, "has_driver", lambda: False)
         assert "no NVIDIA driver" in refusal()
         backends._cuda_works.cache_clear()
         assert not backends._cuda_works()  # a tensor on a GPU is for torch then
     backends._cuda_works.cache_clear()
-    monkeypatch.setenv(siddon_cuda.DEVICE_VARIABLE, "cuda:99")
-    monkeypatch.setattr(siddon_cuda, "has_driver", lambda: True)
+    monkeypatch.setenv(cuda.DEVICE_VARIABLE, "cuda:99")
+    monkeypatch.setattr(cuda, "has_driver", lambda: True)
     assert "cuda:99" in refusal()
     monkeypatch.setattr(backends, "load", without_warp)
     assert "pip install warp-lang" in refusal()
@@ -300,15 +303,15 @@ def test_what_is_missing_is_said_in_one_line(monkeypatch):
 def test_short_memory_means_more_launches(monkeypatch, rng):
     grid = Grid(SHAPE, affine(LINEAR["sheared"], SHAPE))
     views = some_views(rng, (7, 30), n=4)
-    fans, _ = RayMapper(grid)(*(view_rays(views, m) for m in range(4)))
+    fans, _ = Lattices(grid).fans(np.concatenate([view_rays(views, m).vectors() for m in range(4)]), views.shape)
     volume = rng.random(SHAPE, dtype=np.float32)
     launches = []
     launch = warp.launch
     monkeypatch.setattr(warp, "launch", lambda *a, **k: launches.append(a[1]) or launch(*a, **k))
-    expected = siddon_cuda.forward(volume, fans)
-    monkeypatch.setattr(siddon_cuda, "_FEWEST_RAYS", 1)
-    monkeypatch.setattr(type(siddon_cuda.device()), "free_memory", 1000)  # 500 for the rays: 2 or 3 lines of a view
-    np.testing.assert_array_equal(siddon_cuda.forward(volume, fans), expected)
+    expected = cuda.forward(volume, fans)
+    monkeypatch.setattr(cuda, "_FEWEST_RAYS", 1)
+    monkeypatch.setattr(type(cuda.device()), "free_memory", 1000)  # 500 for the rays: 2 or 3 lines of a view
+    np.testing.assert_array_equal(cuda.forward(volume, fans), expected)
     assert launches[0] == (4, 7, 30) and len(launches) > 8 and {dim[0] for dim in launches[1:]} == {1}
 
 
@@ -316,7 +319,7 @@ def test_short_memory_means_more_launches(monkeypatch, rng):
 def test_kernels_compile_for_gpus_without_one(tmp_path):
     from mphdrr.core.projector.backends import warp_kernels
 
-    siddon_cuda.device()
+    cuda.device()
     (compiled,) = warp.compile_aot_module(warp_kernels, arch=75, module_dir=tmp_path, use_ptx=True)
     assert compiled.read_text().count(".entry") == 7
 
@@ -324,7 +327,7 @@ def test_kernels_compile_for_gpus_without_one(tmp_path):
 def test_volume_too_large_for_the_device_is_refused(monkeypatch, rng):
     grid = Grid.centered((40, 40, 40), 1.0)
     A = Projector(grid, some_views(rng), backend="cuda")
-    monkeypatch.setattr(type(siddon_cuda.device()), "free_memory", 1000)
+    monkeypatch.setattr(type(cuda.device()), "free_memory", 1000)
     with pytest.raises(InputError, match="the volume takes"):
         A(np.ones(grid.shape))
 

@@ -13,30 +13,31 @@ import pytest
 
 from mphdrr.core.errors import InputError
 from mphdrr.core.geometry.grid import Grid
-from mphdrr.core.projector.backends import siddon_cpu, siddon_numpy
+from mphdrr.core.projector.backends import cpu, reference
+from mphdrr.core.projector.lattices import Lattices
 from mphdrr.core.projector.models import view_rays
-from mphdrr.core.projector.rays import RayMapper
+from mphdrr.core.projector.rays import Ends
 
 from .test_projector import LINEAR, SHAPES, affine, nasty_rays, random_rays, some_views
 
-LEVELS = siddon_cpu.levels()
+LEVELS = cpu.levels()
 TOLERANCE = {np.float32: 2e-5, np.float64: 1e-9}
 
 
 @pytest.fixture(params=LEVELS)
 def level(request, monkeypatch):
-    monkeypatch.setattr(siddon_cpu, "level", LEVELS.index(request.param))
+    monkeypatch.setattr(cpu, "level", LEVELS.index(request.param))
 
 
-def mappers(rng, kind, shape=(7, 6, 9)):
+def lattices_of(rng, kind, shape=(7, 6, 9)):
     """A volume, and what maps rays to it: without mu, with mu on its lattice, with mu on another's."""
     grid = Grid(shape, affine(LINEAR["rotated"], shape))
     other = Grid((5, 8, 4), affine(LINEAR["sheared"] * 1.2, (5, 8, 4)))
     volume = rng.random(shape).astype(kind)
     mu, other_mu = (0.2 * rng.random(n).astype(kind) for n in (shape, other.shape))
-    yield volume, RayMapper(grid)
-    yield volume, RayMapper(grid, mu=mu)
-    yield volume, RayMapper(grid, mu=other_mu, mu_grid=other)
+    yield volume, Lattices(grid)
+    yield volume, Lattices(grid, mu=mu)
+    yield volume, Lattices(grid, mu=other_mu, mu_grid=other)
 
 
 def as_double(mapped):
@@ -52,41 +53,41 @@ def close(values, expected, kind):
 
 @pytest.mark.parametrize("kind", TOLERANCE)
 def test_every_level_agrees_with_the_reference(level, kind, rng):
-    for volume, mapper in mappers(rng, kind):
-        fans = (view_rays(some_views(rng, (11, 13)), m) for m in range(3))
-        for mapped in (mapper(*fans), mapper.between(*random_rays(rng, mapper.grid, 500))):
+    for volume, lattices in lattices_of(rng, kind):
+        fans = np.concatenate([view_rays(some_views(rng, (11, 13)), m).vectors() for m in range(3)])
+        for mapped in (lattices.fans(fans, (11, 13)), lattices.between(Ends(*random_rays(rng, lattices.grid, 500)))):
             values = rng.random(len(mapped[0])).astype(kind)
-            expected = siddon_numpy.forward(volume.astype(float), *as_double(mapped))
+            expected = reference.forward(volume.astype(float), *as_double(mapped))
             assert expected.any()
-            close(siddon_cpu.forward(volume, *mapped), expected, kind)
+            close(cpu.forward(volume, *mapped), expected, kind)
             sums, expected = np.zeros_like(volume), np.zeros(volume.shape)
-            siddon_cpu.adjoint(sums, values, *mapped)
-            siddon_numpy.adjoint(expected, values, *as_double(mapped))
+            cpu.backproject(sums, values, *mapped)
+            reference.backproject(expected, values, *as_double(mapped))
             close(sums, expected, kind)
             close(
-                siddon_cpu.derivatives(volume, *mapped),
-                siddon_numpy.derivatives(volume.astype(float), *as_double(mapped)),
+                cpu.derivatives(volume, *mapped),
+                reference.derivatives(volume.astype(float), *as_double(mapped)),
                 kind,
             )
-            if mapper.mu is not None:
-                sums, expected = np.zeros_like(mapper.mu), np.zeros(mapper.mu.shape)
-                siddon_cpu.mu_gradient(sums, volume, values, *mapped)
-                siddon_numpy.mu_gradient(expected, volume.astype(float), values, *as_double(mapped))
+            if lattices.mu is not None:
+                sums, expected = np.zeros_like(lattices.mu), np.zeros(lattices.mu.shape)
+                cpu.mu_gradient(sums, volume, values, *mapped)
+                reference.mu_gradient(expected, volume.astype(float), values, *as_double(mapped))
                 close(sums, expected, kind)
 
 
 @pytest.mark.parametrize("kind", TOLERANCE)
 def test_every_level_takes_rays_along_faces_edges_and_corners(level, kind, rng):
     for shape, linear in itertools.product(SHAPES, LINEAR.values()):
-        mapper, volume = RayMapper(Grid(shape, affine(linear, shape))), rng.random(shape).astype(kind)
-        mapped = mapper.between(*nasty_rays(mapper.grid, rng))
-        close(siddon_cpu.forward(volume, *mapped), siddon_numpy.forward(volume.astype(float), *mapped), kind)
+        lattices, volume = Lattices(Grid(shape, affine(linear, shape))), rng.random(shape).astype(kind)
+        mapped = lattices.between(Ends(*nasty_rays(lattices.grid, rng)))
+        close(cpu.forward(volume, *mapped), reference.forward(volume.astype(float), *mapped), kind)
 
 
 def test_no_rays():
-    mapped = RayMapper(Grid.centered(4, 1.0)).between(np.empty((0, 3)), np.empty((0, 3)))
-    assert siddon_cpu.forward(np.ones((4, 4, 4)), *mapped).shape == (0,)
-    assert siddon_cpu.derivatives(np.ones((4, 4, 4)), *mapped).shape == (0, 7)
+    mapped = Lattices(Grid.centered(4, 1.0)).between(Ends(np.empty((0, 3)), np.empty((0, 3))))
+    assert cpu.forward(np.ones((4, 4, 4)), *mapped).shape == (0,)
+    assert cpu.derivatives(np.ones((4, 4, 4)), *mapped).shape == (0, 7)
 
 
 def run(code, **options):
@@ -94,17 +95,17 @@ def run(code, **options):
     return subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, env=environment, **options)
 
 
-PRINT_LEVEL = "from mphdrr.core.projector import siddon_cpu; print(siddon_cpu.levels()[siddon_cpu.level])"
+PRINT_LEVEL = "from mphdrr.core.projector.backends import cpu; print(cpu.levels()[cpu.level])"
 
 
 @pytest.mark.parametrize("name", LEVELS)
 def test_the_environment_names_a_level(name):
-    done = run(PRINT_LEVEL, environment={siddon_cpu.LEVEL_VARIABLE: name})
+    done = run(PRINT_LEVEL, environment={cpu.LEVEL_VARIABLE: name})
     assert done.stdout.strip() == name, done.stderr
 
 
 def test_a_level_that_there_is_not_is_refused():
-    done = run(PRINT_LEVEL, environment={siddon_cpu.LEVEL_VARIABLE: "AVX-1024"})
+    done = run(PRINT_LEVEL, environment={cpu.LEVEL_VARIABLE: "AVX-1024"})
     assert "InputError" in done.stderr and LEVELS[0] in done.stderr and "AVX-1024" in done.stderr
 
 
@@ -117,17 +118,17 @@ def test_the_library_is_the_packages_own(tmp_path):
         ("LD_LIBRARY_PATH", "DYLD_LIBRARY_PATH", "PATH"), f"{tmp_path}{os.pathsep}{os.environ['PATH']}"
     )
     done = run(
-        "from mphdrr.core.projector import siddon_cpu; print(siddon_cpu._library._name)",
+        "from mphdrr.core.projector.backends import cpu; print(cpu._library._name)",
         cwd=tmp_path,
         environment=paths,
     )
-    assert Path(done.stdout.strip()).parent == Path(siddon_cpu.__file__).with_name("kernels"), done.stderr
+    assert Path(done.stdout.strip()).parent == Path(cpu.__file__).with_name("kernels"), done.stderr
 
 
 def test_a_library_of_another_version_is_not_used(monkeypatch):
-    monkeypatch.setattr(siddon_cpu, "_CONTRACT", -1)
+    monkeypatch.setattr(cpu, "_CONTRACT", -1)
     with pytest.raises(ImportError, match="another version"):
-        siddon_cpu._load()
+        cpu._load()
 
 
 @pytest.mark.parametrize("kind", TOLERANCE)
@@ -136,28 +137,28 @@ def test_the_last_voxel_of_a_long_way_counts_whole(level, kind):
     volume = np.zeros(grid.shape, kind)
     volume[..., -1] = 1
     ends = np.array([[1.3, -0.4, 900.0], [-2.2, 3.1, 700.0]])
-    mapped = RayMapper(grid).between(-ends, ends)
-    close(siddon_cpu.forward(volume, *mapped), siddon_numpy.forward(volume.astype(float), *mapped), kind)
+    mapped = Lattices(grid).between(Ends(-ends, ends))
+    close(cpu.forward(volume, *mapped), reference.forward(volume.astype(float), *mapped), kind)
     sums, expected = np.zeros_like(volume), np.zeros(grid.shape)
-    siddon_cpu.adjoint(sums, np.ones(2, kind), *mapped)
-    siddon_numpy.adjoint(expected, np.ones(2), *mapped)
+    cpu.backproject(sums, np.ones(2, kind), *mapped)
+    reference.backproject(expected, np.ones(2), *mapped)
     close(sums, expected, kind)
 
 
 def test_what_does_not_fit_is_not_taken():
     volume = np.ones((3, 4, 5), np.float32)
-    mapped = RayMapper(Grid.centered(volume.shape, 1.0)).between(np.array([[0.0, 0, -9]]), np.array([[0.0, 0, 9]]))
+    mapped = Lattices(Grid.centered(volume.shape, 1.0)).between(Ends(np.array([[0.0, 0, -9]]), np.array([[0.0, 0, 9]])))
     shared = type("Attenuation", (), {"mu": volume[:2], "rays": None})
     read_only = volume.copy()
     read_only.flags.writeable = False
     for call in (
-        lambda: siddon_cpu.forward(volume.astype(np.int32), *mapped),
-        lambda: siddon_cpu.forward(volume.astype(np.float16), *mapped),
-        lambda: siddon_cpu.forward(volume.astype(">f4"), *mapped),
-        lambda: siddon_cpu.forward(np.asfortranarray(volume), *mapped),
-        lambda: siddon_cpu.forward(volume, mapped[0], shared),
-        lambda: siddon_cpu.adjoint(volume, np.ones(0, np.float32), *mapped),
-        lambda: siddon_cpu.adjoint(read_only, np.ones(1, np.float32), *mapped),
+        lambda: cpu.forward(volume.astype(np.int32), *mapped),
+        lambda: cpu.forward(volume.astype(np.float16), *mapped),
+        lambda: cpu.forward(volume.astype(">f4"), *mapped),
+        lambda: cpu.forward(np.asfortranarray(volume), *mapped),
+        lambda: cpu.forward(volume, mapped[0], shared),
+        lambda: cpu.backproject(volume, np.ones(0, np.float32), *mapped),
+        lambda: cpu.backproject(read_only, np.ones(1, np.float32), *mapped),
     ):
         with pytest.raises((TypeError, ValueError), match="expected"):
             call()
@@ -166,6 +167,6 @@ def test_what_does_not_fit_is_not_taken():
 @pytest.mark.parametrize("shape", [(2**11, 2**10, 2**10), (1, 1, 2**12 + 1)])
 def test_volumes_too_large_for_the_indices_are_refused(shape):
     volume = np.broadcast_to(np.float32(1), shape)
-    mapped = RayMapper(Grid.centered(shape, 1.0)).between(np.array([[0.0, 0, -9]]), np.array([[0.0, 0, 9]]))
+    mapped = Lattices(Grid.centered(shape, 1.0)).between(Ends(np.array([[0.0, 0, -9]]), np.array([[0.0, 0, 9]])))
     with pytest.raises(InputError, match=" x ".join(map(str, shape))):
-        siddon_cpu.forward(volume, *mapped)
+        cpu.forward(volume, *mapped)

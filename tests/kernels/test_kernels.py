@@ -17,8 +17,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from mphdrr.core.projector.backends import siddon_numpy
-from mphdrr.core.projector.backends.siddon_cpu import _fans
+from mphdrr.core.projector.backends import reference
+from mphdrr.core.projector.backends.cpu import _fans
 from mphdrr.core.projector.rays import Attenuation, IndexFans, IndexRays
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -154,25 +154,25 @@ def expected(bundle: Bundle) -> list[tuple[Array, float]]:
     NaN is not compared.
     """
     volume, rays, values = bundle.volume.astype(float), bundle.rays.listed(), bundle.values.astype(float)
-    attenuation = None if bundle.attenuation is None else bundle.attenuation.listed()
+    attenuation = bundle.attenuation
     some = _of(rays, bundle.tame)
     if attenuation is not None:
-        mu_rays = None if attenuation.rays is None else _of(attenuation.rays, bundle.tame)
+        mu_rays = None if attenuation.rays is None else _of(attenuation.rays.listed(), bundle.tame)
         attenuation = Attenuation(attenuation.mu.astype(float), mu_rays)
     integrals = np.full(len(rays), np.nan)
-    integrals[bundle.tame] = siddon_numpy.forward(volume, some, attenuation)
+    integrals[bundle.tame] = reference.forward(volume, some, attenuation)
     back = np.full(volume.shape, np.nan)
     rows = np.full((7 if attenuation is None else 14, len(rays)), np.nan)
     gradient = np.full(() if attenuation is None else attenuation.mu.shape, np.nan)
     behind = 0.0  # derivatives by mu are differences of what lies behind
     if bundle.tame.all():
         back[:] = 0.0
-        siddon_numpy.adjoint(back, values, rays, attenuation)
+        reference.backproject(back, values, rays, attenuation)
         if bundle.by_ends:
-            rows[:] = siddon_numpy.derivatives(volume, rays, attenuation).T
+            rows[:] = reference.derivatives(volume, rays, attenuation).T
         if attenuation is not None:
             gradient[:] = 0.0
-            siddon_numpy.mu_gradient(gradient, volume, values, rays, attenuation)
+            reference.mu_gradient(gradient, volume, values, rays, attenuation)
             behind = np.max(values * integrals * rays.lengths, initial=0.0)
     arrays = [integrals, back, rows] + ([] if attenuation is None else [gradient])
     return [(a, max(np.max(np.abs(a), where=~np.isnan(a), initial=0.0), behind * (a is gradient))) for a in arrays]

@@ -1,26 +1,11 @@
-"""The backends: which there are, what they need, and which one "auto" means."""
+"""The backends: which there are, what they need and are good at, and which one "auto" means.
 
-from __future__ import annotations
-
-import functools
-import importlib
-import warnings
-from types import ModuleType
-from typing import Any
-
-import numpy as np
-
-from ...arrays import ArrayOrTensor, to_numpy, to_tensor
-from ...errors import InputError, InputWarning
-
-BACKENDS = ("cpu", "torch", "numpy", "cuda")
-"""Names of the backends. ``siddon_<name>`` is the module of each.
-
-Such a module has four functions. Line integrals are ``L int_0^1 f(alpha) exp(-L int_0^alpha mu) dalpha`` with L the
-ray's length in mm, f the volume and mu what attenuates, if anything.
+A backend is a row of `BACKENDS` and a module with four functions. Line integrals are
+``L int_0^1 f(alpha) exp(-L int_0^alpha mu) dalpha`` with L the ray's length in mm, f the volume and mu the attenuation
+coefficient, if there is any.
 
 - ``forward(volume, rays, attenuation=None)`` returns them, (N,).
-- ``adjoint(volume, values, rays, attenuation=None)`` adds the values to the volume in place, each along its ray with
+- ``backproject(volume, values, rays, attenuation=None)`` adds the values to the volume in place, each along its ray with
   the same weights.
 - ``derivatives(volume, rays, attenuation=None)`` returns (N, 7): the integral over alpha (the line integral per mm of
   L), and its derivatives by the ray's start (3) and end (3) in index space. With attenuation (N, 14): the derivatives
@@ -30,85 +15,164 @@ ray's length in mm, f the volume and mu what attenuates, if anything.
 - ``mu_gradient(gradient, volume, values, rays, attenuation)`` adds to `gradient` (of mu's shape) in place the sum over
   the rays of their values times the derivative of the line integral by mu.
 
-`rays` are `IndexRays` or `IndexFans`, what weakens them an `Attenuation`; volumes, values, mu and gradients are tensors on
-one device for "torch", numpy arrays or tensors on the GPU for "cuda" (see its `native`), and numpy arrays for the others.
+`rays` are `IndexRays` or `IndexFans`, attenuation is an `Attenuation`; volumes, values, mu and gradients are of the kind
+that the backend's `to_backend` returns.
 """
 
+from __future__ import annotations
+
+import functools
+import importlib
+import warnings
+from collections.abc import Callable
+from dataclasses import dataclass
+from types import ModuleType
+from typing import Any
+
+import numpy as np
+
+from ...arrays import ArrayOrTensor, to_numpy, to_tensor
+from ...errors import InputError, InputWarning
+
+
+@dataclass(frozen=True)
+class Backend:
+    """A way to compute line integrals, and how it wants its rays.
+
+    Attributes
+    ----------
+    name : str
+        What users call it.
+    module : str
+        The file here that has its functions.
+    rays_at_once : int
+        Rays of a call: enough that a call costs nothing, few enough that their arrays stay in the cache.
+    rays_of_images : int
+        Small images are traced several at once, up to so many rays.
+    to_backend : function
+        ``(array or tensor, float64) -> array or tensor`` as the backend's functions take it; float32 unless `float64`.
+    own_threads : bool
+        Whether a call uses the whole machine by itself; others are called on several threads.
+    always_float64 : bool
+        Whether it computes in float64 whatever it is given.
+    package : str, optional
+        What to install if it cannot be loaded.
+    """
+
+    name: str
+    module: str
+    rays_at_once: int
+    rays_of_images: int
+    to_backend: Callable[[ArrayOrTensor, bool], ArrayOrTensor]
+    own_threads: bool = False
+    always_float64: bool = False
+    package: str | None = None
+
+    @property
+    def functions(self) -> ModuleType:
+        """The module with its four functions."""
+        return load(self.module)
+
+    def workers(self, threads: int) -> int:
+        """On how many of `threads` it is to be called at the same time."""
+        return 1 if self.own_threads else threads
+
+
+def load(module: str) -> ModuleType:
+    """A module of this package; libraries are imported when a backend is first used."""
+    return importlib.import_module(f".{module}", __package__)
+
+
+def _array(x: ArrayOrTensor, float64: bool) -> ArrayOrTensor:
+    return to_numpy(x, np.float64 if float64 else np.float32)
+
+
+def _tensor(x: ArrayOrTensor, float64: bool) -> ArrayOrTensor:
+    tensor = to_tensor(x)
+    return tensor.double() if float64 else tensor
+
+
+def _on_gpu(x: ArrayOrTensor, float64: bool) -> ArrayOrTensor:
+    return load("cuda").to_backend(x)
+
+
+# torch is slow on a CPU, so calls for several small images stay short: between calls a job can stop.
+_ROWS = (
+    Backend("cpu", "cpu", 2**14, 2**14, _array),
+    Backend("torch", "reference", 2**18, 2**12, _tensor, own_threads=True, package="torch"),
+    Backend("numpy", "reference", 2**12, 2**12, _array, always_float64=True),
+    Backend("cuda", "cuda", 2**22, 2**22, _on_gpu, own_threads=True, package="warp-lang"),
+)
+BACKENDS = {backend.name: backend for backend in _ROWS}
+"""The backends by name."""
+
 _AUTOMATIC = ("cpu", "torch", "numpy")
-"""What "auto" chooses from, the one that it prefers first; for a tensor on a GPU see `for_tensor`."""
+"""What "auto" chooses from for arrays, in order of preference; for a tensor on a GPU see `for_tensor`."""
 
 _OLD_NAMES = {"numba": "cpu"}
 """What files and scripts of version 0.1 call a backend."""
 
-_PACKAGES = {"torch": "torch", "cuda": "warp-lang"}
+# A library may be absent, not be made for this platform, or fail to load its binaries.
+_CANNOT_LOAD = (ImportError, OSError)
 
 
-def choose(name: str) -> str:
+def choose(name: str) -> Backend:
     """The backend that `name` ("auto", one of `BACKENDS` or an old name) stands for on this machine, loaded.
 
     Raises
     ------
     InputError
-        No such backend, or the library or the GPU that it needs is missing.
+        There is no such backend, or the library or the GPU that it needs is missing.
     """
     name = _OLD_NAMES.get(name, name)
-    if name != "auto" and name not in BACKENDS:
+    if name == "auto":
+        return _automatic()
+    if name not in BACKENDS:
         raise InputError(f"backend {name!r}: expected one of auto, {', '.join(BACKENDS)}")
-    if name != "auto":
+    backend = BACKENDS[name]
+    try:
+        _require(backend)
+    except _CANNOT_LOAD as error:
+        remedy = f": pip install {backend.package}" if backend.package else ""
+        raise InputError(f"backend {name!r} cannot be used ({_reason(error)}){remedy}") from None
+    return backend
+
+
+def _automatic() -> Backend:
+    reason = ""
+    for name in _AUTOMATIC:
         try:
-            module = load(name)
+            _require(BACKENDS[name])
         except _CANNOT_LOAD as error:
-            remedy = f": pip install {_PACKAGES[name]}" if name in _PACKAGES else ""
-            raise InputError(f"backend {name!r} cannot be used ({_reason(error)}){remedy}") from None
-        if name == "cuda":
-            module.device()
-        return name
-    for candidate in _AUTOMATIC:
-        try:
-            load(candidate)
-        except _CANNOT_LOAD as error:
-            if candidate == "cpu":
-                reason = _reason(error)
+            reason = reason or _reason(error)
             continue
-        if candidate != "cpu":
-            _warn_slower(candidate, reason)
-        return candidate
+        if reason:
+            _warn_slower(name, reason)
+        return BACKENDS[name]
     raise AssertionError("numpy is always there")
 
 
-def for_tensor(tensor: Any) -> str:
+def _require(backend: Backend) -> None:
+    """Load what the backend needs, or raise."""
+    if backend.package == "torch":
+        importlib.import_module("torch")
+    functions = backend.functions
+    if hasattr(functions, "device"):
+        functions.device()
+
+
+def for_tensor(tensor: Any) -> Backend:
     """What "auto" means for a tensor that is not on the CPU: "cuda" where that works, else "torch"."""
-    return "cuda" if tensor.is_cuda and _cuda_works() else "torch"
+    return BACKENDS["cuda" if tensor.is_cuda and _cuda_works() else "torch"]
 
 
 @functools.cache
 def _cuda_works() -> bool:
     try:
-        load("cuda").device()
+        _require(BACKENDS["cuda"])
     except (InputError, *_CANNOT_LOAD):
         return False
     return True
-
-
-def native(x: ArrayOrTensor, name: str, float64: bool) -> ArrayOrTensor:
-    """`x` as the backend `name` computes with it; `float64` or float32 where it takes either."""
-    if name == "cuda":
-        return load(name).native(x)
-    return to_tensor(x) if name == "torch" else to_numpy(x, np.float64 if float64 else np.float32)
-
-
-def workers(name: str, threads: int) -> int:
-    """On how many of `threads` a backend is to be called at the same time: torch and cuda have threads of their own."""
-    return 1 if name in ("torch", "cuda") else threads
-
-
-def load(name: str) -> ModuleType:
-    """The module of a backend."""
-    return importlib.import_module(f".siddon_{name}", __package__)
-
-
-# A library may be absent, be none for this platform or fail to load its binaries.
-_CANNOT_LOAD = (ImportError, OSError)
 
 
 def _reason(error: BaseException) -> str:
@@ -120,5 +184,5 @@ def _warn_slower(name: str, reason: str) -> None:
     warnings.warn(
         f"projections run with {name}, many times slower than with the backend cpu ({reason})",
         InputWarning,
-        stacklevel=4,
+        stacklevel=5,
     )

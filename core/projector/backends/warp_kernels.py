@@ -1,23 +1,24 @@
 # mypy: disable-error-code="no-untyped-def, valid-type"
 # ruff: noqa: UP018, RUF046 -- to Warp 0.0 is a constant and float(0.0) a variable
-"""Kernels of the "cuda" backend, for NVIDIA Warp: one thread a ray, in one launch the rays of several fans.
+"""Kernels of the "cuda" backend, for NVIDIA Warp: one thread per ray, the rays of several fans in one launch.
 
-A ray walks from voxel to voxel; nothing is stored or sorted. The walk is written once (`_enter`, `_crossing`, `_pass`);
-each kernel does something else with its segments. What is added up along a ray is float32, what sets the walk up float64.
+A ray goes from voxel to voxel; nothing is stored or sorted. The traversal is written once (`_enter`, `_crossing`,
+`_cross`); each kernel uses its segments differently. Sums along a ray are float32, the traversal is set up in float64.
 
-Where a ray is: `alpha` runs here from 0 where it enters the volume to 1 where it leaves, not from its source to its
-target, and is counted in whole numbers, 2^30 to 1. Of each axis the alpha of the next plane is kept with 32 bits more
-(62 to 1); a step adds the gap between planes, without rounding. Both come from float64. So a segment errs by 1e-9 of the
-ray's way inside, however far the source and however short the way, where float32 would err by some 1e-7: a hundred times
-as much, and too much for one voxel of hundreds. It costs an addition of 64 bits where float32 takes a multiplication.
+`alpha` runs here from 0 where a ray enters the volume to 1 where it leaves, not from its source to its target, and is
+counted in units of 2^-30. The alpha of the next plane of each axis has 32 bits more (units of 2^-62); a step adds the gap
+between planes, without rounding. Both come from float64. So the error of a segment is about 1e-9 of the chord, however far
+the source and however short the chord; in float32 it would be about 1e-7, too much for one voxel of hundreds. The price is
+a 64-bit addition where float32 takes a multiplication.
 
-Why an index never leaves its lattice. The first voxel is clamped into it. An axis is stepped only when its next plane
-lies before the end of the walk (`_pass`), and as soon as the voxel is the lattice's last one that way, the next plane is
-`_FAR`, behind the end: an axis takes at most `planes` steps, which lead to the last voxel. Nothing of this is rounded, so
-it holds whatever the compiler makes of it. Gaps are not negative, so no segment is, and the segments add up to the way
-inside. Nothing overflows: a plane is crossed at less than 1, a gap is at most 1 (a plane farther off is not reached).
+Why an index never leaves its lattice: the first voxel is clamped into it. An axis is stepped only when its next plane
+lies before the end of the traversal (`_cross`), and from the last voxel of the lattice in its direction the next plane is
+`_FAR`, beyond the end: an axis takes at most `planes` steps, which lead to the last voxel. Nothing of this is rounded, so
+it holds whatever the compiler makes of it. Gaps are not negative, so no segment is, and the segments add up to the chord.
+Nothing overflows: a plane is crossed at less than 1, and a gap is at most 1 (a plane farther off is not reached).
 
-No kernel is differentiated by Warp: the gradients are written out, like everything else.
+Warp differentiates no kernel: the gradients are written out, like everything else. The file is long because Warp compiles
+the functions of one module together.
 """
 
 # Warp reads the annotations: they must be its types, not strings.
@@ -26,7 +27,7 @@ from typing import Any
 
 import warp as wp
 
-# Without grid-stride loops the kernels need some 60 to 130 registers instead of 100 to 255.
+# Without grid-stride loops the kernels need about 60 to 130 registers instead of 100 to 255.
 wp.set_module_options({"enable_backward": False, "default_grid_stride": False})
 
 _SNAP = wp.constant(wp.float64(1e-9))  # as `rays` has it
@@ -38,10 +39,10 @@ _NO_AXIS = wp.constant(3)
 _vec3l: Any = wp.types.vector(length=3, dtype=wp.int64)
 
 _Volume: Any = wp.array3d(dtype=wp.float32)
-_Numbers: Any = wp.array3d(dtype=wp.float32)  # one for a ray: fan, line, ray
-_Rows: Any = wp.array4d(dtype=wp.float32)  # some for a ray
+_Numbers: Any = wp.array3d(dtype=wp.float32)  # one per ray: fan, row, column
+_Rows: Any = wp.array4d(dtype=wp.float32)  # several per ray
 _Fans: Any = wp.array2d(dtype=wp.vec3d)
-"""For each fan its source, corner, line step and ray step, in index space and then in world mm."""
+"""Source, corner, row step and column step of each fan, in index space and then in world mm."""
 
 
 @wp.struct
@@ -55,8 +56,8 @@ class Chord:
 
 
 @wp.struct
-class Walk:
-    """A ray's way through a lattice: where it is, and its next planes."""
+class Traversal:
+    """The traversal of a lattice by a ray: where the ray is, and its next planes."""
 
     alpha: wp.int32
     leave: wp.int32
@@ -70,25 +71,25 @@ class Walk:
 
 
 @wp.struct
-class Beam:
-    """A ray on its way through the volume and what attenuates it, and the segment that it is about to pass.
+class AttenuatedRay:
+    """A ray that traverses the volume and mu, and its next segment.
 
-    Its `volume` walk goes from 0 to 1; the walk through mu's lattice, needed where that is another (`apart`), counts
-    alpha the same, and begins and ends somewhere between.
+    The traversal of the volume goes from 0 to 1; that of mu, needed where mu has its own lattice (`own_lattice`), uses the
+    same alpha and starts and ends somewhere between.
     """
 
-    volume: Walk
-    mu: Walk
-    apart: wp.int32
-    chord: wp.float32  # way inside the volume, mm
-    depth: wp.float32  # integral of mu from the source on, and its summation's rest
-    rest: wp.float32
+    volume: Traversal
+    mu: Traversal
+    own_lattice: wp.int32
+    chord: wp.float32  # length in the volume, mm
+    depth: wp.float32  # optical depth from the source on, and its compensated sum's correction
+    correction: wp.float32
     end: wp.int32  # of the segment, and its length
     size: wp.float32
     mu_here: wp.float32
-    t: wp.float32  # integral of mu over the segment
-    left: wp.float32  # of the ray, before the segment
-    seen: wp.float32  # integral over the segment of what is left
+    t: wp.float32  # optical depth of the segment
+    transmittance: wp.float32  # from the source to the segment
+    weight: wp.float32  # integral of the transmittance over the segment
 
 
 @wp.func
@@ -105,10 +106,10 @@ def _snapped(s: wp.float64, e: wp.float64):
 
 
 @wp.func
-def _ray(fans: _Fans, fan: int, line: int, ray: int):
+def _ray(fans: _Fans, fan: int, row: int, column: int):
     """Start and direction of a ray in index space."""
     s = fans[fan, 0]
-    e = fans[fan, 1] + fans[fan, 2] * wp.float64(line) + fans[fan, 3] * wp.float64(ray)
+    e = fans[fan, 1] + fans[fan, 2] * wp.float64(row) + fans[fan, 3] * wp.float64(column)
     sx, dx = _snapped(s[0], e[0])
     sy, dy = _snapped(s[1], e[1])
     sz, dz = _snapped(s[2], e[2])
@@ -116,9 +117,9 @@ def _ray(fans: _Fans, fan: int, line: int, ray: int):
 
 
 @wp.func
-def _length(fans: _Fans, fan: int, line: int, ray: int):
+def _length(fans: _Fans, fan: int, row: int, column: int):
     """Length of a ray, mm."""
-    target = fans[fan, 5] + fans[fan, 6] * wp.float64(line) + fans[fan, 7] * wp.float64(ray)
+    target = fans[fan, 5] + fans[fan, 6] * wp.float64(row) + fans[fan, 7] * wp.float64(column)
     return wp.length(target - fans[fan, 4])
 
 
@@ -148,7 +149,7 @@ def _clip(chord: Chord, axis: int, n: int, s: wp.float64, d: wp.float64):
 
 @wp.func
 def _chord(shape: wp.vec3i, start: wp.vec3d, direction: wp.vec3d, low: wp.float64, high: wp.float64):
-    """The part of a ray from `low` to `high` (of its way from source to target) inside a lattice."""
+    """The part of a ray between the alphas `low` and `high` (from source to target) inside a lattice."""
     chord = Chord()
     chord.enter = low
     chord.leave = high
@@ -172,7 +173,7 @@ def _voxel(shape: wp.vec3i, point: wp.vec3d):
 
 @wp.func
 def _axis(n: int, voxel: int, s: wp.float64, d: wp.float64, enter: wp.float64, origin: wp.float64, scale: wp.float64):
-    """Start of a walk along one axis: step, planes ahead, alpha of the next, gap between them."""
+    """Start of a traversal along one axis: step, planes ahead, alpha of the next, gap between them."""
     step = int(0)
     plane = int(0)
     planes = int(0)
@@ -203,11 +204,11 @@ def _enter(
     origin: wp.float64,
     scale: wp.float64,
 ):
-    """A walk along `chord` from `voxel` on, where alpha is ``(alpha from source to target - origin) scale``.
+    """A traversal along `chord` from `voxel` on, where alpha is ``(alpha from source to target - origin) scale``.
 
     A miss is at its end.
     """
-    w = Walk()
+    w = Traversal()
     if chord.enter >= chord.leave:
         return w  # from 0 to 0
     enter = chord.enter
@@ -228,30 +229,30 @@ def _enter(
 
 @wp.func
 def _upper(alpha: wp.int64):
-    """An alpha without its 32 more bits."""
+    """An alpha without its lower 32 bits."""
     return wp.int32(alpha >> wp.int64(32))
 
 
 @wp.func
 def _through(shape: wp.vec3i, start: wp.vec3d, direction: wp.vec3d, low: wp.float64, high: wp.float64):
-    """The walk through a lattice from `low` to `high`, its alpha from 0 to 1, and the part of the ray inside."""
+    """The traversal of a lattice between the alphas `low` and `high`, and the chord; its own alpha is from 0 to 1."""
     chord = _chord(shape, start, direction, low, high)
     if chord.enter >= chord.leave:
         chord.leave = chord.enter
-        return Walk(), chord
+        return Traversal(), chord
     voxel = _voxel(shape, start + direction * chord.enter)
     scale = wp.float64(1.0) / (chord.leave - chord.enter)
     return _enter(chord, voxel, shape, start, direction, chord.enter, scale), chord
 
 
 @wp.func
-def _crossing(w: Walk):
-    """Alpha at which the walk comes to its next plane, or to its end."""
+def _crossing(w: Traversal):
+    """Alpha of the next plane, or of the end of the traversal."""
     return wp.min(wp.min(_upper(w.next[0]), _upper(w.next[1])), wp.min(_upper(w.next[2]), w.leave))
 
 
 @wp.func
-def _step(w: Walk, axis: int):
+def _step(w: Traversal, axis: int):
     """Cross the next plane of an axis."""
     w.axis = axis
     w.voxel[axis] = w.voxel[axis] + w.step[axis]
@@ -261,8 +262,8 @@ def _step(w: Walk, axis: int):
 
 
 @wp.func
-def _pass(w: Walk, end: int):
-    """Walk on to `end`, at most the next crossing, and cross the plane that is there."""
+def _cross(w: Traversal, end: int):
+    """Traversal on to `end`, at most the next crossing, and cross the plane that is there."""
     w.alpha = end
     if end >= w.leave:
         w.axis = w.last
@@ -282,53 +283,55 @@ def _number(alpha: int):
 
 
 @wp.func
-def _plus(total: float, rest: float, x: float):
-    """``total + x``, and what rounding took from it so far (Kahan): a ray may have thousands of segments."""
-    y = x - rest
+def _plus(total: float, correction: float, x: float):
+    """``total + x`` and the rounding error so far (Kahan summation): a ray may have thousands of segments."""
+    y = x - correction
     result = total + y
     return result, (result - total) - y
 
 
 @wp.func
-def _on(axis: int):
+def _unit(axis: int):
     """1 for the axis, 0 for the others; all 0 for `_NO_AXIS`."""
     return wp.vec3f(float(axis == 0), float(axis == 1), float(axis == 2))
 
 
-# Plain: every segment counts its length.
+# Without attenuation: the weight of a segment is its length.
 
 
 @wp.kernel
-def integrate(volume: _Volume, fans: _Fans, first_line: int, integrals: _Numbers):
+def integrate(volume: _Volume, fans: _Fans, first_row: int, integrals: _Numbers):
     """Line integrals, value x mm."""
     f, i, j = wp.tid()
-    start, direction = _ray(fans, f, first_line + i, j)
+    start, direction = _ray(fans, f, first_row + i, j)
     w, chord = _through(_shape(volume), start, direction, wp.float64(0.0), wp.float64(1.0))
     total = float(0.0)
-    rest = float(0.0)
+    correction = float(0.0)
     while w.alpha < w.leave:
         end = _crossing(w)
-        total, rest = _plus(total, rest, _number(end - w.alpha) * volume[w.voxel[0], w.voxel[1], w.voxel[2]])
-        w = _pass(w, end)
-    integrals[f, i, j] = total * wp.float32(_length(fans, f, first_line + i, j) * (chord.leave - chord.enter))
+        total, correction = _plus(
+            total, correction, _number(end - w.alpha) * volume[w.voxel[0], w.voxel[1], w.voxel[2]]
+        )
+        w = _cross(w, end)
+    integrals[f, i, j] = total * wp.float32(_length(fans, f, first_row + i, j) * (chord.leave - chord.enter))
 
 
 @wp.kernel
-def spread(volume: _Volume, fans: _Fans, first_line: int, values: _Numbers):
-    """The adjoint of `integrate`."""
+def backproject(volume: _Volume, fans: _Fans, first_row: int, values: _Numbers):
+    """Add each ray's value to the volume, with the weights of `integrate`."""
     f, i, j = wp.tid()
-    start, direction = _ray(fans, f, first_line + i, j)
+    start, direction = _ray(fans, f, first_row + i, j)
     w, chord = _through(_shape(volume), start, direction, wp.float64(0.0), wp.float64(1.0))
-    value = values[f, i, j] * wp.float32(_length(fans, f, first_line + i, j) * (chord.leave - chord.enter))
+    value = values[f, i, j] * wp.float32(_length(fans, f, first_row + i, j) * (chord.leave - chord.enter))
     while w.alpha < w.leave:
         end = _crossing(w)
         wp.atomic_add(volume, w.voxel[0], w.voxel[1], w.voxel[2], _number(end - w.alpha) * value)
-        w = _pass(w, end)
+        w = _cross(w, end)
 
 
-# Derivatives by the ends: every plane crossed counts its jump, times what its alpha does. The plane at k is crossed at
-# alpha = (k - s)/d (from source to target), d = t - s, so d alpha/ds = (alpha - 1)/d and d alpha/dt = -alpha/d: what is
-# needed of an axis are the sum of its jumps and that of its jumps times alpha.
+# Derivatives by the ends: every plane crossed contributes its jump times the change of its alpha. The plane at k is
+# crossed at alpha = (k - s)/d (from source to target), d = t - s, so d alpha/ds = (alpha - 1)/d and d alpha/dt = -alpha/d:
+# the sum of an axis's jumps and that of its jumps times alpha are all that is needed.
 
 
 @wp.func
@@ -353,38 +356,38 @@ def _moments(chord: Chord, jumps: wp.vec3f, moments: wp.vec3f):
 
 
 @wp.kernel
-def differentiate(volume: _Volume, fans: _Fans, first_line: int, rows: _Rows):
+def differentiate(volume: _Volume, fans: _Fans, first_row: int, rows: _Rows):
     """Columns: the integral over alpha from 0 to 1, its derivatives by the start (3) and by the end (3)."""
     f, i, j = wp.tid()
-    start, direction = _ray(fans, f, first_line + i, j)
+    start, direction = _ray(fans, f, first_row + i, j)
     w, chord = _through(_shape(volume), start, direction, wp.float64(0.0), wp.float64(1.0))
     total = float(0.0)
-    rest = float(0.0)
+    correction = float(0.0)
     before = float(0.0)
     jumps = wp.vec3f()
     moments = wp.vec3f()
     while w.alpha < w.leave:
         value = volume[w.voxel[0], w.voxel[1], w.voxel[2]]
-        jump = _on(w.axis) * (before - value)
+        jump = _unit(w.axis) * (before - value)
         jumps += jump
         moments += jump * _number(w.alpha)
         before = value
         end = _crossing(w)
-        total, rest = _plus(total, rest, _number(end - w.alpha) * value)
-        w = _pass(w, end)
-    jump = _on(w.axis) * before
+        total, correction = _plus(total, correction, _number(end - w.alpha) * value)
+        w = _cross(w, end)
+    jump = _unit(w.axis) * before
     jumps += jump
     moments += jump * _number(w.alpha)
     rows[f, i, j, 0] = total * wp.float32(chord.leave - chord.enter)
     _write_ends(rows, f, i, j, 1, direction, wp.vec3d(jumps), _moments(chord, jumps, moments))
 
 
-# Attenuated: the ray carries what is left of it. Where mu has a lattice of its own, the planes of both cut the ray.
+# With attenuation: the weight includes the transmittance. Where mu has its own lattice, the planes of both cut the ray.
 
 
 @wp.func
-def _mean_transmission(t: float):
-    """Mean of ``exp(-x)`` for x from 0 to t, (1 - exp(-t)) / t: for a small t its series, cut below 1e-8."""
+def _mean_transmittance(t: float):
+    """Mean of ``exp(-x)`` for x from 0 to t, (1 - exp(-t)) / t; for small t by a series, to 1e-8."""
     if wp.abs(t) < 0.1:
         return 1.0 - t * (1.0 / 2.0 - t * (1.0 / 6.0 - t * (1.0 / 24.0 - t * (1.0 / 120.0 - t * (1.0 / 720.0)))))
     return (1.0 - wp.exp(-t)) / t
@@ -392,7 +395,7 @@ def _mean_transmission(t: float):
 
 @wp.func
 def _first_moment(t: float):
-    """Integral of ``u exp(-t u)`` for u from 0 to 1, (1 - (1 + t) exp(-t)) / t^2: for a small t its series."""
+    """Integral of ``u exp(-t u)`` for u from 0 to 1, (1 - (1 + t) exp(-t)) / t^2; for small t by a series."""
     if wp.abs(t) < 0.3:
         series = 1.0 / 30.0 - t * (1.0 / 144.0 - t * (1.0 / 840.0 - t * (1.0 / 5760.0)))
         return 1.0 / 2.0 - t * (1.0 / 3.0 - t * (1.0 / 8.0 - t * series))
@@ -400,165 +403,170 @@ def _first_moment(t: float):
 
 
 @wp.func
-def _before(mu: _Volume, start: wp.vec3d, direction: wp.vec3d, high: wp.float64):
-    """Integral of mu over alpha, from source to target, from the source to `high`; and the walk and part inside."""
+def _depth_before(mu: _Volume, start: wp.vec3d, direction: wp.vec3d, high: wp.float64):
+    """Integral of mu over alpha (from source to target) up to `high`, the traversal after it, and its chord."""
     w, chord = _through(_shape(mu), start, direction, wp.float64(0.0), high)
     total = float(0.0)
-    rest = float(0.0)
+    correction = float(0.0)
     while w.alpha < w.leave:
         end = _crossing(w)
-        total, rest = _plus(total, rest, _number(end - w.alpha) * mu[w.voxel[0], w.voxel[1], w.voxel[2]])
-        w = _pass(w, end)
+        total, correction = _plus(total, correction, _number(end - w.alpha) * mu[w.voxel[0], w.voxel[1], w.voxel[2]])
+        w = _cross(w, end)
     return total * wp.float32(chord.leave - chord.enter), w, chord
 
 
 @wp.func
-def _open(shape: wp.vec3i, mu: _Volume, fans: _Fans, mu_fans: _Fans, apart: int, f: int, line: int, ray: int):
-    """A ray where it enters the volume, and its part inside."""
-    beam = Beam()
-    start, direction = _ray(fans, f, line, ray)
+def _enter_attenuated(
+    shape: wp.vec3i, mu: _Volume, fans: _Fans, mu_fans: _Fans, own_lattice: int, f: int, row: int, column: int
+):
+    """A ray where it enters the volume, and its chord."""
+    traced = AttenuatedRay()
+    start, direction = _ray(fans, f, row, column)
     w, chord = _through(shape, start, direction, wp.float64(0.0), wp.float64(1.0))
-    length = _length(fans, f, line, ray)
-    beam.volume = w
-    beam.apart = apart
-    beam.chord = wp.float32(length * (chord.leave - chord.enter))
-    if apart != 0 and w.alpha < w.leave:
-        start, direction = _ray(mu_fans, f, line, ray)
-        depth, ahead, way = _before(mu, start, direction, chord.enter)
-        beam.depth = wp.float32(length) * depth
+    length = _length(fans, f, row, column)
+    traced.volume = w
+    traced.own_lattice = own_lattice
+    traced.chord = wp.float32(length * (chord.leave - chord.enter))
+    if own_lattice != 0 and w.alpha < w.leave:
+        start, direction = _ray(mu_fans, f, row, column)
+        depth, ahead, mu_chord = _depth_before(mu, start, direction, chord.enter)
+        traced.depth = wp.float32(length) * depth
         within = _chord(_shape(mu), start, direction, chord.enter, chord.leave)
-        # The walk goes on from where it is: at a plane that is just there, rounding must not cross it twice or never.
+        # The traversal goes on from where it is: rounding must not make it cross a plane just there twice or never.
         voxel = _voxel(_shape(mu), start + direction * within.enter)
-        if way.leave > way.enter:
+        if mu_chord.leave > mu_chord.enter:
             voxel = ahead.voxel
         scale = wp.float64(1.0) / (chord.leave - chord.enter)
-        beam.mu = _enter(within, voxel, _shape(mu), start, direction, chord.enter, scale)
-    return beam, chord
+        traced.mu = _enter(within, voxel, _shape(mu), start, direction, chord.enter, scale)
+    return traced, chord
 
 
 @wp.func
-def _look(beam: Beam, mu: _Volume):
+def _next_segment(traced: AttenuatedRay, mu: _Volume):
     """The next segment, up to the next plane of either lattice."""
-    alpha = beam.volume.alpha
-    beam.end = _crossing(beam.volume)
-    beam.mu_here = 0.0
-    if beam.apart == 0:
-        beam.mu_here = mu[beam.volume.voxel[0], beam.volume.voxel[1], beam.volume.voxel[2]]
-    elif alpha < beam.mu.alpha:  # not there yet
-        beam.end = wp.min(beam.end, beam.mu.alpha)
-    elif alpha < beam.mu.leave:
-        beam.end = wp.min(beam.end, _crossing(beam.mu))
-        beam.mu_here = mu[beam.mu.voxel[0], beam.mu.voxel[1], beam.mu.voxel[2]]
-    beam.size = _number(beam.end - alpha)
-    beam.t = beam.mu_here * beam.chord * beam.size
-    beam.left = wp.exp(-beam.depth)
-    beam.seen = beam.left * beam.size * _mean_transmission(beam.t)
-    return beam
+    alpha = traced.volume.alpha
+    traced.end = _crossing(traced.volume)
+    traced.mu_here = 0.0
+    if traced.own_lattice == 0:
+        traced.mu_here = mu[traced.volume.voxel[0], traced.volume.voxel[1], traced.volume.voxel[2]]
+    elif alpha < traced.mu.alpha:  # not there yet
+        traced.end = wp.min(traced.end, traced.mu.alpha)
+    elif alpha < traced.mu.leave:
+        traced.end = wp.min(traced.end, _crossing(traced.mu))
+        traced.mu_here = mu[traced.mu.voxel[0], traced.mu.voxel[1], traced.mu.voxel[2]]
+    traced.size = _number(traced.end - alpha)
+    traced.t = traced.mu_here * traced.chord * traced.size
+    traced.transmittance = wp.exp(-traced.depth)
+    traced.weight = traced.transmittance * traced.size * _mean_transmittance(traced.t)
+    return traced
 
 
 @wp.func
-def _move(beam: Beam):
-    """Behind the segment."""
-    depth, rest = _plus(beam.depth, beam.rest, beam.t)
-    beam.depth = depth
-    beam.rest = rest
-    if beam.apart != 0 and beam.mu.alpha <= beam.volume.alpha and beam.volume.alpha < beam.mu.leave:
-        beam.mu = _pass(beam.mu, beam.end)
-    beam.volume = _pass(beam.volume, beam.end)
-    return beam
+def _advance(traced: AttenuatedRay):
+    """Go on to the end of the segment."""
+    depth, correction = _plus(traced.depth, traced.correction, traced.t)
+    traced.depth = depth
+    traced.correction = correction
+    if traced.own_lattice != 0 and traced.mu.alpha <= traced.volume.alpha and traced.volume.alpha < traced.mu.leave:
+        traced.mu = _cross(traced.mu, traced.end)
+    traced.volume = _cross(traced.volume, traced.end)
+    return traced
 
 
 @wp.func
-def _sum(beam: Beam, volume: _Volume, mu: _Volume):
+def _sum(traced: AttenuatedRay, volume: _Volume, mu: _Volume):
     """The integral along the rest of a ray, per `chord`."""
     total = float(0.0)
-    rest = float(0.0)
-    while beam.volume.alpha < beam.volume.leave:
-        beam = _look(beam, mu)
-        value = volume[beam.volume.voxel[0], beam.volume.voxel[1], beam.volume.voxel[2]]
-        total, rest = _plus(total, rest, beam.seen * value)
-        beam = _move(beam)
+    correction = float(0.0)
+    while traced.volume.alpha < traced.volume.leave:
+        traced = _next_segment(traced, mu)
+        value = volume[traced.volume.voxel[0], traced.volume.voxel[1], traced.volume.voxel[2]]
+        total, correction = _plus(total, correction, traced.weight * value)
+        traced = _advance(traced)
     return total
 
 
 @wp.kernel
 def integrate_attenuated(
-    volume: _Volume, mu: _Volume, fans: _Fans, mu_fans: _Fans, apart: int, first_line: int, integrals: _Numbers
+    volume: _Volume, mu: _Volume, fans: _Fans, mu_fans: _Fans, own_lattice: int, first_row: int, integrals: _Numbers
 ):
     """Line integrals, attenuated towards the sources."""
     f, i, j = wp.tid()
-    beam, _ = _open(_shape(volume), mu, fans, mu_fans, apart, f, first_line + i, j)
-    integrals[f, i, j] = beam.chord * _sum(beam, volume, mu)
+    traced, _ = _enter_attenuated(_shape(volume), mu, fans, mu_fans, own_lattice, f, first_row + i, j)
+    integrals[f, i, j] = traced.chord * _sum(traced, volume, mu)
 
 
 @wp.kernel
-def spread_attenuated(
-    volume: _Volume, mu: _Volume, fans: _Fans, mu_fans: _Fans, apart: int, first_line: int, values: _Numbers
+def backproject_attenuated(
+    volume: _Volume, mu: _Volume, fans: _Fans, mu_fans: _Fans, own_lattice: int, first_row: int, values: _Numbers
 ):
-    """The adjoint of `integrate_attenuated`."""
+    """Add each ray's value to the volume, with the weights of `integrate_attenuated`."""
     f, i, j = wp.tid()
-    beam, _ = _open(_shape(volume), mu, fans, mu_fans, apart, f, first_line + i, j)
-    value = values[f, i, j] * beam.chord
-    while beam.volume.alpha < beam.volume.leave:
-        beam = _look(beam, mu)
-        v = beam.volume.voxel
-        wp.atomic_add(volume, v[0], v[1], v[2], beam.seen * value)
-        beam = _move(beam)
+    traced, _ = _enter_attenuated(_shape(volume), mu, fans, mu_fans, own_lattice, f, first_row + i, j)
+    value = values[f, i, j] * traced.chord
+    while traced.volume.alpha < traced.volume.leave:
+        traced = _next_segment(traced, mu)
+        v = traced.volume.voxel
+        wp.atomic_add(volume, v[0], v[1], v[2], traced.weight * value)
+        traced = _advance(traced)
 
 
-# A plane of mu moves what is left behind it: by the jump of mu there, times the integral of all that lies behind.
+# Moving a plane of mu changes the transmittance beyond it: by the jump of mu there, times the integral beyond.
 
 
 @wp.kernel
 def differentiate_attenuated(
-    volume: _Volume, mu: _Volume, fans: _Fans, mu_fans: _Fans, apart: int, first_line: int, rows: _Rows
+    volume: _Volume, mu: _Volume, fans: _Fans, mu_fans: _Fans, own_lattice: int, first_row: int, rows: _Rows
 ):
-    """Columns of `differentiate`, those by the ends through the volume's planes alone; by mu's (6); by the length."""
+    """The columns of `differentiate`, through the volume's planes alone; by the ends through mu's planes (6); by length."""
     f, i, j = wp.tid()
-    line = first_line + i
-    beam, chord = _open(_shape(volume), mu, fans, mu_fans, apart, f, line, j)
-    _, direction = _ray(fans, f, line, j)
-    mu_start, mu_direction = _ray(mu_fans, f, line, j)
-    length = _length(fans, f, line, j)
+    row = first_row + i
+    traced, chord = _enter_attenuated(_shape(volume), mu, fans, mu_fans, own_lattice, f, row, j)
+    _, direction = _ray(fans, f, row, j)
+    mu_start, mu_direction = _ray(mu_fans, f, row, j)
+    length = _length(fans, f, row, j)
     total = float(0.0)
-    rest = float(0.0)
+    correction = float(0.0)
     by_length = float(0.0)
     before = float(0.0)
     mu_before = float(0.0)
     jumps = wp.vec3f()
     moments = wp.vec3f()
-    mu_jumps = wp.vec3f()  # of mu, and times the integral up to there
+    mu_jumps = wp.vec3f()  # of mu, and times the integral before the plane
     mu_moments = wp.vec3f()
     done_jumps = wp.vec3f()
     done_moments = wp.vec3f()
-    if apart != 0 and beam.mu.axis == _NO_AXIS:  # inside mu's lattice already
-        mu_before = mu[beam.mu.voxel[0], beam.mu.voxel[1], beam.mu.voxel[2]]
-        if beam.mu.alpha >= beam.mu.leave:  # and just about to leave it
-            beam.mu.axis = beam.mu.last
-    while beam.volume.alpha < beam.volume.leave:
-        beam = _look(beam, mu)
-        alpha = _number(beam.volume.alpha)
-        value = volume[beam.volume.voxel[0], beam.volume.voxel[1], beam.volume.voxel[2]]
+    if own_lattice != 0 and traced.mu.axis == _NO_AXIS:  # already inside mu's lattice
+        mu_before = mu[traced.mu.voxel[0], traced.mu.voxel[1], traced.mu.voxel[2]]
+        if traced.mu.alpha >= traced.mu.leave:  # and about to leave it
+            traced.mu.axis = traced.mu.last
+    while traced.volume.alpha < traced.volume.leave:
+        traced = _next_segment(traced, mu)
+        alpha = _number(traced.volume.alpha)
+        value = volume[traced.volume.voxel[0], traced.volume.voxel[1], traced.volume.voxel[2]]
         # A lattice whose plane this is not has no jump here: the same voxel on both sides.
-        jump = _on(beam.volume.axis) * ((before - value) * beam.left)
+        jump = _unit(traced.volume.axis) * ((before - value) * traced.transmittance)
         jumps += jump
         moments += jump * alpha
         before = value
-        mu_axis = beam.volume.axis
-        if beam.apart != 0:
-            mu_axis = beam.mu.axis
-        jump = _on(mu_axis) * (mu_before - beam.mu_here)
+        mu_axis = traced.volume.axis
+        if traced.own_lattice != 0:
+            mu_axis = traced.mu.axis
+        jump = _unit(mu_axis) * (mu_before - traced.mu_here)
         mu_jumps += jump
         mu_moments += jump * alpha
         done_jumps += jump * total
         done_moments += jump * (alpha * total)
-        mu_before = beam.mu_here
+        mu_before = traced.mu_here
         by_length += (
-            value * beam.left * beam.size * (beam.depth * _mean_transmission(beam.t) + beam.t * _first_moment(beam.t))
+            value
+            * traced.transmittance
+            * traced.size
+            * (traced.depth * _mean_transmittance(traced.t) + traced.t * _first_moment(traced.t))
         )
-        total, rest = _plus(total, rest, beam.seen * value)
-        beam = _move(beam)
-    jump = _on(beam.volume.axis) * (before * wp.exp(-beam.depth))
+        total, correction = _plus(total, correction, traced.weight * value)
+        traced = _advance(traced)
+    jump = _unit(traced.volume.axis) * (before * wp.exp(-traced.depth))
     jumps += jump
     moments += jump
     inside = wp.float32(chord.leave - chord.enter)
@@ -569,19 +577,19 @@ def differentiate_attenuated(
     mu_moments = mu_moments * total - done_moments
     jumps_64 = wp.vec3d(mu_jumps)
     moments_64 = _moments(chord, mu_jumps, mu_moments)
-    if apart != 0 and total != 0.0:  # mu's planes before the volume: all of the integral is behind them
+    if own_lattice != 0 and total != 0.0:  # mu's planes before the volume: the whole integral is beyond them
         w, ahead = _through(_shape(mu), mu_start, mu_direction, wp.float64(0.0), chord.enter)
         before = float(0.0)
         jumps = wp.vec3f()
         moments = wp.vec3f()
         while w.alpha < w.leave:
             value = mu[w.voxel[0], w.voxel[1], w.voxel[2]]
-            jump = _on(w.axis) * ((before - value) * total)
+            jump = _unit(w.axis) * ((before - value) * total)
             jumps += jump
             moments += jump * _number(w.alpha)
             before = value
-            w = _pass(w, _crossing(w))
-        jump = _on(w.axis) * (before * total)
+            w = _cross(w, _crossing(w))
+        jump = _unit(w.axis) * (before * total)
         jumps += jump
         moments += jump
         jumps_64 += wp.vec3d(jumps)
@@ -594,46 +602,46 @@ def differentiate_attenuated(
 
 
 @wp.kernel
-def spread_on_mu(
+def differentiate_by_mu(
     gradient: _Volume,
     volume: _Volume,
     mu: _Volume,
     fans: _Fans,
     mu_fans: _Fans,
-    apart: int,
-    first_line: int,
+    own_lattice: int,
+    first_row: int,
     values: _Numbers,
 ):
     """Add to `gradient` each ray's value times its integral's derivatives by mu.
 
-    A segment of mu weakens all that lies behind it, and within it the more the farther from its begin.
+    A segment of mu weakens all that lies beyond it, and what is in it the more, the farther from its start.
     """
     f, i, j = wp.tid()
-    line = first_line + i
-    beam, chord = _open(_shape(volume), mu, fans, mu_fans, apart, f, line, j)
-    total = _sum(beam, volume, mu)
-    value = -values[f, i, j] * beam.chord
-    if apart != 0 and total != 0.0:
-        start, direction = _ray(mu_fans, f, line, j)
+    row = first_row + i
+    traced, chord = _enter_attenuated(_shape(volume), mu, fans, mu_fans, own_lattice, f, row, j)
+    total = _sum(traced, volume, mu)
+    value = -values[f, i, j] * traced.chord
+    if own_lattice != 0 and total != 0.0:
+        start, direction = _ray(mu_fans, f, row, j)
         w, ahead = _through(_shape(mu), start, direction, wp.float64(0.0), chord.enter)
-        all = value * total * wp.float32(_length(fans, f, line, j) * (ahead.leave - ahead.enter))
+        all = value * total * wp.float32(_length(fans, f, row, j) * (ahead.leave - ahead.enter))
         while w.alpha < w.leave:
             end = _crossing(w)
             wp.atomic_add(gradient, w.voxel[0], w.voxel[1], w.voxel[2], _number(end - w.alpha) * all)
-            w = _pass(w, end)
-    value = value * beam.chord
+            w = _cross(w, end)
+    value = value * traced.chord
     done = float(0.0)
-    rest = float(0.0)
-    while beam.volume.alpha < beam.volume.leave:
-        beam = _look(beam, mu)
-        here = volume[beam.volume.voxel[0], beam.volume.voxel[1], beam.volume.voxel[2]]
-        done, rest = _plus(done, rest, beam.seen * here)
-        v = beam.volume.voxel
+    correction = float(0.0)
+    while traced.volume.alpha < traced.volume.leave:
+        traced = _next_segment(traced, mu)
+        here = volume[traced.volume.voxel[0], traced.volume.voxel[1], traced.volume.voxel[2]]
+        done, correction = _plus(done, correction, traced.weight * here)
+        v = traced.volume.voxel
         inside = bool(True)
-        if beam.apart != 0:
-            v = beam.mu.voxel
-            inside = beam.mu.alpha <= beam.volume.alpha and beam.volume.alpha < beam.mu.leave
+        if traced.own_lattice != 0:
+            v = traced.mu.voxel
+            inside = traced.mu.alpha <= traced.volume.alpha and traced.volume.alpha < traced.mu.leave
         if inside:
-            own = here * beam.left * beam.size * _first_moment(beam.t)
-            wp.atomic_add(gradient, v[0], v[1], v[2], value * beam.size * (total - done + own))
-        beam = _move(beam)
+            own = here * traced.transmittance * traced.size * _first_moment(traced.t)
+            wp.atomic_add(gradient, v[0], v[1], v[2], value * traced.size * (total - done + own))
+        traced = _advance(traced)

@@ -1,19 +1,19 @@
-// Line integrals through voxels and what belongs to them: the contract between the kernels and siddon_cpu.py.
+// Line integrals through voxels and their gradients: the contract between the kernels and cpu.py.
 //
 // All coordinates of rays are in index space, where voxel i of an axis fills [i, i + 1) and a lattice's faces lie at 0
-// and n. A point of a ray is source + alpha (target - source), alpha from 0 to 1. With f the volume, mu what attenuates
-// (0 without it) and L the ray's length in mm, its integral is
+// and n. A point of a ray is source + alpha (target - source), alpha from 0 to 1. With f the volume, mu the attenuation
+// coefficient (0 if there is none) and L the ray's length in mm, its integral is
 //
 //     L int_0^1 f(alpha) exp(-L int_0^alpha mu) dalpha
 //
 // The kernels allocate nothing, keep nothing and start no thread: a job belongs to the thread that calls, which needs
-// 400 kB of stack. Nothing here is checked; siddon_cpu.py makes only jobs whose arrays are as large as said here, of
+// 400 kB of stack. Nothing here is checked; cpu.py makes only jobs whose arrays are as large as said here, of
 // fewer than 2^31 voxels in a lattice.
 
 #pragma once
 #include <stdint.h>
 
-#define CONTRACT 1 // counted up with every change of this file: siddon_cpu.py takes no other
+#define CONTRACT 2 // counted up with every change of this file: cpu.py takes no other
 
 // Voxels (n[0], n[1], n[2]) in C order, of a job's kind of number.
 typedef struct {
@@ -21,12 +21,12 @@ typedef struct {
     int64_t n[3];
 } Lattice;
 
-// Rays from a source to the points corner + i line_step + j ray_step, 0 <= i < lines and 0 <= j < rays, line by line.
+// Rays from a source to the points corner + i row_step + j column_step, 0 <= i < rows, 0 <= j < columns, row by row.
 typedef struct {
-    double volume[4][3]; // source, corner, line step, ray step in the volume's index space
+    double volume[4][3]; // source, corner, row step, column step in the volume's index space
     double mu[4][3];     // the same in mu's, where that has a lattice of its own
-    double world[3][3];  // source to corner, line step, ray step in mm
-    int64_t lines, rays;
+    double world[3][3];  // source to corner, row step, column step in mm
+    int64_t rows, columns;
 } Fan;
 
 // Rays one by one, columns of arrays (3, count) and (count).
@@ -37,7 +37,7 @@ typedef struct {
     int64_t count;
 } RayList;
 
-// How mu lies: there is none, it shares the volume's lattice, it has a lattice of its own.
+// There is no mu, it shares the volume's lattice, or it has a lattice of its own.
 enum { NO_MU, SAME_LATTICE, OWN_LATTICE };
 
 typedef struct {
@@ -55,9 +55,9 @@ typedef struct {
 
 // What level of processor the kernels are compiled for; any processor of the platform runs level 0.
 int64_t best_level(void);
-const char *level_name(int64_t level); // null from the first level on that there is not
+const char *level_name(int64_t level); // null if there is no such level
 
-// CONTRACT, and the bytes of a Job and a Fan: siddon_cpu.py compares them with its own.
+// CONTRACT, and the bytes of a Job and a Fan: cpu.py compares them with its own.
 void contract(int64_t numbers[3]);
 
 // values = integrals

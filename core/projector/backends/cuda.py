@@ -53,15 +53,17 @@ def forward(volume: ArrayOrTensor, rays: Rays, attenuation: Attenuation | None =
     """Line integrals (N,), value x mm, of `volume` (n_x, n_y, n_z) along `rays`, attenuated towards their sources."""
     name = "integrate" if attenuation is None else "integrate_attenuated"
     with _Call(volume, rays, attenuation) as call:
-        return call.rows(name, [call.on_device(volume, "the volume")])
+        return call.per_ray(name, [call.on_device(volume, "the volume")])
 
 
-def adjoint(volume: ArrayOrTensor, values: ArrayOrTensor, rays: Rays, attenuation: Attenuation | None = None) -> None:
+def backproject(
+    volume: ArrayOrTensor, values: ArrayOrTensor, rays: Rays, attenuation: Attenuation | None = None
+) -> None:
     """Add `values` (N,), each along its ray with the weights of `forward`, to `volume` in place, in no fixed order."""
-    name = "spread" if attenuation is None else "spread_attenuated"
+    name = "backproject" if attenuation is None else "backproject_attenuated"
     with _Call(volume, rays, attenuation) as call:
         filled = call.on_device(volume, "the volume")
-        call.spread(name, [filled], values)
+        call.accumulate(name, [filled], values)
         _copy_back(filled, volume)
 
 
@@ -69,7 +71,7 @@ def derivatives(volume: ArrayOrTensor, rays: Rays, attenuation: Attenuation | No
     """What the ends of `rays` do to their integrals (N, 7), or attenuated (N, 14), as `backends` describes it."""
     name, columns = ("differentiate", 7) if attenuation is None else ("differentiate_attenuated", 14)
     with _Call(volume, rays, attenuation) as call:
-        return call.rows(name, [call.on_device(volume, "the volume")], columns)
+        return call.per_ray(name, [call.on_device(volume, "the volume")], columns)
 
 
 def mu_gradient(
@@ -78,11 +80,11 @@ def mu_gradient(
     """Add to `gradient`, of mu's shape, each of `values` (N,) times its line integral's derivatives by mu."""
     with _Call(volume, rays, attenuation) as call:
         filled = call.on_device(gradient, "the gradient")
-        call.spread("spread_on_mu", [filled, call.on_device(volume, "the volume")], values)
+        call.accumulate("differentiate_by_mu", [filled, call.on_device(volume, "the volume")], values)
         _copy_back(filled, gradient)
 
 
-def native(x: ArrayOrTensor) -> ArrayOrTensor:
+def to_backend(x: ArrayOrTensor) -> ArrayOrTensor:
     """`x` as float32: a tensor that is on the device stays there, all else becomes an array."""
     if is_tensor(x) and (x.is_cuda or (x.device.type == "cpu" and device().is_cpu)):
         return x.detach().float().resolve_neg().contiguous()  # Warp does not see torch's lazy minus sign
@@ -137,7 +139,7 @@ class _Call:
             self._device = device()
         self._like = volume
         self._kernels = _kernels(self._device)
-        self._fans, self._lines, self._rays = _table(rays)
+        self._fans, self._rows, self._columns = _table(rays)
         self._attenuation = attenuation
         self._mu_fans = self._fans
         if attenuation is not None and attenuation.rays is not None:
@@ -169,57 +171,57 @@ class _Call:
             )
         return wp.array(array, dtype=wp.float32, device=self._device)
 
-    def rows(self, name: str, volumes: list[Any], *columns: int) -> ArrayOrTensor:
+    def per_ray(self, name: str, volumes: list[Any], *columns: int) -> ArrayOrTensor:
         """What a kernel writes, (N,), or (N, columns)."""
         volumes += self._mu()
-        shape = (len(self._fans), self._lines, self._rays, *columns)
+        shape = (len(self._fans), self._rows, self._columns, *columns)
         result = self._like.new_empty(shape) if is_tensor(self._like) else np.empty(shape, np.float32)
-        for fans, lines in self._pieces(math.prod(columns)):
-            piece = result[fans, lines]
+        for fans, rows in self._pieces(math.prod(columns)):
+            piece = result[fans, rows]
             out = wp.from_torch(piece) if is_tensor(piece) else wp.empty(piece.shape, wp.float32, device=self._device)
-            self._launch(name, fans, lines, volumes, out)
+            self._launch(name, fans, rows, volumes, out)
             _copy_back(out, piece)
         return result.reshape(-1, *columns)
 
-    def spread(self, name: str, volumes: list[Any], values: ArrayOrTensor) -> None:
+    def accumulate(self, name: str, volumes: list[Any], values: ArrayOrTensor) -> None:
         """Launch a kernel that adds each ray's value of `values` (N,) to the first of `volumes`."""
         volumes += self._mu()
-        values = values.reshape(len(self._fans), self._lines, self._rays)
-        for fans, lines in self._pieces(1):
-            piece = values[fans, lines]
+        values = values.reshape(len(self._fans), self._rows, self._columns)
+        for fans, rows in self._pieces(1):
+            piece = values[fans, rows]
             if is_tensor(piece):
-                piece = wp.from_torch(native(piece))
+                piece = wp.from_torch(to_backend(piece))
             else:
                 piece = wp.array(np.ascontiguousarray(piece, np.float32), dtype=wp.float32, device=self._device)
-            self._launch(name, fans, lines, volumes, piece)
+            self._launch(name, fans, rows, volumes, piece)
 
     def _mu(self) -> list[Any]:
         return [] if self._attenuation is None else [self.on_device(self._attenuation.mu, "mu")]
 
     def _pieces(self, columns: int) -> Iterator[tuple[slice, slice]]:
-        """Which fans, and which of their lines, are launched together."""
-        bytes_of_a_ray = 4 * columns + _BYTES_OF_A_FAN / (self._lines * self._rays)
+        """Which fans, and which of their rows, are launched together."""
+        bytes_of_a_ray = 4 * columns + _BYTES_OF_A_FAN / (self._rows * self._columns)
         affordable = max(_FEWEST_RAYS, int(self._device.free_memory / 2 / bytes_of_a_ray))
         at_once = min(_RAYS_AT_ONCE, affordable)
-        fans = max(1, at_once // (self._lines * self._rays))
-        lines = self._lines if fans > 1 else min(self._lines, max(1, at_once // self._rays))
+        fans = max(1, at_once // (self._rows * self._columns))
+        rows = self._rows if fans > 1 else min(self._rows, max(1, at_once // self._columns))
         for fan in range(0, len(self._fans), fans):
-            for line in range(0, self._lines, lines):
-                yield slice(fan, min(fan + fans, len(self._fans))), slice(line, min(line + lines, self._lines))
+            for row in range(0, self._rows, rows):
+                yield slice(fan, min(fan + fans, len(self._fans))), slice(row, min(row + rows, self._rows))
 
-    def _launch(self, name: str, fans: slice, lines: slice, volumes: list[Any], numbers: Any) -> None:
+    def _launch(self, name: str, fans: slice, rows: slice, volumes: list[Any], numbers: Any) -> None:
         rays = [wp.array(self._fans[fans], dtype=wp.vec3d, device=self._device)]
         if self._attenuation is not None:
-            apart = self._mu_fans is not self._fans
-            mu_rays = wp.array(self._mu_fans[fans], dtype=wp.vec3d, device=self._device) if apart else rays[0]
-            rays += [mu_rays, int(apart)]
-        dim = (fans.stop - fans.start, lines.stop - lines.start, self._rays)
+            own_lattice = self._mu_fans is not self._fans
+            mu_rays = wp.array(self._mu_fans[fans], dtype=wp.vec3d, device=self._device) if own_lattice else rays[0]
+            rays += [mu_rays, int(own_lattice)]
+        dim = (fans.stop - fans.start, rows.stop - rows.start, self._columns)
         kernel = getattr(self._kernels, name)
-        wp.launch(kernel, dim, inputs=[*volumes, *rays, lines.start, numbers], device=self._device)
+        wp.launch(kernel, dim, inputs=[*volumes, *rays, rows.start, numbers], device=self._device)
 
 
 def _table(rays: Rays) -> tuple[NDArray[np.float64], int, int]:
-    """Rays as the kernels take them: fans (F, 8, 3), their lines and the rays of a line. A single ray is a fan, too."""
+    """Rays as the kernels take them: fans (F, 8, 3), their rows and columns. A single ray is a fan, too."""
     if isinstance(rays, IndexRays):
         table = np.zeros((len(rays), 8, 3))
         table[:, 0] = rays.starts

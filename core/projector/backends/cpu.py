@@ -25,12 +25,12 @@ Array = NDArray[Any]  # of float32 or float64
 LEVEL_VARIABLE = "MPHDRR_CPU_LEVEL"
 """Environment variable that names a lower level of processor, `levels`, than this one's."""
 
-_CONTRACT = 1
+_CONTRACT = 2
 _NAMES = {"win32": "siddon.dll", "darwin": "libsiddon.dylib"}
 _MOST_VOXELS = 2**31 - 1  # their indices are of 32 bits
 _MOST_ALONG = 2**12  # where float32 knows the length of a segment to 0.1 %
 
-_FAN = np.dtype([("volume", "(4,3)f8"), ("mu", "(4,3)f8"), ("world", "(3,3)f8"), ("lines", "i8"), ("rays", "i8")])
+_FAN = np.dtype([("volume", "(4,3)f8"), ("mu", "(4,3)f8"), ("world", "(3,3)f8"), ("rows", "i8"), ("columns", "i8")])
 
 
 class _Lattice(Structure):
@@ -97,7 +97,7 @@ def forward(volume: Array, rays: Rays, attenuation: Attenuation | None = None) -
     return values
 
 
-def adjoint(volume: Array, values: Array, rays: Rays, attenuation: Attenuation | None = None) -> None:
+def backproject(volume: Array, values: Array, rays: Rays, attenuation: Attenuation | None = None) -> None:
     """Add `values` (N,), each along its ray with the weights of `forward`, to `volume` in place."""
     _run(_library.backproject, volume, rays, attenuation, values)
 
@@ -157,12 +157,12 @@ def _fans(rays: IndexFans, mu_rays: Any) -> Array:
     fans["world"][:, 0] -= rays.table[:, 4]
     if mu_rays is not None:
         fans["mu"] = mu_rays.table[:, :4]
-    fans["lines"], fans["rays"] = rays.shape
+    fans["rows"], fans["columns"] = rays.shape
     return fans
 
 
-def _lattice(voxels: Array, alike: Array, written: bool = False) -> _Lattice:
-    """Voxels of the kind of `alike`."""
+def _lattice(voxels: Array, like: Array, written: bool = False) -> _Lattice:
+    """`voxels`, of the same type as `like`."""
     most_along = _MOST_ALONG if voxels.dtype == np.float32 else _MOST_VOXELS
     if voxels.size > _MOST_VOXELS or max(voxels.shape) > most_along:
         raise InputError(
@@ -172,9 +172,9 @@ def _lattice(voxels: Array, alike: Array, written: bool = False) -> _Lattice:
     flags, kind = voxels.flags, voxels.dtype
     if (
         kind not in (np.float32, np.float64)
-        or kind != alike.dtype
+        or kind != like.dtype
         or not flags.c_contiguous
         or written > flags.writeable
     ):
-        raise TypeError(f"expected C-ordered voxels of {alike.dtype}, got {kind}, strides {voxels.strides}")
+        raise TypeError(f"expected C-ordered voxels of {like.dtype}, got {kind}, strides {voxels.strides}")
     return _Lattice(voxels.ctypes.data, voxels.shape)

@@ -1,0 +1,272 @@
+"""The rays of images, and what of them a backend is given at once."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from ..arrays import ArrayOrTensor, cast_like, is_tensor
+from ..geometry.grid import Grid
+from .lattices import Lattices
+from .rays import Array, Attenuation, Ends, Fan, Rays
+
+KEPT_BYTES = 2**27
+"""What a projector keeps of its rays and their weights from call to call takes at most this much memory."""
+
+
+@dataclass(frozen=True, eq=False)
+class Beam:
+    """Rays for every pixel of an image, as many as its fan has shifts, whose weighted integrals add up.
+
+    Attributes
+    ----------
+    rays : Fan
+        From the rays' source to the pixels: n_v rows of n_u rays.
+    weigh : function, optional
+        Weights of the integrals: of slices of rows, columns and shifts, an array (shifts, rows, columns), with 1 row or
+        column where all are the same. None: 1 everywhere.
+    """
+
+    rays: Fan
+    weigh: Callable[[slice, slice, slice], Array] | None = None
+
+    def transposed(self) -> Beam:
+        """The same rays with rows and columns exchanged."""
+        weigh, rays = self.weigh, self.rays.transposed()
+        if weigh is None:
+            return Beam(rays)
+        return Beam(rays, lambda rows, columns, shifts: np.swapaxes(weigh(columns, rows, shifts), -1, -2))
+
+
+@dataclass(frozen=True, eq=False)
+class Bundle:
+    """All rays of one image.
+
+    Attributes
+    ----------
+    beams : tuple of Beam
+        Of one shape; or instead
+    ends : Ends, optional
+        rays from point to point, of which the image (N, 1) has a value each.
+    transposed : bool
+        Whether rows of rays are columns of the image.
+    """
+
+    beams: tuple[Beam, ...] = ()
+    ends: Ends | None = None
+    transposed: bool = False
+
+    @classmethod
+    def along(cls, grid: Grid, *beams: Beam) -> Bundle:
+        """The bundle of `beams` whose rows follow the voxels' contiguous axis as well as they can."""
+        across = beams[0].rays.lies_across(grid)
+        return cls(tuple(beam.transposed() for beam in beams) if across else beams, transposed=across)
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Rows and columns of rays."""
+        return self.beams[0].rays.shape if self.ends is None else self.ends.shape
+
+    @property
+    def rays_of_a_pixel(self) -> int:
+        """How many rays each pixel has."""
+        return sum(len(beam.rays.shifts) for beam in self.beams) if self.ends is None else 1
+
+    def n_rays(self, block: tuple[slice, slice] | None = None) -> int:
+        """How many rays there are, or how many of them in some rows and columns."""
+        rows, columns = self.shape if block is None else (which.stop - which.start for which in block)
+        return rows * columns * self.rays_of_a_pixel
+
+
+@dataclass(frozen=True, eq=False)
+class Part:
+    """Rays that a backend is given in one call.
+
+    Attributes
+    ----------
+    images : list of (int, int)
+        Numbers of the images to which the fans belong, and how many fans of each follow one another.
+    rays : array (F, 4, 3) or Ends
+        The fans' vectors, as of `Fan.vectors`; or rays from point to point.
+    rows, columns : slice
+        The part of an image that each fan covers, of the transposed image if `transposed`.
+    weights : array (F, rows, columns) or None
+        Weights of the integrals, with 1 row or column where all are the same; None: 1 everywhere.
+    """
+
+    images: list[tuple[int, int]]
+    rays: Array | Ends
+    rows: slice
+    columns: slice
+    transposed: bool = False
+    weights: Array | None = None
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Rows and columns of every fan."""
+        return self.rows.stop - self.rows.start, self.columns.stop - self.columns.start
+
+    def in_index_space(self, lattices: Lattices) -> tuple[Rays, Attenuation | None]:
+        """The rays as a backend takes them, and what attenuates them."""
+        if isinstance(self.rays, Ends):
+            return lattices.between(self.rays)
+        return lattices.fans(self.rays, self.shape)
+
+    def pixels(self, image: ArrayOrTensor) -> ArrayOrTensor:
+        """The part of an image that the rays belong to, (rows, columns), as a view."""
+        return (image.T if self.transposed else image)[self.rows, self.columns]
+
+    def add_to(self, images: ArrayOrTensor, first: int, integrals: ArrayOrTensor) -> None:
+        """Add the rays' weighted integrals to `images`, whose first has the number `first`."""
+        integrals = integrals.reshape(-1, *self.shape)
+        if self.weights is not None:
+            integrals = cast_like(self.weights, integrals) * integrals
+        start = 0
+        for number, n in self.images:
+            pixels, own = self.pixels(images[number - first]), integrals[start : start + n]
+            if is_tensor(pixels):
+                pixels += own.sum(0)
+            else:  # one by one: the rounding does not depend on how many fans a part has, and so on the threads
+                for fan in own:
+                    pixels += fan
+            start += n
+
+    def values(self, images: ArrayOrTensor) -> ArrayOrTensor:
+        """What the rays carry back from `images`: weights times pixels, (rays,)."""
+        numbers = [number for number, n in self.images for _ in range(n)]
+        if len(self.images) == 1:
+            pixels = self.pixels(images[numbers[0]])[None]
+        else:
+            pixels = (images.swapaxes(1, 2) if self.transposed else images)[numbers][:, self.rows, self.columns]
+        if self.weights is not None:
+            pixels = cast_like(self.weights, pixels) * pixels
+        elif len(pixels) < len(numbers):
+            pixels = cast_like(np.ones((len(numbers), 1, 1)), pixels) * pixels
+        return pixels.reshape(-1)
+
+
+class Bundles:
+    """The rays of several images of one shape; made when they are asked for and kept while there is room.
+
+    Parameters
+    ----------
+    n : int
+        How many images.
+    make : function
+        Of an image's number: its `Bundle`.
+    """
+
+    def __init__(self, n: int, make: Callable[[int], Bundle]) -> None:
+        self._n = n
+        self._make = make
+        self._bundles: dict[int, Bundle] = {}
+        self._parts: dict[tuple[int, int, int], list[Part]] = {}
+        self._room = KEPT_BYTES
+
+    def __len__(self) -> int:
+        return self._n
+
+    @property
+    def image_shape(self) -> tuple[int, int]:
+        """Rows and columns of an image."""
+        if not self._n:
+            return 0, 0
+        return self[0].shape[::-1] if self[0].transposed else self[0].shape
+
+    def __getitem__(self, number: int) -> Bundle:
+        """The rays of an image."""
+        if number not in self._bundles:
+            bundle = self._make(number)
+            if not self._has_room(256 * bundle.rays_of_a_pixel):
+                return bundle
+            self._bundles[number] = bundle
+        return self._bundles[number]
+
+    def __getstate__(self) -> dict[str, Any]:  # what is kept holds functions that cannot be pickled
+        return self.__dict__ | {"_bundles": {}, "_parts": {}, "_room": KEPT_BYTES}
+
+    def parts(self, images: range, most: int) -> list[Part]:
+        """All rays of several images, at most `most` in a part unless a fan alone has more."""
+        key = images.start, images.stop, most
+        if key not in self._parts:
+            bundles = [(number, self[number]) for number in images]
+            parts: list[Part] = []
+            for transposed in (False, True):
+                some = [(number, bundle) for number, bundle in bundles if bundle.transposed == transposed]
+                if some:
+                    rows, columns = some[0][1].shape
+                    parts += _parts(some, slice(0, rows), slice(0, columns), most)
+            if not self._has_room(sum(_bytes(part) for part in parts)):
+                return parts
+            self._parts[key] = parts
+        return self._parts[key]
+
+    def parts_of(self, number: int, rows: slice, columns: slice, most: int) -> Iterator[Part]:
+        """The rays of some rows and columns of one image, likewise."""
+        return _parts([(number, self[number])], rows, columns, most)
+
+    def _has_room(self, n_bytes: int) -> bool:
+        """Whether so many bytes may be kept; if so, they are counted."""
+        if n_bytes > self._room:
+            return False
+        self._room -= n_bytes
+        return True
+
+
+def _parts(bundles: list[tuple[int, Bundle]], rows: slice, columns: slice, most: int) -> Iterator[Part]:
+    """Some rows and columns of bundles of one orientation, at most `most` rays in a part unless a fan alone has more."""
+    pixels = (rows.stop - rows.start) * (columns.stop - columns.start)
+    if not pixels:
+        return
+    if bundles[0][1].ends is not None:
+        number, bundle = bundles[0]
+        ends: Any = bundle.ends
+        yield Part([(number, 1)], Ends(ends.starts[rows], ends.ends[rows]), rows, columns)
+        return
+    fans_at_once = max(1, most // pixels)
+    pieces: list[tuple[int, Beam, slice]] = []
+    n = 0
+    for number, bundle in bundles:
+        for beam in bundle.beams:
+            first, last = 0, len(beam.rays.shifts)
+            while first < last:
+                end = min(last, first + fans_at_once - n)
+                pieces.append((number, beam, slice(first, end)))
+                n += end - first
+                first = end
+                if n == fans_at_once:
+                    yield _part(pieces, rows, columns, bundle.transposed)
+                    pieces, n = [], 0
+    if pieces:
+        yield _part(pieces, rows, columns, bundles[0][1].transposed)
+
+
+def _part(pieces: list[tuple[int, Beam, slice]], rows: slice, columns: slice, transposed: bool) -> Part:
+    """The part of some shifts of some beams."""
+    images: list[tuple[int, int]] = []
+    for number, _, shifts in pieces:
+        n = shifts.stop - shifts.start
+        if images and images[-1][0] == number:
+            n += images.pop()[1]
+        images.append((number, n))
+    vectors = np.concatenate([beam.rays.part(rows, columns, shifts).vectors() for _, beam, shifts in pieces])
+    weights = None
+    if any(beam.weigh for _, beam, _ in pieces):
+        shape = rows.stop - rows.start, columns.stop - columns.start
+        each = [
+            np.broadcast_to(
+                np.ones(1) if beam.weigh is None else beam.weigh(rows, columns, shifts),
+                (shifts.stop - shifts.start, *shape),
+            )
+            for _, beam, shifts in pieces
+        ]
+        weights = each[0] if len(each) == 1 else np.concatenate(each)
+    return Part(images, vectors, rows, columns, transposed, weights)
+
+
+def _bytes(part: Part) -> int:
+    assert not isinstance(part.rays, Ends)
+    return part.rays.nbytes + (0 if part.weights is None else part.weights.nbytes)

@@ -1,0 +1,87 @@
+"""Threads: results in order with few tasks in flight, and the sum of several volumes."""
+
+from __future__ import annotations
+
+import functools
+import os
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import Future, ThreadPoolExecutor, wait
+from typing import TypeVar
+
+import numpy as np
+
+from ..arrays import ArrayOrTensor
+from ..errors import InputError
+
+In = TypeVar("In")
+Out = TypeVar("Out")
+
+# Tasks handed to each worker ahead of need, so that none waits for the others.
+_TASKS_AHEAD = 4
+
+
+def in_order(function: Callable[[In], Out], items: Iterable[In], workers: int) -> Iterator[Out]:
+    """``function(item)`` of every item, in order, on `workers` threads.
+
+    Items are taken when there is room for them. When the iterator is closed or fails, no task goes on running.
+    """
+    if workers == 1:
+        yield from map(function, items)
+        return
+    running: deque[Future[Out]] = deque()
+    try:
+        for item in items:
+            running.append(_pool(workers).submit(function, item))
+            if len(running) > _TASKS_AHEAD * workers:
+                yield running.popleft().result()
+        while running:
+            yield running.popleft().result()
+    finally:
+        for task in running:
+            task.cancel()
+        wait(running)
+
+
+def run_all(function: Callable[[In], None], items: Iterable[In], workers: int) -> None:
+    """Run ``function(item)`` for every item on `workers` threads."""
+    for _ in in_order(function, items, workers):
+        pass
+
+
+@functools.cache
+def _pool(workers: int) -> ThreadPoolExecutor:
+    """Threads that stay: starting some for every call would cost a short one more than its work."""
+    return ThreadPoolExecutor(workers, thread_name_prefix="mphdrr")
+
+
+if hasattr(os, "register_at_fork"):  # a forked process, such as a data loader's worker, has none of these threads
+    os.register_at_fork(after_in_child=_pool.cache_clear)
+
+
+def sum_of(volumes: list[ArrayOrTensor], workers: int) -> ArrayOrTensor:
+    """Their sum, in the first of them."""
+    total, *others = (volume.reshape(-1) for volume in volumes)
+    size = -(-len(total) // len(volumes))
+
+    def add(first: int) -> None:
+        for other in others:
+            total[first : first + size] += other[first : first + size]
+
+    run_all(add, range(0, len(total), size) if others else [], workers)
+    return volumes[0]
+
+
+def thread_count(threads: int | None) -> int:
+    """`threads`, or the number of processors that this process may use.
+
+    Raises
+    ------
+    InputError
+        Not a whole number of at least 1.
+    """
+    if threads is None:
+        return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    if isinstance(threads, bool) or not isinstance(threads, int | np.integer) or threads < 1:
+        raise InputError(f"threads: expected a whole number of at least 1, got {threads!r}")
+    return int(threads)

@@ -1,0 +1,113 @@
+"""How line integrals move with the rays: gradients by fans and by ends, from a backend's derivatives.
+
+An integral is length x mean. The mean moves with the planes of either grid, and, attenuated, with the length.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from ..geometry.grid import Grid
+from .bundles import Part
+from .rays import Array, Ends
+
+
+def integrals(part: Part, derivatives: Array) -> Array:
+    """Line integrals (rays,) of a part, value x mm."""
+    return np.concatenate([length for _, length in _rays(part)]) * derivatives[0]
+
+
+def by_geometry(part: Part, gradient: Array, derivatives: Array, grid: Grid, mu_grid: Grid) -> list[tuple[int, Array]]:
+    """The gradient by the geometry of each image of a part, with the image's number.
+
+    Parameters
+    ----------
+    part
+        Rays without weights, one fan of each image.
+    gradient
+        By the images, (images, rows, columns).
+    derivatives
+        Of the backend, (7 or 14, rays).
+    grid, mu_grid
+        Of the volume and of mu.
+
+    Returns
+    -------
+    list of (int, array)
+        By source, corner, row step and column step of a fan, (4, 3); by starts and ends, (2, rays, 3).
+    """
+    result, start = [], 0
+    for (number, _), (along, lengths) in zip(part.images, _rays(part), strict=True):
+        own = derivatives[:, start : start + len(lengths)]
+        values = part.pixels(gradient[number]).reshape(-1)
+        by = _by_ends if isinstance(part.rays, Ends) else _by_fan
+        result.append((number, by(part, values, own, along, lengths, grid, mu_grid)))
+        start += len(lengths)
+    return result
+
+
+def _by_ends(
+    part: Part, values: Array, derivatives: Array, along: Array, lengths: Array, grid: Grid, mu_grid: Grid
+) -> Array:
+    """The gradient (2, n, 3) by start and end of the rays."""
+    weights = values * lengths
+    result = np.empty((2, len(values), 3))
+    for end in range(2):
+        result[end] = (weights * derivatives[1 + 3 * end : 4 + 3 * end]).T @ _linear(grid)
+        if len(derivatives) > 7:
+            result[end] += (weights * derivatives[7 + 3 * end : 10 + 3 * end]).T @ _linear(mu_grid)
+    by_length = (_by_length(values, lengths, derivatives) * along).T
+    result[0] -= by_length
+    result[1] += by_length
+    return result
+
+
+def _by_fan(
+    part: Part, values: Array, derivatives: Array, along: Array, lengths: Array, grid: Grid, mu_grid: Grid
+) -> Array:
+    """The gradient (4, 3) by source, corner, row step and column step."""
+    numbers = _numbers(part)
+    # Sums over the rays first, times their numbers where a step moves their ends as often.
+    # einsum, not `@`: BLAS would start threads of its own beside ours.
+    by_planes = np.einsum("in,jn->ij", derivatives[1:13], values * lengths * numbers)
+    by_start, by_end = by_planes[:3, 0] @ _linear(grid), by_planes[3:6].T @ _linear(grid)
+    if len(derivatives) > 7:
+        by_start += by_planes[6:9, 0] @ _linear(mu_grid)
+        by_end += by_planes[9:].T @ _linear(mu_grid)
+    by_length = np.einsum("jn,in->ji", _by_length(values, lengths, derivatives) * numbers, along)
+    result = np.concatenate([by_start[None] - by_length[:1], by_end + by_length])
+    # The part's corner is that of its first row and column.
+    result[2] += part.rows.start * result[1]
+    result[3] += part.columns.start * result[1]
+    return result[[0, 1, 3, 2]] if part.transposed else result
+
+
+def _by_length(values: Array, lengths: Array, derivatives: Array) -> Array:
+    """The gradient (n,) by the rays' lengths at constant ends on the lattices, divided by the lengths."""
+    by_length = derivatives[0] if len(derivatives) == 7 else derivatives[0] + lengths * derivatives[13]
+    return values * by_length / np.where(lengths > 0, lengths, 1.0)
+
+
+def _rays(part: Part) -> list[tuple[Array, Array]]:
+    """Source to target of the rays of every fan, (3, n), and their lengths (n,), world mm."""
+    if isinstance(part.rays, Ends):
+        each = [(part.rays.ends - part.rays.starts).T]
+    else:
+        numbers = _numbers(part)
+        each = [
+            np.einsum("ij,in->jn", np.stack([corner - source, row_step, column_step]), numbers)
+            for source, corner, row_step, column_step in part.rays
+        ]
+    return [(along, np.sqrt((along**2).sum(axis=0))) for along in each]
+
+
+def _numbers(part: Part) -> Array:
+    """Of the rays of a fan: 1, the row's number and the column's, (3, n), counted from the part's corner."""
+    rows, columns = part.shape
+    numbers = np.ones((3, rows, columns))
+    numbers[1], numbers[2] = np.arange(rows)[:, None], np.arange(columns)
+    return numbers.reshape(3, -1)
+
+
+def _linear(grid: Grid) -> Array:
+    return grid.index_from_world[:3, :3]

@@ -52,13 +52,13 @@ def _material(name: str, setting: Setting) -> str | None:
 
 
 def _identifier(name: str, word: str) -> str:
-    """How an enumeration calls a word."""
-    return word if word in _NUMBERS[name] else word.upper().replace("-", "_")
+    """How an enumeration calls a word: isotopes and materials by their names, others in capitals."""
+    return word if name == "isotope" or name.endswith("_material") else word.upper().replace("-", "_")
 
 
 def _enumeration(name: str, setting: Setting, none: tuple[str, str, str] | None) -> Any:
     words = [(_identifier(name, word), label, text) for word, (label, text) in setting.words.items()]
-    items = choices.items(_NUMBERS[name], ([none] if none else []) + words)
+    items = choices.items(_NUMBERS.get(name, {}), ([none] if none else []) + words)
     default = none[0] if none else _identifier(name, setting.default)
     return EnumProperty(name=setting.label, description=setting.text, items=items, default=default)
 

@@ -109,12 +109,14 @@ def run_of(record: Record) -> ProjectionRun:
     )
     volume = arrays["volume/array"]
     n_x, n_y, n_z = volume.shape
-    steps = (arrays[f"views/{name}"] for name in ("sources", "detector_centers", "u_steps", "v_steps"))
+    sources, middles, u_steps, v_steps = (
+        arrays[f"views/{name}"] for name in ("sources", "detector_centers", "u_steps", "v_steps")
+    )
     seed = attributes["seed"]
     return ProjectionRun(
         projections=np.asarray(arrays["projections"], np.float32),
         system=system,
-        views=Views(*steps, (n_v, n_u)),
+        views=Views(sources, middles, u_steps, v_steps, (n_v, n_u)),
         volume=Volume(volume, Grid((n_x, n_y, n_z), arrays["volume/affine"]), str(attributes["volume_quantity"])),
         unit=str(attributes["projections_unit"]),
         settings=json.loads(attributes["settings"]),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import importlib.util
 from pathlib import Path
 
@@ -159,3 +160,12 @@ def test_a_workbook_of_version_0_1_0_opens(workbook):
     assert list(system.numbers) == [1, 41]
     np.testing.assert_allclose(system.centers, original.centers, rtol=0, atol=1e-9)
     np.testing.assert_allclose(system.collimator_length, original.collimator_length, rtol=0, atol=1e-9)
+
+
+def test_every_argument_of_a_model_is_a_setting():
+    names = {field.name for cls in (mph.Emission, mph.Transmission) for field in dataclasses.fields(cls)}
+    names -= {"system", "mu", "photons_per_decay"}  # the recipe has tables of the first two; the isotope says the third
+    declared = {key.removeprefix("model.").removesuffix("_degrees") for key in SETTINGS if key.startswith("model.")}
+    assert names == declared - {"kind", "photons"}
+    options = [setting.option for setting in SETTINGS.values()]
+    assert len(set(options)) == len(options)

@@ -185,10 +185,12 @@ def set_panel(settings: ProjectionProperties, recipe: Recipe) -> None:
 
 
 def drawn(settings: ProjectionProperties, table: str) -> Iterator[tuple[str, bool]]:
-    """Properties of a table that the chosen model has, and whether each has an effect."""
-    values = {
-        key: value for key, value in recipe_values(lambda name: getattr(settings, name)).items() if value is not None
-    }
+    """The properties of a table that the chosen model has, each with whether it has an effect."""
+    try:
+        known = recipe_values(lambda name: getattr(settings, name))
+    except InputError:  # a choice of a later version: rendering refuses it
+        known = {}
+    values = {key: value for key, value in known.items() if value is not None}
     for name, setting in PROPERTIES.items():
         if not setting.key.startswith(f"{table}."):
             continue

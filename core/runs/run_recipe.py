@@ -56,7 +56,11 @@ def run_recipe(
     """
     system = chosen_modules(system or _system(recipe), recipe["system.modules"], "system.modules")
     model = recipe_model(recipe, system)
-    if recipe["attenuation.file"] is not None and mu is None:
+    if mu is None and recipe["attenuation.object"] is not None:
+        raise InputError(
+            f"attenuation.object: {recipe['attenuation.object']!r} is in a Blender scene; give --mu FILE instead"
+        )
+    if mu is None and recipe["attenuation.file"] is not None:
         mu = _attenuation(recipe, model, stages("reading"))
     recorded = recipe.complete()
     if volume is not None:

@@ -157,7 +157,7 @@ _DECLARED = (
             needs=("no volume.states", *_NO_PHANTOM), option="--volume"),
     Setting("volume.states", str, None, "Volumes of what changes, such as a beating heart: a run of each, as OUTPUT-1, "
             "OUTPUT-2 …", is_path=True, sizes=(), needs=("no volume.file", *_NO_PHANTOM)),
-    Setting("volume.object", str, None, "Name of the volume's object in a Blender scene"),
+    Setting("volume.object", str, None, "Name of the volume's object in a Blender scene", needs=_PHANTOM),
     Setting("volume.state", str, None, "State of the object's sequence", needs=("volume.object",)),
     Setting("volume.series", str, None, _SERIES, needs=("volume.file",)),
     Setting("volume.quantity", str, None, "What the values of the volume are", "what the file says; a file that says "
@@ -186,8 +186,8 @@ _DECLARED = (
     Setting("phantom.turn_grid", bool, False, "Turn the grid with the phantom", needs=_PHANTOM),
     Setting("attenuation.file", str, None, "Attenuation coefficients, 1/mm, on any grid, or CT numbers (a DICOM folder, "
             "too)", "nothing attenuates", is_path=True, needs=(_COUNTS, "no attenuation.of_phantom"), option="--mu"),
-    Setting("attenuation.object", str, None, "Name of its object in a Blender scene", needs=(_COUNTS,),
-            option="--mu-object"),
+    Setting("attenuation.object", str, None, "Name of its object in a Blender scene",
+            needs=(_COUNTS, "no attenuation.file", "no attenuation.of_phantom"), option="--mu-object"),
     Setting("attenuation.series", str, None, _SERIES, needs=("attenuation.file",), option="--mu-series"),
     Setting("attenuation.energy", float, None, _AT_ENERGY, unit="keV", words=_ISOTOPES, above=0,
             needs=("attenuation.file",), option="--mu-energy"),

@@ -162,6 +162,18 @@ def test_a_workbook_of_version_0_1_0_opens(workbook):
     np.testing.assert_allclose(system.collimator_length, original.collimator_length, rtol=0, atol=1e-9)
 
 
+@pytest.mark.parametrize(
+    ("entries", "said"),
+    [
+        ({"attenuation.object": "Body", "model.kind": "emission"}, "'Body' is in a Blender scene; give --mu FILE"),
+        ({"volume.object": "CT mu"}, "'CT mu' is in a Blender scene; give --volume FILE"),
+    ],
+)
+def test_what_only_a_scene_has_is_not_left_out(entries, said, workbook):
+    with pytest.raises(mph.InputError, match=said):
+        next(mph.run_recipe(Recipe({"system.file": str(workbook), "system.modules": "1", **entries})))
+
+
 def test_every_argument_of_a_model_is_a_setting():
     names = {field.name for cls in (mph.Emission, mph.Transmission) for field in dataclasses.fields(cls)}
     names -= {"system", "mu", "photons_per_decay"}  # the recipe has tables of the first two; the isotope says the third

@@ -7,6 +7,7 @@
 # make test-app   the Linux zip in a real Blender (see tests/app)
 # make test-kernels   the C kernels under sanitizers, for arm64 under qemu, for Windows under Wine (see tests/kernels)
 # make test-gate  the Monte Carlo exports with GATE 10 itself; wants an environment of its own (2 GB): VENV=.venvgate
+# make test-peers   the exported geometry in the programs that read it; wants an environment of its own: VENV=.venvpeers
 # make clean   removes what the others made, environments included
 #
 # The environment is made in VENV on the first call. PYTHON picks its interpreter (3.11: Blender 4.5, 3.13: Blender 5.2);
@@ -24,7 +25,7 @@ ANY_PYTHON = $$(for p in "$(PYTHON)" python3 python3.11 python3.13; do "$$p" -c 
 ENVIRONMENT = @p=$(ANY_PYTHON); [ -n "$$p" ] || { echo "no Python found; name one: make PYTHON=/path/to/python3.11"; exit 1; }; \
 	"$$p" tools/environment.py $(VENV) --python "$(PYTHON)"
 
-.PHONY: demo gallery test test-long lint test-app test-kernels test-gate bench dist clean env env-dev
+.PHONY: demo gallery test test-long lint test-app test-kernels test-gate test-peers bench dist clean env env-dev
 
 demo: env
 	$(BIN)/mphdrr demo --output $(OUTPUT)
@@ -65,6 +66,11 @@ test-kernels: env-dev
 test-gate:
 	$(ENVIRONMENT) --extras dev,gate
 	$(BIN)/python -m pytest tests/core/test_monte_carlo.py
+
+test-peers:
+	$(ENVIRONMENT) --extras dev,peers --torch "$(TORCH)"
+	@$(BIN)/python -c "import astra, cv2, itk, kornia, lib3mf"  # a missing one would only be skipped
+	$(BIN)/python -m pytest tests/core/test_geometry_export_peers.py
 
 env:
 	$(ENVIRONMENT) --extras blender

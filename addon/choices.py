@@ -2,7 +2,8 @@
 
 Blender stores the number of an enumeration's item, not its identifier, and numbers items by their position unless told
 otherwise: an isotope put between two others would make every saved scene count another isotope's photons. So every item
-of every enumeration has a number of its own: here, where the items come from a table of core; beside the item elsewhere.
+of every enumeration has a number of its own: here, where the items come from a table of core; beside the item elsewhere
+(`core.exchange` numbers the formats of geometry).
 
 A number once given stays with its identifier for ever. A new item gets one that no item of its table ever had, wherever
 it stands in the menu; an item that is dropped takes its number with it. tests/blender/test_choices.py holds them all.
@@ -40,10 +41,6 @@ BACKENDS = {"AUTO": 0, "CPU": 1, "TORCH": 2, "NUMPY": 3, "CUDA": 4}
 JOINED = {"BY_NUMBER": 0, "IN_ORDER": 1, "ONE_FOR_ALL": 2}
 UNITS = {
     "NONE": 0, "mm": 1, "cm": 2, "m": 3, "in": 4, "µm": 5, "rad": 6, "deg": 7, "dm": 8, "ft": 9, "mil": 10, "0.1 mm": 11,
-}  # fmt: skip
-GEOMETRY_FORMATS = {
-    "astra": 0, "rtk": 1, "opencv": 2, "kornia": 3, "pytorch3d": 4, "nerf": 5, "leap": 6, "pytomography": 7, "stir": 8,
-    "stl": 9, "stl-parts": 10, "3mf": 11, "glb": 12, "gate9": 13, "gate10": 14, "mphdrr": 15,
 }  # fmt: skip
 
 

@@ -1,8 +1,8 @@
-"""What is measured: views of the 80-module scanner, volumes, and the float64 reference."""
+"""What is measured: views of the 80-module scanner, volumes, the float64 reference, and the rows of results."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
 
@@ -101,6 +101,24 @@ def save_volumes(folder: str | Path, voxels: int, names: tuple[str, ...] = ("noi
             inside[quarter:-quarter, quarter:-quarter, quarter:-quarter] = True
             volume *= inside
         np.save(volume_path(folder, name, voxels), volume)
+
+
+@dataclass
+class Row:
+    """The measurements of one contender."""
+
+    name: str
+    threads: int
+    n_views: int
+    label: str = ""
+    model: str = ""
+    seconds: dict[str, float] = field(default_factory=dict)
+    """Time of each task, per view."""
+    processor: dict[str, float] = field(default_factory=dict)
+    """The same in processor time, all threads together; other work on the machine disturbs it less."""
+    memory: float = float("nan")
+    """MB beyond volume and images, the largest of all tasks."""
+    errors: dict[str, float] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)

@@ -19,37 +19,19 @@ import sys
 import tempfile
 import threading
 import time
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import report
-from case import Case, reference, save_volumes
+from case import Case, Row, reference, save_volumes
 from peers import PEERS, TASKS, cores, set_thread_variables
 
 ROOT = Path(__file__).parents[1]
 PATIENCE = 3.0  # s: what takes longer has one turn
 ENOUGH = 60.0  # s: a slow contender that has taken this long is asked for nothing more
 TOO_LONG = 120.0  # s: a contender that has not answered one request by then is ended
-
-
-@dataclass
-class Row:
-    """What was measured of one contender."""
-
-    name: str
-    threads: int
-    n_views: int
-    label: str = ""
-    model: str = ""
-    seconds: dict[str, float] = field(default_factory=dict)
-    """Of each task, per view."""
-    processor: dict[str, float] = field(default_factory=dict)
-    """The same on the processor, all threads together; other work on the machine disturbs it less."""
-    memory: float = float("nan")
-    """MB beyond volume and images, the most of all tasks."""
-    errors: dict[str, float] = field(default_factory=dict)
 
 
 class Worker:

@@ -7,17 +7,13 @@ import subprocess
 from dataclasses import dataclass
 from datetime import date
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 import psutil
-from case import SIDE, Case
+from case import SIDE, Case, Row
 
 from mphdrr.core.runs.run import versions
 from mphdrr.core.version import VERSION
-
-if TYPE_CHECKING:
-    from projector import Row
 
 TITLES = {"forward": "forward", "adjoint": "adjoint", "emission": "emission", "pose_gradient": "pose gradient"}
 

@@ -10,13 +10,13 @@ import bpy
 from bpy.props import EnumProperty, StringProperty
 from bpy_extras.io_utils import ExportHelper
 
-from ..addon import choices, design, ids, scanner, selection, storage
+from ..addon import design, ids, scanner, selection, storage
 from ..addon.decimals import typed
 from ..addon.reports import warnings_reported
 from ..core.errors import InputError
-from ..core.exchange import FORMATS, write_geometry
+from ..core.exchange import FORMAT_NUMBERS, FORMATS, write_geometry
 
-_ITEMS = choices.items(choices.GEOMETRY_FORMATS, ((f.name, f.name, f.title) for f in FORMATS.values()))
+_ITEMS = tuple((f.name, f.name, f.title, FORMAT_NUMBERS[f.name]) for f in FORMATS.values())
 
 
 class MPHDRR_OT_export_for_program(ExportHelper, bpy.types.Operator):

@@ -140,13 +140,13 @@ def make(venv: Path, name: str, extras: set[str], torch: str | None) -> None:
     if not (venv / "bin/pip").exists() and subprocess.run([python, "-m", "venv", str(venv)]).returncode != 0:
         raise SystemExit(f"{python} cannot make virtual environments; on Debian: apt-get install python3-venv")
     state_file.unlink(missing_ok=True)
-    if not pip(venv, "install", "-e", f".[{','.join(wanted['extras'])}]"):
-        raise SystemExit("pip could not install what mphDRR needs; its words are above")
-    if wanted["torch"] != state.get("torch", ""):
+    if wanted["torch"] != state.get("torch", ""):  # before the extras, which would bring a torch of their own
         if not wanted["torch"]:
             pip(venv, "uninstall", "-y", "torch", "roma")
         elif not pip(venv, "install", wanted["torch"], "roma>=1.5"):
             print(f"{wanted['torch']} could not be installed: going on without it, its tests are skipped", flush=True)
+    if not pip(venv, "install", "-e", f".[{','.join(wanted['extras'])}]"):
+        raise SystemExit("pip could not install what mphDRR needs; its words are above")
     if wanted["torch"] and "dev" in wanted["extras"] and not add_diffdrr(venv):
         print(f"{DIFFDRR} could not be installed: going on without it, its tests are skipped", flush=True)
     source = venv / "src"  # where mypy finds the repo root under the package's name

@@ -1,6 +1,7 @@
-"""The scanner's geometry as other programs' files.
+"""Exports of the scanner's geometry: cameras, solids and Monte Carlo simulations for other programs.
 
-A format is a module here that offers one `Format`; `FORMATS` lists them all.
+To add a program, write a module here that offers a `Format`, and list it below. The command line, Blender's menu and
+`docs/geometry-export.md`, which refers to the command's help, take it from the list.
 """
 
 from __future__ import annotations
@@ -17,36 +18,35 @@ from .format import Format
 from .gate9 import GATE9
 from .gate10 import GATE10
 from .leap import LEAP
+from .mphdrr_json import MPHDRR, read_geometry
 from .nerf import NERF
 from .opencv import KORNIA, OPENCV
-from .pytomography import PYTOMOGRAPHY
 from .pytorch3d import PYTORCH3D
-from .record import MPHDRR, read_geometry
 from .rtk import RTK
 from .solids import GLB, STL, STL_PARTS, THREE_MF
-from .stir import STIR
 
-__all__ = ["FORMATS", "Format", "read_geometry", "write_geometry"]
+__all__ = ["FORMATS", "FORMAT_NUMBERS", "Format", "read_geometry", "write_geometry"]
 
-_FORMATS = (
-    ASTRA,
-    RTK,
-    OPENCV,
-    KORNIA,
-    PYTORCH3D,
-    NERF,
-    LEAP,
-    PYTOMOGRAPHY,
-    STIR,
-    STL,
-    STL_PARTS,
-    THREE_MF,
-    GLB,
-    GATE9,
-    GATE10,
-    MPHDRR,
-)
-FORMATS: dict[str, Format] = {f.name: f for f in _FORMATS}
+# Blender keeps a menu's choice as a number: never change one, and give a new format a number that no format has had.
+# 7 and 8 belonged to PyTomography and STIR in version 0.1.0.
+_NUMBERED = {
+    0: ASTRA,
+    1: RTK,
+    2: OPENCV,
+    3: KORNIA,
+    4: PYTORCH3D,
+    5: NERF,
+    6: LEAP,
+    9: STL,
+    10: STL_PARTS,
+    11: THREE_MF,
+    12: GLB,
+    13: GATE9,
+    14: GATE10,
+    15: MPHDRR,
+}
+FORMATS: dict[str, Format] = {format.name: format for format in _NUMBERED.values()}
+FORMAT_NUMBERS: dict[str, int] = {format.name: number for number, format in _NUMBERED.items()}
 
 
 def write_geometry(
@@ -64,26 +64,25 @@ def write_geometry(
     system
         The modules.
     path
-        The file to write, or for formats of several files the folder: it is made, and must be empty or absent.
+        The file to write; for formats of several files a folder, which must be new or empty.
     format
         A name of `FORMATS`.
     views
-        The images to describe; by default ``system.views()``. Formats of solids leave it aside.
+        The images to describe; default ``system.views()``. Formats of solids ignore them.
     options
-        Those of the format (`Format.write`).
+        The format's own: ``FORMATS[format].options``.
 
     Raises
     ------
     InputError
-        No such format, an option or suffix that it does not have, what it cannot express, or the file cannot be
-        written (the old one then stays).
+        The format, an option or the file's ending is unknown, the format cannot express the geometry, or the file cannot
+        be written. An existing file is then left as it was.
     """
     instance(system, PinholeSystem, "write_geometry")
     if format not in FORMATS:
         raise InputError(f"format {format!r}: expected one of {', '.join(FORMATS)}")
     views = system.views() if views is None else views
-    if not isinstance(views, Views):
-        raise InputError(f"views: expected Views, got {type(views).__name__}")
+    instance(views, Views, "views")
     if len(views) == 0:
         raise InputError("views: expected one or more, got none")
-    FORMATS[format].write_whole(system, views, path, options)
+    FORMATS[format].save(system, views, path, options)

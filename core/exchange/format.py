@@ -1,14 +1,20 @@
-"""What a format of geometry is."""
+"""What an export format is, and how its file or folder is written: completely or not at all."""
 
 from __future__ import annotations
 
 import inspect
+import json
 import os
+import shutil
+import typing
 import uuid
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
+
+import numpy as np
 
 from ..errors import InputError
 from ..files import ensure_folder, replacing
@@ -18,61 +24,76 @@ from ..geometry.views import Views
 
 @dataclass(frozen=True)
 class Format:
-    """A file format, or a folder of files, for another program.
+    """A file, or a folder of files, for another program.
 
     Attributes
     ----------
     name : str
-        What it is called on the command line.
+        Its name on the command line.
     title : str
-        What it is, in one line.
+        What it holds, in one line.
     suffixes : tuple of str
-        Endings of the file's name, the first being the default; empty for a folder.
+        Endings of the file's name, the default first; empty for a folder.
     write : callable
-        ``write(system, views, path, **options)`` writes the file, or into the existing empty folder; options have
-        defaults. Raises `InputError` for what the format cannot express.
+        ``write(system, views, path, **options)`` writes the file, or fills the empty folder. Raises `InputError` for what
+        the format cannot express.
+    options_of : callable or None
+        Its keyword-only parameters, with types and defaults, are the format's options; None: those of `write`.
     """
 
     name: str
     title: str
     suffixes: tuple[str, ...]
     write: Callable[..., None]
+    options_of: Callable[..., Any] | None = None
 
     @property
-    def options(self) -> dict[str, inspect.Parameter]:
-        """The options of `write`, by name."""
-        return dict(list(inspect.signature(self.write).parameters.items())[3:])
+    def options(self) -> dict[str, tuple[Any, Any]]:
+        """Type and default of each option, by name."""
+        source = self.options_of or self.write
+        types = typing.get_type_hints(source)
+        parameters = inspect.signature(source).parameters.values()
+        return {p.name: (types[p.name], p.default) for p in parameters if p.kind is p.KEYWORD_ONLY}
 
-    def write_whole(
-        self, system: PinholeSystem, views: Views, path: str | os.PathLike[str], options: dict[str, Any]
-    ) -> None:
-        """Write so that all of it is there or nothing."""
+    def save(self, system: PinholeSystem, views: Views, path: str | os.PathLike[str], options: dict[str, Any]) -> None:
+        """Check the options' names and the file's ending, then write."""
         path = Path(path)
-        unknown = set(options) - set(self.options)
-        if unknown:
-            raise InputError(
-                f"format {self.name}: no option {sorted(unknown)[0]!r}, it has {', '.join(self.options) or 'none'}"
-            )
-        if self.suffixes:
-            if not path.name.lower().endswith(self.suffixes):
-                raise InputError(f"{path}: expected a name ending in {', '.join(self.suffixes)}")
-            with replacing(path) as temporary:
-                self.write(system, views, temporary, **options)
-            return
-        if path.exists() and (not path.is_dir() or any(path.iterdir())):
-            raise InputError(f"{path}: expected a new folder or an empty one")
-        parent = ensure_folder(path.absolute().parent)
-        temporary = parent / f".{uuid.uuid4().hex[:8]}-{path.name}"
-        try:
-            temporary.mkdir()
+        for name in sorted(options.keys() - self.options.keys()):
+            raise InputError(f"format {self.name}: no option {name!r}, it has {', '.join(self.options) or 'none'}")
+        if self.suffixes and not path.name.lower().endswith(self.suffixes):
+            raise InputError(f"{path}: expected a name ending in {', '.join(self.suffixes)}")
+        with replacing(path) if self.suffixes else _new_folder(path) as temporary:
             self.write(system, views, temporary, **options)
-            if path.exists():
-                path.rmdir()
-            os.replace(temporary, path)
-        except OSError as error:
-            raise InputError(f"{path}: cannot be written ({error.strerror or error})") from error
-        finally:
-            if temporary.exists():
-                import shutil
 
-                shutil.rmtree(temporary, ignore_errors=True)
+
+def array_format(name: str, title: str, arrays: Callable[..., dict[str, Any]]) -> Format:
+    """A format of named arrays, ``arrays(views, **options)``: NumPy's .npz, or .json with every digit."""
+
+    def write(system: PinholeSystem, views: Views, path: Path, **options: Any) -> None:
+        named = arrays(views, **options)
+        if path.name.lower().endswith(".json"):
+            lists = {key: np.asarray(value).tolist() for key, value in named.items()}
+            path.write_text(json.dumps(lists, indent=1) + "\n", encoding="utf-8")
+            return
+        with open(path, "wb") as file:  # given a name, NumPy would add .npz to .NPZ
+            np.savez(file, **named)
+
+    return Format(name, title, (".npz", ".json"), write, options_of=arrays)
+
+
+@contextmanager
+def _new_folder(path: Path) -> Iterator[Path]:
+    """Give a temporary folder beside `path`; rename it to `path` on success, remove it on failure."""
+    if path.exists() and (not path.is_dir() or any(path.iterdir())):
+        raise InputError(f"{path}: expected a new folder or an empty one")
+    temporary = ensure_folder(path.absolute().parent) / f".{uuid.uuid4().hex[:8]}-{path.name}"
+    try:
+        temporary.mkdir()
+        yield temporary
+        if path.exists():
+            path.rmdir()
+        os.replace(temporary, path)
+    except OSError as error:
+        raise InputError(f"{path}: cannot be written ({error.strerror or error})") from error
+    finally:
+        shutil.rmtree(temporary, ignore_errors=True)

@@ -6,6 +6,7 @@ Rotations are the solids' own: opengate hands them to ``G4PVPlacement(G4Transfor
 from __future__ import annotations
 
 import json
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -13,42 +14,37 @@ from ..geometry.system import PinholeSystem
 from ..geometry.views import Views
 from ..validation import whole_number
 from .format import Format
-from .monte_carlo import REFERENCE_ENERGY, Part, Scene, Simulation, build_scene, material_database, simulation_options
+from .monte_carlo import REFERENCE_ENERGY, Placed, Setup, Simulation, build_setup, material_database
 
-_SCRIPT = Path(__file__).with_name("simulation_script.py")
+_SCRIPT = Path(__file__).with_name("gate10_script.py")
 
 
-@simulation_options(threads=1)
-def write(system: PinholeSystem, views: Views, path: Path, **options: Any) -> None:
-    """Write ``simulation.py``, ``simulation.json`` and ``GateMaterials.db`` into the folder `path`.
+@dataclass(frozen=True, kw_only=True)
+class Gate10Simulation(Simulation):
+    """A simulation in several threads, which together emit the activity."""
 
-    Parameters
-    ----------
-    system, path
-        The modules and the empty folder.
-    views
-        Their shape is that of the images, which cover each crystal.
-    options
-        Those of `Simulation`, and `threads`, a whole number.
+    threads: int = 1
 
-    Raises
-    ------
-    InputError
-        An option, or what `build_scene` refuses.
-    """
-    threads = whole_number(options.pop("threads", 1), "threads")
-    scene = build_scene(system, Simulation(**options))
-    record = {"threads": threads, **_record(system, scene), "image_shape": list(views.shape)}
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        whole_number(self.threads, "threads")
+
+
+def _write(system: PinholeSystem, views: Views, path: Path, **options: Any) -> None:
+    """Write script, numbers and materials into the folder `path`; the shape of the views is that of the images."""
+    simulation = Gate10Simulation(**options)
+    record = _record(system, build_setup(system, simulation), simulation) | {"image_shape": list(views.shape)}
     (path / "simulation.py").write_text(_SCRIPT.read_text(encoding="utf-8"), encoding="utf-8")
     (path / "simulation.json").write_text(_json(record), encoding="utf-8")
     (path / "GateMaterials.db").write_text(material_database(), encoding="ascii", newline="\n")
 
 
-GATE10 = Format("gate10", "GATE 10 (opengate) script: a folder, to run by python simulation.py", (), write)
+_TITLE = "GATE 10 (opengate) script: a folder, to run by python simulation.py"
+GATE10 = Format("gate10", _TITLE, (), _write, options_of=Gate10Simulation)
 
 
 def _json(record: dict[str, Any]) -> str:
-    """JSON with one line for each entry, and for each item of lists of entries."""
+    """JSON with a line for each entry, and for each item of lists of objects."""
     entries = []
     for key, value in record.items():
         text = json.dumps(value)
@@ -58,32 +54,32 @@ def _json(record: dict[str, Any]) -> str:
     return "{\n " + ",\n ".join(entries) + "\n}\n"
 
 
-def _record(system: PinholeSystem, scene: Scene) -> dict[str, Any]:
-    simulation = scene.simulation
-    parts = [part for parts in scene.collimators for part in parts] + [c.part for c in scene.crystals]
-    if scene.phantom is not None:
-        parts += [scene.phantom, *(rods.part for rods in scene.rods)]
+def _record(system: PinholeSystem, setup: Setup, simulation: Gate10Simulation) -> dict[str, Any]:
+    parts = [part for parts in setup.collimators for part in parts] + [solids for solids, _ in setup.crystals]
+    if setup.phantom is not None:
+        parts += [setup.phantom, *(rods for rods, _ in setup.rods)]
     return {
-        "seed": simulation.seed,
-        "time_s": simulation.time,
-        "world_mm": scene.world,
+        "threads": int(simulation.threads),
+        "seed": int(simulation.seed),
+        "time_s": float(simulation.time),
+        "world_mm": setup.world,
         "isotope": simulation.nuclide.name,
         "half_life_s": simulation.nuclide.half_life,
         "lines_keV_photons_per_decay": [list(line) for line in simulation.nuclide.lines],
         "detector": {
-            "energy_resolution": simulation.energy_resolution,
+            "energy_resolution": float(simulation.energy_resolution),
             "reference_keV": REFERENCE_ENERGY,
-            "intrinsic_fwhm_mm": simulation.intrinsic_fwhm,
+            "intrinsic_fwhm_mm": float(simulation.intrinsic_fwhm),
             "window_keV": list(simulation.window),
         },
-        "emitters": _emitters(scene),
-        "crystals": [c.part.name for c in scene.crystals],
-        "modules": _modules(system, scene),
+        "emitters": _emitters(setup, simulation),
+        "crystals": [solids.name for solids, _ in setup.crystals],
+        "modules": _modules(system, setup),
         "volumes": [_volume(part) for part in parts],
     }
 
 
-def _volume(part: Part) -> dict[str, Any]:
+def _volume(part: Placed) -> dict[str, Any]:
     return {
         "name": part.name,
         "mother": part.mother,
@@ -95,36 +91,36 @@ def _volume(part: Part) -> dict[str, Any]:
     }
 
 
-def _modules(system: PinholeSystem, scene: Scene) -> list[dict[str, Any]]:
+def _modules(system: PinholeSystem, setup: Setup) -> list[dict[str, Any]]:
     """Each module's crystal, for its images."""
-    rows: list[dict[str, Any]] = [{}] * len(system)
-    for part, modules in scene.crystals:
-        for i, m in enumerate(modules):
-            rows[m] = {
-                "number": int(system.numbers[m]),
-                "crystal": part.name,
-                "copy": i,
-                "crystal_center_mm": part.centers[i].tolist(),
-                "crystal_size_mm": [float(x) for x in part.size],
-                "axes_uvk": part.rotations[i].T.tolist(),
-            }
-    return rows
+    modules = {
+        int(m): {
+            "number": int(system.numbers[m]),
+            "crystal": part.name,
+            "copy": copy,
+            "crystal_center_mm": part.centers[copy].tolist(),
+            "crystal_size_mm": [float(x) for x in part.size],
+            "axes_uvk": part.rotations[copy].T.tolist(),
+        }
+        for part, indices in setup.crystals
+        for copy, m in enumerate(indices)
+    }
+    return [modules[m] for m in range(len(system))]
 
 
-def _emitters(scene: Scene) -> list[dict[str, Any]]:
-    """The point, or every rod with its share of its sector's activity."""
-    simulation = scene.simulation
-    if scene.phantom is None:
-        center = simulation.place[:3, 3].tolist()
+def _emitters(setup: Setup, simulation: Simulation) -> list[dict[str, Any]]:
+    """The point, or each rod with its share of its sector's activity."""
+    if setup.phantom is None:
+        center = simulation.world_from_phantom[:3, 3].tolist()
         return [{"mother": "world", "center_mm": center, "activity_Bq": simulation.becquerels}]
     return [
         {
-            "mother": scene.phantom.name,
+            "mother": setup.phantom.name,
             "center_mm": center.tolist(),
-            "radius_mm": float(rods.part.size[0]),
-            "height_mm": float(rods.part.size[1]),
-            "activity_Bq": float(rods.activity / len(rods.part.centers)),
+            "radius_mm": float(rods.size[0]),
+            "height_mm": float(rods.size[1]),
+            "activity_Bq": float(activity / len(rods.centers)),
         }
-        for rods in scene.rods
-        for center in rods.part.centers
+        for rods, activity in setup.rods
+        for center in rods.centers
     ]

@@ -2,26 +2,21 @@
 
 from __future__ import annotations
 
-from pathlib import Path
+from typing import Any
 
 import numpy as np
 
-from ..geometry.system import PinholeSystem
 from ..geometry.views import Views
-from .arrays import SUFFIXES, write_arrays
-from .cameras import pixel_axes, with_common_pitch
-from .format import Format
+from .camera_model import pixel_axes, with_common_pitch
+from .format import array_format
 
 
-def _write(system: PinholeSystem, views: Views, path: Path) -> None:
-    """``rowVectors`` point to the next row and ``colVectors`` to the next column; one pixel size for all modules.
-
-    LEAP counts in float32.
-    """
+def _arrays(views: Views) -> dict[str, Any]:
+    """``rowVectors`` point to the next row, ``colVectors`` to the next column; all modules have one pixel size."""
     views, (width, height) = with_common_pitch(views, "leap")
     _, (columns, rows) = pixel_axes(views)
     n_v, n_u = views.shape
-    arrays = {
+    return {
         "numAngles": len(views),
         "numRows": n_v,
         "numCols": n_u,
@@ -32,7 +27,6 @@ def _write(system: PinholeSystem, views: Views, path: Path) -> None:
         "rowVectors": rows.astype(np.float32),
         "colVectors": columns.astype(np.float32),
     }
-    write_arrays(path, arrays)
 
 
-LEAP = Format("leap", "LEAP: modular-beam geometry", SUFFIXES, _write)
+LEAP = array_format("leap", "LEAP: modular-beam geometry", _arrays)

@@ -1,17 +1,17 @@
-"""What the Monte Carlo exports share: the simulated scanner as solids in places, the source, the detector's numbers.
+"""What the Monte Carlo exports share: their options, and the scanner as placed solids.
 
-Every solid of a module has the module's axes: local x = u, y = v, z = k, towards the isocentre. So a point of the crystal
-is at (x, y) where `PinholeSystem.views(detector="real")` has it. Lengths mm, times s, activities Bq, energies keV.
+Every solid of a module has the module's axes: local x = u, y = v, z = k, towards the isocentre. A point of the crystal
+therefore lies at the (x, y) that `PinholeSystem.views(detector="real")` gives it. Lengths mm, times s, activities Bq,
+energies keV.
 """
 
 from __future__ import annotations
 
-import inspect
 import math
-from collections.abc import Callable
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
+from functools import cached_property
 from itertools import pairwise
-from typing import Any, Literal, NamedTuple, get_args, get_type_hints
+from typing import Literal, NamedTuple, get_args, get_type_hints
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,210 +23,142 @@ from ..geometry.module_parts import module_collimators
 from ..geometry.system import PinholeSystem
 from ..phantoms.derenzo import DerenzoPhantom
 from ..physics.isotopes import Isotope, isotope
-from ..validation import positive, real_array
+from ..physics.materials import MATERIALS
+from ..validation import instance, positive, real_array
 
 REFERENCE_ENERGY = 140.5
 """keV at which the energy resolution is given."""
 
-_SPACE = 50.0  # mm of air between the scanner's farthest point and the world's end
-_SAME = 1e-6  # mm: modules whose lengths differ by less are of one class
+_SPACE = 50.0  # mm of air between the scanner's farthest point and the end of the world
+_SAME = 1e-6  # mm: modules whose lengths differ by less are alike
 
-# Density and composition by numbers of atoms or, with a point, by mass: air and PMMA as Geant4's G4_AIR and G4_PLEXIGLASS,
-# CZT as Cd0.9 Zn0.1 Te.
-_MATERIALS = """\
-Air: d=1.20479 mg/cm3 ; n=4 ; state=gas
-        +el: name=Carbon     ; f=0.000124
-        +el: name=Nitrogen   ; f=0.755268
-        +el: name=Oxygen     ; f=0.231781
-        +el: name=Argon      ; f=0.012827
-
-Water: d=1.00 g/cm3 ; n=2 ; state=liquid
-        +el: name=Hydrogen   ; n=2
-        +el: name=Oxygen     ; n=1
-
-PMMA: d=1.19 g/cm3 ; n=3 ; state=solid
-        +el: name=Hydrogen   ; f=0.080538
-        +el: name=Carbon     ; f=0.599848
-        +el: name=Oxygen     ; f=0.319614
-
-Tungsten: d=19.3 g/cm3 ; n=1 ; state=solid
-        +el: name=auto       ; n=1
-
-Lead: d=11.35 g/cm3 ; n=1 ; state=solid
-        +el: name=auto       ; n=1
-
-NaI: d=3.67 g/cm3 ; n=2 ; state=solid
-        +el: name=Sodium     ; n=1
-        +el: name=Iodine     ; n=1
-
-CZT: d=5.78 g/cm3 ; n=3 ; state=solid
-        +el: name=Cadmium    ; n=9
-        +el: name=Zinc       ; n=1
-        +el: name=Tellurium  ; n=10
-"""
-
-_ELEMENTS = (
-    ("Hydrogen", "H", 1, 1.008),
-    ("Carbon", "C", 6, 12.011),
-    ("Nitrogen", "N", 7, 14.007),
-    ("Oxygen", "O", 8, 15.999),
-    ("Sodium", "Na", 11, 22.990),
-    ("Argon", "Ar", 18, 39.948),
-    ("Zinc", "Zn", 30, 65.38),
-    ("Cadmium", "Cd", 48, 112.414),
-    ("Tellurium", "Te", 52, 127.60),
-    ("Iodine", "I", 53, 126.904),
-    ("Tungsten", "W", 74, 183.84),
-    ("Lead", "Pb", 82, 207.2),
-)
+# Name in GATE -> its state; the material of the same name is in `MATERIALS`.
+_STATES = {
+    "Air": "gas", "Water": "liquid", "PMMA": "solid", "Tungsten": "solid", "Lead": "solid", "NaI": "solid",
+    "CZT": "solid",
+}  # fmt: skip
+_ELEMENTS = {  # symbol -> name, atomic number, molar mass in g/mol
+    "H": ("Hydrogen", 1, 1.008),
+    "C": ("Carbon", 6, 12.011),
+    "N": ("Nitrogen", 7, 14.007),
+    "O": ("Oxygen", 8, 15.999),
+    "Na": ("Sodium", 11, 22.990),
+    "Ar": ("Argon", 18, 39.948),
+    "Zn": ("Zinc", 30, 65.38),
+    "Cd": ("Cadmium", 48, 112.414),
+    "Te": ("Tellurium", 52, 127.60),
+    "I": ("Iodine", 53, 126.904),
+    "W": ("Tungsten", 74, 183.84),
+    "Pb": ("Lead", 82, 207.2),
+}
 
 
 def material_database() -> str:
-    """The materials as the text of a ``GateMaterials.db``, which GATE 9 and 10 both read."""
-    elements = [f"{name}: S= {symbol} ; Z= {z}. ; A= {a} g/mole" for name, symbol, z, a in _ELEMENTS]
-    return "\n".join(["[Elements]", *elements, "", "[Materials]", _MATERIALS])
+    """The text of a ``GateMaterials.db``, which GATE 9 and 10 both read."""
+    lines = ["[Elements]"]
+    lines += [f"{name}: S= {symbol} ; Z= {z}. ; A= {a} g/mole" for symbol, (name, z, a) in _ELEMENTS.items()]
+    lines += ["", "[Materials]"]
+    for name, state in _STATES.items():
+        material = MATERIALS.get(name) or MATERIALS[name.lower()]
+        lines.append(f"{name}: d={material.density:g} g/cm3 ; n={len(material.composition)} ; state={state}")
+        if len(material.composition) == 1:  # the element of the same name
+            lines.append("        +el: name=auto ; n=1")
+        else:
+            lines += [f"        +el: name={_ELEMENTS[s][0]} ; f={share:g}" for s, share in material.composition.items()]
+    return "\n".join(lines) + "\n"
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Simulation:
-    """What is simulated: the options of the Monte Carlo formats.
+    """The options of the Monte Carlo formats; `InputError` for an impossible one."""
 
-    Attributes
-    ----------
-    phantom : str or DerenzoPhantom
-        ``"point"``, ``"derenzo"`` (of the three numbers below), or a phantom.
-    radius, rods, height : float, 6 floats, float
-        Of the phantom ``"derenzo"``: radius, rod diameters and length of the rods, mm.
-    position, euler_degrees : 3 floats
-        Middle of the point or phantom, mm, and the phantom's Euler angles phi, theta, psi (`core.frames.euler_pose`).
-    pose : array (4, 4) or None
-        World-from-phantom, a rotation and a translation, instead of both.
-    isotope : str or Isotope
-        Its photons are emitted, each on its own.
-    activity : float or None
-        MBq in all, at the start. None: 1 MBq, or what the `DerenzoPhantom` holds.
-    time : float
-        s.
-    crystal, collimator, phantom_material : str
-        Their materials; a phantom of air attenuates next to nothing.
-    plate_thickness, wall_thickness : float
-        Of the aperture's plate and the collimator's walls, mm.
-    opening_degrees : float
-        Full angle of the knife edge's double cone.
-    edge_at : "middle", "front" or "back"
-        Where in the plate the knife edge is; front is the face towards the ROI.
-    intrinsic_fwhm : float
-        The crystal's resolution, mm; 0: none.
-    energy_resolution : float
-        FWHM at 140.5 keV as a share of the energy; it falls with the square root of the energy.
-    window_percent : float
-        Full width of the energy window around the isotope's strongest line.
-    seed : int
-        Of the random numbers.
-
-    Raises
-    ------
-    InputError
-        An option is none of these.
-    """
-
-    phantom: str | DerenzoPhantom = "point"
-    radius: float = 40.0
-    rods: tuple[float, ...] = (8.0, 6.0, 5.0, 4.0, 3.0, 2.0)
-    height: float = 40.0
-    position: tuple[float, ...] = (0.0, 0.0, 0.0)
-    euler_degrees: tuple[float, ...] = (0.0, 0.0, 0.0)
-    pose: NDArray[np.float64] | None = None
-    isotope: str | Isotope = "Tc-99m"
-    activity: float | None = None
-    time: float = 1.0
+    phantom: str | DerenzoPhantom = "point"  # "point", "derenzo" of the next three numbers, or a phantom
+    radius: float = 40.0  # of the phantom "derenzo", mm
+    rods: tuple[float, ...] = (8.0, 6.0, 5.0, 4.0, 3.0, 2.0)  # their diameters, mm
+    height: float = 40.0  # the rods' length, mm
+    position: tuple[float, ...] = (0.0, 0.0, 0.0)  # middle of the point or phantom, mm
+    euler_degrees: tuple[float, ...] = (0.0, 0.0, 0.0)  # the phantom's phi, theta, psi, as of `euler_pose`
+    pose: NDArray[np.float64] | None = None  # world from phantom (4, 4), rigid, instead of both
+    isotope: str | Isotope = "Tc-99m"  # its photons are emitted, each on its own
+    activity: float | None = None  # total at the start, MBq; None: 1, or that of a `DerenzoPhantom`
+    time: float = 1.0  # s
     crystal: Literal["NaI", "CZT"] = "NaI"
     collimator: Literal["Tungsten", "Lead"] = "Tungsten"
-    phantom_material: Literal["Air", "Water", "PMMA"] = "Air"
-    plate_thickness: float = 2.0
-    wall_thickness: float = 2.0
+    phantom_material: Literal["Air", "Water", "PMMA"] = "Air"  # air hardly attenuates
+    plate_thickness: float = 2.0  # mm; this and the next three as of `Construction`
+    wall_thickness: float = 2.0  # mm
     opening_degrees: float = 90.0
     edge_at: EdgePlace = "middle"
-    intrinsic_fwhm: float = 3.0
-    energy_resolution: float = 0.1
-    window_percent: float = 20.0
+    intrinsic_fwhm: float = 3.0  # the crystal's resolution, mm; 0: perfect
+    energy_resolution: float = (
+        0.1  # FWHM / energy at `REFERENCE_ENERGY`, falling with the energy's square root; 0: perfect
+    )
+    window_percent: float = 20.0  # full width of the energy window around the strongest line
     seed: int = 1
 
     def __post_init__(self) -> None:
-        set_ = object.__setattr__
-        if isinstance(self.phantom, DerenzoPhantom):
-            set_(self, "activity", self.phantom.total_activity * 1e-3 if self.activity is None else self.activity)
-        elif isinstance(self.phantom, str) and self.phantom == "derenzo":
-            set_(self, "phantom", DerenzoPhantom(self.radius, self.rods, self.height))
-        elif not (isinstance(self.phantom, str) and self.phantom == "point"):
-            raise InputError(f"phantom {self.phantom!r}: expected point, derenzo or a DerenzoPhantom")
-        if self.activity is None:
-            set_(self, "activity", 1.0)
-        for name, unit in (
-            ("activity", "MBq"),
-            ("time", "s"),
-            ("window_percent", "%"),
-        ):
-            set_(self, name, positive(getattr(self, name), name, unit))
-        for name in ("intrinsic_fwhm", "energy_resolution"):
-            value = float(real_array(getattr(self, name), name, ()))
-            if value < 0:
-                raise InputError(f"{name}: expected 0 or more, got {value:g}")
-            set_(self, name, value)
-        if self.window_percent >= 200:
+        positive(self.time, "time", "s")
+        if positive(self.window_percent, "window_percent", "%") >= 200:
             raise InputError(f"window_percent: expected less than 200, got {self.window_percent:g}")
-        _ = self.construction
-        kinds = get_type_hints(Simulation)
+        for name in ("intrinsic_fwhm", "energy_resolution"):
+            if (value := float(real_array(getattr(self, name), name, ()))) < 0:
+                raise InputError(f"{name}: expected 0 or more, got {value:g}")
+        types = get_type_hints(Simulation)
         for name in ("crystal", "collimator", "phantom_material"):
-            known = get_args(kinds[name])
+            known = get_args(types[name])
             if getattr(self, name) not in known:
                 raise InputError(f"{name} {getattr(self, name)!r}: expected one of {', '.join(known)}")
-        if isinstance(self.isotope, str):
-            set_(self, "isotope", isotope(self.isotope))
-        elif not isinstance(self.isotope, Isotope):
-            raise InputError(f"isotope: expected a name or an Isotope, got {type(self.isotope).__name__}")
-        # Geant4's engines take seeds up to 900 000 000 for sure (CLHEP's HepJamesRandom).
+        # Geant4's engines are sure to take seeds up to 900 000 000 (CLHEP's HepJamesRandom).
         seed = real_array(self.seed, "seed", ())
         if seed != int(seed) or not 0 < seed < 900_000_000:
             raise InputError(f"seed: expected a whole number from 1 to 899999999, got {self.seed!r}")
-        set_(self, "seed", int(seed))
+        _ = self.construction, self.nuclide, self.derenzo, self.becquerels, self.world_from_phantom
+
+    @cached_property
+    def derenzo(self) -> DerenzoPhantom | None:
+        """The phantom; None for a point."""
+        if isinstance(self.phantom, DerenzoPhantom):
+            return self.phantom
+        if self.phantom not in ("point", "derenzo"):
+            raise InputError(f"phantom {self.phantom!r}: expected point, derenzo or a DerenzoPhantom")
+        return DerenzoPhantom(self.radius, self.rods, self.height) if self.phantom == "derenzo" else None
+
+    @cached_property
+    def nuclide(self) -> Isotope:
+        """The isotope itself."""
+        if isinstance(self.isotope, str):
+            return isotope(self.isotope)
+        instance(self.isotope, Isotope, "isotope")
+        return self.isotope
+
+    @cached_property
+    def becquerels(self) -> float:
+        """Total activity, Bq."""
+        if self.activity is not None:
+            return positive(self.activity, "activity", "MBq") * 1e6
+        return self.phantom.total_activity * 1e3 if isinstance(self.phantom, DerenzoPhantom) else 1e6
+
+    @cached_property
+    def world_from_phantom(self) -> NDArray[np.float64]:
+        """(4, 4), from `pose` or from `position` and `euler_degrees`."""
         if self.pose is None:
             phi, theta, psi = np.radians(real_array(self.euler_degrees, "euler_degrees", (3,)))
-            set_(self, "pose", euler_pose(phi, theta, psi, real_array(self.position, "position", (3,))))
-        pose = checked_affine(self.pose, "phantom pose")  # type: ignore[arg-type]
+            return euler_pose(phi, theta, psi, real_array(self.position, "position", (3,)))
+        pose = checked_affine(self.pose, "phantom pose")
         rotation = pose[:3, :3]
         if not np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-9) or np.linalg.det(rotation) < 0:
             raise InputError("phantom pose: expected a rotation and a translation; solids are not scaled or mirrored")
-        set_(self, "pose", pose)
+        return pose
 
-    # As `__post_init__` leaves them, for the type checker too.
-    @property
-    def nuclide(self) -> Isotope:
-        """The isotope itself."""
-        assert isinstance(self.isotope, Isotope)
-        return self.isotope
-
-    @property
-    def place(self) -> NDArray[np.float64]:
-        """World-from-phantom (4, 4), from `pose` or from `position` and `euler_degrees`."""
-        assert self.pose is not None
-        return self.pose
-
-    @property
+    @cached_property
     def construction(self) -> Construction:
         """How the collimators are built."""
         angle = angle_from_degrees(self.opening_degrees)
         return Construction(self.plate_thickness, self.wall_thickness, angle, self.edge_at)
 
     @property
-    def becquerels(self) -> float:
-        """The activity, Bq."""
-        assert self.activity is not None
-        return self.activity * 1e6
-
-    @property
     def window(self) -> tuple[float, float]:
-        """Of energies, keV."""
+        """Energies, keV."""
         energy, _ = max(self.nuclide.lines, key=lambda line: line[1])
         half = self.window_percent / 200
         return energy * (1 - half), energy * (1 + half)
@@ -237,109 +169,75 @@ class Simulation:
         return sum(photons for _, photons in self.nuclide.lines)
 
 
-def simulation_options(**more: Any) -> Callable[[Callable[..., None]], Callable[..., None]]:
-    """Let ``write(system, views, path, **options)`` of a format show `Simulation`'s options, and `more`, with defaults."""
+class Placed(NamedTuple):
+    """Equal solids at their places in a mother volume.
 
-    kinds = get_type_hints(Simulation)
-    options = {f.name: (kinds[f.name], f.default) for f in fields(Simulation)}
-    options |= {name: (type(default), default) for name, default in more.items()}
-
-    def named(write: Callable[..., None]) -> Callable[..., None]:
-        signature = inspect.signature(write)
-        first = [p for p in signature.parameters.values() if p.kind is not p.VAR_KEYWORD]
-        last = [
-            inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=default, annotation=kind)
-            for name, (kind, default) in options.items()
-        ]
-        write.__signature__ = signature.replace(parameters=first + last)  # type: ignore[attr-defined]
-        write.__annotations__ |= {name: kind for name, (kind, _) in options.items()}
-        return write
-
-    return named
-
-
-class Part(NamedTuple):
-    """Equal solids in their places within a mother volume.
-
-    `size` by shape: ``box`` sides x, y, z; ``trd`` half-widths at -z and +z of a square frustum, and its height; ``cone``
-    radii at -z and +z, height; ``cylinder`` radius, height. `rotations` (N, 3, 3) have the solid's axes in the mother's
-    frame as columns, `centers` (N, 3) are in that frame.
+    `size` depends on the shape: ``box``: sides x, y, z; ``trd``: half-widths at -z and +z of a square frustum, and its
+    height; ``cone``: radii at -z and +z, height; ``cylinder``: radius, height. `rotations` (N, 3, 3) have the solid's axes
+    in the mother's frame as columns, `centers` (N, 3) are in that frame.
     """
 
     name: str
     mother: str
-    shape: str
+    shape: Literal["box", "trd", "cone", "cylinder"]
     size: tuple[float, ...]
     material: str
     centers: NDArray[np.float64]
     rotations: NDArray[np.float64]
 
 
-class Crystals(NamedTuple):
-    """Crystals of one size, and whose they are."""
+class Setup(NamedTuple):
+    """All that is simulated."""
 
-    part: Part
-    modules: NDArray[np.intp]
-
-
-class Rods(NamedTuple):
-    """One sector's rods within the phantom, and their activity, Bq."""
-
-    part: Part
-    activity: float
+    collimators: list[list[Placed]]  # kind by kind: the collimators, and the pieces of air in one of them
+    crystals: list[tuple[Placed, NDArray[np.intp]]]  # size by size: the crystals, and the indices of their modules
+    phantom: Placed | None  # its body; None for a point
+    rods: list[tuple[Placed, float]]  # sector by sector: the rods in the phantom, and their total activity, Bq
+    world: float  # side of the surrounding cube of air, mm
 
 
-class Scene(NamedTuple):
-    """All that is simulated.
+def build_setup(system: PinholeSystem, simulation: Simulation) -> Setup:
+    """The scanner and the phantom as solids.
 
-    `collimators` has one list for each class: the solid, and the air in it. `phantom` is None for a point. `world` is the
-    side of the cube of air.
-    """
-
-    simulation: Simulation
-    collimators: list[list[Part]]
-    crystals: list[Crystals]
-    phantom: Part | None
-    rods: list[Rods]
-    world: float
-
-
-def build_scene(system: PinholeSystem, simulation: Simulation) -> Scene:
-    """The scanner and what is in it, as solids.
-
-    A collimator is the body that `core.collimator` describes: its outside as a solid square frustum, and in it as air the
-    channel and the hole, a cone on either side of the knife edge, or on one where the edge is on a face of the plate.
+    Modules of equal sizes share a collimator: the body of `core.geometry.collimator`, its outside a solid square frustum,
+    and in it, as air, the channel and the hole, a cone on each side of the knife edge.
 
     Raises
     ------
     InputError
-        There is no such collimator, or one begins in the phantom.
+        A collimator cannot be built, or begins inside the phantom.
     """
     poses = system.poses()
     bodies = module_collimators(system, simulation.construction)
+    l, side, thickness = system.collimator_length, system.detector_side, system.detector_thickness
     collimators = [
-        _collimator(f"collimator_{i + 1}", modules, poses, bodies[modules[0]], simulation.collimator)
-        for i, modules in enumerate(
-            _classes(system.collimator_length, system.pinhole_diameter, system.detector_side, system.detector_thickness)
-        )
+        _collimator(f"collimator_{i + 1}", poses[modules], bodies[modules[0]], simulation.collimator)
+        for i, modules in enumerate(_alike(l, system.pinhole_diameter, side, thickness))
     ]
     crystals = []
-    by_size = _classes(system.detector_side, system.detector_thickness)
-    for i, modules in enumerate(by_size):
-        side, thickness = system.detector_side[modules[0]], system.detector_thickness[modules[0]]
-        depths = system.collimator_length[modules] + thickness / 2
-        name = "crystal" if len(by_size) == 1 else f"crystal{i + 1}"
-        part = Part(name, "world", "box", (side, side, thickness), simulation.crystal, *places(poses[modules], depths))
-        crystals.append(Crystals(part, modules))
+    sizes = _alike(side, thickness)
+    for i, modules in enumerate(sizes):
+        size = (side[modules[0]], side[modules[0]], thickness[modules[0]])
+        places = _behind_pinholes(poses[modules], l[modules] + size[2] / 2)
+        name = "crystal" if len(sizes) == 1 else f"crystal{i + 1}"
+        crystals.append((Placed(name, "world", "box", size, simulation.crystal, *places), modules))
+    outer = [parts[0] for parts in collimators] + [solids for solids, _ in crystals]
     phantom, rods = _phantom(simulation)
     if phantom is not None:
-        _refuse_inside(system, bodies, phantom)
-    outer = [parts[0] for parts in collimators] + [c.part for c in crystals] + ([] if phantom is None else [phantom])
-    reach = max([float(np.abs(simulation.place[:3, 3]).max()), *(np.abs(_corners(part)).max() for part in outer)])
-    return Scene(simulation, collimators, crystals, phantom, rods, math.ceil(2 * (reach + _SPACE)))
+        _refuse_overlap(system, bodies, phantom)
+        outer.append(phantom)
+    reach = max(np.abs(simulation.world_from_phantom[:3, 3]).max(), *map(_reach, outer))
+    return Setup(collimators, crystals, phantom, rods, math.ceil(2 * (reach + _SPACE)))
 
 
-def places(
+def _alike(*lengths: NDArray[np.float64]) -> list[NDArray[np.intp]]:
+    """Indices of the modules with equal lengths, kind by kind, from the shortest."""
+    _, kind = np.unique(np.round(np.stack(lengths, axis=1) / _SAME), axis=0, return_inverse=True)
+    kind = kind.reshape(-1)
+    return [np.flatnonzero(kind == i) for i in range(kind.max() + 1)]
+
+
+def _behind_pinholes(
     poses: NDArray[np.float64], depths: NDArray[np.float64] | float
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Centres and rotations of solids that lie `depths` mm behind their pinholes."""
@@ -347,60 +245,48 @@ def places(
     return poses[:, :3, 3] - np.broadcast_to(depths, len(poses))[:, None] * k, poses[:, :3, :3]
 
 
-def _classes(*lengths: NDArray[np.float64]) -> list[NDArray[np.intp]]:
-    """Indices of the modules of equal lengths, class by class, from the shortest."""
-    _, inverse = np.unique(np.round(np.stack(lengths, axis=1) / _SAME), axis=0, return_inverse=True)
-    inverse = inverse.reshape(-1)
-    return [np.flatnonzero(inverse == i) for i in range(inverse.max() + 1)]
-
-
-def _collimator(
-    name: str, modules: NDArray[np.intp], poses: NDArray[np.float64], body: Collimator, material: str
-) -> list[Part]:
-    """The solid and the pieces of air in it, front to back, of one class."""
+def _collimator(name: str, poses: NDArray[np.float64], body: Collimator, material: str) -> list[Placed]:
+    """The solids of one kind, and the pieces of air in each, front to back."""
     built, l, half_side = body.construction, body.length, body.detector_side / 2
     middle = (l + built.front) / 2  # depth of the solid's centre
 
-    def air(kind: str, shape: str, behind: float, before: float, back: float, front: float) -> Part:
-        """Air of widths `behind` and `before` from the depth `back` to `front`."""
-        center = np.array([[0.0, 0.0, middle - (front + back) / 2]])
-        return Part(f"{kind}_{name}", name, shape, (behind, before, back - front), "Air", center, np.eye(3)[None])
+    def air(kind: str, shape: Literal["trd", "cone"], front: tuple[float, float], back: tuple[float, float]) -> Placed:
+        """Air between two (depth, half-width)."""
+        center = np.array([[0.0, 0.0, middle - (front[0] + back[0]) / 2]])
+        size = (back[1], front[1], back[0] - front[0])
+        return Placed(f"{kind}_{name}", name, shape, size, "Air", center, np.eye(3)[None])
 
     outside = (half_side + built.wall_thickness, body.front_half_width, l - built.front)
-    profile = body.hole_profile
-    cones = [
-        air("front" if back <= 0 else "back", "cone", behind, before, back, front)
-        for (front, before), (back, behind) in pairwise(profile)
-    ]
     return [
-        Part(name, "world", "trd", outside, material, *places(poses[modules], middle)),
-        *cones,
-        air("channel", "trd", half_side, body.channel_half_width, l, built.back),
+        Placed(name, "world", "trd", outside, material, *_behind_pinholes(poses, middle)),
+        *(air("front" if back[0] <= 0 else "back", "cone", front, back) for front, back in pairwise(body.hole_profile)),
+        air("channel", "trd", (built.back, body.channel_half_width), (l, half_side)),
     ]
 
 
-def _phantom(simulation: Simulation) -> tuple[Part | None, list[Rods]]:
-    if not isinstance(simulation.phantom, DerenzoPhantom):
+def _phantom(simulation: Simulation) -> tuple[Placed | None, list[tuple[Placed, float]]]:
+    """The phantom's body, 1 mm larger than the rods, and the rods sector by sector."""
+    if simulation.derenzo is None:
         return None, []
-    table, height, material = simulation.phantom.rods(), simulation.phantom.height, simulation.phantom_material
-    pose = simulation.place
-    reach = float((np.hypot(table[:, 1], table[:, 2]) + table[:, 3] / 2).max())
-    size = (max(reach, simulation.phantom.radius) + 1.0, height + 2.0)
-    body = Part("phantom", "world", "cylinder", size, material, pose[None, :3, 3], pose[None, :3, :3])
+    material, pose, height = simulation.phantom_material, simulation.world_from_phantom, simulation.derenzo.height
+    table = simulation.derenzo.rods()
+    sector, x, y, diameter = table.T
+    reach = max(float((np.hypot(x, y) + diameter / 2).max()), simulation.derenzo.radius)
+    size = (reach + 1.0, height + 2.0)
+    body = Placed("phantom", "world", "cylinder", size, material, pose[None, :3, 3], pose[None, :3, :3])
     rods = []
-    areas = table[:, 3] ** 2
-    for sector in np.unique(table[:, 0]):
-        chosen = table[:, 0] == sector
-        centers = np.column_stack([table[chosen, 1:3], np.zeros(chosen.sum())])
+    for number in np.unique(sector):
+        own = sector == number
+        centers = np.column_stack([x[own], y[own], np.zeros(own.sum())])
         rotations = np.broadcast_to(np.eye(3), (len(centers), 3, 3))
-        rod = (table[chosen][0, 3] / 2, height)
-        part = Part(f"rods_{int(sector)}", "phantom", "cylinder", rod, material, centers, rotations)
-        rods.append(Rods(part, simulation.becquerels * areas[chosen].sum() / areas.sum()))
+        size = (diameter[own][0] / 2, height)
+        solids = Placed(f"rods_{int(number)}", "phantom", "cylinder", size, material, centers, rotations)
+        rods.append((solids, float(simulation.becquerels * (diameter[own] ** 2).sum() / (diameter**2).sum())))
     return body, rods
 
 
-def _refuse_inside(system: PinholeSystem, bodies: list[Collimator], phantom: Part) -> None:
-    """Refuse a phantom that a collimator's front reaches into."""
+def _refuse_overlap(system: PinholeSystem, bodies: list[Collimator], phantom: Placed) -> None:
+    """Raise `InputError` where a collimator's front reaches into the phantom."""
     poses, (radius, height) = system.poses(), phantom.size
     corners = np.array([[x, y, -1, 1] for x in (-1, 1) for y in (-1, 1)], float)
     for m, body in enumerate(bodies):
@@ -411,9 +297,8 @@ def _refuse_inside(system: PinholeSystem, bodies: list[Collimator], phantom: Par
             raise InputError(f"module {system.numbers[m]}: its collimator begins inside the phantom; move one of them")
 
 
-def _corners(part: Part) -> NDArray[np.float64]:
-    """Corners (8 N, 3), in the mother's frame, of the boxes around a part's solids."""
-    half = np.array(part.size) / 2 if part.shape == "box" else np.array([part.size[0], part.size[0], part.size[-1] / 2])
-    signs = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], float)
-    corners = part.centers[:, None] + np.einsum("nij,cj->nci", part.rotations, signs * half)
-    return corners.reshape(-1, 3)
+def _reach(solids: Placed) -> float:
+    """The largest coordinate, in the mother's frame, of the boxes around the solids."""
+    size = solids.size
+    half = np.array(size) / 2 if solids.shape == "box" else np.array([size[0], size[0], size[-1] / 2])
+    return float((np.abs(solids.centers) + np.abs(solids.rotations) @ half).max())

@@ -1,46 +1,36 @@
 """OpenCV and kornia: intrinsics and extrinsics.
 
-Camera axes x right, y down, z forward, pixel (0, 0) the centre of pixel 0 (OpenCV, "Camera Calibration and 3D
-Reconstruction"; kornia.geometry.camera.PinholeCamera). They describe the arrays as they are: x to the next column, y to
-the next row. Of `mosaic.as_seen` pictures, which are turned by 180 degrees, they are the cameras turned likewise.
+Camera axes are x right, y down, z forward; pixel (0, 0) is the centre of the first pixel (OpenCV, "Camera Calibration and
+3D Reconstruction"; kornia.geometry.camera.PinholeCamera). The cameras describe the arrays as they are: x to the next
+column, y to the next row. Pictures of `mosaic.as_seen` are turned by 180 degrees, and so must be their cameras.
 """
 
 from __future__ import annotations
 
-from pathlib import Path
+from typing import Any
 
 import numpy as np
 
-from ..geometry.system import PinholeSystem
 from ..geometry.views import Views
-from .arrays import SUFFIXES, write_arrays
-from .cameras import cameras
-from .format import Format
+from .camera_model import camera_model
+from .format import array_format
 
 
-def _write_opencv(system: PinholeSystem, views: Views, path: Path) -> None:
-    seen = cameras(views, "opencv")
+def _opencv(views: Views) -> dict[str, Any]:
+    camera = camera_model(views, "opencv")
     n_v, n_u = views.shape
-    intrinsics = np.zeros((len(views), 3, 3))
-    intrinsics[:, [0, 1], [0, 1]] = seen.focal_lengths
-    intrinsics[:, :2, 2] = seen.principal_points
-    intrinsics[:, 2, 2] = 1.0
-    arrays = {"K": intrinsics, "R": seen.rotations, "t": seen.translations, "width": n_u, "height": n_v}
-    write_arrays(path, arrays)
+    return {"K": camera.matrices, "R": camera.rotations, "t": camera.translations, "width": n_u, "height": n_v}
 
 
-def _write_kornia(system: PinholeSystem, views: Views, path: Path) -> None:
-    seen = cameras(views, "kornia")
-    intrinsics = np.tile(np.eye(4), (len(views), 1, 1))
-    intrinsics[:, [0, 1], [0, 1]] = seen.focal_lengths
-    intrinsics[:, :2, 2] = seen.principal_points
-    extrinsics = np.tile(np.eye(4), (len(views), 1, 1))
-    extrinsics[:, :3, :3] = seen.rotations
-    extrinsics[:, :3, 3] = seen.translations
-    size = np.tile(np.array(views.shape, np.float64), (len(views), 1))
-    arrays = {"intrinsics": intrinsics, "extrinsics": extrinsics, "height": size[:, 0], "width": size[:, 1]}
-    write_arrays(path, arrays)
+def _kornia(views: Views) -> dict[str, Any]:
+    camera = camera_model(views, "kornia")
+    intrinsics, extrinsics = np.tile(np.eye(4), (2, len(views), 1, 1))
+    intrinsics[:, :3, :3] = camera.matrices
+    extrinsics[:, :3, :3] = camera.rotations
+    extrinsics[:, :3, 3] = camera.translations
+    height, width = np.tile(np.array(views.shape, np.float64), (len(views), 1)).T
+    return {"intrinsics": intrinsics, "extrinsics": extrinsics, "height": height, "width": width}
 
 
-OPENCV = Format("opencv", "OpenCV: camera matrices K, rotations R and translations t", SUFFIXES, _write_opencv)
-KORNIA = Format("kornia", "kornia: PinholeCamera's 4 x 4 intrinsics and extrinsics", SUFFIXES, _write_kornia)
+OPENCV = array_format("opencv", "OpenCV: camera matrices K, rotations R and translations t", _opencv)
+KORNIA = array_format("kornia", "kornia: PinholeCamera's 4 x 4 intrinsics and extrinsics", _kornia)

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from ..geometry.system import PinholeSystem
 from ..geometry.views import Views
-from .cameras import pixel_axes, with_common_pitch
+from .camera_model import pixel_axes, with_common_pitch
 from .format import Format
 
 _PARAMETERS = (
@@ -25,36 +25,12 @@ _PARAMETERS = (
 )
 
 
-def _euler_angles(rotation: NDArray[np.float64]) -> tuple[float, float, float]:
-    """Gantry, out-of-plane and in-plane angle, radians, of R = Rz(-in) Rx(-out) Ry(-gantry).
-
-    The last is what the first two leave over, so that nothing is lost where they make the other two one (out = 90
-    degrees).
-    """
-    normal = rotation[2]
-    out = -np.arctan2(normal[1], np.hypot(normal[0], normal[2]))
-    gantry = -np.arctan2(-normal[0], normal[2])
-    rest = rotation @ (_about_x(-out) @ _about_y(-gantry)).T
-    return float(gantry), float(out), float(-np.arctan2(rest[1, 0], rest[0, 0]))
-
-
-def _about_x(angle: float) -> NDArray[np.float64]:
-    c, s = np.cos(angle), np.sin(angle)
-    return np.array([[1.0, 0.0, 0.0], [0.0, c, -s], [0.0, s, c]])
-
-
-def _about_y(angle: float) -> NDArray[np.float64]:
-    c, s = np.cos(angle), np.sin(angle)
-    return np.array([[c, 0.0, s], [0.0, 1.0, 0.0], [-s, 0.0, c]])
-
-
 def _write(system: PinholeSystem, views: Views, path: Path) -> None:
     """Nine parameters a view, and the matrix from world mm to detector mm that follows from them.
 
-    RTK's detector axes are r, c and r x c. They are the arrays' columns and rows here, so that no array need be turned
-    over; r x c then points along the rays, not against them, and RTK's distances, which may have either sign, come out
-    negative for images that are not mirrored. Detector mm are pixels times the pitch from the image's middle: the
-    projections' spacing and origin, which are no part of an RTK geometry, stand in a comment.
+    RTK's detector axes r and c are the arrays' columns and rows, so that no array need be flipped. Then r x c points along
+    the rays, not against them, and RTK's distances, which may have either sign, are negative for images that are not
+    mirrored. The projections' spacing and origin are not part of an RTK geometry: they stand in a comment.
     """
     views, pitch = with_common_pitch(views, "rtk")
     _, (r, c) = pixel_axes(views)
@@ -71,10 +47,10 @@ def _write(system: PinholeSystem, views: Views, path: Path) -> None:
         rotation = np.stack([r[m], c[m], np.cross(r[m], c[m])])
         source, detector = rotation @ views.sources[m], rotation @ views.detector_centers[m]
         distance = source[2] - detector[2]
-        angles = np.degrees(_euler_angles(rotation))
-        values = (source[2], distance, source[0], source[1], detector[0], detector[1], *angles)
+        values = (source[2], distance, *source[:2], *detector[:2], *np.degrees(_euler_angles(rotation)))
         # p = T(source - detector) diag(-SDD, -SDD, 1) [x - source]
-        shift = np.array([[1.0, 0.0, source[0] - detector[0]], [0.0, 1.0, source[1] - detector[1]], [0.0, 0.0, 1.0]])
+        shift = np.eye(3)
+        shift[:2, 2] = source[:2] - detector[:2]
         linear = shift @ np.diag([-distance, -distance, 1.0]) @ rotation
         matrix = np.column_stack([linear, -linear @ views.sources[m]])
         lines.append("  <Projection>")
@@ -84,6 +60,21 @@ def _write(system: PinholeSystem, views: Views, path: Path) -> None:
         lines += ["    </Matrix>", "  </Projection>"]
     lines.append("</RTKThreeDCircularGeometry>")
     path.write_text("\n".join(lines) + "\n", encoding="ascii")
+
+
+def _euler_angles(rotation: NDArray[np.float64]) -> tuple[float, float, float]:
+    """Gantry, out-of-plane and in-plane angle, rad, of R = Rz(-in) Rx(-out) Ry(-gantry).
+
+    The in-plane angle is what remains after the other two, so R is exact at out = 90 degrees too, where gantry and in-plane
+    angle turn about the same axis.
+    """
+    x, y, z = rotation[2]
+    out, gantry = -np.arctan2(y, np.hypot(x, z)), np.arctan2(x, z)
+    (c, s), (c_out, s_out) = (np.cos(gantry), np.sin(gantry)), (np.cos(out), np.sin(out))
+    about_y = np.array([[c, 0.0, -s], [0.0, 1.0, 0.0], [s, 0.0, c]])
+    about_x = np.array([[1.0, 0.0, 0.0], [0.0, c_out, s_out], [0.0, -s_out, c_out]])
+    rest = rotation @ (about_x @ about_y).T
+    return float(gantry), float(out), float(-np.arctan2(rest[1, 0], rest[0, 0]))
 
 
 RTK = Format("rtk", "RTK: ThreeDCircularProjectionGeometry", (".xml",), _write)

@@ -27,7 +27,7 @@ from .models import Array, Model, view_rays
 from .pixel_points import TOLERANCE, expected_error, lattice, offsets, points_needed, require_points, shadow_edges
 from .rays import Fan
 
-# Views may differ from the system they are said to be of by a file's rounding (mm; sine of an angle).
+# Views may differ from their system by a file's rounding (mm; sine of an angle).
 _SAME_PLACE = 1e-3
 _SAME_DIRECTION = 1e-6
 
@@ -46,11 +46,11 @@ class Emission(Model):
 
         time * d_e^2 p_u p_v cos^4(psi) / (16 l^2) * efficiency * integral of f exp(-integral of mu) dr
 
-    with p the pixel pitch on the crystal (of a virtual detector's pixel: its image there), d_e the pinhole's
-    effective diameter and l the collimator's length. Summed over the pixels that is the law of a point source at
-    height h above the pinhole's plane, seen at elevation theta: ``g = d_e^2 sin^3(theta) / (16 h^2)``. The 1/r^2 of
-    that law is in the density of the rays. The rays run from the pinhole through the whole grid, wherever a virtual
-    detector stands. By default the pinhole is ideal: nothing attenuates, penetrates, blurs or is missed.
+    with p the pixel pitch on the crystal (for a virtual detector that of its image there), d_e the pinhole's
+    effective diameter and l the collimator's length. Summed over the pixels this is the sensitivity to a point source at
+    height h above the pinhole's plane and elevation theta: ``g = d_e^2 sin^3(theta) / (16 h^2)``. The 1/r^2 of that law
+    is in the density of the rays. Rays run from the pinhole through the whole grid, wherever a virtual detector stands.
+    By default the pinhole is ideal: no attenuation, penetration, blur or missed photons.
 
     Attributes
     ----------
@@ -58,65 +58,63 @@ class Emission(Model):
         The modules, as many as the views and in their order: ``Emission(system[0:20])`` for
         ``system[0:20].views(...)``.
     mu : Volume, optional
-        What attenuates the photons between each point and the pinhole ("mu", 1/mm), at the energy that is counted: on
-        any grid, the activity's or another. It is exact for the piecewise constant volumes: nothing is resampled, a
-        ray is cut by the planes of both grids, and inside a voxel ``exp(-integral of mu)`` is integrated in closed
-        form. None: no attenuation.
+        Attenuation coefficients ("mu", 1/mm) at the energy that is counted, on the activity's grid or any other. The
+        result is exact for piecewise constant volumes: nothing is resampled, the planes of both grids cut the rays, and
+        ``exp(-integral of mu)`` is integrated in closed form inside a voxel. None: no attenuation.
     time : float
         Of the acquisition, s.
     isotope : Isotope or str, optional
-        What decays (`core.isotopes`): its photons are counted, and its activity, that of the volume at the start, falls
-        during `time`. None: one photon per decay, and an activity that stays.
+        Its photons are counted, and the volume is its activity at the start, which decays during `time`. None: one photon
+        per decay, and constant activity.
     window : tuple of (float, float), optional
         Energies, keV, between which the isotope's photons are counted. None: 10 % around its strongest line.
     photons_per_decay : float, optional
         Instead of the isotope's.
     pixel_points : int, optional
-        Points of each pixel's area, for each point of the hole, from which rays start. None: as many as `tolerance` asks
-        for, which depends on the voxels' size and distance, on the pixels' size, and on the directions from which a module
-        sees the voxels: small voxels on large pixels take many. A number of one's own is taken as it is, with a warning
-        where it is too small for the tolerance. 1, with one point of the hole: the pixels' centres alone.
+        Points of each pixel's area, for each point of the hole, from which rays start. None: as many as `tolerance`
+        requires, which depends on the sizes of voxels and pixels and on the voxels' distance and orientation: small
+        voxels on large pixels take many. A given number is used as it is, with a warning if it is too small for the
+        tolerance. 1, with one point of the hole: only the pixels' centres.
     tolerance : float
-        Largest error of the total counts of a single voxel in any module, as a share of them, wherever it lies between
-        the rays: 2 % by default. Larger sources are more accurate.
+        Largest relative error of the total counts of a single voxel in any module, wherever it lies between the rays: 2 %
+        by default. Larger sources are more accurate.
     aperture_points : int
-        Points of the hole's disk that rays pass, each counting the same: the blur of a hole of diameter d_e.
-        With 1 all rays pass the middle, and the hole blurs nothing; else at least 3.
+        Points of the hole's disk that rays pass, all with the same weight: the blur of a hole of diameter d_e.
+        With 1 all rays pass the centre and there is no blur; otherwise at least 3.
     aperture_tolerance : float, optional
-        Instead of `aperture_points`: as few points as keep the image of one of the grid's voxels, at the isocentre, near
-        to that of the whole hole: the absolute differences of the pixels, each counting over its whole area, sum to at
-        most this share of the counts. Errors at most add up, so it holds for any activity around the isocentre.
+        Instead of `aperture_points`: as few points as keep the image of one voxel at the isocentre close to that of the
+        whole hole. The absolute differences of the pixels sum to at most this share of the counts, and, as errors at most
+        add up, so they do for any activity around the isocentre.
     aperture_mu : float or str, optional
-        Attenuation coefficient of the aperture's material at the photons' energy, 1/mm; or the material's name
-        (`core.materials`: ``"tungsten"``), whose coefficient at the isotope's photons in the window takes its place: of
-        several lines, the one with which as many photons pass as do of all together (`materials.module_coefficients`).
-        None: nothing penetrates it, d_e = d.
+        Attenuation coefficient of the aperture's material at the photons' energy, 1/mm, or the material's name
+        (``"tungsten"``, see `MATERIALS`). Of several lines in the window the coefficient is the one that lets as many
+        photons pass as all lines together (`module_coefficients`). None: no penetration, d_e = d.
     opening_angle : float
         Full angle alpha of the knife edge's double cone, rad.
     edge : str
-        How photons penetrate the knife edge. ``"paix"``: as if the hole were one of diameter d_e with
-        ``d_e^2 = d (d + 2 / mu tan(alpha / 2))`` (Paix 1967), for every direction alike. ``"path"``: each by its path
-        through the edge, ``exp(-mu path)``, through rays that pass beyond the rim, the edge being as thick as the cone
-        goes on; what is steeper than the cone passes nowhere. On the axis that is
-        ``d_e^2 = d^2 + 2 d / mu tan(alpha / 2) + 2 / mu^2 tan^2(alpha / 2)`` (Metzler 2001). The hole itself needs no
-        correction for its obliquity in either: seen at psi its area is cos(psi) times the disk's, which is in cos^4(psi).
-        With one aperture point the edge changes the counts alone; with n, the blur too, by some 4 sqrt(pi n) rays more.
+        How photons penetrate the knife edge. ``"paix"``: as if the hole had the diameter d_e with
+        ``d_e^2 = d (d + 2 / mu tan(alpha / 2))`` (Paix 1967), in every direction. ``"path"``: rays beyond the rim are
+        weighted with ``exp(-mu path)`` for their path through the edge, which is as thick as the cone continues; rays
+        steeper than the cone are blocked. On the axis this gives
+        ``d_e^2 = d^2 + 2 d / mu tan(alpha / 2) + 2 / mu^2 tan^2(alpha / 2)`` (Metzler 2001). Neither needs a correction
+        for obliquity: at psi the hole's area is cos(psi) times the disk's, which is in cos^4(psi). With one aperture
+        point the edge changes only the counts; with n, also the blur, with about 4 sqrt(pi n) more rays.
     crystal_mu : float or str, optional
         Attenuation coefficient of the crystal at the photons' energy, 1/mm, or its name (``"NaI"``), as for the aperture.
         With it ``1 - exp(-crystal_mu Td / cos(psi))`` of the photons are counted. None: all.
     depth_layers : int
-        Depths in the crystal, from front to back, at which photons are recorded, with `crystal_mu`: slanted rays are
-        recorded the farther out, the deeper they are absorbed (parallax). Number and mean depth are exact for every
-        angle from 2 on. With 1 all are recorded where they enter.
+        Depths in the crystal at which photons are absorbed, with `crystal_mu`: the deeper, the farther out slanted rays are
+        recorded (parallax). From 2 on, counts and mean depth are exact for every angle. With 1 all photons are recorded
+        where they enter.
     intrinsic_fwhm : float
-        Of the detector's Gaussian blur, mm on the crystal. What is blurred over the image's edge is lost.
+        Of the detector's Gaussian blur, mm on the crystal. Counts blurred over the image's edge are lost.
     within_crystal : bool
-        Whether pixels, or the parts of them, beyond the crystal's side Ld count nothing.
+        Whether pixels, or parts of them, outside the crystal's side Ld count nothing.
     within_walls : bool
-        Whether the collimator's walls stop photons: those that would not enter by the crystal's front, but by its
-        sides or not at all. The walls run straight from the hole's rim to the front's edges, so no others meet them.
+        Whether the collimator's walls stop photons that would enter through the crystal's sides, or miss it. The walls run
+        straight from the hole's rim to the edges of the crystal's front, so they stop no others.
     within_cone : bool
-        Whether what comes steeper than the knife edge's cone, psi > alpha / 2, counts nothing, for every edge.
+        Whether rays steeper than the knife edge's cone, psi > alpha / 2, count nothing, with either edge.
 
     Raises
     ------
@@ -281,7 +279,7 @@ class Emission(Model):
         u, v, k = self.system.frames()[m]
         l = self.system.collimator_length[m]
         pinhole, rays, scale = views.sources[m], view_rays(views, m), self._crystal_scale(views, m)
-        # The pixels' places on the crystal, mm along u and v, point-inverted, seen from its middle.
+        # The pixels' places on the crystal, mm along u and v from its centre, point-inverted.
         middle = scale * (rays.corner - pinhole) - l * k
         pitch_u, pitch_v = self._crystal_pitch(views, m)
         n_v, n_u = views.shape

@@ -1,4 +1,4 @@
-"""A sum along rays that weights every voxel with the sensitivity of a point source: known, used, and no count."""
+"""A sum along rays that weights every voxel with the sensitivity to a point source; it is not a number of counts."""
 
 from __future__ import annotations
 
@@ -22,13 +22,12 @@ class InverseSquareSum(Model):
     """Siddon's segments times ``d^2 sin^3(theta) / (16 h^2)``, a point source's sensitivity, summed along each ray.
 
     The sum over voxels of value x length of the ray in it x sensitivity, with theta the ray's elevation over the
-    pinhole's plane and h the height of the voxel's centre over it (voxels at or behind the plane count nothing): what
-    "weight each segment with 1/h^2" says, for comparison with programs that do so.
+    pinhole's plane and h the height of the voxel's centre over it (voxels at or behind the plane count nothing). It is for
+    comparison with programs that weight each segment with 1/h^2.
 
-    It is not what a camera counts. The rays of a pixel grid already thin out as 1/h^2 behind the pinhole: of a
-    point source that moves away, a smaller image is left, of as many fewer pixels. Weighting the segments with 1/h^2 again
-    makes the total counts of a point source fall as 1/h^4, and far parts of an object too dark by (h_near / h_far)^2.
-    `Emission` follows the law; this sum has no unit of counts.
+    It is not what a camera counts. The density of a pixel grid's rays already falls as 1/h^2: a point source farther away
+    covers fewer pixels. Weighting the segments with 1/h^2 again makes the total counts of a point source fall as 1/h^4,
+    and far parts of an object too dark by (h_near / h_far)^2. `Emission` follows the law of the pinhole.
 
     Attributes
     ----------

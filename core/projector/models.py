@@ -24,28 +24,28 @@ Array = NDArray[np.float64]
 
 
 class Model(ABC):
-    """What a pixel measures: ``response(sum over beams of weight * integral along the ray of volume * voxel weight)``.
+    """What a pixel measures: ``response(sum over rays of weight * integral of volume * voxel weight)``.
 
-    Linear in the volume. The operator does the rest, so a model knows neither backends nor adjoints.
+    It is linear in the volume. A model describes only rays and weights; backends and adjoints are the operator's.
     """
 
     name: str
     """What a run's record calls it."""
 
     mu: Volume | None = None
-    """What attenuates the rays between the point that is measured and their source, 1/mm."""
+    """Attenuation coefficients between each point and the rays' source, 1/mm."""
 
     takes: tuple[str, ...] = LINE_INTEGRALS
-    """Quantities of volumes that it has a meaning for; arrays and tensors say none, so that theirs are the caller's."""
+    """Quantities of volumes that can be projected; arrays and tensors have none and are not checked."""
 
     weights_voxels: bool = False
-    """Whether each view weights the voxels in its own way (`voxel_weights`)."""
+    """Whether each view has its own voxel weights (`voxel_weights`)."""
 
-    def check(self, views: Views) -> None:  # noqa: B027  (most have nothing to check)
+    def check(self, views: Views) -> None:  # noqa: B027  (most models have nothing to check)
         """Raise `InputError` where the model is not for these views."""
 
     def caution(self, views: Views, grid: Grid) -> str | None:
-        """What a user who projects `grid` into `views` should be warned of."""
+        """A warning for users who project `grid` into `views`, if there is one."""
         return None
 
     def check_volume(self, volume: Volume) -> None:
@@ -62,10 +62,10 @@ class Model(ABC):
 
     @abstractmethod
     def beams(self, views: Views, m: int, grid: Grid) -> Iterator[Beam]:
-        """The rays of view m through `grid`, their sources on the detector's side of what is measured."""
+        """The rays of view m through `grid`, from the detector's side."""
 
     def voxel_weights(self, views: Views, m: int, grid: Grid) -> Array:
-        """What the voxels are multiplied by before view m is taken, of ``grid.shape``; asked for if `weights_voxels`."""
+        """Factors of the voxels in view m, ``grid.shape``; used if `weights_voxels`."""
         return np.ones(grid.shape)
 
     def response(self, views: Views, m: int) -> tuple[Array, Array] | None:
@@ -80,10 +80,10 @@ class Transmission(Model):
     Attributes
     ----------
     pixel_points : int or None
-        Points of each pixel's area to which rays run, and whose line integrals are averaged. 1, the default: the pixel's
-        centre alone, as in most programs for radiographs. None: as many as `tolerance` asks for.
+        Points of each pixel's area whose line integrals are averaged. 1, the default: the pixel's centre, as in most
+        programs for radiographs. None: as many as `tolerance` requires.
     tolerance : float
-        With automatic points, the share of its sum over the image to which a single voxel is right, wherever it lies.
+        With automatic points, the largest relative error of a single voxel's sum over the image, wherever it lies.
 
     Raises
     ------

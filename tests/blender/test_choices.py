@@ -85,9 +85,9 @@ FROZEN = {
     "MPHDRR_OT_show_modules": {"mode": {"ONLY": 0, "SHOW": 1, "HIDE": 2, "ALL": 3}},
     "MPHDRR_OT_renumber_modules": {"order": {"RINGS": 0, "LIST": 1}},
     "MPHDRR_OT_export_for_program": {
-        "format": {
-            "astra": 0, "rtk": 1, "opencv": 2, "kornia": 3, "pytorch3d": 4, "nerf": 5, "leap": 6, "pytomography": 7,
-            "stir": 8, "stl": 9, "stl-parts": 10, "3mf": 11, "glb": 12, "gate9": 13, "gate10": 14, "mphdrr": 15,
+        "format": {  # 7 and 8 were PyTomography and STIR in version 0.1.0
+            "astra": 0, "rtk": 1, "opencv": 2, "kornia": 3, "pytorch3d": 4, "nerf": 5, "leap": 6,
+            "stl": 9, "stl-parts": 10, "3mf": 11, "glb": 12, "gate9": 13, "gate10": 14, "mphdrr": 15,
         },
     },
 }  # fmt: skip

@@ -15,7 +15,6 @@ torch = pytest.importorskip("torch", reason="torch is not installed")
 pytest.importorskip("roma", reason="roma is not installed")
 
 from mphdrr.core.errors import InputError  # noqa: E402
-from mphdrr.core.exchange import trilinear  # noqa: E402
 from mphdrr.core.exchange.diffdrr import (  # noqa: E402
     DRR,
     Registration,
@@ -107,46 +106,12 @@ def test_images_and_points_are_those_of_diffdrr(options, torchio_subject):
     np.testing.assert_allclose(got, theirs.inverse_projection(theirs_pose, pixels), rtol=1e-3, atol=1e-3)
 
 
-@pytest.mark.parametrize(
-    ("options", "call"),
-    [
-        ({}, {}),
-        ({}, {"n_points": 90}),
-        ({}, {"align_corners": True}),
-        ({}, {"alphamin": 0.3, "alphamax": 0.7}),
-        ({}, {"mask_to_channels": True}),
-        ({"mode": "nearest", "voxel_shift": 0.0}, {}),
-        ({"reducefn": "max"}, {}),
-        ({"reducefn": lambda samples: samples.square().sum(-1)}, {}),
-        ({"patch_size": 4, "x0": 7.0, "reverse_x_axis": False}, {}),
-        ({"reshape": False}, {}),
-    ],
-)
-def test_sampled_images_are_those_of_diffdrr(options, call, torchio_subject):
-    """The trilinear renderer takes the same samples; its gradient jumps between voxels, so few rays may differ."""
-    images, gradients = [], []
-    for module in (peer()[0].DRR, DRR):
-        drr = module(torchio_subject, 240.0, 12, 4.0, renderer="trilinear", **options)
-        rotation, translation = ROTATION.clone().requires_grad_(), TRANSLATION.clone().requires_grad_()
-        image = drr(rotation, translation, parameterization="axis_angle", **call)
-        (image * torch.linspace(0, 1, image.numel()).reshape(image.shape)).sum().backward()
-        images.append(image.detach())
-        gradients.append(torch.cat([rotation.grad.ravel(), translation.grad.ravel()]))
-    assert images[0].shape == images[1].shape
-    same = np.isclose(images[1], images[0], atol=2e-5 * float(images[0].max()))
-    # A sample half-way between two voxels or structures is either one's.
-    assert same.mean() > 0.97 if options.get("mode") == "nearest" or "mask_to_channels" in call else same.all()
-    if options.get("mode") != "nearest":
-        np.testing.assert_allclose(gradients[1], gradients[0], rtol=0.02, atol=5e-3 * float(gradients[0].abs().max()))
-
-
-@pytest.mark.parametrize("renderer", ["siddon", "trilinear"])
-def test_subsampled_pixels_are_those_of_diffdrr(renderer, torchio_subject):
+def test_subsampled_pixels_are_those_of_diffdrr(torchio_subject):
     """The same seed chooses the same pixels."""
     images = []
     for module in (peer()[0].DRR, DRR):
         torch.manual_seed(5)
-        drr = module(torchio_subject, 240.0, 12, 4.0, p_subsample=0.4, renderer=renderer)
+        drr = module(torchio_subject, 240.0, 12, 4.0, p_subsample=0.4)
         images.append(drr(ROTATION[:1], TRANSLATION[:1], parameterization="axis_angle"))
     assert int((images[0] == 0).sum()) >= 86
     np.testing.assert_allclose(images[1], images[0], atol=2e-4 * float(images[0].max()))
@@ -155,17 +120,11 @@ def test_subsampled_pixels_are_those_of_diffdrr(renderer, torchio_subject):
 def test_calibration_is_that_of_diffdrr(torchio_subject):
     module, pose_module, _ = peer()
     calibration = torch.tensor([[5.0, 0.2, 0, 3], [0.1, 4.0, 0, -6], [0, 0, 220.0, 0], [0, 0, 0, 1]])
-    for renderer in ("siddon", "trilinear"):
-        expected, got = (
-            drr(torchio_subject, 240.0, 10, 4.0, renderer=renderer)(
-                ROTATION,
-                TRANSLATION,
-                parameterization="axis_angle",
-                calibration=pose_module.RigidTransform(calibration),
-            )
-            for drr in (module.DRR, DRR)
-        )
-        np.testing.assert_allclose(got, expected, atol=2e-4 * float(expected.max()))
+    arguments = {"parameterization": "axis_angle", "calibration": pose_module.RigidTransform(calibration)}
+    expected, got = (
+        drr(torchio_subject, 240.0, 10, 4.0)(ROTATION, TRANSLATION, **arguments) for drr in (module.DRR, DRR)
+    )
+    np.testing.assert_allclose(got, expected, atol=2e-4 * float(expected.max()))
 
 
 @pytest.mark.parametrize("orientation", ["AP", "PA", None])
@@ -281,6 +240,9 @@ def test_generation_before_04(rng):
     image = drr(rotation, translation, parameterization="euler_angles", convention="ZYX")
     assert image.shape == (1, 1, 8, 11)
     assert torch.equal(image, drr(rotation, translation))
+    drr.reshape = False
+    assert torch.equal(drr(rotation, translation), image.reshape(1, 88))
+    drr.reshape = True
     turn = se3_exp(torch.tensor([[0, 0, 0, 0, 0, 0.4]])) @ se3_exp(torch.tensor([[0, 0, 0, 0, -0.3, 0]]))
     turn = (turn @ se3_exp(torch.tensor([[0, 0, 0, 0.2, 0, 0]])))[0, :3, :3].double()
     row, column = 6, 2
@@ -306,64 +268,6 @@ def test_points_before_04(rng):
     points = drr.inverse_projection(pose, pixels)
     nearer = torch.lerp(pose.to(torch.float64)(drr.detector.source[None]), points, 0.6)
     np.testing.assert_allclose(drr.perspective_projection(pose, nearer), pixels, atol=1e-4)
-
-
-def test_sampled_images_before_04(rng):
-    """Samples at fractions from near to far, voxel i's centre at i times the spacing, each counting 1 / n_points."""
-    interpolated = pytest.importorskip("scipy.ndimage").map_coordinates
-    hu, spacing = ct(rng), np.array([1.5, 2.0, 1.0])
-    drr = DRR(hu, spacing, 90.0, 8, 5.0, renderer="trilinear", near=0.1, far=0.95)
-    pose = convert(
-        torch.tensor([[0.4, -0.3, 0.2]]), torch.zeros(1, 3), parameterization="euler_angles", convention="ZYX"
-    )
-    pose.matrix[0, :3, 3] = torch.tensor(np.array(hu.shape) * spacing / 2)
-    source, targets = (pose(x[None]).double()[0] for x in (drr.detector.source, drr.detector.targets()))
-    points = torch.lerp(source, targets[:, None], torch.linspace(0.1, 0.95, 120, dtype=torch.float64)[:, None])
-    density = hu_to_density(torch.from_numpy(hu)).flip([0]).double().numpy()
-    samples = interpolated(density, (points.numpy() / spacing).transpose(2, 0, 1), order=1, mode="grid-constant")
-    expected = samples.sum(-1) / 120 * np.asarray((targets - source).norm(dim=-1))
-    image = drr(pose, n_points=120).reshape(-1)
-    np.testing.assert_allclose(image, expected, atol=2e-5 * expected.max())
-    drr.reshape = False
-    assert drr(pose).shape == (1, 64)
-
-
-def test_many_samples_are_the_integral(subject, monkeypatch):
-    """In a smooth volume; whatever the chunks."""
-    axes = np.stack(np.meshgrid(*[np.arange(n) for n in subject.density.shape], indexing="ij"), -1)
-    smooth = torch.tensor(np.exp(-((axes - np.array([11, 10, 10.5])) ** 2).sum(-1) / 50), dtype=torch.float32)
-    subject = Subject(smooth, subject.affine, subject.reorient)
-    pose = convert(ROTATION, TRANSLATION, parameterization="axis_angle")
-    exact = DRR(subject, 240.0, 8, 4.0)(pose)
-    sampled = DRR(subject, 240.0, 8, 4.0, renderer="trilinear")
-    image = sampled(pose, n_points=800)
-    np.testing.assert_allclose(image, exact, atol=0.03 * float(exact.max()))
-    monkeypatch.setattr(trilinear, "_SAMPLES_AT_ONCE", 5000)
-    np.testing.assert_allclose(sampled(pose, n_points=800), image, rtol=1e-6)
-
-
-def test_gradients_of_samples(subject):
-    """By the density exactly, by the pose between two voxels' centres: against finite differences in float64."""
-    density = torch.rand(subject.density.shape, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
-    drr = DRR(Subject(density, subject.affine, subject.reorient), 240.0, 5, 8.0, renderer="trilinear").double()
-    motion = torch.tensor([[4.0, 120.0, -7.0, 0.3, -0.2, 0.1]], dtype=torch.float64, requires_grad=True)
-    drr.density.requires_grad_()
-
-    def score(motion):
-        return drr(se3_exp(motion), n_points=40).square().sum()
-
-    score(motion).backward()
-    for i in range(6):
-        step = torch.zeros(1, 6, dtype=torch.float64)
-        step[0, i] = 1e-6
-        with torch.no_grad():
-            difference = (score(motion + step) - score(motion - step)) / 2e-6
-        assert float(motion.grad[0, i]) == pytest.approx(float(difference), rel=1e-4, abs=1e-3)
-    with torch.no_grad():
-        change = torch.randn(density.shape, dtype=torch.float64, generator=torch.Generator().manual_seed(1))
-        expected = score(motion), (drr.density.grad * change).sum()
-        drr.density += 1e-6 * change
-        assert float((score(motion) - expected[0]) / 1e-6) == pytest.approx(float(expected[1]), rel=1e-4)
 
 
 def test_subsampled_pixels(subject):
@@ -439,6 +343,12 @@ def test_the_c_arm_preset_is_what_the_users_scripts_make(system, rng):
         np.testing.assert_allclose(image, expected.T.flip([1]), rtol=1e-4, atol=1e-4)
 
 
+def test_the_import_path_of_version_0_1_0_works():
+    from mphdrr.core import diffdrr
+
+    assert diffdrr.DRR is DRR
+
+
 def test_rigid_transforms():
     pose = convert(ROTATION, TRANSLATION, parameterization="axis_angle")
     points = torch.randn(2, 4, 3)
@@ -449,16 +359,12 @@ def test_rigid_transforms():
 
 
 def test_bad_input_is_one_clear_line(subject):
-    drr, sampled = DRR(subject, 240.0, 6, 4.0), DRR(subject, 240.0, 6, 4.0, renderer="trilinear")
+    drr = DRR(subject, 240.0, 6, 4.0)
     for call, word in (
         (lambda: DRR(subject, 240.0, 6, 4.0, renderer="cubic"), "siddon"),
-        (lambda: DRR(subject, 240.0, 6, 4.0, mode="bilinear"), "trilinear"),
-        (lambda: DRR(subject, 240.0, 6, 4.0, renderer="trilinear", near=0.1), "near"),
-        (lambda: DRR(subject, 240.0, 6, 4.0, renderer="trilinear", mode="cubic"), "bilinear"),
-        (lambda: DRR(subject, 240.0, 6, 4.0, renderer="trilinear", whole_line=True), "whole_line"),
-        (lambda: drr(ROTATION, TRANSLATION, parameterization="axis_angle", n_points=9), "n_points"),
-        (lambda: sampled(ROTATION, TRANSLATION, parameterization="axis_angle", n_points=0), "n_points"),
-        (lambda: sampled(ROTATION, TRANSLATION, parameterization="axis_angle", colour=0), "colour"),
+        (lambda: DRR(subject, 240.0, 6, 4.0, renderer="trilinear"), "use DiffDRR itself"),
+        (lambda: DRR(subject, 240.0, 6, 4.0, mode="bilinear"), "nearest"),
+        (lambda: DRR(subject, 240.0, 6, 4.0, reducefn="max"), "sum"),
         (lambda: DRR(subject, 240.0, 6, 4.0, colour="red"), "colour"),
         (lambda: DRR(subject, 240.0, 0, 4.0), "height"),
         (lambda: DRR(subject, -1.0, 6, 4.0), "sdd"),

@@ -1,14 +1,15 @@
-"""The programs themselves, where they are installed, see points where the views see them."""
+"""The programs themselves read what was exported: `make test-peers` runs these tests with all of them installed."""
 
 from __future__ import annotations
 
-import json
 import re
 
 import numpy as np
 import pytest
 
 import mphdrr.core as mph
+from mphdrr.core.geometry.collimator import Construction
+from mphdrr.core.geometry.module_parts import module_parts
 
 from .test_geometry_export import arrays, fiducials, general_views, project
 
@@ -71,7 +72,7 @@ def detector_of(path):
 
 
 def test_rtk_projects_alike(workbook, rng, tmp_path):
-    """RTK's Joseph projector, on a smooth volume: the arrays are RTK's as they stand, whatever the sign of its distances."""
+    """RTK's Joseph projector on a smooth volume: it takes the arrays as they are, whatever the sign of its distances."""
     itk, rtk = imported_rtk()
     system = mph.read_system(workbook)[::16]
     for detector in ("virtual", "real"):
@@ -110,22 +111,24 @@ def test_astra_takes_the_geometry(views, system, rng, tmp_path):
     astra.data3d.delete(identifier)
 
 
-def test_pytomography_places_pixels_alike(rng, tmp_path):
-    torch = pytest.importorskip("torch", reason="no torch")
-    metadata = pytest.importorskip("pytomography.metadata.CT", reason="no PyTomography", exc_type=ImportError)
-    azimuth = rng.uniform(-np.pi, np.pi, 5)
-    centers = 210 * np.stack([np.cos(azimuth), np.sin(azimuth), 0 * azimuth], axis=1)
-    system = mph.PinholeSystem(centers, 2.3, 60.0, 50.0, 10.0, 75.0)
-    views = system.views(shape=(11, 16), pitch=(3.0, 4.0))
-    mph.write_geometry(system, tmp_path / "a.json", "pytomography", views=views)
-    a = json.loads((tmp_path / "a.json").read_text())
-    columns, rows = a.pop("flip_columns"), a.pop("flip_rows")
-    meta = metadata.CTConeBeamFlatPanelProjMeta(
-        **a | {"angles": torch.tensor(a["angles"]), "z_locations": torch.tensor(a["z_locations"])}
-    )
-    for m in range(len(views)):
-        pixels = meta._get_detector_coordinates(m).cpu().numpy()  # columns, rows
-        pixels = pixels[::-1] if columns else pixels
-        pixels = pixels[:, ::-1] if rows else pixels
-        assert np.abs(pixels.transpose(1, 0, 2).reshape(-1, 3) - views.rays(m)[1]).max() < 1e-3  # it counts in float32
-        assert np.allclose(meta.beam_locations[m].cpu(), views.sources[m], atol=1e-4)
+def test_lib3mf_reads_the_solids_in_strict_mode(workbook, tmp_path):
+    """Every part is a closed, oriented surface with its name, in millimetres, and nothing is worth a warning."""
+    wrapper = pytest.importorskip("lib3mf", reason="no lib3mf").get_wrapper()
+    system = mph.read_system(workbook)[::10]
+    mph.write_geometry(system, tmp_path / "a.3mf", "3mf", edge_at="front")
+    model = wrapper.CreateModel()
+    reader = model.QueryReader("3mf")
+    reader.SetStrictModeActive(True)
+    reader.ReadFromFile(str(tmp_path / "a.3mf"))
+    assert reader.GetWarningCount() == 0
+    assert model.GetUnit().name == "MilliMeter"
+    expected = {part.name: part for part in module_parts(system, Construction(edge_at="front"))}
+    objects = model.GetMeshObjects()
+    while objects.MoveNext():
+        seen = objects.GetCurrentMeshObject()
+        part = expected.pop(seen.GetName())
+        assert seen.IsManifoldAndOriented()
+        box = seen.GetOutbox()
+        assert np.allclose(box.MinCoordinate, part.vertices.min(axis=0), atol=1e-4)
+        assert np.allclose(box.MaxCoordinate, part.vertices.max(axis=0), atol=1e-4)
+    assert not expected

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import zipfile
 from xml.etree import ElementTree
 
@@ -20,16 +21,57 @@ MM = 1e-4  # float32 holds lengths of a scanner to about 3e-5 mm
 
 
 def read_glb(path) -> dict:
-    """Meshes as glTF places them, back from its metres and +y up."""
-    scene = trimesh.load(path)
+    """By the glTF 2.0 specification and nothing else: meshes as its nodes place them, back from metres and +y up."""
+    document, buffer = glb_chunks(path)
     meshes = {}
-    for node in scene.graph.nodes_geometry:
-        pose, name = scene.graph[node]
-        assert node == name
-        x, y, z = (scene.geometry[name].vertices @ pose[:3, :3].T + pose[:3, 3]).T * 1000
-        meshes[name] = trimesh.Trimesh(np.column_stack([x, -z, y]), scene.geometry[name].faces, process=False)
-        assert np.allclose(meshes[name].vertices, scene.geometry[name].vertices, atol=MM)  # stored in mm
+
+    def numbers(accessor: dict, kind: str, shape: tuple[int, ...]) -> np.ndarray:
+        view = document["bufferViews"][accessor["bufferView"]]
+        start = view.get("byteOffset", 0) + accessor.get("byteOffset", 0)
+        return np.frombuffer(buffer, kind, accessor["count"] * int(np.prod(shape, dtype=int)), start).reshape(
+            -1, *shape
+        )
+
+    def visit(node: dict, pose: np.ndarray) -> None:
+        pose = pose @ np.reshape(node.get("matrix", np.eye(4)), (4, 4)).T
+        for child in node.get("children", []):
+            visit(document["nodes"][child], pose)
+        if "mesh" not in node:
+            return
+        mesh = document["meshes"][node["mesh"]]
+        (primitive,) = mesh["primitives"]
+        assert mesh["name"] == node["name"] and primitive.get("mode", 4) == 4
+        material = document["materials"][primitive["material"]]["name"]
+        assert node["name"].endswith(material)
+        positions, indices = (
+            document["accessors"][i] for i in (primitive["attributes"]["POSITION"], primitive["indices"])
+        )
+        assert (positions["componentType"], positions["type"], indices["componentType"]) == (5126, "VEC3", 5125)
+        stored = numbers(positions, "<f4", (3,)).astype(float)
+        x, y, z = (stored @ pose[:3, :3].T + pose[:3, 3]).T * 1000
+        faces = numbers(indices, "<u4", ()).reshape(-1, 3)
+        meshes[node["name"]] = trimesh.Trimesh(np.column_stack([x, -z, y]), faces, process=False)
+        assert np.allclose(meshes[node["name"]].vertices, stored, atol=MM)  # stored in mm
+
+    for root in document["scenes"][document["scene"]]["nodes"]:
+        visit(document["nodes"][root], np.eye(4))
     return meshes
+
+
+def glb_chunks(path) -> tuple[dict, bytes]:
+    """The JSON and the binary chunk."""
+    data = path.read_bytes()
+    magic, version, length = data[:4], *np.frombuffer(data[4:12], "<u4")
+    assert (magic, version, length) == (b"glTF", 2, len(data))
+    start, chunks = 12, []
+    while start < length:
+        (size,) = np.frombuffer(data[start : start + 4], "<u4")
+        assert size % 4 == 0
+        chunks.append((data[start + 4 : start + 8], data[start + 8 : start + 8 + int(size)]))
+        start += 8 + int(size)
+    (json_kind, text), (binary_kind, buffer) = chunks
+    assert (json_kind, binary_kind, start) == (b"JSON", b"BIN\0", length)
+    return json.loads(text), buffer
 
 
 def read_3mf(path) -> dict:
@@ -117,19 +159,13 @@ def test_one_stl_file_holds_the_parts_chosen(system, tmp_path, part, kinds):
     assert np.allclose(mesh.bounds[0], np.min([p.vertices.min(axis=0) for p in wanted], axis=0), atol=MM)
 
 
-def test_glb_is_laid_out_as_the_standard_says(system, tmp_path):
-    write_geometry(system, tmp_path / "a.glb", "glb", part="crystals")
-    data = (tmp_path / "a.glb").read_bytes()
-    magic, version, length = data[:4], *np.frombuffer(data[4:12], "<u4")
-    assert (magic, version, length) == (b"glTF", 2, len(data))
-    start, kinds = 12, []
-    while start < length:
-        (size,) = np.frombuffer(data[start : start + 4], "<u4")
-        kinds.append(data[start + 4 : start + 8])
-        assert size % 4 == 0
-        start += 8 + int(size)
-    assert kinds == [b"JSON", b"BIN\0"] and start == length
-    # In metres: the scanner is less than a metre wide.
+def test_glb_shows_the_scanner_in_metres_and_in_colour(system, tmp_path):
+    write_geometry(system, tmp_path / "a.glb", "glb")
+    document, _ = glb_chunks(tmp_path / "a.glb")
+    assert [m["name"] for m in document["materials"]] == ["collimator", "crystal"]
+    colors = [m["pbrMetallicRoughness"]["baseColorFactor"] for m in document["materials"]]
+    assert colors[0] != colors[1]
+    assert document["nodes"][document["scenes"][0]["nodes"][0]]["name"] == "Scanner in mm"
     assert 0.1 < np.ptp(trimesh.load(tmp_path / "a.glb").bounds, axis=0).max() < 1.0
 
 

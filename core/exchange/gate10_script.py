@@ -1,11 +1,11 @@
 """A multi-pinhole SPECT scanner in GATE 10 (opengate 10.1 or later); its numbers are in simulation.json beside this file.
 
-    python simulation.py                  run it: singles.root, then images.npy
+    python simulation.py                  run it: singles_*.root, then images.npy
     python simulation.py --build-only     build it in Geant4, which checks for overlaps; needs no Geant4 data
-    python simulation.py --images-only    make images.npy of the singles that are there
+    python simulation.py --images-only    make images.npy from existing singles
 
-images.npy is (modules, rows, columns): the singles of the energy window that fell on each pixel of each crystal, columns
-along the module's u and rows along its v, in the order of the modules in simulation.json.
+images.npy is (modules, rows, columns): the singles in the energy window, pixel by pixel of each crystal, columns along the
+module's u and rows along its v, in the order of the modules in simulation.json.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ FOLDER = Path(__file__).resolve().parent
 
 
 def build(data: dict[str, Any], threads: int = 1) -> Any:
-    """The simulation of the numbers `data`."""
+    """The simulation described by `data`."""
     import opengate
 
     units = opengate.g4_units
@@ -50,35 +50,35 @@ def build(data: dict[str, Any], threads: int = 1) -> Any:
         add_source(simulation, units, data, number, emitter, share)
     for crystal in data["crystals"]:
         add_digitizer(simulation, units, data["detector"], crystal)
-    statistics = simulation.add_actor("SimulationStatisticsActor", "statistics")
-    statistics.output_filename = "statistics.txt"
+    simulation.add_actor("SimulationStatisticsActor", "statistics").output_filename = "statistics.txt"
     return simulation
 
 
 def construct(simulation: Any) -> None:
-    """Build the volumes in Geant4, which prints the overlaps that it finds; without physics."""
+    """Build the volumes in Geant4, without physics; Geant4 prints the overlaps that it finds."""
     simulation.volume_manager.update_volume_tree_if_needed()
     for volume in simulation.volume_manager.volume_tree_root.descendants:
         volume.construct()
 
 
 def add_volume(simulation: Any, units: Any, part: dict[str, Any]) -> None:
-    """A volume with all its places. `rotations` turn the volume, as opengate's do: their columns are its axes."""
+    """Add a volume at all its places. `rotations` turn the volume, as opengate's do: their columns are its axes."""
     kinds = {"box": "Box", "trd": "Trd", "cone": "Cons", "cylinder": "Tubs"}
     volume = simulation.add_volume(kinds[part["shape"]], part["name"])
     size = [length * units.mm for length in part["size_mm"]]
     if part["shape"] == "box":
         volume.size = size
-    elif part["shape"] == "trd":
+    else:
+        volume.dz = size[-1] / 2
+    if part["shape"] == "trd":
         volume.dx1 = volume.dy1 = size[0]
         volume.dx2 = volume.dy2 = size[1]
-        volume.dz = size[2] / 2
     elif part["shape"] == "cone":
         volume.rmin1 = volume.rmin2 = 0
-        volume.rmax1, volume.rmax2, volume.dz = size[0], size[1], size[2] / 2
-        volume.sphi, volume.dphi = 0, 360 * units.deg
-    else:
-        volume.rmin, volume.rmax, volume.dz = 0, size[0], size[1] / 2
+        volume.rmax1, volume.rmax2 = size[:2]
+    elif part["shape"] == "cylinder":
+        volume.rmin, volume.rmax = 0, size[0]
+    if part["shape"] in ("cone", "cylinder"):
         volume.sphi, volume.dphi = 0, 360 * units.deg
     volume.mother = part["mother"]
     volume.material = part["material"]
@@ -87,10 +87,10 @@ def add_volume(simulation: Any, units: Any, part: dict[str, Any]) -> None:
 
 
 def activity_for_each_thread(opengate: Any, threads: int) -> float:
-    """The share of all activity that a source is to be given so that all threads together emit all of it.
+    """The share of the activity to give to a source so that all threads together emit all of it.
 
-    In opengate 10.0 to 10.1.1 every thread emits what its source is given; later ones divide it among the threads. The
-    number of the version does not tell them apart, so a source is asked what it hands to a thread's.
+    In opengate 10.0 to 10.1.1 every thread emits the whole activity of its source; later ones divide it among the threads.
+    The version number does not distinguish them, so a trial source shows what it hands to a thread.
     """
     if threads == 1:
         return 1.0
@@ -98,7 +98,7 @@ def activity_for_each_thread(opengate: Any, threads: int) -> float:
     trial.number_of_threads = threads
     source = trial.add_source("GenericSource", "trial")
     source.particle, source.activity = "gamma", 1.0
-    given = {"activity": 1.0}  # what earlier ones than 10.1.1 hand over, whose sources are one with their thread's
+    given = {"activity": 1.0}  # before 10.1.1 a thread used the source itself
 
     class Listener:
         def InitializeUserInfo(self, info: Any) -> None:
@@ -111,14 +111,14 @@ def activity_for_each_thread(opengate: Any, threads: int) -> float:
             return 1.0 / (threads * emitted)
     raise SystemExit(
         f"opengate {opengate.__version__}: each of {threads} threads would emit {given['activity']:g} of the activity, "
-        f"expected all or 1/{threads} of it: run this with --threads 1, and copies of it with other seeds"
+        f"expected all or 1/{threads} of it; use --threads 1, and run copies with other seeds"
     )
 
 
 def add_source(
     simulation: Any, units: Any, data: dict[str, Any], number: int, emitter: dict[str, Any], share: float
 ) -> None:
-    """A point, or a rod of the phantom; `share` is that of its activity that opengate is to be told."""
+    """Add a point, or a rod of the phantom, with `share` of its activity."""
     source = simulation.add_source("GenericSource", f"source_{number}")
     source.attached_to = emitter["mother"]
     source.particle = "gamma"
@@ -130,16 +130,14 @@ def add_source(
     source.half_life = data["half_life_s"] * units.s
     source.direction.type = "iso"
     source.position.translation = [x * units.mm for x in emitter["center_mm"]]
+    source.position.type = "cylinder" if "radius_mm" in emitter else "point"
     if "radius_mm" in emitter:
-        source.position.type = "cylinder"
         source.position.radius = emitter["radius_mm"] * units.mm
         source.position.dz = emitter["height_mm"] / 2 * units.mm
-    else:
-        source.position.type = "point"
 
 
 def add_digitizer(simulation: Any, units: Any, detector: dict[str, Any], crystal: str) -> None:
-    """Hits, singles, blurred energies and places, the energy window; one chain for each kind of crystal."""
+    """Add the chain of one kind of crystal: hits, singles, blurred energies and positions, energy window."""
     hits = simulation.add_actor("DigitizerHitsCollectionActor", f"{crystal}_hits")
     hits.attributes = ["TotalEnergyDeposit", "PostPosition", "PreStepUniqueVolumeID", "GlobalTime"]
     chain = [hits]
@@ -174,18 +172,18 @@ def add_digitizer(simulation: Any, units: Any, detector: dict[str, Any], crystal
 
 
 def check_emitted(data: dict[str, Any], emitted: int) -> None:
-    """Stop with an error if not as many photons were emitted as the activity asks for, within 6 standard deviations."""
+    """Stop with an error unless as many photons were emitted as the activity asks for, within 6 standard deviations."""
     decay = np.log(2) / data["half_life_s"]
     photons = sum(photons for _, photons in data["lines_keV_photons_per_decay"])
     decays = sum(emitter["activity_Bq"] for emitter in data["emitters"]) * -np.expm1(-decay * data["time_s"]) / decay
     if abs(emitted - photons * decays) > 6 * np.sqrt(photons * decays) + 1:
         raise SystemExit(
-            f"{emitted} photons were emitted, expected {photons * decays:.0f}: do not use images.npy; run with --threads 1"
+            f"{emitted} photons were emitted, expected {photons * decays:.0f}: do not use images.npy; use --threads 1"
         )
 
 
 def images(data: dict[str, Any], positions: NDArray[np.float64]) -> NDArray[np.uint32]:
-    """Singles at world `positions` (N, 3), mm, as images (modules, rows, columns); they may lie in any crystal."""
+    """Images (modules, rows, columns) of singles at world `positions` (N, 3), mm, in any crystal."""
     rows, columns = data["image_shape"]
     made = np.zeros((len(data["modules"]), rows, columns), np.uint32)
     for image, module in zip(made, data["modules"], strict=True):
@@ -213,10 +211,10 @@ def read_positions(data: dict[str, Any]) -> NDArray[np.float64]:
 
 
 def main() -> None:
-    """Do what the command line says."""
+    """Run the command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--build-only", action="store_true", help="build the volumes, check for overlaps and stop")
-    parser.add_argument("--images-only", action="store_true", help="make images of the singles that are there")
+    parser.add_argument("--images-only", action="store_true", help="make images from existing singles")
     parser.add_argument("--threads", type=int, help="instead of the number in simulation.json")
     arguments = parser.parse_args()
     data = json.loads((FOLDER / "simulation.json").read_text())

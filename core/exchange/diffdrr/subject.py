@@ -1,0 +1,141 @@
+"""What is imaged: a CT as DiffDRR's ``read`` prepares it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from os import PathLike
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from ...errors import InputError
+from ...geometry.rotations import pose_matrix
+from ...physics.ct_numbers import DIFFDRR_AIR, DIFFDRR_BONE
+from ...volumes.volume import LINE_INTEGRALS, Volume, require_quantity
+from ...volumes.volume_files import read_volume, read_volume_of
+
+# The C-arm's frames of reference: the camera's axes in the patient's (x left to right, y back to front, z up).
+_ORIENTATIONS = {
+    "AP": ((1.0, 0.0, 0.0), (0.0, 0.0, -1.0), (0.0, 1.0, 0.0)),
+    "PA": ((1.0, 0.0, 0.0), (0.0, 0.0, 1.0), (0.0, 1.0, 0.0)),
+    None: ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)),
+}
+
+
+@dataclass(frozen=True, eq=False)
+class Subject:
+    """What is imaged.
+
+    Attributes
+    ----------
+    density : Tensor (n_x, n_y, n_z)
+        What is integrated.
+    affine : array (4, 4)
+        World mm from index; an integer index is a voxel's centre.
+    reorient : Tensor (4, 4)
+        Turns the camera before its pose does.
+    hu : Tensor or None
+        CT numbers, from which the density can be computed again.
+    mask : Tensor or None
+        Whole numbers (n_x, n_y, n_z): the structure to which each voxel belongs.
+    """
+
+    density: Tensor
+    affine: np.ndarray[Any, Any]
+    reorient: Tensor
+    hu: Tensor | None = None
+    mask: Tensor | None = None
+
+
+def read(
+    volume: str | PathLike[str] | Volume,
+    labelmap: Any = None,
+    labels: int | list[int] | None = None,
+    orientation: str | None = "AP",
+    bone_attenuation_multiplier: float = 1.0,
+    center_volume: bool = True,
+) -> Subject:
+    """A CT as DiffDRR's ``read`` prepares it.
+
+    Parameters
+    ----------
+    volume
+        File or `Volume` of CT numbers, HU.
+    labelmap
+        File or array of structures on the same voxels.
+    labels
+        Keep these structures only.
+    orientation
+        ``"AP"``, ``"PA"`` or None: the camera's direction.
+    bone_attenuation_multiplier
+        Factor for CT numbers above 350 HU.
+    center_volume
+        Move the volume's middle to the world's origin.
+
+    Raises
+    ------
+    InputError
+        The volume does not hold CT numbers, the labelmap has another shape, or the orientation is unknown.
+    """
+    if isinstance(volume, Volume):
+        require_quantity(volume.quantity, ("hu",), "read")
+    else:
+        volume = read_volume_of(volume, "hu")
+    affine = np.array(volume.grid.affine)
+    if center_volume:
+        affine[:3, 3] -= volume.grid.center
+    hu = torch.from_numpy(np.array(volume.array))
+    density = hu_to_density(hu, bone_attenuation_multiplier)
+    mask = None
+    if labelmap is not None:
+        array = read_volume(Path(labelmap)).array if isinstance(labelmap, str | PathLike) else np.asarray(labelmap)
+        mask = torch.from_numpy(np.array(array))
+        if mask.shape != hu.shape:
+            raise InputError(f"labelmap: expected {tuple(hu.shape)} voxels, as the volume has, got {tuple(mask.shape)}")
+    if labels is not None:
+        if mask is None:
+            raise InputError("labels: expected a labelmap too")
+        density = density * torch.isin(mask, torch.as_tensor(labels).to(mask))
+    return Subject(density, affine, reorientation(orientation), hu, mask)
+
+
+def hu_to_density(hu: Tensor, bone_attenuation_multiplier: float = 1.0) -> Tensor:
+    """`diffdrr_density` for tensors, with gradients: 0 to 1, air as thin as the thinnest tissue, bone times a factor."""
+    hu = hu.to(torch.float32)
+    tissue = hu[(hu > DIFFDRR_AIR) & (hu <= DIFFDRR_BONE)]
+    density = torch.where(hu > DIFFDRR_BONE, hu * bone_attenuation_multiplier, hu)
+    if tissue.numel():
+        density = torch.where(hu <= DIFFDRR_AIR, tissue.min(), density)
+    density = density - density.min()
+    return density / density.max().clamp_min(torch.finfo(torch.float32).tiny)
+
+
+def reorientation(orientation: str | None) -> Tensor:
+    """The matrix (4, 4) of ``"AP"``, ``"PA"`` or None."""
+    if orientation not in _ORIENTATIONS:
+        raise InputError(f"orientation {orientation!r}: expected 'AP', 'PA' or None")
+    return pose_matrix(torch.tensor(_ORIENTATIONS[orientation]), torch.zeros(3))
+
+
+def as_subject(given: Any, affine: Any) -> Subject:
+    """A `Subject` from torchio's, a `Volume`, or an array or tensor with `affine`."""
+    if isinstance(given, Subject):
+        return given
+    if isinstance(given, Volume):
+        if given.quantity == "hu":
+            raise InputError(
+                "DRR: CT numbers are not a density; give the volume to read(volume), and its answer to DRR"
+            )
+        require_quantity(given.quantity, LINE_INTEGRALS, "DRR")
+        return Subject(torch.from_numpy(np.array(given.array)), given.grid.affine, reorientation("AP"))
+    if hasattr(given, "density"):  # torchio's, from DiffDRR's read
+        mask = given.mask.data.squeeze() if getattr(given, "mask", None) is not None else None
+        hu = given.volume.data.squeeze()
+        return Subject(given.density.data.squeeze(), given.volume.affine, given.reorient, hu, mask)
+    if affine is None:
+        raise InputError(f"DRR: expected a subject, a Volume, or an array with `affine`, got {type(given).__name__}")
+    array = given if isinstance(given, Tensor) else torch.from_numpy(np.array(given, dtype=np.float32))
+    return Subject(array, np.asarray(affine, dtype=np.float64), reorientation("AP"))

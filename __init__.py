@@ -3,9 +3,9 @@
 
 def register() -> None:
     """Blender enables the extension."""
-    from .addon import registration
+    from .addon import cli, registration
 
-    registration.register()
+    registration.register(cli.main)
 
 
 def unregister() -> None:

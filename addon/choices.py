@@ -32,6 +32,10 @@ ISOTOPES = {
 }  # fmt: skip
 APERTURES = {"NUMBER": 0, "tungsten": 1, "lead": 2, "gold": 3, "uranium": 4}
 CRYSTALS = {"NUMBER": 0, "NaI": 1, "CsI": 2, "CZT": 3, "CdTe": 4, "BGO": 5, "LYSO": 6, "GAGG": 7}
+MODELS = {"TRANSMISSION": 0, "EMISSION": 1, "INVERSE_SQUARE": 2}
+EDGES = {"PAIX": 0, "PATH": 1}
+DETECTORS = {"VIRTUAL": 0, "REAL": 1}
+BACKENDS = {"AUTO": 0, "CPU": 1, "TORCH": 2, "NUMPY": 3, "CUDA": 4}
 JOINED = {"BY_NUMBER": 0, "IN_ORDER": 1, "ONE_FOR_ALL": 2}
 UNITS = {
     "NONE": 0, "mm": 1, "cm": 2, "m": 3, "in": 4, "µm": 5, "rad": 6, "deg": 7, "dm": 8, "ft": 9, "mil": 10, "0.1 mm": 11,

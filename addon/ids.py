@@ -37,6 +37,7 @@ EXPORT_VOLUME = "mphdrr.export_volume"
 RENDER_PROJECTIONS = "mphdrr.render_projections"
 EXPORT_DATASET = "mphdrr.export_dataset"
 UPDATE_DERENZO = "mphdrr.update_derenzo"
+LOAD_RECIPE = "mphdrr.load_recipe"
 SHOW_PROJECTIONS = "mphdrr.show_projections"
 CANCEL_JOB = "mphdrr.cancel_job"
 

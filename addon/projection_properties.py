@@ -1,173 +1,224 @@
-"""Settings of the projections, and where the last run lies."""
+"""The Projections panel's settings: Blender properties made from `core.runs.settings`, and the recipe that they say."""
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from collections.abc import Callable, Iterator, Mapping
+from typing import Any
 
 import bpy
-from bpy.props import BoolProperty, EnumProperty, FloatProperty, IntProperty, PointerProperty, StringProperty
+from bpy.props import (
+    BoolProperty,
+    EnumProperty,
+    FloatProperty,
+    FloatVectorProperty,
+    IntProperty,
+    PointerProperty,
+    StringProperty,
+)
 
 from ..core.errors import InputError
-from ..core.geometry.system import PinholeSystem
-from ..core.physics.isotopes import ISOTOPES
-from ..core.physics.materials import APERTURES, CRYSTALS
-from ..core.volumes.volume import Volume
+from ..core.runs.recipe import Recipe, fitting_recipe, is_met
+from ..core.runs.settings import SETTINGS, Setting
 from . import choices, ids, volumes
 from .decimals import typed
 
-if TYPE_CHECKING:
-    from ..core.projector import Model
+OPENING_ANGLE = "model.opening_angle_degrees"
+"""A setting of the scanner's here: its collimators are drawn with it."""
+
+_NAMES = {"model.kind": "model", "detector.plane": "detector", "detector.rows": "height", "detector.columns": "width"}
+"""Names that .blend files keep, where they are not those of the settings."""
+
+_NUMBERS = {
+    "model": choices.MODELS,
+    "isotope": choices.ISOTOPES,
+    "aperture_material": choices.APERTURES,
+    "edge": choices.EDGES,
+    "crystal_material": choices.CRYSTALS,
+    "detector": choices.DETECTORS,
+    "backend": choices.BACKENDS,
+}
+
+PROPERTIES = {
+    _NAMES.get(key, key.partition(".")[2]): setting
+    for key, setting in SETTINGS.items()
+    if key.startswith(("model.", "detector.", "compute.")) and key != OPENING_ANGLE
+}
+"""The settings by the names of their properties. A coefficient has a second property, of its material."""
 
 
-def _materials(numbers: dict[str, int], names: tuple[str, ...], none: str) -> choices.Items:
-    """Items of a choice of material, by name or by its coefficient."""
-    by_number = ("NUMBER", "By Coefficient", f"By its attenuation coefficient; 0: {none}")
-    by_name = ((name, name[0].upper() + name[1:], "As it attenuates the isotope's photons") for name in names)
-    return choices.items(numbers, (by_number, *by_name))
+def _material(name: str, setting: Setting) -> str | None:
+    """The property of a coefficient's material; None for other settings."""
+    return name.replace("_mu", "_material") if setting.kind is float and setting.words else None
+
+
+def _identifier(name: str, word: str) -> str:
+    """How an enumeration calls a word: isotopes and materials by their names, others in capitals."""
+    return word if name == "isotope" or name.endswith("_material") else word.upper().replace("-", "_")
+
+
+def _enumeration(name: str, setting: Setting, none: tuple[str, str, str] | None) -> Any:
+    words = [(_identifier(name, word), label, text) for word, (label, text) in setting.words.items()]
+    items = choices.items(_NUMBERS.get(name, {}), ([none] if none else []) + words)
+    default = none[0] if none else _identifier(name, setting.default)
+    return EnumProperty(name=setting.label, description=setting.text, items=items, default=default)
+
+
+def _properties() -> dict[str, Any]:
+    made: dict[str, Any] = {}
+    for name, setting in PROPERTIES.items():
+        absent = f"; 0: {setting.absent}" if setting.default is None else ""
+        common: dict[str, Any] = {"name": setting.label, "description": setting.text + absent}
+        if setting.kind in (int, float):
+            least = 1e-6 if setting.least is None else setting.least
+            limits = {"min": 0 if setting.default is None else least, "max": setting.most, "soft_max": setting.slider}
+            limits["precision"] = 3 if setting.kind is float else None
+            common |= {key: value for key, value in limits.items() if value is not None}
+        material = _material(name, setting)
+        if material is not None:
+            none = ("NUMBER", "By Coefficient", f"By its attenuation coefficient{absent}")
+            made[material] = _enumeration(material, setting, none)
+            common["name"] += f" µ ({setting.unit})"
+        if setting.kind is bool:
+            made[name] = BoolProperty(name=setting.label, description=setting.text, default=setting.default)
+        elif setting.kind is str:
+            absent_item = ("NONE", "None", setting.absent.capitalize()) if setting.default is None else None
+            made[name] = _enumeration(name, setting, absent_item)
+        elif setting.sizes:
+            made[name] = FloatVectorProperty(size=setting.sizes[0], default=(0.0,) * setting.sizes[0], **common)
+        else:
+            make: Callable[..., Any] = IntProperty if setting.kind is int else FloatProperty
+            made[name] = make(default=setting.default or 0, **common)
+    return made
 
 
 class ProjectionSettings:
     """How to project; mixed into the scene's properties (the panel) and into the operator (scripts)."""
 
-    model: EnumProperty(
-        name="Model",
-        description="What a pixel holds",
-        items=(
-            ("TRANSMISSION", "Radiograph", "Line integrals of the volume", 0),
-            ("EMISSION", "SPECT Counts", "Photons of a volume of activity that the crystal counts", 1),
-            (
-                "INVERSE_SQUARE",
-                "Inverse Square Sum",
-                "Line integrals with each segment times a point source's sensitivity, as 1/h^2: no counts, for comparison",
-                2,
-            ),
-        ),
-        default="TRANSMISSION",
-    )
-    time: FloatProperty(name="Time (s)", description="Acquisition time of SPECT counts", default=1.0, min=1e-6)
-    photons: FloatProperty(
-        name="Photons", description="X-ray photons per pixel: a radiograph of attenuation coefficients then holds those "
-        "that pass; 0: line integrals", default=0.0, min=0.0, soft_max=1e6,
-    )  # fmt: skip
-    isotope: EnumProperty(
-        name="Isotope",
-        description="What decays: its photons are counted, and its activity falls during the acquisition",
-        items=choices.items(
-            choices.ISOTOPES,
-            (
-                ("NONE", "None", "One photon per decay, and an activity that stays"),
-                *((name, name, "Energy window 10 % around its strongest line") for name in ISOTOPES),
-            ),
-        ),
-        default="NONE",
-    )
-    aperture_points: IntProperty(
-        name="Aperture Points", description="Points of the hole that rays pass; 1: its middle, no blur, 7 and more: the "
-        "blur of a hole of this size", default=1, min=1, soft_max=64,
-    )  # fmt: skip
-    pixel_points: IntProperty(
-        name="Pixel Points", description="Points of each pixel's area, for each of the hole. 0: for counts as many as keep "
-        "a single voxel's total within 2 %, which takes longer for small voxels; for radiographs the pixel's centre",
-        default=0, min=0, soft_max=100,
-    )  # fmt: skip
-    aperture_material: EnumProperty(
-        name="Aperture", description="Material that photons penetrate at the aperture's edge",
-        items=_materials(choices.APERTURES, APERTURES, "nothing penetrates it"), default="NUMBER",
-    )  # fmt: skip
-    aperture_mu: FloatProperty(
-        name="Aperture µ", description="Attenuation coefficient of the aperture in 1/mm, at the photons' energy, "
-        "where no material is chosen; 0: nothing penetrates it",
-        default=0.0, min=0.0, soft_max=10.0, precision=3,
-    )  # fmt: skip
-    edge: EnumProperty(
-        name="Knife Edge",
-        description="How photons penetrate the aperture's edge",
-        items=(
-            ("PAIX", "Effective Diameter", "As if the hole were wider (Paix 1967)", 0),
-            ("PATH", "Path Length", "Each by its path through the edge: more rays", 1),
-        ),
-        default="PAIX",
-    )
-    crystal_material: EnumProperty(
-        name="Crystal", description="Material that stops the photons that are counted",
-        items=_materials(choices.CRYSTALS, CRYSTALS, "all photons are counted"), default="NUMBER",
-    )  # fmt: skip
-    crystal_mu: FloatProperty(
-        name="Crystal µ", description="Attenuation coefficient of the crystal in 1/mm, at the photons' energy, where no "
-        "material is chosen; 0: all photons are counted",
-        default=0.0, min=0.0, soft_max=5.0, precision=3,
-    )  # fmt: skip
-    depth_layers: IntProperty(
-        name="Depth Layers", description="Depths in the crystal at which photons are recorded (parallax); 1: where they "
-        "enter. Needs the crystal's µ", default=1, min=1, soft_max=8,
-    )  # fmt: skip
-    intrinsic_fwhm: FloatProperty(
-        name="Intrinsic Blur", description="Full width at half maximum of the detector's own blur in mm on the crystal",
-        default=0.0, min=0.0, soft_max=10.0, precision=2,
-    )  # fmt: skip
-    within_cone: BoolProperty(name="Knife-Edge Cone", description="Nothing passes steeper than the knife edge's cone")
-    within_walls: BoolProperty(
-        name="Collimator Walls", description="The walls stop photons that would miss the crystal's front"
-    )
-    within_crystal: BoolProperty(name="Crystal's Side", description="Pixels beyond the crystal count nothing")
     noise: BoolProperty(name="Poisson Noise", description="Draw counts instead of their expected means")
     seed: IntProperty(name="Seed", description="Of the noise: the same seed draws the same counts", default=1, min=0)
-    width: IntProperty(name="Width", description="Pixel columns of each image", default=256, min=1, max=8192)
-    height: IntProperty(name="Height", description="Pixel rows of each image", default=256, min=1, max=8192)
-    detector: EnumProperty(
-        name="Detector",
-        description="Where the images are taken",
-        items=(
-            ("VIRTUAL", "Virtual", "Plane in front of the pinhole: upright, what the module's camera sees", 0),
-            ("REAL", "Real", "Front face of the crystal behind the pinhole: point-inverted", 1),
-        ),
-        default="VIRTUAL",
-    )
-    magnification: FloatProperty(
-        name="Magnification", description="Distance of the virtual detector in units of the collimator length",
-        default=10.0, min=0.1, soft_max=20.0,
-    )  # fmt: skip
     first: IntProperty(name="First", description="First module number to project; 0: from the first", default=0, min=0)
     last: IntProperty(name="Last", description="Last module number to project; 0: to the last", default=0, min=0)
-    backend: EnumProperty(
-        name="Backend",
-        description="What computes the line integrals",
-        items=(
-            ("AUTO", "Automatic", "The fastest that works here", 0),
-            ("CPU", "CPU", "Compiled, on the processor", 1),
-            ("TORCH", "PyTorch", "On the processor or the graphics card", 2),
-            ("NUMPY", "NumPy", "Float64 reference, slow", 3),
-            ("CUDA", "CUDA", "On an NVIDIA graphics card; needs warp-lang in Blender's Python", 4),
-        ),
-        default="AUTO",
-    )
 
 
-# Settings that are arguments of `Emission`; those that may be missing are 0 or NONE.
-_EMISSION = (
-    "time", "isotope", "aperture_points", "aperture_mu", "opening_angle", "edge", "crystal_mu", "depth_layers",
-    "intrinsic_fwhm", "within_cone", "within_walls", "within_crystal", "pixel_points",
-)  # fmt: skip
-_OPTIONAL = ("isotope", "aperture_mu", "crystal_mu", "pixel_points")
+ProjectionSettings.__annotations__.update(_properties())
 
 
-def chosen_model(settings: dict[str, Any], system: PinholeSystem, mu: Volume | None = None) -> Model:
-    """The model that `settings` (`ProjectionSettings`, and the scanner's opening angle) ask for; leaves bpy alone."""
-    from ..core.projector import Emission, InverseSquareSum, Transmission
+def recipe_values(get: Callable[[str], Any]) -> dict[str, Any]:
+    """The values of the settings by their keys in a recipe, None for none; `get` gives a property's.
 
-    if settings["model"] == "TRANSMISSION":
-        return Transmission(settings["pixel_points"] or 1)
-    if settings["model"] == "INVERSE_SQUARE":
-        return InverseSquareSum(system)
-    if settings["model"] != "EMISSION":  # of a file that a later version wrote
-        raise InputError(f"model {settings['model']!r} is not known to this version: choose what the pixels hold")
-    given: dict[str, Any] = {name: settings[name] for name in _EMISSION}
-    given |= {name: typed(value) for name, value in given.items() if isinstance(value, float)}
-    given |= {name: None for name in _OPTIONAL if given[name] in (0, "NONE")}
-    for part in ("aperture", "crystal"):
-        if settings[f"{part}_material"] != "NUMBER":
-            given[f"{part}_mu"] = settings[f"{part}_material"]
-    return Emission(system, mu, **(given | {"edge": given["edge"].lower()}))
+    Raises
+    ------
+    InputError
+        A choice is one that only a later version knows.
+    """
+    values: dict[str, Any] = {}
+    for name, setting in PROPERTIES.items():
+        material = _material(name, setting)
+        value = get(name)
+        if material is not None and get(material) != "NUMBER":
+            name, value = material, get(material)
+        if isinstance(value, str):
+            words = {_identifier(name, word): word for word in setting.words} | {"NONE": None}
+            if value not in words:
+                raise InputError(f"{setting.label}: {value!r} is not known to this version; choose another")
+            values[setting.key] = words[value]
+        elif setting.sizes:
+            values[setting.key] = tuple(map(typed, value)) if any(value) else None
+        else:
+            number = typed(value) if isinstance(value, float) else value
+            values[setting.key] = number if number or setting.default is not None else None
+    values["noise.seed"] = get("seed") if get("noise") else None
+    return values
+
+
+def settings_recipe(get: Callable[[str], Any], is_given: Callable[[str], bool], more: Mapping[str, Any]) -> Recipe:
+    """The recipe of model, detector, noise and backend.
+
+    Parameters
+    ----------
+    get
+        Gives a property's value.
+    is_given
+        Whether a property was given by a script, so that it must have an effect, and not taken from the panel.
+    more
+        Further values by their keys.
+
+    Raises
+    ------
+    InputError
+        A value is not what is expected, or a given one has no effect beside the others.
+    """
+    values = {**recipe_values(get), **more, "system.modules": _range_text(get("first"), get("last"))}
+    given = [
+        setting.key
+        for name, setting in PROPERTIES.items()
+        if (is_given(name) or is_given(_material(name, setting) or name)) and values[setting.key] != setting.default
+    ]
+    return fitting_recipe(values, given)
+
+
+def set_panel(settings: ProjectionProperties, recipe: Recipe) -> None:
+    """Set the panel as a recipe says; what it does not say gets its default.
+
+    Raises
+    ------
+    InputError
+        The panel has no such value.
+    """
+    if recipe["model.pixel_points"] == "auto" and recipe["model.kind"] != "emission":
+        raise InputError("model.pixel_points: the panel has no automatic number for radiographs")
+    modules = _module_range(recipe["system.modules"])
+    for name, setting in PROPERTIES.items():
+        material = _material(name, setting)
+        for own in filter(None, (name, material)):
+            settings.property_unset(own)
+        value = recipe.given.get(setting.key)
+        if isinstance(value, str) and value != "auto":
+            own = material or name
+            setattr(settings, own, _identifier(own, value))
+        elif value not in (None, "auto"):
+            setattr(settings, name, value)
+    settings.noise = recipe["noise.seed"] is not None
+    if settings.noise:
+        settings.seed = recipe["noise.seed"]
+    settings.first, settings.last = modules
+
+
+def drawn(settings: ProjectionProperties, table: str) -> Iterator[tuple[str, bool]]:
+    """The properties of a table that the chosen model has, each with whether it has an effect."""
+    try:
+        known = recipe_values(lambda name: getattr(settings, name))
+    except InputError:  # a choice of a later version: rendering refuses it
+        known = {}
+    values = {key: value for key, value in known.items() if value is not None}
+    for name, setting in PROPERTIES.items():
+        if not setting.key.startswith(f"{table}."):
+            continue
+        unmet = [need for need in setting.needs if not is_met(values, need)]
+        if any("model.kind" in need for need in unmet):
+            continue
+        material = _material(name, setting)
+        if material is not None:
+            yield material, not unmet
+        if material is None or getattr(settings, material) == "NUMBER":
+            yield name, not unmet
+
+
+def makes_counts(settings: ProjectionProperties) -> bool:
+    """Whether images hold numbers of photons, which may have noise."""
+    return settings.model == "EMISSION" or (settings.model == "TRANSMISSION" and settings.photons > 0)
+
+
+def _range_text(first: int, last: int) -> str | None:
+    return f"{first or ''}-{last or ''}" if first or last else None
+
+
+def _module_range(text: str | None) -> tuple[int, int]:
+    first, dash, last = (text or "-").partition("-")
+    try:
+        return int(first or 0), int(last or 0) if dash else int(first)
+    except ValueError:
+        raise InputError(f"system.modules: the panel has one range of modules, not {text!r}") from None
 
 
 def _is_ours(self: ProjectionProperties, item: bpy.types.Object) -> bool:
@@ -190,11 +241,9 @@ class ProjectionProperties(ProjectionSettings, bpy.types.PropertyGroup):
         type=bpy.types.Object, poll=_is_mu,
     )  # fmt: skip
     run_file: StringProperty(
-        name="Run",
-        description="File with the last run's exact arrays",
-        subtype="FILE_PATH",
+        name="Run", description="File with the last run's exact arrays", subtype="FILE_PATH",
         options={"HIDDEN", "PATH_SUPPORTS_BLEND_RELATIVE"},
-    )
+    )  # fmt: skip
     run_summary: StringProperty(name="Last Run", description="What the last run was", options={"HIDDEN"})
 
 

@@ -21,6 +21,7 @@ from ..operators import (
     export_volume,
     import_geometry,
     import_volume,
+    load_recipe,
     modules,
     render_projections,
     volume_files,
@@ -28,7 +29,6 @@ from ..operators import (
 )
 from ..panels import add_menu, design, export, geometry, phantom, projections
 from . import (
-    cli,
     following,
     ids,
     jobs,
@@ -60,6 +60,7 @@ _OPERATORS = (
     add_slices,
     volume_files,
     render_projections,
+    load_recipe,
     jobs,
     export_dataset,
     dropped_files,
@@ -122,8 +123,11 @@ UPDATES: dict[str, Callable[..., None]] = {
 _undo: list[tuple[Callable[..., Any], tuple[Any, ...]]] = []
 
 
-def register() -> None:
-    """Register everything; if something fails, take back what was registered and raise."""
+def register(command: Callable[..., int] | None = None) -> None:
+    """Register everything, or, if something fails, take back what was registered and raise.
+
+    `command` is what ``blender --command mphdrr`` calls.
+    """
     updates.FUNCTIONS.update(UPDATES)
     try:
         for cls in CLASSES:
@@ -138,8 +142,9 @@ def register() -> None:
         for handlers, function in HANDLERS:
             handlers.append(function)
             _undo.append((_remove_handler, (handlers, function)))
-        command = bpy.utils.register_cli_command(ids.PREFIX, cli.main)
-        _undo.append((bpy.utils.unregister_cli_command, (command,)))
+        if command is not None:
+            registered = bpy.utils.register_cli_command(ids.PREFIX, command)
+            _undo.append((bpy.utils.unregister_cli_command, (registered,)))
     except Exception:
         _take_back()
         raise

@@ -44,7 +44,9 @@ from .projector import Emission, InverseSquareSum, Projector, Transmission, inte
 from .runs.files import read_run, write_run
 from .runs.mosaic import as_seen, mosaic
 from .runs.projecting import project_run
+from .runs.recipe import Recipe, read_recipe, write_recipe
 from .runs.run import ProjectionRun
+from .runs.run_recipe import run_recipe
 from .volumes.meshes.mesh import Mesh, read_mesh, write_mesh
 from .volumes.meshes.surface import volume_to_mesh
 from .volumes.meshes.voxelization import voxelize_mesh
@@ -103,6 +105,7 @@ __all__ = [
     "Progress",
     "ProjectionRun",
     "Projector",
+    "Recipe",
     "RingFit",
     "Shape",
     "ShapePhantom",
@@ -144,6 +147,7 @@ __all__ = [
     "read_geometry",
     "read_mesh",
     "read_phantom",
+    "read_recipe",
     "read_run",
     "read_system",
     "read_volume",
@@ -153,6 +157,7 @@ __all__ = [
     "resolution_map",
     "ring_order",
     "roi_radius_seen",
+    "run_recipe",
     "sample_counts",
     "sampling_gaps",
     "seen",
@@ -165,6 +170,7 @@ __all__ = [
     "write_geometry",
     "write_mesh",
     "write_phantom",
+    "write_recipe",
     "write_run",
     "write_system",
     "write_volume",

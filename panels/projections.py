@@ -2,9 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Container
+
 import bpy
 
 from ..addon import ids, jobs, scanner, volumes
+from ..addon.projection_properties import drawn, makes_counts
+
+_MAIN = ("time", "photons", "pixel_points")
+"""Settings of models that the panel itself shows; the others stand under Physics."""
 
 
 class MPHDRR_PT_projections(bpy.types.Panel):
@@ -26,21 +32,13 @@ class MPHDRR_PT_projections(bpy.types.Panel):
         column.prop(settings, "volume", placeholder="Active volume")
         column.prop(settings, "model")
         _draw_ct_hint(column, settings, context.object)
-        if settings.model == "EMISSION":
-            column.prop(settings, "time")
-        elif settings.model == "TRANSMISSION":
-            column.prop(settings, "photons")
-        size = column.column(align=True)
-        size.prop(settings, "width", text="Pixels X")
-        size.prop(settings, "height", text="Y")
-        column.row().prop(settings, "detector", expand=True)
-        column.prop(settings, "magnification")
-        if settings.model != "INVERSE_SQUARE":
-            column.prop(settings, "pixel_points")
+        model = [name for name, _ in drawn(settings, "model") if name != "model"]
+        _draw(column, settings, "model", [name for name in model if name in _MAIN])
+        _draw(column, settings, "detector")
         modules = column.column(align=True)
         modules.prop(settings, "first", text="Modules First")
         modules.prop(settings, "last", text="Last")
-        column.prop(settings, "backend")
+        _draw(column, settings, "compute")
         if not jobs.is_running():
             row = layout.row()
             row.scale_y = 1.4
@@ -48,6 +46,7 @@ class MPHDRR_PT_projections(bpy.types.Panel):
             ready = scanner.active_scanner(context.scene) is not None and bool(volumes.volume_objects(context.scene))
             row.enabled = ready
             row.operator(ids.RENDER_PROJECTIONS, icon="RENDER_STILL")
+            layout.operator(ids.LOAD_RECIPE, icon="FILE_FOLDER")
             if not ready:
                 hint = layout.row()
                 hint.active = False
@@ -58,6 +57,17 @@ class MPHDRR_PT_projections(bpy.types.Panel):
             column.active = False
             for part in settings.run_summary.split(", ", 1):
                 column.label(text=part)
+
+
+def _draw(
+    layout: bpy.types.UILayout, settings: bpy.types.PropertyGroup, table: str, only: Container[str] | None = None
+) -> None:
+    """The settings of a table that the chosen model has; those without an effect are greyed out."""
+    for name, is_active in drawn(settings, table):
+        if only is None or name in only:
+            row = layout.row()
+            row.active = is_active
+            row.prop(settings, name)
 
 
 def _draw_ct_hint(
@@ -87,7 +97,7 @@ class MPHDRR_PT_physics(bpy.types.Panel):
 
     @classmethod
     def poll(cls, context: bpy.types.Context) -> bool:
-        return _makes_counts(getattr(context.scene, ids.SCENE_PROJECTIONS))
+        return bool(getattr(context.scene, ids.SCENE_PROJECTIONS).model != "INVERSE_SQUARE")
 
     def draw(self, context: bpy.types.Context) -> None:
         layout = self.layout
@@ -95,39 +105,16 @@ class MPHDRR_PT_physics(bpy.types.Panel):
         layout.use_property_decorate = False
         layout.enabled = not jobs.is_running()
         settings = getattr(context.scene, ids.SCENE_PROJECTIONS)
+        column = layout.column(align=True)
         if settings.model == "EMISSION":
-            column = layout.column()
-            column.prop(settings, "isotope")
             column.prop(settings, "mu", placeholder="None")
-            column = layout.column(align=True)
-            column.prop(settings, "aperture_points")
-            column.prop(settings, "aperture_material", text="Edge of")
-            if settings.aperture_material == "NUMBER":
-                column.prop(settings, "aperture_mu", text="Edge µ (1/mm)")
-            edge = column.column(align=True)
-            edge.active = settings.aperture_material != "NUMBER" or settings.aperture_mu > 0
-            edge.prop(settings, "edge")
             collection = scanner.active_scanner(context.scene)
             if collection is not None:
                 column.prop(collection.mphdrr_scanner, "opening_angle")
-            column = layout.column(align=True)
-            column.prop(settings, "crystal_material")
-            if settings.crystal_material == "NUMBER":
-                column.prop(settings, "crystal_mu", text="Crystal µ (1/mm)")
-            depth = column.column(align=True)
-            depth.active = settings.crystal_material != "NUMBER" or settings.crystal_mu > 0
-            depth.prop(settings, "depth_layers")
-            column.prop(settings, "intrinsic_fwhm", text="Blur (mm)")
-            column = layout.column(heading="Stopped by", align=True)
-            for name in ("within_cone", "within_walls", "within_crystal"):
-                column.prop(settings, name)
+        _draw(column, settings, "model", [n for n, _ in drawn(settings, "model") if n not in (*_MAIN, "model")])
         row = layout.row(heading="Poisson Noise")
+        row.active = makes_counts(settings)
         row.prop(settings, "noise", text="")
         seed = row.row()
         seed.active = settings.noise
         seed.prop(settings, "seed")
-
-
-def _makes_counts(settings: bpy.types.PropertyGroup) -> bool:
-    """Whether images hold numbers of photons."""
-    return settings.model == "EMISSION" or (settings.model == "TRANSMISSION" and settings.photons > 0)

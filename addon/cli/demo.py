@@ -4,24 +4,19 @@ from __future__ import annotations
 
 import argparse
 import contextlib
-import dataclasses
 import time
 from collections.abc import Iterator
 from pathlib import Path
 
-import numpy as np
-
 from ...core.cli.options import add_command, add_workbook, progress_bar, read_workbook
 from ...core.files import ensure_folder
-from ...core.geometry.frames import euler_pose
-from ...core.geometry.grid import Grid
-from ...core.phantoms.derenzo import DerenzoPhantom
 from ...core.runs.files import write_run
 from ...core.runs.mosaic import mosaic, write_png
-from ...core.runs.projecting import project_run
+from ...core.runs.recipe import Recipe
+from ...core.runs.run_recipe import run_recipe
 
 EXAMPLE = Path(__file__).parents[2] / "examples" / "dc-spect-80.xlsx"
-EULER_DEGREES = (30.0, 55.0, 0.0)
+EULER_DEGREES = (30.0, 55.0, 0.0)  # tilted, so that modules see along and across the rods
 
 
 def add_parser(subparsers) -> None:  # type: ignore[no-untyped-def]
@@ -44,31 +39,29 @@ def _run(arguments: argparse.Namespace) -> None:
     from .session import new_scene, quiet, save_scene
 
     scene = new_scene()  # before the long work: without Blender the demo stops here
-    from .. import last_run, pictures, scanner, volumes
+    from .. import pictures, rendering, scanner, volumes
 
     with _step("geometry"):
         system = read_workbook(arguments)
         collection = scanner.build_scanner(scene, system)
-    with _step("phantom"):
-        phantom = DerenzoPhantom(radius=40.0, rod_diameters=(8, 6, 5, 4, 3, 2), height=40.0, activity=100.0)
-        grid = Grid.centered(arguments.voxels, 102.4 / arguments.voxels)
-        phi, theta, psi = np.deg2rad(EULER_DEGREES)
-        pose = euler_pose(phi, theta, psi)  # tilted, so that modules see along and across the rods
-        volume = phantom.voxelize(grid, pose, progress=progress_bar("voxelizing"))
-        volume_object = volumes.add_volume(volume, "Derenzo phantom", pose, dataclasses.asdict(phantom))
     with _step("projections"):
-        run = project_run(
-            system,
-            volume,
-            shape=(arguments.size, arguments.size),
-            settings={"phantom": dataclasses.asdict(phantom), "euler_degrees": EULER_DEGREES},
-            progress=progress_bar("projecting"),
-        )
+        recipe = Recipe({
+            "system.file": arguments.workbook,
+            "phantom.kind": "derenzo",
+            "phantom.euler_degrees": EULER_DEGREES,
+            "phantom.voxels": arguments.voxels,
+            "phantom.spacing": 102.4 / arguments.voxels,
+            "detector.rows": arguments.size,
+            "detector.columns": arguments.size,
+        })  # fmt: skip
+        (run,) = run_recipe(recipe, system, stages=progress_bar)
+        pose, phantom = run.recipe["phantom.matrix"], run.recipe.tables()["phantom"]
+        volume_object = volumes.add_volume(run.volume, "Derenzo phantom", pose, phantom)
     with _step("dataset"):
         write_run(run, out / "run.h5")
         write_png(mosaic(run.projections), out / "mosaic.png")
     with _step("scene"):
-        last_run.show_run(scene, run, out / "run.h5")
+        rendering.show_run(scene, run, out / "run.h5")
         save_scene(out / "scanner.blend")
     with _step("pictures"), quiet():
         for first, last in scanner.quick_ranges(system):

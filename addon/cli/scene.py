@@ -42,7 +42,7 @@ def _run(arguments: argparse.Namespace) -> None:
     from .session import new_scene, save_scene
 
     blender_scene = new_scene()
-    from .. import ids, last_run, scanner, volumes
+    from .. import ids, rendering, scanner, volumes
 
     scanner.build_scanner(blender_scene, system)
     if volume is not None:
@@ -51,6 +51,6 @@ def _run(arguments: argparse.Namespace) -> None:
         getattr(blender_scene, ids.SCENE_PROJECTIONS).mu = volumes.add_volume(mu, Path(arguments.mu).name)
     if run is not None:
         volumes.add_volume(run.volume, "Projected volume")
-        last_run.show_run(blender_scene, run, Path(arguments.run_file))
+        rendering.show_run(blender_scene, run, Path(arguments.run_file))
     save_scene(path)
     print(path)

@@ -10,18 +10,14 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-from numpy.typing import NDArray
-
 from ..errors import InputError
 from ..files import ensure_folder, refuse_folder
+from ..geometry.module_numbers import chosen_modules as chosen_modules
 from ..geometry.system import PinholeSystem
-from ..physics.isotopes import ISOTOPES
+from ..physics.isotopes import photon_energy as photon_energy
 from ..progress import Progress
 from ..workbook import read_system
 
-DERENZO_OPTIONS = ("radius", "rods", "sectors", "height", "activity", "water", "background")
-"""Of `add_phantom_options`, those that say what the Derenzo phantom is."""
 PLACING_OPTIONS = ("position", "euler", "voxels", "spacing")
 """Of `add_placing_options`."""
 
@@ -132,8 +128,8 @@ def add_placing_options(parser: argparse.ArgumentParser) -> None:
     )
 
 
-def add_view_options(parser: argparse.ArgumentParser, computing: bool = True) -> None:
-    """The images' size and place and, for those that are `computing` them, by what."""
+def add_view_options(parser: argparse.ArgumentParser) -> None:
+    """The images' size and place, and the modules that have one."""
     parser.add_argument("--size", type=int, nargs=2, default=[256, 256], metavar=("ROWS", "COLUMNS"), help="pixels")
     parser.add_argument(
         "--detector", choices=("virtual", "real"), default="virtual", help="upright in front, or crystal"
@@ -141,37 +137,11 @@ def add_view_options(parser: argparse.ArgumentParser, computing: bool = True) ->
     parser.add_argument("--magnification", type=float, default=10.0, help="virtual detector's distance in units of l")
     parser.add_argument("--pitch", type=float, metavar="MM", help="pixel size; default: the crystal's whole side")
     parser.add_argument("--modules", metavar="RANGE", help="such as 1-40 or 1-20,41; default: all")
-    if not computing:
-        return
-    parser.add_argument("--backend", default="auto", help="auto, cpu, cuda, torch or numpy")
-    parser.add_argument("--threads", type=int, metavar="N", help="processor threads; default: all")
 
 
 def one_or_three(values: list) -> list:
     """The numbers along x, y and z of an option that takes one for all."""
     return values * 3 if len(values) == 1 else values
-
-
-def chosen_modules(system: PinholeSystem, text: str | None, option: str = "--modules") -> PinholeSystem:
-    """The modules of `system` whose numbers `text` ("1-40", "1-20,41"), given by `option`, lists; all for None."""
-    if text is None:
-        return system
-    wanted: list[NDArray[np.int64]] = []
-    for part in text.split(","):
-        first, _, last = part.strip().partition("-")
-        try:
-            low, high = int(first), int(last or first)
-        except ValueError:
-            raise InputError(f"{option} {text!r}: expected numbers such as 1-40 or 1-20,41") from None
-        found = np.flatnonzero((system.numbers >= low) & (system.numbers <= high))
-        if high < low:
-            raise InputError(f"{option} {text!r}: {part.strip()} ends before it begins")
-        if len(found) == 0:
-            raise InputError(
-                f"{option} {text!r}: no module {part.strip()}; there are {system.numbers.min()} to {system.numbers.max()}"
-            )
-        wanted.append(found)
-    return system[np.unique(np.concatenate(wanted))]
 
 
 def output_path(text: str, suffixes: tuple[str, ...] = ()) -> Path:
@@ -194,17 +164,6 @@ def numbered_path(path: Path, number: int, count: int) -> Path:
     suffix = ".nii.gz" if path.name.lower().endswith(".nii.gz") else path.suffix
     end = len(path.name) - len(suffix)
     return path.with_name(f"{path.name[:end]}-{number:0{len(str(count))}}{path.name[end:]}")
-
-
-def photon_energy(text: str) -> float:
-    """keV, from a number or from the name of an isotope: the energy of its strongest line."""
-    if text in ISOTOPES:
-        energy, _ = max(ISOTOPES[text].lines, key=lambda line: line[1])
-        return energy
-    try:
-        return float(text)
-    except ValueError:
-        raise InputError(f"energy {text!r}: expected keV, or one of {', '.join(ISOTOPES)}") from None
 
 
 def number_or_name(text: str) -> float | str:

@@ -1,53 +1,46 @@
-"""``mphdrr project WORKBOOK --volume FILE -o run.h5``."""
+"""``mphdrr project WORKBOOK --volume FILE -o run.h5``, ``mphdrr project run.toml -o run.h5``.
+
+Every setting of `runs.settings` is an option; the help lists the most used ones.
+"""
 
 from __future__ import annotations
 
 import argparse
-import math
-from collections.abc import Iterator, Sequence
-from dataclasses import fields
+import tomllib
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from ..errors import InputError
-from ..geometry.system import PinholeSystem
-from ..physics.ct_numbers import hu_to_mu
-from ..physics.isotopes import ISOTOPES
-from ..physics.materials import APERTURES, CRYSTALS
-from ..projector import Emission, InverseSquareSum, Model, Transmission
-from ..runs.files import FORMATS, write_run
+from ..phantoms.kinds import KINDS
+from ..runs.files import FORMATS, read_run, write_run
 from ..runs.mosaic import mosaic, write_png
-from ..runs.projecting import project_run, warn_of_energy
-from ..volumes.rearranging import centered
-from ..volumes.volume import LINE_INTEGRALS, Volume
-from ..volumes.volume_files import read_volume, read_volume_of
-from .options import (
-    DERENZO_OPTIONS,
-    PLACING_OPTIONS,
-    add_command,
-    add_phantom_options,
-    add_view_options,
-    add_workbook,
-    chosen_modules,
-    number_or_name,
-    numbered_path,
-    output_path,
-    photon_energy,
-    progress_bar,
-    read_workbook,
-    refuse,
-)
-from .phantom import chosen_phantom, placed_volume
+from ..runs.recipe import Recipe, read_recipe, write_recipe
+from ..runs.run import ProjectionRun
+from ..runs.run_recipe import run_recipe
+from ..runs.settings import SETTINGS, Setting
+from .options import add_command, number_or_name, numbered_path, output_path, progress_bar
 
-_MOST_MU = 500.0
-"""1/mm: more than any material of the tables attenuates photons of 10 keV or more."""
-_RAYS = [field.name for field in fields(Transmission)]
-"""How many rays a pixel gets, of radiographs and of counts."""
-_EMISSION = [field.name for field in fields(Emission) if field.name not in _RAYS]
-Source = tuple[Volume, Volume | None, dict[str, Any]]
-"""What is projected, what attenuates it, and what to record of them."""
+_LISTED = (
+    "system.columns", "system.modules", "volume.file", "volume.states", "volume.center", "phantom.file",
+    "attenuation.file", "model.time", "model.isotope", "detector.plane", "detector.magnification", "noise.seed",
+    "compute.backend", "compute.threads",
+)  # fmt: skip
+"""Settings whose options the help lists; the others it leaves to --set and the recipe."""
+
+_BY_HAND = ("model.kind", "model.photons", "detector.rows", "detector.columns", "volume.energy")
+
+# Options of the Derenzo phantom by the settings that they stand for.
+_DERENZO = {
+    "--radius": ("phantom.radius",),
+    "--rods": ("phantom.rod_diameters",),
+    "--sectors": ("phantom.sectors",),
+    "--height": ("phantom.height",),
+    "--activity": ("phantom.activity",),
+    "--water": ("phantom.cylinder_radius", "phantom.cylinder_height"),
+    "--background": ("phantom.background",),
+}
 
 
 def add_parser(subparsers) -> None:  # type: ignore[no-untyped-def]
@@ -58,293 +51,158 @@ def add_parser(subparsers) -> None:  # type: ignore[no-untyped-def]
         "project a volume, or a phantom, into every module",
         "mphdrr project scanner.xlsx --volume ct.nii.gz --energy 60 --size 250 250 -o run.h5\n"
         "example: mphdrr project scanner.xlsx --volume heart.nii.gz --mu ct-mu.nii.gz --emission --isotope Tc-99m "
-        "--time 600 --aperture-points 7 --aperture-mu tungsten --crystal-mu CZT --noise 1 -o counts.h5\n"
-        "example: mphdrr project scanner.xlsx --phantom thorax.toml --phantom-mu --emission --isotope Tc-99m -o counts.h5",
-    )
-    add_workbook(parser)
-    source = parser.add_mutually_exclusive_group()
-    source.add_argument(
-        "--volume", metavar="FILE", help="volume or folder of a DICOM series; without it, a Derenzo phantom is made"
-    )
-    source.add_argument(
-        "--states", nargs="+", metavar="FILE",
-        help="volumes of what changes, such as a beating heart: a run of each, as OUTPUT-1, OUTPUT-2 …",
-    )  # fmt: skip
-    source.add_argument("--phantom", metavar="FILE", help="a phantom's shapes (.toml), put on the grid given below")
-    parser.add_argument(
-        "--series", metavar="NAME", help="of several DICOM series in --volume, by number, description or UID"
+        "--set model.aperture_mu=tungsten --write-recipe heart.toml\n"
+        "example: mphdrr project heart.toml --noise 1 -o counts.h5",
     )
     parser.add_argument(
-        "--quantity", choices=LINE_INTEGRALS,
-        help="what the values of --volume or --states are; default: what the file says; one that says nothing holds "
-        "activity with --emission, mu with --photons, and is else taken for CT numbers",
+        "file", nargs="?", metavar="FILE",
+        help="geometry workbook (.xlsx, .xlsm), recipe (.toml), or a run (.h5, .npz, .pt) whose recipe, scanner and volume "
+        "are taken",
+    )  # fmt: skip
+    for setting in SETTINGS.values():
+        if setting.key not in _BY_HAND:
+            _add_setting(parser, setting)
+    _add(
+        parser, "--size", ("detector.rows", "detector.columns"), "Pixels, rows and columns (default: 256 256)", nargs=2
+    )
+    _add(parser, "--energy", ("energy",), SETTINGS["volume.energy"].help, metavar="KEV")
+    kind = parser.add_mutually_exclusive_group()
+    for word in SETTINGS["model.kind"].words:
+        kind.add_argument(
+            f"--{word}", dest="model.kind", action="store_const", const=word, default=argparse.SUPPRESS,
+            help=SETTINGS["model.kind"].words[word][1],
+        )  # fmt: skip
+    _add(kind, "--photons", ("model.photons",), SETTINGS["model.photons"].help)
+    for option, keys in _DERENZO.items():
+        nargs = "+" if option == "--rods" else len(keys) if len(keys) > 1 else None
+        _add(parser, option, keys, argparse.SUPPRESS, nargs=nargs)
+    parser.add_argument(
+        "--set", action="append", default=[], metavar="KEY=VALUE", dest="entries",
+        help="any entry of a recipe, such as model.aperture_points=7; KEY= takes it away",
     )  # fmt: skip
     parser.add_argument(
-        "--energy", metavar="KEV",
-        help="CT numbers of --volume, --states or --mu become attenuation (1/mm) at this energy, or at an isotope's "
-        "strongest line",
+        "--write-recipe", metavar="FILE", help="write the recipe (.toml) of these options, all settings explained in it, "
+        "instead of projecting",
     )  # fmt: skip
-    parser.add_argument(
-        "--center",
-        action="store_true",
-        help="move the volume's middle to the isocentre, other --states and --mu as far",
-    )
-    add_view_options(parser)
-    models = parser.add_argument_group("what pixels hold; without an option, line integrals")
-    one = models.add_mutually_exclusive_group()
-    one.add_argument("--emission", action="store_true", help="SPECT counts of a volume of activity")
-    one.add_argument(
-        "--photons", type=float, metavar="N", help="of N X-ray photons per pixel, those that pass: mu in 1/mm"
-    )
-    one.add_argument(
-        "--inverse-square", action="store_true",
-        help="line integrals with each segment times a point source's sensitivity, as 1/h^2: no counts, for comparison",
-    )  # fmt: skip
-    models.add_argument(
-        "--noise",
-        type=int,
-        metavar="SEED",
-        help="draw Poisson counts instead of their means; of --states, with SEED, SEED + 1 …",
-    )
-    add_ray_options(parser)
-    add_emission_options(parser)
-    add_phantom_options(parser.add_argument_group("Derenzo phantom, without --volume, or place of --phantom"))  # type: ignore[arg-type]
-    parser.add_argument("-o", "--output", required=True, metavar="FILE", help=", ".join(FORMATS))
+    parser.add_argument("-o", "--output", metavar="FILE", help=", ".join(FORMATS))
     parser.add_argument("--mosaic", metavar="PNG", help="also write all images in one picture")
     parser.set_defaults(run=_run)
 
 
-def add_ray_options(parser: argparse.ArgumentParser) -> None:
-    """How many rays a pixel gets, in the namespace only if it is given."""
-    group = parser.add_argument_group("rays of a pixel")
-    group.add_argument(
-        "--pixel-points", type=_points, metavar="N", default=argparse.SUPPRESS,
-        help="points of each pixel's area, for each of the hole; auto: as many as --tolerance asks for "
-        "(default: auto for --emission, 1 otherwise: the pixels' centres)",
-    )  # fmt: skip
-    group.add_argument(
-        "--tolerance", type=float, metavar="SHARE", default=argparse.SUPPRESS,
-        help="how far off the total of a single voxel may be, in any module (default: 0.02)",
-    )  # fmt: skip
+class _Store(argparse.Action):
+    """Stores the value of an option under its key in the recipe, or its values one under each of several keys."""
+
+    def __call__(self, parser: Any, namespace: argparse.Namespace, values: Any, option_string: Any = None) -> None:
+        """Called by argparse."""
+        keys = self.dest.split()
+        for key, value in zip(keys, values if len(keys) > 1 else [values], strict=True):
+            setattr(namespace, key, value)
 
 
-def _points(text: str) -> int | None:
-    return None if text == "auto" else int(text)
+def _add(parser: Any, option: str, keys: tuple[str, ...], text: str, **details: Any) -> None:
+    """Add an option for entries of the recipe; they are in the namespace only where it is typed."""
+    details = {"type": _value, "metavar": "VALUE", **details}
+    text = text if text == argparse.SUPPRESS else text.replace("%", "%%")
+    parser.add_argument(option, action=_Store, dest=" ".join(keys), default=argparse.SUPPRESS, help=text, **details)
 
 
-def add_emission_options(parser: argparse.ArgumentParser) -> None:
-    """The arguments of `Emission`, in the namespace only if they are given."""
-
-    def option(group: argparse._ArgumentGroup, name: str, **details: Any) -> None:
-        group.add_argument(name, default=argparse.SUPPRESS, **details)
-
-    source = parser.add_argument_group("--emission: the source")
-    option(source, "--time", type=float, metavar="S", help="acquisition time, s (default: 1)")
-    option(source, "--isotope", metavar="NAME", help=f"{', '.join(ISOTOPES)}; without it, one photon per decay")
-    option(
-        source, "--window", type=float, nargs=2, metavar=("LOW", "HIGH"),
-        help="energies that are counted, keV (default: 10 %% around the isotope's strongest line)",
-    )  # fmt: skip
-    attenuation = source.add_mutually_exclusive_group()
-    option(
-        attenuation, "--mu", metavar="FILE",
-        help="attenuation coefficients, 1/mm, on any grid, or with --energy CT numbers (a DICOM folder, too); "
-        "without it, none",
-    )  # fmt: skip
-    attenuation.add_argument(
-        "--phantom-mu", action="store_true", help="the phantom's own attenuation coefficients, on its activity's grid"
-    )
-    source.add_argument("--mu-series", metavar="NAME", help="of several DICOM series in --mu, as --series")
-    aperture = parser.add_argument_group("--emission: the pinhole")
-    option(aperture, "--aperture-points", type=int, metavar="N", help="points of the hole that rays pass (default: 1)")
-    option(
-        aperture, "--aperture-tolerance", type=float, metavar="SHARE",
-        help="as many as bring a voxel's image this close, such as 0.1, to that of the whole hole",
-    )  # fmt: skip
-    option(
-        aperture, "--aperture-mu", type=number_or_name, metavar="MATERIAL",
-        help=f"{', '.join(APERTURES)} at the isotope's photons, or the coefficient, 1/mm; without it, nothing penetrates",
-    )  # fmt: skip
-    option(aperture, "--opening-angle", type=float, metavar="DEG", help="full angle of the knife edge (default: 90)")
-    option(
-        aperture, "--edge", choices=("paix", "path"),
-        help="penetration by an effective diameter, or by the path through the edge (default: paix)",
-    )  # fmt: skip
-    option(aperture, "--within-cone", action="store_true", help="nothing passes steeper than the knife edge's cone")
-    crystal = parser.add_argument_group("--emission: collimator and crystal")
-    option(crystal, "--within-walls", action="store_true", help="the collimator's walls stop what misses the front")
-    option(crystal, "--within-crystal", action="store_true", help="pixels beyond the crystal's side count nothing")
-    option(
-        crystal, "--crystal-mu", type=number_or_name, metavar="MATERIAL",
-        help=f"{', '.join(CRYSTALS)} at the isotope's photons, or the coefficient, 1/mm; without it, all photons count",
-    )  # fmt: skip
-    option(
-        crystal, "--depth-layers", type=int, metavar="N", help="depths of interaction, for the parallax (default: 1)"
-    )
-    option(crystal, "--intrinsic-fwhm", type=float, metavar="MM", help="blur of the detector, mm (default: 0)")
+def _add_setting(parser: argparse.ArgumentParser, setting: Setting) -> None:
+    text = argparse.SUPPRESS
+    if setting.key in _LISTED:
+        text = setting.help + (f" (default: {setting.default})" if setting.default not in (None, False) else "")
+    if setting.kind is bool:
+        parser.add_argument(
+            setting.option, dest=setting.key, action="store_true", default=argparse.SUPPRESS, help=text
+        )  # fmt: skip
+        return
+    details: dict[str, Any] = {"type": str} if setting.kind is str else {}
+    if setting.sizes is not None or setting.kind is list:
+        details["nargs"] = "+"
+    metavar = "FILE" if setting.is_path else "NAME" if setting.kind is str else setting.unit.upper() or "VALUE"
+    _add(parser, setting.option, (setting.key,), text, metavar=metavar, **details)
 
 
-def chosen_model(arguments: argparse.Namespace, system: PinholeSystem, mu: Volume | None) -> Model:
-    """The model that `arguments` ask for; `mu` is what attenuates."""
-    rays = {name: getattr(arguments, name) for name in _RAYS if hasattr(arguments, name)}
-    if arguments.inverse_square:
-        return InverseSquareSum(system)
-    if not arguments.emission:
-        return Transmission(**rays)
-    given = {name: getattr(arguments, name) for name in _EMISSION if hasattr(arguments, name)} | rays | {"mu": mu}
-    if "opening_angle" in given:
-        given["opening_angle"] = math.radians(given["opening_angle"])
-    return Emission(system, **given)
+def _value(text: str) -> Any:
+    """A value as in TOML, or a text without quotes."""
+    try:
+        return tomllib.loads(f"value = {text}")["value"]
+    except tomllib.TOMLDecodeError:
+        return number_or_name(text.strip())
 
 
-def _require_fitting(arguments: argparse.Namespace) -> None:
-    """Refuse options that would have no effect beside the others."""
-    if arguments.inverse_square:
-        refuse(arguments, _RAYS, "is not for --inverse-square")
-    if not arguments.emission:
-        refuse(arguments, (*_EMISSION, "phantom_mu", "mu_series"), "needs --emission")
-        if arguments.photons is None:
-            refuse(arguments, ("noise",), "needs --emission or --photons")
-    if arguments.volume or arguments.states:
-        source = "--volume" if arguments.volume else "--states"
-        refuse(arguments, (*DERENZO_OPTIONS, *PLACING_OPTIONS, "phantom_mu"), f"is for a phantom, not for {source}")
-    else:
-        refuse(arguments, ("center",), "needs --volume or --states")
-        if arguments.phantom:
-            refuse(arguments, DERENZO_OPTIONS, "is for the Derenzo phantom, not for --phantom")
-    if not arguments.volume:
-        refuse(arguments, ("series",), "needs --volume")
-        if not arguments.states:
-            refuse(arguments, ("quantity",), "needs --volume or --states")
-    if arguments.energy is not None and not arguments.emission:
-        refuse(arguments, ("quantity",), "has no effect beside --energy, which takes CT numbers")
-    if "mu" not in arguments:
-        refuse(arguments, ("mu_series",), "needs --mu")
-        if arguments.emission or not (arguments.volume or arguments.states):
-            refuse(arguments, ("energy",), "needs a --volume of CT numbers, or with --emission a --mu of them")
-    if "aperture_mu" not in arguments:
-        refuse(arguments, ("edge",), "needs --aperture-mu")
-        if "within_cone" not in arguments:
-            refuse(arguments, ("opening_angle",), "needs --aperture-mu or --within-cone")
-    if arguments.backend in ("cuda", "torch"):
-        refuse(arguments, ("threads",), f"is for cpu and numpy: {arguments.backend} has threads of its own")
+def _changes(arguments: argparse.Namespace, recipe: Recipe) -> dict[str, Any]:
+    """What the options say, by the keys of recipes."""
+    typed = vars(arguments)
+    changes = {key: value for key, value in typed.items() if "." in key}
+    for entry in arguments.entries:
+        key, equals, text = entry.partition("=")
+        if not equals:
+            raise InputError(f"--set {entry}: expected KEY=VALUE, such as model.aperture_points=7")
+        changes[key.strip()] = _value(text) if text.strip() else None
+    if "model.photons" in changes:
+        changes.setdefault("model.kind", "transmission")
+    if "energy" in typed:
+        # Counts are of activity: the CT numbers are those of the attenuation.
+        is_counts = changes.get("model.kind", recipe["model.kind"]) == "emission"
+        changes["attenuation.energy" if is_counts else "volume.energy"] = typed["energy"]
+    if changes.get("phantom.file") in {kind.name for kind in KINDS}:
+        changes["phantom.kind"] = changes.pop("phantom.file")
+    return changes
 
 
-def _attenuation(path: str, energy: str | None, series: str | None) -> Volume:
-    """The volume of mu in a file: as it is, or from CT numbers at `energy`."""
-    progress = progress_bar("reading")
-    if energy is not None:
-        volume = read_volume(path, series=series, progress=progress)
-        if volume.quantity != "hu":
-            raise InputError(f"{path}: it holds {volume.quantity}; --energy is for CT numbers (hu)")
-        return hu_to_mu(volume, photon_energy(energy))
-    advice = "; of CT numbers, give --energy to convert them"
-    volume = read_volume_of(path, "mu", advice, series=series, progress=progress)
-    lowest, highest = float(volume.array.min()), float(volume.array.max())
-    if lowest < -1 or highest > _MOST_MU:  # interpolation may leave values a little below 0
-        raise InputError(
-            f"{path}: {lowest if lowest < -1 else highest:g} is no attenuation in 1/mm; if it holds CT numbers, give "
-            "--energy to convert them"
-        )
-    return volume
+def _chosen(arguments: argparse.Namespace) -> tuple[Recipe, ProjectionRun | None]:
+    """The recipe of the options, and the run whose recipe it began with."""
+    file, run, recipe = arguments.file, None, Recipe()
+    if file is not None:
+        suffix = Path(file).suffix.lower()
+        if suffix == ".toml":
+            recipe = read_recipe(file)
+        elif suffix in FORMATS:
+            run = read_run(file)
+            recipe = run.recipe
+        else:
+            recipe = Recipe({"system.file": file})
+    return recipe.updated(_changes(arguments, recipe)), run
 
 
-def _volume(path: str, arguments: argparse.Namespace) -> Volume:
-    """What a file of --volume or --states holds; what the chosen model has no meaning for is refused."""
-    if arguments.quantity is not None:
-        return read_volume(path, arguments.quantity, series=arguments.series, progress=progress_bar("reading"))
-    if arguments.emission:
-        volume = read_volume_of(path, "activity", series=arguments.series, progress=progress_bar("reading"))
-        lowest, highest = float(volume.array.min()), float(volume.array.max())
-        if lowest < -0.1 * highest:  # interpolation leaves less
-            raise InputError(
-                f"{path}: values of {lowest:g} to {highest:g}, as of a CT, are no activity; --quantity activity takes them "
-                "as such"
-            )
-        return volume
-    if arguments.photons is not None or arguments.energy is not None:
-        return _attenuation(path, arguments.energy, arguments.series)
-    volume = read_volume(path, series=arguments.series, progress=progress_bar("reading"))
-    if volume.quantity == "hu":
-        raise InputError(
-            f"{path}: it holds CT numbers (hu), or says nothing and is taken for them; give --energy KEV to convert them "
-            "to attenuation, or --quantity mu or activity if that is what the values are"
-        )
-    return volume
-
-
-def _of_files(files: Sequence[str], mu: Volume | None, arguments: argparse.Namespace) -> Iterator[Source]:
-    """The volumes of --volume or --states, one at a time; with --center all are moved as the first, mu too."""
-    middle = None
-    for file in files:
-        volume = _volume(file, arguments)
-        settings: dict[str, Any] = {"volume": Path(file).name}
-        if arguments.center:
-            if middle is None:
-                middle = volume.grid.center
-                mu = None if mu is None else centered(mu, mu.grid.center - middle)
-            volume = centered(volume, volume.grid.center - middle)
-            settings["centered"] = True
-        yield volume, mu, settings
-
-
-def _of_phantom(mu: Volume | None, model: Model, arguments: argparse.Namespace) -> Iterator[Source]:
-    """The phantom, attenuated by itself with --phantom-mu."""
-    phantom, settings = chosen_phantom(arguments, arguments.phantom)
-    settings = {"volume": Path(arguments.phantom or "Derenzo phantom").name, **settings}
-    if arguments.phantom_mu:
-        if all(shape.mu is None for shape in phantom.shapes):
-            raise InputError(f"--phantom-mu: no shape of the {phantom.title} has a mu")
-        warn_of_energy(model, phantom.mu_energy, f"the mu of the {phantom.title}")
-        mu = placed_volume(phantom, arguments, "mu")
-        settings["mu_of_phantom_at_kev"] = phantom.mu_energy
-    quantity = "mu" if arguments.phantom and arguments.photons is not None else "activity"
-    yield placed_volume(phantom, arguments, quantity), mu, settings
+def _kept(run: ProjectionRun | None, recipe: Recipe) -> dict[str, Any]:
+    """The scanner and the volume of a run, unless the recipe says others than the run's own."""
+    if run is None:
+        return {}
+    now, then = recipe.tables(), run.recipe.tables()
+    kept: dict[str, Any] = {}
+    if now.get("system") == then.get("system"):
+        kept["system"] = run.system
+    if all(now.get(table) == then.get(table) for table in ("volume", "phantom")):
+        kept["volume"] = run.volume
+    return kept
 
 
 def _run(arguments: argparse.Namespace) -> None:
+    if arguments.write_recipe:
+        path = output_path(arguments.write_recipe, (".toml",))
+        recipe, _ = _chosen(arguments)
+        write_recipe(recipe, path)
+        print(path)
+        return
+    if not arguments.output:
+        raise InputError("nothing to write: give --output FILE, or --write-recipe FILE")
     path = output_path(arguments.output, FORMATS)
     picture = output_path(arguments.mosaic) if arguments.mosaic else None
-    _require_fitting(arguments)
-    system = chosen_modules(read_workbook(arguments), arguments.modules)
-    model = chosen_model(arguments, system, None)  # before the long work: it says what cannot be
-    files = arguments.states or ([arguments.volume] if arguments.volume else [])
-    count = max(1, len(files))
+    recipe, run = _chosen(arguments)
+    states = recipe["volume.states"] or ()
+    count = max(1, len(states))
     outputs = {numbered_path(path, number, count).resolve() for number in range(1, count + 1)}
-    for file in (*files, *([arguments.mu] if "mu" in arguments else [])):
-        if Path(file).resolve() in outputs:
+    for file in (*states, recipe["volume.file"], recipe["attenuation.file"]):
+        if file is not None and Path(file).resolve() in outputs:
             raise InputError(f"{file}: the projections would replace what they are made from; choose another --output")
-    mu = _attenuation(arguments.mu, arguments.energy, arguments.mu_series) if "mu" in arguments else None
-    if mu is not None and arguments.energy is not None:
-        warn_of_energy(model, photon_energy(arguments.energy), f"the mu of {Path(arguments.mu).name}")
-    sources = _of_files(files, mu, arguments) if files else _of_phantom(mu, model, arguments)
-    for number, (volume, mu_of_it, settings) in enumerate(sources, 1):
-        run = project_run(
-            system,
-            volume,
-            shape=tuple(arguments.size),
-            detector=arguments.detector,
-            magnification=arguments.magnification,
-            pitch=arguments.pitch,
-            backend=arguments.backend,
-            threads=arguments.threads,
-            settings={
-                **settings,
-                **({"mu_file": Path(arguments.mu).name} if "mu" in arguments else {}),
-                **({"ct_converted_at_kev": photon_energy(arguments.energy)} if arguments.energy is not None else {}),
-            },
-            model=chosen_model(arguments, system, mu_of_it),
-            photons=arguments.photons,
-            # Noise of its own for each state.
-            noise_seed=None if arguments.noise is None else arguments.noise + number - 1,
-            progress=progress_bar("projecting"),
-        )
+    for number, made in enumerate(run_recipe(recipe, **_kept(run, recipe), stages=progress_bar), 1):
         file = numbered_path(path, number, count)
-        write_run(run, file)
+        write_run(made, file)
         if picture is not None:
-            write_png(mosaic(run.projections), numbered_path(picture, number, count))
-        n_v, n_u = run.views.shape
-        views, largest = len(run.views), float(np.max(run.projections))
+            write_png(mosaic(made.projections), numbered_path(picture, number, count))
+        views, (n_v, n_u) = len(made.views), made.views.shape
+        largest = float(np.max(made.projections))
         print(
-            f"{file}: {views} projection{'s' * (views > 1)} of {n_v} x {n_u} pixels, largest {largest:.4g} {run.unit}"
+            f"{file}: {views} projection{'s' * (views > 1)} of {n_v} x {n_u} pixels, largest {largest:.4g} {made.unit}"
         )

@@ -95,3 +95,20 @@ def isotope(name: str) -> Isotope:
         return ISOTOPES[name]
     except KeyError:
         raise InputError(f"isotope {name!r}: expected one of {', '.join(ISOTOPES)}") from None
+
+
+def photon_energy(value: float | str) -> float:
+    """A photon energy, keV, from a number or its text, or from the name of an isotope: that of its strongest line.
+
+    Raises
+    ------
+    InputError
+        Neither a number nor an isotope.
+    """
+    if value in ISOTOPES:
+        energy, _ = max(ISOTOPES[str(value)].lines, key=lambda line: line[1])
+        return energy
+    try:
+        return float(value)
+    except ValueError:
+        raise InputError(f"energy {value!r}: expected keV, or one of {', '.join(ISOTOPES)}") from None

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -28,26 +29,26 @@ CONVENTIONS = (
     "volume[ix, iy, iz]: affine from index to world, an integer index is the voxel's centre, 0 outside."
 )
 
-UNITS = {
-    "geometry/number": "",
-    "geometry/ring": "",
-    "geometry/center": "mm",
-    "geometry/pinhole_distance": "mm",
-    "geometry/pinhole_diameter": "mm",
-    "geometry/collimator_length": "mm",
-    "geometry/detector_side": "mm",
-    "geometry/detector_thickness": "mm",
-    "geometry/roi_radius": "mm",
-    "geometry/pose": "mm",
-    "geometry/intrinsics": "pixel",
-    "geometry/projection_matrix": "pixel",
-    "views/sources": "mm",
-    "views/detector_centers": "mm",
-    "views/u_steps": "mm",
-    "views/v_steps": "mm",
-    "volume/affine": "mm",
+ARRAYS: dict[str, tuple[str, Callable[[ProjectionRun], Any]]] = {
+    "geometry/number": ("", lambda run: run.system.numbers),
+    "geometry/ring": ("", lambda run: run.system.rings()),
+    "geometry/center": ("mm", lambda run: run.system.centers),
+    "geometry/pinhole_distance": ("mm", lambda run: run.system.pinhole_distance),
+    "geometry/pinhole_diameter": ("mm", lambda run: run.system.pinhole_diameter),
+    "geometry/collimator_length": ("mm", lambda run: run.system.collimator_length),
+    "geometry/detector_side": ("mm", lambda run: run.system.detector_side),
+    "geometry/detector_thickness": ("mm", lambda run: run.system.detector_thickness),
+    "geometry/roi_radius": ("mm", lambda run: run.system.roi_radius),
+    "geometry/pose": ("mm", lambda run: run.system.poses()),
+    "geometry/intrinsics": ("pixel", lambda run: run.intrinsics()),
+    "geometry/projection_matrix": ("pixel", lambda run: run.views.projection_matrices()),
+    "views/sources": ("mm", lambda run: run.views.sources),
+    "views/detector_centers": ("mm", lambda run: run.views.detector_centers),
+    "views/u_steps": ("mm", lambda run: run.views.u_steps),
+    "views/v_steps": ("mm", lambda run: run.views.v_steps),
+    "volume/affine": ("mm", lambda run: run.volume.grid.affine),
 }
-"""Units of the arrays beside projections and volume, whose units are attributes of the run."""
+"""Name, unit and contents of the arrays beside projections and volume, whose units are attributes of the run."""
 
 
 @dataclass(frozen=True)
@@ -63,33 +64,13 @@ class Record:
             return str(self.attributes["projections_unit"])
         if name == "volume/array":
             return str(self.attributes["volume_unit"])
-        return UNITS[name]
+        return ARRAYS[name][0]
 
 
 def record_of(run: ProjectionRun) -> Record:
     """Everything of `run`, as arrays and attributes."""
-    system, views = run.system, run.views
-    arrays: dict[str, NDArray] = {
-        "projections": run.projections,
-        "geometry/number": system.numbers,
-        "geometry/ring": system.rings(),
-        "geometry/center": system.centers,
-        "geometry/pinhole_distance": system.pinhole_distance,
-        "geometry/pinhole_diameter": system.pinhole_diameter,
-        "geometry/collimator_length": system.collimator_length,
-        "geometry/detector_side": system.detector_side,
-        "geometry/detector_thickness": system.detector_thickness,
-        "geometry/roi_radius": system.roi_radius,
-        "geometry/pose": system.poses(),
-        "geometry/intrinsics": run.intrinsics(),
-        "geometry/projection_matrix": views.projection_matrices(),
-        "views/sources": views.sources,
-        "views/detector_centers": views.detector_centers,
-        "views/u_steps": views.u_steps,
-        "views/v_steps": views.v_steps,
-        "volume/array": run.volume.array,
-        "volume/affine": run.volume.grid.affine,
-    }
+    arrays = {"projections": run.projections, "volume/array": run.volume.array}
+    arrays |= {name: get(run) for name, (_, get) in ARRAYS.items()}
     attributes: dict[str, Any] = {
         "format": FORMAT,
         "format_version": FORMAT_VERSION,
@@ -113,7 +94,7 @@ def run_of(record: Record) -> ProjectionRun:
         raise InputError(f"expected a file marked {FORMAT!r}, found {attributes.get('format', 'no mark')!r}")
     if int(attributes["format_version"]) > FORMAT_VERSION:
         raise InputError(f"written by a newer mphDRR (format {attributes['format_version']}); update to read it")
-    missing = [name for name in ("projections", "volume/array", *UNITS) if name not in arrays]
+    missing = [name for name in ("projections", "volume/array", *ARRAYS) if name not in arrays]
     if missing:
         raise InputError(f"array {missing[0]} is missing")
     n_v, n_u = arrays["projections"].shape[1:]
@@ -126,21 +107,17 @@ def run_of(record: Record) -> ProjectionRun:
         roi_radius=arrays["geometry/roi_radius"],
         numbers=arrays["geometry/number"],
     )
-    array = arrays["volume/array"]
-    n_x, n_y, n_z = array.shape
-    grid = Grid((n_x, n_y, n_z), arrays["volume/affine"])
+    volume = arrays["volume/array"]
+    n_x, n_y, n_z = volume.shape
+    sources, middles, u_steps, v_steps = (
+        arrays[f"views/{name}"] for name in ("sources", "detector_centers", "u_steps", "v_steps")
+    )
     seed = attributes["seed"]
     return ProjectionRun(
         projections=np.asarray(arrays["projections"], np.float32),
         system=system,
-        views=Views(
-            arrays["views/sources"],
-            arrays["views/detector_centers"],
-            arrays["views/u_steps"],
-            arrays["views/v_steps"],
-            (n_v, n_u),
-        ),
-        volume=Volume(array, grid, str(attributes["volume_quantity"])),
+        views=Views(sources, middles, u_steps, v_steps, (n_v, n_u)),
+        volume=Volume(volume, Grid((n_x, n_y, n_z), arrays["volume/affine"]), str(attributes["volume_quantity"])),
         unit=str(attributes["projections_unit"]),
         settings=json.loads(attributes["settings"]),
         seed=None if seed == "none" else int(seed),

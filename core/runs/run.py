@@ -18,6 +18,7 @@ from ..geometry.views import Views
 from ..validation import freeze, real_array
 from ..version import VERSION
 from ..volumes.volume import Volume
+from .recipe import Recipe, recipe_of_tables
 
 
 def versions() -> dict[str, str]:
@@ -49,9 +50,9 @@ class ProjectionRun:
     unit : str
         Of the projections, such as ``"kBq/mL mm"``.
     settings : mapping
-        How they were made (detector, magnification, model, backend, phantom ...): anything JSON can hold.
+        How they were made (detector, magnification, model, backend, recipe ...): anything JSON can hold.
     seed : int or None
-        Of the random numbers drawn, None where none were.
+        Of the noise; None where the projections have none.
     workbook, workbook_sha256 : str
         Name and SHA-256 of the geometry workbook; empty where there is none.
     versions : mapping
@@ -90,6 +91,13 @@ class ProjectionRun:
         if source is not None and not self.workbook_sha256:
             object.__setattr__(self, "workbook", source.path.name)
             object.__setattr__(self, "workbook_sha256", source.sha256)
+
+    @property
+    def recipe(self) -> Recipe:
+        """What was asked for; `InputError` where the run does not say it, as those of version 0.1.0 do not."""
+        if "recipe" not in self.settings:
+            raise InputError("the run holds no recipe: it was made by version 0.1.0, or without one")
+        return recipe_of_tables(self.settings["recipe"])
 
     def intrinsics(self) -> NDArray[np.float64]:
         """Camera matrices K (M, 3, 3), pixels: ``K @ (x_u, x_v, x_k)`` is a multiple of ``(column, row, 1)``.

@@ -144,7 +144,7 @@ def test_a_new_choice_has_a_number_of_its_own():
 
 # In a Python of its own: enumerations are made when the extension is imported.
 OPEN = """
-import json, sys
+import importlib, json, sys
 import bpy
 from mphdrr.core.phantoms import kinds
 from mphdrr.core.physics import isotopes, materials
@@ -178,6 +178,7 @@ if sys.argv[2] == "more":
             return (Sphere(radius=self.radius, activity=2.0),)
 
     kinds.KINDS = (kinds.Kind("goose-egg", Egg, "Goose Egg", "an egg"), *kinds.KINDS[::-1])
+    importlib.reload(importlib.import_module("mphdrr.core.runs.settings"))  # whose words are these tables'
 
 from mphdrr.addon import registration
 registration.register()

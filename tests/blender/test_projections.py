@@ -98,8 +98,9 @@ def test_physics_of_the_panel_is_that_of_core(scanned, scene, body):
     np.testing.assert_array_equal(
         images.projection_array(bpy.data.images[ids.projection_name(scanned.numbers[0], 8)]), run.projections[0]
     )
-    assert (run.seed, run.settings["mu_volume"], run.settings["volume"]) == (5, "Body", "Derenzo")
+    assert (run.seed, run.settings["volume"]) == (5, "Derenzo")
     assert {name: run.settings[name] for name in IN_PYTHON} == IN_PYTHON
+    assert (run.recipe["attenuation.object"], run.recipe["noise.seed"]) == ("Body", 5)
 
 
 def test_materials_of_the_panel_are_those_of_core(scanned, scene):
@@ -116,6 +117,8 @@ def test_materials_of_the_panel_are_those_of_core(scanned, scene):
         # Weighed with the scene's modules, which float32 holds.
         expected = model.aperture_mu, model.crystal_mu
         assert (record["aperture_mu"], record["crystal_mu"]) == pytest.approx(expected, rel=1e-6)
+        asked = record["recipe"]["model"]  # materials by name
+        assert (asked["aperture_mu"], asked["crystal_mu"]) == (aperture, "NaI")
 
 
 def test_photons_of_a_radiograph_and_the_inverse_square_sum(scanned, scene, body):
@@ -213,7 +216,7 @@ def test_images_and_arrays_survive_save_and_reopen(scanned, scene, tmp_path):
     assert run_file == "//study_mphdrr/Scene-projections.h5"
     run = read_run(storage.absolute(run_file))
     assert np.array_equal(run.projections[0], before)
-    assert run.settings["phantom"] == "derenzo" and run.settings["rod_diameters_mm"] == [8, 6, 5, 4, 3, 2]
+    assert run.recipe["phantom.kind"] == "derenzo" and run.recipe["phantom.rod_diameters"] == (8, 6, 5, 4, 3, 2)
     # The reopened scene can be projected again, to the last bit.
     bpy.ops.mphdrr.render_projections(width=24, height=20)
     assert np.array_equal(images.projection_array(bpy.data.images[name]), before)
@@ -252,7 +255,7 @@ def test_moved_phantom_is_projected_where_it_is(scanned):
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
-        ({"first": 900, "last": 910}, "no module is numbered 900"),
+        ({"first": 900, "last": 910}, "no module 900-910; there are 1 to 8"),
         ({"volume": "Nope"}, "no volume is named 'Nope'; there are: Derenzo"),
         ({"width": 300, "height": 300}, "8 images of 300 x 300 pixels needs? .* of memory"),
     ],
@@ -459,3 +462,53 @@ def test_attenuation_at_another_energy_is_said(scanned, scene, source, isotope, 
     assert bpy.ops.mphdrr.render_projections(width=4, height=4, last=1, **settings) == {"FINISHED"}
     out = "".join(capfd.readouterr())
     assert (f"the mu of '{mu.name}' holds at 140.5 keV" in out) == said
+
+
+def _panel(settings) -> dict:
+    """Every property of the panel, volumes and the last run aside."""
+    from mphdrr.addon.projection_properties import ProjectionSettings
+
+    values = {name: getattr(settings, name) for name in ProjectionSettings.__annotations__}
+    return {k: tuple(v) if isinstance(v, bpy.types.bpy_prop_array) else v for k, v in values.items()}
+
+
+@pytest.mark.parametrize("saved", ["run", "toml"])
+def test_the_recipe_of_a_run_sets_the_panel_as_it_was(scanned, scene, body, tmp_path, saved):
+    from mphdrr.core.runs.files import read_run
+    from mphdrr.core.runs.recipe import write_recipe
+
+    settings = scene.mphdrr_projections
+    settings.model, settings.noise, settings.seed, settings.mu = "EMISSION", True, 5, bpy.data.objects["Body"]
+    settings.isotope, settings.aperture_material, settings.edge, settings.crystal_mu = "Tl-201", "lead", "PATH", 0.4
+    settings.window, settings.width, settings.height, settings.last = (60, 80), 8, 6, 3
+    scene.mphdrr_geometry.scanner.mphdrr_scanner.opening_angle = 1.4
+    asked = _panel(settings)
+    bpy.ops.mphdrr.render_projections()
+    path = storage.absolute(settings.run_file)
+    if saved == "toml":
+        write_recipe(read_run(path).recipe, tmp_path / "recipe.toml")
+        path = tmp_path / "recipe.toml"
+    for name in asked:
+        settings.property_unset(name)
+    settings.time, settings.photons, settings.mu = 99, 7, None
+    scene.mphdrr_geometry.scanner.mphdrr_scanner.opening_angle = 1.0
+    assert bpy.ops.mphdrr.load_recipe(filepath=str(path)) == {"FINISHED"}
+    assert _panel(settings) == asked
+    assert settings.mu.name == "Body" and settings.volume.name == "Derenzo"
+    assert scene.mphdrr_geometry.scanner.mphdrr_scanner.opening_angle == pytest.approx(1.4)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("[model]\nkind = 'spect'", "model.kind: expected one of transmission, emission"),
+        ("[model]\npixel_points = 'auto'", "no automatic number for radiographs"),
+        ("[system]\nmodules = '1,3'", "the panel has one range of modules"),
+    ],
+)
+def test_a_recipe_that_the_panel_cannot_take_is_one_clear_line(scene, tmp_path, text, message):
+    before = _panel(scene.mphdrr_projections)
+    (tmp_path / "r.toml").write_text(text)
+    with pytest.raises(RuntimeError, match=message):
+        bpy.ops.mphdrr.load_recipe(filepath=str(tmp_path / "r.toml"))
+    assert _panel(scene.mphdrr_projections) == before

@@ -61,7 +61,7 @@ def test_the_current_frame_is_projected(scene, ring_system, beats):
         assert bpy.ops.mphdrr.render_projections(width=10, height=12) == {"FINISHED"}
         run = read_run(storage.absolute(scene.mphdrr_projections.run_file))
         np.testing.assert_allclose(run.projections, Projector(expected.grid, views)(expected), rtol=1e-5, atol=1e-3)
-        assert run.settings["state"] == f"{frame} of 2" and run.settings["frame"] == frame
+        assert run.recipe["volume.state"] == f"{frame} of 2"
 
 
 @pytest.fixture

@@ -75,9 +75,10 @@ def test_what_would_not_be_seen_is_said(options, said, workbook, tmp_path, capsy
 def test_runs_record_what_the_phantom_was(workbook, tmp_path):
     options = [*SMALL, "--radius", "30", "--euler", "10", "20", "30", "-o", str(tmp_path / "run.npz")]
     assert main(["project", str(workbook), *options]) == 0
-    settings = mph.read_run(tmp_path / "run.npz").settings
-    assert settings["phantom"]["radius"] == 30
-    assert settings["euler_degrees"] == [10, 20, 30]
+    recipe = mph.read_run(tmp_path / "run.npz").recipe
+    assert (recipe["phantom.kind"], recipe["phantom.radius"], recipe["phantom.activity"]) == ("derenzo", 30, 100)
+    assert recipe["phantom.euler_degrees"] == pytest.approx((10, 20, 30))
+    np.testing.assert_allclose(recipe["phantom.matrix"], mph.euler_pose(*np.deg2rad([10, 20, 30])))
 
 
 def test_counts_with_attenuation_and_noise(workbook, tmp_path, capsys):
@@ -117,6 +118,7 @@ def test_every_part_of_the_emission_model_is_an_option(workbook, tmp_path):
     assert expected.any()
     np.testing.assert_allclose(run.projections, expected, rtol=1e-5, atol=1e-6 * expected.max())
     assert {name: run.settings[name] for name in model.record()} == model.record()
+    assert (run.recipe["model.aperture_mu"], run.recipe["model.crystal_mu"]) == ("lead", 0.3)  # as they were asked for
 
 
 def test_radiographs_of_mu_and_the_inverse_square_sum(workbook, tmp_path):
@@ -136,23 +138,27 @@ def test_radiographs_of_mu_and_the_inverse_square_sum(workbook, tmp_path):
 
 
 NO_EFFECT = [
-    ("--volume X --voxels 8", "--voxels is for a phantom, not for --volume"),
-    ("--volume X --radius 40", "--radius is for a phantom, not for --volume"),  # the default, but typed
-    ("--states X Y --euler 0 0 0", "--euler is for a phantom, not for --states"),
-    ("--volume X --emission --phantom-mu", "--phantom-mu is for a phantom, not for --volume"),
-    ("--phantom X --rods 8", "--rods is for the Derenzo phantom, not for --phantom"),
-    ("--phantom X --center", "--center needs --volume or --states"),
-    ("--series 3", "--series needs --volume"),
-    ("--phantom-mu", "--phantom-mu needs --emission"),
-    ("--mu X", "--mu needs --emission"),
-    ("--emission --mu-series 3", "--mu-series needs --mu"),
+    ("--volume X --voxels 8", "phantom.voxels (--voxels) does not go with volume.file (--volume)"),
+    ("--volume X --radius 40", "phantom.radius does not go with volume.file (--volume)"),  # the default, but typed
+    ("--states X Y --euler 0 0 0", "phantom.euler_degrees (--euler) does not go with volume.states (--states)"),
     (
-        "--emission --energy 80 --phantom-mu",
-        "--energy needs a --volume of CT numbers, or with --emission a --mu of them",
+        "--volume X --emission --phantom-mu",
+        "attenuation.of_phantom (--phantom-mu) does not go with volume.file (--volume)",
     ),
-    ("--emission --edge paix", "--edge needs --aperture-mu"),
-    ("--emission --opening-angle 80", "--opening-angle needs --aperture-mu or --within-cone"),
-    ("--backend torch --threads 2", "--threads is for cpu and numpy: torch has threads of its own"),
+    ("--phantom X --rods 8", "phantom.rod_diameters does not go with phantom.file (--phantom)"),
+    ("--phantom X --center", "volume.center (--center) needs volume.file (--volume) or volume.states (--states)"),
+    ("--series 3", "volume.series (--series) needs volume.file (--volume)"),
+    ("--phantom-mu", "attenuation.of_phantom (--phantom-mu) needs model.kind = emission (--emission)"),
+    ("--mu X", "attenuation.file (--mu) needs model.kind = emission (--emission)"),
+    ("--emission --mu-series 3", "attenuation.series (--mu-series) needs attenuation.file (--mu)"),
+    ("--emission --energy 80 --phantom-mu", "attenuation.energy (--mu-energy) needs attenuation.file (--mu)"),
+    ("--emission --edge paix", "model.edge (--edge) needs model.aperture_mu (--aperture-mu)"),
+    (
+        "--emission --opening-angle 80",
+        "model.opening_angle_degrees (--opening-angle) needs model.aperture_mu (--aperture-mu) or model.within_cone "
+        "(--within-cone)",
+    ),
+    ("--backend torch --threads 2", "compute.threads (--threads) does not go with compute.backend = torch"),
 ]
 
 
@@ -177,8 +183,14 @@ def test_options_without_effect_are_refused(options, said, tmp_path, capsys):
         (["project", "WORKBOOK", "-o", "FOLDER/a.txt"], "expected a name ending in"),
         (["project", "WORKBOOK", *SMALL, "--backend", "magic", "-o", "FOLDER/a.h5"], "auto, cpu, torch"),
         (["project", "WORKBOOK", *SMALL, "--magnification", "0", "-o", "FOLDER/a.h5"], "magnification"),
-        (["project", "WORKBOOK", *SMALL, "--noise", "1", "-o", "FOLDER/a.h5"], "--noise needs --emission"),
-        (["project", "WORKBOOK", *SMALL, "--edge", "path", "-o", "FOLDER/a.h5"], "--edge needs --emission"),
+        (
+            ["project", "WORKBOOK", *SMALL, "--noise", "1", "-o", "FOLDER/a.h5"],
+            "(--noise) needs model.kind = emission (--emission)",
+        ),
+        (
+            ["project", "WORKBOOK", *SMALL, "--edge", "path", "-o", "FOLDER/a.h5"],
+            "(--edge) needs model.kind = emission (--emission)",
+        ),
         (["project", "WORKBOOK", *SMALL, "--photons", "9", "-o", "FOLDER/a.h5"], "a volume of mu"),
         (["project", "WORKBOOK", *SMALL, "--emission", "--isotope", "Tc", "-o", "FOLDER/a.h5"], "Tc-99m"),
         (["project", "WORKBOOK", *SMALL, "--emission", "--time", "0", "-o", "FOLDER/a.h5"], "time"),
@@ -226,12 +238,12 @@ def test_every_help_has_an_example(command, capsys):
 
 
 def test_an_interrupt_leaves_nothing(workbook, tmp_path, monkeypatch, capsys):
-    import mphdrr.core.cli.project as project
+    from mphdrr.core.runs import run_recipe
 
     def interrupted(*_, **__):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(project, "project_run", interrupted)
+    monkeypatch.setattr(run_recipe, "project_run", interrupted)
     assert main(["project", str(workbook), *SMALL, "-o", str(tmp_path / "run.h5")]) == 130
     assert "cancelled" in capsys.readouterr().err
     assert not list(tmp_path.iterdir())

@@ -182,8 +182,11 @@ def test_a_file_that_says_nothing_holds_what_the_user_says(quantity, options, un
         (["--emission", "--mu", "raw.nii"], "4000 is no attenuation in 1/mm; .* give --energy"),
         (["--volume", "map.npz"], "expected a volume of activity or mu, got sensitivity"),
         (["--volume", "map.npz", "--emission"], "holds sensitivity, expected activity"),
-        (["--volume", "ct.nii", "--quantity", "mu", "--energy", "60"], "--quantity has no effect beside --energy"),
-        (["--quantity", "mu"], "--quantity needs --volume or --states"),
+        (
+            ["--volume", "ct.nii", "--quantity", "mu", "--energy", "60"],
+            r"\(--quantity\) does not go with volume.energy",
+        ),
+        (["--quantity", "mu"], r"\(--quantity\) needs volume.file"),
         (["--volume", "mu.nii", "--quantity", "activity", "--photons", "9"], "photons: expected the transmission of"),
     ],
 )

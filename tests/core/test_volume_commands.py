@@ -124,8 +124,8 @@ def test_project_converts_and_centers_a_ct(tmp_path, ct, workbook, capsys):
             ("--volume", tmp_path / "a.nrrd", "--emission", "--mu", tmp_path / "a.nrrd"),
             "it holds activity, expected mu",
         ),
-        (("--energy", "80"), "--energy needs a --volume"),
-        (("--center",), "--center needs --volume or --states"),
+        (("--energy", "80"), "(--energy) needs volume.file (--volume)"),
+        (("--center",), "(--center) needs volume.file (--volume)"),
     ):
         assert run(*common, *arguments, "-o", out) == 1
         assert message in capsys.readouterr().err

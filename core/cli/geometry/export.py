@@ -35,7 +35,7 @@ def add_parser(actions) -> None:  # type: ignore[no-untyped-def]
     parser.add_argument(
         "--set", action="append", default=[], metavar="NAME=VALUE", help="an option of the format; may be repeated"
     )
-    add_view_options(parser, computing=False)
+    add_view_options(parser)
     described = "\n".join(map(_described, FORMATS.values()))
     parser.epilog = f"formats, with their options for --set:\n{described}\n{parser.epilog}"
     parser.set_defaults(run=_run)

@@ -1,0 +1,179 @@
+"""Projections of a scene: the volume and the scanner projected, images in the .blend, exact arrays in a file beside it."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Generator, Sequence
+from pathlib import Path
+from typing import Any
+
+import bpy
+
+from ..core.errors import InputError
+from ..core.geometry.module_numbers import chosen_modules
+from ..core.memory import require
+from ..core.progress import Progress
+from ..core.runs.files import read_run, write_run
+from ..core.runs.phantom_recipe import with_phantom
+from ..core.runs.projecting import warn_of_energy
+from ..core.runs.recipe import Recipe, read_recipe
+from ..core.runs.run import ProjectionRun
+from ..core.runs.run_recipe import recipe_model, run_recipe
+from ..core.volumes.volume import require_quantity
+from . import ids, images, jobs, phantoms, scanner, storage, volumes
+from .projection_properties import OPENING_ANGLE, set_panel
+
+
+def render_job(context: bpy.types.Context, recipe: Recipe, volume: str = "", mu: str = "") -> jobs.Job:
+    """The job that projects a volume of the context's scene into its scanner's modules.
+
+    Parameters
+    ----------
+    context
+        Its scene has the scanner.
+    recipe
+        The settings of model, detector, noise, modules and backend.
+    volume, mu
+        Names of the objects of what is projected and what attenuates; by default those of the panel.
+
+    Raises
+    ------
+    InputError
+        There is no scanner or no such volume, a phantom has changed, the settings do not go together, or the images do not
+        fit into memory.
+    """
+    scene = context.scene
+    system = chosen_modules(scanner.read_scanner(scanner.required_scanner(scene)), recipe["system.modules"], "modules")
+    model = recipe_model(recipe, system)  # refuses what cannot be, before the work begins
+    photons = recipe["model.photons"]
+    item = _chosen_volume(context, volume, ("mu",) if photons else model.takes, model.name)
+    mu_item = _chosen_mu(context, mu) if recipe["model.kind"] == "emission" else None
+    for chosen in filter(None, (item, mu_item)):
+        phantoms.require_current(chosen)
+    rows, columns = recipe["detector.rows"], recipe["detector.columns"]
+    # The array, and Blender's images with four channels in memory and once more, packed.
+    require(36.0 * len(system) * rows * columns, f"{len(system)} images of {columns} x {rows} pixels")
+    recipe = recipe.updated({"volume.object": item.name, "attenuation.object": mu_item and mu_item.name})
+    recipe = _with_volume(recipe, item)
+    read_volume, read_mu = volumes.reader(item), mu_item and volumes.reader(mu_item)
+    energy = mu_item and phantoms.mu_energy(mu_item)
+    path = storage.folder() / f"{bpy.path.clean_name(scene.name)}-projections.h5"
+    scene_name, start = scene.name, time.perf_counter()
+
+    def work(progress: Progress) -> ProjectionRun:
+        progress(0, len(system))
+        if energy is not None:
+            warn_of_energy(model, energy, f"the mu of {recipe['attenuation.object']!r}")
+        (run,) = run_recipe(recipe, system, read_volume(), read_mu and read_mu(), lambda stage: progress)
+        write_run(run, path)
+        return run
+
+    def finish(run: ProjectionRun) -> Generator[None, None, str]:
+        images.show((yield from images.storing(run.projections, run.system.numbers)), bpy.context)
+        scene = bpy.data.scenes.get(scene_name)
+        if scene is None:
+            raise InputError(f"the scene {scene_name!r} is gone; its projections are in {path}")
+        _record_run(scene, run, path)
+        where = path if bpy.data.filepath else f"{path} until the .blend is saved"
+        seconds = time.perf_counter() - start
+        return f"Projected {recipe['volume.object']!r} into {len(run.views)} modules in {seconds:.1f} s: {where}"
+
+    return jobs.Job("Projecting", work, finish)
+
+
+def load_recipe(scene: bpy.types.Scene, path: Path) -> None:
+    """Set the scene's panel as a recipe (.toml) or the recipe of a run says.
+
+    Raises
+    ------
+    InputError
+        The file cannot be read, a run holds no recipe, or the panel has no such value.
+    """
+    recipe = read_recipe(path) if path.suffix.lower() == ".toml" else read_run(path).recipe
+    settings = getattr(scene, ids.SCENE_PROJECTIONS)
+    set_panel(settings, recipe)
+    known = {item.name: item for item in volumes.volume_objects(scene)}
+    settings.volume, settings.mu = known.get(recipe["volume.object"]), known.get(recipe["attenuation.object"])
+    collection = scanner.active_scanner(scene)
+    if collection is not None and OPENING_ANGLE in recipe.given:
+        collection.mphdrr_scanner.opening_angle = math.radians(recipe[OPENING_ANGLE])
+
+
+def show_run(scene: bpy.types.Scene, run: ProjectionRun, path: Path) -> None:
+    """Make images of `run`, which is kept in the file `path`, and show it as the scene's last."""
+    images.store_projections(run.projections, run.system.numbers)
+    _record_run(scene, run, path)
+
+
+def _record_run(scene: bpy.types.Scene, run: ProjectionRun, path: Path) -> None:
+    state = getattr(scene, ids.SCENE_PROJECTIONS)
+    state.run_file = storage.stored_path(path.absolute())
+    n_v, n_u = run.views.shape
+    what = [run.settings.get("volume"), run.settings.get("backend")]
+    state.run_summary = ", ".join([f"{len(run.views)} views of {n_u} × {n_v}", *(text for text in what if text)])
+
+
+def _with_volume(recipe: Recipe, item: bpy.types.Object) -> Recipe:
+    """The recipe with what the volume's object is: its state and its phantom."""
+    state = 0
+    if item.data.is_sequence:
+        text = volumes.state_text(item)
+        recipe = recipe.updated({"volume.state": text})
+        state = int(text.split()[0]) - 1 if text != "none" else 0
+    settings = phantoms.settings_of(item)
+    if settings is None:
+        return recipe
+    made = phantoms.recipe_of(settings)
+    values: dict[str, Any] = {
+        "phantom.voxels": made.grid.shape, "phantom.spacing": made.grid.spacing.tolist(), "phantom.turn_grid": True,
+    }  # fmt: skip
+    if settings.bl_rna.properties.get("text") is not None:
+        values["phantom.text"] = settings.text.as_string()
+    return with_phantom(recipe.updated(values), made.states[state], volumes.pose_of_object(item))
+
+
+def _chosen_volume(context: bpy.types.Context, name: str, taken: Sequence[str], model: str) -> bpy.types.Object:
+    """The volume named, else the panel's, else the active one, else the only one of a quantity that the model takes."""
+    known = volumes.volume_objects(context.scene)
+    chosen = _named(known, name) if name else _of_panel(context, "volume")
+    # An active CT is meant, though it has to be converted first; otherwise a fitting volume is looked for.
+    if chosen is None and context.object in known and "mu" in taken and volumes.quantity_of(context.object) == "hu":
+        chosen = context.object
+    if chosen is not None:
+        require_quantity(volumes.quantity_of(chosen), taken, f"{chosen.name!r} for {model}")
+        return chosen
+    fitting = [item for item in known if volumes.quantity_of(item) in taken]
+    if context.object in fitting:
+        return context.object
+    what = " or ".join(taken)
+    if not fitting:
+        raise InputError(f"no volume of {what} in the scene: add a phantom first")
+    if len(fitting) > 1:
+        raise InputError(f"choose what to project: there are {len(fitting)} volumes of {what}")
+    return fitting[0]
+
+
+def _chosen_mu(context: bpy.types.Context, name: str) -> bpy.types.Object | None:
+    """The volume of attenuation coefficients named, else the panel's, else None."""
+    chosen = _named(volumes.volume_objects(context.scene), name) if name else _of_panel(context, "mu")
+    if chosen is not None:
+        require_quantity(volumes.quantity_of(chosen), ("mu",), f"{chosen.name!r} for attenuation")
+    return chosen
+
+
+def _of_panel(context: bpy.types.Context, name: str) -> bpy.types.Object | None:
+    """The panel's volume, if it has one. Blender keeps it there even when the user has deleted it."""
+    settings = getattr(context.scene, ids.SCENE_PROJECTIONS)
+    chosen = getattr(settings, name)
+    if chosen is not None and chosen not in volumes.volume_objects(context.scene):
+        label = settings.bl_rna.properties[name].name
+        raise InputError(f"{label} {chosen.name!r} is not in this scene any more: choose another, or none")
+    return chosen
+
+
+def _named(known: list[bpy.types.Object], name: str) -> bpy.types.Object:
+    for item in known:
+        if item.name == name:
+            return item
+    raise InputError(f"no volume is named {name!r}; there are: {', '.join(item.name for item in known) or 'none'}")

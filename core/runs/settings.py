@@ -1,0 +1,269 @@
+"""The settings of a projection run, declared once.
+
+`SETTINGS` is the only declaration: the options of ``mphdrr project``, the recipe files, the properties of Blender's panel
+and operator, and the record in a run file follow from it. A new setting of a model is a line here and an argument of the
+same name in the model's class.
+"""
+
+from __future__ import annotations
+
+import math
+import operator
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
+from numbers import Integral, Real
+from types import MappingProxyType
+from typing import Any
+
+from ..errors import InputError
+from ..phantoms.kinds import KINDS
+from ..physics.isotopes import ISOTOPES
+from ..physics.materials import APERTURES, CRYSTALS
+from ..validation import real_array
+from ..volumes.volume import LINE_INTEGRALS
+
+Words = Mapping[str, tuple[str, str]]
+"""The words that a setting may be, each with its label and description."""
+
+
+@dataclass(frozen=True)
+class Setting:
+    """One setting of a run.
+
+    Attributes
+    ----------
+    key : str
+        Table and name: ``"model.time"``.
+    kind : type
+        Of its value, or of each of several: bool, int, float, str; list for a 4 x 4 matrix.
+    default
+        Its value where none is given; None for none.
+    text, absent : str
+        What it is, and what it means that none is given where the default is None: parts of help texts.
+    unit : str
+        Such as ``"mm"``.
+    words : mapping
+        Words that it may be; beside numbers if its kind is a number.
+    least, above, most : float, optional
+        Bounds of its value: the smallest, one that it must exceed, the largest.
+    slider : float, optional
+        The largest value that a slider reaches.
+    sizes : tuple of int, optional
+        How many values it may have, empty for any number; None for one value alone.
+    is_path : bool
+        Whether it names a file.
+    needs : tuple of str
+        Conditions without which it has no effect, each alternatives such as ``"model.aperture_mu or model.within_cone"``:
+        a setting that must be given, must have one value (``key=value``), or must not be given (``no key``).
+    option, label : str
+        Its option on the command line, and its name in Blender; by default made from the key.
+    """
+
+    key: str
+    kind: type
+    default: Any
+    text: str
+    absent: str = ""
+    unit: str = ""
+    words: Words = field(default_factory=dict)
+    least: float | None = None
+    above: float | None = None
+    most: float | None = None
+    slider: float | None = None
+    sizes: tuple[int, ...] | None = None
+    is_path: bool = False
+    needs: tuple[str, ...] = ()
+    option: str = ""
+    label: str = ""
+
+    def __post_init__(self) -> None:
+        name = self.key.partition(".")[2].removesuffix("_degrees")
+        object.__setattr__(self, "option", self.option or "--" + name.replace("_", "-"))
+        object.__setattr__(self, "label", self.label or name.replace("_", " ").title())
+
+    @property
+    def help(self) -> str:
+        """The text with unit, words and what leaving it out means."""
+        words = ", ".join(self.words)
+        parts = [self.text, *([self.unit] if self.unit else []), *([f"one of {words}"] if words else [])]
+        return ", ".join(parts) + (f"; without it, {self.absent}" if self.absent else "")
+
+    @property
+    def expected(self) -> str:
+        """What one value must be, for messages."""
+        words = f"one of {', '.join(self.words)}" if self.words else ""
+        if self.kind in (bool, str):
+            return words or {bool: "true or false", str: "a text"}[self.kind]
+        number = "a whole number" if self.kind is int else "a number"
+        if self.least is not None:
+            number += f" of {self.least:g} or more"
+        if self.above is not None:
+            number += f" above {self.above:g}"
+        if self.most is not None:
+            number += f" and at most {self.most:g}"
+        return " or ".join(filter(None, (words, number + (f" ({self.unit})" if self.unit else ""))))
+
+    def checked(self, value: Any) -> Any:
+        """`value` as a recipe keeps it, lists as tuples; `InputError` where it is not what is expected."""
+        if self.kind is list:
+            return tuple(map(tuple, real_array(value, self.key, (4, 4)).tolist()))
+        if self.sizes is None:
+            return self._one(value)
+        values = value if isinstance(value, list | tuple) else [value]
+        if not values or (self.sizes and len(values) not in self.sizes):
+            count = " or ".join(map(str, self.sizes)) or "1 or more"
+            raise InputError(f"{self.key}: expected {count} values, got {len(values)}")
+        return tuple(map(self._one, values))
+
+    def _one(self, value: Any) -> Any:
+        if isinstance(value, str):
+            # The projector knows backends by older names, too, and says which there are.
+            good = value in self.words if self.words and self.key != "compute.backend" else self.kind is str
+        elif self.kind in (bool, str):
+            good = isinstance(value, self.kind)
+        else:
+            good = isinstance(value, Integral if self.kind is int else Real) and not isinstance(value, bool)
+            good = good and math.isfinite(value) and self._is_within(value)
+            value = self.kind(value) if good else value
+        if not good:
+            raise InputError(f"{self.key}: expected {self.expected}, got {value!r}")
+        return value
+
+    def _is_within(self, value: Any) -> bool:
+        bounds = ((self.least, operator.ge), (self.above, operator.gt), (self.most, operator.le))
+        return all(bound is None or holds(value, bound) for bound, holds in bounds)
+
+
+def _named(names: Iterable[str], text: str) -> Words:
+    return {name: (name[0].upper() + name[1:], text) for name in names}
+
+
+_COUNTS = "model.kind=emission"
+_RAYS = "no model.kind=inverse-square"
+_FILE = "volume.file or volume.states"
+_PHANTOM = ("no volume.file", "no volume.states")
+_NO_PHANTOM = ("no phantom.kind", "no phantom.file", "no phantom.text")
+_SERIES = "The DICOM series with this number, description or UID, where the folder holds several"
+_AT_ENERGY = "Convert CT numbers to attenuation (1/mm) at this energy, or at an isotope's strongest line"
+_ISOTOPES = _named(ISOTOPES, "Energy window 10 % around its strongest line")
+_BY_NAME = "As it attenuates the isotope's photons"
+
+_DECLARED = (
+    Setting("system.file", str, None, "Geometry workbook (.xlsx, .xlsm)", is_path=True, option="--system"),
+    Setting("system.columns", str, None, "Column map (.toml): which cells hold what, where the headings do not say it; "
+            "geometry show --write-columns makes a draft", is_path=True),
+    Setting("system.modules", str, None, "Numbers of the modules, such as 1-40 or 1-20,41", "all"),
+    Setting("volume.file", str, None, "Volume, or folder of a DICOM series", "a phantom is made", is_path=True,
+            needs=("no volume.states", *_NO_PHANTOM), option="--volume"),
+    Setting("volume.states", str, None, "Volumes of what changes, such as a beating heart: a run of each, as OUTPUT-1, "
+            "OUTPUT-2 …", is_path=True, sizes=(), needs=("no volume.file", *_NO_PHANTOM)),
+    Setting("volume.object", str, None, "Name of the volume's object in a Blender scene", needs=_PHANTOM),
+    Setting("volume.state", str, None, "State of the object's sequence", needs=("volume.object",)),
+    Setting("volume.series", str, None, _SERIES, needs=("volume.file",)),
+    Setting("volume.quantity", str, None, "What the values of the volume are", "what the file says; a file that says "
+            "nothing holds activity for counts, mu for photons, else CT numbers", words=_named(LINE_INTEGRALS, ""),
+            needs=(_FILE, "no volume.energy")),
+    Setting("volume.energy", float, None, _AT_ENERGY, unit="keV", words=_ISOTOPES, above=0,
+            needs=(_FILE, "no model.kind=emission")),
+    Setting("volume.center", bool, False, "Move the volume's centre to the isocentre, and other states and the "
+            "attenuation with it", needs=(_FILE,)),
+    Setting("phantom.kind", str, "derenzo", "Kind of the phantom", needs=(*_PHANTOM, *_NO_PHANTOM[1:]),
+            words={kind.name: (kind.label, kind.summary) for kind in KINDS}, option="--phantom-kind"),
+    Setting("phantom.file", str, None, "A phantom's shapes (.toml), or a kind of phantom", is_path=True,
+            needs=(*_PHANTOM, "no phantom.kind", "no phantom.text"), option="--phantom"),
+    Setting("phantom.text", str, None, "A phantom's shapes: the contents of such a file",
+            needs=(*_PHANTOM, "no phantom.kind", "no phantom.file"), option="--phantom-text"),
+    Setting("phantom.position", float, (0.0, 0.0, 0.0), "Middle of the phantom, x y z", unit="mm", sizes=(3,),
+            needs=_PHANTOM),
+    Setting("phantom.euler_degrees", float, (0.0, 0.0, 0.0), "Angles phi theta psi: psi about its own axis, then theta "
+            "about y, then phi about z", unit="degrees", sizes=(3,), needs=_PHANTOM),
+    Setting("phantom.matrix", list, None, "World-from-phantom matrix, 4 rows", "that of position and angles", unit="mm",
+            needs=_PHANTOM),
+    Setting("phantom.voxels", int, (256,), "Voxels along x y z, or one number for all", least=1, sizes=(1, 3),
+            needs=_PHANTOM),
+    Setting("phantom.spacing", float, None, "Voxel size, one or three", "so that the phantom fits", unit="mm", above=0,
+            sizes=(1, 3), needs=_PHANTOM),
+    Setting("phantom.turn_grid", bool, False, "Turn the grid with the phantom", needs=_PHANTOM),
+    Setting("attenuation.file", str, None, "Attenuation coefficients, 1/mm, on any grid, or CT numbers (a DICOM folder, "
+            "too)", "nothing attenuates", is_path=True, needs=(_COUNTS, "no attenuation.of_phantom"), option="--mu"),
+    Setting("attenuation.object", str, None, "Name of its object in a Blender scene",
+            needs=(_COUNTS, "no attenuation.file", "no attenuation.of_phantom"), option="--mu-object"),
+    Setting("attenuation.series", str, None, _SERIES, needs=("attenuation.file",), option="--mu-series"),
+    Setting("attenuation.energy", float, None, _AT_ENERGY, unit="keV", words=_ISOTOPES, above=0,
+            needs=("attenuation.file",), option="--mu-energy"),
+    Setting("attenuation.of_phantom", bool, False, "The phantom attenuates by its own coefficients",
+            needs=(_COUNTS, *_PHANTOM, "no attenuation.file"), option="--phantom-mu"),
+    Setting("model.kind", str, "transmission", "What a pixel holds", label="Model", option="--model", words={
+        "transmission": ("Radiograph", "Line integrals of the volume"),
+        "emission": ("SPECT Counts", "Photons of a volume of activity that the crystal counts"),
+        "inverse-square": ("Inverse Square Sum", "Line integrals with each segment times a point source's sensitivity, "
+                           "as 1/h^2: no counts, for comparison"),
+    }),
+    Setting("model.time", float, 1.0, "Acquisition time", unit="s", above=0, needs=(_COUNTS,), label="Time (s)"),
+    Setting("model.photons", float, None, "X-ray photons per pixel: a radiograph of attenuation coefficients then holds "
+            "those that pass", "line integrals", above=0, slider=1e6, needs=("model.kind=transmission",)),
+    Setting("model.isotope", str, None, "What decays: its photons are counted, and its activity falls during the "
+            "acquisition", "one photon per decay, and a constant activity", words=_ISOTOPES, needs=(_COUNTS,)),
+    Setting("model.window", float, None, "Energies that are counted, from and to", "10 % around the isotope's strongest "
+            "line", unit="keV", least=0, slider=1000, sizes=(2,), needs=(_COUNTS, "model.isotope"),
+            label="Energy Window (keV)"),
+    Setting("model.aperture_points", int, 1, "Points of the hole that rays pass; 1: its middle, no blur, 7 and more: the "
+            "blur of a hole of this size", least=1, slider=64, needs=(_COUNTS,)),
+    Setting("model.aperture_tolerance", float, None, "In place of a number of points, as many as bring a voxel's image "
+            "this close, such as 0.1, to that of the whole hole", "the number of points holds", above=0, slider=1,
+            needs=(_COUNTS,)),
+    Setting("model.aperture_mu", float, None, "Material of the aperture's edge, or its attenuation coefficient at the "
+            "photons' energy", "nothing penetrates it", unit="1/mm", words=_named(APERTURES, _BY_NAME), above=0,
+            slider=10, needs=(_COUNTS,), label="Aperture"),
+    Setting("model.opening_angle_degrees", float, 90.0, "Full angle of the knife edge's cone", unit="degrees", above=0,
+            most=179.9, needs=(_COUNTS, "model.aperture_mu or model.within_cone")),
+    Setting("model.edge", str, "paix", "How photons penetrate the aperture's edge", label="Knife Edge", words={
+        "paix": ("Effective Diameter", "As if the hole were wider (Paix 1967)"),
+        "path": ("Path Length", "Each by its path through the edge: more rays"),
+    }, needs=(_COUNTS, "model.aperture_mu")),
+    Setting("model.crystal_mu", float, None, "Material of the crystal that stops the photons, or its attenuation "
+            "coefficient at their energy", "all photons are counted", unit="1/mm", words=_named(CRYSTALS, _BY_NAME),
+            above=0, slider=5, needs=(_COUNTS,), label="Crystal"),
+    Setting("model.depth_layers", int, 1, "Depths in the crystal at which photons are recorded (parallax); 1: where they "
+            "enter", least=1, slider=8, needs=(_COUNTS, "model.crystal_mu")),
+    Setting("model.intrinsic_fwhm", float, 0.0, "Full width at half maximum of the detector's own blur, on the crystal",
+            unit="mm", least=0, slider=10, needs=(_COUNTS,), label="Intrinsic Blur (mm)"),
+    Setting("model.within_cone", bool, False, "Nothing passes steeper than the knife edge's cone", needs=(_COUNTS,),
+            label="Knife-Edge Cone"),
+    Setting("model.within_walls", bool, False, "The collimator's walls stop photons that would miss the crystal's front",
+            needs=(_COUNTS,), label="Collimator Walls"),
+    Setting("model.within_crystal", bool, False, "Pixels beyond the crystal's side count nothing", needs=(_COUNTS,),
+            label="Crystal's Side"),
+    Setting("model.pixel_points", int, None, "Points of each pixel's area, for each point of the hole; auto: as many as "
+            "the tolerance asks for, which takes longer for small voxels", "auto for counts, 1, its centre, for "
+            "radiographs", words={"auto": ("Automatic", "")}, least=1, slider=100, needs=(_RAYS,)),
+    Setting("model.tolerance", float, 0.02, "Largest error of a single voxel's total in any module, as a share of it",
+            above=0, slider=1, needs=(_RAYS,)),
+    Setting("detector.plane", str, "virtual", "Where the images are taken", label="Detector", option="--detector", words={
+        "virtual": ("Virtual", "Plane in front of the pinhole: upright, what the module's camera sees"),
+        "real": ("Real", "Front face of the crystal behind the pinhole: point-inverted"),
+    }),
+    Setting("detector.columns", int, 256, "Pixel columns of each image", least=1, most=1 << 20, label="Pixels X",
+            option="--image-columns"),
+    Setting("detector.rows", int, 256, "Pixel rows of each image", least=1, most=1 << 20, label="Pixels Y"),
+    Setting("detector.magnification", float, 10.0, "Distance of the virtual detector in units of the collimator length",
+            above=0, slider=20),
+    Setting("detector.pitch", float, None, "Pixel size", "the image covers the crystal's whole side", unit="mm", above=0,
+            slider=10, label="Pixel Size (mm)"),
+    Setting("noise.seed", int, None, "Draw Poisson counts with this seed; of several states with SEED, SEED + 1 …",
+            "their expected means", least=0, needs=("model.kind=emission or model.photons",), option="--noise"),
+    Setting("compute.backend", str, "auto", "What computes the line integrals", words={
+        "auto": ("Automatic", "The fastest that works here"),
+        "cpu": ("CPU", "Compiled, on the processor"),
+        "torch": ("PyTorch", "On the processor or the graphics card"),
+        "numpy": ("NumPy", "Float64 reference, slow"),
+        "cuda": ("CUDA", "On an NVIDIA graphics card; needs warp-lang"),
+    }),
+    Setting("compute.threads", int, None, "Processor threads", "all", least=1, slider=64,
+            needs=("no compute.backend=torch", "no compute.backend=cuda")),
+)  # fmt: skip
+
+SETTINGS: Mapping[str, Setting] = MappingProxyType({setting.key: setting for setting in _DECLARED})
+"""Every setting by its key, table by table. A phantom's own numbers come beside them, from the class of its kind."""
+
+TABLES = tuple(dict.fromkeys(key.partition(".")[0] for key in SETTINGS))

@@ -1,0 +1,44 @@
+"""TOML files: reading with one-line errors, and writing values."""
+
+from __future__ import annotations
+
+import json
+import os
+import tomllib
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any
+
+from .errors import InputError
+
+
+def read_toml(path: str | os.PathLike[str]) -> dict[str, Any]:
+    """What a TOML file holds.
+
+    Raises
+    ------
+    InputError
+        The file cannot be read or is not TOML.
+    """
+    try:
+        return tomllib.loads(Path(path).read_text(encoding="utf-8-sig"))
+    except tomllib.TOMLDecodeError as error:
+        raise InputError(f"{path}: not TOML: {error}") from None
+    except UnicodeDecodeError:
+        raise InputError(f"{path}: expected TOML, a text in UTF-8") from None
+    except RecursionError:
+        raise InputError(f"{path}: its lists are nested too deeply") from None
+    except (OSError, ValueError) as error:  # an impossible path is a ValueError
+        raise InputError(f"{path}: {getattr(error, 'strerror', None) or error}") from None
+
+
+def toml_value(value: Any) -> str:
+    """A text, a boolean, a number or a list of these as TOML."""
+    if isinstance(value, str):
+        # JSON's escapes are TOML's, except that DEL must be escaped as well.
+        return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")
+    if isinstance(value, bool):
+        return str(value).lower()
+    if isinstance(value, Iterable):
+        return f"[{', '.join(map(toml_value, value))}]"
+    return repr(value)

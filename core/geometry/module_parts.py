@@ -24,7 +24,7 @@ class Look(NamedTuple):
     roughness: float
 
 
-LOOKS: dict[Kind, Look] = {
+LOOKS: dict[PartKind, Look] = {
     "collimator": Look((0.36, 0.39, 0.43, 1.0), metallic=0.85, roughness=0.42),  # tungsten: grey metal
     "crystal": Look((1.0, 0.48, 0.06, 0.85), metallic=0.0, roughness=0.12),  # scintillator: clear amber
 }

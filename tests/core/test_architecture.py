@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ast
 import re
 import subprocess
 import sys
@@ -42,6 +43,42 @@ def test_pyproject_lists_every_package():
 def test_only_compat_looks_at_the_version_of_blender():
     looks = [path for path in SOURCES if "bpy.app.version" in path.read_text(encoding="utf-8")]
     assert [path.relative_to(ROOT).as_posix() for path in looks] in ([], ["addon/compat.py"])
+
+
+def test_no_modules_import_each_other_in_a_circle():
+    """Imports in functions and those for type checkers count: a reader follows them too."""
+    imports = {module_of(path): imported_modules(path) for path in SOURCES}
+    imports = {module: names & set(imports) for module, names in imports.items()}
+    while leaves := [module for module, names in imports.items() if not names & set(imports)]:
+        for module in leaves:
+            del imports[module]
+    circles = {module: sorted(names & set(imports)) for module, names in imports.items()}
+    assert circles == {}, "what is in a circle, or imports something that is"
+
+
+def module_of(path: Path) -> str:
+    parts = path.relative_to(ROOT).with_suffix("").parts
+    return ".".join(parts[:-1] if parts[-1] == "__init__" else parts)
+
+
+def imported_modules(path: Path) -> set[str]:
+    """Modules whose names a file imports; a package counts only where names of its own are taken."""
+    package = path.relative_to(ROOT).parent.parts
+    modules = {module_of(source) for source in SOURCES}
+    found = set()
+    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+        if isinstance(node, ast.ImportFrom) and node.level:
+            base = package[: len(package) - node.level + 1]
+            module = ".".join((*base, node.module) if node.module else base)
+            for alias in node.names:
+                found.add(f"{module}.{alias.name}" if f"{module}.{alias.name}" in modules else module)
+    return found - {module_of(path)}
+
+
+def test_long_files_say_why():
+    lines = {path: path.read_text(encoding="utf-8").splitlines() for path in SOURCES}
+    long = [path for path, text in lines.items() if len(text) > 500]
+    assert [path for path in long if "long because" not in " ".join(lines[path][:40])] == []
 
 
 def test_imports_inside_the_package_are_relative():

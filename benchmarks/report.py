@@ -84,7 +84,7 @@ no voxel can be skipped.""",
 
 NOTES = """- *emission*: counts of the ideal pinhole, attenuated between voxel and pinhole by another volume of noise.
 - *pose gradient*: the image and the derivatives of a weighted sum of its pixels by the six parameters of the camera's pose.
-- *error*: largest difference from the float64 integral (`backend="numpy"`) through the noise, relative to the largest integral.
+- *error*: largest difference from the float64 integral (`backend="numpy"`) of the noise, relative to the largest integral.
   Joseph's method and sampling interpolate: their difference is one of models, not a fault.
 - *offset*: displacement of a smooth volume's image in pixels, by least squares; it shows whether the rays are the same,
   whatever the model.

@@ -34,11 +34,6 @@ def checked(value: ArrayOrTensor, name: str, shape: tuple[int, ...], float64: bo
     """`value` as float32 or float64 numbers, still an array or still a tensor on its device; not copied without need.
 
     A float64 tensor stays float64.
-
-    Raises
-    ------
-    InputError
-        Not real numbers, another shape, or a value that is not finite (its index is named).
     """
     if is_tensor(value):
         return _checked_tensor(value, name, shape, float64)

@@ -28,11 +28,6 @@ def replacing(path: str | os.PathLike[str]) -> Iterator[Path]:
     ------
     Path
         A path that does not exist yet, with the same folder and suffixes.
-
-    Raises
-    ------
-    InputError
-        The folder is missing or cannot be written, the path is a folder, or the disk is full.
     """
     refuse_folder(Path(path).absolute())
     target = Path(os.path.realpath(path))

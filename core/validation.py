@@ -29,11 +29,6 @@ def real_array(
         The expected shape, with None for any length; None for any shape.
     dtype
         Of the result.
-
-    Raises
-    ------
-    InputError
-        Not numbers, another shape, not finite (the message names the first bad index), or too large for the memory.
     """
     try:
         raw = np.asarray(value)

@@ -12,8 +12,8 @@ from typing import Any
 
 from ..errors import InputError
 from ..files import ensure_folder, refuse_folder
-from ..geometry.module_numbers import chosen_modules as chosen_modules
 from ..geometry.system import PinholeSystem
+from ..geometry.system import chosen_modules as chosen_modules
 from ..physics.isotopes import photon_energy as photon_energy
 from ..progress import Progress
 from ..workbook import read_system

@@ -40,16 +40,8 @@ def collimator_solid(collimator: Collimator) -> Solid:
     vertices = np.concatenate([np.column_stack([xy, np.full(_N, z)]) for xy, z in rings])
     ring, point = np.divmod(np.arange(len(rings) * _N), _N)
     following_ring, following_point = (ring + 1) % len(rings), (point + 1) % _N
-    faces = np.stack(
-        [
-            ring * _N + point,
-            following_ring * _N + point,
-            following_ring * _N + following_point,
-            ring * _N + following_point,
-        ],
-        axis=1,
-    )
-    return vertices, faces.astype(np.int32)
+    corners = (ring, point), (following_ring, point), (following_ring, following_point), (ring, following_point)
+    return vertices, np.stack([i * _N + j for i, j in corners], axis=1).astype(np.int32)
 
 
 def crystal_solid(collimator_length: float, detector_side: float, detector_thickness: float) -> Solid:

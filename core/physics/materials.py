@@ -95,11 +95,6 @@ def attenuation(material: str, energy: float) -> float:
         the coefficient is in proportion.
     energy
         keV, from 10 to 1000.
-
-    Raises
-    ------
-    InputError
-        There is no such material, or the energy is out of range.
     """
     made = _known(material)
     energy = positive(energy, "energy", "keV")
@@ -134,11 +129,6 @@ def module_coefficients(
         Full angle alpha of the knife edge, rad.
     place
         Prefix of ``aperture_mu`` and ``crystal_mu`` in error messages.
-
-    Raises
-    ------
-    InputError
-        As in `attenuation`, and where a material is given without lines.
     """
     photons = np.array([photons for _, photons in lines])
     if isinstance(aperture, str):

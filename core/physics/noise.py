@@ -29,11 +29,6 @@ def sample_counts(mean: ArrayLike, seed: int) -> NDArray[np.int64]:
     -------
     int64 array
         Counts, in the shape of `mean`.
-
-    Raises
-    ------
-    InputError
-        A mean is negative, not finite, or too large; the seed is not a whole number.
     """
     if isinstance(seed, bool) or not isinstance(seed, int | np.integer) or seed < 0:
         raise InputError(f"seed: expected a whole number of at least 0, got {seed!r}")

@@ -35,11 +35,6 @@ def seen(system: PinholeSystem, points: ArrayLike) -> NDArray[np.bool_]:
 
     A module sees a point in front of its pinhole if the ray from there through the pinhole's centre meets the crystal's
     front face, ``l max(|x_u|, |x_v|) <= Ld h / 2``.
-
-    Raises
-    ------
-    InputError
-        `system` is not a `PinholeSystem`, or `points` are not finite numbers of that shape.
     """
     return _seen(system, *_in_modules(system, real_array(points, "points", (None, 3))))
 
@@ -77,11 +72,6 @@ def sensitivity(
         Attenuation coefficient of the crystal, 1/mm. Default: it stops all photons.
     photons_per_decay
         Photons that are counted if they are stopped.
-
-    Raises
-    ------
-    InputError
-        A shape is wrong, or a number is not finite or out of range.
     """
     points = real_array(points, "points", (None, 3))
     _check_edge(aperture_mu, opening_angle)
@@ -158,11 +148,6 @@ def isocentre_performance(
         numbers or arrays that broadcast.
     intrinsic_fwhm, aperture_mu, opening_angle, crystal_mu, photons_per_decay
         As in `sensitivity` and `resolution`, but not checked.
-
-    Raises
-    ------
-    InputError
-        b, d, l or Ld is not finite or out of range.
     """
     radius = roi_radius_seen(b, d, Ld, l)
     b, d, l, Td = (np.asarray(x, dtype=np.float64) for x in (b, d, l, Td))

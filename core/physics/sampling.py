@@ -52,11 +52,6 @@ def sampling_gaps(system: PinholeSystem, points: ArrayLike, *, tolerance: float 
         As in `seen`.
     tolerance
         Accuracy, rad: the result may be this much below the true maximum.
-
-    Raises
-    ------
-    InputError
-        A shape is wrong, or a number is not finite or out of range.
     """
     points = real_array(points, "points", (None, 3))
     if positive(tolerance, "tolerance", "rad") < _FINEST:

@@ -44,11 +44,6 @@ def check_geometry(
         Attenuation coefficient of the plates, 1/mm (see `attenuation`), to find plates that are too thin. Default: the
         plates stop everything.
 
-    Raises
-    ------
-    InputError
-        A collimator cannot be built like that.
-
     Examples
     --------
     >>> report = check_geometry(system)

@@ -34,20 +34,11 @@ def check_geometry(
 ) -> GeometryReport:
     """Find parts that overlap, ROIs that are not seen whole, blocked holes, unsuitable plates and open surfaces.
 
-    Parameters
-    ----------
-    system
-    plate_thickness, wall_thickness, opening_angle, edge_at
-        How the collimators are built, as in `core.geometry.collimator.Construction`: mm, mm, rad, and the place of the knife
-        edge in the plate ("middle", "front" or "back").
-    aperture_mu
-        Attenuation coefficient of the plates, 1/mm (see `attenuation`), to find plates that are too thin. Default: the
-        plates stop everything.
+    Collimators are built as in `core.geometry.collimator.Construction`: thicknesses in mm, the angle in rad, and the place
+    of the knife edge in the plate. With `aperture_mu`, the plates' attenuation coefficient, 1/mm (see `attenuation`),
+    plates that are too thin are found, too.
 
-    Examples
-    --------
-    >>> report = check_geometry(system)
-    >>> report.ok
+    >>> check_geometry(system).ok
     True
     """
     instance(system, PinholeSystem, "check_geometry")
@@ -58,10 +49,7 @@ def check_geometry(
     faults = [(part, surface_fault(part.solid)) for part in parts]
     return GeometryReport(
         n_modules=len(system),
-        plate_thickness=construction.plate_thickness,
-        wall_thickness=construction.wall_thickness,
-        opening_angle=construction.opening_angle,
-        edge_at=construction.edge_at,
+        **vars(construction),
         overlaps=find_overlaps(hulls),
         near_pairs=find_near_pairs(system, collimators),
         swallowed_pinholes=find_swallowed_pinholes(system, hulls),

@@ -12,15 +12,19 @@ from ...errors import InputError
 from ...geometry.system import PinholeSystem
 from ...physics.isotopes import ISOTOPES, isotope
 from ...physics.materials import APERTURES, CRYSTALS, module_coefficients
-from ..options import number_or_name
+from ..options import add_command, add_workbook, number_or_name
 
 MATERIAL_OPTIONS = ("aperture_mu", "opening_angle", "crystal_mu", "intrinsic_fwhm", "isotope")
 """Destinations of the options of `add_materials`."""
 
 
-def add_json(parser: argparse.ArgumentParser) -> None:
-    """Add ``--json``."""
+def add_action(actions, name: str, summary: str, example: str, run: Any) -> argparse.ArgumentParser:  # type: ignore[no-untyped-def]
+    """The parser of an action on a workbook, with ``--json``."""
+    parser = add_command(actions, name, summary, f"mphdrr geometry {name} scanner.xlsx{example}")
+    add_workbook(parser)
     parser.add_argument("--json", action="store_true", help="print JSON")
+    parser.set_defaults(run=run)
+    return parser
 
 
 def table_rows(columns: dict[str, NDArray[Any]]) -> list[dict[str, Any]]:
@@ -30,7 +34,7 @@ def table_rows(columns: dict[str, NDArray[Any]]) -> list[dict[str, Any]]:
 
 
 def add_materials(parser: argparse.ArgumentParser) -> None:
-    """Add the materials and the isotope, for `sensitivity_settings` and `resolution_settings`."""
+    """Add the materials and the isotope, for `sensitivity_settings` and `edge_settings`."""
     group = parser.add_argument_group("materials; without an option the module is ideal")
     add_edge(group)
     group.add_argument(
@@ -65,11 +69,6 @@ def sensitivity_settings(arguments: argparse.Namespace, system: PinholeSystem) -
     aperture, crystal = module_coefficients(arguments.aperture_mu, arguments.crystal_mu, lines, system, angle)
     photons = 1.0 if arguments.isotope is None else sum(photons for _, photons in lines)
     return {"aperture_mu": aperture, "opening_angle": angle, "crystal_mu": crystal, "photons_per_decay": photons}
-
-
-def resolution_settings(arguments: argparse.Namespace, system: PinholeSystem) -> dict[str, Any]:
-    """The keywords of `resolution`."""
-    return {**edge_settings(arguments, system), "intrinsic_fwhm": arguments.intrinsic_fwhm}
 
 
 def _lines(arguments: argparse.Namespace) -> tuple[tuple[float, float], ...]:

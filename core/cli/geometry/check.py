@@ -15,21 +15,20 @@ from ...geometry.collimator import EdgePlace
 from ...geometry.system import PinholeSystem
 from ...physics.isotopes import ISOTOPES
 from ...recording import recorded_warnings
-from ..options import add_command, add_workbook, read_workbook, refuse
-from .arguments import add_edge, add_json, edge_settings
+from ..options import read_workbook, refuse
+from .arguments import add_action, add_edge, edge_settings
 
 
 def add_parser(actions) -> None:  # type: ignore[no-untyped-def]
     """Add the action."""
-    parser = add_command(
+    parser = add_action(
         actions,
         "check",
         "compare the workbook with the design formulas, and find modules that overlap, do not see their ROI, block each "
         "other or have unsuitable plates",
-        "mphdrr geometry check scanner.xlsx --wall 3 --strict",
+        " --wall 3 --strict",
+        _run,
     )
-    add_workbook(parser)
-    add_json(parser)
     parser.add_argument("--plate", type=float, default=2.0, metavar="MM", help="thickness of the aperture plates")
     parser.add_argument("--wall", type=float, default=2.0, metavar="MM", help="thickness of the collimators' walls")
     parser.add_argument(
@@ -41,7 +40,6 @@ def add_parser(actions) -> None:  # type: ignore[no-untyped-def]
         "--isotope", metavar="NAME", help=f"{', '.join(ISOTOPES)}: its photons must be stopped by the plates"
     )
     parser.add_argument("--strict", action="store_true", help="exit with status 1 if there is any warning or finding")
-    parser.set_defaults(run=_run)
 
 
 def _run(arguments: argparse.Namespace) -> None:

@@ -23,11 +23,6 @@ def add_parser(actions) -> None:  # type: ignore[no-untyped-def]
         "mphdrr geometry generate ellipse --semi-axes 273 220.5 --z -71 -24 --mirrored -o scanner.xlsx",
     )
     shapes = generate.add_subparsers(metavar="SHAPE", required=True)
-    _add_ellipse(shapes)
-    _add_plates(shapes)
-
-
-def _add_ellipse(shapes) -> None:  # type: ignore[no-untyped-def]
     parser = add_command(
         shapes,
         "ellipse",
@@ -48,11 +43,7 @@ def _add_ellipse(shapes) -> None:  # type: ignore[no-untyped-def]
         "--end", type=float, default=360.0, metavar="DEG", help="of its last; a full turn after the start: closed"
     )
     parser.add_argument("--spacing", choices=("angle", "arc"), default="angle", help="equal steps in angle, or in arc")
-    _add_modules(parser)
-    parser.set_defaults(run=_run, generate=_ellipse)
-
-
-def _add_plates(shapes) -> None:  # type: ignore[no-untyped-def]
+    _add_modules(parser, _ellipse)
     parser = add_command(
         shapes,
         "plates",
@@ -68,11 +59,10 @@ def _add_plates(shapes) -> None:  # type: ignore[no-untyped-def]
     parser.add_argument("--apothem", type=float, metavar="MM", help="distance of the polygon's plates")
     parser.add_argument("--rotation", type=float, default=0.0, metavar="DEG", help="azimuth of its first plate")
     parser.add_argument("--open", action="store_true", help="no plate joins the last vertex to the first")
-    _add_modules(parser)
-    parser.set_defaults(run=_run, generate=_plates)
+    _add_modules(parser, _plates)
 
 
-def _add_modules(parser: argparse.ArgumentParser) -> None:
+def _add_modules(parser: argparse.ArgumentParser, generate: Any) -> None:
     parser.add_argument("--z", type=float, nargs="+", required=True, metavar="MM", help="of each ring")
     parser.add_argument("--mirrored", action="store_true", help="add the rings' mirror images at z = 0")
     group = parser.add_argument_group("the modules")
@@ -82,6 +72,7 @@ def _add_modules(parser: argparse.ArgumentParser) -> None:
     group.add_argument("--R", type=float, default=75.0, metavar="MM", help="ROI radius")
     group.add_argument("--l", type=float, metavar="MM", help="collimator length; default: so that the ROI is just seen")
     parser.add_argument("-o", "--output", required=True, metavar="FILE", help=".xlsx")
+    parser.set_defaults(run=_run, generate=generate)
 
 
 def _run(arguments: argparse.Namespace) -> None:

@@ -11,8 +11,7 @@ from __future__ import annotations
 
 from ...validation import instance
 from ..collimator import OPENING_ANGLE, Construction, EdgePlace
-from ..collimator_mesh import surface_fault
-from ..module_parts import module_collimators, module_parts
+from ..module_parts import module_collimators, module_parts, surface_fault
 from ..system import PinholeSystem
 from .field_of_view import find_blocked, find_uncovered
 from .hulls import Hulls

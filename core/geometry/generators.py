@@ -97,17 +97,9 @@ def plate_rings(
     """A system of rings of modules on flat plates, ring by ring and plate by plate.
 
     The n modules of a plate stand in the middles of n equal parts of it, and aim at the isocentre like all modules.
-
-    Parameters
-    ----------
-    modules
-        Number on each plate in each ring: one number, or one for each plate (0 for none).
-    vertices
-        (V, 2), x and y of the plates' edges, mm, in order. `regular_polygon` gives those of a regular polygon.
-    z, pinhole_diameter, detector_side, detector_thickness, roi_radius, collimator_length, mirrored
-        As in `ellipse_rings`.
-    closed
-        Whether a plate joins the last vertex to the first.
+    `modules` is their number on each plate in each ring, or one number for each plate (0 for none).
+    `vertices` (V, 2) are x and y of the plates' edges, mm, in order, such as those of `regular_polygon`; if `closed`, a
+    plate joins the last to the first. The other parameters are as in `ellipse_rings`.
     """
     corners = real_array(vertices, "vertices", (None, 2))
     if len(corners) < 2 + closed:
@@ -150,10 +142,11 @@ def even_azimuths(ellipse: Ellipse, modules: Any, start: float, end: float, spac
         raise InputError(f"modules: expected at most {_MOST_MODULES} in a ring, got {count}")
     start, end = (float(real_array(x, name, ())) for x, name in ((start, "start"), (end, "end")))
     turn = abs(end - start)
-    closed = abs(turn - FULL_TURN) < 1e-9
     if turn > FULL_TURN + 1e-9:
         raise InputError(f"start and end: expected at most a full turn apart, got {math.degrees(turn):g} degrees")
-    shares = np.linspace(0, 1, count, endpoint=not closed)
+    shares = np.linspace(
+        0, 1, count, endpoint=turn < FULL_TURN - 1e-9
+    )  # the last one of a closed ring is not the first again
     if spacing == "angle":
         return start + shares * (end - start)
     if spacing != "arc":
@@ -169,10 +162,8 @@ def _rings(
 ) -> PinholeSystem:
     """Modules at `places` ((rings,) M, 2), mm, in rings at `z`; `sizes` are d, Ld, Td and R."""
     heights = np.atleast_1d(real_array(z, "z", (None,) * min(np.ndim(z), 2)))
-    if heights.ndim == 1:
-        heights = heights[:, None]
-    if places.ndim == 2:
-        places = places[None]
+    heights = heights[:, None] if heights.ndim == 1 else heights
+    places = places[None] if places.ndim == 2 else places
     try:
         shape = np.broadcast_shapes(heights.shape, places.shape[:2])
     except ValueError:

@@ -37,7 +37,7 @@ def sensitivity_map(
 ) -> Volume:
     """Sum of the modules' `sensitivity`, counts per decay; times 1e6 that is cps/MBq.
 
-    Parameters are as in `sensitivity`; `progress(done, total)` is called between blocks of voxels, may raise `Cancelled`.
+    Parameters are as there. ``progress(done, total)`` is called between blocks of voxels and may raise `Cancelled`.
     """
     optics: dict[str, Any] = {"aperture_mu": aperture_mu, "opening_angle": opening_angle, "crystal_mu": crystal_mu}
     optics["photons_per_decay"] = photons_per_decay

@@ -61,17 +61,9 @@ def sensitivity(
     ``1 - exp(-crystal_mu Td / sin(theta))`` that the crystal stops; elsewhere it is 0. `Emission` with ``edge="paix"``
     counts the same, pixel by pixel.
 
-    Parameters
-    ----------
-    system, points
-        As in `seen`.
-    aperture_mu, opening_angle
-        Attenuation coefficient of the aperture, 1/mm, and full angle of its knife edge, rad, for Paix's
-        ``d_e^2 = d (d + 2 / mu tan(alpha / 2))``. Without a coefficient nothing penetrates and d_e = d.
-    crystal_mu
-        Attenuation coefficient of the crystal, 1/mm. Default: it stops all photons.
-    photons_per_decay
-        Photons that are counted if they are stopped.
+    `aperture_mu` is the aperture's attenuation coefficient, 1/mm, and `opening_angle` the full angle of its knife edge, rad,
+    for Paix's ``d_e^2 = d (d + 2 / mu tan(alpha / 2))``; without a coefficient nothing penetrates and d_e = d. `crystal_mu`
+    is the crystal's, 1/mm; without it, all photons are stopped. `points` are as in `seen`.
     """
     points = real_array(points, "points", (None, 3))
     _check_edge(aperture_mu, opening_angle)

@@ -144,9 +144,8 @@ def even_azimuths(ellipse: Ellipse, modules: Any, start: float, end: float, spac
     turn = abs(end - start)
     if turn > FULL_TURN + 1e-9:
         raise InputError(f"start and end: expected at most a full turn apart, got {math.degrees(turn):g} degrees")
-    shares = np.linspace(
-        0, 1, count, endpoint=turn < FULL_TURN - 1e-9
-    )  # the last one of a closed ring is not the first again
+    closed = turn >= FULL_TURN - 1e-9
+    shares = np.linspace(0, 1, count, endpoint=not closed)
     if spacing == "angle":
         return start + shares * (end - start)
     if spacing != "arc":

@@ -103,18 +103,14 @@ def _fit(system: PinholeSystem, which: NDArray[np.intp]) -> RingFit:
 
 def _run_clockwise(system: PinholeSystem, rings: Sequence[NDArray[np.intp]]) -> bool:
     """Whether azimuths decrease along most of the rings."""
-    orders = [np.argsort(_azimuths(system, which), kind="stable") for which in rings]
+    orders = [np.argsort(np.arctan2(*system.centers[which, 1::-1].T), kind="stable") for which in rings]
     falls = sum(np.count_nonzero(np.diff(order) < 0) for order in orders)
     return bool(2 * falls > sum(len(order) for order in orders))
 
 
-def _azimuths(system: PinholeSystem, which: NDArray[np.intp]) -> Array:
-    return np.arctan2(system.centers[which, 1], system.centers[which, 0])
-
-
 def _in_order(system: PinholeSystem, which: NDArray[np.intp], clockwise: bool) -> tuple[Array, NDArray[np.intp]]:
     """Azimuths without jumps of the modules `which`, and these modules, in their order along the ring."""
-    azimuths = _azimuths(system, which)
+    azimuths = np.arctan2(*system.centers[which, 1::-1].T)
     order = np.argsort(azimuths, kind="stable")
     if clockwise:
         order = order[::-1]

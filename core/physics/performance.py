@@ -75,7 +75,9 @@ def sensitivity(
     h[~visible] = 1.0  # avoids dividing by zero
     cosine = h / np.sqrt(x_u**2 + x_v**2 + h**2)
     diameter = paix_diameter(system.pinhole_diameter, aperture_mu, opening_angle)
-    return photons_per_decay * visible * _counted(h, cosine, diameter, system.detector_thickness, crystal_mu)
+    counts = _counted(h, cosine, diameter, system.detector_thickness, crystal_mu)
+    counts *= photons_per_decay * visible
+    return counts
 
 
 def resolution(

@@ -9,7 +9,7 @@ import pytest
 from mphdrr.addon import scanner
 from mphdrr.core.errors import InputError
 from mphdrr.core.geometry.collimator import Collimator, Construction
-from mphdrr.core.geometry.collimator_mesh import check_watertight, collimator_solid, crystal_solid
+from mphdrr.core.geometry.module_parts import check_watertight, collimator_solid, crystal_solid
 
 trimesh = pytest.importorskip("trimesh")
 

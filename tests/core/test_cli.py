@@ -276,7 +276,7 @@ def test_geometry_performance_adds_up(workbook, capsys):
     assert main(["geometry", "performance", str(workbook), *named[2:4]]) == 1
     assert "crystal_mu 'CZT': at which energy" in capsys.readouterr().err
     assert main(["geometry", "performance", str(workbook), "--opening-angle", "200"]) == 1
-    assert "--opening-angle 200: expected degrees" in capsys.readouterr().err
+    assert "--opening-angle: expected less than 180 degrees, got 200" in capsys.readouterr().err
     assert main(["geometry", "performance", str(workbook), "--point", "0", "0", "900"]) == 0
     assert "from 0 of 80 modules" in capsys.readouterr().out
 

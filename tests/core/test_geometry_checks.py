@@ -13,8 +13,7 @@ from mphdrr.core.geometry.checks.field_of_view import cone_directions, hits, uns
 from mphdrr.core.geometry.checks.hulls import Hulls
 from mphdrr.core.geometry.checks.overlaps import penetration_depths
 from mphdrr.core.geometry.collimator import Collimator, Construction
-from mphdrr.core.geometry.collimator_mesh import surface_fault
-from mphdrr.core.geometry.module_parts import module_parts
+from mphdrr.core.geometry.module_parts import module_parts, surface_fault
 
 
 def system_of(centers, d=2.0, length=60.0, side=50.0, thickness=10.0, radius=40.0, **more) -> mph.PinholeSystem:

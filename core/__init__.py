@@ -9,8 +9,9 @@ Everything imported here is the public interface. Arguments that cannot be used 
 >>> images = mph.Projector(grid, views)(mph.DerenzoPhantom(40, (8, 6, 5, 4, 3, 2), 40).voxelize(grid))
 """
 
-from __future__ import annotations
+import types
 
+from . import moved
 from .errors import InputError, InputWarning
 from .exchange import read_geometry, write_geometry
 from .geometry.checks import GeometryReport, check_geometry
@@ -22,7 +23,6 @@ from .geometry.presets import c_arm_views, pinhole_views
 from .geometry.ring_fits import RingFit, fit_rings, ring_order
 from .geometry.system import PinholeSystem
 from .geometry.views import Views
-from .moved import keep_old_paths
 from .phantoms.defrise import DefrisePhantom
 from .phantoms.derenzo import DerenzoPhantom, DerenzoRods
 from .phantoms.jaszczak import JaszczakPhantom
@@ -69,4 +69,8 @@ from .workbook import (
     write_system,
 )
 
-keep_old_paths()
+__all__ = [
+    name for name, value in globals().items() if not (name.startswith("_") or isinstance(value, types.ModuleType))
+]
+
+moved.keep_old_paths()

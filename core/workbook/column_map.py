@@ -15,7 +15,7 @@ from ..errors import InputError
 from ..files import replacing
 from .headings import unit_of
 from .quantities import DIMENSIONS, POSITION, QUANTITIES
-from .references import MAX_COLUMN, MAX_ROW
+from .sheet_xml import MAX_COLUMN, MAX_ROW
 
 Joined = Literal["by number", "in order", "one for all"]
 

@@ -8,8 +8,8 @@ from dataclasses import dataclass, replace
 
 from ..errors import InputError
 from ..recording import recorded_warnings
-from .book import HEADING_ROWS, Book, Sheet
-from .cells import Outdated, Uncomputed, shortened
+from .book import HEADING_ROWS, Book, Outdated, Sheet, shortened
+from .calculation import Uncomputed
 from .column_map import ColumnMap, Joined, MappedColumn, MappedTable
 from .headed_table import HeadedTable
 from .headings import heading_of, is_number_heading, may_mean

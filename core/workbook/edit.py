@@ -11,13 +11,12 @@ import numpy as np
 
 from ..errors import InputError, InputWarning
 from ..geometry.system import PinholeSystem
-from .cells import module_number
+from .book import module_number
 from .column_map import ColumnMap
 from .layout import Column, Table, map_with_rows
 from .plausibility import is_by_design
-from .quantities import DERIVED, EXACT, NEEDED, QUANTITIES
+from .quantities import DERIVED, EXACT, NEEDED, QUANTITIES, agree
 from .reader import Reading
-from .recalculate import agree
 from .rows import Rows, matched, rows_after
 from .workbook_xml import Place, WorkbookXml
 
@@ -144,7 +143,7 @@ class Edit:
 
     def _rows_of_all(self, column: Column) -> tuple[int, ...]:
         """Rows for all modules in a table that had one row for all; without numbers, as far apart as the coordinates'."""
-        sheet, table, first = self.workbook.sheets[column.table.sheet.name], column.table, column.table.rows[0]
+        sheet, table, first = self.workbook.sheet(column.table.sheet.name), column.table, column.table.rows[0]
         coordinates = self.rows[self.modules].new
         found = tuple(first + (i if self.numbered else row - coordinates[0]) for i, row in enumerate(coordinates))
         for c in (column.column, table.number_column):
@@ -189,7 +188,7 @@ class Edit:
 
     def _is_left_blank(self, column: Column, i: int, row: int) -> bool:
         """Whether l is blank in the row of a module, and was: it is then read as the design formula's."""
-        sheet = self.workbook.sheets[column.table.sheet.name]
+        sheet = self.workbook.sheet(column.table.sheet.name)
         was = sheet.original.get((self.rows[column.table].source(i), column.column))
         return sheet.cell((row, column.column)).blank and (was is None or was.blank)
 
@@ -201,14 +200,14 @@ class Edit:
         cell = self.workbook.cell(place)
         held = float(module_number(cell.value) or 0) if type(cell.value) is str else cell.value
         if cell.formula is None and cell.array is None and (type(held) is not float or held != number):
-            self.workbook.sheets[place[0]].type(place[1:], number)
+            self.workbook.sheet(place[0]).type(place[1:], number)
 
     def _derive(self, column: Column) -> None:
         """Type derived numbers that change, and expect those of H, x2, y2, z2 of formulas that were right.
 
         The formulas of these four may refer to one cell for all modules where each has its own now.
         """
-        quantity, sheet = QUANTITIES[column.quantity], self.workbook.sheets[column.table.sheet.name]
+        quantity, sheet = QUANTITIES[column.quantity], self.workbook.sheet(column.table.sheet.name)
         new, old = (quantity.of(system) / column.factor for system in (self.system, self.old))
         rows = self.rows[column.table]
         for i, (row, j) in enumerate(zip(rows.new, self.old_of, strict=True)):

@@ -7,8 +7,7 @@ from collections import defaultdict
 from dataclasses import dataclass
 from functools import cached_property
 
-from .book import HEADING_ROWS, Book, Sheet
-from .cells import module_number
+from .book import HEADING_ROWS, Book, Sheet, module_number
 from .formulas import areas_in
 from .headings import Heading, heading_of, is_label_heading, is_number_heading, plain, unit_of
 from .layout import Table

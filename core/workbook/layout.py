@@ -12,8 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import InputError, InputWarning
-from .book import HEADING_ROWS, Book, Sheet
-from .cells import Uncomputed, module_number
+from .book import HEADING_ROWS, Book, Sheet, module_number
+from .calculation import Uncomputed
 from .column_map import ColumnMap, MappedTable
 from .headings import heading_of, shows_as_stored
 from .quantities import QUANTITIES

@@ -12,10 +12,8 @@ from ..errors import InputError
 from ..geometry.design_formulas import collimator_length
 from ..geometry.system import PinholeSystem
 from .layout import Column
-from .quantities import DIMENSIONS, POSITION, QUANTITIES, tolerance
+from .quantities import AGREEING, DIMENSIONS, POSITION, QUANTITIES, tolerance
 
-AGREEING = 1e-9
-"""Relative: a formula's result nearer to a number than this gives that number."""
 _SAME_PLACE = 1e-6
 """mm; two pinholes closer than this are one."""
 _SHOWN = 5

@@ -74,7 +74,7 @@ class Rows:
         As when a spreadsheet sorts, the relative references of a formula move with its row, and references to the row
         from elsewhere stay.
         """
-        sheet = workbook.sheets[self.table.sheet.name]
+        sheet = workbook.sheet(self.table.sheet.name)
         self._refuse_occupied(sheet)
         held = {*self.old, *(row for row in self.own if row is not None)}
         before = {at: sheet.cell(at) for row in held for at in self._cells(row)}

@@ -17,12 +17,12 @@ from ..geometry.system import PinholeSystem
 from ..recording import recorded_warnings
 from ..validation import instance
 from .book import Book
+from .calculation import Recalculation
 from .column_map import ColumnMap, column_map
 from .edit import Edit, several
 from .new_workbook import new_workbook
 from .quantities import QUANTITIES, TYPED
 from .reader import Reading, read
-from .recalculate import Recalculation
 from .workbook_xml import KINDS, Place, WorkbookXml
 
 

@@ -147,8 +147,8 @@ def _hidden_by_merged_cells(table: HeadedTable, used: list[tuple[int, str]]) -> 
     for area in table.sheet.merged:
         for column, _ in used:
             for row in table.rows:
-                inside = area.top <= row <= area.bottom and area.left <= column <= area.right
-                if inside and (row, column) != (area.top, area.left) and table.sheet.value(row, column) is not None:
+                hidden = area.contains(row, column) and (row, column) != (area.top, area.left)
+                if hidden and table.sheet.value(row, column) is not None:
                     yield f"{table.sheet.place(row, column)} is hidden under a merged cell, expected a visible number"
                     return
 
@@ -156,11 +156,8 @@ def _hidden_by_merged_cells(table: HeadedTable, used: list[tuple[int, str]]) -> 
 def _texts_above_headings(table: HeadedTable, used: list[tuple[int, str]]) -> Iterator[str]:
     """A text right above a heading, or merged over it, which may be part of what it says."""
     for column, _ in used:
-        at = next(iter(table.headings[column])) - 1, column
-        for area in table.sheet.merged:
-            if area.top <= at[0] <= area.bottom and area.left <= column <= area.right:
-                at = (area.top, area.left)
-                break
+        above = next(iter(table.headings[column])) - 1, column
+        at = next(((area.top, area.left) for area in table.sheet.merged if area.contains(*above)), above)
         if at in table.sheet.texts and at not in table.head:
             text = quoted(table.sheet.texts[at])
             yield f"{table.sheet.place(*at)} holds {text} right above a heading, expected nothing, or a row between"

@@ -73,7 +73,7 @@ def draft_column_map(path: str | os.PathLike[str]) -> ColumnMapDraft:
     partial = {name for name in optional if _has_gaps(found.tables[name], name)}
     chosen = {name: table for name, table in found.tables.items() if name not in partial}
     tables = [mapped for table in dict.fromkeys(chosen.values()) for mapped in _mapped(table, chosen, certain)]
-    if "l" in partial and "l" in found.tables["l"].filled:
+    if "l" in partial and found.tables["l"].has_numbers("l"):
         questions.append("l stands in some rows only and is left out here: the design formula is then used for all")
     missing = [name for name in TYPED if name not in found.tables]
     _add_guesses(tables, found.sheets, missing if not certain else [])

@@ -13,11 +13,11 @@ from ..errors import InputError, InputWarning
 from ..geometry.system import PinholeSystem
 from .book import module_number
 from .column_map import ColumnMap
-from .layout import Column, Table, map_with_rows
+from .layout import Column, Table
 from .plausibility import is_by_design
 from .quantities import DERIVED, EXACT, NEEDED, QUANTITIES, agree
 from .reader import Reading
-from .rows import Rows, matched, rows_after
+from .rows import Rows, matched
 from .workbook_xml import Place, WorkbookXml
 
 _SHOWN = 3
@@ -27,16 +27,7 @@ _SAME = 1e-12
 
 
 class Edit:
-    """Changes of a workbook's cells that make it hold another system.
-
-    Parameters
-    ----------
-    system
-        The system to hold.
-    reading
-        What the workbook holds now.
-    workbook
-        Its cells, which are changed.
+    """The cells of a workbook changed such that it holds another system; `InputError` if it cannot.
 
     Attributes
     ----------
@@ -48,11 +39,6 @@ class Edit:
         The cells of these two that held other numbers, or none.
     numbered : bool
         Whether the workbook has the modules' numbers.
-
-    Raises
-    ------
-    InputError
-        The workbook cannot hold the system.
     """
 
     def __init__(self, system: PinholeSystem, reading: Reading, workbook: WorkbookXml) -> None:
@@ -88,8 +74,11 @@ class Edit:
     def column_map(self) -> ColumnMap | None:
         """The column map that the workbook was read by, if any, with the rows that the modules have now."""
         read_by = self.old.source.columns if self.old.source else None
-        rows = {table: rows.new for table, rows in self.rows.items()}
-        return None if read_by is None else map_with_rows(read_by, self.layout, rows)
+        if read_by is None:
+            return None
+        tables = [self.columns[said.columns[0].quantity].table for said in read_by.tables]
+        rows = [sorted(self.rows[table].new if table in self.rows else table.rows) for table in tables]
+        return ColumnMap(tuple(said.with_rows(its) for said, its in zip(read_by.tables, rows, strict=True)))
 
     def _refuse_unheld(self) -> None:
         file, sheet = self.workbook.name, self.modules.sheet.name
@@ -121,7 +110,7 @@ class Edit:
             own.append(old[j] if j is not None else None if row in old else row)
         # Without numbers, rows of several sheets belong together by their distance from the first.
         spread = not self.numbered and any(self._is_spread(column) for column in self.columns.values())
-        return rows_after(table, old, own, table.number_column, shared, keep_first=bool(shared) or spread)
+        return Rows(table, old, own, shared, keep_first=bool(shared) or spread)
 
     def _is_spread(self, column: Column) -> bool:
         """Whether the modules need different numbers in place of one cell of a table with one row for all."""
@@ -167,7 +156,7 @@ class Edit:
 
     def _require(self, column: Column) -> None:
         """Demand the numbers of a quantity, in the column's unit."""
-        name, sheet = column.quantity, column.table.sheet.name
+        name, sheet = column.quantity, self.workbook.sheet(column.table.sheet.name)
         new, old = (QUANTITIES[name].of(system) for system in (self.system, self.old))
         rows = self.rows.get(column.table)
         old_of = self.old_of
@@ -178,19 +167,15 @@ class Edit:
         else:
             places = rows.new
         for i, row in enumerate(places):
-            if name == "l" and self.by_design[i] and self._is_left_blank(column, i, row):
-                continue
+            if name == "l" and self.by_design[i] and sheet.cell((row, column.column)).blank:
+                was_cell = sheet.original.get((self.rows[column.table].source(i), column.column))
+                if was_cell is None or was_cell.blank:
+                    continue  # and it is read as the design formula's
             j = old_of[i]
             number, was = float(new[i] / column.factor), None if j is None else float(old[j] / column.factor)
             if j is not None and old[j] == new[i] and not math.isnan(self.given[name][j]):
                 number = float(self.given[name][j])
-            self._demand((sheet, row, column.column), number, was)
-
-    def _is_left_blank(self, column: Column, i: int, row: int) -> bool:
-        """Whether l is blank in the row of a module, and was: it is then read as the design formula's."""
-        sheet = self.workbook.sheet(column.table.sheet.name)
-        was = sheet.original.get((self.rows[column.table].source(i), column.column))
-        return sheet.cell((row, column.column)).blank and (was is None or was.blank)
+            self._demand((sheet.name, row, column.column), number, was)
 
     def _demand(self, place: Place, number: float, was: float | None) -> None:
         """Demand a number of a cell, and type it where there is no formula; `was` is the module's number so far."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import warnings
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from functools import cached_property
 
@@ -26,16 +26,9 @@ Label = int | str
 
 @dataclass(frozen=True, eq=False)
 class Table:
-    """Rows of a sheet that hold modules, and the columns of their quantities.
+    """Rows of a sheet that hold modules; `columns` is quantity -> column and unit.
 
-    Attributes
-    ----------
-    columns : dict
-        Quantity -> column and unit.
-    label_column : int or None
-        The column of the modules' numbers or names.
-    labels : tuple of Label, or None
-        Its contents; `InputError` if they do not tell the modules apart.
+    `labels` has what the rows call their modules in the `label_column`; `InputError` if that does not tell them apart.
     """
 
     sheet: Sheet
@@ -66,10 +59,9 @@ class Table:
 
 
 class Column:
-    """The cells of one quantity, one for each module.
+    """The cells of one quantity; `factor` is their unit in mm or rad.
 
-    `rows` has the row of each module of the table of `modules`, all the same if one cell holds for all (`shared`);
-    `factor` is the cells' unit in mm or rad.
+    `rows` has the row of each module of the table of `modules`, all the same if one cell holds for all (`shared`).
     """
 
     def __init__(self, table: Table, quantity: str, modules: Table, rows: tuple[int, ...]) -> None:
@@ -111,7 +103,7 @@ class Column:
 class Layout:
     """Where a workbook's numbers are.
 
-    `modules` is the table of x1, y1, z1, and `rows_of` has the row of each module in every table with a row for each.
+    `modules` is the table of x1, y1, z1; `rows_of` has the row of each module in every table with a row for each.
     """
 
     modules: Table
@@ -161,13 +153,12 @@ def _mapped_table(book: Book, said: MappedTable) -> Table:
     columns = {c.quantity: (index(c.column), c.unit) for c in said.columns}
     number = None if said.number is None else index(said.number)
     table = Table(book.sheets[said.sheet], columns, said.row_numbers(), number)
-    for contradiction in _contradictions(table):
+    if (contradiction := next(_contradictions(table), None)) is not None:
         warnings.warn(contradiction, InputWarning, stacklevel=2)
-        break
     return table
 
 
-def _contradictions(table: Table) -> Iterable[str]:
+def _contradictions(table: Table) -> Iterator[str]:
     """The headings and number formats of mapped columns that say another unit or quantity than the map."""
     sheet, first = table.sheet, table.rows[0]
     for name, (column, unit) in table.columns.items():
@@ -180,15 +171,6 @@ def _contradictions(table: Table) -> Iterable[str]:
         shown = sheet.number_format(first, column)
         if not shows_as_stored(shown, unit):
             yield f"{sheet.where(first, column)} is shown as {shown!r}, {used}"
-
-
-def map_with_rows(columns: ColumnMap, layout: Layout, rows_of: Mapping[Table, Iterable[int]]) -> ColumnMap:
-    """The column map of a layout after its tables have got the rows in `rows_of`."""
-    found = []
-    for said in columns.tables:
-        table = layout.columns[said.columns[0].quantity].table
-        found.append(said.with_rows(sorted(rows_of.get(table, table.rows))))
-    return ColumnMap(tuple(found))
 
 
 def by_label(modules: Table, table: Table) -> tuple[int, ...]:
@@ -233,15 +215,12 @@ def _labels(sheet: Sheet, rows: tuple[int, ...], column: int) -> tuple[Label, ..
         labels = [" ".join(str(value).split()) for value in values]
     first: dict[Label, int] = {}
     for row, label in zip(rows, labels, strict=True):
+        where = sheet.where(row, column)
         if label is None:
-            raise InputError(
-                f"{sheet.where(row, column)} {sheet.found(row, column)}, expected a module's number (or a name in "
-                "every row)"
-            )
+            raise InputError(f"{where} {sheet.found(row, column)}, expected a module's number (or a name in every row)")
         if label in first:
             raise InputError(
-                f"{sheet.where(row, column)} is module {label}, as is {sheet.place(first[label], column)}: "
-                "expected another number"
+                f"{where} is module {label}, as is {sheet.place(first[label], column)}: expected another number"
             )
         first[label] = row
     return tuple(first)

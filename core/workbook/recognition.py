@@ -6,6 +6,7 @@ is unaccounted for. `recognized_layout` refuses a workbook with any; `core.workb
 
 from __future__ import annotations
 
+import itertools
 import re
 import warnings
 from collections.abc import Iterator
@@ -41,7 +42,7 @@ def recognize(book: Book) -> Recognized:
     doubts, missing = [], []
     for name in TYPED:
         having = [table for table in candidates if name in table.columns]
-        filled = [table for table in having if name in table.filled]
+        filled = [table for table in having if table.has_numbers(name)]
         if len(filled) > 1:
             first, second = (t.sheet.place(t.first_heading, t.columns[name][0]) for t in filled[:2])
             doubts.append(f"{first} and {second}, of two sheets, are both headed as {name}, expected one such column")
@@ -89,33 +90,31 @@ def recognized_layout(book: Book) -> Layout:
     for doubt in recognized.doubts:
         raise _unclear(book, doubt)
     coordinates = recognized.tables["x1"]
-    tables = {headed: headed.table() for headed in dict.fromkeys(recognized.tables.values())}
-    layout = Layout(tables[coordinates])
+    tables = {
+        headed: Table(headed.sheet, headed.columns, headed.rows, headed.label_column)
+        for headed in dict.fromkeys(recognized.tables.values())
+    }
+    modules = tables[coordinates]
+    layout = Layout(modules)
     for name, headed in recognized.tables.items():
-        rows = _rows_of(name, layout, headed, coordinates, tables[headed])
-        layout.columns[name] = Column(tables[headed], name, layout.modules, rows)
-    notes = [*_unknown_length(recognized), *_units_in_other_sheets(layout, recognized.sheets), *_gap(layout.modules)]
-    for note in notes:
+        table, once = tables[headed], headed.is_single(name)
+        if not table.rows:
+            raise InputError(f"{book.path.name}: sheet {table.sheet.name} has no numbers under {name}")
+        if table not in layout.rows_of and not (once and len(table.rows) == 1):
+            try:
+                layout.rows_of[table] = _matched_rows(modules, table, coordinates, headed)
+            except InputError:
+                if not once:
+                    raise
+        rows = (table.rows[0],) * len(modules.rows) if once else layout.rows_of[table]
+        layout.columns[name] = Column(table, name, modules, rows)
+    for note in _notes(layout, recognized):
         warnings.warn(f"{book.path.name}: {note}", InputWarning, stacklevel=4)
     return layout
 
 
 def _unclear(book: Book, doubt: str) -> InputError:
     return InputError(f"{book.path.name}: {doubt}; {_HELP}")
-
-
-def _rows_of(name: str, layout: Layout, headed: HeadedTable, coordinates: HeadedTable, table: Table) -> tuple[int, ...]:
-    """The row of each module; a single value, in the table's first row, holds for all modules."""
-    rows, once = table.rows, headed.is_single(name)
-    if not rows:
-        raise InputError(f"{table.sheet.book.path.name}: sheet {table.sheet.name} has no numbers under {name}")
-    if table not in layout.rows_of and not (once and len(rows) == 1):
-        try:
-            layout.rows_of[table] = _matched_rows(layout.modules, table, coordinates, headed)
-        except InputError:
-            if not once:
-                raise
-    return (rows[0],) * len(layout.modules.rows) if once else layout.rows_of[table]
 
 
 def _matched_rows(modules: Table, table: Table, coordinates: HeadedTable, headed: HeadedTable) -> tuple[int, ...]:
@@ -131,10 +130,8 @@ def _matched_rows(modules: Table, table: Table, coordinates: HeadedTable, headed
                 together = f"row {row} of {sheets[0]} and row {its} of {sheets[1]} would belong together"
                 raise _unclear(book, f"{together}, but blank rows differ: expected the modules' numbers in both")
         if table.numbers is not None and list(table.numbers) != sorted(table.numbers):
-            raise _unclear(
-                book,
-                f"the modules' numbers in {sheets[1]} are in no order, {sheets[0]} has none, expected numbers in both",
-            )
+            unsorted = f"the modules' numbers in {sheets[1]} are in no order, {sheets[0]} has none"
+            raise _unclear(book, f"{unsorted}, expected numbers in both")
         for heading, at in other.items():
             if heading not in own:
                 heads = f"{table.sheet.place(*at)} heads names of modules, which {sheets[0]} does not have"
@@ -149,33 +146,26 @@ def _matched_rows(modules: Table, table: Table, coordinates: HeadedTable, headed
     return rows
 
 
-def _unknown_length(recognized: Recognized) -> Iterator[str]:
-    """A heading that is not understood, if no column is headed l."""
-    table = recognized.tables["x1"]
+def _notes(layout: Layout, recognized: Recognized) -> Iterator[str]:
+    """What a person should know of a workbook without doubts, as texts of warnings."""
+    table, modules = recognized.tables["x1"], layout.modules
     if "l" not in recognized.tables:
         for at, text in table.unknown()[:1]:
             yield (
                 "no column is headed l, so the collimator length is the design formula's; "
                 f"{table.sheet.place(*at)} {quoted(text)} is not understood"
             )
-
-
-def _units_in_other_sheets(layout: Layout, sheets: dict[str, Sheet]) -> Iterator[str]:
-    """A sheet that is not the scanner's but says of all lengths what the headings do not."""
     used = {column.table.sheet.name for column in layout.columns.values()}
     units = {column.unit for column in layout.columns.values() if column.unit in LENGTH_UNITS}
-    for name, sheet in sheets.items():
-        for at, text in sheet.texts.items() if name not in used else ():
-            if _ABOUT_ALL.search(text) and any(units != {unit} for unit in units_mentioned(text)):
-                yield (
-                    f"{sheet.place(*at)} says {quoted(text)}, where the headings of the scanner's sheets say "
-                    f"{listed(units)}, which was used"
-                )
-                return
-
-
-def _gap(modules: Table) -> Iterator[str]:
-    """A row between modules that have no numbers."""
+    others = (
+        f"{sheet.place(*at)} says {quoted(text)}, where the headings of the scanner's sheets say {listed(units)}, which "
+        "was used"
+        for name, sheet in recognized.sheets.items()
+        if name not in used
+        for at, text in sheet.texts.items()
+        if _ABOUT_ALL.search(text) and any(units != {unit} for unit in units_mentioned(text))
+    )
+    yield from itertools.islice(others, 1)
     gap = sorted(set(range(modules.rows[0], modules.rows[-1])) - set(modules.rows))
     if gap and modules.labels is None:
         yield (

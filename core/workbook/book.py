@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import io
-import math
 import os
 import zipfile
 from functools import cached_property
@@ -103,11 +102,6 @@ class Sheet:
         return {at: text for at, text in sorted(shown.items()) if type(text) is str and text.strip()}
 
     @property
-    def comments(self) -> dict[At, str]:
-        """The cells' comments."""
-        return self.book.workbook.comments(self.name)
-
-    @property
     def merged(self) -> list[Reference]:
         """Cells that are shown as one."""
         return self.book.workbook.sheet(self.name).merged
@@ -125,13 +119,6 @@ class Sheet:
             elif not _same_result(value, given):
                 value = Outdated(value, given)
         return None if type(value) is str and not value.strip() else value
-
-    def number(self, row: int, column: int, expected: str) -> float:
-        """The number in a cell; `InputError` if it holds none, saying what was `expected`."""
-        value = self.value(row, column)
-        if isinstance(value, float) and math.isfinite(value) and not self.is_date(row, column):
-            return value
-        raise InputError(f"{self.where(row, column)} {self.found(row, column)}, expected {expected}, a number")
 
     def formula(self, row: int, column: int) -> str | None:
         """The formula in a cell."""

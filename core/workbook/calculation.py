@@ -27,16 +27,9 @@ class Uncomputed(str):
 class Calculation:
     """Values of a workbook's formulas, each calculated after those that it needs, without recursion.
 
-    Parameters
-    ----------
-    workbook
-    cell_at
-        Gives the content of a cell.
-    is_calculated
-        Says of a place and its content whether its value is calculated; all others are taken as they stand.
-    settled
-        Given a formula's place and its value, or the `Uncomputed` that says why there is none, gives the value that
-        other formulas see.
+    `cell_at` gives the content of a cell, and `is_calculated` says of a place and its content whether its value is
+    calculated; all others are taken as they stand. Given a formula's place and its value, or the `Uncomputed` that says
+    why there is none, `settled` gives the value that other formulas see.
     """
 
     def __init__(
@@ -110,27 +103,9 @@ class Calculation:
 class Recalculation:
     """New values for every formula of a workbook that depends on `changed` cells, stored in its cells.
 
-    Formulas that stored no value get theirs too, in the sheets that change anyway.
-
-    Parameters
-    ----------
-    workbook
-        It is changed.
-    changed
-        The cells that the formulas may depend on.
-    required
-        The numbers that cells must hold: a formula that gives another one, or cannot be calculated, is replaced.
-    expected
-        The numbers that other formulas should give: one that gives another one is replaced.
-
-    Attributes
-    ----------
-    values : dict
-        Formula -> the value that it stores now.
-    cleared : dict
-        Formula that stores no value now -> why it cannot be calculated; causes before effects.
-    replaced : dict
-        Cell whose formula was replaced by the number that it must hold -> why.
+    Formulas that stored no value get theirs too, in the sheets that change anyway. A formula is replaced by the number
+    that its cell is `required` to hold if it gives another one or cannot be calculated, and by the `expected` number if
+    it gives another one.
     """
 
     def __init__(
@@ -141,8 +116,11 @@ class Recalculation:
         expected: Mapping[Place, float],
     ) -> None:
         self.values: dict[Place, Any] = {}
+        """Formula -> the value that it stores now."""
         self.cleared: dict[Place, str] = {}
+        """Formula that stores no value now -> why it cannot be calculated; causes before effects."""
         self.replaced: dict[Place, str] = {}
+        """Cell whose formula was replaced by a number -> why."""
         self._workbook, self._required, self._expected = workbook, required, expected
         formulas = workbook.formulas if changed else {}
         without_value = {place for place, cell in formulas.items() if cell.value is None}

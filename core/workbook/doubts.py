@@ -25,9 +25,7 @@ def doubts_about(table: HeadedTable, quantities: set[str]) -> Iterator[str]:
     yield from _other_tables(table)
     yield from _texts_between_modules(table)
     yield from _notes_with_units(table, lengths)
-    yield from _number_formats(table, used)
-    yield from _hidden_by_merged_cells(table, used)
-    yield from _texts_above_headings(table, used)
+    yield from _columns(table, used)
 
 
 def listed(units: set[str]) -> str:
@@ -121,7 +119,7 @@ def _notes_with_units(table: HeadedTable, lengths: set[str]) -> Iterator[str]:
             explained = unit in UNIT_WORDS and any(map(units_mentioned, others))
             if lengths != {unit} and not explained:
                 yield f"{sheet.place(*at)} holds {quoted(text)}, {headings_say}: expected one unit"
-    for at, text in sheet.comments.items():
+    for at, text in sheet.book.workbook.comments(sheet.name).items():
         if at[0] < table.first_row and any(lengths != {unit} for unit in units_mentioned(text)):
             yield f"{sheet.place(*at)} has the comment {quoted(text)}, {headings_say}: expected one unit"
 
@@ -132,33 +130,26 @@ def _heads_its_own_numbers(table: HeadedTable, at: At) -> bool:
     return at[1] in table.numeric - {table.label_column} and not only_a_unit
 
 
-def _number_formats(table: HeadedTable, used: list[tuple[int, str]]) -> Iterator[str]:
-    """Number formats that show another unit, or another number, than the cell's."""
+def _columns(table: HeadedTable, used: list[tuple[int, str]]) -> Iterator[str]:
+    """Number formats, merged cells and texts above a heading that give the numbers in `used` columns another meaning."""
+    sheet = table.sheet
     for column, unit in used:
         for row in table.rows:
-            shown = table.sheet.number_format(row, column)
-            if not table.sheet.is_date(row, column) and not shows_as_stored(shown, unit):
-                place = table.sheet.place(row, column)
+            shown = sheet.number_format(row, column)
+            if not sheet.is_date(row, column) and not shows_as_stored(shown, unit):
+                place = sheet.place(row, column)
                 yield f"{place} is shown as {quoted(shown)}, where its heading says {unit}: expected one unit"
                 break
-
-
-def _hidden_by_merged_cells(table: HeadedTable, used: list[tuple[int, str]]) -> Iterator[str]:
-    for area in table.sheet.merged:
-        for column, _ in used:
-            for row in table.rows:
-                hidden = area.contains(row, column) and (row, column) != (area.top, area.left)
-                if hidden and table.sheet.value(row, column) is not None:
-                    yield f"{table.sheet.place(row, column)} is hidden under a merged cell, expected a visible number"
-                    return
-
-
-def _texts_above_headings(table: HeadedTable, used: list[tuple[int, str]]) -> Iterator[str]:
-    """A text right above a heading, or merged over it, which may be part of what it says."""
+    for area in sheet.merged:
+        below = [(row, c) for c, _ in used for row in table.rows if area.contains(row, c)]
+        for at in below:
+            if at != (area.top, area.left) and sheet.value(*at) is not None:
+                yield f"{sheet.place(*at)} is hidden under a merged cell, expected a visible number"
+                break
     for column, _ in used:
         above = next(iter(table.headings[column])) - 1, column
-        at = next(((area.top, area.left) for area in table.sheet.merged if area.contains(*above)), above)
-        if at in table.sheet.texts and at not in table.head:
-            text = quoted(table.sheet.texts[at])
-            yield f"{table.sheet.place(*at)} holds {text} right above a heading, expected nothing, or a row between"
-            return
+        at = next(((area.top, area.left) for area in sheet.merged if area.contains(*above)), above)
+        if at in sheet.texts and at not in table.head:
+            text = quoted(sheet.texts[at])
+            yield f"{sheet.place(*at)} holds {text} right above a heading, expected nothing, or a row between"
+            break

@@ -27,19 +27,7 @@ _SAME = 1e-12
 
 
 class Edit:
-    """The cells of a workbook changed such that it holds another system; `InputError` if it cannot.
-
-    Attributes
-    ----------
-    required : dict
-        Cell -> the number that it must hold, typed or by its formula.
-    expected : dict
-        Cell of a right formula of H, x2, y2 or z2 -> the number that it should give from now on.
-    unsettled : set of Place
-        The cells of these two that held other numbers, or none.
-    numbered : bool
-        Whether the workbook has the modules' numbers.
-    """
+    """The cells of a workbook changed such that it holds another system; `InputError` if it cannot."""
 
     def __init__(self, system: PinholeSystem, reading: Reading, workbook: WorkbookXml) -> None:
         self.system = system
@@ -47,11 +35,14 @@ class Edit:
         self.columns, self.modules = self.layout.columns, self.layout.modules
         self.workbook = workbook
         self.by_design = is_by_design(system)
-        self.numbered = self.modules.number_column is not None
+        self.numbered = self.modules.number_column is not None  # whether the workbook has the modules' numbers
         self.old_of = matched(system, self.old, self.numbered)
         self.required: dict[Place, float] = {}
+        """Cell -> the number that it must hold, typed or by its formula."""
         self.expected: dict[Place, float] = {}
+        """Cell of a right formula of H, x2, y2 or z2 -> the number that it should give from now on."""
         self.unsettled: set[Place] = set()
+        """The cells of these two that held other numbers, or none."""
         self._refuse_unheld()
         self.rows = {table: self._rows_after(table, rows) for table, rows in self.layout.rows_of.items()}
         for rows in self.rows.values():

@@ -79,9 +79,6 @@ def areas_in(formula: str) -> list[Reference]:
     return [area for text in operands(formula) if (area := reference(text)) is not None]
 
 
-# Values
-
-
 class _ErrorValue(Exception):
     """The value of an operand is an error, and so is the result."""
 
@@ -150,7 +147,7 @@ def _area(term: _Term) -> _Cells:
     return value
 
 
-def _numbers(terms: tuple[_Term, ...]) -> list[float]:
+def _numbers(terms: list[_Term]) -> list[float]:
     """The numbers among the cells of areas, and every other argument as a number."""
     found = []
     for value in [term() for term in terms]:
@@ -159,9 +156,6 @@ def _numbers(terms: tuple[_Term, ...]) -> list[float]:
         else:
             found.append(_number(value))
     return found
-
-
-# Operators
 
 
 def _same_as_shown(a: float, b: float) -> bool:
@@ -219,9 +213,6 @@ _OPERATORS: list[dict[str, Callable[[Any, Any], Any]]] = [
     {"*": _of_two_numbers(operator.mul), "/": _of_two_numbers(operator.truediv)},
     {"^": _of_two_numbers(_power)},
 ]
-
-
-# Functions
 
 
 def _atan2(x: float, y: float) -> float:
@@ -412,9 +403,9 @@ class _Parser:
                 break
             self.take()
         self.close("FUNC")
-        return lambda: self.called(name, tuple(terms))
+        return lambda: self.called(name, terms)
 
-    def called(self, name: str, terms: tuple[_Term, ...]) -> Any:
+    def called(self, name: str, terms: list[_Term]) -> Any:
         if name in ("ROW", "COLUMN") and len(terms) < 2:
             at = _area(terms[0]).first if terms else self.surroundings.at
             if at is not None:

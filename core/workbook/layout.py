@@ -83,13 +83,16 @@ class Column:
 
         If they are `optional`, NaN where a cell is blank or cannot be computed, or holds anything else and `may_fail`.
         """
-        numbers = np.full(len(self.rows), math.nan)
+        numbers, sheet = np.full(len(self.rows), math.nan), self.table.sheet
         for i, row in enumerate(self.rows):
-            value = self.table.sheet.value(row, self.column)
+            value = sheet.value(row, self.column)
             absent = value is None or isinstance(value, Uncomputed) or (may_fail is not None and may_fail[i])
-            if isinstance(value, float) or not (optional and absent):
+            if isinstance(value, float) and math.isfinite(value) and not sheet.is_date(row, self.column):
+                numbers[i] = value
+            elif isinstance(value, float) or not (optional and absent):
                 of = "" if self.shared else f" of module {self.modules.module_numbers[i]}"
-                numbers[i] = self.table.sheet.number(row, self.column, self.quantity + of)
+                found = sheet.found(row, self.column)
+                raise InputError(f"{self.where(i)} {found}, expected {self.quantity}{of}, a number")
         return numbers
 
     def refuse(self, bad: NDArray[np.bool_], why: Callable[[int], str]) -> None:
@@ -164,7 +167,7 @@ def _contradictions(table: Table) -> Iterator[str]:
     for name, (column, unit) in table.columns.items():
         used = f"the column map says {name} in {unit}, which is used"
         for row in range(max(1, first - HEADING_ROWS), first):
-            heading = heading_of(sheet.texts.get((row, column)))
+            heading = heading_of(sheet.texts.get((row, column), ""))
             if heading is not None and (heading.quantity != name or heading.unit not in (None, unit)):
                 said = heading.quantity + (f" in {heading.unit}" if heading.unit else "")
                 yield f"{sheet.where(row, column)} says {said}, {used}"

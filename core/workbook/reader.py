@@ -26,14 +26,14 @@ from .recognition import recognized_layout
 def read_system(
     path: str | os.PathLike[str], columns: ColumnMap | str | os.PathLike[str] | None = None
 ) -> PinholeSystem:
-    """The scanner in a geometry workbook.
+    """The scanner in a geometry workbook; `source` names the workbook and the cell of every number.
 
-    Tables are found by their headings, symbols (x1 y1 z1 l d R Ld Td ...) or descriptions, listed in
-    `core.workbook.quantities`, with their units. Anything that is not understood for certain is refused; `columns` then
-    says what is meant. The pinhole centres, d, R, Ld and Td are needed, a number for each module or one for all. l comes
-    from its column, and where that is blank from `collimator_length`. A stored value that is not what its formula gives
-    is refused. Numbers that follow from the others are only checked: one that differs by more than 1e-6 (relative, mm or
-    radians) and by more than rounding in its last decimal is an `InputWarning`.
+    Tables are found by their headings, listed in `core.workbook.quantities`, with their units. Anything that is not
+    understood for certain is refused; `columns` then says what is meant. The pinhole centres, d, R, Ld and Td are needed,
+    a number for each module or one for all. l comes from its column, and where that is blank from `collimator_length`. A
+    stored value that is not what its formula gives is refused. Numbers that follow from the others are only checked: one
+    that differs by more than 1e-6 (relative, mm or radians) and by more than rounding in its last decimal is an
+    `InputWarning`.
 
     Parameters
     ----------
@@ -42,11 +42,6 @@ def read_system(
     columns
         Which cells hold which quantity: a `ColumnMap`, or the path of one as TOML. Nothing else of the workbook is
         then read. Default: by the headings.
-
-    Returns
-    -------
-    PinholeSystem
-        Modules in the order of their rows, lengths in mm; `source` names the workbook and the cell of every number.
 
     Raises
     ------
@@ -57,8 +52,6 @@ def read_system(
     Examples
     --------
     >>> system = read_system("examples/dc-spect-80.xlsx")    # doctest: +SKIP
-    >>> len(system), system.collimator_length[0].round(4)    # doctest: +SKIP
-    (80, 89.0702)
     """
     columns = column_map(columns, path)  # before the file, which may be large
     return read(Book(path), columns).system

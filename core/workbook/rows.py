@@ -36,25 +36,9 @@ def matched(system: PinholeSystem, old: PinholeSystem, numbered: bool) -> list[i
 class Rows:
     """The rows of a table that has a row for each module, and the rows that the modules of another system get in it.
 
-    The modules keep those that they have, if these are in the modules' order.
-
-    Parameters
-    ----------
-    old
-        The row of each module of the workbook.
-    own
-        The row that each module of the system has so far, None for a new one.
-    shared_columns
-        Columns with one value for all modules, which stays in the first row.
-    keep_first
-        Whether the first row must remain a module's.
-
-    Attributes
-    ----------
-    new : list of int
-        The row that each module of the system gets.
-    columns : list of int
-        Those that move with the modules.
+    `old` has the row of each module of the workbook; `own` and `new` have the rows that the modules of the system have so
+    far (None for a new one) and get: their own, if these are in the modules' order. `columns` move with the modules, but
+    `shared_columns` do not: they have one value for all in the first row. With `keep_first`, that stays a module's.
     """
 
     def __init__(

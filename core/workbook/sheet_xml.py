@@ -105,24 +105,16 @@ class _Origin:
 
 @dataclass(frozen=True)
 class Cell:
-    """The content of a cell.
-
-    Attributes
-    ----------
-    value : float, str, bool, CellError, Unreadable or None
-        The typed value, or the stored result of the formula.
-    formula : str or None
-        With its "="; a shared formula as it reads in this cell.
-    array : Reference or None
-        The area of the array formula or data table that the cell belongs to, if that has several cells.
-    single_array : bool
-        Whether the formula is an array formula of this cell alone.
-    """
+    """The content of a cell."""
 
     value: Any = None
+    """The typed value, or the stored result of the formula: a float, str, bool, `CellError`, `Unreadable` or None."""
     formula: str | None = None
+    """With its "="; a shared formula as it reads in this cell."""
     array: Reference | None = None
+    """The area of the array formula or data table that the cell belongs to, if that has several cells."""
     single_array: bool = False
+    """Whether the formula is an array formula of this cell alone."""
     origin: _Origin | None = field(default=None, compare=False, repr=False)
 
     @property
@@ -160,7 +152,8 @@ class SheetXml:
         self.name, self._file, self._data = name, file, data
         self._rows: dict[int, Element] = {}
         self._in_row: dict[int, list[tuple[int, Element]]] = defaultdict(list)
-        self._sheet_data: Element | None = None
+        self._sheet_data: Element  # every sheet with cells has one
+        self._prefix = b""
         self._dimension: Element | None = None
         self.cells: dict[At, Cell] = {}
         self.merged: list[Reference] = []
@@ -182,6 +175,7 @@ class SheetXml:
                 self._read_cell(at, e, strings, masters)
             elif e.name == "sheetData":
                 self._sheet_data = e
+                self._prefix = data[e.start + 1 : e.inner].split(b"sheetData", 1)[0]
             elif e.name == "dimension":
                 self._dimension = e
             elif e.name == "mergeCell" and (area := reference(e.attributes.get("ref", ""))) is not None:
@@ -306,14 +300,12 @@ class SheetXml:
         """A cell's element; shared formulas of the groups in `split` become formulas of their own."""
         cell = self.cells[at]
         origin, data, prefix = cell.origin, self._data, self._prefix
-        tag, value_kept = b"<%bc>" % prefix, False
-        if origin is not None:
-            tag = self._start_tag(origin.element)
-            value_kept = cell.value is origin.value
+        tag = b"<%bc>" % prefix if origin is None else self._start_tag(origin.element)
+        value_kept = origin is not None and cell.value is origin.value
         if origin is None or origin.at != at:
             tag = with_attribute(tag, "r", cell_name(at))
         if not value_kept or cell.value is None:
-            tag = with_attribute(with_attribute(tag, "t", _type(cell.value)), "vm", None)
+            tag = with_attribute(with_attribute(tag, "t", _stored(cell.value)[0]), "vm", None)
         if cell.formula is None:
             tag = with_attribute(tag, "cm", None)
         content = self._formula_xml(at, cell, split)
@@ -323,7 +315,7 @@ class SheetXml:
                 inner = inner[: f.start - origin.element.inner] + inner[f.end - origin.element.inner :]
             content += inner.strip()
         elif cell.value is not None:
-            content += b"<%bv>%b</%bv>" % (prefix, escaped(_stored(cell.value)), prefix)
+            content += b"<%bv>%b</%bv>" % (prefix, escaped(_stored(cell.value)[1]), prefix)
         return tag + content + b"</%bc>" % prefix if content else tag[:-1] + b"/>"
 
     def _formula_xml(self, at: At, cell: Cell, split: set[str]) -> bytes:
@@ -357,21 +349,13 @@ class SheetXml:
 
     def _new_row(self, row: int, cells: list[tuple[int, bytes]]) -> tuple[int, int, bytes]:
         """The XML of a row, which is formatted as the one above."""
-        assert self._sheet_data is not None, "a sheet with cells has their element"
-        tag = b"<%brow>" % self._prefix
         above = max((n for n in self._rows if n < row), default=None)
-        if above is not None:
-            tag = self._start_tag(self._rows[above])
+        tag = b"<%brow>" % self._prefix if above is None else self._start_tag(self._rows[above])
         for attribute in ("spans", "hidden", "collapsed", "outlineLevel"):
             tag = with_attribute(tag, attribute, None)
         xml = with_attribute(tag, "r", str(row)) + b"".join(xml for _, xml in cells) + b"</%brow>" % self._prefix
         at = min((e.start for n, e in self._rows.items() if n > row), default=self._sheet_data.close)
         return at, at, xml
-
-    @property
-    def _prefix(self) -> bytes:
-        assert self._sheet_data is not None, "a sheet with cells has their element"
-        return self._data[self._sheet_data.start + 1 : self._sheet_data.inner].split(b"sheetData", 1)[0]
 
 
 def _same(a: Cell, b: Cell) -> bool:
@@ -423,13 +407,10 @@ def moved(formula: str | None, start: At, to: At) -> str | None:
         return "=#REF!"
 
 
-def _type(value: Any) -> str | None:
+def _stored(value: Any) -> tuple[str | None, str]:
+    """The type of a value, as its cell's attribute, and its text."""
     if isinstance(value, bool):
-        return "b"
-    return "e" if isinstance(value, CellError) else "str" if isinstance(value, str) else None
-
-
-def _stored(value: Any) -> str:
-    if isinstance(value, bool):
-        return str(int(value))
-    return repr(value).removesuffix(".0") if isinstance(value, float) else str(value)
+        return "b", str(int(value))
+    if isinstance(value, str):
+        return "e" if isinstance(value, CellError) else "str", value
+    return None, repr(value).removesuffix(".0")

@@ -180,7 +180,9 @@ class WorkbookXml:
         own, _, plain = name.rpartition("!")
         scope, key = self.title(own.strip("'")) if own else sheet, plain.casefold()
         formula = self._names.get((scope, key)) or self._names.get((None, key))
-        return formula if formula is not None and _is_absolute(formula) else None
+        areas = [text for text in operands(formula or "") if reference(text) is not None]
+        cells = [text.rpartition("!")[2] for text in areas]  # Main!$B$3 means the same everywhere, Main!B3 does not
+        return formula if all(text.count("$") == len(re.findall(r"[A-Za-z]+|\d+", text)) for text in cells) else None
 
     def extent(self, sheet: str) -> At:
         """The last row and the last column of `sheet` with content."""
@@ -188,7 +190,7 @@ class WorkbookXml:
         if key not in self._extents:
             filled = [at for at, cell in self.sheet(sheet).cells.items() if not cell.blank]
             rows, columns = {row for row, _ in filled}, {column for _, column in filled}
-            self._extents[key] = max(rows, default=1), max(columns, default=1)
+            self._extents[key] = max(rows, default=0), max(columns, default=0)
         return self._extents[key]
 
     def ranges_ending_at(self, sheet: str, last: int) -> list[str]:
@@ -244,9 +246,3 @@ class WorkbookXml:
         at = max(e.end for e in root.children if e.namespace == MAIN and e.name in _BEFORE_CALC_PR)
         prefix = data[root.start + 1 : root.inner].split(b"workbook", 1)[0]
         return spliced(data, [(at, at, b'<%bcalcPr fullCalcOnLoad="1"/>' % prefix)])
-
-
-def _is_absolute(formula: str) -> bool:
-    """Whether the formula of a name means the same wherever the name is used: ``Main!$B$3``, not ``Main!B3``."""
-    cells = [text.rpartition("!")[2] for text in operands(formula) if reference(text) is not None]
-    return all(text.count("$") == len(re.findall(r"[A-Za-z]+|\d+", text)) for text in cells)

@@ -28,26 +28,17 @@ from .workbook_xml import KINDS, Place, WorkbookXml
 
 @dataclass(frozen=True)
 class WrittenWorkbook:
-    """What `write_system` has written.
-
-    Attributes
-    ----------
-    path : Path
-    changed : tuple of str
-        The cells (``"Coordinates!B3"``) whose numbers or formulas are not the template's.
-    recalculated : dict
-        Cell -> the value that its formula stores now, of each that depends on these or stored no value before.
-    cleared : tuple of str
-        The cells whose formulas store no value now, because they cannot be calculated here.
-    columns : ColumnMap or None
-        The column map of the new file, with the modules' rows; None if its headings are understood without one.
-    """
+    """What `write_system` has written."""
 
     path: Path
     changed: tuple[str, ...]
+    """The cells (``"Coordinates!B3"``) whose numbers or formulas are not the template's."""
     recalculated: dict[str, Any]
+    """Cell -> the value that its formula stores now, of each that depends on these or stored no value before."""
     cleared: tuple[str, ...]
+    """The cells whose formulas store no value now, because they cannot be calculated here."""
     columns: ColumnMap | None = None
+    """The column map of the new file, with the modules' rows; None if its headings are understood without one."""
 
 
 def write_system(
@@ -58,30 +49,20 @@ def write_system(
 ) -> WrittenWorkbook:
     """Write a scanner's geometry workbook.
 
-    In a copy of `template`, only the cells that differ are written; modules are found by their numbers, and cells as by
-    `read_system`. A formula stays if it still gives the system's number (to 1e-9, relative). Each formula that depends on
-    a changed cell stores its new value if `core.workbook.formulas` can calculate it, otherwise none, and the workbook is
-    marked to be recalculated when it is opened. All other parts of the file - sheets, formats, charts, images, comments,
-    macros - stay byte for byte the template's; if nothing differs, the whole file does.
-
-    Removed modules leave empty rows, added ones come below the last with copies of its formulas, and modules in
-    another order take the contents of their rows along.
+    In a copy of `template`, only the cells that differ are written; modules are found by their numbers (or their order,
+    without numbers), and cells as by `read_system`. A formula stays if it still gives the system's number (to 1e-9,
+    relative). Each formula that depends on a changed cell stores its new value, or none if it cannot be calculated here,
+    and the workbook is marked to be recalculated. All other parts of the file stay byte for byte. Removed modules leave
+    empty rows, added ones come below the last, and modules in another order take the contents of their rows along.
 
     Parameters
     ----------
-    system
-        The scanner. If the workbook has no column of modules' numbers, its modules are found by their order.
     path
         The file to write, .xlsx or .xlsm like the template; it may be the template, which is then replaced.
     template
         The workbook to copy. Default: a new one in the users' layout, with the sheets Main and Coordinates.
     columns
         The template's column map, or the path of one. Default: the one that the system was read by, if any.
-
-    Returns
-    -------
-    WrittenWorkbook
-        The changed and the recalculated cells.
 
     Raises
     ------
@@ -111,7 +92,15 @@ def write_system(
             temporary.write_bytes(new_workbook(system))
         book = Book(temporary if template is None else template)
         workbook = book.workbook
-        _refuse_other_kind(workbook, target, suffix)
+        if workbook.suffix is None:
+            raise InputError(
+                f"{workbook.name}: is neither an .xlsx nor an .xlsm workbook inside, expected it saved as one"
+            )
+        if workbook.suffix != suffix:
+            has = "has macros" if suffix == ".xlsx" else "is a workbook without macros"
+            raise InputError(
+                f"{target}: the template {workbook.name} {has}, expected a name ending in {workbook.suffix}"
+            )
         name = "the new workbook" if template is None else workbook.name
         with recorded_warnings():  # they were given when the system was read
             reading = read(book, said) if template is not None else _read_written(temporary, name, None)
@@ -130,15 +119,6 @@ def write_system(
         cleared=tuple(workbook.text(place) for place in sorted(recalculated.cleared)),
         columns=own,
     )
-
-
-def _refuse_other_kind(workbook: WorkbookXml, target: Path, suffix: str) -> None:
-    kind = workbook.suffix
-    if kind is None:
-        raise InputError(f"{workbook.name}: is neither an .xlsx nor an .xlsm workbook inside, expected it saved as one")
-    if kind != suffix:
-        has = "has macros" if kind == ".xlsm" else "is a workbook without macros"
-        raise InputError(f"{target}: the template {workbook.name} {has}, expected a name ending in {kind}")
 
 
 def _read_written(path: Path, name: str, columns: ColumnMap | None) -> Reading:

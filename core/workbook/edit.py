@@ -53,9 +53,17 @@ class Edit:
         for name in DERIVED:
             if name in self.columns:
                 self._derive(self.columns[name])
-        for rows in self.rows.values():
-            if rows.added:
-                self._warn_of_short_ranges(rows)
+        for table, rows in self.rows.items():
+            name, last = table.sheet.name, max(rows.old)
+            own = {workbook.text((name, row, column)) for row in rows.new for column in rows.columns}
+            found = [text for text in workbook.ranges_ending_at(name, last) if text not in own] if rows.added else []
+            if found:
+                warnings.warn(
+                    f"{workbook.name}: {several(found)} end{'s' * (len(found) == 1)} at row {last} of sheet {name}, so the "
+                    "modules added below are left out there",
+                    InputWarning,
+                    stacklevel=3,
+                )
 
     @property
     def changed(self) -> list[Place]:
@@ -81,14 +89,12 @@ class Edit:
                 InputWarning,
                 stacklevel=4,
             )
-        if "l" not in self.columns:
-            differing = np.flatnonzero(~self.by_design)
-            if len(differing):
-                i = differing[0]
-                raise InputError(
-                    f"{file}: sheet {sheet} has no column headed l for the collimator length of module {numbers[i]}, "
-                    f"{self.system.collimator_length[i]:g} mm, which is not the design formula's"
-                )
+        if "l" not in self.columns and not self.by_design.all():
+            i = np.argmin(self.by_design)
+            raise InputError(
+                f"{file}: sheet {sheet} has no column headed l for the collimator length of module {numbers[i]}, "
+                f"{self.system.collimator_length[i]:g} mm, which is not the design formula's"
+            )
 
     # Rows
 
@@ -200,18 +206,6 @@ class Edit:
                 if was_right and (j is None or not agree(right, number)):
                     self.expected[sheet.name, row, column.column] = number
                     self.unsettled.add((sheet.name, row, column.column))
-
-    def _warn_of_short_ranges(self, rows: Rows) -> None:
-        name, last = rows.table.sheet.name, max(rows.old)
-        own = {self.workbook.text((name, row, column)) for row in rows.new for column in rows.columns}
-        found = [text for text in self.workbook.ranges_ending_at(name, last) if text not in own]
-        if found:
-            warnings.warn(
-                f"{self.workbook.name}: {several(found)} end{'s' * (len(found) == 1)} at row {last} of sheet {name}, "
-                "so the modules added below are left out there",
-                InputWarning,
-                stacklevel=4,
-            )
 
 
 def several(things: Iterable[object]) -> str:

@@ -83,11 +83,8 @@ class HeadedTable:
     @cached_property
     def other_heads(self) -> dict[int, list[At]]:
         """The texts at the head of the columns without a quantity."""
-        found: dict[int, list[At]] = defaultdict(list)
-        for at in self.head:
-            if at[1] not in self.headings:
-                found[at[1]].append(at)
-        return found
+        columns = {column for _, column in self.head} - self.headings.keys()
+        return {column: [at for at in self.head if at[1] == column] for column in sorted(columns)}
 
     @cached_property
     def numeric(self) -> set[int]:
@@ -173,10 +170,8 @@ class HeadedTable:
 
     def _is_summary(self, row: int, column: int) -> bool:
         formula = self.sheet.formula(row, column) or ""
-        return _SUMMARY.search(formula) is not None and any(
-            area.top < area.bottom and area.left <= column <= area.right and area.sheet in (None, self.sheet.name)
-            for area in areas_in(formula)
-        )
+        areas = [area for area in areas_in(formula) if area.sheet in (None, self.sheet.name) and area.top < area.bottom]
+        return bool(_SUMMARY.search(formula)) and any(area.left <= column <= area.right for area in areas)
 
     @cached_property
     def rows(self) -> tuple[int, ...]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 import warnings
 from collections.abc import Callable, Iterator
@@ -14,7 +15,7 @@ from numpy.typing import NDArray
 from ..errors import InputError, InputWarning
 from .book import HEADING_ROWS, Book, Sheet, module_number
 from .calculation import Uncomputed
-from .column_map import ColumnMap, MappedTable
+from .column_map import ColumnMap
 from .headings import heading_of, shows_as_stored
 from .quantities import QUANTITIES
 
@@ -125,7 +126,20 @@ class Layout:
 
 def mapped_layout(book: Book, columns: ColumnMap) -> Layout:
     """The layout that a complete column map describes."""
-    tables = [_mapped_table(book, table) for table in columns.tables]
+    from openpyxl.utils import column_index_from_string as index
+
+    tables = []
+    for said in columns.tables:
+        if said.sheet not in book.sheets:
+            raise InputError(
+                f"{book.path.name}: has no sheet {said.sheet}, which the column map names; its sheets are "
+                f"{', '.join(book.sheets)}"
+            )
+        cells = {c.quantity: (index(c.column), c.unit) for c in said.columns}
+        number = None if said.number is None else index(said.number)
+        tables.append(Table(book.sheets[said.sheet], cells, said.row_numbers(), number))
+        for contradiction in itertools.islice(_contradictions(tables[-1]), 1):
+            warnings.warn(contradiction, InputWarning, stacklevel=2)
     modules, layout = tables[0], Layout(tables[0])
     for table, said in zip(tables, columns.tables, strict=True):
         rows = modules.rows
@@ -143,22 +157,6 @@ def mapped_layout(book: Book, columns: ColumnMap) -> Layout:
         for name in table.columns:
             layout.columns[name] = Column(table, name, modules, rows)
     return layout
-
-
-def _mapped_table(book: Book, said: MappedTable) -> Table:
-    from openpyxl.utils import column_index_from_string as index
-
-    if said.sheet not in book.sheets:
-        raise InputError(
-            f"{book.path.name}: has no sheet {said.sheet}, which the column map names; its sheets are "
-            f"{', '.join(book.sheets)}"
-        )
-    columns = {c.quantity: (index(c.column), c.unit) for c in said.columns}
-    number = None if said.number is None else index(said.number)
-    table = Table(book.sheets[said.sheet], columns, said.row_numbers(), number)
-    if (contradiction := next(_contradictions(table), None)) is not None:
-        warnings.warn(contradiction, InputWarning, stacklevel=2)
-    return table
 
 
 def _contradictions(table: Table) -> Iterator[str]:

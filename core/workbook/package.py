@@ -81,14 +81,11 @@ class Package:
 
     def content_type(self, part: str) -> str:
         """The content type of a member."""
-        suffix = part.rpartition(".")[2].casefold()
-        found = ""
+        said = {}
         for e in self.elements(_CONTENT_TYPES):
-            if e.name == "Override" and e.attributes.get("PartName", "").lstrip("/").casefold() == part.casefold():
-                return e.attributes.get("ContentType", "")
-            if e.name == "Default" and e.attributes.get("Extension", "").casefold() == suffix:
-                found = e.attributes.get("ContentType", "")
-        return found
+            key = e.attributes.get("PartName", "").lstrip("/") or f".{e.attributes.get('Extension', '')}"
+            said[key.casefold()] = e.attributes.get("ContentType", "")
+        return said.get(part.casefold()) or said.get(f".{part.rpartition('.')[2].casefold()}", "")
 
     def with_parts(self, parts: dict[str, bytes], removed: Iterable[str] = (), owner: str = "") -> bytes:
         """The archive with other bytes for `parts` and without the `removed` members that `owner` refers to.

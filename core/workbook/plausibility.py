@@ -31,28 +31,21 @@ def refuse_impossible(columns: dict[str, Column], values: Numbers) -> None:
     columns["d"].refuse(
         d >= side, lambda i: f"has d = {d[i]:g} mm, expected less than Ld = {side[i]:g} mm in {columns['Ld'].place(i)}"
     )
-    x1 = columns["x1"]
+    x1, roi_column = columns["x1"], columns["R"]
     with np.errstate(over="ignore"):
         b = np.sqrt(sum(values[name] ** 2 for name in POSITION))
-
-    def refuse_places(bad: NDArray[np.bool_], text: str) -> None:
-        def why(i: int) -> str:
-            places = {"b": f"{b[i]:g} mm", "roi": f"{roi[i]:g} mm in {columns['R'].place(i)}"}
-            return f"and y1, z1 put the pinhole of module {x1.modules.module_numbers[i]} {text.format(**places)}"
-
-        x1.refuse(bad, why)
-
-    refuse_places(b == 0, "at the isocentre, expected outside the ROI")
-    refuse_places(np.isinf(b), "too far away to compute, expected millimetres")
-    refuse_places(b <= roi, "{b} from the isocentre, expected outside the ROI of {roi}")
+    puts = [f"and y1, z1 put the pinhole of module {number}" for number in x1.modules.module_numbers]
+    x1.refuse(b == 0, lambda i: f"{puts[i]} at the isocentre, expected outside the ROI")
+    x1.refuse(np.isinf(b), lambda i: f"{puts[i]} too far away to compute, expected millimetres")
+    outside = "mm from the isocentre, expected outside the ROI of"
+    x1.refuse(b <= roi, lambda i: f"{puts[i]} {b[i]:g} {outside} {roi[i]:g} mm in {roi_column.place(i)}")
     first: dict[tuple[int, ...], int] = {}
     for i, position in enumerate(zip(*(values[name] for name in POSITION), strict=True)):
         j = first.setdefault(tuple(round(x / _SAME_PLACE) for x in position), i)
         if j != i:
-            numbers = x1.modules.module_numbers
             raise InputError(
-                f"{x1.where(i)} and y1, z1 put the pinhole of module {numbers[i]} at the place of module {numbers[j]} "
-                f"({x1.place(j)}), expected another place"
+                f"{x1.where(i)} {puts[i]} at the place of module {x1.modules.module_numbers[j]} ({x1.place(j)}), expected "
+                "another place"
             )
 
 

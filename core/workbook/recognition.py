@@ -57,20 +57,14 @@ def recognize(book: Book) -> Recognized:
                 doubts.append(
                     f"x1 is in sheet {modules.sheet.name} but {name} in sheet {tables[name].sheet.name}, expected one table"
                 )
-        doubts += _shown_instead(book, modules.sheet)
+        hidden = book.workbook.hidden
+        for other in book.sheets.values() if modules.sheet.name in hidden else ():
+            table = None if other.name in hidden else headed_table(other)
+            if table is not None and table.columns.keys() >= set(POSITION) and table.rows:
+                doubts.append(f"sheet {modules.sheet.name} is hidden, but {other.name} is shown, expected one of them")
     for table in dict.fromkeys(tables.values()):
         doubts += doubts_about(table, {*TYPED, *(name for name, its in tables.items() if its is table)})
     return Recognized(sheets, tables, doubts + missing)
-
-
-def _shown_instead(book: Book, sheet: Sheet) -> Iterator[str]:
-    """A doubt if the sheet of the coordinates is hidden, and a visible one has such a table."""
-    hidden = book.workbook.hidden
-    for other in book.sheets.values() if sheet.name in hidden else ():
-        table = None if other.name in hidden else headed_table(other)
-        if table is not None and table.columns.keys() >= set(POSITION) and table.rows:
-            yield f"sheet {sheet.name} is hidden, but {other.name} is shown, expected one of them"
-            return
 
 
 def _missing(book: Book, sheets: dict[str, Sheet], name: str) -> str:

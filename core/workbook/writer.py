@@ -68,12 +68,8 @@ def write_system(
     ------
     InputError
         The template is refused by `read_system` or cannot hold the system, or the file cannot be written. The file
-        at `path` is then as it was.
-
-    Warns
-    -----
-    InputWarning
-        Formulas that had to be replaced by numbers or store no value, and ranges that leave added modules out.
+        at `path` is then as it was. An `InputWarning` is given of formulas that had to be replaced by numbers or store no
+        value, and of ranges that leave added modules out.
     """
     instance(system, PinholeSystem, "write_system")
     target = Path(path)
@@ -82,11 +78,9 @@ def write_system(
         raise InputError(f"{target}: expected a name ending in {' or '.join(KINDS)}")
     if template is None and suffix != ".xlsx":
         raise InputError(f"{target}: a workbook without a template has no macros, expected a name ending in .xlsx")
-    said: ColumnMap | None = None
+    said = None if template is None or system.source is None else system.source.columns
     if template is not None and columns is not None:
         said = column_map(columns, template)
-    elif template is not None and system.source is not None:
-        said = system.source.columns
     with replacing(target) as temporary:
         if template is None:
             temporary.write_bytes(new_workbook(system))

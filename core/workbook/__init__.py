@@ -2,9 +2,9 @@
 
 Both ways:   quantities (the table of the columns), book, sheet_xml, workbook_xml and package (the file),
              calculation and formulas (the values of its formulas)
-Reading:     headings, headed_table, recognition and doubts (what a workbook's headings say), column_map and draft (what a
-             person says), layout (which cells hold which quantity), reader, plausibility
-Writing:     writer, new_workbook, edit (the cells that change), rows (rows that move with the modules)
+Reading:     headings, headed_table and recognition (what a workbook's headings say, and doubts), column_map and draft (what
+             a person says), layout (which cells hold which quantity), reader, plausibility
+Writing:     writer, edit (the cells that change, and the rows that move with the modules)
 """
 
 from __future__ import annotations

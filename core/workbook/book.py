@@ -36,16 +36,7 @@ class Outdated(NamedTuple):
 
 
 class Book:
-    """An .xlsx or .xlsm file; `InputError` if it is missing, unreadable, too large or not a workbook.
-
-    Attributes
-    ----------
-    sheets : dict
-        Name -> `Sheet`, in the workbook's order.
-    unverified : dict
-        Formulas that cannot be computed here and whose stored value was used although the file asks to be calculated
-        -> why they cannot.
-    """
+    """An .xlsx or .xlsm file; `InputError` if it is missing, unreadable, too large or not a workbook."""
 
     def __init__(self, path: str | os.PathLike[str]) -> None:
         self.path = Path(path)
@@ -54,6 +45,7 @@ class Book:
         self.workbook = WorkbookXml(content, self.path.name)
         self.sheets = {title: Sheet(self, title) for title in self.workbook.parts}
         self.unverified: dict[Place, str] = {}
+        """Formulas whose stored value was used although the file asks to be calculated -> why they cannot be."""
         self.calculation = Calculation(
             self.workbook, self._cell, lambda _, cell: cell.formula is not None, self._relied_on
         )

@@ -95,10 +95,7 @@ class ColumnMap:
                 found = f"{places[name]} has {name}" if name in places else f"{_of(0)} has no column {name}"
                 faults.append(f"{found}, expected x1, y1, z1 in the first table")
         faults += [f"no table has a column {name}" for name in DIMENSIONS if name not in places]
-        return faults + list(self._overlaps())
-
-    def _overlaps(self) -> Iterator[str]:
-        """The columns that are used twice in the same rows, other than for the modules' numbers."""
+        # A column may be used twice in the same rows only for the modules' numbers.
         used: dict[tuple[str, str], list[tuple[set[int], str]]] = {}
         for i, table in enumerate(self.tables):
             rows = set(range(max(table.first_row, 1), min(table.last_row, MAX_ROW) + 1))
@@ -108,8 +105,9 @@ class ColumnMap:
                 others = used.setdefault((table.sheet.casefold(), column), [])
                 for other_rows, other in others:
                     if rows & other_rows and not (name == "number" and other.endswith(".number")):
-                        yield f"{_of(i, name)}: column {column} is {other} too, expected another column"
+                        faults.append(f"{_of(i, name)}: column {column} is {other} too, expected another column")
                 others.append((rows, _of(i, name)))
+        return faults
 
     def to_toml(self) -> str:
         """The map as text, which `from_toml` reads."""

@@ -138,15 +138,12 @@ def preview_workbook(
 
     They begin with row 1 and column A; a blank cell is an empty text, and a smaller sheet gives what it has.
     """
-    return {name: _preview(sheet, rows, columns) for name, sheet in Book(path).sheets.items()}
-
-
-def _preview(sheet: Sheet, rows: int, columns: int) -> tuple[tuple[str, ...], ...]:
-    bottom, right = sheet.book.workbook.extent(sheet.name)
-    return tuple(
-        tuple(_text(sheet.value(row, column)) for column in range(1, min(columns, right) + 1))
-        for row in range(1, min(rows, bottom) + 1)
-    )
+    found = {}
+    for name, sheet in Book(path).sheets.items():
+        bottom, right = map(min, (rows, columns), sheet.book.workbook.extent(name))
+        cells = [[_text(sheet.value(row, column)) for column in range(1, right + 1)] for row in range(1, bottom + 1)]
+        found[name] = tuple(map(tuple, cells))
+    return found
 
 
 def _text(value: object) -> str:

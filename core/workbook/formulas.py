@@ -277,10 +277,6 @@ def _position(wanted: Any, cells: list[Any], mode: Any) -> int:
     raise _ErrorValue(CellError("#N/A"))
 
 
-def _match(wanted: _Term, cells: _Term, mode: _Term = lambda: 1.0) -> float:
-    return _position(wanted(), _area(cells), mode()) + 1.0
-
-
 def _vlookup(wanted: _Term, cells: _Term, column: _Term, mode: _Term = lambda: 1.0) -> Any:
     area, j = _area(cells), int(_number(column()))
     if not 1 <= j <= area.columns:
@@ -321,7 +317,7 @@ _OF_TERMS: dict[str, Callable[..., Any]] = {
     "IF": _if,
     "IFERROR": _if_error,
     "INDEX": _index,
-    "MATCH": _match,
+    "MATCH": lambda wanted, cells, mode=lambda: 1.0: _position(wanted(), _area(cells), mode()) + 1.0,
     "NOT": lambda term: not _truth(term()),
     "OR": lambda *terms: any(_truths(*terms)),
     "TRUE": lambda: True,

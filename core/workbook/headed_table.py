@@ -37,8 +37,6 @@ class HeadedTable:
         rows = [row for said in self.headings.values() for row in said]
         self.first_heading, self.last_heading = min(rows), max(rows)
 
-    # Headings
-
     @cached_property
     def first_row(self) -> int:
         """The first row below with something other than text under a heading."""
@@ -78,8 +76,6 @@ class HeadedTable:
         """The first heading of a column, as a cell's name."""
         return self.sheet.place(next(iter(self.headings[column])), column)
 
-    # Other columns
-
     @cached_property
     def other_heads(self) -> dict[int, list[At]]:
         """The texts at the head of the columns without a quantity."""
@@ -111,8 +107,6 @@ class HeadedTable:
             if not (is_number_heading(text := self.head[at]) or is_label_heading(text))
             and plain(text).casefold() not in IGNORED_HEADINGS
         ]
-
-    # Rows
 
     @cached_property
     def _key_columns(self) -> list[int]:

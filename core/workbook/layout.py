@@ -79,15 +79,17 @@ class Column:
         """Sheet and cell of module index `i`."""
         return self.table.sheet.place(self.rows[i], self.column)
 
-    def numbers(self, optional: bool = False, may_fail: NDArray[np.bool_] | None = None) -> NDArray[np.float64]:
+    def numbers(self, optional: bool = False, ignored: NDArray[np.bool_] | None = None) -> NDArray[np.float64]:
         """The numbers (M,) in the cells, in their unit; `InputError` if one holds no number.
 
-        If they are `optional`, NaN where a cell is blank or cannot be computed, or holds anything else and `may_fail`.
+        NaN where they are `ignored`, or where a cell is blank or cannot be computed if they are `optional`.
         """
         numbers, sheet = np.full(len(self.rows), math.nan), self.table.sheet
         for i, row in enumerate(self.rows):
+            if ignored is not None and ignored[i]:
+                continue
             value = sheet.value(row, self.column)
-            absent = value is None or isinstance(value, Uncomputed) or (may_fail is not None and may_fail[i])
+            absent = value is None or isinstance(value, Uncomputed)
             if isinstance(value, float) and math.isfinite(value) and not sheet.is_date(row, self.column):
                 numbers[i] = value
             elif isinstance(value, float) or not (optional and absent):

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import os
 import warnings
 from collections.abc import Iterator
@@ -76,8 +75,8 @@ def read(book: Book, columns: ColumnMap | None = None) -> Reading:
     for name in QUANTITIES:
         if name in layout.columns and name not in NEEDED:
             # On the z axis a spreadsheet's ATAN2 shows #DIV/0!, and any azimuth is right.
-            may_fail = on_axis if name == "azimuth" else None
-            given[name] = layout.columns[name].numbers(name != "l" or columns is None, may_fail)
+            ignored = on_axis if name == "azimuth" else None
+            given[name] = layout.columns[name].numbers(name != "l" or columns is None, ignored)
     designed = collimator_length(
         np.sqrt(sum(values[name] ** 2 for name in POSITION)), values["d"], values["Ld"], values["R"]
     )
@@ -112,12 +111,10 @@ def _doubtful(
         typed = system.collimator_length / column.factor
         rounding_of_l = column.factor * np.array([tolerance(x, x, column.unit) for x in typed])
     yield from implausible(system, columns)
-    on_z_axis = QUANTITIES["range"].of(system) == 0
     for name in DERIVED:
         if name in given:
-            numbers = np.where(on_z_axis, math.nan, given[name]) if name == "azimuth" else given[name]
             slack = rounding_of_l if QUANTITIES[name].depends_on_length else 0.0
-            yield from differences(columns[name], numbers, QUANTITIES[name].of(system), slack)
+            yield from differences(columns[name], given[name], QUANTITIES[name].of(system), slack)
     for place, why in list(book.unverified.items())[:1]:
         yield (
             f"{book.path.name}: {book.workbook.text(place)}: the stored value is used, though the file asks to be "

@@ -183,8 +183,6 @@ class SheetXml:
         self._mark_arrays()
         self.original = dict(self.cells)
 
-    # Reading
-
     def _read_cell(self, at: At, element: Element, strings: list[str], masters: dict[str, tuple[At, str]]) -> None:
         parts = {e.name: e for e in element.children if e.namespace == MAIN}
         if at in self.cells:
@@ -219,8 +217,6 @@ class SheetXml:
             for place in self.cells:
                 if place == at or area.contains(*place):
                     self.cells[place] = replace(self.cells[place], array=area)
-
-    # Changing
 
     def cell(self, at: At) -> Cell:
         """The cell, a blank one if the sheet has none there."""
@@ -258,8 +254,6 @@ class SheetXml:
 
     def _was(self, at: At) -> Cell:
         return self.original.get(at, _BLANK)
-
-    # Writing
 
     def to_bytes(self) -> bytes:
         """The part with the changed cells."""

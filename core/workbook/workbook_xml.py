@@ -81,8 +81,6 @@ class WorkbookXml:
         part = self._related.get("sharedStrings")
         return [] if part is None else shared_strings(self.package.elements(part))
 
-    # What the file says
-
     @property
     def suffix(self) -> str | None:
         """ ".xlsx" or ".xlsm" by the content, None for anything else."""
@@ -155,8 +153,6 @@ class WorkbookXml:
         """A sheet's name as the workbook writes it, given in whatever case."""
         return None if name is None else self._by_folded_name.get(name.casefold())
 
-    # Cells and formulas
-
     def cell(self, place: Place) -> Cell:
         """A cell as it is now."""
         return self.sheet(place[0]).cell(place[1:])
@@ -219,8 +215,6 @@ class WorkbookXml:
     def text(place: Place) -> str:
         """E.g. ``Coordinates!B3``."""
         return f"{place[0]}!{cell_name(place[1:])}"
-
-    # Writing
 
     @property
     def changed(self) -> list[Place]:

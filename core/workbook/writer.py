@@ -1,7 +1,8 @@
-"""`write_system`: a `PinholeSystem` into a copy of a geometry workbook in which nothing else changes."""
+"""`write_system`: a `PinholeSystem` into a new geometry workbook, or a copy of one in which nothing else changes."""
 
 from __future__ import annotations
 
+import io
 import os
 import warnings
 from collections import defaultdict
@@ -20,10 +21,14 @@ from .book import Book
 from .calculation import Recalculation
 from .column_map import ColumnMap, column_map
 from .edit import Edit, several
-from .new_workbook import new_workbook
+from .plausibility import is_by_design
 from .quantities import QUANTITIES, TYPED
 from .reader import Reading, read
 from .workbook_xml import KINDS, Place, WorkbookXml
+
+_WIDTH = 13
+_FIRST_ROW = 3
+"""Column widths and the first module's row in a new workbook."""
 
 
 @dataclass(frozen=True)
@@ -83,7 +88,7 @@ def write_system(
         said = column_map(columns, template)
     with replacing(target) as temporary:
         if template is None:
-            temporary.write_bytes(new_workbook(system))
+            temporary.write_bytes(_new_workbook(system))
         book = Book(temporary if template is None else template)
         workbook = book.workbook
         if workbook.suffix is None:
@@ -150,14 +155,14 @@ def _warn_of_formulas(workbook: WorkbookXml, recalculated: Recalculation) -> Non
     for place in sorted(recalculated.replaced):
         by_column[place[0], place[2]].append(place)
     messages = [
-        f"{_and_more(workbook, places)}: the formula was replaced by the system's number "
+        f"{several(map(workbook.text, places), shown=1)}: the formula was replaced by the system's number "
         f"({recalculated.replaced[places[0]]})"
         for places in by_column.values()
     ]
     if recalculated.cleared:
         places = list(recalculated.cleared)
         messages.append(
-            f"{_and_more(workbook, places)}: the formula's new value could not be calculated "
+            f"{several(map(workbook.text, places), shown=1)}: the formula's new value could not be calculated "
             f"({recalculated.cleared[places[0]]}); opening the workbook in Excel or LibreOffice and saving it stores the "
             "value"
         )
@@ -165,5 +170,38 @@ def _warn_of_formulas(workbook: WorkbookXml, recalculated: Recalculation) -> Non
         warnings.warn(f"{workbook.name}: {message}", InputWarning, stacklevel=3)
 
 
-def _and_more(workbook: WorkbookXml, places: list[Place]) -> str:
-    return workbook.text(places[0]) + (f" and {len(places) - 1} more" if len(places) > 1 else "")
+def _new_workbook(system: PinholeSystem) -> bytes:
+    """A workbook in the users' layout, its formulas without values; l is a number where it is not the design formula's."""
+    import openpyxl
+    from openpyxl.styles import Alignment, Font
+
+    book = openpyxl.Workbook()
+    book.active.title = "Main"
+    book.create_sheet("Coordinates")
+    by_design = is_by_design(system)
+    columns = [
+        *((name, q.place, q.titles or q.headings[:2], q.formula, q.of(system)) for name, q in QUANTITIES.items()),
+        *(("number", f"{title}!A", ("", "Definitions"), "", system.numbers) for title in book.sheetnames),
+        ("slope", "Coordinates!F", ("S", "3D slope"), "={b}/{x1}", by_design),
+    ]
+    for name, place, titles, formula, numbers in columns:
+        title, letter = place.split("!")
+        sheet = book[title]
+        sheet.freeze_panes = "B3"
+        sheet.column_dimensions[letter].width = _WIDTH
+        for row, text in enumerate(titles, start=1):
+            cell = sheet[f"{letter}{row}"]
+            cell.value, cell.font = text or None, Font(bold=True)
+            cell.alignment = Alignment(wrap_text=True, vertical="top", horizontal="center")
+        places = {other: quantity.place.removeprefix(f"{title}!") for other, quantity in QUANTITIES.items()}
+        for i, number in enumerate(numbers):
+            row = _FIRST_ROW + i
+            cell = sheet[f"{letter}{row}"]
+            cell.value = number.item()
+            if formula and (name != "l" or by_design[i]):
+                cell.value = formula.format_map({other: f"{column}{row}" for other, column in places.items()})
+            if title == "Coordinates" and name != "number":
+                cell.number_format = "0.0000"
+    content = io.BytesIO()
+    book.save(content)
+    return content.getvalue()

@@ -3,7 +3,7 @@
 Both ways:   quantities (the table of the columns), book, sheet_xml, workbook_xml and package (the file),
              calculation and formulas (the values of its formulas)
 Reading:     headings, headed_table and recognition (what a workbook's headings say, and doubts), column_map and draft (what
-             a person says), layout (which cells hold which quantity), reader, plausibility
+             a person says), layout (which cells hold which quantity), reader
 Writing:     writer, edit (the cells that change, and the rows that move with the modules)
 """
 

@@ -19,9 +19,8 @@ from .book import module_number
 from .column_map import ColumnMap
 from .formulas import areas_in
 from .layout import Column, Table
-from .plausibility import is_by_design
 from .quantities import DERIVED, EXACT, NEEDED, QUANTITIES, agree
-from .reader import Reading
+from .reader import Reading, is_by_design
 from .sheet_xml import SheetXml, moved
 from .workbook_xml import Place, WorkbookXml
 
@@ -183,11 +182,6 @@ class Edit:
                     InputWarning,
                     stacklevel=3,
                 )
-
-    @property
-    def changed(self) -> list[Place]:
-        """The cells whose formulas, and those that depend on them, have to be recalculated."""
-        return list(dict.fromkeys([*self.workbook.changed, *sorted(self.unsettled)]))
 
     def column_map(self) -> ColumnMap | None:
         """The column map that the workbook was read by, if any, with the rows that the modules have now."""

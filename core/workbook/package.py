@@ -49,11 +49,7 @@ class Package:
         self.content = content
         self._archive = zipfile.ZipFile(io.BytesIO(content))
         self._members = {info.filename.casefold(): info for info in self._archive.infolist()}
-
-    @property
-    def names(self) -> list[str]:
-        """The members' names in the archive's order."""
-        return [info.filename for info in self._members.values()]
+        self.names = [info.filename for info in self._members.values()]
 
     def read(self, name: str) -> bytes:
         """A member's bytes; `InputError` if it is missing or damaged."""

@@ -21,9 +21,8 @@ from .book import Book
 from .calculation import Recalculation
 from .column_map import ColumnMap, column_map
 from .edit import Edit, several
-from .plausibility import is_by_design
 from .quantities import QUANTITIES, TYPED
-from .reader import Reading, read
+from .reader import Reading, is_by_design, read
 from .workbook_xml import KINDS, Place, WorkbookXml
 
 _WIDTH = 13
@@ -105,7 +104,7 @@ def write_system(
             reading = read(book, said) if template is not None else _read_written(temporary, name, None)
         edit = Edit(system, reading, workbook)
         edited = [] if template is None else workbook.changed
-        to_recalculate = workbook.formulas if template is None else edit.changed
+        to_recalculate = workbook.formulas if template is None else {*edited, *edit.unsettled}
         recalculated = Recalculation(workbook, to_recalculate, edit.required, edit.expected)
         temporary.write_bytes(workbook.to_bytes())
         own = edit.column_map()

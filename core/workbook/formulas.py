@@ -1,7 +1,6 @@
-"""An evaluator of spreadsheet formulas.
+"""An evaluator of spreadsheet formulas: arithmetic over cells and a little logic, without the dependencies of a library.
 
-A geometry table needs arithmetic over cells and a little logic: openpyxl's tokenizer and the precedence below are
-enough, without the dependencies of a library for this. A formula that needs more raises `NotComputable`; nothing is guessed.
+A formula that needs more raises `NotComputable`; nothing is guessed.
 """
 
 from __future__ import annotations

@@ -55,10 +55,6 @@ def read_system(
     InputError
         Not a workbook, a heading, a note or a table that is not understood, or a cell that cannot be used: one
         line with sheet and cell, what is there and what was expected.
-
-    Examples
-    --------
-    >>> system = read_system("examples/dc-spect-80.xlsx")    # doctest: +SKIP
     """
     columns = column_map(columns, path)  # before the file, which may be large
     return read(Book(path), columns).system

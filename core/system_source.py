@@ -32,8 +32,6 @@ class SystemSource:
 
     def cell(self, quantity: str, number: int) -> tuple[str, str] | None:
         """(sheet, cell) of a module's `quantity`, e.g. ``("Coordinates", "B3")``; None without a column."""
-        row_of_module = self.numbers.index(number)
-        for cells in self.cells:
-            if cells.quantity == quantity:
-                return cells.sheet, f"{cells.column}{cells.rows[row_of_module]}"
-        return None
+        i = self.numbers.index(number)
+        found = (c for c in self.cells if c.quantity == quantity)
+        return next(((c.sheet, f"{c.column}{c.rows[i]}") for c in found), None)

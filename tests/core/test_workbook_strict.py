@@ -411,7 +411,9 @@ def test_a_row_of_units_counts(tmp_path):
             sheet.insert_rows(3)
             for column in range(2, sheet.max_column + 1):
                 for row in (1, 2):
-                    if (heading := heading_of(sheet.cell(row, column).value)) is not None and heading.unit == "cm":
+                    if (
+                        heading := heading_of(sheet.cell(row, column).value or "")
+                    ) is not None and heading.unit == "cm":
                         sheet.cell(row, column).value = sheet.cell(row, column).value.rstrip("(cm)[], ")
                         sheet.cell(3, column).value = "[cm]"
 

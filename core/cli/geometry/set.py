@@ -14,7 +14,7 @@ from ...geometry.design_formulas import collimator_length
 from ...geometry.system import PinholeSystem
 from ...recording import recorded_warnings
 from ...workbook import write_system
-from ...workbook.plausibility import is_by_design
+from ...workbook.reader import is_by_design
 from ..options import chosen_modules, output_path, read_workbook
 from .arguments import add_action
 

@@ -51,30 +51,9 @@ class CardiacTorso(Phantom):
     arms, breasts and other organs are left out.
 
     The activities are choices for rest, an hour after 1 GBq: 1.2 % of it in the heart (sestamibi's prescribing
-    information) is about 90 kBq/mL in 133 g; the other organs are set to ratios seen in clinical images.
-
-    Attributes
-    ----------
-    phase : float
-        Of the heart's cycle: 0 at end-diastole, 0.35 at end-systole, below 1.
-    end_diastolic_volume, end_systolic_volume : float
-        Of the left ventricle's cavity, mL.
-    ventricle_length, wall : float
-        Of the cavity from base to apex, and of the wall, at end-diastole, mm.
-    shortening : float
-        Fraction by which the length shortens until end-systole.
-    defect_severity : float
-        Fraction of the muscle's activity that is missing in the defect, 0 (no defect) to 1.
-    defect_angle_degrees, defect_width_degrees : float
-        The defect's middle, 0 anterior, 90 lateral, 180 inferior, 270 septal; and its full angular width.
-    defect_from, defect_to : float
-        Where along the muscle it begins and ends, 0 the base, 1 the apex.
-    defect_transmural : float
-        Fraction of the wall, from the inside, that it takes.
-    body_radii : (2,)
-        Half axes of the body, left-right and front-back, mm.
-    myocardium, right_myocardium, blood, liver, lung, body : float
-        Activities, kBq/mL; the body's also in the spine.
+    information) is about 90 kBq/mL in 133 g; the other organs are set to ratios seen in clinical images; the spine has
+    the body's.
+    The fields say what each setting is, and its unit.
     """
 
     phase: float = setting(0.0, "of the cycle", "0 at end-diastole, 0.35 at end-systole, below 1", 0.0)
@@ -101,22 +80,26 @@ class CardiacTorso(Phantom):
 
     def __post_init__(self) -> None:
         check_settings(self, self.title)
-        for name, most in (
-            ("phase", 1.0),
-            ("shortening", 0.9),
-            ("defect_severity", 1.0),
-            ("defect_width_degrees", 360.0),
-            ("defect_to", 1.0),
-            ("defect_transmural", 1.0),
-            ("end_systolic_volume", self.end_diastolic_volume),
-            ("defect_from", self.defect_to),
-        ):
+        below = {"phase": 1.0, "defect_from": self.defect_to}
+        at_most = {"shortening": 0.9, "defect_width_degrees": 360.0, "end_systolic_volume": self.end_diastolic_volume}
+        at_most |= dict.fromkeys(("defect_severity", "defect_to", "defect_transmural"), 1.0)
+        for name, most in {**at_most, **below}.items():
             value = getattr(self, name)
-            if value > most or (value == most and name in ("phase", "defect_from")):
-                below = "less than" if name in ("phase", "defect_from") else "at most"
-                raise InputError(f"{self.title}: {name.replace('_', ' ')}: expected {below} {most:g}, got {value:g}")
+            if value > most or (value == most and name in below):
+                limit = f"{'less than' if name in below else 'at most'} {most:g}"
+                raise InputError(f"{self.title}: {name.replace('_', ' ')}: expected {limit}, got {value:g}")
         super().__post_init__()  # it makes the shapes, whose messages would not name the setting
-        self._require_in_body()
+        body, *organs = self.shapes
+        for i, organ in enumerate(organs):
+            points = next(points_inside(Layer(organ, organ.pose, 0.0))) - body.pose[:3, 3:]
+            if np.any(body.distance(points) > 0):
+                settings = (
+                    f"body radii of {self.body_radii[0]:g} and {self.body_radii[1]:g} mm"
+                    if i < _TRUNK
+                    else f"ventricle length of {self.ventricle_length:g} mm, wall of {self.wall:g} mm and end diastolic "
+                    f"volume of {self.end_diastolic_volume:g} mL"
+                )
+                raise InputError(f"{self.title}: {settings}: the {organ.name} reaches out of the body")
 
     def beating(self, frames: int) -> list[CardiacTorso]:
         """The torso at as many phases, evenly spaced over the cycle, the first at end-diastole."""
@@ -133,20 +116,6 @@ class CardiacTorso(Phantom):
     def shapes(self) -> Sequence[Shape]:
         """Body, lungs, liver, spine, atria, right ventricle, left ventricle with its defect."""
         return [*self._trunk(), *self._heart()]
-
-    def _require_in_body(self) -> None:
-        """Raise `InputError` if an organ reaches out of the body, as seen at points of it."""
-        body, *organs = self.shapes
-        for i, organ in enumerate(organs):
-            points = next(points_inside(Layer(organ, organ.pose, 0.0))) - body.pose[:3, 3:]
-            if np.any(body.distance(points) > 0):
-                settings = (
-                    f"body radii of {self.body_radii[0]:g} and {self.body_radii[1]:g} mm"
-                    if i < _TRUNK
-                    else f"ventricle length of {self.ventricle_length:g} mm, wall of {self.wall:g} mm and end diastolic "
-                    f"volume of {self.end_diastolic_volume:g} mL"
-                )
-                raise InputError(f"{self.title}: {settings}: the {organ.name} reaches out of the body")
 
     @property
     def _contraction(self) -> float:

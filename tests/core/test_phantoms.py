@@ -298,7 +298,7 @@ def test_files_that_are_no_text_are_refused(tmp_path):
         mph.read_phantom(tmp_path / "b.toml")
     with pytest.raises(mph.InputError, match=r"ending in \.toml"):
         mph.write_phantom(PAINTING, tmp_path / "a.yaml")
-    with pytest.raises(mph.InputError, match="expected a phantom, got int"):
+    with pytest.raises(mph.InputError, match="expected a Phantom, got int"):
         mph.write_phantom(3, tmp_path / "a.toml")
 
 

@@ -361,7 +361,7 @@ def test_files_that_are_no_text_are_refused(tmp_path):
         (lambda: PAINTING.line_integrals(np.zeros((2, 3)), np.zeros((3, 3))), "2 sources but 3 targets"),
         (lambda: PAINTING.line_integrals(np.zeros((2, 2)), np.zeros((2, 3))), "sources: expected shape"),
         (lambda: PAINTING.line_integrals([[0, 0, 0], [0]], np.zeros((2, 3))), "sources: expected real numbers"),
-        (lambda: PAINTING.project(None), "project: expected Views, got NoneType"),
+        (lambda: PAINTING.project(None), "project: expected a Views, got NoneType"),
         (lambda: mph.Cylinder(radius=[[1], [2, 3]], height=1, mu=1), "radius: expected real numbers"),
         (lambda: mph.Sphere(radius=1, mu=1, cut=[[1, 0, 0], [0]]), "cut: expected real numbers"),
         (lambda: mph.random_pose(1, box=[[1], [2, 3]]), "box of random poses: expected real numbers"),

@@ -167,7 +167,8 @@ def _run(arguments: argparse.Namespace) -> None:
     voxels = whole_shape(one_or_three(arguments.voxels), "--voxels", 3)
     fitted = (max(state.extent for state in states) + max(box)) / max(1, min(voxels) - 2)
     grid = Grid.centered(voxels, one_or_three(arguments.spacing or [fitted]), arguments.position)
-    pose = euler_pose(*np.deg2rad(arguments.euler), arguments.position)
+    phi, theta, psi = np.deg2rad(arguments.euler)
+    pose = euler_pose(phi, theta, psi, arguments.position)
     rng = None if arguments.random is None else np.random.default_rng(arguments.random)
     n_files, written = arguments.count * len(states), []
     for index in range(n_files):

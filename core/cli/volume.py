@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import json
+from typing import Any
 
 import numpy as np
 
@@ -20,7 +21,10 @@ from ..volumes.volume import UNITS, Volume
 from ..volumes.volume_files import VOLUME_FORMATS, read_volume, write_volume
 from .options import add_command, output_path, photon_energy, progress_bar
 
-_MESH_UNIT = {"choices": tuple(MILLIMETRES), "help": "of the mesh files' lengths; default: mm, of .glb m"}
+_MESH_UNIT: dict[str, Any] = {
+    "choices": tuple(MILLIMETRES),
+    "help": "of the mesh files' lengths; default: mm, of .glb m",
+}
 
 
 def add_parser(subparsers) -> None:  # type: ignore[no-untyped-def]

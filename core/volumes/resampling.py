@@ -38,11 +38,6 @@ def resample(
         Value outside the old grid. Default: 0, or -1000 for CT numbers.
     progress
         Called as ``progress(done, total)`` between slabs; may raise `Cancelled`.
-
-    Raises
-    ------
-    InputError
-        Not a volume or a grid, an unknown method, or the new volume does not fit into memory.
     """
     if method not in ("linear", "nearest", "mean"):
         raise InputError(f"method {method!r}: expected linear, nearest or mean")
@@ -52,15 +47,11 @@ def resample(
     require(4.5 * grid.n_voxels, "a volume of {} x {} x {} voxels".format(*grid.shape))
     index_from_index = volume.grid.index_from_world @ grid.affine  # index in the old grid from index in the new one
     result = np.empty(grid.shape, np.float32)
-    fill = _along_axes if _is_parallel(index_from_index) else _at_points
+    along = np.abs(index_from_index[:3, :3]) > _PARALLEL
+    is_parallel = (along.sum(axis=0) == 1).all() and (along.sum(axis=1) == 1).all()  # each new axis to one old axis
+    fill = _along_axes if is_parallel else _at_points
     fill(volume.array, background, index_from_index, method, result, progress or (lambda done, total: None))
     return Volume(freeze(result), grid, volume.quantity)
-
-
-def _is_parallel(index_from_index: NDArray[np.float64]) -> bool:
-    """Whether each new axis runs along one old axis."""
-    along = np.abs(index_from_index[:3, :3]) > _PARALLEL
-    return bool((along.sum(axis=0) == 1).all() and (along.sum(axis=1) == 1).all())
 
 
 def _along_axes(

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -41,7 +40,7 @@ def read(path: Path) -> Contents:
         if unit not in _ANALYZE_MILLIMETRES:
             raise InputError(f"vox_units {unit!r}: expected mm, cm, m or um")
         affine[:3] *= _ANALYZE_MILLIMETRES[unit]
-        return Contents(_values(image), affine)
+        return Contents(image.get_fdata(dtype=np.float32, caching="unchanged"), affine)
     if header["qform_code"] == header["sform_code"] == 0:
         warn(path, "it does not say where the patient lies: taken as centred, x from right to left")
     elif header["qform_code"] > 0 and header["sform_code"] > 0:
@@ -52,7 +51,12 @@ def read(path: Path) -> Contents:
             warn(path, f"its sform and qform lie up to {apart:.3g} voxels apart: taken by the sform")
     affine[:3] *= _MILLIMETRES[header.get_xyzt_units()[0]]
     named = header.get_intent()[2]
-    return Contents(_values(image), affine, named if named in UNITS else None, _unit(header))
+    try:
+        unit = json.loads(bytes(header["descrip"].item()).decode()).get("unit")  # as `write` left it
+    except (ValueError, AttributeError):
+        unit = None
+    values = image.get_fdata(dtype=np.float32, caching="unchanged")
+    return Contents(values, affine, named if named in UNITS else None, unit)
 
 
 def write(volume: Volume, path: Path) -> None:
@@ -64,15 +68,3 @@ def write(volume: Volume, path: Path) -> None:
     image.header.set_intent("none", name=volume.quantity)
     image.header["descrip"] = json.dumps({"quantity": volume.quantity, "unit": volume.unit}).encode()[:79]
     nibabel.save(image, path)
-
-
-def _values(image: Any) -> Any:
-    return np.ascontiguousarray(image.get_fdata(dtype=np.float32, caching="unchanged"))
-
-
-def _unit(header: Any) -> str | None:
-    """The unit in a description that `write` left."""
-    try:
-        return json.loads(bytes(header["descrip"].item()).decode()).get("unit")
-    except (ValueError, AttributeError):
-        return None

@@ -21,7 +21,7 @@ from ...errors import InputError
 from ...geometry.grid import Grid
 from ...memory import require
 from ...progress import Progress
-from ...validation import freeze, real_array
+from ...validation import freeze, instance, one_for_all
 from ..volume import Volume
 from .mesh import Mesh, as_mesh, require_closed
 
@@ -61,13 +61,12 @@ def voxelize_mesh(
     InputError
         A mesh is open or its faces look to different sides (with the place), or it is not a mesh.
     """
-    if not isinstance(grid, Grid):
-        raise InputError(f"voxelize_mesh: expected a Grid, got {type(grid).__name__}")
+    instance(grid, Grid, "voxelize_mesh")
     several = isinstance(mesh, Sequence) and not isinstance(mesh, str) and not _is_pair(mesh)
     meshes = [as_mesh(one) for one in (mesh if several else [mesh])]
     if not meshes:
         raise InputError("voxelize_mesh: expected at least one mesh")
-    values = real_array(np.broadcast_to(value, len(meshes)) if np.ndim(value) == 0 else value, "value", (len(meshes),))
+    values = one_for_all(value, "value", len(meshes))
     require(8.5 * grid.n_voxels, "a volume of {} x {} x {} voxels".format(*grid.shape))
     array = np.zeros(grid.shape, np.float32)
     for i, (one, inside) in enumerate(zip(meshes, values, strict=True)):
@@ -199,11 +198,10 @@ def _winding(surface: NDArray[np.float64], shape: tuple[int, int, int]) -> NDArr
         tip = pieces[:, 0]
         for i in range(1, pieces.shape[1] - 1):  # a fan of triangles
             left, right = pieces[:, i] - tip, pieces[:, i + 1] - tip
-            seen_along_z = (
-                left[:, 0] * right[:, 1] - left[:, 1] * right[:, 0]
-            ) / 2  # positive or negative, by its side
-            area += seen_along_z
-            moment += seen_along_z * (tip[:, 2] + (left[:, 2] + right[:, 2]) / 3)
+            # As seen along z: positive or negative, by its side.
+            part = (left[:, 0] * right[:, 1] - left[:, 1] * right[:, 0]) / 2
+            area += part
+            moment += part * (tip[:, 2] + (left[:, 2] + right[:, 2]) / 3)
         own = area * (cells[:, 2] + 1) - moment
         voxel = (cells[:, 0] * n_y + cells[:, 1]) * (n_z + 1) + cells[:, 2]
         np.add.at(steps, voxel, own)

@@ -145,11 +145,8 @@ def _require_fitting(arguments: argparse.Namespace, is_text: bool) -> None:
     if "frames" in arguments:
         refuse(arguments, (f"{_DEST}phase",), "has no effect with --frames, which takes phases evenly over the cycle")
     if is_text:
-        refuse(
-            arguments,
-            (*PLACING_OPTIONS, "quantity", "random", "frames", "json"),
-            f"is of voxels, but a .toml holds only the shapes; expected {', '.join(VOLUME_FORMATS)}",
-        )
+        why = f"is of voxels, but a .toml holds only the shapes; expected {', '.join(VOLUME_FORMATS)}"
+        refuse(arguments, (*PLACING_OPTIONS, "quantity", "random", "frames", "json"), why)
 
 
 def _run(arguments: argparse.Namespace) -> None:

@@ -54,22 +54,17 @@ class DerenzoRods(Shape):
             raise InputError(f"Derenzo sectors: expected a whole number of at least 2, got {self.sectors!r}")
         diameters = real_array(self.rod_diameters, "Derenzo rod diameters", (None,))
         if len(diameters) != self.sectors:
-            raise InputError(
-                f"Derenzo rod diameters: expected one for each of {self.sectors} sectors (0: empty), got {len(diameters)}"
-            )
+            expected = f"one for each of {self.sectors} sectors (0: empty)"
+            raise InputError(f"Derenzo rod diameters: expected {expected}, got {len(diameters)}")
         if np.any(diameters < 0):
             raise InputError(f"Derenzo rod diameters: expected 0 or more mm, got {diameters.min():g}")
         self._set("rod_diameters", tuple(diameters.tolist()))
-        rows = [rows for _, rows in self._rows]
+        rows, within = [rows for _, rows in self._rows], f"a radius of {self.radius:g} mm"
         if sum(n * (n + 1) // 2 for n in rows) > _MOST_RODS:
-            raise InputError(
-                f"Derenzo phantom: more than {_MOST_RODS} rods of {self.rod_diameters} mm in a radius of "
-                f"{self.radius:g} mm; choose thicker ones, or 0 for an empty sector"
-            )
+            many = f"more than {_MOST_RODS} rods of {self.rod_diameters} mm in {within}"
+            raise InputError(f"Derenzo phantom: {many}; choose thicker ones, or 0 for an empty sector")
         if not any(rows):
-            raise InputError(
-                f"Derenzo phantom: no rod of {self.rod_diameters} mm fits into a radius of {self.radius:g} mm"
-            )
+            raise InputError(f"Derenzo phantom: no rod of {self.rod_diameters} mm fits into {within}")
         ends = np.linalg.norm(self.rods[:, 1:3], axis=1) + self.rods[:, 3] / 2
         outermost, half = float(ends.max()), self.height / 2
         volume = float(np.sum(np.pi / 4 * self.rods[:, 3] ** 2) * self.height)
@@ -209,10 +204,9 @@ class DerenzoPhantom(Phantom):
                     "Derenzo cylinder radius: expected more than 0 mm around a background or with a height"
                 )
         elif self.cylinder_radius < self.radius or self._water_height < self.height:
-            raise InputError(
-                f"Derenzo cylinder: expected a radius of {self.radius:g} mm and a height of {self.height:g} mm or more, "
-                f"got {self.cylinder_radius:g} and {self._water_height:g}"
-            )
+            expected = f"a radius of {self.radius:g} mm and a height of {self.height:g} mm or more"
+            found = f"{self.cylinder_radius:g} and {self._water_height:g}"
+            raise InputError(f"Derenzo cylinder: expected {expected}, got {found}")
 
     @cached_property
     def shapes(self) -> Sequence[Shape]:

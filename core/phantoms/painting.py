@@ -352,7 +352,7 @@ def line_integrals(layers: Sequence[Layer], starts: Points, ends: Points) -> Poi
 def _integrals_of_block(layers: Sequence[Layer], starts: Points, ends: Points) -> Points:
     """Of lines (3, N). Each line's pieces between the surfaces that it crosses are painted in the layers' order."""
     directions = ends - starts
-    pieces = []
+    pieces: list[tuple[Any, ...]] = []
     for layer in layers:
         linear = layer.from_world[:3, :3]
         enter, leave = layer.shape.intervals(_moved(layer.from_world, starts), linear @ directions)
@@ -362,10 +362,10 @@ def _integrals_of_block(layers: Sequence[Layer], starts: Points, ends: Points) -
         pieces.append((ray, enter[ray, part], leave[ray, part], *content))
     if not pieces:
         return np.zeros(starts.shape[1])
-    ray, enter, leave, value, add = map(np.concatenate, zip(*pieces, strict=True))
-    order = np.argsort(ray, kind="stable")  # keeps the layers' order in each ray
-    ray, enter, leave, value, add = (column[order] for column in (ray, enter, leave, value, add))
-    counts = np.bincount(ray, minlength=starts.shape[1])
+    columns = [np.concatenate(column) for column in zip(*pieces, strict=True)]
+    order = np.argsort(columns[0], kind="stable")  # keeps the layers' order in each ray
+    rays, enters, leaves, value, add = (column[order] for column in columns)
+    counts = np.bincount(rays, minlength=starts.shape[1])
     firsts = np.cumsum(counts) - counts
     integrals = np.zeros(starts.shape[1])
     # Lines of about as many parts together, up to a power of 2, padded with empty ones.
@@ -375,7 +375,7 @@ def _integrals_of_block(layers: Sequence[Layer], starts: Points, ends: Points) -
         number = np.arange(most)
         there = number < counts[some, None]
         index = np.where(there, firsts[some, None] + number, 0)
-        low, high = np.where(there, enter[index], 0.0), np.where(there, leave[index], 0.0)
+        low, high = np.where(there, enters[index], 0.0), np.where(there, leaves[index], 0.0)
         edges = np.sort(np.concatenate([low, high], axis=1), axis=1)
         middles = (edges[:, :-1] + edges[:, 1:]) / 2
         painted = np.zeros_like(middles)

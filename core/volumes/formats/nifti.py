@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 from pathlib import Path
 
@@ -36,10 +37,10 @@ def read(path: Path) -> Contents:
     affine, header = np.array(image.affine, np.float64), image.header
     if not isinstance(image, nibabel.Nifti1Pair):
         warn(path, "Analyze files do not say where the patient lies: taken as centred, x from right to left")
-        unit = bytes(header["vox_units"].item()).decode("latin-1").strip("\0 ").lower()
-        if unit not in _ANALYZE_MILLIMETRES:
-            raise InputError(f"vox_units {unit!r}: expected mm, cm, m or um")
-        affine[:3] *= _ANALYZE_MILLIMETRES[unit]
+        length = bytes(header["vox_units"].item()).decode("latin-1").strip("\0 ").lower()
+        if length not in _ANALYZE_MILLIMETRES:
+            raise InputError(f"vox_units {length!r}: expected mm, cm, m or um")
+        affine[:3] *= _ANALYZE_MILLIMETRES[length]
         return Contents(image.get_fdata(dtype=np.float32, caching="unchanged"), affine)
     if header["qform_code"] == header["sform_code"] == 0:
         warn(path, "it does not say where the patient lies: taken as centred, x from right to left")
@@ -51,10 +52,9 @@ def read(path: Path) -> Contents:
             warn(path, f"its sform and qform lie up to {apart:.3g} voxels apart: taken by the sform")
     affine[:3] *= _MILLIMETRES[header.get_xyzt_units()[0]]
     named = header.get_intent()[2]
-    try:
-        unit = json.loads(bytes(header["descrip"].item()).decode()).get("unit")  # as `write` left it
-    except (ValueError, AttributeError):
-        unit = None
+    unit: str | None = None
+    with contextlib.suppress(ValueError, AttributeError):  # as `write` left it
+        unit = json.loads(bytes(header["descrip"].item()).decode()).get("unit")
     values = image.get_fdata(dtype=np.float32, caching="unchanged")
     return Contents(values, affine, named if named in UNITS else None, unit)
 

@@ -8,11 +8,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from ...errors import InputError
 from ...files import replacing
-from ...geometry.frames import checked_affine
 from ...validation import freeze, real_array
 from ..formats.contents import first_line
 
@@ -54,11 +53,6 @@ class Mesh:
         # About the mesh's middle: far from the origin no digits are lost.
         a, b, c = ((self.vertices - self.vertices.mean(axis=0))[self.faces[:, i]] for i in range(3))
         return float(np.einsum("ij,ij->", a, np.cross(b, c)) / 6)
-
-    def transformed(self, pose: ArrayLike) -> Mesh:
-        """The mesh after an affine world-from-mesh transform (4, 4)."""
-        matrix = checked_affine(pose, "pose")
-        return Mesh(self.vertices @ matrix[:3, :3].T + matrix[:3, 3], self.faces)
 
 
 def read_mesh(path: str | os.PathLike[str], unit: str | None = None) -> Mesh:

@@ -40,29 +40,28 @@ def voxelize_mesh(
     quantity: str = "activity",
     progress: Progress | None = None,
 ) -> Volume:
-    """A volume filled by one closed mesh or by several.
+    """A volume filled by one closed mesh or by several; parts outside the grid are cut off.
 
     Parameters
     ----------
     mesh
         A `Mesh`, a trimesh mesh or scene, ``(vertices (V, 3), faces (F, 3))`` in world mm, or the path of a file (see
-        `read_mesh`); or a list of these, in which later ones replace what they cover of earlier ones.
+        `read_mesh`); or a list of these, in which later ones replace what they cover of earlier ones. `InputError` says
+        where a mesh is open or its faces look to different sides.
     grid
-        Where the voxels are; any affine. Parts of the mesh outside it are cut off.
+        Where the voxels are; any affine.
     value
         Inside, in the quantity's unit: one number, or one for each mesh. Outside, the volume is 0.
     quantity
         What the values are.
     progress
         Called as ``progress(done, total)``; may raise `Cancelled`.
-
-    Raises
-    ------
-    InputError
-        A mesh is open or its faces look to different sides (with the place), or it is not a mesh.
     """
     instance(grid, Grid, "voxelize_mesh")
-    several = isinstance(mesh, Sequence) and not isinstance(mesh, str) and not _is_pair(mesh)
+    several = isinstance(mesh, Sequence) and not isinstance(mesh, str)
+    if several and len(mesh) == 2:  # meshes, or vertices and faces
+        several = any(isinstance(part, str | os.PathLike | Mesh) or hasattr(part, "faces") for part in mesh)
+        several = several or np.ndim(mesh[0]) != 2
     meshes = [as_mesh(one) for one in (mesh if several else [mesh])]
     if not meshes:
         raise InputError("voxelize_mesh: expected at least one mesh")
@@ -272,10 +271,3 @@ def _clip(pieces: NDArray[np.float64], axis: int, plane: ArrayLike, side: int) -
     spare = np.arange(width) >= count
     last = result[np.arange(n), np.maximum(count[:, 0] - 1, 0)]
     return np.where(spare[:, :, None], last[:, None], result)
-
-
-def _is_pair(given: Sequence[Any]) -> bool:
-    """Whether `given` is (vertices, faces) and not a list of meshes."""
-    if len(given) != 2 or any(isinstance(part, str | os.PathLike | Mesh) or hasattr(part, "faces") for part in given):
-        return False
-    return np.ndim(given[0]) == 2

@@ -147,10 +147,10 @@ class DerenzoRods(Shape):
         return np.maximum(distance, np.abs(z) - kind(self.height / 2))
 
     def _intervals(self, starts: Points, directions: Points) -> Interval:
-        parts = []
-        for _, x, y, w in self.rods:
-            rod = Cylinder(radius=w / 2, height=self.height, activity=0.0)
-            parts.append(rod.intervals(starts - np.array([[x], [y], [0.0]]), directions))
+        parts = [
+            Cylinder(radius=w / 2, height=self.height, activity=0.0).intervals(starts - [[x], [y], [0.0]], directions)
+            for _, x, y, w in self.rods
+        ]
         enter, leave = zip(*parts, strict=True)
         return np.concatenate(enter), np.concatenate(leave)
 

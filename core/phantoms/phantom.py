@@ -158,13 +158,10 @@ class Phantom:
 
     def _changes(self, quantity: str) -> list[float]:
         """`mean_changes` of the shapes that hold the quantity; any pose leaves them as they are."""
-        if quantity not in self._known_changes:
-            self._known_changes[quantity] = mean_changes(self._layers(quantity))
-        return self._known_changes[quantity]
-
-    @cached_property
-    def _known_changes(self) -> dict[str, list[float]]:
-        return {}
+        known: dict[str, list[float]] = vars(self).setdefault("_known_changes", {})
+        if quantity not in known:
+            known[quantity] = mean_changes(self._layers(quantity))
+        return known[quantity]
 
     def _layers(self, quantity: str, pose: ArrayLike | None = None) -> list[Layer]:
         """The shapes that have the quantity, placed in the world."""

@@ -15,10 +15,7 @@ from .volume import Volume, outside_value
 
 
 def crop(volume: Volume, start: ArrayLike, stop: ArrayLike) -> Volume:
-    """The part from index `start` (3,) up to, but without, `stop` (3,); its place in the world stays the same.
-
-    `InputError` if the part is empty or reaches beyond the grid.
-    """
+    """The part from index `start` (3,) up to, but without, `stop` (3,); its place in the world stays the same."""
     instance(volume, Volume, "crop")
     low, high = _indices(start, "crop start"), _indices(stop, "crop stop")
     shape = np.array(volume.grid.shape)
@@ -30,10 +27,7 @@ def crop(volume: Volume, start: ArrayLike, stop: ArrayLike) -> Volume:
 
 
 def crop_to_box(volume: Volume, low: ArrayLike, high: ArrayLike) -> Volume:
-    """The smallest part that holds all of the volume inside the box from `low` (3,) to `high` (3,), world mm.
-
-    `InputError` if the box is empty or does not meet the volume.
-    """
+    """The smallest part that holds all of the volume inside the box from `low` (3,) to `high` (3,), world mm."""
     instance(volume, Volume, "crop_to_box")
     low, high = real_array(low, "box", (3,)), real_array(high, "box", (3,))
     if np.any(low >= high):

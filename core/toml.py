@@ -13,17 +13,24 @@ from .errors import InputError
 
 
 def read_toml(path: str | os.PathLike[str]) -> dict[str, Any]:
-    """What a TOML file holds."""
+    """What a TOML file holds; `InputError` if it cannot be read or is not TOML."""
     try:
-        return tomllib.loads(Path(path).read_text(encoding="utf-8-sig"))
-    except tomllib.TOMLDecodeError as error:
-        raise InputError(f"{path}: not TOML: {error}") from None
+        text = Path(path).read_text(encoding="utf-8-sig")
     except UnicodeDecodeError:
         raise InputError(f"{path}: expected TOML, a text in UTF-8") from None
-    except RecursionError:
-        raise InputError(f"{path}: its lists are nested too deeply") from None
     except (OSError, ValueError) as error:  # an impossible path is a ValueError
         raise InputError(f"{path}: {getattr(error, 'strerror', None) or error}") from None
+    return parse_toml(text, str(path))
+
+
+def parse_toml(text: str, name: str) -> dict[str, Any]:
+    """What a text in TOML holds; `InputError`, which calls the text `name`, if it is not TOML."""
+    try:
+        return tomllib.loads(text)
+    except tomllib.TOMLDecodeError as error:
+        raise InputError(f"{name}: not TOML: {error}") from None
+    except RecursionError:
+        raise InputError(f"{name}: its lists are nested too deeply") from None
 
 
 def toml_value(value: Any) -> str:

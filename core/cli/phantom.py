@@ -7,11 +7,9 @@ import dataclasses
 import json
 from collections.abc import Callable
 from functools import partial
-from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..errors import InputError
 from ..geometry.frames import euler_pose
@@ -23,7 +21,7 @@ from ..phantoms.phantom import QUANTITIES, Phantom, ShapePhantom
 from ..phantoms.random import random_pose
 from ..phantoms.shapes import Box, Cylinder, Ellipsoid, Sphere
 from ..validation import whole_shape
-from ..volumes.volume import UNITS, Volume
+from ..volumes.volume import UNITS
 from ..volumes.volume_files import VOLUME_FORMATS, write_volume
 from .options import (
     PLACING_OPTIONS,
@@ -38,7 +36,6 @@ from .options import (
 )
 
 _DEST = "of_phantom_"  # before the name of a phantom's setting: the voxels have a spacing, too
-Make = Callable[[argparse.Namespace], Phantom]
 
 # Single shapes: class, how many numbers (mm) each of its dimensions takes, and an example.
 _SHAPES = (
@@ -59,16 +56,14 @@ def add_parser(subparsers) -> None:  # type: ignore[no-untyped-def]
 
     for kind in KINDS:
         parser = add(kind.name, f"make {kind.summary}", kind.example)
-        if kind.phantom is DerenzoPhantom:  # with the options that `mphdrr project` has for it
+        if kind.phantom is DerenzoPhantom:  # its rods and water have options of their own
             add_phantom_options(parser)
             _add_output(parser, _derenzo)
             continue
         _add_settings(parser, kind.phantom)
         if hasattr(kind.phantom, "beating"):
-            parser.add_argument(
-                "--frames", type=int, default=argparse.SUPPRESS, metavar="N",
-                help="states of the heart's cycle instead of one --phase, as FILE-1, FILE-2 …",
-            )  # fmt: skip
+            states = "states of the heart's cycle instead of one --phase, as FILE-1, FILE-2 …"
+            parser.add_argument("--frames", type=int, default=argparse.SUPPRESS, metavar="N", help=states)
         add_placing_options(parser)
         _add_output(parser, partial(_of_kind, kind.phantom))
     for shape, dimensions, example in _SHAPES:
@@ -79,28 +74,11 @@ def add_parser(subparsers) -> None:  # type: ignore[no-untyped-def]
         parser.add_argument("--mu", type=float, default=0.0, metavar="1/mm", help="attenuation coefficient")
         add_placing_options(parser)
         _add_output(parser, partial(_of_shape, shape, list(dimensions)))
-    file = add_command(
-        kinds, "file", "make the phantom that a TOML file describes", "mphdrr phantom file thorax.toml -o thorax.nii.gz"
-    )
+    example = "mphdrr phantom file thorax.toml -o thorax.nii.gz"
+    file = add_command(kinds, "file", "make the phantom that a TOML file describes", example)
     file.add_argument("file", metavar="TOML", help="shapes in the order of painting, see docs/phantoms.md")
     add_placing_options(file)
     _add_output(file, lambda arguments: read_phantom(arguments.file))
-
-
-def chosen_phantom(arguments: argparse.Namespace, path: str | None) -> tuple[Phantom, dict[str, Any]]:
-    """The phantom of a TOML file or, without one, of `add_phantom_options`; and a record of what it was made from."""
-    place = {"position_mm": list(arguments.position), "euler_degrees": list(arguments.euler)}
-    if path is None:
-        derenzo = _derenzo(arguments)
-        return derenzo, {"phantom": {"kind": "derenzo", **dataclasses.asdict(derenzo)}, **place}
-    phantom = read_phantom(path)
-    return phantom, {"phantom": {"kind": "file", "file": Path(path).name, "name": phantom.name}, **place}
-
-
-def placed_volume(phantom: Phantom, arguments: argparse.Namespace, quantity: str) -> Volume:
-    """The phantom on the grid and at the place of `add_placing_options`."""
-    grid, pose = _grid(phantom, arguments), _pose(arguments)
-    return phantom.voxelize(grid, pose, progress_bar("voxelizing"), quantity)
 
 
 def _derenzo(arguments: argparse.Namespace) -> DerenzoPhantom:
@@ -140,33 +118,17 @@ def _add_settings(parser: argparse.ArgumentParser, kind: Any) -> None:
         parser.add_argument("--" + (known.get("option") or field.name.replace("_", "-")), **option)
 
 
-def _add_output(parser: argparse.ArgumentParser, make: Make) -> None:
-    parser.add_argument("--quantity", choices=QUANTITIES, default="activity", help="what the voxels hold")
-    parser.add_argument("--random", type=int, metavar="SEED", help="draw position and Euler angles at random")
-    parser.add_argument(
-        "--box", type=float, nargs="+", default=[0], metavar="MM",
-        help="with --random: sides of the box around --position in which the middle is drawn",
-    )  # fmt: skip
-    parser.add_argument(
-        "--count", type=int, default=1, metavar="N", help="with --random: how many, as FILE-1, FILE-2 …"
-    )
-    parser.add_argument("--json", action="store_true", help="print what was written, with the poses, as JSON")
-    parser.add_argument(
-        "-o", "--output", required=True, metavar="FILE", help=f"{', '.join(VOLUME_FORMATS)}; .toml writes the shapes"
-    )
+def _add_output(parser: argparse.ArgumentParser, make: Callable[[argparse.Namespace], Phantom]) -> None:
+    add = parser.add_argument
+    add("--quantity", choices=QUANTITIES, default="activity", help="what the voxels hold")
+    add("--random", type=int, metavar="SEED", help="draw position and Euler angles at random")
+    box = "with --random: sides of the box around --position in which the middle is drawn"
+    add("--box", type=float, nargs="+", default=[0], metavar="MM", help=box)
+    add("--count", type=int, default=1, metavar="N", help="with --random: how many, as FILE-1, FILE-2 …")
+    add("--json", action="store_true", help="print what was written, with the poses, as JSON")
+    formats = f"{', '.join(VOLUME_FORMATS)}; .toml writes the shapes"
+    add("-o", "--output", required=True, metavar="FILE", help=formats)
     parser.set_defaults(run=_run, make=make)
-
-
-def _pose(arguments: argparse.Namespace) -> NDArray[np.float64]:
-    phi, theta, psi = np.deg2rad(arguments.euler)
-    return euler_pose(phi, theta, psi, arguments.position)
-
-
-def _grid(phantom: Phantom, arguments: argparse.Namespace, room: float = 0.0) -> Grid:
-    """The grid asked for; by default it holds the phantom however it is turned, and moved by up to `room` / 2 mm."""
-    voxels = whole_shape(one_or_three(arguments.voxels), "--voxels", 3)
-    fitted = (phantom.extent + room) / max(1, min(voxels) - 2)
-    return Grid.centered(voxels, one_or_three(arguments.spacing or [fitted]), arguments.position)
 
 
 def _require_fitting(arguments: argparse.Namespace, is_text: bool) -> None:
@@ -183,11 +145,8 @@ def _require_fitting(arguments: argparse.Namespace, is_text: bool) -> None:
     if "frames" in arguments:
         refuse(arguments, (f"{_DEST}phase",), "has no effect with --frames, which takes phases evenly over the cycle")
     if is_text:
-        refuse(
-            arguments,
-            (*PLACING_OPTIONS, "quantity", "random", "frames", "json"),
-            f"is of voxels, but a .toml holds only the shapes; expected {', '.join(VOLUME_FORMATS)}",
-        )
+        why = f"is of voxels, but a .toml holds only the shapes; expected {', '.join(VOLUME_FORMATS)}"
+        refuse(arguments, (*PLACING_OPTIONS, "quantity", "random", "frames", "json"), why)
 
 
 def _run(arguments: argparse.Namespace) -> None:
@@ -201,13 +160,18 @@ def _run(arguments: argparse.Namespace) -> None:
         return
     states = phantom.beating(arguments.frames) if "frames" in arguments else [phantom]
     box = one_or_three(arguments.box)
-    grid = _grid(max(states, key=lambda state: state.extent), arguments, room=max(box))
+    # By default the grid holds the phantom however it is turned, and moved within the box.
+    voxels = whole_shape(one_or_three(arguments.voxels), "--voxels", 3)
+    fitted = (max(state.extent for state in states) + max(box)) / max(1, min(voxels) - 2)
+    grid = Grid.centered(voxels, one_or_three(arguments.spacing or [fitted]), arguments.position)
+    phi, theta, psi = np.deg2rad(arguments.euler)
+    pose = euler_pose(phi, theta, psi, arguments.position)
     rng = None if arguments.random is None else np.random.default_rng(arguments.random)
     n_files, written = arguments.count * len(states), []
     for index in range(n_files):
         state = states[index % len(states)]
-        if state is states[0]:  # the other states take the same pose
-            pose = _pose(arguments) if rng is None else random_pose(rng, box, arguments.position)
+        if rng is not None and state is states[0]:  # the other states take the same pose
+            pose = random_pose(rng, box, arguments.position)
         volume = state.voxelize(grid, pose, progress_bar("voxelizing"), quantity=arguments.quantity)
         file = numbered_path(path, index + 1, n_files)
         write_volume(volume, file)

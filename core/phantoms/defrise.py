@@ -21,19 +21,7 @@ class DefrisePhantom(Phantom):
 
     After M. Defrise et al., "A solution to the long-object problem in helical cone-beam tomography", Physics in Medicine
     and Biology 45 (2000) 623-643. By default it fills a ball of 75 mm radius.
-
-    Attributes
-    ----------
-    disks : int
-        How many.
-    disk_radius, disk_thickness, spacing : float
-        mm; the spacing is from middle to middle.
-    margin : float
-        Of water around the disks, mm; 0 for disks without water.
-    activity, background : float
-        Of the disks and of the water, kBq/mL.
-    mu : float
-        Of all of it, 1/mm.
+    The fields say what each setting is, and its unit.
     """
 
     disks: int = count(7, "how many")

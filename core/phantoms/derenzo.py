@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -35,16 +36,8 @@ class DerenzoRods(Shape):
     0.1 R are dropped and the rows counted again. Sector 0 points along -y; sector k of S is turned by 360 k / S degrees,
     counter-clockwise as seen from +z. With more than 6 sectors, a row holds as many rods as its sector has room for.
 
-    Attributes
-    ----------
-    radius : float
-        R, mm.
-    rod_diameters : tuple of floats
-        w of each sector, mm; 0 leaves a sector empty.
-    height : float
-        Length of the rods, mm, centred on z = 0.
-    sectors : int
-        S, 2 or more: how many diameters are expected.
+    `radius` is R, `rod_diameters` is w of each sector (0 leaves it empty), `height` the length of the rods, centred on
+    z = 0, all mm; `sectors` is S, 2 or more.
     """
 
     radius: float
@@ -61,26 +54,21 @@ class DerenzoRods(Shape):
             raise InputError(f"Derenzo sectors: expected a whole number of at least 2, got {self.sectors!r}")
         diameters = real_array(self.rod_diameters, "Derenzo rod diameters", (None,))
         if len(diameters) != self.sectors:
-            raise InputError(
-                f"Derenzo rod diameters: expected one for each of {self.sectors} sectors (0: empty), got {len(diameters)}"
-            )
+            expected = f"one for each of {self.sectors} sectors (0: empty)"
+            raise InputError(f"Derenzo rod diameters: expected {expected}, got {len(diameters)}")
         if np.any(diameters < 0):
             raise InputError(f"Derenzo rod diameters: expected 0 or more mm, got {diameters.min():g}")
         self._set("rod_diameters", tuple(diameters.tolist()))
-        rows = [rows for _, rows in self._rows]
+        rows, within = [rows for _, rows in self._rows], f"a radius of {self.radius:g} mm"
         if sum(n * (n + 1) // 2 for n in rows) > _MOST_RODS:
-            raise InputError(
-                f"Derenzo phantom: more than {_MOST_RODS} rods of {self.rod_diameters} mm in a radius of "
-                f"{self.radius:g} mm; choose thicker ones, or 0 for an empty sector"
-            )
+            many = f"more than {_MOST_RODS} rods of {self.rod_diameters} mm in {within}"
+            raise InputError(f"Derenzo phantom: {many}; choose thicker ones, or 0 for an empty sector")
         if not any(rows):
-            raise InputError(
-                f"Derenzo phantom: no rod of {self.rod_diameters} mm fits into a radius of {self.radius:g} mm"
-            )
-
-    def empty_sectors(self) -> list[float]:
-        """Diameters, mm, of the sectors that have no room for any of their rods."""
-        return [w for w, (_, n) in zip(self.rod_diameters, self._rows, strict=True) if w > 0 and n == 0]
+            raise InputError(f"Derenzo phantom: no rod of {self.rod_diameters} mm fits into {within}")
+        ends = np.linalg.norm(self.rods[:, 1:3], axis=1) + self.rods[:, 3] / 2
+        outermost, half = float(ends.max()), self.height / 2
+        volume = float(np.sum(np.pi / 4 * self.rods[:, 3] ** 2) * self.height)
+        self._set_size((outermost, outermost, half), math.hypot(outermost, half), volume)
 
     @cached_property
     def rods(self) -> NDArray[np.float64]:
@@ -96,10 +84,6 @@ class DerenzoRods(Shape):
         return freeze(np.array(table))
 
     @property
-    def _volume(self) -> float:
-        return float(np.sum(np.pi / 4 * self.rods[:, 3] ** 2) * self.height)
-
-    @property
     def n_parts(self) -> int:
         """As of `Shape`: one for each rod."""
         return len(self.rods)
@@ -109,26 +93,15 @@ class DerenzoRods(Shape):
         """As of `Shape`."""
         return min(float(self.rods[:, 3].min()), self.height)
 
-    @property
-    def half_box(self) -> tuple[float, float, float]:
-        """As of `Shape`."""
-        return self._outermost, self._outermost, self.height / 2
-
-    @property
-    def _outermost(self) -> float:
-        """Distance, mm, from the axis to the rods' farthest point."""
-        return float(np.max(np.linalg.norm(self.rods[:, 1:3], axis=1) + self.rods[:, 3] / 2))
-
     @cached_property
     def _rows(self) -> list[tuple[float, int]]:
         """Margin, mm, and number of rows of each sector."""
         table = []
         for w in self.rod_diameters:
-            margin = _MARGIN * self.radius
-            rows = _count_rows(self.radius, margin, w)
-            if rows <= 1:
-                margin = 0.0
-                rows = _count_rows(self.radius, margin, w)
+            for margin in (_MARGIN * self.radius, 0.0):
+                rows = max(0, int((self.radius - 2 * margin - w) // (_ROW_STEP * w))) if w > 0 else 0
+                if rows > 1:
+                    break
             table.append((margin, rows))
         return table
 
@@ -174,54 +147,27 @@ class DerenzoRods(Shape):
         return np.maximum(distance, np.abs(z) - kind(self.height / 2))
 
     def _intervals(self, starts: Points, directions: Points) -> Interval:
-        parts = []
-        for _, x, y, w in self.rods:
-            rod = Cylinder(radius=w / 2, height=self.height, activity=0.0)
-            parts.append(rod.intervals(starts - np.array([[x], [y], [0.0]]), directions))
+        parts = [
+            Cylinder(radius=w / 2, height=self.height, activity=0.0).intervals(starts - [[x], [y], [0.0]], directions)
+            for _, x, y, w in self.rods
+        ]
         enter, leave = zip(*parts, strict=True)
         return np.concatenate(enter), np.concatenate(leave)
 
     def _surface(self) -> Surface:
-        half = self.height / 2
-        vertices, faces = [], []
-        for i, (_, x, y, w) in enumerate(self.rods):
-            rod, triangles = lathe(
-                np.array([0.0, 1.0, 1.0, 0.0]), np.array([-half, -half, half, half]), w / 2, w / 2, n_sides=24
-            )
-            vertices.append(rod + np.array([x, y, 0.0]))
-            faces.append(triangles + i * len(rod))
-        return np.concatenate(vertices), np.concatenate(faces).astype(np.int32)
+        radii, half = np.array([0.0, 0.5, 0.5, 0.0]), self.height / 2
+        rod, faces = lathe(radii, np.array([-half, -half, half, half]), 1.0, 1.0, n_sides=24)
+        _, x, y, w = self.rods.T[:, :, None]
+        vertices = np.stack([rod[:, 0] * w + x, rod[:, 1] * w + y, np.broadcast_to(rod[:, 2], (len(w), len(rod)))], -1)
+        shifted = faces + np.arange(len(w), dtype=np.int32)[:, None, None] * len(rod)
+        return vertices.reshape(-1, 3), shifted.reshape(-1, 3).astype(np.int32)
 
 
 @dataclass(frozen=True)
 class DerenzoPhantom(Phantom):
-    """Rods along z, centred on the origin, of one diameter in each sector; for their places see `DerenzoRods`.
+    """Rods along z, centred on the origin, of one diameter in each of `sectors`; for their places see `DerenzoRods`.
 
-    Attributes
-    ----------
-    radius : float
-        R, mm.
-    rod_diameters : tuple of floats
-        w of each sector, mm; 0 leaves a sector empty.
-    height : float
-        Length of the rods, mm, centred on z = 0.
-    activity : float
-        Activity concentration in the rods, kBq/mL; 0 for cold rods in active water.
-    sectors : int
-        How many; usually 6.
-    cylinder_radius : float
-        Of a cylinder of water around the rods, mm; 0 for rods alone.
-    cylinder_height : float
-        mm; 0 for the height of the rods.
-    background : float
-        Activity concentration in the water, kBq/mL.
-    mu : float
-        Of the rods and of the water, 1/mm; water's at 140.5 keV by default.
-
-    Raises
-    ------
-    InputError
-        A number is not finite or out of range, or no rod fits.
+    The fields say what each setting is, and its unit. `InputError` if no rod fits.
     """
 
     radius: float = setting(40.0, "mm", "of the phantom")
@@ -238,34 +184,29 @@ class DerenzoPhantom(Phantom):
 
     def __post_init__(self) -> None:
         for name in ("activity", "cylinder_radius", "cylinder_height", "background", "mu"):
-            value = float(real_array(getattr(self, name), f"Derenzo {name.replace('_', ' ')}", ()))
+            title = f"Derenzo {name.replace('_', ' ')}"
+            value = float(real_array(getattr(self, name), title, ()))
             if value < 0:
-                raise InputError(f"Derenzo {name.replace('_', ' ')}: expected 0 or more, got {value:g}")
+                raise InputError(f"{title}: expected 0 or more, got {value:g}")
             object.__setattr__(self, name, value)
         for name in ("radius", "rod_diameters", "height"):  # the rods check them
             object.__setattr__(self, name, getattr(self._rods, name))
         if self.activity == 0 and not (self.background and self.cylinder_radius):
-            raise InputError(
-                "Derenzo activity: expected more than 0 kBq/mL, or 0 in a cylinder with a background, got "
-                f"{self.activity:g}"
-            )
-        empty = [f"{w:g}" for w in self._rods.empty_sectors()]
+            expected = "more than 0 kBq/mL, or 0 in a cylinder with a background"
+            raise InputError(f"Derenzo activity: expected {expected}, got {self.activity:g}")
+        empty = [f"{w:g}" for w, (_, n) in zip(self.rod_diameters, self._rods._rows, strict=True) if w > 0 and n == 0]
         if empty:
-            warnings.warn(
-                f"no rod of {', '.join(empty)} mm fits into a radius of {self.radius:g} mm: such sectors stay empty",
-                InputWarning,
-                stacklevel=3,
-            )
+            text = f"no rod of {', '.join(empty)} mm fits into a radius of {self.radius:g} mm: such sectors stay empty"
+            warnings.warn(text, InputWarning, stacklevel=3)
         if not self.cylinder_radius:
             if self.background or self.cylinder_height:
                 raise InputError(
                     "Derenzo cylinder radius: expected more than 0 mm around a background or with a height"
                 )
         elif self.cylinder_radius < self.radius or self._water_height < self.height:
-            raise InputError(
-                f"Derenzo cylinder: expected a radius of {self.radius:g} mm and a height of {self.height:g} mm or more, "
-                f"got {self.cylinder_radius:g} and {self._water_height:g}"
-            )
+            expected = f"a radius of {self.radius:g} mm and a height of {self.height:g} mm or more"
+            found = f"{self.cylinder_radius:g} and {self._water_height:g}"
+            raise InputError(f"Derenzo cylinder: expected {expected}, got {found}")
 
     @cached_property
     def shapes(self) -> Sequence[Shape]:
@@ -296,7 +237,3 @@ class DerenzoPhantom(Phantom):
     @property
     def _water_height(self) -> float:
         return self.cylinder_height or self.height
-
-
-def _count_rows(radius: float, margin: float, w: float) -> int:
-    return max(0, int((radius - 2 * margin - w) // (_ROW_STEP * w))) if w > 0 else 0

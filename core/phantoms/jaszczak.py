@@ -23,23 +23,8 @@ class JaszczakPhantom(Phantom):
     88 mm high, their centres two diameters apart; spheres with their centres 127 mm above the base. The rods stand on the
     base (-z) in the pattern of `DerenzoRods`. The data sheet does not give the spheres' distance from the axis: here it is
     half the radius, and they lie 60 degrees apart, counter-clockwise from -y. The wall, 3.2 mm thick, is not modelled.
-
-    Attributes
-    ----------
-    radius, height : float
-        Of the cylinder, inside, mm.
-    rod_diameters, sphere_diameters : (6,)
-        mm; 0 leaves a sector or a sphere out.
-    rod_height, sphere_height : float
-        Length of the rods, and of the spheres' centres above the base, mm.
-    sphere_ring_radius : float
-        Of the spheres' centres from the axis, mm.
-    activity : float
-        Of the water, kBq/mL.
-    rod_activity, sphere_activity : float
-        kBq/mL; 0 for cold ones.
-    mu : float
-        Of the water, 1/mm. Cold rods and spheres are made of PMMA, others of water.
+    Cold rods and spheres are made of PMMA, others of water.
+    The fields say what each setting is, and its unit.
     """
 
     radius: float = setting(108.0, "mm", "of the cylinder, inside")

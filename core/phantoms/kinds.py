@@ -19,41 +19,19 @@ from .torso import CardiacTorso
 
 
 class Kind(NamedTuple):
-    """One kind of phantom.
+    """One kind of phantom."""
 
-    Attributes
-    ----------
-    name : str
-        On the command line.
-    phantom : type
-        Its class.
-    label : str
-        In menus.
-    summary : str
-        One line of help.
-    example : str
-        Options of an example on the command line.
-    usual : mapping
-        Settings with which Blender begins where they differ from the class's defaults.
-    """
-
-    name: str
-    phantom: Any
-    label: str
-    summary: str
-    example: str = ""
-    usual: Mapping[str, float] = MappingProxyType({})
+    name: str  # on the command line
+    phantom: Any  # its class
+    label: str  # in menus
+    summary: str  # one line of help
+    example: str = ""  # options on the command line
+    usual: Mapping[str, float] = MappingProxyType({})  # settings where Blender does not begin with the class's default
 
 
+_HOT = {"activity": 100.0}
 KINDS = (
-    Kind(
-        "derenzo",
-        DerenzoPhantom,
-        "Derenzo",
-        "a Derenzo phantom: six sectors of hot rods",
-        "--rods 8 6 5 4 3 2",
-        {"activity": 100.0},
-    ),
+    Kind("derenzo", DerenzoPhantom, "Derenzo", "a Derenzo phantom: sectors of hot rods", "--rods 8 6 5 4 3 2", _HOT),
     Kind(
         "nema", NemaBody, "NEMA Body", "the NEMA (IEC) body phantom: six spheres", "--sphere-activity 40 --voxels 200"
     ),

@@ -25,10 +25,9 @@ Keys are the attributes of the shapes; angles are degrees, ``euler_degrees = [ph
 from __future__ import annotations
 
 import dataclasses
-import json
 import math
 import os
-import tomllib
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
@@ -36,6 +35,8 @@ import numpy as np
 
 from ..errors import InputError
 from ..files import replacing
+from ..toml import parse_toml, read_toml, toml_value
+from ..validation import instance
 from .derenzo import DerenzoRods
 from .phantom import Phantom, ShapePhantom
 from .shapes import Box, Capsule, Cone, Cylinder, Ellipsoid, Shape, Sphere
@@ -45,65 +46,48 @@ SHAPES: dict[str, type[Shape]] = {
 }
 """The shapes by the names of their kinds."""
 
-_TOP = ("name", "mu_energy", "shape")
 _EULER = "euler_degrees"
 
 
 def read_phantom(path: str | os.PathLike[str]) -> ShapePhantom:
-    """The phantom that a TOML file describes; for an example see `core.phantoms.language`.
-
-    Raises
-    ------
-    InputError
-        The file cannot be read, is not TOML or has wrong entries; the message names file, shape and key.
-    """
-    path = Path(path)
-    try:
-        text = path.read_text(encoding="utf-8-sig")
-    except UnicodeDecodeError:
-        raise InputError(f"{path}: expected TOML, a text in UTF-8") from None
-    except (OSError, ValueError) as error:  # an impossible path is a ValueError
-        raise InputError(f"{path}: {getattr(error, 'strerror', None) or error}") from None
-    return parse_phantom(text, str(path))
+    """The phantom that a TOML file describes, see `core.phantoms.language`; `InputError` names file, shape and key."""
+    return _phantom(read_toml(path), str(path))
 
 
 def parse_phantom(text: str, name: str = "phantom") -> ShapePhantom:
     """The phantom that a text in TOML describes, see `read_phantom`; messages call the text `name`."""
-    try:
-        return _phantom(tomllib.loads(text))
-    except tomllib.TOMLDecodeError as error:
-        raise InputError(f"{name}: not TOML: {error}") from None
-    except RecursionError:
-        raise InputError(f"{name}: its lists are nested too deeply") from None
-    except InputError as error:
-        raise InputError(f"{name}: {error}") from None
+    return _phantom(parse_toml(text, name), name)
 
 
 def write_phantom(phantom: Phantom, path: str | os.PathLike[str]) -> None:
     """Write the shapes of any phantom as a .toml file; `read_phantom` gives the same shapes back."""
-    if not isinstance(phantom, Phantom):
-        raise InputError(f"write_phantom: expected a phantom, got {type(phantom).__name__}")
+    instance(phantom, Phantom, "write_phantom")
     path = Path(path)
     if path.suffix.lower() != ".toml":
         raise InputError(f"{path}: expected a name ending in .toml")
-    lines = [f"name = {_text(phantom.title)}", f"mu_energy = {_text(phantom.mu_energy)}"]
+    lines = [f"name = {toml_value(phantom.title)}", f"mu_energy = {toml_value(phantom.mu_energy)}"]
     for shape in phantom.shapes:
-        lines += ["", "[[shape]]", f"kind = {_text(shape.KIND)}"]
-        lines += [f"{key} = {_text(value)}" for key, value in _entries(shape).items()]
+        lines += ["", "[[shape]]", f"kind = {toml_value(shape.KIND)}"]
+        for field in dataclasses.fields(shape):
+            value = getattr(shape, field.name)
+            if field.name == "euler" and any(value):
+                lines.append(f"{_EULER} = {toml_value(map(_degrees, value))}")
+            elif field.init and value != field.default:
+                lines.append(f"{field.name} = {toml_value(value)}")
     with replacing(path) as temporary:
         temporary.write_text("\n".join(lines) + "\n", encoding="utf-8")
 
 
-def _phantom(table: dict[str, Any]) -> ShapePhantom:
-    _refuse_unknown(table, _TOP)
-    shapes = table.get("shape", [])
-    if not isinstance(shapes, list) or not shapes or not all(isinstance(shape, dict) for shape in shapes):
-        raise InputError("expected one [[shape]] or more")
-    return ShapePhantom(
-        [_shape(i, entries) for i, entries in enumerate(shapes, 1)],
-        name=table.get("name", ""),
-        mu_energy=table.get("mu_energy", ShapePhantom.mu_energy),
-    )
+def _phantom(table: dict[str, Any], name: str) -> ShapePhantom:
+    try:
+        _refuse_unknown(table, ("name", "mu_energy", "shape"))
+        shapes = table.get("shape", [])
+        if not isinstance(shapes, list) or not shapes or not all(isinstance(shape, dict) for shape in shapes):
+            raise InputError("expected one [[shape]] or more")
+        made = [_shape(i, entries) for i, entries in enumerate(shapes, 1)]
+        return ShapePhantom(made, table.get("name", ""), table.get("mu_energy", ShapePhantom.mu_energy))
+    except InputError as error:
+        raise InputError(f"{name}: {error}") from None
 
 
 def _shape(number: int, given: dict[str, Any]) -> Shape:
@@ -128,7 +112,7 @@ def _shape(number: int, given: dict[str, Any]) -> Shape:
         raise InputError(f"shape {number}{f' {name!r}' if name else ''}: {error}") from None
 
 
-def _refuse_unknown(table: dict[str, Any], known: Any) -> None:
+def _refuse_unknown(table: dict[str, Any], known: Iterable[str]) -> None:
     for key, value in table.items():
         if key not in known:
             raise InputError(f"{key}: no such key; expected {', '.join(known)}")
@@ -140,32 +124,8 @@ def _has_boolean(value: Any) -> bool:
     return isinstance(value, bool) or (isinstance(value, list) and any(map(_has_boolean, value)))
 
 
-def _entries(shape: Shape) -> dict[str, Any]:
-    """The attributes that were given to make the shape and differ from the defaults."""
-    entries = {}
-    for field in dataclasses.fields(shape):
-        value = getattr(shape, field.name)
-        if field.init and value != field.default:
-            entries[field.name] = value
-    if "euler" in entries:
-        entries[_EULER] = tuple(map(_degrees, entries.pop("euler")))
-    return entries
-
-
 def _degrees(angle: float) -> float:
     """Degrees that convert back to exactly `angle`, radians; plain conversion may change the last digit."""
     degrees = math.degrees(angle)
-    for candidate in (degrees, np.nextafter(degrees, np.inf), np.nextafter(degrees, -np.inf)):
-        if math.radians(candidate) == angle:
-            return float(candidate)
-    return degrees
-
-
-def _text(value: Any) -> str:
-    """A value as TOML."""
-    if isinstance(value, str):
-        # TOML's basic strings have JSON's escapes, but DEL must be escaped, too.
-        return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")
-    if isinstance(value, tuple):
-        return f"[{', '.join(map(_text, value))}]"
-    return repr(value)
+    candidates = (degrees, float(np.nextafter(degrees, np.inf)), float(np.nextafter(degrees, -np.inf)))
+    return next((candidate for candidate in candidates if math.radians(candidate) == angle), degrees)

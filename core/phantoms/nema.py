@@ -31,20 +31,9 @@ class NemaBody(Phantom):
     50 mm holds beads of 0.3 g/cm^3. The spheres lie around it, 70 mm from the lid (+z), on a circle of radius 57.2 mm: that
     of 17 mm towards +x, the others counter-clockwise by size, 60 degrees apart. That sense is not confirmed; OpenGATE's run
     clockwise. The origin is the middle of the spheres' circle, halfway between front and back, 35 mm in front of the
-    body's circles' centres. Walls are not modelled.
-
-    Attributes
-    ----------
-    sphere_diameters : (6,)
-        mm; 0 leaves one out.
-    sphere_activity, background : float
-        kBq/mL; NU 2 asks for a ratio of 4 (or 8) to 1 over a background of 5.3 kBq/mL.
-    lung_diameter : float
-        mm; 0 leaves the insert out.
-    length : float
-        Inside, mm.
-    mu : float
-        Of the water, 1/mm.
+    body's circles' centres. Walls are not modelled. NU 2 asks for spheres 4 (or 8) times as active as a background of
+    5.3 kBq/mL.
+    The fields say what each setting is, and its unit.
     """
 
     sphere_diameters: tuple[float, ...] = setting((10.0, 13.0, 17.0, 22.0, 28.0, 37.0), "mm", "inside; 0 for none", 0.0)
@@ -68,10 +57,8 @@ class NemaBody(Phantom):
             require_at_most(diameter, 2 * _TO_LID, inside, "beneath the lid")
             least = _TO_LID + diameter / 2
             if self.length < least * (1 - 1e-9):
-                raise InputError(
-                    f"{self.title}: length: expected at least {least:g} mm around a sphere of {diameter:g} mm, "
-                    f"got {self.length:g}"
-                )
+                around = f"around a sphere of {diameter:g} mm"
+                raise InputError(f"{self.title}: length: expected at least {least:g} mm {around}, got {self.length:g}")
             if lung:
                 require_at_most(diameter, 2 * _RING_RADIUS - lung, inside, f"beside a lung insert of {lung:g} mm")
         require_apart(self.sphere_diameters, _RING_RADIUS, inside)
@@ -94,10 +81,8 @@ class NemaBody(Phantom):
             shapes.append(Cylinder(radius=self.lung_diameter / 2, height=self.length, position=(0, 0, z), **lung))
         for diameter, (x, y) in zip(self.sphere_diameters, _ring(), strict=True):
             if diameter:
-                holds: dict[str, Any] = {"activity": self.sphere_activity, "mu": self.mu}
-                shapes.append(
-                    Sphere(radius=diameter / 2, position=(x, y, 0.0), name=f"sphere {diameter:g} mm", **holds)
-                )
+                name, holds = f"sphere {diameter:g} mm", {**water, "activity": self.sphere_activity}
+                shapes.append(Sphere(radius=diameter / 2, position=(x, y, 0.0), name=name, **holds))
         return shapes
 
 

@@ -40,17 +40,7 @@ _RAYS, _PARTS = 1 << 14, 256  # at a time; fewer rays where a shape has more par
 
 @dataclass(frozen=True, eq=False)
 class Layer:
-    """One shape of a painting.
-
-    Attributes
-    ----------
-    shape : Shape
-        What is painted.
-    pose : array (4, 4)
-        World-from-shape, mm.
-    value : float
-        What it holds.
-    """
+    """One shape of a painting, its world-from-shape `pose` (4, 4), mm, and the `value` it holds."""
 
     shape: Shape
     pose: Points
@@ -172,16 +162,7 @@ def paint_voxels(
     that a shape covers is counted at points of a low-discrepancy sequence; the shares are then corrected so that the total
     change is the known one. For a shape that is small beside the voxels, the points fill the shape instead.
 
-    Parameters
-    ----------
-    grid
-        Where the voxels are.
-    layers
-        From bottom to top.
-    changes
-        Those of `mean_changes`.
-    progress
-        Called as ``progress(done, total)``.
+    `layers` run from bottom to top; `changes` are those of `mean_changes`; `progress` is called with (done, total).
     """
     require(5.0 * grid.n_voxels, "a volume of {} x {} x {} voxels".format(*grid.shape))
     image = np.zeros(grid.shape, np.float32)
@@ -211,7 +192,12 @@ class _Stroke:
     def __init__(self, grid: Grid, layer: Layer, beneath: Sequence[Layer], mean_change: float) -> None:
         self.grid, self.layer, self.beneath, self.mean_change = grid, layer, beneath, mean_change
         shape, shape_from_index = layer.shape, layer.from_world @ grid.affine
-        low, high = _index_box(shape_from_index, shape)
+        # Bounds of the indices of the shape's points: the tighter of its box and its ball.
+        index_from_shape = np.linalg.inv(shape_from_index)
+        linear, middle = index_from_shape[:3, :3], index_from_shape[:3, 3]
+        of_box = np.abs(linear) @ np.array(shape.half_box)
+        half = np.minimum(of_box, np.linalg.norm(linear, axis=1) * shape.ball_radius)
+        low, high = middle - half, middle + half
         # Clipped as floats: a far-away box must not overflow the integers.
         self.start = np.clip(np.floor(low + 0.5), 0, grid.shape).astype(np.int64)
         self.stop = np.clip(np.floor(high + 0.5) + 1, self.start, grid.shape).astype(np.int64)
@@ -356,44 +342,40 @@ def _coverage(index: NDArray[np.int64], own: _Sampled, lower: Sequence[_Sampled]
 
 def line_integrals(layers: Sequence[Layer], starts: Points, ends: Points) -> Points:
     """Integrals (N,) of the painting, value x mm, along the lines from `starts` to `ends`, (N, 3) world mm: exact."""
-    result = np.empty(len(starts))
     step = max(1, _RAYS * _PARTS // max(_PARTS, *(layer.shape.n_parts for layer in layers), 1))
-    for first in range(0, len(starts), step):
-        block = slice(first, first + step)
-        result[block] = _integrals_of_block(layers, starts[block].T, ends[block].T)
-    return result
+    blocks = [slice(first, first + step) for first in range(0, len(starts), step)]
+    return np.concatenate(
+        [np.empty(0), *(_integrals_of_block(layers, starts[block].T, ends[block].T) for block in blocks)]
+    )
 
 
 def _integrals_of_block(layers: Sequence[Layer], starts: Points, ends: Points) -> Points:
     """Of lines (3, N). Each line's pieces between the surfaces that it crosses are painted in the layers' order."""
     directions = ends - starts
-    rays, enters, leaves, values, adds = [], [], [], [], []
+    pieces: list[tuple[Any, ...]] = []
     for layer in layers:
         linear = layer.from_world[:3, :3]
         enter, leave = layer.shape.intervals(_moved(layer.from_world, starts), linear @ directions)
         enter, leave = np.maximum(enter, 0.0).T, np.minimum(leave, 1.0).T
         ray, part = np.nonzero(enter < leave)
-        rays.append(ray)
-        enters.append(enter[ray, part])
-        leaves.append(leave[ray, part])
-        values.append(np.full(len(ray), layer.value))
-        adds.append(np.full(len(ray), layer.adds))
-    if not rays:
+        content = (np.full(len(ray), held) for held in (layer.value, layer.adds))
+        pieces.append((ray, enter[ray, part], leave[ray, part], *content))
+    if not pieces:
         return np.zeros(starts.shape[1])
-    ray, enter, leave = np.concatenate(rays), np.concatenate(enters), np.concatenate(leaves)
-    value, add = np.concatenate(values), np.concatenate(adds)
-    order = np.argsort(ray, kind="stable")  # keeps the layers' order in each ray
-    ray, enter, leave, value, add = ray[order], enter[order], leave[order], value[order], add[order]
-    counts = np.bincount(ray, minlength=starts.shape[1])
+    columns = [np.concatenate(column) for column in zip(*pieces, strict=True)]
+    order = np.argsort(columns[0], kind="stable")  # keeps the layers' order in each ray
+    rays, enters, leaves, value, add = (column[order] for column in columns)
+    counts = np.bincount(rays, minlength=starts.shape[1])
     firsts = np.cumsum(counts) - counts
     integrals = np.zeros(starts.shape[1])
-    # Lines of about as many parts together, padded with empty ones.
-    for most in np.unique(_next_power_of_2(counts[counts > 0])):
-        some = np.flatnonzero(_next_power_of_2(counts) == most)
+    # Lines of about as many parts together, up to a power of 2, padded with empty ones.
+    padded = np.where(counts > 0, 1 << np.ceil(np.log2(np.maximum(counts, 1))).astype(np.int64), 0)
+    for most in np.unique(padded[padded > 0]):
+        some = np.flatnonzero(padded == most)
         number = np.arange(most)
         there = number < counts[some, None]
         index = np.where(there, firsts[some, None] + number, 0)
-        low, high = np.where(there, enter[index], 0.0), np.where(there, leave[index], 0.0)
+        low, high = np.where(there, enters[index], 0.0), np.where(there, leaves[index], 0.0)
         edges = np.sort(np.concatenate([low, high], axis=1), axis=1)
         middles = (edges[:, :-1] + edges[:, 1:]) / 2
         painted = np.zeros_like(middles)
@@ -403,10 +385,6 @@ def _integrals_of_block(layers: Sequence[Layer], starts: Points, ends: Points) -
             painted = np.where(inside, paint, painted)
         integrals[some] = np.einsum("rs,rs->r", painted, np.diff(edges, axis=1))
     return integrals * np.sqrt(np.einsum("in,in->n", directions, directions))
-
-
-def _next_power_of_2(counts: NDArray[np.int64]) -> NDArray[np.int64]:
-    return np.where(counts > 0, 1 << np.ceil(np.log2(np.maximum(counts, 1))).astype(np.int64), 0)
 
 
 def _shape_points(shape: Shape, first: int) -> Points:
@@ -429,13 +407,3 @@ def _r3_sequence(n: int, first: int = 0) -> Points:
 def _moved(pose: Points, points: Points) -> Points:
     """`points` (3, N) transformed by a pose (4, 4)."""
     return pose[:3, :3] @ points + pose[:3, 3:]
-
-
-def _index_box(shape_from_index: Points, shape: Shape) -> tuple[Points, Points]:
-    """Lower and upper bounds (3,) of the indices of a shape's points."""
-    index_from_shape = np.linalg.inv(shape_from_index)
-    linear, middle = index_from_shape[:3, :3], index_from_shape[:3, 3]
-    of_box = np.abs(linear) @ np.array(shape.half_box)
-    of_ball = np.linalg.norm(linear, axis=1) * shape.ball_radius
-    half = np.minimum(of_box, of_ball)
-    return middle - half, middle + half

@@ -19,7 +19,7 @@ from ..geometry.grid import Grid
 from ..geometry.views import Views
 from ..memory import require
 from ..progress import Progress
-from ..validation import freeze, positive, real_array
+from ..validation import freeze, instance, positive, real_array
 from ..volumes.volume import UNITS, Volume
 from .painting import Layer, line_integrals, mean_changes, paint_voxels, points_inside, values_at
 from .settings import check_settings
@@ -31,25 +31,13 @@ _HELD = 0.98  # with a smaller fraction of the phantom on the grid, a warning is
 
 
 class PhantomMesh(NamedTuple):
-    """One shape of a phantom as a mesh.
-
-    Attributes
-    ----------
-    name : str
-        The shape's name.
-    vertices : array (V, 3)
-        mm, in the phantom's frame.
-    faces : array (F, 3)
-        Triangles, counter-clockwise as seen from outside; the mesh is closed.
-    activity, mu : float or None
-        The shape's content, kBq/mL and 1/mm.
-    """
+    """One shape of a phantom as a closed mesh."""
 
     name: str
-    vertices: NDArray[np.float64]
-    faces: NDArray[np.int32]
-    activity: float | None
-    mu: float | None
+    vertices: NDArray[np.float64]  # (V, 3), mm, in the phantom's frame
+    faces: NDArray[np.int32]  # triangles (F, 3), counter-clockwise as seen from outside
+    activity: float | None  # kBq/mL
+    mu: float | None  # 1/mm
 
 
 class Phantom:
@@ -78,30 +66,11 @@ class Phantom:
         except InputError as error:
             raise InputError(f"{self.title}: {error}") from None
 
-    def _require_no_negative_sums(self) -> None:
-        """Raise `InputError` if a shape with a negative value makes the sum negative at one of its points."""
-        for quantity in QUANTITIES:
-            layers = self._layers(quantity)
-            largest = max((abs(layer.value) for layer in layers), default=0.0)
-            for layer in layers:
-                if layer.value >= 0:
-                    continue
-                points = next(points_inside(layer))
-                values = values_at(layers, points)
-                if values.size and (lowest := float(values.min())) < -1e-9 * largest:
-                    number = next(i for i, shape in enumerate(self.shapes, 1) if shape is layer.shape)
-                    name = f"shape {number}" + (f" {layer.shape.name!r}" if layer.shape.name else "")
-                    place = " ".join(f"{x:.4g}" for x in points[:, values.argmin()])
-                    raise InputError(
-                        f"{name}: {quantity}: {layer.value:g} {UNITS[quantity]} added leaves {lowest:g} at {place} mm; "
-                        "expected 0 or more"
-                    )
-
     @property
     def total_activity(self) -> float:
-        """Activity of the whole phantom, kBq.
+        """Activity of the whole phantom, kBq, from the shapes' volumes.
 
-        From the shapes' volumes. Partial overlaps are counted at points (to about 1/1000 of the smaller shape's content).
+        Partial overlaps are counted at points, to about 1/1000 of the smaller shape's content.
         """
         return self._total("activity") * 1e-3  # kBq/mL times mm^3
 
@@ -124,61 +93,31 @@ class Phantom:
     def voxelize(
         self, grid: Grid, pose: ArrayLike | None = None, progress: Progress | None = None, quantity: str = "activity"
     ) -> Volume:
-        """The phantom as a volume on `grid`; a voxel holds the mean over its volume.
+        """The phantom as a volume on any `grid`; a voxel holds the mean over its volume, parts outside are cut off.
 
-        Parameters
-        ----------
-        grid
-            Any grid; parts outside it are cut off.
-        pose
-            World-from-phantom (4, 4), mm.
-        progress
-            Called as ``progress(done, total)``; may raise `Cancelled`.
-        quantity
-            ``"activity"`` or ``"mu"``.
-
-        Raises
-        ------
-        InputError
-            No grid, no such quantity, the pose is not an invertible 4x4 affine, or the volume does not fit into memory.
+        `progress` is called as ``progress(done, total)`` and may raise `Cancelled`.
         """
-        if not isinstance(grid, Grid):
-            raise InputError(f"voxelize: expected a Grid, got {type(grid).__name__}")
+        instance(grid, Grid, "voxelize")
         image = paint_voxels(grid, self._layers(quantity, pose), self._changes(quantity), progress)
         whole = self._total(quantity) * (1.0 if pose is None else abs(float(np.linalg.det(np.asarray(pose)[:3, :3]))))
         held = float(image.sum(dtype=np.float64)) * grid.voxel_volume / whole if whole > 0 else 1.0
         if held < _HELD:
-            warnings.warn(
-                f"{1 - held:.0%} of the {self.title} lies outside the grid: take larger or more voxels",
-                InputWarning,
-                stacklevel=2,
-            )
+            text = f"{1 - held:.0%} of the {self.title} lies outside the grid: take larger or more voxels"
+            warnings.warn(text, InputWarning, stacklevel=2)
         return Volume(freeze(image), grid, quantity)
 
     def line_integrals(
         self, sources: ArrayLike, targets: ArrayLike, pose: ArrayLike | None = None, quantity: str = "activity"
     ) -> NDArray[np.float64]:
-        """Integrals along lines, exact (closed form).
+        """Integrals (N,) along lines, value x mm, exact (closed form).
 
-        Parameters
-        ----------
-        sources, targets
-            Ends of the lines, (N, 3) each, or (3,) for one that all lines share; world mm.
-        pose, quantity
-            As for `voxelize`.
-
-        Returns
-        -------
-        array (N,)
-            Value x mm.
-
-        Raises
-        ------
-        InputError
-            The numbers of points do not match, or a coordinate is not finite; as for `voxelize`.
+        `sources` and `targets` are the ends of the lines, (N, 3) each, or (3,) for one that all lines share; world mm.
         """
         layers = self._layers(quantity, pose)
-        starts, ends = _points(sources, "sources"), _points(targets, "targets")
+        starts, ends = (
+            real_array(np.atleast_2d(real_array(points, name, None)), name, (None, 3))
+            for points, name in ((sources, "sources"), (targets, "targets"))
+        )
         if len(starts) != len(ends) and 1 not in (len(starts), len(ends)):
             raise InputError(f"line_integrals: {len(starts)} sources but {len(ends)} targets")
         starts, ends = np.broadcast_arrays(starts, ends)
@@ -188,14 +127,8 @@ class Phantom:
         """Exact line integrals to the pixels' centres of all views: images (M, n_v, n_u), value x mm.
 
         `Projector` with `Transmission` converges to them as voxels get smaller.
-
-        Raises
-        ------
-        InputError
-            No views, or the images do not fit into memory; as for `voxelize`.
         """
-        if not isinstance(views, Views):
-            raise InputError(f"project: expected Views, got {type(views).__name__}")
+        instance(views, Views, "project")
         require(4.0 * len(views) * math.prod(views.shape), "a set of projections")
         images = np.empty((len(views), *views.shape), np.float32)
         for m, image in enumerate(images):
@@ -225,13 +158,10 @@ class Phantom:
 
     def _changes(self, quantity: str) -> list[float]:
         """`mean_changes` of the shapes that hold the quantity; any pose leaves them as they are."""
-        if quantity not in self._known_changes:
-            self._known_changes[quantity] = mean_changes(self._layers(quantity))
-        return self._known_changes[quantity]
-
-    @cached_property
-    def _known_changes(self) -> dict[str, list[float]]:
-        return {}
+        known: dict[str, list[float]] = vars(self).setdefault("_known_changes", {})
+        if quantity not in known:
+            known[quantity] = mean_changes(self._layers(quantity))
+        return known[quantity]
 
     def _layers(self, quantity: str, pose: ArrayLike | None = None) -> list[Layer]:
         """The shapes that have the quantity, placed in the world."""
@@ -245,29 +175,12 @@ class Phantom:
         ]
 
 
-def _points(value: ArrayLike, name: str) -> NDArray[np.float64]:
-    """One point (3,) or many (N, 3) as an array (N, 3)."""
-    array = real_array(value, name, None)
-    return real_array(array[None] if array.ndim == 1 else array, name, (None, 3))
-
-
 @dataclass(frozen=True)
 class ShapePhantom(Phantom):
     """A phantom given as a list of shapes, in the order of painting: later ones replace what is beneath them.
 
-    Attributes
-    ----------
-    shapes : tuple of Shape
-        From bottom to top.
-    name : str
-        The phantom's name.
-    mu_energy : float
-        Energy, keV, at which mu holds.
-
-    Raises
-    ------
-    InputError
-        There are no shapes, or something else is among them.
+    `mu_energy` is the energy, keV, at which mu holds. `InputError` if there are no shapes, or negative ones make a sum
+    negative.
 
     Examples
     --------
@@ -293,6 +206,18 @@ class ShapePhantom(Phantom):
             raise InputError(f"phantom name: expected a text, got {self.name!r}")
         object.__setattr__(self, "shapes", shapes)
         object.__setattr__(self, "mu_energy", positive(self.mu_energy, "mu_energy", "keV"))
-
         object.__setattr__(self, "title", self.name or self.title)
-        self._require_no_negative_sums()
+        for quantity in QUANTITIES:
+            layers = self._layers(quantity)
+            largest = max((abs(layer.value) for layer in layers), default=0.0)
+            for layer in layers:
+                if layer.value >= 0:
+                    continue
+                points = next(points_inside(layer))
+                values = values_at(layers, points)
+                if values.size and (lowest := float(values.min())) < -1e-9 * largest:
+                    number = next(i for i, shape in enumerate(shapes, 1) if shape is layer.shape)
+                    name = f"shape {number}" + (f" {layer.shape.name!r}" if layer.shape.name else "")
+                    place = " ".join(f"{x:.4g}" for x in points[:, values.argmin()])
+                    added = f"{layer.value:g} {UNITS[quantity]} added leaves {lowest:g} at {place} mm"
+                    raise InputError(f"{name}: {quantity}: {added}; expected 0 or more")

@@ -23,16 +23,7 @@ _MOST = 10_000
 class PointGrid(Phantom):
     """Equal small balls on a lattice centred on the origin, in air.
 
-    Attributes
-    ----------
-    counts : (3,)
-        Points along x, y, z.
-    spacing : (3,)
-        mm, from point to point.
-    diameter : float
-        Of a point, mm. Each point holds its whole activity on voxels of any size.
-    point_activity : float
-        Of each point, kBq.
+    Each point holds its whole activity on voxels of any size. The fields say what each setting is, and its unit.
     """
 
     counts: tuple[int, int, int] = count((5, 5, 5), "how many along x y z")

@@ -16,21 +16,8 @@ def random_pose(
     """A random pose: the middle uniform in a box, each Euler angle of `euler_pose` uniform between 0 and 360 degrees.
 
     This is not the uniform distribution of rotations, for which cos(theta) would be uniform: a phantom's axis points along
-    +z or -z more often.
-
-    Parameters
-    ----------
-    seed
-        A whole number gives the same pose each time, a generator the next one.
-    box
-        Sides of the box (3,), mm, or one for all.
-    center
-        Its middle (3,), mm.
-
-    Returns
-    -------
-    array (4, 4)
-        World-from-phantom.
+    +z or -z more often. A whole number as `seed` gives the same pose (4, 4), world-from-phantom, each time, a generator the
+    next one. `box` has the sides (3,), mm, or one for all; `center` is its middle (3,), mm.
 
     Examples
     --------

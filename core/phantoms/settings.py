@@ -19,18 +19,8 @@ def setting(
 ) -> Any:
     """A field of a phantom's dataclass: one number, or as many as `default` has.
 
-    Parameters
-    ----------
-    default
-        The default.
-    unit
-        For messages and help; a fraction's says what it is a fraction of (``"of the wall"``).
-    text
-        One line of help.
-    least
-        The smallest value; None for anything above 0.
-    option
-        On the command line, where that is not the field's name.
+    A fraction's `unit` says what it is a fraction of (``"of the wall"``). `text` is one line of help, `least` the smallest
+    value (None for anything above 0), `option` the command line's name where that is not the field's.
     """
     return dataclasses.field(default=default, metadata={"unit": unit, "text": text, "least": least, "option": option})
 
@@ -46,13 +36,7 @@ def choice(default: str, choices: tuple[str, ...], text: str) -> Any:
 
 
 def check_settings(phantom: Any, title: str) -> None:
-    """Check every `setting` of a phantom and turn it into a float or a tuple of floats.
-
-    Raises
-    ------
-    InputError
-        A setting has the wrong number of values, one that is not finite, or one that is too small.
-    """
+    """Check every `setting` of a phantom and turn it into a float or a tuple of floats."""
     fields: tuple[Any, ...] = dataclasses.fields(phantom)
     for field in fields:
         if "unit" not in field.metadata:

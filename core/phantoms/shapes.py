@@ -39,21 +39,18 @@ class Shape:
         phi, theta, psi in radians, as for `euler_pose`.
     axis : (3,) or None
         Instead of `euler`: the direction of the shape's z axis, of any length.
-    activity : float or None
-        kBq/mL; None leaves the activity beneath as it is.
-    mu : float or None
-        Linear attenuation coefficient, 1/mm; None leaves that beneath as it is.
+    activity, mu : float or None
+        kBq/mL, and the linear attenuation coefficient, 1/mm; None leaves what is beneath as it is. One is needed.
     mode : str
         ``"paint"`` replaces what lies beneath, ``"add"`` adds to it (and may be negative).
     cut : (n, 4)
         Planes (nx, ny, nz, d) in the shape's frame: the points with ``n . x <= d`` |n| are kept, d in mm.
     name : str
         For messages and the scene.
-
-    Raises
-    ------
-    InputError
-        A number is not finite or out of range, or the shape has neither activity nor mu.
+    half_box : (3,)
+        Half the sides, mm, of a box around the shape's origin that contains it, before any cut.
+    ball_radius : float
+        Radius, mm, of a ball around the shape's origin that contains it.
     """
 
     position: Vector = (0.0, 0.0, 0.0)
@@ -64,6 +61,9 @@ class Shape:
     mode: str = "paint"
     cut: Vector = ()
     name: str = ""
+    half_box: tuple[float, float, float] = field(init=False, repr=False, compare=False)
+    ball_radius: float = field(init=False, repr=False, compare=False)
+    _whole: float = field(init=False, repr=False, compare=False)  # the volume before any cut, mm^3
 
     KIND: ClassVar[str] = ""
 
@@ -71,12 +71,11 @@ class Shape:
         self._set("position", _numbers(self.position, "position", 3))
         self._set("euler", _numbers(self.euler, "euler", 3))
         if self.axis is not None:
-            axis = np.array(_numbers(self.axis, "axis", 3))
+            self._set("axis", _numbers(self.axis, "axis", 3))
             if any(self.euler):
                 raise InputError("axis: expected either an axis or Euler angles, got both")
-            if not axis.any():
+            if not any(self.axis):
                 raise InputError("axis: expected a direction, got 0 0 0")
-            self._set("axis", tuple(axis.tolist()))
         if self.mode not in MODES:
             raise InputError(f"mode: expected one of {', '.join(MODES)}, got {self.mode!r}")
         for quantity, unit in (("activity", "kBq/mL"), ("mu", "1/mm")):
@@ -91,11 +90,8 @@ class Shape:
             raise InputError("activity, mu: expected at least one of them")
         if not isinstance(self.name, str):
             raise InputError(f"name: expected a text, got {self.name!r}")
-        planes = (
-            np.empty((0, 4))
-            if isinstance(self.cut, list | tuple) and not self.cut
-            else real_array(self.cut, "cut", (None, 4))
-        )
+        none = isinstance(self.cut, list | tuple) and not self.cut
+        planes = np.empty((0, 4)) if none else real_array(self.cut, "cut", (None, 4))
         lengths = np.linalg.norm(planes[:, :3], axis=1)
         if np.any(lengths == 0):
             raise InputError("cut: expected planes nx ny nz d, got one whose normal is 0 0 0")
@@ -136,10 +132,27 @@ class Shape:
             interval = common(interval, below(np.array(normal) @ starts - offset, np.array(normal) @ directions))
         return interval
 
+    def surface(self) -> Surface:
+        """A closed mesh in the shape's frame: vertices (V, 3), mm, and triangles (F, 3), counter-clockwise from outside."""
+        surface = self._surface()
+        for *normal, offset in self.cut:
+            surface = clipped(surface, np.array(normal), offset)
+        return surface
+
     @cached_property
     def volume(self) -> float:
         """mm^3: in closed form, or with a cut summed over lines."""
-        return self._summed_volume(_LINES) if self.cut else self._volume
+        return self._summed_volume(_LINES) if self.cut else self._whole
+
+    @property
+    def n_parts(self) -> int:
+        """How many times at most a line may enter the shape."""
+        return 1
+
+    @property
+    def finest(self) -> float:
+        """Size, mm, of the smallest part."""
+        return min(2 * min(self.half_box), self.volume ** (1 / 3))
 
     def _summed_volume(self, n: int) -> float:
         """The volume summed over n x n lines."""
@@ -153,36 +166,9 @@ class Shape:
         enter, leave = self.intervals(starts, directions)
         return float(np.maximum(leave - enter, 0.0).sum() / len(u) * width * depth * c)
 
-    @property
-    def n_parts(self) -> int:
-        """How many times at most a line may enter the shape."""
-        return 1
-
-    @property
-    def finest(self) -> float:
-        """Size, mm, of the smallest part."""
-        return min(2 * min(self.half_box), self.volume ** (1 / 3))
-
-    @property
-    def half_box(self) -> tuple[float, float, float]:
-        """Half the sides, mm, of a box around the shape's origin that contains it."""
-        raise NotImplementedError
-
-    @property
-    def ball_radius(self) -> float:
-        """Radius, mm, of a ball around the shape's origin that contains it; here of a shape that is round about z."""
-        a, b, c = self.half_box
-        return math.hypot(max(a, b), c)
-
-    def surface(self) -> Surface:
-        """A closed mesh in the shape's frame: vertices (V, 3), mm, and triangles (F, 3), counter-clockwise from outside."""
-        surface = self._surface()
-        for *normal, offset in self.cut:
-            surface = clipped(surface, np.array(normal), offset)
-        return surface
+    # What a kind of shape defines: `_check` checks its numbers and calls `_set_size`; the others ignore the cut.
 
     def _check(self) -> None:
-        """Check the shape's own numbers."""
         raise NotImplementedError
 
     def _distance(self, points: Real) -> Real:
@@ -191,12 +177,13 @@ class Shape:
     def _intervals(self, starts: Points, directions: Points) -> Interval:
         raise NotImplementedError
 
-    @property
-    def _volume(self) -> float:
-        raise NotImplementedError
-
     def _surface(self) -> Surface:
         raise NotImplementedError
+
+    def _set_size(self, half_box: tuple[float, float, float], ball_radius: float, volume: float) -> None:
+        self._set("half_box", half_box)
+        self._set("ball_radius", ball_radius)
+        self._set("_whole", volume)
 
     def _set(self, name: str, value: object) -> None:
         object.__setattr__(self, name, value)
@@ -208,13 +195,7 @@ class Shape:
 
 @dataclass(frozen=True, kw_only=True)
 class Ellipsoid(Shape):
-    """An ellipsoid.
-
-    Attributes
-    ----------
-    radii : (3,)
-        Half axes along x, y, z, mm.
-    """
+    """An ellipsoid with the half axes `radii` (3,) along x, y, z, mm."""
 
     radii: Vector
 
@@ -222,43 +203,24 @@ class Ellipsoid(Shape):
 
     def _check(self) -> None:
         self._set("radii", _positive_numbers(self.radii, "radii", 3))
+        self._set_size(self.radii, max(self.radii), 4 / 3 * math.pi * math.prod(self.radii))
 
     def _distance(self, points: Real) -> Real:
-        return ellipse_distance(points, self.half_box)
+        return ellipse_distance(points, self.radii)
 
     def _intervals(self, starts: Points, directions: Points) -> Interval:
         radii = np.array(self.radii)[:, None]
         return in_unit_ball(starts / radii, directions / radii)
 
-    @property
-    def _volume(self) -> float:
-        return 4 / 3 * math.pi * math.prod(self.half_box)
-
-    @property
-    def half_box(self) -> tuple[float, float, float]:
-        """As of `Shape`."""
-        return self.radii
-
-    @property
-    def ball_radius(self) -> float:
-        """As of `Shape`."""
-        return max(self.half_box)
-
     def _surface(self) -> Surface:
         angle = np.linspace(-np.pi / 2, np.pi / 2, 33)
-        a, b, c = self.half_box
+        a, b, c = self.radii
         return lathe(np.cos(angle), c * np.sin(angle), a, b)
 
 
 @dataclass(frozen=True, kw_only=True)
 class Sphere(Ellipsoid):
-    """A sphere.
-
-    Attributes
-    ----------
-    radius : float
-        mm.
-    """
+    """A sphere of `radius` mm."""
 
     radius: float
     radii: Vector = field(init=False)
@@ -268,19 +230,12 @@ class Sphere(Ellipsoid):
     def _check(self) -> None:
         self._set_positive("radius")
         self._set("radii", (self.radius,) * 3)
+        super()._check()
 
 
 @dataclass(frozen=True, kw_only=True)
 class Cylinder(Shape):
-    """A cylinder along z.
-
-    Attributes
-    ----------
-    radius : float or (2,)
-        mm; along x and y where it is elliptic.
-    height : float
-        mm.
-    """
+    """A cylinder of `height` mm along z; its `radius`, mm, is one number, or (2,) along x and y for an elliptic one."""
 
     radius: Vector
     height: float
@@ -293,6 +248,9 @@ class Cylinder(Shape):
         else:
             self._set_positive("radius")
         self._set_positive("height")
+        a, b = self.radius if isinstance(self.radius, tuple) else (self.radius, self.radius)
+        half = self.height / 2
+        self._set_size((a, b, half), math.hypot(max(a, b), half), 2 * math.pi * a * b * half)
 
     def _distance(self, points: Real) -> Real:
         a, b, half = self.half_box
@@ -304,17 +262,6 @@ class Cylinder(Shape):
         side = in_unit_ball(starts[:2] / radii, directions[:2] / radii)
         return common(side, between(starts[2], directions[2], half))
 
-    @property
-    def _volume(self) -> float:
-        a, b, half = self.half_box
-        return 2 * math.pi * a * b * half
-
-    @property
-    def half_box(self) -> tuple[float, float, float]:
-        """As of `Shape`."""
-        a, b = self.radius if isinstance(self.radius, tuple) else (self.radius, self.radius)
-        return a, b, self.height / 2
-
     def _surface(self) -> Surface:
         a, b, half = self.half_box
         return lathe(np.array([0.0, 1.0, 1.0, 0.0]), np.array([-half, -half, half, half]), a, b)
@@ -324,12 +271,7 @@ class Cylinder(Shape):
 class Cone(Shape):
     """A cone along z, with or without its tip.
 
-    Attributes
-    ----------
-    radius, top_radius : float
-        At ``z = -height / 2`` and at ``z = height / 2``, mm; one of them may be 0.
-    height : float
-        mm.
+    Its `radius` is that at ``z = -height / 2``, its `top_radius` that at ``z = height / 2``, mm; one of them may be 0.
     """
 
     radius: float
@@ -344,56 +286,38 @@ class Cone(Shape):
             if value < 0:
                 raise InputError(f"{name}: expected 0 or more mm, got {value:g}")
             self._set(name, value)
-        positive(max(self.radius, self.top_radius), "radius", "mm")
+        r, t = self.radius, self.top_radius
+        widest = positive(max(r, t), "radius", "mm")
         self._set_positive("height")
+        half = self.height / 2
+        volume = math.pi / 3 * self.height * (r * r + r * t + t * t)
+        self._set_size((widest, widest, half), math.hypot(widest, half), volume)
 
     @property
-    def _slope(self) -> float:
-        return (self.top_radius - self.radius) / self.height
-
-    @property
-    def _middle(self) -> float:
-        """Radius at z = 0, mm."""
-        return (self.radius + self.top_radius) / 2
+    def _line(self) -> tuple[float, float]:
+        """The radius at z = 0, mm, and by how much it grows per mm along z."""
+        return (self.radius + self.top_radius) / 2, (self.top_radius - self.radius) / self.height
 
     def _distance(self, points: Real) -> Real:
         of_type = points.dtype.type
-        side = np.hypot(points[0], points[1]) - of_type(self._middle) - of_type(self._slope) * points[2]
-        side *= of_type(1 / math.hypot(1, self._slope))
+        middle, slope = self._line
+        side = np.hypot(points[0], points[1]) - of_type(middle) - of_type(slope) * points[2]
+        side *= of_type(1 / math.hypot(1, slope))
         return np.maximum(side, np.abs(points[2]) - of_type(self.height / 2))
 
     def _intervals(self, starts: Points, directions: Points) -> Interval:
-        return in_cone(starts, directions, self._middle, self._slope, self.height / 2)
-
-    @property
-    def _volume(self) -> float:
-        r, t = self.radius, self.top_radius
-        return math.pi / 3 * self.height * (r * r + r * t + t * t)
-
-    @property
-    def half_box(self) -> tuple[float, float, float]:
-        """As of `Shape`."""
-        widest = max(self.radius, self.top_radius)
-        return widest, widest, self.height / 2
+        return in_cone(starts, directions, *self._line, self.height / 2)
 
     def _surface(self) -> Surface:
         half = self.height / 2
-        radii = [self.radius] * (self.radius > 0) + [self.top_radius] * (self.top_radius > 0)
-        heights = [-half] * (self.radius > 0) + [half] * (self.top_radius > 0)
-        return lathe(np.array([0.0, *radii, 0.0]), np.array([-half, *heights, half]), 1.0, 1.0)
+        ends = [(r, z) for r, z in ((self.radius, -half), (self.top_radius, half)) if r > 0]
+        radii, heights = np.array([(0.0, -half), *ends, (0.0, half)]).T
+        return lathe(radii, heights, 1.0, 1.0)
 
 
 @dataclass(frozen=True, kw_only=True)
 class Capsule(Shape):
-    """A cylinder along z with half balls on its ends.
-
-    Attributes
-    ----------
-    radius : float
-        mm.
-    height : float
-        Of the cylinder, mm; the whole is longer by 2 radii.
-    """
+    """A cylinder of `radius` and `height` mm along z with half balls on its ends, which add a `radius` each."""
 
     radius: float
     height: float
@@ -402,6 +326,8 @@ class Capsule(Shape):
 
     def _check(self) -> None:
         self._set_positive("radius", "height")
+        r, half = self.radius, self.height / 2 + self.radius
+        self._set_size((r, r, half), half, math.pi * r**2 * (self.height + 4 / 3 * r))
 
     def _distance(self, points: Real) -> Real:
         of_type = points.dtype.type
@@ -417,24 +343,9 @@ class Capsule(Shape):
             in_unit_ball((starts + half) / self.radius, directions / self.radius),
         ]
         # The sum of the parts is convex: one interval, from the first entry to the last exit.
-        missed = [enter >= leave for enter, leave in parts]
-        enter = np.minimum.reduce([np.where(m, np.inf, part[0]) for m, part in zip(missed, parts, strict=True)])
-        leave = np.maximum.reduce([np.where(m, -np.inf, part[1]) for m, part in zip(missed, parts, strict=True)])
+        enter = np.minimum.reduce([np.where(enter >= leave, np.inf, enter) for enter, leave in parts])
+        leave = np.maximum.reduce([np.where(enter >= leave, -np.inf, leave) for enter, leave in parts])
         return enter, leave
-
-    @property
-    def _volume(self) -> float:
-        return math.pi * self.radius**2 * (self.height + 4 / 3 * self.radius)
-
-    @property
-    def half_box(self) -> tuple[float, float, float]:
-        """As of `Shape`."""
-        return self.radius, self.radius, self.ball_radius
-
-    @property
-    def ball_radius(self) -> float:
-        """As of `Shape`."""
-        return self.height / 2 + self.radius
 
     def _surface(self) -> Surface:
         angle = np.linspace(0, np.pi / 2, 13)
@@ -445,13 +356,7 @@ class Capsule(Shape):
 
 @dataclass(frozen=True, kw_only=True)
 class Box(Shape):
-    """A box.
-
-    Attributes
-    ----------
-    size : (3,)
-        Sides along x, y, z, mm.
-    """
+    """A box with the sides `size` (3,) along x, y, z, mm."""
 
     size: Vector
 
@@ -459,6 +364,8 @@ class Box(Shape):
 
     def _check(self) -> None:
         self._set("size", _positive_numbers(self.size, "size", 3))
+        a, b, c = (side / 2 for side in self.size)
+        self._set_size((a, b, c), math.hypot(a, b, c), 8 * a * b * c)
 
     def _distance(self, points: Real) -> Real:
         half = np.array(self.half_box, points.dtype)[:, None]
@@ -467,21 +374,6 @@ class Box(Shape):
     def _intervals(self, starts: Points, directions: Points) -> Interval:
         x, y, z = (between(starts[i], directions[i], half) for i, half in enumerate(self.half_box))
         return common(common(x, y), z)
-
-    @property
-    def _volume(self) -> float:
-        return 8 * math.prod(self.half_box)
-
-    @property
-    def half_box(self) -> tuple[float, float, float]:
-        """As of `Shape`."""
-        a, b, c = self.size
-        return a / 2, b / 2, c / 2
-
-    @property
-    def ball_radius(self) -> float:
-        """As of `Shape`."""
-        return math.hypot(*self.half_box)
 
     def _surface(self) -> Surface:
         a, b, half = self.half_box

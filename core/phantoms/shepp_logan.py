@@ -39,17 +39,9 @@ class SheppLogan(Phantom):
     of 10 degrees, which would turn the ventricles about z a second time. Kak and Slaney's own ellipsoids for three
     dimensions differ. Modified values: P. Toft, "The Radon Transform", thesis, 1996, p. 199.
 
-    Attributes
-    ----------
-    half_size : float
-        The tables' unit of length, mm: the head measures 1.38 x 1.84 x 1.62 of it.
-    activity : float
-        kBq/mL where the table says 1: the skull of the modified phantom.
-    mu : float
-        1/mm where the original's density is 1; water's by default.
-    contrast : str
-        Of the activity: ``"modified"`` (visible) or ``"original"`` (1 % between the parts of the brain). The mu always
-        has the original densities.
+    The head measures 1.38 x 1.84 x 1.62 of `half_size`. The contrast of the activity is ``"modified"`` (visible) or
+    ``"original"`` (1 % between the parts of the brain); mu always has the original densities.
+    The fields say what each setting is, and its unit.
     """
 
     half_size: float = setting(75.0, "mm", "the unit of the tables: the head is 1.84 times as long")

@@ -10,7 +10,6 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..errors import InputError
 from ..physics.materials import attenuation
@@ -23,8 +22,12 @@ from .shapes import Cylinder, Ellipsoid, Shape
 # Rows: the heart's lateral, anterior and apical axis in the torso, after its third, second and first axis in M. Cristy and
 # K. F. Eckerman, ORNL/TM-8381 (1987), whose x and y point to the patient's left and back. Not confirmed.
 _HEART = np.array([[-0.5736, -0.8191, 0.0], [-0.4640, 0.3249, 0.8241], [-0.6751, 0.4727, -0.5664]])
+_U, _, _V = np.linalg.svd(_HEART)
+_AXES = _U @ _V  # orthonormal: the digits above are rounded to four
+# phi, theta, psi of `euler_pose` that turn x, y, z to lateral, anterior, apical.
+_EULER = (math.atan2(_AXES[2, 1], _AXES[2, 0]), math.acos(_AXES[2, 2]), math.atan2(_AXES[1, 2], -_AXES[0, 2]))
 # Where ORNL/TM-8381's axis (x, y) and its height 0 lie from the left ventricle's middle, mm: chosen.
-_AXIS, _HEIGHT = (35.0, -30.0), 490.0
+_MIDLINE, _HEIGHT = (35.0, -30.0), 490.0
 _SYSTOLE = 0.35  # of the cycle
 _RV_WALL = 4.0  # mm
 _TRUNK = 4  # lungs, liver and spine, whose sizes are fixed
@@ -51,30 +54,9 @@ class CardiacTorso(Phantom):
     arms, breasts and other organs are left out.
 
     The activities are choices for rest, an hour after 1 GBq: 1.2 % of it in the heart (sestamibi's prescribing
-    information) is about 90 kBq/mL in 133 g; the other organs are set to ratios seen in clinical images.
-
-    Attributes
-    ----------
-    phase : float
-        Of the heart's cycle: 0 at end-diastole, 0.35 at end-systole, below 1.
-    end_diastolic_volume, end_systolic_volume : float
-        Of the left ventricle's cavity, mL.
-    ventricle_length, wall : float
-        Of the cavity from base to apex, and of the wall, at end-diastole, mm.
-    shortening : float
-        Fraction by which the length shortens until end-systole.
-    defect_severity : float
-        Fraction of the muscle's activity that is missing in the defect, 0 (no defect) to 1.
-    defect_angle_degrees, defect_width_degrees : float
-        The defect's middle, 0 anterior, 90 lateral, 180 inferior, 270 septal; and its full angular width.
-    defect_from, defect_to : float
-        Where along the muscle it begins and ends, 0 the base, 1 the apex.
-    defect_transmural : float
-        Fraction of the wall, from the inside, that it takes.
-    body_radii : (2,)
-        Half axes of the body, left-right and front-back, mm.
-    myocardium, right_myocardium, blood, liver, lung, body : float
-        Activities, kBq/mL; the body's also in the spine.
+    information) is about 90 kBq/mL in 133 g; the other organs are set to ratios seen in clinical images; the spine has
+    the body's.
+    The fields say what each setting is, and its unit.
     """
 
     phase: float = setting(0.0, "of the cycle", "0 at end-diastole, 0.35 at end-systole, below 1", 0.0)
@@ -101,22 +83,26 @@ class CardiacTorso(Phantom):
 
     def __post_init__(self) -> None:
         check_settings(self, self.title)
-        for name, most in (
-            ("phase", 1.0),
-            ("shortening", 0.9),
-            ("defect_severity", 1.0),
-            ("defect_width_degrees", 360.0),
-            ("defect_to", 1.0),
-            ("defect_transmural", 1.0),
-            ("end_systolic_volume", self.end_diastolic_volume),
-            ("defect_from", self.defect_to),
-        ):
+        below = {"phase": 1.0, "defect_from": self.defect_to}
+        at_most = {"shortening": 0.9, "defect_width_degrees": 360.0, "end_systolic_volume": self.end_diastolic_volume}
+        at_most |= dict.fromkeys(("defect_severity", "defect_to", "defect_transmural"), 1.0)
+        for name, most in {**at_most, **below}.items():
             value = getattr(self, name)
-            if value > most or (value == most and name in ("phase", "defect_from")):
-                below = "less than" if name in ("phase", "defect_from") else "at most"
-                raise InputError(f"{self.title}: {name.replace('_', ' ')}: expected {below} {most:g}, got {value:g}")
+            if value > most or (value == most and name in below):
+                limit = f"{'less than' if name in below else 'at most'} {most:g}"
+                raise InputError(f"{self.title}: {name.replace('_', ' ')}: expected {limit}, got {value:g}")
         super().__post_init__()  # it makes the shapes, whose messages would not name the setting
-        self._require_in_body()
+        body, *organs = self.shapes
+        for i, organ in enumerate(organs):
+            points = next(points_inside(Layer(organ, organ.pose, 0.0))) - body.pose[:3, 3:]
+            if np.any(body.distance(points) > 0):
+                settings = (
+                    f"body radii of {self.body_radii[0]:g} and {self.body_radii[1]:g} mm"
+                    if i < _TRUNK
+                    else f"ventricle length of {self.ventricle_length:g} mm, wall of {self.wall:g} mm and end diastolic "
+                    f"volume of {self.end_diastolic_volume:g} mL"
+                )
+                raise InputError(f"{self.title}: {settings}: the {organ.name} reaches out of the body")
 
     def beating(self, frames: int) -> list[CardiacTorso]:
         """The torso at as many phases, evenly spaced over the cycle, the first at end-diastole."""
@@ -134,58 +120,41 @@ class CardiacTorso(Phantom):
         """Body, lungs, liver, spine, atria, right ventricle, left ventricle with its defect."""
         return [*self._trunk(), *self._heart()]
 
-    def _require_in_body(self) -> None:
-        """Raise `InputError` if an organ reaches out of the body, as seen at points of it."""
-        body, *organs = self.shapes
-        for i, organ in enumerate(organs):
-            points = next(points_inside(Layer(organ, organ.pose, 0.0))) - body.pose[:3, 3:]
-            if np.any(body.distance(points) > 0):
-                settings = (
-                    f"body radii of {self.body_radii[0]:g} and {self.body_radii[1]:g} mm"
-                    if i < _TRUNK
-                    else f"ventricle length of {self.ventricle_length:g} mm, wall of {self.wall:g} mm and end diastolic "
-                    f"volume of {self.end_diastolic_volume:g} mL"
-                )
-                raise InputError(f"{self.title}: {settings}: the {organ.name} reaches out of the body")
-
     @property
     def _contraction(self) -> float:
         """0 at end-diastole, 1 at end-systole."""
-        if self.phase < _SYSTOLE:
-            return 0.5 - 0.5 * math.cos(math.pi * self.phase / _SYSTOLE)
-        return 0.5 + 0.5 * math.cos(math.pi * (self.phase - _SYSTOLE) / (1 - _SYSTOLE))
+        after = self.phase - _SYSTOLE
+        return 0.5 + 0.5 * math.cos(math.pi * after / (_SYSTOLE if after < 0 else 1 - _SYSTOLE))
 
     def _trunk(self) -> list[Shape]:
         def at(x: float, y: float, z: float) -> tuple[float, float, float]:
-            return x + _AXIS[0], y + _AXIS[1], z - _HEIGHT
+            return x + _MIDLINE[0], y + _MIDLINE[1], z - _HEIGHT
 
         soft, lung, bone = (attenuation(name, self.mu_energy) for name in ("soft tissue", "lung", "vertebra"))
         # The liver lies below the plane x/350 + y/450 - z/430 = -1, x and y to the left and back, here about z = 350.
         plane = np.array([-1 / 350, -1 / 450, -1 / 430])
         liver = [(*plane, (350 / 430 - 1) / float(np.linalg.norm(plane)))]
+        holds: dict[str, Any] = {"activity": self.liver, "mu": soft}
         lungs: dict[str, Any] = {"radii": (50, 75, 240), "cut": [(0, 0, -1, 0)], "activity": self.lung, "mu": lung}
         body: dict[str, Any] = {"height": 440, "activity": self.body}
         return [
             Cylinder(name="body", radius=self.body_radii, position=at(0, 0, 460), mu=soft, **body),
             Ellipsoid(name="right lung", position=at(85, 0, 435), **lungs),
             Ellipsoid(name="left lung", position=at(-85, 0, 435), **lungs),
-            Cylinder(
-                name="liver",
-                radius=(150, 80),
-                height=160,
-                position=at(0, 0, 350),
-                cut=liver,
-                activity=self.liver,
-                mu=soft,
-            ),
+            Cylinder(name="liver", radius=(150, 80), height=160, position=at(0, 0, 350), cut=liver, **holds),
             Cylinder(name="spine", radius=(20, 25), position=at(0, -70, 460), mu=bone, **body),
         ]
 
     def _heart(self) -> list[Shape]:
-        muscle, cavity = self._muscle_volume, self.ventricle_volume * 1e3
+        cavity, full = self.ventricle_volume * 1e3, self.end_diastolic_volume * 1e3  # mm^3
+        widest = _radius(full, self.ventricle_length) + self.wall
+        muscle = 2 / 3 * math.pi * widest**2 * (self.ventricle_length + self.wall) - full  # the same at every phase
         length = self.ventricle_length * (1 - self.shortening * self._contraction)
         radius = _radius(cavity, length)
-        wall = _wall(radius, length, cavity + muscle)
+        # The wall w with which half an ellipsoid of radius + w and length + w holds both.
+        product = 1.5 * (cavity + muscle) / math.pi
+        roots = np.roots([1.0, 2 * radius + length, radius**2 + 2 * radius * length, radius**2 * length - product])
+        wall = float(roots.real.max())  # the only positive one
         # The apex stays where it is; at end-diastole the origin is halfway between it and the base.
         base = (self.ventricle_length + self.wall) / 2 - length - wall
         soft = attenuation("soft tissue", self.mu_energy)
@@ -193,38 +162,24 @@ class CardiacTorso(Phantom):
 
         def half(name: str, *radii: float, right: float = 0.0, cut: Sequence = (), **holds: Any) -> Shape:
             """The apical half of an ellipsoid whose middle lies at the base, `right` mm towards the right ventricle."""
-            place: dict[str, Any] = {"position": _in_torso(-right, 0, base), "euler": _euler_angles()}
+            place: dict[str, Any] = {"position": np.array([-right, 0, base]) @ _AXES, "euler": _EULER}
             return Ellipsoid(name=name, radii=radii, cut=[(0, 0, -1, 0), *cut], **place, **holds)
 
         beat = (self.ventricle_volume / self.end_diastolic_volume) ** (1 / 3)
         right = [30.0 * beat, 36.0 * beat, 66.0 * beat]
-        layer = self.defect_transmural * wall
-        defect = [
-            half(
-                "defect", radius + layer, radius + layer, length + layer, cut=planes,
-                activity=(1 - self.defect_severity) * self.myocardium,
-            )
-            for planes in self._defect_planes(length + wall)
-        ]  # fmt: skip
+        layer, left = self.defect_transmural * wall, (1 - self.defect_severity) * self.myocardium
+        depth = (radius + layer, radius + layer, length + layer)
+        pieces = self._defect_planes(length + wall)
         outer = (radius + wall, radius + wall, length + wall)
         right_outer = [r + _RV_WALL for r in right]
         return [
-            Ellipsoid(
-                name="atria", radii=(35, 35, 28), position=_in_torso(-8, 0, base - 20), euler=_euler_angles(), **blood
-            ),
+            Ellipsoid(name="atria", radii=(35, 35, 28), position=(-8, 0, base - 20) @ _AXES, euler=_EULER, **blood),
             half("right myocardium", *right_outer, right=26.0, activity=self.right_myocardium, mu=soft),
             half("right ventricle", *right, right=26.0, **blood),
             half("myocardium", *outer, activity=self.myocardium, mu=soft),
-            *defect,
+            *(half("defect", *depth, cut=planes, activity=left) for planes in pieces),
             half("left ventricle", radius, radius, length, **blood),
         ]
-
-    @property
-    def _muscle_volume(self) -> float:
-        """mm^3 of the left ventricle's muscle, at every phase."""
-        full = self.end_diastolic_volume * 1e3
-        radius = _radius(full, self.ventricle_length) + self.wall
-        return 2 / 3 * math.pi * radius**2 * (self.ventricle_length + self.wall) - full
 
     def _defect_planes(self, length: float) -> list[list[tuple[float, float, float, float]]]:
         """Planes around each convex piece of the defect, in the heart's frame; beyond 180 degrees there are two pieces."""
@@ -246,26 +201,3 @@ class CardiacTorso(Phantom):
 def _radius(volume: float, length: float) -> float:
     """Radius, mm, of half an ellipsoid of `volume` mm^3 and `length` mm."""
     return math.sqrt(1.5 * volume / (math.pi * length))
-
-
-def _wall(radius: float, length: float, volume: float) -> float:
-    """Thickness w, mm, with which half an ellipsoid of `radius + w` and `length + w` has `volume` mm^3."""
-    product = 1.5 * volume / math.pi
-    roots = np.roots([1.0, 2 * radius + length, radius**2 + 2 * radius * length, radius**2 * length - product])
-    return float(roots.real.max())  # the only positive one
-
-
-def _in_torso(lateral: float, anterior: float, apical: float) -> NDArray[np.float64]:
-    return np.array([lateral, anterior, apical]) @ _heart_axes()
-
-
-def _euler_angles() -> tuple[float, float, float]:
-    """phi, theta, psi of `euler_pose` that turn x, y, z to lateral, anterior, apical."""
-    turn = _heart_axes().T
-    return math.atan2(turn[1, 2], turn[0, 2]), math.acos(turn[2, 2]), math.atan2(turn[2, 1], -turn[2, 0])
-
-
-def _heart_axes() -> NDArray[np.float64]:
-    """`_HEART` made orthonormal: its digits are rounded to four."""
-    u, _, v = np.linalg.svd(_HEART)
-    return u @ v

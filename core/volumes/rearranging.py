@@ -15,26 +15,19 @@ from .volume import Volume, outside_value
 
 
 def crop(volume: Volume, start: ArrayLike, stop: ArrayLike) -> Volume:
-    """The part from index `start` (3,) up to, but without, `stop` (3,); its place in the world stays the same.
-
-    `InputError` if the part is empty or reaches beyond the grid.
-    """
+    """The part from index `start` (3,) up to, but without, `stop` (3,); its place in the world stays the same."""
     instance(volume, Volume, "crop")
     low, high = _indices(start, "crop start"), _indices(stop, "crop stop")
     shape = np.array(volume.grid.shape)
     if np.any(low < 0) or np.any(high > shape) or np.any(low >= high):
-        raise InputError(
-            f"crop: from {low.tolist()} to {high.tolist()} is no part of {' x '.join(map(str, shape))} voxels"
-        )
+        whole = " x ".join(map(str, shape))
+        raise InputError(f"crop: from {low.tolist()} to {high.tolist()} is no part of {whole} voxels")
     part = tuple(slice(a, b) for a, b in zip(low, high, strict=True))
     return _moved(volume, volume.array[part], low)
 
 
 def crop_to_box(volume: Volume, low: ArrayLike, high: ArrayLike) -> Volume:
-    """The smallest part that holds all of the volume inside the box from `low` (3,) to `high` (3,), world mm.
-
-    `InputError` if the box is empty or does not meet the volume.
-    """
+    """The smallest part that holds all of the volume inside the box from `low` (3,) to `high` (3,), world mm."""
     instance(volume, Volume, "crop_to_box")
     low, high = real_array(low, "box", (3,)), real_array(high, "box", (3,))
     if np.any(low >= high):
@@ -79,8 +72,8 @@ def canonical(volume: Volume) -> Volume:
             array = np.flip(array, axis)
             affine[:3, 3] += affine[:3, axis] * (array.shape[axis] - 1)
             affine[:3, axis] *= -1
-    n_x, n_y, n_z = array.shape
-    return Volume(freeze(np.array(array, order="C")), Grid((n_x, n_y, n_z), affine), volume.quantity)
+    grid = Grid(array.shape, affine)  # type: ignore[arg-type]
+    return Volume(freeze(np.array(array, order="C")), grid, volume.quantity)
 
 
 def centered(volume: Volume, point: ArrayLike = (0.0, 0.0, 0.0)) -> Volume:
@@ -94,21 +87,8 @@ def centered(volume: Volume, point: ArrayLike = (0.0, 0.0, 0.0)) -> Volume:
 def split_labels(volume: Volume, labels: Volume | NDArray) -> dict[int, Volume]:
     """One volume for each label, with the values where `labels` has that label, and elsewhere 0, or -1000 for CT numbers.
 
-    Parameters
-    ----------
-    volume
-    labels
-        Whole numbers: a volume on the same grid, or an array of its shape.
-
-    Returns
-    -------
-    dict
-        Volumes by label; 0, usually the background, is included.
-
-    Raises
-    ------
-    InputError
-        The grid or shape differs, or labels are not whole numbers.
+    `labels` are whole numbers: a volume on the same grid, or an array of its shape. Label 0, usually the background, is
+    included.
     """
     instance(volume, Volume, "split_labels")
     if isinstance(labels, Volume):
@@ -144,5 +124,4 @@ def _moved(volume: Volume, array: NDArray[np.float32], start: NDArray[np.int64])
     """`array` as a volume whose first voxel has the index `start` in `volume`."""
     affine = volume.grid.affine.copy()
     affine[:3, 3] += affine[:3, :3] @ start
-    n_x, n_y, n_z = array.shape
-    return Volume(array, Grid((n_x, n_y, n_z), affine), volume.quantity)
+    return Volume(array, Grid(array.shape, affine), volume.quantity)  # type: ignore[arg-type]

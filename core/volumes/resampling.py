@@ -14,6 +14,7 @@ from ..progress import Progress
 from ..validation import freeze, instance, real_array
 from .volume import Volume, outside_value
 
+Floats = NDArray[np.float32]
 # For n voxels of the new grid along an axis: indices of the old grid and their weights, (n, taps) each.
 _Taps = tuple[NDArray[np.int64], NDArray[np.float32]]
 
@@ -38,38 +39,28 @@ def resample(
         Value outside the old grid. Default: 0, or -1000 for CT numbers.
     progress
         Called as ``progress(done, total)`` between slabs; may raise `Cancelled`.
-
-    Raises
-    ------
-    InputError
-        Not a volume or a grid, an unknown method, or the new volume does not fit into memory.
     """
     if method not in ("linear", "nearest", "mean"):
         raise InputError(f"method {method!r}: expected linear, nearest or mean")
     instance(volume, Volume, "resample")
     instance(grid, Grid, "resample")
     background = np.float32(outside_value(volume) if outside is None else float(real_array(outside, "outside", ())))
-    require(4.5 * grid.n_voxels, "a volume of {} x {} x {} voxels".format(*grid.shape))
+    copied = 4 * volume.grid.n_voxels if background else 0
+    require(4.5 * grid.n_voxels + copied, "a volume of {} x {} x {} voxels".format(*grid.shape))
     index_from_index = volume.grid.index_from_world @ grid.affine  # index in the old grid from index in the new one
     result = np.empty(grid.shape, np.float32)
-    fill = _along_axes if _is_parallel(index_from_index) else _at_points
-    fill(volume.array, background, index_from_index, method, result, progress or (lambda done, total: None))
+    along = np.abs(index_from_index[:3, :3]) > _PARALLEL
+    is_parallel = (along.sum(axis=0) == 1).all() and (along.sum(axis=1) == 1).all()  # each new axis to one old axis
+    fill = _along_axes if is_parallel else _at_points
+    # Outside the array the samples are 0: with the background taken off before, and added after.
+    array = volume.array - background if background else volume.array
+    fill(array, index_from_index, method, result, progress or (lambda done, total: None))
+    result += background
     return Volume(freeze(result), grid, volume.quantity)
 
 
-def _is_parallel(index_from_index: NDArray[np.float64]) -> bool:
-    """Whether each new axis runs along one old axis."""
-    along = np.abs(index_from_index[:3, :3]) > _PARALLEL
-    return bool((along.sum(axis=0) == 1).all() and (along.sum(axis=1) == 1).all())
-
-
 def _along_axes(
-    array: NDArray[np.float32],
-    background: np.float32,
-    index_from_index: NDArray[np.float64],
-    method: str,
-    result: NDArray[np.float32],
-    progress: Callable[[int, int], None],
+    array: Floats, index_from_index: NDArray[np.float64], method: str, result: Floats, progress: Progress
 ) -> None:
     """Fill `result`, one axis after the other."""
     old_axes = np.abs(index_from_index[:3, :3]).argmax(axis=0)  # the old axis of each new one
@@ -82,22 +73,13 @@ def _along_axes(
     slab = max(1, _SLAB // plane)
     for first in range(0, result.shape[0], slab):
         part = slice(first, first + slab)
-        index, weight = taps[0]
-        values = _apply(array, background, (index[part], weight[part]), 0)
-        for axis in (1, 2):
-            values = _apply(values, np.float32(0), taps[axis], axis)
-        result[part] = values + background
+        values = array
+        for axis, (index, weight) in enumerate(taps):
+            columns = slice(None) if axis else part
+            weights = np.expand_dims(weight[columns].T, tuple({1, 2, 3} - {axis + 1}))
+            values = sum(np.take(values, i, axis) * w for i, w in zip(index[columns].T, weights, strict=True))
+        result[part] = values
         progress(min(first + slab, result.shape[0]), result.shape[0])
-
-
-def _apply(array: NDArray[np.float32], background: np.float32, taps: _Taps, axis: int) -> NDArray[np.float32]:
-    """Weighted sums of ``array - background`` along one axis."""
-    index, weight = taps
-    shape = [1, 1, 1]
-    shape[axis] = len(index)
-    return sum(
-        (np.take(array, i, axis) - background) * w.reshape(shape) for i, w in zip(index.T, weight.T, strict=True)
-    )
 
 
 def _nearest_taps(at: NDArray[np.float64], step: float, n: int) -> _Taps:
@@ -128,12 +110,7 @@ _TAPS = {"nearest": _nearest_taps, "linear": _linear_taps, "mean": _mean_taps}
 
 
 def _at_points(
-    array: NDArray[np.float32],
-    background: np.float32,
-    index_from_index: NDArray[np.float64],
-    method: str,
-    result: NDArray[np.float32],
-    progress: Callable[[int, int], None],
+    array: Floats, index_from_index: NDArray[np.float64], method: str, result: Floats, progress: Progress
 ) -> None:
     """Fill `result` from sample points: its voxels' centres, or several points in each voxel for means."""
     linear, origin = index_from_index[:3, :3], index_from_index[:3, 3]
@@ -152,19 +129,17 @@ def _at_points(
             points = in_plane[:, part] + (linear[:, 0] * i)[:, None]
             total = np.zeros(points.shape[1], np.float32)
             for shift in shifts:
-                total += _samples(array, background, points + shift[:, None], taps)
-            values[part] = total / len(shifts) + background
+                total += _samples(array, points + shift[:, None], taps)
+            values[part] = total / len(shifts)
         progress(i + 1, len(result))
 
 
-def _samples(
-    array: NDArray[np.float32], background: np.float32, points: NDArray[np.float64], taps: Callable[..., _Taps]
-) -> NDArray[np.float32]:
-    """``array - background`` at index coordinates `points` (3, N), from the voxels and weights of `taps`; 0 outside."""
+def _samples(array: Floats, points: NDArray[np.float64], taps: Callable[..., _Taps]) -> Floats:
+    """The array at index coordinates `points` (3, N), from the voxels and weights of `taps`; 0 outside."""
     (x, x_weight), (y, y_weight), (z, z_weight) = (
         [part.T.copy() for part in taps(at, 1.0, n)] for at, n in zip(points, array.shape, strict=True)
     )
     total = np.zeros(points.shape[1], np.float32)
     for i, j, k in np.ndindex(len(x), len(y), len(z)):
-        total += x_weight[i] * y_weight[j] * z_weight[k] * (array[x[i], y[j], z[k]] - background)
+        total += x_weight[i] * y_weight[j] * z_weight[k] * array[x[i], y[j], z[k]]
     return total

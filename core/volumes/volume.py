@@ -40,18 +40,9 @@ _CONVERT = (
 class Volume:
     """Voxel values on a grid. Outside the grid they are 0.
 
-    Attributes
-    ----------
-    array : float32 array (n_x, n_y, n_z)
-        Indexed ``[ix, iy, iz]``, C order, read-only. A read-only float32 array in C order is kept, any other is copied.
-    grid : Grid
-    quantity : str
-        ``"activity"`` (kBq/mL), ``"mu"`` (1/mm), ``"hu"``, or another of `UNITS`.
-
-    Raises
-    ------
-    InputError
-        The array's shape is not the grid's, a value is not finite, or the quantity is unknown.
+    The float32 `array` (n_x, n_y, n_z) is read-only, in C order, and indexed ``[ix, iy, iz]``; one that is so already is
+    kept, any other is copied. The `quantity` is ``"activity"`` (kBq/mL), ``"mu"`` (1/mm), ``"hu"``, or another of
+    `UNITS`. `InputError` if the array's shape is not the grid's, or a value is not finite.
     """
 
     array: NDArray[np.float32]
@@ -62,8 +53,10 @@ class Volume:
         instance(self.grid, Grid, "volume")
         if self.quantity not in UNITS:
             raise InputError(f"quantity {self.quantity!r}: expected one of {', '.join(UNITS)}")
-        if _is_kept(self.array, self.grid.shape):
-            require_finite(self.array, "volume")
+        given = self.array
+        fits = isinstance(given, np.ndarray) and (given.dtype, given.shape) == (np.float32, self.grid.shape)
+        if fits and given.flags.c_contiguous and not given.flags.writeable:
+            require_finite(given, "volume")
             return
         with np.errstate(over="ignore"):  # what overflows float32 is refused as not finite
             object.__setattr__(self, "array", freeze(real_array(self.array, "volume", self.grid.shape, np.float32)))
@@ -84,12 +77,3 @@ def require_quantity(quantity: str, taken: Sequence[str], name: str) -> None:
 def outside_value(volume: Volume) -> float:
     """Default value outside the grid when a volume is resampled or padded: -1000 for CT numbers, else 0."""
     return AIR_HU if volume.quantity == "hu" else 0.0
-
-
-def _is_kept(array: object, shape: tuple[int, int, int]) -> bool:
-    return (
-        isinstance(array, np.ndarray)
-        and (array.dtype, array.shape) == (np.float32, shape)
-        and array.flags.c_contiguous
-        and not array.flags.writeable
-    )

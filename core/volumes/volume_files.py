@@ -47,7 +47,7 @@ def read_volume(
 ) -> Volume:
     """Read a volume from NIfTI, a DICOM series or tomogram, MetaImage, NRRD, Analyze, HDF5, .npz or .npy.
 
-    World axes are always NIfTI's, RAS. docs/volumes.md describes the formats and conventions.
+    World axes are always NIfTI's, RAS. docs/volumes.md describes the formats and conventions, and what is refused.
 
     Parameters
     ----------
@@ -62,13 +62,6 @@ def read_volume(
         Number, description or UID of one of several DICOM series in the folder.
     progress
         Called as ``progress(done, total)`` with the slices of a DICOM series; may raise `Cancelled`.
-
-    Raises
-    ------
-    InputError
-        The file does not exist, is damaged, not 3-D, not finite, in another unit or too large for the memory; a DICOM
-        series is not unique, or slices are missing, duplicate, inconsistent or tilted; a nuclear medicine file is not a
-        single reconstructed tomogram.
     """
     path = Path(path)
     contents = _contents(path, series, progress)
@@ -88,10 +81,9 @@ def read_volume_of(
     series: str | None = None,
     progress: Progress | None = None,
 ) -> Volume:
-    """Read a volume that has to hold `quantity`; a file that does not say what it holds is taken for that.
+    """Read a volume that has to hold `quantity`, as `read_volume` does; a file that does not say so is taken for that.
 
-    Parameters and errors are as in `read_volume`. A file that says another quantity is refused; `advice` ends the
-    message.
+    A file that says another quantity is refused; `advice` ends the message.
     """
     path = Path(path)
     contents = _contents(path, series, progress)
@@ -102,13 +94,7 @@ def read_volume_of(
 
 
 def write_volume(volume: Volume, path: str | os.PathLike[str]) -> None:
-    """Write a volume as NIfTI (.nii, .nii.gz; its affine is rounded to float32), .npz, .nrrd or .h5 (exact).
-
-    Raises
-    ------
-    InputError
-        Not a volume, another ending, or the file cannot be written.
-    """
+    """Write a volume as NIfTI (.nii, .nii.gz; its affine is rounded to float32), .npz, .nrrd or .h5 (exact)."""
     path = Path(path)
     write = _WRITERS.get(_ending(path, VOLUME_FORMATS))
     if write is None:
@@ -129,7 +115,16 @@ def _naming(path: Path) -> Iterator[None]:
 
 def _contents(path: Path, series: str | None, progress: Progress | None) -> Contents:
     """What the file or folder at `path` holds."""
-    _require_readable(path)
+    try:  # libraries say little about files that cannot be opened
+        path.stat()
+        if path.is_file():
+            path.open("rb").close()
+    except FileNotFoundError:
+        raise InputError(f"{path}: no such file") from None
+    except (OSError, ValueError) as error:  # an impossible name is a ValueError
+        raise InputError(f"{path}: {getattr(error, 'strerror', None) or error}") from None
+    if not (path.is_file() or path.is_dir()):  # reading a pipe would block
+        raise InputError(f"{path}: neither a file nor a folder")
     ending = _ending(path, READ_FORMATS)
     is_series = path.is_dir() or ending == ".dcm" or (not ending and dicom.is_dicom(path))
     with _naming(path):
@@ -146,20 +141,6 @@ def _contents(path: Path, series: str | None, progress: Progress | None) -> Cont
         except Exception as error:  # whatever a library raises on a damaged file
             kind = "DICOM" if is_series else ending
             raise InputError(f"cannot be read as {kind} ({first_line(error)})") from error
-
-
-def _require_readable(path: Path) -> None:
-    """Raise `InputError` unless `path` is a file or folder that may be read; libraries say little about that."""
-    try:
-        path.stat()
-        if path.is_file():
-            path.open("rb").close()
-    except FileNotFoundError:
-        raise InputError(f"{path}: no such file") from None
-    except (OSError, ValueError) as error:  # an impossible name is a ValueError
-        raise InputError(f"{path}: {getattr(error, 'strerror', None) or error}") from None
-    if not (path.is_file() or path.is_dir()):  # reading a pipe would block
-        raise InputError(f"{path}: neither a file nor a folder")
 
 
 def _ending(path: Path, endings: tuple[str, ...]) -> str:

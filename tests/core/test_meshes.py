@@ -139,7 +139,7 @@ def test_meshes_are_taken_as_paths_arrays_and_trimeshes(tmp_path):
     scene = trimesh.Scene([mesh])
     for given in (mesh, scene, (mesh.vertices, mesh.faces), tmp_path / "m.stl", str(tmp_path / "m.stl"), [mesh]):
         assert content(mph.voxelize_mesh(given, grid)) == pytest.approx(64)
-    turned = mph.Mesh(mesh.vertices, mesh.faces).transformed(np.diag([2.0, 1, -1, 1]))
+    turned = mph.Mesh(mesh.vertices * [2, 1, -1], mesh.faces)
     assert content(mph.voxelize_mesh(turned, mph.Grid.centered(10, 1.0))) == pytest.approx(128)
 
 

@@ -298,7 +298,7 @@ def test_files_that_are_no_text_are_refused(tmp_path):
         mph.read_phantom(tmp_path / "b.toml")
     with pytest.raises(mph.InputError, match=r"ending in \.toml"):
         mph.write_phantom(PAINTING, tmp_path / "a.yaml")
-    with pytest.raises(mph.InputError, match="expected a phantom, got int"):
+    with pytest.raises(mph.InputError, match="expected a Phantom, got int"):
         mph.write_phantom(3, tmp_path / "a.toml")
 
 
@@ -361,7 +361,7 @@ def test_files_that_are_no_text_are_refused(tmp_path):
         (lambda: PAINTING.line_integrals(np.zeros((2, 3)), np.zeros((3, 3))), "2 sources but 3 targets"),
         (lambda: PAINTING.line_integrals(np.zeros((2, 2)), np.zeros((2, 3))), "sources: expected shape"),
         (lambda: PAINTING.line_integrals([[0, 0, 0], [0]], np.zeros((2, 3))), "sources: expected real numbers"),
-        (lambda: PAINTING.project(None), "project: expected Views, got NoneType"),
+        (lambda: PAINTING.project(None), "project: expected a Views, got NoneType"),
         (lambda: mph.Cylinder(radius=[[1], [2, 3]], height=1, mu=1), "radius: expected real numbers"),
         (lambda: mph.Sphere(radius=1, mu=1, cut=[[1, 0, 0], [0]]), "cut: expected real numbers"),
         (lambda: mph.random_pose(1, box=[[1], [2, 3]]), "box of random poses: expected real numbers"),

@@ -28,20 +28,10 @@ RAS_FROM_LPS = np.diag([-1.0, -1.0, 1.0, 1.0])
 
 @dataclass(frozen=True)
 class Contents:
-    """A file's voxels.
-
-    Attributes
-    ----------
-    array : array (n_x, n_y, n_z)
-        The values, of any real type.
-    affine : array (4, 4) or None
-        Index to world mm, or None if the file does not say.
-    quantity, unit : str or None
-        Those of the values, if the file says them.
-    """
+    """A file's voxels: values (n_x, n_y, n_z) of any real type, and what the file says about them, or None."""
 
     array: NDArray[Any]
-    affine: NDArray[np.float64] | None
+    affine: NDArray[np.float64] | None  # index to world mm, (4, 4)
     quantity: str | None = None
     unit: str | None = None
 
@@ -53,10 +43,9 @@ class Contents:
         expected = UNITS.get(self.quantity or quantity)
         if self.unit and expected and self.unit != expected:
             raise InputError(f"its values are in {self.unit}; expected {expected} for {self.quantity or quantity}")
-        n_x, n_y, n_z = self.array.shape
         with np.errstate(over="ignore"):  # what overflows float32 is refused as not finite
             array = np.ascontiguousarray(self.array, np.float32)
-        return Volume(freeze(array), Grid((n_x, n_y, n_z), self.affine), quantity)
+        return Volume(freeze(array), Grid(self.array.shape, self.affine), quantity)  # type: ignore[arg-type]
 
 
 def require_voxels(shape: Sequence[int], kind: np.dtype[Any]) -> None:

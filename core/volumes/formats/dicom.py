@@ -2,11 +2,13 @@
 
 Classic images (a file for each slice), enhanced, multi-frame images and reconstructed nuclear medicine tomograms, whose
 frames are the slices. Index axes run along a row of pixels, down the rows, and from slice to slice: towards right,
-front or head, whichever is closest to the slices' normal.
+front or head, whichever is closest to the slices' normal. A tomogram gives the place of its first slice and the distance
+between slices (DICOM part 3, C.8.4.11 and C.8.4.15).
 """
 
 from __future__ import annotations
 
+import textwrap
 import warnings
 from collections import defaultdict
 from collections.abc import Iterator
@@ -20,14 +22,25 @@ from numpy.typing import NDArray
 from ...errors import InputError, InputWarning
 from ...progress import Progress
 from .contents import RAS_FROM_LPS, Contents, first_line, require_voxels
-from .dicom_header import directions, numbers
-from .dicom_tomogram import is_nuclear, tomogram_frames
 
 _SAME_ORIENTATION = 1e-4  # direction cosines are written with 6 digits
 _SAME_PLACE = 1e-3  # mm
 _SAME_SPACING = 0.02  # relative; scanners round positions
 _UPRIGHT = 0.01  # tangent of the tilt; 0.6 degrees
+_UPRIGHT_ONLY = "expected upright slices: resample the series first"
 _UNITS = {"BQML": ("activity", 1e-3), "HU": ("hu", 1.0)}
+# Value 3 of ImageType (C.8.4.9.1.1.3).
+_TOMOGRAMS = ("RECON TOMO", "RECON GATED TOMO")
+_OTHERS = {
+    "TOMO": "projections",
+    "GATED TOMO": "gated projections",
+    "STATIC": "planar images",
+    "WHOLE BODY": "planar images",
+    "DYNAMIC": "planar images of several times",
+    "GATED": "gated planar images",
+}
+_NUCLEAR = "1.2.840.10008.5.1.4.1.1.20"
+_BECQUERELS = "bq/ml"  # as UCUM codes it, in lower case
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,17 +81,17 @@ def read(path: Path, series: str | None = None, progress: Progress | None = None
         if len(headers) > 1 and any(_is_whole(header) for _, header in headers):
             names = ", ".join(file.name for file, _ in headers)
             raise InputError(f"its series has several files of several frames each, choose one: {names}")
-        slices = [one for file, header in headers for one in _slices_of(file, header)]
-        slices, step = _ordered(slices)
-        quantity, factor = _quantity(headers[0][1], slices[0].unit)
-        rows, columns = slices[0].shape
+        slices, step = _ordered([one for file, header in headers for one in _slices(file, header)])
+        first, modality = slices[0], headers[0][1].get("Modality")
+        unknown = (f"{modality} in {first.unit}" if first.unit else f"{modality}", 1.0)
+        quantity, factor = ("hu", 1.0) if modality == "CT" else _UNITS.get(first.unit, unknown)
+        rows, columns = first.shape
         require_voxels((columns, rows, len(slices)), np.dtype(np.float32))
         array = np.empty((columns, rows, len(slices)), np.float32)
         for k, (one, pixels) in enumerate(_pixels(slices)):
             array[:, :, k] = (pixels.astype(np.float64) * one.slope + one.intercept).T * factor
             if progress is not None:
                 progress(k + 1, len(slices))
-    first = slices[0]
     affine = np.eye(4)
     affine[:3, 0] = first.orientation[0] * first.spacing[1]
     affine[:3, 1] = first.orientation[1] * first.spacing[0]
@@ -127,9 +140,13 @@ def _headers(path: Path) -> list[tuple[Path, Any]]:
     return list(headers.items())
 
 
+def _is_nuclear(header: Any) -> bool:
+    return header.get("Modality") == "NM" or header.get("SOPClassUID") == _NUCLEAR
+
+
 def _is_whole(header: Any) -> bool:
     """Whether a file alone is a volume: a nuclear medicine image of several frames."""
-    return is_nuclear(header) and int(header.get("NumberOfFrames") or 1) > 1
+    return _is_nuclear(header) and int(header.get("NumberOfFrames") or 1) > 1
 
 
 def _kind(header: Any) -> str:
@@ -142,47 +159,38 @@ def _chosen(headers: list[tuple[Path, Any]], path: Path, series: str | None) -> 
     found: dict[str, list[tuple[Path, Any]]] = defaultdict(list)
     for file, header in headers:
         found[str(header.get("SeriesInstanceUID", ""))].append((file, header))
-    if series is not None:
-        names = ("SeriesNumber", "SeriesDescription", "SeriesInstanceUID")
-        matching = [uid for uid, of in found.items() if str(series) in (str(of[0][1].get(name, "")) for name in names)]
-        if len(matching) == 1:
-            return found[matching[0]]
-        raise InputError(f"{len(matching) or 'no'} series {series!r} in it; there are {_listed(found)}")
-    if len(found) > 1:
-        raise InputError(f"it holds {len(found)} series, choose one: {_listed(found)}")
-    return next(iter(found.values()))
-
-
-def _listed(found: dict[str, list[tuple[Path, Any]]]) -> str:
-    """The series by number, description and count, such as ``3 "Thorax 1.0" (133 images)``."""
-    parts = []
+    if len(found) == 1 and series is None:
+        return headers
+    parts = []  # such as 3 "Thorax 1.0" (133 images)
     for uid, of in found.items():
-        header = of[0][1]
-        number, description = header.get("SeriesNumber"), header.get("SeriesDescription")
+        number, description = of[0][1].get("SeriesNumber"), of[0][1].get("SeriesDescription")
         name = " ".join(str(x) for x in (number, description and f'"{description}"') if x is not None) or uid
         parts.append(f"{name} ({len(of)} images)")
-    return "; ".join(parts)
+    if series is None:
+        raise InputError(f"it holds {len(found)} series, choose one: {'; '.join(parts)}")
+    names = ("SeriesNumber", "SeriesDescription", "SeriesInstanceUID")
+    matching = [of for of in found.values() if str(series) in (str(of[0][1].get(name, "")) for name in names)]
+    if len(matching) != 1:
+        raise InputError(f"{len(matching) or 'no'} series {series!r} in it; there are {'; '.join(parts)}")
+    return matching[0]
 
 
-def _slices_of(path: Path, header: Any) -> list[_Slice]:
+def _slices(path: Path, header: Any) -> list[_Slice]:
     """The images of a file; `InputError` names it."""
     try:
-        return list(_slices(path, header))
+        return list(_slices_of_header(path, header))
     except InputError as error:
         raise InputError(f"{path.name}: {error}") from None
     except Exception as error:  # whatever pydicom raises on a damaged tag; it parses tags on access
         raise InputError(f"{path.name}: cannot be read as DICOM ({first_line(error)})") from None
 
 
-def _slices(path: Path, header: Any) -> Iterator[_Slice]:
-    """The images of a file."""
+def _slices_of_header(path: Path, header: Any) -> Iterator[_Slice]:
     if header.get("SamplesPerPixel", 1) != 1:
         raise InputError(f"expected one value per pixel, found {header.SamplesPerPixel} (a colour image)")
     tilt = float(header.get("GantryDetectorTilt") or 0.0)
     if abs(tilt) > 0.01:
-        raise InputError(
-            f"the gantry is tilted by {tilt:g} degrees; expected upright slices: resample the series first"
-        )
+        raise InputError(f"the gantry is tilted by {tilt:g} degrees; {_UPRIGHT_ONLY}")
     if "ModalityLUTSequence" in header:
         raise InputError("values by a table (ModalityLUTSequence) are not read; expected RescaleSlope")
     count = int(header.get("NumberOfFrames") or 1)
@@ -190,7 +198,7 @@ def _slices(path: Path, header: Any) -> Iterator[_Slice]:
     if len(frames) != count:
         raise InputError(f"{count} frames without a place for each; expected an enhanced image, or one frame")
     for number, frame in enumerate(frames):
-        spacing = numbers(frame, "PixelSpacing", 2)
+        spacing = _numbers(frame, "PixelSpacing", 2)
         if spacing.min() <= 0:
             raise InputError(f"PixelSpacing: expected more than 0 mm, got {spacing.min():g}")
         yield _Slice(
@@ -198,11 +206,11 @@ def _slices(path: Path, header: Any) -> Iterator[_Slice]:
             frame=number,
             shape=(int(header.Rows), int(header.Columns)),
             spacing=(float(spacing[0]), float(spacing[1])),
-            orientation=directions(frame),
-            position=numbers(frame, "ImagePositionPatient", 3),
-            slope=float(numbers(frame, "RescaleSlope", 1, 1.0)[0]),
-            intercept=float(numbers(frame, "RescaleIntercept", 1, 0.0)[0]),
-            thickness=float(numbers(frame, "SliceThickness", 1, 0.0)[0]),
+            orientation=_directions(frame),
+            position=_numbers(frame, "ImagePositionPatient", 3),
+            slope=float(_numbers(frame, "RescaleSlope", 1, 1.0)[0]),
+            intercept=float(_numbers(frame, "RescaleIntercept", 1, 0.0)[0]),
+            thickness=float(_numbers(frame, "SliceThickness", 1, 0.0)[0]),
             unit=str(header.get("Units") or frame.get("RescaleType") or ""),
         )
 
@@ -212,7 +220,7 @@ def _frames(header: Any) -> list[Any]:
     from pydicom.dataset import Dataset
 
     if "PerFrameFunctionalGroupsSequence" not in header:
-        return tomogram_frames(header) if is_nuclear(header) else [header]
+        return _tomogram_frames(header) if _is_nuclear(header) else [header]
     shared = header.get("SharedFunctionalGroupsSequence") or []
     frames = []
     for own in header.PerFrameFunctionalGroupsSequence:
@@ -250,20 +258,16 @@ def _ordered(slices: list[_Slice]) -> tuple[list[_Slice], NDArray[np.float64]]:
     gaps = np.diff(places)
     if gaps.min() < _SAME_PLACE:
         k = int(gaps.argmin())
-        raise InputError(
-            f"{slices[k].name} and {slices[k + 1].name} lie at the same place ({places[k]:g} mm): "
-            "expected one slice at each, of one point in time"
-        )
+        both = f"{slices[k].name} and {slices[k + 1].name} lie at the same place ({places[k]:g} mm)"
+        raise InputError(f"{both}: expected one slice at each, of one point in time")
     usual = float(np.sort(gaps)[(len(gaps) - 1) // 2])
     wrong = np.flatnonzero(np.abs(gaps - usual) > _SAME_SPACING * usual + 0.01)
     if len(wrong):
         k = int(wrong[0])
         missing = round(float(gaps[k]) / usual) - 1
         what = f"{missing} slice{'s' * (missing > 1)} missing" if missing > 0 else "uneven slices"
-        raise InputError(
-            f"{what} between {slices[k].name} and {slices[k + 1].name}: {gaps[k]:g} mm apart at "
-            f"{places[k]:g} mm, the others {usual:g} mm"
-        )
+        what += f" between {slices[k].name} and {slices[k + 1].name}"
+        raise InputError(f"{what}: {gaps[k]:g} mm apart at {places[k]:g} mm, the others {usual:g} mm")
     if usual > 1.5 * first.thickness > 0:
         text = f"the slices are {first.thickness:g} mm thick and lie {usual:g} mm apart: there are gaps between them, "
         warnings.warn(f"{text}or some are missing", InputWarning, stacklevel=2)
@@ -272,23 +276,13 @@ def _ordered(slices: list[_Slice]) -> tuple[list[_Slice], NDArray[np.float64]]:
     sideways = moved - np.outer(moved @ normal, normal)
     tilt = float(np.linalg.norm(sideways[-1]) / (places[-1] - places[0]))
     if tilt > _UPRIGHT:
-        raise InputError(
-            f"the gantry is tilted by {np.degrees(np.arctan(tilt)):.1f} degrees (slices move sideways from "
-            f"{first.name} to {last.name}); expected upright slices: resample the series first"
-        )
+        angle, ends = f"{np.degrees(np.arctan(tilt)):.1f} degrees", f"{first.name} to {last.name}"
+        raise InputError(f"the gantry is tilted by {angle} (slices move sideways from {ends}); {_UPRIGHT_ONLY}")
     off = np.linalg.norm(sideways - np.outer((places - places[0]) / (places[-1] - places[0]), sideways[-1]), axis=1)
     if off.max() > 0.1 * min(first.spacing):
         worst = slices[int(off.argmax())]
         raise InputError(f"{worst.name} lies {off.max():.3g} mm beside the other slices")
     return slices, step
-
-
-def _quantity(header: Any, unit: str) -> tuple[str, float]:
-    """The quantity of the values, and the factor to its unit."""
-    modality = header.get("Modality")
-    if modality == "CT":
-        return "hu", 1.0
-    return _UNITS.get(unit, (f"{modality} in {unit}" if unit else f"{modality}", 1.0))
 
 
 def _pixels(slices: list[_Slice]) -> Iterator[tuple[_Slice, NDArray[Any]]]:
@@ -304,11 +298,104 @@ def _pixels(slices: list[_Slice]) -> Iterator[tuple[_Slice, NDArray[Any]]]:
                 frames = data.pixel_array
             except Exception as error:  # truncated, or compressed by a method that is not installed
                 syntax = data.file_meta.TransferSyntaxUID
+                what = f"cannot be read ({first_line(error)})"
                 if syntax.is_compressed:
-                    raise InputError(
-                        f"{one.name}: its pixels are compressed ({syntax.name}), which cannot be decoded here; "
-                        "install pylibjpeg with its plugins, or save the series without compression"
-                    ) from error
-                raise InputError(f"{one.name}: its pixels cannot be read ({first_line(error)})") from error
+                    what = f"are compressed ({syntax.name}), which cannot be decoded here; install pylibjpeg with its "
+                    what += "plugins, or save the series without compression"
+                raise InputError(f"{one.name}: its pixels {what}") from error
             frames = frames.reshape(-1, *one.shape)
         yield one, frames[one.frame]
+
+
+def _tomogram_frames(header: Any) -> list[dict[str, Any]]:
+    """The description of each slice of a reconstructed tomogram, by the tags of a classic image.
+
+    Slice s lies (s - s_1) SpacingBetweenSlices from the first frame's slice s_1, along the cross product of the
+    directions along the rows and down the columns.
+    """
+    count = int(header.get("NumberOfFrames") or 1)
+    kinds: Any = header.get("ImageType") or ()
+    told = not isinstance(kinds, str) and len(kinds) > 2
+    kind = str(kinds[2]) if told else _TOMOGRAMS[0] if "SliceVector" in header else ""
+    if kind not in _TOMOGRAMS:
+        said = f"ImageType {kind or 'without a third value'}, {count} frame{'s' * (count > 1)}"
+        what = _OTHERS.get(kind, "something else")
+        raise InputError(f"it holds {what} ({said}); expected a reconstructed tomogram (RECON TOMO)")
+    if "SliceVector" in header:
+        slices = _numbers(header, "SliceVector", count)
+        _require_one_volume(header, count, len(np.unique(slices)))
+    else:
+        slices = np.arange(1.0, count + 1)
+        _require_one_volume(header, count, int(header.get("NumberOfSlices") or 0))
+    names = ("PixelSpacing", "SliceThickness", "RescaleType", "RescaleSlope", "RescaleIntercept")
+    shared = {name: header.get(name) for name in names} | _in_becquerels(header)
+    # The standard gives the place to the detector, even in a tomogram.
+    for name in ("ImagePositionPatient", "ImageOrientationPatient"):
+        found = [of.get(name) for of in (*(header.get("DetectorInformationSequence") or ()), header)]
+        shared[name] = next((value for value in found if value), None)
+    first = _numbers(shared, "ImagePositionPatient", 3)
+    normal = np.cross(*_directions(shared))
+    steps = (slices - slices[0]) * (_spacing(header) if count > 1 else 0.0)
+    return [{**shared, "ImagePositionPatient": (first + step * normal).tolist()} for step in steps]
+
+
+def _require_one_volume(header: Any, count: int, slices: int) -> None:
+    """Raise `InputError` unless there is one frame for each of `slices` (0 if the file does not say how many)."""
+    for name, several in (
+        ("TimeSlot", "gated, in {} time slots"),
+        ("RRInterval", "gated, in {} R-R intervals"),
+        ("EnergyWindow", "of {} energy windows"),
+    ):
+        # NumberOf... alone does not tell what the frames are: one tomogram may combine several windows.
+        number = int(header.get(f"NumberOf{name}s") or 1) if slices != count else 1
+        if f"{name}Vector" in header:
+            number = len(np.unique(header.get(f"{name}Vector")))
+        if number > 1:
+            what = f"the tomogram is {several.format(number)} ({count} frames)"
+            raise InputError(f"{what}; expected one volume: save each, or their sum, as a file of its own")
+    if slices not in (0, count):
+        raise InputError(f"{count} frames of {slices} slices; expected one frame of each slice")
+
+
+def _spacing(header: Any) -> float:
+    """Distance from slice to slice along the normal, mm; negative if they run against it."""
+    if header.get("SpacingBetweenSlices") not in (None, ""):
+        return float(_numbers(header, "SpacingBetweenSlices", 1)[0])
+    thickness = float(_numbers(header, "SliceThickness", 1)[0])
+    text = (
+        f"{Path(header.filename).name}: it has no SpacingBetweenSlices: its SliceThickness, {thickness:g} mm, was taken, "
+        "along the normal; check that head and feet are not exchanged"
+    )
+    warnings.warn(text, InputWarning, stacklevel=2)
+    return thickness
+
+
+def _in_becquerels(header: Any) -> dict[str, Any]:
+    """The rescaling of stored values to Bq/mL, if the file gives one (RealWorldValueMappingSequence)."""
+    for item in header.get("RealWorldValueMappingSequence") or ():
+        units = item.get("MeasurementUnitsCodeSequence") or ()
+        if any(str(unit.get("CodeValue")).lower() == _BECQUERELS for unit in units) and "RealWorldValueSlope" in item:
+            slope, intercept = item.RealWorldValueSlope, item.get("RealWorldValueIntercept")
+            return {"RescaleSlope": slope, "RescaleIntercept": intercept, "RescaleType": "BQML"}
+    return {}
+
+
+def _numbers(header: Any, name: str, length: int, default: float | None = None) -> NDArray[np.float64]:
+    """The `length` finite numbers of the tag `name`, or `default` if it is missing or empty."""
+    given = header.get(name)
+    value = default if given is None or given == "" else given
+    if value is None:
+        raise InputError(f"it has no {name}")
+    array = np.array(value, np.float64).reshape(-1)
+    if len(array) != length or not np.isfinite(array).all():
+        raise InputError(f"{name}: expected {length} numbers, got {textwrap.shorten(str(given), 60)}")
+    return array
+
+
+def _directions(header: Any) -> NDArray[np.float64]:
+    """ImageOrientationPatient as two orthonormal rows (2, 3): along a row of pixels, and down the rows."""
+    rows = _numbers(header, "ImageOrientationPatient", 6).reshape(2, 3)
+    if not np.allclose(rows @ rows.T, np.eye(2), atol=1e-3):
+        raise InputError("ImageOrientationPatient: expected two unit vectors at right angles")
+    left, _, right = np.linalg.svd(rows, full_matrices=False)
+    return left @ right  # the nearest orthonormal rows: the file has few digits

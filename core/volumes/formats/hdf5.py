@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -24,11 +23,17 @@ def read(path: Path) -> Contents:
                 found = ", ".join(place) or "nothing"
                 raise InputError(f"expected the datasets array and affine; {name} not found (there are: {found})")
         require_voxels(array.shape, array.dtype)
-        length = _text(affine.attrs.get("unit"))
+        texts = (
+            affine.attrs.get("unit"),
+            array.attrs.get("quantity", file.attrs.get("volume_quantity")),
+            array.attrs.get("unit"),
+        )
+        length, quantity, unit = (
+            text.decode() if isinstance(text, bytes) else None if text is None else str(text) for text in texts
+        )
         if length not in (None, "mm"):
             raise InputError(f"its affine is in {length}: expected mm")
-        quantity = _text(array.attrs.get("quantity", file.attrs.get("volume_quantity")))
-        return Contents(array[()], np.asarray(affine[()]), quantity, _text(array.attrs.get("unit")))
+        return Contents(array[()], np.asarray(affine[()]), quantity, unit)
 
 
 def write(volume: Volume, path: Path) -> None:
@@ -41,7 +46,3 @@ def write(volume: Volume, path: Path) -> None:
         file.create_dataset("affine", data=volume.grid.affine).attrs.update(
             unit="mm", description="index to world, on column vectors; an integer index is a voxel's centre"
         )
-
-
-def _text(value: Any) -> str | None:
-    return value.decode() if isinstance(value, bytes) else None if value is None else str(value)

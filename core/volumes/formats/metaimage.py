@@ -41,7 +41,9 @@ def read(path: Path) -> Contents:
         big = _true(header.get("BinaryDataByteOrderMSB", header.get("ElementByteOrderMSB", "False")))
         type_ = np.dtype((">" if big else "<") + _TYPES[kind])
         require_voxels(shape, type_)
-        _refuse_scaled(header)
+        for key, plain in (("ElementToIntensityFunctionSlope", 1.0), ("ElementToIntensityFunctionOffset", 0.0)):
+            if _numbers(header, (key,), np.array([plain]))[0] != plain:
+                raise InputError(f"{key} = {header[key]}: values that are to be scaled are not read")
         values = np.frombuffer(_data(header, file, path, type_.itemsize * int(np.prod(shape, dtype=object))), type_)
     return Contents(values.reshape(shape, order="F"), _affine(header, path))
 
@@ -66,13 +68,13 @@ def _data(header: dict[str, str], file: BinaryIO, path: Path, size: int) -> byte
     refuse_several_files("ElementDataFile", where)
     if not _true(header.get("BinaryData", "True")):
         raise InputError("BinaryData = False: voxels written as text are not read")
-    if where.upper() != "LOCAL":
-        beside = path.parent / where
-        if not beside.is_file():
-            raise InputError(f"its voxels are in {where}, which is not beside it")
-        with open(beside, "rb") as raw:
-            return _unpacked(header, raw, size, where)
-    return _unpacked(header, file, size, "it")
+    if where.upper() == "LOCAL":
+        return _unpacked(header, file, size, "it")
+    beside = path.parent / where
+    if not beside.is_file():
+        raise InputError(f"its voxels are in {where}, which is not beside it")
+    with open(beside, "rb") as raw:
+        return _unpacked(header, raw, size, where)
 
 
 def _unpacked(header: dict[str, str], file: BinaryIO, size: int, name: str) -> bytes:
@@ -112,13 +114,6 @@ def _affine(header: dict[str, str], path: Path) -> NDArray[np.float64]:
     assumed += ["the first voxel's centre at (0, 0, 0)"] * (not header.keys() & set(offset))
     warn_of_assumed(path, assumed)
     return RAS_FROM_LPS @ affine
-
-
-def _refuse_scaled(header: dict[str, str]) -> None:
-    """Refuse voxels whose values are to be scaled."""
-    for key, plain in (("ElementToIntensityFunctionSlope", 1.0), ("ElementToIntensityFunctionOffset", 0.0)):
-        if _numbers(header, (key,), np.array([plain]))[0] != plain:
-            raise InputError(f"{key} = {header[key]}: values that are to be scaled are not read")
 
 
 def _numbers(header: dict[str, str], keys: tuple[str, ...], default: NDArray[np.float64] | None) -> NDArray[np.float64]:

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -37,11 +37,11 @@ def read(path: Path) -> Contents:
     affine, header = np.array(image.affine, np.float64), image.header
     if not isinstance(image, nibabel.Nifti1Pair):
         warn(path, "Analyze files do not say where the patient lies: taken as centred, x from right to left")
-        unit = bytes(header["vox_units"].item()).decode("latin-1").strip("\0 ").lower()
-        if unit not in _ANALYZE_MILLIMETRES:
-            raise InputError(f"vox_units {unit!r}: expected mm, cm, m or um")
-        affine[:3] *= _ANALYZE_MILLIMETRES[unit]
-        return Contents(_values(image), affine)
+        length = bytes(header["vox_units"].item()).decode("latin-1").strip("\0 ").lower()
+        if length not in _ANALYZE_MILLIMETRES:
+            raise InputError(f"vox_units {length!r}: expected mm, cm, m or um")
+        affine[:3] *= _ANALYZE_MILLIMETRES[length]
+        return Contents(image.get_fdata(dtype=np.float32, caching="unchanged"), affine)
     if header["qform_code"] == header["sform_code"] == 0:
         warn(path, "it does not say where the patient lies: taken as centred, x from right to left")
     elif header["qform_code"] > 0 and header["sform_code"] > 0:
@@ -52,7 +52,11 @@ def read(path: Path) -> Contents:
             warn(path, f"its sform and qform lie up to {apart:.3g} voxels apart: taken by the sform")
     affine[:3] *= _MILLIMETRES[header.get_xyzt_units()[0]]
     named = header.get_intent()[2]
-    return Contents(_values(image), affine, named if named in UNITS else None, _unit(header))
+    unit: str | None = None
+    with contextlib.suppress(ValueError, AttributeError):  # as `write` left it
+        unit = json.loads(bytes(header["descrip"].item()).decode()).get("unit")
+    values = image.get_fdata(dtype=np.float32, caching="unchanged")
+    return Contents(values, affine, named if named in UNITS else None, unit)
 
 
 def write(volume: Volume, path: Path) -> None:
@@ -64,15 +68,3 @@ def write(volume: Volume, path: Path) -> None:
     image.header.set_intent("none", name=volume.quantity)
     image.header["descrip"] = json.dumps({"quantity": volume.quantity, "unit": volume.unit}).encode()[:79]
     nibabel.save(image, path)
-
-
-def _values(image: Any) -> Any:
-    return np.ascontiguousarray(image.get_fdata(dtype=np.float32, caching="unchanged"))
-
-
-def _unit(header: Any) -> str | None:
-    """The unit in a description that `write` left."""
-    try:
-        return json.loads(bytes(header["descrip"].item()).decode()).get("unit")
-    except (ValueError, AttributeError):
-        return None

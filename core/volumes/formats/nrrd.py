@@ -46,7 +46,12 @@ def read(path: Path) -> Contents:
     """Read .nrrd, or .nhdr and the file beside it."""
     import nrrd
 
-    header = _known_names(nrrd.read_header(str(path)))
+    header: dict[str, Any] = {}  # with one name for each field
+    for name, value in nrrd.read_header(str(path)).items():
+        known = _SYNONYMS.get(name.lower(), name.lower())
+        if known in _FIELDS and name != name.lower():  # pynrrd would ignore it
+            raise InputError(f"field {name!r}: expected it in small letters, {known!r}")
+        header[known if known in _FIELDS else name] = value
     for name in ("type", "sizes"):
         if name not in header:
             raise InputError(f"it has no field {name}: it is damaged or ends early")
@@ -54,7 +59,10 @@ def read(path: Path) -> Contents:
     if kind == "block":
         raise InputError("expected real numbers, found blocks of bytes")
     require_voxels(header["sizes"], np.dtype(np.float64 if kind == "double" else np.float32))
-    _refuse_quantized(header)
+    # Whole numbers between "old min" and "old max" encode others.
+    ends = [header[name] for name in ("old min", "old max") if np.isfinite(float(header.get(name, np.nan)))]
+    if ends and kind not in ("float", "double"):
+        raise InputError("old min and old max: quantized values are not read; unquantize them (unu unquantize)")
     refuse_several_files("data file:", header.get("data file", ""))
     affine = _affine(header, path)
     try:
@@ -83,32 +91,13 @@ def write(volume: Volume, path: Path) -> None:
     nrrd.write(str(path), volume.array, header, compression_level=1)
 
 
-def _known_names(header: dict[str, Any]) -> dict[str, Any]:
-    """The header with one name for each field; `InputError` for a name that pynrrd ignores, such as "Spacings"."""
-    found: dict[str, Any] = {}
-    for name, value in header.items():
-        known = _SYNONYMS.get(name.lower(), name.lower())
-        if known in _FIELDS and name != name.lower():
-            raise InputError(f"field {name!r}: expected it in small letters, {known!r}")
-        found[known if known in _FIELDS else name] = value
-    return found
-
-
-def _refuse_quantized(header: dict[str, Any]) -> None:
-    """Refuse whole numbers that encode others between "old min" and "old max"."""
-    ends = [header[name] for name in ("old min", "old max") if np.isfinite(float(header.get(name, np.nan)))]
-    if ends and header["type"] not in ("float", "double"):
-        raise InputError("old min and old max: quantized values are not read; unquantize them (unu unquantize)")
-
-
 def _affine(header: dict[str, Any], path: Path) -> np.ndarray:
     """Index to world mm, with a warning of what the header does not say."""
     space = header.get("space")
     name = None if space is None else space.lower()
     if name not in _SPACES:
-        raise InputError(
-            f"space {space!r}: expected right-anterior-superior, left-posterior-superior or another of 3-D"
-        )
+        expected = "right-anterior-superior, left-posterior-superior or another of 3-D"
+        raise InputError(f"space {space!r}: expected {expected}")
     kinds = header.get("kinds", ["space"] * 3)
     if any(kind.lower() not in _SPATIAL for kind in kinds):
         raise InputError(f"kinds {' '.join(kinds)}: expected three axes of space or domain")
@@ -181,9 +170,8 @@ def _of_axes(header: dict[str, Any]) -> tuple[np.ndarray, np.ndarray | None, lis
             raise InputError("axis maxs: an axis of one node has no spacing; expected spacings and axis mins")
         between = (_all_of(high, "axis maxs") - low) / steps
         if np.any(np.abs(spacings - between) > _SAME * np.abs(between)):
-            raise InputError(
-                f"spacings and axis mins and maxs say different lengths: {_text(spacings)} and {_text(between)}"
-            )
+            lengths = f"{_text(spacings)} and {_text(between)}"
+            raise InputError(f"spacings and axis mins and maxs say different lengths: {lengths}")
         spacings = between
     spacings = _all_of(spacings, "spacings")
     return spacings, low + np.where(node, 0.0, spacings / 2), assumed

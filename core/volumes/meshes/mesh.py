@@ -8,12 +8,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from ...errors import InputError
 from ...files import replacing
-from ...geometry.frames import checked_affine
 from ...validation import freeze, real_array
+from ..formats.contents import first_line
 
 MESH_FORMATS = (".stl", ".obj", ".ply", ".glb")
 """Suffixes of mesh files."""
@@ -26,14 +26,9 @@ _SAME_POINT = 1e-7
 
 @dataclass(frozen=True, eq=False)
 class Mesh:
-    """A surface of triangles.
+    """A surface of triangles: vertices (V, 3), world mm, and their indices in faces (F, 3).
 
-    Attributes
-    ----------
-    vertices : array (V, 3)
-        World mm.
-    faces : int array (F, 3)
-        Indices of vertices, counter-clockwise as seen from outside.
+    Corners run counter-clockwise as seen from outside.
     """
 
     vertices: NDArray[np.float64]
@@ -43,9 +38,8 @@ class Mesh:
         vertices = real_array(self.vertices, "mesh vertices", (None, 3))
         faces = np.asarray(self.faces)
         if faces.ndim != 2 or faces.shape[1] != 3 or faces.dtype.kind not in "iu":
-            raise InputError(
-                f"mesh faces: expected F x 3 indices of vertices, got {faces.dtype} of shape {faces.shape}"
-            )
+            found = f"{faces.dtype} of shape {faces.shape}"
+            raise InputError(f"mesh faces: expected F x 3 indices of vertices, got {found}")
         if len(faces) == 0:
             raise InputError("mesh: it has no faces")
         if faces.min() < 0 or faces.max() >= len(vertices):
@@ -60,26 +54,11 @@ class Mesh:
         a, b, c = ((self.vertices - self.vertices.mean(axis=0))[self.faces[:, i]] for i in range(3))
         return float(np.einsum("ij,ij->", a, np.cross(b, c)) / 6)
 
-    def transformed(self, pose: ArrayLike) -> Mesh:
-        """The mesh after an affine world-from-mesh transform (4, 4)."""
-        matrix = checked_affine(pose, "pose")
-        return Mesh(self.vertices @ matrix[:3, :3].T + matrix[:3, 3], self.faces)
-
 
 def read_mesh(path: str | os.PathLike[str], unit: str | None = None) -> Mesh:
-    """Read the triangles of a mesh file, all its objects as one.
+    """Read the triangles of a mesh file, all its objects as one: .stl, .obj, .ply or .glb.
 
-    Parameters
-    ----------
-    path
-        .stl, .obj, .ply or .glb.
-    unit
-        Of the file's lengths: one of `MILLIMETRES`. Default: mm; of .glb m, as its standard says.
-
-    Raises
-    ------
-    InputError
-        No such file, damaged, no triangles, or an unknown unit.
+    `unit` is that of the file's lengths, one of `MILLIMETRES`. Default: mm; of .glb m, as its standard says.
     """
     import trimesh
 
@@ -93,18 +72,11 @@ def read_mesh(path: str | os.PathLike[str], unit: str | None = None) -> Mesh:
     except InputError as error:
         raise InputError(f"{path}: {error}") from None
     except Exception as error:  # whatever trimesh raises on a damaged file
-        said = (str(error).strip() or type(error).__name__).splitlines()[0]
-        raise InputError(f"{path}: cannot be read as {suffix} ({said})") from error
+        raise InputError(f"{path}: cannot be read as {suffix} ({first_line(error)})") from error
 
 
 def write_mesh(mesh: Mesh, path: str | os.PathLike[str], unit: str | None = None) -> None:
-    """Write a mesh as .stl, .obj, .ply or .glb; `unit` as for `read_mesh`.
-
-    Raises
-    ------
-    InputError
-        Not a mesh, another suffix, an unknown unit, or the file cannot be written.
-    """
+    """Write a mesh as .stl, .obj, .ply or .glb; `unit` as for `read_mesh`."""
     import trimesh
 
     path = Path(path)
@@ -132,10 +104,7 @@ def as_mesh(given: Any) -> Mesh:
 
 
 def require_closed(mesh: Mesh) -> None:
-    """Raise `InputError` if the surface is open or its faces look to different sides.
-
-    The message gives the number of bad edges and the middle of one of them, world mm.
-    """
+    """Raise `InputError` if the surface is open or its faces look to different sides; the message says where."""
     vertices = mesh.vertices
     size = float(np.ptp(vertices, axis=0).max())
     # In .stl and other files every triangle has its own copy of its corners.
@@ -152,19 +121,15 @@ def require_closed(mesh: Mesh) -> None:
     edge = np.stack(np.divmod(key, len(first)))
     uses = np.bincount(index)
     turns = np.bincount(index, np.where(start < end, 1, -1))
-
-    def refuse(bad: NDArray[np.int64], what: str, remedy: str) -> None:
+    for wrong, what, remedy in (
+        (uses % 2, "it is not closed", "expected an even number of faces at each edge: fill the holes"),
+        (turns, "faces look to different sides", "expected all to look outwards: recalculate the normals"),
+    ):
+        bad = np.flatnonzero(wrong)
         if len(bad):
             x, y, z = vertices[first[edge[:, bad[0]]]].mean(axis=0)
             count = f"{len(bad)} edge{'s' * (len(bad) > 1)}"
             raise InputError(f"mesh: {what} at {count}, the first at ({x:.4g}, {y:.4g}, {z:.4g}) mm; {remedy}")
-
-    refuse(
-        np.flatnonzero(uses % 2), "it is not closed", "expected an even number of faces at each edge: fill the holes"
-    )
-    refuse(
-        np.flatnonzero(turns), "faces look to different sides", "expected all to look outwards: recalculate the normals"
-    )
 
 
 def _suffix_and_factor(path: Path, unit: str | None) -> tuple[str, float]:

@@ -30,30 +30,16 @@ def volume_to_mesh(volume: Volume, level: float | None = None, progress: Progres
     """The closed surface around the voxels of at least `level`.
 
     The surface lies where the volume, interpolated between the voxels' centres, has that value. Outside the grid the volume
-    counts as 0 (CT numbers: -1000), so that the surface is closed at the grid's border.
-
-    Parameters
-    ----------
-    volume
-        Any quantity.
-    level
-        In the volume's unit. Default: halfway between the value outside the grid and the largest value.
-    progress
-        Called as ``progress(done, total)`` with slabs; may raise `Cancelled`.
-
-    Raises
-    ------
-    InputError
-        Not a volume; the level is not a number, not above the value outside the grid, or above all voxels.
+    counts as 0 (CT numbers: -1000), so that the surface is closed at the grid's border. The default level is halfway between
+    the value outside and the largest value. `progress` is called as ``progress(done, total)``; it may raise `Cancelled`.
     """
     instance(volume, Volume, "volume_to_mesh")
     outside = outside_value(volume)
     highest = float(volume.array.max())
     level = (outside + highest) / 2 if level is None else float(real_array(level, "level", ()))
     if not outside < level <= highest:
-        raise InputError(
-            f"level {level:g}: expected above {outside:g}, the value outside the grid, and at most {highest:g}, the largest"
-        )
+        limits = f"above {outside:g}, the value outside the grid, and at most {highest:g}, the largest"
+        raise InputError(f"level {level:g}: expected {limits}")
     array = volume.array
     shape = np.array(array.shape) + 2  # with a margin of one voxel
     strides = np.array([shape[1] * shape[2], shape[2], 1])

@@ -21,7 +21,7 @@ from ...errors import InputError
 from ...geometry.grid import Grid
 from ...memory import require
 from ...progress import Progress
-from ...validation import freeze, real_array
+from ...validation import freeze, instance, one_for_all
 from ..volume import Volume
 from .mesh import Mesh, as_mesh, require_closed
 
@@ -40,34 +40,32 @@ def voxelize_mesh(
     quantity: str = "activity",
     progress: Progress | None = None,
 ) -> Volume:
-    """A volume filled by one closed mesh or by several.
+    """A volume filled by one closed mesh or by several; parts outside the grid are cut off.
 
     Parameters
     ----------
     mesh
         A `Mesh`, a trimesh mesh or scene, ``(vertices (V, 3), faces (F, 3))`` in world mm, or the path of a file (see
-        `read_mesh`); or a list of these, in which later ones replace what they cover of earlier ones.
+        `read_mesh`); or a list of these, in which later ones replace what they cover of earlier ones. `InputError` says
+        where a mesh is open or its faces look to different sides.
     grid
-        Where the voxels are; any affine. Parts of the mesh outside it are cut off.
+        Where the voxels are; any affine.
     value
         Inside, in the quantity's unit: one number, or one for each mesh. Outside, the volume is 0.
     quantity
         What the values are.
     progress
         Called as ``progress(done, total)``; may raise `Cancelled`.
-
-    Raises
-    ------
-    InputError
-        A mesh is open or its faces look to different sides (with the place), or it is not a mesh.
     """
-    if not isinstance(grid, Grid):
-        raise InputError(f"voxelize_mesh: expected a Grid, got {type(grid).__name__}")
-    several = isinstance(mesh, Sequence) and not isinstance(mesh, str) and not _is_pair(mesh)
+    instance(grid, Grid, "voxelize_mesh")
+    several = isinstance(mesh, Sequence) and not isinstance(mesh, str)
+    if several and len(mesh) == 2:  # meshes, or vertices and faces
+        several = any(isinstance(part, str | os.PathLike | Mesh) or hasattr(part, "faces") for part in mesh)
+        several = several or np.ndim(mesh[0]) != 2
     meshes = [as_mesh(one) for one in (mesh if several else [mesh])]
     if not meshes:
         raise InputError("voxelize_mesh: expected at least one mesh")
-    values = real_array(np.broadcast_to(value, len(meshes)) if np.ndim(value) == 0 else value, "value", (len(meshes),))
+    values = one_for_all(value, "value", len(meshes))
     require(8.5 * grid.n_voxels, "a volume of {} x {} x {} voxels".format(*grid.shape))
     array = np.zeros(grid.shape, np.float32)
     for i, (one, inside) in enumerate(zip(meshes, values, strict=True)):
@@ -199,11 +197,10 @@ def _winding(surface: NDArray[np.float64], shape: tuple[int, int, int]) -> NDArr
         tip = pieces[:, 0]
         for i in range(1, pieces.shape[1] - 1):  # a fan of triangles
             left, right = pieces[:, i] - tip, pieces[:, i + 1] - tip
-            seen_along_z = (
-                left[:, 0] * right[:, 1] - left[:, 1] * right[:, 0]
-            ) / 2  # positive or negative, by its side
-            area += seen_along_z
-            moment += seen_along_z * (tip[:, 2] + (left[:, 2] + right[:, 2]) / 3)
+            # As seen along z: positive or negative, by its side.
+            part = (left[:, 0] * right[:, 1] - left[:, 1] * right[:, 0]) / 2
+            area += part
+            moment += part * (tip[:, 2] + (left[:, 2] + right[:, 2]) / 3)
         own = area * (cells[:, 2] + 1) - moment
         voxel = (cells[:, 0] * n_y + cells[:, 1]) * (n_z + 1) + cells[:, 2]
         np.add.at(steps, voxel, own)
@@ -274,10 +271,3 @@ def _clip(pieces: NDArray[np.float64], axis: int, plane: ArrayLike, side: int) -
     spare = np.arange(width) >= count
     last = result[np.arange(n), np.maximum(count[:, 0] - 1, 0)]
     return np.where(spare[:, :, None], last[:, None], result)
-
-
-def _is_pair(given: Sequence[Any]) -> bool:
-    """Whether `given` is (vertices, faces) and not a list of meshes."""
-    if len(given) != 2 or any(isinstance(part, str | os.PathLike | Mesh) or hasattr(part, "faces") for part in given):
-        return False
-    return np.ndim(given[0]) == 2

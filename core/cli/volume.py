@@ -1,0 +1,204 @@
+"""``mphdrr volume ACTION``: look at volumes, convert them, and turn them into meshes and back."""
+
+from __future__ import annotations
+
+import argparse
+import json
+from typing import Any
+
+import numpy as np
+
+from ..errors import InputError
+from ..geometry.grid import Grid
+from ..physics.ct_numbers import hu_to_mu
+from ..validation import positive, real_array
+from ..volumes.meshes.mesh import MESH_FORMATS, MILLIMETRES, Mesh, read_mesh, write_mesh
+from ..volumes.meshes.surface import volume_to_mesh
+from ..volumes.meshes.voxelization import voxelize_mesh
+from ..volumes.rearranging import canonical, centered, crop_to_box, pad
+from ..volumes.resampling import resample
+from ..volumes.volume import UNITS, Volume
+from ..volumes.volume_files import VOLUME_FORMATS, read_volume, write_volume
+from .options import add_command, output_path, photon_energy, progress_bar
+
+_MESH_UNIT: dict[str, Any] = {
+    "choices": tuple(MILLIMETRES),
+    "help": "of the mesh files' lengths; default: mm, of .glb m",
+}
+
+
+def add_parser(subparsers) -> None:  # type: ignore[no-untyped-def]
+    """Add the command."""
+    volume = add_command(subparsers, "volume", "look at volumes and convert them", "mphdrr volume info ct.nii.gz")
+    actions = volume.add_subparsers(metavar="ACTION", required=True)
+
+    info = add_command(actions, "info", "show a volume's place, grid and values", "mphdrr volume info ct.nii.gz")
+    _add_input(info)
+    info.add_argument("--json", action="store_true", help="print JSON")
+    info.set_defaults(run=_info)
+
+    convert = add_command(
+        actions,
+        "convert",
+        "convert a volume to another format, and crop, move, resample it or convert it to attenuation",
+        "mphdrr volume convert dicom_folder --center --spacing 2 --to-mu --energy Tc-99m -o mu.nii.gz",
+    )
+    _add_input(convert)
+    steps = convert.add_argument_group("changes, in this order")
+    add = steps.add_argument
+    add("--canonical", action="store_true", help="index axes to the right, front and head: flip, transpose")
+    box = ("X0", "X1", "Y0", "Y1", "Z0", "Z1")
+    add("--crop", type=float, nargs=6, metavar=box, help="to a box, mm, in FILE's world")
+    add("--pad", type=int, default=0, metavar="N", help="voxels more on every side")
+    add("--center", action="store_true", help="move the middle to the isocentre")
+    add("--spacing", type=float, nargs="+", metavar="MM", help="resample to this voxel size, one or three")
+    method = "of resampling; default: mean for coarser voxels, else linear; labels need nearest"
+    add("--method", choices=("linear", "nearest", "mean"), help=method)
+    add("--to-mu", action="store_true", help="CT numbers to attenuation, 1/mm, at --energy")
+    energy = "of the photons, or an isotope's name: its strongest line (default: 140.5)"
+    convert.add_argument("--energy", metavar="KEV", help=energy)
+    convert.add_argument("-o", "--output", required=True, metavar="FILE", help=", ".join(VOLUME_FORMATS))
+    convert.set_defaults(run=_convert)
+
+    from_mesh = add_command(
+        actions,
+        "from-mesh",
+        "fill closed meshes with activity or attenuation",
+        "mphdrr volume from-mesh body.stl heart.stl --value 0.0154 0.0160 --quantity mu --spacing 2 -o mu.nii.gz",
+    )
+    add = from_mesh.add_argument
+    add("mesh", nargs="+", metavar="MESH", help=f"{', '.join(MESH_FORMATS)}; later ones replace earlier ones")
+    add("--unit", **_MESH_UNIT)
+    add("--value", type=float, nargs="+", default=[1.0], metavar="X", help="inside: one, or one per mesh")
+    add("--quantity", choices=tuple(UNITS), default="activity", help="what the values are")
+    add("--spacing", type=float, default=1.0, metavar="MM", help="voxel size")
+    voxels = "along x y z, around the isocentre; default: around the meshes"
+    add("--voxels", type=int, nargs=3, metavar="N", help=voxels)
+    add("-o", "--output", required=True, metavar="FILE", help=", ".join(VOLUME_FORMATS))
+    from_mesh.set_defaults(run=_from_mesh)
+
+    to_mesh = add_command(
+        actions,
+        "to-mesh",
+        "make a closed mesh of the surface at a level, to show or to print",
+        "mphdrr volume to-mesh ct.nii.gz --level 300 -o bones.stl",
+    )
+    _add_input(to_mesh)
+    level = "in the volume's unit; default: halfway to the largest value"
+    to_mesh.add_argument("--level", type=float, metavar="X", help=level)
+    to_mesh.add_argument("--unit", **_MESH_UNIT)
+    to_mesh.add_argument("-o", "--output", required=True, metavar="MESH", help=", ".join(MESH_FORMATS))
+    to_mesh.set_defaults(run=_to_mesh)
+
+
+def _add_input(parser: argparse.ArgumentParser) -> None:
+    """Add the volume to read, for `_input`."""
+    add = parser.add_argument
+    add("file", metavar="FILE", help="volume, folder of a DICOM series, or any file of one (formats: docs/volumes.md)")
+    values = "what its values are; default: what the file says, else CT numbers, hu"
+    add("--quantity", choices=tuple(UNITS), help=values)
+    add("--series", metavar="NAME", help="one of several DICOM series, by number, description or UID")
+    affine = "index to world mm, row by row, instead of the file's; .npy needs it"
+    add("--affine", type=float, nargs=16, metavar="A", help=affine)
+
+
+def _input(arguments: argparse.Namespace) -> Volume:
+    affine = None if arguments.affine is None else np.reshape(arguments.affine, (4, 4))
+    return read_volume(
+        arguments.file, arguments.quantity, affine=affine, series=arguments.series, progress=progress_bar("reading")
+    )
+
+
+def _info(arguments: argparse.Namespace) -> None:
+    volume = _input(arguments)
+    array, grid = volume.array, volume.grid
+    corners = grid.corners()
+    # The direction of each index axis in the patient: the closest of R, L, A, P, S, I.
+    axes = [(int(np.abs(axis).argmax()), axis) for axis in grid.affine[:3, :3].T]
+    facts = {
+        "quantity": volume.quantity,
+        "unit": volume.unit,
+        "voxels": list(grid.shape),
+        "spacing_mm": grid.spacing.tolist(),
+        "axes": "".join(("RAS" if axis[world] > 0 else "LPI")[world] for world, axis in axes),
+        "center_mm": grid.center.tolist(),
+        "low_mm": corners.min(axis=0).tolist(),
+        "high_mm": corners.max(axis=0).tolist(),
+        "smallest": float(array.min()),
+        "mean": float(array.mean(dtype=np.float64)),
+        "largest": float(array.max()),
+    }
+    if arguments.json:
+        print(json.dumps({**facts, "affine": grid.affine.tolist()}, indent=1))
+        return
+    for name, value in facts.items():
+        text = " ".join(f"{x:g}" if isinstance(x, float) else str(x) for x in np.atleast_1d(value).tolist())
+        print(f"{name:16s} {text}")
+
+
+def _convert(arguments: argparse.Namespace) -> None:
+    path = output_path(arguments.output, VOLUME_FORMATS)
+    if arguments.energy is not None and not arguments.to_mu:
+        raise InputError("--energy needs --to-mu")
+    if arguments.method is not None and not arguments.spacing:
+        raise InputError("--method needs --spacing")
+    energy = photon_energy(arguments.energy or "140.5")
+    volume = _input(arguments)
+    if arguments.canonical:
+        volume = canonical(volume)
+    if arguments.crop:
+        volume = crop_to_box(volume, arguments.crop[::2], arguments.crop[1::2])
+    if arguments.pad:
+        volume = pad(volume, arguments.pad, arguments.pad)
+    if arguments.center:
+        volume = centered(volume)
+    if arguments.spacing:
+        volume = _respaced(volume, arguments.spacing, arguments.method)
+    if arguments.to_mu:
+        volume = hu_to_mu(volume, energy)
+    write_volume(volume, path)
+    low, high = float(volume.array.min()), float(volume.array.max())
+    print(f"{path}: {' x '.join(map(str, volume.grid.shape))} voxels, {low:.4g} to {high:.4g} {volume.unit}")
+
+
+def _respaced(volume: Volume, spacing: list[float], method: str | None) -> Volume:
+    """The volume on a grid with the same axes and first faces, and at least the same extent."""
+    if len(spacing) not in (1, 3) or not min(spacing) > 0:
+        raise InputError(f"--spacing: expected one or three numbers above 0, got {' '.join(f'{x:g}' for x in spacing)}")
+    old = volume.grid
+    steps = np.broadcast_to(spacing, 3) / old.spacing  # in old voxels
+    n_x, n_y, n_z = (max(1, int(np.ceil(n / step - 1e-6))) for n, step in zip(old.shape, steps, strict=True))
+    index = np.diag([*steps, 1.0])
+    index[:3, 3] = (steps - 1) / 2
+    method = method or ("mean" if steps.max() > 1 else "linear")
+    # Label files say no quantity and are taken for CT numbers, but outside them is 0 and not air.
+    outside = 0.0 if method == "nearest" and volume.array.min() >= 0 else None
+    return resample(volume, Grid((n_x, n_y, n_z), old.affine @ index), method, outside, progress_bar("resampling"))
+
+
+def _from_mesh(arguments: argparse.Namespace) -> None:
+    path = output_path(arguments.output, VOLUME_FORMATS)
+    if len(arguments.value) not in (1, len(arguments.mesh)):
+        raise InputError(f"--value: expected one number, or one for each of {len(arguments.mesh)} meshes")
+    values = real_array(np.broadcast_to(arguments.value, len(arguments.mesh)), "--value", (None,))
+    meshes = [read_mesh(file, arguments.unit) for file in arguments.mesh]
+    spacing = positive(arguments.spacing, "--spacing", "mm")
+    grid = Grid.centered(arguments.voxels, spacing) if arguments.voxels else _grid_around(meshes, spacing)
+    volume = voxelize_mesh(meshes, grid, values, arguments.quantity, progress_bar("voxelizing"))
+    write_volume(volume, path)
+    covered = np.count_nonzero(volume.array) * grid.voxel_volume * 1e-3
+    print(f"{path}: {' x '.join(map(str, grid.shape))} voxels, {covered:.4g} mL of them not 0")
+
+
+def _grid_around(meshes: list[Mesh], spacing: float) -> Grid:
+    """A grid around the meshes with a margin of one voxel."""
+    low = np.min([mesh.vertices.min(axis=0) for mesh in meshes], axis=0)
+    high = np.max([mesh.vertices.max(axis=0) for mesh in meshes], axis=0)
+    return Grid.centered(np.ceil((high - low) / spacing) + 2, spacing, (low + high) / 2)
+
+
+def _to_mesh(arguments: argparse.Namespace) -> None:
+    path = output_path(arguments.output, MESH_FORMATS)
+    mesh = volume_to_mesh(_input(arguments), arguments.level, progress_bar("surface"))
+    write_mesh(mesh, path, arguments.unit)
+    print(f"{path}: {len(mesh.faces)} triangles around {mesh.volume * 1e-3:.4g} mL")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
+from typing import Any
 
 import bpy
 
@@ -62,19 +63,27 @@ def select_active(scene: bpy.types.Scene) -> None:
         select(bpy.context, [camera])
 
 
-def poll_scanner(operator: type[bpy.types.Operator], context: bpy.types.Context) -> bool:
-    """`poll` of operators that need a scanner."""
-    if scanner.active_scanner(context.scene) is None:
-        operator.poll_message_set("No scanner in the scene: import a geometry first")
-        return False
-    return True
+class NeedsScanner:
+    """Mix into an operator that needs a scanner."""
+
+    @classmethod
+    def poll(cls: Any, context: bpy.types.Context) -> bool:
+        """There is a scanner."""
+        if scanner.active_scanner(context.scene) is None:
+            cls.poll_message_set("No scanner in the scene: import a geometry first")
+            return False
+        return True
 
 
-def poll_module(operator: type[bpy.types.Operator], context: bpy.types.Context) -> bool:
-    """`poll` of operators that need an active or selected module."""
-    if not poll_scanner(operator, context):
-        return False
-    if not selected_modules(context):
-        operator.poll_message_set("No module is selected: select a module's camera")
-        return False
-    return True
+class NeedsModules(NeedsScanner):
+    """Mix into an operator that needs an active or selected module."""
+
+    @classmethod
+    def poll(cls: Any, context: bpy.types.Context) -> bool:
+        """There is a scanner, and a module of it is active or selected."""
+        if not super().poll(context):
+            return False
+        if not selected_modules(context):
+            cls.poll_message_set("No module is selected: select a module's camera")
+            return False
+        return True

@@ -9,9 +9,7 @@ from ..addon import ids, jobs, maps, selection
 from ..addon.decimals import typed
 
 
-class MPHDRR_OT_add_map(jobs.JobOperator, bpy.types.Operator):
-    """``bpy.ops.mphdrr.add_map(quantity="sensitivity")``."""
-
+class MPHDRR_OT_add_map(selection.NeedsScanner, jobs.JobOperator, bpy.types.Operator):
     bl_idname = ids.ADD_MAP
     bl_label = "Add Map"
     bl_description = (
@@ -29,10 +27,6 @@ class MPHDRR_OT_add_map(jobs.JobOperator, bpy.types.Operator):
         min=0.0, soft_max=500.0,
     )  # fmt: skip
     within_roi: BoolProperty(name="Within ROI", description="Leave out what lies outside the ROI sphere", default=True)
-
-    @classmethod
-    def poll(cls, context: bpy.types.Context) -> bool:
-        return selection.poll_scanner(cls, context)
 
     def job(self, context: bpy.types.Context) -> jobs.Job:
         return maps.mapping(context.scene, self.quantity, self.voxels, typed(self.side), self.within_roi)

@@ -13,11 +13,10 @@ from ..core.errors import InputError
 
 
 class MPHDRR_OT_export_dataset(ExportHelper, bpy.types.Operator):
+    """Write the last run, with geometry, volume and provenance, as HDF5 (.h5), NumPy (.npz) or PyTorch (.pt)"""
+
     bl_idname = ids.EXPORT_DATASET
     bl_label = "Export mphDRR Dataset"
-    bl_description = (
-        "Write the last run, with geometry, volume and provenance, as HDF5 (.h5), NumPy (.npz) or PyTorch (.pt)"
-    )
 
     filename_ext = ".h5"
     filter_glob: StringProperty(default="*.h5;*.hdf5;*.npz;*.pt", options={"HIDDEN"})
@@ -66,7 +65,3 @@ def export_dataset(scene: bpy.types.Scene, filepath: str) -> Path:
     path = storage.absolute(filepath)
     write_run(read_run(source), path)
     return path
-
-
-def draw_menu(self: bpy.types.Menu, context: bpy.types.Context) -> None:
-    self.layout.operator(ids.EXPORT_DATASET, text="mphDRR Dataset (.h5/.npz/.pt)")

@@ -18,12 +18,11 @@ from ..core.exchange import FORMAT_NUMBERS, FORMATS
 _FORMATS = tuple((f.name, f.name, f.title, FORMAT_NUMBERS[f.name]) for f in FORMATS.values())
 
 
-class MPHDRR_OT_export_geometry(ExportHelper, bpy.types.Operator):
-    """``bpy.ops.mphdrr.export_geometry(filepath="scanner.xlsx")``."""
+class MPHDRR_OT_export_geometry(selection.NeedsScanner, ExportHelper, bpy.types.Operator):
+    """Write the scanner as it stands in the scene to a workbook, into a copy of the one it came from"""
 
     bl_idname = ids.EXPORT_GEOMETRY
     bl_label = "Export Pinhole Geometry"
-    bl_description = "Write the scanner as it stands in the scene to a workbook, into a copy of the one it came from"
     bl_options = {"REGISTER", "UNDO"}
 
     filename_ext = ".xlsx"
@@ -35,10 +34,6 @@ class MPHDRR_OT_export_geometry(ExportHelper, bpy.types.Operator):
         "charts and formats stay. Otherwise a new workbook is made",
         default=True,
     )
-
-    @classmethod
-    def poll(cls, context: bpy.types.Context) -> bool:
-        return selection.poll_scanner(cls, context)
 
     def invoke(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str]:
         workbook = scanner.required_scanner(context.scene).mphdrr_scanner.workbook
@@ -67,9 +62,7 @@ class MPHDRR_OT_export_geometry(ExportHelper, bpy.types.Operator):
         return run_reported(self, export)
 
 
-class MPHDRR_OT_export_for_program(ExportHelper, bpy.types.Operator):
-    """``bpy.ops.mphdrr.export_for_program(format="astra", filepath="scanner.npz")``."""
-
+class MPHDRR_OT_export_for_program(selection.NeedsScanner, ExportHelper, bpy.types.Operator):
     bl_idname = ids.EXPORT_FOR_PROGRAM
     bl_label = "Export Geometry for a Program"
     bl_description = (
@@ -83,10 +76,6 @@ class MPHDRR_OT_export_for_program(ExportHelper, bpy.types.Operator):
         options={"SKIP_SAVE"},
     )  # fmt: skip
     format: EnumProperty(name="Format", description="What is written", items=_FORMATS)
-
-    @classmethod
-    def poll(cls, context: bpy.types.Context) -> bool:
-        return selection.poll_scanner(cls, context)
 
     def check(self, context: bpy.types.Context) -> bool:
         """Give the name the format's suffix."""
@@ -122,9 +111,3 @@ class MPHDRR_OT_export_for_program(ExportHelper, bpy.types.Operator):
         column = layout.column(align=True)
         for line in (format.title, f"Suffix {', '.join(format.suffixes)}" if format.suffixes else "A new folder"):
             column.label(text=line, icon="DOT")
-
-
-def draw_menu(self: bpy.types.Menu, context: bpy.types.Context) -> None:
-    """The entry of File > Export."""
-    self.layout.operator(ids.EXPORT_GEOMETRY, text="Pinhole Geometry (.xlsx)")
-    self.layout.operator(ids.EXPORT_FOR_PROGRAM, text="Pinhole Geometry for Programs")

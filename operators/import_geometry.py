@@ -12,7 +12,6 @@ import bpy
 from bpy.props import BoolProperty, FloatProperty, IntVectorProperty, StringProperty
 
 from ..addon import column_maps, ids, scanner
-from ..addon.preferences import preferences
 from ..addon.reports import run_reported, warnings_reported
 from ..addon.scanner_files import WORKBOOK_SUFFIXES
 from ..core.errors import InputError
@@ -23,13 +22,10 @@ from . import column_map_dialog
 
 
 class MPHDRR_OT_import_geometry(bpy.types.Operator):
-    """``bpy.ops.mphdrr.import_geometry(filepath="scanner.xlsx", columns="map.toml")``."""
+    """Read a workbook of pinhole modules and build the scanner: a camera, a collimator and a crystal each"""
 
     bl_idname = ids.IMPORT_GEOMETRY
     bl_label = "Import Pinhole Geometry"
-    bl_description = (
-        "Read a workbook of pinhole modules and build the scanner: a camera, a collimator and a crystal each"
-    )
     bl_options = {"REGISTER", "UNDO"}
 
     filepath: StringProperty(name="File", description="Workbook to read", subtype="FILE_PATH", options={"SKIP_SAVE"})
@@ -67,11 +63,6 @@ class MPHDRR_OT_import_geometry(bpy.types.Operator):
     )
 
     def invoke(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str]:
-        defaults = preferences(context)
-        if defaults is not None:
-            for name in ("plate_thickness", "wall_thickness"):
-                if not self.properties.is_property_set(name):
-                    setattr(self, name, getattr(defaults, name))
         if not self.filepath:
             context.window_manager.fileselect_add(self)
             return {"RUNNING_MODAL"}
@@ -180,8 +171,3 @@ class MPHDRR_OT_import_geometry(bpy.types.Operator):
         return context.window_manager.invoke_props_dialog(
             self, width=440, title=f"Replace '{old.name}'?", confirm_text="Replace"
         )
-
-
-def draw_menu(self: bpy.types.Menu, context: bpy.types.Context) -> None:
-    """The entry of File > Import."""
-    self.layout.operator(ids.IMPORT_GEOMETRY, text="Pinhole Geometry (.xlsx)")

@@ -12,14 +12,10 @@ from ..addon.replacement import modules_text
 from ..addon.reports import run_reported
 
 
-class _OnScanner:
+class _OnScanner(selection.NeedsScanner):
     """Mixed into operators that change the scanner that the panels work on."""
 
     bl_options = {"REGISTER", "UNDO"}
-
-    @classmethod
-    def poll(cls, context: bpy.types.Context) -> bool:
-        return selection.poll_scanner(cls, context)
 
     def execute(self, context: bpy.types.Context) -> set[str]:
         return run_reported(self, lambda: self.change(context, scanner.required_scanner(context.scene)))
@@ -29,20 +25,15 @@ class _OnScanner:
         raise NotImplementedError
 
 
-class _OnModules(_OnScanner):
+class _OnModules(selection.NeedsModules, _OnScanner):
     """Mixed into operators that work on the selected modules."""
-
-    @classmethod
-    def poll(cls, context: bpy.types.Context) -> bool:
-        return selection.poll_module(cls, context)
 
 
 class MPHDRR_OT_show_modules(_OnScanner, bpy.types.Operator):
-    """``bpy.ops.mphdrr.show_modules(first=1, last=40, mode="ONLY")``."""
+    """Show or hide modules with their collimators and crystals, in the viewport and in renders"""
 
     bl_idname = ids.SHOW_MODULES
     bl_label = "Show Modules"
-    bl_description = "Show or hide modules with their collimators and crystals, in the viewport and in renders"
 
     first: IntProperty(name="First", description="First module number of the range", default=1)
     last: IntProperty(name="Last", description="Last module number of the range", default=1)
@@ -72,11 +63,10 @@ class MPHDRR_OT_show_modules(_OnScanner, bpy.types.Operator):
 
 
 class MPHDRR_OT_look_through_module(_OnScanner, bpy.types.Operator):
-    """``bpy.ops.mphdrr.look_through_module(number=7)``."""
+    """Make the module's pinhole camera the scene's camera, and look through it"""
 
     bl_idname = ids.LOOK_THROUGH_MODULE
     bl_label = "Look Through Module"
-    bl_description = "Make the module's pinhole camera the scene's camera, and look through it"
 
     number: IntProperty(name="Number", description="Module number", default=1)
 
@@ -88,11 +78,10 @@ class MPHDRR_OT_look_through_module(_OnScanner, bpy.types.Operator):
 
 
 class MPHDRR_OT_aim_modules(_OnScanner, bpy.types.Operator):
-    """``bpy.ops.mphdrr.aim_modules()``."""
+    """Turn every module that does not look at the isocentre, without moving it"""
 
     bl_idname = ids.AIM_MODULES
     bl_label = "Aim at Isocentre"
-    bl_description = "Turn every module that does not look at the isocentre, without moving it"
 
     def change(self, context: bpy.types.Context, collection: bpy.types.Collection) -> str:
         aimed = scanner.aim_modules(collection)
@@ -100,11 +89,10 @@ class MPHDRR_OT_aim_modules(_OnScanner, bpy.types.Operator):
 
 
 class MPHDRR_OT_duplicate_modules(_OnModules, bpy.types.Operator):
-    """``bpy.ops.mphdrr.duplicate_modules(count=3, angle=math.radians(9))``: the selected modules."""
+    """Copy the selected modules, with collimators and crystals, to further places on their rings"""
 
     bl_idname = ids.DUPLICATE_MODULES
     bl_label = "Duplicate Along Ring"
-    bl_description = "Copy the selected modules, with collimators and crystals, to further places on their rings"
 
     count: IntProperty(name="Copies", description="Number of copies of each module", default=1, min=1, soft_max=40)
     angle: FloatProperty(
@@ -125,11 +113,10 @@ class MPHDRR_OT_duplicate_modules(_OnModules, bpy.types.Operator):
 
 
 class MPHDRR_OT_remove_modules(_OnModules, bpy.types.Operator):
-    """``bpy.ops.mphdrr.remove_modules()``: the selected modules."""
+    """Delete the selected modules with their collimators and crystals"""
 
     bl_idname = ids.REMOVE_MODULES
     bl_label = "Remove Modules"
-    bl_description = "Delete the selected modules with their collimators and crystals"
 
     def change(self, context: bpy.types.Context, collection: bpy.types.Collection) -> str:
         modules = selection.selected_modules(context)
@@ -139,8 +126,6 @@ class MPHDRR_OT_remove_modules(_OnModules, bpy.types.Operator):
 
 
 class MPHDRR_OT_tidy_modules(_OnScanner, bpy.types.Operator):
-    """``bpy.ops.mphdrr.tidy_modules()``: in all scanners of the scene."""
-
     bl_idname = ids.TIDY_MODULES
     bl_label = "Tidy Modules"
     bl_description = (
@@ -157,11 +142,10 @@ class MPHDRR_OT_tidy_modules(_OnScanner, bpy.types.Operator):
 
 
 class MPHDRR_OT_renumber_modules(_OnScanner, bpy.types.Operator):
-    """``bpy.ops.mphdrr.renumber_modules(order="RINGS")``."""
+    """Number all modules 1, 2, ...; they are listed, projected and exported in that order from now on"""
 
     bl_idname = ids.RENUMBER_MODULES
     bl_label = "Renumber Modules"
-    bl_description = "Number all modules 1, 2, ...; they are listed, projected and exported in that order from now on"
 
     order: EnumProperty(
         name="Order",
@@ -178,11 +162,10 @@ class MPHDRR_OT_renumber_modules(_OnScanner, bpy.types.Operator):
 
 
 class MPHDRR_OT_set_numbers(_OnModules, bpy.types.Operator):
-    """``bpy.ops.mphdrr.set_numbers(to_all=True)``."""
+    """Give the selected modules, or all, the active module's d, l, Ld, Td and R"""
 
     bl_idname = ids.SET_NUMBERS
     bl_label = "Copy Numbers to Selected"
-    bl_description = "Give the selected modules, or all, the active module's d, l, Ld, Td and R"
 
     to_all: BoolProperty(name="All", description="Give them to all modules of the scanner", options={"SKIP_SAVE"})
 
@@ -195,8 +178,6 @@ class MPHDRR_OT_set_numbers(_OnModules, bpy.types.Operator):
 
 
 class MPHDRR_OT_check_geometry(_OnScanner, bpy.types.Operator):
-    """``bpy.ops.mphdrr.check_geometry()``."""
-
     bl_idname = ids.CHECK_GEOMETRY
     bl_label = "Check Geometry"
     bl_description = (

@@ -9,7 +9,6 @@ from ..addon.phantom_properties import menu_entries
 
 
 class MPHDRR_MT_add(bpy.types.Menu):
-    bl_idname = ids.MENU_ADD
     bl_label = "mphDRR"
 
     def draw(self, context: bpy.types.Context) -> None:
@@ -28,8 +27,3 @@ class MPHDRR_MT_add(bpy.types.Menu):
         layout.operator(ids.IMPORT_VOLUME_SEQUENCE, text="Volume Sequence from Files", icon="RENDER_ANIMATION")
         layout.operator(ids.VOXELIZE_OBJECTS, text="Volume from Meshes", icon="OUTLINER_DATA_MESH")
         layout.operator(ids.ADD_MAP, text="Map of the Scanner", icon="OUTLINER_DATA_LIGHTPROBE")
-
-
-def draw_menu(self: bpy.types.Menu, context: bpy.types.Context) -> None:
-    """The entry of the 3D viewport's Add menu."""
-    self.layout.menu(ids.MENU_ADD, icon="OUTLINER_DATA_VOLUME")

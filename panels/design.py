@@ -27,7 +27,6 @@ _LINE = 32  # letters that fit into the sidebar at its usual width
 class MPHDRR_PT_design(ScannerPanel, bpy.types.Panel):
     """The active module."""
 
-    bl_idname = ids.PANEL_DESIGN
     bl_label = "Design"
 
     def draw_scanner(self, context: bpy.types.Context, collection: bpy.types.Collection) -> None:
@@ -57,7 +56,6 @@ class MPHDRR_PT_design(ScannerPanel, bpy.types.Panel):
 class MPHDRR_PT_scanner_design(ScannerPanel, bpy.types.Panel):
     """All modules at once, checks and exports."""
 
-    bl_idname = ids.PANEL_SCANNER_DESIGN
     bl_label = "All Modules"
 
     def draw_scanner(self, context: bpy.types.Context, collection: bpy.types.Collection) -> None:

@@ -8,7 +8,6 @@ from ..addon import ids
 
 
 class MPHDRR_PT_export(bpy.types.Panel):
-    bl_idname = ids.PANEL_EXPORT
     bl_label = "Export"
     bl_space_type = "VIEW_3D"
     bl_region_type = "UI"

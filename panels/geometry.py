@@ -12,8 +12,6 @@ from ..addon import ids, scanner
 class MPHDRR_UL_modules(bpy.types.UIList):
     """The modules among a scanner's objects, by number."""
 
-    bl_idname = ids.LIST_MODULES
-
     def draw_item(
         self, context: bpy.types.Context, layout: bpy.types.UILayout, data: bpy.types.Collection, item: bpy.types.Object,
         icon: int, active_data: bpy.types.PropertyGroup, active_property: str, index: int = 0, flt_flag: int = 0,
@@ -49,7 +47,6 @@ class MPHDRR_UL_modules(bpy.types.UIList):
 class MPHDRR_PT_geometry(bpy.types.Panel):
     """Import, which scanner it is, and which part of it is shown."""
 
-    bl_idname = ids.PANEL_GEOMETRY
     bl_label = "Geometry"
     bl_space_type = "VIEW_3D"
     bl_region_type = "UI"
@@ -87,7 +84,7 @@ class MPHDRR_PT_geometry(bpy.types.Panel):
 class ScannerPanel:
     """Mixed into panels inside Geometry that need a scanner; they draw by `draw_scanner`."""
 
-    bl_parent_id = ids.PANEL_GEOMETRY
+    bl_parent_id = "MPHDRR_PT_geometry"
     bl_space_type = "VIEW_3D"
     bl_region_type = "UI"
     bl_category = ids.CATEGORY
@@ -110,7 +107,6 @@ class ScannerPanel:
 class MPHDRR_PT_modules(ScannerPanel, bpy.types.Panel):
     """The modules: which are shown, and looking through one."""
 
-    bl_idname = ids.PANEL_MODULES
     bl_label = "Modules"
 
     def draw_scanner(self, context: bpy.types.Context, collection: bpy.types.Collection) -> None:
@@ -130,7 +126,9 @@ class MPHDRR_PT_modules(ScannerPanel, bpy.types.Panel):
         _columns(head, "  Module", "b (mm)", "l (mm)")
         head.label(text="", icon="BLANK1")
         head.separator(factor=2.0)  # the list's scroll bar
-        layout.template_list(ids.LIST_MODULES, "", collection, "all_objects", state, "active_index", rows=6, maxrows=12)
+        layout.template_list(
+            "MPHDRR_UL_modules", "", collection, "all_objects", state, "active_index", rows=6, maxrows=12
+        )
 
         items = collection.all_objects
         active = items[state.active_index] if 0 <= state.active_index < len(items) else None

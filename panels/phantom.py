@@ -13,7 +13,6 @@ _LINE = 32  # letters that fit into the sidebar at its usual width
 
 
 class MPHDRR_PT_phantom(bpy.types.Panel):
-    bl_idname = ids.PANEL_PHANTOM
     bl_label = "Phantom"
     bl_space_type = "VIEW_3D"
     bl_region_type = "UI"
@@ -28,7 +27,7 @@ class MPHDRR_PT_phantom(bpy.types.Panel):
         adding = layout.column()
         adding.enabled = not jobs.is_running()
         column = adding.column(align=True)
-        column.menu(ids.MENU_ADD, text="Add Phantom", icon="OUTLINER_DATA_VOLUME")
+        column.menu("MPHDRR_MT_add", text="Add Phantom", icon="OUTLINER_DATA_VOLUME")
         column.operator(ids.IMPORT_VOLUME, text="Import Volume", icon="IMPORT")
         if storage.missing_volumes(storage.seems_there):
             column = adding.column(align=True)

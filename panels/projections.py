@@ -14,7 +14,6 @@ _MAIN = ("time", "photons", "pixel_points")
 
 
 class MPHDRR_PT_projections(bpy.types.Panel):
-    bl_idname = ids.PANEL_PROJECTIONS
     bl_label = "Projections"
     bl_space_type = "VIEW_3D"
     bl_region_type = "UI"
@@ -87,9 +86,8 @@ def _draw_ct_hint(
 
 
 class MPHDRR_PT_physics(bpy.types.Panel):
-    bl_idname = ids.PANEL_PHYSICS
     bl_label = "Physics"
-    bl_parent_id = ids.PANEL_PROJECTIONS
+    bl_parent_id = "MPHDRR_PT_projections"
     bl_space_type = "VIEW_3D"
     bl_region_type = "UI"
     bl_category = ids.CATEGORY

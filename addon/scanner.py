@@ -39,28 +39,11 @@ def build_scanner(
     shape: tuple[int, int] = (256, 256),
     replace: bool = False,
 ) -> bpy.types.Collection:
-    """Put a scanner into the scene, replacing one of the same name; returns its collection.
+    """Put a scanner into the scene, in place of one of the same name; returns its collection.
 
-    Parameters
-    ----------
-    scene
-        Its units become millimetres, its render resolution `shape`.
-    system
-        The modules.
-    name
-        Name of the scanner's collection; by default that of the workbook's file.
-    construction
-        How the collimators are built.
-    shape
-        Pixels (n_v, n_u) of the cameras' pictures.
-    replace
-        Replace a scanner of the same name even if `losses` finds changes. Objects that are not the scanner's are never
-        deleted: they move to the scene's own collection.
-
-    Raises
-    ------
-    InputError
-        Changes would be lost and `replace` is False, or a collimator cannot be built. The scene is as it was.
+    The scene's units become millimetres and its render resolution `shape`, pixels (n_v, n_u). The name is by default that of
+    the workbook's file. The user's objects in the old scanner move to the scene's own collection. Raises InputError, and
+    leaves the scene as it was, where a collimator cannot be built, or changes (`losses`) would be lost without `replace`.
     """
     name = name or default_name(system)
     old = find_scanner(scene, name)
@@ -204,14 +187,8 @@ def read_scanner(collection: bpy.types.Collection, *, aimed: bool = False) -> Pi
     """The scanner as it stands in the scene now: the cameras' places, and the numbers in their properties.
 
     Numbers that have not changed come back exactly, in float64. The system's modules all look at the isocentre: a camera
-    that does not is named in an `InputWarning` (`aim_modules` turns it), or refused if `aimed`. The system has its
-    source (the workbook) only while everything is as it was imported.
-
-    Raises
-    ------
-    InputError
-        There is no module, two have the same number, their numbers are impossible, or, if `aimed`, a camera does not
-        look at the isocentre.
+    that does not is named in an `InputWarning`, or refused if `aimed`. The system has its source (the workbook) only while
+    everything is as it was imported. Raises InputError for no modules, equal module numbers and impossible lengths.
     """
     found = modules(collection)
     if not found:

@@ -8,8 +8,8 @@ import bpy
 from bpy.props import StringProperty
 from bpy_extras.io_utils import ExportHelper
 
-from ..addon import ids, storage
-from ..core.errors import InputError
+from ..addon import ids, rendering
+from ..addon.reports import run_reported
 
 
 class MPHDRR_OT_export_dataset(ExportHelper, bpy.types.Operator):
@@ -29,39 +29,10 @@ class MPHDRR_OT_export_dataset(ExportHelper, bpy.types.Operator):
         return True
 
     def execute(self, context: bpy.types.Context) -> set[str]:
-        try:
-            path = export_dataset(context.scene, self.filepath)
-        except (InputError, MemoryError) as error:
-            self.report({"ERROR"}, str(error) or "not enough memory to write the run")
-            return {"CANCELLED"}
-        self.report({"INFO"}, f"Wrote {path}")
-        return {"FINISHED"}
+        return run_reported(self, lambda: f"Wrote {rendering.export_run(context.scene, self.filepath)}")
 
     def draw(self, context: bpy.types.Context) -> None:
         column = self.layout.column(align=True)
         column.label(text="The name's ending chooses:")
         for line in (".h5    HDF5", ".npz  NumPy archive", ".pt    PyTorch"):
             column.label(text=line, icon="DOT")
-
-
-def export_dataset(scene: bpy.types.Scene, filepath: str) -> Path:
-    """Write a scene's last run to `filepath`, in the format of its suffix.
-
-    Raises
-    ------
-    InputError
-        There is no run, its file is gone, or the new one cannot be written.
-    """
-    from ..core.runs.files import read_run, write_run
-
-    run_file = getattr(scene, ids.SCENE_PROJECTIONS).run_file
-    if not run_file:
-        raise InputError("nothing to export: render the projections first")
-    source = storage.absolute(run_file)
-    if not source.is_file():
-        raise InputError(f"{source}: the last run's file is gone; render the projections again")
-    if not filepath:
-        raise InputError("no file given: set filepath to a name ending in .h5, .npz or .pt")
-    path = storage.absolute(filepath)
-    write_run(read_run(source), path)
-    return path

@@ -1,7 +1,7 @@
 """Modules follow their numbers: cameras are aimed, collimators and crystals reshaped, readouts calculated.
 
 Everything is changed in place (vertices, properties, rotations). No datablock is made or removed: this also runs after
-Blender has stored an undo step, and undo expects the datablocks that it stored. `copies.py` makes and removes modules.
+Blender has stored an undo step, and undo expects the datablocks that it stored. `module_edits.py` makes and removes modules.
 """
 
 from __future__ import annotations
@@ -193,7 +193,7 @@ def _rebuild(
 def _differs(data: bpy.types.ID, numbers: tuple[float | str, ...]) -> bool:
     """Whether a mesh or camera was built from other numbers than these.
 
-    One that is shared, as a fresh copy's is, stays as it is until `copies.py` has made it single-user.
+    One that is shared, as a fresh copy's is, stays as it is until `module_edits.py` has made it single-user.
     """
     return data.users == 1 and data.get(_KEY) != repr(numbers)
 

@@ -13,7 +13,7 @@ from typing import Any
 
 import bpy
 
-from . import copies, following, scanner
+from . import following, module_edits, scanner
 
 _INTERVAL = 0.2  # s between two looks whether a tool is still running
 _overlooked = False  # something happened while rendering or playing
@@ -62,7 +62,7 @@ def after_undo(*_: Any) -> None:
     for collection in _local(bpy.data.collections):
         following.refresh(collection)
         with following.writing():
-            collection.mphdrr_scanner.untidy = copies.untidy_text(collection)
+            collection.mphdrr_scanner.untidy = module_edits.untidy_text(collection)
         _undone[collection.name] = collection.mphdrr_scanner.untidy
 
 
@@ -70,7 +70,7 @@ def after_undo(*_: Any) -> None:
 def after_load(*_: Any) -> None:
     """A file was opened; one of an older version has shared meshes and no readouts. Nothing is tidied unasked."""
     for collection in _local(bpy.data.collections):
-        copies.make_single_users(collection)
+        module_edits.make_single_users(collection)
     after_undo()
 
 
@@ -91,7 +91,7 @@ def _is_busy() -> bool:
 
 
 def _look_for_copies(collection: bpy.types.Collection) -> None:
-    text = copies.untidy_text(collection)
+    text = module_edits.untidy_text(collection)
     properties = collection.mphdrr_scanner
     if properties.untidy != text:
         with following.writing():

@@ -24,8 +24,7 @@ from ..core.workbook import ColumnMap, QuantityCells, SystemSource
 from . import cameras, following, ids
 from .following import modules
 from .module_values import LENGTHS, is_edited, is_moved, module_numbers, off_aim, remember
-from .replacement import clear, losses, modules_text
-from .scanner_parts import NewScanner
+from .scanner_parts import NewScanner, clear, losses, modules_text
 
 _DEFAULT = Construction()
 

@@ -18,9 +18,14 @@ def active_module(context: bpy.types.Context) -> bpy.types.Object | None:
     item = module_of(context.view_layer.objects.active)
     if item is not None and item.name in collection.all_objects:
         return item
-    items, index = collection.all_objects, context.scene.mphdrr_geometry.active_index
-    listed = items[index] if 0 <= index < len(items) else None
-    return listed if listed is not None and listed.mphdrr_module.is_module else None
+    return listed_module(context.scene)
+
+
+def listed_module(scene: bpy.types.Scene) -> bpy.types.Object | None:
+    """The camera of the module that is active in the panel's list."""
+    collection, index = scanner.active_scanner(scene), scene.mphdrr_geometry.active_index
+    camera = collection.all_objects[index] if collection and 0 <= index < len(collection.all_objects) else None
+    return camera if camera is not None and camera.mphdrr_module.is_module else None
 
 
 def selected_modules(context: bpy.types.Context) -> list[bpy.types.Object]:
@@ -57,8 +62,7 @@ def select(context: bpy.types.Context, modules: Iterable[bpy.types.Object]) -> N
 
 def select_active(scene: bpy.types.Scene) -> None:
     """Select the module that is active in the panel's list, as a click on its camera would."""
-    collection, index = scanner.active_scanner(scene), scene.mphdrr_geometry.active_index
-    camera = collection.all_objects[index] if collection and 0 <= index < len(collection.all_objects) else None
+    camera = listed_module(scene)
     if camera is not None and camera.visible_get(view_layer=bpy.context.view_layer):
         select(bpy.context, [camera])
 

@@ -7,9 +7,9 @@ import math
 import bpy
 from bpy.props import BoolProperty, EnumProperty, FloatProperty, IntProperty
 
-from ..addon import copies, following, ids, renumbering, scanner, selection
-from ..addon.replacement import modules_text
+from ..addon import following, ids, module_edits, scanner, selection
 from ..addon.reports import run_reported
+from ..addon.scanner_parts import modules_text
 
 
 class _OnScanner(selection.NeedsScanner):
@@ -107,7 +107,7 @@ class MPHDRR_OT_duplicate_modules(_OnModules, bpy.types.Operator):
 
     def change(self, context: bpy.types.Context, collection: bpy.types.Collection) -> str:
         modules = selection.selected_modules(context)
-        made = copies.duplicate(collection, modules, self.count, self.angle, self.follow_ring)
+        made = module_edits.duplicate(collection, modules, self.count, self.angle, self.follow_ring)
         selection.select(context, made)
         return f"Made {modules_text([o.mphdrr_module.number for o in made])}"
 
@@ -121,7 +121,7 @@ class MPHDRR_OT_remove_modules(_OnModules, bpy.types.Operator):
     def change(self, context: bpy.types.Context, collection: bpy.types.Collection) -> str:
         modules = selection.selected_modules(context)
         text = modules_text([o.mphdrr_module.number for o in modules])
-        copies.remove(collection, modules)
+        module_edits.remove(collection, modules)
         return f"Removed {text}"
 
 
@@ -134,7 +134,7 @@ class MPHDRR_OT_tidy_modules(_OnScanner, bpy.types.Operator):
     )
 
     def change(self, context: bpy.types.Context, collection: bpy.types.Collection) -> str:
-        tidied = [copies.tidy(each) for each in scanner.scanners(context.scene)]
+        tidied = [module_edits.tidy(each) for each in scanner.scanners(context.scene)]
         made, removed = [n for numbers, _ in tidied for n in numbers], sum(n for _, n in tidied)
         done = [f"made {modules_text(made)}"] if made else []
         done += [f"removed {removed} parts without a camera"] if removed else []
@@ -157,7 +157,7 @@ class MPHDRR_OT_renumber_modules(_OnScanner, bpy.types.Operator):
     )
 
     def change(self, context: bpy.types.Context, collection: bpy.types.Collection) -> str:
-        changed = renumbering.renumber(collection, self.order)
+        changed = module_edits.renumber(collection, self.order)
         return f"Numbered {len(scanner.modules(collection))} modules: {changed} have another number than before"
 
 

@@ -6,7 +6,15 @@ import json
 
 import bpy
 
-from ..addon import ids, scanner
+from ..addon import ids, scanner, selection
+
+
+class Sidebar:
+    """Mixed into the panels of the extension's tab."""
+
+    bl_space_type = "VIEW_3D"
+    bl_region_type = "UI"
+    bl_category = ids.CATEGORY
 
 
 class MPHDRR_UL_modules(bpy.types.UIList):
@@ -44,13 +52,10 @@ class MPHDRR_UL_modules(bpy.types.UIList):
         return flags, order
 
 
-class MPHDRR_PT_geometry(bpy.types.Panel):
+class MPHDRR_PT_geometry(Sidebar, bpy.types.Panel):
     """Import, which scanner it is, and which part of it is shown."""
 
     bl_label = "Geometry"
-    bl_space_type = "VIEW_3D"
-    bl_region_type = "UI"
-    bl_category = ids.CATEGORY
     bl_order = ids.ORDER_GEOMETRY
 
     def draw(self, context: bpy.types.Context) -> None:
@@ -81,13 +86,10 @@ class MPHDRR_PT_geometry(bpy.types.Panel):
         _show(row, "All", 0, 0, "ALL")
 
 
-class ScannerPanel:
+class ScannerPanel(Sidebar):
     """Mixed into panels inside Geometry that need a scanner; they draw by `draw_scanner`."""
 
     bl_parent_id = "MPHDRR_PT_geometry"
-    bl_space_type = "VIEW_3D"
-    bl_region_type = "UI"
-    bl_category = ids.CATEGORY
     bl_options = {"DEFAULT_CLOSED"}  # so that Phantom and Projections are in sight
 
     @classmethod
@@ -105,8 +107,6 @@ class ScannerPanel:
 
 
 class MPHDRR_PT_modules(ScannerPanel, bpy.types.Panel):
-    """The modules: which are shown, and looking through one."""
-
     bl_label = "Modules"
 
     def draw_scanner(self, context: bpy.types.Context, collection: bpy.types.Collection) -> None:
@@ -130,12 +130,12 @@ class MPHDRR_PT_modules(ScannerPanel, bpy.types.Panel):
             "MPHDRR_UL_modules", "", collection, "all_objects", state, "active_index", rows=6, maxrows=12
         )
 
-        items = collection.all_objects
-        active = items[state.active_index] if 0 <= state.active_index < len(items) else None
-        if active is not None and active.mphdrr_module.is_module:
-            text = f"Look Through {active.name}"
-            look = layout.operator(ids.LOOK_THROUGH_MODULE, text=text, icon="OUTLINER_OB_CAMERA")
-            look.number = active.mphdrr_module.number
+        camera = selection.listed_module(context.scene)
+        if camera is not None:
+            look = layout.operator(
+                ids.LOOK_THROUGH_MODULE, text=f"Look Through {camera.name}", icon="OUTLINER_OB_CAMERA"
+            )
+            look.number = camera.mphdrr_module.number
         layout.operator(ids.AIM_MODULES, icon="CON_TRACKTO")
 
 

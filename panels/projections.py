@@ -1,4 +1,4 @@
-"""Sidebar, third step: the projections."""
+"""Sidebar, third and last step: the projections, and the dataset that they give."""
 
 from __future__ import annotations
 
@@ -8,23 +8,21 @@ import bpy
 
 from ..addon import ids, jobs, scanner, volumes
 from ..addon.projection_properties import drawn, makes_counts
+from .geometry import Sidebar
 
 _MAIN = ("time", "photons", "pixel_points")
 """Settings of models that the panel itself shows; the others stand under Physics."""
 
 
-class MPHDRR_PT_projections(bpy.types.Panel):
+class MPHDRR_PT_projections(Sidebar, bpy.types.Panel):
     bl_label = "Projections"
-    bl_space_type = "VIEW_3D"
-    bl_region_type = "UI"
-    bl_category = ids.CATEGORY
     bl_order = ids.ORDER_PROJECTIONS
 
     def draw(self, context: bpy.types.Context) -> None:
         layout = self.layout
         layout.use_property_split = True
         layout.use_property_decorate = False
-        settings = getattr(context.scene, ids.SCENE_PROJECTIONS)
+        settings = context.scene.mphdrr_projections
         jobs.draw_job(layout, context)  # at the top, where it is seen on small screens too
         column = layout.column()
         column.enabled = not jobs.is_running()
@@ -85,24 +83,21 @@ def _draw_ct_hint(
         column.label(text="Select the CT, convert it", icon="BLANK1")
 
 
-class MPHDRR_PT_physics(bpy.types.Panel):
+class MPHDRR_PT_physics(Sidebar, bpy.types.Panel):
     bl_label = "Physics"
     bl_parent_id = "MPHDRR_PT_projections"
-    bl_space_type = "VIEW_3D"
-    bl_region_type = "UI"
-    bl_category = ids.CATEGORY
     bl_options = {"DEFAULT_CLOSED"}
 
     @classmethod
     def poll(cls, context: bpy.types.Context) -> bool:
-        return bool(getattr(context.scene, ids.SCENE_PROJECTIONS).model != "INVERSE_SQUARE")
+        return bool(context.scene.mphdrr_projections.model != "INVERSE_SQUARE")
 
     def draw(self, context: bpy.types.Context) -> None:
         layout = self.layout
         layout.use_property_split = True
         layout.use_property_decorate = False
         layout.enabled = not jobs.is_running()
-        settings = getattr(context.scene, ids.SCENE_PROJECTIONS)
+        settings = context.scene.mphdrr_projections
         column = layout.column(align=True)
         if settings.model == "EMISSION":
             column.prop(settings, "mu", placeholder="None")
@@ -116,3 +111,24 @@ class MPHDRR_PT_physics(bpy.types.Panel):
         seed = row.row()
         seed.active = settings.noise
         seed.prop(settings, "seed")
+
+
+class MPHDRR_PT_export(Sidebar, bpy.types.Panel):
+    bl_label = "Export"
+    bl_order = ids.ORDER_EXPORT
+
+    def draw(self, context: bpy.types.Context) -> None:
+        layout = self.layout
+        layout.operator_context = "INVOKE_DEFAULT"
+        run_file = context.scene.mphdrr_projections.run_file
+        row = layout.row()
+        row.enabled = bool(run_file)
+        row.operator(ids.EXPORT_DATASET, text="Export Dataset", icon="EXPORT")
+        column = layout.column(align=True)
+        column.active = False
+        if not run_file:
+            column.label(text="Render the projections first.", icon="INFO")
+        elif run_file.startswith("//"):
+            column.label(text=f"Last run: {run_file}", icon="FILE")
+        else:
+            column.label(text="Last run: kept when the .blend is saved", icon="FILE")

@@ -42,13 +42,13 @@ def _run(arguments: argparse.Namespace) -> None:
     from .session import new_scene, save_scene
 
     blender_scene = new_scene()
-    from .. import ids, rendering, scanner, volumes
+    from .. import rendering, scanner, volumes
 
     scanner.build_scanner(blender_scene, system)
     if volume is not None:
         volumes.add_volume(volume, Path(arguments.volume).name)
     if mu is not None:
-        getattr(blender_scene, ids.SCENE_PROJECTIONS).mu = volumes.add_volume(mu, Path(arguments.mu).name)
+        blender_scene.mphdrr_projections.mu = volumes.add_volume(mu, Path(arguments.mu).name)
     if run is not None:
         volumes.add_volume(run.volume, "Projected volume")
         rendering.show_run(blender_scene, run, Path(arguments.run_file))

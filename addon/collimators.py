@@ -33,7 +33,7 @@ def new_mesh(name: str, solid: Solid, material: bpy.types.Material) -> bpy.types
     """A mesh datablock of a solid, checked to be watertight, with one material."""
     check_watertight(solid)
     mesh = bpy.data.meshes.new(name)
-    _fill(mesh, solid)
+    reshape_mesh(mesh, solid)
     mesh.materials.append(material)
     return mesh
 
@@ -44,21 +44,10 @@ def reshape_mesh(mesh: bpy.types.Mesh, solid: Solid) -> None:
     if len(mesh.vertices) == len(vertices) and len(mesh.polygons) == len(faces):
         mesh.vertices.foreach_set("co", vertices.astype(np.float32).ravel())
         mesh.update()
-    else:  # the user has edited it
+    else:  # it is new, or the user has edited it
         mesh.clear_geometry()
-        _fill(mesh, solid)
-
-
-def _fill(mesh: bpy.types.Mesh, solid: Solid) -> None:
-    vertices, faces = solid
-    mesh.vertices.add(len(vertices))
-    mesh.vertices.foreach_set("co", vertices.astype(np.float32).ravel())
-    mesh.loops.add(faces.size)
-    mesh.loops.foreach_set("vertex_index", faces.ravel())
-    mesh.polygons.add(len(faces))
-    mesh.polygons.foreach_set("loop_start", np.arange(0, faces.size, faces.shape[1], dtype=np.int32))
-    mesh.update(calc_edges=True)
-    mesh.shade_flat()
+        mesh.from_pydata(vertices, [], faces)
+        mesh.shade_flat()
 
 
 def new_sphere(name: str, radius: float, material: bpy.types.Material) -> bpy.types.Mesh:

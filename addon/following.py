@@ -6,7 +6,7 @@ Blender has stored an undo step, and undo expects the datablocks that it stored.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 
 import bpy
@@ -82,7 +82,10 @@ def refresh(
         rebuilt = [_refresh_module(camera, scanner, own, aim) for camera, own in parts.items()]
         if changed is None or any(rebuilt) or scanner.count != len(found):
             _update_totals(scanner, [camera.mphdrr_module for camera in found])
-            _resize_roi(collection, found)
+            radius = max((camera.mphdrr_module.roi_radius for camera in found), default=0.0)
+            for item in collection.objects:
+                if item.mphdrr_module.part == "ROI" and radius > 0:
+                    collimators.resize_sphere(item.data, radius)
 
 
 def refresh_module(camera: bpy.types.Object) -> None:
@@ -111,17 +114,6 @@ def set_for_all(collection: bpy.types.Collection, name: str) -> None:
             setattr(camera.mphdrr_module, name, getattr(collection.mphdrr_scanner, name))
             if name == "collimator_length":
                 camera.mphdrr_module.length_mode = TYPED
-    refresh(collection)
-
-
-def copy_numbers(
-    collection: bpy.types.Collection, source: bpy.types.Object, targets: Iterable[bpy.types.Object]
-) -> None:
-    """Give modules the lengths of another, and its choice whether `l` follows the ROI."""
-    with writing():
-        for camera in targets:
-            for name in (*LENGTHS, "length_mode"):
-                setattr(camera.mphdrr_module, name, getattr(source.mphdrr_module, name))
     refresh(collection)
 
 
@@ -196,13 +188,6 @@ def _differs(data: bpy.types.ID, numbers: tuple[float | str, ...]) -> bool:
     One that is shared, as a fresh copy's is, stays as it is until `module_edits.py` has made it single-user.
     """
     return data.users == 1 and data.get(_KEY) != repr(numbers)
-
-
-def _resize_roi(collection: bpy.types.Collection, modules: Sequence[bpy.types.Object]) -> None:
-    radius = max((camera.mphdrr_module.roi_radius for camera in modules), default=0.0)
-    for item in collection.objects:
-        if item.mphdrr_module.part == "ROI" and radius > 0:
-            collimators.resize_sphere(item.data, radius)
 
 
 def _update_readouts(

@@ -17,7 +17,7 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
 import bpy
-from bpy.props import BoolProperty, FloatProperty, StringProperty
+from bpy.props import BoolProperty
 
 from ..core.errors import InputError
 from ..core.progress import Cancelled, Progress
@@ -88,6 +88,10 @@ class Worker:
     def alive(self) -> bool:
         return self.thread is not None and self.thread.is_alive()
 
+    @property
+    def share(self) -> float:
+        return self.done / max(1, self.total)
+
     def _work(self) -> None:
         with recorded_warnings() as self.caught:
             try:
@@ -102,6 +106,11 @@ class Worker:
 
 
 _current: Worker | None = None
+
+
+def current() -> Worker | None:
+    """What runs in a thread now."""
+    return _current
 
 
 def is_running() -> bool:
@@ -129,30 +138,6 @@ def stop() -> None:
 def before_load(*_: Any) -> None:
     """A job does not outlive its scene."""
     stop()
-
-
-# Named functions, because a lambda in an annotation does not see this module's names.
-def _get_running(self: JobProperties) -> bool:
-    return is_running()
-
-
-def _get_label(self: JobProperties) -> str:
-    return _current.label if _current else ""
-
-
-def _get_progress(self: JobProperties) -> float:
-    return _current.done / _current.total if _current and _current.total else 0.0
-
-
-class JobProperties(bpy.types.PropertyGroup):
-    """The running job; `WindowManager.mphdrr_job`, read-only."""
-
-    running: BoolProperty(name="Running", get=_get_running)
-    label: StringProperty(name="Job", get=_get_label)
-    progress: FloatProperty(
-        name="Progress", description="Share of the work that is done", min=0.0, max=1.0, subtype="FACTOR",
-        get=_get_progress,
-    )  # fmt: skip
 
 
 class JobOperator:
@@ -316,28 +301,18 @@ class MPHDRR_OT_cancel_job(bpy.types.Operator):
     bl_description = "Stop the running job; the scene stays as it was"
     bl_options = {"INTERNAL"}
 
-    @classmethod
-    def poll(cls, context: bpy.types.Context) -> bool:
-        """There is a job."""
-        if not is_running():
-            cls.poll_message_set("No job is running")
-            return False
-        return True
-
     def execute(self, context: bpy.types.Context) -> set[str]:
         """Ask it to stop."""
         cancel()
         return {"FINISHED"}
 
 
-def draw_job(layout: bpy.types.UILayout, context: bpy.types.Context) -> None:
+def draw_job(layout: bpy.types.UILayout) -> None:
     """Draw the running job's progress bar and Cancel button; nothing where there is none."""
-    if not is_running():
-        return
-    state = context.window_manager.mphdrr_job
-    row = layout.row(align=True)
-    row.progress(factor=state.progress, type="BAR", text=f"{state.label}  {state.progress:.0%}")
-    row.operator(ids.CANCEL_JOB, text="", icon="CANCEL")
+    if _current is not None:
+        row = layout.row(align=True)
+        row.progress(factor=_current.share, type="BAR", text=f"{_current.label}  {_current.share:.0%}")
+        row.operator(ids.CANCEL_JOB, text="", icon="CANCEL")
 
 
 def _argument(value: Any) -> Any:

@@ -21,7 +21,7 @@ from bpy.props import (
     StringProperty,
 )
 
-from . import choices, column_maps, ids, jobs, phantom_properties, projection_properties
+from . import choices, column_maps, ids, phantom_properties, projection_properties
 from .updates import FUNCTIONS, on_edit
 
 
@@ -196,7 +196,6 @@ CLASSES = (
     GeometryProperties,
     *phantom_properties.CLASSES,
     *projection_properties.CLASSES,
-    jobs.JobProperties,
     *column_maps.CLASSES,
 )
 
@@ -207,6 +206,5 @@ POINTERS = (
     (bpy.types.Scene, ids.SCENE_GEOMETRY, GeometryProperties),
     (bpy.types.Object, ids.OBJECT_VOLUME, phantom_properties.VolumeProperties),
     (bpy.types.Scene, ids.SCENE_PROJECTIONS, projection_properties.ProjectionProperties),
-    (bpy.types.WindowManager, ids.WINDOW_JOB, jobs.JobProperties),
     (bpy.types.WindowManager, ids.WINDOW_COLUMNS, column_maps.ColumnMapProperties),
 )

@@ -136,7 +136,10 @@ def _prepare_scene(scene: bpy.types.Scene, system: PinholeSystem, shape: tuple[i
     """Set units, render resolution and clipping for the scanner; look at the whole of one that is new."""
     units = scene.unit_settings
     units.system, units.scale_length, units.length_unit = "METRIC", 0.001, "MILLIMETERS"
-    cameras.set_render_shape(scene, shape)
+    n_v, n_u = shape
+    render = scene.render
+    render.resolution_x, render.resolution_y, render.resolution_percentage = n_u, n_v, 100
+    render.pixel_aspect_x, render.pixel_aspect_y = max(1.0, n_v / n_u), max(1.0, n_u / n_v)
     reach = float((system.pinhole_distance + system.collimator_length).max())
     for space in (space for screen in bpy.data.screens for area in screen.areas for space in area.spaces):
         if space.type == "VIEW_3D":

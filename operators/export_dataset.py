@@ -30,9 +30,3 @@ class MPHDRR_OT_export_dataset(ExportHelper, bpy.types.Operator):
 
     def execute(self, context: bpy.types.Context) -> set[str]:
         return run_reported(self, lambda: f"Wrote {rendering.export_run(context.scene, self.filepath)}")
-
-    def draw(self, context: bpy.types.Context) -> None:
-        column = self.layout.column(align=True)
-        column.label(text="The name's ending chooses:")
-        for line in (".h5    HDF5", ".npz  NumPy archive", ".pt    PyTorch"):
-            column.label(text=line, icon="DOT")

@@ -1,4 +1,4 @@
-"""What a user does with modules: show, aim, duplicate, remove, tidy and renumber them, copy their numbers, check them."""
+"""What a user does with modules: show, aim, duplicate, remove, tidy, renumber and check them."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import math
 import bpy
 from bpy.props import BoolProperty, EnumProperty, FloatProperty, IntProperty
 
-from ..addon import following, ids, module_edits, scanner, selection
+from ..addon import ids, module_edits, scanner, selection
 from ..addon.reports import run_reported
 from ..addon.scanner_parts import modules_text
 
@@ -47,16 +47,6 @@ class MPHDRR_OT_show_modules(_OnScanner, bpy.types.Operator):
         ],
         default="ONLY",
     )
-
-    @classmethod
-    def description(cls, context: bpy.types.Context, properties: bpy.types.OperatorProperties) -> str:
-        modules = f"modules {properties.first} to {properties.last}"
-        return {
-            "ONLY": f"Show {modules} and hide all others, in the viewport and in renders",
-            "SHOW": f"Show {modules}",
-            "HIDE": f"Hide {modules}",
-            "ALL": "Show all modules",
-        }[properties.mode]
 
     def change(self, context: bpy.types.Context, collection: bpy.types.Collection) -> str:
         return f"{scanner.show_modules(collection, self.first, self.last, self.mode)} modules visible"
@@ -159,22 +149,6 @@ class MPHDRR_OT_renumber_modules(_OnScanner, bpy.types.Operator):
     def change(self, context: bpy.types.Context, collection: bpy.types.Collection) -> str:
         changed = module_edits.renumber(collection, self.order)
         return f"Numbered {len(scanner.modules(collection))} modules: {changed} have another number than before"
-
-
-class MPHDRR_OT_set_numbers(_OnModules, bpy.types.Operator):
-    """Give the selected modules, or all, the active module's d, l, Ld, Td and R"""
-
-    bl_idname = ids.SET_NUMBERS
-    bl_label = "Copy Numbers to Selected"
-
-    to_all: BoolProperty(name="All", description="Give them to all modules of the scanner", options={"SKIP_SAVE"})
-
-    def change(self, context: bpy.types.Context, collection: bpy.types.Collection) -> str:
-        selected = selection.selected_modules(context)
-        source = selection.active_module(context) or selected[0]
-        targets = {*(scanner.modules(collection) if self.to_all else selected), source}
-        following.copy_numbers(collection, source, targets - {source})
-        return f"{len(targets)} modules have the numbers of {source.name}"
 
 
 class MPHDRR_OT_check_geometry(_OnScanner, bpy.types.Operator):

@@ -46,9 +46,6 @@ class MPHDRR_PT_design(ScannerPanel, bpy.types.Panel):
         row.operator(ids.DUPLICATE_MODULES, text="Duplicate", icon="DUPLICATE")
         row.operator(ids.REMOVE_MODULES, text="Remove", icon="TRASH")
         row = layout.row(align=True)
-        row.operator(ids.SET_NUMBERS, text="Copy to Selected").to_all = False
-        row.operator(ids.SET_NUMBERS, text="Copy to All").to_all = True
-        row = layout.row(align=True)
         row.prop(properties, "keep_aimed", toggle=True, icon="CON_TRACKTO")
         row.operator(ids.AIM_MODULES)
 
@@ -87,7 +84,7 @@ class MPHDRR_PT_scanner_design(ScannerPanel, bpy.types.Panel):
         column = layout.column(align=True)
         column.operator_context = "INVOKE_DEFAULT"
         column.operator_menu_enum(ids.ADD_MAP, "quantity", text="Add Map", icon="OUTLINER_DATA_VOLUME")
-        jobs.draw_job(column, context)
+        jobs.draw_job(column)
         column = layout.column(align=True)
         column.operator_context = "INVOKE_DEFAULT"
         column.operator(ids.EXPORT_GEOMETRY, text="Export Workbook", icon="EXPORT")

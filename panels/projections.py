@@ -23,12 +23,11 @@ class MPHDRR_PT_projections(Sidebar, bpy.types.Panel):
         layout.use_property_split = True
         layout.use_property_decorate = False
         settings = context.scene.mphdrr_projections
-        jobs.draw_job(layout, context)  # at the top, where it is seen on small screens too
+        jobs.draw_job(layout)  # at the top, where it is seen on small screens too
         column = layout.column()
         column.enabled = not jobs.is_running()
         column.prop(settings, "volume", placeholder="Active volume")
         column.prop(settings, "model")
-        _draw_ct_hint(column, settings, context.object)
         model = [name for name, _ in drawn(settings, "model") if name != "model"]
         _draw(column, settings, "model", [name for name in model if name in _MAIN])
         _draw(column, settings, "detector")
@@ -65,22 +64,6 @@ def _draw(
             row = layout.row()
             row.active = is_active
             row.prop(settings, name)
-
-
-def _draw_ct_hint(
-    layout: bpy.types.UILayout, settings: bpy.types.PropertyGroup, active: bpy.types.Object | None
-) -> None:
-    """A CT that would be projected has to be converted first."""
-    item = settings.volume or active
-    if settings.model == "EMISSION" or not volumes.is_volume(item) or volumes.quantity_of(item) != "hu":
-        return
-    column = layout.column(align=True)
-    column.label(text="CT numbers have no radiograph", icon="ERROR")
-    if item == active:
-        column.operator_context = "INVOKE_DEFAULT"
-        column.operator(ids.CT_TO_ATTENUATION)
-    else:
-        column.label(text="Select the CT, convert it", icon="BLANK1")
 
 
 class MPHDRR_PT_physics(Sidebar, bpy.types.Panel):

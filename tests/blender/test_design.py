@@ -379,19 +379,6 @@ def test_modules_are_removed_with_their_parts(collection):
         bpy.ops.mphdrr.remove_modules()
 
 
-def test_numbers_are_given_to_others(collection):
-    scanner.module(collection, 3).mphdrr_module.pinhole_diameter = 3.3
-    scanner.module(collection, 3).mphdrr_module.collimator_length = 58.2
-    select(scanner.module(collection, 3), scanner.module(collection, 7))
-    bpy.ops.mphdrr.set_numbers()
-    system = scanner.read_scanner(collection)
-    assert [m + 1 for m in range(8) if system.pinhole_diameter[m] == 3.3] == [3, 7]
-    assert [m + 1 for m in range(8) if system.collimator_length[m] == 58.2] == [3, 7]
-    bpy.ops.mphdrr.set_numbers(to_all=True)
-    assert scanner.read_scanner(collection).collimator_length.tolist() == [58.2] * 8
-    assert_consistent(collection)
-
-
 def test_check_marks_the_modules_until_something_changes(collection):
     assert bpy.ops.mphdrr.check_geometry() == {"FINISHED"}
     assert collection.mphdrr_scanner.findings == "[]"

@@ -93,17 +93,12 @@ def part_material(part: str) -> bpy.types.Material:
     shader.inputs["Metallic"].default_value = look.metallic
     shader.inputs["Roughness"].default_value = look.roughness
     shader.inputs["Alpha"].default_value = look.color[3]
-    if part == "ROI":
-        _show_rim_only(nodes, links, shader)
+    if part == "ROI":  # transparent but for its rim
+        weight, scale = nodes.new("ShaderNodeLayerWeight"), nodes.new("ShaderNodeMath")
+        weight.location, scale.location = (-520, 0), (-260, 0)
+        weight.inputs["Blend"].default_value = 0.25
+        scale.operation = "MULTIPLY"
+        scale.inputs[1].default_value = 0.35
+        links.new(weight.outputs["Facing"], scale.inputs[0])
+        links.new(scale.outputs[0], shader.inputs["Alpha"])
     return material
-
-
-def _show_rim_only(nodes: bpy.types.Nodes, links: bpy.types.NodeLinks, shader: bpy.types.Node) -> None:
-    """Make a sphere transparent but for its rim."""
-    weight, scale = nodes.new("ShaderNodeLayerWeight"), nodes.new("ShaderNodeMath")
-    weight.location, scale.location = (-520, 0), (-260, 0)
-    weight.inputs["Blend"].default_value = 0.25
-    scale.operation = "MULTIPLY"
-    scale.inputs[1].default_value = 0.35
-    links.new(weight.outputs["Facing"], scale.inputs[0])
-    links.new(scale.outputs[0], shader.inputs["Alpha"])

@@ -23,6 +23,7 @@ from . import choices
 MAX_TABLES = 9
 _FIRST = 3  # modules previewed at the top
 _SEEN = 80  # rows and columns whose texts are shown beside the settings
+_preview_at = lru_cache(maxsize=1)(lambda workbook, changed: preview_workbook(workbook, _SEEN, _SEEN))
 
 
 def _changed(self: bpy.types.PropertyGroup, context: bpy.types.Context) -> None:
@@ -274,15 +275,10 @@ def _rows(text: str, i: int) -> tuple[int, ...]:
     return tuple(sorted(rows))
 
 
-@lru_cache(maxsize=1)
-def _cells_at(workbook: Path, changed: int) -> dict[str, tuple[tuple[str, ...], ...]]:
-    return preview_workbook(workbook, _SEEN, _SEEN)
-
-
 def _cells(workbook: Path) -> dict[str, tuple[tuple[str, ...], ...]]:
     """Sheet -> rows of texts; read again only when the file has changed."""
     # The reader says what is wrong with a file that is not there.
-    return _cells_at(workbook, workbook.stat().st_mtime_ns if workbook.is_file() else 0)
+    return _preview_at(workbook, workbook.stat().st_mtime_ns if workbook.is_file() else 0)
 
 
 def _seen(form: ColumnMapProperties, quantity: ColumnMapQuantity, workbook: Path) -> str:

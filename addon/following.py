@@ -126,7 +126,10 @@ def _refresh_module(
     if np.any(np.array(module.placed, np.float32) != place.astype(np.float32)):
         is_new = not module.built
         module.placed = place
-        if aim and not is_new and scanner.keep_aimed and _is_free(camera) and off_aim([camera]) and np.any(place):
+        data = camera.animation_data
+        animated = data is not None and (data.action is not None or len(data.drivers) or len(data.nla_tracks))
+        is_free = not animated and not len(camera.constraints)  # only the user turns it
+        if aim and not is_new and scanner.keep_aimed and is_free and off_aim([camera]) and np.any(place):
             cameras.set_world_matrix(camera, cameras.camera_matrices(place[None])[0])
     numbers, aimed = module_numbers(camera), not off_aim([camera])
     built_as = _construction_numbers(scanner)
@@ -142,13 +145,6 @@ def _refresh_module(
     if problem:
         module.problem = problem
     return changed
-
-
-def _is_free(camera: bpy.types.Object) -> bool:
-    """Whether only the user turns the camera: no animation, driver or constraint."""
-    data = camera.animation_data
-    is_animated = data is not None and (data.action is not None or len(data.drivers) or len(data.nla_tracks))
-    return not is_animated and not len(camera.constraints)
 
 
 def _construction_numbers(scanner: bpy.types.PropertyGroup) -> _ConstructionNumbers:

@@ -8,7 +8,6 @@ a job themselves, with `run`.
 
 from __future__ import annotations
 
-import sys
 import threading
 import time
 import traceback
@@ -19,6 +18,7 @@ from typing import TYPE_CHECKING, Any
 import bpy
 from bpy.props import BoolProperty
 
+from ..core.cli.options import progress_bar
 from ..core.errors import InputError
 from ..core.progress import Cancelled, Progress
 from ..core.recording import recorded_warnings
@@ -34,16 +34,9 @@ _PATIENCE = 10.0  # s that `stop` waits for a thread
 class Job:
     """Work to do, and what to do with its result.
 
-    Attributes
-    ----------
-    label : str
-        Shown in the progress bar.
-    work : callable
-        ``work(progress)`` runs in a thread and must not touch bpy. It calls ``progress(done, total)`` between its steps,
-        which raises `Cancelled` when the user wants to stop.
-    finish : callable
-        ``finish(result)`` runs in the main thread and returns the line to report; if that takes long, it is a generator
-        that yields between its steps, so that the window can be drawn.
+    ``work(progress)`` runs in a thread and must not touch bpy; ``progress(done, total)`` raises `Cancelled` when the user
+    wants to stop. ``finish(result)`` runs in the main thread and returns the line to report; if that takes long, it is a
+    generator that yields between its steps, so that the window can be drawn.
     """
 
     label: str
@@ -189,7 +182,7 @@ class JobOperator:
             _require_idle()
             with warnings_reported(self):
                 job = self.job(context)
-                text = run(job, _console(job.label))
+                text = run(job, progress_bar(job.label))
             self.report({"INFO"}, text)
         except BaseException as error:
             return self._failed(error)
@@ -331,16 +324,3 @@ def redraw_sidebars() -> None:
             for region in area.regions:
                 if area.type == "VIEW_3D" and region.type == "UI":
                     region.tag_redraw()
-
-
-def _console(label: str) -> Progress:
-    shown = -1
-
-    def progress(done: int, total: int) -> None:
-        nonlocal shown
-        percent = 100 * done // max(1, total)
-        if percent >= shown + 10 or done == total:
-            shown = percent
-            print(f"mphDRR: {label} {percent} % ({done} of {total})", file=sys.stderr, flush=True)
-
-    return progress

@@ -36,7 +36,9 @@ def render_job(context: bpy.types.Context, recipe: Recipe, volume: str = "", mu:
     model = recipe_model(recipe, system)  # refuses what cannot be, before the work begins
     photons = recipe["model.photons"]
     item = _chosen_volume(context, volume, ("mu",) if photons else model.takes, model.name)
-    mu_item = _chosen_mu(context, mu) if recipe["model.kind"] == "emission" else None
+    mu_item = _given(context, "mu", mu) if recipe["model.kind"] == "emission" else None
+    if mu_item is not None:
+        require_quantity(volumes.quantity_of(mu_item), ("mu",), f"{mu_item.name!r} for attenuation")
     for chosen in filter(None, (item, mu_item)):
         phantoms.require_current(chosen)
     rows, columns = recipe["detector.rows"], recipe["detector.columns"]
@@ -149,14 +151,6 @@ def _chosen_volume(context: bpy.types.Context, name: str, taken: Sequence[str], 
     if len(fitting) > 1:
         raise InputError(f"choose what to project: there are {len(fitting)} volumes of {what}")
     return fitting[0]
-
-
-def _chosen_mu(context: bpy.types.Context, name: str) -> bpy.types.Object | None:
-    """The volume of attenuation coefficients named, else the panel's, else None."""
-    chosen = _given(context, "mu", name)
-    if chosen is not None:
-        require_quantity(volumes.quantity_of(chosen), ("mu",), f"{chosen.name!r} for attenuation")
-    return chosen
 
 
 def _given(context: bpy.types.Context, setting: str, name: str) -> bpy.types.Object | None:

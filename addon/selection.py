@@ -8,6 +8,7 @@ from typing import Any
 import bpy
 
 from . import scanner
+from .reports import run_reported
 
 
 def active_module(context: bpy.types.Context) -> bpy.types.Object | None:
@@ -79,8 +80,22 @@ class NeedsScanner:
         return True
 
 
-class NeedsModules(NeedsScanner):
-    """Mix into an operator that needs an active or selected module."""
+class OnScanner(NeedsScanner):
+    """Mix into an operator that works on the scanner of the panels."""
+
+    bl_options = {"REGISTER", "UNDO"}
+
+    def execute(self, context: bpy.types.Context) -> set[str]:
+        """Do the work and report."""
+        return run_reported(self, lambda: self.change(context, scanner.required_scanner(context.scene)))
+
+    def change(self, context: bpy.types.Context, collection: bpy.types.Collection) -> str:
+        """Do the work and return the line to report; raises InputError."""
+        raise NotImplementedError
+
+
+class OnModules(OnScanner):
+    """Mix into an operator that works on the active or selected modules."""
 
     @classmethod
     def poll(cls: Any, context: bpy.types.Context) -> bool:

@@ -125,13 +125,8 @@ class MPHDRR_OT_import_geometry(bpy.types.Operator):
             return
         layout.use_property_split = True
         layout.use_property_decorate = False
-        layout.prop(self, "name")
-        column = layout.column(align=True)
-        column.prop(self, "plate_thickness")
-        column.prop(self, "wall_thickness")
-        layout.prop(self, "image_size")
-        layout.prop(self, "columns")
-        layout.prop(self, "choose_columns")
+        for name in ("name", "plate_thickness", "wall_thickness", "image_size", "columns", "choose_columns"):
+            layout.prop(self, name)
 
     _dialog: Literal["", "COLUMNS", "REPLACE"] = ""  # which one is open
     _losses: list[str] | tuple[str, ...] = ()

@@ -8,28 +8,10 @@ import bpy
 from bpy.props import BoolProperty, EnumProperty, FloatProperty, IntProperty
 
 from ..addon import ids, module_edits, scanner, selection
-from ..addon.reports import run_reported
 from ..addon.scanner_parts import modules_text
 
 
-class _OnScanner(selection.NeedsScanner):
-    """Mixed into operators that change the scanner that the panels work on."""
-
-    bl_options = {"REGISTER", "UNDO"}
-
-    def execute(self, context: bpy.types.Context) -> set[str]:
-        return run_reported(self, lambda: self.change(context, scanner.required_scanner(context.scene)))
-
-    def change(self, context: bpy.types.Context, collection: bpy.types.Collection) -> str:
-        """Do the work and return the line to report; raises InputError."""
-        raise NotImplementedError
-
-
-class _OnModules(selection.NeedsModules, _OnScanner):
-    """Mixed into operators that work on the selected modules."""
-
-
-class MPHDRR_OT_show_modules(_OnScanner, bpy.types.Operator):
+class MPHDRR_OT_show_modules(selection.OnScanner, bpy.types.Operator):
     """Show or hide modules with their collimators and crystals, in the viewport and in renders"""
 
     bl_idname = ids.SHOW_MODULES
@@ -52,7 +34,7 @@ class MPHDRR_OT_show_modules(_OnScanner, bpy.types.Operator):
         return f"{scanner.show_modules(collection, self.first, self.last, self.mode)} modules visible"
 
 
-class MPHDRR_OT_look_through_module(_OnScanner, bpy.types.Operator):
+class MPHDRR_OT_look_through_module(selection.OnScanner, bpy.types.Operator):
     """Make the module's pinhole camera the scene's camera, and look through it"""
 
     bl_idname = ids.LOOK_THROUGH_MODULE
@@ -67,7 +49,7 @@ class MPHDRR_OT_look_through_module(_OnScanner, bpy.types.Operator):
         return f"Looking through {context.scene.camera.name}"
 
 
-class MPHDRR_OT_aim_modules(_OnScanner, bpy.types.Operator):
+class MPHDRR_OT_aim_modules(selection.OnScanner, bpy.types.Operator):
     """Turn every module that does not look at the isocentre, without moving it"""
 
     bl_idname = ids.AIM_MODULES
@@ -78,7 +60,7 @@ class MPHDRR_OT_aim_modules(_OnScanner, bpy.types.Operator):
         return f"Turned {modules_text(aimed)}" if aimed else "All modules aim at the isocentre"
 
 
-class MPHDRR_OT_duplicate_modules(_OnModules, bpy.types.Operator):
+class MPHDRR_OT_duplicate_modules(selection.OnModules, bpy.types.Operator):
     """Copy the selected modules, with collimators and crystals, to further places on their rings"""
 
     bl_idname = ids.DUPLICATE_MODULES
@@ -102,7 +84,7 @@ class MPHDRR_OT_duplicate_modules(_OnModules, bpy.types.Operator):
         return f"Made {modules_text([o.mphdrr_module.number for o in made])}"
 
 
-class MPHDRR_OT_remove_modules(_OnModules, bpy.types.Operator):
+class MPHDRR_OT_remove_modules(selection.OnModules, bpy.types.Operator):
     """Delete the selected modules with their collimators and crystals"""
 
     bl_idname = ids.REMOVE_MODULES
@@ -115,7 +97,7 @@ class MPHDRR_OT_remove_modules(_OnModules, bpy.types.Operator):
         return f"Removed {text}"
 
 
-class MPHDRR_OT_tidy_modules(_OnScanner, bpy.types.Operator):
+class MPHDRR_OT_tidy_modules(selection.OnScanner, bpy.types.Operator):
     bl_idname = ids.TIDY_MODULES
     bl_label = "Tidy Modules"
     bl_description = (
@@ -131,7 +113,7 @@ class MPHDRR_OT_tidy_modules(_OnScanner, bpy.types.Operator):
         return " and ".join(done).capitalize() or "All modules are in order"
 
 
-class MPHDRR_OT_renumber_modules(_OnScanner, bpy.types.Operator):
+class MPHDRR_OT_renumber_modules(selection.OnScanner, bpy.types.Operator):
     """Number all modules 1, 2, ...; they are listed, projected and exported in that order from now on"""
 
     bl_idname = ids.RENUMBER_MODULES
@@ -151,7 +133,7 @@ class MPHDRR_OT_renumber_modules(_OnScanner, bpy.types.Operator):
         return f"Numbered {len(scanner.modules(collection))} modules: {changed} have another number than before"
 
 
-class MPHDRR_OT_check_geometry(_OnScanner, bpy.types.Operator):
+class MPHDRR_OT_check_geometry(selection.OnScanner, bpy.types.Operator):
     bl_idname = ids.CHECK_GEOMETRY
     bl_label = "Check Geometry"
     bl_description = (

@@ -119,12 +119,9 @@ def _draw_numbers(
     for name, label in _LABELS:
         column.prop(numbers, name, text=_label(label, name in mixed))
     column.row(align=True).prop(numbers, "length_mode", expand=True)
-    if numbers.length_mode == "TYPED":
-        column.prop(numbers, "collimator_length", text=_label("Length l", "collimator_length" in mixed))
-    elif "collimator_length" not in mixed:
-        row = column.row(align=True)
-        row.enabled = False  # it follows the others
-        row.prop(numbers, "collimator_length", text=_label("Length l", False))
+    row = column.row(align=True)
+    row.enabled = numbers.length_mode == "TYPED"  # otherwise it follows the others
+    row.prop(numbers, "collimator_length", text=_label("Length l", "collimator_length" in mixed))
     return column
 
 

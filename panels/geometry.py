@@ -64,11 +64,7 @@ class MPHDRR_PT_geometry(Sidebar, bpy.types.Panel):
         layout.operator(ids.IMPORT_GEOMETRY, text="Import Workbook", icon="IMPORT")
         collection = scanner.active_scanner(context.scene)
         if collection is None:
-            column = layout.column(align=True)
-            column.active = False
-            column.label(text="No scanner in the scene.", icon="INFO")
-            column.label(text="Import a workbook, or drop it", icon="BLANK1")
-            column.label(text="on the viewport.", icon="BLANK1")
+            layout.label(text="Or drop it on the viewport.", icon="INFO")
             return
         if len(scanner.scanners(context.scene)) > 1:
             layout.prop(context.scene.mphdrr_geometry, "scanner", text="")

@@ -104,14 +104,8 @@ class MPHDRR_PT_export(Sidebar, bpy.types.Panel):
         layout = self.layout
         layout.operator_context = "INVOKE_DEFAULT"
         run_file = context.scene.mphdrr_projections.run_file
-        row = layout.row()
-        row.enabled = bool(run_file)
-        row.operator(ids.EXPORT_DATASET, text="Export Dataset", icon="EXPORT")
-        column = layout.column(align=True)
-        column.active = False
-        if not run_file:
-            column.label(text="Render the projections first.", icon="INFO")
-        elif run_file.startswith("//"):
-            column.label(text=f"Last run: {run_file}", icon="FILE")
-        else:
-            column.label(text="Last run: kept when the .blend is saved", icon="FILE")
+        layout.enabled = bool(run_file)
+        layout.operator(ids.EXPORT_DATASET, text="Export Dataset", icon="EXPORT")
+        if run_file:
+            kept = run_file if run_file.startswith("//") else "kept when the .blend is saved"
+            layout.label(text=f"Last run: {kept}", icon="FILE")

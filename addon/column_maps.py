@@ -1,8 +1,4 @@
-"""The settings of the column map dialog: filled from a draft, read as a `ColumnMap`, shown as the reader reads them.
-
-They live on the window manager while the dialog is open. Drawing reads nothing from the workbook: a setting that changes
-calls `update`.
-"""
+"""The settings of the column map dialog, on the window manager while it is open; a changed setting calls `update`."""
 
 from __future__ import annotations
 
@@ -245,10 +241,7 @@ def _preview(workbook: Path, columns: ColumnMap) -> tuple[int, list[list[str]]]:
 
 
 def accept(form: ColumnMapProperties) -> ColumnMap:
-    """The column map that the settings describe, also saved where they ask for that.
-
-    Raises InputError where the workbook is refused or the map cannot be saved.
-    """
+    """The column map that the settings describe, also saved where they ask for that; raises the reader's refusal."""
     update(form)
     if form.refusal:
         raise InputError(form.refusal)

@@ -70,8 +70,7 @@ def refresh(
 ) -> None:
     """Make a scanner's modules, and its totals, follow their places and numbers.
 
-    `changed` are the camera objects that may have changed; by default all, and the totals are calculated in any case, as
-    is necessary after an undo. `aim` aims modules that have been moved, if the scanner is set to keep them aimed.
+    `changed` are the camera objects that may have changed; by default all. `aim` lets the scanner keep them aimed.
     """
     scanner = collection.mphdrr_scanner
     if is_writing() or not scanner.is_scanner:
@@ -179,10 +178,7 @@ def _rebuild(
 
 
 def _differs(data: bpy.types.ID, numbers: tuple[float | str, ...]) -> bool:
-    """Whether a mesh or camera was built from other numbers than these.
-
-    One that is shared, as a fresh copy's is, stays as it is until `module_edits.py` has made it single-user.
-    """
+    """Whether a mesh or camera was built from other numbers. A shared one stays until `module_edits.py` has copied it."""
     return data.users == 1 and data.get(_KEY) != repr(numbers)
 
 

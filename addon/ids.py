@@ -44,12 +44,9 @@ CANCEL_JOB = "mphdrr.cancel_job"
 ORDER_GEOMETRY, ORDER_PHANTOM, ORDER_PROJECTIONS, ORDER_EXPORT = 0, 10, 20, 30
 
 # --- Properties on Blender's types; code reads them as attributes: `scene.mphdrr_geometry` ------------------
-SCENE_GEOMETRY = "mphdrr_geometry"
 SCENE_PROJECTIONS = "mphdrr_projections"
 OBJECT_MODULE = "mphdrr_module"
 OBJECT_VOLUME = "mphdrr_volume"
-WINDOW_COLUMNS = "mphdrr_columns"
-COLLECTION_SCANNER = "mphdrr_scanner"
 
 # --- Datablocks ---------------------------------------------------------------------------------------------
 SCANNER = "Scanner"  # default name of a scanner's collection

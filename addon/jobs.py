@@ -1,9 +1,8 @@
 """Long work that leaves the window alive: a thread does it, a modal operator watches it.
 
-What a task does is a function of `addon` that returns a `Job`; an operator that inherits from `JobOperator` calls that
-function. Started from the window (INVOKE), the job runs in a thread, with a progress bar, until Esc or the panel's button
-cancels it. Called from a script (EXEC) or without a window, the operator returns when the job is done. Scripts can also do
-a job themselves, with `run`.
+A function of `addon` returns a `Job`; an operator that inherits from `JobOperator` does it. Started from the window
+(INVOKE), it runs in a thread, until Esc or the panel's button cancels it. Called from a script (EXEC) or without a window,
+the operator returns when the job is done. Scripts can also do a job themselves, with `run`.
 """
 
 from __future__ import annotations
@@ -117,7 +116,8 @@ def cancel() -> None:
         _current.cancel.set()
 
 
-def stop() -> None:
+@bpy.app.handlers.persistent
+def stop(*_: Any) -> None:
     """Stop the running job and wait for its thread: before a file is loaded, or the extension is disabled."""
     global _current
     worker, _current = _current, None
@@ -125,12 +125,6 @@ def stop() -> None:
         worker.cancel.set()
         if worker.thread is not None:
             worker.thread.join(_PATIENCE)
-
-
-@bpy.app.handlers.persistent
-def before_load(*_: Any) -> None:
-    """A job does not outlive its scene."""
-    stop()
 
 
 class JobOperator:

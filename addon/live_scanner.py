@@ -1,8 +1,7 @@
 """Handlers: scanners follow when cameras move, after undo and redo, and when a file is loaded.
 
-Following only changes things in place (`following.refresh`). Cameras that the user copied or deleted with Blender's own
-Shift+D and X need datablocks made and removed: that waits until Blender is idle, and is an undo step of its own. What an
-undo has made untidy again is left so; the panel offers to tidy it.
+Cameras that the user copied or deleted with Blender's own Shift+D and X need datablocks made and removed: that waits until
+Blender is idle, and is an undo step of its own. What an undo has made untidy again is left so; the panel offers to tidy it.
 """
 
 from __future__ import annotations

@@ -68,8 +68,7 @@ def untidy_text(collection: bpy.types.Collection) -> str:
 def tidy(collection: bpy.types.Collection) -> tuple[list[int], int]:
     """Make modules of copied cameras, and remove parts without a camera.
 
-    Returns the new modules' numbers, and how many parts were removed. Raises InputError where a copy's shapes cannot be
-    built, and leaves the scene as it was.
+    Returns the new modules' numbers, and how many parts were removed. Where a shape cannot be built nothing is changed.
     """
     copied, orphans, numbers = copied_cameras(collection), orphan_parts(collection), []
     _require_solids(collection, [*copied, *bare_cameras(collection)])
@@ -88,10 +87,7 @@ def tidy(collection: bpy.types.Collection) -> tuple[list[int], int]:
 def adopt(
     collection: bpy.types.Collection, camera: bpy.types.Object, center: NDArray[np.float64] | None = None
 ) -> None:
-    """Make the copy of a module's camera a module with a new number, a collimator and a crystal.
-
-    `center` is its pinhole (3,), mm, in float64; by default it is where the camera stands.
-    """
+    """Make the copy of a module's camera a module of its own, with its pinhole at `center` (3,), mm, or where it stands."""
     found = [o for o in scanner.modules(collection) if o != camera]
     number = max(o.mphdrr_module.number for o in found) + 1
     if not following.parts_of(collection, [camera])[camera]:
@@ -188,10 +184,7 @@ def _wrapped(angles: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def remove(collection: bpy.types.Collection, modules: Sequence[bpy.types.Object]) -> None:
-    """Remove modules with their collimators and crystals; other objects parented to them stay where they are.
-
-    Raises InputError where no module would be left.
-    """
+    """Remove modules with their collimators and crystals; other objects parented to them stay where they are."""
     if len(modules) >= len(scanner.modules(collection)):
         raise InputError("a scanner needs at least one module: keep one, or delete the scanner's collection")
     children = [child for camera in modules for child in camera.children]

@@ -104,10 +104,7 @@ ProjectionSettings.__annotations__.update(_properties())
 
 
 def recipe_values(get: Callable[[str], Any]) -> dict[str, Any]:
-    """The values of the settings by their keys in a recipe, None for none; `get` gives a property's.
-
-    Raises InputError for a choice that only a later version knows.
-    """
+    """The values of the settings by their keys in a recipe, None for none; `get` gives a property's."""
     values: dict[str, Any] = {}
     for name, setting in PROPERTIES.items():
         material = _material(name, setting)

@@ -80,7 +80,7 @@ MENUS.append((bpy.types.VIEW3D_MT_add, lambda menu, _: menu.layout.menu("MPHDRR_
 
 # (list in bpy.app.handlers, function): decorate the function with @bpy.app.handlers.persistent.
 HANDLERS: tuple[tuple[list[Any], Any], ...] = (
-    (bpy.app.handlers.load_pre, jobs.before_load),
+    (bpy.app.handlers.load_pre, jobs.stop),
     (bpy.app.handlers.load_pre, slices.before_load),
     (bpy.app.handlers.load_post, volumes.after_load),
     (bpy.app.handlers.load_post, live_scanner.after_load),
@@ -112,10 +112,7 @@ _undo: list[tuple[Callable[..., Any], tuple[Any, ...]]] = []
 
 
 def register(command: Callable[..., int] | None = None) -> None:
-    """Register everything, or, if something fails, take back what was registered and raise.
-
-    `command` is what ``blender --command mphdrr`` calls.
-    """
+    """Register everything, or nothing if something fails; `command` is what ``blender --command mphdrr`` calls."""
     updates.FUNCTIONS.update(UPDATES)
     try:
         for cls in CLASSES:

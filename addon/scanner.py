@@ -225,8 +225,7 @@ def read_scanner(collection: bpy.types.Collection, *, aimed: bool = False) -> Pi
 def check_geometry(collection: bpy.types.Collection) -> tuple[list[str], list[bpy.types.Object]]:
     """Check the scanner for overlaps, blocked holes and ROIs that are not seen, and store the findings at its modules.
 
-    Returns the findings, and the camera objects of the modules concerned. Raises InputError where the modules' numbers
-    are impossible or a collimator cannot be built.
+    Returns the findings, and the camera objects of the modules concerned.
     """
     construction = following.construction(collection.mphdrr_scanner)
     report = checks.check_geometry(read_scanner(collection), **asdict(construction))
@@ -259,8 +258,7 @@ def set_visible(camera: bpy.types.Object, visible: bool) -> None:
 def show_modules(collection: bpy.types.Collection, first: int, last: int, mode: str = "ONLY") -> int:
     """Show modules by their numbers, first to last; returns how many are visible now.
 
-    `mode` is ``"SHOW"`` or ``"HIDE"``, which leave the other modules, ``"ONLY"``, or ``"ALL"``, which needs no range. Raises
-    InputError where no module has a number in the range.
+    `mode` is ``"SHOW"`` or ``"HIDE"``, which leave the other modules, ``"ONLY"``, or ``"ALL"``, which needs no range.
     """
     found = modules(collection)
     inside = {o for o in found if mode == "ALL" or first <= o.mphdrr_module.number <= last}

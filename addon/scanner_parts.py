@@ -14,10 +14,7 @@ from .module_values import is_edited, is_moved, off_aim, write_module
 
 
 class NewScanner:
-    """The datablocks of a scanner that is not in the scene yet: `cameras` by module number, `rings` and the `roi` sphere.
-
-    `parts` are the modules' collimators and crystals, as of `module_parts`.
-    """
+    """The datablocks of a scanner that is not in the scene yet: `cameras` by module number, `rings` and the `roi` sphere."""
 
     def __init__(self, system: PinholeSystem, parts: Sequence[ModulePart]) -> None:
         self.cameras: dict[int, bpy.types.Object] = {}

@@ -92,7 +92,11 @@ class MPHDRR_OT_import_geometry(bpy.types.Operator):
         if old is not None and not self.replace and self._has_window():
             self._losses = scanner.losses(old)
             if self._losses:
-                return self._ask_to_replace(context, old)
+                self._dialog = "REPLACE"
+                self.replace = True  # the dialog's button calls execute again
+                return context.window_manager.invoke_props_dialog(
+                    self, width=440, title=f"Replace '{old.name}'?", confirm_text="Replace"
+                )
         return run_reported(self, lambda: self._build(context, system))
 
     def _build(self, context: bpy.types.Context, system: PinholeSystem) -> str:
@@ -158,11 +162,4 @@ class MPHDRR_OT_import_geometry(bpy.types.Operator):
         self._dialog = "COLUMNS"
         return context.window_manager.invoke_props_dialog(
             self, width=column_map_dialog.WIDTH, title=f"Columns of {self._workbook().name}", confirm_text="Import"
-        )
-
-    def _ask_to_replace(self, context: bpy.types.Context, old: bpy.types.Collection) -> set[str]:
-        self._dialog = "REPLACE"
-        self.replace = True  # the dialog's button calls execute again
-        return context.window_manager.invoke_props_dialog(
-            self, width=440, title=f"Replace '{old.name}'?", confirm_text="Replace"
         )

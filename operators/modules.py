@@ -1,4 +1,4 @@
-"""What a user does with modules: show, aim, duplicate, remove, tidy, renumber and check them."""
+"""What a user does with modules: show, aim, duplicate, remove, tidy, renumber, check and map them."""
 
 from __future__ import annotations
 
@@ -7,7 +7,8 @@ import math
 import bpy
 from bpy.props import BoolProperty, EnumProperty, FloatProperty, IntProperty
 
-from ..addon import ids, module_edits, scanner, selection
+from ..addon import ids, jobs, maps, module_edits, scanner, selection
+from ..addon.decimals import typed
 from ..addon.scanner_parts import modules_text
 
 
@@ -148,3 +149,26 @@ class MPHDRR_OT_check_geometry(selection.OnScanner, bpy.types.Operator):
         if concerned:
             selection.select(context, concerned)
         return f"{len(found)} findings at {len(concerned)} modules: see the Design panel"
+
+
+class MPHDRR_OT_add_map(selection.NeedsScanner, jobs.JobOperator, bpy.types.Operator):
+    bl_idname = ids.ADD_MAP
+    bl_label = "Add Map"
+    bl_description = (
+        "Calculate what the scanner, with ideal modules, does in every voxel around the isocentre, and show it as a "
+        "volume, in place of the last map of this quantity"
+    )
+    bl_options = {"REGISTER", "UNDO"}
+
+    quantity: EnumProperty(name="Quantity", description="What is mapped", items=maps.QUANTITIES)
+    voxels: IntProperty(
+        name="Voxels", description="Voxels along each side of the map", default=64, min=2, soft_max=256, max=1024
+    )
+    side: FloatProperty(
+        name="Side (mm)", description="Side of the map's cube in mm; 0 takes the diameter of the ROI", default=0.0,
+        min=0.0, soft_max=500.0,
+    )  # fmt: skip
+    within_roi: BoolProperty(name="Within ROI", description="Leave out what lies outside the ROI sphere", default=True)
+
+    def job(self, context: bpy.types.Context) -> jobs.Job:
+        return maps.mapping(context.scene, self.quantity, self.voxels, typed(self.side), self.within_roi)

@@ -1,4 +1,4 @@
-"""Project a volume into the scanner's modules, as a job; load its settings, and show its result."""
+"""Project a volume into the scanner's modules, as a job; load its settings, show and export its result."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import Any
 
 import bpy
 from bpy.props import FloatProperty, StringProperty
-from bpy_extras.io_utils import ImportHelper
+from bpy_extras.io_utils import ExportHelper, ImportHelper
 
 from ..addon import ids, images, jobs, rendering, scanner, storage
 from ..addon.decimals import typed
@@ -93,3 +93,23 @@ class MPHDRR_OT_show_projections(bpy.types.Operator):
             self.report({"ERROR"}, "no window with a 3D view to open an Image Editor in")
             return {"CANCELLED"}
         return {"FINISHED"}
+
+
+class MPHDRR_OT_export_dataset(ExportHelper, bpy.types.Operator):
+    """Write the last run, with geometry, volume and provenance, as HDF5 (.h5), NumPy (.npz) or PyTorch (.pt)"""
+
+    bl_idname = ids.EXPORT_DATASET
+    bl_label = "Export mphDRR Dataset"
+
+    filename_ext = ".h5"
+    filter_glob: StringProperty(default="*.h5;*.hdf5;*.npz;*.pt", options={"HIDDEN"})
+
+    def check(self, context: bpy.types.Context) -> bool:
+        """Give a name without suffix the default one; the other formats' suffixes stay."""
+        if Path(self.filepath).suffix:
+            return False
+        self.filepath += self.filename_ext
+        return True
+
+    def execute(self, context: bpy.types.Context) -> set[str]:
+        return run_reported(self, lambda: f"Wrote {rendering.export_run(context.scene, self.filepath)}")

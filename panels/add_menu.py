@@ -14,9 +14,8 @@ class MPHDRR_MT_add(bpy.types.Menu):
     def draw(self, context: bpy.types.Context) -> None:
         layout = self.layout
         layout.operator_context = "INVOKE_DEFAULT"
-        for kind, label, _ in menu_entries():
-            layout.operator(ids.ADD_PHANTOM + kind, text=label, icon="OUTLINER_DATA_VOLUME")
         for kind, label, beats in menu_entries():
+            layout.operator(ids.ADD_PHANTOM + kind, text=label, icon="OUTLINER_DATA_VOLUME")
             if beats:
                 layout.operator(
                     ids.ADD_PHANTOM + kind, text=f"Beating {label}", icon="OUTLINER_DATA_VOLUME"

@@ -132,7 +132,6 @@ class MPHDRR_PT_modules(ScannerPanel, bpy.types.Panel):
                 ids.LOOK_THROUGH_MODULE, text=f"Look Through {camera.name}", icon="OUTLINER_OB_CAMERA"
             )
             look.number = camera.mphdrr_module.number
-        layout.operator(ids.AIM_MODULES, icon="CON_TRACKTO")
 
 
 def draw_facts(split: bpy.types.UILayout, *facts: tuple[str, str]) -> None:

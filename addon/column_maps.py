@@ -141,8 +141,7 @@ CLASSES = (ColumnMapTable, ColumnMapQuantity, ColumnMapProperties)
 def fill(form: ColumnMapProperties, workbook: Path, columns: ColumnMap | None = None) -> bool:
     """Fill the settings from a column map, by default from a draft made of the workbook's headings.
 
-    Returns whether the dialog can help: the reader has questions about the workbook, or a map was given. Raises
-    InputError where the file is not a workbook; the settings are then empty.
+    Returns whether the dialog can help: the reader has questions about the workbook, or a map was given.
     """
     clear(form)
     draft = draft_column_map(workbook)

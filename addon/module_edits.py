@@ -1,7 +1,4 @@
-"""Modules made, removed and renumbered in the scene: duplicates, copied cameras, parts whose camera was deleted.
-
-All of this makes or removes datablocks: it is for operators, which are undo steps, not for handlers.
-"""
+"""Modules made, removed and renumbered in the scene, by operators (undo steps), not by handlers."""
 
 from __future__ import annotations
 

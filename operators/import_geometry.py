@@ -1,7 +1,4 @@
-"""File > Import > Pinhole Geometry: a workbook becomes a scanner.
-
-Where the reader does not understand the headings, the user answers in the column map dialog; a script sets `columns`.
-"""
+"""File > Import > Pinhole Geometry: a workbook becomes a scanner, with the column map dialog where headings are unclear."""
 
 from __future__ import annotations
 

@@ -1,7 +1,4 @@
-"""Sidebar, Geometry > Design: the active module's numbers and what they do, and those of all modules.
-
-Drawing shows readouts that were calculated when something changed (`addon/following.py`).
-"""
+"""Sidebar, Geometry > Design: numbers and readouts (`addon/following.py`) of the active module, and of all modules."""
 
 from __future__ import annotations
 

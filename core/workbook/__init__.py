@@ -1,31 +1,10 @@
 """The users' geometry workbook (.xlsx): the pinholes' coordinates and their dimensions.
 
-quantities.py    the table of what the columns may hold: headings, units, formulas
-headings.py      what texts say: headings, units in notes, number formats
-book.py          the file, and the values of its cells
-headed_table.py  a table as a sheet's headings describe it
-doubts.py        what in a table or around it may give its numbers another meaning
-recognition.py   which cells hold which quantity, by the headings
-column_map.py    `ColumnMap`: the same, said by a person
-layout.py        which cells hold which quantity of which module, either way
-reader.py        `read_system`, from the layout to the numbers to the system
-plausibility.py  whether the numbers are possible, plausible, and agree with the formulas
-draft.py         a column map for a person to check, and a preview of the cells
-
-writer.py        `write_system`
-new_workbook.py  a workbook in the users' layout
-edit.py          a system's numbers put into the cells
-rows.py          rows that move, are emptied or are added with the modules
-recalculate.py   new values for the formulas that depend on changed cells
-
-calculation.py   the values of formulas that refer to each other
-formulas.py      the value of one formula
-references.py    B3, Main!$B$3:$B$82 and A:C in formulas
-cells.py         what a cell may hold besides a number, and how messages describe it
-workbook_xml.py  the sheets of a workbook file
-sheet_xml.py     the cells of a sheet; only the bytes of changed ones are replaced
-xml_parts.py     XML that is changed in a few places
-package.py       the zip archive
+Both ways:   quantities (the table of the columns), book, sheet_xml, workbook_xml and package (the file),
+             calculation and formulas (the values of its formulas)
+Reading:     headings, headed_table and recognition (what a workbook's headings say, and doubts), column_map and draft (what
+             a person says), layout (which cells hold which quantity), reader
+Writing:     writer, edit (the cells that change, and the rows that move with the modules)
 """
 
 from __future__ import annotations

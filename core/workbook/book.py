@@ -4,18 +4,15 @@ from __future__ import annotations
 
 import hashlib
 import io
-import math
 import os
 import zipfile
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from ..errors import InputError
-from .calculation import Calculation
-from .cells import Outdated, Uncomputed, description
-from .references import Reference
-from .sheet_xml import At, Cell
+from .calculation import Calculation, Uncomputed
+from .sheet_xml import At, Cell, CellError, Reference, Unreadable
 from .workbook_xml import Place, WorkbookXml
 
 MAX_FILE_BYTES = 256 * 2**20
@@ -31,32 +28,27 @@ _OLE = bytes.fromhex("d0cf11e0a1b11ae1")
 _ENCRYPTED = "EncryptedPackage".encode("utf-16-le")
 
 
-class Book:
-    """An .xlsx or .xlsm file; `InputError` if it is missing, unreadable, too large or not a workbook.
+class Outdated(NamedTuple):
+    """Stands for a formula whose stored value is not what it gives."""
 
-    Attributes
-    ----------
-    sheets : dict
-        Name -> `Sheet`, in the workbook's order.
-    unverified : dict
-        Formulas that cannot be computed here and whose stored value was used although the file asks to be calculated
-        -> why they cannot.
-    """
+    stored: Any
+    computed: Any
+
+
+class Book:
+    """An .xlsx or .xlsm file; `InputError` if it is missing, unreadable, too large or not a workbook."""
 
     def __init__(self, path: str | os.PathLike[str]) -> None:
         self.path = Path(path)
         content = _read(self.path)
         self.sha256 = hashlib.sha256(content).hexdigest()
         self.workbook = WorkbookXml(content, self.path.name)
-        self.sheets = {title: Sheet(self, title) for title in self.workbook.sheets}
+        self.sheets = {title: Sheet(self, title) for title in self.workbook.parts}
         self.unverified: dict[Place, str] = {}
-        self._calculation = Calculation(
+        """Formulas whose stored value was used although the file asks to be calculated -> why they cannot be."""
+        self.calculation = Calculation(
             self.workbook, self._cell, lambda _, cell: cell.formula is not None, self._relied_on
         )
-
-    def formula_value(self, place: Place) -> Any:
-        """The value of a formula: computed here, else as stored, else `Uncomputed`."""
-        return self._calculation.value(place)
 
     def _relied_on(self, place: Place, computed: Any) -> Any:
         stored = self._cell(place).value
@@ -70,7 +62,7 @@ class Book:
         return stored
 
     def _cell(self, place: Place) -> Cell:
-        return self.workbook.sheets[place[0]].original.get(place[1:], Cell())
+        return self.sheets[place[0]].cells.get(place[1:], Cell())
 
 
 class Sheet:
@@ -79,10 +71,10 @@ class Sheet:
     def __init__(self, book: Book, name: str) -> None:
         self.book, self.name = book, name
 
-    @property
+    @cached_property
     def cells(self) -> dict[At, Cell]:
         """(row, column) -> cell, both counted from 1."""
-        return self.book.workbook.sheets[self.name].original
+        return self.book.workbook.sheet(self.name).original
 
     @cached_property
     def rows(self) -> list[int]:
@@ -102,14 +94,9 @@ class Sheet:
         return {at: text for at, text in sorted(shown.items()) if type(text) is str and text.strip()}
 
     @property
-    def comments(self) -> dict[At, str]:
-        """The cells' comments."""
-        return self.book.workbook.comments(self.name)
-
-    @property
     def merged(self) -> list[Reference]:
         """Cells that are shown as one."""
-        return self.book.workbook.sheets[self.name].merged
+        return self.book.workbook.sheet(self.name).merged
 
     def value(self, row: int, column: int) -> Any:
         """What a cell holds, None if blank; `Uncomputed` or `Outdated` for a formula without a reliable value."""
@@ -118,19 +105,12 @@ class Sheet:
             return None
         value = cell.value
         if cell.formula is not None:
-            given = self.book.formula_value((self.name, row, column))
+            given = self.book.calculation.value((self.name, row, column))
             if value is None or isinstance(given, Uncomputed):
                 value = given
             elif not _same_result(value, given):
                 value = Outdated(value, given)
         return None if type(value) is str and not value.strip() else value
-
-    def number(self, row: int, column: int, expected: str) -> float:
-        """The number in a cell; `InputError` if it holds none, saying what was `expected`."""
-        value = self.value(row, column)
-        if isinstance(value, float) and math.isfinite(value) and not self.is_date(row, column):
-            return value
-        raise InputError(f"{self.where(row, column)} {self.found(row, column)}, expected {expected}, a number")
 
     def formula(self, row: int, column: int) -> str | None:
         """The formula in a cell."""
@@ -156,11 +136,47 @@ class Sheet:
         return f"{self.book.path.name}: {self.place(row, column)}"
 
     def found(self, row: int, column: int) -> str:
-        """What is in a cell, as the predicate of a message."""
-        value = self.value(row, column)
-        if isinstance(value, float) and self.is_date(row, column):
-            return f"is formatted as a date or time ({self.number_format(row, column)})"
-        return description(value, self.formula(row, column))
+        """What is in a cell, as the predicate of a message: "is blank"."""
+        value, formula = self.value(row, column), shortened(self.formula(row, column) or "")
+        if value is None:
+            return "is blank"
+        if isinstance(value, Uncomputed):
+            return (
+                f"holds the formula {formula} without a stored value ({shortened(value, 80)}; opening the workbook in "
+                "Excel or LibreOffice and saving it stores the value)"
+            )
+        if isinstance(value, Outdated):
+            return (
+                f"stores {_number(value.stored)}, but its formula {formula} gives {_number(value.computed)} (opening the "
+                "workbook in Excel or LibreOffice and saving it stores the right value)"
+            )
+        if isinstance(value, CellError):
+            return f"shows the error {value}"
+        if isinstance(value, bool):
+            return f"is {str(value).upper()}"
+        if isinstance(value, float):
+            is_date = self.is_date(row, column)
+            return f"is formatted as a date or time ({self.number_format(row, column)})" if is_date else f"is {value:g}"
+        holds = f"{shortened(value)!r}"
+        return f"holds {holds}, which is not a number" if isinstance(value, Unreadable) else f"holds the text {holds}"
+
+
+def module_number(value: Any) -> int | None:
+    """The whole number in a cell, stored as a number or as text; None for anything else."""
+    if type(value) is str:
+        text = value.strip()
+        return int(text) if text.isascii() and text.isdigit() and len(text) < 10 else None
+    return int(value) if isinstance(value, float) and value.is_integer() and abs(value) < 2**53 else None
+
+
+def shortened(text: str, longest: int = 40) -> str:
+    """A text on one line, cut off if it is long."""
+    text = " ".join(text.split())
+    return text if len(text) <= longest else text[: longest - 1] + "…"
+
+
+def _number(value: Any) -> str:
+    return f"{value:.9g}" if type(value) is float else repr(value)
 
 
 def _same_result(stored: Any, computed: Any) -> bool:

@@ -2,20 +2,20 @@
 
 from __future__ import annotations
 
-import json
 import os
 import re
 import tomllib
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal, get_args
 
 from ..errors import InputError
 from ..files import replacing
+from ..toml import read_toml, toml_value
 from .headings import unit_of
 from .quantities import DIMENSIONS, POSITION, QUANTITIES
-from .references import MAX_COLUMN, MAX_ROW
+from .sheet_xml import MAX_COLUMN, MAX_ROW
 
 Joined = Literal["by number", "in order", "one for all"]
 
@@ -25,26 +25,16 @@ _KEYS = {"sheet": str, "header_row": int, "first_row": int, "last_row": int, "sk
     "number": str,
     "columns": dict,
 }
-_COLUMN = '{ column = "B", unit = "mm" }'
 
 
 @dataclass(frozen=True)
 class MappedColumn:
-    """A column of one quantity.
-
-    Attributes
-    ----------
-    quantity : str
-        x1, y1, z1, d, R, Ld, Td; l, b, H, x2, y2, z2, range, azimuth or elevation.
-    column : str
-        Its letters.
-    unit : str
-        mm, cm, m, in, µm, dm, ft, mil or 0.1 mm; rad or deg. Empty in a draft if it is not known.
-    """
+    """A column of one quantity: its symbol, such as x1, Td or azimuth, the column's letters and the unit."""
 
     quantity: str
     column: str
     unit: str
+    """mm, cm, m, in, µm, dm, ft, mil or 0.1 mm; rad or deg. Empty in a draft if it is not known."""
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "unit", unit_of(self.unit) or self.unit)  # "um" and "inches" are units, too
@@ -52,33 +42,21 @@ class MappedColumn:
 
 @dataclass(frozen=True)
 class MappedTable:
-    """Rows of a sheet, and what their columns hold.
-
-    Attributes
-    ----------
-    sheet : str
-    first_row, last_row : int
-        Every row from the first to the last holds a module, except `skip_rows`.
-    columns : tuple of MappedColumn
-    number : str or None
-        Letters of the column with the modules' numbers or names. Without it, the first table's modules are 1, 2, ...
-    rows : "by number", "in order", "one for all" or None
-        How the rows are matched with those of the first table: by the contents of the two `number` columns, in the
-        same order, or one row for all modules. None in the first table itself.
-    header_row : int or None
-        For people.
-    skip_rows : tuple of int
-        Rows between the first and the last that do not belong to the table.
-    """
+    """Rows of a sheet, and what their columns hold. Every row from the first to the last holds a module."""
 
     sheet: str
     first_row: int
     last_row: int
     columns: tuple[MappedColumn, ...]
     number: str | None = None
+    """Letters of the column with the modules' numbers or names. Without it, the first table's modules are 1, 2, ..."""
     rows: Joined | None = None
+    """How the rows are matched with those of the first table: by the contents of the two `number` columns, in the same
+    order, or one row for all modules. None in the first table itself."""
     header_row: int | None = None
+    """For people."""
     skip_rows: tuple[int, ...] = ()
+    """Rows between the first and the last that do not belong to the table."""
 
     def row_numbers(self) -> tuple[int, ...]:
         """The rows of the modules."""
@@ -95,16 +73,8 @@ class MappedTable:
 class ColumnMap:
     """Which cells of a workbook hold which quantity, given by a person instead of its headings.
 
-    Attributes
-    ----------
-    tables : tuple of MappedTable
-        The first holds x1, y1 and z1. d, R, Ld and Td must be in some table; without l, the design formula is used.
-
-    Examples
-    --------
-    >>> import mphdrr.core as mph
-    >>> columns = mph.ColumnMap.from_toml(open("map.toml").read())    # doctest: +SKIP
-    >>> system = mph.read_system("scanner.xlsx", columns=columns)     # doctest: +SKIP
+    The first of the `tables` holds x1, y1 and z1. d, R, Ld and Td must be in some table; without l, the design formula is
+    used. A map read by `from_toml` or `read` may be incomplete: `faults` tells.
     """
 
     tables: tuple[MappedTable, ...]
@@ -125,10 +95,7 @@ class ColumnMap:
                 found = f"{places[name]} has {name}" if name in places else f"{_of(0)} has no column {name}"
                 faults.append(f"{found}, expected x1, y1, z1 in the first table")
         faults += [f"no table has a column {name}" for name in DIMENSIONS if name not in places]
-        return faults + list(self._overlaps())
-
-    def _overlaps(self) -> Iterator[str]:
-        """The columns that are used twice in the same rows, other than for the modules' numbers."""
+        # A column may be used twice in the same rows only for the modules' numbers.
         used: dict[tuple[str, str], list[tuple[set[int], str]]] = {}
         for i, table in enumerate(self.tables):
             rows = set(range(max(table.first_row, 1), min(table.last_row, MAX_ROW) + 1))
@@ -138,43 +105,43 @@ class ColumnMap:
                 others = used.setdefault((table.sheet.casefold(), column), [])
                 for other_rows, other in others:
                     if rows & other_rows and not (name == "number" and other.endswith(".number")):
-                        yield f"{_of(i, name)}: column {column} is {other} too, expected another column"
+                        faults.append(f"{_of(i, name)}: column {column} is {other} too, expected another column")
                 others.append((rows, _of(i, name)))
+        return faults
 
     def to_toml(self) -> str:
         """The map as text, which `from_toml` reads."""
-        return "\n".join(_table_toml(table) for table in self.tables)
+        lines = []
+        for table in self.tables:
+            lines.append("[[tables]]")
+            values = {key: getattr(table, key) for key in _KEYS if key != "columns"}
+            lines += [f"{key} = {toml_value(value)}" for key, value in values.items() if value not in (None, ())]
+            lines.append("[tables.columns]")
+            for c in table.columns:
+                lines.append(f"{c.quantity} = {{ column = {toml_value(c.column)}, unit = {toml_value(c.unit)} }}")
+            lines.append("")
+        return "\n".join(lines)
 
     @classmethod
     def from_toml(cls, text: str, name: str = "column map") -> ColumnMap:
-        """The map in a text that `to_toml` or a person wrote; messages call it `name`.
-
-        Raises
-        ------
-        InputError
-            The text is not TOML, or has unknown keys or values. Whether the map is complete is told by `faults`.
-        """
+        """The map in a TOML text; `InputError`, which calls it `name`, for unknown keys or values."""
         try:
-            values = tomllib.loads(text)
+            return cls._of_values(tomllib.loads(text), name)
         except tomllib.TOMLDecodeError as error:
-            raise InputError(f"{name}: not TOML ({error})") from error
-        _refuse_unknown(values, {"tables"}, name)
-        tables = values.get("tables")
-        if not isinstance(tables, list) or not all(isinstance(table, dict) for table in tables):
-            raise InputError(f"{name}: expected [[tables]] ({_HELP})")
-        return cls(tuple(_table(table, f"{name}: {_of(i)}") for i, table in enumerate(tables)))
+            raise InputError(f"{name}: not TOML: {error}") from None
 
     @classmethod
     def read(cls, path: str | os.PathLike[str]) -> ColumnMap:
-        """The map in a .toml file; `InputError` if it cannot be read."""
-        path = Path(path)
-        try:
-            text = path.read_text(encoding="utf-8")
-        except FileNotFoundError as error:
-            raise InputError(f"{path}: no such file") from error
-        except (OSError, UnicodeDecodeError) as error:
-            raise InputError(f"{path}: cannot be read ({error})") from error
-        return cls.from_toml(text, str(path))
+        """The map in a TOML file; `InputError` if it cannot be read."""
+        return cls._of_values(read_toml(path), str(path))
+
+    @classmethod
+    def _of_values(cls, values: dict[str, Any], name: str) -> ColumnMap:
+        _refuse_others(values, {"tables": list}, name)
+        tables = values.get("tables", [None])
+        if not all(isinstance(table, dict) for table in tables):
+            raise InputError(f"{name}: expected [[tables]] ({_HELP})")
+        return cls(tuple(_table(table, f"{name}: {_of(i)}") for i, table in enumerate(tables)))
 
     def write(self, path: str | os.PathLike[str], comment: str = "") -> None:
         """Write the map to a .toml file, below the lines of a comment."""
@@ -239,52 +206,32 @@ def _is_column(letters: str) -> bool:
     return bool(re.fullmatch("[A-Z]{1,3}", letters)) and column_index_from_string(letters) <= MAX_COLUMN
 
 
-def _refuse_unknown(values: Mapping[str, Any], known: Iterable[str], where: str) -> None:
-    for key in values:
-        if key not in known:
-            raise InputError(f"{where}: unknown key {key!r}, expected {', '.join(sorted(known))}")
+def _refuse_others(values: dict[str, Any], kinds: dict[str, type], where: str) -> None:
+    """Raise `InputError` for keys and types of values that are not expected."""
+    words = {int: "a whole number", str: "text in quotes", dict: "a table", list: "a list"}
+    for key, value in values.items():
+        if key not in kinds:
+            raise InputError(f"{where}: unknown key {key!r}, expected {', '.join(sorted(kinds))}")
+        if type(value) is not kinds[key]:
+            raise InputError(f"{where}: {key} = {value!r}, expected {words[kinds[key]]}")
 
 
 def _table(values: dict[str, Any], where: str) -> MappedTable:
-    _refuse_unknown(values, _KEYS, where)
+    _refuse_others(values, _KEYS, where)
     if values.get("rows") == "one for all" and "first_row" in values:
         values = {"last_row": values["first_row"], **values}
     for key in ("sheet", "first_row", "last_row", "columns"):
         if key not in values:
             raise InputError(f"{where}: has no {key} ({_HELP})")
-    for key, value in values.items():
-        if type(value) is not _KEYS[key]:
-            what = {int: "a whole number", str: "text in quotes", dict: "a table", list: "a list"}[_KEYS[key]]
-            raise InputError(f"{where}: {key} = {value!r}, expected {what}")
-    skipped = values.get("skip_rows", [])
+    skipped = tuple(values.get("skip_rows", []))
     if not all(type(row) is int for row in skipped):
-        raise InputError(f"{where}: skip_rows = {skipped!r}, expected whole numbers")
-    columns = tuple(_column(name, column, f"{where}.{name}") for name, column in values["columns"].items())
+        raise InputError(f"{where}: skip_rows = {list(skipped)}, expected whole numbers")
+    columns = []
+    for name, column in values["columns"].items():
+        if isinstance(column, dict):
+            _refuse_others(column, {"column": str, "unit": str}, f"{where}.{name}")
+        if not isinstance(column, dict) or len(column) < 2:
+            raise InputError(f'{where}.{name}: expected {{ column = "B", unit = "mm" }}')
+        columns.append(MappedColumn(name, column["column"].upper(), column["unit"]))
     number = values["number"].upper() if "number" in values else None
-    return MappedTable(**{**values, "columns": columns, "number": number, "skip_rows": tuple(skipped)})
-
-
-def _column(name: str, values: Any, where: str) -> MappedColumn:
-    if not isinstance(values, dict):
-        raise InputError(f"{where}: expected {_COLUMN}")
-    _refuse_unknown(values, ("column", "unit"), where)
-    for key in ("column", "unit"):
-        if not isinstance(values.get(key), str):
-            raise InputError(f"{where}: has no {key}, expected {_COLUMN}")
-    return MappedColumn(name, values["column"].upper(), values["unit"])
-
-
-def _table_toml(table: MappedTable) -> str:
-    lines = ["[[tables]]"]
-    for key in _KEYS:
-        value = getattr(table, key)
-        if key != "columns" and value not in (None, ()):
-            lines.append(f"{key} = {_toml(value)}")
-    lines.append("[tables.columns]")
-    lines += [f"{c.quantity} = {{ column = {_toml(c.column)}, unit = {_toml(c.unit)} }}" for c in table.columns]
-    return "\n".join(lines) + "\n"
-
-
-def _toml(value: int | str | tuple[int, ...]) -> str:
-    """A value as TOML, which writes it as JSON does."""
-    return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")
+    return MappedTable(**{**values, "columns": tuple(columns), "number": number, "skip_rows": skipped})

@@ -8,8 +8,8 @@ from dataclasses import dataclass, replace
 
 from ..errors import InputError
 from ..recording import recorded_warnings
-from .book import HEADING_ROWS, Book, Sheet
-from .cells import Outdated, Uncomputed, shortened
+from .book import HEADING_ROWS, Book, Outdated, Sheet, shortened
+from .calculation import Uncomputed
 from .column_map import ColumnMap, Joined, MappedColumn, MappedTable
 from .headed_table import HeadedTable
 from .headings import heading_of, is_number_heading, may_mean
@@ -19,18 +19,12 @@ from .recognition import recognize, recognized_layout
 
 @dataclass(frozen=True)
 class ColumnMapDraft:
-    """A best guess at a workbook's column map.
-
-    Attributes
-    ----------
-    columns : ColumnMap
-        For a person to check; units that are stated nowhere are empty, and what was not found is missing.
-    questions : tuple of str
-        What is uncertain or missing, a line each; empty if the headings are understood.
-    """
+    """A best guess at a workbook's column map."""
 
     columns: ColumnMap
+    """For a person to check; units that are stated nowhere are empty, and what was not found is missing."""
     questions: tuple[str, ...]
+    """What is uncertain or missing, a line each; empty if the headings are understood."""
 
     def write(self, path: str | os.PathLike[str]) -> None:
         """Write the map as TOML, with the questions as comments above it."""
@@ -41,25 +35,7 @@ class ColumnMapDraft:
 def draft_column_map(path: str | os.PathLike[str]) -> ColumnMapDraft:
     """A best guess at a workbook's column map, for a person to check.
 
-    Parameters
-    ----------
-    path
-        An .xlsx or .xlsm file.
-
-    Returns
-    -------
-    ColumnMapDraft
-        For a workbook that `read_system` understands, the map that says the same.
-
-    Raises
-    ------
-    InputError
-        Not a workbook.
-
-    Examples
-    --------
-    >>> draft = draft_column_map("scanner.xlsx")    # doctest: +SKIP
-    >>> draft.write("map.toml")                     # doctest: +SKIP
+    For a workbook that `read_system` understands, it is the map that says the same.
     """
     book = Book(path)
     found = recognize(book)
@@ -73,7 +49,7 @@ def draft_column_map(path: str | os.PathLike[str]) -> ColumnMapDraft:
     partial = {name for name in optional if _has_gaps(found.tables[name], name)}
     chosen = {name: table for name, table in found.tables.items() if name not in partial}
     tables = [mapped for table in dict.fromkeys(chosen.values()) for mapped in _mapped(table, chosen, certain)]
-    if "l" in partial and "l" in found.tables["l"].filled:
+    if "l" in partial and found.tables["l"].has_numbers("l"):
         questions.append("l stands in some rows only and is left out here: the design formula is then used for all")
     missing = [name for name in TYPED if name not in found.tables]
     _add_guesses(tables, found.sheets, missing if not certain else [])
@@ -128,74 +104,46 @@ def _add_guesses(tables: list[MappedTable], sheets: dict[str, Sheet], missing: l
     """Add columns whose headings speak of what is missing, to the table with the same rows if there is one."""
     used = {(table.sheet, c.column) for table in tables for c in table.columns}
     for name in missing:
-        guess = next((g for sheet in sheets.values() for g in _guesses(sheet, name) if not _columns(g) & used), None)
+        guesses = (guess for sheet in sheets.values() for guess in _guesses(sheet, name))
+        guess = next((guess for guess in guesses if (guess.sheet, guess.columns[0].column) not in used), None)
         if guess is None:
             continue
-        used |= _columns(guess)
+        used.add((guess.sheet, guess.columns[0].column))
         rows = (guess.sheet, guess.first_row, guess.last_row)
-        for i, table in enumerate(tables):
-            if (table.sheet, table.first_row, table.last_row) == rows:
-                tables[i] = replace(table, columns=table.columns + guess.columns)
-                break
+        same = [i for i, table in enumerate(tables) if (table.sheet, table.first_row, table.last_row) == rows]
+        if same:
+            tables[same[0]] = replace(tables[same[0]], columns=tables[same[0]].columns + guess.columns)
         else:
-            tables.append(guess if guess.rows else replace(guess, number=_number_column(sheets[guess.sheet])))
-
-
-def _columns(table: MappedTable) -> set[tuple[str, str]]:
-    return {(table.sheet, c.column) for c in table.columns}
+            tables.append(guess)
 
 
 def _guesses(sheet: Sheet, name: str) -> Iterator[MappedTable]:
     """Columns with numbers under a heading that may mean a quantity."""
-    for (row, column), text in sheet.texts.items():
-        if row <= HEADING_ROWS and name in may_mean(text) and heading_of(text) is None:
-            below = [r for r in sheet.rows if r > row and type(sheet.value(r, column)) is float]
-            if below:
-                once = below[0] == below[-1] and name not in POSITION
-                rows = range(below[0], below[-1] + 1)
-                yield _mapped_table(sheet, rows, {name: (column, "")}, row, rows_are="one for all" if once else None)
-
-
-def _number_column(sheet: Sheet) -> str | None:
-    """Letters of the one column of a sheet that is headed as the modules' numbers."""
-    from openpyxl.utils import get_column_letter as letters
-
-    headed = {letters(c) for (r, c), text in sheet.texts.items() if r <= HEADING_ROWS and is_number_heading(text)}
-    return headed.pop() if len(headed) == 1 else None
+    headings = {at: text for at, text in sheet.texts.items() if at[0] <= HEADING_ROWS}
+    numbers = {column for (_, column), text in headings.items() if is_number_heading(text)}
+    for (row, column), text in headings.items():
+        below = [r for r in sheet.rows if r > row and type(sheet.value(r, column)) is float]
+        if below and name in may_mean(text) and heading_of(text) is None:
+            rows, said = range(below[0], below[-1] + 1), {name: (column, "")}
+            if len(rows) == 1 and name not in POSITION:
+                yield _mapped_table(sheet, rows, said, row, rows_are="one for all")
+            else:
+                yield _mapped_table(sheet, rows, said, row, next(iter(numbers)) if len(numbers) == 1 else None)
 
 
 def preview_workbook(
     path: str | os.PathLike[str], rows: int = 20, columns: int = 26
 ) -> dict[str, tuple[tuple[str, ...], ...]]:
-    """What the first cells of each sheet show, as short texts.
+    """What the first `rows` and `columns` of each sheet show: sheet -> rows of short texts.
 
-    Parameters
-    ----------
-    path
-        An .xlsx or .xlsm file.
-    rows, columns
-        How many from the top left; a smaller sheet gives what it has.
-
-    Returns
-    -------
-    dict
-        Sheet -> rows of texts, beginning with row 1 and column A; a blank cell is an empty text.
-
-    Raises
-    ------
-    InputError
-        Not a workbook.
+    They begin with row 1 and column A; a blank cell is an empty text, and a smaller sheet gives what it has.
     """
-    return {name: _preview(sheet, rows, columns) for name, sheet in Book(path).sheets.items()}
-
-
-def _preview(sheet: Sheet, rows: int, columns: int) -> tuple[tuple[str, ...], ...]:
-    filled = [at for at, cell in sheet.cells.items() if not cell.blank]
-    bottom = min(rows, max((row for row, _ in filled), default=0))
-    right = min(columns, max((column for _, column in filled), default=0))
-    return tuple(
-        tuple(_text(sheet.value(row, column)) for column in range(1, right + 1)) for row in range(1, bottom + 1)
-    )
+    found = {}
+    for name, sheet in Book(path).sheets.items():
+        bottom, right = map(min, (rows, columns), sheet.book.workbook.extent(name))
+        cells = [[_text(sheet.value(row, column)) for column in range(1, right + 1)] for row in range(1, bottom + 1)]
+        found[name] = tuple(map(tuple, cells))
+    return found
 
 
 def _text(value: object) -> str:

@@ -1,8 +1,6 @@
-"""An evaluator of spreadsheet formulas.
+"""An evaluator of spreadsheet formulas: arithmetic over cells and a little logic, without the dependencies of a library.
 
-A geometry table needs arithmetic over cells and a little logic: openpyxl's tokenizer and the precedence below are
-enough. The libraries for this were weighed: `formulas` (EUPL) brings scipy, `xlcalculator` pandas, and `pycel` a networkx
-of 2021. A formula that needs more raises `NotComputable`; nothing is guessed.
+A formula that needs more raises `NotComputable`; nothing is guessed.
 """
 
 from __future__ import annotations
@@ -15,16 +13,9 @@ from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any
 
-from .references import Reference, reference
-
-Lookup = Callable[[str | None, int, int], Any]
-"""(sheet name or None for the formula's own, row, column) -> the cell's value, None if blank."""
+from .sheet_xml import At, CellError, Reference, reference
 
 _MAX_RANGE = 100_000
-
-
-class CellError(str):
-    """An error value such as #REF! or #DIV/0!."""
 
 
 class NotComputable(Exception):
@@ -33,35 +24,22 @@ class NotComputable(Exception):
 
 @dataclass(frozen=True)
 class Surroundings:
-    """What a formula refers to.
+    """What a formula refers to; each sheet is given by its name, or None for the formula's own."""
 
-    Attributes
-    ----------
-    lookup : Lookup
-    at : (row, column), or None
-        The formula's own cell, for ``ROW()``.
-    extent : callable, or None
-        Sheet name or None -> its last row and column with content, at which whole columns and rows end.
-    name : callable, or None
-        Defined name -> its formula, None if unknown.
-    """
-
-    lookup: Lookup
-    at: tuple[int, int] | None = None
-    extent: Callable[[str | None], tuple[int, int]] | None = None
-    name: Callable[[str], str | None] | None = None
+    lookup: Callable[[str | None, int, int], Any]
+    """(sheet, row, column) -> the cell's value, None if blank."""
+    at: At | None = None
+    """The formula's own cell, for ``ROW()``."""
+    extent: Callable[[str | None], At] | None = None
+    """Sheet -> its last row and column with content, at which whole columns and rows end."""
+    name: Callable[[str], str | None] = lambda _: None
+    """Defined name -> its formula, None if unknown."""
 
 
 def calculate(formula: str, surroundings: Surroundings) -> float | str | bool | CellError:
-    """What a spreadsheet shows for `formula` (with its "="): a number, text, a boolean or an error value.
-
-    Raises
-    ------
-    NotComputable
-        It uses a function, a name or a value that is not known here.
-    """
+    """What a spreadsheet shows for `formula` (with its "="), or `NotComputable`."""
     try:
-        value = _scalar(_Parser(tokens_of(formula), surroundings).whole()())
+        value = _scalar(_Parser(formula, surroundings).value())
     except _ErrorValue as error:
         return error.args[0]
     except ZeroDivisionError:
@@ -100,9 +78,6 @@ def areas_in(formula: str) -> list[Reference]:
     return [area for text in operands(formula) if (area := reference(text)) is not None]
 
 
-# Values
-
-
 class _ErrorValue(Exception):
     """The value of an operand is an error, and so is the result."""
 
@@ -119,14 +94,18 @@ _Term = Callable[[], Any]
 """A part of a formula, computed when called: the branch of an IF that is not taken must not be computed."""
 
 
+def _no_error(value: Any) -> Any:
+    if isinstance(value, CellError):
+        raise _ErrorValue(value)
+    return value
+
+
 def _scalar(value: Any) -> Any:
     if isinstance(value, _Cells):
         if len(value) != 1:
             raise NotComputable("it uses a range where one cell belongs")
         value = value[0]
-    if isinstance(value, CellError):
-        raise _ErrorValue(value)
-    return value
+    return _no_error(value)
 
 
 def _number(value: Any) -> float:
@@ -160,13 +139,6 @@ def _truth(value: Any) -> bool:
     return bool(value)
 
 
-def _truths(terms: tuple[_Term, ...]) -> list[bool]:
-    values = [_scalar(term()) for term in terms]
-    if not all(isinstance(value, (bool, float)) for value in values):
-        raise NotComputable("it uses a text or a blank as a truth value")
-    return [bool(value) for value in values]
-
-
 def _area(term: _Term) -> _Cells:
     value = term()
     if not isinstance(value, _Cells):
@@ -174,21 +146,15 @@ def _area(term: _Term) -> _Cells:
     return value
 
 
-def _numbers(terms: tuple[_Term, ...]) -> list[float]:
+def _numbers(terms: list[_Term]) -> list[float]:
     """The numbers among the cells of areas, and every other argument as a number."""
     found = []
     for value in [term() for term in terms]:
         if isinstance(value, _Cells):
-            for cell in value:
-                if isinstance(cell, CellError):
-                    raise _ErrorValue(cell)
-            found += [cell for cell in value if type(cell) is float]
+            found += [cell for cell in map(_no_error, value) if type(cell) is float]
         else:
             found.append(_number(value))
     return found
-
-
-# Operators
 
 
 def _same_as_shown(a: float, b: float) -> bool:
@@ -248,9 +214,6 @@ _OPERATORS: list[dict[str, Callable[[Any, Any], Any]]] = [
 ]
 
 
-# Functions
-
-
 def _atan2(x: float, y: float) -> float:
     if x == y == 0:
         raise ZeroDivisionError
@@ -265,6 +228,13 @@ def _rounded(rounding: str) -> Callable[[float, float], float]:
             return float(decimal.Decimal(f"{value:.15g}").quantize(step, rounding=rounding))
 
     return function
+
+
+def _truths(first: _Term, *more: _Term) -> list[bool]:
+    values = [_scalar(term()) for term in (first, *more)]
+    if not all(isinstance(value, (bool, float)) for value in values):
+        raise NotComputable("it uses a text or a blank as a truth value")
+    return [bool(value) for value in values]
 
 
 def _if(condition: _Term, then: _Term, otherwise: _Term = lambda: False) -> Any:
@@ -306,10 +276,6 @@ def _position(wanted: Any, cells: list[Any], mode: Any) -> int:
     raise _ErrorValue(CellError("#N/A"))
 
 
-def _match(wanted: _Term, cells: _Term, mode: _Term = lambda: 1.0) -> float:
-    return _position(wanted(), _area(cells), mode()) + 1.0
-
-
 def _vlookup(wanted: _Term, cells: _Term, column: _Term, mode: _Term = lambda: 1.0) -> Any:
     area, j = _area(cells), int(_number(column()))
     if not 1 <= j <= area.columns:
@@ -343,38 +309,36 @@ _OF_RANGES: dict[str, Callable[[list[float]], float]] = {
     "SUMSQ": lambda xs: math.fsum(x * x for x in xs),
 }
 _OF_TERMS: dict[str, Callable[..., Any]] = {
-    "AND": lambda first, *more: all(_truths((first, *more))),
+    "AND": lambda *terms: all(_truths(*terms)),
     "COUNT": lambda cells: float(sum(type(cell) is float for cell in _area(cells))),
     "COUNTA": lambda cells: float(sum(cell is not None for cell in _area(cells))),
     "FALSE": lambda: False,
     "IF": _if,
     "IFERROR": _if_error,
     "INDEX": _index,
-    "MATCH": _match,
+    "MATCH": lambda wanted, cells, mode=lambda: 1.0: _position(wanted(), _area(cells), mode()) + 1.0,
     "NOT": lambda term: not _truth(term()),
-    "OR": lambda first, *more: any(_truths((first, *more))),
+    "OR": lambda *terms: any(_truths(*terms)),
     "TRUE": lambda: True,
     "VLOOKUP": _vlookup,
 }
 
 
 class _Parser:
-    """A recursive descent through the tokens; its methods return the terms that they pass."""
+    """A recursive descent through a formula's tokens; its methods return the terms that they pass."""
 
-    def __init__(self, tokens: tuple[Any, ...], surroundings: Surroundings) -> None:
-        self.tokens, self.surroundings, self.at = tokens, surroundings, 0
+    def __init__(self, formula: str, surroundings: Surroundings) -> None:
+        self.tokens, self.surroundings, self.at = tokens_of(formula), surroundings, 0
 
-    def whole(self) -> _Term:
+    def value(self) -> Any:
         term = self.operation(0)
         if self.at < len(self.tokens):
             raise NotComputable(f"it uses {self.tokens[self.at].value!r}")
-        return term
+        return term()
 
     def is_next(self, kind: str, subtype: str = "") -> bool:
-        if self.at == len(self.tokens):
-            return False
-        token = self.tokens[self.at]
-        return token.type == kind and (not subtype or token.subtype == subtype)
+        token = self.tokens[self.at] if self.at < len(self.tokens) else None
+        return token is not None and token.type == kind and subtype in ("", token.subtype)
 
     def take(self) -> Any:
         if self.at == len(self.tokens):
@@ -417,15 +381,13 @@ class _Parser:
             return self.call(text[:-1].upper().removeprefix("_XLFN."))
         if kind == ("OPERAND", "RANGE"):
             return lambda: self.cells(text)
-        constants: dict[tuple[str, str], Callable[[], Any]] = {
-            ("OPERAND", "NUMBER"): lambda: float(text),
-            ("OPERAND", "TEXT"): lambda: text[1:-1].replace('""', '"'),
-            ("OPERAND", "LOGICAL"): lambda: text.upper() == "TRUE",
-            ("OPERAND", "ERROR"): lambda: CellError(text),
-        }
-        if kind not in constants:
+        if kind[0] != "OPERAND":
             raise NotComputable(f"it uses {text!r}")
-        return constants[kind]
+        if kind[1] == "NUMBER":
+            return lambda: float(text)
+        if kind[1] == "TEXT":
+            return lambda: text[1:-1].replace('""', '"')
+        return lambda: text.upper() == "TRUE" if kind[1] == "LOGICAL" else CellError(text)
 
     def call(self, name: str) -> _Term:
         terms: list[_Term] = []
@@ -436,9 +398,9 @@ class _Parser:
                 break
             self.take()
         self.close("FUNC")
-        return lambda: self.called(name, tuple(terms))
+        return lambda: self.called(name, terms)
 
-    def called(self, name: str, terms: tuple[_Term, ...]) -> Any:
+    def called(self, name: str, terms: list[_Term]) -> Any:
         if name in ("ROW", "COLUMN") and len(terms) < 2:
             at = _area(terms[0]).first if terms else self.surroundings.at
             if at is not None:
@@ -457,14 +419,14 @@ class _Parser:
     def cells(self, text: str) -> Any:
         area = reference(text)
         if area is None:
-            formula = self.surroundings.name(text) if self.surroundings.name else None
+            formula = self.surroundings.name(text)
             if formula is None:
                 raise NotComputable(f"it uses {text}")
-            return _Parser(tokens_of(formula), self.surroundings).whole()()
+            return _Parser(formula, self.surroundings).value()
         sheet, top, left, bottom, right = area
         if sheet is not None and ":" in sheet:
             raise NotComputable(f"it uses {text}, through several sheets")
-        if self.surroundings.extent and (bottom - top + 1) * (right - left + 1) > _MAX_RANGE:
+        if self.surroundings.extent and area.size > _MAX_RANGE:
             last_row, last_column = self.surroundings.extent(sheet)  # beyond which all cells are blank
             bottom, right = max(top, min(bottom, last_row)), max(left, min(right, last_column))
         if (bottom - top + 1) * (right - left + 1) > _MAX_RANGE:

@@ -7,11 +7,9 @@ from collections import defaultdict
 from dataclasses import dataclass
 from functools import cached_property
 
-from .book import HEADING_ROWS, Book, Sheet
-from .cells import module_number
+from .book import HEADING_ROWS, Book, Sheet, module_number
 from .formulas import areas_in
 from .headings import Heading, heading_of, is_label_heading, is_number_heading, plain, unit_of
-from .layout import Table
 from .quantities import DIMENSIONS, POSITION, QUANTITIES, TYPED
 from .sheet_xml import At
 
@@ -30,29 +28,14 @@ _NUMERIC = re.compile(r"[\d.,eE+\-\s]+")
 
 @dataclass(eq=False)
 class HeadedTable:
-    """A sheet with headings that are understood, and what is under them.
-
-    Attributes
-    ----------
-    sheet : Sheet
-    headings : dict
-        Column -> {row: what the heading there says}.
-    """
+    """A sheet with headings that are understood, `headings`: column -> {row: what it says}, and what is under them."""
 
     sheet: Sheet
     headings: dict[int, dict[int, Heading]]
 
-    # Headings
-
-    @cached_property
-    def first_heading(self) -> int:
-        """The first row with a heading."""
-        return min(row for said in self.headings.values() for row in said)
-
-    @cached_property
-    def last_heading(self) -> int:
-        """The last row with a heading."""
-        return max(row for said in self.headings.values() for row in said)
+    def __post_init__(self) -> None:
+        rows = [row for said in self.headings.values() for row in said]
+        self.first_heading, self.last_heading = min(rows), max(rows)
 
     @cached_property
     def first_row(self) -> int:
@@ -71,8 +54,7 @@ class HeadedTable:
         found: dict[str, tuple[int, str]] = {}
         for column in sorted(self.headings):
             quantity = self.quantity(column)
-            units = [*self.units(column), *QUANTITIES[quantity].units]
-            found.setdefault(quantity, (column, units[0]))
+            found.setdefault(quantity, (column, [*self.units(column), *QUANTITIES[quantity].units][0]))
         return found
 
     def quantity(self, column: int) -> str:
@@ -94,16 +76,11 @@ class HeadedTable:
         """The first heading of a column, as a cell's name."""
         return self.sheet.place(next(iter(self.headings[column])), column)
 
-    # Other columns
-
     @cached_property
     def other_heads(self) -> dict[int, list[At]]:
         """The texts at the head of the columns without a quantity."""
-        found: dict[int, list[At]] = defaultdict(list)
-        for at in self.head:
-            if at[1] not in self.headings:
-                found[at[1]].append(at)
-        return found
+        columns = {column for _, column in self.head} - self.headings.keys()
+        return {column: [at for at in self.head if at[1] == column] for column in sorted(columns)}
 
     @cached_property
     def numeric(self) -> set[int]:
@@ -111,12 +88,11 @@ class HeadedTable:
         rows = set(self.rows)
         return {column for row, column in self.sheet.cells if row in rows and is_number(self.sheet, row, column)}
 
-    @property
-    def filled(self) -> list[str]:
-        """The typed quantities that have numbers here."""
-        return [name for name in TYPED if name in self.columns and self.columns[name][0] in self.numeric]
+    def has_numbers(self, quantity: str) -> bool:
+        """Whether the table has a column of a quantity, with numbers in it."""
+        return quantity in self.columns and self.columns[quantity][0] in self.numeric
 
-    @property
+    @cached_property
     def label_headings(self) -> dict[str, At]:
         """The headings of other names of the modules."""
         return {plain(text).casefold(): at for at, text in self.head.items() if is_label_heading(text)}
@@ -131,8 +107,6 @@ class HeadedTable:
             if not (is_number_heading(text := self.head[at]) or is_label_heading(text))
             and plain(text).casefold() not in IGNORED_HEADINGS
         ]
-
-    # Rows
 
     @cached_property
     def _key_columns(self) -> list[int]:
@@ -189,40 +163,24 @@ class HeadedTable:
         return found
 
     def _is_summary(self, row: int, column: int) -> bool:
-        formula = self.sheet.formula(row, column)
-        if formula is None or not _SUMMARY.search(formula):
-            return False
-        return any(
-            area.top < area.bottom and area.left <= column <= area.right and area.sheet in (None, self.sheet.name)
-            for area in areas_in(formula)
-        )
+        formula = self.sheet.formula(row, column) or ""
+        areas = [area for area in areas_in(formula) if area.sheet in (None, self.sheet.name) and area.top < area.bottom]
+        return bool(_SUMMARY.search(formula)) and any(area.left <= column <= area.right for area in areas)
 
     @cached_property
     def rows(self) -> tuple[int, ...]:
         """The rows of the modules, including those with a number and nothing else: a blank is to be refused."""
         if self.label_column is None:
             return tuple(self._filled_rows)
-        filled = set(self._filled_rows)
-        return tuple(
-            row
-            for row in self.sheet.rows
-            if row in filled
-            or (
-                row >= self.first_row
-                and row not in self.summaries
-                and module_number(self.sheet.value(row, self.label_column)) is not None
-            )
-        )
+        below = [row for row in self.sheet.rows if row >= self.first_row and row not in self.summaries]
+        numbered = [row for row in below if module_number(self.sheet.value(row, self.label_column)) is not None]
+        return tuple(sorted({*self._filled_rows, *numbered}))
 
     def is_single(self, quantity: str) -> bool:
         """Whether a dimension is given once for all modules, in the table's first row."""
         column = self.columns[quantity][0]
         filled = [row for row in self.rows if self.sheet.value(row, column) is not None]
         return quantity in DIMENSIONS and filled == [*self.rows[:1]]
-
-    def table(self) -> Table:
-        """The table; `InputError` if the modules' numbers are unclear."""
-        return Table(self.sheet, self.columns, self.rows, self.label_column)
 
 
 def headed_tables(book: Book) -> tuple[dict[str, Sheet], list[HeadedTable]]:
@@ -232,7 +190,9 @@ def headed_tables(book: Book) -> tuple[dict[str, Sheet], list[HeadedTable]]:
     """
     sheets = {name: sheet for name, sheet in book.sheets.items() if plain(name).casefold() not in OTHER_SHEETS}
     tables = [table for sheet in sheets.values() if (table := headed_table(sheet)) is not None]
-    if all(plain(table.sheet.name).casefold() in SCANNER_SHEETS for table in tables if table.filled):
+    if all(
+        plain(table.sheet.name).casefold() in SCANNER_SHEETS for table in tables if any(map(table.has_numbers, TYPED))
+    ):
         return sheets, tables
     return book.sheets, [table for sheet in book.sheets.values() if (table := headed_table(sheet)) is not None]
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 import re
 import unicodedata
 from collections.abc import Iterable
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 from .quantities import ANGLE_UNITS, QUANTITIES
 
@@ -97,10 +97,8 @@ def quoted(text: str) -> str:
     return repr(text if len(text) <= 60 else text[:59] + "…")
 
 
-def heading_of(text: Any) -> Heading | None:
+def heading_of(text: str) -> Heading | None:
     """What a heading says, None if it is not understood as a whole."""
-    if not isinstance(text, str):
-        return None
     text = plain(text)
     if (name := _quantity_of(text)) is not None:
         return Heading(name, None)
@@ -116,37 +114,30 @@ def _quantity_of(text: str) -> str | None:
     return _QUANTITY_OF.get(text if len(text) == 1 else text.casefold())
 
 
-def unit_of(text: Any) -> str | None:
+def unit_of(text: str) -> str | None:
     """The unit that a text consists of: "mm", "[mm]", "(in mm)"."""
-    match = _BRACKETED_UNIT.fullmatch(plain(text).casefold()) if isinstance(text, str) else None
+    match = _BRACKETED_UNIT.fullmatch(plain(text).casefold())
     return None if match is None else _UNIT_OF.get((match[1] or match[2] or match[3]).strip())
 
 
-def is_number_heading(text: Any) -> bool:
+def is_number_heading(text: str) -> bool:
     """Whether a text heads the modules' numbers."""
-    return isinstance(text, str) and plain(text).casefold() in _NUMBER_HEADINGS.split(", ")
+    return plain(text).casefold() in _NUMBER_HEADINGS.split(", ")
 
 
-def is_label_heading(text: Any) -> bool:
+def is_label_heading(text: str) -> bool:
     """Whether a text heads other names of the modules."""
-    return isinstance(text, str) and plain(text).casefold() in _LABEL_HEADINGS.split(", ")
+    return plain(text).casefold() in _LABEL_HEADINGS.split(", ")
 
 
-def may_mean(text: Any) -> list[str]:
+def may_mean(text: str) -> list[str]:
     """The quantities that a heading may be about, by its words."""
-    if not isinstance(text, str):
-        return []
     words = set(re.findall(r"[^\W_]+", plain(text).casefold()))
     return [name for name, hints in _HINTS.items() if words & hints]
 
 
-def units_mentioned(text: Any, alone: bool = False) -> list[str]:
-    """The length units that a note speaks of: "mm" ..., or its own word for one that is not supported.
-
-    With `alone`, only if the note says nothing else.
-    """
-    if not isinstance(text, str):
-        return []
+def units_mentioned(text: str, alone: bool = False) -> list[str]:
+    """The length units that a note speaks of, if `alone` only if it says nothing else; its own word for other units."""
     folded = plain(text).casefold()
     words = _WORD.findall(re.sub(r"['’](?=\w)", "", folded))
     if alone:

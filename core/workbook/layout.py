@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 import warnings
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from functools import cached_property
 
@@ -12,9 +13,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import InputError, InputWarning
-from .book import HEADING_ROWS, Book, Sheet
-from .cells import Uncomputed, module_number
-from .column_map import ColumnMap, MappedTable
+from .book import HEADING_ROWS, Book, Sheet, module_number
+from .calculation import Uncomputed
+from .column_map import ColumnMap
 from .headings import heading_of, shows_as_stored
 from .quantities import QUANTITIES
 
@@ -26,16 +27,9 @@ Label = int | str
 
 @dataclass(frozen=True, eq=False)
 class Table:
-    """Rows of a sheet that hold modules, and the columns of their quantities.
+    """Rows of a sheet that hold modules; `columns` is quantity -> column and unit.
 
-    Attributes
-    ----------
-    columns : dict
-        Quantity -> column and unit.
-    label_column : int or None
-        The column of the modules' numbers or names.
-    labels : tuple of Label, or None
-        Its contents; `InputError` if they do not tell the modules apart.
+    `labels` has what the rows call their modules in the `label_column`; `InputError` if that does not tell them apart.
     """
 
     sheet: Sheet
@@ -66,10 +60,9 @@ class Table:
 
 
 class Column:
-    """The cells of one quantity, one for each module.
+    """The cells of one quantity; `factor` is their unit in mm or rad.
 
-    `rows` has the row of each module of the table of `modules`, all the same if one cell holds for all (`shared`);
-    `factor` is the cells' unit in mm or rad.
+    `rows` has the row of each module of the table of `modules`, all the same if one cell holds for all (`shared`).
     """
 
     def __init__(self, table: Table, quantity: str, modules: Table, rows: tuple[int, ...]) -> None:
@@ -86,18 +79,23 @@ class Column:
         """Sheet and cell of module index `i`."""
         return self.table.sheet.place(self.rows[i], self.column)
 
-    def numbers(self, optional: bool = False, may_fail: NDArray[np.bool_] | None = None) -> NDArray[np.float64]:
+    def numbers(self, optional: bool = False, ignored: NDArray[np.bool_] | None = None) -> NDArray[np.float64]:
         """The numbers (M,) in the cells, in their unit; `InputError` if one holds no number.
 
-        If they are `optional`, NaN where a cell is blank or cannot be computed, or holds anything else and `may_fail`.
+        NaN where they are `ignored`, or where a cell is blank or cannot be computed if they are `optional`.
         """
-        numbers = np.full(len(self.rows), math.nan)
+        numbers, sheet = np.full(len(self.rows), math.nan), self.table.sheet
         for i, row in enumerate(self.rows):
-            value = self.table.sheet.value(row, self.column)
-            absent = value is None or isinstance(value, Uncomputed) or (may_fail is not None and may_fail[i])
-            if isinstance(value, float) or not (optional and absent):
+            if ignored is not None and ignored[i]:
+                continue
+            value = sheet.value(row, self.column)
+            absent = value is None or isinstance(value, Uncomputed)
+            if isinstance(value, float) and math.isfinite(value) and not sheet.is_date(row, self.column):
+                numbers[i] = value
+            elif isinstance(value, float) or not (optional and absent):
                 of = "" if self.shared else f" of module {self.modules.module_numbers[i]}"
-                numbers[i] = self.table.sheet.number(row, self.column, self.quantity + of)
+                found = sheet.found(row, self.column)
+                raise InputError(f"{self.where(i)} {found}, expected {self.quantity}{of}, a number")
         return numbers
 
     def refuse(self, bad: NDArray[np.bool_], why: Callable[[int], str]) -> None:
@@ -111,7 +109,7 @@ class Column:
 class Layout:
     """Where a workbook's numbers are.
 
-    `modules` is the table of x1, y1, z1, and `rows_of` has the row of each module in every table with a row for each.
+    `modules` is the table of x1, y1, z1; `rows_of` has the row of each module in every table with a row for each.
     """
 
     modules: Table
@@ -130,7 +128,20 @@ class Layout:
 
 def mapped_layout(book: Book, columns: ColumnMap) -> Layout:
     """The layout that a complete column map describes."""
-    tables = [_mapped_table(book, table) for table in columns.tables]
+    from openpyxl.utils import column_index_from_string as index
+
+    tables = []
+    for said in columns.tables:
+        if said.sheet not in book.sheets:
+            raise InputError(
+                f"{book.path.name}: has no sheet {said.sheet}, which the column map names; its sheets are "
+                f"{', '.join(book.sheets)}"
+            )
+        cells = {c.quantity: (index(c.column), c.unit) for c in said.columns}
+        number = None if said.number is None else index(said.number)
+        tables.append(Table(book.sheets[said.sheet], cells, said.row_numbers(), number))
+        for contradiction in itertools.islice(_contradictions(tables[-1]), 1):
+            warnings.warn(contradiction, InputWarning, stacklevel=2)
     modules, layout = tables[0], Layout(tables[0])
     for table, said in zip(tables, columns.tables, strict=True):
         rows = modules.rows
@@ -150,45 +161,19 @@ def mapped_layout(book: Book, columns: ColumnMap) -> Layout:
     return layout
 
 
-def _mapped_table(book: Book, said: MappedTable) -> Table:
-    from openpyxl.utils import column_index_from_string as index
-
-    if said.sheet not in book.sheets:
-        raise InputError(
-            f"{book.path.name}: has no sheet {said.sheet}, which the column map names; its sheets are "
-            f"{', '.join(book.sheets)}"
-        )
-    columns = {c.quantity: (index(c.column), c.unit) for c in said.columns}
-    number = None if said.number is None else index(said.number)
-    table = Table(book.sheets[said.sheet], columns, said.row_numbers(), number)
-    for contradiction in _contradictions(table):
-        warnings.warn(contradiction, InputWarning, stacklevel=2)
-        break
-    return table
-
-
-def _contradictions(table: Table) -> Iterable[str]:
+def _contradictions(table: Table) -> Iterator[str]:
     """The headings and number formats of mapped columns that say another unit or quantity than the map."""
     sheet, first = table.sheet, table.rows[0]
     for name, (column, unit) in table.columns.items():
         used = f"the column map says {name} in {unit}, which is used"
         for row in range(max(1, first - HEADING_ROWS), first):
-            heading = heading_of(sheet.texts.get((row, column)))
+            heading = heading_of(sheet.texts.get((row, column), ""))
             if heading is not None and (heading.quantity != name or heading.unit not in (None, unit)):
                 said = heading.quantity + (f" in {heading.unit}" if heading.unit else "")
                 yield f"{sheet.where(row, column)} says {said}, {used}"
         shown = sheet.number_format(first, column)
         if not shows_as_stored(shown, unit):
             yield f"{sheet.where(first, column)} is shown as {shown!r}, {used}"
-
-
-def map_with_rows(columns: ColumnMap, layout: Layout, rows_of: Mapping[Table, Iterable[int]]) -> ColumnMap:
-    """The column map of a layout after its tables have got the rows in `rows_of`."""
-    found = []
-    for said in columns.tables:
-        table = layout.columns[said.columns[0].quantity].table
-        found.append(said.with_rows(sorted(rows_of.get(table, table.rows))))
-    return ColumnMap(tuple(found))
 
 
 def by_label(modules: Table, table: Table) -> tuple[int, ...]:
@@ -233,15 +218,12 @@ def _labels(sheet: Sheet, rows: tuple[int, ...], column: int) -> tuple[Label, ..
         labels = [" ".join(str(value).split()) for value in values]
     first: dict[Label, int] = {}
     for row, label in zip(rows, labels, strict=True):
+        where = sheet.where(row, column)
         if label is None:
-            raise InputError(
-                f"{sheet.where(row, column)} {sheet.found(row, column)}, expected a module's number (or a name in "
-                "every row)"
-            )
+            raise InputError(f"{where} {sheet.found(row, column)}, expected a module's number (or a name in every row)")
         if label in first:
             raise InputError(
-                f"{sheet.where(row, column)} is module {label}, as is {sheet.place(first[label], column)}: "
-                "expected another number"
+                f"{where} is module {label}, as is {sheet.place(first[label], column)}: expected another number"
             )
         first[label] = row
     return tuple(first)

@@ -1,4 +1,4 @@
-"""The zip archive that a workbook is. A copy with new bytes for a few members keeps all others as they were."""
+"""A workbook's zip archive and the XML in it, of which a few bytes can be replaced and all others kept."""
 
 from __future__ import annotations
 
@@ -9,34 +9,47 @@ import re
 import warnings
 import zipfile
 from collections.abc import Callable, Iterable
+from dataclasses import dataclass, field
+from typing import Any
+from xml.parsers import expat
+from xml.sax.saxutils import escape
 
 from ..errors import InputError
-from .xml_parts import elements, spliced, utf8
 
 _CONTENT_TYPES = "[Content_Types].xml"
+_START_TAG = re.compile(rb"""<(?:[^>"']|"[^"]*"|'[^']*')*>""")
+
+
+@dataclass(slots=True, eq=False)
+class Element:
+    """An XML element and the place of its bytes.
+
+    `start`, `inner`, `close` and `end` are the offsets of the start tag, of the content, of the end tag, and of what
+    follows; in an empty element without end tag, the last three are the same. The key of an attribute with a prefix is
+    "namespace name"; `text` is without that of the `children`.
+    """
+
+    name: str
+    namespace: str
+    attributes: dict[str, str]
+    parent: Element | None
+    start: int
+    inner: int
+    close: int
+    end: int
+    text: str = ""
+    children: list[Element] = field(default_factory=list)
 
 
 class Package:
-    """The members of a workbook file.
-
-    Parameters
-    ----------
-    content
-        The file's bytes.
-    name
-        The file's name in messages.
-    """
+    """The members of a workbook file with these bytes; messages call it `name`."""
 
     def __init__(self, content: bytes, name: str) -> None:
         self.name = name
         self.content = content
         self._archive = zipfile.ZipFile(io.BytesIO(content))
         self._members = {info.filename.casefold(): info for info in self._archive.infolist()}
-
-    @property
-    def names(self) -> list[str]:
-        """The members' names in the archive's order."""
-        return [info.filename for info in self._members.values()]
+        self.names = [info.filename for info in self._members.values()]
 
     def read(self, name: str) -> bytes:
         """A member's bytes; `InputError` if it is missing or damaged."""
@@ -44,10 +57,12 @@ class Package:
             return self._archive.read(self._members[name.casefold()])
         except KeyError as error:
             raise InputError(f"{self.name}: not a whole .xlsx workbook (it has no {name})") from error
-        except (zipfile.BadZipFile, RuntimeError, NotImplementedError, EOFError, OSError) as error:
-            raise InputError(f"{self.name}: its part {name} cannot be read ({error})") from error
-        except Exception as error:  # zlib.error and its like have no common name
-            raise InputError(f"{self.name}: its part {name} is damaged ({error})") from error
+        except Exception as error:  # zlib.error, zipfile.BadZipFile and their like have no common name
+            raise InputError(f"{self.name}: its part {name} is damaged or cannot be read ({error})") from error
+
+    def elements(self, name: str) -> list[Element]:
+        """The XML elements of a member."""
+        return elements(self.read(name), f"{self.name}: {name}")
 
     def relations(self, part: str) -> list[tuple[str, str, str]]:
         """(id, last word of the type, member) of what `part` ("" for the package) refers to inside the package."""
@@ -56,20 +71,17 @@ class Package:
             return []
         return [
             (e.attributes.get("Id", ""), e.attributes.get("Type", "").rpartition("/")[2], _target(part, e.attributes))
-            for e in elements(utf8(self.read(name), name)[0], name)
+            for e in self.elements(name)
             if e.name == "Relationship" and e.attributes.get("TargetMode") != "External"
         ]
 
     def content_type(self, part: str) -> str:
         """The content type of a member."""
-        suffix = part.rpartition(".")[2].casefold()
-        found = ""
-        for e in elements(utf8(self.read(_CONTENT_TYPES), _CONTENT_TYPES)[0], _CONTENT_TYPES):
-            if e.name == "Override" and e.attributes.get("PartName", "").lstrip("/").casefold() == part.casefold():
-                return e.attributes.get("ContentType", "")
-            if e.name == "Default" and e.attributes.get("Extension", "").casefold() == suffix:
-                found = e.attributes.get("ContentType", "")
-        return found
+        said = {}
+        for e in self.elements(_CONTENT_TYPES):
+            key = e.attributes.get("PartName", "").lstrip("/") or f".{e.attributes.get('Extension', '')}"
+            said[key.casefold()] = e.attributes.get("ContentType", "")
+        return said.get(part.casefold()) or said.get(f".{part.rpartition('.')[2].casefold()}", "")
 
     def with_parts(self, parts: dict[str, bytes], removed: Iterable[str] = (), owner: str = "") -> bytes:
         """The archive with other bytes for `parts` and without the `removed` members that `owner` refers to.
@@ -99,9 +111,10 @@ class Package:
         return out.getvalue()
 
     def _without(self, name: str, element: str, is_meant: Callable[[dict[str, str]], bool]) -> bytes:
-        data, to_encoding = utf8(self.read(name), name)
-        cuts = [(e.start, e.end, b"") for e in elements(data, name) if e.name == element and is_meant(e.attributes)]
-        return to_encoding(spliced(data, cuts))
+        found = self.elements(name)
+        return spliced(
+            self.read(name), [(e.start, e.end, b"") for e in found if e.name == element and is_meant(e.attributes)]
+        )
 
 
 def _relations_part(part: str) -> str:
@@ -114,3 +127,69 @@ def _target(part: str, attributes: dict[str, str]) -> str:
     target = attributes.get("Target", "")
     path = target[1:] if target.startswith("/") else posixpath.join(posixpath.dirname(part), target)
     return re.sub(r"^(\.\./)+", "", posixpath.normpath(path))
+
+
+def elements(data: bytes, name: str) -> list[Element]:
+    """All elements of UTF-8 `data` in document order; `InputError`, which names `name`, if it is malformed."""
+    parser = expat.ParserCreate("utf-8", " ")
+    parser.buffer_text = True
+    found: list[Element] = []
+    opened: list[Element] = []
+
+    def start(tag: str, attributes: dict[str, str]) -> None:
+        at = parser.CurrentByteIndex
+        match = _START_TAG.match(data, at)
+        assert match is not None, "the parser has seen a whole tag here"
+        namespace, _, local = tag.rpartition(" ")
+        parent, inner = opened[-1] if opened else None, match.end()
+        found.append(Element(local, namespace, attributes, parent, at, inner, inner, inner))
+        opened.append(found[-1])
+        if parent is not None:
+            parent.children.append(found[-1])
+
+    def end(_tag: str) -> None:
+        element = opened.pop()
+        if not data.endswith(b"/>", element.start, element.inner):
+            element.close = parser.CurrentByteIndex
+            element.end = data.index(b">", element.close) + 1
+
+    def text(characters: str) -> None:
+        opened[-1].text += characters
+
+    def doctype(*_: Any) -> None:
+        raise InputError(f"{name}: has a document type, expected none in a workbook")
+
+    parser.StartElementHandler, parser.EndElementHandler = start, end
+    parser.CharacterDataHandler, parser.StartDoctypeDeclHandler = text, doctype
+    try:
+        data.decode()  # a byte order mark may tell the parser of another encoding
+        parser.Parse(data, True)
+    except (UnicodeDecodeError, expat.ExpatError) as error:
+        raise InputError(f"{name}: not readable XML ({error})") from error
+    return found
+
+
+def spliced(data: bytes, changes: list[tuple[int, int, bytes]]) -> bytes:
+    """`data` with the bytes from start to end replaced by others, for each of `changes`: (start, end, new bytes)."""
+    pieces, at = [], 0
+    for start, end, new in sorted(changes, key=lambda change: change[:2]):
+        pieces += [data[at:start], new]
+        at = end
+    return b"".join([*pieces, data[at:]])
+
+
+def with_attribute(tag: bytes, name: str, value: str | None) -> bytes:
+    """A start tag with another value of an attribute without prefix; None removes the attribute."""
+    attribute = re.compile(rb"""\s+%b\s*=\s*("[^"]*"|'[^']*')""" % name.encode())
+    if value is None:
+        return attribute.sub(b"", tag, count=1)
+    new = b' %b="%b"' % (name.encode(), escaped(value))
+    if attribute.search(tag):
+        return attribute.sub(lambda _: new, tag, count=1)
+    end = len(tag) - (2 if tag.endswith(b"/>") else 1)
+    return tag[:end].rstrip() + new + tag[end:]
+
+
+def escaped(text: str) -> bytes:
+    """Text for an element or a quoted attribute."""
+    return escape(text, {'"': "&quot;"}).encode("ascii", "xmlcharrefreplace")

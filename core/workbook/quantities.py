@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,44 +21,37 @@ ANGLE_UNITS = {"rad": 1.0, "deg": math.pi / 180}
 
 EXACT = 1e-6
 """Two numbers of one quantity agree if they differ less: relative, and absolute in mm or rad."""
+AGREEING = 1e-9
+"""Relative: a formula's result nearer to a number than this gives that number."""
 _COARSEST_ROUNDING = {**{unit: 0.005 / factor for unit, factor in LENGTH_UNITS.items()}, "rad": 0.0005, "deg": 0.005}
 """Unit -> the largest rounding error that a typed number is granted."""
 
 
 @dataclass(frozen=True)
 class Quantity:
-    """One row of the table.
-
-    Attributes
-    ----------
-    name : str
-        Its symbol, which is also its name in messages and column maps.
-    of : callable
-        Its numbers (M,) in a `PinholeSystem`, mm or rad.
-    headings : tuple of str
-        The texts that head its column. Texts of one letter are case-sensitive, others are not.
-    role : "needed", "optional" or "derived"
-        Whether the column must be there, may be, or only repeats what follows from the others and is compared.
-    kind : "length" or "angle"
-    formula : str
-        Its formula in a spreadsheet, with other quantities in braces; "" for one that is typed.
-    hints : str
-        Words that suggest this quantity in a heading that is not understood.
-    plausible : (lowest, highest)
-        mm or rad; a warning is given of numbers outside.
-    depends_on_length : bool
-        Whether it is derived from l, and hence from all the digits of an l that is shown rounded.
-    """
+    """One row of the table."""
 
     name: str
+    """Its symbol, which is also its name in messages and column maps."""
     of: Callable[[PinholeSystem], NDArray[np.float64]]
+    """Its numbers (M,) in a `PinholeSystem`, mm or rad."""
     headings: tuple[str, ...]
+    """The texts that head its column. Texts of one letter are case-sensitive, others are not."""
+    place: str
+    """Sheet and column in a new workbook."""
+    titles: tuple[str, str] | None = None
+    """The symbol and the description that head it in a new workbook; by default the first two headings."""
     role: Literal["needed", "optional", "derived"] = "derived"
+    """Whether the column must be there, may be, or only repeats what follows from the others and is compared."""
     kind: Literal["length", "angle"] = "length"
     formula: str = ""
+    """Its formula in a spreadsheet, with other quantities in braces; "" for one that is typed."""
     hints: str = ""
+    """Words that suggest this quantity in a heading that is not understood."""
     plausible: tuple[float, float] = (-math.inf, math.inf)
+    """mm or rad; a warning is given of numbers outside."""
     depends_on_length: bool = False
+    """Whether it is derived from l, and hence from all the digits of an l that is shown rounded."""
 
     @property
     def units(self) -> dict[str, float]:
@@ -66,29 +59,20 @@ class Quantity:
         return LENGTH_UNITS if self.kind == "length" else ANGLE_UNITS
 
 
-def _coordinate(axis: str, places: str) -> dict:
+def _coordinate(axis: str, places: str) -> dict[str, Any]:
     """Name, headings and hints of a coordinate: "x1" and the places that it may be of."""
-    headings = [
-        f"{axis[0]} {of} {place}"
-        for place in places.split(", ")
-        for of in ("coordinate value at", "coordinate at", "coordinate of", "position of")
-    ]
+    phrases = "coordinate value at", "coordinate at", "coordinate of", "position of"
+    headings = [f"{axis[0]} {of} {place}" for place in places.split(", ") for of in phrases]
     hints = f"{axis[0]} {axis[0]}1 {axis[0]}2 coordinate coordinates position"
     return {"name": axis, "headings": (axis, *headings), "hints": hints}
 
 
 _HOLES = "center of hole, centre of hole, center of pinhole, centre of pinhole, pinhole"
-_END = "end of detector"
 
 
 def _detector_back(system: PinholeSystem) -> NDArray[np.float64]:
     """Distance (M,) from the isocentre to the crystal's back, mm."""
     return system.pinhole_distance + system.collimator_length + system.detector_thickness
-
-
-def _detector_end(system: PinholeSystem, axis: int) -> NDArray[np.float64]:
-    """One coordinate (M,) of the middle of the crystal's back, mm."""
-    return system.centers[:, axis] * (_detector_back(system) / system.pinhole_distance)
 
 
 def _planar_range(system: PinholeSystem) -> NDArray[np.float64]:
@@ -98,13 +82,20 @@ def _planar_range(system: PinholeSystem) -> NDArray[np.float64]:
 
 # Causes stand before their effects, so that the cause of an error is the cell that is refused.
 _TABLE = (
-    Quantity(**_coordinate("x1", _HOLES), of=lambda s: s.centers[:, 0], role="needed"),
-    Quantity(**_coordinate("y1", _HOLES), of=lambda s: s.centers[:, 1], role="needed"),
-    Quantity(**_coordinate("z1", _HOLES), of=lambda s: s.centers[:, 2], role="needed"),
+    *(
+        Quantity(
+            **_coordinate(f"{axis}1", _HOLES),
+            of=lambda s, i=i: s.centers[:, i],  # type: ignore[misc]
+            place=f"Coordinates!{'BCD'[i]}",
+            role="needed",
+        )
+        for i, axis in enumerate("xyz")
+    ),
     Quantity(
         "d",
         lambda s: s.pinhole_diameter,
         ("d", "diameter of pinhole", "pinhole diameter", "diameter of hole", "hole diameter"),
+        "Main!P",
         role="needed",
         hints="d diameter bore",
         plausible=(0.05, 50),
@@ -113,6 +104,7 @@ _TABLE = (
         "R",
         lambda s: s.roi_radius,
         ("R", "radius of spherical region of interest", "radius of region of interest", "radius of roi", "roi radius"),
+        "Main!Q",
         role="needed",
         hints="r radius roi",
         plausible=(5, 1000),
@@ -121,6 +113,7 @@ _TABLE = (
         "Ld",
         lambda s: s.detector_side,
         ("Ld", "length of side of detector crystal", "side of detector crystal", "side of crystal", "crystal side"),
+        "Main!S",
         role="needed",
         hints="ld side width size edge",
         plausible=(1, 1000),
@@ -129,6 +122,7 @@ _TABLE = (
         "Td",
         lambda s: s.detector_thickness,
         ("Td", "thickness of detector crystal", "thickness of crystal", "crystal thickness"),
+        "Main!T",
         role="needed",
         hints="td thickness",
         plausible=(0.1, 200),
@@ -142,6 +136,7 @@ _TABLE = (
             *(f"distance from pinhole to {to}" for to in ("heart", "isocenter", "isocentre")),
             *(f"pinhole to {to} distance" for to in ("heart", "isocenter", "isocentre")),
         ),
+        "Coordinates!E",
         formula="=SQRT(SUMSQ({x1},{y1},{z1}))",
         hints="b distance",
         plausible=(40, 2000),
@@ -150,26 +145,47 @@ _TABLE = (
         "l",
         lambda s: s.collimator_length,
         ("l", "length of collimator", "collimator length"),
+        "Coordinates!G",
         role="optional",
         formula="=({Ld}-{d})*({b}^2-{R}^2)/({b}*{d}+2*{R}*SQRT({b}^2-{R}^2+{d}^2/4))",
         hints="l length depth height",
         plausible=(1, 1000),
     ),
-    Quantity("H", _detector_back, ("l+b+Td", "b+l+Td"), formula="={b}+{l}+{Td}", hints="td", depends_on_length=True),
+    Quantity(
+        "H",
+        _detector_back,
+        ("l+b+Td", "b+l+Td"),
+        "Coordinates!H",
+        titles=("l + b+Td", ""),
+        formula="={b}+{l}+{Td}",
+        hints="td",
+        depends_on_length=True,
+    ),
     *(
         Quantity(
-            **_coordinate(f"{axis}2", _END),
-            of=lambda s, i=i: _detector_end(s, i),  # type: ignore[misc]
+            **_coordinate(f"{axis}2", "end of detector"),
+            of=lambda s, i=i: s.centers[:, i] * (_detector_back(s) / s.pinhole_distance),  # type: ignore[misc]
+            place=f"Coordinates!{'IJK'[i]}",
             formula=f"={{{axis}1}}*{{H}}/{{b}}",
             depends_on_length=True,
         )
         for i, axis in enumerate("xyz")
     ),
-    Quantity("range", _planar_range, ("pinhole range",), formula="=SQRT(SUMSQ({x1},{y1}))", hints="range"),
+    Quantity(
+        "range",
+        _planar_range,
+        ("pinhole range",),
+        "Coordinates!U",
+        titles=("", "pinhole range"),
+        formula="=SQRT(SUMSQ({x1},{y1}))",
+        hints="range",
+    ),
     Quantity(
         "azimuth",
         lambda s: np.arctan2(s.centers[:, 1], s.centers[:, 0]),
         ("pinhole azimuth",),
+        "Coordinates!V",
+        titles=("", "pinhole azimuth (radians)"),
         kind="angle",
         formula="=(ATAN2({x1},{y1}))",
         hints="azimuth",
@@ -178,6 +194,8 @@ _TABLE = (
         "elevation",
         lambda s: np.arctan2(s.centers[:, 2], _planar_range(s)),
         ("pinhole elevation",),
+        "Coordinates!W",
+        titles=("", "pinhole elevation (radians)"),
         kind="angle",
         formula="=(ATAN2({range},{z1}))",
         hints="elevation",
@@ -204,3 +222,8 @@ def tolerance(number: float, expected: float, unit: str) -> float:
     # Trailing zeros are lost: 89.1 may be 89.10, so few decimals stand for the coarsest rounding.
     rounding = min(0.5 * 10.0**-decimals, _COARSEST_ROUNDING[unit])
     return max(EXACT * max(1.0 / LENGTH_UNITS.get(unit, 1.0), abs(expected)), rounding * (1 + 1e-9))
+
+
+def agree(value: object, wanted: float, at_least: float = 0.0) -> bool:
+    """Whether a cell's value is the number `wanted`, relative to it and `at_least`."""
+    return type(value) is float and abs(value - wanted) <= AGREEING * max(abs(wanted), at_least)

@@ -1,4 +1,4 @@
-"""`read_system`: a geometry workbook as a `PinholeSystem`."""
+"""`read_system`: a geometry workbook as a `PinholeSystem`, and whether its numbers are possible and plausible."""
 
 from __future__ import annotations
 
@@ -11,29 +11,36 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ..errors import InputWarning
+from ..errors import InputError, InputWarning
 from ..geometry.design_formulas import collimator_length
 from ..geometry.system import PinholeSystem
 from ..system_source import QuantityCells, SystemSource
 from .book import Book
 from .column_map import ColumnMap, column_map
 from .layout import Column, Layout, mapped_layout
-from .plausibility import Numbers, differences, implausible, refuse_impossible, refuse_not_positive
-from .quantities import DERIVED, NEEDED, POSITION, QUANTITIES, tolerance
+from .quantities import AGREEING, DERIVED, DIMENSIONS, NEEDED, POSITION, QUANTITIES, tolerance
 from .recognition import recognized_layout
+
+_SAME_PLACE = 1e-6
+"""mm; two pinholes closer than this are one."""
+_SHOWN = 5
+"""Warnings of one column; the last one counts the rest."""
+
+Numbers = dict[str, NDArray[np.float64]]
+"""Quantity -> its numbers (M,)."""
 
 
 def read_system(
     path: str | os.PathLike[str], columns: ColumnMap | str | os.PathLike[str] | None = None
 ) -> PinholeSystem:
-    """The scanner in a geometry workbook.
+    """The scanner in a geometry workbook; `source` names the workbook and the cell of every number.
 
-    Tables are found by their headings, symbols (x1 y1 z1 l d R Ld Td ...) or descriptions, listed in
-    `core.workbook.quantities`, with their units. Anything that is not understood for certain is refused; `columns` then
-    says what is meant. The pinhole centres, d, R, Ld and Td are needed, a number for each module or one for all. l comes
-    from its column, and where that is blank from `collimator_length`. A stored value that is not what its formula gives
-    is refused. Numbers that follow from the others are only checked: one that differs by more than 1e-6 (relative, mm or
-    radians) and by more than rounding in its last decimal is an `InputWarning`.
+    Tables are found by their headings, listed in `core.workbook.quantities`, with their units. Anything that is not
+    understood for certain is refused; `columns` then says what is meant. The pinhole centres, d, R, Ld and Td are needed,
+    a number for each module or one for all. l comes from its column, and where that is blank from `collimator_length`. A
+    stored value that is not what its formula gives is refused. Numbers that follow from the others are only checked: one
+    that differs by more than 1e-6 (relative, mm or radians) and by more than rounding in its last decimal is an
+    `InputWarning`.
 
     Parameters
     ----------
@@ -43,22 +50,11 @@ def read_system(
         Which cells hold which quantity: a `ColumnMap`, or the path of one as TOML. Nothing else of the workbook is
         then read. Default: by the headings.
 
-    Returns
-    -------
-    PinholeSystem
-        Modules in the order of their rows, lengths in mm; `source` names the workbook and the cell of every number.
-
     Raises
     ------
     InputError
         Not a workbook, a heading, a note or a table that is not understood, or a cell that cannot be used: one
         line with sheet and cell, what is there and what was expected.
-
-    Examples
-    --------
-    >>> system = read_system("examples/dc-spect-80.xlsx")    # doctest: +SKIP
-    >>> len(system), system.collimator_length[0].round(4)    # doctest: +SKIP
-    (80, 89.0702)
     """
     columns = column_map(columns, path)  # before the file, which may be large
     return read(Book(path), columns).system
@@ -78,20 +74,20 @@ def read(book: Book, columns: ColumnMap | None = None) -> Reading:
     layout = recognized_layout(book) if columns is None else mapped_layout(book, columns)
     given = {name: layout.columns[name].numbers() for name in NEEDED}
     values = {name: given[name] * layout.columns[name].factor for name in NEEDED}
-    refuse_impossible(layout.columns, values)
+    _refuse_impossible(layout.columns, values)
     on_axis = np.hypot(values["x1"], values["y1"]) == 0
     for name in QUANTITIES:
         if name in layout.columns and name not in NEEDED:
             # On the z axis a spreadsheet's ATAN2 shows #DIV/0!, and any azimuth is right.
-            may_fail = on_axis if name == "azimuth" else None
-            given[name] = layout.columns[name].numbers(name != "l" or columns is None, may_fail)
+            ignored = on_axis if name == "azimuth" else None
+            given[name] = layout.columns[name].numbers(name != "l" or columns is None, ignored)
     designed = collimator_length(
         np.sqrt(sum(values[name] ** 2 for name in POSITION)), values["d"], values["Ld"], values["R"]
     )
     length = designed
     if "l" in given:
         in_sheet = given["l"] * layout.columns["l"].factor
-        refuse_not_positive(layout.columns["l"], in_sheet)
+        _refuse_not_positive(layout.columns["l"], in_sheet)
         length = np.where(np.isnan(in_sheet), designed, in_sheet)
     system = PinholeSystem(
         centers=np.stack([values[name] for name in POSITION], axis=1),
@@ -115,16 +111,14 @@ def _doubtful(
     rounding_of_l: NDArray[np.float64] | float = 0.0
     if "l" in given:
         column = columns["l"]
-        yield from differences(column, given["l"], designed)
+        yield from _differences(column, given["l"], designed)
         typed = system.collimator_length / column.factor
         rounding_of_l = column.factor * np.array([tolerance(x, x, column.unit) for x in typed])
-    yield from implausible(system, columns)
-    on_z_axis = QUANTITIES["range"].of(system) == 0
+    yield from _implausible(system, columns)
     for name in DERIVED:
         if name in given:
-            numbers = np.where(on_z_axis, math.nan, given[name]) if name == "azimuth" else given[name]
             slack = rounding_of_l if QUANTITIES[name].depends_on_length else 0.0
-            yield from differences(columns[name], numbers, QUANTITIES[name].of(system), slack)
+            yield from _differences(columns[name], given[name], QUANTITIES[name].of(system), slack)
     for place, why in list(book.unverified.items())[:1]:
         yield (
             f"{book.path.name}: {book.workbook.text(place)}: the stored value is used, though the file asks to be "
@@ -152,3 +146,85 @@ def _source(book: Book, layout: Layout, columns: ColumnMap | None) -> SystemSour
         cells=tuple(cells),
         columns=columns,
     )
+
+
+def _refuse_impossible(columns: dict[str, Column], values: Numbers) -> None:
+    """Raise `InputError` if no scanner can have the typed `values`, mm, naming the cell."""
+    for name in DIMENSIONS:
+        _refuse_not_positive(columns[name], values[name])
+    d, side, roi = values["d"], values["Ld"], values["R"]
+    columns["d"].refuse(
+        d >= side, lambda i: f"has d = {d[i]:g} mm, expected less than Ld = {side[i]:g} mm in {columns['Ld'].place(i)}"
+    )
+    x1, roi_column = columns["x1"], columns["R"]
+    with np.errstate(over="ignore"):
+        b = np.sqrt(sum(values[name] ** 2 for name in POSITION))
+    puts = [f"and y1, z1 put the pinhole of module {number}" for number in x1.modules.module_numbers]
+    x1.refuse(b == 0, lambda i: f"{puts[i]} at the isocentre, expected outside the ROI")
+    x1.refuse(np.isinf(b), lambda i: f"{puts[i]} too far away to compute, expected millimetres")
+    outside = "mm from the isocentre, expected outside the ROI of"
+    x1.refuse(b <= roi, lambda i: f"{puts[i]} {b[i]:g} {outside} {roi[i]:g} mm in {roi_column.place(i)}")
+    first: dict[tuple[int, ...], int] = {}
+    for i, position in enumerate(zip(*(values[name] for name in POSITION), strict=True)):
+        j = first.setdefault(tuple(round(x / _SAME_PLACE) for x in position), i)
+        if j != i:
+            raise InputError(
+                f"{x1.where(i)} {puts[i]} at the place of module {x1.modules.module_numbers[j]} ({x1.place(j)}), expected "
+                "another place"
+            )
+
+
+def _refuse_not_positive(column: Column, values: NDArray[np.float64]) -> None:
+    """Raise `InputError` if a length (M,), mm, is not positive."""
+    column.refuse(values <= 0, lambda i: f"has {column.quantity} = {values[i]:g} mm, expected more than 0")
+
+
+def is_by_design(system: PinholeSystem) -> NDArray[np.bool_]:
+    """Which modules (M,) have the design formula's collimator length."""
+    length = collimator_length(
+        system.pinhole_distance, system.pinhole_diameter, system.detector_side, system.roi_radius
+    )
+    return np.abs(length - system.collimator_length) <= AGREEING * system.collimator_length
+
+
+def _implausible(system: PinholeSystem, columns: dict[str, Column]) -> Iterator[str]:
+    """For each quantity, the first module whose number is unlike that of any scanner."""
+    for name, quantity in QUANTITIES.items():
+        low, high = quantity.plausible
+        values = quantity.of(system)
+        column = columns[name if name in columns and quantity.role != "derived" else "x1"]
+        odd = np.flatnonzero((values < low) | (values > high))
+        if len(odd):
+            several = len(set(column.rows)) > 1 and len(odd) > 1
+            more = f" (so it is for {len(odd) - 1} more modules)" if several else ""
+            yield (
+                f"{column.where(int(odd[0]))} makes {name} = {values[odd[0]]:.6g} mm{more}, which is unlikely, expected "
+                f"{low:g} to {high:g} mm: are the units right?"
+            )
+
+
+def _differences(
+    column: Column, given: NDArray[np.float64], expected: NDArray[np.float64], slack: NDArray[np.float64] | float = 0.0
+) -> Iterator[str]:
+    """The first modules whose number `given` (M,) in the sheet, in its unit, is not as `expected` (M,), mm or rad.
+
+    The tolerance is larger by `slack`, mm, for rounding of the numbers behind `expected`.
+    """
+    name, unit = column.quantity, column.unit
+    expected, slack = expected / column.factor, np.broadcast_to(slack, given.shape) / column.factor
+    difference = np.abs(given - expected)
+    if QUANTITIES[name].kind == "angle":
+        turn = 2 * math.pi / column.factor
+        difference = np.abs((given - expected + turn / 2) % turn - turn / 2)
+    differing = [
+        int(i)
+        for i in np.flatnonzero(np.isfinite(given))
+        if difference[i] > tolerance(given[i], expected[i], unit) + slack[i]
+    ]
+    used = "the sheet's is used" if name == "l" else "the formula's is used"
+    for n, i in enumerate(differing[:_SHOWN], start=1):
+        more = f"; so do {len(differing) - _SHOWN} more cells of this column" if n == _SHOWN < len(differing) else ""
+        yield (
+            f"{column.where(i)} has {name} = {given[i]:.9g} {unit}, the formula gives {expected[i]:.9g} {unit} "
+            f"({used}{more})"
+        )

@@ -3,25 +3,92 @@
 from __future__ import annotations
 
 import re
+from collections import defaultdict
 from dataclasses import dataclass, field, replace
-from typing import Any
+from functools import lru_cache
+from typing import Any, NamedTuple
 
 from ..errors import InputError
-from .formulas import CellError
-from .references import Reference, reference
-from .xml_parts import Element, elements, escaped, spliced, utf8, with_attribute
+from .package import Element, elements, escaped, spliced, with_attribute
 
 MAIN = "http://schemas.openxmlformats.org/spreadsheetml/2006/main"
 STRICT = "http://purl.oclc.org/ooxml/spreadsheetml/main"
 
-_NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?")
-
+MAX_ROW = 1_048_576
+MAX_COLUMN = 16_384
 At = tuple[int, int]
 """Row and column, counted from 1."""
+
+_NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?")
+
+_SHEET = r"(?:(?P<sheet>'(?:[^'\[\]]|'')+'|[^'!\[\]()\s]+)!)?"
+_AREAS = tuple(
+    re.compile(_SHEET + area, re.IGNORECASE)
+    for area in (
+        r"\$?(?P<left>[A-Z]{1,3})\$?(?P<top>\d{1,7})(?::\$?(?P<right>[A-Z]{1,3})\$?(?P<bottom>\d{1,7}))?",
+        r"\$?(?P<left>[A-Z]{1,3}):\$?(?P<right>[A-Z]{1,3})",
+        r"\$?(?P<top>\d{1,7}):\$?(?P<bottom>\d{1,7})",
+    )
+)
+
+
+class CellError(str):
+    """An error value such as #REF! or #DIV/0!."""
 
 
 class Unreadable(str):
     """The text of a stored value that is neither number, text, boolean nor error."""
+
+
+class Reference(NamedTuple):
+    """An area of cells; ``sheet`` is None for the formula's own, "First:Last" for an area through several sheets."""
+
+    sheet: str | None
+    top: int
+    left: int
+    bottom: int
+    right: int
+
+    @property
+    def name(self) -> str:
+        """E.g. ``B3:C5``."""
+        return f"{cell_name((self.top, self.left))}:{cell_name((self.bottom, self.right))}"
+
+    @property
+    def size(self) -> int:
+        """How many cells it has."""
+        return (self.bottom - self.top + 1) * (self.right - self.left + 1)
+
+    def contains(self, row: int, column: int) -> bool:
+        """Whether a cell is in the area, whatever its sheet."""
+        return self.top <= row <= self.bottom and self.left <= column <= self.right
+
+
+def cell_name(at: At) -> str:
+    """E.g. ``B3``."""
+    from openpyxl.utils import get_column_letter
+
+    return f"{get_column_letter(at[1])}{at[0]}"
+
+
+@lru_cache(maxsize=2**15)
+def reference(text: str) -> Reference | None:
+    """What ``B3``, ``'My sheet'!$B$3:$B$82``, ``A:C`` or ``3:5`` refers to; None for a name or another file's cell."""
+    from openpyxl.utils import column_index_from_string as column
+
+    match = next((found for area in _AREAS if (found := area.fullmatch(text))), None)
+    if match is None:
+        return None
+    parts = match.groupdict()
+    sheet = parts["sheet"]
+    if sheet is not None and sheet.startswith("'"):
+        sheet = sheet[1:-1].replace("''", "'")
+    left, top, right, bottom = (parts.get(side) for side in ("left", "top", "right", "bottom"))
+    columns = [1, MAX_COLUMN] if left is None else sorted([column(left.upper()), column((right or left).upper())])
+    rows = [1, MAX_ROW] if top is None else sorted([int(top), int(bottom or top)])
+    if rows[0] < 1 or rows[1] > MAX_ROW or columns[1] > MAX_COLUMN:
+        return None
+    return Reference(sheet, rows[0], columns[0], rows[1], columns[1])
 
 
 @dataclass(frozen=True)
@@ -38,24 +105,16 @@ class _Origin:
 
 @dataclass(frozen=True)
 class Cell:
-    """The content of a cell.
-
-    Attributes
-    ----------
-    value : float, str, bool, CellError, Unreadable or None
-        The typed value, or the stored result of the formula.
-    formula : str or None
-        With its "="; a shared formula as it reads in this cell.
-    array : Reference or None
-        The area of the array formula or data table that the cell belongs to, if that has several cells.
-    single_array : bool
-        Whether the formula is an array formula of this cell alone.
-    """
+    """The content of a cell."""
 
     value: Any = None
+    """The typed value, or the stored result of the formula: a float, str, bool, `CellError`, `Unreadable` or None."""
     formula: str | None = None
+    """With its "="; a shared formula as it reads in this cell."""
     array: Reference | None = None
+    """The area of the array formula or data table that the cell belongs to, if that has several cells."""
     single_array: bool = False
+    """Whether the formula is an array formula of this cell alone."""
     origin: _Origin | None = field(default=None, compare=False, repr=False)
 
     @property
@@ -77,18 +136,7 @@ _BLANK = Cell()
 
 
 class SheetXml:
-    """The cells of a worksheet part.
-
-    Parameters
-    ----------
-    data
-        The part.
-    strings
-        The workbook's shared strings.
-    name
-        The sheet's name.
-    file
-        The workbook's name in messages.
+    """The cells of a worksheet part, with the workbook's shared `strings`; messages name the `file` and the sheet.
 
     Attributes
     ----------
@@ -101,25 +149,17 @@ class SheetXml:
     """
 
     def __init__(self, data: bytes, strings: list[str], name: str, file: str) -> None:
-        self.name, self._file = name, file
-        where = f"{file}: sheet {name}"
-        self._data, self._to_encoding = utf8(data, where)
+        self.name, self._file, self._data = name, file, data
         self._rows: dict[int, Element] = {}
-        self._in_row: dict[int, list[tuple[int, Element]]] = {}
-        self._sheet_data: Element | None = None
+        self._in_row: dict[int, list[tuple[int, Element]]] = defaultdict(list)
+        self._sheet_data: Element  # every sheet with cells has one
+        self._prefix = b""
         self._dimension: Element | None = None
         self.cells: dict[At, Cell] = {}
         self.merged: list[Reference] = []
-        self._read(elements(self._data, where), strings)
-        self.original = dict(self.cells)
-
-    # Reading
-
-    def _read(self, found: list[Element], strings: list[str]) -> None:
-        inside: dict[int, list[Element]] = {}
-        cells: list[tuple[At, Element]] = []
+        masters: dict[str, tuple[At, str]] = {}  # of shared formulas
         row = column = 0
-        for e in found:
+        for e in elements(data, f"{file}: sheet {name}"):
             if e.namespace != MAIN:
                 continue
             parent = e.parent.name if e.parent is not None else ""
@@ -131,39 +171,28 @@ class SheetXml:
                 # As in spreadsheet programs, a cell's own name counts, whatever row it is in.
                 at = (named.top, named.left) if named else (row, column + 1)
                 column = at[1]
-                cells.append((at, e))
-                self._in_row.setdefault(row, []).append((column, e))
-            elif parent in ("c", "is", "r"):
-                inside.setdefault(id(e.parent), []).append(e)
+                self._in_row[row].append((column, e))
+                self._read_cell(at, e, strings, masters)
             elif e.name == "sheetData":
                 self._sheet_data = e
+                self._prefix = data[e.start + 1 : e.inner].split(b"sheetData", 1)[0]
             elif e.name == "dimension":
                 self._dimension = e
             elif e.name == "mergeCell" and (area := reference(e.attributes.get("ref", ""))) is not None:
                 self.merged.append(area)
-        masters: dict[str, tuple[At, str]] = {}
-        for at, element in cells:
-            if at in self.cells:
-                raise InputError(
-                    f"{self._file}: {self.name}!{cell_name(at)} is stored twice in the file, expected it once; Excel or "
-                    "LibreOffice may repair it"
-                )
-            self.cells[at] = self._cell(at, element, inside, strings, masters)
         self._mark_arrays()
+        self.original = dict(self.cells)
 
-    def _cell(
-        self,
-        at: At,
-        element: Element,
-        inside: dict[int, list[Element]],
-        strings: list[str],
-        masters: dict[str, tuple[At, str]],
-    ) -> Cell:
-        content = inside.get(id(element), [])
-        parts = {e.name: e for e in content}
-        if len(parts) < len(content):
+    def _read_cell(self, at: At, element: Element, strings: list[str], masters: dict[str, tuple[At, str]]) -> None:
+        parts = {e.name: e for e in element.children if e.namespace == MAIN}
+        if at in self.cells:
+            raise InputError(
+                f"{self._file}: {self.name}!{cell_name(at)} is stored twice in the file, expected it once; Excel or "
+                "LibreOffice may repair it"
+            )
+        if len(parts) < sum(e.namespace == MAIN for e in element.children):
             raise InputError(f"{self._file}: {self.name}!{cell_name(at)} has several values in the file, expected one")
-        value = _value(element.attributes.get("t", "n"), parts, inside, strings)
+        value = _value(element.attributes.get("t", "n"), parts, strings)
         formula, group, text = parts.get("f"), None, None
         if formula is not None:
             text = f"={formula.text.strip()}" if formula.text.strip() else None
@@ -174,7 +203,7 @@ class SheetXml:
                 elif group in masters:
                     start, text = masters[group]
                     text = moved(text, start, at)
-        return Cell(value, text, origin=_Origin(at, element, formula, text, value, group))
+        self.cells[at] = Cell(value, text, origin=_Origin(at, element, formula, text, value, group))
 
     def _mark_arrays(self) -> None:
         for at, cell in list(self.cells.items()):
@@ -185,19 +214,9 @@ class SheetXml:
             if area is None or (area.top, area.left) == (area.bottom, area.right):
                 self.cells[at] = replace(cell, single_array=f.attributes["t"] == "array")
                 continue
-            for row in range(area.top, area.bottom + 1):
-                for column in range(area.left, area.right + 1):
-                    if (row, column) in self.cells:
-                        self.cells[row, column] = replace(self.cells[row, column], array=area)
-            self.cells[at] = replace(self.cells[at], array=area)
-
-    @property
-    def extent(self) -> At:
-        """The last row and the last column with content."""
-        filled = [at for at, cell in self.cells.items() if not cell.blank]
-        return max((row for row, _ in filled), default=1), max((column for _, column in filled), default=1)
-
-    # Changing
+            for place in self.cells:
+                if place == at or area.contains(*place):
+                    self.cells[place] = replace(self.cells[place], array=area)
 
     def cell(self, at: At) -> Cell:
         """The cell, a blank one if the sheet has none there."""
@@ -219,14 +238,14 @@ class SheetXml:
         area = self.cell(at).array
         if area is not None:
             raise InputError(
-                f"{self._file}: {self.name}!{cell_name(at)} is one cell of the array formula or data table "
-                f"{_area_name(*area[1:])}, expected a cell of its own: its number cannot be changed alone"
+                f"{self._file}: {self.name}!{cell_name(at)} is one cell of the array formula or data table {area.name}, "
+                "expected a cell of its own: its number cannot be changed alone"
             )
 
     @property
     def changed(self) -> list[At]:
         """The cells that are not as read, row by row."""
-        return sorted(at for at, cell in self.cells.items() if not _same(cell, self.original.get(at, _BLANK)))
+        return sorted(at for at, cell in self.cells.items() if not _same(cell, self._was(at)))
 
     @property
     def formulas_added_or_removed(self) -> bool:
@@ -236,48 +255,51 @@ class SheetXml:
     def _was(self, at: At) -> Cell:
         return self.original.get(at, _BLANK)
 
-    # Writing
-
     def to_bytes(self) -> bytes:
         """The part with the changed cells."""
         changed = self.changed
         split = {group for at in changed if (group := self._group_without_text(at)) is not None}
         members = [at for at, cell in self.cells.items() if cell.origin and cell.origin.group in split]
         changes: list[tuple[int, int, bytes]] = []
-        added: dict[int, list[tuple[int, bytes]]] = {}
+        added: dict[int, list[tuple[int, bytes]]] = defaultdict(list)
         for at in sorted({*changed, *members}):
             xml, old = self._xml(at, split), self._was(at).origin
             if old is None:
-                added.setdefault(at[0], []).append((at[1], xml))
+                added[at[0]].append((at[1], xml))
             else:
                 changes.append((old.element.start, old.element.end, xml))
         for row, cells in added.items():
             changes += self._into_row(self._rows[row], row, cells) if row in self._rows else [self._new_row(row, cells)]
-        if added and self._dimension is not None:
-            changes += self._grown(self._dimension)
-        return self._to_encoding(spliced(self._data, changes))
+        area = None if self._dimension is None else reference(self._dimension.attributes.get("ref", ""))
+        if added and self._dimension is not None and area is not None:
+            e, rows, columns = self._dimension, list(added), [column for cells in added.values() for column, _ in cells]
+            grown = Reference(
+                None,
+                min(area.top, *rows),
+                min(area.left, *columns),
+                max(area.bottom, *rows),
+                max(area.right, *columns),
+            )
+            changes.append((e.start, e.inner, with_attribute(self._data[e.start : e.inner], "ref", grown.name)))
+        return spliced(self._data, changes)
 
     def _group_without_text(self, at: At) -> str | None:
         """The shared formula whose text the cell held and holds no longer."""
         was, cell = self._was(at), self.cells[at]
-        if was.origin is None or was.origin.group is None or was.origin.formula is None:
+        if was.origin is None or was.origin.formula is None or not was.origin.formula.text.strip():
             return None
-        kept = cell.formula == was.formula and cell.origin is was.origin
-        return None if kept or not was.origin.formula.text.strip() else was.origin.group
+        return None if cell.formula == was.formula and cell.origin is was.origin else was.origin.group
 
     def _xml(self, at: At, split: set[str]) -> bytes:
         """A cell's element; shared formulas of the groups in `split` become formulas of their own."""
         cell = self.cells[at]
         origin, data, prefix = cell.origin, self._data, self._prefix
-        tag, value_kept = b"<%bc>" % prefix, False
-        if origin is not None:
-            tag = data[origin.element.start : origin.element.inner]
-            tag = tag[:-2].rstrip() + b">" if tag.endswith(b"/>") else tag
-            value_kept = cell.value is origin.value
+        tag = b"<%bc>" % prefix if origin is None else self._start_tag(origin.element)
+        value_kept = origin is not None and cell.value is origin.value
         if origin is None or origin.at != at:
             tag = with_attribute(tag, "r", cell_name(at))
         if not value_kept or cell.value is None:
-            tag = with_attribute(with_attribute(tag, "t", _type(cell.value)), "vm", None)
+            tag = with_attribute(with_attribute(tag, "t", _stored(cell.value)[0]), "vm", None)
         if cell.formula is None:
             tag = with_attribute(tag, "cm", None)
         content = self._formula_xml(at, cell, split)
@@ -287,7 +309,7 @@ class SheetXml:
                 inner = inner[: f.start - origin.element.inner] + inner[f.end - origin.element.inner :]
             content += inner.strip()
         elif cell.value is not None:
-            content += b"<%bv>%b</%bv>" % (prefix, escaped(_stored(cell.value)), prefix)
+            content += b"<%bv>%b</%bv>" % (prefix, escaped(_stored(cell.value)[1]), prefix)
         return tag + content + b"</%bc>" % prefix if content else tag[:-1] + b"/>"
 
     def _formula_xml(self, at: At, cell: Cell, split: set[str]) -> bytes:
@@ -304,55 +326,39 @@ class SheetXml:
             attributes += b' xml:space="preserve"'
         return b"<%bf%b>%b</%bf>" % (self._prefix, attributes, escaped(text), self._prefix)
 
-    def _into_row(self, element: Element, row: int, cells: list[tuple[int, bytes]]) -> list[tuple[int, int, bytes]]:
-        tag = with_attribute(self._data[element.start : element.inner], "spans", None)
-        if tag.endswith(b"/>"):
-            whole = tag[:-2].rstrip() + b">" + b"".join(xml for _, xml in cells) + b"</%brow>" % self._prefix
-            return [(element.start, element.end, whole)]
-        changes = [(element.start, element.inner, tag)]
+    def _start_tag(self, e: Element) -> bytes:
+        """An element's start tag, also of an element that has no end tag yet."""
+        tag = self._data[e.start : e.inner]
+        return tag[:-2].rstrip() + b">" if tag.endswith(b"/>") else tag
+
+    def _into_row(self, e: Element, row: int, cells: list[tuple[int, bytes]]) -> list[tuple[int, int, bytes]]:
+        tag = with_attribute(self._start_tag(e), "spans", None)
+        if e.inner == e.end:
+            return [(e.start, e.end, tag + b"".join(xml for _, xml in cells) + b"</%brow>" % self._prefix)]
+        changes = [(e.start, e.inner, tag)]
         for column, xml in cells:
-            at = min((e.start for c, e in self._in_row.get(row, []) if c > column), default=element.close)
+            at = min((other.start for c, other in self._in_row[row] if c > column), default=e.close)
             changes.append((at, at, xml))
         return changes
 
     def _new_row(self, row: int, cells: list[tuple[int, bytes]]) -> tuple[int, int, bytes]:
         """The XML of a row, which is formatted as the one above."""
-        assert self._sheet_data is not None, "a sheet with cells has their element"
-        tag = b"<%brow>" % self._prefix
         above = max((n for n in self._rows if n < row), default=None)
-        if above is not None:
-            tag = self._data[self._rows[above].start : self._rows[above].inner]
-            tag = tag[:-2].rstrip() + b">" if tag.endswith(b"/>") else tag
+        tag = b"<%brow>" % self._prefix if above is None else self._start_tag(self._rows[above])
         for attribute in ("spans", "hidden", "collapsed", "outlineLevel"):
             tag = with_attribute(tag, attribute, None)
         xml = with_attribute(tag, "r", str(row)) + b"".join(xml for _, xml in cells) + b"</%brow>" % self._prefix
         at = min((e.start for n, e in self._rows.items() if n > row), default=self._sheet_data.close)
         return at, at, xml
 
-    def _grown(self, e: Element) -> list[tuple[int, int, bytes]]:
-        """The stated size of the sheet, made to hold its new cells."""
-        area = reference(e.attributes.get("ref", ""))
-        if area is None:
-            return []
-        rows, columns = zip(*(at for at in self.cells if at not in self.original), strict=True)
-        top, bottom = min(area.top, *rows), max(area.bottom, *rows)
-        left, right = min(area.left, *columns), max(area.right, *columns)
-        tag = with_attribute(self._data[e.start : e.inner], "ref", _area_name(top, left, bottom, right))
-        return [(e.start, e.inner, tag)]
-
-    @property
-    def _prefix(self) -> bytes:
-        assert self._sheet_data is not None, "a sheet with cells has their element"
-        return self._data[self._sheet_data.start + 1 : self._sheet_data.inner].split(b"sheetData", 1)[0]
-
 
 def _same(a: Cell, b: Cell) -> bool:
     return a == b and type(a.value) is type(b.value) and (a.style == b.style or a.origin is b.origin)
 
 
-def _value(kind: str, parts: dict[str, Element], inside: dict[int, list[Element]], strings: list[str]) -> Any:
+def _value(kind: str, parts: dict[str, Element], strings: list[str]) -> Any:
     if kind == "inlineStr" and "is" in parts:
-        return _rich_text(parts["is"], inside)
+        return _rich_text(parts["is"])
     if "v" not in parts:
         return None
     text = parts["v"].text
@@ -373,22 +379,14 @@ def _value(kind: str, parts: dict[str, Element], inside: dict[int, list[Element]
     return CellError(text) if kind == "e" else Unreadable(text)
 
 
-def _rich_text(element: Element, inside: dict[int, list[Element]]) -> str:
-    runs = inside.get(id(element), [])
-    return "".join(e.text if e.name == "t" else _rich_text(e, inside) for e in runs if e.name in ("t", "r"))
+def _rich_text(e: Element) -> str:
+    """The text of a string's runs, without phonetic hints."""
+    return e.text if e.name == "t" else "".join(_rich_text(run) for run in e.children if run.name in ("t", "r"))
 
 
-def shared_strings(data: bytes, name: str) -> list[str]:
-    """The texts of the part of shared strings, without phonetic hints."""
-    strings: list[str] = []
-    for e in elements(utf8(data, name)[0], name):
-        if e.namespace != MAIN:
-            continue
-        if e.name == "si":
-            strings.append("")
-        elif e.name == "t" and strings and e.parent is not None and e.parent.name in ("si", "r"):
-            strings[-1] += e.text
-    return strings
+def shared_strings(found: list[Element]) -> list[str]:
+    """The texts in the elements of the part of shared strings."""
+    return [_rich_text(e) for e in found if e.name == "si" and e.namespace == MAIN]
 
 
 def moved(formula: str | None, start: At, to: At) -> str | None:
@@ -403,26 +401,10 @@ def moved(formula: str | None, start: At, to: At) -> str | None:
         return "=#REF!"
 
 
-def cell_name(at: At) -> str:
-    """E.g. ``B3``."""
-    from openpyxl.utils import get_column_letter
-
-    return f"{get_column_letter(at[1])}{at[0]}"
-
-
-def _area_name(top: int, left: int, bottom: int, right: int) -> str:
-    return f"{cell_name((top, left))}:{cell_name((bottom, right))}"
-
-
-def _type(value: Any) -> str | None:
+def _stored(value: Any) -> tuple[str | None, str]:
+    """The type of a value, as its cell's attribute, and its text."""
     if isinstance(value, bool):
-        return "b"
-    if isinstance(value, CellError):
-        return "e"
-    return "str" if isinstance(value, str) else None
-
-
-def _stored(value: Any) -> str:
-    if isinstance(value, bool):
-        return str(int(value))
-    return repr(value).removesuffix(".0") if isinstance(value, float) else str(value)
+        return "b", str(int(value))
+    if isinstance(value, str):
+        return "e" if isinstance(value, CellError) else "str", value
+    return None, repr(value).removesuffix(".0")

@@ -3,15 +3,12 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Iterator, Mapping
 from functools import cached_property
 
 from ..errors import InputError
 from .formulas import areas_in, operands
-from .package import Package
-from .references import Reference, reference
-from .sheet_xml import MAIN, STRICT, At, Cell, SheetXml, cell_name, shared_strings
-from .xml_parts import Element, elements, spliced, utf8, with_attribute
+from .package import Package, spliced, with_attribute
+from .sheet_xml import MAIN, STRICT, At, Cell, Reference, SheetXml, cell_name, reference, shared_strings
 
 KINDS = {
     ".xlsx": "application/vnd.openxmlformats-officedocument.spreadsheetml.sheet.main+xml",
@@ -25,45 +22,17 @@ Place = tuple[str, int, int]
 """Sheet, row, column."""
 
 
-class _Sheets(Mapping[str, SheetXml]):
-    """Sheets by name. Each is parsed when it is first asked for: users' workbooks carry large ones that nobody needs."""
-
-    def __init__(self, titles: list[str], parse: Callable[[str], SheetXml]) -> None:
-        self._titles, self._parse = titles, parse
-        self.parsed: dict[str, SheetXml] = {}
-
-    def __getitem__(self, title: str) -> SheetXml:
-        if title not in self.parsed:
-            self.parsed[title] = self._parse(title)
-        return self.parsed[title]
-
-    def __iter__(self) -> Iterator[str]:
-        return iter(self._titles)
-
-    def __len__(self) -> int:
-        return len(self._titles)
-
-
 class WorkbookXml:
-    """The worksheets of a workbook file.
-
-    Parameters
-    ----------
-    content
-        The file's bytes.
-    name
-        The file's name in messages.
+    """The worksheets of a workbook file with these bytes; messages call it `name`.
 
     Attributes
     ----------
-    sheets : mapping
-        Name -> `SheetXml`, in the workbook's order; chart sheets are left out.
+    parts : dict
+        Worksheet -> its member of the package, in the workbook's order.
     all_sheets : list of str
-        The names of all sheets.
+        The names of all sheets, also of charts.
     hidden : set of str
         The sheets that are not shown.
-    parts : dict
-        Sheet -> its member of the package.
     """
 
     def __init__(self, content: bytes, name: str) -> None:
@@ -73,21 +42,16 @@ class WorkbookXml:
         if not found:
             raise InputError(f"{name}: not a whole .xlsx workbook (it does not say where its sheets are)")
         self._part = found[0]
-        self._data, self._to_encoding = utf8(self.package.read(self._part), name)
-        found_elements = elements(self._data, name)
+        found_elements = self.package.elements(self._part)
         if found_elements[0].namespace == STRICT:
             raise InputError(f"{name}: a 'Strict Open XML Spreadsheet', expected it saved as 'Excel Workbook (*.xlsx)'")
         self._elements = [e for e in found_elements if e.namespace == MAIN]
         relations = self.package.relations(self._part)
         self._related = {kind: member for _, kind, member in reversed(relations)}
-        texts = (
-            shared_strings(self.package.read(self._related["sharedStrings"]), name)
-            if "sharedStrings" in self._related
-            else []
-        )
         self.all_sheets: list[str] = []
         self.hidden: set[str] = set()
         self.parts: dict[str, str] = {}
+        self._parsed: dict[str, SheetXml] = {}
         worksheets = {key: member for key, kind, member in relations if kind == "worksheet"}
         for e in self._elements:
             if e.name != "sheet":
@@ -103,13 +67,19 @@ class WorkbookXml:
             key = next((value for attribute, value in e.attributes.items() if attribute.endswith(" id")), "")
             if key in worksheets:
                 self.parts[title] = worksheets[key]
-        self.sheets = _Sheets(
-            list(self.parts), lambda title: SheetXml(self.package.read(self.parts[title]), texts, title, name)
-        )
-        self._by_folded_name = {title.casefold(): title for title in self.sheets}
+        self._by_folded_name = {title.casefold(): title for title in self.parts}
         self._extents: dict[tuple[str, int], At] = {}
 
-    # What the file says
+    def sheet(self, title: str) -> SheetXml:
+        """A worksheet, parsed when it is first asked for: users' workbooks carry large ones that nobody needs."""
+        if title not in self._parsed:
+            self._parsed[title] = SheetXml(self.package.read(self.parts[title]), self._strings, title, self.name)
+        return self._parsed[title]
+
+    @cached_property
+    def _strings(self) -> list[str]:
+        part = self._related.get("sharedStrings")
+        return [] if part is None else shared_strings(self.package.elements(part))
 
     @property
     def suffix(self) -> str | None:
@@ -129,9 +99,7 @@ class WorkbookXml:
         """The number format of each style of cells."""
         from openpyxl.styles.numbers import BUILTIN_FORMATS
 
-        if "styles" not in self._related:
-            return []
-        parts = self._parts_of(self._related["styles"])
+        parts = self.package.elements(self._related["styles"]) if "styles" in self._related else []
         named = [e.attributes for e in parts if e.name == "numFmt"]
         own = {attributes.get("numFmtId"): attributes.get("formatCode", "") for attributes in named}
         styles = [e for e in parts if e.name == "xf" and e.parent is not None and e.parent.name == "cellXfs"]
@@ -148,7 +116,7 @@ class WorkbookXml:
         found: dict[At, str] = {}
         for member in self._related_to(sheet, "comments"):
             at = None
-            for e in self._parts_of(member):
+            for e in self.package.elements(member):
                 if e.name == "comment" and (cell := reference(e.attributes.get("ref", ""))) is not None:
                     at = cell.top, cell.left
                 elif e.name == "t" and at is not None:
@@ -173,7 +141,7 @@ class WorkbookXml:
         found = {}
         for title in self.parts:
             for member in self._related_to(title, "table"):
-                attributes = self._parts_of(member)[0].attributes
+                attributes = self.package.elements(member)[0].attributes
                 if (area := reference(attributes.get("ref", ""))) is not None:
                     found[attributes.get("displayName", "").casefold()] = area._replace(sheet=title)
         return found
@@ -181,30 +149,25 @@ class WorkbookXml:
     def _related_to(self, sheet: str, kind: str) -> list[str]:
         return [member for _, its, member in self.package.relations(self.parts[sheet]) if its == kind]
 
-    def _parts_of(self, member: str) -> list[Element]:
-        return elements(utf8(self.package.read(member), self.name)[0], self.name)
-
     def title(self, name: str | None) -> str | None:
         """A sheet's name as the workbook writes it, given in whatever case."""
         return None if name is None else self._by_folded_name.get(name.casefold())
 
-    # Cells and formulas
-
     def cell(self, place: Place) -> Cell:
         """A cell as it is now."""
-        return self.sheets[place[0]].cell(place[1:])
+        return self.sheet(place[0]).cell(place[1:])
 
     def put(self, place: Place, cell: Cell) -> None:
         """Give a place another content."""
-        self.sheets[place[0]].cells[place[1:]] = cell
+        self.sheet(place[0]).cells[place[1:]] = cell
 
     @property
     def formulas(self) -> dict[Place, Cell]:
         """The cells with formulas, or of array formulas, of all sheets."""
         return {
             (title, *at): cell
-            for title, sheet in self.sheets.items()
-            for at, cell in sheet.cells.items()
+            for title in self.parts
+            for at, cell in self.sheet(title).cells.items()
             if cell.formula is not None or cell.array is not None
         }
 
@@ -213,13 +176,17 @@ class WorkbookXml:
         own, _, plain = name.rpartition("!")
         scope, key = self.title(own.strip("'")) if own else sheet, plain.casefold()
         formula = self._names.get((scope, key)) or self._names.get((None, key))
-        return formula if formula is not None and _is_absolute(formula) else None
+        areas = [text for text in operands(formula or "") if reference(text) is not None]
+        cells = [text.rpartition("!")[2] for text in areas]  # Main!$B$3 means the same everywhere, Main!B3 does not
+        return formula if all(text.count("$") == len(re.findall(r"[A-Za-z]+|\d+", text)) for text in cells) else None
 
     def extent(self, sheet: str) -> At:
         """The last row and the last column of `sheet` with content."""
-        key = sheet, len(self.sheets[sheet].cells)  # which grows when rows are added; emptied cells do no harm
+        key = sheet, len(self.sheet(sheet).cells)  # which grows when rows are added; emptied cells do no harm
         if key not in self._extents:
-            self._extents[key] = self.sheets[sheet].extent
+            filled = [at for at, cell in self.sheet(sheet).cells.items() if not cell.blank]
+            rows, columns = {row for row, _ in filled}, {column for _, column in filled}
+            self._extents[key] = max(rows, default=0), max(columns, default=0)
         return self._extents[key]
 
     def ranges_ending_at(self, sheet: str, last: int) -> list[str]:
@@ -235,51 +202,41 @@ class WorkbookXml:
         ]
         for member in self.package.names:
             if member.startswith("xl/charts/") and member.endswith(".xml"):
-                series = [reference(e.text.strip()) for e in self._parts_of(member) if e.name == "f"]
+                series = [reference(e.text.strip()) for e in self.package.elements(member) if e.name == "f"]
                 found += [f"the chart {member}"] * any(map(ends_there, series))
         found += [f"the table {name}" for name, area in self.tables.items() if ends_there(area)]
-        for title, cells in self.sheets.items():
-            for at, cell in cells.cells.items():
-                if cell.formula is not None and any(ends_there(area, title) for area in areas_in(cell.formula)):
-                    found.append(self.text((title, *at)))
-        return found
+        return found + [
+            self.text(place)
+            for place, cell in self.formulas.items()
+            if any(ends_there(area, place[0]) for area in areas_in(cell.formula or ""))
+        ]
 
     @staticmethod
     def text(place: Place) -> str:
         """E.g. ``Coordinates!B3``."""
         return f"{place[0]}!{cell_name(place[1:])}"
 
-    # Writing
-
     @property
     def changed(self) -> list[Place]:
         """The cells that are not as they were read."""
-        return [(title, *at) for title, sheet in self.sheets.parsed.items() for at in sheet.changed]
+        return [(title, *at) for title, sheet in self._parsed.items() for at in sheet.changed]
 
     def to_bytes(self) -> bytes:
         """The workbook with the changed cells; spreadsheet programs will recalculate it when they open it."""
-        changed = {title: sheet for title, sheet in self.sheets.parsed.items() if sheet.changed}
+        changed = {title: sheet for title, sheet in self._parsed.items() if sheet.changed}
         if not changed:
             return self.package.content
         parts = {self.parts[title]: sheet.to_bytes() for title, sheet in changed.items()}
-        parts[self._part] = self._to_encoding(self._recalculated_on_load())
-        removed = []
-        if any(sheet.formulas_added_or_removed for sheet in changed.values()):
-            removed = [self._related["calcChain"]] if "calcChain" in self._related else []
-        return self.package.with_parts(parts, removed, self._part)
+        parts[self._part] = self._recalculated_on_load()
+        stale_chain = "calcChain" in self._related and any(s.formulas_added_or_removed for s in changed.values())
+        return self.package.with_parts(parts, [self._related["calcChain"]] if stale_chain else [], self._part)
 
     def _recalculated_on_load(self) -> bytes:
-        root = self._elements[0]
-        for e in self._elements:
-            if e.name == "calcPr" and e.parent is root:
-                tag = with_attribute(self._data[e.start : e.inner], "fullCalcOnLoad", "1")
-                return spliced(self._data, [(e.start, e.inner, tag)])
-        at = max(e.end for e in self._elements if e.parent is root and e.name in _BEFORE_CALC_PR)
-        prefix = self._data[root.start + 1 : root.inner].split(b"workbook", 1)[0]
-        return spliced(self._data, [(at, at, b'<%bcalcPr fullCalcOnLoad="1"/>' % prefix)])
-
-
-def _is_absolute(formula: str) -> bool:
-    """Whether the formula of a name means the same wherever the name is used: ``Main!$B$3``, not ``Main!B3``."""
-    cells = [text.rpartition("!")[2] for text in operands(formula) if reference(text) is not None]
-    return all(text.count("$") == len(re.findall(r"[A-Za-z]+|\d+", text)) for text in cells)
+        root, data = self._elements[0], self.package.read(self._part)
+        for e in root.children:
+            if e.name == "calcPr" and e.namespace == MAIN:
+                tag = with_attribute(data[e.start : e.inner], "fullCalcOnLoad", "1")
+                return spliced(data, [(e.start, e.inner, tag)])
+        at = max(e.end for e in root.children if e.namespace == MAIN and e.name in _BEFORE_CALC_PR)
+        prefix = data[root.start + 1 : root.inner].split(b"workbook", 1)[0]
+        return spliced(data, [(at, at, b'<%bcalcPr fullCalcOnLoad="1"/>' % prefix)])

@@ -1,7 +1,8 @@
-"""`write_system`: a `PinholeSystem` into a copy of a geometry workbook in which nothing else changes."""
+"""`write_system`: a `PinholeSystem` into a new geometry workbook, or a copy of one in which nothing else changes."""
 
 from __future__ import annotations
 
+import io
 import os
 import warnings
 from collections import defaultdict
@@ -17,37 +18,31 @@ from ..geometry.system import PinholeSystem
 from ..recording import recorded_warnings
 from ..validation import instance
 from .book import Book
+from .calculation import Recalculation
 from .column_map import ColumnMap, column_map
 from .edit import Edit, several
-from .new_workbook import new_workbook
 from .quantities import QUANTITIES, TYPED
-from .reader import Reading, read
-from .recalculate import Recalculation
+from .reader import Reading, is_by_design, read
 from .workbook_xml import KINDS, Place, WorkbookXml
+
+_WIDTH = 13
+_FIRST_ROW = 3
+"""Column widths and the first module's row in a new workbook."""
 
 
 @dataclass(frozen=True)
 class WrittenWorkbook:
-    """What `write_system` has written.
-
-    Attributes
-    ----------
-    path : Path
-    changed : tuple of str
-        The cells (``"Coordinates!B3"``) whose numbers or formulas are not the template's.
-    recalculated : dict
-        Cell -> the value that its formula stores now, of each that depends on these or stored no value before.
-    cleared : tuple of str
-        The cells whose formulas store no value now, because they cannot be calculated here.
-    columns : ColumnMap or None
-        The column map of the new file, with the modules' rows; None if its headings are understood without one.
-    """
+    """What `write_system` has written."""
 
     path: Path
     changed: tuple[str, ...]
+    """The cells (``"Coordinates!B3"``) whose numbers or formulas are not the template's."""
     recalculated: dict[str, Any]
+    """Cell -> the value that its formula stores now, of each that depends on these or stored no value before."""
     cleared: tuple[str, ...]
+    """The cells whose formulas store no value now, because they cannot be calculated here."""
     columns: ColumnMap | None = None
+    """The column map of the new file, with the modules' rows; None if its headings are understood without one."""
 
 
 def write_system(
@@ -58,19 +53,14 @@ def write_system(
 ) -> WrittenWorkbook:
     """Write a scanner's geometry workbook.
 
-    In a copy of `template`, only the cells that differ are written; modules are found by their numbers, and cells as by
-    `read_system`. A formula stays if it still gives the system's number (to 1e-9, relative). Each formula that depends on
-    a changed cell stores its new value if `core.workbook.formulas` can calculate it, otherwise none, and the workbook is
-    marked to be recalculated when it is opened. All other parts of the file - sheets, formats, charts, images, comments,
-    macros - stay byte for byte the template's; if nothing differs, the whole file does.
-
-    Removed modules leave empty rows, added ones come below the last with copies of its formulas, and modules in
-    another order take the contents of their rows along.
+    In a copy of `template`, only the cells that differ are written; modules are found by their numbers (or their order,
+    without numbers), and cells as by `read_system`. A formula stays if it still gives the system's number (to 1e-9,
+    relative). Each formula that depends on a changed cell stores its new value, or none if it cannot be calculated here,
+    and the workbook is marked to be recalculated. All other parts of the file stay byte for byte. Removed modules leave
+    empty rows, added ones come below the last, and modules in another order take the contents of their rows along.
 
     Parameters
     ----------
-    system
-        The scanner. If the workbook has no column of modules' numbers, its modules are found by their order.
     path
         The file to write, .xlsx or .xlsm like the template; it may be the template, which is then replaced.
     template
@@ -78,21 +68,12 @@ def write_system(
     columns
         The template's column map, or the path of one. Default: the one that the system was read by, if any.
 
-    Returns
-    -------
-    WrittenWorkbook
-        The changed and the recalculated cells.
-
     Raises
     ------
     InputError
         The template is refused by `read_system` or cannot hold the system, or the file cannot be written. The file
-        at `path` is then as it was.
-
-    Warns
-    -----
-    InputWarning
-        Formulas that had to be replaced by numbers or store no value, and ranges that leave added modules out.
+        at `path` is then as it was. An `InputWarning` is given of formulas that had to be replaced by numbers or store no
+        value, and of ranges that leave added modules out.
     """
     instance(system, PinholeSystem, "write_system")
     target = Path(path)
@@ -101,23 +82,29 @@ def write_system(
         raise InputError(f"{target}: expected a name ending in {' or '.join(KINDS)}")
     if template is None and suffix != ".xlsx":
         raise InputError(f"{target}: a workbook without a template has no macros, expected a name ending in .xlsx")
-    said: ColumnMap | None = None
+    said = None if template is None or system.source is None else system.source.columns
     if template is not None and columns is not None:
         said = column_map(columns, template)
-    elif template is not None and system.source is not None:
-        said = system.source.columns
     with replacing(target) as temporary:
         if template is None:
-            temporary.write_bytes(new_workbook(system))
+            temporary.write_bytes(_new_workbook(system))
         book = Book(temporary if template is None else template)
         workbook = book.workbook
-        _refuse_other_kind(workbook, target, suffix)
+        if workbook.suffix is None:
+            raise InputError(
+                f"{workbook.name}: is neither an .xlsx nor an .xlsm workbook inside, expected it saved as one"
+            )
+        if workbook.suffix != suffix:
+            has = "has macros" if suffix == ".xlsx" else "is a workbook without macros"
+            raise InputError(
+                f"{target}: the template {workbook.name} {has}, expected a name ending in {workbook.suffix}"
+            )
         name = "the new workbook" if template is None else workbook.name
         with recorded_warnings():  # they were given when the system was read
             reading = read(book, said) if template is not None else _read_written(temporary, name, None)
         edit = Edit(system, reading, workbook)
         edited = [] if template is None else workbook.changed
-        to_recalculate = workbook.formulas if template is None else edit.changed
+        to_recalculate = workbook.formulas if template is None else {*edited, *edit.unsettled}
         recalculated = Recalculation(workbook, to_recalculate, edit.required, edit.expected)
         temporary.write_bytes(workbook.to_bytes())
         own = edit.column_map()
@@ -130,15 +117,6 @@ def write_system(
         cleared=tuple(workbook.text(place) for place in sorted(recalculated.cleared)),
         columns=own,
     )
-
-
-def _refuse_other_kind(workbook: WorkbookXml, target: Path, suffix: str) -> None:
-    kind = workbook.suffix
-    if kind is None:
-        raise InputError(f"{workbook.name}: is neither an .xlsx nor an .xlsm workbook inside, expected it saved as one")
-    if kind != suffix:
-        has = "has macros" if kind == ".xlsm" else "is a workbook without macros"
-        raise InputError(f"{target}: the template {workbook.name} {has}, expected a name ending in {kind}")
 
 
 def _read_written(path: Path, name: str, columns: ColumnMap | None) -> Reading:
@@ -176,14 +154,14 @@ def _warn_of_formulas(workbook: WorkbookXml, recalculated: Recalculation) -> Non
     for place in sorted(recalculated.replaced):
         by_column[place[0], place[2]].append(place)
     messages = [
-        f"{_and_more(workbook, places)}: the formula was replaced by the system's number "
+        f"{several(map(workbook.text, places), shown=1)}: the formula was replaced by the system's number "
         f"({recalculated.replaced[places[0]]})"
         for places in by_column.values()
     ]
     if recalculated.cleared:
         places = list(recalculated.cleared)
         messages.append(
-            f"{_and_more(workbook, places)}: the formula's new value could not be calculated "
+            f"{several(map(workbook.text, places), shown=1)}: the formula's new value could not be calculated "
             f"({recalculated.cleared[places[0]]}); opening the workbook in Excel or LibreOffice and saving it stores the "
             "value"
         )
@@ -191,5 +169,38 @@ def _warn_of_formulas(workbook: WorkbookXml, recalculated: Recalculation) -> Non
         warnings.warn(f"{workbook.name}: {message}", InputWarning, stacklevel=3)
 
 
-def _and_more(workbook: WorkbookXml, places: list[Place]) -> str:
-    return workbook.text(places[0]) + (f" and {len(places) - 1} more" if len(places) > 1 else "")
+def _new_workbook(system: PinholeSystem) -> bytes:
+    """A workbook in the users' layout, its formulas without values; l is a number where it is not the design formula's."""
+    import openpyxl
+    from openpyxl.styles import Alignment, Font
+
+    book = openpyxl.Workbook()
+    book.active.title = "Main"
+    book.create_sheet("Coordinates")
+    by_design = is_by_design(system)
+    columns = [
+        *((name, q.place, q.titles or q.headings[:2], q.formula, q.of(system)) for name, q in QUANTITIES.items()),
+        *(("number", f"{title}!A", ("", "Definitions"), "", system.numbers) for title in book.sheetnames),
+        ("slope", "Coordinates!F", ("S", "3D slope"), "={b}/{x1}", by_design),
+    ]
+    for name, place, titles, formula, numbers in columns:
+        title, letter = place.split("!")
+        sheet = book[title]
+        sheet.freeze_panes = "B3"
+        sheet.column_dimensions[letter].width = _WIDTH
+        for row, text in enumerate(titles, start=1):
+            cell = sheet[f"{letter}{row}"]
+            cell.value, cell.font = text or None, Font(bold=True)
+            cell.alignment = Alignment(wrap_text=True, vertical="top", horizontal="center")
+        places = {other: quantity.place.removeprefix(f"{title}!") for other, quantity in QUANTITIES.items()}
+        for i, number in enumerate(numbers):
+            row = _FIRST_ROW + i
+            cell = sheet[f"{letter}{row}"]
+            cell.value = number.item()
+            if formula and (name != "l" or by_design[i]):
+                cell.value = formula.format_map({other: f"{column}{row}" for other, column in places.items()})
+            if title == "Coordinates" and name != "number":
+                cell.number_format = "0.0000"
+    content = io.BytesIO()
+    book.save(content)
+    return content.getvalue()

@@ -1,4 +1,4 @@
-"""What is not understood for certain is refused, naming the cell; what is, is right, in whatever unit."""
+"""What is not understood with certainty is refused, naming the cell; everything else is read correctly, in any unit."""
 
 from __future__ import annotations
 
@@ -411,7 +411,9 @@ def test_a_row_of_units_counts(tmp_path):
             sheet.insert_rows(3)
             for column in range(2, sheet.max_column + 1):
                 for row in (1, 2):
-                    if (heading := heading_of(sheet.cell(row, column).value)) is not None and heading.unit == "cm":
+                    if (
+                        heading := heading_of(sheet.cell(row, column).value or "")
+                    ) is not None and heading.unit == "cm":
                         sheet.cell(row, column).value = sheet.cell(row, column).value.rstrip("(cm)[], ")
                         sheet.cell(3, column).value = "[cm]"
 

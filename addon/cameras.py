@@ -45,14 +45,6 @@ def set_field_of_view(camera: bpy.types.Camera, width: float, distance: float) -
     camera.shift_x = camera.shift_y = 0.0
 
 
-def set_render_shape(scene: bpy.types.Scene, shape: tuple[int, int]) -> None:
-    """Set the scene's render resolution to an image shape (n_v, n_u) of a square detector."""
-    n_v, n_u = shape
-    render = scene.render
-    render.resolution_x, render.resolution_y, render.resolution_percentage = n_u, n_v, 100
-    render.pixel_aspect_x, render.pixel_aspect_y = max(1.0, n_v / n_u), max(1.0, n_u / n_v)
-
-
 def set_up_camera(camera: bpy.types.Camera, system: PinholeSystem, m: int) -> None:
     """Set up camera data for module `m`, with the field of view of the default virtual detector."""
     set_field_of_view(camera, float(system.detector_side[m]), float(system.collimator_length[m]))

@@ -1,9 +1,8 @@
 """Numbers by which .blend files and Blender's preferences keep choices.
 
-Blender stores the number of an enumeration's item, not its identifier, and by default numbers items by position: an isotope
-put between two others would make every saved scene count another isotope's photons. So every item has a number of its own:
-in the tables below, the one it had in version 0.1.0; of a later item, a checksum of its identifier. Items may therefore be
-added, moved and removed without a change here.
+Blender stores the number of an enumeration's item, by default its position: an isotope put between two others would make
+every saved scene count another isotope's photons. So every item has a number of its own: in the tables below, the one it
+had in version 0.1.0; of a later item, a checksum of its identifier. Later items need no change here.
 """
 
 from __future__ import annotations

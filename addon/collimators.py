@@ -32,7 +32,7 @@ def new_mesh(name: str, solid: Solid, material: bpy.types.Material) -> bpy.types
     """A mesh datablock of a solid, checked to be watertight, with one material."""
     check_watertight(solid)
     mesh = bpy.data.meshes.new(name)
-    _fill(mesh, solid)
+    reshape_mesh(mesh, solid)
     mesh.materials.append(material)
     return mesh
 
@@ -43,21 +43,10 @@ def reshape_mesh(mesh: bpy.types.Mesh, solid: Solid) -> None:
     if len(mesh.vertices) == len(vertices) and len(mesh.polygons) == len(faces):
         mesh.vertices.foreach_set("co", vertices.astype(np.float32).ravel())
         mesh.update()
-    else:  # the user has edited it
+    else:  # it is new, or the user has edited it
         mesh.clear_geometry()
-        _fill(mesh, solid)
-
-
-def _fill(mesh: bpy.types.Mesh, solid: Solid) -> None:
-    vertices, faces = solid
-    mesh.vertices.add(len(vertices))
-    mesh.vertices.foreach_set("co", vertices.astype(np.float32).ravel())
-    mesh.loops.add(faces.size)
-    mesh.loops.foreach_set("vertex_index", faces.ravel())
-    mesh.polygons.add(len(faces))
-    mesh.polygons.foreach_set("loop_start", np.arange(0, faces.size, faces.shape[1], dtype=np.int32))
-    mesh.update(calc_edges=True)
-    mesh.shade_flat()
+        mesh.from_pydata(vertices, [], faces)
+        mesh.shade_flat()
 
 
 def new_sphere(name: str, radius: float, material: bpy.types.Material) -> bpy.types.Mesh:
@@ -103,17 +92,12 @@ def part_material(part: str) -> bpy.types.Material:
     shader.inputs["Metallic"].default_value = look.metallic
     shader.inputs["Roughness"].default_value = look.roughness
     shader.inputs["Alpha"].default_value = look.color[3]
-    if part == "ROI":
-        _show_rim_only(nodes, links, shader)
+    if part == "ROI":  # transparent but for its rim
+        weight, scale = nodes.new("ShaderNodeLayerWeight"), nodes.new("ShaderNodeMath")
+        weight.location, scale.location = (-520, 0), (-260, 0)
+        weight.inputs["Blend"].default_value = 0.25
+        scale.operation = "MULTIPLY"
+        scale.inputs[1].default_value = 0.35
+        links.new(weight.outputs["Facing"], scale.inputs[0])
+        links.new(scale.outputs[0], shader.inputs["Alpha"])
     return material
-
-
-def _show_rim_only(nodes: bpy.types.Nodes, links: bpy.types.NodeLinks, shader: bpy.types.Node) -> None:
-    """Make a sphere transparent but for its rim."""
-    weight, scale = nodes.new("ShaderNodeLayerWeight"), nodes.new("ShaderNodeMath")
-    weight.location, scale.location = (-520, 0), (-260, 0)
-    weight.inputs["Blend"].default_value = 0.25
-    scale.operation = "MULTIPLY"
-    scale.inputs[1].default_value = 0.35
-    links.new(weight.outputs["Facing"], scale.inputs[0])
-    links.new(scale.outputs[0], shader.inputs["Alpha"])

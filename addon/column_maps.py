@@ -1,8 +1,4 @@
-"""The settings of the column map dialog: filled from a draft, read as a `ColumnMap`, shown as the reader reads them.
-
-They live on the window manager while the dialog is open. Drawing reads nothing from the workbook: a setting that changes
-calls `update`.
-"""
+"""The settings of the column map dialog, on the window manager while it is open; a changed setting calls `update`."""
 
 from __future__ import annotations
 
@@ -23,6 +19,7 @@ from . import choices
 MAX_TABLES = 9
 _FIRST = 3  # modules previewed at the top
 _SEEN = 80  # rows and columns whose texts are shown beside the settings
+_preview_at = lru_cache(maxsize=1)(lambda workbook, changed: preview_workbook(workbook, _SEEN, _SEEN))
 
 
 def _changed(self: bpy.types.PropertyGroup, context: bpy.types.Context) -> None:
@@ -144,8 +141,7 @@ CLASSES = (ColumnMapTable, ColumnMapQuantity, ColumnMapProperties)
 def fill(form: ColumnMapProperties, workbook: Path, columns: ColumnMap | None = None) -> bool:
     """Fill the settings from a column map, by default from a draft made of the workbook's headings.
 
-    Returns whether the dialog can help: the reader has questions about the workbook, or a map was given. Raises
-    InputError where the file is not a workbook; the settings are then empty.
+    Returns whether the dialog can help: the reader has questions about the workbook, or a map was given.
     """
     clear(form)
     draft = draft_column_map(workbook)
@@ -244,10 +240,7 @@ def _preview(workbook: Path, columns: ColumnMap) -> tuple[int, list[list[str]]]:
 
 
 def accept(form: ColumnMapProperties) -> ColumnMap:
-    """The column map that the settings describe, also saved where they ask for that.
-
-    Raises InputError where the workbook is refused or the map cannot be saved.
-    """
+    """The column map that the settings describe, also saved where they ask for that; raises the reader's refusal."""
     update(form)
     if form.refusal:
         raise InputError(form.refusal)
@@ -274,15 +267,10 @@ def _rows(text: str, i: int) -> tuple[int, ...]:
     return tuple(sorted(rows))
 
 
-@lru_cache(maxsize=1)
-def _cells_at(workbook: Path, changed: int) -> dict[str, tuple[tuple[str, ...], ...]]:
-    return preview_workbook(workbook, _SEEN, _SEEN)
-
-
 def _cells(workbook: Path) -> dict[str, tuple[tuple[str, ...], ...]]:
     """Sheet -> rows of texts; read again only when the file has changed."""
     # The reader says what is wrong with a file that is not there.
-    return _cells_at(workbook, workbook.stat().st_mtime_ns if workbook.is_file() else 0)
+    return _preview_at(workbook, workbook.stat().st_mtime_ns if workbook.is_file() else 0)
 
 
 def _seen(form: ColumnMapProperties, quantity: ColumnMapQuantity, workbook: Path) -> str:

@@ -1,12 +1,12 @@
 """Modules follow their numbers: cameras are aimed, collimators and crystals reshaped, readouts calculated.
 
 Everything is changed in place (vertices, properties, rotations). No datablock is made or removed: this also runs after
-Blender has stored an undo step, and undo expects the datablocks that it stored. `copies.py` makes and removes modules.
+Blender has stored an undo step, and undo expects the datablocks that it stored. `module_edits.py` makes and removes modules.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 
 import bpy
@@ -70,8 +70,7 @@ def refresh(
 ) -> None:
     """Make a scanner's modules, and its totals, follow their places and numbers.
 
-    `changed` are the camera objects that may have changed; by default all, and the totals are calculated in any case, as
-    is necessary after an undo. `aim` aims modules that have been moved, if the scanner is set to keep them aimed.
+    `changed` are the camera objects that may have changed; by default all. `aim` lets the scanner keep them aimed.
     """
     scanner = collection.mphdrr_scanner
     if is_writing() or not scanner.is_scanner:
@@ -82,7 +81,10 @@ def refresh(
         rebuilt = [_refresh_module(camera, scanner, own, aim) for camera, own in parts.items()]
         if changed is None or any(rebuilt) or scanner.count != len(found):
             _update_totals(scanner, [camera.mphdrr_module for camera in found])
-            _resize_roi(collection, found)
+            radius = max((camera.mphdrr_module.roi_radius for camera in found), default=0.0)
+            for item in collection.objects:
+                if item.mphdrr_module.part == "ROI" and radius > 0:
+                    collimators.resize_sphere(item.data, radius)
 
 
 def refresh_module(camera: bpy.types.Object) -> None:
@@ -114,17 +116,6 @@ def set_for_all(collection: bpy.types.Collection, name: str) -> None:
     refresh(collection)
 
 
-def copy_numbers(
-    collection: bpy.types.Collection, source: bpy.types.Object, targets: Iterable[bpy.types.Object]
-) -> None:
-    """Give modules the lengths of another, and its choice whether `l` follows the ROI."""
-    with writing():
-        for camera in targets:
-            for name in (*LENGTHS, "length_mode"):
-                setattr(camera.mphdrr_module, name, getattr(source.mphdrr_module, name))
-    refresh(collection)
-
-
 def _refresh_module(
     camera: bpy.types.Object, scanner: bpy.types.PropertyGroup, parts: Sequence[bpy.types.Object], aim: bool
 ) -> bool:
@@ -134,7 +125,10 @@ def _refresh_module(
     if np.any(np.array(module.placed, np.float32) != place.astype(np.float32)):
         is_new = not module.built
         module.placed = place
-        if aim and not is_new and scanner.keep_aimed and _is_free(camera) and off_aim([camera]) and np.any(place):
+        data = camera.animation_data
+        animated = data is not None and (data.action is not None or len(data.drivers) or len(data.nla_tracks))
+        is_free = not animated and not len(camera.constraints)  # only the user turns it
+        if aim and not is_new and scanner.keep_aimed and is_free and off_aim([camera]) and np.any(place):
             cameras.set_world_matrix(camera, cameras.camera_matrices(place[None])[0])
     numbers, aimed = module_numbers(camera), not off_aim([camera])
     built_as = _construction_numbers(scanner)
@@ -150,13 +144,6 @@ def _refresh_module(
     if problem:
         module.problem = problem
     return changed
-
-
-def _is_free(camera: bpy.types.Object) -> bool:
-    """Whether only the user turns the camera: no animation, driver or constraint."""
-    data = camera.animation_data
-    is_animated = data is not None and (data.action is not None or len(data.drivers) or len(data.nla_tracks))
-    return not is_animated and not len(camera.constraints)
 
 
 def _construction_numbers(scanner: bpy.types.PropertyGroup) -> _ConstructionNumbers:
@@ -191,18 +178,8 @@ def _rebuild(
 
 
 def _differs(data: bpy.types.ID, numbers: tuple[float | str, ...]) -> bool:
-    """Whether a mesh or camera was built from other numbers than these.
-
-    One that is shared, as a fresh copy's is, stays as it is until `copies.py` has made it single-user.
-    """
+    """Whether a mesh or camera was built from other numbers. A shared one stays until `module_edits.py` has copied it."""
     return data.users == 1 and data.get(_KEY) != repr(numbers)
-
-
-def _resize_roi(collection: bpy.types.Collection, modules: Sequence[bpy.types.Object]) -> None:
-    radius = max((camera.mphdrr_module.roi_radius for camera in modules), default=0.0)
-    for item in collection.objects:
-        if item.mphdrr_module.part == "ROI" and radius > 0:
-            collimators.resize_sphere(item.data, radius)
 
 
 def _update_readouts(

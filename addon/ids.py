@@ -15,7 +15,6 @@ DUPLICATE_MODULES = "mphdrr.duplicate_modules"
 REMOVE_MODULES = "mphdrr.remove_modules"
 TIDY_MODULES = "mphdrr.tidy_modules"
 RENUMBER_MODULES = "mphdrr.renumber_modules"
-SET_NUMBERS = "mphdrr.set_numbers"
 CHECK_GEOMETRY = "mphdrr.check_geometry"
 ADD_MAP = "mphdrr.add_map"
 EXPORT_FOR_PROGRAM = "mphdrr.export_for_program"
@@ -41,30 +40,13 @@ LOAD_RECIPE = "mphdrr.load_recipe"
 SHOW_PROJECTIONS = "mphdrr.show_projections"
 CANCEL_JOB = "mphdrr.cancel_job"
 
-# --- Panels, lists, menus and file handlers: class names, drawn in the order of the work ---------------------------
-PANEL_GEOMETRY = "MPHDRR_PT_geometry"
-PANEL_MODULES = "MPHDRR_PT_modules"
-PANEL_DESIGN = "MPHDRR_PT_design"
-PANEL_SCANNER_DESIGN = "MPHDRR_PT_scanner_design"
-PANEL_PHANTOM = "MPHDRR_PT_phantom"
-PANEL_PROJECTIONS = "MPHDRR_PT_projections"
-PANEL_PHYSICS = "MPHDRR_PT_physics"
-PANEL_EXPORT = "MPHDRR_PT_export"
-LIST_MODULES = "MPHDRR_UL_modules"
-FILE_HANDLER_WORKBOOK = "MPHDRR_FH_workbook"
-FILE_HANDLER_PHANTOM = "MPHDRR_FH_phantom"
-MENU_ADD = "MPHDRR_MT_add"
-FILE_HANDLER_VOLUME = "MPHDRR_FH_volume"
-ORDER_GEOMETRY, ORDER_PHANTOM, ORDER_PROJECTIONS, ORDER_EXPORT = 0, 10, 20, 30  # bl_order
+# --- Panels, drawn in the order of the work: bl_order -----------------------------------------------------------------
+ORDER_GEOMETRY, ORDER_PHANTOM, ORDER_PROJECTIONS, ORDER_EXPORT = 0, 10, 20, 30
 
 # --- Properties on Blender's types; code reads them as attributes: `scene.mphdrr_geometry` ------------------
-SCENE_GEOMETRY = "mphdrr_geometry"
 SCENE_PROJECTIONS = "mphdrr_projections"
 OBJECT_MODULE = "mphdrr_module"
 OBJECT_VOLUME = "mphdrr_volume"
-WINDOW_JOB = "mphdrr_job"
-WINDOW_COLUMNS = "mphdrr_columns"
-COLLECTION_SCANNER = "mphdrr_scanner"
 
 # --- Datablocks ---------------------------------------------------------------------------------------------
 SCANNER = "Scanner"  # default name of a scanner's collection

@@ -1,14 +1,12 @@
 """Long work that leaves the window alive: a thread does it, a modal operator watches it.
 
-What a task does is a function of `addon` that returns a `Job`; an operator that inherits from `JobOperator` calls that
-function. Started from the window (INVOKE), the job runs in a thread, with a progress bar, until Esc or the panel's button
-cancels it. Called from a script (EXEC) or without a window, the operator returns when the job is done. Scripts can also do
-a job themselves, with `run`.
+A function of `addon` returns a `Job`; an operator that inherits from `JobOperator` does it. Started from the window
+(INVOKE), it runs in a thread, until Esc or the panel's button cancels it. Called from a script (EXEC) or without a window,
+the operator returns when the job is done. Scripts can also do a job themselves, with `run`.
 """
 
 from __future__ import annotations
 
-import sys
 import threading
 import time
 import traceback
@@ -17,8 +15,9 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
 import bpy
-from bpy.props import BoolProperty, FloatProperty, StringProperty
+from bpy.props import BoolProperty
 
+from ..core.cli.options import progress_bar
 from ..core.errors import InputError
 from ..core.progress import Cancelled, Progress
 from ..core.recording import recorded_warnings
@@ -34,16 +33,9 @@ _PATIENCE = 10.0  # s that `stop` waits for a thread
 class Job:
     """Work to do, and what to do with its result.
 
-    Attributes
-    ----------
-    label : str
-        Shown in the progress bar.
-    work : callable
-        ``work(progress)`` runs in a thread and must not touch bpy. It calls ``progress(done, total)`` between its steps,
-        which raises `Cancelled` when the user wants to stop.
-    finish : callable
-        ``finish(result)`` runs in the main thread and returns the line to report; if that takes long, it is a generator
-        that yields between its steps, so that the window can be drawn.
+    ``work(progress)`` runs in a thread and must not touch bpy; ``progress(done, total)`` raises `Cancelled` when the user
+    wants to stop. ``finish(result)`` runs in the main thread and returns the line to report; if that takes long, it is a
+    generator that yields between its steps, so that the window can be drawn.
     """
 
     label: str
@@ -88,6 +80,10 @@ class Worker:
     def alive(self) -> bool:
         return self.thread is not None and self.thread.is_alive()
 
+    @property
+    def share(self) -> float:
+        return self.done / max(1, self.total)
+
     def _work(self) -> None:
         with recorded_warnings() as self.caught:
             try:
@@ -104,6 +100,11 @@ class Worker:
 _current: Worker | None = None
 
 
+def current() -> Worker | None:
+    """What runs in a thread now."""
+    return _current
+
+
 def is_running() -> bool:
     """Whether a job runs in a thread now."""
     return _current is not None
@@ -115,7 +116,8 @@ def cancel() -> None:
         _current.cancel.set()
 
 
-def stop() -> None:
+@bpy.app.handlers.persistent
+def stop(*_: Any) -> None:
     """Stop the running job and wait for its thread: before a file is loaded, or the extension is disabled."""
     global _current
     worker, _current = _current, None
@@ -123,36 +125,6 @@ def stop() -> None:
         worker.cancel.set()
         if worker.thread is not None:
             worker.thread.join(_PATIENCE)
-
-
-@bpy.app.handlers.persistent
-def before_load(*_: Any) -> None:
-    """A job does not outlive its scene."""
-    stop()
-
-
-# Named functions, because a lambda in an annotation does not see this module's names.
-def _get_running(self: JobProperties) -> bool:
-    return is_running()
-
-
-def _get_label(self: JobProperties) -> str:
-    return _current.label if _current else ""
-
-
-def _get_progress(self: JobProperties) -> float:
-    return _current.done / _current.total if _current and _current.total else 0.0
-
-
-class JobProperties(bpy.types.PropertyGroup):
-    """The running job; `WindowManager.mphdrr_job`, read-only."""
-
-    running: BoolProperty(name="Running", get=_get_running)
-    label: StringProperty(name="Job", get=_get_label)
-    progress: FloatProperty(
-        name="Progress", description="Share of the work that is done", min=0.0, max=1.0, subtype="FACTOR",
-        get=_get_progress,
-    )  # fmt: skip
 
 
 class JobOperator:
@@ -204,7 +176,7 @@ class JobOperator:
             _require_idle()
             with warnings_reported(self):
                 job = self.job(context)
-                text = run(job, _console(job.label))
+                text = run(job, progress_bar(job.label))
             self.report({"INFO"}, text)
         except BaseException as error:
             return self._failed(error)
@@ -316,28 +288,18 @@ class MPHDRR_OT_cancel_job(bpy.types.Operator):
     bl_description = "Stop the running job; the scene stays as it was"
     bl_options = {"INTERNAL"}
 
-    @classmethod
-    def poll(cls, context: bpy.types.Context) -> bool:
-        """There is a job."""
-        if not is_running():
-            cls.poll_message_set("No job is running")
-            return False
-        return True
-
     def execute(self, context: bpy.types.Context) -> set[str]:
         """Ask it to stop."""
         cancel()
         return {"FINISHED"}
 
 
-def draw_job(layout: bpy.types.UILayout, context: bpy.types.Context) -> None:
+def draw_job(layout: bpy.types.UILayout) -> None:
     """Draw the running job's progress bar and Cancel button; nothing where there is none."""
-    if not is_running():
-        return
-    state = context.window_manager.mphdrr_job
-    row = layout.row(align=True)
-    row.progress(factor=state.progress, type="BAR", text=f"{state.label}  {state.progress:.0%}")
-    row.operator(ids.CANCEL_JOB, text="", icon="CANCEL")
+    if _current is not None:
+        row = layout.row(align=True)
+        row.progress(factor=_current.share, type="BAR", text=f"{_current.label}  {_current.share:.0%}")
+        row.operator(ids.CANCEL_JOB, text="", icon="CANCEL")
 
 
 def _argument(value: Any) -> Any:
@@ -356,16 +318,3 @@ def redraw_sidebars() -> None:
             for region in area.regions:
                 if area.type == "VIEW_3D" and region.type == "UI":
                     region.tag_redraw()
-
-
-def _console(label: str) -> Progress:
-    shown = -1
-
-    def progress(done: int, total: int) -> None:
-        nonlocal shown
-        percent = 100 * done // max(1, total)
-        if percent >= shown + 10 or done == total:
-            shown = percent
-            print(f"mphDRR: {label} {percent} % ({done} of {total})", file=sys.stderr, flush=True)
-
-    return progress

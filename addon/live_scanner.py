@@ -1,8 +1,7 @@
 """Handlers: scanners follow when cameras move, after undo and redo, and when a file is loaded.
 
-Following only changes things in place (`following.refresh`). Cameras that the user copied or deleted with Blender's own
-Shift+D and X need datablocks made and removed: that waits until Blender is idle, and is an undo step of its own. What an
-undo has made untidy again is left so; the panel offers to tidy it.
+Cameras that the user copied or deleted with Blender's own Shift+D and X need datablocks made and removed: that waits until
+Blender is idle, and is an undo step of its own. What an undo has made untidy again is left so; the panel offers to tidy it.
 """
 
 from __future__ import annotations
@@ -13,7 +12,7 @@ from typing import Any
 
 import bpy
 
-from . import copies, following, scanner
+from . import following, module_edits, scanner
 
 _INTERVAL = 0.2  # s between two looks whether a tool is still running
 _overlooked = False  # something happened while rendering or playing
@@ -62,7 +61,7 @@ def after_undo(*_: Any) -> None:
     for collection in _local(bpy.data.collections):
         following.refresh(collection)
         with following.writing():
-            collection.mphdrr_scanner.untidy = copies.untidy_text(collection)
+            collection.mphdrr_scanner.untidy = module_edits.untidy_text(collection)
         _undone[collection.name] = collection.mphdrr_scanner.untidy
 
 
@@ -70,7 +69,7 @@ def after_undo(*_: Any) -> None:
 def after_load(*_: Any) -> None:
     """A file was opened; one of an older version has shared meshes and no readouts. Nothing is tidied unasked."""
     for collection in _local(bpy.data.collections):
-        copies.make_single_users(collection)
+        module_edits.make_single_users(collection)
     after_undo()
 
 
@@ -91,7 +90,7 @@ def _is_busy() -> bool:
 
 
 def _look_for_copies(collection: bpy.types.Collection) -> None:
-    text = copies.untidy_text(collection)
+    text = module_edits.untidy_text(collection)
     properties = collection.mphdrr_scanner
     if properties.untidy != text:
         with following.writing():

@@ -100,7 +100,10 @@ def module_numbers(camera: bpy.types.Object) -> ModuleNumbers:
     """
     module, exact = camera.mphdrr_module, exact_values(camera)
     center = _center(camera, exact.get("center"))
-    values = {name: _length(getattr(module, name), exact.get(name)) for name in LENGTHS}
+    values = {name: typed(getattr(module, name)) for name in LENGTHS}
+    values |= {
+        name: exact[name] for name in LENGTHS if name in exact and np.float32(exact[name]) == getattr(module, name)
+    }
     numbers = ModuleNumbers(module.number, center, **values)
     if module.length_mode != FROM_ROI:
         return numbers
@@ -116,10 +119,6 @@ def _with_length(numbers: ModuleNumbers) -> ModuleNumbers:
         return numbers._replace(collimator_length=float(collimator_length(numbers.pinhole_distance, d, side, roi)))
     except InputError:
         return numbers  # `read_scanner` and the module's `problem` say what is wrong
-
-
-def _length(visible: float, exact: float | None) -> float:
-    return exact if exact is not None and float(np.float32(exact)) == visible else typed(visible)
 
 
 def _center(camera: bpy.types.Object, exact: list[float] | None) -> NDArray[np.float64]:

@@ -104,13 +104,7 @@ ProjectionSettings.__annotations__.update(_properties())
 
 
 def recipe_values(get: Callable[[str], Any]) -> dict[str, Any]:
-    """The values of the settings by their keys in a recipe, None for none; `get` gives a property's.
-
-    Raises
-    ------
-    InputError
-        A choice is one that only a later version knows.
-    """
+    """The values of the settings by their keys in a recipe, None for none; `get` gives a property's."""
     values: dict[str, Any] = {}
     for name, setting in PROPERTIES.items():
         material = _material(name, setting)
@@ -132,23 +126,13 @@ def recipe_values(get: Callable[[str], Any]) -> dict[str, Any]:
 
 
 def settings_recipe(get: Callable[[str], Any], is_given: Callable[[str], bool], more: Mapping[str, Any]) -> Recipe:
-    """The recipe of model, detector, noise and backend.
+    """The recipe of model, detector, noise and backend, with `more` values by their keys.
 
-    Parameters
-    ----------
-    get
-        Gives a property's value.
-    is_given
-        Whether a property was given by a script, so that it must have an effect, and not taken from the panel.
-    more
-        Further values by their keys.
-
-    Raises
-    ------
-    InputError
-        A value is not what is expected, or a given one has no effect beside the others.
+    `get` gives a property's value, `is_given` whether a script has set it: InputError then says if it has no effect.
     """
-    values = {**recipe_values(get), **more, "system.modules": _range_text(get("first"), get("last"))}
+    first, last = get("first"), get("last")
+    modules = f"{first or ''}-{last or ''}" if first or last else None
+    values = {**recipe_values(get), **more, "system.modules": modules}
     given = [
         setting.key
         for name, setting in PROPERTIES.items()
@@ -158,16 +142,15 @@ def settings_recipe(get: Callable[[str], Any], is_given: Callable[[str], bool], 
 
 
 def set_panel(settings: ProjectionProperties, recipe: Recipe) -> None:
-    """Set the panel as a recipe says; what it does not say gets its default.
-
-    Raises
-    ------
-    InputError
-        The panel has no such value.
-    """
+    """Set the panel as a recipe says, and the rest to its defaults; raises InputError for what the panel cannot show."""
     if recipe["model.pixel_points"] == "auto" and recipe["model.kind"] != "emission":
         raise InputError("model.pixel_points: the panel has no automatic number for radiographs")
-    modules = _module_range(recipe["system.modules"])
+    text = recipe["system.modules"] or "-"
+    first, dash, last = text.partition("-")
+    try:
+        modules = int(first or 0), int(last or 0) if dash else int(first)
+    except ValueError:
+        raise InputError(f"system.modules: the panel has one range of modules, not {text!r}") from None
     for name, setting in PROPERTIES.items():
         material = _material(name, setting)
         for own in filter(None, (name, material)):
@@ -207,18 +190,6 @@ def drawn(settings: ProjectionProperties, table: str) -> Iterator[tuple[str, boo
 def makes_counts(settings: ProjectionProperties) -> bool:
     """Whether images hold numbers of photons, which may have noise."""
     return settings.model == "EMISSION" or (settings.model == "TRANSMISSION" and settings.photons > 0)
-
-
-def _range_text(first: int, last: int) -> str | None:
-    return f"{first or ''}-{last or ''}" if first or last else None
-
-
-def _module_range(text: str | None) -> tuple[int, int]:
-    first, dash, last = (text or "-").partition("-")
-    try:
-        return int(first or 0), int(last or 0) if dash else int(first)
-    except ValueError:
-        raise InputError(f"system.modules: the panel has one range of modules, not {text!r}") from None
 
 
 def _is_ours(self: ProjectionProperties, item: bpy.types.Object) -> bool:

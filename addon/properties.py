@@ -21,7 +21,7 @@ from bpy.props import (
     StringProperty,
 )
 
-from . import choices, column_maps, ids, jobs, phantom_properties, projection_properties
+from . import choices, column_maps, ids, phantom_properties, projection_properties
 from .updates import FUNCTIONS, on_edit
 
 
@@ -59,10 +59,7 @@ def _lengths(edited: Callable[[str], Any], suffix: str = "") -> dict[str, Any]:
 
 
 class ModuleProperties(bpy.types.PropertyGroup):
-    """One pinhole module; lives on the module's camera object as `Object.mphdrr_module`.
-
-    The scanner's other objects (collimator, crystal, ROI sphere) carry `part` and `number` only.
-    """
+    """`Object.mphdrr_module`: one pinhole module, on its camera object; other parts carry `part` and `number` only."""
 
     is_module: BoolProperty(name="Is Module", options={"HIDDEN"})
     part: EnumProperty(
@@ -196,17 +193,15 @@ CLASSES = (
     GeometryProperties,
     *phantom_properties.CLASSES,
     *projection_properties.CLASSES,
-    jobs.JobProperties,
     *column_maps.CLASSES,
 )
 
 # (Blender type, attribute name, group): `registration.py` attaches a `PointerProperty` of the group to the type.
 POINTERS = (
     (bpy.types.Object, ids.OBJECT_MODULE, ModuleProperties),
-    (bpy.types.Collection, ids.COLLECTION_SCANNER, ScannerProperties),
-    (bpy.types.Scene, ids.SCENE_GEOMETRY, GeometryProperties),
+    (bpy.types.Collection, "mphdrr_scanner", ScannerProperties),
+    (bpy.types.Scene, "mphdrr_geometry", GeometryProperties),
     (bpy.types.Object, ids.OBJECT_VOLUME, phantom_properties.VolumeProperties),
     (bpy.types.Scene, ids.SCENE_PROJECTIONS, projection_properties.ProjectionProperties),
-    (bpy.types.WindowManager, ids.WINDOW_JOB, jobs.JobProperties),
-    (bpy.types.WindowManager, ids.WINDOW_COLUMNS, column_maps.ColumnMapProperties),
+    (bpy.types.WindowManager, "mphdrr_columns", column_maps.ColumnMapProperties),
 )

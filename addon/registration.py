@@ -3,38 +3,22 @@
 from __future__ import annotations
 
 import atexit
+import importlib
+import pkgutil
 from collections.abc import Callable
 from types import ModuleType
 from typing import Any
 
 import bpy
 
-from ..operators import (
-    add_map,
-    add_phantom,
-    add_slices,
-    convert_ct,
-    dropped_files,
-    edit_phantom,
-    export_dataset,
-    export_geometry,
-    export_volume,
-    import_geometry,
-    import_volume,
-    load_recipe,
-    modules,
-    render_projections,
-    volume_files,
-    voxelize_objects,
-)
-from ..panels import add_menu, design, export, geometry, phantom, projections
+from .. import operators, panels
+from ..operators import add_phantom
 from . import (
     following,
     ids,
     jobs,
     live_phantoms,
     live_scanner,
-    preferences,
     properties,
     scanner,
     selection,
@@ -44,55 +28,59 @@ from . import (
     volumes,
 )
 
-# Where the classes are. Those of one module are registered in the order in which they stand in it: a panel after its
-# parent. Panels are drawn in the order of the work.
-_OPERATORS = (
-    import_geometry,
-    modules,
-    export_geometry,
-    add_map,
-    add_phantom,
-    edit_phantom,
-    voxelize_objects,
-    import_volume,
-    export_volume,
-    convert_ct,
-    add_slices,
-    volume_files,
-    render_projections,
-    load_recipe,
-    jobs,
-    export_dataset,
-    dropped_files,
-)
-_PANELS = (add_menu, geometry, design, phantom, projections, export)
 
-
-def _classes(module: ModuleType) -> list[type]:
-    """The classes of a module that Blender registers: its `MPHDRR_...`."""
-    return [cls for name, cls in vars(module).items() if name.startswith("MPHDRR_") and isinstance(cls, type)]
+def _classes(module: ModuleType) -> list[Any]:
+    """The classes that Blender registers, its `MPHDRR_...`, of a module or of all modules of a package."""
+    if hasattr(module, "__path__"):
+        names = [f"{module.__name__}.{found.name}" for found in pkgutil.iter_modules(module.__path__)]
+        return [cls for name in names for cls in _classes(importlib.import_module(name))]
+    found = [cls for name, cls in vars(module).items() if name.startswith("MPHDRR_") and isinstance(cls, type)]
+    return [cls for cls in found if cls.__module__ == module.__name__]
 
 
 CLASSES: tuple[type, ...] = (
     *properties.CLASSES,
     *add_phantom.ADD_KINDS,
-    *(cls for module in (preferences, *_OPERATORS, *_PANELS) for cls in _classes(module)),
+    *_classes(operators),
+    *_classes(jobs),
+    *sorted(_classes(panels), key=lambda cls: hasattr(cls, "bl_parent_id")),  # a panel after its parent
 )
 
-# (menu, draw function): entries in Blender's own menus.
-MENUS: tuple[tuple[Any, Any], ...] = (
-    (bpy.types.TOPBAR_MT_file_import, import_geometry.draw_menu),
-    (bpy.types.TOPBAR_MT_file_import, import_volume.draw_menu),
-    (bpy.types.TOPBAR_MT_file_export, export_geometry.draw_menu),
-    (bpy.types.TOPBAR_MT_file_export, export_volume.draw_menu),
-    (bpy.types.TOPBAR_MT_file_export, export_dataset.draw_menu),
-    (bpy.types.VIEW3D_MT_add, add_menu.draw_menu),
-    (bpy.types.VIEW3D_MT_object_convert, voxelize_objects.draw_menu),
-)
+# Entries in Blender's own menus: operators with their texts.
+ENTRIES = {
+    bpy.types.TOPBAR_MT_file_import: {
+        ids.IMPORT_GEOMETRY: "Pinhole Geometry (.xlsx)",
+        ids.IMPORT_VOLUME: "Volume for Projection (.nii, DICOM, .nrrd, .vdb, ...)",
+        ids.IMPORT_VOLUME_SEQUENCE: "Volume Sequence (.nii, .nrrd, .vdb, ...)",
+    },
+    bpy.types.TOPBAR_MT_file_export: {
+        ids.EXPORT_GEOMETRY: "Pinhole Geometry (.xlsx)",
+        ids.EXPORT_FOR_PROGRAM: "Pinhole Geometry for Programs",
+        ids.EXPORT_VOLUME: "Volume (.vdb, .nii, .nrrd, ...)",
+        ids.EXPORT_DATASET: "mphDRR Dataset (.h5/.npz/.pt)",
+    },
+    bpy.types.VIEW3D_MT_object_convert: {
+        ids.VOXELIZE_OBJECTS: "Voxelize Meshes",
+        ids.MESH_FROM_VOLUME: "Mesh from Volume",
+    },
+}
+
+
+def _draw_entries(entries: dict[str, str]) -> Callable[..., None]:
+    def draw(menu: bpy.types.Menu, context: bpy.types.Context) -> None:
+        menu.layout.operator_context = "INVOKE_DEFAULT"
+        for operator, text in entries.items():
+            menu.layout.operator(operator, text=text)
+
+    return draw
+
+
+MENUS = [(menu, _draw_entries(entries)) for menu, entries in ENTRIES.items()]
+MENUS.append((bpy.types.VIEW3D_MT_add, lambda menu, _: menu.layout.menu("MPHDRR_MT_add", icon="OUTLINER_DATA_VOLUME")))
 
 # (list in bpy.app.handlers, function): decorate the function with @bpy.app.handlers.persistent.
 HANDLERS: tuple[tuple[list[Any], Any], ...] = (
-    (bpy.app.handlers.load_pre, jobs.before_load),
+    (bpy.app.handlers.load_pre, jobs.stop),
     (bpy.app.handlers.load_pre, slices.before_load),
     (bpy.app.handlers.load_post, volumes.after_load),
     (bpy.app.handlers.load_post, live_scanner.after_load),
@@ -124,10 +112,7 @@ _undo: list[tuple[Callable[..., Any], tuple[Any, ...]]] = []
 
 
 def register(command: Callable[..., int] | None = None) -> None:
-    """Register everything, or, if something fails, take back what was registered and raise.
-
-    `command` is what ``blender --command mphdrr`` calls.
-    """
+    """Register everything, or nothing if something fails; `command` is what ``blender --command mphdrr`` calls."""
     updates.FUNCTIONS.update(UPDATES)
     try:
         for cls in CLASSES:

@@ -21,34 +21,24 @@ from ..core.runs.recipe import Recipe, read_recipe
 from ..core.runs.run import ProjectionRun
 from ..core.runs.run_recipe import recipe_model, run_recipe
 from ..core.volumes.volume import require_quantity
-from . import ids, images, jobs, phantoms, scanner, storage, volumes
+from . import images, jobs, phantoms, scanner, storage, volumes
 from .projection_properties import OPENING_ANGLE, set_panel
 
 
 def render_job(context: bpy.types.Context, recipe: Recipe, volume: str = "", mu: str = "") -> jobs.Job:
-    """The job that projects a volume of the context's scene into its scanner's modules.
+    """The job that projects a volume of the context's scene into its scanner's modules as `recipe` says.
 
-    Parameters
-    ----------
-    context
-        Its scene has the scanner.
-    recipe
-        The settings of model, detector, noise, modules and backend.
-    volume, mu
-        Names of the objects of what is projected and what attenuates; by default those of the panel.
-
-    Raises
-    ------
-    InputError
-        There is no scanner or no such volume, a phantom has changed, the settings do not go together, or the images do not
-        fit into memory.
+    `volume` and `mu` name the objects of what is projected and what attenuates; by default they are the panel's. Raises
+    InputError where there is none, a phantom has changed, settings do not go together, or memory does not suffice.
     """
     scene = context.scene
     system = chosen_modules(scanner.read_scanner(scanner.required_scanner(scene)), recipe["system.modules"], "modules")
     model = recipe_model(recipe, system)  # refuses what cannot be, before the work begins
     photons = recipe["model.photons"]
     item = _chosen_volume(context, volume, ("mu",) if photons else model.takes, model.name)
-    mu_item = _chosen_mu(context, mu) if recipe["model.kind"] == "emission" else None
+    mu_item = _given(context, "mu", mu) if recipe["model.kind"] == "emission" else None
+    if mu_item is not None:
+        require_quantity(volumes.quantity_of(mu_item), ("mu",), f"{mu_item.name!r} for attenuation")
     for chosen in filter(None, (item, mu_item)):
         phantoms.require_current(chosen)
     rows, columns = recipe["detector.rows"], recipe["detector.columns"]
@@ -83,21 +73,30 @@ def render_job(context: bpy.types.Context, recipe: Recipe, volume: str = "", mu:
 
 
 def load_recipe(scene: bpy.types.Scene, path: Path) -> None:
-    """Set the scene's panel as a recipe (.toml) or the recipe of a run says.
-
-    Raises
-    ------
-    InputError
-        The file cannot be read, a run holds no recipe, or the panel has no such value.
-    """
+    """Set the scene's panel as a recipe (.toml) or the recipe of a run says."""
     recipe = read_recipe(path) if path.suffix.lower() == ".toml" else read_run(path).recipe
-    settings = getattr(scene, ids.SCENE_PROJECTIONS)
+    settings = scene.mphdrr_projections
     set_panel(settings, recipe)
     known = {item.name: item for item in volumes.volume_objects(scene)}
     settings.volume, settings.mu = known.get(recipe["volume.object"]), known.get(recipe["attenuation.object"])
     collection = scanner.active_scanner(scene)
     if collection is not None and OPENING_ANGLE in recipe.given:
         collection.mphdrr_scanner.opening_angle = math.radians(recipe[OPENING_ANGLE])
+
+
+def export_run(scene: bpy.types.Scene, filepath: str) -> Path:
+    """Write the scene's last run to a file, in the format of its suffix: .h5, .npz or .pt."""
+    run_file = scene.mphdrr_projections.run_file
+    if not run_file:
+        raise InputError("nothing to export: render the projections first")
+    source = storage.absolute(run_file)
+    if not source.is_file():
+        raise InputError(f"{source}: the last run's file is gone; render the projections again")
+    if not filepath:
+        raise InputError("no file given: set filepath to a name ending in .h5, .npz or .pt")
+    path = storage.absolute(filepath)
+    write_run(read_run(source), path)
+    return path
 
 
 def show_run(scene: bpy.types.Scene, run: ProjectionRun, path: Path) -> None:
@@ -107,7 +106,7 @@ def show_run(scene: bpy.types.Scene, run: ProjectionRun, path: Path) -> None:
 
 
 def _record_run(scene: bpy.types.Scene, run: ProjectionRun, path: Path) -> None:
-    state = getattr(scene, ids.SCENE_PROJECTIONS)
+    state = scene.mphdrr_projections
     state.run_file = storage.stored_path(path.absolute())
     n_v, n_u = run.views.shape
     what = [run.settings.get("volume"), run.settings.get("backend")]
@@ -116,11 +115,10 @@ def _record_run(scene: bpy.types.Scene, run: ProjectionRun, path: Path) -> None:
 
 def _with_volume(recipe: Recipe, item: bpy.types.Object) -> Recipe:
     """The recipe with what the volume's object is: its state and its phantom."""
-    state = 0
+    state = "none"
     if item.data.is_sequence:
-        text = volumes.state_text(item)
-        recipe = recipe.updated({"volume.state": text})
-        state = int(text.split()[0]) - 1 if text != "none" else 0
+        state = volumes.state_text(item)
+        recipe = recipe.updated({"volume.state": state})
     settings = phantoms.settings_of(item)
     if settings is None:
         return recipe
@@ -130,13 +128,14 @@ def _with_volume(recipe: Recipe, item: bpy.types.Object) -> Recipe:
     }  # fmt: skip
     if settings.bl_rna.properties.get("text") is not None:
         values["phantom.text"] = settings.text.as_string()
-    return with_phantom(recipe.updated(values), made.states[state], volumes.pose_of_object(item))
+    shown = made.states[0 if state == "none" else int(state.split()[0]) - 1]
+    return with_phantom(recipe.updated(values), shown, volumes.pose_of_object(item))
 
 
 def _chosen_volume(context: bpy.types.Context, name: str, taken: Sequence[str], model: str) -> bpy.types.Object:
     """The volume named, else the panel's, else the active one, else the only one of a quantity that the model takes."""
     known = volumes.volume_objects(context.scene)
-    chosen = _named(known, name) if name else _of_panel(context, "volume")
+    chosen = _given(context, "volume", name)
     # An active CT is meant, though it has to be converted first; otherwise a fitting volume is looked for.
     if chosen is None and context.object in known and "mu" in taken and volumes.quantity_of(context.object) == "hu":
         chosen = context.object
@@ -154,26 +153,14 @@ def _chosen_volume(context: bpy.types.Context, name: str, taken: Sequence[str], 
     return fitting[0]
 
 
-def _chosen_mu(context: bpy.types.Context, name: str) -> bpy.types.Object | None:
-    """The volume of attenuation coefficients named, else the panel's, else None."""
-    chosen = _named(volumes.volume_objects(context.scene), name) if name else _of_panel(context, "mu")
-    if chosen is not None:
-        require_quantity(volumes.quantity_of(chosen), ("mu",), f"{chosen.name!r} for attenuation")
-    return chosen
-
-
-def _of_panel(context: bpy.types.Context, name: str) -> bpy.types.Object | None:
-    """The panel's volume, if it has one. Blender keeps it there even when the user has deleted it."""
-    settings = getattr(context.scene, ids.SCENE_PROJECTIONS)
-    chosen = getattr(settings, name)
-    if chosen is not None and chosen not in volumes.volume_objects(context.scene):
-        label = settings.bl_rna.properties[name].name
+def _given(context: bpy.types.Context, setting: str, name: str) -> bpy.types.Object | None:
+    """The volume called `name`, or else the panel's, if it has one."""
+    known = {item.name: item for item in volumes.volume_objects(context.scene)}
+    if name and name not in known:
+        raise InputError(f"no volume is named {name!r}; there are: {', '.join(known) or 'none'}")
+    settings = context.scene.mphdrr_projections
+    chosen = known[name] if name else getattr(settings, setting)
+    if chosen is not None and chosen not in known.values():  # Blender keeps a volume there that the user has deleted
+        label = settings.bl_rna.properties[setting].name
         raise InputError(f"{label} {chosen.name!r} is not in this scene any more: choose another, or none")
     return chosen
-
-
-def _named(known: list[bpy.types.Object], name: str) -> bpy.types.Object:
-    for item in known:
-        if item.name == name:
-            return item
-    raise InputError(f"no volume is named {name!r}; there are: {', '.join(item.name for item in known) or 'none'}")

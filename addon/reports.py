@@ -27,18 +27,12 @@ def warnings_reported(operator: bpy.types.Operator) -> Iterator[None]:
 
 
 def run_reported(operator: bpy.types.Operator, action: Callable[[], str]) -> set[str]:
-    """Run an operator's work: report the line that `action` returns, its warnings, and an `InputError` as {'ERROR'}.
-
-    Returns
-    -------
-    set
-        {'FINISHED'}, or {'CANCELLED'} after an `InputError`.
-    """
+    """Run an operator's work; report its warnings, and the line that it returns or an `InputError` as {'ERROR'}."""
     try:
         with warnings_reported(operator):
             text = action()
-    except InputError as error:
-        operator.report({"ERROR"}, str(error))
+    except (InputError, MemoryError) as error:
+        operator.report({"ERROR"}, str(error) or "not enough memory")
         return {"CANCELLED"}
     operator.report({"INFO"}, text)
     return {"FINISHED"}

@@ -24,8 +24,7 @@ from ..core.workbook import ColumnMap, QuantityCells, SystemSource
 from . import cameras, following, ids
 from .following import modules
 from .module_values import LENGTHS, is_edited, is_moved, module_numbers, off_aim, remember
-from .replacement import clear, losses, modules_text
-from .scanner_parts import NewScanner
+from .scanner_parts import NewScanner, clear, losses, modules_text
 
 _DEFAULT = Construction()
 
@@ -39,28 +38,11 @@ def build_scanner(
     shape: tuple[int, int] = (256, 256),
     replace: bool = False,
 ) -> bpy.types.Collection:
-    """Put a scanner into the scene, replacing one of the same name; returns its collection.
+    """Put a scanner into the scene, in place of one of the same name; returns its collection.
 
-    Parameters
-    ----------
-    scene
-        Its units become millimetres, its render resolution `shape`.
-    system
-        The modules.
-    name
-        Name of the scanner's collection; by default that of the workbook's file.
-    construction
-        How the collimators are built.
-    shape
-        Pixels (n_v, n_u) of the cameras' pictures.
-    replace
-        Replace a scanner of the same name even if `losses` finds changes. Objects that are not the scanner's are never
-        deleted: they move to the scene's own collection.
-
-    Raises
-    ------
-    InputError
-        Changes would be lost and `replace` is False, or a collimator cannot be built. The scene is as it was.
+    The scene's units become millimetres and its render resolution `shape`, pixels (n_v, n_u). The name is by default that of
+    the workbook's file. The user's objects in the old scanner move to the scene's own collection. Raises InputError, and
+    leaves the scene as it was, where a collimator cannot be built, or changes (`losses`) would be lost without `replace`.
     """
     name = name or default_name(system)
     old = find_scanner(scene, name)
@@ -154,7 +136,10 @@ def _prepare_scene(scene: bpy.types.Scene, system: PinholeSystem, shape: tuple[i
     """Set units, render resolution and clipping for the scanner; look at the whole of one that is new."""
     units = scene.unit_settings
     units.system, units.scale_length, units.length_unit = "METRIC", 0.001, "MILLIMETERS"
-    cameras.set_render_shape(scene, shape)
+    n_v, n_u = shape
+    render = scene.render
+    render.resolution_x, render.resolution_y, render.resolution_percentage = n_u, n_v, 100
+    render.pixel_aspect_x, render.pixel_aspect_y = max(1.0, n_v / n_u), max(1.0, n_u / n_v)
     reach = float((system.pinhole_distance + system.collimator_length).max())
     for space in (space for screen in bpy.data.screens for area in screen.areas for space in area.spaces):
         if space.type == "VIEW_3D":
@@ -204,14 +189,8 @@ def read_scanner(collection: bpy.types.Collection, *, aimed: bool = False) -> Pi
     """The scanner as it stands in the scene now: the cameras' places, and the numbers in their properties.
 
     Numbers that have not changed come back exactly, in float64. The system's modules all look at the isocentre: a camera
-    that does not is named in an `InputWarning` (`aim_modules` turns it), or refused if `aimed`. The system has its
-    source (the workbook) only while everything is as it was imported.
-
-    Raises
-    ------
-    InputError
-        There is no module, two have the same number, their numbers are impossible, or, if `aimed`, a camera does not
-        look at the isocentre.
+    that does not is named in an `InputWarning`, or refused if `aimed`. The system has its source (the workbook) only while
+    everything is as it was imported. Raises InputError for no modules, equal module numbers and impossible lengths.
     """
     found = modules(collection)
     if not found:
@@ -246,8 +225,7 @@ def read_scanner(collection: bpy.types.Collection, *, aimed: bool = False) -> Pi
 def check_geometry(collection: bpy.types.Collection) -> tuple[list[str], list[bpy.types.Object]]:
     """Check the scanner for overlaps, blocked holes and ROIs that are not seen, and store the findings at its modules.
 
-    Returns the findings, and the camera objects of the modules concerned. Raises InputError where the modules' numbers
-    are impossible or a collimator cannot be built.
+    Returns the findings, and the camera objects of the modules concerned.
     """
     construction = following.construction(collection.mphdrr_scanner)
     report = checks.check_geometry(read_scanner(collection), **asdict(construction))
@@ -280,8 +258,7 @@ def set_visible(camera: bpy.types.Object, visible: bool) -> None:
 def show_modules(collection: bpy.types.Collection, first: int, last: int, mode: str = "ONLY") -> int:
     """Show modules by their numbers, first to last; returns how many are visible now.
 
-    `mode` is ``"SHOW"`` or ``"HIDE"``, which leave the other modules, ``"ONLY"``, or ``"ALL"``, which needs no range. Raises
-    InputError where no module has a number in the range.
+    `mode` is ``"SHOW"`` or ``"HIDE"``, which leave the other modules, ``"ONLY"``, or ``"ALL"``, which needs no range.
     """
     found = modules(collection)
     inside = {o for o in found if mode == "ALL" or first <= o.mphdrr_module.number <= last}

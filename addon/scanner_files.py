@@ -25,35 +25,17 @@ _EQUAL = 1e-9  # mm, or share of a length above 1 mm
 
 
 def export_scanner(collection: bpy.types.Collection, path: Path, use_template: bool = True) -> PinholeSystem:
-    """Write the scanner as it stands in the scene to a workbook, which becomes the scanner's own.
+    """Write the scanner as it stands in the scene to a workbook (.xlsx, .xlsm), which becomes the scanner's own.
 
-    Parameters
-    ----------
-    collection
-        The scanner.
-    path
-        The workbook to write, .xlsx or .xlsm.
-    use_template
-        Write into a copy of the scanner's present workbook, so that all else in it stays. If that was read by a column
-        map, it is written by the map, and the scene keeps the new file's own map. Otherwise, or if the workbook has gone
-        (`InputWarning`), a new one is made.
-
-    Returns
-    -------
-    PinholeSystem
-        The system that was written, with the new file as its source.
-
-    Raises
-    ------
-    InputError
-        A camera does not look at the isocentre, the modules' numbers are impossible, or the file cannot be written. The
-        scanner stays as it was.
+    With `use_template` it is written into a copy of the scanner's present workbook, by the column map that this was read
+    by; a new one is made where that workbook has gone (`InputWarning`). Returns the system, with the new file as its source.
+    Raises InputError, and leaves the scanner as it was, where a camera is not aimed or the file cannot be written.
     """
     following.refresh(collection)
     system = scanner.read_scanner(collection, aimed=True)
     template = _template(collection) if use_template else None
-    source = scanner.source(collection)
-    columns = source.columns if source is not None and template is not None else None
+    source = scanner.source(collection) if template is not None else None
+    columns = source.columns if source is not None else None
     own = write_system(system, path, template, columns).columns
     with recorded_warnings():  # the writer has already warned of the template's doubts
         written = read_system(path, own)
@@ -76,21 +58,8 @@ def export_for_program(
 ) -> PinholeSystem:
     """Write the scanner as it stands in the scene in one of `FORMATS`, with its collimators as they are built.
 
-    Parameters
-    ----------
-    collection
-        The scanner.
-    path
-        The file to write, or a new folder for formats of several files.
-    format
-        A name in `core.exchange.FORMATS`.
-    shape, detector, magnification
-        The images to describe (`PinholeSystem.views`).
-
-    Raises
-    ------
-    InputError
-        A camera does not look at the isocentre, the format cannot express the scanner, or the file cannot be written.
+    `path` is a new folder for formats of several files; the images described are `system.views(shape, detector, ...)`.
+    Raises InputError where a camera does not look at the isocentre or the format cannot express the scanner.
     """
     options = asdict(following.construction(collection.mphdrr_scanner))
     options["opening_degrees"] = typed(math.degrees(options.pop("opening_angle")))

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
+from typing import Any
 
 import bpy
 
 from . import scanner
+from .reports import run_reported
 
 
 def active_module(context: bpy.types.Context) -> bpy.types.Object | None:
@@ -17,9 +19,14 @@ def active_module(context: bpy.types.Context) -> bpy.types.Object | None:
     item = module_of(context.view_layer.objects.active)
     if item is not None and item.name in collection.all_objects:
         return item
-    items, index = collection.all_objects, context.scene.mphdrr_geometry.active_index
-    listed = items[index] if 0 <= index < len(items) else None
-    return listed if listed is not None and listed.mphdrr_module.is_module else None
+    return listed_module(context.scene)
+
+
+def listed_module(scene: bpy.types.Scene) -> bpy.types.Object | None:
+    """The camera of the module that is active in the panel's list."""
+    collection, index = scanner.active_scanner(scene), scene.mphdrr_geometry.active_index
+    camera = collection.all_objects[index] if collection and 0 <= index < len(collection.all_objects) else None
+    return camera if camera is not None and camera.mphdrr_module.is_module else None
 
 
 def selected_modules(context: bpy.types.Context) -> list[bpy.types.Object]:
@@ -56,25 +63,46 @@ def select(context: bpy.types.Context, modules: Iterable[bpy.types.Object]) -> N
 
 def select_active(scene: bpy.types.Scene) -> None:
     """Select the module that is active in the panel's list, as a click on its camera would."""
-    collection, index = scanner.active_scanner(scene), scene.mphdrr_geometry.active_index
-    camera = collection.all_objects[index] if collection and 0 <= index < len(collection.all_objects) else None
+    camera = listed_module(scene)
     if camera is not None and camera.visible_get(view_layer=bpy.context.view_layer):
         select(bpy.context, [camera])
 
 
-def poll_scanner(operator: type[bpy.types.Operator], context: bpy.types.Context) -> bool:
-    """`poll` of operators that need a scanner."""
-    if scanner.active_scanner(context.scene) is None:
-        operator.poll_message_set("No scanner in the scene: import a geometry first")
-        return False
-    return True
+class NeedsScanner:
+    """Mix into an operator that needs a scanner."""
+
+    @classmethod
+    def poll(cls: Any, context: bpy.types.Context) -> bool:
+        """There is a scanner."""
+        if scanner.active_scanner(context.scene) is None:
+            cls.poll_message_set("No scanner in the scene: import a geometry first")
+            return False
+        return True
 
 
-def poll_module(operator: type[bpy.types.Operator], context: bpy.types.Context) -> bool:
-    """`poll` of operators that need an active or selected module."""
-    if not poll_scanner(operator, context):
-        return False
-    if not selected_modules(context):
-        operator.poll_message_set("No module is selected: select a module's camera")
-        return False
-    return True
+class OnScanner(NeedsScanner):
+    """Mix into an operator that works on the scanner of the panels."""
+
+    bl_options = {"REGISTER", "UNDO"}
+
+    def execute(self, context: bpy.types.Context) -> set[str]:
+        """Do the work and report."""
+        return run_reported(self, lambda: self.change(context, scanner.required_scanner(context.scene)))
+
+    def change(self, context: bpy.types.Context, collection: bpy.types.Collection) -> str:
+        """Do the work and return the line to report; raises InputError."""
+        raise NotImplementedError
+
+
+class OnModules(OnScanner):
+    """Mix into an operator that works on the active or selected modules."""
+
+    @classmethod
+    def poll(cls: Any, context: bpy.types.Context) -> bool:
+        """There is a scanner, and a module of it is active or selected."""
+        if not super().poll(context):
+            return False
+        if not selected_modules(context):
+            cls.poll_message_set("No module is selected: select a module's camera")
+            return False
+        return True

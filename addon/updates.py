@@ -1,7 +1,4 @@
-"""What an edited property calls: functions by name, so that property groups import nothing that draws or rebuilds.
-
-`registration.py`, which knows every module, fills the table.
-"""
+"""What an edited property calls: functions by name, so that property groups import nothing that draws or rebuilds."""
 
 from __future__ import annotations
 
@@ -11,7 +8,7 @@ from typing import Any
 import bpy
 
 FUNCTIONS: dict[str, Callable[..., None]] = {}
-"""Each takes the object, collection or scene that holds the property, and what was given to `on_edit`."""
+"""Filled by `registration.py`. Each takes the property's object, collection or scene, and what was given to `on_edit`."""
 
 
 def on_edit(name: str, *arguments: Any) -> Callable[[bpy.types.PropertyGroup, bpy.types.Context], None]:

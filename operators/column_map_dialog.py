@@ -23,7 +23,11 @@ def draw(layout: bpy.types.UILayout, form: ColumnMapProperties) -> None:
     row.prop(form, "n_tables")
     row.prop(form, "unit")
     _tables(layout, form)
-    _quantities(layout, form)
+    compared = [quantity for quantity in form.quantities if quantity.name in DERIVED]
+    split = layout.split(factor=0.6) if compared else layout
+    _columns(split, "Quantity", [quantity for quantity in form.quantities if quantity.name not in DERIVED], 0.38)
+    if compared:
+        _columns(split, "Compared", compared, 0.2)
     _result(layout, form)
     layout.prop(form, "save_as")
 
@@ -46,16 +50,6 @@ def _tables(layout: bpy.types.UILayout, form: ColumnMapProperties) -> None:
             rest.prop(table, name)
         if i > 0:
             column.prop(table, "rows")
-
-
-def _quantities(layout: bpy.types.UILayout, form: ColumnMapProperties) -> None:
-    """Draw the quantities that are read and, beside them, those that are only compared."""
-    compared = [quantity for quantity in form.quantities if quantity.name in DERIVED]
-    read = [quantity for quantity in form.quantities if quantity.name not in DERIVED]
-    split = layout.split(factor=0.6) if compared else layout
-    _columns(split, "Quantity", read, 0.38)
-    if compared:
-        _columns(split, "Compared", compared, 0.2)
 
 
 def _columns(layout: bpy.types.UILayout, head: str, quantities: list[ColumnMapQuantity], factor: float) -> None:

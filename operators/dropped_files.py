@@ -16,21 +16,18 @@ class _Dropped:
 
 
 class MPHDRR_FH_workbook(_Dropped, bpy.types.FileHandler):
-    bl_idname = ids.FILE_HANDLER_WORKBOOK
     bl_label = "Pinhole Geometry"
     bl_import_operator = ids.IMPORT_GEOMETRY
     bl_file_extensions = ";".join(WORKBOOK_SUFFIXES)
 
 
 class MPHDRR_FH_phantom(_Dropped, bpy.types.FileHandler):
-    bl_idname = ids.FILE_HANDLER_PHANTOM
     bl_label = "Phantom"
     bl_import_operator = ids.IMPORT_PHANTOM
     bl_file_extensions = ".toml"
 
 
 class MPHDRR_FH_volume(_Dropped, bpy.types.FileHandler):
-    bl_idname = ids.FILE_HANDLER_VOLUME
     bl_label = "Volume for Projection"
     bl_import_operator = ids.IMPORT_VOLUME
     # Blender compares the last suffix only. Most .hdr files are pictures of surroundings, not Analyze images.

@@ -10,7 +10,6 @@ from bpy_extras.io_utils import ExportHelper
 
 from ..addon import ids, scanner, scanner_files, selection, storage
 from ..addon.decimals import typed
-from ..addon.reports import run_reported
 from ..addon.scanner_files import WORKBOOK_SUFFIXES
 from ..core.errors import InputError
 from ..core.exchange import FORMAT_NUMBERS, FORMATS
@@ -18,13 +17,11 @@ from ..core.exchange import FORMAT_NUMBERS, FORMATS
 _FORMATS = tuple((f.name, f.name, f.title, FORMAT_NUMBERS[f.name]) for f in FORMATS.values())
 
 
-class MPHDRR_OT_export_geometry(ExportHelper, bpy.types.Operator):
-    """``bpy.ops.mphdrr.export_geometry(filepath="scanner.xlsx")``."""
+class MPHDRR_OT_export_geometry(selection.OnScanner, ExportHelper, bpy.types.Operator):
+    """Write the scanner as it stands in the scene to a workbook, into a copy of the one it came from"""
 
     bl_idname = ids.EXPORT_GEOMETRY
     bl_label = "Export Pinhole Geometry"
-    bl_description = "Write the scanner as it stands in the scene to a workbook, into a copy of the one it came from"
-    bl_options = {"REGISTER", "UNDO"}
 
     filename_ext = ".xlsx"
     filepath: StringProperty(name="File", description="Workbook to write", subtype="FILE_PATH", options={"SKIP_SAVE"})
@@ -35,10 +32,6 @@ class MPHDRR_OT_export_geometry(ExportHelper, bpy.types.Operator):
         "charts and formats stay. Otherwise a new workbook is made",
         default=True,
     )
-
-    @classmethod
-    def poll(cls, context: bpy.types.Context) -> bool:
-        return selection.poll_scanner(cls, context)
 
     def invoke(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str]:
         workbook = scanner.required_scanner(context.scene).mphdrr_scanner.workbook
@@ -55,21 +48,15 @@ class MPHDRR_OT_export_geometry(ExportHelper, bpy.types.Operator):
         self.filepath += self.filename_ext
         return True
 
-    def execute(self, context: bpy.types.Context) -> set[str]:
-        def export() -> str:
-            if not self.filepath:
-                raise InputError("no file given: set filepath to a name ending in .xlsx")
-            path = storage.absolute(self.filepath)
-            collection = scanner.required_scanner(context.scene)
-            system = scanner_files.export_scanner(collection, path, self.use_template)
-            return f"Wrote {len(system)} modules to {path}"
-
-        return run_reported(self, export)
+    def change(self, context: bpy.types.Context, collection: bpy.types.Collection) -> str:
+        if not self.filepath:
+            raise InputError("no file given: set filepath to a name ending in .xlsx")
+        path = storage.absolute(self.filepath)
+        system = scanner_files.export_scanner(collection, path, self.use_template)
+        return f"Wrote {len(system)} modules to {path}"
 
 
-class MPHDRR_OT_export_for_program(ExportHelper, bpy.types.Operator):
-    """``bpy.ops.mphdrr.export_for_program(format="astra", filepath="scanner.npz")``."""
-
+class MPHDRR_OT_export_for_program(selection.OnScanner, ExportHelper, bpy.types.Operator):
     bl_idname = ids.EXPORT_FOR_PROGRAM
     bl_label = "Export Geometry for a Program"
     bl_description = (
@@ -84,10 +71,6 @@ class MPHDRR_OT_export_for_program(ExportHelper, bpy.types.Operator):
     )  # fmt: skip
     format: EnumProperty(name="Format", description="What is written", items=_FORMATS)
 
-    @classmethod
-    def poll(cls, context: bpy.types.Context) -> bool:
-        return selection.poll_scanner(cls, context)
-
     def check(self, context: bpy.types.Context) -> bool:
         """Give the name the format's suffix."""
         path, suffixes = Path(self.filepath), FORMATS[self.format].suffixes
@@ -98,33 +81,18 @@ class MPHDRR_OT_export_for_program(ExportHelper, bpy.types.Operator):
         before, self.filepath = self.filepath, str(stem) + (suffixes[0] if suffixes else "")
         return before != self.filepath
 
-    def execute(self, context: bpy.types.Context) -> set[str]:
-        def export() -> str:
-            if not self.filepath:
-                raise InputError("no file given: set filepath")
-            path, images = storage.absolute(self.filepath), context.scene.mphdrr_projections
-            system = scanner_files.export_for_program(
-                scanner.required_scanner(context.scene),
-                path,
-                self.format,
-                (images.height, images.width),
-                images.detector.lower(),
-                typed(images.magnification),
-            )
-            return f"Wrote {len(system)} modules to {path}"
-
-        return run_reported(self, export)
+    def change(self, context: bpy.types.Context, collection: bpy.types.Collection) -> str:
+        if not self.filepath:
+            raise InputError("no file given: set filepath")
+        path, images = storage.absolute(self.filepath), context.scene.mphdrr_projections
+        shape, magnification = (images.height, images.width), typed(images.magnification)
+        system = scanner_files.export_for_program(
+            collection, path, self.format, shape, images.detector.lower(), magnification
+        )
+        return f"Wrote {len(system)} modules to {path}"
 
     def draw(self, context: bpy.types.Context) -> None:
-        layout = self.layout
-        layout.prop(self, "format")
+        self.layout.prop(self, "format")
         format = FORMATS[self.format]
-        column = layout.column(align=True)
         for line in (format.title, f"Suffix {', '.join(format.suffixes)}" if format.suffixes else "A new folder"):
-            column.label(text=line, icon="DOT")
-
-
-def draw_menu(self: bpy.types.Menu, context: bpy.types.Context) -> None:
-    """The entry of File > Export."""
-    self.layout.operator(ids.EXPORT_GEOMETRY, text="Pinhole Geometry (.xlsx)")
-    self.layout.operator(ids.EXPORT_FOR_PROGRAM, text="Pinhole Geometry for Programs")
+            self.layout.label(text=line, icon="DOT")

@@ -36,9 +36,3 @@ class MPHDRR_OT_export_volume(jobs.JobOperator, bpy.types.Operator):
         if not self.filepath:
             raise InputError(f"no file given: expected a name ending in {', '.join(WRITTEN_ENDINGS)}")
         return exporting(context.object, storage.absolute(self.filepath))
-
-
-def draw_menu(self: bpy.types.Menu, context: bpy.types.Context) -> None:
-    """The entry of File > Export."""
-    self.layout.operator_context = "INVOKE_DEFAULT"
-    self.layout.operator(ids.EXPORT_VOLUME, text="Volume (.vdb, .nii, .nrrd, ...)")

@@ -1,7 +1,4 @@
-"""File > Import > Pinhole Geometry: a workbook becomes a scanner.
-
-Where the reader does not understand the headings, the user answers in the column map dialog; a script sets `columns`.
-"""
+"""File > Import > Pinhole Geometry: a workbook becomes a scanner, with the column map dialog where headings are unclear."""
 
 from __future__ import annotations
 
@@ -12,7 +9,6 @@ import bpy
 from bpy.props import BoolProperty, FloatProperty, IntVectorProperty, StringProperty
 
 from ..addon import column_maps, ids, scanner
-from ..addon.preferences import preferences
 from ..addon.reports import run_reported, warnings_reported
 from ..addon.scanner_files import WORKBOOK_SUFFIXES
 from ..core.errors import InputError
@@ -23,13 +19,10 @@ from . import column_map_dialog
 
 
 class MPHDRR_OT_import_geometry(bpy.types.Operator):
-    """``bpy.ops.mphdrr.import_geometry(filepath="scanner.xlsx", columns="map.toml")``."""
+    """Read a workbook of pinhole modules and build the scanner: a camera, a collimator and a crystal each"""
 
     bl_idname = ids.IMPORT_GEOMETRY
     bl_label = "Import Pinhole Geometry"
-    bl_description = (
-        "Read a workbook of pinhole modules and build the scanner: a camera, a collimator and a crystal each"
-    )
     bl_options = {"REGISTER", "UNDO"}
 
     filepath: StringProperty(name="File", description="Workbook to read", subtype="FILE_PATH", options={"SKIP_SAVE"})
@@ -67,11 +60,6 @@ class MPHDRR_OT_import_geometry(bpy.types.Operator):
     )
 
     def invoke(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str]:
-        defaults = preferences(context)
-        if defaults is not None:
-            for name in ("plate_thickness", "wall_thickness"):
-                if not self.properties.is_property_set(name):
-                    setattr(self, name, getattr(defaults, name))
         if not self.filepath:
             context.window_manager.fileselect_add(self)
             return {"RUNNING_MODAL"}
@@ -101,7 +89,11 @@ class MPHDRR_OT_import_geometry(bpy.types.Operator):
         if old is not None and not self.replace and self._has_window():
             self._losses = scanner.losses(old)
             if self._losses:
-                return self._ask_to_replace(context, old)
+                self._dialog = "REPLACE"
+                self.replace = True  # the dialog's button calls execute again
+                return context.window_manager.invoke_props_dialog(
+                    self, width=440, title=f"Replace '{old.name}'?", confirm_text="Replace"
+                )
         return run_reported(self, lambda: self._build(context, system))
 
     def _build(self, context: bpy.types.Context, system: PinholeSystem) -> str:
@@ -134,13 +126,8 @@ class MPHDRR_OT_import_geometry(bpy.types.Operator):
             return
         layout.use_property_split = True
         layout.use_property_decorate = False
-        layout.prop(self, "name")
-        column = layout.column(align=True)
-        column.prop(self, "plate_thickness")
-        column.prop(self, "wall_thickness")
-        layout.prop(self, "image_size")
-        layout.prop(self, "columns")
-        layout.prop(self, "choose_columns")
+        for name in ("name", "plate_thickness", "wall_thickness", "image_size", "columns", "choose_columns"):
+            layout.prop(self, name)
 
     _dialog: Literal["", "COLUMNS", "REPLACE"] = ""  # which one is open
     _losses: list[str] | tuple[str, ...] = ()
@@ -173,15 +160,3 @@ class MPHDRR_OT_import_geometry(bpy.types.Operator):
         return context.window_manager.invoke_props_dialog(
             self, width=column_map_dialog.WIDTH, title=f"Columns of {self._workbook().name}", confirm_text="Import"
         )
-
-    def _ask_to_replace(self, context: bpy.types.Context, old: bpy.types.Collection) -> set[str]:
-        self._dialog = "REPLACE"
-        self.replace = True  # the dialog's button calls execute again
-        return context.window_manager.invoke_props_dialog(
-            self, width=440, title=f"Replace '{old.name}'?", confirm_text="Replace"
-        )
-
-
-def draw_menu(self: bpy.types.Menu, context: bpy.types.Context) -> None:
-    """The entry of File > Import."""
-    self.layout.operator(ids.IMPORT_GEOMETRY, text="Pinhole Geometry (.xlsx)")

@@ -157,12 +157,6 @@ class MPHDRR_OT_import_volume_sequence(ReadVolumes, bpy.types.Operator):
         return self.importing(paths, self.name or common, self.frame_start)
 
 
-def draw_menu(self: bpy.types.Menu, context: bpy.types.Context) -> None:
-    """The entries of File > Import."""
-    self.layout.operator(ids.IMPORT_VOLUME, text="Volume for Projection (.nii, DICOM, .nrrd, .vdb, ...)")
-    self.layout.operator(ids.IMPORT_VOLUME_SEQUENCE, text="Volume Sequence (.nii, .nrrd, .vdb, ...)")
-
-
 def _by_number(name: str) -> list[tuple[int, str]]:
     """What to sort names by so that "beat2" comes before "beat10"."""
     return [(int(part) if part.isdecimal() else -1, part.lower()) for part in re.split(r"(\d+)", name)]

@@ -1,4 +1,4 @@
-"""What a user does with modules: show, aim, duplicate, remove, tidy and renumber them, copy their numbers, check them."""
+"""What a user does with modules: show, aim, duplicate, remove, tidy, renumber, check and map them."""
 
 from __future__ import annotations
 
@@ -7,42 +7,16 @@ import math
 import bpy
 from bpy.props import BoolProperty, EnumProperty, FloatProperty, IntProperty
 
-from ..addon import copies, following, ids, renumbering, scanner, selection
-from ..addon.replacement import modules_text
-from ..addon.reports import run_reported
+from ..addon import ids, jobs, maps, module_edits, scanner, selection
+from ..addon.decimals import typed
+from ..addon.scanner_parts import modules_text
 
 
-class _OnScanner:
-    """Mixed into operators that change the scanner that the panels work on."""
-
-    bl_options = {"REGISTER", "UNDO"}
-
-    @classmethod
-    def poll(cls, context: bpy.types.Context) -> bool:
-        return selection.poll_scanner(cls, context)
-
-    def execute(self, context: bpy.types.Context) -> set[str]:
-        return run_reported(self, lambda: self.change(context, scanner.required_scanner(context.scene)))
-
-    def change(self, context: bpy.types.Context, collection: bpy.types.Collection) -> str:
-        """Do the work and return the line to report; raises InputError."""
-        raise NotImplementedError
-
-
-class _OnModules(_OnScanner):
-    """Mixed into operators that work on the selected modules."""
-
-    @classmethod
-    def poll(cls, context: bpy.types.Context) -> bool:
-        return selection.poll_module(cls, context)
-
-
-class MPHDRR_OT_show_modules(_OnScanner, bpy.types.Operator):
-    """``bpy.ops.mphdrr.show_modules(first=1, last=40, mode="ONLY")``."""
+class MPHDRR_OT_show_modules(selection.OnScanner, bpy.types.Operator):
+    """Show or hide modules with their collimators and crystals, in the viewport and in renders"""
 
     bl_idname = ids.SHOW_MODULES
     bl_label = "Show Modules"
-    bl_description = "Show or hide modules with their collimators and crystals, in the viewport and in renders"
 
     first: IntProperty(name="First", description="First module number of the range", default=1)
     last: IntProperty(name="Last", description="Last module number of the range", default=1)
@@ -57,26 +31,15 @@ class MPHDRR_OT_show_modules(_OnScanner, bpy.types.Operator):
         default="ONLY",
     )
 
-    @classmethod
-    def description(cls, context: bpy.types.Context, properties: bpy.types.OperatorProperties) -> str:
-        modules = f"modules {properties.first} to {properties.last}"
-        return {
-            "ONLY": f"Show {modules} and hide all others, in the viewport and in renders",
-            "SHOW": f"Show {modules}",
-            "HIDE": f"Hide {modules}",
-            "ALL": "Show all modules",
-        }[properties.mode]
-
     def change(self, context: bpy.types.Context, collection: bpy.types.Collection) -> str:
         return f"{scanner.show_modules(collection, self.first, self.last, self.mode)} modules visible"
 
 
-class MPHDRR_OT_look_through_module(_OnScanner, bpy.types.Operator):
-    """``bpy.ops.mphdrr.look_through_module(number=7)``."""
+class MPHDRR_OT_look_through_module(selection.OnScanner, bpy.types.Operator):
+    """Make the module's pinhole camera the scene's camera, and look through it"""
 
     bl_idname = ids.LOOK_THROUGH_MODULE
     bl_label = "Look Through Module"
-    bl_description = "Make the module's pinhole camera the scene's camera, and look through it"
 
     number: IntProperty(name="Number", description="Module number", default=1)
 
@@ -87,24 +50,22 @@ class MPHDRR_OT_look_through_module(_OnScanner, bpy.types.Operator):
         return f"Looking through {context.scene.camera.name}"
 
 
-class MPHDRR_OT_aim_modules(_OnScanner, bpy.types.Operator):
-    """``bpy.ops.mphdrr.aim_modules()``."""
+class MPHDRR_OT_aim_modules(selection.OnScanner, bpy.types.Operator):
+    """Turn every module that does not look at the isocentre, without moving it"""
 
     bl_idname = ids.AIM_MODULES
     bl_label = "Aim at Isocentre"
-    bl_description = "Turn every module that does not look at the isocentre, without moving it"
 
     def change(self, context: bpy.types.Context, collection: bpy.types.Collection) -> str:
         aimed = scanner.aim_modules(collection)
         return f"Turned {modules_text(aimed)}" if aimed else "All modules aim at the isocentre"
 
 
-class MPHDRR_OT_duplicate_modules(_OnModules, bpy.types.Operator):
-    """``bpy.ops.mphdrr.duplicate_modules(count=3, angle=math.radians(9))``: the selected modules."""
+class MPHDRR_OT_duplicate_modules(selection.OnModules, bpy.types.Operator):
+    """Copy the selected modules, with collimators and crystals, to further places on their rings"""
 
     bl_idname = ids.DUPLICATE_MODULES
     bl_label = "Duplicate Along Ring"
-    bl_description = "Copy the selected modules, with collimators and crystals, to further places on their rings"
 
     count: IntProperty(name="Copies", description="Number of copies of each module", default=1, min=1, soft_max=40)
     angle: FloatProperty(
@@ -119,28 +80,25 @@ class MPHDRR_OT_duplicate_modules(_OnModules, bpy.types.Operator):
 
     def change(self, context: bpy.types.Context, collection: bpy.types.Collection) -> str:
         modules = selection.selected_modules(context)
-        made = copies.duplicate(collection, modules, self.count, self.angle, self.follow_ring)
+        made = module_edits.duplicate(collection, modules, self.count, self.angle, self.follow_ring)
         selection.select(context, made)
         return f"Made {modules_text([o.mphdrr_module.number for o in made])}"
 
 
-class MPHDRR_OT_remove_modules(_OnModules, bpy.types.Operator):
-    """``bpy.ops.mphdrr.remove_modules()``: the selected modules."""
+class MPHDRR_OT_remove_modules(selection.OnModules, bpy.types.Operator):
+    """Delete the selected modules with their collimators and crystals"""
 
     bl_idname = ids.REMOVE_MODULES
     bl_label = "Remove Modules"
-    bl_description = "Delete the selected modules with their collimators and crystals"
 
     def change(self, context: bpy.types.Context, collection: bpy.types.Collection) -> str:
         modules = selection.selected_modules(context)
         text = modules_text([o.mphdrr_module.number for o in modules])
-        copies.remove(collection, modules)
+        module_edits.remove(collection, modules)
         return f"Removed {text}"
 
 
-class MPHDRR_OT_tidy_modules(_OnScanner, bpy.types.Operator):
-    """``bpy.ops.mphdrr.tidy_modules()``: in all scanners of the scene."""
-
+class MPHDRR_OT_tidy_modules(selection.OnScanner, bpy.types.Operator):
     bl_idname = ids.TIDY_MODULES
     bl_label = "Tidy Modules"
     bl_description = (
@@ -149,19 +107,18 @@ class MPHDRR_OT_tidy_modules(_OnScanner, bpy.types.Operator):
     )
 
     def change(self, context: bpy.types.Context, collection: bpy.types.Collection) -> str:
-        tidied = [copies.tidy(each) for each in scanner.scanners(context.scene)]
+        tidied = [module_edits.tidy(each) for each in scanner.scanners(context.scene)]
         made, removed = [n for numbers, _ in tidied for n in numbers], sum(n for _, n in tidied)
         done = [f"made {modules_text(made)}"] if made else []
         done += [f"removed {removed} parts without a camera"] if removed else []
         return " and ".join(done).capitalize() or "All modules are in order"
 
 
-class MPHDRR_OT_renumber_modules(_OnScanner, bpy.types.Operator):
-    """``bpy.ops.mphdrr.renumber_modules(order="RINGS")``."""
+class MPHDRR_OT_renumber_modules(selection.OnScanner, bpy.types.Operator):
+    """Number all modules 1, 2, ...; they are listed, projected and exported in that order from now on"""
 
     bl_idname = ids.RENUMBER_MODULES
     bl_label = "Renumber Modules"
-    bl_description = "Number all modules 1, 2, ...; they are listed, projected and exported in that order from now on"
 
     order: EnumProperty(
         name="Order",
@@ -173,30 +130,11 @@ class MPHDRR_OT_renumber_modules(_OnScanner, bpy.types.Operator):
     )
 
     def change(self, context: bpy.types.Context, collection: bpy.types.Collection) -> str:
-        changed = renumbering.renumber(collection, self.order)
+        changed = module_edits.renumber(collection, self.order)
         return f"Numbered {len(scanner.modules(collection))} modules: {changed} have another number than before"
 
 
-class MPHDRR_OT_set_numbers(_OnModules, bpy.types.Operator):
-    """``bpy.ops.mphdrr.set_numbers(to_all=True)``."""
-
-    bl_idname = ids.SET_NUMBERS
-    bl_label = "Copy Numbers to Selected"
-    bl_description = "Give the selected modules, or all, the active module's d, l, Ld, Td and R"
-
-    to_all: BoolProperty(name="All", description="Give them to all modules of the scanner", options={"SKIP_SAVE"})
-
-    def change(self, context: bpy.types.Context, collection: bpy.types.Collection) -> str:
-        selected = selection.selected_modules(context)
-        source = selection.active_module(context) or selected[0]
-        targets = {*(scanner.modules(collection) if self.to_all else selected), source}
-        following.copy_numbers(collection, source, targets - {source})
-        return f"{len(targets)} modules have the numbers of {source.name}"
-
-
-class MPHDRR_OT_check_geometry(_OnScanner, bpy.types.Operator):
-    """``bpy.ops.mphdrr.check_geometry()``."""
-
+class MPHDRR_OT_check_geometry(selection.OnScanner, bpy.types.Operator):
     bl_idname = ids.CHECK_GEOMETRY
     bl_label = "Check Geometry"
     bl_description = (
@@ -211,3 +149,26 @@ class MPHDRR_OT_check_geometry(_OnScanner, bpy.types.Operator):
         if concerned:
             selection.select(context, concerned)
         return f"{len(found)} findings at {len(concerned)} modules: see the Design panel"
+
+
+class MPHDRR_OT_add_map(selection.NeedsScanner, jobs.JobOperator, bpy.types.Operator):
+    bl_idname = ids.ADD_MAP
+    bl_label = "Add Map"
+    bl_description = (
+        "Calculate what the scanner, with ideal modules, does in every voxel around the isocentre, and show it as a "
+        "volume, in place of the last map of this quantity"
+    )
+    bl_options = {"REGISTER", "UNDO"}
+
+    quantity: EnumProperty(name="Quantity", description="What is mapped", items=maps.QUANTITIES)
+    voxels: IntProperty(
+        name="Voxels", description="Voxels along each side of the map", default=64, min=2, soft_max=256, max=1024
+    )
+    side: FloatProperty(
+        name="Side (mm)", description="Side of the map's cube in mm; 0 takes the diameter of the ROI", default=0.0,
+        min=0.0, soft_max=500.0,
+    )  # fmt: skip
+    within_roi: BoolProperty(name="Within ROI", description="Leave out what lies outside the ROI sphere", default=True)
+
+    def job(self, context: bpy.types.Context) -> jobs.Job:
+        return maps.mapping(context.scene, self.quantity, self.voxels, typed(self.side), self.within_roi)

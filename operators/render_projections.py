@@ -1,16 +1,20 @@
-"""Project a volume into the scanner's modules, as a job."""
+"""Project a volume into the scanner's modules, as a job; load its settings, show and export its result."""
 
 from __future__ import annotations
 
 import math
+from pathlib import Path
 from typing import Any
 
 import bpy
 from bpy.props import FloatProperty, StringProperty
+from bpy_extras.io_utils import ExportHelper, ImportHelper
 
-from ..addon import ids, images, jobs, rendering, scanner
+from ..addon import ids, images, jobs, rendering, scanner, storage
 from ..addon.decimals import typed
 from ..addon.projection_properties import OPENING_ANGLE, ProjectionSettings, settings_recipe
+from ..addon.reports import run_reported
+from ..core.errors import InputError
 
 
 class MPHDRR_OT_render_projections(ProjectionSettings, jobs.JobOperator, bpy.types.Operator):
@@ -47,7 +51,29 @@ class MPHDRR_OT_render_projections(ProjectionSettings, jobs.JobOperator, bpy.typ
         coefficient = name.replace("_material", "_mu")
         if not self.properties.is_property_set(name) and self.properties.is_property_set(coefficient):
             return "NUMBER"
-        return getattr(self if self.properties.is_property_set(name) else getattr(scene, ids.SCENE_PROJECTIONS), name)
+        return getattr(self if self.properties.is_property_set(name) else scene.mphdrr_projections, name)
+
+
+class MPHDRR_OT_load_recipe(ImportHelper, bpy.types.Operator):
+    bl_idname = ids.LOAD_RECIPE
+    bl_label = "Load Recipe"
+    bl_description = (
+        "Set the panel as a recipe (.toml) or a run (.h5, .npz, .pt) says: model, detector, noise, modules and, where the "
+        "scene has objects of their names, volumes. By default the recipe of the last run"
+    )
+    bl_options = {"REGISTER", "UNDO"}
+
+    filter_glob: StringProperty(default="*.toml;*.h5;*.hdf5;*.npz;*.pt", options={"HIDDEN"})
+
+    def execute(self, context: bpy.types.Context) -> set[str]:
+        def load() -> str:
+            filepath = self.filepath or context.scene.mphdrr_projections.run_file
+            if not filepath:
+                raise InputError("no file given: set filepath to a recipe (.toml) or a run (.h5, .npz, .pt)")
+            rendering.load_recipe(context.scene, Path(storage.absolute(filepath)))
+            return f"Set the panel as {bpy.path.basename(filepath)} says"
+
+        return run_reported(self, load)
 
 
 class MPHDRR_OT_show_projections(bpy.types.Operator):
@@ -67,3 +93,23 @@ class MPHDRR_OT_show_projections(bpy.types.Operator):
             self.report({"ERROR"}, "no window with a 3D view to open an Image Editor in")
             return {"CANCELLED"}
         return {"FINISHED"}
+
+
+class MPHDRR_OT_export_dataset(ExportHelper, bpy.types.Operator):
+    """Write the last run, with geometry, volume and provenance, as HDF5 (.h5), NumPy (.npz) or PyTorch (.pt)"""
+
+    bl_idname = ids.EXPORT_DATASET
+    bl_label = "Export mphDRR Dataset"
+
+    filename_ext = ".h5"
+    filter_glob: StringProperty(default="*.h5;*.hdf5;*.npz;*.pt", options={"HIDDEN"})
+
+    def check(self, context: bpy.types.Context) -> bool:
+        """Give a name without suffix the default one; the other formats' suffixes stay."""
+        if Path(self.filepath).suffix:
+            return False
+        self.filepath += self.filename_ext
+        return True
+
+    def execute(self, context: bpy.types.Context) -> set[str]:
+        return run_reported(self, lambda: f"Wrote {rendering.export_run(context.scene, self.filepath)}")

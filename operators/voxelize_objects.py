@@ -86,14 +86,6 @@ class MPHDRR_OT_mesh_from_volume(jobs.JobOperator, bpy.types.Operator):
         return meshes.extracting(context.object, typed(self.level) or None)
 
 
-def draw_menu(self: bpy.types.Menu, context: bpy.types.Context) -> None:
-    """The entries of Object > Convert."""
-    self.layout.separator()
-    self.layout.operator_context = "INVOKE_DEFAULT"
-    self.layout.operator(ids.VOXELIZE_OBJECTS, icon="OUTLINER_DATA_VOLUME")
-    self.layout.operator(ids.MESH_FROM_VOLUME, icon="OUTLINER_DATA_MESH")
-
-
 def _chosen(context: bpy.types.Context) -> list[bpy.types.Object]:
     """The selected mesh objects by name, without the scanner's own."""
     found = [o for o in context.selected_objects if o.type == "MESH" and o.mphdrr_module.part == "NONE"]

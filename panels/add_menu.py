@@ -9,15 +9,13 @@ from ..addon.phantom_properties import menu_entries
 
 
 class MPHDRR_MT_add(bpy.types.Menu):
-    bl_idname = ids.MENU_ADD
     bl_label = "mphDRR"
 
     def draw(self, context: bpy.types.Context) -> None:
         layout = self.layout
         layout.operator_context = "INVOKE_DEFAULT"
-        for kind, label, _ in menu_entries():
-            layout.operator(ids.ADD_PHANTOM + kind, text=label, icon="OUTLINER_DATA_VOLUME")
         for kind, label, beats in menu_entries():
+            layout.operator(ids.ADD_PHANTOM + kind, text=label, icon="OUTLINER_DATA_VOLUME")
             if beats:
                 layout.operator(
                     ids.ADD_PHANTOM + kind, text=f"Beating {label}", icon="OUTLINER_DATA_VOLUME"
@@ -28,8 +26,3 @@ class MPHDRR_MT_add(bpy.types.Menu):
         layout.operator(ids.IMPORT_VOLUME_SEQUENCE, text="Volume Sequence from Files", icon="RENDER_ANIMATION")
         layout.operator(ids.VOXELIZE_OBJECTS, text="Volume from Meshes", icon="OUTLINER_DATA_MESH")
         layout.operator(ids.ADD_MAP, text="Map of the Scanner", icon="OUTLINER_DATA_LIGHTPROBE")
-
-
-def draw_menu(self: bpy.types.Menu, context: bpy.types.Context) -> None:
-    """The entry of the 3D viewport's Add menu."""
-    self.layout.menu(ids.MENU_ADD, icon="OUTLINER_DATA_VOLUME")

@@ -1,7 +1,4 @@
-"""Sidebar, Geometry > Design: the active module's numbers and what they do, and those of all modules.
-
-Drawing shows readouts that were calculated when something changed (`addon/following.py`).
-"""
+"""Sidebar, Geometry > Design: numbers and readouts (`addon/following.py`) of the active module, and of all modules."""
 
 from __future__ import annotations
 
@@ -27,7 +24,6 @@ _LINE = 32  # letters that fit into the sidebar at its usual width
 class MPHDRR_PT_design(ScannerPanel, bpy.types.Panel):
     """The active module."""
 
-    bl_idname = ids.PANEL_DESIGN
     bl_label = "Design"
 
     def draw_scanner(self, context: bpy.types.Context, collection: bpy.types.Collection) -> None:
@@ -47,9 +43,6 @@ class MPHDRR_PT_design(ScannerPanel, bpy.types.Panel):
         row.operator(ids.DUPLICATE_MODULES, text="Duplicate", icon="DUPLICATE")
         row.operator(ids.REMOVE_MODULES, text="Remove", icon="TRASH")
         row = layout.row(align=True)
-        row.operator(ids.SET_NUMBERS, text="Copy to Selected").to_all = False
-        row.operator(ids.SET_NUMBERS, text="Copy to All").to_all = True
-        row = layout.row(align=True)
         row.prop(properties, "keep_aimed", toggle=True, icon="CON_TRACKTO")
         row.operator(ids.AIM_MODULES)
 
@@ -57,7 +50,6 @@ class MPHDRR_PT_design(ScannerPanel, bpy.types.Panel):
 class MPHDRR_PT_scanner_design(ScannerPanel, bpy.types.Panel):
     """All modules at once, checks and exports."""
 
-    bl_idname = ids.PANEL_SCANNER_DESIGN
     bl_label = "All Modules"
 
     def draw_scanner(self, context: bpy.types.Context, collection: bpy.types.Collection) -> None:
@@ -89,7 +81,7 @@ class MPHDRR_PT_scanner_design(ScannerPanel, bpy.types.Panel):
         column = layout.column(align=True)
         column.operator_context = "INVOKE_DEFAULT"
         column.operator_menu_enum(ids.ADD_MAP, "quantity", text="Add Map", icon="OUTLINER_DATA_VOLUME")
-        jobs.draw_job(column, context)
+        jobs.draw_job(column)
         column = layout.column(align=True)
         column.operator_context = "INVOKE_DEFAULT"
         column.operator(ids.EXPORT_GEOMETRY, text="Export Workbook", icon="EXPORT")
@@ -124,12 +116,9 @@ def _draw_numbers(
     for name, label in _LABELS:
         column.prop(numbers, name, text=_label(label, name in mixed))
     column.row(align=True).prop(numbers, "length_mode", expand=True)
-    if numbers.length_mode == "TYPED":
-        column.prop(numbers, "collimator_length", text=_label("Length l", "collimator_length" in mixed))
-    elif "collimator_length" not in mixed:
-        row = column.row(align=True)
-        row.enabled = False  # it follows the others
-        row.prop(numbers, "collimator_length", text=_label("Length l", False))
+    row = column.row(align=True)
+    row.enabled = numbers.length_mode == "TYPED"  # otherwise it follows the others
+    row.prop(numbers, "collimator_length", text=_label("Length l", "collimator_length" in mixed))
     return column
 
 

@@ -6,13 +6,19 @@ import json
 
 import bpy
 
-from ..addon import ids, scanner
+from ..addon import ids, scanner, selection
+
+
+class Sidebar:
+    """Mixed into the panels of the extension's tab."""
+
+    bl_space_type = "VIEW_3D"
+    bl_region_type = "UI"
+    bl_category = ids.CATEGORY
 
 
 class MPHDRR_UL_modules(bpy.types.UIList):
     """The modules among a scanner's objects, by number."""
-
-    bl_idname = ids.LIST_MODULES
 
     def draw_item(
         self, context: bpy.types.Context, layout: bpy.types.UILayout, data: bpy.types.Collection, item: bpy.types.Object,
@@ -46,14 +52,10 @@ class MPHDRR_UL_modules(bpy.types.UIList):
         return flags, order
 
 
-class MPHDRR_PT_geometry(bpy.types.Panel):
+class MPHDRR_PT_geometry(Sidebar, bpy.types.Panel):
     """Import, which scanner it is, and which part of it is shown."""
 
-    bl_idname = ids.PANEL_GEOMETRY
     bl_label = "Geometry"
-    bl_space_type = "VIEW_3D"
-    bl_region_type = "UI"
-    bl_category = ids.CATEGORY
     bl_order = ids.ORDER_GEOMETRY
 
     def draw(self, context: bpy.types.Context) -> None:
@@ -62,11 +64,7 @@ class MPHDRR_PT_geometry(bpy.types.Panel):
         layout.operator(ids.IMPORT_GEOMETRY, text="Import Workbook", icon="IMPORT")
         collection = scanner.active_scanner(context.scene)
         if collection is None:
-            column = layout.column(align=True)
-            column.active = False
-            column.label(text="No scanner in the scene.", icon="INFO")
-            column.label(text="Import a workbook, or drop it", icon="BLANK1")
-            column.label(text="on the viewport.", icon="BLANK1")
+            layout.label(text="Or drop it on the viewport.", icon="INFO")
             return
         if len(scanner.scanners(context.scene)) > 1:
             layout.prop(context.scene.mphdrr_geometry, "scanner", text="")
@@ -84,13 +82,10 @@ class MPHDRR_PT_geometry(bpy.types.Panel):
         _show(row, "All", 0, 0, "ALL")
 
 
-class ScannerPanel:
+class ScannerPanel(Sidebar):
     """Mixed into panels inside Geometry that need a scanner; they draw by `draw_scanner`."""
 
-    bl_parent_id = ids.PANEL_GEOMETRY
-    bl_space_type = "VIEW_3D"
-    bl_region_type = "UI"
-    bl_category = ids.CATEGORY
+    bl_parent_id = "MPHDRR_PT_geometry"
     bl_options = {"DEFAULT_CLOSED"}  # so that Phantom and Projections are in sight
 
     @classmethod
@@ -108,9 +103,6 @@ class ScannerPanel:
 
 
 class MPHDRR_PT_modules(ScannerPanel, bpy.types.Panel):
-    """The modules: which are shown, and looking through one."""
-
-    bl_idname = ids.PANEL_MODULES
     bl_label = "Modules"
 
     def draw_scanner(self, context: bpy.types.Context, collection: bpy.types.Collection) -> None:
@@ -130,15 +122,16 @@ class MPHDRR_PT_modules(ScannerPanel, bpy.types.Panel):
         _columns(head, "  Module", "b (mm)", "l (mm)")
         head.label(text="", icon="BLANK1")
         head.separator(factor=2.0)  # the list's scroll bar
-        layout.template_list(ids.LIST_MODULES, "", collection, "all_objects", state, "active_index", rows=6, maxrows=12)
+        layout.template_list(
+            "MPHDRR_UL_modules", "", collection, "all_objects", state, "active_index", rows=6, maxrows=12
+        )
 
-        items = collection.all_objects
-        active = items[state.active_index] if 0 <= state.active_index < len(items) else None
-        if active is not None and active.mphdrr_module.is_module:
-            text = f"Look Through {active.name}"
-            look = layout.operator(ids.LOOK_THROUGH_MODULE, text=text, icon="OUTLINER_OB_CAMERA")
-            look.number = active.mphdrr_module.number
-        layout.operator(ids.AIM_MODULES, icon="CON_TRACKTO")
+        camera = selection.listed_module(context.scene)
+        if camera is not None:
+            look = layout.operator(
+                ids.LOOK_THROUGH_MODULE, text=f"Look Through {camera.name}", icon="OUTLINER_OB_CAMERA"
+            )
+            look.number = camera.mphdrr_module.number
 
 
 def draw_facts(split: bpy.types.UILayout, *facts: tuple[str, str]) -> None:

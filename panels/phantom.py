@@ -8,16 +8,13 @@ from typing import Any
 import bpy
 
 from ..addon import ids, jobs, outlines, phantoms, slices, storage, volumes
+from .geometry import Sidebar, draw_facts
 
 _LINE = 32  # letters that fit into the sidebar at its usual width
 
 
-class MPHDRR_PT_phantom(bpy.types.Panel):
-    bl_idname = ids.PANEL_PHANTOM
+class MPHDRR_PT_phantom(Sidebar, bpy.types.Panel):
     bl_label = "Phantom"
-    bl_space_type = "VIEW_3D"
-    bl_region_type = "UI"
-    bl_category = ids.CATEGORY
     bl_order = ids.ORDER_PHANTOM
 
     def draw(self, context: bpy.types.Context) -> None:
@@ -28,7 +25,7 @@ class MPHDRR_PT_phantom(bpy.types.Panel):
         adding = layout.column()
         adding.enabled = not jobs.is_running()
         column = adding.column(align=True)
-        column.menu(ids.MENU_ADD, text="Add Phantom", icon="OUTLINER_DATA_VOLUME")
+        column.menu("MPHDRR_MT_add", text="Add Phantom", icon="OUTLINER_DATA_VOLUME")
         column.operator(ids.IMPORT_VOLUME, text="Import Volume", icon="IMPORT")
         if storage.missing_volumes(storage.seems_there):
             column = adding.column(align=True)
@@ -54,10 +51,8 @@ class MPHDRR_PT_phantom(bpy.types.Panel):
 
 def _draw_numbers(layout: bpy.types.UILayout, item: bpy.types.Object) -> None:
     settings = item.mphdrr_volume
-    split = layout.split(factor=0.34)
-    names, values = split.column(align=True), split.column(align=True)
-    names.active = False
-    for name, value in (
+    draw_facts(
+        layout.split(factor=0.34),
         ("Volume", item.name),
         ("Holds", f"{settings.quantity}, {settings.unit}"),
         ("Voxels", " × ".join(map(str, settings.shape))),
@@ -65,9 +60,7 @@ def _draw_numbers(layout: bpy.types.UILayout, item: bpy.types.Object) -> None:
         ("Values", f"{settings.minimum:.4g} to {settings.maximum:.4g}"),
         *([("State", volumes.state_text(item))] if item.data.is_sequence else []),
         ("File", volumes.file_state(item)),
-    ):
-        names.label(text=name)
-        values.label(text=value)
+    )
 
 
 def _draw_display(layout: bpy.types.UILayout, item: bpy.types.Object) -> None:

@@ -1,4 +1,4 @@
-"""Sidebar, third step: the projections."""
+"""Sidebar, third and last step: the projections, and the dataset that they give."""
 
 from __future__ import annotations
 
@@ -8,30 +8,26 @@ import bpy
 
 from ..addon import ids, jobs, scanner, volumes
 from ..addon.projection_properties import drawn, makes_counts
+from .geometry import Sidebar
 
 _MAIN = ("time", "photons", "pixel_points")
 """Settings of models that the panel itself shows; the others stand under Physics."""
 
 
-class MPHDRR_PT_projections(bpy.types.Panel):
-    bl_idname = ids.PANEL_PROJECTIONS
+class MPHDRR_PT_projections(Sidebar, bpy.types.Panel):
     bl_label = "Projections"
-    bl_space_type = "VIEW_3D"
-    bl_region_type = "UI"
-    bl_category = ids.CATEGORY
     bl_order = ids.ORDER_PROJECTIONS
 
     def draw(self, context: bpy.types.Context) -> None:
         layout = self.layout
         layout.use_property_split = True
         layout.use_property_decorate = False
-        settings = getattr(context.scene, ids.SCENE_PROJECTIONS)
-        jobs.draw_job(layout, context)  # at the top, where it is seen on small screens too
+        settings = context.scene.mphdrr_projections
+        jobs.draw_job(layout)  # at the top, where it is seen on small screens too
         column = layout.column()
         column.enabled = not jobs.is_running()
         column.prop(settings, "volume", placeholder="Active volume")
         column.prop(settings, "model")
-        _draw_ct_hint(column, settings, context.object)
         model = [name for name, _ in drawn(settings, "model") if name != "model"]
         _draw(column, settings, "model", [name for name in model if name in _MAIN])
         _draw(column, settings, "detector")
@@ -70,41 +66,21 @@ def _draw(
             row.prop(settings, name)
 
 
-def _draw_ct_hint(
-    layout: bpy.types.UILayout, settings: bpy.types.PropertyGroup, active: bpy.types.Object | None
-) -> None:
-    """A CT that would be projected has to be converted first."""
-    item = settings.volume or active
-    if settings.model == "EMISSION" or not volumes.is_volume(item) or volumes.quantity_of(item) != "hu":
-        return
-    column = layout.column(align=True)
-    column.label(text="CT numbers have no radiograph", icon="ERROR")
-    if item == active:
-        column.operator_context = "INVOKE_DEFAULT"
-        column.operator(ids.CT_TO_ATTENUATION)
-    else:
-        column.label(text="Select the CT, convert it", icon="BLANK1")
-
-
-class MPHDRR_PT_physics(bpy.types.Panel):
-    bl_idname = ids.PANEL_PHYSICS
+class MPHDRR_PT_physics(Sidebar, bpy.types.Panel):
     bl_label = "Physics"
-    bl_parent_id = ids.PANEL_PROJECTIONS
-    bl_space_type = "VIEW_3D"
-    bl_region_type = "UI"
-    bl_category = ids.CATEGORY
+    bl_parent_id = "MPHDRR_PT_projections"
     bl_options = {"DEFAULT_CLOSED"}
 
     @classmethod
     def poll(cls, context: bpy.types.Context) -> bool:
-        return bool(getattr(context.scene, ids.SCENE_PROJECTIONS).model != "INVERSE_SQUARE")
+        return bool(context.scene.mphdrr_projections.model != "INVERSE_SQUARE")
 
     def draw(self, context: bpy.types.Context) -> None:
         layout = self.layout
         layout.use_property_split = True
         layout.use_property_decorate = False
         layout.enabled = not jobs.is_running()
-        settings = getattr(context.scene, ids.SCENE_PROJECTIONS)
+        settings = context.scene.mphdrr_projections
         column = layout.column(align=True)
         if settings.model == "EMISSION":
             column.prop(settings, "mu", placeholder="None")
@@ -118,3 +94,18 @@ class MPHDRR_PT_physics(bpy.types.Panel):
         seed = row.row()
         seed.active = settings.noise
         seed.prop(settings, "seed")
+
+
+class MPHDRR_PT_export(Sidebar, bpy.types.Panel):
+    bl_label = "Export"
+    bl_order = ids.ORDER_EXPORT
+
+    def draw(self, context: bpy.types.Context) -> None:
+        layout = self.layout
+        layout.operator_context = "INVOKE_DEFAULT"
+        run_file = context.scene.mphdrr_projections.run_file
+        layout.enabled = bool(run_file)
+        layout.operator(ids.EXPORT_DATASET, text="Export Dataset", icon="EXPORT")
+        if run_file:
+            kept = run_file if run_file.startswith("//") else "kept when the .blend is saved"
+            layout.label(text=f"Last run: {kept}", icon="FILE")

@@ -14,6 +14,7 @@ from ...core.runs.files import write_run
 from ...core.runs.mosaic import mosaic, write_png
 from ...core.runs.recipe import Recipe
 from ...core.runs.run_recipe import run_recipe
+from .scene import new_scene, quiet, save_scene
 
 EXAMPLE = Path(__file__).parents[2] / "examples" / "dc-spect-80.xlsx"
 EULER_DEGREES = (30.0, 55.0, 0.0)  # tilted, so that modules see along and across the rods
@@ -36,8 +37,6 @@ def add_parser(subparsers) -> None:  # type: ignore[no-untyped-def]
 
 def _run(arguments: argparse.Namespace) -> None:
     out = ensure_folder(arguments.output)
-    from .session import new_scene, quiet, save_scene
-
     scene = new_scene()  # before the long work: without Blender the demo stops here
     from .. import pictures, rendering, scanner, volumes
 

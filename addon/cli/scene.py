@@ -1,14 +1,22 @@
-"""``mphdrr scene WORKBOOK -o FILE.blend``."""
+"""``mphdrr scene WORKBOOK -o FILE.blend``, and the Blender session that commands work in."""
 
 from __future__ import annotations
 
 import argparse
+import contextlib
+import os
+import sys
+from collections.abc import Iterator
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from ...core.cli.options import add_command, add_workbook, chosen_modules, output_path, read_workbook
 from ...core.errors import InputError
 from ...core.runs.files import read_run
 from ...core.volumes.volume_files import read_volume, read_volume_of
+
+if TYPE_CHECKING:
+    import bpy
 
 
 def add_parser(subparsers) -> None:  # type: ignore[no-untyped-def]
@@ -39,18 +47,68 @@ def _run(arguments: argparse.Namespace) -> None:
     mu = read_volume_of(arguments.mu, "mu") if arguments.mu else None
     run = read_run(arguments.run_file) if arguments.run_file else None
 
-    from .session import new_scene, save_scene
-
     blender_scene = new_scene()
-    from .. import ids, rendering, scanner, volumes
+    from .. import rendering, scanner, volumes
 
     scanner.build_scanner(blender_scene, system)
     if volume is not None:
         volumes.add_volume(volume, Path(arguments.volume).name)
     if mu is not None:
-        getattr(blender_scene, ids.SCENE_PROJECTIONS).mu = volumes.add_volume(mu, Path(arguments.mu).name)
+        blender_scene.mphdrr_projections.mu = volumes.add_volume(mu, Path(arguments.mu).name)
     if run is not None:
         volumes.add_volume(run.volume, "Projected volume")
         rendering.show_run(blender_scene, run, Path(arguments.run_file))
     save_scene(path)
     print(path)
+
+
+def new_scene() -> bpy.types.Scene:
+    """An empty scene in an empty file, with the extension registered; raises `InputError` where there is no Blender."""
+    try:
+        import bpy
+    except ModuleNotFoundError:
+        raise InputError(
+            "this command needs Blender: pip install 'mphdrr[blender]', or run blender --command mphdrr"
+        ) from None
+    except ImportError as error:  # a shared library is missing
+        raise InputError(
+            f"Blender's bpy package does not load ({error}); on Debian and Ubuntu install libx11-6 libxi6 libxfixes3 "
+            "libxrender1 libxkbcommon0 libsm6 libgl1"
+        ) from None
+    from .. import ids, registration
+
+    bpy.ops.wm.read_homefile(use_empty=True)
+    if not hasattr(bpy.types.Object, ids.OBJECT_MODULE):
+        registration.register()
+    scene = bpy.context.scene
+    if scene.world is None:
+        scene.world = bpy.data.worlds.new("World")
+    return scene
+
+
+@contextlib.contextmanager
+def quiet() -> Iterator[None]:
+    """Keep what Blender itself prints on standard output, a line for every tile and file, out of sight."""
+    sys.stdout.flush()
+    kept = os.dup(1)
+    nowhere = os.open(os.devnull, os.O_WRONLY)
+    try:
+        os.dup2(nowhere, 1)
+        yield
+    finally:
+        os.dup2(kept, 1)
+        os.close(kept)
+        os.close(nowhere)
+
+
+def save_scene(path: Path) -> None:
+    """Save the file as `path`; Blender itself writes beside it and renames."""
+    import bpy
+
+    try:
+        # No .blend1 beside the result of a command.
+        bpy.context.preferences.filepaths.save_version = 0
+        with quiet():
+            bpy.ops.wm.save_as_mainfile(filepath=os.path.abspath(path), check_existing=False)
+    except RuntimeError as error:
+        raise InputError(f"{path}: cannot be written ({str(error).strip().splitlines()[0]})") from error

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 import mphdrr.core as mph
-from mphdrr.addon import cameras, collimators, copies, following, live_scanner, registration, scanner
+from mphdrr.addon import cameras, collimators, following, live_scanner, module_edits, registration, scanner
 from mphdrr.addon.module_values import module_numbers
 from mphdrr.core.errors import InputError, InputWarning
 from mphdrr.core.geometry.system import PinholeSystem
@@ -355,7 +355,7 @@ def test_duplicates_stand_along_the_ring(collection, roi_system):
     with pytest.raises(RuntimeError, match="place of another module"):
         bpy.ops.mphdrr.duplicate_modules(count=1, angle=0.0)
 
-    made = copies.duplicate(collection, [scanner.module(collection, 1)], 1, np.radians(30.0), follow_ring=True)
+    made = module_edits.duplicate(collection, [scanner.module(collection, 1)], 1, np.radians(30.0), follow_ring=True)
     x, y, z = module_numbers(made[0]).center
     radii = np.hypot(*roi_system.centers[:2, :2].T)
     assert min(radii) < np.hypot(x, y) < max(radii) and z == pytest.approx(-30.0)
@@ -377,19 +377,6 @@ def test_modules_are_removed_with_their_parts(collection):
     select(*scanner.modules(collection))
     with pytest.raises(RuntimeError, match="at least one module"):
         bpy.ops.mphdrr.remove_modules()
-
-
-def test_numbers_are_given_to_others(collection):
-    scanner.module(collection, 3).mphdrr_module.pinhole_diameter = 3.3
-    scanner.module(collection, 3).mphdrr_module.collimator_length = 58.2
-    select(scanner.module(collection, 3), scanner.module(collection, 7))
-    bpy.ops.mphdrr.set_numbers()
-    system = scanner.read_scanner(collection)
-    assert [m + 1 for m in range(8) if system.pinhole_diameter[m] == 3.3] == [3, 7]
-    assert [m + 1 for m in range(8) if system.collimator_length[m] == 58.2] == [3, 7]
-    bpy.ops.mphdrr.set_numbers(to_all=True)
-    assert scanner.read_scanner(collection).collimator_length.tolist() == [58.2] * 8
-    assert_consistent(collection)
 
 
 def test_check_marks_the_modules_until_something_changes(collection):

@@ -10,7 +10,7 @@ import bpy
 import numpy as np
 import pytest
 
-from mphdrr.addon import copies, scanner
+from mphdrr.addon import module_edits, scanner
 from mphdrr.core.errors import InputError, InputWarning
 from mphdrr.core.workbook import read_system
 
@@ -58,9 +58,9 @@ def random_edits(rng: np.random.Generator, collection: bpy.types.Collection) -> 
             case 3:
                 module.collimator_length = rng.uniform(40.0, 90.0)
             case 4:
-                copies.duplicate(collection, [camera], 1, rng.uniform(0.01, 0.03), bool(rng.integers(2)))
+                module_edits.duplicate(collection, [camera], 1, rng.uniform(0.01, 0.03), bool(rng.integers(2)))
             case 5:
-                copies.remove(collection, [camera])
+                module_edits.remove(collection, [camera])
             case 6:
                 module.detector_side, module.detector_thickness = rng.uniform(40.0, 60.0), rng.uniform(5.0, 12.0)
         bpy.context.view_layer.update()
@@ -85,8 +85,8 @@ def test_random_edits_come_back_from_the_workbook(scene, collection, tmp_path, s
 
 
 def test_modules_keep_the_order_of_the_workbook_and_added_ones_come_last(collection, tmp_path):
-    copies.duplicate(collection, [scanner.module(collection, 5)], 1, 0.02, follow_ring=False)
-    copies.remove(collection, [scanner.module(collection, 2)])
+    module_edits.duplicate(collection, [scanner.module(collection, 5)], 1, 0.02, follow_ring=False)
+    module_edits.remove(collection, [scanner.module(collection, 2)])
     bpy.ops.mphdrr.export_geometry(filepath=str(tmp_path / "a.xlsx"))
     assert read_system(tmp_path / "a.xlsx").numbers.tolist() == [1, *range(3, 18)]
     assert not scanner.module(collection, 17).mphdrr_module.added

@@ -321,10 +321,9 @@ def test_stop_ends_the_thread_of_the_running_job(monkeypatch):
     before = warnings.showwarning, list(warnings.filters)
     run = _run_in_thread(work)
     monkeypatch.setattr(jobs, "_current", run)
-    state = bpy.context.window_manager.mphdrr_job
-    assert state.running and state.label == "Test"
+    assert jobs.is_running() and jobs.current().label == "Test"
     jobs.stop()
-    assert not run.alive and not state.running and state.progress == 0
+    assert not run.alive and jobs.current() is None
     assert (warnings.showwarning, list(warnings.filters)) == before
 
 

@@ -1,21 +1,25 @@
-"""Modules made and removed in the scene: duplicates, copied cameras, and parts whose camera was deleted.
-
-All of this makes or removes datablocks: it is for operators, which are undo steps, not for handlers.
-"""
+"""Modules made, removed and renumbered in the scene, by operators (undo steps), not by handlers."""
 
 from __future__ import annotations
 
+import json
+import re
 from collections.abc import Sequence
+from typing import Literal
 
 import bpy
 import numpy as np
 from numpy.typing import NDArray
 
 from ..core.errors import InputError
+from ..core.geometry.ring_fits import ring_order
+from ..core.recording import recorded_warnings
 from . import cameras, collimators, following, ids, scanner
 from .following import PARTS
 from .module_values import add_module, module_numbers
 from .scanner_parts import new_part
+
+_OURS = re.compile(r"(Module|Collimator|Crystal) \d+(\.\d+)?")  # a name that the extension gave
 
 
 def copied_cameras(collection: bpy.types.Collection) -> list[bpy.types.Object]:
@@ -50,20 +54,18 @@ def untidy_text(collection: bpy.types.Collection) -> str:
     """What `tidy` would put in order, in words; empty where all is in order."""
     copied = copied_cameras(collection)
     bare = [camera for camera in bare_cameras(collection) if camera not in copied]
-    orphans = orphan_parts(collection)
-    texts = (
-        f"{len(copied)} copied camera{'s' * (len(copied) > 1)}" if copied else "",
-        f"{len(bare)} bare camera{'s' * (len(bare) > 1)}" if bare else "",
-        f"{len(orphans)} part{'s' * (len(orphans) > 1)} without a camera" if orphans else "",
+    found = (
+        ("copied camera{}", copied),
+        ("bare camera{}", bare),
+        ("part{} without a camera", orphan_parts(collection)),
     )
-    return ", ".join(text for text in texts if text)
+    return ", ".join(f"{len(items)} {text.format('s' * (len(items) > 1))}" for text, items in found if items)
 
 
 def tidy(collection: bpy.types.Collection) -> tuple[list[int], int]:
     """Make modules of copied cameras, and remove parts without a camera.
 
-    Returns the new modules' numbers, and how many parts were removed. Raises InputError where a copy's shapes cannot be
-    built, and leaves the scene as it was.
+    Returns the new modules' numbers, and how many parts were removed. Where a shape cannot be built nothing is changed.
     """
     copied, orphans, numbers = copied_cameras(collection), orphan_parts(collection), []
     _require_solids(collection, [*copied, *bare_cameras(collection)])
@@ -82,10 +84,7 @@ def tidy(collection: bpy.types.Collection) -> tuple[list[int], int]:
 def adopt(
     collection: bpy.types.Collection, camera: bpy.types.Object, center: NDArray[np.float64] | None = None
 ) -> None:
-    """Make the copy of a module's camera a module with a new number, a collimator and a crystal.
-
-    `center` is its pinhole (3,), mm, in float64; by default it is where the camera stands.
-    """
+    """Make the copy of a module's camera a module of its own, with its pinhole at `center` (3,), mm, or where it stands."""
     found = [o for o in scanner.modules(collection) if o != camera]
     number = max(o.mphdrr_module.number for o in found) + 1
     if not following.parts_of(collection, [camera])[camera]:
@@ -112,10 +111,8 @@ def _require_solids(collection: bpy.types.Collection, modules: Sequence[bpy.type
 def _add_parts(collection: bpy.types.Collection, camera: bpy.types.Object) -> None:
     construction = following.construction(collection.mphdrr_scanner)
     for part in PARTS:
-        name, solid = (
-            ids.part_name(camera.name, part),
-            collimators.part_solid(part, module_numbers(camera), construction),
-        )
+        name = ids.part_name(camera.name, part)
+        solid = collimators.part_solid(part, module_numbers(camera), construction)
         item = new_part(camera, part, name, collimators.new_mesh(name, solid, collimators.part_material(part)))
         item.hide_viewport, item.hide_render = camera.hide_viewport, camera.hide_render
         for home in camera.users_collection:
@@ -125,22 +122,11 @@ def _add_parts(collection: bpy.types.Collection, camera: bpy.types.Object) -> No
 def duplicate(
     collection: bpy.types.Collection, modules: Sequence[bpy.types.Object], count: int, angle: float, follow_ring: bool
 ) -> list[bpy.types.Object]:
-    """Copy modules along their ring; returns the new camera objects.
+    """Make `count` copies of each module, `angle` radians apart about the world's z axis; returns their camera objects.
 
-    Parameters
-    ----------
-    collection, modules
-        The scanner, and those of its camera objects to copy.
-    count, angle
-        How many copies of each, and the angle from one to the next, radians about the world's z axis.
-    follow_ring
-        Keep to the ring's arc: a copy's z and distance from the z axis are those of the ring at its azimuth, linear
-        between neighbours and constant beyond the arc's ends. Otherwise the copy is turned about z.
-
-    Raises
-    ------
-    InputError
-        A copy would stand where a module already stands, or its shapes cannot be built. The scene is as it was.
+    With `follow_ring` a copy's z and distance from the z axis are those of the ring at its azimuth, linear between
+    neighbours and constant beyond the arc's ends. Raises InputError, and leaves the scene as it was, where a module
+    already stands in a copy's place or its shapes cannot be built.
     """
     _require_solids(collection, modules)
     taken = [module_numbers(o).center for o in scanner.modules(collection)]
@@ -195,10 +181,7 @@ def _wrapped(angles: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def remove(collection: bpy.types.Collection, modules: Sequence[bpy.types.Object]) -> None:
-    """Remove modules with their collimators and crystals; other objects parented to them stay where they are.
-
-    Raises InputError where no module would be left.
-    """
+    """Remove modules with their collimators and crystals; other objects parented to them stay where they are."""
     if len(modules) >= len(scanner.modules(collection)):
         raise InputError("a scanner needs at least one module: keep one, or delete the scanner's collection")
     children = [child for camera in modules for child in camera.children]
@@ -208,6 +191,43 @@ def remove(collection: bpy.types.Collection, modules: Sequence[bpy.types.Object]
             cameras.unparent(child)
     _remove([*parts, *modules])
     following.refresh(collection)
+
+
+def renumber(collection: bpy.types.Collection, order: Literal["RINGS", "LIST"] = "RINGS") -> int:
+    """Number a scanner's modules 1, 2, ... in the order of `ring_order` or the present one; returns how many changed.
+
+    They are listed, projected and exported in that order from now on. Names that the user gave stay. Raises InputError
+    where the scanner is untidy, or its numbers are impossible; it stays as it was.
+    """
+    untidy = untidy_text(collection)
+    if untidy:
+        raise InputError(f"scanner '{collection.name}': {untidy}: press Tidy Modules in the Design panel first")
+    with recorded_warnings():  # where the cameras look does not matter here
+        system = scanner.read_scanner(collection)
+    found = scanner.modules(collection)
+    places = ring_order(system) if order == "RINGS" else np.arange(len(found))
+    parts = following.parts_of(collection, found)
+    names: list[tuple[bpy.types.ID, str]] = []
+    with following.writing():
+        for index, camera in enumerate(found[place] for place in places):
+            camera.mphdrr_module.number, camera.mphdrr_module.index = index + 1, index
+            name = ids.module_name(index + 1, len(found))
+            names += [(camera, name), (camera.data, name)]
+            for part in parts[camera]:
+                part.mphdrr_module.number = index + 1
+                part_name = ids.part_name(name, part.mphdrr_module.part)
+                names += [(part, part_name), (part.data, part_name)]
+        ordered = scanner.read_scanner(collection)
+        if np.any(np.diff(places) < 0):
+            collection.mphdrr_scanner.source = ""  # the workbook has another order
+        collection.mphdrr_scanner.quick_ranges = json.dumps(scanner.quick_ranges(ordered))
+    names = [(item, name) for item, name in names if item.name != name and _OURS.fullmatch(item.name)]
+    for item, name in names:
+        item.name = f"{name} renumbered"  # so that the new names are free
+    for item, name in names:
+        item.name = name
+    following.refresh(collection)
+    return int(np.count_nonzero(system.numbers[places] != ordered.numbers))
 
 
 def _remove(items: Sequence[bpy.types.Object]) -> None:

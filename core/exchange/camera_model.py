@@ -20,23 +20,12 @@ class CameraModel:
 
     World point X, mm, has camera coordinates ``(x, y, z) = rotations[m] @ (X - centers[m])`` and is seen at pixel
     ``principal_points[m] + focal_lengths[m] * (x, y) / z`` (column, row); 0 is the centre of pixel 0.
-
-    Attributes
-    ----------
-    rotations : array (M, 3, 3)
-        Rows x, y, z in the world: proper rotations.
-    centers : array (M, 3)
-        Sources, world mm.
-    focal_lengths : array (M, 2)
-        Pixels. The first is negative for a mirror image, which no rotation can express.
-    principal_points : array (M, 2)
-        Pixels.
     """
 
-    rotations: NDArray[np.float64]
-    centers: NDArray[np.float64]
-    focal_lengths: NDArray[np.float64]
-    principal_points: NDArray[np.float64]
+    rotations: NDArray[np.float64]  # (M, 3, 3), rows x, y, z in the world: proper rotations
+    centers: NDArray[np.float64]  # (M, 3), sources, world mm
+    focal_lengths: NDArray[np.float64]  # (M, 2), pixels; the first is negative for a mirror image
+    principal_points: NDArray[np.float64]  # (M, 2), pixels
 
     @property
     def translations(self) -> NDArray[np.float64]:
@@ -54,22 +43,15 @@ class CameraModel:
 
 
 def camera_model(views: Views, format: str, mirrored: bool = True) -> CameraModel:
-    """The cameras of `views`, exactly.
+    """The cameras of `views`, exactly, for the `format` that errors name.
 
-    Parameters
-    ----------
-    views
-        Their frames (u, v, k) are right-handed with k along the rays, so they are cameras as they stand, with the virtual
-        detector and, as (-u, -v, k), with the real one.
-    format
-        Its name, for errors.
-    mirrored
-        Whether the format can hold mirror images.
+    The frames (u, v, k) of views are right-handed with k along the rays, so they are cameras as they stand, with the virtual
+    detector and, as (-u, -v, k), with the real one.
 
     Raises
     ------
     InputError
-        The pixel steps are not perpendicular, or an image is mirrored and must not be.
+        The pixel steps are not perpendicular, or an image is mirrored and the format is not `mirrored`.
     """
     pitches, (x, y) = pixel_axes(views)
     _refuse_oblique(views, format)
@@ -111,8 +93,8 @@ def _refuse_oblique(views: Views, format: str) -> None:
     n_v, n_u = views.shape
     proportion = pitches[:, 1] / pitches[:, 0]
     # How far the last row slides along the columns, and the last column along the rows, in pixels.
-    m = _first_beyond_tolerance(np.abs(cosine) * np.maximum(n_v * proportion, n_u / proportion) / 2)
-    if m is not None:
+    slide = np.abs(cosine) * np.maximum(n_v * proportion, n_u / proportion) / 2
+    for m in np.flatnonzero(~(slide <= _TOLERANCE))[:1]:
         raise InputError(
             f"view {m}: format {format} needs pixel rows perpendicular to columns, and these are "
             f"{np.degrees(np.arccos(cosine[m])):.4g} degrees apart"
@@ -123,17 +105,13 @@ def with_common_pitch(views: Views, format: str) -> tuple[Views, tuple[float, fl
     """The same rays with one pixel size for all detectors, and that size (pitch_u, pitch_v), mm.
 
     Detectors with smaller pixels are moved away from their sources until their pixels are as large as the largest.
-
-    Raises
-    ------
-    InputError
-        The pixel steps are not perpendicular, or two views' pixels have different proportions.
+    `InputError` where pixel steps are not perpendicular, or two views' pixels have different proportions.
     """
     _refuse_oblique(views, format)
     pitches, _ = pixel_axes(views)
     proportion = pitches[:, 1] / pitches[:, 0]
-    m = _first_beyond_tolerance(np.abs(proportion / proportion[0] - 1) * max(views.shape) / 2)
-    if m is not None:
+    stretch = np.abs(proportion / proportion[0] - 1) * max(views.shape) / 2
+    for m in np.flatnonzero(~(stretch <= _TOLERANCE))[:1]:
         raise InputError(
             f"view {m}: format {format} has one pixel size for all views, and its pixels of {pitches[m, 0]:g} x "
             f"{pitches[m, 1]:g} mm have other proportions than view 0's of {pitches[0, 0]:g} x {pitches[0, 1]:g} mm"
@@ -142,9 +120,3 @@ def with_common_pitch(views: Views, format: str) -> tuple[Views, tuple[float, fl
     scale = pitch_u / pitches[:, :1]
     centers = views.sources + scale * (views.detector_centers - views.sources)
     return Views(views.sources, centers, scale * views.u_steps, scale * views.v_steps, views.shape), (pitch_u, pitch_v)
-
-
-def _first_beyond_tolerance(pixels: NDArray[np.float64]) -> int | None:
-    """The first view whose shift (M,), in pixels at the image's edge, is beyond rounding."""
-    off = ~(pixels <= _TOLERANCE)
-    return int(np.argmax(off)) if off.any() else None

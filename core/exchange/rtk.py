@@ -13,15 +13,8 @@ from .camera_model import pixel_axes, with_common_pitch
 from .format import Format
 
 _PARAMETERS = (
-    "SourceToIsocenterDistance",
-    "SourceToDetectorDistance",
-    "SourceOffsetX",
-    "SourceOffsetY",
-    "ProjectionOffsetX",
-    "ProjectionOffsetY",
-    "GantryAngle",
-    "OutOfPlaneAngle",
-    "InPlaneAngle",
+    *("SourceToIsocenterDistance", "SourceToDetectorDistance", "SourceOffsetX", "SourceOffsetY"),
+    *("ProjectionOffsetX", "ProjectionOffsetY", "GantryAngle", "OutOfPlaneAngle", "InPlaneAngle"),
 )
 
 

@@ -229,9 +229,8 @@ class DRR(torch.nn.Module):
     def rescale_detector_(self, scale: float) -> None:
         """Multiply the number of pixels per side by `scale`, on a detector of the same size."""
         d = self.detector
-        self.set_intrinsics_(
-            height=int(d.height * scale), width=int(d.width * scale), delx=d.delx / scale, dely=d.dely / scale
-        )
+        pixels = {"height": int(d.height * scale), "width": int(d.width * scale)}
+        self.set_intrinsics_(**pixels, delx=d.delx / scale, dely=d.dely / scale)
 
     def perspective_projection(self, pose: Any, points: Tensor) -> Tensor:
         """Pixels (B, N, 2), x right and y down from the image's corner, of world `points` (B, N, 3), mm.
@@ -244,16 +243,6 @@ class DRR(torch.nn.Module):
     def inverse_projection(self, pose: Any, points: Tensor) -> Tensor:
         """World points (B, N, 3), mm, on the detector, of pixels `points` (B, N, 2) as of `perspective_projection`."""
         return self._camera(RigidTransform(pose).to(points))(self.detector.unproject(points))
-
-    @property
-    def affine(self) -> RigidTransform:
-        """World mm from index."""
-        return RigidTransform(torch.tensor(self.grid.affine).to(self.density))
-
-    @property
-    def affine_inverse(self) -> RigidTransform:
-        """Index from world mm."""
-        return RigidTransform(torch.tensor(self.grid.index_from_world).to(self.density))
 
     @property
     def device(self) -> torch.device:
@@ -281,7 +270,7 @@ class Registration(torch.nn.Module):
         self.drr = drr
         self._rotation = torch.nn.Parameter(rotation)
         self._translation = torch.nn.Parameter(translation)
-        self.parameterization, self.convention = parameterization, convention
+        self._kind: dict[str, Any] = {"parameterization": parameterization, "convention": convention}
 
     def forward(self, **options: Any) -> Tensor:
         """The radiograph from the present pose; `options` are those of `DRR.forward`."""
@@ -291,10 +280,6 @@ class Registration(torch.nn.Module):
     def pose(self) -> RigidTransform:
         """The present pose."""
         return convert(self.rotation, self.translation, **self._kind)
-
-    @property
-    def _kind(self) -> dict[str, Any]:
-        return {"parameterization": self.parameterization, "convention": self.convention}
 
     @property
     def rotation(self) -> Tensor:

@@ -27,27 +27,13 @@ _ORIENTATIONS = {
 
 @dataclass(frozen=True, eq=False)
 class Subject:
-    """What is imaged.
+    """What is imaged."""
 
-    Attributes
-    ----------
-    density : Tensor (n_x, n_y, n_z)
-        What is integrated.
-    affine : array (4, 4)
-        World mm from index; an integer index is a voxel's centre.
-    reorient : Tensor (4, 4)
-        Turns the camera before its pose does.
-    hu : Tensor or None
-        CT numbers, from which the density can be computed again.
-    mask : Tensor or None
-        Whole numbers (n_x, n_y, n_z): the structure to which each voxel belongs.
-    """
-
-    density: Tensor
-    affine: np.ndarray[Any, Any]
-    reorient: Tensor
-    hu: Tensor | None = None
-    mask: Tensor | None = None
+    density: Tensor  # (n_x, n_y, n_z), what is integrated
+    affine: np.ndarray[Any, Any]  # (4, 4), world mm from index; an integer index is a voxel's centre
+    reorient: Tensor  # (4, 4), turns the camera before its pose does
+    hu: Tensor | None = None  # CT numbers, from which the density can be computed again
+    mask: Tensor | None = None  # whole numbers (n_x, n_y, n_z): the structure to which each voxel belongs
 
 
 def read(

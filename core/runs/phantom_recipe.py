@@ -21,13 +21,7 @@ _SAME_POSE = 1e-5  # mm; Blender's matrices are float32
 
 
 def recipe_phantom(recipe: Recipe) -> Phantom:
-    """The phantom that a recipe describes.
-
-    Raises
-    ------
-    InputError
-        The phantom cannot be so, or its file cannot be read.
-    """
+    """The phantom that a recipe describes; `InputError` where it cannot be so, or its file cannot be read."""
     if recipe["phantom.file"] is not None:
         return read_phantom(recipe["phantom.file"])
     if recipe["phantom.text"] is not None:
@@ -38,13 +32,7 @@ def recipe_phantom(recipe: Recipe) -> Phantom:
 
 
 def phantom_pose(recipe: Recipe) -> NDArray[np.float64]:
-    """World-from-phantom pose (4, 4), mm.
-
-    Raises
-    ------
-    InputError
-        Angles and matrix are both given and disagree.
-    """
+    """World-from-phantom pose (4, 4), mm; `InputError` where matrix and position with angles are given and disagree."""
     phi, theta, psi = np.deg2rad(recipe["phantom.euler_degrees"])
     pose = euler_pose(phi, theta, psi, recipe["phantom.position"])
     if recipe["phantom.matrix"] is None:

@@ -30,6 +30,9 @@ _MODELS: dict[str, Any] = {"transmission": Transmission, "emission": Emission, "
 _MOST_MU = 500.0
 """1/mm: more than any material of the tables attenuates photons of 10 keV or more."""
 
+_Source = tuple[Volume, Volume | None, Recipe]
+"""What is projected, what attenuates it, and what to record of it."""
+
 
 def run_recipe(
     recipe: Recipe,
@@ -54,21 +57,26 @@ def run_recipe(
     InputError
         A file cannot be read, the recipe names no system, or as `project_run`; all but the volumes is checked first.
     """
-    system = chosen_modules(system or _system(recipe), recipe["system.modules"], "system.modules")
+    if system is None:
+        if recipe["system.file"] is None:
+            raise InputError("system.file: missing; name the geometry workbook")
+        system = read_system(recipe["system.file"], columns=recipe["system.columns"])
+    system = chosen_modules(system, recipe["system.modules"], "system.modules")
     model = recipe_model(recipe, system)
-    if mu is None and recipe["attenuation.object"] is not None:
-        raise InputError(
-            f"attenuation.object: {recipe['attenuation.object']!r} is in a Blender scene; give --mu FILE instead"
-        )
-    if mu is None and recipe["attenuation.file"] is not None:
-        mu = _attenuation(recipe, model, stages("reading"))
+    if mu is None:
+        mu = _attenuation(recipe, model, stages)
     recorded = recipe.complete()
+    sources: Iterator[_Source]
     if volume is not None:
-        sources: Iterator[_Source] = iter([(volume, mu, recorded)])
+        if mu is None and recipe["attenuation.of_phantom"]:
+            raise InputError("attenuation.of_phantom: a volume that is given needs its mu as well")
+        sources = iter([(volume, mu, recorded)])
     elif recipe["volume.file"] is not None or recipe["volume.states"] is not None:
         sources = _from_files(recipe, recorded, mu, stages)
     else:
         sources = _from_phantom(recipe, recorded, model, mu, stages)
+    energy = recipe["volume.energy"] or recipe["attenuation.energy"]
+    converted = {} if energy is None else {"ct_converted_at_kev": photon_energy(energy)}
     for number, (source, mu_of_it, record) in enumerate(sources):
         seed = recipe["noise.seed"]
         if seed is not None:  # noise of its own for each state
@@ -82,7 +90,7 @@ def run_recipe(
             pitch=recipe["detector.pitch"],
             backend=recipe["compute.backend"],
             threads=recipe["compute.threads"],
-            settings={"volume": _volume_name(record), **_energies(recipe), "recipe": record.tables()},
+            settings={"volume": _volume_name(record), **converted, "recipe": record.tables()},
             model=recipe_model(recipe, system, mu_of_it),
             photons=recipe["model.photons"],
             noise_seed=record["noise.seed"],
@@ -91,13 +99,7 @@ def run_recipe(
 
 
 def recipe_model(recipe: Recipe, system: PinholeSystem, mu: Volume | None = None) -> Model:
-    """The model that a recipe asks for; `mu` is what attenuates.
-
-    Raises
-    ------
-    InputError
-        The settings do not go together.
-    """
+    """The model that a recipe asks for; `mu` is what attenuates. `InputError` where the settings do not go together."""
     cls = _MODELS[recipe["model.kind"]]
     given = recipe.fields("model", cls)
     if given.get("pixel_points") == "auto":
@@ -110,30 +112,27 @@ def recipe_model(recipe: Recipe, system: PinholeSystem, mu: Volume | None = None
     return model
 
 
-_Source = tuple[Volume, Volume | None, Recipe]
-"""What is projected, what attenuates it, and what to record of it."""
-
-
-def _system(recipe: Recipe) -> PinholeSystem:
-    if recipe["system.file"] is None:
-        raise InputError("system.file: missing; name the geometry workbook")
-    return read_system(recipe["system.file"], columns=recipe["system.columns"])
-
-
 def _volume_name(record: Recipe) -> str:
     """What a run calls its volume."""
-    for key in ("volume.object", "volume.file", "phantom.file"):
-        if record[key] is not None:
-            return Path(record[key]).name
-    if record["volume.states"] is not None:
-        return Path(record["volume.states"][0]).name
+    names = [record[key] for key in ("volume.object", "volume.file", "phantom.file")] + list(
+        record["volume.states"] or ()
+    )
+    for name in filter(None, names):
+        return Path(name).name
     return f"{record['phantom.kind'].capitalize()} phantom" if "phantom.kind" in record.given else ""
 
 
-def _energies(recipe: Recipe) -> dict[str, float]:
-    """At which energies CT numbers were converted, keV."""
-    energy = recipe["volume.energy"] or recipe["attenuation.energy"]
-    return {} if energy is None else {"ct_converted_at_kev": photon_energy(energy)}
+def _attenuation(recipe: Recipe, model: Model, stages: Stages) -> Volume | None:
+    """The attenuation that the recipe names, but for that of its phantom."""
+    name, path, energy = (recipe[f"attenuation.{name}"] for name in ("object", "file", "energy"))
+    if name is not None:
+        raise InputError(f"attenuation.object: {name!r} is in a Blender scene; give --mu FILE instead")
+    if path is None:
+        return None
+    mu = _read_mu(path, energy, recipe["attenuation.series"], stages("reading"))
+    if energy is not None:
+        warn_of_energy(model, photon_energy(energy), f"the mu of {Path(path).name}")
+    return mu
 
 
 def _from_files(recipe: Recipe, record: Recipe, mu: Volume | None, stages: Stages) -> Iterator[_Source]:
@@ -191,14 +190,6 @@ def _read_mu(path: str, energy: float | str | None, series: str | None, progress
             "--energy to convert them"
         )
     return volume
-
-
-def _attenuation(recipe: Recipe, model: Model, progress: Progress | None) -> Volume:
-    path, energy = recipe["attenuation.file"], recipe["attenuation.energy"]
-    mu = _read_mu(path, energy, recipe["attenuation.series"], progress)
-    if energy is not None:
-        warn_of_energy(model, photon_energy(energy), f"the mu of {Path(path).name}")
-    return mu
 
 
 def _from_phantom(recipe: Recipe, record: Recipe, model: Model, mu: Volume | None, stages: Stages) -> Iterator[_Source]:

@@ -224,6 +224,7 @@ def _source(folder: _Folder, setup: Setup, simulation: Simulation) -> list[str]:
     energies = "".join(f"{_n(energy / 1000, photons)}\n" for energy, photons in simulation.nuclide.lines)
     spectrum = folder.write("spectrum.txt", "1 0\n" + energies)
     pose = simulation.world_from_phantom
+    photons_per_decay = sum(photons for _, photons in simulation.nuclide.lines)
 
     def source(name: str, activity: float, center: NDArray[np.float64], *shape: str) -> list[str]:
         return [
@@ -233,7 +234,7 @@ def _source(folder: _Folder, setup: Setup, simulation: Simulation) -> list[str]:
                 "gps/particle gamma",
                 "gps/ene/type UserSpectrum",
                 f"gps/setSpectrumFile {spectrum}",
-                f"setActivity {_n(activity * simulation.photons_per_decay)} becquerel",
+                f"setActivity {_n(activity * photons_per_decay)} becquerel",
                 "setForcedUnstableFlag true",
                 f"setForcedHalfLife {_n(simulation.nuclide.half_life)} s",
                 "gps/ang/type iso",

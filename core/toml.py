@@ -13,23 +13,18 @@ from .errors import InputError
 
 
 def read_toml(path: str | os.PathLike[str]) -> dict[str, Any]:
-    """What a TOML file holds.
-
-    Raises
-    ------
-    InputError
-        The file cannot be read or is not TOML.
-    """
+    """What a TOML file holds; `InputError` where it cannot be read or is not TOML."""
     try:
         return tomllib.loads(Path(path).read_text(encoding="utf-8-sig"))
     except tomllib.TOMLDecodeError as error:
-        raise InputError(f"{path}: not TOML: {error}") from None
+        reason = f"not TOML: {error}"
     except UnicodeDecodeError:
-        raise InputError(f"{path}: expected TOML, a text in UTF-8") from None
+        reason = "expected TOML, a text in UTF-8"
     except RecursionError:
-        raise InputError(f"{path}: its lists are nested too deeply") from None
+        reason = "its lists are nested too deeply"
     except (OSError, ValueError) as error:  # an impossible path is a ValueError
-        raise InputError(f"{path}: {getattr(error, 'strerror', None) or error}") from None
+        reason = getattr(error, "strerror", None) or str(error)
+    raise InputError(f"{path}: {reason}")
 
 
 def toml_value(value: Any) -> str:

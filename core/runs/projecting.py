@@ -40,12 +40,10 @@ def project_run(
 
     Parameters
     ----------
-    system, volume
-        What sees, and what is seen.
     shape, detector, magnification, pitch
-        The images, see `PinholeSystem.views`.
+        The images, as of `PinholeSystem.views`.
     backend, threads
-        See `Projector`.
+        As of `Projector`.
     settings
         More to record in the run.
     model

@@ -11,8 +11,8 @@ import pytest
 
 import mphdrr.core as mph
 from mphdrr.addon.cli import main
-from mphdrr.core.runs.phantom_recipe import euler_degrees, phantom_pose
 from mphdrr.core.runs.recipe import Recipe
+from mphdrr.core.runs.run_recipe import euler_degrees, phantom_pose
 from mphdrr.core.runs.settings import SETTINGS
 
 DATA = Path(__file__).parent / "data"

@@ -7,19 +7,19 @@ To add a program, write its `Format` in a module here, and list it below. The co
 from __future__ import annotations
 
 import os
+from pathlib import Path
 from typing import Any
 
 from ..errors import InputError
+from ..files import replacing
 from ..geometry.system import PinholeSystem
 from ..geometry.views import Views
 from ..validation import instance
-from .array_formats import ASTRA, KORNIA, LEAP, OPENCV, PYTORCH3D
-from .format import Format
+from .cameras import ASTRA, KORNIA, LEAP, NERF, OPENCV, PYTORCH3D, RTK
+from .format import Format, new_folder
 from .gate9 import GATE9
 from .gate10 import GATE10
 from .mphdrr_json import MPHDRR, read_geometry
-from .nerf import NERF
-from .rtk import RTK
 from .solids import GLB, STL, STL_PARTS, THREE_MF
 
 __all__ = ["FORMATS", "FORMAT_NUMBERS", "Format", "read_geometry", "write_geometry"]
@@ -67,4 +67,10 @@ def write_geometry(
     instance(views, Views, "views")
     if len(views) == 0:
         raise InputError("views: expected one or more, got none")
-    FORMATS[format].save(system, views, path, options)
+    chosen, path = FORMATS[format], Path(path)
+    for name in sorted(options.keys() - chosen.options.keys()):
+        raise InputError(f"format {format}: no option {name!r}, it has {', '.join(chosen.options) or 'none'}")
+    if chosen.suffixes and not path.name.lower().endswith(chosen.suffixes):
+        raise InputError(f"{path}: expected a name ending in {', '.join(chosen.suffixes)}")
+    with replacing(path) if chosen.suffixes else new_folder(path) as temporary:
+        chosen.write(system, views, temporary, **options)

@@ -14,9 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from ..errors import InputError
-from ..files import ensure_folder, replacing
-from ..geometry.system import PinholeSystem
-from ..geometry.views import Views
+from ..files import ensure_folder
 
 
 @dataclass(frozen=True)
@@ -39,19 +37,9 @@ class Format:
         parameters = inspect.signature(source).parameters.values()
         return {p.name: (types[p.name], p.default) for p in parameters if p.kind is p.KEYWORD_ONLY}
 
-    def save(self, system: PinholeSystem, views: Views, path: str | os.PathLike[str], options: dict[str, Any]) -> None:
-        """Check the options' names and the file's ending, then write."""
-        path = Path(path)
-        for name in sorted(options.keys() - self.options.keys()):
-            raise InputError(f"format {self.name}: no option {name!r}, it has {', '.join(self.options) or 'none'}")
-        if self.suffixes and not path.name.lower().endswith(self.suffixes):
-            raise InputError(f"{path}: expected a name ending in {', '.join(self.suffixes)}")
-        with replacing(path) if self.suffixes else _new_folder(path) as temporary:
-            self.write(system, views, temporary, **options)
-
 
 @contextmanager
-def _new_folder(path: Path) -> Iterator[Path]:
+def new_folder(path: Path) -> Iterator[Path]:
     """Give a temporary folder beside `path`; rename it to `path` on success, remove it on failure."""
     if path.exists() and (not path.is_dir() or any(path.iterdir())):
         raise InputError(f"{path}: expected a new folder or an empty one")

@@ -8,6 +8,7 @@ from __future__ import annotations
 import json
 import os
 from collections.abc import Callable
+from operator import attrgetter
 from pathlib import Path
 from typing import Any
 
@@ -34,24 +35,19 @@ _CONVENTIONS = (
     "volume[ix, iy, iz]: affine from index to world, an integer index is the voxel's centre, 0 outside."
 )
 
+_LENGTHS = ("pinhole_diameter", "collimator_length", "detector_side", "detector_thickness", "roi_radius")
+_RAYS = ("sources", "detector_centers", "u_steps", "v_steps")
+
 # Name, unit and contents of the arrays beside projections and volume, whose units are attributes.
 _ARRAYS: dict[str, tuple[str, Callable[[ProjectionRun], Any]]] = {
     "geometry/number": ("", lambda run: run.system.numbers),
     "geometry/ring": ("", lambda run: run.system.rings()),
     "geometry/center": ("mm", lambda run: run.system.centers),
-    "geometry/pinhole_distance": ("mm", lambda run: run.system.pinhole_distance),
-    "geometry/pinhole_diameter": ("mm", lambda run: run.system.pinhole_diameter),
-    "geometry/collimator_length": ("mm", lambda run: run.system.collimator_length),
-    "geometry/detector_side": ("mm", lambda run: run.system.detector_side),
-    "geometry/detector_thickness": ("mm", lambda run: run.system.detector_thickness),
-    "geometry/roi_radius": ("mm", lambda run: run.system.roi_radius),
+    **{f"geometry/{name}": ("mm", attrgetter(f"system.{name}")) for name in ("pinhole_distance", *_LENGTHS)},
     "geometry/pose": ("mm", lambda run: run.system.poses()),
     "geometry/intrinsics": ("pixel", lambda run: run.intrinsics()),
     "geometry/projection_matrix": ("pixel", lambda run: run.views.projection_matrices()),
-    "views/sources": ("mm", lambda run: run.views.sources),
-    "views/detector_centers": ("mm", lambda run: run.views.detector_centers),
-    "views/u_steps": ("mm", lambda run: run.views.u_steps),
-    "views/v_steps": ("mm", lambda run: run.views.v_steps),
+    **{f"views/{name}": ("mm", attrgetter(f"views.{name}")) for name in _RAYS},
     "volume/affine": ("mm", lambda run: run.volume.grid.affine),
 }
 _ATTRIBUTES = "attributes"
@@ -112,9 +108,8 @@ def _run_of(arrays: dict[str, NDArray[Any]], attributes: dict[str, Any]) -> Proj
     for name in ("projections", "volume/array", *_ARRAYS):
         if name not in arrays:
             raise InputError(f"array {name} is missing")
-    names = ("pinhole_diameter", "collimator_length", "detector_side", "detector_thickness", "roi_radius")
-    lengths = {name: arrays[f"geometry/{name}"] for name in names}
-    rays = [arrays[f"views/{name}"] for name in ("sources", "detector_centers", "u_steps", "v_steps")]
+    lengths = {name: arrays[f"geometry/{name}"] for name in _LENGTHS}
+    rays = [arrays[f"views/{name}"] for name in _RAYS]
     volume, seed = arrays["volume/array"], attributes["seed"]
     n_v, n_u = arrays["projections"].shape[1:]
     n_x, n_y, n_z = volume.shape

@@ -69,12 +69,6 @@ class Recipe:
         names = (field.name for field in dataclasses.fields(cls) if field.init)
         return {name: self.given[f"{table}.{name}"] for name in names if f"{table}.{name}" in self.given}
 
-    def complete(self) -> Recipe:
-        """This recipe with the defaults, too, of all settings of the images that have an effect in it."""
-        of_images = ("model.", "detector.", "compute.")
-        defaults = {key: setting.default for key, setting in SETTINGS.items() if key.startswith(of_images)}
-        return fitting_recipe({**defaults, **self.given}, self.given)
-
     def tables(self) -> dict[str, dict[str, Any]]:
         """The values by table and name, as JSON and TOML hold them."""
         tables: dict[str, dict[str, Any]] = {table: {} for table in TABLES}

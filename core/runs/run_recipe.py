@@ -28,8 +28,9 @@ from ..volumes.volume import Volume
 from ..volumes.volume_files import read_volume, read_volume_of
 from ..workbook import read_system
 from .projecting import project_run, warn_of_energy
-from .recipe import Recipe
+from .recipe import Recipe, fitting_recipe
 from .run import ProjectionRun
+from .settings import SETTINGS
 
 Stages = Callable[[str], Progress | None]
 """Gives the progress callback of a stage: reading, voxelizing, projecting."""
@@ -76,7 +77,9 @@ def run_recipe(
     model = recipe_model(recipe, system)
     if mu is None:
         mu = _attenuation(recipe, model, stages)
-    recorded = recipe.complete()
+    of_images = ("model.", "detector.", "compute.")
+    defaults = {key: setting.default for key, setting in SETTINGS.items() if key.startswith(of_images)}
+    recorded = fitting_recipe({**defaults, **recipe.given}, recipe.given)
     sources: Iterator[_Source]
     if volume is not None:
         if mu is None and recipe["attenuation.of_phantom"]:
@@ -208,7 +211,15 @@ def _from_phantom(recipe: Recipe, record: Recipe, model: Model, mu: Volume | Non
         raise InputError(
             f"volume.object: {recipe['volume.object']!r} is in a Blender scene; give --volume FILE instead"
         )
-    phantom, pose = _phantom(recipe), phantom_pose(recipe)
+    phantom: Phantom
+    if recipe["phantom.file"] is not None:
+        phantom = read_phantom(recipe["phantom.file"])
+    elif recipe["phantom.text"] is not None:
+        phantom = parse_phantom(recipe["phantom.text"])
+    else:
+        (kind,) = (kind for kind in KINDS if kind.name == recipe["phantom.kind"])
+        phantom = kind.phantom(**{**kind.usual, **recipe.fields("phantom", kind.phantom)})
+    pose = phantom_pose(recipe)
     n_x, n_y, n_z = np.broadcast_to(recipe["phantom.voxels"], 3).tolist()
     # Where no spacing is given, the phantom fits however it is turned, and a voxel is kept free all around.
     spacing = np.broadcast_to(recipe["phantom.spacing"] or phantom.extent / max(1, min(n_x, n_y, n_z) - 2), 3)
@@ -227,16 +238,6 @@ def _from_phantom(recipe: Recipe, record: Recipe, model: Model, mu: Volume | Non
     quantity = "mu" if is_described and recipe["model.photons"] is not None else "activity"
     volume = phantom.voxelize(grid, pose, stages("voxelizing"), quantity)
     yield volume, mu, with_phantom(record, phantom, pose)
-
-
-def _phantom(recipe: Recipe) -> Phantom:
-    if recipe["phantom.file"] is not None:
-        return read_phantom(recipe["phantom.file"])
-    if recipe["phantom.text"] is not None:
-        return parse_phantom(recipe["phantom.text"])
-    (kind,) = (kind for kind in KINDS if kind.name == recipe["phantom.kind"])
-    phantom: Phantom = kind.phantom(**{**kind.usual, **recipe.fields("phantom", kind.phantom)})
-    return phantom
 
 
 def phantom_pose(recipe: Recipe) -> NDArray[np.float64]:

@@ -24,15 +24,11 @@ class DRR(torch.nn.Module):
 
     Parameters
     ----------
-    subject
-        A `Subject`, ours or torchio's, a `Volume`, or an array or tensor with `affine`. Volumes and arrays are integrated as
-        they are.
-    sdd
-        Source to detector, mm.
-    height, delx, width, dely
-        Pixels and their sizes, mm.
-    x0, y0
-        Principal point, mm.
+    subject, affine
+        A `Subject`, ours or torchio's, a `Volume`, or an array or tensor with `affine`, world mm from index. Volumes and
+        arrays are integrated as they are.
+    sdd, height, delx, width, dely, x0, y0
+        Source to detector, pixels and their sizes, principal point; mm.
     p_subsample
         Share of the pixels that are computed, chosen once at random; the others are 0.
     reshape
@@ -45,8 +41,6 @@ class DRR(torch.nn.Module):
         Integrate behind the source and beyond the detector too: the default since 0.4.
     backend
         As of `Projector`.
-    affine
-        World mm from index, for an array.
     stop_gradients_through_grid_sample
         Give no gradient to the volume.
     volume, spacing, sdr, bone_attenuation_multiplier

@@ -18,8 +18,10 @@ from ..geometry.grid import Grid
 from ..geometry.system import PinholeSystem
 from ..geometry.views import Views
 from ..validation import instance
-from .camera_model import camera_model, pixel_axes, with_common_pitch
 from .format import Format
+
+# How far a format may move a pixel at the image's edge, in pixels. Views rounded to float32 stay within it.
+_TOLERANCE = 1e-3
 
 
 def _array_format(name: str, title: str, arrays: Callable[..., dict[str, Any]]) -> Format:
@@ -62,8 +64,8 @@ def _leap(views: Views) -> dict[str, Any]:
 
     ``rowVectors`` point to the next row, ``colVectors`` to the next column; all modules have one pixel size.
     """
-    views, (width, height) = with_common_pitch(views, "leap")
-    _, (columns, rows) = pixel_axes(views)
+    views, (width, height) = _with_common_pitch(views, "leap")
+    _, (columns, rows) = _pixel_axes(views)
     vectors = {
         "sourcePositions": views.sources,
         "moduleCenters": views.detector_centers,
@@ -82,18 +84,14 @@ def _leap(views: Views) -> dict[str, Any]:
 
 def _opencv(views: Views) -> dict[str, Any]:
     """``projectPoints``: x right, y down, z forward; pixel (0, 0) is the centre of the first pixel."""
-    camera = camera_model(views, "opencv")
-    n_v, n_u = views.shape
-    return {"K": camera.matrices, "R": camera.rotations, "t": camera.translations, "width": n_u, "height": n_v}
+    matrices, rotations, translations = _camera_matrices(views, "opencv")
+    return {"K": matrices, "R": rotations, "t": translations, "width": views.shape[1], "height": views.shape[0]}
 
 
 def _kornia(views: Views) -> dict[str, Any]:
     """``kornia.geometry.camera.PinholeCamera``, whose axes and pixels are OpenCV's."""
-    camera = camera_model(views, "kornia")
     intrinsics, extrinsics = np.tile(np.eye(4), (2, len(views), 1, 1))
-    intrinsics[:, :3, :3] = camera.matrices
-    extrinsics[:, :3, :3] = camera.rotations
-    extrinsics[:, :3, 3] = camera.translations
+    intrinsics[:, :3, :3], extrinsics[:, :3, :3], extrinsics[:, :3, 3] = _camera_matrices(views, "kornia")
     height, width = np.tile(np.array(views.shape, np.float64), (len(views), 1)).T
     return {"intrinsics": intrinsics, "extrinsics": extrinsics, "height": height, "width": width}
 
@@ -105,16 +103,16 @@ def _pytorch3d(views: Views, *, in_ndc: bool = True) -> dict[str, Any]:
     shorter side, with its origin in the middle of the image, x to the left and y up.
     """
     instance(in_ndc, bool, "in_ndc")
-    camera = camera_model(views, "pytorch3d")
+    matrices, rotations, translations = _camera_matrices(views, "pytorch3d")
     half_turn = np.array([-1.0, -1.0, 1.0])  # x right, y down to x left, y up
-    focal, principal = camera.focal_lengths, camera.principal_points + 0.5
+    focal, principal = matrices[:, [0, 1], [0, 1]], matrices[:, :2, 2] + 0.5
     if in_ndc:
         half_side = min(views.shape) / 2
         focal = focal / half_side
         principal = (np.array(views.shape[::-1]) / 2 - principal) / half_side
     return {
-        "R": camera.rotations.transpose(0, 2, 1) * half_turn,
-        "T": camera.translations * half_turn,
+        "R": rotations.transpose(0, 2, 1) * half_turn,
+        "T": translations * half_turn,
         "focal_length": focal,
         "principal_point": principal,
         "image_size": np.tile(views.shape, (len(views), 1)),
@@ -137,8 +135,8 @@ def _rtk(system: PinholeSystem, views: Views, path: Path) -> None:
     the rays, not against them, and RTK's distances, which may have either sign, are negative for images that are not
     mirrored. The projections' spacing and origin are not part of an RTK geometry: they stand in a comment.
     """
-    views, pitch = with_common_pitch(views, "rtk")
-    _, (r, c) = pixel_axes(views)
+    views, pitch = _with_common_pitch(views, "rtk")
+    _, (r, c) = _pixel_axes(views)
     n_v, n_u = views.shape
     origin = [-(n_u - 1) / 2 * pitch[0], -(n_v - 1) / 2 * pitch[1]]
     lines = [
@@ -192,14 +190,19 @@ def _nerf(system: PinholeSystem, views: Views, path: Path, *, pictures: str = "i
     """
     if not isinstance(pictures, str) or "{}" not in pictures:
         raise InputError(f"pictures {pictures!r}: expected a file name with {{}} for the view's number")
-    camera = camera_model(views, "nerf", mirrored=False)
+    matrices, rotations, _ = _camera_matrices(views, "nerf", mirrored=False)
     n_v, n_u = views.shape
     # The picture is the array turned by 180 degrees, and so is the camera; then x right, y down becomes x right, y up.
-    axes = camera.rotations * np.array([-1.0, 1.0, -1.0])[:, None]
+    axes = rotations * np.array([-1.0, 1.0, -1.0])[:, None]
     poses = np.tile(np.eye(4), (len(views), 1, 1))
     poses[:, :3, :3] = axes.transpose(0, 2, 1)
-    poses[:, :3, 3] = camera.centers
-    (fl_x, fl_y), (cx, cy) = camera.focal_lengths.T, (np.array([n_u, n_v]) - 0.5 - camera.principal_points).T
+    poses[:, :3, 3] = views.sources
+    fl_x, fl_y, cx, cy = (
+        matrices[:, 0, 0],
+        matrices[:, 1, 1],
+        n_u - 0.5 - matrices[:, 0, 2],
+        n_v - 0.5 - matrices[:, 1, 2],
+    )
     intrinsics = {"camera_angle_x": 2 * np.arctan(n_u / 2 / fl_x), "fl_x": fl_x, "fl_y": fl_y, "cx": cx, "cy": cy}
     common = {name: float(values[0]) for name, values in intrinsics.items() if np.ptp(values) < 1e-9}
     numbers = system.numbers if len(system) == len(views) else np.arange(1, len(views) + 1)
@@ -214,6 +217,89 @@ def _nerf(system: PinholeSystem, views: Views, path: Path, *, pictures: str = "i
     ]
     document = {"camera_model": "PINHOLE", "w": n_u, "h": n_v, **common, "frames": frames}
     path.write_text(json.dumps(document, indent=1) + "\n", encoding="utf-8")
+
+
+def _camera_matrices(views: Views, format: str, mirrored: bool = True) -> tuple[NDArray[np.float64], ...]:
+    """Camera matrices K (M, 3, 3), rotations R (M, 3, 3) and translations t (M, 3), mm, of `views`, exactly.
+
+    World point X is seen where ``K @ (R @ X + t)`` is a multiple of (column, row, 1); 0 is the centre of pixel 0. R is a
+    proper rotation to x along the columns' index, y along the rows' and z forward: the frames (u, v, k) of views are
+    right-handed with k along the rays, so they are cameras as they stand, with the virtual detector and, as (-u, -v, k),
+    with the real one. The first focal length is negative for a mirror image, which no rotation can express.
+
+    Raises
+    ------
+    InputError
+        The pixel steps are not perpendicular, or an image is mirrored and the format is not `mirrored`.
+    """
+    pitches, (x, y) = _pixel_axes(views)
+    _refuse_oblique(views, format)
+    z = np.cross(x, y)
+    to_detector = views.detector_centers - views.sources
+    distance = np.einsum("mi,mi->m", z, to_detector)
+    mirror = distance < 0
+    if mirror.any() and not mirrored:
+        raise InputError(
+            f"view {int(np.argmax(mirror))}: format {format} cannot hold a mirror image; reverse its columns or its rows"
+        )
+    sign = np.where(mirror, -1.0, 1.0)[:, None]
+    n_v, n_u = views.shape
+    foot = -np.stack([np.einsum("mi,mi->m", axis, to_detector) for axis in (x, y)], axis=1) / pitches
+    matrices = np.tile(np.eye(3), (len(views), 1, 1))
+    matrices[:, [0, 1], [0, 1]] = (
+        np.abs(distance)[:, None] / pitches * np.concatenate([sign, np.ones_like(sign)], axis=1)
+    )
+    matrices[:, :2, 2] = foot + (np.array([n_u, n_v]) - 1) / 2
+    rotations = np.stack([sign * x, y, sign * z], axis=1)
+    return matrices, rotations, -np.einsum("mij,mj->mi", rotations, views.sources)
+
+
+def _pixel_axes(views: Views) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Pixel pitches (M, 2), mm, and unit vectors (2, M, 3) along columns' and rows' index.
+
+    The second vectors are made exactly perpendicular to the first.
+    """
+    pitches = np.stack([np.linalg.norm(views.u_steps, axis=1), np.linalg.norm(views.v_steps, axis=1)], axis=1)
+    x = views.u_steps / pitches[:, :1]
+    y = views.v_steps / pitches[:, 1:]
+    y = y - np.einsum("mi,mi->m", x, y)[:, None] * x
+    return pitches, np.stack([x, y / np.linalg.norm(y, axis=1, keepdims=True)])
+
+
+def _refuse_oblique(views: Views, format: str) -> None:
+    """Raise `InputError` naming the first view whose pixel rows are not perpendicular to its columns."""
+    pitches, _ = _pixel_axes(views)
+    cosine = np.einsum("mi,mi->m", views.u_steps, views.v_steps) / pitches.prod(axis=1)
+    n_v, n_u = views.shape
+    proportion = pitches[:, 1] / pitches[:, 0]
+    # How far the last row slides along the columns, and the last column along the rows, in pixels.
+    slide = np.abs(cosine) * np.maximum(n_v * proportion, n_u / proportion) / 2
+    for m in np.flatnonzero(~(slide <= _TOLERANCE))[:1]:
+        raise InputError(
+            f"view {m}: format {format} needs pixel rows perpendicular to columns, and these are "
+            f"{np.degrees(np.arccos(cosine[m])):.4g} degrees apart"
+        )
+
+
+def _with_common_pitch(views: Views, format: str) -> tuple[Views, tuple[float, float]]:
+    """The same rays with one pixel size for all detectors, and that size (pitch_u, pitch_v), mm.
+
+    Detectors with smaller pixels are moved away from their sources until their pixels are as large as the largest.
+    `InputError` where pixel steps are not perpendicular, or two views' pixels have different proportions.
+    """
+    _refuse_oblique(views, format)
+    pitches, _ = _pixel_axes(views)
+    proportion = pitches[:, 1] / pitches[:, 0]
+    stretch = np.abs(proportion / proportion[0] - 1) * max(views.shape) / 2
+    for m in np.flatnonzero(~(stretch <= _TOLERANCE))[:1]:
+        raise InputError(
+            f"view {m}: format {format} has one pixel size for all views, and its pixels of {pitches[m, 0]:g} x "
+            f"{pitches[m, 1]:g} mm have other proportions than view 0's of {pitches[0, 0]:g} x {pitches[0, 1]:g} mm"
+        )
+    pitch_u, pitch_v = pitches[np.argmax(pitches[:, 0])].tolist()
+    scale = pitch_u / pitches[:, :1]
+    centers = views.sources + scale * (views.detector_centers - views.sources)
+    return Views(views.sources, centers, scale * views.u_steps, scale * views.v_steps, views.shape), (pitch_u, pitch_v)
 
 
 ASTRA = _array_format("astra", "ASTRA Toolbox: cone_vec vectors", _astra)

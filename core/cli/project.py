@@ -18,7 +18,7 @@ from ..runs.files import FORMATS, read_run, write_run
 from ..runs.mosaic import mosaic, write_png
 from ..runs.recipe import Recipe, read_recipe, write_recipe
 from ..runs.run_recipe import run_recipe
-from ..runs.settings import SETTINGS, Setting
+from ..runs.settings import SETTINGS
 from .options import add_command, number_or_name, numbered_path, output_path, progress_bar
 
 _LISTED = (
@@ -58,8 +58,19 @@ def add_parser(subparsers) -> None:  # type: ignore[no-untyped-def]
     )
     parser.add_argument("file", nargs="?", metavar="FILE", help=f"{what}are taken")
     for setting in SETTINGS.values():
-        if setting.key not in _BY_HAND:
-            _add_setting(parser, setting)
+        if setting.key in _BY_HAND:
+            continue
+        text = argparse.SUPPRESS
+        if setting.key in _LISTED:
+            text = setting.help + (f" (default: {setting.default})" if setting.default not in (None, False) else "")
+        details: dict[str, Any] = {"type": str} if setting.kind is str else {}
+        if setting.kind is bool:
+            details["action"] = "store_true"
+        else:
+            details["metavar"] = "FILE" if setting.is_path else "NAME" if details else setting.unit.upper() or "VALUE"
+        if setting.sizes is not None or setting.kind is list:
+            details["nargs"] = "+"
+        _add(parser, setting.option, (setting.key,), text, **details)
     size = ("detector.rows", "detector.columns")
     _add(parser, "--size", size, "Pixels, rows and columns (default: 256 256)", nargs=2)
     _add(parser, "--energy", ("energy",), SETTINGS["volume.energy"].help, metavar="KEV")
@@ -95,20 +106,6 @@ def _add(parser: Any, option: str, keys: tuple[str, ...], text: str, **details: 
         details = {"action": _Store, "type": _value, "metavar": "VALUE", **details}
     text = text if text == argparse.SUPPRESS else text.replace("%", "%%")
     parser.add_argument(option, dest=" ".join(keys), default=argparse.SUPPRESS, help=text, **details)
-
-
-def _add_setting(parser: argparse.ArgumentParser, setting: Setting) -> None:
-    text = argparse.SUPPRESS
-    if setting.key in _LISTED:
-        text = setting.help + (f" (default: {setting.default})" if setting.default not in (None, False) else "")
-    if setting.kind is bool:
-        _add(parser, setting.option, (setting.key,), text, action="store_true")
-        return
-    details: dict[str, Any] = {"type": str} if setting.kind is str else {}
-    if setting.sizes is not None or setting.kind is list:
-        details["nargs"] = "+"
-    metavar = "FILE" if setting.is_path else "NAME" if setting.kind is str else setting.unit.upper() or "VALUE"
-    _add(parser, setting.option, (setting.key,), text, metavar=metavar, **details)
 
 
 def _value(text: str) -> Any:

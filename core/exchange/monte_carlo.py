@@ -140,8 +140,8 @@ class Simulation:
     def world_from_phantom(self) -> NDArray[np.float64]:
         """(4, 4), from `pose` or from `position` and `euler_degrees`."""
         if self.pose is None:
-            phi, theta, psi = np.radians(real_array(self.euler_degrees, "euler_degrees", (3,)))
-            return euler_pose(phi, theta, psi, real_array(self.position, "position", (3,)))
+            angles = np.radians(real_array(self.euler_degrees, "euler_degrees", (3,)))
+            return euler_pose(*angles, translation=real_array(self.position, "position", (3,)))
         pose = checked_affine(self.pose, "phantom pose")
         rotation = pose[:3, :3]
         if not np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-9) or np.linalg.det(rotation) < 0:

@@ -39,9 +39,6 @@ _MODELS: dict[str, Any] = {"transmission": Transmission, "emission": Emission, "
 _MOST_MU = 500.0
 """1/mm: more than any material of the tables attenuates photons of 10 keV or more."""
 
-_SAME_POSE = 1e-5
-"""mm; Blender's matrices are float32."""
-
 _Source = tuple[Volume, Volume | None, Recipe]
 """What is projected, what attenuates it, and what to record of it."""
 
@@ -248,7 +245,7 @@ def phantom_pose(recipe: Recipe) -> NDArray[np.float64]:
         return pose
     matrix = np.array(recipe["phantom.matrix"])
     placed = "phantom.position" in recipe.given or "phantom.euler_degrees" in recipe.given
-    if placed and not np.allclose(matrix, pose, rtol=0, atol=_SAME_POSE):
+    if placed and not np.allclose(matrix, pose, rtol=0, atol=1e-5):  # mm; Blender's matrices are float32
         raise InputError("phantom.matrix: it is another pose than that of phantom.position and phantom.euler_degrees")
     return matrix
 

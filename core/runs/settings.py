@@ -70,12 +70,8 @@ class Setting:
         if self.kind in (bool, str):
             return words or {bool: "true or false", str: "a text"}[self.kind]
         number = "a whole number" if self.kind is int else "a number"
-        for said, bound in (
-            ("of {:g} or more", self.least),
-            ("above {:g}", self.above),
-            ("and at most {:g}", self.most),
-        ):
-            number += "" if bound is None else " " + said.format(bound)
+        bounds = {"of {:g} or more": self.least, "above {:g}": self.above, "and at most {:g}": self.most}
+        number += "".join(" " + said.format(bound) for said, bound in bounds.items() if bound is not None)
         return " or ".join(filter(None, (words, number + (f" ({self.unit})" if self.unit else ""))))
 
     def checked(self, value: Any) -> Any:

@@ -50,12 +50,10 @@ def read(
     ----------
     volume
         File or `Volume` of CT numbers, HU.
-    labelmap
-        File or array of structures on the same voxels.
-    labels
-        Keep these structures only.
+    labelmap, labels
+        File or array of structures on the same voxels, and those of them to keep; all by default.
     orientation
-        ``"AP"``, ``"PA"`` or None: the camera's direction.
+        The camera's direction: ``"AP"``, ``"PA"`` or None.
     bone_attenuation_multiplier
         Factor for CT numbers above 350 HU.
     center_volume

@@ -90,20 +90,10 @@ def add_parser(subparsers) -> None:  # type: ignore[no-untyped-def]
     parser.set_defaults(run=_run)
 
 
-class _Store(argparse.Action):
-    """Stores the value of an option under its key in the recipe, or its values one under each of several keys."""
-
-    def __call__(self, parser: Any, namespace: argparse.Namespace, values: Any, option_string: Any = None) -> None:
-        """Called by argparse."""
-        keys = self.dest.split()
-        for key, value in zip(keys, values if len(keys) > 1 else [values], strict=True):
-            setattr(namespace, key, value)
-
-
 def _add(parser: Any, option: str, keys: tuple[str, ...], text: str, **details: Any) -> None:
-    """Add an option for entries of the recipe; they are in the namespace only where it is typed."""
+    """Add an option for an entry of the recipe, or for several; it is in the namespace only where it is typed."""
     if "action" not in details:
-        details = {"action": _Store, "type": _value, "metavar": "VALUE", **details}
+        details = {"type": _value, "metavar": "VALUE", **details}
     text = text if text == argparse.SUPPRESS else text.replace("%", "%%")
     parser.add_argument(option, dest=" ".join(keys), default=argparse.SUPPRESS, help=text, **details)
 
@@ -119,7 +109,10 @@ def _value(text: str) -> Any:
 def _changes(arguments: argparse.Namespace, recipe: Recipe) -> dict[str, Any]:
     """What the options say, by the keys of recipes."""
     typed = vars(arguments)
-    changes = {key: value for key, value in typed.items() if "." in key}
+    changes: dict[str, Any] = {}
+    for dest, value in typed.items():
+        keys = dest.split()
+        changes |= dict(zip(keys, value if len(keys) > 1 else [value], strict=True)) if "." in dest else {}
     for entry in arguments.entries:
         key, equals, text = entry.partition("=")
         if not equals:

@@ -33,12 +33,7 @@ FORMAT_NUMBERS: dict[str, int] = {format.name: number for number, format in enum
 
 
 def write_geometry(
-    system: PinholeSystem,
-    path: str | os.PathLike[str],
-    format: str,
-    *,
-    views: Views | None = None,
-    **options: Any,
+    system: PinholeSystem, path: str | os.PathLike[str], format: str, *, views: Views | None = None, **options: Any
 ) -> None:
     """Write the scanner's geometry for another program.
 

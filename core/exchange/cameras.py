@@ -225,12 +225,8 @@ def _camera_matrices(views: Views, format: str, mirrored: bool = True) -> tuple[
     World point X is seen where ``K @ (R @ X + t)`` is a multiple of (column, row, 1); 0 is the centre of pixel 0. R is a
     proper rotation to x along the columns' index, y along the rows' and z forward: the frames (u, v, k) of views are
     right-handed with k along the rays, so they are cameras as they stand, with the virtual detector and, as (-u, -v, k),
-    with the real one. The first focal length is negative for a mirror image, which no rotation can express.
-
-    Raises
-    ------
-    InputError
-        The pixel steps are not perpendicular, or an image is mirrored and the format is not `mirrored`.
+    with the real one. The first focal length is negative for a mirror image, which no rotation can express. `InputError`
+    where pixel steps are not perpendicular, or an image is mirrored and must not be.
     """
     pitches, (x, y) = _pixel_axes(views)
     _refuse_oblique(views, format)

@@ -60,10 +60,7 @@ _Contents = tuple[dict[str, NDArray[Any]], dict[str, Any]]
 def write_run(run: ProjectionRun, path: str | os.PathLike[str]) -> None:
     """Write a run as HDF5 (.h5, .hdf5), numpy archive (.npz) or torch file (.pt), by the path's suffix.
 
-    Raises
-    ------
-    InputError
-        Another suffix, torch is missing for .pt, or the file cannot be written (the old one then stays).
+    `InputError` for another suffix, where torch is missing for .pt, or the file cannot be written: the old one then stays.
     """
     write, _ = _format(Path(path))
     arrays = {"projections": run.projections, "volume/array": run.volume.array}

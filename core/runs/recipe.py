@@ -22,16 +22,12 @@ _PLACED = ("phantom.position", "phantom.euler_degrees")
 class Recipe:
     """Values of settings by their keys (`settings.SETTINGS`); those that are not given have their defaults.
 
-    The settings of a phantom's class are there as ``"phantom.<name>"``.
+    The settings of a phantom's class are there as ``"phantom.<name>"``. `InputError` for an unknown setting, a wrong value,
+    and a setting without an effect beside the others.
 
     >>> recipe = Recipe({"system.file": "scanner.xlsx", "model.kind": "emission", "model.isotope": "Tc-99m"})
     >>> recipe["model.time"]
     1.0
-
-    Raises
-    ------
-    InputError
-        There is no such setting, its value is not what is expected, or it has no effect beside the others.
     """
 
     given: Mapping[str, Any] = dataclasses.field(default_factory=dict)
@@ -83,9 +79,8 @@ def fitting_recipe(values: Mapping[str, Any], kept: Collection[str] = ()) -> Rec
     values = {key: value for key, value in values.items() if value is not None}
 
     def is_stale(key: str) -> bool:
-        if key not in SETTINGS and key.partition(".")[2] not in _phantom_fields(values):
-            return True
-        return bool(_unmet(values, key))
+        is_known = key in SETTINGS or key.partition(".")[2] in _phantom_fields(values)
+        return not is_known or bool(_unmet(values, key))
 
     while stale := [key for key in values if key not in kept and is_stale(key)]:
         for key in stale:
@@ -104,13 +99,7 @@ def recipe_of_tables(tables: Mapping[str, Any]) -> Recipe:
 
 
 def read_recipe(path: str | os.PathLike[str]) -> Recipe:
-    """The recipe in a TOML file, whose paths are relative to its folder.
-
-    Raises
-    ------
-    InputError
-        The file cannot be read, or as of `Recipe`: the message names file and key.
-    """
+    """The recipe in a TOML file, whose paths are relative to its folder; `InputError` names file and key."""
     folder = Path(path).parent
     tables = read_toml(path)
     try:
@@ -122,10 +111,7 @@ def read_recipe(path: str | os.PathLike[str]) -> Recipe:
 def write_recipe(recipe: Recipe, path: str | os.PathLike[str]) -> None:
     """Write a recipe as TOML: what is given, and every other setting as a comment with its default.
 
-    Raises
-    ------
-    InputError
-        The name does not end in .toml, or the file cannot be written.
+    `InputError` where the name does not end in .toml, or the file cannot be written.
     """
     path = Path(path)
     if path.suffix.lower() != ".toml":

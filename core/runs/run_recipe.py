@@ -125,10 +125,8 @@ def recipe_model(recipe: Recipe, system: PinholeSystem, mu: Volume | None = None
 
 def _volume_name(record: Recipe) -> str:
     """What a run calls its volume."""
-    names = [record[key] for key in ("volume.object", "volume.file", "phantom.file")] + list(
-        record["volume.states"] or ()
-    )
-    for name in filter(None, names):
+    names = [record[key] for key in ("volume.object", "volume.file", "phantom.file")]
+    for name in filter(None, (*names, *(record["volume.states"] or ()))):
         return Path(name).name
     return f"{record['phantom.kind'].capitalize()} phantom" if "phantom.kind" in record.given else ""
 

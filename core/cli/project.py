@@ -145,7 +145,8 @@ def _chosen(arguments: argparse.Namespace) -> tuple[Recipe, dict[str, Any]]:
     before, recipe = recipe.tables(), recipe.updated(_changes(arguments, recipe))
     if run is None:
         return recipe, {}
-    now, kept = recipe.tables(), {}
+    now = recipe.tables()
+    kept: dict[str, Any] = {}
     if now.get("system") == before.get("system"):
         kept["system"] = run.system
     # An attenuation that is made with the volume, or moved with it, needs the volume made anew.

@@ -150,7 +150,8 @@ def _execute(macros: Iterable[str]) -> list[str]:
 
 def _volume(part: Placed) -> list[str]:
     """The commands that make a volume, without its place."""
-    shape, (a, b, *more) = part.shape, part.size
+    shape: str = part.shape
+    a, b, *more = part.size
     if shape == "box":
         settings = {"XLength": a, "YLength": b, "ZLength": more[0]}
     elif shape == "cylinder":

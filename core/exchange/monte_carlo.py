@@ -140,8 +140,8 @@ class Simulation:
     def world_from_phantom(self) -> NDArray[np.float64]:
         """(4, 4), from `pose` or from `position` and `euler_degrees`."""
         if self.pose is None:
-            angles = np.radians(real_array(self.euler_degrees, "euler_degrees", (3,)))
-            return euler_pose(*angles, translation=real_array(self.position, "position", (3,)))
+            phi, theta, psi = np.radians(real_array(self.euler_degrees, "euler_degrees", (3,)))
+            return euler_pose(phi, theta, psi, real_array(self.position, "position", (3,)))
         pose = checked_affine(self.pose, "phantom pose")
         rotation = pose[:3, :3]
         if not np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-9) or np.linalg.det(rotation) < 0:
@@ -216,8 +216,8 @@ def build_setup(system: PinholeSystem, simulation: Simulation) -> Setup:
         outer.append(phantom)
     reach = np.abs(simulation.world_from_phantom[:3, 3]).max()
     for solids in outer:
-        size = np.array(solids.size)
-        half = size / 2 if solids.shape == "box" else np.array([size[0], size[0], size[-1] / 2])
+        radius, *_, height = solids.size
+        half = np.array(solids.size) / 2 if solids.shape == "box" else np.array([radius, radius, height / 2])
         reach = max(reach, (np.abs(solids.centers) + np.abs(solids.rotations) @ half).max())
     return Setup(collimators, crystals, phantom, rods, math.ceil(2 * (reach + _SPACE)))
 

@@ -56,10 +56,8 @@ def read_geometry(path: str | os.PathLike[str]) -> tuple[PinholeSystem, Views]:
             raise InputError(f"not a file of the format mphdrr ({_KIND})")
         if document.get("version") != _VERSION:
             raise InputError(f"version {document.get('version')!r}; this mphDRR reads {_VERSION}")
-        system, views = (
-            {field: [one[name] for one in document[table]] for name, field in fields.items()}
-            for table, fields in (("modules", _MODULE), ("views", _VIEW))
-        )
+        system: Any = {field: [one[name] for one in document["modules"]] for name, field in _MODULE.items()}
+        views: Any = {field: [one[name] for one in document["views"]] for name, field in _VIEW.items()}
         return PinholeSystem(**system), Views(**views, shape=(document["rows"], document["columns"]))
     except InputError as error:
         reason = str(error)

@@ -105,15 +105,15 @@ def _run_of(arrays: dict[str, NDArray[Any]], attributes: dict[str, Any]) -> Proj
     for name in ("projections", "volume/array", *_ARRAYS):
         if name not in arrays:
             raise InputError(f"array {name} is missing")
-    lengths = {name: arrays[f"geometry/{name}"] for name in _LENGTHS}
-    rays = [arrays[f"views/{name}"] for name in _RAYS]
+    lengths: Any = {name: arrays[f"geometry/{name}"] for name in _LENGTHS}
+    rays: Any = {name: arrays[f"views/{name}"] for name in _RAYS}
     volume, seed = arrays["volume/array"], attributes["seed"]
     n_v, n_u = arrays["projections"].shape[1:]
     n_x, n_y, n_z = volume.shape
     return ProjectionRun(
         projections=np.asarray(arrays["projections"], np.float32),
         system=PinholeSystem(arrays["geometry/center"], **lengths, numbers=arrays["geometry/number"]),
-        views=Views(*rays, shape=(n_v, n_u)),
+        views=Views(**rays, shape=(n_v, n_u)),
         volume=Volume(volume, Grid((n_x, n_y, n_z), arrays["volume/affine"]), str(attributes["volume_quantity"])),
         unit=str(attributes["projections_unit"]),
         settings=json.loads(attributes["settings"]),

@@ -254,10 +254,11 @@ def with_phantom(recipe: Recipe, phantom: Phantom, pose: NDArray[np.float64]) ->
     angles = euler_degrees(pose)
     if angles is not None:
         values |= {"position": pose[:3, 3].tolist(), "euler_degrees": angles}
+    cls: Any = type(phantom)
     for kind in KINDS:
-        if type(phantom) is kind.phantom:
-            numbers: Any = dataclasses.fields(kind.phantom)
-            values |= {"kind": kind.name} | {f.name: getattr(phantom, f.name) for f in numbers if f.init}
+        if cls is kind.phantom:
+            fields = dataclasses.fields(cls)
+            values |= {"kind": kind.name} | {f.name: getattr(phantom, f.name) for f in fields if f.init}
     return recipe.updated({f"phantom.{name}": value for name, value in values.items()})
 
 

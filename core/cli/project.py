@@ -53,10 +53,8 @@ def add_parser(subparsers) -> None:  # type: ignore[no-untyped-def]
         "--set model.aperture_mu=tungsten --write-recipe heart.toml\n"
         "example: mphdrr project heart.toml --noise 1 -o counts.h5",
     )
-    what = (
-        "geometry workbook (.xlsx, .xlsm), recipe (.toml), or a run (.h5, .npz, .pt) whose recipe, scanner and volume "
-    )
-    parser.add_argument("file", nargs="?", metavar="FILE", help=f"{what}are taken")
+    text = "geometry workbook (.xlsx, .xlsm), recipe (.toml), or run (.h5, .npz, .pt), to be made again"
+    parser.add_argument("file", nargs="?", metavar="FILE", help=text)
     for setting in SETTINGS.values():
         if setting.key in _BY_HAND:
             continue

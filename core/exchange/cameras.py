@@ -197,12 +197,8 @@ def _nerf(system: PinholeSystem, views: Views, path: Path, *, pictures: str = "i
     poses = np.tile(np.eye(4), (len(views), 1, 1))
     poses[:, :3, :3] = axes.transpose(0, 2, 1)
     poses[:, :3, 3] = views.sources
-    fl_x, fl_y, cx, cy = (
-        matrices[:, 0, 0],
-        matrices[:, 1, 1],
-        n_u - 0.5 - matrices[:, 0, 2],
-        n_v - 0.5 - matrices[:, 1, 2],
-    )
+    (fl_x, _, cx), (_, fl_y, cy), _ = matrices.transpose(1, 2, 0)
+    cx, cy = n_u - 0.5 - cx, n_v - 0.5 - cy
     intrinsics = {"camera_angle_x": 2 * np.arctan(n_u / 2 / fl_x), "fl_x": fl_x, "fl_y": fl_y, "cx": cx, "cy": cy}
     common = {name: float(values[0]) for name, values in intrinsics.items() if np.ptp(values) < 1e-9}
     numbers = system.numbers if len(system) == len(views) else np.arange(1, len(views) + 1)
@@ -238,15 +234,14 @@ def _camera_matrices(views: Views, format: str, mirrored: bool = True) -> tuple[
         raise InputError(
             f"view {int(np.argmax(mirror))}: format {format} cannot hold a mirror image; reverse its columns or its rows"
         )
-    sign = np.where(mirror, -1.0, 1.0)[:, None]
+    sign = np.where(mirror, -1.0, 1.0)
     n_v, n_u = views.shape
     foot = -np.stack([np.einsum("mi,mi->m", axis, to_detector) for axis in (x, y)], axis=1) / pitches
     matrices = np.tile(np.eye(3), (len(views), 1, 1))
-    matrices[:, [0, 1], [0, 1]] = (
-        np.abs(distance)[:, None] / pitches * np.concatenate([sign, np.ones_like(sign)], axis=1)
-    )
+    matrices[:, [0, 1], [0, 1]] = np.abs(distance)[:, None] / pitches
+    matrices[:, 0, 0] *= sign
     matrices[:, :2, 2] = foot + (np.array([n_u, n_v]) - 1) / 2
-    rotations = np.stack([sign * x, y, sign * z], axis=1)
+    rotations = np.stack([sign[:, None] * x, y, sign[:, None] * z], axis=1)
     return matrices, rotations, -np.einsum("mij,mj->mi", rotations, views.sources)
 
 

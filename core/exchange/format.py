@@ -25,9 +25,7 @@ class Format:
     title: str  # what it holds, in one line
     suffixes: tuple[str, ...]  # endings of the file's name, the default first; empty for a folder
     write: Callable[..., None]  # write(system, views, path, **options) writes the file, or fills the empty folder
-    options_of: Callable[..., Any] | None = (
-        None  # whose keyword-only parameters are the options; None: those of `write`
-    )
+    options_of: Callable[..., Any] | None = None  # has the options as keyword-only parameters; None: `write` has them
 
     @property
     def options(self) -> dict[str, tuple[Any, Any]]:

@@ -124,9 +124,8 @@ class _Folder:
 
 def angle_and_axis(rotation: NDArray[np.float64]) -> tuple[float, NDArray[np.float64]]:
     """Angle, 0 to pi, and unit axis of a rotation matrix (3, 3); the axis is z where it does not turn."""
-    twice = np.array(
-        [rotation[2, 1] - rotation[1, 2], rotation[0, 2] - rotation[2, 0], rotation[1, 0] - rotation[0, 1]]
-    )
+    odd = rotation - rotation.T
+    twice = np.array([odd[2, 1], odd[0, 2], odd[1, 0]])
     sine, cosine = np.linalg.norm(twice) / 2, (np.trace(rotation) - 1) / 2
     if cosine > 0:
         axis = twice / (2 * sine) if sine > 0 else np.array([0.0, 0.0, 1.0])
@@ -228,20 +227,13 @@ def _source(folder: _Folder, setup: Setup, simulation: Simulation) -> list[str]:
     photons_per_decay = sum(photons for _, photons in simulation.nuclide.lines)
 
     def source(name: str, activity: float, center: NDArray[np.float64], *shape: str) -> list[str]:
-        return [
-            f"/gate/source/addSource {name} gps",
-            *_under(
-                f"/gate/source/{name}",
-                "gps/particle gamma",
-                "gps/ene/type UserSpectrum",
-                f"gps/setSpectrumFile {spectrum}",
-                f"setActivity {_n(activity * photons_per_decay)} becquerel",
-                "setForcedUnstableFlag true",
-                f"setForcedHalfLife {_n(simulation.nuclide.half_life)} s",
-                "gps/ang/type iso",
-                *_under("gps/pos", *shape, f"centre {_n(*center)} mm"),
-            ),
+        settings = [
+            *("gps/particle gamma", "gps/ene/type UserSpectrum", f"gps/setSpectrumFile {spectrum}"),
+            *(f"setActivity {_n(activity * photons_per_decay)} becquerel", "setForcedUnstableFlag true"),
+            *(f"setForcedHalfLife {_n(simulation.nuclide.half_life)} s", "gps/ang/type iso"),
+            *_under("gps/pos", *shape, f"centre {_n(*center)} mm"),
         ]
+        return [f"/gate/source/addSource {name} gps", *_under(f"/gate/source/{name}", *settings)]
 
     if setup.phantom is None:
         return source("point", simulation.becquerels, pose[:3, 3], "type Point")

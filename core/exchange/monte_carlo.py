@@ -33,10 +33,7 @@ _SPACE = 50.0  # mm of air between the scanner's farthest point and the end of t
 _SAME = 1e-6  # mm: modules whose lengths differ by less are alike
 
 # Name in GATE -> its state; the material of the same name is in `MATERIALS`.
-_STATES = {
-    "Air": "gas", "Water": "liquid", "PMMA": "solid", "Tungsten": "solid", "Lead": "solid", "NaI": "solid",
-    "CZT": "solid",
-}  # fmt: skip
+_STATES = {"Air": "gas", "Water": "liquid", **dict.fromkeys(("PMMA", "Tungsten", "Lead", "NaI", "CZT"), "solid")}
 _ELEMENTS = {  # symbol -> name, atomic number, molar mass in g/mol
     "H": ("Hydrogen", 1, 1.008),
     "C": ("Carbon", 6, 12.011),

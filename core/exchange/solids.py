@@ -9,7 +9,7 @@ from __future__ import annotations
 import zipfile
 from collections.abc import Callable
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 
@@ -110,16 +110,11 @@ def _save_glb(path: Path, parts: list[ModulePart]) -> None:
     from trimesh.visual import TextureVisuals
     from trimesh.visual.material import PBRMaterial
 
-    materials = {
-        kind: PBRMaterial(
-            kind,
-            baseColorFactor=[round(255 * share) for share in look.color],
-            metallicFactor=look.metallic,
-            roughnessFactor=look.roughness,
-            alphaMode="OPAQUE" if look.color[3] == 1.0 else "BLEND",
-        )
-        for kind, look in LOOKS.items()
-    }
+    materials = {}
+    for kind, look in LOOKS.items():
+        factors: Any = {"metallicFactor": look.metallic, "roughnessFactor": look.roughness}
+        factors["baseColorFactor"] = [round(255 * share) for share in look.color]
+        materials[kind] = PBRMaterial(kind, **factors, alphaMode="OPAQUE" if look.color[3] == 1.0 else "BLEND")
     to_metres = np.diag([0.001, 0.001, 0.001, 1.0])
     to_metres[1:3, 1:3] = [[0.0, 0.001], [-0.001, 0.0]]
     scene = trimesh.Scene()

@@ -187,9 +187,7 @@ def _torch() -> Any:
     try:
         import torch
     except ImportError:
-        raise InputError(
-            ".pt files need torch, which is not installed: pip install torch, or use .h5 or .npz"
-        ) from None
+        raise InputError(".pt files need torch, which is missing: pip install torch, or use .h5 or .npz") from None
     return torch
 
 

@@ -42,9 +42,7 @@ class ProjectionRun:
     views: Views  # the M images' rays
     volume: Volume  # what was projected
     unit: str = ""  # of the projections, such as "kBq/mL mm"
-    settings: Mapping[str, Any] = field(
-        default_factory=dict
-    )  # how they were made (recipe, model ...), as JSON can hold it
+    settings: Mapping[str, Any] = field(default_factory=dict)  # how they were made: anything JSON can hold
     seed: int | None = None  # of the noise; None where the projections have none
     workbook: str = ""  # name of the geometry workbook, and its SHA-256; empty where there is none
     workbook_sha256: str = ""

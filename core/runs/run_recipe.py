@@ -167,10 +167,8 @@ def _read(path: str, recipe: Recipe, progress: Progress | None) -> Volume:
         volume = read_volume_of(path, "activity", series=series, progress=progress)
         lowest, highest = float(volume.array.min()), float(volume.array.max())
         if lowest < -0.1 * highest:  # interpolation leaves less
-            raise InputError(
-                f"{path}: values of {lowest:g} to {highest:g}, as of a CT, are no activity; --quantity "
-                "activity takes them as such"
-            )
+            values = f"values of {lowest:g} to {highest:g}, as of a CT, are no activity"
+            raise InputError(f"{path}: {values}; --quantity activity takes them as such")
         return volume
     if recipe["model.photons"] is not None or recipe["volume.energy"] is not None:
         return _read_mu(path, recipe["volume.energy"], series, progress)
@@ -203,9 +201,8 @@ def _read_mu(path: str, energy: float | str | None, series: str | None, progress
 
 def _from_phantom(recipe: Recipe, record: Recipe, model: Model, mu: Volume | None, stages: Stages) -> Iterator[_Source]:
     if recipe["volume.object"] is not None and not any(key.startswith("phantom.") for key in recipe.given):
-        raise InputError(
-            f"volume.object: {recipe['volume.object']!r} is in a Blender scene; give --volume FILE instead"
-        )
+        name = recipe["volume.object"]
+        raise InputError(f"volume.object: {name!r} is in a Blender scene; give --volume FILE instead")
     phantom: Phantom
     if recipe["phantom.file"] is not None:
         phantom = read_phantom(recipe["phantom.file"])

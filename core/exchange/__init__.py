@@ -1,61 +1,39 @@
 """Exports of the scanner's geometry: cameras, solids and Monte Carlo simulations for other programs.
 
-To add a program, write a module here that offers a `Format`, and list it below. The command line, Blender's menu and
+To add a program, write its `Format` in a module here, and list it below. The command line, Blender's menu and
 `docs/geometry-export.md`, which refers to the command's help, take it from the list.
 """
 
 from __future__ import annotations
 
 import os
+from pathlib import Path
 from typing import Any
 
 from ..errors import InputError
+from ..files import replacing
 from ..geometry.system import PinholeSystem
 from ..geometry.views import Views
 from ..validation import instance
-from .astra import ASTRA
-from .format import Format
+from .cameras import ASTRA, KORNIA, LEAP, NERF, OPENCV, PYTORCH3D, RTK
+from .format import Format, new_folder
 from .gate9 import GATE9
 from .gate10 import GATE10
-from .leap import LEAP
 from .mphdrr_json import MPHDRR, read_geometry
-from .nerf import NERF
-from .opencv import KORNIA, OPENCV
-from .pytorch3d import PYTORCH3D
-from .rtk import RTK
 from .solids import GLB, STL, STL_PARTS, THREE_MF
 
 __all__ = ["FORMATS", "FORMAT_NUMBERS", "Format", "read_geometry", "write_geometry"]
 
-# Blender keeps a menu's choice as a number: never change one, and give a new format a number that no format has had.
-# 7 and 8 belonged to PyTomography and STIR in version 0.1.0.
-_NUMBERED = {
-    0: ASTRA,
-    1: RTK,
-    2: OPENCV,
-    3: KORNIA,
-    4: PYTORCH3D,
-    5: NERF,
-    6: LEAP,
-    9: STL,
-    10: STL_PARTS,
-    11: THREE_MF,
-    12: GLB,
-    13: GATE9,
-    14: GATE10,
-    15: MPHDRR,
-}
-FORMATS: dict[str, Format] = {format.name: format for format in _NUMBERED.values()}
-FORMAT_NUMBERS: dict[str, int] = {format.name: number for number, format in _NUMBERED.items()}
+_CAMERAS = (ASTRA, RTK, OPENCV, KORNIA, PYTORCH3D, NERF, LEAP)
+_FORMATS = (*_CAMERAS, None, None, STL, STL_PARTS, THREE_MF, GLB, GATE9, GATE10, MPHDRR)
+FORMATS: dict[str, Format] = {format.name: format for format in _FORMATS if format}
+
+# Blender keeps a menu's choice by its place in the list: add formats at the end, and leave a None where one is removed.
+FORMAT_NUMBERS: dict[str, int] = {format.name: number for number, format in enumerate(_FORMATS) if format}
 
 
 def write_geometry(
-    system: PinholeSystem,
-    path: str | os.PathLike[str],
-    format: str,
-    *,
-    views: Views | None = None,
-    **options: Any,
+    system: PinholeSystem, path: str | os.PathLike[str], format: str, *, views: Views | None = None, **options: Any
 ) -> None:
     """Write the scanner's geometry for another program.
 
@@ -75,8 +53,7 @@ def write_geometry(
     Raises
     ------
     InputError
-        The format, an option or the file's ending is unknown, the format cannot express the geometry, or the file cannot
-        be written. An existing file is then left as it was.
+        For an unknown format, option or ending, and for what the format cannot express. An existing file then stays.
     """
     instance(system, PinholeSystem, "write_geometry")
     if format not in FORMATS:
@@ -85,4 +62,10 @@ def write_geometry(
     instance(views, Views, "views")
     if len(views) == 0:
         raise InputError("views: expected one or more, got none")
-    FORMATS[format].save(system, views, path, options)
+    chosen, path = FORMATS[format], Path(path)
+    for name in sorted(options.keys() - chosen.options.keys()):
+        raise InputError(f"format {format}: no option {name!r}, it has {', '.join(chosen.options) or 'none'}")
+    if chosen.suffixes and not path.name.lower().endswith(chosen.suffixes):
+        raise InputError(f"{path}: expected a name ending in {', '.join(chosen.suffixes)}")
+    with replacing(path) if chosen.suffixes else new_folder(path) as temporary:
+        chosen.write(system, views, temporary, **options)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import inspect
-import json
 import os
 import shutil
 import typing
@@ -14,38 +13,19 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from ..errors import InputError
-from ..files import ensure_folder, replacing
-from ..geometry.system import PinholeSystem
-from ..geometry.views import Views
+from ..files import ensure_folder
 
 
 @dataclass(frozen=True)
 class Format:
-    """A file, or a folder of files, for another program.
+    """A file, or a folder of files, for another program."""
 
-    Attributes
-    ----------
-    name : str
-        Its name on the command line.
-    title : str
-        What it holds, in one line.
-    suffixes : tuple of str
-        Endings of the file's name, the default first; empty for a folder.
-    write : callable
-        ``write(system, views, path, **options)`` writes the file, or fills the empty folder. Raises `InputError` for what
-        the format cannot express.
-    options_of : callable or None
-        Its keyword-only parameters, with types and defaults, are the format's options; None: those of `write`.
-    """
-
-    name: str
-    title: str
-    suffixes: tuple[str, ...]
-    write: Callable[..., None]
-    options_of: Callable[..., Any] | None = None
+    name: str  # on the command line
+    title: str  # what it holds, in one line
+    suffixes: tuple[str, ...]  # endings of the file's name, the default first; empty for a folder
+    write: Callable[..., None]  # write(system, views, path, **options) writes the file, or fills the empty folder
+    options_of: Callable[..., Any] | None = None  # has the options as keyword-only parameters; None: `write` has them
 
     @property
     def options(self) -> dict[str, tuple[Any, Any]]:
@@ -55,34 +35,9 @@ class Format:
         parameters = inspect.signature(source).parameters.values()
         return {p.name: (types[p.name], p.default) for p in parameters if p.kind is p.KEYWORD_ONLY}
 
-    def save(self, system: PinholeSystem, views: Views, path: str | os.PathLike[str], options: dict[str, Any]) -> None:
-        """Check the options' names and the file's ending, then write."""
-        path = Path(path)
-        for name in sorted(options.keys() - self.options.keys()):
-            raise InputError(f"format {self.name}: no option {name!r}, it has {', '.join(self.options) or 'none'}")
-        if self.suffixes and not path.name.lower().endswith(self.suffixes):
-            raise InputError(f"{path}: expected a name ending in {', '.join(self.suffixes)}")
-        with replacing(path) if self.suffixes else _new_folder(path) as temporary:
-            self.write(system, views, temporary, **options)
-
-
-def array_format(name: str, title: str, arrays: Callable[..., dict[str, Any]]) -> Format:
-    """A format of named arrays, ``arrays(views, **options)``: NumPy's .npz, or .json with every digit."""
-
-    def write(system: PinholeSystem, views: Views, path: Path, **options: Any) -> None:
-        named = arrays(views, **options)
-        if path.name.lower().endswith(".json"):
-            lists = {key: np.asarray(value).tolist() for key, value in named.items()}
-            path.write_text(json.dumps(lists, indent=1) + "\n", encoding="utf-8")
-            return
-        with open(path, "wb") as file:  # given a name, NumPy would add .npz to .NPZ
-            np.savez(file, **named)
-
-    return Format(name, title, (".npz", ".json"), write, options_of=arrays)
-
 
 @contextmanager
-def _new_folder(path: Path) -> Iterator[Path]:
+def new_folder(path: Path) -> Iterator[Path]:
     """Give a temporary folder beside `path`; rename it to `path` on success, remove it on failure."""
     if path.exists() and (not path.is_dir() or any(path.iterdir())):
         raise InputError(f"{path}: expected a new folder or an empty one")

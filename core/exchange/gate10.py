@@ -14,7 +14,7 @@ from ..geometry.system import PinholeSystem
 from ..geometry.views import Views
 from ..validation import whole_number
 from .format import Format
-from .monte_carlo import REFERENCE_ENERGY, Placed, Setup, Simulation, build_setup, material_database
+from .monte_carlo import REFERENCE_ENERGY, Setup, Simulation, build_setup, material_database
 
 _SCRIPT = Path(__file__).with_name("gate10_script.py")
 
@@ -35,7 +35,7 @@ def _write(system: PinholeSystem, views: Views, path: Path, **options: Any) -> N
     simulation = Gate10Simulation(**options)
     record = _record(system, build_setup(system, simulation), simulation) | {"image_shape": list(views.shape)}
     (path / "simulation.py").write_text(_SCRIPT.read_text(encoding="utf-8"), encoding="utf-8")
-    (path / "simulation.json").write_text(_json(record), encoding="utf-8")
+    (path / "simulation.json").write_text(json.dumps(record, indent=1), encoding="utf-8")
     (path / "GateMaterials.db").write_text(material_database(), encoding="ascii", newline="\n")
 
 
@@ -43,21 +43,22 @@ _TITLE = "GATE 10 (opengate) script: a folder, to run by python simulation.py"
 GATE10 = Format("gate10", _TITLE, (), _write, options_of=Gate10Simulation)
 
 
-def _json(record: dict[str, Any]) -> str:
-    """JSON with a line for each entry, and for each item of lists of objects."""
-    entries = []
-    for key, value in record.items():
-        text = json.dumps(value)
-        if isinstance(value, list) and value and isinstance(value[0], dict):
-            text = "[\n  " + ",\n  ".join(map(json.dumps, value)) + "\n ]"
-        entries.append(f"{json.dumps(key)}: {text}")
-    return "{\n " + ",\n ".join(entries) + "\n}\n"
-
-
 def _record(system: PinholeSystem, setup: Setup, simulation: Gate10Simulation) -> dict[str, Any]:
     parts = [part for parts in setup.collimators for part in parts] + [solids for solids, _ in setup.crystals]
     if setup.phantom is not None:
         parts += [setup.phantom, *(rods for rods, _ in setup.rods)]
+    modules = {
+        int(m): {
+            "number": int(system.numbers[m]),
+            "crystal": part.name,
+            "copy": copy,
+            "crystal_center_mm": part.centers[copy].tolist(),
+            "crystal_size_mm": [float(x) for x in part.size],
+            "axes_uvk": part.rotations[copy].T.tolist(),
+        }
+        for part, indices in setup.crystals
+        for copy, m in enumerate(indices)
+    }
     return {
         "threads": int(simulation.threads),
         "seed": int(simulation.seed),
@@ -74,38 +75,20 @@ def _record(system: PinholeSystem, setup: Setup, simulation: Gate10Simulation) -
         },
         "emitters": _emitters(setup, simulation),
         "crystals": [solids.name for solids, _ in setup.crystals],
-        "modules": _modules(system, setup),
-        "volumes": [_volume(part) for part in parts],
+        "modules": [modules[m] for m in range(len(system))],
+        "volumes": [
+            {
+                "name": part.name,
+                "mother": part.mother,
+                "shape": part.shape,
+                "size_mm": [float(x) for x in part.size],
+                "material": part.material,
+                "centers_mm": part.centers.tolist(),
+                "rotations": part.rotations.tolist(),
+            }
+            for part in parts
+        ],
     }
-
-
-def _volume(part: Placed) -> dict[str, Any]:
-    return {
-        "name": part.name,
-        "mother": part.mother,
-        "shape": part.shape,
-        "size_mm": [float(x) for x in part.size],
-        "material": part.material,
-        "centers_mm": part.centers.tolist(),
-        "rotations": part.rotations.tolist(),
-    }
-
-
-def _modules(system: PinholeSystem, setup: Setup) -> list[dict[str, Any]]:
-    """Each module's crystal, for its images."""
-    modules = {
-        int(m): {
-            "number": int(system.numbers[m]),
-            "crystal": part.name,
-            "copy": copy,
-            "crystal_center_mm": part.centers[copy].tolist(),
-            "crystal_size_mm": [float(x) for x in part.size],
-            "axes_uvk": part.rotations[copy].T.tolist(),
-        }
-        for part, indices in setup.crystals
-        for copy, m in enumerate(indices)
-    }
-    return [modules[m] for m in range(len(system))]
 
 
 def _emitters(setup: Setup, simulation: Simulation) -> list[dict[str, Any]]:

@@ -39,11 +39,15 @@ def _write(system: PinholeSystem, views: Views, path: Path, **options: Any) -> N
     folder.write("GateMaterials.db", material_database())
     one = len(setup.crystals) == 1
     heads = [_head(folder, c, "SPECThead" if one else f"head{i + 1}") for i, (c, _) in enumerate(setup.crystals)]
+    collimators = [
+        folder.macro(f"geometry/{solid.name}", sum(map(_centered, air), _repeated(folder, solid)))
+        for solid, *air in setup.collimators
+    ]
     world = _under("/gate/world", *(f"geometry/set{axis}Length {_n(setup.world)} mm" for axis in "XYZ"))
     geometry = [
         folder.macro("geometry/world", [*world, "/gate/world/setMaterial Air"]),
         folder.list("geometry/heads", heads),
-        folder.list("geometry/collimators", [_collimator(folder, parts) for parts in setup.collimators]),
+        folder.list("geometry/collimators", collimators),
     ]
     if setup.phantom is not None:
         parts = (setup.phantom, *(rods for rods, _ in setup.rods))
@@ -51,6 +55,11 @@ def _write(system: PinholeSystem, views: Views, path: Path, **options: Any) -> N
     cuts = _under("/gate/physics", *(f"{p}/SetCutInRegion world 0.1 mm" for p in ("Gamma", "Electron", "Positron")))
     flags = ("setRootHitFlag 0", "setRootNtupleFlag 0", "setRootSinglesFlag 1")
     singles = _under("/gate/output/root", "enable", "setFileName singles", *flags)
+    side, (n_v, n_u) = setup.crystals[0][0].size[0], views.shape
+    pixels = [f"pixelSizeX {_n(side / n_u)} mm", f"pixelSizeY {_n(side / n_v)} mm"]
+    pixels += [f"pixelNumberX {n_u}", f"pixelNumberY {n_v}"]
+    plane = ("enable", "setFileName projections", "projectionPlane XY")
+    projections = _under("/gate/output/projection", *plane, *pixels, "setInputDataName Window")
     main = [
         f"# {len(system)} pinhole modules in GATE 9.3 or later. Run it from this folder: Gate main.mac",
         "/gate/geometry/setMaterialDatabase GateMaterials.db",
@@ -60,7 +69,7 @@ def _write(system: PinholeSystem, views: Views, path: Path, **options: Any) -> N
         *_execute([folder.list("digitizer/all", [_digitizer(folder, c.name, simulation) for c, _ in setup.crystals])]),
         *_execute([folder.macro("source", _source(folder, setup, simulation))]),
         *_execute([folder.macro("output", singles)]),
-        *(_execute([folder.macro("projections", _projections(setup.crystals[0][0], views))]) if one else []),
+        *(_execute([folder.macro("projections", projections)]) if one else []),
         "/gate/random/setEngineName MersenneTwister",
         f"/gate/random/setEngineSeed {int(simulation.seed)}",
         f"/gate/application/setTimeSlice {_n(simulation.time)} s",
@@ -115,9 +124,8 @@ class _Folder:
 
 def angle_and_axis(rotation: NDArray[np.float64]) -> tuple[float, NDArray[np.float64]]:
     """Angle, 0 to pi, and unit axis of a rotation matrix (3, 3); the axis is z where it does not turn."""
-    twice = np.array(
-        [rotation[2, 1] - rotation[1, 2], rotation[0, 2] - rotation[2, 0], rotation[1, 0] - rotation[0, 1]]
-    )
+    odd = rotation - rotation.T
+    twice = np.array([odd[2, 1], odd[0, 2], odd[1, 0]])
     sine, cosine = np.linalg.norm(twice) / 2, (np.trace(rotation) - 1) / 2
     if cosine > 0:
         axis = twice / (2 * sine) if sine > 0 else np.array([0.0, 0.0, 1.0])
@@ -139,31 +147,19 @@ def _execute(macros: Iterable[str]) -> list[str]:
     return [f"/control/execute {name}" for name in macros]
 
 
-def _shape(part: Placed) -> tuple[str, dict[str, float]]:
-    """GATE's name of the shape, and its settings: mm, or degrees."""
-    if part.shape == "box":
-        return "box", dict(zip(("XLength", "YLength", "ZLength"), part.size, strict=True))
-    if part.shape == "cylinder":
-        radius, height = part.size
-        return "cylinder", {"Rmin": 0, "Rmax": radius, "Height": height}
-    a, b, height = part.size
-    if part.shape == "cone":
-        return "cone", {
-            "Rmin1": 0,
-            "Rmax1": a,
-            "Rmin2": 0,
-            "Rmax2": b,
-            "Height": height,
-            "PhiStart": 0,
-            "DeltaPhi": 360,
-        }
-    square = {"Dy1": a, "Dx1": a, "Dx2": a, "Alp1": 0, "Dy2": b, "Dx3": b, "Dx4": b, "Alp2": 0}
-    return "trap", {"Dz": height / 2, "Theta": 0, "Phi": 0, **square}
-
-
 def _volume(part: Placed) -> list[str]:
     """The commands that make a volume, without its place."""
-    shape, settings = _shape(part)
+    shape: str = part.shape
+    a, b, *more = part.size
+    if shape == "box":
+        settings = {"XLength": a, "YLength": b, "ZLength": more[0]}
+    elif shape == "cylinder":
+        settings = {"Rmin": 0, "Rmax": a, "Height": b}
+    elif shape == "cone":
+        settings = {"Rmin1": 0, "Rmax1": a, "Rmin2": 0, "Rmax2": b, "Height": more[0], "PhiStart": 0, "DeltaPhi": 360}
+    else:
+        square = {"Dy1": a, "Dx1": a, "Dx2": a, "Alp1": 0, "Dy2": b, "Dx3": b, "Dx4": b, "Alp2": 0}
+        shape, settings = "trap", {"Dz": more[0] / 2, "Theta": 0, "Phi": 0, **square}
     sizes = (f"geometry/set{key} {_n(x)} {'deg' if key in _IN_DEGREES else 'mm'}" for key, x in settings.items())
     made = _under(f"/gate/{part.mother}/daughters", f"name {part.name}", f"insert {shape}")
     return made + _under(f"/gate/{part.name}", *sizes, f"setMaterial {part.material}")
@@ -198,49 +194,28 @@ def _head(folder: _Folder, crystal: Placed, name: str) -> str:
     return folder.macro(f"geometry/{name}", [made, *kind, *rest, *_centered(inside), *attached])
 
 
-def _collimator(folder: _Folder, parts: list[Placed]) -> str:
-    solid, *air = parts
-    lines = [line for part in air for line in _centered(part)]
-    return folder.macro(f"geometry/{solid.name}", _repeated(folder, solid) + lines)
-
-
 def _digitizer(folder: _Folder, crystal: str, simulation: Simulation) -> str:
     """The singles of one sensitive detector, and those in the energy window.
 
     The window is a digitizer of its own, with this one module: GATE's projections read the first module of theirs.
     """
-    detector = f"/gate/digitizerMgr/{crystal}/SinglesDigitizer"
-    lines = _under(
-        f"{detector}/Singles",
-        "insert adder",
-        "adder/positionPolicy energyWeightedCentroid",
-        "insert readout",
-        "readout/setPolicy TakeEnergyWinner",
-        "readout/setDepth 1",
-    )
+    singles = ["insert adder", "adder/positionPolicy energyWeightedCentroid"]
+    singles += ["insert readout", "readout/setPolicy TakeEnergyWinner", "readout/setDepth 1"]
     if simulation.energy_resolution:
-        lines += _under(
-            f"{detector}/Singles",
-            "insert energyResolution",
-            f"energyResolution/fwhm {_n(simulation.energy_resolution)}",
-            f"energyResolution/energyOfReference {_n(REFERENCE_ENERGY)} keV",
-        )
+        singles += ["insert energyResolution", f"energyResolution/fwhm {_n(simulation.energy_resolution)}"]
+        singles += [f"energyResolution/energyOfReference {_n(REFERENCE_ENERGY)} keV"]
     if simulation.intrinsic_fwhm:
-        lines += _under(
-            f"{detector}/Singles",
-            "insert spatialResolution",
-            f"spatialResolution/fwhm {_n(simulation.intrinsic_fwhm)} mm",
-            "spatialResolution/confineInsideOfSmallestElement true",
-        )
-    lines += _under("/gate/digitizerMgr", "name Window", f"chooseSD {crystal}", "insert SinglesDigitizer")
+        singles += ["insert spatialResolution", f"spatialResolution/fwhm {_n(simulation.intrinsic_fwhm)} mm"]
+        singles += ["spatialResolution/confineInsideOfSmallestElement true"]
     low, high = simulation.window
-    lines += _under(
-        f"{detector}/Window",
-        "setInputCollection Singles",
-        "insert energyFraming",
-        f"energyFraming/setMin {_n(low)} keV",
-        f"energyFraming/setMax {_n(high)} keV",
-    )
+    window = ["setInputCollection Singles", "insert energyFraming"]
+    window += [f"energyFraming/setMin {_n(low)} keV", f"energyFraming/setMax {_n(high)} keV"]
+    detector = f"/gate/digitizerMgr/{crystal}/SinglesDigitizer"
+    lines = [
+        *_under(f"{detector}/Singles", *singles),
+        *_under("/gate/digitizerMgr", "name Window", f"chooseSD {crystal}", "insert SinglesDigitizer"),
+        *_under(f"{detector}/Window", *window),
+    ]
     return folder.macro(f"digitizer/{crystal}", lines)
 
 
@@ -249,22 +224,16 @@ def _source(folder: _Folder, setup: Setup, simulation: Simulation) -> list[str]:
     energies = "".join(f"{_n(energy / 1000, photons)}\n" for energy, photons in simulation.nuclide.lines)
     spectrum = folder.write("spectrum.txt", "1 0\n" + energies)
     pose = simulation.world_from_phantom
+    photons_per_decay = sum(photons for _, photons in simulation.nuclide.lines)
 
     def source(name: str, activity: float, center: NDArray[np.float64], *shape: str) -> list[str]:
-        return [
-            f"/gate/source/addSource {name} gps",
-            *_under(
-                f"/gate/source/{name}",
-                "gps/particle gamma",
-                "gps/ene/type UserSpectrum",
-                f"gps/setSpectrumFile {spectrum}",
-                f"setActivity {_n(activity * simulation.photons_per_decay)} becquerel",
-                "setForcedUnstableFlag true",
-                f"setForcedHalfLife {_n(simulation.nuclide.half_life)} s",
-                "gps/ang/type iso",
-                *_under("gps/pos", *shape, f"centre {_n(*center)} mm"),
-            ),
+        settings = [
+            *("gps/particle gamma", "gps/ene/type UserSpectrum", f"gps/setSpectrumFile {spectrum}"),
+            *(f"setActivity {_n(activity * photons_per_decay)} becquerel", "setForcedUnstableFlag true"),
+            *(f"setForcedHalfLife {_n(simulation.nuclide.half_life)} s", "gps/ang/type iso"),
+            *_under("gps/pos", *shape, f"centre {_n(*center)} mm"),
         ]
+        return [f"/gate/source/addSource {name} gps", *_under(f"/gate/source/{name}", *settings)]
 
     if setup.phantom is None:
         return source("point", simulation.becquerels, pose[:3, 3], "type Point")
@@ -274,32 +243,8 @@ def _source(folder: _Folder, setup: Setup, simulation: Simulation) -> list[str]:
         middle = rods.centers.mean(axis=0)
         around = np.linalg.norm(rods.centers - middle, axis=1).max() + radius
         name = rods.name.replace("rods", "sector")
-        lines = source(
-            name,
-            activity,
-            pose[:3, :3] @ middle + pose[:3, 3],
-            "type Volume",
-            "shape Cylinder",
-            f"radius {_n(around)} mm",
-            f"halfz {_n(height / 2)} mm",
-            f"rot1 {_n(*pose[:3, 0])}",
-            f"rot2 {_n(*pose[:3, 1])}",
-            f"confine {rods.name}_phys",
-        )
+        shape = ["type Volume", "shape Cylinder", f"radius {_n(around)} mm", f"halfz {_n(height / 2)} mm"]
+        shape += [f"rot1 {_n(*pose[:3, 0])}", f"rot2 {_n(*pose[:3, 1])}", f"confine {rods.name}_phys"]
+        lines = source(name, activity, pose[:3, :3] @ middle + pose[:3, 3], *shape)
         macros.append(folder.macro(f"sources/{name}", lines))
     return _execute(macros)
-
-
-def _projections(crystal: Placed, views: Views) -> list[str]:
-    (n_v, n_u), (side, _, _) = views.shape, crystal.size
-    return _under(
-        "/gate/output/projection",
-        "enable",
-        "setFileName projections",
-        "projectionPlane XY",
-        f"pixelSizeX {_n(side / n_u)} mm",
-        f"pixelSizeY {_n(side / n_v)} mm",
-        f"pixelNumberX {n_u}",
-        f"pixelNumberY {n_v}",
-        "setInputDataName Window",
-    )

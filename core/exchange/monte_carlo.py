@@ -11,7 +11,7 @@ import math
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import pairwise
-from typing import Literal, NamedTuple, get_args, get_type_hints
+from typing import Any, Literal, NamedTuple, get_args, get_type_hints
 
 import numpy as np
 from numpy.typing import NDArray
@@ -33,10 +33,7 @@ _SPACE = 50.0  # mm of air between the scanner's farthest point and the end of t
 _SAME = 1e-6  # mm: modules whose lengths differ by less are alike
 
 # Name in GATE -> its state; the material of the same name is in `MATERIALS`.
-_STATES = {
-    "Air": "gas", "Water": "liquid", "PMMA": "solid", "Tungsten": "solid", "Lead": "solid", "NaI": "solid",
-    "CZT": "solid",
-}  # fmt: skip
+_STATES = {"Air": "gas", "Water": "liquid", **dict.fromkeys(("PMMA", "Tungsten", "Lead", "NaI", "CZT"), "solid")}
 _ELEMENTS = {  # symbol -> name, atomic number, molar mass in g/mol
     "H": ("Hydrogen", 1, 1.008),
     "C": ("Carbon", 6, 12.011),
@@ -90,9 +87,7 @@ class Simulation:
     opening_degrees: float = 90.0
     edge_at: EdgePlace = "middle"
     intrinsic_fwhm: float = 3.0  # the crystal's resolution, mm; 0: perfect
-    energy_resolution: float = (
-        0.1  # FWHM / energy at `REFERENCE_ENERGY`, falling with the energy's square root; 0: perfect
-    )
+    energy_resolution: float = 0.1  # FWHM / energy at `REFERENCE_ENERGY`, as 1 / sqrt(energy); 0: perfect
     window_percent: float = 20.0  # full width of the energy window around the strongest line
     seed: int = 1
 
@@ -163,18 +158,12 @@ class Simulation:
         half = self.window_percent / 200
         return energy * (1 - half), energy * (1 + half)
 
-    @property
-    def photons_per_decay(self) -> float:
-        """Of all lines together."""
-        return sum(photons for _, photons in self.nuclide.lines)
-
 
 class Placed(NamedTuple):
     """Equal solids at their places in a mother volume.
 
     `size` depends on the shape: ``box``: sides x, y, z; ``trd``: half-widths at -z and +z of a square frustum, and its
-    height; ``cone``: radii at -z and +z, height; ``cylinder``: radius, height. `rotations` (N, 3, 3) have the solid's axes
-    in the mother's frame as columns, `centers` (N, 3) are in that frame.
+    height; ``cone``: radii at -z and +z, height; ``cylinder``: radius, height.
     """
 
     name: str
@@ -182,8 +171,8 @@ class Placed(NamedTuple):
     shape: Literal["box", "trd", "cone", "cylinder"]
     size: tuple[float, ...]
     material: str
-    centers: NDArray[np.float64]
-    rotations: NDArray[np.float64]
+    centers: NDArray[np.float64]  # (N, 3), in the mother's frame
+    rotations: NDArray[np.float64]  # (N, 3, 3), the solid's axes in that frame as columns
 
 
 class Setup(NamedTuple):
@@ -200,12 +189,8 @@ def build_setup(system: PinholeSystem, simulation: Simulation) -> Setup:
     """The scanner and the phantom as solids.
 
     Modules of equal sizes share a collimator: the body of `core.geometry.collimator`, its outside a solid square frustum,
-    and in it, as air, the channel and the hole, a cone on each side of the knife edge.
-
-    Raises
-    ------
-    InputError
-        A collimator cannot be built, or begins inside the phantom.
+    and in it, as air, the channel and the hole, a cone on each side of the knife edge. `InputError` where a collimator
+    cannot be built, or begins inside the phantom.
     """
     poses = system.poses()
     bodies = module_collimators(system, simulation.construction)
@@ -221,12 +206,16 @@ def build_setup(system: PinholeSystem, simulation: Simulation) -> Setup:
         places = _behind_pinholes(poses[modules], l[modules] + size[2] / 2)
         name = "crystal" if len(sizes) == 1 else f"crystal{i + 1}"
         crystals.append((Placed(name, "world", "box", size, simulation.crystal, *places), modules))
-    outer = [parts[0] for parts in collimators] + [solids for solids, _ in crystals]
     phantom, rods = _phantom(simulation)
+    outer = [parts[0] for parts in collimators] + [solids for solids, _ in crystals]
     if phantom is not None:
         _refuse_overlap(system, bodies, phantom)
         outer.append(phantom)
-    reach = max(np.abs(simulation.world_from_phantom[:3, 3]).max(), *map(_reach, outer))
+    reach = np.abs(simulation.world_from_phantom[:3, 3]).max()
+    for solids in outer:
+        radius, *_, height = solids.size
+        half = np.array(solids.size) / 2 if solids.shape == "box" else np.array([radius, radius, height / 2])
+        reach = max(reach, (np.abs(solids.centers) + np.abs(solids.rotations) @ half).max())
     return Setup(collimators, crystals, phantom, rods, math.ceil(2 * (reach + _SPACE)))
 
 
@@ -237,12 +226,9 @@ def _alike(*lengths: NDArray[np.float64]) -> list[NDArray[np.intp]]:
     return [np.flatnonzero(kind == i) for i in range(kind.max() + 1)]
 
 
-def _behind_pinholes(
-    poses: NDArray[np.float64], depths: NDArray[np.float64] | float
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Centres and rotations of solids that lie `depths` mm behind their pinholes."""
-    k = poses[:, :3, 2]
-    return poses[:, :3, 3] - np.broadcast_to(depths, len(poses))[:, None] * k, poses[:, :3, :3]
+def _behind_pinholes(poses: NDArray[np.float64], depths: Any) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Centres and rotations of solids that lie `depths` (M,) or one depth, mm, behind their pinholes."""
+    return poses[:, :3, 3] - np.reshape(depths, (-1, 1)) * poses[:, :3, 2], poses[:, :3, :3]
 
 
 def _collimator(name: str, poses: NDArray[np.float64], body: Collimator, material: str) -> list[Placed]:
@@ -295,10 +281,3 @@ def _refuse_overlap(system: PinholeSystem, bodies: list[Collimator], phantom: Pl
         local = (front - phantom.centers[0]) @ phantom.rotations[0]
         if np.any((np.hypot(local[:, 0], local[:, 1]) <= radius) & (np.abs(local[:, 2]) <= height / 2)):
             raise InputError(f"module {system.numbers[m]}: its collimator begins inside the phantom; move one of them")
-
-
-def _reach(solids: Placed) -> float:
-    """The largest coordinate, in the mother's frame, of the boxes around the solids."""
-    size = solids.size
-    half = np.array(size) / 2 if solids.shape == "box" else np.array([size[0], size[0], size[-1] / 2])
-    return float((np.abs(solids.centers) + np.abs(solids.rotations) @ half).max())

@@ -22,15 +22,8 @@ _CONVENTIONS = {
     "projection_matrix": "3 x 4, homogeneous world point to (column, row, 1) times depth; 0 is the centre of pixel 0",
 }
 # Names in the file -> fields of PinholeSystem and of Views.
-_MODULE = {
-    "number": "numbers",
-    "pinhole_center": "centers",
-    "pinhole_diameter": "pinhole_diameter",
-    "collimator_length": "collimator_length",
-    "detector_side": "detector_side",
-    "detector_thickness": "detector_thickness",
-    "roi_radius": "roi_radius",
-}
+_LENGTHS = ("pinhole_diameter", "collimator_length", "detector_side", "detector_thickness", "roi_radius")
+_MODULE = {"number": "numbers", "pinhole_center": "centers"} | {name: name for name in _LENGTHS}
 _VIEW = {"source": "sources", "detector_center": "detector_centers", "u_step": "u_steps", "v_step": "v_steps"}
 
 
@@ -56,37 +49,27 @@ def _write(system: PinholeSystem, views: Views, path: Path) -> None:
 
 
 def read_geometry(path: str | os.PathLike[str]) -> tuple[PinholeSystem, Views]:
-    """Read what `write_geometry` wrote in the format ``"mphdrr"``, bit for bit.
-
-    Raises
-    ------
-    InputError
-        The file cannot be read, is not such a file, or describes an impossible system.
-    """
+    """Read what `write_geometry` wrote in the format ``"mphdrr"``, bit for bit; `InputError` for any other file."""
     try:
         document = json.loads(Path(path).read_text(encoding="utf-8"))
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read ({error.strerror or error})") from error
-    except ValueError as error:
-        raise InputError(f"{path}: not JSON ({error})") from error
-    if not isinstance(document, dict) or document.get("kind") != _KIND:
-        raise InputError(f"{path}: not a file of the format mphdrr ({_KIND})")
-    if document.get("version") != _VERSION:
-        raise InputError(f"{path}: version {document.get('version')!r}; this mphDRR reads {_VERSION}")
-    try:
-        system: dict[str, Any] = {
-            field: [module[name] for module in document["modules"]] for name, field in _MODULE.items()
-        }
-        views: dict[str, Any] = {field: [view[name] for view in document["views"]] for name, field in _VIEW.items()}
-        shape = (document["rows"], document["columns"])
-    except KeyError as error:
-        raise InputError(f"{path}: incomplete, {error} is missing") from error
-    except TypeError as error:
-        raise InputError(f"{path}: expected lists of modules and views ({error})") from error
-    try:
-        return PinholeSystem(**system), Views(**views, shape=shape)
+        if not isinstance(document, dict) or document.get("kind") != _KIND:
+            raise InputError(f"not a file of the format mphdrr ({_KIND})")
+        if document.get("version") != _VERSION:
+            raise InputError(f"version {document.get('version')!r}; this mphDRR reads {_VERSION}")
+        system: Any = {field: [one[name] for one in document["modules"]] for name, field in _MODULE.items()}
+        views: Any = {field: [one[name] for one in document["views"]] for name, field in _VIEW.items()}
+        return PinholeSystem(**system), Views(**views, shape=(document["rows"], document["columns"]))
     except InputError as error:
-        raise InputError(f"{path}: {error}") from error
+        reason = str(error)
+    except OSError as error:
+        reason = f"cannot be read ({error.strerror or error})"
+    except ValueError as error:
+        reason = f"not JSON ({error})"
+    except KeyError as error:
+        reason = f"incomplete, {error} is missing"
+    except TypeError as error:
+        reason = f"expected lists of modules and views ({error})"
+    raise InputError(f"{path}: {reason}")
 
 
 MPHDRR = Format("mphdrr", "mphDRR: JSON of modules, frames and views, every digit", (".json",), _write)

@@ -9,7 +9,7 @@ from __future__ import annotations
 import zipfile
 from collections.abc import Callable
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 
@@ -22,11 +22,10 @@ from ..version import VERSION
 from .format import Format
 
 _KINDS = {"collimators": ("collimator",), "crystals": ("crystal",), "all": ("collimator", "crystal")}
+_Save = Callable[[Path, list[ModulePart]], None]
 
 
-def _solid_format(
-    name: str, title: str, suffixes: tuple[str, ...], save: Callable[[Path, list[ModulePart]], None]
-) -> Format:
+def _solid_format(name: str, title: str, suffixes: tuple[str, ...], save: _Save) -> Format:
     """A format of the chosen parts, written by `save`."""
 
     def write(
@@ -49,13 +48,10 @@ def _solid_format(
 
 
 def _save_stl(path: Path, parts: list[ModulePart]) -> None:
-    corners = np.concatenate([p.vertices[p.triangles] for p in parts])
-    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    facets = np.zeros(len(corners), dtype=[("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
-    facets["normal"] = normals / np.linalg.norm(normals, axis=1, keepdims=True)
-    facets["corners"] = corners
-    header = f"mphDRR {VERSION}, mm".encode().ljust(80)
-    path.write_bytes(header + np.uint32(len(facets)).astype("<u4").tobytes() + facets.tobytes())
+    import trimesh
+
+    meshes = [trimesh.Trimesh(p.vertices, p.triangles, process=False) for p in parts]
+    path.write_bytes(trimesh.util.concatenate(meshes).export(file_type="stl"))
 
 
 def _save_stl_parts(path: Path, parts: list[ModulePart]) -> None:
@@ -78,13 +74,16 @@ _RELATIONSHIPS = """<?xml version="1.0" encoding="UTF-8"?>
 
 def _save_3mf(path: Path, parts: list[ModulePart]) -> None:
     """3MF (Core Specification 1.2) in millimetres, a named object for each part."""
+    bases = []
+    for kind, look in LOOKS.items():  # whose colours are linear, while 3MF's are sRGB
+        shares = (1.055 * x ** (1 / 2.4) - 0.055 if x > 0.0031308 else 12.92 * x for x in look.color[:3])
+        color = "".join(f"{round(255 * share):02X}" for share in shares)
+        bases.append(f'<base name="{kind}" displaycolor="#{color}"/>')
     lines = [
         '<?xml version="1.0" encoding="UTF-8"?>',
         '<model unit="millimeter" xml:lang="en-US" xmlns="http://schemas.microsoft.com/3dmanufacturing/core/2015/02">',
         f'<metadata name="Application">mphDRR {VERSION}</metadata>',
-        '<resources><basematerials id="1">',
-        *(f'<base name="{kind}" displaycolor="{_srgb(look.color)}"/>' for kind, look in LOOKS.items()),
-        "</basematerials>",
+        f'<resources><basematerials id="1">{"".join(bases)}</basematerials>',
     ]
     numbered = list(enumerate(parts, start=2))  # the materials are resource 1
     for number, p in numbered:
@@ -101,12 +100,6 @@ def _save_3mf(path: Path, parts: list[ModulePart]) -> None:
         package.writestr("3D/3dmodel.model", "\n".join(lines))
 
 
-def _srgb(color: tuple[float, float, float, float]) -> str:
-    """A linear colour as sRGB's "#A2A8AF"."""
-    shares = (1.055 * share ** (1 / 2.4) - 0.055 if share > 0.0031308 else 12.92 * share for share in color[:3])
-    return "#" + "".join(f"{round(255 * share):02X}" for share in shares)
-
-
 def _save_glb(path: Path, parts: list[ModulePart]) -> None:
     """Binary glTF 2.0, a named mesh for each part.
 
@@ -117,24 +110,18 @@ def _save_glb(path: Path, parts: list[ModulePart]) -> None:
     from trimesh.visual import TextureVisuals
     from trimesh.visual.material import PBRMaterial
 
-    materials = {
-        kind: PBRMaterial(
-            kind,
-            baseColorFactor=[round(255 * share) for share in look.color],
-            metallicFactor=look.metallic,
-            roughnessFactor=look.roughness,
-            alphaMode="OPAQUE" if look.color[3] == 1.0 else "BLEND",
-        )
-        for kind, look in LOOKS.items()
-    }
+    materials = {}
+    for kind, look in LOOKS.items():
+        factors: Any = {"metallicFactor": look.metallic, "roughnessFactor": look.roughness}
+        factors["baseColorFactor"] = [round(255 * share) for share in look.color]
+        materials[kind] = PBRMaterial(kind, **factors, alphaMode="OPAQUE" if look.color[3] == 1.0 else "BLEND")
     to_metres = np.diag([0.001, 0.001, 0.001, 1.0])
     to_metres[1:3, 1:3] = [[0.0, 0.001], [-0.001, 0.0]]
     scene = trimesh.Scene()
     scene.graph.update("Scanner in mm", matrix=to_metres)
     for p in parts:
-        mesh = trimesh.Trimesh(
-            p.vertices, p.triangles, process=False, visual=TextureVisuals(material=materials[p.kind])
-        )
+        visual = TextureVisuals(material=materials[p.kind])
+        mesh = trimesh.Trimesh(p.vertices, p.triangles, process=False, visual=visual)
         scene.add_geometry(mesh, node_name=p.name, geom_name=p.name, parent_node_name="Scanner in mm")
     path.write_bytes(scene.export(file_type="glb"))
 

@@ -1,6 +1,6 @@
 """Run files: HDF5, numpy archives and torch files, each of which holds a run whole.
 
-What they hold (names, shapes, units) is in `record`.
+Whatever the format, a file holds arrays by name (``"geometry/center"``) with units, and attributes (text or whole numbers).
 """
 
 from __future__ import annotations
@@ -8,47 +8,88 @@ from __future__ import annotations
 import json
 import os
 from collections.abc import Callable
+from operator import attrgetter
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ..errors import InputError
 from ..files import replacing
-from .record import Record, record_of, run_of
+from ..geometry.grid import Grid
+from ..geometry.system import PinholeSystem
+from ..geometry.views import Views
+from ..volumes.volume import Volume
 from .run import ProjectionRun
 
+_FORMAT = "mphDRR run"
+_FORMAT_VERSION = 1
+
+_CONVENTIONS = (
+    "Lengths in mm. World: right-handed, origin at the isocentre, +z along the patient. "
+    "Module frame (u, v, k): right-handed, k from the pinhole to the isocentre, u = normalize(z x k), v = k x u. "
+    "projections[m, row, column]: column along +u, row along +v, pixel 0's centre at 0; seen from the pinhole with "
+    "+v up, +u points to the left. Poses: world-from-module, acting on column vectors. "
+    "intrinsics @ (u, v, k) and projection_matrix @ (x, y, z, 1) are multiples of (column, row, 1). "
+    "volume[ix, iy, iz]: affine from index to world, an integer index is the voxel's centre, 0 outside."
+)
+
+_LENGTHS = ("pinhole_diameter", "collimator_length", "detector_side", "detector_thickness", "roi_radius")
+_RAYS = ("sources", "detector_centers", "u_steps", "v_steps")
+
+# Name, unit and contents of the arrays beside projections and volume, whose units are attributes.
+_ARRAYS: dict[str, tuple[str, Callable[[ProjectionRun], Any]]] = {
+    "geometry/number": ("", lambda run: run.system.numbers),
+    "geometry/ring": ("", lambda run: run.system.rings()),
+    "geometry/center": ("mm", lambda run: run.system.centers),
+    **{f"geometry/{name}": ("mm", attrgetter(f"system.{name}")) for name in ("pinhole_distance", *_LENGTHS)},
+    "geometry/pose": ("mm", lambda run: run.system.poses()),
+    "geometry/intrinsics": ("pixel", lambda run: run.intrinsics()),
+    "geometry/projection_matrix": ("pixel", lambda run: run.views.projection_matrices()),
+    **{f"views/{name}": ("mm", attrgetter(f"views.{name}")) for name in _RAYS},
+    "volume/affine": ("mm", lambda run: run.volume.grid.affine),
+}
 _ATTRIBUTES = "attributes"
 _COMPRESS_FROM = 1 << 16  # bytes: below, compressing costs more than it saves
+
+_Contents = tuple[dict[str, NDArray[Any]], dict[str, Any]]
+"""Arrays and attributes by name."""
 
 
 def write_run(run: ProjectionRun, path: str | os.PathLike[str]) -> None:
     """Write a run as HDF5 (.h5, .hdf5), numpy archive (.npz) or torch file (.pt), by the path's suffix.
 
-    Raises
-    ------
-    InputError
-        Another suffix, torch is missing for .pt, or the file cannot be written (the old one then stays).
+    `InputError` for another suffix, where torch is missing for .pt, or the file cannot be written: the old one then stays.
     """
     write, _ = _format(Path(path))
+    arrays = {"projections": run.projections, "volume/array": run.volume.array}
+    arrays |= {name: get(run) for name, (_, get) in _ARRAYS.items()}
+    attributes = {
+        "format": _FORMAT,
+        "format_version": _FORMAT_VERSION,
+        "conventions": _CONVENTIONS,
+        "projections_unit": run.unit,
+        "volume_quantity": run.volume.quantity,
+        "volume_unit": run.volume.unit,
+        "seed": "none" if run.seed is None else int(run.seed),
+        "workbook": run.workbook,
+        "workbook_sha256": run.workbook_sha256,
+        "settings": json.dumps(dict(run.settings)),
+        "versions": json.dumps(dict(run.versions)),
+    }
     with replacing(path) as temporary:
-        write(record_of(run), temporary)
+        write(arrays, attributes, temporary)
 
 
 def read_run(path: str | os.PathLike[str]) -> ProjectionRun:
-    """Read a run written by `write_run`.
-
-    Raises
-    ------
-    InputError
-        No such file, or not a whole run.
-    """
+    """Read a run written by `write_run`; `InputError` where there is no such file, or no whole run in it."""
     path = Path(path)
     _, read = _format(path)
     if not path.is_file():
         raise InputError(f"{path}: no such file")
     try:
-        return run_of(read(path))
+        return _run_of(*read(path))
     except InputError as error:
         raise InputError(f"{path}: {error}") from None
     except Exception as error:  # whatever the format's library raises on a damaged file
@@ -56,29 +97,53 @@ def read_run(path: str | os.PathLike[str]) -> ProjectionRun:
         raise InputError(f"{path}: cannot be read as a projection run ({reason})") from error
 
 
-def _write_hdf5(record: Record, path: Path) -> None:
+def _run_of(arrays: dict[str, NDArray[Any]], attributes: dict[str, Any]) -> ProjectionRun:
+    if attributes.get("format") != _FORMAT:
+        raise InputError(f"expected a file marked {_FORMAT!r}, found {attributes.get('format', 'no mark')!r}")
+    if int(attributes["format_version"]) > _FORMAT_VERSION:
+        raise InputError(f"written by a newer mphDRR (format {attributes['format_version']}); update to read it")
+    for name in ("projections", "volume/array", *_ARRAYS):
+        if name not in arrays:
+            raise InputError(f"array {name} is missing")
+    lengths: Any = {name: arrays[f"geometry/{name}"] for name in _LENGTHS}
+    rays: Any = {name: arrays[f"views/{name}"] for name in _RAYS}
+    volume, seed = arrays["volume/array"], attributes["seed"]
+    n_v, n_u = arrays["projections"].shape[1:]
+    n_x, n_y, n_z = volume.shape
+    return ProjectionRun(
+        projections=np.asarray(arrays["projections"], np.float32),
+        system=PinholeSystem(arrays["geometry/center"], **lengths, numbers=arrays["geometry/number"]),
+        views=Views(**rays, shape=(n_v, n_u)),
+        volume=Volume(volume, Grid((n_x, n_y, n_z), arrays["volume/affine"]), str(attributes["volume_quantity"])),
+        unit=str(attributes["projections_unit"]),
+        settings=json.loads(attributes["settings"]),
+        seed=None if seed == "none" else int(seed),
+        workbook=str(attributes["workbook"]),
+        workbook_sha256=str(attributes["workbook_sha256"]),
+        versions=json.loads(attributes["versions"]),
+    )
+
+
+def _write_hdf5(arrays: dict[str, NDArray[Any]], attributes: dict[str, Any], path: Path) -> None:
     """Arrays as datasets with a `unit`, in chunks of one view each, so that one view reads alone; attributes on the root."""
     import h5py
 
+    units = {"projections": attributes["projections_unit"], "volume/array": attributes["volume_unit"]}
+    units |= {name: unit for name, (unit, _) in _ARRAYS.items()}
     with h5py.File(path, "w") as file:
-        file.attrs.update(record.attributes)
-        for name, array in record.arrays.items():
+        file.attrs.update(attributes)
+        for name, array in arrays.items():
             packed: dict[str, Any] = {}
             if array.nbytes >= _COMPRESS_FROM:
-                packed = {
-                    "compression": "gzip",
-                    "compression_opts": 1,
-                    "shuffle": True,
-                    "chunks": (1, *array.shape[1:]),
-                }
-            dataset = file.create_dataset(name, data=array, **packed)
-            dataset.attrs["unit"] = record.unit(name)
+                packed = {"compression": "gzip", "compression_opts": 1, "shuffle": True}
+                packed["chunks"] = (1, *array.shape[1:])
+            file.create_dataset(name, data=array, **packed).attrs["unit"] = units[name]
 
 
-def _read_hdf5(path: Path) -> Record:
+def _read_hdf5(path: Path) -> _Contents:
     import h5py
 
-    arrays: dict[str, np.ndarray] = {}
+    arrays: dict[str, NDArray[Any]] = {}
 
     def take(name: str, item: h5py.Dataset | h5py.Group) -> None:
         if isinstance(item, h5py.Dataset):
@@ -89,47 +154,44 @@ def _read_hdf5(path: Path) -> Record:
         attributes = {
             name: value.item() if isinstance(value, np.generic) else value for name, value in file.attrs.items()
         }
-    return Record(arrays, attributes)
+    return arrays, attributes
 
 
-def _write_npz(record: Record, path: Path) -> None:
+def _write_npz(arrays: dict[str, NDArray[Any]], attributes: dict[str, Any], path: Path) -> None:
     """Arrays by name, attributes as JSON text."""
-    contents: dict[str, Any] = {**record.arrays, _ATTRIBUTES: np.array(json.dumps(record.attributes))}
+    contents: dict[str, Any] = {**arrays, _ATTRIBUTES: np.array(json.dumps(attributes))}
     with open(path, "wb") as file:
         np.savez_compressed(file, **contents)
 
 
-def _read_npz(path: Path) -> Record:
+def _read_npz(path: Path) -> _Contents:
     with np.load(path, allow_pickle=False) as file:
-        arrays = {name: file[name] for name in file.files if name != _ATTRIBUTES}
-        attributes = json.loads(str(file[_ATTRIBUTES])) if _ATTRIBUTES in file.files else {}
-    return Record(arrays, attributes)
+        arrays = dict(file)
+    return arrays, json.loads(str(arrays.pop(_ATTRIBUTES, "{}")))
 
 
-def _write_pt(record: Record, path: Path) -> None:
+def _write_pt(arrays: dict[str, NDArray[Any]], attributes: dict[str, Any], path: Path) -> None:
     """Only tensors, text and whole numbers: ``torch.load(path, weights_only=True)`` reads them."""
     torch = _torch()
-    tensors = {name: torch.from_numpy(np.array(array, order="C")) for name, array in record.arrays.items()}
-    torch.save({_ATTRIBUTES: record.attributes, **tensors}, path)
+    tensors = {name: torch.from_numpy(np.array(array, order="C")) for name, array in arrays.items()}
+    torch.save({_ATTRIBUTES: attributes, **tensors}, path)
 
 
-def _read_pt(path: Path) -> Record:
+def _read_pt(path: Path) -> _Contents:
     content = _torch().load(path, weights_only=True, map_location="cpu")
     attributes = content.pop(_ATTRIBUTES, {})
-    return Record({name: tensor.numpy() for name, tensor in content.items()}, attributes)
+    return {name: tensor.numpy() for name, tensor in content.items()}, attributes
 
 
 def _torch() -> Any:
     try:
         import torch
     except ImportError:
-        raise InputError(
-            ".pt files need torch, which is not installed: pip install torch, or use .h5 or .npz"
-        ) from None
+        raise InputError(".pt files need torch, which is missing: pip install torch, or use .h5 or .npz") from None
     return torch
 
 
-_Format = tuple[Callable[[Record, Path], None], Callable[[Path], Record]]
+_Format = tuple[Callable[[dict[str, NDArray[Any]], dict[str, Any], Path], None], Callable[[Path], _Contents]]
 _FORMATS: dict[str, _Format] = {
     ".h5": (_write_hdf5, _read_hdf5),
     ".hdf5": (_write_hdf5, _read_hdf5),

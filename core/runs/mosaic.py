@@ -23,19 +23,9 @@ def as_seen(images: ArrayLike) -> NDArray:
 
 
 def mosaic(images: ArrayLike, columns: int = 20) -> NDArray:
-    """Pictures of all images (M, n_v, n_u) in one, row by row from the top left; empty places are 0.
+    """Pictures of all images (M, n_v, n_u) in one (rows * n_v, columns * n_u), row 0 at the top; empty places are 0.
 
-    Parameters
-    ----------
-    images
-        In module order; 80 modules in 4 rings and 20 columns show a ring a row.
-    columns
-        Pictures in a row.
-
-    Returns
-    -------
-    array (rows * n_v, columns * n_u)
-        Row 0 is the top.
+    They follow each other row by row from the top left: 80 modules in 4 rings and 20 `columns` show a ring a row.
     """
     images = as_seen(images)
     if images.ndim != 3:
@@ -52,25 +42,15 @@ def mosaic(images: ArrayLike, columns: int = 20) -> NDArray:
 def write_png(picture: ArrayLike, path: str | os.PathLike[str]) -> None:
     """Write a picture (row 0 at the top) as an 8-bit grey PNG: 0 is black, or the smallest value if that is negative.
 
-    The largest value is white.
-
-    Raises
-    ------
-    InputError
-        The file cannot be written.
+    The largest value is white. `InputError` where the file cannot be written.
     """
     picture = np.asarray(picture, np.float32)
     low, high = float(picture.min(initial=0.0)), float(picture.max(initial=0.0))
     grey = np.rint((picture - low) / ((high - low) or 1.0) * 255).astype(np.uint8)
-    with replacing(path) as temporary:
-        temporary.write_bytes(_png(grey))
-
-
-def _png(grey: NDArray[np.uint8]) -> bytes:
-    """A picture (rows, columns) as a PNG file."""
     header = struct.pack(">2I5B", grey.shape[1], grey.shape[0], 8, 0, 0, 0, 0)  # 8 bits, grey
     rows = zlib.compress(np.pad(grey, ((0, 0), (1, 0))).tobytes())  # a 0 before each: it is stored as it is
-    chunks = [(b"IHDR", header), (b"IDAT", rows), (b"IEND", b"")]
-    return b"\x89PNG\r\n\x1a\n" + b"".join(
-        struct.pack(">I", len(data)) + name + data + struct.pack(">I", zlib.crc32(name + data)) for name, data in chunks
-    )
+    png = b"\x89PNG\r\n\x1a\n"
+    for name, data in ((b"IHDR", header), (b"IDAT", rows), (b"IEND", b"")):
+        png += struct.pack(">I", len(data)) + name + data + struct.pack(">I", zlib.crc32(name + data))
+    with replacing(path) as temporary:
+        temporary.write_bytes(png)

@@ -40,12 +40,10 @@ def project_run(
 
     Parameters
     ----------
-    system, volume
-        What sees, and what is seen.
     shape, detector, magnification, pitch
-        The images, see `PinholeSystem.views`.
+        The images, as of `PinholeSystem.views`.
     backend, threads
-        See `Projector`.
+        As of `Projector`.
     settings
         More to record in the run.
     model
@@ -55,7 +53,7 @@ def project_run(
     noise_seed
         With an `Emission` or `photons`: the run holds counts drawn with this seed (`sample_counts`), not their means.
     progress
-        Called as ``progress(done, total)`` after every view; may raise `Cancelled`.
+        Called after every view.
 
     Raises
     ------
@@ -66,9 +64,8 @@ def project_run(
     model.check_volume(volume)
     if photons is not None:
         if not isinstance(model, Transmission) or volume.quantity != "mu":
-            raise InputError(
-                f"photons: expected the transmission of a volume of mu, got {model.name} of {volume.quantity}"
-            )
+            what = f"{model.name} of {volume.quantity}"
+            raise InputError(f"photons: expected the transmission of a volume of mu, got {what}")
         photons = positive(photons, "photons")
     elif noise_seed is not None and not isinstance(model, Emission):
         raise InputError("noise_seed: only the counts of an Emission, or photons that pass, have noise")

@@ -35,45 +35,18 @@ def versions() -> dict[str, str]:
 
 @dataclass(frozen=True, eq=False)
 class ProjectionRun:
-    """The images of one run, with geometry, volume and provenance.
+    """The images of one run, with geometry, volume and provenance; `InputError` where the parts do not fit together."""
 
-    Attributes
-    ----------
-    projections : float32 array (M, n_v, n_u)
-        Column index along +u, row index along +v.
-    system : PinholeSystem
-        The M modules.
-    views : Views
-        The M images' rays.
-    volume : Volume
-        What was projected.
-    unit : str
-        Of the projections, such as ``"kBq/mL mm"``.
-    settings : mapping
-        How they were made (detector, magnification, model, backend, recipe ...): anything JSON can hold.
-    seed : int or None
-        Of the noise; None where the projections have none.
-    workbook, workbook_sha256 : str
-        Name and SHA-256 of the geometry workbook; empty where there is none.
-    versions : mapping
-        Of mphDRR and what it ran on.
-
-    Raises
-    ------
-    InputError
-        The parts do not fit together.
-    """
-
-    projections: NDArray[np.float32]
-    system: PinholeSystem
-    views: Views
-    volume: Volume
-    unit: str = ""
-    settings: Mapping[str, Any] = field(default_factory=dict)
-    seed: int | None = None
-    workbook: str = ""
+    projections: NDArray[np.float32]  # (M, n_v, n_u), column index along +u, row index along +v
+    system: PinholeSystem  # the M modules
+    views: Views  # the M images' rays
+    volume: Volume  # what was projected
+    unit: str = ""  # of the projections, such as "kBq/mL mm"
+    settings: Mapping[str, Any] = field(default_factory=dict)  # how they were made: anything JSON can hold
+    seed: int | None = None  # of the noise; None where the projections have none
+    workbook: str = ""  # name of the geometry workbook, and its SHA-256; empty where there is none
     workbook_sha256: str = ""
-    versions: Mapping[str, str] = field(default_factory=versions)
+    versions: Mapping[str, str] = field(default_factory=versions)  # of mphDRR and what it ran on
 
     def __post_init__(self) -> None:
         if len(self.views) != len(self.system):

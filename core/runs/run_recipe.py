@@ -2,13 +2,22 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+from numpy.typing import NDArray
+
 from ..errors import InputError
+from ..geometry.frames import euler_pose
+from ..geometry.grid import Grid
 from ..geometry.system import PinholeSystem, chosen_modules
+from ..phantoms.kinds import KINDS
+from ..phantoms.language import parse_phantom, read_phantom
+from ..phantoms.phantom import Phantom
 from ..physics.ct_numbers import hu_to_mu
 from ..physics.isotopes import photon_energy
 from ..progress import Progress
@@ -17,10 +26,10 @@ from ..volumes.rearranging import centered
 from ..volumes.volume import Volume
 from ..volumes.volume_files import read_volume, read_volume_of
 from ..workbook import read_system
-from .phantom_recipe import phantom_grid, phantom_pose, recipe_phantom, with_phantom
 from .projecting import project_run, warn_of_energy
-from .recipe import Recipe
+from .recipe import Recipe, fitting_recipe
 from .run import ProjectionRun
+from .settings import SETTINGS
 
 Stages = Callable[[str], Progress | None]
 """Gives the progress callback of a stage: reading, voxelizing, projecting."""
@@ -28,6 +37,9 @@ Stages = Callable[[str], Progress | None]
 _MODELS: dict[str, Any] = {"transmission": Transmission, "emission": Emission, "inverse-square": InverseSquareSum}
 _MOST_MU = 500.0
 """1/mm: more than any material of the tables attenuates photons of 10 keV or more."""
+
+_Source = tuple[Volume, Volume | None, Recipe]
+"""What is projected, what attenuates it, and what to record of it."""
 
 
 def run_recipe(
@@ -53,21 +65,28 @@ def run_recipe(
     InputError
         A file cannot be read, the recipe names no system, or as `project_run`; all but the volumes is checked first.
     """
-    system = chosen_modules(system or _system(recipe), recipe["system.modules"], "system.modules")
+    if system is None:
+        if recipe["system.file"] is None:
+            raise InputError("system.file: missing; name the geometry workbook")
+        system = read_system(recipe["system.file"], columns=recipe["system.columns"])
+    system = chosen_modules(system, recipe["system.modules"], "system.modules")
     model = recipe_model(recipe, system)
-    if mu is None and recipe["attenuation.object"] is not None:
-        raise InputError(
-            f"attenuation.object: {recipe['attenuation.object']!r} is in a Blender scene; give --mu FILE instead"
-        )
-    if mu is None and recipe["attenuation.file"] is not None:
-        mu = _attenuation(recipe, model, stages("reading"))
-    recorded = recipe.complete()
+    if mu is None:
+        mu = _attenuation(recipe, model, stages)
+    of_images = ("model.", "detector.", "compute.")
+    defaults = {key: setting.default for key, setting in SETTINGS.items() if key.startswith(of_images)}
+    recorded = fitting_recipe({**defaults, **recipe.given}, recipe.given)
+    sources: Iterator[_Source]
     if volume is not None:
-        sources: Iterator[_Source] = iter([(volume, mu, recorded)])
+        if mu is None and recipe["attenuation.of_phantom"]:
+            raise InputError("attenuation.of_phantom: a volume that is given needs its mu as well")
+        sources = iter([(volume, mu, recorded)])
     elif recipe["volume.file"] is not None or recipe["volume.states"] is not None:
         sources = _from_files(recipe, recorded, mu, stages)
     else:
         sources = _from_phantom(recipe, recorded, model, mu, stages)
+    energy = recipe["volume.energy"] or recipe["attenuation.energy"]
+    converted = {} if energy is None else {"ct_converted_at_kev": photon_energy(energy)}
     for number, (source, mu_of_it, record) in enumerate(sources):
         seed = recipe["noise.seed"]
         if seed is not None:  # noise of its own for each state
@@ -81,7 +100,7 @@ def run_recipe(
             pitch=recipe["detector.pitch"],
             backend=recipe["compute.backend"],
             threads=recipe["compute.threads"],
-            settings={"volume": _volume_name(record), **_energies(recipe), "recipe": record.tables()},
+            settings={"volume": _volume_name(record), **converted, "recipe": record.tables()},
             model=recipe_model(recipe, system, mu_of_it),
             photons=recipe["model.photons"],
             noise_seed=record["noise.seed"],
@@ -90,13 +109,7 @@ def run_recipe(
 
 
 def recipe_model(recipe: Recipe, system: PinholeSystem, mu: Volume | None = None) -> Model:
-    """The model that a recipe asks for; `mu` is what attenuates.
-
-    Raises
-    ------
-    InputError
-        The settings do not go together.
-    """
+    """The model that a recipe asks for; `mu` is what attenuates. `InputError` where the settings do not go together."""
     cls = _MODELS[recipe["model.kind"]]
     given = recipe.fields("model", cls)
     if given.get("pixel_points") == "auto":
@@ -109,30 +122,25 @@ def recipe_model(recipe: Recipe, system: PinholeSystem, mu: Volume | None = None
     return model
 
 
-_Source = tuple[Volume, Volume | None, Recipe]
-"""What is projected, what attenuates it, and what to record of it."""
-
-
-def _system(recipe: Recipe) -> PinholeSystem:
-    if recipe["system.file"] is None:
-        raise InputError("system.file: missing; name the geometry workbook")
-    return read_system(recipe["system.file"], columns=recipe["system.columns"])
-
-
 def _volume_name(record: Recipe) -> str:
     """What a run calls its volume."""
-    for key in ("volume.object", "volume.file", "phantom.file"):
-        if record[key] is not None:
-            return Path(record[key]).name
-    if record["volume.states"] is not None:
-        return Path(record["volume.states"][0]).name
+    names = [record[key] for key in ("volume.object", "volume.file", "phantom.file")]
+    for name in filter(None, (*names, *(record["volume.states"] or ()))):
+        return Path(name).name
     return f"{record['phantom.kind'].capitalize()} phantom" if "phantom.kind" in record.given else ""
 
 
-def _energies(recipe: Recipe) -> dict[str, float]:
-    """At which energies CT numbers were converted, keV."""
-    energy = recipe["volume.energy"] or recipe["attenuation.energy"]
-    return {} if energy is None else {"ct_converted_at_kev": photon_energy(energy)}
+def _attenuation(recipe: Recipe, model: Model, stages: Stages) -> Volume | None:
+    """The attenuation that the recipe names, but for that of its phantom."""
+    name, path, energy = (recipe[f"attenuation.{name}"] for name in ("object", "file", "energy"))
+    if name is not None:
+        raise InputError(f"attenuation.object: {name!r} is in a Blender scene; give --mu FILE instead")
+    if path is None:
+        return None
+    mu = _read_mu(path, energy, recipe["attenuation.series"], stages("reading"))
+    if energy is not None:
+        warn_of_energy(model, photon_energy(energy), f"the mu of {Path(path).name}")
+    return mu
 
 
 def _from_files(recipe: Recipe, record: Recipe, mu: Volume | None, stages: Stages) -> Iterator[_Source]:
@@ -158,10 +166,8 @@ def _read(path: str, recipe: Recipe, progress: Progress | None) -> Volume:
         volume = read_volume_of(path, "activity", series=series, progress=progress)
         lowest, highest = float(volume.array.min()), float(volume.array.max())
         if lowest < -0.1 * highest:  # interpolation leaves less
-            raise InputError(
-                f"{path}: values of {lowest:g} to {highest:g}, as of a CT, are no activity; --quantity "
-                "activity takes them as such"
-            )
+            values = f"values of {lowest:g} to {highest:g}, as of a CT, are no activity"
+            raise InputError(f"{path}: {values}; --quantity activity takes them as such")
         return volume
     if recipe["model.photons"] is not None or recipe["volume.energy"] is not None:
         return _read_mu(path, recipe["volume.energy"], series, progress)
@@ -192,21 +198,28 @@ def _read_mu(path: str, energy: float | str | None, series: str | None, progress
     return volume
 
 
-def _attenuation(recipe: Recipe, model: Model, progress: Progress | None) -> Volume:
-    path, energy = recipe["attenuation.file"], recipe["attenuation.energy"]
-    mu = _read_mu(path, energy, recipe["attenuation.series"], progress)
-    if energy is not None:
-        warn_of_energy(model, photon_energy(energy), f"the mu of {Path(path).name}")
-    return mu
-
-
 def _from_phantom(recipe: Recipe, record: Recipe, model: Model, mu: Volume | None, stages: Stages) -> Iterator[_Source]:
     if recipe["volume.object"] is not None and not any(key.startswith("phantom.") for key in recipe.given):
-        raise InputError(
-            f"volume.object: {recipe['volume.object']!r} is in a Blender scene; give --volume FILE instead"
-        )
-    phantom, pose = recipe_phantom(recipe), phantom_pose(recipe)
-    grid = phantom_grid(recipe, phantom, pose)
+        name = recipe["volume.object"]
+        raise InputError(f"volume.object: {name!r} is in a Blender scene; give --volume FILE instead")
+    phantom: Phantom
+    if recipe["phantom.file"] is not None:
+        phantom = read_phantom(recipe["phantom.file"])
+    elif recipe["phantom.text"] is not None:
+        phantom = parse_phantom(recipe["phantom.text"])
+    else:
+        (kind,) = (kind for kind in KINDS if kind.name == recipe["phantom.kind"])
+        phantom = kind.phantom(**{**kind.usual, **recipe.fields("phantom", kind.phantom)})
+    pose = phantom_pose(recipe)
+    n_x, n_y, n_z = np.broadcast_to(recipe["phantom.voxels"], 3).tolist()
+    # Where no spacing is given, the phantom fits however it is turned, and a voxel is kept free all around.
+    spacing = np.broadcast_to(recipe["phantom.spacing"] or phantom.extent / max(1, min(n_x, n_y, n_z) - 2), 3)
+    if recipe["phantom.turn_grid"]:
+        low, high = phantom.box
+        own = Grid.centered((n_x, n_y, n_z), spacing, (low + high) / 2)
+        grid = Grid(own.shape, pose @ own.affine)
+    else:
+        grid = Grid.centered((n_x, n_y, n_z), spacing, pose[:3, 3])
     if recipe["attenuation.of_phantom"]:
         if all(shape.mu is None for shape in phantom.shapes):
             raise InputError(f"attenuation.of_phantom (--phantom-mu): no shape of the {phantom.title} has a mu")
@@ -216,3 +229,43 @@ def _from_phantom(recipe: Recipe, record: Recipe, model: Model, mu: Volume | Non
     quantity = "mu" if is_described and recipe["model.photons"] is not None else "activity"
     volume = phantom.voxelize(grid, pose, stages("voxelizing"), quantity)
     yield volume, mu, with_phantom(record, phantom, pose)
+
+
+def phantom_pose(recipe: Recipe) -> NDArray[np.float64]:
+    """World-from-phantom pose (4, 4), mm; `InputError` where matrix and position with angles are given and disagree."""
+    phi, theta, psi = np.deg2rad(recipe["phantom.euler_degrees"])
+    pose = euler_pose(phi, theta, psi, recipe["phantom.position"])
+    if recipe["phantom.matrix"] is None:
+        return pose
+    matrix = np.array(recipe["phantom.matrix"])
+    placed = "phantom.position" in recipe.given or "phantom.euler_degrees" in recipe.given
+    if placed and not np.allclose(matrix, pose, rtol=0, atol=1e-5):  # mm; Blender's matrices are float32
+        raise InputError("phantom.matrix: it is another pose than that of phantom.position and phantom.euler_degrees")
+    return matrix
+
+
+def with_phantom(recipe: Recipe, phantom: Phantom, pose: NDArray[np.float64]) -> Recipe:
+    """The recipe with all that describes the phantom: the numbers of its kind, and its pose as matrix and angles."""
+    values: dict[str, Any] = {"matrix": pose.tolist(), "voxels": recipe["phantom.voxels"]}
+    angles = euler_degrees(pose)
+    if angles is not None:
+        values |= {"position": pose[:3, 3].tolist(), "euler_degrees": angles}
+    cls: Any = type(phantom)
+    for kind in KINDS:
+        if cls is kind.phantom:
+            fields = dataclasses.fields(cls)
+            values |= {"kind": kind.name} | {f.name: getattr(phantom, f.name) for f in fields if f.init}
+    return recipe.updated({f"phantom.{name}": value for name, value in values.items()})
+
+
+def euler_degrees(pose: NDArray[np.float64]) -> list[float] | None:
+    """Angles phi, theta, psi with which `euler_pose` turns as `pose` does; None where it does more than turn and move."""
+    turn = pose[:3, :3]
+    if not np.allclose(turn @ turn.T, np.eye(3), rtol=0, atol=1e-6) or np.linalg.det(turn) < 0:
+        return None
+    theta = math.atan2(math.hypot(turn[0, 2], turn[1, 2]), turn[2, 2])
+    if math.sin(theta) < 1e-9:  # both others turn about z: phi takes it all
+        phi, psi = math.atan2(turn[1, 0] * turn[2, 2], turn[1, 1]), 0.0
+    else:
+        phi, psi = math.atan2(turn[1, 2], turn[0, 2]), math.atan2(turn[2, 1], -turn[2, 0])
+    return [math.degrees(angle) for angle in (phi, theta, psi)]

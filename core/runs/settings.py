@@ -30,51 +30,26 @@ Words = Mapping[str, tuple[str, str]]
 class Setting:
     """One setting of a run.
 
-    Attributes
-    ----------
-    key : str
-        Table and name: ``"model.time"``.
-    kind : type
-        Of its value, or of each of several: bool, int, float, str; list for a 4 x 4 matrix.
-    default
-        Its value where none is given; None for none.
-    text, absent : str
-        What it is, and what it means that none is given where the default is None: parts of help texts.
-    unit : str
-        Such as ``"mm"``.
-    words : mapping
-        Words that it may be; beside numbers if its kind is a number.
-    least, above, most : float, optional
-        Bounds of its value: the smallest, one that it must exceed, the largest.
-    slider : float, optional
-        The largest value that a slider reaches.
-    sizes : tuple of int, optional
-        How many values it may have, empty for any number; None for one value alone.
-    is_path : bool
-        Whether it names a file.
-    needs : tuple of str
-        Conditions without which it has no effect, each alternatives such as ``"model.aperture_mu or model.within_cone"``:
-        a setting that must be given, must have one value (``key=value``), or must not be given (``no key``).
-    option, label : str
-        Its option on the command line, and its name in Blender; by default made from the key.
+    Its `needs` are conditions without which it has no effect, each alternatives such as ``"model.aperture_mu or
+    model.within_cone"``: a setting that must be given, have one value (``key=value``), or not be given (``no key``).
     """
 
-    key: str
-    kind: type
-    default: Any
-    text: str
-    absent: str = ""
-    unit: str = ""
-    words: Words = field(default_factory=dict)
+    key: str  # table and name: "model.time"
+    kind: type  # of its value, or of each of several: bool, int, float, str; list for a 4 x 4 matrix
+    default: Any  # None: none
+    text: str  # what it is, for help texts
+    absent: str = ""  # what it means that none is given, where the default is None
+    unit: str = ""  # such as "mm"
+    words: Words = field(default_factory=dict)  # that it may be, beside numbers if its kind is a number
     least: float | None = None
-    above: float | None = None
+    above: float | None = None  # it must exceed this
     most: float | None = None
-    slider: float | None = None
-    sizes: tuple[int, ...] | None = None
-    is_path: bool = False
+    slider: float | None = None  # the largest value that a slider reaches
+    sizes: tuple[int, ...] | None = None  # how many values it may have, () for any number; None: one value alone
+    is_path: bool = False  # whether it names a file
     needs: tuple[str, ...] = ()
-    option: str = ""
-    label: str = ""
+    option: str = ""  # on the command line; by default made from the key, like the next
+    label: str = ""  # in Blender
 
     def __post_init__(self) -> None:
         name = self.key.partition(".")[2].removesuffix("_degrees")
@@ -84,9 +59,9 @@ class Setting:
     @property
     def help(self) -> str:
         """The text with unit, words and what leaving it out means."""
-        words = ", ".join(self.words)
-        parts = [self.text, *([self.unit] if self.unit else []), *([f"one of {words}"] if words else [])]
-        return ", ".join(parts) + (f"; without it, {self.absent}" if self.absent else "")
+        words = f"one of {', '.join(self.words)}" if self.words else ""
+        said = ", ".join(filter(None, (self.text, self.unit, words)))
+        return said + (f"; without it, {self.absent}" if self.absent else "")
 
     @property
     def expected(self) -> str:
@@ -95,12 +70,8 @@ class Setting:
         if self.kind in (bool, str):
             return words or {bool: "true or false", str: "a text"}[self.kind]
         number = "a whole number" if self.kind is int else "a number"
-        if self.least is not None:
-            number += f" of {self.least:g} or more"
-        if self.above is not None:
-            number += f" above {self.above:g}"
-        if self.most is not None:
-            number += f" and at most {self.most:g}"
+        bounds = {"of {:g} or more": self.least, "above {:g}": self.above, "and at most {:g}": self.most}
+        number += "".join(" " + said.format(bound) for said, bound in bounds.items() if bound is not None)
         return " or ".join(filter(None, (words, number + (f" ({self.unit})" if self.unit else ""))))
 
     def checked(self, value: Any) -> Any:
@@ -122,16 +93,13 @@ class Setting:
         elif self.kind in (bool, str):
             good = isinstance(value, self.kind)
         else:
+            bounds = ((self.least, operator.ge), (self.above, operator.gt), (self.most, operator.le))
             good = isinstance(value, Integral if self.kind is int else Real) and not isinstance(value, bool)
-            good = good and math.isfinite(value) and self._is_within(value)
+            good = good and math.isfinite(value) and all(b is None or holds(value, b) for b, holds in bounds)
             value = self.kind(value) if good else value
         if not good:
             raise InputError(f"{self.key}: expected {self.expected}, got {value!r}")
         return value
-
-    def _is_within(self, value: Any) -> bool:
-        bounds = ((self.least, operator.ge), (self.above, operator.gt), (self.most, operator.le))
-        return all(bound is None or holds(value, bound) for bound, holds in bounds)
 
 
 def _named(names: Iterable[str], text: str) -> Words:

@@ -11,8 +11,8 @@ import pytest
 
 import mphdrr.core as mph
 from mphdrr.addon.cli import main
-from mphdrr.core.runs.phantom_recipe import euler_degrees, phantom_pose
 from mphdrr.core.runs.recipe import Recipe
+from mphdrr.core.runs.run_recipe import euler_degrees, phantom_pose
 from mphdrr.core.runs.settings import SETTINGS
 
 DATA = Path(__file__).parent / "data"
@@ -90,6 +90,41 @@ def test_options_their_recipe_and_its_run_make_the_same_images(workbook, tmp_pat
     # Another position makes another volume.
     assert main(["project", first, "--position", "9", "0", "0", "-o", third]) == 0
     assert mph.read_run(third).volume.grid.center == pytest.approx([9, 0, 0])
+
+
+def test_a_changed_recipe_keeps_what_still_holds_and_no_more():
+    pose = mph.euler_pose(0, 0, np.pi / 2, (1, 2, 3))
+    numbers = {"phantom.kind": "nema", "phantom.sphere_activity": 3.0, "phantom.matrix": pose.tolist()}
+    made = Recipe({**numbers, "phantom.position": (1, 2, 3), "phantom.euler_degrees": (0, 0, 90)})
+    moved = made.updated({"phantom.position": (9, 0, 0)})
+    np.testing.assert_allclose(phantom_pose(moved), mph.euler_pose(0, 0, np.pi / 2, (9, 0, 0)), atol=1e-12)
+    np.testing.assert_allclose(phantom_pose(made.updated({"phantom.matrix": None})), phantom_pose(made), atol=1e-12)
+    assert moved["phantom.sphere_activity"] == 3
+    assert "phantom.sphere_activity" not in made.updated({"phantom.kind": "jaszczak"}).given
+    only_matrix = Recipe({"phantom.matrix": made["phantom.matrix"]}).updated({"phantom.position": (9, 0, 0)})
+    with pytest.raises(mph.InputError, match="another pose"):
+        phantom_pose(only_matrix)
+
+
+@pytest.mark.parametrize("centered", [False, True])
+def test_a_run_made_again_is_attenuated_again(centered, workbook, tmp_path, capsys):
+    """Also where the attenuation is the phantom's, or is moved with the volume."""
+    first, second = str(tmp_path / "a.h5"), str(tmp_path / "b.h5")
+    options = ["--water", "45", "60", "--phantom-mu"]
+    if centered:
+        away = mph.Grid.centered(8, 9.0, (150.0, 0, 0))
+        for name, value, quantity in (("v", 1.0, "activity"), ("mu", 0.01, "mu")):
+            mph.write_volume(mph.Volume(np.full(away.shape, value), away, quantity), tmp_path / f"{name}.npz")
+        options = ["--volume", str(tmp_path / "v.npz"), "--mu", str(tmp_path / "mu.npz"), "--center"]
+    small = SMALL[4:] if centered else SMALL
+    assert main(["project", str(workbook), *small, "--emission", *options, "-o", first]) == 0
+    assert main(["project", first, "-o", second]) == 0
+    runs = [mph.read_run(path) for path in (first, second)]
+    assert runs[0].projections.max() > 0
+    np.testing.assert_array_equal(runs[1].projections, runs[0].projections)
+    if not centered:
+        with pytest.raises(mph.InputError, match="needs its mu as well"):
+            next(mph.run_recipe(runs[0].recipe, volume=runs[0].volume))
 
 
 def test_every_entry_can_be_set_on_the_command_line(workbook, tmp_path, capsys):

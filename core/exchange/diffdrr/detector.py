@@ -28,7 +28,7 @@ class Detector:
     x0: float  # principal point, mm, as given to `DRR`
     y0: float
     reverse_x_axis: bool  # whether the columns run the other way
-    old: bool  # whether the geometry is that before 0.4
+    old: bool  # the geometry before 0.4, whose source is sdd / 2 from the camera's origin
 
     def __post_init__(self) -> None:
         whole_shape((self.height, self.width), "detector's height and width", 2)
@@ -36,14 +36,9 @@ class Detector:
             positive(getattr(self, name), name, "mm")
 
     @property
-    def sdr(self) -> float:
-        """Source to the camera's origin, mm, before 0.4: half of `sdd`."""
-        return self.sdd / 2
-
-    @property
     def source(self) -> Tensor:
         """The source (1, 3), mm."""
-        return torch.tensor([[self.sdr if self.old else 0.0, 0.0, 0.0]], dtype=torch.float64)
+        return torch.tensor([[self.sdd / 2 if self.old else 0.0, 0.0, 0.0]], dtype=torch.float64)
 
     def targets(self, calibration: Tensor | None = None) -> Tensor:
         """The pixels' centres (height * width, 3), mm; `calibration` (4, 4) maps (column, row, 1) to them."""
@@ -53,7 +48,7 @@ class Detector:
             column = -column
         row, column = (x.reshape(-1) for x in torch.meshgrid(row, column, indexing="ij"))
         if self.old:
-            behind = torch.full_like(row, -self.sdr)
+            behind = torch.full_like(row, -self.sdd / 2)
             return torch.stack([behind, row * self.delx - self.y0, column * self.dely - self.x0], dim=-1)
         unit = torch.stack([column, -row, torch.ones_like(row)], dim=-1)
         if calibration is None:
@@ -65,7 +60,7 @@ class Detector:
         """Pixels (..., 2), x right and y down from the image's corner, of `points` (..., 3) in the camera's frame."""
         x, y, z = points.unbind(-1)
         if self.old:
-            scale = self.sdd / (self.sdr - x)
+            scale = self.sdd / (self.sdd / 2 - x)
             column, row = (scale * z + self.x0) / self.delx, (self.y0 - scale * y) / self.dely
             return torch.stack([self.width / 2 - column, self.height / 2 - row], dim=-1)
         column, row = (x / z * self.sdd - self.x0) / self.delx, (y / z * self.sdd - self.y0) / self.dely
@@ -76,7 +71,7 @@ class Detector:
         column, row = pixels[..., 0] - self.width / 2, self.height / 2 - pixels[..., 1]
         if self.old:
             y, z = self.y0 - row * self.dely, -(column * self.delx + self.x0)
-            return torch.stack([torch.full_like(column, -self.sdr), y, z], dim=-1)
+            return torch.stack([torch.full_like(column, -self.sdd / 2), y, z], dim=-1)
         x = (-column if self.reverse_x_axis else column) * self.delx + self.x0
         return torch.stack([x, row * self.dely + self.y0, torch.full_like(x, self.sdd)], dim=-1)
 
@@ -86,10 +81,8 @@ def drr_arguments(views: Views, m: int, orientation: str | None = "AP") -> tuple
 
     Parameters
     ----------
-    views
-        Their pixels must be rectangles.
-    m
-        The view's index.
+    views, m
+        The m-th of these; `InputError` where its pixels are not rectangles.
     orientation
         The subject's, as given to `read`.
 
@@ -99,11 +92,6 @@ def drr_arguments(views: Views, m: int, orientation: str | None = "AP") -> tuple
         sdd, height, width, delx, dely, x0, y0, reverse_x_axis.
     pose : RigidTransform
         The camera, in the world of the views.
-
-    Raises
-    ------
-    InputError
-        The pixels are not rectangles.
     """
     u, v = views.u_steps[m], views.v_steps[m]
     delx, dely = np.linalg.norm(u), np.linalg.norm(v)
@@ -119,8 +107,6 @@ def drr_arguments(views: Views, m: int, orientation: str | None = "AP") -> tuple
     camera[:3] = np.column_stack([x, y, depth, views.sources[m]])
     pose = torch.tensor(camera) @ torch.linalg.inv(reorientation(orientation).double())
     height, width = views.shape
-    arguments = {
-        "sdd": float(to_center @ depth), "height": height, "width": width, "delx": float(delx), "dely": float(dely),
-        "x0": float(to_center @ x), "y0": float(to_center @ y), "reverse_x_axis": not mirrored,
-    }  # fmt: skip
+    arguments = {"sdd": float(to_center @ depth), "height": height, "width": width, "reverse_x_axis": not mirrored}
+    arguments |= {"delx": float(delx), "dely": float(dely), "x0": float(to_center @ x), "y0": float(to_center @ y)}
     return arguments, RigidTransform(pose)

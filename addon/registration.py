@@ -12,10 +12,9 @@ import bpy
 from ..operators import (
     add_map,
     add_phantom,
-    add_slices,
-    convert_ct,
     dropped_files,
     edit_phantom,
+    edit_volume,
     export_dataset,
     export_geometry,
     export_volume,
@@ -24,7 +23,6 @@ from ..operators import (
     load_recipe,
     modules,
     render_projections,
-    volume_files,
     voxelize_objects,
 )
 from ..panels import add_menu, design, export, geometry, phantom, projections
@@ -53,12 +51,10 @@ _OPERATORS = (
     add_map,
     add_phantom,
     edit_phantom,
+    edit_volume,
     voxelize_objects,
     import_volume,
     export_volume,
-    convert_ct,
-    add_slices,
-    volume_files,
     render_projections,
     load_recipe,
     jobs,

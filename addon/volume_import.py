@@ -56,12 +56,10 @@ def importing(
         states: list[Volume] = []
         for k, path in enumerate(paths):
             progress(k, count + 1)
-            is_vdb = path.suffix.lower() == ".vdb"
-            states.append(
-                vdb.read_vdb(path, quantity, grid, unit=unit)
-                if is_vdb
-                else read_volume(path, quantity, progress=part_of(progress, k, count + 1))
-            )
+            if path.suffix.lower() == ".vdb":
+                states.append(vdb.read_vdb(path, quantity, grid, unit=unit))
+            else:
+                states.append(read_volume(path, quantity, progress=part_of(progress, k, count + 1)))
             if k == 0 and count > 1:
                 shape = " x ".join(map(str, states[0].grid.shape))
                 require(4.0 * (count - 1) * states[0].grid.n_voxels, f"{count} volumes of {shape} voxels")

@@ -21,18 +21,13 @@ class MPHDRR_OT_add_map(jobs.JobOperator, bpy.types.Operator):
     bl_options = {"REGISTER", "UNDO"}
 
     quantity: EnumProperty(name="Quantity", description="What is mapped", items=maps.QUANTITIES)
-    voxels: IntProperty(
-        name="Voxels", description="Voxels along each side of the map", default=64, min=2, soft_max=256, max=1024
-    )
+    voxels: IntProperty(name="Voxels", description="Along each side", default=64, min=2, soft_max=256, max=1024)
     side: FloatProperty(
-        name="Side (mm)", description="Side of the map's cube in mm; 0 takes the diameter of the ROI", default=0.0,
-        min=0.0, soft_max=500.0,
-    )  # fmt: skip
+        name="Side (mm)", description="Of the map's cube; 0 takes the diameter of the ROI", min=0.0, soft_max=500.0
+    )
     within_roi: BoolProperty(name="Within ROI", description="Leave out what lies outside the ROI sphere", default=True)
 
-    @classmethod
-    def poll(cls, context: bpy.types.Context) -> bool:
-        return selection.poll_scanner(cls, context)
+    poll = classmethod(selection.poll_scanner)
 
     def job(self, context: bpy.types.Context) -> jobs.Job:
         return maps.mapping(context.scene, self.quantity, self.voxels, typed(self.side), self.within_roi)

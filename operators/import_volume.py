@@ -40,21 +40,22 @@ class ReadVolumes(jobs.JobOperator):
         default=True,
     )
     attenuation: BoolProperty(
-        name="CT to Attenuation",
-        description="Convert CT numbers (HU) to attenuation coefficients (1/mm)",
-        default=False,
+        name="CT to Attenuation", description="Convert CT numbers (HU) to attenuation coefficients (1/mm)"
     )
     energy: FloatProperty(
-        name="Energy (keV)", description="Of the photons that are attenuated, in keV: 140.5 is Tc-99m's", default=140.5,
-        min=10.0, max=1000.0,
-    )  # fmt: skip
-    grid: StringProperty(
-        name="Grid", description="Of an OpenVDB file that holds several, the one to read", options={"SKIP_SAVE"}
+        name="Energy (keV)",
+        description="Of the photons, in keV: 140.5 is Tc-99m's",
+        default=140.5,
+        min=10.0,
+        max=1000.0,
     )
+    grid: StringProperty(name="Grid", description="Of an OpenVDB file that holds several", options={"SKIP_SAVE"})
     unit: FloatProperty(
-        name="Unit (mm)", description="Length in mm of an OpenVDB file's unit, if another program wrote it", default=1.0,
+        name="Unit (mm)",
+        description="Length in mm of the unit of another program's OpenVDB file",
+        default=1.0,
         min=1e-6,
-    )  # fmt: skip
+    )
 
     if TYPE_CHECKING:  # of Blender
         layout: bpy.types.UILayout
@@ -99,9 +100,8 @@ class MPHDRR_OT_import_volume(ReadVolumes, bpy.types.Operator):
     bl_options = {"REGISTER", "UNDO"}
 
     filepath: StringProperty(
-        name="File", description="File, or folder of a DICOM series, to read", subtype="FILE_PATH",
-        options={"SKIP_SAVE"},
-    )  # fmt: skip
+        name="File", description="Or folder of a DICOM series", subtype="FILE_PATH", options={"SKIP_SAVE"}
+    )
     filter_glob: StringProperty(default=";".join(f"*{ending}" for ending in READ_ENDINGS), options={"HIDDEN"})
     name: StringProperty(name="Name", description="The object's name. Empty: the file's", options={"SKIP_SAVE"})
 
@@ -125,17 +125,12 @@ class MPHDRR_OT_import_volume_sequence(ReadVolumes, bpy.types.Operator):
     )
     bl_options = {"REGISTER", "UNDO"}
 
-    directory: StringProperty(
-        name="Folder", description="Where the files are", subtype="DIR_PATH", options={"SKIP_SAVE"}
-    )
+    directory: StringProperty(description="Where the files are", subtype="DIR_PATH", options={"SKIP_SAVE"})
     files: CollectionProperty(
-        name="Files", description="Of one volume for each frame", type=bpy.types.OperatorFileListElement,
-        options={"SKIP_SAVE"},
-    )  # fmt: skip
-    filter_glob: StringProperty(default=";".join(f"*{ending}" for ending in _STATES), options={"HIDDEN"})
-    name: StringProperty(
-        name="Name", description="The object's name. Empty: what the files' names have in common", options={"SKIP_SAVE"}
+        description="Of one volume for each frame", type=bpy.types.OperatorFileListElement, options={"SKIP_SAVE"}
     )
+    filter_glob: StringProperty(default=";".join(f"*{ending}" for ending in _STATES), options={"HIDDEN"})
+    name: StringProperty(name="Name", description="Empty: what the files' have in common", options={"SKIP_SAVE"})
     frame_start: IntProperty(name="First Frame", description="Frame that shows the first file", default=1)
 
     own_names = ("name", "frame_start")

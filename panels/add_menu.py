@@ -19,9 +19,8 @@ class MPHDRR_MT_add(bpy.types.Menu):
             layout.operator(ids.ADD_PHANTOM + kind, text=label, icon="OUTLINER_DATA_VOLUME")
         for kind, label, beats in menu_entries():
             if beats:
-                layout.operator(
-                    ids.ADD_PHANTOM + kind, text=f"Beating {label}", icon="OUTLINER_DATA_VOLUME"
-                ).frames = 24
+                entry = layout.operator(ids.ADD_PHANTOM + kind, text=f"Beating {label}", icon="OUTLINER_DATA_VOLUME")
+                entry.frames = 24
         layout.operator(ids.IMPORT_PHANTOM, text="Phantom from TOML File", icon="FILE_TEXT")
         layout.separator()
         layout.operator(ids.IMPORT_VOLUME, text="Volume from File", icon="IMPORT")

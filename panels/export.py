@@ -26,7 +26,6 @@ class MPHDRR_PT_export(bpy.types.Panel):
         column.active = False
         if not run_file:
             column.label(text="Render the projections first.", icon="INFO")
-        elif run_file.startswith("//"):
-            column.label(text=f"Last run: {run_file}", icon="FILE")
         else:
-            column.label(text="Last run: kept when the .blend is saved", icon="FILE")
+            kept = run_file if run_file.startswith("//") else "kept when the .blend is saved"
+            column.label(text=f"Last run: {kept}", icon="FILE")

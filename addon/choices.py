@@ -1,9 +1,8 @@
 """Numbers by which .blend files and Blender's preferences keep choices.
 
-Blender stores the number of an enumeration's item, not its identifier, and by default numbers items by position: an isotope
-put between two others would make every saved scene count another isotope's photons. So every item has a number of its own:
-in the tables below, the one it had in version 0.1.0; of a later item, a checksum of its identifier. Items may therefore be
-added, moved and removed without a change here.
+Blender stores the number of an enumeration's item, by default its position: an isotope put between two others would change
+every saved scene. So every item has a number of its own: in the tables below, the one it had in version 0.1.0; of a later
+item, a checksum of its identifier. Items may be added, moved and removed without a change here.
 """
 
 from __future__ import annotations
@@ -24,8 +23,7 @@ KINDS = {
     "VOLUME": 0, "DERENZO": 1, "NEMA": 2, "JASZCZAK": 3, "DEFRISE": 4, "SHEPP_LOGAN": 5, "POINTS": 6, "TORSO": 7,
     "FILE": 1000,
 }  # fmt: skip
-PHANTOM_WORDS = {"modified": 0, "original": 1}
-"""Words that settings of phantoms choose from (`core.phantoms.settings.choice`)."""
+PHANTOM_WORDS = {"modified": 0, "original": 1}  # that settings choose from (`core.phantoms.settings.choice`)
 ISOTOPES = {
     "NONE": 0, "F-18": 1, "Ga-67": 2, "Tc-99m": 3, "In-111": 4, "I-123": 5, "I-131": 6, "Xe-133": 7, "Lu-177": 8,
     "Tl-201": 9,

@@ -22,19 +22,8 @@ _MOSAIC_PIXELS = 6e6  # 80 views of 256 x 256 are shown pixel by pixel, larger o
 def store_projections(projections: NDArray[np.float32], numbers: Iterable[int], columns: int = 20) -> bpy.types.Image:
     """Make a float image of each module and the mosaic, packed into the .blend, in place of those of an earlier run.
 
-    Parameters
-    ----------
-    projections
-        (M, n_v, n_u), as the projector gives them.
-    numbers
-        The modules' numbers (M,), which name the images.
-    columns
-        Pictures in a row of the mosaic.
-
-    Returns
-    -------
-    Image
-        The mosaic, scaled so that its largest value is white.
+    `projections` are (M, n_v, n_u), the modules' `numbers` (M,) name the images, and the mosaic has `columns` pictures in a
+    row. Returns the mosaic, scaled so that its largest value is white.
     """
     for _ in storing(projections, numbers, columns):
         pass
@@ -50,25 +39,20 @@ def storing(
     for picture, name in zip(as_seen(projections), names, strict=True):
         _store(name, picture, exact=True)
         yield
-    sheet = np.maximum(mosaic(_reduced(projections, columns), columns), 0.0)
+    count, n_v, n_u = projections.shape
+    pixels = -(-count // columns) * columns * n_v * n_u
+    factor = min(int(np.ceil(np.sqrt(pixels / _MOSAIC_PIXELS))), n_v, n_u)
+    if factor > 1:  # too large to look at: means over blocks of pixels
+        rows, width = n_v // factor, n_u // factor
+        blocks = projections[:, : rows * factor, : width * factor].reshape(count, rows, factor, width, factor)
+        projections = blocks.mean(axis=(2, 4), dtype=np.float32)
+    sheet = np.maximum(mosaic(projections, columns), 0.0)
     yield
     image = _store(ids.MOSAIC, sheet / (float(sheet.max(initial=0.0)) or 1.0), exact=False)
     kept = {*names, ids.MOSAIC}
     for other in [image for image in bpy.data.images if _KEY in image and image.name not in kept]:
         bpy.data.images.remove(other)
     return image
-
-
-def _reduced(projections: NDArray[np.float32], columns: int) -> NDArray[np.float32]:
-    """Means over blocks of pixels, if the mosaic would be too large to look at."""
-    count, n_v, n_u = projections.shape
-    pixels = -(-count // columns) * columns * n_v * n_u
-    factor = min(int(np.ceil(np.sqrt(pixels / _MOSAIC_PIXELS))), n_v, n_u)
-    if factor <= 1:
-        return projections
-    rows, width = n_v // factor, n_u // factor
-    blocks = projections[:, : rows * factor, : width * factor].reshape(count, rows, factor, width, factor)
-    return blocks.mean(axis=(2, 4), dtype=np.float32)
 
 
 def projection_array(image: bpy.types.Image) -> NDArray[np.float32]:

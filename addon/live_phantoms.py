@@ -10,12 +10,9 @@ from . import jobs, phantoms
 
 QUICK_VOXELS = 64**3
 """Up to so many voxels, of all its states, a phantom is made again at every edit."""
-
 RESTED_VOXELS = 128**3
 """Up to so many it is made again by a job when its settings rest."""
-
 _REST = 0.5  # s without an edit
-
 _edited = ""  # name of the phantom that `_rested` is about
 
 

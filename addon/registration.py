@@ -32,7 +32,6 @@ from . import (
     jobs,
     live_phantoms,
     live_scanner,
-    preferences,
     properties,
     scanner,
     selection,
@@ -72,7 +71,7 @@ def _classes(module: ModuleType) -> list[type]:
 CLASSES: tuple[type, ...] = (
     *properties.CLASSES,
     *add_phantom.ADD_KINDS,
-    *(cls for module in (preferences, *_OPERATORS, *_PANELS) for cls in _classes(module)),
+    *(cls for module in (*_OPERATORS, *_PANELS) for cls in _classes(module)),
 )
 
 # (menu, draw function): entries in Blender's own menus.
@@ -99,7 +98,7 @@ HANDLERS: tuple[tuple[list[Any], Any], ...] = (
     (bpy.app.handlers.redo_post, live_scanner.after_undo),
     (bpy.app.handlers.save_pre, storage.before_save),
     (bpy.app.handlers.save_post, storage.after_save),
-    (bpy.app.handlers.save_post_fail, storage.after_failed_save),
+    (bpy.app.handlers.save_post_fail, storage.restore_paths),
 )
 
 # What edited properties call (`addon/updates.py`).

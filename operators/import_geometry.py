@@ -12,7 +12,6 @@ import bpy
 from bpy.props import BoolProperty, FloatProperty, IntVectorProperty, StringProperty
 
 from ..addon import column_maps, ids, scanner
-from ..addon.preferences import preferences
 from ..addon.reports import run_reported, warnings_reported
 from ..addon.scanner_files import WORKBOOK_SUFFIXES
 from ..core.errors import InputError
@@ -67,11 +66,6 @@ class MPHDRR_OT_import_geometry(bpy.types.Operator):
     )
 
     def invoke(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str]:
-        defaults = preferences(context)
-        if defaults is not None:
-            for name in ("plate_thickness", "wall_thickness"):
-                if not self.properties.is_property_set(name):
-                    setattr(self, name, getattr(defaults, name))
         if not self.filepath:
             context.window_manager.fileselect_add(self)
             return {"RUNNING_MODAL"}

@@ -40,11 +40,8 @@ UNITS = {
 }  # fmt: skip
 
 
-def number(numbers: Mapping[str, int], identifier: str) -> int:
-    """The number of a choice: that of a table above, or else a checksum of its identifier."""
-    return numbers.get(identifier, zlib.crc32(identifier.encode()) & 0x7FFFFFFF)
-
-
 def items(numbers: Mapping[str, int], chosen: Iterable[tuple[str, str, str]]) -> Items:
-    """Items (identifier, label, description) with their numbers, of which a table above holds the old ones."""
-    return tuple((identifier, label, text, number(numbers, identifier)) for identifier, label, text in chosen)
+    """Items (identifier, label, description) with their numbers: a table's above, or else a checksum of the identifier."""
+    return tuple(
+        (name, label, text, numbers.get(name, zlib.crc32(name.encode()) & 0x7FFFFFFF)) for name, label, text in chosen
+    )

@@ -20,7 +20,6 @@ _DESCRIPTIONS = {
     "completeness": "Of the angular sampling (Tuy): 1 where every plane through the voxel meets a pinhole. Slow",
 }
 QUANTITIES = choices.items(choices.MAPS, ((name, name.capitalize(), _DESCRIPTIONS.get(name, "")) for name in MAPS))
-"""What can be mapped, as items of an enumeration."""
 _BYTES = 40.0  # a voxel, while the map is made and put into the scene
 
 

@@ -30,11 +30,9 @@ from . import choices
 from .decimals import typed
 from .updates import on_edit
 
-FILE = "file"
-"""Beside the names of `KINDS`: a phantom that a text in TOML describes."""
+FILE = "file"  # beside the names of `KINDS`: a phantom that a text in TOML describes
 
-_UNITS = {"mm": "mm", "kBq/mL": "kBq_per_mL", "1/mm": "per_mm", "kBq": "kBq", "mL": "mL"}
-"""Units as they are written in the names of JSON's keys."""
+_UNITS = {"mm": "mm", "kBq/mL": "kBq_per_mL", "1/mm": "per_mm", "kBq": "kBq", "mL": "mL"}  # in JSON's keys
 
 
 class PhantomSettings:
@@ -254,7 +252,6 @@ _GROUPS = {
     )
     for kind in KINDS
 } | {FILE: PhantomTextProperties}  # fmt: skip
-"""What objects keep of how they were made: the settings of every kind of phantom."""
 
 _KINDS = (
     ("VOLUME", "Volume", "Voxels from elsewhere"),

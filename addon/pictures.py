@@ -12,7 +12,6 @@ from ..core.errors import InputError
 from . import scanner
 
 SIZE = (960, 560)
-_SAMPLES = 12
 _DIRECTION = Vector((0.75, -1.0, 0.62))  # from the scanner's middle to the camera
 _LENS, _SENSOR = 50.0, 36.0
 # Direction from the scanner's middle in units of its reach, power (W per mm^2 of reach^2) and size of each light.
@@ -26,7 +25,7 @@ def render_scanner(
     last: int,
     volume: bpy.types.Object | None = None,
     zoom: float = 1.0,
-    samples: int = _SAMPLES,
+    samples: int = 12,
 ) -> None:
     """Render modules `first` to `last` of a scanner to a PNG, with a volume or without; the scene stays as it was."""
     shown = {camera: not camera.hide_viewport for camera in scanner.modules(collection)}

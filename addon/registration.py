@@ -25,7 +25,7 @@ from ..operators import (
     render_projections,
     voxelize_objects,
 )
-from ..panels import add_menu, design, export, geometry, phantom, projections
+from ..panels import design, export, geometry, phantom, projections
 from . import (
     following,
     ids,
@@ -60,7 +60,7 @@ _OPERATORS = (
     export_dataset,
     dropped_files,
 )
-_PANELS = (add_menu, geometry, design, phantom, projections, export)
+_PANELS = (geometry, design, phantom, projections, export)
 
 
 def _classes(module: ModuleType) -> list[type]:
@@ -81,7 +81,7 @@ MENUS: tuple[tuple[Any, Any], ...] = (
     (bpy.types.TOPBAR_MT_file_export, export_geometry.draw_menu),
     (bpy.types.TOPBAR_MT_file_export, export_volume.draw_menu),
     (bpy.types.TOPBAR_MT_file_export, export_dataset.draw_menu),
-    (bpy.types.VIEW3D_MT_add, add_menu.draw_menu),
+    (bpy.types.VIEW3D_MT_add, phantom.draw_menu),
     (bpy.types.VIEW3D_MT_object_convert, voxelize_objects.draw_menu),
 )
 

@@ -12,7 +12,6 @@ import re
 import shutil
 import time
 import warnings
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -80,18 +79,10 @@ def _size_at(path: Path, now: float) -> int | None:
     return path.stat().st_size if path.is_file() else None
 
 
-def missing_volumes(is_there: Callable[[Path], bool] = Path.is_file) -> list[bpy.types.Volume]:
-    """Volumes of ours of which a file, shown or with every voxel, is missing."""
-    return [
-        data
-        for data in bpy.data.volumes
-        if _OUR_VOLUME.fullmatch(absolute(data.filepath).name) and not all(map(is_there, _files_of(data)))
-    ]
-
-
-def seems_there(path: Path) -> bool:
-    """Whether there is a file, by `size_of`."""
-    return size_of(path) is not None
+def missing_volumes() -> list[bpy.types.Volume]:
+    """Volumes of ours of which a file, shown or with every voxel, is missing, by `size_of`."""
+    ours = [data for data in bpy.data.volumes if _OUR_VOLUME.fullmatch(absolute(data.filepath).name)]
+    return [data for data in ours if any(size_of(path) is None for path in _files_of(data))]
 
 
 def relocate(directory: str) -> str:
@@ -102,6 +93,7 @@ def relocate(directory: str) -> str:
     top = absolute(directory)
     if not directory or not top.is_dir():
         raise InputError(f"{directory or 'no folder given'}: expected a folder to look in")
+    _size_at.cache_clear()
     missing = missing_volumes()
     wanted = {absolute(data.filepath).name for data in missing}
     there = {path.name: path for path in sorted(top.rglob("*.vdb"), reverse=True) if path.name in wanted}

@@ -27,12 +27,9 @@ from ..core.validation import freeze, positive
 from ..core.version import VERSION
 from ..core.volumes.volume import AIR_HU, UNITS, Volume
 
-SMOKE = "smoke for display"
-"""Name of a grid that only Blender's solid viewport uses."""
-
+SMOKE = "smoke for display"  # a grid that only Blender's solid viewport uses
 BACKGROUND = {"hu": AIR_HU}
 """Value of the voxels that take no room in a file, where it is not 0: around a CT there is air, not water."""
-
 _NUMBERS = ("float", "double", "half", "int32", "int64", "bool")  # value types that can become a volume
 _SLAB = 64  # layers copied to OpenVDB at once: the copy stays small
 _NOTE = (

@@ -6,7 +6,7 @@ import os
 import re
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import Any
 
 import bpy
 from bpy.props import BoolProperty, CollectionProperty, EnumProperty, FloatProperty, IntProperty, StringProperty
@@ -57,13 +57,9 @@ class ReadVolumes(jobs.JobOperator):
         min=1e-6,
     )
 
-    if TYPE_CHECKING:  # of Blender
-        layout: bpy.types.UILayout
+    own_names: tuple[str, ...] = ("name",)  # the operator's own properties, in the order of drawing
 
-    own_names: tuple[str, ...] = ("name",)
-    """The operator's own properties, in the order of drawing."""
-
-    def draw(self, context: bpy.types.Context) -> None:
+    def draw(self: Any, context: bpy.types.Context) -> None:
         layout = self.layout
         layout.use_property_split = True
         layout.use_property_decorate = False
@@ -140,14 +136,16 @@ class MPHDRR_OT_import_volume_sequence(ReadVolumes, bpy.types.Operator):
 
     def job(self, context: bpy.types.Context) -> jobs.Job:
         folder = storage.absolute(self.directory)
-        paths = [folder / name for name in sorted({file.name for file in self.files if file.name}, key=_by_number)]
+        names = {file.name for file in self.files if file.name}
+        # By number, so that "beat2" comes before "beat10".
+        parts = {n: [(int(p) if p.isdecimal() else -1, p.lower()) for p in re.split(r"(\d+)", n)] for n in names}
+        paths = [folder / name for name in sorted(names, key=parts.__getitem__)]
         if len(paths) < 2:
             raise InputError(f"{folder}: expected two files or more, one for each frame; choose them all")
         for path in paths:
             if not path.name.lower().endswith(_STATES):
-                raise InputError(
-                    f"{path}: expected a name ending in {', '.join(_STATES)}; a DICOM series is one volume"
-                )
+                expected = ", ".join(_STATES)
+                raise InputError(f"{path}: expected a name ending in {expected}; a DICOM series is one volume")
         common = re.sub(r"[\d _.-]*$", "", os.path.commonprefix([name_of(path) for path in paths]))  # noqa: RUF071
         return self.importing(paths, self.name or common, self.frame_start)
 
@@ -156,8 +154,3 @@ def draw_menu(self: bpy.types.Menu, context: bpy.types.Context) -> None:
     """The entries of File > Import."""
     self.layout.operator(ids.IMPORT_VOLUME, text="Volume for Projection (.nii, DICOM, .nrrd, .vdb, ...)")
     self.layout.operator(ids.IMPORT_VOLUME_SEQUENCE, text="Volume Sequence (.nii, .nrrd, .vdb, ...)")
-
-
-def _by_number(name: str) -> list[tuple[int, str]]:
-    """What to sort names by so that "beat2" comes before "beat10"."""
-    return [(int(part) if part.isdecimal() else -1, part.lower()) for part in re.split(r"(\d+)", name)]

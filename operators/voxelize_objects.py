@@ -25,7 +25,7 @@ class MPHDRR_OT_voxelize_objects(jobs.JobOperator, bpy.types.Operator):
         description="What the volume holds",
         items=choices.items(choices.QUANTITIES, (("activity", "Activity", "kBq/mL"), ("mu", "Attenuation", "1/mm"))),
     )
-    value: FloatProperty(name="Value", description="Inside the meshes", default=100.0, min=0.0, precision=4)
+    value: FloatProperty(name="Value", description="Inside, in kBq/mL or 1/mm", default=100.0, min=0.0, precision=4)
     voxels: IntProperty(
         name="Voxels", description="Voxels along the longest side", default=128, min=2, soft_max=512, max=4096
     )
@@ -43,15 +43,6 @@ class MPHDRR_OT_voxelize_objects(jobs.JobOperator, bpy.types.Operator):
 
     def ask(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str] | None:
         return self.ask_in_dialog(context, "Voxelize", width=320)
-
-    def draw(self, context: bpy.types.Context) -> None:
-        layout = self.layout
-        layout.use_property_split = True
-        layout.use_property_decorate = False
-        layout.prop(self, "quantity")
-        layout.prop(self, "value", text="kBq/mL" if self.quantity == "activity" else "1/mm")
-        for name in ("voxels", "voxel_size", "name"):
-            layout.prop(self, name)
 
     def job(self, context: bpy.types.Context) -> jobs.Job:
         return meshes.voxelizing(

@@ -1,4 +1,4 @@
-"""Sidebar, second step: the phantom."""
+"""Sidebar, second step: the phantom; and Add > mphDRR, everything that can be put into the scanner."""
 
 from __future__ import annotations
 
@@ -8,8 +8,35 @@ from typing import Any
 import bpy
 
 from ..addon import ids, jobs, phantoms, slices, storage, volumes
+from ..addon.phantom_properties import menu_entries
 
 _LINE = 32  # letters that fit into the sidebar at its usual width
+
+
+class MPHDRR_MT_add(bpy.types.Menu):
+    bl_idname = ids.MENU_ADD
+    bl_label = "mphDRR"
+
+    def draw(self, context: bpy.types.Context) -> None:
+        layout = self.layout
+        layout.operator_context = "INVOKE_DEFAULT"
+        for kind, label, _ in menu_entries():
+            layout.operator(ids.ADD_PHANTOM + kind, text=label, icon="OUTLINER_DATA_VOLUME")
+        for kind, label, beats in menu_entries():
+            if beats:
+                entry = layout.operator(ids.ADD_PHANTOM + kind, text=f"Beating {label}", icon="OUTLINER_DATA_VOLUME")
+                entry.frames = 24
+        layout.operator(ids.IMPORT_PHANTOM, text="Phantom from TOML File", icon="FILE_TEXT")
+        layout.separator()
+        layout.operator(ids.IMPORT_VOLUME, text="Volume from File", icon="IMPORT")
+        layout.operator(ids.IMPORT_VOLUME_SEQUENCE, text="Volume Sequence from Files", icon="RENDER_ANIMATION")
+        layout.operator(ids.VOXELIZE_OBJECTS, text="Volume from Meshes", icon="OUTLINER_DATA_MESH")
+        layout.operator(ids.ADD_MAP, text="Map of the Scanner", icon="OUTLINER_DATA_LIGHTPROBE")
+
+
+def draw_menu(self: bpy.types.Menu, context: bpy.types.Context) -> None:
+    """The entry of the 3D viewport's Add menu."""
+    self.layout.menu(ids.MENU_ADD, icon="OUTLINER_DATA_VOLUME")
 
 
 class MPHDRR_PT_phantom(bpy.types.Panel):
@@ -30,7 +57,7 @@ class MPHDRR_PT_phantom(bpy.types.Panel):
         column = adding.column(align=True)
         column.menu(ids.MENU_ADD, text="Add Phantom", icon="OUTLINER_DATA_VOLUME")
         column.operator(ids.IMPORT_VOLUME, text="Import Volume", icon="IMPORT")
-        if storage.missing_volumes(storage.seems_there):
+        if storage.missing_volumes():
             column = adding.column(align=True)
             column.alert = True
             column.label(text="Files of voxels are missing", icon="ERROR")

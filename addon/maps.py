@@ -28,16 +28,8 @@ def mapping(
 ) -> jobs.Job:
     """The job that adds a map of the scene's scanner, with ideal modules, or replaces the last one of its quantity.
 
-    Parameters
-    ----------
-    scene
-        With a scanner.
-    quantity
-        One of `core.physics.maps.MAPS`.
-    voxels, side
-        Along each side of the map's cube around the isocentre, and the side in mm; 0 takes the diameter of the ROI.
-    only_roi
-        Leave out what lies outside the ROI sphere.
+    The map is a cube of `voxels` along each `side` (mm; 0: the ROI's diameter) around the isocentre, of one of `MAPS`;
+    with `only_roi`, without what lies outside the ROI sphere.
     """
     collection = scanner.required_scanner(scene)
     system = scanner.read_scanner(collection)

@@ -34,18 +34,9 @@ def voxelizing(
 ) -> jobs.Job:
     """The job that makes a volume of closed mesh objects, modifiers included: a voxel holds the share that they cover.
 
-    Parameters
-    ----------
-    items
-        Later ones cover earlier ones.
-    value
-        Inside the meshes, in the quantity's unit; an object's custom property of the quantity's name counts instead.
-    quantity
-        ``"activity"`` or ``"mu"``.
-    voxels, voxel_size
-        Along the longest side, and their size in mm; 0 takes it from their number.
-    name
-        The object's name; by default the first mesh's.
+    Later items cover earlier ones. The `value` inside is in the unit of the `quantity`, "activity" or "mu"; an object's
+    custom property of that name counts instead. `voxels` are those along the longest side; a `voxel_size` in mm, if not 0,
+    counts instead. The volume's name is by default the first mesh's.
     """
     if not items:
         raise InputError("no mesh object is selected: select closed meshes first")

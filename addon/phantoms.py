@@ -118,16 +118,10 @@ def poll_phantom(operator: type[bpy.types.Operator], context: bpy.types.Context)
 def adding(
     settings: PhantomSettings, name: str, pose: NDArray[np.float64] | None = None, attenuation: bool = False
 ) -> jobs.Job:
-    """The job that adds a phantom to the scene.
+    """The job that adds a phantom to the scene, of an operator's settings or `phantom_properties.plain_settings`.
 
-    Parameters
-    ----------
-    settings, name
-        An operator's settings, or `phantom_properties.plain_settings`; and the object's name.
-    pose
-        World-from-phantom matrix (4, 4), mm. Default: the world's axes.
-    attenuation
-        Also add the mu of a phantom of activity, as a child.
+    The `pose` is its world-from-phantom matrix (4, 4), mm, by default the world's axes. With `attenuation`, the mu of a
+    phantom of activity is added too, as a child.
     """
     recipe, folder, values = recipe_of(settings), storage.folder(), settings.values()
     kind, quantity = settings.identifier, values["quantity"]

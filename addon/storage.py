@@ -67,10 +67,7 @@ def of_frame(path: Path, number: int) -> Path:
 
 
 def size_of(path: Path) -> int | None:
-    """Bytes of a file, None where there is none; looked up every two seconds at most.
-
-    For panels, which are drawn at every movement of the mouse: a look at a network disk may take long.
-    """
+    """Bytes of a file, None where there is none. Panels are drawn often: looks at the disk are two seconds apart."""
     return _size_at(path, time.monotonic() // _LOOK)
 
 
@@ -86,10 +83,7 @@ def missing_volumes() -> list[bpy.types.Volume]:
 
 
 def relocate(directory: str) -> str:
-    """Look for missing volumes' files by their names, in a folder and all below it; returns which volumes' were found.
-
-    The files of one volume are in one folder.
-    """
+    """Look for missing volumes' files by name, in a folder and all below it; returns which volumes' were found."""
     top = absolute(directory)
     if not directory or not top.is_dir():
         raise InputError(f"{directory or 'no folder given'}: expected a folder to look in")
@@ -99,7 +93,7 @@ def relocate(directory: str) -> str:
     there = {path.name: path for path in sorted(top.rglob("*.vdb"), reverse=True) if path.name in wanted}
     found = []
     for data in missing:
-        shown = there.get(absolute(data.filepath).name)
+        shown = there.get(absolute(data.filepath).name)  # the files of one volume are in one folder
         if shown is not None and all(shown.with_name(path.name).is_file() for path in _files_of(data)):
             data.filepath = stored_path(shown)
             data.grids.load()

@@ -46,19 +46,10 @@ def store_volume(
     pose: ArrayLike | None = None,
     provenance: dict[str, Any] | None = None,
 ) -> StoredVolume:
-    """Write the voxels of a volume, or of the states of one, for `volumes.add_stored`.
+    """Write the voxels of a volume in world mm, or of states of one quantity, to a folder, for `volumes.add_stored`.
 
-    Parameters
-    ----------
-    volume
-        In world mm; states must hold one quantity.
-    folder
-        Where to, `storage.folder()`.
-    pose
-        Rigid world-from-object matrix (4, 4): where the object's origin and axes shall be; the voxels stay where they
-        are. Default: the origin at the middle of the (first) grid, axes along the world's.
-    provenance
-        What the volume was made from, kept in the file.
+    The rigid world-from-object matrix `pose` (4, 4) says where the object's origin and axes shall be; the voxels stay where
+    they are. Default: the origin at the middle of the (first) grid, axes along the world's. The file keeps the `provenance`.
     """
     states = (volume,) if isinstance(volume, Volume) else tuple(volume)
     if len({state.quantity for state in states}) != 1:

@@ -50,18 +50,10 @@ def write_vdb(
 ) -> None:
     """Write a volume as a sparse float grid named after its quantity; voxels of 0 (-1000 HU) take no room.
 
-    Parameters
-    ----------
-    volume, path
-        What to write, and where to; raises `InputError` where that fails.
-    provenance
-        What the volume was made from, kept as JSON in the metadata.
-    smoke_above
-        Also write a grid `SMOKE` of the values above this one, minus it: Blender's solid viewport draws the surroundings
-        of values below 0 black. `read_vdb` ignores it.
-    center_shift
-        Voxels by which the transform is shifted along every index axis, for the Blender that draws the file
-        (`compat.VDB_CENTER_SHIFT`). `read_vdb` gives the same volume whatever the shift.
+    The `provenance`, what the volume was made from, is kept as JSON. With `smoke_above`, a grid `SMOKE` holds the values
+    above that one, minus it: Blender's solid viewport draws the surroundings of values below 0 black. The transform is
+    shifted by `center_shift` voxels along every index axis, for the Blender that draws the file
+    (`compat.VDB_CENTER_SHIFT`). `read_vdb` gives the same volume whatever the shift, without the smoke.
     """
     grids = [_grid_of(volume, provenance or {}, center_shift)]
     if smoke_above is not None:
@@ -84,8 +76,7 @@ def read_vdb(path: str | Path, quantity: str | None = None, grid: str | None = N
     path
         The file.
     quantity
-        What the values are, one of `UNITS`; of several grids, the one of that quantity. Default: what the file
-        says, and ``"activity"`` where it says nothing.
+        What the values are, one of `UNITS`, and which of several grids. Default: what the file says, or else activity.
     grid
         The grid's name; needed where a file holds several and `quantity` does not tell which.
     unit

@@ -32,17 +32,14 @@ def importing(
     unit: float = 1.0,
     frame_start: int = 1,
 ) -> jobs.Job:
-    """The job that reads a file as a volume, or several as the states of one, from frame `frame_start` on.
+    """The job that reads a file (or the folder of a DICOM series) as a volume, or several as the states of one.
 
     Parameters
     ----------
-    paths
-        The files; a folder is a DICOM series.
-    name
-        The object's name; by default the first file's.
+    paths, name, frame_start
+        The files, the object's name (by default the first file's), and the frame of the first state.
     quantity
-        What the voxels hold, one of `UNITS`. Default: what the file says; of those that say nothing, OpenVDB files hold
-        activity, others CT numbers.
+        What the voxels hold, one of `UNITS`. Default: what the file says, or else activity in OpenVDB, CT numbers elsewhere.
     center
         Move the (first) volume's middle to the isocentre; states move together.
     energy

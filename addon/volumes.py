@@ -1,8 +1,7 @@
 """Core volumes <-> Blender's Volume objects.
 
-The voxels are in .vdb files (`stored_volumes`), so that a saved .blend can be projected after it is opened again. The
-affine in the file is from voxel index to the object's own space, and the object's matrix is the pose: moving the object
-moves the volume.
+The voxels are in .vdb files (`stored_volumes`), so that a saved .blend can be projected later. The affine in the file is
+from voxel index to the object's own space, and the object's matrix is the pose: moving the object moves the volume.
 """
 
 from __future__ import annotations
@@ -59,8 +58,7 @@ def add_stored(stored: StoredVolume, name: str, collection: bpy.types.Collection
 def replace_stored(item: bpy.types.Object, stored: StoredVolume) -> None:
     """Give a Volume object the voxels and the pose of a stored volume.
 
-    Its datablock stays, with what the user has set on it. One of another quantity, or that other objects show too, is
-    replaced, and removed if nothing else needs it.
+    Its datablock stays, with what the user has set on it, unless it is of another quantity or other objects show it too.
     """
     old, settings = item.data, item.mphdrr_volume
     if old.users == 1 and settings.quantity == stored.volume.quantity:  # in place: what the user set on it stays
@@ -155,9 +153,8 @@ def pose_of_object(item: bpy.types.Object) -> NDArray[np.float64]:
     exact = item.mphdrr_volume.exact_pose
     if exact:
         pose = np.array(json.loads(exact))
-        if np.allclose(pose[:3, :3], shown[:3, :3], rtol=0, atol=2e-6) and np.allclose(
-            pose[:3, 3], shown[:3, 3], rtol=1e-6, atol=1e-6
-        ):
+        is_turned = not np.allclose(pose[:3, :3], shown[:3, :3], rtol=0, atol=2e-6)
+        if not is_turned and np.allclose(pose[:3, 3], shown[:3, 3], rtol=1e-6, atol=1e-6):
             return pose
     return checked_affine(shown, f"{item.name}: its matrix")
 

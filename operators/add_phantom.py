@@ -87,7 +87,6 @@ class MPHDRR_OT_import_phantom(PhantomSettings, AddPhantom, bpy.types.Operator):
         "name": StringProperty(name="Name", description="Of the object; empty: the phantom's", options={"SKIP_SAVE"}),
         **sampling(),
     }
-
     identifier = FILE
 
     def ask(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str] | None:

@@ -83,9 +83,8 @@ def show_below(image: bpy.types.Image, context: bpy.types.Context) -> bool:
     new = [a for a in window.screen.areas if a not in before]
     area = min([*new, view], key=lambda a: a.y)
     area.type = "IMAGE_EDITOR"
-    area.spaces.active.image = image
-    _fit(context, window, area)
-    return True
+    area.spaces.active.image = None
+    return show(image, context)
 
 
 def _fit(context: bpy.types.Context, window: bpy.types.Window, area: bpy.types.Area) -> None:

@@ -56,11 +56,6 @@ def full_resolution(path: Path) -> Path:
     return path.with_name(path.name.replace(ids.PREVIEW, "", 1))
 
 
-def is_preview(path: Path) -> bool:
-    """Whether a .vdb is a coarser copy for display."""
-    return path != full_resolution(path)
-
-
 def of_frame(path: Path, number: int) -> Path:
     """The file of a sequence with that number."""
     return path.with_name(_FRAME.sub(f"_{number:04d}.vdb", path.name))

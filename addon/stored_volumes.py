@@ -119,8 +119,6 @@ def _empty(volume: Volume) -> float:
 
 def _extent(volume: Volume) -> float:
     filled = volume.array != _empty(volume)
-    sides = []
-    for axis, spacing in enumerate(volume.grid.spacing):
-        used = np.flatnonzero(filled.any(axis=tuple(k for k in range(3) if k != axis)))
-        sides.append(spacing * (used[-1] - used[0] + 1) if len(used) else spacing)
-    return float(max(sides))
+    used = [np.flatnonzero(filled.any(axis=others)) for others in ((1, 2), (0, 2), (0, 1))]
+    counts = [k[-1] - k[0] + 1 if len(k) else 1 for k in used]
+    return float(max(np.multiply(counts, volume.grid.spacing)))

@@ -177,17 +177,11 @@ def _chosen(grids: dict[str, Any], quantity: str | None, name: str | None) -> st
     if not grids:
         raise InputError("it holds no grid, or ends before the first")
     listed = ", ".join(f"{key!r} ({grid.valueTypeName})" for key, grid in grids.items())
-    if name is not None:
-        if name not in grids:
-            raise InputError(f"it holds no grid {name!r}; expected one of {listed}")
-        if grids[name].valueTypeName not in _NUMBERS:
-            raise InputError(f"the grid {name!r} holds {grids[name].valueTypeName}; expected numbers")
-        return name
-    usable = [key for key, grid in grids.items() if grid.valueTypeName in _NUMBERS]
+    usable = [key for key, grid in grids.items() if grid.valueTypeName in _NUMBERS and name in (None, key)]
     if len(usable) > 1 and quantity is not None:
         usable = [key for key in usable if _quantity_of(grids[key]) == quantity] or usable
     if not usable:
-        raise InputError(f"it holds no grid of numbers, but {listed}")
+        raise InputError(f"it holds no grid of numbers{'' if name is None else f' {name!r}'}, but {listed}")
     if len(usable) > 1:
         raise InputError(f"it holds several grids: say which, of {listed}")
     return usable[0]
@@ -223,12 +217,13 @@ def _volume_of(grid: Any, quantity: str | None, unit: float) -> Volume:
         raise InputError(f"the grid {grid.name!r} has no active voxels")
     affine = np.diag([unit, unit, unit, 1.0]) @ _centered(grid, drawn)
     affine[:3, 3] += affine[:3, :3] @ first
-    array = _values(grid, first, last - first + 1)
+    n_x, n_y, n_z = (int(n) for n in last - first + 1)
+    array = _values(grid, first, (n_x, n_y, n_z))
     if grid.gridClass == openvdb().GridClass.LEVEL_SET:
         # Signed distances in the file's unit; inside a voxel the surface is taken for a plane.
         size = np.cbrt(abs(np.linalg.det(drawn[:3, :3])))
         array = np.clip(0.5 - array / np.float32(size), 0.0, 1.0)
-    return Volume(freeze(array), Grid(array.shape, affine), quantity)
+    return Volume(freeze(array), Grid((n_x, n_y, n_z), affine), quantity)
 
 
 def _centered(grid: Any, drawn: NDArray[np.float64]) -> NDArray[np.float64]:

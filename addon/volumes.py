@@ -21,7 +21,7 @@ from ..core.geometry.frames import checked_affine
 from ..core.memory import readable_size
 from ..core.physics.maps import MAPS
 from ..core.volumes.volume import UNITS, Volume
-from . import compat, storage, volume_materials
+from . import compat, ids, storage, volume_materials
 from .cameras import world_matrix
 from .stored_volumes import StoredVolume, moved, store_volume, write_states
 from .vdb import SMOKE, read_vdb
@@ -139,7 +139,7 @@ def file_state(item: bpy.types.Object) -> str:
     size = storage.size_of(file_of(item))
     if size is None:
         return "missing"
-    shown = ", coarser copy shown" if storage.is_preview(storage.absolute(item.data.filepath)) else ""
+    shown = ", coarser copy shown" if ids.PREVIEW in item.data.filepath else ""
     kept = "" if bpy.data.filepath else ", until saved"
     return readable_size(size) + shown + kept
 

@@ -30,8 +30,7 @@ class MPHDRR_OT_apply_phantom_pose(_EditPhantom, bpy.types.Operator):
     bl_idname = ids.APPLY_PHANTOM_POSE
     bl_label = "Apply Pose"
     bl_description = (
-        "Make the active phantom's voxels again where it stands, on a grid along the world's axes. It becomes a volume "
-        "like any other: its settings are given up"
+        "Make the active phantom's voxels again on a grid along the world's axes; its settings are given up"
     )
     bl_options = {"REGISTER", "UNDO"}
 

@@ -49,9 +49,8 @@ class MPHDRR_OT_ct_to_attenuation(jobs.JobOperator, bpy.types.Operator):
     bl_options = {"REGISTER", "UNDO"}
 
     energy: FloatProperty(
-        name="Energy (keV)", description="Of the photons that are attenuated, in keV: 140.5 is Tc-99m's, about 70 those of "
-        "a CT of 120 kV", default=140.5, min=10.0, max=1000.0,
-    )  # fmt: skip
+        name="Energy (keV)", description="Tc-99m: 140.5; a CT of 120 kV: about 70", default=140.5, min=10.0, max=1000.0
+    )
 
     @classmethod
     def poll(cls, context: bpy.types.Context) -> bool:

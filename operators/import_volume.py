@@ -115,10 +115,7 @@ class MPHDRR_OT_import_volume_sequence(ReadVolumes, bpy.types.Operator):
 
     bl_idname = ids.IMPORT_VOLUME_SEQUENCE
     bl_label = "Import Volume Sequence"
-    bl_description = (
-        "Read several files, in the order of the numbers in their names, as one volume that plays over the frames, such as "
-        "the states of a beating heart"
-    )
+    bl_description = "Read several files, in the order of their numbers, as one volume that plays over the frames"
     bl_options = {"REGISTER", "UNDO"}
 
     directory: StringProperty(description="Where the files are", subtype="DIR_PATH", options={"SKIP_SAVE"})

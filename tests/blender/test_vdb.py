@@ -133,7 +133,7 @@ def test_grids_are_chosen_by_name(tmp_path):
     assert {read_vdb(path, grid=f"heat[{k}]").array.max() for k in (0, 1)} == {2, 3}
     for name, message in (
         (None, r"several grids.*'heat\[1\]'.*velocity"),
-        ("smoke", r"no grid 'smoke'.*'heat\[0\]'"),
+        ("smoke", r"no grid of numbers 'smoke'.*'heat\[0\]'"),
         ("velocity", "vec3s"),
     ):
         with pytest.raises(InputError, match=message):

@@ -73,7 +73,12 @@ class Recipe:
             if baked:
                 place = np.eye(4)
                 place[:3, 3] = pose[:3, 3]
-                grid = self._world_grid(pose)
+                # A grid along the world's axes that holds the phantom, with voxels as small as its own.
+                corners = list(itertools.product(*zip(*self.phantom.box, strict=True))) @ pose[:3, :3].T + pose[:3, 3]
+                low, high = corners.min(axis=0), corners.max(axis=0)
+                spacing = min(Grid(self.grid.shape, pose @ self.grid.affine).spacing)
+                n_x, n_y, n_z = (int(n) for n in np.ceil((high - low) / spacing) + 2)
+                grid = Grid.centered((n_x, n_y, n_z), spacing, (low + high) / 2)
                 made = [phantom.voxelize(grid, pose, next(reports), quantity) for phantom in self.states]
                 settings = self.settings | {"pose": pose.tolist()}
             else:
@@ -82,14 +87,6 @@ class Recipe:
                 made = [moved(volume, pose) for volume in own]
             stored.append(store_volume(made, folder, place, settings))
         return stored
-
-    def _world_grid(self, pose: NDArray[np.float64]) -> Grid:
-        """A grid along the world's axes that holds the phantom at a pose, with voxels as small as its own."""
-        corners = list(itertools.product(*zip(*self.phantom.box, strict=True))) @ pose[:3, :3].T + pose[:3, 3]
-        low, high = corners.min(axis=0), corners.max(axis=0)
-        spacing = min(Grid(self.grid.shape, pose @ self.grid.affine).spacing)
-        n_x, n_y, n_z = (int(n) for n in np.ceil((high - low) / spacing) + 2)
-        return Grid.centered((n_x, n_y, n_z), spacing, (low + high) / 2)
 
 
 def recipe_of(settings: PhantomSettings) -> Recipe:

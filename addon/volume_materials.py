@@ -87,16 +87,13 @@ def new_material(name: str, quantity: str, size: float) -> bpy.types.Material:
 
 def set_range(material: bpy.types.Material, low: float, high: float) -> None:
     """Spread the colours from the value `low` to `high`; a material that the user made is left alone."""
-    node = material.node_tree.nodes.get(_RANGE) if material.node_tree else None
-    if node is not None:
-        node.inputs["From Min"].default_value = low
-        node.inputs["From Max"].default_value = high
+    if material.node_tree and (node := material.node_tree.nodes.get(_RANGE)):
+        node.inputs["From Min"].default_value, node.inputs["From Max"].default_value = low, high
 
 
 def resize(material: bpy.types.Material, old: float, new: float) -> None:
     """Keep a volume as opaque as before when its size, mm, changes from `old` to `new`."""
-    node = material.node_tree.nodes.get(_OPACITY_NODE) if material.node_tree else None
-    if node is not None:
+    if material.node_tree and (node := material.node_tree.nodes.get(_OPACITY_NODE)):
         node.outputs[0].default_value *= old / new
 
 

@@ -8,8 +8,7 @@ import numpy as np
 
 from ..core.geometry import module_parts
 from ..core.geometry.collimator import Collimator, Construction
-from ..core.geometry.collimator_mesh import Solid, check_watertight, collimator_solid, crystal_solid
-from ..core.geometry.module_parts import Look
+from ..core.geometry.module_parts import Look, Solid, check_watertight, collimator_solid, crystal_solid
 from . import compat
 from .module_values import ModuleNumbers
 

@@ -11,7 +11,7 @@ from typing import Any
 import bpy
 
 from ..core.errors import InputError
-from ..core.geometry.module_numbers import chosen_modules
+from ..core.geometry.system import chosen_modules
 from ..core.memory import require
 from ..core.progress import Progress
 from ..core.runs.files import read_run, write_run

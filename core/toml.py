@@ -13,13 +13,7 @@ from .errors import InputError
 
 
 def read_toml(path: str | os.PathLike[str]) -> dict[str, Any]:
-    """What a TOML file holds.
-
-    Raises
-    ------
-    InputError
-        The file cannot be read or is not TOML.
-    """
+    """What a TOML file holds."""
     try:
         return tomllib.loads(Path(path).read_text(encoding="utf-8-sig"))
     except tomllib.TOMLDecodeError as error:

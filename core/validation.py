@@ -19,21 +19,8 @@ def real_array(
 ) -> NDArray[Any]:
     """A copy of `value` as a C-ordered array of real, finite numbers.
 
-    Parameters
-    ----------
-    value
-        The caller's argument.
-    name
-        Its name in error messages.
-    shape
-        The expected shape, with None for any length; None for any shape.
-    dtype
-        Of the result.
-
-    Raises
-    ------
-    InputError
-        Not numbers, another shape, not finite (the message names the first bad index), or too large for the memory.
+    In the expected `shape` None is any length; None alone is any shape. Error messages say `name`, and the first index
+    that is not finite.
     """
     try:
         raw = np.asarray(value)
@@ -44,13 +31,13 @@ def real_array(
     except RuntimeError as error:  # a torch tensor that requires gradients; torch says what to do
         raise InputError(f"{name}: {error}") from None
     if raw.size > _MANY:
-        require(raw.size * np.dtype(dtype).itemsize, f"{name} of {_shape(raw.shape)} numbers")
+        require(raw.size * np.dtype(dtype).itemsize, f"{name} of {shape_text(raw.shape)} numbers")
     array = np.array(raw, dtype=dtype, order="C")
     if shape is not None and (
         array.ndim != len(shape) or any(n is not None and n != m for n, m in zip(shape, array.shape, strict=True))
     ):
         expected = " x ".join("any" if n is None else str(n) for n in shape) or "one number"
-        raise InputError(f"{name}: expected shape {expected}, got {_shape(array.shape)}")
+        raise InputError(f"{name}: expected shape {expected}, got {shape_text(array.shape)}")
     require_finite(array, name)
     return array
 
@@ -123,7 +110,8 @@ def freeze(array: NDArray[Any]) -> NDArray[Any]:
     return array
 
 
-def _shape(shape: tuple[int, ...]) -> str:
+def shape_text(shape: tuple[int, ...]) -> str:
+    """A shape in messages: "3 x 4", or "one number"."""
     return " x ".join(map(str, shape)) or "one number"
 
 

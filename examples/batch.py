@@ -1,4 +1,4 @@
-"""The main job in Blender without a window:
+"""Workbook, phantom, projections and dataset in Blender without a window:
 
     blender --background --python examples/batch.py -- scanner.xlsx folder
 
@@ -13,7 +13,7 @@ from pathlib import Path
 
 import bpy
 
-if not hasattr(bpy.types.Scene, "mphdrr_projections"):  # the bpy package, where no extension is enabled
+if not hasattr(bpy.types.Scene, "mphdrr_projections"):  # Blender's Python package has no extensions enabled
     import mphdrr
 
     mphdrr.register()
@@ -26,7 +26,7 @@ folder.mkdir(parents=True, exist_ok=True)
 bpy.ops.wm.read_homefile(use_empty=True)
 bpy.ops.mphdrr.import_geometry(filepath=str(workbook.absolute()))
 bpy.ops.mphdrr.add_derenzo(radius=40, rod_diameters=(8, 6, 5, 4, 3, 2), height=40, theta=math.radians(55), voxels=128)
-bpy.ops.wm.save_as_mainfile(filepath=str(folder / "scanner.blend"))  # large files then go beside it
+bpy.ops.wm.save_as_mainfile(filepath=str(folder / "scanner.blend"))  # from now on large files are saved beside it
 
 bpy.ops.mphdrr.render_projections(width=128, height=128)
 bpy.ops.mphdrr.export_dataset(filepath=str(folder / "run.npz"))

@@ -1,8 +1,8 @@
-"""Pictures of every phantom, of a CT and of the scanner's sensitivity: `make gallery` puts them into docs/images.
+"""Pictures of every phantom, of a CT and of the scanner's sensitivity: `make gallery` writes them to docs/images.
 
     python examples/gallery.py FOLDER [CT]
 
-CT is a volume file of CT numbers; without it, its pictures are left out. The pictures in the scanner need Blender's Python
+CT is a volume file of CT numbers; without it, its pictures are omitted. The pictures in the scanner need Blender's Python
 module (bpy).
 """
 
@@ -41,7 +41,7 @@ PHANTOMS = {
     "cardiac torso": mph.CardiacTorso(),
     **{path.stem.replace("_", " "): mph.read_phantom(path) for path in sorted((HERE / "phantoms").glob("*.toml"))},
 }
-# Where `telling` would miss what matters: the point through which the slices go, mm.
+# The point through which the slices go, mm, where `telling` would miss the interesting ones.
 THROUGH = {"Jaszczak": (0.0, 40.0, -50.0), "cardiac torso": (0.0, 0.0, 0.0)}
 
 
@@ -59,13 +59,13 @@ def main(folder: Path, ct: Path | None) -> None:
 
 
 def grid_of(phantom: mph.Phantom) -> mph.Grid:
-    """Voxels that hold a phantom."""
+    """A grid that contains a phantom."""
     voxels = 160
     return mph.Grid.centered(voxels, phantom.extent / (voxels - 2))
 
 
 def sheet(system: mph.PinholeSystem, volumes: dict[str, mph.Volume]) -> Image.Image:
-    """Two columns of volumes: slices across z, y and x of each, and what a module sees."""
+    """Two columns of volumes: slices across z, y and x of each, and its projection."""
     views = system[system.numbers == MODULE].views((TILE, TILE))
     width, height, rows = 4 * (TILE + MARGIN) + MARGIN, TILE + TEXT + MARGIN, -(-len(volumes) // 2)
     page = Image.new("RGB", (2 * width, rows * height + MARGIN), (24, 26, 29))
@@ -90,7 +90,7 @@ def sheet(system: mph.PinholeSystem, volumes: dict[str, mph.Volume]) -> Image.Im
 
 
 def telling(array: np.ndarray) -> list[int]:
-    """Along each axis the slice near the middle with most to see: where values differ most."""
+    """Along each axis the slice near the middle with the most contrast."""
     places = []
     for axis in range(3):
         n = array.shape[axis]
@@ -100,14 +100,14 @@ def telling(array: np.ndarray) -> list[int]:
 
 
 def framed(array: np.ndarray) -> tuple[np.ndarray, int]:
-    """Index in the middle of what is not empty, and the side of a cube around that holds it."""
+    """Index at the middle of the filled voxels, and the side of a cube around it that contains them."""
     filled = np.argwhere(array > 0.02 * array.max())
     low, high = filled.min(axis=0), filled.max(axis=0)
     return (low + high) // 2, int((high - low).max()) + 8
 
 
 def around(picture: np.ndarray, middle: np.ndarray, side: int) -> np.ndarray:
-    """The square of a picture around a pixel, 0 where it ends."""
+    """The square of a picture around a pixel, 0 outside the picture."""
     first = middle + side - side // 2  # of the padded picture
     return np.pad(picture, side)[first[0] : first[0] + side, first[1] : first[1] + side]
 
@@ -127,7 +127,7 @@ def in_the_scanner(system: mph.PinholeSystem, folder: Path, ct: mph.Volume | Non
     try:
         import bpy
     except ImportError:
-        print("no bpy: the pictures in the scanner are left out", file=sys.stderr)
+        print("no bpy: the pictures in the scanner are omitted", file=sys.stderr)
         return
     import mphdrr
     from mphdrr.addon import jobs, maps, pictures, scanner, volumes

@@ -1,4 +1,4 @@
-"""The main job as a Python package, without Blender: python package.py [scanner.xlsx]"""
+"""Workbook, phantom, projections and their adjoint in Python, without Blender: python package.py [scanner.xlsx]"""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
 """Load a batch of projections and volumes from a run, as a training script would: python read_run.py run.h5
 
-A run is one HDF5 file; `h5py.File(path)["projections"][m]` reads one view alone. The same file as .pt is made by
-``mphdrr export run.h5 -o run.pt`` and loads with ``torch.load("run.pt", weights_only=True)``.
+A run is one HDF5 file; `h5py.File(path)["projections"][m]` reads only one view. ``mphdrr export run.h5 -o run.pt`` writes
+it as .pt, which loads with ``torch.load("run.pt", weights_only=True)``.
 """
 
 from __future__ import annotations

@@ -2,8 +2,8 @@
 
     python register_pose.py ct.nii.gz [--degrees 10] [--millimetres 20] [--pixels 128] [--seed 0]
 
-A radiograph is made from a known pose; the search starts from a pose that is turned and shifted at random by as much
-as asked, and prints how near it comes. Needs torch and roma: pip install "mphdrr[torch]".
+A radiograph is made from a known pose. The search starts from a pose rotated and shifted from it in random directions, and
+its remaining error is printed. Needs torch and roma: pip install "mphdrr[torch]".
 """
 
 from __future__ import annotations
@@ -21,17 +21,17 @@ from mphdrr.core.projector.poses import pinhole_images
 
 WATER = 0.02  # 1/mm, at about 70 keV
 DISTANCE = 1000.0  # mm, source to detector
-SOURCE = 700.0  # mm, source to the CT's middle
+SOURCE = 700.0  # mm, source to the CT's centre
 SIDE = 512.0  # mm, the detector's
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("ct", help="NIfTI file of CT numbers")
-    parser.add_argument("--degrees", type=float, default=10.0, help="turn of the start about the CT's middle")
+    parser.add_argument("--degrees", type=float, default=10.0, help="rotation of the start about the CT's centre")
     parser.add_argument("--millimetres", type=float, default=20.0, help="shift of the start")
     parser.add_argument("--pixels", type=int, default=128, help="pixels along a side of the radiograph")
-    parser.add_argument("--seed", type=int, default=0, help="of the turn's and the shift's directions")
+    parser.add_argument("--seed", type=int, default=0, help="of the directions of rotation and shift")
     arguments = parser.parse_args()
 
     ct = mph.read_volume(arguments.ct, quantity="hu")

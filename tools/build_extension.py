@@ -1,7 +1,7 @@
-"""Build what is given away, in dist/, as `make dist` does: the package's wheels and the extension's zips, for each platform.
+"""Build the package's wheels and the extension's zips in dist/, for each platform: `make dist`.
 
-The C kernels are compiled for all of them here. A zip holds every wheel that it needs. Run by an environment with bpy, whose
-own command-line tool builds and validates; no Blender application is needed.
+The C kernels are compiled for all platforms here. A zip contains every wheel that it needs. Needs an environment with bpy,
+whose command-line tool builds and validates the zips; no Blender application is needed.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ COMPILED = ("h5py==3.16.0", "pylibjpeg-openjpeg==2.6.0")
 
 @dataclass(frozen=True)
 class Platform:
-    """What pip is asked for: wheel tags and Python versions."""
+    """Wheel tags and Python versions for pip."""
 
     tags: tuple[str, ...]
     pythons: tuple[str, ...] = ("3.11", "3.13")  # Blender 4.5 and 5.0; 5.1 and later
@@ -64,7 +64,7 @@ PLATFORMS = {
 
 
 def download(folder: Path, packages: tuple[str, ...], *options: str) -> list[Path]:
-    """Give the wheels of `packages` in `folder`, downloaded unless they are there; a stamp says that all are."""
+    """Give the wheels of `packages` in `folder`, downloaded unless a stamp there says that they are complete."""
     stamp = folder / ".complete"
     asked = " ".join((*packages, *options))
     if not (stamp.is_file() and stamp.read_text() == asked):
@@ -88,14 +88,14 @@ def wheels_for(name: str, folder: Path) -> list[Path]:
 
 
 def source_files() -> list[Path]:
-    """Give the files of the tree that git does not ignore, relative to the root; the manifest says which are packed."""
+    """Give the files of the tree that git does not ignore, relative to the root; the manifest chooses those to pack."""
     command = ("git", "ls-files", "-z", "--cached", "--others", "--exclude-standard")
     names = subprocess.run(command, cwd=ROOT, check=True, capture_output=True, text=True).stdout.split("\0")
     return [Path(name) for name in names if name and (ROOT / name).is_file()]
 
 
 def stage(folder: Path) -> None:
-    """Lay out the tree in `folder`."""
+    """Copy the tree to `folder`."""
     for name in source_files():
         (folder / name).parent.mkdir(parents=True, exist_ok=True)
         shutil.copyfile(ROOT / name, folder / name)
@@ -109,7 +109,7 @@ def build_wheel(name: str, tree: Path, output: Path) -> None:
 
 
 def build_zip(name: str, tree: Path, output: Path) -> Path:
-    """Build the extension's zip for platform `name` from a copy of the tree, which gets what the zip has beside it."""
+    """Build the extension's zip for platform `name` from a copy of the tree, to which kernels and wheels are added."""
     build_kernels.build(name, tree / build_kernels.KERNELS.relative_to(ROOT))
     wheels = wheels_for(name, ROOT / "wheels")
     (tree / "wheels").mkdir()
@@ -124,7 +124,7 @@ def build_zip(name: str, tree: Path, output: Path) -> Path:
     listed += "".join(f'  "./wheels/{wheel.name}",\n' for wheel in wheels) + "]\n"
     manifest.write_text(given.replace(declared, listed), encoding="utf-8")
     tool = (sys.executable, extension_tool())
-    options = ("--source-dir", tree, "--output-dir", output, "--split-platforms")  # so that names tell the platform
+    options = ("--source-dir", tree, "--output-dir", output, "--split-platforms")  # adds the platform to the name
     subprocess.run((*tool, "build", *options), check=True, stdout=subprocess.DEVNULL)
     version = tomllib.loads(given)["version"]
     file = output / f"mphdrr-{version}-{name.replace('-', '_')}.zip"
@@ -133,7 +133,7 @@ def build_zip(name: str, tree: Path, output: Path) -> Path:
 
 
 def toml_list(values: list[str]) -> str:
-    """Write `values` as Blender's manifests do."""
+    """Format `values` as in Blender's manifests."""
     return "[" + ", ".join(f'"{value}"' for value in values) + "]"
 
 
@@ -146,7 +146,7 @@ def extension_tool() -> Path:
 
 
 def main() -> None:
-    """Build for all platforms, or for those named."""
+    """Build for all platforms, or for the given ones."""
     parser = argparse.ArgumentParser(description=__doc__)
     names = build_kernels.PLATFORMS
     parser.add_argument("--platform", action="append", choices=names, help="build for this one only; may be repeated")

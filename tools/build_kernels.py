@@ -1,7 +1,7 @@
-"""Compile the C kernels of the projector into the library of one platform, by the compiler that the package ziglang has.
+"""Compile the C kernels of the projector into the library of one platform, with the compiler in the package ziglang.
 
-Zig compiles for every platform on any other. What is compiled is core/projector/backends/kernels/; siddon.c once for each
-level of processor and kind of number.
+Zig compiles for every platform on any other. The sources are in core/projector/backends/kernels/; siddon.c is compiled once
+per level of processor and number type.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ FLAGS = (
 
 @dataclass(frozen=True)
 class Platform:
-    """What the compiler and pip call a platform, its library's name, and the flags of each level of its processors."""
+    """The compiler's and pip's names of a platform, its library's name, and the flags of each level of its processors."""
 
     target: str
     tag: str
@@ -37,7 +37,7 @@ class Platform:
     levels: tuple[tuple[str, ...], ...] = ((), AVX2, AVX512)
 
 
-# The names are Blender's; linux-arm64, which Blender has no builds for, is named alike.
+# Blender's names; linux-arm64, for which there is no Blender, is named in the same way.
 PLATFORMS = {
     "linux-x64": Platform("x86_64-linux-gnu.2.17", "manylinux_2_17_x86_64.manylinux2014_x86_64"),
     "linux-arm64": Platform("aarch64-linux-gnu.2.17", "manylinux_2_17_aarch64.manylinux2014_aarch64", levels=((),)),
@@ -48,7 +48,7 @@ PLATFORMS = {
 
 
 def this_platform() -> str | None:
-    """Give the name of the platform that this Python runs on, None where the kernels are not built for it."""
+    """Give the name of the platform that this Python runs on, or None if the kernels are not built for it."""
     system = {"linux": "linux", "win32": "windows", "darwin": "macos"}.get(sys.platform)
     machine = {"x86_64": "x64", "amd64": "x64", "aarch64": "arm64", "arm64": "arm64"}.get(platform.machine().lower())
     if sys.maxsize < 2**32 or (system == "linux" and platform.libc_ver()[0] != "glibc"):
@@ -58,13 +58,13 @@ def this_platform() -> str | None:
 
 
 def zig(*arguments: str | Path, cwd: str | Path) -> None:
-    """Run the compiler; stop where it fails, after its own words."""
+    """Run the compiler; exit if it fails."""
     if subprocess.run((sys.executable, "-m", "ziglang", *arguments), cwd=cwd).returncode != 0:
-        raise SystemExit("the kernels could not be compiled: the compiler's words are above")
+        raise SystemExit("the kernels could not be compiled: see the compiler's messages above")
 
 
 def compiled(name: str, folder: str | Path, flags: tuple[str, ...] = FLAGS) -> list[str]:
-    """Give the names of the objects of platform `name`'s library, compiled into `folder`."""
+    """Compile the object files of platform `name`'s library into `folder`, and give their names."""
     made_for = PLATFORMS[name]
     calls: list[tuple[str, str, tuple[str, ...]]] = [("levels.o", "levels.c", ())]
     for level, options in enumerate(made_for.levels):
@@ -81,10 +81,10 @@ def compiled(name: str, folder: str | Path, flags: tuple[str, ...] = FLAGS) -> l
 
 
 def build(name: str, folder: Path) -> Path:
-    """Give the library of platform `name`, compiled into `folder`, which is made.
+    """Compile the library of platform `name` into `folder`, which is made if necessary, and give its path.
 
-    The kernels call no C library and none is linked, only the compiler's own functions: to make one of Windows ready takes
-    Zig two minutes.
+    The kernels call no C library, so none is linked, only the compiler's own functions; to prepare Windows' would take Zig
+    two minutes.
     """
     made_for = PLATFORMS[name]
     with tempfile.TemporaryDirectory() as objects:
@@ -99,17 +99,17 @@ def build(name: str, folder: Path) -> Path:
         )
         zig("build-lib", "-target", made_for.target, *options, *compiled(name, objects), cwd=objects)
         folder.mkdir(parents=True, exist_ok=True)
-        # Not written over: a process may have the one there loaded.
+        # Replaced, not overwritten: a process may have the old one loaded.
         new = folder / (made_for.library + ".new")
         shutil.copyfile(Path(objects) / made_for.library, new)
         return new.replace(folder / made_for.library)
 
 
 def main() -> None:
-    """Build for this machine, or for the platform named."""
+    """Build for this machine, or for the given platform."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument(
-        "platform", nargs="?", choices=PLATFORMS, default=this_platform(), help="this machine's if not given"
+        "platform", nargs="?", choices=PLATFORMS, default=this_platform(), help="default: this machine's"
     )
     parser.add_argument("--output", type=Path, default=KERNELS, help="folder of the library")
     arguments = parser.parse_args()

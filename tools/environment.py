@@ -1,6 +1,6 @@
-"""Make a virtual environment of this tree, or do nothing when it is there; for the Makefile. Any Python 3 runs it.
+"""Make a virtual environment for this tree, or bring it up to date, for the Makefile. Any Python 3 runs this script.
 
-bpy exists for Python 3.11 (Blender 4.5 LTS) and 3.13 (Blender 5.2 LTS) only, so one of these is looked for.
+bpy exists for Python 3.11 (Blender 4.5 LTS) and 3.13 (Blender 5.2 LTS) only, so one of these is searched for.
 """
 
 from __future__ import annotations
@@ -22,13 +22,13 @@ KERNELS = ROOT / "core/projector/backends/kernels"
 VERSIONS = ("3.11", "3.13")
 VERSION_WITH_TORCH = "3.11"
 
-# What tests/core/test_diffdrr.py compares with. DiffDRR declares more than it imports (pyvista, kornia, timm, torchvision,
-# ...: gigabytes), so it is installed without its dependencies, and these are what its modules that we test import. pandas
-# 3.1 asks for numpy 2, bpy 4.5 for numpy 1.
+# For tests/core/test_diffdrr.py. DiffDRR requires gigabytes of packages that the tested modules do not import (pyvista,
+# kornia, timm, torchvision, ...), so it is installed without its dependencies, and with the imports of these modules only.
+# pandas 3.1 requires numpy 2, bpy 4.5 numpy 1.
 DIFFDRR = "diffdrr==0.6.1"
 DIFFDRR_IMPORTS = ("einops", "fastcore", "pandas<3.1", "torchio")
 
-# What bpy loads from the system -> the Debian package that has it.
+# System library that bpy loads -> the Debian package that contains it.
 LIBRARIES = {
     "libX11.so.6": "libx11-6",
     "libXi.so.6": "libxi6",
@@ -43,7 +43,7 @@ LIBRARIES = {
 
 
 def version_of(python: str | Path) -> str | None:
-    """Give "3.11" and the like, or None where `python` does not run (a pyenv shim of a version that is not chosen)."""
+    """Give a version such as "3.11", or None if `python` does not run (such as a pyenv shim of an inactive version)."""
     ask = "import sys; print('%d.%d' % sys.version_info[:2])"
     try:
         answer = subprocess.run([str(python), "-c", ask], capture_output=True, text=True, timeout=60)
@@ -53,7 +53,7 @@ def version_of(python: str | Path) -> str | None:
 
 
 def candidates(name: str) -> list[str | Path]:
-    """Interpreters to try, the asked one first; a name with a version in it asks for that version alone."""
+    """Interpreters to try, `name` first; a name that contains a version allows only that version."""
     match = re.search(r"3\.\d+$", name)
     versions = (match.group(),) if match else VERSIONS
     found: list[str | Path] = [name, *(f"python{version}" for version in versions)]
@@ -67,7 +67,7 @@ def candidates(name: str) -> list[str | Path]:
 
 
 def find_python(name: str) -> tuple[str, str]:
-    """Give the interpreter to use and its version, or stop with one line."""
+    """Give the interpreter to use and its version, or exit with one line."""
     for python in candidates(name):
         version = version_of(python)
         if version in VERSIONS:
@@ -91,28 +91,28 @@ def missing_packages() -> list[str]:
 
 
 def pip(venv: Path, *arguments: str) -> bool:
-    """Run the environment's pip, silent but for errors; say whether it succeeded."""
+    """Run the environment's pip, silent except for errors; return whether it succeeded."""
     command = [str(venv / "bin/python"), "-m", "pip", *arguments, "-qq", "--disable-pip-version-check", "--no-input"]
     return subprocess.run(command, cwd=ROOT, stdin=subprocess.DEVNULL).returncode == 0
 
 
 def add_diffdrr(venv: Path) -> bool:
-    """Install the DiffDRR of the tests; say whether it succeeded."""
-    # torchio would fetch a torch of its own where ours could not be installed.
+    """Install the DiffDRR of the tests; return whether it succeeded."""
+    # torchio would fetch its own torch if ours could not be installed.
     if subprocess.run([str(venv / "bin/python"), "-c", "import torch"], stderr=subprocess.DEVNULL).returncode != 0:
         return False
     return pip(venv, "install", *DIFFDRR_IMPORTS) and pip(venv, "install", "--no-deps", DIFFDRR)
 
 
 def kernels_changed() -> bool:
-    """Say whether the library of the C kernels is missing in the tree, or older than what it is built from."""
+    """Whether the library of the C kernels is missing in the tree, or older than its sources."""
     sources = (ROOT / "tools/build_kernels.py", *KERNELS.glob("*.[ch]"))
     libraries = [file for file in KERNELS.iterdir() if file.suffix in (".so", ".dylib", ".dll")]
     return not libraries or libraries[0].stat().st_mtime < max(file.stat().st_mtime for file in sources)
 
 
 def make(venv: Path, name: str, extras: set[str], torch: str | None) -> None:
-    """Bring `venv` to what is asked; `torch` is a requirement, "" for an environment without it, None for either."""
+    """Make or update `venv`; `torch` is a requirement, "" for an environment without torch, None to leave it unchanged."""
     python, version = find_python(name)
     if torch and version != VERSION_WITH_TORCH:
         torch = ""
@@ -128,7 +128,7 @@ def make(venv: Path, name: str, extras: set[str], torch: str | None) -> None:
     }
     if state == wanted and not kernels_changed():
         return
-    if state == wanted and "dev" in wanted["extras"]:  # the others have no compiler: pip gets them one for a moment
+    if state == wanted and "dev" in wanted["extras"]:  # elsewhere pip fetches the compiler for the build
         subprocess.run([str(venv / "bin/python"), str(ROOT / "tools/build_kernels.py")], check=True)
         return
     started = time.monotonic()
@@ -140,16 +140,16 @@ def make(venv: Path, name: str, extras: set[str], torch: str | None) -> None:
     if not (venv / "bin/pip").exists() and subprocess.run([python, "-m", "venv", str(venv)]).returncode != 0:
         raise SystemExit(f"{python} cannot make virtual environments; on Debian: apt-get install python3-venv")
     state_file.unlink(missing_ok=True)
-    if wanted["torch"] != state.get("torch", ""):  # before the extras, which would bring a torch of their own
+    if wanted["torch"] != state.get("torch", ""):  # before the extras, which would install another torch
         if not wanted["torch"]:
             pip(venv, "uninstall", "-y", "torch", "roma")
         elif not pip(venv, "install", wanted["torch"], "roma>=1.5"):
             print(f"{wanted['torch']} could not be installed: going on without it, its tests are skipped", flush=True)
     if not pip(venv, "install", "-e", f".[{','.join(wanted['extras'])}]"):
-        raise SystemExit("pip could not install what mphDRR needs; its words are above")
+        raise SystemExit("pip could not install what mphDRR needs: see its messages above")
     if wanted["torch"] and "dev" in wanted["extras"] and not add_diffdrr(venv):
         print(f"{DIFFDRR} could not be installed: going on without it, its tests are skipped", flush=True)
-    source = venv / "src"  # where mypy finds the repo root under the package's name
+    source = venv / "src"  # where mypy finds the repo root by the package's name
     source.mkdir(exist_ok=True)
     if not (source / "mphdrr").is_symlink():
         (source / "mphdrr").symlink_to(ROOT)
@@ -158,12 +158,12 @@ def make(venv: Path, name: str, extras: set[str], torch: str | None) -> None:
 
 
 def main() -> None:
-    """Parse the Makefile's call."""
+    """Parse the Makefile's arguments."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("venv", nargs="?", type=Path, help="folder of the environment")
     parser.add_argument("--python", default="python3", help="interpreter, or a name of one")
     parser.add_argument("--extras", default="blender", help="extras of pyproject.toml, separated by commas")
-    parser.add_argument("--torch", help="requirement for torch, or empty for none; unset leaves it as it is")
+    parser.add_argument("--torch", help="requirement for torch, or empty for none; default: unchanged")
     parser.add_argument(
         "--libraries", action="store_true", help="only list the Debian packages of all libraries bpy needs"
     )

@@ -12,8 +12,8 @@ from typing import Any
 
 from ..errors import InputError
 from ..files import ensure_folder, refuse_folder
-from ..geometry.module_numbers import chosen_modules as chosen_modules
 from ..geometry.system import PinholeSystem
+from ..geometry.system import chosen_modules as chosen_modules
 from ..physics.isotopes import photon_energy as photon_energy
 from ..progress import Progress
 from ..workbook import read_system
@@ -74,11 +74,8 @@ def add_command(subparsers, name: str, summary: str, example: str) -> argparse.A
 
 def add_workbook(parser: argparse.ArgumentParser, name: str = "workbook", default: str | None = None) -> None:
     """The geometry workbook, for `read_workbook`; `name` may be that of an option, with a default."""
-    what = "geometry workbook (.xlsx, .xlsm)"
-    if name == "workbook":
-        parser.add_argument(name, metavar="FILE", help=what)
-    else:
-        parser.add_argument(name, metavar="FILE", help=what, default=default, dest="workbook")
+    option = {} if name == "workbook" else {"default": default, "dest": "workbook"}
+    parser.add_argument(name, metavar="FILE", help="geometry workbook (.xlsx, .xlsm)", **option)  # type: ignore[arg-type]
     parser.add_argument(
         "--columns",
         metavar="MAP",
@@ -114,14 +111,8 @@ def add_placing_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--position", type=float, nargs=3, default=[0, 0, 0], metavar="MM", help="middle of the phantom, x y z"
     )
-    parser.add_argument(
-        "--euler",
-        type=float,
-        nargs=3,
-        default=[0, 0, 0],
-        metavar="DEG",
-        help="phi theta psi: psi about its own axis, theta about y, phi about z",
-    )
+    text = "phi theta psi: psi about its own axis, theta about y, phi about z"
+    parser.add_argument("--euler", type=float, nargs=3, default=[0, 0, 0], metavar="DEG", help=text)
     parser.add_argument("--voxels", type=int, nargs="+", default=[256], metavar="N", help="voxels along x y z, or one")
     parser.add_argument(
         "--spacing", type=float, nargs="+", metavar="MM", help="voxel size, one or three; default: so that it fits"
@@ -131,9 +122,8 @@ def add_placing_options(parser: argparse.ArgumentParser) -> None:
 def add_view_options(parser: argparse.ArgumentParser) -> None:
     """The images' size and place, and the modules that have one."""
     parser.add_argument("--size", type=int, nargs=2, default=[256, 256], metavar=("ROWS", "COLUMNS"), help="pixels")
-    parser.add_argument(
-        "--detector", choices=("virtual", "real"), default="virtual", help="upright in front, or crystal"
-    )
+    planes = ("virtual", "real")
+    parser.add_argument("--detector", choices=planes, default="virtual", help="upright in front, or crystal")
     parser.add_argument("--magnification", type=float, default=10.0, help="virtual detector's distance in units of l")
     parser.add_argument("--pitch", type=float, metavar="MM", help="pixel size; default: the crystal's whole side")
     parser.add_argument("--modules", metavar="RANGE", help="such as 1-40 or 1-20,41; default: all")
@@ -176,8 +166,7 @@ def number_or_name(text: str) -> float | str:
 
 def progress_bar(label: str) -> Progress:
     """A progress callback that draws a bar on standard error when that is a terminal, and says nothing otherwise."""
-    started = time.monotonic()
-    width = 30
+    started, width = time.monotonic(), 30
 
     def show(done: int, total: int) -> None:
         if not sys.stderr.isatty():

@@ -5,12 +5,10 @@ it. Depths are along the module's axis, mm from the pinhole's centre, positive t
 
 - The hole is narrowest at depth 0, where its diameter is d, and opens as a double cone of full angle alpha through the
   whole plate: its radius at depth s is ``d/2 + |s| tan(alpha/2)``.
-- The plate's faces are at `Construction.front` and `Construction.back`. The knife edge lies in the plate's middle, or
-on
+- The plate's faces are at `Construction.front` and `Construction.back`. The knife edge lies in the plate's middle, or on
   the face towards the ROI (front) or towards the crystal (back).
 - Behind the plate is a channel, a square frustum that ends at the crystal's front face with the crystal's side. It is
-never
-  narrower than the pyramid that the crystal sees through the hole, of half-width ``d/2 + (Ld - d)/2 * s/l``.
+  never narrower than the pyramid that the crystal sees through the hole, of half-width ``d/2 + (Ld - d)/2 * s/l``.
 - The outside is a square frustum, everywhere at least a wall's thickness outside the hole and the channel.
 
 So a ray from the front that passes the hole at depth 0, is no steeper than the cone and meets the crystal's front face
@@ -51,22 +49,10 @@ def angle_from_degrees(degrees: float, name: str = "opening_degrees") -> float:
 
 @dataclass(frozen=True)
 class Construction:
-    """How the collimators of a scanner are built.
+    """How the collimators of a scanner are built: thicknesses of plates and walls, mm, and the knife edge.
 
-    Attributes
-    ----------
-    plate_thickness, wall_thickness : float
-        Of the aperture plates and the collimators' walls, mm.
-    opening_angle : float
-        Full angle alpha of the hole's double cone, rad.
-    edge_at : "middle", "front" or "back"
-        Where in the plate the knife edge is; front is the face towards the ROI. The edge is always at the pinhole's
-        centre, so this moves the plate.
-
-    Raises
-    ------
-    InputError
-        A length is not above 0, the angle is not between 0 and pi, or the place is not one of these.
+    `opening_angle` is the full angle alpha of the hole's double cone, rad. `edge_at` says where in the plate the edge is;
+    front is the face towards the ROI. The edge is always at the pinhole's centre, so this moves the plate.
     """
 
     plate_thickness: float = 2.0
@@ -93,28 +79,10 @@ class Construction:
         """Depth of the plate's face towards the crystal, mm, at least 0."""
         return self.front + self.plate_thickness
 
-    @property
-    def slope(self) -> float:
-        """``tan(alpha / 2)``."""
-        return edge_slope(self.opening_angle)
-
 
 @dataclass(frozen=True)
 class Collimator:
-    """One module's collimator.
-
-    Attributes
-    ----------
-    diameter, length, detector_side : float
-        d of the hole, l from the pinhole's centre to the crystal's front face, and Ld of the crystal, mm.
-    construction : Construction
-        Plate, walls and knife edge.
-
-    Raises
-    ------
-    InputError
-        The plate, the hole and the crystal do not fit together.
-    """
+    """One module's collimator: d of the hole, l from its centre to the crystal's front face, and Ld of the crystal, mm."""
 
     diameter: float
     length: float
@@ -142,7 +110,7 @@ class Collimator:
 
     def hole_radius(self, depth: float) -> float:
         """Radius of the hole, mm, at a depth within the plate: ``d/2 + |s| tan(alpha/2)``."""
-        return self.diameter / 2 + abs(depth) * self.construction.slope
+        return self.diameter / 2 + abs(depth) * edge_slope(self.construction.opening_angle)
 
     @property
     def hole_profile(self) -> list[tuple[float, float]]:

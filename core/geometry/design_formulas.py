@@ -23,33 +23,10 @@ def collimator_length(b: ArrayLike, d: ArrayLike, Ld: ArrayLike, R: ArrayLike) -
 
     With ``s = (Ld - d) / (2 l)`` tangency means ``b s - d/2 = R sqrt(1 + s^2)``, hence
     ``l = (Ld - d)(b^2 - R^2) / (b d + 2 R sqrt(b^2 - R^2 + d^2/4))``, which is column G of the users' workbook.
-
-    Parameters
-    ----------
-    b
-        Pinhole centre to isocentre, mm, larger than R.
-    d
-        Pinhole diameter, mm.
-    Ld
-        Side of the square detector crystal, mm, larger than d.
-    R
-        ROI radius, mm.
-
-    Returns
-    -------
-    array
-        l, mm, of the broadcast shape.
-
-    Raises
-    ------
-    InputError
-        A number is not finite or out of range, or the shapes do not broadcast.
+    Arguments are in mm and broadcast: b from pinhole centre to isocentre, larger than R; d of the pinhole; Ld, the side of
+    the square crystal, larger than d; and the ROI's radius R.
     """
-    b, d, Ld, R = _numbers(b=b, d=d, Ld=Ld, R=R)
-    _require("d", d, d > 0, "more than 0")
-    _require("Ld", Ld, Ld > d, "more than d")
-    _require("R", R, R > 0, "more than 0")
-    _require("b", b, b > R, "more than R")
+    b, d, Ld, R = _numbers({"d": "0", "Ld": "d", "R": "0", "b": "R"}, b=b, d=d, Ld=Ld, R=R)
     return (Ld - d) * (b**2 - R**2) / (b * d + 2 * R * np.sqrt(b**2 - R**2 + d**2 / 4))
 
 
@@ -57,28 +34,22 @@ def roi_radius_seen(b: ArrayLike, d: ArrayLike, Ld: ArrayLike, l: ArrayLike) -> 
     """Radius R, mm, of the largest sphere at the isocentre that the module's field of view holds, or 0.
 
     The inverse of `collimator_length`: ``R = (b (Ld - d) - d l) / sqrt(4 l^2 + (Ld - d)^2)``. Every ray from this sphere
-    through any point of the hole meets the crystal's front face. Parameters and errors are as there, with the collimator
-    length l, mm.
+    through any point of the hole meets the crystal's front face. Arguments are as there, with the collimator length l, mm.
     """
-    b, d, Ld, l = _numbers(b=b, d=d, Ld=Ld, l=l)
-    _require("d", d, d > 0, "more than 0")
-    _require("Ld", Ld, Ld > d, "more than d")
-    _require("l", l, l > 0, "more than 0")
-    _require("b", b, b > 0, "more than 0")
+    b, d, Ld, l = _numbers({"d": "0", "Ld": "d", "l": "0", "b": "0"}, b=b, d=d, Ld=Ld, l=l)
     return np.maximum((b * (Ld - d) - d * l) / np.hypot(2 * l, Ld - d), 0.0)
 
 
-def _numbers(**given: ArrayLike) -> list[Array]:
+def _numbers(limits: dict[str, str], **given: ArrayLike) -> list[Array]:
+    """The arguments as arrays; each must be finite and more than its limit, which is 0 or another argument."""
     try:
-        arrays = [np.asarray(x, dtype=np.float64) for x in given.values()]
-        np.broadcast_shapes(*(array.shape for array in arrays))
+        arrays = {name: np.asarray(x, dtype=np.float64) for name, x in given.items()}
+        np.broadcast_shapes(*(array.shape for array in arrays.values()))
     except (TypeError, ValueError):
         raise InputError(f"{', '.join(given)}: expected real numbers, or arrays of them that broadcast") from None
-    return arrays
-
-
-def _require(name: str, value: Array, good: NDArray[np.bool_], need: str) -> None:
-    good = good & np.isfinite(value)
-    if not np.all(good):
-        found = np.broadcast_to(value, np.shape(good))[~good].flat[0]
-        raise InputError(f"{_NAMES[name]} must be {need} mm, got {found:g}")
+    for name, limit in limits.items():
+        good = (arrays[name] > arrays.get(limit, 0.0)) & np.isfinite(arrays[name])
+        if not np.all(good):
+            found = np.broadcast_to(arrays[name], np.shape(good))[~good].flat[0]
+            raise InputError(f"{_NAMES[name]} must be more than {limit} mm, got {found:g}")
+    return list(arrays.values())

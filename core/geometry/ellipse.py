@@ -6,10 +6,7 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
-
-from ..errors import InputError
-from ..validation import lengths, real_array
+from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 
@@ -20,30 +17,11 @@ _FEWEST_POINTS = 6
 
 @dataclass(frozen=True, eq=False)
 class Ellipse:
-    """An ellipse.
-
-    Attributes
-    ----------
-    semi_axes, center : array (2,)
-        mm.
-    rotation : float
-        Angle from x to the first axis, rad.
-    """
+    """An ellipse: semi-axes (2,) and center (2,), mm, and the angle from x to the first axis, rad."""
 
     semi_axes: Array
     center: Array
     rotation: float
-
-    @classmethod
-    def checked(cls, semi_axes: ArrayLike, center: ArrayLike, rotation: float) -> Ellipse:
-        """The ellipse of a user's numbers; `InputError` if it does not hold the isocentre."""
-        turn = float(real_array(rotation, "rotation", ()))
-        ellipse = cls(lengths(semi_axes, "semi_axes", 2), real_array(center, "center", (2,)), turn)
-        if not ellipse.holds_isocentre:
-            raise InputError(
-                f"the isocentre must be inside the ellipse, but its centre is {np.linalg.norm(ellipse.center):g} mm off"
-            )
-        return ellipse
 
     @property
     def axes(self) -> Array:

@@ -29,40 +29,37 @@ def module_frames(centers: ArrayLike) -> NDArray[np.float64]:
     """
     k = principal_rays(centers)
     u = np.cross([0.0, 0.0, 1.0], k)
-    length = np.linalg.norm(u, axis=1)
-    parallel = length < _PARALLEL
-    if parallel.any():
-        u[parallel] = np.cross([1.0, 0.0, 0.0], k[parallel])
-        length = np.linalg.norm(u, axis=1)
-    u /= length[:, None]
+    parallel = np.linalg.norm(u, axis=1) < _PARALLEL
+    u[parallel] = np.cross([1.0, 0.0, 0.0], k[parallel])
+    u /= np.linalg.norm(u, axis=1)[:, None]
     return np.stack([u, np.cross(k, u), k], axis=1)
 
 
 def module_poses(centers: ArrayLike) -> NDArray[np.float64]:
     """World-from-module poses (M, 4, 4) of pinholes at `centers` (M, 3), mm: columns u, v, k and the centre."""
     frames = module_frames(centers)
-    poses = np.zeros((len(frames), 4, 4))
+    poses = np.tile(np.eye(4), (len(frames), 1, 1))
     poses[:, :3, :3] = frames.transpose(0, 2, 1)
     poses[:, :3, 3] = centers
-    poses[:, 3, 3] = 1.0
     return poses
 
 
 def euler_pose(
     phi: float = 0.0, theta: float = 0.0, psi: float = 0.0, translation: ArrayLike = (0.0, 0.0, 0.0)
 ) -> NDArray[np.float64]:
-    """World-from-object pose (4, 4): a rotation by three Euler angles, then a translation.
+    """World-from-object pose (4, 4): a rotation by three Euler angles, rad, then a translation, mm.
 
-    Parameters
-    ----------
-    phi, theta, psi
-        Radians: a rotation by psi about the object's z axis, then by theta about world y, then by phi about world z.
-    translation
-        mm, applied last.
+    The object is turned by psi about its z axis, then by theta about world y, then by phi about world z.
     """
     angles = real_array([phi, theta, psi], "Euler angles", (3,))
     pose = np.eye(4)
-    pose[:3, :3] = _rotation(2, angles[0]) @ _rotation(1, angles[1]) @ _rotation(2, angles[2])
+    for axis, angle in zip((2, 1, 2), angles, strict=True):
+        i, j = (axis + 1) % 3, (axis + 2) % 3
+        turn = np.eye(3)
+        turn[i, i] = turn[j, j] = np.cos(angle)
+        turn[j, i] = np.sin(angle)
+        turn[i, j] = -turn[j, i]
+        pose[:3, :3] = pose[:3, :3] @ turn
     pose[:3, 3] = real_array(translation, "translation", (3,))
     return pose
 
@@ -76,14 +73,4 @@ def checked_affine(affine: ArrayLike, name: str) -> NDArray[np.float64]:
     # Scaled to unit columns, so that a grid of small voxels is not taken for singular.
     if np.any(lengths == 0) or abs(np.linalg.det(matrix[:3, :3] / lengths)) < 1e-10:
         raise InputError(f"{name}: its three axes are not independent, so it cannot be inverted")
-    return matrix
-
-
-def _rotation(axis: int, angle: float) -> NDArray[np.float64]:
-    """Rotation matrix (3, 3) about a coordinate axis."""
-    i, j = (axis + 1) % 3, (axis + 2) % 3
-    matrix = np.eye(3)
-    matrix[i, i] = matrix[j, j] = np.cos(angle)
-    matrix[j, i] = np.sin(angle)
-    matrix[i, j] = -matrix[j, i]
     return matrix

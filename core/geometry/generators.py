@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ..errors import InputError
-from ..validation import positive, real_array, whole_number
+from ..validation import lengths, positive, real_array, whole_number
 from .design_formulas import collimator_length as designed_length
 from .ellipse import Array, Ellipse
 from .system import PinholeSystem
@@ -62,19 +62,17 @@ def ellipse_rings(
         ring, whose last module is one step before `end`.
     spacing
         ``"angle"``: equal steps in azimuth; ``"arc"``: equal lengths along the ellipse.
-    center
-        Centre (x, y) of the ellipse, mm. The isocentre must be inside the ellipse.
-    rotation
-        Rotation of the ellipse about its centre, rad.
+    center, rotation
+        Centre (x, y) of the ellipse, mm, and its rotation about it, rad. The isocentre must be inside the ellipse.
     mirrored
         Append the rings' mirror images at z = 0, beginning with that of the last ring.
-
-    Raises
-    ------
-    InputError
-        A number is of the wrong kind or out of range, or two modules would stand at the same place.
     """
-    ellipse = Ellipse.checked(semi_axes, center, rotation)
+    turn = float(real_array(rotation, "rotation", ()))
+    ellipse = Ellipse(lengths(semi_axes, "semi_axes", 2), real_array(center, "center", (2,)), turn)
+    if not ellipse.holds_isocentre:
+        raise InputError(
+            f"the isocentre must be inside the ellipse, but its centre is {np.linalg.norm(ellipse.center):g} mm off"
+        )
     if np.ndim(modules) == 0:
         azimuths = even_azimuths(ellipse, modules, start, end, spacing)
     else:
@@ -99,22 +97,9 @@ def plate_rings(
     """A system of rings of modules on flat plates, ring by ring and plate by plate.
 
     The n modules of a plate stand in the middles of n equal parts of it, and aim at the isocentre like all modules.
-
-    Parameters
-    ----------
-    modules
-        Number on each plate in each ring: one number, or one for each plate (0 for none).
-    vertices
-        (V, 2), x and y of the plates' edges, mm, in order. `regular_polygon` gives those of a regular polygon.
-    z, pinhole_diameter, detector_side, detector_thickness, roi_radius, collimator_length, mirrored
-        As in `ellipse_rings`.
-    closed
-        Whether a plate joins the last vertex to the first.
-
-    Raises
-    ------
-    InputError
-        As in `ellipse_rings`.
+    `modules` is their number on each plate in each ring, or one number for each plate (0 for none).
+    `vertices` (V, 2) are x and y of the plates' edges, mm, in order, such as those of `regular_polygon`; if `closed`, a
+    plate joins the last to the first. The other parameters are as in `ellipse_rings`.
     """
     corners = real_array(vertices, "vertices", (None, 2))
     if len(corners) < 2 + closed:
@@ -122,10 +107,9 @@ def plate_rings(
     ends = np.roll(corners, -1, axis=0) if closed else corners[1:]
     starts = corners[: len(ends)]
     try:
-        counts = np.asarray(modules)
+        counts = np.broadcast_to(modules, len(starts)) if np.ndim(modules) == 0 else np.asarray(modules)
     except ValueError:  # lists of different lengths
         counts = np.empty(0)
-    counts = np.broadcast_to(counts, len(starts)) if counts.ndim == 0 else counts
     whole = counts.shape == (len(starts),) and counts.dtype.kind in "iu"
     if not whole or counts.min() < 0 or not 0 < counts.max() <= _MOST_MODULES:
         raise InputError(
@@ -141,19 +125,7 @@ def plate_rings(
 def regular_polygon(sides: int, apothem: float, rotation: float = 0.0) -> Array:
     """Vertices (sides, 2), mm, of a regular polygon around the isocentre, for `plate_rings`.
 
-    Parameters
-    ----------
-    sides
-        At least 3.
-    apothem
-        Distance of the plates from the isocentre, mm.
-    rotation
-        Azimuth of the middle of the first plate, rad.
-
-    Raises
-    ------
-    InputError
-        A number is of the wrong kind or out of range.
+    The plates are `apothem` mm from the isocentre; the middle of the first has the azimuth `rotation`, rad.
     """
     sides = whole_number(sides, "sides")
     if sides < 3:
@@ -170,9 +142,9 @@ def even_azimuths(ellipse: Ellipse, modules: Any, start: float, end: float, spac
         raise InputError(f"modules: expected at most {_MOST_MODULES} in a ring, got {count}")
     start, end = (float(real_array(x, name, ())) for x, name in ((start, "start"), (end, "end")))
     turn = abs(end - start)
-    closed = abs(turn - FULL_TURN) < 1e-9
     if turn > FULL_TURN + 1e-9:
         raise InputError(f"start and end: expected at most a full turn apart, got {math.degrees(turn):g} degrees")
+    closed = turn >= FULL_TURN - 1e-9
     shares = np.linspace(0, 1, count, endpoint=not closed)
     if spacing == "angle":
         return start + shares * (end - start)
@@ -189,10 +161,8 @@ def _rings(
 ) -> PinholeSystem:
     """Modules at `places` ((rings,) M, 2), mm, in rings at `z`; `sizes` are d, Ld, Td and R."""
     heights = np.atleast_1d(real_array(z, "z", (None,) * min(np.ndim(z), 2)))
-    if heights.ndim == 1:
-        heights = heights[:, None]
-    if places.ndim == 2:
-        places = places[None]
+    heights = heights[:, None] if heights.ndim == 1 else heights
+    places = places[None] if places.ndim == 2 else places
     try:
         shape = np.broadcast_shapes(heights.shape, places.shape[:2])
     except ValueError:

@@ -14,20 +14,10 @@ from .frames import checked_affine
 
 @dataclass(frozen=True, eq=False)
 class Grid:
-    """A lattice of voxels.
+    """A lattice of voxels: their numbers (n_x, n_y, n_z) along the index axes, and the affine (4, 4) to world mm.
 
-    Attributes
-    ----------
-    shape : tuple of int
-        Voxels (n_x, n_y, n_z) along the index axes.
-    affine : array (4, 4)
-        Index to world mm, on column vectors; an integer index is the voxel's CENTRE. Any invertible affine:
-        rotated, sheared, anisotropic, mirrored.
-
-    Raises
-    ------
-    InputError
-        The shape is not three whole numbers of at least 1, or the affine is not an invertible 4x4 affine.
+    The affine acts on column vectors, and an integer index is the voxel's CENTRE. It may be any that is invertible:
+    rotated, sheared, anisotropic, mirrored.
     """
 
     shape: tuple[int, int, int]

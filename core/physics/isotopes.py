@@ -29,21 +29,11 @@ _DAY = 24 * _HOUR
 
 @dataclass(frozen=True)
 class Isotope:
-    """An isotope and the photons that it is imaged with.
+    """An isotope and the photons that it is imaged with."""
 
-    Attributes
-    ----------
-    name : str
-        Such as ``"Tc-99m"``.
-    half_life : float
-        s.
-    lines : tuple of (float, float)
-        Energy in keV and photons per decay, by energy.
-    """
-
-    name: str
-    half_life: float
-    lines: tuple[tuple[float, float], ...]
+    name: str  # such as "Tc-99m"
+    half_life: float  # s
+    lines: tuple[tuple[float, float], ...]  # energy, keV, and photons per decay, by energy
 
     @property
     def window(self) -> tuple[float, float]:
@@ -91,23 +81,15 @@ ISOTOPES = {
 
 def isotope(name: str) -> Isotope:
     """The isotope of a name such as "Tc-99m"; `InputError` lists the names."""
-    try:
-        return ISOTOPES[name]
-    except KeyError:
-        raise InputError(f"isotope {name!r}: expected one of {', '.join(ISOTOPES)}") from None
+    if name not in ISOTOPES:
+        raise InputError(f"isotope {name!r}: expected one of {', '.join(ISOTOPES)}")
+    return ISOTOPES[name]
 
 
 def photon_energy(value: float | str) -> float:
-    """A photon energy, keV, from a number or its text, or from the name of an isotope: that of its strongest line.
-
-    Raises
-    ------
-    InputError
-        Neither a number nor an isotope.
-    """
+    """A photon energy, keV, from a number or its text, or from the name of an isotope: that of its strongest line."""
     if value in ISOTOPES:
-        energy, _ = max(ISOTOPES[str(value)].lines, key=lambda line: line[1])
-        return energy
+        return max(ISOTOPES[str(value)].lines, key=lambda line: line[1])[0]
     try:
         return float(value)
     except ValueError:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -36,36 +37,15 @@ def sensitivity_map(
 ) -> Volume:
     """Sum of the modules' `sensitivity`, counts per decay; times 1e6 that is cps/MBq.
 
-    Parameters
-    ----------
-    system, grid
-    aperture_mu, opening_angle, crystal_mu, photons_per_decay
-        As in `sensitivity`.
-    progress
-        Called as ``progress(done, total)`` between blocks of voxels; may raise `Cancelled`.
-
-    Raises
-    ------
-    InputError
-        A number is not finite or out of range, or the volume does not fit into memory.
+    Parameters are as there. ``progress(done, total)`` is called between blocks of voxels and may raise `Cancelled`.
     """
-
-    def total(points: Array) -> Array:
-        counts = sensitivity(
-            system,
-            points,
-            aperture_mu=aperture_mu,
-            opening_angle=opening_angle,
-            crystal_mu=crystal_mu,
-            photons_per_decay=photons_per_decay,
-        )
-        return counts.sum(axis=1)
-
-    return _map(system, grid, "sensitivity", total, progress)
+    optics: dict[str, Any] = {"aperture_mu": aperture_mu, "opening_angle": opening_angle, "crystal_mu": crystal_mu}
+    optics["photons_per_decay"] = photons_per_decay
+    return _map(system, grid, "sensitivity", lambda points: sensitivity(system, points, **optics).sum(axis=1), progress)
 
 
 def modules_map(system: PinholeSystem, grid: Grid, *, progress: Progress | None = None) -> Volume:
-    """Number of modules that see each voxel (see `seen`). Parameters and errors as in `sensitivity_map`."""
+    """Number of modules that see each voxel (see `seen`)."""
     return _map(system, grid, "modules", lambda points: seen(system, points).sum(axis=1, dtype=np.float64), progress)
 
 
@@ -82,16 +62,14 @@ def resolution_map(
     """Resolution of the projections, FWHM in mm: the count-weighted root mean square of the modules' `resolution`.
 
     The variance of all photons together is the mean of the modules' variances. A reconstruction that models the blur
-    may do better, and one from few counts worse. Parameters and errors are as in `sensitivity_map` and `resolution`.
+    may do better, and one from few counts worse. Parameters are as in `sensitivity_map` and `resolution`.
     """
 
+    edge: dict[str, Any] = {"aperture_mu": aperture_mu, "opening_angle": opening_angle}
+
     def combined(points: Array) -> Array:
-        fwhm = resolution(
-            system, points, intrinsic_fwhm=intrinsic_fwhm, aperture_mu=aperture_mu, opening_angle=opening_angle
-        )
-        counts = sensitivity(
-            system, points, aperture_mu=aperture_mu, opening_angle=opening_angle, crystal_mu=crystal_mu
-        )
+        fwhm = resolution(system, points, intrinsic_fwhm=intrinsic_fwhm, **edge)
+        counts = sensitivity(system, points, crystal_mu=crystal_mu, **edge)
         total = counts.sum(axis=1)
         return np.sqrt((counts * np.nan_to_num(fwhm) ** 2).sum(axis=1) / np.where(total > 0, total, 1))
 
@@ -104,8 +82,7 @@ def completeness_map(
     """Completeness of the angular sampling, from 0 to 1: 1 - gap / 90 degrees, with the gap of `sampling_gaps`.
 
     It is 1 where every plane through the voxel meets a pinhole that sees it (Tuy's condition), and 0 where at most one
-    module sees the voxel. `tolerance` is that of the gap, rad; the other parameters and errors are as in
-    `sensitivity_map`.
+    module sees the voxel. `tolerance` is that of the gap, rad.
     """
 
     def share(points: Array) -> Array:

@@ -15,25 +15,8 @@ _LARGEST_MEAN = 9e18
 def sample_counts(mean: ArrayLike, seed: int) -> NDArray[np.int64]:
     """Counts drawn from Poisson distributions with given means.
 
-    Each view has its own random generator, made from the seed and the view's index, so its counts do not depend on the
-    other views.
-
-    Parameters
-    ----------
-    mean
-        Expected counts, (M, n_v, n_u) or any array whose first axis is the views.
-    seed
-        A whole number of at least 0; the same seed gives the same counts.
-
-    Returns
-    -------
-    int64 array
-        Counts, in the shape of `mean`.
-
-    Raises
-    ------
-    InputError
-        A mean is negative, not finite, or too large; the seed is not a whole number.
+    `mean` is (M, n_v, n_u) or any array whose first axis is the views. Each view has its own random generator, made from
+    the seed, a whole number of at least 0, and the view's index, so its counts do not depend on the other views.
     """
     if isinstance(seed, bool) or not isinstance(seed, int | np.integer) or seed < 0:
         raise InputError(f"seed: expected a whole number of at least 0, got {seed!r}")

@@ -35,17 +35,12 @@ def seen(system: PinholeSystem, points: ArrayLike) -> NDArray[np.bool_]:
 
     A module sees a point in front of its pinhole if the ray from there through the pinhole's centre meets the crystal's
     front face, ``l max(|x_u|, |x_v|) <= Ld h / 2``.
-
-    Raises
-    ------
-    InputError
-        `system` is not a `PinholeSystem`, or `points` are not finite numbers of that shape.
     """
     return _seen(system, *_in_modules(system, real_array(points, "points", (None, 3))))
 
 
 def magnification(system: PinholeSystem, points: ArrayLike) -> Array:
-    """Magnification l / h (P, M) at each point; NaN behind the pinhole. Parameters and errors as in `seen`."""
+    """Magnification l / h (P, M) at each of the `points` (P, 3), world mm; NaN behind the pinhole."""
     _, _, h = _in_modules(system, real_array(points, "points", (None, 3)))
     with np.errstate(divide="ignore"):
         return np.where(h > 0, system.collimator_length / h, np.nan)
@@ -66,22 +61,9 @@ def sensitivity(
     ``1 - exp(-crystal_mu Td / sin(theta))`` that the crystal stops; elsewhere it is 0. `Emission` with ``edge="paix"``
     counts the same, pixel by pixel.
 
-    Parameters
-    ----------
-    system, points
-        As in `seen`.
-    aperture_mu, opening_angle
-        Attenuation coefficient of the aperture, 1/mm, and full angle of its knife edge, rad, for Paix's
-        ``d_e^2 = d (d + 2 / mu tan(alpha / 2))``. Without a coefficient nothing penetrates and d_e = d.
-    crystal_mu
-        Attenuation coefficient of the crystal, 1/mm. Default: it stops all photons.
-    photons_per_decay
-        Photons that are counted if they are stopped.
-
-    Raises
-    ------
-    InputError
-        A shape is wrong, or a number is not finite or out of range.
+    `aperture_mu` is the aperture's attenuation coefficient, 1/mm, and `opening_angle` the full angle of its knife edge, rad,
+    for Paix's ``d_e^2 = d (d + 2 / mu tan(alpha / 2))``; without a coefficient nothing penetrates and d_e = d. `crystal_mu`
+    is the crystal's, 1/mm; without it, all photons are stopped. `points` are as in `seen`.
     """
     points = real_array(points, "points", (None, 3))
     _check_edge(aperture_mu, opening_angle)
@@ -92,9 +74,10 @@ def sensitivity(
     visible = _seen(system, x_u, x_v, h)
     h[~visible] = 1.0  # avoids dividing by zero
     cosine = h / np.sqrt(x_u**2 + x_v**2 + h**2)
-    counts = _point_law(h, cosine, paix_diameter(system.pinhole_diameter, aperture_mu, opening_angle))
+    diameter = paix_diameter(system.pinhole_diameter, aperture_mu, opening_angle)
+    counts = _counted(h, cosine, diameter, system.detector_thickness, crystal_mu)
     counts *= photons_per_decay * visible
-    return counts if crystal_mu is None else counts * _stopped(cosine, crystal_mu, system.detector_thickness)
+    return counts
 
 
 def resolution(
@@ -109,7 +92,7 @@ def resolution(
 
     ``R^2 = (d_re (1 + h / l))^2 + (R_i h / l)^2`` with ``d_re = d + ln(2) / mu tan(alpha / 2)``, the diameter at which
     the knife edge transmits half of the photons (Accorsi and Metzler 2004, along the axis). `intrinsic_fwhm` is R_i, mm
-    on the crystal; the other parameters, and the errors, are as in `sensitivity`.
+    on the crystal; the other parameters are as in `sensitivity`.
     """
     points = real_array(points, "points", (None, 3))
     _check_edge(aperture_mu, opening_angle)
@@ -124,16 +107,12 @@ def resolution(
 
 
 class ModulePerformance(NamedTuple):
-    """Performance at the isocentre.
+    """Performance at the isocentre."""
 
-    `sensitivity` is in counts per decay, `resolution` (FWHM in object space) in mm, `magnification` is l / b, and
-    `roi_radius_seen` is the radius of the largest sphere that is seen whole, mm.
-    """
-
-    sensitivity: Array
-    resolution: Array
-    magnification: Array
-    roi_radius_seen: Array
+    sensitivity: Array  # counts per decay
+    resolution: Array  # FWHM in object space, mm
+    magnification: Array  # l / b
+    roi_radius_seen: Array  # of the largest sphere that is seen whole, mm
 
 
 def isocentre_performance(
@@ -151,24 +130,14 @@ def isocentre_performance(
 ) -> ModulePerformance:
     """Performance of one module or many at the isocentre, from their dimensions alone. It is fast, for live readouts.
 
-    Parameters
-    ----------
-    b, d, l, Ld, Td
-        Pinhole to isocentre, diameter of the hole, collimator length, and side and thickness of the crystal, mm:
-        numbers or arrays that broadcast.
-    intrinsic_fwhm, aperture_mu, opening_angle, crystal_mu, photons_per_decay
-        As in `sensitivity` and `resolution`, but not checked.
-
-    Raises
-    ------
-    InputError
-        b, d, l or Ld is not finite or out of range.
+    b is the distance from pinhole to isocentre, d the hole's diameter, l the collimator length, Ld and Td the side and
+    thickness of the crystal, mm: numbers or arrays that broadcast. The options are those of `sensitivity` and
+    `resolution`, but not checked.
     """
     radius = roi_radius_seen(b, d, Ld, l)
     b, d, l, Td = (np.asarray(x, dtype=np.float64) for x in (b, d, l, Td))
-    counts = photons_per_decay * _point_law(b, np.ones(()), paix_diameter(d, aperture_mu, opening_angle))
     return ModulePerformance(
-        counts if crystal_mu is None else counts * _stopped(np.ones(()), crystal_mu, Td),
+        photons_per_decay * _counted(b, np.ones(()), paix_diameter(d, aperture_mu, opening_angle), Td, crystal_mu),
         _fwhm(b / l, half_value_diameter(d, aperture_mu, opening_angle), intrinsic_fwhm),
         l / b,
         radius,
@@ -187,12 +156,12 @@ def _seen(system: PinholeSystem, x_u: Array, x_v: Array, h: Array) -> NDArray[np
     return (h > 0) & (np.abs(x_u) <= reach) & (np.abs(x_v) <= reach)
 
 
-def _point_law(h: Array, cosine: Array, diameter: Array) -> Array:
-    return (diameter / h) ** 2 * cosine * cosine * cosine / 16
-
-
-def _stopped(cosine: Array, mu: float, thickness: Array) -> Array:
-    return absorbed_share(cosine, mu, thickness, layer_depths(1, 0.0), 0)  # type: ignore[arg-type]  # M of them
+def _counted(h: Array, cosine: Array, diameter: Array, thickness: Array, crystal_mu: float | None) -> Array:
+    """Fraction of a point's photons that pass the hole and are stopped by the crystal."""
+    passed = (diameter / h) ** 2 * cosine * cosine * cosine / 16
+    if crystal_mu is None:
+        return passed
+    return passed * absorbed_share(cosine, crystal_mu, thickness, layer_depths(1, 0.0), 0)  # type: ignore[arg-type]
 
 
 def _fwhm(h_per_l: Array, diameter: Array, intrinsic_fwhm: float) -> Array:

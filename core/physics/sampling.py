@@ -46,17 +46,7 @@ def sampling_gaps(system: PinholeSystem, points: ArrayLike, *, tolerance: float 
     With unit vectors n normal to the plane and d_k from the point to the pinholes it is
     ``max over n of min over k of asin |n . d_k|``: 0 for complete sampling, pi/2 for a single pinhole or none.
 
-    Parameters
-    ----------
-    system, points
-        As in `seen`.
-    tolerance
-        Accuracy, rad: the result may be this much below the true maximum.
-
-    Raises
-    ------
-    InputError
-        A shape is wrong, or a number is not finite or out of range.
+    `tolerance` is the accuracy, rad: the result may be this much below the true maximum. `points` are as in `seen`.
     """
     points = real_array(points, "points", (None, 3))
     if positive(tolerance, "tolerance", "rad") < _FINEST:
@@ -65,16 +55,14 @@ def sampling_gaps(system: PinholeSystem, points: ArrayLike, *, tolerance: float 
     somewhere = np.flatnonzero(visible.any(axis=1))
     for first in range(0, len(somewhere), _POINTS):
         block = somewhere[first : first + _POINTS]
-        gaps[block] = _gaps(_towards(system.centers, points[block], visible[block]), tolerance)
+        # The pinholes that see each point come first; one of them is repeated where there are fewer than elsewhere.
+        sees = visible[block]
+        order = np.argsort(~sees, axis=1, kind="stable")[:, : sees.sum(axis=1).max()]
+        order = np.where(np.take_along_axis(sees, order, axis=1), order, order[:, :1])
+        vectors = system.centers[order] - points[block, None]
+        towards = np.ascontiguousarray((vectors / _lengths(vectors)[..., None]).swapaxes(1, 2))
+        gaps[block] = _gaps(towards, tolerance)
     return gaps
-
-
-def _towards(centers: Array, points: Array, visible: NDArray[np.bool_]) -> Array:
-    """Unit vectors (P, 3, K) from each point to the pinholes that see it; one is repeated where there are fewer than K."""
-    order = np.argsort(~visible, axis=1, kind="stable")[:, : visible.sum(axis=1).max()]
-    order = np.where(np.take_along_axis(visible, order, axis=1), order, order[:, :1])
-    vectors = centers[order] - points[:, None]
-    return np.ascontiguousarray((vectors / _lengths(vectors)[..., None]).swapaxes(1, 2))
 
 
 def _gaps(towards: Array, tolerance: float) -> Array:
@@ -104,8 +92,7 @@ def _gaps(towards: Array, tolerance: float) -> Array:
 def _patches() -> Array:
     """Patches (1, N, 3, 3) of a cube's surface, each a middle and two half sides, that cover the normals of all planes.
 
-    As n and -n describe the same plane, three faces are enough. Seen from the cube's centre the patches are about
-    equal.
+    As n and -n describe the same plane, three faces are enough. Seen from the cube's centre, patches are about equal.
     """
     edges = np.tan(np.linspace(-math.pi / 4, math.pi / 4, _SIDE + 1))
     a, b = np.meshgrid((edges[1:] + edges[:-1]) / 2, (edges[1:] + edges[:-1]) / 2)

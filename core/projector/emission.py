@@ -298,7 +298,7 @@ class Emission(Model):
                 point = opening.x * u + opening.y * v
                 shift = None
                 if len(holes) > 1:
-                    # As seen from the isocentre, the points of all holes together are spread evenly over the pixel.
+                    # Seen from the isocentre, the points of all holes together fill the pixel evenly.
                     seen = (1 + l / self.system.pinhole_distance[m]) * np.array([opening.x, opening.y])
                     shift = start / math.sqrt(n) - seen / (pitch_u, pitch_v)
                 places = offsets(n, shift) * (pitch_u, pitch_v)

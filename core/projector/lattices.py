@@ -86,7 +86,7 @@ def filled_lattices(
         if volume is None or whole_mu:
             return Lattices(grid, volume, mu=mu)
         (common, mu_common), common_origin = cropped(volume, mu)
-        # One lattice is walked twice as fast as two, but two let rays that miss the volume's box stop at once.
+        # One lattice is traversed twice as fast as two, but two let rays that miss the volume's box stop at once.
         if math.prod(common.shape) <= 2 * math.prod(box.shape):
             return Lattices(grid, common, common_origin, mu_common)
     if not whole_mu:

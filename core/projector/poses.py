@@ -247,7 +247,7 @@ def emission_images(
         hole = diameter[..., None] / 2 * diameter.new_tensor(point)
         sources = positions + (rotations[..., :2] @ hole[..., None])[..., 0]
         places = pitch.new_tensor(lattice(n)).expand(*pitch.shape[:-1], n, 2)
-        if aperture_points > 1:  # as in `Emission`: spread evenly over the pixel, as seen from the isocentre
+        if aperture_points > 1:  # as in `Emission`: seen from the isocentre they fill the pixel evenly
             shift = pitch.new_tensor(start) / math.sqrt(n) - (1 + l / distance)[..., None] * hole / pitch
             places = (places + shift[..., None, :] + 0.5) % 1 - 0.5
         for some in places.split(max(1, _RAYS_AT_ONCE // (n_v * n_u)), dim=-2):

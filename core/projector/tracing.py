@@ -9,10 +9,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ..arrays import ArrayOrTensor, checked, is_double, is_tensor, promote, require_numbers, to_caller
+from ..arrays import ArrayOrTensor, checked, is_double, is_tensor, namespace, promote, require_numbers, to_caller
 from ..errors import InputError
 from ..geometry.grid import Grid
-from ..validation import real_array, whole_shape
+from ..validation import instance, real_array, whole_shape
 from ..volumes.volume import LINE_INTEGRALS, Volume, require_quantity
 from . import backends, ray_gradients
 from .bundles import Beam, Bundle, Bundles, Part
@@ -76,12 +76,15 @@ def trace_rays(
     >>> trace_rays(np.ones(grid.shape), source, [0.0, 0.0, 9.0], grid=grid).sum().backward()
     """
     array, mu, execution = _execution(volume, backend, grid, mu, mu_grid, (sources, targets))
-    if any(is_tensor(value) for value in (array, sources, targets)):
-        return _trace_rays_in_torch(array, sources, targets, mu, execution)
-    starts, ends = points(sources, "sources"), points(targets, "targets")
-    n = fitting_count(len(starts), len(ends))
-    rays = Ends(np.broadcast_to(starts, (n, 3)), np.broadcast_to(ends, (n, 3)))
-    return _integrals(execution, array, _of_ends(rays), mu).reshape(n)
+    in_torch = any(is_tensor(value) for value in (array, sources, targets))
+    starts, ends = (_numbers(x, name, 3, in_torch) for x, name in ((sources, "sources"), (targets, "targets")))
+    if len(starts) != len(ends) and 1 not in (len(starts), len(ends)):
+        raise InputError(f"trace_rays: {len(starts)} sources but {len(ends)} targets")
+    n = len(ends) if len(starts) == 1 else len(starts)
+    xp = namespace(starts)
+    rays = xp.stack([xp.broadcast_to(points, (n, 3)) for points in (starts, ends)])
+    integrals = _traced(array, mu, rays, lambda rays: Bundles(1, lambda _: Bundle(ends=Ends(*rays))), execution)
+    return _of_kind(integrals.reshape(n), array, sources, targets)
 
 
 def trace_fans(
@@ -123,11 +126,19 @@ def trace_fans(
     """
     shape = whole_shape(shape, "shape of a fan", 2)
     array, mu, execution = _execution(volume, backend, grid, mu, mu_grid, (vectors,))
-    if is_tensor(array) or is_tensor(vectors):
-        return _trace_fans_in_torch(array, vectors, shape, mu, execution)
-    numbers = _fan_vectors(vectors, "vectors")
-    integrals = _integrals(execution, array, _of_fans(numbers, shape, execution.grid), mu)
-    return integrals.reshape(*numbers.shape[:-2], *shape)
+    numbers = _numbers(vectors, "vectors", (4, 3), is_tensor(array) or is_tensor(vectors))
+
+    def bundles(vectors: Array) -> Bundles:
+        each = vectors.reshape(-1, 4, 3)
+
+        def bundle(number: int) -> Bundle:
+            source, corner, row_step, column_step = each[number]
+            return Bundle.along(execution.grid, Beam(Fan(source, corner, row_step, column_step, shape)))
+
+        return Bundles(len(each), bundle)
+
+    integrals = _traced(array, mu, numbers, bundles, execution)
+    return _of_kind(integrals.reshape(*numbers.shape[:-2], *shape), array, vectors)
 
 
 def _execution(
@@ -143,11 +154,11 @@ def _execution(
         require_quantity(volume.quantity, LINE_INTEGRALS if mu is None else ("activity",), "line integrals")
     chosen = backends.choose(backend)
     reference = chosen.always_float64 and backend != "auto"
-    array, grid = _field(volume, "volume", grid, None, reference)
+    array, grid = _field(volume, "volume", grid, reference)
     if mu is not None:
         if isinstance(mu, Volume):
             require_quantity(mu.quantity, ("mu",), "mu")
-        mu, mu_grid = _field(mu, "mu", mu_grid, grid, reference)
+        mu, mu_grid = _field(mu, "mu", mu_grid if isinstance(mu, Volume) else mu_grid or grid, reference)
         array, mu = promote(array, require_no_negative(mu))
     if is_tensor(array) and array.device.type != "cpu" and backend == "auto":
         chosen = backends.for_tensor(array)
@@ -155,48 +166,57 @@ def _execution(
     return array, mu, Execution(chosen, grid, mu_grid, float64, thread_count(None))
 
 
-def _of_ends(rays: Ends) -> Bundles:
-    return Bundles(1, lambda _: Bundle(ends=rays))
+def _field(value: Volume | ArrayOrTensor, name: str, grid: Grid | None, float64: bool) -> tuple[ArrayOrTensor, Grid]:
+    """The numbers of a `Volume`, or of an array or tensor on `grid`; and their grid."""
+    if isinstance(value, Volume):
+        if grid is not None and grid != value.grid:
+            raise InputError(f"{name} is a Volume and has a grid; leave the other out")
+        return value.array, value.grid
+    if grid is None:
+        raise InputError(f"{name}: expected a Volume, or also a grid, got {type(value).__name__}")
+    instance(grid, Grid, f"grid of {name}")
+    return checked(value, name, grid.shape, float64), grid
 
 
-def _of_fans(vectors: Array, shape: tuple[int, int], grid: Grid) -> Bundles:
-    """The fans of `vectors` (..., 4, 3)."""
-    vectors = vectors.reshape(-1, 4, 3)
-
-    def fan(source: Array, corner: Array, row_step: Array, column_step: Array) -> Fan:
-        return Fan(source, corner, row_step, column_step, shape)
-
-    return Bundles(len(vectors), lambda number: Bundle.along(grid, Beam(fan(*vectors[number]))))
-
-
-def _integrals(execution: Execution, volume: ArrayOrTensor, bundles: Bundles, mu: ArrayOrTensor) -> Array:
-    """Line integrals (images, rows, columns): float64 of the reference, else float32."""
-    images = [to_caller(image, np.empty(0)) for image in execution.images(volume, bundles, mu)]
-    return np.array(images, np.float64 if execution.backend.always_float64 else np.float32)
-
-
-def _trace_rays_in_torch(volume: Any, sources: Any, targets: Any, mu: Any, execution: Execution) -> Tensor:
-    """Line integrals (N,) along rays from `sources` to `targets`, as a step of torch's graph."""
+def _numbers(value: Any, name: str, last: int | tuple[int, int], in_torch: bool) -> Any:
+    """Points (n, 3), of one (3,) or many, or vectors (..., 4, 3); in torch a tensor of float64 on the CPU, in its graph."""
+    data = value
+    if is_tensor(value):
+        require_numbers(value, name)
+        value = value.to("cpu", namespace(value).float64)
+        data = value.numpy(force=True)
+    try:
+        shape = np.shape(data)
+    except (ValueError, RuntimeError):  # ragged, or tensors of a graph in a list: `real_array` says so
+        shape = ()
+    if isinstance(last, tuple):
+        if shape[-2:] != last:
+            raise InputError(f"{name}: expected ... x 4 x 3, got shape {shape}")
+        array = real_array(data, name, shape)
+    elif shape == (0,):  # an empty list
+        array = np.empty((0, 3))
+    else:
+        array = real_array(data, name, (3,) if len(shape) == 1 else (None, 3)).reshape(-1, 3)
+    if not in_torch:
+        return array
     import torch
 
-    starts, ends = _numbers(sources, points, "sources"), _numbers(targets, points, "targets")
-    n = fitting_count(len(starts), len(ends))
-    rays = torch.stack([starts.expand(n, 3), ends.expand(n, 3)])
-    integrals = _traced(volume, mu, rays, lambda rays: _of_ends(Ends(*rays)), execution)
-    return _of_kind(integrals.reshape(n), volume, sources, targets)
-
-
-def _trace_fans_in_torch(volume: Any, vectors: Any, shape: tuple[int, int], mu: Any, execution: Execution) -> Tensor:
-    """Line integrals (..., rows, columns) along the fans of `vectors` (..., 4, 3), likewise."""
-    numbers = _numbers(vectors, _fan_vectors, "vectors")
-    integrals = _traced(volume, mu, numbers, lambda vectors: _of_fans(vectors, shape, execution.grid), execution)
-    return _of_kind(integrals.reshape(*numbers.shape[:-2], *shape), volume, vectors)
+    return value.reshape(array.shape) if is_tensor(value) else torch.from_numpy(array)
 
 
 def _traced(
-    volume: Any, mu: Any, geometry: Tensor, bundles_of: Callable[[Array], Bundles], execution: Execution
-) -> Tensor:
-    """Line integrals, one after the other, of the rays that ``bundles_of(geometry)`` makes."""
+    volume: Any, mu: Any, geometry: Any, bundles_of: Callable[[Array], Bundles], execution: Execution
+) -> ArrayOrTensor:
+    """Line integrals (images, rows, columns) of the rays that ``bundles_of(geometry)`` makes, a step of torch's graph if
+    the geometry is a tensor; float32, or float64 of the reference and in torch.
+    """
+
+    def images(bundles: Bundles, volume: Any, mu: Any) -> list[Array]:
+        return [to_caller(image, np.empty(0)) for image in execution.images(volume, bundles, mu)]
+
+    if not is_tensor(geometry):
+        kind = np.float64 if execution.backend.always_float64 else np.float32
+        return np.array(images(bundles_of(geometry), volume, mu), kind)
     import torch
 
     from . import autograd
@@ -208,41 +228,36 @@ def _traced(
         parts: list[tuple[Part, Array]] = []
         if needs[2]:
             parts = execution.derivatives(volume_data, bundles, mu_data)
-            images = np.zeros((len(bundles), *bundles.image_shape))
+            integrals = np.zeros((len(bundles), *bundles.image_shape))
             for part, derivatives in parts:
-                part.add_to(images, 0, ray_gradients.integrals(part, derivatives))
+                part.add_to(integrals, 0, ray_gradients.integrals(part, derivatives))
         else:
-            traced = execution.images(volume_data, bundles, mu_data)
-            images = np.array([to_caller(image, np.empty(0)) for image in traced], np.float64)
+            integrals = np.array(images(bundles, volume_data, mu_data), np.float64)
 
         def gradients(gradient: Tensor, needs: Any) -> list[Tensor | None]:
-            by_volume, by_mu, by_geometry = needs
             found: list[Tensor | None] = [None, None, None]
-            if by_volume or by_mu:
+            if needs[0] or needs[1]:
                 values = gradient.to(volume_data)  # the torch backend works on the device of the values
-                if by_volume:
-                    found[0] = torch.as_tensor(execution.backproject(values, bundles, mu_data)).to(values)
-                if by_mu:
-                    found[1] = torch.as_tensor(execution.mu_gradient(values, bundles, volume_data, mu_data)).to(values)
-            if by_geometry:
-                by_each = _by_geometry(gradient.numpy(force=True), parts, bundles, execution)
-                found[2] = torch.from_numpy(by_each).reshape(geometry.shape)
+            if needs[0]:
+                found[0] = torch.as_tensor(execution.backproject(values, bundles, mu_data)).to(values)
+            if needs[1]:
+                found[1] = torch.as_tensor(execution.mu_gradient(values, bundles, volume_data, mu_data)).to(values)
+            if needs[2]:
+                by_geometry = _by_geometry(gradient.numpy(force=True), parts, bundles, execution)
+                found[2] = torch.from_numpy(by_geometry).reshape(geometry.shape)
             return found
 
-        return torch.from_numpy(images), gradients
+        return torch.from_numpy(integrals), gradients
 
     return autograd.step(run, volume, mu, geometry)
 
 
 def _by_geometry(gradient: Array, parts: list[tuple[Part, Array]], bundles: Bundles, execution: Execution) -> Array:
     """The gradient by fans (images, 4, 3), or by starts and ends (2, rays, 3)."""
-
-    def of_part(of: tuple[Part, Array]) -> list[tuple[int, Array]]:
-        part, derivatives = of
-        mu_grid = execution.mu_grid or execution.grid
-        return ray_gradients.by_geometry(part, gradient, derivatives, execution.grid, mu_grid)
-
-    results = in_order(of_part, parts, execution.workers)
+    mu_grid = execution.mu_grid or execution.grid
+    results = in_order(
+        lambda of: ray_gradients.by_geometry(of[0], gradient, of[1], execution.grid, mu_grid), parts, execution.workers
+    )
     if len(bundles) and bundles[0].ends is not None:
         return np.concatenate([np.empty((2, 0, 3)), *(own for result in results for _, own in result)], axis=1)
     total = np.zeros((len(bundles), 4, 3))
@@ -252,76 +267,13 @@ def _by_geometry(gradient: Array, parts: list[tuple[Part, Array]], bundles: Bund
     return total
 
 
-def _numbers(value: Any, checked: Callable[[Any, str], Array], name: str) -> Tensor:
-    """`value`, which is `checked`, as a tensor of float64 on the CPU, where rays are made; still in its graph."""
-    import torch
-
-    if not is_tensor(value):
-        return torch.from_numpy(checked(value, name))
-    require_numbers(value, name)
-    value = value.to("cpu", torch.float64)
-    return value.reshape(checked(value.numpy(force=True), name).shape)
-
-
-def _of_kind(integrals: Tensor, volume: Any, *geometry: Any) -> Tensor:
+def _of_kind(integrals: ArrayOrTensor, volume: Any, *geometry: Any) -> ArrayOrTensor:
     """`integrals` of the type of the geometry's tensors, or else of the volume, on the device of the first tensor."""
+    given = [x for x in (volume, *geometry) if is_tensor(x)]
+    if not given:
+        return integrals
     import torch
 
-    given = [x for x in (volume, *geometry) if is_tensor(x)]
     kinds = [x.dtype for x in geometry if is_tensor(x) and x.is_floating_point()]
     kind = functools.reduce(torch.promote_types, kinds or [given[0].dtype])
     return integrals.to(given[0].device, kind if kind.is_floating_point else torch.float64)
-
-
-def _fan_vectors(value: ArrayLike, name: str) -> Array:
-    """`value` as an array (..., 4, 3) of real, finite numbers, or `InputError`."""
-    shape = _shape_of(value)
-    vectors = real_array(value, name, shape)
-    if shape[-2:] != (4, 3):
-        raise InputError(f"{name}: expected ... x 4 x 3, got shape {shape}")
-    return vectors
-
-
-def _field(
-    value: Volume | ArrayOrTensor, name: str, grid: Grid | None, default: Grid | None, float64: bool
-) -> tuple[ArrayOrTensor, Grid]:
-    """The numbers of a `Volume`, or of an array or tensor on `grid`, or else on `default`; and their grid."""
-    if isinstance(value, Volume):
-        if grid is not None and grid != value.grid:
-            raise InputError(f"{name} is a Volume and has a grid; leave the other out")
-        return value.array, value.grid
-    grid = grid or default
-    if grid is None:
-        raise InputError(f"{name}: expected a Volume, or also a grid, got {type(value).__name__}")
-    if not isinstance(grid, Grid):
-        raise InputError(f"{name}: expected its grid to be Grid, got {type(grid).__name__}")
-    return checked(value, name, grid.shape, float64), grid
-
-
-def fitting_count(n_sources: int, n_targets: int) -> int:
-    """How many rays `n_sources` sources and `n_targets` targets are; one of either serves all of the other.
-
-    Raises
-    ------
-    InputError
-        Neither as many nor one.
-    """
-    if n_sources != n_targets and 1 not in (n_sources, n_targets):
-        raise InputError(f"trace_rays: {n_sources} sources but {n_targets} targets")
-    return n_targets if n_sources == 1 else n_sources
-
-
-def _shape_of(value: ArrayLike) -> tuple[int, ...]:
-    """The shape of `value`; () of what `real_array` refuses: what is ragged, or tensors of a graph in a list."""
-    try:
-        return np.shape(value)
-    except (ValueError, RuntimeError):
-        return ()
-
-
-def points(value: ArrayLike, name: str) -> Array:
-    """`value`, one point (3,) or many (n, 3), as an array (n, 3), or `InputError`."""
-    shape = _shape_of(value)
-    if shape == (0,):  # an empty list
-        return np.empty((0, 3))
-    return real_array(value, name, (3,))[None] if len(shape) == 1 else real_array(value, name, (None, 3))

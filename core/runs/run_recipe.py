@@ -8,8 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from ..errors import InputError
-from ..geometry.module_numbers import chosen_modules
-from ..geometry.system import PinholeSystem
+from ..geometry.system import PinholeSystem, chosen_modules
 from ..physics.ct_numbers import hu_to_mu
 from ..physics.isotopes import photon_energy
 from ..progress import Progress

@@ -1,7 +1,7 @@
 """A real Blender, driven from outside: the built zip installed into a clean home, without network.
 
 Needs the script `real-blender` (REAL_BLENDER, or shared/tools beside the clone) and the zip in dist/: make test-app.
-Blender runs in a root of its own that sees this repository's disk, not the machine's temporary folder: files for it and
+Blender runs in its own root, which contains this repository's disk but not the machine's temporary folder: files for it and
 from it go to `work_folder`.
 """
 
@@ -37,10 +37,10 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 def real_blender(
     *arguments: str | Path, home: Path, network: bool = False, timeout: float = 300
 ) -> subprocess.CompletedProcess[str]:
-    """The script with these arguments, with mounts of its own and, unless asked, without network.
+    """The script with these arguments, in its own mount namespace and, by default, without network.
 
-    The script leaves its mount of our folder behind, and takes what is mounted there for ours: once the folder was
-    deleted and made anew, it would show the deleted one. Mounts of its own end with it, and begin without an old one.
+    The script does not unmount our folder, and takes whatever is mounted there for ours: once the folder was
+    deleted and created again, it would show the deleted one. In a namespace of its own the mounts end with it.
     """
     command = [str(REAL_BLENDER), *map(str, arguments)]
     if shutil.which("unshare"):
@@ -77,7 +77,7 @@ def extension_zip() -> Path:
 
 @pytest.fixture(scope="session")
 def home(extension_zip: Path) -> Path:
-    """A clean home of Blender with the extension installed and enabled, from the zip and nothing else."""
+    """A clean home of Blender with the extension installed from the zip and enabled."""
     subprocess.run([REAL_BLENDER, "setup"], check=True, capture_output=True)
     shutil.rmtree(OUTPUT, ignore_errors=True)
     folder = OUTPUT / "home"
@@ -96,7 +96,7 @@ def work_folder(home: Path, request: pytest.FixtureRequest) -> Path:
 
 @pytest.fixture
 def blender(home: Path) -> Run:
-    """`blender(*arguments, check=True, network=False, timeout=300)`: run it with the extension and give what it said."""
+    """`blender(*arguments, check=True, network=False, timeout=300)`: run it with the extension and return its output."""
 
     def run(*arguments: str | Path, **options: float) -> subprocess.CompletedProcess[str]:
         return run_blender(*arguments, home=home, **options)
@@ -118,9 +118,9 @@ def blender_script(blender: Run, work_folder: Path) -> Run:
 
 @pytest.fixture
 def blender_window(home: Path, work_folder: Path) -> Callable[..., Path]:
-    """`blender_window(text, *arguments, seconds=12)`: run Python in a Blender with its window; give a PNG of the screen.
+    """`blender_window(text, *arguments, seconds=12)`: run Python in a Blender with its window; return a PNG of the screen.
 
-    The window is closed after `seconds`; what the script finds it writes to a file named in `arguments`.
+    The window is closed after `seconds`; the script writes its findings to a file named in `arguments`.
     """
 
     def run(text: str, *arguments: str | Path, seconds: float = 12) -> Path:

@@ -1,4 +1,4 @@
-"""The zip as a user gets it: what is in it, and that Blender installs, enables and disables it."""
+"""The zip as a user gets it: its contents; Blender installs, enables and disables it."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The main path in the window, and a picture of it to look at."""
+"""The main path in the window, and a screenshot of it."""
 
 from __future__ import annotations
 

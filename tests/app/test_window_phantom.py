@@ -1,4 +1,4 @@
-"""Phantoms in the window: dragging a setting costs no time, voxels follow when it rests, undo goes back to the old ones."""
+"""Phantoms in the window: dragging a setting does not block, voxels follow when it rests, undo restores the old ones."""
 
 from __future__ import annotations
 

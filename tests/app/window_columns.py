@@ -1,4 +1,4 @@
-"""The column map dialog in the window: opened by a workbook that is refused, settled, confirmed.
+"""The column map dialog in the window: opened by a workbook that is refused, filled in, confirmed.
 
 Arguments after ``--``: the workbook, the file for what was seen, three pictures: the dialog as it
 opens, the dialog with a map that is complete, and what comes after it over a scanner that has changed.

@@ -75,7 +75,7 @@ def steps():
             next(r for r in area.regions if r.type == "UI").active_panel_category = "mphDRR"
     yield 0.5
 
-    # Several rays of each pixel, so that it lasts long enough to be seen half-way.
+    # Several rays per pixel, so that it takes long enough to be cancelled half-way.
     start_job(width=500, height=500, pixel_points=8)
     while job().running:
         yield 0.05

@@ -1,4 +1,4 @@
-"""Choices are kept in files by fixed numbers: what was saved is what is opened, whatever has been added since."""
+"""Files store choices by fixed numbers: a saved choice opens as the same choice, whatever has been added since."""
 
 from __future__ import annotations
 
@@ -75,7 +75,7 @@ FROZEN = {
     "ColumnMapTable": {"rows": {"BY_NUMBER": 0, "IN_ORDER": 1, "ONE_FOR_ALL": 2}},
     "ColumnMapQuantity": {"unit": UNITS},
     "ColumnMapProperties": {"unit": {name: number for name, number in UNITS.items() if name not in ("rad", "deg")}},
-    # Operators' are kept by the preferences, of keys and menus that users make.
+    # Those of operators are stored in the preferences, for users' keys and menus.
     "MPHDRR_OT_render_projections": PROJECTIONS,
     "MPHDRR_OT_import_phantom": {"quantity": HELD},
     **{f"MPHDRR_OT_add_{kind}": {"quantity": HELD, **words} for kind, words in PHANTOMS.items()},
@@ -142,7 +142,7 @@ def test_a_new_choice_has_a_number_of_its_own():
     assert old == 1 and new == zlib.crc32(b"Co-57") & 0x7FFFFFFF
 
 
-# In a Python of its own: enumerations are made when the extension is imported.
+# In a new Python: enumerations are made when the extension is imported.
 OPEN = """
 import importlib, json, sys
 import bpy

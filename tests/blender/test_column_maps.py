@@ -1,4 +1,4 @@
-"""Column maps in Blender: the dialog's settings say what the map says, and the scene keeps it for writing back."""
+"""Column maps in Blender: the dialog's settings correspond to the map, and the scene keeps it for writing back."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ def small(small_workbook) -> PinholeSystem:
 
 @pytest.fixture
 def columns(unread) -> ColumnMap:
-    """What a person says of it."""
+    """The column map that a person would give."""
     return ColumnMap.from_toml(
         """
         [[tables]]
@@ -117,7 +117,7 @@ def test_every_setting_of_a_table_survives(form, unread, columns):
 
 
 def test_what_is_missing_is_asked_for_and_then_read(form, unread, small):
-    """From the draft to the scanner as a user settles it."""
+    """From the draft to the scanner, step by step as a user."""
     assert column_maps.fill(form, unread)
     assert any("x1" in doubt for doubt in json.loads(form.doubts))
     assert form.refusal and form.preview == ""

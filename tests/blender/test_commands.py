@@ -1,4 +1,4 @@
-"""The commands and the example that make scenes, as their users run them: in a process of their own."""
+"""The commands and the example that make scenes, as users run them: in a new process."""
 
 from __future__ import annotations
 

@@ -45,7 +45,7 @@ def depth(camera: bpy.types.Object) -> tuple[float, float]:
 
 
 def assert_consistent(collection: bpy.types.Collection) -> None:
-    """Everything that is shown says what `read_scanner` says."""
+    """Everything shown agrees with `read_scanner`."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", InputWarning)
         system = scanner.read_scanner(collection)
@@ -256,7 +256,7 @@ def test_impossible_numbers_are_said_and_cured(collection):
 
 
 def test_after_an_undo_everything_agrees_again(collection):
-    """Undo gives back the camera as it was, and may keep the meshes and the totals that followed it since."""
+    """Undo restores the camera, and may keep meshes and totals that have followed it since."""
     camera = scanner.module(collection, 2)
     module = camera.mphdrr_module
     names = [n for n in (p.identifier for p in module.bl_rna.properties) if n not in {"rna_type", "name", "visible"}]
@@ -320,7 +320,7 @@ def test_blenders_own_duplicate_and_delete_are_tidied(collection):
     bpy.ops.mphdrr.tidy_modules()
     assert len(bpy.data.meshes) == n_meshes - 2
 
-    select(scanner.module(collection, 4))  # a copy whose original goes before it is tidied takes its place
+    select(scanner.module(collection, 4))  # a copy whose original is deleted before tidying takes its place
     bpy.ops.object.duplicate()
     bpy.data.objects.remove(scanner.module(collection, 4))
     update()

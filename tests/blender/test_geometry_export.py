@@ -1,4 +1,4 @@
-"""Scene -> workbook: what is written is what the scene says, and counts as saved."""
+"""Scene to workbook: the written workbook agrees with the scene, which then counts as saved."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ def test_unchanged_scanner_writes_the_same_file(scene, workbook, tmp_path):
 
 
 def random_edits(rng: np.random.Generator, collection: bpy.types.Collection) -> None:
-    """What a user does in an afternoon: moves, numbers, copies, deletions."""
+    """A user's afternoon: moves, numbers, copies, deletions."""
     for _ in range(12):
         found = scanner.modules(collection)
         camera = found[rng.integers(len(found))]
@@ -104,7 +104,7 @@ def test_camera_off_aim_is_refused_by_its_number(collection, own, tmp_path):
 
 
 def test_moved_and_exported_at_once(collection, tmp_path):
-    """A script that does not update the view layer first: the module is aimed all the same."""
+    """In a script that does not update the view layer first, the module is still aimed."""
     scanner.module(collection, 12).location.z += 2.5
     bpy.ops.mphdrr.export_geometry(filepath=str(tmp_path / "moved.xlsx"))
     moved = read_system(tmp_path / "moved.xlsx")

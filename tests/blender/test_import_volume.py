@@ -1,4 +1,4 @@
-"""What is imported is what the file holds; how it is drawn follows its quantity; slices show its voxels."""
+"""Imported volumes equal their files, are drawn according to their quantity, and slices show their voxels."""
 
 from __future__ import annotations
 

@@ -19,7 +19,7 @@ def item():
 
 @pytest.fixture
 def window(monkeypatch):
-    """A window, for which every phantom is too large to be made at every edit."""
+    """A window in which every phantom is too large to be made at every edit."""
     monkeypatch.setattr(live_phantoms, "_has_window", lambda: True)
     monkeypatch.setattr(live_phantoms, "QUICK_VOXELS", 0)
 
@@ -29,7 +29,7 @@ def is_waiting() -> bool:
 
 
 def assert_made(item) -> None:
-    """The voxels are those of the settings, of every quantity, at the object."""
+    """The voxels of every quantity follow from the settings and the object's pose."""
     recipe = phantoms.recipe_of(phantoms.settings_of(item))
     for one in phantoms.with_children(item):
         volume = volumes.volume_from_object(one)

@@ -1,4 +1,4 @@
-"""A scene that version 0.1.0 saved opens with all that is in it: scanner, settings, phantom and projections."""
+"""A scene saved by version 0.1.0 opens completely: scanner, settings, phantom and projections."""
 
 from __future__ import annotations
 

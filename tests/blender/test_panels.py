@@ -24,7 +24,7 @@ class Drawn:
 
 
 def draw_panels() -> int:
-    """Draw all panels that would be seen; returns how many."""
+    """Draw all visible panels; return their number."""
     count = 0
     for cls in PANELS:
         if hasattr(cls, "poll") and not cls.poll(bpy.context):

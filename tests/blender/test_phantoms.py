@@ -1,4 +1,4 @@
-"""Phantoms in the scene: every kind is core's, follows its settings and its object, and can be baked."""
+"""Phantoms in the scene: every kind equals core's, follows its settings and its object, and can be baked."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ def voxels_of(item) -> np.ndarray:
 
 
 def expected(phantom: Phantom, voxels: int, quantity: str = "activity") -> Volume:
-    """The phantom on a cube that holds its box, in its own frame."""
+    """The phantom on a cube that contains it, in its own frame."""
     low, high = phantom.box
     grid = Grid.centered((voxels,) * 3, (high - low).max() / (voxels - 2), (low + high) / 2)
     return phantom.voxelize(grid, quantity=quantity)

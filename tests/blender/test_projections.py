@@ -1,4 +1,4 @@
-"""Projections from the scene: the operator gives what core gives, as images and as a file."""
+"""Projections from the scene: the operator's images and file equal core's."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from mphdrr.core.volumes.volume import Volume  # noqa: E402
 
 @pytest.fixture
 def scanned(scene, ring_system) -> PinholeSystem:
-    """A scene with a scanner of eight modules and a small phantom, off centre and turned."""
+    """A scene with a scanner of eight modules and a small phantom, off centre and rotated."""
     scanner.build_scanner(scene, ring_system, "Ring")
     bpy.ops.mphdrr.add_derenzo(voxels=32, location=(5, -3, 2), phi=0.2, theta=0.3)
     return ring_system
@@ -61,7 +61,7 @@ def test_emission_makes_counts(scanned, scene):
 
 @pytest.fixture
 def body(scanned) -> Volume:
-    """Attenuating matter in the scene, on a grid of its own, moved and turned."""
+    """An attenuation volume in the scene, on its own grid, moved and rotated."""
     volume = Volume(np.full((4, 5, 6), 0.0154), Grid.centered((4, 5, 6), 20.0), "mu")
     item = volumes.add_volume(volume, "Body")
     item.location.x, item.rotation_euler.z = 6.0, 0.3
@@ -69,7 +69,7 @@ def body(scanned) -> Volume:
     return volumes.volume_from_object(item)
 
 
-# What the panel is set to, and what that is in Python.
+# Settings of the panel, and the same in Python.
 PHYSICS = {
     "isotope": "Tc-99m", "aperture_points": 3, "aperture_mu": 3.6, "opening_angle": np.float32(1.4), "edge": "PATH",
     "crystal_mu": 0.404, "depth_layers": 2, "intrinsic_fwhm": 3.0, "within_cone": True, "within_walls": True,
@@ -104,7 +104,7 @@ def test_physics_of_the_panel_is_that_of_core(scanned, scene, body):
 
 
 def test_materials_of_the_panel_are_those_of_core(scanned, scene):
-    """Chosen materials attenuate the isotope's photons; a coefficient that a script gives is not overruled by them."""
+    """Chosen materials attenuate the isotope's photons; a coefficient given by a script takes precedence."""
     from mphdrr.core.runs.files import read_run
 
     settings = scene.mphdrr_projections
@@ -114,7 +114,7 @@ def test_materials_of_the_panel_are_those_of_core(scanned, scene):
         model = Emission(scanned, isotope="Tl-201", aperture_mu=aperture, crystal_mu="NaI")
         assert bpy.ops.mphdrr.render_projections(width=4, height=4, **given) == {"FINISHED"}
         record = read_run(storage.absolute(settings.run_file)).settings
-        # Weighed with the scene's modules, which float32 holds.
+        # With the scene's modules, whose numbers are float32.
         expected = model.aperture_mu, model.crystal_mu
         assert (record["aperture_mu"], record["crystal_mu"]) == pytest.approx(expected, rel=1e-6)
         asked = record["recipe"]["model"]  # materials by name
@@ -432,7 +432,7 @@ def test_maps_of_the_scanner_are_not_projected(scanned, quantity):
 
 @pytest.mark.parametrize("name", ["volume", "mu"])
 def test_a_volume_of_the_panel_that_was_deleted_is_missed(scene, scanned, body, name):
-    """Blender keeps it in the panel: nothing else is projected, and nothing is left out, in its place."""
+    """Blender keeps it in the panel: nothing else is projected instead, and it is not silently left out."""
     item = bpy.data.objects["Derenzo" if name == "volume" else "Body"]
     setattr(scene.mphdrr_projections, name, item)
     item.users_collection[0].objects.unlink(item)
@@ -465,7 +465,7 @@ def test_attenuation_at_another_energy_is_said(scanned, scene, source, isotope, 
 
 
 def _panel(settings) -> dict:
-    """Every property of the panel, volumes and the last run aside."""
+    """Every property of the panel, except volumes and the last run."""
     from mphdrr.addon.projection_properties import ProjectionSettings
 
     values = {name: getattr(settings, name) for name in ProjectionSettings.__annotations__}

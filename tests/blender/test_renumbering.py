@@ -1,4 +1,4 @@
-"""Modules numbered anew: in the scene, in what is read from it, and in the workbook."""
+"""Renumbered modules: in the scene, in the system read from it, and in the workbook."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ def names(collection) -> list[tuple[str, str]]:
 
 
 def assert_whole(collection, numbers) -> None:
-    """Every module has its number, and its parts and all names follow it."""
+    """Every module has its number, and its parts and all names agree."""
     found = scanner.modules(collection)
     assert [camera.mphdrr_module.number for camera in found] == list(numbers)
     assert [camera.name for camera in found] == [f"Module {n:02d}" for n in numbers]

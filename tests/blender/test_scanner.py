@@ -158,7 +158,7 @@ def test_edited_module_is_rebuilt_with_its_numbers(scene, ring_system):
     z = [v.co.z for v in crystal.data.vertices]
     assert (min(z), max(z)) == pytest.approx((80.0, 89.5))
     assert counts() == before
-    camera.mphdrr_module.pinhole_diameter = 500.0  # no such shape: refused when read, but nothing breaks
+    camera.mphdrr_module.pinhole_diameter = 500.0  # impossible: refused when read, but nothing breaks
     with pytest.raises(InputError, match="module 2"):
         scanner.read_scanner(collection)
 
@@ -280,6 +280,6 @@ def test_modules_are_shown_by_range(scene, ring_system):
 
 
 def test_python_ends_with_the_extension_registered():
-    """Blender 4.5's module waits for ever where classes are still registered as Python ends."""
+    """Blender 4.5's module hangs if classes are still registered when Python ends."""
     script = "from mphdrr.addon import registration as r; r.register(); r.unregister(); r.register()"
     subprocess.run([sys.executable, "-c", script], check=True, timeout=60)

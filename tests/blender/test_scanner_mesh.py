@@ -1,4 +1,4 @@
-"""The collimators' shapes, by trimesh, and as they arrive in Blender."""
+"""The collimators' shapes, checked by trimesh, and their meshes in Blender."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import pytest
 from mphdrr.addon import scanner
 from mphdrr.core.errors import InputError
 from mphdrr.core.geometry.collimator import Collimator, Construction
-from mphdrr.core.geometry.collimator_mesh import check_watertight, collimator_solid, crystal_solid
+from mphdrr.core.geometry.module_parts import check_watertight, collimator_solid, crystal_solid
 
 trimesh = pytest.importorskip("trimesh")
 
@@ -58,7 +58,7 @@ def test_collimator_has_the_volume_of_its_walls(size):
 
     corners = np.unique(collimator_solid(body(*size))[0].round(9), axis=0)
     half = {s: np.abs(corners[np.isclose(corners[:, 2], s), :2]).max() for s in (-front, back, length)}
-    # The channel is never narrower than the pyramid from the hole to the crystal, and the wall never thinner than asked.
+    # The channel is never narrower than the pyramid from the hole to the crystal, the wall never thinner than requested.
     assert half[length] == pytest.approx(side / 2 + wall)
     channel = body(*size).channel_half_width
     assert channel >= d / 2 + (side - d) / 2 * back / length - 1e-9

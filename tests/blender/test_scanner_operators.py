@@ -106,7 +106,7 @@ def test_warnings_are_reported_not_raised():
 
 
 def test_every_operator_says_why_it_cannot_run():
-    """In an empty scene; Blender's own words for it are "context is incorrect"."""
+    """In an empty scene; Blender's own message is "context is incorrect"."""
     bpy.data.batch_remove(bpy.data.objects)
     greyed = [name for name in dir(bpy.ops.mphdrr) if not getattr(bpy.ops.mphdrr, name).poll()]
     assert {"add_slices", "apply_phantom_pose", "update_phantom", "renumber_modules", "show_projections"} <= set(greyed)

@@ -1,4 +1,4 @@
-"""Blender's cameras see what `Views` says: by Blender's own projection, and by Cycles."""
+"""Blender's cameras agree with `Views`: by Blender's own projection, and by Cycles."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ def test_module_on_the_axis(scene):
 
 @pytest.mark.parametrize("number", [14, 47])
 def test_markers_rendered_by_cycles_land_where_views_say(scene, dc_spect, number, tmp_path):
-    """Not mirrored and not upside down: the markers differ in size and are not symmetric in any way."""
+    """Not mirrored and not upside down: the markers differ in size and have no symmetry."""
     shape = (96, 128)
     collection = scanner.build_scanner(scene, dc_spect, shape=shape)
     for item in list(scene.objects):

@@ -1,4 +1,4 @@
-"""What beats: states that follow each other frame by frame, shown and projected."""
+"""Sequences: states that follow each other frame by frame, shown and projected."""
 
 from __future__ import annotations
 
@@ -87,7 +87,7 @@ def test_files_follow_each_other_as_shown(tmp_path, halves, scene):
     for frame in (5, 6, 7):
         scene.frame_set(frame)
         volume = volumes.volume_from_object(item)
-        # Moved together: the first file's middle lies at the isocentre, the second's 10 mm beside it as it did.
+        # Moved together: the first file's centre is at the isocentre, the second's still 10 mm beside it.
         np.testing.assert_allclose(volume.grid.center, (10.0 * (frame == 6), 0, 0), atol=1e-9)
         bright[frame] = _brightness(scene)
     left, right = bright[5]
@@ -97,7 +97,7 @@ def test_files_follow_each_other_as_shown(tmp_path, halves, scene):
 
 
 def _brightness(scene) -> tuple[float, float]:
-    """Of the left and the right half of Cycles' picture from the front, the first file's cube in its middle."""
+    """Brightness of the left and right half of Cycles' picture from the front, with the first file's cube in the middle."""
     for other in [o for o in scene.objects if o.type != "VOLUME"]:
         bpy.data.objects.remove(other)
     camera = bpy.data.objects.new("Camera", bpy.data.cameras.new("Camera"))
@@ -106,7 +106,7 @@ def _brightness(scene) -> tuple[float, float]:
     camera.data.type, camera.data.ortho_scale = "ORTHO", 40.0
     scene.camera, scene.world, scene.render.engine, scene.cycles.samples = camera, None, "CYCLES", 4
     if hasattr(scene.cycles, "volume_biased"):
-        scene.cycles.volume_biased = True  # 5.2's other way takes a hundred times as long
+        scene.cycles.volume_biased = True  # 5.2's other method takes a hundred times as long
     scene.render.resolution_x = scene.render.resolution_y = 16
     scene.render.resolution_percentage = 100
     scene.render.filepath = str(Path(bpy.app.tempdir) / "frame.png")

@@ -1,4 +1,4 @@
-"""OpenVDB files: ours come back to the last bit, other programs' by OpenVDB's own conventions, bad ones in one line."""
+"""OpenVDB files: ours bit for bit, other programs' by OpenVDB's conventions, bad ones refused in one line."""
 
 from __future__ import annotations
 
@@ -163,7 +163,7 @@ def test_what_others_do_to_our_grids_counts(tmp_path, shift, mirror):
 
 
 def _centroid(path, name, spread=0.0):
-    """Where other programs see a grid's content: OpenVDB's own transform of integer indices, as all of them use it."""
+    """Position of a grid's content in other programs: OpenVDB's own transform of integer indices, which all of them use."""
     grid = vdb.read(str(path), name)
     first, last = grid.evalActiveVoxelBoundingBox()
     shape = tuple(b - a + 1 for a, b in zip(first, last, strict=True))
@@ -187,7 +187,7 @@ def test_other_programs_find_voxels_where_they_are(tmp_path, mirror):
     write_vdb(volume, tmp_path / "a.vdb")
     np.testing.assert_allclose(_centroid(tmp_path / "a.vdb", "mu"), expected, atol=1e-5)
     assert "mphdrr_note" not in vdb.read(str(tmp_path / "a.vdb"), "mu").metadata
-    # What a scene draws is for the running Blender, and says so where that is not for others.
+    # Files for drawing are for the running Blender, and say so if they are not for other programs.
     item = volumes.add_volume(volume, "Body", pose=euler_pose(0.2, 0.1, 0.4, (9.0, 8.0, 7.0)))
     shown = item.data.filepath
     bpy.context.view_layer.update()

@@ -1,4 +1,4 @@
-"""Volumes in the scene: exact voxels, exact places, files that stay with the .blend."""
+"""Volumes in the scene: exact voxels, exact positions, files that stay with the .blend."""
 
 from __future__ import annotations
 
@@ -100,7 +100,7 @@ def test_large_volume_is_shown_coarser_but_kept_whole(monkeypatch):
     shown = volumes.read_vdb(Path(item.data.filepath))
     assert shown.grid.shape == (16, 16, 17)
     np.testing.assert_allclose(shown.array.sum() * 8, array.sum(), rtol=1e-5)
-    # The first block's middle is the corner between its eight voxels.
+    # The first block's centre is the corner between its eight voxels.
     own = volumes.pose_of_object(item) @ shown.grid.affine
     np.testing.assert_allclose(own[:3, 3], (volume.grid.affine @ [0.5, 0.5, 0.5, 1.0])[:3])
 
@@ -179,7 +179,7 @@ def _centroid(scene, axes, aim, width, pixels=64):
     camera.matrix_world = Matrix(pose)
     scene.world = None
     scene.render.engine = "CYCLES"
-    scene.cycles.samples = 128  # 5.2 estimates volumes by chance: the noise alone is some 0.004 voxel
+    scene.cycles.samples = 128  # 5.2 samples volumes randomly: the noise alone is about 0.004 voxel
     scene.cycles.use_denoising = False
     scene.cycles.pixel_filter_type = "BOX"
     scene.cycles.volume_step_rate = 0.25

@@ -1,4 +1,4 @@
-"""Helpers of the tests without Blender."""
+"""Helpers for the tests without Blender."""
 
 from __future__ import annotations
 
@@ -58,5 +58,5 @@ def general_grid(rng: np.random.Generator, shape: tuple[int, int, int]) -> Grid:
 
 
 def emission(system: PinholeSystem, mu: Volume | None = None, **options: Any) -> Emission:
-    """Emission through the pixels' centres alone, for laws of single rays; without the warning that these are few."""
+    """Emission with one ray to each pixel's centre, for laws of single rays; without the warning that these are too few."""
     return Emission(system, mu, **({"pixel_points": 1, "tolerance": 1e9} | options))

@@ -16,7 +16,7 @@ LPS = np.diag([-1.0, -1.0, 1.0, 1.0])
 def write_series(
     volume: mph.Volume, folder: Path, number: int = 1, description: str = "Thorax", names=None
 ) -> list[Dataset]:
-    """One file for each plane of iz, with its own slope and intercept; gives the data sets, which know their files."""
+    """Write a file for each plane of iz, with its own slope and intercept; return the data sets, which know their files."""
     folder.mkdir(exist_ok=True)
     affine = LPS @ volume.grid.affine
     spacing = volume.grid.spacing
@@ -71,7 +71,7 @@ def write_tomogram(volume: mph.Volume, path: Path, order=None, **changes) -> Dat
     data.SOPInstanceUID = data.file_meta.MediaStorageSOPInstanceUID = generate_uid()
     data.SeriesInstanceUID, data.Modality = generate_uid(), "NM"
     data.ImageType = ["DERIVED", "PRIMARY", "RECON TOMO", "EMISSION"]
-    data.NumberOfFrames, data.NumberOfSlices, data.NumberOfEnergyWindows = len(order), n_z, 2  # one for the scatter
+    data.NumberOfFrames, data.NumberOfSlices, data.NumberOfEnergyWindows = len(order), n_z, 2  # one window for scatter
     data.FrameIncrementPointer = 0x00540080
     data.SliceVector = [int(k if way > 0 else n_z - 1 - k) + 1 for k in order]
     data.DetectorInformationSequence = [detector]

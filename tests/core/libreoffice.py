@@ -1,4 +1,4 @@
-"""LibreOffice, where it is installed: an independent calculator of whole workbooks."""
+"""LibreOffice, if it is installed: an independent calculator of whole workbooks."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ _SETTINGS = """<?xml version="1.0" encoding="UTF-8"?>
 
 
 def program() -> str | None:
-    """The path of LibreOffice, None where it is not installed."""
+    """The path of LibreOffice, None if it is not installed."""
     found = shutil.which("soffice") or shutil.which("libreoffice")
     return found or next((path for path in _USUAL_PLACES if os.path.exists(path)), None)
 
@@ -35,7 +35,7 @@ def program() -> str | None:
 def recalculated(workbooks: list[bytes], suffix: str = ".xlsx", time_limit: float = TIME_LIMIT) -> list[bytes | None]:
     """The workbooks (files' bytes) as LibreOffice saves them after calculating all their formulas.
 
-    None stands for one that LibreOffice did not save: it is not installed, failed, or took too long. It runs
+    None for a workbook that LibreOffice did not save: it is not installed, failed, or took too long. It runs
     without a window, in a temporary folder with a profile of its own, and no macro runs.
     """
     office = program()
@@ -66,7 +66,7 @@ def recalculated(workbooks: list[bytes], suffix: str = ".xlsx", time_limit: floa
 def _run(command: list[str], time_limit: float) -> None:
     quiet = subprocess.DEVNULL
     try:
-        # A session of its own, so that what soffice starts can be ended with it.
+        # Its own session, so that the processes that soffice starts end with it.
         process = subprocess.Popen(command, stdin=quiet, stdout=quiet, stderr=quiet, start_new_session=True)
     except OSError:
         return

@@ -1,4 +1,4 @@
-"""Laws of the pinhole's plane: the knife edge, the hole's quadrature, and what does not pass."""
+"""Laws of the pinhole's plane: the knife edge, the hole's quadrature, and what stops photons."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ OPTIONS = {
 
 
 def ellipse_area(length, slope):
-    """Area, mm^2, of the pinhole's plane where a line of a slope is in the edge for less than `length` mm.
+    """Area, mm^2, of the pinhole's plane where a line with this slope runs less than `length` mm through the edge.
 
     Its rim is an ellipse: |(t x, w y) - f| + |(t x, w y) + f| = 2 K with w^2 = t^2 - slope^2, f = (a slope, 0) and
     2 K = 2 a t + length w^2 / sqrt(1 + slope^2), from the squared distances to the two cones.
@@ -106,7 +106,7 @@ def voxel_image(n, fwhm):
 
 @pytest.mark.parametrize("fwhm", [0.0, 1.0])
 def test_points_for_a_tolerance_keep_it(fwhm):
-    """What pixels, wherever they begin, count over their whole area of a voxel; a third of the points would not do."""
+    """A voxel's counts, integrated over whole pixels at any offset; a third of the points would not suffice."""
     system = one_module()
     exact = voxel_image(400, fwhm)
 
@@ -127,7 +127,7 @@ def test_points_for_a_tolerance_keep_it(fwhm):
 
 
 def flat_field(model, n=120, pitch=1.0):
-    """Image of a slab across all that the pixels see."""
+    """Image of a slab that fills the pixels' field of view."""
     slab = mph.Grid.centered((1, 1, 1), (10, 2000, 2000))
     views = model.system.views((n, n), "real", pitch=pitch)
     return mph.Projector(slab, views, model)(np.ones((1, 1, 1)))[0].astype(float)
@@ -143,7 +143,7 @@ def test_the_cone_lets_a_disk_of_the_crystal_see(edge):
 
 
 def test_walls_stop_what_would_enter_the_crystals_sides():
-    """At depth z what came in by the front lies within (l + z) / l Ld; on the front the walls are the crystal's edges."""
+    """At depth z photons from the front are within (l + z) / l Ld; at the front the walls end at the crystal's edges."""
     system = one_module(detector_side=40.0)
     walls = flat_field(emission(system, within_walls=True))
     np.testing.assert_allclose(walls, flat_field(emission(system, within_crystal=True)), rtol=1e-6)
@@ -153,7 +153,7 @@ def test_walls_stop_what_would_enter_the_crystals_sides():
     # One of the two layers ends at 20 mm, the other at 20 * 70 / 60, smoothed over a pixel.
     middle = share[60]
     np.testing.assert_allclose(middle[places < 19], 1, rtol=1e-5)
-    # In between the back counts alone: cos^2 / distance^2, from cos^4, the slab's path and the crystal's.
+    # In between only the back layer counts: cos^2 / distance^2, from cos^4, the slab's path and the crystal's.
     between = places[(places > 20.5) & (places < 22.5)]
     front, back = (1 / (distance**2 + between**2 + 0.25) for distance in (60, 70))
     np.testing.assert_allclose(middle[(places > 20.5) & (places < 22.5)], back / (front + back), rtol=1e-5)
@@ -207,7 +207,7 @@ def test_bad_apertures_are_refused(system):
 
 
 def test_weights_of_tensors_are_those_of_arrays_and_differentiable():
-    """By the pixels' places and the collimator's length, so that poses of cameras that count can be optimised."""
+    """By the pixels' positions and the collimator's length, for optimising the poses of cameras that count photons."""
     torch = pytest.importorskip("torch", reason="torch is not installed")
     model = emission(one_module(), **OPTIONS)
     u, v = np.linspace(-24, 23, 6)[None], np.linspace(-22, 21, 5)[:, None]
@@ -224,7 +224,7 @@ def test_weights_of_tensors_are_those_of_arrays_and_differentiable():
 
 
 def test_memory_is_asked_for_mu_and_for_weights(system, monkeypatch):
-    """Before it is taken: with a large mu, or voxel weights, less of the volume itself fits."""
+    """Before it is allocated: with a large mu, or voxel weights, a smaller volume fits."""
     grid, views = mph.Grid.centered((40, 40, 40), 2.0), system.views((4, 4))
     large = mph.Volume(np.zeros((80, 80, 80), np.float32), mph.Grid.centered(80, 2.0), "mu")
     monkeypatch.setattr("mphdrr.core.memory.available", lambda: 600_000)
@@ -243,7 +243,7 @@ def test_memory_is_asked_for_mu_and_for_weights(system, monkeypatch):
 
 
 def test_the_whole_camera_counts_like_photons_one_by_one(rng):
-    """Photons from a spot through the edge into the crystal: their number, mean place and spread as they are recorded."""
+    """Photons from a spot through the edge into the crystal: number, mean and deviation of the recorded positions."""
     system, n = one_module(detector_side=30.0), 1_000_000
     grid = turned_grid((3, 3, 3), 1.0, (20.0, 37.0, -20.0))
     edge, crystal_mu, far = KnifeEdge(1.0, 1.5, 1.0), 0.15, 4.0

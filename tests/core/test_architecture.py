@@ -1,4 +1,4 @@
-"""What the layout promises and no linter sees: one version, no stray package, nothing imported too early."""
+"""Promises of the layout that no linter checks: one version, no stray package, nothing imported too early."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The benchmark, very small: it runs, and its yardstick is right."""
+"""A very small benchmark runs, and its plain C reference is right."""
 
 from __future__ import annotations
 

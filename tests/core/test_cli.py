@@ -1,4 +1,4 @@
-"""The command line: what its users type, and what it says when they err."""
+"""The command line: what users type, and what it says about mistakes."""
 
 from __future__ import annotations
 
@@ -100,7 +100,7 @@ def test_counts_with_attenuation_and_noise(workbook, tmp_path, capsys):
 
 
 def test_every_part_of_the_emission_model_is_an_option(workbook, tmp_path):
-    """Options reach the model and the record; those left out are the model's own defaults."""
+    """Options reach the model and the record; for omitted ones the model's defaults hold."""
     run_file = tmp_path / "run.h5"
     options = (
         "--emission --isotope Tl-201 --window 60 80 --time 300 --aperture-points 3 --aperture-mu lead --opening-angle 80 "
@@ -118,7 +118,7 @@ def test_every_part_of_the_emission_model_is_an_option(workbook, tmp_path):
     assert expected.any()
     np.testing.assert_allclose(run.projections, expected, rtol=1e-5, atol=1e-6 * expected.max())
     assert {name: run.settings[name] for name in model.record()} == model.record()
-    assert (run.recipe["model.aperture_mu"], run.recipe["model.crystal_mu"]) == ("lead", 0.3)  # as they were asked for
+    assert (run.recipe["model.aperture_mu"], run.recipe["model.crystal_mu"]) == ("lead", 0.3)  # as requested
 
 
 def test_radiographs_of_mu_and_the_inverse_square_sum(workbook, tmp_path):
@@ -276,7 +276,7 @@ def test_geometry_performance_adds_up(workbook, capsys):
     assert main(["geometry", "performance", str(workbook), *named[2:4]]) == 1
     assert "crystal_mu 'CZT': at which energy" in capsys.readouterr().err
     assert main(["geometry", "performance", str(workbook), "--opening-angle", "200"]) == 1
-    assert "--opening-angle 200: expected degrees" in capsys.readouterr().err
+    assert "--opening-angle: expected less than 180 degrees, got 200" in capsys.readouterr().err
     assert main(["geometry", "performance", str(workbook), "--point", "0", "0", "900"]) == 0
     assert "from 0 of 80 modules" in capsys.readouterr().out
 
@@ -300,7 +300,7 @@ def test_geometry_map_writes_a_volume(workbook, tmp_path, capsys, quantity):
 
 
 def test_geometry_of_a_fit_is_generated_again(workbook, tmp_path, capsys):
-    """The workbook that the printed parameters make follows the same ellipse."""
+    """The workbook made from the printed parameters follows the same ellipse."""
     assert main(["geometry", "fit", str(workbook), "--json"]) == 0
     ring = json.loads(capsys.readouterr().out)["rings"][0]
     assert ring["curve_deviation"] < 0.001

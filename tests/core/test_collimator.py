@@ -1,7 +1,7 @@
-"""The collimator's one description: rays through what is drawn, written to files and simulated, by ray casters of our own.
+"""One description of the collimator: rays through the drawn, exported and simulated bodies, by ray casters of our own.
 
-Every ray goes from a point in front of a module to a point of its crystal's front face, and is cut with triangles read
-back from files, or with the convex solids of a GATE macro or script, less the air that is their daughter.
+Rays go from a point in front of a module to a point of its crystal's front face, and are intersected with triangles read
+back from files, or with the convex solids of a GATE macro or script, minus the air in them.
 """
 
 from __future__ import annotations
@@ -69,14 +69,14 @@ def from_roi(rng, system, m: int, crossing: np.ndarray) -> Rays:
 
 
 def disc(rng, n: int, low: float, high: float) -> np.ndarray:
-    """Points (2, n) evenly over a ring: one in each of n rings of equal area."""
+    """Points (2, n) evenly distributed over a ring: one in each of n rings of equal area."""
     share = rng.permutation((np.arange(n) + rng.random(n)) / n)
     radius, turn = np.sqrt(low**2 + share * (high**2 - low**2)), rng.uniform(0, 2 * np.pi, n)
     return radius * np.stack([np.cos(turn), np.sin(turn)])
 
 
 def rays_of(rng, system, m: int) -> tuple[Rays, Rays]:
-    """Rays from the ROI through the hole; and rays that reach the crystal past the hole, from the ROI and from elsewhere."""
+    """Rays from the ROI through the hole; and rays from the ROI and elsewhere that reach the crystal beside the hole."""
     d, l, side = system.pinhole_diameter[m], system.collimator_length[m], system.detector_side[m]
     through = from_roi(rng, system, m, disc(rng, N, 0, 0.9999 * d / 2))
     assert through.on_crystal.max() < side / 2 + 1e-6, "the design formula: all of them meet the crystal"
@@ -141,7 +141,7 @@ class Convex:
         self.center = np.asarray(center, float)[:, None]
 
     def interval(self, source: np.ndarray, target: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Where rays (3, N) are inside: from a share of their length to another, or from infinity to minus infinity."""
+        """Where rays (3, N) are inside: from one fraction of their length to another, or from infinity to minus infinity."""
         origin, along = source - self.center, target - source
         growth = (self.before - self.behind) / self.height
         middle = (self.before + self.behind) / 2
@@ -195,7 +195,7 @@ def path_in_material(solid: Convex, air: list[Convex], rays: Rays) -> np.ndarray
 
 
 def gate9_solids(folder, system) -> dict[int, tuple[Convex, list[Convex]]]:
-    """By module, from the macros: solid and air, in the module's frame."""
+    """For each module, from the macros: solid and air, in the module's frame."""
     macros, found = Macros(folder), {}
 
     def convex(volume, center) -> Convex:

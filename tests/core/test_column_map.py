@@ -1,4 +1,4 @@
-"""Column maps: what a person says is what is read and written, and a draft says what was seen."""
+"""Column maps: a map decides what is read and written, and a draft says what was recognised."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ def warnings_are_errors():
 
 
 def silent(folder: Path, edit: Callable | None = None) -> Path:
-    """The plain workbook, typed, with headings that nobody here understands; edited further."""
+    """The plain workbook with typed numbers and headings that the reader does not understand, edited further."""
     book = plain()
     typed(book["Main"], book["Coordinates"])
     for sheet in book.worksheets:

@@ -1,4 +1,4 @@
-"""Laws of the crystal: what it absorbs, how deep, and where that is recorded."""
+"""Laws of the crystal: how much is absorbed, how deep, and at which position it is recorded."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from .test_emission import one_module, spot_image, turned_grid
 @pytest.mark.parametrize("n", [1, 2, 5])
 @pytest.mark.parametrize("mu", [1e-3, 0.26, 5.0])
 def test_layers_absorb_what_the_crystal_absorbs_as_deep(n, mu):
-    """1 - exp(-mu T / cos) of the photons, from 2 layers on at the mean depth, at every angle."""
+    """1 - exp(-mu T / cos) of the photons are absorbed, with 2 or more layers at the mean depth, at every angle."""
     thickness, cosine = 9.0, np.linspace(0.3, 1, 50)
     depths = layer_depths(n, thickness)
     shares = np.array([absorbed_share(cosine, mu, thickness, depths, layer) for layer in range(n)])
@@ -58,7 +58,7 @@ def test_parallax_shifts_a_point_outwards_by_its_mean_depth(mu, detector):
 
 
 def test_thin_layers_blur_like_the_exponential():
-    """The variance along the radius of what is recorded, against that of the depth of absorption."""
+    """The variance of the recorded positions along the radius, against that of the depth of absorption."""
     system, mu = one_module(), 0.26
     sharp, places = spot_image(emission(system, crystal_mu=mu), (0, 70, 0), pitch=0.05, n=200)
     deep, _ = spot_image(emission(system, crystal_mu=mu, depth_layers=12), (0, 70, 0), pitch=0.05, n=200)

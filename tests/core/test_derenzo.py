@@ -26,14 +26,14 @@ def test_rods_follow_the_users_rule():
     rods = phantom.rods()
     for sector, (w, rows) in enumerate([(10, 2), (8, 2), (6, 3), (4, 5), (2, 10), (1, 22)]):
         mine = rods[rods[:, 0] == sector]
-        # Only one 10 mm row fits with the margins, so that sector drops them.
+        # Only one 10 mm row fits with the margins, so this sector has none.
         assert len(mine) == rows * (rows + 1) // 2, f"sector of {w} mm rods"
     # Sector 0 runs along -y, its first row at sqrt(3) w (margin dropped) and its second two rods 2 w apart.
     first = rods[rods[:, 0] == 0]
     assert np.allclose(first[0, 1:3], [0, -np.sqrt(3) * 10])
     assert np.allclose(sorted(first[1:, 1]), [-10, 10])
     assert np.allclose(first[1:, 2], -2 * np.sqrt(3) * 10)
-    # Sector 2, turned by 120 degrees counter-clockwise from -y, keeps its margin.
+    # Sector 2, rotated by 120 degrees counter-clockwise from -y, keeps its margin.
     direction = np.deg2rad(-90 + 120)
     assert np.allclose(
         rods[rods[:, 0] == 2][0, 1:3], (5 + np.sqrt(3) * 6) * np.array([np.cos(direction), np.sin(direction)])
@@ -41,7 +41,7 @@ def test_rods_follow_the_users_rule():
 
 
 def users_rods(radius: float, diameters: tuple[float, ...]) -> list[tuple[int, float, float, float]]:
-    """The rule in the users' words, written anew: sector, x, y and diameter of each rod."""
+    """The users' rule, implemented independently: sector, x, y and diameter of each rod."""
     rods = []
     for sector, w in enumerate(diameters):
         case = radius * 0.1
@@ -59,12 +59,12 @@ def users_rods(radius: float, diameters: tuple[float, ...]) -> list[tuple[int, f
 
 
 def test_rods_on_a_slice_are_the_users_sector_by_sector():
-    """Counted, and their area, on 640 x 640 pixels across radius 40 mm."""
+    """Number and area of the rods, on 640 x 640 pixels across the radius of 40 mm."""
     radius, n = 40.0, 640
     axis = (np.arange(n) - (n - 1) / 2) * 2 * radius / n
     grid = mph.Grid.centered((n, n, 1), (2 * radius / n, 2 * radius / n, 1.0))
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore", mph.InputWarning)  # the slice holds a part of the height
+        warnings.simplefilter("ignore", mph.InputWarning)  # the slice contains a part of the height
         slice_ = mph.DerenzoPhantom(radius, RODS, 30.0).voxelize(grid).array[:, :, 0]
     theirs = users_rods(radius, RODS)
     x, y = np.meshgrid(axis, axis, indexing="ij")
@@ -140,7 +140,7 @@ def test_voxels_hold_the_share_of_their_rods(rng):
 
 def test_euler_angles_turn_psi_then_theta_then_phi():
     tilt = mph.euler_pose(theta=np.pi / 2)
-    assert np.allclose(tilt @ [0, 0, 1, 1], [1, 0, 0, 1])  # the axis falls towards +x
+    assert np.allclose(tilt @ [0, 0, 1, 1], [1, 0, 0, 1])  # the axis tilts towards +x
     assert np.allclose(mph.euler_pose(np.pi / 2, np.pi / 2, 0, (0, 0, 5)) @ [0, 0, 1, 1], [0, 1, 5, 1])
     assert np.allclose(mph.euler_pose(0, np.pi / 2, np.pi / 2) @ [1, 0, 0, 1], [0, 1, 0, 1])
 

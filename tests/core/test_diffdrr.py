@@ -1,6 +1,6 @@
-"""DiffDRR's face: the same arguments and poses give DiffDRR's images, points and gradients.
+"""DiffDRR's interface: the same arguments and poses give DiffDRR's images, points and gradients.
 
-What DiffDRR 0.6.1 has is compared with it where it is installed; the arguments before 0.4 follow closed descriptions.
+Results are compared with DiffDRR 0.6.1 if it is installed; the arguments before 0.4 with their definition.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ from .conftest import general_grid  # noqa: E402
 
 
 def peer():
-    """DiffDRR's modules, or a skip where it is not installed."""
+    """DiffDRR's modules; skips the test if it is not installed."""
     return tuple(
         pytest.importorskip(name, reason=f"DiffDRR is not installed ({name} is missing)", exc_type=ImportError)
         for name in ("diffdrr.drr", "diffdrr.pose", "torchio")
@@ -157,7 +157,7 @@ def test_euler_angles_are_those_of_diffdrr(convention, rng):
 
 
 def test_the_whole_line_counts_beyond_the_detector(torchio_subject):
-    """With the detector in the middle of the body DiffDRR goes on to the other side."""
+    """With the detector in the middle of the body, DiffDRR integrates beyond it."""
     module = peer()[0]
     arguments = {"parameterization": "axis_angle"}
     theirs, ours = module.DRR(torchio_subject, 120.0, 9, 4.0), DRR(torchio_subject, 120.0, 9, 4.0)
@@ -185,7 +185,7 @@ def test_poses_are_those_of_diffdrr(parameterization, size, rng):
     theirs = peer()[1]
     translation = torch.tensor(rng.normal(size=(5, 3)) * 100, dtype=torch.float32)
     rotation = torch.tensor(rng.normal(size=(5, size)), dtype=torch.float32)
-    if parameterization == "quaternion_adjugate":  # DiffDRR's choice of a column differs where it is no q q^T
+    if parameterization == "quaternion_adjugate":  # DiffDRR chooses another column if the matrix is no q q^T
         rotation = rotation_parameters(convert(rotation[:, :4], translation, parameterization="quaternion").rotation,
                                        parameterization)  # fmt: skip
     arguments = {"parameterization": parameterization, "convention": "ZXY"}
@@ -311,7 +311,7 @@ def test_ways_to_give_the_volume(subject, rng, tmp_path):
 
 @pytest.mark.parametrize("detector", ["virtual", "real"])
 def test_a_view_is_a_pose(detector, system, subject):
-    """Any view has DiffDRR's arguments that give its image; mirrored and with an offset too."""
+    """For any view there are arguments of DiffDRR that give its image, also mirrored and with an offset."""
     grid = Grid(subject.density.shape, subject.affine)
     views = system.views((9, 12), detector, pitch=(0.9, 1.2) if detector == "real" else (9.0, 12.0), offset=(2.0, 3.0))
     mirrored = Views(views.sources, views.detector_centers, -views.u_steps, views.v_steps, views.shape)

@@ -33,7 +33,7 @@ def in_ball(rng, radius, n):
 
 
 def turned_grid(shape, spacing, center=(0.0, 0.0, 0.0)):
-    """A grid with no plane along any module's rays."""
+    """A grid without planes parallel to any module's rays."""
     affine = mph.euler_pose(0.3, 0.5, 0.2)
     affine[:3, :3] *= spacing
     affine[:3, 3] = center - affine[:3, :3] @ ((np.array(shape) - 1) / 2)
@@ -62,7 +62,7 @@ def test_point_source_obeys_pinhole_sensitivity(rng):
     voxels = index @ grid.affine[:3, :3].T + grid.affine[:3, 3]
     expected = sensitivity(system, voxels.reshape(-1, 3)).reshape(80, 100, 27) @ weights * grid.voxel_volume
     for m in range(len(system)):
-        pitch = system.detector_side[m] / 256  # and more of them around, so that nothing is cut off
+        pitch = system.detector_side[m] / 256  # and more around, so that nothing is cut off
         A = mph.Projector(grid, system[m].views((320, 320), "real", pitch=pitch), mph.Emission(system[m]))
         total = A.T(np.ones((1, 320, 320)))[tuple(np.moveaxis(index, -1, 0))] @ weights
         np.testing.assert_allclose(total, expected[m], rtol=0.01)
@@ -111,7 +111,7 @@ def test_counts_per_solid_angle_follow_the_formula(backend):
 @pytest.mark.parametrize("backend", BACKENDS)
 @pytest.mark.parametrize("magnification", [0.7, 2.0, 10.0])
 def test_real_and_virtual_detector_count_the_same(backend, magnification, system, rng):
-    """Point-inverted, and wherever the virtual detector stands: in front of, inside or behind the volume."""
+    """Point-inverted, and the same wherever the virtual detector is: in front of, inside or behind the volume."""
     grid = general_grid(rng, (9, 8, 7))
     x = rng.random(grid.shape)
     model = emission(system)
@@ -214,7 +214,7 @@ def test_uniform_body_counts_in_closed_form(backend, mu):
 
 @pytest.mark.parametrize("backend", BACKENDS)
 def test_point_source_in_a_ball_loses_its_radius(backend):
-    """exp(-mu R) from the middle of a ball of attenuating matter that is far larger than the activity's grid."""
+    """exp(-mu R) from the centre of an attenuating ball that is far larger than the activity's grid."""
     system = one_module()
     n, radius, mu = 48, 50.0, 0.0154
     body = mph.Grid.centered((n,) * 3, 2.2 * radius / n)
@@ -233,7 +233,7 @@ def test_attenuation_depends_on_matter_and_not_on_its_grid(backend, system, rng)
     """The same mu on the activity's grid, on a twice finer one and on a larger one gives the same counts."""
     grid = turned_grid((6, 5, 4), 14.0)
     activity = np.zeros(grid.shape)
-    activity[2:4, 1:3, 1:3] = rng.random((2, 2, 2))  # mu lies also outside the activity's support
+    activity[2:4, 1:3, 1:3] = rng.random((2, 2, 2))  # there is mu outside the activity too
     mu = rng.uniform(0, 0.03, grid.shape)
     fine = np.diag([0.5, 0.5, 0.5, 1.0])
     fine[:3, 3] = -0.25
@@ -296,7 +296,7 @@ def test_mu_that_is_not_mu_is_refused(system):
 
 
 def spot_image(model, place, pitch=0.05, n=160):
-    """Image of a spot of 1 mm around the middle of its picture, and the pixels' places on the crystal along u."""
+    """Image of a spot of 1 mm around the centre of its projection, and the pixels' positions on the crystal along u."""
     system = model.system
     column, row, factor = system.views((1, 1), "real").projection_matrices()[0] @ [*place, 1.0]
     offset = np.array([column, row]) / factor * system.detector_side[0]

@@ -1,4 +1,4 @@
-"""Counts as functions of the activity, of what attenuates it and of the camera: their gradients in torch."""
+"""Gradients of counts in torch: by the activity, its attenuation and the camera."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from .conftest import BACKENDS, emission, general_grid  # noqa: E402
 
 
 def grid_of_mu(which, grid, rng):
-    """The activity's grid, or one that is larger, coarser and turned."""
+    """The activity's grid, or one that is larger, coarser and rotated."""
     if which == "shared":
         return grid
     affine = general_grid(rng, (5, 4, 6)).affine
@@ -42,7 +42,7 @@ def camera(system, m=3):
 @pytest.mark.parametrize("backend", BACKENDS)
 @pytest.mark.parametrize("which", ["shared", "own"])
 def test_mu_given_is_the_models_mu(backend, which, system, rng):
-    """A(x, mu) is what a model with that mu measures, for arrays and tensors; likewise its adjoint."""
+    """A(x, mu) equals the images of a model with that mu, for arrays and tensors; likewise its adjoint."""
     grid = general_grid(rng, (9, 8, 7))
     x = rng.random(grid.shape).astype(np.float32)
     views = system[3:5].views((10, 11), pitch=5.0)
@@ -79,7 +79,7 @@ def test_gradcheck_by_activity_and_mu(backend, which, system, rng):
 @pytest.mark.parametrize("backend", BACKENDS[1:])
 @pytest.mark.parametrize("which", ["shared", "own"])
 def test_backends_agree_on_gradients_by_mu(backend, which, system, rng):
-    """Wherever a ray passes in front of activity, in air too and outside the activity's box; whatever the threads."""
+    """Wherever a ray passes in front of activity, also in air and outside the activity's box, for any number of threads."""
     grid = general_grid(rng, (9, 8, 7))
     x = np.zeros(grid.shape, np.float32)
     x[3:6, 2:5, 2:6] = rng.random((3, 3, 4))

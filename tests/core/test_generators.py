@@ -94,7 +94,7 @@ def test_a_closed_ring_is_found_from_its_first_module(end):
 
 
 def test_the_fit_is_the_nearest_ellipse(rng):
-    """Of noisy pinholes: no ellipse beside it has a smaller sum of squares."""
+    """For noisy pinholes: no ellipse near it has a smaller sum of squares."""
     made = mph.ellipse_rings(40, z=0.0, **TILTED, **MODULE)
     noisy = mph.PinholeSystem(made.centers + rng.normal(size=(40, 3)) * [2, 2, 0.1], 2.3, 60.0, 50.0, 10.0, 75.0)
     (fit,) = mph.fit_rings(noisy)
@@ -115,7 +115,7 @@ def test_the_fit_is_the_nearest_ellipse(rng):
 
 
 def test_the_real_scanner_stands_on_one_ellipse(workbook):
-    """Semi-axes of 273 and 220.5 mm, its centre 60 mm from the isocentre; evenly spaced it is not."""
+    """Semi-axes of 273 and 220.5 mm, its centre 60 mm from the isocentre; the modules are not evenly spaced."""
     system = mph.read_system(workbook)
     fits = mph.fit_rings(system)
     assert [len(fit.numbers) for fit in fits] == [20, 20, 20, 20]

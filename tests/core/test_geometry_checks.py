@@ -1,4 +1,4 @@
-"""Laws of the checks: what is planted is found, as deep as it is, and nothing else is."""
+"""Laws of the checks: planted faults are found with their depth, and nothing else is."""
 
 from __future__ import annotations
 
@@ -13,8 +13,7 @@ from mphdrr.core.geometry.checks.field_of_view import cone_directions, hits, uns
 from mphdrr.core.geometry.checks.hulls import Hulls
 from mphdrr.core.geometry.checks.overlaps import penetration_depths
 from mphdrr.core.geometry.collimator import Collimator, Construction
-from mphdrr.core.geometry.collimator_mesh import surface_fault
-from mphdrr.core.geometry.module_parts import module_parts
+from mphdrr.core.geometry.module_parts import module_parts, surface_fault
 
 
 def system_of(centers, d=2.0, length=60.0, side=50.0, thickness=10.0, radius=40.0, **more) -> mph.PinholeSystem:
@@ -22,7 +21,7 @@ def system_of(centers, d=2.0, length=60.0, side=50.0, thickness=10.0, radius=40.
 
 
 def crowd(rng, n: int = 30) -> mph.PinholeSystem:
-    """Modules of all sizes, so near each other that many overlap."""
+    """Modules of all sizes, so close together that many overlap."""
     direction = rng.normal(size=(n, 3)) * [0.2, 0.5, 0.3] + [1, 0, 0]
     direction /= np.linalg.norm(direction, axis=1)[:, None]
     return system_of(
@@ -73,7 +72,7 @@ def test_touching_is_no_overlap(rng, gap):
 
 @pytest.mark.parametrize("depth", [1e-5, 0.3])
 def test_side_walls_in_each_other_are_as_deep_as_planted(depth):
-    """Two collimators mirrored in a plane that their side walls are parallel to, each depth/2 beyond it."""
+    """Two collimators mirrored in a plane parallel to their side walls, each depth/2 beyond it."""
     d, length, side, wall = 2.0, 60.0, 50.0, 2.0
     front = Collimator(d, length, side, Construction(2.0, wall)).front_half_width
     angle = np.arctan((side / 2 + wall - front) / (length + 1))  # from the plate's front, 1 mm before the pinhole
@@ -87,7 +86,7 @@ def test_side_walls_in_each_other_are_as_deep_as_planted(depth):
 
 
 def test_depth_is_the_distance_to_the_minkowski_difference(rng):
-    """The shortest way out for any two bodies, by the convex hull of all differences of their corners."""
+    """The shortest translation that separates two bodies, by the convex hull of all differences of their corners."""
     spatial = pytest.importorskip("scipy.spatial")
     system = crowd(rng)
     parts = module_parts(system)
@@ -148,7 +147,7 @@ def test_a_module_in_front_blocks_the_rays_that_meet_it():
 
 
 def test_a_sliver_of_a_thousandth_is_found(rng):
-    """Small modules that just reach over the silhouette of the ROI, at any place around it."""
+    """Small modules that just reach over the silhouette of the ROI, anywhere around it."""
     found = []
     for angle, beyond in zip(rng.uniform(0, 2 * np.pi, 12), rng.uniform(-1.5, 1.0, 12), strict=True):
         # The cone's half-angle is 30 degrees; at the depth of 60 mm its radius is 34.64 mm.
@@ -163,7 +162,7 @@ def test_a_sliver_of_a_thousandth_is_found(rng):
         shares = {b.module: b.share for b in blocked}
         assert shares.get(1, 0.0) == pytest.approx(fine.mean(), abs=5e-4)
         found.append(fine.mean())
-    assert np.count_nonzero((np.array(found) > 2e-4) & (np.array(found) < 1.5e-3)) > 3  # such slivers they were
+    assert np.count_nonzero((np.array(found) > 2e-4) & (np.array(found) < 1.5e-3)) > 3  # the slivers were this small
 
 
 def test_rays_meet_hulls_where_points_along_them_are_inside(rng):

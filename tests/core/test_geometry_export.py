@@ -121,7 +121,7 @@ def read_pytorch3d(path, points):
 
 
 def read_nerf(path, points):
-    """nerfstudio's page "Data conventions": +X right, +Y up, -Z forward; of pictures that `as_seen` turned."""
+    """nerfstudio's page "Data conventions": +X right, +Y up, -Z forward; for pictures turned by `as_seen`."""
     document = json.loads(path.read_text())
     seen = []
     for frame, at in zip(document["frames"], points, strict=True):
@@ -187,7 +187,7 @@ def fiducials(views, rng, count=20):
 
 
 def general_views(rng, mirrored=False, count=15):
-    """Views of any pose, with pixels of one proportion and many sizes, seen far off their middles."""
+    """Views of any pose, with pixels of one proportion and many sizes, far off centre."""
     poses = np.array([euler_pose(*rng.uniform(-4, 4, 3))[:3, :3] for _ in range(count)])
     poses[0] = euler_pose(0, np.pi / 2, 0)[:3, :3]  # axes along the world's
     poses[1] = [[1, 0, 0], [0, 0, 1], [0, -1, 0]]  # RTK's gantry and in-plane angles are one here
@@ -205,7 +205,7 @@ def scanner(workbook):
 
 @pytest.mark.parametrize("format", READERS)
 def test_scanner_is_seen_alike_through_every_format(format, scanner, rng, tmp_path):
-    """All 80 modules, both detectors, other than square images and pixels, shifted."""
+    """All 80 modules, both detectors, images and pixels that are not square, shifted."""
     in_roi = rng.normal(size=(80, 20, 3))
     in_roi *= 75 * rng.uniform(0, 1, (80, 20, 1)) ** (1 / 3) / np.linalg.norm(in_roi, axis=-1, keepdims=True)
     for settings in (

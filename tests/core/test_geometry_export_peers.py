@@ -1,4 +1,4 @@
-"""The programs themselves read what was exported: `make test-peers` runs these tests with all of them installed."""
+"""The exported files in the programs themselves: `make test-peers` runs these tests with all of them installed."""
 
 from __future__ import annotations
 
@@ -72,7 +72,7 @@ def detector_of(path):
 
 
 def test_rtk_projects_alike(workbook, rng, tmp_path):
-    """RTK's Joseph projector on a smooth volume: it takes the arrays as they are, whatever the sign of its distances."""
+    """RTK's Joseph projector on a smooth volume: the arrays fit as they are, whatever the sign of its distances."""
     itk, rtk = imported_rtk()
     system = mph.read_system(workbook)[::16]
     for detector in ("virtual", "real"):
@@ -107,12 +107,12 @@ def test_astra_takes_the_geometry(views, system, rng, tmp_path):
     assert astra.geom_size(geometry) == (n_v, len(views), n_u)
     volume = astra.create_vol_geom(*a["volume_counts"].tolist(), *a["volume_windows"].tolist())
     assert astra.geom_size(volume) == (10, 6, 4)
-    identifier = astra.data3d.create("-sino", geometry)  # refused unless ASTRA finds the vectors good
+    identifier = astra.data3d.create("-sino", geometry)  # ASTRA refuses wrong vectors
     astra.data3d.delete(identifier)
 
 
 def test_lib3mf_reads_the_solids_in_strict_mode(workbook, tmp_path):
-    """Every part is a closed, oriented surface with its name, in millimetres, and nothing is worth a warning."""
+    """Every part is a closed, oriented surface with its name, in millimetres, and there is no warning."""
     wrapper = pytest.importorskip("lib3mf", reason="no lib3mf").get_wrapper()
     system = mph.read_system(workbook)[::10]
     mph.write_geometry(system, tmp_path / "a.3mf", "3mf", edge_at="front")

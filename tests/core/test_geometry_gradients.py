@@ -31,7 +31,7 @@ def oblique_rays(rng, grid, n=60):
 
 
 def some_mu(rng, grid, which):
-    """Nothing; on the volume's grid; on another that lies across it."""
+    """None; on the volume's grid; on another one that cuts across it."""
     if which is None:
         return None
     if which == "own":
@@ -67,7 +67,7 @@ def test_gradient_is_the_central_difference(backend, which, shape, rng):
                 for sign in (1, -1)
             )  # fmt: skip
             difference = (ahead - behind) / (2 * h)
-            # A ray within h of an edge of a voxel has a kink there: few do.
+            # A ray within h of a voxel's edge has a kink there: these are few.
             close = np.abs(difference - got[end][:, axis]) < 1e-5 * scale
             assert close.mean() >= 0.97, (end, axis, np.abs(difference - got[end][:, axis]).max())
 
@@ -107,7 +107,7 @@ def test_chord_of_a_slab(backend):
 
 @pytest.mark.parametrize("backend", BACKENDS)
 def test_chord_of_an_attenuating_slab(backend):
-    """(1 - exp(-m chord)) / m, seen from outside and from inside; mu on its own planes before it too."""
+    """(1 - exp(-m chord)) / m, from outside and from inside; also with mu in front, on its own planes."""
     grid = Grid.centered((8, 40, 40), 2.0)
     before = Volume(
         np.full((2, 10, 10), 0.1), Grid.centered((2, 10, 10), 8.0, (-28.0, 0, 0)), "mu"
@@ -135,7 +135,7 @@ def test_chord_of_an_attenuating_slab(backend):
 
 @pytest.mark.parametrize("backend", BACKENDS)
 def test_gradients_depend_on_matter_and_not_on_its_grid(backend, rng):
-    """The same mu on the volume's grid, on one twice as fine and on one that goes on outside: planes met at once."""
+    """The same mu on the volume's grid, on a twice finer and on a larger one: planes of both are crossed at once."""
     grid = general_grid(rng, (6, 5, 4))
     volume, values = Volume(rng.random(grid.shape), grid), rng.uniform(0, 0.2, grid.shape)
     fine, moved = np.diag([0.5, 0.5, 0.5, 1.0]), np.eye(4)
@@ -210,7 +210,7 @@ def test_gradcheck_by_everything(backend, which, rng):
 @pytest.mark.parametrize("backend", BACKENDS)
 @pytest.mark.parametrize("which", MU)
 def test_fans_are_their_rays(backend, which, rng, monkeypatch):
-    """Integrals and all gradients: lines along either axis, cut into blocks, from outside and from inside; arrays too."""
+    """Integrals and all gradients: rows along either axis, in blocks, from outside and from inside; also for arrays."""
     monkeypatch.setattr(execution, "_FEWEST_RAYS", 16)
     grid = general_grid(rng, (9, 8, 7))
     mu_grid = (some_mu(rng, grid, which) or Volume(np.ones(grid.shape), grid)).grid

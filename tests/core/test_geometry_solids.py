@@ -1,4 +1,4 @@
-"""Solids as files: what other programs read is the geometry, named, closed and in its place."""
+"""Solids as files: other programs read the geometry with names, closed surfaces and the right positions."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ MM = 1e-4  # float32 holds lengths of a scanner to about 3e-5 mm
 
 
 def read_glb(path) -> dict:
-    """By the glTF 2.0 specification and nothing else: meshes as its nodes place them, back from metres and +y up."""
+    """Read by the glTF 2.0 specification alone: meshes as its nodes place them, converted back from metres and +y up."""
     document, buffer = glb_chunks(path)
     meshes = {}
 
@@ -83,7 +83,7 @@ def read_3mf(path) -> dict:
 
 
 def read_3mf_as_xml(path) -> dict:
-    """By the 3MF core specification and nothing else."""
+    """Read by the 3MF core specification alone."""
     core = "{http://schemas.microsoft.com/3dmanufacturing/core/2015/02}"
     with zipfile.ZipFile(path) as package:
         relationship = ElementTree.fromstring(package.read("_rels/.rels"))[0]
@@ -149,7 +149,7 @@ def test_parts_come_back_whole_and_in_their_place(system, tmp_path, format, name
 def test_one_stl_file_holds_the_parts_chosen(system, tmp_path, part, kinds):
     path = tmp_path / "scanner.STL"
     write_geometry(system, path, "stl", part=part)
-    assert not path.read_bytes().startswith(b"solid")  # that would be a text file
+    assert not path.read_bytes().startswith(b"solid")  # with "solid" at the start it would be a text file
     mesh = trimesh.load(path, file_type="stl")
     wanted = [p for p in module_parts(system) if part == "all" or p.kind == part[:-1]]
     assert len(wanted) == 12 * kinds

@@ -28,7 +28,7 @@ def voxel_centers(grid):
 
 
 def test_sensitivity_map_sums_the_law_of_the_point_source(workbook, rng):
-    """At 20 random points, written out for every module."""
+    """At 20 random points, computed module by module."""
     system = mph.read_system(workbook)
     for point in rng.uniform(-140, 140, (20, 3)):
         expected, modules = 0.0, 0
@@ -96,7 +96,7 @@ def test_gap_of_few_pinholes():
     origin = [[0.0, 0.0, 0.0]]
     fine = {"tolerance": 1e-4}
     assert mph.sampling_gaps(pinholes([[1, 2, 3]]), origin)[0] == pytest.approx(math.pi / 2, abs=0.1 * DEGREE)
-    assert mph.sampling_gaps(pinholes([[0, 1, 0]]), [[0, 300.0, 0]])[0] == math.pi / 2  # nobody sees it
+    assert mph.sampling_gaps(pinholes([[0, 1, 0]]), [[0, 300.0, 0]])[0] == math.pi / 2  # no module sees it
     # Two lines: the worst normal halves the smaller angle between them.
     for angle in (0.4, 1.2, 2.5):
         two = pinholes([[1, 0, 0], [math.cos(angle), math.sin(angle), 0]])
@@ -109,7 +109,7 @@ def test_gap_of_few_pinholes():
 
 @pytest.mark.parametrize(("n", "gap"), [(6, math.pi / 6), (7, math.pi / 14), (20, math.pi / 20), (45, math.pi / 90)])
 def test_gap_of_a_ring(n, gap):
-    """In its plane the worst planes stand upright, halfway between two pinholes or their opposites."""
+    """In the ring's plane: the worst planes are perpendicular to it, halfway between two pinholes or their opposites."""
     angles = 2 * np.pi * np.arange(n) / n + 0.2
     ring = pinholes(np.stack([np.cos(angles), np.sin(angles), 0 * angles], axis=1))
     found = mph.sampling_gaps(ring, [[0.0, 0, 0]], tolerance=1e-5)[0]
@@ -126,7 +126,7 @@ def test_gap_above_the_plane_of_a_ring_is_that_of_the_level_plane():
 
 
 def test_pinholes_all_around_leave_no_gap(rng):
-    """And more pinholes never widen one."""
+    """More pinholes never widen a gap."""
     directions = rng.normal(size=(1500, 3))
     gaps = [mph.sampling_gaps(pinholes(directions[:n]), [[3.0, 2, 1]])[0] for n in (5, 20, 100, 1500)]
     assert np.all(np.diff(gaps) < 0.1 * DEGREE)

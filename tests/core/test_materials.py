@@ -34,7 +34,7 @@ TC, TL = 140.5, 70.8
         ("air", 120, 1.7525e-5),
         ("muscle", TL, 0.02003),
         ("adipose tissue", TL, 0.01775),
-        # In Tc-99m's light: the constants.
+        # At Tc-99m's energy: the constants.
         ("tungsten", TC, TUNGSTEN_MU),
         ("lead", TC, LEAD_MU),
         ("NaI", TC, NAI_MU),
@@ -93,7 +93,7 @@ def test_shares_of_the_mass_are_those_of_the_formulas():
 
 
 def test_where_compton_scattering_rules_electrons_count():
-    """At 140.5 keV the coefficients of light materials are to water's as the electrons per volume."""
+    """At 140.5 keV the coefficients of light materials are proportional to their electrons per volume."""
     for name, per_gram in (("soft tissue", 0.5500), ("lung", 0.5505), ("PMMA", 0.5394)):
         expected = mph.MATERIALS[name].density * per_gram / 0.5551
         assert mph.attenuation(name, TC) / mph.attenuation("water", TC) == pytest.approx(expected, rel=1e-2)

@@ -1,4 +1,4 @@
-"""Meshes to volumes and back: volumes by the divergence theorem, on any grid, and open meshes named with the place."""
+"""Meshes to volumes and back: volumes by the divergence theorem, on any grid; open meshes are refused with the place."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""GATE 9 macros and the GATE 10 script, read back and compared with the geometry that they were made from."""
+"""GATE 9 macros and the GATE 10 script, read back and compared with their geometry."""
 
 from __future__ import annotations
 
@@ -67,7 +67,7 @@ COMMANDS = re.compile(
 
 
 class Volume(NamedTuple):
-    """Of a macro: its solid, and its places in its mother as GATE 9 hands them to Geant4."""
+    """A volume of a macro: its solid, and its placements in its mother as GATE 9 hands them to Geant4."""
 
     mother: str
     shape: str
@@ -261,7 +261,7 @@ def test_macros_of_any_scanner_hang_together(system, tmp_path) -> None:
 
 
 def test_heads_on_the_axes(tmp_path) -> None:
-    """Where rotations are none, quarter and half turns, and u has no z to be made of."""
+    """With rotations by 0, 90 and 180 degrees, and on the z axis, where z × k is 0."""
     centers = 200 * np.concatenate([np.eye(3), -np.eye(3), [[0.6, 0, 0.8]]])
     system = PinholeSystem(centers, 2.0, 60.0, 50.0, 10.0, 75.0)
     for chosen in (system, *(system[m] for m in range(len(system)))):
@@ -433,7 +433,7 @@ def test_the_script_bins_singles_into_the_real_detectors_pixels(system, tmp_path
         assert np.array_equal(found[m], expected) and found.sum() == len(targets)
 
 
-# Geant4 is built once per process: each of these runs in one of its own.
+# Geant4 is built once per process, so each of these tests runs in a process of its own.
 _DRIVER = """
 import json, sys
 import simulation as script
@@ -467,7 +467,7 @@ json.dump(described, open("described.json", "w"))
 
 
 def run_gate10(folder: Path, *command: str, **variables: str) -> str:
-    """What GATE 10 prints; it must not look for Geant4's data, which it would download."""
+    """The output of GATE 10; it must not look for Geant4's data, which it would download."""
     environment = {**os.environ, "GATEONRTD": "1", **variables}
     run = subprocess.run(
         [sys.executable, *command], cwd=folder, env=environment, capture_output=True, text=True, timeout=120
@@ -541,7 +541,7 @@ def test_gate10_chain_and_source(system, tmp_path) -> None:
     # Geant4's own units: MeV and ns.
     lines = ISOTOPES["I-123"].lines
     activity, energies, half_life, mother = described["source"]
-    # In opengate 10.1.1 each of the two threads emits what it is given.
+    # In opengate 10.1.1 each of the two threads emits the full activity of its source.
     assert activity == pytest.approx(2e6 / 2 * sum(p for _, p in lines) * 1e-9)
     np.testing.assert_allclose(energies, [e * 1e-3 for e, _ in lines])
     assert half_life == pytest.approx(ISOTOPES["I-123"].half_life * 1e9) and mother == "world"
@@ -556,7 +556,7 @@ def test_gate10_chain_and_source(system, tmp_path) -> None:
 
 
 class TrialSource:
-    """Of an opengate that hands `handed(activity, threads)` to the source of each thread; None: it has no such call."""
+    """An opengate that gives `handed(activity, threads)` to the source of each thread; None: it has no such call."""
 
     def __init__(self, handed, threads: int) -> None:
         self.handed, self.threads, self.activity = handed, threads, 0.0
@@ -605,7 +605,7 @@ def test_the_script_refuses_a_run_that_emitted_something_else(system, tmp_path) 
             script.check_emitted(data, round(wrong))
 
 
-# Geant4's data sets are not needed where photons only fly: empty files in their place, and no physics but decays.
+# Photons without interactions need no data sets: empty files in their place, and no physics but decays.
 _RUN = """
 import json, sys
 import opengate, uproot
@@ -631,7 +631,7 @@ json.dump([int(counts.events), threads], open("emitted.json", "w"))
 @needs_gate10
 @pytest.mark.parametrize("threads", [1, 2, 4])
 def test_gate10_emits_the_activity_whatever_the_number_of_threads(scanner, tmp_path, threads) -> None:
-    """Run by Geant4 itself; every thread emits its part, all together what was asked, within 5 standard deviations."""
+    """Run by Geant4: each thread emits its part, all together the requested activity, within 5 standard deviations."""
     asked = {"isotope": "Tc-99m", "activity": 2e-3, "time": 3, "seed": 11}
     folder = export(scanner[:2], tmp_path / "out", "gate10", **asked)
     (tmp_path / "ENSDFSTATE.dat").touch()

@@ -1,7 +1,7 @@
-"""Workbooks that are easily misread: each is read right, or refused, or warned of; none is wrong without a word.
+"""Workbooks that are easily misread: each is read correctly, refused or warned about; none is silently wrong.
 
 The files are made by hand, by openpyxl, XlsxWriter and LibreOffice. The short run reads a sample of each catalogue, the
-long one all. MPHDRR_TEST_EXAMPLES=2000 makes more of the random ones than the default.
+long run reads all. MPHDRR_TEST_EXAMPLES=2000 makes more random ones than the default.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ try:
 except ImportError:  # the property test skips
     settings = None
 
-# The same ones every time, unless more are asked for.
+# The same ones every time, unless more are requested.
 EXAMPLES, SAME = int(os.environ.get("MPHDRR_TEST_EXAMPLES", "60")), "MPHDRR_TEST_EXAMPLES" not in os.environ
 CATALOGUES = [
     real.CASES,
@@ -215,7 +215,7 @@ def test_changed_system_comes_back_from_its_template(name, tmp_path):
     assert back.system is not None, back.refusal
     assert not back.warnings
     assert not (wrong := differences(back.system, system)), wrong
-    # What was not changed is stored as it was, what was changed in the file's own unit.
+    # Unchanged numbers are stored as they were, changed ones in the file's own unit.
     x1 = before.system.source.cell("x1", int(system.numbers[-1]))
     old, new = (
         openpyxl.load_workbook(file, data_only=True)[x1[0]][x1[1]].value for file in (path, back.system.source.path)

@@ -1,4 +1,4 @@
-"""Laws of what modules see, count and resolve."""
+"""Laws of the modules' field of view, sensitivity and resolution."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ def points_around(rng, n=40, size=60.0):
 
 
 def test_a_module_sees_what_its_crystal_shows(system, rng):
-    """The projection matrices of views that cover the crystal say the same."""
+    """The projection matrices of views that cover the crystal agree."""
     points = points_around(rng, 3000, 250)
     n = 8
     matrices = system.views(shape=(n, n), detector="real").projection_matrices()
@@ -50,7 +50,7 @@ def test_sensitivity_is_the_law_of_the_point_source(system, rng):
 
 
 def test_sensitivity_is_what_emission_counts(system):
-    """A small voxel's counts, summed over a crystal of fine pixels, for every setting that both have."""
+    """A small voxel's counts, summed over a crystal of fine pixels, for every setting in common."""
     grid = mph.Grid.centered(1, 3.0, (8.0, -5.0, 11.0))
     settings = {"crystal_mu": 0.25, "photons_per_decay": 0.88, **EDGE}
     for whole in ({}, settings):
@@ -151,7 +151,7 @@ def test_what_cannot_be_is_refused_by_name(system, call, names):
 
 
 def test_poses_and_points_move_together(system, rng):
-    """A point at one place of a module's frame is the same to it wherever the module stands."""
+    """A point in a module's frame has the same performance wherever the module is."""
     local = np.array([10.0, -6.0, 150.0, 1.0])
     first, other = system[0:1], rng.normal(size=3)
     other *= system.pinhole_distance[0] / np.linalg.norm(other)

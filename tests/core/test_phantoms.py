@@ -60,7 +60,7 @@ def total(volume: mph.Volume) -> float:
 
 
 def lines(rng: np.random.Generator, n: int, reach: float) -> tuple[np.ndarray, np.ndarray]:
-    """Ends of lines (3, n), some along axes and planes, some of no length."""
+    """Ends of lines (3, n), some along axes and planes, some of length zero."""
     starts, ends = rng.uniform(-reach, reach, (2, 3, n))
     ends[:2, : n // 8] = starts[:2, : n // 8]
     ends[1:, n // 8 : n // 4] = starts[1:, n // 8 : n // 4]
@@ -77,7 +77,7 @@ def test_a_shape_is_the_same_to_points_lines_and_as_a_mesh(shape, rng):
     inside = np.stack([shape.distance(starts + t * (ends - starts)) < 0 for t in along])
     within = np.maximum(np.minimum(leave, 1) - np.maximum(enter, 0), 0).sum(axis=0)
     assert np.abs(inside.mean(axis=0) - within).max() < 4e-3
-    # The distance is a bound: nothing changes within it.
+    # The distance is a bound: within it nothing changes.
     points = rng.uniform(-13, 13, (3, 3000))
     distance = shape.distance(points)
     step = rng.normal(size=points.shape)
@@ -134,7 +134,7 @@ def test_line_integrals_are_those_of_the_values(phantom, quantity, rng):
     ids=lambda shape: shape.KIND,
 )
 def test_projections_of_voxels_converge_to_the_closed_form(shape, rng, capsys):
-    """A voxel's mean does not know where in it a ray runs: h for single rays, h^2 for the mean over many rays."""
+    """A voxel's mean does not depend on where in it the ray runs: h for single rays, h^2 for the mean over many rays."""
     phantom, pose = mph.ShapePhantom([shape]), mph.euler_pose(0.4, 0.7, -1.1, (1, 2, -3))
     starts = rng.normal(size=(20_000, 3))
     starts *= 200 / np.linalg.norm(starts, axis=1)[:, None]
@@ -406,7 +406,7 @@ def test_what_just_fits_is_made_and_holds_its_parts():
 
 
 def test_totals_are_what_the_layers_over_a_shape_leave_of_it():
-    """In closed form: the lens of two balls; and nothing of what is covered whole, however small beside its cover."""
+    """In closed form: the lens of two balls; and 0 for a shape that is completely covered, however small it is."""
     r, big, apart = 3.0, 100.0, 101.0
     lens = np.pi * (big + r - apart) ** 2 * (apart**2 + 2 * apart * (r + big) - 3 * (r - big) ** 2) / (12 * apart)
     small = mph.Sphere(radius=r, activity=7, position=(1, 2, 3))
@@ -416,7 +416,7 @@ def test_totals_are_what_the_layers_over_a_shape_leave_of_it():
     assert left == pytest.approx(7e-3 * (4 / 3 * np.pi * r**3 - lens), rel=2e-3)
     outer = dataclasses.replace(cover, position=(20, 0, 0))
     assert mph.ShapePhantom([small, outer]).total_activity == 0
-    # The other way around: the small one over the big one takes its part of it.
+    # The other way around: the small one replaces its part of the big one.
     both = mph.ShapePhantom([dataclasses.replace(cover, activity=1), small])
     expected = 4 / 3 * np.pi * (big**3 + 7 * r**3) - lens
     assert 1e3 * both.total_activity == pytest.approx(expected, abs=2e-3 * r**3)

@@ -1,4 +1,4 @@
-"""A pixel is an area: the counts of small sources do not depend on where they lie between the rays."""
+"""A pixel is an area: the counts of small sources do not depend on their position between the rays."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def totals(grid, n, backend="auto", **options):
 @pytest.mark.parametrize("n", [64, 128, 256, 512])
 @pytest.mark.parametrize("size", [0.5, 1.0, 4.0])
 def test_a_voxel_anywhere_counts_by_the_point_law(n, size, rng):
-    """Through the ideal pinhole; straight and turned voxels of a fraction of a pixel to several."""
+    """Through the ideal pinhole; parallel and rotated voxels, from a fraction of a pixel to several pixels."""
     places = in_ball(rng, 35, 3 if size < 1 and n == 64 else 6)
     for grid in [mph.Grid.centered(1, size, place) for place in places[1:]] + [turned_grid((1, 1, 1), size, places[0])]:
         np.testing.assert_allclose(totals(grid, n), law(MODULES, grid), rtol=0.02)
@@ -58,7 +58,7 @@ def test_capillaries_and_sheets_of_one_voxel_count_by_the_point_law(shape, point
 
 
 def test_a_voxel_of_a_large_grid_counts_by_the_point_law(rng):
-    """The number of rays is the whole grid's, for whichever voxel."""
+    """The number of rays depends on the whole grid, not on the filled voxels."""
     grid = mph.Grid.centered(64, 1.5)
     for index in rng.integers(4, 60, (6, 3)):
         volume = np.zeros(grid.shape)
@@ -67,7 +67,7 @@ def test_a_voxel_of_a_large_grid_counts_by_the_point_law(rng):
         A = mph.Projector(grid, MODULES.views((64, 64), "real"), mph.Emission(MODULES))
         expected = law(MODULES, mph.Grid.centered(1, 1.5, place))
         np.testing.assert_allclose(A(volume).sum(axis=(1, 2), dtype=float), expected, rtol=0.02)
-        # And the adjoint of ones is the sensitivity of that voxel, without gaps.
+        # The adjoint of ones is the voxel's sensitivity, without gaps.
     ones = np.ones(A.shape_out)
     assert A.T(ones)[tuple(index)] == pytest.approx(law(MODULES, mph.Grid.centered(1, 1.5, place)).sum(), rel=0.02)
 
@@ -76,7 +76,7 @@ def test_a_voxel_of_a_large_grid_counts_by_the_point_law(rng):
     "options", [{"pixel_points": 1}, {"pixel_points": 3}, {"pixel_points": 1, "aperture_points": 7}]
 )
 def test_too_few_points_are_warned_of_with_the_error_that_they_make(options):
-    """The error found for many places is at most what the warning says; where the tolerance is met, nothing is said."""
+    """The error at many positions is at most the warned one; if the tolerance is met, there is no warning."""
     views = MODULES.views((64, 64), "real")
     with pytest.warns(InputWarning, match=r"in module \d+") as caught:
         mph.Projector(mph.Grid.centered(1, 2.0), views, mph.Emission(MODULES, **options))
@@ -95,10 +95,10 @@ def test_what_no_number_of_points_can_do_is_said():
 
 @pytest.mark.parametrize("hole_points", [1, 5])
 def test_expected_error_bounds_the_error_of_a_shadow(hole_points, rng):
-    """Of the sum of a box's chords over the lattice, for many places of the box: against its volume."""
+    """Errors of the sum of a box's chords over the lattice, for many positions of the box, against its volume."""
     for _ in range(30):
         edges = np.zeros((1, 3, 2))
-        edges[0, :2] = np.diag(rng.uniform(0.1, 0.8, 2))  # seen along an axis: the worst there is
+        edges[0, :2] = np.diag(rng.uniform(0.1, 0.8, 2))  # seen along an axis: the worst case
         n = int(rng.choice([21, 55, 90]))
         bound = expected_error(edges, n, hole_points)
         places = np.concatenate([offsets(n, rng.random(2)) for _ in range(hole_points)])

@@ -23,7 +23,7 @@ def rotation(rng):
 
 
 def affine(linear, shape, center=(3.0, -5.0, 2.0)):
-    """An affine with its grid's middle at `center`."""
+    """An affine with its grid's centre at `center`."""
     a = np.eye(4)
     a[:3, :3] = linear
     a[:3, 3] = center - a[:3, :3] @ ((np.array(shape) - 1) / 2)

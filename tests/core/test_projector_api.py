@@ -172,7 +172,7 @@ def test_progress_counts_the_views_and_can_cancel():
     next(images)
     images.close()
     with pytest.raises(InputError):
-        A.iter_views(ONES[1:])  # at once, not at the first image
+        A.iter_views(ONES[1:])  # immediately, not at the first image
 
 
 def test_what_cannot_fit_is_refused_before_it_starts(monkeypatch):
@@ -228,7 +228,7 @@ with multiprocessing.get_context("fork").Pool(2) as pool:
 
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="processes fork on POSIX only")
 def test_forked_processes_project_too():
-    """The threads of a process stay behind when it forks, as the workers of data loaders do."""
+    """Threads do not survive a fork, which is how data loaders start their workers."""
     done = run_python(FORK)
     assert done.stdout.strip() == "1", done.stderr
 

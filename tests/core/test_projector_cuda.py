@@ -1,4 +1,4 @@
-"""The "cuda" backend's kernels: on a GPU where MPHDRR_CUDA_DEVICE=cuda asks for it, else the same on Warp's CPU device."""
+"""The "cuda" backend's kernels: on a GPU with MPHDRR_CUDA_DEVICE=cuda, else the same kernels on Warp's CPU device."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def device(monkeypatch):
 
 @pytest.fixture
 def small_pieces(monkeypatch):
-    """Launches of 17 rays: lines and fans in several pieces."""
+    """Launches of 17 rays: rows and fans in several pieces."""
     monkeypatch.setattr(cuda, "_RAYS_AT_ONCE", 17)
 
 
@@ -79,7 +79,7 @@ def test_thousands_of_voxels_do_not_add_up_errors():
 
 @pytest.mark.parametrize("kind", LINEAR)
 def test_fans_in_planes_of_faces(kind, rng):
-    """Rays that are made on the device belong to the same voxels as the reference's, up to which rounding may not go."""
+    """Rays made on the device meet the same voxels as the reference's, in spite of rounding."""
     grid = Grid(SHAPE, affine(LINEAR[kind], SHAPE))
     sources = np.array([[-9.5, 2.5, 1.5], [2.5, -9.5, 1.5], [2.5, 3.5, -9.5]] * 2)  # of the voxels' centres
     targets = sources + np.array([[30, 0, 0], [0, 30, 0], [0, 0, 30], [30, 10, 0], [10, 30, 0], [0, 10, 30]])
@@ -99,7 +99,7 @@ WEAKENED = ["mu on the same grid", "mu on another grid"]
 
 @pytest.fixture(params=["plain", *WEAKENED])
 def lattices(request, rng):
-    """A volume, rays through it, and what attenuates them, in float32: for "cuda", and in float64 for numpy."""
+    """A volume, rays through it and their attenuation, in float32 for "cuda" and in float64 for numpy."""
     volume, mu = rng.random(SHAPE), None
     starts, ends = rng.normal(size=(2, 300, 3)) * 6 + np.array(SHAPE) / 2
     ends[:150] = np.array(SHAPE) - starts[:150] + rng.normal(size=(150, 3))  # others miss, start or end inside
@@ -132,7 +132,7 @@ def test_derivatives_are_finite_differences(lattices):
     same = mu is not None and mu_rays is None
 
     def integral(ends=(zero, zero), mu_ends=(zero, zero), longer=1.0):
-        """The integral over alpha, with mu's rays moved on their own, and the exponent's length."""
+        """The integral over alpha, with mu's rays moved separately, and the length in the exponent."""
         changed = IndexRays(rays.starts, rays.directions, length * longer)
         changed, behind = moved(changed, *ends), moved(changed if same else mu_rays, *mu_ends)
         return reference.forward(volume, changed, weakened(mu, behind)) / changed.lengths
@@ -155,7 +155,7 @@ def test_derivatives_are_finite_differences(lattices):
 
 @pytest.mark.parametrize("rounding", [False, True])
 def test_derivatives_depend_on_mu_and_not_on_its_grid(rounding, rng):
-    """Mu on the volume's lattice, on one twice as fine, on one that goes on outside and on a part: planes met at once."""
+    """mu on the volume's lattice, on a twice finer, a larger and a smaller one: planes of both are crossed at once."""
     volume, mu = single(rng.random(SHAPE), rng.random(SHAPE) * 0.1)
     mu[0], mu[:, :, 3:] = 0, 0
     starts, ends = rng.normal(size=(2, 3000, 3)) * 6 + np.array(SHAPE) / 2
@@ -203,7 +203,7 @@ def test_adjoint_has_the_weights_of_the_integrals(lattices, rng):
 
 @pytest.mark.parametrize("attenuation", [None, "same", "other"])
 def test_projector_agrees_with_the_reference(attenuation, system, rng, monkeypatch):
-    """All of emission, views that are traced by rows and by columns, in launches of several views and of parts of one."""
+    """All of emission, with views traced by rows and by columns, in launches of several views and of parts of one."""
     grid = general_grid(rng, (20, 18, 16))
     mu_grid = general_grid(rng, (12, 14, 10)) if attenuation == "other" else grid
     mu = Volume(rng.uniform(0, 0.02, mu_grid.shape), mu_grid, "mu") if attenuation else None
@@ -291,7 +291,7 @@ def test_what_is_missing_is_said_in_one_line(monkeypatch):
         patch.setattr(cuda, "has_driver", lambda: False)
         assert "no NVIDIA driver" in refusal()
         backends._cuda_works.cache_clear()
-        assert not backends._cuda_works()  # a tensor on a GPU is for torch then
+        assert not backends._cuda_works()  # a tensor on a GPU then goes to torch
     backends._cuda_works.cache_clear()
     monkeypatch.setenv(cuda.DEVICE_VARIABLE, "cuda:99")
     monkeypatch.setattr(cuda, "has_driver", lambda: True)
@@ -310,7 +310,7 @@ def test_short_memory_means_more_launches(monkeypatch, rng):
     monkeypatch.setattr(warp, "launch", lambda *a, **k: launches.append(a[1]) or launch(*a, **k))
     expected = cuda.forward(volume, fans)
     monkeypatch.setattr(cuda, "_FEWEST_RAYS", 1)
-    monkeypatch.setattr(type(cuda.device()), "free_memory", 1000)  # 500 for the rays: 2 or 3 lines of a view
+    monkeypatch.setattr(type(cuda.device()), "free_memory", 1000)  # 500 for the rays: 2 or 3 rows of a view
     np.testing.assert_array_equal(cuda.forward(volume, fans), expected)
     assert launches[0] == (4, 7, 30) and len(launches) > 8 and {dim[0] for dim in launches[1:]} == {1}
 
@@ -334,7 +334,7 @@ def test_volume_too_large_for_the_device_is_refused(monkeypatch, rng):
 
 @pytest.mark.parametrize("same", [True, False])
 def test_gradients_are_those_of_the_reference(same, system, rng):
-    """Of rays by volume, mu and ends; of a projector by volume and mu; of cameras by their numbers."""
+    """For rays by volume, mu and ends; for a projector by volume and mu; for cameras by their parameters."""
     torch = pytest.importorskip("torch", reason="torch is not installed")
     from mphdrr.core.projector.poses import emission_images
 

@@ -83,7 +83,7 @@ def test_reconstruction_by_gradient_descent():
 
 
 def test_gradient_through_a_bad_loss_is_not_refused():
-    """A loss that turns to NaN is the training loop's to notice; it must not raise inside backward."""
+    """A loss of NaN is for the training loop to notice; it must not raise inside backward."""
     A = Projector(GRID, VIEWS)
     x = torch.zeros(GRID.shape, requires_grad=True)
     (A(x) * float("nan")).sum().backward()

@@ -1,4 +1,4 @@
-"""What a volume holds decides what can be made of it: the same rule by script and on the command line."""
+"""A volume's quantity decides what can be made of it: the same rule in scripts and on the command line."""
 
 from __future__ import annotations
 
@@ -137,7 +137,7 @@ def ct() -> mph.Volume:
 
 
 def _said_nothing(volume: mph.Volume, path) -> None:
-    """As other programs write it."""
+    """A file as other programs write it."""
     import nibabel
 
     nibabel.save(nibabel.Nifti1Image(volume.array, volume.grid.affine), path)

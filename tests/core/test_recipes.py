@@ -1,4 +1,4 @@
-"""Recipes: files, options and runs say the same; what old versions wrote is read."""
+"""Recipes: files, options and runs agree; files of old versions are read."""
 
 from __future__ import annotations
 
@@ -81,13 +81,13 @@ def test_options_their_recipe_and_its_run_make_the_same_images(workbook, tmp_pat
         assert run.recipe["model.aperture_mu"] == "tungsten" and run.recipe["noise.seed"] == run.seed == 4
     (again,) = mph.run_recipe(runs[0].recipe)  # from the files, not from the run
     np.testing.assert_array_equal(again.projections, runs[0].projections)
-    # Options override the recipe, and entries that then have no effect go.
+    # Options override the recipe, and entries that then have no effect are dropped.
     assert main(["project", first, "--transmission", "--set", "detector.rows=5", "-o", third]) == 0
     changed = mph.read_run(third)
     assert changed.projections.shape == (2, 5, 8) and changed.unit == "kBq/mL mm"
     assert "model.aperture_mu" not in changed.recipe.given and changed.recipe["phantom.position"] == (1, 2, 3)
     np.testing.assert_array_equal(changed.volume.array, runs[0].volume.array)
-    # Another place is another volume.
+    # Another position makes another volume.
     assert main(["project", first, "--position", "9", "0", "0", "-o", third]) == 0
     assert mph.read_run(third).volume.grid.center == pytest.approx([9, 0, 0])
 

@@ -1,4 +1,4 @@
-"""Recorders of warnings: each thread's take its own, in any order of beginning and ending, and leave nothing behind."""
+"""Recorders of warnings: each records its own thread, whatever the order of begin and end, and none leaves a trace."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from mphdrr.core.recording import recorded_warnings
 
 @pytest.fixture(autouse=True)
 def shown(monkeypatch):
-    """What is shown where no recorder takes it; afterwards all is as before."""
+    """The warnings shown without a recorder; afterwards everything is as before."""
     shown: list[str] = []
 
     def show(message, category, *where, **more):
@@ -114,7 +114,7 @@ def test_pythons_own_recorder_may_overlap(begins_first, ends_first, shown):
     _say("neither")
     assert shown == ["neither"]
     assert [*records["ours"], *(str(w.message) for w in records["Python's"])] == ["both"]
-    # What the overlap may leave is a hook that passes everything on; the next recorder takes it away.
+    # The overlap may leave a hook that passes everything on; the next recorder removes it.
     with recorded_warnings() as caught:
         _say("again")
     assert caught == ["again"]

@@ -48,7 +48,7 @@ def test_pose_error():
 
 
 def test_pose_of_a_camera_is_recovered(rng):
-    """Balls of different size, 61 x 63 pixels: what is left over at the coarse levels must not shift the image."""
+    """Balls of different size, 61 x 63 pixels: remainders at the coarse levels must not shift the image."""
     grid = Grid.centered((24, 24, 24), 4.0, (10.0, -5.0, 3.0))
     points = np.stack(np.meshgrid(*[np.arange(24)] * 3, indexing="ij"), -1)
     balls = sum(np.exp(-((points - c) ** 2).sum(-1) / (2 * w**2)) for c, w in zip(

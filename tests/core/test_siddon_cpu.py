@@ -1,4 +1,4 @@
-"""The binding of the C kernels: every level of processor, what is loaded, what is refused. See also tests/kernels."""
+"""The binding of the C kernels: levels of processor, which library is loaded, what is refused. See also tests/kernels."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def level(request, monkeypatch):
 
 
 def lattices_of(rng, kind, shape=(7, 6, 9)):
-    """A volume, and what maps rays to it: without mu, with mu on its lattice, with mu on another's."""
+    """A volume and its rays: without mu, with mu on its lattice, with mu on another lattice."""
     grid = Grid(shape, affine(LINEAR["rotated"], shape))
     other = Grid((5, 8, 4), affine(LINEAR["sheared"] * 1.2, (5, 8, 4)))
     volume = rng.random(shape).astype(kind)
@@ -111,7 +111,7 @@ def test_a_level_that_there_is_not_is_refused():
 
 @pytest.mark.skipif(sys.platform == "win32", reason="the names are those of other systems")
 def test_the_library_is_the_packages_own(tmp_path):
-    """Not one of its name in the working folder, or in one that the environment names."""
+    """Not a library of the same name in the working folder, or in a folder that the environment names."""
     for name in ("libsiddon.so", "libsiddon.dylib"):
         (tmp_path / name).write_text("not a library")
     paths = dict.fromkeys(

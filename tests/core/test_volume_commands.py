@@ -104,7 +104,7 @@ def test_project_converts_and_centers_a_ct(tmp_path, ct, workbook, capsys):
     assert result.projections.max() == pytest.approx(24 * attenuation("water", 140.5), rel=0.5)
     assert result.settings["ct_converted_at_kev"] == 140.5
 
-    # Activity and CT in one frame stay together: as if both had been centred before.
+    # Activity and CT in one frame stay together, as if both had been centred before.
     activity = mph.Volume(ct.array == 0, ct.grid, "activity")
     mph.write_volume(activity, tmp_path / "a.nrrd")
     emission = ("--emission", "--mu", ct_file, "--energy", 140.5, "--center")
@@ -132,7 +132,7 @@ def test_project_converts_and_centers_a_ct(tmp_path, ct, workbook, capsys):
 
 
 def test_project_takes_one_series_of_a_dicom_folder(tmp_path, ct, workbook, capsys):
-    """As the radiograph of the volume, and the counts through the mu, that the series was written from."""
+    """Equal to the radiograph of the volume, and the counts with the mu, from which the series was written."""
     affine = np.diag([2.0, 2, 3, 1])
     affine[:3, 3] = ct.grid.affine[:3, 3]
     ct = mph.Volume(ct.array, mph.Grid(ct.grid.shape, affine), "hu")

@@ -1,4 +1,4 @@
-"""Volumes in every format: round trips, where DICOM and ITK put things, and one clear line for what is no volume."""
+"""Volumes in every format: round trips, positions in DICOM and ITK, and one clear line for files that are no volumes."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ CHEST = Path(__file__).parents[3] / "shared" / "data" / "chest_ct_3mm.nii.gz"
 
 
 def turned_grid(shape=(5, 6, 7)) -> mph.Grid:
-    """Oblique, with right angles and iz towards the head: what a series can hold as it is."""
+    """Oblique, with right angles and iz towards the head: a grid that a series can express."""
     affine = euler_pose(0.3, 0.2, -0.1, (10, -20, 30))
     affine[:3, :3] @= np.diag([0.7, 0.9, 2.5])
     return mph.Grid(shape, affine)
@@ -169,7 +169,7 @@ def test_nrrd_spaces(tmp_path, rng, space):
 
 
 def test_a_series_in_any_order_is_the_volume_it_was_written_from(tmp_path, ct, rng):
-    names = [f"IM{n:03d}" for n in rng.permutation(7)]  # no suffix, and the order of names says nothing
+    names = [f"IM{n:03d}" for n in rng.permutation(7)]  # no suffix, and names in no order
     write_series(ct, tmp_path / "series", names=names)
     (tmp_path / "series" / "readme.txt").write_text("not an image")
     seen = []
@@ -277,7 +277,7 @@ def test_enhanced_and_run_length_coded_images(tmp_path, ct):
 @pytest.mark.parametrize("mirrored", [False, True])
 @pytest.mark.parametrize("order", [range(7), range(6, -1, -1), (2, 0, 5, 1, 4, 6, 3)], ids=["up", "down", "any"])
 def test_a_reconstructed_tomogram_is_the_volume_it_was_written_from(tmp_path, rng, mirrored, order):
-    """By the first frame's place and the signed spacing; mirrored, the slices follow each other against their normal."""
+    """By the first frame's position and the signed spacing; if mirrored, slices follow each other against their normal."""
     grid = turned_grid()
     if mirrored:
         grid = mph.Grid(grid.shape, grid.affine @ np.diag([-1, 1, 1, 1]))
@@ -289,7 +289,7 @@ def test_a_reconstructed_tomogram_is_the_volume_it_was_written_from(tmp_path, rn
         back = mph.read_volume(path, "activity")
         assert np.array_equal(back.array, volume.array)
         assert np.allclose(back.grid.affine, grid.affine, rtol=0, atol=1e-9)
-    # Some programs write the place beside the detectors; and values in Bq/mL say so.
+    # Some programs write the position outside the detectors; values in Bq/mL are marked so.
     (detector,) = data.DetectorInformationSequence
     place = {name: getattr(detector, name) for name in ("ImagePositionPatient", "ImageOrientationPatient")}
     unit, mapping = Dataset(), Dataset()
@@ -363,7 +363,7 @@ def _tilt(written, folder):
 
 def _cut_before_its_rows(size):
     def cut(written, folder):
-        last = Path(written[-1].filename)  # no gap tells that it is missing
+        last = Path(written[-1].filename)  # it leaves no gap
         last.write_bytes(last.read_bytes()[:size])
 
     return cut
@@ -614,14 +614,14 @@ def test_bad_input_gets_one_line_that_names_the_place(tmp_path, ct, case, caplog
     assert expected in message
     assert message.startswith(f"{path}: ")
     assert "\n" not in message
-    assert "nibabel" not in caplog.text  # it would print that on standard error
+    assert "nibabel" not in caplog.text  # which would be printed on standard error
 
 
 @pytest.mark.parametrize("of_series", [False, True])
 def test_what_may_not_be_read_is_said_and_not_left_out(tmp_path, ct, monkeypatch, of_series):
     write_series(ct, tmp_path / "s", names=[f"slice{k}" for k in range(7)])
     mph.write_volume(ct, tmp_path / "v.nii")
-    locked = tmp_path / "s/slice6" if of_series else tmp_path / "v.nii"  # no gap tells of a last slice
+    locked = tmp_path / "s/slice6" if of_series else tmp_path / "v.nii"  # a missing last slice leaves no gap
     may_open = io.open
 
     def open_others(path, *args, **kwargs):

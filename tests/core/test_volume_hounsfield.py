@@ -1,4 +1,4 @@
-"""CT numbers to attenuation: the fixed points of the bilinear curve, at any energy, and what lies beyond it."""
+"""CT numbers to attenuation: the fixed points of the bilinear curve, at any energy, and values beyond it."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Where voxels lie by the fields of a header: each is honoured, refused or said, and SimpleITK puts them there too."""
+"""Voxel positions by a header's fields: each is used, refused or warned about, and SimpleITK agrees."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import mphdrr.core as mph
 
 try:
     import SimpleITK as itk
-except ImportError:  # where it is installed its places are compared, too
+except ImportError:  # if it is installed, its positions are compared too
     itk = None
 
 LPS = np.diag([-1.0, -1, 1, 1])
@@ -43,7 +43,7 @@ def read(path) -> tuple[mph.Volume, list[str]]:
 
 
 MINS = {"spacings": "1 2 3", "axis mins": "10 20 30"}
-# Fields of the axes, index to mm, and whether something of the voxels had to be assumed.
+# Fields of the axes, index to mm, and whether something about the voxels had to be assumed.
 OF_AXES = {
     "cells": ({**MINS, "centerings": "cell cell cell"}, at((10.5, 21, 31.5)), False),
     "cells, by the other names": (

@@ -1,4 +1,4 @@
-"""Volumes on other grids: what is linear stays, sums are kept, and nothing moves in the world."""
+"""Volumes on other grids: linear functions and sums are preserved, and nothing moves in the world."""
 
 from __future__ import annotations
 

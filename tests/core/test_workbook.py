@@ -1,4 +1,4 @@
-"""The workbook reader: what it reads, finds, computes, warns of and refuses."""
+"""The workbook reader: what it reads, finds, computes, warns about and refuses."""
 
 from __future__ import annotations
 
@@ -101,7 +101,7 @@ def saved(book: Workbook, folder: Path, name: str = "scanner.xlsx") -> Path:
 
 
 def read_edited(folder: Path, edit: Callable[[Worksheet, Worksheet], object]):
-    """What is read from the plain workbook after `edit(main, coordinates)`."""
+    """The system read from the plain workbook after `edit(main, coordinates)`."""
     book = plain()
     edit(book["Main"], book["Coordinates"])
     return read_system(saved(book, folder))
@@ -507,7 +507,7 @@ def test_values_typed_as_displayed_are_not_warned_of(tmp_path):
                 coordinates.cell(row, column, round(coordinates.cell(row, column).value, 3))
 
     system = read_edited(tmp_path, edit)
-    assert system.collimator_length[0] == round(float(system.collimator_length[0]), 2)  # typed numbers are the master
+    assert system.collimator_length[0] == round(float(system.collimator_length[0]), 2)  # typed numbers prevail
 
 
 def test_tolerance_is_the_rounding_shown():

@@ -1,4 +1,4 @@
-"""What is not understood for certain is refused, naming the cell; what is, is right, in whatever unit."""
+"""What is not understood with certainty is refused, naming the cell; everything else is read correctly, in any unit."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The workbook writer: the system comes back, formulas stay and are right, and nothing else changes."""
+"""The workbook writer: the system can be read back, formulas stay and are right, and nothing else changes."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ def read_quietly(path) -> mph.PinholeSystem:
 
 
 def write_changed(folder, layout: Layout, seed: int):
-    """A template of the layout, a change of its system, and what is written of that."""
+    """A template of the layout, a change of its system, and the written result."""
     template = folder / "template.xlsx"
     template.write_bytes(content_of(laid_out(layout)))
     system = random_change(np.random.default_rng(seed), read_quietly(template), layout)
@@ -66,7 +66,7 @@ def write_changed(folder, layout: Layout, seed: int):
 
 
 def assert_in_order(path) -> None:
-    """Rows and cells stand once each and in order, formulas before values, as spreadsheet programs demand."""
+    """Rows and cells occur once each and in order, formulas before values, as spreadsheet programs require."""
     main = "{http://schemas.openxmlformats.org/spreadsheetml/2006/main}"
     with zipfile.ZipFile(path) as archive:
         for name in archive.namelist():
@@ -138,7 +138,7 @@ else:
     # One module becomes three; one cell for all modules becomes one for each, to which formulas of H do not refer.
     @example(Layout(n=1, numbered=False), 2)
     @example(Layout(n=4, one_sheet=True, shared=True, inputs=True, top=2, seed=739), 197743)
-    # The first of the modules without numbers goes, and the one cell for all becomes one for each.
+    # The first of the modules without numbers is removed, and the one cell for all becomes one for each.
     @example(Layout(n=4, numbered=False, shared=True, derived="absent"), 97)
     def test_any_change_of_any_layout_comes_back(tmp_path_factory, layout, seed):
         check_a_change_comes_back(tmp_path_factory.mktemp("w"), layout, seed)
@@ -259,7 +259,7 @@ def test_new_workbook_is_laid_out_as_the_real_one(workbook, tmp_path):
 
 @pytest.fixture
 def template(tmp_path):
-    """Four modules with formulas everywhere; its values as LibreOffice would have stored them do not matter."""
+    """Four modules with formulas everywhere; the stored values do not matter."""
     path = tmp_path / "template.xlsx"
     path.write_bytes(content_of(laid_out(Layout(seed=3))))
     return path
@@ -382,7 +382,7 @@ def test_a_formula_that_gives_the_new_number_stays(template, tmp_path):
 
 
 def test_a_formula_that_comes_to_refer_to_itself_is_replaced_alone(template, tmp_path):
-    """As a spreadsheet sorts, =B$3 of another row comes to stand in B3 itself; what depends on it stays a formula."""
+    """Sorted as by a spreadsheet, =B$3 of another row moves to B3 itself; cells that depend on it stay formulas."""
     book = openpyxl.load_workbook(template)
     for row in range(4, 7):
         book["Main"][f"B{row}"] = "=B$3"
@@ -551,7 +551,7 @@ def test_bad_templates_are_refused_as_by_the_reader(template, tmp_path):
 def test_a_system_that_would_be_refused_is_not_written(template, tmp_path):
     system = read_quietly(template)
     centers = system.centers.copy()
-    centers[1] = centers[0] + 1e-9  # one place, as far as a workbook can tell
+    centers[1] = centers[0] + 1e-9  # the same position, in a workbook's precision
     twice = changed(system, centers=centers)
     for source, name in ((template, "template.xlsx"), (None, "the new workbook")):
         with pytest.raises(mph.InputError, match=f"^{name} cannot hold this system, with it: {name}: Coordinates!B4 "):

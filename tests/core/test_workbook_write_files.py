@@ -1,4 +1,4 @@
-"""The written file: all that is not changed is byte for byte the template's, whatever its XML looks like."""
+"""The written file: everything unchanged is byte for byte the template's, whatever its XML looks like."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def infos_of(path: Path) -> list[tuple]:
 
 
 def repacked(content: bytes, edit) -> bytes:
-    """A workbook with its members' bytes as `edit(name, data)` gives them; None leaves one out."""
+    """A workbook with the members' bytes that `edit(name, data)` returns; None omits a member."""
     out = io.BytesIO()
     with zipfile.ZipFile(io.BytesIO(content)) as old, zipfile.ZipFile(out, "w") as new:
         for info in old.infolist():
@@ -177,7 +177,7 @@ def _prefixed(xml: str) -> str:
 
 
 def _without_places(xml: str) -> str:
-    """No r where a cell or row follows the one before."""
+    """No attribute r if a cell or row directly follows the previous one."""
     xml = re.sub(r'<c r="A(\d+)"', r"<c", xml)
     return re.sub(r'<row r="([23456])"', "<row", xml) if '<row r="1"' in xml else xml
 
@@ -215,7 +215,7 @@ def _edit(system: mph.PinholeSystem) -> mph.PinholeSystem:
 
 @pytest.fixture(scope="module")
 def plain_written(tmp_path_factory):
-    """A system and what is written of it into a workbook with usual XML."""
+    """A system, and the result of writing it into a workbook with usual XML."""
     folder = tmp_path_factory.mktemp("plain")
     plain = folder / "plain.xlsx"
     plain.write_bytes(content_of(laid_out(Layout(seed=11))))
@@ -365,7 +365,7 @@ def test_formulas_stay_through_names_sheets_and_whole_columns(tmp_path):
     assert values["Theta", "A6"] == 2
     assert values["It's values", "B1"] == pytest.approx(2 * x.sum() + 1, rel=1e-12)
     assert "Coordinates!B3" not in written.changed
-    assert values["Theta", "A3"] == 2 * x[0]  # it has not moved, but had no value
+    assert values["Theta", "A3"] == 2 * x[0]  # it did not move, but had no value
     beyond = [f"{sheet}{row}" for sheet in ("Theta!A", "It's values!B") for row in (9, 10, 11)]
     assert set(written.cleared) == {*beyond, "It's values!D1"}
 
@@ -387,7 +387,7 @@ def test_formulas_of_tables_store_no_value_if_the_table_changes(tmp_path):
     template.write_bytes(repacked(content_of(book), lambda name, data: stored.sub(rb"\1<v>77</v>", data)))
     written = write_quietly(moved(read_quietly(template)), tmp_path / "o.xlsx", template)
     values = values_of(written.path)
-    assert values["Other", "D1"] == 77  # as it was stored: nothing that it refers to has changed
+    assert values["Other", "D1"] == 77  # as stored before: nothing that it refers to has changed
     assert {"Other!D2", "Other!D3"} <= set(written.cleared)
     assert ("Other", "D2") not in values
     assert values_of(written.path, data_only=False)["Other", "D2"] == "=SUM(Pins[x1])"

@@ -50,7 +50,7 @@ def random_system(rng, n: int, shared: bool) -> PinholeSystem:
 
 @dataclasses.dataclass(frozen=True)
 class Layout:
-    """How a random workbook is laid out."""
+    """The layout of a random workbook."""
 
     n: int = 4
     numbered: bool = True

@@ -1,4 +1,4 @@
-"""The kernels without Python around them, on hostile rays: under sanitizers, for arm64 under qemu, for Windows under Wine.
+"""The kernels without Python, on hostile rays: under sanitizers, for arm64 under qemu, for Windows under Wine.
 
 check.c runs thousands of bundles of rays from a file. Their results are compared with the float64 reference in numpy; that
 nothing is read or written outside its array is seen by sanitizers, and elsewhere by pages that cannot be touched.
@@ -42,8 +42,8 @@ class Bundle:
     rays: IndexRays | IndexFans
     attenuation: Attenuation | None
     values: Array
-    tame: Array  # which rays the reference has an answer for
-    by_ends: bool  # whether derivatives by the ends are compared: where edges are met, they jump
+    tame: Array  # rays that the reference can compute
+    by_ends: bool  # whether derivatives by the ends are compared: at edges they are discontinuous
     tolerance: float
 
 
@@ -59,11 +59,11 @@ def points(rng: np.random.Generator, count: int, shape: tuple[int, ...]) -> Arra
 
 
 def hostile(rng: np.random.Generator, starts: Array, ends: Array, shape: tuple[int, ...], kind: str) -> Array:
-    """Change some of the rays in place; say which."""
+    """Change some of the rays in place; return which."""
     changed = rng.random(len(starts)) < 0.5
     for i in np.flatnonzero(changed):
         a, b = rng.permutation(3)[:2]
-        if kind == "awkward":  # through edges and corners, along faces and edges, of no length
+        if kind == "awkward":  # through edges and corners, along faces and edges, of length zero
             which = rng.integers(5)
             corner = rng.integers(-1, np.array(shape) + 2).astype(float)
             if which == 0:
@@ -120,7 +120,7 @@ def bundles() -> Iterator[Bundle]:
             with np.errstate(all="ignore"):
                 lengths = np.linalg.norm(ends - starts, axis=1) * 1.5
                 rays = IndexRays(starts, ends - starts, lengths)
-                # mu's lattice lies a little elsewhere and is coarser.
+                # mu's lattice is slightly shifted and coarser.
                 mu_rays = IndexRays(starts * 0.7 + 0.3, (ends - starts) * 0.7, lengths) if attenuated == "own" else None
             tame, by_ends = ~changed if kind == "wild" else np.ones(count, bool), kind == "ordinary"
         values = rng.random(len(rays)).astype(number)
@@ -149,7 +149,7 @@ def packed(bundle: Bundle, level: int) -> bytes:
 
 
 def expected(bundle: Bundle) -> list[tuple[Array, float]]:
-    """What comes of a bundle by the reference: arrays in check.c's order, each with the size of what is summed up in it.
+    """The reference's results for a bundle: arrays in check.c's order, each with the magnitude of its summands.
 
     NaN is not compared.
     """
@@ -164,7 +164,7 @@ def expected(bundle: Bundle) -> list[tuple[Array, float]]:
     back = np.full(volume.shape, np.nan)
     rows = np.full((7 if attenuation is None else 14, len(rays)), np.nan)
     gradient = np.full(() if attenuation is None else attenuation.mu.shape, np.nan)
-    behind = 0.0  # derivatives by mu are differences of what lies behind
+    behind = 0.0  # derivatives by mu are differences of integrals beyond a voxel
     if bundle.tame.all():
         back[:] = 0.0
         reference.backproject(back, values, rays, attenuation)

@@ -3,24 +3,27 @@
 from __future__ import annotations
 
 import argparse
-import math
 from typing import Any
 
 from numpy.typing import NDArray
 
-from ...errors import InputError
+from ...geometry.collimator import angle_from_degrees
 from ...geometry.system import PinholeSystem
 from ...physics.isotopes import ISOTOPES, isotope
 from ...physics.materials import APERTURES, CRYSTALS, module_coefficients
-from ..options import number_or_name
+from ..options import add_command, add_workbook, number_or_name
 
 MATERIAL_OPTIONS = ("aperture_mu", "opening_angle", "crystal_mu", "intrinsic_fwhm", "isotope")
 """Destinations of the options of `add_materials`."""
 
 
-def add_json(parser: argparse.ArgumentParser) -> None:
-    """Add ``--json``."""
+def add_action(actions, name: str, summary: str, example: str, run: Any) -> argparse.ArgumentParser:  # type: ignore[no-untyped-def]
+    """The parser of an action on a workbook, with ``--json``."""
+    parser = add_command(actions, name, summary, f"mphdrr geometry {name} scanner.xlsx{example}")
+    add_workbook(parser)
     parser.add_argument("--json", action="store_true", help="print JSON")
+    parser.set_defaults(run=run)
+    return parser
 
 
 def table_rows(columns: dict[str, NDArray[Any]]) -> list[dict[str, Any]]:
@@ -30,7 +33,7 @@ def table_rows(columns: dict[str, NDArray[Any]]) -> list[dict[str, Any]]:
 
 
 def add_materials(parser: argparse.ArgumentParser) -> None:
-    """Add the materials and the isotope, for `sensitivity_settings` and `resolution_settings`."""
+    """Add the materials and the isotope, for `sensitivity_settings` and `edge_settings`."""
     group = parser.add_argument_group("materials; without an option the module is ideal")
     add_edge(group)
     group.add_argument(
@@ -54,35 +57,19 @@ def add_edge(parser: argparse._ActionsContainer) -> None:
 
 def edge_settings(arguments: argparse.Namespace, system: PinholeSystem) -> dict[str, Any]:
     """Attenuation coefficient of the aperture and angle of its knife edge, as keywords."""
-    angle = _angle(arguments)
-    aperture, _ = module_coefficients(arguments.aperture_mu, None, _lines(arguments), system, angle)
-    return {"aperture_mu": aperture, "opening_angle": angle}
+    settings = sensitivity_settings(arguments, system)
+    return {name: settings[name] for name in ("aperture_mu", "opening_angle")}
 
 
 def sensitivity_settings(arguments: argparse.Namespace, system: PinholeSystem) -> dict[str, Any]:
     """The keywords of `sensitivity`."""
-    lines, angle = _lines(arguments), _angle(arguments)
-    aperture, crystal = module_coefficients(arguments.aperture_mu, arguments.crystal_mu, lines, system, angle)
-    photons = 1.0 if arguments.isotope is None else sum(photons for _, photons in lines)
+    lines: tuple[tuple[float, float], ...] = ()
+    photons = 1.0
+    if arguments.isotope is not None:
+        decaying = isotope(arguments.isotope)
+        lines = decaying.lines_within(*decaying.window)  # within its energy window
+        photons = sum(number for _, number in lines)
+    angle = angle_from_degrees(arguments.opening_angle, "--opening-angle")
+    crystal_mu = getattr(arguments, "crystal_mu", None)  # not every action has a crystal
+    aperture, crystal = module_coefficients(arguments.aperture_mu, crystal_mu, lines, system, angle)
     return {"aperture_mu": aperture, "opening_angle": angle, "crystal_mu": crystal, "photons_per_decay": photons}
-
-
-def resolution_settings(arguments: argparse.Namespace, system: PinholeSystem) -> dict[str, Any]:
-    """The keywords of `resolution`."""
-    return {**edge_settings(arguments, system), "intrinsic_fwhm": arguments.intrinsic_fwhm}
-
-
-def _lines(arguments: argparse.Namespace) -> tuple[tuple[float, float], ...]:
-    """The isotope's lines in its energy window."""
-    if arguments.isotope is None:
-        return ()
-    decaying = isotope(arguments.isotope)
-    return decaying.lines_within(*decaying.window)
-
-
-def _angle(arguments: argparse.Namespace) -> float:
-    """The knife edge's opening angle, rad."""
-    degrees = arguments.opening_angle
-    if not 0 < degrees < 180:
-        raise InputError(f"--opening-angle {degrees:g}: expected degrees, more than 0 and less than 180")
-    return math.radians(degrees)

@@ -15,21 +15,20 @@ from ...geometry.collimator import EdgePlace
 from ...geometry.system import PinholeSystem
 from ...physics.isotopes import ISOTOPES
 from ...recording import recorded_warnings
-from ..options import add_command, add_workbook, read_workbook, refuse
-from .arguments import add_edge, add_json, edge_settings
+from ..options import read_workbook, refuse
+from .arguments import add_action, add_edge, edge_settings
 
 
 def add_parser(actions) -> None:  # type: ignore[no-untyped-def]
     """Add the action."""
-    parser = add_command(
+    parser = add_action(
         actions,
         "check",
         "compare the workbook with the design formulas, and find modules that overlap, do not see their ROI, block each "
         "other or have unsuitable plates",
-        "mphdrr geometry check scanner.xlsx --wall 3 --strict",
+        " --wall 3 --strict",
+        _run,
     )
-    add_workbook(parser)
-    add_json(parser)
     parser.add_argument("--plate", type=float, default=2.0, metavar="MM", help="thickness of the aperture plates")
     parser.add_argument("--wall", type=float, default=2.0, metavar="MM", help="thickness of the collimators' walls")
     parser.add_argument(
@@ -41,7 +40,6 @@ def add_parser(actions) -> None:  # type: ignore[no-untyped-def]
         "--isotope", metavar="NAME", help=f"{', '.join(ISOTOPES)}: its photons must be stopped by the plates"
     )
     parser.add_argument("--strict", action="store_true", help="exit with status 1 if there is any warning or finding")
-    parser.set_defaults(run=_run)
 
 
 def _run(arguments: argparse.Namespace) -> None:
@@ -57,7 +55,10 @@ def _run(arguments: argparse.Namespace) -> None:
         **edge_settings(arguments, system),
     )
     findings = report.messages()
-    total = f"{_count(messages, 'warning')} of the workbook, {_count(findings, 'finding')} in the geometry"
+    warnings, found = (
+        f"{len(x)} {name}{'s' * (len(x) != 1)}" for x, name in ((messages, "warning"), (findings, "finding"))
+    )
+    total = f"{warnings} of the workbook, {found} in the geometry"
     if arguments.json:
         answer = {"summary": _summary(system), "warnings": messages, "findings": findings, "geometry": report.as_dict()}
         print(json.dumps(answer, indent=1))
@@ -73,24 +74,16 @@ def _run(arguments: argparse.Namespace) -> None:
         raise InputError(f"{arguments.workbook}: {total}")
 
 
-def _count(lines: list[str], name: str) -> str:
-    return f"{len(lines)} {name}{'' if len(lines) == 1 else 's'}"
-
-
 def _summary(system: PinholeSystem) -> dict[str, str]:
-    counts = np.bincount(system.rings())
-    return {
-        "modules": str(len(system)),
-        "rings": " + ".join(map(str, counts)),
-        "b, pinhole distance": _range(system.pinhole_distance),
-        "l, collimator length": _range(system.collimator_length),
-        "d, pinhole diameter": _range(system.pinhole_diameter),
-        "Ld, crystal side": _range(system.detector_side),
-        "Td, crystal thickness": _range(system.detector_thickness),
-        "R, ROI radius": _range(system.roi_radius),
-    }
-
-
-def _range(values: np.ndarray) -> str:
-    low, high = values.min(), values.max()
-    return f"{low:g} mm" if low == high else f"{low:.2f} to {high:.2f} mm"
+    lines = {"modules": str(len(system)), "rings": " + ".join(map(str, np.bincount(system.rings())))}
+    for name, values in {
+        "b, pinhole distance": system.pinhole_distance,
+        "l, collimator length": system.collimator_length,
+        "d, pinhole diameter": system.pinhole_diameter,
+        "Ld, crystal side": system.detector_side,
+        "Td, crystal thickness": system.detector_thickness,
+        "R, ROI radius": system.roi_radius,
+    }.items():
+        low, high = values.min(), values.max()
+        lines[name] = f"{low:g} mm" if low == high else f"{low:.2f} to {high:.2f} mm"
+    return lines

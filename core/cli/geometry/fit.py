@@ -9,23 +9,21 @@ from typing import Any
 import numpy as np
 
 from ...geometry.ring_fits import RingFit, fit_rings
-from ..options import add_command, add_workbook, read_workbook
-from .arguments import add_json
+from ..options import read_workbook
+from .arguments import add_action
 
 _FOLLOWS = 0.1  # mm off the ellipse that rounding in a workbook explains
 
 
 def add_parser(actions) -> None:  # type: ignore[no-untyped-def]
     """Add the action."""
-    parser = add_command(
+    add_action(
         actions,
         "fit",
         "find the ellipse that each ring of modules follows, and the modules' distances from it",
-        "mphdrr geometry fit scanner.xlsx",
+        "",
+        _run,
     )
-    add_workbook(parser)
-    add_json(parser)
-    parser.set_defaults(run=_run)
 
 
 def _run(arguments: argparse.Namespace) -> None:

@@ -13,6 +13,14 @@ from ...geometry.system import PinholeSystem
 from ...workbook import write_system
 from ..options import add_command, output_path
 
+_SIZES = {
+    "--d": ("pinhole_diameter", 2.3, "pinhole diameter"),
+    "--Ld": ("detector_side", 50.0, "side of the crystal"),
+    "--Td": ("detector_thickness", 10.0, "thickness of the crystal"),
+    "--R": ("roi_radius", 75.0, "ROI radius"),
+    "--l": ("collimator_length", None, "collimator length; default: so that the ROI is just seen"),
+}
+
 
 def add_parser(actions) -> None:  # type: ignore[no-untyped-def]
     """Add the action."""
@@ -23,11 +31,6 @@ def add_parser(actions) -> None:  # type: ignore[no-untyped-def]
         "mphdrr geometry generate ellipse --semi-axes 273 220.5 --z -71 -24 --mirrored -o scanner.xlsx",
     )
     shapes = generate.add_subparsers(metavar="SHAPE", required=True)
-    _add_ellipse(shapes)
-    _add_plates(shapes)
-
-
-def _add_ellipse(shapes) -> None:  # type: ignore[no-untyped-def]
     parser = add_command(
         shapes,
         "ellipse",
@@ -48,11 +51,7 @@ def _add_ellipse(shapes) -> None:  # type: ignore[no-untyped-def]
         "--end", type=float, default=360.0, metavar="DEG", help="of its last; a full turn after the start: closed"
     )
     parser.add_argument("--spacing", choices=("angle", "arc"), default="angle", help="equal steps in angle, or in arc")
-    _add_modules(parser)
-    parser.set_defaults(run=_run, generate=_ellipse)
-
-
-def _add_plates(shapes) -> None:  # type: ignore[no-untyped-def]
+    _add_modules(parser, _ellipse)
     parser = add_command(
         shapes,
         "plates",
@@ -68,31 +67,22 @@ def _add_plates(shapes) -> None:  # type: ignore[no-untyped-def]
     parser.add_argument("--apothem", type=float, metavar="MM", help="distance of the polygon's plates")
     parser.add_argument("--rotation", type=float, default=0.0, metavar="DEG", help="azimuth of its first plate")
     parser.add_argument("--open", action="store_true", help="no plate joins the last vertex to the first")
-    _add_modules(parser)
-    parser.set_defaults(run=_run, generate=_plates)
+    _add_modules(parser, _plates)
 
 
-def _add_modules(parser: argparse.ArgumentParser) -> None:
+def _add_modules(parser: argparse.ArgumentParser, generate: Any) -> None:
     parser.add_argument("--z", type=float, nargs="+", required=True, metavar="MM", help="of each ring")
     parser.add_argument("--mirrored", action="store_true", help="add the rings' mirror images at z = 0")
     group = parser.add_argument_group("the modules")
-    group.add_argument("--d", type=float, default=2.3, metavar="MM", help="pinhole diameter")
-    group.add_argument("--Ld", type=float, default=50.0, metavar="MM", help="side of the crystal")
-    group.add_argument("--Td", type=float, default=10.0, metavar="MM", help="thickness of the crystal")
-    group.add_argument("--R", type=float, default=75.0, metavar="MM", help="ROI radius")
-    group.add_argument("--l", type=float, metavar="MM", help="collimator length; default: so that the ROI is just seen")
+    for name, (size, default, text) in _SIZES.items():
+        group.add_argument(name, dest=size, type=float, default=default, metavar="MM", help=text)
     parser.add_argument("-o", "--output", required=True, metavar="FILE", help=".xlsx")
+    parser.set_defaults(run=_run, generate=generate)
 
 
 def _run(arguments: argparse.Namespace) -> None:
     path = output_path(arguments.output, (".xlsx",))
-    sizes = {
-        "pinhole_diameter": arguments.d,
-        "detector_side": arguments.Ld,
-        "detector_thickness": arguments.Td,
-        "roi_radius": arguments.R,
-        "collimator_length": arguments.l,
-    }
+    sizes = {size: getattr(arguments, size) for size, _, _ in _SIZES.values()}
     system = arguments.generate(arguments, {"z": arguments.z, "mirrored": arguments.mirrored, **sizes})
     write_system(system, path)
     b, l = system.pinhole_distance, system.collimator_length
@@ -102,16 +92,9 @@ def _run(arguments: argparse.Namespace) -> None:
 def _ellipse(arguments: argparse.Namespace, modules: dict[str, Any]) -> PinholeSystem:
     axes = arguments.semi_axes
     start, end, rotation = np.deg2rad([arguments.start, arguments.end, arguments.rotation])
-    return ellipse_rings(
-        arguments.modules,
-        axes[0] if len(axes) == 1 else axes,
-        start=start,
-        end=end,
-        spacing=arguments.spacing,
-        center=arguments.center,
-        rotation=rotation,
-        **modules,
-    )
+    ring = {"start": start, "end": end, "spacing": arguments.spacing}
+    curve = {"center": arguments.center, "rotation": rotation}
+    return ellipse_rings(arguments.modules, axes[0] if len(axes) == 1 else axes, **ring, **curve, **modules)
 
 
 def _plates(arguments: argparse.Namespace, modules: dict[str, Any]) -> PinholeSystem:

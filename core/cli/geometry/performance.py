@@ -11,35 +11,32 @@ import numpy as np
 from ...geometry.design_formulas import roi_radius_seen
 from ...physics.performance import magnification, resolution, sensitivity
 from ...physics.sampling import sampling_gaps
-from ..options import add_command, add_workbook, read_workbook
-from .arguments import add_json, add_materials, resolution_settings, sensitivity_settings, table_rows
+from ..options import read_workbook
+from .arguments import add_action, add_materials, edge_settings, sensitivity_settings, table_rows
 
 
 def add_parser(actions) -> None:  # type: ignore[no-untyped-def]
     """Add the action."""
-    parser = add_command(
+    parser = add_action(
         actions,
         "performance",
         "print each module's sensitivity, resolution and field of view at the isocentre, or at a point",
-        "mphdrr geometry performance scanner.xlsx --isotope Tc-99m --aperture-mu tungsten --crystal-mu NaI",
+        " --isotope Tc-99m --aperture-mu tungsten --crystal-mu NaI",
+        _run,
     )
     parser.add_argument(
         "--point", type=float, nargs=3, default=[0, 0, 0], metavar="MM", help="where the source is, x y z"
     )
     add_materials(parser)
-    add_workbook(parser)
-    add_json(parser)
-    parser.set_defaults(run=_run)
 
 
 def _run(arguments: argparse.Namespace) -> None:
     system = read_workbook(arguments)
-    points = [arguments.point]
+    points, edge = [arguments.point], edge_settings(arguments, system)
     counts = 1e6 * sensitivity(system, points, **sensitivity_settings(arguments, system))[0]
-    fwhm = resolution(system, points, **resolution_settings(arguments, system))[0]
-    radius = roi_radius_seen(
-        system.pinhole_distance, system.pinhole_diameter, system.detector_side, system.collimator_length
-    )
+    fwhm = resolution(system, points, **edge, intrinsic_fwhm=arguments.intrinsic_fwhm)[0]
+    b, d, l, side = system.pinhole_distance, system.pinhole_diameter, system.collimator_length, system.detector_side
+    radius = roi_radius_seen(b, d, side, l)
     columns = {
         "number": system.numbers,
         "ring": system.rings() + 1,

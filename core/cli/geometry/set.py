@@ -8,16 +8,15 @@ import json
 import sys
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ...errors import InputError
 from ...geometry.design_formulas import collimator_length
 from ...geometry.system import PinholeSystem
 from ...recording import recorded_warnings
-from ...workbook import WrittenWorkbook, write_system
+from ...workbook import write_system
 from ...workbook.plausibility import is_by_design
-from ..options import add_command, add_workbook, chosen_modules, output_path, read_workbook
-from .arguments import add_json
+from ..options import chosen_modules, output_path, read_workbook
+from .arguments import add_action
 
 _DIMENSIONS = {
     "diameter": ("pinhole_diameter", "d, pinhole diameter"),
@@ -29,14 +28,13 @@ _DIMENSIONS = {
 
 def add_parser(actions) -> None:  # type: ignore[no-untyped-def]
     """Add the action."""
-    parser = add_command(
+    parser = add_action(
         actions,
         "set",
         "change a workbook's numbers and keep all the rest of it",
-        "mphdrr geometry set scanner.xlsx --modules 1-20 --diameter 2 -o thinner.xlsx",
+        " --modules 1-20 --diameter 2 -o thinner.xlsx",
+        _run,
     )
-    add_workbook(parser)
-    add_json(parser)
     parser.add_argument(
         "-o", "--output", required=True, metavar="OUT", help="workbook to write; FILE itself is replaced"
     )
@@ -55,7 +53,6 @@ def add_parser(actions) -> None:  # type: ignore[no-untyped-def]
     parser.add_argument(
         "--write-columns", metavar="MAP", help="with --columns, also write the column map (.toml) of the new workbook"
     )
-    parser.set_defaults(run=_run)
 
 
 def _run(arguments: argparse.Namespace) -> None:
@@ -74,14 +71,8 @@ def _run(arguments: argparse.Namespace) -> None:
         return
     for message in messages:
         sys.stderr.write(f"mphdrr: warning: {message}\n")
-    print(_summary(written))
-
-
-def _summary(written: WrittenWorkbook) -> str:
-    counts = [f"{len(written.changed)} cells changed", f"{len(written.recalculated)} recalculated"]
-    if written.cleared:
-        counts.append(f"{len(written.cleared)} without a value")
-    return f"{written.path}: {', '.join(counts)}"
+    cleared = f", {len(written.cleared)} without a value" if written.cleared else ""
+    print(f"{written.path}: {len(written.changed)} cells changed, {len(written.recalculated)} recalculated{cleared}")
 
 
 def _changed(system: PinholeSystem, arguments: argparse.Namespace) -> PinholeSystem:
@@ -97,7 +88,10 @@ def _changed(system: PinholeSystem, arguments: argparse.Namespace) -> PinholeSys
     if arguments.length is not None:
         follows = np.where(chosen, arguments.length == "design", follows)
     if arguments.length not in (None, "design"):
-        values["collimator_length"] = np.where(chosen, _number(arguments.length), values["collimator_length"])
+        try:
+            values["collimator_length"] = np.where(chosen, float(arguments.length), values["collimator_length"])
+        except ValueError:
+            raise InputError(f"--length {arguments.length!r}: expected millimetres or 'design'") from None
     system = PinholeSystem(**values)
     designed = collimator_length(
         system.pinhole_distance, system.pinhole_diameter, system.detector_side, system.roi_radius
@@ -110,19 +104,10 @@ def _changed(system: PinholeSystem, arguments: argparse.Namespace) -> PinholeSys
         if removed.all():
             raise InputError(f"--remove {arguments.remove!r}: are all modules, expected at least one to be left")
         system = system[~removed]
-    return system if arguments.order is None else system[_order(system, arguments.order)]
-
-
-def _number(text: str) -> float:
-    try:
-        return float(text)
-    except ValueError:
-        raise InputError(f"--length {text!r}: expected millimetres or 'design'") from None
-
-
-def _order(system: PinholeSystem, text: str) -> NDArray[np.int64]:
+    if arguments.order is None:
+        return system
     index = {str(number): i for i, number in enumerate(system.numbers)}
-    wanted = [part.strip() for part in text.split(",")]
+    wanted = [part.strip() for part in arguments.order.split(",")]
     if sorted(wanted) != sorted(index):
         raise InputError(f"--order: expected each of the modules' {len(index)} numbers once, got {len(wanted)}")
-    return np.array([index[number] for number in wanted])
+    return system[np.array([index[number] for number in wanted])]

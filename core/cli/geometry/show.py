@@ -12,22 +12,17 @@ import numpy as np
 from ...errors import InputError
 from ...geometry.system import PinholeSystem
 from ...workbook import draft_column_map
-from ..options import add_command, add_workbook, chosen_modules, output_path, read_workbook
-from .arguments import add_json, table_rows
+from ..options import chosen_modules, output_path, read_workbook
+from .arguments import add_action, table_rows
 
 
 def add_parser(actions) -> None:  # type: ignore[no-untyped-def]
     """Add the action."""
-    parser = add_command(
-        actions, "show", "print every module's numbers", "mphdrr geometry show scanner.xlsx --modules 1-20"
-    )
+    parser = add_action(actions, "show", "print every module's numbers", " --modules 1-20", _run)
     parser.add_argument("--modules", metavar="RANGE", help="such as 1-40 or 1-20,41; default: all")
-    add_workbook(parser)
-    add_json(parser)
     parser.add_argument(
         "--write-columns", metavar="MAP", help="instead, write a column map (.toml) of what was seen, for you to check"
     )
-    parser.set_defaults(run=_run)
 
 
 def _run(arguments: argparse.Namespace) -> None:
@@ -67,15 +62,8 @@ def _write_columns(arguments: argparse.Namespace) -> None:
 
 def _rows(system: PinholeSystem) -> list[dict[str, Any]]:
     x, y, z = system.centers.T
-    places = {"number": system.numbers, "ring": system.rings() + 1, "x": x, "y": y, "z": z}
-    sizes = {
-        "b": system.pinhole_distance,
-        "l": system.collimator_length,
-        "azimuth": np.arctan2(y, x),
-        "elevation": np.arctan2(z, np.hypot(x, y)),
-        "d": system.pinhole_diameter,
-        "Ld": system.detector_side,
-        "Td": system.detector_thickness,
-        "R": system.roi_radius,
-    }
-    return table_rows({**places, **sizes})
+    columns = {"number": system.numbers, "ring": system.rings() + 1, "x": x, "y": y, "z": z}
+    columns |= {"b": system.pinhole_distance, "l": system.collimator_length}
+    columns |= {"azimuth": np.arctan2(y, x), "elevation": np.arctan2(z, np.hypot(x, y))}
+    columns |= {"d": system.pinhole_diameter, "Ld": system.detector_side, "Td": system.detector_thickness}
+    return table_rows({**columns, "R": system.roi_radius})

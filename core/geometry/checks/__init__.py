@@ -11,8 +11,7 @@ from __future__ import annotations
 
 from ...validation import instance
 from ..collimator import OPENING_ANGLE, Construction, EdgePlace
-from ..collimator_mesh import surface_fault
-from ..module_parts import module_collimators, module_parts
+from ..module_parts import module_collimators, module_parts, surface_fault
 from ..system import PinholeSystem
 from .field_of_view import find_blocked, find_uncovered
 from .hulls import Hulls
@@ -34,25 +33,11 @@ def check_geometry(
 ) -> GeometryReport:
     """Find parts that overlap, ROIs that are not seen whole, blocked holes, unsuitable plates and open surfaces.
 
-    Parameters
-    ----------
-    system
-    plate_thickness, wall_thickness, opening_angle, edge_at
-        How the collimators are built, as in `core.geometry.collimator.Construction`: mm, mm, rad, and the place of the knife
-        edge in the plate ("middle", "front" or "back").
-    aperture_mu
-        Attenuation coefficient of the plates, 1/mm (see `attenuation`), to find plates that are too thin. Default: the
-        plates stop everything.
+    Collimators are built as in `core.geometry.collimator.Construction`: thicknesses in mm, the angle in rad, and the place
+    of the knife edge in the plate. With `aperture_mu`, the plates' attenuation coefficient, 1/mm (see `attenuation`),
+    plates that are too thin are found, too.
 
-    Raises
-    ------
-    InputError
-        A collimator cannot be built like that.
-
-    Examples
-    --------
-    >>> report = check_geometry(system)
-    >>> report.ok
+    >>> check_geometry(system).ok
     True
     """
     instance(system, PinholeSystem, "check_geometry")
@@ -63,10 +48,7 @@ def check_geometry(
     faults = [(part, surface_fault(part.solid)) for part in parts]
     return GeometryReport(
         n_modules=len(system),
-        plate_thickness=construction.plate_thickness,
-        wall_thickness=construction.wall_thickness,
-        opening_angle=construction.opening_angle,
-        edge_at=construction.edge_at,
+        **vars(construction),
         overlaps=find_overlaps(hulls),
         near_pairs=find_near_pairs(system, collimators),
         swallowed_pinholes=find_swallowed_pinholes(system, hulls),

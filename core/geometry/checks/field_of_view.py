@@ -20,6 +20,8 @@ from ..system import PinholeSystem
 from .hulls import TOUCH, Hulls
 from .report import Blocked, Uncovered
 
+Array = NDArray[np.float64]
+
 SLACK = 0.01
 """Shortfall of the field of view, mm of radius, that is accepted: l may be rounded to 0.01 mm."""
 RAYS = 10_000
@@ -32,14 +34,11 @@ def find_uncovered(system: PinholeSystem) -> tuple[Uncovered, ...]:
     b, d, radius = system.pinhole_distance, system.pinhole_diameter, system.roi_radius
     slope = (system.detector_side - d) / (2 * system.collimator_length)
     seen = roi_radius_seen(b, d, system.detector_side, system.collimator_length)
+    columns = (column.tolist() for column in (system.numbers, b, d, slope, radius, seen))
     return tuple(
-        Uncovered(
-            module=int(system.numbers[m]),
-            roi_radius=float(radius[m]),
-            seen_radius=float(seen[m]),
-            unseen_share=unseen_share(float(b[m]), float(d[m]), float(slope[m]), float(radius[m])),
-        )
-        for m in np.flatnonzero(radius - seen > SLACK)
+        Uncovered(number, radius, seen, unseen_share(b, d, slope, radius))
+        for number, b, d, slope, radius, seen in zip(*columns, strict=True)
+        if radius - seen > SLACK
     )
 
 
@@ -52,7 +51,8 @@ def unseen_share(b: float, d: float, slope: float, radius: float) -> float:
     ends = [b - radius, b + radius]
     # The square's corners and sides reach the rim of the disc where c w^2 = radius^2 - (x - b)^2, with c = 2 and 1.
     for c in (2.0, 1.0):
-        ends += _real_roots(c * slope**2 + 1, -(c * slope * d + 2 * b), c * d**2 / 4 + b**2 - radius**2)
+        roots = np.roots([c * slope**2 + 1, -(c * slope * d + 2 * b), c * d**2 / 4 + b**2 - radius**2])
+        ends += roots[np.isreal(roots)].real.tolist()
     ends.append(d / (2 * slope))  # the pyramid's apex
     planes = np.unique(np.clip(ends, b - radius, b + radius))
     low, high = planes[:-1, None], planes[1:, None]
@@ -60,22 +60,12 @@ def unseen_share(b: float, d: float, slope: float, radius: float) -> float:
     angle = (_NODES + 1) * np.pi / 2
     x = low + (high - low) * (1 - np.cos(angle)) / 2
     weight = (high - low) / 2 * np.sin(angle) * _WEIGHTS * np.pi / 2
-    unseen = _outside_square(np.sqrt(np.maximum(radius**2 - (x - b) ** 2, 0.0)), x * slope - d / 2)
-    return float((weight * unseen).sum() / (4 / 3 * np.pi * radius**3))
-
-
-def _outside_square(disc: NDArray[np.float64], half: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Area of discs of radius `disc` outside the concentric squares of half-width `half`, mm^2."""
-    inside = np.clip(half, 0.0, disc)
+    disc = np.sqrt(np.maximum(radius**2 - (x - b) ** 2, 0.0))
+    half = np.clip(x * slope - d / 2, 0.0, disc)
     with np.errstate(invalid="ignore"):
-        segments = 4 * (disc**2 * np.arccos(inside / disc) - inside * np.sqrt(disc**2 - inside**2))
-    return np.where(inside**2 * 2 <= disc**2, np.pi * disc**2 - 4 * inside**2, segments)
-
-
-def _real_roots(a: float, b: float, c: float) -> list[float]:
-    """Roots of a x^2 + b x + c."""
-    under = b * b - 4 * a * c
-    return [] if under < 0 else [(-b - np.sqrt(under)) / (2 * a), (-b + np.sqrt(under)) / (2 * a)]
+        segments = 4 * (disc**2 * np.arccos(half / disc) - half * np.sqrt(disc**2 - half**2))
+    unseen = np.where(half**2 * 2 <= disc**2, np.pi * disc**2 - 4 * half**2, segments)
+    return float((weight * unseen).sum() / (4 / 3 * np.pi * radius**3))
 
 
 def find_blocked(system: PinholeSystem, hulls: Hulls) -> tuple[Blocked, ...]:
@@ -101,7 +91,7 @@ def find_blocked(system: PinholeSystem, hulls: Hulls) -> tuple[Blocked, ...]:
     return tuple(found)
 
 
-def cone_directions(n: int, cosine: float) -> NDArray[np.float64]:
+def cone_directions(n: int, cosine: float) -> Array:
     """`n` unit vectors (n, 3), spread evenly over the cone around z whose half-angle has the given cosine."""
     index = np.arange(n)
     z = 1 - (1 - cosine) * (index + 0.5) / n
@@ -110,13 +100,7 @@ def cone_directions(n: int, cosine: float) -> NDArray[np.float64]:
     return np.stack([across * np.cos(angle), across * np.sin(angle), z], axis=1)
 
 
-def hits(
-    hulls: Hulls,
-    p: int,
-    origin: NDArray[np.float64],
-    directions: NDArray[np.float64],
-    lengths: NDArray[np.float64],
-) -> NDArray[np.bool_]:
+def hits(hulls: Hulls, p: int, origin: Array, directions: Array, lengths: Array) -> NDArray[np.bool_]:
     """Which rays (N,) from `origin` along unit `directions` (N, 3), with `lengths` (N,), pass through hull `p`."""
     towards = hulls.normals[p] @ directions.T
     towards[towards == 0] = -np.finfo(np.float64).tiny  # parallel to a face
@@ -129,9 +113,7 @@ def hits(
     return leaves - enters > TOUCH
 
 
-def _candidates(
-    hulls: Hulls, pinhole: NDArray[np.float64], axis: NDArray[np.float64], b: float, radius: float
-) -> NDArray[np.intp]:
+def _candidates(hulls: Hulls, pinhole: Array, axis: Array, b: float, radius: float) -> NDArray[np.intp]:
     """Parts with a corner in front of the pinhole, whose bounding sphere meets the cone of the ROI."""
     in_front = ((hulls.vertices - pinhole) @ axis).max(axis=1) > 0
     to = hulls.centers - pinhole

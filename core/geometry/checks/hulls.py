@@ -8,7 +8,6 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ..collimator_mesh import Solid
 from ..module_parts import ModulePart, PartKind
 
 TOUCH = 1e-6
@@ -21,36 +20,21 @@ _EDGES = np.array([[0, 1], [0, 3], [0, 4], [1, 5], [2, 6], [3, 7]])  # one for e
 
 @dataclass(frozen=True, eq=False)
 class Hulls:
-    """Convex hulls of P parts, world mm.
+    """Convex hulls of P parts, world mm. A point x is inside where ``normals @ x <= offsets`` for all faces."""
 
-    Attributes
-    ----------
-    numbers : int array (P,)
-        Module numbers.
-    kinds : tuple of P names
-        "collimator" or "crystal".
-    vertices : array (P, 8, 3)
-    normals, offsets : arrays (P, 6, 3), (P, 6)
-        The faces: a point x is inside where ``normals @ x <= offsets``.
-    edges : array (P, 6, 3)
-        Unit vectors along the edges.
-    centers, radii : arrays (P, 3), (P,)
-        Bounding spheres.
-    """
-
-    numbers: NDArray[np.int64]
+    numbers: NDArray[np.int64]  # (P,), the modules'
     kinds: tuple[PartKind, ...]
-    vertices: NDArray[np.float64]
-    normals: NDArray[np.float64]
-    offsets: NDArray[np.float64]
-    edges: NDArray[np.float64]
-    centers: NDArray[np.float64]
-    radii: NDArray[np.float64]
+    vertices: NDArray[np.float64]  # (P, 8, 3)
+    normals: NDArray[np.float64]  # (P, 6, 3)
+    offsets: NDArray[np.float64]  # (P, 6)
+    edges: NDArray[np.float64]  # (P, 6, 3), unit vectors
+    centers: NDArray[np.float64]  # (P, 3), of the bounding spheres
+    radii: NDArray[np.float64]  # (P,)
 
     @classmethod
     def of(cls, parts: Sequence[ModulePart]) -> Hulls:
         """The hulls of `parts`."""
-        vertices = np.stack([part.to_world(_corners(part.solid)) for part in parts])
+        vertices = np.stack([part.to_world(_corners(part.solid[0])) for part in parts])
         a, b, _, d = (vertices[:, _FACES[:, i]] for i in range(4))
         normals = _unit(np.cross(b - a, d - a))
         centers = vertices.mean(axis=1)
@@ -69,9 +53,8 @@ class Hulls:
         return len(self.numbers)
 
 
-def _corners(solid: Solid) -> NDArray[np.float64]:
-    """Corners (8, 3) of the hull: both ends of the solid are squares around Z, of which the outermost count."""
-    vertices, _ = solid
+def _corners(vertices: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Corners (8, 3) of the hull: both ends of a solid are squares around Z, of which the outermost count."""
     corners = []
     for z in (vertices[:, 2].min(), vertices[:, 2].max()):
         half = np.abs(vertices[vertices[:, 2] == z, :2]).max()

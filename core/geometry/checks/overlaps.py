@@ -26,10 +26,16 @@ _TRIPLES = np.array(list(combinations(range(12), 3)))  # faces of two bodies tha
 
 def find_overlaps(hulls: Hulls) -> tuple[Overlap, ...]:
     """All pairs of parts of different modules whose hulls are more than `TOUCH` inside each other."""
-    pairs = _near_pairs(hulls)
+    pairs = []  # of which the bounding spheres meet
+    for p in range(len(hulls) - 1):
+        distance = np.linalg.norm(hulls.centers[p + 1 :] - hulls.centers[p], axis=1)
+        near = distance < hulls.radii[p + 1 :] + hulls.radii[p]
+        others = p + 1 + np.flatnonzero(near & (hulls.numbers[p + 1 :] != hulls.numbers[p]))
+        pairs.append(np.stack([np.full(len(others), p), others]))
+    near_pairs = np.concatenate(pairs, axis=1)
     found = []
-    for start in range(0, len(pairs), _CHUNK):
-        i, j = pairs[start : start + _CHUNK].T
+    for start in range(0, near_pairs.shape[1], _CHUNK):
+        i, j = near_pairs[:, start : start + _CHUNK]
         depths = penetration_depths(hulls, i, j)
         deep = depths > TOUCH
         i, j, depths = i[deep], j[deep], depths[deep]
@@ -50,18 +56,6 @@ def penetration_depths(hulls: Hulls, i: NDArray[np.intp], j: NDArray[np.intp]) -
     b = axes @ hulls.vertices[j].transpose(0, 2, 1)
     shared = np.minimum(a.max(axis=2) - b.min(axis=2), b.max(axis=2) - a.min(axis=2))
     return np.where(parallel, np.inf, shared).min(axis=1)
-
-
-def _near_pairs(hulls: Hulls) -> NDArray[np.intp]:
-    """Pairs (N, 2) of parts of different modules whose bounding spheres meet."""
-    pairs = []
-    for p in range(len(hulls) - 1):
-        distance = np.linalg.norm(hulls.centers[p + 1 :] - hulls.centers[p], axis=1)
-        near = distance < hulls.radii[p + 1 :] + hulls.radii[p]
-        near &= hulls.numbers[p + 1 :] != hulls.numbers[p]
-        others = p + 1 + np.flatnonzero(near)
-        pairs.append(np.column_stack([np.full(len(others), p), others]))
-    return np.concatenate(pairs)
 
 
 def _common_points(hulls: Hulls, i: NDArray[np.intp], j: NDArray[np.intp]) -> NDArray[np.float64]:

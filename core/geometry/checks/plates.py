@@ -31,9 +31,8 @@ def find_vignetted(system: PinholeSystem, collimators: Sequence[Collimator]) -> 
         if radius[m] >= b[m]:  # the pinhole is inside the ROI, which is found as an intrusion
             continue
         needed = needed_angle(b[m], body.diameter, radius[m])
-        share = body.open_share(math.tan(needed / 2))
+        share, built = body.open_share(math.tan(needed / 2)), body.construction
         if share < FEWEST_OPEN:
-            built = body.construction
             number = int(system.numbers[m])
             found.append(Vignetted(number, share, built.plate_thickness, built.opening_angle, needed))
     return tuple(found)

@@ -26,17 +26,14 @@ class Finding:
 
 @dataclass(frozen=True)
 class Overlap(Finding):
-    """Parts of two modules, taken as convex bodies, penetrate each other.
-
-    `depth`, mm, is the shortest translation that separates them, and `point`, world mm, lies inside both.
-    """
+    """Parts of two modules, taken as convex bodies, penetrate each other."""
 
     first: int
     first_part: PartKind
     second: int
     second_part: PartKind
-    depth: float
-    point: tuple[float, float, float]
+    depth: float  # mm, of the shortest translation that separates them
+    point: tuple[float, float, float]  # inside both, world mm
     message = (
         "modules {0.first} and {0.second}: {0.first_part} and {0.second_part} overlap, {0.depth:.4g} mm deep at "
         "({0.point[0]:.1f}, {0.point[1]:.1f}, {0.point[2]:.1f}) mm"
@@ -76,16 +73,12 @@ class Intrusion(Finding):
 
 @dataclass(frozen=True)
 class Uncovered(Finding):
-    """A module's field of view does not hold its ROI.
-
-    `seen_radius`, mm, is that of the largest sphere at the isocentre in the field of view, and `unseen_share` the
-    fraction of the ROI's volume outside the field of view.
-    """
+    """A module's field of view does not hold its ROI."""
 
     module: int
-    roi_radius: float
-    seen_radius: float
-    unseen_share: float
+    roi_radius: float  # mm
+    seen_radius: float  # mm, of the largest sphere at the isocentre in the field of view
+    unseen_share: float  # fraction of the ROI's volume outside the field of view
     message = (
         "module {0.module}: sees {0.seen_radius:.4g} mm around the isocentre, {0.shortage:.4g} mm less than its ROI radius; "
         "{0.unseen_share:.3%} of the ROI is outside its field of view"
@@ -109,17 +102,13 @@ class Blocked(Finding):
 
 @dataclass(frozen=True)
 class Vignetted(Finding):
-    """The plate is too thick for the hole's opening angle and shades the hole from part of the ROI.
-
-    Only the fraction `open_share` of the hole's area is open to the steepest rays from the ROI; with `needed_angle`,
-    rad, a plate of any thickness would leave the hole open.
-    """
+    """The plate is too thick for the hole's opening angle and shades the hole from part of the ROI."""
 
     module: int
-    open_share: float
-    plate_thickness: float
-    opening_angle: float
-    needed_angle: float
+    open_share: float  # fraction of the hole's area that is open to the steepest rays from the ROI
+    plate_thickness: float  # mm
+    opening_angle: float  # rad
+    needed_angle: float  # rad; with it, a plate of any thickness would leave the hole open
     message = (
         "module {0.module}: only {0.open_share:.1%} of its hole is open to the rim of its ROI: a plate of "
         "{0.plate_thickness:.4g} mm is too thick for an opening angle of {1:.4g} degrees, {2:.1f} are needed"
@@ -133,16 +122,12 @@ class Vignetted(Finding):
 
 @dataclass(frozen=True)
 class ThinPlate(Finding):
-    """The plate lets through a fraction `transmission` of the photons along the axis.
-
-    `share` is the number of photons that pass the plate beside the hole, relative to those that pass the hole and its
-    edge.
-    """
+    """The plate lets through a fraction `transmission` of the photons along the axis."""
 
     module: int
-    plate_thickness: float
+    plate_thickness: float  # mm
     transmission: float
-    share: float
+    share: float  # photons that pass the plate beside the hole, relative to those that pass the hole and its edge
     message = (
         "module {0.module}: its plate of {0.plate_thickness:.4g} mm lets {0.transmission:.2%} of the photons through: "
         "{0.share:.2%} as many pass beside the hole as pass the hole"
@@ -161,17 +146,9 @@ class OpenMesh(Finding):
 
 @dataclass(frozen=True)
 class GeometryReport:
-    """What `check_geometry` found.
+    """What `check_geometry` found in so many modules of that construction (mm, mm, rad).
 
-    Attributes
-    ----------
-    n_modules : int
-        Number of modules checked.
-    plate_thickness, wall_thickness, opening_angle, edge_at
-        The construction that was checked: mm, mm, rad, and "middle", "front" or "back".
-    overlaps, near_pairs, swallowed_pinholes, intrusions, uncovered, blocked, vignetted, thin_plates, open_meshes :
-    tuple
-        The findings of each kind, in the order of the modules.
+    The findings of each kind are in the order of the modules.
     """
 
     n_modules: int

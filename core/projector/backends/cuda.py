@@ -2,7 +2,7 @@
 
 Why NVIDIA Warp: one wheel for each of Linux, Windows and macOS without bounds on numpy, which brings its own compilers
 and runs the very same kernels on the CPU, where they are tested. Triton has no official wheel for Windows, and its programs
-are of blocks, not of rays that walk.
+work on blocks, not on single rays.
 
 The volume is on the device as a whole. The rays are made there, from their fans; they are launched in pieces that leave
 half of the free memory alone. An array is copied to the device and the results back at every call, a tensor on the device

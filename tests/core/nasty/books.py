@@ -1,4 +1,4 @@
-"""Sheets, and files: which sheet is meant, and what is no workbook, a damaged one, or an odd but right one."""
+"""Sheets and files: which sheet is meant, and files that are no workbook, damaged, or odd but valid."""
 
 from __future__ import annotations
 
@@ -112,7 +112,7 @@ def _sheets() -> None:
             copied = users(scanner(SCANNER.centers * 1.02, 2.4, 76.0, 51.0, 11.0))[name]
             copied.name = other
             made.sheets.append(copied)
-            known = (RIGHT,) if other == "Values" else ()  # the users' own sheet beside the two
+            known = (RIGHT,) if other == "Values" else ()  # the users' own sheet in addition to the two
             CASES.add(
                 f"{other!r} is a copy of {name} of other numbers",
                 made,
@@ -171,7 +171,7 @@ def _sheets() -> None:
         place=("Main", "Design Table"),
         columns=users_map(),
     )
-    # Sheets that the users' workbook has beside the two.
+    # Sheets that the users' workbook has in addition to the two.
     for name, cells in {
         "Theta": {"A1": "theta", "A2": 0.1, "B1": "sin", "B2": Formula("SIN(A2)", 0.09983341664682815)},
         "Values": {"A1": "quantity", "B1": "value", "A2": "b", "B2": 250.0, "A3": "magnification", "B3": 3.2},

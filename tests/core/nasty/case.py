@@ -1,4 +1,4 @@
-"""A nasty workbook, and the judge of what is read from it."""
+"""A nasty workbook, and the judgement of what is read from it."""
 
 from __future__ import annotations
 
@@ -34,15 +34,15 @@ class Case:
     ----------
     name : str
     make : callable
-        Gives the book, which is then written by hand, or writes the file itself.
+        Returns the book, which is then written by hand, or writes the file itself.
     truth : PinholeSystem or None
         The scanner that a person sees in it, or the one of the two that `columns` tells; None: nobody can tell.
     allowed : tuple of str
-        What may become of it.
+        The allowed outcomes.
     place : tuple of str
-        One of these must stand in a refusal or a warning: the cell, or the sheet.
+        A refusal or a warning must contain one of these: the cell, or the sheet.
     columns : str or None
-        The TOML of the column map with which it must be read as `truth` where it is refused without.
+        The TOML of the column map with which it must be read as `truth` if it is refused without.
     unmappable : str
         Why no column map reads it although a person does.
     numbered : bool
@@ -97,7 +97,7 @@ def write(case: Case, folder: Path) -> Path:
 
 
 def sample(names: Iterable[str], every: int) -> list[Any]:
-    """Parameters for pytest: every so many of the names, evenly spread, in the short run, the rest in the long one."""
+    """Parameters for pytest: every n-th name in the short run, the rest in the long run."""
     return [
         pytest.param(name, marks=() if i % every == 0 else pytest.mark.long, id=name) for i, name in enumerate(names)
     ]
@@ -105,7 +105,7 @@ def sample(names: Iterable[str], every: int) -> list[Any]:
 
 @dataclass(frozen=True)
 class Outcome:
-    """What a program makes of a file."""
+    """The outcome of reading a file."""
 
     system: PinholeSystem | None
     refusal: str
@@ -113,7 +113,7 @@ class Outcome:
 
 
 def read(path: Path, columns: str | None = None) -> Outcome:
-    """What `read_system` makes of `path`; an exception other than `InputError` is passed on."""
+    """The outcome of `read_system` for `path`; an exception other than `InputError` is passed on."""
     options = {}
     if columns is not None:
         options["columns"] = path.with_suffix(".toml")
@@ -168,7 +168,7 @@ def fault(case: Case, path: Path, mapped: bool = False) -> str:
 
 
 def verdict(case: Case, outcome: Outcome) -> str:
-    """What became of the file."""
+    """The outcome for the file."""
     if outcome.system is None:
         return REFUSED
     wrong = "nobody can tell what it means" if case.truth is None else None

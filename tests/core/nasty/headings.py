@@ -33,7 +33,7 @@ def _wrong(book: Book, name: str, factor: float = 1.1, column: str | None = None
 
 
 def _words_in_a_heading() -> None:
-    # What the column holds is not the quantity: it must not be read as one. A map is no help, the numbers are others'.
+    # The column contains another quantity and must not be read. A map does not help: the numbers are different.
     for name, heading, factor in (
         ("d", "d/2", 0.5),
         ("d", "half diameter of pinhole", 0.5),

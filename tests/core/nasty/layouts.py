@@ -1,4 +1,4 @@
-"""Layouts: tables beside and below each other, legends, single values; derived columns at odds with the rest."""
+"""Layouts: tables beside and below each other, legends, single values; derived columns that contradict the rest."""
 
 from __future__ import annotations
 
@@ -288,7 +288,7 @@ def _tables_in_one_sheet() -> None:
 
 
 def _derived() -> None:
-    """Derived columns in units of their own are checked in them; those at odds with the coordinates are warned of."""
+    """Derived columns in other units are checked in these; those that contradict the coordinates give a warning."""
     columns = {"E": "b", "H": "H", "I": "x2", "J": "y2", "K": "z2", "U": "range"}
 
     def scaled(letters: str, factor: float, heading: str) -> Book:

@@ -1,4 +1,4 @@
-"""Column maps: what is asked of them, and what is wrong with them."""
+"""Column maps: valid ones and faulty ones."""
 
 from __future__ import annotations
 
@@ -155,7 +155,7 @@ def _wrong() -> None:
         if name == "no way of joining":
             allowed = (REFUSED, RIGHT)
         CASES.add(f"wrong: {name}", users(), SCANNER, *allowed, place=MAP, columns=text, unmappable="it is wrong")
-    # What the map says is at odds with what the sheet says.
+    # The map contradicts the sheet.
     for heading, unit in (("{} (cm)", "mm"), ("{} (mm)", "cm"), ("{} (in)", "cm")):
         said = heading[4:6]
         book = one_sheet(BIG, {q: heading.format(q) for q in ("x1", "y1", "z1", "d", "R", "Ld", "Td", "l")}, said)
@@ -186,7 +186,7 @@ def _wrong() -> None:
         place=MAP,
         columns=one_sheet_map(columns={"d": "F", "R": "E"}),
     )
-    # What is wrong with a workbook is so with a map too.
+    # Faults of a workbook remain faults with a map.
     for name, value in {
         "a text": "315",
         "a blank cell": None,

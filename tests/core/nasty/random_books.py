@@ -1,4 +1,4 @@
-"""Workbooks of random scanners, layouts, units and decorations, each with what a person reads in it."""
+"""Workbooks of random scanners, layouts, units and decorations, each with the system that a person reads in it."""
 
 from __future__ import annotations
 
@@ -190,7 +190,7 @@ def number_format(draft: Draft, code: str, meaning: str) -> None:
 
 
 def heading_word(draft: Draft, word: str, meaning: str) -> None:
-    """A word more in the heading of the first column."""
+    """An additional word in the heading of the first column."""
     name = draft.layout.order[0]
     sheet, column = draft.columns[name]
     sheet[f"{column}{draft.first - 1}"] = word.format(sheet[f"{column}{draft.first - 1}"])
@@ -199,14 +199,14 @@ def heading_word(draft: Draft, word: str, meaning: str) -> None:
 
 
 def _mean(draft: Draft, meaning: str, everywhere: bool = False) -> None:
-    """What a decoration of the first sheet, or of all, says of the numbers: their unit, nothing, or what nobody can tell."""
+    """What a decoration of the first sheet, or of all, says about the numbers: their unit, nothing, or something unclear."""
     if meaning == "nobody":
         draft.truth = None
     elif meaning != "same":
         again = meaning in draft.said
         draft.said.add(meaning)
         if draft.layout.unit not in ("", meaning) or len(draft.said) > 1:
-            draft.truth = None  # at odds with the headings, or with another decoration
+            draft.truth = None  # contradicts the headings, or another decoration
         if not again:
             _other_unit(draft, meaning, draft.book.sheets if everywhere else draft.book.sheets[:1])
 
@@ -259,7 +259,7 @@ def note_below(draft: Draft, text: str, meaning: str) -> None:
 
 
 def cell(draft: Draft, value: Any) -> None:
-    """Something else in place of a number."""
+    """Something else instead of a number."""
     name = draft.layout.order[-1]
     sheet, column = draft.columns[name]
     sheet[f"{column}{draft.first}"] = value
@@ -302,7 +302,7 @@ def other_sheet(draft: Draft, name: str, kind: str, state: str) -> None:
 
 
 def labels(draft: Draft, disagree: bool) -> None:
-    """Labels in place of the numbers, alike in both sheets or not."""
+    """Labels instead of the modules' numbers, the same in both sheets or not."""
     if not draft.layout.numbers or len(draft.layout.sheets) == 1 or draft.layout.shared:
         return
     column = letter(draft.layout.left + 1)
@@ -496,7 +496,7 @@ layouts = st.builds(
 
 @dataclass(frozen=True)
 class Recipe:
-    """A layout, what is added to it in turn, and the program that writes it."""
+    """A layout, its decorations in order, and the program that writes it."""
 
     layout: Layout
     added: tuple[tuple, ...]
@@ -532,7 +532,7 @@ def written(recipe: Recipe, path: Path) -> Draft:
 
 
 def map_of(draft: Draft) -> str | None:
-    """The column map that says what a person sees; None where a map has no words for it."""
+    """The column map for what a person sees; None if a map cannot express it."""
     units = {name: draft.units.get(name, "mm") for name in draft.columns}
     if draft.truth is None or not set(units.values()) <= {"mm", "cm", "m", "in"}:
         return None

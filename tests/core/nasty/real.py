@@ -1,4 +1,4 @@
-"""The users' real workbook in every state it comes in: each is read without a map and without a word."""
+"""The users' real workbook in every state that occurs: each is read without a map and without a warning."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ COLUMNS = {"d": "P", "R": "Q", "Ld": "S", "Td": "T"}
 
 
 def _truth() -> PinholeSystem:
-    """What openpyxl finds in its cells."""
+    """The contents of its cells, by openpyxl."""
     book = openpyxl.load_workbook(REAL, data_only=True)
 
     def column(sheet: str, letters: str) -> np.ndarray:

@@ -30,7 +30,7 @@ VARIED = scanner(CENTERS, d=[2.0, 2.5, 3.0, 3.5], Ld=[50.0, 52.0, 54.0, 56.0], T
 
 
 def _labelled(left: list[object], right: list[object], heads: tuple[str, str] = ("Definitions", "Definitions")) -> Book:
-    """The users' workbook with labels of the rows in Coordinates (left) and Main (right); without l, which would tell."""
+    """The users' workbook with row labels in Coordinates (left) and Main (right); without l, which would decide."""
     book = typed(users(VARIED))
     book["Coordinates"].cells = {at: v for at, v in book["Coordinates"].cells.items() if at[0] not in "GHIJK"}
     for sheet, labels, head in ((book["Coordinates"], left, heads[0]), (book["Main"], right, heads[1])):

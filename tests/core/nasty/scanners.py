@@ -63,7 +63,7 @@ def scanner(
 
 
 SCANNER = scanner()
-# In centimetres its distances still look like a small scanner's in millimetres: its size gives nothing away.
+# In centimetres its distances still look like a small scanner's in millimetres: its size does not reveal the unit.
 BIG = scanner(BIG_CENTERS, 4.0, 150.0, 120.0, 20.0)
 
 
@@ -169,7 +169,7 @@ def one_sheet(
     sheet: str = "Geometry",
     length: bool = True,
 ) -> Book:
-    """A table of `system` with its numbers in `unit` (of all, or of each quantity); nothing tells the unit."""
+    """A table of `system` with its numbers in `unit` (for all, or for each quantity); the unit is stated nowhere."""
     cells: dict[str, Any] = {f"A{top}": number}
     for name, column in ONE_SHEET_COLUMNS.items():
         if name == "l" and not length:

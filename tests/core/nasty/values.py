@@ -1,4 +1,4 @@
-"""Cells: texts for numbers, errors, dates, extreme numbers; stored values that are not what their formulas give."""
+"""Cells: texts for numbers, errors, dates, extreme numbers; stored values that differ from their formulas' results."""
 
 from __future__ import annotations
 
@@ -438,7 +438,7 @@ def _stored_values() -> None:
     empty = users()
     empty["Coordinates"]["B4"] = Formula("", 155.0)
     CASES.add("a formula without a text", empty, SCANNER, RIGHT, REFUSED, place=("Coordinates!",), unmappable=STALE)
-    # l typed in is its own master; the sheet's formula for the others gives another one.
+    # A typed l prevails; the sheet's formula for the others gives another one.
     master = users()
     master["Coordinates"]["G4"] = 60.0
     length = SCANNER.collimator_length.copy()

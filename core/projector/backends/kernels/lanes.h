@@ -9,8 +9,8 @@
 #define LANES (32 / sizeof(REAL))
 #endif
 
-typedef REAL F __attribute__((ext_vector_type(LANES)));   // what is walked with: float or double
-typedef double D __attribute__((ext_vector_type(LANES))); // what a walk is set up with
+typedef REAL F __attribute__((ext_vector_type(LANES)));   // what is traversed in: float or double
+typedef double D __attribute__((ext_vector_type(LANES))); // what a traversal is set up in
 typedef __typeof__((F)0 < (F)0) I; // whole numbers, and true (-1) or false (0), as wide as F
 typedef __typeof__((D)0 < (D)0) B; // as wide as D
 

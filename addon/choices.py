@@ -23,8 +23,7 @@ KINDS = {
     "VOLUME": 0, "DERENZO": 1, "NEMA": 2, "JASZCZAK": 3, "DEFRISE": 4, "SHEPP_LOGAN": 5, "POINTS": 6, "TORSO": 7,
     "FILE": 1000,
 }  # fmt: skip
-PHANTOM_WORDS = {"modified": 0, "original": 1}
-"""Words that settings of phantoms choose from (`core.phantoms.settings.choice`)."""
+PHANTOM_WORDS = {"modified": 0, "original": 1}  # that settings choose from (`core.phantoms.settings.choice`)
 ISOTOPES = {
     "NONE": 0, "F-18": 1, "Ga-67": 2, "Tc-99m": 3, "In-111": 4, "I-123": 5, "I-131": 6, "Xe-133": 7, "Lu-177": 8,
     "Tl-201": 9,
@@ -41,11 +40,8 @@ UNITS = {
 }  # fmt: skip
 
 
-def number(numbers: Mapping[str, int], identifier: str) -> int:
-    """The number of a choice: that of a table above, or else a checksum of its identifier."""
-    return numbers.get(identifier, zlib.crc32(identifier.encode()) & 0x7FFFFFFF)
-
-
 def items(numbers: Mapping[str, int], chosen: Iterable[tuple[str, str, str]]) -> Items:
-    """Items (identifier, label, description) with their numbers, of which a table above holds the old ones."""
-    return tuple((identifier, label, text, number(numbers, identifier)) for identifier, label, text in chosen)
+    """Items (identifier, label, description) with their numbers: a table's above, or else a checksum of the identifier."""
+    return tuple(
+        (name, label, text, numbers.get(name, zlib.crc32(name.encode()) & 0x7FFFFFFF)) for name, label, text in chosen
+    )

@@ -16,59 +16,35 @@ from ..core.runs.mosaic import as_seen, mosaic
 from . import ids
 
 _KEY = "mphdrr_projection"  # custom property: marks the images that a new run replaces
+_COLUMNS = 20  # pictures in a row of the mosaic
 _MOSAIC_PIXELS = 6e6  # 80 views of 256 x 256 are shown pixel by pixel, larger ones reduced
 
 
-def store_projections(projections: NDArray[np.float32], numbers: Iterable[int], columns: int = 20) -> bpy.types.Image:
+def storing(projections: NDArray[np.float32], numbers: Iterable[int]) -> Generator[None, None, bpy.types.Image]:
     """Make a float image of each module and the mosaic, packed into the .blend, in place of those of an earlier run.
 
-    Parameters
-    ----------
-    projections
-        (M, n_v, n_u), as the projector gives them.
-    numbers
-        The modules' numbers (M,), which name the images.
-    columns
-        Pictures in a row of the mosaic.
-
-    Returns
-    -------
-    Image
-        The mosaic, scaled so that its largest value is white.
+    `projections` are (M, n_v, n_u), the modules' `numbers` (M,) name the images. Yields between steps, so that a window
+    can be drawn, and returns the mosaic, scaled so that its largest value is white.
     """
-    for _ in storing(projections, numbers, columns):
-        pass
-    return bpy.data.images[ids.MOSAIC]
-
-
-def storing(
-    projections: NDArray[np.float32], numbers: Iterable[int], columns: int = 20
-) -> Generator[None, None, bpy.types.Image]:
-    """`store_projections` in small steps, between which a window can be drawn; returns the mosaic."""
     numbers = [int(number) for number in numbers]
     names = [ids.projection_name(number, max(numbers)) for number in numbers]
     for picture, name in zip(as_seen(projections), names, strict=True):
         _store(name, picture, exact=True)
         yield
-    sheet = np.maximum(mosaic(_reduced(projections, columns), columns), 0.0)
+    count, n_v, n_u = projections.shape
+    pixels = -(-count // _COLUMNS) * _COLUMNS * n_v * n_u
+    factor = min(int(np.ceil(np.sqrt(pixels / _MOSAIC_PIXELS))), n_v, n_u)
+    if factor > 1:  # too large to look at: means over blocks of pixels
+        rows, width = n_v // factor, n_u // factor
+        blocks = projections[:, : rows * factor, : width * factor].reshape(count, rows, factor, width, factor)
+        projections = blocks.mean(axis=(2, 4), dtype=np.float32)
+    sheet = np.maximum(mosaic(projections, _COLUMNS), 0.0)
     yield
     image = _store(ids.MOSAIC, sheet / (float(sheet.max(initial=0.0)) or 1.0), exact=False)
     kept = {*names, ids.MOSAIC}
     for other in [image for image in bpy.data.images if _KEY in image and image.name not in kept]:
         bpy.data.images.remove(other)
     return image
-
-
-def _reduced(projections: NDArray[np.float32], columns: int) -> NDArray[np.float32]:
-    """Means over blocks of pixels, if the mosaic would be too large to look at."""
-    count, n_v, n_u = projections.shape
-    pixels = -(-count // columns) * columns * n_v * n_u
-    factor = min(int(np.ceil(np.sqrt(pixels / _MOSAIC_PIXELS))), n_v, n_u)
-    if factor <= 1:
-        return projections
-    rows, width = n_v // factor, n_u // factor
-    blocks = projections[:, : rows * factor, : width * factor].reshape(count, rows, factor, width, factor)
-    return blocks.mean(axis=(2, 4), dtype=np.float32)
 
 
 def projection_array(image: bpy.types.Image) -> NDArray[np.float32]:
@@ -107,9 +83,8 @@ def show_below(image: bpy.types.Image, context: bpy.types.Context) -> bool:
     new = [a for a in window.screen.areas if a not in before]
     area = min([*new, view], key=lambda a: a.y)
     area.type = "IMAGE_EDITOR"
-    area.spaces.active.image = image
-    _fit(context, window, area)
-    return True
+    area.spaces.active.image = None
+    return show(image, context)
 
 
 def _fit(context: bpy.types.Context, window: bpy.types.Window, area: bpy.types.Area) -> None:
@@ -131,8 +106,7 @@ def _fit(context: bpy.types.Context, window: bpy.types.Window, area: bpy.types.A
 def _store(name: str, picture: NDArray[np.float32], *, exact: bool) -> bpy.types.Image:
     """Make or replace our image `name`, from a picture whose row 0 is the top."""
     height, width = picture.shape
-    old = bpy.data.images.get(name)
-    image = old
+    image = old = bpy.data.images.get(name)
     if old is None or _KEY not in old or tuple(old.size) != (width, height) or old.is_float != exact:
         image = bpy.data.images.new(name, width, height, float_buffer=exact, is_data=True)
         if old is not None and _KEY in old:

@@ -10,17 +10,15 @@ from . import jobs, phantoms
 
 QUICK_VOXELS = 64**3
 """Up to so many voxels, of all its states, a phantom is made again at every edit."""
-
 RESTED_VOXELS = 128**3
 """Up to so many it is made again by a job when its settings rest."""
-
 _REST = 0.5  # s without an edit
-
 _edited = ""  # name of the phantom that `_rested` is about
 
 
 def settings_changed(item: bpy.types.ID) -> None:
     """A phantom's setting was edited: make its voxels again, or mark them as outdated and say what is wrong."""
+    global _edited
     settings = phantoms.settings_of(item) if isinstance(item, bpy.types.Object) else None
     if settings is None:  # it is being added
         return
@@ -38,7 +36,9 @@ def settings_changed(item: bpy.types.ID) -> None:
             return
     properties.message = next(iter(caught), "")
     if properties.outdated and settings.n_voxels <= RESTED_VOXELS and _has_window():
-        _wait_for(item)
+        _edited = item.name
+        stop()
+        bpy.app.timers.register(_rested, first_interval=_REST)
 
 
 def stop() -> None:
@@ -50,13 +50,6 @@ def stop() -> None:
 def _has_window() -> bool:
     """Whether Blender's timers run."""
     return not bpy.app.background
-
-
-def _wait_for(item: bpy.types.Object) -> None:
-    global _edited
-    _edited = item.name
-    stop()
-    bpy.app.timers.register(_rested, first_interval=_REST)
 
 
 def _rested() -> float | None:

@@ -20,7 +20,6 @@ _DESCRIPTIONS = {
     "completeness": "Of the angular sampling (Tuy): 1 where every plane through the voxel meets a pinhole. Slow",
 }
 QUANTITIES = choices.items(choices.MAPS, ((name, name.capitalize(), _DESCRIPTIONS.get(name, "")) for name in MAPS))
-"""What can be mapped, as items of an enumeration."""
 _BYTES = 40.0  # a voxel, while the map is made and put into the scene
 
 
@@ -29,23 +28,8 @@ def mapping(
 ) -> jobs.Job:
     """The job that adds a map of the scene's scanner, with ideal modules, or replaces the last one of its quantity.
 
-    Parameters
-    ----------
-    scene
-        With a scanner.
-    quantity
-        One of `core.physics.maps.MAPS`.
-    voxels
-        Along each side of the map's cube around the isocentre.
-    side
-        Of the cube, mm; 0 takes the diameter of the ROI.
-    only_roi
-        Leave out what lies outside the ROI sphere.
-
-    Raises
-    ------
-    InputError
-        No scanner in the scene, or the memory is too small.
+    The map is a cube of `voxels` along each `side` (mm; 0: the ROI's diameter) around the isocentre, of one of `MAPS`;
+    with `only_roi`, without what lies outside the ROI sphere.
     """
     collection = scanner.required_scanner(scene)
     system = scanner.read_scanner(collection)
@@ -59,9 +43,8 @@ def mapping(
         return store_volume(within_roi(volume, system) if only_roi else volume, folder, provenance=provenance)
 
     def finish(stored: StoredVolume) -> str:
-        old = [item for item in volumes.volume_objects(scene) if volumes.quantity_of(item) == quantity]
-        if old:
-            item = old[0]
+        item = next((old for old in volumes.volume_objects(scene) if volumes.quantity_of(old) == quantity), None)
+        if item is not None:
             volumes.replace_stored(item, stored)
         else:
             item = volumes.add_stored(stored, name, scene.collection)

@@ -34,25 +34,9 @@ def voxelizing(
 ) -> jobs.Job:
     """The job that makes a volume of closed mesh objects, modifiers included: a voxel holds the share that they cover.
 
-    Parameters
-    ----------
-    items
-        Later ones cover earlier ones.
-    value
-        Inside the meshes, in the quantity's unit; an object's custom property of the quantity's name counts instead.
-    quantity
-        ``"activity"`` or ``"mu"``.
-    voxels
-        Along the longest side.
-    voxel_size
-        mm; 0 takes it from the number of voxels.
-    name
-        The object's name; by default the first mesh's.
-
-    Raises
-    ------
-    InputError
-        No objects, one without faces or with an open mesh, or the memory is too small.
+    Later items cover earlier ones. The `value` inside is in the unit of the `quantity`, "activity" or "mu"; an object's
+    custom property of that name counts instead. `voxels` are those along the longest side; a `voxel_size` in mm, if not 0,
+    counts instead. The volume's name is by default the first mesh's.
     """
     if not items:
         raise InputError("no mesh object is selected: select closed meshes first")
@@ -81,13 +65,7 @@ def voxelizing(
 
 
 def extracting(item: bpy.types.Object, level: float | None = None) -> jobs.Job:
-    """The job that makes a closed mesh of a volume's surface of one value (default: half of the maximum).
-
-    Raises
-    ------
-    InputError
-        The object is no volume, or its file is gone.
-    """
+    """The job that makes a closed mesh of a volume's surface of one value (default: half of the maximum)."""
     read, pose, name = volumes.reader(item), volumes.pose_of_object(item), f"{item.name} surface"
 
     def work(progress: Progress) -> Mesh:
@@ -101,39 +79,28 @@ def extracting(item: bpy.types.Object, level: float | None = None) -> jobs.Job:
 
 
 def meshes_of(items: Sequence[bpy.types.Object], depsgraph: bpy.types.Depsgraph) -> list[Mesh]:
-    """What objects look like, modifiers included, in world mm.
-
-    Raises
-    ------
-    InputError
-        One has no faces, or its mesh is open; the message names the object, and where.
-    """
+    """What objects look like, modifiers included, in world mm; `InputError` names one that has no faces, or is open."""
     meshes = []
     for item in items:
+        evaluated = item.evaluated_get(depsgraph)
+        mesh = evaluated.to_mesh()
         try:
-            meshes.append(_mesh_of(item, depsgraph))
+            mesh.calc_loop_triangles()
+            points = np.empty((len(mesh.vertices), 3), np.float32)
+            mesh.vertices.foreach_get("co", points.ravel())
+            faces = np.empty((len(mesh.loop_triangles), 3), np.int32)
+            mesh.loop_triangles.foreach_get("vertices", faces.ravel())
+        finally:
+            evaluated.to_mesh_clear()
+        pose = world_matrix(item)
+        if np.linalg.det(pose[:3, :3]) < 0:  # a mirrored object shows the other side of its faces
+            faces = faces[:, ::-1]
+        try:
+            meshes.append(Mesh(points.astype(np.float64) @ pose[:3, :3].T + pose[:3, 3], faces.astype(np.int64)))
             require_closed(meshes[-1])
         except InputError as error:
             raise InputError(f"{item.name!r}: {error}") from None
     return meshes
-
-
-def _mesh_of(item: bpy.types.Object, depsgraph: bpy.types.Depsgraph) -> Mesh:
-    evaluated = item.evaluated_get(depsgraph)
-    mesh = evaluated.to_mesh()
-    try:
-        mesh.calc_loop_triangles()
-        points = np.empty(3 * len(mesh.vertices), np.float32)
-        mesh.vertices.foreach_get("co", points)
-        corners = np.empty(3 * len(mesh.loop_triangles), np.int32)
-        mesh.loop_triangles.foreach_get("vertices", corners)
-    finally:
-        evaluated.to_mesh_clear()
-    pose = world_matrix(item)
-    faces = corners.reshape(-1, 3).astype(np.int64)
-    if np.linalg.det(pose[:3, :3]) < 0:  # a mirrored object shows the other side of its faces
-        faces = faces[:, ::-1]
-    return Mesh(points.reshape(-1, 3).astype(np.float64) @ pose[:3, :3].T + pose[:3, 3], faces)
 
 
 def add_mesh(mesh: Mesh, name: str, pose: NDArray[np.float64], collection: bpy.types.Collection) -> bpy.types.Object:

@@ -30,31 +30,26 @@ from . import choices
 from .decimals import typed
 from .updates import on_edit
 
-FILE = "file"
-"""Beside the names of `KINDS`: a phantom that a text in TOML describes."""
+FILE = "file"  # beside the names of `KINDS`: a phantom that a text in TOML describes
 
-_UNITS = {"mm": "mm", "kBq/mL": "kBq_per_mL", "1/mm": "per_mm", "kBq": "kBq", "mL": "mL"}
-"""Units as they are written in the names of JSON's keys."""
+_UNITS = {"mm": "mm", "kBq/mL": "kBq_per_mL", "1/mm": "per_mm", "kBq": "kBq", "mL": "mL"}  # in JSON's keys
 
 
 class PhantomSettings:
     """What a phantom is made from: mixed into the operator that adds one and into the properties that its object keeps.
 
-    The properties themselves are those of `kind_settings`, or a text, and those of `sampling`.
+    The properties themselves are those of `settings_class`, or a text, and those of `sampling`.
     """
 
     identifier = ""
     """The kind's name in Python: of its operator and of its settings in `VolumeProperties`."""
     own_names: tuple[str, ...] = ()
     """Names of the settings beside those of `sampling`, in the order of drawing."""
+    n_states = 1
+    """How many states there are, one for each frame."""
 
     voxels: Any
     voxel_size: Any
-
-    @property
-    def n_states(self) -> int:
-        """How many states there are, one for each frame."""
-        return 1
 
     @property
     def n_voxels(self) -> int:
@@ -107,7 +102,7 @@ class KindSettings(PhantomSettings):
     kind = KINDS[0]
 
     @property
-    def n_states(self) -> int:
+    def n_states(self) -> int:  # type: ignore[override]
         """How many phases of the heart's cycle."""
         return int(self.frames) if _beats(self.kind) else 1  # type: ignore[attr-defined]
 
@@ -129,46 +124,18 @@ class KindSettings(PhantomSettings):
         return values | {"phase": 0.0} if self.n_states > 1 else values
 
 
-class TextSettings(PhantomSettings):
-    """The settings of a phantom that a text of the .blend describes."""
-
-    identifier = FILE
-    own_names = ("text",)
-    text: Any
-
-    def phantom(self) -> Phantom:
-        """The text's phantom."""
-        return parse_phantom(*self.described())
-
-    def recipe(self) -> dict[str, Any]:
-        """The whole text, and its name."""
-        text, name = self.described()
-        return {"phantom": FILE, "file": name, "text": text}
-
-    def described(self) -> tuple[str, str]:
-        """The text in TOML, and its name. Raises InputError."""
-        if self.text is None:
-            raise InputError("no text is chosen: choose one that describes a phantom")
-        return self.text.as_string(), self.text.name
-
-
 def sampling(update: Any = None) -> dict[str, Any]:
     """Properties of all phantoms: what the voxels hold, and how many there are."""
+    quantities = (("activity", "Activity", "In kBq/mL"), ("mu", "Attenuation", "Linear attenuation in 1/mm"))
     return {
         "quantity": EnumProperty(
             name="Quantity", description="What the voxels hold", default="activity", update=update,
-            items=choices.items(
-                choices.QUANTITIES,
-                (("activity", "Activity", "In kBq/mL"), ("mu", "Attenuation", "Linear attenuation in 1/mm")),
-            ),
+            items=choices.items(choices.QUANTITIES, quantities),
         ),
-        "voxels": IntProperty(
-            name="Voxels per Side", description="Voxels along each side of the grid", default=128, min=4, soft_max=512,
-            max=4096, update=update,
-        ),
+        "voxels": IntProperty(name="Voxels per Side", default=128, min=4, soft_max=512, max=4096, update=update),
         "voxel_size": FloatProperty(
-            name="Voxel Size (mm)", description="Side of a voxel in mm; 0 fits the grid to the phantom", default=0.0,
-            min=0.0, soft_max=10.0, precision=3, update=update,
+            name="Voxel Size (mm)", description="0 fits the grid to the phantom", min=0.0, soft_max=10.0, precision=3,
+            update=update,
         ),
     }  # fmt: skip
 
@@ -178,8 +145,8 @@ def settings_class(kind: Kind, name: str, bases: tuple[type, ...], update: Any =
     own = {field.name: _property(field, kind, update) for field in _fields(kind)}
     if _beats(kind):
         own["frames"] = IntProperty(
-            name="Frames", description="States of the heart's cycle, one for each frame; 1: it stands still at its phase",
-            default=1, min=1, soft_max=48, max=1000, update=update, options={"SKIP_SAVE"},
+            name="Frames", description="States of the heart's cycle; 1: it stands still at its phase", default=1, min=1,
+            soft_max=48, max=1000, update=update, options={"SKIP_SAVE"},
         )  # fmt: skip
     members["__annotations__"] = members.get("__annotations__", {}) | own | sampling(update)
     members |= {"kind": kind, "identifier": identifier(kind), "own_names": tuple(own)}
@@ -187,13 +154,7 @@ def settings_class(kind: Kind, name: str, bases: tuple[type, ...], update: Any =
 
 
 def plain_settings(name: str, **values: Any) -> KindSettings:
-    """Settings of the kind with that name, for scripts: its defaults, and the values given.
-
-    Raises
-    ------
-    InputError
-        No kind, or no setting of it, has such a name.
-    """
+    """Settings of the kind with that name, for scripts: its defaults, and the values given; raises InputError."""
     kind = next((kind for kind in KINDS if name in (kind.name, identifier(kind))), None)
     if kind is None:
         raise InputError(f"phantom {name!r}: expected one of {', '.join(kind.name for kind in KINDS)}")
@@ -260,16 +221,28 @@ def _plain(value: Any) -> Any:
     return typed(value) if isinstance(value, float) else value
 
 
-class PhantomTextProperties(TextSettings, bpy.types.PropertyGroup):
-    """Settings of a phantom that a text describes."""
+class PhantomTextProperties(PhantomSettings, bpy.types.PropertyGroup):
+    """Settings of a phantom that a text of the .blend describes."""
 
     __annotations__ = {
         "text": PointerProperty(
-            name="Text", type=bpy.types.Text, update=on_edit("phantom"),
-            description="Describes the phantom in TOML; can be edited in a Text Editor",
+            name="Text", description="Describes the phantom in TOML", type=bpy.types.Text, update=on_edit("phantom")
         ),
         **sampling(on_edit("phantom")),
-    }  # fmt: skip
+    }
+    identifier = FILE
+    own_names = ("text",)
+
+    def phantom(self) -> Phantom:
+        """The text's phantom."""
+        recipe = self.recipe()
+        return parse_phantom(recipe["text"], recipe["file"])
+
+    def recipe(self) -> dict[str, Any]:
+        """The whole text, and its name. Raises InputError."""
+        if self.text is None:
+            raise InputError("no text is chosen: choose one that describes a phantom")
+        return {"phantom": FILE, "file": self.text.name, "text": self.text.as_string()}
 
 
 _GROUPS = {
@@ -279,7 +252,6 @@ _GROUPS = {
     )
     for kind in KINDS
 } | {FILE: PhantomTextProperties}  # fmt: skip
-"""What objects keep of how they were made: the settings of every kind of phantom."""
 
 _KINDS = (
     ("VOLUME", "Volume", "Voxels from elsewhere"),
@@ -291,22 +263,16 @@ _KINDS = (
 class VolumeProperties(bpy.types.PropertyGroup):
     """One volume; lives on its object as `Object.mphdrr_volume`, with the settings of every kind (`.derenzo`, ...)."""
 
-    is_volume: BoolProperty(name="Is Volume", options={"HIDDEN"})
+    is_volume: BoolProperty(options={"HIDDEN"})
     kind: EnumProperty(
-        name="Kind", description="What the volume was made as: the kind whose settings count",
-        items=choices.items(choices.KINDS, _KINDS), default="VOLUME",
-    )  # fmt: skip
-    with_parent: BoolProperty(
-        name="With Parent",
-        description="Another quantity of the phantom that is this volume's parent",
-        options={"HIDDEN"},
+        name="Kind",
+        description="The kind whose settings count",
+        items=choices.items(choices.KINDS, _KINDS),
+        default="VOLUME",
     )
-    outdated: BoolProperty(
-        name="Outdated",
-        description="The phantom's settings have changed since its voxels were made",
-        options={"HIDDEN"},
-    )
-    message: StringProperty(name="Message", description="What is wrong with the phantom's settings", options={"HIDDEN"})
+    with_parent: BoolProperty(options={"HIDDEN"})  # another quantity of the phantom that is the parent
+    outdated: BoolProperty(options={"HIDDEN"})  # the phantom's settings have changed since its voxels were made
+    message: StringProperty(options={"HIDDEN"})  # what is wrong with the phantom's settings
     quantity: EnumProperty(
         name="Quantity", description="What the voxels hold", default="activity",
         items=choices.items(choices.QUANTITIES, ((name, name.capitalize(), f"In {unit}") for name, unit in UNITS.items())),
@@ -316,29 +282,18 @@ class VolumeProperties(bpy.types.PropertyGroup):
     spacing: FloatVectorProperty(name="Spacing", description="Voxel size in mm along the grid's axes", size=3)
     minimum: FloatProperty(name="Minimum", description="Smallest voxel value")
     maximum: FloatProperty(name="Maximum", description="Largest voxel value")
-    extent: FloatProperty(
-        name="Extent", description="Largest side in mm of the box around the voxels that are not empty", default=1.0,
-        options={"HIDDEN"},
-    )  # fmt: skip
+    # Largest side in mm of the box around the voxels that are not empty.
+    extent: FloatProperty(default=1.0, options={"HIDDEN"})
     display_low: FloatProperty(
-        name="Low", description="Value, in the volume's unit, at and below which nothing is shown",
-        update=on_edit("display_range"),
-    )  # fmt: skip
-    display_high: FloatProperty(
-        name="High", description="Value, in the volume's unit, that is shown brightest", default=1.0,
-        update=on_edit("display_range"),
-    )  # fmt: skip
-    slices: IntVectorProperty(
-        name="Slices", description="Voxel, along each of the grid's axes, that the slice planes lie in; from 0", size=3,
-        min=0, update=on_edit("slices"),
-    )  # fmt: skip
-    exact_pose: StringProperty(
-        name="Exact Pose", description="World-from-object matrix in double precision, JSON", options={"HIDDEN"}
+        name="Low", description="Value at and below which nothing is shown", update=on_edit("display_range")
     )
-    center_shift: FloatProperty(
-        name="Centre Shift", description="Voxels by which the .vdb is shifted for the Blender that wrote it",
-        options={"HIDDEN"},
-    )  # fmt: skip
+    display_high: FloatProperty(
+        name="High", description="Value that is shown brightest", default=1.0, update=on_edit("display_range")
+    )
+    slices: IntVectorProperty(name="Slices", description="Voxel from 0", size=3, min=0, update=on_edit("slices"))
+    exact_pose: StringProperty(options={"HIDDEN"})  # world-from-object matrix in double precision, JSON
+    # Voxels by which the .vdb is shifted for the Blender that wrote it.
+    center_shift: FloatProperty(options={"HIDDEN"})
 
 
 VolumeProperties.__annotations__.update(

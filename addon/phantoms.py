@@ -13,6 +13,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
+import bmesh
 import bpy
 import numpy as np
 from numpy.typing import NDArray
@@ -22,33 +23,24 @@ from ..core.geometry.grid import Grid
 from ..core.memory import require
 from ..core.phantoms.phantom import Phantom
 from ..core.progress import Progress, part_of
-from . import jobs, outlines, storage, volumes
+from ..core.volumes.meshes.mesh import Mesh
+from . import jobs, meshes, storage, volumes
 from .cameras import set_world_matrix, world_matrix
 from .phantom_properties import FILE, PhantomSettings
 from .stored_volumes import StoredVolume, moved, store_volume
 from .vdb import provenance_of
 
+_OUTLINE = "mphdrr_outline"  # custom property of an outline's object
+
 
 @dataclass(frozen=True)
 class Recipe:
-    """What a phantom's settings say, for a thread that leaves bpy alone.
+    """What a phantom's settings say, for a thread that leaves bpy alone."""
 
-    Attributes
-    ----------
-    phantom : Phantom
-        Of one that beats, the first state.
-    n_states : int
-        How many states there are, one for each frame.
-    grid : Grid
-        Its voxels, in its own frame.
-    settings : dict
-        As JSON can hold them.
-    """
-
-    phantom: Phantom
-    n_states: int
-    grid: Grid
-    settings: dict[str, Any]
+    phantom: Phantom  # of one that beats, the first state
+    n_states: int  # one for each frame
+    grid: Grid  # its voxels, in its own frame
+    settings: dict[str, Any]  # as JSON can hold them
 
     @cached_property
     def states(self) -> Sequence[Phantom]:
@@ -67,21 +59,26 @@ class Recipe:
         """A volume of each quantity, stored in `folder`, its phantom at a world-from-phantom pose (4, 4), mm.
 
         Its grid turns with the phantom or, if `baked`, its grid and its object are along the world's axes.
-
-        Raises
-        ------
-        InputError
-            No part of the phantom holds a quantity, or it does not fit into memory.
         """
-        self._check(quantities)
-        count = len(quantities) * self.n_states
+        title, count = self.phantom.title, len(quantities) * self.n_states
+        for quantity in quantities:
+            if all(getattr(shape, quantity) is None for shape in self.phantom.shapes):
+                raise InputError(f"the {title} has no {quantity}")
+        if count > 1:
+            shape = " x ".join(map(str, self.grid.shape))
+            require(4.0 * count * self.grid.n_voxels, f"{title}: {count} volumes of {shape} voxels")
         reports = (part_of(progress, number, count) for number in range(count))
         stored = []
         for quantity, pose in zip(quantities, poses, strict=True):
             if baked:
                 place = np.eye(4)
                 place[:3, 3] = pose[:3, 3]
-                grid = self._world_grid(pose)
+                # A grid along the world's axes that holds the phantom, with voxels as small as its own.
+                corners = list(itertools.product(*zip(*self.phantom.box, strict=True))) @ pose[:3, :3].T + pose[:3, 3]
+                low, high = corners.min(axis=0), corners.max(axis=0)
+                spacing = min(Grid(self.grid.shape, pose @ self.grid.affine).spacing)
+                n_x, n_y, n_z = (int(n) for n in np.ceil((high - low) / spacing) + 2)
+                grid = Grid.centered((n_x, n_y, n_z), spacing, (low + high) / 2)
                 made = [phantom.voxelize(grid, pose, next(reports), quantity) for phantom in self.states]
                 settings = self.settings | {"pose": pose.tolist()}
             else:
@@ -90,24 +87,6 @@ class Recipe:
                 made = [moved(volume, pose) for volume in own]
             stored.append(store_volume(made, folder, place, settings))
         return stored
-
-    def _check(self, quantities: Sequence[str]) -> None:
-        title = self.phantom.title
-        for quantity in quantities:
-            if all(getattr(shape, quantity) is None for shape in self.phantom.shapes):
-                raise InputError(f"the {title} has no {quantity}")
-        count = len(quantities) * self.n_states
-        if count > 1:
-            shape = " x ".join(map(str, self.grid.shape))
-            require(4.0 * count * self.grid.n_voxels, f"{title}: {count} volumes of {shape} voxels")
-
-    def _world_grid(self, pose: NDArray[np.float64]) -> Grid:
-        """A grid along the world's axes that holds the phantom at a pose, with voxels as small as its own."""
-        corners = list(itertools.product(*zip(*self.phantom.box, strict=True))) @ pose[:3, :3].T + pose[:3, 3]
-        low, high = corners.min(axis=0), corners.max(axis=0)
-        spacing = min(Grid(self.grid.shape, pose @ self.grid.affine).spacing)
-        n_x, n_y, n_z = (int(n) for n in np.ceil((high - low) / spacing) + 2)
-        return Grid.centered((n_x, n_y, n_z), spacing, (low + high) / 2)
 
 
 def recipe_of(settings: PhantomSettings) -> Recipe:
@@ -136,23 +115,10 @@ def poll_phantom(operator: type[bpy.types.Operator], context: bpy.types.Context)
 def adding(
     settings: PhantomSettings, name: str, pose: NDArray[np.float64] | None = None, attenuation: bool = False
 ) -> jobs.Job:
-    """The job that adds a phantom to the scene.
+    """The job that adds a phantom to the scene, of an operator's settings or `phantom_properties.plain_settings`.
 
-    Parameters
-    ----------
-    settings
-        An operator's, or `phantom_properties.plain_settings`.
-    name
-        The object's name.
-    pose
-        World-from-phantom matrix (4, 4), mm. Default: the world's axes.
-    attenuation
-        Also add the mu of a phantom of activity, as a child.
-
-    Raises
-    ------
-    InputError
-        There is no such phantom.
+    The `pose` is its world-from-phantom matrix (4, 4), mm, by default the world's axes. With `attenuation`, the mu of a
+    phantom of activity is added too, as a child.
     """
     recipe, folder, values = recipe_of(settings), storage.folder(), settings.values()
     kind, quantity = settings.identifier, values["quantity"]
@@ -188,11 +154,6 @@ def updating(item: bpy.types.Object, bake: bool = False) -> jobs.Job:
     """The job that makes a phantom's voxels, and its children's, again from its settings.
 
     With `bake`, at its pose and on a grid along the world's axes; then it is a phantom no more, but a volume like any other.
-
-    Raises
-    ------
-    InputError
-        The object is no phantom, its settings make none, or its matrix is singular.
     """
     work, name, before = remaking(item, bake), item.name, settings_of(item).values()
 
@@ -212,7 +173,7 @@ def updating(item: bpy.types.Object, bake: bool = False) -> jobs.Job:
 
 
 def remaking(item: bpy.types.Object, bake: bool = False) -> Callable[[Progress | None], list[StoredVolume]]:
-    """The work of `updating`, whose result is for `replace`; leaves bpy alone. Raises as that does."""
+    """The work of `updating`, whose result is for `replace`; leaves bpy alone."""
     settings = settings_of(item)
     if settings is None:
         raise InputError("no phantom is active: select one that was added with its settings")
@@ -223,13 +184,7 @@ def remaking(item: bpy.types.Object, bake: bool = False) -> Callable[[Progress |
 
 
 def replace(item: bpy.types.Object, stored: Sequence[StoredVolume], baked: bool = False) -> None:
-    """Give a phantom and its children the voxels that `remaking` made; they stay where they are.
-
-    Raises
-    ------
-    InputError
-        Children have come or gone in the meantime.
-    """
+    """Give a phantom and its children the voxels that `remaking` made; they stay where they are."""
     made = with_children(item)
     if len(made) != len(stored):
         raise InputError(f"the volumes of {item.name!r} are not those of before: try again")
@@ -248,17 +203,10 @@ def replace(item: bpy.types.Object, stored: Sequence[StoredVolume], baked: bool 
     if not baked:
         update_outline(item)
         return
-    outlines.remove(item)
+    remove_outline(item)
     properties.kind = "VOLUME"
     for child in made[1:]:
         child.mphdrr_volume.with_parent = False
-
-
-def root_of(item: bpy.types.Object) -> bpy.types.Object | None:
-    """The phantom that a volume is, or belongs to as its other quantity; None where there is none."""
-    if item.mphdrr_volume.with_parent and item.parent is not None:
-        item = item.parent
-    return None if settings_of(item) is None else item
 
 
 def with_children(item: bpy.types.Object) -> list[bpy.types.Object]:
@@ -268,15 +216,8 @@ def with_children(item: bpy.types.Object) -> list[bpy.types.Object]:
 
 
 def mu_energy(item: bpy.types.Object) -> float | None:
-    """The photon energy, keV, at which a volume's mu holds: of a phantom, or of a CT that was converted; else None.
-
-    Raises
-    ------
-    InputError
-        The phantom's settings make no phantom.
-    """
-    root = root_of(item)
-    if root is not None:
+    """The photon energy, keV, at which a volume's mu holds: of a phantom, or of a CT that was converted; else None."""
+    if (root := _root_of(item)) is not None:
         return recipe_of(settings_of(root)).phantom.mu_energy
     path = volumes.file_of(item)
     energy = provenance_of(path).get("energy_keV") if path.is_file() else None
@@ -285,24 +226,64 @@ def mu_energy(item: bpy.types.Object) -> float | None:
 
 def require_current(item: bpy.types.Object) -> None:
     """Raise `InputError` where a volume is of a phantom whose settings have changed since its voxels were made."""
-    phantom = root_of(item)
+    phantom = _root_of(item)
     if phantom is not None and phantom.mphdrr_volume.outdated:
         raise InputError(f"{phantom.name!r} has changed since its voxels were made: press Update Phantom first")
 
 
-def toggle_outline(item: bpy.types.Object) -> str:
-    """Show the surfaces of a phantom (of one that beats, in its first state) as wires that go with it, or hide them.
+def _root_of(item: bpy.types.Object) -> bpy.types.Object | None:
+    """The phantom that a volume is, or belongs to as its other quantity; None where there is none."""
+    if item.mphdrr_volume.with_parent and item.parent is not None:
+        item = item.parent
+    return None if settings_of(item) is None else item
 
-    Returns which of the two it did; raises `InputError` where the settings make no phantom.
-    """
-    if outlines.of(item) is not None:
-        outlines.remove(item)
+
+def toggle_outline(item: bpy.types.Object) -> str:
+    """Show the surfaces of a phantom (of one that beats, in its first state) as wires that go with it, or hide them."""
+    if outline_of(item) is not None:
+        remove_outline(item)
         return f"Removed the outline of {item.name!r}"
-    outlines.show(item, recipe_of(settings_of(item)).phantom.meshes())
+    _show_outline(item)
     return f"Added the outline of {item.name!r}"
 
 
 def update_outline(item: bpy.types.Object) -> None:
-    """Make a phantom's outline again, where it has one; raises as `toggle_outline` does."""
-    if outlines.of(item) is not None:
-        outlines.show(item, recipe_of(settings_of(item)).phantom.meshes())
+    """Make a phantom's outline again, where it has one."""
+    if outline_of(item) is not None:
+        _show_outline(item)
+
+
+def outline_of(item: bpy.types.Object) -> bpy.types.Object | None:
+    """A phantom's outline, if it has one."""
+    return next((child for child in item.children if _OUTLINE in child), None)
+
+
+def remove_outline(item: bpy.types.Object) -> None:
+    """Remove a phantom's outline, if it has one."""
+    outline = outline_of(item)
+    if outline is not None:
+        mesh = outline.data
+        bpy.data.objects.remove(outline)
+        if mesh.users == 0:
+            bpy.data.meshes.remove(mesh)
+
+
+def _show_outline(item: bpy.types.Object) -> None:
+    parts = recipe_of(settings_of(item)).phantom.meshes()
+    starts = np.cumsum([0, *(len(part.vertices) for part in parts)])
+    vertices = np.concatenate([part.vertices for part in parts])
+    faces = np.concatenate([part.faces + start for part, start in zip(parts, starts[:-1], strict=True)])
+    remove_outline(item)
+    collection = item.users_collection[0] if item.users_collection else bpy.context.scene.collection
+    outline = meshes.add_mesh(Mesh(vertices, faces), f"{item.name} outline", np.eye(4), collection)
+    shape = bmesh.new()
+    try:  # edges inside flat faces would fill the picture with wires
+        shape.from_mesh(outline.data)
+        bmesh.ops.dissolve_limit(shape, angle_limit=0.01, verts=shape.verts, edges=shape.edges)
+        shape.to_mesh(outline.data)
+    finally:
+        shape.free()
+    outline[_OUTLINE] = True
+    outline.display_type = "WIRE"
+    outline.hide_render = outline.hide_select = True
+    outline.parent = item

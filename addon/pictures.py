@@ -12,7 +12,6 @@ from ..core.errors import InputError
 from . import scanner
 
 SIZE = (960, 560)
-_SAMPLES = 12
 _DIRECTION = Vector((0.75, -1.0, 0.62))  # from the scanner's middle to the camera
 _LENS, _SENSOR = 50.0, 36.0
 # Direction from the scanner's middle in units of its reach, power (W per mm^2 of reach^2) and size of each light.
@@ -26,15 +25,9 @@ def render_scanner(
     last: int,
     volume: bpy.types.Object | None = None,
     zoom: float = 1.0,
-    samples: int = _SAMPLES,
+    samples: int = 12,
 ) -> None:
-    """Render modules `first` to `last` of a scanner to a PNG, with a volume or without; the file stays as it was.
-
-    Raises
-    ------
-    InputError
-        The picture cannot be written.
-    """
+    """Render modules `first` to `last` of a scanner to a PNG, with a volume or without; the scene stays as it was."""
     shown = {camera: not camera.hide_viewport for camera in scanner.modules(collection)}
     studio = bpy.data.scenes.new("mphDRR studio")
     studio.world = bpy.data.worlds.new("mphDRR studio")
@@ -44,7 +37,12 @@ def render_scanner(
         if volume is not None:
             studio.collection.objects.link(volume)
         scanner.show_modules(collection, first, last, "ONLY")
-        _set_up(studio, samples)
+        render, cycles = studio.render, studio.cycles
+        render.engine, cycles.device, cycles.samples, cycles.max_bounces = "CYCLES", "CPU", samples, 4
+        cycles.use_denoising, cycles.denoising_prefilter = True, "FAST"
+        render.resolution_x, render.resolution_y = SIZE
+        render.image_settings.file_format, render.image_settings.color_mode = "PNG", "RGB"
+        studio.view_settings.view_transform = "Standard"
         _furnish(studio, collection, zoom)
         studio.render.filepath = str(Path(path).absolute())
         bpy.ops.render.render(write_still=True, scene=studio.name)
@@ -56,16 +54,6 @@ def render_scanner(
         furniture = [item for item in studio.collection.objects if item != volume]
         bpy.data.batch_remove([*(item.data for item in furniture), *furniture, studio.world])
         bpy.data.scenes.remove(studio)
-
-
-def _set_up(studio: bpy.types.Scene, samples: int) -> None:
-    """Settings of Cycles and of the picture."""
-    render, cycles = studio.render, studio.cycles
-    render.engine, cycles.device, cycles.samples, cycles.max_bounces = "CYCLES", "CPU", samples, 4
-    cycles.use_denoising, cycles.denoising_prefilter = True, "FAST"
-    render.resolution_x, render.resolution_y = SIZE
-    render.image_settings.file_format, render.image_settings.color_mode = "PNG", "RGB"
-    studio.view_settings.view_transform = "Standard"
 
 
 def _furnish(studio: bpy.types.Scene, collection: bpy.types.Collection, zoom: float) -> None:

@@ -91,7 +91,7 @@ HANDLERS: tuple[tuple[list[Any], Any], ...] = (
     (bpy.app.handlers.redo_post, live_scanner.after_undo),
     (bpy.app.handlers.save_pre, storage.before_save),
     (bpy.app.handlers.save_post, storage.after_save),
-    (bpy.app.handlers.save_post_fail, storage.after_failed_save),
+    (bpy.app.handlers.save_post_fail, storage.restore_paths),
 )
 
 # What edited properties call (`addon/updates.py`).

@@ -100,7 +100,8 @@ def export_run(scene: bpy.types.Scene, filepath: str) -> Path:
 
 def show_run(scene: bpy.types.Scene, run: ProjectionRun, path: Path) -> None:
     """Make images of `run`, which is kept in the file `path`, and show it as the scene's last."""
-    images.store_projections(run.projections, run.system.numbers)
+    for _ in images.storing(run.projections, run.system.numbers):
+        pass
     _record_run(scene, run, path)
 
 

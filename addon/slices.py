@@ -29,19 +29,15 @@ _last: tuple[Path, Volume] | None = None
 
 
 def add_slices(item: bpy.types.Object) -> list[bpy.types.Object]:
-    """Three planes through a volume's middle, in the order of the grid's axes, in place of those that it has.
-
-    Raises
-    ------
-    InputError
-        The object is not a volume of ours, or its file is gone.
-    """
-    if not volumes.is_volume(item):
-        raise InputError("no volume is active: select one")
+    """Three planes through a volume's middle, in the order of the grid's axes, in place of those that it has."""
+    volumes.require_volume(item)
     volume = _stored(item)
     remove_slices(item)
-    names = _names(volumes.pose_of_object(item) @ volume.grid.affine)
-    planes = [_plane(item, volume, axis, names[axis]) for axis in range(3)]
+    world = volumes.pose_of_object(item) @ volume.grid.affine
+    toward = np.abs(np.linalg.inv(world[:3, :3]))  # row: normal of the plane across that axis of the grid
+    toward /= np.linalg.norm(toward, axis=1, keepdims=True)
+    best = max(itertools.permutations(range(3)), key=lambda order: sum(toward[a, w] for a, w in enumerate(order)))
+    planes = [_plane(item, volume, axis, _PLANES[best[axis]]) for axis in range(3)]
     item.mphdrr_volume.slices = [n // 2 for n in volume.grid.shape]  # which paints them
     return planes
 
@@ -49,8 +45,7 @@ def add_slices(item: bpy.types.Object) -> list[bpy.types.Object]:
 def remove_slices(item: bpy.types.Object) -> None:
     """Remove a volume's planes, with their meshes, materials and images."""
     for plane in planes_of(item):
-        mesh = plane.data
-        materials = list(mesh.materials)
+        mesh, materials = plane.data, list(plane.data.materials)
         bpy.data.objects.remove(plane)
         if mesh.users == 0:
             bpy.data.meshes.remove(mesh)
@@ -98,7 +93,11 @@ def update(item: bpy.types.Object) -> None:
         index = min(settings.slices[axis], volume.grid.shape[axis] - 1)
         plane.location = volume.grid.affine[:3, axis] * index
         image = plane.data.materials[0].node_tree.nodes["Slice"].image
-        _paint(image, np.take(volume.array, index, axis), settings)
+        low, high = settings.display_low, settings.display_high
+        relative = (np.take(volume.array, index, axis).T - low) / max(high - low, 1e-30)
+        shades = np.clip(relative * (_SHADES - 1), 0, _SHADES - 1).astype(np.uint8)
+        image.pixels.foreach_set(_colors(settings.quantity)[shades].ravel())
+        image.update()
 
 
 @bpy.app.handlers.persistent
@@ -128,14 +127,6 @@ def _stored(item: bpy.types.Object) -> Volume:
 
 def _lattice(volume: Volume) -> str:
     return json.dumps([volume.grid.shape, volume.grid.affine.tolist()])
-
-
-def _names(world: NDArray[np.float64]) -> list[str]:
-    """What the planes across the grid's axes are called."""
-    toward = np.abs(np.linalg.inv(world[:3, :3]))  # row: normal of the plane across that axis of the grid
-    toward /= np.linalg.norm(toward, axis=1, keepdims=True)
-    best = max(itertools.permutations(range(3)), key=lambda order: sum(toward[a, w] for a, w in enumerate(order)))
-    return [_PLANES[w] for w in best]
 
 
 def _plane(item: bpy.types.Object, volume: Volume, axis: int, name: str) -> bpy.types.Object:
@@ -175,20 +166,10 @@ def _material(name: str, image: bpy.types.Image) -> bpy.types.Material:
     return material
 
 
-def _paint(image: bpy.types.Image, values: NDArray[np.float32], settings: bpy.types.PropertyGroup) -> None:
-    """Show values (n_across, n_up) in an image of that size."""
-    low, high = settings.display_low, settings.display_high
-    scale = (_SHADES - 1) / max(high - low, 1e-30)
-    shades = np.clip((values.T - low) * scale, 0, _SHADES - 1).astype(np.uint8)
-    image.pixels.foreach_set(_colors(settings.quantity)[shades].ravel())
-    image.update()
-
-
 def _colors(quantity: str) -> NDArray[np.float32]:
     """RGBA (256, 4) of the display range, as an sRGB image holds them."""
     positions, colors = zip(*volume_materials.ramp(quantity), strict=True)
-    linear = np.array(colors)
     shades = np.linspace(0, 1, _SHADES)
-    rgb = np.stack([np.interp(shades, positions, linear[:, c]) for c in range(3)], axis=1)
+    rgb = np.stack([np.interp(shades, positions, channel) for channel in np.transpose(colors)], axis=1)
     srgb = np.where(rgb <= 0.0031308, 12.92 * rgb, 1.055 * rgb ** (1 / 2.4) - 0.055)
     return np.concatenate([srgb, np.ones((_SHADES, 1))], axis=1).astype(np.float32)

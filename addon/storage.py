@@ -6,13 +6,12 @@ Files made before the first save are copied there when it happens. Packing a .bl
 
 from __future__ import annotations
 
-import math
+import functools
 import os
 import re
 import shutil
 import time
 import warnings
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -28,20 +27,13 @@ _OUR_VOLUME = re.compile(r"[a-z]+-[0-9a-f]{16}(\.preview)?(_\d{4})?\.vdb")
 _FRAME = re.compile(r"_\d{4}\.vdb$")  # of a sequence, at the end of the name
 
 _LOOK = 2.0  # s that a file's size, once read, is shown
-_sizes: dict[Path, tuple[float, int | None]] = {}  # when a file was looked at, and its size
 
 # Paths as they were before the save that is running: (owner, attribute, old path).
 _before_save: list[tuple[Any, str, str]] = []
 
 
 def folder() -> Path:
-    """The folder for this .blend's large files, made if need be.
-
-    Raises
-    ------
-    InputError
-        It cannot be written.
-    """
+    """The folder for this .blend's large files, made if need be."""
     return ensure_folder(_folder())
 
 
@@ -64,67 +56,44 @@ def full_resolution(path: Path) -> Path:
     return path.with_name(path.name.replace(ids.PREVIEW, "", 1))
 
 
-def is_preview(path: Path) -> bool:
-    """Whether a .vdb is a coarser copy for display."""
-    return path != full_resolution(path)
-
-
 def of_frame(path: Path, number: int) -> Path:
     """The file of a sequence with that number."""
     return path.with_name(_FRAME.sub(f"_{number:04d}.vdb", path.name))
 
 
 def size_of(path: Path) -> int | None:
-    """Bytes of a file, None where there is none; looked up every two seconds at most.
-
-    For panels, which are drawn at every movement of the mouse: a look at a network disk may take long.
-    """
-    now = time.monotonic()
-    looked, size = _sizes.get(path, (-math.inf, None))
-    if now - looked > _LOOK:
-        size = path.stat().st_size if path.is_file() else None
-        _sizes[path] = now, size
-    return size
+    """Bytes of a file, None where there is none. Panels are drawn often: looks at the disk are two seconds apart."""
+    return _size_at(path, time.monotonic() // _LOOK)
 
 
-def missing_volumes(is_there: Callable[[Path], bool] = Path.is_file) -> list[bpy.types.Volume]:
-    """Volumes of ours of which a file, shown or with every voxel, is missing."""
-    return [
-        data
-        for data in bpy.data.volumes
-        if _OUR_VOLUME.fullmatch(absolute(data.filepath).name) and not all(map(is_there, _files_of(data)))
-    ]
+@functools.lru_cache(maxsize=4096)
+def _size_at(path: Path, now: float) -> int | None:
+    return path.stat().st_size if path.is_file() else None
 
 
-def seems_there(path: Path) -> bool:
-    """Whether there is a file, by `size_of`."""
-    return size_of(path) is not None
+def missing_volumes() -> list[bpy.types.Volume]:
+    """Volumes of ours of which a file, shown or with every voxel, is missing, by `size_of`."""
+    ours = [data for data in bpy.data.volumes if _OUR_VOLUME.fullmatch(absolute(data.filepath).name)]
+    return [data for data in ours if any(size_of(path) is None for path in _files_of(data))]
 
 
 def relocate(directory: str) -> str:
-    """Look for missing volumes' files by their names, in a folder and all below it; returns which volumes' were found.
-
-    The files of one volume are in one folder.
-
-    Raises
-    ------
-    InputError
-        No such folder.
-    """
+    """Look for missing volumes' files by name, in a folder and all below it; returns which volumes' were found."""
     top = absolute(directory)
     if not directory or not top.is_dir():
         raise InputError(f"{directory or 'no folder given'}: expected a folder to look in")
+    _size_at.cache_clear()
     missing = missing_volumes()
     wanted = {absolute(data.filepath).name for data in missing}
     there = {path.name: path for path in sorted(top.rglob("*.vdb"), reverse=True) if path.name in wanted}
     found = []
     for data in missing:
-        shown = there.get(absolute(data.filepath).name)
+        shown = there.get(absolute(data.filepath).name)  # the files of one volume are in one folder
         if shown is not None and all(shown.with_name(path.name).is_file() for path in _files_of(data)):
             data.filepath = stored_path(shown)
             data.grids.load()
             found.append(data.name)
-    _sizes.clear()
+    _size_at.cache_clear()
     if absent := sorted(data.name for data in missing if data.name not in found):
         warnings.warn(f"{top}: the files of {', '.join(absent)} are not there either", InputWarning, stacklevel=2)
     return f"Found the files of {', '.join(sorted(found)) or 'no volume'}"
@@ -138,13 +107,7 @@ def unused_volumes() -> list[Path]:
 
 
 def remove_unused() -> str:
-    """Remove the `unused_volumes`; returns how many there were.
-
-    Raises
-    ------
-    InputError
-        The .blend, as it is saved, may need them, or they cannot be removed.
-    """
+    """Remove the `unused_volumes`, unless the .blend, as it is saved, may need them; returns how many there were."""
     # Without a window Blender does not keep account of changes.
     if bpy.data.filepath and bpy.data.is_dirty and not bpy.app.background:
         raise InputError("the .blend has changes that are not saved, and as saved may need these files: save it")
@@ -202,32 +165,31 @@ def before_save(filepath: str, _: Any = None) -> None:
             _bring(source, target)
             source = target / source.name
         # A Save As elsewhere leaves the file where it is, as Blender does with images; only the path changes.
-        _set(settings, "run_file", _relative(source, Path(filepath).parent))
+        try:
+            path = "//" + Path(os.path.relpath(source, target.parent)).as_posix()
+        except ValueError:  # another drive
+            path = str(source)
+        _set(settings, "run_file", path)
 
 
 @bpy.app.handlers.persistent
 def after_save(filepath: str, _: Any = None) -> None:
     """Set paths back after "Save Copy", when this session still belongs to another file or to none."""
     if not filepath or bpy.data.filepath != filepath:
-        _restore()
-    else:
-        for owner, name, _ in _before_save:
-            # `//` did not lead there yet when the path was set, so Blender could not read the voxels: set it again.
-            if isinstance(owner, bpy.types.Volume):
-                setattr(owner, name, getattr(owner, name))
+        restore_paths()
+    for owner, name, _ in _before_save:
+        # `//` did not lead there yet when the path was set, so Blender could not read the voxels: set it again.
+        if isinstance(owner, bpy.types.Volume):
+            setattr(owner, name, getattr(owner, name))
     _before_save.clear()
 
 
 @bpy.app.handlers.persistent
-def after_failed_save(*_: Any) -> None:
-    """Set paths back when Blender could not write the .blend."""
-    _restore()
-    _before_save.clear()
-
-
-def _restore() -> None:
+def restore_paths(*_: Any) -> None:
+    """Set paths back as they were before a save, for example when Blender could not write the .blend."""
     for owner, name, old in _before_save:
         setattr(owner, name, old)
+    _before_save.clear()
 
 
 def _set(owner: Any, name: str, path: str) -> None:
@@ -252,8 +214,7 @@ def _folder() -> Path:
 
 
 def _folder_of(blend: str) -> Path:
-    path = Path(blend)
-    return path.with_name(f"{path.stem}_mphdrr")
+    return Path(blend).with_name(f"{Path(blend).stem}_mphdrr")
 
 
 def _temporary_folder() -> Path:
@@ -262,10 +223,3 @@ def _temporary_folder() -> Path:
 
 def _is_temporary(path: Path) -> bool:
     return path.is_absolute() and path.is_relative_to(_temporary_folder())
-
-
-def _relative(path: Path, top: Path) -> str:
-    try:
-        return "//" + Path(os.path.relpath(path, top)).as_posix()
-    except ValueError:  # another drive
-        return str(path)

@@ -25,28 +25,14 @@ MAX_SHOWN_VOXELS = 256**3
 
 @dataclass(frozen=True)
 class StoredVolume:
-    """A volume, or the states of one, whose voxels are in files, ready to be put into the scene.
-
-    Attributes
-    ----------
-    states : tuple of Volume
-        In world mm.
-    pose : array (4, 4)
-        World-from-object matrix.
-    path : Path
-        The .vdb of the first state that Blender shows: every voxel, or a coarser copy.
-    low, high : float
-        Smallest and largest value.
-    extent : float
-        Largest side, mm, of the box around the voxels that are not empty.
-    """
+    """A volume, or the states of one, in world mm, whose voxels are in files, ready to be put into the scene."""
 
     states: tuple[Volume, ...]
-    pose: NDArray[np.float64]
-    path: Path
-    low: float
-    high: float
-    extent: float
+    pose: NDArray[np.float64]  # world from object
+    path: Path  # the .vdb of the first state that Blender shows: every voxel, or a coarser copy
+    low: float  # smallest value
+    high: float  # largest value
+    extent: float  # largest side, mm, of the box around the voxels that are not empty
 
     @property
     def volume(self) -> Volume:
@@ -60,24 +46,10 @@ def store_volume(
     pose: ArrayLike | None = None,
     provenance: dict[str, Any] | None = None,
 ) -> StoredVolume:
-    """Write the voxels of a volume, or of the states of one, for `volumes.add_stored`.
+    """Write the voxels of a volume in world mm, or of states of one quantity, to a folder, for `volumes.add_stored`.
 
-    Parameters
-    ----------
-    volume
-        In world mm; states must hold one quantity.
-    folder
-        Where to, `storage.folder()`.
-    pose
-        Rigid world-from-object matrix (4, 4): where the object's origin and axes shall be; the voxels stay where they
-        are. Default: the origin at the middle of the (first) grid, axes along the world's.
-    provenance
-        What the volume was made from, kept in the file.
-
-    Raises
-    ------
-    InputError
-        No states, or states of several quantities.
+    The rigid world-from-object matrix `pose` (4, 4) says where the object's origin and axes shall be; the voxels stay where
+    they are. Default: the origin at the middle of the (first) grid, axes along the world's. The file keeps the `provenance`.
     """
     states = (volume,) if isinstance(volume, Volume) else tuple(volume)
     if len({state.quantity for state in states}) != 1:
@@ -88,15 +60,9 @@ def store_volume(
         place[:3, 3] = states[0].grid.center
     else:
         place = checked_affine(pose, "volume pose")
-    local = [moved(state, np.linalg.inv(place)) for state in states]
-    return StoredVolume(
-        states,
-        place,
-        write_states(local, folder, provenance),
-        min(float(v.array.min()) for v in states),
-        max(float(v.array.max()) for v in states),
-        max(_extent(v) for v in states),
-    )
+    path = write_states([moved(state, np.linalg.inv(place)) for state in states], folder, provenance)
+    low, high = min(float(v.array.min()) for v in states), max(float(v.array.max()) for v in states)
+    return StoredVolume(states, place, path, low, high, max(map(_extent, states)))
 
 
 def write_states(states: Sequence[Volume], folder: Path, provenance: dict[str, Any] | None = None) -> Path:
@@ -116,20 +82,18 @@ def write_states(states: Sequence[Volume], folder: Path, provenance: dict[str, A
         shown = [coarser(state) for state in shown]
     low = min(float(state.array.min()) for state in shown)
     smoke_above = volume_materials.usual_range(states[0].quantity, low, 1.0)[0] if low < 0 else None
+
+    def write(stem: str, states: Sequence[Volume], provenance: Any, smoke_above: float | None) -> Path:
+        paths = [folder / f"{stem}{f'_{k:04d}' if len(states) > 1 else ''}.vdb" for k in range(1, len(states) + 1)]
+        for state, path in zip(states, paths, strict=True):
+            if not path.exists():
+                write_vdb(state, path, provenance, smoke_above=smoke_above, center_shift=compat.VDB_CENTER_SHIFT)
+        return paths[0]
+
     if shown[0] is states[0]:
-        return _write(states, folder, stem, provenance, smoke_above)
-    _write(states, folder, stem, provenance)
-    return _write(shown, folder, stem + ids.PREVIEW, {"coarser_copy_of": stem}, smoke_above)
-
-
-def _write(
-    states: Sequence[Volume], folder: Path, stem: str, provenance: Any, smoke_above: float | None = None
-) -> Path:
-    paths = [folder / f"{stem}{f'_{k:04d}' if len(states) > 1 else ''}.vdb" for k in range(1, len(states) + 1)]
-    for state, path in zip(states, paths, strict=True):
-        if not path.exists():
-            write_vdb(state, path, provenance, smoke_above=smoke_above, center_shift=compat.VDB_CENTER_SHIFT)
-    return paths[0]
+        return write(stem, states, provenance, smoke_above)
+    write(stem, states, provenance, None)
+    return write(stem + ids.PREVIEW, shown, {"coarser_copy_of": stem}, smoke_above)
 
 
 def moved(volume: Volume, matrix: NDArray[np.float64]) -> Volume:
@@ -140,9 +104,7 @@ def moved(volume: Volume, matrix: NDArray[np.float64]) -> Volume:
 def coarser(volume: Volume) -> Volume:
     """Means over blocks of 2^3 voxels, for display; voxels beyond the edge are empty."""
     padding = [(0, n % 2) for n in volume.grid.shape]
-    array = volume.array
-    if any(after for _, after in padding):
-        array = np.pad(array, padding, constant_values=_empty(volume))
+    array = np.pad(volume.array, padding, constant_values=_empty(volume))
     a, b, c = (n // 2 for n in array.shape)
     means = array.reshape(a, 2, b, 2, c, 2).mean(axis=(1, 3, 5), dtype=np.float32)
     blocks = np.diag([2.0, 2.0, 2.0, 1.0])
@@ -157,8 +119,6 @@ def _empty(volume: Volume) -> float:
 
 def _extent(volume: Volume) -> float:
     filled = volume.array != _empty(volume)
-    sides = []
-    for axis, spacing in enumerate(volume.grid.spacing):
-        used = np.flatnonzero(filled.any(axis=tuple(k for k in range(3) if k != axis)))
-        sides.append(spacing * (used[-1] - used[0] + 1) if len(used) else spacing)
-    return float(max(sides))
+    used = [np.flatnonzero(filled.any(axis=others)) for others in ((1, 2), (0, 2), (0, 1))]
+    counts = [k[-1] - k[0] + 1 if len(k) else 1 for k in used]
+    return float(max(np.multiply(counts, volume.grid.spacing)))

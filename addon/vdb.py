@@ -9,6 +9,7 @@ and say so in their metadata; files written for other programs are not shifted.
 from __future__ import annotations
 
 import json
+import struct
 import warnings
 from collections.abc import Sequence
 from pathlib import Path
@@ -25,61 +26,39 @@ from ..core.memory import require
 from ..core.validation import freeze, positive
 from ..core.version import VERSION
 from ..core.volumes.volume import AIR_HU, UNITS, Volume
-from .vdb_length import missing_bytes
 
-SMOKE = "smoke for display"
-"""Name of a grid that only Blender's solid viewport uses."""
-
+SMOKE = "smoke for display"  # a grid that only Blender's solid viewport uses
 BACKGROUND = {"hu": AIR_HU}
 """Value of the voxels that take no room in a file, where it is not 0: around a CT there is air, not water."""
-
 _NUMBERS = ("float", "double", "half", "int32", "int64", "bool")  # value types that can become a volume
 _SLAB = 64  # layers copied to OpenVDB at once: the copy stays small
 _NOTE = (
     "Written for a Blender that draws index i over [i, i + 1]: the centre of voxel i is where this transform carries "
     "i {back:+g} along every axis. File > Export > Volume of mphDRR writes files for other programs."
 )
+_MAGIC = 0x56444220  # " BDV", OpenVDB's io::OPENVDB_MAGIC
+_UUID_CHARACTERS, _LONGEST_TEXT, _MOST_GRIDS = 36, 1 << 20, 10_000  # of a .vdb's header
 
 
 def write_vdb(
-    volumes: Volume | Sequence[Volume],
+    volume: Volume,
     path: str | Path,
     provenance: dict[str, Any] | None = None,
     *,
     smoke_above: float | None = None,
     center_shift: float = 0.0,
 ) -> None:
-    """Write volumes as sparse float grids, each named after its quantity; voxels of 0 (-1000 HU) take no room.
+    """Write a volume as a sparse float grid named after its quantity; voxels of 0 (-1000 HU) take no room.
 
-    Parameters
-    ----------
-    volumes
-        One, or several of different quantities, such as activity and mu; their grids may differ.
-    path
-        The file.
-    provenance
-        What the volumes were made from, kept as JSON in the metadata.
-    smoke_above
-        Also write a grid `SMOKE` of the first volume's values above this one, minus it: Blender's solid viewport draws
-        the surroundings of values below 0 black. `read_vdb` ignores it.
-    center_shift
-        Voxels by which the transforms are shifted along every index axis, for files that a Blender draws which places
-        them otherwise (`compat.VDB_CENTER_SHIFT`). `read_vdb` gives the same volume whatever the shift was.
-
-    Raises
-    ------
-    InputError
-        No volumes, two of one quantity, or the file cannot be written.
+    The `provenance`, what the volume was made from, is kept as JSON. With `smoke_above`, a grid `SMOKE` holds the values
+    above that one, minus it: Blender's solid viewport draws the surroundings of values below 0 black. The transform is
+    shifted by `center_shift` voxels along every index axis, for the Blender that draws the file
+    (`compat.VDB_CENTER_SHIFT`). `read_vdb` gives the same volume whatever the shift, without the smoke.
     """
-    several = [volumes] if isinstance(volumes, Volume) else list(volumes)
-    path = Path(path)
-    names = [volume.quantity for volume in several]
-    if not names or len(set(names)) < len(names):
-        raise InputError(f"{path}: expected volumes of different quantities, got {', '.join(names) or 'none'}")
-    grids = [_grid_of(volume, provenance or {}, center_shift) for volume in several]
+    grids = [_grid_of(volume, provenance or {}, center_shift)]
     if smoke_above is not None:
-        above = freeze(np.maximum(several[0].array - np.float32(smoke_above), 0))
-        grids.append(_grid_of(Volume(above, several[0].grid), {}, center_shift))
+        above = freeze(np.maximum(volume.array - np.float32(smoke_above), 0))
+        grids.append(_grid_of(Volume(above, volume.grid), {}, center_shift))
         grids[-1].name = SMOKE
     with replacing(path) as temporary:
         openvdb().write(str(temporary), grids=grids)
@@ -90,25 +69,18 @@ def read_vdb(path: str | Path, quantity: str | None = None, grid: str | None = N
 
     Another program's grid becomes a volume on the box around its active voxels, with all values in the box, active or not,
     in float32; outside of it a volume is 0, whatever the grid's background. A level set gives the share (0 to 1) of each
-    voxel that lies inside it.
+    voxel that lies inside it. Raises `InputError` where the file or the grid cannot be read as a volume.
 
     Parameters
     ----------
     path
         The file.
     quantity
-        What the values are, one of `UNITS`; of several grids, the one of that quantity. Default: what the file
-        says, and ``"activity"`` where it says nothing.
+        What the values are, one of `UNITS`, and which of several grids. Default: what the file says, or else activity.
     grid
         The grid's name; needed where a file holds several and `quantity` does not tell which.
     unit
         Length in mm of the file's unit, for files of other programs: 1000 for one in metres.
-
-    Raises
-    ------
-    InputError
-        No such file, not OpenVDB, damaged; no such grid, or several and none chosen; a grid of vectors or points, one
-        without active voxels, a frustum; values that are not finite; too large for the memory.
     """
     path = Path(path)
     if not path.is_file():
@@ -116,7 +88,7 @@ def read_vdb(path: str | Path, quantity: str | None = None, grid: str | None = N
     if quantity is not None and quantity not in UNITS:
         raise InputError(f"quantity {quantity!r}: expected one of {', '.join(UNITS)}")
     unit = positive(unit, "unit of the file's lengths", "mm")
-    if missing := missing_bytes(path):
+    if missing := _missing_bytes(path):
         raise InputError(f"{path}: is cut off, {missing} bytes are missing at its end")
     try:
         name = _chosen(_described(path), quantity, grid)
@@ -137,8 +109,7 @@ def provenance_of(path: Path) -> dict[str, Any]:
     except Exception:  # whatever OpenVDB raises; `read_vdb` says what is wrong
         return {}
     texts = (grid.metadata.get("mphdrr_provenance") for grid in grids)
-    provenance: dict[str, Any] = json.loads(next((text for text in texts if text), "{}"))
-    return provenance
+    return dict(json.loads(next(filter(None, texts), "{}")))
 
 
 def openvdb() -> Any:
@@ -198,28 +169,19 @@ def _described(path: Path) -> dict[str, Any]:
     """The grids of a file, without voxels, by the names that OpenVDB reads them by: those that recur have a number."""
     grids = [grid for grid in openvdb().readAllGridMetadata(str(path)) if grid.name != SMOKE]
     names = [grid.name for grid in grids]
-    named: dict[str, Any] = {}
-    for k, grid in enumerate(grids):
-        recurs = names.count(grid.name) > 1
-        named[f"{grid.name}[{names[:k].count(grid.name)}]" if recurs else grid.name] = grid
-    return named
+    numbered = [f"{name}[{names[:k].count(name)}]" if names.count(name) > 1 else name for k, name in enumerate(names)]
+    return dict(zip(numbered, grids, strict=True))
 
 
 def _chosen(grids: dict[str, Any], quantity: str | None, name: str | None) -> str:
     if not grids:
         raise InputError("it holds no grid, or ends before the first")
     listed = ", ".join(f"{key!r} ({grid.valueTypeName})" for key, grid in grids.items())
-    if name is not None:
-        if name not in grids:
-            raise InputError(f"it holds no grid {name!r}; expected one of {listed}")
-        if grids[name].valueTypeName not in _NUMBERS:
-            raise InputError(f"the grid {name!r} holds {grids[name].valueTypeName}; expected numbers")
-        return name
-    usable = [key for key, grid in grids.items() if grid.valueTypeName in _NUMBERS]
+    usable = [key for key, grid in grids.items() if grid.valueTypeName in _NUMBERS and name in (None, key)]
     if len(usable) > 1 and quantity is not None:
         usable = [key for key in usable if _quantity_of(grids[key]) == quantity] or usable
     if not usable:
-        raise InputError(f"it holds no grid of numbers, but {listed}")
+        raise InputError(f"it holds no grid of numbers{'' if name is None else f' {name!r}'}, but {listed}")
     if len(usable) > 1:
         raise InputError(f"it holds several grids: say which, of {listed}")
     return usable[0]
@@ -235,13 +197,22 @@ def _volume_of(grid: Any, quantity: str | None, unit: float) -> Volume:
     quantity = quantity or _quantity_of(grid) or "activity"
     if not grid.transform.isLinear:
         raise InputError(f"the grid {grid.name!r} is a frustum, whose voxels are no parallelepipeds: resample it first")
-    drawn = _affine_of(grid.transform)
+    far = 2.0**20  # index units: far enough that subtracting the origin costs no digits
+    origin, *ends = (np.array(grid.transform.indexToWorld(tuple(point))) for point in far * np.eye(4, 3, -1))
+    drawn = np.eye(4)  # on column vectors
+    drawn[:3] = np.column_stack([*((end - origin) / far for end in ends), origin])
+    known = grid.metadata
     first, last = (np.array(corner) for corner in grid.evalActiveVoxelBoundingBox())
-    own = _own_lattice(grid, drawn)
-    if own is not None:
-        shape, affine, mirrored = own
-        array = _values(grid, np.zeros(3, int), shape)
-        return Volume(freeze(array[::-1].copy() if mirrored else array), Grid(shape, affine), quantity)
+    if {"mphdrr_shape", "mphdrr_affine", "mphdrr_mirrored", "mphdrr_center_shift"} <= known.keys():
+        shape, affine = json.loads(known["mphdrr_shape"]), np.array(json.loads(known["mphdrr_affine"]))
+        written = _drawn(affine, shape, known["mphdrr_mirrored"], known["mphdrr_center_shift"])
+        inside = (first.min() >= 0 and np.all(last < shape)) or grid.activeVoxelCount() == 0
+        # The metadata outlive what other programs do to the transform and the voxels.
+        if inside and np.allclose(drawn, written, rtol=0, atol=1e-9 * np.abs(written).max()):
+            array = _values(grid, np.zeros(3, int), shape)
+            return Volume(
+                freeze(array[::-1].copy() if known["mphdrr_mirrored"] else array), Grid(shape, affine), quantity
+            )
     if np.any(last < first):
         raise InputError(f"the grid {grid.name!r} has no active voxels")
     affine = np.diag([unit, unit, unit, 1.0]) @ _centered(grid, drawn)
@@ -253,25 +224,6 @@ def _volume_of(grid: Any, quantity: str | None, unit: float) -> Volume:
         size = np.cbrt(abs(np.linalg.det(drawn[:3, :3])))
         array = np.clip(0.5 - array / np.float32(size), 0.0, 1.0)
     return Volume(freeze(array), Grid((n_x, n_y, n_z), affine), quantity)
-
-
-def _own_lattice(
-    grid: Any, drawn: NDArray[np.float64]
-) -> tuple[tuple[int, int, int], NDArray[np.float64], bool] | None:
-    """Shape, affine and whether it is stored mirrored, of our own grid that no other program has changed."""
-    known = grid.metadata
-    if not {"mphdrr_shape", "mphdrr_affine", "mphdrr_mirrored", "mphdrr_center_shift"} <= known.keys():
-        return None
-    n_x, n_y, n_z = json.loads(known["mphdrr_shape"])
-    shape = (n_x, n_y, n_z)
-    affine = np.array(json.loads(known["mphdrr_affine"]))
-    mirrored = bool(known["mphdrr_mirrored"])
-    written = _drawn(affine, shape, mirrored, known["mphdrr_center_shift"])
-    first, last = grid.evalActiveVoxelBoundingBox()
-    inside = min(first) >= 0 and all(a < n for a, n in zip(last, shape, strict=True))
-    # The metadata outlive what other programs do to the transform and the voxels.
-    same = np.allclose(drawn, written, rtol=0, atol=1e-9 * np.abs(written).max())
-    return (shape, affine, mirrored) if same and (inside or grid.activeVoxelCount() == 0) else None
 
 
 def _centered(grid: Any, drawn: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -296,22 +248,47 @@ def _centered(grid: Any, drawn: NDArray[np.float64]) -> NDArray[np.float64]:
     return drawn @ centers
 
 
-def _affine_of(transform: Any) -> NDArray[np.float64]:
-    """A linear transform as a matrix (4, 4) on column vectors."""
-    far = 2.0**20  # index units: far enough that subtracting the origin costs no digits
-    origin = np.array(transform.indexToWorld((0.0, 0.0, 0.0)))
-    affine = np.eye(4)
-    affine[:3, 3] = origin
-    for axis in range(3):
-        point = np.zeros(3)
-        point[axis] = far
-        affine[:3, axis] = (np.array(transform.indexToWorld(tuple(point))) - origin) / far
-    return affine
-
-
-def _values(grid: Any, first: NDArray[Any], shape: tuple[int, ...]) -> NDArray[np.float32]:
+def _values(grid: Any, first: NDArray[Any], shape: Sequence[int]) -> NDArray[np.float32]:
     """The grid's values from the voxel `first` on, active or not."""
     require(4.0 * np.prod(shape, dtype=float), f"the volume of {' x '.join(map(str, shape))} voxels")
     array = np.zeros(shape, np.float32)
     grid.copyToArray(array, ijk=tuple(int(i) for i in first))
     return array
+
+
+def _missing_bytes(path: Path) -> int:
+    """How many bytes a file lacks at its end; 0 also where its layout does not say.
+
+    OpenVDB itself reads past a missing end and takes what it finds for values. Its `io::Archive` is a header, the file's
+    metadata, then each grid after a descriptor with the offsets at which its parts begin and end.
+    """
+    with path.open("rb") as file:
+
+        def numbers(kinds: str) -> tuple[int, ...]:
+            return struct.unpack(f"<{kinds}", file.read(struct.calcsize(f"<{kinds}")))
+
+        def count(most: int) -> int:
+            (number,) = numbers("I")
+            if number > most:
+                raise struct.error("another layout")
+            return number
+
+        def skip_texts() -> None:  # name, type and value of metadata; name, type and instance parent of a grid
+            for _ in range(3):
+                file.seek(count(_LONGEST_TEXT), 1)
+
+        end = 0
+        try:
+            magic, _version, _major, _minor, has_offsets = numbers("qIIIB")
+            if magic != _MAGIC or not has_offsets:
+                return 0
+            file.seek(_UUID_CHARACTERS, 1)
+            for _ in range(count(_MOST_GRIDS)):
+                skip_texts()
+            for _ in range(count(_MOST_GRIDS)):
+                skip_texts()
+                _begin, _blocks, end = numbers("qqq")
+                file.seek(max(end, 0))
+        except struct.error:  # OpenVDB itself refuses a file that is cut off in its header
+            return 0
+        return max(0, end - path.stat().st_size)

@@ -17,13 +17,7 @@ WRITTEN_ENDINGS = (".vdb", *VOLUME_FORMATS)
 
 
 def exporting(item: bpy.types.Object, path: Path) -> jobs.Job:
-    """The job that writes every voxel of a volume, where it stands in the world; the name's ending chooses the format.
-
-    Raises
-    ------
-    InputError
-        Another ending, the scene's own file, no volume, or a phantom whose settings have changed.
-    """
+    """The job that writes every voxel of a volume, where it stands in the world; the name's ending chooses the format."""
     if not path.name.lower().endswith(WRITTEN_ENDINGS):
         raise InputError(f"{path}: expected a name ending in {', '.join(WRITTEN_ENDINGS)}")
     read = volumes.reader(item)

@@ -32,38 +32,31 @@ def importing(
     unit: float = 1.0,
     frame_start: int = 1,
 ) -> jobs.Job:
-    """The job that reads a file as a volume, or several as the states of one.
+    """The job that reads a file (or the folder of a DICOM series) as a volume, or several as the states of one.
 
     Parameters
     ----------
-    paths
-        The files; a folder is a DICOM series.
-    name
-        The object's name; by default the first file's.
+    paths, name, frame_start
+        The files, the object's name (by default the first file's), and the frame of the first state.
     quantity
-        What the voxels hold, one of `UNITS`. Default: what the file says; of those that say nothing, OpenVDB files hold
-        activity, others CT numbers.
+        What the voxels hold, one of `UNITS`. Default: what the file says, or else activity in OpenVDB, CT numbers elsewhere.
     center
         Move the (first) volume's middle to the isocentre; states move together.
     energy
         Convert CT numbers to attenuation of photons of this energy, keV.
     grid, unit
         Of OpenVDB files, see `vdb.read_vdb`.
-    frame_start
-        Frame of the first state.
     """
     folder, count = storage.folder(), len(paths)
-
-    def read(path: Path, progress: Progress | None) -> Volume:
-        if path.suffix.lower() == ".vdb":
-            return vdb.read_vdb(path, quantity, grid, unit=unit)
-        return read_volume(path, quantity, progress=progress)
 
     def work(progress: Progress) -> StoredVolume:
         states: list[Volume] = []
         for k, path in enumerate(paths):
             progress(k, count + 1)
-            states.append(read(path, part_of(progress, k, count + 1)))
+            if path.suffix.lower() == ".vdb":
+                states.append(vdb.read_vdb(path, quantity, grid, unit=unit))
+            else:
+                states.append(read_volume(path, quantity, progress=part_of(progress, k, count + 1)))
             if k == 0 and count > 1:
                 shape = " x ".join(map(str, states[0].grid.shape))
                 require(4.0 * (count - 1) * states[0].grid.n_voxels, f"{count} volumes of {shape} voxels")
@@ -102,14 +95,10 @@ def name_of(path: Path) -> str:
 
 
 def converting(item: bpy.types.Object, energy: float) -> jobs.Job:
-    """The job that adds the attenuation of a CT, for photons of an energy in keV; the CT stays.
-
-    Raises
-    ------
-    InputError
-        The object is no volume, its file is gone, or the memory is too small.
-    """
-    readers, pose, folder = volumes.state_readers(item), volumes.pose_of_object(item), storage.folder()
+    """The job that adds the attenuation of a CT, for photons of an energy in keV; the CT stays."""
+    volumes.require_volume(item)
+    readers = [volumes.reader(item, path) for path in storage.files_of_states(item.data)]
+    pose, folder = volumes.pose_of_object(item), storage.folder()
     name, collection, count = f"{item.name} mu", item.users_collection[0], len(readers)
     n_x, n_y, n_z = item.mphdrr_volume.shape
     require(8.0 * count * n_x * n_y * n_z, f"the attenuation of {count * n_x * n_y * n_z} voxels")

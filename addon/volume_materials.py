@@ -23,8 +23,7 @@ _CT_WINDOW = (-200.0, 1000.0)  # HU: skin to bone
 # Extinction times the volume's size: a rod of a twentieth of it looks solid; attenuation and maps can be looked through.
 _OPACITY, _OPACITY_THROUGH = 60.0, 20.0
 _SMOKE = 15.0  # the same for the solid viewport's smoke, which is denser: thin enough that rods show behind rods
-_RANGE = "Display Range"  # the node that holds the values at the ramp's ends
-_OPACITY_NODE = "Opacity"
+_RANGE, _OPACITY_NODE = "Display Range", "Opacity"  # nodes: the values at the ramp's ends, and the extinction
 
 
 def ramp(quantity: str) -> tuple[tuple[float, tuple[float, float, float]], ...]:
@@ -40,10 +39,7 @@ def usual_range(quantity: str, low: float, high: float) -> tuple[float, float]:
 
 
 def new_material(name: str, quantity: str, size: float) -> bpy.types.Material:
-    """A material that glows and is opaque where the values of the .vdb's grid `quantity` are high (see `set_range`).
-
-    The volume's `size`, mm, sets the node "Opacity".
-    """
+    """A material that glows and is opaque where the grid `quantity` is high (`set_range`); for a volume of `size` mm."""
     material = bpy.data.materials.new(name)
     enable_nodes(material)
     tree = material.node_tree
@@ -91,16 +87,13 @@ def new_material(name: str, quantity: str, size: float) -> bpy.types.Material:
 
 def set_range(material: bpy.types.Material, low: float, high: float) -> None:
     """Spread the colours from the value `low` to `high`; a material that the user made is left alone."""
-    node = material.node_tree.nodes.get(_RANGE) if material.node_tree else None
-    if node is not None:
-        node.inputs["From Min"].default_value = low
-        node.inputs["From Max"].default_value = high
+    if material.node_tree and (node := material.node_tree.nodes.get(_RANGE)):
+        node.inputs["From Min"].default_value, node.inputs["From Max"].default_value = low, high
 
 
 def resize(material: bpy.types.Material, old: float, new: float) -> None:
     """Keep a volume as opaque as before when its size, mm, changes from `old` to `new`."""
-    node = material.node_tree.nodes.get(_OPACITY_NODE) if material.node_tree else None
-    if node is not None:
+    if material.node_tree and (node := material.node_tree.nodes.get(_OPACITY_NODE)):
         node.outputs[0].default_value *= old / new
 
 

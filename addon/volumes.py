@@ -1,8 +1,7 @@
 """Core volumes <-> Blender's Volume objects.
 
-The voxels are in .vdb files (`stored_volumes`), so that a saved .blend can be projected after it is opened again. The
-affine in the file is from voxel index to the object's own space, and the object's matrix is the pose: moving the object
-moves the volume.
+The voxels are in .vdb files (`stored_volumes`), so that a saved .blend can be projected later. The affine in the file is
+from voxel index to the object's own space, and the object's matrix is the pose: moving the object moves the volume.
 """
 
 from __future__ import annotations
@@ -22,7 +21,7 @@ from ..core.geometry.frames import checked_affine
 from ..core.memory import readable_size
 from ..core.physics.maps import MAPS
 from ..core.volumes.volume import UNITS, Volume
-from . import compat, storage, volume_materials
+from . import compat, ids, storage, volume_materials
 from .cameras import world_matrix
 from .stored_volumes import StoredVolume, moved, store_volume, write_states
 from .vdb import SMOKE, read_vdb
@@ -36,26 +35,11 @@ def add_volume(
     collection: bpy.types.Collection | None = None,
     frame_start: int = 1,
 ) -> bpy.types.Object:
-    """Put a volume into the scene as a Volume object with a material.
+    """Put a volume into the scene as a Volume object with a material; see `store_volume` for `volume` and `pose`.
 
-    The states of something that changes, such as a beating heart, follow each other frame by frame and begin again after the
-    last one (`Volume.sequence_mode`). `volume_from_object` and projections take the state of the scene's current frame.
-
-    Parameters
-    ----------
-    volume, pose, provenance
-        See `store_volume`.
-    name
-        The object's name; Blender numbers it if it is taken.
-    collection
-        Default: the scene's own.
-    frame_start
-        Frame of the first state.
-
-    Raises
-    ------
-    InputError
-        No states, or states of several quantities.
+    The states of something that changes, such as a beating heart, follow each other frame by frame from `frame_start` and
+    begin again after the last one (`Volume.sequence_mode`). `volume_from_object` and projections take the state of the
+    scene's current frame. Blender numbers the name if it is taken; the collection is by default the scene's own.
     """
     item = add_stored(store_volume(volume, storage.folder(), pose, provenance), name, collection)
     if item.data.is_sequence:
@@ -74,15 +58,13 @@ def add_stored(stored: StoredVolume, name: str, collection: bpy.types.Collection
 def replace_stored(item: bpy.types.Object, stored: StoredVolume) -> None:
     """Give a Volume object the voxels and the pose of a stored volume.
 
-    Its datablock stays, with what the user has set on it. One of another quantity, or that other objects show too, is
-    replaced, and removed if nothing else needs it.
+    Its datablock stays, with what the user has set on it, unless it is of another quantity or other objects show it too.
     """
     old, settings = item.data, item.mphdrr_volume
     if old.users == 1 and settings.quantity == stored.volume.quantity:  # in place: what the user set on it stays
         _show(old, stored)
-        for material in old.materials:
-            if material is not None:
-                volume_materials.resize(material, settings.extent, stored.extent)
+        for material in filter(None, old.materials):
+            volume_materials.resize(material, settings.extent, stored.extent)
         _describe(item, stored)
         return
     item.data = data = _volume_data(stored, item.name)
@@ -109,54 +91,35 @@ def show_range(item: bpy.types.Object) -> None:
     """Draw a volume in its display range (`VolumeProperties.display_low` and `display_high`)."""
     settings = item.mphdrr_volume
     low, high = settings.display_low, max(settings.display_high, settings.display_low + 1e-30)
-    for material in item.data.materials:
-        if material is not None:
-            volume_materials.set_range(material, low, high)
+    for material in filter(None, item.data.materials):
+        volume_materials.set_range(material, low, high)
     volume_materials.set_display(item.data, low, high, settings.extent)
 
 
 def volume_from_object(item: bpy.types.Object) -> Volume:
-    """The exact volume that an object shows, in world mm, wherever the object has been moved, turned or scaled to.
-
-    Raises
-    ------
-    InputError
-        The object is not a volume of ours, or its file is gone.
-    """
+    """The exact volume that an object shows, in world mm, wherever the object has been moved, turned or scaled to."""
     return reader(item)()
 
 
-def reader(item: bpy.types.Object) -> Callable[[], Volume]:
+def reader(item: bpy.types.Object, path: Path | None = None) -> Callable[[], Volume]:
     """A function that does what `volume_from_object` does but leaves bpy alone, to be called in a thread.
 
-    Raises
-    ------
-    InputError
-        The object is not a volume of ours, or its file is gone.
+    `path` is the file of a state (`storage.files_of_states`); default: of the one at the current frame.
     """
-    _require_volume(item)
-    if _state(item.data) is None:
+    require_volume(item)
+    if path is None and _state(item.data) is None:
         raise InputError(f"{item.name!r} has no state at frame {bpy.context.scene.frame_current}")
-    return _reader(item, file_of(item))
-
-
-def state_readers(item: bpy.types.Object) -> list[Callable[[], Volume]]:
-    """`reader` of every state of a sequence, in their order; of any other volume its only one."""
-    _require_volume(item)
-    return [_reader(item, path) for path in storage.files_of_states(item.data)]
-
-
-def _require_volume(item: bpy.types.Object | None) -> None:
-    if not is_volume(item):
-        what = "nothing is chosen" if item is None else f"{item.name!r} is no mphDRR volume"
-        raise InputError(f"{what}: add a phantom first, or choose one")
-
-
-def _reader(item: bpy.types.Object, path: Path) -> Callable[[], Volume]:
-    pose = pose_of_object(item)
+    pose, path = pose_of_object(item), path or file_of(item)
     if not path.is_file():
         raise InputError(f"{path}: no such file; the voxels of {item.name!r} are gone, so add the volume again")
     return lambda: moved(read_vdb(path), pose)
+
+
+def require_volume(item: bpy.types.Object | None) -> None:
+    """Raise `InputError` unless an object is one of our volumes."""
+    if not is_volume(item):
+        what = "nothing is chosen" if item is None else f"{item.name!r} is no mphDRR volume"
+        raise InputError(f"{what}: add a phantom first, or choose one")
 
 
 def file_of(item: bpy.types.Object) -> Path:
@@ -176,7 +139,7 @@ def file_state(item: bpy.types.Object) -> str:
     size = storage.size_of(file_of(item))
     if size is None:
         return "missing"
-    shown = ", coarser copy shown" if storage.is_preview(storage.absolute(item.data.filepath)) else ""
+    shown = ", coarser copy shown" if ids.PREVIEW in item.data.filepath else ""
     kept = "" if bpy.data.filepath else ", until saved"
     return readable_size(size) + shown + kept
 
@@ -190,9 +153,8 @@ def pose_of_object(item: bpy.types.Object) -> NDArray[np.float64]:
     exact = item.mphdrr_volume.exact_pose
     if exact:
         pose = np.array(json.loads(exact))
-        if np.allclose(pose[:3, :3], shown[:3, :3], rtol=0, atol=2e-6) and np.allclose(
-            pose[:3, 3], shown[:3, 3], rtol=1e-6, atol=1e-6
-        ):
+        is_turned = not np.allclose(pose[:3, :3], shown[:3, :3], rtol=0, atol=2e-6)
+        if not is_turned and np.allclose(pose[:3, 3], shown[:3, 3], rtol=1e-6, atol=1e-6):
             return pose
     return checked_affine(shown, f"{item.name}: its matrix")
 
@@ -238,9 +200,8 @@ def after_load(*_: Any) -> None:
         settings = item.mphdrr_volume
         if not settings.is_property_set("display_high"):  # made by an older version of this extension
             settings.extent = max(n * s for n, s in zip(settings.shape, settings.spacing, strict=True))
-            settings.display_low, settings.display_high = volume_materials.usual_range(
-                settings.quantity, 0.0, settings.maximum
-            )
+            usual = volume_materials.usual_range(settings.quantity, 0.0, settings.maximum)
+            settings.display_low, settings.display_high = usual
         if settings.center_shift != compat.VDB_CENTER_SHIFT:
             try:
                 states = [read_vdb(path) for path in storage.files_of_states(item.data)]
@@ -271,16 +232,14 @@ def _show(data: bpy.types.Volume, stored: StoredVolume) -> None:
     """Let a datablock show a stored volume; where Blender cannot load it, it shows what it did."""
     before = data.is_sequence, data.filepath
     data.is_sequence, data.filepath = False, storage.stored_path(stored.path)
-    try:
-        if not data.grids.load() or data.grids.error_message:
-            raise InputError(
-                f"{stored.path}: Blender cannot load the volume ({data.grids.error_message or 'no reason given'})"
-            )
-        if stored.volume.quantity not in data.grids:
-            raise InputError(f"{stored.path}: Blender finds no grid {stored.volume.quantity!r} in it")
-    except InputError:
+    error = ""
+    if not data.grids.load() or data.grids.error_message:
+        error = f"Blender cannot load the volume ({data.grids.error_message or 'no reason given'})"
+    elif stored.volume.quantity not in data.grids:
+        error = f"Blender finds no grid {stored.volume.quantity!r} in it"
+    if error:
         data.is_sequence, data.filepath = before
-        raise
+        raise InputError(f"{stored.path}: {error}")
     # What the solid viewport draws.
     data.grids.active_index = data.grids.find(SMOKE if SMOKE in data.grids else stored.volume.quantity)
     if len(stored.states) > 1:  # set after loading, which would look for frame 0 until the scene is evaluated
@@ -292,10 +251,8 @@ def _state(data: bpy.types.Volume) -> int | None:
     count = data.frame_duration
     if not data.is_sequence:
         return 0
-    if count == 0:
-        return None
     frame = bpy.context.scene.frame_current - data.frame_start  # 0: the first
-    if data.sequence_mode == "CLIP" and not 0 <= frame < count:
+    if count == 0 or (data.sequence_mode == "CLIP" and not 0 <= frame < count):
         return None
     if data.sequence_mode == "EXTEND":
         frame = min(max(frame, 0), count - 1)
@@ -314,15 +271,12 @@ def _describe(item: bpy.types.Object, stored: StoredVolume) -> None:
     shown = settings.display_low, settings.display_high
     usual = volume_materials.usual_range(settings.quantity, settings.minimum, settings.maximum)
     chosen = settings.is_volume and settings.quantity == volume.quantity and not np.allclose(shown, usual)
-    settings.is_volume = True
-    settings.quantity = volume.quantity
-    settings.unit = UNITS[volume.quantity]
-    settings.shape = volume.grid.shape
-    settings.spacing = volume.grid.spacing
+    settings.is_volume, settings.quantity, settings.unit = True, volume.quantity, UNITS[volume.quantity]
+    settings.shape, settings.spacing = volume.grid.shape, volume.grid.spacing
     settings.minimum, settings.maximum = stored.low, stored.high
     settings.extent = stored.extent
     settings.exact_pose = json.dumps(stored.pose.tolist())
     settings.center_shift = compat.VDB_CENTER_SHIFT
-    settings.display_low, settings.display_high = (
-        shown if chosen else volume_materials.usual_range(volume.quantity, stored.low, stored.high)
-    )
+    if not chosen:
+        shown = volume_materials.usual_range(volume.quantity, stored.low, stored.high)
+    settings.display_low, settings.display_high = shown

@@ -11,7 +11,7 @@ from ..addon import ids, jobs, phantoms, storage
 from ..addon.phantom_properties import FILE, PhantomSettings, identifier, sampling, settings_class
 from ..core.errors import InputError
 from ..core.geometry.frames import euler_pose
-from ..core.phantoms.kinds import KINDS, Kind
+from ..core.phantoms.kinds import KINDS
 from ..core.phantoms.language import read_phantom
 from ..core.phantoms.phantom import Phantom
 
@@ -21,17 +21,12 @@ class AddPhantom(jobs.JobOperator):
 
     attenuation: BoolProperty(
         name="With Attenuation",
-        description="Add the volume of attenuation coefficients too, as a child that goes with the activity",
-        default=False,
+        description="Add the volume of attenuation coefficients too, as a child of the activity",
     )
-    location: FloatVectorProperty(
-        name="Location", description="Origin of the phantom's frame, world mm", size=3, default=(0.0, 0.0, 0.0)
-    )
-    phi: FloatProperty(name="Phi", description="Turn about world z, done last", subtype="ANGLE", default=0.0)
-    theta: FloatProperty(name="Theta", description="Turn about world y, after psi", subtype="ANGLE", default=0.0)
-    psi: FloatProperty(
-        name="Psi", description="Turn about the phantom's own axis, done first", subtype="ANGLE", default=0.0
-    )
+    location: FloatVectorProperty(name="Location", description="Origin of the phantom's frame, world mm")
+    phi: FloatProperty(name="Phi", description="Turn about world z, done last", subtype="ANGLE")
+    theta: FloatProperty(name="Theta", description="Turn about world y, after psi", subtype="ANGLE")
+    psi: FloatProperty(name="Psi", description="Turn about the phantom's own axis, done first", subtype="ANGLE")
 
     def draw(self: Any, context: bpy.types.Context) -> None:
         layout = self.layout
@@ -41,8 +36,7 @@ class AddPhantom(jobs.JobOperator):
         row = layout.row()
         row.enabled = self.quantity == "activity"
         row.prop(self, "attenuation")
-        column = layout.column(align=True)
-        column.prop(self, "location")
+        layout.column(align=True).prop(self, "location")
         column = layout.column(align=True)
         for angle in ("phi", "theta", "psi"):
             column.prop(self, angle)
@@ -62,23 +56,21 @@ class AddKind(AddPhantom):
         return self.adding(self.name)
 
 
-def _operator(kind: Kind) -> Any:
-    """The operator that adds one kind: its settings are its arguments."""
-    name = identifier(kind)
-    return settings_class(
+# The operator that adds one kind: its settings are its arguments.
+ADD_KINDS = tuple(
+    settings_class(
         kind,
-        f"MPHDRR_OT_add_{name}",
+        f"MPHDRR_OT_add_{identifier(kind)}",
         (AddKind, bpy.types.Operator),
         __annotations__={"name": StringProperty(name="Name", description="The object's name", default=kind.label)},
-        __doc__=f"``bpy.ops.mphdrr.add_{name}(voxels=64)``.",
-        bl_idname=ids.ADD_PHANTOM + name,
+        __doc__=f"``bpy.ops.mphdrr.add_{identifier(kind)}(voxels=64)``.",
+        bl_idname=ids.ADD_PHANTOM + identifier(kind),
         bl_label=f"Add {kind.label}",
         bl_description=f"Add {kind.summary}, as a volume",
         bl_options={"REGISTER", "UNDO"},
     )
-
-
-ADD_KINDS = tuple(_operator(kind) for kind in KINDS)
+    for kind in KINDS
+)
 
 
 class MPHDRR_OT_import_phantom(PhantomSettings, AddPhantom, bpy.types.Operator):
@@ -90,14 +82,11 @@ class MPHDRR_OT_import_phantom(PhantomSettings, AddPhantom, bpy.types.Operator):
     bl_options = {"REGISTER", "UNDO"}
 
     __annotations__ = {
-        "filepath": StringProperty(
-            name="File", description="Phantom to read", subtype="FILE_PATH", options={"SKIP_SAVE"}
-        ),
+        "filepath": StringProperty(description="Phantom to read", subtype="FILE_PATH", options={"SKIP_SAVE"}),
         "filter_glob": StringProperty(default="*.toml", options={"HIDDEN"}),
         "name": StringProperty(name="Name", description="Of the object; empty: the phantom's", options={"SKIP_SAVE"}),
         **sampling(),
     }
-
     identifier = FILE
 
     def ask(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str] | None:

@@ -13,9 +13,7 @@ class _EditPhantom(jobs.JobOperator):
 
     bake = False
 
-    @classmethod
-    def poll(cls, context: bpy.types.Context) -> bool:
-        return phantoms.poll_phantom(cls, context)
+    poll = classmethod(phantoms.poll_phantom)
 
     def job(self, context: bpy.types.Context) -> jobs.Job:
         return phantoms.updating(context.object, self.bake)
@@ -28,19 +26,11 @@ class MPHDRR_OT_update_phantom(_EditPhantom, bpy.types.Operator):
     bl_options = {"REGISTER", "UNDO"}
 
 
-class MPHDRR_OT_update_derenzo(_EditPhantom, bpy.types.Operator):
-    bl_idname = ids.UPDATE_DERENZO  # what older scripts call it
-    bl_label = "Update Phantom"
-    bl_description = MPHDRR_OT_update_phantom.bl_description
-    bl_options = {"INTERNAL", "UNDO"}
-
-
 class MPHDRR_OT_apply_phantom_pose(_EditPhantom, bpy.types.Operator):
     bl_idname = ids.APPLY_PHANTOM_POSE
     bl_label = "Apply Pose"
     bl_description = (
-        "Make the active phantom's voxels again where it stands, on a grid along the world's axes. It becomes a volume "
-        "like any other: its settings are given up"
+        "Make the active phantom's voxels again on a grid along the world's axes; its settings are given up"
     )
     bl_options = {"REGISTER", "UNDO"}
 
@@ -53,9 +43,7 @@ class MPHDRR_OT_show_phantom_outline(bpy.types.Operator):
     bl_description = "Show or hide the surfaces of the active phantom's shapes as wires that go with it"
     bl_options = {"REGISTER", "UNDO"}
 
-    @classmethod
-    def poll(cls, context: bpy.types.Context) -> bool:
-        return phantoms.poll_phantom(cls, context)
+    poll = classmethod(phantoms.poll_phantom)
 
     def execute(self, context: bpy.types.Context) -> set[str]:
         return run_reported(self, lambda: phantoms.toggle_outline(context.object))

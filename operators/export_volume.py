@@ -16,16 +16,13 @@ class MPHDRR_OT_export_volume(jobs.JobOperator, bpy.types.Operator):
     bl_idname = ids.EXPORT_VOLUME
     bl_label = "Export Volume"
     bl_description = (
-        "Write every voxel of the active volume, where it stands in the world, for other programs; the name's ending "
-        "chooses: " + ", ".join(WRITTEN_ENDINGS)
+        f"Write every voxel of the active volume, where it stands in the world; endings: {', '.join(WRITTEN_ENDINGS)}"
     )
 
     filepath: StringProperty(name="File", description="File to write", subtype="FILE_PATH", options={"SKIP_SAVE"})
     filter_glob: StringProperty(default=";".join(f"*{e}" for e in WRITTEN_ENDINGS), options={"HIDDEN"})
 
-    @classmethod
-    def poll(cls, context: bpy.types.Context) -> bool:
-        return volumes.poll_volume(cls, context)
+    poll = classmethod(volumes.poll_volume)
 
     def ask(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str] | None:
         is_given = bool(self.filepath)

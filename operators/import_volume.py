@@ -6,7 +6,7 @@ import os
 import re
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import Any
 
 import bpy
 from bpy.props import BoolProperty, CollectionProperty, EnumProperty, FloatProperty, IntProperty, StringProperty
@@ -40,29 +40,26 @@ class ReadVolumes(jobs.JobOperator):
         default=True,
     )
     attenuation: BoolProperty(
-        name="CT to Attenuation",
-        description="Convert CT numbers (HU) to attenuation coefficients (1/mm)",
-        default=False,
+        name="CT to Attenuation", description="Convert CT numbers (HU) to attenuation coefficients (1/mm)"
     )
     energy: FloatProperty(
-        name="Energy (keV)", description="Of the photons that are attenuated, in keV: 140.5 is Tc-99m's", default=140.5,
-        min=10.0, max=1000.0,
-    )  # fmt: skip
-    grid: StringProperty(
-        name="Grid", description="Of an OpenVDB file that holds several, the one to read", options={"SKIP_SAVE"}
+        name="Energy (keV)",
+        description="Of the photons, in keV: 140.5 is Tc-99m's",
+        default=140.5,
+        min=10.0,
+        max=1000.0,
     )
+    grid: StringProperty(name="Grid", description="Of an OpenVDB file that holds several", options={"SKIP_SAVE"})
     unit: FloatProperty(
-        name="Unit (mm)", description="Length in mm of an OpenVDB file's unit, if another program wrote it", default=1.0,
+        name="Unit (mm)",
+        description="Length in mm of the unit of another program's OpenVDB file",
+        default=1.0,
         min=1e-6,
-    )  # fmt: skip
+    )
 
-    if TYPE_CHECKING:  # of Blender
-        layout: bpy.types.UILayout
+    own_names: tuple[str, ...] = ("name",)  # the operator's own properties, in the order of drawing
 
-    own_names: tuple[str, ...] = ("name",)
-    """The operator's own properties, in the order of drawing."""
-
-    def draw(self, context: bpy.types.Context) -> None:
+    def draw(self: Any, context: bpy.types.Context) -> None:
         layout = self.layout
         layout.use_property_split = True
         layout.use_property_decorate = False
@@ -99,9 +96,8 @@ class MPHDRR_OT_import_volume(ReadVolumes, bpy.types.Operator):
     bl_options = {"REGISTER", "UNDO"}
 
     filepath: StringProperty(
-        name="File", description="File, or folder of a DICOM series, to read", subtype="FILE_PATH",
-        options={"SKIP_SAVE"},
-    )  # fmt: skip
+        name="File", description="Or folder of a DICOM series", subtype="FILE_PATH", options={"SKIP_SAVE"}
+    )
     filter_glob: StringProperty(default=";".join(f"*{ending}" for ending in READ_ENDINGS), options={"HIDDEN"})
     name: StringProperty(name="Name", description="The object's name. Empty: the file's", options={"SKIP_SAVE"})
 
@@ -119,23 +115,15 @@ class MPHDRR_OT_import_volume_sequence(ReadVolumes, bpy.types.Operator):
 
     bl_idname = ids.IMPORT_VOLUME_SEQUENCE
     bl_label = "Import Volume Sequence"
-    bl_description = (
-        "Read several files, in the order of the numbers in their names, as one volume that plays over the frames, such as "
-        "the states of a beating heart"
-    )
+    bl_description = "Read several files, in the order of their numbers, as one volume that plays over the frames"
     bl_options = {"REGISTER", "UNDO"}
 
-    directory: StringProperty(
-        name="Folder", description="Where the files are", subtype="DIR_PATH", options={"SKIP_SAVE"}
-    )
+    directory: StringProperty(description="Where the files are", subtype="DIR_PATH", options={"SKIP_SAVE"})
     files: CollectionProperty(
-        name="Files", description="Of one volume for each frame", type=bpy.types.OperatorFileListElement,
-        options={"SKIP_SAVE"},
-    )  # fmt: skip
-    filter_glob: StringProperty(default=";".join(f"*{ending}" for ending in _STATES), options={"HIDDEN"})
-    name: StringProperty(
-        name="Name", description="The object's name. Empty: what the files' names have in common", options={"SKIP_SAVE"}
+        description="Of one volume for each frame", type=bpy.types.OperatorFileListElement, options={"SKIP_SAVE"}
     )
+    filter_glob: StringProperty(default=";".join(f"*{ending}" for ending in _STATES), options={"HIDDEN"})
+    name: StringProperty(name="Name", description="Empty: what the files' have in common", options={"SKIP_SAVE"})
     frame_start: IntProperty(name="First Frame", description="Frame that shows the first file", default=1)
 
     own_names = ("name", "frame_start")
@@ -145,18 +133,15 @@ class MPHDRR_OT_import_volume_sequence(ReadVolumes, bpy.types.Operator):
 
     def job(self, context: bpy.types.Context) -> jobs.Job:
         folder = storage.absolute(self.directory)
-        paths = [folder / name for name in sorted({file.name for file in self.files if file.name}, key=_by_number)]
+        names = {file.name for file in self.files if file.name}
+        # By number, so that "beat2" comes before "beat10".
+        parts = {n: [(int(p) if p.isdecimal() else -1, p.lower()) for p in re.split(r"(\d+)", n)] for n in names}
+        paths = [folder / name for name in sorted(names, key=parts.__getitem__)]
         if len(paths) < 2:
             raise InputError(f"{folder}: expected two files or more, one for each frame; choose them all")
         for path in paths:
             if not path.name.lower().endswith(_STATES):
-                raise InputError(
-                    f"{path}: expected a name ending in {', '.join(_STATES)}; a DICOM series is one volume"
-                )
+                expected = ", ".join(_STATES)
+                raise InputError(f"{path}: expected a name ending in {expected}; a DICOM series is one volume")
         common = re.sub(r"[\d _.-]*$", "", os.path.commonprefix([name_of(path) for path in paths]))  # noqa: RUF071
         return self.importing(paths, self.name or common, self.frame_start)
-
-
-def _by_number(name: str) -> list[tuple[int, str]]:
-    """What to sort names by so that "beat2" comes before "beat10"."""
-    return [(int(part) if part.isdecimal() else -1, part.lower()) for part in re.split(r"(\d+)", name)]

@@ -25,16 +25,13 @@ class MPHDRR_OT_voxelize_objects(jobs.JobOperator, bpy.types.Operator):
         description="What the volume holds",
         items=choices.items(choices.QUANTITIES, (("activity", "Activity", "kBq/mL"), ("mu", "Attenuation", "1/mm"))),
     )
-    value: FloatProperty(
-        name="Value", description="Inside the meshes, in kBq/mL or 1/mm", default=100.0, min=0.0, precision=4
-    )
+    value: FloatProperty(name="Value", description="Inside, in kBq/mL or 1/mm", default=100.0, min=0.0, precision=4)
     voxels: IntProperty(
         name="Voxels", description="Voxels along the longest side", default=128, min=2, soft_max=512, max=4096
     )
     voxel_size: FloatProperty(
-        name="Voxel Size (mm)", description="Side of a voxel in mm; 0 takes it from the number of voxels", default=0.0,
-        min=0.0, soft_max=10.0, precision=3,
-    )  # fmt: skip
+        name="Voxel Size (mm)", description="0 takes it from the number of voxels", min=0.0, soft_max=10.0, precision=3
+    )
     name: StringProperty(name="Name", description="The volume's name; empty: the mesh's")
 
     @classmethod
@@ -46,16 +43,6 @@ class MPHDRR_OT_voxelize_objects(jobs.JobOperator, bpy.types.Operator):
 
     def ask(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str] | None:
         return self.ask_in_dialog(context, "Voxelize", width=320)
-
-    def draw(self, context: bpy.types.Context) -> None:
-        layout = self.layout
-        layout.use_property_split = True
-        layout.use_property_decorate = False
-        layout.prop(self, "quantity")
-        layout.prop(self, "value", text="kBq/mL" if self.quantity == "activity" else "1/mm")
-        layout.prop(self, "voxels")
-        layout.prop(self, "voxel_size")
-        layout.prop(self, "name")
 
     def job(self, context: bpy.types.Context) -> jobs.Job:
         return meshes.voxelizing(
@@ -71,13 +58,9 @@ class MPHDRR_OT_mesh_from_volume(jobs.JobOperator, bpy.types.Operator):
     bl_description = "Make a closed mesh of the active volume's surface of one value, for display and print"
     bl_options = {"REGISTER", "UNDO"}
 
-    level: FloatProperty(
-        name="Level", description="The surface's value, in the volume's unit; 0: half of the maximum", default=0.0
-    )
+    level: FloatProperty(name="Level", description="The surface's value, in the volume's unit; 0: half of the maximum")
 
-    @classmethod
-    def poll(cls, context: bpy.types.Context) -> bool:
-        return volumes.poll_volume(cls, context)
+    poll = classmethod(volumes.poll_volume)
 
     def ask(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str] | None:
         return self.ask_in_dialog(context, "Make")

@@ -1,4 +1,4 @@
-"""Sidebar, second step: the phantom."""
+"""Sidebar, second step: the phantom; and Add > mphDRR, everything that can be put into the scanner."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from typing import Any
 
 import bpy
 
-from ..addon import ids, jobs, outlines, phantoms, slices, storage, volumes
+from ..addon import ids, jobs, phantoms, slices, storage, volumes
 from .geometry import Sidebar, draw_facts
 
 _LINE = 32  # letters that fit into the sidebar at its usual width
@@ -27,7 +27,7 @@ class MPHDRR_PT_phantom(Sidebar, bpy.types.Panel):
         column = adding.column(align=True)
         column.menu("MPHDRR_MT_add", text="Add Phantom", icon="OUTLINER_DATA_VOLUME")
         column.operator(ids.IMPORT_VOLUME, text="Import Volume", icon="IMPORT")
-        if storage.missing_volumes(storage.seems_there):
+        if storage.missing_volumes():
             column = adding.column(align=True)
             column.alert = True
             column.label(text="Files of voxels are missing", icon="ERROR")
@@ -37,9 +37,8 @@ class MPHDRR_PT_phantom(Sidebar, bpy.types.Panel):
             column = layout.column(align=True)
             column.active = False
             known = volumes.volume_objects(context.scene)
-            column.label(
-                text="Select a volume to see its numbers." if known else "No volume in the scene.", icon="INFO"
-            )
+            text = "Select a volume to see its numbers." if known else "No volume in the scene."
+            column.label(text=text, icon="INFO")
             return
         _draw_numbers(layout, item)
         _draw_display(layout, item)
@@ -90,19 +89,17 @@ def _draw_phantom(layout: bpy.types.UILayout, item: bpy.types.Object, phantom: A
     if settings.message:
         column = layout.column(align=True)
         column.alert = settings.outdated
-        first, *others = textwrap.wrap(settings.message, _LINE)
-        column.label(text=first, icon="ERROR" if settings.outdated else "INFO")
-        for line in others:
-            column.label(text=line, icon="BLANK1")
+        icon = "ERROR" if settings.outdated else "INFO"
+        for line in textwrap.wrap(settings.message, _LINE):
+            column.label(text=line, icon=icon)
+            icon = "BLANK1"
     column = layout.column(align=True)
     column.enabled = not jobs.is_running()
     row = column.row(align=True)
     row.alert = settings.outdated
-    row.operator(
-        ids.UPDATE_PHANTOM, text="Changed: Update" if settings.outdated else "Update Phantom", icon="FILE_REFRESH"
-    )
+    text = "Changed: Update" if settings.outdated else "Update Phantom"
+    row.operator(ids.UPDATE_PHANTOM, text=text, icon="FILE_REFRESH")
     column.operator(ids.APPLY_PHANTOM_POSE, icon="OBJECT_ORIGIN")
-    shown = outlines.of(item) is not None
-    column.operator(
-        ids.SHOW_PHANTOM_OUTLINE, text="Hide Outline" if shown else "Show Outline", icon="SHADING_WIRE", depress=shown
-    )
+    shown = phantoms.outline_of(item) is not None
+    text = "Hide Outline" if shown else "Show Outline"
+    column.operator(ids.SHOW_PHANTOM_OUTLINE, text=text, icon="SHADING_WIRE", depress=shown)

@@ -12,7 +12,7 @@ bpy = pytest.importorskip("bpy")
 
 from mathutils import Matrix  # noqa: E402
 
-from mphdrr.addon import cameras, jobs, outlines, phantom_properties, phantoms, volumes  # noqa: E402
+from mphdrr.addon import cameras, jobs, phantom_properties, phantoms, volumes  # noqa: E402
 from mphdrr.core.errors import InputError  # noqa: E402
 from mphdrr.core.geometry.frames import euler_pose  # noqa: E402
 from mphdrr.core.geometry.grid import Grid  # noqa: E402
@@ -214,10 +214,10 @@ def test_outline_goes_with_the_phantom_and_its_settings():
     item = add("derenzo", voxels=16, **POSE)
     assert bpy.ops.mphdrr.show_phantom_outline() == {"FINISHED"}
     item.mphdrr_volume.derenzo.height = 90
-    outline = outlines.of(item)
+    outline = phantoms.outline_of(item)
     assert outline.display_type == "WIRE" and outline.parent == item
     assert outline.dimensions[2] == pytest.approx(90)
     np.testing.assert_allclose(cameras.world_matrix(outline), cameras.world_matrix(item), atol=1e-6)
     meshes = len(bpy.data.meshes)
     assert bpy.ops.mphdrr.show_phantom_outline() == {"FINISHED"}
-    assert outlines.of(item) is None and len(bpy.data.meshes) == meshes - 1
+    assert phantoms.outline_of(item) is None and len(bpy.data.meshes) == meshes - 1

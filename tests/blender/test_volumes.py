@@ -225,7 +225,7 @@ def test_derenzo_update_remakes_the_voxels_in_place():
     bpy.ops.mphdrr.add_derenzo(voxels=32, location=(10, 0, 0))
     item = bpy.context.object
     item.mphdrr_volume.derenzo.radius = 30
-    assert bpy.ops.mphdrr.update_derenzo() == {"FINISHED"}
+    assert bpy.ops.mphdrr.update_phantom() == {"FINISHED"}
     assert item.mphdrr_volume.spacing[0] == pytest.approx(60 / 30)
     np.testing.assert_allclose(volumes.volume_from_object(item).grid.center, (10, 0, 0), atol=1e-6)
 

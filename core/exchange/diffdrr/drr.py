@@ -238,6 +238,16 @@ class DRR(torch.nn.Module):
         return self._camera(RigidTransform(pose).to(points))(self.detector.unproject(points))
 
     @property
+    def affine(self) -> RigidTransform:
+        """Index to world mm."""
+        return RigidTransform(torch.tensor(self.grid.affine).to(self.density))
+
+    @property
+    def affine_inverse(self) -> RigidTransform:
+        """World mm to index."""
+        return RigidTransform(torch.tensor(self.grid.index_from_world).to(self.density))
+
+    @property
     def device(self) -> torch.device:
         """The density's device."""
         return self.density.device
@@ -263,16 +273,19 @@ class Registration(torch.nn.Module):
         self.drr = drr
         self._rotation = torch.nn.Parameter(rotation)
         self._translation = torch.nn.Parameter(translation)
-        self._kind: dict[str, Any] = {"parameterization": parameterization, "convention": convention}
+        self.parameterization, self.convention = parameterization, convention
+
+    def _kind(self) -> dict[str, Any]:
+        return {"parameterization": self.parameterization, "convention": self.convention}
 
     def forward(self, **options: Any) -> Tensor:
         """The radiograph from the present pose; `options` are those of `DRR.forward`."""
-        return self.drr(self.rotation, self.translation, **self._kind, **options)
+        return self.drr(self.rotation, self.translation, **self._kind(), **options)
 
     @property
     def pose(self) -> RigidTransform:
         """The present pose."""
-        return convert(self.rotation, self.translation, **self._kind)
+        return convert(self.rotation, self.translation, **self._kind())
 
     @property
     def rotation(self) -> Tensor:

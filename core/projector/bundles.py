@@ -19,18 +19,11 @@ KEPT_BYTES = 2**27
 
 @dataclass(frozen=True, eq=False)
 class Beam:
-    """Rays for every pixel of an image, as many as its fan has shifts, whose weighted integrals add up.
+    """Rays for every pixel of an image, as many as its fan has shifts, whose weighted integrals add up."""
 
-    Attributes
-    ----------
-    rays : Fan
-        From the rays' source to the pixels: n_v rows of n_u rays.
-    weigh : function, optional
-        Weights of the integrals: of slices of rows, columns and shifts, an array (shifts, rows, columns), with 1 row or
-        column where all are the same. None: 1 everywhere.
-    """
-
-    rays: Fan
+    rays: Fan  # from the rays' source to the pixels: n_v rows of n_u rays
+    # weights of the integrals: of slices of rows, columns and shifts, an array (shifts, rows, columns), with 1 row or
+    # column where all are the same. None: 1 everywhere.
     weigh: Callable[[slice, slice, slice], Array] | None = None
 
     def transposed(self) -> Beam:
@@ -43,21 +36,11 @@ class Beam:
 
 @dataclass(frozen=True, eq=False)
 class Bundle:
-    """All rays of one image.
+    """All rays of one image."""
 
-    Attributes
-    ----------
-    beams : tuple of Beam
-        Of one shape; or instead
-    ends : Ends, optional
-        rays from point to point, of which the image (N, 1) has a value each.
-    transposed : bool
-        Whether rows of rays are columns of the image.
-    """
-
-    beams: tuple[Beam, ...] = ()
-    ends: Ends | None = None
-    transposed: bool = False
+    beams: tuple[Beam, ...] = ()  # of one shape, unless there are `ends`
+    ends: Ends | None = None  # rays from point to point, of which the image (N, 1) has a value each
+    transposed: bool = False  # whether rows of rays are columns of the image
 
     @classmethod
     def along(cls, grid: Grid, *beams: Beam) -> Bundle:
@@ -83,25 +66,15 @@ class Bundle:
 
 @dataclass(frozen=True, eq=False)
 class Part:
-    """Rays that a backend is given in one call.
+    """Rays that a backend is given in one call."""
 
-    Attributes
-    ----------
-    images : list of (int, int)
-        Numbers of the images to which the fans belong, and how many fans of each follow one another.
-    rays : array (F, 4, 3) or Ends
-        The fans' vectors, as of `Fan.vectors`; or rays from point to point.
-    rows, columns : slice
-        The part of an image that each fan covers, of the transposed image if `transposed`.
-    weights : array (F, rows, columns) or None
-        Weights of the integrals, with 1 row or column where all are the same; None: 1 everywhere.
-    """
-
+    # numbers of the images to which the fans belong, and how many fans of each follow one another
     images: list[tuple[int, int]]
-    rays: Array | Ends
-    rows: slice
+    rays: Array | Ends  # (F, 4, 3), the fans' vectors, as of `Fan.vectors`; or rays from point to point
+    rows: slice  # the part of an image that each fan covers, of the transposed image if `transposed`
     columns: slice
     transposed: bool = False
+    # (F, rows, columns), weights of the integrals, with 1 row or column where all are the same; None: 1 everywhere
     weights: Array | None = None
 
     @property

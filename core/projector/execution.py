@@ -43,26 +43,13 @@ class _Task:
 
 @dataclass(frozen=True, eq=False)
 class Execution:
-    """A backend at work on the rays through one volume; nothing is checked.
-
-    Attributes
-    ----------
-    backend : Backend
-    grid : Grid
-        The volume's voxels.
-    mu_grid : Grid or None
-        The voxels of mu, where that has its own.
-    float64 : bool
-        Whether arrays are float64, not float32.
-    threads : int
-        On which a backend without threads of its own is called.
-    """
+    """A backend at work on the rays through one volume; nothing is checked."""
 
     backend: Backend
-    grid: Grid
-    mu_grid: Grid | None = None
-    float64: bool = False
-    threads: int = 1
+    grid: Grid  # the volume's voxels
+    mu_grid: Grid | None = None  # the voxels of mu, where that has its own
+    float64: bool = False  # whether arrays are float64, not float32
+    threads: int = 1  # on which a backend without threads of its own is called
 
     def images(self, volume: ArrayOrTensor, bundles: Bundles, mu: ArrayOrTensor = None) -> Iterator[ArrayOrTensor]:
         """The images one by one, as the backend computes them: integrals, value x mm, weighted and summed."""

@@ -29,18 +29,13 @@ class InverseSquareSum(Model):
     covers fewer pixels. Weighting the segments with 1/h^2 again makes the total counts of a point source fall as 1/h^4,
     and far parts of an object too dark by (h_near / h_far)^2. `Emission` follows the law of the pinhole.
 
-    Attributes
-    ----------
-    system : PinholeSystem
-        The modules, as many as the views and in their order.
-
     Raises
     ------
     InputError
         The system is none.
     """
 
-    system: PinholeSystem
+    system: PinholeSystem  # the modules, as many as the views and in their order
 
     name = "inverse square sum"
     weights_voxels = True

@@ -19,23 +19,12 @@ Index = tuple[int, int, int]
 
 @dataclass(frozen=True, eq=False)
 class Lattices:
-    """A volume, what attenuates it, and the index spaces of both.
+    """A volume, what attenuates it, and the index spaces of both."""
 
-    Attributes
-    ----------
-    grid : Grid
-        The volume's.
-    volume : array or tensor, optional
-        The part of it that is traced; None where a volume is yet to be filled.
-    origin : tuple of int
-        Voxel of `grid` at which that part begins.
-    mu : array or tensor, optional
-        What attenuates, on `mu_grid` from voxel `mu_origin` on, or on the volume's own lattice if `mu_grid` is None.
-    """
-
-    grid: Grid
-    volume: ArrayOrTensor = None
-    origin: Index = (0, 0, 0)
+    grid: Grid  # the volume's
+    volume: ArrayOrTensor = None  # the part of it that is traced; None where a volume is yet to be filled
+    origin: Index = (0, 0, 0)  # voxel of `grid` at which that part begins
+    # what attenuates, on `mu_grid` from voxel `mu_origin` on, or on the volume's own lattice if `mu_grid` is None
     mu: ArrayOrTensor = None
     mu_grid: Grid | None = None
     mu_origin: Index = (0, 0, 0)

@@ -61,18 +61,10 @@ def _standardised(x: Tensor) -> Tensor:
 
 @dataclass(frozen=True, eq=False)
 class PoseEstimate:
-    """What a registration found.
+    """What a registration found."""
 
-    Attributes
-    ----------
-    pose : Tensor (4, 4)
-        World from camera, columns u, v, k and the pinhole, mm.
-    similarities : tuple of float
-        The similarity before each step.
-    """
-
-    pose: Tensor
-    similarities: tuple[float, ...]
+    pose: Tensor  # (4, 4): World from camera, columns u, v, k and the pinhole, mm
+    similarities: tuple[float, ...]  # the similarity before each step
 
 
 def register_pose(

@@ -28,23 +28,14 @@ class Fan:
 
     The ray of row i and column j goes from `source` to ``corner + i row_step + j column_step``. With S shifts there are S
     such lattices, each moved by a number of rows and columns: more points of every pixel.
-
-    Attributes
-    ----------
-    source, corner, row_step, column_step : array (3,)
-        mm.
-    shape : tuple of int
-        Rows and columns.
-    shifts : array (S, 2)
-        In rows and columns.
     """
 
-    source: Array
-    corner: Array
-    row_step: Array
-    column_step: Array
-    shape: tuple[int, int]
-    shifts: Array = field(default_factory=lambda: _UNSHIFTED)
+    source: Array  # (3,), mm
+    corner: Array  # (3,), mm
+    row_step: Array  # (3,), mm
+    column_step: Array  # (3,), mm
+    shape: tuple[int, int]  # rows and columns
+    shifts: Array = field(default_factory=lambda: _UNSHIFTED)  # (S, 2), in rows and columns
 
     def __len__(self) -> int:
         return len(self.shifts) * self.shape[0] * self.shape[1]
@@ -81,16 +72,10 @@ class Fan:
 
 @dataclass(frozen=True, eq=False)
 class Ends:
-    """Rays from point to point: N rows of one ray.
+    """Rays from point to point: N rows of one ray."""
 
-    Attributes
-    ----------
-    starts, ends : array (N, 3)
-        World mm.
-    """
-
-    starts: Array
-    ends: Array
+    starts: Array  # (N, 3): World mm
+    ends: Array  # (N, 3): World mm
 
     def __len__(self) -> int:
         return len(self.ends)
@@ -144,20 +129,11 @@ class IndexRays:
     """Rays in index space, where voxel i of an axis fills [i, i + 1) and the faces lie at 0, 1, ..., n.
 
     A point of ray r is ``starts[r] + alpha * directions[r]``, alpha from 0 (source) to 1 (target).
-
-    Attributes
-    ----------
-    starts : float64 array (N, 3)
-        Sources, voxels.
-    directions : float64 array (N, 3)
-        Source to target, voxels; a component is either exactly 0 or larger than 1e-9 in size.
-    lengths : float64 array (N,)
-        Source to target, mm: ``lengths[r] * (alpha_2 - alpha_1)`` is the length of a segment.
     """
 
-    starts: Array
-    directions: Array
-    lengths: Array
+    starts: Array  # (N, 3): Sources, voxels
+    directions: Array  # (N, 3): Source to target, voxels; a component is either exactly 0 or larger than 1e-9 in size
+    lengths: Array  # (N,): Source to target, mm: ``lengths[r] * (alpha_2 - alpha_1)`` is the length of a segment
 
     def __len__(self) -> int:
         return len(self.lengths)
@@ -173,19 +149,12 @@ class IndexRays:
 
 @dataclass(frozen=True, eq=False)
 class IndexFans:
-    """Fans of one shape in index space, the rays of each after those of the one before: `IndexRays` not yet listed.
+    """Fans of one shape in index space, the rays of each after those of the one before: `IndexRays` not yet listed."""
 
-    Attributes
-    ----------
-    table : array (F, 8, 3)
-        Source, corner, row step and column step of each in index space, where nothing is snapped yet; the same in world
-        mm.
-    shape : tuple of int
-        Rows and columns.
-    """
-
+    # (F, 8, 3): Source, corner, row step and column step of each in index space, where nothing is snapped yet; the
+    # same in world mm
     table: Array
-    shape: tuple[int, int]
+    shape: tuple[int, int]  # rows and columns
 
     def __len__(self) -> int:
         return len(self.table) * self.shape[0] * self.shape[1]
@@ -203,18 +172,10 @@ Rays = IndexRays | IndexFans
 
 @dataclass(frozen=True, eq=False)
 class Attenuation:
-    """What weakens rays between each point and their source.
+    """What weakens rays between each point and their source."""
 
-    Attributes
-    ----------
-    mu : array or tensor (n_x, n_y, n_z)
-        Attenuation coefficients, 1/mm, of the backend's kind; 0 outside.
-    rays : IndexRays, IndexFans or None
-        The same rays in mu's own index space; None where mu shares the volume's lattice.
-    """
-
-    mu: Any
-    rays: Rays | None = None
+    mu: Any  # (n_x, n_y, n_z): Attenuation coefficients, 1/mm, of the backend's kind; 0 outside
+    rays: Rays | None = None  # the same rays in mu's own index space; None where mu shares the volume's lattice
 
 
 def index_fans(

@@ -37,36 +37,18 @@ from ...errors import InputError, InputWarning
 
 @dataclass(frozen=True)
 class Backend:
-    """A way to compute line integrals, and how it wants its rays.
+    """A way to compute line integrals, and how it wants its rays."""
 
-    Attributes
-    ----------
-    name : str
-        What users call it.
-    module : str
-        The file here that has its functions.
-    rays_at_once : int
-        Rays of a call: enough that a call costs nothing, few enough that their arrays stay in the cache.
-    rays_of_images : int
-        Small images are traced several at once, up to so many rays.
-    to_backend : function
-        ``(array or tensor, float64) -> array or tensor`` as the backend's functions take it; float32 unless `float64`.
-    own_threads : bool
-        Whether a call uses the whole machine by itself; others are called on several threads.
-    always_float64 : bool
-        Whether it computes in float64 whatever it is given.
-    package : str, optional
-        What to install if it cannot be loaded.
-    """
-
-    name: str
-    module: str
+    name: str  # what users call it
+    module: str  # the file here that has its functions
+    # rays of a call: enough that a call costs nothing, few enough that their arrays stay in the cache
     rays_at_once: int
-    rays_of_images: int
+    rays_of_images: int  # small images are traced several at once, up to so many rays
+    # ``(array or tensor, float64) -> array or tensor`` as the backend's functions take it; float32 unless `float64`
     to_backend: Callable[[ArrayOrTensor, bool], ArrayOrTensor]
-    own_threads: bool = False
-    always_float64: bool = False
-    package: str | None = None
+    own_threads: bool = False  # whether a call uses the whole machine by itself; others are called on several threads
+    always_float64: bool = False  # whether it computes in float64 whatever it is given
+    package: str | None = None  # what to install if it cannot be loaded
 
     @property
     def functions(self) -> ModuleType:

@@ -6,17 +6,17 @@ import bmesh
 import bpy
 import numpy as np
 
-from ..core.geometry import module_parts
+from ..core.geometry import part_colors
 from ..core.geometry.collimator import Collimator, Construction
-from ..core.geometry.module_parts import Look, Solid, check_watertight, collimator_solid, crystal_solid
+from ..core.geometry.module_parts import Solid, check_watertight, collimator_solid, crystal_solid
 from . import compat
 from .module_values import ModuleNumbers
 
 # By `Object.mphdrr_module.part`: the material's name, and its colour and gloss. Exported solids look the same.
 LOOKS = {
-    "COLLIMATOR": ("mphDRR collimator", module_parts.LOOKS["collimator"]),
-    "CRYSTAL": ("mphDRR crystal", module_parts.LOOKS["crystal"]),
-    "ROI": ("mphDRR ROI", Look((0.25, 0.62, 1.0, 0.12), metallic=0.0, roughness=0.5)),  # pale blue
+    "COLLIMATOR": ("mphDRR collimator", part_colors.LOOKS["collimator"]),
+    "CRYSTAL": ("mphDRR crystal", part_colors.LOOKS["crystal"]),
+    "ROI": ("mphDRR ROI", part_colors.Look((0.25, 0.62, 1.0, 0.12), metallic=0.0, roughness=0.5)),  # pale blue
 }
 
 

@@ -12,11 +12,10 @@ import bpy
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core.runs.mosaic import as_seen, mosaic
+from ..core.runs.mosaic import COLUMNS, as_seen, mosaic
 from . import ids
 
 _KEY = "mphdrr_projection"  # custom property: marks the images that a new run replaces
-_COLUMNS = 20  # pictures in a row of the mosaic
 _MOSAIC_PIXELS = 6e6  # 80 views of 256 x 256 are shown pixel by pixel, larger ones reduced
 
 
@@ -32,13 +31,13 @@ def storing(projections: NDArray[np.float32], numbers: Iterable[int]) -> Generat
         _store(name, picture, exact=True)
         yield
     count, n_v, n_u = projections.shape
-    pixels = -(-count // _COLUMNS) * _COLUMNS * n_v * n_u
+    pixels = -(-count // COLUMNS) * COLUMNS * n_v * n_u
     factor = min(int(np.ceil(np.sqrt(pixels / _MOSAIC_PIXELS))), n_v, n_u)
     if factor > 1:  # too large to look at: means over blocks of pixels
         rows, width = n_v // factor, n_u // factor
         blocks = projections[:, : rows * factor, : width * factor].reshape(count, rows, factor, width, factor)
         projections = blocks.mean(axis=(2, 4), dtype=np.float32)
-    sheet = np.maximum(mosaic(projections, _COLUMNS), 0.0)
+    sheet = np.maximum(mosaic(projections), 0.0)
     yield
     image = _store(ids.MOSAIC, sheet / (float(sheet.max(initial=0.0)) or 1.0), exact=False)
     kept = {*names, ids.MOSAIC}

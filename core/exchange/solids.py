@@ -15,7 +15,8 @@ import numpy as np
 
 from ..errors import InputError
 from ..geometry.collimator import Construction, EdgePlace, angle_from_degrees
-from ..geometry.module_parts import LOOKS, ModulePart, module_parts
+from ..geometry.module_parts import ModulePart, module_parts
+from ..geometry.part_colors import LOOKS
 from ..geometry.system import PinholeSystem
 from ..geometry.views import Views
 from ..version import VERSION

@@ -7,13 +7,13 @@ crystal reaches from Z = l to l + Td, and the collimator stands in front of it, 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import InputError
 from .collimator import Collimator, Construction
+from .part_colors import PartKind
 from .system import PinholeSystem
 
 Solid = tuple[NDArray[np.float64], NDArray[np.int32]]
@@ -22,23 +22,6 @@ Solid = tuple[NDArray[np.float64], NDArray[np.int32]]
 # Points on a ring: a multiple of 8, so that squares have points at their corners. The polygon is inscribed in the hole's
 # circle: 99.84 % of the area is open.
 _N = 64
-
-PartKind = Literal["collimator", "crystal"]
-
-
-class Look(NamedTuple):
-    """How a part is shown: linear RGBA colour, metallic and roughness from 0 to 1."""
-
-    color: tuple[float, float, float, float]
-    metallic: float
-    roughness: float
-
-
-LOOKS: dict[PartKind, Look] = {
-    "collimator": Look((0.36, 0.39, 0.43, 1.0), metallic=0.85, roughness=0.42),  # tungsten: grey metal
-    "crystal": Look((1.0, 0.48, 0.06, 0.85), metallic=0.0, roughness=0.12),  # scintillator: clear amber
-}
-"""In Blender and in exported solids."""
 
 
 @dataclass(frozen=True, eq=False)

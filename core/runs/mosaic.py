@@ -22,7 +22,11 @@ def as_seen(images: ArrayLike) -> NDArray:
     return np.asarray(images)[..., ::-1, ::-1]
 
 
-def mosaic(images: ArrayLike, columns: int = 20) -> NDArray:
+COLUMNS = 20
+"""Images in a row, unless told otherwise."""
+
+
+def mosaic(images: ArrayLike, columns: int = COLUMNS) -> NDArray:
     """Pictures of all images (M, n_v, n_u) in one (rows * n_v, columns * n_u), row 0 at the top; empty places are 0.
 
     They follow each other row by row from the top left: 80 modules in 4 rings and 20 `columns` show a ring a row.

@@ -19,6 +19,7 @@ from ..errors import InputError
 from ..phantoms.kinds import KINDS
 from ..physics.isotopes import ISOTOPES
 from ..physics.materials import APERTURES, CRYSTALS
+from ..projector.backends import BACKENDS, OLD_NAMES
 from ..validation import real_array
 from ..volumes.volume import LINE_INTEGRALS
 
@@ -88,8 +89,9 @@ class Setting:
 
     def _one(self, value: Any) -> Any:
         if isinstance(value, str):
-            # The projector knows backends by older names, too, and says which there are.
-            good = value in self.words if self.words and self.key != "compute.backend" else self.kind is str
+            if self.key == "compute.backend":
+                value = OLD_NAMES.get(value, value)
+            good = value in self.words if self.words else self.kind is str
         elif self.kind in (bool, str):
             good = isinstance(value, self.kind)
         else:
@@ -221,14 +223,10 @@ _DECLARED = (
     Setting("noise.seed", int, None, "Draw Poisson counts with this seed; of several states with SEED, SEED + 1 …",
             "their expected means", least=0, needs=("model.kind=emission or model.photons",), option="--noise"),
     Setting("compute.backend", str, "auto", "What computes the line integrals", words={
-        "auto": ("Automatic", "The fastest that works here"),
-        "cpu": ("CPU", "Compiled, on the processor"),
-        "torch": ("PyTorch", "On the processor or the graphics card"),
-        "numpy": ("NumPy", "Float64 reference, slow"),
-        "cuda": ("CUDA", "On an NVIDIA graphics card; needs warp-lang"),
+        "auto": ("Automatic", "The fastest that works here"), **{b.name: (b.label, b.text) for b in BACKENDS.values()},
     }),
     Setting("compute.threads", int, None, "Processor threads", "all", least=1, slider=64,
-            needs=("no compute.backend=torch", "no compute.backend=cuda")),
+            needs=tuple(f"no compute.backend={b.name}" for b in BACKENDS.values() if b.own_threads)),
 )  # fmt: skip
 
 SETTINGS: Mapping[str, Setting] = MappingProxyType({setting.key: setting for setting in _DECLARED})

@@ -511,3 +511,11 @@ def test_a_recipe_that_the_panel_cannot_take_is_one_clear_line(scene, tmp_path, 
     with pytest.raises(RuntimeError, match=message):
         bpy.ops.mphdrr.load_recipe(filepath=str(tmp_path / "r.toml"))
     assert _panel(scene.mphdrr_projections) == before
+
+
+def test_every_setting_has_a_property_of_its_own():
+    from mphdrr.addon.projection_properties import PROPERTIES
+    from mphdrr.core.runs.settings import SETTINGS
+
+    shown = [key for key in SETTINGS if key.startswith(("model.", "detector.", "compute."))]
+    assert len({setting.key for setting in PROPERTIES.values()}) == len(shown) - 1  # the opening angle is the scanner's

@@ -8,7 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ..module_parts import ModulePart, PartKind
+from ..module_parts import ModulePart
+from ..part_colors import PartKind
 
 TOUCH = 1e-6
 """Bodies that penetrate each other by less than this, mm, only touch."""

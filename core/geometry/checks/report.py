@@ -7,7 +7,7 @@ from dataclasses import asdict, dataclass
 from typing import Any, ClassVar
 
 from ..collimator import EdgePlace
-from ..module_parts import PartKind
+from ..part_colors import PartKind
 
 
 class Finding:

@@ -40,6 +40,8 @@ class Backend:
     """A way to compute line integrals, and how it wants its rays."""
 
     name: str  # what users call it
+    label: str  # how menus show it
+    text: str  # what it is good for
     module: str  # the file here that has its functions
     # rays of a call: enough that a call costs nothing, few enough that their arrays stay in the cache
     rays_at_once: int
@@ -48,7 +50,6 @@ class Backend:
     to_backend: Callable[[ArrayOrTensor, bool], ArrayOrTensor]
     own_threads: bool = False  # whether a call uses the whole machine by itself; others are called on several threads
     always_float64: bool = False  # whether it computes in float64 whatever it is given
-    package: str | None = None  # what to install if it cannot be loaded
 
     @property
     def functions(self) -> ModuleType:
@@ -80,10 +81,10 @@ def _on_gpu(x: ArrayOrTensor, float64: bool) -> ArrayOrTensor:
 
 # torch is slow on a CPU, so calls for several small images stay short: between calls a job can stop.
 _ROWS = (
-    Backend("cpu", "cpu", 2**14, 2**14, _array),
-    Backend("torch", "reference", 2**18, 2**12, _tensor, own_threads=True, package="torch"),
-    Backend("numpy", "reference", 2**12, 2**12, _array, always_float64=True),
-    Backend("cuda", "cuda", 2**22, 2**22, _on_gpu, own_threads=True, package="warp-lang"),
+    Backend("cpu", "CPU", "Compiled, on the processor", "cpu", 2**14, 2**14, _array),
+    Backend("torch", "PyTorch", "On the processor or the graphics card", "reference", 2**18, 2**12, _tensor, True),
+    Backend("numpy", "NumPy", "Float64 reference, slow", "reference", 2**12, 2**12, _array, False, True),
+    Backend("cuda", "CUDA", "On an NVIDIA graphics card; needs warp-lang", "cuda", 2**22, 2**22, _on_gpu, True),
 )
 BACKENDS = {backend.name: backend for backend in _ROWS}
 """The backends by name."""
@@ -91,8 +92,10 @@ BACKENDS = {backend.name: backend for backend in _ROWS}
 _AUTOMATIC = ("cpu", "torch", "numpy")
 """What "auto" chooses from for arrays, in order of preference; for a tensor on a GPU see `for_tensor`."""
 
-_OLD_NAMES = {"numba": "cpu"}
+OLD_NAMES = {"numba": "cpu"}
 """What files and scripts of version 0.1 call a backend."""
+
+_PACKAGES = {"torch": "torch", "cuda": "warp-lang"}
 
 # A library may be absent, not be made for this platform, or fail to load its binaries.
 _CANNOT_LOAD = (ImportError, OSError)
@@ -106,7 +109,7 @@ def choose(name: str) -> Backend:
     InputError
         There is no such backend, or the library or the GPU that it needs is missing.
     """
-    name = _OLD_NAMES.get(name, name)
+    name = OLD_NAMES.get(name, name)
     if name == "auto":
         return _automatic()
     if name not in BACKENDS:
@@ -115,7 +118,7 @@ def choose(name: str) -> Backend:
     try:
         _require(backend)
     except _CANNOT_LOAD as error:
-        remedy = f": pip install {backend.package}" if backend.package else ""
+        remedy = f": pip install {_PACKAGES[name]}" if name in _PACKAGES else ""
         raise InputError(f"backend {name!r} cannot be used ({_reason(error)}){remedy}") from None
     return backend
 
@@ -136,7 +139,7 @@ def _automatic() -> Backend:
 
 def _require(backend: Backend) -> None:
     """Load what the backend needs, or raise."""
-    if backend.package == "torch":
+    if backend.name == "torch":
         importlib.import_module("torch")
     functions = backend.functions
     if hasattr(functions, "device"):

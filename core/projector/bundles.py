@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from typing import Any
 
@@ -136,7 +136,7 @@ class Bundles:
         self._n = n
         self._make = make
         self._bundles: dict[int, Bundle] = {}
-        self._parts: dict[tuple[int, int, int], list[Part]] = {}
+        self._parts: dict[tuple[int, ...], list[Part]] = {}
         self._room = KEPT_BYTES
 
     def __len__(self) -> int:
@@ -177,9 +177,16 @@ class Bundles:
             self._parts[key] = parts
         return self._parts[key]
 
-    def parts_of(self, number: int, rows: slice, columns: slice, most: int) -> Iterator[Part]:
+    def parts_of(self, number: int, rows: slice, columns: slice, most: int) -> Iterable[Part]:
         """The rays of some rows and columns of one image, likewise."""
-        return _parts([(number, self[number])], rows, columns, most)
+        bundle = self[number]
+        key = number, rows.start, rows.stop, columns.start, columns.stop, most
+        if key not in self._parts:
+            parts = _parts([(number, bundle)], rows, columns, most)
+            if bundle.ends is not None or not self._has_room(16 * bundle.n_rays((rows, columns))):
+                return parts
+            self._parts[key] = list(parts)
+        return self._parts[key]
 
     def _has_room(self, n_bytes: int) -> bool:
         """Whether so many bytes may be kept; if so, they are counted."""

@@ -20,6 +20,9 @@ from .rays import Array, Attenuation, Rays, window
 # Rays of a task: with fewer, starting it takes longer than tracing them.
 _FEWEST_RAYS = 2**12
 
+# Rays of a task: between tasks a job can stop.
+_MOST_RAYS = 2**18
+
 # Rays that the threads of a backprojection trace before they wait for each other.
 _RAYS_OF_A_ROUND = 2**19
 
@@ -171,8 +174,10 @@ class Execution:
                 rows, columns = window([beam.rays for beam in bundle.beams], corners)
             width = columns.stop - columns.start
             pixels = (rows.stop - rows.start) * width
-            most = min(self.backend.rays_at_once, pixels // (2 * workers))
-            size = max(1, max(most, _FEWEST_RAYS // bundle.rays_of_a_pixel) // max(1, width))
+            # Blocks as large as the cache allows, but enough of them for all threads, and none that takes long.
+            enough = max(pixels // -(-2 * workers // n), _FEWEST_RAYS // bundle.rays_of_a_pixel)
+            most = min(self.backend.rays_at_once, _MOST_RAYS // bundle.rays_of_a_pixel)
+            size = max(1, min(enough, most) // max(1, width))
             for row in range(rows.start, max(rows.stop, rows.start + 1), size):
                 end = min(row + size, rows.stop)
                 yield _Task(range(first, first + 1), (slice(row, end), columns), end == rows.stop)

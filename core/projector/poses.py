@@ -108,7 +108,7 @@ def _pixels(pitch: Tensor, offset: Tensor, shape: tuple[int, int]) -> tuple[Tens
 def _fans(
     shape: tuple[int, int], positions: Tensor, rotations: Tensor, distance: Tensor, pitch: Tensor, offset: Tensor
 ) -> Tensor:
-    """The rays of `pinhole_rays` as the vectors (..., 4, 3) of `trace_fans`; rays are a line's columns, lines are rows."""
+    """The rays of `pinhole_rays` as the vectors (..., 4, 3) of `trace_fans`, rows and columns as in the image."""
     u, v, k = rotations.unbind(dim=-1)
     pitch_u, pitch_v = pitch[..., :1], pitch[..., 1:]
     first_u, first_v = (offset - pitch * (pitch.new_tensor([shape[1], shape[0]]) - 1) / 2).split(1, dim=-1)

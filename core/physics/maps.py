@@ -64,7 +64,6 @@ def resolution_map(
     The variance of all photons together is the mean of the modules' variances. A reconstruction that models the blur
     may do better, and one from few counts worse. Parameters are as in `sensitivity_map` and `resolution`.
     """
-
     edge: dict[str, Any] = {"aperture_mu": aperture_mu, "opening_angle": opening_angle}
 
     def combined(points: Array) -> Array:

@@ -17,10 +17,10 @@ from ..geometry.system import PinholeSystem
 from ..geometry.views import Views
 from ..physics.aperture import KnifeEdge, Opening, openings, paix_diameter, within_cone
 from ..physics.aperture import points_needed as hole_points_needed
-from ..physics.crystal import absorbed_share, gaussian_blur, layer_depths, share_inside
+from ..physics.crystal import absorbed_share, gaussian_blur, share_inside
 from ..physics.isotopes import Isotope, isotope
 from ..physics.materials import module_coefficients
-from ..validation import positive, real_array
+from ..validation import instance, positive, real_array
 from ..volumes.volume import Volume, require_quantity
 from .bundles import Beam
 from .models import Array, Model, view_rays
@@ -152,8 +152,7 @@ class Emission(Model):
     takes = ("activity",)
 
     def __post_init__(self) -> None:
-        if not isinstance(self.system, PinholeSystem):
-            raise InputError(f"emission: expected a PinholeSystem, got {type(self.system).__name__}")
+        instance(self.system, PinholeSystem, "emission")
         if self.mu is not None:
             if not isinstance(self.mu, Volume):
                 hint = "; tensors of it go to the projector, A(x, mu=...)" if is_tensor(self.mu) else ""
@@ -291,7 +290,7 @@ class Emission(Model):
         inside = sum(opening.hole > 0 for opening in holes)  # and the edge's points, which count less
         starts = np.concatenate([lattice(k) for k in (inside, len(holes) - inside) if k])
         n = self._pixel_points(views, m, grid)
-        for layer, z in enumerate(layer_depths(self.depth_layers, self.system.detector_thickness[m])):
+        for layer, z in enumerate(np.linspace(0, self.system.detector_thickness[m], self.depth_layers)):
             stretch = depth / (l + z)
             steps = stretch * scale * rays.row_step, stretch * scale * rays.column_step
             for opening, start in zip(holes, starts, strict=True):
@@ -352,7 +351,7 @@ class Emission(Model):
             Rays of a pixel: along each side, a ray stands for this part of it where the crystal or a wall ends.
         """
         side, thickness = self.system.detector_side[m], self.system.detector_thickness[m]
-        depths = layer_depths(self.depth_layers, thickness)
+        depths = np.linspace(0, thickness, self.depth_layers)
         distance = length + depths[layer]
         slope_u, slope_v = (along_u + opening.x) / distance, (along_v + opening.y) / distance
         squared_secant = 1 + slope_u**2 + slope_v**2

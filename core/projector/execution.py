@@ -114,8 +114,8 @@ class Execution:
         images, lattices = self.to_backend(images), self._lattices(volume, mu, whole_mu=True)
         gradient_of = self.backend.functions.mu_gradient
 
-        def add(gradient: ArrayOrTensor, values: ArrayOrTensor, rays: Rays, attenuation: Attenuation | None) -> None:
-            gradient_of(gradient, lattices.volume, values, rays, attenuation)
+        def add(gradient: ArrayOrTensor, *values_and_rays: Any) -> None:
+            gradient_of(gradient, lattices.volume, *values_and_rays)
 
         return self._accumulated(add, self.mu_grid or self.grid, images, bundles, lattices)
 

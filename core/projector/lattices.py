@@ -54,11 +54,7 @@ class Lattices:
 
 
 def filled_lattices(
-    grid: Grid,
-    volume: ArrayOrTensor,
-    mu: ArrayOrTensor = None,
-    mu_grid: Grid | None = None,
-    whole_mu: bool = False,
+    grid: Grid, volume: ArrayOrTensor, mu: ArrayOrTensor = None, mu_grid: Grid | None = None, whole_mu: bool = False
 ) -> Lattices:
     """The lattices of the parts of `volume` and of mu that are not empty.
 

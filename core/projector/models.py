@@ -56,9 +56,9 @@ class Model(ABC):
         """The model's own settings, for a run's record: anything JSON can hold."""
         return {}
 
-    @abstractmethod
     def unit(self, volume: Volume) -> str:
-        """Unit of the images of `volume`."""
+        """Unit of the images of `volume`: of its line integrals, where the weights have none."""
+        return f"{volume.unit} mm"
 
     @abstractmethod
     def beams(self, views: Views, m: int, grid: Grid) -> Iterator[Beam]:
@@ -103,10 +103,6 @@ class Transmission(Model):
     def record(self) -> dict[str, Any]:
         """The settings, for a run's record."""
         return {"pixel_points": self.pixel_points, "tolerance": self.tolerance}
-
-    def unit(self, volume: Volume) -> str:
-        """Unit of the images of `volume`."""
-        return f"{volume.unit} mm"
 
     def beams(self, views: Views, m: int, grid: Grid) -> Iterator[Beam]:
         """The rays of `views`, or to more points of their pixels, weights summing to 1."""

@@ -114,12 +114,7 @@ class Projector(LinearOperator):
     """
 
     def __init__(
-        self,
-        grid: Grid,
-        views: Views,
-        model: Model | None = None,
-        backend: str = "auto",
-        threads: int | None = None,
+        self, grid: Grid, views: Views, model: Model | None = None, backend: str = "auto", threads: int | None = None
     ) -> None:
         for value, kind, name in ((grid, Grid, "grid"), (views, Views, "views")):
             if not isinstance(value, kind):

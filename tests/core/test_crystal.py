@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import mphdrr.core as mph
-from mphdrr.core.physics.crystal import absorbed_share, layer_depths
+from mphdrr.core.physics.crystal import absorbed_share
 
 from .conftest import emission
 from .test_emission import one_module, spot_image, turned_grid
@@ -17,7 +17,7 @@ from .test_emission import one_module, spot_image, turned_grid
 def test_layers_absorb_what_the_crystal_absorbs_as_deep(n, mu):
     """1 - exp(-mu T / cos) of the photons are absorbed, with 2 or more layers at the mean depth, at every angle."""
     thickness, cosine = 9.0, np.linspace(0.3, 1, 50)
-    depths = layer_depths(n, thickness)
+    depths = np.linspace(0, thickness, n)
     shares = np.array([absorbed_share(cosine, mu, thickness, depths, layer) for layer in range(n)])
     k = mu / cosine
     np.testing.assert_allclose(shares.sum(axis=0), -np.expm1(-k * thickness), rtol=1e-12)

@@ -126,9 +126,7 @@ def test_chord_of_an_attenuating_slab(backend):
             expected = 16 * secant * torch.exp(-left)
         torch.testing.assert_close(y[0], expected)
         for got, wanted in zip(
-            torch.autograd.grad(y.sum(), (source, target)),
-            torch.autograd.grad(expected, (source, target)),
-            strict=True,
+            torch.autograd.grad(y.sum(), (source, target)), torch.autograd.grad(expected, (source, target)), strict=True
         ):
             torch.testing.assert_close(got, wanted, atol=1e-11, rtol=1e-8)
 

@@ -65,9 +65,7 @@ def test_every_level_agrees_with_the_reference(level, kind, rng):
             reference.backproject(expected, values, *as_double(mapped))
             close(sums, expected, kind)
             close(
-                cpu.derivatives(volume, *mapped),
-                reference.derivatives(volume.astype(float), *as_double(mapped)),
-                kind,
+                cpu.derivatives(volume, *mapped), reference.derivatives(volume.astype(float), *as_double(mapped)), kind
             )
             if lattices.mu is not None:
                 sums, expected = np.zeros_like(lattices.mu), np.zeros(lattices.mu.shape)
@@ -118,9 +116,7 @@ def test_the_library_is_the_packages_own(tmp_path):
         ("LD_LIBRARY_PATH", "DYLD_LIBRARY_PATH", "PATH"), f"{tmp_path}{os.pathsep}{os.environ['PATH']}"
     )
     done = run(
-        "from mphdrr.core.projector.backends import cpu; print(cpu._library._name)",
-        cwd=tmp_path,
-        environment=paths,
+        "from mphdrr.core.projector.backends import cpu; print(cpu._library._name)", cwd=tmp_path, environment=paths
     )
     assert Path(done.stdout.strip()).parent == Path(cpu.__file__).with_name("kernels"), done.stderr
 

@@ -11,7 +11,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..arrays import ArrayOrTensor, is_tensor, namespace
-from ..errors import InputError
 from ..geometry.grid import Grid
 from ..geometry.views import Views
 from ..validation import positive, real_array
@@ -145,12 +144,3 @@ def view_rays(views: Views, m: int) -> Fan:
     u_step, v_step = views.u_steps[m], views.v_steps[m]
     corner = views.detector_centers[m] - (n_u - 1) / 2 * u_step - (n_v - 1) / 2 * v_step
     return Fan(views.sources[m], corner, v_step, u_step, views.shape)
-
-
-def require_model(value: object) -> Model:
-    """`value` if it is a model."""
-    if not isinstance(value, Model):
-        raise InputError(
-            f"projector: expected model to be Transmission, Emission or another model, got {type(value).__name__}"
-        )
-    return value

@@ -20,7 +20,7 @@ from . import backends
 from .bundles import Bundle, Bundles
 from .execution import Execution
 from .lattices import require_no_negative, same_lattice
-from .models import Model, Transmission, require_model
+from .models import Model, Transmission
 from .parallel import thread_count
 
 
@@ -116,14 +116,19 @@ class Projector(LinearOperator):
     def __init__(
         self, grid: Grid, views: Views, model: Model | None = None, backend: str = "auto", threads: int | None = None
     ) -> None:
-        for value, kind, name in ((grid, Grid, "grid"), (views, Views, "views")):
+        model = Transmission() if model is None else model
+        for value, kind, what in (
+            (grid, Grid, "grid to be Grid"),
+            (views, Views, "views to be Views"),
+            (model, Model, "model to be Transmission, Emission or another model"),
+        ):
             if not isinstance(value, kind):
-                raise InputError(f"projector: expected {name} to be {kind.__name__}, got {type(value).__name__}")
+                raise InputError(f"projector: expected {what}, got {type(value).__name__}")
         self.grid = grid
         self.views = views
-        self.model: Model = Transmission() if model is None else require_model(model)
-        self.model.check(views)
-        if caution := self.model.caution(views, grid):
+        self.model = model
+        model.check(views)
+        if caution := model.caution(views, grid):
             warnings.warn(caution, InputWarning, stacklevel=2)
         self._auto = backend == "auto"
         self._backend = backends.choose(backend)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass, fields
+from functools import partial
 from typing import Any, Literal
 
 import numpy as np
@@ -290,6 +291,12 @@ class Emission(Model):
         inside = sum(opening.hole > 0 for opening in holes)  # and the edge's points, which count less
         starts = np.concatenate([lattice(k) for k in (inside, len(holes) - inside) if k])
         n = self._pixel_points(views, m, grid)
+
+        def weigh(places: Array, opening: Opening, layer: int, rows: slice, columns: slice, which: slice) -> Array:
+            u_places, v_places = places[which].T[:, :, None, None]
+            along, across = along_u[:, columns] + u_places, along_v[rows] + v_places
+            return self.pixel_weights(m, along, across, (pitch_u, pitch_v), l, opening, layer, n * len(holes)) / n
+
         for layer, z in enumerate(np.linspace(0, self.system.detector_thickness[m], self.depth_layers)):
             stretch = depth / (l + z)
             steps = stretch * scale * rays.row_step, stretch * scale * rays.column_step
@@ -301,23 +308,10 @@ class Emission(Model):
                     seen = (1 + l / self.system.pinhole_distance[m]) * np.array([opening.x, opening.y])
                     shift = start / math.sqrt(n) - seen / (pitch_u, pitch_v)
                 places = offsets(n, shift) * (pitch_u, pitch_v)
-
-                def weigh(
-                    rows: slice,
-                    columns: slice,
-                    which: slice,
-                    places: Array = places,
-                    opening: Opening = opening,
-                    layer: int = layer,
-                ) -> Array:
-                    u_places, v_places = places[which].T[:, :, None, None]
-                    along, across = along_u[:, columns] + u_places, along_v[rows] + v_places
-                    pitch = pitch_u, pitch_v
-                    return self.pixel_weights(m, along, across, pitch, l, opening, layer, n * len(holes)) / n
-
                 corner = pinhole + point + depth * k + stretch * (middle + point)
                 shifts = places[:, ::-1] / (scale * (rays.row_step @ v), scale * (rays.column_step @ u))
-                yield Beam(Fan(pinhole + point, corner, *steps, views.shape, shifts), weigh)
+                fan = Fan(pinhole + point, corner, *steps, views.shape, shifts)
+                yield Beam(fan, partial(weigh, places, opening, layer))
 
     def pixel_weights(
         self,

@@ -161,7 +161,10 @@ class Projector(LinearOperator):
         """
         if mu is None:
             return super().__call__(x, progress)
-        x, mu = promote(self._check(x), self._check_mu(mu))
+        x = self._check(x)
+        if self.model.mu is None:
+            raise InputError("mu: the projector's model has none; give it one to say on which grid mu is")
+        x, mu = promote(x, require_no_negative(checked(mu, "mu", self.model.mu.grid.shape, self._float64)))
         if not is_tensor(x):
             return self._run(x, progress, mu)
         from . import autograd
@@ -219,11 +222,6 @@ class Projector(LinearOperator):
             self.model.check_volume(x)
             return x.array
         return checked(x, "volume", self.shape_in, self._float64)
-
-    def _check_mu(self, mu: ArrayOrTensor) -> ArrayOrTensor:
-        if self.model.mu is None:
-            raise InputError("mu: the projector's model has none; give it one to say on which grid mu is")
-        return require_no_negative(checked(mu, "mu", self.model.mu.grid.shape, self._float64))
 
     def _run(
         self, x: ArrayOrTensor, progress: Progress | None = None, mu: ArrayOrTensor | None = None

@@ -10,11 +10,10 @@ import sys
 import numpy as np
 
 from ...errors import InputError
-from ...geometry.design_formulas import collimator_length
 from ...geometry.system import PinholeSystem
 from ...recording import recorded_warnings
 from ...workbook import write_system
-from ...workbook.reader import is_by_design
+from ...workbook.quantities import QUANTITIES, needed_numbers
 from ..options import chosen_modules, output_path, read_workbook
 from .arguments import add_action
 
@@ -84,7 +83,8 @@ def _changed(system: PinholeSystem, arguments: argparse.Namespace) -> PinholeSys
             values[name] = np.where(chosen, number, values[name])
     if arguments.move is not None:
         values["centers"] = np.where(chosen[:, None], values["centers"] + arguments.move, values["centers"])
-    follows = is_by_design(system)
+    length = QUANTITIES["l"]
+    follows = length.is_default(system)
     if arguments.length is not None:
         follows = np.where(chosen, arguments.length == "design", follows)
     if arguments.length not in (None, "design"):
@@ -93,11 +93,9 @@ def _changed(system: PinholeSystem, arguments: argparse.Namespace) -> PinholeSys
         except ValueError:
             raise InputError(f"--length {arguments.length!r}: expected millimetres or 'design'") from None
     system = PinholeSystem(**values)
-    designed = collimator_length(
-        system.pinhole_distance, system.pinhole_diameter, system.detector_side, system.roi_radius
-    )
     # Lengths that are the formula's to 1e-9 stay as they are, to the last digit.
-    lengths = np.where(follows & ~is_by_design(system), designed, system.collimator_length)
+    changes = follows & ~length.is_default(system)
+    lengths = np.where(changes, length.default(needed_numbers(system)), system.collimator_length)
     system = dataclasses.replace(system, collimator_length=lengths)
     if arguments.remove is not None:
         removed = np.isin(system.numbers, chosen_modules(system, arguments.remove, "--remove").numbers)

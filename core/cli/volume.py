@@ -11,6 +11,7 @@ import numpy as np
 from ..errors import InputError
 from ..geometry.grid import Grid
 from ..physics.ct_numbers import hu_to_mu
+from ..physics.isotopes import photon_energy
 from ..validation import positive, real_array
 from ..volumes.meshes.mesh import MESH_FORMATS, MILLIMETRES, Mesh, read_mesh, write_mesh
 from ..volumes.meshes.surface import volume_to_mesh
@@ -19,7 +20,7 @@ from ..volumes.rearranging import canonical, centered, crop_to_box, pad
 from ..volumes.resampling import resample
 from ..volumes.volume import UNITS, Volume
 from ..volumes.volume_files import VOLUME_FORMATS, read_volume, write_volume
-from .options import add_command, output_path, photon_energy, progress_bar
+from .options import add_command, output_path, progress_bar
 
 _MESH_UNIT: dict[str, Any] = {
     "choices": tuple(MILLIMETRES),

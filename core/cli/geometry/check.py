@@ -21,25 +21,19 @@ from .arguments import add_action, add_edge, edge_settings
 
 def add_parser(actions) -> None:  # type: ignore[no-untyped-def]
     """Add the action."""
-    parser = add_action(
-        actions,
-        "check",
+    summary = (
         "compare the workbook with the design formulas, and find modules that overlap, do not see their ROI, block each "
-        "other or have unsuitable plates",
-        " --wall 3 --strict",
-        _run,
+        "other or have unsuitable plates"
     )
-    parser.add_argument("--plate", type=float, default=2.0, metavar="MM", help="thickness of the aperture plates")
-    parser.add_argument("--wall", type=float, default=2.0, metavar="MM", help="thickness of the collimators' walls")
-    parser.add_argument(
-        "--edge-at", choices=get_args(EdgePlace), default="middle",
-        help="where in the plate the knife edge is; front is the face towards the ROI",
-    )  # fmt: skip
+    parser = add_action(actions, "check", summary, " --wall 3 --strict", _run)
+    add = parser.add_argument
+    add("--plate", type=float, default=2.0, metavar="MM", help="thickness of the aperture plates")
+    add("--wall", type=float, default=2.0, metavar="MM", help="thickness of the collimators' walls")
+    place = "where in the plate the knife edge is; front is the face towards the ROI"
+    add("--edge-at", choices=get_args(EdgePlace), default="middle", help=place)
     add_edge(parser)
-    parser.add_argument(
-        "--isotope", metavar="NAME", help=f"{', '.join(ISOTOPES)}: its photons must be stopped by the plates"
-    )
-    parser.add_argument("--strict", action="store_true", help="exit with status 1 if there is any warning or finding")
+    add("--isotope", metavar="NAME", help=f"{', '.join(ISOTOPES)}: its photons must be stopped by the plates")
+    add("--strict", action="store_true", help="exit with status 1 if there is any warning or finding")
 
 
 def _run(arguments: argparse.Namespace) -> None:
@@ -47,13 +41,8 @@ def _run(arguments: argparse.Namespace) -> None:
         refuse(arguments, ("isotope",), "needs --aperture-mu")
     with recorded_warnings() as messages:
         system = read_workbook(arguments)
-    report = check_geometry(
-        system,
-        plate_thickness=arguments.plate,
-        wall_thickness=arguments.wall,
-        edge_at=arguments.edge_at,
-        **edge_settings(arguments, system),
-    )
+    parts = {"plate_thickness": arguments.plate, "wall_thickness": arguments.wall, "edge_at": arguments.edge_at}
+    report = check_geometry(system, **parts, **edge_settings(arguments, system))
     findings = report.messages()
     warnings, found = (
         f"{len(x)} {name}{'s' * (len(x) != 1)}" for x, name in ((messages, "warning"), (findings, "finding"))

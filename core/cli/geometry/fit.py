@@ -17,13 +17,8 @@ _FOLLOWS = 0.1  # mm off the ellipse that rounding in a workbook explains
 
 def add_parser(actions) -> None:  # type: ignore[no-untyped-def]
     """Add the action."""
-    add_action(
-        actions,
-        "fit",
-        "find the ellipse that each ring of modules follows, and the modules' distances from it",
-        "",
-        _run,
-    )
+    summary = "find the ellipse that each ring of modules follows, and the modules' distances from it"
+    add_action(actions, "fit", summary, "", _run)
 
 
 def _run(arguments: argparse.Namespace) -> None:

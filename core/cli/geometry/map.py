@@ -20,25 +20,20 @@ _OF_MATERIALS = ("sensitivity", "resolution")
 
 def add_parser(actions) -> None:  # type: ignore[no-untyped-def]
     """Add the action."""
-    parser = add_action(
-        actions,
-        "map",
-        "make a volume of what the scanner does in every voxel",
-        " --quantity sensitivity --voxels 64 --spacing 3 -o sensitivity.nii.gz",
-        _run,
+    example = " --quantity sensitivity --voxels 64 --spacing 3 -o sensitivity.nii.gz"
+    parser = add_action(actions, "map", "make a volume of what the scanner does in every voxel", example, _run)
+    add = parser.add_argument
+    quantity = (
+        "counts per decay; number of modules that see the voxel; expected FWHM, mm; completeness of the angular "
+        "sampling, 1 where every plane through the voxel meets a pinhole that sees it"
     )
-    parser.add_argument(
-        "--quantity", choices=MAPS, default="sensitivity",
-        help="counts per decay; number of modules that see the voxel; expected FWHM, mm; completeness of the angular "
-        "sampling, 1 where every plane through the voxel meets a pinhole that sees it",
-    )  # fmt: skip
-    parser.add_argument("--voxels", type=int, nargs="+", default=[64], metavar="N", help="voxels along x y z, or one")
-    parser.add_argument(
-        "--spacing", type=float, nargs="+", metavar="MM", help="voxel size, one or three; default: so that the ROI fits"
-    )
-    parser.add_argument("--center", type=float, nargs=3, default=[0, 0, 0], metavar="MM", help="of the grid, x y z")
-    parser.add_argument("--modules", metavar="RANGE", help="such as 1-40 or 1-20,41; default: all")
-    parser.add_argument("-o", "--output", required=True, metavar="FILE", help=", ".join(VOLUME_FORMATS))
+    add("--quantity", choices=MAPS, default="sensitivity", help=quantity)
+    add("--voxels", type=int, nargs="+", default=[64], metavar="N", help="voxels along x y z, or one")
+    spacing = "voxel size, one or three; default: so that the ROI fits"
+    add("--spacing", type=float, nargs="+", metavar="MM", help=spacing)
+    add("--center", type=float, nargs=3, default=[0, 0, 0], metavar="MM", help="of the grid, x y z")
+    add("--modules", metavar="RANGE", help="such as 1-40 or 1-20,41; default: all")
+    add("-o", "--output", required=True, metavar="FILE", help=", ".join(VOLUME_FORMATS))
     add_materials(parser)
 
 

@@ -12,28 +12,24 @@ from ...geometry.design_formulas import roi_radius_seen
 from ...physics.performance import magnification, resolution, sensitivity
 from ...physics.sampling import sampling_gaps
 from ..options import read_workbook
-from .arguments import add_action, add_materials, edge_settings, sensitivity_settings, table_rows
+from .arguments import EDGE, add_action, add_materials, sensitivity_settings, table_rows
 
 
 def add_parser(actions) -> None:  # type: ignore[no-untyped-def]
     """Add the action."""
-    parser = add_action(
-        actions,
-        "performance",
-        "print each module's sensitivity, resolution and field of view at the isocentre, or at a point",
-        " --isotope Tc-99m --aperture-mu tungsten --crystal-mu NaI",
-        _run,
-    )
-    parser.add_argument(
-        "--point", type=float, nargs=3, default=[0, 0, 0], metavar="MM", help="where the source is, x y z"
-    )
+    summary = "print each module's sensitivity, resolution and field of view at the isocentre, or at a point"
+    example = " --isotope Tc-99m --aperture-mu tungsten --crystal-mu NaI"
+    parser = add_action(actions, "performance", summary, example, _run)
+    add = parser.add_argument
+    add("--point", type=float, nargs=3, default=[0, 0, 0], metavar="MM", help="where the source is, x y z")
     add_materials(parser)
 
 
 def _run(arguments: argparse.Namespace) -> None:
     system = read_workbook(arguments)
-    points, edge = [arguments.point], edge_settings(arguments, system)
-    counts = 1e6 * sensitivity(system, points, **sensitivity_settings(arguments, system))[0]
+    points, settings = [arguments.point], sensitivity_settings(arguments, system)
+    edge = {name: settings[name] for name in EDGE}
+    counts = 1e6 * sensitivity(system, points, **settings)[0]
     fwhm = resolution(system, points, **edge, intrinsic_fwhm=arguments.intrinsic_fwhm)[0]
     b, d, l, side = system.pinhole_distance, system.pinhole_diameter, system.collimator_length, system.detector_side
     radius = roi_radius_seen(b, d, side, l)

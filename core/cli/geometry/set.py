@@ -27,31 +27,23 @@ _DIMENSIONS = {
 
 def add_parser(actions) -> None:  # type: ignore[no-untyped-def]
     """Add the action."""
-    parser = add_action(
-        actions,
-        "set",
-        "change a workbook's numbers and keep all the rest of it",
-        " --modules 1-20 --diameter 2 -o thinner.xlsx",
-        _run,
-    )
-    parser.add_argument(
-        "-o", "--output", required=True, metavar="OUT", help="workbook to write; FILE itself is replaced"
-    )
-    parser.add_argument("--modules", metavar="RANGE", help="those to change, such as 1-40 or 1-20,41; default: all")
+    summary = "change a workbook's numbers and keep all the rest of it"
+    parser = add_action(actions, "set", summary, " --modules 1-20 --diameter 2 -o thinner.xlsx", _run)
+    add = parser.add_argument
+    add("-o", "--output", required=True, metavar="OUT", help="workbook to write; FILE itself is replaced")
+    add("--modules", metavar="RANGE", help="those to change, such as 1-40 or 1-20,41; default: all")
     for name, (_, what) in _DIMENSIONS.items():
-        parser.add_argument(f"--{name}", type=float, metavar="MM", help=what)
-    parser.add_argument(
-        "--length",
-        metavar="MM",
-        help="l, collimator length, or 'design' for the design formula's; default: those that follow the formula go "
-        "on following it, the others stay",
+        add(f"--{name}", type=float, metavar="MM", help=what)
+    length = (
+        "l, collimator length, or 'design' for the design formula's; default: those that follow the formula go on "
+        "following it, the others stay"
     )
-    parser.add_argument("--move", type=float, nargs=3, metavar=("X", "Y", "Z"), help="shift of the pinholes, mm")
-    parser.add_argument("--remove", metavar="RANGE", help="modules to take out")
-    parser.add_argument("--order", metavar="N,N,...", help="the modules' numbers in the order they are to have")
-    parser.add_argument(
-        "--write-columns", metavar="MAP", help="with --columns, also write the column map (.toml) of the new workbook"
-    )
+    add("--length", metavar="MM", help=length)
+    add("--move", type=float, nargs=3, metavar=("X", "Y", "Z"), help="shift of the pinholes, mm")
+    add("--remove", metavar="RANGE", help="modules to take out")
+    add("--order", metavar="N,N,...", help="the modules' numbers in the order they are to have")
+    columns = "with --columns, also write the column map (.toml) of the new workbook"
+    add("--write-columns", metavar="MAP", help=columns)
 
 
 def _run(arguments: argparse.Namespace) -> None:

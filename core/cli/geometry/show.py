@@ -19,10 +19,10 @@ from .arguments import add_action, table_rows
 def add_parser(actions) -> None:  # type: ignore[no-untyped-def]
     """Add the action."""
     parser = add_action(actions, "show", "print every module's numbers", " --modules 1-20", _run)
-    parser.add_argument("--modules", metavar="RANGE", help="such as 1-40 or 1-20,41; default: all")
-    parser.add_argument(
-        "--write-columns", metavar="MAP", help="instead, write a column map (.toml) of what was seen, for you to check"
-    )
+    add = parser.add_argument
+    add("--modules", metavar="RANGE", help="such as 1-40 or 1-20,41; default: all")
+    columns = "instead, write a column map (.toml) of what was seen, for you to check"
+    add("--write-columns", metavar="MAP", help=columns)
 
 
 def _run(arguments: argparse.Namespace) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import json
 import sys
 import textwrap
 import time
@@ -83,6 +84,16 @@ def add_workbook(parser: argparse.ArgumentParser, name: str = "workbook", defaul
 def read_workbook(arguments: argparse.Namespace) -> PinholeSystem:
     """The scanner of the workbook of `add_workbook`."""
     return read_system(arguments.workbook, columns=arguments.columns)
+
+
+def print_answer(arguments: argparse.Namespace, record: Any, lines: Iterable[str], notes: Iterable[str] = ()) -> None:
+    """Print a record as JSON if ``--json`` was typed, else its lines of text, with notes on standard error."""
+    if arguments.json:
+        print(json.dumps(record, indent=1))
+        return
+    for note in notes:
+        sys.stderr.write(f"mphdrr: {note}\n")
+    print("\n".join(lines))
 
 
 def one_or_three(values: list) -> list:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import json
 from typing import Any
 
 import numpy as np
@@ -20,7 +19,7 @@ from ..volumes.rearranging import canonical, centered, crop_to_box, pad
 from ..volumes.resampling import resample
 from ..volumes.volume import UNITS, Volume
 from ..volumes.volume_files import VOLUME_FORMATS, read_volume, write_volume
-from .options import add_command, output_path, progress_bar
+from .options import add_command, output_path, print_answer, progress_bar
 
 _MESH_UNIT: dict[str, Any] = {
     "choices": tuple(MILLIMETRES),
@@ -129,12 +128,11 @@ def _info(arguments: argparse.Namespace) -> None:
         "mean": float(array.mean(dtype=np.float64)),
         "largest": float(array.max()),
     }
-    if arguments.json:
-        print(json.dumps({**facts, "affine": grid.affine.tolist()}, indent=1))
-        return
+    lines = []
     for name, value in facts.items():
         text = " ".join(f"{x:g}" if isinstance(x, float) else str(x) for x in np.atleast_1d(value).tolist())
-        print(f"{name:16s} {text}")
+        lines.append(f"{name:16s} {text}")
+    print_answer(arguments, {**facts, "affine": grid.affine.tolist()}, lines)
 
 
 def _convert(arguments: argparse.Namespace) -> None:

@@ -60,9 +60,7 @@ class Quantity:
     hints: str = ""
     """Words that suggest this quantity in a heading that is not understood."""
     plausible: tuple[float, float] = (-math.inf, math.inf)
-    """mm or rad; a warning is given of numbers outside."""
-    positive: bool = True
-    """Whether a typed number must be more than 0, coordinates aside."""
+    """mm or rad; a warning is given of numbers outside. If all of them are above 0, a typed one that is not is refused."""
     blank: float | Callable[[Numbers], NDArray[np.float64]] = math.nan
     """The number of an optional one where its cell is blank, or a function of the needed ones, mm, that gives it (M,)."""
     depends_on_length: bool = False

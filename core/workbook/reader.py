@@ -170,9 +170,9 @@ def _refuse_impossible(columns: dict[str, Column], values: Numbers) -> None:
 
 
 def _refuse_not_positive(column: Column, values: NDArray[np.float64]) -> None:
-    """Raise `InputError` if a number (M,), mm or rad, is not positive but must be."""
+    """Raise `InputError` if a number (M,), mm or rad, is not positive but plausible ones are."""
     quantity = QUANTITIES[column.quantity]
-    bad = (values <= 0) & quantity.positive
+    bad = (values <= 0) & (quantity.plausible[0] > 0)
     column.refuse(bad, lambda i: f"has {quantity.name} = {quantity.said(values[i])}, expected more than 0")
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import pickle
-import warnings
 from collections.abc import Callable
 from pathlib import Path
 
@@ -21,6 +20,8 @@ from .test_workbook import CENTERS, assert_plain, plain, saved
 from .test_workbook import _typed as typed
 from .test_workbook_strict import READ, REFUSED
 from .workbooks import by_design, changed
+
+pytestmark = pytest.mark.filterwarnings("error")
 
 MAP = """
 [[tables]]
@@ -47,13 +48,6 @@ R = { column = "C", unit = "mm" }
 Ld = { column = "D", unit = "mm" }
 Td = { column = "E", unit = "mm" }
 """
-
-
-@pytest.fixture(autouse=True)
-def warnings_are_errors():
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        yield
 
 
 def silent(folder: Path, edit: Callable | None = None) -> Path:

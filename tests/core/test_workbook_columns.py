@@ -13,7 +13,7 @@ ROOT = Path(__file__).resolve().parents[2]
 ENTRY = """
     Quantity(
         "Ns", "septa", ("Ns", "number of septa"), "Main!U", role="optional", kind="number", hints="septa",
-        plausible=(0, 20), positive=False, blank=2.0,
+        plausible=(0, 20), blank=2.0,
     ),
 """
 SETTING = """

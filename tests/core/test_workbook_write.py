@@ -27,6 +27,7 @@ from .workbooks import (
     random_centers,
     random_change,
     random_system,
+    read_quietly,
     values_of,
 )
 
@@ -46,12 +47,6 @@ def assert_same(back: mph.PinholeSystem, system: mph.PinholeSystem, numbered: bo
         np.testing.assert_array_equal(back.numbers, system.numbers)
     for name in ("centers", "collimator_length", *DIMENSIONS.values()):
         np.testing.assert_allclose(getattr(back, name), getattr(system, name), rtol=1e-9, atol=0, err_msg=name)
-
-
-def read_quietly(path) -> mph.PinholeSystem:
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        return mph.read_system(path)
 
 
 def write_changed(folder, layout: Layout, seed: int):

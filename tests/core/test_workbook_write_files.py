@@ -26,7 +26,7 @@ from openpyxl.worksheet.table import Table
 import mphdrr
 import mphdrr.core as mph
 
-from .workbooks import Layout, by_design, changed, content_of, laid_out, values_of
+from .workbooks import Layout, by_design, changed, content_of, laid_out, read_quietly, values_of
 
 SPREADSHEET = "http://schemas.openxmlformats.org/spreadsheetml/2006/main"
 
@@ -53,12 +53,6 @@ def repacked(content: bytes, edit) -> bytes:
             if data is not None:
                 new.writestr(info, data)
     return out.getvalue()
-
-
-def read_quietly(path) -> mph.PinholeSystem:
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        return mph.read_system(path)
 
 
 def write_quietly(system, path, template) -> mph.WrittenWorkbook:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import io
+import warnings
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +13,7 @@ from openpyxl.utils import get_column_letter as letter
 from openpyxl.workbook import Workbook
 from openpyxl.workbook.defined_name import DefinedName
 
-from mphdrr.core import PinholeSystem, collimator_length
+from mphdrr.core import PinholeSystem, collimator_length, read_system
 from mphdrr.core.workbook.quantities import DERIVED, QUANTITIES
 
 DIMENSIONS = {"d": "pinhole_diameter", "R": "roi_radius", "Ld": "detector_side", "Td": "detector_thickness"}
@@ -34,6 +35,12 @@ def by_design(system: PinholeSystem) -> PinholeSystem:
     return changed(
         s, collimator_length=collimator_length(s.pinhole_distance, s.pinhole_diameter, s.detector_side, s.roi_radius)
     )
+
+
+def read_quietly(path) -> PinholeSystem:
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        return read_system(path)
 
 
 def random_centers(rng, n: int) -> np.ndarray:

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import json
-import sys
 from typing import get_args
 
 import numpy as np
@@ -15,7 +13,7 @@ from ...geometry.collimator import EdgePlace
 from ...geometry.system import PinholeSystem
 from ...physics.isotopes import ISOTOPES
 from ...recording import recorded_warnings
-from ..options import read_workbook, refuse
+from ..options import print_answer, read_workbook, refuse
 from .arguments import add_action, add_edge, edge_settings
 
 
@@ -48,17 +46,10 @@ def _run(arguments: argparse.Namespace) -> None:
         f"{len(x)} {name}{'s' * (len(x) != 1)}" for x, name in ((messages, "warning"), (findings, "finding"))
     )
     total = f"{warnings} of the workbook, {found} in the geometry"
-    if arguments.json:
-        answer = {"summary": _summary(system), "warnings": messages, "findings": findings, "geometry": report.as_dict()}
-        print(json.dumps(answer, indent=1))
-    else:
-        for message in messages:
-            sys.stderr.write(f"mphdrr: warning: {message}\n")
-        for name, text in _summary(system).items():
-            print(f"{name:22s} {text}")
-        for finding in findings:
-            print(finding)
-        print(total)
+    summary = _summary(system)
+    answer = {"summary": summary, "warnings": messages, "findings": findings, "geometry": report.as_dict()}
+    lines = [*(f"{name:22s} {text}" for name, text in summary.items()), *findings, total]
+    print_answer(arguments, answer, lines, [f"warning: {message}" for message in messages])
     if arguments.strict and (messages or findings):
         raise InputError(f"{arguments.workbook}: {total}")
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import json
 from typing import Any
 
 import numpy as np
@@ -12,7 +11,7 @@ from ...geometry.grid import Grid
 from ...physics.maps import MAPS
 from ...validation import whole_shape
 from ...volumes.volume_files import VOLUME_FORMATS, write_volume
-from ..options import chosen_modules, one_or_three, output_path, progress_bar, read_workbook, refuse
+from ..options import chosen_modules, one_or_three, output_path, print_answer, progress_bar, read_workbook, refuse
 from .arguments import MATERIAL_OPTIONS, add_action, add_materials, sensitivity_settings
 
 _OF_MATERIALS = ("sensitivity", "resolution")
@@ -54,9 +53,7 @@ def _run(arguments: argparse.Namespace) -> None:
     volume = MAPS[arguments.quantity](system, grid, **settings, progress=progress_bar("mapping"))
     write_volume(volume, path)
     low, high, mean = (float(f(volume.array)) for f in (np.min, np.max, np.mean))
-    if arguments.json:
-        record = {"file": str(path), "quantity": volume.quantity, "unit": volume.unit}
-        print(json.dumps({**record, "minimum": low, "maximum": high, "mean": mean}, indent=1))
-        return
+    record = {"file": str(path), "quantity": volume.quantity, "unit": volume.unit}
     shape = " x ".join(map(str, volume.grid.shape))
-    print(f"{path}: {shape} voxels, {volume.quantity} from {low:.4g} to {high:.4g} {volume.unit}".removesuffix(" 1"))
+    text = f"{path}: {shape} voxels, {volume.quantity} from {low:.4g} to {high:.4g} {volume.unit}".removesuffix(" 1")
+    print_answer(arguments, {**record, "minimum": low, "maximum": high, "mean": mean}, [text])

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import json
 import math
 
 import numpy as np
@@ -11,7 +10,7 @@ import numpy as np
 from ...geometry.design_formulas import roi_radius_seen
 from ...physics.performance import magnification, resolution, sensitivity
 from ...physics.sampling import sampling_gaps
-from ..options import read_workbook
+from ..options import print_answer, read_workbook
 from .arguments import EDGE, add_action, add_materials, sensitivity_settings, table_rows
 
 
@@ -53,16 +52,13 @@ def _run(arguments: argparse.Namespace) -> None:
         "sampling_gap_degrees": math.degrees(sampling_gaps(system, points)[0]),
     }
     rows = table_rows(columns)
-    if arguments.json:
-        modules = [{name: None if x != x else x for name, x in row.items()} for row in rows]  # no NaN in JSON
-        units = "sensitivity cps/MBq; resolution and radii mm"
-        print(json.dumps({"point": arguments.point, "modules": modules, "total": total, "units": units}, indent=1))
-        return
-    print(" module  ring  cps/MBq  FWHM mm  magnification  sees R mm     R mm")
-    for row in rows:
-        print("{:7d} {:5d} {:8.3f} {:8.2f} {:14.4f} {:10.2f} {:8.2f}".format(*row.values()))
-    print(f"total {total['sensitivity']:.1f} cps/MBq from {total['modules_seeing']} of {len(system)} modules")
+    modules = [{name: None if x != x else x for name, x in row.items()} for row in rows]  # no NaN in JSON
+    units = "sensitivity cps/MBq; resolution and radii mm"
+    lines = [" module  ring  cps/MBq  FWHM mm  magnification  sees R mm     R mm"]
+    lines += ["{:7d} {:5d} {:8.3f} {:8.2f} {:14.4f} {:10.2f} {:8.2f}".format(*row.values()) for row in rows]
+    lines += [f"total {total['sensitivity']:.1f} cps/MBq from {total['modules_seeing']} of {len(system)} modules"]
     if rms is not None:
-        print(f"resolution {rms:.2f} mm FWHM, the modules' root mean square weighted by counts")
-    print(f"planes through the point miss all pinholes by up to {total['sampling_gap_degrees']:.1f} degrees")
-    print(f"{total['modules_holding_roi']} of {len(system)} modules see their whole ROI")
+        lines += [f"resolution {rms:.2f} mm FWHM, the modules' root mean square weighted by counts"]
+    lines += [f"planes through the point miss all pinholes by up to {total['sampling_gap_degrees']:.1f} degrees"]
+    lines += [f"{total['modules_holding_roi']} of {len(system)} modules see their whole ROI"]
+    print_answer(arguments, {"point": arguments.point, "modules": modules, "total": total, "units": units}, lines)

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import argparse
 import dataclasses
-import json
-import sys
 
 import numpy as np
 
@@ -14,7 +12,7 @@ from ...geometry.system import PinholeSystem
 from ...recording import recorded_warnings
 from ...workbook import write_system
 from ...workbook.quantities import QUANTITIES, needed_numbers
-from ..options import chosen_modules, output_path, read_workbook
+from ..options import chosen_modules, output_path, print_answer, read_workbook
 from .arguments import add_action
 
 _DIMENSIONS = {
@@ -56,14 +54,10 @@ def _run(arguments: argparse.Namespace) -> None:
         written = write_system(system, target, template=arguments.workbook)
     if map_path is not None and written.columns is not None:
         written.columns.write(map_path)
-    if arguments.json:
-        answer = {**dataclasses.asdict(written), "path": str(written.path), "warnings": messages}
-        print(json.dumps(answer, indent=1))
-        return
-    for message in messages:
-        sys.stderr.write(f"mphdrr: warning: {message}\n")
+    answer = {**dataclasses.asdict(written), "path": str(written.path), "warnings": messages}
     cleared = f", {len(written.cleared)} without a value" if written.cleared else ""
-    print(f"{written.path}: {len(written.changed)} cells changed, {len(written.recalculated)} recalculated{cleared}")
+    text = f"{written.path}: {len(written.changed)} cells changed, {len(written.recalculated)} recalculated{cleared}"
+    print_answer(arguments, answer, [text], [f"warning: {message}" for message in messages])
 
 
 def _changed(system: PinholeSystem, arguments: argparse.Namespace) -> PinholeSystem:

@@ -244,13 +244,12 @@ def _texts_between_modules(table: HeadedTable) -> Iterator[str]:
     for row, column in table.sheet.texts:
         if row in between and min(columns) <= column <= max(columns):
             found.setdefault(row, (row, column))
-    for row, at in sorted(found.items()):
+    for row, at in sorted(found.items())[:1]:
         place = table.sheet.place(*at)
         if row in table.summaries:
             yield f"{place} sums up its column between rows of modules, expected sums below the last module"
         else:
             yield f"{place} holds {quoted(table.sheet.texts[at])} between rows of modules, expected one table"
-        return
 
 
 def _notes_with_units(table: HeadedTable, lengths: set[str]) -> Iterator[str]:

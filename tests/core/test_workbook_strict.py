@@ -6,6 +6,7 @@ import io
 import re
 import zipfile
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -23,7 +24,7 @@ from mphdrr.core.workbook.quantities import LENGTH_UNITS, QUANTITIES
 
 from .test_workbook import _one_sheet, assert_plain, plain, read_edited, saved
 from .test_workbook import _typed as typed
-from .workbooks import DIMENSIONS, by_design, changed
+from .workbooks import DIMENSIONS, by_design
 
 pytestmark = pytest.mark.filterwarnings("error")
 
@@ -364,7 +365,7 @@ def test_lengths_are_converted_and_written_back_in_their_unit(units, tmp_path):
     system = mph.read_system(template)
     same = mph.write_system(system, tmp_path / "same.xlsx", template)
     assert same.path.read_bytes() == template.read_bytes()
-    moved = by_design(changed(system, centers=system.centers * 1.25))
+    moved = by_design(replace(system, centers=system.centers * 1.25))
     written = mph.write_system(moved, tmp_path / "moved.xlsx", template)
     back = mph.read_system(written.path)  # no warning: the derived columns are in their units, too
     np.testing.assert_allclose(back.centers, moved.centers, rtol=1e-12)

@@ -6,6 +6,7 @@ import io
 import json
 import warnings
 import zipfile
+from dataclasses import replace
 from xml.etree import ElementTree
 
 import numpy as np
@@ -21,7 +22,6 @@ from .workbooks import (
     DIMENSIONS,
     Layout,
     by_design,
-    changed,
     content_of,
     laid_out,
     random_centers,
@@ -151,7 +151,7 @@ else:
         system = random_system(rng, n, shared=False)
         if scaled:
             factors = np.where(rng.random(n) < 0.5, 1.05, 1)
-            system = changed(system, collimator_length=system.collimator_length * factors)
+            system = replace(system, collimator_length=system.collimator_length * factors)
         path = tmp_path_factory.mktemp("w") / "new.xlsx"
         mph.write_system(system, path)
         back = mph.read_system(path) if not scaled else read_quietly(path)
@@ -225,7 +225,7 @@ def test_a_moved_pinhole_changes_its_row_alone(workbook, tmp_path):
     system = mph.read_system(workbook)
     centers = system.centers.copy()
     centers[3] += [1.0, -2.0, 1 / 3]
-    moved = by_design(changed(system, centers=centers))
+    moved = by_design(replace(system, centers=centers))
     written = mph.write_system(moved, tmp_path / "moved.xlsx", workbook)
     assert written.changed == ("Coordinates!B6", "Coordinates!C6", "Coordinates!D6")
     assert set(written.recalculated) == {f"Coordinates!{c}6" for c in "EFGHIJKUVW"}
@@ -316,7 +316,7 @@ def test_a_summary_beside_the_table_stays_where_it_is(template, tmp_path, order)
 @QUIET
 def test_renumbered_modules_keep_their_rows(template, tmp_path):
     system = mph.read_system(template)
-    system = changed(system, numbers=system.numbers + 1000)
+    system = replace(system, numbers=system.numbers + 1000)
     written = mph.write_system(system, tmp_path / "o.xlsx", template)
     assert written.changed == tuple(f"{sheet}!A{row}" for sheet in ("Main", "Coordinates") for row in range(3, 7))
     assert_same(mph.read_system(tmp_path / "o.xlsx"), system)
@@ -357,7 +357,7 @@ def test_a_formula_that_does_not_give_the_number_is_replaced_with_a_warning(temp
     centers = system.centers.copy()
     centers[0, 0] = 280.5
     with pytest.warns(mph.InputWarning, match=r"template.xlsx: Coordinates!B3: the formula was replaced .*gives 277"):
-        mph.write_system(by_design(changed(system, centers=centers)), tmp_path / "o.xlsx", template)
+        mph.write_system(by_design(replace(system, centers=centers)), tmp_path / "o.xlsx", template)
     assert values_of(tmp_path / "o.xlsx", data_only=False)["Coordinates", "B3"] == 280.5
 
 
@@ -369,7 +369,7 @@ def test_a_formula_that_gives_the_new_number_stays(template, tmp_path):
     system = read_quietly(template)
     centers = system.centers.copy()
     centers[:2, 0] = 280.5, -280.5
-    written = mph.write_system(by_design(changed(system, centers=centers)), tmp_path / "o.xlsx", template)
+    written = mph.write_system(by_design(replace(system, centers=centers)), tmp_path / "o.xlsx", template)
     cells = values_of(tmp_path / "o.xlsx", data_only=False)
     assert (cells["Coordinates", "B3"], cells["Coordinates", "B4"]) == (280.5, "=-B3")
     assert values_of(tmp_path / "o.xlsx")["Coordinates", "B4"] == -280.5
@@ -383,7 +383,7 @@ def test_a_formula_that_comes_to_refer_to_itself_is_replaced_alone(template, tmp
         book["Main"][f"B{row}"] = "=B$3"
     book["Main"]["B3"] = 2.25
     book.save(template)
-    system = by_design(changed(read_quietly(template), pinhole_diameter=2.25))
+    system = by_design(replace(read_quietly(template), pinhole_diameter=2.25))
     with pytest.warns(mph.InputWarning) as caught:
         mph.write_system(system[[3, 0, 1, 2]], tmp_path / "o.xlsx", template)
     replaced = [str(w.message) for w in caught if "the formula was replaced" in str(w.message)]
@@ -405,7 +405,7 @@ def test_what_nobody_can_calculate_stores_no_value(template, tmp_path):
     system = read_quietly(template)
     with pytest.warns(mph.InputWarning, match=r"Other!A1 and 1 more: the formula's new value could not be calculated"):
         written = mph.write_system(
-            by_design(changed(system, centers=system.centers * 1.1)), tmp_path / "o.xlsx", template
+            by_design(replace(system, centers=system.centers * 1.1)), tmp_path / "o.xlsx", template
         )
     assert written.cleared == ("Other!A1", "Other!A2")
 
@@ -421,7 +421,7 @@ def test_a_system_is_read_back_from_formulas_without_values(template, tmp_path):
     table[f"{length}4"] = table[f"{length}4"].value + "*SUMPRODUCT(1)"
     book.save(template)
     system = read_quietly(template)
-    system = by_design(changed(system, centers=system.centers * 1.1))
+    system = by_design(replace(system, centers=system.centers * 1.1))
     with pytest.warns(mph.InputWarning) as caught:
         written = mph.write_system(system, tmp_path / "o.xlsx", template)
     replaced, cleared = sorted(str(w.message) for w in caught)
@@ -436,9 +436,9 @@ def test_one_cell_for_all_modules_is_changed_or_spread(tmp_path):
     template = tmp_path / "template.xlsx"
     template.write_bytes(content_of(laid_out(Layout(shared=True, length="absent", derived="absent"))))
     system = read_quietly(template)
-    written = mph.write_system(by_design(changed(system, pinhole_diameter=3.3)), tmp_path / "o.xlsx", template)
+    written = mph.write_system(by_design(replace(system, pinhole_diameter=3.3)), tmp_path / "o.xlsx", template)
     assert written.changed == ("Main!B3",)
-    different = by_design(changed(system, pinhole_diameter=[1.0, 2.0, 3.0, 4.0]))
+    different = by_design(replace(system, pinhole_diameter=[1.0, 2.0, 3.0, 4.0]))
     mph.write_system(different, tmp_path / "o.xlsx", template)
     values = values_of(tmp_path / "o.xlsx")
     assert [values.get(("Main", f"B{row}")) for row in range(3, 7)] == [1, 2, 3, 4]
@@ -451,7 +451,7 @@ def test_without_a_column_of_lengths_only_designed_ones_are_held(tmp_path):
     template.write_bytes(content_of(laid_out(Layout(length="absent"))))
     system = read_quietly(template)
     with pytest.raises(mph.InputError, match="no column headed l for the collimator length of module"):
-        mph.write_system(changed(system, collimator_length=99.0), tmp_path / "o.xlsx", template)
+        mph.write_system(replace(system, collimator_length=99.0), tmp_path / "o.xlsx", template)
 
 
 def test_numbers_that_the_sheet_cannot_say_are_warned_of(tmp_path):
@@ -459,7 +459,7 @@ def test_numbers_that_the_sheet_cannot_say_are_warned_of(tmp_path):
     template.write_bytes(content_of(laid_out(Layout(numbered=False, length="absent", derived="absent"))))
     system = read_quietly(template)
     with pytest.warns(mph.InputWarning, match="has no column of the modules' numbers"):
-        mph.write_system(changed(system, numbers=[5, 6, 7, 8]), tmp_path / "o.xlsx", template)
+        mph.write_system(replace(system, numbers=[5, 6, 7, 8]), tmp_path / "o.xlsx", template)
     assert (tmp_path / "o.xlsx").read_bytes() == template.read_bytes()
 
 
@@ -467,7 +467,7 @@ def test_a_workbook_may_replace_itself(template):
     system = read_quietly(template)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        mph.write_system(by_design(changed(system, centers=system.centers * 1.01)), template, template)
+        mph.write_system(by_design(replace(system, centers=system.centers * 1.01)), template, template)
     np.testing.assert_array_equal(read_quietly(template).centers, system.centers * 1.01)
     assert [p.name for p in template.parent.iterdir()] == ["template.xlsx"]
 
@@ -480,7 +480,7 @@ def test_every_layout_that_is_read_can_be_written(edit, tmp_path, rng):
     template = tmp_path / "t.xlsx"
     book.save(template)
     system = read_quietly(template)
-    other = by_design(changed(system, centers=random_centers(rng, 4), pinhole_diameter=rng.uniform(1, 3, 4)))
+    other = by_design(replace(system, centers=random_centers(rng, 4), pinhole_diameter=rng.uniform(1, 3, 4)))
     for wanted in (other[[3, 0, 1]], more_of(other, 2)):
         if edit.__name__ == "_blank_rows_and_notes" and len(wanted) > 4:
             with pytest.raises(mph.InputError, match="Coordinates!A11 is not blank"):  # a note
@@ -547,7 +547,7 @@ def test_a_system_that_would_be_refused_is_not_written(template, tmp_path):
     system = read_quietly(template)
     centers = system.centers.copy()
     centers[1] = centers[0] + 1e-9  # the same position, in a workbook's precision
-    twice = changed(system, centers=centers)
+    twice = replace(system, centers=centers)
     for source, name in ((template, "template.xlsx"), (None, "the new workbook")):
         with pytest.raises(mph.InputError, match=f"^{name} cannot hold this system, with it: {name}: Coordinates!B4 "):
             mph.write_system(by_design(twice), tmp_path / "o.xlsx", source)

@@ -25,14 +25,9 @@ def designed(centers, d, R, Ld, Td, numbers=None, length=None) -> PinholeSystem:
     return PinholeSystem(centers, d, length, Ld, Td, R, numbers)
 
 
-def changed(system: PinholeSystem, **values) -> PinholeSystem:
-    fields = {f.name: getattr(system, f.name) for f in dataclasses.fields(system)}
-    return PinholeSystem(**{**fields, **values})
-
-
 def by_design(system: PinholeSystem) -> PinholeSystem:
     s = system
-    return changed(
+    return dataclasses.replace(
         s, collimator_length=collimator_length(s.pinhole_distance, s.pinhole_diameter, s.detector_side, s.roi_radius)
     )
 
@@ -202,7 +197,9 @@ def random_change(rng, system: PinholeSystem, layout: Layout) -> PinholeSystem:
     changed_system = by_design(PinholeSystem(**arrays))
     if layout.length in ("formula", "typed", "blank") and rng.random() < 0.3:
         factor = np.where(rng.random(len(changed_system)) < 0.5, 1.1, 1.0)
-        changed_system = changed(changed_system, collimator_length=changed_system.collimator_length * factor)
+        changed_system = dataclasses.replace(
+            changed_system, collimator_length=changed_system.collimator_length * factor
+        )
     return changed_system
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import dataclasses
+from typing import Any
 
 import numpy as np
 
@@ -62,26 +63,26 @@ def _run(arguments: argparse.Namespace) -> None:
 
 def _changed(system: PinholeSystem, arguments: argparse.Namespace) -> PinholeSystem:
     chosen = np.isin(system.numbers, chosen_modules(system, arguments.modules).numbers)
-    values = {f.name: getattr(system, f.name) for f in dataclasses.fields(system)}
+    changes: dict[str, Any] = {}
     for option, (name, _) in _DIMENSIONS.items():
         number = getattr(arguments, option)
         if number is not None:
-            values[name] = np.where(chosen, number, values[name])
+            changes[name] = np.where(chosen, number, getattr(system, name))
     if arguments.move is not None:
-        values["centers"] = np.where(chosen[:, None], values["centers"] + arguments.move, values["centers"])
+        changes["centers"] = np.where(chosen[:, None], system.centers + arguments.move, system.centers)
     length = QUANTITIES["l"]
     follows = length.is_default(system)
     if arguments.length is not None:
         follows = np.where(chosen, arguments.length == "design", follows)
     if arguments.length not in (None, "design"):
         try:
-            values["collimator_length"] = np.where(chosen, float(arguments.length), values["collimator_length"])
+            changes["collimator_length"] = np.where(chosen, float(arguments.length), system.collimator_length)
         except ValueError:
             raise InputError(f"--length {arguments.length!r}: expected millimetres or 'design'") from None
-    system = PinholeSystem(**values)
+    system = dataclasses.replace(system, **changes)
     # Lengths that are the formula's to 1e-9 stay as they are, to the last digit.
-    changes = follows & ~length.is_default(system)
-    lengths = np.where(changes, length.default(needed_numbers(system)), system.collimator_length)
+    others = follows & ~length.is_default(system)
+    lengths = np.where(others, length.default(needed_numbers(system)), system.collimator_length)
     system = dataclasses.replace(system, collimator_length=lengths)
     if arguments.remove is not None:
         removed = np.isin(system.numbers, chosen_modules(system, arguments.remove, "--remove").numbers)

@@ -23,12 +23,15 @@ from .workbooks import (
     Layout,
     by_design,
     content_of,
+    edited,
     laid_out,
     random_centers,
     random_change,
     random_system,
     read_quietly,
+    saved_layout,
     values_of,
+    write_quietly,
 )
 
 try:
@@ -54,10 +57,7 @@ def write_changed(folder, layout: Layout, seed: int):
     template = folder / "template.xlsx"
     template.write_bytes(content_of(laid_out(layout)))
     system = random_change(np.random.default_rng(seed), read_quietly(template), layout)
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        written = mph.write_system(system, folder / "written.xlsx", template)
-    return system, written
+    return system, write_quietly(system, folder / "written.xlsx", template)
 
 
 def assert_in_order(path) -> None:
@@ -255,9 +255,7 @@ def test_new_workbook_is_laid_out_as_the_real_one(workbook, tmp_path):
 @pytest.fixture
 def template(tmp_path):
     """Four modules with formulas everywhere; the stored values do not matter."""
-    path = tmp_path / "template.xlsx"
-    path.write_bytes(content_of(laid_out(Layout(seed=3))))
-    return path
+    return saved_layout(tmp_path / "template.xlsx", seed=3)
 
 
 @QUIET
@@ -301,11 +299,10 @@ def test_reordered_modules_take_their_rows_along(template, tmp_path):
 @QUIET
 @pytest.mark.parametrize("order", [[1, 2, 3], [3, 1, 2, 0]])
 def test_a_summary_beside_the_table_stays_where_it_is(template, tmp_path, order):
-    book = openpyxl.load_workbook(template)
-    sheet = book["Coordinates"]
-    first = sheet.max_column + 1
-    sheet.cell(3, first).value, sheet.cell(3, first + 1).value = "highest", "=MAX(B3:B6)"
-    book.save(template)
+    with edited(template) as book:
+        sheet = book["Coordinates"]
+        first = sheet.max_column + 1
+        sheet.cell(3, first).value, sheet.cell(3, first + 1).value = "highest", "=MAX(B3:B6)"
     system = read_quietly(template)[order]
     mph.write_system(system, tmp_path / "o.xlsx", template)
     cells, values = (openpyxl.load_workbook(tmp_path / "o.xlsx", data_only=d)["Coordinates"] for d in (False, True))
@@ -323,9 +320,8 @@ def test_renumbered_modules_keep_their_rows(template, tmp_path):
 
 
 def test_a_cell_in_the_way_of_added_modules_is_named(template, tmp_path):
-    book = openpyxl.load_workbook(template)
-    book["Coordinates"]["A8"] = "note: all in mm"
-    book.save(template)
+    with edited(template) as book:
+        book["Coordinates"]["A8"] = "note: all in mm"
     system = mph.read_system(template)
     more = more_of(system, 3)
     with pytest.raises(mph.InputError, match=r"^template.xlsx: Coordinates!A8 is not blank"):
@@ -349,10 +345,9 @@ def more_of(system, n):
 @QUIET
 @pytest.mark.parametrize("formula", ["=270+7", "=Main!$H$9*1"])
 def test_a_formula_that_does_not_give_the_number_is_replaced_with_a_warning(template, tmp_path, formula):
-    book = openpyxl.load_workbook(template)
-    book["Main"]["H9"] = 277
-    book["Coordinates"]["B3"] = formula
-    book.save(template)
+    with edited(template) as book:
+        book["Main"]["H9"] = 277
+        book["Coordinates"]["B3"] = formula
     system = read_quietly(template)
     centers = system.centers.copy()
     centers[0, 0] = 280.5
@@ -363,9 +358,8 @@ def test_a_formula_that_does_not_give_the_number_is_replaced_with_a_warning(temp
 
 @QUIET
 def test_a_formula_that_gives_the_new_number_stays(template, tmp_path):
-    book = openpyxl.load_workbook(template)
-    book["Coordinates"]["B4"] = "=-B3"
-    book.save(template)
+    with edited(template) as book:
+        book["Coordinates"]["B4"] = "=-B3"
     system = read_quietly(template)
     centers = system.centers.copy()
     centers[:2, 0] = 280.5, -280.5
@@ -378,11 +372,10 @@ def test_a_formula_that_gives_the_new_number_stays(template, tmp_path):
 
 def test_a_formula_that_comes_to_refer_to_itself_is_replaced_alone(template, tmp_path):
     """Sorted as by a spreadsheet, =B$3 of another row moves to B3 itself; cells that depend on it stay formulas."""
-    book = openpyxl.load_workbook(template)
-    for row in range(4, 7):
-        book["Main"][f"B{row}"] = "=B$3"
-    book["Main"]["B3"] = 2.25
-    book.save(template)
+    with edited(template) as book:
+        for row in range(4, 7):
+            book["Main"][f"B{row}"] = "=B$3"
+        book["Main"]["B3"] = 2.25
     system = by_design(replace(read_quietly(template), pinhole_diameter=2.25))
     with pytest.warns(mph.InputWarning) as caught:
         mph.write_system(system[[3, 0, 1, 2]], tmp_path / "o.xlsx", template)
@@ -397,11 +390,10 @@ def test_a_formula_that_comes_to_refer_to_itself_is_replaced_alone(template, tmp
 
 
 def test_what_nobody_can_calculate_stores_no_value(template, tmp_path):
-    book = openpyxl.load_workbook(template)
-    del book["Theta"], book["It's values"]
-    other = book.create_sheet("Other")
-    other["A1"], other["A2"], other["A3"] = "=FOO(Coordinates!B3)", "=A1+1", "=FOO(1)"
-    book.save(template)
+    with edited(template) as book:
+        del book["Theta"], book["It's values"]
+        other = book.create_sheet("Other")
+        other["A1"], other["A2"], other["A3"] = "=FOO(Coordinates!B3)", "=A1+1", "=FOO(1)"
     system = read_quietly(template)
     with pytest.warns(mph.InputWarning, match=r"Other!A1 and 1 more: the formula's new value could not be calculated"):
         written = mph.write_system(
@@ -412,14 +404,13 @@ def test_what_nobody_can_calculate_stores_no_value(template, tmp_path):
 
 def test_a_system_is_read_back_from_formulas_without_values(template, tmp_path):
     """SUMPRODUCT is beyond the evaluator: H stores no value, and the formula of an l that must be right is replaced."""
-    book = openpyxl.load_workbook(template)
-    table = book["Coordinates"]
-    columns = {cell.value: cell.column_letter for cell in table[2] if cell.value}
-    length, end = columns["length of collimator"], columns["l + b+Td"]
-    for row in range(3, 7):
-        table[f"{end}{row}"] = f"=SUMPRODUCT({length}{row}:{length}{row})+{columns['b']}{row}+Main!E{row}"
-    table[f"{length}4"] = table[f"{length}4"].value + "*SUMPRODUCT(1)"
-    book.save(template)
+    with edited(template) as book:
+        table = book["Coordinates"]
+        columns = {cell.value: cell.column_letter for cell in table[2] if cell.value}
+        length, end = columns["length of collimator"], columns["l + b+Td"]
+        for row in range(3, 7):
+            table[f"{end}{row}"] = f"=SUMPRODUCT({length}{row}:{length}{row})+{columns['b']}{row}+Main!E{row}"
+        table[f"{length}4"] = table[f"{length}4"].value + "*SUMPRODUCT(1)"
     system = read_quietly(template)
     system = by_design(replace(system, centers=system.centers * 1.1))
     with pytest.warns(mph.InputWarning) as caught:
@@ -433,8 +424,7 @@ def test_a_system_is_read_back_from_formulas_without_values(template, tmp_path):
 
 @QUIET
 def test_one_cell_for_all_modules_is_changed_or_spread(tmp_path):
-    template = tmp_path / "template.xlsx"
-    template.write_bytes(content_of(laid_out(Layout(shared=True, length="absent", derived="absent"))))
+    template = saved_layout(tmp_path / "template.xlsx", shared=True, length="absent", derived="absent")
     system = read_quietly(template)
     written = mph.write_system(by_design(replace(system, pinhole_diameter=3.3)), tmp_path / "o.xlsx", template)
     assert written.changed == ("Main!B3",)
@@ -447,16 +437,14 @@ def test_one_cell_for_all_modules_is_changed_or_spread(tmp_path):
 
 
 def test_without_a_column_of_lengths_only_designed_ones_are_held(tmp_path):
-    template = tmp_path / "template.xlsx"
-    template.write_bytes(content_of(laid_out(Layout(length="absent"))))
+    template = saved_layout(tmp_path / "template.xlsx", length="absent")
     system = read_quietly(template)
     with pytest.raises(mph.InputError, match="no column headed l for the collimator length of module"):
         mph.write_system(replace(system, collimator_length=99.0), tmp_path / "o.xlsx", template)
 
 
 def test_numbers_that_the_sheet_cannot_say_are_warned_of(tmp_path):
-    template = tmp_path / "template.xlsx"
-    template.write_bytes(content_of(laid_out(Layout(numbered=False, length="absent", derived="absent"))))
+    template = saved_layout(tmp_path / "template.xlsx", numbered=False, length="absent", derived="absent")
     system = read_quietly(template)
     with pytest.warns(mph.InputWarning, match="has no column of the modules' numbers"):
         mph.write_system(replace(system, numbers=[5, 6, 7, 8]), tmp_path / "o.xlsx", template)
@@ -465,9 +453,7 @@ def test_numbers_that_the_sheet_cannot_say_are_warned_of(tmp_path):
 
 def test_a_workbook_may_replace_itself(template):
     system = read_quietly(template)
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        mph.write_system(by_design(replace(system, centers=system.centers * 1.01)), template, template)
+    write_quietly(by_design(replace(system, centers=system.centers * 1.01)), template, template)
     np.testing.assert_array_equal(read_quietly(template).centers, system.centers * 1.01)
     assert [p.name for p in template.parent.iterdir()] == ["template.xlsx"]
 

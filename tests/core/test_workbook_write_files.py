@@ -9,7 +9,6 @@ import signal
 import subprocess
 import sys
 import time
-import warnings
 import zipfile
 from dataclasses import replace
 from pathlib import Path
@@ -27,8 +26,9 @@ from openpyxl.worksheet.table import Table
 import mphdrr
 import mphdrr.core as mph
 
-from .workbooks import Layout, by_design, content_of, laid_out, read_quietly, values_of
+from .workbooks import Layout, by_design, content_of, laid_out, read_quietly, values_of, write_quietly
 
+SIZES = ("pinhole_diameter", "detector_side", "detector_thickness", "roi_radius")
 SPREADSHEET = "http://schemas.openxmlformats.org/spreadsheetml/2006/main"
 
 
@@ -54,12 +54,6 @@ def repacked(content: bytes, edit) -> bytes:
             if data is not None:
                 new.writestr(info, data)
     return out.getvalue()
-
-
-def write_quietly(system, path, template) -> mph.WrittenWorkbook:
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        return mph.write_system(system, path, template)
 
 
 def moved(system: mph.PinholeSystem) -> mph.PinholeSystem:
@@ -199,10 +193,7 @@ UNREADABLE = {
 def _edit(system: mph.PinholeSystem) -> mph.PinholeSystem:
     """Moved, one removed, one added."""
     part = moved(system)[[0, 1, 3]]
-    arrays = {
-        name: np.append(getattr(part, name), getattr(part, name)[0])
-        for name in ("pinhole_diameter", "detector_side", "detector_thickness", "roi_radius")
-    }
+    arrays = {name: np.append(getattr(part, name), getattr(part, name)[0]) for name in SIZES}
     centers = np.concatenate([part.centers, [[7.0, 210.0, 33.125]]])
     return by_design(mph.PinholeSystem(centers, numbers=np.append(part.numbers, 999), collimator_length=1.0, **arrays))
 

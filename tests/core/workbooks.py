@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import io
 import warnings
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -13,7 +15,7 @@ from openpyxl.utils import get_column_letter as letter
 from openpyxl.workbook import Workbook
 from openpyxl.workbook.defined_name import DefinedName
 
-from mphdrr.core import PinholeSystem, collimator_length, read_system
+from mphdrr.core import PinholeSystem, WrittenWorkbook, collimator_length, read_system, write_system
 from mphdrr.core.workbook.quantities import DERIVED, QUANTITIES
 
 DIMENSIONS = {"d": "pinhole_diameter", "R": "roi_radius", "Ld": "detector_side", "Td": "detector_thickness"}
@@ -36,6 +38,12 @@ def read_quietly(path) -> PinholeSystem:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         return read_system(path)
+
+
+def write_quietly(system, path, template) -> WrittenWorkbook:
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        return write_system(system, path, template)
 
 
 def random_centers(rng, n: int) -> np.ndarray:
@@ -207,6 +215,20 @@ def content_of(book: Workbook) -> bytes:
     file = io.BytesIO()
     book.save(file)
     return file.getvalue()
+
+
+def saved_layout(path: Path, **layout) -> Path:
+    """The file of a workbook with this layout."""
+    path.write_bytes(content_of(laid_out(Layout(**layout))))
+    return path
+
+
+@contextlib.contextmanager
+def edited(path: Path) -> Iterator[Workbook]:
+    """A file's workbook, which is saved again."""
+    book = openpyxl.load_workbook(path)
+    yield book
+    book.save(path)
 
 
 def values_of(content: bytes | Path, data_only: bool = True) -> dict[tuple[str, str], object]:

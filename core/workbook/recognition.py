@@ -145,7 +145,7 @@ def _notes(layout: Layout, recognized: Recognized) -> Iterator[str]:
     """What a person should know of a workbook without doubts, as texts of warnings."""
     table, modules = recognized.tables["x1"], layout.modules
     for quantity in [QUANTITIES[name] for name in OPTIONAL if name not in recognized.tables]:
-        for at, text in table.unknown()[: callable(quantity.blank)]:
+        for at, text in table.unknown()[:1] if quantity.formula else ():
             yield (
                 f"no column is headed {quantity.name}, so the {quantity.title} is {quantity.blank_is}; "
                 f"{table.sheet.place(*at)} {quoted(text)} is not understood"

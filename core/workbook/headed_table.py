@@ -139,7 +139,7 @@ class HeadedTable:
     @cached_property
     def _filled_rows(self) -> list[int]:
         """The rows with anything but a note in the key columns, or with typed dimensions."""
-        typed = [self.columns[name][0] for name in (*DIMENSIONS, "l") if name in self.columns]
+        typed = [self.columns[name][0] for name in TYPED if name in self.columns and name not in POSITION]
         found: list[int] = []
         for row in self.sheet.rows:
             if row < self.first_row or row in self.summaries:

@@ -116,6 +116,8 @@ def register(command: Callable[..., int] | None = None) -> None:
     updates.FUNCTIONS.update(UPDATES)
     try:
         for cls in CLASSES:
+            if issubclass(cls, bpy.types.Operator) and cls.__doc__ is not None:
+                cls.bl_description = " ".join(cls.__doc__.split())  # Blender would keep line breaks and indentation
             bpy.utils.register_class(cls)
             _undo.append((bpy.utils.unregister_class, (cls,)))
         for owner, name, group in properties.POINTERS:

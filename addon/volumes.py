@@ -23,6 +23,7 @@ from ..core.physics.maps import MAPS
 from ..core.volumes.volume import UNITS, Volume
 from . import compat, ids, storage, volume_materials
 from .cameras import world_matrix
+from .reports import polled
 from .stored_volumes import StoredVolume, moved, store_volume, write_states
 from .vdb import SMOKE, read_vdb
 
@@ -176,10 +177,7 @@ def can_be_projected(item: bpy.types.Object | None) -> bool:
 
 def poll_volume(operator: type[bpy.types.Operator], context: bpy.types.Context) -> bool:
     """`poll` of operators that need an active volume."""
-    if not is_volume(context.object):
-        operator.poll_message_set("No volume is active: select one first")
-        return False
-    return True
+    return polled(operator, is_volume(context.object), "No volume is active: select one first")
 
 
 def volume_objects(scene: bpy.types.Scene) -> list[bpy.types.Object]:

@@ -19,7 +19,7 @@ from bpy.props import (
 from ..core.errors import InputError
 from ..core.runs.recipe import Recipe, fitting_recipe, is_met
 from ..core.runs.settings import SETTINGS, Setting
-from . import choices, ids, volumes
+from . import choices, volumes
 from .decimals import typed
 
 OPENING_ANGLE = "model.opening_angle_degrees"
@@ -192,24 +192,16 @@ def makes_counts(settings: ProjectionProperties) -> bool:
     return settings.model == "EMISSION" or (settings.model == "TRANSMISSION" and settings.photons > 0)
 
 
-def _is_ours(self: ProjectionProperties, item: bpy.types.Object) -> bool:
-    return volumes.can_be_projected(item)
-
-
-def _is_mu(self: ProjectionProperties, item: bpy.types.Object) -> bool:
-    return volumes.is_volume(item) and getattr(item, ids.OBJECT_VOLUME).quantity == "mu"
-
-
 class ProjectionProperties(ProjectionSettings, bpy.types.PropertyGroup):
     """State of the Projections panel; `Scene.mphdrr_projections`."""
 
     volume: PointerProperty(
         name="Volume", description="What to project; empty: the active volume, or the only one", type=bpy.types.Object,
-        poll=_is_ours,
+        poll=lambda self, item: volumes.can_be_projected(item),
     )  # fmt: skip
     mu: PointerProperty(
         name="Attenuation", description="Volume of attenuation coefficients (1/mm) before the pinhole; empty: none",
-        type=bpy.types.Object, poll=_is_mu,
+        type=bpy.types.Object, poll=lambda self, item: volumes.is_volume(item) and volumes.quantity_of(item) == "mu",
     )  # fmt: skip
     run_file: StringProperty(
         name="Run", description="File with the last run's exact arrays", subtype="FILE_PATH",

@@ -24,15 +24,6 @@ from bpy.props import (
 from . import choices, column_maps, ids, phantom_properties, projection_properties
 from .updates import FUNCTIONS, on_edit
 
-
-def _is_visible(self: ModuleProperties) -> bool:
-    return not self.id_data.hide_viewport
-
-
-def _set_visible(self: ModuleProperties, value: bool) -> None:
-    FUNCTIONS["visible"](self.id_data, value)
-
-
 _LENGTH_MODES = [
     ("FROM_ROI", "From ROI", "l follows b, d, Ld and R: the field of view is tangent to the ROI sphere", 0),
     ("TYPED", "Typed", "l stays as it was typed", 1),
@@ -69,7 +60,8 @@ class ModuleProperties(bpy.types.PropertyGroup):
     )  # fmt: skip
     visible: BoolProperty(
         name="Visible", description="Show the module, its collimator and its crystal, also in renders",
-        get=_is_visible, set=_set_visible,
+        get=lambda self: not self.id_data.hide_viewport,
+        set=lambda self, value: FUNCTIONS["visible"](self.id_data, value),
     )  # fmt: skip
     number: IntProperty(name="Number", description="Module number, as in the workbook")
     index: IntProperty(name="Index", description="Place of the module in its system, from 0", min=0, options={"HIDDEN"})
@@ -169,16 +161,13 @@ ScannerProperties.__annotations__ |= _lengths(
 )
 
 
-def _is_scanner(self: GeometryProperties, collection: bpy.types.Collection) -> bool:
-    return collection.mphdrr_scanner.is_scanner
-
-
 class GeometryProperties(bpy.types.PropertyGroup):
     """State of the Geometry panel; `Scene.mphdrr_geometry`."""
 
     scanner: PointerProperty(
-        name="Scanner", description="The scanner that the panels work on", type=bpy.types.Collection, poll=_is_scanner
-    )
+        name="Scanner", description="The scanner that the panels work on", type=bpy.types.Collection,
+        poll=lambda self, collection: collection.mphdrr_scanner.is_scanner,
+    )  # fmt: skip
     active_index: IntProperty(
         name="Active Module", description="Its index among the scanner's objects", update=on_edit("active_module")
     )
@@ -198,10 +187,10 @@ CLASSES = (
 
 # (Blender type, attribute name, group): `registration.py` attaches a `PointerProperty` of the group to the type.
 POINTERS = (
-    (bpy.types.Object, ids.OBJECT_MODULE, ModuleProperties),
+    (bpy.types.Object, "mphdrr_module", ModuleProperties),
     (bpy.types.Collection, "mphdrr_scanner", ScannerProperties),
     (bpy.types.Scene, "mphdrr_geometry", GeometryProperties),
-    (bpy.types.Object, ids.OBJECT_VOLUME, phantom_properties.VolumeProperties),
-    (bpy.types.Scene, ids.SCENE_PROJECTIONS, projection_properties.ProjectionProperties),
+    (bpy.types.Object, "mphdrr_volume", phantom_properties.VolumeProperties),
+    (bpy.types.Scene, "mphdrr_projections", projection_properties.ProjectionProperties),
     (bpy.types.WindowManager, "mphdrr_columns", column_maps.ColumnMapProperties),
 )

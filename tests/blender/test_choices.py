@@ -8,11 +8,10 @@ import sys
 import zlib
 from pathlib import Path
 
+import bpy
 import pytest
 
-bpy = pytest.importorskip("bpy")
-
-from mphdrr.addon import choices, registration  # noqa: E402
+from mphdrr.addon import choices, registration
 
 SAVED = Path(__file__).parent / "data" / "choices-0.1.0.blend"
 """Every choice that a scene can keep, numbered by position as version 0.1.0 did; what they are is in its text."""

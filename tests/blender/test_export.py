@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
+import bpy
 import numpy as np
 import pytest
 
-bpy = pytest.importorskip("bpy")
-
-from mphdrr.addon import scanner, volumes  # noqa: E402
-from mphdrr.core.runs.files import read_run  # noqa: E402
+from mphdrr.addon import scanner, volumes
+from mphdrr.core.runs.files import read_run
 
 
 @pytest.fixture

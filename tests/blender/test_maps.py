@@ -6,7 +6,7 @@ import bpy
 import numpy as np
 import pytest
 
-from mphdrr.addon import ids, scanner, volumes
+from mphdrr.addon import scanner, volumes
 from mphdrr.core.physics.maps import sensitivity_map
 from mphdrr.core.physics.performance import sensitivity
 
@@ -18,9 +18,7 @@ def collection(scene, workbook):
 
 
 def the_map(quantity="sensitivity"):
-    (item,) = [
-        o for o in volumes.volume_objects(bpy.context.scene) if getattr(o, ids.OBJECT_VOLUME).quantity == quantity
-    ]
+    (item,) = [o for o in volumes.volume_objects(bpy.context.scene) if o.mphdrr_volume.quantity == quantity]
     return item
 
 
@@ -33,7 +31,7 @@ def test_map_is_the_cores_within_the_roi(collection):
     places = corners @ volume.grid.affine[:3, :3].T + volume.grid.affine[:3, 3]
     inside = np.linalg.norm(places, axis=-1) <= system.roi_radius.max()
     assert np.array_equal(volume.array, np.where(inside, expected, 0))
-    assert getattr(the_map(), ids.OBJECT_VOLUME).unit == "counts/decay"
+    assert the_map().mphdrr_volume.unit == "counts/decay"
 
 
 def test_map_follows_the_scanner_and_is_replaced(collection):

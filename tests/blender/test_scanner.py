@@ -11,7 +11,7 @@ import bpy
 import numpy as np
 import pytest
 
-from mphdrr.addon import cameras, ids, registration, scanner
+from mphdrr.addon import cameras, registration, scanner
 from mphdrr.core.errors import InputError, InputWarning
 from mphdrr.core.geometry.collimator import Construction
 from mphdrr.core.geometry.system import PinholeSystem
@@ -31,7 +31,7 @@ def assert_same(a: PinholeSystem, b: PinholeSystem) -> None:
 
 def test_registers_twice():
     registration.unregister()
-    assert not hasattr(bpy.types.Object, ids.OBJECT_MODULE)
+    assert not hasattr(bpy.types.Object, "mphdrr_module")
     for _ in range(2):
         registration.register()
         registration.unregister()
@@ -49,7 +49,7 @@ def test_failed_registration_leaves_nothing(monkeypatch):
     monkeypatch.setattr(registration, "CLASSES", (*registration.CLASSES, Broken))
     with pytest.raises((RuntimeError, ValueError), match="no_dot_in_it"):
         registration.register()
-    assert not hasattr(bpy.types.Object, ids.OBJECT_MODULE)
+    assert not hasattr(bpy.types.Object, "mphdrr_module")
     monkeypatch.undo()
     registration.register()
 

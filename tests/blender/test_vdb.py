@@ -4,17 +4,16 @@ from __future__ import annotations
 
 import warnings
 
+import bpy
 import numpy as np
 import pytest
 
-bpy = pytest.importorskip("bpy")
-
-from mphdrr.addon import compat, volumes  # noqa: E402
-from mphdrr.addon.vdb import openvdb, read_vdb, write_vdb  # noqa: E402
-from mphdrr.core.errors import InputError  # noqa: E402
-from mphdrr.core.geometry.frames import euler_pose  # noqa: E402
-from mphdrr.core.geometry.grid import Grid  # noqa: E402
-from mphdrr.core.volumes.volume import Volume  # noqa: E402
+from mphdrr.addon import compat, volumes
+from mphdrr.addon.vdb import openvdb, read_vdb, write_vdb
+from mphdrr.core.errors import InputError
+from mphdrr.core.geometry.frames import euler_pose
+from mphdrr.core.geometry.grid import Grid
+from mphdrr.core.volumes.volume import Volume
 
 vdb = openvdb()
 

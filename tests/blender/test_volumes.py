@@ -5,19 +5,17 @@ from __future__ import annotations
 import itertools
 from pathlib import Path
 
+import bpy
 import numpy as np
 import pytest
+from mathutils import Matrix
 
-bpy = pytest.importorskip("bpy")
-
-from mathutils import Matrix  # noqa: E402
-
-from mphdrr.addon import compat, storage, stored_volumes, volume_materials, volumes  # noqa: E402
-from mphdrr.core.errors import InputError  # noqa: E402
-from mphdrr.core.geometry.frames import euler_pose  # noqa: E402
-from mphdrr.core.geometry.grid import Grid  # noqa: E402
-from mphdrr.core.phantoms.derenzo import DerenzoPhantom  # noqa: E402
-from mphdrr.core.volumes.volume import Volume  # noqa: E402
+from mphdrr.addon import compat, storage, stored_volumes, volume_materials, volumes
+from mphdrr.core.errors import InputError
+from mphdrr.core.geometry.frames import euler_pose
+from mphdrr.core.geometry.grid import Grid
+from mphdrr.core.phantoms.derenzo import DerenzoPhantom
+from mphdrr.core.volumes.volume import Volume
 
 SHEAR = np.array([[1.0, 0.3, 0.0, 0.0], [0.0, 1.0, -0.2, 0.0], [0.0, 0.0, 1.0, 0.0], [0.0, 0.0, 0.0, 1.0]])
 AFFINES = {

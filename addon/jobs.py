@@ -70,10 +70,6 @@ class Worker(threading.Thread):
         self.caught: list[str] = []
         self.cancel = threading.Event()
 
-    @property
-    def share(self) -> float:
-        return self.done / max(1, self.total)
-
     def run(self) -> None:
         with recorded_warnings() as self.caught:
             try:
@@ -93,12 +89,6 @@ _current: Worker | None = None
 def is_running() -> bool:
     """Whether a job runs in a thread now."""
     return _current is not None
-
-
-def cancel() -> None:
-    """Ask the running job to stop at its next step."""
-    if _current is not None:
-        _current.cancel.set()
 
 
 @bpy.app.handlers.persistent
@@ -194,7 +184,7 @@ class JobOperator:
             self._end(context)
             return {"CANCELLED"}
         if event.type == "ESC" and event.value == "PRESS":
-            cancel()
+            worker.cancel.set()
             return {"RUNNING_MODAL"}
         if event.type != "TIMER":
             return {"PASS_THROUGH"}
@@ -273,16 +263,18 @@ class MPHDRR_OT_cancel_job(bpy.types.Operator):
     bl_options = {"INTERNAL"}
 
     def execute(self, context: bpy.types.Context) -> set[str]:
-        """Ask it to stop."""
-        cancel()
+        """Ask it to stop at its next step."""
+        if _current is not None:
+            _current.cancel.set()
         return {"FINISHED"}
 
 
 def draw_job(layout: bpy.types.UILayout) -> None:
     """Draw the running job's progress bar and Cancel button; nothing where there is none."""
     if _current is not None:
+        share = _current.done / max(1, _current.total)
         row = layout.row(align=True)
-        row.progress(factor=_current.share, type="BAR", text=f"{_current.label}  {_current.share:.0%}")
+        row.progress(factor=share, type="BAR", text=f"{_current.label}  {share:.0%}")
         row.operator(ids.CANCEL_JOB, text="", icon="CANCEL")
 
 

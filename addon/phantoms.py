@@ -25,7 +25,7 @@ from ..core.phantoms.phantom import Phantom
 from ..core.progress import Progress, part_of
 from ..core.volumes.meshes.mesh import Mesh
 from . import jobs, meshes, storage, volumes
-from .cameras import set_world_matrix, world_matrix
+from .cameras import remove_objects, set_world_matrix, world_matrix
 from .phantom_properties import FILE, PhantomSettings
 from .reports import polled
 from .stored_volumes import StoredVolume, moved, store_volume
@@ -261,10 +261,7 @@ def remove_outline(item: bpy.types.Object) -> None:
     """Remove a phantom's outline, if it has one."""
     outline = outline_of(item)
     if outline is not None:
-        mesh = outline.data
-        bpy.data.objects.remove(outline)
-        if mesh.users == 0:
-            bpy.data.meshes.remove(mesh)
+        remove_objects([outline])
 
 
 def _show_outline(item: bpy.types.Object) -> None:

@@ -34,8 +34,7 @@ def test_dataset_holds_the_run_whole(rendered, tmp_path, suffix, ring_system):
 
 
 @pytest.mark.parametrize(
-    ("name", "message"),
-    [("run.txt", "expected a name ending in"), ("nowhere/run.h5", "no such folder"), ("", "file")],
+    ("name", "message"), [("run.txt", "expected a name ending in"), ("nowhere/run.h5", "no such folder"), ("", "file")]
 )
 def test_wrong_names_are_clear_errors_and_nothing_is_written(rendered, tmp_path, name, message):
     with pytest.raises(RuntimeError, match=message):

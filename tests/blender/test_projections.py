@@ -5,6 +5,8 @@ from __future__ import annotations
 import threading
 import warnings
 from pathlib import Path
+from types import SimpleNamespace
+from unittest.mock import MagicMock
 
 import bpy
 import numpy as np
@@ -136,27 +138,16 @@ def test_photons_of_a_radiograph_and_the_inverse_square_sum(scanned, scene, body
 def test_physics_panel_shows_settings_that_exist(scanned, scene, model):
     settings = scene.mphdrr_projections
     settings.model, settings.photons = model, 100
-    shown = []
-
-    class Layout:
-        def prop(self, owner, name, **_):
-            assert name in owner.bl_rna.properties
-            shown.append(name)
-
-        def column(self, **_):
-            return self
-
-        row = column
-
-    class Panel:
-        layout = Layout()
-
+    layout = MagicMock()
+    layout.row.return_value = layout.column.return_value = layout
     assert "DEFAULT_CLOSED" in MPHDRR_PT_physics.bl_options
     assert MPHDRR_PT_physics.poll(bpy.context) == (model != "INVERSE_SQUARE")
-    MPHDRR_PT_physics.draw(Panel(), bpy.context)
-    assert {"noise", "seed"} <= set(shown)
+    MPHDRR_PT_physics.draw(SimpleNamespace(layout=layout), bpy.context)
+    shown = {name: owner for (owner, name), _ in layout.prop.call_args_list}
+    assert all(name in owner.bl_rna.properties for name, owner in shown.items())
+    assert {"noise", "seed"} <= shown.keys()
     of_counts = {"mu", *PHYSICS} - {"time", "pixel_points"}
-    assert (of_counts <= set(shown)) == (model == "EMISSION")
+    assert (of_counts <= shown.keys()) == (model == "EMISSION")
 
 
 @pytest.mark.parametrize(
@@ -305,7 +296,8 @@ def test_job_stops_at_its_next_step_when_cancelled():
     assert isinstance(run.error, Cancelled) and not run.is_alive() and (run.done, run.total) == (2, 2)
 
 
-def test_stop_ends_the_thread_of_the_running_job(monkeypatch):
+@pytest.mark.parametrize("end", [jobs.stop, lambda: bpy.ops.wm.read_homefile(use_factory_startup=True)])
+def test_stopping_or_loading_a_file_ends_the_thread_of_the_running_job(monkeypatch, end):
     def work(progress):
         while True:
             progress(0, 1)
@@ -314,20 +306,9 @@ def test_stop_ends_the_thread_of_the_running_job(monkeypatch):
     run = _run_in_thread(work)
     monkeypatch.setattr(jobs, "_current", run)
     assert jobs.is_running()
-    jobs.stop()
+    end()
     assert not run.is_alive() and not jobs.is_running()
     assert (warnings.showwarning, list(warnings.filters)) == before
-
-
-def test_loading_a_file_ends_the_running_job(monkeypatch):
-    def work(progress):
-        while True:
-            progress(0, 1)
-
-    run = _run_in_thread(work)
-    monkeypatch.setattr(jobs, "_current", run)
-    bpy.ops.wm.read_homefile(use_factory_startup=True)
-    assert not run.is_alive() and not jobs.is_running()
 
 
 @pytest.mark.parametrize(

@@ -204,14 +204,7 @@ def test_replacing_asks_for_what_would_be_lost_and_keeps_what_is_the_users(scene
     with pytest.raises(InputError) as error:
         scanner.build_scanner(scene, ring_system, "One")
     assert counts() == before
-    for phrase in (
-        "module 5 moved",
-        "module 6 with changed",
-        "My lamp",
-        "My folder",
-        copy.name,
-        "replace=True",
-    ):
+    for phrase in ("module 5 moved", "module 6 with changed", "My lamp", "My folder", copy.name, "replace=True"):
         assert phrase in str(error.value)
     assert "\n" not in str(error.value)
 

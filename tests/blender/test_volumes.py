@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 from pathlib import Path
 
 import bpy
@@ -258,14 +257,12 @@ def test_volumes_are_within_eevees_reach(scene):
 
 
 def test_volume_drawn_for_another_blender_is_rewritten_on_load(tmp_path, sparse_volume, monkeypatch):
-    other = -0.5 - compat.VDB_CENTER_SHIFT
-    running = compat.VDB_CENTER_SHIFT
-    monkeypatch.setattr(compat, "VDB_CENTER_SHIFT", other)
+    monkeypatch.setattr(compat, "VDB_CENTER_SHIFT", -0.5 - compat.VDB_CENTER_SHIFT)
     volumes.add_volume(sparse_volume, "Sample")
     bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "a.blend"))
-    monkeypatch.setattr(compat, "VDB_CENTER_SHIFT", running)
+    monkeypatch.undo()
     bpy.ops.wm.open_mainfile(filepath=str(tmp_path / "a.blend"))
     item = bpy.data.objects["Sample"]
     assert item.mphdrr_volume.center_shift == compat.VDB_CENTER_SHIFT
     assert np.array_equal(volumes.volume_from_object(item).array, sparse_volume.array)
-    assert len({p.name for p in itertools.chain((tmp_path / "a_mphdrr").iterdir())}) == 2
+    assert len({p.name for p in (tmp_path / "a_mphdrr").iterdir()}) == 2

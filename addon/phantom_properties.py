@@ -271,11 +271,9 @@ class VolumeProperties(bpy.types.PropertyGroup):
 
     is_volume: BoolProperty(options={"HIDDEN"})
     kind: EnumProperty(
-        name="Kind",
-        description="The kind whose settings count",
+        name="Kind", description="The kind whose settings count", default="VOLUME",
         items=choices.items(choices.KINDS, _KINDS),
-        default="VOLUME",
-    )
+    )  # fmt: skip
     with_parent: BoolProperty(options={"HIDDEN"})  # another quantity of the phantom that is the parent
     outdated: BoolProperty(options={"HIDDEN"})  # the phantom's settings have changed since its voxels were made
     message: StringProperty(options={"HIDDEN"})  # what is wrong with the phantom's settings

@@ -17,6 +17,7 @@ from bpy.props import (
 )
 
 from ..core.errors import InputError
+from ..core.physics.maps import MAPS
 from ..core.runs.recipe import Recipe, fitting_recipe, is_met
 from ..core.runs.settings import SETTINGS, Setting
 from . import choices, volumes
@@ -197,7 +198,7 @@ class ProjectionProperties(ProjectionSettings, bpy.types.PropertyGroup):
 
     volume: PointerProperty(
         name="Volume", description="What to project; empty: the active volume, or the only one", type=bpy.types.Object,
-        poll=lambda self, item: volumes.can_be_projected(item),
+        poll=lambda self, item: volumes.is_volume(item) and volumes.quantity_of(item) not in MAPS,
     )  # fmt: skip
     mu: PointerProperty(
         name="Attenuation", description="Volume of attenuation coefficients (1/mm) before the pinhole; empty: none",

@@ -19,7 +19,6 @@ from numpy.typing import ArrayLike, NDArray
 from ..core.errors import InputError
 from ..core.geometry.frames import checked_affine
 from ..core.memory import readable_size
-from ..core.physics.maps import MAPS
 from ..core.volumes.volume import UNITS, Volume
 from . import compat, ids, storage, volume_materials
 from .cameras import world_matrix
@@ -168,11 +167,6 @@ def is_volume(item: bpy.types.Object | None) -> bool:
 def quantity_of(item: bpy.types.Object) -> str:
     """What the voxels of one of our volumes hold."""
     return str(item.mphdrr_volume.quantity)
-
-
-def can_be_projected(item: bpy.types.Object | None) -> bool:
-    """Whether an object is a volume of matter or activity, not a map of the scanner."""
-    return is_volume(item) and item is not None and quantity_of(item) not in MAPS
 
 
 def poll_volume(operator: type[bpy.types.Operator], context: bpy.types.Context) -> bool:

@@ -49,6 +49,10 @@ def _unit_of_all_changed(self: ColumnMapProperties, context: bpy.types.Context) 
     update(self)
 
 
+def _sheets(self: ColumnMapTable, context: bpy.types.Context, edit_text: str) -> list[str]:
+    return json.loads(context.window_manager.mphdrr_columns.sheets or "[]")
+
+
 def _units(*tables: Iterable[str]) -> choices.Items:
     units = [(unit, unit, "") for table in tables for unit in table]
     return choices.items(choices.UNITS, [("NONE", "?", "Not known"), *units])
@@ -57,10 +61,7 @@ def _units(*tables: Iterable[str]) -> choices.Items:
 class ColumnMapTable(bpy.types.PropertyGroup):
     """Rows of a sheet (`MappedTable`)."""
 
-    sheet: StringProperty(
-        name="Sheet", description="Name of the sheet", update=_changed,
-        search=lambda self, context, text: json.loads(context.window_manager.mphdrr_columns.sheets or "[]"),
-    )  # fmt: skip
+    sheet: StringProperty(name="Sheet", description="Name of the sheet", search=_sheets, update=_changed)
     header_row: IntProperty(
         name="Header Row", description="Row of the headings shown below; they are not read. 0: none", min=0,
         update=_changed,

@@ -193,16 +193,24 @@ def makes_counts(settings: ProjectionProperties) -> bool:
     return settings.model == "EMISSION" or (settings.model == "TRANSMISSION" and settings.photons > 0)
 
 
+def _is_ours(self: ProjectionProperties, item: bpy.types.Object) -> bool:
+    return volumes.is_volume(item) and volumes.quantity_of(item) not in MAPS
+
+
+def _is_mu(self: ProjectionProperties, item: bpy.types.Object) -> bool:
+    return volumes.is_volume(item) and volumes.quantity_of(item) == "mu"
+
+
 class ProjectionProperties(ProjectionSettings, bpy.types.PropertyGroup):
     """State of the Projections panel; `Scene.mphdrr_projections`."""
 
     volume: PointerProperty(
         name="Volume", description="What to project; empty: the active volume, or the only one", type=bpy.types.Object,
-        poll=lambda self, item: volumes.is_volume(item) and volumes.quantity_of(item) not in MAPS,
+        poll=_is_ours,
     )  # fmt: skip
     mu: PointerProperty(
         name="Attenuation", description="Volume of attenuation coefficients (1/mm) before the pinhole; empty: none",
-        type=bpy.types.Object, poll=lambda self, item: volumes.is_volume(item) and volumes.quantity_of(item) == "mu",
+        type=bpy.types.Object, poll=_is_mu,
     )  # fmt: skip
     run_file: StringProperty(
         name="Run", description="File with the last run's exact arrays", subtype="FILE_PATH",

@@ -24,6 +24,16 @@ from bpy.props import (
 from . import choices, column_maps, ids, phantom_properties, projection_properties
 from .updates import FUNCTIONS, on_edit
 
+
+# Functions, not lambdas: Blender evaluates annotations where a lambda does not find this module's names.
+def _is_visible(self: ModuleProperties) -> bool:
+    return not self.id_data.hide_viewport
+
+
+def _set_visible(self: ModuleProperties, value: bool) -> None:
+    FUNCTIONS["visible"](self.id_data, value)
+
+
 _LENGTH_MODES = [
     ("FROM_ROI", "From ROI", "l follows b, d, Ld and R: the field of view is tangent to the ROI sphere", 0),
     ("TYPED", "Typed", "l stays as it was typed", 1),
@@ -60,8 +70,7 @@ class ModuleProperties(bpy.types.PropertyGroup):
     )  # fmt: skip
     visible: BoolProperty(
         name="Visible", description="Show the module, its collimator and its crystal, also in renders",
-        get=lambda self: not self.id_data.hide_viewport,
-        set=lambda self, value: FUNCTIONS["visible"](self.id_data, value),
+        get=_is_visible, set=_set_visible,
     )  # fmt: skip
     number: IntProperty(name="Number", description="Module number, as in the workbook")
     index: IntProperty(name="Index", description="Place of the module in its system, from 0", min=0, options={"HIDDEN"})
@@ -161,13 +170,16 @@ ScannerProperties.__annotations__ |= _lengths(
 )
 
 
+def _is_scanner(self: GeometryProperties, collection: bpy.types.Collection) -> bool:
+    return collection.mphdrr_scanner.is_scanner
+
+
 class GeometryProperties(bpy.types.PropertyGroup):
     """State of the Geometry panel; `Scene.mphdrr_geometry`."""
 
     scanner: PointerProperty(
-        name="Scanner", description="The scanner that the panels work on", type=bpy.types.Collection,
-        poll=lambda self, collection: collection.mphdrr_scanner.is_scanner,
-    )  # fmt: skip
+        name="Scanner", description="The scanner that the panels work on", type=bpy.types.Collection, poll=_is_scanner
+    )
     active_index: IntProperty(
         name="Active Module", description="Its index among the scanner's objects", update=on_edit("active_module")
     )

@@ -273,12 +273,6 @@ def test_foreign_image_of_the_same_name_is_kept(scanned):
     assert tuple(bpy.data.images["mphDRR 01"].size) == (8, 8)
 
 
-def _run_in_thread(work) -> jobs.Worker:
-    run = jobs.Worker("Test", work)
-    run.start()
-    return run
-
-
 def test_job_stops_at_its_next_step_when_cancelled():
     reached, go_on = threading.Event(), threading.Event()
 
@@ -288,7 +282,8 @@ def test_job_stops_at_its_next_step_when_cancelled():
         go_on.wait(5)
         progress(2, 2)
 
-    run = _run_in_thread(work)
+    run = jobs.Worker("Test", work)
+    run.start()
     assert reached.wait(5)
     run.cancel.set()
     go_on.set()
@@ -303,7 +298,8 @@ def test_stopping_or_loading_a_file_ends_the_thread_of_the_running_job(monkeypat
             progress(0, 1)
 
     before = warnings.showwarning, list(warnings.filters)
-    run = _run_in_thread(work)
+    run = jobs.Worker("Test", work)
+    run.start()
     monkeypatch.setattr(jobs, "_current", run)
     assert jobs.is_running()
     end()

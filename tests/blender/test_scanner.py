@@ -12,11 +12,10 @@ import numpy as np
 import pytest
 
 from mphdrr.addon import cameras, registration, scanner
+from mphdrr.addon.module_values import LENGTHS
 from mphdrr.core.errors import InputError, InputWarning
 from mphdrr.core.geometry.collimator import Construction
 from mphdrr.core.geometry.system import PinholeSystem
-
-LENGTHS = ("pinhole_diameter", "collimator_length", "detector_side", "detector_thickness", "roi_radius")
 
 
 def counts() -> dict[str, int]:

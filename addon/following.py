@@ -153,10 +153,7 @@ def _construction_numbers(scanner: bpy.types.PropertyGroup) -> _ConstructionNumb
 
 
 def _rebuild(
-    camera: bpy.types.Object,
-    numbers: ModuleNumbers,
-    built_as: _ConstructionNumbers,
-    parts: Sequence[bpy.types.Object],
+    camera: bpy.types.Object, numbers: ModuleNumbers, built_as: _ConstructionNumbers, parts: Sequence[bpy.types.Object]
 ) -> str:
     """Give the camera's view and the parts' meshes the shape of `numbers`; returns why not, or an empty text."""
     _, _, d, l, side, thickness, _ = numbers

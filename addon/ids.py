@@ -42,11 +42,6 @@ CANCEL_JOB = "mphdrr.cancel_job"
 # --- Panels, drawn in the order of the work: bl_order -----------------------------------------------------------------
 ORDER_GEOMETRY, ORDER_PHANTOM, ORDER_PROJECTIONS, ORDER_EXPORT = 0, 10, 20, 30
 
-# --- Properties on Blender's types; code reads them as attributes: `scene.mphdrr_geometry` ------------------
-SCENE_PROJECTIONS = "mphdrr_projections"
-OBJECT_MODULE = "mphdrr_module"
-OBJECT_VOLUME = "mphdrr_volume"
-
 # --- Datablocks ---------------------------------------------------------------------------------------------
 SCANNER = "Scanner"  # default name of a scanner's collection
 PARTS = ("NONE", "CAMERA", "COLLIMATOR", "CRYSTAL", "ROI")  # `Object.mphdrr_module.part`

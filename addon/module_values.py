@@ -67,8 +67,7 @@ def remember(camera: bpy.types.Object, system: PinholeSystem, m: int) -> None:
     module = camera.mphdrr_module
     module.number, module.index, module.added = int(np.asarray(system.numbers)[m]), m, False
     _write_exact(
-        camera,
-        ModuleNumbers(module.number, system.centers[m], *(float(getattr(system, name)[m]) for name in LENGTHS)),
+        camera, ModuleNumbers(module.number, system.centers[m], *(float(getattr(system, name)[m]) for name in LENGTHS))
     )
 
 

@@ -6,6 +6,7 @@ import atexit
 import importlib
 import pkgutil
 from collections.abc import Callable
+from contextlib import ExitStack
 from types import ModuleType
 from typing import Any
 
@@ -38,7 +39,7 @@ def _classes(module: ModuleType) -> list[Any]:
     return [cls for cls in found if cls.__module__ == module.__name__]
 
 
-CLASSES: tuple[type, ...] = (
+CLASSES: tuple[Any, ...] = (
     *properties.CLASSES,
     *add_phantom.ADD_KINDS,
     *_classes(operators),
@@ -107,8 +108,7 @@ UPDATES: dict[str, Callable[..., None]] = {
     "slices": slices.update,
 }
 
-# How to take back what was registered: (function, arguments).
-_undo: list[tuple[Callable[..., Any], tuple[Any, ...]]] = []
+_registered = ExitStack()  # takes back what was registered, in reverse order
 
 
 def register(command: Callable[..., int] | None = None) -> None:
@@ -116,22 +116,23 @@ def register(command: Callable[..., int] | None = None) -> None:
     updates.FUNCTIONS.update(UPDATES)
     try:
         for cls in CLASSES:
+            if issubclass(cls, bpy.types.Operator) and cls.__doc__ is not None:
+                cls.bl_description = " ".join(cls.__doc__.split())  # Blender would keep line breaks and indentation
             bpy.utils.register_class(cls)
-            _undo.append((bpy.utils.unregister_class, (cls,)))
+            _registered.callback(bpy.utils.unregister_class, cls)
         for owner, name, group in properties.POINTERS:
             setattr(owner, name, bpy.props.PointerProperty(type=group))
-            _undo.append((delattr, (owner, name)))
+            _registered.callback(delattr, owner, name)
         for menu, draw in MENUS:
             menu.append(draw)
-            _undo.append((menu.remove, (draw,)))
+            _registered.callback(menu.remove, draw)
         for handlers, function in HANDLERS:
             handlers.append(function)
-            _undo.append((_remove_handler, (handlers, function)))
+            _registered.callback(_remove_handler, handlers, function)
         if command is not None:
-            registered = bpy.utils.register_cli_command(ids.PREFIX, command)
-            _undo.append((bpy.utils.unregister_cli_command, (registered,)))
+            _registered.callback(bpy.utils.unregister_cli_command, bpy.utils.register_cli_command(ids.PREFIX, command))
     except Exception:
-        _take_back()
+        _registered.close()
         raise
     if bpy.app.module:
         # Registered classes keep Python's bpy module alive: Blender 4.5 would wait for ever when Python ends.
@@ -139,18 +140,12 @@ def register(command: Callable[..., int] | None = None) -> None:
 
 
 def unregister() -> None:
-    """Take back what `register` did, in reverse order."""
+    """Take back what `register` did."""
     atexit.unregister(unregister)
     jobs.stop()
     live_scanner.stop()
     live_phantoms.stop()
-    _take_back()
-
-
-def _take_back() -> None:
-    while _undo:
-        function, arguments = _undo.pop()
-        function(*arguments)
+    _registered.close()
 
 
 def _remove_handler(handlers: list[Any], function: Any) -> None:

@@ -26,6 +26,13 @@ def warnings_reported(operator: bpy.types.Operator) -> Iterator[None]:
                 operator.report({"WARNING"}, f"... and {len(caught) - _MOST} more warnings of this kind")
 
 
+def polled(operator: type[bpy.types.Operator], is_met: bool, need: str) -> bool:
+    """An operator's answer to `poll`: whether its `need` is met, which the tooltip shows where it is not."""
+    if not is_met:
+        operator.poll_message_set(need)
+    return is_met
+
+
 def run_reported(operator: bpy.types.Operator, action: Callable[[], str]) -> set[str]:
     """Run an operator's work; report its warnings, and the line that it returns or an `InputError` as {'ERROR'}."""
     try:

@@ -149,9 +149,7 @@ def clear(scene: bpy.types.Scene, collection: bpy.types.Collection, replacements
     bpy.data.batch_remove([data for data in datas if data.users == 0])
 
 
-def parts_and_others(
-    collection: bpy.types.Collection,
-) -> tuple[list[bpy.types.Object], list[bpy.types.Object]]:
+def parts_and_others(collection: bpy.types.Collection) -> tuple[list[bpy.types.Object], list[bpy.types.Object]]:
     """The scanner's own objects, and the user's: other objects, and copies of the scanner's."""
     parts, others = [], []
     seen: set[tuple[str, int]] = set()

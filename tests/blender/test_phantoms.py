@@ -5,22 +5,20 @@ from __future__ import annotations
 import dataclasses
 from pathlib import Path
 
+import bpy
 import numpy as np
 import pytest
+from mathutils import Matrix
 
-bpy = pytest.importorskip("bpy")
-
-from mathutils import Matrix  # noqa: E402
-
-from mphdrr.addon import cameras, jobs, phantom_properties, phantoms, volumes  # noqa: E402
-from mphdrr.core.errors import InputError  # noqa: E402
-from mphdrr.core.geometry.frames import euler_pose  # noqa: E402
-from mphdrr.core.geometry.grid import Grid  # noqa: E402
-from mphdrr.core.phantoms.kinds import KINDS  # noqa: E402
-from mphdrr.core.phantoms.language import read_phantom  # noqa: E402
-from mphdrr.core.phantoms.phantom import Phantom  # noqa: E402
-from mphdrr.core.projector import Projector  # noqa: E402
-from mphdrr.core.volumes.volume import Volume  # noqa: E402
+from mphdrr.addon import cameras, jobs, phantom_properties, phantoms, volumes
+from mphdrr.core.errors import InputError
+from mphdrr.core.geometry.frames import euler_pose
+from mphdrr.core.geometry.grid import Grid
+from mphdrr.core.phantoms.kinds import KINDS
+from mphdrr.core.phantoms.language import read_phantom
+from mphdrr.core.phantoms.phantom import Phantom
+from mphdrr.core.projector import Projector
+from mphdrr.core.volumes.volume import Volume
 
 THORAX = Path(__file__).parents[2] / "examples" / "phantoms" / "thorax.toml"
 POSE = {"location": (4.0, -5.0, 6.0), "phi": 0.5, "theta": 0.25, "psi": -0.125}  # whole in float32

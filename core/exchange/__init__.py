@@ -24,11 +24,12 @@ from .solids import GLB, STL, STL_PARTS, THREE_MF
 
 __all__ = ["FORMATS", "FORMAT_NUMBERS", "Format", "read_geometry", "write_geometry"]
 
-_CAMERAS = (ASTRA, RTK, OPENCV, KORNIA, PYTORCH3D, NERF, LEAP)
-_FORMATS = (*_CAMERAS, None, None, STL, STL_PARTS, THREE_MF, GLB, GATE9, GATE10, MPHDRR)
-FORMATS: dict[str, Format] = {format.name: format for format in _FORMATS if format}
-
 # Blender keeps a menu's choice by its place in the list: add formats at the end, and leave a None where one is removed.
+_FORMATS = (
+    *(ASTRA, RTK, OPENCV, KORNIA, PYTORCH3D, NERF, LEAP, None, None),
+    *(STL, STL_PARTS, THREE_MF, GLB, GATE9, GATE10, MPHDRR),
+)
+FORMATS: dict[str, Format] = {format.name: format for format in _FORMATS if format}
 FORMAT_NUMBERS: dict[str, int] = {format.name: number for number, format in enumerate(_FORMATS) if format}
 
 

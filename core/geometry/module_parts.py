@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ..errors import InputError
+from ..errors import InputError, naming
 from .collimator import Collimator, Construction
 from .part_colors import PartKind
 from .system import PinholeSystem
@@ -54,10 +54,8 @@ def module_collimators(system: PinholeSystem, construction: Construction) -> lis
     made = []
     sizes = (system.pinhole_diameter, system.collimator_length, system.detector_side)
     for number, d, l, side in zip(system.numbers.tolist(), *(size.tolist() for size in sizes), strict=True):
-        try:
+        with naming(f"module {number}"):
             made.append(Collimator(d, l, side, construction))
-        except InputError as error:
-            raise InputError(f"module {number}: {error}") from None
     return made
 
 

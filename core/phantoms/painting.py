@@ -173,11 +173,7 @@ def paint_voxels(
             for _ in stroke.paint(image, pool):
                 done += 1
                 if progress is not None:
-                    try:
-                        progress(done, total)
-                    except BaseException:
-                        pool.shutdown(wait=False, cancel_futures=True)
-                        raise
+                    progress(done, total)
     # Where layers were sampled at different points, one may replace a little more than there was.
     values = [layer.value for layer in layers]
     if min(values, default=0.0) >= 0:

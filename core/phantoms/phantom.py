@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ..errors import InputError, InputWarning
+from ..errors import InputError, InputWarning, naming
 from ..geometry.frames import checked_affine
 from ..geometry.grid import Grid
 from ..geometry.views import Views
@@ -61,10 +61,8 @@ class Phantom:
 
     def __post_init__(self) -> None:
         check_settings(self, self.title)
-        try:
+        with naming(self.title):
             len(self.shapes)
-        except InputError as error:
-            raise InputError(f"{self.title}: {error}") from None
 
     @property
     def total_activity(self) -> float:

@@ -14,7 +14,7 @@ from ..errors import InputError
 from ..files import replacing
 from ..geometry.system import PinholeSystem
 from ..geometry.views import Views
-from ..validation import instance
+from ..validation import instance, one_of
 from .cameras import ASTRA, KORNIA, LEAP, NERF, OPENCV, PYTORCH3D, RTK
 from .format import Format, new_folder
 from .gate9 import GATE9
@@ -57,8 +57,7 @@ def write_geometry(
         For an unknown format, option or ending, and for what the format cannot express. An existing file then stays.
     """
     instance(system, PinholeSystem, "write_geometry")
-    if format not in FORMATS:
-        raise InputError(f"format {format!r}: expected one of {', '.join(FORMATS)}")
+    one_of(format, FORMATS, "format")
     views = system.views() if views is None else views
     instance(views, Views, "views")
     if len(views) == 0:

@@ -339,10 +339,9 @@ def _coverage(index: NDArray[np.int64], own: _Sampled, lower: Sequence[_Sampled]
 def line_integrals(layers: Sequence[Layer], starts: Points, ends: Points) -> Points:
     """Integrals (N,) of the painting, value x mm, along the lines from `starts` to `ends`, (N, 3) world mm: exact."""
     step = max(1, _RAYS * _PARTS // max(_PARTS, *(layer.shape.n_parts for layer in layers), 1))
-    blocks = [slice(first, first + step) for first in range(0, len(starts), step)]
-    return np.concatenate(
-        [np.empty(0), *(_integrals_of_block(layers, starts[block].T, ends[block].T) for block in blocks)]
-    )
+    blocks = (slice(first, first + step) for first in range(0, len(starts), step))
+    parts = (_integrals_of_block(layers, starts[block].T, ends[block].T) for block in blocks)
+    return np.concatenate([np.empty(0), *parts])
 
 
 def _integrals_of_block(layers: Sequence[Layer], starts: Points, ends: Points) -> Points:

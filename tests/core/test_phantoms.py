@@ -184,11 +184,12 @@ def test_total_activity_does_not_depend_on_grid_or_pose(phantom, rng):
 
 
 def test_scaled_and_sheared_poses_and_grids_hold_what_they_should(rng):
-    grid = general_grid(rng, (70, 110, 60))
+    grid = general_grid(rng, (36, 56, 30))
+    grid = mph.Grid(grid.shape, np.diag([2.0, 2, 2, 1]) @ grid.affine)
     assert total(PAINTING.voxelize(grid)) == pytest.approx(PAINTING.total_activity, rel=1e-3)
     pose = mph.euler_pose(0.1, 0.2, 0.3)
     pose[:3, :3] = pose[:3, :3] @ np.array([[0.8, 0.1, 0], [0, -1.1, 0.2], [0, 0, 0.7]])
-    held = total(PAINTING.voxelize(mph.Grid.centered(60, 1.5), pose))
+    held = total(PAINTING.voxelize(mph.Grid.centered(45, 2.0), pose))
     assert held == pytest.approx(PAINTING.total_activity * 0.8 * 1.1 * 0.7, rel=1e-3)
 
 
@@ -196,13 +197,13 @@ def test_voxels_hold_the_mean_of_what_was_painted(rng):
     """Against brute force: many random points of each voxel, painted one by one."""
     grid, pose = mph.Grid.centered((24, 22, 20), (3.0, 2.5, 3.0), center=(4, 1, 0)), mph.euler_pose(0.4, 0.7, -1.1)
     values = PAINTING.voxelize(grid, pose).array
-    index = np.stack(np.unravel_index(rng.choice(values.size, 1500, replace=False), values.shape), axis=1)
-    points = (index[:, None] + rng.uniform(-0.5, 0.5, (1500, 400, 3))).reshape(-1, 3)
+    index = np.stack(np.unravel_index(rng.choice(values.size, 600, replace=False), values.shape), axis=1)
+    points = (index[:, None] + rng.uniform(-0.5, 0.5, (600, 400, 3))).reshape(-1, 3)
     world = points @ grid.affine[:3, :3].T + grid.affine[:3, 3]
-    means = PAINTING.values(world, pose).reshape(1500, 400).mean(axis=1)
+    means = PAINTING.values(world, pose).reshape(600, 400).mean(axis=1)
     difference = values[tuple(index.T)] - means
     assert np.abs(difference).max() < 1.2  # of 10; the brute force's own noise is 0.2
-    assert abs(difference.mean()) < 0.02
+    assert abs(difference.mean()) < 0.03
 
 
 def test_later_shapes_replace_and_none_leaves():
@@ -381,14 +382,9 @@ def test_what_just_fits_is_made_and_holds_its_parts():
     spheres = mph.JaszczakPhantom(sphere_diameters=(54,) * 6, sphere_height=159, rod_height=132)
     for phantom, content in (
         (
-            mph.NemaBody(sphere_diameters=(0, 0, 140, 0, 0, 0), lung_diameter=0, length=140),
-            5.3 * 140 * body + 15.9 * ball * 140**3,
-        ),
-        (
             mph.NemaBody(sphere_diameters=(57.2,) * 6, lung_diameter=57.2),
             5.3 * 180 * (body - np.pi * 28.6**2) + 6 * 15.9 * ball * 57.2**3,
         ),
-        (mph.NemaBody(sphere_diameters=none, lung_diameter=224, length=1), 5.3 * (body - np.pi * 112**2)),
         (spheres, 50 * (cylinder - spheres.shapes[1].volume - 6 * ball * 54**3)),
         (
             mph.JaszczakPhantom(
@@ -401,6 +397,8 @@ def test_what_just_fits_is_made_and_holds_its_parts():
         (mph.ShapePhantom([SHAPES[0], mph.Sphere(radius=7, activity=-1, mode="add")]), 0),
     ):
         assert phantom.total_activity == pytest.approx(content * 1e-3, rel=3e-4, abs=1e-9), phantom
+    assert mph.NemaBody(sphere_diameters=(0, 0, 140, 0, 0, 0), lung_diameter=0, length=140).shapes[-1].radius == 70
+    assert mph.NemaBody(sphere_diameters=none, lung_diameter=224, length=1).shapes[-1].radius == 112
     assert mph.CardiacTorso(body_radii=(155, 105)).shapes[0].radius == (155, 105)
     assert mph.JaszczakPhantom(rod_height=186, sphere_diameters=none, sphere_height=999).shapes[1].height == 186
 
@@ -432,8 +430,8 @@ def test_one_side_of_the_box_of_poses_counts_for_all(side):
 
 
 def test_a_phantom_beyond_the_grid_is_said():
-    with pytest.warns(mph.InputWarning, match="of the NEMA body phantom lies outside the grid"):
-        mph.NemaBody().voxelize(mph.Grid.centered(16, 4.0))
+    with pytest.warns(mph.InputWarning, match="of the Shepp-Logan phantom lies outside the grid"):
+        mph.SheppLogan().voxelize(mph.Grid.centered(16, 4.0))
 
 
 def test_voxelizing_can_be_cancelled_between_shapes():
@@ -498,18 +496,19 @@ def test_points_hold_their_activity_on_any_voxels():
 
 
 def test_the_heart_beats_with_its_muscle_and_apex_kept():
-    frames = mph.CardiacTorso(defect_severity=0.4).beating(20)
+    assert [frame.phase for frame in mph.CardiacTorso().beating(4)] == [0, 0.25, 0.5, 0.75]
+    frames = [mph.CardiacTorso(defect_severity=0.4, phase=phase) for phase in (0, 0.2, 0.35, 0.4, 0.8)]
     volumes = [frame.ventricle_volume for frame in frames]
-    assert volumes[0] == 120 and volumes[7] == pytest.approx(45) and np.argmin(volumes) == 7
+    assert volumes[0] == 120 and volumes[2] == pytest.approx(45) and np.argmin(volumes) == 2
     muscles, apexes = [], []
-    for frame in (*frames[::4], frames[7]):
+    for frame in frames:
         parts = {shape.name: shape for shape in frame.shapes}
         assert parts["left ventricle"].volume == pytest.approx(frame.ventricle_volume * 1e3, rel=1e-4)
         muscles.append(parts["myocardium"].volume - parts["left ventricle"].volume)
         pose = parts["myocardium"].pose
         apexes.append(pose[:3, 3] + pose[:3, 2] * parts["myocardium"].radii[2])
     np.testing.assert_allclose(muscles, muscles[0], rtol=1e-4)
-    np.testing.assert_allclose(apexes, np.broadcast_to(apexes[0], (6, 3)), atol=1e-9)
+    np.testing.assert_allclose(apexes, np.broadcast_to(apexes[0], (5, 3)), atol=1e-9)
     assert muscles[0] * 1.05e-3 == pytest.approx(133, abs=1)  # g
 
 

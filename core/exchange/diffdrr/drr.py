@@ -13,7 +13,7 @@ from ...errors import InputError
 from ...geometry.grid import Grid
 from ...geometry.rotations import SIZES, pose_matrix, rotation_matrix
 from ...projector.tracing import trace_rays
-from ...validation import positive, whole_shape
+from ...validation import one_of, positive, whole_shape
 from .detector import Detector
 from .poses import RigidTransform, convert
 from .subject import Subject, as_subject, hu_to_density
@@ -268,8 +268,7 @@ class Registration(torch.nn.Module):
         self, drr: DRR, rotation: Tensor, translation: Tensor, parameterization: str, convention: str | None = None
     ) -> None:
         super().__init__()
-        if parameterization not in SIZES:
-            raise InputError(f"parameterization {parameterization!r}: expected one of {', '.join(SIZES)}")
+        one_of(parameterization, SIZES, "parameterization")
         self.drr = drr
         self._rotation = torch.nn.Parameter(rotation)
         self._translation = torch.nn.Parameter(translation)

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from ...errors import InputError
 from ...files import replacing
-from ...validation import freeze, real_array
+from ...validation import freeze, one_of, real_array
 from ..formats.contents import reading
 
 MESH_FORMATS = (".stl", ".obj", ".ply", ".glb")
@@ -134,6 +134,5 @@ def _suffix_and_factor(path: Path, unit: str | None) -> tuple[str, float]:
     if suffix not in MESH_FORMATS:
         raise InputError(f"{path}: expected a name ending in {', '.join(MESH_FORMATS)}")
     unit = unit or ("m" if suffix == ".glb" else "mm")
-    if unit not in MILLIMETRES:
-        raise InputError(f"unit {unit!r}: expected one of {', '.join(MILLIMETRES)}")
+    one_of(unit, MILLIMETRES, "unit")
     return suffix, MILLIMETRES[unit]

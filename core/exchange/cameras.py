@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import InputError
+from ..geometry.frames import affine_matrix
 from ..geometry.grid import Grid
 from ..geometry.system import PinholeSystem
 from ..geometry.views import Views
@@ -89,8 +90,8 @@ def _opencv(views: Views) -> dict[str, Any]:
 
 def _kornia(views: Views) -> dict[str, Any]:
     """``kornia.geometry.camera.PinholeCamera``, whose axes and pixels are OpenCV's."""
-    intrinsics, extrinsics = np.tile(np.eye(4), (2, len(views), 1, 1))
-    intrinsics[:, :3, :3], extrinsics[:, :3, :3], extrinsics[:, :3, 3] = _camera_matrices(views, "kornia")
+    matrices, rotations, translations = _camera_matrices(views, "kornia")
+    intrinsics, extrinsics = affine_matrix(matrices, 0.0), affine_matrix(rotations, translations)
     height, width = np.tile(np.array(views.shape, np.float64), (len(views), 1)).T
     return {"intrinsics": intrinsics, "extrinsics": extrinsics, "height": height, "width": width}
 
@@ -192,9 +193,7 @@ def _nerf(system: PinholeSystem, views: Views, path: Path, *, pictures: str = "i
     n_v, n_u = views.shape
     # The picture is the array turned by 180 degrees, and so is the camera; then x right, y down becomes x right, y up.
     axes = rotations * np.array([-1.0, 1.0, -1.0])[:, None]
-    poses = np.tile(np.eye(4), (len(views), 1, 1))
-    poses[:, :3, :3] = axes.transpose(0, 2, 1)
-    poses[:, :3, 3] = views.sources
+    poses = affine_matrix(axes.transpose(0, 2, 1), views.sources)
     (fl_x, _, cx), (_, fl_y, cy), _ = matrices.transpose(1, 2, 0)
     cx, cy = n_u - 0.5 - cx, n_v - 0.5 - cy
     intrinsics = {"camera_angle_x": 2 * np.arctan(n_u / 2 / fl_x), "fl_x": fl_x, "fl_y": fl_y, "cx": cx, "cy": cy}

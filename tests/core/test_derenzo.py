@@ -9,6 +9,7 @@ import pytest
 from scipy.ndimage import center_of_mass, label
 
 import mphdrr.core as mph
+
 RODS = (8.0, 6.0, 5.0, 4.0, 3.0, 2.0)
 
 

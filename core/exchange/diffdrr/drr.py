@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from ...errors import InputError
+from ...geometry.frames import affine_matrix
 from ...geometry.grid import Grid
 from ...geometry.rotations import SIZES, pose_matrix, rotation_matrix
 from ...projector.tracing import trace_rays
@@ -303,8 +304,7 @@ def _since_04(
     """The arguments before 0.4 as those of `DRR._set_up`: the subject stands for CT numbers and their voxel size."""
     hu = torch.as_tensor(np.array(volume) if not isinstance(volume, Tensor) else volume).flip([0])
     size = np.array([positive(s, "voxel spacing", "mm") for s in np.asarray(spacing).tolist()])
-    affine = np.diag([*size, 1.0])
-    affine[:3, 3] = size / 2
+    affine = affine_matrix(np.diag(size), size / 2)
     subject = Subject(hu_to_density(hu, bone_attenuation_multiplier), affine, torch.eye(4), hu)
     return (subject, 2 * sdr, *args), {**kwargs, "old": True}
 

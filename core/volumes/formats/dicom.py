@@ -20,6 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...errors import InputError, InputWarning
+from ...geometry.frames import affine_matrix
 from ...progress import Progress
 from .contents import RAS_FROM_LPS, Contents, first_line, reading, require_voxels
 
@@ -96,12 +97,8 @@ def read(path: Path, series: str | None = None, progress: Progress | None = None
             array[:, :, k] = (pixels.astype(np.float64) * one.slope + one.intercept).T * factor
             if progress is not None:
                 progress(k + 1, len(slices))
-    affine = np.eye(4)
-    affine[:3, 0] = first.orientation[0] * first.spacing[1]
-    affine[:3, 1] = first.orientation[1] * first.spacing[0]
-    affine[:3, 2] = step
-    affine[:3, 3] = first.position
-    return Contents(array, RAS_FROM_LPS @ affine, quantity)
+    axes = np.column_stack([*(first.orientation * np.array(first.spacing[::-1])[:, None]), step])
+    return Contents(array, RAS_FROM_LPS @ affine_matrix(axes, first.position), quantity)
 
 
 def _headers(path: Path) -> list[tuple[Path, Any]]:

@@ -164,7 +164,7 @@ def test_projectors_agree_with_exact_projections(system):
 
 @pytest.mark.parametrize("phantom", KINDS, ids=title)
 def test_total_activity_does_not_depend_on_grid_or_pose(phantom, rng):
-    """To 0.01 %, also where voxels are larger than the parts; for activity and for mu."""
+    """To 0.01 %, also where voxels are larger than the parts."""
     for voxels in (28, 6):
         spacing = phantom.extent / (voxels - 3)
         grid = mph.Grid.centered(voxels, spacing)
@@ -172,8 +172,13 @@ def test_total_activity_does_not_depend_on_grid_or_pose(phantom, rng):
         volume = phantom.voxelize(grid, None if voxels == 6 else turned)
         assert total(volume) == pytest.approx(phantom.total_activity, rel=1e-4)
         assert volume.array.min() >= -1e-5 * volume.array.max()
-    # The same for mu, against the closed forms along many parallel lines.
-    volume = phantom.voxelize(grid, turned, quantity="mu")
+
+
+@pytest.mark.parametrize("phantom", [KINDS[1], KINDS[5], PAINTING], ids=title)
+def test_total_mu_is_that_of_many_parallel_lines(phantom, rng):
+    spacing = phantom.extent / 3
+    turned = mph.euler_pose(*rng.uniform(-3, 3, 3), translation=rng.uniform(-1, 1, 3) * spacing)
+    volume = phantom.voxelize(mph.Grid.centered(6, spacing), turned, quantity="mu")
     assert volume.quantity == "mu"
     side = np.linspace(-0.5, 0.5, 201)[1:] - 0.5 / 200
     v, w = (phantom.extent + 2 * spacing) * np.stack(np.meshgrid(side, side)).reshape(2, -1)

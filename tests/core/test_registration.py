@@ -48,21 +48,21 @@ def test_pose_error():
 
 
 def test_pose_of_a_camera_is_recovered(rng):
-    """Balls of different size, 31 x 33 pixels: remainders at the coarse levels must not shift the image."""
+    """Balls of different size, 47 x 49 pixels: remainders at the coarse levels must not shift the image."""
     grid = Grid.centered((24, 24, 24), 4.0, (10.0, -5.0, 3.0))
     points = np.stack(np.meshgrid(*[np.arange(24)] * 3, indexing="ij"), -1)
     balls = sum(np.exp(-((points - c) ** 2).sum(-1) / (2 * w**2)) for c, w in zip(
         rng.uniform(6, 18, (6, 3)), rng.uniform(1.5, 3, 6), strict=True))  # fmt: skip
     volume = Volume(balls, grid)
     truth = pose_matrix(torch.eye(3, dtype=torch.float64), torch.tensor(grid.center - [0, 0, 200.0]))
-    image = pinhole_images(volume, truth[:3, 3], truth[:3, :3], 400.0, 8.0, (31, 33), (4.0, -3.0))
+    image = pinhole_images(volume, truth[:3, 3], truth[:3, :3], 400.0, 5.0, (47, 49), (4.0, -3.0))
     motion = se3_exp(torch.tensor([3.0, -4.0, 6.0, 0.08, -0.1, 0.05], dtype=torch.float64))
     calls = []
-    found = register_pose(image, volume, motion @ truth, 400.0, 8.0, (4.0, -3.0), levels=(2, 1), steps=40,
+    found = register_pose(image, volume, motion @ truth, 400.0, 5.0, (4.0, -3.0), levels=(2, 1), steps=60,
                           progress=lambda *at: calls.append(at))  # fmt: skip
     angle, apart = pose_error(found.pose, truth, grid.center)
     assert np.degrees(angle) < 0.5 and apart < 1.5  # 7.9 degrees and 7.8 mm at the start
-    assert calls[-1] == (80, 80) and len(found.similarities) == 80
+    assert calls[-1] == (120, 120) and len(found.similarities) == 120
 
 
 def test_bad_input_is_one_clear_line():

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
+
 
 class InputError(ValueError):
     """The user's input cannot be used: one line that names the place, what was found and what was expected."""
@@ -9,3 +12,12 @@ class InputError(ValueError):
 
 class InputWarning(UserWarning):
     """The user's input was used, but something about it should be checked."""
+
+
+@contextmanager
+def naming(name: object) -> Iterator[None]:
+    """Put a name, such as a file's, before the messages of input errors."""
+    try:
+        yield
+    except InputError as error:
+        raise InputError(f"{name}: {error}") from None

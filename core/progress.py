@@ -27,8 +27,4 @@ def in_threads(work: Callable[[Part], None], parts: Sequence[Part], progress: Pr
     with ThreadPoolExecutor(os.cpu_count()) as pool:
         for done, _ in enumerate(pool.map(work, parts), 1):
             if progress is not None:
-                try:
-                    progress(done, len(parts))
-                except BaseException:
-                    pool.shutdown(wait=False, cancel_futures=True)
-                    raise
+                progress(done, len(parts))  # leaving the loop cancels the parts that have not begun

@@ -24,7 +24,7 @@ from typing import Literal, get_args
 import numpy as np
 
 from ..errors import InputError
-from ..validation import positive
+from ..validation import one_of, positive
 
 EdgePlace = Literal["middle", "front", "back"]
 
@@ -66,8 +66,7 @@ class Construction:
         object.__setattr__(self, "opening_angle", positive(self.opening_angle, "opening_angle", "rad"))
         if self.opening_angle >= math.pi:
             raise InputError(f"opening_angle: expected less than pi, got {self.opening_angle:g} rad")
-        if self.edge_at not in get_args(EdgePlace):
-            raise InputError(f"edge_at {self.edge_at!r}: expected one of {', '.join(get_args(EdgePlace))}")
+        one_of(self.edge_at, get_args(EdgePlace), "edge_at")
 
     @property
     def front(self) -> float:

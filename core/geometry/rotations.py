@@ -14,6 +14,7 @@ import torch
 from torch import Tensor
 
 from ..errors import InputError
+from ..validation import one_of
 
 try:
     import roma
@@ -147,8 +148,7 @@ def _from_quaternion(wxyz: Tensor) -> Tensor:
 
 
 def _require(rotation: Tensor | None, parameterization: str, convention: str | None) -> None:
-    if parameterization not in SIZES:
-        raise InputError(f"parameterization {parameterization!r}: expected one of {', '.join(SIZES)}")
+    one_of(parameterization, SIZES, "parameterization")
     if parameterization == "euler_angles":
         axes = convention or ""
         good = len(axes) == 3 and (set(axes) <= set("XYZ") or set(axes) <= set("xyz"))

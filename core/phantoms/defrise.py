@@ -21,7 +21,6 @@ class DefrisePhantom(Phantom):
 
     After M. Defrise et al., "A solution to the long-object problem in helical cone-beam tomography", Physics in Medicine
     and Biology 45 (2000) 623-643. By default it fills a ball of 75 mm radius.
-    The fields say what each setting is, and its unit.
     """
 
     disks: int = count(7, "how many")

@@ -167,7 +167,7 @@ class DerenzoRods(Shape):
 class DerenzoPhantom(Phantom):
     """Rods along z, centred on the origin, of one diameter in each of `sectors`; for their places see `DerenzoRods`.
 
-    The fields say what each setting is, and its unit. `InputError` if no rod fits.
+    `InputError` if no rod fits.
     """
 
     radius: float = setting(40.0, "mm", "of the phantom")

@@ -19,6 +19,7 @@ from mphdrr.core.geometry.grid import Grid
 from mphdrr.core.geometry.system import PinholeSystem
 from mphdrr.core.projector import Emission
 from mphdrr.core.volumes.volume import Volume
+from mphdrr.core.workbook import read_system
 
 WORKBOOK = Path(__file__).parents[2] / "examples" / "dc-spect-80.xlsx"
 
@@ -35,6 +36,12 @@ def rng() -> np.random.Generator:
 @pytest.fixture(scope="session")
 def workbook() -> Path:
     return WORKBOOK
+
+
+@pytest.fixture(scope="session")
+def scanner() -> PinholeSystem:
+    """The users' scanner of 80 modules."""
+    return read_system(WORKBOOK)
 
 
 @pytest.fixture

@@ -4,8 +4,6 @@ A Blender camera is right-handed with X right, Y up and looks along -Z; seen fro
 to the LEFT. So a module's camera has X = -u, Y = v, Z = -k.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import bpy

@@ -4,8 +4,6 @@ Everything is changed in place (vertices, properties, rotations). No datablock i
 Blender has stored an undo step, and undo expects the datablocks that it stored. `module_edits.py` makes and removes modules.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 

@@ -1,7 +1,5 @@
 """Every idname, datablock name and prefix of the extension. Needs no Blender."""
 
-from __future__ import annotations
-
 PREFIX = "mphdrr"
 CATEGORY = "mphDRR"  # the sidebar tab
 

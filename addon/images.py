@@ -4,8 +4,6 @@ The arrays' column index grows along +u, so an image's columns are reversed; its
 Module images hold the exact float32 values in R, G and B; the mosaic is scaled for display.
 """
 
-from __future__ import annotations
-
 from collections.abc import Generator, Iterable
 
 import bpy

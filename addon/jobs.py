@@ -5,8 +5,6 @@ A function of `addon` returns a `Job`; an operator that inherits from `JobOperat
 the operator returns when the job is done. Scripts can also do a job themselves, with `run`.
 """
 
-from __future__ import annotations
-
 import threading
 import time
 import traceback

@@ -1,7 +1,5 @@
 """Modules made, removed and renumbered in the scene, by operators (undo steps), not by handlers."""
 
-from __future__ import annotations
-
 import json
 import re
 from collections.abc import Sequence

@@ -4,8 +4,6 @@ Blender keeps places and properties as float32. `Object.mphdrr_module.exact` has
 valid as long as the visible one is its rounding. A number that the user has typed is read as the decimal typed.
 """
 
-from __future__ import annotations
-
 import json
 from collections.abc import Iterable
 from typing import Any, NamedTuple

@@ -3,8 +3,6 @@
 The settings of each kind of phantom follow from the fields of its class (`core.phantoms.kinds`).
 """
 
-from __future__ import annotations
-
 import dataclasses
 from typing import Any
 

@@ -4,8 +4,6 @@ The object's matrix is the phantom's pose. The voxels are in its own frame, so t
 phantom may have children that go with it: a volume of its other quantity, and an outline.
 """
 
-from __future__ import annotations
-
 import itertools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """What the extension registers with Blender; the only file that imports operators and panels."""
 
-from __future__ import annotations
-
 import atexit
 import importlib
 import pkgutil

@@ -1,7 +1,5 @@
 """Projections of a scene: the volume and the scanner projected, images in the .blend, exact arrays in a file beside it."""
 
-from __future__ import annotations
-
 import math
 import time
 from collections.abc import Generator, Sequence

@@ -1,7 +1,5 @@
 """What core says to the user, as Blender's reports."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 

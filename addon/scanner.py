@@ -4,8 +4,6 @@ A scanner is a collection with a sub-collection for each ring; a module is a cam
 children are its collimator and its crystal.
 """
 
-from __future__ import annotations
-
 import json
 import warnings
 from collections.abc import Iterable

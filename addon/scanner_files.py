@@ -1,7 +1,5 @@
 """Scanners from workbooks, and the scene's scanner as a workbook or as another program's file."""
 
-from __future__ import annotations
-
 import hashlib
 import math
 import warnings

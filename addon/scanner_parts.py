@@ -1,7 +1,5 @@
 """The datablocks of a scanner: made outside the scene, so that a failure leaves nothing behind, and replaced there."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Which modules an operator or a panel works on: the active one and the selected ones."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable
 from typing import Any
 

@@ -4,8 +4,6 @@ Each plane is a mesh object, a child of the volume's, with an image of the slice
 sheared grid it is a parallelogram. Planes are named sagittal, coronal and axial by the world axis closest to their normal.
 """
 
-from __future__ import annotations
-
 import itertools
 import json
 from pathlib import Path

@@ -4,8 +4,6 @@ The voxels are in .vdb files (`stored_volumes`), so that a saved .blend can be p
 from voxel index to the object's own space, and the object's matrix is the pose: moving the object moves the volume.
 """
 
-from __future__ import annotations
-
 import json
 from collections.abc import Callable, Sequence
 from pathlib import Path

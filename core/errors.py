@@ -1,7 +1,5 @@
 """Errors and warnings about the user's input."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from contextlib import contextmanager
 

@@ -1,7 +1,5 @@
 """Checks of arguments where they enter the package."""
 
-from __future__ import annotations
-
 from collections.abc import Collection
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Add > mphDRR: an operator for every kind of phantom, and one for phantoms that a TOML file describes."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import bpy

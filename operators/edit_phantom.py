@@ -1,7 +1,5 @@
 """What is done to a phantom in the scene: its voxels made again, its pose applied, its outline shown."""
 
-from __future__ import annotations
-
 import bpy
 
 from ..addon import ids, jobs, phantoms

@@ -1,7 +1,5 @@
 """The active volume: slices through it, a CT's attenuation, its files cleaned up or found again."""
 
-from __future__ import annotations
-
 import bpy
 from bpy.props import FloatProperty, StringProperty
 

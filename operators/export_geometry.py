@@ -1,7 +1,5 @@
 """File > Export > Pinhole Geometry: the scanner as a workbook, or as another program's file."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import bpy

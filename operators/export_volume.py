@@ -1,7 +1,5 @@
 """File > Export > Volume: the active volume, where it stands in the world, for other programs."""
 
-from __future__ import annotations
-
 import bpy
 from bpy.props import StringProperty
 

@@ -1,7 +1,5 @@
 """File > Import > Volume for Projection, Volume Sequence: CTs, SPECT images and OpenVDB grids become volumes."""
 
-from __future__ import annotations
-
 import os
 import re
 from collections.abc import Sequence

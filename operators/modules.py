@@ -1,7 +1,5 @@
 """What a user does with modules: show, aim, duplicate, remove, tidy, renumber, check and map them."""
 
-from __future__ import annotations
-
 import math
 
 import bpy

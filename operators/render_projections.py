@@ -1,7 +1,5 @@
 """Project a volume into the scanner's modules, as a job; load its settings, show and export its result."""
 
-from __future__ import annotations
-
 import math
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """Closed mesh objects become a volume of activity or attenuation, and volumes become meshes."""
 
-from __future__ import annotations
-
 import bpy
 from bpy.props import EnumProperty, FloatProperty, IntProperty, StringProperty
 

@@ -1,7 +1,5 @@
 """Sidebar, Geometry > Design: numbers and readouts (`addon/following.py`) of the active module, and of all modules."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Sequence
 

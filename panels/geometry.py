@@ -1,7 +1,5 @@
 """Sidebar, first step: the scanner and its modules."""
 
-from __future__ import annotations
-
 import json
 import textwrap
 

@@ -1,7 +1,5 @@
 """Sidebar, second step: the phantom; and Add > mphDRR, everything that can be put into the scanner."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import bpy

@@ -1,7 +1,5 @@
 """``mphdrr phantom KIND -o FILE``."""
 
-from __future__ import annotations
-
 import argparse
 import dataclasses
 import json

@@ -1,7 +1,5 @@
 """``mphdrr volume ACTION``: look at volumes, convert them, and turn them into meshes and back."""
 
-from __future__ import annotations
-
 import argparse
 from typing import Any
 

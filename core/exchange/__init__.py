@@ -4,8 +4,6 @@ To add a program, write its `Format` in a module here, and list it below. The co
 `docs/geometry-export.md`, which refers to the command's help, take it from the list.
 """
 
-from __future__ import annotations
-
 import os
 from pathlib import Path
 from typing import Any

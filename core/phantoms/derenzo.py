@@ -1,7 +1,5 @@
 """The Derenzo phantom: parallel rods, of one diameter in each sector, alone or in a cylinder of water."""
 
-from __future__ import annotations
-
 import math
 import warnings
 from collections.abc import Sequence

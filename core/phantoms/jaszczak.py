@@ -1,7 +1,5 @@
 """The Jaszczak phantom: rods and spheres, cold as a rule, in a cylinder of active water."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass

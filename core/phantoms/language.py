@@ -22,8 +22,6 @@
 Keys are the attributes of the shapes; angles are degrees, ``euler_degrees = [phi, theta, psi]``.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import math
 import os

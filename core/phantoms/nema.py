@@ -1,7 +1,5 @@
 """The body phantom of IEC 61675-1 and NEMA NU 2: six spheres and a lung insert in a torso of water."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """Phantoms: what all kinds have in common, and those given as a list of shapes."""
 
-from __future__ import annotations
-
 import itertools
 import math
 import warnings

@@ -1,7 +1,5 @@
 """Point sources on a lattice, for resolution and calibration."""
 
-from __future__ import annotations
-
 import itertools
 import math
 from collections.abc import Sequence

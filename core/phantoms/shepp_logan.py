@@ -1,7 +1,5 @@
 """The three-dimensional Shepp-Logan head phantom: ten ellipsoids, added up."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass

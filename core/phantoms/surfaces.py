@@ -1,7 +1,5 @@
 """Closed meshes of shapes."""
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 

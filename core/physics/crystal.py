@@ -3,8 +3,6 @@
 Functions of cosines and positions take arrays or tensors.
 """
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

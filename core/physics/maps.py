@@ -1,7 +1,5 @@
 """Maps of a system's performance, as volumes. A voxel's value is that at its centre, and 0 where no module sees it."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from typing import Any

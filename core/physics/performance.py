@@ -11,8 +11,6 @@ R. Accorsi, S. D. Metzler, "Analytic determination of the resolution-equivalent 
 collimator", IEEE Transactions on Medical Imaging 23 (2004) 750-763.
 """
 
-from __future__ import annotations
-
 import math
 from typing import NamedTuple
 

@@ -1,7 +1,5 @@
 """SPECT: how many photons a pixel of the crystal counts."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass, fields

@@ -1,7 +1,5 @@
 """The one driver of rays: cuts images into what a backend takes at once, and runs it on several threads."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import Any

@@ -1,7 +1,5 @@
 """A sum along rays that weights every voxel with the sensitivity to a point source; it is not a number of counts."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """The lattices of a volume and of mu: cropped to what is filled, and rays in their index spaces."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from dataclasses import dataclass

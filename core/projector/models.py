@@ -1,7 +1,5 @@
 """What a pixel measures: which rays it takes, with which weights."""
 
-from __future__ import annotations
-
 from abc import ABC, abstractmethod
 from collections.abc import Iterator
 from dataclasses import dataclass, replace

@@ -3,8 +3,6 @@
 An integral is length x mean. The mean moves with the planes of either grid, and, attenuated, with the length.
 """
 
-from __future__ import annotations
-
 import numpy as np
 
 from ..geometry.grid import Grid

@@ -3,8 +3,6 @@
 Whatever the format, a file holds arrays by name (``"geometry/center"``) with units, and attributes (text or whole numbers).
 """
 
-from __future__ import annotations
-
 import json
 import os
 from collections.abc import Callable

@@ -1,7 +1,5 @@
 """A volume: an array on a grid, and the quantity that it holds."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """Volumes in files: the formats by their endings, and one clear line for every file that cannot be read."""
 
-from __future__ import annotations
-
 import os
 from dataclasses import replace
 from pathlib import Path

@@ -1,7 +1,5 @@
 """A first column map for a person to check, and what the cells of a workbook show."""
 
-from __future__ import annotations
-
 import os
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace

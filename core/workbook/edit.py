@@ -3,8 +3,6 @@
 Its formulas are not recalculated yet.
 """
 
-from __future__ import annotations
-
 import itertools
 import math
 import warnings

@@ -1,7 +1,5 @@
 """A table as a sheet's headings describe it: which columns it has, and which rows hold modules."""
 
-from __future__ import annotations
-
 import re
 from collections import defaultdict
 from dataclasses import dataclass

@@ -3,8 +3,6 @@
 A new column is one more entry in it; one that is typed is also a field of `PinholeSystem`.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """`read_system`: a geometry workbook as a `PinholeSystem`, and whether its numbers are possible and plausible."""
 
-from __future__ import annotations
-
 import math
 import os
 import warnings

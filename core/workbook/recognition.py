@@ -4,8 +4,6 @@ A doubt is anything that may make a number mean something else than its heading 
 is unaccounted for. `recognized_layout` refuses a workbook with any; `core.workbook.draft` asks a person.
 """
 
-from __future__ import annotations
-
 import itertools
 import re
 import warnings

@@ -1,7 +1,5 @@
 """The sheets of a workbook file as cells that can be changed, and the file with the changes."""
 
-from __future__ import annotations
-
 import re
 from functools import cached_property
 

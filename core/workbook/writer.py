@@ -1,7 +1,5 @@
 """`write_system`: a `PinholeSystem` into a new geometry workbook, or a copy of one in which nothing else changes."""
 
-from __future__ import annotations
-
 import io
 import os
 import warnings

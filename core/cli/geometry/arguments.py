@@ -1,7 +1,5 @@
 """Options that the actions share."""
 
-from __future__ import annotations
-
 import argparse
 from typing import Any
 

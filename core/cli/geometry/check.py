@@ -1,7 +1,5 @@
 """``mphdrr geometry check FILE``."""
 
-from __future__ import annotations
-
 import argparse
 from typing import get_args
 

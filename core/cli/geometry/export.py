@@ -1,7 +1,5 @@
 """``mphdrr geometry export FILE -o OUT``."""
 
-from __future__ import annotations
-
 import argparse
 import typing
 from pathlib import Path

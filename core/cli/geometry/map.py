@@ -1,7 +1,5 @@
 """``mphdrr geometry map FILE -o FILE``."""
 
-from __future__ import annotations
-
 import argparse
 from typing import Any
 

@@ -1,7 +1,5 @@
 """``mphdrr geometry performance FILE``."""
 
-from __future__ import annotations
-
 import argparse
 import math
 

@@ -1,7 +1,5 @@
 """``mphdrr geometry set FILE -o OUT.xlsx``."""
 
-from __future__ import annotations
-
 import argparse
 import dataclasses
 from typing import Any

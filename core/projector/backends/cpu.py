@@ -5,8 +5,6 @@ They run in the thread that calls, without the GIL: the operator calls them on s
 float64, all others in float32.
 """
 
-from __future__ import annotations
-
 import ctypes
 import os
 import sys

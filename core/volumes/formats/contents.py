@@ -4,8 +4,6 @@ World axes are NIfTI's: +x to the patient's right, +y to the front (anterior), +
 Those of DICOM and ITK point left, back (posterior) and to the head: LPS.
 """
 
-from __future__ import annotations
-
 import math
 import warnings
 from collections.abc import Iterator, Sequence

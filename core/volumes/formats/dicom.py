@@ -6,8 +6,6 @@ front or head, whichever is closest to the slices' normal. A tomogram gives the 
 between slices (DICOM part 3, C.8.4.11 and C.8.4.15).
 """
 
-from __future__ import annotations
-
 import textwrap
 import warnings
 from collections import defaultdict

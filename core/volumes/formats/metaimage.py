@@ -4,8 +4,6 @@ Only ITK and SimpleITK read it in Python, and they are too large to depend on (5
 https://itk.org/Wiki/ITK/MetaIO/Documentation
 """
 
-from __future__ import annotations
-
 import zlib
 from pathlib import Path
 from typing import BinaryIO

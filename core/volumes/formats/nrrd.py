@@ -1,7 +1,5 @@
 """NRRD, by pynrrd."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Triangle meshes, their files, and the check that they are closed."""
 
-from __future__ import annotations
-
 import os
 from dataclasses import dataclass
 from pathlib import Path

@@ -7,8 +7,6 @@ theorem). That is the covered share, unless the mesh intersects itself: a voxel 
 2. In columns of voxels with such places the share is the mean over many rays along z of the length inside.
 """
 
-from __future__ import annotations
-
 import math
 import os
 from collections.abc import Sequence

@@ -12,10 +12,11 @@ import numpy as np
 
 from ..core.errors import InputError
 from ..core.geometry.collimator import Construction, EdgePlace
+from ..core.geometry.system import LENGTHS
 from ..core.physics.performance import isocentre_performance
 from . import cameras, collimators
 from .decimals import typed
-from .module_values import LENGTHS, TYPED, ModuleNumbers, module_numbers, off_aim
+from .module_values import TYPED, ModuleNumbers, module_numbers, off_aim
 
 PARTS = ("COLLIMATOR", "CRYSTAL")  # what hangs on a module's camera: `Object.mphdrr_module.part`
 _KEY = "mphdrr_solid"  # custom property of a mesh or camera: the numbers that it was built from

@@ -14,11 +14,10 @@ from numpy.typing import NDArray
 
 from ..core.errors import InputError
 from ..core.geometry.design_formulas import collimator_length
-from ..core.geometry.system import PinholeSystem
+from ..core.geometry.system import LENGTHS, PinholeSystem
 from . import cameras
 from .decimals import typed
 
-LENGTHS = ("pinhole_diameter", "collimator_length", "detector_side", "detector_thickness", "roi_radius")
 FROM_ROI, TYPED = "FROM_ROI", "TYPED"  # `mphdrr_module.length_mode`
 _TURNED = 1e-4  # rad: rotations kept as float32 angles agree to better than 1e-6
 _FORMULA = 1e-9  # of l: an imported l this close to the design formula's was calculated with it

@@ -11,9 +11,9 @@ import numpy as np
 import pytest
 
 from mphdrr.addon import module_edits, scanner
-from mphdrr.addon.module_values import LENGTHS
 from mphdrr.addon.scanner_files import export_scanner
 from mphdrr.core.errors import InputError, InputWarning
+from mphdrr.core.geometry.system import LENGTHS
 from mphdrr.core.workbook import read_system
 
 

@@ -12,10 +12,9 @@ import numpy as np
 import pytest
 
 from mphdrr.addon import cameras, registration, scanner
-from mphdrr.addon.module_values import LENGTHS
 from mphdrr.core.errors import InputError, InputWarning
 from mphdrr.core.geometry.collimator import Construction
-from mphdrr.core.geometry.system import PinholeSystem
+from mphdrr.core.geometry.system import LENGTHS, PinholeSystem
 
 
 def counts() -> dict[str, int]:

@@ -83,7 +83,7 @@ def test_a_typed_column_is_one_entry_and_one_field(workbook, tmp_path):
     put(package / "core/workbook/quantities.py", ")\nQUANTITIES = ", ENTRY)
     system = package / "core/geometry/system.py"
     put(system, "    source: SystemSource | None = None\n", "    septa: NDArray[np.float64] = 2.0\n")
-    put(system, "        for name in _LENGTHS:\n", SETTING)
+    put(system, "        for name in LENGTHS:\n", SETTING)
     environment = {**os.environ, "PYTHONPATH": str(tmp_path)}
     command = [sys.executable, "-c", USE, str(tmp_path), str(workbook)]
     done = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True)

@@ -396,7 +396,8 @@ def _r3_sequence(n: int, first: int = 0) -> Points:
     """
     ratio = 1.2207440846057596  # the real root of x^4 = x + 1
     steps = ratio ** -np.arange(1.0, 4.0)
-    return (0.5 + np.outer(steps, np.arange(first + 1, first + n + 1))) % 1.0
+    points = 0.5 + np.outer(steps, np.arange(first + 1, first + n + 1))
+    return points - np.floor(points)  # the remainder, several times faster than %
 
 
 def _moved(pose: Points, points: Points) -> Points:

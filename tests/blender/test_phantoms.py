@@ -101,7 +101,7 @@ def test_scripts_add_what_operators_add():
 
 
 def test_settings_that_cannot_be_leave_the_voxels_and_say_why():
-    item = add("defrise", voxels=8)
+    item = add("defrise", voxels=24)
     before, settings = voxels_of(item), item.mphdrr_volume.defrise
     settings.spacing = 1.0
     assert "disk thickness" in item.mphdrr_volume.message and item.mphdrr_volume.outdated
@@ -117,7 +117,7 @@ def test_settings_that_cannot_be_leave_the_voxels_and_say_why():
     with pytest.raises(RuntimeError, match="grid of points has no mu"):
         bpy.ops.mphdrr.add_points(voxels=8, attenuation=True)
     assert (len(bpy.data.objects), len(bpy.data.volumes)) == objects
-    item = add("points", voxels=8)
+    item = add("points", voxels=12)
     item.mphdrr_volume.points.quantity = "mu"
     assert "has no mu" in item.mphdrr_volume.message and item.mphdrr_volume.quantity == "activity"
 
@@ -170,7 +170,7 @@ def test_toml_that_is_no_phantom_adds_nothing(text, message, tmp_path):
 
 @pytest.mark.parametrize("scale", [(1, 1, 1, 1), (1.2, 0.8, 1, 1)], ids=["turned", "sheared"])
 def test_applied_pose_keeps_activity_and_projections(ring_system, scale):
-    item = add("shepp-logan", voxels=120, attenuation=True)
+    item = add("shepp-logan", voxels=100, attenuation=True)
     phantom = item.mphdrr_volume.shepp_logan.phantom()
     # Scaled, under a parent that may be scaled too.
     parent = bpy.data.objects.new("Parent", None)

@@ -169,12 +169,18 @@ def test_total_activity_does_not_depend_on_grid_or_pose(phantom, rng):
         spacing = phantom.extent / (voxels - 3)
         grid = mph.Grid.centered(voxels, spacing)
         turned = mph.euler_pose(*rng.uniform(-3, 3, 3), translation=rng.uniform(-1, 1, 3) * spacing)
-        volume = phantom.voxelize(grid, None if voxels == 6 else turned)
-        assert total(volume) == pytest.approx(phantom.total_activity, rel=1e-4)
-        assert volume.array.min() >= -1e-5 * volume.array.max()
+        for pose in (None, turned) if voxels == 6 else (turned,):
+            volume = phantom.voxelize(grid, pose)
+            assert total(volume) == pytest.approx(phantom.total_activity, rel=1e-4)
+            assert volume.array.min() >= -1e-5 * volume.array.max()
 
 
-@pytest.mark.parametrize("phantom", [KINDS[1], KINDS[5], PAINTING], ids=title)
+QUICK = (KINDS[1], KINDS[5], PAINTING)
+
+
+@pytest.mark.parametrize(
+    "phantom", [*QUICK, *(pytest.param(p, marks=pytest.mark.long) for p in KINDS if p not in QUICK)], ids=title
+)
 def test_total_mu_is_that_of_many_parallel_lines(phantom, rng):
     spacing = phantom.extent / 3
     turned = mph.euler_pose(*rng.uniform(-3, 3, 3), translation=rng.uniform(-1, 1, 3) * spacing)
@@ -201,13 +207,13 @@ def test_voxels_hold_the_mean_of_what_was_painted(rng):
     """Against brute force: many random points of each voxel, painted one by one."""
     grid, pose = mph.Grid.centered((24, 22, 20), (3.0, 2.5, 3.0), center=(4, 1, 0)), mph.euler_pose(0.4, 0.7, -1.1)
     values = PAINTING.voxelize(grid, pose).array
-    index = np.stack(np.unravel_index(rng.choice(values.size, 600, replace=False), values.shape), axis=1)
-    points = (index[:, None] + rng.uniform(-0.5, 0.5, (600, 400, 3))).reshape(-1, 3)
+    index = np.stack(np.unravel_index(rng.choice(values.size, 1500, replace=False), values.shape), axis=1)
+    points = (index[:, None] + rng.uniform(-0.5, 0.5, (1500, 400, 3))).reshape(-1, 3)
     world = points @ grid.affine[:3, :3].T + grid.affine[:3, 3]
-    means = PAINTING.values(world, pose).reshape(600, 400).mean(axis=1)
+    means = PAINTING.values(world, pose).reshape(1500, 400).mean(axis=1)
     difference = values[tuple(index.T)] - means
     assert np.abs(difference).max() < 1.2  # of 10; the brute force's own noise is 0.2
-    assert abs(difference.mean()) < 0.03
+    assert abs(difference.mean()) < 0.02
 
 
 def test_later_shapes_replace_and_none_leaves():
@@ -374,6 +380,11 @@ def test_what_just_fits_is_made_and_holds_its_parts():
     spheres = mph.JaszczakPhantom(sphere_diameters=(54,) * 6, sphere_height=159, rod_height=132)
     for phantom, content in (
         (
+            mph.NemaBody(sphere_diameters=(0, 0, 140, 0, 0, 0), lung_diameter=0, length=140),
+            5.3 * 140 * body + 15.9 * ball * 140**3,
+        ),
+        (mph.NemaBody(sphere_diameters=none, lung_diameter=224, length=1), 5.3 * (body - np.pi * 112**2)),
+        (
             mph.NemaBody(sphere_diameters=(57.2,) * 6, lung_diameter=57.2),
             5.3 * 180 * (body - np.pi * 28.6**2) + 6 * 15.9 * ball * 57.2**3,
         ),
@@ -389,8 +400,6 @@ def test_what_just_fits_is_made_and_holds_its_parts():
         (mph.ShapePhantom([SHAPES[0], mph.Sphere(radius=7, activity=-1, mode="add")]), 0),
     ):
         assert phantom.total_activity == pytest.approx(content * 1e-3, rel=3e-4, abs=1e-9), phantom
-    assert mph.NemaBody(sphere_diameters=(0, 0, 140, 0, 0, 0), lung_diameter=0, length=140).shapes[-1].radius == 70
-    assert mph.NemaBody(sphere_diameters=none, lung_diameter=224, length=1).shapes[-1].radius == 112
     assert mph.CardiacTorso(body_radii=(155, 105)).shapes[0].radius == (155, 105)
     assert mph.JaszczakPhantom(rod_height=186, sphere_diameters=none, sphere_height=999).shapes[1].height == 186
 
@@ -488,19 +497,18 @@ def test_points_hold_their_activity_on_any_voxels():
 
 
 def test_the_heart_beats_with_its_muscle_and_apex_kept():
-    assert [frame.phase for frame in mph.CardiacTorso().beating(4)] == [0, 0.25, 0.5, 0.75]
-    frames = [mph.CardiacTorso(defect_severity=0.4, phase=phase) for phase in (0, 0.2, 0.35, 0.4, 0.8)]
+    frames = mph.CardiacTorso(defect_severity=0.4).beating(20)
     volumes = [frame.ventricle_volume for frame in frames]
-    assert volumes[0] == 120 and volumes[2] == pytest.approx(45) and np.argmin(volumes) == 2
+    assert volumes[0] == 120 and volumes[7] == pytest.approx(45) and np.argmin(volumes) == 7
     muscles, apexes = [], []
-    for frame in frames:
+    for frame in (*frames[::4], frames[7]):
         parts = {shape.name: shape for shape in frame.shapes}
         assert parts["left ventricle"].volume == pytest.approx(frame.ventricle_volume * 1e3, rel=1e-4)
         muscles.append(parts["myocardium"].volume - parts["left ventricle"].volume)
         pose = parts["myocardium"].pose
         apexes.append(pose[:3, 3] + pose[:3, 2] * parts["myocardium"].radii[2])
     np.testing.assert_allclose(muscles, muscles[0], rtol=1e-4)
-    np.testing.assert_allclose(apexes, np.broadcast_to(apexes[0], (5, 3)), atol=1e-9)
+    np.testing.assert_allclose(apexes, np.broadcast_to(apexes[0], (6, 3)), atol=1e-9)
     assert muscles[0] * 1.05e-3 == pytest.approx(133, abs=1)  # g
 
 

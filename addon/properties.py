@@ -40,8 +40,12 @@ _LENGTH_MODES = [
     ("TYPED", "Typed", "l stays as it was typed", 1),
 ]
 _MAY_BE_ZERO = ("pinhole_diameter", "detector_thickness")  # while they are typed; of the others a picture is drawn
-LABELS = {name: f"{name.split('_')[-1].capitalize()} {text.partition(':')[0]}" for name, text in LENGTHS.items()}
-"""Of the lengths, short, for the sidebar: "Diameter d"."""
+_SHORT = {"pinhole_diameter": "Hole", "detector_thickness": "Depth", "roi_radius": "ROI"}
+LABELS = {
+    name: f"{_SHORT.get(name, name.split('_')[-1].capitalize())} {text.partition(':')[0]}"
+    for name, text in LENGTHS.items()
+}
+"""Of the lengths, short enough for the sidebar: "Hole d"."""
 _SEES_ROI = 1 - 1e-6  # of R: an `l` from the ROI sees R up to rounding
 
 

@@ -90,6 +90,7 @@ def test_pictures_leave_the_scene_as_it_was(tmp_path, dc_spect, scene):
     assert (tmp_path / "p.png").stat().st_size > 10_000
 
 
+@pytest.mark.long
 def test_examples_run(tmp_path, workbook, small_run):
     said = run(EXAMPLES / "batch.py", workbook, tmp_path / "batch")
     assert {path.name for path in (tmp_path / "batch").iterdir()} >= {"run.npz", "scanner.blend", "scanner_mphdrr"}

@@ -13,6 +13,7 @@ SCRIPT = Path(__file__).parents[2] / "benchmarks" / "projector.py"
 
 
 @pytest.mark.skipif(shutil.which("cc") is None, reason="there is no compiler cc")
+@pytest.mark.long
 def test_plain_c_integrates_the_same(tmp_path):
     size = ["--voxels", "16", "--pixels", "8", "--views", "2", "--rounds", "1", "--no-growth"]
     command = [sys.executable, str(SCRIPT), "--only", "c", *size, "--output", str(tmp_path)]

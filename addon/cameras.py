@@ -4,7 +4,7 @@ A Blender camera is right-handed with X right, Y up and looks along -Z; seen fro
 to the LEFT. So a module's camera has X = -u, Y = v, Z = -k.
 """
 
-from __future__ import annotations
+from collections.abc import Sequence
 
 import bpy
 import numpy as np
@@ -84,3 +84,10 @@ def unparent(item: bpy.types.Object) -> None:
     matrix = world_matrix(item)
     item.parent = None
     set_world_matrix(item, matrix)
+
+
+def remove_objects(items: Sequence[bpy.types.Object]) -> None:
+    """Remove objects, and their meshes or cameras that nothing else uses."""
+    datas = {item.data for item in items if item.data is not None}
+    bpy.data.batch_remove(list(items))
+    bpy.data.batch_remove([data for data in datas if data.users == 0])

@@ -5,8 +5,6 @@ every saved scene count another isotope's photons. So every item has a number of
 had in version 0.1.0; of a later item, a checksum of its identifier. Later items need no change here.
 """
 
-from __future__ import annotations
-
 import zlib
 from collections.abc import Iterable, Mapping
 

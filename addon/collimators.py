@@ -1,7 +1,5 @@
 """How modules look: the meshes of collimators, crystals and the ROI sphere, and their colours."""
 
-from __future__ import annotations
-
 import bmesh
 import bpy
 import numpy as np

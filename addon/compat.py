@@ -1,7 +1,5 @@
 """Differences between Blender versions; the only file that looks at `bpy.app.version`."""
 
-from __future__ import annotations
-
 import bpy
 
 # Voxel index i of an OpenVDB grid is drawn over [i, i + 1] in 4.5, centred on i in 5.0 and later. Files that a scene draws

@@ -1,7 +1,5 @@
 """Blender's float32 numbers, read as they were typed."""
 
-from __future__ import annotations
-
 import numpy as np
 
 

@@ -1,7 +1,5 @@
 """How projections are shown: `Scene.mphdrr_display`."""
 
-from __future__ import annotations
-
 import bpy
 from bpy.props import BoolProperty, EnumProperty, FloatProperty
 

@@ -4,8 +4,6 @@ Everything is changed in place (vertices, properties, rotations). No datablock i
 Blender has stored an undo step, and undo expects the datablocks that it stored. `module_edits.py` makes and removes modules.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 
@@ -14,10 +12,11 @@ import numpy as np
 
 from ..core.errors import InputError
 from ..core.geometry.collimator import Construction, EdgePlace
+from ..core.geometry.system import LENGTHS
 from ..core.physics.performance import isocentre_performance
 from . import cameras, collimators
 from .decimals import typed
-from .module_values import LENGTHS, TYPED, ModuleNumbers, module_numbers, off_aim
+from .module_values import TYPED, ModuleNumbers, module_numbers, off_aim
 
 PARTS = ("COLLIMATOR", "CRYSTAL")  # what hangs on a module's camera: `Object.mphdrr_module.part`
 _KEY = "mphdrr_solid"  # custom property of a mesh or camera: the numbers that it was built from
@@ -153,10 +152,7 @@ def _construction_numbers(scanner: bpy.types.PropertyGroup) -> _ConstructionNumb
 
 
 def _rebuild(
-    camera: bpy.types.Object,
-    numbers: ModuleNumbers,
-    built_as: _ConstructionNumbers,
-    parts: Sequence[bpy.types.Object],
+    camera: bpy.types.Object, numbers: ModuleNumbers, built_as: _ConstructionNumbers, parts: Sequence[bpy.types.Object]
 ) -> str:
     """Give the camera's view and the parts' meshes the shape of `numbers`; returns why not, or an empty text."""
     _, _, d, l, side, thickness, _ = numbers

@@ -1,7 +1,5 @@
 """Every idname, datablock name and prefix of the extension. Needs no Blender."""
 
-from __future__ import annotations
-
 PREFIX = "mphdrr"
 CATEGORY = "mphDRR"  # the sidebar tab
 
@@ -42,15 +40,11 @@ CANCEL_JOB = "mphdrr.cancel_job"
 # --- Panels, drawn in the order of the work: bl_order -----------------------------------------------------------------
 ORDER_GEOMETRY, ORDER_PHANTOM, ORDER_PROJECTIONS, ORDER_EXPORT = 0, 10, 20, 30
 
-# --- Properties on Blender's types; code reads them as attributes: `scene.mphdrr_geometry` ------------------
-SCENE_PROJECTIONS = "mphdrr_projections"
-OBJECT_MODULE = "mphdrr_module"
-OBJECT_VOLUME = "mphdrr_volume"
-
 # --- Datablocks ---------------------------------------------------------------------------------------------
 SCANNER = "Scanner"  # default name of a scanner's collection
-PARTS = ("NONE", "CAMERA", "COLLIMATOR", "CRYSTAL", "ROI")  # `Object.mphdrr_module.part`
+PARTS = ("NONE", "CAMERA", "COLLIMATOR", "CRYSTAL", "ROI", "PLANE")  # `Object.mphdrr_module.part`
 MOSAIC = "mphDRR mosaic"
+PLANES = "mphDRR projections"  # the collection of the planes that show them
 PREVIEW = ".preview"  # in the names of coarser copies of large volumes, for display only
 
 
@@ -72,3 +66,8 @@ def ring_name(ring: int) -> str:
 def projection_name(number: int, n_modules: int = 80) -> str:
     """Name of a module's projection image: "mphDRR 07", padded as `module_name`."""
     return module_name(number, n_modules).replace("Module", "mphDRR")
+
+
+def picture_name(projection: str) -> str:
+    """Name of the picture of a module's projection, in colours: "mphDRR 07 picture"."""
+    return f"{projection} picture"

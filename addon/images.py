@@ -4,8 +4,6 @@ The arrays' column index grows along +u, so an image's columns are reversed; its
 Each module has two: one holds the exact float32 numbers in R, G and B, the other, as the mosaic, shows them in colours.
 """
 
-from __future__ import annotations
-
 from collections.abc import Generator
 from typing import Any
 
@@ -13,15 +11,13 @@ import bpy
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core.geometry.system import PinholeSystem
 from ..core.runs.display import Display
 from ..core.runs.mosaic import as_seen, sheet
 from ..core.runs.run import ProjectionRun
 from . import ids
 
 _KEY = "mphdrr_projection"  # custom property: marks the images that a new run replaces
-_UNIT = "mphdrr_unit"  # of the numbers in an exact image
-_TILES = "mphdrr_tiles"  # of the mosaic: where in it which module's image is
+_TILES = "mphdrr_tiles"  # custom property of the mosaic: its modules, unit, and where in it which one's image is
 
 
 def storing(run: ProjectionRun, display: Display) -> Generator[None, None, bpy.types.Image]:
@@ -31,29 +27,48 @@ def storing(run: ProjectionRun, display: Display) -> Generator[None, None, bpy.t
     between steps, so that a window can be drawn.
     """
     numbers = run.system.numbers.tolist()
-    names = [ids.projection_name(number, max(numbers)) for number in numbers]
+    names = [projection_name(number, numbers) for number in numbers]
     for picture, name in zip(as_seen(run.projections), names, strict=True):
-        _store(name, picture, exact=True)[_UNIT] = run.unit
+        _store(name, picture, exact=True)
         yield
     kept = {*names, *map(ids.picture_name, names), ids.MOSAIC}
     for other in [image for image in bpy.data.images if _KEY in image and image.name not in kept]:
         bpy.data.images.remove(other)
-    return (yield from showing(run.projections, run.system, run.unit, display))
+    return (yield from _showing(run.projections, numbers, run.system.rings().tolist(), run.unit, display))
 
 
-def showing(
-    projections: NDArray[np.float32], system: PinholeSystem, unit: str, display: Display
+def show_again(display: Display) -> None:
+    """Make the pictures anew from the exact images, as `display` says; nothing where there is no run."""
+    mosaic = bpy.data.images.get(ids.MOSAIC)
+    if mosaic is None or _TILES not in mosaic:
+        return
+    tiles = mosaic[_TILES].to_dict()
+    found = [bpy.data.images.get(projection_name(number, tiles["numbers"])) for number in tiles["numbers"]]
+    if None not in found:
+        projections = np.stack([projection_array(image) for image in found])
+        for _ in _showing(projections, tiles["numbers"], tiles["rings"], tiles["unit"], display):
+            pass
+
+
+def projection_name(number: int, numbers: list[int]) -> str:
+    """Name of the exact image of the module `number` of a run of the modules `numbers`."""
+    return ids.projection_name(number, max(numbers))
+
+
+def _showing(
+    projections: NDArray[np.float32], numbers: list[int], rings: list[int], unit: str, display: Display
 ) -> Generator[None, None, bpy.types.Image]:
     """Make the pictures of projections (M, n_v, n_u) as `display` says; returns the mosaic."""
-    numbers = system.numbers.tolist()
     window = display.window(projections)
     for picture, number in zip(as_seen(projections), numbers, strict=True):
-        name = ids.picture_name(ids.projection_name(number, max(numbers)))
+        name = ids.picture_name(projection_name(number, numbers))
         _store(name, display.colored(picture, window), exact=False)
         yield
-    drawn = sheet(projections, system.numbers, system.rings(), unit, display)
+    drawn = sheet(projections, numbers, rings, unit, display)
     image = _store(ids.MOSAIC, drawn.picture, exact=False)
-    image[_TILES] = {"numbers": numbers, "corners": drawn.corners.ravel().tolist(), "tile": drawn.tile}
+    image[_TILES] = {
+        "numbers": numbers, "rings": rings, "unit": unit, "corners": drawn.corners.ravel().tolist(), "tile": drawn.tile,
+    }  # fmt: skip
     return image
 
 

@@ -5,13 +5,11 @@ A function of `addon` returns a `Job`; an operator that inherits from `JobOperat
 the operator returns when the job is done. Scripts can also do a job themselves, with `run`.
 """
 
-from __future__ import annotations
-
 import threading
 import time
 import traceback
 from collections.abc import Callable, Generator
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import bpy
@@ -58,33 +56,19 @@ def _finishing(job: Job, result: Any) -> Generator[None, None, str]:
     return (yield from finished) if isinstance(finished, Generator) else finished
 
 
-@dataclass
-class Worker:
-    """Work in a thread of its own, with its progress and the warnings that it gave."""
+class Worker(threading.Thread):
+    """The thread that does a job's work, with its progress and the warnings that it gave."""
 
-    label: str
-    work: Callable[[Progress], Any]
-    done: int = 0
-    total: int = 0
-    result: Any = None
-    error: BaseException | None = None
-    caught: list[str] = field(default_factory=list)
-    cancel: threading.Event = field(default_factory=threading.Event)
-    thread: threading.Thread | None = None
+    def __init__(self, label: str, work: Callable[[Progress], Any]) -> None:
+        super().__init__(name=f"mphDRR: {label}", daemon=True)
+        self.label, self.work = label, work
+        self.done = self.total = 0
+        self.result: Any = None
+        self.error: BaseException | None = None
+        self.caught: list[str] = []
+        self.cancel = threading.Event()
 
-    def start(self) -> None:
-        self.thread = threading.Thread(target=self._work, name=f"mphDRR: {self.label}", daemon=True)
-        self.thread.start()
-
-    @property
-    def alive(self) -> bool:
-        return self.thread is not None and self.thread.is_alive()
-
-    @property
-    def share(self) -> float:
-        return self.done / max(1, self.total)
-
-    def _work(self) -> None:
+    def run(self) -> None:
         with recorded_warnings() as self.caught:
             try:
                 self.result = self.work(self._progress)
@@ -100,20 +84,9 @@ class Worker:
 _current: Worker | None = None
 
 
-def current() -> Worker | None:
-    """What runs in a thread now."""
-    return _current
-
-
 def is_running() -> bool:
     """Whether a job runs in a thread now."""
     return _current is not None
-
-
-def cancel() -> None:
-    """Ask the running job to stop at its next step."""
-    if _current is not None:
-        _current.cancel.set()
 
 
 @bpy.app.handlers.persistent
@@ -123,16 +96,22 @@ def stop(*_: Any) -> None:
     worker, _current = _current, None
     if worker is not None:
         worker.cancel.set()
-        if worker.thread is not None:
-            worker.thread.join(_PATIENCE)
+        worker.join(_PATIENCE)
 
 
 class JobOperator:
-    """Mix into an operator and implement `job`, and `ask` where the user is asked first."""
+    """Mix into an operator and implement `job`; say in `asks_for` or `dialog` what the user is asked for first."""
+
+    bl_options = {"REGISTER", "UNDO"}
 
     confirmed: BoolProperty(
         name="Confirmed", description="Start without asking", options={"HIDDEN", "SKIP_SAVE"}, default=False
     )
+
+    asks_for = ""
+    """The property that a file browser sets, unless it is given, as by dropping a file on the window."""
+    dialog: dict[str, Any] | None = None
+    """How a dialog of the operator's properties looks: `confirm_text` on its button, `width`."""
 
     _asked = False
     _job: Job | None = None
@@ -151,19 +130,11 @@ class JobOperator:
         """The job, from the operator's and the scene's settings; raises InputError."""
         raise NotImplementedError
 
-    def ask(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str] | None:
+    def ask(self, context: bpy.types.Context) -> set[str] | None:
         """Open a dialog or a file browser, whose button starts the job; None where there is nothing to ask."""
-        return None
-
-    def ask_in_dialog(self, context: bpy.types.Context, confirm_text: str, width: int = 300) -> set[str]:
-        """`ask` with a dialog of the operator's properties."""
-        return context.window_manager.invoke_props_dialog(
-            self, title=self.bl_label, confirm_text=confirm_text, width=width
-        )
-
-    def ask_for_file(self, context: bpy.types.Context, is_given: bool) -> set[str] | None:
-        """`ask` with a file browser, unless the file is given, as by dropping it on the window."""
-        if is_given:
+        if self.dialog is not None:
+            return context.window_manager.invoke_props_dialog(self, title=self.bl_label, **self.dialog)
+        if not self.asks_for or getattr(self, self.asks_for):
             return None
         context.window_manager.fileselect_add(self)
         return {"RUNNING_MODAL"}
@@ -189,7 +160,7 @@ class JobOperator:
             return self.execute(context)
         try:
             _require_idle()
-            asked = None if self.confirmed else self.ask(context, event)
+            asked = None if self.confirmed else self.ask(context)
             if asked is not None:
                 self._asked = True
                 return asked
@@ -198,7 +169,7 @@ class JobOperator:
         except Exception as error:
             return self._failed(error)
         self._run = _current = Worker(self._job.label, self._job.work)
-        self._run.start()
+        _current.start()
         manager = context.window_manager
         self._timer = manager.event_timer_add(_INTERVAL, window=context.window)
         manager.modal_handler_add(self)
@@ -211,12 +182,12 @@ class JobOperator:
             self._end(context)
             return {"CANCELLED"}
         if event.type == "ESC" and event.value == "PRESS":
-            cancel()
+            worker.cancel.set()
             return {"RUNNING_MODAL"}
         if event.type != "TIMER":
             return {"PASS_THROUGH"}
         redraw_sidebars()
-        if worker.alive:
+        if worker.is_alive():
             return {"PASS_THROUGH"}
         try:
             if self._finishing is None:
@@ -283,22 +254,25 @@ def _require_idle() -> None:
 
 
 class MPHDRR_OT_cancel_job(bpy.types.Operator):
+    """Stop the running job; the scene stays as it was"""
+
     bl_idname = ids.CANCEL_JOB
     bl_label = "Cancel"
-    bl_description = "Stop the running job; the scene stays as it was"
     bl_options = {"INTERNAL"}
 
     def execute(self, context: bpy.types.Context) -> set[str]:
-        """Ask it to stop."""
-        cancel()
+        """Ask it to stop at its next step."""
+        if _current is not None:
+            _current.cancel.set()
         return {"FINISHED"}
 
 
 def draw_job(layout: bpy.types.UILayout) -> None:
     """Draw the running job's progress bar and Cancel button; nothing where there is none."""
     if _current is not None:
+        share = _current.done / max(1, _current.total)
         row = layout.row(align=True)
-        row.progress(factor=_current.share, type="BAR", text=f"{_current.label}  {_current.share:.0%}")
+        row.progress(factor=share, type="BAR", text=f"{_current.label}  {share:.0%}")
         row.operator(ids.CANCEL_JOB, text="", icon="CANCEL")
 
 

@@ -1,7 +1,5 @@
 """Phantoms follow their settings: small ones at once, others, in a window, once the settings rest; large ones on Update."""
 
-from __future__ import annotations
-
 import bpy
 
 from ..core.errors import InputError

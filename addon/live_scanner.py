@@ -4,8 +4,6 @@ Cameras that the user copied or deleted with Blender's own Shift+D and X need da
 Blender is idle, and is an undo step of its own. What an undo has made untidy again is left so; the panel offers to tidy it.
 """
 
-from __future__ import annotations
-
 import sys
 from collections.abc import Iterable
 from typing import Any

@@ -1,7 +1,5 @@
 """Maps of what the scanner does in every voxel, as volumes in the scene."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import bpy

@@ -1,7 +1,5 @@
 """Mesh objects of the scene as core's meshes and back, and the jobs that make volumes of them or them of volumes."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import bpy

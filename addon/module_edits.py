@@ -1,7 +1,5 @@
 """Modules made, removed and renumbered in the scene, by operators (undo steps), not by handlers."""
 
-from __future__ import annotations
-
 import json
 import re
 from collections.abc import Sequence
@@ -69,7 +67,7 @@ def tidy(collection: bpy.types.Collection) -> tuple[list[int], int]:
     """
     copied, orphans, numbers = copied_cameras(collection), orphan_parts(collection), []
     _require_solids(collection, [*copied, *bare_cameras(collection)])
-    _remove(orphans)
+    cameras.remove_objects(orphans)
     for camera in copied:
         adopt(collection, camera)
         numbers.append(camera.mphdrr_module.number)
@@ -189,7 +187,7 @@ def remove(collection: bpy.types.Collection, modules: Sequence[bpy.types.Object]
     for child in children:
         if child not in parts:
             cameras.unparent(child)
-    _remove([*parts, *modules])
+    cameras.remove_objects([*parts, *modules])
     following.refresh(collection)
 
 
@@ -228,12 +226,6 @@ def renumber(collection: bpy.types.Collection, order: Literal["RINGS", "LIST"] =
         item.name = name
     following.refresh(collection)
     return int(np.count_nonzero(system.numbers[places] != ordered.numbers))
-
-
-def _remove(items: Sequence[bpy.types.Object]) -> None:
-    datas = {item.data for item in items if item.data is not None}
-    bpy.data.batch_remove(list(items))
-    bpy.data.batch_remove([data for data in datas if data.users == 0])
 
 
 def make_single_users(collection: bpy.types.Collection) -> None:

@@ -4,8 +4,6 @@ Blender keeps places and properties as float32. `Object.mphdrr_module.exact` has
 valid as long as the visible one is its rounding. A number that the user has typed is read as the decimal typed.
 """
 
-from __future__ import annotations
-
 import json
 from collections.abc import Iterable
 from typing import Any, NamedTuple
@@ -16,11 +14,10 @@ from numpy.typing import NDArray
 
 from ..core.errors import InputError
 from ..core.geometry.design_formulas import collimator_length
-from ..core.geometry.system import PinholeSystem
+from ..core.geometry.system import LENGTHS, PinholeSystem
 from . import cameras
 from .decimals import typed
 
-LENGTHS = ("pinhole_diameter", "collimator_length", "detector_side", "detector_thickness", "roi_radius")
 FROM_ROI, TYPED = "FROM_ROI", "TYPED"  # `mphdrr_module.length_mode`
 _TURNED = 1e-4  # rad: rotations kept as float32 angles agree to better than 1e-6
 _FORMULA = 1e-9  # of l: an imported l this close to the design formula's was calculated with it
@@ -67,8 +64,7 @@ def remember(camera: bpy.types.Object, system: PinholeSystem, m: int) -> None:
     module = camera.mphdrr_module
     module.number, module.index, module.added = int(np.asarray(system.numbers)[m]), m, False
     _write_exact(
-        camera,
-        ModuleNumbers(module.number, system.centers[m], *(float(getattr(system, name)[m]) for name in LENGTHS)),
+        camera, ModuleNumbers(module.number, system.centers[m], *(float(getattr(system, name)[m]) for name in LENGTHS))
     )
 
 

@@ -3,8 +3,6 @@
 The settings of each kind of phantom follow from the fields of its class (`core.phantoms.kinds`).
 """
 
-from __future__ import annotations
-
 import dataclasses
 from typing import Any
 
@@ -31,8 +29,6 @@ from .decimals import typed
 from .updates import on_edit
 
 FILE = "file"  # beside the names of `KINDS`: a phantom that a text in TOML describes
-
-_UNITS = {"mm": "mm", "kBq/mL": "kBq_per_mL", "1/mm": "per_mm", "kBq": "kBq", "mL": "mL"}  # in JSON's keys
 
 
 class PhantomSettings:
@@ -115,8 +111,8 @@ class KindSettings(PhantomSettings):
         """The class's fields, their units in their names, and the number of frames of one that beats."""
         recipe: dict[str, Any] = {"phantom": self.kind.name}
         for field in _fields(self.kind):
-            unit, value = _UNITS.get(field.metadata.get("unit", "")), self._arguments()[field.name]
-            recipe[f"{field.name}_{unit}" if unit else field.name] = list(value) if isinstance(value, tuple) else value
+            value = self._arguments()[field.name]
+            recipe[field.name + _key_ending(field)] = list(value) if isinstance(value, tuple) else value
         return recipe | {"frames": self.n_states} if self.n_states > 1 else recipe
 
     def _arguments(self) -> dict[str, Any]:
@@ -189,6 +185,14 @@ def _fields(kind: Kind) -> list[Any]:
     return [field for field in dataclasses.fields(kind.phantom) if field.metadata]
 
 
+def _key_ending(field: Any) -> str:
+    """A setting's unit as JSON's keys end with it: "_mm", "_kBq_per_mL", "_per_mm"; none for shares, degrees and words."""
+    unit = field.metadata.get("unit", "")
+    if not unit or unit.startswith("of ") or unit == "DEG":  # names of angles end with "_degrees" already
+        return ""
+    return "_" + unit.replace("1/", "per_").replace("/", "_per_")
+
+
 def _property(field: Any, kind: Kind, update: Any) -> Any:
     """A field of a phantom's dataclass as a property."""
     known = field.metadata
@@ -203,12 +207,12 @@ def _property(field: Any, kind: Kind, update: Any) -> Any:
     many = {"size": len(default)} if isinstance(default, tuple) else {}
     if not unit:
         return (IntVectorProperty if many else IntProperty)(**options, **many, min=1)
-    if unit in _UNITS:
-        options |= {"name": f"{name} ({unit})", "description": f"{text}, in {unit}"}
+    if unit.startswith("of "):
+        options |= {"description": f"Share {unit}, {known['text']}"}
     elif unit == "DEG":
         options |= {"name": f"{name} (°)", "description": f"{text}, in degrees"}
     else:
-        options |= {"description": f"Share {unit}, {known['text']}"}
+        options |= {"name": f"{name} ({unit})", "description": f"{text}, in {unit}"}
     # What must be above 0 has no smallest number.
     options |= {"min": 1e-6 if known["least"] is None else known["least"], "precision": 4 if unit == "1/mm" else 2}
     return (FloatVectorProperty if many else FloatProperty)(**options, **many)
@@ -265,11 +269,9 @@ class VolumeProperties(bpy.types.PropertyGroup):
 
     is_volume: BoolProperty(options={"HIDDEN"})
     kind: EnumProperty(
-        name="Kind",
-        description="The kind whose settings count",
+        name="Kind", description="The kind whose settings count", default="VOLUME",
         items=choices.items(choices.KINDS, _KINDS),
-        default="VOLUME",
-    )
+    )  # fmt: skip
     with_parent: BoolProperty(options={"HIDDEN"})  # another quantity of the phantom that is the parent
     outdated: BoolProperty(options={"HIDDEN"})  # the phantom's settings have changed since its voxels were made
     message: StringProperty(options={"HIDDEN"})  # what is wrong with the phantom's settings

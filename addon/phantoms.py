@@ -4,8 +4,6 @@ The object's matrix is the phantom's pose. The voxels are in its own frame, so t
 phantom may have children that go with it: a volume of its other quantity, and an outline.
 """
 
-from __future__ import annotations
-
 import itertools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -25,8 +23,9 @@ from ..core.phantoms.phantom import Phantom
 from ..core.progress import Progress, part_of
 from ..core.volumes.meshes.mesh import Mesh
 from . import jobs, meshes, storage, volumes
-from .cameras import set_world_matrix, world_matrix
+from .cameras import remove_objects, set_world_matrix, world_matrix
 from .phantom_properties import FILE, PhantomSettings
+from .reports import polled
 from .stored_volumes import StoredVolume, moved, store_volume
 from .vdb import provenance_of
 
@@ -106,10 +105,8 @@ def settings_of(item: bpy.types.Object | None) -> Any:
 
 def poll_phantom(operator: type[bpy.types.Operator], context: bpy.types.Context) -> bool:
     """`poll` of operators that need an active phantom."""
-    if settings_of(context.object) is None:
-        operator.poll_message_set("No phantom is active: select one that was added with its settings")
-        return False
-    return True
+    is_phantom = settings_of(context.object) is not None
+    return polled(operator, is_phantom, "No phantom is active: select one that was added with its settings")
 
 
 def adding(
@@ -262,10 +259,7 @@ def remove_outline(item: bpy.types.Object) -> None:
     """Remove a phantom's outline, if it has one."""
     outline = outline_of(item)
     if outline is not None:
-        mesh = outline.data
-        bpy.data.objects.remove(outline)
-        if mesh.users == 0:
-            bpy.data.meshes.remove(mesh)
+        remove_objects([outline])
 
 
 def _show_outline(item: bpy.types.Object) -> None:

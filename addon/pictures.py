@@ -1,7 +1,5 @@
 """Pictures of the scanner, rendered by Cycles on the processor: they need no window and no graphics card."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import bpy

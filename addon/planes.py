@@ -4,9 +4,7 @@ A plane is an image empty, a child of its module's camera, in a collection of it
 looks through the camera sees the scene, and the picture over it as the camera's background image.
 """
 
-from __future__ import annotations
-
-from collections.abc import Iterable
+from typing import Any
 
 import bpy
 import numpy as np
@@ -14,16 +12,15 @@ from numpy.typing import NDArray
 
 from ..core.geometry.system import PinholeSystem
 from ..core.geometry.views import Views
-from . import ids, scanner, selection
+from ..core.runs.run import ProjectionRun
+from . import ids, images, scanner, selection
 
 _KEY = "mphdrr_field"  # custom property of a plane: middle and size (5,) of the virtual detector in the camera's frame, mm
 _BETWEEN = 0.3  # of the way from the pinhole to the ROI's surface: where a plane is unless told otherwise
 
 
-def make(
-    scene: bpy.types.Scene, system: PinholeSystem, views: Views, pictures: Iterable[bpy.types.Image]
-) -> list[bpy.types.Object]:
-    """Show the pictures (M) of a run's `views` at the modules of the scene's scanner, in place of those of another run.
+def make(scene: bpy.types.Scene, run: ProjectionRun) -> list[bpy.types.Object]:
+    """Show the pictures of a run (`images.storing`) at the modules of the scene's scanner, in place of another run's.
 
     Modules that the scanner does not have any more get none.
     """
@@ -35,10 +32,12 @@ def make(
     scene.collection.children.link(home)
     cameras = {camera.mphdrr_module.number: camera for camera in scanner.modules(collection)}
     made = []
-    for number, field, picture in zip(system.numbers.tolist(), _fields(system, views), pictures, strict=True):
+    numbers = run.system.numbers.tolist()
+    for number, field in zip(numbers, _fields(run.system, run.views), strict=True):
         if number not in cameras:
             continue
         camera = cameras[number]
+        picture = bpy.data.images[ids.picture_name(images.projection_name(number, numbers))]
         plane = bpy.data.objects.new(ids.part_name(camera.name, "projection"), None)
         plane.empty_display_type, plane.data = "IMAGE", picture
         plane.empty_image_side, plane.use_empty_image_alpha = "BACK", True
@@ -69,47 +68,46 @@ def remove(scene: bpy.types.Scene) -> None:
 
 def update(scene: bpy.types.Scene) -> None:
     """Place and show the planes and backgrounds as the scene's settings say."""
-    settings, shown = scene.mphdrr_display, _shown(scene)
-    for plane in planes(scene):
-        camera = plane.parent
-        if camera is None or not camera.mphdrr_module.is_module:
-            continue
-        field = np.array(plane[_KEY])
+    settings = scene.mphdrr_display
+    for plane, shown in _wanted(scene):
+        camera, field = plane.parent, np.array(plane[_KEY])
         module = camera.mphdrr_module
         distance = settings.plane_distance or _BETWEEN * (module.pinhole_distance - module.roi_radius)
-        share = 1.0 if settings.plane_at_detector else distance / field[2]
-        x, y, depth, width, height = share * field
+        x, y, depth, width, height = field * (1.0 if settings.plane_at_detector else distance / field[2])
         plane.location = x, y, -depth
         # A picture's longer side is as long as the empty; pixels that are not square are stretched.
         columns, rows = plane.data.size
-        unit = max(columns, rows)
-        plane.empty_display_size = 1.0
-        plane.scale = width * unit / columns, height * unit / rows, 1.0
+        plane.empty_display_size = max(columns, rows)
+        plane.scale = width / columns, height / rows, 1.0
         plane.color[3] = settings.plane_opacity
-        hidden = not shown(camera)
-        if plane.hide_viewport != hidden:
-            plane.hide_viewport = hidden
+        if plane.hide_viewport == shown:
+            plane.hide_viewport = not shown
         for background in camera.data.background_images:
             if background.image == plane.data:
                 background.show_background_image = settings.backgrounds
                 background.alpha = settings.plane_opacity
 
 
-def _shown(scene: bpy.types.Scene):  # type: ignore[no-untyped-def]
-    """Whether a module's plane is shown, as a function of its camera."""
+@bpy.app.handlers.persistent
+def after_update(scene: bpy.types.Scene, *_: Any) -> None:
+    """Another module is active, or modules were shown or hidden: so are their planes."""
+    if any(plane.hide_viewport == shown for plane, shown in _wanted(scene)):
+        update(scene)
+
+
+def _wanted(scene: bpy.types.Scene) -> list[tuple[bpy.types.Object, bool]]:
+    """The planes that belong to a module, each with whether it is to be shown."""
     mode = scene.mphdrr_display.planes
     active = selection.active_module(bpy.context) if mode in ("ACTIVE", "RING") else None
-    ring = active.mphdrr_module.ring if active is not None else None
+    ring = None if active is None else active.mphdrr_module.ring
 
     def shown(camera: bpy.types.Object) -> bool:
-        wanted = {
-            "ALL": True,
-            "RING": camera.mphdrr_module.ring == ring,
-            "ACTIVE": camera == active,
-        }.get(mode, False)
-        return wanted and not camera.hide_viewport
+        if camera.hide_viewport or mode == "NONE":
+            return False
+        return mode == "ALL" or camera == active or (mode == "RING" and camera.mphdrr_module.ring == ring)
 
-    return shown
+    owned = [(plane, plane.parent) for plane in planes(scene) if plane.parent is not None and plane.data is not None]
+    return [(plane, shown(camera)) for plane, camera in owned]
 
 
 def _fields(system: PinholeSystem, views: Views) -> NDArray[np.float64]:

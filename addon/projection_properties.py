@@ -17,9 +17,10 @@ from bpy.props import (
 )
 
 from ..core.errors import InputError
+from ..core.physics.maps import MAPS
 from ..core.runs.recipe import Recipe, fitting_recipe, is_met
 from ..core.runs.settings import SETTINGS, Setting
-from . import choices, ids, volumes
+from . import choices, volumes
 from .decimals import typed
 
 OPENING_ANGLE = "model.opening_angle_degrees"
@@ -193,11 +194,11 @@ def makes_counts(settings: ProjectionProperties) -> bool:
 
 
 def _is_ours(self: ProjectionProperties, item: bpy.types.Object) -> bool:
-    return volumes.can_be_projected(item)
+    return volumes.is_volume(item) and volumes.quantity_of(item) not in MAPS
 
 
 def _is_mu(self: ProjectionProperties, item: bpy.types.Object) -> bool:
-    return volumes.is_volume(item) and getattr(item, ids.OBJECT_VOLUME).quantity == "mu"
+    return volumes.is_volume(item) and volumes.quantity_of(item) == "mu"
 
 
 class ProjectionProperties(ProjectionSettings, bpy.types.PropertyGroup):

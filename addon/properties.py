@@ -21,10 +21,11 @@ from bpy.props import (
     StringProperty,
 )
 
-from . import choices, column_maps, ids, phantom_properties, projection_properties
+from . import choices, column_maps, display_properties, ids, phantom_properties, projection_properties
 from .updates import FUNCTIONS, on_edit
 
 
+# Functions, not lambdas: Blender evaluates annotations where a lambda does not find this module's names.
 def _is_visible(self: ModuleProperties) -> bool:
     return not self.id_data.hide_viewport
 
@@ -193,15 +194,17 @@ CLASSES = (
     GeometryProperties,
     *phantom_properties.CLASSES,
     *projection_properties.CLASSES,
+    *display_properties.CLASSES,
     *column_maps.CLASSES,
 )
 
 # (Blender type, attribute name, group): `registration.py` attaches a `PointerProperty` of the group to the type.
 POINTERS = (
-    (bpy.types.Object, ids.OBJECT_MODULE, ModuleProperties),
+    (bpy.types.Object, "mphdrr_module", ModuleProperties),
     (bpy.types.Collection, "mphdrr_scanner", ScannerProperties),
     (bpy.types.Scene, "mphdrr_geometry", GeometryProperties),
-    (bpy.types.Object, ids.OBJECT_VOLUME, phantom_properties.VolumeProperties),
-    (bpy.types.Scene, ids.SCENE_PROJECTIONS, projection_properties.ProjectionProperties),
+    (bpy.types.Object, "mphdrr_volume", phantom_properties.VolumeProperties),
+    (bpy.types.Scene, "mphdrr_projections", projection_properties.ProjectionProperties),
+    (bpy.types.Scene, "mphdrr_display", display_properties.DisplayProperties),
     (bpy.types.WindowManager, "mphdrr_columns", column_maps.ColumnMapProperties),
 )

@@ -1,11 +1,10 @@
 """What the extension registers with Blender; the only file that imports operators and panels."""
 
-from __future__ import annotations
-
 import atexit
 import importlib
 import pkgutil
 from collections.abc import Callable
+from contextlib import ExitStack
 from types import ModuleType
 from typing import Any
 
@@ -16,10 +15,13 @@ from ..operators import add_phantom
 from . import (
     following,
     ids,
+    images,
     jobs,
     live_phantoms,
     live_scanner,
+    planes,
     properties,
+    rendering,
     scanner,
     selection,
     slices,
@@ -38,7 +40,7 @@ def _classes(module: ModuleType) -> list[Any]:
     return [cls for cls in found if cls.__module__ == module.__name__]
 
 
-CLASSES: tuple[type, ...] = (
+CLASSES: tuple[Any, ...] = (
     *properties.CLASSES,
     *add_phantom.ADD_KINDS,
     *_classes(operators),
@@ -85,11 +87,13 @@ HANDLERS: tuple[tuple[list[Any], Any], ...] = (
     (bpy.app.handlers.load_post, volumes.after_load),
     (bpy.app.handlers.load_post, live_scanner.after_load),
     (bpy.app.handlers.depsgraph_update_post, live_scanner.after_update),
+    (bpy.app.handlers.depsgraph_update_post, planes.after_update),
     (bpy.app.handlers.frame_change_post, live_scanner.after_frame),
     (bpy.app.handlers.frame_change_post, slices.after_frame_change),
     (bpy.app.handlers.undo_post, live_scanner.after_undo),
     (bpy.app.handlers.redo_post, live_scanner.after_undo),
     (bpy.app.handlers.save_pre, storage.before_save),
+    (bpy.app.handlers.save_pre, images.before_save),
     (bpy.app.handlers.save_post, storage.after_save),
     (bpy.app.handlers.save_post_fail, storage.restore_paths),
 )
@@ -105,10 +109,11 @@ UPDATES: dict[str, Callable[..., None]] = {
     "phantom": live_phantoms.settings_changed,
     "display_range": slices.range_changed,
     "slices": slices.update,
+    "display": rendering.display_changed,
+    "planes": planes.update,
 }
 
-# How to take back what was registered: (function, arguments).
-_undo: list[tuple[Callable[..., Any], tuple[Any, ...]]] = []
+_registered = ExitStack()  # takes back what was registered, in reverse order
 
 
 def register(command: Callable[..., int] | None = None) -> None:
@@ -116,22 +121,23 @@ def register(command: Callable[..., int] | None = None) -> None:
     updates.FUNCTIONS.update(UPDATES)
     try:
         for cls in CLASSES:
+            if issubclass(cls, bpy.types.Operator) and cls.__doc__ is not None:
+                cls.bl_description = " ".join(cls.__doc__.split())  # Blender would keep line breaks and indentation
             bpy.utils.register_class(cls)
-            _undo.append((bpy.utils.unregister_class, (cls,)))
+            _registered.callback(bpy.utils.unregister_class, cls)
         for owner, name, group in properties.POINTERS:
             setattr(owner, name, bpy.props.PointerProperty(type=group))
-            _undo.append((delattr, (owner, name)))
+            _registered.callback(delattr, owner, name)
         for menu, draw in MENUS:
             menu.append(draw)
-            _undo.append((menu.remove, (draw,)))
+            _registered.callback(menu.remove, draw)
         for handlers, function in HANDLERS:
             handlers.append(function)
-            _undo.append((_remove_handler, (handlers, function)))
+            _registered.callback(_remove_handler, handlers, function)
         if command is not None:
-            registered = bpy.utils.register_cli_command(ids.PREFIX, command)
-            _undo.append((bpy.utils.unregister_cli_command, (registered,)))
+            _registered.callback(bpy.utils.unregister_cli_command, bpy.utils.register_cli_command(ids.PREFIX, command))
     except Exception:
-        _take_back()
+        _registered.close()
         raise
     if bpy.app.module:
         # Registered classes keep Python's bpy module alive: Blender 4.5 would wait for ever when Python ends.
@@ -139,18 +145,12 @@ def register(command: Callable[..., int] | None = None) -> None:
 
 
 def unregister() -> None:
-    """Take back what `register` did, in reverse order."""
+    """Take back what `register` did."""
     atexit.unregister(unregister)
     jobs.stop()
     live_scanner.stop()
     live_phantoms.stop()
-    _take_back()
-
-
-def _take_back() -> None:
-    while _undo:
-        function, arguments = _undo.pop()
-        function(*arguments)
+    _registered.close()
 
 
 def _remove_handler(handlers: list[Any], function: Any) -> None:

@@ -1,7 +1,5 @@
 """Projections of a scene: the volume and the scanner projected, images in the .blend, exact arrays in a file beside it."""
 
-from __future__ import annotations
-
 import math
 import time
 from collections.abc import Generator, Sequence
@@ -20,8 +18,10 @@ from ..core.runs.recipe import Recipe, read_recipe
 from ..core.runs.run import ProjectionRun
 from ..core.runs.run_recipe import recipe_model, run_recipe, with_phantom
 from ..core.volumes.volume import require_quantity
-from . import images, jobs, phantoms, scanner, storage, volumes
+from . import images, jobs, phantoms, planes, scanner, storage, volumes
 from .projection_properties import OPENING_ANGLE, set_panel
+
+_REST = 0.05  # s without an edit of the display before the pictures are made anew
 
 
 def render_job(context: bpy.types.Context, recipe: Recipe, volume: str = "", mu: str = "") -> jobs.Job:
@@ -59,11 +59,10 @@ def render_job(context: bpy.types.Context, recipe: Recipe, volume: str = "", mu:
         return run
 
     def finish(run: ProjectionRun) -> Generator[None, None, str]:
-        images.show((yield from images.storing(run.projections, run.system.numbers)), bpy.context)
         scene = bpy.data.scenes.get(scene_name)
         if scene is None:
             raise InputError(f"the scene {scene_name!r} is gone; its projections are in {path}")
-        _record_run(scene, run, path)
+        images.show((yield from _storing(scene, run, path)), bpy.context)
         where = path if bpy.data.filepath else f"{path} until the .blend is saved"
         seconds = time.perf_counter() - start
         return f"Projected {recipe['volume.object']!r} into {len(run.views)} modules in {seconds:.1f} s: {where}"
@@ -100,17 +99,35 @@ def export_run(scene: bpy.types.Scene, filepath: str) -> Path:
 
 def show_run(scene: bpy.types.Scene, run: ProjectionRun, path: Path) -> None:
     """Make images of `run`, which is kept in the file `path`, and show it as the scene's last."""
-    for _ in images.storing(run.projections, run.system.numbers):
+    for _ in _storing(scene, run, path):
         pass
-    _record_run(scene, run, path)
 
 
-def _record_run(scene: bpy.types.Scene, run: ProjectionRun, path: Path) -> None:
+def display_changed(scene: bpy.types.Scene) -> None:
+    """Show the last run in other colours or another window, once the settings rest."""
+    if bpy.app.background:
+        _display_again()
+    elif not bpy.app.timers.is_registered(_display_again):
+        bpy.app.timers.register(_display_again, first_interval=_REST)
+
+
+def _display_again() -> None:
+    try:
+        images.show_again(bpy.context.scene.mphdrr_display.display())
+    except InputError:  # a window that is none, as between the typing of its two ends: the panel says so
+        pass
+
+
+def _storing(scene: bpy.types.Scene, run: ProjectionRun, path: Path) -> Generator[None, None, bpy.types.Image]:
+    """Make images and planes of `run`, which is kept in the file `path`, and note it as the scene's last."""
+    mosaic = yield from images.storing(run, scene.mphdrr_display.display())
+    planes.make(scene, run)
     state = scene.mphdrr_projections
     state.run_file = storage.stored_path(path.absolute())
     n_v, n_u = run.views.shape
     what = [run.settings.get("volume"), run.settings.get("backend")]
     state.run_summary = ", ".join([f"{len(run.views)} views of {n_u} × {n_v}", *(text for text in what if text)])
+    return mosaic
 
 
 def _with_volume(recipe: Recipe, item: bpy.types.Object) -> Recipe:

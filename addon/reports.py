@@ -1,7 +1,5 @@
 """What core says to the user, as Blender's reports."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
@@ -24,6 +22,13 @@ def warnings_reported(operator: bpy.types.Operator) -> Iterator[None]:
                 operator.report({"WARNING"}, text)
             if len(caught) > _MOST:
                 operator.report({"WARNING"}, f"... and {len(caught) - _MOST} more warnings of this kind")
+
+
+def polled(operator: type[bpy.types.Operator], is_met: bool, need: str) -> bool:
+    """An operator's answer to `poll`: whether its `need` is met, which the tooltip shows where it is not."""
+    if not is_met:
+        operator.poll_message_set(need)
+    return is_met
 
 
 def run_reported(operator: bpy.types.Operator, action: Callable[[], str]) -> set[str]:

@@ -4,8 +4,6 @@ A scanner is a collection with a sub-collection for each ring; a module is a cam
 children are its collimator and its crystal.
 """
 
-from __future__ import annotations
-
 import json
 import warnings
 from collections.abc import Iterable
@@ -19,11 +17,11 @@ from ..core.errors import InputError, InputWarning
 from ..core.geometry import checks
 from ..core.geometry.collimator import Construction
 from ..core.geometry.module_parts import module_parts
-from ..core.geometry.system import PinholeSystem
+from ..core.geometry.system import LENGTHS, PinholeSystem
 from ..core.workbook import ColumnMap, QuantityCells, SystemSource
 from . import cameras, following, ids
 from .following import modules
-from .module_values import LENGTHS, is_edited, is_moved, module_numbers, off_aim, remember
+from .module_values import is_edited, is_moved, module_numbers, off_aim, remember
 from .scanner_parts import NewScanner, clear, losses, modules_text
 
 _DEFAULT = Construction()

@@ -1,7 +1,5 @@
 """Scanners from workbooks, and the scene's scanner as a workbook or as another program's file."""
 
-from __future__ import annotations
-
 import hashlib
 import math
 import warnings
@@ -13,12 +11,11 @@ import numpy as np
 
 from ..core.errors import InputError, InputWarning
 from ..core.exchange import FORMATS, write_geometry
-from ..core.geometry.system import Detector, PinholeSystem
+from ..core.geometry.system import LENGTHS, Detector, PinholeSystem
 from ..core.recording import recorded_warnings
 from ..core.workbook import read_system, write_system
 from . import following, scanner, storage
 from .decimals import typed
-from .module_values import LENGTHS
 
 WORKBOOK_SUFFIXES = (".xlsx", ".xlsm")
 _EQUAL = 1e-9  # mm, or share of a length above 1 mm

@@ -1,7 +1,5 @@
 """The datablocks of a scanner: made outside the scene, so that a failure leaves nothing behind, and replaced there."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Any
 
@@ -149,9 +147,7 @@ def clear(scene: bpy.types.Scene, collection: bpy.types.Collection, replacements
     bpy.data.batch_remove([data for data in datas if data.users == 0])
 
 
-def parts_and_others(
-    collection: bpy.types.Collection,
-) -> tuple[list[bpy.types.Object], list[bpy.types.Object]]:
+def parts_and_others(collection: bpy.types.Collection) -> tuple[list[bpy.types.Object], list[bpy.types.Object]]:
     """The scanner's own objects, and the user's: other objects, and copies of the scanner's."""
     parts, others = [], []
     seen: set[tuple[str, int]] = set()

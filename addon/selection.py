@@ -1,14 +1,12 @@
 """Which modules an operator or a panel works on: the active one and the selected ones."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable
 from typing import Any
 
 import bpy
 
 from . import scanner
-from .reports import run_reported
+from .reports import polled, run_reported
 
 
 def active_module(context: bpy.types.Context) -> bpy.types.Object | None:
@@ -74,10 +72,8 @@ class NeedsScanner:
     @classmethod
     def poll(cls: Any, context: bpy.types.Context) -> bool:
         """There is a scanner."""
-        if scanner.active_scanner(context.scene) is None:
-            cls.poll_message_set("No scanner in the scene: import a geometry first")
-            return False
-        return True
+        has_scanner = scanner.active_scanner(context.scene) is not None
+        return polled(cls, has_scanner, "No scanner in the scene: import a geometry first")
 
 
 class OnScanner(NeedsScanner):
@@ -100,9 +96,5 @@ class OnModules(OnScanner):
     @classmethod
     def poll(cls: Any, context: bpy.types.Context) -> bool:
         """There is a scanner, and a module of it is active or selected."""
-        if not super().poll(context):
-            return False
-        if not selected_modules(context):
-            cls.poll_message_set("No module is selected: select a module's camera")
-            return False
-        return True
+        need = "No module is selected: select a module's camera"
+        return super().poll(context) and polled(cls, bool(selected_modules(context)), need)

@@ -4,8 +4,6 @@ Each plane is a mesh object, a child of the volume's, with an image of the slice
 sheared grid it is a parallelogram. Planes are named sagittal, coronal and axial by the world axis closest to their normal.
 """
 
-from __future__ import annotations
-
 import itertools
 import json
 from pathlib import Path
@@ -17,6 +15,7 @@ from numpy.typing import NDArray
 from ..core.errors import InputError
 from ..core.volumes.volume import Volume
 from . import vdb, volume_materials, volumes
+from .cameras import remove_objects
 from .compat import enable_nodes
 
 _PLANES = ("Sagittal", "Coronal", "Axial")  # across world x, y, z
@@ -45,10 +44,8 @@ def add_slices(item: bpy.types.Object) -> list[bpy.types.Object]:
 def remove_slices(item: bpy.types.Object) -> None:
     """Remove a volume's planes, with their meshes, materials and images."""
     for plane in planes_of(item):
-        mesh, materials = plane.data, list(plane.data.materials)
-        bpy.data.objects.remove(plane)
-        if mesh.users == 0:
-            bpy.data.meshes.remove(mesh)
+        materials = list(plane.data.materials)
+        remove_objects([plane])
         for material in materials:
             if material is None or material.users:
                 continue

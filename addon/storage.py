@@ -4,8 +4,6 @@
 Files made before the first save are copied there when it happens. Packing a .blend does not include volumes.
 """
 
-from __future__ import annotations
-
 import functools
 import os
 import re

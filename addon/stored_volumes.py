@@ -1,7 +1,5 @@
 """Volumes on their way into the scene: their voxels are written to .vdb files. Leaves bpy alone, for a job's thread."""
 
-from __future__ import annotations
-
 import hashlib
 import json
 from collections.abc import Sequence

@@ -1,7 +1,5 @@
 """What an edited property calls: functions by name, so that property groups import nothing that draws or rebuilds."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import Any
 

@@ -6,8 +6,6 @@ Blender 4.5 draws them half a voxel farther along every index axis. So the files
 and say so in their metadata; files written for other programs are not shifted.
 """
 
-from __future__ import annotations
-
 import json
 import struct
 import warnings

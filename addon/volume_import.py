@@ -1,7 +1,5 @@
 """Volumes from files, and CTs that become attenuation: jobs that add a volume to the scene."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any

@@ -3,8 +3,6 @@
 Activity glows in the colours of "inferno"; attenuation and CT numbers look like a radiograph, the higher the brighter.
 """
 
-from __future__ import annotations
-
 import bpy
 
 from .compat import enable_nodes

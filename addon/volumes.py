@@ -4,8 +4,6 @@ The voxels are in .vdb files (`stored_volumes`), so that a saved .blend can be p
 from voxel index to the object's own space, and the object's matrix is the pose: moving the object moves the volume.
 """
 
-from __future__ import annotations
-
 import json
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -19,10 +17,10 @@ from numpy.typing import ArrayLike, NDArray
 from ..core.errors import InputError
 from ..core.geometry.frames import checked_affine
 from ..core.memory import readable_size
-from ..core.physics.maps import MAPS
 from ..core.volumes.volume import UNITS, Volume
 from . import compat, ids, storage, volume_materials
 from .cameras import world_matrix
+from .reports import polled
 from .stored_volumes import StoredVolume, moved, store_volume, write_states
 from .vdb import SMOKE, read_vdb
 
@@ -169,17 +167,9 @@ def quantity_of(item: bpy.types.Object) -> str:
     return str(item.mphdrr_volume.quantity)
 
 
-def can_be_projected(item: bpy.types.Object | None) -> bool:
-    """Whether an object is a volume of matter or activity, not a map of the scanner."""
-    return is_volume(item) and item is not None and quantity_of(item) not in MAPS
-
-
 def poll_volume(operator: type[bpy.types.Operator], context: bpy.types.Context) -> bool:
     """`poll` of operators that need an active volume."""
-    if not is_volume(context.object):
-        operator.poll_message_set("No volume is active: select one first")
-        return False
-    return True
+    return polled(operator, is_volume(context.object), "No volume is active: select one first")
 
 
 def volume_objects(scene: bpy.types.Scene) -> list[bpy.types.Object]:

@@ -1,7 +1,5 @@
 """Numpy arrays and torch tensors: checked on the way in, of the caller's kind on the way out."""
 
-from __future__ import annotations
-
 import sys
 from typing import Any
 

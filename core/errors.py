@@ -1,6 +1,7 @@
 """Errors and warnings about the user's input."""
 
-from __future__ import annotations
+from collections.abc import Iterator
+from contextlib import contextmanager
 
 
 class InputError(ValueError):
@@ -9,3 +10,12 @@ class InputError(ValueError):
 
 class InputWarning(UserWarning):
     """The user's input was used, but something about it should be checked."""
+
+
+@contextmanager
+def naming(name: object) -> Iterator[None]:
+    """Put a name, such as a file's, before the messages of input errors."""
+    try:
+        yield
+    except InputError as error:
+        raise InputError(f"{name}: {error}") from None

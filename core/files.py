@@ -1,7 +1,5 @@
 """Writing files such that the old or the new one is always there, whole."""
 
-from __future__ import annotations
-
 import os
 import shutil
 import uuid

@@ -1,7 +1,5 @@
 """Checks that a job fits into memory before it begins."""
 
-from __future__ import annotations
-
 from .errors import InputError
 
 # The rest is left to other programs.

@@ -1,7 +1,5 @@
 """Import paths of version 0.1.0 that documentation named, and where their modules are now."""
 
-from __future__ import annotations
-
 import importlib
 import sys
 from collections.abc import Sequence

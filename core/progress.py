@@ -1,7 +1,5 @@
 """Progress and cancellation of long work."""
 
-from __future__ import annotations
-
 import os
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -27,8 +25,4 @@ def in_threads(work: Callable[[Part], None], parts: Sequence[Part], progress: Pr
     with ThreadPoolExecutor(os.cpu_count()) as pool:
         for done, _ in enumerate(pool.map(work, parts), 1):
             if progress is not None:
-                try:
-                    progress(done, len(parts))
-                except BaseException:
-                    pool.shutdown(wait=False, cancel_futures=True)
-                    raise
+                progress(done, len(parts))  # leaving the loop cancels the parts that have not begun

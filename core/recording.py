@@ -5,8 +5,6 @@ record, and all later warnings go there. Here each warning goes to a recorder of
 is restored when no recorder is left.
 """
 
-from __future__ import annotations
-
 import threading
 import warnings
 from collections.abc import Callable, Iterator

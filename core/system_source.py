@@ -1,7 +1,5 @@
 """Where in which workbook a system's numbers are."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """TOML files: reading with one-line errors, and writing values."""
 
-from __future__ import annotations
-
 import json
 import os
 import tomllib

@@ -1,7 +1,6 @@
 """Checks of arguments where they enter the package."""
 
-from __future__ import annotations
-
+from collections.abc import Collection
 from typing import Any
 
 import numpy as np
@@ -60,6 +59,12 @@ def instance(value: object, kind: type, name: str) -> None:
     """Raise `InputError` unless `value` is a `kind`."""
     if not isinstance(value, kind):
         raise InputError(f"{name}: expected a {kind.__name__}, got {type(value).__name__}")
+
+
+def one_of(value: object, known: Collection[object], name: str) -> None:
+    """Raise `InputError` unless `value` is one of the `known` words."""
+    if value not in known:
+        raise InputError(f"{name} {value!r}: expected one of {', '.join(map(str, known))}")
 
 
 def whole_shape(value: Any, name: str, length: int) -> Any:

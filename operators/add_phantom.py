@@ -1,7 +1,5 @@
 """Add > mphDRR: an operator for every kind of phantom, and one for phantoms that a TOML file describes."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import bpy
@@ -49,8 +47,7 @@ class AddPhantom(jobs.JobOperator):
 class AddKind(AddPhantom):
     """What the operators of all kinds do."""
 
-    def ask(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str] | None:
-        return self.ask_in_dialog(context, "Add", width=340)
+    dialog = {"confirm_text": "Add", "width": 340}
 
     def job(self: Any, context: bpy.types.Context) -> jobs.Job:
         return self.adding(self.name)
@@ -63,23 +60,19 @@ ADD_KINDS = tuple(
         f"MPHDRR_OT_add_{identifier(kind)}",
         (AddKind, bpy.types.Operator),
         __annotations__={"name": StringProperty(name="Name", description="The object's name", default=kind.label)},
-        __doc__=f"``bpy.ops.mphdrr.add_{identifier(kind)}(voxels=64)``.",
+        __doc__=f"Add {kind.summary}, as a volume",
         bl_idname=ids.ADD_PHANTOM + identifier(kind),
         bl_label=f"Add {kind.label}",
-        bl_description=f"Add {kind.summary}, as a volume",
-        bl_options={"REGISTER", "UNDO"},
     )
     for kind in KINDS
 )
 
 
 class MPHDRR_OT_import_phantom(PhantomSettings, AddPhantom, bpy.types.Operator):
-    """``bpy.ops.mphdrr.import_phantom(filepath="thorax.toml")``."""
+    """Add the phantom that a TOML file describes as a volume; its text becomes one of the .blend"""
 
     bl_idname = ids.IMPORT_PHANTOM
     bl_label = "Import Phantom"
-    bl_description = "Add the phantom that a TOML file describes as a volume; its text becomes one of the .blend"
-    bl_options = {"REGISTER", "UNDO"}
 
     __annotations__ = {
         "filepath": StringProperty(description="Phantom to read", subtype="FILE_PATH", options={"SKIP_SAVE"}),
@@ -88,9 +81,7 @@ class MPHDRR_OT_import_phantom(PhantomSettings, AddPhantom, bpy.types.Operator):
         **sampling(),
     }
     identifier = FILE
-
-    def ask(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str] | None:
-        return self.ask_for_file(context, bool(self.filepath))
+    asks_for = "filepath"
 
     def job(self, context: bpy.types.Context) -> jobs.Job:
         if not self.filepath:

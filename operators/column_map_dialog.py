@@ -1,7 +1,5 @@
 """The column map dialog of the import, drawn."""
 
-from __future__ import annotations
-
 import json
 import textwrap
 

@@ -1,7 +1,5 @@
 """Files dropped on the 3D viewport or the outliner: which operator opens which endings."""
 
-from __future__ import annotations
-
 import bpy
 
 from ..addon import ids

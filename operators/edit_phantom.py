@@ -1,7 +1,5 @@
 """What is done to a phantom in the scene: its voxels made again, its pose applied, its outline shown."""
 
-from __future__ import annotations
-
 import bpy
 
 from ..addon import ids, jobs, phantoms
@@ -20,27 +18,26 @@ class _EditPhantom(jobs.JobOperator):
 
 
 class MPHDRR_OT_update_phantom(_EditPhantom, bpy.types.Operator):
+    """Make the active phantom's voxels again from its settings; its place stays"""
+
     bl_idname = ids.UPDATE_PHANTOM
     bl_label = "Update Phantom"
-    bl_description = "Make the active phantom's voxels again from its settings; its place stays"
-    bl_options = {"REGISTER", "UNDO"}
 
 
 class MPHDRR_OT_apply_phantom_pose(_EditPhantom, bpy.types.Operator):
+    """Make the active phantom's voxels again on a grid along the world's axes; its settings are given up"""
+
     bl_idname = ids.APPLY_PHANTOM_POSE
     bl_label = "Apply Pose"
-    bl_description = (
-        "Make the active phantom's voxels again on a grid along the world's axes; its settings are given up"
-    )
-    bl_options = {"REGISTER", "UNDO"}
 
     bake = True
 
 
 class MPHDRR_OT_show_phantom_outline(bpy.types.Operator):
+    """Show or hide the surfaces of the active phantom's shapes as wires that go with it"""
+
     bl_idname = ids.SHOW_PHANTOM_OUTLINE
     bl_label = "Outline"
-    bl_description = "Show or hide the surfaces of the active phantom's shapes as wires that go with it"
     bl_options = {"REGISTER", "UNDO"}
 
     poll = classmethod(phantoms.poll_phantom)

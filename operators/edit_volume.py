@@ -1,19 +1,18 @@
 """The active volume: slices through it, a CT's attenuation, its files cleaned up or found again."""
 
-from __future__ import annotations
-
 import bpy
 from bpy.props import FloatProperty, StringProperty
 
 from ..addon import ids, jobs, slices, storage, volume_import, volumes
 from ..addon.decimals import typed
-from ..addon.reports import run_reported
+from ..addon.reports import polled, run_reported
 
 
 class MPHDRR_OT_add_slices(bpy.types.Operator):
+    """Show an axial, a coronal and a sagittal slice of the active volume as planes that go with it"""
+
     bl_idname = ids.ADD_SLICES
     bl_label = "Add Slices"
-    bl_description = "Show an axial, a coronal and a sagittal slice of the active volume as planes that go with it"
     bl_options = {"REGISTER", "UNDO"}
 
     poll = classmethod(volumes.poll_volume)
@@ -26,9 +25,10 @@ class MPHDRR_OT_add_slices(bpy.types.Operator):
 
 
 class MPHDRR_OT_remove_slices(bpy.types.Operator):
+    """Remove the active volume's slice planes"""
+
     bl_idname = ids.REMOVE_SLICES
     bl_label = "Remove Slices"
-    bl_description = "Remove the active volume's slice planes"
     bl_options = {"REGISTER", "UNDO"}
 
     poll = classmethod(volumes.poll_volume)
@@ -39,14 +39,11 @@ class MPHDRR_OT_remove_slices(bpy.types.Operator):
 
 
 class MPHDRR_OT_ct_to_attenuation(jobs.JobOperator, bpy.types.Operator):
-    """``bpy.ops.mphdrr.ct_to_attenuation(energy=140.5)``."""
+    """Make a volume of attenuation coefficients (1/mm) from the active volume of CT numbers; the CT stays"""
 
     bl_idname = ids.CT_TO_ATTENUATION
     bl_label = "CT to Attenuation"
-    bl_description = (
-        "Make a volume of attenuation coefficients (1/mm) from the active volume of CT numbers; the CT stays"
-    )
-    bl_options = {"REGISTER", "UNDO"}
+    dialog = {"confirm_text": "Convert"}
 
     energy: FloatProperty(
         name="Energy (keV)", description="Tc-99m: 140.5; a CT of 120 kV: about 70", default=140.5, min=10.0, max=1000.0
@@ -54,22 +51,18 @@ class MPHDRR_OT_ct_to_attenuation(jobs.JobOperator, bpy.types.Operator):
 
     @classmethod
     def poll(cls, context: bpy.types.Context) -> bool:
-        if not volumes.is_volume(context.object) or volumes.quantity_of(context.object) != "hu":
-            cls.poll_message_set("No CT is active: select a volume of CT numbers (hu)")
-            return False
-        return True
-
-    def ask(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str] | None:
-        return self.ask_in_dialog(context, "Convert")
+        is_ct = volumes.is_volume(context.object) and volumes.quantity_of(context.object) == "hu"
+        return polled(cls, is_ct, "No CT is active: select a volume of CT numbers (hu)")
 
     def job(self, context: bpy.types.Context) -> jobs.Job:
         return volume_import.converting(context.object, typed(self.energy))
 
 
 class MPHDRR_OT_clean_volume_files(bpy.types.Operator):
+    """Remove the files of voxels in this .blend's folder that none of its volumes needs any more"""
+
     bl_idname = ids.CLEAN_VOLUME_FILES
     bl_label = "Clean Up Volume Files"
-    bl_description = "Remove the files of voxels in this .blend's folder that none of its volumes needs any more"
     bl_options = {"REGISTER"}
 
     def invoke(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str]:
@@ -86,11 +79,10 @@ class MPHDRR_OT_clean_volume_files(bpy.types.Operator):
 
 
 class MPHDRR_OT_find_volume_files(bpy.types.Operator):
-    """``bpy.ops.mphdrr.find_volume_files(directory="...")``."""
+    """Look for the missing files of voxels, by their names, in a folder and all below it"""
 
     bl_idname = ids.FIND_VOLUME_FILES
     bl_label = "Find Missing Volume Files"
-    bl_description = "Look for the missing files of voxels, by their names, in a folder and all below it"
     bl_options = {"REGISTER", "UNDO"}
 
     directory: StringProperty(name="Folder", description="Where to look", subtype="DIR_PATH", options={"SKIP_SAVE"})

@@ -1,7 +1,5 @@
 """File > Export > Pinhole Geometry: the scanner as a workbook, or as another program's file."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import bpy
@@ -57,12 +55,12 @@ class MPHDRR_OT_export_geometry(selection.OnScanner, ExportHelper, bpy.types.Ope
 
 
 class MPHDRR_OT_export_for_program(selection.OnScanner, ExportHelper, bpy.types.Operator):
+    """Write the scanner as it stands in the scene for another program: cameras for reconstruction codes, solids to print,
+    Monte Carlo simulations. Images are those of the Projections panel
+    """
+
     bl_idname = ids.EXPORT_FOR_PROGRAM
     bl_label = "Export Geometry for a Program"
-    bl_description = (
-        "Write the scanner as it stands in the scene for another program: cameras for reconstruction codes, solids to "
-        "print, Monte Carlo simulations. Images are those of the Projections panel"
-    )
 
     filename_ext = ""
     filepath: StringProperty(

@@ -1,7 +1,5 @@
 """File > Export > Volume: the active volume, where it stands in the world, for other programs."""
 
-from __future__ import annotations
-
 import bpy
 from bpy.props import StringProperty
 
@@ -11,23 +9,24 @@ from ..core.errors import InputError
 
 
 class MPHDRR_OT_export_volume(jobs.JobOperator, bpy.types.Operator):
-    """``bpy.ops.mphdrr.export_volume(filepath="heart.vdb")``."""
-
     bl_idname = ids.EXPORT_VOLUME
     bl_label = "Export Volume"
     bl_description = (
         f"Write every voxel of the active volume, where it stands in the world; endings: {', '.join(WRITTEN_ENDINGS)}"
     )
+    bl_options = set()
 
     filepath: StringProperty(name="File", description="File to write", subtype="FILE_PATH", options={"SKIP_SAVE"})
     filter_glob: StringProperty(default=";".join(f"*{e}" for e in WRITTEN_ENDINGS), options={"HIDDEN"})
 
     poll = classmethod(volumes.poll_volume)
 
-    def ask(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str] | None:
-        is_given = bool(self.filepath)
-        self.filepath = self.filepath or bpy.path.clean_name(context.object.name) + WRITTEN_ENDINGS[0]
-        return self.ask_for_file(context, is_given)
+    def ask(self, context: bpy.types.Context) -> set[str] | None:
+        if self.filepath:
+            return None
+        self.filepath = bpy.path.clean_name(context.object.name) + WRITTEN_ENDINGS[0]
+        context.window_manager.fileselect_add(self)
+        return {"RUNNING_MODAL"}
 
     def job(self, context: bpy.types.Context) -> jobs.Job:
         if not self.filepath:

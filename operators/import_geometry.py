@@ -1,7 +1,5 @@
 """File > Import > Pinhole Geometry: a workbook becomes a scanner, with the column map dialog where headings are unclear."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Literal
 

@@ -1,7 +1,5 @@
 """File > Import > Volume for Projection, Volume Sequence: CTs, SPECT images and OpenVDB grids become volumes."""
 
-from __future__ import annotations
-
 import os
 import re
 from collections.abc import Sequence
@@ -86,23 +84,17 @@ class ReadVolumes(jobs.JobOperator):
 
 
 class MPHDRR_OT_import_volume(ReadVolumes, bpy.types.Operator):
-    """``bpy.ops.mphdrr.import_volume(filepath="ct.nii.gz", attenuation=True)``."""
+    """Read a CT, an image or an OpenVDB grid as a volume to project; of a DICOM series choose the folder"""
 
     bl_idname = ids.IMPORT_VOLUME
     bl_label = "Import Volume"
-    bl_description = (
-        "Read a CT, an image or an OpenVDB grid as a volume to project; of a DICOM series choose the folder"
-    )
-    bl_options = {"REGISTER", "UNDO"}
+    asks_for = "filepath"
 
     filepath: StringProperty(
         name="File", description="Or folder of a DICOM series", subtype="FILE_PATH", options={"SKIP_SAVE"}
     )
     filter_glob: StringProperty(default=";".join(f"*{ending}" for ending in READ_ENDINGS), options={"HIDDEN"})
     name: StringProperty(name="Name", description="The object's name. Empty: the file's", options={"SKIP_SAVE"})
-
-    def ask(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str] | None:
-        return self.ask_for_file(context, bool(self.filepath))
 
     def job(self, context: bpy.types.Context) -> jobs.Job:
         if not self.filepath:
@@ -111,12 +103,11 @@ class MPHDRR_OT_import_volume(ReadVolumes, bpy.types.Operator):
 
 
 class MPHDRR_OT_import_volume_sequence(ReadVolumes, bpy.types.Operator):
-    """``bpy.ops.mphdrr.import_volume_sequence(directory="beats", files=[{"name": "1.nii"}, {"name": "2.nii"}])``."""
+    """Read several files, in the order of their numbers, as one volume that plays over the frames"""
 
     bl_idname = ids.IMPORT_VOLUME_SEQUENCE
     bl_label = "Import Volume Sequence"
-    bl_description = "Read several files, in the order of their numbers, as one volume that plays over the frames"
-    bl_options = {"REGISTER", "UNDO"}
+    asks_for = "files"
 
     directory: StringProperty(description="Where the files are", subtype="DIR_PATH", options={"SKIP_SAVE"})
     files: CollectionProperty(
@@ -127,9 +118,6 @@ class MPHDRR_OT_import_volume_sequence(ReadVolumes, bpy.types.Operator):
     frame_start: IntProperty(name="First Frame", description="Frame that shows the first file", default=1)
 
     own_names = ("name", "frame_start")
-
-    def ask(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str] | None:
-        return self.ask_for_file(context, bool(self.files))
 
     def job(self, context: bpy.types.Context) -> jobs.Job:
         folder = storage.absolute(self.directory)

@@ -1,7 +1,5 @@
 """What a user does with modules: show, aim, duplicate, remove, tidy, renumber, check and map them."""
 
-from __future__ import annotations
-
 import math
 
 import bpy
@@ -99,12 +97,12 @@ class MPHDRR_OT_remove_modules(selection.OnModules, bpy.types.Operator):
 
 
 class MPHDRR_OT_tidy_modules(selection.OnScanner, bpy.types.Operator):
+    """Make modules of copied cameras, with numbers, collimators and crystals of their own, and remove collimators and
+    crystals whose camera was deleted
+    """
+
     bl_idname = ids.TIDY_MODULES
     bl_label = "Tidy Modules"
-    bl_description = (
-        "Make modules of copied cameras, with numbers, collimators and crystals of their own, and remove collimators "
-        "and crystals whose camera was deleted"
-    )
 
     def change(self, context: bpy.types.Context, collection: bpy.types.Collection) -> str:
         tidied = [module_edits.tidy(each) for each in scanner.scanners(context.scene)]
@@ -135,12 +133,12 @@ class MPHDRR_OT_renumber_modules(selection.OnScanner, bpy.types.Operator):
 
 
 class MPHDRR_OT_check_geometry(selection.OnScanner, bpy.types.Operator):
+    """Look for collimators and crystals that overlap, holes that another module blocks, and modules that do not see
+    their ROI; select the modules concerned
+    """
+
     bl_idname = ids.CHECK_GEOMETRY
     bl_label = "Check Geometry"
-    bl_description = (
-        "Look for collimators and crystals that overlap, holes that another module blocks, and modules that do not see "
-        "their ROI; select the modules concerned"
-    )
 
     def change(self, context: bpy.types.Context, collection: bpy.types.Collection) -> str:
         found, concerned = scanner.check_geometry(collection)
@@ -152,13 +150,12 @@ class MPHDRR_OT_check_geometry(selection.OnScanner, bpy.types.Operator):
 
 
 class MPHDRR_OT_add_map(selection.NeedsScanner, jobs.JobOperator, bpy.types.Operator):
+    """Calculate what the scanner, with ideal modules, does in every voxel around the isocentre, and show it as a volume,
+    in place of the last map of this quantity
+    """
+
     bl_idname = ids.ADD_MAP
     bl_label = "Add Map"
-    bl_description = (
-        "Calculate what the scanner, with ideal modules, does in every voxel around the isocentre, and show it as a "
-        "volume, in place of the last map of this quantity"
-    )
-    bl_options = {"REGISTER", "UNDO"}
 
     quantity: EnumProperty(name="Quantity", description="What is mapped", items=maps.QUANTITIES)
     voxels: IntProperty(

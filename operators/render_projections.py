@@ -1,7 +1,5 @@
 """Project a volume into the scanner's modules, as a job; load its settings, show and export its result."""
 
-from __future__ import annotations
-
 import math
 from pathlib import Path
 from typing import Any
@@ -13,18 +11,17 @@ from bpy_extras.io_utils import ExportHelper, ImportHelper
 from ..addon import ids, images, jobs, rendering, scanner, storage
 from ..addon.decimals import typed
 from ..addon.projection_properties import OPENING_ANGLE, ProjectionSettings, settings_recipe
-from ..addon.reports import run_reported
+from ..addon.reports import polled, run_reported
 from ..core.errors import InputError
 
 
 class MPHDRR_OT_render_projections(ProjectionSettings, jobs.JobOperator, bpy.types.Operator):
+    """Project the volume into every module: exact line integrals or SPECT counts, stored as images and as a file beside
+    the .blend. Settings that a script leaves out are those of the panel
+    """
+
     bl_idname = ids.RENDER_PROJECTIONS
     bl_label = "Render Projections"
-    bl_description = (
-        "Project the volume into every module: exact line integrals or SPECT counts, stored as images and as a file "
-        "beside the .blend. Settings that a script leaves out are those of the panel"
-    )
-    bl_options = {"REGISTER", "UNDO"}
 
     volume: StringProperty(name="Volume", description="Name of the volume object to project", options={"SKIP_SAVE"})
     mu: StringProperty(
@@ -55,12 +52,12 @@ class MPHDRR_OT_render_projections(ProjectionSettings, jobs.JobOperator, bpy.typ
 
 
 class MPHDRR_OT_load_recipe(ImportHelper, bpy.types.Operator):
+    """Set the panel as a recipe (.toml) or a run (.h5, .npz, .pt) says: model, detector, noise, modules and, where the
+    scene has objects of their names, volumes. By default the recipe of the last run
+    """
+
     bl_idname = ids.LOAD_RECIPE
     bl_label = "Load Recipe"
-    bl_description = (
-        "Set the panel as a recipe (.toml) or a run (.h5, .npz, .pt) says: model, detector, noise, modules and, where the "
-        "scene has objects of their names, volumes. By default the recipe of the last run"
-    )
     bl_options = {"REGISTER", "UNDO"}
 
     filter_glob: StringProperty(default="*.toml;*.h5;*.hdf5;*.npz;*.pt", options={"HIDDEN"})
@@ -77,16 +74,14 @@ class MPHDRR_OT_load_recipe(ImportHelper, bpy.types.Operator):
 
 
 class MPHDRR_OT_show_projections(bpy.types.Operator):
+    """Show the mosaic of the last run in an Image Editor, opened below the 3D view if there is none"""
+
     bl_idname = ids.SHOW_PROJECTIONS
     bl_label = "Show Projections"
-    bl_description = "Show the mosaic of the last run in an Image Editor, opened below the 3D view if there is none"
 
     @classmethod
     def poll(cls, context: bpy.types.Context) -> bool:
-        if ids.MOSAIC not in bpy.data.images:
-            cls.poll_message_set("No projections yet: render them first")
-            return False
-        return True
+        return polled(cls, ids.MOSAIC in bpy.data.images, "No projections yet: render them first")
 
     def execute(self, context: bpy.types.Context) -> set[str]:
         if not images.show_below(bpy.data.images[ids.MOSAIC], context):

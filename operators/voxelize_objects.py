@@ -1,24 +1,21 @@
 """Closed mesh objects become a volume of activity or attenuation, and volumes become meshes."""
 
-from __future__ import annotations
-
 import bpy
 from bpy.props import EnumProperty, FloatProperty, IntProperty, StringProperty
 
 from ..addon import choices, ids, jobs, meshes, volumes
 from ..addon.decimals import typed
+from ..addon.reports import polled
 
 
 class MPHDRR_OT_voxelize_objects(jobs.JobOperator, bpy.types.Operator):
-    """``bpy.ops.mphdrr.voxelize_objects(value=100)``."""
+    """Make a volume of the selected closed meshes, modifiers included: a voxel holds the share that they cover. An
+    object's custom property 'activity' or 'mu' counts instead of the value; later names cover earlier ones
+    """
 
     bl_idname = ids.VOXELIZE_OBJECTS
     bl_label = "Voxelize Meshes"
-    bl_description = (
-        "Make a volume of the selected closed meshes, modifiers included: a voxel holds the share that they cover. "
-        "An object's custom property 'activity' or 'mu' counts instead of the value; later names cover earlier ones"
-    )
-    bl_options = {"REGISTER", "UNDO"}
+    dialog = {"confirm_text": "Voxelize", "width": 320}
 
     quantity: EnumProperty(
         name="Quantity",
@@ -36,13 +33,7 @@ class MPHDRR_OT_voxelize_objects(jobs.JobOperator, bpy.types.Operator):
 
     @classmethod
     def poll(cls, context: bpy.types.Context) -> bool:
-        if not _chosen(context):
-            cls.poll_message_set("Select closed mesh objects first")
-            return False
-        return True
-
-    def ask(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str] | None:
-        return self.ask_in_dialog(context, "Voxelize", width=320)
+        return polled(cls, bool(_chosen(context)), "Select closed mesh objects first")
 
     def job(self, context: bpy.types.Context) -> jobs.Job:
         return meshes.voxelizing(
@@ -51,19 +42,15 @@ class MPHDRR_OT_voxelize_objects(jobs.JobOperator, bpy.types.Operator):
 
 
 class MPHDRR_OT_mesh_from_volume(jobs.JobOperator, bpy.types.Operator):
-    """``bpy.ops.mphdrr.mesh_from_volume(level=50)``."""
+    """Make a closed mesh of the active volume's surface of one value, for display and print"""
 
     bl_idname = ids.MESH_FROM_VOLUME
     bl_label = "Mesh from Volume"
-    bl_description = "Make a closed mesh of the active volume's surface of one value, for display and print"
-    bl_options = {"REGISTER", "UNDO"}
+    dialog = {"confirm_text": "Make"}
 
     level: FloatProperty(name="Level", description="The surface's value, in the volume's unit; 0: half of the maximum")
 
     poll = classmethod(volumes.poll_volume)
-
-    def ask(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str] | None:
-        return self.ask_in_dialog(context, "Make")
 
     def job(self, context: bpy.types.Context) -> jobs.Job:
         return meshes.extracting(context.object, typed(self.level) or None)

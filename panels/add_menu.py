@@ -1,7 +1,5 @@
 """Add > mphDRR: everything that can be put into the scanner."""
 
-from __future__ import annotations
-
 import bpy
 
 from ..addon import ids

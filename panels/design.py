@@ -1,15 +1,12 @@
 """Sidebar, Geometry > Design: numbers and readouts (`addon/following.py`) of the active module, and of all modules."""
 
-from __future__ import annotations
-
 import json
-import textwrap
 from collections.abc import Sequence
 
 import bpy
 
 from ..addon import ids, jobs, selection
-from .geometry import ScannerPanel, draw_facts
+from .geometry import ScannerPanel, draw_facts, draw_text
 
 _LABELS = (
     ("pinhole_diameter", "Hole d"),
@@ -18,7 +15,6 @@ _LABELS = (
     ("roi_radius", "ROI R"),
 )
 _MOST_FINDINGS = 8
-_LINE = 32  # letters that fit into the sidebar at its usual width
 
 
 class MPHDRR_PT_design(ScannerPanel, bpy.types.Panel):
@@ -75,7 +71,7 @@ class MPHDRR_PT_scanner_design(ScannerPanel, bpy.types.Panel):
             if not findings:
                 layout.label(text="Nothing found", icon="CHECKMARK")
             for text in findings[:_MOST_FINDINGS]:
-                _draw_text(layout, text)
+                draw_text(layout, text)
             if len(findings) > _MOST_FINDINGS:
                 layout.label(text=f"... and {len(findings) - _MOST_FINDINGS} more", icon="BLANK1")
         column = layout.column(align=True)
@@ -94,7 +90,7 @@ def _draw_module(layout: bpy.types.UILayout, camera: bpy.types.Object) -> None:
     _draw_numbers(layout, module, mixed=())
     for text in (module.problem, module.finding, "" if module.aimed else "Not aimed at the isocentre"):
         if text:
-            _draw_text(layout, text)
+            draw_text(layout, text)
     draw_facts(
         layout.box().split(factor=0.42),
         ("Distance b", f"{module.pinhole_distance:.2f} mm"),
@@ -124,10 +120,3 @@ def _draw_numbers(
 
 def _label(text: str, is_mixed: bool) -> str:
     return f"{text}, mixed" if is_mixed else f"{text} (mm)"
-
-
-def _draw_text(layout: bpy.types.UILayout, text: str) -> None:
-    """Draw a text in lines that fit into a narrow sidebar."""
-    column = layout.column(align=True)
-    for i, line in enumerate(textwrap.wrap(text, _LINE)):
-        column.label(text=line, icon="BLANK1" if i else "ERROR")

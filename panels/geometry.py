@@ -1,12 +1,14 @@
 """Sidebar, first step: the scanner and its modules."""
 
-from __future__ import annotations
-
 import json
+import textwrap
 
 import bpy
+import numpy as np
 
 from ..addon import ids, scanner, selection
+
+_LINE = 32  # letters that fit into the sidebar at its usual width
 
 
 class Sidebar:
@@ -46,10 +48,7 @@ class MPHDRR_UL_modules(bpy.types.UIList):
             self.bitflag_filter_item if o.mphdrr_module.is_module and wanted in o.name.lower() else 0 for o in items
         ]
         by_number = sorted(range(len(items)), key=lambda i: (items[i].mphdrr_module.index, items[i].name))
-        order = [0] * len(items)
-        for place, i in enumerate(by_number):
-            order[i] = place
-        return flags, order
+        return flags, np.argsort(by_number).tolist()  # the place of each item
 
 
 class MPHDRR_PT_geometry(Sidebar, bpy.types.Panel):
@@ -141,6 +140,13 @@ def draw_facts(split: bpy.types.UILayout, *facts: tuple[str, str]) -> None:
     for name, value in facts:
         names.label(text=name)
         values.label(text=value)
+
+
+def draw_text(layout: bpy.types.UILayout, text: str, icon: str = "ERROR") -> None:
+    """Draw a text in lines that fit into a narrow sidebar."""
+    column = layout.column(align=True)
+    for i, line in enumerate(textwrap.wrap(text, _LINE)):
+        column.label(text=line, icon="BLANK1" if i else icon)
 
 
 def _columns(layout: bpy.types.UILayout, name: str, *numbers: str) -> None:

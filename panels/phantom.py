@@ -1,16 +1,11 @@
 """Sidebar, second step: the phantom; and Add > mphDRR, everything that can be put into the scanner."""
 
-from __future__ import annotations
-
-import textwrap
 from typing import Any
 
 import bpy
 
 from ..addon import ids, jobs, phantoms, slices, storage, volumes
-from .geometry import Sidebar, draw_facts
-
-_LINE = 32  # letters that fit into the sidebar at its usual width
+from .geometry import Sidebar, draw_facts, draw_text
 
 
 class MPHDRR_PT_phantom(Sidebar, bpy.types.Panel):
@@ -87,12 +82,9 @@ def _draw_phantom(layout: bpy.types.UILayout, item: bpy.types.Object, phantom: A
     settings = item.mphdrr_volume
     phantom.draw_settings(layout)
     if settings.message:
-        column = layout.column(align=True)
+        column = layout.column()
         column.alert = settings.outdated
-        icon = "ERROR" if settings.outdated else "INFO"
-        for line in textwrap.wrap(settings.message, _LINE):
-            column.label(text=line, icon=icon)
-            icon = "BLANK1"
+        draw_text(column, settings.message, "ERROR" if settings.outdated else "INFO")
     column = layout.column(align=True)
     column.enabled = not jobs.is_running()
     row = column.row(align=True)

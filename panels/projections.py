@@ -1,7 +1,5 @@
 """Sidebar, third and last step: the projections, and the dataset that they give."""
 
-from __future__ import annotations
-
 from collections.abc import Container
 
 import bpy

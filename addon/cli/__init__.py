@@ -3,8 +3,6 @@
 The commands without Blender are in `core.cli`; those here import bpy only when they run.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 from ...core import cli

@@ -1,7 +1,5 @@
 """``mphdrr demo``: the main job on the example workbook, from the geometry to a file to train on."""
 
-from __future__ import annotations
-
 import argparse
 import contextlib
 import time

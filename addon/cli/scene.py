@@ -75,10 +75,10 @@ def new_scene() -> bpy.types.Scene:
             f"Blender's bpy package does not load ({error}); on Debian and Ubuntu install libx11-6 libxi6 libxfixes3 "
             "libxrender1 libxkbcommon0 libsm6 libgl1"
         ) from None
-    from .. import ids, registration
+    from .. import registration
 
     bpy.ops.wm.read_homefile(use_empty=True)
-    if not hasattr(bpy.types.Object, ids.OBJECT_MODULE):
+    if not hasattr(bpy.types.Object, "mphdrr_module"):
         registration.register()
     scene = bpy.context.scene
     if scene.world is None:

@@ -4,8 +4,6 @@ A command is a module here with ``add_parser(subparsers)``, which sets the defau
 arguments. `addon.cli` adds those that need Blender.
 """
 
-from __future__ import annotations
-
 import argparse
 import contextlib
 import sys

@@ -1,7 +1,5 @@
 """``mphdrr export RUN -o FILE``."""
 
-from __future__ import annotations
-
 import argparse
 
 from ..errors import InputError

@@ -1,8 +1,7 @@
 """Options and parsing that several commands share."""
 
-from __future__ import annotations
-
 import argparse
+import json
 import sys
 import textwrap
 import time
@@ -14,12 +13,8 @@ from ..errors import InputError
 from ..files import ensure_folder, refuse_folder
 from ..geometry.system import PinholeSystem
 from ..geometry.system import chosen_modules as chosen_modules
-from ..physics.isotopes import photon_energy as photon_energy
 from ..progress import Progress
 from ..workbook import read_system
-
-PLACING_OPTIONS = ("position", "euler", "voxels", "spacing")
-"""Of `add_placing_options`."""
 
 _HANGING = 15 * " "  # under the second column of lists in descriptions
 
@@ -89,44 +84,14 @@ def read_workbook(arguments: argparse.Namespace) -> PinholeSystem:
     return read_system(arguments.workbook, columns=arguments.columns)
 
 
-def add_phantom_options(parser: argparse.ArgumentParser) -> None:
-    """Size, content and place of the Derenzo phantom, and the grid under it."""
-    parser.add_argument("--radius", type=float, default=40.0, metavar="MM", help="radius of the phantom")
-    parser.add_argument("--rods", type=float, nargs="+", default=[8, 6, 5, 4, 3, 2], metavar="MM", help="rod diameters")
-    parser.add_argument("--sectors", type=int, default=6, metavar="N", help="of rods, each of one diameter")
-    parser.add_argument("--height", type=float, default=40.0, metavar="MM", help="length of the rods")
-    parser.add_argument(
-        "--activity", type=float, default=100.0, metavar="kBq/mL", help="concentration in the rods; 0 for cold rods"
-    )
-    parser.add_argument(
-        "--water", type=float, nargs=2, default=[0, 0], metavar=("RADIUS", "HEIGHT"),
-        help="a cylinder of water around the rods, mm; without it, none",
-    )  # fmt: skip
-    parser.add_argument("--background", type=float, default=0.0, metavar="kBq/mL", help="concentration in the water")
-    add_placing_options(parser)
-
-
-def add_placing_options(parser: argparse.ArgumentParser) -> None:
-    """Place of a phantom, and the grid under it."""
-    parser.add_argument(
-        "--position", type=float, nargs=3, default=[0, 0, 0], metavar="MM", help="middle of the phantom, x y z"
-    )
-    text = "phi theta psi: psi about its own axis, theta about y, phi about z"
-    parser.add_argument("--euler", type=float, nargs=3, default=[0, 0, 0], metavar="DEG", help=text)
-    parser.add_argument("--voxels", type=int, nargs="+", default=[256], metavar="N", help="voxels along x y z, or one")
-    parser.add_argument(
-        "--spacing", type=float, nargs="+", metavar="MM", help="voxel size, one or three; default: so that it fits"
-    )
-
-
-def add_view_options(parser: argparse.ArgumentParser) -> None:
-    """The images' size and place, and the modules that have one."""
-    parser.add_argument("--size", type=int, nargs=2, default=[256, 256], metavar=("ROWS", "COLUMNS"), help="pixels")
-    planes = ("virtual", "real")
-    parser.add_argument("--detector", choices=planes, default="virtual", help="upright in front, or crystal")
-    parser.add_argument("--magnification", type=float, default=10.0, help="virtual detector's distance in units of l")
-    parser.add_argument("--pitch", type=float, metavar="MM", help="pixel size; default: the crystal's whole side")
-    parser.add_argument("--modules", metavar="RANGE", help="such as 1-40 or 1-20,41; default: all")
+def print_answer(arguments: argparse.Namespace, record: Any, lines: Iterable[str], notes: Iterable[str] = ()) -> None:
+    """Print a record as JSON if ``--json`` was typed, else its lines of text, with notes on standard error."""
+    if arguments.json:
+        print(json.dumps(record, indent=1))
+        return
+    for note in notes:
+        sys.stderr.write(f"mphdrr: {note}\n")
+    print("\n".join(lines))
 
 
 def one_or_three(values: list) -> list:

@@ -1,7 +1,5 @@
 """``mphdrr phantom KIND -o FILE``."""
 
-from __future__ import annotations
-
 import argparse
 import dataclasses
 import json
@@ -23,17 +21,7 @@ from ..phantoms.shapes import Box, Cylinder, Ellipsoid, Sphere
 from ..validation import whole_shape
 from ..volumes.volume import UNITS
 from ..volumes.volume_files import VOLUME_FORMATS, write_volume
-from .options import (
-    PLACING_OPTIONS,
-    add_command,
-    add_phantom_options,
-    add_placing_options,
-    numbered_path,
-    one_or_three,
-    output_path,
-    progress_bar,
-    refuse,
-)
+from .options import add_command, numbered_path, one_or_three, output_path, progress_bar, refuse
 
 _DEST = "of_phantom_"  # before the name of a phantom's setting: the voxels have a spacing, too
 
@@ -57,14 +45,13 @@ def add_parser(subparsers) -> None:  # type: ignore[no-untyped-def]
     for kind in KINDS:
         parser = add(kind.name, f"make {kind.summary}", kind.example)
         if kind.phantom is DerenzoPhantom:  # its rods and water have options of their own
-            add_phantom_options(parser)
+            _add_derenzo(parser)
             _add_output(parser, _derenzo)
             continue
         _add_settings(parser, kind.phantom)
         if hasattr(kind.phantom, "beating"):
             states = "states of the heart's cycle instead of one --phase, as FILE-1, FILE-2 …"
             parser.add_argument("--frames", type=int, default=argparse.SUPPRESS, metavar="N", help=states)
-        add_placing_options(parser)
         _add_output(parser, partial(_of_kind, kind.phantom))
     for shape, dimensions, example in _SHAPES:
         parser = add(shape.KIND, f"make one {shape.KIND}", example)
@@ -72,13 +59,24 @@ def add_parser(subparsers) -> None:  # type: ignore[no-untyped-def]
             parser.add_argument(f"--{dimension}", type=float, nargs=count, required=True, metavar="MM")
         parser.add_argument("--activity", type=float, default=100.0, metavar="kBq/mL", help="concentration")
         parser.add_argument("--mu", type=float, default=0.0, metavar="1/mm", help="attenuation coefficient")
-        add_placing_options(parser)
         _add_output(parser, partial(_of_shape, shape, list(dimensions)))
     example = "mphdrr phantom file thorax.toml -o thorax.nii.gz"
     file = add_command(kinds, "file", "make the phantom that a TOML file describes", example)
     file.add_argument("file", metavar="TOML", help="shapes in the order of painting, see docs/phantoms.md")
-    add_placing_options(file)
     _add_output(file, lambda arguments: read_phantom(arguments.file))
+
+
+def _add_derenzo(parser: argparse.ArgumentParser) -> None:
+    add = parser.add_argument
+    add("--radius", type=float, default=40.0, metavar="MM", help="radius of the phantom")
+    add("--rods", type=float, nargs="+", default=[8, 6, 5, 4, 3, 2], metavar="MM", help="rod diameters")
+    add("--sectors", type=int, default=6, metavar="N", help="of rods, each of one diameter")
+    add("--height", type=float, default=40.0, metavar="MM", help="length of the rods")
+    activity = "concentration in the rods; 0 for cold rods"
+    add("--activity", type=float, default=100.0, metavar="kBq/mL", help=activity)
+    water = "a cylinder of water around the rods, mm; without it, none"
+    add("--water", type=float, nargs=2, default=[0, 0], metavar=("RADIUS", "HEIGHT"), help=water)
+    add("--background", type=float, default=0.0, metavar="kBq/mL", help="concentration in the water")
 
 
 def _derenzo(arguments: argparse.Namespace) -> DerenzoPhantom:
@@ -119,7 +117,14 @@ def _add_settings(parser: argparse.ArgumentParser, kind: Any) -> None:
 
 
 def _add_output(parser: argparse.ArgumentParser, make: Callable[[argparse.Namespace], Phantom]) -> None:
+    """Place of the phantom, the grid under it, and the files."""
     add = parser.add_argument
+    add("--position", type=float, nargs=3, default=[0, 0, 0], metavar="MM", help="middle of the phantom, x y z")
+    euler = "phi theta psi: psi about its own axis, theta about y, phi about z"
+    add("--euler", type=float, nargs=3, default=[0, 0, 0], metavar="DEG", help=euler)
+    add("--voxels", type=int, nargs="+", default=[256], metavar="N", help="voxels along x y z, or one")
+    spacing = "voxel size, one or three; default: so that it fits"
+    add("--spacing", type=float, nargs="+", metavar="MM", help=spacing)
     add("--quantity", choices=QUANTITIES, default="activity", help="what the voxels hold")
     add("--random", type=int, metavar="SEED", help="draw position and Euler angles at random")
     box = "with --random: sides of the box around --position in which the middle is drawn"
@@ -146,7 +151,7 @@ def _require_fitting(arguments: argparse.Namespace, is_text: bool) -> None:
         refuse(arguments, (f"{_DEST}phase",), "has no effect with --frames, which takes phases evenly over the cycle")
     if is_text:
         why = f"is of voxels, but a .toml holds only the shapes; expected {', '.join(VOLUME_FORMATS)}"
-        refuse(arguments, (*PLACING_OPTIONS, "quantity", "random", "frames", "json"), why)
+        refuse(arguments, ("position", "euler", "voxels", "spacing", "quantity", "random", "frames", "json"), why)
 
 
 def _run(arguments: argparse.Namespace) -> None:

@@ -3,8 +3,6 @@
 Every setting of `runs.settings` is an option; the help lists the most used ones.
 """
 
-from __future__ import annotations
-
 import argparse
 import tomllib
 from pathlib import Path

@@ -1,9 +1,6 @@
 """``mphdrr volume ACTION``: look at volumes, convert them, and turn them into meshes and back."""
 
-from __future__ import annotations
-
 import argparse
-import json
 from typing import Any
 
 import numpy as np
@@ -11,6 +8,7 @@ import numpy as np
 from ..errors import InputError
 from ..geometry.grid import Grid
 from ..physics.ct_numbers import hu_to_mu
+from ..physics.isotopes import photon_energy
 from ..validation import positive, real_array
 from ..volumes.meshes.mesh import MESH_FORMATS, MILLIMETRES, Mesh, read_mesh, write_mesh
 from ..volumes.meshes.surface import volume_to_mesh
@@ -19,7 +17,7 @@ from ..volumes.rearranging import canonical, centered, crop_to_box, pad
 from ..volumes.resampling import resample
 from ..volumes.volume import UNITS, Volume
 from ..volumes.volume_files import VOLUME_FORMATS, read_volume, write_volume
-from .options import add_command, output_path, photon_energy, progress_bar
+from .options import add_command, output_path, print_answer, progress_bar
 
 _MESH_UNIT: dict[str, Any] = {
     "choices": tuple(MILLIMETRES),
@@ -128,12 +126,11 @@ def _info(arguments: argparse.Namespace) -> None:
         "mean": float(array.mean(dtype=np.float64)),
         "largest": float(array.max()),
     }
-    if arguments.json:
-        print(json.dumps({**facts, "affine": grid.affine.tolist()}, indent=1))
-        return
+    lines = []
     for name, value in facts.items():
         text = " ".join(f"{x:g}" if isinstance(x, float) else str(x) for x in np.atleast_1d(value).tolist())
-        print(f"{name:16s} {text}")
+        lines.append(f"{name:16s} {text}")
+    print_answer(arguments, {**facts, "affine": grid.affine.tolist()}, lines)
 
 
 def _convert(arguments: argparse.Namespace) -> None:

@@ -4,8 +4,6 @@ To add a program, write its `Format` in a module here, and list it below. The co
 `docs/geometry-export.md`, which refers to the command's help, take it from the list.
 """
 
-from __future__ import annotations
-
 import os
 from pathlib import Path
 from typing import Any
@@ -14,7 +12,7 @@ from ..errors import InputError
 from ..files import replacing
 from ..geometry.system import PinholeSystem
 from ..geometry.views import Views
-from ..validation import instance
+from ..validation import instance, one_of
 from .cameras import ASTRA, KORNIA, LEAP, NERF, OPENCV, PYTORCH3D, RTK
 from .format import Format, new_folder
 from .gate9 import GATE9
@@ -24,11 +22,12 @@ from .solids import GLB, STL, STL_PARTS, THREE_MF
 
 __all__ = ["FORMATS", "FORMAT_NUMBERS", "Format", "read_geometry", "write_geometry"]
 
-_CAMERAS = (ASTRA, RTK, OPENCV, KORNIA, PYTORCH3D, NERF, LEAP)
-_FORMATS = (*_CAMERAS, None, None, STL, STL_PARTS, THREE_MF, GLB, GATE9, GATE10, MPHDRR)
-FORMATS: dict[str, Format] = {format.name: format for format in _FORMATS if format}
-
 # Blender keeps a menu's choice by its place in the list: add formats at the end, and leave a None where one is removed.
+_FORMATS = (
+    *(ASTRA, RTK, OPENCV, KORNIA, PYTORCH3D, NERF, LEAP, None, None),
+    *(STL, STL_PARTS, THREE_MF, GLB, GATE9, GATE10, MPHDRR),
+)
+FORMATS: dict[str, Format] = {format.name: format for format in _FORMATS if format}
 FORMAT_NUMBERS: dict[str, int] = {format.name: number for number, format in enumerate(_FORMATS) if format}
 
 
@@ -56,8 +55,7 @@ def write_geometry(
         For an unknown format, option or ending, and for what the format cannot express. An existing file then stays.
     """
     instance(system, PinholeSystem, "write_geometry")
-    if format not in FORMATS:
-        raise InputError(f"format {format!r}: expected one of {', '.join(FORMATS)}")
+    one_of(format, FORMATS, "format")
     views = system.views() if views is None else views
     instance(views, Views, "views")
     if len(views) == 0:

@@ -3,8 +3,6 @@
 All but NeRF's describe the images' arrays as they are; pictures of `mosaic.as_seen` are turned by 180 degrees.
 """
 
-from __future__ import annotations
-
 import json
 from collections.abc import Callable
 from pathlib import Path
@@ -14,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import InputError
+from ..geometry.frames import affine_matrix
 from ..geometry.grid import Grid
 from ..geometry.system import PinholeSystem
 from ..geometry.views import Views
@@ -64,8 +63,7 @@ def _leap(views: Views) -> dict[str, Any]:
 
     ``rowVectors`` point to the next row, ``colVectors`` to the next column; all modules have one pixel size.
     """
-    views, (width, height) = _with_common_pitch(views, "leap")
-    _, (columns, rows) = _pixel_axes(views)
+    views, (width, height), (columns, rows) = _with_common_pitch(views, "leap")
     vectors = {
         "sourcePositions": views.sources,
         "moduleCenters": views.detector_centers,
@@ -90,8 +88,8 @@ def _opencv(views: Views) -> dict[str, Any]:
 
 def _kornia(views: Views) -> dict[str, Any]:
     """``kornia.geometry.camera.PinholeCamera``, whose axes and pixels are OpenCV's."""
-    intrinsics, extrinsics = np.tile(np.eye(4), (2, len(views), 1, 1))
-    intrinsics[:, :3, :3], extrinsics[:, :3, :3], extrinsics[:, :3, 3] = _camera_matrices(views, "kornia")
+    matrices, rotations, translations = _camera_matrices(views, "kornia")
+    intrinsics, extrinsics = affine_matrix(matrices, 0.0), affine_matrix(rotations, translations)
     height, width = np.tile(np.array(views.shape, np.float64), (len(views), 1)).T
     return {"intrinsics": intrinsics, "extrinsics": extrinsics, "height": height, "width": width}
 
@@ -135,8 +133,7 @@ def _rtk(system: PinholeSystem, views: Views, path: Path) -> None:
     the rays, not against them, and RTK's distances, which may have either sign, are negative for images that are not
     mirrored. The projections' spacing and origin are not part of an RTK geometry: they stand in a comment.
     """
-    views, pitch = _with_common_pitch(views, "rtk")
-    _, (r, c) = _pixel_axes(views)
+    views, pitch, (r, c) = _with_common_pitch(views, "rtk")
     n_v, n_u = views.shape
     origin = [-(n_u - 1) / 2 * pitch[0], -(n_v - 1) / 2 * pitch[1]]
     lines = [
@@ -194,9 +191,7 @@ def _nerf(system: PinholeSystem, views: Views, path: Path, *, pictures: str = "i
     n_v, n_u = views.shape
     # The picture is the array turned by 180 degrees, and so is the camera; then x right, y down becomes x right, y up.
     axes = rotations * np.array([-1.0, 1.0, -1.0])[:, None]
-    poses = np.tile(np.eye(4), (len(views), 1, 1))
-    poses[:, :3, :3] = axes.transpose(0, 2, 1)
-    poses[:, :3, 3] = views.sources
+    poses = affine_matrix(axes.transpose(0, 2, 1), views.sources)
     (fl_x, _, cx), (_, fl_y, cy), _ = matrices.transpose(1, 2, 0)
     cx, cy = n_u - 0.5 - cx, n_v - 0.5 - cy
     intrinsics = {"camera_angle_x": 2 * np.arctan(n_u / 2 / fl_x), "fl_x": fl_x, "fl_y": fl_y, "cx": cx, "cy": cy}
@@ -224,8 +219,7 @@ def _camera_matrices(views: Views, format: str, mirrored: bool = True) -> tuple[
     with the real one. The first focal length is negative for a mirror image, which no rotation can express. `InputError`
     where pixel steps are not perpendicular, or an image is mirrored and must not be.
     """
-    pitches, (x, y) = _pixel_axes(views)
-    _refuse_oblique(views, format)
+    pitches, (x, y) = _pixel_axes(views, format)
     z = np.cross(x, y)
     to_detector = views.detector_centers - views.sources
     distance = np.einsum("mi,mi->m", z, to_detector)
@@ -245,22 +239,14 @@ def _camera_matrices(views: Views, format: str, mirrored: bool = True) -> tuple[
     return matrices, rotations, -np.einsum("mij,mj->mi", rotations, views.sources)
 
 
-def _pixel_axes(views: Views) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def _pixel_axes(views: Views, format: str) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Pixel pitches (M, 2), mm, and unit vectors (2, M, 3) along columns' and rows' index.
 
-    The second vectors are made exactly perpendicular to the first.
+    The second vectors are made exactly perpendicular to the first; `InputError` names the first view where they are not.
     """
     pitches = np.stack([np.linalg.norm(views.u_steps, axis=1), np.linalg.norm(views.v_steps, axis=1)], axis=1)
-    x = views.u_steps / pitches[:, :1]
-    y = views.v_steps / pitches[:, 1:]
-    y = y - np.einsum("mi,mi->m", x, y)[:, None] * x
-    return pitches, np.stack([x, y / np.linalg.norm(y, axis=1, keepdims=True)])
-
-
-def _refuse_oblique(views: Views, format: str) -> None:
-    """Raise `InputError` naming the first view whose pixel rows are not perpendicular to its columns."""
-    pitches, _ = _pixel_axes(views)
-    cosine = np.einsum("mi,mi->m", views.u_steps, views.v_steps) / pitches.prod(axis=1)
+    x, y = views.u_steps / pitches[:, :1], views.v_steps / pitches[:, 1:]
+    cosine = np.einsum("mi,mi->m", x, y)
     n_v, n_u = views.shape
     proportion = pitches[:, 1] / pitches[:, 0]
     # How far the last row slides along the columns, and the last column along the rows, in pixels.
@@ -270,16 +256,17 @@ def _refuse_oblique(views: Views, format: str) -> None:
             f"view {m}: format {format} needs pixel rows perpendicular to columns, and these are "
             f"{np.degrees(np.arccos(cosine[m])):.4g} degrees apart"
         )
+    y = y - cosine[:, None] * x
+    return pitches, np.stack([x, y / np.linalg.norm(y, axis=1, keepdims=True)])
 
 
-def _with_common_pitch(views: Views, format: str) -> tuple[Views, tuple[float, float]]:
-    """The same rays with one pixel size for all detectors, and that size (pitch_u, pitch_v), mm.
+def _with_common_pitch(views: Views, format: str) -> tuple[Views, tuple[float, float], NDArray[np.float64]]:
+    """The same rays with one pixel size (pitch_u, pitch_v), mm, for all detectors; that size; and the `_pixel_axes`.
 
     Detectors with smaller pixels are moved away from their sources until their pixels are as large as the largest.
     `InputError` where pixel steps are not perpendicular, or two views' pixels have different proportions.
     """
-    _refuse_oblique(views, format)
-    pitches, _ = _pixel_axes(views)
+    pitches, axes = _pixel_axes(views, format)
     proportion = pitches[:, 1] / pitches[:, 0]
     stretch = np.abs(proportion / proportion[0] - 1) * max(views.shape) / 2
     for m in np.flatnonzero(~(stretch <= _TOLERANCE))[:1]:
@@ -290,7 +277,8 @@ def _with_common_pitch(views: Views, format: str) -> tuple[Views, tuple[float, f
     pitch_u, pitch_v = pitches[np.argmax(pitches[:, 0])].tolist()
     scale = pitch_u / pitches[:, :1]
     centers = views.sources + scale * (views.detector_centers - views.sources)
-    return Views(views.sources, centers, scale * views.u_steps, scale * views.v_steps, views.shape), (pitch_u, pitch_v)
+    scaled = Views(views.sources, centers, scale * views.u_steps, scale * views.v_steps, views.shape)
+    return scaled, (pitch_u, pitch_v), axes
 
 
 ASTRA = _array_format("astra", "ASTRA Toolbox: cone_vec vectors", _astra)

@@ -1,7 +1,5 @@
 """What an export format is, and how its file or folder is written: completely or not at all."""
 
-from __future__ import annotations
-
 import inspect
 import os
 import shutil

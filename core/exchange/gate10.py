@@ -3,8 +3,6 @@
 Rotations are the solids' own: opengate hands them to ``G4PVPlacement(G4Transform3D, ...)``, which turns the solid.
 """
 
-from __future__ import annotations
-
 import json
 from dataclasses import dataclass
 from pathlib import Path

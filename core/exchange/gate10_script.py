@@ -8,8 +8,6 @@ images.npy is (modules, rows, columns): the singles in the energy window, pixel 
 module's u and rows along its v, in the order of the modules in simulation.json.
 """
 
-from __future__ import annotations
-
 import argparse
 import json
 import os

@@ -10,8 +10,6 @@ itself. So the files hold the inverse of the solid's rotation. (GateMiscFunction
 GateVVolume.cc, GateVolumePlacement.cc of GATE 9.3.)
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any

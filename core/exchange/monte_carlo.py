@@ -5,8 +5,6 @@ therefore lies at the (x, y) that `PinholeSystem.views(detector="real")` gives i
 energies keV.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 from functools import cached_property
@@ -24,7 +22,7 @@ from ..geometry.system import PinholeSystem
 from ..phantoms.derenzo import DerenzoPhantom
 from ..physics.isotopes import Isotope, isotope
 from ..physics.materials import MATERIALS
-from ..validation import instance, positive, real_array
+from ..validation import instance, one_of, positive, real_array
 
 REFERENCE_ENERGY = 140.5
 """keV at which the energy resolution is given."""
@@ -100,9 +98,7 @@ class Simulation:
                 raise InputError(f"{name}: expected 0 or more, got {value:g}")
         types = get_type_hints(Simulation)
         for name in ("crystal", "collimator", "phantom_material"):
-            known = get_args(types[name])
-            if getattr(self, name) not in known:
-                raise InputError(f"{name} {getattr(self, name)!r}: expected one of {', '.join(known)}")
+            one_of(getattr(self, name), get_args(types[name]), name)
         # Geant4's engines are sure to take seeds up to 900 000 000 (CLHEP's HepJamesRandom).
         seed = real_array(self.seed, "seed", ())
         if seed != int(seed) or not 0 < seed < 900_000_000:

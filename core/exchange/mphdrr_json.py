@@ -1,14 +1,12 @@
 """mphDRR's own JSON file of a geometry. It holds every digit and can be read back."""
 
-from __future__ import annotations
-
 import json
 import os
 from pathlib import Path
 from typing import Any
 
 from ..errors import InputError
-from ..geometry.system import PinholeSystem
+from ..geometry.system import LENGTHS, PinholeSystem
 from ..geometry.views import Views
 from .format import Format
 
@@ -22,8 +20,7 @@ _CONVENTIONS = {
     "projection_matrix": "3 x 4, homogeneous world point to (column, row, 1) times depth; 0 is the centre of pixel 0",
 }
 # Names in the file -> fields of PinholeSystem and of Views.
-_LENGTHS = ("pinhole_diameter", "collimator_length", "detector_side", "detector_thickness", "roi_radius")
-_MODULE = {"number": "numbers", "pinhole_center": "centers"} | {name: name for name in _LENGTHS}
+_MODULE = {"number": "numbers", "pinhole_center": "centers"} | {name: name for name in LENGTHS}
 _VIEW = {"source": "sources", "detector_center": "detector_centers", "u_step": "u_steps", "v_step": "v_steps"}
 
 

@@ -4,8 +4,6 @@ Every part is a closed surface of its own in world mm: origin at the isocentre, 
 colour the parts ("Module 07 collimator"). STL can do neither, so there is also a folder with one file for each part.
 """
 
-from __future__ import annotations
-
 import zipfile
 from collections.abc import Callable
 from pathlib import Path
@@ -13,12 +11,12 @@ from typing import Any, Literal
 
 import numpy as np
 
-from ..errors import InputError
 from ..geometry.collimator import Construction, EdgePlace, angle_from_degrees
 from ..geometry.module_parts import ModulePart, module_parts
 from ..geometry.part_colors import LOOKS
 from ..geometry.system import PinholeSystem
 from ..geometry.views import Views
+from ..validation import one_of
 from ..version import VERSION
 from .format import Format
 
@@ -40,8 +38,7 @@ def _solid_format(name: str, title: str, suffixes: tuple[str, ...], save: _Save)
         opening_degrees: float = 90.0,
         edge_at: EdgePlace = "middle",
     ) -> None:
-        if part not in _KINDS:
-            raise InputError(f"part {part!r}: expected one of {', '.join(_KINDS)}")
+        one_of(part, _KINDS, "part")
         construction = Construction(plate_thickness, wall_thickness, angle_from_degrees(opening_degrees), edge_at)
         save(path, [p for p in module_parts(system, construction) if p.kind in _KINDS[part]])
 

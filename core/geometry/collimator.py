@@ -15,8 +15,6 @@ So a ray from the front that passes the hole at depth 0, is no steeper than the 
 touches nothing. Any other way to that face leads through the plate or a wall.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 from typing import Literal, get_args
@@ -24,7 +22,7 @@ from typing import Literal, get_args
 import numpy as np
 
 from ..errors import InputError
-from ..validation import positive
+from ..validation import one_of, positive
 
 EdgePlace = Literal["middle", "front", "back"]
 
@@ -66,8 +64,7 @@ class Construction:
         object.__setattr__(self, "opening_angle", positive(self.opening_angle, "opening_angle", "rad"))
         if self.opening_angle >= math.pi:
             raise InputError(f"opening_angle: expected less than pi, got {self.opening_angle:g} rad")
-        if self.edge_at not in get_args(EdgePlace):
-            raise InputError(f"edge_at {self.edge_at!r}: expected one of {', '.join(get_args(EdgePlace))}")
+        one_of(self.edge_at, get_args(EdgePlace), "edge_at")
 
     @property
     def front(self) -> float:

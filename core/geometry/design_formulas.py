@@ -1,7 +1,5 @@
 """Design formulas of a pinhole module."""
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 

@@ -1,7 +1,5 @@
 """Ellipses around the isocentre, in the plane z = 0: points at azimuths, distances, and the least-squares fit."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """Module frames, rotations and 4x4 poses. World: right-handed, mm, origin at the isocentre, +z along the patient."""
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
@@ -37,11 +35,14 @@ def module_frames(centers: ArrayLike) -> NDArray[np.float64]:
 
 def module_poses(centers: ArrayLike) -> NDArray[np.float64]:
     """World-from-module poses (M, 4, 4) of pinholes at `centers` (M, 3), mm: columns u, v, k and the centre."""
-    frames = module_frames(centers)
-    poses = np.tile(np.eye(4), (len(frames), 1, 1))
-    poses[:, :3, :3] = frames.transpose(0, 2, 1)
-    poses[:, :3, 3] = centers
-    return poses
+    return affine_matrix(module_frames(centers).transpose(0, 2, 1), centers)
+
+
+def affine_matrix(linear: NDArray[np.float64], translation: ArrayLike) -> NDArray[np.float64]:
+    """Matrices (..., 4, 4) on column vectors, of their linear part (..., 3, 3) and their translation (..., 3)."""
+    matrix = np.zeros((*linear.shape[:-2], 4, 4))
+    matrix[..., :3, :3], matrix[..., :3, 3], matrix[..., 3, 3] = linear, translation, 1.0
+    return matrix
 
 
 def euler_pose(
@@ -52,16 +53,15 @@ def euler_pose(
     The object is turned by psi about its z axis, then by theta about world y, then by phi about world z.
     """
     angles = real_array([phi, theta, psi], "Euler angles", (3,))
-    pose = np.eye(4)
+    rotation = np.eye(3)
     for axis, angle in zip((2, 1, 2), angles, strict=True):
         i, j = (axis + 1) % 3, (axis + 2) % 3
         turn = np.eye(3)
         turn[i, i] = turn[j, j] = np.cos(angle)
         turn[j, i] = np.sin(angle)
         turn[i, j] = -turn[j, i]
-        pose[:3, :3] = pose[:3, :3] @ turn
-    pose[:3, 3] = real_array(translation, "translation", (3,))
-    return pose
+        rotation = rotation @ turn
+    return affine_matrix(rotation, real_array(translation, "translation", (3,)))
 
 
 def checked_affine(affine: ArrayLike, name: str) -> NDArray[np.float64]:

@@ -3,8 +3,6 @@
 Azimuths are polar angles about the isocentre, rad, from +x towards +y, as in the users' workbook.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from typing import Any, Literal

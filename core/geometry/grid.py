@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..validation import freeze, lengths, real_array, whole_shape
-from .frames import checked_affine
+from .frames import affine_matrix, checked_affine
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,9 +35,8 @@ class Grid:
         """
         counts = whole_shape(np.broadcast_to(np.asarray(shape), 3) if np.ndim(shape) == 0 else shape, "grid shape", 3)
         spacing = lengths(spacing, "voxel spacing", 3)
-        affine = np.diag([*spacing, 1.0])
-        affine[:3, 3] = real_array(center, "grid centre", (3,)) - spacing * (np.array(counts) - 1) / 2
-        return cls(counts, affine)
+        first = real_array(center, "grid centre", (3,)) - spacing * (np.array(counts) - 1) / 2
+        return cls(counts, affine_matrix(np.diag(spacing), first))
 
     @property
     def spacing(self) -> NDArray[np.float64]:

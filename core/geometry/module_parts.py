@@ -4,14 +4,13 @@ A solid's coordinates are those of the module's camera space, mm: the pinhole at
 crystal reaches from Z = l to l + Td, and the collimator stands in front of it, around the pinhole.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ..errors import InputError
+from ..errors import InputError, naming
+from ..validation import freeze
 from .collimator import Collimator, Construction
 from .part_colors import PartKind
 from .system import PinholeSystem
@@ -22,6 +21,11 @@ Solid = tuple[NDArray[np.float64], NDArray[np.int32]]
 # Points on a ring: a multiple of 8, so that squares have points at their corners. The polygon is inscribed in the hole's
 # circle: 99.84 % of the area is open.
 _N = 64
+
+
+_FACES = [[0, 3, 2, 1], [4, 5, 6, 7], [0, 1, 5, 4], [1, 2, 6, 5], [2, 3, 7, 6], [3, 0, 4, 7]]
+BOX_FACES = freeze(np.array(_FACES, np.int32))
+"""A box's quads (6, 4), where corners 0 to 3 go around one end, and 4 to 7 around the other."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,10 +58,8 @@ def module_collimators(system: PinholeSystem, construction: Construction) -> lis
     made = []
     sizes = (system.pinhole_diameter, system.collimator_length, system.detector_side)
     for number, d, l, side in zip(system.numbers.tolist(), *(size.tolist() for size in sizes), strict=True):
-        try:
+        with naming(f"module {number}"):
             made.append(Collimator(d, l, side, construction))
-        except InputError as error:
-            raise InputError(f"module {number}: {error}") from None
     return made
 
 
@@ -107,8 +109,7 @@ def crystal_solid(collimator_length: float, detector_side: float, detector_thick
     h = detector_side / 2
     front, back = collimator_length, collimator_length + detector_thickness
     vertices = np.array([[x, y, z] for z in (front, back) for x, y in ((-h, -h), (h, -h), (h, h), (-h, h))])
-    faces = [[0, 3, 2, 1], [4, 5, 6, 7], [0, 1, 5, 4], [1, 2, 6, 5], [2, 3, 7, 6], [3, 0, 4, 7]]
-    return vertices, np.array(faces, dtype=np.int32)
+    return vertices, BOX_FACES
 
 
 def surface_fault(solid: Solid) -> str | None:

@@ -1,7 +1,5 @@
 """How the parts of modules look, in Blender and in exported solids."""
 
-from __future__ import annotations
-
 from typing import Literal, NamedTuple
 
 PartKind = Literal["collimator", "crystal"]

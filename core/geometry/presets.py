@@ -5,8 +5,6 @@ They differ in more than scale. The true one looks from the pinhole, so that nea
 the pinhole's distance b. Its radiographs are plausible, but are not what the scanner sees.
 """
 
-from __future__ import annotations
-
 from numpy.typing import ArrayLike
 
 from ..validation import lengths as checked_lengths

@@ -1,7 +1,5 @@
 """The rings of a given system: the order of their modules, and the ellipse that each follows."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any

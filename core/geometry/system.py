@@ -17,6 +17,9 @@ from .views import Views
 
 Detector = Literal["virtual", "real"]
 
+LENGTHS = ("pinhole_diameter", "collimator_length", "detector_side", "detector_thickness", "roi_radius")
+"""The modules' dimensions."""
+
 # Pinholes that differ in z by less than this fraction of the crystal's side belong to one ring.
 _RING_GAP = 0.2
 
@@ -51,7 +54,7 @@ class PinholeSystem:
             raise InputError("numbers: expected whole numbers")
         object.__setattr__(self, "centers", freeze(centers))
         object.__setattr__(self, "numbers", freeze(numbers))
-        for name in _LENGTHS:
+        for name in LENGTHS:
             object.__setattr__(self, name, freeze(one_for_all(getattr(self, name), name, n)))
             self._refuse(getattr(self, name) <= 0, f"{name} must be more than 0 mm, got {{{name}:g}}")
         self._refuse(
@@ -171,6 +174,3 @@ def chosen_modules(system: PinholeSystem, text: str | None, name: str = "--modul
             raise InputError(f"{name} {text!r}: no module {part.strip()}; there are {lowest} to {highest}")
         wanted.append(found)
     return system[np.unique(np.concatenate(wanted))]
-
-
-_LENGTHS = ("pinhole_diameter", "collimator_length", "detector_side", "detector_thickness", "roi_radius")

@@ -1,7 +1,5 @@
 """The Defrise phantom: hot disks across the axis, which show where data along the axis are missing."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -21,7 +19,6 @@ class DefrisePhantom(Phantom):
 
     After M. Defrise et al., "A solution to the long-object problem in helical cone-beam tomography", Physics in Medicine
     and Biology 45 (2000) 623-643. By default it fills a ball of 75 mm radius.
-    The fields say what each setting is, and its unit.
     """
 
     disks: int = count(7, "how many")

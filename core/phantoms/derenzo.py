@@ -1,7 +1,5 @@
 """The Derenzo phantom: parallel rods, of one diameter in each sector, alone or in a cylinder of water."""
 
-from __future__ import annotations
-
 import math
 import warnings
 from collections.abc import Sequence
@@ -167,7 +165,7 @@ class DerenzoRods(Shape):
 class DerenzoPhantom(Phantom):
     """Rods along z, centred on the origin, of one diameter in each of `sectors`; for their places see `DerenzoRods`.
 
-    The fields say what each setting is, and its unit. `InputError` if no rod fits.
+    `InputError` if no rod fits.
     """
 
     radius: float = setting(40.0, "mm", "of the phantom")

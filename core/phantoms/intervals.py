@@ -4,8 +4,6 @@ Points and directions are (n, N); intervals are two arrays (1, N), from and to w
 misses.
 """
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 

@@ -1,7 +1,5 @@
 """The Jaszczak phantom: rods and spheres, cold as a rule, in a cylinder of active water."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -24,7 +22,6 @@ class JaszczakPhantom(Phantom):
     base (-z) in the pattern of `DerenzoRods`. The data sheet does not give the spheres' distance from the axis: here it is
     half the radius, and they lie 60 degrees apart, counter-clockwise from -y. The wall, 3.2 mm thick, is not modelled.
     Cold rods and spheres are made of PMMA, others of water.
-    The fields say what each setting is, and its unit.
     """
 
     radius: float = setting(108.0, "mm", "of the cylinder, inside")

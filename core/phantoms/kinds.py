@@ -3,8 +3,6 @@
 A new kind is a file with its dataclass, whose fields are made by `settings.setting`, `count` and `choice`, and a line here.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from types import MappingProxyType
 from typing import Any, NamedTuple

@@ -22,8 +22,6 @@
 Keys are the attributes of the shapes; angles are degrees, ``euler_degrees = [phi, theta, psi]``.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import math
 import os
@@ -33,7 +31,7 @@ from typing import Any
 
 import numpy as np
 
-from ..errors import InputError
+from ..errors import InputError, naming
 from ..files import replacing
 from ..toml import parse_toml, read_toml, toml_value
 from ..validation import instance
@@ -79,19 +77,18 @@ def write_phantom(phantom: Phantom, path: str | os.PathLike[str]) -> None:
 
 
 def _phantom(table: dict[str, Any], name: str) -> ShapePhantom:
-    try:
+    with naming(name):
         _refuse_unknown(table, ("name", "mu_energy", "shape"))
         shapes = table.get("shape", [])
         if not isinstance(shapes, list) or not shapes or not all(isinstance(shape, dict) for shape in shapes):
             raise InputError("expected one [[shape]] or more")
         made = [_shape(i, entries) for i, entries in enumerate(shapes, 1)]
         return ShapePhantom(made, table.get("name", ""), table.get("mu_energy", ShapePhantom.mu_energy))
-    except InputError as error:
-        raise InputError(f"{name}: {error}") from None
 
 
 def _shape(number: int, given: dict[str, Any]) -> Shape:
-    try:
+    name = given.get("name", "")
+    with naming(f"shape {number}{f' {name!r}' if name else ''}"):
         entries = dict(given)
         kind = entries.pop("kind", None)
         if not isinstance(kind, str) or kind not in SHAPES:
@@ -107,9 +104,6 @@ def _shape(number: int, given: dict[str, Any]) -> Shape:
                 raise InputError(f"{_EULER}: expected 3 numbers, got {angles!r}")
             entries["euler"] = [math.radians(angle) for angle in angles]
         return SHAPES[kind](**entries)
-    except InputError as error:
-        name = given.get("name", "")
-        raise InputError(f"shape {number}{f' {name!r}' if name else ''}: {error}") from None
 
 
 def _refuse_unknown(table: dict[str, Any], known: Iterable[str]) -> None:

@@ -1,7 +1,5 @@
 """The body phantom of IEC 61675-1 and NEMA NU 2: six spheres and a lung insert in a torso of water."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -33,7 +31,6 @@ class NemaBody(Phantom):
     clockwise. The origin is the middle of the spheres' circle, halfway between front and back, 35 mm in front of the
     body's circles' centres. Walls are not modelled. NU 2 asks for spheres 4 (or 8) times as active as a background of
     5.3 kBq/mL.
-    The fields say what each setting is, and its unit.
     """
 
     sphere_diameters: tuple[float, ...] = setting((10.0, 13.0, 17.0, 22.0, 28.0, 37.0), "mm", "inside; 0 for none", 0.0)

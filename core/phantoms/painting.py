@@ -173,11 +173,7 @@ def paint_voxels(
             for _ in stroke.paint(image, pool):
                 done += 1
                 if progress is not None:
-                    try:
-                        progress(done, total)
-                    except BaseException:
-                        pool.shutdown(wait=False, cancel_futures=True)
-                        raise
+                    progress(done, total)
     # Where layers were sampled at different points, one may replace a little more than there was.
     values = [layer.value for layer in layers]
     if min(values, default=0.0) >= 0:
@@ -343,10 +339,9 @@ def _coverage(index: NDArray[np.int64], own: _Sampled, lower: Sequence[_Sampled]
 def line_integrals(layers: Sequence[Layer], starts: Points, ends: Points) -> Points:
     """Integrals (N,) of the painting, value x mm, along the lines from `starts` to `ends`, (N, 3) world mm: exact."""
     step = max(1, _RAYS * _PARTS // max(_PARTS, *(layer.shape.n_parts for layer in layers), 1))
-    blocks = [slice(first, first + step) for first in range(0, len(starts), step)]
-    return np.concatenate(
-        [np.empty(0), *(_integrals_of_block(layers, starts[block].T, ends[block].T) for block in blocks)]
-    )
+    blocks = (slice(first, first + step) for first in range(0, len(starts), step))
+    parts = (_integrals_of_block(layers, starts[block].T, ends[block].T) for block in blocks)
+    return np.concatenate([np.empty(0), *parts])
 
 
 def _integrals_of_block(layers: Sequence[Layer], starts: Points, ends: Points) -> Points:
@@ -401,7 +396,8 @@ def _r3_sequence(n: int, first: int = 0) -> Points:
     """
     ratio = 1.2207440846057596  # the real root of x^4 = x + 1
     steps = ratio ** -np.arange(1.0, 4.0)
-    return (0.5 + np.outer(steps, np.arange(first + 1, first + n + 1))) % 1.0
+    points = 0.5 + np.outer(steps, np.arange(first + 1, first + n + 1))
+    return points - np.floor(points)  # the remainder, several times faster than %
 
 
 def _moved(pose: Points, points: Points) -> Points:

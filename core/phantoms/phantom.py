@@ -1,7 +1,5 @@
 """Phantoms: what all kinds have in common, and those given as a list of shapes."""
 
-from __future__ import annotations
-
 import itertools
 import math
 import warnings
@@ -13,13 +11,13 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ..errors import InputError, InputWarning
+from ..errors import InputError, InputWarning, naming
 from ..geometry.frames import checked_affine
 from ..geometry.grid import Grid
 from ..geometry.views import Views
 from ..memory import require
 from ..progress import Progress
-from ..validation import freeze, instance, positive, real_array
+from ..validation import freeze, instance, one_of, positive, real_array
 from ..volumes.volume import UNITS, Volume
 from .painting import Layer, line_integrals, mean_changes, paint_voxels, points_inside, values_at
 from .settings import check_settings
@@ -45,7 +43,7 @@ class Phantom:
 
     The frame's origin is the phantom's middle; `pose` is world-from-phantom (4, 4), mm, any invertible affine (default:
     identity), see `euler_pose`. The `quantity` is ``"activity"`` (kBq/mL) or ``"mu"`` (1/mm, at `mu_energy`).
-    A kind of phantom defines its `shapes`; everything else follows.
+    A kind of phantom defines its `shapes`; everything else follows. Its fields say what each setting is, and its unit.
     """
 
     mu_energy: float = 140.5
@@ -61,10 +59,8 @@ class Phantom:
 
     def __post_init__(self) -> None:
         check_settings(self, self.title)
-        try:
+        with naming(self.title):
             len(self.shapes)
-        except InputError as error:
-            raise InputError(f"{self.title}: {error}") from None
 
     @property
     def total_activity(self) -> float:
@@ -165,8 +161,7 @@ class Phantom:
 
     def _layers(self, quantity: str, pose: ArrayLike | None = None) -> list[Layer]:
         """The shapes that have the quantity, placed in the world."""
-        if quantity not in QUANTITIES:
-            raise InputError(f"quantity {quantity!r}: expected one of {', '.join(QUANTITIES)}")
+        one_of(quantity, QUANTITIES, "quantity")
         world = np.eye(4) if pose is None else checked_affine(pose, "phantom pose")
         return [
             Layer(shape, world @ shape.pose, value)

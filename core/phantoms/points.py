@@ -1,7 +1,5 @@
 """Point sources on a lattice, for resolution and calibration."""
 
-from __future__ import annotations
-
 import itertools
 import math
 from collections.abc import Sequence
@@ -23,7 +21,7 @@ _MOST = 10_000
 class PointGrid(Phantom):
     """Equal small balls on a lattice centred on the origin, in air.
 
-    Each point holds its whole activity on voxels of any size. The fields say what each setting is, and its unit.
+    Each point holds its whole activity on voxels of any size.
     """
 
     counts: tuple[int, int, int] = count((5, 5, 5), "how many along x y z")

@@ -1,7 +1,5 @@
 """Random poses, for training sets."""
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 

@@ -1,7 +1,5 @@
 """Settings of a kind of phantom: the fields of its dataclass with their units, help and checks."""
 
-from __future__ import annotations
-
 import dataclasses
 import itertools
 import math

@@ -4,8 +4,6 @@ A shape lies in its own frame, centred on the origin with its axis along z; `pos
 say otherwise: a line enters and leaves them once.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass, field
 from functools import cached_property

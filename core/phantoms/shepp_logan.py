@@ -1,7 +1,5 @@
 """The three-dimensional Shepp-Logan head phantom: ten ellipsoids, added up."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -41,7 +39,6 @@ class SheppLogan(Phantom):
 
     The head measures 1.38 x 1.84 x 1.62 of `half_size`. The contrast of the activity is ``"modified"`` (visible) or
     ``"original"`` (1 % between the parts of the brain); mu always has the original densities.
-    The fields say what each setting is, and its unit.
     """
 
     half_size: float = setting(75.0, "mm", "the unit of the tables: the head is 1.84 times as long")

@@ -1,7 +1,5 @@
 """Closed meshes of shapes."""
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 
@@ -16,21 +14,15 @@ def lathe(radii: NDArray[np.float64], heights: NDArray[np.float64], a: float, b:
     """
     angle = 2 * np.pi * (np.arange(n_sides) + 0.5) / n_sides
     circle = np.stack([a * np.cos(angle), b * np.sin(angle)], axis=1)
-    rings = len(radii) - 2
-    vertices = np.empty((rings * n_sides + 2, 3))
-    vertices[1:-1, :2] = (radii[1:-1, None, None] * circle).reshape(-1, 2)
-    vertices[1:-1, 2] = np.repeat(heights[1:-1], n_sides)
-    vertices[0], vertices[-1] = (0, 0, heights[0]), (0, 0, heights[-1])
-    here, following = np.arange(n_sides), np.roll(np.arange(n_sides), -1)
-    bottom = np.stack([np.zeros_like(here), 1 + following, 1 + here], axis=1)
-    last = 1 + (rings - 1) * n_sides
-    top = np.stack([np.full_like(here, len(vertices) - 1), last + here, last + following], axis=1)
-    faces = [bottom]
-    for ring in range(rings - 1):
-        low, high = 1 + ring * n_sides, 1 + (ring + 1) * n_sides
-        faces.append(np.stack([low + here, low + following, high + following], axis=1))
-        faces.append(np.stack([low + here, high + following, high + here], axis=1))
-    return vertices, np.concatenate([*faces, top]).astype(np.int32)
+    sides = (radii[1:-1, None, None] * circle).reshape(-1, 2)
+    sides = np.column_stack([sides, np.repeat(heights[1:-1], n_sides)])
+    vertices = np.concatenate([[(0, 0, heights[0])], sides, [(0, 0, heights[-1])]])
+    # Rings of vertices, of which the first and the last are a single one: there one of a quad's two triangles is empty.
+    rings = np.arange(1 - n_sides, len(sides) + n_sides + 1).reshape(-1, n_sides).clip(0, len(sides) + 1)
+    following = np.roll(rings, -1, axis=1)
+    quads = np.stack([rings[:-1], following[:-1], following[1:], rings[1:]], axis=-1)
+    faces = quads[..., [0, 1, 2, 0, 2, 3]].reshape(-1, 3)
+    return vertices, faces[(faces != np.roll(faces, 1, axis=1)).all(axis=1)].astype(np.int32)
 
 
 def clipped(surface: Surface, normal: NDArray[np.float64], offset: float) -> Surface:
@@ -39,34 +31,29 @@ def clipped(surface: Surface, normal: NDArray[np.float64], offset: float) -> Sur
     height = vertices @ normal - offset
     # A vertex in the plane would give slivers without area.
     height = np.where(np.abs(height) < 1e-9 * np.abs(vertices).max(), -1e-9 * np.abs(vertices).max(), height)
-    if (height <= 0).all():
-        return surface
-    points, made = list(vertices), {}
-
-    def crossing(i: int, j: int) -> int:
-        key = (min(i, j), max(i, j))
-        if key not in made:
-            share = height[key[0]] / (height[key[0]] - height[key[1]])
-            made[key] = len(points)
-            points.append(vertices[key[0]] + share * (vertices[key[1]] - vertices[key[0]]))
-        return made[key]
-
-    kept = (height[faces] <= 0).sum(axis=1)
-    triangles = [tuple(face) for face in faces[kept == 3]]
-    rim = []
-    for face in faces[(kept == 1) | (kept == 2)]:
-        polygon, cut = [], {}
-        for i, j in zip(face, np.roll(face, -1), strict=True):
-            if height[i] <= 0:
-                polygon.append(i)
-            if (height[i] <= 0) != (height[j] <= 0):
-                cut["leave" if height[i] <= 0 else "enter"] = crossing(i, j)
-                polygon.append(crossing(i, j))
-        triangles += [(polygon[0], polygon[k], polygon[k + 1]) for k in range(1, len(polygon) - 1)]
-        rim.append((cut["enter"], cut["leave"]))
-    if rim:
-        points.append(np.mean([points[i] for i, _ in rim], axis=0))
-        # The face's own edge runs from `leave` to `enter`: the lid's runs the other way.
-        triangles += [(len(points) - 1, enter, leave) for enter, leave in rim]
-    used, corners = np.unique(np.array(triangles, np.int32).reshape(-1, 3), return_inverse=True)
-    return np.array(points)[used], corners.reshape(-1, 3).astype(np.int32)
+    below = (height <= 0)[faces]
+    kept = below.sum(axis=1)
+    cut = (kept == 1) | (kept == 2)
+    if not cut.any():
+        return vertices, faces[kept == 3]
+    # Turned so that the corner that lies alone on its side comes first; the plane crosses the edges from there.
+    alone = np.argmax(below[cut] == (kept[cut] == 1)[:, None], axis=1)
+    a, b, c = np.take_along_axis(faces[cut], (alone[:, None] + np.arange(3)) % 3, axis=1).T
+    edges = np.sort(np.concatenate([np.stack([a, b], axis=1), np.stack([a, c], axis=1)]), axis=1)
+    edges, place = np.unique(edges, axis=0, return_inverse=True)
+    first, last = edges.T
+    share = height[first] / (height[first] - height[last])
+    crossings = vertices[first] + share[:, None] * (vertices[last] - vertices[first])
+    points = np.concatenate([vertices, crossings, crossings.mean(axis=0, keepdims=True)])
+    to_b, to_c = len(vertices) + place.reshape(2, -1)
+    middle = np.full_like(a, len(points) - 1)
+    one, two = kept[cut] == 1, kept[cut] == 2
+    triangles = np.concatenate(
+        [
+            faces[kept == 3],
+            *(np.stack(corners, axis=1)[one] for corners in ((a, to_b, to_c), (middle, to_c, to_b))),
+            *(np.stack(corners, axis=1)[two] for corners in ((to_b, b, c), (to_b, c, to_c), (middle, to_b, to_c))),
+        ]
+    )
+    used, corners = np.unique(triangles, return_inverse=True)
+    return points[used], corners.reshape(-1, 3).astype(np.int32)

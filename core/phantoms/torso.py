@@ -56,7 +56,6 @@ class CardiacTorso(Phantom):
     The activities are choices for rest, an hour after 1 GBq: 1.2 % of it in the heart (sestamibi's prescribing
     information) is about 90 kBq/mL in 133 g; the other organs are set to ratios seen in clinical images; the spine has
     the body's.
-    The fields say what each setting is, and its unit.
     """
 
     phase: float = setting(0.0, "of the cycle", "0 at end-diastole, 0.35 at end-systole, below 1", 0.0)

@@ -3,8 +3,6 @@
 Functions of slopes take arrays or tensors.
 """
 
-from __future__ import annotations
-
 import functools
 import math
 from collections.abc import Sequence

@@ -3,8 +3,6 @@
 Functions of cosines and positions take arrays or tensors.
 """
 
-from __future__ import annotations
-
 import math
 
 import numpy as np
@@ -12,18 +10,11 @@ from numpy.typing import NDArray
 
 from ..arrays import ArrayOrTensor, namespace
 
-Array = NDArray[np.float64]
-
-
-def layer_depths(n: int, thickness: float) -> Array:
-    """Depths (n,), mm behind the crystal's front, that photons are assigned to: 0 alone, or from front to back."""
-    return np.linspace(0.0, thickness, n)
-
 
 def absorbed_share(
     cosine: ArrayOrTensor, mu: float, thickness: float, depths: NDArray[np.float64], layer: int
 ) -> ArrayOrTensor:
-    """Fraction of the photons that are assigned to ``depths[layer]`` (of `layer_depths`).
+    """Fraction of the photons that are assigned to ``depths[layer]``: of 0 alone, or of depths from 0 to `thickness`.
 
     A fraction exp(-mu z / cosine) of the photons reaches depth z. A photon absorbed between two depths is shared
     between them by linear interpolation, so the total, ``1 - exp(-mu thickness / cosine)``, and the mean depth are

@@ -5,8 +5,6 @@ The conversion is bilinear: tissue below 0 HU is a mixture of air and water, abo
 Nucl. Sci. 50 (2003) 1510-1515).
 """
 
-from __future__ import annotations
-
 import warnings
 from typing import Any
 

@@ -10,8 +10,6 @@ are left out: the other isotopes' below 35 keV, and Lu-177's (54 to 63 keV, 6 % 
 Evaluations differ by as much as 3 % (Tc-99m: 0.885 to 0.891; Xe-133's 81 keV: 0.369 to 0.380).
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 

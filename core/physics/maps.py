@@ -1,7 +1,5 @@
 """Maps of a system's performance, as volumes. A voxel's value is that at its centre, and 0 where no module sees it."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from typing import Any
@@ -64,7 +62,6 @@ def resolution_map(
     The variance of all photons together is the mean of the modules' variances. A reconstruction that models the blur
     may do better, and one from few counts worse. Parameters are as in `sensitivity_map` and `resolution`.
     """
-
     edge: dict[str, Any] = {"aperture_mu": aperture_mu, "opening_angle": opening_angle}
 
     def combined(points: Array) -> Array:

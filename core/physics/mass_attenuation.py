@@ -1,7 +1,5 @@
 """Mass attenuation coefficients of the elements from NIST, 10 to 1000 keV: the table in mass_attenuation.txt."""
 
-from __future__ import annotations
-
 from functools import cache
 from pathlib import Path
 

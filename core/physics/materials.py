@@ -3,8 +3,6 @@
 A material's coefficient at any energy is the sum of its elements' `mass_attenuation` coefficients, weighted by mass.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 

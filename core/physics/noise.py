@@ -1,7 +1,5 @@
 """Poisson noise of counts."""
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 

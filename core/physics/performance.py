@@ -11,8 +11,6 @@ R. Accorsi, S. D. Metzler, "Analytic determination of the resolution-equivalent 
 collimator", IEEE Transactions on Medical Imaging 23 (2004) 750-763.
 """
 
-from __future__ import annotations
-
 import math
 from typing import NamedTuple
 
@@ -25,7 +23,7 @@ from ..geometry.design_formulas import roi_radius_seen
 from ..geometry.system import PinholeSystem
 from ..validation import instance, positive, real_array
 from .aperture import half_value_diameter, paix_diameter
-from .crystal import absorbed_share, layer_depths
+from .crystal import absorbed_share
 
 Array = NDArray[np.float64]
 
@@ -36,12 +34,12 @@ def seen(system: PinholeSystem, points: ArrayLike) -> NDArray[np.bool_]:
     A module sees a point in front of its pinhole if the ray from there through the pinhole's centre meets the crystal's
     front face, ``l max(|x_u|, |x_v|) <= Ld h / 2``.
     """
-    return _seen(system, *_in_modules(system, real_array(points, "points", (None, 3))))
+    return _seen(system, *_in_modules(system, points))
 
 
 def magnification(system: PinholeSystem, points: ArrayLike) -> Array:
     """Magnification l / h (P, M) at each of the `points` (P, 3), world mm; NaN behind the pinhole."""
-    _, _, h = _in_modules(system, real_array(points, "points", (None, 3)))
+    _, _, h = _in_modules(system, points)
     with np.errstate(divide="ignore"):
         return np.where(h > 0, system.collimator_length / h, np.nan)
 
@@ -65,12 +63,11 @@ def sensitivity(
     for Paix's ``d_e^2 = d (d + 2 / mu tan(alpha / 2))``; without a coefficient nothing penetrates and d_e = d. `crystal_mu`
     is the crystal's, 1/mm; without it, all photons are stopped. `points` are as in `seen`.
     """
-    points = real_array(points, "points", (None, 3))
+    x_u, x_v, h = _in_modules(system, points)
     _check_edge(aperture_mu, opening_angle)
     if crystal_mu is not None:
         crystal_mu = positive(crystal_mu, "crystal_mu", "1/mm")
     photons_per_decay = positive(photons_per_decay, "photons_per_decay")
-    x_u, x_v, h = _in_modules(system, points)
     visible = _seen(system, x_u, x_v, h)
     h[~visible] = 1.0  # avoids dividing by zero
     cosine = h / np.sqrt(x_u**2 + x_v**2 + h**2)
@@ -94,12 +91,11 @@ def resolution(
     the knife edge transmits half of the photons (Accorsi and Metzler 2004, along the axis). `intrinsic_fwhm` is R_i, mm
     on the crystal; the other parameters are as in `sensitivity`.
     """
-    points = real_array(points, "points", (None, 3))
+    x_u, x_v, h = _in_modules(system, points)
     _check_edge(aperture_mu, opening_angle)
     intrinsic_fwhm = float(real_array(intrinsic_fwhm, "intrinsic_fwhm", ()))
     if intrinsic_fwhm < 0:
         raise InputError(f"intrinsic_fwhm: expected 0 mm or more, got {intrinsic_fwhm:g}")
-    x_u, x_v, h = _in_modules(system, points)
     diameter = half_value_diameter(system.pinhole_diameter, aperture_mu, opening_angle)
     fwhm = _fwhm(h / system.collimator_length, diameter, intrinsic_fwhm)
     fwhm[~_seen(system, x_u, x_v, h)] = np.nan
@@ -144,8 +140,9 @@ def isocentre_performance(
     )
 
 
-def _in_modules(system: PinholeSystem, points: Array) -> tuple[Array, Array, Array]:
-    """x_u, x_v and h (P, M), mm, of points (P, 3) in the modules' frames."""
+def _in_modules(system: PinholeSystem, points: ArrayLike) -> tuple[Array, Array, Array]:
+    """x_u, x_v and h (P, M), mm, of points (P, 3) in the modules' frames; checks both."""
+    points = real_array(points, "points", (None, 3))
     instance(system, PinholeSystem, "system")
     u, v, k = system.frames().transpose(1, 2, 0)
     return points @ u, points @ v, points @ k + system.pinhole_distance
@@ -161,7 +158,7 @@ def _counted(h: Array, cosine: Array, diameter: Array, thickness: Array, crystal
     passed = (diameter / h) ** 2 * cosine * cosine * cosine / 16
     if crystal_mu is None:
         return passed
-    return passed * absorbed_share(cosine, crystal_mu, thickness, layer_depths(1, 0.0), 0)  # type: ignore[arg-type]
+    return passed * absorbed_share(cosine, crystal_mu, thickness, np.zeros(1), 0)  # type: ignore[arg-type]
 
 
 def _fwhm(h_per_l: Array, diameter: Array, intrinsic_fwhm: float) -> Array:

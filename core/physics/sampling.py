@@ -12,8 +12,6 @@ S. D. Metzler, J. E. Bowsher, R. J. Jaszczak, "Geometrical similarities of the O
 numerical algorithm for assessing sampling completeness", IEEE Transactions on Nuclear Science 50 (2003) 1550-1555.
 """
 
-from __future__ import annotations
-
 import functools
 import math
 

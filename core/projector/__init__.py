@@ -6,8 +6,6 @@ space, `lattices` crops volumes to what is filled, `autograd` makes steps of tor
 is needed.
 """
 
-from __future__ import annotations
-
 from .emission import Emission
 from .inverse_square import InverseSquareSum
 from .models import Model, Transmission, intensity

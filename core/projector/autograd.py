@@ -1,7 +1,5 @@
 """Steps in torch's graph, made of plain functions."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from typing import Any
 

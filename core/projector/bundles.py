@@ -172,7 +172,8 @@ class Bundles:
                 if some:
                     rows, columns = some[0][1].shape
                     parts += _parts(some, slice(0, rows), slice(0, columns), most)
-            if not self._has_room(sum(_bytes(part) for part in parts)):
+            kept = [x for part in parts for x in (part.rays, part.weights) if isinstance(x, np.ndarray)]
+            if not self._has_room(sum(x.nbytes for x in kept)):
                 return parts
             self._parts[key] = parts
         return self._parts[key]
@@ -245,8 +246,3 @@ def _part(pieces: list[tuple[int, Beam, slice]], rows: slice, columns: slice, tr
         ]
         weights = each[0] if len(each) == 1 else np.concatenate(each)
     return Part(images, vectors, rows, columns, transposed, weights)
-
-
-def _bytes(part: Part) -> int:
-    assert not isinstance(part.rays, Ends)
-    return part.rays.nbytes + (0 if part.weights is None else part.weights.nbytes)

@@ -1,10 +1,9 @@
 """SPECT: how many photons a pixel of the crystal counts."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass, fields
+from functools import partial
 from typing import Any, Literal
 
 import numpy as np
@@ -17,10 +16,10 @@ from ..geometry.system import PinholeSystem
 from ..geometry.views import Views
 from ..physics.aperture import KnifeEdge, Opening, openings, paix_diameter, within_cone
 from ..physics.aperture import points_needed as hole_points_needed
-from ..physics.crystal import absorbed_share, gaussian_blur, layer_depths, share_inside
+from ..physics.crystal import absorbed_share, gaussian_blur, share_inside
 from ..physics.isotopes import Isotope, isotope
 from ..physics.materials import module_coefficients
-from ..validation import positive, real_array
+from ..validation import instance, positive, real_array
 from ..volumes.volume import Volume, require_quantity
 from .bundles import Beam
 from .models import Array, Model, view_rays
@@ -152,8 +151,7 @@ class Emission(Model):
     takes = ("activity",)
 
     def __post_init__(self) -> None:
-        if not isinstance(self.system, PinholeSystem):
-            raise InputError(f"emission: expected a PinholeSystem, got {type(self.system).__name__}")
+        instance(self.system, PinholeSystem, "emission")
         if self.mu is not None:
             if not isinstance(self.mu, Volume):
                 hint = "; tensors of it go to the projector, A(x, mu=...)" if is_tensor(self.mu) else ""
@@ -291,7 +289,13 @@ class Emission(Model):
         inside = sum(opening.hole > 0 for opening in holes)  # and the edge's points, which count less
         starts = np.concatenate([lattice(k) for k in (inside, len(holes) - inside) if k])
         n = self._pixel_points(views, m, grid)
-        for layer, z in enumerate(layer_depths(self.depth_layers, self.system.detector_thickness[m])):
+
+        def weigh(places: Array, opening: Opening, layer: int, rows: slice, columns: slice, which: slice) -> Array:
+            u_places, v_places = places[which].T[:, :, None, None]
+            along, across = along_u[:, columns] + u_places, along_v[rows] + v_places
+            return self.pixel_weights(m, along, across, (pitch_u, pitch_v), l, opening, layer, n * len(holes)) / n
+
+        for layer, z in enumerate(np.linspace(0, self.system.detector_thickness[m], self.depth_layers)):
             stretch = depth / (l + z)
             steps = stretch * scale * rays.row_step, stretch * scale * rays.column_step
             for opening, start in zip(holes, starts, strict=True):
@@ -302,23 +306,10 @@ class Emission(Model):
                     seen = (1 + l / self.system.pinhole_distance[m]) * np.array([opening.x, opening.y])
                     shift = start / math.sqrt(n) - seen / (pitch_u, pitch_v)
                 places = offsets(n, shift) * (pitch_u, pitch_v)
-
-                def weigh(
-                    rows: slice,
-                    columns: slice,
-                    which: slice,
-                    places: Array = places,
-                    opening: Opening = opening,
-                    layer: int = layer,
-                ) -> Array:
-                    u_places, v_places = places[which].T[:, :, None, None]
-                    along, across = along_u[:, columns] + u_places, along_v[rows] + v_places
-                    pitch = pitch_u, pitch_v
-                    return self.pixel_weights(m, along, across, pitch, l, opening, layer, n * len(holes)) / n
-
                 corner = pinhole + point + depth * k + stretch * (middle + point)
                 shifts = places[:, ::-1] / (scale * (rays.row_step @ v), scale * (rays.column_step @ u))
-                yield Beam(Fan(pinhole + point, corner, *steps, views.shape, shifts), weigh)
+                fan = Fan(pinhole + point, corner, *steps, views.shape, shifts)
+                yield Beam(fan, partial(weigh, places, opening, layer))
 
     def pixel_weights(
         self,
@@ -352,7 +343,7 @@ class Emission(Model):
             Rays of a pixel: along each side, a ray stands for this part of it where the crystal or a wall ends.
         """
         side, thickness = self.system.detector_side[m], self.system.detector_thickness[m]
-        depths = layer_depths(self.depth_layers, thickness)
+        depths = np.linspace(0, thickness, self.depth_layers)
         distance = length + depths[layer]
         slope_u, slope_v = (along_u + opening.x) / distance, (along_v + opening.y) / distance
         squared_secant = 1 + slope_u**2 + slope_v**2

@@ -1,7 +1,5 @@
 """The one driver of rays: cuts images into what a backend takes at once, and runs it on several threads."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import Any
@@ -114,8 +112,8 @@ class Execution:
         images, lattices = self.to_backend(images), self._lattices(volume, mu, whole_mu=True)
         gradient_of = self.backend.functions.mu_gradient
 
-        def add(gradient: ArrayOrTensor, values: ArrayOrTensor, rays: Rays, attenuation: Attenuation | None) -> None:
-            gradient_of(gradient, lattices.volume, values, rays, attenuation)
+        def add(gradient: ArrayOrTensor, *values_and_rays: Any) -> None:
+            gradient_of(gradient, lattices.volume, *values_and_rays)
 
         return self._accumulated(add, self.mu_grid or self.grid, images, bundles, lattices)
 

@@ -1,17 +1,14 @@
 """A sum along rays that weights every voxel with the sensitivity to a point source; it is not a number of counts."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
 
-from ..errors import InputError
 from ..geometry.grid import Grid
 from ..geometry.system import PinholeSystem
 from ..geometry.views import Views
-from ..volumes.volume import Volume
+from ..validation import instance
 from .bundles import Beam
 from .emission import Emission
 from .models import Array, Model, view_rays
@@ -41,12 +38,7 @@ class InverseSquareSum(Model):
     weights_voxels = True
 
     def __post_init__(self) -> None:
-        if not isinstance(self.system, PinholeSystem):
-            raise InputError(f"inverse square sum: expected a PinholeSystem, got {type(self.system).__name__}")
-
-    def unit(self, volume: Volume) -> str:
-        """Unit of the images of `volume`: of its line integrals, as the weights have none."""
-        return f"{volume.unit} mm"
+        instance(self.system, PinholeSystem, "inverse square sum")
 
     def check(self, views: Views) -> None:
         """Raise `InputError` unless `views` are of this system."""

@@ -1,7 +1,5 @@
 """The lattices of a volume and of mu: cropped to what is filled, and rays in their index spaces."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -54,11 +52,7 @@ class Lattices:
 
 
 def filled_lattices(
-    grid: Grid,
-    volume: ArrayOrTensor,
-    mu: ArrayOrTensor = None,
-    mu_grid: Grid | None = None,
-    whole_mu: bool = False,
+    grid: Grid, volume: ArrayOrTensor, mu: ArrayOrTensor = None, mu_grid: Grid | None = None, whole_mu: bool = False
 ) -> Lattices:
     """The lattices of the parts of `volume` and of mu that are not empty.
 

@@ -1,7 +1,5 @@
 """What a pixel measures: which rays it takes, with which weights."""
 
-from __future__ import annotations
-
 from abc import ABC, abstractmethod
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
@@ -11,7 +9,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..arrays import ArrayOrTensor, is_tensor, namespace
-from ..errors import InputError
 from ..geometry.grid import Grid
 from ..geometry.views import Views
 from ..validation import positive, real_array
@@ -56,9 +53,9 @@ class Model(ABC):
         """The model's own settings, for a run's record: anything JSON can hold."""
         return {}
 
-    @abstractmethod
     def unit(self, volume: Volume) -> str:
-        """Unit of the images of `volume`."""
+        """Unit of the images of `volume`: of its line integrals, where the weights have none."""
+        return f"{volume.unit} mm"
 
     @abstractmethod
     def beams(self, views: Views, m: int, grid: Grid) -> Iterator[Beam]:
@@ -104,10 +101,6 @@ class Transmission(Model):
         """The settings, for a run's record."""
         return {"pixel_points": self.pixel_points, "tolerance": self.tolerance}
 
-    def unit(self, volume: Volume) -> str:
-        """Unit of the images of `volume`."""
-        return f"{volume.unit} mm"
-
     def beams(self, views: Views, m: int, grid: Grid) -> Iterator[Beam]:
         """The rays of `views`, or to more points of their pixels, weights summing to 1."""
         rays = view_rays(views, m)
@@ -149,12 +142,3 @@ def view_rays(views: Views, m: int) -> Fan:
     u_step, v_step = views.u_steps[m], views.v_steps[m]
     corner = views.detector_centers[m] - (n_u - 1) / 2 * u_step - (n_v - 1) / 2 * v_step
     return Fan(views.sources[m], corner, v_step, u_step, views.shape)
-
-
-def require_model(value: object) -> Model:
-    """`value` if it is a model."""
-    if not isinstance(value, Model):
-        raise InputError(
-            f"projector: expected model to be Transmission, Emission or another model, got {type(value).__name__}"
-        )
-    return value

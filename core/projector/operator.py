@@ -20,7 +20,7 @@ from . import backends
 from .bundles import Bundle, Bundles
 from .execution import Execution
 from .lattices import require_no_negative, same_lattice
-from .models import Model, Transmission, require_model
+from .models import Model, Transmission
 from .parallel import thread_count
 
 
@@ -114,21 +114,21 @@ class Projector(LinearOperator):
     """
 
     def __init__(
-        self,
-        grid: Grid,
-        views: Views,
-        model: Model | None = None,
-        backend: str = "auto",
-        threads: int | None = None,
+        self, grid: Grid, views: Views, model: Model | None = None, backend: str = "auto", threads: int | None = None
     ) -> None:
-        for value, kind, name in ((grid, Grid, "grid"), (views, Views, "views")):
+        model = Transmission() if model is None else model
+        for value, kind, what in (
+            (grid, Grid, "grid to be Grid"),
+            (views, Views, "views to be Views"),
+            (model, Model, "model to be Transmission, Emission or another model"),
+        ):
             if not isinstance(value, kind):
-                raise InputError(f"projector: expected {name} to be {kind.__name__}, got {type(value).__name__}")
+                raise InputError(f"projector: expected {what}, got {type(value).__name__}")
         self.grid = grid
         self.views = views
-        self.model: Model = Transmission() if model is None else require_model(model)
-        self.model.check(views)
-        if caution := self.model.caution(views, grid):
+        self.model = model
+        model.check(views)
+        if caution := model.caution(views, grid):
             warnings.warn(caution, InputWarning, stacklevel=2)
         self._auto = backend == "auto"
         self._backend = backends.choose(backend)
@@ -161,7 +161,10 @@ class Projector(LinearOperator):
         """
         if mu is None:
             return super().__call__(x, progress)
-        x, mu = promote(self._check(x), self._check_mu(mu))
+        x = self._check(x)
+        if self.model.mu is None:
+            raise InputError("mu: the projector's model has none; give it one to say on which grid mu is")
+        x, mu = promote(x, require_no_negative(checked(mu, "mu", self.model.mu.grid.shape, self._float64)))
         if not is_tensor(x):
             return self._run(x, progress, mu)
         from . import autograd
@@ -219,11 +222,6 @@ class Projector(LinearOperator):
             self.model.check_volume(x)
             return x.array
         return checked(x, "volume", self.shape_in, self._float64)
-
-    def _check_mu(self, mu: ArrayOrTensor) -> ArrayOrTensor:
-        if self.model.mu is None:
-            raise InputError("mu: the projector's model has none; give it one to say on which grid mu is")
-        return require_no_negative(checked(mu, "mu", self.model.mu.grid.shape, self._float64))
 
     def _run(
         self, x: ArrayOrTensor, progress: Progress | None = None, mu: ArrayOrTensor | None = None

@@ -1,7 +1,5 @@
 """Threads: results in order with few tasks in flight, and the sum of several volumes."""
 
-from __future__ import annotations
-
 import functools
 import os
 from collections import deque

@@ -11,8 +11,6 @@ References
 I. H. Sloan, S. Joe, "Lattice Methods for Multiple Integration", Oxford University Press (1994).
 """
 
-from __future__ import annotations
-
 import functools
 import math
 

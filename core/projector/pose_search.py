@@ -1,7 +1,5 @@
 """Registration: find the pose from which a camera saw an image, by gradient descent. Needs torch and RoMa."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any

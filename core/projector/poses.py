@@ -4,8 +4,6 @@
 the same, part of torch's graph. Needs torch.
 """
 
-from __future__ import annotations
-
 import functools
 import math
 from typing import Any

@@ -3,8 +3,6 @@
 An integral is length x mean. The mean moves with the planes of either grid, and, attenuated, with the length.
 """
 
-from __future__ import annotations
-
 import numpy as np
 
 from ..geometry.grid import Grid
@@ -93,12 +91,12 @@ def _rays(part: Part) -> list[tuple[Array, Array]]:
     if isinstance(part.rays, Ends):
         each = [(part.rays.ends - part.rays.starts).T]
     else:
-        numbers = _numbers(part)
-        each = [
-            np.einsum("ij,in->jn", np.stack([corner - source, row_step, column_step]), numbers)
-            for source, corner, row_step, column_step in part.rays
-        ]
-    return [(along, np.sqrt((along**2).sum(axis=0))) for along in each]
+        rows, columns = map(np.arange, part.shape)
+        each = []
+        for source, corner, row_step, column_step in part.rays:
+            firsts = (corner - source)[:, None] + np.outer(row_step, rows)
+            each.append((firsts[:, :, None] + np.outer(column_step, columns)[:, None]).reshape(3, -1))
+    return [(along, np.sqrt(np.einsum("in,in->n", along, along))) for along in each]
 
 
 def _numbers(part: Part) -> Array:

@@ -37,9 +37,6 @@ class Fan:
     shape: tuple[int, int]  # rows and columns
     shifts: Array = field(default_factory=lambda: _UNSHIFTED)  # (S, 2), in rows and columns
 
-    def __len__(self) -> int:
-        return len(self.shifts) * self.shape[0] * self.shape[1]
-
     def part(self, rows: slice, columns: slice, shifts: slice = _ALL) -> Fan:
         """Some rows, some columns of these, and some of the shifts."""
         row, last_row, _ = rows.indices(self.shape[0])
@@ -76,9 +73,6 @@ class Ends:
 
     starts: Array  # (N, 3): World mm
     ends: Array  # (N, 3): World mm
-
-    def __len__(self) -> int:
-        return len(self.ends)
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -137,10 +131,6 @@ class IndexRays:
 
     def __len__(self) -> int:
         return len(self.lengths)
-
-    def __getitem__(self, which: slice) -> IndexRays:
-        """Some of the rays."""
-        return IndexRays(self.starts[which], self.directions[which], self.lengths[which])
 
     def listed(self) -> IndexRays:
         """These rays."""

@@ -1,7 +1,5 @@
 """Numbers as colours: the window, the scale and the colours that a picture of projections is shown in."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -3,8 +3,6 @@
 Whatever the format, a file holds arrays by name (``"geometry/center"``) with units, and attributes (text or whole numbers).
 """
 
-from __future__ import annotations
-
 import json
 import os
 from collections.abc import Callable
@@ -18,7 +16,7 @@ from numpy.typing import NDArray
 from ..errors import InputError
 from ..files import replacing
 from ..geometry.grid import Grid
-from ..geometry.system import PinholeSystem
+from ..geometry.system import LENGTHS, PinholeSystem
 from ..geometry.views import Views
 from ..volumes.volume import Volume
 from .run import ProjectionRun
@@ -35,7 +33,6 @@ _CONVENTIONS = (
     "volume[ix, iy, iz]: affine from index to world, an integer index is the voxel's centre, 0 outside."
 )
 
-_LENGTHS = ("pinhole_diameter", "collimator_length", "detector_side", "detector_thickness", "roi_radius")
 _RAYS = ("sources", "detector_centers", "u_steps", "v_steps")
 
 # Name, unit and contents of the arrays beside projections and volume, whose units are attributes.
@@ -43,7 +40,7 @@ _ARRAYS: dict[str, tuple[str, Callable[[ProjectionRun], Any]]] = {
     "geometry/number": ("", lambda run: run.system.numbers),
     "geometry/ring": ("", lambda run: run.system.rings()),
     "geometry/center": ("mm", lambda run: run.system.centers),
-    **{f"geometry/{name}": ("mm", attrgetter(f"system.{name}")) for name in ("pinhole_distance", *_LENGTHS)},
+    **{f"geometry/{name}": ("mm", attrgetter(f"system.{name}")) for name in ("pinhole_distance", *LENGTHS)},
     "geometry/pose": ("mm", lambda run: run.system.poses()),
     "geometry/intrinsics": ("pixel", lambda run: run.intrinsics()),
     "geometry/projection_matrix": ("pixel", lambda run: run.views.projection_matrices()),
@@ -105,7 +102,7 @@ def _run_of(arrays: dict[str, NDArray[Any]], attributes: dict[str, Any]) -> Proj
     for name in ("projections", "volume/array", *_ARRAYS):
         if name not in arrays:
             raise InputError(f"array {name} is missing")
-    lengths: Any = {name: arrays[f"geometry/{name}"] for name in _LENGTHS}
+    lengths: Any = {name: arrays[f"geometry/{name}"] for name in LENGTHS}
     rays: Any = {name: arrays[f"views/{name}"] for name in _RAYS}
     volume, seed = arrays["volume/array"], attributes["seed"]
     n_v, n_u = arrays["projections"].shape[1:]

@@ -1,7 +1,5 @@
 """Text in pictures: one size of one typeface, in pixels, so that pictures need no library that draws."""
 
-from __future__ import annotations
-
 import base64
 import functools
 import zlib

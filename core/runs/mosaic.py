@@ -1,7 +1,5 @@
 """Pictures of projections: upright, as seen from the pinhole, alone or all in one with numbers and a colour bar."""
 
-from __future__ import annotations
-
 import os
 import struct
 import zlib

@@ -1,7 +1,5 @@
 """From a system and a volume to a projection run: the main job, as one call."""
 
-from __future__ import annotations
-
 import warnings
 from collections.abc import Mapping
 from typing import Any

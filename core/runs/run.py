@@ -1,7 +1,5 @@
 """A projection run: the images, and everything they were made from."""
 
-from __future__ import annotations
-
 import contextlib
 import platform
 from collections.abc import Mapping

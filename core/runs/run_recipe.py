@@ -1,7 +1,5 @@
 """From a recipe to projection runs: the main job, for the command line, the demo, scripts and Blender."""
 
-from __future__ import annotations
-
 import dataclasses
 import math
 from collections.abc import Callable, Iterator

@@ -5,8 +5,6 @@ and operator, and the record in a run file follow from it. A new setting of a mo
 same name in the model's class.
 """
 
-from __future__ import annotations
-
 import math
 import operator
 from collections.abc import Iterable, Mapping

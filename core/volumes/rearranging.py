@@ -1,7 +1,5 @@
 """Changes that keep the voxels' values: crop, pad, reorient, move, and split by labels."""
 
-from __future__ import annotations
-
 from itertools import permutations
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Resampling of volumes onto other grids."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import numpy as np

@@ -1,7 +1,5 @@
 """A volume: an array on a grid, and the quantity that it holds."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -10,7 +8,7 @@ from numpy.typing import NDArray
 
 from ..errors import InputError
 from ..geometry.grid import Grid
-from ..validation import freeze, instance, real_array, require_finite
+from ..validation import freeze, instance, one_of, real_array, require_finite
 
 UNITS = {
     "activity": "kBq/mL",
@@ -51,8 +49,7 @@ class Volume:
 
     def __post_init__(self) -> None:
         instance(self.grid, Grid, "volume")
-        if self.quantity not in UNITS:
-            raise InputError(f"quantity {self.quantity!r}: expected one of {', '.join(UNITS)}")
+        one_of(self.quantity, UNITS, "quantity")
         given = self.array
         fits = isinstance(given, np.ndarray) and (given.dtype, given.shape) == (np.float32, self.grid.shape)
         if fits and given.flags.c_contiguous and not given.flags.writeable:

@@ -1,21 +1,17 @@
 """Volumes in files: the formats by their endings, and one clear line for every file that cannot be read."""
 
-from __future__ import annotations
-
 import os
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 
 from numpy.typing import ArrayLike
 
-from ..errors import InputError
+from ..errors import InputError, naming
 from ..files import replacing
-from ..progress import Cancelled, Progress
+from ..progress import Progress
 from ..validation import instance, real_array
 from .formats import dicom, hdf5, metaimage, nifti, nrrd, numpy_files
-from .formats.contents import Contents, first_line
+from .formats.contents import Contents, reading
 from .volume import UNITS, Volume
 
 _READERS = {
@@ -65,7 +61,7 @@ def read_volume(
     """
     path = Path(path)
     contents = _contents(path, series, progress)
-    with _naming(path):
+    with naming(path):
         if affine is not None:
             contents = replace(contents, affine=real_array(affine, "affine", (4, 4)))
         if contents.quantity is not None and contents.quantity not in UNITS and quantity is None:
@@ -87,7 +83,7 @@ def read_volume_of(
     """
     path = Path(path)
     contents = _contents(path, series, progress)
-    with _naming(path):
+    with naming(path):
         if contents.quantity in UNITS and contents.quantity != quantity:
             raise InputError(f"it holds {contents.quantity}, expected {quantity} in {UNITS[quantity]}{advice}")
         return contents.volume(quantity)
@@ -104,15 +100,6 @@ def write_volume(volume: Volume, path: str | os.PathLike[str]) -> None:
         write(volume, temporary)
 
 
-@contextmanager
-def _naming(path: Path) -> Iterator[None]:
-    """Put the file's name before the messages of input errors."""
-    try:
-        yield
-    except InputError as error:
-        raise InputError(f"{path}: {error}") from None
-
-
 def _contents(path: Path, series: str | None, progress: Progress | None) -> Contents:
     """What the file or folder at `path` holds."""
     try:  # libraries say little about files that cannot be opened
@@ -127,20 +114,15 @@ def _contents(path: Path, series: str | None, progress: Progress | None) -> Cont
         raise InputError(f"{path}: neither a file nor a folder")
     ending = _ending(path, READ_FORMATS)
     is_series = path.is_dir() or ending == ".dcm" or (not ending and dicom.is_dicom(path))
-    with _naming(path):
+    with naming(path):
         if not (ending or is_series):
             raise InputError(f"expected a folder of DICOM files, or a name ending in {', '.join(READ_FORMATS)}")
         if path.is_file() and path.stat().st_size == 0:
             raise InputError("it is empty")
         if series is not None and not is_series:
             raise InputError("only folders of DICOM files hold several series")
-        try:
-            return dicom.read(path, series, progress) if is_series else _READERS[ending](path)
-        except (InputError, MemoryError, Cancelled):
-            raise
-        except Exception as error:  # whatever a library raises on a damaged file
-            kind = "DICOM" if is_series else ending
-            raise InputError(f"cannot be read as {kind} ({first_line(error)})") from error
+    with reading(path, "DICOM" if is_series else ending):
+        return dicom.read(path, series, progress) if is_series else _READERS[ending](path)
 
 
 def _ending(path: Path, endings: tuple[str, ...]) -> str:

@@ -7,8 +7,6 @@ Reading:     headings, headed_table and recognition (what a workbook's headings 
 Writing:     writer, edit (the cells that change, and the rows that move with the modules)
 """
 
-from __future__ import annotations
-
 from ..system_source import QuantityCells, SystemSource
 from .column_map import ColumnMap, MappedColumn, MappedTable
 from .draft import ColumnMapDraft, draft_column_map, preview_workbook

@@ -1,7 +1,5 @@
 """A workbook file and the values of its cells. The file is read once, into memory, and never opened for writing."""
 
-from __future__ import annotations
-
 import hashlib
 import io
 import os

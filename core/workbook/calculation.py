@@ -1,7 +1,5 @@
 """The values of formulas that refer to each other, and new stored values where cells have changed."""
 
-from __future__ import annotations
-
 import math
 import re
 from collections import defaultdict

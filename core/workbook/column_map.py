@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import re
-import tomllib
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -12,7 +11,7 @@ from typing import Any, Literal, get_args
 
 from ..errors import InputError
 from ..files import replacing
-from ..toml import read_toml, toml_value
+from ..toml import parse_toml, read_toml, toml_value
 from .headings import unit_of
 from .quantities import DIMENSIONS, POSITION, QUANTITIES
 from .sheet_xml import MAX_COLUMN, MAX_ROW
@@ -20,11 +19,8 @@ from .sheet_xml import MAX_COLUMN, MAX_ROW
 Joined = Literal["by number", "in order", "one for all"]
 
 _HELP = "see docs/workbook.md"
-_KEYS = {"sheet": str, "header_row": int, "first_row": int, "last_row": int, "skip_rows": list} | {
-    "rows": str,
-    "number": str,
-    "columns": dict,
-}
+_KEYS = {"sheet": str, "header_row": int, "first_row": int, "last_row": int, "skip_rows": list}
+_KEYS |= {"rows": str, "number": str, "columns": dict}
 
 
 @dataclass(frozen=True)
@@ -125,10 +121,7 @@ class ColumnMap:
     @classmethod
     def from_toml(cls, text: str, name: str = "column map") -> ColumnMap:
         """The map in a TOML text; `InputError`, which calls it `name`, for unknown keys or values."""
-        try:
-            return cls._of_values(tomllib.loads(text), name)
-        except tomllib.TOMLDecodeError as error:
-            raise InputError(f"{name}: not TOML: {error}") from None
+        return cls._of_values(parse_toml(text, name), name)
 
     @classmethod
     def read(cls, path: str | os.PathLike[str]) -> ColumnMap:

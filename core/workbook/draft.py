@@ -1,7 +1,5 @@
 """A first column map for a person to check, and what the cells of a workbook show."""
 
-from __future__ import annotations
-
 import os
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -13,7 +11,7 @@ from .calculation import Uncomputed
 from .column_map import ColumnMap, Joined, MappedColumn, MappedTable
 from .headed_table import HeadedTable
 from .headings import heading_of, is_number_heading, may_mean
-from .quantities import DERIVED, NEEDED, POSITION, TYPED
+from .quantities import DERIVED, NEEDED, OPTIONAL, POSITION, QUANTITIES, TYPED
 from .recognition import recognize, recognized_layout
 
 
@@ -49,8 +47,10 @@ def draft_column_map(path: str | os.PathLike[str]) -> ColumnMapDraft:
     partial = {name for name in optional if _has_gaps(found.tables[name], name)}
     chosen = {name: table for name, table in found.tables.items() if name not in partial}
     tables = [mapped for table in dict.fromkeys(chosen.values()) for mapped in _mapped(table, chosen, certain)]
-    if "l" in partial and found.tables["l"].has_numbers("l"):
-        questions.append("l stands in some rows only and is left out here: the design formula is then used for all")
+    for name in OPTIONAL:
+        if name in partial and found.tables[name].has_numbers(name):
+            used = QUANTITIES[name].blank_is.removesuffix("'s")
+            questions.append(f"{name} stands in some rows only and is left out here: {used} is then used for all")
     missing = [name for name in TYPED if name not in found.tables]
     _add_guesses(tables, found.sheets, missing if not certain else [])
     if missing and not tables:

@@ -3,8 +3,6 @@
 Its formulas are not recalculated yet.
 """
 
-from __future__ import annotations
-
 import itertools
 import math
 import warnings
@@ -19,8 +17,8 @@ from .book import module_number
 from .column_map import ColumnMap
 from .formulas import areas_in
 from .layout import Column, Table
-from .quantities import DERIVED, EXACT, NEEDED, QUANTITIES, agree
-from .reader import Reading, is_by_design
+from .quantities import DERIVED, EXACT, OPTIONAL, QUANTITIES, TYPED, agree
+from .reader import Reading
 from .sheet_xml import SheetXml, moved
 from .workbook_xml import Place, WorkbookXml
 
@@ -152,7 +150,7 @@ class Edit:
         self.old, self.given, self.layout = reading.system, reading.given, reading.layout
         self.columns, self.modules = self.layout.columns, self.layout.modules
         self.workbook = workbook
-        self.by_design = is_by_design(system)
+        self.is_default = {name: QUANTITIES[name].is_default(system) for name in OPTIONAL}
         self.numbered = self.modules.number_column is not None  # whether the workbook has the modules' numbers
         self.old_of = matched(system, self.old, self.numbered)
         self.required: dict[Place, float] = {}
@@ -166,8 +164,9 @@ class Edit:
         for rows in self.rows.values():
             rows.move(workbook)
         self._number_modules()
-        for name in (*NEEDED, *(["l"] if "l" in self.columns else [])):
-            self._require(self.columns[name])
+        for name in TYPED:
+            if name in self.columns:
+                self._require(self.columns[name])
         for name in DERIVED:
             if name in self.columns:
                 self._derive(self.columns[name])
@@ -202,12 +201,13 @@ class Edit:
                 InputWarning,
                 stacklevel=4,
             )
-        if "l" not in self.columns and not self.by_design.all():
-            i = np.argmin(self.by_design)
-            raise InputError(
-                f"{file}: sheet {sheet} has no column headed l for the collimator length of module {numbers[i]}, "
-                f"{self.system.collimator_length[i]:g} mm, which is not the design formula's"
-            )
+        for name, is_default in self.is_default.items():
+            if name not in self.columns and not is_default.all():
+                i, quantity = np.argmin(is_default), QUANTITIES[name]
+                raise InputError(
+                    f"{file}: sheet {sheet} has no column headed {name} for the {quantity.title} of module {numbers[i]}, "
+                    f"{quantity.said(quantity.of(self.system)[i])}, which is not {quantity.blank_is}"
+                )
 
     def _rows_after(self, table: Table, old: tuple[int, ...]) -> Rows:
         shared = {c.column for c in self.columns.values() if c.table.sheet is table.sheet and c.shared}
@@ -273,10 +273,10 @@ class Edit:
         else:
             places = rows.new
         for i, row in enumerate(places):
-            if name == "l" and self.by_design[i] and sheet.cell((row, column.column)).blank:
+            if name in OPTIONAL and self.is_default[name][i] and sheet.cell((row, column.column)).blank:
                 was_cell = sheet.original.get((self.rows[column.table].source(i), column.column))
                 if was_cell is None or was_cell.blank:
-                    continue  # and it is read as the design formula's
+                    continue  # and it is read as the default
             j = old_of[i]
             number, was = float(new[i] / column.factor), None if j is None else float(old[j] / column.factor)
             if j is not None and old[j] == new[i] and not math.isnan(self.given[name][j]):

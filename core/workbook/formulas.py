@@ -3,8 +3,6 @@
 A formula that needs more raises `NotComputable`; nothing is guessed.
 """
 
-from __future__ import annotations
-
 import decimal
 import math
 import operator

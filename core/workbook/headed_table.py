@@ -1,7 +1,5 @@
 """A table as a sheet's headings describe it: which columns it has, and which rows hold modules."""
 
-from __future__ import annotations
-
 import re
 from collections import defaultdict
 from dataclasses import dataclass
@@ -139,7 +137,7 @@ class HeadedTable:
     @cached_property
     def _filled_rows(self) -> list[int]:
         """The rows with anything but a note in the key columns, or with typed dimensions."""
-        typed = [self.columns[name][0] for name in (*DIMENSIONS, "l") if name in self.columns]
+        typed = [self.columns[name][0] for name in TYPED if name in self.columns and name not in POSITION]
         found: list[int] = []
         for row in self.sheet.rows:
             if row < self.first_row or row in self.summaries:

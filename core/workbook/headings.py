@@ -4,8 +4,6 @@ A heading is understood as a whole or not at all: it is one of the texts in the 
 aside), alone or with a known unit: "x1 (mm)", "x1 [cm]", "x1, cm", "x1/cm", "x1 in cm".
 """
 
-from __future__ import annotations
-
 import re
 import unicodedata
 from collections.abc import Iterable

@@ -1,7 +1,5 @@
 """Which cells hold which quantity of which module, whether the headings say so or a column map."""
 
-from __future__ import annotations
-
 import itertools
 import math
 import warnings

@@ -1,33 +1,28 @@
 """`read_system`: a geometry workbook as a `PinholeSystem`, and whether its numbers are possible and plausible."""
 
-from __future__ import annotations
-
 import math
 import os
 import warnings
 from collections.abc import Iterator
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import InputError, InputWarning
-from ..geometry.design_formulas import collimator_length
 from ..geometry.system import PinholeSystem
 from ..system_source import QuantityCells, SystemSource
 from .book import Book
 from .column_map import ColumnMap, column_map
 from .layout import Column, Layout, mapped_layout
-from .quantities import AGREEING, DERIVED, DIMENSIONS, NEEDED, POSITION, QUANTITIES, tolerance
+from .quantities import DERIVED, DIMENSIONS, NEEDED, OPTIONAL, POSITION, QUANTITIES, TYPED, Numbers, tolerance
 from .recognition import recognized_layout
 
 _SAME_PLACE = 1e-6
 """mm; two pinholes closer than this are one."""
 _SHOWN = 5
 """Warnings of one column; the last one counts the rest."""
-
-Numbers = dict[str, NDArray[np.float64]]
-"""Quantity -> its numbers (M,)."""
 
 
 def read_system(
@@ -72,46 +67,44 @@ class Reading:
 def read(book: Book, columns: ColumnMap | None = None) -> Reading:
     """The scanner in `book` and where its numbers are; see `read_system`."""
     layout = recognized_layout(book) if columns is None else mapped_layout(book, columns)
-    given = {name: layout.columns[name].numbers() for name in NEEDED}
-    values = {name: given[name] * layout.columns[name].factor for name in NEEDED}
-    _refuse_impossible(layout.columns, values)
+    cells = layout.columns
+    given = {name: cells[name].numbers() for name in NEEDED}
+    values = {name: given[name] * cells[name].factor for name in NEEDED}
+    _refuse_impossible(cells, values)
     on_axis = np.hypot(values["x1"], values["y1"]) == 0
-    for name in QUANTITIES:
-        if name in layout.columns and name not in NEEDED:
+    for name, quantity in QUANTITIES.items():
+        if name in cells and name not in NEEDED:
             # On the z axis a spreadsheet's ATAN2 shows #DIV/0!, and any azimuth is right.
             ignored = on_axis if name == "azimuth" else None
-            given[name] = layout.columns[name].numbers(name != "l" or columns is None, ignored)
-    designed = collimator_length(
-        np.sqrt(sum(values[name] ** 2 for name in POSITION)), values["d"], values["Ld"], values["R"]
-    )
-    length = designed
-    if "l" in given:
-        in_sheet = given["l"] * layout.columns["l"].factor
-        _refuse_not_positive(layout.columns["l"], in_sheet)
-        length = np.where(np.isnan(in_sheet), designed, in_sheet)
+            given[name] = cells[name].numbers(quantity.role == "derived" or columns is None, ignored)
+    defaults = {name: QUANTITIES[name].default(values) for name in OPTIONAL}
+    values |= defaults
+    for name in OPTIONAL:
+        if name in given:
+            in_sheet = given[name] * cells[name].factor
+            _refuse_not_positive(cells[name], in_sheet)
+            values[name] = np.where(np.isnan(in_sheet), defaults[name], in_sheet)
+    fields: dict[str, Any] = {str(QUANTITIES[name].source): values[name] for name in TYPED if name not in POSITION}
     system = PinholeSystem(
         centers=np.stack([values[name] for name in POSITION], axis=1),
-        pinhole_diameter=values["d"],
-        collimator_length=length,
-        detector_side=values["Ld"],
-        detector_thickness=values["Td"],
-        roi_radius=values["R"],
         numbers=np.array(layout.modules.module_numbers),
         source=_source(book, layout, columns),
+        **fields,
     )
-    for doubtful in _doubtful(book, layout.columns, given, system, designed):
+    for doubtful in _doubtful(book, cells, given, defaults, system):
         warnings.warn(doubtful, InputWarning, stacklevel=3)
     return Reading(layout, given, system)
 
 
 def _doubtful(
-    book: Book, columns: dict[str, Column], given: Numbers, system: PinholeSystem, designed: NDArray[np.float64]
+    book: Book, columns: dict[str, Column], given: Numbers, defaults: Numbers, system: PinholeSystem
 ) -> Iterator[str]:
-    """What is read but may be wrong, as texts of warnings; `designed` is the design formula's l (M,)."""
+    """What is read but may be wrong, as texts of warnings; `defaults` are the numbers of blank cells, mm."""
+    for name in OPTIONAL:
+        if name in given and QUANTITIES[name].formula:
+            yield from _differences(columns[name], given[name], defaults[name])
     rounding_of_l: NDArray[np.float64] | float = 0.0
-    if "l" in given:
-        column = columns["l"]
-        yield from _differences(column, given["l"], designed)
+    if (column := columns.get("l")) is not None:
         typed = system.collimator_length / column.factor
         rounding_of_l = column.factor * np.array([tolerance(x, x, column.unit) for x in typed])
     yield from _implausible(system, columns)
@@ -175,16 +168,10 @@ def _refuse_impossible(columns: dict[str, Column], values: Numbers) -> None:
 
 
 def _refuse_not_positive(column: Column, values: NDArray[np.float64]) -> None:
-    """Raise `InputError` if a length (M,), mm, is not positive."""
-    column.refuse(values <= 0, lambda i: f"has {column.quantity} = {values[i]:g} mm, expected more than 0")
-
-
-def is_by_design(system: PinholeSystem) -> NDArray[np.bool_]:
-    """Which modules (M,) have the design formula's collimator length."""
-    length = collimator_length(
-        system.pinhole_distance, system.pinhole_diameter, system.detector_side, system.roi_radius
-    )
-    return np.abs(length - system.collimator_length) <= AGREEING * system.collimator_length
+    """Raise `InputError` if a number (M,), mm or rad, is not positive but plausible ones are."""
+    quantity = QUANTITIES[column.quantity]
+    bad = (values <= 0) & (quantity.plausible[0] > 0)
+    column.refuse(bad, lambda i: f"has {quantity.name} = {quantity.said(values[i])}, expected more than 0")
 
 
 def _implausible(system: PinholeSystem, columns: dict[str, Column]) -> Iterator[str]:
@@ -198,8 +185,8 @@ def _implausible(system: PinholeSystem, columns: dict[str, Column]) -> Iterator[
             several = len(set(column.rows)) > 1 and len(odd) > 1
             more = f" (so it is for {len(odd) - 1} more modules)" if several else ""
             yield (
-                f"{column.where(int(odd[0]))} makes {name} = {values[odd[0]]:.6g} mm{more}, which is unlikely, expected "
-                f"{low:g} to {high:g} mm: are the units right?"
+                f"{column.where(int(odd[0]))} makes {name} = {quantity.said(values[odd[0]])}{more}, which is unlikely, "
+                f"expected {low:g} to {quantity.said(high)}: are the units right?"
             )
 
 
@@ -221,7 +208,7 @@ def _differences(
         for i in np.flatnonzero(np.isfinite(given))
         if difference[i] > tolerance(given[i], expected[i], unit) + slack[i]
     ]
-    used = "the sheet's is used" if name == "l" else "the formula's is used"
+    used = "the sheet's is used" if name in OPTIONAL else "the formula's is used"
     for n, i in enumerate(differing[:_SHOWN], start=1):
         more = f"; so do {len(differing) - _SHOWN} more cells of this column" if n == _SHOWN < len(differing) else ""
         yield (

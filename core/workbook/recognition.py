@@ -4,8 +4,6 @@ A doubt is anything that may make a number mean something else than its heading 
 is unaccounted for. `recognized_layout` refuses a workbook with any; `core.workbook.draft` asks a person.
 """
 
-from __future__ import annotations
-
 import itertools
 import re
 import warnings
@@ -18,7 +16,7 @@ from .book import HEADING_ROWS, Book, Sheet
 from .headed_table import HeadedTable, headed_table, headed_tables, is_number
 from .headings import UNIT_WORDS, heading_of, may_mean, quoted, shows_as_stored, unit_of, units_mentioned
 from .layout import Column, Layout, Table, by_label, in_order
-from .quantities import DERIVED, LENGTH_UNITS, NEEDED, POSITION, QUANTITIES, TYPED
+from .quantities import DERIVED, LENGTH_UNITS, NEEDED, OPTIONAL, POSITION, QUANTITIES, TYPED
 from .sheet_xml import At
 
 _HELP = "a column map can say what is meant (columns='map.toml', --columns map.toml; docs/workbook.md)"
@@ -144,10 +142,10 @@ def _matched_rows(modules: Table, table: Table, coordinates: HeadedTable, headed
 def _notes(layout: Layout, recognized: Recognized) -> Iterator[str]:
     """What a person should know of a workbook without doubts, as texts of warnings."""
     table, modules = recognized.tables["x1"], layout.modules
-    if "l" not in recognized.tables:
-        for at, text in table.unknown()[:1]:
+    for quantity in [QUANTITIES[name] for name in OPTIONAL if name not in recognized.tables]:
+        for at, text in table.unknown()[:1] if quantity.formula else ():
             yield (
-                "no column is headed l, so the collimator length is the design formula's; "
+                f"no column is headed {quantity.name}, so the {quantity.title} is {quantity.blank_is}; "
                 f"{table.sheet.place(*at)} {quoted(text)} is not understood"
             )
     used = {column.table.sheet.name for column in layout.columns.values()}
@@ -244,13 +242,12 @@ def _texts_between_modules(table: HeadedTable) -> Iterator[str]:
     for row, column in table.sheet.texts:
         if row in between and min(columns) <= column <= max(columns):
             found.setdefault(row, (row, column))
-    for row, at in sorted(found.items()):
+    for row, at in sorted(found.items())[:1]:
         place = table.sheet.place(*at)
         if row in table.summaries:
             yield f"{place} sums up its column between rows of modules, expected sums below the last module"
         else:
             yield f"{place} holds {quoted(table.sheet.texts[at])} between rows of modules, expected one table"
-        return
 
 
 def _notes_with_units(table: HeadedTable, lengths: set[str]) -> Iterator[str]:
@@ -289,7 +286,7 @@ def _columns(table: HeadedTable, used: list[tuple[int, str]]) -> Iterator[str]:
             shown = sheet.number_format(row, column)
             if not sheet.is_date(row, column) and not shows_as_stored(shown, unit):
                 place = sheet.place(row, column)
-                yield f"{place} is shown as {quoted(shown)}, where its heading says {unit}: expected one unit"
+                yield f"{place} is shown as {quoted(shown)}, where its heading says {unit or 'no unit'}: expected one unit"
                 break
     for area in sheet.merged:
         below = [(row, c) for c, _ in used for row in table.rows if area.contains(row, c)]

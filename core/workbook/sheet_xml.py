@@ -138,14 +138,8 @@ _BLANK = Cell()
 class SheetXml:
     """The cells of a worksheet part, with the workbook's shared `strings`; messages name the `file` and the sheet.
 
-    Attributes
-    ----------
-    cells : dict
-        (row, column) -> `Cell`, to be changed before `to_bytes`.
-    original : dict
-        The cells as read.
-    merged : list of Reference
-        The merged areas.
+    `cells` has the `Cell` at each (row, column), to be changed before `to_bytes`, `original` those as read, and `merged`
+    the merged areas.
     """
 
     def __init__(self, data: bytes, strings: list[str], name: str, file: str) -> None:
@@ -272,14 +266,9 @@ class SheetXml:
             changes += self._into_row(self._rows[row], row, cells) if row in self._rows else [self._new_row(row, cells)]
         area = None if self._dimension is None else reference(self._dimension.attributes.get("ref", ""))
         if added and self._dimension is not None and area is not None:
-            e, rows, columns = self._dimension, list(added), [column for cells in added.values() for column, _ in cells]
-            grown = Reference(
-                None,
-                min(area.top, *rows),
-                min(area.left, *columns),
-                max(area.bottom, *rows),
-                max(area.right, *columns),
-            )
+            e, columns = self._dimension, [column for cells in added.values() for column, _ in cells]
+            top, left = min(area.top, *added), min(area.left, *columns)
+            grown = Reference(None, top, left, max(area.bottom, *added), max(area.right, *columns))
             changes.append((e.start, e.inner, with_attribute(self._data[e.start : e.inner], "ref", grown.name)))
         return spliced(self._data, changes)
 

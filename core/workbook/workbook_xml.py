@@ -1,7 +1,5 @@
 """The sheets of a workbook file as cells that can be changed, and the file with the changes."""
 
-from __future__ import annotations
-
 import re
 from functools import cached_property
 
@@ -25,14 +23,8 @@ Place = tuple[str, int, int]
 class WorkbookXml:
     """The worksheets of a workbook file with these bytes; messages call it `name`.
 
-    Attributes
-    ----------
-    parts : dict
-        Worksheet -> its member of the package, in the workbook's order.
-    all_sheets : list of str
-        The names of all sheets, also of charts.
-    hidden : set of str
-        The sheets that are not shown.
+    `parts` has the member of the package of each worksheet, in the workbook's order, `all_sheets` the names of all sheets,
+    also of charts, and `hidden` those of the sheets that are not shown.
     """
 
     def __init__(self, content: bytes, name: str) -> None:

@@ -1,7 +1,5 @@
 """`write_system`: a `PinholeSystem` into a new geometry workbook, or a copy of one in which nothing else changes."""
 
-from __future__ import annotations
-
 import io
 import os
 import warnings
@@ -21,8 +19,8 @@ from .book import Book
 from .calculation import Recalculation
 from .column_map import ColumnMap, column_map
 from .edit import Edit, several
-from .quantities import QUANTITIES, TYPED
-from .reader import Reading, is_by_design, read
+from .quantities import OPTIONAL, QUANTITIES, TYPED
+from .reader import Reading, read
 from .workbook_xml import KINDS, Place, WorkbookXml
 
 _WIDTH = 13
@@ -136,16 +134,16 @@ def _refuse_other_system(back: Reading, name: str, system: PinholeSystem, number
             f"{name} cannot hold this system: its modules {several(system.numbers)} would be read as "
             f"{several(back.system.numbers)}"
         )
-    for quantity in TYPED:
-        wanted, got = (QUANTITIES[quantity].of(s) for s in (system, back.system))
+    for quantity in [QUANTITIES[name] for name in TYPED]:
+        wanted, got = quantity.of(system), quantity.of(back.system)
         differing = np.flatnonzero(np.abs(got - wanted) > 2e-9 * np.abs(wanted))
         if len(differing):
             i = int(differing[0])
-            column = back.layout.columns.get(quantity)
+            column = back.layout.columns.get(quantity.name)
             why = f": {column.place(i)} is read for all modules" if column is not None and column.shared else ""
             raise InputError(
-                f"{name} cannot hold this system: {quantity} = {wanted[i]:.9g} mm of module {system.numbers[i]} would be "
-                f"read as {got[i]:.9g} mm{why}"
+                f"{name} cannot hold this system: {quantity.name} = {quantity.said(wanted[i], 9)} of module "
+                f"{system.numbers[i]} would be read as {quantity.said(got[i], 9)}{why}"
             )
 
 
@@ -170,18 +168,18 @@ def _warn_of_formulas(workbook: WorkbookXml, recalculated: Recalculation) -> Non
 
 
 def _new_workbook(system: PinholeSystem) -> bytes:
-    """A workbook in the users' layout, its formulas without values; l is a number where it is not the design formula's."""
+    """A workbook in the users' layout, its formulas without values; l is a number where it is not that of the formula."""
     import openpyxl
     from openpyxl.styles import Alignment, Font
 
     book = openpyxl.Workbook()
     book.active.title = "Main"
     book.create_sheet("Coordinates")
-    by_design = is_by_design(system)
+    typed = {name: ~QUANTITIES[name].is_default(system) for name in OPTIONAL}
     columns = [
         *((name, q.place, q.titles or q.headings[:2], q.formula, q.of(system)) for name, q in QUANTITIES.items()),
         *(("number", f"{title}!A", ("", "Definitions"), "", system.numbers) for title in book.sheetnames),
-        ("slope", "Coordinates!F", ("S", "3D slope"), "={b}/{x1}", by_design),
+        ("slope", "Coordinates!F", ("S", "3D slope"), "={b}/{x1}", system.numbers),
     ]
     for name, place, titles, formula, numbers in columns:
         title, letter = place.split("!")
@@ -197,7 +195,7 @@ def _new_workbook(system: PinholeSystem) -> bytes:
             row = _FIRST_ROW + i
             cell = sheet[f"{letter}{row}"]
             cell.value = number.item()
-            if formula and (name != "l" or by_design[i]):
+            if formula and not (name in typed and typed[name][i]):
                 cell.value = formula.format_map({other: f"{column}{row}" for other, column in places.items()})
             if title == "Coordinates" and name != "number":
                 cell.number_format = "0.0000"

@@ -53,7 +53,7 @@ def start_job(**settings) -> None:
 
 def job():
     """The job that runs now, or None, as the installed extension has it."""
-    return next(module for name, module in sys.modules.items() if name.endswith(".addon.jobs")).current()
+    return next(module for name, module in sys.modules.items() if name.endswith(".addon.jobs"))._current
 
 
 def ours() -> list[str]:

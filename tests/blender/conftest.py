@@ -11,6 +11,7 @@ bpy = pytest.importorskip("bpy", reason="needs Blender's Python module: pip inst
 
 from mphdrr.addon import registration  # noqa: E402
 from mphdrr.core.geometry.system import PinholeSystem  # noqa: E402
+from mphdrr.core.workbook import read_system, write_system  # noqa: E402
 
 WORKBOOK = Path(__file__).parents[2] / "examples" / "dc-spect-80.xlsx"
 
@@ -32,16 +33,12 @@ def workbook() -> Path:
 @pytest.fixture(scope="session")
 def dc_spect() -> PinholeSystem:
     """The real scanner: 80 modules in 4 rings."""
-    from mphdrr.core.workbook import read_system
-
     return read_system(WORKBOOK)
 
 
 @pytest.fixture(scope="session")
 def small_workbook(dc_spect, tmp_path_factory) -> Path:
     """The real scanner's first 16 modules in a workbook of the same layout."""
-    from mphdrr.core.workbook import write_system
-
     path = tmp_path_factory.mktemp("workbook") / "small.xlsx"
     write_system(dc_spect[:16], path)
     return path

@@ -8,11 +8,10 @@ import sys
 import zlib
 from pathlib import Path
 
+import bpy
 import pytest
 
-bpy = pytest.importorskip("bpy")
-
-from mphdrr.addon import choices, registration  # noqa: E402
+from mphdrr.addon import choices, registration
 
 SAVED = Path(__file__).parent / "data" / "choices-0.1.0.blend"
 """Every choice that a scene can keep, numbered by position as version 0.1.0 did; what they are is in its text."""
@@ -170,6 +169,7 @@ if sys.argv[2] == "more":
     @dataclass(frozen=True)
     class Egg(Phantom):
         radius: float = setting(20.0, "mm", "radius of the egg")
+        weight: float = setting(60.0, "g", "with its shell")
         shell: str = choice("white", ("white", "brown"), "colour of the shell")
         title = "egg"
 
@@ -189,6 +189,9 @@ if sys.argv[2] == "more":
     bpy.ops.mphdrr.add_goose_egg(voxels=8, shell="brown")
     made = bpy.context.object.mphdrr_volume
     assert (made.kind, made.goose_egg.shell, made.maximum) == ("GOOSE_EGG", "brown", 2.0)
+    assert made.goose_egg.recipe().keys() == {"phantom", "radius_mm", "weight_g", "shell"}
+    weight = made.goose_egg.bl_rna.properties["weight"]
+    assert (weight.name, weight.description) == ("Weight (g)", "With its shell, in g")
 bpy.ops.wm.open_mainfile(filepath=sys.argv[1], load_ui=False)
 expected = json.loads(bpy.data.texts["expected.json"].as_string())
 read = {}

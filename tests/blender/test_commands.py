@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 import mphdrr.core as mph
+from mphdrr.addon import images, pictures, scanner, volumes
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
 
@@ -37,8 +38,6 @@ def test_scene_command_saves_scanner_volume_and_projections(tmp_path, workbook, 
     assert {path.name for path in blend.parent.iterdir()} == {"scanner.blend", "scanner_mphdrr"}
 
     bpy.ops.wm.open_mainfile(filepath=str(blend))
-    from mphdrr.addon import images, scanner, volumes
-
     collection = scanner.active_scanner(bpy.context.scene)
     assert np.array_equal(scanner.read_scanner(collection).centers, mph.read_system(workbook).centers)
     expected = mph.read_run(small_run)
@@ -54,8 +53,6 @@ def test_scene_command_takes_a_volume_of_mu(tmp_path, workbook):
     mph.write_volume(mu, tmp_path / "mu.nii")
     run("-m", "mphdrr", "scene", workbook, "--modules", "1-2", "--mu", tmp_path / "mu.nii", "-o", tmp_path / "s.blend")
     bpy.ops.wm.open_mainfile(filepath=str(tmp_path / "s.blend"))
-    from mphdrr.addon import volumes
-
     shown = volumes.volume_from_object(bpy.context.scene.mphdrr_projections.mu)
     assert shown.quantity == "mu" and np.array_equal(shown.array, mu.array)
     np.testing.assert_allclose(shown.grid.affine, mu.grid.affine, atol=1e-4)
@@ -76,8 +73,6 @@ def test_scene_command_refuses_activity_as_mu(tmp_path, workbook):
 
 
 def test_pictures_leave_the_scene_as_it_was(tmp_path, dc_spect, scene):
-    from mphdrr.addon import pictures, scanner
-
     collection = scanner.build_scanner(scene, dc_spect)
     scanner.show_modules(collection, 5, 9)
 

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
+import bpy
 import numpy as np
 import pytest
 
-bpy = pytest.importorskip("bpy")
-
-from mphdrr.addon import scanner, volumes  # noqa: E402
-from mphdrr.core.runs.files import read_run  # noqa: E402
+from mphdrr.addon import scanner, volumes
+from mphdrr.core.runs.files import read_run
 
 
 @pytest.fixture
@@ -35,8 +34,7 @@ def test_dataset_holds_the_run_whole(rendered, tmp_path, suffix, ring_system):
 
 
 @pytest.mark.parametrize(
-    ("name", "message"),
-    [("run.txt", "expected a name ending in"), ("nowhere/run.h5", "no such folder"), ("", "file")],
+    ("name", "message"), [("run.txt", "expected a name ending in"), ("nowhere/run.h5", "no such folder"), ("", "file")]
 )
 def test_wrong_names_are_clear_errors_and_nothing_is_written(rendered, tmp_path, name, message):
     with pytest.raises(RuntimeError, match=message):

@@ -11,10 +11,10 @@ import numpy as np
 import pytest
 
 from mphdrr.addon import module_edits, scanner
+from mphdrr.addon.scanner_files import export_scanner
 from mphdrr.core.errors import InputError, InputWarning
+from mphdrr.core.geometry.system import LENGTHS
 from mphdrr.core.workbook import read_system
-
-LENGTHS = ("pinhole_diameter", "collimator_length", "detector_side", "detector_thickness", "roi_radius")
 
 
 @pytest.fixture
@@ -116,8 +116,6 @@ def test_template_that_has_gone_is_said(collection, own, tmp_path):
     own.unlink()
     scanner.module(collection, 3).mphdrr_module.pinhole_diameter = 2.9
     system = scanner.read_scanner(collection)
-    from mphdrr.addon.scanner_files import export_scanner
-
     with pytest.warns(InputWarning, match=r"own\.xlsx has gone"):
         export_scanner(collection, tmp_path / "new.xlsx")
     assert_equal(read_system(tmp_path / "new.xlsx"), system)

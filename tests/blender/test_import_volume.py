@@ -5,19 +5,18 @@ from __future__ import annotations
 import time
 from pathlib import Path
 
+import bpy
 import numpy as np
 import pytest
 
-bpy = pytest.importorskip("bpy")
-
-from mphdrr.addon import slices, storage, stored_volumes, volume_materials, volumes  # noqa: E402
-from mphdrr.addon.vdb import openvdb, write_vdb  # noqa: E402
-from mphdrr.core.errors import InputError  # noqa: E402
-from mphdrr.core.geometry.frames import euler_pose  # noqa: E402
-from mphdrr.core.geometry.grid import Grid  # noqa: E402
-from mphdrr.core.physics.ct_numbers import hu_to_mu  # noqa: E402
-from mphdrr.core.volumes.volume import Volume  # noqa: E402
-from mphdrr.core.volumes.volume_files import write_volume  # noqa: E402
+from mphdrr.addon import slices, storage, stored_volumes, volume_materials, volumes
+from mphdrr.addon.vdb import openvdb, write_vdb
+from mphdrr.core.errors import InputError
+from mphdrr.core.geometry.frames import euler_pose
+from mphdrr.core.geometry.grid import Grid
+from mphdrr.core.physics.ct_numbers import hu_to_mu
+from mphdrr.core.volumes.volume import Volume
+from mphdrr.core.volumes.volume_files import write_volume
 
 AFFINE = euler_pose(0.3, 0.1, -0.2, (40.0, 50.0, 60.0)) @ np.diag([0.7, -0.8, 2.5, 1.0])
 

@@ -8,7 +8,7 @@ import bpy
 import numpy as np
 import pytest
 
-from mphdrr.addon import ids, volumes
+from mphdrr.addon import volumes
 
 
 def select(*items):
@@ -107,4 +107,4 @@ def test_volume_to_mesh_and_back():
     again = added()
     assert content(again) == pytest.approx(4 / 3 * math.pi * 20**3, rel=2e-2)
     assert again.grid.center[0] == pytest.approx(15.0, abs=0.1)
-    assert getattr(volumes.volume_objects(bpy.context.scene)[0], ids.OBJECT_VOLUME).quantity == "activity"
+    assert volumes.volume_objects(bpy.context.scene)[0].mphdrr_volume.quantity == "activity"

@@ -60,5 +60,5 @@ def test_panels_draw_what_exists(scene, ring_system):
 
 @pytest.mark.parametrize("kind", ["derenzo", "torso"])
 def test_panels_draw_a_phantom(kind):
-    assert getattr(bpy.ops.mphdrr, f"add_{kind}")(voxels=8) == {"FINISHED"}
+    assert getattr(bpy.ops.mphdrr, f"add_{kind}")(voxels=12) == {"FINISHED"}
     draw_panels()

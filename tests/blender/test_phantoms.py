@@ -5,22 +5,20 @@ from __future__ import annotations
 import dataclasses
 from pathlib import Path
 
+import bpy
 import numpy as np
 import pytest
+from mathutils import Matrix
 
-bpy = pytest.importorskip("bpy")
-
-from mathutils import Matrix  # noqa: E402
-
-from mphdrr.addon import cameras, jobs, phantom_properties, phantoms, volumes  # noqa: E402
-from mphdrr.core.errors import InputError  # noqa: E402
-from mphdrr.core.geometry.frames import euler_pose  # noqa: E402
-from mphdrr.core.geometry.grid import Grid  # noqa: E402
-from mphdrr.core.phantoms.kinds import KINDS  # noqa: E402
-from mphdrr.core.phantoms.language import read_phantom  # noqa: E402
-from mphdrr.core.phantoms.phantom import Phantom  # noqa: E402
-from mphdrr.core.projector import Projector  # noqa: E402
-from mphdrr.core.volumes.volume import Volume  # noqa: E402
+from mphdrr.addon import cameras, jobs, phantom_properties, phantoms, volumes
+from mphdrr.core.errors import InputError
+from mphdrr.core.geometry.frames import euler_pose
+from mphdrr.core.geometry.grid import Grid
+from mphdrr.core.phantoms.kinds import KINDS
+from mphdrr.core.phantoms.language import read_phantom
+from mphdrr.core.phantoms.phantom import Phantom
+from mphdrr.core.projector import Projector
+from mphdrr.core.volumes.volume import Volume
 
 THORAX = Path(__file__).parents[2] / "examples" / "phantoms" / "thorax.toml"
 POSE = {"location": (4.0, -5.0, 6.0), "phi": 0.5, "theta": 0.25, "psi": -0.125}  # whole in float32
@@ -103,7 +101,7 @@ def test_scripts_add_what_operators_add():
 
 
 def test_settings_that_cannot_be_leave_the_voxels_and_say_why():
-    item = add("defrise", voxels=8)
+    item = add("defrise", voxels=24)
     before, settings = voxels_of(item), item.mphdrr_volume.defrise
     settings.spacing = 1.0
     assert "disk thickness" in item.mphdrr_volume.message and item.mphdrr_volume.outdated
@@ -119,7 +117,7 @@ def test_settings_that_cannot_be_leave_the_voxels_and_say_why():
     with pytest.raises(RuntimeError, match="grid of points has no mu"):
         bpy.ops.mphdrr.add_points(voxels=8, attenuation=True)
     assert (len(bpy.data.objects), len(bpy.data.volumes)) == objects
-    item = add("points", voxels=8)
+    item = add("points", voxels=12)
     item.mphdrr_volume.points.quantity = "mu"
     assert "has no mu" in item.mphdrr_volume.message and item.mphdrr_volume.quantity == "activity"
 
@@ -172,7 +170,7 @@ def test_toml_that_is_no_phantom_adds_nothing(text, message, tmp_path):
 
 @pytest.mark.parametrize("scale", [(1, 1, 1, 1), (1.2, 0.8, 1, 1)], ids=["turned", "sheared"])
 def test_applied_pose_keeps_activity_and_projections(ring_system, scale):
-    item = add("shepp-logan", voxels=120, attenuation=True)
+    item = add("shepp-logan", voxels=100, attenuation=True)
     phantom = item.mphdrr_volume.shepp_logan.phantom()
     # Scaled, under a parent that may be scaled too.
     parent = bpy.data.objects.new("Parent", None)

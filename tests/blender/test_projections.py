@@ -5,21 +5,29 @@ from __future__ import annotations
 import threading
 import warnings
 from pathlib import Path
+from types import SimpleNamespace
+from unittest.mock import MagicMock
 
+import bpy
 import numpy as np
 import pytest
 
-bpy = pytest.importorskip("bpy")
-
-from mphdrr.addon import ids, images, jobs, scanner, storage, volumes  # noqa: E402
-from mphdrr.core import memory  # noqa: E402
-from mphdrr.core.errors import InputError  # noqa: E402
-from mphdrr.core.geometry.grid import Grid  # noqa: E402
-from mphdrr.core.geometry.system import PinholeSystem  # noqa: E402
-from mphdrr.core.progress import Cancelled  # noqa: E402
-from mphdrr.core.projector import Emission, Projector  # noqa: E402
-from mphdrr.core.runs.mosaic import as_seen  # noqa: E402
-from mphdrr.core.volumes.volume import Volume  # noqa: E402
+from mphdrr.addon import ids, images, jobs, scanner, storage, volumes
+from mphdrr.addon.projection_properties import PROPERTIES, ProjectionSettings
+from mphdrr.core import memory
+from mphdrr.core.errors import InputError
+from mphdrr.core.geometry.grid import Grid
+from mphdrr.core.geometry.system import PinholeSystem
+from mphdrr.core.physics.ct_numbers import hu_to_mu
+from mphdrr.core.physics.noise import sample_counts
+from mphdrr.core.progress import Cancelled
+from mphdrr.core.projector import Emission, InverseSquareSum, Projector, intensity
+from mphdrr.core.runs.files import read_run
+from mphdrr.core.runs.mosaic import as_seen
+from mphdrr.core.runs.recipe import write_recipe
+from mphdrr.core.runs.settings import SETTINGS
+from mphdrr.core.volumes.volume import Volume
+from mphdrr.panels.projections import MPHDRR_PT_physics
 
 
 @pytest.fixture
@@ -48,10 +56,8 @@ def test_images_hold_exactly_what_core_projects(scanned, scene, detector):
 
 
 def test_emission_makes_counts(scanned, scene):
-    from mphdrr.core.runs.files import read_run
-
     assert bpy.ops.mphdrr.render_projections(width=24, height=20, model="EMISSION", time=60) == {"FINISHED"}
-    run = read_run(storage.absolute(getattr(scene, ids.SCENE_PROJECTIONS).run_file))
+    run = read_run(storage.absolute(scene.mphdrr_projections.run_file))
     volume = volumes.volume_from_object(bpy.data.objects["Derenzo"])
     expected = Projector(volume.grid, scanned.views((20, 24)), Emission(scanned, time=60))(volume)
     assert expected.max() > 0
@@ -80,9 +86,6 @@ IN_PYTHON = PHYSICS | {"edge": "path", "opening_angle": 1.4}
 
 def test_physics_of_the_panel_is_that_of_core(scanned, scene, body):
     """Images equal core's, and the run records every setting, the volume of mu and the seed."""
-    from mphdrr.core.physics.noise import sample_counts
-    from mphdrr.core.runs.files import read_run
-
     settings = scene.mphdrr_projections
     settings.model, settings.noise, settings.seed, settings.mu = "EMISSION", True, 5, bpy.data.objects["Body"]
     shape = scene.mphdrr_geometry.scanner.mphdrr_scanner  # whose collimators are drawn so, too
@@ -105,8 +108,6 @@ def test_physics_of_the_panel_is_that_of_core(scanned, scene, body):
 
 def test_materials_of_the_panel_are_those_of_core(scanned, scene):
     """Chosen materials attenuate the isotope's photons; a coefficient given by a script takes precedence."""
-    from mphdrr.core.runs.files import read_run
-
     settings = scene.mphdrr_projections
     settings.model, settings.isotope = "EMISSION", "Tl-201"
     settings.aperture_material, settings.crystal_material = "tungsten", "NaI"
@@ -122,9 +123,6 @@ def test_materials_of_the_panel_are_those_of_core(scanned, scene):
 
 
 def test_photons_of_a_radiograph_and_the_inverse_square_sum(scanned, scene, body):
-    from mphdrr.core.projector import InverseSquareSum, intensity
-    from mphdrr.core.runs.files import read_run
-
     views = scanned.views((20, 24))
     bpy.ops.mphdrr.render_projections(width=24, height=20, photons=1000)  # the only volume of mu
     run = read_run(storage.absolute(scene.mphdrr_projections.run_file))
@@ -138,31 +136,18 @@ def test_photons_of_a_radiograph_and_the_inverse_square_sum(scanned, scene, body
 
 @pytest.mark.parametrize("model", ["TRANSMISSION", "EMISSION", "INVERSE_SQUARE"])
 def test_physics_panel_shows_settings_that_exist(scanned, scene, model):
-    from mphdrr.panels.projections import MPHDRR_PT_physics
-
     settings = scene.mphdrr_projections
     settings.model, settings.photons = model, 100
-    shown = []
-
-    class Layout:
-        def prop(self, owner, name, **_):
-            assert name in owner.bl_rna.properties
-            shown.append(name)
-
-        def column(self, **_):
-            return self
-
-        row = column
-
-    class Panel:
-        layout = Layout()
-
+    layout = MagicMock()
+    layout.row.return_value = layout.column.return_value = layout
     assert "DEFAULT_CLOSED" in MPHDRR_PT_physics.bl_options
     assert MPHDRR_PT_physics.poll(bpy.context) == (model != "INVERSE_SQUARE")
-    MPHDRR_PT_physics.draw(Panel(), bpy.context)
-    assert {"noise", "seed"} <= set(shown)
+    MPHDRR_PT_physics.draw(SimpleNamespace(layout=layout), bpy.context)
+    shown = {name: owner for (owner, name), _ in layout.prop.call_args_list}
+    assert all(name in owner.bl_rna.properties for name, owner in shown.items())
+    assert {"noise", "seed"} <= shown.keys()
     of_counts = {"mu", *PHYSICS} - {"time", "pixel_points"}
-    assert (of_counts <= set(shown)) == (model == "EMISSION")
+    assert (of_counts <= shown.keys()) == (model == "EMISSION")
 
 
 @pytest.mark.parametrize(
@@ -204,8 +189,6 @@ def test_rendering_again_replaces_the_images(scanned):
 
 
 def test_images_and_arrays_survive_save_and_reopen(scanned, scene, tmp_path):
-    from mphdrr.core.runs.files import read_run
-
     bpy.ops.mphdrr.render_projections(width=24, height=20)
     name = ids.projection_name(scanned.numbers[0], 8)
     before = images.projection_array(bpy.data.images[name])
@@ -290,12 +273,6 @@ def test_foreign_image_of_the_same_name_is_kept(scanned):
     assert tuple(bpy.data.images["mphDRR 01"].size) == (8, 8)
 
 
-def _run_in_thread(work) -> jobs.Worker:
-    run = jobs.Worker("Test", work)
-    run.start()
-    return run
-
-
 def test_job_stops_at_its_next_step_when_cancelled():
     reached, go_on = threading.Event(), threading.Event()
 
@@ -305,37 +282,29 @@ def test_job_stops_at_its_next_step_when_cancelled():
         go_on.wait(5)
         progress(2, 2)
 
-    run = _run_in_thread(work)
+    run = jobs.Worker("Test", work)
+    run.start()
     assert reached.wait(5)
     run.cancel.set()
     go_on.set()
-    run.thread.join(5)
-    assert isinstance(run.error, Cancelled) and not run.alive and (run.done, run.total) == (2, 2)
+    run.join(5)
+    assert isinstance(run.error, Cancelled) and not run.is_alive() and (run.done, run.total) == (2, 2)
 
 
-def test_stop_ends_the_thread_of_the_running_job(monkeypatch):
+@pytest.mark.parametrize("end", [jobs.stop, lambda: bpy.ops.wm.read_homefile(use_factory_startup=True)])
+def test_stopping_or_loading_a_file_ends_the_thread_of_the_running_job(monkeypatch, end):
     def work(progress):
         while True:
             progress(0, 1)
 
     before = warnings.showwarning, list(warnings.filters)
-    run = _run_in_thread(work)
+    run = jobs.Worker("Test", work)
+    run.start()
     monkeypatch.setattr(jobs, "_current", run)
-    assert jobs.is_running() and jobs.current().label == "Test"
-    jobs.stop()
-    assert not run.alive and jobs.current() is None
+    assert jobs.is_running()
+    end()
+    assert not run.is_alive() and not jobs.is_running()
     assert (warnings.showwarning, list(warnings.filters)) == before
-
-
-def test_loading_a_file_ends_the_running_job(monkeypatch):
-    def work(progress):
-        while True:
-            progress(0, 1)
-
-    run = _run_in_thread(work)
-    monkeypatch.setattr(jobs, "_current", run)
-    bpy.ops.wm.read_homefile(use_factory_startup=True)
-    assert not run.alive and not jobs.is_running()
 
 
 @pytest.mark.parametrize(
@@ -373,9 +342,6 @@ HOW = r"hu_to_mu\(volume, energy\), .*CT to Attenuation in Blender's Phantom pan
 @pytest.mark.parametrize("chosen", ["named", "panel", "active"])
 @pytest.mark.parametrize("settings", [{}, {"photons": 1000.0}, {"model": "INVERSE_SQUARE"}])
 def test_a_ct_is_no_radiograph_until_it_is_converted(scene, scanned, ct, chosen, settings):
-    from mphdrr.core.physics.ct_numbers import hu_to_mu
-    from mphdrr.core.runs.files import read_run
-
     given = {**settings, **({"volume": "CT"} if chosen == "named" else {})}
     scene.mphdrr_projections.volume = ct if chosen == "panel" else None
     with pytest.raises(RuntimeError, match=f"'CT' for .*: expected a volume of .*mu, got hu; .*{HOW}"):
@@ -402,8 +368,6 @@ def test_a_moved_ct_is_converted_where_it_is_and_in_every_state(scene, scanned):
     bpy.ops.mphdrr.ct_to_attenuation()
     made = bpy.context.object
     assert made.data.is_sequence and made.data.frame_start == 4
-    from mphdrr.core.physics.ct_numbers import hu_to_mu
-
     for k in range(3):
         scene.frame_set(4 + k)
         expected, got = hu_to_mu(volumes.volume_from_object(item)), volumes.volume_from_object(made)
@@ -444,9 +408,8 @@ def test_only_a_ct_is_converted(scanned):
         bpy.ops.mphdrr.ct_to_attenuation()
 
 
-@pytest.mark.parametrize(("isotope", "said"), [("Tc-99m", False), ("I-131", True)])
 @pytest.mark.parametrize("source", ["phantom", "ct"])
-def test_attenuation_at_another_energy_is_said(scanned, scene, source, isotope, said, capfd):
+def test_attenuation_at_another_energy_is_said(scanned, scene, source, capfd):
     if source == "phantom":
         bpy.ops.mphdrr.add_nema(voxels=16, attenuation=True, name="Body")
         mu = next(o for o in volumes.volume_objects(scene) if o.mphdrr_volume.quantity == "mu")
@@ -456,26 +419,22 @@ def test_attenuation_at_another_energy_is_said(scanned, scene, source, isotope, 
         )
         bpy.ops.mphdrr.ct_to_attenuation()
         mu = bpy.context.object
-    settings = {"model": "EMISSION", "isotope": isotope, "volume": "Derenzo", "mu": mu.name}
-    capfd.readouterr()
-    assert bpy.ops.mphdrr.render_projections(width=4, height=4, last=1, **settings) == {"FINISHED"}
-    out = "".join(capfd.readouterr())
-    assert (f"the mu of '{mu.name}' holds at 140.5 keV" in out) == said
+    settings = {"model": "EMISSION", "volume": "Derenzo", "mu": mu.name}
+    for isotope, said in (("Tc-99m", False), ("I-131", True)):
+        capfd.readouterr()
+        done = bpy.ops.mphdrr.render_projections(width=4, height=4, last=1, isotope=isotope, **settings)
+        out = "".join(capfd.readouterr())
+        assert done == {"FINISHED"} and (f"the mu of '{mu.name}' holds at 140.5 keV" in out) == said
 
 
 def _panel(settings) -> dict:
     """Every property of the panel, except volumes and the last run."""
-    from mphdrr.addon.projection_properties import ProjectionSettings
-
     values = {name: getattr(settings, name) for name in ProjectionSettings.__annotations__}
     return {k: tuple(v) if isinstance(v, bpy.types.bpy_prop_array) else v for k, v in values.items()}
 
 
 @pytest.mark.parametrize("saved", ["run", "toml"])
 def test_the_recipe_of_a_run_sets_the_panel_as_it_was(scanned, scene, body, tmp_path, saved):
-    from mphdrr.core.runs.files import read_run
-    from mphdrr.core.runs.recipe import write_recipe
-
     settings = scene.mphdrr_projections
     settings.model, settings.noise, settings.seed, settings.mu = "EMISSION", True, 5, bpy.data.objects["Body"]
     settings.isotope, settings.aperture_material, settings.edge, settings.crystal_mu = "Tl-201", "lead", "PATH", 0.4
@@ -514,8 +473,5 @@ def test_a_recipe_that_the_panel_cannot_take_is_one_clear_line(scene, tmp_path, 
 
 
 def test_every_setting_has_a_property_of_its_own():
-    from mphdrr.addon.projection_properties import PROPERTIES
-    from mphdrr.core.runs.settings import SETTINGS
-
     shown = [key for key in SETTINGS if key.startswith(("model.", "detector.", "compute."))]
     assert len({setting.key for setting in PROPERTIES.values()}) == len(shown) - 1  # the opening angle is the scanner's

@@ -11,12 +11,10 @@ import bpy
 import numpy as np
 import pytest
 
-from mphdrr.addon import cameras, ids, registration, scanner
+from mphdrr.addon import cameras, registration, scanner
 from mphdrr.core.errors import InputError, InputWarning
 from mphdrr.core.geometry.collimator import Construction
-from mphdrr.core.geometry.system import PinholeSystem
-
-LENGTHS = ("pinhole_diameter", "collimator_length", "detector_side", "detector_thickness", "roi_radius")
+from mphdrr.core.geometry.system import LENGTHS, PinholeSystem
 
 
 def counts() -> dict[str, int]:
@@ -31,7 +29,7 @@ def assert_same(a: PinholeSystem, b: PinholeSystem) -> None:
 
 def test_registers_twice():
     registration.unregister()
-    assert not hasattr(bpy.types.Object, ids.OBJECT_MODULE)
+    assert not hasattr(bpy.types.Object, "mphdrr_module")
     for _ in range(2):
         registration.register()
         registration.unregister()
@@ -49,7 +47,7 @@ def test_failed_registration_leaves_nothing(monkeypatch):
     monkeypatch.setattr(registration, "CLASSES", (*registration.CLASSES, Broken))
     with pytest.raises((RuntimeError, ValueError), match="no_dot_in_it"):
         registration.register()
-    assert not hasattr(bpy.types.Object, ids.OBJECT_MODULE)
+    assert not hasattr(bpy.types.Object, "mphdrr_module")
     monkeypatch.undo()
     registration.register()
 
@@ -204,14 +202,7 @@ def test_replacing_asks_for_what_would_be_lost_and_keeps_what_is_the_users(scene
     with pytest.raises(InputError) as error:
         scanner.build_scanner(scene, ring_system, "One")
     assert counts() == before
-    for phrase in (
-        "module 5 moved",
-        "module 6 with changed",
-        "My lamp",
-        "My folder",
-        copy.name,
-        "replace=True",
-    ):
+    for phrase in ("module 5 moved", "module 6 with changed", "My lamp", "My folder", copy.name, "replace=True"):
         assert phrase in str(error.value)
     assert "\n" not in str(error.value)
 

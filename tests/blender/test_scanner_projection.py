@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import bmesh
 import bpy
 import numpy as np
 import pytest
@@ -81,8 +82,6 @@ def test_markers_rendered_by_cycles_land_where_views_say(scene, dc_spect, number
 
 
 def emitting_sphere(center: np.ndarray, radius: float, channel: int) -> bpy.types.Object:
-    import bmesh
-
     mesh = bpy.data.meshes.new("Marker")
     shape = bmesh.new()
     bmesh.ops.create_icosphere(shape, subdivisions=3, radius=radius)

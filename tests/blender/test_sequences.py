@@ -4,20 +4,19 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import bpy
 import numpy as np
 import pytest
 
-bpy = pytest.importorskip("bpy")
-
-from mphdrr.addon import phantoms, scanner, storage, volumes  # noqa: E402
-from mphdrr.addon.phantom_properties import plain_settings  # noqa: E402
-from mphdrr.addon.stored_volumes import store_volume  # noqa: E402
-from mphdrr.core.geometry.grid import Grid  # noqa: E402
-from mphdrr.core.phantoms.torso import CardiacTorso  # noqa: E402
-from mphdrr.core.projector import Projector  # noqa: E402
-from mphdrr.core.runs.files import read_run  # noqa: E402
-from mphdrr.core.volumes.volume import Volume  # noqa: E402
-from mphdrr.core.volumes.volume_files import write_volume  # noqa: E402
+from mphdrr.addon import phantoms, scanner, storage, volumes
+from mphdrr.addon.phantom_properties import plain_settings
+from mphdrr.addon.stored_volumes import store_volume
+from mphdrr.core.geometry.grid import Grid
+from mphdrr.core.phantoms.torso import CardiacTorso
+from mphdrr.core.projector import Projector
+from mphdrr.core.runs.files import read_run
+from mphdrr.core.volumes.volume import Volume
+from mphdrr.core.volumes.volume_files import write_volume
 
 
 @pytest.fixture
@@ -28,8 +27,8 @@ def beats() -> list[Volume]:
 
 
 def test_every_frame_has_its_state_of_the_torso(scene):
-    assert bpy.ops.mphdrr.add_torso(voxels=8, frames=2) == {"FINISHED"}
-    item, recipe = bpy.context.object, phantoms.recipe_of(plain_settings("torso", voxels=8, frames=2))
+    assert bpy.ops.mphdrr.add_torso(voxels=12, frames=2) == {"FINISHED"}
+    item, recipe = bpy.context.object, phantoms.recipe_of(plain_settings("torso", voxels=12, frames=2))
     assert recipe.settings["frames"] == 2 and list(recipe.states) == list(CardiacTorso().beating(2))
     states = [state.voxelize(recipe.grid).array for state in recipe.states]
     for frame in (1, 2, 3):

@@ -4,17 +4,17 @@ from __future__ import annotations
 
 import warnings
 
+import bpy
 import numpy as np
 import pytest
 
-bpy = pytest.importorskip("bpy")
-
-from mphdrr.addon import compat, volumes  # noqa: E402
-from mphdrr.addon.vdb import openvdb, read_vdb, write_vdb  # noqa: E402
-from mphdrr.core.errors import InputError  # noqa: E402
-from mphdrr.core.geometry.frames import euler_pose  # noqa: E402
-from mphdrr.core.geometry.grid import Grid  # noqa: E402
-from mphdrr.core.volumes.volume import Volume  # noqa: E402
+from mphdrr.addon import compat, volumes
+from mphdrr.addon.vdb import openvdb, read_vdb, write_vdb
+from mphdrr.core.errors import InputError
+from mphdrr.core.geometry.frames import euler_pose
+from mphdrr.core.geometry.grid import Grid
+from mphdrr.core.volumes.volume import Volume
+from mphdrr.core.volumes.volume_files import read_volume
 
 vdb = openvdb()
 
@@ -199,8 +199,6 @@ def test_other_programs_find_voxels_where_they_are(tmp_path, mirror):
 
 @pytest.mark.parametrize("ending", [".vdb", ".nii.gz", ".npz", ".nrrd"])
 def test_export_writes_a_moved_volume_for_other_programs(tmp_path, ending):
-    from mphdrr.core.volumes.volume_files import read_volume
-
     rng = np.random.default_rng(8)
     volume = Volume(rng.random((5, 4, 6), np.float32), Grid((5, 4, 6), LINEAR), "activity")
     item = volumes.add_volume(volume, "Heart")

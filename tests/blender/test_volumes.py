@@ -2,22 +2,19 @@
 
 from __future__ import annotations
 
-import itertools
 from pathlib import Path
 
+import bpy
 import numpy as np
 import pytest
+from mathutils import Matrix
 
-bpy = pytest.importorskip("bpy")
-
-from mathutils import Matrix  # noqa: E402
-
-from mphdrr.addon import compat, storage, stored_volumes, volume_materials, volumes  # noqa: E402
-from mphdrr.core.errors import InputError  # noqa: E402
-from mphdrr.core.geometry.frames import euler_pose  # noqa: E402
-from mphdrr.core.geometry.grid import Grid  # noqa: E402
-from mphdrr.core.phantoms.derenzo import DerenzoPhantom  # noqa: E402
-from mphdrr.core.volumes.volume import Volume  # noqa: E402
+from mphdrr.addon import compat, storage, stored_volumes, volume_materials, volumes
+from mphdrr.core.errors import InputError
+from mphdrr.core.geometry.frames import euler_pose
+from mphdrr.core.geometry.grid import Grid
+from mphdrr.core.phantoms.derenzo import DerenzoPhantom
+from mphdrr.core.volumes.volume import Volume
 
 SHEAR = np.array([[1.0, 0.3, 0.0, 0.0], [0.0, 1.0, -0.2, 0.0], [0.0, 0.0, 1.0, 0.0], [0.0, 0.0, 0.0, 1.0]])
 AFFINES = {
@@ -260,14 +257,12 @@ def test_volumes_are_within_eevees_reach(scene):
 
 
 def test_volume_drawn_for_another_blender_is_rewritten_on_load(tmp_path, sparse_volume, monkeypatch):
-    other = -0.5 - compat.VDB_CENTER_SHIFT
-    running = compat.VDB_CENTER_SHIFT
-    monkeypatch.setattr(compat, "VDB_CENTER_SHIFT", other)
+    monkeypatch.setattr(compat, "VDB_CENTER_SHIFT", -0.5 - compat.VDB_CENTER_SHIFT)
     volumes.add_volume(sparse_volume, "Sample")
     bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "a.blend"))
-    monkeypatch.setattr(compat, "VDB_CENTER_SHIFT", running)
+    monkeypatch.undo()
     bpy.ops.wm.open_mainfile(filepath=str(tmp_path / "a.blend"))
     item = bpy.data.objects["Sample"]
     assert item.mphdrr_volume.center_shift == compat.VDB_CENTER_SHIFT
     assert np.array_equal(volumes.volume_from_object(item).array, sparse_volume.array)
-    assert len({p.name for p in itertools.chain((tmp_path / "a_mphdrr").iterdir())}) == 2
+    assert len({p.name for p in (tmp_path / "a_mphdrr").iterdir()}) == 2

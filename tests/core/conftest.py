@@ -3,17 +3,23 @@
 from __future__ import annotations
 
 import importlib.util
+import os
+import subprocess
+import sys
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
+from mphdrr.core.errors import InputError
 from mphdrr.core.geometry.frames import euler_pose
 from mphdrr.core.geometry.grid import Grid
 from mphdrr.core.geometry.system import PinholeSystem
 from mphdrr.core.projector import Emission
 from mphdrr.core.volumes.volume import Volume
+from mphdrr.core.workbook import read_system
 
 WORKBOOK = Path(__file__).parents[2] / "examples" / "dc-spect-80.xlsx"
 
@@ -30,6 +36,12 @@ def rng() -> np.random.Generator:
 @pytest.fixture(scope="session")
 def workbook() -> Path:
     return WORKBOOK
+
+
+@pytest.fixture(scope="session")
+def scanner() -> PinholeSystem:
+    """The users' scanner of 80 modules."""
+    return read_system(WORKBOOK)
 
 
 @pytest.fixture
@@ -60,3 +72,33 @@ def general_grid(rng: np.random.Generator, shape: tuple[int, int, int]) -> Grid:
 def emission(system: PinholeSystem, mu: Volume | None = None, **options: Any) -> Emission:
     """Emission with one ray to each pixel's centre, for laws of single rays; without the warning that these are too few."""
     return Emission(system, mu, **({"pixel_points": 1, "tolerance": 1e9} | options))
+
+
+def same_matter(grid: Grid, mu: np.ndarray) -> list[Volume]:
+    """The same mu on `grid`, on a twice finer one and on a larger one."""
+    fine, moved = np.diag([0.5, 0.5, 0.5, 1.0]), np.eye(4)
+    fine[:3, 3], moved[:3, 3] = -0.25, (-1, -2, -3)
+    padding = np.array(((1, 1), (2, 0), (3, 4)))
+    twice = Grid(tuple(2 * n for n in grid.shape), grid.affine @ fine)
+    larger = Grid(tuple(grid.shape + padding.sum(axis=1)), grid.affine @ moved)
+    return [
+        Volume(mu, grid, "mu"),
+        Volume(mu.repeat(2, 0).repeat(2, 1).repeat(2, 2), twice, "mu"),
+        Volume(np.pad(mu, padding), larger, "mu"),
+    ]
+
+
+def refused(call: Callable[[], object], *words: str) -> None:
+    """`call` is refused in one line that has these words."""
+    with pytest.raises(InputError) as error:
+        call()
+    text = str(error.value)
+    assert all(word in text for word in words) and "\n" not in text, text
+
+
+def run_python(
+    code: str, environment: dict[str, str] | None = None, **options: Any
+) -> subprocess.CompletedProcess[str]:
+    """What a Python of its own says to `code`."""
+    together = os.environ | (environment or {})
+    return subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, env=together, **options)

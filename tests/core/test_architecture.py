@@ -92,6 +92,7 @@ def test_imports_inside_the_package_are_relative():
     [
         ("mphdrr", {"numpy", "bpy", "mphdrr.core", "mphdrr.addon"}),
         ("mphdrr.core", {"bpy", "torch", "h5py", "trimesh", "PIL", "nibabel", "scipy", "openpyxl"}),
+        ("mphdrr.core.projector", {"torch"}),
     ],
 )
 def test_import_loads_nothing_heavy(module: str, unwanted: set[str]):

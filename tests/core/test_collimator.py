@@ -26,11 +26,6 @@ PLACES = ("middle", "front", "back")
 N = 160
 
 
-@pytest.fixture(scope="module")
-def scanner(workbook) -> mph.PinholeSystem:
-    return mph.read_system(workbook)
-
-
 class Rays:
     """Rays (3, N) that end on a module's crystal, in its frame (u, v, depth behind the pinhole), and where they cross
     the pinhole's plane."""

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import pickle
-import warnings
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -20,7 +20,9 @@ from .nasty.case import sample
 from .test_workbook import CENTERS, assert_plain, plain, saved
 from .test_workbook import _typed as typed
 from .test_workbook_strict import READ, REFUSED
-from .workbooks import by_design, changed
+from .workbooks import by_design
+
+pytestmark = pytest.mark.filterwarnings("error")
 
 MAP = """
 [[tables]]
@@ -47,13 +49,6 @@ R = { column = "C", unit = "mm" }
 Ld = { column = "D", unit = "mm" }
 Td = { column = "E", unit = "mm" }
 """
-
-
-@pytest.fixture(autouse=True)
-def warnings_are_errors():
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        yield
 
 
 def silent(folder: Path, edit: Callable | None = None) -> Path:
@@ -255,7 +250,7 @@ def test_a_workbook_is_written_back_by_its_map(tmp_path):
     same = mph.write_system(system, tmp_path / "same.xlsx", path)
     assert same.path.read_bytes() == path.read_bytes()
     assert same.columns == system.source.columns
-    thinner = by_design(changed(system, pinhole_diameter=np.array([2.0, 2.1, 2.2, 2.3])))
+    thinner = by_design(replace(system, pinhole_diameter=np.array([2.0, 2.1, 2.2, 2.3])))
     written = mph.write_system(thinner, tmp_path / "thinner.xlsx", path)
     assert {"Main!B3", "Main!B4", "Main!B5", "Coordinates!G3"} <= set(written.changed)
     assert {name[:-1] for name in written.changed} == {"Main!B", "Coordinates!G"}
@@ -307,7 +302,7 @@ def test_what_one_row_for_all_cannot_hold_is_refused_with_its_cell(tmp_path):
     text = MAP.replace('rows = "by number"\nnumber = "A"', 'rows = "one for all"')
     text = text.replace("last_row = 6\nrows", "last_row = 3\nrows")
     system = mph.read_system(path, columns=mph.ColumnMap.from_toml(text))
-    differing = by_design(changed(system, pinhole_diameter=np.array([2.0, 2.1, 2.2, 2.3])))
+    differing = by_design(replace(system, pinhole_diameter=np.array([2.0, 2.1, 2.2, 2.3])))
     with pytest.raises(mph.InputError, match=r"d = 2.1 mm of module 2 .*: Main!B3 is read for all modules$"):
         mph.write_system(differing, tmp_path / "o.xlsx", path)
     assert not (tmp_path / "o.xlsx").exists()

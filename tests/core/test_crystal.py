@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 import mphdrr.core as mph
-from mphdrr.core.physics.crystal import absorbed_share, layer_depths
+from mphdrr.core.physics.crystal import absorbed_share
 
 from .conftest import emission
-from .test_emission import one_module, spot_image, turned_grid
+from .test_emission import one_module, spot_image, turned_grid, width
 
 
 @pytest.mark.parametrize("n", [1, 2, 5])
@@ -17,7 +17,7 @@ from .test_emission import one_module, spot_image, turned_grid
 def test_layers_absorb_what_the_crystal_absorbs_as_deep(n, mu):
     """1 - exp(-mu T / cos) of the photons are absorbed, with 2 or more layers at the mean depth, at every angle."""
     thickness, cosine = 9.0, np.linspace(0.3, 1, 50)
-    depths = layer_depths(n, thickness)
+    depths = np.linspace(0, thickness, n)
     shares = np.array([absorbed_share(cosine, mu, thickness, depths, layer) for layer in range(n)])
     k = mu / cosine
     np.testing.assert_allclose(shares.sum(axis=0), -np.expm1(-k * thickness), rtol=1e-12)
@@ -63,12 +63,8 @@ def test_thin_layers_blur_like_the_exponential():
     sharp, places = spot_image(emission(system, crystal_mu=mu), (0, 70, 0), pitch=0.05, n=200)
     deep, _ = spot_image(emission(system, crystal_mu=mu, depth_layers=12), (0, 70, 0), pitch=0.05, n=200)
 
-    def variance(image):
-        profile = image.sum(axis=0) / image.sum()
-        return profile @ places**2 - (profile @ places) ** 2
-
     tangent, z = 70 / 200, np.linspace(0, 10, 100_001)
     density = np.exp(-mu * np.hypot(1, tangent) * z)
     density /= density.sum()
     expected = tangent**2 * (density @ z**2 - (density @ z) ** 2)
-    assert variance(deep) - variance(sharp) == pytest.approx(expected, rel=0.03)
+    assert width(deep, places) ** 2 - width(sharp, places) ** 2 == pytest.approx(expected, rel=0.03)

@@ -6,9 +6,8 @@ import numpy as np
 import pytest
 
 import mphdrr.core as mph
-from mphdrr.core.errors import InputError
 
-from .conftest import BACKENDS, WORKBOOK, emission, general_grid
+from .conftest import BACKENDS, WORKBOOK, emission, general_grid, refused, same_matter
 
 TOLERANCE = {"numpy": 1e-12, "torch": 1e-5, "cpu": 1e-5}
 
@@ -45,6 +44,15 @@ def assert_adjoint(A, rng):
     Ax, ATy = A(x).astype(float), A.T(y).astype(float)
     assert Ax.any()
     assert abs(np.vdot(Ax, y) - np.vdot(x, ATy)) < np.linalg.norm(Ax) * np.linalg.norm(y) * TOLERANCE[A.backend]
+
+
+def assert_real_is_virtual(model, rng, pitch=4.0):
+    """Images on the crystal are those of virtual detectors, point-inverted."""
+    grid = general_grid(rng, (9, 8, 7))
+    x = rng.random(grid.shape)
+    real = mph.Projector(grid, model.system.views((9, 10), "real", pitch=pitch), model)(x)
+    virtual = mph.Projector(grid, model.system.views((9, 10), "virtual", 3.0, pitch=3 * pitch), model)(x)
+    np.testing.assert_allclose(virtual[:, ::-1, ::-1], real, rtol=1e-5, atol=1e-5 * real.max())
 
 
 def test_point_source_obeys_pinhole_sensitivity(rng):
@@ -139,23 +147,21 @@ def test_views_of_another_system_are_refused(system):
     grid = mph.Grid.centered((4, 4, 4), 1.0)
     views = system.views((4, 4))
 
-    def refused(*words, views=views, **arguments):
-        with pytest.raises(InputError) as error:
-            mph.Projector(grid, views, emission(**({"system": system} | arguments)))
-        assert all(word in str(error.value) for word in words) and "\n" not in str(error.value)
+    def not_taken(*words, views=views, **arguments):
+        refused(lambda: mph.Projector(grid, views, emission(**({"system": system} | arguments))), *words)
 
-    refused("12 modules", "4 views", views=system[:4].views((4, 4)))
-    refused("view 0", "pinhole", views=system[np.arange(12)[::-1]].views((4, 4)))
+    not_taken("12 modules", "4 views", views=system[:4].views((4, 4)))
+    not_taken("view 0", "pinhole", views=system[np.arange(12)[::-1]].views((4, 4)))
     turned = mph.Views(
         views.sources, views.detector_centers, views.u_steps + np.array([0, 0, 1]), views.v_steps, (4, 4)
     )
-    refused("view 0", "along", views=turned)
+    not_taken("view 0", "along", views=turned)
     behind = mph.Views(views.sources, 2 * views.sources - views.detector_centers, views.u_steps, views.v_steps, (4, 4))
-    refused("in front", views=behind)
-    refused("PinholeSystem", system=views)
-    refused("time", time=0)
-    with pytest.raises(InputError, match="activity"):
-        mph.Projector(grid, views, emission(system))(mph.Volume(np.ones(grid.shape), grid, "hu"))
+    not_taken("in front", views=behind)
+    not_taken("PinholeSystem", system=views)
+    not_taken("time", time=0)
+    hu = mph.Volume(np.ones(grid.shape), grid, "hu")
+    refused(lambda: mph.Projector(grid, views, emission(system))(hu), "activity")
 
 
 def some_mu(rng, grid):
@@ -234,16 +240,7 @@ def test_attenuation_depends_on_matter_and_not_on_its_grid(backend, system, rng)
     grid = turned_grid((6, 5, 4), 14.0)
     activity = np.zeros(grid.shape)
     activity[2:4, 1:3, 1:3] = rng.random((2, 2, 2))  # there is mu outside the activity too
-    mu = rng.uniform(0, 0.03, grid.shape)
-    fine = np.diag([0.5, 0.5, 0.5, 1.0])
-    fine[:3, 3] = -0.25
-    moved = np.eye(4)
-    moved[:3, 3] = -1, -2, -3
-    same = [
-        mph.Volume(mu, grid, "mu"),
-        mph.Volume(mu.repeat(2, 0).repeat(2, 1).repeat(2, 2), mph.Grid((12, 10, 8), grid.affine @ fine), "mu"),
-        mph.Volume(np.pad(mu, ((1, 1), (2, 0), (3, 4))), mph.Grid((8, 7, 11), grid.affine @ moved), "mu"),
-    ]
+    same = same_matter(grid, rng.uniform(0, 0.03, grid.shape))
     counts = [mph.Projector(grid, system.views((9, 8)), emission(system, v), backend)(activity) for v in same]
     assert counts[0].any()
     for other in counts[1:]:
@@ -291,8 +288,7 @@ def test_mu_that_is_not_mu_is_refused(system):
         (mph.Volume(np.zeros((2, 2, 2)), grid), "activity"),
         (mph.Volume(np.full((2, 2, 2), -0.1), grid, "mu"), "negative"),
     ):
-        with pytest.raises(InputError, match=word):
-            emission(system, mu)
+        refused(lambda mu=mu: emission(system, mu), word)
 
 
 def spot_image(model, place, pitch=0.05, n=160):
@@ -336,12 +332,8 @@ def test_disk_points_have_the_moments_of_the_disk():
 
 
 def test_virtual_detector_sees_the_finite_aperture_as_the_crystal_does(system, rng):
-    grid = general_grid(rng, (9, 8, 7))
-    x = rng.random(grid.shape)
     model = emission(system, aperture_points=5, crystal_mu=0.1, intrinsic_fwhm=6.0, within_crystal=True)
-    real = mph.Projector(grid, system.views((9, 10), "real", pitch=7.0), model)(x)
-    virtual = mph.Projector(grid, system.views((9, 10), "virtual", 3.0, pitch=21.0), model)(x)
-    np.testing.assert_allclose(virtual[:, ::-1, ::-1], real, rtol=1e-5, atol=1e-5 * real.max())
+    assert_real_is_virtual(model, rng, pitch=7.0)
 
 
 def test_penetration_widens_the_pinhole():
@@ -408,20 +400,6 @@ def test_adjoint_of_the_whole_camera(backend, system, rng):
     assert_adjoint(A, rng)
 
 
-def test_bad_detectors_are_refused(system):
-    for arguments, word in (
-        ({"aperture_points": 0}, "aperture_points"),
-        ({"aperture_points": 2}, "aperture_points"),
-        ({"aperture_points": 2.5}, "aperture_points"),
-        ({"aperture_mu": -1}, "aperture_mu"),
-        ({"opening_angle": 4}, "opening_angle"),
-        ({"crystal_mu": 0}, "crystal_mu"),
-        ({"intrinsic_fwhm": -1}, "intrinsic_fwhm"),
-    ):
-        with pytest.raises(InputError, match=word):
-            emission(system, **arguments)
-
-
 def test_counts_are_poisson():
     mean = np.broadcast_to(np.array([0.3, 20.0, 1e6])[:, None, None], (3, 200, 200))
     counts = mph.sample_counts(mean, seed=1)
@@ -450,8 +428,7 @@ def test_a_views_noise_depends_on_the_seed_and_on_itself_only(rng):
         ([[1], [1, 2]], 1),
         (3.0, 1),
     ):
-        with pytest.raises(InputError):
-            mph.sample_counts(bad, seed)
+        refused(lambda bad=bad, seed=seed: mph.sample_counts(bad, seed))
 
 
 def test_isotopes():
@@ -459,8 +436,7 @@ def test_isotopes():
     assert tc.photons_per_decay(126, 155) == 0.891 and tc.photons_per_decay(0, 100) == 0
     assert tc.mean_decay_time(1e-3) == pytest.approx(1e-3)
     assert tc.mean_decay_time(100 * tc.half_life) == pytest.approx(tc.half_life / np.log(2))
-    with pytest.raises(InputError, match="Tl-201"):
-        mph.isotope("Unobtainium")
+    refused(lambda: mph.isotope("Unobtainium"), "Tl-201")
     for name, isotope in mph.ISOTOPES.items():
         energies, photons = np.transpose(isotope.lines)
         assert isotope.name == name and (np.diff(energies) > 0).all() and 0.01 <= photons.min() <= photons.max() <= 2
@@ -504,11 +480,9 @@ def test_an_isotope_counts_its_photons_and_decays(rng):
         ({"isotope": "Tc-99m", "window": (10, 20)}, "its lines: 140.5"),
         ({"window": (10, 20)}, "needs an isotope"),
     ):
-        with pytest.raises(InputError, match=word):
-            emission(system, **options)
+        refused(lambda options=options: emission(system, **options), word)
 
 
 def test_gradients_in_mu_are_refused(system):
     torch = pytest.importorskip("torch", reason="torch is not installed")
-    with pytest.raises(InputError, match=r"A\(x, mu=...\)"):
-        emission(system, torch.rand(2, 2, 2, requires_grad=True))
+    refused(lambda: emission(system, torch.rand(2, 2, 2, requires_grad=True)), "A(x, mu=...)")

@@ -114,10 +114,9 @@ def test_the_fit_is_the_nearest_ellipse(rng):
             assert squares(best + sign * step * np.eye(5)[i]) > least
 
 
-def test_the_real_scanner_stands_on_one_ellipse(workbook):
+def test_the_real_scanner_stands_on_one_ellipse(scanner):
     """Semi-axes of 273 and 220.5 mm, its centre 60 mm from the isocentre; the modules are not evenly spaced."""
-    system = mph.read_system(workbook)
-    fits = mph.fit_rings(system)
+    fits = mph.fit_rings(scanner)
     assert [len(fit.numbers) for fit in fits] == [20, 20, 20, 20]
     for ring, fit in enumerate(fits):
         assert np.allclose(fit.semi_axes, [273.0, 220.5], atol=1e-3)
@@ -126,7 +125,7 @@ def test_the_real_scanner_stands_on_one_ellipse(workbook):
         assert fit.curve_deviation < 0.001
         assert fit.even_deviation == pytest.approx(8.415, abs=0.01)
         again = mph.ellipse_rings(**fit.parameters(), **MODULE)
-        those = system[20 * ring : 20 * ring + 20]
+        those = scanner[20 * ring : 20 * ring + 20]
         assert np.abs(again.centers - those.centers).max() < 0.001
         assert np.abs(again.collimator_length - those.collimator_length).max() < 0.001
 

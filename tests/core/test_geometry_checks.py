@@ -33,17 +33,16 @@ def crowd(rng, n: int = 30) -> mph.PinholeSystem:
     )
 
 
-def test_the_real_scanner_can_be_built(workbook):
-    report = mph.check_geometry(mph.read_system(workbook))
+def test_the_real_scanner_can_be_built(scanner):
+    report = mph.check_geometry(scanner)
     assert report.ok and report.messages() == []
     assert report.n_modules == 80
 
 
-def test_thick_walls_of_the_real_scanner_overlap(workbook):
+def test_thick_walls_of_the_real_scanner_overlap(scanner):
     """Independent: with walls of 8 mm, 188 pairs of collimators have a common volume by manifold3d, with 5 mm none."""
-    system = mph.read_system(workbook)
-    assert mph.check_geometry(system, wall_thickness=5.0).ok
-    report = mph.check_geometry(system, wall_thickness=8.0)
+    assert mph.check_geometry(scanner, wall_thickness=5.0).ok
+    report = mph.check_geometry(scanner, wall_thickness=8.0)
     assert len(report.overlaps) == len(report.findings) == 188
     assert {o.first_part for o in report.overlaps} == {o.second_part for o in report.overlaps} == {"collimator"}
 

@@ -198,11 +198,6 @@ def general_views(rng, mirrored=False, count=15):
     return mph.Views(sources, centers, (-size if mirrored else size) * x, 0.7 * size * y, (37, 64))
 
 
-@pytest.fixture
-def scanner(workbook):
-    return mph.read_system(workbook)
-
-
 @pytest.mark.parametrize("format", READERS)
 def test_scanner_is_seen_alike_through_every_format(format, scanner, rng, tmp_path):
     """All 80 modules, both detectors, images and pixels that are not square, shifted."""

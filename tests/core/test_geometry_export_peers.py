@@ -15,8 +15,7 @@ from .test_geometry_export import arrays, fiducials, general_views, project
 
 
 @pytest.fixture(params=["scanner", "real detector", "any pose", "mirrored"])
-def views(request, workbook, rng):
-    scanner = mph.read_system(workbook)
+def views(request, scanner, rng):
     if request.param == "scanner":
         return scanner.views()
     if request.param == "real detector":
@@ -71,10 +70,10 @@ def detector_of(path):
     )
 
 
-def test_rtk_projects_alike(workbook, rng, tmp_path):
+def test_rtk_projects_alike(scanner, rng, tmp_path):
     """RTK's Joseph projector on a smooth volume: the arrays fit as they are, whatever the sign of its distances."""
     itk, rtk = imported_rtk()
-    system = mph.read_system(workbook)[::16]
+    system = scanner[::16]
     for detector in ("virtual", "real"):
         views = system.views((24, 30), detector, offset=(4.0, 0.0))
         grid = mph.Grid.centered((60, 50, 40), (1.5, 2.0, 2.0), (4.0, -3.0, 6.0))
@@ -111,10 +110,10 @@ def test_astra_takes_the_geometry(views, system, rng, tmp_path):
     astra.data3d.delete(identifier)
 
 
-def test_lib3mf_reads_the_solids_in_strict_mode(workbook, tmp_path):
+def test_lib3mf_reads_the_solids_in_strict_mode(scanner, tmp_path):
     """Every part is a closed, oriented surface with its name, in millimetres, and there is no warning."""
     wrapper = pytest.importorskip("lib3mf", reason="no lib3mf").get_wrapper()
-    system = mph.read_system(workbook)[::10]
+    system = scanner[::10]
     mph.write_geometry(system, tmp_path / "a.3mf", "3mf", edge_at="front")
     model = wrapper.CreateModel()
     reader = model.QueryReader("3mf")

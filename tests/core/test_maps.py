@@ -10,8 +10,8 @@ import pytest
 import mphdrr.core as mph
 
 from .conftest import general_grid
+from .test_performance import EDGE, law_of_the_point_source
 
-EDGE = {"aperture_mu": 3.4, "opening_angle": 1.2}
 DEGREE = math.radians(1)
 
 
@@ -31,21 +31,11 @@ def test_sensitivity_map_sums_the_law_of_the_point_source(workbook, rng):
     """At 20 random points, computed module by module."""
     system = mph.read_system(workbook)
     for point in rng.uniform(-140, 140, (20, 3)):
-        expected, modules = 0.0, 0
-        for m in range(len(system)):
-            u, v, k = system.frames()[m]
-            ray = point - system.centers[m]
-            h, reach = ray @ k, system.detector_side[m] / (2 * system.collimator_length[m])
-            if h > 0 and abs(ray @ u) <= reach * h and abs(ray @ v) <= reach * h:
-                sine = h / np.linalg.norm(ray)
-                stopped = 1 - math.exp(-0.25 * system.detector_thickness[m] / sine)
-                d = system.pinhole_diameter[m]
-                expected += 0.89 * d * (d + 2 / 3.4 * math.tan(0.6)) * sine**3 / (16 * h**2) * stopped
-                modules += 1
+        expected = law_of_the_point_source(system, point, 0.25, 0.89)
         grid = mph.Grid.centered(1, 1.0, point)
         found = mph.sensitivity_map(system, grid, crystal_mu=0.25, photons_per_decay=0.89, **EDGE)
-        assert found.array[0, 0, 0] == pytest.approx(expected, rel=1e-6)
-        assert mph.modules_map(system, grid).array[0, 0, 0] == modules
+        assert found.array[0, 0, 0] == pytest.approx(expected.sum(), rel=1e-6)
+        assert mph.modules_map(system, grid).array[0, 0, 0] == np.count_nonzero(expected)
 
 
 def test_sensitivity_map_is_what_the_adjoint_gives(workbook):

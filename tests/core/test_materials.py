@@ -129,20 +129,15 @@ def test_several_lines_count_as_they_do_together(system):
     """Tungsten's K edge is between Tl-201's two strongest lines, 68.9 and 70.8 keV; Ga-67's are far apart."""
     system = dataclasses.replace(system[:2], pinhole_diameter=2.3, detector_thickness=10.0)
     points = system.principal_rays[0] * np.linspace(-40, 40, 5)[:, None]  # on the axis of module 0
+    materials = {"aperture_mu": "tungsten", "crystal_mu": "NaI"}
     for isotope, window in (("Tl-201", None), ("Ga-67", (80, 330))):
-        model = mph.Emission(system, isotope=isotope, window=window, aperture_mu="tungsten", crystal_mu="NaI")
+        model = mph.Emission(system, isotope=isotope, window=window, **materials)
         lines = model.isotope.lines_within(*model.window)
         assert len(lines) > 1
-        apart = sum(
-            mph.sensitivity(
-                system,
-                points,
-                aperture_mu=mph.attenuation("tungsten", energy),
-                crystal_mu=mph.attenuation("NaI", energy),
-                photons_per_decay=photons,
-            )
-            for energy, photons in lines
-        )
+        apart = 0.0
+        for energy, photons in lines:
+            numbers = {name: mph.attenuation(material, energy) for name, material in materials.items()}
+            apart += mph.sensitivity(system, points, **numbers, photons_per_decay=photons)
         numbers = {name: getattr(model, name) for name in ("aperture_mu", "crystal_mu", "photons_per_decay")}
         together = mph.sensitivity(system, points, **numbers)
         assert together[:, 0] == pytest.approx(apart[:, 0], rel=1e-9) and together[:, 0].min() > 0

@@ -13,8 +13,8 @@ from .conftest import general_grid
 trimesh = pytest.importorskip("trimesh")
 
 
-def sphere(radius: float = 20.0, center=(1.3, -2.2, 0.7)) -> mph.Mesh:
-    mesh = trimesh.creation.icosphere(subdivisions=5, radius=radius)
+def sphere(radius: float = 20.0, center=(1.3, -2.2, 0.7), subdivisions: int = 5) -> mph.Mesh:
+    mesh = trimesh.creation.icosphere(subdivisions=subdivisions, radius=radius)
     return mph.Mesh(mesh.vertices + np.array(center), mesh.faces)
 
 
@@ -120,7 +120,7 @@ def test_what_lies_beside_the_grid_is_left_out():
 
 @pytest.mark.parametrize("suffix", MESH_FORMATS)
 def test_files_come_back_in_every_format_and_unit(tmp_path, suffix):
-    mesh = sphere()
+    mesh = sphere(subdivisions=3)
     path = tmp_path / f"m{suffix}"
     for unit in (None, "cm"):
         mph.write_mesh(mesh, path, unit)

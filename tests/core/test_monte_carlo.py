@@ -17,7 +17,7 @@ from typing import NamedTuple
 import numpy as np
 import pytest
 
-from mphdrr.core import ISOTOPES, DerenzoPhantom, InputError, PinholeSystem, euler_pose, read_system
+from mphdrr.core import ISOTOPES, DerenzoPhantom, InputError, PinholeSystem, euler_pose
 from mphdrr.core.exchange import FORMATS, write_geometry
 from mphdrr.core.exchange.gate9 import MOST_LINES, angle_and_axis
 
@@ -169,11 +169,6 @@ def rodrigues(angle: float, axis: np.ndarray) -> np.ndarray:
     x, y, z = axis / np.linalg.norm(axis)
     cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
     return np.eye(3) + np.sin(angle) * cross + (1 - np.cos(angle)) * cross @ cross
-
-
-@pytest.fixture(scope="module")
-def scanner(workbook: Path) -> PinholeSystem:
-    return read_system(workbook)
 
 
 def export(system: PinholeSystem, path: Path, format: str, **options) -> Path:

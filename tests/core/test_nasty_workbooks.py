@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import os
 import warnings
+from dataclasses import replace
 
 import numpy as np
 import openpyxl
@@ -19,7 +20,7 @@ from .nasty import books, by_libreoffice, headings, layouts, maps, real, rows, u
 from .nasty.case import differences, fault, read, sample, write
 from .nasty.scanners import ONE_SHEET_COLUMNS, SYMBOLS, one_sheet, one_sheet_map, users, users_map
 from .nasty.sheets import by_hand
-from .workbooks import by_design, changed
+from .workbooks import by_design
 
 try:
     from hypothesis import HealthCheck, given, settings
@@ -149,7 +150,7 @@ def moved(system: mph.PinholeSystem) -> mph.PinholeSystem:
     centers[-1] += [3.0, -4.5, 1.25]
     diameter = system.pinhole_diameter.copy()
     diameter[0] += 0.3
-    return by_design(changed(system, centers=centers, pinhole_diameter=diameter))
+    return by_design(replace(system, centers=centers, pinhole_diameter=diameter))
 
 
 def _in(unit: str, form: str = "{} (%s)") -> dict[str, str]:

@@ -24,42 +24,36 @@ radius = 10
 activity = 40
 """
 
+
+def one(shape: mph.Shape) -> mph.ShapePhantom:
+    return mph.ShapePhantom([shape])
+
+
 NUMPY = ["--size", "9", "9", "--backend", "numpy"]
 
 
 @pytest.mark.parametrize(
     ("kind", "phantom"),
     [
-        (["nema", "--background", "2"], mph.NemaBody(background=2)),
+        ("nema --background 2", mph.NemaBody(background=2)),
+        ("jaszczak --rod-diameters 5 6 7 8 9 0", mph.JaszczakPhantom(rod_diameters=(5, 6, 7, 8, 9, 0))),
+        ("defrise --disks 3 --spacing-of-disks 30", mph.DefrisePhantom(3, spacing=30)),
+        ("shepp-logan --contrast original", mph.SheppLogan(contrast="original")),
+        ("points --counts 1 2 3 --spacing-of-points 9 8 7", mph.PointGrid((1, 2, 3), (9, 8, 7))),
+        ("torso --phase 0.35 --defect-severity 1", mph.CardiacTorso(phase=0.35, defect_severity=1)),
         (
-            ["jaszczak", "--rod-diameters", "5", "6", "7", "8", "9", "0"],
-            mph.JaszczakPhantom(rod_diameters=(5, 6, 7, 8, 9, 0)),
-        ),
-        (["defrise", "--disks", "3", "--spacing-of-disks", "30"], mph.DefrisePhantom(3, spacing=30)),
-        (["shepp-logan", "--contrast", "original"], mph.SheppLogan(contrast="original")),
-        (
-            ["points", "--counts", "1", "2", "3", "--spacing-of-points", "9", "8", "7"],
-            mph.PointGrid((1, 2, 3), (9, 8, 7)),
-        ),
-        (["torso", "--phase", "0.35", "--defect-severity", "1"], mph.CardiacTorso(phase=0.35, defect_severity=1)),
-        (
-            ["derenzo", "--rods", "8", "5", "4", "--sectors", "3", "--water", "45", "50", "--background", "3"],
+            "derenzo --rods 8 5 4 --sectors 3 --water 45 50 --background 3",
             mph.DerenzoPhantom(40, (8, 5, 4), 40, 100, 3, 45, 50, 3),
         ),
-        (
-            ["cylinder", "--radius", "30", "20", "--height", "9"],
-            mph.ShapePhantom([mph.Cylinder(radius=(30, 20), height=9, activity=100, mu=0)], "cylinder"),
-        ),
-        (["sphere", "--radius", "3"], mph.ShapePhantom([mph.Sphere(radius=3, activity=100, mu=0)], "sphere")),
-        (
-            ["ellipsoid", "--radii", "3", "4", "5"],
-            mph.ShapePhantom([mph.Ellipsoid(radii=(3, 4, 5), activity=100, mu=0)]),
-        ),
-        (["box", "--size", "3", "4", "5"], mph.ShapePhantom([mph.Box(size=(3, 4, 5), activity=100, mu=0)])),
+        ("cylinder --radius 30 20 --height 9", one(mph.Cylinder(radius=(30, 20), height=9, activity=100, mu=0))),
+        ("sphere --radius 3", one(mph.Sphere(radius=3, activity=100, mu=0))),
+        ("ellipsoid --radii 3 4 5", one(mph.Ellipsoid(radii=(3, 4, 5), activity=100, mu=0))),
+        ("box --size 3 4 5", one(mph.Box(size=(3, 4, 5), activity=100, mu=0))),
     ],
-    ids=lambda value: value[0] if isinstance(value, list) else "",
+    ids=lambda value: value.split()[0] if isinstance(value, str) else "",
 )
 def test_every_kind_is_made_as_asked(kind, phantom, tmp_path, capsys):
+    kind = kind.split()
     assert main(["phantom", *kind, "-o", str(tmp_path / "p.toml")]) == 0
     assert mph.read_phantom(tmp_path / "p.toml").shapes == tuple(phantom.shapes)
     if kind[0] == "sphere":
@@ -89,19 +83,8 @@ def test_random_instances_are_written_with_their_poses(tmp_path, capsys):
 def test_a_phantom_of_shapes_is_projected(workbook, tmp_path, capsys):
     path = tmp_path / "thorax.toml"
     path.write_text(THORAX)
-    words = [
-        "project",
-        str(workbook),
-        "--phantom",
-        str(path),
-        "--voxels",
-        "40",
-        "--size",
-        "12",
-        "12",
-        "--modules",
-        "1-2",
-    ]
+    options = ["--voxels", "40", "--size", "12", "12", "--modules", "1-2"]
+    words = ["project", str(workbook), "--phantom", str(path), *options]
     assert main([*words, "-o", str(tmp_path / "run.npz")]) == 0
     run = mph.read_run(tmp_path / "run.npz")
     assert run.settings["volume"] == "thorax.toml" and run.recipe["phantom.file"] == str(path)
@@ -179,32 +162,23 @@ def test_a_beating_heart_is_a_run_for_each_state(workbook, tmp_path, capsys, mon
 @pytest.mark.parametrize(
     ("words", "status", "said"),
     [
-        (["nema", "--length", "-1"], 1, "NEMA body phantom: length: expected more than 0 mm, got -1"),
-        (["sphere"], 2, "--radius"),
-        (["blob"], 2, "invalid choice"),
-        (["file", "nowhere.toml"], 1, "nowhere.toml: No such file"),
-        (
-            ["derenzo", "--rods", "8", "6"],
-            1,
-            "Derenzo rod diameters: expected one for each of 6 sectors (0: empty), got 2",
-        ),
-        (["sphere", "--radius", "3", "--count", "2"], 1, "--count and --box need --random"),
-        (["sphere", "--radius", "3", "--random", "-1"], 1, "--random: expected a seed"),
-        (["sphere", "--radius", "3", "--random", "1", "--count", "0"], 1, "--count: expected at least 1"),
-        (["torso", "--random", "1", "--euler", "1", "2", "3"], 1, "--euler has no effect with --random"),
-        (["torso", "--frames", "2", "--phase", "0.1"], 1, "--phase has no effect with --frames"),
-        (["torso", "--frames", "0"], 1, "frames of the cycle: expected"),
-        (
-            ["sphere", "--radius", "3", "--voxels", "9", "-o", "TOML"],
-            1,
-            "--voxels is of voxels, but a .toml holds only",
-        ),
+        ("nema --length -1", 1, "NEMA body phantom: length: expected more than 0 mm, got -1"),
+        ("sphere", 2, "--radius"),
+        ("blob", 2, "invalid choice"),
+        ("file nowhere.toml", 1, "nowhere.toml: No such file"),
+        ("derenzo --rods 8 6", 1, "Derenzo rod diameters: expected one for each of 6 sectors (0: empty), got 2"),
+        ("sphere --radius 3 --count 2", 1, "--count and --box need --random"),
+        ("sphere --radius 3 --random -1", 1, "--random: expected a seed"),
+        ("sphere --radius 3 --random 1 --count 0", 1, "--count: expected at least 1"),
+        ("torso --random 1 --euler 1 2 3", 1, "--euler has no effect with --random"),
+        ("torso --frames 2 --phase 0.1", 1, "--phase has no effect with --frames"),
+        ("torso --frames 0", 1, "frames of the cycle: expected"),
+        ("sphere --radius 3 --voxels 9 -o p.toml", 1, "--voxels is of voxels, but a .toml holds only"),
     ],
 )
-def test_wrong_words_get_one_line(words, status, said, tmp_path, capsys):
-    words = ["-o", str(tmp_path / "p.npz"), *[str(tmp_path / "p.toml") if word == "TOML" else word for word in words]]
-    words = [*words[2:], *([] if "-o" in words[2:] else words[:2])]
-    assert main(["phantom", *words]) == status
+def test_wrong_words_get_one_line(words, status, said, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    assert main(["phantom", *f"{words}{'' if ' -o ' in words else ' -o p.npz'}".split()]) == status
     error = capsys.readouterr().err
     assert said in error and error.count("\n") == 1
     assert not list(tmp_path.iterdir())

@@ -164,17 +164,21 @@ def test_projectors_agree_with_exact_projections(system):
 
 @pytest.mark.parametrize("phantom", KINDS, ids=title)
 def test_total_activity_does_not_depend_on_grid_or_pose(phantom, rng):
-    """To 0.01 %, also where voxels are larger than the parts; for activity and for mu."""
+    """To 0.01 %, also where voxels are larger than the parts."""
     for voxels in (28, 6):
         spacing = phantom.extent / (voxels - 3)
         grid = mph.Grid.centered(voxels, spacing)
         turned = mph.euler_pose(*rng.uniform(-3, 3, 3), translation=rng.uniform(-1, 1, 3) * spacing)
-        for pose in (None, turned) if voxels == 6 else (turned,):
-            volume = phantom.voxelize(grid, pose)
-            assert total(volume) == pytest.approx(phantom.total_activity, rel=1e-4)
-            assert volume.array.min() >= -1e-5 * volume.array.max()
-    # The same for mu, against the closed forms along many parallel lines.
-    volume = phantom.voxelize(grid, turned, quantity="mu")
+        volume = phantom.voxelize(grid, None if voxels == 6 else turned)
+        assert total(volume) == pytest.approx(phantom.total_activity, rel=1e-4)
+        assert volume.array.min() >= -1e-5 * volume.array.max()
+
+
+@pytest.mark.parametrize("phantom", [KINDS[1], KINDS[5], PAINTING], ids=title)
+def test_total_mu_is_that_of_many_parallel_lines(phantom, rng):
+    spacing = phantom.extent / 3
+    turned = mph.euler_pose(*rng.uniform(-3, 3, 3), translation=rng.uniform(-1, 1, 3) * spacing)
+    volume = phantom.voxelize(mph.Grid.centered(6, spacing), turned, quantity="mu")
     assert volume.quantity == "mu"
     side = np.linspace(-0.5, 0.5, 201)[1:] - 0.5 / 200
     v, w = (phantom.extent + 2 * spacing) * np.stack(np.meshgrid(side, side)).reshape(2, -1)
@@ -184,11 +188,12 @@ def test_total_activity_does_not_depend_on_grid_or_pose(phantom, rng):
 
 
 def test_scaled_and_sheared_poses_and_grids_hold_what_they_should(rng):
-    grid = general_grid(rng, (70, 110, 60))
+    grid = general_grid(rng, (36, 56, 30))
+    grid = mph.Grid(grid.shape, np.diag([2.0, 2, 2, 1]) @ grid.affine)
     assert total(PAINTING.voxelize(grid)) == pytest.approx(PAINTING.total_activity, rel=1e-3)
     pose = mph.euler_pose(0.1, 0.2, 0.3)
     pose[:3, :3] = pose[:3, :3] @ np.array([[0.8, 0.1, 0], [0, -1.1, 0.2], [0, 0, 0.7]])
-    held = total(PAINTING.voxelize(mph.Grid.centered(60, 1.5), pose))
+    held = total(PAINTING.voxelize(mph.Grid.centered(45, 2.0), pose))
     assert held == pytest.approx(PAINTING.total_activity * 0.8 * 1.1 * 0.7, rel=1e-3)
 
 
@@ -196,13 +201,13 @@ def test_voxels_hold_the_mean_of_what_was_painted(rng):
     """Against brute force: many random points of each voxel, painted one by one."""
     grid, pose = mph.Grid.centered((24, 22, 20), (3.0, 2.5, 3.0), center=(4, 1, 0)), mph.euler_pose(0.4, 0.7, -1.1)
     values = PAINTING.voxelize(grid, pose).array
-    index = np.stack(np.unravel_index(rng.choice(values.size, 1500, replace=False), values.shape), axis=1)
-    points = (index[:, None] + rng.uniform(-0.5, 0.5, (1500, 400, 3))).reshape(-1, 3)
+    index = np.stack(np.unravel_index(rng.choice(values.size, 600, replace=False), values.shape), axis=1)
+    points = (index[:, None] + rng.uniform(-0.5, 0.5, (600, 400, 3))).reshape(-1, 3)
     world = points @ grid.affine[:3, :3].T + grid.affine[:3, 3]
-    means = PAINTING.values(world, pose).reshape(1500, 400).mean(axis=1)
+    means = PAINTING.values(world, pose).reshape(600, 400).mean(axis=1)
     difference = values[tuple(index.T)] - means
     assert np.abs(difference).max() < 1.2  # of 10; the brute force's own noise is 0.2
-    assert abs(difference.mean()) < 0.02
+    assert abs(difference.mean()) < 0.03
 
 
 def test_later_shapes_replace_and_none_leaves():
@@ -320,16 +325,10 @@ def test_files_that_are_no_text_are_refused(tmp_path):
         (lambda: mph.CardiacTorso(defect_severity=7), "defect severity: expected at most 1, got 7"),
         (lambda: mph.CardiacTorso(end_systolic_volume=200), "end systolic volume: expected at most 120, got 200"),
         (lambda: mph.CardiacTorso().beating(0), "frames of the cycle"),
-        (
-            lambda: mph.NemaBody(sphere_diameters=(500,) * 6),
-            "NEMA body phantom: sphere diameters: .* in the body, got 500",
-        ),
+        (lambda: mph.NemaBody(sphere_diameters=(500,) * 6), "phantom: sphere diameters: .* in the body, got 500"),
         (lambda: mph.NemaBody(sphere_diameters=(10, 13, 17, 22, 55, 60)), "of 55 and 60 mm overlap: .* 57.2 mm apart"),
         (lambda: mph.NemaBody(sphere_diameters=(0, 0, 150, 0, 0, 0)), "at most 140 mm beneath the lid, got 150"),
-        (
-            lambda: mph.NemaBody(lung_diameter=80),
-            "sphere diameters: expected at most 34.4 mm beside a lung insert of 80",
-        ),
+        (lambda: mph.NemaBody(lung_diameter=80), "diameters: expected at most 34.4 mm beside a lung insert of 80"),
         (lambda: mph.NemaBody(lung_diameter=300), "lung diameter: expected at most 224 mm in the body, got 300"),
         (lambda: mph.NemaBody(length=80), "length: expected at least 81 mm around a sphere of 22 mm, got 80"),
         (lambda: mph.JaszczakPhantom(sphere_ring_radius=120), "sphere ring radius: expected at most 108 mm"),
@@ -340,10 +339,7 @@ def test_files_that_are_no_text_are_refused(tmp_path):
         (lambda: mph.JaszczakPhantom(rod_height=190), "rod height: expected at most 186 mm in the cylinder, got 190"),
         (lambda: mph.DefrisePhantom(spacing=5), "disk thickness: expected at most 5 mm from disk to disk, got 8"),
         (lambda: mph.PointGrid((2, 1, 1), (3, 1, 1), 4), "diameter: expected at most 3 mm from point to point, got 4"),
-        (
-            lambda: mph.CardiacTorso(body_radii=(100, 80)),
-            "body radii of 100 and 80 mm: the right lung reaches out of the",
-        ),
+        (lambda: mph.CardiacTorso(body_radii=(100, 80)), "body radii of 100 and 80 mm: the right lung reaches out"),
         (lambda: mph.CardiacTorso(ventricle_length=400), "ventricle length of 400 mm, .* reaches out of the body"),
         (
             lambda: mph.ShapePhantom([SHAPES[0], mph.Sphere(radius=9, activity=-1, mode="add", name="hole")]),
@@ -353,11 +349,8 @@ def test_files_that_are_no_text_are_refused(tmp_path):
         (lambda: mph.DerenzoPhantom(40, (8,) * 6, 30, 0), "or 0 in a cylinder with a background"),
         (lambda: mph.DerenzoPhantom(40, (8,) * 6, 30, background=1), "Derenzo cylinder radius"),
         (lambda: mph.DerenzoPhantom(40, (8,) * 6, 30, cylinder_radius=30), "radius of 40 mm and a height of 30 mm"),
-        (
-            lambda: PAINTING.voxelize(mph.Grid.centered(4, 1), quantity="hu"),
-            "quantity 'hu': expected one of activity, mu",
-        ),
-        (lambda: PAINTING.voxelize(mph.Grid.centered(4, 1), np.zeros((4, 4))), "phantom pose"),
+        (lambda: PAINTING.values(np.zeros((1, 3)), quantity="hu"), "quantity 'hu': expected one of activity, mu"),
+        (lambda: PAINTING.values(np.zeros((1, 3)), np.zeros((4, 4))), "phantom pose"),
         (lambda: PAINTING.line_integrals(np.zeros((2, 3)), np.zeros((3, 3))), "2 sources but 3 targets"),
         (lambda: PAINTING.line_integrals(np.zeros((2, 2)), np.zeros((2, 3))), "sources: expected shape"),
         (lambda: PAINTING.line_integrals([[0, 0, 0], [0]], np.zeros((2, 3))), "sources: expected real numbers"),
@@ -381,14 +374,9 @@ def test_what_just_fits_is_made_and_holds_its_parts():
     spheres = mph.JaszczakPhantom(sphere_diameters=(54,) * 6, sphere_height=159, rod_height=132)
     for phantom, content in (
         (
-            mph.NemaBody(sphere_diameters=(0, 0, 140, 0, 0, 0), lung_diameter=0, length=140),
-            5.3 * 140 * body + 15.9 * ball * 140**3,
-        ),
-        (
             mph.NemaBody(sphere_diameters=(57.2,) * 6, lung_diameter=57.2),
             5.3 * 180 * (body - np.pi * 28.6**2) + 6 * 15.9 * ball * 57.2**3,
         ),
-        (mph.NemaBody(sphere_diameters=none, lung_diameter=224, length=1), 5.3 * (body - np.pi * 112**2)),
         (spheres, 50 * (cylinder - spheres.shapes[1].volume - 6 * ball * 54**3)),
         (
             mph.JaszczakPhantom(
@@ -401,6 +389,8 @@ def test_what_just_fits_is_made_and_holds_its_parts():
         (mph.ShapePhantom([SHAPES[0], mph.Sphere(radius=7, activity=-1, mode="add")]), 0),
     ):
         assert phantom.total_activity == pytest.approx(content * 1e-3, rel=3e-4, abs=1e-9), phantom
+    assert mph.NemaBody(sphere_diameters=(0, 0, 140, 0, 0, 0), lung_diameter=0, length=140).shapes[-1].radius == 70
+    assert mph.NemaBody(sphere_diameters=none, lung_diameter=224, length=1).shapes[-1].radius == 112
     assert mph.CardiacTorso(body_radii=(155, 105)).shapes[0].radius == (155, 105)
     assert mph.JaszczakPhantom(rod_height=186, sphere_diameters=none, sphere_height=999).shapes[1].height == 186
 
@@ -432,8 +422,8 @@ def test_one_side_of_the_box_of_poses_counts_for_all(side):
 
 
 def test_a_phantom_beyond_the_grid_is_said():
-    with pytest.warns(mph.InputWarning, match="of the NEMA body phantom lies outside the grid"):
-        mph.NemaBody().voxelize(mph.Grid.centered(16, 4.0))
+    with pytest.warns(mph.InputWarning, match="of the Shepp-Logan phantom lies outside the grid"):
+        mph.SheppLogan().voxelize(mph.Grid.centered(16, 4.0))
 
 
 def test_voxelizing_can_be_cancelled_between_shapes():
@@ -498,18 +488,19 @@ def test_points_hold_their_activity_on_any_voxels():
 
 
 def test_the_heart_beats_with_its_muscle_and_apex_kept():
-    frames = mph.CardiacTorso(defect_severity=0.4).beating(20)
+    assert [frame.phase for frame in mph.CardiacTorso().beating(4)] == [0, 0.25, 0.5, 0.75]
+    frames = [mph.CardiacTorso(defect_severity=0.4, phase=phase) for phase in (0, 0.2, 0.35, 0.4, 0.8)]
     volumes = [frame.ventricle_volume for frame in frames]
-    assert volumes[0] == 120 and volumes[7] == pytest.approx(45) and np.argmin(volumes) == 7
+    assert volumes[0] == 120 and volumes[2] == pytest.approx(45) and np.argmin(volumes) == 2
     muscles, apexes = [], []
-    for frame in (*frames[::4], frames[7]):
+    for frame in frames:
         parts = {shape.name: shape for shape in frame.shapes}
         assert parts["left ventricle"].volume == pytest.approx(frame.ventricle_volume * 1e3, rel=1e-4)
         muscles.append(parts["myocardium"].volume - parts["left ventricle"].volume)
         pose = parts["myocardium"].pose
         apexes.append(pose[:3, 3] + pose[:3, 2] * parts["myocardium"].radii[2])
     np.testing.assert_allclose(muscles, muscles[0], rtol=1e-4)
-    np.testing.assert_allclose(apexes, np.broadcast_to(apexes[0], (6, 3)), atol=1e-9)
+    np.testing.assert_allclose(apexes, np.broadcast_to(apexes[0], (5, 3)), atol=1e-9)
     assert muscles[0] * 1.05e-3 == pytest.approx(133, abs=1)  # g
 
 
@@ -531,14 +522,13 @@ def test_defects_lie_where_they_are_placed(width):
         assert np.array_equal(values, np.where((turned < width / 2) & reached, 22.5, 90.0))
 
 
-def test_the_torso_fits_into_the_scanner(workbook):
-    system = mph.read_system(workbook)
+def test_the_torso_fits_into_the_scanner(scanner):
     torso = mph.CardiacTorso()
-    assert not torso.values(system.centers, quantity="mu").any()
+    assert not torso.values(scanner.centers, quantity="mu").any()
     ventricle = next(mesh for mesh in torso.meshes() if mesh.name == "myocardium")
     assert np.linalg.norm(ventricle.vertices, axis=1).max() < 75
     # The patient's left and front, -x and +y, face the modules.
-    assert system.centers[:, 1].mean() > 0 > system.centers[:, 0].mean()
+    assert scanner.centers[:, 1].mean() > 0 > scanner.centers[:, 0].mean()
 
 
 @pytest.mark.parametrize("kind", kinds.KINDS, ids=lambda kind: kind.name)

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import os
-import subprocess
-import sys
 import warnings
 
 import numpy as np
@@ -20,22 +18,13 @@ from mphdrr.core.projector import Projector, Transmission, backends, trace_rays
 from mphdrr.core.projector.backends import cpu
 from mphdrr.core.volumes.volume import Volume
 
-from .conftest import WORKBOOK, emission
+from .conftest import WORKBOOK, emission, refused, run_python
 
 GRID = Grid.centered((5, 4, 3), 1.0)
 VIEWS = Views(
     [[0, 0, -20], [0, -20, 0]], [[0, 0, 20], [0, 20, 0]], [[1, 0, 0], [1, 0, 0]], [[0, 1, 0], [0, 0, 1]], (6, 7)
 )
 ONES = np.ones(GRID.shape, np.float32)
-
-
-def refused(call, *words):
-    with pytest.raises(InputError) as error:
-        call()
-    text = str(error.value)
-    assert "\n" not in text
-    for word in words:
-        assert word in text, text
 
 
 def test_types_out():
@@ -201,17 +190,6 @@ def test_adjoint_uses_fewer_threads_when_memory_is_short(monkeypatch):
     np.testing.assert_array_equal(Projector(GRID, VIEWS, threads=4).T(images), expected)
 
 
-def run_python(code, **environment):
-    return subprocess.run(
-        [sys.executable, "-c", code], capture_output=True, text=True, env={**os.environ, **environment}, timeout=120
-    )
-
-
-def test_import_does_not_load_torch():
-    done = run_python("import sys, mphdrr.core.projector; print('torch' in sys.modules)")
-    assert done.stdout.strip() == "False", done.stderr
-
-
 FORK = """
 import multiprocessing, numpy as np
 from mphdrr.core.geometry.grid import Grid
@@ -229,7 +207,7 @@ with multiprocessing.get_context("fork").Pool(2) as pool:
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="processes fork on POSIX only")
 def test_forked_processes_project_too():
     """Threads do not survive a fork, which is how data loaders start their workers."""
-    done = run_python(FORK)
+    done = run_python(FORK, timeout=120)
     assert done.stdout.strip() == "1", done.stderr
 
 

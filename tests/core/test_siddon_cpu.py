@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import itertools
 import os
-import subprocess
 import sys
 from pathlib import Path
 
@@ -18,6 +17,7 @@ from mphdrr.core.projector.lattices import Lattices
 from mphdrr.core.projector.models import view_rays
 from mphdrr.core.projector.rays import Ends
 
+from .conftest import run_python
 from .test_projector import LINEAR, SHAPES, affine, nasty_rays, random_rays, some_views
 
 LEVELS = cpu.levels()
@@ -65,9 +65,7 @@ def test_every_level_agrees_with_the_reference(level, kind, rng):
             reference.backproject(expected, values, *as_double(mapped))
             close(sums, expected, kind)
             close(
-                cpu.derivatives(volume, *mapped),
-                reference.derivatives(volume.astype(float), *as_double(mapped)),
-                kind,
+                cpu.derivatives(volume, *mapped), reference.derivatives(volume.astype(float), *as_double(mapped)), kind
             )
             if lattices.mu is not None:
                 sums, expected = np.zeros_like(lattices.mu), np.zeros(lattices.mu.shape)
@@ -90,22 +88,17 @@ def test_no_rays():
     assert cpu.derivatives(np.ones((4, 4, 4)), *mapped).shape == (0, 7)
 
 
-def run(code, **options):
-    environment = {**os.environ, **options.pop("environment", {})}
-    return subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, env=environment, **options)
-
-
 PRINT_LEVEL = "from mphdrr.core.projector.backends import cpu; print(cpu.levels()[cpu.level])"
 
 
 @pytest.mark.parametrize("name", LEVELS)
 def test_the_environment_names_a_level(name):
-    done = run(PRINT_LEVEL, environment={cpu.LEVEL_VARIABLE: name})
+    done = run_python(PRINT_LEVEL, {cpu.LEVEL_VARIABLE: name})
     assert done.stdout.strip() == name, done.stderr
 
 
 def test_a_level_that_there_is_not_is_refused():
-    done = run(PRINT_LEVEL, environment={cpu.LEVEL_VARIABLE: "AVX-1024"})
+    done = run_python(PRINT_LEVEL, {cpu.LEVEL_VARIABLE: "AVX-1024"})
     assert "InputError" in done.stderr and LEVELS[0] in done.stderr and "AVX-1024" in done.stderr
 
 
@@ -117,11 +110,7 @@ def test_the_library_is_the_packages_own(tmp_path):
     paths = dict.fromkeys(
         ("LD_LIBRARY_PATH", "DYLD_LIBRARY_PATH", "PATH"), f"{tmp_path}{os.pathsep}{os.environ['PATH']}"
     )
-    done = run(
-        "from mphdrr.core.projector.backends import cpu; print(cpu._library._name)",
-        cwd=tmp_path,
-        environment=paths,
-    )
+    done = run_python("from mphdrr.core.projector.backends import cpu; print(cpu._library._name)", paths, cwd=tmp_path)
     assert Path(done.stdout.strip()).parent == Path(cpu.__file__).with_name("kernels"), done.stderr
 
 

@@ -93,7 +93,7 @@ def test_meshes_in_and_out(tmp_path, ct, capsys):
     assert "--value: expected one number, or one for each of 2 meshes" in capsys.readouterr().err
 
 
-def test_project_converts_and_centers_a_ct(tmp_path, ct, workbook, capsys):
+def test_project_converts_and_centers_a_ct(tmp_path, ct, workbook, scanner, capsys):
     common = ("project", workbook, "--modules", "1", "--size", 9, 9, "--backend", "numpy")
     ct_file, out = tmp_path / "ct.nrrd", tmp_path / "run.h5"
     assert run(*common, "--volume", ct_file, "--center", "--energy", "Tc-99m", "-o", out) == 0
@@ -110,7 +110,7 @@ def test_project_converts_and_centers_a_ct(tmp_path, ct, workbook, capsys):
     emission = ("--emission", "--mu", ct_file, "--energy", 140.5, "--center")
     assert run(*common, "--volume", tmp_path / "a.nrrd", *emission, "-o", out) == 0
     counts = mph.read_run(out).projections
-    system = mph.read_system(workbook)[:1]
+    system = scanner[:1]
     model = mph.Emission(system, mu=mph.hu_to_mu(mph.centered(ct)))
     expected = mph.project_run(system, mph.centered(activity), shape=(9, 9), backend="numpy", model=model).projections
     assert np.allclose(counts, expected, rtol=1e-5)
@@ -131,7 +131,7 @@ def test_project_converts_and_centers_a_ct(tmp_path, ct, workbook, capsys):
         assert message in capsys.readouterr().err
 
 
-def test_project_takes_one_series_of_a_dicom_folder(tmp_path, ct, workbook, capsys):
+def test_project_takes_one_series_of_a_dicom_folder(tmp_path, ct, workbook, scanner, capsys):
     """Equal to the radiograph of the volume, and the counts with the mu, from which the series was written."""
     affine = np.diag([2.0, 2, 3, 1])
     affine[:3, 3] = ct.grid.affine[:3, 3]
@@ -144,7 +144,7 @@ def test_project_takes_one_series_of_a_dicom_folder(tmp_path, ct, workbook, caps
     assert run(*common, "--volume", folder, *options, "-o", out) == 1
     assert 'it holds 2 series, choose one: 3 "Soft" (16 images); 4 "Lung" (16 images)' in capsys.readouterr().err
     assert run(*common, "--volume", folder, "--series", "Lung", *options, "-o", out) == 0
-    system = mph.read_system(workbook)[:1]
+    system = scanner[:1]
     expected = mph.project_run(system, mph.hu_to_mu(mph.centered(ct), 80), shape=(9, 9), backend="numpy")
     np.testing.assert_allclose(mph.read_run(out).projections, expected.projections, rtol=1e-6)
 

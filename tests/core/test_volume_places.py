@@ -215,6 +215,7 @@ def test_units_and_two_places_of_nifti_and_analyze(tmp_path):
         nibabel.save(image, tmp_path / "v.nii")
         volume, said = read(tmp_path / "v.nii")
         assert said == [] and np.allclose(volume.grid.affine, at(scale * np.array([4.0, 5, 6]), scale))
+        assert volume.quantity == "hu"
     for moved, told in ((0.0, 0), (0.5, 1)):
         image = nibabel.Nifti1Image(VALUES, at((4, 5, 6)))
         image.set_qform(at((4 + moved, 5, 6)), 1)

@@ -8,7 +8,6 @@ import hashlib
 import io
 import pickle
 import re
-import warnings
 import zipfile
 from collections.abc import Callable
 from pathlib import Path
@@ -34,6 +33,8 @@ try:
     from hypothesis import strategies as st
 except ImportError:  # the property tests skip
     st = None
+
+pytestmark = pytest.mark.filterwarnings("error")
 
 SYMBOLS = ["", "x1", "y1", "z1", "b", "S", "l", "l + b+Td", "x2", "y2", "z2", "", "", ""]
 DESCRIPTIONS = [
@@ -115,13 +116,6 @@ def assert_plain(system, n: int = len(CENTERS)) -> None:
         np.testing.assert_array_equal(getattr(system, name), np.full(n, value))
     expected = collimator_length(np.linalg.norm(CENTERS[:n], axis=1), 2.3, 50, 75)
     np.testing.assert_allclose(system.collimator_length, expected, rtol=1e-12)
-
-
-@pytest.fixture(autouse=True)
-def warnings_are_errors():
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        yield
 
 
 # The real workbook
@@ -426,11 +420,8 @@ def test_dimensions_may_stand_in_two_sheets(tmp_path):
 
 
 def test_modules_without_coordinates_are_left_out_with_a_warning(tmp_path):
-    def edit(main, coordinates):
-        main.append([9, 2.3, 75, 50, 10])
-
     with pytest.warns(InputWarning, match=r"^scanner.xlsx: Main!A7 has module 9 without coordinates"):
-        assert len(read_edited(tmp_path, edit)) == 4
+        assert len(read_edited(tmp_path, lambda main, _: main.append([9, 2.3, 75, 50, 10]))) == 4
 
 
 # Formulas and typed values
@@ -438,21 +429,15 @@ def test_modules_without_coordinates_are_left_out_with_a_warning(tmp_path):
 
 def test_typed_collimator_length_is_the_master_and_warned_of(tmp_path):
     with pytest.warns(InputWarning) as caught:
-        system = read_edited(tmp_path, lambda main, coordinates: coordinates.__setitem__("G4", 60.0))
+        system = read_edited(tmp_path, _set("Coordinates", "G4", 60.0))
     assert system.collimator_length[1] == 60.0
     assert [str(w.message).split(",")[0] for w in caught] == ["scanner.xlsx: Coordinates!G4 has l = 60 mm"]
     assert "the sheet's is used" in str(caught[0].message)
 
 
 def test_missing_collimator_length_is_computed(tmp_path):
-    def blank(main, coordinates):
-        _typed(main, coordinates)
-        coordinates["G4"] = None
-
-    assert_plain(read_edited(tmp_path, blank))
-    assert_plain(
-        read_edited(tmp_path, lambda main, coordinates: (_typed(main, coordinates), coordinates.delete_cols(7)))
-    )
+    for blank in (_set("Coordinates", "G4", None), lambda main, coordinates: coordinates.delete_cols(7)):
+        assert_plain(read_edited(tmp_path, lambda *sheets, blank=blank: (_typed(*sheets), blank(*sheets))))
 
 
 def test_derived_formula_beyond_arithmetic_is_computed_by_ours(tmp_path):
@@ -491,10 +476,7 @@ def test_elevation_may_be_in_degrees(tmp_path):
 
 
 def test_angles_a_turn_apart_agree(tmp_path):
-    def edit(main, coordinates):
-        coordinates["M3"] = "=ATAN2(B3,C3)+2*PI()"
-
-    assert_plain(read_edited(tmp_path, edit))
+    assert_plain(read_edited(tmp_path, _set("Coordinates", "M3", "=ATAN2(B3,C3)+2*PI()")))
 
 
 def test_values_typed_as_displayed_are_not_warned_of(tmp_path):
@@ -616,19 +598,7 @@ def test_counts_of_errors_are_those_of_libreoffice():
 
 
 @pytest.mark.parametrize(
-    "formula",
-    [
-        "=Name",
-        "=FOO(1)",
-        "=[1]S!A1",
-        "=SUM(A:A)",
-        "=(1",
-        "=1+",
-        "=",
-        "=1)",
-        "=}",
-        "=SQRT(1,2)",
-    ],
+    "formula", ["=Name", "=FOO(1)", "=[1]S!A1", "=SUM(A:A)", "=(1", "=1+", "=", "=1)", "=}", "=SQRT(1,2)"]
 )
 def test_formulas_beyond_arithmetic_are_not_computed(formula):
     with pytest.raises(NotComputable):
@@ -675,10 +645,6 @@ def _center(row: int, x: float, y: float, z: float) -> Callable[[Worksheet, Work
     return edit
 
 
-def _row_missing(main: Worksheet, coordinates: Worksheet) -> None:
-    main.delete_rows(5)
-
-
 def _row_missing_without_numbers(main: Worksheet, coordinates: Worksheet) -> None:
     main.delete_rows(5)
     main.delete_cols(1)
@@ -687,18 +653,6 @@ def _row_missing_without_numbers(main: Worksheet, coordinates: Worksheet) -> Non
 def _copied_table(main: Worksheet, coordinates: Worksheet) -> None:
     coordinates.title = "A"
     main.parent.copy_worksheet(coordinates).title = "B"
-
-
-def _second_x1(main: Worksheet, coordinates: Worksheet) -> None:
-    coordinates["R1"] = "x1"
-
-
-def _no_rows(main: Worksheet, coordinates: Worksheet) -> None:
-    coordinates.delete_rows(3, 10)
-
-
-def _sum_below(main: Worksheet, coordinates: Worksheet) -> None:
-    coordinates.append(["mean", 1.0, 2.0, 3.0])
 
 
 BAD_CELLS = {
@@ -764,16 +718,25 @@ BAD_CELLS = {
         _set("Coordinates", "A7", 5),
         "Coordinates!A7 is module 5, expected a row for it in sheet Main too",
     ),
-    "sum below the table": (_sum_below, "Coordinates!A7 holds the text 'mean', expected a module's number"),
+    "sum below the table": (
+        lambda _, table: table.append(["mean", 1.0, 2.0, 3.0]),
+        "Coordinates!A7 holds the text 'mean', expected a module's number",
+    ),
     "dimensions of a module missing": (
-        _row_missing,
+        lambda main, _: main.delete_rows(5),
         "Coordinates!A5 is module 3, expected a row for it in sheet Main too, with its d",
     ),
     "too few rows": (_row_missing_without_numbers, "sheet Main has 3 rows of d (Main!A3 to Main!A5), expected one or"),
-    "two columns of one name": (_second_x1, "Coordinates!B1 and Coordinates!R1 are both headed as x1"),
+    "two columns of one name": (
+        _set("Coordinates", "R1", "x1"),
+        "Coordinates!B1 and Coordinates!R1 are both headed as x1",
+    ),
     "headings at odds": (_set("Coordinates", "B1", "y2"), "Coordinates!B2 is headed as x1 but Coordinates!B1 as y2"),
     "two tables": (_copied_table, "A!B1 and B!B1, of two sheets, are both headed as x1"),
-    "no modules": (_no_rows, "sheet Coordinates has no modules, expected rows with x1, y1, z1"),
+    "no modules": (
+        lambda _, table: table.delete_rows(3, 10),
+        "sheet Coordinates has no modules, expected rows with x1, y1, z1",
+    ),
 }
 
 

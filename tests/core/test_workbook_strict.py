@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import io
 import re
-import warnings
 import zipfile
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -24,27 +24,28 @@ from mphdrr.core.workbook.quantities import LENGTH_UNITS, QUANTITIES
 
 from .test_workbook import _one_sheet, assert_plain, plain, read_edited, saved
 from .test_workbook import _typed as typed
+from .workbooks import DIMENSIONS, by_design
+
+pytestmark = pytest.mark.filterwarnings("error")
 
 Edit = Callable[[Worksheet, Worksheet], object]
 
 
-@pytest.fixture(autouse=True)
-def warnings_are_errors():
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        yield
+def of_typed(edit: Callable[..., None]) -> Callable[..., Edit]:
+    """`edit(main, coordinates, ...)` as a function of the other arguments, which edits a workbook of typed numbers."""
+
+    def of(*arguments: object, **more: object) -> Edit:
+        return lambda main, coordinates: (typed(main, coordinates), edit(main, coordinates, *arguments, **more))
+
+    return of
 
 
-def _set(**cells: object) -> Edit:
+@of_typed
+def _set(main: Worksheet, coordinates: Worksheet, **cells: object) -> None:
     """Typed numbers everywhere, then cells such as Coordinates_B1="x1 (cm)"."""
-
-    def edit(main: Worksheet, coordinates: Worksheet) -> None:
-        typed(main, coordinates)
-        for name, value in cells.items():
-            sheet, cell = name.split("_")
-            {"Main": main, "Coordinates": coordinates}[sheet][cell] = value
-
-    return edit
+    for name, value in cells.items():
+        sheet, cell = name.split("_")
+        {"Main": main, "Coordinates": coordinates}[sheet][cell] = value
 
 
 def _no_symbols(main: Worksheet, coordinates: Worksheet) -> None:
@@ -54,14 +55,11 @@ def _no_symbols(main: Worksheet, coordinates: Worksheet) -> None:
             cell.value = None
 
 
-def _heading(cell: str, text: str) -> Edit:
+@of_typed
+def _heading(main: Worksheet, coordinates: Worksheet, cell: str, text: str) -> None:
     """A heading of its own in row 2, without the symbols in row 1."""
-
-    def edit(main: Worksheet, coordinates: Worksheet) -> None:
-        _no_symbols(main, coordinates)
-        (main if cell[0] == "M" else coordinates)[cell[1:]] = text
-
-    return edit
+    _no_symbols(main, coordinates)
+    (main if cell[0] == "M" else coordinates)[cell[1:]] = text
 
 
 def _also(*edits: Edit) -> Edit:
@@ -83,14 +81,11 @@ def _merged(main: Worksheet, coordinates: Worksheet) -> None:
     coordinates.merge_cells("B3:D3")
 
 
-def _format(cells: str, number_format: str) -> Edit:
-    def edit(main: Worksheet, coordinates: Worksheet) -> None:
-        typed(main, coordinates)
-        for row in coordinates[cells]:
-            for cell in row:
-                cell.number_format = number_format
-
-    return edit
+@of_typed
+def _format(main: Worksheet, coordinates: Worksheet, cells: str, number_format: str) -> None:
+    for row in coordinates[cells]:
+        for cell in row:
+            cell.number_format = number_format
 
 
 def _merged_over(sheet: Worksheet, cells: str) -> None:
@@ -98,57 +93,44 @@ def _merged_over(sheet: Worksheet, cells: str) -> None:
     sheet.merged_cells.add(cells)
 
 
-def _comment(cell: str, text: str) -> Edit:
-    def edit(main: Worksheet, coordinates: Worksheet) -> None:
-        typed(main, coordinates)
-        coordinates[cell].comment = Comment(text, "a colleague")
-
-    return edit
+@of_typed
+def _comment(main: Worksheet, coordinates: Worksheet, cell: str, text: str) -> None:
+    coordinates[cell].comment = Comment(text, "a colleague")
 
 
-def _column(title: str, values: list[object], letter: str = "R") -> Edit:
-    def edit(main: Worksheet, coordinates: Worksheet) -> None:
-        typed(main, coordinates)
-        coordinates[f"{letter}1"] = title
-        for row, value in enumerate(values, start=3):
-            coordinates[f"{letter}{row}"] = value
-
-    return edit
+@of_typed
+def _column(main: Worksheet, coordinates: Worksheet, title: str, values: list[object], letter: str = "R") -> None:
+    coordinates[f"{letter}1"] = title
+    for row, value in enumerate(values, start=3):
+        coordinates[f"{letter}{row}"] = value
 
 
-def _labels(own: list[object], of_main: list[object], heading: str | None = None) -> Edit:
-    def edit(main: Worksheet, coordinates: Worksheet) -> None:
-        typed(main, coordinates)
-        for sheet, labels in ((coordinates, own), (main, of_main)):
-            if heading is not None:
-                sheet["A2"] = heading
-            for row, label in enumerate(labels, start=3):
-                sheet.cell(row, 1).value = label
-
-    return edit
-
-
-def _second_table(start: int, text: str | None) -> Edit:
-    def edit(main: Worksheet, coordinates: Worksheet) -> None:
-        typed(main, coordinates)
-        if text is not None:
-            coordinates.cell(start, 1).value = text
-        for i, row in enumerate(range(start + 1, start + 4)):
-            for column, value in enumerate((5 + i, 200.0 + i, 10.0 * i, 5.0), start=1):
-                coordinates.cell(row, column).value = value
-            for column, value in enumerate((5 + i, 2.3, 75.0, 50.0, 10.0), start=1):
-                main.cell(7 + i, column).value = value
-
-    return edit
+@of_typed
+def _labels(
+    main: Worksheet, coordinates: Worksheet, own: list[object], of_main: list[object], heading: str | None = None
+) -> None:
+    for sheet, labels in ((coordinates, own), (main, of_main)):
+        if heading is not None:
+            sheet["A2"] = heading
+        for row, label in enumerate(labels, start=3):
+            sheet.cell(row, 1).value = label
 
 
-def _of_main(title: str, values: list[object]) -> Edit:
-    def edit(main: Worksheet, coordinates: Worksheet) -> None:
-        typed(main, coordinates)
-        for row, value in enumerate([title, None, *values], start=1):
-            main.cell(row, 8).value = value
+@of_typed
+def _second_table(main: Worksheet, coordinates: Worksheet, start: int, text: str | None) -> None:
+    if text is not None:
+        coordinates.cell(start, 1).value = text
+    for i, row in enumerate(range(start + 1, start + 4)):
+        for column, value in enumerate((5 + i, 200.0 + i, 10.0 * i, 5.0), start=1):
+            coordinates.cell(row, column).value = value
+        for column, value in enumerate((5 + i, 2.3, 75.0, 50.0, 10.0), start=1):
+            main.cell(7 + i, column).value = value
 
-    return edit
+
+@of_typed
+def _of_main(main: Worksheet, coordinates: Worksheet, title: str, values: list[object]) -> None:
+    for row, value in enumerate([title, None, *values], start=1):
+        main.cell(row, 8).value = value
 
 
 def _no_numbers(main: Worksheet, coordinates: Worksheet) -> None:
@@ -160,14 +142,13 @@ def _unnumbered(main: Worksheet, coordinates: Worksheet) -> None:
     coordinates.delete_cols(1)
 
 
-def _copy_of_coordinates(name: str, state: str = "visible", own_state: str = "visible") -> Edit:
-    def edit(main: Worksheet, coordinates: Worksheet) -> None:
-        typed(main, coordinates)
-        copy = main.parent.copy_worksheet(coordinates)
-        copy.title, copy.sheet_state, coordinates.sheet_state = name, state, own_state
-        copy["B3"] = 300.0
-
-    return edit
+@of_typed
+def _copy_of_coordinates(
+    main: Worksheet, coordinates: Worksheet, name: str, state: str = "visible", own_state: str = "visible"
+) -> None:
+    copy = main.parent.copy_worksheet(coordinates)
+    copy.title, copy.sheet_state, coordinates.sheet_state = name, state, own_state
+    copy["B3"] = 300.0
 
 
 def _single(main: Worksheet, coordinates: Worksheet) -> None:
@@ -375,14 +356,7 @@ def in_units(units: dict[str, str]):
 def test_lengths_are_converted_and_written_back_in_their_unit(units, tmp_path):
     system = read_edited(tmp_path, in_units(units))
     expected = read_edited(tmp_path, in_units({"": "mm"}))
-    for name in (
-        "centers",
-        "collimator_length",
-        "pinhole_diameter",
-        "detector_side",
-        "detector_thickness",
-        "roi_radius",
-    ):
+    for name in ("centers", "collimator_length", *DIMENSIONS.values()):
         np.testing.assert_allclose(getattr(system, name), getattr(expected, name), rtol=1e-14)
     template = tmp_path / "template.xlsx"
     book = plain()
@@ -391,14 +365,11 @@ def test_lengths_are_converted_and_written_back_in_their_unit(units, tmp_path):
     system = mph.read_system(template)
     same = mph.write_system(system, tmp_path / "same.xlsx", template)
     assert same.path.read_bytes() == template.read_bytes()
-    arrays = {n: getattr(system, n) for n in ("pinhole_diameter", "detector_side", "roi_radius", "detector_thickness")}
-    b = 1.25 * system.pinhole_distance
-    length = mph.collimator_length(b, system.pinhole_diameter, system.detector_side, system.roi_radius)
-    moved = mph.PinholeSystem(system.centers * 1.25, collimator_length=length, **arrays)
+    moved = by_design(replace(system, centers=system.centers * 1.25))
     written = mph.write_system(moved, tmp_path / "moved.xlsx", template)
     back = mph.read_system(written.path)  # no warning: the derived columns are in their units, too
     np.testing.assert_allclose(back.centers, moved.centers, rtol=1e-12)
-    np.testing.assert_allclose(back.collimator_length, length, rtol=1e-12)
+    np.testing.assert_allclose(back.collimator_length, moved.collimator_length, rtol=1e-12)
     cells = openpyxl.load_workbook(written.path)["Coordinates"]
     unit = LENGTH_UNITS[units.get("x1", units[""])]
     assert cells["B3"].value == pytest.approx(system.centers[0, 0] * 1.25 / unit, rel=1e-12)

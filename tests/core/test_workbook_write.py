@@ -6,6 +6,7 @@ import io
 import json
 import warnings
 import zipfile
+from dataclasses import replace
 from xml.etree import ElementTree
 
 import numpy as np
@@ -21,13 +22,16 @@ from .workbooks import (
     DIMENSIONS,
     Layout,
     by_design,
-    changed,
     content_of,
+    edited,
     laid_out,
     random_centers,
     random_change,
     random_system,
+    read_quietly,
+    saved_layout,
     values_of,
+    write_quietly,
 )
 
 try:
@@ -48,21 +52,12 @@ def assert_same(back: mph.PinholeSystem, system: mph.PinholeSystem, numbered: bo
         np.testing.assert_allclose(getattr(back, name), getattr(system, name), rtol=1e-9, atol=0, err_msg=name)
 
 
-def read_quietly(path) -> mph.PinholeSystem:
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        return mph.read_system(path)
-
-
 def write_changed(folder, layout: Layout, seed: int):
     """A template of the layout, a change of its system, and the written result."""
     template = folder / "template.xlsx"
     template.write_bytes(content_of(laid_out(layout)))
     system = random_change(np.random.default_rng(seed), read_quietly(template), layout)
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        written = mph.write_system(system, folder / "written.xlsx", template)
-    return system, written
+    return system, write_quietly(system, folder / "written.xlsx", template)
 
 
 def assert_in_order(path) -> None:
@@ -156,7 +151,7 @@ else:
         system = random_system(rng, n, shared=False)
         if scaled:
             factors = np.where(rng.random(n) < 0.5, 1.05, 1)
-            system = changed(system, collimator_length=system.collimator_length * factors)
+            system = replace(system, collimator_length=system.collimator_length * factors)
         path = tmp_path_factory.mktemp("w") / "new.xlsx"
         mph.write_system(system, path)
         back = mph.read_system(path) if not scaled else read_quietly(path)
@@ -230,7 +225,7 @@ def test_a_moved_pinhole_changes_its_row_alone(workbook, tmp_path):
     system = mph.read_system(workbook)
     centers = system.centers.copy()
     centers[3] += [1.0, -2.0, 1 / 3]
-    moved = by_design(changed(system, centers=centers))
+    moved = by_design(replace(system, centers=centers))
     written = mph.write_system(moved, tmp_path / "moved.xlsx", workbook)
     assert written.changed == ("Coordinates!B6", "Coordinates!C6", "Coordinates!D6")
     assert set(written.recalculated) == {f"Coordinates!{c}6" for c in "EFGHIJKUVW"}
@@ -260,9 +255,7 @@ def test_new_workbook_is_laid_out_as_the_real_one(workbook, tmp_path):
 @pytest.fixture
 def template(tmp_path):
     """Four modules with formulas everywhere; the stored values do not matter."""
-    path = tmp_path / "template.xlsx"
-    path.write_bytes(content_of(laid_out(Layout(seed=3))))
-    return path
+    return saved_layout(tmp_path / "template.xlsx", seed=3)
 
 
 @QUIET
@@ -306,11 +299,10 @@ def test_reordered_modules_take_their_rows_along(template, tmp_path):
 @QUIET
 @pytest.mark.parametrize("order", [[1, 2, 3], [3, 1, 2, 0]])
 def test_a_summary_beside_the_table_stays_where_it_is(template, tmp_path, order):
-    book = openpyxl.load_workbook(template)
-    sheet = book["Coordinates"]
-    first = sheet.max_column + 1
-    sheet.cell(3, first).value, sheet.cell(3, first + 1).value = "highest", "=MAX(B3:B6)"
-    book.save(template)
+    with edited(template) as book:
+        sheet = book["Coordinates"]
+        first = sheet.max_column + 1
+        sheet.cell(3, first).value, sheet.cell(3, first + 1).value = "highest", "=MAX(B3:B6)"
     system = read_quietly(template)[order]
     mph.write_system(system, tmp_path / "o.xlsx", template)
     cells, values = (openpyxl.load_workbook(tmp_path / "o.xlsx", data_only=d)["Coordinates"] for d in (False, True))
@@ -321,16 +313,15 @@ def test_a_summary_beside_the_table_stays_where_it_is(template, tmp_path, order)
 @QUIET
 def test_renumbered_modules_keep_their_rows(template, tmp_path):
     system = mph.read_system(template)
-    system = changed(system, numbers=system.numbers + 1000)
+    system = replace(system, numbers=system.numbers + 1000)
     written = mph.write_system(system, tmp_path / "o.xlsx", template)
     assert written.changed == tuple(f"{sheet}!A{row}" for sheet in ("Main", "Coordinates") for row in range(3, 7))
     assert_same(mph.read_system(tmp_path / "o.xlsx"), system)
 
 
 def test_a_cell_in_the_way_of_added_modules_is_named(template, tmp_path):
-    book = openpyxl.load_workbook(template)
-    book["Coordinates"]["A8"] = "note: all in mm"
-    book.save(template)
+    with edited(template) as book:
+        book["Coordinates"]["A8"] = "note: all in mm"
     system = mph.read_system(template)
     more = more_of(system, 3)
     with pytest.raises(mph.InputError, match=r"^template.xlsx: Coordinates!A8 is not blank"):
@@ -354,27 +345,25 @@ def more_of(system, n):
 @QUIET
 @pytest.mark.parametrize("formula", ["=270+7", "=Main!$H$9*1"])
 def test_a_formula_that_does_not_give_the_number_is_replaced_with_a_warning(template, tmp_path, formula):
-    book = openpyxl.load_workbook(template)
-    book["Main"]["H9"] = 277
-    book["Coordinates"]["B3"] = formula
-    book.save(template)
+    with edited(template) as book:
+        book["Main"]["H9"] = 277
+        book["Coordinates"]["B3"] = formula
     system = read_quietly(template)
     centers = system.centers.copy()
     centers[0, 0] = 280.5
     with pytest.warns(mph.InputWarning, match=r"template.xlsx: Coordinates!B3: the formula was replaced .*gives 277"):
-        mph.write_system(by_design(changed(system, centers=centers)), tmp_path / "o.xlsx", template)
+        mph.write_system(by_design(replace(system, centers=centers)), tmp_path / "o.xlsx", template)
     assert values_of(tmp_path / "o.xlsx", data_only=False)["Coordinates", "B3"] == 280.5
 
 
 @QUIET
 def test_a_formula_that_gives_the_new_number_stays(template, tmp_path):
-    book = openpyxl.load_workbook(template)
-    book["Coordinates"]["B4"] = "=-B3"
-    book.save(template)
+    with edited(template) as book:
+        book["Coordinates"]["B4"] = "=-B3"
     system = read_quietly(template)
     centers = system.centers.copy()
     centers[:2, 0] = 280.5, -280.5
-    written = mph.write_system(by_design(changed(system, centers=centers)), tmp_path / "o.xlsx", template)
+    written = mph.write_system(by_design(replace(system, centers=centers)), tmp_path / "o.xlsx", template)
     cells = values_of(tmp_path / "o.xlsx", data_only=False)
     assert (cells["Coordinates", "B3"], cells["Coordinates", "B4"]) == (280.5, "=-B3")
     assert values_of(tmp_path / "o.xlsx")["Coordinates", "B4"] == -280.5
@@ -383,12 +372,11 @@ def test_a_formula_that_gives_the_new_number_stays(template, tmp_path):
 
 def test_a_formula_that_comes_to_refer_to_itself_is_replaced_alone(template, tmp_path):
     """Sorted as by a spreadsheet, =B$3 of another row moves to B3 itself; cells that depend on it stay formulas."""
-    book = openpyxl.load_workbook(template)
-    for row in range(4, 7):
-        book["Main"][f"B{row}"] = "=B$3"
-    book["Main"]["B3"] = 2.25
-    book.save(template)
-    system = by_design(changed(read_quietly(template), pinhole_diameter=2.25))
+    with edited(template) as book:
+        for row in range(4, 7):
+            book["Main"][f"B{row}"] = "=B$3"
+        book["Main"]["B3"] = 2.25
+    system = by_design(replace(read_quietly(template), pinhole_diameter=2.25))
     with pytest.warns(mph.InputWarning) as caught:
         mph.write_system(system[[3, 0, 1, 2]], tmp_path / "o.xlsx", template)
     replaced = [str(w.message) for w in caught if "the formula was replaced" in str(w.message)]
@@ -402,31 +390,29 @@ def test_a_formula_that_comes_to_refer_to_itself_is_replaced_alone(template, tmp
 
 
 def test_what_nobody_can_calculate_stores_no_value(template, tmp_path):
-    book = openpyxl.load_workbook(template)
-    del book["Theta"], book["It's values"]
-    other = book.create_sheet("Other")
-    other["A1"], other["A2"], other["A3"] = "=FOO(Coordinates!B3)", "=A1+1", "=FOO(1)"
-    book.save(template)
+    with edited(template) as book:
+        del book["Theta"], book["It's values"]
+        other = book.create_sheet("Other")
+        other["A1"], other["A2"], other["A3"] = "=FOO(Coordinates!B3)", "=A1+1", "=FOO(1)"
     system = read_quietly(template)
     with pytest.warns(mph.InputWarning, match=r"Other!A1 and 1 more: the formula's new value could not be calculated"):
         written = mph.write_system(
-            by_design(changed(system, centers=system.centers * 1.1)), tmp_path / "o.xlsx", template
+            by_design(replace(system, centers=system.centers * 1.1)), tmp_path / "o.xlsx", template
         )
     assert written.cleared == ("Other!A1", "Other!A2")
 
 
 def test_a_system_is_read_back_from_formulas_without_values(template, tmp_path):
     """SUMPRODUCT is beyond the evaluator: H stores no value, and the formula of an l that must be right is replaced."""
-    book = openpyxl.load_workbook(template)
-    table = book["Coordinates"]
-    columns = {cell.value: cell.column_letter for cell in table[2] if cell.value}
-    length, end = columns["length of collimator"], columns["l + b+Td"]
-    for row in range(3, 7):
-        table[f"{end}{row}"] = f"=SUMPRODUCT({length}{row}:{length}{row})+{columns['b']}{row}+Main!E{row}"
-    table[f"{length}4"] = table[f"{length}4"].value + "*SUMPRODUCT(1)"
-    book.save(template)
+    with edited(template) as book:
+        table = book["Coordinates"]
+        columns = {cell.value: cell.column_letter for cell in table[2] if cell.value}
+        length, end = columns["length of collimator"], columns["l + b+Td"]
+        for row in range(3, 7):
+            table[f"{end}{row}"] = f"=SUMPRODUCT({length}{row}:{length}{row})+{columns['b']}{row}+Main!E{row}"
+        table[f"{length}4"] = table[f"{length}4"].value + "*SUMPRODUCT(1)"
     system = read_quietly(template)
-    system = by_design(changed(system, centers=system.centers * 1.1))
+    system = by_design(replace(system, centers=system.centers * 1.1))
     with pytest.warns(mph.InputWarning) as caught:
         written = mph.write_system(system, tmp_path / "o.xlsx", template)
     replaced, cleared = sorted(str(w.message) for w in caught)
@@ -438,12 +424,11 @@ def test_a_system_is_read_back_from_formulas_without_values(template, tmp_path):
 
 @QUIET
 def test_one_cell_for_all_modules_is_changed_or_spread(tmp_path):
-    template = tmp_path / "template.xlsx"
-    template.write_bytes(content_of(laid_out(Layout(shared=True, length="absent", derived="absent"))))
+    template = saved_layout(tmp_path / "template.xlsx", shared=True, length="absent", derived="absent")
     system = read_quietly(template)
-    written = mph.write_system(by_design(changed(system, pinhole_diameter=3.3)), tmp_path / "o.xlsx", template)
+    written = mph.write_system(by_design(replace(system, pinhole_diameter=3.3)), tmp_path / "o.xlsx", template)
     assert written.changed == ("Main!B3",)
-    different = by_design(changed(system, pinhole_diameter=[1.0, 2.0, 3.0, 4.0]))
+    different = by_design(replace(system, pinhole_diameter=[1.0, 2.0, 3.0, 4.0]))
     mph.write_system(different, tmp_path / "o.xlsx", template)
     values = values_of(tmp_path / "o.xlsx")
     assert [values.get(("Main", f"B{row}")) for row in range(3, 7)] == [1, 2, 3, 4]
@@ -452,27 +437,23 @@ def test_one_cell_for_all_modules_is_changed_or_spread(tmp_path):
 
 
 def test_without_a_column_of_lengths_only_designed_ones_are_held(tmp_path):
-    template = tmp_path / "template.xlsx"
-    template.write_bytes(content_of(laid_out(Layout(length="absent"))))
+    template = saved_layout(tmp_path / "template.xlsx", length="absent")
     system = read_quietly(template)
     with pytest.raises(mph.InputError, match="no column headed l for the collimator length of module"):
-        mph.write_system(changed(system, collimator_length=99.0), tmp_path / "o.xlsx", template)
+        mph.write_system(replace(system, collimator_length=99.0), tmp_path / "o.xlsx", template)
 
 
 def test_numbers_that_the_sheet_cannot_say_are_warned_of(tmp_path):
-    template = tmp_path / "template.xlsx"
-    template.write_bytes(content_of(laid_out(Layout(numbered=False, length="absent", derived="absent"))))
+    template = saved_layout(tmp_path / "template.xlsx", numbered=False, length="absent", derived="absent")
     system = read_quietly(template)
     with pytest.warns(mph.InputWarning, match="has no column of the modules' numbers"):
-        mph.write_system(changed(system, numbers=[5, 6, 7, 8]), tmp_path / "o.xlsx", template)
+        mph.write_system(replace(system, numbers=[5, 6, 7, 8]), tmp_path / "o.xlsx", template)
     assert (tmp_path / "o.xlsx").read_bytes() == template.read_bytes()
 
 
 def test_a_workbook_may_replace_itself(template):
     system = read_quietly(template)
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        mph.write_system(by_design(changed(system, centers=system.centers * 1.01)), template, template)
+    write_quietly(by_design(replace(system, centers=system.centers * 1.01)), template, template)
     np.testing.assert_array_equal(read_quietly(template).centers, system.centers * 1.01)
     assert [p.name for p in template.parent.iterdir()] == ["template.xlsx"]
 
@@ -485,7 +466,7 @@ def test_every_layout_that_is_read_can_be_written(edit, tmp_path, rng):
     template = tmp_path / "t.xlsx"
     book.save(template)
     system = read_quietly(template)
-    other = by_design(changed(system, centers=random_centers(rng, 4), pinhole_diameter=rng.uniform(1, 3, 4)))
+    other = by_design(replace(system, centers=random_centers(rng, 4), pinhole_diameter=rng.uniform(1, 3, 4)))
     for wanted in (other[[3, 0, 1]], more_of(other, 2)):
         if edit.__name__ == "_blank_rows_and_notes" and len(wanted) > 4:
             with pytest.raises(mph.InputError, match="Coordinates!A11 is not blank"):  # a note
@@ -552,7 +533,7 @@ def test_a_system_that_would_be_refused_is_not_written(template, tmp_path):
     system = read_quietly(template)
     centers = system.centers.copy()
     centers[1] = centers[0] + 1e-9  # the same position, in a workbook's precision
-    twice = changed(system, centers=centers)
+    twice = replace(system, centers=centers)
     for source, name in ((template, "template.xlsx"), (None, "the new workbook")):
         with pytest.raises(mph.InputError, match=f"^{name} cannot hold this system, with it: {name}: Coordinates!B4 "):
             mph.write_system(by_design(twice), tmp_path / "o.xlsx", source)

@@ -9,8 +9,8 @@ import signal
 import subprocess
 import sys
 import time
-import warnings
 import zipfile
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -26,8 +26,9 @@ from openpyxl.worksheet.table import Table
 import mphdrr
 import mphdrr.core as mph
 
-from .workbooks import Layout, by_design, changed, content_of, laid_out, values_of
+from .workbooks import Layout, by_design, content_of, laid_out, read_quietly, values_of, write_quietly
 
+SIZES = ("pinhole_diameter", "detector_side", "detector_thickness", "roi_radius")
 SPREADSHEET = "http://schemas.openxmlformats.org/spreadsheetml/2006/main"
 
 
@@ -55,22 +56,10 @@ def repacked(content: bytes, edit) -> bytes:
     return out.getvalue()
 
 
-def read_quietly(path) -> mph.PinholeSystem:
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        return mph.read_system(path)
-
-
-def write_quietly(system, path, template) -> mph.WrittenWorkbook:
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        return mph.write_system(system, path, template)
-
-
 def moved(system: mph.PinholeSystem) -> mph.PinholeSystem:
     centers = system.centers.copy()
     centers[1] *= 1.03
-    return by_design(changed(system, centers=centers))
+    return by_design(replace(system, centers=centers))
 
 
 @pytest.fixture
@@ -204,10 +193,7 @@ UNREADABLE = {
 def _edit(system: mph.PinholeSystem) -> mph.PinholeSystem:
     """Moved, one removed, one added."""
     part = moved(system)[[0, 1, 3]]
-    arrays = {
-        name: np.append(getattr(part, name), getattr(part, name)[0])
-        for name in ("pinhole_diameter", "detector_side", "detector_thickness", "roi_radius")
-    }
+    arrays = {name: np.append(getattr(part, name), getattr(part, name)[0]) for name in SIZES}
     centers = np.concatenate([part.centers, [[7.0, 210.0, 33.125]]])
     return by_design(mph.PinholeSystem(centers, numbers=np.append(part.numbers, 999), collimator_length=1.0, **arrays))
 
@@ -274,7 +260,7 @@ def test_texts_that_were_numbers_in_formulas_and_cells_of_any_type_become_number
     system = read_quietly(template)
     copy = write_quietly(system, tmp_path / "o.xlsx", template)
     assert copy.path.read_bytes() == template.read_bytes()
-    other = changed(moved(system), numbers=system.numbers + 1)
+    other = replace(moved(system), numbers=system.numbers + 1)
     write_quietly(other, tmp_path / "o.xlsx", template)
     assert values_of(tmp_path / "o.xlsx")["Coordinates", "A3"] == system.numbers[0] + 1
     np.testing.assert_array_equal(read_quietly(tmp_path / "o.xlsx").numbers, system.numbers + 1)
@@ -299,7 +285,7 @@ def test_the_other_cells_keep_a_shared_formula(tmp_path):
     system = read_quietly(template)
     centers = system.centers.copy()
     centers[0, 0] += 1
-    written = write_quietly(by_design(changed(system, centers=centers)), tmp_path / "o.xlsx", template)
+    written = write_quietly(by_design(replace(system, centers=centers)), tmp_path / "o.xlsx", template)
     formulas = values_of(written.path, data_only=False)
     assert [formulas["Coordinates", f"B{row}"] for row in range(4, 7)] == [f"=100+C{row}*0.5" for row in range(4, 7)]
     # And sorted, and removed.
@@ -425,7 +411,7 @@ def test_killed_at_any_moment_the_old_or_the_new_file_is_whole(times, tmp_path, 
     a = read_quietly(workbook)
     centers = a.centers.copy()
     centers[:, 0] += 0.5
-    b = by_design(changed(a, centers=centers))
+    b = by_design(replace(a, centers=centers))
     write_quietly(b, tmp_path / "b.xlsx", workbook)
     path = tmp_path / "master.xlsx"
     path.write_bytes(workbook.read_bytes())

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import io
+import warnings
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +15,7 @@ from openpyxl.utils import get_column_letter as letter
 from openpyxl.workbook import Workbook
 from openpyxl.workbook.defined_name import DefinedName
 
-from mphdrr.core import PinholeSystem, collimator_length
+from mphdrr.core import PinholeSystem, WrittenWorkbook, collimator_length, read_system, write_system
 from mphdrr.core.workbook.quantities import DERIVED, QUANTITIES
 
 DIMENSIONS = {"d": "pinhole_diameter", "R": "roi_radius", "Ld": "detector_side", "Td": "detector_thickness"}
@@ -24,16 +27,23 @@ def designed(centers, d, R, Ld, Td, numbers=None, length=None) -> PinholeSystem:
     return PinholeSystem(centers, d, length, Ld, Td, R, numbers)
 
 
-def changed(system: PinholeSystem, **values) -> PinholeSystem:
-    fields = {f.name: getattr(system, f.name) for f in dataclasses.fields(system)}
-    return PinholeSystem(**{**fields, **values})
-
-
 def by_design(system: PinholeSystem) -> PinholeSystem:
     s = system
-    return changed(
+    return dataclasses.replace(
         s, collimator_length=collimator_length(s.pinhole_distance, s.pinhole_diameter, s.detector_side, s.roi_radius)
     )
+
+
+def read_quietly(path) -> PinholeSystem:
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        return read_system(path)
+
+
+def write_quietly(system, path, template) -> WrittenWorkbook:
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        return write_system(system, path, template)
 
 
 def random_centers(rng, n: int) -> np.ndarray:
@@ -195,7 +205,9 @@ def random_change(rng, system: PinholeSystem, layout: Layout) -> PinholeSystem:
     changed_system = by_design(PinholeSystem(**arrays))
     if layout.length in ("formula", "typed", "blank") and rng.random() < 0.3:
         factor = np.where(rng.random(len(changed_system)) < 0.5, 1.1, 1.0)
-        changed_system = changed(changed_system, collimator_length=changed_system.collimator_length * factor)
+        changed_system = dataclasses.replace(
+            changed_system, collimator_length=changed_system.collimator_length * factor
+        )
     return changed_system
 
 
@@ -203,6 +215,20 @@ def content_of(book: Workbook) -> bytes:
     file = io.BytesIO()
     book.save(file)
     return file.getvalue()
+
+
+def saved_layout(path: Path, **layout) -> Path:
+    """The file of a workbook with this layout."""
+    path.write_bytes(content_of(laid_out(Layout(**layout))))
+    return path
+
+
+@contextlib.contextmanager
+def edited(path: Path) -> Iterator[Workbook]:
+    """A file's workbook, which is saved again."""
+    book = openpyxl.load_workbook(path)
+    yield book
+    book.save(path)
 
 
 def values_of(content: bytes | Path, data_only: bool = True) -> dict[tuple[str, str], object]:

@@ -1,7 +1,5 @@
 """``mphdrr geometry ACTION``: an action is a module here with ``add_parser(actions)``."""
 
-from __future__ import annotations
-
 from ..options import add_command
 from . import check, export, fit, generate, map, performance, set, show
 

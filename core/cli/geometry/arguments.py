@@ -1,7 +1,5 @@
 """Options that the actions share."""
 
-from __future__ import annotations
-
 import argparse
 from typing import Any
 
@@ -15,6 +13,8 @@ from ..options import add_command, add_workbook, number_or_name
 
 MATERIAL_OPTIONS = ("aperture_mu", "opening_angle", "crystal_mu", "intrinsic_fwhm", "isotope")
 """Destinations of the options of `add_materials`."""
+EDGE = MATERIAL_OPTIONS[:2]
+"""Of those of `add_edge`, which are also keywords."""
 
 
 def add_action(actions, name: str, summary: str, example: str, run: Any) -> argparse.ArgumentParser:  # type: ignore[no-untyped-def]
@@ -36,29 +36,24 @@ def add_materials(parser: argparse.ArgumentParser) -> None:
     """Add the materials and the isotope, for `sensitivity_settings` and `edge_settings`."""
     group = parser.add_argument_group("materials; without an option the module is ideal")
     add_edge(group)
-    group.add_argument(
-        "--crystal-mu", type=number_or_name, metavar="MATERIAL",
-        help=f"{', '.join(CRYSTALS)} at the isotope's photons, or the coefficient, 1/mm; without it, all photons count",
-    )  # fmt: skip
-    group.add_argument(
-        "--intrinsic-fwhm", type=float, default=0.0, metavar="MM", help="resolution of the detector, mm on the crystal"
-    )
-    group.add_argument("--isotope", metavar="NAME", help=f"{', '.join(ISOTOPES)}; without it, one photon per decay")
+    crystal = f"{', '.join(CRYSTALS)} at the isotope's photons, or the coefficient, 1/mm; without it, all photons count"
+    add = group.add_argument
+    add("--crystal-mu", type=number_or_name, metavar="MATERIAL", help=crystal)
+    add("--intrinsic-fwhm", type=float, default=0.0, metavar="MM", help="resolution of the detector, mm on the crystal")
+    add("--isotope", metavar="NAME", help=f"{', '.join(ISOTOPES)}; without it, one photon per decay")
 
 
 def add_edge(parser: argparse._ActionsContainer) -> None:
     """Add the knife edge's material and angle, for `edge_settings`, which needs an option ``--isotope`` too."""
-    parser.add_argument(
-        "--aperture-mu", type=number_or_name, metavar="MATERIAL",
-        help=f"{', '.join(APERTURES)} at the isotope's photons, or the coefficient, 1/mm; without it, nothing penetrates",
-    )  # fmt: skip
+    edge = f"{', '.join(APERTURES)} at the isotope's photons, or the coefficient, 1/mm; without it, nothing penetrates"
+    parser.add_argument("--aperture-mu", type=number_or_name, metavar="MATERIAL", help=edge)
     parser.add_argument("--opening-angle", type=float, default=90.0, metavar="DEG", help="full angle of the knife edge")
 
 
 def edge_settings(arguments: argparse.Namespace, system: PinholeSystem) -> dict[str, Any]:
     """Attenuation coefficient of the aperture and angle of its knife edge, as keywords."""
     settings = sensitivity_settings(arguments, system)
-    return {name: settings[name] for name in ("aperture_mu", "opening_angle")}
+    return {name: settings[name] for name in EDGE}
 
 
 def sensitivity_settings(arguments: argparse.Namespace, system: PinholeSystem) -> dict[str, Any]:

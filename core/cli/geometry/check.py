@@ -1,10 +1,6 @@
 """``mphdrr geometry check FILE``."""
 
-from __future__ import annotations
-
 import argparse
-import json
-import sys
 from typing import get_args
 
 import numpy as np
@@ -15,31 +11,25 @@ from ...geometry.collimator import EdgePlace
 from ...geometry.system import PinholeSystem
 from ...physics.isotopes import ISOTOPES
 from ...recording import recorded_warnings
-from ..options import read_workbook, refuse
+from ..options import print_answer, read_workbook, refuse
 from .arguments import add_action, add_edge, edge_settings
 
 
 def add_parser(actions) -> None:  # type: ignore[no-untyped-def]
     """Add the action."""
-    parser = add_action(
-        actions,
-        "check",
+    summary = (
         "compare the workbook with the design formulas, and find modules that overlap, do not see their ROI, block each "
-        "other or have unsuitable plates",
-        " --wall 3 --strict",
-        _run,
+        "other or have unsuitable plates"
     )
-    parser.add_argument("--plate", type=float, default=2.0, metavar="MM", help="thickness of the aperture plates")
-    parser.add_argument("--wall", type=float, default=2.0, metavar="MM", help="thickness of the collimators' walls")
-    parser.add_argument(
-        "--edge-at", choices=get_args(EdgePlace), default="middle",
-        help="where in the plate the knife edge is; front is the face towards the ROI",
-    )  # fmt: skip
+    parser = add_action(actions, "check", summary, " --wall 3 --strict", _run)
+    add = parser.add_argument
+    add("--plate", type=float, default=2.0, metavar="MM", help="thickness of the aperture plates")
+    add("--wall", type=float, default=2.0, metavar="MM", help="thickness of the collimators' walls")
+    place = "where in the plate the knife edge is; front is the face towards the ROI"
+    add("--edge-at", choices=get_args(EdgePlace), default="middle", help=place)
     add_edge(parser)
-    parser.add_argument(
-        "--isotope", metavar="NAME", help=f"{', '.join(ISOTOPES)}: its photons must be stopped by the plates"
-    )
-    parser.add_argument("--strict", action="store_true", help="exit with status 1 if there is any warning or finding")
+    add("--isotope", metavar="NAME", help=f"{', '.join(ISOTOPES)}: its photons must be stopped by the plates")
+    add("--strict", action="store_true", help="exit with status 1 if there is any warning or finding")
 
 
 def _run(arguments: argparse.Namespace) -> None:
@@ -47,29 +37,17 @@ def _run(arguments: argparse.Namespace) -> None:
         refuse(arguments, ("isotope",), "needs --aperture-mu")
     with recorded_warnings() as messages:
         system = read_workbook(arguments)
-    report = check_geometry(
-        system,
-        plate_thickness=arguments.plate,
-        wall_thickness=arguments.wall,
-        edge_at=arguments.edge_at,
-        **edge_settings(arguments, system),
-    )
+    parts = {"plate_thickness": arguments.plate, "wall_thickness": arguments.wall, "edge_at": arguments.edge_at}
+    report = check_geometry(system, **parts, **edge_settings(arguments, system))
     findings = report.messages()
     warnings, found = (
         f"{len(x)} {name}{'s' * (len(x) != 1)}" for x, name in ((messages, "warning"), (findings, "finding"))
     )
     total = f"{warnings} of the workbook, {found} in the geometry"
-    if arguments.json:
-        answer = {"summary": _summary(system), "warnings": messages, "findings": findings, "geometry": report.as_dict()}
-        print(json.dumps(answer, indent=1))
-    else:
-        for message in messages:
-            sys.stderr.write(f"mphdrr: warning: {message}\n")
-        for name, text in _summary(system).items():
-            print(f"{name:22s} {text}")
-        for finding in findings:
-            print(finding)
-        print(total)
+    summary = _summary(system)
+    answer = {"summary": summary, "warnings": messages, "findings": findings, "geometry": report.as_dict()}
+    lines = [*(f"{name:22s} {text}" for name, text in summary.items()), *findings, total]
+    print_answer(arguments, answer, lines, [f"warning: {message}" for message in messages])
     if arguments.strict and (messages or findings):
         raise InputError(f"{arguments.workbook}: {total}")
 

@@ -1,7 +1,5 @@
 """``mphdrr geometry export FILE -o OUT``."""
 
-from __future__ import annotations
-
 import argparse
 import typing
 from pathlib import Path
@@ -12,7 +10,7 @@ from ...errors import InputError
 from ...exchange import FORMATS, Format, write_geometry
 from ...geometry.grid import Grid
 from ...volumes.volume_files import read_volume
-from ..options import add_command, add_view_options, add_workbook, chosen_modules, output_path, read_workbook
+from ..options import add_command, add_workbook, chosen_modules, output_path, read_workbook
 
 _WORDS = {bool: "yes|no", int: "N", float: "NUMBER", str: "TEXT", tuple: "NUMBER,NUMBER,...", Grid: "VOLUME-FILE"}
 """How a value of each type is shown in the help; options of other types are for scripts."""
@@ -28,14 +26,16 @@ def add_parser(actions) -> None:  # type: ignore[no-untyped-def]
         "example: mphdrr geometry export scanner.xlsx -o cameras.npz --format pytorch3d --set in_ndc=no",
     )
     add_workbook(parser)
-    parser.add_argument("-o", "--output", required=True, metavar="OUT", help="file, or new folder, to write")
-    parser.add_argument(
-        "--format", choices=FORMATS, metavar="NAME", help="see the list below; default: the only one with OUT's ending"
-    )
-    parser.add_argument(
-        "--set", action="append", default=[], metavar="NAME=VALUE", help="an option of the format; may be repeated"
-    )
-    add_view_options(parser)
+    add = parser.add_argument
+    add("-o", "--output", required=True, metavar="OUT", help="file, or new folder, to write")
+    default = "see the list below; default: the only one with OUT's ending"
+    add("--format", choices=FORMATS, metavar="NAME", help=default)
+    add("--set", action="append", default=[], metavar="NAME=VALUE", help="an option of the format; may be repeated")
+    add("--size", type=int, nargs=2, default=[256, 256], metavar=("ROWS", "COLUMNS"), help="pixels")
+    add("--detector", choices=("virtual", "real"), default="virtual", help="upright in front, or crystal")
+    add("--magnification", type=float, default=10.0, help="virtual detector's distance in units of l")
+    add("--pitch", type=float, metavar="MM", help="pixel size; default: the crystal's whole side")
+    add("--modules", metavar="RANGE", help="such as 1-40 or 1-20,41; default: all")
     described = "\n".join(map(_described, FORMATS.values()))
     parser.epilog = f"formats, with their options for --set:\n{described}\n{parser.epilog}"
     parser.set_defaults(run=_run)

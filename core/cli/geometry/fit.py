@@ -1,15 +1,13 @@
 """``mphdrr geometry fit FILE``."""
 
-from __future__ import annotations
-
 import argparse
-import json
+from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
 
 from ...geometry.ring_fits import RingFit, fit_rings
-from ..options import read_workbook
+from ..options import print_answer, read_workbook
 from .arguments import add_action
 
 _FOLLOWS = 0.1  # mm off the ellipse that rounding in a workbook explains
@@ -17,30 +15,26 @@ _FOLLOWS = 0.1  # mm off the ellipse that rounding in a workbook explains
 
 def add_parser(actions) -> None:  # type: ignore[no-untyped-def]
     """Add the action."""
-    add_action(
-        actions,
-        "fit",
-        "find the ellipse that each ring of modules follows, and the modules' distances from it",
-        "",
-        _run,
-    )
+    summary = "find the ellipse that each ring of modules follows, and the modules' distances from it"
+    add_action(actions, "fit", summary, "", _run)
 
 
 def _run(arguments: argparse.Namespace) -> None:
     rings = [_record(fit) for fit in fit_rings(read_workbook(arguments))]
-    if arguments.json:
-        print(json.dumps({"rings": rings, "units": "mm, degrees"}, indent=1))
-        return
+    print_answer(arguments, {"rings": rings, "units": "mm, degrees"}, _lines(rings))
+
+
+def _lines(rings: list[dict[str, Any]]) -> Iterator[str]:
     for i, ring in enumerate(rings, 1):
         (a, b), (x, y), azimuths, z = (ring[name] for name in ("semi_axes", "center", "azimuths", "z"))
-        print(f"ring {i}: {len(azimuths)} modules, {ring['numbers'][0]} to {ring['numbers'][-1]}")
-        print(f"  ellipse     semi-axes {a:.3f} and {b:.3f} mm, turned by {ring['rotation']:.4f} degrees")
-        print(f"              centre at x = {x:.3f}, y = {y:.3f} mm")
-        print(f"  azimuths    from {azimuths[0]:.4f} to {azimuths[-1]:.4f} degrees")
-        print(f"  z           from {min(z):.4f} to {max(z):.4f} mm")
+        yield f"ring {i}: {len(azimuths)} modules, {ring['numbers'][0]} to {ring['numbers'][-1]}"
+        yield f"  ellipse     semi-axes {a:.3f} and {b:.3f} mm, turned by {ring['rotation']:.4f} degrees"
+        yield f"              centre at x = {x:.3f}, y = {y:.3f} mm"
+        yield f"  azimuths    from {azimuths[0]:.4f} to {azimuths[-1]:.4f} degrees"
+        yield f"  z           from {min(z):.4f} to {max(z):.4f} mm"
         verdict = "" if ring["curve_deviation"] <= _FOLLOWS else ": these modules follow no ellipse"
-        print(f"  deviation   {ring['curve_deviation']:.2g} mm at most from the ellipse{verdict}")
-        print(
+        yield f"  deviation   {ring['curve_deviation']:.2g} mm at most from the ellipse{verdict}"
+        yield (
             f"              {ring['even_deviation']:.2g} mm at most if at equal steps of {ring['spacing']} and at one z, "
             f"{np.mean(z):.4f} mm"
         )

@@ -1,7 +1,5 @@
 """``mphdrr geometry generate SHAPE -o FILE``."""
 
-from __future__ import annotations
-
 import argparse
 from typing import Any
 
@@ -38,19 +36,14 @@ def add_parser(actions) -> None:  # type: ignore[no-untyped-def]
         "mphdrr geometry generate ellipse --modules 20 --semi-axes 273 220.5 --center 42.43 -42.43 --start 14.25 "
         "--end 255.6 --spacing arc --z -71 -24 --mirrored -o scanner.xlsx",
     )
-    parser.add_argument("--modules", type=int, default=20, metavar="M", help="modules of each ring")
-    parser.add_argument(
-        "--semi-axes", type=float, nargs="+", required=True, metavar="MM", help="along x and y, or a circle's radius"
-    )
-    parser.add_argument(
-        "--center", type=float, nargs=2, default=[0, 0], metavar="MM", help="of the ellipse, x y from the isocentre"
-    )
-    parser.add_argument("--rotation", type=float, default=0.0, metavar="DEG", help="of the ellipse about its centre")
-    parser.add_argument("--start", type=float, default=0.0, metavar="DEG", help="azimuth of a ring's first module")
-    parser.add_argument(
-        "--end", type=float, default=360.0, metavar="DEG", help="of its last; a full turn after the start: closed"
-    )
-    parser.add_argument("--spacing", choices=("angle", "arc"), default="angle", help="equal steps in angle, or in arc")
+    add = parser.add_argument
+    add("--modules", type=int, default=20, metavar="M", help="modules of each ring")
+    add("--semi-axes", type=float, nargs="+", required=True, metavar="MM", help="along x and y, or a circle's radius")
+    add("--center", type=float, nargs=2, default=[0, 0], metavar="MM", help="of the ellipse, x y from the isocentre")
+    add("--rotation", type=float, default=0.0, metavar="DEG", help="of the ellipse about its centre")
+    add("--start", type=float, default=0.0, metavar="DEG", help="azimuth of a ring's first module")
+    add("--end", type=float, default=360.0, metavar="DEG", help="of its last; a full turn after the start: closed")
+    add("--spacing", choices=("angle", "arc"), default="angle", help="equal steps in angle, or in arc")
     _add_modules(parser, _ellipse)
     parser = add_command(
         shapes,
@@ -58,15 +51,14 @@ def add_parser(actions) -> None:  # type: ignore[no-untyped-def]
         "rings of modules on flat plates",
         "mphdrr geometry generate plates --polygon 5 --apothem 220 --modules 4 --z -71 -24 --mirrored -o scanner.xlsx",
     )
-    parser.add_argument(
-        "--modules", type=int, nargs="+", default=[4], metavar="N", help="of each plate in each ring, or one for all"
-    )
+    add = parser.add_argument
+    add("--modules", type=int, nargs="+", default=[4], metavar="N", help="of each plate in each ring, or one for all")
     plates = parser.add_mutually_exclusive_group(required=True)
     plates.add_argument("--polygon", type=int, metavar="SIDES", help="plates of a regular polygon, with --apothem")
     plates.add_argument("--vertices", type=float, nargs="+", metavar="MM", help="x y x y ... of the plates' edges")
-    parser.add_argument("--apothem", type=float, metavar="MM", help="distance of the polygon's plates")
-    parser.add_argument("--rotation", type=float, default=0.0, metavar="DEG", help="azimuth of its first plate")
-    parser.add_argument("--open", action="store_true", help="no plate joins the last vertex to the first")
+    add("--apothem", type=float, metavar="MM", help="distance of the polygon's plates")
+    add("--rotation", type=float, default=0.0, metavar="DEG", help="azimuth of its first plate")
+    add("--open", action="store_true", help="no plate joins the last vertex to the first")
     _add_modules(parser, _plates)
 
 

@@ -1,9 +1,6 @@
 """``mphdrr geometry map FILE -o FILE``."""
 
-from __future__ import annotations
-
 import argparse
-import json
 from typing import Any
 
 import numpy as np
@@ -12,7 +9,7 @@ from ...geometry.grid import Grid
 from ...physics.maps import MAPS
 from ...validation import whole_shape
 from ...volumes.volume_files import VOLUME_FORMATS, write_volume
-from ..options import chosen_modules, one_or_three, output_path, progress_bar, read_workbook, refuse
+from ..options import chosen_modules, one_or_three, output_path, print_answer, progress_bar, read_workbook, refuse
 from .arguments import MATERIAL_OPTIONS, add_action, add_materials, sensitivity_settings
 
 _OF_MATERIALS = ("sensitivity", "resolution")
@@ -20,25 +17,20 @@ _OF_MATERIALS = ("sensitivity", "resolution")
 
 def add_parser(actions) -> None:  # type: ignore[no-untyped-def]
     """Add the action."""
-    parser = add_action(
-        actions,
-        "map",
-        "make a volume of what the scanner does in every voxel",
-        " --quantity sensitivity --voxels 64 --spacing 3 -o sensitivity.nii.gz",
-        _run,
+    example = " --quantity sensitivity --voxels 64 --spacing 3 -o sensitivity.nii.gz"
+    parser = add_action(actions, "map", "make a volume of what the scanner does in every voxel", example, _run)
+    add = parser.add_argument
+    quantity = (
+        "counts per decay; number of modules that see the voxel; expected FWHM, mm; completeness of the angular "
+        "sampling, 1 where every plane through the voxel meets a pinhole that sees it"
     )
-    parser.add_argument(
-        "--quantity", choices=MAPS, default="sensitivity",
-        help="counts per decay; number of modules that see the voxel; expected FWHM, mm; completeness of the angular "
-        "sampling, 1 where every plane through the voxel meets a pinhole that sees it",
-    )  # fmt: skip
-    parser.add_argument("--voxels", type=int, nargs="+", default=[64], metavar="N", help="voxels along x y z, or one")
-    parser.add_argument(
-        "--spacing", type=float, nargs="+", metavar="MM", help="voxel size, one or three; default: so that the ROI fits"
-    )
-    parser.add_argument("--center", type=float, nargs=3, default=[0, 0, 0], metavar="MM", help="of the grid, x y z")
-    parser.add_argument("--modules", metavar="RANGE", help="such as 1-40 or 1-20,41; default: all")
-    parser.add_argument("-o", "--output", required=True, metavar="FILE", help=", ".join(VOLUME_FORMATS))
+    add("--quantity", choices=MAPS, default="sensitivity", help=quantity)
+    add("--voxels", type=int, nargs="+", default=[64], metavar="N", help="voxels along x y z, or one")
+    spacing = "voxel size, one or three; default: so that the ROI fits"
+    add("--spacing", type=float, nargs="+", metavar="MM", help=spacing)
+    add("--center", type=float, nargs=3, default=[0, 0, 0], metavar="MM", help="of the grid, x y z")
+    add("--modules", metavar="RANGE", help="such as 1-40 or 1-20,41; default: all")
+    add("-o", "--output", required=True, metavar="FILE", help=", ".join(VOLUME_FORMATS))
     add_materials(parser)
 
 
@@ -59,9 +51,7 @@ def _run(arguments: argparse.Namespace) -> None:
     volume = MAPS[arguments.quantity](system, grid, **settings, progress=progress_bar("mapping"))
     write_volume(volume, path)
     low, high, mean = (float(f(volume.array)) for f in (np.min, np.max, np.mean))
-    if arguments.json:
-        record = {"file": str(path), "quantity": volume.quantity, "unit": volume.unit}
-        print(json.dumps({**record, "minimum": low, "maximum": high, "mean": mean}, indent=1))
-        return
+    record = {"file": str(path), "quantity": volume.quantity, "unit": volume.unit}
     shape = " x ".join(map(str, volume.grid.shape))
-    print(f"{path}: {shape} voxels, {volume.quantity} from {low:.4g} to {high:.4g} {volume.unit}".removesuffix(" 1"))
+    text = f"{path}: {shape} voxels, {volume.quantity} from {low:.4g} to {high:.4g} {volume.unit}".removesuffix(" 1")
+    print_answer(arguments, {**record, "minimum": low, "maximum": high, "mean": mean}, [text])

@@ -1,9 +1,6 @@
 """``mphdrr geometry performance FILE``."""
 
-from __future__ import annotations
-
 import argparse
-import json
 import math
 
 import numpy as np
@@ -11,29 +8,25 @@ import numpy as np
 from ...geometry.design_formulas import roi_radius_seen
 from ...physics.performance import magnification, resolution, sensitivity
 from ...physics.sampling import sampling_gaps
-from ..options import read_workbook
-from .arguments import add_action, add_materials, edge_settings, sensitivity_settings, table_rows
+from ..options import print_answer, read_workbook
+from .arguments import EDGE, add_action, add_materials, sensitivity_settings, table_rows
 
 
 def add_parser(actions) -> None:  # type: ignore[no-untyped-def]
     """Add the action."""
-    parser = add_action(
-        actions,
-        "performance",
-        "print each module's sensitivity, resolution and field of view at the isocentre, or at a point",
-        " --isotope Tc-99m --aperture-mu tungsten --crystal-mu NaI",
-        _run,
-    )
-    parser.add_argument(
-        "--point", type=float, nargs=3, default=[0, 0, 0], metavar="MM", help="where the source is, x y z"
-    )
+    summary = "print each module's sensitivity, resolution and field of view at the isocentre, or at a point"
+    example = " --isotope Tc-99m --aperture-mu tungsten --crystal-mu NaI"
+    parser = add_action(actions, "performance", summary, example, _run)
+    add = parser.add_argument
+    add("--point", type=float, nargs=3, default=[0, 0, 0], metavar="MM", help="where the source is, x y z")
     add_materials(parser)
 
 
 def _run(arguments: argparse.Namespace) -> None:
     system = read_workbook(arguments)
-    points, edge = [arguments.point], edge_settings(arguments, system)
-    counts = 1e6 * sensitivity(system, points, **sensitivity_settings(arguments, system))[0]
+    points, settings = [arguments.point], sensitivity_settings(arguments, system)
+    edge = {name: settings[name] for name in EDGE}
+    counts = 1e6 * sensitivity(system, points, **settings)[0]
     fwhm = resolution(system, points, **edge, intrinsic_fwhm=arguments.intrinsic_fwhm)[0]
     b, d, l, side = system.pinhole_distance, system.pinhole_diameter, system.collimator_length, system.detector_side
     radius = roi_radius_seen(b, d, side, l)
@@ -57,16 +50,13 @@ def _run(arguments: argparse.Namespace) -> None:
         "sampling_gap_degrees": math.degrees(sampling_gaps(system, points)[0]),
     }
     rows = table_rows(columns)
-    if arguments.json:
-        modules = [{name: None if x != x else x for name, x in row.items()} for row in rows]  # no NaN in JSON
-        units = "sensitivity cps/MBq; resolution and radii mm"
-        print(json.dumps({"point": arguments.point, "modules": modules, "total": total, "units": units}, indent=1))
-        return
-    print(" module  ring  cps/MBq  FWHM mm  magnification  sees R mm     R mm")
-    for row in rows:
-        print("{:7d} {:5d} {:8.3f} {:8.2f} {:14.4f} {:10.2f} {:8.2f}".format(*row.values()))
-    print(f"total {total['sensitivity']:.1f} cps/MBq from {total['modules_seeing']} of {len(system)} modules")
+    modules = [{name: None if x != x else x for name, x in row.items()} for row in rows]  # no NaN in JSON
+    units = "sensitivity cps/MBq; resolution and radii mm"
+    lines = [" module  ring  cps/MBq  FWHM mm  magnification  sees R mm     R mm"]
+    lines += ["{:7d} {:5d} {:8.3f} {:8.2f} {:14.4f} {:10.2f} {:8.2f}".format(*row.values()) for row in rows]
+    lines += [f"total {total['sensitivity']:.1f} cps/MBq from {total['modules_seeing']} of {len(system)} modules"]
     if rms is not None:
-        print(f"resolution {rms:.2f} mm FWHM, the modules' root mean square weighted by counts")
-    print(f"planes through the point miss all pinholes by up to {total['sampling_gap_degrees']:.1f} degrees")
-    print(f"{total['modules_holding_roi']} of {len(system)} modules see their whole ROI")
+        lines += [f"resolution {rms:.2f} mm FWHM, the modules' root mean square weighted by counts"]
+    lines += [f"planes through the point miss all pinholes by up to {total['sampling_gap_degrees']:.1f} degrees"]
+    lines += [f"{total['modules_holding_roi']} of {len(system)} modules see their whole ROI"]
+    print_answer(arguments, {"point": arguments.point, "modules": modules, "total": total, "units": units}, lines)

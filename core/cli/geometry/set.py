@@ -1,21 +1,17 @@
 """``mphdrr geometry set FILE -o OUT.xlsx``."""
 
-from __future__ import annotations
-
 import argparse
 import dataclasses
-import json
-import sys
+from typing import Any
 
 import numpy as np
 
 from ...errors import InputError
-from ...geometry.design_formulas import collimator_length
 from ...geometry.system import PinholeSystem
 from ...recording import recorded_warnings
 from ...workbook import write_system
-from ...workbook.reader import is_by_design
-from ..options import chosen_modules, output_path, read_workbook
+from ...workbook.quantities import QUANTITIES, needed_numbers
+from ..options import chosen_modules, output_path, print_answer, read_workbook
 from .arguments import add_action
 
 _DIMENSIONS = {
@@ -28,31 +24,23 @@ _DIMENSIONS = {
 
 def add_parser(actions) -> None:  # type: ignore[no-untyped-def]
     """Add the action."""
-    parser = add_action(
-        actions,
-        "set",
-        "change a workbook's numbers and keep all the rest of it",
-        " --modules 1-20 --diameter 2 -o thinner.xlsx",
-        _run,
-    )
-    parser.add_argument(
-        "-o", "--output", required=True, metavar="OUT", help="workbook to write; FILE itself is replaced"
-    )
-    parser.add_argument("--modules", metavar="RANGE", help="those to change, such as 1-40 or 1-20,41; default: all")
+    summary = "change a workbook's numbers and keep all the rest of it"
+    parser = add_action(actions, "set", summary, " --modules 1-20 --diameter 2 -o thinner.xlsx", _run)
+    add = parser.add_argument
+    add("-o", "--output", required=True, metavar="OUT", help="workbook to write; FILE itself is replaced")
+    add("--modules", metavar="RANGE", help="those to change, such as 1-40 or 1-20,41; default: all")
     for name, (_, what) in _DIMENSIONS.items():
-        parser.add_argument(f"--{name}", type=float, metavar="MM", help=what)
-    parser.add_argument(
-        "--length",
-        metavar="MM",
-        help="l, collimator length, or 'design' for the design formula's; default: those that follow the formula go "
-        "on following it, the others stay",
+        add(f"--{name}", type=float, metavar="MM", help=what)
+    length = (
+        "l, collimator length, or 'design' for the design formula's; default: those that follow the formula go on "
+        "following it, the others stay"
     )
-    parser.add_argument("--move", type=float, nargs=3, metavar=("X", "Y", "Z"), help="shift of the pinholes, mm")
-    parser.add_argument("--remove", metavar="RANGE", help="modules to take out")
-    parser.add_argument("--order", metavar="N,N,...", help="the modules' numbers in the order they are to have")
-    parser.add_argument(
-        "--write-columns", metavar="MAP", help="with --columns, also write the column map (.toml) of the new workbook"
-    )
+    add("--length", metavar="MM", help=length)
+    add("--move", type=float, nargs=3, metavar=("X", "Y", "Z"), help="shift of the pinholes, mm")
+    add("--remove", metavar="RANGE", help="modules to take out")
+    add("--order", metavar="N,N,...", help="the modules' numbers in the order they are to have")
+    columns = "with --columns, also write the column map (.toml) of the new workbook"
+    add("--write-columns", metavar="MAP", help=columns)
 
 
 def _run(arguments: argparse.Namespace) -> None:
@@ -65,39 +53,34 @@ def _run(arguments: argparse.Namespace) -> None:
         written = write_system(system, target, template=arguments.workbook)
     if map_path is not None and written.columns is not None:
         written.columns.write(map_path)
-    if arguments.json:
-        answer = {**dataclasses.asdict(written), "path": str(written.path), "warnings": messages}
-        print(json.dumps(answer, indent=1))
-        return
-    for message in messages:
-        sys.stderr.write(f"mphdrr: warning: {message}\n")
+    answer = {**dataclasses.asdict(written), "path": str(written.path), "warnings": messages}
     cleared = f", {len(written.cleared)} without a value" if written.cleared else ""
-    print(f"{written.path}: {len(written.changed)} cells changed, {len(written.recalculated)} recalculated{cleared}")
+    text = f"{written.path}: {len(written.changed)} cells changed, {len(written.recalculated)} recalculated{cleared}"
+    print_answer(arguments, answer, [text], [f"warning: {message}" for message in messages])
 
 
 def _changed(system: PinholeSystem, arguments: argparse.Namespace) -> PinholeSystem:
     chosen = np.isin(system.numbers, chosen_modules(system, arguments.modules).numbers)
-    values = {f.name: getattr(system, f.name) for f in dataclasses.fields(system)}
+    changes: dict[str, Any] = {}
     for option, (name, _) in _DIMENSIONS.items():
         number = getattr(arguments, option)
         if number is not None:
-            values[name] = np.where(chosen, number, values[name])
+            changes[name] = np.where(chosen, number, getattr(system, name))
     if arguments.move is not None:
-        values["centers"] = np.where(chosen[:, None], values["centers"] + arguments.move, values["centers"])
-    follows = is_by_design(system)
+        changes["centers"] = np.where(chosen[:, None], system.centers + arguments.move, system.centers)
+    length = QUANTITIES["l"]
+    follows = length.is_default(system)
     if arguments.length is not None:
         follows = np.where(chosen, arguments.length == "design", follows)
     if arguments.length not in (None, "design"):
         try:
-            values["collimator_length"] = np.where(chosen, float(arguments.length), values["collimator_length"])
+            changes["collimator_length"] = np.where(chosen, float(arguments.length), system.collimator_length)
         except ValueError:
             raise InputError(f"--length {arguments.length!r}: expected millimetres or 'design'") from None
-    system = PinholeSystem(**values)
-    designed = collimator_length(
-        system.pinhole_distance, system.pinhole_diameter, system.detector_side, system.roi_radius
-    )
+    system = dataclasses.replace(system, **changes)
     # Lengths that are the formula's to 1e-9 stay as they are, to the last digit.
-    lengths = np.where(follows & ~is_by_design(system), designed, system.collimator_length)
+    others = follows & ~length.is_default(system)
+    lengths = np.where(others, length.default(needed_numbers(system)), system.collimator_length)
     system = dataclasses.replace(system, collimator_length=lengths)
     if arguments.remove is not None:
         removed = np.isin(system.numbers, chosen_modules(system, arguments.remove, "--remove").numbers)

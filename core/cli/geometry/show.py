@@ -1,28 +1,23 @@
 """``mphdrr geometry show FILE``."""
 
-from __future__ import annotations
-
 import argparse
-import json
-import sys
 from typing import Any
-
-import numpy as np
 
 from ...errors import InputError
 from ...geometry.system import PinholeSystem
 from ...workbook import draft_column_map
-from ..options import chosen_modules, output_path, read_workbook
+from ...workbook.quantities import QUANTITIES
+from ..options import chosen_modules, output_path, print_answer, read_workbook
 from .arguments import add_action, table_rows
 
 
 def add_parser(actions) -> None:  # type: ignore[no-untyped-def]
     """Add the action."""
     parser = add_action(actions, "show", "print every module's numbers", " --modules 1-20", _run)
-    parser.add_argument("--modules", metavar="RANGE", help="such as 1-40 or 1-20,41; default: all")
-    parser.add_argument(
-        "--write-columns", metavar="MAP", help="instead, write a column map (.toml) of what was seen, for you to check"
-    )
+    add = parser.add_argument
+    add("--modules", metavar="RANGE", help="such as 1-40 or 1-20,41; default: all")
+    columns = "instead, write a column map (.toml) of what was seen, for you to check"
+    add("--write-columns", metavar="MAP", help=columns)
 
 
 def _run(arguments: argparse.Namespace) -> None:
@@ -32,16 +27,15 @@ def _run(arguments: argparse.Namespace) -> None:
     system = read_workbook(arguments)
     chosen = set(chosen_modules(system, arguments.modules).numbers.tolist())
     rows = [row for row in _rows(system) if row["number"] in chosen]  # rings are those of the whole scanner
-    if arguments.json:
-        print(json.dumps({"modules": rows, "units": "mm, radians"}, indent=1))
-        return
-    print(" module  ring        x        y        z        b        l   azimuth elevation     d     Ld     Td      R")
-    for row in rows:
-        print(
-            "{number:7d} {ring:5d} {x:8.2f} {y:8.2f} {z:8.2f} {b:8.2f} {l:8.3f} {azimuth:9.4f} {elevation:9.4f} "
-            "{d:5.2f} {Ld:6.2f} {Td:6.2f} {R:6.2f}".format(**row)
-        )
-    print("lengths in mm, angles in radians")
+    heading = (
+        " module  ring        x        y        z        b        l   azimuth elevation     d     Ld     Td      R"
+    )
+    line = (
+        "{number:7d} {ring:5d} {x:8.2f} {y:8.2f} {z:8.2f} {b:8.2f} {l:8.3f} {azimuth:9.4f} {elevation:9.4f} "
+        "{d:5.2f} {Ld:6.2f} {Td:6.2f} {R:6.2f}"
+    )
+    lines = [heading, *(line.format(**row) for row in rows), "lengths in mm, angles in radians"]
+    print_answer(arguments, {"modules": rows, "units": "mm, radians"}, lines)
 
 
 def _write_columns(arguments: argparse.Namespace) -> None:
@@ -50,20 +44,13 @@ def _write_columns(arguments: argparse.Namespace) -> None:
         raise InputError("--write-columns writes what the headings say, expected it without --columns")
     draft = draft_column_map(arguments.workbook)
     draft.write(path)
-    if arguments.json:
-        print(json.dumps({"path": str(path), "open": draft.questions}, indent=1))
-        return
-    for question in draft.questions:
-        sys.stderr.write(f"mphdrr: to be settled: {question}\n")
-    print(
-        f"{path}: {len(draft.questions)} to be settled; check it, then: geometry show {arguments.workbook} --columns {path}"
-    )
+    then = f"check it, then: geometry show {arguments.workbook} --columns {path}"
+    lines = [f"{path}: {len(draft.questions)} to be settled; {then}"]
+    notes = [f"to be settled: {question}" for question in draft.questions]
+    print_answer(arguments, {"path": str(path), "open": draft.questions}, lines, notes)
 
 
 def _rows(system: PinholeSystem) -> list[dict[str, Any]]:
-    x, y, z = system.centers.T
-    columns = {"number": system.numbers, "ring": system.rings() + 1, "x": x, "y": y, "z": z}
-    columns |= {"b": system.pinhole_distance, "l": system.collimator_length}
-    columns |= {"azimuth": np.arctan2(y, x), "elevation": np.arctan2(z, np.hypot(x, y))}
-    columns |= {"d": system.pinhole_diameter, "Ld": system.detector_side, "Td": system.detector_thickness}
-    return table_rows({**columns, "R": system.roi_radius})
+    columns = {"number": system.numbers, "ring": system.rings() + 1, **dict(zip("xyz", system.centers.T, strict=True))}
+    names = ("b", "l", "azimuth", "elevation", "d", "Ld", "Td", "R")
+    return table_rows({**columns, **{name: QUANTITIES[name].of(system) for name in names}})

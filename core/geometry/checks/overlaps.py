@@ -6,8 +6,6 @@ are also the normals of the Minkowski difference, so the smallest overlap of the
 separates the bodies (S. Cameron, R. K. Culley, IEEE ICRA 1986).
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from itertools import combinations
 

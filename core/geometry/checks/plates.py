@@ -4,8 +4,6 @@
 photons through beside it. All others are found here.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 

@@ -1,7 +1,5 @@
 """The findings of the checks, as numbers and as one line each. Modules are named by their users' numbers."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import asdict, dataclass
 from typing import Any, ClassVar

@@ -19,8 +19,6 @@ coefficient, if there is any.
 that the backend's `to_backend` returns.
 """
 
-from __future__ import annotations
-
 import functools
 import importlib
 import warnings

@@ -5,8 +5,6 @@ They run in the thread that calls, without the GIL: the operator calls them on s
 float64, all others in float32.
 """
 
-from __future__ import annotations
-
 import ctypes
 import os
 import sys
@@ -38,10 +36,8 @@ class _Lattice(Structure):
 
 
 class _RayList(Structure):
-    _fields_ = [
-        *((name, c_void_p) for name in ("starts", "directions", "mu_starts", "mu_directions", "lengths")),
-        ("count", c_int64),
-    ]
+    _fields_ = [(name, c_void_p) for name in ("starts", "directions", "mu_starts", "mu_directions", "lengths")]
+    _fields_ += [("count", c_int64)]
 
 
 class _Job(Structure):
@@ -60,8 +56,7 @@ def _load() -> ctypes.CDLL:
     library = ctypes.CDLL(str(path))
     numbers = (c_int64 * 3)()
     library.contract(numbers)
-    expected = [_CONTRACT, ctypes.sizeof(_Job), _FAN.itemsize]
-    if list(numbers) != expected:
+    if list(numbers) != [_CONTRACT, ctypes.sizeof(_Job), _FAN.itemsize]:
         raise ImportError(f"{path} belongs to another version of mphDRR: install it anew")
     library.best_level.restype, library.level_name.restype = c_int64, c_char_p
     library.level_name.argtypes = [c_int64]
@@ -120,8 +115,7 @@ def _run(
     kernel: Any, volume: Array, rays: Rays, attenuation: Attenuation | None, values: Array | None = None, **others: Any
 ) -> None:
     """Run a kernel on all rays."""
-    mu = None if attenuation is None else attenuation.mu
-    mu_rays = None if attenuation is None else attenuation.rays
+    mu, mu_rays = (None, None) if attenuation is None else (attenuation.mu, attenuation.rays)
     if values is not None:
         others["values"] = values = np.ascontiguousarray(values, volume.dtype)
         if len(values) != len(rays):
@@ -170,11 +164,7 @@ def _lattice(voxels: Array, like: Array, written: bool = False) -> _Lattice:
             f"{_MOST_ALONG} along an axis in float32; use the backend numpy"
         )
     flags, kind = voxels.flags, voxels.dtype
-    if (
-        kind not in (np.float32, np.float64)
-        or kind != like.dtype
-        or not flags.c_contiguous
-        or written > flags.writeable
-    ):
+    of_the_kind = kind in (np.float32, np.float64) and kind == like.dtype
+    if not of_the_kind or not flags.c_contiguous or written > flags.writeable:
         raise TypeError(f"expected C-ordered voxels of {like.dtype}, got {kind}, strides {voxels.strides}")
     return _Lattice(voxels.ctypes.data, voxels.shape)

@@ -21,7 +21,7 @@ import sys
 import tempfile
 import threading
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -51,27 +51,23 @@ _loaded: set[str] = set()
 
 def forward(volume: ArrayOrTensor, rays: Rays, attenuation: Attenuation | None = None) -> ArrayOrTensor:
     """Line integrals (N,), value x mm, of `volume` (n_x, n_y, n_z) along `rays`, attenuated towards their sources."""
-    name = "integrate" if attenuation is None else "integrate_attenuated"
     with _Call(volume, rays, attenuation) as call:
-        return call.per_ray(name, [call.on_device(volume, "the volume")])
+        return call.per_ray("integrate" if attenuation is None else "integrate_attenuated")
 
 
 def backproject(
     volume: ArrayOrTensor, values: ArrayOrTensor, rays: Rays, attenuation: Attenuation | None = None
 ) -> None:
     """Add `values` (N,), each along its ray with the weights of `forward`, to `volume` in place, in no fixed order."""
-    name = "backproject" if attenuation is None else "backproject_attenuated"
     with _Call(volume, rays, attenuation) as call:
-        filled = call.on_device(volume, "the volume")
-        call.accumulate(name, [filled], values)
-        _copy_back(filled, volume)
+        call.accumulate("backproject" if attenuation is None else "backproject_attenuated", values)
 
 
 def derivatives(volume: ArrayOrTensor, rays: Rays, attenuation: Attenuation | None = None) -> ArrayOrTensor:
     """What the ends of `rays` do to their integrals (N, 7), or attenuated (N, 14), as `backends` describes it."""
     name, columns = ("differentiate", 7) if attenuation is None else ("differentiate_attenuated", 14)
     with _Call(volume, rays, attenuation) as call:
-        return call.per_ray(name, [call.on_device(volume, "the volume")], columns)
+        return call.per_ray(name, columns)
 
 
 def mu_gradient(
@@ -79,9 +75,7 @@ def mu_gradient(
 ) -> None:
     """Add to `gradient`, of mu's shape, each of `values` (N,) times its line integral's derivatives by mu."""
     with _Call(volume, rays, attenuation) as call:
-        filled = call.on_device(gradient, "the gradient")
-        call.accumulate("differentiate_by_mu", [filled, call.on_device(volume, "the volume")], values)
-        _copy_back(filled, gradient)
+        call.accumulate("differentiate_by_mu", values, gradient)
 
 
 def to_backend(x: ArrayOrTensor) -> ArrayOrTensor:
@@ -130,14 +124,14 @@ class _Call:
     """Rays on their way through the device: what is needed of a call, and its launches."""
 
     def __init__(self, volume: ArrayOrTensor, rays: Rays, attenuation: Attenuation | None) -> None:
-        self._stream: Any = None
+        self._stream: Any = nullcontext()
         if is_tensor(volume):
             self._device = wp.device_from_torch(volume.device)
             if volume.is_cuda:
                 self._stream = wp.ScopedStream(wp.stream_from_torch(volume.device))
         else:
             self._device = device()
-        self._like = volume
+        self._volume = volume
         self._kernels = _kernels(self._device)
         self._fans, self._rows, self._columns = _table(rays)
         self._attenuation = attenuation
@@ -146,13 +140,11 @@ class _Call:
             self._mu_fans = _table(attenuation.rays)[0]
 
     def __enter__(self) -> _Call:
-        if self._stream is not None:
-            self._stream.__enter__()
+        self._stream.__enter__()
         return self
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, traceback: Any) -> None:
-        if self._stream is not None:
-            self._stream.__exit__(kind, error, traceback)
+        self._stream.__exit__(kind, error, traceback)
         if isinstance(error, RuntimeError) and "Failed to allocate" in str(error):
             free = readable_size(self._device.free_memory)
             raise InputError(f"backend 'cuda': {self._device.name} has too little free memory, {free}") from error
@@ -171,11 +163,11 @@ class _Call:
             )
         return wp.array(array, dtype=wp.float32, device=self._device)
 
-    def per_ray(self, name: str, volumes: list[Any], *columns: int) -> ArrayOrTensor:
+    def per_ray(self, name: str, *columns: int) -> ArrayOrTensor:
         """What a kernel writes, (N,), or (N, columns)."""
-        volumes += self._mu()
+        volumes = self._volumes()
         shape = (len(self._fans), self._rows, self._columns, *columns)
-        result = self._like.new_empty(shape) if is_tensor(self._like) else np.empty(shape, np.float32)
+        result = self._volume.new_empty(shape) if is_tensor(self._volume) else np.empty(shape, np.float32)
         for fans, rows in self._pieces(math.prod(columns)):
             piece = result[fans, rows]
             out = wp.from_torch(piece) if is_tensor(piece) else wp.empty(piece.shape, wp.float32, device=self._device)
@@ -183,9 +175,11 @@ class _Call:
             _copy_back(out, piece)
         return result.reshape(-1, *columns)
 
-    def accumulate(self, name: str, volumes: list[Any], values: ArrayOrTensor) -> None:
-        """Launch a kernel that adds each ray's value of `values` (N,) to the first of `volumes`."""
-        volumes += self._mu()
+    def accumulate(self, name: str, values: ArrayOrTensor, gradient: ArrayOrTensor = None) -> None:
+        """Launch a kernel that adds each ray's value of `values` (N,) to the volume, or to a gradient."""
+        volumes = self._volumes()
+        if gradient is not None:
+            volumes.insert(0, self.on_device(gradient, "the gradient"))
         values = values.reshape(len(self._fans), self._rows, self._columns)
         for fans, rows in self._pieces(1):
             piece = values[fans, rows]
@@ -194,9 +188,12 @@ class _Call:
             else:
                 piece = wp.array(np.ascontiguousarray(piece, np.float32), dtype=wp.float32, device=self._device)
             self._launch(name, fans, rows, volumes, piece)
+        _copy_back(volumes[0], self._volume if gradient is None else gradient)
 
-    def _mu(self) -> list[Any]:
-        return [] if self._attenuation is None else [self.on_device(self._attenuation.mu, "mu")]
+    def _volumes(self) -> list[Any]:
+        """The volume, and mu if there is any, on the device."""
+        mu = [] if self._attenuation is None else [self.on_device(self._attenuation.mu, "mu")]
+        return [self.on_device(self._volume, "the volume"), *mu]
 
     def _pieces(self, columns: int) -> Iterator[tuple[slice, slice]]:
         """Which fans, and which of their rows, are launched together."""

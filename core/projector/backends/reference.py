@@ -30,7 +30,7 @@ def forward(volume: Array, rays: Rays, attenuation: Attenuation | None = None) -
     """Line integrals (N,), value x mm, of `volume` (n_x, n_y, n_z) along `rays`, attenuated towards their sources."""
     voxels = volume.reshape(-1)
     integrals = [(voxels[s.voxel] * s.weight).sum(1) for s in _segments(volume, rays, attenuation)]
-    return namespace(volume).concatenate(integrals) if integrals else _zeros(volume, 0)
+    return namespace(volume).concatenate(integrals)
 
 
 def backproject(volume: Array, values: Array, rays: Rays, attenuation: Attenuation | None = None) -> None:
@@ -86,7 +86,7 @@ def derivatives(volume: Array, rays: Rays, attenuation: Attenuation | None = Non
             of_mu = [_by_ends(mu_jump, alpha, axis - mu_axes, last.part(part)), by_length[:, None]]
         by_ends = _by_ends(jump, alpha, axis, first.part(part))
         pieces.append(xp.concatenate([detected.sum(1)[:, None], by_ends, *of_mu], 1))
-    return xp.concatenate(pieces) if pieces else _zeros(volume, 0, 7 if attenuation is None else 14)
+    return xp.concatenate(pieces)
 
 
 def _by_ends(jump: Array, alpha: Array, axis: Array, lattice: _Lattice) -> Array:
@@ -175,7 +175,7 @@ def _crossings(lattices: list[_Lattice]) -> Iterator[tuple[slice, Array]]:
     xp, place = namespace(lengths), _place(lengths)
     budget = _CROSSINGS_CPU if not is_tensor(lengths) or lengths.device.type == "cpu" else _CROSSINGS_GPU
     rays_at_once = max(1, budget // sum(sum(lattice.shape) + 5 for lattice in lattices))
-    for first in range(0, len(lengths), rays_at_once):
+    for first in range(0, max(1, len(lengths)), rays_at_once):  # once where there are no rays
         part = slice(first, first + rays_at_once)
         length = lengths[part, None]
         alpha = [xp.zeros_like(length), xp.ones_like(length)]
@@ -286,10 +286,6 @@ def _like(numbers: np.ndarray[Any, Any], volume: Array) -> Array:
 
 def _place(array: Array) -> dict[str, Any]:
     return {"device": array.device} if is_tensor(array) else {}
-
-
-def _zeros(volume: Array, *shape: int) -> Array:
-    return volume.new_zeros(shape) if is_tensor(volume) else np.zeros(shape)
 
 
 def _sorted(alpha: Array) -> Array:

@@ -299,12 +299,10 @@ def _unit(axis: int):
 # Without attenuation: the weight of a segment is its length.
 
 
-@wp.kernel
-def integrate(volume: _Volume, fans: _Fans, first_row: int, integrals: _Numbers):
-    """Line integrals, value x mm."""
-    f, i, j = wp.tid()
-    start, direction = _ray(fans, f, first_row + i, j)
-    w, chord = _through(_shape(volume), start, direction, wp.float64(0.0), wp.float64(1.0))
+@wp.func
+def _integral(volume: _Volume, start: wp.vec3d, direction: wp.vec3d, high: wp.float64):
+    """Integral over a chord, per its length, up to the alpha `high` (from source to target); the traversal after it."""
+    w, chord = _through(_shape(volume), start, direction, wp.float64(0.0), high)
     total = float(0.0)
     correction = float(0.0)
     while w.alpha < w.leave:
@@ -313,6 +311,15 @@ def integrate(volume: _Volume, fans: _Fans, first_row: int, integrals: _Numbers)
             total, correction, _number(end - w.alpha) * volume[w.voxel[0], w.voxel[1], w.voxel[2]]
         )
         w = _cross(w, end)
+    return total, w, chord
+
+
+@wp.kernel
+def integrate(volume: _Volume, fans: _Fans, first_row: int, integrals: _Numbers):
+    """Line integrals, value x mm."""
+    f, i, j = wp.tid()
+    start, direction = _ray(fans, f, first_row + i, j)
+    total, _, chord = _integral(volume, start, direction, wp.float64(1.0))
     integrals[f, i, j] = total * wp.float32(_length(fans, f, first_row + i, j) * (chord.leave - chord.enter))
 
 
@@ -355,12 +362,10 @@ def _moments(chord: Chord, jumps: wp.vec3f, moments: wp.vec3f):
     return wp.vec3d(jumps) * chord.enter + wp.vec3d(moments) * (chord.leave - chord.enter)
 
 
-@wp.kernel
-def differentiate(volume: _Volume, fans: _Fans, first_row: int, rows: _Rows):
-    """Columns: the integral over alpha from 0 to 1, its derivatives by the start (3) and by the end (3)."""
-    f, i, j = wp.tid()
-    start, direction = _ray(fans, f, first_row + i, j)
-    w, chord = _through(_shape(volume), start, direction, wp.float64(0.0), wp.float64(1.0))
+@wp.func
+def _jumps(volume: _Volume, start: wp.vec3d, direction: wp.vec3d, high: wp.float64):
+    """As `_integral`: the integral, the sums of jumps and of jumps times alpha along the chord, and the chord."""
+    w, chord = _through(_shape(volume), start, direction, wp.float64(0.0), high)
     total = float(0.0)
     correction = float(0.0)
     before = float(0.0)
@@ -378,6 +383,15 @@ def differentiate(volume: _Volume, fans: _Fans, first_row: int, rows: _Rows):
     jump = _unit(w.axis) * before
     jumps += jump
     moments += jump * _number(w.alpha)
+    return total, jumps, moments, chord
+
+
+@wp.kernel
+def differentiate(volume: _Volume, fans: _Fans, first_row: int, rows: _Rows):
+    """Columns: the integral over alpha from 0 to 1, its derivatives by the start (3) and by the end (3)."""
+    f, i, j = wp.tid()
+    start, direction = _ray(fans, f, first_row + i, j)
+    total, jumps, moments, chord = _jumps(volume, start, direction, wp.float64(1.0))
     rows[f, i, j, 0] = total * wp.float32(chord.leave - chord.enter)
     _write_ends(rows, f, i, j, 1, direction, wp.vec3d(jumps), _moments(chord, jumps, moments))
 
@@ -403,19 +417,6 @@ def _first_moment(t: float):
 
 
 @wp.func
-def _depth_before(mu: _Volume, start: wp.vec3d, direction: wp.vec3d, high: wp.float64):
-    """Integral of mu over alpha (from source to target) up to `high`, the traversal after it, and its chord."""
-    w, chord = _through(_shape(mu), start, direction, wp.float64(0.0), high)
-    total = float(0.0)
-    correction = float(0.0)
-    while w.alpha < w.leave:
-        end = _crossing(w)
-        total, correction = _plus(total, correction, _number(end - w.alpha) * mu[w.voxel[0], w.voxel[1], w.voxel[2]])
-        w = _cross(w, end)
-    return total * wp.float32(chord.leave - chord.enter), w, chord
-
-
-@wp.func
 def _enter_attenuated(
     shape: wp.vec3i, mu: _Volume, fans: _Fans, mu_fans: _Fans, own_lattice: int, f: int, row: int, column: int
 ):
@@ -429,8 +430,8 @@ def _enter_attenuated(
     traced.chord = wp.float32(length * (chord.leave - chord.enter))
     if own_lattice != 0 and w.alpha < w.leave:
         start, direction = _ray(mu_fans, f, row, column)
-        depth, ahead, mu_chord = _depth_before(mu, start, direction, chord.enter)
-        traced.depth = wp.float32(length) * depth
+        depth, ahead, mu_chord = _integral(mu, start, direction, chord.enter)
+        traced.depth = wp.float32(length) * (depth * wp.float32(mu_chord.leave - mu_chord.enter))
         within = _chord(_shape(mu), start, direction, chord.enter, chord.leave)
         # The traversal goes on from where it is: rounding must not make it cross a plane just there twice or never.
         voxel = _voxel(_shape(mu), start + direction * within.enter)
@@ -578,22 +579,9 @@ def differentiate_attenuated(
     jumps_64 = wp.vec3d(mu_jumps)
     moments_64 = _moments(chord, mu_jumps, mu_moments)
     if own_lattice != 0 and total != 0.0:  # mu's planes before the volume: the whole integral is beyond them
-        w, ahead = _through(_shape(mu), mu_start, mu_direction, wp.float64(0.0), chord.enter)
-        before = float(0.0)
-        jumps = wp.vec3f()
-        moments = wp.vec3f()
-        while w.alpha < w.leave:
-            value = mu[w.voxel[0], w.voxel[1], w.voxel[2]]
-            jump = _unit(w.axis) * ((before - value) * total)
-            jumps += jump
-            moments += jump * _number(w.alpha)
-            before = value
-            w = _cross(w, _crossing(w))
-        jump = _unit(w.axis) * (before * total)
-        jumps += jump
-        moments += jump
-        jumps_64 += wp.vec3d(jumps)
-        moments_64 += _moments(ahead, jumps, moments)
+        _mu_total, jumps_ahead, moments_ahead, ahead = _jumps(mu, mu_start, mu_direction, chord.enter)
+        jumps_64 += wp.vec3d(jumps_ahead * total)
+        moments_64 += _moments(ahead, jumps_ahead * total, moments_ahead * total)
     scale = -length * (chord.leave - chord.enter)
     _write_ends(rows, f, i, j, 7, mu_direction, jumps_64 * scale, moments_64 * scale)
     rows[f, i, j, 13] = 0.0

@@ -4,11 +4,10 @@ World axes are NIfTI's: +x to the patient's right, +y to the front (anterior), +
 Those of DICOM and ITK point left, back (posterior) and to the head: LPS.
 """
 
-from __future__ import annotations
-
 import math
 import warnings
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -16,9 +15,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ...errors import InputError, InputWarning
+from ...errors import InputError, InputWarning, naming
 from ...geometry.grid import Grid
 from ...memory import require
+from ...progress import Cancelled
 from ...validation import freeze
 from ..volume import UNITS, Volume
 
@@ -76,6 +76,18 @@ def warn_of_assumed(path: Path, assumed: Sequence[str]) -> None:
     """Warn of what was `assumed` about the volume's place because the header does not say it, if anything."""
     if assumed:
         warn(path, f"it does not say how it lies; taken as: {'; '.join(assumed)}")
+
+
+@contextmanager
+def reading(name: object, kind: str) -> Iterator[None]:
+    """Make whatever a library raises on a damaged file an input error, and put the file's `name` before all of these."""
+    with naming(name):
+        try:
+            yield
+        except (InputError, MemoryError, Cancelled):
+            raise
+        except Exception as error:
+            raise InputError(f"cannot be read as {kind} ({first_line(error)})") from error
 
 
 def first_line(error: BaseException) -> str:

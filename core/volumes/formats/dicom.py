@@ -6,8 +6,6 @@ front or head, whichever is closest to the slices' normal. A tomogram gives the 
 between slices (DICOM part 3, C.8.4.11 and C.8.4.15).
 """
 
-from __future__ import annotations
-
 import textwrap
 import warnings
 from collections import defaultdict
@@ -20,8 +18,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...errors import InputError, InputWarning
+from ...geometry.frames import affine_matrix
 from ...progress import Progress
-from .contents import RAS_FROM_LPS, Contents, first_line, require_voxels
+from .contents import RAS_FROM_LPS, Contents, first_line, reading, require_voxels
 
 _SAME_ORIENTATION = 1e-4  # direction cosines are written with 6 digits
 _SAME_PLACE = 1e-3  # mm
@@ -81,7 +80,11 @@ def read(path: Path, series: str | None = None, progress: Progress | None = None
         if len(headers) > 1 and any(_is_whole(header) for _, header in headers):
             names = ", ".join(file.name for file, _ in headers)
             raise InputError(f"its series has several files of several frames each, choose one: {names}")
-        slices, step = _ordered([one for file, header in headers for one in _slices(file, header)])
+        slices: list[_Slice] = []
+        for file, header in headers:
+            with reading(file.name, "DICOM"):  # pydicom parses tags on access
+                slices += _slices(file, header)
+        slices, step = _ordered(slices)
         first, modality = slices[0], headers[0][1].get("Modality")
         unknown = (f"{modality} in {first.unit}" if first.unit else f"{modality}", 1.0)
         quantity, factor = ("hu", 1.0) if modality == "CT" else _UNITS.get(first.unit, unknown)
@@ -92,12 +95,8 @@ def read(path: Path, series: str | None = None, progress: Progress | None = None
             array[:, :, k] = (pixels.astype(np.float64) * one.slope + one.intercept).T * factor
             if progress is not None:
                 progress(k + 1, len(slices))
-    affine = np.eye(4)
-    affine[:3, 0] = first.orientation[0] * first.spacing[1]
-    affine[:3, 1] = first.orientation[1] * first.spacing[0]
-    affine[:3, 2] = step
-    affine[:3, 3] = first.position
-    return Contents(array, RAS_FROM_LPS @ affine, quantity)
+    axes = np.column_stack([*(first.orientation * np.array(first.spacing[::-1])[:, None]), step])
+    return Contents(array, RAS_FROM_LPS @ affine_matrix(axes, first.position), quantity)
 
 
 def _headers(path: Path) -> list[tuple[Path, Any]]:
@@ -175,17 +174,8 @@ def _chosen(headers: list[tuple[Path, Any]], path: Path, series: str | None) -> 
     return matching[0]
 
 
-def _slices(path: Path, header: Any) -> list[_Slice]:
-    """The images of a file; `InputError` names it."""
-    try:
-        return list(_slices_of_header(path, header))
-    except InputError as error:
-        raise InputError(f"{path.name}: {error}") from None
-    except Exception as error:  # whatever pydicom raises on a damaged tag; it parses tags on access
-        raise InputError(f"{path.name}: cannot be read as DICOM ({first_line(error)})") from None
-
-
-def _slices_of_header(path: Path, header: Any) -> Iterator[_Slice]:
+def _slices(path: Path, header: Any) -> Iterator[_Slice]:
+    """The images of a file."""
     if header.get("SamplesPerPixel", 1) != 1:
         raise InputError(f"expected one value per pixel, found {header.SamplesPerPixel} (a colour image)")
     tilt = float(header.get("GantryDetectorTilt") or 0.0)

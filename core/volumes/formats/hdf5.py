@@ -1,7 +1,5 @@
 """HDF5: datasets ``array``, with the attributes quantity and unit, and ``affine``. Run files are read, too."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -4,8 +4,6 @@ Only ITK and SimpleITK read it in Python, and they are too large to depend on (5
 https://itk.org/Wiki/ITK/MetaIO/Documentation
 """
 
-from __future__ import annotations
-
 import zlib
 from pathlib import Path
 from typing import BinaryIO
@@ -14,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...errors import InputError
+from ...geometry.frames import affine_matrix
 from .contents import RAS_FROM_LPS, Contents, refuse_several_files, require_voxels, warn_of_assumed
 
 _TYPES = {
@@ -101,19 +100,16 @@ def _affine(header: dict[str, str], path: Path) -> NDArray[np.float64]:
     said = "AnatomicalOrientation"  # ITK's programs write it beside the matrix, which takes precedence
     if not header.keys() & set(turned) and header.get(said, "RAI").upper() not in ("RAI", "???"):
         raise InputError(f"{said} = {header[said]} without a TransformMatrix: expected the matrix, or RAI")
-    affine = np.eye(4)
     # Row i of the matrix is the direction of axis i.
     directions = _numbers(header, turned, np.eye(3).ravel()).reshape(3, 3)
-    affine[:3, :3] = directions.T * _numbers(header, spacing, np.ones(3))
-    affine[:3, 3] = _numbers(header, offset, np.zeros(3))
+    axes, origin = directions.T * _numbers(header, spacing, np.ones(3)), _numbers(header, offset, np.zeros(3))
     unit = header.get("DistanceUnits", "?")
     if unit not in _MILLIMETRES:
         raise InputError(f"DistanceUnits = {unit}: expected mm, cm or um")
-    affine[:3] *= _MILLIMETRES[unit]
     assumed = ["voxels of 1 mm"] * (not header.keys() & set(spacing))
     assumed += ["the first voxel's centre at (0, 0, 0)"] * (not header.keys() & set(offset))
     warn_of_assumed(path, assumed)
-    return RAS_FROM_LPS @ affine
+    return RAS_FROM_LPS @ affine_matrix(axes * _MILLIMETRES[unit], origin * _MILLIMETRES[unit])
 
 
 def _numbers(header: dict[str, str], keys: tuple[str, ...], default: NDArray[np.float64] | None) -> NDArray[np.float64]:

@@ -1,7 +1,5 @@
 """NIfTI-1 and -2, and Analyze 7.5, by nibabel."""
 
-from __future__ import annotations
-
 import contextlib
 import json
 from pathlib import Path

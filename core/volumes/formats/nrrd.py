@@ -1,13 +1,12 @@
 """NRRD, by pynrrd."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from ...errors import InputError
+from ...geometry.frames import affine_matrix
 from ..volume import Volume
 from .contents import Contents, first_line, refuse_several_files, require_voxels, warn_of_assumed
 
@@ -124,10 +123,8 @@ def _affine(header: dict[str, Any], path: Path) -> np.ndarray:
     else:
         assumed.append("the first voxel's centre at (0, 0, 0)")
         origin = np.zeros(3)
-    affine = np.eye(4)
-    affine[:3, :3], affine[:3, 3] = axes, origin
     warn_of_assumed(path, assumed)
-    return np.diag([*map(float, _SPACES[name]), 1.0]) @ affine
+    return np.diag([*map(float, _SPACES[name]), 1.0]) @ affine_matrix(axes, origin)
 
 
 def _of_space(header: dict[str, Any], directions: np.ndarray) -> np.ndarray:

@@ -1,7 +1,5 @@
 """numpy's files: npz with the exact affine, and bare npy arrays."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

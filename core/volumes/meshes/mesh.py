@@ -1,7 +1,5 @@
 """Triangle meshes, their files, and the check that they are closed."""
 
-from __future__ import annotations
-
 import os
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,8 +10,8 @@ from numpy.typing import NDArray
 
 from ...errors import InputError
 from ...files import replacing
-from ...validation import freeze, real_array
-from ..formats.contents import first_line
+from ...validation import freeze, one_of, real_array
+from ..formats.contents import reading
 
 MESH_FORMATS = (".stl", ".obj", ".ply", ".glb")
 """Suffixes of mesh files."""
@@ -64,15 +62,11 @@ def read_mesh(path: str | os.PathLike[str], unit: str | None = None) -> Mesh:
 
     path = Path(path)
     suffix, factor = _suffix_and_factor(path, unit)
-    try:
+    with reading(path, suffix):
         if not path.is_file():
             raise InputError("no such file")
         mesh = trimesh.load(path, process=False, force="mesh")
         return Mesh(np.asarray(mesh.vertices) * factor, np.asarray(mesh.faces))
-    except InputError as error:
-        raise InputError(f"{path}: {error}") from None
-    except Exception as error:  # whatever trimesh raises on a damaged file
-        raise InputError(f"{path}: cannot be read as {suffix} ({first_line(error)})") from error
 
 
 def write_mesh(mesh: Mesh, path: str | os.PathLike[str], unit: str | None = None) -> None:
@@ -138,6 +132,5 @@ def _suffix_and_factor(path: Path, unit: str | None) -> tuple[str, float]:
     if suffix not in MESH_FORMATS:
         raise InputError(f"{path}: expected a name ending in {', '.join(MESH_FORMATS)}")
     unit = unit or ("m" if suffix == ".glb" else "mm")
-    if unit not in MILLIMETRES:
-        raise InputError(f"unit {unit!r}: expected one of {', '.join(MILLIMETRES)}")
+    one_of(unit, MILLIMETRES, "unit")
     return suffix, MILLIMETRES[unit]

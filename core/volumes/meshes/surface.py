@@ -5,8 +5,6 @@ H. Kuhn's six tetrahedra, in the same way in all cubes. The surface is therefore
 tables of marching cubes do not guarantee. A compiled library would be faster, but one more wheel for every platform.
 """
 
-from __future__ import annotations
-
 from itertools import permutations
 
 import numpy as np

@@ -7,8 +7,6 @@ theorem). That is the covered share, unless the mesh intersects itself: a voxel 
 2. In columns of voxels with such places the share is the mean over many rays along z of the length inside.
 """
 
-from __future__ import annotations
-
 import math
 import os
 from collections.abc import Sequence
@@ -20,7 +18,7 @@ from numpy.typing import ArrayLike, NDArray
 from ...errors import InputError
 from ...geometry.grid import Grid
 from ...memory import require
-from ...progress import Progress
+from ...progress import Progress, part_of
 from ...validation import freeze, instance, one_for_all
 from ..volume import Volume
 from .mesh import Mesh, as_mesh, require_closed
@@ -69,12 +67,7 @@ def voxelize_mesh(
     require(8.5 * grid.n_voxels, "a volume of {} x {} x {} voxels".format(*grid.shape))
     array = np.zeros(grid.shape, np.float32)
     for i, (one, inside) in enumerate(zip(meshes, values, strict=True)):
-
-        def report(done: int, total: int, i: int = i) -> None:
-            if progress is not None:
-                progress(i * total + done, len(meshes) * total)
-
-        covered = mesh_coverage(one, grid, report)
+        covered = mesh_coverage(one, grid, part_of(progress, i, len(meshes)))
         array += covered * (np.float32(inside) - array)
     return Volume(freeze(array), grid, quantity)
 

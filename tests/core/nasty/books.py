@@ -42,13 +42,8 @@ def _sheets() -> None:
         *(("Geometry", "Geometry (2)"), ("Geometry", "Geometry old"), ("Geometry", "old"), ("A", "B"), ("v1", "v2")),
         *(("Coordinates", "Coordinates (2)"), ("Coordinates", "Coordinates old"), ("Coordinates", "Main")),
         *(("nominal", "measured"), ("Ring 1", "Ring 2"), ("Sheet1", "Sheet2"), ("Coordinates", "MDSL cloud import")),
-        *(
-            ("2021", "2022"),
-            ("Coordinates ", "Coordinates_"),
-            ("Final", "Final final"),
-            ("Geometry", "Values"),
-            ("Lage", "Theta"),
-        ),
+        *(("2021", "2022"), ("Coordinates ", "Coordinates_"), ("Final", "Final final"), ("Geometry", "Values")),
+        ("Lage", "Theta"),
     ):
         # The users' own sheet beside their Coordinates: a person knows which is meant.
         known = (RIGHT,) if second == "MDSL cloud import" else ()

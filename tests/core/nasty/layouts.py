@@ -265,15 +265,9 @@ def _tables_in_one_sheet() -> None:
     CASES.add("z1 of minus zero", negative, scanner(CENTERS * [1, 1, 0]), RIGHT)
     one = one_sheet(BIG[:1])
     CASES.add("one module", one, BIG[:1], RIGHT)
-    many = scanner(
-        np.round(
-            np.array([[500 * np.cos(a), 500 * np.sin(a), 3 * i - 100] for i, a in enumerate(np.linspace(0, 3, 60))]), 4
-        ),
-        4.0,
-        150.0,
-        120.0,
-        20.0,
-    )
+    angles = enumerate(np.linspace(0, 3, 60))
+    centers = np.array([[500 * np.cos(a), 500 * np.sin(a), 3 * i - 100] for i, a in angles])
+    many = scanner(np.round(centers, 4), 4.0, 150.0, 120.0, 20.0)
     CASES.add("sixty modules", one_sheet(many), many, RIGHT)
     for builtin, meaning in ((9, "0%"), (10, "0.00%"), (14, "a date"), (20, "a time"), (45, "mm:ss")):
         made = one_sheet(BIG)

@@ -369,46 +369,22 @@ def backwards(draft: Draft) -> None:
     draft.plain = False
 
 
+def all_mean(meaning: str, *texts: str) -> list[tuple[str, str]]:
+    """Texts, each with what it makes the numbers mean."""
+    return [(text, meaning) for text in texts]
+
+
 UNIT_WORDS = [
-    ("cm", "cm"),
-    ("in cm", "cm"),
-    ("all lengths in cm", "cm"),
-    ("Units: cm", "cm"),
-    ("inches", "in"),
-    ("m", "m"),
-    ("dm", "dm"),
-    ("[cm]", "cm"),
-    ("Maße in Zoll", "in"),
-    ("lengths in mm", "same"),
-    ("mm", "same"),
-    ("feet", "ft"),
+    *all_mean("cm", "cm", "in cm", "all lengths in cm", "Units: cm"),
+    *(("inches", "in"), ("m", "m"), ("dm", "dm"), ("[cm]", "cm"), ("Maße in Zoll", "in")),
+    *(("lengths in mm", "same"), ("mm", "same"), ("feet", "ft")),
 ]
 OTHER_WORDS = [("OBSOLETE", "same"), ("half values", "nobody"), ("mirrored", "nobody"), ("values x 10", "nobody")]
 TITLES = [("DC-SPECT", "same"), ("Geometry of the scanner", "same"), ("2021-03-04", "same")]
 HEADING_WORDS = [
-    *(
-        ("{} (old)", "nobody"),
-        ("tolerance of {}", "nobody"),
-        ("half {}", "nobody"),
-        ("{} nominal", "nobody"),
-        ("{}²", "nobody"),
-    ),
-    *(
-        ("{} (dm)", "nobody"),
-        ("{} (cm, CAD)", "nobody"),
-        ("{} × 10", "nobody"),
-        ("Δ{}", "nobody"),
-        ("{}/2", "nobody"),
-        ("{}, mm or cm", "nobody"),
-    ),
-    *(
-        ("{} of window", "nobody"),
-        ("{} (0.1 mm)", "nobody"),
-        ("-{}", "nobody"),
-        ("{}", "same"),
-        (" {} ", "same"),
-        ("{}:", "same"),
-    ),
+    *all_mean("nobody", "{} (old)", "tolerance of {}", "half {}", "{} nominal", "{}²", "{} (dm)", "{} (cm, CAD)"),
+    *all_mean("nobody", "{} × 10", "Δ{}", "{}/2", "{}, mm or cm", "{} of window", "{} (0.1 mm)", "-{}"),
+    *all_mean("same", "{}", " {} ", "{}:"),
 ]
 FORMATS = [
     ("0.00", "same"),
@@ -422,15 +398,8 @@ FORMATS = [
     ('"-"0.0', "nobody"),
 ]
 COLUMNS = [
-    *(("serial", "same"), ("S", "same"), ("3D slope", "same"), ("weight (kg)", "same"), ("note", "same")),
-    *(
-        ("{0}", "nobody"),
-        ("{0} new", "nobody"),
-        ("{0} (measured)", "nobody"),
-        ("{1}", "nobody"),
-        ("{1} (cm)", "nobody"),
-        ("{0}_corr", "nobody"),
-    ),
+    *all_mean("same", "serial", "S", "3D slope", "weight (kg)", "note"),
+    *all_mean("nobody", "{0}", "{0} new", "{0} (measured)", "{1}", "{1} (cm)", "{0}_corr"),
 ]
 GAPS = st.integers(0, 2)
 

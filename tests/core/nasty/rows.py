@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 
@@ -92,45 +93,9 @@ def _labels() -> None:
         ("numbers and numbers as text", [1, 2, 3, 4], ["1", "2", "3", "4"], VARIED),
         ("numbers with zeros in front as text", ["01", "02", "03", "04"], [1, 2, 3, 4], VARIED),
         ("numbers as decimals", [1.0, 2.0, 3.0, 4.0], [1, 2, 3, 4], VARIED),
-        (
-            "numbers from 0",
-            [0, 1, 2, 3],
-            [0, 1, 2, 3],
-            scanner(
-                CENTERS,
-                [2.0, 2.5, 3.0, 3.5],
-                75.0,
-                [50.0, 52.0, 54.0, 56.0],
-                [8.0, 9.0, 10.0, 11.0],
-                numbers=[0, 1, 2, 3],
-            ),
-        ),
-        (
-            "numbers with gaps",
-            [2, 5, 9, 40],
-            [2, 5, 9, 40],
-            scanner(
-                CENTERS,
-                [2.0, 2.5, 3.0, 3.5],
-                75.0,
-                [50.0, 52.0, 54.0, 56.0],
-                [8.0, 9.0, 10.0, 11.0],
-                numbers=[2, 5, 9, 40],
-            ),
-        ),
-        (
-            "numbers falling",
-            [4, 3, 2, 1],
-            [4, 3, 2, 1],
-            scanner(
-                CENTERS,
-                [2.0, 2.5, 3.0, 3.5],
-                75.0,
-                [50.0, 52.0, 54.0, 56.0],
-                [8.0, 9.0, 10.0, 11.0],
-                numbers=[4, 3, 2, 1],
-            ),
-        ),
+        ("numbers from 0", [0, 1, 2, 3], [0, 1, 2, 3], replace(VARIED, numbers=[0, 1, 2, 3])),
+        ("numbers with gaps", [2, 5, 9, 40], [2, 5, 9, 40], replace(VARIED, numbers=[2, 5, 9, 40])),
+        ("numbers falling", [4, 3, 2, 1], [4, 3, 2, 1], replace(VARIED, numbers=[4, 3, 2, 1])),
     ):
         CASES.add(name, _labelled(left, right), truth, RIGHT, REFUSED, place=USERS, columns=users_map(length=False))
     CASES.add(
@@ -376,14 +341,8 @@ def _below_and_beside() -> None:
     CASES.add("rows of the same numbers below", below(*old), BIG, REFUSED, WARNED_OF, **cut)
     CASES.add("rows without numbers below", below(*[[None, *row[1:]] for row in old]), BIG, REFUSED, WARNED_OF, **cut)
     for gap in (1, 3):
-        going_on = scanner(
-            np.vstack([BIG.centers, [row[1:4] for row in more]]),
-            4.0,
-            150.0,
-            120.0,
-            20.0,
-            np.r_[BIG.collimator_length, [200.0] * 3],
-        )
+        centers = np.vstack([BIG.centers, [row[1:4] for row in more]])
+        going_on = scanner(centers, 4.0, 150.0, 120.0, 20.0, np.r_[BIG.collimator_length, [200.0] * 3])
         CASES.add(
             f"numbers go on after {gap} blank rows",
             below(*more, gap=gap),

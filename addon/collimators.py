@@ -20,10 +20,10 @@ LOOKS = {
 
 def part_solid(part: str, numbers: ModuleNumbers, construction: Construction) -> Solid:
     """The solid of a module's "COLLIMATOR" or "CRYSTAL"; raises `InputError` where it cannot be built."""
-    _, _, d, l, side, thickness, _ = numbers
+    l, side = numbers.collimator_length, numbers.detector_side
     if part == "COLLIMATOR":
-        return collimator_solid(Collimator(d, l, side, construction))
-    return crystal_solid(l, side, thickness)
+        return collimator_solid(Collimator(numbers.pinhole_diameter, l, side, construction))
+    return crystal_solid(l, side, numbers.detector_thickness)
 
 
 def new_mesh(name: str, solid: Solid, material: bpy.types.Material) -> bpy.types.Mesh:

@@ -63,6 +63,11 @@ class DisplayProperties(bpy.types.PropertyGroup):
         update=on_edit("planes"),
     )  # fmt: skip
 
+    @property
+    def problem(self) -> str:
+        """Why the window is none; "" where it is one."""
+        return "" if self.automatic or self.low < self.high else "Low must be less than High"
+
     def display(self) -> Display:
         """The colours, scale and window; raises `InputError` where the window is none."""
         low, high = (None, None) if self.automatic else (self.low, self.high)

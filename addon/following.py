@@ -6,6 +6,7 @@ Blender has stored an undo step, and undo expects the datablocks that it stored.
 
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from typing import Any
 
 import bpy
 import numpy as np
@@ -155,21 +156,24 @@ def _rebuild(
     camera: bpy.types.Object, numbers: ModuleNumbers, built_as: _ConstructionNumbers, parts: Sequence[bpy.types.Object]
 ) -> str:
     """Give the camera's view and the parts' meshes the shape of `numbers`; returns why not, or an empty text."""
-    _, _, d, l, side, thickness, _ = numbers
+    l, side = numbers.collimator_length, numbers.detector_side
+    given: dict[str, tuple[Any, ...]] = {
+        "COLLIMATOR": (numbers.pinhole_diameter, l, side, *built_as),
+        "CRYSTAL": (l, side, numbers.detector_thickness),
+    }
     if _differs(camera.data, (l, side)):
         cameras.set_field_of_view(camera.data, side, l)
         camera.data[_KEY] = repr((l, side))
     for item in parts:
         part = item.mphdrr_module.part
-        given = (d, l, side, *built_as) if part == "COLLIMATOR" else (l, side, thickness)
-        if item.data.is_editmode or not _differs(item.data, given):
+        if item.data.is_editmode or not _differs(item.data, given[part]):
             continue
         try:
             solid = collimators.part_solid(part, numbers, Construction(*built_as))
         except InputError as error:  # e.g. while d is typed before Ld: the last shape stays
             return f"module {numbers.number}: {error}"
         collimators.reshape_mesh(item.data, solid)
-        item.data[_KEY] = repr(given)
+        item.data[_KEY] = repr(given[part])
     return ""
 
 
@@ -183,10 +187,10 @@ def _update_readouts(
 ) -> None:
     """Write a module's readouts; where its numbers are impossible they are 0, and `problem` says why."""
     module.pinhole_distance, module.aimed = numbers.pinhole_distance, aimed
-    _, _, d, l, side, thickness, _ = numbers
+    sizes = numbers.pinhole_diameter, numbers.collimator_length, numbers.detector_side, numbers.detector_thickness
     try:
         numbers.system()  # refuses impossible numbers
-        at = isocentre_performance(numbers.pinhole_distance, d, l, side, thickness, intrinsic_fwhm=intrinsic_fwhm)
+        at = isocentre_performance(numbers.pinhole_distance, *sizes, intrinsic_fwhm=intrinsic_fwhm)
     except InputError as error:
         module.problem = str(error)
         module.sensitivity = module.resolution = module.magnification = module.roi_seen = 0.0

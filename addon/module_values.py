@@ -5,8 +5,9 @@ valid as long as the visible one is its rounding. A number that the user has typ
 """
 
 import json
+from collections import namedtuple
 from collections.abc import Iterable
-from typing import Any, NamedTuple
+from typing import Any
 
 import bpy
 import numpy as np
@@ -19,20 +20,17 @@ from . import cameras
 from .decimals import typed
 
 FROM_ROI, TYPED = "FROM_ROI", "TYPED"  # `mphdrr_module.length_mode`
+_DESIGNED_FROM = ("pinhole_diameter", "detector_side", "roi_radius")  # with b, what the design formula takes
 _TURNED = 1e-4  # rad: rotations kept as float32 angles agree to better than 1e-6
 _FORMULA = 1e-9  # of l: an imported l this close to the design formula's was calculated with it
 
 
-class ModuleNumbers(NamedTuple):
-    """A module's number, place and lengths, in float64 and mm."""
+_made_of: Any = namedtuple  # Any: mypy knows only fields that are written out
+_Fields: Any = _made_of("_Fields", ("number", "center", *LENGTHS))
 
-    number: int
-    center: NDArray[np.float64]  # (3,), world
-    pinhole_diameter: float
-    collimator_length: float
-    detector_side: float
-    detector_thickness: float
-    roi_radius: float
+
+class ModuleNumbers(_Fields):
+    """A module's number, its pinhole's place (3,) in the world and its dimensions, in float64 and mm."""
 
     @property
     def pinhole_distance(self) -> float:
@@ -51,8 +49,8 @@ def write_module(camera: bpy.types.Object, system: PinholeSystem, m: int, ring: 
     values = {name: float(getattr(system, name)[m]) for name in LENGTHS}
     for name, value in values.items():  # before is_module, which lets an edit rebuild the module
         setattr(module, name, value)
-    b, d, side, roi = float(system.pinhole_distance[m]), *(values[LENGTHS[i]] for i in (0, 2, 4))
-    error = abs(float(collimator_length(b, d, side, roi)) - values["collimator_length"])
+    d, side, roi = (values[name] for name in _DESIGNED_FROM)
+    error = abs(float(collimator_length(float(system.pinhole_distance[m]), d, side, roi)) - values["collimator_length"])
     module.length_mode = FROM_ROI if error <= _FORMULA * values["collimator_length"] else TYPED
     module.ring = ring
     remember(camera, system, m)
@@ -103,16 +101,16 @@ def module_numbers(camera: bpy.types.Object) -> ModuleNumbers:
     numbers = ModuleNumbers(module.number, center, **values)
     if module.length_mode != FROM_ROI:
         return numbers
-    given = ("pinhole_diameter", "detector_side", "roi_radius")
-    if [FROM_ROI, center.tolist(), *(values[n] for n in given)] == [exact.get(n) for n in ("mode", "center", *given)]:
+    now = [FROM_ROI, center.tolist(), *(values[name] for name in _DESIGNED_FROM)]
+    if now == [exact.get(name) for name in ("mode", "center", *_DESIGNED_FROM)]:
         return numbers._replace(collimator_length=exact["collimator_length"])
     return _with_length(numbers)
 
 
 def _with_length(numbers: ModuleNumbers) -> ModuleNumbers:
-    _, _, d, _, side, _, roi = numbers
+    given = [getattr(numbers, name) for name in _DESIGNED_FROM]
     try:
-        return numbers._replace(collimator_length=float(collimator_length(numbers.pinhole_distance, d, side, roi)))
+        return numbers._replace(collimator_length=float(collimator_length(numbers.pinhole_distance, *given)))
     except InputError:
         return numbers  # `read_scanner` and the module's `problem` say what is wrong
 

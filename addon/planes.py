@@ -15,7 +15,9 @@ from ..core.geometry.views import Views
 from ..core.runs.run import ProjectionRun
 from . import ids, images, scanner, selection
 
-_KEY = "mphdrr_field"  # custom property of a plane: middle and size (5,) of the virtual detector in the camera's frame, mm
+_KEY = (
+    "mphdrr_field"  # custom property of a plane: middle and size (5,) of the virtual detector in the camera's frame, mm
+)
 _BETWEEN = 0.3  # of the way from the pinhole to the ROI's surface: where a plane is unless told otherwise
 
 
@@ -125,7 +127,7 @@ def _set_background(camera: bpy.types.Camera, field: NDArray[np.float64], pictur
     """Lay a picture over a camera's view, as large as it is seen from there."""
     background = camera.background_images.new()
     background.image = picture
-    x, y, distance, width, height = field
+    x, y, distance, width, _ = field
     seen = camera.sensor_width / camera.lens * distance  # how much the camera sees there
     background.frame_method, background.display_depth = "STRETCH", "FRONT"
     background.scale = width / seen

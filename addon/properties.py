@@ -21,6 +21,7 @@ from bpy.props import (
     StringProperty,
 )
 
+from ..core.geometry.system import LENGTHS
 from . import choices, column_maps, display_properties, ids, phantom_properties, projection_properties
 from .updates import FUNCTIONS, on_edit
 
@@ -38,14 +39,9 @@ _LENGTH_MODES = [
     ("FROM_ROI", "From ROI", "l follows b, d, Ld and R: the field of view is tangent to the ROI sphere", 0),
     ("TYPED", "Typed", "l stays as it was typed", 1),
 ]
-# name: (label, description, smallest value), of a module and of all modules.
-_LENGTHS = {
-    "pinhole_diameter": ("Pinhole Diameter", "d: diameter of the hole in mm", 0.0),
-    "collimator_length": ("Collimator Length", "l: from the pinhole to the crystal's front face, in mm", 1e-3),
-    "detector_side": ("Detector Side", "Ld: side of the square crystal in mm", 1e-3),
-    "detector_thickness": ("Detector Thickness", "Td: thickness of the crystal in mm", 0.0),
-    "roi_radius": ("ROI Radius", "R: radius in mm of the sphere that the module must see", 0.0),
-}
+_MAY_BE_ZERO = ("pinhole_diameter", "detector_thickness")  # while they are typed; of the others a picture is drawn
+LABELS = {name: f"{name.split('_')[-1].capitalize()} {text.partition(':')[0]}" for name, text in LENGTHS.items()}
+"""Of the lengths, short, for the sidebar: "Diameter d"."""
 _SEES_ROI = 1 - 1e-6  # of R: an `l` from the ROI sees R up to rounding
 
 
@@ -53,9 +49,15 @@ def _lengths(edited: Callable[[str], Any], suffix: str = "") -> dict[str, Any]:
     """Properties for d, l, Ld, Td and R, with the callback that `edited` gives for each name."""
     return {
         name: FloatProperty(
-            name=label, description=text + suffix, min=low, step=10, precision=3, unit="NONE", update=edited(name)
+            name=name.replace("_", " ").title().replace("Roi", "ROI"),
+            description=f"{text}, in mm{suffix}",
+            min=0.0 if name in _MAY_BE_ZERO else 1e-3,
+            step=10,
+            precision=3,
+            unit="NONE",
+            update=edited(name),
         )
-        for name, (label, text, low) in _LENGTHS.items()
+        for name, text in LENGTHS.items()
     }
 
 

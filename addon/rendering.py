@@ -112,10 +112,9 @@ def display_changed(scene: bpy.types.Scene) -> None:
 
 
 def _display_again() -> None:
-    try:
-        images.show_again(bpy.context.scene.mphdrr_display.display())
-    except InputError:  # a window that is none, as between the typing of its two ends: the panel says so
-        pass
+    settings = bpy.context.scene.mphdrr_display
+    if not settings.problem:  # which there is between the typing of the window's two ends
+        images.show_again(settings.display())
 
 
 def _storing(scene: bpy.types.Scene, run: ProjectionRun, path: Path) -> Generator[None, None, bpy.types.Image]:

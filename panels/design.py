@@ -6,14 +6,9 @@ from collections.abc import Sequence
 import bpy
 
 from ..addon import ids, jobs, selection
+from ..addon.properties import LABELS
 from .geometry import ScannerPanel, draw_facts, draw_text
 
-_LABELS = (
-    ("pinhole_diameter", "Hole d"),
-    ("detector_side", "Side Ld"),
-    ("detector_thickness", "Depth Td"),
-    ("roi_radius", "ROI R"),
-)
 _MOST_FINDINGS = 8
 
 
@@ -109,12 +104,13 @@ def _draw_numbers(
     column = layout.column(align=True)
     column.use_property_split = True
     column.use_property_decorate = False
-    for name, label in _LABELS:
-        column.prop(numbers, name, text=_label(label, name in mixed))
+    for name, label in LABELS.items():
+        if name != "collimator_length":
+            column.prop(numbers, name, text=_label(label, name in mixed))
     column.row(align=True).prop(numbers, "length_mode", expand=True)
     row = column.row(align=True)
     row.enabled = numbers.length_mode == "TYPED"  # otherwise it follows the others
-    row.prop(numbers, "collimator_length", text=_label("Length l", "collimator_length" in mixed))
+    row.prop(numbers, "collimator_length", text=_label(LABELS["collimator_length"], "collimator_length" in mixed))
     return column
 
 

@@ -3,7 +3,6 @@
 import bpy
 
 from ..addon import ids
-from ..core.errors import InputError
 from .geometry import Sidebar
 
 
@@ -28,10 +27,8 @@ class _Display:
         column.active = not settings.automatic
         column.prop(settings, "low", text="Window Low")
         column.prop(settings, "high")
-        try:
-            settings.display()
-        except InputError as error:
-            layout.label(text=str(error), icon="ERROR")
+        if settings.problem:
+            layout.label(text=settings.problem, icon="ERROR")
 
 
 class MPHDRR_PT_display(_Display, Sidebar, bpy.types.Panel):

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from ..errors import InputError
-from ..geometry.system import LENGTHS, PinholeSystem
+from ..geometry.system import LATER_LENGTHS, LENGTHS, PinholeSystem
 from ..geometry.views import Views
 from .format import Format
 
@@ -53,7 +53,9 @@ def read_geometry(path: str | os.PathLike[str]) -> tuple[PinholeSystem, Views]:
             raise InputError(f"not a file of the format mphdrr ({_KIND})")
         if document.get("version") != _VERSION:
             raise InputError(f"version {document.get('version')!r}; this mphDRR reads {_VERSION}")
-        system: Any = {field: [one[name] for one in document["modules"]] for name, field in _MODULE.items()}
+        modules = document["modules"]
+        lacked = [name for name in LATER_LENGTHS if not any(name in one for one in modules)]
+        system: Any = {field: [one[name] for one in modules] for name, field in _MODULE.items() if name not in lacked}
         views: Any = {field: [one[name] for one in document["views"]] for name, field in _VIEW.items()}
         return PinholeSystem(**system), Views(**views, shape=(document["rows"], document["columns"]))
     except InputError as error:

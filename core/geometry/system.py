@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from dataclasses import dataclass, fields
+from dataclasses import MISSING, dataclass, fields
 from typing import Literal
 
 import numpy as np
@@ -17,8 +17,14 @@ from .views import Views
 
 Detector = Literal["virtual", "real"]
 
-LENGTHS = ("pinhole_diameter", "collimator_length", "detector_side", "detector_thickness", "roi_radius")
-"""The modules' dimensions."""
+LENGTHS = {
+    "pinhole_diameter": "d: diameter of the hole",
+    "collimator_length": "l: from the pinhole to the crystal's front face",
+    "detector_side": "Ld: side of the square crystal",
+    "detector_thickness": "Td: thickness of the crystal",
+    "roi_radius": "R: radius of the sphere that the module must see",
+}
+"""The modules' dimensions: fields of `PinholeSystem`, with their symbols and what they are."""
 
 # Pinholes that differ in z by less than this fraction of the crystal's side belong to one ring.
 _RING_GAP = 0.2
@@ -149,6 +155,10 @@ class PinholeSystem:
         middles = self.centers + distance * k + x0 * u + y0 * v
         pitch_u, pitch_v = to_virtual * pitches[:, :1], to_virtual * pitches[:, 1:]
         return Views(self.centers, middles, pitch_u * u, pitch_v * v, (n_v, n_u))
+
+
+LATER_LENGTHS = tuple(f.name for f in fields(PinholeSystem) if f.name in LENGTHS and f.default is not MISSING)
+"""Dimensions that have a default, since files of earlier versions lack them."""
 
 
 def chosen_modules(system: PinholeSystem, text: str | None, name: str = "--modules") -> PinholeSystem:

@@ -18,7 +18,8 @@ def setting(
     """A field of a phantom's dataclass: one number, or as many as `default` has.
 
     A fraction's `unit` says what it is a fraction of (``"of the wall"``). `text` is one line of help, `least` the smallest
-    value (None for anything above 0), `option` the command line's name where that is not the field's.
+    value (None for anything above 0), `option` its name on the command line and in recipes where that is not the field's,
+    which the grid's settings have.
     """
     return dataclasses.field(default=default, metadata={"unit": unit, "text": text, "least": least, "option": option})
 
@@ -31,6 +32,12 @@ def count(default: int | tuple[int, ...], text: str) -> Any:
 def choice(default: str, choices: tuple[str, ...], text: str) -> Any:
     """A field of a phantom's dataclass: one of several words; the class checks it."""
     return dataclasses.field(default=default, metadata={"choices": choices, "text": text})
+
+
+def setting_names(cls: Any) -> dict[str, str]:
+    """The arguments of a dataclass by their names in recipes: ``{"spacing_of_disks": "spacing", "disks": "disks"}``."""
+    fields = [field for field in dataclasses.fields(cls) if field.init]
+    return {field.metadata.get("option", "").replace("-", "_") or field.name: field.name for field in fields}
 
 
 def check_settings(phantom: Any, title: str) -> None:

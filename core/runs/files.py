@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from ..errors import InputError
 from ..files import replacing
 from ..geometry.grid import Grid
-from ..geometry.system import LENGTHS, PinholeSystem
+from ..geometry.system import LATER_LENGTHS, LENGTHS, PinholeSystem
 from ..geometry.views import Views
 from ..volumes.volume import Volume
 from .run import ProjectionRun
@@ -100,9 +100,9 @@ def _run_of(arrays: dict[str, NDArray[Any]], attributes: dict[str, Any]) -> Proj
     if int(attributes["format_version"]) > _FORMAT_VERSION:
         raise InputError(f"written by a newer mphDRR (format {attributes['format_version']}); update to read it")
     for name in ("projections", "volume/array", *_ARRAYS):
-        if name not in arrays:
+        if name not in arrays and name.removeprefix("geometry/") not in LATER_LENGTHS:
             raise InputError(f"array {name} is missing")
-    lengths: Any = {name: arrays[f"geometry/{name}"] for name in LENGTHS}
+    lengths: Any = {name: arrays[f"geometry/{name}"] for name in LENGTHS if f"geometry/{name}" in arrays}
     rays: Any = {name: arrays[f"views/{name}"] for name in _RAYS}
     volume, seed = arrays["volume/array"], attributes["seed"]
     n_v, n_u = arrays["projections"].shape[1:]

@@ -12,6 +12,7 @@ from typing import Any
 from ..errors import InputError
 from ..files import replacing
 from ..phantoms.kinds import KINDS
+from ..phantoms.settings import setting_names
 from ..toml import read_toml, toml_value
 from .settings import SETTINGS, TABLES
 
@@ -62,8 +63,8 @@ class Recipe:
 
     def fields(self, table: str, cls: Any) -> dict[str, Any]:
         """Given values of a table that are arguments of the dataclass `cls`, by their names."""
-        names = (field.name for field in dataclasses.fields(cls) if field.init)
-        return {name: self.given[f"{table}.{name}"] for name in names if f"{table}.{name}" in self.given}
+        keys = {f"{table}.{key}": name for key, name in setting_names(cls).items()}
+        return {name: self.given[key] for key, name in keys.items() if key in self.given}
 
     def tables(self) -> dict[str, dict[str, Any]]:
         """The values by table and name, as JSON and TOML hold them."""
@@ -183,9 +184,7 @@ def _checked(values: Mapping[str, Any], key: str) -> Any:
 def _phantom_fields(values: Mapping[str, Any]) -> list[str]:
     """The numbers of the phantom's kind."""
     name = values.get("phantom.kind", SETTINGS["phantom.kind"].default)
-    return [
-        field.name for kind in KINDS if kind.name == name for field in dataclasses.fields(kind.phantom) if field.init
-    ]
+    return [key for kind in KINDS if kind.name == name for key in setting_names(kind.phantom)]
 
 
 def _with_paths(recipe: Recipe, change: Callable[[str], str]) -> Recipe:

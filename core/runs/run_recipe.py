@@ -1,6 +1,5 @@
 """From a recipe to projection runs: the main job, for the command line, the demo, scripts and Blender."""
 
-import dataclasses
 import math
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -16,6 +15,7 @@ from ..geometry.system import PinholeSystem, chosen_modules
 from ..phantoms.kinds import KINDS
 from ..phantoms.language import parse_phantom, read_phantom
 from ..phantoms.phantom import Phantom
+from ..phantoms.settings import setting_names
 from ..physics.ct_numbers import hu_to_mu
 from ..physics.isotopes import photon_energy
 from ..progress import Progress
@@ -251,8 +251,8 @@ def with_phantom(recipe: Recipe, phantom: Phantom, pose: NDArray[np.float64]) ->
     cls: Any = type(phantom)
     for kind in KINDS:
         if cls is kind.phantom:
-            fields = dataclasses.fields(cls)
-            values |= {"kind": kind.name} | {f.name: getattr(phantom, f.name) for f in fields if f.init}
+            own = {key: getattr(phantom, name) for key, name in setting_names(cls).items()}
+            values |= {"kind": kind.name} | own
     return recipe.updated({f"phantom.{name}": value for name, value in values.items()})
 
 

@@ -11,6 +11,7 @@ import pytest
 
 import mphdrr.core as mph
 from mphdrr.addon.cli import main
+from mphdrr.core.phantoms.kinds import KINDS
 from mphdrr.core.runs.recipe import Recipe
 from mphdrr.core.runs.run_recipe import euler_degrees, phantom_pose
 from mphdrr.core.runs.settings import SETTINGS
@@ -127,6 +128,21 @@ def test_a_run_made_again_is_attenuated_again(centered, workbook, tmp_path, caps
             next(mph.run_recipe(runs[0].recipe, volume=runs[0].volume))
 
 
+@pytest.mark.parametrize("kind", KINDS, ids=lambda kind: kind.name)
+def test_a_phantom_has_settings_apart_from_those_of_its_grid(kind, workbook, tmp_path, capsys):
+    """Defrise's disks and the grid of points have a spacing, as the voxels have."""
+    first, second = str(tmp_path / "a.h5"), str(tmp_path / "b.h5")
+    small = ["--voxels", "14", "--spacing", "30", "31", "32", "--size", "6", "8", "--modules", "3"]
+    assert main(["project", str(workbook), "--phantom", kind.name, *small, "-o", first]) == 0
+    assert main(["project", first, "-o", second]) == 0
+    runs = [mph.read_run(path) for path in (first, second)]
+    expected = kind.phantom(**kind.usual).voxelize(runs[0].volume.grid)
+    np.testing.assert_allclose(runs[0].volume.grid.spacing, (30, 31, 32))
+    for run in runs:
+        np.testing.assert_array_equal(run.volume.array, expected.array)
+        assert run.recipe == runs[0].recipe and run.recipe["phantom.spacing"] == (30, 31, 32)
+
+
 def test_every_entry_can_be_set_on_the_command_line(workbook, tmp_path, capsys):
     entries = ["model.kind=emission", "model.edge=path", "model.aperture_mu=2.5", "model.window=[60, 80]",
                "model.isotope=Tl-201", "phantom.kind=points", "phantom.counts=[2, 1, 1]"]  # fmt: skip
@@ -211,6 +227,10 @@ def test_what_only_a_scene_has_is_not_left_out(entries, said, workbook):
 
 def test_every_argument_of_a_model_is_a_setting():
     names = {field.name for cls in (mph.Emission, mph.Transmission) for field in dataclasses.fields(cls)}
+    for cls in (mph.Emission, mph.Transmission):  # radiographs have one point of each pixel unless told otherwise
+        for field in dataclasses.fields(cls):
+            setting = SETTINGS.get(f"model.{field.name}")
+            assert setting is None or setting.default == field.default or (cls, field.default) == (mph.Transmission, 1)
     names -= {"system", "mu", "photons_per_decay"}  # the recipe has tables of the first two; the isotope says the third
     declared = {key.removeprefix("model.").removesuffix("_degrees") for key in SETTINGS if key.startswith("model.")}
     assert names == declared - {"kind", "photons"}

@@ -7,19 +7,16 @@ from typing import Any
 import numpy as np
 
 from ...errors import InputError
-from ...geometry.system import PinholeSystem
+from ...geometry.system import LENGTHS, PinholeSystem
 from ...recording import recorded_warnings
 from ...workbook import write_system
 from ...workbook.quantities import QUANTITIES, needed_numbers
 from ..options import chosen_modules, output_path, print_answer, read_workbook
 from .arguments import add_action
 
-_DIMENSIONS = {
-    "diameter": ("pinhole_diameter", "d, pinhole diameter"),
-    "side": ("detector_side", "Ld, side of the crystal"),
-    "thickness": ("detector_thickness", "Td, thickness of the crystal"),
-    "roi": ("roi_radius", "R, radius of the ROI"),
-}
+_DIMENSIONS = {name.split("_")[-1]: name for name in LENGTHS if name not in ("collimator_length", "roi_radius")}
+_DIMENSIONS["roi"] = "roi_radius"
+"""Option -> field; l is another matter."""
 
 
 def add_parser(actions) -> None:  # type: ignore[no-untyped-def]
@@ -29,8 +26,8 @@ def add_parser(actions) -> None:  # type: ignore[no-untyped-def]
     add = parser.add_argument
     add("-o", "--output", required=True, metavar="OUT", help="workbook to write; FILE itself is replaced")
     add("--modules", metavar="RANGE", help="those to change, such as 1-40 or 1-20,41; default: all")
-    for name, (_, what) in _DIMENSIONS.items():
-        add(f"--{name}", type=float, metavar="MM", help=what)
+    for option, name in _DIMENSIONS.items():
+        add(f"--{option}", type=float, metavar="MM", help=LENGTHS[name])
     length = (
         "l, collimator length, or 'design' for the design formula's; default: those that follow the formula go on "
         "following it, the others stay"
@@ -62,7 +59,7 @@ def _run(arguments: argparse.Namespace) -> None:
 def _changed(system: PinholeSystem, arguments: argparse.Namespace) -> PinholeSystem:
     chosen = np.isin(system.numbers, chosen_modules(system, arguments.modules).numbers)
     changes: dict[str, Any] = {}
-    for option, (name, _) in _DIMENSIONS.items():
+    for option, name in _DIMENSIONS.items():
         number = getattr(arguments, option)
         if number is not None:
             changes[name] = np.where(chosen, number, getattr(system, name))

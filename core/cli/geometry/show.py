@@ -6,7 +6,7 @@ from typing import Any
 from ...errors import InputError
 from ...geometry.system import PinholeSystem
 from ...workbook import draft_column_map
-from ...workbook.quantities import QUANTITIES
+from ...workbook.quantities import DIMENSIONS, OPTIONAL, QUANTITIES
 from ..options import chosen_modules, output_path, print_answer, read_workbook
 from .arguments import add_action, table_rows
 
@@ -52,5 +52,5 @@ def _write_columns(arguments: argparse.Namespace) -> None:
 
 def _rows(system: PinholeSystem) -> list[dict[str, Any]]:
     columns = {"number": system.numbers, "ring": system.rings() + 1, **dict(zip("xyz", system.centers.T, strict=True))}
-    names = ("b", "l", "azimuth", "elevation", "d", "Ld", "Td", "R")
+    names = dict.fromkeys(("b", "l", "azimuth", "elevation", *DIMENSIONS, *OPTIONAL))
     return table_rows({**columns, **{name: QUANTITIES[name].of(system) for name in names}})

@@ -113,12 +113,14 @@ def _wanted(scene: bpy.types.Scene) -> list[tuple[bpy.types.Object, bool]]:
 
 
 def _fields(system: PinholeSystem, views: Views) -> NDArray[np.float64]:
-    """For each view x, y and distance of the picture's middle in the camera's frame, and its width and height (M, 5), mm."""
+    """For each view x, y and distance of the picture's middle in the camera's frame, and its width and height (M, 5), mm.
+
+    Width and height are negative where the picture is upside down, as on the real detector.
+    """
     u, v, k = np.moveaxis(system.frames(), 1, 0)
     to_middle = views.detector_centers - views.sources
     n_v, n_u = views.shape
-    width = n_u * np.linalg.norm(views.u_steps, axis=1)
-    height = n_v * np.linalg.norm(views.v_steps, axis=1)
+    width, height = n_u * np.sum(views.u_steps * u, axis=1), n_v * np.sum(views.v_steps * v, axis=1)
     places = [-np.sum(to_middle * u, axis=1), np.sum(to_middle * v, axis=1), np.sum(to_middle * k, axis=1)]
     return np.stack([*places, width, height], axis=1)
 
@@ -127,10 +129,11 @@ def _set_background(camera: bpy.types.Camera, field: NDArray[np.float64], pictur
     """Lay a picture over a camera's view, as large as it is seen from there."""
     background = camera.background_images.new()
     background.image = picture
-    x, y, distance, width, _ = field
+    x, y, distance, width, height = field
     seen = camera.sensor_width / camera.lens * distance  # how much the camera sees there
     background.frame_method, background.display_depth = "STRETCH", "FRONT"
-    background.scale = width / seen
+    background.use_flip_x, background.use_flip_y = width < 0, height < 0
+    background.scale = abs(width) / seen
     background.offset = x / seen, y / seen
     camera.show_background_images = True
 

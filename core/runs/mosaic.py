@@ -88,7 +88,7 @@ def sheet(
     images = display.colored(_sized(as_seen(projections), pixels), window)
     places = _places(np.asarray(rings))
     n_v, n_u = tile = images.shape[1:3]
-    letters = max(1, round(min(n_v, n_u) / 110))
+    letters = max(1, round(min(n_v, n_u) / 60))
     gap = 2 * letters
     corners = gap + places * (np.array(tile) + gap)
     height, width = corners.max(axis=0) + tile + gap
@@ -96,7 +96,7 @@ def sheet(
     for image, (row, column), number in zip(images, corners, np.asarray(numbers), strict=True):
         picture[row : row + n_v, column : column + n_u] = image
         _write(picture, str(number), row + letters, column + letters, letters)
-    bar = _color_bar(display, window, unit, height, max(1, round(height / 450)))
+    bar = _color_bar(display, window, unit, height, max(letters, round(height / 300)))
     return Sheet(np.concatenate([picture, bar], axis=1), corners, (n_v, n_u), window)
 
 

@@ -3,6 +3,7 @@
 import bpy
 from bpy.props import BoolProperty, EnumProperty, FloatProperty
 
+from ..core.errors import InputError
 from ..core.runs.display import COLORS, SCALES, Display
 from .updates import on_edit
 
@@ -65,8 +66,12 @@ class DisplayProperties(bpy.types.PropertyGroup):
 
     @property
     def problem(self) -> str:
-        """Why the window is none; "" where it is one."""
-        return "" if self.automatic or self.low < self.high else "Low must be less than High"
+        """What is wrong with the window; "" where it is good."""
+        try:
+            self.display()
+        except InputError as error:
+            return str(error)
+        return ""
 
     def display(self) -> Display:
         """The colours, scale and window; raises `InputError` where the window is none."""

@@ -132,7 +132,7 @@ def _set_background(camera: bpy.types.Camera, field: NDArray[np.float64], pictur
     x, y, distance, width, height = field
     seen = camera.sensor_width / camera.lens * distance  # how much the camera sees there
     background.frame_method, background.display_depth = "STRETCH", "FRONT"
-    background.use_flip_x, background.use_flip_y = width < 0, height < 0
+    background.use_flip_x, background.use_flip_y = bool(width < 0), bool(height < 0)
     background.scale = abs(width) / seen
     background.offset = x / seen, y / seen
     camera.show_background_images = True

@@ -47,6 +47,8 @@ class Display:
                 raise InputError(f"{name} = {value}: expected a finite number")
         if self.low is not None and self.high is not None and self.low >= self.high:
             raise InputError(f"window {self.low:g} to {self.high:g}: expected low to be less than high")
+        if self.scale == "log" and self.low is not None and self.low <= 0:
+            raise InputError(f"low = {self.low:g}: expected more than 0 on the logarithmic scale")
 
     def window(self, values: ArrayLike) -> tuple[float, float]:
         """The numbers that get the first and the last colour where `values` are shown."""

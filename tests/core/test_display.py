@@ -46,6 +46,7 @@ def test_numbers_outside_a_window_have_its_ends_colours_and_no_number_has_the_fi
         ({"colors": "jet"}, "colors 'jet': expected one of inferno"),
         ({"scale": "cube"}, "scale 'cube': expected one of linear"),
         ({"low": 3, "high": 3}, "expected low to be less than high"),
+        ({"scale": "log", "low": 0}, "expected more than 0 on the logarithmic scale"),
         ({"high": np.inf}, "expected a finite number"),
     ],
 )

@@ -39,15 +39,23 @@ def storing(run: ProjectionRun, display: Display) -> Generator[None, None, bpy.t
 
 def show_again(display: Display) -> None:
     """Make the pictures anew from the exact images, as `display` says; nothing where there is no run."""
-    mosaic = bpy.data.images.get(ids.MOSAIC)
-    if mosaic is None or _TILES not in mosaic:
+    shown = tiles(bpy.data.images.get(ids.MOSAIC))
+    if shown is None:
         return
-    tiles = mosaic[_TILES].to_dict()
-    found = [bpy.data.images.get(projection_name(number, tiles["numbers"])) for number in tiles["numbers"]]
+    numbers = shown["numbers"]
+    found = [bpy.data.images.get(projection_name(number, numbers)) for number in numbers]
     if None not in found:
         projections = np.stack([projection_array(image) for image in found])
-        for _ in _showing(projections, tiles["numbers"], tiles["rings"], tiles["unit"], display):
+        for _ in _showing(projections, numbers, shown["rings"], shown["unit"], display):
             pass
+
+
+def tiles(image: bpy.types.Image | None) -> dict[str, Any] | None:
+    """Of the mosaic: `numbers` and `rings` of its modules, `unit`, the tiles' size `tile` and their `corners`; else None.
+
+    Rows and columns are counted from the top left.
+    """
+    return None if image is None or _TILES not in image else image[_TILES].to_dict()
 
 
 def projection_name(number: int, numbers: list[int]) -> str:
@@ -78,6 +86,14 @@ def projection_array(image: bpy.types.Image) -> NDArray[np.float32]:
     pixels = np.empty(4 * width * height, np.float32)
     image.pixels.foreach_get(pixels)
     return np.ascontiguousarray(pixels.reshape(height, width, 4)[:, ::-1, 0])
+
+
+def redraw_mosaic() -> None:
+    """Have the Image Editors that show the mosaic drawn again: another module is active."""
+    for window in bpy.context.window_manager.windows:
+        for area in window.screen.areas:
+            if area.type == "IMAGE_EDITOR" and tiles(area.spaces.active.image) is not None:
+                area.tag_redraw()
 
 
 def show(image: bpy.types.Image, context: bpy.types.Context) -> bool:

@@ -26,6 +26,7 @@ from . import (
     selection,
     slices,
     storage,
+    tiles,
     updates,
     volumes,
 )
@@ -87,6 +88,7 @@ HANDLERS: tuple[tuple[list[Any], Any], ...] = (
     (bpy.app.handlers.load_post, volumes.after_load),
     (bpy.app.handlers.load_post, live_scanner.after_load),
     (bpy.app.handlers.depsgraph_update_post, live_scanner.after_update),
+    (bpy.app.handlers.depsgraph_update_post, selection.after_update),
     (bpy.app.handlers.depsgraph_update_post, planes.after_update),
     (bpy.app.handlers.frame_change_post, live_scanner.after_frame),
     (bpy.app.handlers.frame_change_post, slices.after_frame_change),
@@ -134,6 +136,11 @@ def register(command: Callable[..., int] | None = None) -> None:
         for handlers, function in HANDLERS:
             handlers.append(function)
             _registered.callback(_remove_handler, handlers, function)
+        if not bpy.app.background:
+            _registered.callback(tiles.draw_no_frames, tiles.draw_frames())
+            keymap = bpy.context.window_manager.keyconfigs.addon.keymaps.new("Image", space_type="IMAGE_EDITOR")
+            click = keymap.keymap_items.new(ids.PICK_MODULE, "LEFTMOUSE", "PRESS")
+            _registered.callback(keymap.keymap_items.remove, click)
         if command is not None:
             _registered.callback(bpy.utils.unregister_cli_command, bpy.utils.register_cli_command(ids.PREFIX, command))
     except Exception:

@@ -66,13 +66,13 @@ class Display:
     def shares(self, values: ArrayLike, window: tuple[float, float]) -> NDArray[np.float32]:
         """Where `values` stand between the first colour, 0, and the last, 1; numbers outside the window are clipped."""
         low, high = window
-        values = np.asarray(values, np.float32)
+        numbers = np.asarray(values, np.float32)
         if self.scale == "log":
             if not 0 < low < high:
-                return (values >= high).astype(np.float32) if high > 0 else np.zeros_like(values)
-            values = np.log(np.maximum(values, low, dtype=np.float32))
+                return (numbers >= high).astype(np.float32) if high > 0 else np.zeros_like(numbers)
+            numbers = np.log(np.maximum(numbers, low, dtype=np.float32))
             low, high = float(np.log(low)), float(np.log(high))
-        shares = np.clip((values - low) / ((high - low) or 1.0), 0.0, 1.0)
+        shares = np.clip((numbers - low) / ((high - low) or 1.0), 0.0, 1.0)
         return np.nan_to_num(np.sqrt(shares) if self.scale == "sqrt" else shares, nan=0.0)
 
     def value_at(self, share: float, window: tuple[float, float]) -> float:

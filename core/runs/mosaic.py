@@ -156,13 +156,13 @@ def write_png(picture: ArrayLike, path: str | os.PathLike[str]) -> None:
     Of numbers, 0 is black, or the smallest if that is negative, and the largest is white. `InputError` where the file cannot
     be written.
     """
-    picture = np.asarray(picture)
-    if picture.ndim == 2:
-        low, high = float(picture.min(initial=0.0)), float(picture.max(initial=0.0))
-        picture = np.rint((picture - low) / ((high - low) or 1.0) * 255).astype(np.uint8)[..., None]
-    height, width, channels = picture.shape
+    pixels = np.asarray(picture)
+    if pixels.ndim == 2:
+        low, high = float(pixels.min(initial=0.0)), float(pixels.max(initial=0.0))
+        pixels = np.rint((pixels - low) / ((high - low) or 1.0) * 255).astype(np.uint8)[..., None]
+    height, width, channels = pixels.shape
     header = struct.pack(">2I5B", width, height, 8, {1: 0, 3: 2}[channels], 0, 0, 0)  # 8 bits, grey or colours
-    rows = zlib.compress(np.pad(picture.reshape(height, -1), ((0, 0), (1, 0))).tobytes())  # 0 before each: stored as is
+    rows = zlib.compress(np.pad(pixels.reshape(height, -1), ((0, 0), (1, 0))).tobytes())  # 0 before each: stored as is
     png = b"\x89PNG\r\n\x1a\n"
     for name, data in ((b"IHDR", header), (b"IDAT", rows), (b"IEND", b"")):
         png += struct.pack(">I", len(data)) + name + data + struct.pack(">I", zlib.crc32(name + data))

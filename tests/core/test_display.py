@@ -19,7 +19,7 @@ def test_larger_numbers_never_have_a_lower_colour_and_the_ends_are_the_windows(v
     display, values = Display(colors, scale), np.sort(np.float32(values))
     low, high = display.window(values)
     shares = display.shares(values, (low, high))
-    assert np.all(np.diff(shares) >= 0) and 0 <= shares.min() and shares.max() <= 1
+    assert np.all(np.diff(shares) >= 0) and shares.min() >= 0 and shares.max() <= 1
     assert high == values.max() and low <= high
     if low < high:
         first, last = Display(colors).colored([0.0, 1.0])

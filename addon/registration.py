@@ -138,9 +138,10 @@ def register(command: Callable[..., int] | None = None) -> None:
             _registered.callback(_remove_handler, handlers, function)
         if not bpy.app.background:
             _registered.callback(tiles.draw_no_frames, tiles.draw_frames())
-            keymap = bpy.context.window_manager.keyconfigs.addon.keymaps.new("Image", space_type="IMAGE_EDITOR")
-            click = keymap.keymap_items.new(ids.PICK_MODULE, "LEFTMOUSE", "PRESS")
-            _registered.callback(keymap.keymap_items.remove, click)
+            for name in ("Image", "Image Editor Tool: Sample"):  # the editor's usual tool takes clicks first
+                keymap = bpy.context.window_manager.keyconfigs.addon.keymaps.new(name, space_type="IMAGE_EDITOR")
+                click = keymap.keymap_items.new(ids.PICK_MODULE, "LEFTMOUSE", "PRESS")
+                _registered.callback(keymap.keymap_items.remove, click)
         if command is not None:
             _registered.callback(bpy.utils.unregister_cli_command, bpy.utils.register_cli_command(ids.PREFIX, command))
     except Exception:

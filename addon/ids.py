@@ -5,6 +5,7 @@ CATEGORY = "mphDRR"  # the sidebar tab
 
 # --- Operators: idname as in `bpy.ops.<idname>` -------------------------------------------------------------
 IMPORT_GEOMETRY = "mphdrr.import_geometry"
+LOAD_EXAMPLE = "mphdrr.load_example"
 SHOW_MODULES = "mphdrr.show_modules"
 LOOK_THROUGH_MODULE = "mphdrr.look_through_module"
 AIM_MODULES = "mphdrr.aim_modules"

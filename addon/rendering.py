@@ -47,7 +47,7 @@ def render_job(context: bpy.types.Context, recipe: Recipe, volume: str = "", mu:
     recipe = _with_volume(recipe, item)
     read_volume, read_mu = volumes.reader(item), mu_item and volumes.reader(mu_item)
     energy = mu_item and phantoms.mu_energy(mu_item)
-    path = storage.folder() / f"{bpy.path.clean_name(scene.name)}-projections.h5"
+    path = run_path(scene)
     scene_name, start = scene.name, time.perf_counter()
 
     def work(progress: Progress) -> ProjectionRun:
@@ -62,12 +62,17 @@ def render_job(context: bpy.types.Context, recipe: Recipe, volume: str = "", mu:
         scene = bpy.data.scenes.get(scene_name)
         if scene is None:
             raise InputError(f"the scene {scene_name!r} is gone; its projections are in {path}")
-        images.show((yield from _storing(scene, run, path)), bpy.context)
+        images.show((yield from storing(scene, run, path)), bpy.context)
         where = path if bpy.data.filepath else f"{path} until the .blend is saved"
         seconds = time.perf_counter() - start
         return f"Projected {recipe['volume.object']!r} into {len(run.views)} modules in {seconds:.1f} s: {where}"
 
     return jobs.Job("Projecting", work, finish)
+
+
+def run_path(scene: bpy.types.Scene) -> Path:
+    """The file of the scene's last run."""
+    return storage.folder() / f"{bpy.path.clean_name(scene.name)}-projections.h5"
 
 
 def load_recipe(scene: bpy.types.Scene, path: Path) -> None:
@@ -99,8 +104,20 @@ def export_run(scene: bpy.types.Scene, filepath: str) -> Path:
 
 def show_run(scene: bpy.types.Scene, run: ProjectionRun, path: Path) -> None:
     """Make images of `run`, which is kept in the file `path`, and show it as the scene's last."""
-    for _ in _storing(scene, run, path):
+    for _ in storing(scene, run, path):
         pass
+
+
+def storing(scene: bpy.types.Scene, run: ProjectionRun, path: Path) -> Generator[None, None, bpy.types.Image]:
+    """Make images and planes of `run`, which is kept in the file `path`, and note it as the scene's last."""
+    mosaic = yield from images.storing(run, scene.mphdrr_display.display())
+    planes.make(scene, run)
+    state = scene.mphdrr_projections
+    state.run_file = storage.stored_path(path.absolute())
+    n_v, n_u = run.views.shape
+    what = [run.settings.get("volume"), run.settings.get("backend")]
+    state.run_summary = ", ".join([f"{len(run.views)} views of {n_u} × {n_v}", *(text for text in what if text)])
+    return mosaic
 
 
 def display_changed(scene: bpy.types.Scene) -> None:
@@ -115,18 +132,6 @@ def _display_again() -> None:
     settings = bpy.context.scene.mphdrr_display
     if not settings.problem:  # which there is between the typing of the window's two ends
         images.show_again(settings.display())
-
-
-def _storing(scene: bpy.types.Scene, run: ProjectionRun, path: Path) -> Generator[None, None, bpy.types.Image]:
-    """Make images and planes of `run`, which is kept in the file `path`, and note it as the scene's last."""
-    mosaic = yield from images.storing(run, scene.mphdrr_display.display())
-    planes.make(scene, run)
-    state = scene.mphdrr_projections
-    state.run_file = storage.stored_path(path.absolute())
-    n_v, n_u = run.views.shape
-    what = [run.settings.get("volume"), run.settings.get("backend")]
-    state.run_summary = ", ".join([f"{len(run.views)} views of {n_u} × {n_v}", *(text for text in what if text)])
-    return mosaic
 
 
 def _with_volume(recipe: Recipe, item: bpy.types.Object) -> Recipe:

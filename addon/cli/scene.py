@@ -29,7 +29,9 @@ def add_parser(subparsers) -> None:  # type: ignore[no-untyped-def]
     )
     add_workbook(parser)
     parser.add_argument("--modules", metavar="RANGE", help="such as 1-40 or 1-20,41; default: all")
-    parser.add_argument("--volume", metavar="FILE", help="also put in this volume: .nii, .nii.gz, .npz")
+    parser.add_argument(
+        "--volume", metavar="FILE", help="also put in this volume, of any format that volume info reads"
+    )
     parser.add_argument(
         "--mu", metavar="FILE", help="and this volume of attenuation coefficients (1/mm), for SPECT counts"
     )

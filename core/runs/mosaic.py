@@ -12,6 +12,7 @@ from ..errors import InputError
 from ..files import replacing
 from .display import Display
 from .lettering import HEIGHT, WIDTH, lettered
+from .run import ProjectionRun
 
 
 def as_seen(images: ArrayLike) -> NDArray:
@@ -98,6 +99,12 @@ def sheet(
         _write(picture, str(number), row + letters, column + letters, letters)
     bar = _color_bar(display, window, unit, height, max(letters, round(height / 300)))
     return Sheet(np.concatenate([picture, bar], axis=1), corners, (n_v, n_u), window)
+
+
+def write_sheet(run: ProjectionRun, path: str | os.PathLike[str], display: Display | None = None) -> None:
+    """Write all images of a run in one picture, a PNG; see `sheet`."""
+    drawn = sheet(run.projections, run.system.numbers, run.system.rings(), run.unit, display)
+    write_png(drawn.picture, path)
 
 
 def _sized(images: NDArray[np.float32], pixels: float) -> NDArray[np.float32]:

@@ -1,19 +1,19 @@
-"""Projections in the window: a tile is clicked, a module is selected; leaves planes, mosaic and the frame of module 55.
+"""The example in the window, with a tile clicked and a module selected; leaves the frame of module 55 around its tile.
 
-Arguments after ``--``: the workbook, the file for what was seen.
+Argument after ``--``: the file for what was seen.
 """
 
 import json
 import subprocess
 import sys
+import time
 import traceback
 from pathlib import Path
 
 import bpy
 import numpy as np
-from mathutils import Euler
 
-workbook, result_file = (Path(word) for word in sys.argv[sys.argv.index("--") + 1 :][:2])
+result_file = Path(sys.argv[sys.argv.index("--") + 1])
 bpy.context.preferences.view.show_splash = False
 seen: dict[str, object] = {"ok": False}
 
@@ -24,17 +24,24 @@ def editor(kind: str):
     return window, area, next(r for r in area.regions if r.type == "WINDOW")
 
 
-def project() -> None:
-    for name in ("Cube", "Light", "Camera"):
-        bpy.data.objects.remove(bpy.data.objects[name])
-    bpy.ops.mphdrr.import_geometry(filepath=str(workbook))
-    bpy.ops.mphdrr.add_derenzo(voxels=64)
-    bpy.ops.mphdrr.render_projections(width=64, height=64)
+def load() -> None:
+    """Press the empty panel's first button, and measure until its job is done."""
+    started = time.monotonic()
     window, area, region = editor("VIEW_3D")
+    area.spaces.active.show_region_ui = True
     with bpy.context.temp_override(window=window, area=area, region=region):
-        bpy.ops.mphdrr.show_projections()
-    view = area.spaces.active.region_3d
-    view.view_distance, view.view_rotation = 620, Euler((1.05, 0, 0.95)).to_quaternion()
+        bpy.ops.mphdrr.load_example("INVOKE_DEFAULT")
+
+    def look() -> float | None:
+        if len(window.modal_operators):
+            return 0.1
+        seen["seconds"] = time.monotonic() - started
+        sidebar = next(region for region in area.regions if region.type == "UI")
+        sidebar.active_panel_category = "mphDRR"
+        bpy.app.timers.register(step, first_interval=3.0)
+        return None
+
+    bpy.app.timers.register(look, first_interval=0.2)
 
 
 def place_of(number: int) -> tuple[int, int, int, int]:
@@ -77,19 +84,23 @@ def select() -> None:
 def finish() -> None:
     seen["selected"] = active()
     seen["tile"], seen["other"] = place_of(55), place_of(31)
+    seen["tiles"] = [place_of(number) for number in range(1, 81)]
+    seen["hidden"] = sorted(o.name for o in bpy.data.objects if o.hide_viewport)
     seen["planes"] = sum(not o.hide_viewport for o in bpy.data.objects if o.mphdrr_module.part == "PLANE")
     seen["ok"] = True
 
 
-def step(steps=iter((project, click, select, finish))) -> float | None:
+STEPS = iter((load, click, select, finish))
+
+
+def step() -> float | None:
+    action = next(STEPS)
     try:
-        next(steps)()
-    except StopIteration:
-        return None
+        action()
     except Exception:
         seen["error"] = traceback.format_exc()
     result_file.write_text(json.dumps(seen))
-    return None if "error" in seen else 3.0
+    return None if "error" in seen or action in (load, finish) else 3.0
 
 
 bpy.app.timers.register(step, first_interval=1.5)

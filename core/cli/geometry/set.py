@@ -14,8 +14,13 @@ from ...workbook.quantities import QUANTITIES, needed_numbers
 from ..options import chosen_modules, output_path, print_answer, read_workbook
 from .arguments import add_action
 
-_DIMENSIONS = {name.split("_")[-1]: name for name in LENGTHS if name not in ("collimator_length", "roi_radius")}
-_DIMENSIONS["roi"] = "roi_radius"
+_SHORT = {
+    "pinhole_diameter": "diameter",
+    "detector_side": "side",
+    "detector_thickness": "thickness",
+    "roi_radius": "roi",
+}
+_DIMENSIONS = {_SHORT.get(name, name.replace("_", "-")): name for name in LENGTHS if name != "collimator_length"}
 """Option -> field; l is another matter."""
 
 
@@ -60,7 +65,7 @@ def _changed(system: PinholeSystem, arguments: argparse.Namespace) -> PinholeSys
     chosen = np.isin(system.numbers, chosen_modules(system, arguments.modules).numbers)
     changes: dict[str, Any] = {}
     for option, name in _DIMENSIONS.items():
-        number = getattr(arguments, option)
+        number = getattr(arguments, option.replace("-", "_"))
         if number is not None:
             changes[name] = np.where(chosen, number, getattr(system, name))
     if arguments.move is not None:

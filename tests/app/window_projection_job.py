@@ -56,6 +56,11 @@ def job():
     return next(module for name, module in sys.modules.items() if name.endswith(".addon.jobs"))._current
 
 
+def share() -> float:
+    """How much of the running job is done."""
+    return job().done / max(1, job().total)
+
+
 def ours() -> list[str]:
     return sorted(i.name for i in bpy.data.images if i.name.startswith("mphDRR"))
 
@@ -91,10 +96,10 @@ def steps():
     before = run_file.read_bytes()
     pixels = list(bpy.data.images["mphDRR 01"].pixels[:400])
     start_job(width=768, height=768, pixel_points=8)
-    while (running := job()) and running.share < 0.2:
+    while job() and share() < 0.2:
         yield 0.05
     assert job()
-    seen["cancelled_at"] = job().share
+    seen["cancelled_at"] = share()
     bpy.ops.mphdrr.cancel_job()
     asked = time.perf_counter()
     while job():
@@ -133,7 +138,7 @@ running = steps()
 def drive():
     beats.append(time.perf_counter())
     if job():
-        progress.append(job().share)
+        progress.append(share())
     try:
         return next(running) or 0.05
     except StopIteration:

@@ -33,7 +33,7 @@ def example_job(context: bpy.types.Context) -> jobs.Job:
     scene_name, path = scene.name, rendering.run_path(scene)
 
     def work(progress: Progress) -> Any:
-        stored = adding.work(part_of(progress, 0, 2))
+        stored = adding.work(part_of(progress, 0, 2) or progress)
         (run,) = run_recipe(recipe, system, stages=lambda stage: part_of(progress, 1, 2) or progress)
         write_run(run, path)
         return stored, run

@@ -1,4 +1,4 @@
-"""The example in one click; clicking a tile of the mosaic makes its module active, and back."""
+"""The example in one click (docs/images/window.png is this picture); clicking a tile of the mosaic makes its module active, and back."""
 
 import json
 from pathlib import Path
@@ -11,7 +11,7 @@ SCRIPT = Path(__file__).with_name("window_display.py")
 
 def test_the_example_is_seen_and_tiles_planes_list_and_mosaic_show_one_module(blender_window, work_folder):
     result_file = work_folder / "seen.json"
-    picture = blender_window(SCRIPT.read_text(encoding="utf-8"), result_file, seconds=45)
+    picture = blender_window(SCRIPT.read_text(encoding="utf-8"), result_file, seconds=50)
     seen = json.loads(result_file.read_text())
     assert seen["ok"], seen
     assert seen["seconds"] < 15 and seen["hidden"] == ["Camera", "Cube", "Light"]
@@ -26,5 +26,5 @@ def test_the_example_is_seen_and_tiles_planes_list_and_mosaic_show_one_module(bl
     tiles = [
         screen[round(top) : round(bottom), round(left) : round(right)] for left, top, right, bottom in seen["tiles"]
     ]
-    assert min((tile[15:].max(axis=2) > 150).mean() for tile in tiles) > 0.02, "every tile shows the phantom"
+    assert min((tile[15:].max(axis=2) > 90).mean() for tile in tiles) > 0.05, "every tile shows the phantom"
     assert lit(seen["tile"]) > 0.9 and lit(seen["other"]) < 0.3, "the active module's tile has a frame"

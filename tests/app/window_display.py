@@ -38,7 +38,7 @@ def load() -> None:
         seen["seconds"] = time.monotonic() - started
         sidebar = next(region for region in area.regions if region.type == "UI")
         sidebar.active_panel_category = "mphDRR"
-        bpy.app.timers.register(step, first_interval=3.0)
+        bpy.app.timers.register(step, first_interval=8.0)  # drawn in software, slowly
         return None
 
     bpy.app.timers.register(look, first_interval=0.2)

@@ -5,6 +5,7 @@ from bpy.props import BoolProperty, EnumProperty, FloatProperty
 
 from ..core.errors import InputError
 from ..core.runs.display import COLORS, SCALES, Display
+from . import choices
 from .updates import on_edit
 
 _SCALE_TEXTS = {
@@ -13,10 +14,10 @@ _SCALE_TEXTS = {
     "log": ("Logarithmic", "Colours in proportion to the numbers' logarithms, over three decades unless typed"),
 }
 _PLANES = (
-    ("NONE", "None", "No planes", 0),
-    ("ACTIVE", "Active", "That of the active module", 1),
-    ("RING", "Ring", "Those of the active module's ring", 2),
-    ("ALL", "All", "Those of all visible modules", 3),
+    ("NONE", "None", "No planes"),
+    ("ACTIVE", "Active", "That of the active module"),
+    ("RING", "Ring", "Those of the active module's ring"),
+    ("ALL", "All", "Those of all visible modules"),
 )
 
 
@@ -25,12 +26,12 @@ class DisplayProperties(bpy.types.PropertyGroup):
 
     colors: EnumProperty(
         name="Colors", description="Colours of the numbers; all but grey are perceptually uniform",
-        items=[(name.upper(), name.capitalize(), "", i) for i, name in enumerate(COLORS)],
+        items=choices.items({}, ((name.upper(), name.capitalize(), "") for name in COLORS)),
         default="INFERNO", update=on_edit("display"),
     )  # fmt: skip
     scale: EnumProperty(
         name="Scale", description="How the colours follow the numbers",
-        items=[(name.upper(), *_SCALE_TEXTS[name], i) for i, name in enumerate(SCALES)],
+        items=choices.items({}, ((name.upper(), *_SCALE_TEXTS[name]) for name in SCALES)),
         default="LINEAR", update=on_edit("display"),
     )  # fmt: skip
     automatic: BoolProperty(
@@ -44,8 +45,8 @@ class DisplayProperties(bpy.types.PropertyGroup):
         name="High", description="The number that has the last colour", default=1.0, update=on_edit("display")
     )
     planes: EnumProperty(
-        name="Planes", description="Whose projections stand in the scene, between pinhole and ROI", items=_PLANES,
-        default="ALL", update=on_edit("planes"),
+        name="Planes", description="Whose projections stand in the scene, between pinhole and ROI",
+        items=choices.items({}, _PLANES), default="ALL", update=on_edit("planes"),
     )  # fmt: skip
     plane_distance: FloatProperty(
         name="Distance", description="Of the planes from the pinholes, mm; 0: between pinhole and ROI", min=0.0,

@@ -100,7 +100,8 @@ class MPHDRR_OT_pick_module(bpy.types.Operator):
     @classmethod
     def poll(cls, context: bpy.types.Context) -> bool:
         space = context.space_data
-        return space is not None and space.type == "IMAGE_EDITOR" and images.tiles(space.image) is not None
+        is_shown = space is not None and space.type == "IMAGE_EDITOR" and images.tiles(space.image) is not None
+        return polled(cls, is_shown, "Only in an Image Editor that shows the mosaic")
 
     def invoke(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str]:
         try:

@@ -58,7 +58,7 @@ class Display:
             high = float(np.max(values, initial=-np.inf, where=np.isfinite(values)))
             high = high if np.isfinite(high) else 0.0
         if low is None and self.scale == "log":
-            low = high / 10.0**_DECADES
+            low = min(high, high / 10.0**_DECADES)
         elif low is None:
             low = min(0.0, float(np.min(values, initial=0.0, where=np.isfinite(values))))
         return low, high

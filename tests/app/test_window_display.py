@@ -1,4 +1,4 @@
-"""The example in one click (docs/images/window.png is this picture); clicking a tile of the mosaic makes its module active, and back."""
+"""The example in one click, of which docs/images/window.png is the picture; a click on a tile makes its module active."""
 
 import json
 from pathlib import Path

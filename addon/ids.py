@@ -5,6 +5,7 @@ CATEGORY = "mphDRR"  # the sidebar tab
 
 # --- Operators: idname as in `bpy.ops.<idname>` -------------------------------------------------------------
 IMPORT_GEOMETRY = "mphdrr.import_geometry"
+LOAD_EXAMPLE = "mphdrr.load_example"
 SHOW_MODULES = "mphdrr.show_modules"
 LOOK_THROUGH_MODULE = "mphdrr.look_through_module"
 AIM_MODULES = "mphdrr.aim_modules"
@@ -35,6 +36,7 @@ RENDER_PROJECTIONS = "mphdrr.render_projections"
 EXPORT_DATASET = "mphdrr.export_dataset"
 LOAD_RECIPE = "mphdrr.load_recipe"
 SHOW_PROJECTIONS = "mphdrr.show_projections"
+PICK_MODULE = "mphdrr.pick_module"
 CANCEL_JOB = "mphdrr.cancel_job"
 
 # --- Panels, drawn in the order of the work: bl_order -----------------------------------------------------------------
@@ -42,8 +44,9 @@ ORDER_GEOMETRY, ORDER_PHANTOM, ORDER_PROJECTIONS, ORDER_EXPORT = 0, 10, 20, 30
 
 # --- Datablocks ---------------------------------------------------------------------------------------------
 SCANNER = "Scanner"  # default name of a scanner's collection
-PARTS = ("NONE", "CAMERA", "COLLIMATOR", "CRYSTAL", "ROI")  # `Object.mphdrr_module.part`
+PARTS = ("NONE", "CAMERA", "COLLIMATOR", "CRYSTAL", "ROI", "PLANE")  # `Object.mphdrr_module.part`
 MOSAIC = "mphDRR mosaic"
+PLANES = "mphDRR projections"  # the collection of the planes that show them
 PREVIEW = ".preview"  # in the names of coarser copies of large volumes, for display only
 
 
@@ -65,3 +68,8 @@ def ring_name(ring: int) -> str:
 def projection_name(number: int, n_modules: int = 80) -> str:
     """Name of a module's projection image: "mphDRR 07", padded as `module_name`."""
     return module_name(number, n_modules).replace("Module", "mphDRR")
+
+
+def picture_name(projection: str) -> str:
+    """Name of the picture of a module's projection, in colours: "mphDRR 07 picture"."""
+    return f"{projection} picture"

@@ -1,46 +1,82 @@
 """Projections as Blender images, shown as the pinhole sees them: +v up, +u left.
 
 The arrays' column index grows along +u, so an image's columns are reversed; its rows start at the bottom, as the arrays' do.
-Module images hold the exact float32 values in R, G and B; the mosaic is scaled for display.
+Each module has two: one holds the exact float32 numbers in R, G and B, the other, as the mosaic, shows them in colours.
 """
 
-from collections.abc import Generator, Iterable
+from collections.abc import Generator
+from typing import Any
 
 import bpy
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core.runs.mosaic import COLUMNS, as_seen, mosaic
+from ..core.runs.display import Display
+from ..core.runs.mosaic import as_seen, sheet
+from ..core.runs.run import ProjectionRun
 from . import ids
 
 _KEY = "mphdrr_projection"  # custom property: marks the images that a new run replaces
-_MOSAIC_PIXELS = 6e6  # 80 views of 256 x 256 are shown pixel by pixel, larger ones reduced
+_TILES = "mphdrr_tiles"  # custom property of the mosaic: its modules, unit, and where in it which one's image is
 
 
-def storing(projections: NDArray[np.float32], numbers: Iterable[int]) -> Generator[None, None, bpy.types.Image]:
-    """Make a float image of each module and the mosaic, packed into the .blend, in place of those of an earlier run.
+def storing(run: ProjectionRun, display: Display) -> Generator[None, None, bpy.types.Image]:
+    """Make images of a run, packed into the .blend, in place of those of an earlier run.
 
-    `projections` are (M, n_v, n_u), the modules' `numbers` (M,) name the images. Yields between steps, so that a window
-    can be drawn, and returns the mosaic, scaled so that its largest value is white.
+    For each module one of the exact numbers, float32, and one to look at; and the mosaic, which is returned. Yields
+    between steps, so that a window can be drawn.
     """
-    numbers = [int(number) for number in numbers]
-    names = [ids.projection_name(number, max(numbers)) for number in numbers]
-    for picture, name in zip(as_seen(projections), names, strict=True):
+    numbers = run.system.numbers.tolist()
+    names = [projection_name(number, numbers) for number in numbers]
+    for picture, name in zip(as_seen(run.projections), names, strict=True):
         _store(name, picture, exact=True)
         yield
-    count, n_v, n_u = projections.shape
-    pixels = -(-count // COLUMNS) * COLUMNS * n_v * n_u
-    factor = min(int(np.ceil(np.sqrt(pixels / _MOSAIC_PIXELS))), n_v, n_u)
-    if factor > 1:  # too large to look at: means over blocks of pixels
-        rows, width = n_v // factor, n_u // factor
-        blocks = projections[:, : rows * factor, : width * factor].reshape(count, rows, factor, width, factor)
-        projections = blocks.mean(axis=(2, 4), dtype=np.float32)
-    sheet = np.maximum(mosaic(projections), 0.0)
-    yield
-    image = _store(ids.MOSAIC, sheet / (float(sheet.max(initial=0.0)) or 1.0), exact=False)
-    kept = {*names, ids.MOSAIC}
+    kept = {*names, *map(ids.picture_name, names), ids.MOSAIC}
     for other in [image for image in bpy.data.images if _KEY in image and image.name not in kept]:
         bpy.data.images.remove(other)
+    return (yield from _showing(run.projections, numbers, run.system.rings().tolist(), run.unit, display))
+
+
+def show_again(display: Display) -> None:
+    """Make the pictures anew from the exact images, as `display` says; nothing where there is no run."""
+    shown = tiles(bpy.data.images.get(ids.MOSAIC))
+    if shown is None:
+        return
+    numbers = shown["numbers"]
+    found = [bpy.data.images.get(projection_name(number, numbers)) for number in numbers]
+    if None not in found:
+        projections = np.stack([projection_array(image) for image in found])
+        for _ in _showing(projections, numbers, shown["rings"], shown["unit"], display):
+            pass
+
+
+def tiles(image: bpy.types.Image | None) -> dict[str, Any] | None:
+    """Of the mosaic: `numbers` and `rings` of its modules, `unit`, the tiles' size `tile` and their `corners`; else None.
+
+    Rows and columns are counted from the top left.
+    """
+    return None if image is None or _TILES not in image else image[_TILES].to_dict()
+
+
+def projection_name(number: int, numbers: list[int]) -> str:
+    """Name of the exact image of the module `number` of a run of the modules `numbers`."""
+    return ids.projection_name(number, max(numbers))
+
+
+def _showing(
+    projections: NDArray[np.float32], numbers: list[int], rings: list[int], unit: str, display: Display
+) -> Generator[None, None, bpy.types.Image]:
+    """Make the pictures of projections (M, n_v, n_u) as `display` says; returns the mosaic."""
+    window = display.window(projections)
+    for picture, number in zip(as_seen(projections), numbers, strict=True):
+        name = ids.picture_name(projection_name(number, numbers))
+        _store(name, display.colored(picture, window), exact=False)
+        yield
+    drawn = sheet(projections, numbers, rings, unit, display)
+    image = _store(ids.MOSAIC, drawn.picture, exact=False)
+    image[_TILES] = {
+        "numbers": numbers, "rings": rings, "unit": unit, "corners": drawn.corners.ravel().tolist(), "tile": drawn.tile,
+    }  # fmt: skip
     return image
 
 
@@ -50,6 +86,14 @@ def projection_array(image: bpy.types.Image) -> NDArray[np.float32]:
     pixels = np.empty(4 * width * height, np.float32)
     image.pixels.foreach_get(pixels)
     return np.ascontiguousarray(pixels.reshape(height, width, 4)[:, ::-1, 0])
+
+
+def redraw_mosaic() -> None:
+    """Have the Image Editors that show the mosaic drawn again: another module is active."""
+    for window in bpy.context.window_manager.windows:
+        for area in window.screen.areas:
+            if area.type == "IMAGE_EDITOR" and tiles(area.spaces.active.image) is not None:
+                area.tag_redraw()
 
 
 def show(image: bpy.types.Image, context: bpy.types.Context) -> bool:
@@ -100,12 +144,12 @@ def _fit(context: bpy.types.Context, window: bpy.types.Window, area: bpy.types.A
     bpy.app.timers.register(fit, first_interval=0.2)
 
 
-def _store(name: str, picture: NDArray[np.float32], *, exact: bool) -> bpy.types.Image:
-    """Make or replace our image `name`, from a picture whose row 0 is the top."""
-    height, width = picture.shape
+def _store(name: str, picture: NDArray[Any], *, exact: bool) -> bpy.types.Image:
+    """Make or replace our image `name`, from numbers (height, width) or 8-bit colours (…, 3), row 0 at the top."""
+    height, width = picture.shape[:2]
     image = old = bpy.data.images.get(name)
     if old is None or _KEY not in old or tuple(old.size) != (width, height) or old.is_float != exact:
-        image = bpy.data.images.new(name, width, height, float_buffer=exact, is_data=True)
+        image = bpy.data.images.new(name, width, height, float_buffer=exact, is_data=exact)
         if old is not None and _KEY in old:
             old.user_remap(image)
             bpy.data.images.remove(old)
@@ -114,10 +158,19 @@ def _store(name: str, picture: NDArray[np.float32], *, exact: bool) -> bpy.types
             old.name = f"{name}.other"
             image.name = name
     pixels = np.ones((height, width, 4), np.float32)
-    pixels[..., :3] = picture[::-1, :, None]
+    pixels[..., :3] = picture[::-1, :, None] if exact else picture[::-1] / np.float32(255)
     image.pixels.foreach_set(pixels.ravel())
     image.update()
     image.use_fake_user = True  # or it is not saved while nothing shows it
     image[_KEY] = True
-    image.pack()
+    if exact:
+        image.pack()
     return image
+
+
+@bpy.app.handlers.persistent
+def before_save(*_: object) -> None:
+    """Pack the pictures to look at: only now, since each edit of the display makes them anew."""
+    for image in bpy.data.images:
+        if _KEY in image and image.is_dirty:
+            image.pack()

@@ -15,14 +15,18 @@ from ..operators import add_phantom
 from . import (
     following,
     ids,
+    images,
     jobs,
     live_phantoms,
     live_scanner,
+    planes,
     properties,
+    rendering,
     scanner,
     selection,
     slices,
     storage,
+    tiles,
     updates,
     volumes,
 )
@@ -84,11 +88,14 @@ HANDLERS: tuple[tuple[list[Any], Any], ...] = (
     (bpy.app.handlers.load_post, volumes.after_load),
     (bpy.app.handlers.load_post, live_scanner.after_load),
     (bpy.app.handlers.depsgraph_update_post, live_scanner.after_update),
+    (bpy.app.handlers.depsgraph_update_post, selection.after_update),
+    (bpy.app.handlers.depsgraph_update_post, planes.after_update),
     (bpy.app.handlers.frame_change_post, live_scanner.after_frame),
     (bpy.app.handlers.frame_change_post, slices.after_frame_change),
     (bpy.app.handlers.undo_post, live_scanner.after_undo),
     (bpy.app.handlers.redo_post, live_scanner.after_undo),
     (bpy.app.handlers.save_pre, storage.before_save),
+    (bpy.app.handlers.save_pre, images.before_save),
     (bpy.app.handlers.save_post, storage.after_save),
     (bpy.app.handlers.save_post_fail, storage.restore_paths),
 )
@@ -104,6 +111,8 @@ UPDATES: dict[str, Callable[..., None]] = {
     "phantom": live_phantoms.settings_changed,
     "display_range": slices.range_changed,
     "slices": slices.update,
+    "display": rendering.display_changed,
+    "planes": planes.update,
 }
 
 _registered = ExitStack()  # takes back what was registered, in reverse order
@@ -127,6 +136,12 @@ def register(command: Callable[..., int] | None = None) -> None:
         for handlers, function in HANDLERS:
             handlers.append(function)
             _registered.callback(_remove_handler, handlers, function)
+        if not bpy.app.background:
+            _registered.callback(tiles.draw_no_frames, tiles.draw_frames())
+            for name in ("Image", "Image Editor Tool: Sample"):  # the editor's usual tool takes clicks first
+                keymap = bpy.context.window_manager.keyconfigs.addon.keymaps.new(name, space_type="IMAGE_EDITOR")
+                click = keymap.keymap_items.new(ids.PICK_MODULE, "LEFTMOUSE", "PRESS")
+                _registered.callback(keymap.keymap_items.remove, click)
         if command is not None:
             _registered.callback(bpy.utils.unregister_cli_command, bpy.utils.register_cli_command(ids.PREFIX, command))
     except Exception:

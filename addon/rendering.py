@@ -18,8 +18,10 @@ from ..core.runs.recipe import Recipe, read_recipe
 from ..core.runs.run import ProjectionRun
 from ..core.runs.run_recipe import recipe_model, run_recipe, with_phantom
 from ..core.volumes.volume import require_quantity
-from . import images, jobs, phantoms, scanner, storage, volumes
+from . import images, jobs, phantoms, planes, scanner, storage, volumes
 from .projection_properties import OPENING_ANGLE, set_panel
+
+_REST = 0.05  # s without an edit of the display before the pictures are made anew
 
 
 def render_job(context: bpy.types.Context, recipe: Recipe, volume: str = "", mu: str = "") -> jobs.Job:
@@ -39,13 +41,13 @@ def render_job(context: bpy.types.Context, recipe: Recipe, volume: str = "", mu:
     for chosen in filter(None, (item, mu_item)):
         phantoms.require_current(chosen)
     rows, columns = recipe["detector.rows"], recipe["detector.columns"]
-    # The array, and Blender's images with four channels in memory and once more, packed.
-    require(36.0 * len(system) * rows * columns, f"{len(system)} images of {columns} x {rows} pixels")
+    # The array; Blender's images with four channels in memory and once more, packed; the pictures of them, likewise.
+    require(44.0 * len(system) * rows * columns, f"{len(system)} images of {columns} x {rows} pixels")
     recipe = recipe.updated({"volume.object": item.name, "attenuation.object": mu_item and mu_item.name})
     recipe = _with_volume(recipe, item)
     read_volume, read_mu = volumes.reader(item), mu_item and volumes.reader(mu_item)
     energy = mu_item and phantoms.mu_energy(mu_item)
-    path = storage.folder() / f"{bpy.path.clean_name(scene.name)}-projections.h5"
+    path = run_path(scene)
     scene_name, start = scene.name, time.perf_counter()
 
     def work(progress: Progress) -> ProjectionRun:
@@ -57,16 +59,20 @@ def render_job(context: bpy.types.Context, recipe: Recipe, volume: str = "", mu:
         return run
 
     def finish(run: ProjectionRun) -> Generator[None, None, str]:
-        images.show((yield from images.storing(run.projections, run.system.numbers)), bpy.context)
         scene = bpy.data.scenes.get(scene_name)
         if scene is None:
             raise InputError(f"the scene {scene_name!r} is gone; its projections are in {path}")
-        _record_run(scene, run, path)
+        images.show((yield from storing(scene, run, path)), bpy.context)
         where = path if bpy.data.filepath else f"{path} until the .blend is saved"
         seconds = time.perf_counter() - start
         return f"Projected {recipe['volume.object']!r} into {len(run.views)} modules in {seconds:.1f} s: {where}"
 
     return jobs.Job("Projecting", work, finish)
+
+
+def run_path(scene: bpy.types.Scene) -> Path:
+    """The file of the scene's last run."""
+    return storage.folder() / f"{bpy.path.clean_name(scene.name)}-projections.h5"
 
 
 def load_recipe(scene: bpy.types.Scene, path: Path) -> None:
@@ -98,17 +104,34 @@ def export_run(scene: bpy.types.Scene, filepath: str) -> Path:
 
 def show_run(scene: bpy.types.Scene, run: ProjectionRun, path: Path) -> None:
     """Make images of `run`, which is kept in the file `path`, and show it as the scene's last."""
-    for _ in images.storing(run.projections, run.system.numbers):
+    for _ in storing(scene, run, path):
         pass
-    _record_run(scene, run, path)
 
 
-def _record_run(scene: bpy.types.Scene, run: ProjectionRun, path: Path) -> None:
+def storing(scene: bpy.types.Scene, run: ProjectionRun, path: Path) -> Generator[None, None, bpy.types.Image]:
+    """Make images and planes of `run`, which is kept in the file `path`, and note it as the scene's last."""
+    mosaic = yield from images.storing(run, scene.mphdrr_display.display())
+    planes.make(scene, run)
     state = scene.mphdrr_projections
     state.run_file = storage.stored_path(path.absolute())
     n_v, n_u = run.views.shape
     what = [run.settings.get("volume"), run.settings.get("backend")]
     state.run_summary = ", ".join([f"{len(run.views)} views of {n_u} × {n_v}", *(text for text in what if text)])
+    return mosaic
+
+
+def display_changed(scene: bpy.types.Scene) -> None:
+    """Show the last run in other colours or another window, once the settings rest."""
+    if bpy.app.background:
+        _display_again()
+    elif not bpy.app.timers.is_registered(_display_again):
+        bpy.app.timers.register(_display_again, first_interval=_REST)
+
+
+def _display_again() -> None:
+    settings = bpy.context.scene.mphdrr_display
+    if not settings.problem:  # which there is between the typing of the window's two ends
+        images.show_again(settings.display())
 
 
 def _with_volume(recipe: Recipe, item: bpy.types.Object) -> Recipe:

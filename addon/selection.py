@@ -5,7 +5,7 @@ from typing import Any
 
 import bpy
 
-from . import scanner
+from . import following, images, scanner
 from .reports import polled, run_reported
 
 
@@ -59,9 +59,25 @@ def select(context: bpy.types.Context, modules: Iterable[bpy.types.Object]) -> N
         layer.objects.active = shown[0]
 
 
+@bpy.app.handlers.persistent
+def after_update(scene: bpy.types.Scene, *_: Any) -> None:
+    """Another module was made active in the viewport: the list and the mosaic follow."""
+    camera = module_of(bpy.context.view_layer.objects.active)
+    collection = scanner.active_scanner(scene)
+    if camera is None or collection is None or camera == listed_module(scene):
+        return
+    index = collection.all_objects.find(camera.name)
+    if index >= 0:
+        with following.writing():
+            scene.mphdrr_geometry.active_index = index
+        images.redraw_mosaic()
+
+
 def select_active(scene: bpy.types.Scene) -> None:
     """Select the module that is active in the panel's list, as a click on its camera would."""
     camera = listed_module(scene)
+    if following.is_writing():  # the list follows the viewport
+        return
     if camera is not None and camera.visible_get(view_layer=bpy.context.view_layer):
         select(bpy.context, [camera])
 

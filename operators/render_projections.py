@@ -8,7 +8,7 @@ import bpy
 from bpy.props import FloatProperty, StringProperty
 from bpy_extras.io_utils import ExportHelper, ImportHelper
 
-from ..addon import ids, images, jobs, rendering, scanner, storage
+from ..addon import ids, images, jobs, rendering, scanner, storage, tiles
 from ..addon.decimals import typed
 from ..addon.projection_properties import OPENING_ANGLE, ProjectionSettings, settings_recipe
 from ..addon.reports import polled, run_reported
@@ -88,6 +88,28 @@ class MPHDRR_OT_show_projections(bpy.types.Operator):
             self.report({"ERROR"}, "no window with a 3D view to open an Image Editor in")
             return {"CANCELLED"}
         return {"FINISHED"}
+
+
+class MPHDRR_OT_pick_module(bpy.types.Operator):
+    """Make the module active whose image in the mosaic is clicked"""
+
+    bl_idname = ids.PICK_MODULE
+    bl_label = "Pick Module"
+    bl_options = {"UNDO", "INTERNAL"}
+
+    @classmethod
+    def poll(cls, context: bpy.types.Context) -> bool:
+        space = context.space_data
+        is_shown = space is not None and space.type == "IMAGE_EDITOR" and images.tiles(space.image) is not None
+        return polled(cls, is_shown, "Only in an Image Editor that shows the mosaic")
+
+    def invoke(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str]:
+        try:
+            picked = tiles.pick(context, event.mouse_region_x, event.mouse_region_y)
+        except InputError as error:
+            self.report({"WARNING"}, str(error))
+            return {"CANCELLED"}
+        return {"PASS_THROUGH"} if picked is None else {"FINISHED"}
 
 
 class MPHDRR_OT_export_dataset(ExportHelper, bpy.types.Operator):

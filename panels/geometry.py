@@ -6,7 +6,7 @@ import textwrap
 import bpy
 import numpy as np
 
-from ..addon import ids, scanner, selection
+from ..addon import ids, jobs, scanner, selection
 
 _LINE = 32  # letters that fit into the sidebar at its usual width
 
@@ -60,10 +60,15 @@ class MPHDRR_PT_geometry(Sidebar, bpy.types.Panel):
     def draw(self, context: bpy.types.Context) -> None:
         layout = self.layout
         layout.operator_context = "INVOKE_DEFAULT"
-        layout.operator(ids.IMPORT_GEOMETRY, text="Import Workbook", icon="IMPORT")
         collection = scanner.active_scanner(context.scene)
+        if collection is None and not jobs.is_running():
+            row = layout.row()
+            row.scale_y = 1.4
+            row.operator(ids.LOAD_EXAMPLE, icon="PLAY")
+        layout.operator(ids.IMPORT_GEOMETRY, text="Import Workbook", icon="IMPORT")
         if collection is None:
-            layout.label(text="Or drop it on the viewport.", icon="INFO")
+            layout.label(text="Or drop one on the viewport.", icon="INFO")
+            jobs.draw_job(layout)
             return
         if len(scanner.scanners(context.scene)) > 1:
             layout.prop(context.scene.mphdrr_geometry, "scanner", text="")

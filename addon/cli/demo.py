@@ -9,7 +9,7 @@ from pathlib import Path
 from ...core.cli.options import add_command, add_workbook, progress_bar, read_workbook
 from ...core.files import ensure_folder
 from ...core.runs.files import write_run
-from ...core.runs.mosaic import mosaic, write_png
+from ...core.runs.mosaic import write_sheet
 from ...core.runs.recipe import Recipe
 from ...core.runs.run_recipe import run_recipe
 from .scene import new_scene, quiet, save_scene
@@ -56,7 +56,7 @@ def _run(arguments: argparse.Namespace) -> None:
         volume_object = volumes.add_volume(run.volume, "Derenzo phantom", pose, phantom)
     with _step("dataset"):
         write_run(run, out / "run.h5")
-        write_png(mosaic(run.projections), out / "mosaic.png")
+        write_sheet(run, out / "mosaic.png")
     with _step("scene"):
         rendering.show_run(scene, run, out / "run.h5")
         save_scene(out / "scanner.blend")

@@ -4,7 +4,7 @@ import argparse
 
 from ..errors import InputError
 from ..runs.files import FORMATS, read_run, write_run
-from ..runs.mosaic import mosaic, write_png
+from ..runs.mosaic import write_sheet
 from .options import add_command, output_path
 
 
@@ -31,5 +31,5 @@ def _run(arguments: argparse.Namespace) -> None:
         write_run(run, path)
         print(path)
     if picture is not None:
-        write_png(mosaic(run.projections), picture)
+        write_sheet(run, picture)
         print(picture)

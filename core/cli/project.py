@@ -13,7 +13,7 @@ import numpy as np
 from ..errors import InputError
 from ..phantoms.kinds import KINDS
 from ..runs.files import FORMATS, read_run, write_run
-from ..runs.mosaic import mosaic, write_png
+from ..runs.mosaic import write_sheet
 from ..runs.recipe import Recipe, read_recipe, write_recipe
 from ..runs.run_recipe import run_recipe
 from ..runs.settings import SETTINGS
@@ -174,7 +174,7 @@ def _run(arguments: argparse.Namespace) -> None:
         file = numbered_path(path, number, count)
         write_run(run, file)
         if picture is not None:
-            write_png(mosaic(run.projections), numbered_path(picture, number, count))
+            write_sheet(run, numbered_path(picture, number, count))
         views, (n_v, n_u) = len(run.views), run.views.shape
         plural, largest = "s" * (views > 1), float(np.max(run.projections))
         print(f"{file}: {views} projection{plural} of {n_v} x {n_u} pixels, largest {largest:.4g} {run.unit}")

@@ -1,14 +1,18 @@
-"""Pictures of projections: upright, as seen from the pinhole, alone or side by side."""
+"""Pictures of projections: upright, as seen from the pinhole, alone or all in one with numbers and a colour bar."""
 
 import os
 import struct
 import zlib
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..errors import InputError
 from ..files import replacing
+from .display import Display
+from .lettering import HEIGHT, WIDTH, lettered
+from .run import ProjectionRun
 
 
 def as_seen(images: ArrayLike) -> NDArray:
@@ -22,6 +26,10 @@ def as_seen(images: ArrayLike) -> NDArray:
 
 COLUMNS = 20
 """Images in a row, unless told otherwise."""
+_BORDER = 64
+"""Grey between the images of a sheet, 0 to 255."""
+_SMALLEST = 64
+"""Pixels along a side of an image in a sheet, at least."""
 
 
 def mosaic(images: ArrayLike, columns: int = COLUMNS) -> NDArray:
@@ -41,16 +49,127 @@ def mosaic(images: ArrayLike, columns: int = COLUMNS) -> NDArray:
     return sheet.reshape(rows, columns, n_v, n_u).swapaxes(1, 2).reshape(rows * n_v, columns * n_u)
 
 
-def write_png(picture: ArrayLike, path: str | os.PathLike[str]) -> None:
-    """Write a picture (row 0 at the top) as an 8-bit grey PNG: 0 is black, or the smallest value if that is negative.
+@dataclass(frozen=True, eq=False)
+class Sheet:
+    """All projections of a run in one picture that says what it shows."""
 
-    The largest value is white. `InputError` where the file cannot be written.
+    picture: NDArray[np.uint8]
+    """Colours (height, width, 3), row 0 at the top."""
+    corners: NDArray[np.int64]
+    """Row and column (M, 2) of each image's top left pixel."""
+    tile: tuple[int, int]
+    """Rows and columns of an image in it."""
+    window: tuple[float, float]
+    """The numbers at the colour bar's lower and upper end."""
+
+    def image_at(self, row: float, column: float) -> int | None:
+        """Index of the image at a place in the picture; None between images."""
+        inside = (np.array([row, column]) >= self.corners) & (np.array([row, column]) < self.corners + self.tile)
+        found = np.flatnonzero(inside.all(axis=1))
+        return int(found[0]) if len(found) else None
+
+
+def sheet(
+    projections: NDArray[np.float32],
+    numbers: ArrayLike,
+    rings: ArrayLike,
+    unit: str,
+    display: Display | None = None,
+    pixels: float = 6e6,
+) -> Sheet:
+    """Draw the images (M, n_v, n_u) of modules with these `numbers` and `rings` (M,), a ring in a row, with a colour bar.
+
+    Rings follow each other in the order of their modules; one of more than `COLUMNS` modules takes several rows. Where the
+    images have more than `pixels` together, they are shown smaller, as means over blocks of pixels; small ones are shown
+    larger, so that the numbers do not hide them. The colour bar's ends are the window of `display`, which is by default
+    that of the exact numbers.
     """
-    picture = np.asarray(picture, np.float32)
-    low, high = float(picture.min(initial=0.0)), float(picture.max(initial=0.0))
-    grey = np.rint((picture - low) / ((high - low) or 1.0) * 255).astype(np.uint8)
-    header = struct.pack(">2I5B", grey.shape[1], grey.shape[0], 8, 0, 0, 0, 0)  # 8 bits, grey
-    rows = zlib.compress(np.pad(grey, ((0, 0), (1, 0))).tobytes())  # a 0 before each: it is stored as it is
+    display = display or Display()
+    window = display.window(projections)
+    images = display.colored(_sized(as_seen(projections), pixels), window)
+    places = _places(np.asarray(rings))
+    n_v, n_u = tile = images.shape[1:3]
+    letters = max(1, round(min(n_v, n_u) / 60))
+    gap = 2 * letters
+    corners = gap + places * (np.array(tile) + gap)
+    height, width = corners.max(axis=0) + tile + gap
+    picture = np.full((height, width, 3), _BORDER, np.uint8)
+    for image, (row, column), number in zip(images, corners, np.asarray(numbers), strict=True):
+        picture[row : row + n_v, column : column + n_u] = image
+        _write(picture, str(number), row + letters, column + letters, letters)
+    bar = _color_bar(display, window, unit, height, max(letters, round(height / 300)))
+    return Sheet(np.concatenate([picture, bar], axis=1), corners, (n_v, n_u), window)
+
+
+def write_sheet(run: ProjectionRun, path: str | os.PathLike[str], display: Display | None = None) -> None:
+    """Write all images of a run in one picture, a PNG; see `sheet`."""
+    drawn = sheet(run.projections, run.system.numbers, run.system.rings(), run.unit, display)
+    write_png(drawn.picture, path)
+
+
+def _sized(images: NDArray[np.float32], pixels: float) -> NDArray[np.float32]:
+    """The images with so many pixels that they can be looked at."""
+    count, n_v, n_u = images.shape
+    factor = min(int(np.ceil(np.sqrt(images.size / pixels))), n_v, n_u)
+    if factor > 1:
+        rows, columns = n_v // factor, n_u // factor
+        blocks = images[:, : rows * factor, : columns * factor].reshape(count, rows, factor, columns, factor)
+        return blocks.mean(axis=(2, 4), dtype=np.float32)
+    factor = -(-_SMALLEST // max(n_v, n_u))
+    return images.repeat(factor, axis=1).repeat(factor, axis=2) if factor > 1 else images
+
+
+def _places(rings: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Row and column (M, 2) of each image, counted in images."""
+    places = np.empty((len(rings), 2), np.int64)
+    row = 0
+    for ring in dict.fromkeys(rings.tolist()):
+        members = np.flatnonzero(rings == ring)
+        position = np.arange(len(members))
+        places[members] = np.stack([row + position // COLUMNS, position % COLUMNS], axis=1)
+        row += int(position[-1]) // COLUMNS + 1
+    return places
+
+
+def _color_bar(
+    display: Display, window: tuple[float, float], unit: str, height: int, letters: int
+) -> NDArray[np.uint8]:
+    """A colour bar (height, width, 3) with its numbers and, above, its unit."""
+    line = HEIGHT * letters
+    marks = [(share, f"{display.value_at(share, window):.4g}") for share in (1.0, 0.75, 0.5, 0.25, 0.0)]
+    columns = max(len(unit), 3 + max(len(text) for _, text in marks))
+    bar = np.full((height, (columns + 2) * WIDTH * letters, 3), _BORDER, np.uint8)
+    top, bottom, left = 2 * line, height - line, WIDTH * letters
+    _write(bar, unit, line // 3, left, letters)
+    ramp = [display.value_at(share, window) for share in np.linspace(1.0, 0.0, bottom - top)]
+    bar[top:bottom, left : 3 * left] = display.colored(ramp, window)[:, None]
+    for share, text in marks:
+        middle = bottom - round(share * (bottom - top))
+        _write(bar, text, min(max(middle - line // 2, top - line // 2), height - line), 4 * left, letters)
+    return bar
+
+
+def _write(picture: NDArray[np.uint8], text: str, row: int, column: int, letters: int) -> None:
+    """Write a line of text in white, on what is there, darkened."""
+    ink = lettered(text, letters)
+    place = picture[row : row + ink.shape[0], column : column + ink.shape[1]]
+    place //= 2
+    place[ink[: place.shape[0], : place.shape[1]]] = 255
+
+
+def write_png(picture: ArrayLike, path: str | os.PathLike[str]) -> None:
+    """Write a picture, row 0 at the top, as an 8-bit PNG: colours (height, width, 3) of uint8, or numbers (height, width).
+
+    Of numbers, 0 is black, or the smallest if that is negative, and the largest is white. `InputError` where the file cannot
+    be written.
+    """
+    pixels = np.asarray(picture)
+    if pixels.ndim == 2:
+        low, high = float(pixels.min(initial=0.0)), float(pixels.max(initial=0.0))
+        pixels = np.rint((pixels - low) / ((high - low) or 1.0) * 255).astype(np.uint8)[..., None]
+    height, width, channels = pixels.shape
+    header = struct.pack(">2I5B", width, height, 8, {1: 0, 3: 2}[channels], 0, 0, 0)  # 8 bits, grey or colours
+    rows = zlib.compress(np.pad(pixels.reshape(height, -1), ((0, 0), (1, 0))).tobytes())  # 0 before each: stored as is
     png = b"\x89PNG\r\n\x1a\n"
     for name, data in ((b"IHDR", header), (b"IDAT", rows), (b"IEND", b"")):
         png += struct.pack(">I", len(data)) + name + data + struct.pack(">I", zlib.crc32(name + data))

@@ -20,7 +20,7 @@ def test_main_path_runs_in_the_window(blender_window, work_folder):
     assert result["ok"], result
     assert {"run.npz", "scanner.blend", "scanner_mphdrr"} <= set(result["files"])
 
-    # The rods are drawn, also after the first save has moved their .vdb. docs/images/window.png is this picture.
+    # The rods are drawn, also after the first save has moved their .vdb.
     screen = np.asarray(Image.open(picture).convert("RGB")).astype(int)
     x, y = result["phantom_at"]
     red, green, blue = screen[y - 30 : y + 30, x - 30 : x + 30].reshape(-1, 3).T

@@ -1,4 +1,4 @@
-"""The main path in the window: import, phantom, projections, export; leaves the window as the README shows it.
+"""The main path in the window: import, phantom, projections, export; leaves the window open.
 
 Arguments after ``--``: the workbook, a folder for the files. Writes ``result.json`` there.
 """

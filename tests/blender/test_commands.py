@@ -43,7 +43,7 @@ def test_scene_command_saves_scanner_volume_and_projections(tmp_path, workbook, 
     expected = mph.read_run(small_run)
     (item,) = volumes.volume_objects(bpy.context.scene)
     assert np.array_equal(volumes.volume_from_object(item).array, expected.volume.array)
-    shown = [image for image in bpy.data.images if tuple(image.size) == (16, 12)]
+    shown = [image for image in bpy.data.images if tuple(image.size) == (16, 12) and image.is_float]
     assert len(shown) == 3
     assert np.array_equal(images.projection_array(shown[0]), expected.projections[0])
 

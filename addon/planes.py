@@ -1,0 +1,144 @@
+"""Projections where they belong: as planes between each pinhole and the ROI, and over what its camera sees.
+
+A plane is an image empty, a child of its module's camera, in a collection of its own. It faces the ROI only: whoever
+looks through the camera sees the scene, and the picture over it as the camera's background image.
+"""
+
+from typing import Any
+
+import bpy
+import numpy as np
+from numpy.typing import NDArray
+
+from ..core.geometry.system import PinholeSystem
+from ..core.geometry.views import Views
+from ..core.runs.run import ProjectionRun
+from . import ids, images, scanner, selection
+
+_KEY = (
+    "mphdrr_field"  # custom property of a plane: middle and size (5,) of the virtual detector in the camera's frame, mm
+)
+_BETWEEN = 0.3  # of the way from the pinhole to the ROI's surface: where a plane is unless told otherwise
+
+
+def make(scene: bpy.types.Scene, run: ProjectionRun) -> list[bpy.types.Object]:
+    """Show the pictures of a run (`images.storing`) at the modules of the scene's scanner, in place of another run's.
+
+    Modules that the scanner does not have any more get none.
+    """
+    collection = scanner.active_scanner(scene)
+    remove(scene)
+    if collection is None:
+        return []
+    home = bpy.data.collections.new(ids.PLANES)
+    scene.collection.children.link(home)
+    cameras = {camera.mphdrr_module.number: camera for camera in scanner.modules(collection)}
+    made = []
+    numbers = run.system.numbers.tolist()
+    for number, field in zip(numbers, _fields(run.system, run.views), strict=True):
+        if number not in cameras:
+            continue
+        camera = cameras[number]
+        picture = bpy.data.images[ids.picture_name(images.projection_name(number, numbers))]
+        plane = bpy.data.objects.new(ids.part_name(camera.name, "projection"), None)
+        plane.empty_display_type, plane.data = "IMAGE", picture
+        plane.empty_image_side, plane.use_empty_image_alpha = "BACK", True
+        plane.parent, plane.mphdrr_module.part, plane.mphdrr_module.number = camera, "PLANE", number
+        plane.lock_location = plane.lock_rotation = plane.lock_scale = (True, True, True)
+        plane[_KEY] = field.tolist()
+        home.objects.link(plane)
+        _set_background(camera.data, field, picture)
+        made.append(plane)
+    update(scene)
+    return made
+
+
+def planes(scene: bpy.types.Scene) -> list[bpy.types.Object]:
+    """The planes in the scene."""
+    return [o for c in scene.collection.children if c.name.startswith(ids.PLANES) for o in c.objects if _KEY in o]
+
+
+def remove(scene: bpy.types.Scene) -> None:
+    """Remove the planes and the cameras' backgrounds."""
+    for plane in planes(scene):
+        if plane.parent is not None:
+            _remove_background(plane.parent.data, plane.data)
+        bpy.data.objects.remove(plane)
+    for home in [c for c in scene.collection.children if c.name.startswith(ids.PLANES) and not c.all_objects]:
+        bpy.data.collections.remove(home)
+
+
+def update(scene: bpy.types.Scene) -> None:
+    """Place and show the planes and backgrounds as the scene's settings say."""
+    settings = scene.mphdrr_display
+    for plane, shown in _wanted(scene):
+        camera, field = plane.parent, np.array(plane[_KEY])
+        module = camera.mphdrr_module
+        distance = settings.plane_distance or _BETWEEN * (module.pinhole_distance - module.roi_radius)
+        x, y, depth, width, height = field * (1.0 if settings.plane_at_detector else distance / field[2])
+        plane.location = x, y, -depth
+        # A picture's longer side is as long as the empty; pixels that are not square are stretched.
+        columns, rows = plane.data.size
+        plane.empty_display_size = max(columns, rows)
+        plane.scale = width / columns, height / rows, 1.0
+        plane.color[3] = settings.plane_opacity
+        if plane.hide_viewport == shown:
+            plane.hide_viewport = not shown
+        for background in camera.data.background_images:
+            if background.image == plane.data:
+                background.show_background_image = settings.backgrounds
+                background.alpha = settings.plane_opacity
+
+
+@bpy.app.handlers.persistent
+def after_update(scene: bpy.types.Scene, *_: Any) -> None:
+    """Another module is active, or modules were shown or hidden: so are their planes."""
+    if any(plane.hide_viewport == shown for plane, shown in _wanted(scene)):
+        update(scene)
+
+
+def _wanted(scene: bpy.types.Scene) -> list[tuple[bpy.types.Object, bool]]:
+    """The planes that belong to a module, each with whether it is to be shown."""
+    mode = scene.mphdrr_display.planes
+    active = selection.active_module(bpy.context) if mode in ("ACTIVE", "RING") else None
+    ring = None if active is None else active.mphdrr_module.ring
+
+    def shown(camera: bpy.types.Object) -> bool:
+        if camera.hide_viewport or mode == "NONE":
+            return False
+        return mode == "ALL" or camera == active or (mode == "RING" and camera.mphdrr_module.ring == ring)
+
+    owned = [(plane, plane.parent) for plane in planes(scene) if plane.parent is not None and plane.data is not None]
+    return [(plane, shown(camera)) for plane, camera in owned]
+
+
+def _fields(system: PinholeSystem, views: Views) -> NDArray[np.float64]:
+    """For each view x, y and distance of the picture's middle in the camera's frame, and its width and height (M, 5), mm.
+
+    Width and height are negative where the picture is upside down, as on the real detector.
+    """
+    u, v, k = np.moveaxis(system.frames(), 1, 0)
+    to_middle = views.detector_centers - views.sources
+    n_v, n_u = views.shape
+    width, height = n_u * np.sum(views.u_steps * u, axis=1), n_v * np.sum(views.v_steps * v, axis=1)
+    places = [-np.sum(to_middle * u, axis=1), np.sum(to_middle * v, axis=1), np.sum(to_middle * k, axis=1)]
+    return np.stack([*places, width, height], axis=1)
+
+
+def _set_background(camera: bpy.types.Camera, field: NDArray[np.float64], picture: bpy.types.Image) -> None:
+    """Lay a picture over a camera's view, as large as it is seen from there."""
+    background = camera.background_images.new()
+    background.image = picture
+    x, y, distance, width, height = field
+    seen = camera.sensor_width / camera.lens * distance  # how much the camera sees there
+    background.frame_method, background.display_depth = "STRETCH", "FRONT"
+    background.use_flip_x, background.use_flip_y = bool(width < 0), bool(height < 0)
+    background.scale = abs(width) / seen
+    background.offset = x / seen, y / seen
+    camera.show_background_images = True
+
+
+def _remove_background(camera: bpy.types.Camera, picture: bpy.types.Image | None) -> None:
+    for background in list(camera.background_images):
+        if background.image == picture:
+            camera.background_images.remove(background)

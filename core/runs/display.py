@@ -1,0 +1,96 @@
+"""Numbers as colours: the window, the scale and the colours that a picture of projections is shown in."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from ..errors import InputError
+
+# 17 evenly spaced colours of each map, between which is interpolated: matplotlib's, less than 2.5 % away (CC0).
+_COLORS = {
+    "inferno": "000004 0b0724 210c4a 3d0965 57106e 71196e 8a226a a32c61 bc3754 d04545 e35933 f1711f f98c0a fcaa0f f9c932 "
+    "f2e865 fcffa4",
+    "magma": "000004 0a0822 1d1147 36106b 51127c 6a1c81 832681 9c2e7f b73779 cf4070 e55064 f4695c fb8761 fea571 fec287 "
+    "fde0a1 fcfdbf",
+    "viridis": "440154 48186a 472d7b 424086 3b528b 33638d 2c728e 26828e 21918c 1f9f88 27ad81 3dbc74 5cc863 81d34d aadc32 "
+    "d5e21a fde725",
+    "grey": "000000 ffffff",
+}
+COLORS = tuple(_COLORS)
+"""Names of the colour maps; all but grey are perceptually uniform."""
+SCALES = ("linear", "sqrt", "log")
+_DECADES = 3.0
+"""That an automatic logarithmic window spans."""
+
+
+@dataclass(frozen=True)
+class Display:
+    """How numbers are shown as colours; `InputError` where the settings do not go together.
+
+    `low` and `high` are the numbers that have the first and the last colour; None is automatic: 0, or the smallest number
+    where that is negative, and the largest. On the logarithmic scale an automatic `low` is a thousandth of `high`.
+    """
+
+    colors: str = "inferno"
+    scale: str = "linear"
+    low: float | None = None
+    high: float | None = None
+
+    def __post_init__(self) -> None:
+        if self.colors not in COLORS:
+            raise InputError(f"colors {self.colors!r}: expected one of {', '.join(COLORS)}")
+        if self.scale not in SCALES:
+            raise InputError(f"scale {self.scale!r}: expected one of {', '.join(SCALES)}")
+        for name, value in (("low", self.low), ("high", self.high)):
+            if value is not None and not np.isfinite(value):
+                raise InputError(f"{name} = {value}: expected a finite number")
+        if self.low is not None and self.high is not None and self.low >= self.high:
+            raise InputError(f"window {self.low:g} to {self.high:g}: expected low to be less than high")
+        if self.scale == "log" and self.low is not None and self.low <= 0:
+            raise InputError(f"low = {self.low:g}: expected more than 0 on the logarithmic scale")
+
+    def window(self, values: ArrayLike) -> tuple[float, float]:
+        """The numbers that get the first and the last colour where `values` are shown."""
+        values = np.asarray(values)
+        low, high = self.low, self.high
+        if high is None:
+            high = float(np.max(values, initial=-np.inf, where=np.isfinite(values)))
+            high = high if np.isfinite(high) else 0.0
+        if low is None and self.scale == "log":
+            low = min(high, high / 10.0**_DECADES)
+        elif low is None:
+            low = min(0.0, float(np.min(values, initial=0.0, where=np.isfinite(values))))
+        return low, high
+
+    def shares(self, values: ArrayLike, window: tuple[float, float]) -> NDArray[np.float32]:
+        """Where `values` stand between the first colour, 0, and the last, 1; numbers outside the window are clipped."""
+        low, high = window
+        numbers = np.asarray(values, np.float32)
+        if self.scale == "log":
+            if not 0 < low < high:
+                return (numbers >= high).astype(np.float32) if high > 0 else np.zeros_like(numbers)
+            numbers = np.log(np.maximum(numbers, low, dtype=np.float32))
+            low, high = float(np.log(low)), float(np.log(high))
+        shares = np.clip((numbers - low) / ((high - low) or 1.0), 0.0, 1.0)
+        return np.nan_to_num(np.sqrt(shares) if self.scale == "sqrt" else shares, nan=0.0)
+
+    def value_at(self, share: float, window: tuple[float, float]) -> float:
+        """The number that `shares` puts at `share`."""
+        low, high = window
+        if self.scale == "log":
+            return float(low * (high / low) ** share) if 0 < low < high else high * share
+        return low + (high - low) * (share**2 if self.scale == "sqrt" else share)
+
+    def colored(self, values: ArrayLike, window: tuple[float, float] | None = None) -> NDArray[np.uint8]:
+        """Colours (..., 3), 8-bit sRGB, of `values` (...), in the window given or in their own."""
+        shares = self.shares(values, self.window(values) if window is None else window)
+        return _table(self.colors)[np.rint(shares * 255).astype(np.uint8)]
+
+
+def _table(colors: str) -> NDArray[np.uint8]:
+    """256 colours (256, 3)."""
+    anchors = np.array([list(bytes.fromhex(text)) for text in _COLORS[colors].split()], float)
+    places = np.linspace(0, len(anchors) - 1, 256)
+    channels = [np.interp(places, np.arange(len(anchors)), channel) for channel in anchors.T]
+    return np.rint(np.stack(channels, axis=1)).astype(np.uint8)

@@ -1,0 +1,54 @@
+"""How the projections are shown: in the 3D view's sidebar, and in the Image Editor's beside the pictures."""
+
+import bpy
+
+from ..addon import ids
+from .geometry import Sidebar
+
+
+class _Display:
+    """Mix into a panel that shows the settings of colours and window."""
+
+    bl_label = "Display"
+
+    @classmethod
+    def poll(cls, context: bpy.types.Context) -> bool:
+        return ids.MOSAIC in bpy.data.images
+
+    def draw(self, context: bpy.types.Context) -> None:
+        layout = self.layout  # type: ignore[attr-defined]
+        layout.use_property_split = True
+        layout.use_property_decorate = False
+        settings = context.scene.mphdrr_display
+        layout.prop(settings, "colors")
+        layout.prop(settings, "scale")
+        layout.prop(settings, "automatic", text="Automatic Window")
+        column = layout.column(align=True)
+        column.active = not settings.automatic
+        column.prop(settings, "low", text="Window Low")
+        column.prop(settings, "high")
+        if settings.problem:
+            layout.label(text=settings.problem, icon="ERROR")
+
+
+class MPHDRR_PT_display(_Display, Sidebar, bpy.types.Panel):
+    bl_parent_id = "MPHDRR_PT_projections"
+    bl_options = {"DEFAULT_CLOSED"}
+
+    def draw(self, context: bpy.types.Context) -> None:
+        super().draw(context)
+        layout, settings = self.layout, context.scene.mphdrr_display
+        row = layout.row(align=True)
+        row.prop(settings, "planes", expand=True)
+        column = layout.column()
+        column.active = settings.planes != "NONE"
+        column.prop(settings, "plane_at_detector")
+        distance = column.row()
+        distance.active = not settings.plane_at_detector
+        distance.prop(settings, "plane_distance")
+        layout.prop(settings, "backgrounds")
+        layout.prop(settings, "plane_opacity")
+
+
+class MPHDRR_PT_display_of_images(_Display, bpy.types.Panel):
+    bl_space_type, bl_region_type, bl_category = "IMAGE_EDITOR", "UI", ids.CATEGORY

@@ -1,0 +1,143 @@
+"""Projections in colours: where they stand in the scene, what edits of the display change, and what they leave."""
+
+import bpy
+import numpy as np
+import pytest
+from bpy_extras.object_utils import world_to_camera_view
+from mathutils import Vector
+
+from mphdrr.addon import ids, images, planes, scanner, selection, volumes
+from mphdrr.core.geometry.grid import Grid
+from mphdrr.core.runs.display import Display
+from mphdrr.core.runs.mosaic import as_seen
+from mphdrr.core.volumes.volume import Volume
+
+POINT = np.array([9.0, -6.0, 12.0])
+
+
+@pytest.fixture
+def projected(scene, ring_system):
+    """A scanner of eight modules and what they see of a small source that is off every axis."""
+    scanner.build_scanner(scene, ring_system, "Ring")
+    volumes.add_volume(Volume(np.ones((2, 2, 2), np.float32), Grid.centered(2, 2.0, POINT)), "Point")
+
+    def project(**settings):
+        assert bpy.ops.mphdrr.render_projections(width=50, height=40, **settings) == {"FINISHED"}
+        bpy.context.view_layer.update()
+        return planes.planes(scene)
+
+    return project
+
+
+def brightest(picture: bpy.types.Image) -> tuple[float, float]:
+    """Place of the brightest pixel of a picture, from 0 to 1 to the right and upwards."""
+    width, height = picture.size
+    pixels = np.empty(4 * width * height, np.float32)
+    picture.pixels.foreach_get(pixels)
+    row, column = np.unravel_index(pixels.reshape(height, width, 4)[..., :3].sum(axis=-1).argmax(), (height, width))
+    return (column + 0.5) / width, (row + 0.5) / height
+
+
+@pytest.mark.parametrize("detector", ["VIRTUAL", "REAL"])
+def test_a_point_is_where_plane_camera_and_mosaic_show_it(projected, scene, ring_system, detector):
+    made = projected(detector=detector, magnification=7.0)
+    assert len(made) == 8
+    tiles = bpy.data.images[ids.MOSAIC]["mphdrr_tiles"]
+    for plane, number in zip(made, ring_system.numbers, strict=True):
+        camera, picture = plane.parent, plane.data
+        assert camera == scanner.module(scanner.active_scanner(scene), number)
+        x, y = brightest(picture)
+        # The plane: its brightest pixel lies on the line from the pinhole to the point.
+        side = plane.empty_display_size / max(picture.size)
+        place = plane.matrix_world @ Vector(((x - 0.5) * picture.size[0] * side, (y - 0.5) * picture.size[1] * side, 0))
+        seen, wanted = (world_to_camera_view(scene, camera, Vector(p)) for p in (place, POINT))
+        assert abs(seen.x - wanted.x) < 1 / 50 and abs(seen.y - wanted.y) < 1 / 40
+        assert 0 < seen.z < wanted.z, "it stands between pinhole and ROI"
+        # The camera's view: a picture laid over it.
+        (background,) = camera.data.background_images
+        flip_x, flip_y = 1 - 2 * background.use_flip_x, 1 - 2 * background.use_flip_y
+        in_view = (0.5 + background.offset[i] + flip * (at - 0.5) * background.scale
+                   for i, (at, flip) in enumerate(((x, flip_x), (y, flip_y))))  # fmt: skip
+        assert next(in_view) == pytest.approx(wanted.x, abs=1 / 50)
+        assert next(in_view) == pytest.approx(wanted.y, abs=1 / 40)
+        # The mosaic: the exact image's brightest pixel, at the module's tile.
+        exact = as_seen(images.projection_array(bpy.data.images[ids.projection_name(number, 8)]))
+        row, column = np.unravel_index(exact.argmax(), exact.shape)
+        np.testing.assert_allclose((x, 1 - y), ((column + 0.5) / 50, (row + 0.5) / 40))
+        assert number == tiles["numbers"][planes.planes(scene).index(plane)]
+
+
+def test_the_display_changes_pictures_and_leaves_numbers(projected, scene):
+    projected()
+    name = ids.projection_name(1, 8)
+    before, picture = images.projection_array(bpy.data.images[name]), ids.picture_name(name)
+    settings = scene.mphdrr_display
+    everything = []
+    settings.low = 0.01 * before.max()
+    for edit in ({"colors": "GREY"}, {"scale": "LOG"}, {"high": 0.25 * before.max()}, {"automatic": False}):
+        for setting, value in edit.items():
+            setattr(settings, setting, value)
+        pixels = np.empty(4 * before.size, np.float32)
+        bpy.data.images[picture].pixels.foreach_get(pixels)
+        everything.append(pixels)
+        assert np.array_equal(images.projection_array(bpy.data.images[name]), before)
+    assert len({pixels.tobytes() for pixels in everything}) == 3, "a window that is automatic does not follow High"
+    expected = Display("grey", "log", settings.low, settings.high).colored(as_seen(before))
+    np.testing.assert_array_equal(np.rint(everything[-1].reshape(40, 50, 4)[::-1, :, :3] * 255), expected)
+    settings.low = settings.high + 1
+    assert settings.problem and np.array_equal(images.projection_array(bpy.data.images[name]), before)
+
+
+def test_planes_of_the_active_module_its_ring_or_all_that_are_visible(projected, scene):
+    made = projected()
+    settings, collection = scene.mphdrr_display, scanner.active_scanner(scene)
+
+    def shown():
+        bpy.context.view_layer.update()
+        return [plane.mphdrr_module.number for plane in made if not plane.hide_viewport]
+
+    assert shown() == list(range(1, 9))
+    scanner.show_modules(collection, 2, 3)
+    assert shown() == [2, 3]
+    scanner.show_modules(collection, 0, 0, "ALL")
+    selection.select(bpy.context, [scanner.module(collection, 6)])
+    for mode, numbers in (("ACTIVE", [6]), ("RING", [5, 6, 7, 8]), ("NONE", [])):
+        settings.planes = mode
+        assert shown() == numbers
+    settings.planes = "ACTIVE"
+    bpy.context.view_layer.objects.active = made[2]
+    assert selection.active_module(bpy.context) == made[2].parent and shown() == [3], "a plane is part of its module"
+
+
+def test_planes_stand_where_they_are_told(projected, scene, ring_system):
+    plane = projected(magnification=7.0)[4]
+    settings = scene.mphdrr_display
+    settings.plane_distance = 30.0
+    assert plane.location.z == pytest.approx(-30.0)
+    settings.plane_at_detector = True
+    assert plane.location.z == pytest.approx(-7 * ring_system.collimator_length[4])
+    settings.plane_opacity, settings.backgrounds = 0.25, False
+    (background,) = plane.parent.data.background_images
+    assert plane.color[3] == background.alpha == 0.25 and not background.show_background_image
+
+
+def test_another_run_replaces_planes_and_backgrounds(projected, scene):
+    projected()
+    made = projected(last=3)
+    assert [plane.mphdrr_module.number for plane in made] == [1, 2, 3]
+    assert len(planes.planes(scene)) == 3 and sum(c.name.startswith(ids.PLANES) for c in bpy.data.collections) == 1
+    backgrounds = [len(camera.data.background_images) for camera in scanner.modules(scanner.active_scanner(scene))]
+    assert backgrounds == [1, 1, 1, 0, 0, 0, 0, 0]
+
+
+def test_pictures_and_planes_survive_the_file(projected, scene, tmp_path):
+    before = [tuple(plane.matrix_world.translation) for plane in projected()]
+    name = ids.picture_name(ids.projection_name(2, 8))
+    seen = brightest(bpy.data.images[name])
+    bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "a.blend"))
+    bpy.ops.wm.open_mainfile(filepath=str(tmp_path / "a.blend"))
+    made = planes.planes(bpy.context.scene)
+    np.testing.assert_allclose([tuple(plane.matrix_world.translation) for plane in made], before)
+    assert brightest(bpy.data.images[name]) == seen
+    bpy.context.scene.mphdrr_display.colors = "VIRIDIS"
+    assert brightest(bpy.data.images[name]) == seen

@@ -1,0 +1,85 @@
+"""Colours of numbers, and the mosaic with its numbers and colour bar."""
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from PIL import Image
+
+import mphdrr.core as mph
+from mphdrr.core.runs.display import COLORS, SCALES, Display
+from mphdrr.core.runs.lettering import lettered
+from mphdrr.core.runs.mosaic import sheet, write_png
+
+numbers = st.lists(st.floats(-1e6, 1e6, width=32), min_size=2, max_size=30)
+
+
+@given(numbers, st.sampled_from(SCALES), st.sampled_from(COLORS))
+def test_larger_numbers_never_have_a_lower_colour_and_the_ends_are_the_windows(values, scale, colors):
+    display, values = Display(colors, scale), np.sort(np.float32(values))
+    low, high = display.window(values)
+    shares = display.shares(values, (low, high))
+    assert np.all(np.diff(shares) >= 0) and shares.min() >= 0 and shares.max() <= 1
+    assert high == values.max() and low <= high
+    if low < high:
+        first, last = Display(colors).colored([0.0, 1.0])
+        np.testing.assert_array_equal(display.colored([low, high], (low, high)), [first, last])
+
+
+@pytest.mark.parametrize("scale", SCALES)
+def test_the_bar_says_the_number_that_has_its_colour(scale):
+    display, window = Display(scale=scale, low=2.0, high=300.0), (2.0, 300.0)
+    for share in np.linspace(0, 1, 7):
+        assert display.shares(display.value_at(share, window), window) == pytest.approx(share, abs=1e-6)
+
+
+def test_numbers_outside_a_window_have_its_ends_colours_and_no_number_has_the_first():
+    display = Display("grey", low=1.0, high=2.0)
+    np.testing.assert_array_equal(display.colored([0.0, 1.5, 9.0, np.nan])[:, 0], [0, 128, 255, 0])
+    assert Display().window([[np.nan, 3.0], [np.inf, -1.0]]) == (-1.0, 3.0)
+    assert Display(scale="log").window([5.0, 2000.0]) == (2.0, 2000.0)
+
+
+@pytest.mark.parametrize(
+    ("settings", "said"),
+    [
+        ({"colors": "jet"}, "colors 'jet': expected one of inferno"),
+        ({"scale": "cube"}, "scale 'cube': expected one of linear"),
+        ({"low": 3, "high": 3}, "expected low to be less than high"),
+        ({"scale": "log", "low": 0}, "expected more than 0 on the logarithmic scale"),
+        ({"high": np.inf}, "expected a finite number"),
+    ],
+)
+def test_displays_that_cannot_be(settings, said):
+    with pytest.raises(mph.InputError, match=said):
+        Display(**settings)
+
+
+@pytest.mark.parametrize(("shape", "factor"), [((70, 80), 1.0), ((20, 30), 3.0), ((200, 160), 0.5)])
+def test_every_image_stands_in_its_rings_row_as_the_pinhole_sees_it(shape, factor):
+    rings = np.repeat([0, 1], [3, 5])
+    images = np.random.default_rng(2).random((8, *shape), np.float32) * 70
+    drawn = sheet(images, np.arange(1, 9), rings, "counts", pixels=8 * 110 * 90)
+    assert drawn.window == (0.0, images.max()), "the bar's upper end is the largest exact number"
+    assert drawn.tile == (shape[0] * factor, shape[1] * factor)
+    rows, columns = drawn.corners.T
+    assert len(set(rows[:3])) == len(set(rows[3:])) == 1 and rows[0] < rows[3]
+    assert list(columns[:3]) == list(columns[3:6]) == sorted(columns[:3])
+    for m, (row, column) in enumerate(drawn.corners):
+        own = drawn.picture[row : row + drawn.tile[0], column : column + drawn.tile[1]]
+        middle = drawn.image_at(row + drawn.tile[0] / 2, column + drawn.tile[1] / 2)
+        assert middle == m and drawn.image_at(row - 1, column) is None
+        if factor == 1:  # all but the number in the corner
+            np.testing.assert_array_equal(own[20:], Display().colored(mph.as_seen(images[m]), drawn.window)[20:])
+
+
+def test_a_run_without_counts_can_be_shown(tmp_path):
+    drawn = sheet(np.zeros((1, 8, 8), np.float32), [1], [0], "counts", Display(scale="log"))
+    write_png(drawn.picture, tmp_path / "a.png")
+    np.testing.assert_array_equal(np.asarray(Image.open(tmp_path / "a.png")), drawn.picture)
+
+
+def test_letters_are_told_apart():
+    pictures = {text: lettered(text).tobytes() for text in "0123456789.-+ekBqmLcounts/"}
+    assert len(set(pictures.values())) == len(pictures)
+    assert lettered("12", 2).shape == (26, 28) and lettered("€").tobytes() == lettered("?").tobytes()

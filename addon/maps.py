@@ -1,5 +1,6 @@
 """Maps of what the scanner does in every voxel, as volumes in the scene."""
 
+import json
 from typing import Any
 
 import bpy
@@ -34,6 +35,7 @@ def mapping(
     grid = Grid.centered((voxels,) * 3, (side or 2 * float(system.roi_radius.max())) / voxels)
     require(_BYTES * grid.n_voxels, f"a map of {voxels}^3 voxels")
     name, folder = f"{quantity.capitalize()} map", storage.folder()
+    recipe = json.dumps({"voxels": voxels, "side": side, "only_roi": only_roi})
     provenance: dict[str, Any] = {"map": quantity, "modules": len(system), "scanner": collection.name}
 
     def work(progress: Progress) -> StoredVolume:
@@ -47,9 +49,20 @@ def mapping(
         else:
             item = volumes.add_stored(stored, name, scene.collection)
             volume_materials.show_in_eevee(scene)
+        item.mphdrr_volume.recipe = recipe
         values, high = stored.volume.array, stored.high
         low = float(values[values > 0].min(initial=high))
         item.mphdrr_volume.display_low, item.mphdrr_volume.display_high = low if low < high else 0.0, high
         return f"{name}: {low:.4g} to {high:.4g} {stored.volume.unit}".removesuffix(" 1")
 
     return jobs.Job(f"{name} of {len(system)} modules", work, finish)
+
+
+def is_map(item: bpy.types.Object) -> bool:
+    """Whether a volume is a map that knows how it was made."""
+    return bool(item.mphdrr_volume.recipe) and volumes.quantity_of(item) in MAPS
+
+
+def again(scene: bpy.types.Scene, item: bpy.types.Object) -> jobs.Job:
+    """The job that makes a map again, of the scanner as it is now."""
+    return mapping(scene, volumes.quantity_of(item), **json.loads(item.mphdrr_volume.recipe))

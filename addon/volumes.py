@@ -179,11 +179,8 @@ def volume_objects(scene: bpy.types.Scene) -> list[bpy.types.Object]:
 
 @bpy.app.handlers.persistent
 def after_load(*_: Any) -> None:
-    """Say which files are missing; rewrite volumes of a .blend whose Blender draws voxels half a voxel elsewhere."""
+    """Rewrite volumes of a .blend whose Blender draws voxels half a voxel elsewhere."""
     missing = storage.missing_volumes()
-    if missing:
-        names = ", ".join(sorted(data.name for data in missing))
-        print(f"mphDRR: the voxel files of {names} are missing: Find Missing Volume Files in the Phantom panel")
     for item in bpy.data.objects:
         if not is_volume(item) or item.data in missing:
             continue
@@ -223,6 +220,9 @@ def _show(data: bpy.types.Volume, stored: StoredVolume) -> None:
     before = data.is_sequence, data.filepath
     data.is_sequence, data.filepath = False, storage.stored_path(stored.path)
     error = ""
+    # A load that finds the file keeps the message of one that did not, as after a crash; unloading then drops it.
+    data.grids.load()
+    data.grids.unload()
     if not data.grids.load() or data.grids.error_message:
         error = f"Blender cannot load the volume ({data.grids.error_message or 'no reason given'})"
     elif stored.volume.quantity not in data.grids:

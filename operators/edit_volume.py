@@ -3,7 +3,7 @@
 import bpy
 from bpy.props import FloatProperty, StringProperty
 
-from ..addon import ids, jobs, slices, storage, volume_import, volumes
+from ..addon import ids, jobs, recovery, slices, storage, volume_import, volumes
 from ..addon.decimals import typed
 from ..addon.reports import polled, run_reported
 
@@ -76,6 +76,20 @@ class MPHDRR_OT_clean_volume_files(bpy.types.Operator):
 
     def execute(self, context: bpy.types.Context) -> set[str]:
         return run_reported(self, storage.remove_unused)
+
+
+class MPHDRR_OT_remake_volumes(jobs.JobOperator, bpy.types.Operator):
+    """Make the phantoms and maps again whose files of voxels are missing, as after a crash; they stay where they are"""
+
+    bl_idname = ids.REMAKE_VOLUMES
+    bl_label = "Make Missing Volumes Again"
+
+    @classmethod
+    def poll(cls, context: bpy.types.Context) -> bool:
+        return polled(cls, bool(recovery.missing(context.scene)[0]), "No phantom or map misses its file of voxels")
+
+    def job(self, context: bpy.types.Context) -> jobs.Job:
+        return recovery.remaking(context.scene)
 
 
 class MPHDRR_OT_find_volume_files(bpy.types.Operator):

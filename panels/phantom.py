@@ -4,7 +4,7 @@ from typing import Any
 
 import bpy
 
-from ..addon import ids, jobs, phantoms, slices, storage, volumes
+from ..addon import ids, jobs, phantoms, recovery, slices, storage, volumes
 from .geometry import Sidebar, draw_facts, draw_text
 
 
@@ -23,10 +23,7 @@ class MPHDRR_PT_phantom(Sidebar, bpy.types.Panel):
         column.menu("MPHDRR_MT_add", text="Add Phantom", icon="OUTLINER_DATA_VOLUME")
         column.operator(ids.IMPORT_VOLUME, text="Import Volume", icon="IMPORT")
         if storage.missing_volumes():
-            column = adding.column(align=True)
-            column.alert = True
-            column.label(text="Files of voxels are missing", icon="ERROR")
-            column.operator(ids.FIND_VOLUME_FILES, icon="VIEWZOOM")
+            _draw_missing(adding.column(align=True), context.scene)
         item = context.object
         if not volumes.is_volume(item):
             column = layout.column(align=True)
@@ -41,6 +38,19 @@ class MPHDRR_PT_phantom(Sidebar, bpy.types.Panel):
         if phantom is not None:
             _draw_phantom(layout, item, phantom)
         layout.operator(ids.CLEAN_VOLUME_FILES, icon="TRASH")
+
+
+def _draw_missing(column: bpy.types.UILayout, scene: bpy.types.Scene) -> None:
+    """The volumes whose files are gone: what can be made again, and what else to do."""
+    again, others = recovery.missing(scene)
+    column.alert = True
+    column.label(text="Files of voxels are missing", icon="ERROR")
+    if again:
+        names = ", ".join(item.name for item in again)
+        column.operator(ids.REMAKE_VOLUMES, text=f"Make Again: {names}", icon="FILE_REFRESH")
+    if others:
+        draw_text(column, recovery.what_to_do(others), "BLANK1")
+    column.operator(ids.FIND_VOLUME_FILES, icon="VIEWZOOM")
 
 
 def _draw_numbers(layout: bpy.types.UILayout, item: bpy.types.Object) -> None:

@@ -1,0 +1,65 @@
+"""Volumes whose files are gone, as after a crash that took the temporary folder: those with a recipe are made again."""
+
+import warnings
+from collections.abc import Generator
+from typing import Any
+
+import bpy
+
+from ..core.errors import InputError, InputWarning
+from ..core.progress import Progress, part_of
+from . import jobs, maps, phantoms, scanner, storage, volumes
+
+
+def missing(scene: bpy.types.Scene) -> tuple[list[bpy.types.Object], list[bpy.types.Object]]:
+    """A scene's volumes whose files are missing: phantoms and maps, which can be made again, and the others."""
+    gone = set(storage.missing_volumes())
+    found = [item for item in volumes.volume_objects(scene) if item.data in gone]
+    phantom = {item: phantoms.root_of(item) for item in found}
+    has_scanner = scanner.active_scanner(scene) is not None
+    known = [item for item in found if phantom[item] is not None or (has_scanner and maps.is_map(item))]
+    again = dict.fromkeys(phantom[item] or item for item in known)
+    return list(again), [item for item in found if item not in known]
+
+
+def remaking(scene: bpy.types.Scene) -> jobs.Job:
+    """The job that makes the volumes with a recipe again, with which the others are named in a warning."""
+    again, others = missing(scene)
+    made: list[jobs.Job] = []
+    for item in again:
+        try:
+            made.append(phantoms.updating(item) if phantoms.settings_of(item) is not None else maps.again(scene, item))
+        except InputError as error:
+            warnings.warn(f"{item.name}: {error}", InputWarning, stacklevel=2)
+    if others:
+        warnings.warn(what_to_do(others), InputWarning, stacklevel=2)
+    if not made:
+        raise InputError("no phantom or map misses its files, or none can be made again")
+
+    def work(progress: Progress) -> list[Any]:
+        return [job.work(part_of(progress, k, len(made)) or progress) for k, job in enumerate(made)]
+
+    def finish(results: list[Any]) -> Generator[None, None, str]:
+        for job, result in zip(made, results, strict=True):
+            job.finish(result)
+            yield
+        return f"Made {', '.join(item.name for item in again)} again"
+
+    return jobs.Job("Making volumes again", work, finish)
+
+
+def what_to_do(others: list[bpy.types.Object]) -> str:
+    """What the user can do about volumes without a recipe, in one line."""
+    return f"{', '.join(item.name for item in others)}: find the voxel files in a folder, or import again"
+
+
+@bpy.app.handlers.persistent
+def after_load(*_: Any) -> None:
+    """Say which files are missing, and what to do."""
+    for scene in bpy.data.scenes:
+        again, others = missing(scene)
+        if again:
+            names = ", ".join(item.name for item in again)
+            print(f"mphDRR: the voxel files of {names} are missing: press Make Again in the Phantom panel")
+        if others:
+            print(f"mphDRR: voxel files are missing. {what_to_do(others)}: see the Phantom panel")

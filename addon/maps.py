@@ -9,11 +9,11 @@ from ..core.geometry.grid import Grid
 from ..core.memory import require
 from ..core.physics.maps import MAPS, within_roi
 from ..core.progress import Progress
-from . import choices, jobs, scanner, storage, volume_materials, volumes
+from . import choices, jobs, scanner, slices, storage, volume_materials, volumes
 from .stored_volumes import StoredVolume, store_volume
 
 _DESCRIPTIONS = {
-    "sensitivity": "Counts per decay of all modules together",
+    "sensitivity": "Of all modules together, cps/MBq",
     "modules": "Number of modules that see a voxel",
     "resolution": "FWHM in mm that the projections hold, all modules together",
     "completeness": "Of the angular sampling (Tuy): 1 where every plane through the voxel meets a pinhole. Slow",
@@ -25,7 +25,7 @@ _BYTES = 40.0  # a voxel, while the map is made and put into the scene
 def mapping(
     scene: bpy.types.Scene, quantity: str, voxels: int = 64, side: float = 0.0, only_roi: bool = True
 ) -> jobs.Job:
-    """The job that adds a map of the scene's scanner, with ideal modules, or replaces the last one of its quantity.
+    """The job that adds a map of the scene's scanner, with ideal modules and slices, or replaces the last of its quantity.
 
     The map is a cube of `voxels` along each `side` (mm; 0: the ROI's diameter) around the isocentre, of one of `MAPS`;
     with `only_roi`, without what lies outside the ROI sphere.
@@ -50,10 +50,13 @@ def mapping(
             item = volumes.add_stored(stored, name, scene.collection)
             volume_materials.show_in_eevee(scene)
         item.mphdrr_volume.recipe = recipe
+        unit, factor = volume_materials.shown_unit(quantity)
         values, high = stored.volume.array, stored.high
-        low = float(values[values > 0].min(initial=high))
+        low, high = factor * float(values[values > 0].min(initial=high)), factor * high
         item.mphdrr_volume.display_low, item.mphdrr_volume.display_high = low if low < high else 0.0, high
-        return f"{name}: {low:.4g} to {high:.4g} {stored.volume.unit}".removesuffix(" 1")
+        if not slices.planes_of(item):  # the solid viewport draws a volume in one colour, its slices in all
+            slices.add_slices(item)
+        return f"{name}: {low:.4g} to {high:.4g} {unit}".removesuffix(" 1")
 
     return jobs.Job(f"{name} of {len(system)} modules", work, finish)
 

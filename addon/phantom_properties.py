@@ -264,6 +264,16 @@ _KINDS = (
 )
 
 
+LOOKS = (
+    ("DENSITY", "Density", "Smoke that is the denser, the higher the value"),
+    ("BRIGHTEST", "Brightest", "The highest values shine through, as in a maximum intensity projection"),
+    ("SHELL", "Shell", "The surface at a value: spheres, rods, the heart"),
+    ("CUT", "Cut-Away", "The outer surface, cut open at the slices"),
+    ("BONE", "Bone", "Of a CT: the bones' surface, and their window"),
+    ("SOFT", "Soft Tissue", "Of a CT: the skin, and the window of soft tissue"),
+)
+
+
 class VolumeProperties(bpy.types.PropertyGroup):
     """One volume; lives on its object as `Object.mphdrr_volume`, with the settings of every kind (`.derenzo`, ...)."""
 
@@ -292,6 +302,13 @@ class VolumeProperties(bpy.types.PropertyGroup):
     )
     display_high: FloatProperty(
         name="High", description="Value that is shown brightest", default=1.0, update=on_edit("display_range")
+    )
+    look: EnumProperty(
+        name="Look", description="How the volume is drawn", items=choices.items({}, LOOKS), default="DENSITY",
+        update=on_edit("look"),
+    )  # fmt: skip
+    surface: FloatProperty(
+        name="Surface", description="Value at which the surface is drawn", update=on_edit("display_range")
     )
     slices: IntVectorProperty(name="Slices", description="Voxel from 0", size=3, min=0, update=on_edit("slices"))
     exact_pose: StringProperty(options={"HIDDEN"})  # world-from-object matrix in double precision, JSON

@@ -58,8 +58,7 @@ def after_load(*_: Any) -> None:
     """Say which files are missing, and what to do."""
     for scene in bpy.data.scenes:
         again, others = missing(scene)
-        if again:
-            names = ", ".join(item.name for item in again)
-            print(f"mphDRR: the voxel files of {names} are missing: press Make Again in the Phantom panel")
-        if others:
-            print(f"mphDRR: voxel files are missing. {what_to_do(others)}: see the Phantom panel")
+        for found, todo in ((again, "press Make Again"), (others, "Find Missing Volume Files, or import again,")):
+            if found:
+                names = ", ".join(item.name for item in found)
+                print(f"mphDRR: the voxel files of {names} are missing: {todo} in the Phantom panel")

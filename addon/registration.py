@@ -13,6 +13,7 @@ import bpy
 from .. import operators, panels
 from ..operators import add_phantom
 from . import (
+    color_bar,
     following,
     ids,
     images,
@@ -98,6 +99,7 @@ HANDLERS: tuple[tuple[list[Any], Any], ...] = (
     (bpy.app.handlers.redo_post, live_scanner.after_undo),
     (bpy.app.handlers.save_pre, storage.before_save),
     (bpy.app.handlers.save_pre, images.before_save),
+    (bpy.app.handlers.save_pre, slices.before_save),
     (bpy.app.handlers.save_post, storage.after_save),
     (bpy.app.handlers.save_post_fail, storage.restore_paths),
 )
@@ -111,8 +113,9 @@ UPDATES: dict[str, Callable[..., None]] = {
     "all_modules": following.set_for_all,
     "active_module": selection.select_active,
     "phantom": live_phantoms.settings_changed,
-    "display_range": slices.range_changed,
+    "display_range": slices.update,
     "slices": slices.update,
+    "look": slices.look_changed,
     "display": rendering.display_changed,
     "planes": planes.update,
 }
@@ -140,6 +143,7 @@ def register(command: Callable[..., int] | None = None) -> None:
             _registered.callback(_remove_handler, handlers, function)
         if not bpy.app.background:
             _registered.callback(tiles.draw_no_frames, tiles.draw_frames())
+            _registered.callback(color_bar.draw_no_bars, color_bar.draw_bars())
             for name in ("Image", "Image Editor Tool: Sample"):  # the editor's usual tool takes clicks first
                 keymap = bpy.context.window_manager.keyconfigs.addon.keymaps.new(name, space_type="IMAGE_EDITOR")
                 click = keymap.keymap_items.new(ids.PICK_MODULE, "LEFTMOUSE", "PRESS")

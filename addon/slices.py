@@ -1,7 +1,8 @@
 """Slice planes: three pictures of a volume's voxels, across its grid's axes, that go with the object.
 
 Each plane is a mesh object, a child of the volume's, with an image of the slice in the colours of the display range; on a
-sheared grid it is a parallelogram. Planes are named sagittal, coronal and axial by the world axis closest to their normal.
+sheared grid it is a parallelogram. Where nothing is shown, it is transparent. Planes are named sagittal, coronal and axial
+by the world axis closest to their normal.
 """
 
 import itertools
@@ -10,11 +11,12 @@ from pathlib import Path
 
 import bpy
 import numpy as np
+from mathutils import Vector
 from numpy.typing import NDArray
 
 from ..core.errors import InputError
 from ..core.volumes.volume import Volume
-from . import vdb, volume_materials, volumes
+from . import looks, vdb, volume_materials, volumes
 from .cameras import remove_objects
 from .compat import enable_nodes
 
@@ -22,6 +24,7 @@ _PLANES = ("Sagittal", "Coronal", "Axial")  # across world x, y, z
 _KEY = "mphdrr_slice"  # custom property: the axis of the grid that a plane is across
 _LATTICE = "mphdrr_slice_of"  # custom property: shape and affine that the planes were made for
 _SHADES = 256
+_FRONT = (0.7, -0.5, 0.5)  # direction from which a scene is looked at first: the volume is cut open on that side
 
 # The volume that slices were last taken of: reading it takes longer than all the rest.
 _last: tuple[Path, Volume] | None = None
@@ -38,11 +41,15 @@ def add_slices(item: bpy.types.Object) -> list[bpy.types.Object]:
     best = max(itertools.permutations(range(3)), key=lambda order: sum(toward[a, w] for a, w in enumerate(order)))
     planes = [_plane(item, volume, axis, _PLANES[best[axis]]) for axis in range(3)]
     item.mphdrr_volume.slices = [n // 2 for n in volume.grid.shape]  # which paints them
+    for screen in bpy.data.screens:
+        for area in screen.areas:
+            if area.type == "VIEW_3D":
+                area.spaces.active.shading.color_type = "TEXTURE"  # the solid viewport's default shows no pictures
     return planes
 
 
 def remove_slices(item: bpy.types.Object) -> None:
-    """Remove a volume's planes, with their meshes, materials and images."""
+    """Remove a volume's planes, with their meshes, materials and images; the volume is whole again."""
     for plane in planes_of(item):
         materials = list(plane.data.materials)
         remove_objects([plane])
@@ -53,11 +60,37 @@ def remove_slices(item: bpy.types.Object) -> None:
             bpy.data.materials.remove(material)
             if image is not None and image.users == 0:
                 bpy.data.images.remove(image)
+    looks.show(item, None)
 
 
 def planes_of(item: bpy.types.Object) -> list[bpy.types.Object]:
     """A volume's planes, in the order of the grid's axes."""
     return sorted((child for child in item.children if _KEY in child), key=lambda plane: plane[_KEY])
+
+
+def sliced(context: bpy.types.Context) -> bpy.types.Object | None:
+    """The active volume, if it has planes; also where one of them is active."""
+    item = context.object
+    if item is not None and _KEY in item:
+        item = item.parent
+    return item if volumes.is_volume(item) and planes_of(item) else None
+
+
+def way(item: bpy.types.Object, axis: int) -> tuple[Vector, Vector]:
+    """Along which a plane moves: a corner, in front, of the first plane across an axis, and the step to the next, mm."""
+    shape, affine = json.loads(planes_of(item)[axis][_LATTICE])
+    world = np.array(item.matrix_world) @ affine
+    corner = np.where(np.linalg.inv(world)[:3, :3] @ _FRONT >= 0, np.array(shape) - 0.5, -0.5)
+    corner[axis] = 0.0
+    return Vector((world @ [*corner, 1.0])[:3]), Vector(world[:3, axis])
+
+
+def move(item: bpy.types.Object, axis: int, index: float) -> None:
+    """Move a plane to the voxel nearest to an index, if it is not there yet."""
+    settings = item.mphdrr_volume
+    nearest = min(max(round(index), 0), settings.shape[axis] - 1)
+    if settings.slices[axis] != nearest:
+        settings.slices[axis] = nearest
 
 
 def names(item: bpy.types.Object) -> list[str]:
@@ -66,16 +99,21 @@ def names(item: bpy.types.Object) -> list[str]:
     return [by_axis.get(axis, "") for axis in range(3)]
 
 
-def range_changed(item: bpy.types.Object) -> None:
-    """Draw a volume and its planes in its display range."""
-    volumes.show_range(item)
-    update(item)
+def look_changed(item: bpy.types.Object) -> None:
+    """Draw a volume in the look that was chosen."""
+    looks.choose(item)
+    if item.mphdrr_volume.look == "CUT" and not planes_of(item):
+        try:
+            add_slices(item)
+        except InputError as error:
+            print(f"mphDRR: {item.name} is not cut open: {error}")
 
 
 def update(item: bpy.types.Object) -> None:
-    """Draw a volume's planes, if it has some, at `VolumeProperties.slices` and in its display range."""
+    """Draw a volume, and its planes if it has some: at `VolumeProperties.slices`, in its look and display range."""
     planes, settings = planes_of(item), item.mphdrr_volume
     if not planes:
+        looks.show(item, None)
         return
     try:
         volume = _stored(item)
@@ -85,16 +123,23 @@ def update(item: bpy.types.Object) -> None:
     if any(plane[_LATTICE] != _lattice(volume) for plane in planes):  # the volume has other voxels now
         add_slices(item)
         return
+    normals = np.linalg.inv(volume.grid.affine)  # rows: from the object's space to the grid's indices
+    front = np.array(_FRONT) @ volumes.pose_of_object(item)[:3, :3]
+    cut = []
     for plane in planes:
         axis = plane[_KEY]
         index = min(settings.slices[axis], volume.grid.shape[axis] - 1)
         plane.location = volume.grid.affine[:3, axis] * index
         image = plane.data.materials[0].node_tree.nodes["Slice"].image
-        low, high = settings.display_low, settings.display_high
+        side = 1.0 if normals[axis, :3] @ front >= 0 else -1.0
+        cut.append(((side * normals[axis, :3]).tolist(), float(side * (index - normals[axis, 3]))))
+        factor = volume_materials.shown_unit(settings.quantity)[1]
+        low, high = settings.display_low / factor, settings.display_high / factor
         relative = (np.take(volume.array, index, axis).T - low) / max(high - low, 1e-30)
         shades = np.clip(relative * (_SHADES - 1), 0, _SHADES - 1).astype(np.uint8)
-        image.pixels.foreach_set(_colors(settings.quantity)[shades].ravel())
+        image.pixels.foreach_set(colors(settings.quantity)[shades].ravel())
         image.update()
+    looks.show(item, cut)
 
 
 @bpy.app.handlers.persistent
@@ -102,6 +147,16 @@ def before_load(*_: object) -> None:
     """Another file has other volumes."""
     global _last
     _last = None
+
+
+@bpy.app.handlers.persistent
+def before_save(*_: object) -> None:
+    """Pack the planes' images: Blender does not save what was painted."""
+    for item in bpy.data.objects:
+        if _KEY in item:
+            image = item.data.materials[0].node_tree.nodes["Slice"].image
+            if image is not None and image.is_dirty:
+                image.pack()
 
 
 @bpy.app.handlers.persistent
@@ -154,19 +209,22 @@ def _material(name: str, image: bpy.types.Image) -> bpy.types.Material:
     tree.nodes.clear()
     texture = tree.nodes.new("ShaderNodeTexImage")
     texture.name, texture.image, texture.interpolation, texture.extension = "Slice", image, "Closest", "EXTEND"
-    emission = tree.nodes.new("ShaderNodeEmission")
-    emission.location = (300.0, 0.0)
-    output = tree.nodes.new("ShaderNodeOutputMaterial")
-    output.location = (500.0, 0.0)
+    emission, nothing = tree.nodes.new("ShaderNodeEmission"), tree.nodes.new("ShaderNodeBsdfTransparent")
+    mix, output = tree.nodes.new("ShaderNodeMixShader"), tree.nodes.new("ShaderNodeOutputMaterial")
+    emission.location, nothing.location = (300.0, 0.0), (300.0, -150.0)
+    mix.location, output.location = (500.0, 0.0), (700.0, 0.0)
     tree.links.new(texture.outputs["Color"], emission.inputs["Color"])
-    tree.links.new(emission.outputs[0], output.inputs["Surface"])
+    tree.links.new(texture.outputs["Alpha"], mix.inputs[0])
+    tree.links.new(nothing.outputs[0], mix.inputs[1])
+    tree.links.new(emission.outputs[0], mix.inputs[2])
+    tree.links.new(mix.outputs[0], output.inputs["Surface"])
     return material
 
 
-def _colors(quantity: str) -> NDArray[np.float32]:
-    """RGBA (256, 4) of the display range, as an sRGB image holds them."""
+def colors(quantity: str) -> NDArray[np.float32]:
+    """RGBA (256, 4) of the display range, as an sRGB image holds them; the lowest is transparent."""
     positions, colors = zip(*volume_materials.ramp(quantity), strict=True)
     shades = np.linspace(0, 1, _SHADES)
     rgb = np.stack([np.interp(shades, positions, channel) for channel in np.transpose(colors)], axis=1)
     srgb = np.where(rgb <= 0.0031308, 12.92 * rgb, 1.055 * rgb ** (1 / 2.4) - 0.055)
-    return np.concatenate([srgb, np.ones((_SHADES, 1))], axis=1).astype(np.float32)
+    return np.column_stack([srgb, np.arange(_SHADES) > 0]).astype(np.float32)

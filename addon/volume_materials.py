@@ -1,32 +1,56 @@
-"""How volumes look: the volume material, and the density of the solid viewport's smoke.
+"""How volumes look: colours, units, the volume material, and the density of the solid viewport's smoke.
 
-Activity glows in the colours of "inferno"; attenuation and CT numbers look like a radiograph, the higher the brighter.
+Activity glows in purples, maps are green, attenuation and CT numbers look like a radiograph, the higher the brighter. None
+has a hue of the crystals (`core.geometry.part_colors`) or of what Blender marks as selected.
 """
+
+from collections.abc import Sequence
+from typing import Any
 
 import bpy
 
+from ..core.volumes.volume import UNITS
 from .compat import enable_nodes
 
-# Positions and linear RGB of Matplotlib's "inferno" (CC0), without its pale end, which tone mapping would bleach.
-_INFERNO = (
-    (0.00, (0.0119, 0.0025, 0.0461)),
-    (0.25, (0.0953, 0.0052, 0.1513)),
-    (0.50, (0.5034, 0.0382, 0.0886)),
-    (0.75, (0.8879, 0.1413, 0.0178)),
-    (1.00, (0.9200, 0.4600, 0.0220)),
+# Positions and linear RGB, evenly brighter.
+_PURPLES = (
+    (0.00, (0.0060, 0.0020, 0.0180)),
+    (0.25, (0.0500, 0.0090, 0.1750)),
+    (0.50, (0.2700, 0.0180, 0.3000)),
+    (0.75, (0.7800, 0.0700, 0.3600)),
+    (1.00, (0.9500, 0.4800, 0.6800)),
+)
+_GREENS = (
+    (0.00, (0.0020, 0.0100, 0.0160)),
+    (0.25, (0.0110, 0.0800, 0.1200)),
+    (0.50, (0.0140, 0.2800, 0.2200)),
+    (0.75, (0.1100, 0.5600, 0.1200)),
+    (1.00, (0.6200, 0.7600, 0.0200)),
 )
 _GREYS = ((0.00, (0.02, 0.02, 0.02)), (1.00, (0.80, 0.80, 0.80)))
 _XRAY = ("mu", "hu")
+_SHOWN_AS = {"sensitivity": ("cps/MBq", 1e6)}  # not in the voxels' own unit: as every other sensitivity in the window
 _CT_WINDOW = (-200.0, 1000.0)  # HU: skin to bone
 # Extinction times the volume's size: a rod of a twentieth of it looks solid; attenuation and maps can be looked through.
 _OPACITY, _OPACITY_THROUGH = 60.0, 20.0
 _SMOKE = 15.0  # the same for the solid viewport's smoke, which is denser: thin enough that rods show behind rods
-_RANGE, _OPACITY_NODE = "Display Range", "Opacity"  # nodes: the values at the ramp's ends, and the extinction
+# Nodes: the values at the ramp's ends; the extinction, for relative values ** exponent and times a gain.
+_RANGE, _OPACITY_NODE, _EXPONENT, _GAIN = "Display Range", "Opacity", "Exponent", "Gain"
+_CUT = "Cut"  # nodes, numbered by the grid's axes: what lies beyond all three is cut away
+_FAR = 1e9  # where nothing is cut
+
+Cut = Sequence[tuple[Sequence[float], float]]
+"""Of each axis of a grid: a vector n and a number t; points x, mm in the object's space, with n x > t lie in front."""
 
 
 def ramp(quantity: str) -> tuple[tuple[float, tuple[float, float, float]], ...]:
     """Positions (0 to 1) and colours (linear RGB) that show a quantity's display range."""
-    return _GREYS if quantity in _XRAY else _INFERNO
+    return _GREYS if quantity in _XRAY else _PURPLES if quantity == "activity" else _GREENS
+
+
+def shown_unit(quantity: str) -> tuple[str, float]:
+    """The unit in which the window shows a quantity, and by what the voxels' values are multiplied for that."""
+    return _SHOWN_AS.get(quantity, (UNITS[quantity], 1.0))
 
 
 def usual_range(quantity: str, low: float, high: float) -> tuple[float, float]:
@@ -61,7 +85,14 @@ def new_material(name: str, quantity: str, size: float) -> bpy.types.Material:
         element.position, element.color = position, (*rgb, 1.0)
     opacity = node("ShaderNodeValue", 1, 1.3, name=_OPACITY_NODE, label="Opacity (1/mm)")
     opacity.outputs[0].default_value = (_OPACITY if quantity == "activity" else _OPACITY_THROUGH) / size
-    extinction = node("ShaderNodeMath", 2, 0.3, operation="MULTIPLY")
+    exponent = node("ShaderNodeMath", 2, 1.3, operation="POWER", name=_EXPONENT, label=_EXPONENT)
+    gain = node("ShaderNodeMath", 2, 2.3, operation="MULTIPLY", name=_GAIN, label=_GAIN)
+    exponent.inputs[1].default_value = gain.inputs[1].default_value = 1.0
+    place = node("ShaderNodeTexCoord", -2, 3)
+    kept = node("ShaderNodeMath", 2, 3.3, operation="SUBTRACT", label="Not Cut Away")
+    kept.inputs[0].default_value = 1.0
+    seen = node("ShaderNodeMath", 3, 2.3, operation="MULTIPLY")
+    extinction = node("ShaderNodeMath", 3, 0.3, operation="MULTIPLY")
     absorption = node("ShaderNodeVolumeAbsorption", 4, 0.6)
     absorption.inputs["Color"].default_value = (0.0, 0.0, 0.0, 1.0)
     emission = node("ShaderNodeEmission", 4, -0.4)
@@ -71,8 +102,13 @@ def new_material(name: str, quantity: str, size: float) -> bpy.types.Material:
     link = tree.links.new
     link(attribute.outputs["Fac"], relative.inputs["Value"])
     link(relative.outputs["Result"], color.inputs["Fac"])
-    link(relative.outputs["Result"], extinction.inputs[0])
-    link(opacity.outputs[0], extinction.inputs[1])
+    link(relative.outputs["Result"], exponent.inputs[0])
+    link(opacity.outputs[0], gain.inputs[0])
+    link(in_front(tree, place.outputs["Object"]), kept.inputs[1])
+    link(gain.outputs[0], seen.inputs[0])
+    link(kept.outputs[0], seen.inputs[1])
+    link(exponent.outputs[0], extinction.inputs[0])
+    link(seen.outputs[0], extinction.inputs[1])
     link(extinction.outputs[0], absorption.inputs["Density"])
     link(color.outputs["Color"], emission.inputs["Color"])
     link(extinction.outputs[0], emission.inputs["Strength"])
@@ -89,17 +125,65 @@ def set_range(material: bpy.types.Material, low: float, high: float) -> None:
         node.inputs["From Min"].default_value, node.inputs["From Max"].default_value = low, high
 
 
+def in_front(tree: bpy.types.NodeTree, place: bpy.types.NodeSocket) -> bpy.types.NodeSocket:
+    """Add nodes whose output is 1 where the `place` is cut away (`set_cut`), else 0; to any kind of tree."""
+    result = None
+    for axis in range(3):
+        along = tree.nodes.new("ShaderNodeVectorMath")
+        beyond = tree.nodes.new("ShaderNodeMath")
+        along.operation, beyond.operation = "DOT_PRODUCT", "GREATER_THAN"
+        along.name, beyond.name = f"{_CUT} {axis} along", f"{_CUT} {axis}"
+        along.location, beyond.location = (-220.0, -660.0 - 180.0 * axis), (0.0, -660.0 - 180.0 * axis)
+        beyond.inputs[1].default_value = _FAR
+        tree.links.new(place, along.inputs[0])
+        tree.links.new(along.outputs["Value"], beyond.inputs[0])
+        if result is None:
+            result = beyond.outputs[0]
+            continue
+        both = tree.nodes.new("ShaderNodeMath")
+        both.operation, both.location = "MULTIPLY", (220.0, -660.0 - 180.0 * axis)
+        tree.links.new(result, both.inputs[0])
+        tree.links.new(beyond.outputs[0], both.inputs[1])
+        result = both.outputs[0]
+    return result
+
+
+def set_cut(tree: bpy.types.NodeTree, cut: Cut | None) -> None:
+    """Cut away what lies in front along all three axes; None: nothing."""
+    for axis, (normal, limit) in enumerate(cut or [((0.0, 0.0, 0.0), _FAR)] * 3):
+        along, beyond = tree.nodes.get(f"{_CUT} {axis} along"), tree.nodes.get(f"{_CUT} {axis}")
+        if along is not None and beyond is not None:  # a tree of an earlier version, or of the user's, has none
+            _set(along.inputs[1], tuple(normal))
+            _set(beyond.inputs[1], limit)
+
+
+def set_opacity(material: bpy.types.Material, exponent: float, gain: float) -> None:
+    """Make extinction follow a power of the relative values, times a gain."""
+    for name, value in ((_EXPONENT, exponent), (_GAIN, gain)):
+        if material.node_tree and (node := material.node_tree.nodes.get(name)):
+            _set(node.inputs[1], value)
+
+
+def _set(socket: Any, value: Any) -> None:
+    """Set a socket's value, if it changes: every change has the scene drawn again."""
+    now = socket.default_value
+    if (tuple(now) if isinstance(value, tuple) else now) != value:
+        socket.default_value = value
+
+
 def resize(material: bpy.types.Material, old: float, new: float) -> None:
     """Keep a volume as opaque as before when its size, mm, changes from `old` to `new`."""
     if material.node_tree and (node := material.node_tree.nodes.get(_OPACITY_NODE)):
         node.outputs[0].default_value *= old / new
 
 
-def set_display(data: bpy.types.Volume, low: float, high: float, size: float) -> None:
-    """Make the solid viewport draw the volume's values as smoke of a useful density."""
-    data.display.density = _SMOKE / size / (high - low)
-    data.display.wireframe_type = "NONE"
-    data.display.interpolation_method = "LINEAR"
+def set_display(data: bpy.types.Volume, low: float, high: float, size: float, gain: float = 1.0) -> None:
+    """Make the solid viewport draw the volume's values as smoke of a useful density, times a gain, or none."""
+    display = data.display
+    display.density = (gain or 1.0) * _SMOKE / size / (high - low)
+    # No smoke: of its slice along x the first, at the box's edge, where nothing is.
+    display.use_slice, display.slice_axis, display.slice_depth = not gain, "X", 0.0
+    display.wireframe_type, display.interpolation_method = "NONE", "LINEAR"
 
 
 def show_in_eevee(scene: bpy.types.Scene) -> None:

@@ -17,7 +17,7 @@ from numpy.typing import ArrayLike, NDArray
 from ..core.errors import InputError
 from ..core.geometry.frames import checked_affine
 from ..core.memory import readable_size
-from ..core.volumes.volume import UNITS, Volume
+from ..core.volumes.volume import Volume
 from . import compat, ids, storage, volume_materials
 from .cameras import world_matrix
 from .reports import polled
@@ -83,15 +83,6 @@ def make_active(context: bpy.types.Context, item: bpy.types.Object) -> None:
         other.select_set(False)
     item.select_set(True)
     context.view_layer.objects.active = item
-
-
-def show_range(item: bpy.types.Object) -> None:
-    """Draw a volume in its display range (`VolumeProperties.display_low` and `display_high`)."""
-    settings = item.mphdrr_volume
-    low, high = settings.display_low, max(settings.display_high, settings.display_low + 1e-30)
-    for material in filter(None, item.data.materials):
-        volume_materials.set_range(material, low, high)
-    volume_materials.set_display(item.data, low, high, settings.extent)
 
 
 def volume_from_object(item: bpy.types.Object) -> Volume:
@@ -189,6 +180,11 @@ def after_load(*_: Any) -> None:
             settings.extent = max(n * s for n, s in zip(settings.shape, settings.spacing, strict=True))
             usual = volume_materials.usual_range(settings.quantity, 0.0, settings.maximum)
             settings.display_low, settings.display_high = usual
+        unit, factor = volume_materials.shown_unit(settings.quantity)
+        if settings.unit != unit:  # as older versions showed it
+            for name in ("minimum", "maximum", "display_low", "display_high"):
+                setattr(settings, name, factor * getattr(settings, name))
+            settings.unit = unit
         if settings.center_shift != compat.VDB_CENTER_SHIFT:
             try:
                 states = [read_vdb(path) for path in storage.files_of_states(item.data)]
@@ -260,13 +256,14 @@ def _describe(item: bpy.types.Object, stored: StoredVolume) -> None:
     settings = item.mphdrr_volume
     shown = settings.display_low, settings.display_high
     usual = volume_materials.usual_range(settings.quantity, settings.minimum, settings.maximum)
+    unit, factor = volume_materials.shown_unit(volume.quantity)
     chosen = settings.is_volume and settings.quantity == volume.quantity and not np.allclose(shown, usual)
-    settings.is_volume, settings.quantity, settings.unit = True, volume.quantity, UNITS[volume.quantity]
+    settings.is_volume, settings.quantity, settings.unit = True, volume.quantity, unit
     settings.shape, settings.spacing = volume.grid.shape, volume.grid.spacing
-    settings.minimum, settings.maximum = stored.low, stored.high
+    settings.minimum, settings.maximum = factor * stored.low, factor * stored.high
     settings.extent = stored.extent
     settings.exact_pose = json.dumps(stored.pose.tolist())
     settings.center_shift = compat.VDB_CENTER_SHIFT
     if not chosen:
-        shown = volume_materials.usual_range(volume.quantity, stored.low, stored.high)
+        shown = volume_materials.usual_range(volume.quantity, factor * stored.low, factor * stored.high)
     settings.display_low, settings.display_high = shown

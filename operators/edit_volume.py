@@ -18,9 +18,6 @@ class MPHDRR_OT_add_slices(bpy.types.Operator):
     poll = classmethod(volumes.poll_volume)
 
     def execute(self, context: bpy.types.Context) -> set[str]:
-        for area in context.screen.areas if context.screen else ():
-            if area.type == "VIEW_3D":
-                area.spaces.active.shading.color_type = "TEXTURE"  # the solid viewport's default shows no pictures
         return run_reported(self, lambda: f"Added {len(slices.add_slices(context.object))} slices")
 
 

@@ -4,7 +4,7 @@ from typing import Any
 
 import bpy
 
-from ..addon import ids, jobs, phantoms, recovery, slices, storage, volumes
+from ..addon import ids, jobs, phantom_properties, phantoms, recovery, slices, storage, volumes
 from .geometry import Sidebar, draw_facts, draw_text
 
 
@@ -74,6 +74,11 @@ def _draw_display(layout: bpy.types.UILayout, item: bpy.types.Object) -> None:
     column = layout.column(align=True)
     column.prop(settings, "display_low", text=f"Low, {settings.unit}")
     column.prop(settings, "display_high", text=f"High, {settings.unit}")
+    looks = layout.grid_flow(columns=2, align=True)
+    for name, *_ in phantom_properties.LOOKS[: None if settings.quantity == "hu" else 4]:
+        looks.prop_enum(settings, "look", name)
+    if settings.look not in ("DENSITY", "BRIGHTEST"):
+        layout.prop(settings, "surface", text=f"Surface, {settings.unit}")
     if item.data.is_sequence:
         column = layout.column(align=True)
         column.prop(item.data, "frame_start", text="First Frame")

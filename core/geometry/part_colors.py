@@ -15,5 +15,5 @@ class Look(NamedTuple):
 
 LOOKS: dict[PartKind, Look] = {
     "collimator": Look((0.36, 0.39, 0.43, 1.0), metallic=0.85, roughness=0.42),  # tungsten: grey metal
-    "crystal": Look((1.0, 0.48, 0.06, 0.85), metallic=0.0, roughness=0.12),  # scintillator: clear amber
+    "crystal": Look((0.05, 0.22, 0.85, 0.85), metallic=0.0, roughness=0.12),  # scintillator: clear blue
 }

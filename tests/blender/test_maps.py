@@ -31,7 +31,7 @@ def test_map_is_the_cores_within_the_roi(collection):
     places = corners @ volume.grid.affine[:3, :3].T + volume.grid.affine[:3, 3]
     inside = np.linalg.norm(places, axis=-1) <= system.roi_radius.max()
     assert np.array_equal(volume.array, np.where(inside, expected, 0))
-    assert the_map().mphdrr_volume.unit == "counts/decay"
+    assert the_map().mphdrr_volume.unit == "cps/MBq"
 
 
 def test_map_follows_the_scanner_and_is_replaced(collection):

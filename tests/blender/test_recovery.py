@@ -29,8 +29,8 @@ def crashed(scene, small_workbook, tmp_path, capsys):
     storage._size_at.cache_clear()
     bpy.ops.wm.open_mainfile(filepath=str(tmp_path / "study.blend"))
     said = capsys.readouterr().out
-    assert "NEMA, Modules map" in said or "Modules map, NEMA" in said
-    assert "CT: find the voxel files in a folder, or import again" in said
+    assert "Modules map, NEMA are missing: press Make Again" in said
+    assert "CT are missing: Find Missing Volume Files, or import again" in said
     return made
 
 

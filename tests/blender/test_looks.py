@@ -1,0 +1,154 @@
+"""Looks of volumes: surfaces, cuts in front of slices, colours that tell things apart."""
+
+from __future__ import annotations
+
+import colorsys
+
+import bpy
+import numpy as np
+import pytest
+from scipy import ndimage
+
+from mphdrr.addon import color_bar, looks, slices, volume_materials, volumes
+from mphdrr.core.geometry.grid import Grid
+from mphdrr.core.geometry.part_colors import LOOKS
+from mphdrr.core.volumes.volume import Volume
+
+
+@pytest.fixture
+def nema(scene):
+    bpy.ops.mphdrr.add_nema(voxels=64)
+    return bpy.context.object
+
+
+def surface(item) -> tuple[np.ndarray, np.ndarray]:
+    """Vertices (n, 3) in the object's space and edges (m, 2) of the surface that Blender draws."""
+    made = looks.surface_of(item)
+    bpy.context.view_layer.update()
+    mesh = made.evaluated_get(bpy.context.evaluated_depsgraph_get()).data
+    vertices = np.array([made.matrix_local @ vertex.co for vertex in mesh.vertices]).reshape(-1, 3)
+    return vertices, np.array([edge.vertices for edge in mesh.edges]).reshape(-1, 2)
+
+
+def test_a_shell_shows_the_six_spheres_where_they_are(nema):
+    nema.mphdrr_volume.look = "SHELL"
+    vertices, edges = surface(nema)
+    part = np.arange(len(vertices))
+    while not np.array_equal(part[edges[:, 0]], part[edges[:, 1]]):
+        np.minimum.at(part, edges, part[edges].min(axis=1, keepdims=True))
+    found = [vertices[part == k] for k in np.unique(part)]
+    assert len(found) == 6
+    angles = np.radians(60 * np.arange(6))
+    expected = 57.2 * np.column_stack([np.cos(angles), np.sin(angles), np.zeros(6)])
+    middles = np.array([(sphere.min(axis=0) + sphere.max(axis=0)) / 2 for sphere in found])
+    assert np.linalg.norm(middles[:, None] - expected, axis=2).min(axis=0).max() < 1.0
+
+
+def test_what_lies_in_front_of_the_slices_is_cut_away_and_comes_back(nema):
+    before = [len(kind) for kind in (bpy.data.objects, bpy.data.materials, bpy.data.node_groups, bpy.data.images)]
+    settings = nema.mphdrr_volume
+    settings.look = "CUT"
+    assert len(slices.planes_of(nema)) == 3
+    for index in ((32, 32, 40), (20, 40, 30)):
+        settings.slices = index
+        at = slices._stored(nema).grid.affine @ [*index, 1.0]
+        vertices, _ = surface(nema)
+        inside = ((vertices - at[:3]) * [1, -1, 1] > 5.0).all(axis=1)  # mm: a face reaches as far as a voxel
+        assert len(vertices) > 1000 and not inside.any()
+        for axis, sign in enumerate((1, -1, 1)):  # the material's nodes say the same
+            nodes = nema.data.materials[0].node_tree.nodes
+            normal = np.array(nodes[f"Cut {axis} along"].inputs[1].default_value)
+            limit = nodes[f"Cut {axis}"].inputs[1].default_value
+            for offset, beyond in ((-0.1, False), (0.1, True)):
+                point = at[:3] + sign * offset * np.eye(3)[axis]
+                assert (normal @ point > limit) == beyond
+    slices.remove_slices(nema)
+    vertices, _ = surface(nema)
+    assert ((vertices - at[:3]) * [1, -1, 1] > 5.0).all(axis=1).any()
+    settings.look = "DENSITY"
+    after = [len(kind) for kind in (bpy.data.objects, bpy.data.materials, bpy.data.node_groups, bpy.data.images)]
+    assert after == before
+
+
+def test_smoke_gives_way_to_surfaces_and_slices(nema):
+    display, settings = nema.data.display, nema.mphdrr_volume
+    for look, smoke in (("DENSITY", True), ("BRIGHTEST", True), ("SHELL", False), ("DENSITY", True)):
+        settings.look = look
+        assert display.use_slice != smoke
+    slices.add_slices(nema)
+    assert display.use_slice
+    slices.remove_slices(nema)
+    assert not display.use_slice
+
+
+def test_presets_of_a_ct(scene):
+    array = np.full((9, 9, 9), -1000.0)
+    array[2:7, 2:7, 2:7], array[4, 4, 4] = 40.0, 900.0
+    item = volumes.add_volume(Volume(array, Grid.centered(9, 2.0), "hu"), "CT")
+    sides = {}
+    for look in ("BONE", "SOFT"):
+        item.mphdrr_volume.look = look
+        sides[look] = np.ptp(surface(item)[0], axis=0).max()
+    assert sides["BONE"] < 4.0 and 8.0 < sides["SOFT"] < 10.0  # one voxel, and five
+    assert (item.mphdrr_volume.display_low, item.mphdrr_volume.display_high) == (-160.0, 240.0)
+
+
+def test_slices_of_nema_show_six_spheres_also_after_reopening(nema, tmp_path):
+    slices.add_slices(nema)
+    nema.mphdrr_volume.display_low = 6.0  # above the background
+    at = np.linalg.inv(slices._stored(nema).grid.affine) @ [0, 0, 0, 1]  # the spheres' middles
+    nema.mphdrr_volume.slices = np.rint(at[:3]).astype(int).tolist()
+    bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "a.blend"))
+    bpy.ops.wm.open_mainfile(filepath=str(tmp_path / "a.blend"))
+    image = slices.planes_of(bpy.data.objects["NEMA Body"])[2].data.materials[0].node_tree.nodes["Slice"].image
+    pixels = np.array(image.pixels).reshape(image.size[1], image.size[0], 4)
+    assert ndimage.label(pixels[..., 3] > 0)[1] == 6
+
+
+def test_a_map_has_a_bar_in_the_unit_of_the_panels(scene, small_workbook):
+    bpy.ops.mphdrr.import_geometry(filepath=str(small_workbook))
+    bpy.ops.mphdrr.add_map(quantity="sensitivity", voxels=9)
+    item = bpy.data.objects["Sensitivity map"]
+    middle = 1e6 * volumes.volume_from_object(item).array[4, 4, 4]
+    assert middle == pytest.approx(scene.mphdrr_geometry.scanner.mphdrr_scanner.sensitivity, rel=1e-5)
+    title, texts = color_bar.marks(item)
+    settings = item.mphdrr_volume
+    assert title == "Sensitivity, cps/MBq" and float(texts[0]) <= middle <= float(texts[-1])
+    assert (
+        float(texts[-1]) == pytest.approx(settings.maximum, rel=1e-3) == pytest.approx(settings.display_high, rel=1e-3)
+    )
+    assert len(slices.planes_of(item)) == 3
+
+
+def test_a_map_of_an_older_file_is_shown_in_the_same_unit(scene, tmp_path):
+    item = volumes.add_volume(Volume(np.full((3, 3, 3), 2e-4), Grid.centered(3, 1.0), "sensitivity"), "Map")
+    settings = item.mphdrr_volume
+    shown = settings.display_high
+    settings.unit = "counts/decay"
+    for name in ("minimum", "maximum", "display_low", "display_high"):
+        setattr(settings, name, 1e-6 * getattr(settings, name))
+    bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "a.blend"))
+    bpy.ops.wm.open_mainfile(filepath=str(tmp_path / "a.blend"))
+    settings = bpy.data.objects["Map"].mphdrr_volume
+    assert settings.unit == "cps/MBq" and settings.display_high == pytest.approx(shown) == pytest.approx(200.0)
+
+
+def test_crystals_phantoms_maps_and_the_selection_share_no_hue(scene):
+    theme = bpy.context.preferences.themes[0].view_3d
+
+    def hues(*colors) -> np.ndarray:
+        return np.array([360 * colorsys.rgb_to_hsv(*color[:3])[0] for color in colors])
+
+    def ramp(quantity) -> np.ndarray:
+        positions, colors = zip(*volume_materials.ramp(quantity), strict=True)
+        shares = np.linspace(0.1, 1.0, 40)
+        return hues(*np.column_stack([np.interp(shares, positions, channel) for channel in np.transpose(colors)]))
+
+    found = {
+        "crystal": hues(LOOKS["crystal"].color), "phantom": ramp("activity"), "map": ramp("resolution"),
+        "selection": hues(theme.object_selected, theme.object_active),
+    }  # fmt: skip
+    for name, one in found.items():
+        for other, two in found.items():
+            apart = np.abs((one[:, None] - two + 180) % 360 - 180).min()
+            assert name == other or apart > 12, f"{name} and {other}: {apart:.0f} degrees of hue apart"

@@ -13,7 +13,7 @@ from ..core.runs.files import write_run
 from ..core.runs.recipe import Recipe
 from ..core.runs.run_recipe import run_recipe
 from ..core.workbook import read_system
-from . import images, jobs, phantoms, rendering, scanner
+from . import images, jobs, phantoms, rendering, scanner, studio
 from .cli.demo import EULER_DEGREES, EXAMPLE
 from .phantom_properties import plain_settings
 
@@ -46,6 +46,7 @@ def example_job(context: bpy.types.Context) -> jobs.Job:
         yield
         mosaic = yield from rendering.storing(scene, run, path)
         _hide_startup(scene)
+        studio.light(scene)
         _look(bpy.context)
         images.show_below(mosaic, bpy.context)
         return f"Loaded the example: {len(system)} modules and what they see of a Derenzo phantom"

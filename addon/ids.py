@@ -47,6 +47,7 @@ SCANNER = "Scanner"  # default name of a scanner's collection
 PARTS = ("NONE", "CAMERA", "COLLIMATOR", "CRYSTAL", "ROI", "PLANE")  # `Object.mphdrr_module.part`
 MOSAIC = "mphDRR mosaic"
 PLANES = "mphDRR projections"  # the collection of the planes that show them
+STUDIO = "mphDRR studio"  # the collection of the lights, and a world
 PREVIEW = ".preview"  # in the names of coarser copies of large volumes, for display only
 
 

@@ -6,7 +6,7 @@ from typing import Literal
 import bpy
 from bpy.props import BoolProperty, FloatProperty, IntVectorProperty, StringProperty
 
-from ..addon import column_maps, ids, scanner
+from ..addon import column_maps, ids, scanner, studio
 from ..addon.reports import run_reported, warnings_reported
 from ..addon.scanner_files import WORKBOOK_SUFFIXES
 from ..core.errors import InputError
@@ -103,6 +103,7 @@ class MPHDRR_OT_import_geometry(bpy.types.Operator):
             shape=(self.image_size[1], self.image_size[0]),
             replace=self.replace,
         )
+        studio.light(context.scene)
         context.view_layer.update()  # so that scripts find the children's matrix_world in place
         self._dialog = ""
         column_maps.clear(context.window_manager.mphdrr_columns)

@@ -12,8 +12,8 @@ from .resizing import resized
 _CHARACTERS = "".join(map(chr, range(32, 127))) + "µ²³·×°±−–αβθφψΣ∫"
 _EM, _ROWS, _BASELINE = 48, 51, 39
 """Pixels to the em of the stored letters, their height, and the row on which they stand."""
-# DejaVu Sans; its licence is free for any use. A byte for each character's width, then one bit a pixel, column by column: where
-# ink begins or ends along a row.
+# DejaVu Sans; its licence is free for any use. A byte for each character's width, then one bit a pixel, column by column:
+# where ink begins or ends along a row.
 _BITS = (
     b"c-qxmPjBPMm9HWRu{KakbUX;u8;wZ2d$P`DBkV~BV??|AFdrdDO^^?uqYr~N{Rce`5MT#;%3(iB4(#p#d)xgA>|AmSl$#EQx%GapNERhglxz=@aH"
     b"eHbtiSKQdhhpsRdoOGXD8vmfA!+<aB$K;=pTgT6$B?ICojiGN5@}{hF`tz^^Si2%h$j7@)t*=(W|3h9gU6-4-QXW4!#`y>uB`T(dfmC;fr65z8sC"

@@ -18,11 +18,12 @@ from . import letters
 from .resizing import resized
 
 SUFFIXES = (".png", ".svg")
-SMALLEST, LARGEST = 200, 16384
+SMALLEST, LARGEST = 240, 16384
 """Of a page's sides, pixels."""
 
 Point = tuple[float, float]
-_STARTS = {"start": 0.0, "middle": 0.5, "end": 1.0}
+Anchor = Literal["start", "middle", "end"]
+_STARTS: dict[Anchor, float] = {"start": 0.0, "middle": 0.5, "end": 1.0}
 _FONTS = "DejaVu Sans, Verdana, Arial, sans-serif"
 
 
@@ -41,7 +42,7 @@ class Page:
     @property
     def em(self) -> float:
         """The size of text that suits the page."""
-        return max(9.0, min(self.width, 1.8 * self.height) / 72)
+        return max(7.0, min(self.width, 1.8 * self.height) / 72)
 
     @property
     def picture(self) -> NDArray[np.uint8]:
@@ -63,7 +64,7 @@ class Page:
 
     def line(self, points: Sequence[Point], color: str, width: float = 1.5, dash: float = 0.0) -> None:
         """Draw a line through points, or one of dashes that are `dash` long."""
-        self._ink(self._covered_by_lines(_dashes(points, dash) if dash else [points], width / 2), color)
+        self._ink(self._covered_by_lines(list(_dashes(points, dash)) if dash else [points], width / 2), color)
         dashes = f' stroke-dasharray="{dash:.2f} {dash:.2f}"' if dash else ""
         self._marks.append(
             f'<polyline points="{_listed(points)}" fill="none" stroke="{color}" stroke-width="{width:.2f}" '
@@ -90,7 +91,7 @@ class Page:
         y: float,
         size: float,
         color: str = "#000000",
-        anchor: Literal["start", "middle", "end"] = "start",
+        anchor: Anchor = "start",
         upward: bool = False,
     ) -> None:
         """Write a line of text that stands on (x, y), and begins, has its middle or ends there; `upward` turns it."""
@@ -125,7 +126,8 @@ class Page:
         low = np.maximum(np.floor(points.min(axis=0) - margin), 0).astype(int)
         high = np.minimum(np.ceil(points.max(axis=0) + margin), [self.width, self.height]).astype(int)
         x, y = np.arange(low[0], max(high[0], low[0])) + 0.5, np.arange(low[1], max(high[1], low[1])) + 0.5
-        return int(low[1]), int(low[0]), *np.meshgrid(x, y)
+        across, down = np.meshgrid(x, y)
+        return int(low[1]), int(low[0]), across, down
 
     def _covered_by_lines(self, lines: Sequence[Sequence[Point]], half: float) -> tuple[int, int, NDArray]:
         """How much of each pixel lines of half a width cover."""
@@ -151,6 +153,11 @@ class Page:
         place = self._pixels[top : top + share.shape[0], left : left + share.shape[1]]
         share = share[: place.shape[0], : place.shape[1], None]
         place += share * (_rgb(color) - place)
+
+
+def box(left: float, top: float, width: float, height: float) -> list[Point]:
+    """A rectangle's corners."""
+    return [(left, top), (left + width, top), (left + width, top + height), (left, top + height)]
 
 
 def _dashes(points: Sequence[Point], dash: float) -> Iterator[list[Point]]:

@@ -13,16 +13,23 @@ INK, FAINT = "#20262d", "#6b7480"
 _STEPS = (1.0, 2.0, 2.5, 5.0, 10.0)
 
 
-def heading(page: Page, title: str, lines: Sequence[str] = ()) -> int:
+def heading(page: Page, title: str, lines: Sequence[str] = (), ink: str = INK, faint: str = FAINT) -> int:
     """Write a title and lines below it; returns the first row that is free."""
     em = page.em
     row, room = 0.9 * em, page.width - 2 * em
-    for number, text in enumerate([title, *lines]):
-        size = (1.25 if number == 0 else 1.0) * em
-        size *= min(1.0, room / max(letters.width(text, size), 1.0))  # a line that is too long is written smaller
-        row += (1.2 if number == 0 else 1.45) * em
-        page.text(text, em, row, size, INK if number == 0 else FAINT)
-    return round(row + em)
+    for text, size, step, color in (
+        (title, 1.25 * em, 1.2 * em, ink),
+        *((line, em, 1.45 * em, faint) for line in lines),
+    ):
+        row += step
+        # A line that is too long is written smaller.
+        page.text(text, em, row, size * min(1.0, room / max(letters.width(text, size), 1.0)), color)
+    return heading_height(page, len(lines))
+
+
+def heading_height(page: Page, lines: int) -> int:
+    """Rows that a heading with so many lines below its title takes."""
+    return round((3.1 + 1.45 * lines) * page.em)
 
 
 def ticks(low: float, high: float, most: int) -> list[float]:
@@ -47,7 +54,7 @@ def color_bar(
     width = round(1.1 * em)
     ramp = [display.value_at(share, window) for share in np.linspace(1.0, 0.0, max(2, height))]
     page.image(display.colored(ramp, window)[:, None], left, top, width, height)
-    page.text(unit, left, top - 0.75 * em, 0.9 * em, INK)
+    page.text(unit, left, top - 0.9 * em, 0.9 * em, INK)
     for share in (0.0, 0.25, 0.5, 0.75, 1.0):
         row = top + height * (1 - share)
         page.line([(left + width, row), (left + width + 0.3 * em, row)], INK, 0.06 * em)

@@ -1,12 +1,13 @@
 """What a figure is of."""
 
-from collections.abc import Sequence
+from collections.abc import Container, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import InputError
+from ..geometry.collimator import Construction
 from ..geometry.system import PinholeSystem, chosen_modules
 from ..runs.display import Display
 from ..runs.run import ProjectionRun
@@ -20,11 +21,20 @@ NEEDS = {
 """What a figure may need, and how to give it."""
 
 
+def require(needs: Sequence[str], have: Container[str], figure: str) -> None:
+    """Raise `InputError` unless there is all that a figure needs."""
+    for need in needs:
+        if need not in have:
+            raise InputError(f"figure {figure}: needs {NEEDS[need]}")
+
+
 @dataclass(frozen=True, eq=False)
 class Subject:
     """A scanner, a volume and projections, each only where there is one."""
 
     scanner: PinholeSystem | None = None
+    construction: Construction = field(default_factory=Construction)
+    """Of the scanner's collimators."""
     volume: Volume | None = None
     run: ProjectionRun | None = None
     name: str = ""
@@ -36,13 +46,6 @@ class Subject:
     modules: str | None = None
     """Which modules, such as "1-40" or "1-20,41"; all where it is None."""
 
-    def require(self, needs: Sequence[str], figure: str) -> None:
-        """Raise `InputError` unless there is all that a figure needs."""
-        for need in needs:
-            if getattr(self, need) is None:
-                raise InputError(f"figure {figure}: needs {NEEDS[need]}")
-
-    def chosen(self) -> PinholeSystem:
-        """The scanner's modules that are to be shown."""
-        assert self.scanner is not None
-        return chosen_modules(self.scanner, self.modules)
+    def chosen(self, system: PinholeSystem) -> PinholeSystem:
+        """The modules of `system` that are to be shown."""
+        return chosen_modules(system, self.modules)

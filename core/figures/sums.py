@@ -43,7 +43,7 @@ def draw(page: Page, subject: Subject) -> None:
     sums = [orthogonal_sum(volume, axis) for axis, _, _ in _PANELS]
     display = Display("inferno" if volume.quantity == "activity" else "grey")
     window = display.window(np.concatenate([values.ravel() for values, _ in sums]))
-    unit = f"{volume.unit} · mm"
+    unit = f"{volume.unit} mm"
     em = page.em
     top = heading(page, f"Orthogonal sums{': ' if subject.name else ''}{subject.name}", _placed(subject))
     bar = bar_width(page, display, window, unit)

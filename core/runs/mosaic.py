@@ -87,11 +87,11 @@ def sheet(
     display = display or Display()
     window = display.window(projections)
     images = display.colored(_sized(as_seen(projections), pixels), window)
-    places = _places(np.asarray(rings))
+    at = places(np.asarray(rings))
     n_v, n_u = tile = images.shape[1:3]
     letters = max(1, round(min(n_v, n_u) / 60))
     gap = 2 * letters
-    corners = gap + places * (np.array(tile) + gap)
+    corners = gap + at * (np.array(tile) + gap)
     height, width = corners.max(axis=0) + tile + gap
     picture = np.full((height, width, 3), _BORDER, np.uint8)
     for image, (row, column), number in zip(images, corners, np.asarray(numbers), strict=True):
@@ -119,16 +119,16 @@ def _sized(images: NDArray[np.float32], pixels: float) -> NDArray[np.float32]:
     return images.repeat(factor, axis=1).repeat(factor, axis=2) if factor > 1 else images
 
 
-def _places(rings: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Row and column (M, 2) of each image, counted in images."""
-    places = np.empty((len(rings), 2), np.int64)
+def places(rings: NDArray[np.int64], columns: int = COLUMNS) -> NDArray[np.int64]:
+    """Row and column (M, 2) of each image, counted in images: a ring in a row, or in several of at most `columns`."""
+    at = np.empty((len(rings), 2), np.int64)
     row = 0
     for ring in dict.fromkeys(rings.tolist()):
         members = np.flatnonzero(rings == ring)
         position = np.arange(len(members))
-        places[members] = np.stack([row + position // COLUMNS, position % COLUMNS], axis=1)
-        row += int(position[-1]) // COLUMNS + 1
-    return places
+        at[members] = np.stack([row + position // columns, position % columns], axis=1)
+        row += int(position[-1]) // columns + 1
+    return at
 
 
 def _color_bar(

@@ -37,6 +37,7 @@ RENDER_PROJECTIONS = "mphdrr.render_projections"
 EXPORT_DATASET = "mphdrr.export_dataset"
 LOAD_RECIPE = "mphdrr.load_recipe"
 SHOW_PROJECTIONS = "mphdrr.show_projections"
+EXPORT_FIGURE = "mphdrr.export_figure"
 PICK_MODULE = "mphdrr.pick_module"
 CANCEL_JOB = "mphdrr.cancel_job"
 

@@ -63,6 +63,7 @@ ENTRIES = {
         ids.EXPORT_FOR_PROGRAM: "Pinhole Geometry for Programs",
         ids.EXPORT_VOLUME: "Volume (.vdb, .nii, .nrrd, ...)",
         ids.EXPORT_DATASET: "mphDRR Dataset (.h5/.npz/.pt)",
+        ids.EXPORT_FIGURE: "mphDRR Figure (.png/.svg)",
     },
     bpy.types.VIEW3D_MT_object_convert: {
         ids.VOXELIZE_OBJECTS: "Voxelize Meshes",

@@ -102,8 +102,10 @@ class MPHDRR_PT_export(Sidebar, bpy.types.Panel):
         layout = self.layout
         layout.operator_context = "INVOKE_DEFAULT"
         run_file = context.scene.mphdrr_projections.run_file
-        layout.enabled = bool(run_file)
-        layout.operator(ids.EXPORT_DATASET, text="Export Dataset", icon="EXPORT")
+        row = layout.row()
+        row.enabled = bool(run_file)
+        row.operator(ids.EXPORT_DATASET, text="Export Dataset", icon="EXPORT")
+        layout.operator(ids.EXPORT_FIGURE, text="Export Figure", icon="IMAGE_DATA")
         if run_file:
             kept = run_file if run_file.startswith("//") else "kept when the .blend is saved"
             layout.label(text=f"Last run: {kept}", icon="FILE")

@@ -87,11 +87,11 @@ def sheet(
     display = display or Display()
     window = display.window(projections)
     images = display.colored(_sized(as_seen(projections), pixels), window)
-    places = _places(np.asarray(rings))
+    at = places(np.asarray(rings))
     n_v, n_u = tile = images.shape[1:3]
     letters = max(1, round(min(n_v, n_u) / 60))
     gap = 2 * letters
-    corners = gap + places * (np.array(tile) + gap)
+    corners = gap + at * (np.array(tile) + gap)
     height, width = corners.max(axis=0) + tile + gap
     picture = np.full((height, width, 3), _BORDER, np.uint8)
     for image, (row, column), number in zip(images, corners, np.asarray(numbers), strict=True):
@@ -119,16 +119,16 @@ def _sized(images: NDArray[np.float32], pixels: float) -> NDArray[np.float32]:
     return images.repeat(factor, axis=1).repeat(factor, axis=2) if factor > 1 else images
 
 
-def _places(rings: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Row and column (M, 2) of each image, counted in images."""
-    places = np.empty((len(rings), 2), np.int64)
+def places(rings: NDArray[np.int64], columns: int = COLUMNS) -> NDArray[np.int64]:
+    """Row and column (M, 2) of each image, counted in images: a ring in a row, or in several of at most `columns`."""
+    at = np.empty((len(rings), 2), np.int64)
     row = 0
     for ring in dict.fromkeys(rings.tolist()):
         members = np.flatnonzero(rings == ring)
         position = np.arange(len(members))
-        places[members] = np.stack([row + position // COLUMNS, position % COLUMNS], axis=1)
-        row += int(position[-1]) // COLUMNS + 1
-    return places
+        at[members] = np.stack([row + position // columns, position % columns], axis=1)
+        row += int(position[-1]) // columns + 1
+    return at
 
 
 def _color_bar(
@@ -158,10 +158,15 @@ def _write(picture: NDArray[np.uint8], text: str, row: int, column: int, letters
 
 
 def write_png(picture: ArrayLike, path: str | os.PathLike[str]) -> None:
-    """Write a picture, row 0 at the top, as an 8-bit PNG: colours (height, width, 3) of uint8, or numbers (height, width).
+    """Write a picture (`png`) to a file; `InputError` where it cannot be written."""
+    with replacing(path) as temporary:
+        temporary.write_bytes(png(picture))
 
-    Of numbers, 0 is black, or the smallest if that is negative, and the largest is white. `InputError` where the file cannot
-    be written.
+
+def png(picture: ArrayLike) -> bytes:
+    """A picture, row 0 at the top, as an 8-bit PNG: colours (height, width, 3) of uint8, or numbers (height, width).
+
+    Of numbers, 0 is black, or the smallest if that is negative, and the largest is white.
     """
     pixels = np.asarray(picture)
     if pixels.ndim == 2:
@@ -170,8 +175,7 @@ def write_png(picture: ArrayLike, path: str | os.PathLike[str]) -> None:
     height, width, channels = pixels.shape
     header = struct.pack(">2I5B", width, height, 8, {1: 0, 3: 2}[channels], 0, 0, 0)  # 8 bits, grey or colours
     rows = zlib.compress(np.pad(pixels.reshape(height, -1), ((0, 0), (1, 0))).tobytes())  # 0 before each: stored as is
-    png = b"\x89PNG\r\n\x1a\n"
-    for name, data in ((b"IHDR", header), (b"IDAT", rows), (b"IEND", b"")):
-        png += struct.pack(">I", len(data)) + name + data + struct.pack(">I", zlib.crc32(name + data))
-    with replacing(path) as temporary:
-        temporary.write_bytes(png)
+    data = b"\x89PNG\r\n\x1a\n"
+    for name, part in ((b"IHDR", header), (b"IDAT", rows), (b"IEND", b"")):
+        data += struct.pack(">I", len(part)) + name + part + struct.pack(">I", zlib.crc32(name + part))
+    return data

@@ -82,6 +82,7 @@ def _draw_entries(entries: dict[str, str]) -> Callable[..., None]:
 
 
 MENUS = [(menu, _draw_entries(entries)) for menu, entries in ENTRIES.items()]
+MENUS.append((bpy.types.STATUSBAR_HT_header, jobs.draw_status))
 MENUS.append((bpy.types.VIEW3D_MT_add, lambda menu, _: menu.layout.menu("MPHDRR_MT_add", icon="OUTLINER_DATA_VOLUME")))
 
 # (list in bpy.app.handlers, function): decorate the function with @bpy.app.handlers.persistent.

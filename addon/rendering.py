@@ -2,6 +2,7 @@
 
 import math
 import time
+import uuid
 from collections.abc import Generator, Sequence
 from pathlib import Path
 from typing import Any
@@ -11,7 +12,7 @@ import bpy
 from ..core.errors import InputError
 from ..core.geometry.system import chosen_modules
 from ..core.memory import require
-from ..core.progress import Progress
+from ..core.progress import Progress, stages_of
 from ..core.runs.files import read_run, write_run
 from ..core.runs.projecting import warn_of_energy
 from ..core.runs.recipe import Recipe, read_recipe
@@ -47,27 +48,33 @@ def render_job(context: bpy.types.Context, recipe: Recipe, volume: str = "", mu:
     recipe = _with_volume(recipe, item)
     read_volume, read_mu = volumes.reader(item), mu_item and volumes.reader(mu_item)
     energy = mu_item and phantoms.mu_energy(mu_item)
-    path = run_path(scene)
+    path, display = run_path(scene), scene.mphdrr_display.display()
+    new = path.with_name(f"{path.stem}-{uuid.uuid4().hex[:8]}{path.suffix}")
     scene_name, start = scene.name, time.perf_counter()
 
-    def work(progress: Progress) -> ProjectionRun:
-        progress(0, len(system))
+    def work(progress: Progress) -> tuple[ProjectionRun, images.Pictures]:
+        stages = stages_of(progress)
         if energy is not None:
             warn_of_energy(model, energy, f"the mu of {recipe['attenuation.object']!r}")
-        (run,) = run_recipe(recipe, system, read_volume(), read_mu and read_mu(), lambda stage: progress)
-        write_run(run, path)
-        return run
+        stages("reading")
+        (run,) = run_recipe(recipe, system, read_volume(), read_mu and read_mu(), stages)
+        stages("writing the run file")
+        write_run(run, new)
+        return run, images.pictures(run, display, stages("storing"))
 
-    def finish(run: ProjectionRun) -> Generator[None, None, str]:
+    def finish(result: tuple[ProjectionRun, images.Pictures]) -> jobs.Finishing:
+        run, made = result
         scene = bpy.data.scenes.get(scene_name)
         if scene is None:
             raise InputError(f"the scene {scene_name!r} is gone; its projections are in {path}")
-        images.show((yield from storing(scene, run, path)), bpy.context)
+        mosaic = yield from storing(scene, run, path, made)
+        new.replace(path)
+        images.show(mosaic, bpy.context)
         where = path if bpy.data.filepath else f"{path} until the .blend is saved"
         seconds = time.perf_counter() - start
         return f"Projected {recipe['volume.object']!r} into {len(run.views)} modules in {seconds:.1f} s: {where}"
 
-    return jobs.Job("Projecting", work, finish)
+    return jobs.Job("Projecting", work, finish, lambda: new.unlink(missing_ok=True))
 
 
 def run_path(scene: bpy.types.Scene) -> Path:
@@ -108,16 +115,23 @@ def show_run(scene: bpy.types.Scene, run: ProjectionRun, path: Path) -> None:
         pass
 
 
-def storing(scene: bpy.types.Scene, run: ProjectionRun, path: Path) -> Generator[None, None, bpy.types.Image]:
-    """Make images and planes of `run`, which is kept in the file `path`, and note it as the scene's last."""
-    mosaic = yield from images.storing(run, scene.mphdrr_display.display())
+def storing(
+    scene: bpy.types.Scene, run: ProjectionRun, path: Path, made: images.Pictures | None = None
+) -> Generator[tuple[str, int, int], None, bpy.types.Image]:
+    """Make images (of `images.pictures`) and planes of `run`, kept in the file `path`, and note it as the scene's last."""
+    mosaic = yield from images.storing(run, scene.mphdrr_display.display(), made)
+    place(scene, run, path)
+    return mosaic
+
+
+def place(scene: bpy.types.Scene, run: ProjectionRun, path: Path) -> None:
+    """Make the planes of `run`, of which there are images, and note it as the scene's last."""
     planes.make(scene, run)
     state = scene.mphdrr_projections
     state.run_file = storage.stored_path(path.absolute())
     n_v, n_u = run.views.shape
     what = [run.settings.get("volume"), run.settings.get("backend")]
     state.run_summary = ", ".join([f"{len(run.views)} views of {n_u} × {n_v}", *(text for text in what if text)])
-    return mosaic
 
 
 def display_changed(scene: bpy.types.Scene) -> None:

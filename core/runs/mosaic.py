@@ -1,5 +1,6 @@
 """Pictures of projections: upright, as seen from the pinhole, alone or all in one with numbers and a colour bar."""
 
+import math
 import os
 import struct
 import zlib
@@ -107,16 +108,30 @@ def write_sheet(run: ProjectionRun, path: str | os.PathLike[str], display: Displ
     write_png(drawn.picture, path)
 
 
+def smaller(images: NDArray[np.float32], pixels: float) -> NDArray[np.float32]:
+    """Images (M, n_v, n_u) of about so many `pixels` together: means over blocks, where blocks of a size fill an image."""
+    needed = math.sqrt(images.size / pixels)
+    common = math.gcd(*images.shape[1:])
+    side = max(side for side in range(1, max(2, math.ceil(2 * needed))) if common % side == 0)
+    return _means(images, side) if needed > 1 and side > 1 else images
+
+
 def _sized(images: NDArray[np.float32], pixels: float) -> NDArray[np.float32]:
     """The images with so many pixels that they can be looked at."""
-    count, n_v, n_u = images.shape
+    _, n_v, n_u = images.shape
     factor = min(int(np.ceil(np.sqrt(images.size / pixels))), n_v, n_u)
     if factor > 1:
-        rows, columns = n_v // factor, n_u // factor
-        blocks = images[:, : rows * factor, : columns * factor].reshape(count, rows, factor, columns, factor)
-        return blocks.mean(axis=(2, 4), dtype=np.float32)
+        return _means(images, factor)
     factor = -(-_SMALLEST // max(n_v, n_u))
     return images.repeat(factor, axis=1).repeat(factor, axis=2) if factor > 1 else images
+
+
+def _means(images: NDArray[np.float32], side: int) -> NDArray[np.float32]:
+    """Means over blocks of `side` pixels a side; pixels beyond the last block are left out."""
+    count, n_v, n_u = images.shape
+    rows, columns = n_v // side, n_u // side
+    blocks = images[:, : rows * side, : columns * side].reshape(count, rows, side, columns, side)
+    return blocks.mean(axis=(2, 4), dtype=np.float32)
 
 
 def places(rings: NDArray[np.int64], columns: int = COLUMNS) -> NDArray[np.int64]:

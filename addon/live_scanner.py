@@ -33,12 +33,12 @@ def _follow(scene: bpy.types.Scene, depsgraph: bpy.types.Depsgraph, aim: bool) -
     global _overlooked
     if depsgraph.mode != "VIEWPORT" or following.is_writing():
         return
-    moved, structure = set(), _overlooked
+    # Both when objects were added, deleted, shown or hidden; selecting is an update of the scene alone.
+    structure = _overlooked or (depsgraph.id_type_updated("SCENE") and depsgraph.id_type_updated("COLLECTION"))
+    moved = set()
     for update in depsgraph.updates:
         item = update.id.original
-        if isinstance(item, bpy.types.Scene):
-            structure = True  # objects were added, deleted, shown or hidden
-        elif update.is_updated_transform and isinstance(item, bpy.types.Object) and item.mphdrr_module.is_module:
+        if update.is_updated_transform and isinstance(item, bpy.types.Object) and item.mphdrr_module.is_module:
             moved.add(item)
     if not (moved or structure):
         return

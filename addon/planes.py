@@ -8,12 +8,13 @@ from typing import Any
 
 import bpy
 import numpy as np
+from mathutils import Matrix
 from numpy.typing import NDArray
 
 from ..core.geometry.system import PinholeSystem
 from ..core.geometry.views import Views
 from ..core.runs.run import ProjectionRun
-from . import ids, images, scanner, selection
+from . import grabbing, ids, images, scanner, selection
 
 _KEY = (
     "mphdrr_field"  # custom property of a plane: middle and size (5,) of the virtual detector in the camera's frame, mm
@@ -44,7 +45,7 @@ def make(scene: bpy.types.Scene, run: ProjectionRun) -> list[bpy.types.Object]:
         plane.empty_display_type, plane.data = "IMAGE", picture
         plane.empty_image_side, plane.use_empty_image_alpha = "BACK", True
         plane.parent, plane.mphdrr_module.part, plane.mphdrr_module.number = camera, "PLANE", number
-        plane.lock_location = plane.lock_rotation = plane.lock_scale = (True, True, True)
+        plane.lock_scale = (True, True, True)
         plane[_KEY] = field.tolist()
         home.objects.link(plane)
         _set_background(camera.data, field, picture)
@@ -76,11 +77,10 @@ def update(scene: bpy.types.Scene) -> None:
         module = camera.mphdrr_module
         distance = settings.plane_distance or _BETWEEN * (module.pinhole_distance - module.roi_radius)
         x, y, depth, width, height = field * (1.0 if settings.plane_at_detector else distance / field[2])
-        plane.location = x, y, -depth
         # A picture's longer side is as long as the empty; pixels that are not square are stretched.
         columns, rows = plane.data.size
         plane.empty_display_size = max(columns, rows)
-        plane.scale = width / columns, height / rows, 1.0
+        grabbing.place(plane, Matrix.LocRotScale((x, y, -depth), None, (width / columns, height / rows, 1.0)))
         plane.color[3] = settings.plane_opacity
         if plane.hide_viewport == shown:
             plane.hide_viewport = not shown

@@ -41,10 +41,10 @@ def example_job(context: bpy.types.Context) -> jobs.Job:
     def finish(result: Any) -> Generator[None, None, str]:
         stored, run = result
         scene = bpy.data.scenes[scene_name]
-        scanner.build_scanner(scene, system)
+        collection = scanner.build_scanner(scene, system)
         adding.finish(stored)
         yield
-        mosaic = yield from rendering.storing(scene, run, path)
+        mosaic = yield from rendering.storing(scene, run, path, collection)
         _hide_startup(scene)
         _look(bpy.context)
         images.show_below(mosaic, bpy.context)

@@ -203,7 +203,7 @@ def _update_readouts(changed: Sequence[tuple[bpy.types.PropertyGroup, ModuleNumb
     if not changed:
         return
     numbers = [own for _, own in changed]
-    sizes = {name: np.array([getattr(own, name) for own in numbers]) for name in LENGTHS}
+    sizes: dict[str, Any] = {name: np.array([getattr(own, name) for own in numbers]) for name in LENGTHS}
     try:
         system = PinholeSystem(  # refuses impossible numbers
             np.array([own.center for own in numbers]), **sizes, numbers=np.array([own.number for own in numbers])

@@ -7,6 +7,7 @@ the part's place and where the camera started say where the module is.
 """
 
 from collections.abc import Iterable
+from typing import Any
 
 import bpy
 import numpy as np
@@ -15,7 +16,6 @@ from numpy.typing import NDArray
 
 from . import cameras, following
 
-_PARTS = (*following.PARTS, "PLANE")
 _HOME = "mphdrr_home"  # custom property of a plane: its place on its camera (4, 4)
 _START = "mphdrr_start"  # custom property of a part that is dragged: world matrix (4, 4) of its camera when that began
 _NEAR = 1e-5  # mm, or of a rotation's matrix: rounding
@@ -27,9 +27,9 @@ def place(item: bpy.types.Object, matrix: Matrix) -> None:
     item[_HOME] = [x for row in matrix for x in row]
 
 
-def is_part(item: bpy.types.ID) -> bool:
+def is_part(item: bpy.types.Object) -> bool:
     """Whether a module is moved by it."""
-    return isinstance(item, bpy.types.Object) and item.mphdrr_module.part in _PARTS
+    return item.mphdrr_module.part in following.PARTS or _HOME in item
 
 
 def is_dragging() -> bool:
@@ -45,10 +45,10 @@ def is_dragged(item: bpy.types.Object) -> bool:
 
 def is_off(item: bpy.types.Object) -> bool:
     """Whether a part is not at its place on its module's camera, and may take the module along."""
-    camera, home = item.parent, _home(item)
-    if home is None or camera is None or not camera.mphdrr_module.is_module or item.library or camera.library:
+    camera = item.parent
+    if camera is None or not camera.mphdrr_module.is_module or item.library or camera.library:
         return False
-    if np.abs(np.array(item.matrix_parent_inverse @ item.matrix_basis) - home).max() <= _NEAR:
+    if np.abs(np.array(item.matrix_parent_inverse @ item.matrix_basis) - _home(item)).max() <= _NEAR:
         return False
     kind = item.mphdrr_module.part
     is_copy = sum(o.mphdrr_module.part == kind for o in camera.children) > 1  # which of them would it be?
@@ -65,7 +65,7 @@ def carry(items: Iterable[bpy.types.Object], dragging: bool) -> set[bpy.types.Ob
         camera, home = item.parent, _home(item)
         if camera not in starts and (is_dragged(item) or not _moves_itself(camera, dragging)):
             start = np.reshape(item[_START], (4, 4)) if is_dragged(item) else cameras.world_matrix(camera)
-            motion = np.array(item.matrix_basis, np.float64) @ np.linalg.inv(home)
+            motion: Any = np.array(item.matrix_basis, np.float64) @ np.linalg.inv(home)
             motion[:3, :3] /= np.linalg.norm(motion[:3, :3], axis=0)
             _move(camera, start @ motion)
             starts[camera] = start
@@ -98,10 +98,8 @@ def _moves_itself(camera: bpy.types.Object, dragging: bool) -> bool:
     return bool(was_moved) or (dragging and camera.select_get()) or not following.is_free(camera)
 
 
-def _home(item: bpy.types.Object) -> NDArray[np.float64] | None:
-    if item.mphdrr_module.part in following.PARTS:
-        return np.eye(4)
-    return np.reshape(item[_HOME], (4, 4)) if _HOME in item else None
+def _home(item: bpy.types.Object) -> NDArray[np.float64]:
+    return np.reshape(item[_HOME], (4, 4)) if _HOME in item else np.eye(4)
 
 
 def _move(camera: bpy.types.Object, matrix: NDArray[np.float64]) -> None:

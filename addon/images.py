@@ -17,6 +17,7 @@ from ..core.runs.run import ProjectionRun
 from . import ids
 
 _KEY = "mphdrr_projection"  # custom property: marks the images that a new run replaces
+_SCANNER = "mphdrr_scanner"  # custom property of the mosaic: the collection of the scanner that the run is of
 _TILES = "mphdrr_tiles"  # custom property of the mosaic: its modules, unit, and where in it which one's image is
 
 
@@ -58,6 +59,19 @@ def tiles(image: bpy.types.Image | None) -> dict[str, Any] | None:
     return None if image is None or _TILES not in image else image[_TILES].to_dict()
 
 
+def set_scanner(mosaic: bpy.types.Image, collection: bpy.types.Collection | None) -> None:
+    """Note which scanner the mosaic's run is of."""
+    if collection is not None:
+        mosaic[_SCANNER] = collection
+    elif _SCANNER in mosaic:
+        del mosaic[_SCANNER]
+
+
+def scanner_of(mosaic: bpy.types.Image) -> bpy.types.Collection | None:
+    """The scanner that the mosaic's run is of; None where it has been removed."""
+    return mosaic.get(_SCANNER)
+
+
 def projection_name(number: int, numbers: list[int]) -> str:
     """Name of the exact image of the module `number` of a run of the modules `numbers`."""
     return ids.projection_name(number, max(numbers))
@@ -72,8 +86,11 @@ def _showing(
         name = ids.picture_name(projection_name(number, numbers))
         _store(name, display.colored(picture, window), exact=False)
         yield
+    old = bpy.data.images.get(ids.MOSAIC)
+    owner = None if old is None else old.get(_SCANNER)
     drawn = sheet(projections, numbers, rings, unit, display)
     image = _store(ids.MOSAIC, drawn.picture, exact=False)
+    set_scanner(image, owner)
     image[_TILES] = {
         "numbers": numbers, "rings": rings, "unit": unit, "corners": drawn.corners.ravel().tolist(), "tile": drawn.tile,
     }  # fmt: skip

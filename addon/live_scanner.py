@@ -38,7 +38,9 @@ def _follow(scene: bpy.types.Scene, depsgraph: bpy.types.Depsgraph, aim: bool) -
     structure = _overlooked or (depsgraph.id_type_updated("SCENE") and depsgraph.id_type_updated("COLLECTION"))
     objects = [u.id.original for u in depsgraph.updates if u.is_updated_transform and u.id.id_type == "OBJECT"]
     moved = {item for item in objects if item.mphdrr_module.is_module}
-    off = [item for item in objects if grabbing.is_part(item) and grabbing.is_off(item)]
+    off = [
+        item for item in (scene.objects if _overlooked else objects) if grabbing.is_part(item) and grabbing.is_off(item)
+    ]
     if not (moved or off or structure):
         return
     _overlooked = _is_busy()

@@ -92,7 +92,8 @@ def module_numbers(camera: bpy.types.Object) -> ModuleNumbers:
 
 def numbers_of(cameras_: Sequence[bpy.types.Object], matrices: NDArray[np.float64]) -> list[ModuleNumbers]:
     """`module_numbers` of each module; `matrices` (M, 4, 4) are the cameras' world matrices."""
-    found, designed = [], []
+    found: list[ModuleNumbers] = []
+    designed = []
     for camera, place in zip(cameras_, matrices[:, :3, 3].tolist(), strict=True):
         module, exact = camera.mphdrr_module, exact_values(camera)
         values = {name: getattr(module, name) for name in LENGTHS}

@@ -4,8 +4,6 @@ A plane is an image empty, a child of its module's camera, in a collection of it
 looks through the camera sees the scene, and the picture over it as the camera's background image.
 """
 
-from typing import Any
-
 import bpy
 import numpy as np
 from mathutils import Matrix
@@ -22,12 +20,11 @@ _KEY = (
 _BETWEEN = 0.3  # of the way from the pinhole to the ROI's surface: where a plane is unless told otherwise
 
 
-def make(scene: bpy.types.Scene, run: ProjectionRun) -> list[bpy.types.Object]:
-    """Show the pictures of a run (`images.storing`) at the modules of the scene's scanner, in place of another run's.
+def make(scene: bpy.types.Scene, run: ProjectionRun, collection: bpy.types.Collection | None) -> list[bpy.types.Object]:
+    """Show the pictures of a run (`images.storing`) at the modules of its scanner, in place of another run's.
 
     Modules that the scanner does not have any more get none.
     """
-    collection = scanner.active_scanner(scene)
     remove(scene)
     if collection is None:
         return []
@@ -91,9 +88,9 @@ def update(scene: bpy.types.Scene) -> None:
 
 
 @bpy.app.handlers.persistent
-def after_update(scene: bpy.types.Scene, *_: Any) -> None:
+def after_update(scene: bpy.types.Scene, depsgraph: bpy.types.Depsgraph) -> None:
     """Another module is active, or modules were shown or hidden: so are their planes."""
-    if any(plane.hide_viewport == shown for plane, shown in _wanted(scene)):
+    if depsgraph.id_type_updated("SCENE") and any(plane.hide_viewport == shown for plane, shown in _wanted(scene)):
         update(scene)
 
 

@@ -31,7 +31,8 @@ def render_job(context: bpy.types.Context, recipe: Recipe, volume: str = "", mu:
     InputError where there is none, a phantom has changed, settings do not go together, or memory does not suffice.
     """
     scene = context.scene
-    system = chosen_modules(scanner.read_scanner(scanner.required_scanner(scene)), recipe["system.modules"], "modules")
+    collection = scanner.required_scanner(scene)
+    system = chosen_modules(scanner.read_scanner(collection), recipe["system.modules"], "modules")
     model = recipe_model(recipe, system)  # refuses what cannot be, before the work begins
     photons = recipe["model.photons"]
     item = _chosen_volume(context, volume, ("mu",) if photons else model.takes, model.name)
@@ -48,7 +49,7 @@ def render_job(context: bpy.types.Context, recipe: Recipe, volume: str = "", mu:
     read_volume, read_mu = volumes.reader(item), mu_item and volumes.reader(mu_item)
     energy = mu_item and phantoms.mu_energy(mu_item)
     path = run_path(scene)
-    scene_name, start = scene.name, time.perf_counter()
+    scene_name, scanner_name, start = scene.name, collection.name, time.perf_counter()
 
     def work(progress: Progress) -> ProjectionRun:
         progress(0, len(system))
@@ -62,7 +63,8 @@ def render_job(context: bpy.types.Context, recipe: Recipe, volume: str = "", mu:
         scene = bpy.data.scenes.get(scene_name)
         if scene is None:
             raise InputError(f"the scene {scene_name!r} is gone; its projections are in {path}")
-        images.show((yield from storing(scene, run, path)), bpy.context)
+        owner = bpy.data.collections.get(scanner_name)  # which need not be the panel's any more
+        images.show((yield from storing(scene, run, path, owner)), bpy.context)
         where = path if bpy.data.filepath else f"{path} until the .blend is saved"
         seconds = time.perf_counter() - start
         return f"Projected {recipe['volume.object']!r} into {len(run.views)} modules in {seconds:.1f} s: {where}"
@@ -104,14 +106,17 @@ def export_run(scene: bpy.types.Scene, filepath: str) -> Path:
 
 def show_run(scene: bpy.types.Scene, run: ProjectionRun, path: Path) -> None:
     """Make images of `run`, which is kept in the file `path`, and show it as the scene's last."""
-    for _ in storing(scene, run, path):
+    for _ in storing(scene, run, path, scanner.active_scanner(scene)):
         pass
 
 
-def storing(scene: bpy.types.Scene, run: ProjectionRun, path: Path) -> Generator[None, None, bpy.types.Image]:
-    """Make images and planes of `run`, which is kept in the file `path`, and note it as the scene's last."""
+def storing(
+    scene: bpy.types.Scene, run: ProjectionRun, path: Path, collection: bpy.types.Collection | None
+) -> Generator[None, None, bpy.types.Image]:
+    """Make images and planes of `run` of the scanner `collection`, kept in the file `path`; note it as the scene's last."""
     mosaic = yield from images.storing(run, scene.mphdrr_display.display())
-    planes.make(scene, run)
+    images.set_scanner(mosaic, collection)
+    planes.make(scene, run, collection)
     state = scene.mphdrr_projections
     state.run_file = storage.stored_path(path.absolute())
     n_v, n_u = run.views.shape

@@ -35,7 +35,9 @@ def test_the_module_goes_where_a_part_is_put(collection, name):
     for _ in range(3):  # what the handler writes is an update again
         bpy.context.view_layer.update()
     assert np.allclose(camera.matrix_world, MOTION @ before, atol=1e-4)
-    assert np.allclose(item.matrix_parent_inverse @ item.matrix_basis, local, atol=1e-6), "it is where it was on its module"
+    assert np.allclose(item.matrix_parent_inverse @ item.matrix_basis, local, atol=1e-6), (
+        "it is where it was on its module"
+    )
     with pytest.warns(match="module 3 not aimed"):
         after = scanner.read_scanner(collection)
     assert after.centers[2] == pytest.approx(list(MOTION @ before.translation), abs=1e-4)

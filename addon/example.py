@@ -46,11 +46,11 @@ def example_job(context: bpy.types.Context) -> jobs.Job:
         scene = bpy.data.scenes[scene_name]
         mosaic = yield from images.storing(run, display, made)
         new.replace(path)
-        scanner.build_scanner(scene, system)
+        collection = scanner.build_scanner(scene, system)
         yield None
         adding.finish(stored)
         yield None
-        rendering.place(scene, run, path)
+        rendering.place(scene, run, path, collection)
         _hide_startup(scene)
         studio.light(scene)
         _look(bpy.context)

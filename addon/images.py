@@ -24,6 +24,7 @@ from . import ids
 _KEY = "mphdrr_projection"  # custom property: marks the images that a new run replaces
 _PIXELS = 2.2e7
 """Of all pictures together, about: larger images are shown smaller, since a picture takes memory again when it is drawn."""
+_SCANNER = "mphdrr_scanner"  # custom property of the mosaic: the collection of the scanner that the run is of
 _TILES = "mphdrr_tiles"  # custom property of the mosaic: its modules, unit, and where in it which one's image is
 
 
@@ -107,6 +108,19 @@ def tiles(image: bpy.types.Image | None) -> dict[str, Any] | None:
     Rows and columns are counted from the top left.
     """
     return None if image is None or _TILES not in image else image[_TILES].to_dict()
+
+
+def set_scanner(mosaic: bpy.types.Image, collection: bpy.types.Collection | None) -> None:
+    """Note which scanner the mosaic's run is of."""
+    if collection is not None:
+        mosaic[_SCANNER] = collection
+    elif _SCANNER in mosaic:
+        del mosaic[_SCANNER]
+
+
+def scanner_of(mosaic: bpy.types.Image) -> bpy.types.Collection | None:
+    """The scanner that the mosaic's run is of; None where it has been removed."""
+    return mosaic.get(_SCANNER)
 
 
 def projection_name(number: int, numbers: list[int]) -> str:

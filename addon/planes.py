@@ -4,16 +4,15 @@ A plane is an image empty, a child of its module's camera, in a collection of it
 looks through the camera sees the scene, and the picture over it as the camera's background image.
 """
 
-from typing import Any
-
 import bpy
 import numpy as np
+from mathutils import Matrix
 from numpy.typing import NDArray
 
 from ..core.geometry.system import PinholeSystem
 from ..core.geometry.views import Views
 from ..core.runs.run import ProjectionRun
-from . import ids, images, scanner, selection
+from . import grabbing, ids, images, scanner, selection
 
 _KEY = (
     "mphdrr_field"  # custom property of a plane: middle and size (5,) of the virtual detector in the camera's frame, mm
@@ -21,12 +20,11 @@ _KEY = (
 _BETWEEN = 0.3  # of the way from the pinhole to the ROI's surface: where a plane is unless told otherwise
 
 
-def make(scene: bpy.types.Scene, run: ProjectionRun) -> list[bpy.types.Object]:
-    """Show the pictures of a run (`images.storing`) at the modules of the scene's scanner, in place of another run's.
+def make(scene: bpy.types.Scene, run: ProjectionRun, collection: bpy.types.Collection | None) -> list[bpy.types.Object]:
+    """Show the pictures of a run (`images.storing`) at the modules of its scanner, in place of another run's.
 
     Modules that the scanner does not have any more get none.
     """
-    collection = scanner.active_scanner(scene)
     remove(scene)
     if collection is None:
         return []
@@ -44,7 +42,7 @@ def make(scene: bpy.types.Scene, run: ProjectionRun) -> list[bpy.types.Object]:
         plane.empty_display_type, plane.data = "IMAGE", picture
         plane.empty_image_side, plane.use_empty_image_alpha = "BACK", True
         plane.parent, plane.mphdrr_module.part, plane.mphdrr_module.number = camera, "PLANE", number
-        plane.lock_location = plane.lock_rotation = plane.lock_scale = (True, True, True)
+        plane.lock_scale = (True, True, True)
         plane[_KEY] = field.tolist()
         home.objects.link(plane)
         _set_background(camera.data, field, picture)
@@ -76,11 +74,10 @@ def update(scene: bpy.types.Scene) -> None:
         module = camera.mphdrr_module
         distance = settings.plane_distance or _BETWEEN * (module.pinhole_distance - module.roi_radius)
         x, y, depth, width, height = field * (1.0 if settings.plane_at_detector else distance / field[2])
-        plane.location = x, y, -depth
         # A picture's longer side is as long as the empty; pixels that are not square are stretched.
         columns, rows = plane.data.size
         plane.empty_display_size = max(columns, rows)
-        plane.scale = width / columns, height / rows, 1.0
+        grabbing.place(plane, Matrix.LocRotScale((x, y, -depth), None, (width / columns, height / rows, 1.0)))
         plane.color[3] = settings.plane_opacity
         if plane.hide_viewport == shown:
             plane.hide_viewport = not shown
@@ -91,9 +88,9 @@ def update(scene: bpy.types.Scene) -> None:
 
 
 @bpy.app.handlers.persistent
-def after_update(scene: bpy.types.Scene, *_: Any) -> None:
+def after_update(scene: bpy.types.Scene, depsgraph: bpy.types.Depsgraph) -> None:
     """Another module is active, or modules were shown or hidden: so are their planes."""
-    if any(plane.hide_viewport == shown for plane, shown in _wanted(scene)):
+    if depsgraph.id_type_updated("SCENE") and any(plane.hide_viewport == shown for plane, shown in _wanted(scene)):
         update(scene)
 
 

@@ -184,8 +184,9 @@ class GeometryProperties(bpy.types.PropertyGroup):
     """State of the Geometry panel; `Scene.mphdrr_geometry`."""
 
     scanner: PointerProperty(
-        name="Scanner", description="The scanner that the panels work on", type=bpy.types.Collection, poll=_is_scanner
-    )
+        name="Scanner", description="The scanner that the panels work on: the one of the active object",
+        type=bpy.types.Collection, poll=_is_scanner, update=on_edit("scanner_chosen"),
+    )  # fmt: skip
     active_index: IntProperty(
         name="Active Module", description="Its index among the scanner's objects", update=on_edit("active_module")
     )

@@ -114,6 +114,7 @@ UPDATES: dict[str, Callable[..., None]] = {
     "scanner": following.refresh,
     "all_modules": following.set_for_all,
     "active_module": selection.select_active,
+    "scanner_chosen": selection.scanner_chosen,
     "phantom": live_phantoms.settings_changed,
     "display_range": slices.update,
     "slices": slices.update,

@@ -19,7 +19,7 @@ from ..core.runs.recipe import Recipe, read_recipe
 from ..core.runs.run import ProjectionRun
 from ..core.runs.run_recipe import recipe_model, run_recipe, with_phantom
 from ..core.volumes.volume import require_quantity
-from . import images, jobs, phantoms, planes, scanner, storage, volumes
+from . import ids, images, jobs, phantoms, planes, scanner, storage, volumes
 from .projection_properties import OPENING_ANGLE, set_panel
 
 _REST = 0.05  # s without an edit of the display before the pictures are made anew
@@ -32,7 +32,8 @@ def render_job(context: bpy.types.Context, recipe: Recipe, volume: str = "", mu:
     InputError where there is none, a phantom has changed, settings do not go together, or memory does not suffice.
     """
     scene = context.scene
-    system = chosen_modules(scanner.read_scanner(scanner.required_scanner(scene)), recipe["system.modules"], "modules")
+    collection = scanner.required_scanner(scene)
+    system = chosen_modules(scanner.read_scanner(collection), recipe["system.modules"], "modules")
     model = recipe_model(recipe, system)  # refuses what cannot be, before the work begins
     photons = recipe["model.photons"]
     item = _chosen_volume(context, volume, ("mu",) if photons else model.takes, model.name)
@@ -50,7 +51,7 @@ def render_job(context: bpy.types.Context, recipe: Recipe, volume: str = "", mu:
     energy = mu_item and phantoms.mu_energy(mu_item)
     path, display = run_path(scene), scene.mphdrr_display.display()
     new = path.with_name(f"{path.stem}-{uuid.uuid4().hex[:8]}{path.suffix}")
-    scene_name, start = scene.name, time.perf_counter()
+    scene_name, scanner_name, start = scene.name, collection.name, time.perf_counter()
 
     def work(progress: Progress) -> tuple[ProjectionRun, images.Pictures]:
         stages = stages_of(progress)
@@ -67,7 +68,8 @@ def render_job(context: bpy.types.Context, recipe: Recipe, volume: str = "", mu:
         scene = bpy.data.scenes.get(scene_name)
         if scene is None:
             raise InputError(f"the scene {scene_name!r} is gone; its projections are in {path}")
-        mosaic = yield from storing(scene, run, path, made)
+        owner = bpy.data.collections.get(scanner_name)  # which need not be the panel's any more
+        mosaic = yield from storing(scene, run, path, owner, made)
         new.replace(path)
         images.show(mosaic, bpy.context)
         where = path if bpy.data.filepath else f"{path} until the .blend is saved"
@@ -111,22 +113,30 @@ def export_run(scene: bpy.types.Scene, filepath: str) -> Path:
 
 def show_run(scene: bpy.types.Scene, run: ProjectionRun, path: Path) -> None:
     """Make images of `run`, which is kept in the file `path`, and show it as the scene's last."""
-    for _ in storing(scene, run, path):
+    for _ in storing(scene, run, path, scanner.active_scanner(scene)):
         pass
 
 
 def storing(
-    scene: bpy.types.Scene, run: ProjectionRun, path: Path, made: images.Pictures | None = None
+    scene: bpy.types.Scene,
+    run: ProjectionRun,
+    path: Path,
+    collection: bpy.types.Collection | None,
+    made: images.Pictures | None = None,
 ) -> Generator[tuple[str, int, int], None, bpy.types.Image]:
-    """Make images (of `images.pictures`) and planes of `run`, kept in the file `path`, and note it as the scene's last."""
+    """Make images (of `images.pictures`) and planes of `run` of the scanner `collection`, kept in the file `path`.
+
+    Notes it as the scene's last.
+    """
     mosaic = yield from images.storing(run, scene.mphdrr_display.display(), made)
-    place(scene, run, path)
+    place(scene, run, path, collection)
     return mosaic
 
 
-def place(scene: bpy.types.Scene, run: ProjectionRun, path: Path) -> None:
-    """Make the planes of `run`, of which there are images, and note it as the scene's last."""
-    planes.make(scene, run)
+def place(scene: bpy.types.Scene, run: ProjectionRun, path: Path, collection: bpy.types.Collection | None) -> None:
+    """Make the planes of `run` of the scanner `collection`, of which there are images, and note it as the scene's last."""
+    images.set_scanner(bpy.data.images[ids.MOSAIC], collection)
+    planes.make(scene, run, collection)
     state = scene.mphdrr_projections
     state.run_file = storage.stored_path(path.absolute())
     n_v, n_u = run.views.shape

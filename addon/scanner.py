@@ -74,9 +74,7 @@ def build_scanner(
     first = next(iter(new.cameras.values()))
     if scene.camera is None:
         scene.camera = first
-    state = scene.mphdrr_geometry
-    state.scanner = collection
-    state.active_index = collection.all_objects.find(first.name)
+    scene.mphdrr_geometry.scanner = collection  # and its first module becomes active
     return collection
 
 
@@ -158,6 +156,14 @@ def find_scanner(scene: bpy.types.Scene, name: str) -> bpy.types.Collection | No
     found = scanners(scene)
     by_name = [c for c in found if c.mphdrr_scanner.scanner_name == name] or [c for c in found if c.name == name]
     return by_name[0] if by_name else None
+
+
+def scanner_of(scene: bpy.types.Scene, item: bpy.types.Object | None) -> bpy.types.Collection | None:
+    """The scene's scanner that an object is in, the active one first; None for other objects."""
+    if item is None:
+        return None
+    found = sorted(scanners(scene), key=lambda c: c != scene.mphdrr_geometry.scanner)
+    return next((c for c in found if c.all_objects.get(item.name) == item), None)
 
 
 def active_scanner(scene: bpy.types.Scene) -> bpy.types.Collection | None:

@@ -25,7 +25,10 @@ def pick(context: bpy.types.Context, x: float, y: float) -> str | None:
     found = np.flatnonzero(((place >= corners) & (place < corners + tiles["tile"])).all(axis=1))
     if not len(found):
         return None
-    camera = scanner.module(scanner.required_scanner(context.scene), tiles["numbers"][found[0]])
+    collection = images.scanner_of(image)
+    if collection not in scanner.scanners(context.scene):
+        raise InputError("the scanner of these projections is not in the scene: render them again")
+    camera = scanner.module(collection, tiles["numbers"][found[0]])
     if not camera.visible_get():
         raise InputError(f"{camera.name} is hidden: show it in the Modules panel")
     selection.select(context, [camera])
@@ -39,6 +42,8 @@ def _draw() -> None:
     tiles = images.tiles(image)
     camera = selection.active_module(context) if tiles is not None else None
     if tiles is None or camera is None or camera.mphdrr_module.number not in tiles["numbers"]:
+        return
+    if scanner.scanner_of(context.scene, camera) != images.scanner_of(image):
         return
     row, column = np.reshape(tiles["corners"], (-1, 2))[tiles["numbers"].index(camera.mphdrr_module.number)]
     (rows, columns), (width, height) = tiles["tile"], image.size

@@ -44,7 +44,8 @@ def example_job(context: bpy.types.Context) -> jobs.Job:
         scanner.build_scanner(scene, system)
         adding.finish(stored)
         yield
-        mosaic = yield from rendering.storing(scene, run, path)
+        state = rendering.taken_over(scene, run, bpy.context.object)
+        mosaic = yield from rendering.storing(scene, run, path, state)
         _hide_startup(scene)
         _look(bpy.context)
         images.show_below(mosaic, bpy.context)

@@ -12,11 +12,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..core.runs.display import Display
-from ..core.runs.mosaic import as_seen, sheet
+from ..core.runs.mosaic import Sheet, as_seen, sheet
 from ..core.runs.run import ProjectionRun
 from . import ids
 
 _KEY = "mphdrr_projection"  # custom property: marks the images that a new run replaces
+_TEXT = "mphdrr_difference"  # custom property of a difference: its numbers, in words
 _TILES = "mphdrr_tiles"  # custom property of the mosaic: its modules, unit, and where in it which one's image is
 
 
@@ -74,10 +75,33 @@ def _showing(
         yield
     drawn = sheet(projections, numbers, rings, unit, display)
     image = _store(ids.MOSAIC, drawn.picture, exact=False)
+    _note_tiles(image, drawn, numbers, rings, unit)
+    return image
+
+
+def _note_tiles(image: bpy.types.Image, drawn: Sheet, numbers: list[int], rings: list[int], unit: str) -> None:
     image[_TILES] = {
         "numbers": numbers, "rings": rings, "unit": unit, "corners": drawn.corners.ravel().tolist(), "tile": drawn.tile,
     }  # fmt: skip
+
+
+def store_difference(drawn: Sheet, numbers: list[int], unit: str, text: str) -> bpy.types.Image:
+    """Make the image of a difference of two runs, until other projections are shown; `text` says its numbers."""
+    image = _store(ids.DIFFERENCE, drawn.picture, exact=False)
+    _note_tiles(image, drawn, numbers, [], unit)
+    image[_TEXT] = text
     return image
+
+
+def difference_text() -> str:
+    """The numbers of the difference that was drawn last; "" where there is none."""
+    image = bpy.data.images.get(ids.DIFFERENCE)
+    return str(image.get(_TEXT, "")) if image is not None else ""
+
+
+def clear() -> None:
+    """Remove all images of runs."""
+    bpy.data.batch_remove([image for image in bpy.data.images if _KEY in image])
 
 
 def projection_array(image: bpy.types.Image) -> NDArray[np.float32]:

@@ -214,7 +214,7 @@ def with_children(item: bpy.types.Object) -> list[bpy.types.Object]:
 
 def mu_energy(item: bpy.types.Object) -> float | None:
     """The photon energy, keV, at which a volume's mu holds: of a phantom, or of a CT that was converted; else None."""
-    if (root := _root_of(item)) is not None:
+    if (root := root_of(item)) is not None:
         return recipe_of(settings_of(root)).phantom.mu_energy
     path = volumes.file_of(item)
     energy = provenance_of(path).get("energy_keV") if path.is_file() else None
@@ -223,12 +223,12 @@ def mu_energy(item: bpy.types.Object) -> float | None:
 
 def require_current(item: bpy.types.Object) -> None:
     """Raise `InputError` where a volume is of a phantom whose settings have changed since its voxels were made."""
-    phantom = _root_of(item)
+    phantom = root_of(item)
     if phantom is not None and phantom.mphdrr_volume.outdated:
         raise InputError(f"{phantom.name!r} has changed since its voxels were made: press Update Phantom first")
 
 
-def _root_of(item: bpy.types.Object) -> bpy.types.Object | None:
+def root_of(item: bpy.types.Object) -> bpy.types.Object | None:
     """The phantom that a volume is, or belongs to as its other quantity; None where there is none."""
     if item.mphdrr_volume.with_parent and item.parent is not None:
         item = item.parent

@@ -22,6 +22,7 @@ from . import (
     planes,
     properties,
     rendering,
+    runs,
     scanner,
     selection,
     slices,
@@ -87,9 +88,14 @@ HANDLERS: tuple[tuple[list[Any], Any], ...] = (
     (bpy.app.handlers.load_pre, slices.before_load),
     (bpy.app.handlers.load_post, volumes.after_load),
     (bpy.app.handlers.load_post, live_scanner.after_load),
+    (bpy.app.handlers.load_post, runs.after_load),
     (bpy.app.handlers.depsgraph_update_post, live_scanner.after_update),
     (bpy.app.handlers.depsgraph_update_post, selection.after_update),
     (bpy.app.handlers.depsgraph_update_post, planes.after_update),
+    (bpy.app.handlers.depsgraph_update_post, runs.after_update),
+    (bpy.app.handlers.frame_change_post, runs.after_update),
+    (bpy.app.handlers.undo_post, runs.after_update),
+    (bpy.app.handlers.redo_post, runs.after_update),
     (bpy.app.handlers.frame_change_post, live_scanner.after_frame),
     (bpy.app.handlers.frame_change_post, slices.after_frame_change),
     (bpy.app.handlers.undo_post, live_scanner.after_undo),
@@ -113,6 +119,7 @@ UPDATES: dict[str, Callable[..., None]] = {
     "slices": slices.update,
     "display": rendering.display_changed,
     "planes": planes.update,
+    "active_run": rendering.active_run_changed,
 }
 
 _registered = ExitStack()  # takes back what was registered, in reverse order
@@ -158,6 +165,7 @@ def unregister() -> None:
     jobs.stop()
     live_scanner.stop()
     live_phantoms.stop()
+    runs.stop()
     _registered.close()
 
 

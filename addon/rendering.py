@@ -1,14 +1,18 @@
 """Projections of a scene: the volume and the scanner projected, images in the .blend, exact arrays in a file beside it."""
 
+import contextlib
 import math
+import sys
 import time
-from collections.abc import Generator, Sequence
+import uuid
+import warnings
+from collections.abc import Generator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import bpy
 
-from ..core.errors import InputError
+from ..core.errors import InputError, InputWarning
 from ..core.geometry.system import chosen_modules
 from ..core.memory import require
 from ..core.progress import Progress
@@ -18,7 +22,7 @@ from ..core.runs.recipe import Recipe, read_recipe
 from ..core.runs.run import ProjectionRun
 from ..core.runs.run_recipe import recipe_model, run_recipe, with_phantom
 from ..core.volumes.volume import require_quantity
-from . import images, jobs, phantoms, planes, scanner, storage, volumes
+from . import following, images, jobs, phantoms, planes, runs, scanner, storage, volumes
 from .projection_properties import OPENING_ANGLE, set_panel
 
 _REST = 0.05  # s without an edit of the display before the pictures are made anew
@@ -31,7 +35,8 @@ def render_job(context: bpy.types.Context, recipe: Recipe, volume: str = "", mu:
     InputError where there is none, a phantom has changed, settings do not go together, or memory does not suffice.
     """
     scene = context.scene
-    system = chosen_modules(scanner.read_scanner(scanner.required_scanner(scene)), recipe["system.modules"], "modules")
+    collection = scanner.required_scanner(scene)
+    system = chosen_modules(scanner.read_scanner(collection), recipe["system.modules"], "modules")
     model = recipe_model(recipe, system)  # refuses what cannot be, before the work begins
     photons = recipe["model.photons"]
     item = _chosen_volume(context, volume, ("mu",) if photons else model.takes, model.name)
@@ -47,7 +52,7 @@ def render_job(context: bpy.types.Context, recipe: Recipe, volume: str = "", mu:
     recipe = _with_volume(recipe, item)
     read_volume, read_mu = volumes.reader(item), mu_item and volumes.reader(mu_item)
     energy = mu_item and phantoms.mu_energy(mu_item)
-    path = run_path(scene)
+    path, state = run_path(scene), runs.state_of(collection, system, recipe, item, mu_item)
     scene_name, start = scene.name, time.perf_counter()
 
     def work(progress: Progress) -> ProjectionRun:
@@ -62,7 +67,7 @@ def render_job(context: bpy.types.Context, recipe: Recipe, volume: str = "", mu:
         scene = bpy.data.scenes.get(scene_name)
         if scene is None:
             raise InputError(f"the scene {scene_name!r} is gone; its projections are in {path}")
-        images.show((yield from storing(scene, run, path)), bpy.context)
+        images.show((yield from storing(scene, run, path, state)), bpy.context)
         where = path if bpy.data.filepath else f"{path} until the .blend is saved"
         seconds = time.perf_counter() - start
         return f"Projected {recipe['volume.object']!r} into {len(run.views)} modules in {seconds:.1f} s: {where}"
@@ -71,8 +76,8 @@ def render_job(context: bpy.types.Context, recipe: Recipe, volume: str = "", mu:
 
 
 def run_path(scene: bpy.types.Scene) -> Path:
-    """The file of the scene's last run."""
-    return storage.folder() / f"{bpy.path.clean_name(scene.name)}-projections.h5"
+    """A file for a new run of the scene."""
+    return storage.folder() / f"{bpy.path.clean_name(scene.name)}-projections-{uuid.uuid4().hex[:8]}.h5"
 
 
 def load_recipe(scene: bpy.types.Scene, path: Path) -> None:
@@ -88,36 +93,119 @@ def load_recipe(scene: bpy.types.Scene, path: Path) -> None:
 
 
 def export_run(scene: bpy.types.Scene, filepath: str) -> Path:
-    """Write the scene's last run to a file, in the format of its suffix: .h5, .npz or .pt."""
-    run_file = scene.mphdrr_projections.run_file
-    if not run_file:
+    """Write the shown run to a file, in the format of its suffix: .h5, .npz or .pt; warns where the scene has changed."""
+    if not scene.mphdrr_projections.run_file:
         raise InputError("nothing to export: render the projections first")
-    source = storage.absolute(run_file)
-    if not source.is_file():
-        raise InputError(f"{source}: the last run's file is gone; render the projections again")
+    source = file_of(scene.mphdrr_projections.run_file)
     if not filepath:
         raise InputError("no file given: set filepath to a name ending in .h5, .npz or .pt")
     path = storage.absolute(filepath)
     write_run(read_run(source), path)
+    if found := runs.changes(scene):
+        text = f"the run is not of the scene as it is now ({'; '.join(found)}): {path.name} holds what was rendered"
+        warnings.warn(text, InputWarning, stacklevel=2)
     return path
 
 
-def show_run(scene: bpy.types.Scene, run: ProjectionRun, path: Path) -> None:
-    """Make images of `run`, which is kept in the file `path`, and show it as the scene's last."""
-    for _ in storing(scene, run, path):
+def file_of(run_file: str) -> Path:
+    """A run's file, from its path in the .blend; `InputError` where it is gone."""
+    path = storage.absolute(run_file)
+    if not path.is_file():
+        raise InputError(f"{path}: the run's file is gone; render the projections again")
+    return path
+
+
+def show_run(scene: bpy.types.Scene, run: ProjectionRun, path: Path, volume: bpy.types.Object) -> None:
+    """Put `run`, which is kept in the file `path`, into the scene's list and show it; the panel says what it was made with.
+
+    `volume` is the object of what was projected.
+    """
+    state = taken_over(scene, run, volume)
+    for _ in storing(scene, run, path, state):
         pass
 
 
-def storing(scene: bpy.types.Scene, run: ProjectionRun, path: Path) -> Generator[None, None, bpy.types.Image]:
-    """Make images and planes of `run`, which is kept in the file `path`, and note it as the scene's last."""
+def taken_over(scene: bpy.types.Scene, run: ProjectionRun, volume: bpy.types.Object) -> dict[str, Any]:
+    """Set the panel as a run that was made outside the scene says; returns the scene's state that it belongs to."""
+    recipe = Recipe()
+    with contextlib.suppress(InputError):  # a recipe that there is not, or that the panel cannot show
+        recipe = run.recipe
+        set_panel(scene.mphdrr_projections, recipe)
+    return runs.state_of(scanner.active_scanner(scene), run.system, recipe, volume, None)
+
+
+def storing(
+    scene: bpy.types.Scene, run: ProjectionRun, path: Path, state: Mapping[str, Any]
+) -> Generator[None, None, bpy.types.Image]:
+    """Show `run`, which is kept in the file `path` and was made in that state of the scene, and put it into the list."""
+    mosaic = yield from showing(scene, run)
+    runs.add(scene, run, path, state)
+    return mosaic
+
+
+def showing(scene: bpy.types.Scene, run: ProjectionRun) -> Generator[None, None, bpy.types.Image]:
+    """Make images and planes of a run, in place of those of another; returns the mosaic."""
     mosaic = yield from images.storing(run, scene.mphdrr_display.display())
     planes.make(scene, run)
-    state = scene.mphdrr_projections
-    state.run_file = storage.stored_path(path.absolute())
-    n_v, n_u = run.views.shape
-    what = [run.settings.get("volume"), run.settings.get("backend")]
-    state.run_summary = ", ".join([f"{len(run.views)} views of {n_u} × {n_v}", *(text for text in what if text)])
     return mosaic
+
+
+def showing_job(scene: bpy.types.Scene, index: int) -> jobs.Job:
+    """The job that shows a run of the scene's list."""
+    item = scene.mphdrr_projections.runs[index]
+    scene_name, name, file, path = scene.name, item.name, item.file, file_of(item.file)
+
+    def finish(run: ProjectionRun) -> Generator[None, None, str]:
+        scene = bpy.data.scenes[scene_name]
+        images.show((yield from showing(scene, run)), bpy.context)
+        files = [item.file for item in scene.mphdrr_projections.runs]
+        if file in files:  # it may have been removed meanwhile
+            runs.mark_shown(scene, files.index(file))
+        return f"Shown: {name}"
+
+    return jobs.Job("Showing a run", lambda progress: read_run(path), finish)
+
+
+def active_run_changed(scene: bpy.types.Scene) -> None:
+    """Another run of the list was chosen: show it."""
+    if following.is_writing():
+        return
+    if bpy.app.background:
+        _show_chosen()
+    elif not bpy.app.timers.is_registered(_show_chosen):
+        bpy.app.timers.register(_show_chosen, first_interval=_REST)
+
+
+def _show_chosen() -> float | None:
+    """Press the button that shows the chosen run; later, if a job is running."""
+    settings = bpy.context.scene.mphdrr_projections
+    if jobs.is_running():
+        return 10 * _REST
+    if settings.active_run < len(settings.runs) and settings.runs[settings.active_run] != runs.shown(settings.id_data):
+        try:
+            bpy.ops.mphdrr.show_run("INVOKE_DEFAULT", index=settings.active_run)
+        except RuntimeError as error:  # which Blender has shown, too
+            print(f"mphDRR: {error}", file=sys.stderr)
+    return None
+
+
+def remove_run(scene: bpy.types.Scene, index: int) -> str:
+    """Take a run off the scene's list, with its file if it is this .blend's own, and show the one beside it."""
+    settings = scene.mphdrr_projections
+    item = settings.runs[index]
+    is_shown, name = item == runs.shown(scene), item.name
+    shown = settings.run_file
+    text = f"Removed {name!r}" + ("" if runs.remove_file(item) else f"; its file stays: {storage.absolute(item.file)}")
+    settings.runs.remove(index)
+    if not is_shown:
+        runs.mark_shown(scene, [item.file for item in settings.runs].index(shown) if shown else -1)
+    elif not settings.runs:
+        images.clear()
+        planes.remove(scene)
+        runs.mark_shown(scene, -1)
+    else:
+        settings.active_run = min(index, len(settings.runs) - 1)
+    return text
 
 
 def display_changed(scene: bpy.types.Scene) -> None:

@@ -35,6 +35,11 @@ def folder() -> Path:
     return ensure_folder(_folder())
 
 
+def is_own(path: Path) -> bool:
+    """Whether a file is in the folder for this .blend's large files."""
+    return path.resolve().parent == _folder().resolve()
+
+
 def stored_path(path: Path) -> str:
     """How the .blend should name a file: `//...` when it is saved and the file lies below it, else absolute."""
     if bpy.data.filepath:
@@ -156,18 +161,11 @@ def before_save(filepath: str, _: Any = None) -> None:
             _set(volume, "filepath", f"//{target.name}/{source.name}")
     for scene in bpy.data.scenes:
         settings = scene.mphdrr_projections
-        if not settings.run_file:
-            continue
-        source = absolute(settings.run_file)
-        if _is_temporary(source):
-            _bring(source, target)
-            source = target / source.name
-        # A Save As elsewhere leaves the file where it is, as Blender does with images; only the path changes.
-        try:
-            path = "//" + Path(os.path.relpath(source, target.parent)).as_posix()
-        except ValueError:  # another drive
-            path = str(source)
-        _set(settings, "run_file", path)
+        for owner, name in [(settings, "run_file"), *((run, "file") for run in settings.runs)]:
+            if getattr(owner, name):
+                _set(owner, name, _run_path(absolute(getattr(owner, name)), target))
+        for run in settings.runs:
+            run.is_saved = True
 
 
 @bpy.app.handlers.persistent
@@ -197,12 +195,25 @@ def _set(owner: Any, name: str, path: str) -> None:
         setattr(owner, name, path)
 
 
+def _run_path(source: Path, target: Path) -> str:
+    """How the .blend names a run's file, which is copied to the folder `target` if it is a temporary one."""
+    if _is_temporary(source):
+        if source.is_file():  # of a list, not each is needed
+            _bring(source, target)
+        source = target / source.name
+    # A Save As elsewhere leaves the file where it is, as Blender does with images; only the path changes.
+    try:
+        return "//" + Path(os.path.relpath(source, target.parent)).as_posix()
+    except ValueError:  # another drive
+        return str(source)
+
+
 def _bring(file: Path, target: Path) -> None:
     destination = ensure_folder(target) / file.name
     if not file.is_file():
         raise InputError(f"{file}: is gone, so it cannot be stored beside the .blend; make it again")
-    if destination.exists() and file.suffix == ".vdb":
-        return  # named by its content
+    if destination.exists():
+        return  # named by its content, or a run's own name
     with replacing(destination) as temporary:
         shutil.copyfile(file, temporary)
 

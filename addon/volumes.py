@@ -126,6 +126,11 @@ def file_of(item: bpy.types.Object) -> Path:
     return storage.of_frame(path, _state(item.data) or 1) if item.data.is_sequence else path
 
 
+def content_of(item: bpy.types.Object) -> str:
+    """A text that tells a volume's voxels, of all its states, from others."""
+    return item.mphdrr_volume.content or bpy.path.basename(item.data.filepath)
+
+
 def state_text(item: bpy.types.Object) -> str:
     """Which state of a sequence the current frame shows: "3 of 8"."""
     state = _state(item.data)
@@ -193,6 +198,7 @@ def after_load(*_: Any) -> None:
             usual = volume_materials.usual_range(settings.quantity, 0.0, settings.maximum)
             settings.display_low, settings.display_high = usual
         if settings.center_shift != compat.VDB_CENTER_SHIFT:
+            settings.content = content_of(item)
             try:
                 states = [read_vdb(path) for path in storage.files_of_states(item.data)]
                 item.data.filepath = storage.stored_path(write_states(states, storage.folder()))
@@ -265,7 +271,7 @@ def _describe(item: bpy.types.Object, stored: StoredVolume) -> None:
     settings.shape, settings.spacing = volume.grid.shape, volume.grid.spacing
     settings.minimum, settings.maximum = stored.low, stored.high
     settings.extent = stored.extent
-    settings.exact_pose = json.dumps(stored.pose.tolist())
+    settings.exact_pose, settings.content = json.dumps(stored.pose.tolist()), stored.path.name
     settings.center_shift = compat.VDB_CENTER_SHIFT
     if not chosen:
         shown = volume_materials.usual_range(volume.quantity, stored.low, stored.high)

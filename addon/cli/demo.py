@@ -58,7 +58,7 @@ def _run(arguments: argparse.Namespace) -> None:
         write_run(run, out / "run.h5")
         write_sheet(run, out / "mosaic.png")
     with _step("scene"):
-        rendering.show_run(scene, run, out / "run.h5")
+        rendering.show_run(scene, run, out / "run.h5", volume_object)
         save_scene(out / "scanner.blend")
     with _step("pictures"), quiet():
         for first, last in scanner.quick_ranges(system):

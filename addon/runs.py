@@ -27,7 +27,6 @@ from .scanner_parts import modules_text
 
 UNKNOWN = "made by an earlier version, which did not keep the scene's state"
 _MOST = 3  # lines of differences
-_TURNED = 1e-5  # of a pose's axes: less is Blender's float32
 _REST = 0.3  # s after a change until the runs are compared with the scene
 _DEFAULTS = {
     key: setting.default
@@ -233,13 +232,13 @@ def _of_modules(scene: bpy.types.Scene, old: Mapping[str, Any]) -> Iterator[str]
         if number not in cameras:
             continue
         now = module_numbers(cameras[number])
-        is_moved = values[:3] != now.center.tolist()
+        is_moved = not all(map(_equal, values[:3], now.center.tolist()))
         if is_moved:
             moved.append(int(number))
         other = {
             name: (value, getattr(now, name))
             for name, value in zip(LENGTHS, values[3:], strict=True)
-            if value != getattr(now, name)
+            if not _equal(value, getattr(now, name))
         }
         follows = cameras[number].mphdrr_module.length_mode == FROM_ROI and (is_moved or len(other) > 1)
         if follows:
@@ -261,6 +260,11 @@ def _of_modules(scene: bpy.types.Scene, old: Mapping[str, Any]) -> Iterator[str]
     new = [] if "system.modules" in old["settings"] else [int(n) for n in cameras if n not in old["modules"]]
     if new:
         yield f"{_modules(new, count)} added"
+
+
+def _equal(old: float, new: float) -> bool:
+    """Whether two numbers are one in float64, up to the rounding of other machines and of several numbers at once."""
+    return math.isclose(old, new, rel_tol=1e-12, abs_tol=1e-12)
 
 
 def _modules(numbers: list[int], count: int) -> str:
@@ -300,9 +304,8 @@ def _of_volume(
         yield f"{kind} {item.name} changed"
     if now["state"] != old["state"]:
         yield f"{kind} {item.name}: state {old['state'] or 'none'}, now {now['state'] or 'none'}"
-    if now["pose"] != old["pose"]:
-        turned = np.abs(np.array(now["pose"]) - old["pose"])[:3, :3].max() > _TURNED
-        yield f"{kind} {item.name} {'turned' if turned else 'moved'}"
+    if what := volumes.pose_change(np.array(old["pose"]), np.array(now["pose"])):
+        yield f"{kind} {item.name} {what}"
 
 
 def _of_settings(old: Mapping[str, Any], now: Mapping[str, Any]) -> Iterator[str]:

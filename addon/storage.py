@@ -22,6 +22,7 @@ from . import ids
 
 _OUR_VOLUME = re.compile(r"[a-z]+-[0-9a-f]{16}(\.preview)?(_\d{4})?\.vdb")
 """Names of the files that `stored_volumes` writes, made from their content."""
+_OUR_RUN = re.compile(r".*-projections-[0-9a-f]{8}\.h5")  # names of the files of runs
 _FRAME = re.compile(r"_\d{4}\.vdb$")  # of a sequence, at the end of the name
 
 _LOOK = 2.0  # s that a file's size, once read, is shown
@@ -103,9 +104,10 @@ def relocate(directory: str) -> str:
 
 
 def unused_volumes() -> list[Path]:
-    """Files of voxels in this .blend's folder that none of its volumes needs."""
+    """Files of voxels and of runs in this .blend's folder that none of its volumes and lists of runs needs."""
     used = {path.name for data in bpy.data.volumes for path in _files_of(data)}
-    ours = [path for path in _folder().glob("*.vdb") if _OUR_VOLUME.fullmatch(path.name)]
+    used |= {absolute(run.file).name for scene in bpy.data.scenes for run in scene.mphdrr_projections.runs}
+    ours = [p for p in _folder().glob("*") if _OUR_VOLUME.fullmatch(p.name) or _OUR_RUN.fullmatch(p.name)]
     return sorted(path for path in ours if path.is_file() and path.name not in used)
 
 
@@ -115,7 +117,7 @@ def remove_unused() -> str:
     if bpy.data.filepath and bpy.data.is_dirty and not bpy.app.background:
         raise InputError("the .blend has changes that are not saved, and as saved may need these files: save it")
     unused = unused_volumes()
-    text = f"Removed {summary(unused)}" if unused else "No file of voxels is unused"
+    text = f"Removed {summary(unused)}" if unused else "No file of voxels or runs is unused"
     for path in unused:
         try:
             path.unlink(missing_ok=True)
@@ -127,7 +129,7 @@ def remove_unused() -> str:
 def summary(files: list[Path]) -> str:
     """How many unused files there are, and how large they are."""
     size = readable_size(sum(path.stat().st_size for path in files))
-    return f"{len(files)} unused file{'s' if len(files) != 1 else ''} of voxels ({size})"
+    return f"{len(files)} unused file{'s' if len(files) != 1 else ''} of voxels or runs ({size})"
 
 
 def files_of_states(data: bpy.types.Volume) -> list[Path]:

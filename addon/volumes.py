@@ -156,10 +156,16 @@ def pose_of_object(item: bpy.types.Object) -> NDArray[np.float64]:
     exact = item.mphdrr_volume.exact_pose
     if exact:
         pose = np.array(json.loads(exact))
-        is_turned = not np.allclose(pose[:3, :3], shown[:3, :3], rtol=0, atol=2e-6)
-        if not is_turned and np.allclose(pose[:3, 3], shown[:3, 3], rtol=1e-6, atol=1e-6):
+        if not pose_change(pose, shown):
             return pose
     return checked_affine(shown, f"{item.name}: its matrix")
+
+
+def pose_change(old: NDArray[np.float64], new: NDArray[np.float64]) -> str:
+    """Whether an object "turned" or "moved" between two poses (4, 4); "" for what may be Blender's float32."""
+    if not np.allclose(old[:3, :3], new[:3, :3], rtol=0, atol=2e-6):
+        return "turned"
+    return "" if np.allclose(old[:3, 3], new[:3, 3], rtol=1e-6, atol=1e-6) else "moved"
 
 
 def is_volume(item: bpy.types.Object | None) -> bool:

@@ -220,6 +220,9 @@ def test_two_runs_survive_save_and_reopen(render, scene, tmp_path):
     replaced = storage.absolute(settings.runs[0].file)
     bpy.ops.mphdrr.render_projections()
     assert len(settings.runs) == 2 and replaced.exists()
+    bpy.ops.wm.save_mainfile()
+    assert bpy.ops.mphdrr.clean_volume_files() == {"FINISHED"}
+    assert not replaced.exists() and all(storage.absolute(item.file).exists() for item in settings.runs)
 
 
 def test_a_file_of_another_blend_is_never_removed(render, scene, tmp_path):

@@ -300,3 +300,19 @@ def test_a_volume_that_is_not_in_the_panel_is_found_again(render, scene):
     assert runs.changes(scene) == ["volume Derenzo, now Other"] and runs.volume_to_render(scene) == ""
     assert bpy.ops.mphdrr.render_projections() == {"FINISHED"}
     assert runs.changes(scene) == [] and rendering.file_of(scene.mphdrr_projections.run_file)
+
+
+def test_two_runs_of_blender_4_5_open_in_every_version(scene, tmp_path):
+    """Three modules; Module 03 was moved and the phantom turned between the runs, of which the second is shown."""
+    for name in ("runs-4.5.blend", "runs-4.5_mphdrr"):
+        (shutil.copytree if (DATA / name).is_dir() else shutil.copy)(DATA / name, tmp_path / name)
+    bpy.ops.wm.open_mainfile(filepath=str(tmp_path / "runs-4.5.blend"))
+    scene = bpy.context.scene
+    before, after = scene.mphdrr_projections.runs
+    assert (before.name, after.name) == ("Before", "Derenzo, emission") and runs.shown(scene) == after
+    assert runs.changes(scene, before) == ["Module 03 moved", "phantom Derenzo turned"] and runs.changes(scene) == []
+    expected = array_of(after)
+    assert np.array_equal(images.projection_array(bpy.data.images["mphDRR 66"]), expected[2])
+    assert bpy.ops.mphdrr.render_projections() == {"FINISHED"}
+    np.testing.assert_allclose(array_of(scene.mphdrr_projections.runs[-1]), expected, rtol=1e-6)
+    assert runs.changes(scene, scene.mphdrr_projections.runs[1]) == []

@@ -1,6 +1,5 @@
 """The example: the bundled scanner around a Derenzo phantom, projected and shown, in one step."""
 
-import uuid
 from typing import Any
 
 import bpy
@@ -13,7 +12,7 @@ from ..core.runs.files import write_run
 from ..core.runs.recipe import Recipe
 from ..core.runs.run_recipe import run_recipe
 from ..core.workbook import read_system
-from . import images, jobs, phantoms, rendering, scanner, studio
+from . import images, jobs, phantoms, rendering, runs, scanner, studio
 from .cli.demo import EULER_DEGREES, EXAMPLE
 from .phantom_properties import plain_settings
 
@@ -31,33 +30,32 @@ def example_job(context: bpy.types.Context) -> jobs.Job:
     placed = {"phantom.kind": "derenzo", "phantom.euler_degrees": EULER_DEGREES, "phantom.voxels": _VOXELS}
     recipe = Recipe({"system.file": str(EXAMPLE), **placed, **detector})
     scene_name, path, display = scene.name, rendering.run_path(scene), scene.mphdrr_display.display()
-    new = path.with_name(f"{path.stem}-{uuid.uuid4().hex[:8]}{path.suffix}")
 
     def work(progress: Progress) -> Any:
         stages = stages_of(progress)
         stored = adding.work(progress)
         (run,) = run_recipe(recipe, system, stages=stages)
         stages("writing the run file")
-        write_run(run, new)
+        write_run(run, path)
         return stored, run, images.pictures(run, display, stages("storing"))
 
     def finish(result: Any) -> jobs.Finishing:
         stored, run, made = result
         scene = bpy.data.scenes[scene_name]
         mosaic = yield from images.storing(run, display, made)
-        new.replace(path)
         collection = scanner.build_scanner(scene, system)
         yield None
         adding.finish(stored)
         yield None
-        rendering.place(scene, run, path, collection)
+        rendering.place(scene, run, collection)
+        runs.add(scene, run, path, rendering.taken_over(scene, run, bpy.context.object), collection)
         _hide_startup(scene)
         studio.light(scene)
         _look(bpy.context)
         images.show_below(mosaic, bpy.context)
         return f"Loaded the example: {len(system)} modules and what they see of a Derenzo phantom"
 
-    return jobs.Job("Loading the example", work, finish, lambda: new.unlink(missing_ok=True))
+    return jobs.Job("Loading the example", work, finish, lambda: path.unlink(missing_ok=True))
 
 
 def _hide_startup(scene: bpy.types.Scene) -> None:

@@ -38,16 +38,20 @@ EXPORT_DATASET = "mphdrr.export_dataset"
 LOAD_RECIPE = "mphdrr.load_recipe"
 SHOW_PROJECTIONS = "mphdrr.show_projections"
 EXPORT_FIGURE = "mphdrr.export_figure"
+SHOW_RUN = "mphdrr.show_run"
+REMOVE_RUN = "mphdrr.remove_run"
+COMPARE_RUNS = "mphdrr.compare_runs"
 PICK_MODULE = "mphdrr.pick_module"
 CANCEL_JOB = "mphdrr.cancel_job"
 
 # --- Panels, drawn in the order of the work: bl_order -----------------------------------------------------------------
-ORDER_GEOMETRY, ORDER_PHANTOM, ORDER_PROJECTIONS, ORDER_EXPORT = 0, 10, 20, 30
+ORDER_GEOMETRY, ORDER_PHANTOM, ORDER_PROJECTIONS, ORDER_RUNS, ORDER_EXPORT = 0, 10, 20, 25, 30
 
 # --- Datablocks ---------------------------------------------------------------------------------------------
 SCANNER = "Scanner"  # default name of a scanner's collection
 PARTS = ("NONE", "CAMERA", "COLLIMATOR", "CRYSTAL", "ROI", "PLANE")  # `Object.mphdrr_module.part`
 MOSAIC = "mphDRR mosaic"
+DIFFERENCE = "mphDRR difference"
 PLANES = "mphDRR projections"  # the collection of the planes that show them
 STUDIO = "mphDRR studio"  # the collection of the lights, and a world
 PREVIEW = ".preview"  # in the names of coarser copies of large volumes, for display only

@@ -25,6 +25,7 @@ _KEY = "mphdrr_projection"  # custom property: marks the images that a new run r
 _PIXELS = 2.2e7
 """Of all pictures together, about: larger images are shown smaller, since a picture takes memory again when it is drawn."""
 _SCANNER = "mphdrr_scanner"  # custom property of the mosaic: the collection of the scanner that the run is of
+_TEXT = "mphdrr_difference"  # custom property of a difference: its numbers, in words
 _TILES = "mphdrr_tiles"  # custom property of the mosaic: its modules, unit, and where in it which one's image is
 
 
@@ -140,6 +141,27 @@ def _describe(image: bpy.types.Image, drawn: Sheet, numbers: list[int], rings: l
     image[_TILES] = {
         "numbers": numbers, "rings": rings, "unit": unit, "corners": drawn.corners.ravel().tolist(), "tile": drawn.tile,
     }  # fmt: skip
+
+
+def store_difference(drawn: Sheet, numbers: list[int], unit: str, text: str) -> bpy.types.Image:
+    """Make the image of a difference of two runs, until other projections are shown; `text` says its numbers."""
+    old = bpy.data.images.get(ids.DIFFERENCE)
+    image = _new(ids.DIFFERENCE, drawn.picture) if old is None else _fill(old, drawn.picture)
+    image.use_fake_user, image[_KEY] = True, True
+    _describe(image, drawn, numbers, [], unit)
+    image[_TEXT] = text
+    return image
+
+
+def difference_text() -> str:
+    """The numbers of the difference that was drawn last; "" where there is none."""
+    image = bpy.data.images.get(ids.DIFFERENCE)
+    return str(image.get(_TEXT, "")) if image is not None else ""
+
+
+def clear() -> None:
+    """Remove all images of runs."""
+    bpy.data.batch_remove([image for image in bpy.data.images if _KEY in image])
 
 
 def projection_array(image: bpy.types.Image) -> NDArray[np.float32]:

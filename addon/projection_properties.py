@@ -8,6 +8,7 @@ from typing import Any
 import bpy
 from bpy.props import (
     BoolProperty,
+    CollectionProperty,
     EnumProperty,
     FloatProperty,
     FloatVectorProperty,
@@ -22,6 +23,7 @@ from ..core.runs.recipe import Recipe, fitting_recipe, is_met
 from ..core.runs.settings import SETTINGS, Setting
 from . import choices, volumes
 from .decimals import typed
+from .updates import on_edit
 
 OPENING_ANGLE = "model.opening_angle_degrees"
 """A setting of the scanner's here: its collimators are drawn with it."""
@@ -201,6 +203,30 @@ def _is_mu(self: ProjectionProperties, item: bpy.types.Object) -> bool:
     return volumes.is_volume(item) and volumes.quantity_of(item) == "mu"
 
 
+class RunProperties(bpy.types.PropertyGroup):
+    """A run in the scene's list, `ProjectionProperties.runs`; `addon/runs.py` writes it."""
+
+    name: StringProperty(name="Name", description="Of the run; one that is given another name is kept")
+    usual_name: StringProperty(name="Usual Name", description="That it got when it was made", options={"HIDDEN"})
+    file: StringProperty(
+        name="File", description="With its exact arrays", subtype="FILE_PATH",
+        options={"HIDDEN", "PATH_SUPPORTS_BLEND_RELATIVE"},
+    )  # fmt: skip
+    scanner: PointerProperty(name="Scanner", description="That it is of", type=bpy.types.Collection)
+    summary: StringProperty(name="Summary", description="What it is", options={"HIDDEN"})
+    state: StringProperty(name="State", description="Of the scene when it was made, float64 JSON", options={"HIDDEN"})
+    keep: BoolProperty(
+        name="Keep",
+        description="Keep this run. Of the others the last two stay, and the next render replaces the older",
+    )
+    is_saved: BoolProperty(name="Saved", description="A saved .blend may need its file", options={"HIDDEN"})
+
+    @property
+    def is_kept(self) -> bool:
+        """Whether the next render leaves it."""
+        return bool(self.keep or self.name != self.usual_name)
+
+
 class ProjectionProperties(ProjectionSettings, bpy.types.PropertyGroup):
     """State of the Projections panel; `Scene.mphdrr_projections`."""
 
@@ -212,11 +238,15 @@ class ProjectionProperties(ProjectionSettings, bpy.types.PropertyGroup):
         name="Attenuation", description="Volume of attenuation coefficients (1/mm) before the pinhole; empty: none",
         type=bpy.types.Object, poll=_is_mu,
     )  # fmt: skip
+    runs: CollectionProperty(type=RunProperties, name="Runs", options={"HIDDEN"})
+    active_run: IntProperty(
+        name="Run", description="The run in the list whose images are shown", update=on_edit("active_run")
+    )
     run_file: StringProperty(
-        name="Run", description="File with the last run's exact arrays", subtype="FILE_PATH",
+        name="Run", description="File with the shown run's exact arrays", subtype="FILE_PATH",
         options={"HIDDEN", "PATH_SUPPORTS_BLEND_RELATIVE"},
     )  # fmt: skip
-    run_summary: StringProperty(name="Last Run", description="What the last run was", options={"HIDDEN"})
+    run_summary: StringProperty(name="Shown Run", description="What the shown run is", options={"HIDDEN"})
 
 
-CLASSES = (ProjectionProperties,)
+CLASSES = (RunProperties, ProjectionProperties)

@@ -24,6 +24,7 @@ from . import (
     properties,
     recovery,
     rendering,
+    runs,
     scanner,
     selection,
     slices,
@@ -92,9 +93,14 @@ HANDLERS: tuple[tuple[list[Any], Any], ...] = (
     (bpy.app.handlers.load_post, volumes.after_load),
     (bpy.app.handlers.load_post, recovery.after_load),
     (bpy.app.handlers.load_post, live_scanner.after_load),
+    (bpy.app.handlers.load_post, runs.after_load),
     (bpy.app.handlers.depsgraph_update_post, live_scanner.after_update),
     (bpy.app.handlers.depsgraph_update_post, selection.after_update),
     (bpy.app.handlers.depsgraph_update_post, planes.after_update),
+    (bpy.app.handlers.depsgraph_update_post, runs.after_update),
+    (bpy.app.handlers.frame_change_post, runs.after_update),
+    (bpy.app.handlers.undo_post, runs.after_update),
+    (bpy.app.handlers.redo_post, runs.after_update),
     (bpy.app.handlers.frame_change_post, live_scanner.after_frame),
     (bpy.app.handlers.frame_change_post, slices.after_frame_change),
     (bpy.app.handlers.undo_post, live_scanner.after_undo),
@@ -121,6 +127,7 @@ UPDATES: dict[str, Callable[..., None]] = {
     "look": slices.look_changed,
     "display": rendering.display_changed,
     "planes": planes.update,
+    "active_run": rendering.active_run_changed,
 }
 
 _registered = ExitStack()  # takes back what was registered, in reverse order
@@ -167,6 +174,7 @@ def unregister() -> None:
     jobs.stop()
     live_scanner.stop()
     live_phantoms.stop()
+    runs.stop()
     _registered.close()
 
 

@@ -17,7 +17,7 @@ from ..core.errors import InputError
 
 class MPHDRR_OT_render_projections(ProjectionSettings, jobs.JobOperator, bpy.types.Operator):
     """Project the volume into every module: exact line integrals or SPECT counts, stored as images and as a file beside
-    the .blend. Settings that a script leaves out are those of the panel
+    the .blend. The settings are what the panel says now, unless a script gives others
     """
 
     bl_idname = ids.RENDER_PROJECTIONS
@@ -113,7 +113,7 @@ class MPHDRR_OT_pick_module(bpy.types.Operator):
 
 
 class MPHDRR_OT_export_dataset(ExportHelper, bpy.types.Operator):
-    """Write the last run, with geometry, volume and provenance, as HDF5 (.h5), NumPy (.npz) or PyTorch (.pt)"""
+    """Write the shown run, with geometry, volume and provenance, as HDF5 (.h5), NumPy (.npz) or PyTorch (.pt)"""
 
     bl_idname = ids.EXPORT_DATASET
     bl_label = "Export mphDRR Dataset"

@@ -4,9 +4,10 @@ from collections.abc import Container
 
 import bpy
 
-from ..addon import ids, jobs, scanner, volumes
+from ..addon import ids, jobs, runs, scanner, volumes
 from ..addon.projection_properties import drawn, makes_counts
-from .geometry import Sidebar
+from .geometry import Sidebar, draw_text
+from .runs import draw_changes
 
 _MAIN = ("time", "photons", "pixel_points")
 """Settings of models that the panel itself shows; the others stand under Physics."""
@@ -47,10 +48,7 @@ class MPHDRR_PT_projections(Sidebar, bpy.types.Panel):
                 hint.label(text="Needs a scanner and a volume.", icon="INFO")
         if settings.run_file:
             layout.operator(ids.SHOW_PROJECTIONS, text="Show Mosaic", icon="IMAGE_DATA")
-            column = layout.column(align=True)
-            column.active = False
-            for part in settings.run_summary.split(", ", 1):
-                column.label(text=part)
+            draw_changes(layout, context.scene)
 
 
 def _draw(
@@ -108,4 +106,6 @@ class MPHDRR_PT_export(Sidebar, bpy.types.Panel):
         layout.operator(ids.EXPORT_FIGURE, text="Export Figure", icon="IMAGE_DATA")
         if run_file:
             kept = run_file if run_file.startswith("//") else "kept when the .blend is saved"
-            layout.label(text=f"Last run: {kept}", icon="FILE")
+            layout.label(text=f"Shown run: {kept}", icon="FILE")
+        for line in runs.change_lines(context.scene):
+            draw_text(layout, line)

@@ -63,11 +63,11 @@ def _run(arguments: argparse.Namespace) -> None:
         })  # fmt: skip
         (run,) = run_recipe(recipe, system, stages=progress_bar)
         pose, phantom = run.recipe["phantom.matrix"], run.recipe.tables()["phantom"]
-        volumes.add_volume(run.volume, "Derenzo phantom", pose, phantom)
+        item = volumes.add_volume(run.volume, "Derenzo phantom", pose, phantom)
     with _step("dataset"):
         write_run(run, out / "run.h5")
     with _step("scene"):
-        rendering.show_run(scene, run, out / "run.h5")
+        rendering.show_run(scene, run, out / "run.h5", item)
         save_scene(out / "scanner.blend")
     with _step("pictures"), quiet():
         ranges = {f"modules-{first}-{last}": f"{first}-{last}" for first, last in scanner.quick_ranges(system)}

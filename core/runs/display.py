@@ -16,8 +16,11 @@ _COLORS = {
     "viridis": "440154 48186a 472d7b 424086 3b528b 33638d 2c728e 26828e 21918c 1f9f88 27ad81 3dbc74 5cc863 81d34d aadc32 "
     "d5e21a fde725",
     "grey": "000000 ffffff",
+    "diverging": "04306b 2a6fbb 8fbfe6 f4f4f4 f0a58c c8402f 6b0410",
 }
-COLORS = tuple(_COLORS)
+DIVERGING = "diverging"
+"""Name of the colours of differences: blue below the middle, white there, red above it."""
+COLORS = tuple(name for name in _COLORS if name != DIVERGING)
 """Names of the colour maps; all but grey are perceptually uniform."""
 SCALES = ("linear", "sqrt", "log")
 _DECADES = 3.0
@@ -38,7 +41,7 @@ class Display:
     high: float | None = None
 
     def __post_init__(self) -> None:
-        if self.colors not in COLORS:
+        if self.colors not in _COLORS:
             raise InputError(f"colors {self.colors!r}: expected one of {', '.join(COLORS)}")
         if self.scale not in SCALES:
             raise InputError(f"scale {self.scale!r}: expected one of {', '.join(SCALES)}")

@@ -36,6 +36,7 @@ RENDER_PROJECTIONS = "mphdrr.render_projections"
 EXPORT_DATASET = "mphdrr.export_dataset"
 LOAD_RECIPE = "mphdrr.load_recipe"
 SHOW_PROJECTIONS = "mphdrr.show_projections"
+LIVE_PREVIEW = "mphdrr.live_preview"
 PICK_MODULE = "mphdrr.pick_module"
 CANCEL_JOB = "mphdrr.cancel_job"
 

@@ -73,9 +73,7 @@ def update(scene: bpy.types.Scene) -> None:
     settings = scene.mphdrr_display
     for plane, shown in _wanted(scene):
         camera, field = plane.parent, np.array(plane[_KEY])
-        module = camera.mphdrr_module
-        distance = settings.plane_distance or _BETWEEN * (module.pinhole_distance - module.roi_radius)
-        x, y, depth, width, height = field * (1.0 if settings.plane_at_detector else distance / field[2])
+        x, y, depth, width, height = field * share_of_way(settings, camera.mphdrr_module, field[2])
         plane.location = x, y, -depth
         # A picture's longer side is as long as the empty; pixels that are not square are stretched.
         columns, rows = plane.data.size
@@ -88,6 +86,13 @@ def update(scene: bpy.types.Scene) -> None:
             if background.image == plane.data:
                 background.show_background_image = settings.backgrounds
                 background.alpha = settings.plane_opacity
+
+
+def share_of_way(settings: bpy.types.PropertyGroup, module: bpy.types.PropertyGroup, distance: float) -> float:
+    """Where a module's picture is shown: as a share of the way from its pinhole to the detector at `distance`, mm."""
+    if settings.plane_at_detector:
+        return 1.0
+    return (settings.plane_distance or _BETWEEN * (module.pinhole_distance - module.roi_radius)) / distance
 
 
 @bpy.app.handlers.persistent

@@ -12,6 +12,7 @@ from ..core.errors import InputError
 from ..core.geometry.system import chosen_modules
 from ..core.memory import require
 from ..core.progress import Progress
+from ..core.projector import Model
 from ..core.runs.files import read_run, write_run
 from ..core.runs.projecting import warn_of_energy
 from ..core.runs.recipe import Recipe, read_recipe
@@ -19,7 +20,8 @@ from ..core.runs.run import ProjectionRun
 from ..core.runs.run_recipe import recipe_model, run_recipe, with_phantom
 from ..core.volumes.volume import require_quantity
 from . import images, jobs, phantoms, planes, scanner, storage, volumes
-from .projection_properties import OPENING_ANGLE, set_panel
+from .decimals import typed
+from .projection_properties import OPENING_ANGLE, set_panel, settings_recipe
 
 _REST = 0.05  # s without an edit of the display before the pictures are made anew
 
@@ -33,11 +35,7 @@ def render_job(context: bpy.types.Context, recipe: Recipe, volume: str = "", mu:
     scene = context.scene
     system = chosen_modules(scanner.read_scanner(scanner.required_scanner(scene)), recipe["system.modules"], "modules")
     model = recipe_model(recipe, system)  # refuses what cannot be, before the work begins
-    photons = recipe["model.photons"]
-    item = _chosen_volume(context, volume, ("mu",) if photons else model.takes, model.name)
-    mu_item = _given(context, "mu", mu) if recipe["model.kind"] == "emission" else None
-    if mu_item is not None:
-        require_quantity(volumes.quantity_of(mu_item), ("mu",), f"{mu_item.name!r} for attenuation")
+    item, mu_item = sources(context, recipe, model, volume, mu)
     for chosen in filter(None, (item, mu_item)):
         phantoms.require_current(chosen)
     rows, columns = recipe["detector.rows"], recipe["detector.columns"]
@@ -68,6 +66,25 @@ def render_job(context: bpy.types.Context, recipe: Recipe, volume: str = "", mu:
         return f"Projected {recipe['volume.object']!r} into {len(run.views)} modules in {seconds:.1f} s: {where}"
 
     return jobs.Job("Projecting", work, finish)
+
+
+def sources(
+    context: bpy.types.Context, recipe: Recipe, model: Model, volume: str = "", mu: str = ""
+) -> tuple[bpy.types.Object, bpy.types.Object | None]:
+    """The objects of what is projected and of what attenuates it, if anything; arguments and errors as of `render_job`."""
+    photons = recipe["model.photons"]
+    item = _chosen_volume(context, volume, ("mu",) if photons else model.takes, model.name)
+    mu_item = _given(context, "mu", mu) if recipe["model.kind"] == "emission" else None
+    if mu_item is not None:
+        require_quantity(volumes.quantity_of(mu_item), ("mu",), f"{mu_item.name!r} for attenuation")
+    return item, mu_item
+
+
+def panel_recipe(scene: bpy.types.Scene) -> Recipe:
+    """What the scene's panel asks for; raises InputError where that cannot be."""
+    settings, angle = scene.mphdrr_projections, scanner.required_scanner(scene).mphdrr_scanner.opening_angle
+    more = {OPENING_ANGLE: math.degrees(typed(angle))}
+    return settings_recipe(lambda name: getattr(settings, name), lambda name: False, more)
 
 
 def run_path(scene: bpy.types.Scene) -> Path:

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..core.runs.display import Display
-from ..core.runs.mosaic import as_seen, sheet
+from ..core.runs.mosaic import as_seen, sheet, totals
 from ..core.runs.run import ProjectionRun
 from . import ids
 
@@ -53,7 +53,8 @@ def show_again(display: Display) -> None:
 def tiles(image: bpy.types.Image | None) -> dict[str, Any] | None:
     """Of the mosaic: `numbers` and `rings` of its modules, `unit`, the tiles' size `tile` and their `corners`; else None.
 
-    Rows and columns are counted from the top left.
+    Rows and columns are counted from the top left. `window` is that of the colours; `totals` are what `summed` says of each
+    image, "sum" or "mean", and `maxima` their largest numbers. Files of earlier versions lack these four.
     """
     return None if image is None or _TILES not in image else image[_TILES].to_dict()
 
@@ -72,12 +73,20 @@ def _showing(
         name = ids.picture_name(projection_name(number, numbers))
         _store(name, display.colored(picture, window), exact=False)
         yield
-    drawn = sheet(projections, numbers, rings, unit, display)
+    word, values = totals(projections, unit)
+    maxima = projections.max(axis=(1, 2))
+    drawn = sheet(projections, numbers, rings, unit, display, total=(word, values))
     image = _store(ids.MOSAIC, drawn.picture, exact=False)
     image[_TILES] = {
         "numbers": numbers, "rings": rings, "unit": unit, "corners": drawn.corners.ravel().tolist(), "tile": drawn.tile,
+        "window": drawn.window, "summed": word, "totals": values.tolist(), "maxima": maxima.tolist(),
     }  # fmt: skip
     return image
+
+
+def is_exact(image: bpy.types.Image) -> bool:
+    """Whether an image holds the exact numbers of a module's projection."""
+    return _KEY in image and image.is_float
 
 
 def projection_array(image: bpy.types.Image) -> NDArray[np.float32]:

@@ -20,7 +20,7 @@ from ..core.geometry.system import PinholeSystem
 from ..core.geometry.views import Views
 from ..core.memory import readable_size
 from ..core.runs.display import Display
-from ..core.runs.mosaic import Sheet, sheet
+from ..core.runs.mosaic import as_seen, sized, totals
 from ..core.runs.recipe import Recipe
 from ..core.runs.run import ProjectionRun
 from ..core.runs.run_recipe import recipe_model, run_recipe
@@ -37,6 +37,7 @@ MOST_KEPT = 2 * 2**30
 _INTERVAL = 0.02  # s between two looks, while there is something to do
 _REST = 0.3  # s without a change before the picture is made with all pixels
 _SHOWN_PIXELS = 512**2
+_MOST_CAUTIONS = 2
 
 Source = tuple[Path, NDArray[np.float64]]
 """File and pose (4, 4) of a volume, mm."""
@@ -64,10 +65,10 @@ class Preview:
     """A preview that has been made."""
 
     run: ProjectionRun  # of one module; exact
-    sheet: Sheet  # its picture
-    corners: (
-        NDArray[np.float64] | None
-    )  # world places (4, 3), mm, of the picture in the scene: from top left, clockwise
+    picture: NDArray[np.uint8]  # its colours (height, width, 3), row 0 at the top
+    colors: NDArray[np.uint8]  # (1, 256, 3), from the first to the last
+    window: tuple[float, float]  # the numbers that have these
+    corners: NDArray[np.float64] | None  # world places (4, 3), mm, of the picture in the scene, from top left clockwise
     lines: tuple[str, ...]
     is_quick: bool
 
@@ -118,16 +119,20 @@ def make(asked: Request, quick: bool, voxels: dict[Path, Volume]) -> Preview:
         if path not in voxels:
             voxels[path] = read_vdb(path)
     volume, *mu = (moved(voxels[path], pose) for path, pose in sources)
-    sized = quick_recipe(recipe) if quick else recipe
-    (run,) = run_recipe(sized, system, volume, mu[0] if mu else None)
+    (run,) = run_recipe(quick_recipe(recipe) if quick else recipe, system, volume, mu[0] if mu else None)
     shown = run.projections
     if run.unit == "counts" and quick:  # shown per pixel of the panel's size, as the full picture and the runs are
         shown = shown * np.float32(_pixel_area(_views(recipe, system)) / _pixel_area(run.views))
-    drawn = sheet(shown, system.numbers, [0], run.unit, asked.display, _SHOWN_PIXELS)
+    word, (total,) = totals(run.projections, run.unit)
+    low, high = window = asked.display.window(shown)
+    picture = asked.display.colored(sized(as_seen(shown), _SHOWN_PIXELS)[0], window)
+    bar = [asked.display.value_at(share, window) for share in np.linspace(0.0, 1.0, 256)]
+    colors = asked.display.colored([bar], window)
     rows, columns = run.views.shape
-    title, *lines = asked.lines
+    title, *others = asked.lines
+    lines = (title, f"{columns} × {rows} pixels, {word} {total:.4g}", f"{low:.4g} to {high:.4g} {run.unit}", *others)
     corners = None if asked.share is None else _corners(run.views, asked.share)
-    return Preview(run, drawn, corners, (title, f"{columns} × {rows} pixels", *lines), quick)
+    return Preview(run, picture, colors, window, corners, lines, quick)
 
 
 def quick_recipe(recipe: Recipe) -> Recipe:
@@ -182,6 +187,7 @@ class Session:
         self.full_at: float | None = None  # when the picture is to be made with all pixels; None: it is, or cannot be
         self.shown: Preview | None = None
         self.problem = ""  # why there is no picture, in words
+        self.cautions: tuple[str, ...] = ()  # what was warned of when it was made
 
     def look(self, context: bpy.types.Context) -> float | None:
         """Do what there is to do now; returns in how many seconds to look again, None for not before a change."""
@@ -220,7 +226,7 @@ class Session:
         self.worker = None
         error = worker.error
         if error is None:
-            self.shown, self.problem = worker.result, ""
+            self.shown, self.problem, self.cautions = worker.result, "", tuple(worker.caught[:_MOST_CAUTIONS])
         elif isinstance(error, InputError):
             self._fail(str(error))
         elif isinstance(error, MemoryError):
@@ -240,7 +246,11 @@ class Session:
         waits = ("Waits for the running job",) if jobs.is_running() else ()
         if self.problem:
             return ("No preview", self.problem, *waits)
-        return ((*self.shown.lines, *waits)) if self.shown else ("Preview", "The first picture is being made")
+        return (
+            (*self.shown.lines, *self.cautions, *waits)
+            if self.shown
+            else ("Preview", "The first picture is being made")
+        )
 
     @property
     def kept(self) -> str:

@@ -11,9 +11,10 @@ import bpy
 import gpu
 import numpy as np
 from gpu_extras.batch import batch_for_shader
+from numpy.typing import NDArray
 
-_HEIGHT = 240.0  # of the picture in the corner, in Blender's units of its interface
-_MARGIN, _TEXT = 12.0, 12.0
+_WIDTH = 230.0  # of the picture in the corner, in Blender's units of its interface
+_MARGIN, _TEXT = 20.0, 11.0
 _BACK, _FRONT = (0.05, 0.05, 0.05, 0.75), (1.0, 1.0, 1.0, 1.0)
 _TRIANGLES = ((0, 1, 2), (0, 2, 3))
 
@@ -36,23 +37,25 @@ def start(session: Any) -> Callable[[], None]:
 
 
 class _Textures:
-    """The texture of the preview that is shown; made when it is first drawn."""
+    """The textures of the preview that is shown; made when they are first drawn."""
 
     def __init__(self) -> None:
         self._of: Any = None
-        self._texture: Any = None
+        self._made: tuple[Any, Any] = (None, None)
 
-    def of(self, shown: Any) -> Any:
-        """The texture of a preview's sheet."""
+    def of(self, shown: Any) -> tuple[Any, Any]:
+        """The textures of a preview's picture and of its colours."""
         if self._of is not shown:
-            picture = shown.sheet.picture
-            height, width = picture.shape[:2]
-            pixels = np.ones((height, width, 4), np.float32)
-            pixels[..., :3] = picture[::-1] / np.float32(255)
-            data = gpu.types.Buffer("FLOAT", pixels.size, pixels.ravel())
-            self._texture = gpu.types.GPUTexture((width, height), format="RGBA8", data=data)
-            self._of = shown
-        return self._texture
+            self._made, self._of = (_texture(shown.picture), _texture(shown.colors)), shown
+        return self._made
+
+
+def _texture(picture: NDArray[np.uint8]) -> Any:
+    height, width = picture.shape[:2]
+    pixels = np.ones((height, width, 4), np.float32)
+    pixels[..., :3] = picture[::-1] / np.float32(255)
+    data = gpu.types.Buffer("FLOAT", pixels.size, pixels.ravel())
+    return gpu.types.GPUTexture((width, height), format="RGBA8", data=data)
 
 
 def _draw_corner(session: Any, textures: _Textures) -> None:
@@ -62,25 +65,21 @@ def _draw_corner(session: Any, textures: _Textures) -> None:
     margin, size = _MARGIN * unit, _TEXT * unit
     right = context.region.width - margin - _covered(context)
     blf.size(0, size)
-    lines, shown = session.lines, session.shown
-    height = width = 0.0
+    shown, width, height = session.shown, _WIDTH * unit, 0.0
+    lines = [piece for line in session.lines for piece in _wrapped(line, width)]
     if shown is not None:
-        rows, columns = shown.sheet.picture.shape[:2]
-        height = min(_HEIGHT * unit, 0.5 * context.region.height)
-        width = height * columns / rows
-    lines = tuple(piece for line in lines for piece in _wrapped(line, max(width, 2 * _HEIGHT * unit)))
-    box = max(width, *(blf.dimensions(0, line)[0] for line in lines)) + 2 * margin
-    top = margin + height + (1.5 * len(lines) + 1) * size + margin
-    left = right - box
+        rows, columns = shown.picture.shape[:2]
+        width, height = _fitting(columns / rows, width, 0.6 * context.region.height)
+    left, top = right - max(width, _WIDTH * unit), margin + height + (1.4 * len(lines) + 2) * size
     gpu.state.blend_set("ALPHA")
-    _rectangle(left, margin, right, top)
+    _rectangle(left - size, margin - size, right + size, top)
     if shown is not None:
-        x, y = left + margin, 2 * margin
-        places = [(x, y + height), (x + width, y + height), (x + width, y), (x, y)]
-        _picture(textures.of(shown), [(*place, 0.0) for place in places], (0.0, 1.0, 1.0, 0.0))
+        picture, colors = textures.of(shown)
+        _picture(picture, _box(left, margin + size, left + width, margin + size + height))
+        _picture(colors, _box(left, margin, left + width, margin + 0.6 * size))
     blf.color(0, *_FRONT)
     for number, line in enumerate(lines):
-        blf.position(0, left + margin, top - (1.5 * number + 2) * size, 0)
+        blf.position(0, left, top - (1.4 * number + 1.7) * size, 0)
         blf.draw(0, line)
     gpu.state.blend_set("NONE")
 
@@ -96,28 +95,32 @@ def _draw_plane(session: Any, textures: _Textures) -> None:
     towards = back[:3, 3] - corners.mean(axis=0) if view.is_perspective else back[:3, 2]
     if np.dot(towards, inward) <= 0:
         return
-    (row, column), (rows, columns) = shown.sheet.corners[0], shown.sheet.tile
-    height, width = shown.sheet.picture.shape[:2]
-    part = column / width, 1 - row / height, (column + columns) / width, 1 - (row + rows) / height
     gpu.state.depth_test_set("LESS_EQUAL")
-    raised = corners + 1e-3 * inward  # before the plane of the last run
-    _picture(textures.of(shown), raised.tolist(), part)
+    _picture(textures.of(shown)[0], (corners + 1e-3 * inward).tolist())  # before the plane of the last run
     gpu.state.depth_test_set("NONE")
 
 
-def _picture(texture: Any, places: list[Any], part: tuple[float, float, float, float]) -> None:
-    """Draw a part (left, top, right, bottom; 0 to 1 from the bottom left) of a texture to four places, clockwise."""
-    left, top, right, bottom = part
+def _fitting(aspect: float, width: float, height: float) -> tuple[float, float]:
+    """Width and height of a picture that is as large as fits."""
+    return min(width, aspect * height), min(height, width / aspect)
+
+
+def _box(left: float, bottom: float, right: float, top: float) -> list[tuple[float, float, float]]:
+    return [(left, top, 0.0), (right, top, 0.0), (right, bottom, 0.0), (left, bottom, 0.0)]
+
+
+def _picture(texture: Any, places: list[Any]) -> None:
+    """Draw a texture to four places: from its top left, clockwise."""
     shader = gpu.shader.from_builtin("IMAGE")
     shader.uniform_sampler("image", texture)
-    corners = [(left, top), (right, top), (right, bottom), (left, bottom)]
+    corners = [(0, 1), (1, 1), (1, 0), (0, 0)]
     batch_for_shader(shader, "TRIS", {"pos": places, "texCoord": corners}, indices=_TRIANGLES).draw(shader)
 
 
 def _rectangle(left: float, bottom: float, right: float, top: float) -> None:
     shader = gpu.shader.from_builtin("UNIFORM_COLOR")
     shader.uniform_float("color", _BACK)
-    places = [(left, top), (right, top), (right, bottom), (left, bottom)]
+    places = _box(left, bottom, right, top)
     batch_for_shader(shader, "TRIS", {"pos": places}, indices=_TRIANGLES).draw(shader)
 
 

@@ -69,6 +69,12 @@ class Sheet:
         return int(found[0]) if len(found) else None
 
 
+def totals(projections: NDArray[np.float32], unit: str) -> tuple[str, NDArray[np.float64]]:
+    """What sums up each of the images (M, n_v, n_u): "sum" of counts and photons, "mean" of line integrals; and it (M,)."""
+    name = "sum" if unit in ("counts", "photons") else "mean"
+    return name, getattr(np, name)(projections, axis=(1, 2), dtype=np.float64)
+
+
 def sheet(
     projections: NDArray[np.float32],
     numbers: ArrayLike,
@@ -76,17 +82,19 @@ def sheet(
     unit: str,
     display: Display | None = None,
     pixels: float = 6e6,
+    total: tuple[str, ArrayLike] | None = None,
 ) -> Sheet:
     """Draw the images (M, n_v, n_u) of modules with these `numbers` and `rings` (M,), a ring in a row, with a colour bar.
 
     Rings follow each other in the order of their modules; one of more than `COLUMNS` modules takes several rows. Where the
     images have more than `pixels` together, they are shown smaller, as means over blocks of pixels; small ones are shown
     larger, so that the numbers do not hide them. The colour bar's ends are the window of `display`, which is by default
-    that of the exact numbers.
+    that of the exact numbers. Each image has its `total`, by default that of `totals`, in a corner if there is room.
     """
+    word, values = totals(projections, unit) if total is None else total
     display = display or Display()
     window = display.window(projections)
-    images = display.colored(_sized(as_seen(projections), pixels), window)
+    images = display.colored(sized(as_seen(projections), pixels), window)
     places = _places(np.asarray(rings))
     n_v, n_u = tile = images.shape[1:3]
     letters = max(1, round(min(n_v, n_u) / 60))
@@ -94,9 +102,13 @@ def sheet(
     corners = gap + places * (np.array(tile) + gap)
     height, width = corners.max(axis=0) + tile + gap
     picture = np.full((height, width, 3), _BORDER, np.uint8)
-    for image, (row, column), number in zip(images, corners, np.asarray(numbers), strict=True):
+    texts = [f"{word} {value:.4g}" for value in np.asarray(values)]
+    room = min(n_u // (WIDTH * max(map(len, texts)) + 2), n_v // (4 * HEIGHT), letters)  # 0: none
+    for image, (row, column), number, text in zip(images, corners, np.asarray(numbers), texts, strict=True):
         picture[row : row + n_v, column : column + n_u] = image
         _write(picture, str(number), row + letters, column + letters, letters)
+        if room:
+            _write(picture, text, row + n_v - (HEIGHT + 1) * room, column + room, room)
     bar = _color_bar(display, window, unit, height, max(letters, round(height / 300)))
     return Sheet(np.concatenate([picture, bar], axis=1), corners, (n_v, n_u), window)
 
@@ -107,8 +119,8 @@ def write_sheet(run: ProjectionRun, path: str | os.PathLike[str], display: Displ
     write_png(drawn.picture, path)
 
 
-def _sized(images: NDArray[np.float32], pixels: float) -> NDArray[np.float32]:
-    """The images with so many pixels that they can be looked at."""
+def sized(images: NDArray[np.float32], pixels: float) -> NDArray[np.float32]:
+    """Images (M, n_v, n_u) with so many pixels that they can be looked at: up to about `pixels` together, not too few."""
     count, n_v, n_u = images.shape
     factor = min(int(np.ceil(np.sqrt(images.size / pixels))), n_v, n_u)
     if factor > 1:
@@ -136,10 +148,11 @@ def _color_bar(
 ) -> NDArray[np.uint8]:
     """A colour bar (height, width, 3) with its numbers and, above, its unit."""
     line = HEIGHT * letters
-    marks = [(share, f"{display.value_at(share, window):.4g}") for share in (1.0, 0.75, 0.5, 0.25, 0.0)]
+    top, bottom, left = 2 * line, height - line, WIDTH * letters
+    steps = next((n for n in (4, 2) if bottom - top >= n * line), 1)  # as many as have room
+    marks = [(share, f"{display.value_at(share, window):.4g}") for share in np.linspace(1.0, 0.0, steps + 1).tolist()]
     columns = max(len(unit), 3 + max(len(text) for _, text in marks))
     bar = np.full((height, (columns + 2) * WIDTH * letters, 3), _BORDER, np.uint8)
-    top, bottom, left = 2 * line, height - line, WIDTH * letters
     _write(bar, unit, line // 3, left, letters)
     ramp = [display.value_at(share, window) for share in np.linspace(1.0, 0.0, bottom - top)]
     bar[top:bottom, left : 3 * left] = display.colored(ramp, window)[:, None]

@@ -65,7 +65,7 @@ def moved(item, times):
     for number in range(MOVES):
         spent["move"] = 0.0
         item.location.x += 0.5 if number % 2 else -0.45
-        yield 0.3
+        yield 0.15
         times.append(1e3 * spent["move"])
 
 
@@ -87,12 +87,14 @@ def steps():
     camera.select_set(True)
     bpy.context.view_layer.objects.active = camera
     scene.mphdrr_projections.width = scene.mphdrr_projections.height = 256
-    yield 3.0
+    scanner = scene.mphdrr_geometry.scanner
+    importlib.import_module(f"{MODULE}.addon.scanner").show_modules(scanner, 50, 60)  # drawn in software, slowly
+    yield 4.0
     off = []
     for _ in range(MOVES):
         spent["move"] = 0.0
         camera.location.x += 0.01
-        yield 0.1
+        yield 0.05
         off.append(1e3 * spent["move"])
     figures("off", off)
     names = set(bpy.data.images.keys()), set(bpy.data.objects.keys())

@@ -38,7 +38,7 @@ def test_a_preview_is_what_the_projector_says(scanned, scene, settings):
         expected = Projector(volume.grid, views, model)(volume)
         assert expected.max() > 0 and made.is_quick == quick
         np.testing.assert_allclose(made.run.projections, expected, rtol=0, atol=2e-5 * expected.max())
-        assert f"{shape[1]} × {shape[0]} pixels" in made.lines
+        assert f"{shape[1]} × {shape[0]} pixels" in made.lines[1]
 
 
 def test_counts_are_shown_per_pixel_of_the_panel_whatever_the_number_of_pixels(scanned, scene):
@@ -46,8 +46,8 @@ def test_counts_are_shown_per_pixel_of_the_panel_whatever_the_number_of_pixels(s
     settings.model, settings.width, settings.height = "EMISSION", 512, 512
     quick, full = shown(True), shown(False)
     assert quick.run.projections.sum() == pytest.approx(full.run.projections.sum(), rel=0.02)
-    assert quick.sheet.window[1] == pytest.approx(full.sheet.window[1], rel=0.3)
-    assert quick.sheet.window[1] == pytest.approx(quick.run.projections.max() / 16)
+    assert quick.window[1] == pytest.approx(full.window[1], rel=0.3)
+    assert quick.window[1] == pytest.approx(quick.run.projections.max() / 16)
 
 
 def test_what_moves_is_asked_for_anew_and_voxels_are_read_once(scanned, scene, monkeypatch):

@@ -38,6 +38,7 @@ LOAD_RECIPE = "mphdrr.load_recipe"
 SHOW_PROJECTIONS = "mphdrr.show_projections"
 LIVE_PREVIEW = "mphdrr.live_preview"
 PICK_MODULE = "mphdrr.pick_module"
+WIDE_FIELD = "mphdrr.wide_field"
 PICK_WINDOW = "mphdrr.pick_window"
 CANCEL_JOB = "mphdrr.cancel_job"
 

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..core.runs.display import Display
-from ..core.runs.mosaic import as_seen, sheet, totals
+from ..core.runs.mosaic import as_seen, sheet
 from ..core.runs.run import ProjectionRun
 from . import ids
 
@@ -54,7 +54,8 @@ def tiles(image: bpy.types.Image | None) -> dict[str, Any] | None:
     """Of the mosaic: `numbers` and `rings` of its modules, `unit`, the tiles' size `tile` and their `corners`; else None.
 
     Rows and columns are counted from the top left. `window` is that of the colours; `totals` are what `summed` says of each
-    image, "sum" or "mean", and `maxima` their largest numbers. Files of earlier versions lack these four.
+    image, "sum" or "mean", `maxima` their largest numbers, and `half` whether only their middle halves are meant and shown.
+    Files of earlier versions lack these five.
     """
     return None if image is None or _TILES not in image else image[_TILES].to_dict()
 
@@ -69,19 +70,25 @@ def _showing(
 ) -> Generator[None, None, bpy.types.Image]:
     """Make the pictures of projections (M, n_v, n_u) as `display` says; returns the mosaic."""
     window = display.window(projections)
-    for picture, number in zip(as_seen(projections), numbers, strict=True):
+    for picture, number in zip(as_seen(display.part(projections)), numbers, strict=True):
         name = ids.picture_name(projection_name(number, numbers))
         _store(name, display.colored(picture, window), exact=False)
         yield
-    word, values = totals(projections, unit)
-    maxima = projections.max(axis=(1, 2))
-    drawn = sheet(projections, numbers, rings, unit, display, total=(word, values))
+    drawn = sheet(projections, numbers, rings, unit, display)
     image = _store(ids.MOSAIC, drawn.picture, exact=False)
     image[_TILES] = {
         "numbers": numbers, "rings": rings, "unit": unit, "corners": drawn.corners.ravel().tolist(), "tile": drawn.tile,
-        "window": drawn.window, "summed": word, "totals": values.tolist(), "maxima": maxima.tolist(),
+        "window": drawn.window, "summed": drawn.summed, "totals": drawn.totals.tolist(),
+        "maxima": display.part(projections).max(axis=(1, 2)).tolist(), "half": display.half,
     }  # fmt: skip
     return image
+
+
+def whole_size(picture: bpy.types.Image) -> tuple[int, int]:
+    """Columns and rows of the projection of which a picture shows all or a part."""
+    exact = bpy.data.images.get(picture.name.removesuffix(ids.picture_name("")))
+    columns, rows = picture.size if exact is None else exact.size
+    return columns, rows
 
 
 def is_exact(image: bpy.types.Image) -> bool:

@@ -77,8 +77,9 @@ def update(scene: bpy.types.Scene) -> None:
         plane.location = x, y, -depth
         # A picture's longer side is as long as the empty; pixels that are not square are stretched.
         columns, rows = plane.data.size
+        all_columns, all_rows = images.whole_size(plane.data)
         plane.empty_display_size = max(columns, rows)
-        plane.scale = width / columns, height / rows, 1.0
+        plane.scale = width / all_columns, height / all_rows, 1.0
         plane.color[3] = settings.plane_opacity
         if plane.hide_viewport == shown:
             plane.hide_viewport = not shown
@@ -86,6 +87,7 @@ def update(scene: bpy.types.Scene) -> None:
             if background.image == plane.data:
                 background.show_background_image = settings.backgrounds
                 background.alpha = settings.plane_opacity
+                _place_background(background, camera.data, field, columns / all_columns)
 
 
 def share_of_way(settings: bpy.types.PropertyGroup, module: bpy.types.PropertyGroup, distance: float) -> float:
@@ -131,16 +133,22 @@ def _fields(system: PinholeSystem, views: Views) -> NDArray[np.float64]:
 
 
 def _set_background(camera: bpy.types.Camera, field: NDArray[np.float64], picture: bpy.types.Image) -> None:
-    """Lay a picture over a camera's view, as large as it is seen from there."""
+    """Lay a picture over a camera's view."""
     background = camera.background_images.new()
     background.image = picture
-    x, y, distance, width, height = field
-    seen = camera.sensor_width / camera.lens * distance  # how much the camera sees there
     background.frame_method, background.display_depth = "STRETCH", "FRONT"
-    background.use_flip_x, background.use_flip_y = bool(width < 0), bool(height < 0)
-    background.scale = abs(width) / seen
-    background.offset = x / seen, y / seen
+    background.use_flip_x, background.use_flip_y = bool(field[3] < 0), bool(field[4] < 0)
     camera.show_background_images = True
+
+
+def _place_background(
+    background: bpy.types.CameraBackgroundImage, camera: bpy.types.Camera, field: NDArray[np.float64], share: float
+) -> None:
+    """Make a picture as large as the `share` of the field that it shows is seen from the camera."""
+    x, y, distance, width, _ = field
+    seen = camera.sensor_width / camera.lens * distance  # how much the camera sees there
+    background.scale = share * abs(width) / seen
+    background.offset = x / seen, y / seen
 
 
 def _remove_background(camera: bpy.types.Camera, picture: bpy.types.Image | None) -> None:

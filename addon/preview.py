@@ -123,15 +123,16 @@ def make(asked: Request, quick: bool, voxels: dict[Path, Volume]) -> Preview:
     shown = run.projections
     if run.unit == "counts" and quick:  # shown per pixel of the panel's size, as the full picture and the runs are
         shown = shown * np.float32(_pixel_area(_views(recipe, system)) / _pixel_area(run.views))
-    word, (total,) = totals(run.projections, run.unit)
+    word, (total,) = totals(asked.display.part(run.projections), run.unit)
     low, high = window = asked.display.window(shown)
-    picture = asked.display.colored(sized(as_seen(shown), _SHOWN_PIXELS)[0], window)
+    part = asked.display.part(shown)
+    picture = asked.display.colored(sized(as_seen(part), _SHOWN_PIXELS)[0], window)
     bar = [asked.display.value_at(share, window) for share in np.linspace(0.0, 1.0, 256)]
     colors = asked.display.colored([bar], window)
     rows, columns = run.views.shape
     title, *others = asked.lines
     lines = (title, f"{columns} × {rows} pixels, {word} {total:.4g}", f"{low:.4g} to {high:.4g} {run.unit}", *others)
-    corners = None if asked.share is None else _corners(run.views, asked.share)
+    corners = None if asked.share is None else _corners(run.views, part.shape[1:], asked.share)
     return Preview(run, picture, colors, window, corners, lines, quick)
 
 
@@ -148,17 +149,17 @@ def quick_recipe(recipe: Recipe) -> Recipe:
 def _views(recipe: Recipe, system: PinholeSystem) -> Views:
     """The views of a recipe's detector."""
     shape = recipe["detector.rows"], recipe["detector.columns"]
-    names = ("plane", "magnification", "pitch")
-    return system.views(shape, *(recipe[f"detector.{name}"] for name in names))
+    plane, magnification, pitch = (recipe[f"detector.{name}"] for name in ("plane", "magnification", "pitch"))
+    return system.views(shape, plane, magnification, pitch, field=recipe["detector.field"])
 
 
 def _pixel_area(views: Views) -> float:
     return float(np.linalg.norm(np.cross(views.u_steps[0], views.v_steps[0])))
 
 
-def _corners(views: Views, share: float) -> NDArray[np.float64]:
-    """Where a view's picture stands at a share of its rays: top left, top right, bottom right, bottom left (4, 3), mm."""
-    n_v, n_u = views.shape
+def _corners(views: Views, shape: tuple[int, ...], share: float) -> NDArray[np.float64]:
+    """Where the middle `shape` pixels of a view stand at a share of its rays: from top left clockwise (4, 3), mm."""
+    n_v, n_u = shape
     u, v = 0.5 * n_u * views.u_steps[0], 0.5 * n_v * views.v_steps[0]
     source, middle = views.sources[0], views.detector_centers[0]
     return np.stack(

@@ -13,7 +13,7 @@ import numpy as np
 from gpu_extras.batch import batch_for_shader
 from numpy.typing import NDArray
 
-_WIDTH = 230.0  # of the picture in the corner, in Blender's units of its interface
+_WIDTH = 250.0  # of the picture in the corner, in Blender's units of its interface
 _MARGIN, _TEXT = 20.0, 11.0
 _BACK, _FRONT = (0.05, 0.05, 0.05, 0.75), (1.0, 1.0, 1.0, 1.0)
 _TRIANGLES = ((0, 1, 2), (0, 2, 3))

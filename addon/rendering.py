@@ -149,6 +149,7 @@ def _display_again() -> None:
     settings = bpy.context.scene.mphdrr_display
     if not settings.problem:  # which there is between the typing of the window's two ends
         images.show_again(settings.display())
+        planes.update(bpy.context.scene)  # the pictures' sizes may be others now
 
 
 def _with_volume(recipe: Recipe, item: bpy.types.Object) -> Recipe:

@@ -45,18 +45,22 @@ def value_at(image: bpy.types.Image | None, across: float, up: float) -> tuple[s
         found = _tile_at(image, tiles, across, up)
         if found is None:
             return None
-        number, down, right = found
-        name = images.projection_name(tiles["numbers"][number], tiles["numbers"])
+        name = images.projection_name(tiles["numbers"][found[0]], tiles["numbers"])
+        within = found[1:]
     exact = bpy.data.images.get(name)
     if exact is None or not images.is_exact(exact):
         return None
-    values = as_seen(images.projection_array(exact))
+    shown = images.tiles(bpy.data.images.get(ids.MOSAIC)) or {}
+    values, whole = images.projection_array(exact), images.is_exact(image)
     rows, columns = values.shape
+    part = as_seen(Display(half=bool(shown.get("half")) and not whole).part(values))
     if tiles is None:
-        row, column = int((1 - up) * rows), int(across * columns)
+        down, right = int((1 - up) * part.shape[0]), int(across * part.shape[1])
     else:  # a tile's pixel is a block of the image's, or the other way round
-        row, column = _index(down, rows, tiles["tile"][0]), _index(right, columns, tiles["tile"][1])
-    return f"{name}, column {columns - 1 - column}, row {rows - 1 - row}", float(values[row, column])
+        down, right = (_index(*place) for place in zip(within, part.shape, tiles["tile"], strict=True))
+    row = rows - 1 - down - (rows - part.shape[0]) // 2
+    column = columns - 1 - right - (columns - part.shape[1]) // 2
+    return f"{name}, column {column}, row {row}", float(part[down, right])
 
 
 def set_window(settings: bpy.types.PropertyGroup, end: str, value: float, window: Sequence[float]) -> None:

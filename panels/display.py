@@ -30,6 +30,7 @@ class _Display:
         picks = layout.row(align=True)
         picks.operator(ids.PICK_WINDOW, text="Pick Low", icon="EYEDROPPER").end = "LOW"
         picks.operator(ids.PICK_WINDOW, text="Pick High", icon="EYEDROPPER").end = "HIGH"
+        layout.prop(settings, "half")
         if settings.problem:
             layout.label(text=settings.problem, icon="ERROR")
         _draw_totals(layout, context)
@@ -42,7 +43,7 @@ def _draw_totals(layout: bpy.types.UILayout, context: bpy.types.Context) -> None
         return
     index = shown["numbers"].index(camera.mphdrr_module.number)
     column = layout.column(align=True)
-    column.label(text=f"Last run, {camera.name} ({shown['unit']})")
+    column.label(text=f"{camera.name}{', central half' if shown['half'] else ''} ({shown['unit']})")
     for text, value in ((shown["summed"].capitalize(), shown["totals"][index]), ("Maximum", shown["maxima"][index])):
         row = column.split(factor=0.4)
         row.active = False

@@ -61,6 +61,10 @@ class Sheet:
     """Rows and columns of an image in it."""
     window: tuple[float, float]
     """The numbers at the colour bar's lower and upper end."""
+    summed: str
+    """What the numbers in the images' corners are, "sum" or "mean"; see `totals`."""
+    totals: NDArray[np.float64]
+    """These numbers (M,)."""
 
     def image_at(self, row: float, column: float) -> int | None:
         """Index of the image at a place in the picture; None between images."""
@@ -82,18 +86,18 @@ def sheet(
     unit: str,
     display: Display | None = None,
     pixels: float = 6e6,
-    total: tuple[str, ArrayLike] | None = None,
 ) -> Sheet:
     """Draw the images (M, n_v, n_u) of modules with these `numbers` and `rings` (M,), a ring in a row, with a colour bar.
 
     Rings follow each other in the order of their modules; one of more than `COLUMNS` modules takes several rows. Where the
     images have more than `pixels` together, they are shown smaller, as means over blocks of pixels; small ones are shown
     larger, so that the numbers do not hide them. The colour bar's ends are the window of `display`, which is by default
-    that of the exact numbers. Each image has its `total`, by default that of `totals`, in a corner if there is room.
+    that of all exact numbers. Each image has what `totals` says of the part that is shown in a corner if there is room.
     """
-    word, values = totals(projections, unit) if total is None else total
     display = display or Display()
     window = display.window(projections)
+    projections = display.part(projections)
+    word, values = totals(projections, unit)
     images = display.colored(sized(as_seen(projections), pixels), window)
     places = _places(np.asarray(rings))
     n_v, n_u = tile = images.shape[1:3]
@@ -102,7 +106,7 @@ def sheet(
     corners = gap + places * (np.array(tile) + gap)
     height, width = corners.max(axis=0) + tile + gap
     picture = np.full((height, width, 3), _BORDER, np.uint8)
-    texts = [f"{word} {value:.4g}" for value in np.asarray(values)]
+    texts = [f"{word} {value:.4g}" for value in values]
     room = min(n_u // (WIDTH * max(map(len, texts)) + 2), n_v // (4 * HEIGHT), letters)  # 0: none
     for image, (row, column), number, text in zip(images, corners, np.asarray(numbers), texts, strict=True):
         picture[row : row + n_v, column : column + n_u] = image
@@ -110,7 +114,7 @@ def sheet(
         if room:
             _write(picture, text, row + n_v - (HEIGHT + 1) * room, column + room, room)
     bar = _color_bar(display, window, unit, height, max(letters, round(height / 300)))
-    return Sheet(np.concatenate([picture, bar], axis=1), corners, (n_v, n_u), window)
+    return Sheet(np.concatenate([picture, bar], axis=1), corners, (n_v, n_u), window, word, values)
 
 
 def write_sheet(run: ProjectionRun, path: str | os.PathLike[str], display: Display | None = None) -> None:

@@ -94,9 +94,27 @@ def test_every_image_has_its_sum_or_mean_and_the_bar_the_largest_number(unit):
     assert has_ink(bar, f"{images.max():.4g}", 2) and has_ink(bar, "0", 2) and not has_ink(bar, "9.9", 2)
 
 
+@pytest.mark.parametrize("shape", [(128, 128), (101, 126)])
+def test_the_central_half_is_shown_with_its_own_totals_in_the_window_of_all(shape):
+    images = np.random.default_rng(4).random((2, *shape), np.float32)
+    images[0, 0, 0] = 50.0
+    n_v, n_u = shape
+    middle = images[:, n_v // 4 : n_v - n_v // 4, n_u // 4 : n_u - n_u // 4]
+    display = Display(half=True)
+    assert np.array_equal(display.part(images), middle)
+    assert np.array_equal(display.part(images[:, ::-1, ::-1]), middle[:, ::-1, ::-1]), "seen from any side"
+    drawn, own = sheet(images, [1, 2], [0, 0], "counts", display), Display(high=50.0)
+    assert drawn.window == (0.0, 50.0), "the largest of all exact numbers"
+    np.testing.assert_array_equal(
+        drawn.picture[:, :-200], sheet(middle, [1, 2], [0, 0], "counts", own).picture[:, :-200]
+    )
+    np.testing.assert_allclose(drawn.totals, middle.sum(axis=(1, 2), dtype=float))
+
+
 def test_images_too_small_for_a_total_have_none():
     images = np.zeros((2, 64, 64), np.float32)
-    drawn = sheet(images, [1, 2], [0, 0], "counts", total=("sum", [123456.0, 1.0]))
+    images[0, 20, 20] = 123456.0
+    drawn = sheet(images, [1, 2], [0, 0], "counts")
     (row, column) = drawn.corners[1]
     assert not (drawn.picture[row + 20 : row + 64, column : column + 64] == 255).any()
 

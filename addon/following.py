@@ -14,11 +14,11 @@ import numpy as np
 
 from ..core.errors import InputError
 from ..core.geometry.collimator import Construction, EdgePlace
-from ..core.geometry.system import LENGTHS, PinholeSystem
+from ..core.geometry.system import LENGTHS
 from ..core.physics.performance import ModulePerformance, isocentre_performance
 from . import cameras, collimators
 from .decimals import typed
-from .module_values import TYPED, ModuleNumbers, are_aimed, numbers_of
+from .module_values import TYPED, ModuleNumbers, are_aimed, numbers_of, system_of
 
 PARTS = ("COLLIMATOR", "CRYSTAL")  # what hangs on a module's camera: `Object.mphdrr_module.part`
 _KEY = "mphdrr_solid"  # custom property of a mesh or camera: the numbers that it was built from
@@ -202,14 +202,10 @@ def _update_readouts(changed: Sequence[tuple[bpy.types.PropertyGroup, ModuleNumb
     """Write modules' readouts; where the numbers of one are impossible they are 0, and `problem` says why."""
     if not changed:
         return
-    numbers = [own for _, own in changed]
-    sizes: dict[str, Any] = {name: np.array([getattr(own, name) for own in numbers]) for name in LENGTHS}
     try:
-        system = PinholeSystem(  # refuses impossible numbers
-            np.array([own.center for own in numbers]), **sizes, numbers=np.array([own.number for own in numbers])
-        )
-        del sizes["roi_radius"]
-        at = isocentre_performance(system.pinhole_distance, *sizes.values(), intrinsic_fwhm=intrinsic_fwhm)
+        system = system_of([numbers for _, numbers in changed])  # refuses impossible ones
+        sizes = (getattr(system, name) for name in LENGTHS if name != "roi_radius")
+        at = isocentre_performance(system.pinhole_distance, *sizes, intrinsic_fwhm=intrinsic_fwhm)
         problem = ""
     except InputError as error:
         if len(changed) > 1:  # which one is it?

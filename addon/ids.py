@@ -41,7 +41,10 @@ EXPORT_FIGURE = "mphdrr.export_figure"
 SHOW_RUN = "mphdrr.show_run"
 REMOVE_RUN = "mphdrr.remove_run"
 COMPARE_RUNS = "mphdrr.compare_runs"
+LIVE_PREVIEW = "mphdrr.live_preview"
 PICK_MODULE = "mphdrr.pick_module"
+WIDE_FIELD = "mphdrr.wide_field"
+PICK_WINDOW = "mphdrr.pick_window"
 CANCEL_JOB = "mphdrr.cancel_job"
 
 # --- Panels, drawn in the order of the work: bl_order -----------------------------------------------------------------

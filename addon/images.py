@@ -106,9 +106,17 @@ def show_again(display: Display) -> None:
 def tiles(image: bpy.types.Image | None) -> dict[str, Any] | None:
     """Of the mosaic: `numbers` and `rings` of its modules, `unit`, the tiles' size `tile` and their `corners`; else None.
 
-    Rows and columns are counted from the top left.
+    Rows and columns are counted from the top left. `window` is that of the colours; `totals` are what `summed` says of each
+    image, "sum" or "mean", `maxima` their largest numbers, and `half` whether only their middle halves are meant and shown.
+    Files of earlier versions lack these five.
     """
     return None if image is None or _TILES not in image else image[_TILES].to_dict()
+
+
+def share_shown() -> tuple[float, float]:
+    """What the pictures show of the width and height of the exact images."""
+    x, y = (tiles(bpy.data.images.get(ids.MOSAIC)) or {}).get("share", (1.0, 1.0))
+    return x, y
 
 
 def set_scanner(mosaic: bpy.types.Image, collection: bpy.types.Collection | None) -> None:
@@ -132,7 +140,7 @@ def projection_name(number: int, numbers: list[int]) -> str:
 def _colored(projections: NDArray[np.float32], display: Display) -> Iterator[NDArray[np.uint8]]:
     """The pictures of projections (M, n_v, n_u) as `display` says, in one window."""
     window = display.window(projections)
-    for picture in smaller(as_seen(projections), _PIXELS):
+    for picture in smaller(as_seen(display.part(projections)), _PIXELS):
         yield display.colored(picture, window)
 
 
@@ -140,6 +148,8 @@ def _describe(image: bpy.types.Image, drawn: Sheet, numbers: list[int], rings: l
     """Note on the mosaic what is where in it."""
     image[_TILES] = {
         "numbers": numbers, "rings": rings, "unit": unit, "corners": drawn.corners.ravel().tolist(), "tile": drawn.tile,
+        "window": drawn.window, "summed": drawn.summed, "totals": drawn.totals.tolist(), "maxima": drawn.maxima.tolist(),
+        "half": drawn.half, "share": drawn.share,
     }  # fmt: skip
 
 
@@ -162,6 +172,11 @@ def difference_text() -> str:
 def clear() -> None:
     """Remove all images of runs."""
     bpy.data.batch_remove([image for image in bpy.data.images if _KEY in image])
+
+
+def is_exact(image: bpy.types.Image) -> bool:
+    """Whether an image holds the exact numbers of a module's projection."""
+    return _KEY in image and image.is_float
 
 
 def projection_array(image: bpy.types.Image) -> NDArray[np.float32]:

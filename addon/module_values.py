@@ -38,6 +38,13 @@ class ModuleNumbers(_Fields):
         return float(np.linalg.norm(self.center))
 
 
+def system_of(modules: Sequence[ModuleNumbers], source: Any = None) -> PinholeSystem:
+    """A system of these modules; raises `InputError` where their numbers are impossible."""
+    lengths = {name: np.array([getattr(numbers, name) for numbers in modules]) for name in LENGTHS}
+    centers, own = np.array([numbers.center for numbers in modules]), np.array([numbers.number for numbers in modules])
+    return PinholeSystem(centers, **lengths, numbers=own, source=source)
+
+
 def write_module(camera: bpy.types.Object, system: PinholeSystem, m: int, ring: int) -> None:
     """Make an object the camera of module `m`; `l` follows the ROI where the design formula gives it."""
     module = camera.mphdrr_module

@@ -226,9 +226,14 @@ def mu_energy(item: bpy.types.Object) -> float | None:
 
 def require_current(item: bpy.types.Object) -> None:
     """Raise `InputError` where a volume is of a phantom whose settings have changed since its voxels were made."""
-    phantom = root_of(item)
-    if phantom is not None and phantom.mphdrr_volume.outdated:
+    if (phantom := outdated(item)) is not None:
         raise InputError(f"{phantom.name!r} has changed since its voxels were made: press Update Phantom first")
+
+
+def outdated(item: bpy.types.Object) -> bpy.types.Object | None:
+    """The phantom of a volume if its settings have changed since its voxels were made; else None."""
+    phantom = root_of(item)
+    return phantom if phantom is not None and phantom.mphdrr_volume.outdated else None
 
 
 def root_of(item: bpy.types.Object) -> bpy.types.Object | None:

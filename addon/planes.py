@@ -69,11 +69,11 @@ def remove(scene: bpy.types.Scene) -> None:
 def update(scene: bpy.types.Scene) -> None:
     """Place and show the planes and backgrounds as the scene's settings say."""
     settings = scene.mphdrr_display
+    part = images.share_shown()
     for plane, shown in _wanted(scene):
         camera, field = plane.parent, np.array(plane[_KEY])
-        module = camera.mphdrr_module
-        distance = settings.plane_distance or _BETWEEN * (module.pinhole_distance - module.roi_radius)
-        x, y, depth, width, height = field * (1.0 if settings.plane_at_detector else distance / field[2])
+        x, y, depth, width, height = field * share_of_way(settings, camera.mphdrr_module, field[2])
+        width, height = width * part[0], height * part[1]
         # A picture's longer side is as long as the empty; pixels that are not square are stretched.
         columns, rows = plane.data.size
         plane.empty_display_size = max(columns, rows)
@@ -85,6 +85,14 @@ def update(scene: bpy.types.Scene) -> None:
             if background.image == plane.data:
                 background.show_background_image = settings.backgrounds
                 background.alpha = settings.plane_opacity
+                _place_background(background, camera.data, field, part[0])
+
+
+def share_of_way(settings: bpy.types.PropertyGroup, module: bpy.types.PropertyGroup, distance: float) -> float:
+    """Where a module's picture is shown: as a share of the way from its pinhole to the detector at `distance`, mm."""
+    if settings.plane_at_detector:
+        return 1.0
+    return (settings.plane_distance or _BETWEEN * (module.pinhole_distance - module.roi_radius)) / distance
 
 
 @bpy.app.handlers.persistent
@@ -123,16 +131,22 @@ def _fields(system: PinholeSystem, views: Views) -> NDArray[np.float64]:
 
 
 def _set_background(camera: bpy.types.Camera, field: NDArray[np.float64], picture: bpy.types.Image) -> None:
-    """Lay a picture over a camera's view, as large as it is seen from there."""
+    """Lay a picture over a camera's view."""
     background = camera.background_images.new()
     background.image = picture
-    x, y, distance, width, height = field
-    seen = camera.sensor_width / camera.lens * distance  # how much the camera sees there
     background.frame_method, background.display_depth = "STRETCH", "FRONT"
-    background.use_flip_x, background.use_flip_y = bool(width < 0), bool(height < 0)
-    background.scale = abs(width) / seen
-    background.offset = x / seen, y / seen
+    background.use_flip_x, background.use_flip_y = bool(field[3] < 0), bool(field[4] < 0)
     camera.show_background_images = True
+
+
+def _place_background(
+    background: bpy.types.CameraBackgroundImage, camera: bpy.types.Camera, field: NDArray[np.float64], share: float
+) -> None:
+    """Make a picture as large as the `share` of the field that it shows is seen from the camera."""
+    x, y, distance, width, _ = field
+    seen = camera.sensor_width / camera.lens * distance  # how much the camera sees there
+    background.scale = share * abs(width) / seen
+    background.offset = x / seen, y / seen
 
 
 def _remove_background(camera: bpy.types.Camera, picture: bpy.types.Image | None) -> None:

@@ -21,6 +21,7 @@ from . import (
     live_phantoms,
     live_scanner,
     planes,
+    preview,
     properties,
     recovery,
     rendering,
@@ -90,6 +91,7 @@ MENUS.append((bpy.types.VIEW3D_MT_add, lambda menu, _: menu.layout.menu("MPHDRR_
 HANDLERS: tuple[tuple[list[Any], Any], ...] = (
     (bpy.app.handlers.load_pre, jobs.stop),
     (bpy.app.handlers.load_pre, slices.before_load),
+    (bpy.app.handlers.load_pre, preview.stop),
     (bpy.app.handlers.load_post, volumes.after_load),
     (bpy.app.handlers.load_post, recovery.after_load),
     (bpy.app.handlers.load_post, live_scanner.after_load),
@@ -101,7 +103,9 @@ HANDLERS: tuple[tuple[list[Any], Any], ...] = (
     (bpy.app.handlers.frame_change_post, runs.after_update),
     (bpy.app.handlers.undo_post, runs.after_update),
     (bpy.app.handlers.redo_post, runs.after_update),
+    (bpy.app.handlers.depsgraph_update_post, preview.after_update),
     (bpy.app.handlers.frame_change_post, live_scanner.after_frame),
+    (bpy.app.handlers.frame_change_post, preview.after_update),
     (bpy.app.handlers.frame_change_post, slices.after_frame_change),
     (bpy.app.handlers.undo_post, live_scanner.after_undo),
     (bpy.app.handlers.redo_post, live_scanner.after_undo),
@@ -172,6 +176,7 @@ def unregister() -> None:
     """Take back what `register` did."""
     atexit.unregister(unregister)
     jobs.stop()
+    preview.stop()
     live_scanner.stop()
     live_phantoms.stop()
     runs.stop()

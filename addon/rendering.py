@@ -16,6 +16,7 @@ from ..core.errors import InputError, InputWarning
 from ..core.geometry.system import chosen_modules
 from ..core.memory import require
 from ..core.progress import Progress, stages_of
+from ..core.projector import Model
 from ..core.runs.files import read_run, write_run
 from ..core.runs.projecting import warn_of_energy
 from ..core.runs.recipe import Recipe, read_recipe
@@ -38,11 +39,7 @@ def render_job(context: bpy.types.Context, recipe: Recipe, volume: str = "", mu:
     collection = scanner.required_scanner(scene)
     system = chosen_modules(scanner.read_scanner(collection), recipe["system.modules"], "modules")
     model = recipe_model(recipe, system)  # refuses what cannot be, before the work begins
-    photons = recipe["model.photons"]
-    item = _chosen_volume(context, volume, ("mu",) if photons else model.takes, model.name)
-    mu_item = _given(context, "mu", mu) if recipe["model.kind"] == "emission" else None
-    if mu_item is not None:
-        require_quantity(volumes.quantity_of(mu_item), ("mu",), f"{mu_item.name!r} for attenuation")
+    item, mu_item = sources(context, recipe, model, volume, mu)
     for chosen in filter(None, (item, mu_item)):
         phantoms.require_current(chosen)
     rows, columns = recipe["detector.rows"], recipe["detector.columns"]
@@ -78,6 +75,18 @@ def render_job(context: bpy.types.Context, recipe: Recipe, volume: str = "", mu:
         return f"Projected {recipe['volume.object']!r} into {len(run.views)} modules in {seconds:.1f} s: {where}"
 
     return jobs.Job("Projecting", work, finish, lambda: path.unlink(missing_ok=True))
+
+
+def sources(
+    context: bpy.types.Context, recipe: Recipe, model: Model, volume: str = "", mu: str = ""
+) -> tuple[bpy.types.Object, bpy.types.Object | None]:
+    """The objects of what is projected and of what attenuates it, if anything; arguments and errors as of `render_job`."""
+    photons = recipe["model.photons"]
+    item = _chosen_volume(context, volume, ("mu",) if photons else model.takes, model.name)
+    mu_item = _given(context, "mu", mu) if recipe["model.kind"] == "emission" else None
+    if mu_item is not None:
+        require_quantity(volumes.quantity_of(mu_item), ("mu",), f"{mu_item.name!r} for attenuation")
+    return item, mu_item
 
 
 def run_path(scene: bpy.types.Scene) -> Path:
@@ -252,6 +261,7 @@ def _display_again() -> None:
     settings = bpy.context.scene.mphdrr_display
     if not settings.problem:  # which there is between the typing of the window's two ends
         images.show_again(settings.display())
+        planes.update(bpy.context.scene)  # the pictures' sizes may be others now
 
 
 def _with_volume(recipe: Recipe, item: bpy.types.Object) -> Recipe:

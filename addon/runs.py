@@ -198,7 +198,7 @@ def _volume_state(item: bpy.types.Object) -> dict[str, Any]:
     return {"name": item.name, "content": volumes.content_of(item), "state": state, "pose": pose}
 
 
-def _panel_recipe(scene: bpy.types.Scene) -> Recipe:
+def panel_recipe(scene: bpy.types.Scene) -> Recipe:
     """What the panel asks for now."""
     collection = scanner.active_scanner(scene)
     angle = math.pi / 2 if collection is None else collection.mphdrr_scanner.opening_angle
@@ -216,7 +216,7 @@ def _settings(recipe: Recipe) -> dict[str, Any]:
 def _differences(scene: bpy.types.Scene, old: Mapping[str, Any], own: bpy.types.Collection | None) -> Iterator[str]:
     collection = own if own in scanner.scanners(scene) else scanner.active_scanner(scene)
     yield from _of_modules(collection, old)
-    settings = _settings(_panel_recipe(scene))
+    settings = _settings(panel_recipe(scene))
     panel = scene.mphdrr_projections
     chosen = panel.volume or _found(scene, old["volume"])
     yield from _of_volume(scene, "", old["volume"], chosen)

@@ -17,11 +17,11 @@ from ..core.errors import InputError, InputWarning
 from ..core.geometry import checks
 from ..core.geometry.collimator import Construction
 from ..core.geometry.module_parts import module_parts
-from ..core.geometry.system import LENGTHS, PinholeSystem
+from ..core.geometry.system import PinholeSystem
 from ..core.workbook import ColumnMap, QuantityCells, SystemSource
 from . import cameras, following, ids
 from .following import modules
-from .module_values import is_edited, is_moved, module_numbers, off_aim, remember
+from .module_values import is_edited, is_moved, module_numbers, off_aim, remember, system_of
 from .scanner_parts import NewScanner, clear, losses, modules_text
 
 _DEFAULT = Construction()
@@ -214,16 +214,11 @@ def read_scanner(collection: bpy.types.Collection, *, aimed: bool = False) -> Pi
         if aimed:
             raise InputError(f"{text}, which a geometry file cannot express: {cure}")
         warnings.warn(f"{text}, but calculated as if aimed: {cure}", InputWarning, stacklevel=2)
-    numbers = [module_numbers(camera) for camera in found]
     as_imported = len(found) == collection.mphdrr_scanner.n_modules and not any(
         camera.mphdrr_module.added or is_moved(camera) or is_edited(camera) for camera in found
     )
-    return PinholeSystem(
-        centers=np.array([n.center for n in numbers]),
-        **{name: np.array([getattr(n, name) for n in numbers]) for name in LENGTHS},
-        numbers=np.array(list(by_number), dtype=np.int64),
-        source=source(collection) if as_imported else None,
-    )
+    numbers = [module_numbers(camera) for camera in found]
+    return system_of(numbers, source(collection) if as_imported else None)
 
 
 def check_geometry(collection: bpy.types.Collection) -> tuple[list[str], list[bpy.types.Object]]:

@@ -95,13 +95,19 @@ def reader(item: bpy.types.Object, path: Path | None = None) -> Callable[[], Vol
 
     `path` is the file of a state (`storage.files_of_states`); default: of the one at the current frame.
     """
+    path, pose = source(item, path)
+    return lambda: moved(read_vdb(path), pose)
+
+
+def source(item: bpy.types.Object, path: Path | None = None) -> tuple[Path, NDArray[np.float64]]:
+    """The file and the pose (4, 4), mm, of which `reader` makes a volume; raises InputError where there is none."""
     require_volume(item)
     if path is None and _state(item.data) is None:
         raise InputError(f"{item.name!r} has no state at frame {bpy.context.scene.frame_current}")
     pose, path = pose_of_object(item), path or file_of(item)
     if not path.is_file():
         raise InputError(f"{path}: no such file; the voxels of {item.name!r} are gone, so add the volume again")
-    return lambda: moved(read_vdb(path), pose)
+    return path, pose
 
 
 def require_volume(item: bpy.types.Object | None) -> None:

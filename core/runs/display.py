@@ -32,13 +32,15 @@ class Display:
     """How numbers are shown as colours; `InputError` where the settings do not go together.
 
     `low` and `high` are the numbers that have the first and the last colour; None is automatic: 0, or the smallest number
-    where that is negative, and the largest. On the logarithmic scale an automatic `low` is a thousandth of `high`.
+    where that is negative, and the largest. On the logarithmic scale an automatic `low` is a thousandth of `high`. `half`:
+    only the middle half of each image is shown; of a wide field of view, twice the crystal's, that is what the crystal sees.
     """
 
     colors: str = "inferno"
     scale: str = "linear"
     low: float | None = None
     high: float | None = None
+    half: bool = False
 
     def __post_init__(self) -> None:
         if self.colors not in _COLORS:
@@ -52,6 +54,11 @@ class Display:
             raise InputError(f"window {self.low:g} to {self.high:g}: expected low to be less than high")
         if self.scale == "log" and self.low is not None and self.low <= 0:
             raise InputError(f"low = {self.low:g}: expected more than 0 on the logarithmic scale")
+
+    def part(self, images: NDArray[np.float32]) -> NDArray[np.float32]:
+        """What of images (..., n_v, n_u) is shown."""
+        n_v, n_u = images.shape[-2:]
+        return images[..., n_v // 4 : n_v - n_v // 4, n_u // 4 : n_u - n_u // 4] if self.half else images
 
     def window(self, values: ArrayLike) -> tuple[float, float]:
         """The numbers that get the first and the last colour where `values` are shown."""

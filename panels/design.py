@@ -91,7 +91,7 @@ def _draw_module(layout: bpy.types.UILayout, camera: bpy.types.Object) -> None:
         ("Distance b", f"{module.pinhole_distance:.2f} mm"),
         ("Sensitivity", f"{module.sensitivity:.2f} cps/MBq"),
         ("Resolution", f"{module.resolution:.2f} mm FWHM"),
-        ("Magnification", f"{module.magnification:.3f}"),
+        ("Magnif. l / b", f"{module.magnification:.3f}"),
         ("Radius seen", f"{module.roi_seen:.2f} mm"),
         ("ROI", "seen whole" if module.sees_roi else "not seen whole"),
     )

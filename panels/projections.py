@@ -30,8 +30,10 @@ class MPHDRR_PT_projections(Sidebar, bpy.types.Panel):
         _draw(column, settings, "model", [name for name in model if name in _MAIN])
         _draw(column, settings, "detector")
         modules = column.column(align=True)
-        modules.prop(settings, "first", text="Modules First")
-        modules.prop(settings, "last", text="Last")
+        modules.prop(settings, "all_modules")
+        if not settings.all_modules:
+            modules.prop(settings, "first")
+            modules.prop(settings, "last")
         _draw(column, settings, "compute")
         if not jobs.is_running():
             row = layout.row()
@@ -72,6 +74,9 @@ class MPHDRR_PT_physics(Sidebar, bpy.types.Panel):
     @classmethod
     def poll(cls, context: bpy.types.Context) -> bool:
         return bool(context.scene.mphdrr_projections.model != "INVERSE_SQUARE")
+
+    def draw_header_preset(self, context: bpy.types.Context) -> None:
+        self.layout.operator_menu_enum(ids.USE_PRESET, "preset", text="", icon="PRESET")
 
     def draw(self, context: bpy.types.Context) -> None:
         layout = self.layout

@@ -9,7 +9,7 @@ import tomllib
 from pathlib import Path
 
 import bpy
-from bpy.app.translations import pgettext_iface
+from bpy.app.translations import pgettext_iface as iface
 from bpy.props import IntProperty
 
 from ..core.memory import readable_size
@@ -52,7 +52,7 @@ class MPHDRR_Preferences(bpy.types.AddonPreferences):
         folder = cache_folder()
         if folder is not None:
             row = layout.row()
-            text = pgettext_iface("Compiled code, {size} in {folder}")
+            text = iface("Compiled code, {size} in {folder}")
             row.label(text=text.format(size=readable_size(cache_size()), folder=folder), translate=False)
             row.operator(ids.CLEAN_CACHE, text="Clean", icon="TRASH")
 

@@ -5,6 +5,7 @@ import textwrap
 
 import bpy
 import numpy as np
+from bpy.app.translations import pgettext_iface as iface
 
 from ..addon import ids, jobs, scanner, selection
 
@@ -78,7 +79,7 @@ class MPHDRR_PT_geometry(Sidebar, bpy.types.Panel):
             layout.split(factor=0.34),
             ("Scanner", collection.name),
             ("Workbook", bpy.path.basename(properties.workbook) or "none"),
-            ("Modules", f"{properties.count} in {n_rings} rings"),
+            ("Modules", iface("{count} in {rings} rings").format(count=properties.count, rings=n_rings)),
         )
         row = layout.row(align=True)
         for first, last in json.loads(properties.quick_ranges or "[]"):
@@ -132,9 +133,8 @@ class MPHDRR_PT_modules(ScannerPanel, bpy.types.Panel):
 
         camera = selection.listed_module(context.scene)
         if camera is not None:
-            look = layout.operator(
-                ids.LOOK_THROUGH_MODULE, text=f"Look Through {camera.name}", icon="OUTLINER_OB_CAMERA"
-            )
+            text = iface("Look Through {module}").format(module=camera.name)
+            look = layout.operator(ids.LOOK_THROUGH_MODULE, text=text, icon="OUTLINER_OB_CAMERA")
             look.number = camera.mphdrr_module.number
 
 

@@ -5,7 +5,7 @@ What adds something is under Add > mphDRR (`add_menu.py`), what reads and writes
 """
 
 import bpy
-from bpy.app.translations import pgettext_iface
+from bpy.app.translations import pgettext_iface as iface
 
 from ..addon import ids, selection
 
@@ -34,7 +34,7 @@ class MPHDRR_MT_modules(bpy.types.Menu):
         layout.operator(ids.EXPORT_FOR_PROGRAM)
         layout.separator()
         state = context.scene.mphdrr_geometry
-        text = pgettext_iface("Show Only Modules {first} to {last}").format(first=state.first, last=state.last)
+        text = iface("Show Only Modules {first} to {last}").format(first=state.first, last=state.last)
         shown = layout.operator(ids.SHOW_MODULES, text=text)
         shown.first, shown.last, shown.mode = state.first, state.last, "ONLY"
         layout.operator(ids.SHOW_MODULES, text="Show All Modules", icon="HIDE_OFF").mode = "ALL"

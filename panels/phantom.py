@@ -3,6 +3,7 @@
 from typing import Any
 
 import bpy
+from bpy.app.translations import pgettext_iface as iface
 
 from ..addon import ids, jobs, phantoms, slices, storage, volumes
 from .geometry import Sidebar, draw_facts, draw_text
@@ -62,8 +63,8 @@ def _draw_display(layout: bpy.types.UILayout, item: bpy.types.Object) -> None:
     if settings.quantity == "hu":
         layout.operator(ids.CT_TO_ATTENUATION, icon="MOD_FLUIDSIM")
     column = layout.column(align=True)
-    column.prop(settings, "display_low", text=f"Low, {settings.unit}")
-    column.prop(settings, "display_high", text=f"High, {settings.unit}")
+    column.prop(settings, "display_low", text=iface("Low, {unit}").format(unit=settings.unit))
+    column.prop(settings, "display_high", text=iface("High, {unit}").format(unit=settings.unit))
     if item.data.is_sequence:
         column = layout.column(align=True)
         column.prop(item.data, "frame_start", text="First Frame")

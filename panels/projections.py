@@ -3,6 +3,7 @@
 from collections.abc import Container
 
 import bpy
+from bpy.app.translations import pgettext_iface as iface
 
 from ..addon import ids, jobs, scanner, volumes
 from ..addon.projection_properties import drawn, makes_counts
@@ -110,5 +111,5 @@ class MPHDRR_PT_export(Sidebar, bpy.types.Panel):
         layout.enabled = bool(run_file)
         layout.operator(ids.EXPORT_DATASET, text="Export Dataset", icon="EXPORT")
         if run_file:
-            kept = run_file if run_file.startswith("//") else "kept when the .blend is saved"
-            layout.label(text=f"Last run: {kept}", icon="FILE")
+            kept = run_file if run_file.startswith("//") else iface("kept when the .blend is saved")
+            layout.label(text=iface("Last run: {file}").format(file=kept), icon="FILE")

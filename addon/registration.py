@@ -96,6 +96,7 @@ def _draw_splash(menu: bpy.types.Menu, context: bpy.types.Context) -> None:
     """An extension cannot bring an application template: Blender looks for these in its own folders only."""
     menu.layout.operator_context = "INVOKE_DEFAULT"
     menu.layout.operator(ids.LOAD_EXAMPLE, text="mphDRR Example", icon="PLAY")
+    menu.layout.separator()
 
 
 MENUS = [(menu, _draw_entries(entries)) for menu, entries in ENTRIES.items()]

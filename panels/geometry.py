@@ -68,7 +68,7 @@ class MPHDRR_PT_geometry(Sidebar, bpy.types.Panel):
             row.operator(ids.LOAD_EXAMPLE, icon="PLAY")
         layout.operator(ids.IMPORT_GEOMETRY, text="Import Workbook", icon="IMPORT")
         if collection is None:
-            layout.label(text="Or drop one on the viewport.", icon="INFO")
+            draw_hint(layout, "Or drop one on the viewport.")
             jobs.draw_job(layout)
             return
         if len(scanner.scanners(context.scene)) > 1:
@@ -145,6 +145,13 @@ def draw_facts(split: bpy.types.UILayout, *facts: tuple[str, str]) -> None:
     for name, value in facts:
         names.label(text=name)
         values.label(text=value)
+
+
+def draw_hint(layout: bpy.types.UILayout, text: str) -> None:
+    """Draw what comes next, in grey."""
+    row = layout.row()
+    row.active = False
+    row.label(text=text, icon="INFO")
 
 
 def draw_text(layout: bpy.types.UILayout, text: str, icon: str = "ERROR") -> None:

@@ -6,7 +6,7 @@ import bpy
 from bpy.app.translations import pgettext_iface as iface
 
 from ..addon import ids, jobs, phantoms, slices, storage, volumes
-from .geometry import Sidebar, draw_facts, draw_text
+from .geometry import Sidebar, draw_facts, draw_hint, draw_text
 
 
 class MPHDRR_PT_phantom(Sidebar, bpy.types.Panel):
@@ -30,11 +30,8 @@ class MPHDRR_PT_phantom(Sidebar, bpy.types.Panel):
             column.operator(ids.FIND_VOLUME_FILES, icon="VIEWZOOM")
         item = context.object
         if not volumes.is_volume(item):
-            column = layout.column(align=True)
-            column.active = False
             known = volumes.volume_objects(context.scene)
-            text = "Select a volume to see its numbers." if known else "No volume in the scene."
-            column.label(text=text, icon="INFO")
+            draw_hint(layout, "Select a volume to see its numbers." if known else "No volume in the scene yet.")
             return
         _draw_numbers(layout, item)
         _draw_display(layout, item)

@@ -7,7 +7,7 @@ from bpy.app.translations import pgettext_iface as iface
 
 from ..addon import ids, jobs, scanner, volumes
 from ..addon.projection_properties import drawn, makes_counts
-from .geometry import Sidebar
+from .geometry import Sidebar, draw_hint
 
 _MAIN = ("time", "photons", "pixel_points")
 """Settings of models that the panel itself shows; the others stand under Physics."""
@@ -40,14 +40,15 @@ class MPHDRR_PT_projections(Sidebar, bpy.types.Panel):
             row = layout.row()
             row.scale_y = 1.4
             row.operator_context = "INVOKE_DEFAULT"
-            ready = scanner.active_scanner(context.scene) is not None and bool(volumes.volume_objects(context.scene))
-            row.enabled = ready
+            has_scanner = scanner.active_scanner(context.scene) is not None
+            has_volume = bool(volumes.volume_objects(context.scene))
+            row.enabled = has_scanner and has_volume
             row.operator(ids.RENDER_PROJECTIONS, icon="RENDER_STILL")
             layout.operator(ids.LOAD_RECIPE, icon="FILE_FOLDER")
-            if not ready:
-                hint = layout.row()
-                hint.active = False
-                hint.label(text="Needs a scanner and a volume.", icon="INFO")
+            if not has_scanner:
+                draw_hint(layout, "Needs a scanner: Load Example.")
+            elif not has_volume:
+                draw_hint(layout, "Needs a volume: Add Phantom.")
         if settings.run_file:
             layout.operator(ids.SHOW_PROJECTIONS, text="Show Mosaic", icon="IMAGE_DATA")
             column = layout.column(align=True)
@@ -113,3 +114,5 @@ class MPHDRR_PT_export(Sidebar, bpy.types.Panel):
         if run_file:
             kept = run_file if run_file.startswith("//") else iface("kept when the .blend is saved")
             layout.label(text=iface("Last run: {file}").format(file=kept), icon="FILE")
+        else:
+            draw_hint(layout, "Render projections first.")

@@ -238,7 +238,8 @@ def _is_mu(self: ProjectionProperties, item: bpy.types.Object) -> bool:
 
 
 def _volume_chosen(self: ProjectionProperties, context: bpy.types.Context) -> None:
-    if self.volume is not None:
+    # In the panel: to a script, a model that changes by itself would be a wrong number without a word.
+    if self.volume is not None and context.region is not None and context.region.type == "UI":
         fit_model(self, volumes.quantity_of(self.volume))
 
 

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+
 import bpy
 import numpy as np
 import pytest
 
 from mphdrr.addon import scanner, volumes
-from mphdrr.addon.projection_properties import USUAL_TIME, recipe_values
+from mphdrr.addon.projection_properties import USUAL_TIME, _volume_chosen, recipe_values
 from mphdrr.core.geometry.grid import Grid
 from mphdrr.core.runs.presets import PRESETS
 from mphdrr.core.runs.recipe import Recipe, write_recipe
@@ -40,22 +42,23 @@ def test_the_panel_shows_what_the_preset_says(settings, name):
         assert values["model.isotope"] is values["model.crystal_mu"] is values["model.aperture_mu"] is None
 
 
-def test_a_chosen_volume_sets_the_model_until_the_user_does(settings, objects):
-    settings.volume = objects["activity"]
-    assert (settings.model, settings.time) == ("EMISSION", USUAL_TIME)
-    settings.volume = objects["mu"]
-    assert settings.model == "TRANSMISSION"
-    settings.volume, settings.time = objects["hu"], 20.0  # to be converted first
-    assert settings.model == "TRANSMISSION"
-    settings.volume = objects["activity"]
-    assert (settings.model, settings.time) == ("EMISSION", 20.0), "a time that was typed stays"
+def test_a_volume_chosen_in_the_panel_sets_the_model_until_the_user_does(settings, objects):
+    def choose(name: str) -> tuple[str, float]:
+        settings.volume = objects[name]
+        _volume_chosen(settings, SimpleNamespace(region=SimpleNamespace(type="UI")))
+        return settings.model, settings.time
+
+    assert choose("activity") == ("EMISSION", USUAL_TIME)
+    assert choose("mu")[0] == "TRANSMISSION"
+    settings.time = 20.0
+    assert choose("hu")[0] == "TRANSMISSION"  # to be converted first
+    assert choose("activity") == ("EMISSION", 20.0), "a time that was typed stays"
     settings.model = "TRANSMISSION"  # line integrals of activity, as the user wants
-    settings.volume = None
-    settings.volume = objects["activity"]
-    assert settings.model == "TRANSMISSION"
+    assert choose("mu")[0] == choose("activity")[0] == "TRANSMISSION"
 
 
 def test_scripts_get_line_integrals_unless_they_say_otherwise(settings, objects):
+    settings.volume = objects["activity"]
     assert settings.model == "TRANSMISSION" and settings.time == 1.0
 
 

@@ -141,7 +141,6 @@ class MPHDRR_PT_modules(ScannerPanel, bpy.types.Panel):
 def draw_facts(split: bpy.types.UILayout, *facts: tuple[str, str]) -> None:
     """Draw names and their values, side by side."""
     names, values = split.column(align=True), split.column(align=True)
-    names.active = False
     for name, value in facts:
         names.label(text=name)
         values.label(text=value)

@@ -16,27 +16,20 @@ seen: dict[str, object] = {"ok": False}
 bpy.context.preferences.view.show_splash = False
 
 
-def search(text: str) -> None:
-    """Open the search over the 3D view, as F3 does, and type."""
+def search() -> None:
+    """Open the search over the 3D view, as F3 does."""
     window = bpy.context.window_manager.windows[0]
     area = max((a for a in window.screen.areas if a.type == "VIEW_3D"), key=lambda a: a.width)
     region = next(r for r in area.regions if r.type == "WINDOW")
     place = [str(region.x + region.width // 3), str(window.height - region.y - region.height // 2)]
-    subprocess.run(["xdotool", "mousemove", *place], check=True)
+    area.spaces.active.shading.type = "WIREFRAME"  # drawn fast, also without a graphics card
+    keys("mousemove", *place)
     with bpy.context.temp_override(window=window, area=area, region=region):
         bpy.ops.wm.search_menu("INVOKE_DEFAULT")
-    words.append(text)
 
 
-words: list[str] = []
-
-
-def typed() -> None:
-    subprocess.run(["xdotool", "type", "--delay", "40", words[-1]], check=True)
-
-
-def chosen() -> None:
-    subprocess.run(["xdotool", "key", "Return"], check=True)
+def keys(*what: str) -> None:
+    subprocess.run(["xdotool", *what], check=True)
 
 
 def model() -> str:
@@ -44,24 +37,21 @@ def model() -> str:
 
 
 def steps():
+    """Yields how many seconds Blender may take before the next step."""
     bpy.ops.mphdrr.import_geometry(filepath=str(workbook))
     camera = bpy.data.objects["Module 05"]
     camera.rotation_euler.x += 0.2
     bpy.context.view_layer.update()
-    yield
-    seen["before"] = [camera.mphdrr_module.aimed, model()]
-    for text in ("collimator aim", "preset ideal"):
-        search(text)
-        yield
-        typed()
-        yield
-        chosen()
-        yield
+    for text in ("collimator aim", "preset ideal", "projection"):
+        search()
+        yield 3.0
+        seen.setdefault("before", [camera.mphdrr_module.aimed, model()])
+        keys("type", "--delay", "100", text)
+        yield 6.0
+        if text != "projection":
+            keys("key", "Return")
+            yield 2.0
     seen["after"] = [camera.mphdrr_module.aimed, model()]
-    search("projection")
-    yield
-    typed()
-    yield
     seen["ok"] = True
 
 
@@ -70,15 +60,13 @@ running = steps()
 
 def tick() -> float | None:
     try:
-        next(running)
+        return next(running)
     except StopIteration:
-        result_file.write_text(json.dumps(seen))
-        return None
+        pass
     except Exception:
         seen["error"] = traceback.format_exc()
-        result_file.write_text(json.dumps(seen))
-        return None
-    return 2.5
+    result_file.write_text(json.dumps(seen))
+    return None
 
 
 bpy.app.timers.register(tick, first_interval=2.0)

@@ -5,6 +5,7 @@ CATEGORY = "mphDRR"  # the sidebar tab
 
 # --- Operators: idname as in `bpy.ops.<idname>` -------------------------------------------------------------
 IMPORT_GEOMETRY = "mphdrr.import_geometry"
+BROWSE_EXAMPLE = "mphdrr.browse_example"
 LOAD_EXAMPLE = "mphdrr.load_example"
 SHOW_MODULES = "mphdrr.show_modules"
 LOOK_THROUGH_MODULE = "mphdrr.look_through_module"
@@ -35,6 +36,7 @@ FIND_VOLUME_FILES = "mphdrr.find_volume_files"
 EXPORT_VOLUME = "mphdrr.export_volume"
 RENDER_PROJECTIONS = "mphdrr.render_projections"
 EXPORT_DATASET = "mphdrr.export_dataset"
+USE_PRESET = "mphdrr.use_preset"
 LOAD_RECIPE = "mphdrr.load_recipe"
 SHOW_PROJECTIONS = "mphdrr.show_projections"
 EXPORT_FIGURE = "mphdrr.export_figure"
@@ -45,6 +47,7 @@ LIVE_PREVIEW = "mphdrr.live_preview"
 PICK_MODULE = "mphdrr.pick_module"
 WIDE_FIELD = "mphdrr.wide_field"
 PICK_WINDOW = "mphdrr.pick_window"
+CLEAN_CACHE = "mphdrr.clean_cache"
 CANCEL_JOB = "mphdrr.cancel_job"
 
 # --- Panels, drawn in the order of the work: bl_order -----------------------------------------------------------------

@@ -97,7 +97,7 @@ class ModuleProperties(bpy.types.PropertyGroup):
     resolution: FloatProperty(
         name="Resolution", description="FWHM in mm at the isocentre, of the hole and the detector"
     )
-    magnification: FloatProperty(name="Magnification", description="l / b: of the image on the crystal")
+    magnification: FloatProperty(name="Magnification l / b", description="Of the image on the crystal")
     roi_seen: FloatProperty(name="Radius Seen", description="Radius in mm of the largest sphere that it sees whole")
     aimed: BoolProperty(name="Aimed", description="The camera looks at the isocentre", default=True)
     problem: StringProperty(name="Problem", description="Why the module's numbers are impossible")

@@ -21,6 +21,7 @@ from . import (
     live_phantoms,
     live_scanner,
     planes,
+    preferences,
     preview,
     properties,
     recovery,
@@ -47,6 +48,7 @@ def _classes(module: ModuleType) -> list[Any]:
 
 CLASSES: tuple[Any, ...] = (
     *properties.CLASSES,
+    *_classes(preferences),
     *add_phantom.ADD_KINDS,
     *_classes(operators),
     *_classes(jobs),
@@ -83,9 +85,29 @@ def _draw_entries(entries: dict[str, str]) -> Callable[..., None]:
     return draw
 
 
+# Menus of ours in Blender's own: name, text, icon.
+SUBMENUS = {
+    bpy.types.VIEW3D_MT_add: ("MPHDRR_MT_add", "mphDRR", "OUTLINER_DATA_VOLUME"),
+    bpy.types.VIEW3D_MT_object: ("MPHDRR_MT_commands", "mphDRR", "OUTLINER_OB_CAMERA"),
+    bpy.types.IMAGE_MT_image: ("MPHDRR_MT_projections", "mphDRR Projections", "RENDER_STILL"),
+}
+
+
+def _draw_submenu(name: str, text: str, icon: str) -> Callable[..., None]:
+    return lambda menu, context: menu.layout.menu(name, text=text, icon=icon)
+
+
+def _draw_splash(menu: bpy.types.Menu, context: bpy.types.Context) -> None:
+    """An extension cannot bring an application template: Blender looks for these in its own folders only."""
+    menu.layout.operator_context = "INVOKE_DEFAULT"
+    menu.layout.operator(ids.LOAD_EXAMPLE, text="mphDRR Example", icon="PLAY")
+    menu.layout.separator()
+
+
 MENUS = [(menu, _draw_entries(entries)) for menu, entries in ENTRIES.items()]
 MENUS.append((bpy.types.STATUSBAR_HT_header, jobs.draw_status))
-MENUS.append((bpy.types.VIEW3D_MT_add, lambda menu, _: menu.layout.menu("MPHDRR_MT_add", icon="OUTLINER_DATA_VOLUME")))
+MENUS += [(menu, _draw_submenu(*submenu)) for menu, submenu in SUBMENUS.items()]
+MENUS.append((bpy.types.WM_MT_splash, _draw_splash))
 
 # (list in bpy.app.handlers, function): decorate the function with @bpy.app.handlers.persistent.
 HANDLERS: tuple[tuple[list[Any], Any], ...] = (
@@ -149,6 +171,7 @@ def register(command: Callable[..., int] | None = None) -> None:
         for owner, name, group in properties.POINTERS:
             setattr(owner, name, bpy.props.PointerProperty(type=group))
             _registered.callback(delattr, owner, name)
+        preferences.apply()
         for menu, draw in MENUS:
             menu.append(draw)
             _registered.callback(menu.remove, draw)

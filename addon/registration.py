@@ -15,7 +15,6 @@ from ..operators import add_phantom
 from . import (
     following,
     ids,
-    images,
     jobs,
     live_phantoms,
     live_scanner,
@@ -96,7 +95,6 @@ HANDLERS: tuple[tuple[list[Any], Any], ...] = (
     (bpy.app.handlers.undo_post, live_scanner.after_undo),
     (bpy.app.handlers.redo_post, live_scanner.after_undo),
     (bpy.app.handlers.save_pre, storage.before_save),
-    (bpy.app.handlers.save_pre, images.before_save),
     (bpy.app.handlers.save_post, storage.after_save),
     (bpy.app.handlers.save_post_fail, storage.restore_paths),
 )

@@ -173,10 +173,16 @@ def _write(picture: NDArray[np.uint8], text: str, row: int, column: int, letters
 
 
 def write_png(picture: ArrayLike, path: str | os.PathLike[str]) -> None:
-    """Write a picture, row 0 at the top, as an 8-bit PNG: colours (height, width, 3) of uint8, or numbers (height, width).
+    """Write a picture as an 8-bit PNG (`png_bytes`); `InputError` where the file cannot be written."""
+    png = png_bytes(picture)
+    with replacing(path) as temporary:
+        temporary.write_bytes(png)
 
-    Of numbers, 0 is black, or the smallest if that is negative, and the largest is white. `InputError` where the file cannot
-    be written.
+
+def png_bytes(picture: ArrayLike, level: int = -1) -> bytes:
+    """A picture, row 0 at the top, as an 8-bit PNG: colours (height, width, 3) of uint8, or numbers (height, width).
+
+    Of numbers, 0 is black, or the smallest if that is negative, and the largest is white. `level` is zlib's.
     """
     pixels = np.asarray(picture)
     if pixels.ndim == 2:
@@ -184,9 +190,8 @@ def write_png(picture: ArrayLike, path: str | os.PathLike[str]) -> None:
         pixels = np.rint((pixels - low) / ((high - low) or 1.0) * 255).astype(np.uint8)[..., None]
     height, width, channels = pixels.shape
     header = struct.pack(">2I5B", width, height, 8, {1: 0, 3: 2}[channels], 0, 0, 0)  # 8 bits, grey or colours
-    rows = zlib.compress(np.pad(pixels.reshape(height, -1), ((0, 0), (1, 0))).tobytes())  # 0 before each: stored as is
+    rows = zlib.compress(np.pad(pixels.reshape(height, -1), ((0, 0), (1, 0))).tobytes(), level)  # 0 before each: as is
     png = b"\x89PNG\r\n\x1a\n"
     for name, data in ((b"IHDR", header), (b"IDAT", rows), (b"IEND", b"")):
         png += struct.pack(">I", len(data)) + name + data + struct.pack(">I", zlib.crc32(name + data))
-    with replacing(path) as temporary:
-        temporary.write_bytes(png)
+    return png

@@ -39,7 +39,7 @@ def example_job(context: bpy.types.Context) -> jobs.Job:
         (run,) = run_recipe(recipe, system, stages=stages)
         stages("writing the run file")
         write_run(run, new)
-        return stored, run, images.pictures(run, display, stages("storing"))
+        return stored, run, images.pictures(run, display, stages("packing"))
 
     def finish(result: Any) -> jobs.Finishing:
         stored, run, made = result

@@ -87,7 +87,10 @@ def show_again(display: Display) -> None:
     found = [bpy.data.images.get(projection_name(number, numbers)) for number in numbers]
     if None in found:
         return
-    projections = np.stack([projection_array(image) for image in found])
+    first = projection_array(found[0])
+    projections = np.empty((len(found), *first.shape), np.float32)
+    for m, image in enumerate(found):
+        projections[m] = projection_array(image)
     colored, mosaic, drawn = _colored(projections, numbers, rings, unit, display)
     for number, data in zip(numbers, colored, strict=True):
         picture = bpy.data.images.get(ids.picture_name(projection_name(number, numbers)))

@@ -60,7 +60,7 @@ def render_job(context: bpy.types.Context, recipe: Recipe, volume: str = "", mu:
         (run,) = run_recipe(recipe, system, read_volume(), read_mu and read_mu(), stages)
         stages("writing the run file")
         write_run(run, new)
-        return run, images.pictures(run, display, stages("storing"))
+        return run, images.pictures(run, display, stages("packing"))
 
     def finish(result: tuple[ProjectionRun, images.Pictures]) -> jobs.Finishing:
         run, made = result
@@ -94,8 +94,8 @@ def load_recipe(scene: bpy.types.Scene, path: Path) -> None:
         collection.mphdrr_scanner.opening_angle = math.radians(recipe[OPENING_ANGLE])
 
 
-def export_run(scene: bpy.types.Scene, filepath: str) -> Path:
-    """Write the scene's last run to a file, in the format of its suffix: .h5, .npz or .pt."""
+def exporting(scene: bpy.types.Scene, filepath: str) -> jobs.Job:
+    """The job that writes the scene's last run to a file, in the format of its suffix: .h5, .npz or .pt."""
     run_file = scene.mphdrr_projections.run_file
     if not run_file:
         raise InputError("nothing to export: render the projections first")
@@ -105,8 +105,14 @@ def export_run(scene: bpy.types.Scene, filepath: str) -> Path:
     if not filepath:
         raise InputError("no file given: set filepath to a name ending in .h5, .npz or .pt")
     path = storage.absolute(filepath)
-    write_run(read_run(source), path)
-    return path
+
+    def work(progress: Progress) -> None:
+        stages_of(progress)("reading the run file")
+        run = read_run(source)
+        stages_of(progress)("writing the file")
+        write_run(run, path)
+
+    return jobs.Job("Exporting the projections", work, lambda _: f"Wrote {path}")
 
 
 def show_run(scene: bpy.types.Scene, run: ProjectionRun, path: Path) -> None:

@@ -3,6 +3,7 @@
 Arguments after ``--``: the file for what was seen, the workbook, the pixels along a side of the images.
 """
 
+import itertools
 import json
 import resource
 import sys
@@ -40,7 +41,7 @@ def inside():
 
 
 def longest() -> float:
-    return max((b - a for a, b in zip(beats, beats[1:])), default=0.0)
+    return max((b - a for a, b in itertools.pairwise(beats)), default=0.0)
 
 
 def start(operator, **settings) -> None:
@@ -58,7 +59,7 @@ def measured(name: str, operator, **settings):
         yield 0.03
     yield 0.5
     seen["gaps"][name] = round(longest(), 3)
-    seen.setdefault("allgaps", {})[name] = sorted([round(b - a, 3) for a, b in zip(beats, beats[1:])])[-6:]
+    seen.setdefault("allgaps", {})[name] = sorted([round(b - a, 3) for a, b in itertools.pairwise(beats)])[-6:]
     note()
     seen["memory"][name] = round(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e6, 2)
 
@@ -69,7 +70,7 @@ def state() -> str:
     for kind in ("objects", "images", "collections", "cameras", "meshes", "materials", "volumes", "texts", "scenes"):
         for item in getattr(bpy.data, kind):
             lines.append(f"{kind} {item.name} {item.users} {item.as_pointer()}")
-            lines += [f"  {key} {item[key]!r}" for key in item.keys()]
+            lines += [f"  {key} {item[key]!r}" for key in item.keys()]  # noqa: SIM118
             for name, property in item.bl_rna.properties.items():
                 if property.type in ("BOOLEAN", "INT", "FLOAT", "STRING", "ENUM") and name != "pixels":
                     value = getattr(item, name)
@@ -123,7 +124,7 @@ def steps():
             each.tag_redraw()
         yield 0.3
     seen["redraw"] = round(longest(), 3)
-    render = dict(width=pixels, height=pixels, volume="Derenzo")
+    render = {"width": pixels, "height": pixels, "volume": "Derenzo"}
     yield from measured("projecting", mph.render_projections, **render)
     yield 3.0
     beats.clear()
@@ -142,7 +143,6 @@ def steps():
 
 def note() -> None:
     result_file.write_text(json.dumps(seen, indent=1))
-
 
 
 _modal = jobs.JobOperator.modal

@@ -42,8 +42,8 @@ def render_job(context: bpy.types.Context, recipe: Recipe, volume: str = "", mu:
     for chosen in filter(None, (item, mu_item)):
         phantoms.require_current(chosen)
     rows, columns = recipe["detector.rows"], recipe["detector.columns"]
-    # The array; Blender's images with four channels in memory and once more, packed; the pictures of them, likewise.
-    require(44.0 * len(system) * rows * columns, f"{len(system)} images of {columns} x {rows} pixels")
+    # The array, means and colours of it, and the packed images, in our memory and in Blender's beside those of the last run.
+    require(16.0 * len(system) * rows * columns, f"{len(system)} images of {columns} x {rows} pixels")
     recipe = recipe.updated({"volume.object": item.name, "attenuation.object": mu_item and mu_item.name})
     recipe = _with_volume(recipe, item)
     read_volume, read_mu = volumes.reader(item), mu_item and volumes.reader(mu_item)

@@ -23,7 +23,6 @@ class MPHDRR_PT_projections(Sidebar, bpy.types.Panel):
         settings = context.scene.mphdrr_projections
         jobs.draw_job(layout)  # at the top, where it is seen on small screens too
         column = layout.column()
-        column.enabled = not jobs.is_running()
         column.prop(settings, "volume", placeholder="Active volume")
         column.prop(settings, "model")
         model = [name for name, _ in drawn(settings, "model") if name != "model"]
@@ -33,18 +32,17 @@ class MPHDRR_PT_projections(Sidebar, bpy.types.Panel):
         modules.prop(settings, "first", text="Modules First")
         modules.prop(settings, "last", text="Last")
         _draw(column, settings, "compute")
-        if not jobs.is_running():
-            row = layout.row()
-            row.scale_y = 1.4
-            row.operator_context = "INVOKE_DEFAULT"
-            ready = scanner.active_scanner(context.scene) is not None and bool(volumes.volume_objects(context.scene))
-            row.enabled = ready
-            row.operator(ids.RENDER_PROJECTIONS, icon="RENDER_STILL")
-            layout.operator(ids.LOAD_RECIPE, icon="FILE_FOLDER")
-            if not ready:
-                hint = layout.row()
-                hint.active = False
-                hint.label(text="Needs a scanner and a volume.", icon="INFO")
+        row = layout.row()
+        row.scale_y = 1.4
+        row.operator_context = "INVOKE_DEFAULT"
+        ready = scanner.active_scanner(context.scene) is not None and bool(volumes.volume_objects(context.scene))
+        row.enabled = ready
+        row.operator(ids.RENDER_PROJECTIONS, icon="RENDER_STILL")
+        layout.operator(ids.LOAD_RECIPE, icon="FILE_FOLDER")
+        if not ready:
+            hint = layout.row()
+            hint.active = False
+            hint.label(text="Needs a scanner and a volume.", icon="INFO")
         if settings.run_file:
             layout.operator(ids.SHOW_PROJECTIONS, text="Show Mosaic", icon="IMAGE_DATA")
             column = layout.column(align=True)
@@ -77,7 +75,6 @@ class MPHDRR_PT_physics(Sidebar, bpy.types.Panel):
         layout = self.layout
         layout.use_property_split = True
         layout.use_property_decorate = False
-        layout.enabled = not jobs.is_running()
         settings = context.scene.mphdrr_projections
         column = layout.column(align=True)
         if settings.model == "EMISSION":

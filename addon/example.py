@@ -37,7 +37,7 @@ def example_job(context: bpy.types.Context) -> jobs.Job:
         (run,) = run_recipe(recipe, system, stages=stages)
         stages("writing the run file")
         write_run(run, path)
-        return stored, run, images.pictures(run, display, stages("storing"))
+        return stored, run, images.pictures(run, display, stages("packing"))
 
     def finish(result: Any) -> jobs.Finishing:
         stored, run, made = result

@@ -5,7 +5,7 @@ Each module has two: one holds the exact float32 numbers in R, G and B, the othe
 """
 
 import os
-from collections.abc import Generator, Iterator, Sequence
+from collections.abc import Callable, Generator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import Any
@@ -17,13 +17,14 @@ from numpy.typing import NDArray
 from ..core.progress import Progress
 from ..core.runs.display import Display
 from ..core.runs.exr import exr_bytes
-from ..core.runs.mosaic import Sheet, as_seen, sheet, smaller
+from ..core.runs.mosaic import Sheet, as_seen, png, sheet, smaller
 from ..core.runs.run import ProjectionRun
 from . import ids
 
 _KEY = "mphdrr_projection"  # custom property: marks the images that a new run replaces
 _PIXELS = 2.2e7
 """Of all pictures together, about: larger images are shown smaller, since a picture takes memory again when it is drawn."""
+_PNG_LEVEL = 1  # fast
 _SCANNER = "mphdrr_scanner"  # custom property of the mosaic: the collection of the scanner that the run is of
 _TEXT = "mphdrr_difference"  # custom property of a difference: its numbers, in words
 _TILES = "mphdrr_tiles"  # custom property of the mosaic: its modules, unit, and where in it which one's image is
@@ -31,25 +32,21 @@ _TILES = "mphdrr_tiles"  # custom property of the mosaic: its modules, unit, and
 
 @dataclass(frozen=True)
 class Pictures:
-    """What the images of a run will hold, made in a thread."""
+    """Files with what the images of a run hold, made in a thread."""
 
     display: Display
-    exact: list[bytes]  # OpenEXR files
-    colored: Sequence[NDArray[np.uint8]]  # (height, width, 3), row 0 at the top
-    mosaic: Sheet
+    exact: list[bytes]  # OpenEXR, of float32
+    colored: list[bytes]  # PNG
+    mosaic: bytes  # PNG
+    drawn: Sheet  # what is where in the mosaic
 
 
 def pictures(run: ProjectionRun, display: Display, progress: Progress | None = None) -> Pictures:
-    """Make the contents of a run's images; leaves bpy alone. `progress` counts the modules."""
-    exact: list[bytes] = []
-    with ThreadPoolExecutor(os.cpu_count()) as pool:
-        for packed in pool.map(exr_bytes, as_seen(run.projections)):
-            exact.append(packed)
-            if progress is not None:
-                progress(len(exact), len(run.views))
+    """Make the contents of a run's images; leaves bpy alone. `progress` counts the files."""
+    count = 2 * len(run.views)
+    exact = _in_threads(exr_bytes, as_seen(run.projections), progress, 0, count)
     numbers, rings = run.system.numbers.tolist(), run.system.rings().tolist()
-    colored = list(_colored(run.projections, display))
-    return Pictures(display, exact, colored, sheet(run.projections, numbers, rings, run.unit, display))
+    return Pictures(display, exact, *_colored(run.projections, numbers, rings, run.unit, display, progress))
 
 
 def storing(
@@ -65,20 +62,19 @@ def storing(
     numbers = run.system.numbers.tolist()
     new: dict[str, bpy.types.Image] = {}
     try:
-        for k, (number, exact, colors) in enumerate(zip(numbers, made.exact, made.colored, strict=True)):
+        for k, (number, exact, colored) in enumerate(zip(numbers, made.exact, made.colored, strict=True)):
             yield "storing", k, len(numbers)
             name = projection_name(number, numbers)
             new[name] = bpy.data.images.new(name, 1, 1, float_buffer=True, is_data=True)
-            new[name].pack(data=exact, data_len=len(exact))
-            new[name].source = "FILE"  # the packed one, which Blender reads when the image is looked at
-            new[ids.picture_name(name)] = _new(ids.picture_name(name), colors)
-        new[ids.MOSAIC] = _new(ids.MOSAIC, made.mosaic.picture)
+            _fill(new[name], exact)
+            new[ids.picture_name(name)] = _new_picture(ids.picture_name(name), colored)
+        new[ids.MOSAIC] = _new_picture(ids.MOSAIC, made.mosaic)
         yield "storing", len(numbers), len(numbers)
     except BaseException:
         bpy.data.batch_remove(new.values())
         raise
     _put_in_place(new)
-    _describe(new[ids.MOSAIC], made.mosaic, numbers, run.system.rings().tolist(), run.unit)
+    _describe(new[ids.MOSAIC], made.drawn, numbers, run.system.rings().tolist(), run.unit)
     if made.display != display:  # which was edited meanwhile
         show_again(display)
     return new[ids.MOSAIC]
@@ -93,13 +89,16 @@ def show_again(display: Display) -> None:
     found = [bpy.data.images.get(projection_name(number, numbers)) for number in numbers]
     if None in found:
         return
-    projections = np.stack([projection_array(image) for image in found])
-    for number, colors in zip(numbers, _colored(projections, display), strict=True):
+    first = projection_array(found[0])
+    projections = np.empty((len(found), *first.shape), np.float32)
+    for m, image in enumerate(found):
+        projections[m] = projection_array(image)
+    colored, mosaic, drawn = _colored(projections, numbers, rings, unit, display)
+    for number, data in zip(numbers, colored, strict=True):
         picture = bpy.data.images.get(ids.picture_name(projection_name(number, numbers)))
         if picture is not None:
-            _fill(picture, colors)
-    drawn = sheet(projections, numbers, rings, unit, display)
-    _fill(bpy.data.images[ids.MOSAIC], drawn.picture)
+            _fill(picture, data)
+    _fill(bpy.data.images[ids.MOSAIC], mosaic)
     _describe(bpy.data.images[ids.MOSAIC], drawn, numbers, rings, unit)
 
 
@@ -137,11 +136,36 @@ def projection_name(number: int, numbers: list[int]) -> str:
     return ids.projection_name(number, max(numbers))
 
 
-def _colored(projections: NDArray[np.float32], display: Display) -> Iterator[NDArray[np.uint8]]:
-    """The pictures of projections (M, n_v, n_u) as `display` says, in one window."""
-    window = display.window(projections)
-    for picture in smaller(as_seen(display.part(projections)), _PIXELS):
-        yield display.colored(picture, window)
+def _colored(
+    projections: NDArray[np.float32],
+    numbers: list[int],
+    rings: list[int],
+    unit: str,
+    display: Display,
+    progress: Progress | None = None,
+) -> tuple[list[bytes], bytes, Sheet]:
+    """The pictures of projections (M, n_v, n_u) in one window, and the mosaic, as PNG files; and what is where in it."""
+    window, count = display.window(projections), len(numbers)
+
+    def file(picture: NDArray[np.float32]) -> bytes:
+        return png(display.colored(picture, window), _PNG_LEVEL)
+
+    colored = _in_threads(file, smaller(as_seen(display.part(projections)), _PIXELS), progress, count, 2 * count)
+    drawn = sheet(projections, numbers, rings, unit, display)
+    return colored, png(drawn.picture, _PNG_LEVEL), drawn
+
+
+def _in_threads(
+    make: Callable[[Any], bytes], pictures: NDArray[np.float32], progress: Progress | None, done: int, total: int
+) -> list[bytes]:
+    """What `make` makes of each picture."""
+    files: list[bytes] = []
+    with ThreadPoolExecutor(os.cpu_count()) as pool:
+        for file in pool.map(make, pictures):
+            files.append(file)
+            if progress is not None:
+                progress(done + len(files), total)
+    return files
 
 
 def _describe(image: bpy.types.Image, drawn: Sheet, numbers: list[int], rings: list[int], unit: str) -> None:
@@ -155,8 +179,9 @@ def _describe(image: bpy.types.Image, drawn: Sheet, numbers: list[int], rings: l
 
 def store_difference(drawn: Sheet, numbers: list[int], unit: str, text: str) -> bpy.types.Image:
     """Make the image of a difference of two runs, until other projections are shown; `text` says its numbers."""
+    file = png(drawn.picture, _PNG_LEVEL)
     old = bpy.data.images.get(ids.DIFFERENCE)
-    image = _new(ids.DIFFERENCE, drawn.picture) if old is None else _fill(old, drawn.picture)
+    image = _new_picture(ids.DIFFERENCE, file) if old is None else _fill(old, file)
     image.use_fake_user, image[_KEY] = True, True
     _describe(image, drawn, numbers, [], unit)
     image[_TEXT] = text
@@ -246,19 +271,20 @@ def _fit(context: bpy.types.Context, window: bpy.types.Window, area: bpy.types.A
     bpy.app.timers.register(fit, first_interval=0.2)
 
 
-def _new(name: str, colors: NDArray[np.uint8]) -> bpy.types.Image:
-    return _fill(bpy.data.images.new(name, colors.shape[1], colors.shape[0]), colors)
+def _new_picture(name: str, png: bytes) -> bpy.types.Image:
+    image = _fill(bpy.data.images.new(name, 1, 1), png)
+    len(image.pixels)  # reads it now, in a step of its own, and not when all are first drawn
+    return image
 
 
-def _fill(image: bpy.types.Image, colors: NDArray[np.uint8]) -> bpy.types.Image:
-    """Give an image 8-bit colours (height, width, 3), row 0 at the top."""
-    height, width = colors.shape[:2]
-    if tuple(image.size) != (width, height):
-        image.scale(width, height)
-    pixels = np.ones((height, width, 4), np.float32)
-    np.divide(colors[::-1], np.float32(255), out=pixels[..., :3])
-    image.pixels.foreach_set(pixels.ravel())
-    image.update()
+def _fill(image: bpy.types.Image, file: bytes) -> bpy.types.Image:
+    """Pack the contents of a file into an image, which shows it from now on."""
+    image.pack(data=file, data_len=len(file))
+    if image.source != "FILE":
+        image.source = "FILE"
+    else:
+        image.buffers_free()
+        image.update()
     return image
 
 
@@ -275,11 +301,3 @@ def _put_in_place(new: dict[str, bpy.types.Image]) -> None:
     bpy.data.batch_remove(old)
     for name, image in new.items():
         image.name, image[_KEY] = name, True
-
-
-@bpy.app.handlers.persistent
-def before_save(*_: object) -> None:
-    """Pack the pictures to look at: only now, since each edit of the display makes them anew."""
-    for image in bpy.data.images:
-        if _KEY in image and image.is_dirty:
-            image.pack()

@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any
 
 import bpy
 from bpy.props import BoolProperty, IntProperty
+from bpy_extras.io_utils import ExportHelper
 
 from ..core.cli.options import progress_bar
 from ..core.errors import InputError
@@ -233,12 +234,10 @@ class JobOperator:
                 self._asked = True
                 return asked
             with warnings_reported(self):
-                self._job = self.job(context)
+                job = self.job(context)
         except Exception as error:
             return self._failed(error)
-        self._run = Worker(self._job.label, self._job.work)
-        _waiting.append(self._run)
-        self._begin_if_first()
+        self._enqueue(job)
         manager = context.window_manager
         self._timer = manager.event_timer_add(_INTERVAL, window=context.window)
         manager.modal_handler_add(self)
@@ -291,6 +290,12 @@ class JobOperator:
         if self._job is not None:
             self._job.discard()
 
+    def _enqueue(self, job: Job) -> None:
+        """Let a job begin when those that wait have."""
+        self._job, self._run = job, Worker(job.label, job.work)
+        _waiting.append(self._run)
+        self._begin_if_first()
+
     def _begin_if_first(self) -> None:
         """Start the thread where no job runs and none waits longer."""
         global _current
@@ -336,6 +341,15 @@ class JobOperator:
         else:
             raise error  # KeyboardInterrupt and the like
         return {"CANCELLED"}
+
+
+class ExportJob(JobOperator, ExportHelper):
+    """Mix into an operator whose job writes the file that the user chooses."""
+
+    def ask(self, context: bpy.types.Context) -> set[str] | None:
+        """Open the file browser."""
+        answer: set[str] = ExportHelper.invoke(self, context, None)
+        return answer
 
 
 class MPHDRR_OT_cancel_job(bpy.types.Operator):

@@ -43,8 +43,8 @@ def render_job(context: bpy.types.Context, recipe: Recipe, volume: str = "", mu:
     for chosen in filter(None, (item, mu_item)):
         phantoms.require_current(chosen)
     rows, columns = recipe["detector.rows"], recipe["detector.columns"]
-    # The array; Blender's images with four channels in memory and once more, packed; the pictures of them, likewise.
-    require(44.0 * len(system) * rows * columns, f"{len(system)} images of {columns} x {rows} pixels")
+    # The array, means and colours of it, and the packed images, in our memory and in Blender's beside those of the last run.
+    require(16.0 * len(system) * rows * columns, f"{len(system)} images of {columns} x {rows} pixels")
     recipe = recipe.updated({"volume.object": item.name, "attenuation.object": mu_item and mu_item.name})
     recipe = _with_volume(recipe, item)
     read_volume, read_mu = volumes.reader(item), mu_item and volumes.reader(mu_item)
@@ -61,7 +61,7 @@ def render_job(context: bpy.types.Context, recipe: Recipe, volume: str = "", mu:
         (run,) = run_recipe(recipe, system, read_volume(), read_mu and read_mu(), stages)
         stages("writing the run file")
         write_run(run, path)
-        return run, images.pictures(run, display, stages("storing"))
+        return run, images.pictures(run, display, stages("packing"))
 
     def finish(result: tuple[ProjectionRun, images.Pictures]) -> jobs.Finishing:
         run, made = result
@@ -106,19 +106,28 @@ def load_recipe(scene: bpy.types.Scene, path: Path) -> None:
         collection.mphdrr_scanner.opening_angle = math.radians(recipe[OPENING_ANGLE])
 
 
-def export_run(scene: bpy.types.Scene, filepath: str) -> Path:
-    """Write the shown run to a file, in the format of its suffix: .h5, .npz or .pt; warns where the scene has changed."""
+def exporting(scene: bpy.types.Scene, filepath: str) -> jobs.Job:
+    """The job that writes the shown run to a file, in the format of its suffix: .h5, .npz or .pt.
+
+    Warns where the scene has changed since the run was made.
+    """
     if not scene.mphdrr_projections.run_file:
         raise InputError("nothing to export: render the projections first")
     source = file_of(scene.mphdrr_projections.run_file)
     if not filepath:
         raise InputError("no file given: set filepath to a name ending in .h5, .npz or .pt")
     path = storage.absolute(filepath)
-    write_run(read_run(source), path)
     if found := runs.changes(scene):
         text = f"the run is not of the scene as it is now ({'; '.join(found)}): {path.name} holds what was rendered"
         warnings.warn(text, InputWarning, stacklevel=2)
-    return path
+
+    def work(progress: Progress) -> None:
+        stages_of(progress)("reading the run file")
+        run = read_run(source)
+        stages_of(progress)("writing the file")
+        write_run(run, path)
+
+    return jobs.Job("Exporting the projections", work, lambda _: f"Wrote {path}")
 
 
 def file_of(run_file: str) -> Path:
@@ -191,7 +200,7 @@ def showing_job(scene: bpy.types.Scene, index: int) -> jobs.Job:
 
     def work(progress: Progress) -> tuple[ProjectionRun, images.Pictures]:
         run = read_run(path)
-        return run, images.pictures(run, display, stages_of(progress)("storing"))
+        return run, images.pictures(run, display, stages_of(progress)("packing"))
 
     def finish(result: tuple[ProjectionRun, images.Pictures]) -> jobs.Finishing:
         run, made = result

@@ -12,48 +12,60 @@ import numpy as np
 from ..core.errors import InputError, InputWarning
 from ..core.exchange import FORMATS, write_geometry
 from ..core.geometry.system import LENGTHS, Detector, PinholeSystem
+from ..core.progress import Progress, stages_of
 from ..core.recording import recorded_warnings
 from ..core.workbook import read_system, write_system
-from . import following, scanner, storage
+from . import following, jobs, scanner, storage
 from .decimals import typed
 
 WORKBOOK_SUFFIXES = (".xlsx", ".xlsm")
 _EQUAL = 1e-9  # mm, or share of a length above 1 mm
 
 
-def export_scanner(collection: bpy.types.Collection, path: Path, use_template: bool = True) -> PinholeSystem:
-    """Write the scanner as it stands in the scene to a workbook (.xlsx, .xlsm), which becomes the scanner's own.
+def exporting_scanner(collection: bpy.types.Collection, path: Path, use_template: bool = True) -> jobs.Job:
+    """The job that writes the scanner as it stands in the scene to a workbook (.xlsx, .xlsm), which becomes its own.
 
     With `use_template` it is written into a copy of the scanner's present workbook, by the column map that this was read
-    by; a new one is made where that workbook has gone (`InputWarning`). Returns the system, with the new file as its source.
-    Raises InputError, and leaves the scanner as it was, where a camera is not aimed or the file cannot be written.
+    by; a new one is made where that workbook has gone (`InputWarning`). Raises InputError, and leaves the scanner as it was,
+    where a camera is not aimed or the file cannot be written.
     """
     following.refresh(collection)
     system = scanner.read_scanner(collection, aimed=True)
     template = _template(collection) if use_template else None
     source = scanner.source(collection) if template is not None else None
-    columns = source.columns if source is not None else None
-    own = write_system(system, path, template, columns).columns
-    with recorded_warnings():  # the writer has already warned of the template's doubts
-        written = read_system(path, own)
-    different = _difference(system, written)
-    if different:
-        raise InputError(f"{path}: was written, but reads back differently ({different}); the scene keeps its numbers")
-    # The scene's own float64 numbers, which may differ in the last digit.
-    written = replace(system, source=written.source)
-    scanner.remember_source(collection, written)
-    return written
+    columns, name = source.columns if source is not None else None, collection.name
+
+    def work(progress: Progress) -> PinholeSystem:
+        stages_of(progress)("writing the workbook")
+        own = write_system(system, path, template, columns).columns
+        with recorded_warnings():  # the writer has already warned of the template's doubts
+            written = read_system(path, own)
+        different = _difference(system, written)
+        if different:
+            raise InputError(
+                f"{path}: was written, but reads back differently ({different}); the scene keeps its numbers"
+            )
+        # The scene's own float64 numbers, which may differ in the last digit.
+        return replace(system, source=written.source)
+
+    def finish(written: PinholeSystem) -> str:
+        collection = bpy.data.collections.get(name)
+        if collection is not None:
+            scanner.remember_source(collection, written)
+        return f"Wrote {len(written)} modules to {path}"
+
+    return jobs.Job("Exporting the workbook", work, finish)
 
 
-def export_for_program(
+def exporting_for_program(
     collection: bpy.types.Collection,
     path: Path,
     format: str,
     shape: tuple[int, int],
     detector: Detector = "virtual",
     magnification: float = 10.0,
-) -> PinholeSystem:
-    """Write the scanner as it stands in the scene in one of `FORMATS`, with its collimators as they are built.
+) -> jobs.Job:
+    """The job that writes the scanner as it stands in the scene in one of `FORMATS`, its collimators as they are built.
 
     `path` is a new folder for formats of several files; the images described are `system.views(shape, detector, ...)`.
     Raises InputError where a camera does not look at the isocentre or the format cannot express the scanner.
@@ -63,8 +75,12 @@ def export_for_program(
     system = scanner.read_scanner(collection, aimed=True)
     views = system.views(shape, detector, magnification=magnification)
     known = {name: value for name, value in options.items() if name in FORMATS[format].options}
-    write_geometry(system, path, format, views=views, **known)
-    return system
+
+    def work(progress: Progress) -> None:
+        stages_of(progress)("writing the file")
+        write_geometry(system, path, format, views=views, **known)
+
+    return jobs.Job("Exporting the geometry", work, lambda _: f"Wrote {len(system)} modules to {path}")
 
 
 def _template(collection: bpy.types.Collection) -> Path | None:

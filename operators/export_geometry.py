@@ -4,9 +4,8 @@ from pathlib import Path
 
 import bpy
 from bpy.props import BoolProperty, EnumProperty, StringProperty
-from bpy_extras.io_utils import ExportHelper
 
-from ..addon import ids, scanner, scanner_files, selection, storage
+from ..addon import ids, jobs, scanner, scanner_files, selection, storage
 from ..addon.decimals import typed
 from ..addon.scanner_files import WORKBOOK_SUFFIXES
 from ..core.errors import InputError
@@ -15,7 +14,7 @@ from ..core.exchange import FORMAT_NUMBERS, FORMATS
 _FORMATS = tuple((f.name, f.name, f.title, FORMAT_NUMBERS[f.name]) for f in FORMATS.values())
 
 
-class MPHDRR_OT_export_geometry(selection.OnScanner, ExportHelper, bpy.types.Operator):
+class MPHDRR_OT_export_geometry(selection.NeedsScanner, jobs.ExportJob, bpy.types.Operator):
     """Write the scanner as it stands in the scene to a workbook, into a copy of the one it came from"""
 
     bl_idname = ids.EXPORT_GEOMETRY
@@ -31,13 +30,13 @@ class MPHDRR_OT_export_geometry(selection.OnScanner, ExportHelper, bpy.types.Ope
         default=True,
     )
 
-    def invoke(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str]:
+    def ask(self, context: bpy.types.Context) -> set[str] | None:
         workbook = scanner.required_scanner(context.scene).mphdrr_scanner.workbook
         if not self.filepath and workbook:
             # Not the workbook itself: overwriting it takes typing its name.
             path = storage.absolute(workbook)
             self.filepath = str(path.with_stem(f"{path.stem.removesuffix('-edited')}-edited"))
-        return super().invoke(context, event)
+        return super().ask(context)
 
     def check(self, context: bpy.types.Context) -> bool:
         """Add the default suffix to a name without one."""
@@ -46,21 +45,21 @@ class MPHDRR_OT_export_geometry(selection.OnScanner, ExportHelper, bpy.types.Ope
         self.filepath += self.filename_ext
         return True
 
-    def change(self, context: bpy.types.Context, collection: bpy.types.Collection) -> str:
+    def job(self, context: bpy.types.Context) -> jobs.Job:
         if not self.filepath:
             raise InputError("no file given: set filepath to a name ending in .xlsx")
-        path = storage.absolute(self.filepath)
-        system = scanner_files.export_scanner(collection, path, self.use_template)
-        return f"Wrote {len(system)} modules to {path}"
+        collection, path = scanner.required_scanner(context.scene), storage.absolute(self.filepath)
+        return scanner_files.exporting_scanner(collection, path, self.use_template)
 
 
-class MPHDRR_OT_export_for_program(selection.OnScanner, ExportHelper, bpy.types.Operator):
+class MPHDRR_OT_export_for_program(selection.NeedsScanner, jobs.ExportJob, bpy.types.Operator):
     """Write the scanner as it stands in the scene for another program: cameras for reconstruction codes, solids to print,
     Monte Carlo simulations. Images are those of the Projections panel
     """
 
     bl_idname = ids.EXPORT_FOR_PROGRAM
     bl_label = "Export Geometry for a Program"
+    bl_options = set()
 
     filename_ext = ""
     filepath: StringProperty(
@@ -79,15 +78,13 @@ class MPHDRR_OT_export_for_program(selection.OnScanner, ExportHelper, bpy.types.
         before, self.filepath = self.filepath, str(stem) + (suffixes[0] if suffixes else "")
         return before != self.filepath
 
-    def change(self, context: bpy.types.Context, collection: bpy.types.Collection) -> str:
+    def job(self, context: bpy.types.Context) -> jobs.Job:
         if not self.filepath:
             raise InputError("no file given: set filepath")
         path, images = storage.absolute(self.filepath), context.scene.mphdrr_projections
         shape, magnification = (images.height, images.width), typed(images.magnification)
-        system = scanner_files.export_for_program(
-            collection, path, self.format, shape, images.detector.lower(), magnification
-        )
-        return f"Wrote {len(system)} modules to {path}"
+        collection, detector = scanner.required_scanner(context.scene), images.detector.lower()
+        return scanner_files.exporting_for_program(collection, path, self.format, shape, detector, magnification)
 
     def draw(self, context: bpy.types.Context) -> None:
         self.layout.prop(self, "format")

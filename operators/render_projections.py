@@ -6,7 +6,7 @@ from typing import Any
 
 import bpy
 from bpy.props import EnumProperty, FloatProperty, StringProperty
-from bpy_extras.io_utils import ExportHelper, ImportHelper
+from bpy_extras.io_utils import ImportHelper
 
 from ..addon import choices, ids, images, jobs, rendering, scanner, storage, tiles
 from ..addon.decimals import typed
@@ -133,11 +133,12 @@ class MPHDRR_OT_pick_module(bpy.types.Operator):
         return {"PASS_THROUGH"} if picked is None else {"FINISHED"}
 
 
-class MPHDRR_OT_export_dataset(ExportHelper, bpy.types.Operator):
+class MPHDRR_OT_export_dataset(jobs.ExportJob, bpy.types.Operator):
     """Write the shown run, with geometry, volume and provenance, as HDF5 (.h5), NumPy (.npz) or PyTorch (.pt)"""
 
     bl_idname = ids.EXPORT_DATASET
     bl_label = "Export mphDRR Dataset"
+    bl_options = set()
 
     filename_ext = ".h5"
     filter_glob: StringProperty(default="*.h5;*.hdf5;*.npz;*.pt", options={"HIDDEN"})
@@ -149,5 +150,5 @@ class MPHDRR_OT_export_dataset(ExportHelper, bpy.types.Operator):
         self.filepath += self.filename_ext
         return True
 
-    def execute(self, context: bpy.types.Context) -> set[str]:
-        return run_reported(self, lambda: f"Wrote {rendering.export_run(context.scene, self.filepath)}")
+    def job(self, context: bpy.types.Context) -> jobs.Job:
+        return rendering.exporting(context.scene, self.filepath)

@@ -5,7 +5,7 @@ from typing import Any
 import bpy
 from bpy.app.translations import pgettext_iface as iface
 
-from ..addon import ids, jobs, phantom_properties, phantoms, recovery, slices, storage, volumes
+from ..addon import ids, phantom_properties, phantoms, recovery, slices, storage, volumes
 from .geometry import Sidebar, draw_facts, draw_hint, draw_text
 
 
@@ -19,7 +19,6 @@ class MPHDRR_PT_phantom(Sidebar, bpy.types.Panel):
         layout.use_property_split = True
         layout.use_property_decorate = False
         adding = layout.column()
-        adding.enabled = not jobs.is_running()
         column = adding.column(align=True)
         column.menu("MPHDRR_MT_add", text="Add Phantom", icon="OUTLINER_DATA_VOLUME")
         column.operator(ids.IMPORT_VOLUME, text="Import Volume", icon="IMPORT")
@@ -99,7 +98,6 @@ def _draw_phantom(layout: bpy.types.UILayout, item: bpy.types.Object, phantom: A
         column.alert = settings.outdated
         draw_text(column, settings.message, "ERROR" if settings.outdated else "INFO")
     column = layout.column(align=True)
-    column.enabled = not jobs.is_running()
     row = column.row(align=True)
     row.alert = settings.outdated
     text = "Changed: Update" if settings.outdated else "Update Phantom"

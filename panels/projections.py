@@ -25,7 +25,6 @@ class MPHDRR_PT_projections(Sidebar, bpy.types.Panel):
         settings = context.scene.mphdrr_projections
         jobs.draw_job(layout)  # at the top, where it is seen on small screens too
         column = layout.column()
-        column.enabled = not jobs.is_running()
         column.prop(settings, "volume", placeholder="Active volume")
         column.prop(settings, "model")
         model = [name for name, _ in drawn(settings, "model") if name != "model"]
@@ -39,19 +38,18 @@ class MPHDRR_PT_projections(Sidebar, bpy.types.Panel):
             modules.prop(settings, "first")
             modules.prop(settings, "last")
         _draw(column, settings, "compute")
-        if not jobs.is_running():
-            row = layout.row()
-            row.scale_y = 1.4
-            row.operator_context = "INVOKE_DEFAULT"
-            has_scanner = scanner.active_scanner(context.scene) is not None
-            has_volume = bool(volumes.volume_objects(context.scene))
-            row.enabled = has_scanner and has_volume
-            row.operator(ids.RENDER_PROJECTIONS, icon="RENDER_STILL")
-            layout.operator(ids.LOAD_RECIPE, icon="FILE_FOLDER")
-            if not has_scanner:
-                draw_hint(layout, "Needs a scanner: Load Example.")
-            elif not has_volume:
-                draw_hint(layout, "Needs a volume: Add Phantom.")
+        row = layout.row()
+        row.scale_y = 1.4
+        row.operator_context = "INVOKE_DEFAULT"
+        has_scanner = scanner.active_scanner(context.scene) is not None
+        has_volume = bool(volumes.volume_objects(context.scene))
+        row.enabled = has_scanner and has_volume
+        row.operator(ids.RENDER_PROJECTIONS, icon="RENDER_STILL")
+        layout.operator(ids.LOAD_RECIPE, icon="FILE_FOLDER")
+        if not has_scanner:
+            draw_hint(layout, "Needs a scanner: Load Example.")
+        elif not has_volume:
+            draw_hint(layout, "Needs a volume: Add Phantom.")
         if settings.run_file:
             layout.operator(ids.SHOW_PROJECTIONS, text="Show Mosaic", icon="IMAGE_DATA")
             draw_changes(layout, context.scene)
@@ -84,7 +82,6 @@ class MPHDRR_PT_physics(Sidebar, bpy.types.Panel):
         layout = self.layout
         layout.use_property_split = True
         layout.use_property_decorate = False
-        layout.enabled = not jobs.is_running()
         settings = context.scene.mphdrr_projections
         column = layout.column(align=True)
         if settings.model == "EMISSION":

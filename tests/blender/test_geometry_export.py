@@ -10,8 +10,8 @@ import bpy
 import numpy as np
 import pytest
 
-from mphdrr.addon import module_edits, scanner
-from mphdrr.addon.scanner_files import export_scanner
+from mphdrr.addon import jobs, module_edits, scanner
+from mphdrr.addon.scanner_files import exporting_scanner
 from mphdrr.core.errors import InputError, InputWarning
 from mphdrr.core.geometry.system import LENGTHS
 from mphdrr.core.workbook import read_system
@@ -117,7 +117,7 @@ def test_template_that_has_gone_is_said(collection, own, tmp_path):
     scanner.module(collection, 3).mphdrr_module.pinhole_diameter = 2.9
     system = scanner.read_scanner(collection)
     with pytest.warns(InputWarning, match=r"own\.xlsx has gone"):
-        export_scanner(collection, tmp_path / "new.xlsx")
+        jobs.run(exporting_scanner(collection, tmp_path / "new.xlsx"))
     assert_equal(read_system(tmp_path / "new.xlsx"), system)
 
 

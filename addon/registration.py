@@ -22,6 +22,7 @@ from . import (
     planes,
     properties,
     rendering,
+    run_notes,
     runs,
     scanner,
     selection,
@@ -145,6 +146,7 @@ def register(command: Callable[..., int] | None = None) -> None:
             _registered.callback(_remove_handler, handlers, function)
         if not bpy.app.background:
             _registered.callback(tiles.draw_no_frames, tiles.draw_frames())
+            _registered.callback(run_notes.draw_no_notes, run_notes.draw_notes())
             for name in ("Image", "Image Editor Tool: Sample"):  # the editor's usual tool takes clicks first
                 keymap = bpy.context.window_manager.keyconfigs.addon.keymaps.new(name, space_type="IMAGE_EDITOR")
                 click = keymap.keymap_items.new(ids.PICK_MODULE, "LEFTMOUSE", "PRESS")

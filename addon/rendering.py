@@ -178,14 +178,17 @@ def active_run_changed(scene: bpy.types.Scene) -> None:
 
 def _show_chosen() -> float | None:
     """Press the button that shows the chosen run; later, if a job is running."""
-    settings = bpy.context.scene.mphdrr_projections
     if jobs.is_running():
         return 10 * _REST
-    if settings.active_run < len(settings.runs) and settings.runs[settings.active_run] != runs.shown(settings.id_data):
-        try:
-            bpy.ops.mphdrr.show_run("INVOKE_DEFAULT", index=settings.active_run)
-        except RuntimeError as error:  # which Blender has shown, too
-            print(f"mphDRR: {error}", file=sys.stderr)
+    windows = bpy.context.window_manager.windows
+    with bpy.context.temp_override(window=windows[0]) if windows else contextlib.nullcontext():
+        scene = bpy.context.scene
+        settings, shown = scene.mphdrr_projections, runs.shown(scene)
+        if settings.active_run < len(settings.runs) and settings.runs[settings.active_run] != shown:
+            try:
+                bpy.ops.mphdrr.show_run("INVOKE_DEFAULT", index=settings.active_run)
+            except RuntimeError as error:  # its file is gone
+                print(f"mphDRR: {error}", file=sys.stderr)
     return None
 
 

@@ -126,12 +126,19 @@ def show_run(scene: bpy.types.Scene, run: ProjectionRun, path: Path, volume: bpy
 
 
 def taken_over(scene: bpy.types.Scene, run: ProjectionRun, volume: bpy.types.Object) -> dict[str, Any]:
-    """Set the panel as a run that was made outside the scene says; returns the scene's state that it belongs to."""
-    recipe = Recipe()
-    with contextlib.suppress(InputError):  # a recipe that there is not, or that the panel cannot show
+    """Set the panel as a run that was made outside the scene says; returns the scene's state that it belongs to.
+
+    That is empty where the run does not say how it was made.
+    """
+    try:
         recipe = run.recipe
+    except InputError:
+        return {}
+    with contextlib.suppress(InputError):  # what the panel cannot show is said to have changed
         set_panel(scene.mphdrr_projections, recipe)
-    return runs.state_of(scanner.active_scanner(scene), run.system, recipe, volume, None)
+    state = runs.state_of(scanner.active_scanner(scene), run.system, recipe, volume, None)
+    attenuates = [value for key, value in recipe.given.items() if key.startswith("attenuation.") and value]
+    return state | {"mu": {"name": f"of {run.settings['volume']}"}} if attenuates else state
 
 
 def storing(
@@ -207,6 +214,7 @@ def remove_run(scene: bpy.types.Scene, index: int) -> str:
         planes.remove(scene)
         runs.mark_shown(scene, -1)
     else:
+        settings.run_file = settings.run_summary = ""  # until the other one is shown
         settings.active_run = min(index, len(settings.runs) - 1)
     return text
 

@@ -194,6 +194,11 @@ def difference_text() -> str:
     return str(image.get(_TEXT, "")) if image is not None else ""
 
 
+def is_ours(image: bpy.types.Image | None) -> bool:
+    """Whether an image is of a run."""
+    return image is not None and _KEY in image
+
+
 def clear() -> None:
     """Remove all images of runs."""
     bpy.data.batch_remove([image for image in bpy.data.images if _KEY in image])

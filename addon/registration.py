@@ -25,6 +25,7 @@ from . import (
     properties,
     recovery,
     rendering,
+    run_notes,
     runs,
     scanner,
     selection,
@@ -179,6 +180,7 @@ def register(command: Callable[..., int] | None = None) -> None:
         if not bpy.app.background:
             _registered.callback(tiles.draw_no_frames, tiles.draw_frames())
             _registered.callback(color_bar.draw_no_bars, color_bar.draw_bars())
+            _registered.callback(run_notes.draw_no_notes, run_notes.draw_notes())
             for name in ("Image", "Image Editor Tool: Sample"):  # the editor's usual tool takes clicks first
                 keymap = bpy.context.window_manager.keyconfigs.addon.keymaps.new(name, space_type="IMAGE_EDITOR")
                 click = keymap.keymap_items.new(ids.PICK_MODULE, "LEFTMOUSE", "PRESS")

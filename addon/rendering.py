@@ -149,12 +149,19 @@ def show_run(scene: bpy.types.Scene, run: ProjectionRun, path: Path, volume: bpy
 
 
 def taken_over(scene: bpy.types.Scene, run: ProjectionRun, volume: bpy.types.Object) -> dict[str, Any]:
-    """Set the panel as a run that was made outside the scene says; returns the scene's state that it belongs to."""
-    recipe = Recipe()
-    with contextlib.suppress(InputError):  # a recipe that there is not, or that the panel cannot show
+    """Set the panel as a run that was made outside the scene says; returns the scene's state that it belongs to.
+
+    That is empty where the run does not say how it was made.
+    """
+    try:
         recipe = run.recipe
+    except InputError:
+        return {}
+    with contextlib.suppress(InputError):  # what the panel cannot show is said to have changed
         set_panel(scene.mphdrr_projections, recipe)
-    return runs.state_of(run.system, recipe, volume, None)
+    state = runs.state_of(run.system, recipe, volume, None)
+    attenuates = [value for key, value in recipe.given.items() if key.startswith("attenuation.") and value]
+    return state | {"mu": {"name": f"of {run.settings['volume']}"}} if attenuates else state
 
 
 def storing(
@@ -228,14 +235,17 @@ def active_run_changed(scene: bpy.types.Scene) -> None:
 
 def _show_chosen() -> float | None:
     """Press the button that shows the chosen run; later, if a job is running."""
-    settings = bpy.context.scene.mphdrr_projections
     if jobs.is_running():
         return 10 * _REST
-    if settings.active_run < len(settings.runs) and settings.runs[settings.active_run] != runs.shown(settings.id_data):
-        try:
-            bpy.ops.mphdrr.show_run("INVOKE_DEFAULT", index=settings.active_run)
-        except RuntimeError as error:  # which Blender has shown, too
-            print(f"mphDRR: {error}", file=sys.stderr)
+    windows = bpy.context.window_manager.windows
+    with bpy.context.temp_override(window=windows[0]) if windows else contextlib.nullcontext():
+        scene = bpy.context.scene
+        settings, shown = scene.mphdrr_projections, runs.shown(scene)
+        if settings.active_run < len(settings.runs) and settings.runs[settings.active_run] != shown:
+            try:
+                bpy.ops.mphdrr.show_run("INVOKE_DEFAULT", index=settings.active_run)
+            except RuntimeError as error:  # its file is gone
+                print(f"mphDRR: {error}", file=sys.stderr)
     return None
 
 
@@ -254,6 +264,7 @@ def remove_run(scene: bpy.types.Scene, index: int) -> str:
         planes.remove(scene)
         runs.mark_shown(scene, -1)
     else:
+        settings.run_file = settings.run_summary = ""  # until the other one is shown
         settings.active_run = min(index, len(settings.runs) - 1)
     return text
 

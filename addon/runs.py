@@ -25,7 +25,7 @@ from .module_values import FROM_ROI, module_numbers
 from .projection_properties import OPENING_ANGLE, settings_recipe
 from .scanner_parts import modules_text
 
-UNKNOWN = "made by an earlier version, which did not keep the scene's state"
+UNKNOWN = "made without this scene, or by an earlier version: its state is not known"
 _MOST = 3  # lines of differences
 _REST = 0.3  # s after a change until the runs are compared with the scene
 _DEFAULTS = {
@@ -59,16 +59,17 @@ def add(
     state: Mapping[str, Any],
     collection: bpy.types.Collection | None,
 ) -> None:
-    """Put a run of the scanner `collection` at the end of the scene's list, in place of runs that are not kept.
+    """Put a run of the scanner `collection` at the end of the scene's list, as the one that is shown.
 
-    It is kept in the file `path`; `state` is of the scene that it was made in.
+    It is kept in the file `path`; `state` is that of the scene (`state_of`), empty where it is not known. Runs that are not
+    kept go, but for the last one.
     """
     settings = scene.mphdrr_projections
     for index in reversed([i for i, item in enumerate(settings.runs) if not item.is_kept][:-1]):
         if not settings.runs[index].is_saved:
             remove_file(settings.runs[index])
         settings.runs.remove(index)
-    name = f"{state['volume']['name']}, {run.settings.get('model', 'run')}"
+    name = ", ".join(run.settings[key] for key in ("volume", "model") if run.settings.get(key)) or "Run"
     known, number = {item.name for item in settings.runs}, 2
     unique = name
     while unique in known:
@@ -76,7 +77,7 @@ def add(
     item = settings.runs.add()
     item.name = item.usual_name = unique
     item.file, item.summary = storage.stored_path(path.absolute()), summary_of(run)
-    item.state, item.scanner = json.dumps(state), collection
+    item.state, item.scanner = json.dumps(state) if state else "", collection
     mark_shown(scene, len(settings.runs) - 1)
 
 
@@ -297,7 +298,7 @@ def _of_volume(
             yield f"{what}none, now {item.name}"
         return
     now = _volume_state(item)
-    same_voxels = now["content"] == old["content"]
+    same_voxels = now["content"] == old.get("content")  # which a run from outside may lack
     if now["name"] != old["name"] and not same_voxels:
         yield f"{what or 'volume '}{old['name']}, now {now['name']}"
         return

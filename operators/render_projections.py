@@ -8,7 +8,7 @@ import bpy
 from bpy.props import EnumProperty, FloatProperty, StringProperty
 from bpy_extras.io_utils import ImportHelper
 
-from ..addon import choices, ids, images, jobs, rendering, scanner, storage, tiles
+from ..addon import choices, ids, images, jobs, rendering, runs, scanner, storage, tiles
 from ..addon.decimals import typed
 from ..addon.projection_properties import OPENING_ANGLE, ProjectionSettings, settings_recipe, use_preset
 from ..addon.reports import polled, run_reported
@@ -142,6 +142,11 @@ class MPHDRR_OT_export_dataset(jobs.ExportJob, bpy.types.Operator):
 
     filename_ext = ".h5"
     filter_glob: StringProperty(default="*.h5;*.hdf5;*.npz;*.pt", options={"HIDDEN"})
+
+    def draw(self, context: bpy.types.Context) -> None:
+        """Beside the file browser: where the run is not of the scene as it is now."""
+        for line in runs.change_lines(context.scene):
+            self.layout.label(text=line, icon="ERROR")
 
     def check(self, context: bpy.types.Context) -> bool:
         """Give a name without suffix the default one; the other formats' suffixes stay."""

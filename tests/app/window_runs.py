@@ -35,11 +35,15 @@ def load() -> None:
 
 
 def show_sidebars() -> None:
-    for kind in ("VIEW_3D", "IMAGE_EDITOR"):
-        area = editor(kind)["area"]
-        area.spaces.active.show_region_ui = True
-        next(region for region in area.regions if region.type == "UI").active_panel_category = "mphDRR"
+    editor("IMAGE_EDITOR")["area"].spaces.active.show_region_ui = True
     seen["loaded"] = runs.change_lines(bpy.context.scene)
+
+
+def show_tabs() -> None:
+    """Once the sidebars have been drawn."""
+    for kind in ("VIEW_3D", "IMAGE_EDITOR"):
+        sidebar = next(region for region in editor(kind)["area"].regions if region.type == "UI")
+        sidebar.active_panel_category = "mphDRR"
 
 
 def move() -> None:
@@ -93,7 +97,7 @@ def finish() -> None:
     seen["ok"] = True
 
 
-STEPS = [load, show_sidebars, move, back, again, render, choose, compare, finish]
+STEPS = [load, show_sidebars, show_tabs, move, back, again, render, choose, compare, finish]
 
 
 def step() -> float | None:

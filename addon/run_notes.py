@@ -1,0 +1,41 @@
+"""A line over the pictures in the Image Editor that says where they are not of the scene as it is now."""
+
+import blf
+import bpy
+
+from . import images, runs
+
+_COLOR = (1.0, 0.45, 0.35, 1.0)
+_SIZE, _LEFT, _TOP = (
+    13,
+    70,
+    40,
+)  # of the letters, and from the region's left, beside the tools, and top; pixels at scale 1
+
+
+def _draw() -> None:
+    """Draw the line; Blender calls this for every Image Editor."""
+    context = bpy.context
+    if not images.is_ours(context.space_data.image):
+        return
+    lines = runs.change_lines(context.scene)
+    if not lines or lines == [runs.UNKNOWN]:
+        return
+    scale = context.preferences.system.ui_scale
+    blf.size(0, _SIZE * scale)
+    blf.color(0, *_COLOR)
+    blf.enable(0, blf.SHADOW)
+    blf.shadow(0, 5, 0.0, 0.0, 0.0, 1.0)
+    blf.position(0, _LEFT * scale, context.region.height - _TOP * scale, 0)
+    blf.draw(0, f"Not of the scene as it is now: {', '.join(lines)}")
+    blf.disable(0, blf.SHADOW)
+
+
+def draw_notes() -> object:
+    """Draw notes from now on; the result takes it back (`draw_no_notes`)."""
+    return bpy.types.SpaceImageEditor.draw_handler_add(_draw, (), "WINDOW", "POST_PIXEL")
+
+
+def draw_no_notes(handle: object) -> None:
+    """Undo `draw_notes`."""
+    bpy.types.SpaceImageEditor.draw_handler_remove(handle, "WINDOW")

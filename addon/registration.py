@@ -14,6 +14,7 @@ from .. import operators, panels
 from ..operators import add_phantom
 from . import (
     following,
+    framing,
     ids,
     images,
     jobs,
@@ -24,6 +25,7 @@ from . import (
     rendering,
     scanner,
     selection,
+    sight_lines,
     slices,
     storage,
     tiles,
@@ -85,6 +87,7 @@ MENUS.append((bpy.types.VIEW3D_MT_add, lambda menu, _: menu.layout.menu("MPHDRR_
 HANDLERS: tuple[tuple[list[Any], Any], ...] = (
     (bpy.app.handlers.load_pre, jobs.stop),
     (bpy.app.handlers.load_pre, slices.before_load),
+    (bpy.app.handlers.load_pre, framing.forget),
     (bpy.app.handlers.load_post, volumes.after_load),
     (bpy.app.handlers.load_post, live_scanner.after_load),
     (bpy.app.handlers.depsgraph_update_post, live_scanner.after_update),
@@ -94,6 +97,10 @@ HANDLERS: tuple[tuple[list[Any], Any], ...] = (
     (bpy.app.handlers.frame_change_post, slices.after_frame_change),
     (bpy.app.handlers.undo_post, live_scanner.after_undo),
     (bpy.app.handlers.redo_post, live_scanner.after_undo),
+    (bpy.app.handlers.undo_pre, framing.before_undo),
+    (bpy.app.handlers.redo_pre, framing.before_undo),
+    (bpy.app.handlers.undo_post, framing.after_undo),
+    (bpy.app.handlers.redo_post, framing.after_undo),
     (bpy.app.handlers.save_pre, storage.before_save),
     (bpy.app.handlers.save_pre, images.before_save),
     (bpy.app.handlers.save_post, storage.after_save),
@@ -112,6 +119,7 @@ UPDATES: dict[str, Callable[..., None]] = {
     "phantom": live_phantoms.settings_changed,
     "display_range": slices.range_changed,
     "slices": slices.update,
+    "sight_lines": sight_lines.redraw,
     "display": rendering.display_changed,
     "planes": planes.update,
 }
@@ -139,6 +147,7 @@ def register(command: Callable[..., int] | None = None) -> None:
             _registered.callback(_remove_handler, handlers, function)
         if not bpy.app.background:
             _registered.callback(tiles.draw_no_frames, tiles.draw_frames())
+            _registered.callback(sight_lines.draw_no_lines, sight_lines.draw_lines())
             for name in ("Image", "Image Editor Tool: Sample"):  # the editor's usual tool takes clicks first
                 keymap = bpy.context.window_manager.keyconfigs.addon.keymaps.new(name, space_type="IMAGE_EDITOR")
                 click = keymap.keymap_items.new(ids.PICK_MODULE, "LEFTMOUSE", "PRESS")

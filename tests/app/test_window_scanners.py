@@ -13,7 +13,7 @@ WORKBOOK = Path(__file__).resolve().parents[2] / "examples" / "dc-spect-80.xlsx"
 
 def test_a_crystal_moves_its_module_and_the_panels_follow(blender_window, work_folder):
     result = work_folder / "result.json"
-    blender_window(SCRIPT.read_text(encoding="utf-8"), WORKBOOK, result, seconds=75)
+    blender_window(SCRIPT.read_text(encoding="utf-8"), WORKBOOK, result, seconds=110)
     seen = json.loads(result.read_text())
     assert seen["ok"], seen
     before = seen["before"]
@@ -38,4 +38,13 @@ def test_a_crystal_moves_its_module_and_the_panels_follow(blender_window, work_f
     assert seen["imported"]["panel"] == "B"
     assert (before["panel"], before["listed"], before["active"]) == ("A", 30, "Crystal 30")
     assert (seen["other"]["panel"], seen["other"]["listed"]) == ("B", 60)
+    assert seen["back"]["panel"] == "B"
+    whole, without, again = seen["counts"]
+    assert again == whole
+    gone = {kind: whole[kind] - without[kind] for kind in whole}
+    assert gone == {"objects": 241, "meshes": 161, "cameras": 80, "materials": 0, "collections": 5}
+
+    start, looking, undone, redone = seen["views"]
+    assert undone == start != looking == redone, "the view of before the import comes back"
+    assert seen["middle"] == pytest.approx([0.5, 0.5], abs=0.03), "framed beside the sidebar"
     assert moved("moving") == pytest.approx([0, 0, 0], abs=1e-3), "A stays where it is"

@@ -93,6 +93,24 @@ def look_at_back(name: str, number: int) -> None:
     view.view_location, view.view_distance, view.view_perspective = camera.location, 500, "PERSP"
 
 
+def view() -> list[float]:
+    """How the 3D view looks at the scene."""
+    space = viewport()[1].spaces.active
+    return [space.clip_start, space.clip_end, space.region_3d.view_distance, *space.region_3d.view_location]
+
+
+def on_screen(point: Vector) -> list[float]:
+    """Where in the part of the 3D view that toolbar and sidebar leave free a point is, from 0 to 1."""
+    _, area, region = viewport()
+    x, y = location_3d_to_region_2d(region, area.spaces.active.region_3d, point)
+    tools, sidebar = (next(r for r in area.regions if r.type == kind).width for kind in ("TOOLS", "UI"))
+    return [(x - tools) / (region.width - tools - sidebar), y / region.height]
+
+
+def counts() -> dict[str, int]:
+    return {kind: len(getattr(bpy.data, kind)) for kind in ("objects", "meshes", "cameras", "materials", "collections")}
+
+
 def click_on(item) -> None:
     _, area, region = viewport()
     middle = item.matrix_world @ (sum((Vector(v.co) for v in item.data.vertices), Vector()) / len(item.data.vertices))
@@ -104,8 +122,25 @@ def steps():
     """Yields what to wait for: seconds, or a function that says when it has happened."""
     for name in ("Cube", "Light", "Camera"):
         bpy.data.objects.remove(bpy.data.objects[name])
+    yield 1
+    window, area, region = viewport()
+    with bpy.context.temp_override(window=window, area=area, region=region):
+        bpy.ops.ed.undo_push(message="Start")
+    area.spaces.active.show_region_ui = True
+    yield 1
+    seen["views"] = [view()]
+    bpy.ops.mphdrr.import_geometry("EXEC_DEFAULT", True, filepath=str(workbook), name="A")
+    yield 1
+    seen["views"].append(view())
+    keys("ctrl+z")
+    yield lambda: "A" not in bpy.data.collections
+    seen["views"].append(view())
+    keys("ctrl+shift+z")
+    yield lambda: "A" in bpy.data.collections
+    seen["views"].append(view())
+    seen["middle"] = on_screen(Vector())
     for name, first in (("A", 30), ("B", 60)):
-        bpy.ops.mphdrr.import_geometry("EXEC_DEFAULT", True, filepath=str(workbook), name=name)
+        bpy.ops.mphdrr.import_geometry("EXEC_DEFAULT", True, filepath=str(workbook), name=name, replace=True)
         bpy.ops.mphdrr.show_modules(first=first, last=first, mode="ONLY")
     yield 2
     seen["imported"] = state()
@@ -177,10 +212,22 @@ def steps():
         bpy.ops.ed.undo_push(message="Select")
     yield 1
     seen["other"] = state()
+    seen["counts"] = [counts()]
+    bpy.ops.mphdrr.remove_scanner("EXEC_DEFAULT", True)
+    yield 1
+    seen["counts"].append(counts())
+    keys("ctrl+z")
+    yield lambda: "B" in bpy.data.collections
+    seen["counts"].append(counts())
+    yield 1
+    seen["back"] = state()
+    geometry = bpy.context.scene.mphdrr_geometry
+    geometry.show_rays = geometry.show_frustums = geometry.show_detectors = True
     look_at_back("B", 60)
     start = module("B", 60).location.copy()
     keys("g", "x", "4", "0")  # still moving when the picture is taken
     yield lambda: (module("B", 60).location - start - Vector((40, 0, 0))).length < 1e-3
+    viewport()[1].spaces.active.region_3d.view_distance = 1500
     seen["moving"] = state()
     seen["ok"] = True
 

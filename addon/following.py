@@ -155,11 +155,11 @@ def _refresh_modules(
 _construction = lru_cache(maxsize=1)(lambda numbers: Construction(*numbers))
 
 
-def is_free(camera: bpy.types.Object) -> bool:
+def is_free(item: bpy.types.Object) -> bool:
     """Whether only the user moves an object: no animation, driver or constraint does."""
-    data = camera.animation_data
+    data = item.animation_data
     animated = data is not None and (data.action is not None or len(data.drivers) or len(data.nla_tracks))
-    return not animated and not len(camera.constraints)
+    return not animated and not len(item.constraints)
 
 
 def _construction_numbers(scanner: bpy.types.PropertyGroup) -> _ConstructionNumbers:

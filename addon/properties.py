@@ -167,6 +167,9 @@ class ScannerProperties(bpy.types.PropertyGroup):
     sensitivity: FloatProperty(name="Sensitivity", description="Of all modules together, at the isocentre, cps/MBq")
     resolution: FloatProperty(name="Resolution", description="Mean FWHM in mm of the modules at the isocentre")
     n_covering: IntProperty(name="Covering", description="Number of modules that see their whole ROI sphere")
+    parts_free: BoolProperty(
+        name="Parts Free", description="Parts may be grabbed; version 0.1.0 locked them", options={"HIDDEN"}
+    )
     untidy: StringProperty(name="Untidy", description="Copied cameras and parts without a camera, in words")
     findings: StringProperty(name="Findings", description="What the last check of the geometry found, JSON")
 

@@ -69,7 +69,7 @@ def build_scanner(
     properties.scanner_name = name
     for setting, value in asdict(construction).items():
         setattr(properties, setting, value.upper() if isinstance(value, str) else value)
-    properties.is_scanner = True
+    properties.is_scanner = properties.parts_free = True
     _write_source(properties, system)
     following.refresh(collection)
 

@@ -147,7 +147,7 @@ def steps():
     look_at_back("A", 30)
     yield 3
     click_on(part("A", 30, "CRYSTAL"))
-    yield 2
+    yield lambda: state()["panel"] == "A" and state()["listed"] == 30
     seen["clicked"] = seen["before"] = state()
 
     keys("g", "x", "3", "0", "Return")
@@ -210,16 +210,15 @@ def steps():
         item.select_set(True)
         bpy.context.view_layer.objects.active = item
         bpy.ops.ed.undo_push(message="Select")
-    yield 1
+    yield lambda: state()["panel"] == "B" and state()["listed"] == 60
     seen["other"] = state()
     seen["counts"] = [counts()]
     bpy.ops.mphdrr.remove_scanner("EXEC_DEFAULT", True)
     yield 1
     seen["counts"].append(counts())
     keys("ctrl+z")
-    yield lambda: "B" in bpy.data.collections
+    yield lambda: "B" in bpy.data.collections and state()["panel"] == "B"
     seen["counts"].append(counts())
-    yield 1
     seen["back"] = state()
     geometry = bpy.context.scene.mphdrr_geometry
     geometry.show_rays = geometry.show_frustums = geometry.show_detectors = True

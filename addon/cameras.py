@@ -15,6 +15,7 @@ from ..core.geometry.frames import module_poses
 from ..core.geometry.system import PinholeSystem
 
 _CAMERA_FROM_MODULE = np.diag([-1.0, 1.0, -1.0, 1.0])
+_ROUNDING = 1e-5  # of a field of view
 _SMALLEST = 1.0  # Blender silently clamps Camera.lens and Camera.sensor_width below this
 
 
@@ -43,6 +44,12 @@ def set_field_of_view(camera: bpy.types.Camera, width: float, distance: float) -
     camera.lens_unit = "MILLIMETERS"
     camera.lens = distance * scale
     camera.shift_x = camera.shift_y = 0.0
+
+
+def has_field_of_view(camera: bpy.types.Camera, width: float, distance: float) -> bool:
+    """Whether the picture is as `set_field_of_view` makes it."""
+    straight = camera.type == "PERSP" and camera.sensor_fit == "HORIZONTAL" and camera.shift_x == camera.shift_y == 0.0
+    return straight and abs(camera.sensor_width / camera.lens * distance / width - 1.0) < _ROUNDING
 
 
 def set_up_camera(camera: bpy.types.Camera, system: PinholeSystem, m: int) -> None:

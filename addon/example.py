@@ -51,8 +51,8 @@ def example_job(context: bpy.types.Context) -> jobs.Job:
         runs.add(scene, run, path, rendering.taken_over(scene, run, bpy.context.object), collection)
         _hide_startup(scene)
         studio.light(scene)
-        _look(bpy.context)
         images.show_below(mosaic, bpy.context)
+        scanner.set_up_scene(scene, collection, _VIEW.to_quaternion())
         return f"Loaded the example: {len(system)} modules and what they see of a Derenzo phantom"
 
     return jobs.Job("Loading the example", work, finish, lambda: path.unlink(missing_ok=True))
@@ -66,13 +66,3 @@ def _hide_startup(scene: bpy.types.Scene) -> None:
             item.hide_viewport = item.hide_render = True
             if scene.camera == item:
                 scene.camera = scanner.modules(scanner.required_scanner(scene))[0]
-
-
-def _look(context: bpy.types.Context) -> None:
-    """Turn the largest 3D view to the scanner."""
-    areas = [a for window in context.window_manager.windows for a in window.screen.areas if a.type == "VIEW_3D"]
-    if areas:
-        view = max(areas, key=lambda a: a.width * a.height).spaces.active.region_3d
-        if view is not None:
-            view.view_perspective, view.view_rotation = "PERSP", _VIEW.to_quaternion()
-            view.view_location, view.view_distance = (60.0, 30.0, 0.0), 0.85 * view.view_distance  # beside the sidebar

@@ -155,11 +155,11 @@ def _refresh_modules(
 _construction = lru_cache(maxsize=1)(lambda numbers: Construction(*numbers))
 
 
-def is_free(camera: bpy.types.Object) -> bool:
+def is_free(item: bpy.types.Object) -> bool:
     """Whether only the user moves an object: no animation, driver or constraint does."""
-    data = camera.animation_data
+    data = item.animation_data
     animated = data is not None and (data.action is not None or len(data.drivers) or len(data.nla_tracks))
-    return not animated and not len(camera.constraints)
+    return not animated and not len(item.constraints)
 
 
 def _construction_numbers(scanner: bpy.types.PropertyGroup) -> _ConstructionNumbers:
@@ -178,8 +178,7 @@ def _rebuild(
         "CRYSTAL": (l, side, numbers.detector_thickness),
     }
     if _differs(camera.data, (l, side)):
-        cameras.set_field_of_view(camera.data, side, l)
-        camera.data[_KEY] = repr((l, side))
+        _set_view(camera.data, l, side)
     for item in parts:
         part = item.mphdrr_module.part
         if item.data.is_editmode or not _differs(item.data, given[part]):
@@ -191,6 +190,26 @@ def _rebuild(
         collimators.reshape_mesh(item.data, solid)
         item.data[_KEY] = repr(given[part])
     return ""
+
+
+def _set_view(camera: bpy.types.Camera, l: float, side: float) -> None:
+    cameras.set_field_of_view(camera, side, l)
+    camera[_KEY] = repr((l, side))
+
+
+def shows_its_field(camera: bpy.types.Object) -> bool:
+    """Whether a module's camera sees what its projection shows: its lens and sensor are not edited."""
+    module = camera.mphdrr_module
+    sizes = module.detector_side, module.collimator_length
+    return bool(module.problem) or cameras.has_field_of_view(camera.data, *sizes)
+
+
+def reset_views(collection: bpy.types.Collection) -> list[int]:
+    """Make the modules' cameras see what their projections show; returns the numbers of those that did not."""
+    edited = [camera for camera in modules(collection) if not shows_its_field(camera)]
+    for camera in edited:
+        _set_view(camera.data, camera.mphdrr_module.collimator_length, camera.mphdrr_module.detector_side)
+    return [camera.mphdrr_module.number for camera in edited]
 
 
 def _differs(data: bpy.types.ID, numbers: tuple[float | str, ...]) -> bool:

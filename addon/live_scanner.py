@@ -89,8 +89,10 @@ def after_load(*_: Any) -> None:
     """A file was opened; one of an older version has shared meshes and no readouts. Nothing is tidied unasked."""
     for collection in _local(bpy.data.collections):
         module_edits.make_single_users(collection)
-        for item in filter(grabbing.is_part, collection.all_objects):
-            item.lock_location = item.lock_rotation = (False, False, False)  # as version 0.1.0 locked them
+        if not collection.mphdrr_scanner.parts_free:
+            for item in filter(grabbing.is_part, collection.all_objects):
+                item.lock_location = item.lock_rotation = (False, False, False)
+            collection.mphdrr_scanner.parts_free = True
     after_undo()
 
 
@@ -131,10 +133,11 @@ def _settle() -> float | None:
     """Finish and tidy once no tool is running, e.g. the move that follows Shift+D. Tidying is an undo step."""
     global _unstored
     windows = bpy.context.window_manager.windows
+    if not grabbing.is_dragging():
+        for item in filter(grabbing.is_dragged, bpy.context.scene.objects):
+            grabbing.finish(item)
     if any(len(window.modal_operators) for window in windows) or _is_busy():
         return _INTERVAL
-    for item in filter(grabbing.is_dragged, bpy.context.scene.objects):
-        grabbing.finish(item)
     if _unstored:
         _unstored = False
         with bpy.context.temp_override(window=windows[0]):

@@ -12,10 +12,10 @@ from numpy.typing import NDArray
 from ..core.errors import InputError
 from ..core.geometry.ring_fits import ring_order
 from ..core.recording import recorded_warnings
-from . import cameras, collimators, following, ids, scanner
+from . import cameras, collimators, following, ids, planes, scanner
 from .following import PARTS
 from .module_values import add_module, module_numbers
-from .scanner_parts import new_part
+from .scanner_parts import clear, new_part, parts_and_others
 
 _OURS = re.compile(r"(Module|Collimator|Crystal) \d+(\.\d+)?")  # a name that the extension gave
 
@@ -181,7 +181,7 @@ def _wrapped(angles: NDArray[np.float64]) -> NDArray[np.float64]:
 def remove(collection: bpy.types.Collection, modules: Sequence[bpy.types.Object]) -> None:
     """Remove modules with their collimators and crystals; other objects parented to them stay where they are."""
     if len(modules) >= len(scanner.modules(collection)):
-        raise InputError("a scanner needs at least one module: keep one, or delete the scanner's collection")
+        raise InputError("a scanner needs at least one module: keep one, or press Remove Scanner")
     children = [child for camera in modules for child in camera.children]
     parts = [child for child in children if child.mphdrr_module.part in PARTS]
     for child in children:
@@ -189,6 +189,17 @@ def remove(collection: bpy.types.Collection, modules: Sequence[bpy.types.Object]
             cameras.unparent(child)
     cameras.remove_objects([*parts, *modules])
     following.refresh(collection)
+
+
+def remove_scanner(scene: bpy.types.Scene, collection: bpy.types.Collection) -> None:
+    """Remove a scanner, with its projections in the scene; the user's objects in it move to the scene's collection."""
+    planes.remove(scene, collection)
+    _, others = parts_and_others(collection)
+    cameras.remove_objects([item for item in others if item.mphdrr_module.part != "NONE"])  # copies
+    clear(scene, collection, {})
+    bpy.data.collections.remove(collection)
+    materials = [bpy.data.materials.get(name) for name, _ in collimators.LOOKS.values()]
+    bpy.data.batch_remove([material for material in materials if material is not None and material.users == 0])
 
 
 def renumber(collection: bpy.types.Collection, order: Literal["RINGS", "LIST"] = "RINGS") -> int:

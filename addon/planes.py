@@ -56,9 +56,11 @@ def planes(scene: bpy.types.Scene) -> list[bpy.types.Object]:
     return [o for c in scene.collection.children if c.name.startswith(ids.PLANES) for o in c.objects if _KEY in o]
 
 
-def remove(scene: bpy.types.Scene) -> None:
-    """Remove the planes and the cameras' backgrounds."""
+def remove(scene: bpy.types.Scene, collection: bpy.types.Collection | None = None) -> None:
+    """Remove the planes and the cameras' backgrounds, of one scanner or of all."""
     for plane in planes(scene):
+        if collection is not None and plane.parent not in scanner.modules(collection):
+            continue
         if plane.parent is not None:
             _remove_background(plane.parent.data, plane.data)
         bpy.data.objects.remove(plane)

@@ -167,6 +167,9 @@ class ScannerProperties(bpy.types.PropertyGroup):
     sensitivity: FloatProperty(name="Sensitivity", description="Of all modules together, at the isocentre, cps/MBq")
     resolution: FloatProperty(name="Resolution", description="Mean FWHM in mm of the modules at the isocentre")
     n_covering: IntProperty(name="Covering", description="Number of modules that see their whole ROI sphere")
+    parts_free: BoolProperty(
+        name="Parts Free", description="Parts may be grabbed; version 0.1.0 locked them", options={"HIDDEN"}
+    )
     untidy: StringProperty(name="Untidy", description="Copied cameras and parts without a camera, in words")
     findings: StringProperty(name="Findings", description="What the last check of the geometry found, JSON")
 
@@ -192,6 +195,23 @@ class GeometryProperties(bpy.types.PropertyGroup):
     )
     first: IntProperty(name="First", description="First module number of the range", default=1)
     last: IntProperty(name="Last", description="Last module number of the range", default=40)
+    # What `sight_lines.py` draws in the 3D views.
+    show_rays: BoolProperty(
+        name="Ray", description="Draw the principal ray, through the isocentre to the virtual detector",
+        update=on_edit("sight_lines"),
+    )  # fmt: skip
+    show_frustums: BoolProperty(
+        name="Frustum", description="Draw the field of view, from the pinhole to the virtual detector's corners",
+        update=on_edit("sight_lines"),
+    )  # fmt: skip
+    show_detectors: BoolProperty(
+        name="Detector", description="Draw the virtual detector where it truly is, at the magnification times l",
+        update=on_edit("sight_lines"),
+    )  # fmt: skip
+    sight_all: BoolProperty(
+        name="All Modules", description="Draw it for all visible modules, not for the active one only",
+        update=on_edit("sight_lines"),
+    )  # fmt: skip
 
 
 # Every property group; a group comes after those that it points to.

@@ -15,6 +15,7 @@ from ..operators import add_phantom
 from . import (
     color_bar,
     following,
+    framing,
     ids,
     jobs,
     live_phantoms,
@@ -29,6 +30,7 @@ from . import (
     runs,
     scanner,
     selection,
+    sight_lines,
     slices,
     storage,
     tiles,
@@ -114,6 +116,7 @@ HANDLERS: tuple[tuple[list[Any], Any], ...] = (
     (bpy.app.handlers.load_pre, jobs.stop),
     (bpy.app.handlers.load_pre, slices.before_load),
     (bpy.app.handlers.load_pre, preview.stop),
+    (bpy.app.handlers.load_pre, framing.forget),
     (bpy.app.handlers.load_post, volumes.after_load),
     (bpy.app.handlers.load_post, recovery.after_load),
     (bpy.app.handlers.load_post, live_scanner.after_load),
@@ -131,6 +134,10 @@ HANDLERS: tuple[tuple[list[Any], Any], ...] = (
     (bpy.app.handlers.frame_change_post, slices.after_frame_change),
     (bpy.app.handlers.undo_post, live_scanner.after_undo),
     (bpy.app.handlers.redo_post, live_scanner.after_undo),
+    (bpy.app.handlers.undo_pre, framing.before_undo),
+    (bpy.app.handlers.redo_pre, framing.before_undo),
+    (bpy.app.handlers.undo_post, framing.after_undo),
+    (bpy.app.handlers.redo_post, framing.after_undo),
     (bpy.app.handlers.save_pre, storage.before_save),
     (bpy.app.handlers.save_pre, slices.before_save),
     (bpy.app.handlers.save_post, storage.after_save),
@@ -150,6 +157,7 @@ UPDATES: dict[str, Callable[..., None]] = {
     "display_range": slices.update,
     "slices": slices.update,
     "look": slices.look_changed,
+    "sight_lines": sight_lines.redraw,
     "display": rendering.display_changed,
     "planes": planes.update,
     "active_run": rendering.active_run_changed,
@@ -181,6 +189,7 @@ def register(command: Callable[..., int] | None = None) -> None:
             _registered.callback(tiles.draw_no_frames, tiles.draw_frames())
             _registered.callback(color_bar.draw_no_bars, color_bar.draw_bars())
             _registered.callback(run_notes.draw_no_notes, run_notes.draw_notes())
+            _registered.callback(sight_lines.draw_no_lines, sight_lines.draw_lines())
             for name in ("Image", "Image Editor Tool: Sample"):  # the editor's usual tool takes clicks first
                 keymap = bpy.context.window_manager.keyconfigs.addon.keymaps.new(name, space_type="IMAGE_EDITOR")
                 click = keymap.keymap_items.new(ids.PICK_MODULE, "LEFTMOUSE", "PRESS")

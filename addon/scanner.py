@@ -12,6 +12,7 @@ from pathlib import Path
 
 import bpy
 import numpy as np
+from mathutils import Quaternion
 
 from ..core.errors import InputError, InputWarning
 from ..core.geometry import checks
@@ -19,12 +20,14 @@ from ..core.geometry.collimator import Construction
 from ..core.geometry.module_parts import module_parts
 from ..core.geometry.system import PinholeSystem
 from ..core.workbook import ColumnMap, QuantityCells, SystemSource
-from . import cameras, following, ids
+from . import cameras, following, framing, ids
 from .following import modules
 from .module_values import is_edited, is_moved, module_numbers, off_aim, remember, system_of
 from .scanner_parts import NewScanner, clear, losses, modules_text
 
 _DEFAULT = Construction()
+_UNIT = 0.001  # m: a millimetre
+_SMALLEST_REACH = 1.0  # mm, of a scanner without modules
 
 
 def build_scanner(
@@ -66,11 +69,16 @@ def build_scanner(
     properties.scanner_name = name
     for setting, value in asdict(construction).items():
         setattr(properties, setting, value.upper() if isinstance(value, str) else value)
-    properties.is_scanner = True
+    properties.is_scanner = properties.parts_free = True
     _write_source(properties, system)
     following.refresh(collection)
 
-    _prepare_scene(scene, system, shape, is_new=old is None)
+    n_v, n_u = shape
+    render = scene.render
+    render.resolution_x, render.resolution_y, render.resolution_percentage = n_u, n_v, 100
+    render.pixel_aspect_x, render.pixel_aspect_y = max(1.0, n_v / n_u), max(1.0, n_u / n_v)
+    if old is None or not is_set_up(scene):
+        set_up_scene(scene, collection)
     first = next(iter(new.cameras.values()))
     if scene.camera is None:
         scene.camera = first
@@ -128,22 +136,18 @@ def quick_ranges(system: PinholeSystem) -> list[tuple[int, int]]:
     return ranges
 
 
-def _prepare_scene(scene: bpy.types.Scene, system: PinholeSystem, shape: tuple[int, int], is_new: bool) -> None:
-    """Set units, render resolution and clipping for the scanner; look at the whole of one that is new."""
+def set_up_scene(scene: bpy.types.Scene, collection: bpy.types.Collection, rotation: Quaternion | None = None) -> None:
+    """Set the scene's units for a scanner, and look at the whole of it, if given from the view's `rotation`."""
     units = scene.unit_settings
-    units.system, units.scale_length, units.length_unit = "METRIC", 0.001, "MILLIMETERS"
-    n_v, n_u = shape
-    render = scene.render
-    render.resolution_x, render.resolution_y, render.resolution_percentage = n_u, n_v, 100
-    render.pixel_aspect_x, render.pixel_aspect_y = max(1.0, n_v / n_u), max(1.0, n_u / n_v)
-    reach = float((system.pinhole_distance + system.collimator_length).max())
-    for space in (space for screen in bpy.data.screens for area in screen.areas for space in area.spaces):
-        if space.type == "VIEW_3D":
-            space.clip_start = max(space.clip_start, 1.0)
-            space.clip_end = max(space.clip_end, 20.0 * reach)
-            # The scanner's size is far from that of Blender's default scene.
-            if is_new and space.region_3d is not None and space.region_3d.view_perspective != "CAMERA":
-                space.region_3d.view_location, space.region_3d.view_distance = (0.0, 0.0, 0.0), 2.6 * reach
+    units.system, units.scale_length, units.length_unit = "METRIC", _UNIT, "MILLIMETERS"
+    reaches = [o.mphdrr_module.pinhole_distance + o.mphdrr_module.collimator_length for o in modules(collection)]
+    framing.look(collection, max(reaches, default=_SMALLEST_REACH), rotation)
+
+
+def is_set_up(scene: bpy.types.Scene) -> bool:
+    """Whether the scene's units are millimetres."""
+    units = scene.unit_settings
+    return units.system == "METRIC" and abs(units.scale_length - _UNIT) < 1e-6 * _UNIT
 
 
 def scanners(scene: bpy.types.Scene) -> list[bpy.types.Collection]:

@@ -70,7 +70,8 @@ def after_update(scene: bpy.types.Scene, depsgraph: bpy.types.Depsgraph) -> None
         return
     if collection != scanner.active_scanner(scene) or (camera is not None and camera != listed_module(scene)):
         with following.writing():
-            scene.mphdrr_geometry.scanner = collection
+            if scene.mphdrr_geometry.scanner != collection:  # writing it makes Blender look at all objects
+                scene.mphdrr_geometry.scanner = collection
             _list(scene, camera or next(iter(scanner.modules(collection)), None))
         images.redraw_mosaic()
 

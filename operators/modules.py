@@ -5,7 +5,7 @@ import math
 import bpy
 from bpy.props import BoolProperty, EnumProperty, FloatProperty, IntProperty
 
-from ..addon import ids, jobs, maps, module_edits, scanner, selection
+from ..addon import following, ids, jobs, maps, module_edits, scanner, selection
 from ..addon.decimals import typed
 from ..addon.scanner_parts import modules_text
 
@@ -130,6 +130,48 @@ class MPHDRR_OT_renumber_modules(selection.OnScanner, bpy.types.Operator):
     def change(self, context: bpy.types.Context, collection: bpy.types.Collection) -> str:
         changed = module_edits.renumber(collection, self.order)
         return f"Numbered {len(scanner.modules(collection))} modules: {changed} have another number than before"
+
+
+class MPHDRR_OT_reset_cameras(selection.OnScanner, bpy.types.Operator):
+    """Set lens and sensor of the modules' cameras to what the projections show"""
+
+    bl_idname = ids.RESET_CAMERAS
+    bl_label = "Reset Cameras"
+
+    def change(self, context: bpy.types.Context, collection: bpy.types.Collection) -> str:
+        reset = following.reset_views(collection)
+        return f"Reset the cameras of {modules_text(reset)}" if reset else "All cameras see what their projections show"
+
+
+class MPHDRR_OT_set_up_scene(selection.OnScanner, bpy.types.Operator):
+    """Set the scene's units to millimetres, and look at the whole scanner: for a scanner from another file"""
+
+    bl_idname = ids.SET_UP_SCENE
+    bl_label = "Set Up Scene"
+
+    def change(self, context: bpy.types.Context, collection: bpy.types.Collection) -> str:
+        scanner.set_up_scene(context.scene, collection)
+        return f"The scene's units are millimetres; looking at '{collection.name}'"
+
+
+class MPHDRR_OT_remove_scanner(selection.OnScanner, bpy.types.Operator):
+    """Remove the scanner with its cameras, collimators, crystals and projections in the scene; your own objects stay"""
+
+    bl_idname = ids.REMOVE_SCANNER
+    bl_label = "Remove Scanner"
+
+    def invoke(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str]:
+        collection = scanner.required_scanner(context.scene)
+        n = len(scanner.modules(collection))
+        return context.window_manager.invoke_confirm(
+            self, event, title=f"Remove '{collection.name}'?", message=f"With its {n} modules; your own objects stay",
+            confirm_text="Remove", icon="WARNING",
+        )  # fmt: skip
+
+    def change(self, context: bpy.types.Context, collection: bpy.types.Collection) -> str:
+        name = collection.name
+        module_edits.remove_scanner(context.scene, collection)
+        return f"Removed '{name}'"
 
 
 class MPHDRR_OT_check_geometry(selection.OnScanner, bpy.types.Operator):

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 import bpy
 from bpy.app.translations import pgettext_iface as iface
 
-from ..addon import ids, jobs, selection
+from ..addon import following, ids, jobs, scanner, selection
 from ..addon.properties import LABELS
 from .geometry import ScannerPanel, draw_facts, draw_text
 
@@ -25,6 +25,13 @@ class MPHDRR_PT_design(ScannerPanel, bpy.types.Panel):
             box = layout.box().column(align=True)
             box.label(text=properties.untidy.capitalize(), icon="ERROR")
             box.operator(ids.TIDY_MODULES, icon="BRUSH_DATA")
+        edited = sum(not following.shows_its_field(camera) for camera in scanner.modules(collection))
+        if edited:
+            box = layout.box().column(align=True)
+            draw_text(
+                box, f"Lens or sensor edited of {edited} camera{'s' * (edited > 1)}: not what the projections show"
+            )
+            box.operator(ids.RESET_CAMERAS, icon="CAMERA_DATA")
         camera = selection.active_module(context)
         if camera is None:
             layout.label(text="Select a module's camera", icon="INFO")
@@ -79,6 +86,8 @@ class MPHDRR_PT_scanner_design(ScannerPanel, bpy.types.Panel):
         column.operator_context = "INVOKE_DEFAULT"
         column.operator(ids.EXPORT_GEOMETRY, text="Export Workbook", icon="EXPORT")
         column.operator(ids.EXPORT_FOR_PROGRAM, text="Export for a Program", icon="EXPORT")
+        column.separator()
+        column.operator(ids.REMOVE_SCANNER, icon="TRASH")
 
 
 def _draw_module(layout: bpy.types.UILayout, camera: bpy.types.Object) -> None:

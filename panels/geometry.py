@@ -7,7 +7,7 @@ import bpy
 import numpy as np
 from bpy.app.translations import pgettext_iface as iface
 
-from ..addon import ids, jobs, scanner, selection
+from ..addon import following, ids, jobs, scanner, selection
 
 _LINE = 32  # letters that fit into the sidebar at its usual width
 
@@ -31,7 +31,9 @@ class MPHDRR_UL_modules(bpy.types.UIList):
         row = layout.row(align=True)
         row.active = module.visible
         columns = row.row(align=True)
-        columns.alert = bool(module.problem or module.finding or not module.aimed)
+        columns.alert = bool(module.problem or module.finding or not module.aimed) or not following.shows_its_field(
+            item
+        )
         _columns(columns, item.name, f"{module.pinhole_distance:.1f}", f"{module.collimator_length:.1f}")
         if columns.alert:
             columns.label(text="", icon="ERROR")
@@ -73,6 +75,10 @@ class MPHDRR_PT_geometry(Sidebar, bpy.types.Panel):
             return
         if len(scanner.scanners(context.scene)) > 1:
             layout.prop(context.scene.mphdrr_geometry, "scanner", text="")
+        if not scanner.is_set_up(context.scene):
+            box = layout.box().column(align=True)
+            draw_text(box, "The scene's units are not millimetres")
+            box.operator(ids.SET_UP_SCENE, icon="SCENE_DATA")
         properties = collection.mphdrr_scanner
         n_rings = sum(c.mphdrr_scanner.is_ring for c in collection.children)
         draw_facts(
@@ -136,6 +142,12 @@ class MPHDRR_PT_modules(ScannerPanel, bpy.types.Panel):
             text = iface("Look Through {module}").format(module=camera.name)
             look = layout.operator(ids.LOOK_THROUGH_MODULE, text=text, icon="OUTLINER_OB_CAMERA")
             look.number = camera.mphdrr_module.number
+        row = layout.row(align=True)
+        for name in ("show_rays", "show_frustums", "show_detectors"):
+            row.prop(state, name, toggle=True)
+        row = layout.row()
+        row.active = state.show_rays or state.show_frustums or state.show_detectors
+        row.prop(state, "sight_all")
 
 
 def draw_facts(split: bpy.types.UILayout, *facts: tuple[str, str]) -> None:

@@ -230,6 +230,19 @@ def test_nothing_is_done_when_something_else_moves_or_nothing_has_changed(scene,
     assert len(seen) <= n + 1, "what the handler writes does not call it for ever"
 
 
+def test_selecting_a_module_rebuilds_none_and_hiding_one_is_seen(collection, monkeypatch):
+    calls = []
+    monkeypatch.setattr(following, "refresh", lambda *args, **kwargs: calls.append(args))
+    for number in (2, 5, 7):
+        select(scanner.module(collection, number))
+        update()
+        update()
+    assert calls == []
+    scanner.module(collection, 1).mphdrr_module.visible = False
+    update()
+    assert calls
+
+
 def test_impossible_numbers_are_said_and_cured(collection):
     camera = scanner.module(collection, 7)
     module = camera.mphdrr_module

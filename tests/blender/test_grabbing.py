@@ -124,3 +124,15 @@ def test_what_is_locked_animated_copied_or_moved_itself_is_respected(scene, coll
     bpy.context.view_layer.update()
     assert np.array_equal(cameras.world_matrix(other), place) and copy.location.x == 20.0
     assert planes.planes(scene)
+
+
+def test_parts_that_version_0_1_0_locked_are_freed_and_the_users_locks_stay(collection, tmp_path):
+    path = str(tmp_path / "old.blend")
+    item = part(scanner.module(collection, 1), "CRYSTAL")
+    for was_free in (False, True):
+        item.lock_location, collection.mphdrr_scanner.parts_free = (True, True, True), was_free
+        bpy.ops.wm.save_as_mainfile(filepath=path)
+        bpy.ops.wm.open_mainfile(filepath=path)
+        collection = scanner.active_scanner(bpy.context.scene)
+        item = part(scanner.module(collection, 1), "CRYSTAL")
+        assert tuple(item.lock_location) == (was_free,) * 3

@@ -5,12 +5,14 @@ import importlib
 import pkgutil
 from collections.abc import Callable
 from contextlib import ExitStack
+from pathlib import Path
 from types import ModuleType
 from typing import Any
 
 import bpy
 
 from .. import operators, panels
+from ..core import cache
 from ..operators import add_phantom
 from . import (
     following,
@@ -121,6 +123,7 @@ _registered = ExitStack()  # takes back what was registered, in reverse order
 def register(command: Callable[..., int] | None = None) -> None:
     """Register everything, or nothing if something fails; `command` is what ``blender --command mphdrr`` calls."""
     updates.FUNCTIONS.update(UPDATES)
+    cache.keep_in(_extension_folder())
     try:
         for cls in CLASSES:
             if issubclass(cls, bpy.types.Operator) and cls.__doc__ is not None:
@@ -159,6 +162,14 @@ def unregister() -> None:
     live_scanner.stop()
     live_phantoms.stop()
     _registered.close()
+
+
+def _extension_folder() -> Path | None:
+    """The folder that Blender gives the extension for its files; None where this is no installed extension."""
+    try:
+        return Path(bpy.utils.extension_path_user(__package__.removesuffix(".addon")))
+    except ValueError:
+        return None
 
 
 def _remove_handler(handlers: list[Any], function: Any) -> None:

@@ -105,7 +105,7 @@ def draw_frames() -> None:
     picture.text(at(zero) + [10, 24], "isocentre, origin", "", "start")
     picture.text(0.5 * (at(p) + at(zero)) + [16, -8], "b", "soft")
     picture.text(at(corners[0]) + [-4, 26], "crystal, side Ld", "", "middle")
-    picture.text(at(zero) + [1.35 * 60 + 8, 40], "ROI, radius R", "soft", "start")
+    picture.text(at(zero) + [1.35 * 60 - 6, 62], "ROI, radius R", "soft", "start")
     picture.text((380, 382), "k: from the pinhole to the isocentre;  u = z × k / |z × k|;  v = k × u", "mono")
     picture.write("frames.svg")
 

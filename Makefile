@@ -3,6 +3,8 @@
 # make test-long   the tests that take minutes: long property runs, workbooks through LibreOffice
 # make bench   speed, accuracy and memory beside other projectors, into docs/; BENCH=--quick: a minute or two, into out/
 # make gallery   the README's pictures of phantoms, of a CT (CT=FILE) and of the scanner's sensitivity, into docs/images
+# make docs    docs/ as a site in out/docs, with links and references checked; wrong ones are errors
+# make tutorial   the tutorial's steps in a real Blender, and its pictures anew in docs/images/tutorial
 # make dist    the package's wheels and the extension's zips in dist/, one per platform; PLATFORM=linux-x64 builds for that one
 # make test-app   the Linux zip in a real Blender (see tests/app)
 # make test-kernels   the C kernels under sanitizers, for arm64 under qemu, for Windows under Wine (see tests/kernels)
@@ -25,7 +27,7 @@ ANY_PYTHON = $$(for p in "$(PYTHON)" python3 python3.11 python3.13; do "$$p" -c 
 ENVIRONMENT = @p=$(ANY_PYTHON); [ -n "$$p" ] || { echo "no Python found; name one: make PYTHON=/path/to/python3.11"; exit 1; }; \
 	"$$p" tools/environment.py $(VENV) --python "$(PYTHON)"
 
-.PHONY: demo gallery test test-long lint test-app test-kernels test-gate test-peers bench dist clean env env-dev
+.PHONY: demo gallery test test-long lint test-app test-kernels test-gate test-peers bench docs tutorial dist clean env env-dev
 
 demo: env
 	$(BIN)/mphdrr demo --output $(OUTPUT)
@@ -49,6 +51,16 @@ lint: env-dev
 
 bench: env-dev
 	$(BIN)/python benchmarks/projector.py $(BENCH)
+
+docs:
+	$(ENVIRONMENT) --extras docs
+	$(BIN)/python -m sphinx --fail-on-warning --keep-going --quiet --fresh-env --doctree-dir $(OUTPUT)/docs-parsed docs $(OUTPUT)/docs
+	@echo "$(OUTPUT)/docs/index.html"
+
+tutorial: env-dev
+	$(BIN)/python tools/build_extension.py --platform linux-x64
+	$(BIN)/python -m pytest tests/app/test_window_tutorial.py
+	$(BIN)/python tools/tutorial_pictures.py
 
 dist: env-dev
 	$(BIN)/python tools/build_extension.py $(addprefix --platform ,$(PLATFORM))

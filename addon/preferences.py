@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import functools
-import os
 import shutil
 import tomllib
 from pathlib import Path
@@ -12,6 +11,7 @@ import bpy
 from bpy.app.translations import pgettext_iface as iface
 from bpy.props import IntProperty
 
+from ..core import cache
 from ..core.memory import readable_size
 from ..core.projector import backends, parallel
 from . import ids
@@ -89,7 +89,6 @@ def website() -> str:
 def apply() -> None:
     """Do as the preferences say, when the extension is enabled."""
     folder, addon = cache_folder(), bpy.context.preferences.addons.get(PACKAGE)
-    if folder is not None:
-        os.environ.setdefault("MPHDRR_CACHE", str(folder))
+    cache.keep_in(folder)
     if addon is not None and addon.preferences is not None:
         parallel.set_usual_threads(addon.preferences.threads or None)

@@ -55,5 +55,10 @@ class _OldPaths(MetaPathFinder, Loader):
 
 
 def keep_old_paths() -> None:
-    """Let ``import mphdrr.core.<old name>`` give the module that has its contents now."""
+    """Let ``import mphdrr.core.<old name>`` give the module that has its contents now; of the Python package only.
+
+    An installed extension leaves Blender's imports alone, as its platform asks.
+    """
+    if __package__.startswith("bl_ext."):
+        return
     sys.meta_path.insert(0, _OldPaths())  # before a path of packages finds the same file once more

@@ -9,6 +9,7 @@ from __future__ import annotations
 import argparse
 import importlib.util
 import os
+import re
 import shutil
 import subprocess
 import sys
@@ -101,6 +102,22 @@ def stage(folder: Path) -> None:
         shutil.copyfile(ROOT / name, folder / name)
 
 
+def own_readme(tree: Path, website: str | None) -> None:
+    """Make the README of `tree` fit a zip without docs/: its pictures lie beside it, links lead to the website."""
+
+    def fitting(link: re.Match[str]) -> str:
+        is_picture, text, path = link.groups()
+        if is_picture:
+            shutil.copyfile(tree / path, tree / Path(path).name)
+            return f"![{text}]({Path(path).name})"
+        page = Path(path).with_suffix(".html").name
+        return f"[{text}]({website.rstrip('/')}/{page})" if website else text
+
+    readme = tree / "README.md"
+    given = readme.read_text(encoding="utf-8")
+    readme.write_text(re.sub(r"(!?)\[([^]]*)\]\((docs/[^)]+)\)", fitting, given), encoding="utf-8")
+
+
 def build_wheel(name: str, tree: Path, output: Path) -> None:
     """Build the package's wheel for platform `name` from a copy of the tree."""
     options = ("--no-build-isolation", "--no-deps", "-qq", "--disable-pip-version-check", "-w", output)
@@ -120,6 +137,7 @@ def build_zip(name: str, tree: Path, output: Path) -> Path:
     declared = f"platforms = {toml_list(tomllib.loads(given)['platforms'])}\n"
     if declared not in given:
         raise SystemExit(f"{MANIFEST.name}: expected the platforms on one line, as in {declared.strip()}")
+    own_readme(tree, tomllib.loads(given).get("website"))
     listed = f"platforms = {toml_list([name])}\nwheels = [\n"
     listed += "".join(f'  "./wheels/{wheel.name}",\n' for wheel in wheels) + "]\n"
     manifest.write_text(given.replace(declared, listed), encoding="utf-8")

@@ -2,16 +2,22 @@
 
 import argparse
 import contextlib
+import importlib.util
 import time
+import warnings
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 from ...core.cli.options import add_command, add_workbook, progress_bar, read_workbook
+from ...core.errors import InputWarning
 from ...core.files import ensure_folder
 from ...core.runs.files import write_run
+from ...core.runs.mosaic import write_sheet
 from ...core.runs.recipe import Recipe
+from ...core.runs.run import ProjectionRun
 from ...core.runs.run_recipe import run_recipe
-from .scene import new_scene, quiet, save_scene
+from .scene import INSTALL_BLENDER, new_scene, quiet, save_scene
 
 EXAMPLE = Path(__file__).parents[2] / "examples" / "dc-spect-80.xlsx"
 EULER_DEGREES = (30.0, 55.0, 0.0)  # tilted, so that modules see along and across the rods
@@ -20,7 +26,6 @@ _FIGURES = (
     ("phantom", "inside", None),
     ("cut-away", "cut-away", None),
     ("sums", "sums", None),
-    ("mosaic", "mosaic", None),
 )
 _SIZE = dict.fromkeys(("scanner", "inside", "cut-away"), (960, 560))
 """Smaller than usual: they take most of the demo's time."""
@@ -43,14 +48,10 @@ def add_parser(subparsers) -> None:  # type: ignore[no-untyped-def]
 
 def _run(arguments: argparse.Namespace) -> None:
     out = ensure_folder(arguments.output)
-    scene = new_scene()  # before the long work: without Blender the demo stops here
-    import bpy
-
-    from .. import figures, jobs, rendering, scanner, volumes
-
+    has_blender = importlib.util.find_spec("bpy") is not None
+    scene = new_scene() if has_blender else None  # before the long work: what is wrong with Blender shows at once
     with _step("geometry"):
         system = read_workbook(arguments)
-        scanner.build_scanner(scene, system)
     with _step("projections"):
         recipe = Recipe({
             "system.file": arguments.workbook,
@@ -62,19 +63,34 @@ def _run(arguments: argparse.Namespace) -> None:
             "detector.columns": arguments.size,
         })  # fmt: skip
         (run,) = run_recipe(recipe, system, stages=progress_bar)
-        pose, phantom = run.recipe["phantom.matrix"], run.recipe.tables()["phantom"]
-        item = volumes.add_volume(run.volume, "Derenzo phantom", pose, phantom)
     with _step("dataset"):
         write_run(run, out / "run.h5")
+        write_sheet(run, out / "mosaic.png")
+    if scene is None:
+        text = f"no scene and no pictures of it, which need Blender: {INSTALL_BLENDER}"
+        warnings.warn(text, InputWarning, stacklevel=2)
+    else:
+        _make_scene(scene, run, out)
+    print(f"{out}: {', '.join(sorted(p.name for p in out.iterdir() if p.suffix in ('.blend', '.h5', '.png')))}")
+
+
+def _make_scene(scene: Any, run: ProjectionRun, out: Path) -> None:
+    """Write the scene of a run, and pictures of it."""
+    import bpy
+
+    from .. import figures, jobs, rendering, scanner, volumes
+
     with _step("scene"):
+        scanner.build_scanner(scene, run.system)
+        pose, phantom = run.recipe["phantom.matrix"], run.recipe.tables()["phantom"]
+        item = volumes.add_volume(run.volume, "Derenzo phantom", pose, phantom)
         rendering.show_run(scene, run, out / "run.h5", item)
         save_scene(out / "scanner.blend")
     with _step("pictures"), quiet():
-        ranges = {f"modules-{first}-{last}": f"{first}-{last}" for first, last in scanner.quick_ranges(system)}
+        ranges = {f"modules-{first}-{last}": f"{first}-{last}" for first, last in scanner.quick_ranges(run.system)}
         for name, figure, modules in (*((name, "scanner", text) for name, text in ranges.items()), *_FIGURES):
             path = out / f"{name}.png"
             jobs.run(figures.figure_job(bpy.context, figure, [path], _SIZE.get(figure), modules))
-    print(f"{out}: {', '.join(sorted(p.name for p in out.iterdir() if p.suffix in ('.blend', '.h5', '.png')))}")
 
 
 @contextlib.contextmanager

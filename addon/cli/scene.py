@@ -18,6 +18,9 @@ from ...core.volumes.volume_files import read_volume, read_volume_of
 if TYPE_CHECKING:
     import bpy
 
+# Double quotes: Windows' command prompt knows no others.
+INSTALL_BLENDER = 'pip install "mphdrr[blender]", or ".[blender]" in its source; or run blender --command mphdrr'
+
 
 def add_parser(subparsers) -> None:  # type: ignore[no-untyped-def]
     """Add the command."""
@@ -69,9 +72,7 @@ def new_scene() -> bpy.types.Scene:
     try:
         import bpy
     except ModuleNotFoundError:
-        raise InputError(
-            "this command needs Blender: pip install 'mphdrr[blender]', or run blender --command mphdrr"
-        ) from None
+        raise InputError(f"this command needs Blender: {INSTALL_BLENDER}") from None
     except ImportError as error:  # a shared library is missing
         raise InputError(
             f"Blender's bpy package does not load ({error}); on Debian and Ubuntu install libx11-6 libxi6 libxfixes3 "

@@ -42,7 +42,7 @@ class Shape:
     mode : str
         ``"paint"`` replaces what lies beneath, ``"add"`` adds to it (and may be negative).
     cut : (n, 4)
-        Planes (nx, ny, nz, d) in the shape's frame: the points with ``n . x <= d`` |n| are kept, d in mm.
+        Planes (nx, ny, nz, d) in the shape's frame: the points with ``n . x <= d |n|`` are kept, d in mm.
     name : str
         For messages and the scene.
     half_box : (3,)

@@ -41,6 +41,14 @@ def test_zip_holds_the_extension_and_no_tests(extension_zip: Path):
     assert sorted(generated["wheels"]) == sorted(f"./{name}" for name in names if name.startswith("wheels/"))
 
 
+def test_readme_in_the_zip_leads_nowhere_that_is_not_there(extension_zip: Path):
+    with zipfile.ZipFile(extension_zip) as archive:
+        links = re.findall(r"\]\(([^)]+)\)", archive.read("README.md").decode())
+        names = set(archive.namelist())
+    assert [link for link in links if link.endswith(".webp")] == ["load.webp"]
+    assert all(link in names or link.startswith("https://") for link in links), links
+
+
 @pytest.mark.parametrize("python", ["cp311", "cp313"])
 def test_zip_holds_compiled_wheels_for_the_pythons_of_both_blenders(extension_zip: Path, python: str):
     with zipfile.ZipFile(extension_zip) as archive:
@@ -67,6 +75,9 @@ for name in ("h5py", "openjpeg", "psutil", "openpyxl", "nibabel", "trimesh"):
     assert ".local" in module.__file__, module.__file__  # from the extension's wheels, not from the machine
 cpu = importlib.import_module("{MODULE}.core.projector.backends.cpu")
 assert cpu.levels(), "the kernels"
+cache = importlib.import_module("{MODULE}.core.cache")
+assert str(cache.folder()) == bpy.utils.extension_path_user("{MODULE}"), cache.folder()
+assert not [finder for finder in sys.meta_path if "mphdrr" in type(finder).__module__]
 print("ENABLED", sys.modules["{MODULE}"].__file__)
 """)
     assert "ENABLED" in said.stdout

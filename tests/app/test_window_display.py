@@ -1,4 +1,4 @@
-"""The example in one click, of which docs/images/window.png is the picture; a click on a tile makes its module active."""
+"""The example in one click; a click on a tile makes its module active."""
 
 import json
 from pathlib import Path

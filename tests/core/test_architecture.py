@@ -81,6 +81,24 @@ def test_long_files_say_why():
     assert [path for path in long if "long because" not in " ".join(lines[path][:40])] == []
 
 
+def test_the_extension_starts_no_process_opens_no_connection_and_runs_no_text():
+    """As docs/extension-review.md says."""
+    banned = {"subprocess", "multiprocessing", "socket", "http", "urllib", "requests", "ftplib", "webbrowser"}
+    for path in SOURCES:
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            names = [alias.name for alias in node.names] if isinstance(node, ast.Import) else []
+            names += [node.module or ""] if isinstance(node, ast.ImportFrom) and not node.level else []
+            assert not banned & {name.partition(".")[0] for name in names}, path
+            called = getattr(getattr(node, "func", None), "id", "")
+            assert called not in ("eval", "exec"), path
+
+
+def test_links_of_the_readme_lead_to_files():
+    """Those in docs/ are checked by `make docs`."""
+    links = re.findall(r"\]\(([^)#]+)", (ROOT / "README.md").read_text(encoding="utf-8"))
+    assert links and [link for link in links if not (ROOT / link).is_file()] == []
+
+
 def test_imports_inside_the_package_are_relative():
     """As an extension the package is called bl_ext.<repository>.mphdrr."""
     absolute = re.compile(r"^\s*(from|import) mphdrr\b", re.MULTILINE)

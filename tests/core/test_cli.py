@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib.util
 import json
 import subprocess
 import sys
@@ -342,3 +343,12 @@ def test_geometry_of_plates_is_generated(tmp_path, capsys):
     for wrong in (["--polygon", "5"], ["--vertices", "1", "2", "3"]):
         assert main(["geometry", "generate", "plates", *wrong, "--z", "0", "-o", str(path)]) == 1
         assert "expected" in capsys.readouterr().err
+
+
+def test_demo_without_blender_leaves_out_the_scene(tmp_path, monkeypatch, capsys):
+    find_spec = importlib.util.find_spec
+    without = lambda name, *more: None if name == "bpy" else find_spec(name, *more)  # noqa: E731
+    monkeypatch.setattr(importlib.util, "find_spec", without)
+    assert main(["demo", "--voxels", "16", "--size", "8", "--output", str(tmp_path)]) == 0
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["mosaic.png", "run.h5"]
+    assert "need Blender" in capsys.readouterr().err

@@ -22,7 +22,6 @@ import tempfile
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager, nullcontext
-from pathlib import Path
 from types import ModuleType
 from typing import Any
 
@@ -30,6 +29,7 @@ import numpy as np
 import warp as wp
 from numpy.typing import NDArray
 
+from ... import cache
 from ...arrays import ArrayOrTensor, is_tensor, to_numpy
 from ...errors import InputError
 from ...memory import readable_size
@@ -252,9 +252,9 @@ def _kernels(device: Any) -> ModuleType:
 
 
 def _initialize() -> None:
-    """Start Warp with its cache in `_cache_folder`, unless the user has chosen another or has started it already."""
+    """Start Warp with its cache in `cache.folder`, unless the user has chosen another or has started it already."""
     if wp.config.kernel_cache_dir is None and "WARP_CACHE_PATH" not in os.environ:
-        folder = str(_cache_folder())
+        folder = str(cache.folder() / "warp")
         try:
             os.makedirs(folder, exist_ok=True)
             tempfile.TemporaryFile(dir=folder).close()
@@ -264,19 +264,6 @@ def _initialize() -> None:
             folder = _scratch_folder()
         wp.config.kernel_cache_dir = folder
     wp.init()
-
-
-def _cache_folder() -> Path:
-    """The folder of this user in which Warp may keep what it can make again."""
-    if "MPHDRR_CACHE" in os.environ:
-        return Path(os.environ["MPHDRR_CACHE"])
-    if sys.platform == "win32":
-        base = os.environ.get("LOCALAPPDATA") or Path.home() / "AppData" / "Local"
-    elif sys.platform == "darwin":
-        base = Path.home() / "Library" / "Caches"
-    else:
-        base = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
-    return Path(base) / "mphdrr" / "warp"
 
 
 @functools.cache

@@ -20,7 +20,7 @@ def test_tutorial(blender_window, work_folder, monkeypatch):
     missing = {name: [words for words in said[name] if words not in " ".join(texts[name].split())] for name in said}
     assert not any(missing.values()), f"what was seen is not what the page says: {missing}"
 
-    code, printed = re.findall(r"```(?:python|text)\n(.*?)```", sections[8], flags=re.DOTALL)
+    code, printed = re.findall(r"```(?:python|text)\n(.*?)```", "".join(sections), flags=re.DOTALL)
     monkeypatch.chdir(work_folder)
     with contextlib.redirect_stdout(io.StringIO()) as output:
         exec(code, {})

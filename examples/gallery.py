@@ -130,7 +130,7 @@ def in_the_scanner(system: mph.PinholeSystem, folder: Path, ct: mph.Volume | Non
         print("no bpy: the pictures in the scanner are omitted", file=sys.stderr)
         return
     import mphdrr
-    from mphdrr.addon import jobs, maps, pictures, scanner, volumes
+    from mphdrr.addon import jobs, maps, pictures, scanner, slices, volumes
 
     bpy.ops.wm.read_factory_settings(use_empty=True)
     mphdrr.register()
@@ -141,6 +141,7 @@ def in_the_scanner(system: mph.PinholeSystem, folder: Path, ct: mph.Volume | Non
     first, last = int(system.numbers.min()), int(system.numbers.max())
     jobs.run(maps.mapping(scene, "sensitivity", voxels=128))
     (shown,) = volumes.volume_objects(scene)
+    slices.remove_slices(shown)  # it is cut open in front of them
     pictures.render_scanner(collection, folder / "sensitivity.png", first, last, shown, zoom=1.5)
     bpy.data.objects.remove(shown)
     if ct is not None:

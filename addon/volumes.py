@@ -254,7 +254,8 @@ def _describe(item: bpy.types.Object, stored: StoredVolume) -> None:
     volume = stored.volume
     item.matrix_world = Matrix(stored.pose)
     settings = item.mphdrr_volume
-    shown = settings.display_low, settings.display_high
+    low, high = shown = settings.display_low, settings.display_high
+    surface = (settings.surface - low) / ((high - low) or 1.0)  # share of the display range
     usual = volume_materials.usual_range(settings.quantity, settings.minimum, settings.maximum)
     unit, factor = volume_materials.shown_unit(volume.quantity)
     chosen = settings.is_volume and settings.quantity == volume.quantity and not np.allclose(shown, usual)
@@ -266,4 +267,6 @@ def _describe(item: bpy.types.Object, stored: StoredVolume) -> None:
     settings.center_shift = compat.VDB_CENTER_SHIFT
     if not chosen:
         shown = volume_materials.usual_range(volume.quantity, factor * stored.low, factor * stored.high)
+    if shown != (low, high):
+        settings.surface = shown[0] + surface * (shown[1] - shown[0])
     settings.display_low, settings.display_high = shown

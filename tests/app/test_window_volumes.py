@@ -14,7 +14,7 @@ SCRIPT = Path(__file__).with_name("window_volumes.py")
 
 def test_slices_shells_maps_and_light(blender_window, work_folder):
     result = work_folder / "seen.json"
-    blender_window(SCRIPT.read_text(encoding="utf-8"), result, work_folder, seconds=100)
+    blender_window(SCRIPT.read_text(encoding="utf-8"), result, work_folder, seconds=150)
     seen = json.loads(result.read_text())
     assert seen["ok"], seen
     left, top, right, bottom = seen["frame"]
@@ -24,7 +24,7 @@ def test_slices_shells_maps_and_light(blender_window, work_folder):
         screen = np.asarray(Image.open(work_folder / f"{name}.png").convert("RGB")).astype(int)
         return screen[top + 60 : bottom - 20, left + 170 : right - 60]
 
-    def colored(name: str, saturation: float = 0.35) -> tuple[np.ndarray, np.ndarray]:
+    def colored(name: str, saturation: float = 0.15) -> tuple[np.ndarray, np.ndarray]:
         """Hue in degrees, and where a picture has colours."""
         hsv = np.asarray(Image.fromarray(picture(name).astype(np.uint8)).convert("HSV")).astype(float)
         return hsv[..., 0] * 360 / 255, (hsv[..., 1] > 255 * saturation) & (hsv[..., 2] > 60)

@@ -68,7 +68,7 @@ def steps():
     space = viewport()[1].spaces.active
     space.overlay.show_floor = space.overlay.show_axis_x = space.overlay.show_axis_y = False
     space.overlay.show_text = space.show_gizmo_navigate = False
-    in_view("mphdrr.add_nema", "EXEC_DEFAULT", True, voxels=100)
+    in_view("mphdrr.add_nema", "EXEC_DEFAULT", True, voxels=80)
     in_view("mphdrr.add_slices", "EXEC_DEFAULT", True)
     nema = bpy.context.object
     settings = nema.mphdrr_volume
@@ -115,7 +115,7 @@ def steps():
     nema.hide_set(True)
     for child in nema.children:
         child.hide_set(True)
-    in_view("mphdrr.add_torso", "EXEC_DEFAULT", True, voxels=100)
+    in_view("mphdrr.add_torso", "EXEC_DEFAULT", True, voxels=64)
     torso = bpy.context.object
     torso.mphdrr_volume.look = "SHELL"
     yield 4
@@ -124,7 +124,7 @@ def steps():
     for child in torso.children:
         child.hide_set(True)
     in_view("mphdrr.import_geometry", "EXEC_DEFAULT", True, filepath=WORKBOOK)
-    in_view("mphdrr.add_map", "EXEC_DEFAULT", True, quantity="sensitivity", voxels=48)
+    in_view("mphdrr.add_map", "EXEC_DEFAULT", True, quantity="sensitivity", voxels=32)
     in_view("mphdrr.show_modules", "EXEC_DEFAULT", True, first=1, last=40, mode="ONLY")
     look(420.0, (1.05, 0.0, 0.95))
     viewport()[2].data.view_location = (0.0, 0.0, -30.0)
@@ -137,7 +137,7 @@ def steps():
     look(1300.0, (1.05, 0.0, 0.95))
     space.overlay.show_overlays = False
     space.shading.type = "RENDERED"
-    yield 30
+    yield 20
     picture("rendered")
     seen["engine"] = bpy.context.scene.render.engine
     space.shading.type, space.overlay.show_overlays, space.show_region_ui = "SOLID", True, True

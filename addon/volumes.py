@@ -173,7 +173,7 @@ def after_load(*_: Any) -> None:
     """Rewrite volumes of a .blend whose Blender draws voxels half a voxel elsewhere."""
     missing = storage.missing_volumes()
     for item in bpy.data.objects:
-        if not is_volume(item) or item.data in missing:
+        if not is_volume(item):
             continue
         settings = item.mphdrr_volume
         if not settings.is_property_set("display_high"):  # made by an older version of this extension
@@ -185,7 +185,7 @@ def after_load(*_: Any) -> None:
             for name in ("minimum", "maximum", "display_low", "display_high"):
                 setattr(settings, name, factor * getattr(settings, name))
             settings.unit = unit
-        if settings.center_shift != compat.VDB_CENTER_SHIFT:
+        if settings.center_shift != compat.VDB_CENTER_SHIFT and item.data not in missing:
             try:
                 states = [read_vdb(path) for path in storage.files_of_states(item.data)]
                 item.data.filepath = storage.stored_path(write_states(states, storage.folder()))

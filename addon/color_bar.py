@@ -21,7 +21,7 @@ def place() -> tuple[float, float, float, float]:
 def marks(item: bpy.types.Object) -> tuple[str, list[str]]:
     """What is written above a volume's bar, and beside it, from its lower end to the upper."""
     settings = item.mphdrr_volume
-    title = f"{settings.quantity.capitalize()}, {settings.unit}".removesuffix(", 1")
+    title = f"{settings.quantity}, {settings.unit}".removesuffix(", 1")
     low, high = settings.display_low, settings.display_high
     return title, [f"{low + share * (high - low):.4g}" for share in _MARKS]
 

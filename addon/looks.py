@@ -10,7 +10,7 @@ from mathutils import Vector
 from . import compat, volume_materials
 from .cameras import remove_objects
 from .compat import enable_nodes
-from .volume_materials import Cut
+from .volume_materials import Cut, change
 
 _KEY = "mphdrr_surface"  # custom property of a surface's object
 # Exponent and gain of the extinction; where a surface is drawn, the volume itself is not.
@@ -47,13 +47,12 @@ def show(item: bpy.types.Object, cut: Cut | None) -> None:
         remove_surface(item)
         return
     surface = surface_of(item) or _new_surface(item)
-    surface.location = _shift(item)
+    change(surface, location=_shift(item))
     made, opened = surface.modifiers
-    made.grid_name, made.threshold = settings.quantity, settings.surface / factor
-    fine = max(settings.shape) <= _FINE
-    made.resolution_mode, made.voxel_amount = "GRID" if fine else "VOXEL_AMOUNT", _FINE
+    voxels = "GRID" if max(settings.shape) <= _FINE else "VOXEL_AMOUNT"
+    change(made, grid_name=settings.quantity, threshold=settings.surface / factor, resolution_mode=voxels)
     volume_materials.set_cut(opened.node_group, cut)
-    opened.show_viewport = opened.show_render = cut is not None
+    change(opened, show_viewport=cut is not None, show_render=cut is not None)
 
 
 def surface_of(item: bpy.types.Object) -> bpy.types.Object | None:
@@ -87,7 +86,7 @@ def _new_surface(item: bpy.types.Object) -> bpy.types.Object:
     surface[_KEY] = True
     surface.parent, surface.hide_select = item, True
     made = surface.modifiers.new("Surface", "VOLUME_TO_MESH")
-    made.object, made.use_smooth_shade = item, True
+    made.object, made.use_smooth_shade, made.voxel_amount = item, True, _FINE
     surface.modifiers.new("Cut", "NODES").node_group = _cutting(name)
     for collection in item.users_collection:
         collection.objects.link(surface)

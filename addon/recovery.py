@@ -25,10 +25,11 @@ def missing(scene: bpy.types.Scene) -> tuple[list[bpy.types.Object], list[bpy.ty
 def remaking(scene: bpy.types.Scene) -> jobs.Job:
     """The job that makes the volumes with a recipe again, with which the others are named in a warning."""
     again, others = missing(scene)
-    made: list[jobs.Job] = []
+    made: list[tuple[str, jobs.Job]] = []
     for item in again:
         try:
-            made.append(phantoms.updating(item) if phantoms.settings_of(item) is not None else maps.again(scene, item))
+            job = phantoms.updating(item) if phantoms.settings_of(item) is not None else maps.again(scene, item)
+            made.append((item.name, job))
         except InputError as error:
             warnings.warn(f"{item.name}: {error}", InputWarning, stacklevel=2)
     if others:
@@ -37,13 +38,13 @@ def remaking(scene: bpy.types.Scene) -> jobs.Job:
         raise InputError("no phantom or map misses its files, or none can be made again")
 
     def work(progress: Progress) -> list[Any]:
-        return [job.work(part_of(progress, k, len(made)) or progress) for k, job in enumerate(made)]
+        return [job.work(part_of(progress, k, len(made)) or progress) for k, (_, job) in enumerate(made)]
 
     def finish(results: list[Any]) -> Generator[None, None, str]:
-        for job, result in zip(made, results, strict=True):
+        for (_, job), result in zip(made, results, strict=True):
             job.finish(result)
             yield
-        return f"Made {', '.join(item.name for item in again)} again"
+        return f"Made {', '.join(name for name, _ in made)} again"
 
     return jobs.Job("Making volumes again", work, finish)
 

@@ -191,7 +191,7 @@ def _plane(item: bpy.types.Object, volume: Volume, axis: int, name: str) -> bpy.
     mesh = bpy.data.meshes.new(name)
     mesh.from_pydata((corners @ volume.grid.affine.T)[:, :3].tolist(), [], [(0, 1, 2, 3)])
     mesh.uv_layers.new(name="Slice").data.foreach_set("uv", np.array(uv, np.float32).ravel())
-    image = bpy.data.images.new(name, volume.grid.shape[across], volume.grid.shape[up])
+    image = bpy.data.images.new(name, volume.grid.shape[across], volume.grid.shape[up], alpha=True)
     mesh.materials.append(_material(name, image))
     plane = bpy.data.objects.new(name, mesh)
     plane[_KEY], plane[_LATTICE] = axis, _lattice(volume)

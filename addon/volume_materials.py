@@ -8,6 +8,7 @@ from collections.abc import Sequence
 from typing import Any
 
 import bpy
+import numpy as np
 
 from ..core.volumes.volume import UNITS
 from .compat import enable_nodes
@@ -37,6 +38,7 @@ _SMOKE = 15.0  # the same for the solid viewport's smoke, which is denser: thin 
 # Nodes: the values at the ramp's ends; the extinction, for relative values ** exponent and times a gain.
 _RANGE, _OPACITY_NODE, _EXPONENT, _GAIN = "Display Range", "Opacity", "Exponent", "Gain"
 _CUT = "Cut"  # nodes, numbered by the grid's axes: what lies beyond all three is cut away
+_THINNEST = 1e-5  # Blender's least density of smoke
 _FAR = 1e9  # where nothing is cut
 
 Cut = Sequence[tuple[Sequence[float], float]]
@@ -122,7 +124,8 @@ def new_material(name: str, quantity: str, size: float) -> bpy.types.Material:
 def set_range(material: bpy.types.Material, low: float, high: float) -> None:
     """Spread the colours from the value `low` to `high`; a material that the user made is left alone."""
     if material.node_tree and (node := material.node_tree.nodes.get(_RANGE)):
-        node.inputs["From Min"].default_value, node.inputs["From Max"].default_value = low, high
+        change(node.inputs["From Min"], default_value=low)
+        change(node.inputs["From Max"], default_value=high)
 
 
 def in_front(tree: bpy.types.NodeTree, place: bpy.types.NodeSocket) -> bpy.types.NodeSocket:
@@ -153,22 +156,24 @@ def set_cut(tree: bpy.types.NodeTree, cut: Cut | None) -> None:
     for axis, (normal, limit) in enumerate(cut or [((0.0, 0.0, 0.0), _FAR)] * 3):
         along, beyond = tree.nodes.get(f"{_CUT} {axis} along"), tree.nodes.get(f"{_CUT} {axis}")
         if along is not None and beyond is not None:  # a tree of an earlier version, or of the user's, has none
-            _set(along.inputs[1], tuple(normal))
-            _set(beyond.inputs[1], limit)
+            change(along.inputs[1], default_value=normal)
+            change(beyond.inputs[1], default_value=limit)
 
 
 def set_opacity(material: bpy.types.Material, exponent: float, gain: float) -> None:
     """Make extinction follow a power of the relative values, times a gain."""
     for name, value in ((_EXPONENT, exponent), (_GAIN, gain)):
         if material.node_tree and (node := material.node_tree.nodes.get(name)):
-            _set(node.inputs[1], value)
+            change(node.inputs[1], default_value=value)
 
 
-def _set(socket: Any, value: Any) -> None:
-    """Set a socket's value, if it changes: every change has the scene drawn again."""
-    now = socket.default_value
-    if (tuple(now) if isinstance(value, tuple) else now) != value:
-        socket.default_value = value
+def change(owner: Any, **values: Any) -> None:
+    """Set properties that have other values: setting one has the scene calculated and drawn again."""
+    for name, value in values.items():
+        now = getattr(owner, name)
+        same = now == value if isinstance(value, str | bool) else np.allclose(now, value, rtol=1e-6, atol=0)  # float32
+        if not same:
+            setattr(owner, name, value)
 
 
 def resize(material: bpy.types.Material, old: float, new: float) -> None:
@@ -179,11 +184,10 @@ def resize(material: bpy.types.Material, old: float, new: float) -> None:
 
 def set_display(data: bpy.types.Volume, low: float, high: float, size: float, gain: float = 1.0) -> None:
     """Make the solid viewport draw the volume's values as smoke of a useful density, times a gain, or none."""
-    display = data.display
-    display.density = (gain or 1.0) * _SMOKE / size / (high - low)
-    # No smoke: of its slice along x the first, at the box's edge, where nothing is.
-    display.use_slice, display.slice_axis, display.slice_depth = not gain, "X", 0.0
-    display.wireframe_type, display.interpolation_method = "NONE", "LINEAR"
+    density = max(gain * _SMOKE / size / (high - low), _THINNEST)
+    # Blender knows no density of 0, only very thin smoke: of that, no more than a slice at the edge.
+    hidden = {"use_slice": not gain, "slice_axis": "X", "slice_depth": 0.0}
+    change(data.display, density=density, **hidden, wireframe_type="NONE", interpolation_method="LINEAR")
 
 
 def show_in_eevee(scene: bpy.types.Scene) -> None:

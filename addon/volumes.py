@@ -190,7 +190,7 @@ def after_load(*_: Any) -> None:
     """Rewrite volumes of a .blend whose Blender draws voxels half a voxel elsewhere."""
     missing = storage.missing_volumes()
     for item in bpy.data.objects:
-        if not is_volume(item) or item.data in missing:
+        if not is_volume(item):
             continue
         settings = item.mphdrr_volume
         if not settings.is_property_set("display_high"):  # made by an older version of this extension
@@ -202,7 +202,7 @@ def after_load(*_: Any) -> None:
             for name in ("minimum", "maximum", "display_low", "display_high"):
                 setattr(settings, name, factor * getattr(settings, name))
             settings.unit = unit
-        if settings.center_shift != compat.VDB_CENTER_SHIFT:
+        if settings.center_shift != compat.VDB_CENTER_SHIFT and item.data not in missing:
             settings.content = content_of(item)
             try:
                 states = [read_vdb(path) for path in storage.files_of_states(item.data)]
@@ -272,7 +272,8 @@ def _describe(item: bpy.types.Object, stored: StoredVolume) -> None:
     volume = stored.volume
     item.matrix_world = Matrix(stored.pose)
     settings = item.mphdrr_volume
-    shown = settings.display_low, settings.display_high
+    low, high = shown = settings.display_low, settings.display_high
+    surface = (settings.surface - low) / ((high - low) or 1.0)  # share of the display range
     usual = volume_materials.usual_range(settings.quantity, settings.minimum, settings.maximum)
     unit, factor = volume_materials.shown_unit(volume.quantity)
     chosen = settings.is_volume and settings.quantity == volume.quantity and not np.allclose(shown, usual)
@@ -284,4 +285,6 @@ def _describe(item: bpy.types.Object, stored: StoredVolume) -> None:
     settings.center_shift = compat.VDB_CENTER_SHIFT
     if not chosen:
         shown = volume_materials.usual_range(volume.quantity, factor * stored.low, factor * stored.high)
+    if shown != (low, high):
+        settings.surface = shown[0] + surface * (shown[1] - shown[0])
     settings.display_low, settings.display_high = shown

@@ -115,7 +115,7 @@ def in_the_scanner(system: mph.PinholeSystem, folder: Path, ct: mph.Volume | Non
         print("no bpy: the pictures in the scanner are omitted", file=sys.stderr)
         return
     import mphdrr
-    from mphdrr.addon import figures, jobs, maps, scanner, volumes
+    from mphdrr.addon import figures, jobs, maps, scanner, slices, volumes
 
     bpy.ops.wm.read_factory_settings(use_empty=True)
     mphdrr.register()
@@ -126,6 +126,7 @@ def in_the_scanner(system: mph.PinholeSystem, folder: Path, ct: mph.Volume | Non
         jobs.run(figures.figure_job(bpy.context, "inside", [folder / name], (960, 560), labels=False, samples=12))
 
     jobs.run(maps.mapping(scene, "sensitivity", voxels=128))
+    slices.remove_slices(*volumes.volume_objects(scene))  # it is cut open in front of them
     picture("sensitivity.png")
     if ct is not None:
         bpy.data.objects.remove(*volumes.volume_objects(scene))

@@ -53,9 +53,10 @@ def _run(arguments: argparse.Namespace) -> None:
     run = read_run(arguments.run_file) if arguments.run_file else None
 
     blender_scene = new_scene()
-    from .. import rendering, scanner, volumes
+    from .. import rendering, scanner, studio, volumes
 
     scanner.build_scanner(blender_scene, system)
+    studio.light(blender_scene)
     if volume is not None:
         volumes.add_volume(volume, Path(arguments.volume).name)
     if mu is not None:

@@ -70,6 +70,17 @@ def test_what_lies_in_front_of_the_slices_is_cut_away_and_comes_back(nema):
     assert after == before
 
 
+def test_a_surface_follows_a_phantom_that_changes(nema):
+    settings = nema.mphdrr_volume
+    settings.look = "SHELL"
+    _, edges = surface(nema)
+    settings.nema.sphere_activity, settings.nema.background = 2120.0, 530.0
+    assert settings.surface == pytest.approx(0.6 * 2120.0)
+    assert np.array_equal(surface(nema)[1], edges)
+    settings.nema.quantity = "mu"
+    assert 0 < settings.surface < settings.maximum and len(surface(nema)[0]) > 100
+
+
 def test_smoke_gives_way_to_surfaces_and_slices(nema):
     display, settings = nema.data.display, nema.mphdrr_volume
     for look, smoke in (("DENSITY", True), ("BRIGHTEST", True), ("SHELL", False), ("DENSITY", True)):
@@ -113,7 +124,7 @@ def test_a_map_has_a_bar_in_the_unit_of_the_panels(scene, small_workbook):
     assert middle == pytest.approx(scene.mphdrr_geometry.scanner.mphdrr_scanner.sensitivity, rel=1e-5)
     title, texts = color_bar.marks(item)
     settings = item.mphdrr_volume
-    assert title == "Sensitivity, cps/MBq" and float(texts[0]) <= middle <= float(texts[-1])
+    assert title == "sensitivity, cps/MBq" and float(texts[0]) <= middle <= float(texts[-1])
     assert (
         float(texts[-1]) == pytest.approx(settings.maximum, rel=1e-3) == pytest.approx(settings.display_high, rel=1e-3)
     )

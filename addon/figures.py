@@ -30,7 +30,12 @@ from ..core.runs.files import read_run
 from . import collimators, compat, following, ids, jobs, phantoms, scanner, selection, storage, studio, volumes
 from .choices import items
 
-KIND_ITEMS = items({}, ((name.upper(), kind.label, kind.summary) for name, kind in KINDS.items()))
+KIND_ITEMS = items({}, ((name.upper().replace("-", "_"), kind.label, kind.summary) for name, kind in KINDS.items()))
+_MISSING = {
+    "scanner": "no scanner in the scene: import a workbook first",
+    "volume": "no volume in the scene: add a phantom first",
+    "run": "no projections: render them first",
+}
 SAMPLES = 16
 """Rays per pixel; what noise they leave is smoothed."""
 _DIRECTION = Vector((0.75, -1.0, 0.62)).normalized()  # from the scanner to the camera
@@ -94,7 +99,7 @@ def figure_job(
     run_file = scene.mphdrr_projections.run_file
     if "run" in kind.needs and run_file:
         later["run"] = partial(read_run, storage.absolute(run_file))
-    require(kind.needs, {*known, *later}, kind.name)
+    require(kind.needs, {*known, *later}, kind.name, _MISSING)
 
     def work(progress: Progress) -> Subject:
         progress(0, 1)
@@ -250,12 +255,12 @@ def _aim(camera: bpy.types.Object, page: Page, points: NDArray[np.float64], top:
     x_high, x_low = np.max(x - across * depth), np.max(-x - across * depth)
     y_high, y_low = np.max(y - above * depth), np.max(-y - below * depth)
     distance = max((x_high + x_low) / (2 * across), (y_high + y_low) / (above + below))
-    place = (
-        right * (x_high - x_low) / 2
-        + up * ((y_high - above * distance) + (below * distance - y_low)) / 2
-        + back * distance
-    )
-    camera.location = place
+    cx, cy = (x_high - x_low) / 2, (y_high - above * distance + below * distance - y_low) / 2
+    for _ in range(10):  # into the middle, where one direction leaves room
+        seen_x, seen_y = (x - cx) / (depth + distance), (y - cy) / (depth + distance)
+        cx += distance * (seen_x.max() + seen_x.min()) / 2
+        cy += distance * (seen_y.max() - above + seen_y.min() + below) / 2
+    camera.location = cx * right + cy * up + distance * back
     camera.rotation_mode, camera.rotation_quaternion = "QUATERNION", turn
     camera.data.clip_start, camera.data.clip_end = 0.01 * distance, 10.0 * distance
 

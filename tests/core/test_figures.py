@@ -170,7 +170,9 @@ def test_the_command_lists_and_draws(tmp_path, capsys):
     assert figure("--list") == 0
     assert [line.split()[0] for line in capsys.readouterr().out.splitlines()] == list(KINDS)
     out = tmp_path / "sums.svg"
-    assert figure("sums", "derenzo", "--voxels", 24, "--euler-degrees", 30, 55, 0, "--position", 5, 0, 0, "-o", out) == 0
+    assert (
+        figure("sums", "derenzo", "--voxels", 24, "--euler-degrees", 30, 55, 0, "--position", 5, 0, 0, "-o", out) == 0
+    )
     assert "T = (5, 0, 0) mm    R = (φ, θ, ψ) = (30, 55, 0)°" in out.read_text(encoding="utf-8")
     assert capsys.readouterr().out == f"{out}\n"
 

@@ -40,6 +40,7 @@ def example(scene, dc_spect, tmp_path):
     mph.write_run(run, tmp_path / "run.h5")
     rendering.show_run(scene, run, tmp_path / "run.h5")
     scanner.show_modules(collection, 5, 41)
+    bpy.context.view_layer.update()
     return scene
 
 

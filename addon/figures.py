@@ -103,7 +103,10 @@ def figure_job(
 
     def work(progress: Progress) -> Subject:
         progress(0, 1)
-        return Subject(**known, **{key: read() for key, read in later.items()})
+        found = {key: read() for key, read in later.items()}
+        if "run" in found:
+            known["name"] = found["run"].settings.get("volume", "")
+        return Subject(**known, **found)
 
     def finish(subject: Subject) -> Generator[None, None, str]:
         if kind.draw is not None:
@@ -274,6 +277,7 @@ def _set_up(scene: bpy.types.Scene, page: Page, samples: int, path: Path) -> Non
         raise InputError("Cycles is disabled: enable Cycles Render Engine in Edit > Preferences > Add-ons") from None
     cycles = scene.cycles
     cycles.device, cycles.samples, cycles.max_bounces, cycles.seed = "CPU", samples, 4, 0
+    cycles.use_adaptive_sampling, cycles.adaptive_threshold, cycles.adaptive_min_samples = True, 0.05, 4
     cycles.use_denoising, cycles.denoising_prefilter = True, "FAST"
     render.resolution_x, render.resolution_y, render.resolution_percentage = page.width, page.height, 100
     render.image_settings.file_format, render.image_settings.color_mode = "PNG", "RGB"
@@ -311,15 +315,14 @@ def _pixels(path: Path) -> NDArray[np.uint8]:
 
 
 def _draw_axes(page: Page, camera: bpy.types.Object) -> None:
-    """The directions of x, y and z in the lower left corner."""
+    """The directions of x, y and z, in the upper right corner beside the title."""
     em = page.em
-    x, y = 3.2 * em, page.height - 3.0 * em
+    x, y = page.width - 3.2 * em, 2.9 * em
     right, up, back = np.array(camera.rotation_quaternion.to_matrix()).T
     for axis in np.argsort(back):  # the nearest last
-        across, along = right[axis], -up[axis]
-        color = _AXES[axis]
-        page.line([(x, y), (x + 1.7 * em * across, y + 1.7 * em * along)], color, 0.14 * em)
-        page.text("xyz"[axis], x + 2.3 * em * across, y + 2.3 * em * along + 0.3 * em, em, color, "middle")
+        across, down, color = right[axis] * em, -up[axis] * em, _AXES[axis]
+        page.line([(x, y), (x + 1.4 * across, y + 1.4 * down)], color, 0.14 * em)
+        page.text("xyz"[axis], x + 2.0 * across, y + 2.0 * down + 0.3 * em, 0.9 * em, color, "middle")
 
 
 def _remove(scene: bpy.types.Scene) -> None:

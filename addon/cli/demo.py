@@ -73,7 +73,7 @@ def _run(arguments: argparse.Namespace) -> None:
         ranges = {f"modules-{first}-{last}": f"{first}-{last}" for first, last in scanner.quick_ranges(system)}
         for name, figure, modules in (*((name, "scanner", text) for name, text in ranges.items()), *_FIGURES):
             path = out / f"{name}.png"
-            jobs.run(figures.figure_job(bpy.context, figure, [path], _SIZE.get(figure), modules))
+            jobs.run(figures.figure_job(bpy.context, figure, [path], _SIZE.get(figure), modules, samples=8))
     print(f"{out}: {', '.join(sorted(p.name for p in out.iterdir() if p.suffix in ('.blend', '.h5', '.png')))}")
 
 

@@ -30,7 +30,12 @@ from ..core.runs.files import read_run
 from . import collimators, compat, following, ids, jobs, phantoms, scanner, selection, storage, studio, volumes
 from .choices import items
 
-KIND_ITEMS = items({}, ((name.upper(), kind.label, kind.summary) for name, kind in KINDS.items()))
+KIND_ITEMS = items({}, ((name.upper().replace("-", "_"), kind.label, kind.summary) for name, kind in KINDS.items()))
+_MISSING = {
+    "scanner": "no scanner in the scene: import a workbook first",
+    "volume": "no volume in the scene: add a phantom first",
+    "run": "no projections: render them first",
+}
 SAMPLES = 16
 """Rays per pixel; what noise they leave is smoothed."""
 _DIRECTION = Vector((0.75, -1.0, 0.62)).normalized()  # from the scanner to the camera
@@ -94,11 +99,14 @@ def figure_job(
     run_file = scene.mphdrr_projections.run_file
     if "run" in kind.needs and run_file:
         later["run"] = partial(read_run, storage.absolute(run_file))
-    require(kind.needs, {*known, *later}, kind.name)
+    require(kind.needs, {*known, *later}, kind.name, _MISSING)
 
     def work(progress: Progress) -> Subject:
         progress(0, 1)
-        return Subject(**known, **{key: read() for key, read in later.items()})
+        found = {key: read() for key, read in later.items()}
+        if "run" in found:
+            known["name"] = found["run"].settings.get("volume", "")
+        return Subject(**known, **found)
 
     def finish(subject: Subject) -> Generator[None, None, str]:
         if kind.draw is not None:
@@ -250,12 +258,12 @@ def _aim(camera: bpy.types.Object, page: Page, points: NDArray[np.float64], top:
     x_high, x_low = np.max(x - across * depth), np.max(-x - across * depth)
     y_high, y_low = np.max(y - above * depth), np.max(-y - below * depth)
     distance = max((x_high + x_low) / (2 * across), (y_high + y_low) / (above + below))
-    place = (
-        right * (x_high - x_low) / 2
-        + up * ((y_high - above * distance) + (below * distance - y_low)) / 2
-        + back * distance
-    )
-    camera.location = place
+    cx, cy = (x_high - x_low) / 2, (y_high - above * distance + below * distance - y_low) / 2
+    for _ in range(10):  # into the middle, where one direction leaves room
+        seen_x, seen_y = (x - cx) / (depth + distance), (y - cy) / (depth + distance)
+        cx += distance * (seen_x.max() + seen_x.min()) / 2
+        cy += distance * (seen_y.max() - above + seen_y.min() + below) / 2
+    camera.location = cx * right + cy * up + distance * back
     camera.rotation_mode, camera.rotation_quaternion = "QUATERNION", turn
     camera.data.clip_start, camera.data.clip_end = 0.01 * distance, 10.0 * distance
 
@@ -269,6 +277,7 @@ def _set_up(scene: bpy.types.Scene, page: Page, samples: int, path: Path) -> Non
         raise InputError("Cycles is disabled: enable Cycles Render Engine in Edit > Preferences > Add-ons") from None
     cycles = scene.cycles
     cycles.device, cycles.samples, cycles.max_bounces, cycles.seed = "CPU", samples, 4, 0
+    cycles.use_adaptive_sampling, cycles.adaptive_threshold, cycles.adaptive_min_samples = True, 0.05, 4
     cycles.use_denoising, cycles.denoising_prefilter = True, "FAST"
     render.resolution_x, render.resolution_y, render.resolution_percentage = page.width, page.height, 100
     render.image_settings.file_format, render.image_settings.color_mode = "PNG", "RGB"
@@ -306,15 +315,14 @@ def _pixels(path: Path) -> NDArray[np.uint8]:
 
 
 def _draw_axes(page: Page, camera: bpy.types.Object) -> None:
-    """The directions of x, y and z in the lower left corner."""
+    """The directions of x, y and z, in the upper right corner beside the title."""
     em = page.em
-    x, y = 3.2 * em, page.height - 3.0 * em
+    x, y = page.width - 3.2 * em, 2.9 * em
     right, up, back = np.array(camera.rotation_quaternion.to_matrix()).T
     for axis in np.argsort(back):  # the nearest last
-        across, along = right[axis], -up[axis]
-        color = _AXES[axis]
-        page.line([(x, y), (x + 1.7 * em * across, y + 1.7 * em * along)], color, 0.14 * em)
-        page.text("xyz"[axis], x + 2.3 * em * across, y + 2.3 * em * along + 0.3 * em, em, color, "middle")
+        across, down, color = right[axis] * em, -up[axis] * em, _AXES[axis]
+        page.line([(x, y), (x + 1.4 * across, y + 1.4 * down)], color, 0.14 * em)
+        page.text("xyz"[axis], x + 2.0 * across, y + 2.0 * down + 0.3 * em, 0.9 * em, color, "middle")
 
 
 def _remove(scene: bpy.types.Scene) -> None:

@@ -61,7 +61,5 @@ class MPHDRR_OT_export_figure(jobs.JobOperator, bpy.types.Operator):
         if bool(self.width) != bool(self.height):
             raise InputError("size: give both width and height, or neither")
         size = (self.width, self.height) if self.width else None
-        return figures.figure_job(
-            context, self.figure.lower(), [storage.absolute(self.filepath)], size, self.modules or None, self.labels,
-            self.samples,
-        )  # fmt: skip
+        name, paths = self.figure.lower().replace("_", "-"), [storage.absolute(self.filepath)]
+        return figures.figure_job(context, name, paths, size, self.modules or None, self.labels, self.samples)

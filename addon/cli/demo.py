@@ -90,7 +90,7 @@ def _make_scene(scene: Any, run: ProjectionRun, out: Path) -> None:
         ranges = {f"modules-{first}-{last}": f"{first}-{last}" for first, last in scanner.quick_ranges(run.system)}
         for name, figure, modules in (*((name, "scanner", text) for name, text in ranges.items()), *_FIGURES):
             path = out / f"{name}.png"
-            jobs.run(figures.figure_job(bpy.context, figure, [path], _SIZE.get(figure), modules))
+            jobs.run(figures.figure_job(bpy.context, figure, [path], _SIZE.get(figure), modules, samples=8))
 
 
 @contextlib.contextmanager

@@ -25,6 +25,11 @@ from ...core.workbook import read_system
 from .scene import new_scene, quiet
 
 _WORKBOOKS = (".xlsx", ".xlsm")
+_MISSING = {
+    "scanner": "needs a scanner: give a workbook, a run or a .blend",
+    "volume": "needs a volume: give a volume file, a phantom, a run or a .blend",
+    "run": "needs projections: give a run, a recipe, or a .blend with projections",
+}
 _POSED = ("position", "euler_degrees", "voxels")
 
 
@@ -89,7 +94,7 @@ def _run(arguments: argparse.Namespace) -> None:
     else:
         subject = _subject(arguments)
         have = [need for need in NEEDS if getattr(subject, need) is not None]
-        require(kind.needs, have, kind.name)
+        require(kind.needs, have, kind.name, _MISSING)
         if kind.draw is not None:
             kind.draw(page, subject)
         else:

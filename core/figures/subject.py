@@ -1,6 +1,6 @@
 """What a figure is of."""
 
-from collections.abc import Container, Sequence
+from collections.abc import Container, Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -13,19 +13,15 @@ from ..runs.display import Display
 from ..runs.run import ProjectionRun
 from ..volumes.volume import Volume
 
-NEEDS = {
-    "scanner": "a scanner: give a workbook, a run or a .blend",
-    "volume": "a volume: give a volume file, a phantom, a run or a .blend",
-    "run": "projections: give a run or a recipe, or a .blend with projections",
-}
-"""What a figure may need, and how to give it."""
+NEEDS = ("scanner", "volume", "run")
+"""What a figure may need: fields of `Subject`."""
 
 
-def require(needs: Sequence[str], have: Container[str], figure: str) -> None:
-    """Raise `InputError` unless there is all that a figure needs."""
+def require(needs: Sequence[str], have: Container[str], figure: str, missing: Mapping[str, str]) -> None:
+    """Raise `InputError` unless there is all that a figure needs; `missing` says of each what to do."""
     for need in needs:
         if need not in have:
-            raise InputError(f"figure {figure}: needs {NEEDS[need]}")
+            raise InputError(f"figure {figure}: {missing[need]}")
 
 
 @dataclass(frozen=True, eq=False)

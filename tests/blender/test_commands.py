@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 import mphdrr.core as mph
-from mphdrr.addon import images, pictures, scanner, volumes
+from mphdrr.addon import images, scanner, volumes
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
 
@@ -70,24 +70,6 @@ def test_scene_command_refuses_activity_as_mu(tmp_path, workbook):
     done = run("-m", "mphdrr", "scene", workbook, "--mu", tmp_path / "a.nii", "-o", tmp_path / "s.blend", status=1)
     assert "a.nii: it holds activity, expected mu in 1/mm" in done.stderr
     assert not (tmp_path / "s.blend").exists()
-
-
-def test_pictures_leave_the_scene_as_it_was(tmp_path, dc_spect, scene):
-    collection = scanner.build_scanner(scene, dc_spect)
-    scanner.show_modules(collection, 5, 9)
-
-    def state() -> tuple:
-        counts = [
-            len(getattr(bpy.data, kind)) for kind in ("objects", "cameras", "lights", "worlds", "meshes", "materials")
-        ]
-        visible = [not camera.hide_viewport for camera in scanner.modules(collection)]
-        render = scene.render
-        return counts, visible, render.engine, render.resolution_x, render.filepath, scene.camera, scene.world
-
-    before = state()
-    pictures.render_scanner(collection, tmp_path / "p.png", 1, 20, samples=1)
-    assert state() == before
-    assert (tmp_path / "p.png").stat().st_size > 10_000
 
 
 @pytest.mark.long

@@ -98,6 +98,8 @@ HANDLERS: tuple[tuple[list[Any], Any], ...] = (
     (bpy.app.handlers.frame_change_post, slices.after_frame_change),
     (bpy.app.handlers.undo_post, live_scanner.after_undo),
     (bpy.app.handlers.redo_post, live_scanner.after_undo),
+    (bpy.app.handlers.undo_post, preview.after_update),
+    (bpy.app.handlers.redo_post, preview.after_update),
     (bpy.app.handlers.save_pre, storage.before_save),
     (bpy.app.handlers.save_pre, images.before_save),
     (bpy.app.handlers.save_post, storage.after_save),

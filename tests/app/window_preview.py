@@ -156,7 +156,7 @@ def steps():
     yield 4.0
     exact = importlib.import_module(f"{MODULE}.addon.images").projection_array(bpy.data.images["mphDRR 30"])
     settings = scene.mphdrr_display
-    seen["picked"] = [settings.automatic, settings.low, bool(0 < settings.high and np.isin(settings.high, exact))]
+    seen["picked"] = [settings.automatic, settings.low, bool(settings.high > 0 and np.isin(settings.high, exact))]
     seen["ok"] = True
 
 

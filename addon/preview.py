@@ -38,6 +38,7 @@ _INTERVAL = 0.02  # s between two looks, while there is something to do
 _REST = 0.3  # s without a change before the picture is made with all pixels
 _SHOWN_PIXELS = 512**2
 _MOST_CAUTIONS = 2
+_PATIENCE = 0.5  # s, after which it is said that a picture takes long
 
 Source = tuple[Path, NDArray[np.float64]]
 """File and pose (4, 4) of a volume, mm."""
@@ -190,11 +191,16 @@ class Session:
         self.shown: Preview | None = None
         self.problem = ""  # why there is no picture, in words
         self.cautions: tuple[str, ...] = ()  # what was warned of when it was made
+        self.started, self.quick = 0.0, True  # when the thread was, and what it makes
+        self.late = ""  # what the thread makes, where that takes long
 
     def look(self, context: bpy.types.Context) -> float | None:
         """Do what there is to do now; returns in how many seconds to look again, None for not before a change."""
         if self.worker is not None:
             if self.worker.is_alive():
+                if not self.late and time.monotonic() > self.started + _PATIENCE:
+                    self.late = "Being made again after a change" if self.quick else "Being made with all pixels"
+                    _redraw()
                 return _INTERVAL
             self._take(self.worker)
         if self.has_changed:
@@ -220,12 +226,13 @@ class Session:
     def _start(self, quick: bool) -> None:
         asked, voxels = self.asked, self.voxels
         assert asked is not None
+        self.quick, self.started = quick, time.monotonic()
         self.worker = jobs.Worker("Preview", lambda progress: make(asked, quick, voxels))
         self.worker.start()
 
     def _take(self, worker: jobs.Worker) -> None:
         """Show what a thread has made."""
-        self.worker = None
+        self.worker, self.late = None, ""
         error = worker.error
         if error is None:
             self.shown, self.problem, self.cautions = worker.result, "", tuple(worker.caught[:_MOST_CAUTIONS])
@@ -238,21 +245,20 @@ class Session:
         _redraw()
 
     def _fail(self, problem: str) -> None:
-        if (problem, None) != (self.problem, self.asked):
-            self.shown, self.problem, self.asked, self.full_at = None, problem, None, None
-            _redraw()
+        self.shown, self.problem, self.asked, self.full_at = None, problem, None, None
+        _redraw()
 
     @property
     def lines(self) -> tuple[str, ...]:
         """What stands beside the picture."""
-        waits = ("Waits for the running job",) if jobs.is_running() else ()
+        waits = "Waits for the running job" if jobs.is_running() else self.late
         if self.problem:
-            return ("No preview", self.problem, *waits)
-        return (
-            (*self.shown.lines, *self.cautions, *waits)
-            if self.shown
-            else ("Preview", "The first picture is being made")
-        )
+            said: tuple[str, ...] = ("No preview", self.problem)
+        elif self.shown is None:
+            said = ("Preview", "The first picture is being made")
+        else:
+            said = (*self.shown.lines, *self.cautions)
+        return (*said, waits) if waits else said
 
     @property
     def kept(self) -> str:

@@ -138,6 +138,8 @@ HANDLERS: tuple[tuple[list[Any], Any], ...] = (
     (bpy.app.handlers.redo_pre, framing.before_undo),
     (bpy.app.handlers.undo_post, framing.after_undo),
     (bpy.app.handlers.redo_post, framing.after_undo),
+    (bpy.app.handlers.undo_post, preview.after_update),
+    (bpy.app.handlers.redo_post, preview.after_update),
     (bpy.app.handlers.save_pre, storage.before_save),
     (bpy.app.handlers.save_pre, slices.before_save),
     (bpy.app.handlers.save_post, storage.after_save),

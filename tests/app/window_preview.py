@@ -1,10 +1,11 @@
-"""The example with a live preview: module and phantom moved fifty times, numbers and job; leaves the preview in view.
+"""The example with a live preview: fifty moves of module and phantom, numbers edited; then the eyedropper.
 
 Argument after ``--``: the file for what was seen.
 """
 
 import importlib
 import json
+import subprocess
 import sys
 import time
 import traceback
@@ -60,13 +61,23 @@ def load():
         bpy.ops.mphdrr.load_example("INVOKE_DEFAULT")
 
 
-def moved(item, times):
-    """Steps that move an object and note what each move took of the main thread."""
-    for number in range(MOVES):
-        spent["move"] = 0.0
-        item.location.x += 0.5 if number % 2 else -0.45
-        yield 0.15
-        times.append(1e3 * spent["move"])
+def pick_high(number):
+    """Click with the eyedropper on the brightest pixel of a module's tile in the mosaic."""
+    window = bpy.context.window_manager.windows[0]
+    area = next(a for a in window.screen.areas if a.type == "IMAGE_EDITOR")
+    region = next(r for r in area.regions if r.type == "WINDOW")
+    image = area.spaces.active.image
+    tiles = image["mphdrr_tiles"].to_dict()
+    exact = importlib.import_module(f"{MODULE}.addon.images").projection_array(bpy.data.images[f"mphDRR {number}"])
+    picture = exact[::-1, ::-1]
+    place = np.array(np.unravel_index(picture.argmax(), picture.shape)) + 0.5
+    row, column = np.reshape(tiles["corners"], (-1, 2))[tiles["numbers"].index(number)] + place
+    x, y = region.view2d.view_to_region(column / image.size[0], 1 - row / image.size[1], clip=False)
+    with bpy.context.temp_override(window=window, area=area, region=region):
+        bpy.ops.mphdrr.pick_window("INVOKE_DEFAULT", end="HIGH")
+    on_screen = str(round(region.x + x)), str(round(window.height - region.y - y))
+    subprocess.run(["xdotool", "mousemove", *on_screen], check=True)
+    subprocess.run(["xdotool", "click", "1"], check=True)
 
 
 def figures(name, times):
@@ -92,7 +103,7 @@ def steps():
     phantom.display_type = "BOUNDS"
     yield 4.0
     off = []
-    for _ in range(MOVES):
+    for _ in range(MOVES // 2):
         spent["move"] = 0.0
         camera.location.x += 0.01
         yield 0.05
@@ -103,13 +114,14 @@ def steps():
     yield 4.0
     session = preview.session()
     seen["first"] = [session.problem, session.lines, session.shown is not None and not session.shown.is_quick]
-    quick = []
-    for name, item in (("module", camera), ("phantom", phantom)):
-        times = []
-        for wait in moved(item, times):
-            yield wait
-            quick.append(session.shown.is_quick)
-        figures(name, times)
+    times, quick = [], []
+    for number in range(MOVES):
+        spent["move"] = 0.0
+        (camera, phantom)[number % 2].location.x += 0.5 if number % 4 < 2 else -0.45
+        yield 0.15
+        times.append(1e3 * spent["move"])
+        quick.append(session.shown.is_quick)
+    figures("on", times)
     seen["quick"] = sum(quick)
     yield 3.0
     seen["full"] = not session.shown.is_quick
@@ -132,6 +144,11 @@ def steps():
     scene.mphdrr_projections.model, phantom.display_type = "EMISSION", "TEXTURED"
     yield 6.0
     seen["unit"] = session.shown.run.unit
+    pick_high(30)
+    yield 4.0
+    exact = importlib.import_module(f"{MODULE}.addon.images").projection_array(bpy.data.images["mphDRR 30"])
+    settings = scene.mphdrr_display
+    seen["picked"] = [settings.automatic, settings.low, bool(settings.high > 0 and np.isin(settings.high, exact))]
     seen["ok"] = True
 
 

@@ -1,5 +1,7 @@
 """The live preview without a window: what is asked for, and that the picture is the projector's."""
 
+import threading
+
 import bpy
 import numpy as np
 import pytest
@@ -125,6 +127,26 @@ def test_what_cannot_be_previewed_is_said_in_a_line(scanned, scene, monkeypatch)
     bpy.data.objects.remove(phantom)
     assert "no volume" in look()[1]
     assert session.shown is None
+
+
+def test_a_picture_that_takes_long_says_that_it_is_of_before(scanned, scene, monkeypatch):
+    session, go_on, make = preview.Session(), threading.Event(), preview.make
+    session.look(bpy.context)
+    session.worker.join()
+    session.look(bpy.context)
+    before = session.lines
+    monkeypatch.setattr(preview, "make", lambda *arguments: go_on.wait(60) and make(*arguments))
+    monkeypatch.setattr(preview, "_PATIENCE", 0.0)
+    bpy.data.objects["Derenzo"].location.x = 7.0
+    bpy.context.view_layer.update()
+    session.has_changed, session.full_at = True, None
+    session.look(bpy.context)
+    session.look(bpy.context)
+    assert session.lines == (*before, "Being made again after a change")
+    go_on.set()
+    session.worker.join()
+    session.look(bpy.context)
+    assert "Being made" not in " ".join(session.lines) and session.shown.is_quick
 
 
 def test_a_phantom_that_has_changed_is_previewed_as_it_was_built(scanned, scene):

@@ -88,7 +88,6 @@ class PhantomSettings:
             else:
                 own.prop(self, name)
         column = layout.column(align=True)
-        column.use_property_split = False
         for name in sampling():
             column.prop(self, name)
 

@@ -84,7 +84,7 @@ def _properties() -> dict[str, Any]:
         if material is not None:
             none = ("NUMBER", "By Coefficient", f"By its attenuation coefficient{absent}")
             made[material] = _enumeration(material, setting, none)
-            common["name"] += f" µ ({setting.unit})"
+            common["name"] = f"µ ({setting.unit})"  # below the material's menu
         if setting.kind is bool:
             made[name] = BoolProperty(name=setting.label, description=setting.text, default=setting.default)
         elif setting.kind is str:

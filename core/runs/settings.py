@@ -174,12 +174,12 @@ _DECLARED = (
             "acquisition", "one photon per decay, and a constant activity", words=_ISOTOPES, needs=(_COUNTS,)),
     Setting("model.window", float, None, "Energies that are counted, from and to", "10 % around the isotope's strongest "
             "line", unit="keV", least=0, slider=1000, sizes=(2,), needs=(_COUNTS, "model.isotope"),
-            label="Energy Window (keV)"),
+            label="Window (keV)"),
     Setting("model.aperture_points", int, 1, "Points of the hole that rays pass; 1: its middle, no blur, 7 and more: the "
-            "blur of a hole of this size", least=1, slider=64, needs=(_COUNTS,)),
+            "blur of a hole of this size", least=1, slider=64, needs=(_COUNTS,), label="Hole Points"),
     Setting("model.aperture_tolerance", float, None, "In place of a number of points, as many as bring a voxel's image "
             "this close, such as 0.1, to that of the whole hole", "the number of points holds", above=0, slider=1,
-            needs=(_COUNTS,)),
+            needs=(_COUNTS,), label="Hole Tolerance"),
     Setting("model.aperture_mu", float, None, "Material of the aperture's edge, or its attenuation coefficient at the "
             "photons' energy", "nothing penetrates it", unit="1/mm", words=_named(APERTURES, _BY_NAME), above=0,
             slider=10, needs=(_COUNTS,), label="Aperture"),
@@ -195,7 +195,7 @@ _DECLARED = (
     Setting("model.depth_layers", int, 1, "Depths in the crystal at which photons are recorded (parallax); 1: where they "
             "enter", least=1, slider=8, needs=(_COUNTS, "model.crystal_mu")),
     Setting("model.intrinsic_fwhm", float, 0.0, "Full width at half maximum of the detector's own blur, on the crystal",
-            unit="mm", least=0, slider=10, needs=(_COUNTS,), label="Intrinsic Blur (mm)"),
+            unit="mm", least=0, slider=10, needs=(_COUNTS,), label="Blur (mm)"),
     Setting("model.within_cone", bool, False, "Nothing passes steeper than the knife edge's cone", needs=(_COUNTS,),
             label="Knife-Edge Cone"),
     Setting("model.within_walls", bool, False, "The collimator's walls stop photons that would miss the crystal's front",

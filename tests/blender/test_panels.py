@@ -5,6 +5,7 @@ from __future__ import annotations
 import functools
 from unittest.mock import MagicMock
 
+import blf
 import bpy
 import pytest
 
@@ -62,3 +63,12 @@ def test_panels_draw_what_exists(scene, ring_system):
 def test_panels_draw_a_phantom(kind):
     assert getattr(bpy.ops.mphdrr, f"add_{kind}")(voxels=12) == {"FINISHED"}
     draw_panels()
+
+
+def test_labels_of_the_projections_fit_beside_their_fields(scene):
+    """At the default width a label has 85 pixels, with letters of 11; checkboxes have theirs on the right."""
+    blf.size(0, 11)
+    properties = scene.mphdrr_projections.bl_rna.properties
+    drawn = {p.name for p in properties if p.type != "BOOLEAN" and not p.is_hidden}
+    assert len(drawn) > 20
+    assert {name for name in drawn if blf.dimensions(0, name)[0] > 85} == set()

@@ -69,6 +69,11 @@ def world_matrix(item: bpy.types.Object) -> NDArray[np.float64]:
     return world_matrix(item.parent) @ np.array(item.matrix_parent_inverse, dtype=np.float64) @ local
 
 
+def world_matrices(items: Sequence[bpy.types.Object]) -> NDArray[np.float64]:
+    """`world_matrix` of each object: (N, 4, 4)."""
+    return np.array([world_matrix(item) for item in items]).reshape(-1, 4, 4)
+
+
 def set_world_matrix(item: bpy.types.Object, matrix: NDArray[np.float64]) -> None:
     """Put an object at a world matrix (4, 4), under whatever parent it has."""
     if item.parent is not None:

@@ -44,6 +44,11 @@ class DisplayProperties(bpy.types.PropertyGroup):
     high: FloatProperty(
         name="High", description="The number that has the last colour", default=1.0, update=on_edit("display")
     )
+    half: BoolProperty(
+        name="Central Half", description="Show the middle half of each image only: of a wide field of view, twice the "
+        "crystal's, that is what the crystal sees",
+        update=on_edit("display"),
+    )  # fmt: skip
     planes: EnumProperty(
         name="Planes", description="Whose projections stand in the scene, between pinhole and ROI",
         items=choices.items({}, _PLANES), default="ALL", update=on_edit("planes"),
@@ -77,7 +82,7 @@ class DisplayProperties(bpy.types.PropertyGroup):
     def display(self) -> Display:
         """The colours, scale and window; raises `InputError` where the window is none."""
         low, high = (None, None) if self.automatic else (self.low, self.high)
-        return Display(self.colors.lower(), self.scale.lower(), low, high)
+        return Display(self.colors.lower(), self.scale.lower(), low, high, self.half)
 
 
 CLASSES = (DisplayProperties,)

@@ -1,6 +1,5 @@
 """The example: the bundled scanner around a Derenzo phantom, projected and shown, in one step."""
 
-from collections.abc import Generator
 from typing import Any
 
 import bpy
@@ -8,12 +7,12 @@ import numpy as np
 from mathutils import Euler
 
 from ..core.geometry.frames import euler_pose
-from ..core.progress import Progress, part_of
+from ..core.progress import Progress, stages_of
 from ..core.runs.files import write_run
 from ..core.runs.recipe import Recipe
 from ..core.runs.run_recipe import run_recipe
 from ..core.workbook import read_system
-from . import images, jobs, phantoms, rendering, scanner, studio
+from . import images, jobs, phantoms, rendering, runs, scanner, studio
 from .cli.demo import EULER_DEGREES, EXAMPLE
 from .phantom_properties import plain_settings
 
@@ -30,28 +29,33 @@ def example_job(context: bpy.types.Context) -> jobs.Job:
     detector = {"detector.rows": _PIXELS, "detector.columns": _PIXELS}
     placed = {"phantom.kind": "derenzo", "phantom.euler_degrees": EULER_DEGREES, "phantom.voxels": _VOXELS}
     recipe = Recipe({"system.file": str(EXAMPLE), **placed, **detector})
-    scene_name, path = scene.name, rendering.run_path(scene)
+    scene_name, path, display = scene.name, rendering.run_path(scene), scene.mphdrr_display.display()
 
     def work(progress: Progress) -> Any:
-        stored = adding.work(part_of(progress, 0, 2) or progress)
-        (run,) = run_recipe(recipe, system, stages=lambda stage: part_of(progress, 1, 2) or progress)
+        stages = stages_of(progress)
+        stored = adding.work(progress)
+        (run,) = run_recipe(recipe, system, stages=stages)
+        stages("writing the run file")
         write_run(run, path)
-        return stored, run
+        return stored, run, images.pictures(run, display, stages("storing"))
 
-    def finish(result: Any) -> Generator[None, None, str]:
-        stored, run = result
+    def finish(result: Any) -> jobs.Finishing:
+        stored, run, made = result
         scene = bpy.data.scenes[scene_name]
-        scanner.build_scanner(scene, system)
+        mosaic = yield from images.storing(run, display, made)
+        collection = scanner.build_scanner(scene, system)
+        yield None
         adding.finish(stored)
-        yield
-        mosaic = yield from rendering.storing(scene, run, path)
+        yield None
+        rendering.place(scene, run, collection)
+        runs.add(scene, run, path, rendering.taken_over(scene, run, bpy.context.object), collection)
         _hide_startup(scene)
         studio.light(scene)
         _look(bpy.context)
         images.show_below(mosaic, bpy.context)
         return f"Loaded the example: {len(system)} modules and what they see of a Derenzo phantom"
 
-    return jobs.Job("Loading the example", work, finish)
+    return jobs.Job("Loading the example", work, finish, lambda: path.unlink(missing_ok=True))
 
 
 def _hide_startup(scene: bpy.types.Scene) -> None:

@@ -6,6 +6,7 @@ Blender has stored an undo step, and undo expects the datablocks that it stored.
 
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from functools import lru_cache
 from typing import Any
 
 import bpy
@@ -14,10 +15,10 @@ import numpy as np
 from ..core.errors import InputError
 from ..core.geometry.collimator import Construction, EdgePlace
 from ..core.geometry.system import LENGTHS
-from ..core.physics.performance import isocentre_performance
+from ..core.physics.performance import ModulePerformance, isocentre_performance
 from . import cameras, collimators
 from .decimals import typed
-from .module_values import TYPED, ModuleNumbers, module_numbers, off_aim
+from .module_values import TYPED, ModuleNumbers, are_aimed, numbers_of, system_of
 
 PARTS = ("COLLIMATOR", "CRYSTAL")  # what hangs on a module's camera: `Object.mphdrr_module.part`
 _KEY = "mphdrr_solid"  # custom property of a mesh or camera: the numbers that it was built from
@@ -78,8 +79,8 @@ def refresh(
     found = modules(collection)
     with writing():
         parts = parts_of(collection, found if changed is None else changed)
-        rebuilt = [_refresh_module(camera, scanner, own, aim) for camera, own in parts.items()]
-        if changed is None or any(rebuilt) or scanner.count != len(found):
+        rebuilt = _refresh_modules(parts, scanner, aim)
+        if changed is None or rebuilt or scanner.count != len(found):
             _update_totals(scanner, [camera.mphdrr_module for camera in found])
             radius = max((camera.mphdrr_module.roi_radius for camera in found), default=0.0)
             for item in collection.objects:
@@ -116,34 +117,49 @@ def set_for_all(collection: bpy.types.Collection, name: str) -> None:
     refresh(collection)
 
 
-def _refresh_module(
-    camera: bpy.types.Object, scanner: bpy.types.PropertyGroup, parts: Sequence[bpy.types.Object], aim: bool
+def _refresh_modules(
+    parts: dict[bpy.types.Object, list[bpy.types.Object]], scanner: bpy.types.PropertyGroup, aim: bool
 ) -> bool:
-    """Make one module follow; returns whether its readouts have changed."""
-    module = camera.mphdrr_module
-    place = cameras.world_matrix(camera)[:3, 3]
-    if np.any(np.array(module.placed, np.float32) != place.astype(np.float32)):
-        is_new = not module.built
-        module.placed = place
-        data = camera.animation_data
-        animated = data is not None and (data.action is not None or len(data.drivers) or len(data.nla_tracks))
-        is_free = not animated and not len(camera.constraints)  # only the user turns it
-        if aim and not is_new and scanner.keep_aimed and is_free and off_aim([camera]) and np.any(place):
-            cameras.set_world_matrix(camera, cameras.camera_matrices(place[None])[0])
-    numbers, aimed = module_numbers(camera), not off_aim([camera])
-    built_as = _construction_numbers(scanner)
-    intrinsic_fwhm = typed(scanner.intrinsic_fwhm)
-    built = repr((*numbers._replace(center=numbers.center.tolist()), aimed, *built_as, intrinsic_fwhm))
-    changed = module.built != built
-    if changed:
-        module.built, module.finding = built, ""
-        module.collimator_length = numbers.collimator_length
-        _update_readouts(module, numbers, aimed, intrinsic_fwhm)
-    # Even where nothing has changed: an undo may have restored the numbers and not the meshes.
-    problem = "" if module.problem else _rebuild(camera, numbers, built_as, parts)
-    if problem:
-        module.problem = problem
-    return changed
+    """Make modules follow, all together, which is faster than one by one; returns whether a readout has changed."""
+    cameras_, matrices = list(parts), cameras.world_matrices(list(parts))
+    may_aim = aim and scanner.keep_aimed
+    off = ~are_aimed(matrices) & np.any(matrices[:, :3, 3], axis=1) & may_aim
+    to_aim = []
+    for m, (camera, place) in enumerate(zip(cameras_, matrices[:, :3, 3], strict=True)):
+        module = camera.mphdrr_module
+        if np.any(np.array(module.placed, np.float32) != place.astype(np.float32)):
+            if off[m] and module.built and is_free(camera):  # it is not new
+                to_aim.append(m)
+            module.placed = place
+    for m, matrix in zip(to_aim, cameras.camera_matrices(matrices[to_aim, :3, 3]), strict=True):
+        cameras.set_world_matrix(cameras_[m], matrix)
+        matrices[m] = cameras.world_matrix(cameras_[m])
+    built_as, intrinsic_fwhm = _construction_numbers(scanner), typed(scanner.intrinsic_fwhm)
+    found, changed = numbers_of(cameras_, matrices), []
+    for camera, numbers, aimed in zip(cameras_, found, are_aimed(matrices).tolist(), strict=True):
+        module = camera.mphdrr_module
+        built = repr((*numbers._replace(center=numbers.center.tolist()), aimed, *built_as, intrinsic_fwhm))
+        if module.built != built:
+            module.built, module.finding, module.aimed = built, "", aimed
+            module.collimator_length, module.pinhole_distance = numbers.collimator_length, numbers.pinhole_distance
+            changed.append((module, numbers))
+    _update_readouts(changed, intrinsic_fwhm)
+    for camera, numbers in zip(cameras_, found, strict=True):
+        # Even where nothing has changed: an undo may have restored the numbers and not the meshes.
+        problem = "" if camera.mphdrr_module.problem else _rebuild(camera, numbers, built_as, parts[camera])
+        if problem:
+            camera.mphdrr_module.problem = problem
+    return bool(changed)
+
+
+_construction = lru_cache(maxsize=1)(lambda numbers: Construction(*numbers))
+
+
+def is_free(camera: bpy.types.Object) -> bool:
+    """Whether only the user moves an object: no animation, driver or constraint does."""
+    data = camera.animation_data
+    animated = data is not None and (data.action is not None or len(data.drivers) or len(data.nla_tracks))
+    return not animated and not len(camera.constraints)
 
 
 def _construction_numbers(scanner: bpy.types.PropertyGroup) -> _ConstructionNumbers:
@@ -169,7 +185,7 @@ def _rebuild(
         if item.data.is_editmode or not _differs(item.data, given[part]):
             continue
         try:
-            solid = collimators.part_solid(part, numbers, Construction(*built_as))
+            solid = collimators.part_solid(part, numbers, _construction(built_as))
         except InputError as error:  # e.g. while d is typed before Ld: the last shape stays
             return f"module {numbers.number}: {error}"
         collimators.reshape_mesh(item.data, solid)
@@ -182,22 +198,25 @@ def _differs(data: bpy.types.ID, numbers: tuple[float | str, ...]) -> bool:
     return data.users == 1 and data.get(_KEY) != repr(numbers)
 
 
-def _update_readouts(
-    module: bpy.types.PropertyGroup, numbers: ModuleNumbers, aimed: bool, intrinsic_fwhm: float
-) -> None:
-    """Write a module's readouts; where its numbers are impossible they are 0, and `problem` says why."""
-    module.pinhole_distance, module.aimed = numbers.pinhole_distance, aimed
-    sizes = numbers.pinhole_diameter, numbers.collimator_length, numbers.detector_side, numbers.detector_thickness
-    try:
-        numbers.system()  # refuses impossible numbers
-        at = isocentre_performance(numbers.pinhole_distance, *sizes, intrinsic_fwhm=intrinsic_fwhm)
-    except InputError as error:
-        module.problem = str(error)
-        module.sensitivity = module.resolution = module.magnification = module.roi_seen = 0.0
+def _update_readouts(changed: Sequence[tuple[bpy.types.PropertyGroup, ModuleNumbers]], intrinsic_fwhm: float) -> None:
+    """Write modules' readouts; where the numbers of one are impossible they are 0, and `problem` says why."""
+    if not changed:
         return
-    module.problem = ""
-    module.sensitivity, module.resolution = 1e6 * float(at.sensitivity), float(at.resolution)
-    module.magnification, module.roi_seen = float(at.magnification), float(at.roi_radius_seen)
+    try:
+        system = system_of([numbers for _, numbers in changed])  # refuses impossible ones
+        sizes = (getattr(system, name) for name in LENGTHS if name != "roi_radius")
+        at = isocentre_performance(system.pinhole_distance, *sizes, intrinsic_fwhm=intrinsic_fwhm)
+        problem = ""
+    except InputError as error:
+        if len(changed) > 1:  # which one is it?
+            for one in changed:
+                _update_readouts([one], intrinsic_fwhm)
+            return
+        problem, at = str(error), ModulePerformance(*np.zeros((4, 1)))
+    for (module, _), *values in zip(changed, *(readout.tolist() for readout in at), strict=True):
+        module.problem = problem
+        module.sensitivity, module.resolution = 1e6 * values[0], values[1]
+        module.magnification, module.roi_seen = values[2:]
 
 
 def _update_totals(scanner: bpy.types.PropertyGroup, modules: Sequence[bpy.types.PropertyGroup]) -> None:

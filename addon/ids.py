@@ -5,6 +5,7 @@ CATEGORY = "mphDRR"  # the sidebar tab
 
 # --- Operators: idname as in `bpy.ops.<idname>` -------------------------------------------------------------
 IMPORT_GEOMETRY = "mphdrr.import_geometry"
+BROWSE_EXAMPLE = "mphdrr.browse_example"
 LOAD_EXAMPLE = "mphdrr.load_example"
 SHOW_MODULES = "mphdrr.show_modules"
 LOOK_THROUGH_MODULE = "mphdrr.look_through_module"
@@ -35,18 +36,28 @@ FIND_VOLUME_FILES = "mphdrr.find_volume_files"
 EXPORT_VOLUME = "mphdrr.export_volume"
 RENDER_PROJECTIONS = "mphdrr.render_projections"
 EXPORT_DATASET = "mphdrr.export_dataset"
+USE_PRESET = "mphdrr.use_preset"
 LOAD_RECIPE = "mphdrr.load_recipe"
 SHOW_PROJECTIONS = "mphdrr.show_projections"
+EXPORT_FIGURE = "mphdrr.export_figure"
+SHOW_RUN = "mphdrr.show_run"
+REMOVE_RUN = "mphdrr.remove_run"
+COMPARE_RUNS = "mphdrr.compare_runs"
+LIVE_PREVIEW = "mphdrr.live_preview"
 PICK_MODULE = "mphdrr.pick_module"
+WIDE_FIELD = "mphdrr.wide_field"
+PICK_WINDOW = "mphdrr.pick_window"
+CLEAN_CACHE = "mphdrr.clean_cache"
 CANCEL_JOB = "mphdrr.cancel_job"
 
 # --- Panels, drawn in the order of the work: bl_order -----------------------------------------------------------------
-ORDER_GEOMETRY, ORDER_PHANTOM, ORDER_PROJECTIONS, ORDER_EXPORT = 0, 10, 20, 30
+ORDER_GEOMETRY, ORDER_PHANTOM, ORDER_PROJECTIONS, ORDER_RUNS, ORDER_EXPORT = 0, 10, 20, 25, 30
 
 # --- Datablocks ---------------------------------------------------------------------------------------------
 SCANNER = "Scanner"  # default name of a scanner's collection
 PARTS = ("NONE", "CAMERA", "COLLIMATOR", "CRYSTAL", "ROI", "PLANE")  # `Object.mphdrr_module.part`
 MOSAIC = "mphDRR mosaic"
+DIFFERENCE = "mphDRR difference"
 PLANES = "mphDRR projections"  # the collection of the planes that show them
 STUDIO = "mphDRR studio"  # the collection of the lights, and a world
 PREVIEW = ".preview"  # in the names of coarser copies of large volumes, for display only

@@ -4,37 +4,84 @@ The arrays' column index grows along +u, so an image's columns are reversed; its
 Each module has two: one holds the exact float32 numbers in R, G and B, the other, as the mosaic, shows them in colours.
 """
 
-from collections.abc import Generator
+import os
+from collections.abc import Generator, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
 from typing import Any
 
 import bpy
 import numpy as np
 from numpy.typing import NDArray
 
+from ..core.progress import Progress
 from ..core.runs.display import Display
-from ..core.runs.mosaic import as_seen, sheet
+from ..core.runs.exr import exr_bytes
+from ..core.runs.mosaic import Sheet, as_seen, sheet, smaller
 from ..core.runs.run import ProjectionRun
 from . import ids
 
 _KEY = "mphdrr_projection"  # custom property: marks the images that a new run replaces
+_PIXELS = 2.2e7
+"""Of all pictures together, about: larger images are shown smaller, since a picture takes memory again when it is drawn."""
+_SCANNER = "mphdrr_scanner"  # custom property of the mosaic: the collection of the scanner that the run is of
+_TEXT = "mphdrr_difference"  # custom property of a difference: its numbers, in words
 _TILES = "mphdrr_tiles"  # custom property of the mosaic: its modules, unit, and where in it which one's image is
 
 
-def storing(run: ProjectionRun, display: Display) -> Generator[None, None, bpy.types.Image]:
+@dataclass(frozen=True)
+class Pictures:
+    """What the images of a run will hold, made in a thread."""
+
+    display: Display
+    exact: list[bytes]  # OpenEXR files
+    colored: Sequence[NDArray[np.uint8]]  # (height, width, 3), row 0 at the top
+    mosaic: Sheet
+
+
+def pictures(run: ProjectionRun, display: Display, progress: Progress | None = None) -> Pictures:
+    """Make the contents of a run's images; leaves bpy alone. `progress` counts the modules."""
+    exact: list[bytes] = []
+    with ThreadPoolExecutor(os.cpu_count()) as pool:
+        for packed in pool.map(exr_bytes, as_seen(run.projections)):
+            exact.append(packed)
+            if progress is not None:
+                progress(len(exact), len(run.views))
+    numbers, rings = run.system.numbers.tolist(), run.system.rings().tolist()
+    colored = list(_colored(run.projections, display))
+    return Pictures(display, exact, colored, sheet(run.projections, numbers, rings, run.unit, display))
+
+
+def storing(
+    run: ProjectionRun, display: Display, made: Pictures | None = None
+) -> Generator[tuple[str, int, int], None, bpy.types.Image]:
     """Make images of a run, packed into the .blend, in place of those of an earlier run.
 
     For each module one of the exact numbers, float32, and one to look at; and the mosaic, which is returned. Yields
-    between steps, so that a window can be drawn.
+    between steps, so that a window can be drawn; what ends it there leaves the earlier run's images as they are.
+    `made` is what `pictures` has made.
     """
+    made = made or pictures(run, display)
     numbers = run.system.numbers.tolist()
-    names = [projection_name(number, numbers) for number in numbers]
-    for picture, name in zip(as_seen(run.projections), names, strict=True):
-        _store(name, picture, exact=True)
-        yield
-    kept = {*names, *map(ids.picture_name, names), ids.MOSAIC}
-    for other in [image for image in bpy.data.images if _KEY in image and image.name not in kept]:
-        bpy.data.images.remove(other)
-    return (yield from _showing(run.projections, numbers, run.system.rings().tolist(), run.unit, display))
+    new: dict[str, bpy.types.Image] = {}
+    try:
+        for k, (number, exact, colors) in enumerate(zip(numbers, made.exact, made.colored, strict=True)):
+            yield "storing", k, len(numbers)
+            name = projection_name(number, numbers)
+            new[name] = bpy.data.images.new(name, 1, 1, float_buffer=True, is_data=True)
+            new[name].pack(data=exact, data_len=len(exact))
+            new[name].source = "FILE"  # the packed one, which Blender reads when the image is looked at
+            new[ids.picture_name(name)] = _new(ids.picture_name(name), colors)
+        new[ids.MOSAIC] = _new(ids.MOSAIC, made.mosaic.picture)
+        yield "storing", len(numbers), len(numbers)
+    except BaseException:
+        bpy.data.batch_remove(new.values())
+        raise
+    _put_in_place(new)
+    _describe(new[ids.MOSAIC], made.mosaic, numbers, run.system.rings().tolist(), run.unit)
+    if made.display != display:  # which was edited meanwhile
+        show_again(display)
+    return new[ids.MOSAIC]
 
 
 def show_again(display: Display) -> None:
@@ -42,20 +89,47 @@ def show_again(display: Display) -> None:
     shown = tiles(bpy.data.images.get(ids.MOSAIC))
     if shown is None:
         return
-    numbers = shown["numbers"]
+    numbers, rings, unit = (shown[name] for name in ("numbers", "rings", "unit"))
     found = [bpy.data.images.get(projection_name(number, numbers)) for number in numbers]
-    if None not in found:
-        projections = np.stack([projection_array(image) for image in found])
-        for _ in _showing(projections, numbers, shown["rings"], shown["unit"], display):
-            pass
+    if None in found:
+        return
+    projections = np.stack([projection_array(image) for image in found])
+    for number, colors in zip(numbers, _colored(projections, display), strict=True):
+        picture = bpy.data.images.get(ids.picture_name(projection_name(number, numbers)))
+        if picture is not None:
+            _fill(picture, colors)
+    drawn = sheet(projections, numbers, rings, unit, display)
+    _fill(bpy.data.images[ids.MOSAIC], drawn.picture)
+    _describe(bpy.data.images[ids.MOSAIC], drawn, numbers, rings, unit)
 
 
 def tiles(image: bpy.types.Image | None) -> dict[str, Any] | None:
     """Of the mosaic: `numbers` and `rings` of its modules, `unit`, the tiles' size `tile` and their `corners`; else None.
 
-    Rows and columns are counted from the top left.
+    Rows and columns are counted from the top left. `window` is that of the colours; `totals` are what `summed` says of each
+    image, "sum" or "mean", `maxima` their largest numbers, and `half` whether only their middle halves are meant and shown.
+    Files of earlier versions lack these five.
     """
     return None if image is None or _TILES not in image else image[_TILES].to_dict()
+
+
+def share_shown() -> tuple[float, float]:
+    """What the pictures show of the width and height of the exact images."""
+    x, y = (tiles(bpy.data.images.get(ids.MOSAIC)) or {}).get("share", (1.0, 1.0))
+    return x, y
+
+
+def set_scanner(mosaic: bpy.types.Image, collection: bpy.types.Collection | None) -> None:
+    """Note which scanner the mosaic's run is of."""
+    if collection is not None:
+        mosaic[_SCANNER] = collection
+    elif _SCANNER in mosaic:
+        del mosaic[_SCANNER]
+
+
+def scanner_of(mosaic: bpy.types.Image) -> bpy.types.Collection | None:
+    """The scanner that the mosaic's run is of; None where it has been removed."""
+    return mosaic.get(_SCANNER)
 
 
 def projection_name(number: int, numbers: list[int]) -> str:
@@ -63,28 +137,56 @@ def projection_name(number: int, numbers: list[int]) -> str:
     return ids.projection_name(number, max(numbers))
 
 
-def _showing(
-    projections: NDArray[np.float32], numbers: list[int], rings: list[int], unit: str, display: Display
-) -> Generator[None, None, bpy.types.Image]:
-    """Make the pictures of projections (M, n_v, n_u) as `display` says; returns the mosaic."""
+def _colored(projections: NDArray[np.float32], display: Display) -> Iterator[NDArray[np.uint8]]:
+    """The pictures of projections (M, n_v, n_u) as `display` says, in one window."""
     window = display.window(projections)
-    for picture, number in zip(as_seen(projections), numbers, strict=True):
-        name = ids.picture_name(projection_name(number, numbers))
-        _store(name, display.colored(picture, window), exact=False)
-        yield
-    drawn = sheet(projections, numbers, rings, unit, display)
-    image = _store(ids.MOSAIC, drawn.picture, exact=False)
+    for picture in smaller(as_seen(display.part(projections)), _PIXELS):
+        yield display.colored(picture, window)
+
+
+def _describe(image: bpy.types.Image, drawn: Sheet, numbers: list[int], rings: list[int], unit: str) -> None:
+    """Note on the mosaic what is where in it."""
     image[_TILES] = {
         "numbers": numbers, "rings": rings, "unit": unit, "corners": drawn.corners.ravel().tolist(), "tile": drawn.tile,
+        "window": drawn.window, "summed": drawn.summed, "totals": drawn.totals.tolist(), "maxima": drawn.maxima.tolist(),
+        "half": drawn.half, "share": drawn.share,
     }  # fmt: skip
+
+
+def store_difference(drawn: Sheet, numbers: list[int], unit: str, text: str) -> bpy.types.Image:
+    """Make the image of a difference of two runs, until other projections are shown; `text` says its numbers."""
+    old = bpy.data.images.get(ids.DIFFERENCE)
+    image = _new(ids.DIFFERENCE, drawn.picture) if old is None else _fill(old, drawn.picture)
+    image.use_fake_user, image[_KEY] = True, True
+    _describe(image, drawn, numbers, [], unit)
+    image[_TEXT] = text
     return image
+
+
+def difference_text() -> str:
+    """The numbers of the difference that was drawn last; "" where there is none."""
+    image = bpy.data.images.get(ids.DIFFERENCE)
+    return str(image.get(_TEXT, "")) if image is not None else ""
+
+
+def clear() -> None:
+    """Remove all images of runs."""
+    bpy.data.batch_remove([image for image in bpy.data.images if _KEY in image])
+
+
+def is_exact(image: bpy.types.Image) -> bool:
+    """Whether an image holds the exact numbers of a module's projection."""
+    return _KEY in image and image.is_float
 
 
 def projection_array(image: bpy.types.Image) -> NDArray[np.float32]:
     """The projection (n_v, n_u) that a module image holds, in the arrays' order."""
+    was_read = image.has_data
     width, height = image.size
     pixels = np.empty(4 * width * height, np.float32)
     image.pixels.foreach_get(pixels)
+    if not was_read and image.packed_file is not None:
+        image.buffers_free()  # four times the size of the numbers
     return np.ascontiguousarray(pixels.reshape(height, width, 4)[:, ::-1, 0])
 
 
@@ -144,28 +246,35 @@ def _fit(context: bpy.types.Context, window: bpy.types.Window, area: bpy.types.A
     bpy.app.timers.register(fit, first_interval=0.2)
 
 
-def _store(name: str, picture: NDArray[Any], *, exact: bool) -> bpy.types.Image:
-    """Make or replace our image `name`, from numbers (height, width) or 8-bit colours (…, 3), row 0 at the top."""
-    height, width = picture.shape[:2]
-    image = old = bpy.data.images.get(name)
-    if old is None or _KEY not in old or tuple(old.size) != (width, height) or old.is_float != exact:
-        image = bpy.data.images.new(name, width, height, float_buffer=exact, is_data=exact)
-        if old is not None and _KEY in old:
-            old.user_remap(image)
-            bpy.data.images.remove(old)
-            image.name = name
-        elif old is not None:  # somebody else's image has our name
-            old.name = f"{name}.other"
-            image.name = name
+def _new(name: str, colors: NDArray[np.uint8]) -> bpy.types.Image:
+    return _fill(bpy.data.images.new(name, colors.shape[1], colors.shape[0]), colors)
+
+
+def _fill(image: bpy.types.Image, colors: NDArray[np.uint8]) -> bpy.types.Image:
+    """Give an image 8-bit colours (height, width, 3), row 0 at the top."""
+    height, width = colors.shape[:2]
+    if tuple(image.size) != (width, height):
+        image.scale(width, height)
     pixels = np.ones((height, width, 4), np.float32)
-    pixels[..., :3] = picture[::-1, :, None] if exact else picture[::-1] / np.float32(255)
+    np.divide(colors[::-1], np.float32(255), out=pixels[..., :3])
     image.pixels.foreach_set(pixels.ravel())
     image.update()
-    image.use_fake_user = True  # or it is not saved while nothing shows it
-    image[_KEY] = True
-    if exact:
-        image.pack()
     return image
+
+
+def _put_in_place(new: dict[str, bpy.types.Image]) -> None:
+    """Give new images their names; they replace all our images of before."""
+    old = {image for image in bpy.data.images if _KEY in image}
+    for name, image in new.items():
+        before = bpy.data.images.get(name)
+        if before in old and before.users > before.use_fake_user:
+            before.user_remap(image)
+        elif before is not None and before not in old and before != image:  # somebody else's image has our name
+            before.name = f"{name}.other"
+        image.use_fake_user = True  # or it is not saved while nothing shows it
+    bpy.data.batch_remove(old)
+    for name, image in new.items():
+        image.name, image[_KEY] = name, True
 
 
 @bpy.app.handlers.persistent

@@ -1,10 +1,12 @@
 """Long work that leaves the window alive: a thread does it, a modal operator watches it.
 
 A function of `addon` returns a `Job`; an operator that inherits from `JobOperator` does it. Started from the window
-(INVOKE), it runs in a thread, until Esc or the panel's button cancels it. Called from a script (EXEC) or without a window,
-the operator returns when the job is done. Scripts can also do a job themselves, with `run`.
+(INVOKE), it runs in a thread, after those that were started before it, until Esc or a button cancels it. Called from a
+script (EXEC) or without a window, the operator returns when the job is done. Scripts can also do a job themselves, with
+`run`.
 """
 
+import itertools
 import threading
 import time
 import traceback
@@ -13,11 +15,11 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import bpy
-from bpy.props import BoolProperty
+from bpy.props import BoolProperty, IntProperty
 
 from ..core.cli.options import progress_bar
 from ..core.errors import InputError
-from ..core.progress import Cancelled, Progress
+from ..core.progress import Cancelled, Progress, StagedProgress
 from ..core.recording import recorded_warnings
 from . import ids
 from .reports import warnings_reported
@@ -25,6 +27,14 @@ from .reports import warnings_reported
 _INTERVAL = 0.1  # s between two looks at the thread
 _STEP = 0.05  # s that finishing may take of the main thread before the window is drawn again
 _PATIENCE = 10.0  # s that `stop` waits for a thread
+_STATUS_UNITS = 16  # the job's width in the status bar
+_SOON = 1.0  # s of a stage after which the time left is guessed
+
+Finishing = Generator[tuple[str, int, int] | None, None, str]
+"""Steps of the main thread, between which the window is drawn; returns the line to report.
+
+A step that can be cancelled yields its stage, what is done of it, and its total; one that can not yields None.
+"""
 
 
 @dataclass
@@ -32,71 +42,131 @@ class Job:
     """Work to do, and what to do with its result.
 
     ``work(progress)`` runs in a thread and must not touch bpy; ``progress(done, total)`` raises `Cancelled` when the user
-    wants to stop. ``finish(result)`` runs in the main thread and returns the line to report; if that takes long, it is a
-    generator that yields between its steps, so that the window can be drawn.
+    wants to stop, `stages_of` gives its stages. ``finish(result)`` runs in the main thread and returns the line to report;
+    if that takes long, it is a generator (`Finishing`). Where the user cancels, its last yield raises `Cancelled`: by then
+    it has changed nothing that it does not take back. ``discard()`` removes what the work has left on disk, where the job
+    ends before it has finished.
     """
 
     label: str
     work: Callable[[Progress], Any]
-    finish: Callable[[Any], str | Generator[None, None, str]]
+    finish: Callable[[Any], str | Finishing]
+    discard: Callable[[], None] = lambda: None
 
 
 def run(job: Job, progress: Progress = lambda done, total: None) -> str:
     """Do a job now; returns the line to report, raises what the work raises."""
-    steps = _finishing(job, job.work(progress))
-    while True:
-        try:
-            next(steps)
-        except StopIteration as end:
-            return str(end.value)
+    try:
+        steps = _finishing(job, job.work(progress))
+        while True:
+            try:
+                next(steps)
+            except StopIteration as end:
+                return str(end.value)
+    except BaseException:
+        job.discard()
+        raise
 
 
-def _finishing(job: Job, result: Any) -> Generator[None, None, str]:
+def _finishing(job: Job, result: Any) -> Finishing:
     finished = job.finish(result)
     return (yield from finished) if isinstance(finished, Generator) else finished
 
 
 class Worker(threading.Thread):
-    """The thread that does a job's work, with its progress and the warnings that it gave."""
+    """The thread that does a job's work, with its stage and the warnings that it gave; later, the steps that finish it."""
+
+    _numbers = itertools.count(1)
 
     def __init__(self, label: str, work: Callable[[Progress], Any]) -> None:
         super().__init__(name=f"mphDRR: {label}", daemon=True)
-        self.label, self.work = label, work
+        self.label, self.work, self.number = label, work, next(self._numbers)
+        self.stage, self.since = label, time.monotonic()
         self.done = self.total = 0
         self.result: Any = None
         self.error: BaseException | None = None
         self.caught: list[str] = []
         self.cancel = threading.Event()
+        self.steps: Finishing | None = None
+        self._can_stop = False
 
     def run(self) -> None:
         with recorded_warnings() as self.caught:
             try:
-                self.result = self.work(self._progress)
+                self.result = self.work(StagedProgress(self._begin, self.label))
             except BaseException as error:
                 self.error = error
 
-    def _progress(self, done: int, total: int) -> None:
-        self.done, self.total = done, total
+    @property
+    def share(self) -> float:
+        """How much of the stage is done."""
+        return min(1.0, self.done / max(1, self.total))
+
+    @property
+    def text(self) -> str:
+        """The stage in words: how far it is, and how long it takes."""
+        words, seconds = self.stage[:1].upper() + self.stage[1:], time.monotonic() - self.since
         if self.cancel.is_set():
-            raise Cancelled
+            return f"{words}: stopping"
+        if self.total < 2:
+            return f"{words}, {seconds:.0f} s" if seconds > _SOON else words
+        words = f"{words} {self.done} of {self.total}"
+        if seconds < _SOON or not self.done:
+            return words
+        return f"{words}, {_readable(seconds / self.done * (self.total - self.done))} left"
+
+    @property
+    def is_stoppable(self) -> bool:
+        """Whether the user has cancelled it and finishing can be stopped after its last step."""
+        return self.cancel.is_set() and self._can_stop
+
+    def show_step(self, step: tuple[str, int, int] | None) -> None:
+        """Note a step of finishing."""
+        self._can_stop = step is not None
+        if step is not None:
+            self.show(*step)
+
+    def show(self, stage: str, done: int, total: int) -> None:
+        """Note how far a stage is."""
+        if stage != self.stage:
+            self.stage, self.since = stage, time.monotonic()
+        self.done, self.total = done, total
+
+    def _begin(self, stage: str) -> Progress:
+        def progress(done: int, total: int) -> None:
+            self.show(stage, done, total)
+            if self.cancel.is_set():
+                raise Cancelled
+
+        self.since = time.monotonic()
+        progress(0, 0)
+        return progress
+
+
+def _readable(seconds: float) -> str:
+    return f"{seconds:.0f} s" if seconds < 100 else f"{seconds / 60:.0f} min"
 
 
 _current: Worker | None = None
+_waiting: list[Worker] = []
 
 
 def is_running() -> bool:
-    """Whether a job runs in a thread now."""
-    return _current is not None
+    """Whether a job runs in a thread now, or waits for its turn."""
+    return _current is not None or bool(_waiting)
 
 
 @bpy.app.handlers.persistent
 def stop(*_: Any) -> None:
-    """Stop the running job and wait for its thread: before a file is loaded, or the extension is disabled."""
+    """Stop all jobs and wait for the running one's thread: before a file is loaded, or the extension is disabled."""
     global _current
     worker, _current = _current, None
+    _waiting.clear()
     if worker is not None:
         worker.cancel.set()
         worker.join(_PATIENCE)
+        if worker.steps is not None:
+            worker.steps.close()
 
 
 class JobOperator:
@@ -116,7 +186,6 @@ class JobOperator:
     _asked = False
     _job: Job | None = None
     _run: Worker | None = None
-    _finishing: Generator[None, None, str] | None = None
     _timer: bpy.types.Timer | None = None
 
     if TYPE_CHECKING:  # what every bpy.types.Operator has
@@ -144,22 +213,21 @@ class JobOperator:
         if self._asked:
             return self._start_after_asking()
         try:
-            _require_idle()
+            if is_running():
+                raise InputError("another job is running: wait for it or cancel it")
             with warnings_reported(self):
                 job = self.job(context)
-                text = run(job, progress_bar(job.label))
+                text = run(job, StagedProgress(progress_bar, job.label))
             self.report({"INFO"}, text)
         except BaseException as error:
             return self._failed(error)
         return {"FINISHED"}
 
     def invoke(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str]:
-        """Start the job in a thread; without a window, do it at once."""
-        global _current
+        """Start the job in a thread, or let it wait for those before it; without a window, do it at once."""
         if bpy.app.background or context.window is None:
             return self.execute(context)
         try:
-            _require_idle()
             asked = None if self.confirmed else self.ask(context)
             if asked is not None:
                 self._asked = True
@@ -168,43 +236,50 @@ class JobOperator:
                 self._job = self.job(context)
         except Exception as error:
             return self._failed(error)
-        self._run = _current = Worker(self._job.label, self._job.work)
-        _current.start()
+        self._run = Worker(self._job.label, self._job.work)
+        _waiting.append(self._run)
+        self._begin_if_first()
         manager = context.window_manager
         self._timer = manager.event_timer_add(_INTERVAL, window=context.window)
         manager.modal_handler_add(self)
         return {"RUNNING_MODAL"}
 
     def modal(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str]:
-        """Watch the thread; when it is done, finish step by step."""
+        """Begin when it is this job's turn, watch the thread, and when that is done, finish step by step."""
         job, worker = self._job, self._run
-        if job is None or worker is None or worker is not _current:  # stopped from outside
-            self._end(context)
+        if job is None or worker is None or (worker is not _current and worker not in _waiting):  # stopped from outside
+            self.cancel(context)
             return {"CANCELLED"}
-        if event.type == "ESC" and event.value == "PRESS":
+        if event.type == "ESC" and event.value == "PRESS" and worker is _current:
             worker.cancel.set()
             return {"RUNNING_MODAL"}
         if event.type != "TIMER":
             return {"PASS_THROUGH"}
-        redraw_sidebars()
+        if worker in _waiting and not worker.cancel.is_set():
+            self._begin_if_first()
+            return {"PASS_THROUGH"}
+        _redraw(context)
         if worker.is_alive():
             return {"PASS_THROUGH"}
         try:
-            if self._finishing is None:
+            if worker.steps is None:
                 for text in worker.caught:
                     self.report({"WARNING"}, text)
                 if worker.error is not None or worker.cancel.is_set():
                     raise worker.error or Cancelled()
-                self._finishing = _finishing(job, worker.result)
+                worker.steps = _finishing(job, worker.result)
+                worker.result = None
             enough = time.perf_counter() + _STEP
             while time.perf_counter() < enough:
-                next(self._finishing)
+                step = worker.steps.throw(Cancelled()) if worker.is_stoppable else next(worker.steps)
+                worker.show_step(step)
         except StopIteration as end:
             self._end(context)
             self.report({"INFO"}, end.value)
             return {"FINISHED"}
         except BaseException as error:
             self._end(context)
+            job.discard()
             return self._failed(error)
         return {"PASS_THROUGH"}
 
@@ -213,6 +288,15 @@ class JobOperator:
         if self._run is not None and self._run is _current:
             stop()
         self._end(context)
+        if self._job is not None:
+            self._job.discard()
+
+    def _begin_if_first(self) -> None:
+        """Start the thread where no job runs and none waits longer."""
+        global _current
+        if _current is None and self._run is _waiting[0]:
+            _current = _waiting.pop(0)
+            _current.start()
 
     def _start_after_asking(self) -> set[str]:
         """Blender calls `execute` after a dialog, which cannot become modal: start another operator of this kind."""
@@ -231,13 +315,19 @@ class JobOperator:
             self._timer = None
         if _current is self._run:
             _current = None
-        redraw_sidebars()
+        elif self._run in _waiting:
+            _waiting.remove(self._run)
+        _redraw(context)
 
     def _failed(self, error: BaseException) -> set[str]:
         if isinstance(error, Cancelled):
             self.report({"WARNING"}, f"{self.bl_label}: cancelled, nothing was changed")
         elif isinstance(error, InputError):
             self.report({"ERROR"}, str(error))
+        elif isinstance(error, ReferenceError):  # a datablock that the job had made or found
+            self.report(
+                {"ERROR"}, f"{self.bl_label}: stopped, since Undo has taken back what it works on; start it again"
+            )
         elif isinstance(error, MemoryError):
             self.report({"ERROR"}, f"{self.bl_label}: not enough memory; choose fewer voxels or pixels")
         elif isinstance(error, Exception):
@@ -248,32 +338,41 @@ class JobOperator:
         return {"CANCELLED"}
 
 
-def _require_idle() -> None:
-    if is_running():
-        raise InputError("another job is running: wait for it or cancel it")
-
-
 class MPHDRR_OT_cancel_job(bpy.types.Operator):
-    """Stop the running job; the scene stays as it was"""
+    """Stop a job, or take it out of the queue; the scene stays as it was"""
 
     bl_idname = ids.CANCEL_JOB
     bl_label = "Cancel"
     bl_options = {"INTERNAL"}
 
+    number: IntProperty(name="Job", description="Its number; 0: the running one", options={"HIDDEN", "SKIP_SAVE"})
+
     def execute(self, context: bpy.types.Context) -> set[str]:
         """Ask it to stop at its next step."""
-        if _current is not None:
-            _current.cancel.set()
+        for worker in filter(None, (_current, *_waiting)):
+            if self.number == worker.number or (self.number == 0 and worker is _current):
+                worker.cancel.set()
         return {"FINISHED"}
 
 
 def draw_job(layout: bpy.types.UILayout) -> None:
-    """Draw the running job's progress bar and Cancel button; nothing where there is none."""
-    if _current is not None:
-        share = _current.done / max(1, _current.total)
+    """Draw the running job's stage and those that wait, each with its Cancel button; nothing where there is none."""
+    for worker in filter(None, (_current, *_waiting)):
         row = layout.row(align=True)
-        row.progress(factor=share, type="BAR", text=f"{_current.label}  {share:.0%}")
-        row.operator(ids.CANCEL_JOB, text="", icon="CANCEL")
+        if worker is _current:
+            row.progress(factor=worker.share, type="BAR", text=worker.text)
+        else:
+            row.label(text=f"{worker.label}: waits", icon="TIME")
+        row.operator(ids.CANCEL_JOB, text="", icon="CANCEL").number = worker.number
+
+
+def draw_status(header: bpy.types.Header, context: bpy.types.Context) -> None:
+    """Draw the running job in Blender's status bar."""
+    if _current is not None:
+        row = header.layout.row(align=True)
+        row.ui_units_x = _STATUS_UNITS
+        row.progress(factor=_current.share, type="BAR", text=f"mphDRR: {_current.text}")
+        row.operator(ids.CANCEL_JOB, text="", icon="CANCEL").number = _current.number
 
 
 def _argument(value: Any) -> Any:
@@ -285,9 +384,11 @@ def _argument(value: Any) -> Any:
     return value
 
 
-def redraw_sidebars() -> None:
-    """Have the panels drawn, but not the scene: ten times a second, that would slow the work down."""
-    for window in bpy.context.window_manager.windows:
+def _redraw(context: bpy.types.Context) -> None:
+    """Have sidebars and status bars drawn, but not the scene: ten times a second, that would slow the work down."""
+    for window in context.window_manager.windows:
+        with bpy.context.temp_override(window=window):
+            window.workspace.status_text_set(None)  # there is no other way to have the status bar drawn
         for area in window.screen.areas:
             for region in area.regions:
                 if area.type == "VIEW_3D" and region.type == "UI":

@@ -10,10 +10,11 @@ from typing import Any
 
 import bpy
 
-from . import following, module_edits, scanner
+from . import following, grabbing, module_edits, scanner
 
 _INTERVAL = 0.2  # s between two looks whether a tool is still running
 _overlooked = False  # something happened while rendering or playing
+_unstored = False  # modules have moved and no undo step has it
 _undone: dict[str, str] = {}  # by scanner: what the last undo left untidy, in words
 
 
@@ -33,18 +34,19 @@ def _follow(scene: bpy.types.Scene, depsgraph: bpy.types.Depsgraph, aim: bool) -
     global _overlooked
     if depsgraph.mode != "VIEWPORT" or following.is_writing():
         return
-    moved, structure = set(), _overlooked
-    for update in depsgraph.updates:
-        item = update.id.original
-        if isinstance(item, bpy.types.Scene):
-            structure = True  # objects were added, deleted, shown or hidden
-        elif update.is_updated_transform and isinstance(item, bpy.types.Object) and item.mphdrr_module.is_module:
-            moved.add(item)
-    if not (moved or structure):
+    # Both when objects were added, deleted, shown or hidden; selecting is an update of the scene alone.
+    structure = _overlooked or (depsgraph.id_type_updated("SCENE") and depsgraph.id_type_updated("COLLECTION"))
+    objects = [u.id.original for u in depsgraph.updates if u.is_updated_transform and u.id.id_type == "OBJECT"]
+    moved = {item for item in objects if item.mphdrr_module.is_module}
+    off = [
+        item for item in (scene.objects if _overlooked else objects) if grabbing.is_part(item) and grabbing.is_off(item)
+    ]
+    if not (moved or off or structure):
         return
     _overlooked = _is_busy()
     if _overlooked:
         return
+    moved |= _carry(off)
     for collection in _local(scanner.scanners(scene)):
         found = scanner.modules(collection)
         following.refresh(collection, found if structure else [camera for camera in found if camera in moved], aim)
@@ -52,10 +54,29 @@ def _follow(scene: bpy.types.Scene, depsgraph: bpy.types.Depsgraph, aim: bool) -
             _look_for_copies(collection)
 
 
+def _carry(off: list[bpy.types.Object]) -> set[bpy.types.Object]:
+    """Modules follow their parts that are `off`; returns their cameras."""
+    global _unstored
+    dragging = grabbing.is_dragging()
+    # Blender stores an undo step when a drag ends; what a script moved was stored before the cameras followed.
+    _unstored |= bool(off) and not dragging and not all(map(grabbing.is_dragged, off))
+    carried = grabbing.carry(off, dragging)
+    if off:
+        _settle_later()
+    return carried
+
+
 @bpy.app.handlers.persistent
 def after_undo(*_: Any) -> None:
     """Undo and redo restore some datablocks and leave others: make everything agree again."""
+    global _unstored
     _undone.clear()
+    _unstored = False
+    for item in filter(grabbing.is_part, bpy.data.objects):
+        if grabbing.is_dragged(item):
+            grabbing.finish(item)
+        elif grabbing.is_off(item):  # in the undo step its camera has not followed yet: so it has not moved
+            grabbing.put_back(item)
     for collection in _local(bpy.data.collections):
         following.refresh(collection)
         with following.writing():
@@ -68,13 +89,15 @@ def after_load(*_: Any) -> None:
     """A file was opened; one of an older version has shared meshes and no readouts. Nothing is tidied unasked."""
     for collection in _local(bpy.data.collections):
         module_edits.make_single_users(collection)
+        for item in filter(grabbing.is_part, collection.all_objects):
+            item.lock_location = item.lock_rotation = (False, False, False)  # as version 0.1.0 locked them
     after_undo()
 
 
 def stop() -> None:
     """Forget what waits: the extension is disabled."""
-    if bpy.app.timers.is_registered(_tidy):
-        bpy.app.timers.unregister(_tidy)
+    if bpy.app.timers.is_registered(_settle):
+        bpy.app.timers.unregister(_settle)
 
 
 def _local(collections: Iterable[bpy.types.Collection]) -> list[bpy.types.Collection]:
@@ -95,15 +118,27 @@ def _look_for_copies(collection: bpy.types.Collection) -> None:
             properties.untidy = text
     if _undone.get(collection.name) != text:
         _undone.pop(collection.name, None)
-    if text and collection.name not in _undone and not bpy.app.background and not bpy.app.timers.is_registered(_tidy):
-        bpy.app.timers.register(_tidy, first_interval=_INTERVAL)
+    if text and collection.name not in _undone:
+        _settle_later()
 
 
-def _tidy() -> float | None:
-    """Tidy once no tool is running, e.g. the move that follows Shift+D. The operator makes an undo step of it."""
+def _settle_later() -> None:
+    if not bpy.app.background and not bpy.app.timers.is_registered(_settle):
+        bpy.app.timers.register(_settle, first_interval=_INTERVAL)
+
+
+def _settle() -> float | None:
+    """Finish and tidy once no tool is running, e.g. the move that follows Shift+D. Tidying is an undo step."""
+    global _unstored
     windows = bpy.context.window_manager.windows
     if any(len(window.modal_operators) for window in windows) or _is_busy():
         return _INTERVAL
+    for item in filter(grabbing.is_dragged, bpy.context.scene.objects):
+        grabbing.finish(item)
+    if _unstored:
+        _unstored = False
+        with bpy.context.temp_override(window=windows[0]):
+            bpy.ops.ed.undo_push(message="Move Module")
     if any(c.mphdrr_scanner.untidy for c in scanner.scanners(bpy.context.scene)):
         try:
             bpy.ops.mphdrr.tidy_modules("EXEC_DEFAULT", True)

@@ -6,7 +6,7 @@ valid as long as the visible one is its rounding. A number that the user has typ
 
 import json
 from collections import namedtuple
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from typing import Any
 
 import bpy
@@ -37,10 +37,12 @@ class ModuleNumbers(_Fields):
         """b: pinhole centre to isocentre."""
         return float(np.linalg.norm(self.center))
 
-    def system(self) -> PinholeSystem:
-        """A system of this module alone; raises `InputError` where the numbers are impossible."""
-        lengths = {name: np.array([getattr(self, name)]) for name in LENGTHS}
-        return PinholeSystem(self.center[None], **lengths, numbers=np.array([self.number]), source=None)
+
+def system_of(modules: Sequence[ModuleNumbers], source: Any = None) -> PinholeSystem:
+    """A system of these modules; raises `InputError` where their numbers are impossible."""
+    lengths = {name: np.array([getattr(numbers, name) for numbers in modules]) for name in LENGTHS}
+    centers, own = np.array([numbers.center for numbers in modules]), np.array([numbers.number for numbers in modules])
+    return PinholeSystem(centers, **lengths, numbers=own, source=source)
 
 
 def write_module(camera: bpy.types.Object, system: PinholeSystem, m: int, ring: int) -> None:
@@ -71,7 +73,7 @@ def add_module(camera: bpy.types.Object, number: int, index: int, center: NDArra
     module, numbers = camera.mphdrr_module, module_numbers(camera)
     numbers = numbers._replace(number=number, center=numbers.center if center is None else center)
     if module.length_mode == FROM_ROI:
-        numbers = _with_length(numbers)
+        (numbers,) = _with_lengths([numbers])
     module.number, module.index, module.added = number, index, True
     _write_exact(camera, numbers)
 
@@ -92,44 +94,60 @@ def module_numbers(camera: bpy.types.Object) -> ModuleNumbers:
     Numbers that have not changed are as imported. An `l` that follows the ROI is calculated in float64 once a number in
     its formula has changed; where the formula has no solution (a pinhole inside the ROI) `l` keeps its last value.
     """
-    module, exact = camera.mphdrr_module, exact_values(camera)
-    center = _center(camera, exact.get("center"))
-    values = {name: typed(getattr(module, name)) for name in LENGTHS}
-    values |= {
-        name: exact[name] for name in LENGTHS if name in exact and np.float32(exact[name]) == getattr(module, name)
-    }
-    numbers = ModuleNumbers(module.number, center, **values)
-    if module.length_mode != FROM_ROI:
-        return numbers
-    now = [FROM_ROI, center.tolist(), *(values[name] for name in _DESIGNED_FROM)]
-    if now == [exact.get(name) for name in ("mode", "center", *_DESIGNED_FROM)]:
-        return numbers._replace(collimator_length=exact["collimator_length"])
-    return _with_length(numbers)
+    return numbers_of([camera], cameras.world_matrix(camera)[None])[0]
 
 
-def _with_length(numbers: ModuleNumbers) -> ModuleNumbers:
-    given = [getattr(numbers, name) for name in _DESIGNED_FROM]
+def numbers_of(cameras_: Sequence[bpy.types.Object], matrices: NDArray[np.float64]) -> list[ModuleNumbers]:
+    """`module_numbers` of each module; `matrices` (M, 4, 4) are the cameras' world matrices."""
+    found: list[ModuleNumbers] = []
+    designed = []
+    for camera, place in zip(cameras_, matrices[:, :3, 3].tolist(), strict=True):
+        module, exact = camera.mphdrr_module, exact_values(camera)
+        values = {name: getattr(module, name) for name in LENGTHS}
+        for name, value in values.items():
+            known = exact.get(name)
+            values[name] = known if known is not None and np.float32(known) == value else typed(value)
+        numbers = ModuleNumbers(module.number, _center(camera, place, exact.get("center")), **values)
+        if module.length_mode == FROM_ROI:
+            now = [FROM_ROI, numbers.center.tolist(), *(values[name] for name in _DESIGNED_FROM)]
+            if now == [exact.get(name) for name in ("mode", "center", *_DESIGNED_FROM)]:
+                numbers = numbers._replace(collimator_length=exact["collimator_length"])
+            else:
+                designed.append(len(found))
+        found.append(numbers)
+    for i, numbers in zip(designed, _with_lengths([found[i] for i in designed]), strict=True):
+        found[i] = numbers
+    return found
+
+
+def _with_lengths(modules: Sequence[ModuleNumbers]) -> list[ModuleNumbers]:
+    """The modules with the design formula's `l`."""
+    given = [[numbers.pinhole_distance for numbers in modules]]
+    given += [[getattr(numbers, name) for numbers in modules] for name in _DESIGNED_FROM]
     try:
-        return numbers._replace(collimator_length=float(collimator_length(numbers.pinhole_distance, *given)))
-    except InputError:
-        return numbers  # `read_scanner` and the module's `problem` say what is wrong
+        lengths = collimator_length(*given).tolist()
+    except InputError:  # `read_scanner` and the module's `problem` say what is wrong
+        return list(modules) if len(modules) == 1 else [_with_lengths([numbers])[0] for numbers in modules]
+    return [numbers._replace(collimator_length=l) for numbers, l in zip(modules, lengths, strict=True)]
 
 
-def _center(camera: bpy.types.Object, exact: list[float] | None) -> NDArray[np.float64]:
-    """Pinhole centre (3,), mm: the coordinates of `exact` as long as they are those of the camera."""
-    place = cameras.world_matrix(camera)[:3, 3]
-    if camera.parent is None and not len(camera.constraints):
-        place = np.array([typed(x) for x in place])
+def _center(camera: bpy.types.Object, place: list[float], exact: list[float] | None) -> NDArray[np.float64]:
+    """Pinhole centre (3,), mm: the coordinates of `exact` as long as they are those of the camera's `place`."""
+    is_free = camera.parent is None and not len(camera.constraints)
     if exact is None:
-        return place
-    rounding = 4 * float(np.spacing(np.float32(np.abs(exact).max())))
-    return np.where(np.abs(place - exact) <= rounding, exact, place)
+        return np.array([typed(x) if is_free else x for x in place])
+    rounding = 4 * float(np.spacing(np.float32(max(map(abs, exact)))))
+    now = []
+    for x, known in zip(place, exact, strict=True):
+        x = typed(x) if is_free else x
+        now.append(known if abs(x - known) <= rounding else x)
+    return np.array(now)
 
 
 def is_moved(camera: bpy.types.Object) -> bool:
     """Whether the pinhole is not where it was imported."""
     center = exact_values(camera).get("center")
-    return _center(camera, center).tolist() != center
+    return _center(camera, cameras.world_matrix(camera)[:3, 3].tolist(), center).tolist() != center
 
 
 def is_edited(camera: bpy.types.Object) -> bool:
@@ -140,12 +158,16 @@ def is_edited(camera: bpy.types.Object) -> bool:
 
 def off_aim(cameras_: Iterable[bpy.types.Object]) -> list[int]:
     """Numbers of the modules whose cameras do not look at the isocentre, or are rolled."""
-    return [camera.mphdrr_module.number for camera in cameras_ if not _is_aimed(cameras.world_matrix(camera))]
+    found = list(cameras_)
+    aimed = are_aimed(cameras.world_matrices(found))
+    return [camera.mphdrr_module.number for camera, is_aimed in zip(found, aimed, strict=True) if not is_aimed]
 
 
-def _is_aimed(matrix: NDArray[np.float64]) -> bool:
-    if not np.any(matrix[:3, 3]):
-        return False  # at the isocentre there is no direction to it
-    rotation = matrix[:3, :3] / np.linalg.norm(matrix[:3, :3], axis=0)
-    aimed = cameras.camera_matrices(matrix[None, :3, 3])[0, :3, :3]
-    return bool(np.abs(rotation - aimed).max() <= _TURNED)
+def are_aimed(matrices: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """Whether cameras of these world matrices (M, 4, 4) look at the isocentre, upright: (M,)."""
+    aimed = np.any(matrices[:, :3, 3], axis=1)  # at the isocentre there is no direction to it
+    rotation = matrices[aimed, :3, :3]
+    rotation /= np.linalg.norm(rotation, axis=1, keepdims=True)
+    error = np.abs(rotation - cameras.camera_matrices(matrices[aimed, :3, 3])[:, :3, :3])
+    aimed[aimed] = error.max(axis=(1, 2)) <= _TURNED
+    return aimed

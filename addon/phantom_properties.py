@@ -311,6 +311,8 @@ class VolumeProperties(bpy.types.PropertyGroup):
         name="Surface", description="Value at which the surface is drawn", update=on_edit("display_range")
     )
     slices: IntVectorProperty(name="Slices", description="Voxel from 0", size=3, min=0, update=on_edit("slices"))
+    # Name of the file that the voxels were first stored in: says whether they are the same, in every version of Blender.
+    content: StringProperty(options={"HIDDEN"})
     exact_pose: StringProperty(options={"HIDDEN"})  # world-from-object matrix in double precision, JSON
     # Voxels by which the .vdb is shifted for the Blender that wrote it.
     center_shift: FloatProperty(options={"HIDDEN"})

@@ -20,7 +20,7 @@ from ..core.errors import InputError
 from ..core.geometry.grid import Grid
 from ..core.memory import require
 from ..core.phantoms.phantom import Phantom
-from ..core.progress import Progress, part_of
+from ..core.progress import Progress, part_of, stages_of
 from ..core.volumes.meshes.mesh import Mesh
 from . import jobs, meshes, storage, volumes
 from .cameras import remove_objects, set_world_matrix, world_matrix
@@ -66,7 +66,9 @@ class Recipe:
         if count > 1:
             shape = " x ".join(map(str, self.grid.shape))
             require(4.0 * count * self.grid.n_voxels, f"{title}: {count} volumes of {shape} voxels")
-        reports = (part_of(progress, number, count) for number in range(count))
+        stages = stages_of(progress)
+        voxelizing = stages("voxelizing")
+        reports = (part_of(voxelizing, number, count) for number in range(count))
         stored = []
         for quantity, pose in zip(quantities, poses, strict=True):
             if baked:
@@ -84,6 +86,7 @@ class Recipe:
                 place, settings = pose, self.settings
                 own = [phantom.voxelize(self.grid, None, next(reports), quantity) for phantom in self.states]
                 made = [moved(volume, pose) for volume in own]
+            stages("writing the voxels")
             stored.append(store_volume(made, folder, place, settings))
         return stored
 
@@ -223,9 +226,14 @@ def mu_energy(item: bpy.types.Object) -> float | None:
 
 def require_current(item: bpy.types.Object) -> None:
     """Raise `InputError` where a volume is of a phantom whose settings have changed since its voxels were made."""
-    phantom = root_of(item)
-    if phantom is not None and phantom.mphdrr_volume.outdated:
+    if (phantom := outdated(item)) is not None:
         raise InputError(f"{phantom.name!r} has changed since its voxels were made: press Update Phantom first")
+
+
+def outdated(item: bpy.types.Object) -> bpy.types.Object | None:
+    """The phantom of a volume if its settings have changed since its voxels were made; else None."""
+    phantom = root_of(item)
+    return phantom if phantom is not None and phantom.mphdrr_volume.outdated else None
 
 
 def root_of(item: bpy.types.Object) -> bpy.types.Object | None:

@@ -4,16 +4,15 @@ A plane is an image empty, a child of its module's camera, in a collection of it
 looks through the camera sees the scene, and the picture over it as the camera's background image.
 """
 
-from typing import Any
-
 import bpy
 import numpy as np
+from mathutils import Matrix
 from numpy.typing import NDArray
 
 from ..core.geometry.system import PinholeSystem
 from ..core.geometry.views import Views
 from ..core.runs.run import ProjectionRun
-from . import ids, images, scanner, selection
+from . import grabbing, ids, images, scanner, selection
 
 _KEY = (
     "mphdrr_field"  # custom property of a plane: middle and size (5,) of the virtual detector in the camera's frame, mm
@@ -21,12 +20,11 @@ _KEY = (
 _BETWEEN = 0.3  # of the way from the pinhole to the ROI's surface: where a plane is unless told otherwise
 
 
-def make(scene: bpy.types.Scene, run: ProjectionRun) -> list[bpy.types.Object]:
-    """Show the pictures of a run (`images.storing`) at the modules of the scene's scanner, in place of another run's.
+def make(scene: bpy.types.Scene, run: ProjectionRun, collection: bpy.types.Collection | None) -> list[bpy.types.Object]:
+    """Show the pictures of a run (`images.storing`) at the modules of its scanner, in place of another run's.
 
     Modules that the scanner does not have any more get none.
     """
-    collection = scanner.active_scanner(scene)
     remove(scene)
     if collection is None:
         return []
@@ -44,7 +42,7 @@ def make(scene: bpy.types.Scene, run: ProjectionRun) -> list[bpy.types.Object]:
         plane.empty_display_type, plane.data = "IMAGE", picture
         plane.empty_image_side, plane.use_empty_image_alpha = "BACK", True
         plane.parent, plane.mphdrr_module.part, plane.mphdrr_module.number = camera, "PLANE", number
-        plane.lock_location = plane.lock_rotation = plane.lock_scale = (True, True, True)
+        plane.lock_scale = (True, True, True)
         plane[_KEY] = field.tolist()
         home.objects.link(plane)
         _set_background(camera.data, field, picture)
@@ -71,16 +69,15 @@ def remove(scene: bpy.types.Scene) -> None:
 def update(scene: bpy.types.Scene) -> None:
     """Place and show the planes and backgrounds as the scene's settings say."""
     settings = scene.mphdrr_display
+    part = images.share_shown()
     for plane, shown in _wanted(scene):
         camera, field = plane.parent, np.array(plane[_KEY])
-        module = camera.mphdrr_module
-        distance = settings.plane_distance or _BETWEEN * (module.pinhole_distance - module.roi_radius)
-        x, y, depth, width, height = field * (1.0 if settings.plane_at_detector else distance / field[2])
-        plane.location = x, y, -depth
+        x, y, depth, width, height = field * share_of_way(settings, camera.mphdrr_module, field[2])
+        width, height = width * part[0], height * part[1]
         # A picture's longer side is as long as the empty; pixels that are not square are stretched.
         columns, rows = plane.data.size
         plane.empty_display_size = max(columns, rows)
-        plane.scale = width / columns, height / rows, 1.0
+        grabbing.place(plane, Matrix.LocRotScale((x, y, -depth), None, (width / columns, height / rows, 1.0)))
         plane.color[3] = settings.plane_opacity
         if plane.hide_viewport == shown:
             plane.hide_viewport = not shown
@@ -88,12 +85,20 @@ def update(scene: bpy.types.Scene) -> None:
             if background.image == plane.data:
                 background.show_background_image = settings.backgrounds
                 background.alpha = settings.plane_opacity
+                _place_background(background, camera.data, field, part[0])
+
+
+def share_of_way(settings: bpy.types.PropertyGroup, module: bpy.types.PropertyGroup, distance: float) -> float:
+    """Where a module's picture is shown: as a share of the way from its pinhole to the detector at `distance`, mm."""
+    if settings.plane_at_detector:
+        return 1.0
+    return (settings.plane_distance or _BETWEEN * (module.pinhole_distance - module.roi_radius)) / distance
 
 
 @bpy.app.handlers.persistent
-def after_update(scene: bpy.types.Scene, *_: Any) -> None:
+def after_update(scene: bpy.types.Scene, depsgraph: bpy.types.Depsgraph) -> None:
     """Another module is active, or modules were shown or hidden: so are their planes."""
-    if any(plane.hide_viewport == shown for plane, shown in _wanted(scene)):
+    if depsgraph.id_type_updated("SCENE") and any(plane.hide_viewport == shown for plane, shown in _wanted(scene)):
         update(scene)
 
 
@@ -126,16 +131,22 @@ def _fields(system: PinholeSystem, views: Views) -> NDArray[np.float64]:
 
 
 def _set_background(camera: bpy.types.Camera, field: NDArray[np.float64], picture: bpy.types.Image) -> None:
-    """Lay a picture over a camera's view, as large as it is seen from there."""
+    """Lay a picture over a camera's view."""
     background = camera.background_images.new()
     background.image = picture
-    x, y, distance, width, height = field
-    seen = camera.sensor_width / camera.lens * distance  # how much the camera sees there
     background.frame_method, background.display_depth = "STRETCH", "FRONT"
-    background.use_flip_x, background.use_flip_y = bool(width < 0), bool(height < 0)
-    background.scale = abs(width) / seen
-    background.offset = x / seen, y / seen
+    background.use_flip_x, background.use_flip_y = bool(field[3] < 0), bool(field[4] < 0)
     camera.show_background_images = True
+
+
+def _place_background(
+    background: bpy.types.CameraBackgroundImage, camera: bpy.types.Camera, field: NDArray[np.float64], share: float
+) -> None:
+    """Make a picture as large as the `share` of the field that it shows is seen from the camera."""
+    x, y, distance, width, _ = field
+    seen = camera.sensor_width / camera.lens * distance  # how much the camera sees there
+    background.scale = share * abs(width) / seen
+    background.offset = x / seen, y / seen
 
 
 def _remove_background(camera: bpy.types.Camera, picture: bpy.types.Image | None) -> None:

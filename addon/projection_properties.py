@@ -8,6 +8,7 @@ from typing import Any
 import bpy
 from bpy.props import (
     BoolProperty,
+    CollectionProperty,
     EnumProperty,
     FloatProperty,
     FloatVectorProperty,
@@ -18,13 +19,18 @@ from bpy.props import (
 
 from ..core.errors import InputError
 from ..core.physics.maps import MAPS
+from ..core.runs.presets import PRESETS
 from ..core.runs.recipe import Recipe, fitting_recipe, is_met
 from ..core.runs.settings import SETTINGS, Setting
-from . import choices, volumes
+from . import choices, scanner, volumes
 from .decimals import typed
+from .updates import on_edit
 
 OPENING_ANGLE = "model.opening_angle_degrees"
 """A setting of the scanner's here: its collimators are drawn with it."""
+
+USUAL_TIME = 600.0
+"""s, of a cardiac acquisition: what the panel has when a preset or a volume makes it count photons."""
 
 _NAMES = {"model.kind": "model", "detector.plane": "detector", "detector.rows": "height", "detector.columns": "width"}
 """Names that .blend files keep, where they are not those of the settings."""
@@ -97,8 +103,8 @@ class ProjectionSettings:
 
     noise: BoolProperty(name="Poisson Noise", description="Draw counts instead of their expected means")
     seed: IntProperty(name="Seed", description="Of the noise: the same seed draws the same counts", default=1, min=0)
-    first: IntProperty(name="First", description="First module number to project; 0: from the first", default=0, min=0)
-    last: IntProperty(name="Last", description="Last module number to project; 0: to the last", default=0, min=0)
+    first: IntProperty(name="First Module", description="Its number; 0: from the first", default=0, min=0)
+    last: IntProperty(name="Last Module", description="Its number; 0: to the last", default=0, min=0)
 
 
 ProjectionSettings.__annotations__.update(_properties())
@@ -153,19 +159,51 @@ def set_panel(settings: ProjectionProperties, recipe: Recipe) -> None:
     except ValueError:
         raise InputError(f"system.modules: the panel has one range of modules, not {text!r}") from None
     for name, setting in PROPERTIES.items():
-        material = _material(name, setting)
-        for own in filter(None, (name, material)):
-            settings.property_unset(own)
-        value = recipe.given.get(setting.key)
-        if isinstance(value, str) and value != "auto":
-            own = material or name
-            setattr(settings, own, _identifier(own, value))
-        elif value not in (None, "auto"):
-            setattr(settings, name, value)
+        _set(settings, name, recipe.given.get(setting.key))
+    settings.fitted = ""  # the model is the recipe's, whatever the volume holds
+    settings.model = _identifier("model", recipe["model.kind"])
     settings.noise = recipe["noise.seed"] is not None
     if settings.noise:
         settings.seed = recipe["noise.seed"]
     settings.first, settings.last = modules
+
+
+def _set(settings: ProjectionProperties, name: str, value: Any) -> None:
+    """Set a property to a value of a recipe; None and "auto" are its default."""
+    setting = PROPERTIES[name]
+    material = _material(name, setting)
+    for own in filter(None, (name, material)):
+        settings.property_unset(own)
+    if isinstance(value, str) and value != "auto":
+        own = material or name
+        setattr(settings, own, _identifier(own, value))
+    elif value not in (None, "auto"):
+        setattr(settings, name, value)
+
+
+def use_preset(settings: ProjectionProperties, preset: str) -> None:
+    """Set the physics as a preset of `core.runs.presets` says; what it leaves alone stays."""
+    changes = PRESETS[preset].changes
+    for name, setting in PROPERTIES.items():
+        if setting.key in changes:
+            _set(settings, name, changes[setting.key])
+    _set_time(settings)
+
+
+def fit_model(settings: ProjectionProperties, quantity: str) -> None:
+    """Choose the model by what a volume holds, unless the user has chosen one: counts of activity, a radiograph of mu."""
+    model = {"activity": "EMISSION", "mu": "TRANSMISSION"}.get(quantity)
+    if model is None or (settings.is_property_set("model") and settings.model != settings.fitted):
+        return
+    settings.model = settings.fitted = model
+    if model == "EMISSION":
+        _set_time(settings)
+
+
+def _set_time(settings: ProjectionProperties) -> None:
+    """Nobody acquires for the default time, 1 s, which only makes counts the sensitivity's rates."""
+    if not settings.is_property_set("time"):
+        settings.time = USUAL_TIME
 
 
 def drawn(settings: ProjectionProperties, table: str) -> Iterator[tuple[str, bool]]:
@@ -201,22 +239,73 @@ def _is_mu(self: ProjectionProperties, item: bpy.types.Object) -> bool:
     return volumes.is_volume(item) and volumes.quantity_of(item) == "mu"
 
 
+class RunProperties(bpy.types.PropertyGroup):
+    """A run in the scene's list, `ProjectionProperties.runs`; `addon/runs.py` writes it."""
+
+    name: StringProperty(name="Name", description="Of the run; one that is given another name is kept")
+    usual_name: StringProperty(name="Usual Name", description="That it got when it was made", options={"HIDDEN"})
+    file: StringProperty(
+        name="File", description="With its exact arrays", subtype="FILE_PATH",
+        options={"HIDDEN", "PATH_SUPPORTS_BLEND_RELATIVE"},
+    )  # fmt: skip
+    scanner: PointerProperty(name="Scanner", description="That it is of", type=bpy.types.Collection)
+    summary: StringProperty(name="Summary", description="What it is", options={"HIDDEN"})
+    state: StringProperty(name="State", description="Of the scene when it was made, float64 JSON", options={"HIDDEN"})
+    keep: BoolProperty(
+        name="Keep",
+        description="Keep this run. Of the others the last two stay, and the next render replaces the older",
+    )
+    is_saved: BoolProperty(name="Saved", description="A saved .blend may need its file", options={"HIDDEN"})
+
+    @property
+    def is_kept(self) -> bool:
+        """Whether the next render leaves it."""
+        return bool(self.keep or self.name != self.usual_name)
+
+
+def _volume_chosen(self: ProjectionProperties, context: bpy.types.Context) -> None:
+    # In the panel: to a script, a model that changes by itself would be a wrong number without a word.
+    if self.volume is not None and context.region is not None and context.region.type == "UI":
+        fit_model(self, volumes.quantity_of(self.volume))
+
+
+def _projects_all(self: ProjectionProperties) -> bool:
+    return self.first == self.last == 0
+
+
+def _project_all(self: ProjectionProperties, value: bool) -> None:
+    collection = None if value else scanner.active_scanner(self.id_data)
+    numbers = [camera.mphdrr_module.number for camera in scanner.modules(collection)] if collection else []
+    self.first, self.last = (min(numbers), max(numbers)) if numbers else (0, 0 if value else 1)
+
+
 class ProjectionProperties(ProjectionSettings, bpy.types.PropertyGroup):
     """State of the Projections panel; `Scene.mphdrr_projections`."""
 
     volume: PointerProperty(
         name="Volume", description="What to project; empty: the active volume, or the only one", type=bpy.types.Object,
-        poll=_is_ours,
+        poll=_is_ours, update=_volume_chosen,
     )  # fmt: skip
+    all_modules: BoolProperty(
+        name="All Modules", description="Project into every module, not a range of numbers",
+        get=_projects_all, set=_project_all,
+    )  # fmt: skip
+    fitted: StringProperty(
+        name="Fitted Model", description="The model that the volume's quantity has chosen", options={"HIDDEN"}
+    )
     mu: PointerProperty(
         name="Attenuation", description="Volume of attenuation coefficients (1/mm) before the pinhole; empty: none",
         type=bpy.types.Object, poll=_is_mu,
     )  # fmt: skip
+    runs: CollectionProperty(type=RunProperties, name="Runs", options={"HIDDEN"})
+    active_run: IntProperty(
+        name="Run", description="The run in the list whose images are shown", update=on_edit("active_run")
+    )
     run_file: StringProperty(
-        name="Run", description="File with the last run's exact arrays", subtype="FILE_PATH",
+        name="Run", description="File with the shown run's exact arrays", subtype="FILE_PATH",
         options={"HIDDEN", "PATH_SUPPORTS_BLEND_RELATIVE"},
     )  # fmt: skip
-    run_summary: StringProperty(name="Last Run", description="What the last run was", options={"HIDDEN"})
+    run_summary: StringProperty(name="Shown Run", description="What the shown run is", options={"HIDDEN"})
 
 
-CLASSES = (ProjectionProperties,)
+CLASSES = (RunProperties, ProjectionProperties)

@@ -97,7 +97,7 @@ class ModuleProperties(bpy.types.PropertyGroup):
     resolution: FloatProperty(
         name="Resolution", description="FWHM in mm at the isocentre, of the hole and the detector"
     )
-    magnification: FloatProperty(name="Magnification", description="l / b: of the image on the crystal")
+    magnification: FloatProperty(name="Magnification l / b", description="Of the image on the crystal")
     roi_seen: FloatProperty(name="Radius Seen", description="Radius in mm of the largest sphere that it sees whole")
     aimed: BoolProperty(name="Aimed", description="The camera looks at the isocentre", default=True)
     problem: StringProperty(name="Problem", description="Why the module's numbers are impossible")
@@ -184,8 +184,9 @@ class GeometryProperties(bpy.types.PropertyGroup):
     """State of the Geometry panel; `Scene.mphdrr_geometry`."""
 
     scanner: PointerProperty(
-        name="Scanner", description="The scanner that the panels work on", type=bpy.types.Collection, poll=_is_scanner
-    )
+        name="Scanner", description="The scanner that the panels work on: the one of the active object",
+        type=bpy.types.Collection, poll=_is_scanner, update=on_edit("scanner_chosen"),
+    )  # fmt: skip
     active_index: IntProperty(
         name="Active Module", description="Its index among the scanner's objects", update=on_edit("active_module")
     )

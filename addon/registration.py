@@ -21,9 +21,12 @@ from . import (
     live_phantoms,
     live_scanner,
     planes,
+    preferences,
+    preview,
     properties,
     recovery,
     rendering,
+    runs,
     scanner,
     selection,
     slices,
@@ -45,6 +48,7 @@ def _classes(module: ModuleType) -> list[Any]:
 
 CLASSES: tuple[Any, ...] = (
     *properties.CLASSES,
+    *_classes(preferences),
     *add_phantom.ADD_KINDS,
     *_classes(operators),
     *_classes(jobs),
@@ -63,6 +67,7 @@ ENTRIES = {
         ids.EXPORT_FOR_PROGRAM: "Pinhole Geometry for Programs",
         ids.EXPORT_VOLUME: "Volume (.vdb, .nii, .nrrd, ...)",
         ids.EXPORT_DATASET: "mphDRR Dataset (.h5/.npz/.pt)",
+        ids.EXPORT_FIGURE: "mphDRR Figure (.png/.svg)",
     },
     bpy.types.VIEW3D_MT_object_convert: {
         ids.VOXELIZE_OBJECTS: "Voxelize Meshes",
@@ -80,20 +85,49 @@ def _draw_entries(entries: dict[str, str]) -> Callable[..., None]:
     return draw
 
 
+# Menus of ours in Blender's own: name, text, icon.
+SUBMENUS = {
+    bpy.types.VIEW3D_MT_add: ("MPHDRR_MT_add", "mphDRR", "OUTLINER_DATA_VOLUME"),
+    bpy.types.VIEW3D_MT_object: ("MPHDRR_MT_commands", "mphDRR", "OUTLINER_OB_CAMERA"),
+    bpy.types.IMAGE_MT_image: ("MPHDRR_MT_projections", "mphDRR Projections", "RENDER_STILL"),
+}
+
+
+def _draw_submenu(name: str, text: str, icon: str) -> Callable[..., None]:
+    return lambda menu, context: menu.layout.menu(name, text=text, icon=icon)
+
+
+def _draw_splash(menu: bpy.types.Menu, context: bpy.types.Context) -> None:
+    """An extension cannot bring an application template: Blender looks for these in its own folders only."""
+    menu.layout.operator_context = "INVOKE_DEFAULT"
+    menu.layout.operator(ids.LOAD_EXAMPLE, text="mphDRR Example", icon="PLAY")
+    menu.layout.separator()
+
+
 MENUS = [(menu, _draw_entries(entries)) for menu, entries in ENTRIES.items()]
-MENUS.append((bpy.types.VIEW3D_MT_add, lambda menu, _: menu.layout.menu("MPHDRR_MT_add", icon="OUTLINER_DATA_VOLUME")))
+MENUS.append((bpy.types.STATUSBAR_HT_header, jobs.draw_status))
+MENUS += [(menu, _draw_submenu(*submenu)) for menu, submenu in SUBMENUS.items()]
+MENUS.append((bpy.types.WM_MT_splash, _draw_splash))
 
 # (list in bpy.app.handlers, function): decorate the function with @bpy.app.handlers.persistent.
 HANDLERS: tuple[tuple[list[Any], Any], ...] = (
     (bpy.app.handlers.load_pre, jobs.stop),
     (bpy.app.handlers.load_pre, slices.before_load),
+    (bpy.app.handlers.load_pre, preview.stop),
     (bpy.app.handlers.load_post, volumes.after_load),
     (bpy.app.handlers.load_post, recovery.after_load),
     (bpy.app.handlers.load_post, live_scanner.after_load),
+    (bpy.app.handlers.load_post, runs.after_load),
     (bpy.app.handlers.depsgraph_update_post, live_scanner.after_update),
     (bpy.app.handlers.depsgraph_update_post, selection.after_update),
     (bpy.app.handlers.depsgraph_update_post, planes.after_update),
+    (bpy.app.handlers.depsgraph_update_post, runs.after_update),
+    (bpy.app.handlers.frame_change_post, runs.after_update),
+    (bpy.app.handlers.undo_post, runs.after_update),
+    (bpy.app.handlers.redo_post, runs.after_update),
+    (bpy.app.handlers.depsgraph_update_post, preview.after_update),
     (bpy.app.handlers.frame_change_post, live_scanner.after_frame),
+    (bpy.app.handlers.frame_change_post, preview.after_update),
     (bpy.app.handlers.frame_change_post, slices.after_frame_change),
     (bpy.app.handlers.undo_post, live_scanner.after_undo),
     (bpy.app.handlers.redo_post, live_scanner.after_undo),
@@ -112,12 +146,14 @@ UPDATES: dict[str, Callable[..., None]] = {
     "scanner": following.refresh,
     "all_modules": following.set_for_all,
     "active_module": selection.select_active,
+    "scanner_chosen": selection.scanner_chosen,
     "phantom": live_phantoms.settings_changed,
     "display_range": slices.update,
     "slices": slices.update,
     "look": slices.look_changed,
     "display": rendering.display_changed,
     "planes": planes.update,
+    "active_run": rendering.active_run_changed,
 }
 
 _registered = ExitStack()  # takes back what was registered, in reverse order
@@ -135,6 +171,7 @@ def register(command: Callable[..., int] | None = None) -> None:
         for owner, name, group in properties.POINTERS:
             setattr(owner, name, bpy.props.PointerProperty(type=group))
             _registered.callback(delattr, owner, name)
+        preferences.apply()
         for menu, draw in MENUS:
             menu.append(draw)
             _registered.callback(menu.remove, draw)
@@ -162,8 +199,10 @@ def unregister() -> None:
     """Take back what `register` did."""
     atexit.unregister(unregister)
     jobs.stop()
+    preview.stop()
     live_scanner.stop()
     live_phantoms.stop()
+    runs.stop()
     _registered.close()
 
 

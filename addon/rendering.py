@@ -1,24 +1,29 @@
 """Projections of a scene: the volume and the scanner projected, images in the .blend, exact arrays in a file beside it."""
 
+import contextlib
 import math
+import sys
 import time
-from collections.abc import Generator, Sequence
+import uuid
+import warnings
+from collections.abc import Generator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import bpy
 
-from ..core.errors import InputError
+from ..core.errors import InputError, InputWarning
 from ..core.geometry.system import chosen_modules
 from ..core.memory import require
-from ..core.progress import Progress
+from ..core.progress import Progress, stages_of
+from ..core.projector import Model
 from ..core.runs.files import read_run, write_run
 from ..core.runs.projecting import warn_of_energy
 from ..core.runs.recipe import Recipe, read_recipe
 from ..core.runs.run import ProjectionRun
 from ..core.runs.run_recipe import recipe_model, run_recipe, with_phantom
 from ..core.volumes.volume import require_quantity
-from . import images, jobs, phantoms, planes, scanner, storage, volumes
+from . import following, ids, images, jobs, phantoms, planes, runs, scanner, storage, volumes
 from .projection_properties import OPENING_ANGLE, set_panel
 
 _REST = 0.05  # s without an edit of the display before the pictures are made anew
@@ -31,13 +36,10 @@ def render_job(context: bpy.types.Context, recipe: Recipe, volume: str = "", mu:
     InputError where there is none, a phantom has changed, settings do not go together, or memory does not suffice.
     """
     scene = context.scene
-    system = chosen_modules(scanner.read_scanner(scanner.required_scanner(scene)), recipe["system.modules"], "modules")
+    collection = scanner.required_scanner(scene)
+    system = chosen_modules(scanner.read_scanner(collection), recipe["system.modules"], "modules")
     model = recipe_model(recipe, system)  # refuses what cannot be, before the work begins
-    photons = recipe["model.photons"]
-    item = _chosen_volume(context, volume, ("mu",) if photons else model.takes, model.name)
-    mu_item = _given(context, "mu", mu) if recipe["model.kind"] == "emission" else None
-    if mu_item is not None:
-        require_quantity(volumes.quantity_of(mu_item), ("mu",), f"{mu_item.name!r} for attenuation")
+    item, mu_item = sources(context, recipe, model, volume, mu)
     for chosen in filter(None, (item, mu_item)):
         phantoms.require_current(chosen)
     rows, columns = recipe["detector.rows"], recipe["detector.columns"]
@@ -47,32 +49,49 @@ def render_job(context: bpy.types.Context, recipe: Recipe, volume: str = "", mu:
     recipe = _with_volume(recipe, item)
     read_volume, read_mu = volumes.reader(item), mu_item and volumes.reader(mu_item)
     energy = mu_item and phantoms.mu_energy(mu_item)
-    path = run_path(scene)
-    scene_name, start = scene.name, time.perf_counter()
+    path, display = run_path(scene), scene.mphdrr_display.display()
+    state = runs.state_of(system, recipe, item, mu_item)
+    scene_name, scanner_name, start = scene.name, collection.name, time.perf_counter()
 
-    def work(progress: Progress) -> ProjectionRun:
-        progress(0, len(system))
+    def work(progress: Progress) -> tuple[ProjectionRun, images.Pictures]:
+        stages = stages_of(progress)
         if energy is not None:
             warn_of_energy(model, energy, f"the mu of {recipe['attenuation.object']!r}")
-        (run,) = run_recipe(recipe, system, read_volume(), read_mu and read_mu(), lambda stage: progress)
+        stages("reading")
+        (run,) = run_recipe(recipe, system, read_volume(), read_mu and read_mu(), stages)
+        stages("writing the run file")
         write_run(run, path)
-        return run
+        return run, images.pictures(run, display, stages("storing"))
 
-    def finish(run: ProjectionRun) -> Generator[None, None, str]:
+    def finish(result: tuple[ProjectionRun, images.Pictures]) -> jobs.Finishing:
+        run, made = result
         scene = bpy.data.scenes.get(scene_name)
         if scene is None:
-            raise InputError(f"the scene {scene_name!r} is gone; its projections are in {path}")
-        images.show((yield from storing(scene, run, path)), bpy.context)
+            raise InputError(f"the scene {scene_name!r} is gone, and its projections with it")
+        owner = bpy.data.collections.get(scanner_name)  # which need not be the panel's any more
+        images.show((yield from storing(scene, run, path, state, owner, made)), bpy.context)
         where = path if bpy.data.filepath else f"{path} until the .blend is saved"
         seconds = time.perf_counter() - start
         return f"Projected {recipe['volume.object']!r} into {len(run.views)} modules in {seconds:.1f} s: {where}"
 
-    return jobs.Job("Projecting", work, finish)
+    return jobs.Job("Projecting", work, finish, lambda: path.unlink(missing_ok=True))
+
+
+def sources(
+    context: bpy.types.Context, recipe: Recipe, model: Model, volume: str = "", mu: str = ""
+) -> tuple[bpy.types.Object, bpy.types.Object | None]:
+    """The objects of what is projected and of what attenuates it, if anything; arguments and errors as of `render_job`."""
+    photons = recipe["model.photons"]
+    item = _chosen_volume(context, volume, ("mu",) if photons else model.takes, model.name)
+    mu_item = _given(context, "mu", mu) if recipe["model.kind"] == "emission" else None
+    if mu_item is not None:
+        require_quantity(volumes.quantity_of(mu_item), ("mu",), f"{mu_item.name!r} for attenuation")
+    return item, mu_item
 
 
 def run_path(scene: bpy.types.Scene) -> Path:
-    """The file of the scene's last run."""
-    return storage.folder() / f"{bpy.path.clean_name(scene.name)}-projections.h5"
+    """A file for a new run of the scene."""
+    return storage.folder() / f"{bpy.path.clean_name(scene.name)}-projections-{uuid.uuid4().hex[:8]}.h5"
 
 
 def load_recipe(scene: bpy.types.Scene, path: Path) -> None:
@@ -88,36 +107,146 @@ def load_recipe(scene: bpy.types.Scene, path: Path) -> None:
 
 
 def export_run(scene: bpy.types.Scene, filepath: str) -> Path:
-    """Write the scene's last run to a file, in the format of its suffix: .h5, .npz or .pt."""
-    run_file = scene.mphdrr_projections.run_file
-    if not run_file:
+    """Write the shown run to a file, in the format of its suffix: .h5, .npz or .pt; warns where the scene has changed."""
+    if not scene.mphdrr_projections.run_file:
         raise InputError("nothing to export: render the projections first")
-    source = storage.absolute(run_file)
-    if not source.is_file():
-        raise InputError(f"{source}: the last run's file is gone; render the projections again")
+    source = file_of(scene.mphdrr_projections.run_file)
     if not filepath:
         raise InputError("no file given: set filepath to a name ending in .h5, .npz or .pt")
     path = storage.absolute(filepath)
     write_run(read_run(source), path)
+    if found := runs.changes(scene):
+        text = f"the run is not of the scene as it is now ({'; '.join(found)}): {path.name} holds what was rendered"
+        warnings.warn(text, InputWarning, stacklevel=2)
     return path
 
 
-def show_run(scene: bpy.types.Scene, run: ProjectionRun, path: Path) -> None:
-    """Make images of `run`, which is kept in the file `path`, and show it as the scene's last."""
-    for _ in storing(scene, run, path):
+def file_of(run_file: str) -> Path:
+    """A run's file, from its path in the .blend; `InputError` where it is gone."""
+    path = storage.absolute(run_file)
+    if not path.is_file():
+        raise InputError(f"{path}: the run's file is gone; render the projections again")
+    return path
+
+
+def show_run(scene: bpy.types.Scene, run: ProjectionRun, path: Path, volume: bpy.types.Object) -> None:
+    """Put `run`, which is kept in the file `path`, into the scene's list and show it; the panel says what it was made with.
+
+    `volume` is the object of what was projected.
+    """
+    state = taken_over(scene, run, volume)
+    for _ in storing(scene, run, path, state, scanner.active_scanner(scene)):
         pass
 
 
-def storing(scene: bpy.types.Scene, run: ProjectionRun, path: Path) -> Generator[None, None, bpy.types.Image]:
-    """Make images and planes of `run`, which is kept in the file `path`, and note it as the scene's last."""
-    mosaic = yield from images.storing(run, scene.mphdrr_display.display())
-    planes.make(scene, run)
-    state = scene.mphdrr_projections
-    state.run_file = storage.stored_path(path.absolute())
-    n_v, n_u = run.views.shape
-    what = [run.settings.get("volume"), run.settings.get("backend")]
-    state.run_summary = ", ".join([f"{len(run.views)} views of {n_u} × {n_v}", *(text for text in what if text)])
+def taken_over(scene: bpy.types.Scene, run: ProjectionRun, volume: bpy.types.Object) -> dict[str, Any]:
+    """Set the panel as a run that was made outside the scene says; returns the scene's state that it belongs to."""
+    recipe = Recipe()
+    with contextlib.suppress(InputError):  # a recipe that there is not, or that the panel cannot show
+        recipe = run.recipe
+        set_panel(scene.mphdrr_projections, recipe)
+    return runs.state_of(run.system, recipe, volume, None)
+
+
+def storing(
+    scene: bpy.types.Scene,
+    run: ProjectionRun,
+    path: Path,
+    state: Mapping[str, Any],
+    collection: bpy.types.Collection | None,
+    made: images.Pictures | None = None,
+) -> Generator[tuple[str, int, int], None, bpy.types.Image]:
+    """Show `run` of the scanner `collection` and put it into the list; returns the mosaic.
+
+    It is kept in the file `path` and was made in that `state` of the scene; `made` is what `images.pictures` made of it.
+    """
+    mosaic = yield from showing(scene, run, collection, made)
+    runs.add(scene, run, path, state, collection)
     return mosaic
+
+
+def showing(
+    scene: bpy.types.Scene,
+    run: ProjectionRun,
+    collection: bpy.types.Collection | None,
+    made: images.Pictures | None = None,
+) -> Generator[tuple[str, int, int], None, bpy.types.Image]:
+    """Make images and planes of a run of the scanner `collection`, in place of another's; returns the mosaic."""
+    mosaic = yield from images.storing(run, scene.mphdrr_display.display(), made)
+    place(scene, run, collection)
+    return mosaic
+
+
+def place(scene: bpy.types.Scene, run: ProjectionRun, collection: bpy.types.Collection | None) -> None:
+    """Make the planes of a run of the scanner `collection`, of which there are images."""
+    images.set_scanner(bpy.data.images[ids.MOSAIC], collection)
+    planes.make(scene, run, collection)
+
+
+def showing_job(scene: bpy.types.Scene, index: int) -> jobs.Job:
+    """The job that shows a run of the scene's list."""
+    item = scene.mphdrr_projections.runs[index]
+    scene_name, name, file, path = scene.name, item.name, item.file, file_of(item.file)
+    display = scene.mphdrr_display.display()
+
+    def work(progress: Progress) -> tuple[ProjectionRun, images.Pictures]:
+        run = read_run(path)
+        return run, images.pictures(run, display, stages_of(progress)("storing"))
+
+    def finish(result: tuple[ProjectionRun, images.Pictures]) -> jobs.Finishing:
+        run, made = result
+        scene = bpy.data.scenes[scene_name]
+        files = [item.file for item in scene.mphdrr_projections.runs]
+        if file not in files:  # it was removed meanwhile
+            raise InputError(f"the run {name!r} is gone")
+        index = files.index(file)
+        images.show((yield from showing(scene, run, scene.mphdrr_projections.runs[index].scanner, made)), bpy.context)
+        runs.mark_shown(scene, index)
+        return f"Shown: {name}"
+
+    return jobs.Job("Showing a run", work, finish)
+
+
+def active_run_changed(scene: bpy.types.Scene) -> None:
+    """Another run of the list was chosen: show it."""
+    if following.is_writing():
+        return
+    if bpy.app.background:
+        _show_chosen()
+    elif not bpy.app.timers.is_registered(_show_chosen):
+        bpy.app.timers.register(_show_chosen, first_interval=_REST)
+
+
+def _show_chosen() -> float | None:
+    """Press the button that shows the chosen run; later, if a job is running."""
+    settings = bpy.context.scene.mphdrr_projections
+    if jobs.is_running():
+        return 10 * _REST
+    if settings.active_run < len(settings.runs) and settings.runs[settings.active_run] != runs.shown(settings.id_data):
+        try:
+            bpy.ops.mphdrr.show_run("INVOKE_DEFAULT", index=settings.active_run)
+        except RuntimeError as error:  # which Blender has shown, too
+            print(f"mphDRR: {error}", file=sys.stderr)
+    return None
+
+
+def remove_run(scene: bpy.types.Scene, index: int) -> str:
+    """Take a run off the scene's list, with its file if it is this .blend's own, and show the one beside it."""
+    settings = scene.mphdrr_projections
+    item = settings.runs[index]
+    is_shown, name = item == runs.shown(scene), item.name
+    shown = settings.run_file
+    text = f"Removed {name!r}" + ("" if runs.remove_file(item) else f"; its file stays: {storage.absolute(item.file)}")
+    settings.runs.remove(index)
+    if not is_shown:
+        runs.mark_shown(scene, [item.file for item in settings.runs].index(shown) if shown else -1)
+    elif not settings.runs:
+        images.clear()
+        planes.remove(scene)
+        runs.mark_shown(scene, -1)
+    else:
+        settings.active_run = min(index, len(settings.runs) - 1)
+    return text
 
 
 def display_changed(scene: bpy.types.Scene) -> None:
@@ -132,6 +261,7 @@ def _display_again() -> None:
     settings = bpy.context.scene.mphdrr_display
     if not settings.problem:  # which there is between the typing of the window's two ends
         images.show_again(settings.display())
+        planes.update(bpy.context.scene)  # the pictures' sizes may be others now
 
 
 def _with_volume(recipe: Recipe, item: bpy.types.Object) -> Recipe:

@@ -17,11 +17,11 @@ from ..core.errors import InputError, InputWarning
 from ..core.geometry import checks
 from ..core.geometry.collimator import Construction
 from ..core.geometry.module_parts import module_parts
-from ..core.geometry.system import LENGTHS, PinholeSystem
+from ..core.geometry.system import PinholeSystem
 from ..core.workbook import ColumnMap, QuantityCells, SystemSource
 from . import cameras, following, ids
 from .following import modules
-from .module_values import is_edited, is_moved, module_numbers, off_aim, remember
+from .module_values import is_edited, is_moved, module_numbers, off_aim, remember, system_of
 from .scanner_parts import NewScanner, clear, losses, modules_text
 
 _DEFAULT = Construction()
@@ -74,9 +74,7 @@ def build_scanner(
     first = next(iter(new.cameras.values()))
     if scene.camera is None:
         scene.camera = first
-    state = scene.mphdrr_geometry
-    state.scanner = collection
-    state.active_index = collection.all_objects.find(first.name)
+    scene.mphdrr_geometry.scanner = collection  # and its first module becomes active
     return collection
 
 
@@ -160,6 +158,14 @@ def find_scanner(scene: bpy.types.Scene, name: str) -> bpy.types.Collection | No
     return by_name[0] if by_name else None
 
 
+def scanner_of(scene: bpy.types.Scene, item: bpy.types.Object | None) -> bpy.types.Collection | None:
+    """The scene's scanner that an object is in, the active one first; None for other objects."""
+    if item is None:
+        return None
+    found = sorted(scanners(scene), key=lambda c: c != scene.mphdrr_geometry.scanner)
+    return next((c for c in found if c.all_objects.get(item.name) == item), None)
+
+
 def active_scanner(scene: bpy.types.Scene) -> bpy.types.Collection | None:
     """The scanner that the panels work on: the chosen one if it is in the scene, else the first; None without one."""
     found = scanners(scene)
@@ -208,16 +214,11 @@ def read_scanner(collection: bpy.types.Collection, *, aimed: bool = False) -> Pi
         if aimed:
             raise InputError(f"{text}, which a geometry file cannot express: {cure}")
         warnings.warn(f"{text}, but calculated as if aimed: {cure}", InputWarning, stacklevel=2)
-    numbers = [module_numbers(camera) for camera in found]
     as_imported = len(found) == collection.mphdrr_scanner.n_modules and not any(
         camera.mphdrr_module.added or is_moved(camera) or is_edited(camera) for camera in found
     )
-    return PinholeSystem(
-        centers=np.array([n.center for n in numbers]),
-        **{name: np.array([getattr(n, name) for n in numbers]) for name in LENGTHS},
-        numbers=np.array(list(by_number), dtype=np.int64),
-        source=source(collection) if as_imported else None,
-    )
+    numbers = [module_numbers(camera) for camera in found]
+    return system_of(numbers, source(collection) if as_imported else None)
 
 
 def check_geometry(collection: bpy.types.Collection) -> tuple[list[str], list[bpy.types.Object]]:

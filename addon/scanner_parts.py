@@ -83,7 +83,7 @@ def new_part(camera: bpy.types.Object, part: str, name: str, mesh: bpy.types.Mes
     """A module's collimator or crystal, parented to its camera. Its mesh is its own, so that it can be reshaped."""
     item = bpy.data.objects.new(name, mesh)
     item.parent = camera
-    item.lock_location = item.lock_rotation = item.lock_scale = (True, True, True)
+    item.lock_scale = (True, True, True)  # moving it moves the module (`grabbing.py`)
     item.mphdrr_module.part, item.mphdrr_module.number = part, camera.mphdrr_module.number
     return item
 

@@ -32,7 +32,7 @@ def selected_modules(context: bpy.types.Context) -> list[bpy.types.Object]:
     collection = scanner.active_scanner(context.scene)
     if collection is None:
         return []
-    chosen = {module_of(item) for item in context.view_layer.objects if item.select_get(view_layer=context.view_layer)}
+    chosen = {module_of(item) for item in context.view_layer.objects.selected}
     active = active_module(context)
     return [o for o in scanner.modules(collection) if o in chosen] or ([active] if active else [])
 
@@ -49,9 +49,8 @@ def select(context: bpy.types.Context, modules: Iterable[bpy.types.Object]) -> N
     if context.mode != "OBJECT":
         return
     layer = context.view_layer
-    for item in layer.objects:
-        if item.select_get(view_layer=layer):
-            item.select_set(False, view_layer=layer)
+    for item in list(layer.objects.selected):
+        item.select_set(False, view_layer=layer)
     shown = [o for o in modules if o.name in layer.objects and o.visible_get(view_layer=layer)]
     for camera in shown:
         camera.select_set(True, view_layer=layer)
@@ -60,26 +59,45 @@ def select(context: bpy.types.Context, modules: Iterable[bpy.types.Object]) -> N
 
 
 @bpy.app.handlers.persistent
-def after_update(scene: bpy.types.Scene, *_: Any) -> None:
-    """Another module was made active in the viewport: the list and the mosaic follow."""
-    camera = module_of(bpy.context.view_layer.objects.active)
-    collection = scanner.active_scanner(scene)
-    if camera is None or collection is None or camera == listed_module(scene):
+def after_update(scene: bpy.types.Scene, depsgraph: bpy.types.Depsgraph) -> None:
+    """Another object was made active in the viewport: the panels' scanner, the list and the mosaic follow."""
+    if not depsgraph.id_type_updated("SCENE") or scene != bpy.context.scene:
         return
-    index = collection.all_objects.find(camera.name)
-    if index >= 0:
+    item = bpy.context.view_layer.objects.active
+    camera = module_of(item)
+    collection = scanner.scanner_of(scene, camera or item)
+    if collection is None:
+        return
+    if collection != scanner.active_scanner(scene) or (camera is not None and camera != listed_module(scene)):
         with following.writing():
-            scene.mphdrr_geometry.active_index = index
+            scene.mphdrr_geometry.scanner = collection
+            _list(scene, camera or next(iter(scanner.modules(collection)), None))
         images.redraw_mosaic()
+
+
+def scanner_chosen(scene: bpy.types.Scene) -> None:
+    """Another scanner was chosen in the panel: its first module becomes active."""
+    collection = scanner.active_scanner(scene)
+    if collection is not None and not following.is_writing():
+        _list(scene, next(iter(scanner.modules(collection)), None))
+
+
+def _list(scene: bpy.types.Scene, camera: bpy.types.Object | None) -> None:
+    """Make a module active in the panel's list."""
+    collection = scanner.active_scanner(scene)
+    if camera is not None and collection is not None:
+        scene.mphdrr_geometry.active_index = collection.all_objects.find(camera.name)
 
 
 def select_active(scene: bpy.types.Scene) -> None:
     """Select the module that is active in the panel's list, as a click on its camera would."""
-    camera = listed_module(scene)
-    if following.is_writing():  # the list follows the viewport
+    camera, layer = listed_module(scene), bpy.context.view_layer
+    if camera is None or following.is_writing():  # the list follows the viewport
         return
-    if camera is not None and camera.visible_get(view_layer=bpy.context.view_layer):
+    if camera.visible_get(view_layer=layer):
         select(bpy.context, [camera])
+    elif camera.name in layer.objects and bpy.context.mode == "OBJECT":  # or the list would follow the viewport again
+        layer.objects.active = camera
 
 
 class NeedsScanner:

@@ -22,6 +22,7 @@ from . import ids
 
 _OUR_VOLUME = re.compile(r"[a-z]+-[0-9a-f]{16}(\.preview)?(_\d{4})?\.vdb")
 """Names of the files that `stored_volumes` writes, made from their content."""
+_OUR_RUN = re.compile(r".*-projections-[0-9a-f]{8}\.h5")  # names of the files of runs
 _FRAME = re.compile(r"_\d{4}\.vdb$")  # of a sequence, at the end of the name
 
 _LOOK = 2.0  # s that a file's size, once read, is shown
@@ -33,6 +34,11 @@ _before_save: list[tuple[Any, str, str]] = []
 def folder() -> Path:
     """The folder for this .blend's large files, made if need be."""
     return ensure_folder(_folder())
+
+
+def is_own(path: Path) -> bool:
+    """Whether a file is in the folder for this .blend's large files."""
+    return path.resolve().parent == _folder().resolve()
 
 
 def stored_path(path: Path) -> str:
@@ -98,9 +104,10 @@ def relocate(directory: str) -> str:
 
 
 def unused_volumes() -> list[Path]:
-    """Files of voxels in this .blend's folder that none of its volumes needs."""
+    """Files of voxels and of runs in this .blend's folder that none of its volumes and lists of runs needs."""
     used = {path.name for data in bpy.data.volumes for path in _files_of(data)}
-    ours = [path for path in _folder().glob("*.vdb") if _OUR_VOLUME.fullmatch(path.name)]
+    used |= {absolute(run.file).name for scene in bpy.data.scenes for run in scene.mphdrr_projections.runs}
+    ours = [p for p in _folder().glob("*") if _OUR_VOLUME.fullmatch(p.name) or _OUR_RUN.fullmatch(p.name)]
     return sorted(path for path in ours if path.is_file() and path.name not in used)
 
 
@@ -110,7 +117,7 @@ def remove_unused() -> str:
     if bpy.data.filepath and bpy.data.is_dirty and not bpy.app.background:
         raise InputError("the .blend has changes that are not saved, and as saved may need these files: save it")
     unused = unused_volumes()
-    text = f"Removed {summary(unused)}" if unused else "No file of voxels is unused"
+    text = f"Removed {summary(unused)}" if unused else "No file of voxels or runs is unused"
     for path in unused:
         try:
             path.unlink(missing_ok=True)
@@ -122,7 +129,7 @@ def remove_unused() -> str:
 def summary(files: list[Path]) -> str:
     """How many unused files there are, and how large they are."""
     size = readable_size(sum(path.stat().st_size for path in files))
-    return f"{len(files)} unused file{'s' if len(files) != 1 else ''} of voxels ({size})"
+    return f"{len(files)} unused file{'s' if len(files) != 1 else ''} of voxels or runs ({size})"
 
 
 def files_of_states(data: bpy.types.Volume) -> list[Path]:
@@ -156,18 +163,11 @@ def before_save(filepath: str, _: Any = None) -> None:
             _set(volume, "filepath", f"//{target.name}/{source.name}")
     for scene in bpy.data.scenes:
         settings = scene.mphdrr_projections
-        if not settings.run_file:
-            continue
-        source = absolute(settings.run_file)
-        if _is_temporary(source):
-            _bring(source, target)
-            source = target / source.name
-        # A Save As elsewhere leaves the file where it is, as Blender does with images; only the path changes.
-        try:
-            path = "//" + Path(os.path.relpath(source, target.parent)).as_posix()
-        except ValueError:  # another drive
-            path = str(source)
-        _set(settings, "run_file", path)
+        for owner, name in [(settings, "run_file"), *((run, "file") for run in settings.runs)]:
+            if getattr(owner, name):
+                _set(owner, name, _run_path(absolute(getattr(owner, name)), target))
+        for run in settings.runs:
+            run.is_saved = True
 
 
 @bpy.app.handlers.persistent
@@ -197,12 +197,25 @@ def _set(owner: Any, name: str, path: str) -> None:
         setattr(owner, name, path)
 
 
+def _run_path(source: Path, target: Path) -> str:
+    """How the .blend names a run's file, which is copied to the folder `target` if it is a temporary one."""
+    if _is_temporary(source):
+        if source.is_file():  # of a list, not each is needed
+            _bring(source, target)
+        source = target / source.name
+    # A Save As elsewhere leaves the file where it is, as Blender does with images; only the path changes.
+    try:
+        return "//" + Path(os.path.relpath(source, target.parent)).as_posix()
+    except ValueError:  # another drive
+        return str(source)
+
+
 def _bring(file: Path, target: Path) -> None:
     destination = ensure_folder(target) / file.name
     if not file.is_file():
         raise InputError(f"{file}: is gone, so it cannot be stored beside the .blend; make it again")
-    if destination.exists() and file.suffix == ".vdb":
-        return  # named by its content
+    if destination.exists():
+        return  # named by its content, or a run's own name
     with replacing(destination) as temporary:
         shutil.copyfile(file, temporary)
 

@@ -6,7 +6,7 @@ from typing import Any
 import bpy
 
 from ..core.errors import InputError
-from ..core.progress import Progress
+from ..core.progress import Progress, stages_of
 from ..core.volumes.volume_files import VOLUME_FORMATS, write_volume
 from . import jobs, phantoms, vdb, volumes
 
@@ -30,9 +30,9 @@ def exporting(item: bpy.types.Object, path: Path) -> jobs.Job:
         provenance |= {"frame": bpy.context.scene.frame_current, "state": volumes.state_text(item)}
 
     def work(progress: Progress) -> None:
-        progress(0, 2)
+        stages_of(progress)("reading the voxels")
         volume = read()
-        progress(1, 2)
+        stages_of(progress)("writing the file")
         if path.suffix.lower() == ".vdb":
             vdb.write_vdb(volume, path, provenance)
         else:

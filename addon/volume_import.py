@@ -8,7 +8,7 @@ import bpy
 
 from ..core.memory import require
 from ..core.physics.ct_numbers import hu_to_mu
-from ..core.progress import Progress, part_of
+from ..core.progress import Progress, part_of, stages_of
 from ..core.volumes.rearranging import centered
 from ..core.volumes.volume import UNITS, Volume
 from ..core.volumes.volume_files import READ_FORMATS, read_volume
@@ -50,11 +50,11 @@ def importing(
     def work(progress: Progress) -> StoredVolume:
         states: list[Volume] = []
         for k, path in enumerate(paths):
-            progress(k, count + 1)
+            progress(k, count)
             if path.suffix.lower() == ".vdb":
                 states.append(vdb.read_vdb(path, quantity, grid, unit=unit))
             else:
-                states.append(read_volume(path, quantity, progress=part_of(progress, k, count + 1)))
+                states.append(read_volume(path, quantity, progress=part_of(progress, k, count)))
             if k == 0 and count > 1:
                 shape = " x ".join(map(str, states[0].grid.shape))
                 require(4.0 * (count - 1) * states[0].grid.n_voxels, f"{count} volumes of {shape} voxels")
@@ -68,7 +68,7 @@ def importing(
             middle = states[0].grid.center
             provenance["moved_mm"] = (-middle).tolist()
             states = [centered(volume, volume.grid.center - middle) for volume in states]
-        progress(count, count + 1)
+        stages_of(progress)("writing the voxels")
         return store_volume(states, folder, None, provenance)
 
     def finish(stored: StoredVolume) -> str:
@@ -106,9 +106,9 @@ def converting(item: bpy.types.Object, energy: float) -> jobs.Job:
     def work(progress: Progress) -> StoredVolume:
         states: list[Volume] = []
         for read in readers:
-            progress(len(states), count + 1)
+            progress(len(states), count)
             states.append(hu_to_mu(read(), energy))
-        progress(count, count + 1)
+        stages_of(progress)("writing the voxels")
         return store_volume(states, folder, pose, provenance)
 
     def finish(stored: StoredVolume) -> str:

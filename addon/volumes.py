@@ -95,13 +95,19 @@ def reader(item: bpy.types.Object, path: Path | None = None) -> Callable[[], Vol
 
     `path` is the file of a state (`storage.files_of_states`); default: of the one at the current frame.
     """
+    path, pose = source(item, path)
+    return lambda: moved(read_vdb(path), pose)
+
+
+def source(item: bpy.types.Object, path: Path | None = None) -> tuple[Path, NDArray[np.float64]]:
+    """The file and the pose (4, 4), mm, of which `reader` makes a volume; raises InputError where there is none."""
     require_volume(item)
     if path is None and _state(item.data) is None:
         raise InputError(f"{item.name!r} has no state at frame {bpy.context.scene.frame_current}")
     pose, path = pose_of_object(item), path or file_of(item)
     if not path.is_file():
         raise InputError(f"{path}: no such file; the voxels of {item.name!r} are gone, so add the volume again")
-    return lambda: moved(read_vdb(path), pose)
+    return path, pose
 
 
 def require_volume(item: bpy.types.Object | None) -> None:
@@ -115,6 +121,11 @@ def file_of(item: bpy.types.Object) -> Path:
     """The .vdb with every voxel of a Volume object; of a sequence, that of the current frame."""
     path = storage.full_resolution(storage.absolute(item.data.filepath))
     return storage.of_frame(path, _state(item.data) or 1) if item.data.is_sequence else path
+
+
+def content_of(item: bpy.types.Object) -> str:
+    """A text that tells a volume's voxels, of all its states, from others."""
+    return item.mphdrr_volume.content or bpy.path.basename(item.data.filepath)
 
 
 def state_text(item: bpy.types.Object) -> str:
@@ -142,10 +153,16 @@ def pose_of_object(item: bpy.types.Object) -> NDArray[np.float64]:
     exact = item.mphdrr_volume.exact_pose
     if exact:
         pose = np.array(json.loads(exact))
-        is_turned = not np.allclose(pose[:3, :3], shown[:3, :3], rtol=0, atol=2e-6)
-        if not is_turned and np.allclose(pose[:3, 3], shown[:3, 3], rtol=1e-6, atol=1e-6):
+        if not pose_change(pose, shown):
             return pose
     return checked_affine(shown, f"{item.name}: its matrix")
+
+
+def pose_change(old: NDArray[np.float64], new: NDArray[np.float64]) -> str:
+    """Whether an object "turned" or "moved" between two poses (4, 4); "" for what may be Blender's float32."""
+    if not np.allclose(old[:3, :3], new[:3, :3], rtol=0, atol=2e-6):
+        return "turned"
+    return "" if np.allclose(old[:3, 3], new[:3, 3], rtol=1e-6, atol=1e-6) else "moved"
 
 
 def is_volume(item: bpy.types.Object | None) -> bool:
@@ -186,6 +203,7 @@ def after_load(*_: Any) -> None:
                 setattr(settings, name, factor * getattr(settings, name))
             settings.unit = unit
         if settings.center_shift != compat.VDB_CENTER_SHIFT and item.data not in missing:
+            settings.content = content_of(item)
             try:
                 states = [read_vdb(path) for path in storage.files_of_states(item.data)]
                 item.data.filepath = storage.stored_path(write_states(states, storage.folder()))
@@ -263,7 +281,7 @@ def _describe(item: bpy.types.Object, stored: StoredVolume) -> None:
     settings.shape, settings.spacing = volume.grid.shape, volume.grid.spacing
     settings.minimum, settings.maximum = factor * stored.low, factor * stored.high
     settings.extent = stored.extent
-    settings.exact_pose = json.dumps(stored.pose.tolist())
+    settings.exact_pose, settings.content = json.dumps(stored.pose.tolist()), stored.path.name
     settings.center_shift = compat.VDB_CENTER_SHIFT
     if not chosen:
         shown = volume_materials.usual_range(volume.quantity, factor * stored.low, factor * stored.high)

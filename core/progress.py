@@ -9,10 +9,30 @@ Part = TypeVar("Part")
 
 Progress = Callable[[int, int], None]
 """Called as ``progress(done, total)`` between steps; may raise `Cancelled` to stop the work."""
+Stages = Callable[[str], Progress | None]
+"""Begins a stage of the work, such as "projecting", and gives its progress callback."""
 
 
 class Cancelled(Exception):
     """Raised by a progress callback to stop the work. Nothing half-done is left behind."""
+
+
+class StagedProgress:
+    """The progress callback of a whole work, whose `stages` have words and callbacks of their own (`stages_of`)."""
+
+    def __init__(self, stages: Stages, label: str) -> None:
+        self.stages = stages
+        self._whole = stages(label)
+
+    def __call__(self, done: int, total: int) -> None:
+        """Say how far the whole work is."""
+        if self._whole is not None:
+            self._whole(done, total)
+
+
+def stages_of(progress: Progress | None) -> Stages:
+    """What begins the stages of a work with this callback; of one without stages, `progress` counts each of them."""
+    return progress.stages if isinstance(progress, StagedProgress) else lambda words: progress
 
 
 def part_of(progress: Progress | None, number: int, count: int) -> Progress | None:

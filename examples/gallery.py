@@ -15,22 +15,11 @@ import numpy as np
 from PIL import Image, ImageDraw
 
 import mphdrr.core as mph
+from mphdrr.core.runs.display import Display
 
 HERE = Path(__file__).parent
 TILE, MARGIN, TEXT = 180, 8, 22
 MODULE = 30  # whose projection is shown
-# Matplotlib's "inferno" (CC0) at equal steps.
-INFERNO = (
-    (0, 0, 4),
-    (40, 11, 84),
-    (101, 21, 110),
-    (159, 42, 99),
-    (212, 72, 66),
-    (245, 125, 21),
-    (250, 193, 39),
-    (252, 255, 164),
-)
-
 PHANTOMS = {
     "Derenzo": mph.DerenzoPhantom(40, (8, 6, 5, 4, 3, 2), 40, 100),
     "NEMA body": mph.NemaBody(),
@@ -114,12 +103,8 @@ def around(picture: np.ndarray, middle: np.ndarray, side: int) -> np.ndarray:
 
 def colored(picture: np.ndarray, grey: bool) -> Image.Image:
     """Values as colours, from 0 to nearly the largest."""
-    share = np.clip(picture / max(float(np.quantile(picture, 0.999)), 1e-12), 0, 1)
-    if grey:
-        return Image.fromarray(np.uint8(255 * share)).convert("RGB")
-    steps = np.linspace(0, 1, len(INFERNO))
-    channels = [np.interp(share, steps, [color[k] for color in INFERNO]) for k in range(3)]
-    return Image.fromarray(np.uint8(np.stack(channels, axis=-1)))
+    window = 0.0, max(float(np.quantile(picture, 0.999)), 1e-12)
+    return Image.fromarray(Display("grey" if grey else "inferno").colored(picture, window))
 
 
 def in_the_scanner(system: mph.PinholeSystem, folder: Path, ct: mph.Volume | None) -> None:
@@ -130,23 +115,24 @@ def in_the_scanner(system: mph.PinholeSystem, folder: Path, ct: mph.Volume | Non
         print("no bpy: the pictures in the scanner are omitted", file=sys.stderr)
         return
     import mphdrr
-    from mphdrr.addon import jobs, maps, pictures, scanner, slices, volumes
+    from mphdrr.addon import figures, jobs, maps, scanner, slices, volumes
 
     bpy.ops.wm.read_factory_settings(use_empty=True)
     mphdrr.register()
     scene = bpy.context.scene
-    collection = scanner.build_scanner(scene, system)
-    for item in collection.objects:
-        item.hide_render = True  # the ROI's sphere
-    first, last = int(system.numbers.min()), int(system.numbers.max())
+    scanner.build_scanner(scene, system)
+
+    def picture(name: str) -> None:
+        jobs.run(figures.figure_job(bpy.context, "inside", [folder / name], (960, 560), labels=False, samples=12))
+
     jobs.run(maps.mapping(scene, "sensitivity", voxels=128))
     (shown,) = volumes.volume_objects(scene)
     slices.remove_slices(shown)  # it is cut open in front of them
-    pictures.render_scanner(collection, folder / "sensitivity.png", first, last, shown, zoom=1.5)
-    bpy.data.objects.remove(shown)
+    picture("sensitivity.png")
     if ct is not None:
-        shown = volumes.add_volume(ct, "chest CT")
-        pictures.render_scanner(collection, folder / "ct.png", first, last, shown, zoom=1.2)
+        bpy.data.objects.remove(shown)
+        volumes.add_volume(ct, "chest CT")
+        picture("ct.png")
 
 
 if __name__ == "__main__":

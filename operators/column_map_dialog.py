@@ -4,6 +4,7 @@ import json
 import textwrap
 
 import bpy
+from bpy.app.translations import pgettext_iface as iface
 
 from ..addon.column_maps import ColumnMapProperties, ColumnMapQuantity
 from ..core.workbook.quantities import DERIVED, QUANTITIES
@@ -37,7 +38,7 @@ def _tables(layout: bpy.types.UILayout, form: ColumnMapProperties) -> None:
         box.use_property_split = True
         box.use_property_decorate = False
         one = i > 0 and table.rows == "ONE_FOR_ALL"
-        box.label(text=f"Table {i + 1}" + (": pinholes" if i == 0 else ""))
+        box.label(text=iface("Table {number}" if i else "Table {number}: pinholes").format(number=i + 1))
         column = box.column(align=True)
         column.prop(table, "sheet")
         column.prop(table, "header_row")
@@ -80,7 +81,7 @@ def _result(layout: bpy.types.UILayout, form: ColumnMapProperties) -> None:
         box.alert = True
         used = _lines(box, [form.refusal], "ERROR")
     else:
-        box.label(text=f"{form.n_modules} modules, in mm:", icon="CHECKMARK")
+        box.label(text=iface("{count} modules, in mm:").format(count=form.n_modules), icon="CHECKMARK")
         columns = box.row()
         for texts in zip(*rows, strict=True):
             column = columns.column(align=True)

@@ -56,7 +56,7 @@ class MPHDRR_OT_ct_to_attenuation(jobs.JobOperator, bpy.types.Operator):
 
 
 class MPHDRR_OT_clean_volume_files(bpy.types.Operator):
-    """Remove the files of voxels in this .blend's folder that none of its volumes needs any more"""
+    """Remove the files of voxels and runs in this .blend's folder that no volume and no list of runs needs any more"""
 
     bl_idname = ids.CLEAN_VOLUME_FILES
     bl_label = "Clean Up Volume Files"

@@ -123,6 +123,8 @@ class MPHDRR_OT_import_geometry(bpy.types.Operator):
             for line in self._losses:
                 column.label(text=line[:1].upper() + line[1:], icon="DOT")
             return
+        if context.space_data.type == "FILE_BROWSER":  # not in the panel of the last operation
+            layout.operator(ids.BROWSE_EXAMPLE, icon="FILE_FOLDER")
         layout.use_property_split = True
         layout.use_property_decorate = False
         for name in ("name", "plate_thickness", "wall_thickness", "image_size", "columns", "choose_columns"):

@@ -1,8 +1,9 @@
-"""The example in one click."""
+"""The example in one click, and its workbook in the file browser."""
 
 import bpy
 
 from ..addon import example, ids, jobs
+from ..addon.cli.demo import EXAMPLE
 from ..addon.reports import polled
 
 
@@ -18,3 +19,21 @@ class MPHDRR_OT_load_example(jobs.JobOperator, bpy.types.Operator):
 
     def job(self, context: bpy.types.Context) -> jobs.Job:
         return example.example_job(context)
+
+
+class MPHDRR_OT_browse_example(bpy.types.Operator):
+    """Choose the bundled workbook, a scanner of 80 modules in 4 rings"""
+
+    bl_idname = ids.BROWSE_EXAMPLE
+    bl_label = "Example Workbook"
+    bl_options = {"INTERNAL"}
+
+    @classmethod
+    def poll(cls, context: bpy.types.Context) -> bool:
+        is_browser = context.space_data is not None and context.space_data.type == "FILE_BROWSER"
+        return polled(cls, is_browser, "Only in a file browser")
+
+    def execute(self, context: bpy.types.Context) -> set[str]:
+        params = context.space_data.params
+        params.directory, params.filename = bytes(EXAMPLE.parent), EXAMPLE.name
+        return {"FINISHED"}

@@ -5,19 +5,20 @@ from pathlib import Path
 from typing import Any
 
 import bpy
-from bpy.props import FloatProperty, StringProperty
+from bpy.props import EnumProperty, FloatProperty, StringProperty
 from bpy_extras.io_utils import ExportHelper, ImportHelper
 
-from ..addon import ids, images, jobs, rendering, scanner, storage, tiles
+from ..addon import choices, ids, images, jobs, rendering, scanner, storage, tiles
 from ..addon.decimals import typed
-from ..addon.projection_properties import OPENING_ANGLE, ProjectionSettings, settings_recipe
+from ..addon.projection_properties import OPENING_ANGLE, ProjectionSettings, settings_recipe, use_preset
 from ..addon.reports import polled, run_reported
 from ..core.errors import InputError
+from ..core.runs.presets import PRESETS
 
 
 class MPHDRR_OT_render_projections(ProjectionSettings, jobs.JobOperator, bpy.types.Operator):
     """Project the volume into every module: exact line integrals or SPECT counts, stored as images and as a file beside
-    the .blend. Settings that a script leaves out are those of the panel
+    the .blend. The settings are what the panel says now, unless a script gives others
     """
 
     bl_idname = ids.RENDER_PROJECTIONS
@@ -49,6 +50,26 @@ class MPHDRR_OT_render_projections(ProjectionSettings, jobs.JobOperator, bpy.typ
         if not self.properties.is_property_set(name) and self.properties.is_property_set(coefficient):
             return "NUMBER"
         return getattr(self if self.properties.is_property_set(name) else scene.mphdrr_projections, name)
+
+
+class MPHDRR_OT_use_preset(bpy.types.Operator):
+    """Count photons, with isotope, aperture and crystal chosen together; time, noise, attenuation and the detector's own
+    blur stay as they are
+    """
+
+    bl_idname = ids.USE_PRESET
+    bl_label = "Physics Preset"
+    bl_options = {"REGISTER", "UNDO"}
+
+    preset: EnumProperty(
+        name="Preset",
+        description="What is imaged with which camera",
+        items=choices.items({}, ((each.name, each.label, each.text) for each in PRESETS.values())),
+    )
+
+    def execute(self, context: bpy.types.Context) -> set[str]:
+        use_preset(context.scene.mphdrr_projections, self.preset)
+        return {"FINISHED"}
 
 
 class MPHDRR_OT_load_recipe(ImportHelper, bpy.types.Operator):
@@ -113,7 +134,7 @@ class MPHDRR_OT_pick_module(bpy.types.Operator):
 
 
 class MPHDRR_OT_export_dataset(ExportHelper, bpy.types.Operator):
-    """Write the last run, with geometry, volume and provenance, as HDF5 (.h5), NumPy (.npz) or PyTorch (.pt)"""
+    """Write the shown run, with geometry, volume and provenance, as HDF5 (.h5), NumPy (.npz) or PyTorch (.pt)"""
 
     bl_idname = ids.EXPORT_DATASET
     bl_label = "Export mphDRR Dataset"

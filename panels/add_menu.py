@@ -1,6 +1,7 @@
 """Add > mphDRR: everything that can be put into the scanner."""
 
 import bpy
+from bpy.app.translations import pgettext_iface as iface
 
 from ..addon import ids
 from ..addon.phantom_properties import menu_entries
@@ -15,9 +16,8 @@ class MPHDRR_MT_add(bpy.types.Menu):
         for kind, label, beats in menu_entries():
             layout.operator(ids.ADD_PHANTOM + kind, text=label, icon="OUTLINER_DATA_VOLUME")
             if beats:
-                layout.operator(
-                    ids.ADD_PHANTOM + kind, text=f"Beating {label}", icon="OUTLINER_DATA_VOLUME"
-                ).frames = 24
+                text = iface("Beating {phantom}").format(phantom=iface(label))
+                layout.operator(ids.ADD_PHANTOM + kind, text=text, icon="OUTLINER_DATA_VOLUME").frames = 24
         layout.operator(ids.IMPORT_PHANTOM, text="Phantom from TOML File", icon="FILE_TEXT")
         layout.separator()
         layout.operator(ids.IMPORT_VOLUME, text="Volume from File", icon="IMPORT")

@@ -4,6 +4,7 @@ import json
 from collections.abc import Sequence
 
 import bpy
+from bpy.app.translations import pgettext_iface as iface
 
 from ..addon import ids, jobs, selection
 from ..addon.properties import LABELS
@@ -57,7 +58,7 @@ class MPHDRR_PT_scanner_design(ScannerPanel, bpy.types.Panel):
             layout.box().split(factor=0.42),
             ("Sensitivity", f"{properties.sensitivity:.1f} cps/MBq"),
             ("Mean FWHM", f"{properties.resolution:.2f} mm"),
-            ("See the ROI", f"{properties.n_covering} of {properties.count} modules"),
+            ("See the ROI", iface("{some} of {all} modules").format(some=properties.n_covering, all=properties.count)),
         )
         layout.operator_menu_enum(ids.RENUMBER_MODULES, "order", text="Renumber", icon="LINENUMBERS_ON")
         layout.operator(ids.CHECK_GEOMETRY, icon="CHECKMARK")
@@ -68,7 +69,8 @@ class MPHDRR_PT_scanner_design(ScannerPanel, bpy.types.Panel):
             for text in findings[:_MOST_FINDINGS]:
                 draw_text(layout, text)
             if len(findings) > _MOST_FINDINGS:
-                layout.label(text=f"... and {len(findings) - _MOST_FINDINGS} more", icon="BLANK1")
+                more = iface("... and {count} more").format(count=len(findings) - _MOST_FINDINGS)
+                layout.label(text=more, icon="BLANK1")
         column = layout.column(align=True)
         column.operator_context = "INVOKE_DEFAULT"
         column.operator_menu_enum(ids.ADD_MAP, "quantity", text="Add Map", icon="OUTLINER_DATA_VOLUME")
@@ -91,7 +93,7 @@ def _draw_module(layout: bpy.types.UILayout, camera: bpy.types.Object) -> None:
         ("Distance b", f"{module.pinhole_distance:.2f} mm"),
         ("Sensitivity", f"{module.sensitivity:.2f} cps/MBq"),
         ("Resolution", f"{module.resolution:.2f} mm FWHM"),
-        ("Magnification", f"{module.magnification:.3f}"),
+        ("Magnif. l / b", f"{module.magnification:.3f}"),
         ("Radius seen", f"{module.roi_seen:.2f} mm"),
         ("ROI", "seen whole" if module.sees_roi else "not seen whole"),
     )
@@ -115,4 +117,4 @@ def _draw_numbers(
 
 
 def _label(text: str, is_mixed: bool) -> str:
-    return f"{text}, mixed" if is_mixed else f"{text} (mm)"
+    return iface("{name}, mixed" if is_mixed else "{name} (mm)").format(name=iface(text))

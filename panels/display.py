@@ -2,7 +2,7 @@
 
 import bpy
 
-from ..addon import ids
+from ..addon import ids, images, selection
 from .geometry import Sidebar
 
 
@@ -27,8 +27,28 @@ class _Display:
         column.active = not settings.automatic
         column.prop(settings, "low", text="Window Low")
         column.prop(settings, "high")
+        picks = layout.row(align=True)
+        picks.operator(ids.PICK_WINDOW, text="Pick Low", icon="EYEDROPPER").end = "LOW"
+        picks.operator(ids.PICK_WINDOW, text="Pick High", icon="EYEDROPPER").end = "HIGH"
+        layout.prop(settings, "half")
         if settings.problem:
             layout.label(text=settings.problem, icon="ERROR")
+        _draw_totals(layout, context)
+
+
+def _draw_totals(layout: bpy.types.UILayout, context: bpy.types.Context) -> None:
+    """What sums up the active module's image of the last run."""
+    shown, camera = images.tiles(bpy.data.images[ids.MOSAIC]), selection.active_module(context)
+    if not shown or "totals" not in shown or camera is None or camera.mphdrr_module.number not in shown["numbers"]:
+        return
+    index = shown["numbers"].index(camera.mphdrr_module.number)
+    column = layout.column(align=True)
+    column.label(text=f"{camera.name}{', central half' if shown['half'] else ''} ({shown['unit']})")
+    for text, value in ((shown["summed"].capitalize(), shown["totals"][index]), ("Maximum", shown["maxima"][index])):
+        row = column.split(factor=0.4)
+        row.active = False
+        row.label(text=text)
+        row.label(text=f"{value:.6g}")
 
 
 class MPHDRR_PT_display(_Display, Sidebar, bpy.types.Panel):

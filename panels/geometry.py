@@ -5,6 +5,7 @@ import textwrap
 
 import bpy
 import numpy as np
+from bpy.app.translations import pgettext_iface as iface
 
 from ..addon import ids, jobs, scanner, selection
 
@@ -67,7 +68,7 @@ class MPHDRR_PT_geometry(Sidebar, bpy.types.Panel):
             row.operator(ids.LOAD_EXAMPLE, icon="PLAY")
         layout.operator(ids.IMPORT_GEOMETRY, text="Import Workbook", icon="IMPORT")
         if collection is None:
-            layout.label(text="Or drop one on the viewport.", icon="INFO")
+            draw_hint(layout, "Or drop one on the viewport.")
             jobs.draw_job(layout)
             return
         if len(scanner.scanners(context.scene)) > 1:
@@ -78,7 +79,7 @@ class MPHDRR_PT_geometry(Sidebar, bpy.types.Panel):
             layout.split(factor=0.34),
             ("Scanner", collection.name),
             ("Workbook", bpy.path.basename(properties.workbook) or "none"),
-            ("Modules", f"{properties.count} in {n_rings} rings"),
+            ("Modules", iface("{count} in {rings} rings").format(count=properties.count, rings=n_rings)),
         )
         row = layout.row(align=True)
         for first, last in json.loads(properties.quick_ranges or "[]"):
@@ -132,19 +133,24 @@ class MPHDRR_PT_modules(ScannerPanel, bpy.types.Panel):
 
         camera = selection.listed_module(context.scene)
         if camera is not None:
-            look = layout.operator(
-                ids.LOOK_THROUGH_MODULE, text=f"Look Through {camera.name}", icon="OUTLINER_OB_CAMERA"
-            )
+            text = iface("Look Through {module}").format(module=camera.name)
+            look = layout.operator(ids.LOOK_THROUGH_MODULE, text=text, icon="OUTLINER_OB_CAMERA")
             look.number = camera.mphdrr_module.number
 
 
 def draw_facts(split: bpy.types.UILayout, *facts: tuple[str, str]) -> None:
     """Draw names and their values, side by side."""
     names, values = split.column(align=True), split.column(align=True)
-    names.active = False
     for name, value in facts:
         names.label(text=name)
         values.label(text=value)
+
+
+def draw_hint(layout: bpy.types.UILayout, text: str) -> None:
+    """Draw what comes next, in grey."""
+    row = layout.row()
+    row.active = False
+    row.label(text=text, icon="INFO")
 
 
 def draw_text(layout: bpy.types.UILayout, text: str, icon: str = "ERROR") -> None:

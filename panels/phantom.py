@@ -3,9 +3,10 @@
 from typing import Any
 
 import bpy
+from bpy.app.translations import pgettext_iface as iface
 
 from ..addon import ids, jobs, phantom_properties, phantoms, recovery, slices, storage, volumes
-from .geometry import Sidebar, draw_facts, draw_text
+from .geometry import Sidebar, draw_facts, draw_hint, draw_text
 
 
 class MPHDRR_PT_phantom(Sidebar, bpy.types.Panel):
@@ -26,11 +27,8 @@ class MPHDRR_PT_phantom(Sidebar, bpy.types.Panel):
             _draw_missing(adding.column(align=True), context.scene)
         item = context.object
         if not volumes.is_volume(item):
-            column = layout.column(align=True)
-            column.active = False
             known = volumes.volume_objects(context.scene)
-            text = "Select a volume to see its numbers." if known else "No volume in the scene."
-            column.label(text=text, icon="INFO")
+            draw_hint(layout, "Select a volume to see its numbers." if known else "No volume in the scene yet.")
             return
         _draw_numbers(layout, item)
         _draw_display(layout, item)
@@ -72,13 +70,13 @@ def _draw_display(layout: bpy.types.UILayout, item: bpy.types.Object) -> None:
     if settings.quantity == "hu":
         layout.operator(ids.CT_TO_ATTENUATION, icon="MOD_FLUIDSIM")
     column = layout.column(align=True)
-    column.prop(settings, "display_low", text=f"Low, {settings.unit}")
-    column.prop(settings, "display_high", text=f"High, {settings.unit}")
+    column.prop(settings, "display_low", text=iface("Low, {unit}").format(unit=settings.unit))
+    column.prop(settings, "display_high", text=iface("High, {unit}").format(unit=settings.unit))
     looks = layout.grid_flow(columns=2, align=True)
     for name, *_ in phantom_properties.LOOKS[: None if settings.quantity == "hu" else 4]:
         looks.prop_enum(settings, "look", name)
     if settings.look not in ("DENSITY", "BRIGHTEST"):
-        layout.prop(settings, "surface", text=f"Surface, {settings.unit}")
+        layout.prop(settings, "surface", text=iface("Surface, {unit}").format(unit=settings.unit))
     if item.data.is_sequence:
         column = layout.column(align=True)
         column.prop(item.data, "frame_start", text="First Frame")

@@ -3,10 +3,12 @@
 from collections.abc import Container
 
 import bpy
+from bpy.app.translations import pgettext_iface as iface
 
-from ..addon import ids, jobs, scanner, volumes
+from ..addon import ids, jobs, runs, scanner, volumes
 from ..addon.projection_properties import drawn, makes_counts
-from .geometry import Sidebar
+from .geometry import Sidebar, draw_hint, draw_text
+from .runs import draw_changes
 
 _MAIN = ("time", "photons", "pixel_points")
 """Settings of models that the panel itself shows; the others stand under Physics."""
@@ -29,28 +31,30 @@ class MPHDRR_PT_projections(Sidebar, bpy.types.Panel):
         model = [name for name, _ in drawn(settings, "model") if name != "model"]
         _draw(column, settings, "model", [name for name in model if name in _MAIN])
         _draw(column, settings, "detector")
+        if settings.model != "EMISSION":
+            column.operator(ids.WIDE_FIELD, icon="FULLSCREEN_ENTER", depress=settings.field > 1)
         modules = column.column(align=True)
-        modules.prop(settings, "first", text="Modules First")
-        modules.prop(settings, "last", text="Last")
+        modules.prop(settings, "all_modules")
+        if not settings.all_modules:
+            modules.prop(settings, "first")
+            modules.prop(settings, "last")
         _draw(column, settings, "compute")
         if not jobs.is_running():
             row = layout.row()
             row.scale_y = 1.4
             row.operator_context = "INVOKE_DEFAULT"
-            ready = scanner.active_scanner(context.scene) is not None and bool(volumes.volume_objects(context.scene))
-            row.enabled = ready
+            has_scanner = scanner.active_scanner(context.scene) is not None
+            has_volume = bool(volumes.volume_objects(context.scene))
+            row.enabled = has_scanner and has_volume
             row.operator(ids.RENDER_PROJECTIONS, icon="RENDER_STILL")
             layout.operator(ids.LOAD_RECIPE, icon="FILE_FOLDER")
-            if not ready:
-                hint = layout.row()
-                hint.active = False
-                hint.label(text="Needs a scanner and a volume.", icon="INFO")
+            if not has_scanner:
+                draw_hint(layout, "Needs a scanner: Load Example.")
+            elif not has_volume:
+                draw_hint(layout, "Needs a volume: Add Phantom.")
         if settings.run_file:
             layout.operator(ids.SHOW_PROJECTIONS, text="Show Mosaic", icon="IMAGE_DATA")
-            column = layout.column(align=True)
-            column.active = False
-            for part in settings.run_summary.split(", ", 1):
-                column.label(text=part)
+            draw_changes(layout, context.scene)
 
 
 def _draw(
@@ -72,6 +76,9 @@ class MPHDRR_PT_physics(Sidebar, bpy.types.Panel):
     @classmethod
     def poll(cls, context: bpy.types.Context) -> bool:
         return bool(context.scene.mphdrr_projections.model != "INVERSE_SQUARE")
+
+    def draw_header_preset(self, context: bpy.types.Context) -> None:
+        self.layout.operator_menu_enum(ids.USE_PRESET, "preset", text="", icon="PRESET")
 
     def draw(self, context: bpy.types.Context) -> None:
         layout = self.layout
@@ -102,8 +109,14 @@ class MPHDRR_PT_export(Sidebar, bpy.types.Panel):
         layout = self.layout
         layout.operator_context = "INVOKE_DEFAULT"
         run_file = context.scene.mphdrr_projections.run_file
-        layout.enabled = bool(run_file)
-        layout.operator(ids.EXPORT_DATASET, text="Export Dataset", icon="EXPORT")
+        row = layout.row()
+        row.enabled = bool(run_file)
+        row.operator(ids.EXPORT_DATASET, text="Export Dataset", icon="EXPORT")
+        layout.operator(ids.EXPORT_FIGURE, text="Export Figure", icon="IMAGE_DATA")
         if run_file:
-            kept = run_file if run_file.startswith("//") else "kept when the .blend is saved"
-            layout.label(text=f"Last run: {kept}", icon="FILE")
+            kept = run_file if run_file.startswith("//") else iface("kept when the .blend is saved")
+            layout.label(text=iface("Shown run: {file}").format(file=kept), icon="FILE")
+        else:
+            draw_hint(layout, "Render projections first.")
+        for line in runs.change_lines(context.scene):
+            draw_text(layout, line)

@@ -6,9 +6,9 @@ The commands without Blender are in `core.cli`; those here import bpy only when 
 from collections.abc import Sequence
 
 from ...core import cli
-from . import demo, scene
+from . import demo, figure, scene
 
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run one command line (by default the program's own) and return its exit status."""
-    return cli.main(argv, more_commands=(scene.add_parser, demo.add_parser))
+    return cli.main(argv, more_commands=(figure.add_parser, scene.add_parser, demo.add_parser))

@@ -9,13 +9,21 @@ from pathlib import Path
 from ...core.cli.options import add_command, add_workbook, progress_bar, read_workbook
 from ...core.files import ensure_folder
 from ...core.runs.files import write_run
-from ...core.runs.mosaic import write_sheet
 from ...core.runs.recipe import Recipe
 from ...core.runs.run_recipe import run_recipe
 from .scene import new_scene, quiet, save_scene
 
 EXAMPLE = Path(__file__).parents[2] / "examples" / "dc-spect-80.xlsx"
 EULER_DEGREES = (30.0, 55.0, 0.0)  # tilted, so that modules see along and across the rods
+# Besides the modules' ranges: name, kind and modules.
+_FIGURES = (
+    ("phantom", "inside", None),
+    ("cut-away", "cut-away", None),
+    ("sums", "sums", None),
+    ("mosaic", "mosaic", None),
+)
+_SIZE = dict.fromkeys(("scanner", "inside", "cut-away"), (960, 560))
+"""Smaller than usual: they take most of the demo's time."""
 
 
 def add_parser(subparsers) -> None:  # type: ignore[no-untyped-def]
@@ -36,11 +44,13 @@ def add_parser(subparsers) -> None:  # type: ignore[no-untyped-def]
 def _run(arguments: argparse.Namespace) -> None:
     out = ensure_folder(arguments.output)
     scene = new_scene()  # before the long work: without Blender the demo stops here
-    from .. import pictures, rendering, scanner, volumes
+    import bpy
+
+    from .. import figures, jobs, rendering, scanner, volumes
 
     with _step("geometry"):
         system = read_workbook(arguments)
-        collection = scanner.build_scanner(scene, system)
+        scanner.build_scanner(scene, system)
     with _step("projections"):
         recipe = Recipe({
             "system.file": arguments.workbook,
@@ -53,18 +63,17 @@ def _run(arguments: argparse.Namespace) -> None:
         })  # fmt: skip
         (run,) = run_recipe(recipe, system, stages=progress_bar)
         pose, phantom = run.recipe["phantom.matrix"], run.recipe.tables()["phantom"]
-        volume_object = volumes.add_volume(run.volume, "Derenzo phantom", pose, phantom)
+        item = volumes.add_volume(run.volume, "Derenzo phantom", pose, phantom)
     with _step("dataset"):
         write_run(run, out / "run.h5")
-        write_sheet(run, out / "mosaic.png")
     with _step("scene"):
-        rendering.show_run(scene, run, out / "run.h5")
+        rendering.show_run(scene, run, out / "run.h5", item)
         save_scene(out / "scanner.blend")
     with _step("pictures"), quiet():
-        for first, last in scanner.quick_ranges(system):
-            pictures.render_scanner(collection, out / f"modules-{first}-{last}.png", first, last)
-        first, last = int(system.numbers.min()), int(system.numbers.max())
-        pictures.render_scanner(collection, out / "phantom.png", first, last, volume_object, zoom=1.5)
+        ranges = {f"modules-{first}-{last}": f"{first}-{last}" for first, last in scanner.quick_ranges(system)}
+        for name, figure, modules in (*((name, "scanner", text) for name, text in ranges.items()), *_FIGURES):
+            path = out / f"{name}.png"
+            jobs.run(figures.figure_job(bpy.context, figure, [path], _SIZE.get(figure), modules))
     print(f"{out}: {', '.join(sorted(p.name for p in out.iterdir() if p.suffix in ('.blend', '.h5', '.png')))}")
 
 

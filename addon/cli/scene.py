@@ -59,8 +59,8 @@ def _run(arguments: argparse.Namespace) -> None:
     if mu is not None:
         blender_scene.mphdrr_projections.mu = volumes.add_volume(mu, Path(arguments.mu).name)
     if run is not None:
-        volumes.add_volume(run.volume, "Projected volume")
-        rendering.show_run(blender_scene, run, Path(arguments.run_file))
+        projected = volumes.add_volume(run.volume, "Projected volume")
+        rendering.show_run(blender_scene, run, Path(arguments.run_file), projected)
     save_scene(path)
     print(path)
 

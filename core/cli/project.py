@@ -14,6 +14,7 @@ from ..errors import InputError
 from ..phantoms.kinds import KINDS
 from ..runs.files import FORMATS, read_run, write_run
 from ..runs.mosaic import write_sheet
+from ..runs.presets import PRESETS
 from ..runs.recipe import Recipe, read_recipe, write_recipe
 from ..runs.run_recipe import run_recipe
 from ..runs.settings import SETTINGS
@@ -47,8 +48,8 @@ def add_parser(subparsers) -> None:  # type: ignore[no-untyped-def]
         "project",
         "project a volume, or a phantom, into every module",
         "mphdrr project scanner.xlsx --volume ct.nii.gz --energy 60 --size 250 250 -o run.h5\n"
-        "example: mphdrr project scanner.xlsx --volume heart.nii.gz --mu ct-mu.nii.gz --emission --isotope Tc-99m "
-        "--set model.aperture_mu=tungsten --write-recipe heart.toml\n"
+        "example: mphdrr project scanner.xlsx --volume heart.nii.gz --mu ct-mu.nii.gz --preset tc99m-tungsten-czt "
+        "--time 600 --write-recipe heart.toml\n"
         "example: mphdrr project heart.toml --noise 1 -o counts.h5",
     )
     text = "geometry workbook (.xlsx, .xlsm), recipe (.toml), or run (.h5, .npz, .pt), to be made again"
@@ -74,6 +75,9 @@ def add_parser(subparsers) -> None:  # type: ignore[no-untyped-def]
     for word, (_, text) in SETTINGS["model.kind"].words.items():
         _add(model, f"--{word}", ("model.kind",), text, action="store_const", const=word)
     _add(model, "--photons", ("model.photons",), SETTINGS["model.photons"].help)
+    text = "physics of counts in one choice, which options override: "
+    text += ", ".join(PRESETS)
+    parser.add_argument("--preset", choices=PRESETS, metavar="NAME", help=text)
     for option, keys in _DERENZO.items():
         nargs = "+" if option == "--rods" else len(keys) if len(keys) > 1 else None
         _add(parser, option, keys, argparse.SUPPRESS, nargs=nargs)
@@ -138,7 +142,9 @@ def _chosen(arguments: argparse.Namespace) -> tuple[Recipe, dict[str, Any]]:
         recipe = run.recipe
     elif file is not None:
         recipe = Recipe({"system.file": file})
-    before, recipe = recipe.tables(), recipe.updated(_changes(arguments, recipe))
+    before = recipe.tables()
+    preset = {} if arguments.preset is None else PRESETS[arguments.preset].changes
+    recipe = recipe.updated({**preset, **_changes(arguments, recipe.updated(preset))})
     if run is None:
         return recipe, {}
     now = recipe.tables()

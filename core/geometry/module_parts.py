@@ -5,6 +5,7 @@ crystal reaches from Z = l to l + Td, and the collimator stands in front of it, 
 """
 
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,6 +22,9 @@ Solid = tuple[NDArray[np.float64], NDArray[np.int32]]
 # Points on a ring: a multiple of 8, so that squares have points at their corners. The polygon is inscribed in the hole's
 # circle: 99.84 % of the area is open.
 _N = 64
+_ANGLE = 2 * np.pi * np.arange(_N) / _N
+_CIRCLE = np.stack([np.cos(_ANGLE), np.sin(_ANGLE)], axis=1)
+_SQUARE = _CIRCLE / np.abs(_CIRCLE).max(axis=1, keepdims=True)  # half-width 1, at the same angles
 
 
 _FACES = [[0, 3, 2, 1], [4, 5, 6, 7], [0, 1, 5, 4], [1, 2, 6, 5], [2, 3, 7, 6], [3, 0, 4, 7]]
@@ -86,22 +90,27 @@ def collimator_solid(collimator: Collimator) -> Solid:
     Its rings of points run along the hole from the plate's front to its back, along the channel to the crystal, and along
     the outside back to the front; quads join each ring to the next and the last to the first.
     """
-    angle = 2 * np.pi * np.arange(_N) / _N
-    circle = np.stack([np.cos(angle), np.sin(angle)], axis=1)
-    square = circle / np.abs(circle).max(axis=1, keepdims=True)  # half-width 1, at the same angles
     built, l = collimator.construction, collimator.length
     rings = (
-        *((circle * radius, depth) for depth, radius in collimator.hole_profile),
-        (square * collimator.channel_half_width, built.back),
-        (square * collimator.detector_side / 2, l),
-        (square * (collimator.detector_side / 2 + built.wall_thickness), l),
-        (square * collimator.front_half_width, built.front),
+        *((_CIRCLE, radius, depth) for depth, radius in collimator.hole_profile),
+        (_SQUARE, collimator.channel_half_width, built.back),
+        (_SQUARE, collimator.detector_side / 2, l),
+        (_SQUARE, collimator.detector_side / 2 + built.wall_thickness, l),
+        (_SQUARE, collimator.front_half_width, built.front),
     )
-    vertices = np.concatenate([np.column_stack([xy, np.full(_N, z)]) for xy, z in rings])
-    ring, point = np.divmod(np.arange(len(rings) * _N), _N)
-    following_ring, following_point = (ring + 1) % len(rings), (point + 1) % _N
+    vertices = np.empty((len(rings), _N, 3))
+    for ring, (points, size, depth) in zip(vertices, rings, strict=True):
+        ring[:, :2], ring[:, 2] = points * size, depth
+    return vertices.reshape(-1, 3), _ring_faces(len(rings))
+
+
+@lru_cache
+def _ring_faces(n: int) -> NDArray[np.int32]:
+    """Quads that join each of `n` rings of `_N` points to the next and the last to the first."""
+    ring, point = np.divmod(np.arange(n * _N), _N)
+    following_ring, following_point = (ring + 1) % n, (point + 1) % _N
     corners = (ring, point), (following_ring, point), (following_ring, following_point), (ring, following_point)
-    return vertices, np.stack([i * _N + j for i, j in corners], axis=1).astype(np.int32)
+    return freeze(np.stack([i * _N + j for i, j in corners], axis=1).astype(np.int32))
 
 
 def crystal_solid(collimator_length: float, detector_side: float, detector_thickness: float) -> Solid:

@@ -70,14 +70,25 @@ def sum_of(volumes: list[ArrayOrTensor], workers: int) -> ArrayOrTensor:
     return volumes[0]
 
 
+_usual: int | None = None
+
+
+def set_usual_threads(threads: int | None) -> None:
+    """How many threads are used where nobody says; None: as many as this process may use processors."""
+    global _usual
+    _usual = None if threads is None else thread_count(threads)
+
+
 def thread_count(threads: int | None) -> int:
-    """`threads`, or the number of processors that this process may use.
+    """`threads`, or the usual number: that of `set_usual_threads`, or of the processors that this process may use.
 
     Raises
     ------
     InputError
         Not a whole number of at least 1.
     """
+    if threads is None and _usual is not None:
+        return _usual
     if threads is None:
         return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     if isinstance(threads, bool) or not isinstance(threads, int | np.integer) or threads < 1:

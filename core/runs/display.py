@@ -16,8 +16,11 @@ _COLORS = {
     "viridis": "440154 48186a 472d7b 424086 3b528b 33638d 2c728e 26828e 21918c 1f9f88 27ad81 3dbc74 5cc863 81d34d aadc32 "
     "d5e21a fde725",
     "grey": "000000 ffffff",
+    "diverging": "04306b 2a6fbb 8fbfe6 f4f4f4 f0a58c c8402f 6b0410",
 }
-COLORS = tuple(_COLORS)
+DIVERGING = "diverging"
+"""Name of the colours of differences: blue below the middle, white there, red above it."""
+COLORS = tuple(name for name in _COLORS if name != DIVERGING)
 """Names of the colour maps; all but grey are perceptually uniform."""
 SCALES = ("linear", "sqrt", "log")
 _DECADES = 3.0
@@ -29,16 +32,18 @@ class Display:
     """How numbers are shown as colours; `InputError` where the settings do not go together.
 
     `low` and `high` are the numbers that have the first and the last colour; None is automatic: 0, or the smallest number
-    where that is negative, and the largest. On the logarithmic scale an automatic `low` is a thousandth of `high`.
+    where that is negative, and the largest. On the logarithmic scale an automatic `low` is a thousandth of `high`. `half`:
+    only the middle half of each image is shown; of a wide field of view, twice the crystal's, that is what the crystal sees.
     """
 
     colors: str = "inferno"
     scale: str = "linear"
     low: float | None = None
     high: float | None = None
+    half: bool = False
 
     def __post_init__(self) -> None:
-        if self.colors not in COLORS:
+        if self.colors not in _COLORS:
             raise InputError(f"colors {self.colors!r}: expected one of {', '.join(COLORS)}")
         if self.scale not in SCALES:
             raise InputError(f"scale {self.scale!r}: expected one of {', '.join(SCALES)}")
@@ -49,6 +54,11 @@ class Display:
             raise InputError(f"window {self.low:g} to {self.high:g}: expected low to be less than high")
         if self.scale == "log" and self.low is not None and self.low <= 0:
             raise InputError(f"low = {self.low:g}: expected more than 0 on the logarithmic scale")
+
+    def part(self, images: NDArray[np.float32]) -> NDArray[np.float32]:
+        """What of images (..., n_v, n_u) is shown."""
+        n_v, n_u = images.shape[-2:]
+        return images[..., n_v // 4 : n_v - n_v // 4, n_u // 4 : n_u - n_u // 4] if self.half else images
 
     def window(self, values: ArrayLike) -> tuple[float, float]:
         """The numbers that get the first and the last colour where `values` are shown."""

@@ -1,5 +1,6 @@
 """Pictures of projections: upright, as seen from the pinhole, alone or all in one with numbers and a colour bar."""
 
+import math
 import os
 import struct
 import zlib
@@ -61,12 +62,28 @@ class Sheet:
     """Rows and columns of an image in it."""
     window: tuple[float, float]
     """The numbers at the colour bar's lower and upper end."""
+    summed: str
+    """What the numbers in the images' corners are, "sum" or "mean"; see `totals`."""
+    totals: NDArray[np.float64]
+    """These numbers (M,)."""
+    maxima: NDArray[np.float32]
+    """The largest numbers that are shown of each image (M,)."""
+    half: bool
+    """Whether the images' middle halves are shown."""
+    share: tuple[float, float]
+    """What is shown of the images' width and height."""
 
     def image_at(self, row: float, column: float) -> int | None:
         """Index of the image at a place in the picture; None between images."""
         inside = (np.array([row, column]) >= self.corners) & (np.array([row, column]) < self.corners + self.tile)
         found = np.flatnonzero(inside.all(axis=1))
         return int(found[0]) if len(found) else None
+
+
+def totals(projections: NDArray[np.float32], unit: str) -> tuple[str, NDArray[np.float64]]:
+    """What sums up each of the images (M, n_v, n_u): "sum" of counts and photons, "mean" of line integrals; and it (M,)."""
+    name = "sum" if unit in ("counts", "photons") else "mean"
+    return name, getattr(np, name)(projections, axis=(1, 2), dtype=np.float64)
 
 
 def sheet(
@@ -82,23 +99,31 @@ def sheet(
     Rings follow each other in the order of their modules; one of more than `COLUMNS` modules takes several rows. Where the
     images have more than `pixels` together, they are shown smaller, as means over blocks of pixels; small ones are shown
     larger, so that the numbers do not hide them. The colour bar's ends are the window of `display`, which is by default
-    that of the exact numbers.
+    that of all exact numbers. Each image has what `totals` says of the part that is shown in a corner if there is room.
     """
     display = display or Display()
     window = display.window(projections)
-    images = display.colored(_sized(as_seen(projections), pixels), window)
-    places = _places(np.asarray(rings))
+    shown = display.part(projections)
+    word, values = totals(shown, unit)
+    images = display.colored(sized(as_seen(shown), pixels), window)
+    at = places(np.asarray(rings))
     n_v, n_u = tile = images.shape[1:3]
     letters = max(1, round(min(n_v, n_u) / 60))
     gap = 2 * letters
-    corners = gap + places * (np.array(tile) + gap)
+    corners = gap + at * (np.array(tile) + gap)
     height, width = corners.max(axis=0) + tile + gap
     picture = np.full((height, width, 3), _BORDER, np.uint8)
-    for image, (row, column), number in zip(images, corners, np.asarray(numbers), strict=True):
+    texts = [f"{word} {value:.4g}" for value in values]
+    room = min(n_u // (WIDTH * max(map(len, texts)) + 2), n_v // (4 * HEIGHT), letters)  # 0: none
+    for image, (row, column), number, text in zip(images, corners, np.asarray(numbers), texts, strict=True):
         picture[row : row + n_v, column : column + n_u] = image
         _write(picture, str(number), row + letters, column + letters, letters)
+        if room:
+            _write(picture, text, row + n_v - (HEIGHT + 1) * room, column + room, room)
     bar = _color_bar(display, window, unit, height, max(letters, round(height / 300)))
-    return Sheet(np.concatenate([picture, bar], axis=1), corners, (n_v, n_u), window)
+    whole = np.concatenate([picture, bar], axis=1)
+    share = shown.shape[2] / projections.shape[2], shown.shape[1] / projections.shape[1]
+    return Sheet(whole, corners, (n_v, n_u), window, word, values, shown.max(axis=(1, 2)), display.half, share)
 
 
 def write_sheet(run: ProjectionRun, path: str | os.PathLike[str], display: Display | None = None) -> None:
@@ -107,28 +132,42 @@ def write_sheet(run: ProjectionRun, path: str | os.PathLike[str], display: Displ
     write_png(drawn.picture, path)
 
 
-def _sized(images: NDArray[np.float32], pixels: float) -> NDArray[np.float32]:
-    """The images with so many pixels that they can be looked at."""
-    count, n_v, n_u = images.shape
+def smaller(images: NDArray[np.float32], pixels: float) -> NDArray[np.float32]:
+    """Images (M, n_v, n_u) of about so many `pixels` together: means over blocks, where blocks of a size fill an image."""
+    needed = math.sqrt(images.size / pixels)
+    common = math.gcd(*images.shape[1:])
+    side = max(side for side in range(1, max(2, math.ceil(2 * needed))) if common % side == 0)
+    return _means(images, side) if needed > 1 and side > 1 else images
+
+
+def sized(images: NDArray[np.float32], pixels: float) -> NDArray[np.float32]:
+    """Images (M, n_v, n_u) with so many pixels that they can be looked at: up to about `pixels` together, not too few."""
+    _, n_v, n_u = images.shape
     factor = min(int(np.ceil(np.sqrt(images.size / pixels))), n_v, n_u)
     if factor > 1:
-        rows, columns = n_v // factor, n_u // factor
-        blocks = images[:, : rows * factor, : columns * factor].reshape(count, rows, factor, columns, factor)
-        return blocks.mean(axis=(2, 4), dtype=np.float32)
+        return _means(images, factor)
     factor = -(-_SMALLEST // max(n_v, n_u))
     return images.repeat(factor, axis=1).repeat(factor, axis=2) if factor > 1 else images
 
 
-def _places(rings: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Row and column (M, 2) of each image, counted in images."""
-    places = np.empty((len(rings), 2), np.int64)
+def _means(images: NDArray[np.float32], side: int) -> NDArray[np.float32]:
+    """Means over blocks of `side` pixels a side; pixels beyond the last block are left out."""
+    count, n_v, n_u = images.shape
+    rows, columns = n_v // side, n_u // side
+    blocks = images[:, : rows * side, : columns * side].reshape(count, rows, side, columns, side)
+    return blocks.mean(axis=(2, 4), dtype=np.float32)
+
+
+def places(rings: NDArray[np.int64], columns: int = COLUMNS) -> NDArray[np.int64]:
+    """Row and column (M, 2) of each image, counted in images: a ring in a row, or in several of at most `columns`."""
+    at = np.empty((len(rings), 2), np.int64)
     row = 0
     for ring in dict.fromkeys(rings.tolist()):
         members = np.flatnonzero(rings == ring)
         position = np.arange(len(members))
-        places[members] = np.stack([row + position // COLUMNS, position % COLUMNS], axis=1)
-        row += int(position[-1]) // COLUMNS + 1
-    return places
+        at[members] = np.stack([row + position // columns, position % columns], axis=1)
+        row += int(position[-1]) // columns + 1
+    return at
 
 
 def _color_bar(
@@ -136,10 +175,11 @@ def _color_bar(
 ) -> NDArray[np.uint8]:
     """A colour bar (height, width, 3) with its numbers and, above, its unit."""
     line = HEIGHT * letters
-    marks = [(share, f"{display.value_at(share, window):.4g}") for share in (1.0, 0.75, 0.5, 0.25, 0.0)]
+    top, bottom, left = 2 * line, height - line, WIDTH * letters
+    steps = next((n for n in (4, 2) if bottom - top >= n * line), 1)  # as many as have room
+    marks = [(share, f"{display.value_at(share, window):.4g}") for share in np.linspace(1.0, 0.0, steps + 1).tolist()]
     columns = max(len(unit), 3 + max(len(text) for _, text in marks))
     bar = np.full((height, (columns + 2) * WIDTH * letters, 3), _BORDER, np.uint8)
-    top, bottom, left = 2 * line, height - line, WIDTH * letters
     _write(bar, unit, line // 3, left, letters)
     ramp = [display.value_at(share, window) for share in np.linspace(1.0, 0.0, bottom - top)]
     bar[top:bottom, left : 3 * left] = display.colored(ramp, window)[:, None]
@@ -158,10 +198,15 @@ def _write(picture: NDArray[np.uint8], text: str, row: int, column: int, letters
 
 
 def write_png(picture: ArrayLike, path: str | os.PathLike[str]) -> None:
-    """Write a picture, row 0 at the top, as an 8-bit PNG: colours (height, width, 3) of uint8, or numbers (height, width).
+    """Write a picture (`png`) to a file; `InputError` where it cannot be written."""
+    with replacing(path) as temporary:
+        temporary.write_bytes(png(picture))
 
-    Of numbers, 0 is black, or the smallest if that is negative, and the largest is white. `InputError` where the file cannot
-    be written.
+
+def png(picture: ArrayLike) -> bytes:
+    """A picture, row 0 at the top, as an 8-bit PNG: colours (height, width, 3) of uint8, or numbers (height, width).
+
+    Of numbers, 0 is black, or the smallest if that is negative, and the largest is white.
     """
     pixels = np.asarray(picture)
     if pixels.ndim == 2:
@@ -170,8 +215,7 @@ def write_png(picture: ArrayLike, path: str | os.PathLike[str]) -> None:
     height, width, channels = pixels.shape
     header = struct.pack(">2I5B", width, height, 8, {1: 0, 3: 2}[channels], 0, 0, 0)  # 8 bits, grey or colours
     rows = zlib.compress(np.pad(pixels.reshape(height, -1), ((0, 0), (1, 0))).tobytes())  # 0 before each: stored as is
-    png = b"\x89PNG\r\n\x1a\n"
-    for name, data in ((b"IHDR", header), (b"IDAT", rows), (b"IEND", b"")):
-        png += struct.pack(">I", len(data)) + name + data + struct.pack(">I", zlib.crc32(name + data))
-    with replacing(path) as temporary:
-        temporary.write_bytes(png)
+    data = b"\x89PNG\r\n\x1a\n"
+    for name, part in ((b"IHDR", header), (b"IDAT", rows), (b"IEND", b"")):
+        data += struct.pack(">I", len(part)) + name + part + struct.pack(">I", zlib.crc32(name + part))
+    return data

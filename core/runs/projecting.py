@@ -33,12 +33,13 @@ def project_run(
     photons: float | None = None,
     noise_seed: int | None = None,
     progress: Progress | None = None,
+    field: float = 1.0,
 ) -> ProjectionRun:
     """Project `volume` into every module of `system`.
 
     Parameters
     ----------
-    shape, detector, magnification, pitch
+    shape, detector, magnification, pitch, field
         The images, as of `PinholeSystem.views`.
     backend, threads
         As of `Projector`.
@@ -70,7 +71,9 @@ def project_run(
     lowest, highest = float(volume.array.min()), float(volume.array.max())
     if isinstance(model, Emission) and lowest < -0.1 * abs(highest):  # interpolation leaves less
         _warn(f"the activity is {lowest:g} to {highest:g} kBq/mL: what is below 0 makes counts below 0")
-    views = system.views(shape=shape, detector=detector, magnification=magnification, pitch=pitch)
+    views = system.views(shape=shape, detector=detector, magnification=magnification, pitch=pitch, field=field)
+    if isinstance(model, Emission) and not model.within_crystal:
+        _warn_of_no_crystal(system, views, magnification)
     _warn_of_unseen(volume, views, ends_at_plane=not isinstance(model, Emission))
     n_v, n_u = views.shape
     require(4.0 * len(views) * n_v * n_u, f"a set of {len(views)} projections of {n_v} x {n_u} pixels")
@@ -101,6 +104,18 @@ def warn_of_energy(model: Model, energy: float, what: str) -> None:
     window = model.window if isinstance(model, Emission) else None
     if window is not None and not window[0] <= energy <= window[1]:
         _warn(f"{what} holds at {energy:g} keV, photons of {window[0]:g} to {window[1]:g} keV are counted")
+
+
+def _warn_of_no_crystal(system: PinholeSystem, views: Views, magnification: float) -> None:
+    """Warn where images of counts reach beyond the crystal."""
+    steps = np.stack([views.u_steps, views.v_steps])
+    sides = np.linalg.norm(steps, axis=2) * np.array(views.shape[::-1])[:, None] / magnification  # on the crystal, mm
+    beyond = int(np.any(sides > 1.001 * system.detector_side, axis=0).sum())
+    if beyond:
+        _warn(
+            f"{beyond} of {len(views)} images are wider than the crystal: pixels beside it count photons that nothing "
+            "detects, unless within_crystal (Crystal's Side) leaves them out"
+        )
 
 
 def _warn_of_unseen(volume: Volume, views: Views, ends_at_plane: bool) -> None:

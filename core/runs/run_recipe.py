@@ -1,7 +1,7 @@
 """From a recipe to projection runs: the main job, for the command line, the demo, scripts and Blender."""
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +18,7 @@ from ..phantoms.phantom import Phantom
 from ..phantoms.settings import setting_names
 from ..physics.ct_numbers import hu_to_mu
 from ..physics.isotopes import photon_energy
-from ..progress import Progress
+from ..progress import Progress, Stages
 from ..projector import Emission, InverseSquareSum, Model, Transmission
 from ..volumes.rearranging import centered
 from ..volumes.volume import Volume
@@ -28,9 +28,6 @@ from .projecting import project_run, warn_of_energy
 from .recipe import Recipe, fitting_recipe
 from .run import ProjectionRun
 from .settings import SETTINGS
-
-Stages = Callable[[str], Progress | None]
-"""Gives the progress callback of a stage: reading, voxelizing, projecting."""
 
 _MODELS: dict[str, Any] = {"transmission": Transmission, "emission": Emission, "inverse-square": InverseSquareSum}
 _MOST_MU = 500.0
@@ -56,7 +53,7 @@ def run_recipe(
     system, volume, mu
         Instead of those that the recipe names; of `system` the recipe chooses modules.
     stages
-        Gives the progress callback of each stage.
+        Begins each stage: reading, voxelizing, projecting.
 
     Raises
     ------
@@ -96,6 +93,7 @@ def run_recipe(
             detector=recipe["detector.plane"],
             magnification=recipe["detector.magnification"],
             pitch=recipe["detector.pitch"],
+            field=recipe["detector.field"],
             backend=recipe["compute.backend"],
             threads=recipe["compute.threads"],
             settings={"volume": _volume_name(record), **converted, "recipe": record.tables()},

@@ -6,7 +6,8 @@ import pytest
 from bpy_extras.object_utils import world_to_camera_view
 from mathutils import Vector
 
-from mphdrr.addon import ids, images, planes, scanner, selection, volumes
+from mphdrr.addon import ids, images, planes, scanner, selection, tiles, volumes
+from mphdrr.core.errors import InputError
 from mphdrr.core.geometry.grid import Grid
 from mphdrr.core.runs.display import Display
 from mphdrr.core.runs.mosaic import as_seen
@@ -42,7 +43,7 @@ def brightest(picture: bpy.types.Image) -> tuple[float, float]:
 def test_a_point_is_where_plane_camera_and_mosaic_show_it(projected, scene, ring_system, detector):
     made = projected(detector=detector, magnification=7.0)
     assert len(made) == 8
-    tiles = bpy.data.images[ids.MOSAIC]["mphdrr_tiles"]
+    shown = bpy.data.images[ids.MOSAIC]["mphdrr_tiles"]
     for plane, number in zip(made, ring_system.numbers, strict=True):
         camera, picture = plane.parent, plane.data
         assert camera == scanner.module(scanner.active_scanner(scene), number)
@@ -64,7 +65,7 @@ def test_a_point_is_where_plane_camera_and_mosaic_show_it(projected, scene, ring
         exact = as_seen(images.projection_array(bpy.data.images[ids.projection_name(number, 8)]))
         row, column = np.unravel_index(exact.argmax(), exact.shape)
         np.testing.assert_allclose((x, 1 - y), ((column + 0.5) / 50, (row + 0.5) / 40))
-        assert number == tiles["numbers"][planes.planes(scene).index(plane)]
+        assert number == shown["numbers"][planes.planes(scene).index(plane)]
 
 
 def test_the_display_changes_pictures_and_leaves_numbers(projected, scene):
@@ -80,12 +81,110 @@ def test_the_display_changes_pictures_and_leaves_numbers(projected, scene):
         pixels = np.empty(4 * before.size, np.float32)
         bpy.data.images[picture].pixels.foreach_get(pixels)
         everything.append(pixels)
-        assert np.array_equal(images.projection_array(bpy.data.images[name]), before)
+        assert images.projection_array(bpy.data.images[name]).tobytes() == before.tobytes(), "to the last bit"
     assert len({pixels.tobytes() for pixels in everything}) == 3, "a window that is automatic does not follow High"
     expected = Display("grey", "log", settings.low, settings.high).colored(as_seen(before))
     np.testing.assert_array_equal(np.rint(everything[-1].reshape(40, 50, 4)[::-1, :, :3] * 255), expected)
     settings.low = settings.high + 1
     assert settings.problem and np.array_equal(images.projection_array(bpy.data.images[name]), before)
+
+
+def test_a_number_picked_from_a_picture_is_the_exact_one_and_becomes_an_end_of_the_window(projected, scene):
+    projected()
+    settings, mosaic = scene.mphdrr_display, bpy.data.images[ids.MOSAIC]
+    shown = images.tiles(mosaic)
+    exact = images.projection_array(bpy.data.images[ids.projection_name(5, 8)])
+    row, column = np.unravel_index(exact.argmax(), exact.shape)
+    # As seen from the pinhole the first row is at the bottom, and the first column on the right.
+    down, right = exact.shape[0] - 1 - row, exact.shape[1] - 1 - column
+    place, larger = np.reshape(shown["corners"], (-1, 2))[4], np.array(shown["tile"]) / exact.shape
+    for within in (0.01, 0.99):
+        y, x = place + (np.array([down, right]) + within) * larger
+        found = tiles.value_at(mosaic, x / mosaic.size[0], 1 - y / mosaic.size[1])
+        assert found == (f"mphDRR 05, column {column}, row {row}", exact.max())
+    for name in ("mphDRR 05", "mphDRR 05 picture"):
+        found = tiles.value_at(bpy.data.images[name], (right + 0.5) / 50, 1 - (down + 0.5) / 40)
+        assert found == (f"mphDRR 05, column {column}, row {row}", exact.max())
+    assert tiles.value_at(mosaic, 0.999, 0.5) is None and tiles.value_at(mosaic, -0.1, 0.5) is None
+    assert tiles.value_at(bpy.data.images.new("Other", 8, 8), 0.5, 0.5) is None
+    with pytest.raises(InputError, match="expected low to be less than high"):
+        tiles.set_window(settings, "low", 2 * shown["window"][1], shown["window"])
+    assert settings.automatic
+    tiles.set_window(settings, "high", found[1], shown["window"])
+    assert (settings.low, settings.high, settings.automatic) == (shown["window"][0], exact.max(), False)
+    tiles.set_window(settings, "low", 0.5 * found[1], shown["window"])
+    assert settings.high == exact.max() and images.tiles(mosaic)["window"] == [settings.low, settings.high]
+
+
+def test_the_mosaic_knows_each_images_sum_or_mean_and_its_maximum(projected):
+    projected()
+    for settings, word in (({}, "mean"), ({"model": "EMISSION"}, "sum")):
+        projected(**settings)
+        shown = images.tiles(bpy.data.images[ids.MOSAIC])
+        exact = [images.projection_array(bpy.data.images[ids.projection_name(n, 8)]) for n in shown["numbers"]]
+        assert shown["summed"] == word and shown["maxima"] == [image.max() for image in exact]
+        np.testing.assert_allclose(shown["totals"], [getattr(image, word)(dtype=float) for image in exact], rtol=1e-12)
+
+
+@pytest.mark.parametrize("detector", ["VIRTUAL", "REAL"])
+def test_the_central_half_of_a_wide_field_is_what_the_crystal_sees(projected, scene, detector):
+    """Its pictures are those of a run of the crystal's field, and stand in the scene where those stand."""
+    settings = scene.mphdrr_display
+    settings.automatic, settings.high = False, 20.0
+
+    def pictures():
+        bpy.context.view_layer.update()
+        made = planes.planes(scene)
+        pixels = [np.array(bpy.data.images[ids.picture_name(f"mphDRR 0{n}")].pixels) for n in (2, 7)]
+        views = [
+            (background.scale, *background.offset)
+            for plane in made
+            for background in plane.parent.data.background_images
+        ]
+        return pixels, [np.array(plane.matrix_world) * plane.empty_display_size for plane in made], views
+
+    projected(detector=detector)
+    (first, of_seven), places, views = pictures()
+    bpy.ops.mphdrr.render_projections(width=100, height=80, detector=detector, field=2.0)
+    wide = pictures()
+    assert wide[2][0][0] == pytest.approx(2 * views[0][0])
+    exact = images.projection_array(bpy.data.images["mphDRR 07"])
+    settings.half = True
+    (second, of_seven_now), places_now, views_now = pictures()
+    np.testing.assert_allclose(second, first, atol=1e-2)
+    np.testing.assert_allclose(of_seven_now, of_seven, atol=1e-2)
+    np.testing.assert_allclose(views_now, views, atol=1e-6)
+    np.testing.assert_allclose(places_now, places, atol=1e-3)
+    assert np.array_equal(images.projection_array(bpy.data.images["mphDRR 07"]), exact) and exact.shape == (80, 100)
+    # The eyedropper counts columns and rows in the whole array.
+    for name, at in (("mphDRR 07 picture", (0.01, 0.01)), ("mphDRR 07", (0.51 * 0.5 + 0.25, 0.25))):
+        found = tiles.value_at(bpy.data.images[name], *at)
+        column, row = (int(word.rstrip(",")) for word in found[0].split()[3::2])
+        assert found[1] == exact[row, column]
+    found = tiles.value_at(bpy.data.images["mphDRR 07 picture"], 0.01, 0.01)
+    assert found[0] == "mphDRR 07, column 74, row 20"
+    shown = images.tiles(bpy.data.images[ids.MOSAIC])
+    row, column = np.reshape(shown["corners"], (-1, 2))[6]
+    mosaic = bpy.data.images[ids.MOSAIC]
+    found = tiles.value_at(mosaic, (column + 0.5) / mosaic.size[0], 1 - (row + 0.5) / mosaic.size[1])
+    assert found == ("mphDRR 07, column 74, row 59", exact[59, 74])
+
+
+def test_the_wide_field_has_twice_the_pixels_of_the_same_size(projected, scene):
+    settings = scene.mphdrr_projections
+    settings.width, settings.height = 50, 40
+    assert bpy.ops.mphdrr.wide_field() == {"FINISHED"}
+    assert (settings.width, settings.height, settings.field) == (100, 80, 2.0)
+    assert bpy.ops.mphdrr.wide_field() == {"FINISHED"}
+    assert (settings.width, settings.height, settings.field) == (50, 40, 1.0)
+    settings.pitch = 0.5
+    with pytest.raises(RuntimeError, match="pixels' size is typed"):
+        bpy.ops.mphdrr.wide_field()
+    settings.pitch, settings.model = 0.0, "EMISSION"
+    with pytest.raises(RuntimeError, match="counts end at the crystal"):
+        bpy.ops.mphdrr.wide_field()
+    with pytest.raises(RuntimeError, match="field"):
+        bpy.ops.mphdrr.render_projections(model="EMISSION", field=2.0, width=8, height=8)
 
 
 def test_planes_of_the_active_module_its_ring_or_all_that_are_visible(projected, scene):

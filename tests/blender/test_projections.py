@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import threading
 import warnings
 from pathlib import Path
@@ -198,7 +199,7 @@ def test_images_and_arrays_survive_save_and_reopen(scanned, scene, tmp_path):
     bpy.ops.wm.open_mainfile(filepath=str(tmp_path / "study.blend"))
     assert np.array_equal(images.projection_array(bpy.data.images[name]), before)
     run_file = bpy.context.scene.mphdrr_projections.run_file
-    assert run_file == "//study_mphdrr/Scene-projections.h5"
+    assert re.fullmatch(r"//study_mphdrr/Scene-projections-[0-9a-f]{8}\.h5", run_file)
     run = read_run(storage.absolute(run_file))
     assert np.array_equal(run.projections[0], before)
     assert run.recipe["phantom.kind"] == "derenzo" and run.recipe["phantom.rod_diameters"] == (8, 6, 5, 4, 3, 2)

@@ -99,3 +99,13 @@ def test_import_loads_nothing_heavy(module: str, unwanted: set[str]):
     script = f"import sys, {module}; print(*(set({sorted(unwanted)!r}) & set(sys.modules)))"
     loaded = subprocess.run([sys.executable, "-c", script], check=True, capture_output=True, text=True).stdout
     assert loaded.strip() == ""
+
+
+@pytest.mark.parametrize("path", [path for path in SOURCES if "bpy" in path.read_text(encoding="utf-8")], ids=str)
+def test_labels_can_be_translated(path):
+    """A label is a text that a catalogue can have: what is put into it comes after `pgettext_iface`."""
+    for call in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+        for keyword in call.keywords if isinstance(call, ast.Call) else ():
+            if keyword.arg in ("text", "heading", "placeholder") and isinstance(keyword.value, ast.JoinedStr):
+                words = [part.value for part in keyword.value.values if isinstance(part, ast.Constant)]
+                assert not any(letter.isalpha() for word in words for letter in word), f"line {keyword.value.lineno}"

@@ -9,7 +9,7 @@ from PIL import Image
 import mphdrr.core as mph
 from mphdrr.core.runs.display import COLORS, SCALES, Display
 from mphdrr.core.runs.lettering import lettered
-from mphdrr.core.runs.mosaic import sheet, write_png
+from mphdrr.core.runs.mosaic import sheet, totals, write_png
 
 numbers = st.lists(st.floats(-1e6, 1e6, width=32), min_size=2, max_size=30)
 
@@ -69,8 +69,54 @@ def test_every_image_stands_in_its_rings_row_as_the_pinhole_sees_it(shape, facto
         own = drawn.picture[row : row + drawn.tile[0], column : column + drawn.tile[1]]
         middle = drawn.image_at(row + drawn.tile[0] / 2, column + drawn.tile[1] / 2)
         assert middle == m and drawn.image_at(row - 1, column) is None
-        if factor == 1:  # all but the number in the corner
-            np.testing.assert_array_equal(own[20:], Display().colored(mph.as_seen(images[m]), drawn.window)[20:])
+        if factor == 1:  # all but the number and the total in the corners
+            wanted = Display().colored(mph.as_seen(images[m]), drawn.window)
+            np.testing.assert_array_equal(own[20:-16], wanted[20:-16])
+
+
+def has_ink(picture, text, letters=1):
+    """Whether a text stands somewhere in a picture, in white."""
+    ink = lettered(text, letters)
+    windows = np.lib.stride_tricks.sliding_window_view((picture == 255).all(axis=2), ink.shape)
+    return bool((windows == ink).all(axis=(2, 3)).any())
+
+
+@pytest.mark.parametrize("unit", ["counts", "photons", "kBq/mL mm", "1"])
+def test_every_image_has_its_sum_or_mean_and_the_bar_the_largest_number(unit):
+    images = 2 * np.random.default_rng(3).random((3, 128, 128), np.float32)
+    word, values = totals(images, unit)
+    assert word == ("sum" if unit in ("counts", "photons") else "mean")
+    np.testing.assert_allclose(values, [getattr(image.astype(float), word)() for image in images], rtol=1e-12)
+    drawn = sheet(images, [1, 2, 3], [0, 0, 0], unit)
+    for (row, column), value in zip(drawn.corners, values, strict=True):
+        assert has_ink(drawn.picture[row : row + 128, column : column + 128], f"{word} {value:.4g}")
+    bar = drawn.picture[:, drawn.corners[-1, 1] + 128 :]
+    assert has_ink(bar, f"{images.max():.4g}", 2) and has_ink(bar, "0", 2) and not has_ink(bar, "9.9", 2)
+
+
+@pytest.mark.parametrize("shape", [(128, 128), (101, 126)])
+def test_the_central_half_is_shown_with_its_own_totals_in_the_window_of_all(shape):
+    images = np.random.default_rng(4).random((2, *shape), np.float32)
+    images[0, 0, 0] = 50.0
+    n_v, n_u = shape
+    middle = images[:, n_v // 4 : n_v - n_v // 4, n_u // 4 : n_u - n_u // 4]
+    display = Display(half=True)
+    assert np.array_equal(display.part(images), middle)
+    assert np.array_equal(display.part(images[:, ::-1, ::-1]), middle[:, ::-1, ::-1]), "seen from any side"
+    drawn, own = sheet(images, [1, 2], [0, 0], "counts", display), Display(high=50.0)
+    assert drawn.window == (0.0, 50.0), "the largest of all exact numbers"
+    np.testing.assert_array_equal(
+        drawn.picture[:, :-200], sheet(middle, [1, 2], [0, 0], "counts", own).picture[:, :-200]
+    )
+    np.testing.assert_allclose(drawn.totals, middle.sum(axis=(1, 2), dtype=float))
+
+
+def test_images_too_small_for_a_total_have_none():
+    images = np.zeros((2, 64, 64), np.float32)
+    images[0, 20, 20] = 123456.0
+    drawn = sheet(images, [1, 2], [0, 0], "counts")
+    (row, column) = drawn.corners[1]
+    assert not (drawn.picture[row + 20 : row + 64, column : column + 64] == 255).any()
 
 
 def test_a_run_without_counts_can_be_shown(tmp_path):

@@ -151,11 +151,25 @@ def for_tensor(tensor: Any) -> Backend:
 
 @functools.cache
 def _cuda_works() -> bool:
+    return not _problem("cuda")
+
+
+def _problem(name: str) -> str:
+    """Why a backend cannot be used on this machine, "" where it can; its libraries are loaded for this."""
     try:
-        _require(BACKENDS["cuda"])
-    except (InputError, *_CANNOT_LOAD):
-        return False
-    return True
+        _require(BACKENDS[name])
+    except (InputError, *_CANNOT_LOAD) as error:
+        return _reason(error)
+    return ""
+
+
+@functools.cache
+def states() -> dict[str, str]:
+    """What each backend is on this machine: used by "auto", there to be chosen, or why it is not there."""
+    problems = {name: _problem(name) for name in BACKENDS}
+    used = next(name for name in _AUTOMATIC if not problems[name])
+    found = {name: f"not found: {problem}" if problem else "found, can be chosen" for name, problem in problems.items()}
+    return {**found, used: "found, used automatically"}
 
 
 def _reason(error: BaseException) -> str:

@@ -268,6 +268,8 @@ def _initialize() -> None:
 
 def _cache_folder() -> Path:
     """The folder of this user in which Warp may keep what it can make again."""
+    if "MPHDRR_CACHE" in os.environ:
+        return Path(os.environ["MPHDRR_CACHE"])
     if sys.platform == "win32":
         base = os.environ.get("LOCALAPPDATA") or Path.home() / "AppData" / "Local"
     elif sys.platform == "darwin":

@@ -1,0 +1,180 @@
+"""``mphdrr figure KIND FILE … -o PICTURE``; only the figures that are rendered, and a .blend, need Blender."""
+
+import argparse
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ...core.cli.options import add_command, output_path, progress_bar, refuse
+from ...core.errors import InputError
+from ...core.figures.kinds import KINDS, FigureKind, figure_kind
+from ...core.figures.page import SUFFIXES, Page
+from ...core.figures.subject import NEEDS, Subject, require
+from ...core.geometry.frames import euler_pose
+from ...core.geometry.grid import Grid
+from ...core.phantoms.kinds import KINDS as PHANTOMS
+from ...core.phantoms.language import read_phantom
+from ...core.runs.files import FORMATS, read_run
+from ...core.runs.recipe import read_recipe
+from ...core.runs.run import ProjectionRun
+from ...core.runs.run_recipe import phantom_pose, run_recipe
+from ...core.toml import read_toml
+from ...core.volumes.volume_files import read_volume
+from ...core.workbook import read_system
+from .scene import new_scene, quiet
+
+_WORKBOOKS = (".xlsx", ".xlsm")
+_POSED = ("position", "euler_degrees", "voxels")
+
+
+def add_parser(subparsers) -> None:  # type: ignore[no-untyped-def]
+    """Add the command."""
+    parser = add_command(
+        subparsers,
+        "figure",
+        "draw a figure as papers show them, of a scanner, a phantom or projections",
+        "mphdrr figure cut-away scanner.xlsx derenzo -o figure.png --size 1600x900\n"
+        "example: mphdrr figure scanner scanner.xlsx --modules 1-40 -o modules.svg\n"
+        "example: mphdrr figure mosaic run.h5 -o mosaic.png -o mosaic.svg",
+    )
+    add = parser.add_argument
+    add("kind", nargs="?", metavar="KIND", help=f"one of {', '.join(KINDS)}; --list explains them")
+    text = "what it is of: a workbook, a phantom (its kind or a .toml), a volume, a recipe, a run, or a .blend alone"
+    add("files", nargs="*", metavar="FILE", help=text)
+    text = f"{', '.join(SUFFIXES)}; in .svg the labels are text; may be repeated"
+    add("-o", "--output", action="append", default=[], metavar="FILE", help=text)
+    add("--list", action="store_true", help="list the kinds of figures")
+    add("--size", type=_size, metavar="WIDTHxHEIGHT", help="pixels; the kind's own by default")
+    add("--modules", metavar="RANGE", help="such as 1-40 or 1-20,41; default: all. c-arm shows the first")
+    add(
+        "--position", type=float, nargs=3, default=[0.0, 0.0, 0.0], metavar="MM", help="of a phantom: its middle, x y z"
+    )
+    text = "of a phantom: phi theta psi, psi about its own axis, then theta about world y, then phi about world z"
+    add("--euler-degrees", type=float, nargs=3, default=[0.0, 0.0, 0.0], metavar="DEG", help=text)
+    add("--voxels", type=int, default=200, metavar="N", help="of a phantom, along each side")
+    add("--no-labels", action="store_true", help="without title and axes, where the figure is rendered")
+    add("--samples", type=int, default=16, metavar="N", help="rays per pixel, where the figure is rendered")
+    parser.set_defaults(run=_run)
+
+
+def _size(text: str) -> tuple[int, int]:
+    width, _, height = text.lower().partition("x")
+    try:
+        return int(width), int(height)
+    except ValueError:
+        raise argparse.ArgumentTypeError(f"{text!r}: expected pixels such as 1600x900") from None
+
+
+def _run(arguments: argparse.Namespace) -> None:
+    if arguments.list:
+        width = max(map(len, KINDS))
+        print(
+            "\n".join(f"{kind.name:{width}}  {kind.summary} (of {' and '.join(kind.needs)})" for kind in KINDS.values())
+        )
+        return
+    if arguments.kind is None:
+        raise InputError("figure: name a kind; --list shows them")
+    kind = figure_kind(arguments.kind)
+    if not arguments.output:
+        raise InputError("nothing to write: give --output FILE")
+    paths = [output_path(name, SUFFIXES) for name in arguments.output]
+    page = Page(*(arguments.size or kind.size))
+    blends = [file for file in arguments.files if file.lower().endswith(".blend")]
+    if blends:
+        if len(arguments.files) > 1:
+            raise InputError(f"{blends[0]}: a .blend holds all that is shown; give no other file")
+        refuse(arguments, _POSED, "is for phantoms that are named on the command line, not for a .blend")
+        _of_scene(arguments, kind, Path(blends[0]), paths)
+    else:
+        subject = _subject(arguments)
+        have = [need for need in NEEDS if getattr(subject, need) is not None]
+        require(kind.needs, have, kind.name)
+        if kind.draw is not None:
+            kind.draw(page, subject)
+        else:
+            _render(arguments, kind, page, subject)
+        for path in paths:
+            page.write(path)
+    for path in paths:
+        print(path)
+
+
+def _of_scene(arguments: argparse.Namespace, kind: FigureKind, blend: Path, paths: list[Path]) -> None:
+    """A figure of the scene in a .blend, as the window makes it."""
+    new_scene()
+    import bpy
+
+    from .. import figures, jobs
+
+    with quiet():
+        try:
+            bpy.ops.wm.open_mainfile(filepath=str(blend.absolute()))
+        except RuntimeError as error:
+            raise InputError(f"{blend}: cannot be opened ({str(error).strip().splitlines()[0]})") from None
+        labels = not arguments.no_labels
+        given = arguments.size, arguments.modules, labels, arguments.samples
+        jobs.run(figures.figure_job(bpy.context, kind.name, paths, *given))
+
+
+def _render(arguments: argparse.Namespace, kind: FigureKind, page: Page, subject: Subject) -> None:
+    """A figure that Blender renders."""
+    new_scene()
+    from .. import figures, volumes
+
+    assert kind.studio is not None
+    item = None
+    if kind.studio.volume and subject.volume is not None:
+        item = volumes.add_volume(subject.volume, subject.name or "Volume")
+    with quiet():
+        for _ in figures.rendering(page, subject, kind.studio, item, not arguments.no_labels, arguments.samples):
+            pass
+
+
+def _subject(arguments: argparse.Namespace) -> Subject:
+    """What the files and names on the command line hold; of two that hold the same, the later counts."""
+    found: dict[str, Any] = {"modules": arguments.modules}
+    posed = False
+    for file in arguments.files:
+        made = _read(arguments, file, found.get("scanner"))
+        posed = posed or made.pop("posed", False)
+        found |= made
+    if not posed:
+        refuse(arguments, _POSED, "is for a phantom: name its kind, or its .toml")
+    return Subject(**found)
+
+
+def _read(arguments: argparse.Namespace, file: str, scanner: Any) -> dict[str, Any]:
+    """What one of the files holds, by the names of `Subject`'s fields."""
+    suffix = Path(file).suffix.lower()
+    if suffix in _WORKBOOKS:
+        return {"scanner": read_system(file)}
+    if suffix == ".toml" and "shape" not in read_toml(file):
+        (run,) = run_recipe(read_recipe(file), scanner, stages=progress_bar)
+        return _of_run(run)
+    kinds = [kind for kind in PHANTOMS if kind.name == file]
+    if kinds or suffix == ".toml":
+        phantom: Any = kinds[0].phantom(**kinds[0].usual) if kinds else read_phantom(file)
+        phi, theta, psi = np.deg2rad(arguments.euler_degrees)
+        pose = euler_pose(phi, theta, psi, arguments.position)
+        # As large as the phantom however it is turned, and a voxel free all around.
+        spacing = phantom.extent / max(1, arguments.voxels - 2)
+        grid = Grid.centered(arguments.voxels, spacing, arguments.position)
+        volume = phantom.voxelize(grid, pose, progress_bar("voxelizing"))
+        return {"volume": volume, "pose": pose, "name": phantom.title, "posed": True}
+    if suffix in FORMATS:
+        try:
+            return _of_run(read_run(file))
+        except InputError:
+            if suffix == ".pt" or not Path(file).is_file():
+                raise
+    return {"volume": read_volume(file), "pose": None, "name": Path(file).name}
+
+
+def _of_run(run: ProjectionRun) -> dict[str, Any]:
+    found = {"scanner": run.system, "volume": run.volume, "run": run, "name": str(run.settings.get("volume", ""))}
+    try:
+        placed = any(key.startswith("phantom.") for key in run.recipe.given)
+        return {**found, "pose": phantom_pose(run.recipe) if placed else None}
+    except InputError:  # of version 0.1.0, which keeps no recipe
+        return {**found, "pose": None}

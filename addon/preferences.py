@@ -1,0 +1,95 @@
+"""Preferences > Add-ons > mphDRR: what computes here and why, threads, the cache, the example, the website."""
+
+from __future__ import annotations
+
+import functools
+import os
+import shutil
+import tomllib
+from pathlib import Path
+
+import bpy
+from bpy.app.translations import pgettext_iface as iface
+from bpy.props import IntProperty
+
+from ..core.memory import readable_size
+from ..core.projector import backends, parallel
+from . import ids
+
+PACKAGE = __package__.rpartition(".")[0]  # "mphdrr", or "bl_ext.<repo>.mphdrr" when installed as an extension
+
+
+def _threads_set(self: MPHDRR_Preferences, context: bpy.types.Context) -> None:
+    parallel.set_usual_threads(self.threads or None)
+
+
+class MPHDRR_Preferences(bpy.types.AddonPreferences):
+    """What holds for all scenes."""
+
+    bl_idname = PACKAGE
+
+    threads: IntProperty(
+        name="Threads", description="Processor threads that projections use where the panel does not say; 0: all",
+        default=0, min=0, soft_max=64, update=_threads_set,
+    )  # fmt: skip
+
+    def draw(self, context: bpy.types.Context) -> None:
+        """Called by Blender."""
+        layout = self.layout
+        row = layout.row()
+        row.operator_context = "INVOKE_DEFAULT"
+        row.operator(ids.LOAD_EXAMPLE, icon="PLAY")
+        if website():
+            row.operator("wm.url_open", text="Website and Documentation", icon="URL").url = website()
+        box = layout.box()
+        box.label(text="What computes the projections:")
+        names, states = (part := box.split(factor=0.2)).column(align=True), part.column(align=True)
+        for name, state in backends.states().items():
+            names.label(text=backends.BACKENDS[name].label)
+            states.label(text=state[:1].upper() + state[1:])
+        layout.use_property_split = True
+        layout.prop(self, "threads", text="Threads" if self.threads else "Threads (0: all)")
+        folder = cache_folder()
+        if folder is not None:
+            row = layout.row()
+            text = iface("Compiled code, {size} in {folder}")
+            row.label(text=text.format(size=readable_size(cache_size()), folder=folder), translate=False)
+            row.operator(ids.CLEAN_CACHE, text="Clean", icon="TRASH")
+
+
+def cache_folder() -> Path | None:
+    """The folder in the extension's own one for what can be made again; None where this is no installed extension."""
+    try:
+        return Path(bpy.utils.extension_path_user(PACKAGE, path="cache"))
+    except ValueError:
+        return None
+
+
+def cache_size() -> int:
+    """Bytes of the files in `cache_folder`."""
+    folder = cache_folder()
+    return sum(path.stat().st_size for path in folder.rglob("*") if path.is_file()) if folder else 0
+
+
+def clean_cache() -> str:
+    """Delete what is in `cache_folder`; returns the line to report."""
+    size, folder = cache_size(), cache_folder()
+    if folder is not None:
+        shutil.rmtree(folder, ignore_errors=True)  # a library that is loaded cannot be deleted on Windows
+    return f"Deleted {readable_size(size - cache_size())}"
+
+
+@functools.cache
+def website() -> str:
+    """The extension's website, as its manifest says; "" for none."""
+    manifest = Path(__file__).parents[1] / "blender_manifest.toml"
+    return tomllib.loads(manifest.read_text(encoding="utf-8")).get("website", "") if manifest.is_file() else ""
+
+
+def apply() -> None:
+    """Do as the preferences say, when the extension is enabled."""
+    folder, addon = cache_folder(), bpy.context.preferences.addons.get(PACKAGE)
+    if folder is not None:
+        os.environ.setdefault("MPHDRR_CACHE", str(folder))
+    if addon is not None and addon.preferences is not None:
+        parallel.set_usual_threads(addon.preferences.threads or None)

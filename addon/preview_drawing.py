@@ -1,0 +1,145 @@
+"""The live preview's picture in the 3D views: in a corner, with its lines, and where the module's plane stands.
+
+It is drawn over the views and is no datablock: nothing of it is saved, undone or rendered.
+"""
+
+from collections.abc import Callable
+from typing import Any
+
+import blf
+import bpy
+import gpu
+import numpy as np
+from gpu_extras.batch import batch_for_shader
+from numpy.typing import NDArray
+
+_WIDTH = 250.0  # of the picture in the corner, in Blender's units of its interface
+_MARGIN, _TEXT = 20.0, 11.0
+_BACK, _FRONT = (0.05, 0.05, 0.05, 0.75), (1.0, 1.0, 1.0, 1.0)
+_TRIANGLES = ((0, 1, 2), (0, 2, 3))
+
+
+def start(session: Any) -> Callable[[], None]:
+    """Draw the preview of a `preview.Session` from now on; the result takes it back."""
+    if bpy.app.background:
+        return lambda: None
+    view, textures = bpy.types.SpaceView3D, _Textures()
+    handles = [
+        view.draw_handler_add(_draw_plane, (session, textures), "WINDOW", "POST_VIEW"),
+        view.draw_handler_add(_draw_corner, (session, textures), "WINDOW", "POST_PIXEL"),
+    ]
+
+    def end() -> None:
+        for handle in handles:
+            view.draw_handler_remove(handle, "WINDOW")
+
+    return end
+
+
+class _Textures:
+    """The textures of the preview that is shown; made when they are first drawn."""
+
+    def __init__(self) -> None:
+        self._of: Any = None
+        self._made: tuple[Any, Any] = (None, None)
+
+    def of(self, shown: Any) -> tuple[Any, Any]:
+        """The textures of a preview's picture and of its colours."""
+        if self._of is not shown:
+            self._made, self._of = (_texture(shown.picture), _texture(shown.colors)), shown
+        return self._made
+
+
+def _texture(picture: NDArray[np.uint8]) -> Any:
+    height, width = picture.shape[:2]
+    pixels = np.ones((height, width, 4), np.float32)
+    pixels[..., :3] = picture[::-1] / np.float32(255)
+    data = gpu.types.Buffer("FLOAT", pixels.size, pixels.ravel())
+    return gpu.types.GPUTexture((width, height), format="RGBA8", data=data)
+
+
+def _draw_corner(session: Any, textures: _Textures) -> None:
+    """Draw the picture and its lines in the lower right corner, beside the sidebar."""
+    context = bpy.context
+    unit = context.preferences.system.ui_scale
+    margin, size = _MARGIN * unit, _TEXT * unit
+    right = context.region.width - margin - _covered(context)
+    blf.size(0, size)
+    shown, width, height = session.shown, _WIDTH * unit, 0.0
+    lines = [piece for line in session.lines for piece in _wrapped(line, width)]
+    if shown is not None:
+        rows, columns = shown.picture.shape[:2]
+        width, height = _fitting(columns / rows, width, 0.6 * context.region.height)
+    left, top = right - max(width, _WIDTH * unit), margin + height + (1.4 * len(lines) + 2) * size
+    gpu.state.blend_set("ALPHA")
+    _rectangle(left - size, margin - size, right + size, top)
+    if shown is not None:
+        picture, colors = textures.of(shown)
+        _picture(picture, _box(left, margin + size, left + width, margin + size + height))
+        _picture(colors, _box(left, margin, left + width, margin + 0.6 * size))
+    blf.color(0, *_FRONT)
+    for number, line in enumerate(lines):
+        blf.position(0, left, top - (1.4 * number + 1.7) * size, 0)
+        blf.draw(0, line)
+    gpu.state.blend_set("NONE")
+
+
+def _draw_plane(session: Any, textures: _Textures) -> None:
+    """Draw the picture where the module's plane stands; it faces the ROI, as the planes do."""
+    shown = session.shown
+    if shown is None or shown.corners is None:
+        return
+    corners, view = shown.corners, bpy.context.region_data
+    inward = shown.run.views.detector_centers[0] - shown.run.views.sources[0]
+    back = np.array(view.view_matrix.inverted())
+    towards = back[:3, 3] - corners.mean(axis=0) if view.is_perspective else back[:3, 2]
+    if np.dot(towards, inward) <= 0:
+        return
+    gpu.state.depth_test_set("LESS_EQUAL")
+    _picture(textures.of(shown)[0], (corners + 1e-3 * inward).tolist())  # before the plane of the last run
+    gpu.state.depth_test_set("NONE")
+
+
+def _fitting(aspect: float, width: float, height: float) -> tuple[float, float]:
+    """Width and height of a picture that is as large as fits."""
+    return min(width, aspect * height), min(height, width / aspect)
+
+
+def _box(left: float, bottom: float, right: float, top: float) -> list[tuple[float, float, float]]:
+    return [(left, top, 0.0), (right, top, 0.0), (right, bottom, 0.0), (left, bottom, 0.0)]
+
+
+def _picture(texture: Any, places: list[Any]) -> None:
+    """Draw a texture to four places: from its top left, clockwise."""
+    shader = gpu.shader.from_builtin("IMAGE")
+    shader.uniform_sampler("image", texture)
+    corners = [(0, 1), (1, 1), (1, 0), (0, 0)]
+    batch_for_shader(shader, "TRIS", {"pos": places, "texCoord": corners}, indices=_TRIANGLES).draw(shader)
+
+
+def _rectangle(left: float, bottom: float, right: float, top: float) -> None:
+    shader = gpu.shader.from_builtin("UNIFORM_COLOR")
+    shader.uniform_float("color", _BACK)
+    places = _box(left, bottom, right, top)
+    batch_for_shader(shader, "TRIS", {"pos": places}, indices=_TRIANGLES).draw(shader)
+
+
+def _wrapped(line: str, width: float) -> list[str]:
+    """A line as lines that are no wider than `width`, in pixels, where it has spaces."""
+    pieces = [""]
+    for word in line.split():
+        longer = f"{pieces[-1]} {word}".strip()
+        if pieces[-1] and blf.dimensions(0, longer)[0] > width:
+            pieces.append(word)
+        else:
+            pieces[-1] = longer
+    return pieces
+
+
+def _covered(context: bpy.types.Context) -> float:
+    """How much of the region's right the sidebar covers, in pixels."""
+    if not context.preferences.system.use_region_overlap:
+        return 0.0
+    return float(
+        max((region.width for region in context.area.regions if region.type == "UI" and region.width > 1), default=0)
+    )

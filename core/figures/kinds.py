@@ -1,0 +1,77 @@
+"""The kinds of figures, one line each; command line and Blender follow from this table.
+
+A new kind is a line here: one that is drawn has a function of a page and a subject, one that is rendered says what is put
+into the studio (`addon.figures`).
+"""
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+from ..errors import InputError
+from . import mosaics, sums, virtual_c_arm
+from .page import Page
+from .subject import Subject
+
+
+class Studio(NamedTuple):
+    """What a rendered figure shows besides the scanner's modules."""
+
+    volume: bool = False
+    rays: bool = False  # the modules' principal rays
+    cut: bool = False  # the modules between the isocentre and the viewer are left out
+    near: bool = False  # the ROI fills the picture's height
+
+
+class FigureKind(NamedTuple):
+    """One kind of figure."""
+
+    name: str  # on the command line
+    label: str  # in menus
+    summary: str  # one line of help
+    needs: tuple[str, ...]  # of `subject.NEEDS`
+    size: tuple[int, int]  # width and height, pixels, where none is given
+    draw: Callable[[Page, Subject], None] | None = None
+    studio: Studio | None = None  # of a figure that Blender renders
+    one_module: bool = False  # it shows the first of the chosen modules
+
+
+KINDS = {
+    kind.name: kind
+    for kind in (
+        FigureKind(
+            "scanner", "Scanner", "the scanner's modules, or some of them alone, in place", ("scanner",), (1600, 1000),
+            studio=Studio(),
+        ),
+        FigureKind(
+            "cut-away", "Cut-Away with Rays", "a volume and the principal rays, the modules in front of it cut away",
+            ("scanner", "volume"), (1600, 1000), studio=Studio(volume=True, rays=True, cut=True),
+        ),
+        FigureKind(
+            "inside", "Volume in the Scanner", "a volume seen from near by, between the modules", ("scanner", "volume"),
+            (1600, 1000), studio=Studio(volume=True, near=True),
+        ),
+        FigureKind(
+            "sums", "Orthogonal Sums", "a volume's sums along x, y and z, value x mm, with its translation T and rotation R",
+            ("volume",), (1600, 680), sums.draw,
+        ),
+        FigureKind(
+            "mosaic", "Mosaic, FOV", "all projections ring by ring, the central half of each image", ("run",), (1800, 480),
+            mosaics.draw_fov,
+        ),
+        FigureKind(
+            "mosaic-wide", "Mosaic, Wide FOV", "all projections ring by ring, whole images", ("run",), (1800, 480),
+            mosaics.draw_wide_fov,
+        ),
+        FigureKind(
+            "c-arm", "Virtual C-Arm", "a module's distances, as the true pinhole and as a C-arm with its source 5 l away",
+            ("scanner",), (1600, 800), virtual_c_arm.draw, one_module=True,
+        ),
+    )
+}  # fmt: skip
+
+
+def figure_kind(name: str) -> FigureKind:
+    """The kind of that name; `InputError` where there is none."""
+    if name not in KINDS:
+        raise InputError(f"figure {name!r}: expected one of {', '.join(KINDS)}")
+    return KINDS[name]

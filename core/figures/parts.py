@@ -1,0 +1,68 @@
+"""Parts that flat figures share: their heading, axes in mm and colour bars."""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from ..runs.display import Display
+from . import letters
+from .page import Page
+
+INK, FAINT = "#20262d", "#6b7480"
+"""Colours of text and lines, and of what is said besides."""
+_STEPS = (1.0, 2.0, 2.5, 5.0, 10.0)
+
+
+def heading(page: Page, title: str, lines: Sequence[str] = (), ink: str = INK, faint: str = FAINT) -> int:
+    """Write a title and lines below it; returns the first row that is free."""
+    em = page.em
+    row, room = 0.9 * em, page.width - 2 * em
+    for text, size, step, color in (
+        (title, 1.25 * em, 1.2 * em, ink),
+        *((line, em, 1.45 * em, faint) for line in lines),
+    ):
+        row += step
+        # A line that is too long is written smaller.
+        page.text(text, em, row, size * min(1.0, room / max(letters.width(text, size), 1.0)), color)
+    return heading_height(page, len(lines))
+
+
+def heading_height(page: Page, lines: int) -> int:
+    """Rows that a heading with so many lines below its title takes."""
+    return round((3.1 + 1.45 * lines) * page.em)
+
+
+def ticks(low: float, high: float, most: int) -> list[float]:
+    """Round numbers from `low` to `high`, `most` steps at most."""
+    raw = (high - low) / max(1, most)
+    power = 10.0 ** np.floor(np.log10(raw))
+    step = power * next(s for s in _STEPS if s * power >= raw * (1 - 1e-9))
+    first = np.ceil(low / step - 1e-9)
+    return [float(step * n) for n in np.arange(first, np.floor(high / step + 1e-9) + 1)]
+
+
+def number(value: float) -> str:
+    """A number with a proper minus sign."""
+    return f"{value:.4g}".replace("-", "−")
+
+
+def color_bar(
+    page: Page, display: Display, window: tuple[float, float], unit: str, left: int, top: int, height: int
+) -> None:
+    """A colour bar with its numbers on its right, and its unit above."""
+    em = page.em
+    width = round(1.1 * em)
+    ramp = [display.value_at(share, window) for share in np.linspace(1.0, 0.0, max(2, height))]
+    page.image(display.colored(ramp, window)[:, None], left, top, width, height)
+    page.text(unit, left, top - 0.9 * em, 0.9 * em, INK)
+    for share in (0.0, 0.25, 0.5, 0.75, 1.0):
+        row = top + height * (1 - share)
+        page.line([(left + width, row), (left + width + 0.3 * em, row)], INK, 0.06 * em)
+        page.text(number(display.value_at(share, window)), left + width + 0.5 * em, row + 0.33 * em, 0.9 * em, INK)
+
+
+def bar_width(page: Page, display: Display, window: tuple[float, float], unit: str) -> int:
+    """Columns that a colour bar takes."""
+    texts = [number(display.value_at(share, window)) for share in (0.0, 0.25, 0.5, 0.75, 1.0)]
+    numbers = 1.6 * page.em + max(letters.width(text, 0.9 * page.em) for text in texts)
+    return round(max(numbers, letters.width(unit, 0.9 * page.em)))

@@ -1,0 +1,51 @@
+"""What a figure is of."""
+
+from collections.abc import Container, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..errors import InputError
+from ..geometry.collimator import Construction
+from ..geometry.system import PinholeSystem, chosen_modules
+from ..runs.display import Display
+from ..runs.run import ProjectionRun
+from ..volumes.volume import Volume
+
+NEEDS = {
+    "scanner": "a scanner: give a workbook, a run or a .blend",
+    "volume": "a volume: give a volume file, a phantom, a run or a .blend",
+    "run": "projections: give a run or a recipe, or a .blend with projections",
+}
+"""What a figure may need, and how to give it."""
+
+
+def require(needs: Sequence[str], have: Container[str], figure: str) -> None:
+    """Raise `InputError` unless there is all that a figure needs."""
+    for need in needs:
+        if need not in have:
+            raise InputError(f"figure {figure}: needs {NEEDS[need]}")
+
+
+@dataclass(frozen=True, eq=False)
+class Subject:
+    """A scanner, a volume and projections, each only where there is one."""
+
+    scanner: PinholeSystem | None = None
+    construction: Construction = field(default_factory=Construction)
+    """Of the scanner's collimators."""
+    volume: Volume | None = None
+    run: ProjectionRun | None = None
+    name: str = ""
+    """What the volume is called."""
+    pose: NDArray[np.float64] | None = None
+    """World-from-phantom (4, 4), mm, where the volume is a phantom."""
+    display: Display = field(default_factory=Display)
+    """How projections are shown."""
+    modules: str | None = None
+    """Which modules, such as "1-40" or "1-20,41"; all where it is None."""
+
+    def chosen(self, system: PinholeSystem) -> PinholeSystem:
+        """The modules of `system` that are to be shown."""
+        return chosen_modules(system, self.modules)

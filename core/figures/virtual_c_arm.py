@@ -1,0 +1,202 @@
+"""One module's geometry to scale: as the true pinhole, and as a virtual C-arm whose source is 5 l from the isocentre.
+
+The second is how projections are often made with a renderer of radiographs: from source to detector 10 l, from source to the
+isocentre 5 l ("sdr"), whatever the pinhole's distance b is.
+"""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from ..geometry.presets import c_arm_views
+from ..geometry.system import PinholeSystem
+from ..geometry.views import Views
+from . import letters
+from .page import Anchor, Page, Point, box
+from .parts import FAINT, INK, heading, number
+from .subject import Subject
+
+_CRYSTAL, _METAL, _ROI, _FAN = "#f0a030", "#8a929c", "#4f9bd6", "#d0502a"
+_ABOVE, _BELOW, _BESIDE = 4.4, 8.0, 3.8
+"""Room around a drawing for its texts, in units of the text's size."""
+
+
+class _Drawing(NamedTuple):
+    """Where a drawing is: millimetres along the principal ray from the pinhole and across it, on a page."""
+
+    page: Page
+    pixels: float  # per mm
+    origin: Point  # the pinhole on the page
+
+    def to(self, along: float, across: float = 0.0) -> Point:
+        return self.origin[0] + along * self.pixels, self.origin[1] - across * self.pixels
+
+    def line(self, points: Sequence[Point], color: str, width: float, dash: float = 0.0) -> None:
+        self.page.line([self.to(*p) for p in points], color, width * self.page.em, dash * self.page.em)
+
+    def area(self, points: Sequence[Point], color: str, opacity: float = 1.0) -> None:
+        self.page.area([self.to(*p) for p in points], color, opacity)
+
+    def circle(self, along: float, radius: float, color: str, opacity: float) -> None:
+        turns = np.linspace(0, 2 * np.pi, 97)
+        points = [(along + radius * np.cos(t), radius * np.sin(t)) for t in turns]
+        self.area(points[:-1], color, opacity)
+        self.line(points, color, 0.09)
+
+    def dot(self, along: float, radius: float, color: str) -> None:
+        turns = np.linspace(0, 2 * np.pi, 24, endpoint=False)
+        size = radius * self.page.em / self.pixels
+        self.area([(along + size * np.cos(t), size * np.sin(t)) for t in turns], color)
+
+    def text(self, text: str, along: float, across: float, down: float, anchor: Anchor = "middle") -> None:
+        """Write text at a place, or `down` times the page's size of text below."""
+        x, y = self.to(along, across)
+        self.page.text(text, x, y + down * self.page.em, 0.85 * self.page.em, INK, anchor)
+
+    def title(self, corner: Point, text: str, line: str) -> None:
+        """A title and a line below it, above the upper left corner of a drawing."""
+        em = self.page.em
+        left, top = self.to(*corner)
+        self.page.text(text, left, top - 3.0 * em, em, INK)
+        self.page.text(line, left, top - 1.6 * em, 0.85 * em, FAINT)
+
+    def distance(self, start: float, end: float, text: str, bottom: float, row: int) -> None:
+        """A line with arrows from `start` to `end`, in a row below the drawing, with its text on or beside it."""
+        em = self.page.em
+        y = self.to(0.0, bottom)[1] + (1.1 + 1.6 * row) * em
+        left, right = self.to(min(start, end))[0], self.to(max(start, end))[0]
+        for x in (left, right):
+            self.page.line([(x, self.to(0.0)[1]), (x, y + 0.4 * em)], FAINT, 0.03 * em, 0.25 * em)
+        self.page.line([(left, y), (right, y)], INK, 0.06 * em)
+        tip = min(0.5 * em, 0.45 * (right - left))
+        for x, way in ((left, 1), (right, -1)):
+            self.page.area([(x, y), (x + way * tip, y - 0.18 * em), (x + way * tip, y + 0.18 * em)], INK)
+        size = 0.85 * em
+        if letters.width(text, size) + 2.5 * em < right - left:
+            room = letters.width(text, size) / 2 + 0.3 * em
+            middle = (left + right) / 2
+            self.page.area(box(middle - room, y - 0.6 * em, 2 * room, 1.2 * em), "#ffffff")
+            self.page.text(text, middle, y + 0.3 * em, size, INK, "middle")
+        else:
+            self.page.text(text, right + 0.5 * em, y + 0.3 * em, size, INK)
+
+
+class _Module(NamedTuple):
+    """A module's numbers, mm."""
+
+    b: float
+    l: float
+    side: float
+    thick: float
+    radius: float
+
+
+class _Fan(NamedTuple):
+    """A view's source and detector, mm along the principal ray from the pinhole, and half the detector's side."""
+
+    source: float
+    detector: float
+    half: float
+
+    @property
+    def length(self) -> float:
+        return self.detector - self.source
+
+
+def _fan(views: Views, module: PinholeSystem) -> _Fan:
+    source, detector = (
+        float((place - module.centers[0]) @ module.principal_rays[0])
+        for place in (views.sources[0], views.detector_centers[0])
+    )
+    return _Fan(source, detector, float(np.linalg.norm(views.u_steps[0])) * views.shape[1] / 2)
+
+
+def draw(page: Page, subject: Subject) -> None:
+    """The first of the chosen modules, in a plane through its principal ray."""
+    assert subject.scanner is not None
+    module = subject.chosen(subject.scanner)[:1]
+    lengths = ("pinhole_distance", "collimator_length", "detector_side", "detector_thickness", "roi_radius")
+    m = _Module(*(float(getattr(module, name)[0]) for name in lengths))
+    pinhole, c_arm = _fan(module.views(), module), _fan(c_arm_views(module), module)
+    em = page.em
+    title = f"Module {int(module.numbers[0])}: the true pinhole, and a virtual C-arm in its place"
+    top = heading(page, title, ["To scale, in a plane through the principal ray"])
+    ranges = [
+        (-m.l - m.thick, max(pinhole.detector, m.b + m.radius)),
+        (min(c_arm.source, 0.0), max(c_arm.detector, m.b + m.radius)),
+    ]
+    half = max(pinhole.half, c_arm.half, m.radius)
+    width, height = page.width - 2 * em, page.height - top - em
+
+    def scale(columns: int) -> float:
+        """Pixels per mm with so many drawings beside each other."""
+        spans = [high - low for low, high in ranges]
+        across = (width - 2 * _BESIDE * em * columns) / (sum(spans) if columns == 2 else max(spans))
+        return min(across, (height * columns / 2 - (_ABOVE + _BELOW) * em) / (2 * half))
+
+    columns = max((2, 1), key=scale)
+    pixels = max(scale(columns), 1e-3)
+    tall = 2 * half * pixels + (_ABOVE + _BELOW) * em
+    wide = [(high - low) * pixels + 2 * _BESIDE * em for low, high in ranges]
+    y = top + max(0.0, (height - tall * 2 / columns) / 2)
+    x = em + max(0.0, (width - (sum(wide) if columns == 2 else max(wide))) / 2)
+    for across, (low, _), fan, details in zip(wide, ranges, (pinhole, c_arm), (_pinhole, _c_arm), strict=True):
+        drawing = _Drawing(page, pixels, (x + _BESIDE * em - low * pixels, y + _ABOVE * em + half * pixels))
+        _draw_fan(drawing, m, fan)
+        details(drawing, m, fan, (low, half))
+        x, y = (x + across, y) if columns == 2 else (x, y + tall)
+
+
+def _draw_fan(drawing: _Drawing, m: _Module, fan: _Fan) -> None:
+    """The rays of a view, the ROI and the detector's plane."""
+    drawing.area([(fan.source, 0.0), (fan.detector, fan.half), (fan.detector, -fan.half)], _FAN, 0.12)
+    drawing.circle(m.b, m.radius, _ROI, 0.22)
+    for end in (fan.half, -fan.half):
+        drawing.line([(fan.source, 0.0), (fan.detector, end)], _FAN, 0.06)
+    drawing.line([(fan.detector, fan.half), (fan.detector, -fan.half)], INK, 0.18)
+    drawing.text(f" ROI, R = {number(m.radius)} mm", m.b + m.radius, 0.0, 1.4, "start")
+
+
+def _pinhole(drawing: _Drawing, m: _Module, fan: _Fan, corner: Point) -> None:
+    half = corner[1]
+    back = -m.l - m.thick
+    drawing.title(corner, "True pinhole", f"Field at the isocentre: {number(m.side * m.b / m.l)} mm")
+    drawing.area([(-m.l, m.side / 2), (-m.l, -m.side / 2), (back, -m.side / 2), (back, m.side / 2)], _CRYSTAL)
+    for end in (m.side / 2, -m.side / 2):
+        drawing.line([(0.0, 0.0), (-m.l, end)], _METAL, 0.16)
+    drawing.line([(-m.l, 0.0), (fan.detector, 0.0)], _FAN, 0.08)
+    drawing.dot(0.0, 0.3, INK)
+    drawing.dot(m.b, 0.22, _ROI)
+    drawing.text("Crystal", (back - m.l) / 2, -m.side / 2, 1.2)
+    drawing.text("Pinhole", 0.0, 0.0, -1.0)
+    drawing.text(f"Virtual detector, {number(2 * fan.half)} mm", fan.detector, half, -0.5, "end")
+    # From the lowest row up: texts hide the lines that lead to rows below them.
+    drawing.distance(0.0, fan.detector, f"{number(fan.length / m.l)} l = {number(fan.length)} mm", -half, 2)
+    drawing.distance(0.0, m.b, f"b = {number(m.b)} mm", -half, 1)
+    drawing.distance(-m.l, 0.0, f"l = {number(m.l)} mm", -half, 0)
+
+
+def _c_arm(drawing: _Drawing, m: _Module, fan: _Fan, corner: Point) -> None:
+    half = corner[1]
+    near, source = m.b - fan.source, fan.source
+    lengths = number(near / m.l)
+    field = 2 * fan.half * near / fan.length
+    text = f"Wide FOV at the isocentre: {number(field)} mm; FOV, its central half: {number(field / 2)} mm"
+    drawing.title(corner, f"Virtual C-arm: source {lengths} l from the isocentre", text)
+    for end in (fan.half / 2, -fan.half / 2):
+        drawing.line([(source, 0.0), (fan.detector, end)], _FAN, 0.05, 0.4)
+    drawing.line([(fan.detector, fan.half / 2), (fan.detector, -fan.half / 2)], _FAN, 0.3)
+    drawing.line([(source, 0.0), (fan.detector, 0.0)], _FAN, 0.08)
+    drawing.dot(source, 0.3, INK)
+    drawing.dot(m.b, 0.22, _ROI)
+    drawing.dot(0.0, 0.3, _METAL)
+    drawing.text("Source ", source, 0.0, -0.5, "end")
+    opened = max(0.0, -source) / fan.length * fan.half  # half the fan's width at the pinhole
+    drawing.text("True pinhole", 0.0, opened, -1.4, "end")
+    drawing.text(f"Detector, {number(2 * fan.half)} mm", fan.detector, half, -0.5, "end")
+    side = "behind" if source < 0 else "in front of"
+    drawing.distance(source, 0.0, f"source {number(abs(source))} mm {side} the pinhole", -half, 3)
+    drawing.distance(source, fan.detector, f"{number(fan.length / m.l)} l = {number(fan.length)} mm", -half, 2)
+    drawing.distance(0.0, m.b, f"b = {number(m.b)} mm", -half, 1)
+    drawing.distance(source, m.b, f"{lengths} l = {number(near)} mm", -half, 0)

@@ -1,0 +1,67 @@
+"""File > Export > mphDRR Figure: a picture as papers show it, of what is in the scene."""
+
+from pathlib import Path
+
+import bpy
+from bpy.props import BoolProperty, EnumProperty, IntProperty, StringProperty
+
+from ..addon import figures, ids, jobs, scanner, storage, volumes
+from ..addon.reports import polled
+from ..core.errors import InputError
+from ..core.figures.page import LARGEST, SUFFIXES
+
+
+class MPHDRR_OT_export_figure(jobs.JobOperator, bpy.types.Operator):
+    """Draw a figure of the scanner, the volume or the last projections as PNG, or as SVG whose labels are text"""
+
+    bl_idname = ids.EXPORT_FIGURE
+    bl_label = "Export Figure"
+    bl_options = set()
+
+    filepath: StringProperty(name="File", description="File to write", subtype="FILE_PATH", options={"SKIP_SAVE"})
+    filter_glob: StringProperty(default=";".join(f"*{suffix}" for suffix in SUFFIXES), options={"HIDDEN"})
+    figure: EnumProperty(name="Figure", description="What is shown", items=figures.KIND_ITEMS, default="SCANNER")
+    width: IntProperty(
+        name="Width", description="Pixels; 0: what suits the figure", min=0, max=LARGEST, subtype="PIXEL"
+    )
+    height: IntProperty(
+        name="Height", description="Pixels; 0: what suits the figure", min=0, max=LARGEST, subtype="PIXEL"
+    )
+    modules: StringProperty(
+        name="Modules", description="Such as 1-40 or 1-20,41; empty: all, or of figures of one module the active one"
+    )
+    labels: BoolProperty(name="Labels", description="Write title and axes on rendered figures", default=True)
+    samples: IntProperty(
+        name="Samples", description="Rays per pixel of rendered figures: the more, the smoother and slower",
+        default=figures.SAMPLES, min=1, soft_max=256,
+    )  # fmt: skip
+
+    @classmethod
+    def poll(cls, context: bpy.types.Context) -> bool:
+        shows = scanner.active_scanner(context.scene) is not None or bool(volumes.volume_objects(context.scene))
+        return polled(cls, shows, "Nothing to show: import a workbook or add a phantom first")
+
+    def ask(self, context: bpy.types.Context) -> set[str] | None:
+        if self.filepath:
+            return None
+        self.filepath = f"figure{SUFFIXES[0]}"
+        context.window_manager.fileselect_add(self)
+        return {"RUNNING_MODAL"}
+
+    def check(self, context: bpy.types.Context) -> bool:
+        """Give a name without one of the suffixes the first."""
+        if Path(self.filepath).suffix.lower() in SUFFIXES:
+            return False
+        self.filepath += SUFFIXES[0]
+        return True
+
+    def job(self, context: bpy.types.Context) -> jobs.Job:
+        if not self.filepath:
+            raise InputError(f"no file given: set filepath to a name ending in {' or '.join(SUFFIXES)}")
+        if bool(self.width) != bool(self.height):
+            raise InputError("size: give both width and height, or neither")
+        size = (self.width, self.height) if self.width else None
+        return figures.figure_job(
+            context, self.figure.lower(), [storage.absolute(self.filepath)], size, self.modules or None, self.labels,
+            self.samples,
+        )  # fmt: skip

@@ -1,0 +1,108 @@
+"""The scene's runs: show one, remove one, compare two."""
+
+from typing import Any
+
+import bpy
+from bpy.props import EnumProperty, IntProperty
+
+from ..addon import ids, images, jobs, rendering, runs
+from ..addon.reports import polled, run_reported
+from ..core.errors import InputError
+from ..core.progress import Progress
+from ..core.runs.comparing import difference, difference_sheet
+from ..core.runs.files import read_run
+
+_others: list[tuple[str, str, str]] = []  # Blender keeps no texts of such a list: they must live on here
+
+
+def _required_run(scene: bpy.types.Scene, index: int) -> bpy.types.PropertyGroup:
+    found = scene.mphdrr_projections.runs
+    if not 0 <= index < len(found):
+        raise InputError(f"index {index}: the scene has {len(found)} runs, counted from 0")
+    return found[index]
+
+
+class _OfRuns:
+    """Mix into an operator that needs a run in the list."""
+
+    @classmethod
+    def poll(cls, context: bpy.types.Context) -> bool:
+        is_met = bool(context.scene.mphdrr_projections.runs)
+        return polled(cls, is_met, "No runs yet: render the projections first")  # type: ignore[arg-type]
+
+
+class MPHDRR_OT_show_run(_OfRuns, jobs.JobOperator, bpy.types.Operator):
+    """Show a run of the list: its images, the mosaic and the planes in the scene. Modules and volumes stay as they are"""
+
+    bl_idname = ids.SHOW_RUN
+    bl_label = "Show Run"
+
+    index: IntProperty(name="Index", description="Place of the run in the list, from 0", min=0, options={"SKIP_SAVE"})
+
+    def job(self, context: bpy.types.Context) -> jobs.Job:
+        _required_run(context.scene, self.index)
+        return rendering.showing_job(context.scene, self.index)
+
+
+class MPHDRR_OT_remove_run(_OfRuns, bpy.types.Operator):
+    """Remove a run from the list, and its file from the disk if it is in this .blend's own folder"""
+
+    bl_idname = ids.REMOVE_RUN
+    bl_label = "Remove Run"
+    bl_options = {"REGISTER", "UNDO"}
+
+    index: IntProperty(name="Index", description="Place of the run in the list, from 0", min=0, options={"SKIP_SAVE"})
+
+    def invoke(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str]:
+        item = _required_run(context.scene, self.index)
+        return context.window_manager.invoke_confirm(
+            self, event, title=f"Remove {item.name!r} ({runs.size_text([item])})?", confirm_text="Remove", icon="WARNING",
+            message="Neither Undo nor the .blend as it was saved will find its file again.",
+        )  # fmt: skip
+
+    def execute(self, context: bpy.types.Context) -> set[str]:
+        def remove() -> str:
+            _required_run(context.scene, self.index)
+            return rendering.remove_run(context.scene, self.index)
+
+        return run_reported(self, remove)
+
+
+def _other_runs(self: Any, context: bpy.types.Context | None) -> list[tuple[str, str, str]]:
+    """The runs that are not shown, by their places in the list."""
+    found = context.scene.mphdrr_projections.runs if context is not None else ()
+    shown = runs.shown(context.scene) if context is not None else None
+    _others[:] = [(str(i), item.name, item.summary) for i, item in enumerate(found) if item != shown]
+    return _others
+
+
+class MPHDRR_OT_compare_runs(_OfRuns, jobs.JobOperator, bpy.types.Operator):
+    """Draw the shown run minus another one, of the same modules, pixels and unit, as a mosaic: white where they are equal,
+    red where the shown one has more, blue where it has less
+    """
+
+    bl_idname = ids.COMPARE_RUNS
+    bl_label = "Compare Runs"
+
+    other: EnumProperty(name="Other", description="What is subtracted", items=_other_runs, options={"SKIP_SAVE"})
+
+    def job(self, context: bpy.types.Context) -> jobs.Job:
+        shown = runs.shown(context.scene)
+        if shown is None or not self.other:
+            raise InputError("there is no other run to compare with: keep the shown one and render again")
+        other = _required_run(context.scene, int(self.other))
+        paths = [rendering.file_of(item.file) for item in (shown, other)]
+        names = f"{shown.name!r} minus {other.name!r}"
+
+        def work(progress: Progress) -> Any:
+            one, two = map(read_run, paths)
+            found = difference(one, two)
+            return found, difference_sheet(one, found), one.system.numbers.tolist()
+
+        def finish(result: Any) -> str:
+            found, drawn, numbers = result
+            text = f"{names}: {found.text}"
+            images.show_below(images.store_difference(drawn, numbers, found.unit, text), bpy.context)
+            return text
+
+        return jobs.Job("Comparing", work, finish)

@@ -1,0 +1,89 @@
+"""Object > mphDRR, and Image > mphDRR Projections: every command, so that the menus' search (F3) finds it.
+
+What adds something is under Add > mphDRR (`add_menu.py`), what reads and writes files also under File
+(`addon/registration.py`).
+"""
+
+import bpy
+from bpy.app.translations import pgettext_iface as iface
+
+from ..addon import ids, selection
+
+
+class MPHDRR_MT_commands(bpy.types.Menu):
+    bl_label = "mphDRR"
+
+    def draw(self, context: bpy.types.Context) -> None:
+        layout = self.layout
+        layout.operator_context = "INVOKE_DEFAULT"
+        layout.menu("MPHDRR_MT_modules", icon="OUTLINER_OB_CAMERA")
+        layout.menu("MPHDRR_MT_volumes", icon="OUTLINER_DATA_VOLUME")
+        layout.menu("MPHDRR_MT_projections", icon="RENDER_STILL")
+        layout.separator()
+        layout.operator(ids.LOAD_EXAMPLE, icon="PLAY")
+
+
+class MPHDRR_MT_modules(bpy.types.Menu):
+    bl_label = "Modules and Collimators"
+
+    def draw(self, context: bpy.types.Context) -> None:
+        layout = self.layout
+        layout.operator_context = "INVOKE_DEFAULT"
+        layout.operator(ids.IMPORT_GEOMETRY, icon="IMPORT")
+        layout.operator(ids.EXPORT_GEOMETRY, icon="EXPORT")
+        layout.operator(ids.EXPORT_FOR_PROGRAM)
+        layout.separator()
+        state = context.scene.mphdrr_geometry
+        text = iface("Show Only Modules {first} to {last}").format(first=state.first, last=state.last)
+        shown = layout.operator(ids.SHOW_MODULES, text=text)
+        shown.first, shown.last, shown.mode = state.first, state.last, "ONLY"
+        layout.operator(ids.SHOW_MODULES, text="Show All Modules", icon="HIDE_OFF").mode = "ALL"
+        camera = selection.listed_module(context.scene)
+        look = layout.operator(ids.LOOK_THROUGH_MODULE, text="Look Through Active Module")
+        look.number = camera.mphdrr_module.number if camera else 1
+        layout.separator()
+        layout.operator(ids.DUPLICATE_MODULES, icon="DUPLICATE")
+        layout.operator(ids.REMOVE_MODULES, icon="TRASH")
+        layout.operator(ids.AIM_MODULES, icon="CON_TRACKTO")
+        layout.operator(ids.TIDY_MODULES, icon="BRUSH_DATA")
+        layout.operator_menu_enum(ids.RENUMBER_MODULES, "order", icon="LINENUMBERS_ON")
+        layout.separator()
+        layout.operator(ids.CHECK_GEOMETRY, icon="CHECKMARK")
+        layout.operator_menu_enum(ids.ADD_MAP, "quantity", icon="OUTLINER_DATA_LIGHTPROBE")
+
+
+class MPHDRR_MT_volumes(bpy.types.Menu):
+    bl_label = "Phantoms and Volumes"
+
+    def draw(self, context: bpy.types.Context) -> None:
+        layout = self.layout
+        layout.operator_context = "INVOKE_DEFAULT"
+        layout.menu("MPHDRR_MT_add", text="Add Phantom or Volume", icon="ADD")
+        layout.separator()
+        layout.operator(ids.UPDATE_PHANTOM, icon="FILE_REFRESH")
+        layout.operator(ids.APPLY_PHANTOM_POSE, icon="OBJECT_ORIGIN")
+        layout.operator(ids.SHOW_PHANTOM_OUTLINE, text="Show or Hide Outline", icon="SHADING_WIRE")
+        layout.separator()
+        layout.operator(ids.CT_TO_ATTENUATION, icon="MOD_FLUIDSIM")
+        layout.operator(ids.ADD_SLICES, icon="MESH_PLANE")
+        layout.operator(ids.REMOVE_SLICES, icon="X")
+        layout.operator(ids.VOXELIZE_OBJECTS, icon="OUTLINER_DATA_MESH")
+        layout.operator(ids.MESH_FROM_VOLUME, icon="MESH_DATA")
+        layout.separator()
+        layout.operator(ids.EXPORT_VOLUME, icon="EXPORT")
+        layout.operator(ids.REMAKE_VOLUMES, icon="FILE_REFRESH")
+        layout.operator(ids.FIND_VOLUME_FILES, icon="VIEWZOOM")
+        layout.operator(ids.CLEAN_VOLUME_FILES, icon="TRASH")
+
+
+class MPHDRR_MT_projections(bpy.types.Menu):
+    bl_label = "Projections"
+
+    def draw(self, context: bpy.types.Context) -> None:
+        layout = self.layout
+        layout.operator_context = "INVOKE_DEFAULT"
+        layout.operator(ids.RENDER_PROJECTIONS, icon="RENDER_STILL")
+        layout.operator(ids.SHOW_PROJECTIONS, icon="IMAGE_DATA")
+        layout.operator_menu_enum(ids.USE_PRESET, "preset", icon="PRESET")
+        layout.operator(ids.LOAD_RECIPE, icon="FILE_FOLDER")
+        layout.operator(ids.EXPORT_DATASET, icon="EXPORT")

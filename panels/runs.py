@@ -1,0 +1,85 @@
+"""The scene's runs: their list, what has changed since the shown one was rendered, and comparing, in both sidebars."""
+
+import bpy
+
+from ..addon import ids, images, jobs, runs
+from .geometry import Sidebar, draw_text
+
+
+class MPHDRR_UL_runs(bpy.types.UIList):
+    """The runs, the shown one marked, also where it is of another state of the scene."""
+
+    def draw_item(
+        self, context: bpy.types.Context, layout: bpy.types.UILayout, data: bpy.types.PropertyGroup,
+        item: bpy.types.PropertyGroup, icon: int, active_data: bpy.types.PropertyGroup, active_property: str,
+        index: int = 0, flt_flag: int = 0,
+    ) -> None:  # fmt: skip
+        row = layout.row(align=True)
+        is_shown = item.file == data.run_file
+        is_stale = is_shown and bool(runs.change_lines(context.scene))
+        row.prop(
+            item, "name", text="", emboss=False, icon="ERROR" if is_stale else "HIDE_OFF" if is_shown else "BLANK1"
+        )
+        size = row.row()
+        size.alignment, size.active = "RIGHT", False
+        size.label(text=runs.size_text([item]))
+        row.prop(item, "keep", text="", icon="PINNED" if item.is_kept else "UNPINNED", emboss=False)
+
+
+class _Runs:
+    """Mix into a panel that shows the runs."""
+
+    bl_label = "Runs"
+
+    @classmethod
+    def poll(cls, context: bpy.types.Context) -> bool:
+        return bool(context.scene.mphdrr_projections.runs)
+
+    def draw(self, context: bpy.types.Context) -> None:
+        layout = self.layout  # type: ignore[attr-defined]
+        settings = context.scene.mphdrr_projections
+        draw_changes(layout, context.scene)
+        row = layout.row()
+        row.enabled = not jobs.is_running()
+        row.template_list("MPHDRR_UL_runs", "", settings, "runs", settings, "active_run", rows=2, maxrows=6)
+        buttons = row.column(align=True)
+        buttons.operator_context = "INVOKE_DEFAULT"
+        buttons.operator(ids.REMOVE_RUN, text="", icon="REMOVE").index = settings.active_run
+        column = layout.column(align=True)
+        column.active = False
+        for part in settings.run_summary.split(", ", 1):
+            column.label(text=part)
+        if len(settings.runs) > 1:
+            column.label(text=f"All runs: {runs.size_text(settings.runs)}")
+            row = layout.row()
+            row.operator_context = "INVOKE_DEFAULT"
+            row.enabled = not jobs.is_running()
+            row.operator_menu_enum(ids.COMPARE_RUNS, "other", text="Compare With", icon="SELECT_DIFFERENCE")
+            if text := images.difference_text():
+                draw_text(layout, text, icon="INFO")
+
+
+class MPHDRR_PT_runs(_Runs, Sidebar, bpy.types.Panel):
+    bl_order = ids.ORDER_RUNS
+
+
+class MPHDRR_PT_runs_of_images(_Runs, bpy.types.Panel):
+    bl_space_type, bl_region_type, bl_category = "IMAGE_EDITOR", "UI", ids.CATEGORY
+
+
+def draw_changes(layout: bpy.types.UILayout, scene: bpy.types.Scene) -> None:
+    """What has changed since the shown run was rendered, and a button that renders again; nothing where it is current."""
+    lines = runs.change_lines(scene)
+    if not lines:
+        return
+    box = layout.box()
+    box.alert = lines != [runs.UNKNOWN]
+    draw_text(box, "Not of the scene as it is now:" if box.alert else "Shown run:")
+    column = box.column(align=True)
+    for line in lines:
+        draw_text(column, line, icon="DOT")
+    row = box.row()
+    row.alert, row.enabled = False, not jobs.is_running()
+    row.operator_context = "INVOKE_DEFAULT"
+    again = row.operator(ids.RENDER_PROJECTIONS, text="Render Again", icon="FILE_REFRESH")
+    again.volume = runs.volume_to_render(scene)

@@ -1,0 +1,153 @@
+"""The example with a live preview: module and phantom moved fifty times, numbers and job; leaves the preview in view.
+
+Argument after ``--``: the file for what was seen.
+"""
+
+import importlib
+import json
+import sys
+import time
+import traceback
+from pathlib import Path
+
+import bpy
+import numpy as np
+
+MODULE = "bl_ext.user_default.mphdrr"
+preview = importlib.import_module(f"{MODULE}.addon.preview")
+volumes = importlib.import_module(f"{MODULE}.addon.volumes")
+core = importlib.import_module(f"{MODULE}.core")
+
+result_file = Path(sys.argv[sys.argv.index("--") + 1])
+bpy.context.preferences.view.show_splash = False
+seen: dict[str, object] = {"ok": False}
+spent = {"move": 0.0}
+MOVES = 50
+
+
+def timed(function):
+    """The function, its time added to that of the move."""
+
+    def run(*arguments):
+        started = time.perf_counter()
+        try:
+            return function(*arguments)
+        finally:
+            spent["move"] += time.perf_counter() - started
+
+    return run
+
+
+original = preview.after_update
+handlers = bpy.app.handlers.depsgraph_update_post
+handlers[handlers.index(original)] = timed(original)
+preview._look = timed(preview._look)
+preview.preview_drawing._draw_corner = timed(preview.preview_drawing._draw_corner)
+preview.preview_drawing._draw_plane = timed(preview.preview_drawing._draw_plane)
+
+
+def view():
+    window = bpy.context.window_manager.windows[0]
+    area = max((a for a in window.screen.areas if a.type == "VIEW_3D"), key=lambda a: a.width)
+    return window, area
+
+
+def load():
+    window, area = view()
+    area.spaces.active.show_region_ui = True
+    region = next(r for r in area.regions if r.type == "WINDOW")
+    with bpy.context.temp_override(window=window, area=area, region=region):
+        bpy.ops.mphdrr.load_example("INVOKE_DEFAULT")
+
+
+def moved(item, times):
+    """Steps that move an object and note what each move took of the main thread."""
+    for number in range(MOVES):
+        spent["move"] = 0.0
+        item.location.x += 0.5 if number % 2 else -0.45
+        yield 0.15
+        times.append(1e3 * spent["move"])
+
+
+def figures(name, times):
+    seen[name] = {"median": float(np.median(times)), "p95": float(np.percentile(times, 95)), "most": max(times)}
+
+
+def steps():
+    window, area = view()
+    load()
+    while len(window.modal_operators):
+        yield 0.5
+    yield 6.0  # drawn in software, slowly
+    next(r for r in area.regions if r.type == "UI").active_panel_category = "mphDRR"
+    scene = bpy.context.scene
+    camera, phantom = bpy.data.objects["Module 55"], bpy.data.objects["Derenzo"]
+    for item in list(bpy.context.selected_objects):
+        item.select_set(False)
+    camera.select_set(True)
+    bpy.context.view_layer.objects.active = camera
+    scene.mphdrr_projections.width = scene.mphdrr_projections.height = 256
+    scanner = scene.mphdrr_geometry.scanner
+    importlib.import_module(f"{MODULE}.addon.scanner").show_modules(scanner, 50, 60)  # drawn in software, slowly
+    phantom.display_type = "BOUNDS"
+    yield 4.0
+    off = []
+    for _ in range(MOVES):
+        spent["move"] = 0.0
+        camera.location.x += 0.01
+        yield 0.05
+        off.append(1e3 * spent["move"])
+    figures("off", off)
+    names = set(bpy.data.images.keys()), set(bpy.data.objects.keys())
+    bpy.ops.mphdrr.live_preview()
+    yield 4.0
+    session = preview.session()
+    seen["first"] = [session.problem, session.lines, session.shown is not None and not session.shown.is_quick]
+    quick = []
+    for name, item in (("module", camera), ("phantom", phantom)):
+        times = []
+        for wait in moved(item, times):
+            yield wait
+            quick.append(session.shown.is_quick)
+        figures(name, times)
+    seen["quick"] = sum(quick)
+    yield 3.0
+    seen["full"] = not session.shown.is_quick
+    run = session.shown.run
+    volume = volumes.volume_from_object(phantom)
+    exact = core.Projector(volume.grid, run.system.views((256, 256)))(volume)
+    seen["differs"] = float(np.abs(run.projections - exact).max() / exact.max())
+    seen["largest"] = float(exact.max())
+    seen["same place"] = bool(np.allclose(run.system.centers[0], camera.location, atol=1e-5))
+    camera.mphdrr_module.collimator_length = 60.0
+    yield 3.0
+    seen["typed"] = float(session.shown.run.system.collimator_length[0])
+    camera.mphdrr_module.pinhole_diameter = 400.0
+    yield 3.0
+    seen["impossible"] = session.problem
+    camera.mphdrr_module.pinhole_diameter = 2.3
+    yield 3.0
+    seen["again"] = session.problem
+    seen["images"] = (set(bpy.data.images.keys()), set(bpy.data.objects.keys())) == names
+    scene.mphdrr_projections.model, phantom.display_type = "EMISSION", "TEXTURED"
+    yield 6.0
+    seen["unit"] = session.shown.run.unit
+    seen["ok"] = True
+
+
+STEPS = steps()
+
+
+def step():
+    wait = None
+    try:
+        wait = next(STEPS)
+    except StopIteration:
+        pass
+    except Exception:
+        seen["error"] = traceback.format_exc()
+    result_file.write_text(json.dumps(seen))
+    return wait
+
+
+bpy.app.timers.register(step, first_interval=1.5)

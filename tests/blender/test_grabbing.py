@@ -1,0 +1,126 @@
+"""A collimator, a crystal or a plane that is moved takes its module along."""
+
+import bpy
+import numpy as np
+import pytest
+from mathutils import Euler, Matrix
+
+from mphdrr.addon import cameras, grabbing, live_scanner, planes, scanner, volumes
+from mphdrr.core.geometry.grid import Grid
+from mphdrr.core.volumes.volume import Volume
+
+MOTION = Matrix.Translation((4.0, -9.0, 6.5)) @ Euler((0.1, -0.2, 0.3)).to_matrix().to_4x4()
+
+
+@pytest.fixture
+def collection(scene, ring_system):
+    made = scanner.build_scanner(scene, ring_system)
+    made.mphdrr_scanner.keep_aimed = False
+    volumes.add_volume(Volume(np.ones((2, 2, 2), np.float32), Grid.centered(2, 2.0), "activity"), "Box")
+    bpy.ops.mphdrr.render_projections(width=8, height=6)
+    bpy.context.view_layer.update()
+    return made
+
+
+def part(camera: bpy.types.Object, name: str) -> bpy.types.Object:
+    return next(c for c in camera.children if c.mphdrr_module.part == name)
+
+
+@pytest.mark.parametrize("name", ["COLLIMATOR", "CRYSTAL", "PLANE"])
+def test_the_module_goes_where_a_part_is_put(collection, name):
+    camera = scanner.module(collection, 3)
+    item, before, numbers = part(camera, name), camera.matrix_world.copy(), scanner.read_scanner(collection).centers
+    local = item.matrix_basis.copy()
+    item.matrix_world = MOTION @ item.matrix_world
+    for _ in range(3):  # what the handler writes is an update again
+        bpy.context.view_layer.update()
+    assert np.allclose(camera.matrix_world, MOTION @ before, atol=1e-4)
+    assert np.allclose(item.matrix_parent_inverse @ item.matrix_basis, local, atol=1e-6), (
+        "it is where it was on its module"
+    )
+    with pytest.warns(match="module 3 not aimed"):
+        after = scanner.read_scanner(collection)
+    assert after.centers[2] == pytest.approx(list(MOTION @ before.translation), abs=1e-4)
+    assert np.array_equal(np.delete(after.centers, 2, 0), np.delete(numbers, 2, 0))
+    collection.mphdrr_scanner.keep_aimed = True
+    item.location.z += 2.0
+    bpy.context.view_layer.update()
+    assert camera.mphdrr_module.aimed and scanner.off_aim([camera]) == []
+
+
+def test_a_drag_goes_from_where_it_began(collection, monkeypatch):
+    """Blender's tools write the part's own place anew with each motion of the mouse, and once more if they are cancelled."""
+    collection.mphdrr_scanner.keep_aimed = True
+    camera = scanner.module(collection, 5)
+    start, items = camera.matrix_world.copy(), [part(camera, name) for name in ("CRYSTAL", "COLLIMATOR")]
+    monkeypatch.setattr(grabbing, "is_dragging", lambda: True)
+
+    def drag(by: float) -> None:
+        for item in items:
+            item.location.y = by
+        for _ in range(2):
+            bpy.context.view_layer.update()
+        assert np.allclose(camera.location, start @ Matrix.Translation((0, by, 0)).translation, atol=1e-4)
+        assert camera.mphdrr_module.aimed
+        assert all(np.allclose(item.matrix_world, camera.matrix_world, atol=1e-4) for item in items)
+
+    for by in (0.5, 7.0, 12.0):
+        drag(by)
+    place = camera.matrix_world.copy()
+    live_scanner.after_undo()  # as at the end of the drag
+    bpy.context.view_layer.update()
+    assert np.allclose(camera.matrix_world, place, atol=1e-5) and camera.mphdrr_module.aimed
+    assert all(np.array_equal(item.matrix_basis, np.eye(4)) and not grabbing.is_dragged(item) for item in items)
+    start = place
+    drag(3.0)
+    drag(0.0)
+    assert np.allclose(camera.matrix_world, start, atol=1e-4)
+
+
+def test_an_undo_step_taken_before_the_last_motion_was_seen(collection, monkeypatch):
+    camera = scanner.module(collection, 5)
+    start, item = camera.matrix_world.copy(), part(camera, "CRYSTAL")
+    monkeypatch.setattr(grabbing, "is_dragging", lambda: True)
+    item.location.y = 3.0
+    bpy.context.view_layer.update()
+    item.location.y = 11.0
+    live_scanner.after_undo()
+    assert np.allclose(camera.location, start @ Matrix.Translation((0, 11, 0)).translation, atol=1e-4)
+    item.location.y = 40.0  # and here none was seen: the next step has where the module went
+    place = camera.location.copy()
+    live_scanner.after_undo()
+    bpy.context.view_layer.update()
+    assert camera.location == place and np.array_equal(item.matrix_basis, np.eye(4))
+
+
+def test_what_is_locked_animated_copied_or_moved_itself_is_respected(scene, collection):
+    camera = scanner.module(collection, 2)
+    item, place = part(camera, "CRYSTAL"), camera.location.copy()
+    camera.lock_location = (False, False, True)
+    item.matrix_world = Matrix.Translation((1, 2, 3)) @ item.matrix_world
+    bpy.context.view_layer.update()
+    assert np.allclose(camera.location - place, (1, 2, 0), atol=1e-4)
+    assert np.array_equal(item.matrix_basis, np.eye(4))
+
+    camera.lock_location = (False, False, False)
+    place = camera.location.copy()
+    for moved in (camera, *camera.children):
+        moved.location.x += 5.0
+    bpy.context.view_layer.update()
+    bpy.context.view_layer.update()
+    assert np.allclose(camera.location - place, (5, 0, 0), atol=1e-4)
+
+    camera.keyframe_insert("location", frame=1)
+    place = camera.location.copy()
+    item.location.x += 5.0
+    bpy.context.view_layer.update()
+    assert camera.location == place and np.array_equal(item.matrix_basis, np.eye(4))
+
+    other = scanner.module(collection, 6)
+    copy = part(other, "COLLIMATOR").copy()
+    other.users_collection[0].objects.link(copy)
+    place = cameras.world_matrix(other)
+    copy.location.x += 20.0
+    bpy.context.view_layer.update()
+    assert np.array_equal(cameras.world_matrix(other), place) and copy.location.x == 20.0
+    assert planes.planes(scene)

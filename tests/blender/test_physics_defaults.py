@@ -1,0 +1,80 @@
+"""The Projections panel's physics in one choice, and by what the chosen volume holds."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+
+import bpy
+import numpy as np
+import pytest
+
+from mphdrr.addon import scanner, volumes
+from mphdrr.addon.projection_properties import USUAL_TIME, _volume_chosen, recipe_values
+from mphdrr.core.geometry.grid import Grid
+from mphdrr.core.runs.presets import PRESETS
+from mphdrr.core.runs.recipe import Recipe, write_recipe
+from mphdrr.core.volumes.volume import Volume
+
+
+@pytest.fixture
+def settings(scene):
+    return scene.mphdrr_projections
+
+
+@pytest.fixture
+def objects(scene) -> dict[str, bpy.types.Object]:
+    grid = Grid.centered((3, 3, 3), 10.0)
+    return {q: volumes.add_volume(Volume(np.ones((3, 3, 3)), grid, q), q) for q in ("activity", "mu", "hu")}
+
+
+@pytest.mark.parametrize("name", PRESETS)
+def test_the_panel_shows_what_the_preset_says(settings, name):
+    settings.isotope, settings.window, settings.depth_layers, settings.crystal_mu = "I-131", (300, 400), 4, 0.3
+    settings.crystal_material, settings.intrinsic_fwhm, settings.noise = "NUMBER", 2.5, True
+    assert bpy.ops.mphdrr.use_preset(preset=name) == {"FINISHED"}
+    values = recipe_values(lambda key: getattr(settings, key))
+    given = {f"model.{key}": value for key, value in PRESETS[name].model.items() if value is not None}
+    assert {key: values[key] for key in given} == given
+    assert values["model.kind"] == "emission" and values["model.time"] == USUAL_TIME
+    assert values["model.window"] is None and values["model.depth_layers"] == 1
+    assert values["model.intrinsic_fwhm"] == (0 if name == "ideal" else 2.5) and values["noise.seed"] == 1
+    if name == "ideal":
+        assert values["model.isotope"] is values["model.crystal_mu"] is values["model.aperture_mu"] is None
+
+
+def test_a_volume_chosen_in_the_panel_sets_the_model_until_the_user_does(settings, objects):
+    def choose(name: str) -> tuple[str, float]:
+        settings.volume = objects[name]
+        _volume_chosen(settings, SimpleNamespace(region=SimpleNamespace(type="UI")))
+        return settings.model, settings.time
+
+    assert choose("activity") == ("EMISSION", USUAL_TIME)
+    assert choose("mu")[0] == "TRANSMISSION"
+    settings.time = 20.0
+    assert choose("hu")[0] == "TRANSMISSION"  # to be converted first
+    assert choose("activity") == ("EMISSION", 20.0), "a time that was typed stays"
+    settings.model = "TRANSMISSION"  # line integrals of activity, as the user wants
+    assert choose("mu")[0] == choose("activity")[0] == "TRANSMISSION"
+
+
+def test_scripts_get_line_integrals_unless_they_say_otherwise(settings, objects):
+    settings.volume = objects["activity"]
+    assert settings.model == "TRANSMISSION" and settings.time == 1.0
+
+
+def test_a_recipe_says_the_model_whatever_its_volume_holds(settings, objects, tmp_path):
+    write_recipe(Recipe({"volume.object": "activity"}), tmp_path / "a.toml")
+    settings.volume = objects["mu"]
+    assert bpy.ops.mphdrr.load_recipe(filepath=str(tmp_path / "a.toml")) == {"FINISHED"}
+    assert settings.volume == objects["activity"] and settings.model == "TRANSMISSION"
+
+
+def test_all_modules_or_a_range_of_real_numbers(scene, settings, ring_system):
+    assert settings.all_modules
+    scanner.build_scanner(scene, ring_system)
+    settings.all_modules = False
+    assert (settings.first, settings.last) == (min(ring_system.numbers), max(ring_system.numbers))
+    settings.first = 3
+    assert not settings.all_modules
+    settings.all_modules = True
+    assert (settings.first, settings.last) == (0, 0)

@@ -1,0 +1,318 @@
+"""The scene's runs: what has changed since each was made, their list, their files, and the difference of two."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+from unittest.mock import MagicMock
+
+import bpy
+import numpy as np
+import pytest
+
+from mphdrr.addon import ids, images, planes, registration, rendering, runs, scanner, storage, volumes
+from mphdrr.core.geometry.grid import Grid
+from mphdrr.core.runs.comparing import difference
+from mphdrr.core.runs.files import read_run
+from mphdrr.core.volumes.volume import Volume
+
+DATA = Path(__file__).parent / "data"
+
+
+@pytest.fixture
+def render(scene, ring_system):
+    """A scanner of eight modules and a phantom; the result renders what the panel says."""
+    scanner.build_scanner(scene, ring_system, "Ring")
+    bpy.ops.mphdrr.add_derenzo(voxels=16, location=(5, -3, 2), phi=0.2)
+    settings = scene.mphdrr_projections
+    settings.width, settings.height, settings.model = 12, 10, "EMISSION"
+
+    def now(name: str = "") -> bpy.types.PropertyGroup:
+        assert bpy.ops.mphdrr.render_projections() == {"FINISHED"}
+        if name:
+            settings.runs[-1].name = name
+        return settings.runs[-1]
+
+    return now
+
+
+def module(number: int) -> bpy.types.Object:
+    return scanner.module(scanner.active_scanner(bpy.context.scene), number)
+
+
+def move(item: bpy.types.Object, distance: float) -> None:
+    item.location.z += distance
+    bpy.context.view_layer.update()
+
+
+def shown_array(number: int = 3) -> np.ndarray:
+    return images.projection_array(bpy.data.images[ids.projection_name(number, 8)])
+
+
+def array_of(item) -> np.ndarray:
+    return read_run(storage.absolute(item.file)).projections
+
+
+def drawn(name: str) -> list[str]:
+    """What a panel's labels and buttons say."""
+    (cls,) = (cls for cls in registration.CLASSES if cls.__name__ == name)
+    layout = MagicMock()
+    for part in ("box", "column", "row", "split"):
+        getattr(layout, part).return_value = layout
+    panel = MagicMock(layout=layout)
+    panel.draw.side_effect = lambda context: cls.draw(panel, context)
+    assert not hasattr(cls, "poll") or cls.poll(bpy.context)
+    cls.draw(panel, bpy.context)
+    return [options["text"] for _, _, options in layout.mock_calls if options.get("text")]
+
+
+def set_(**values):
+    for name, value in values.items():
+        setattr(bpy.context.scene.mphdrr_projections, name, value)
+
+
+def derenzo() -> bpy.types.Object:
+    return bpy.data.objects["Derenzo"]
+
+
+EDITS = {
+    "Module 03 moved": (lambda: move(module(3), 1.0), lambda: move(module(3), -1.0)),
+    "modules 3, 5 moved": (lambda: (move(module(3), 1.0), move(module(5), 2.0)), None),
+    "Module 02: d 2.3 mm, now 2.3000002 mm": (
+        lambda: setattr(module(2).mphdrr_module, "pinhole_diameter", 2.3000002),
+        lambda: setattr(module(2).mphdrr_module, "pinhole_diameter", 2.3),
+    ),
+    "all modules: Ld 48 mm, now 47 mm": (
+        lambda: setattr(scanner.active_scanner(bpy.context.scene).mphdrr_scanner, "detector_side", 47.0), None,
+    ),
+    "phantom Derenzo moved": (lambda: move(derenzo(), 0.001), lambda: move(derenzo(), -0.001)),
+    "phantom Derenzo turned": (lambda: setattr(derenzo().rotation_euler, "x", 0.5), None),
+    "phantom Derenzo changed": (
+        lambda: setattr(derenzo().mphdrr_volume.derenzo, "activity", 50.0),
+        lambda: setattr(derenzo().mphdrr_volume.derenzo, "activity", 100.0),
+    ),
+    "volume Derenzo is gone": (lambda: bpy.data.objects.remove(derenzo()), None),
+    "time 60 s, now 30 s": (lambda: set_(time=30.0), lambda: set_(time=60.0)),
+    "isotope none, now Tc-99m": (lambda: set_(isotope="Tc-99m"), lambda: set_(isotope="NONE")),
+    "model SPECT Counts, now Radiograph": (lambda: set_(model="TRANSMISSION"), lambda: set_(model="EMISSION")),
+    "pixels X 12, now 14": (lambda: set_(width=14), lambda: set_(width=12)),
+    "modules all, now 2-": (lambda: set_(first=2), lambda: set_(first=0)),
+    "seed none, now 4": (lambda: set_(noise=True, seed=4), lambda: set_(noise=False)),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("said", EDITS)
+def test_whatever_changes_is_said_until_it_goes_back(render, scene, said):
+    set_(time=60.0)
+    render()
+    assert runs.changes(scene) == []
+    edit, back = EDITS[said]
+    edit()
+    bpy.context.view_layer.update()
+    assert runs.changes(scene) == [said]
+    if back is not None:
+        back()
+        bpy.context.view_layer.update()
+        assert runs.changes(scene) == []
+
+
+def test_what_does_not_change_the_images_leaves_the_run_current(render, scene):
+    render()
+    derenzo().name = "Cold rods"
+    module(2).rotation_euler.x += 0.1  # projected as if aimed
+    scene.mphdrr_display.colors = "GREY"
+    set_(backend="NUMPY")
+    bpy.ops.mphdrr.add_nema(voxels=12)
+    bpy.context.view_layer.update()
+    assert runs.changes(scene) == [] and runs.volume_to_render(scene) == "Cold rods"
+
+
+def test_a_module_moved_by_a_millimetre_is_said_by_panels_list_and_export(render, scene, tmp_path, capfd):
+    item = render()
+    before = array_of(item)
+    quiet = [drawn(name) for name in ("MPHDRR_PT_projections", "MPHDRR_PT_runs", "MPHDRR_PT_export")]
+    assert not any("moved" in text for texts in quiet for text in texts)
+    move(module(3), 1.0)
+    names = "MPHDRR_PT_projections", "MPHDRR_PT_runs", "MPHDRR_PT_runs_of_images", "MPHDRR_PT_export"
+    for name in names:
+        assert "Module 03 moved" in drawn(name), name
+        assert ("Render Again" in drawn(name)) == (name != "MPHDRR_PT_export")
+    row = MagicMock()
+    row.row.return_value = row
+    registration.bpy.types.MPHDRR_UL_runs.draw_item(None, bpy.context, row, scene.mphdrr_projections, item, 0, None, "")
+    assert row.prop.call_args_list[0].kwargs["icon"] == "ERROR"
+    capfd.readouterr()
+    assert bpy.ops.mphdrr.export_dataset(filepath=str(tmp_path / "old.npz")) == {"FINISHED"}
+    assert "not of the scene as it is now (Module 03 moved): old.npz holds what was rendered" in capfd.readouterr().out
+    exported = read_run(tmp_path / "old.npz")
+    assert np.array_equal(exported.projections, before)
+    assert exported.system.centers[2, 2] == pytest.approx(module(3).location.z - 1.0)
+    render()
+    assert runs.changes(scene) == [] and not np.array_equal(shown_array(), before[2])
+    bpy.ops.mphdrr.export_dataset(filepath=str(tmp_path / "new.npz"))
+    assert "not of the scene" not in capfd.readouterr().out
+
+
+def test_the_list_keeps_two_and_what_is_renamed_or_pinned(render, scene):
+    listed = scene.mphdrr_projections.runs
+    first = storage.absolute(render().file)
+    render("the first sight")
+    render().keep = True
+    second = storage.absolute(listed[0].file)
+    assert [item.name for item in listed] == ["Derenzo, emission", "the first sight", "Derenzo, emission 2"]
+    for _ in range(3):
+        render()
+    assert [item.is_kept for item in listed] == [True, True, False, False]
+    assert not first.exists() and second == first
+    files = [storage.absolute(item.file) for item in listed]
+    assert len(set(files)) == 4 and sorted(storage.folder().glob("*.h5")) == sorted(files)
+    assert len({item.name for item in listed}) == 4 and runs.shown(scene) == listed[3]
+    assert "KiB" in runs.size_text(listed)
+
+
+def test_choosing_a_run_shows_its_images_and_removing_it_removes_its_file(render, scene):
+    settings = scene.mphdrr_projections
+    old = array_of(render())
+    move(derenzo(), 6.0)
+    new = array_of(render())
+    assert np.array_equal(shown_array(), new[2]) and not np.array_equal(old, new)
+    settings.active_run = 0
+    assert np.array_equal(shown_array(), old[2]) and settings.run_file == settings.runs[0].file
+    assert runs.changes(scene) == ["phantom Derenzo moved"]
+    path = storage.absolute(settings.run_file)
+    assert bpy.ops.mphdrr.remove_run(index=0) == {"FINISHED"}
+    assert not path.exists() and len(settings.runs) == 1
+    assert np.array_equal(shown_array(), new[2]) and runs.changes(scene) == []
+    assert bpy.ops.mphdrr.remove_run() == {"FINISHED"}
+    assert not settings.run_file and not planes.planes(scene) and ids.MOSAIC not in bpy.data.images
+    with pytest.raises(RuntimeError, match="No runs yet"):
+        bpy.ops.mphdrr.remove_run()
+
+
+def test_removing_another_run_leaves_the_shown_one(render, scene):
+    settings = scene.mphdrr_projections
+    render(), render()
+    shown = settings.runs[1].name
+    bpy.ops.mphdrr.remove_run(index=0)
+    assert runs.shown(scene).name == shown and settings.active_run == 0
+
+
+def test_two_runs_survive_save_and_reopen(render, scene, tmp_path):
+    before = [array_of(render("one"))]
+    move(module(3), 1.0)
+    before.append(array_of(render()))
+    bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "study.blend"))
+    shutil.move(tmp_path, moved := tmp_path.with_name(tmp_path.name + "-moved"))
+    bpy.ops.wm.open_mainfile(filepath=str(moved / "study.blend"))
+    scene = bpy.context.scene
+    settings = scene.mphdrr_projections
+    assert [item.name for item in settings.runs] == ["one", "Derenzo, emission"]
+    assert all(item.file.startswith("//study_mphdrr/") and item.is_saved for item in settings.runs)
+    for item, expected in zip(settings.runs, before, strict=True):
+        assert np.array_equal(array_of(item), expected)
+    assert runs.changes(scene) == [] and runs.changes(scene, settings.runs[0]) == ["Module 03 moved"]
+    move(module(3), -1.0)
+    assert runs.changes(scene, settings.runs[0]) == [] and runs.changes(scene) == ["Module 03 moved"]
+    settings.active_run = 0
+    assert np.array_equal(shown_array(), before[0][2])
+    # The .blend as it was saved may need the file of a run that another one replaces.
+    settings.runs[0].name = settings.runs[0].usual_name
+    replaced = storage.absolute(settings.runs[0].file)
+    bpy.ops.mphdrr.render_projections()
+    assert len(settings.runs) == 2 and replaced.exists()
+    bpy.ops.wm.save_mainfile()
+    assert bpy.ops.mphdrr.clean_volume_files() == {"FINISHED"}
+    assert not replaced.exists() and all(storage.absolute(item.file).exists() for item in settings.runs)
+
+
+def test_a_file_of_another_blend_is_never_removed(render, scene, tmp_path):
+    render()
+    bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "a.blend"))
+    (tmp_path / "sub").mkdir()
+    bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "sub" / "b.blend"))
+    path = storage.absolute(scene.mphdrr_projections.run_file)
+    assert path.resolve().parent == tmp_path / "a_mphdrr"
+    bpy.ops.mphdrr.remove_run()
+    assert path.is_file() and not scene.mphdrr_projections.runs
+
+
+def test_a_run_whose_file_is_gone_is_said_and_does_not_stop_saving(render, scene, tmp_path):
+    settings = scene.mphdrr_projections
+    render("one"), render()
+    gone = storage.absolute(settings.runs[0].file)
+    gone.unlink()
+    with pytest.raises(RuntimeError, match="the run's file is gone"):
+        bpy.ops.mphdrr.show_run(index=0)
+    assert runs.shown(scene) == settings.runs[1] and "missing" in runs.size_text([settings.runs[0]])
+    bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "a.blend"))
+    assert storage.absolute(settings.runs[1].file).parent == tmp_path / "a_mphdrr"
+    settings.active_run = 0  # chosen in the list
+    assert runs.shown(scene) == settings.runs[1]
+
+
+def test_the_difference_of_two_runs_is_drawn_and_said(render, scene, capfd):
+    settings = scene.mphdrr_projections
+    render(), move(derenzo(), 3.0), render()
+    found = difference(*(read_run(storage.absolute(settings.runs[i].file)) for i in (1, 0)))
+    assert bpy.ops.mphdrr.compare_runs(other="0") == {"FINISHED"}
+    assert found.maximum > 0 and found.text in capfd.readouterr().out
+    image = bpy.data.images[ids.DIFFERENCE]
+    assert images.tiles(image)["numbers"] == list(range(1, 9))
+    pixels = np.array(image.pixels[:]).reshape(-1, 4)
+    assert (pixels[:, 0] - pixels[:, 2]).max() > 0.4 and (pixels[:, 2] - pixels[:, 0]).max() > 0.4
+    assert found.text in " ".join(drawn("MPHDRR_PT_runs"))
+    set_(width=14)
+    render()
+    assert ids.DIFFERENCE not in bpy.data.images, "it belonged to the run that was shown"
+    with pytest.raises(RuntimeError, match="cannot compare runs of different pixels: 14 x 10, and 12 x 10"):
+        bpy.ops.mphdrr.compare_runs(other="0")
+
+
+def test_example_and_runs_from_outside_are_current(scene, ring_system):
+    assert bpy.ops.mphdrr.load_example() == {"FINISHED"}
+    assert runs.changes(scene) == [] and len(scene.mphdrr_projections.runs) == 1
+    move(module(30), 1.0)
+    assert runs.changes(scene) == ["Module 30 moved"]
+
+
+def test_a_file_of_version_0_1_0_shows_its_run(scene, tmp_path):
+    shutil.copytree(DATA / "scene-0.1.0_mphdrr", tmp_path / "scene-0.1.0_mphdrr")
+    shutil.copy(DATA / "scene-0.1.0.blend", tmp_path)
+    bpy.ops.wm.open_mainfile(filepath=str(tmp_path / "scene-0.1.0.blend"))
+    scene = bpy.context.scene
+    (item,) = scene.mphdrr_projections.runs
+    assert item.file == scene.mphdrr_projections.run_file and runs.changes(scene) == [runs.UNKNOWN]
+    assert runs.UNKNOWN.split(",")[0] in " ".join(drawn("MPHDRR_PT_runs"))
+    settings = scene.mphdrr_projections
+    settings.width, settings.height = 12, 8
+    bpy.ops.mphdrr.render_projections()
+    assert runs.changes(scene) == [] and len(settings.runs) == 2
+    settings.active_run = 0
+    assert images.projection_array(bpy.data.images["mphDRR 03"]).shape == (16, 24)
+
+
+def test_a_volume_that_is_not_in_the_panel_is_found_again(render, scene):
+    """With two volumes and none chosen, the run's own is what is compared and rendered again."""
+    render()
+    volumes.add_volume(Volume(np.ones((2, 2, 2), np.float32), Grid.centered(2, 2.0), "activity"), "Other")
+    assert runs.changes(scene) == [] and runs.volume_to_render(scene) == "Derenzo"
+    set_(volume=bpy.data.objects["Other"])
+    assert runs.changes(scene) == ["volume Derenzo, now Other"] and runs.volume_to_render(scene) == ""
+    assert bpy.ops.mphdrr.render_projections() == {"FINISHED"}
+    assert runs.changes(scene) == [] and rendering.file_of(scene.mphdrr_projections.run_file)
+
+
+def test_two_runs_of_blender_4_5_open_in_every_version(scene, tmp_path):
+    """Three modules; Module 03 was moved and the phantom turned between the runs, of which the second is shown."""
+    for name in ("runs-4.5.blend", "runs-4.5_mphdrr"):
+        (shutil.copytree if (DATA / name).is_dir() else shutil.copy)(DATA / name, tmp_path / name)
+    bpy.ops.wm.open_mainfile(filepath=str(tmp_path / "runs-4.5.blend"))
+    scene = bpy.context.scene
+    before, after = scene.mphdrr_projections.runs
+    assert (before.name, after.name) == ("Before", "Derenzo, emission") and runs.shown(scene) == after
+    assert runs.changes(scene, before) == ["Module 03 moved", "phantom Derenzo turned"] and runs.changes(scene) == []
+    expected = array_of(after)
+    assert np.array_equal(images.projection_array(bpy.data.images["mphDRR 66"]), expected[2])
+    assert bpy.ops.mphdrr.render_projections() == {"FINISHED"}
+    np.testing.assert_allclose(array_of(scene.mphdrr_projections.runs[-1]), expected, rtol=1e-6)
+    assert runs.changes(scene, scene.mphdrr_projections.runs[1]) == []

@@ -126,11 +126,10 @@ def in_the_scanner(system: mph.PinholeSystem, folder: Path, ct: mph.Volume | Non
         jobs.run(figures.figure_job(bpy.context, "inside", [folder / name], (960, 560), labels=False, samples=12))
 
     jobs.run(maps.mapping(scene, "sensitivity", voxels=128))
-    (shown,) = volumes.volume_objects(scene)
-    slices.remove_slices(shown)  # it is cut open in front of them
+    slices.remove_slices(*volumes.volume_objects(scene))  # it is cut open in front of them
     picture("sensitivity.png")
     if ct is not None:
-        bpy.data.objects.remove(shown)
+        bpy.data.objects.remove(*volumes.volume_objects(scene))
         volumes.add_volume(ct, "chest CT")
         picture("ct.png")
 

@@ -71,6 +71,7 @@ class MPHDRR_MT_volumes(bpy.types.Menu):
         layout.operator(ids.MESH_FROM_VOLUME, icon="MESH_DATA")
         layout.separator()
         layout.operator(ids.EXPORT_VOLUME, icon="EXPORT")
+        layout.operator(ids.REMAKE_VOLUMES, icon="FILE_REFRESH")
         layout.operator(ids.FIND_VOLUME_FILES, icon="VIEWZOOM")
         layout.operator(ids.CLEAN_VOLUME_FILES, icon="TRASH")
 

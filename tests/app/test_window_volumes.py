@@ -1,4 +1,4 @@
-"""What volumes are is seen in the window: spheres in NEMA's slices, the colours of a map, a lit scanner."""
+"""What volumes are is seen in the window: spheres in NEMA's slices, the colours of a map."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from scipy import ndimage
 SCRIPT = Path(__file__).with_name("window_volumes.py")
 
 
-def test_slices_shells_maps_and_light(blender_window, work_folder):
+def test_slices_shells_and_maps(blender_window, work_folder):
     result = work_folder / "seen.json"
     blender_window(SCRIPT.read_text(encoding="utf-8"), result, work_folder, seconds=150)
     seen = json.loads(result.read_text())
@@ -45,4 +45,3 @@ def test_slices_shells_maps_and_light(blender_window, work_folder):
     x, y, width, height = seen["bar"]
     bar = screen[round(y) : round(y + height), round(x + width / 2)]
     assert len(np.unique(bar, axis=0)) > 50 and bar[0].sum() > bar[-1].sum() + 200, "its colour bar, brighter upwards"
-    assert 0.15 < picture("rendered").mean() / 255 < 0.6, seen["engine"]

@@ -1,4 +1,4 @@
-"""Volumes in the window: NEMA's slices and shell, an arrow that is dragged, a map, the rendered view; a picture of each.
+"""Volumes in the window: NEMA's slices and shell, an arrow that is dragged, a map; a picture of each.
 
 Arguments after ``--``: the file for what was seen, and the folder for the pictures.
 """
@@ -134,13 +134,7 @@ def steps():
     left, bottom, width, height = color_bar.place()
     window, _, region = viewport()
     seen["bar"] = [region.x + left, window.height - region.y - bottom - height, width, height]
-    look(1300.0, (1.05, 0.0, 0.95))
-    space.overlay.show_overlays = False
-    space.shading.type = "RENDERED"
-    yield 20
-    picture("rendered")
-    seen["engine"] = bpy.context.scene.render.engine
-    space.shading.type, space.overlay.show_overlays, space.show_region_ui = "SOLID", True, True
+    space.show_region_ui = True
     bpy.context.view_layer.objects.active = bpy.data.objects["Sensitivity map"]
     look(600.0, (1.05, 0.0, 0.95))
     yield 2

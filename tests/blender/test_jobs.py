@@ -115,7 +115,9 @@ STAGES = {
 }  # fmt: skip
 
 
-@pytest.mark.parametrize("make", STAGES)
+@pytest.mark.parametrize(
+    "make", [pytest.param(make, marks=pytest.mark.long) if make is loading else make for make in STAGES]
+)
 def test_cancelling_in_any_stage_leaves_everything_as_it_was(scanned, tmp_path, monkeypatch, make):
     monkeypatch.setattr(example, "_VOXELS", 8)
     monkeypatch.setattr(example, "_PIXELS", 8)

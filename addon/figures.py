@@ -278,7 +278,7 @@ def _set_up(scene: bpy.types.Scene, page: Page, samples: int, path: Path) -> Non
     cycles = scene.cycles
     cycles.device, cycles.samples, cycles.max_bounces, cycles.seed = "CPU", samples, 4, 0
     cycles.use_adaptive_sampling, cycles.adaptive_threshold, cycles.adaptive_min_samples = True, 0.05, 4
-    cycles.use_denoising, cycles.denoising_prefilter = True, "FAST"
+    cycles.use_denoising, cycles.denoising_prefilter = True, "ACCURATE"
     render.resolution_x, render.resolution_y, render.resolution_percentage = page.width, page.height, 100
     render.image_settings.file_format, render.image_settings.color_mode = "PNG", "RGB"
     scene.view_settings.view_transform = "Standard"

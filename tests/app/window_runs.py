@@ -91,9 +91,9 @@ def compare() -> None:
 def finish() -> None:
     seen["runs"] = [item.name for item in bpy.context.scene.mphdrr_projections.runs]
     seen["image"] = editor("IMAGE_EDITOR")["area"].spaces.active.image.name
-    sidebar = next(r for r in editor("IMAGE_EDITOR")["area"].regions if r.type == "UI")
-    window = editor("IMAGE_EDITOR")["window"]
-    seen["sidebar"] = [sidebar.x, window.height - sidebar.y - sidebar.height, sidebar.width, sidebar.height]
+    place = editor("IMAGE_EDITOR")
+    area = place["area"]
+    seen["editor"] = [area.x, place["window"].height - area.y - area.height, area.width, area.height]
     seen["ok"] = True
 
 

@@ -120,13 +120,17 @@ def blender_script(blender: Run, work_folder: Path) -> Run:
 def blender_window(home: Path, work_folder: Path) -> Callable[..., Path]:
     """`blender_window(text, *arguments, seconds=12)`: run Python in a Blender with its window; return a PNG of the screen.
 
-    The window is closed after `seconds`; the script writes its findings to a file named in `arguments`.
+    The script writes its findings to a JSON file in `work_folder`; the window is closed when that has "error" or a
+    true "ok", and at the latest after `seconds`.
     """
 
     def run(text: str, *arguments: str | Path, seconds: float = 12) -> Path:
         script, picture = work_folder / "window.py", work_folder / "window.png"
         script.write_text(text, encoding="utf-8")
-        done = real_blender("screenshot", picture, script, str(seconds), *arguments, home=home, timeout=seconds + 120)
+        driver = Path(__file__).with_name("in_window.py")
+        done = real_blender(
+            "python", driver, picture, script, str(seconds), work_folder, *arguments, home=home, timeout=seconds + 120
+        )
         if not picture.is_file():
             pytest.fail(f"no screenshot\n{done.stdout[-4000:]}\n{done.stderr[-4000:]}")
         return picture

@@ -51,11 +51,12 @@ def start() -> None:
     result: dict[str, object] = {"ok": False}
     try:
         work()
-        result = {"ok": True, "files": sorted(path.name for path in folder.iterdir())}
+        result = {"files": sorted(path.name for path in folder.iterdir())}
     except Exception:
         result["error"] = traceback.format_exc()
     (folder / "result.json").write_text(json.dumps(result))
-    bpy.app.timers.register(open_tab, first_interval=3)
+    if "error" not in result:
+        bpy.app.timers.register(open_tab, first_interval=3)
 
 
 def open_tab() -> None:
@@ -69,6 +70,7 @@ def open_tab() -> None:
     region = next(region for region in area.regions if region.type == "WINDOW")
     x, y = location_3d_to_region_2d(region, area.spaces.active.region_3d, (0, 0, 0))
     result = json.loads((folder / "result.json").read_text())
+    result["ok"] = True
     result["phantom_at"] = [round(region.x + x), round(window.height - region.y - y)]
     (folder / "result.json").write_text(json.dumps(result))
 

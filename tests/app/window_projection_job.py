@@ -146,7 +146,7 @@ def drive():
     except Exception as error:  # into the file, where the test looks
         import traceback
 
-        seen["ok"] = False
+        seen["error"] = str(error)
         note(f"FAILED: {type(error).__name__}: {error} {traceback.format_exc()}")
         return None
 

@@ -5,10 +5,7 @@ its text must contain. A step is a generator: it yields what to wait for, and re
 To add one, write it here, and its section with that picture in the page; `make tutorial` takes all pictures anew.
 """
 
-import contextlib
 import json
-import os
-import signal
 import subprocess
 import sys
 import time
@@ -190,14 +187,6 @@ def work():
     said["ok"] = True
 
 
-def close() -> None:
-    """End the wait of the script that has opened this window, and so the test."""
-    parent = os.getppid()
-    for child in Path(f"/proc/{parent}/task/{parent}/children").read_text().split():
-        if Path(f"/proc/{child}/comm").read_text().strip() == "sleep":
-            os.kill(int(child), signal.SIGTERM)
-
-
 def tick() -> float | None:
     """Go on when what the last step waits for has happened."""
     global wanted, since
@@ -215,8 +204,6 @@ def tick() -> float | None:
     except Exception:
         said["error"] = traceback.format_exc()
     (folder / "said.json").write_text(json.dumps(said))
-    with contextlib.suppress(OSError):  # then it waits to its end
-        close()
     return None
 
 

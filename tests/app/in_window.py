@@ -1,0 +1,53 @@
+"""Run a script in a Blender with its window on a virtual screen; capture the screen once it is done, or when time is up.
+
+Arguments: the PNG to write, the script, the seconds that it may take, the folder in which it says how it went, and its own
+arguments. It is done when a JSON file in that folder has "error", or a true "ok". Runs on the real Blender's own Python.
+"""
+
+import json
+import os
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+SCREEN = 1600, 1000
+_REDRAW = 5.0  # s that the window gets to be drawn, in software, after the script is done
+
+
+def is_done(folder: Path) -> bool:
+    """Whether the script says that it has ended."""
+    for path in folder.glob("*.json"):
+        try:
+            said = json.loads(path.read_text())
+        except ValueError:  # it is being written
+            continue
+        if "error" in said or said.get("ok"):
+            return True
+    return False
+
+
+def main(picture: str, script: str, seconds: str, folder: str, *arguments: str) -> None:
+    """Do so."""
+    width, height = SCREEN
+    reading, writing = os.pipe()
+    screen = subprocess.Popen(
+        ["Xvfb", "-displayfd", str(writing), "-screen", "0", f"{width}x{height}x24"],
+        pass_fds=[writing], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,
+    )  # fmt: skip
+    os.close(writing)
+    with os.fdopen(reading) as number:
+        os.environ["DISPLAY"] = f":{number.readline().strip()}"
+    place = ["--window-geometry", "0", "0", str(width), str(height)]
+    blender = subprocess.Popen(["blender", *place, "--python", script, "--", *arguments])
+    end = time.monotonic() + float(seconds)
+    while time.monotonic() < end and blender.poll() is None and not is_done(Path(folder)):
+        time.sleep(0.3)
+    time.sleep(_REDRAW)
+    subprocess.run(["import", "-window", "root", picture], check=True)
+    for process in (blender, screen):
+        process.kill()
+        process.wait()
+
+
+main(*sys.argv[1:])

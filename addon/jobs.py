@@ -15,6 +15,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import bpy
+from bpy.app.translations import pgettext_iface as iface
 from bpy.props import BoolProperty, IntProperty
 from bpy_extras.io_utils import ExportHelper
 
@@ -376,7 +377,7 @@ def draw_job(layout: bpy.types.UILayout) -> None:
         if worker is _current:
             row.progress(factor=worker.share, type="BAR", text=worker.text)
         else:
-            row.label(text=f"{worker.label}: waits", icon="TIME")
+            row.label(text=iface("{job}: waits").format(job=iface(worker.label)), translate=False, icon="TIME")
         row.operator(ids.CANCEL_JOB, text="", icon="CANCEL").number = worker.number
 
 
@@ -385,7 +386,7 @@ def draw_status(header: bpy.types.Header, context: bpy.types.Context) -> None:
     if _current is not None:
         row = header.layout.row(align=True)
         row.ui_units_x = _STATUS_UNITS
-        row.progress(factor=_current.share, type="BAR", text=f"mphDRR: {_current.text}")
+        row.progress(factor=_current.share, type="BAR", text="mphDRR: " + _current.text)
         row.operator(ids.CANCEL_JOB, text="", icon="CANCEL").number = _current.number
 
 

@@ -152,7 +152,7 @@ def _views(recipe: Recipe, system: PinholeSystem) -> Views:
     """The views of a recipe's detector."""
     shape = recipe["detector.rows"], recipe["detector.columns"]
     plane, magnification, pitch = (recipe[f"detector.{name}"] for name in ("plane", "magnification", "pitch"))
-    return system.views(shape, plane, magnification, pitch, field=recipe["detector.field"])
+    return system.views(shape, plane, magnification, pitch)
 
 
 def _pixel_area(views: Views) -> float:

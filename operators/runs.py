@@ -36,6 +36,7 @@ class MPHDRR_OT_show_run(_OfRuns, jobs.JobOperator, bpy.types.Operator):
 
     bl_idname = ids.SHOW_RUN
     bl_label = "Show Run"
+    bl_options = {"REGISTER", "UNDO", "INTERNAL"}  # a click in the list
 
     index: IntProperty(name="Index", description="Place of the run in the list, from 0", min=0, options={"SKIP_SAVE"})
 

@@ -1,6 +1,7 @@
 """How the projections are shown: in the 3D view's sidebar, and in the Image Editor's beside the pictures."""
 
 import bpy
+from bpy.app.translations import pgettext_iface as iface
 
 from ..addon import ids, images, selection
 from .geometry import Sidebar
@@ -43,12 +44,13 @@ def _draw_totals(layout: bpy.types.UILayout, context: bpy.types.Context) -> None
         return
     index = shown["numbers"].index(camera.mphdrr_module.number)
     column = layout.column(align=True)
-    column.label(text=f"{camera.name}{', central half' if shown['half'] else ''} ({shown['unit']})")
+    text = iface("{name}, central half ({unit})") if shown["half"] else "{name} ({unit})"
+    column.label(text=text.format(name=camera.name, unit=shown["unit"]), translate=False)
     for text, value in ((shown["summed"].capitalize(), shown["totals"][index]), ("Maximum", shown["maxima"][index])):
         row = column.split(factor=0.4)
         row.active = False
         row.label(text=text)
-        row.label(text=f"{value:.6g}")
+        row.label(text=f"{value:.6g}", translate=False)
 
 
 class MPHDRR_PT_display(_Display, Sidebar, bpy.types.Panel):

@@ -45,11 +45,15 @@ class MPHDRR_MT_modules(bpy.types.Menu):
         layout.operator(ids.DUPLICATE_MODULES, icon="DUPLICATE")
         layout.operator(ids.REMOVE_MODULES, icon="TRASH")
         layout.operator(ids.AIM_MODULES, icon="CON_TRACKTO")
+        layout.operator(ids.RESET_CAMERAS, icon="LOOP_BACK")
         layout.operator(ids.TIDY_MODULES, icon="BRUSH_DATA")
         layout.operator_menu_enum(ids.RENUMBER_MODULES, "order", icon="LINENUMBERS_ON")
         layout.separator()
         layout.operator(ids.CHECK_GEOMETRY, icon="CHECKMARK")
         layout.operator_menu_enum(ids.ADD_MAP, "quantity", icon="OUTLINER_DATA_LIGHTPROBE")
+        layout.separator()
+        layout.operator(ids.SET_UP_SCENE, icon="SCENE_DATA")
+        layout.operator(ids.REMOVE_SCANNER, icon="TRASH")
 
 
 class MPHDRR_MT_volumes(bpy.types.Menu):
@@ -83,7 +87,15 @@ class MPHDRR_MT_projections(bpy.types.Menu):
         layout = self.layout
         layout.operator_context = "INVOKE_DEFAULT"
         layout.operator(ids.RENDER_PROJECTIONS, icon="RENDER_STILL")
+        layout.operator(ids.LIVE_PREVIEW, icon="VIEW_CAMERA")
         layout.operator(ids.SHOW_PROJECTIONS, icon="IMAGE_DATA")
+        layout.operator_menu_enum(ids.PICK_WINDOW, "end", icon="EYEDROPPER")
+        layout.separator()
+        settings = context.scene.mphdrr_projections
+        layout.operator_menu_enum(ids.COMPARE_RUNS, "other", icon="SELECT_DIFFERENCE")
+        layout.operator(ids.REMOVE_RUN, icon="TRASH").index = settings.active_run
+        layout.separator()
         layout.operator_menu_enum(ids.USE_PRESET, "preset", icon="PRESET")
         layout.operator(ids.LOAD_RECIPE, icon="FILE_FOLDER")
         layout.operator(ids.EXPORT_DATASET, icon="EXPORT")
+        layout.operator(ids.EXPORT_FIGURE, icon="IMAGE_DATA")

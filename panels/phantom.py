@@ -44,7 +44,7 @@ def _draw_missing(column: bpy.types.UILayout, scene: bpy.types.Scene) -> None:
     column.label(text="Files of voxels are missing", icon="ERROR")
     if again:
         names = ", ".join(item.name for item in again)
-        column.operator(ids.REMAKE_VOLUMES, text=f"Make Again: {names}", icon="FILE_REFRESH")
+        column.operator(ids.REMAKE_VOLUMES, text=iface("Make Again: {names}").format(names=names), icon="FILE_REFRESH")
     if others:
         draw_text(column, recovery.what_to_do(others), "BLANK1")
     column.operator(ids.FIND_VOLUME_FILES, icon="VIEWZOOM")

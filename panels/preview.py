@@ -3,6 +3,7 @@
 import textwrap
 
 import bpy
+from bpy.app.translations import pgettext_iface as iface
 
 from ..addon import ids, preview
 from .geometry import Sidebar
@@ -24,4 +25,4 @@ class MPHDRR_PT_preview(Sidebar, bpy.types.Panel):
         if session.problem:
             for line in textwrap.wrap(session.problem, _LINE):
                 column.label(text=line)
-        column.label(text=f"{session.kept} of voxels kept in memory")
+        column.label(text=iface("{size} of voxels kept in memory").format(size=session.kept))

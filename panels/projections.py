@@ -30,8 +30,6 @@ class MPHDRR_PT_projections(Sidebar, bpy.types.Panel):
         model = [name for name, _ in drawn(settings, "model") if name != "model"]
         _draw(column, settings, "model", [name for name in model if name in _MAIN])
         _draw(column, settings, "detector")
-        if settings.model != "EMISSION":
-            column.operator(ids.WIDE_FIELD, icon="FULLSCREEN_ENTER", depress=settings.field > 1)
         modules = column.column(align=True)
         modules.prop(settings, "all_modules")
         if not settings.all_modules:

@@ -1,6 +1,7 @@
 """The scene's runs: their list, what has changed since the shown one was rendered, and comparing, in both sidebars."""
 
 import bpy
+from bpy.app.translations import pgettext_iface as iface
 
 from ..addon import ids, images, jobs, runs
 from .geometry import Sidebar, draw_text
@@ -50,7 +51,7 @@ class _Runs:
         for part in settings.run_summary.split(", ", 1):
             column.label(text=part)
         if len(settings.runs) > 1:
-            column.label(text=f"All runs: {runs.size_text(settings.runs)}")
+            column.label(text=iface("All runs: {size}").format(size=runs.size_text(settings.runs)))
             row = layout.row()
             row.operator_context = "INVOKE_DEFAULT"
             row.enabled = not jobs.is_running()

@@ -127,7 +127,6 @@ class PinholeSystem:
         magnification: float = 10.0,
         pitch: ArrayLike | None = None,
         offset: ArrayLike = (0.0, 0.0),
-        field: float = 1.0,
     ) -> Views:
         """The modules' images, of n_v rows and n_u columns, as `Views`.
 
@@ -136,8 +135,8 @@ class PinholeSystem:
         detector is the crystal's front face behind the pinhole, so its image is point-inverted.
 
         `pitch` is the pixel size on that detector, mm, one number or (pitch_u, pitch_v). By default the image covers the
-        crystal (Ld / n on the real, magnification * Ld / n on the virtual detector), or `field` times its side. `offset` is
-        the place (x0, y0) of the image's middle on that detector, mm along u and v.
+        crystal (Ld / n on the real, magnification * Ld / n on the virtual detector). `offset` is the place (x0, y0) of the
+        image's middle on that detector, mm along u and v.
         """
         n_v, n_u = whole_shape(shape, "image shape", 2)
         magnification = positive(magnification, "magnification")
@@ -146,7 +145,7 @@ class PinholeSystem:
         # A length on the real detector is -magnification times as long on the virtual one.
         to_virtual = 1.0 if detector == "virtual" else -magnification
         if pitch is None:
-            side = abs(magnification / to_virtual) * positive(field, "field") * self.detector_side[:, None]
+            side = abs(magnification / to_virtual) * self.detector_side[:, None]
             pitches = side / np.array([n_u, n_v])
         else:
             pitches = np.broadcast_to(lengths(pitch, "pixel pitch", 2), (len(self), 2))

@@ -33,7 +33,7 @@ class Display:
 
     `low` and `high` are the numbers that have the first and the last colour; None is automatic: 0, or the smallest number
     where that is negative, and the largest. On the logarithmic scale an automatic `low` is a thousandth of `high`. `half`:
-    only the middle half of each image is shown; of a wide field of view, twice the crystal's, that is what the crystal sees.
+    only the middle half of each image is shown, which users call the FOV; all of it is their wide FOV.
     """
 
     colors: str = "inferno"

@@ -33,13 +33,12 @@ def project_run(
     photons: float | None = None,
     noise_seed: int | None = None,
     progress: Progress | None = None,
-    field: float = 1.0,
 ) -> ProjectionRun:
     """Project `volume` into every module of `system`.
 
     Parameters
     ----------
-    shape, detector, magnification, pitch, field
+    shape, detector, magnification, pitch
         The images, as of `PinholeSystem.views`.
     backend, threads
         As of `Projector`.
@@ -71,7 +70,7 @@ def project_run(
     lowest, highest = float(volume.array.min()), float(volume.array.max())
     if isinstance(model, Emission) and lowest < -0.1 * abs(highest):  # interpolation leaves less
         _warn(f"the activity is {lowest:g} to {highest:g} kBq/mL: what is below 0 makes counts below 0")
-    views = system.views(shape=shape, detector=detector, magnification=magnification, pitch=pitch, field=field)
+    views = system.views(shape=shape, detector=detector, magnification=magnification, pitch=pitch)
     if isinstance(model, Emission) and not model.within_crystal:
         _warn_of_no_crystal(system, views, magnification)
     _warn_of_unseen(volume, views, ends_at_plane=not isinstance(model, Emission))

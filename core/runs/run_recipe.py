@@ -93,7 +93,6 @@ def run_recipe(
             detector=recipe["detector.plane"],
             magnification=recipe["detector.magnification"],
             pitch=recipe["detector.pitch"],
-            field=recipe["detector.field"],
             backend=recipe["compute.backend"],
             threads=recipe["compute.threads"],
             settings={"volume": _volume_name(record), **converted, "recipe": record.tables()},

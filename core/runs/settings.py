@@ -219,9 +219,6 @@ _DECLARED = (
             label="Distance (× l)"),
     Setting("detector.pitch", float, None, "Pixel size", "the image covers the crystal's whole side", unit="mm", above=0,
             slider=10, label="Pixel Size (mm)"),
-    Setting("detector.field", float, 1.0, "Side of the images in units of the crystal's; more than 1 shows what lies beside "
-            "its field of view, from which no photon is counted", above=0, slider=4,
-            needs=("no detector.pitch", "no model.kind=emission"), label="Field of View"),
     Setting("noise.seed", int, None, "Draw Poisson counts with this seed; of several states with SEED, SEED + 1 …",
             "their expected means", least=0, needs=("model.kind=emission or model.photons",), option="--noise"),
     Setting("compute.backend", str, "auto", "What computes the line integrals", words={

@@ -23,7 +23,7 @@ def projected(scene, ring_system):
     volumes.add_volume(Volume(np.ones((2, 2, 2), np.float32), Grid.centered(2, 2.0, POINT)), "Point")
 
     def project(**settings):
-        assert bpy.ops.mphdrr.render_projections(width=50, height=40, **settings) == {"FINISHED"}
+        assert bpy.ops.mphdrr.render_projections(**{"width": 50, "height": 40} | settings) == {"FINISHED"}
         bpy.context.view_layer.update()
         return planes.planes(scene)
 
@@ -127,8 +127,8 @@ def test_the_mosaic_knows_each_images_sum_or_mean_and_its_maximum(projected):
 
 
 @pytest.mark.parametrize("detector", ["VIRTUAL", "REAL"])
-def test_the_central_half_of_a_wide_field_is_what_the_crystal_sees(projected, scene, detector):
-    """Its pictures are those of a run of the crystal's field, and stand in the scene where those stand."""
+def test_the_central_half_is_a_run_of_half_the_side(projected, scene, detector):
+    """Its pictures are those of such a run, and stand in the scene where those stand."""
     settings = scene.mphdrr_display
     settings.automatic, settings.high = False, 20.0
 
@@ -143,9 +143,9 @@ def test_the_central_half_of_a_wide_field_is_what_the_crystal_sees(projected, sc
         ]
         return pixels, [np.array(plane.matrix_world) * plane.empty_display_size for plane in made], views
 
-    projected(detector=detector)
+    projected(detector=detector, width=40, pitch=2.0)
     (first, of_seven), places, views = pictures()
-    bpy.ops.mphdrr.render_projections(width=100, height=80, detector=detector, field=2.0)
+    bpy.ops.mphdrr.render_projections(width=80, height=80, detector=detector, pitch=2.0)
     wide = pictures()
     assert wide[2][0][0] == pytest.approx(2 * views[0][0])
     exact = images.projection_array(bpy.data.images["mphDRR 07"])
@@ -155,36 +155,19 @@ def test_the_central_half_of_a_wide_field_is_what_the_crystal_sees(projected, sc
     np.testing.assert_allclose(of_seven_now, of_seven, atol=1e-2)
     np.testing.assert_allclose(views_now, views, atol=1e-6)
     np.testing.assert_allclose(places_now, places, atol=1e-3)
-    assert np.array_equal(images.projection_array(bpy.data.images["mphDRR 07"]), exact) and exact.shape == (80, 100)
+    assert np.array_equal(images.projection_array(bpy.data.images["mphDRR 07"]), exact) and exact.shape == (80, 80)
     # The eyedropper counts columns and rows in the whole array.
     for name, at in (("mphDRR 07 picture", (0.01, 0.01)), ("mphDRR 07", (0.51 * 0.5 + 0.25, 0.25))):
         found = tiles.value_at(bpy.data.images[name], *at)
         column, row = (int(word.rstrip(",")) for word in found[0].split()[3::2])
         assert found[1] == exact[row, column]
     found = tiles.value_at(bpy.data.images["mphDRR 07 picture"], 0.01, 0.01)
-    assert found[0] == "mphDRR 07, column 74, row 20"
+    assert found[0] == "mphDRR 07, column 59, row 20"
     shown = images.tiles(bpy.data.images[ids.MOSAIC])
     row, column = np.reshape(shown["corners"], (-1, 2))[6]
     mosaic = bpy.data.images[ids.MOSAIC]
     found = tiles.value_at(mosaic, (column + 0.5) / mosaic.size[0], 1 - (row + 0.5) / mosaic.size[1])
-    assert found == ("mphDRR 07, column 74, row 59", exact[59, 74])
-
-
-def test_the_wide_field_has_twice_the_pixels_of_the_same_size(projected, scene):
-    settings = scene.mphdrr_projections
-    settings.width, settings.height = 50, 40
-    assert bpy.ops.mphdrr.wide_field() == {"FINISHED"}
-    assert (settings.width, settings.height, settings.field) == (100, 80, 2.0)
-    assert bpy.ops.mphdrr.wide_field() == {"FINISHED"}
-    assert (settings.width, settings.height, settings.field) == (50, 40, 1.0)
-    settings.pitch = 0.5
-    with pytest.raises(RuntimeError, match="pixels' size is typed"):
-        bpy.ops.mphdrr.wide_field()
-    settings.pitch, settings.model = 0.0, "EMISSION"
-    with pytest.raises(RuntimeError, match="counts end at the crystal"):
-        bpy.ops.mphdrr.wide_field()
-    with pytest.raises(RuntimeError, match="field"):
-        bpy.ops.mphdrr.render_projections(model="EMISSION", field=2.0, width=8, height=8)
+    assert found == ("mphDRR 07, column 59, row 59", exact[59, 59])
 
 
 def test_planes_of_the_active_module_its_ring_or_all_that_are_visible(projected, scene):

@@ -34,11 +34,11 @@ def example(scene, dc_spect, tmp_path):
     collection = scanner.build_scanner(scene, system)
     pose = mph.euler_pose(0.3, 0.2, 0.1, (4.0, 0.0, -6.0))
     volume = mph.DerenzoPhantom(40, (8, 6, 5, 4, 3, 2), 40, 100).voxelize(mph.Grid.centered(24, 4.0), pose)
-    volumes.add_volume(volume, "Derenzo", pose)
+    item = volumes.add_volume(volume, "Derenzo", pose)
     views = system.views(shape=(16, 16))
     run = mph.ProjectionRun(mph.Projector(volume.grid, views)(volume), system, views, volume)
     mph.write_run(run, tmp_path / "run.h5")
-    rendering.show_run(scene, run, tmp_path / "run.h5")
+    rendering.show_run(scene, run, tmp_path / "run.h5", item)
     scanner.show_modules(collection, 5, 41)
     bpy.context.view_layer.update()
     return scene

@@ -12,8 +12,8 @@ import pytest
 import mphdrr.core as mph
 from mphdrr.addon.cli import main
 from mphdrr.core.phantoms.kinds import KINDS
-from mphdrr.core.runs.recipe import Recipe, fitting_recipe
-from mphdrr.core.runs.run_recipe import euler_degrees, phantom_pose, run_recipe
+from mphdrr.core.runs.recipe import Recipe
+from mphdrr.core.runs.run_recipe import euler_degrees, phantom_pose
 from mphdrr.core.runs.settings import SETTINGS
 
 DATA = Path(__file__).parent / "data"
@@ -238,17 +238,7 @@ def test_every_argument_of_a_model_is_a_setting():
     assert len(set(options)) == len(options)
 
 
-def test_a_wide_field_is_of_radiographs(system):
+def test_counts_beside_the_crystal_are_said(system):
     volume = mph.Volume(np.ones((4, 4, 4), np.float32), mph.Grid.centered(4, 10.0))
-    wide, narrow = (
-        next(
-            run_recipe(Recipe({"detector.rows": 8 * n, "detector.columns": 8 * n, "detector.field": n}), system, volume)
-        )
-        for n in (2, 1)
-    )
-    np.testing.assert_allclose(wide.projections[:, 4:12, 4:12], narrow.projections, rtol=1e-5)
-    with pytest.raises(mph.InputError, match=r"detector\.field .*does not go with"):
-        Recipe({"model.kind": "emission", "detector.field": 2})
     with pytest.warns(mph.InputWarning, match="wider than the crystal"):
         mph.project_run(system, volume, (4, 4), pitch=500.0, model=mph.Emission(system))
-    assert fitting_recipe({"model.kind": "emission", "detector.field": 2.0}).given == {"model.kind": "emission"}

@@ -45,7 +45,7 @@ class DisplayProperties(bpy.types.PropertyGroup):
         name="High", description="The number that has the last colour", default=1.0, update=on_edit("display")
     )
     half: BoolProperty(
-        name="Central Half", description="Show the middle half of each image only, often called FOV; all of it is the wide FOV",
+        name="Central Half", description="Show the middle half of each image, often called FOV; all of it is the wide FOV",
         update=on_edit("display"),
     )  # fmt: skip
     planes: EnumProperty(

@@ -51,7 +51,7 @@ def pictures(run: ProjectionRun, display: Display, progress: Progress | None = N
 
 def storing(
     run: ProjectionRun, display: Display, made: Pictures | None = None
-) -> Generator[tuple[str, int, int], None, bpy.types.Image]:
+) -> Generator[tuple[str, int, int] | None, None, bpy.types.Image]:
     """Make images of a run, packed into the .blend, in place of those of an earlier run.
 
     For each module one of the exact numbers, float32, and one to look at; and the mosaic, which is returned. Yields

@@ -171,7 +171,7 @@ def storing(
     state: Mapping[str, Any],
     collection: bpy.types.Collection | None,
     made: images.Pictures | None = None,
-) -> Generator[tuple[str, int, int], None, bpy.types.Image]:
+) -> Generator[tuple[str, int, int] | None, None, bpy.types.Image]:
     """Show `run` of the scanner `collection` and put it into the list; returns the mosaic.
 
     It is kept in the file `path` and was made in that `state` of the scene; `made` is what `images.pictures` made of it.
@@ -186,9 +186,10 @@ def showing(
     run: ProjectionRun,
     collection: bpy.types.Collection | None,
     made: images.Pictures | None = None,
-) -> Generator[tuple[str, int, int], None, bpy.types.Image]:
+) -> Generator[tuple[str, int, int] | None, None, bpy.types.Image]:
     """Make images and planes of a run of the scanner `collection`, in place of another's; returns the mosaic."""
     mosaic = yield from images.storing(run, scene.mphdrr_display.display(), made)
+    yield None
     place(scene, run, collection)
     return mosaic
 

@@ -17,7 +17,7 @@ _REDRAW = 5.0  # s that the window gets to be drawn, in software, after the scri
 
 def is_done(folder: Path) -> bool:
     """Whether the script says that it has ended."""
-    for path in folder.glob("*.json"):
+    for path in folder.rglob("*.json"):
         try:
             said = json.loads(path.read_text())
         except ValueError:  # it is being written

@@ -41,7 +41,6 @@ def work() -> None:
         bpy.ops.mphdrr.show_projections()
     space = area.spaces.active
     space.show_region_ui = True
-    space.shading.type = "MATERIAL"
     view = space.region_3d
     view.view_distance, view.view_location = 520, (40, 0, 10)
     view.view_rotation = Euler((1.05, 0, 0.95)).to_quaternion()

@@ -2,7 +2,7 @@
 # make test    linters, types and tests (tests/core, tests/blender)
 # make test-long   the tests that take minutes: long property runs, workbooks through LibreOffice
 # make bench   speed, accuracy and memory beside other projectors, into docs/; BENCH=--quick: a minute or two, into out/
-# make gallery   the README's pictures of phantoms, of a CT (CT=FILE) and of the scanner's sensitivity, into docs/images
+# make gallery   the documentation's pictures of phantoms, of a CT (CT=FILE), of the scanner's sensitivity and of the demo, into docs/images
 # make docs    docs/ as a site in out/docs, with links and references checked; wrong ones are errors
 # make tutorial   the tutorial's steps in a real Blender, and its pictures anew in docs/images/tutorial
 # make dist    the package's wheels and the extension's zips in dist/, one per platform; PLATFORM=linux-x64 builds for that one

@@ -27,7 +27,7 @@ from ..core.geometry.module_parts import module_parts
 from ..core.geometry.system import PinholeSystem
 from ..core.progress import Cancelled, Progress
 from ..core.runs.files import read_run
-from . import collimators, compat, following, ids, jobs, phantoms, scanner, selection, storage, studio, volumes
+from . import collimators, compat, following, ids, jobs, looks, phantoms, scanner, selection, storage, studio, volumes
 from .choices import items
 
 KIND_ITEMS = items({}, ((name.upper().replace("-", "_"), kind.label, kind.summary) for name, kind in KINDS.items()))
@@ -144,6 +144,12 @@ def rendering(
         roi.visible_shadow = False
         if shown.volume and item is not None:
             _put(scene, item.data).matrix_world = item.matrix_world
+            surface = looks.surface_of(item)
+            if surface is not None:  # of a look that draws no smoke
+                drawn = surface.copy()
+                drawn.data, drawn.parent = surface.data.copy(), None
+                scene.collection.objects.link(drawn)
+                drawn.matrix_world = surface.matrix_world
         if shown.rays:
             _put(scene, _rays(system))
         points = _corners(system if shown.cut else subject.scanner, radius)

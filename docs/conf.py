@@ -14,7 +14,7 @@ from sphinx.util import logging
 from sphinx.util.docutils import SphinxDirective
 
 import mphdrr.core as mph
-from mphdrr.addon.cli import demo, scene
+from mphdrr.addon.cli import demo, figure, scene
 from mphdrr.core.cli import build_parser
 from mphdrr.core.version import VERSION
 
@@ -85,7 +85,7 @@ class Commands(SphinxDirective):
     def run(self) -> list[nodes.Node]:
         """Ask the parsers."""
         os.environ["COLUMNS"] = "88"
-        return _sections(build_parser((scene.add_parser, demo.add_parser)))
+        return _sections(build_parser((figure.add_parser, scene.add_parser, demo.add_parser)))
 
 
 def _sections(parser: Any) -> list[nodes.Node]:

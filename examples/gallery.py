@@ -1,4 +1,4 @@
-"""Pictures of every phantom, of a CT and of the scanner's sensitivity: `make gallery` writes them to docs/images.
+"""Pictures of every phantom, a CT, the scanner's sensitivity and the demo: `make gallery` writes them to docs/images.
 
     python examples/gallery.py FOLDER [CT]
 
@@ -9,6 +9,7 @@ module (bpy).
 from __future__ import annotations
 
 import sys
+import tempfile
 from pathlib import Path
 
 import numpy as np
@@ -19,6 +20,7 @@ from mphdrr.core.runs.display import Display
 
 HERE = Path(__file__).parent
 TILE, MARGIN, TEXT = 180, 8, 22
+LARGEST = 1800  # pixels
 MODULE = 30  # whose projection is shown
 PHANTOMS = {
     "Derenzo": mph.DerenzoPhantom(40, (8, 6, 5, 4, 3, 2), 40, 100),
@@ -42,9 +44,16 @@ def main(folder: Path, ct: Path | None) -> None:
     if ct is not None:
         hounsfield = mph.centered(mph.read_volume(ct))
         volumes["chest CT"] = mph.hu_to_mu(hounsfield)
-    sheet(system, volumes).save(folder / "gallery.png", optimize=True)
-    print(folder / "gallery.png")
+    keep(sheet(system, volumes), folder / "gallery.webp")
     in_the_scanner(system, folder, hounsfield)
+
+
+def keep(picture: Image.Image, path: Path) -> None:
+    """Write a picture as a small file, not larger than a page shows it."""
+    picture = picture.convert("RGB")
+    picture.thumbnail((LARGEST, LARGEST), Image.Resampling.LANCZOS)
+    picture.save(path, quality=88, method=6)
+    print(path)
 
 
 def grid_of(phantom: mph.Phantom) -> mph.Grid:
@@ -108,30 +117,37 @@ def colored(picture: np.ndarray, grey: bool) -> Image.Image:
 
 
 def in_the_scanner(system: mph.PinholeSystem, folder: Path, ct: mph.Volume | None) -> None:
-    """The sensitivity map, and the CT, between the modules."""
+    """The sensitivity map, and the CT, between the modules; and the demo's pictures."""
     try:
         import bpy
     except ImportError:
         print("no bpy: the pictures in the scanner are omitted", file=sys.stderr)
         return
-    import mphdrr
-    from mphdrr.addon import figures, jobs, maps, scanner, slices, volumes
+    from mphdrr.addon import cli, figures, jobs, maps, scanner, slices, volumes
+    from mphdrr.addon.cli.scene import new_scene, quiet
 
-    bpy.ops.wm.read_factory_settings(use_empty=True)
-    mphdrr.register()
-    scene = bpy.context.scene
+    with tempfile.TemporaryDirectory() as demo:
+        cli.main(["demo", "--output", demo])
+        for name in ("mosaic", "phantom", "cut-away"):
+            keep(Image.open(Path(demo, f"{name}.png")), folder / f"{name}.webp")
+
+    scene = new_scene()
     scanner.build_scanner(scene, system)
 
     def picture(name: str) -> None:
-        jobs.run(figures.figure_job(bpy.context, "inside", [folder / name], (960, 560), labels=False, samples=12))
+        with tempfile.TemporaryDirectory() as made, quiet():
+            path = Path(made, "picture.png")
+            jobs.run(figures.figure_job(bpy.context, "inside", [path], (960, 560), labels=False, samples=12))
+            drawn = Image.open(path).convert("RGB")
+        keep(drawn, folder / f"{name}.webp")
 
     jobs.run(maps.mapping(scene, "sensitivity", voxels=128))
     slices.remove_slices(*volumes.volume_objects(scene))  # it is cut open in front of them
-    picture("sensitivity.png")
+    picture("sensitivity")
     if ct is not None:
         bpy.data.objects.remove(*volumes.volume_objects(scene))
         volumes.add_volume(ct, "chest CT")
-        picture("ct.png")
+        picture("ct")
 
 
 if __name__ == "__main__":

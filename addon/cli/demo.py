@@ -27,7 +27,7 @@ _FIGURES = (
     ("cut-away", "cut-away", None),
     ("sums", "sums", None),
 )
-_SIZE = dict.fromkeys(("scanner", "inside", "cut-away"), (960, 560))
+_SIZE = dict.fromkeys(("scanner", "inside", "cut-away"), (880, 510))
 """Smaller than usual: they take most of the demo's time."""
 
 

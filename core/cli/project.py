@@ -94,7 +94,9 @@ def _add(parser: Any, option: str, keys: tuple[str, ...], text: str, **details: 
     """Add an option for an entry of the recipe, or for several; it is in the namespace only where it is typed."""
     if "action" not in details:
         details = {"type": _value, "metavar": "VALUE", **details}
-    text = text if text == argparse.SUPPRESS else text.replace("%", "%%")
+    if text != argparse.SUPPRESS:
+        text = text.replace("%", "%%")
+        text = text[0].lower() + text[1:] if text[1].islower() else text  # as in the other options' help
     parser.add_argument(option, dest=" ".join(keys), default=argparse.SUPPRESS, help=text, **details)
 
 

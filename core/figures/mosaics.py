@@ -1,14 +1,15 @@
 """All projections of a run in one figure, ring by ring."""
 
+from dataclasses import replace
 from functools import partial
 
 import numpy as np
 
+from ..runs import letters
 from ..runs.mosaic import as_seen, places
-from . import letters
+from ..runs.resizing import resized
 from .page import Page, box
 from .parts import INK, bar_width, color_bar, heading
-from .resizing import resized
 from .subject import Subject
 
 _ON_IMAGE, _UNDER_IT = "#ffffff", "#000000"
@@ -19,9 +20,7 @@ def _draw(page: Page, subject: Subject, wide: bool) -> None:
     assert run is not None
     system = subject.chosen(run.system)
     images = run.projections[np.isin(run.system.numbers, system.numbers)]
-    n_v, n_u = run.views.shape
-    if not wide:
-        images = images[:, n_v // 4 : n_v - n_v // 4, n_u // 4 : n_u - n_u // 4]
+    images = replace(subject.display, half=not wide).part(images)
     rows, columns = images.shape[1:]
     what = "Wide FOV: whole images" if wide else "FOV: the central half of each image"
     of_what = f" of {subject.name}" if subject.name else ""

@@ -13,9 +13,9 @@ from numpy.typing import ArrayLike, NDArray
 
 from ..errors import InputError
 from ..files import replacing
+from ..runs import letters
 from ..runs.mosaic import png, write_png
-from . import letters
-from .resizing import resized
+from ..runs.resizing import resized
 
 SUFFIXES = (".png", ".svg")
 SMALLEST, LARGEST = 240, 16384

@@ -4,8 +4,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from ..runs import letters
 from ..runs.display import Display
-from . import letters
 from .page import Page
 
 INK, FAINT = "#20262d", "#6b7480"

@@ -12,7 +12,7 @@ import numpy as np
 from ..geometry.presets import c_arm_views
 from ..geometry.system import PinholeSystem
 from ..geometry.views import Views
-from . import letters
+from ..runs import letters
 from .page import Anchor, Page, Point, box
 from .parts import FAINT, INK, heading, number
 from .subject import Subject

@@ -11,8 +11,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from ..errors import InputError
 from ..files import replacing
+from . import letters
 from .display import Display
-from .lettering import HEIGHT, WIDTH, lettered
 from .run import ProjectionRun
 
 
@@ -31,6 +31,8 @@ _BORDER = 64
 """Grey between the images of a sheet, 0 to 255."""
 _SMALLEST = 64
 """Pixels along a side of an image in a sheet, at least."""
+_SMALL_TEXT = 11.0
+"""The least size of text, pixels."""
 
 
 def mosaic(images: ArrayLike, columns: int = COLUMNS) -> NDArray:
@@ -108,19 +110,19 @@ def sheet(
     images = display.colored(sized(as_seen(shown), pixels), window)
     at = places(np.asarray(rings))
     n_v, n_u = tile = images.shape[1:3]
-    letters = max(1, round(min(n_v, n_u) / 60))
-    gap = 2 * letters
+    size = max(_SMALL_TEXT, min(n_v, n_u) / 5.5)
+    gap = round(size / 6)
     corners = gap + at * (np.array(tile) + gap)
     height, width = corners.max(axis=0) + tile + gap
     picture = np.full((height, width, 3), _BORDER, np.uint8)
     texts = [f"{word} {value:.4g}" for value in values]
-    room = min(n_u // (WIDTH * max(map(len, texts)) + 2), n_v // (4 * HEIGHT), letters)  # 0: none
+    small = min(n_u / max(letters.width(text, 1.05) for text in texts), n_v / 5, 0.7 * size)
     for image, (row, column), number, text in zip(images, corners, np.asarray(numbers), texts, strict=True):
         picture[row : row + n_v, column : column + n_u] = image
-        _write(picture, str(number), row + letters, column + letters, letters)
-        if room:
-            _write(picture, text, row + n_v - (HEIGHT + 1) * room, column + room, room)
-    bar = _color_bar(display, window, unit, height, max(letters, round(height / 300)))
+        _write(picture, str(number), row + gap // 2, column + gap, size)
+        if small >= _SMALL_TEXT:
+            _write(picture, text, row + n_v - math.ceil(1.1 * small), column + gap, small)
+    bar = _color_bar(display, window, unit, height, max(size, height / 25))
     whole = np.concatenate([picture, bar], axis=1)
     share = shown.shape[2] / projections.shape[2], shown.shape[1] / projections.shape[1]
     return Sheet(whole, corners, (n_v, n_u), window, word, values, shown.max(axis=(1, 2)), display.half, share)
@@ -170,31 +172,29 @@ def places(rings: NDArray[np.int64], columns: int = COLUMNS) -> NDArray[np.int64
     return at
 
 
-def _color_bar(
-    display: Display, window: tuple[float, float], unit: str, height: int, letters: int
-) -> NDArray[np.uint8]:
+def _color_bar(display: Display, window: tuple[float, float], unit: str, height: int, size: float) -> NDArray[np.uint8]:
     """A colour bar (height, width, 3) with its numbers and, above, its unit."""
-    line = HEIGHT * letters
-    top, bottom, left = 2 * line, height - line, WIDTH * letters
+    line, em = math.ceil(1.1 * size), round(size)
+    top, bottom = 2 * line, height - line
     steps = next((n for n in (4, 2) if bottom - top >= n * line), 1)  # as many as have room
     marks = [(share, f"{display.value_at(share, window):.4g}") for share in np.linspace(1.0, 0.0, steps + 1).tolist()]
-    columns = max(len(unit), 3 + max(len(text) for _, text in marks))
-    bar = np.full((height, (columns + 2) * WIDTH * letters, 3), _BORDER, np.uint8)
-    _write(bar, unit, line // 3, left, letters)
+    columns = max(letters.width(unit, size), 1.5 * em + max(letters.width(text, size) for _, text in marks))
+    bar = np.full((height, math.ceil(columns) + em, 3), _BORDER, np.uint8)
+    _write(bar, unit, line // 3, em // 2, size, shade=1.0)
     ramp = [display.value_at(share, window) for share in np.linspace(1.0, 0.0, bottom - top)]
-    bar[top:bottom, left : 3 * left] = display.colored(ramp, window)[:, None]
+    bar[top:bottom, em // 2 : em // 2 + em] = display.colored(ramp, window)[:, None]
     for share, text in marks:
         middle = bottom - round(share * (bottom - top))
-        _write(bar, text, min(max(middle - line // 2, top - line // 2), height - line), 4 * left, letters)
+        _write(bar, text, min(max(middle - line // 2, top - line // 2), height - line), 2 * em, size, shade=1.0)
     return bar
 
 
-def _write(picture: NDArray[np.uint8], text: str, row: int, column: int, letters: int) -> None:
-    """Write a line of text in white, on what is there, darkened."""
-    ink = lettered(text, letters)
+def _write(picture: NDArray[np.uint8], text: str, row: int, column: int, size: float, shade: float = 0.5) -> None:
+    """Write a line of text in white, on what is there, `shade` times as bright."""
+    ink, _ = letters.lettered(text, size)
     place = picture[row : row + ink.shape[0], column : column + ink.shape[1]]
-    place //= 2
-    place[ink[: place.shape[0], : place.shape[1]]] = 255
+    ink = ink[: place.shape[0], : place.shape[1], None]
+    place[:] = np.rint(255 * ink + (1 - ink) * shade * place)
 
 
 def write_png(picture: ArrayLike, path: str | os.PathLike[str]) -> None:

@@ -59,6 +59,17 @@ def test_a_rendered_figure_leaves_the_scene_as_it_was(example, tmp_path):
     assert 40 < shown.mean() < 150
 
 
+def test_a_volume_is_shown_in_its_look(example, tmp_path):
+    (item,) = volumes.volume_objects(example)
+    for look in ("DENSITY", "SHELL"):  # smoke, and a surface that is an object of its own
+        item.mphdrr_volume.look = look
+        before, path = state(), tmp_path / f"{look}.png"
+        jobs.run(figures.figure_job(bpy.context, "inside", [path], (320, 240), labels=False, samples=1))
+        assert state() == before
+        shown = picture(path)
+        assert np.count_nonzero(shown[..., 0] - shown[..., 1] > 40) > 200, f"{look}: the phantom's purple"
+
+
 def test_a_scanner_fits_its_figure_with_even_margins(example, tmp_path):
     for size in ((480, 240), (240, 420)):
         path = tmp_path / f"{size[0]}.png"

@@ -13,13 +13,13 @@ from PIL import Image
 
 import mphdrr.core as mph
 from mphdrr.addon.cli import main
-from mphdrr.core.figures import letters
 from mphdrr.core.figures.kinds import KINDS
 from mphdrr.core.figures.page import Page
-from mphdrr.core.figures.resizing import resized
 from mphdrr.core.figures.subject import Subject
 from mphdrr.core.figures.sums import orthogonal_sum
 from mphdrr.core.geometry.presets import c_arm_views
+from mphdrr.core.runs import letters
+from mphdrr.core.runs.resizing import resized
 
 WORKBOOK = Path(__file__).parents[2] / "examples" / "dc-spect-80.xlsx"
 TEXT = re.compile(

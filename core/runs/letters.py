@@ -1,4 +1,4 @@
-"""Lettering of figures in any size: a proportional typeface, smoothed, so that figures need no library that draws."""
+"""Text in pictures, in any size: a proportional typeface, smoothed, so that pictures need no library that draws."""
 
 import base64
 import functools

@@ -74,6 +74,21 @@ def test_maps_are_not_projected(collection):
     assert bpy.ops.mphdrr.render_projections(width=4, height=4) == {"FINISHED"}
 
 
+def test_a_maps_surface_is_at_a_value_of_the_windows_unit(collection):
+    bpy.ops.mphdrr.add_map(quantity="sensitivity", voxels=12, within_roi=False)
+    item = the_map()
+    bpy.context.view_layer.objects.active = item
+    settings = item.mphdrr_volume
+    level = 0.7 * settings.maximum
+    assert level > 100, "cps/MBq"
+    assert bpy.ops.mphdrr.mesh_from_volume(level=level) == {"FINISHED"}
+    mesh = bpy.data.meshes[f"{item.name} surface"]
+    system = scanner.read_scanner(collection)
+    places = np.array([vertex.co for vertex in mesh.vertices])
+    values = 1e6 * sensitivity(system, places).sum(axis=1)
+    assert np.median(values) == pytest.approx(level, rel=0.1)
+
+
 @pytest.mark.parametrize("quantity", ["modules", "resolution", "completeness"])
 def test_other_maps(collection, quantity):
     assert bpy.ops.mphdrr.add_map(quantity=quantity, voxels=4, side=20) == {"FINISHED"}

@@ -50,7 +50,7 @@ class MPHDRR_OT_mesh_from_volume(jobs.JobOperator, bpy.types.Operator):
 
     level: FloatProperty(
         name="Level",
-        description="The surface's value, in the unit that the panel shows; 0: halfway from the value outside to the largest",
+        description="The surface's value, in the unit that the panel shows; 0: halfway from outside to the largest",
     )
 
     poll = classmethod(volumes.poll_volume)

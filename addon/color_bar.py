@@ -34,7 +34,7 @@ def _shown(context: bpy.types.Context) -> bpy.types.Object | None:
     return None
 
 
-def _draw() -> None:
+def draw() -> None:
     """Draw the bar; Blender calls this for every 3D view."""
     context = bpy.context
     item = _shown(context) if context.space_data.overlay.show_overlays else None
@@ -58,13 +58,3 @@ def _draw() -> None:
         blf.position(0, left if text is title else left + 1.5 * width, bottom + share * height - 0.35 * letters, 0.0)
         blf.draw(0, text)
     blf.disable(0, blf.SHADOW)
-
-
-def draw_bars() -> object:
-    """Draw bars from now on; the result takes it back (`draw_no_bars`)."""
-    return bpy.types.SpaceView3D.draw_handler_add(_draw, (), "WINDOW", "POST_PIXEL")
-
-
-def draw_no_bars(handle: object) -> None:
-    """Undo `draw_bars`."""
-    bpy.types.SpaceView3D.draw_handler_remove(handle, "WINDOW")

@@ -23,18 +23,23 @@ _BYTES = 40.0  # a voxel, while the map is made and put into the scene
 
 
 def mapping(
-    scene: bpy.types.Scene, quantity: str, voxels: int = 64, side: float = 0.0, only_roi: bool = True
+    scene: bpy.types.Scene,
+    quantity: str,
+    voxels: int = 64,
+    side: float = 0.0,
+    only_roi: bool = True,
+    collection: bpy.types.Collection | None = None,
 ) -> jobs.Job:
-    """The job that adds a map of the scene's scanner, with ideal modules and slices, or replaces the last of its quantity.
+    """The job that adds a map of a scanner, with ideal modules and slices, or replaces its last of that quantity.
 
     The map is a cube of `voxels` along each `side` (mm; 0: the ROI's diameter) around the isocentre, of one of `MAPS`;
-    with `only_roi`, without what lies outside the ROI sphere.
+    with `only_roi`, without what lies outside the ROI sphere. The scanner is by default that of the panels.
     """
-    collection = scanner.required_scanner(scene)
+    collection = collection or scanner.required_scanner(scene)
     system = scanner.read_scanner(collection)
     grid = Grid.centered((voxels,) * 3, (side or 2 * float(system.roi_radius.max())) / voxels)
     require(_BYTES * grid.n_voxels, f"a map of {voxels}^3 voxels")
-    name, folder = f"{quantity.capitalize()} map", storage.folder()
+    name, folder, owner = _name(quantity), storage.folder(), collection.name
     recipe = json.dumps({"voxels": voxels, "side": side, "only_roi": only_roi})
     provenance: dict[str, Any] = {"map": quantity, "modules": len(system), "scanner": collection.name}
 
@@ -43,13 +48,15 @@ def mapping(
         return store_volume(within_roi(volume, system) if only_roi else volume, folder, provenance=provenance)
 
     def finish(stored: StoredVolume) -> str:
-        item = next((old for old in volumes.volume_objects(scene) if volumes.quantity_of(old) == quantity), None)
+        collection = bpy.data.collections.get(owner)  # it may have been removed since
+        known = (old for old in volumes.volume_objects(scene) if volumes.quantity_of(old) == quantity)
+        item = next((old for old in known if _is_of(old, collection)), None)
         if item is not None:
             volumes.replace_stored(item, stored)
         else:
             item = volumes.add_stored(stored, name, scene.collection)
             volume_materials.show_in_eevee(scene)
-        item.mphdrr_volume.recipe = recipe
+        item.mphdrr_volume.recipe, item.mphdrr_volume.scanner = recipe, collection
         unit, factor = volume_materials.shown_unit(quantity)
         values, high = stored.volume.array, stored.high
         low, high = factor * float(values[values > 0].min(initial=high)), factor * high
@@ -61,11 +68,24 @@ def mapping(
     return jobs.Job(f"{name} of {len(system)} modules", work, finish)
 
 
-def is_map(item: bpy.types.Object) -> bool:
-    """Whether a volume is a map that knows how it was made."""
-    return bool(item.mphdrr_volume.recipe) and volumes.quantity_of(item) in MAPS
+def _is_of(item: bpy.types.Object, collection: bpy.types.Collection | None) -> bool:
+    """Whether a volume is a map of a scanner; those of earlier versions do not say of which, nor that they are maps."""
+    settings = item.mphdrr_volume
+    return settings.scanner == collection or (
+        settings.scanner is None and item.name.startswith(_name(settings.quantity))
+    )
+
+
+def _name(quantity: str) -> str:
+    return f"{quantity.capitalize()} map"
+
+
+def can_be_made_again(scene: bpy.types.Scene, item: bpy.types.Object) -> bool:
+    """Whether a volume is a map that knows how it was made, of a scanner in the scene."""
+    return bool(item.mphdrr_volume.recipe) and item.mphdrr_volume.scanner in scanner.scanners(scene)
 
 
 def again(scene: bpy.types.Scene, item: bpy.types.Object) -> jobs.Job:
-    """The job that makes a map again, of the scanner as it is now."""
-    return mapping(scene, volumes.quantity_of(item), **json.loads(item.mphdrr_volume.recipe))
+    """The job that makes a map again, of its scanner as it is now."""
+    settings = item.mphdrr_volume
+    return mapping(scene, settings.quantity, **json.loads(settings.recipe), collection=settings.scanner)

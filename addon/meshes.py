@@ -15,7 +15,7 @@ from ..core.volumes.meshes.mesh import Mesh, require_closed
 from ..core.volumes.meshes.surface import volume_to_mesh
 from ..core.volumes.meshes.voxelization import voxelize_mesh
 from ..core.volumes.volume import UNITS
-from . import jobs, storage, volumes
+from . import jobs, storage, volume_materials, volumes
 from .cameras import world_matrix
 from .stored_volumes import StoredVolume, store_volume
 
@@ -63,8 +63,13 @@ def voxelizing(
 
 
 def extracting(item: bpy.types.Object, level: float | None = None) -> jobs.Job:
-    """The job that makes a closed mesh of a volume's surface of one value (default: half of the maximum)."""
+    """The job that makes a closed mesh of a volume's surface of one value, in the unit that the window shows.
+
+    By default it is halfway between the value outside and the largest.
+    """
     read, pose, name = volumes.reader(item), volumes.pose_of_object(item), f"{item.name} surface"
+    if level is not None:
+        level /= volume_materials.shown_unit(volumes.quantity_of(item))[1]
 
     def work(progress: Progress) -> Mesh:
         return volume_to_mesh(read(), level, progress)

@@ -179,11 +179,11 @@ def _wrapped(angles: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def remove(collection: bpy.types.Collection, modules: Sequence[bpy.types.Object]) -> None:
-    """Remove modules with their collimators and crystals; other objects parented to them stay where they are."""
+    """Remove modules with their parts and projections in the scene; other objects parented to them stay where they are."""
     if len(modules) >= len(scanner.modules(collection)):
         raise InputError("a scanner needs at least one module: keep one, or press Remove Scanner")
     children = [child for camera in modules for child in camera.children]
-    parts = [child for child in children if child.mphdrr_module.part in PARTS]
+    parts = [child for child in children if child.mphdrr_module.part in (*PARTS, "PLANE")]
     for child in children:
         if child not in parts:
             cameras.unparent(child)

@@ -285,6 +285,7 @@ class VolumeProperties(bpy.types.PropertyGroup):
     with_parent: BoolProperty(options={"HIDDEN"})  # another quantity of the phantom that is the parent
     outdated: BoolProperty(options={"HIDDEN"})  # the phantom's settings have changed since its voxels were made
     recipe: StringProperty(options={"HIDDEN"})  # of a map: how it was made, JSON
+    scanner: PointerProperty(type=bpy.types.Collection, options={"HIDDEN"})  # that a map is of
     message: StringProperty(options={"HIDDEN"})  # what is wrong with the phantom's settings
     quantity: EnumProperty(
         name="Quantity", description="What the voxels hold", default="activity",

@@ -73,6 +73,9 @@ def update(scene: bpy.types.Scene) -> None:
     settings = scene.mphdrr_display
     part = images.share_shown()
     for plane, shown in _wanted(scene):
+        _show(plane, shown)
+        if plane.parent is None:
+            continue
         camera, field = plane.parent, np.array(plane[_KEY])
         x, y, depth, width, height = field * share_of_way(settings, camera.mphdrr_module, field[2])
         width, height = width * part[0], height * part[1]
@@ -81,13 +84,16 @@ def update(scene: bpy.types.Scene) -> None:
         plane.empty_display_size = max(columns, rows)
         grabbing.place(plane, Matrix.LocRotScale((x, y, -depth), None, (width / columns, height / rows, 1.0)))
         plane.color[3] = settings.plane_opacity
-        if plane.hide_viewport == shown:
-            plane.hide_viewport = not shown
         for background in camera.data.background_images:
             if background.image == plane.data:
                 background.show_background_image = settings.backgrounds
                 background.alpha = settings.plane_opacity
                 _place_background(background, camera.data, field, part[0])
+
+
+def _show(plane: bpy.types.Object, shown: bool) -> None:
+    if plane.hide_viewport == shown:  # writing the same value would make Blender evaluate the plane again
+        plane.hide_viewport = not shown
 
 
 def share_of_way(settings: bpy.types.PropertyGroup, module: bpy.types.PropertyGroup, distance: float) -> float:
@@ -100,23 +106,23 @@ def share_of_way(settings: bpy.types.PropertyGroup, module: bpy.types.PropertyGr
 @bpy.app.handlers.persistent
 def after_update(scene: bpy.types.Scene, depsgraph: bpy.types.Depsgraph) -> None:
     """Another module is active, or modules were shown or hidden: so are their planes."""
-    if depsgraph.id_type_updated("SCENE") and any(plane.hide_viewport == shown for plane, shown in _wanted(scene)):
-        update(scene)
+    if depsgraph.id_type_updated("SCENE") and scene == bpy.context.scene:
+        for plane, shown in _wanted(scene):
+            _show(plane, shown)
 
 
 def _wanted(scene: bpy.types.Scene) -> list[tuple[bpy.types.Object, bool]]:
-    """The planes that belong to a module, each with whether it is to be shown."""
+    """The planes, each with whether it is to be shown: not without its module, which was deleted."""
     mode = scene.mphdrr_display.planes
     active = selection.active_module(bpy.context) if mode in ("ACTIVE", "RING") else None
     ring = None if active is None else active.mphdrr_module.ring
 
-    def shown(camera: bpy.types.Object) -> bool:
-        if camera.hide_viewport or mode == "NONE":
+    def shown(camera: bpy.types.Object | None) -> bool:
+        if camera is None or camera.hide_viewport or mode == "NONE":
             return False
         return mode == "ALL" or camera == active or (mode == "RING" and camera.mphdrr_module.ring == ring)
 
-    owned = [(plane, plane.parent) for plane in planes(scene) if plane.parent is not None and plane.data is not None]
-    return [(plane, shown(camera)) for plane, camera in owned]
+    return [(plane, shown(plane.parent)) for plane in planes(scene) if plane.data is not None]
 
 
 def _fields(system: PinholeSystem, views: Views) -> NDArray[np.float64]:

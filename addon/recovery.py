@@ -8,7 +8,7 @@ import bpy
 
 from ..core.errors import InputError, InputWarning
 from ..core.progress import Progress, part_of
-from . import jobs, maps, phantoms, scanner, storage, volumes
+from . import jobs, maps, phantoms, storage, volumes
 
 
 def missing(scene: bpy.types.Scene) -> tuple[list[bpy.types.Object], list[bpy.types.Object]]:
@@ -16,8 +16,7 @@ def missing(scene: bpy.types.Scene) -> tuple[list[bpy.types.Object], list[bpy.ty
     gone = set(storage.missing_volumes())
     found = [item for item in volumes.volume_objects(scene) if item.data in gone]
     phantom = {item: phantoms.root_of(item) for item in found}
-    has_scanner = scanner.active_scanner(scene) is not None
-    known = [item for item in found if phantom[item] is not None or (has_scanner and maps.is_map(item))]
+    known = [item for item in found if phantom[item] is not None or maps.can_be_made_again(scene, item)]
     again = dict.fromkeys(phantom[item] or item for item in known)
     return list(again), [item for item in found if item not in known]
 

@@ -134,6 +134,8 @@ HANDLERS: tuple[tuple[list[Any], Any], ...] = (
     (bpy.app.handlers.frame_change_post, slices.after_frame_change),
     (bpy.app.handlers.undo_post, live_scanner.after_undo),
     (bpy.app.handlers.redo_post, live_scanner.after_undo),
+    (bpy.app.handlers.undo_post, slices.after_undo),
+    (bpy.app.handlers.redo_post, slices.after_undo),
     (bpy.app.handlers.undo_pre, framing.before_undo),
     (bpy.app.handlers.redo_pre, framing.before_undo),
     (bpy.app.handlers.undo_post, framing.after_undo),
@@ -144,6 +146,14 @@ HANDLERS: tuple[tuple[list[Any], Any], ...] = (
     (bpy.app.handlers.save_pre, slices.before_save),
     (bpy.app.handlers.save_post, storage.after_save),
     (bpy.app.handlers.save_post_fail, storage.restore_paths),
+)
+
+# What is drawn over Blender's editors, in a window.
+DRAWINGS = (
+    (bpy.types.SpaceImageEditor, tiles.draw, "POST_PIXEL"),
+    (bpy.types.SpaceImageEditor, run_notes.draw, "POST_PIXEL"),
+    (bpy.types.SpaceView3D, color_bar.draw, "POST_PIXEL"),
+    (bpy.types.SpaceView3D, sight_lines.draw, "POST_VIEW"),
 )
 
 # What edited properties call (`addon/updates.py`).
@@ -188,10 +198,9 @@ def register(command: Callable[..., int] | None = None) -> None:
             handlers.append(function)
             _registered.callback(_remove_handler, handlers, function)
         if not bpy.app.background:
-            _registered.callback(tiles.draw_no_frames, tiles.draw_frames())
-            _registered.callback(color_bar.draw_no_bars, color_bar.draw_bars())
-            _registered.callback(run_notes.draw_no_notes, run_notes.draw_notes())
-            _registered.callback(sight_lines.draw_no_lines, sight_lines.draw_lines())
+            for space, draw, when in DRAWINGS:
+                drawing = space.draw_handler_add(draw, (), "WINDOW", when)
+                _registered.callback(space.draw_handler_remove, drawing, "WINDOW")
             for name in ("Image", "Image Editor Tool: Sample"):  # the editor's usual tool takes clicks first
                 keymap = bpy.context.window_manager.keyconfigs.addon.keymaps.new(name, space_type="IMAGE_EDITOR")
                 click = keymap.keymap_items.new(ids.PICK_MODULE, "LEFTMOUSE", "PRESS")

@@ -6,14 +6,11 @@ import bpy
 from . import images, runs
 
 _COLOR = (1.0, 0.45, 0.35, 1.0)
-_SIZE, _LEFT, _TOP = (
-    13,
-    70,
-    40,
-)  # of the letters, and from the region's left, beside the tools, and top; pixels at scale 1
+_SIZE = 13  # of the letters, pixels at a resolution scale of 1
+_LEFT, _TOP = 70, 40  # the same, from the region's left, beside the tools, and top
 
 
-def _draw() -> None:
+def draw() -> None:
     """Draw the line; Blender calls this for every Image Editor."""
     context = bpy.context
     if not images.is_ours(context.space_data.image):
@@ -29,13 +26,3 @@ def _draw() -> None:
     blf.position(0, _LEFT * scale, context.region.height - _TOP * scale, 0)
     blf.draw(0, f"Not of the scene as it is now: {', '.join(lines)}")
     blf.disable(0, blf.SHADOW)
-
-
-def draw_notes() -> object:
-    """Draw notes from now on; the result takes it back (`draw_no_notes`)."""
-    return bpy.types.SpaceImageEditor.draw_handler_add(_draw, (), "WINDOW", "POST_PIXEL")
-
-
-def draw_no_notes(handle: object) -> None:
-    """Undo `draw_notes`."""
-    bpy.types.SpaceImageEditor.draw_handler_remove(handle, "WINDOW")

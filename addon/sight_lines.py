@@ -40,7 +40,7 @@ def lines(context: bpy.types.Context) -> dict[str, NDArray[np.float64]]:
     return {name: points[:, _DRAWN[name][1]].reshape(-1, 2, 3) for name in wanted}
 
 
-def _draw() -> None:
+def draw() -> None:
     """Draw them; Blender calls this for every 3D view."""
     context = bpy.context
     if not context.space_data.overlay.show_overlays:
@@ -55,16 +55,6 @@ def _draw() -> None:
         batch_for_shader(shader, "LINES", {"pos": ends.reshape(-1, 3).astype(np.float32)}).draw(shader)
     gpu.state.depth_test_set("NONE")
     gpu.state.blend_set("NONE")
-
-
-def draw_lines() -> object:
-    """Draw sight lines from now on; the result takes it back (`draw_no_lines`)."""
-    return bpy.types.SpaceView3D.draw_handler_add(_draw, (), "WINDOW", "POST_VIEW")
-
-
-def draw_no_lines(handle: object) -> None:
-    """Undo `draw_lines`."""
-    bpy.types.SpaceView3D.draw_handler_remove(handle, "WINDOW")
 
 
 def redraw(*_: object) -> None:

@@ -28,6 +28,8 @@ _FRONT = (0.7, -0.5, 0.5)  # direction from which a scene is looked at first: th
 
 # The volume that slices were last taken of: reading it takes longer than all the rest.
 _last: tuple[Path, Volume] | None = None
+# By the session's number of a plane's image: the file, index and display range that it was painted of.
+_painted: dict[int, tuple[Path, int, float, float]] = {}
 
 
 def add_slices(item: bpy.types.Object) -> list[bpy.types.Object]:
@@ -78,7 +80,7 @@ def sliced(context: bpy.types.Context) -> bpy.types.Object | None:
 
 def way(item: bpy.types.Object, axis: int) -> tuple[Vector, Vector]:
     """Along which a plane moves: a corner, in front, of the first plane across an axis, and the step to the next, mm."""
-    shape, affine = json.loads(planes_of(item)[axis][_LATTICE])
+    shape, affine = json.loads(planes_of(item)[0][_LATTICE])  # the same of all; the user may have deleted one
     world = np.array(item.matrix_world) @ affine
     corner = np.where(np.linalg.inv(world)[:3, :3] @ _FRONT >= 0, np.array(shape) - 0.5, -0.5)
     corner[axis] = 0.0
@@ -130,16 +132,42 @@ def update(item: bpy.types.Object) -> None:
         axis = plane[_KEY]
         index = min(settings.slices[axis], volume.grid.shape[axis] - 1)
         plane.location = volume.grid.affine[:3, axis] * index
-        image = plane.data.materials[0].node_tree.nodes["Slice"].image
         side = 1.0 if normals[axis, :3] @ front >= 0 else -1.0
         cut.append(((side * normals[axis, :3]).tolist(), float(side * (index - normals[axis, 3]))))
-        factor = volume_materials.shown_unit(settings.quantity)[1]
-        low, high = settings.display_low / factor, settings.display_high / factor
-        relative = (np.take(volume.array, index, axis).T - low) / max(high - low, 1e-30)
-        shades = np.clip(relative * (_SHADES - 1), 0, _SHADES - 1).astype(np.uint8)
-        image.pixels.foreach_set(colors(settings.quantity)[shades].ravel())
-        image.update()
+        _paint(item, plane)
     looks.show(item, cut)
+
+
+def _paint(item: bpy.types.Object, plane: bpy.types.Object) -> None:
+    """Paint a plane's image, unless it is so; raises InputError where the voxels' file is missing."""
+    settings, axis = item.mphdrr_volume, plane[_KEY]
+    image = plane.data.materials[0].node_tree.nodes["Slice"].image
+    wanted = volumes.file_of(item), settings.slices[axis], settings.display_low, settings.display_high
+    if image is None or _painted.get(image.session_uid) == wanted:
+        return
+    array = _stored(item).array
+    factor = volume_materials.shown_unit(settings.quantity)[1]
+    low, high = settings.display_low / factor, settings.display_high / factor
+    relative = (np.take(array, min(settings.slices[axis], array.shape[axis] - 1), axis).T - low) / max(
+        high - low, 1e-30
+    )
+    shades = np.clip(relative * (_SHADES - 1), 0, _SHADES - 1).astype(np.uint8)
+    image.pixels.foreach_set(colors(settings.quantity)[shades].ravel())
+    image.update()
+    _painted[image.session_uid] = wanted
+
+
+@bpy.app.handlers.persistent
+def after_undo(*_: object) -> None:
+    """Undo and redo restore planes and their settings, but not what was painted."""
+    for gone in _painted.keys() - {image.session_uid for image in bpy.data.images}:
+        del _painted[gone]
+    for plane in [item for item in bpy.data.objects if _KEY in item]:
+        if volumes.is_volume(plane.parent):
+            try:
+                _paint(plane.parent, plane)
+            except InputError as error:
+                print(f"mphDRR: {plane.name} is not painted: {error}")
 
 
 @bpy.app.handlers.persistent
@@ -147,6 +175,7 @@ def before_load(*_: object) -> None:
     """Another file has other volumes."""
     global _last
     _last = None
+    _painted.clear()
 
 
 @bpy.app.handlers.persistent

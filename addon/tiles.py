@@ -98,7 +98,7 @@ def _index(place: float, pixels: int, of_tile: int) -> int:
     return int(place) // (of_tile // pixels)
 
 
-def _draw() -> None:
+def draw() -> None:
     """Draw the frame; Blender calls this for every Image Editor."""
     context = bpy.context
     image = context.space_data.image
@@ -119,13 +119,3 @@ def _draw() -> None:
     shader.uniform_float("color", _ACTIVE)
     corners = [(left, top, 0), (right, top, 0), (right, bottom, 0), (left, bottom, 0), (left, top, 0)]
     batch_for_shader(shader, "LINE_STRIP", {"pos": corners}).draw(shader)
-
-
-def draw_frames() -> object:
-    """Draw frames from now on; the result takes it back (`draw_no_frames`)."""
-    return bpy.types.SpaceImageEditor.draw_handler_add(_draw, (), "WINDOW", "POST_PIXEL")
-
-
-def draw_no_frames(handle: object) -> None:
-    """Undo `draw_frames`."""
-    bpy.types.SpaceImageEditor.draw_handler_remove(handle, "WINDOW")

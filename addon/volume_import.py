@@ -12,7 +12,7 @@ from ..core.progress import Progress, part_of, stages_of
 from ..core.volumes.rearranging import centered
 from ..core.volumes.volume import UNITS, Volume
 from ..core.volumes.volume_files import READ_FORMATS, read_volume
-from . import jobs, storage, vdb, volumes
+from . import jobs, storage, vdb, volume_materials, volumes
 from .stored_volumes import StoredVolume, store_volume
 
 READ_ENDINGS = (*READ_FORMATS, ".vdb")
@@ -78,7 +78,8 @@ def importing(
         volumes.make_active(bpy.context, item)
         volume, states = stored.volume, f"{count} states of " if count > 1 else ""
         voxels = " x ".join(map(str, volume.grid.shape))
-        values = f"{volume.quantity}, {stored.low:.4g} to {stored.high:.4g} {volume.unit}"
+        shown_in, factor = volume_materials.shown_unit(volume.quantity)
+        values = f"{volume.quantity}, {factor * stored.low:.4g} to {factor * stored.high:.4g} {shown_in}"
         moved = ", its middle moved to the isocentre" if center else ""
         return f"Imported {item.name!r}: {states}{voxels} voxels of {values}{moved}"
 

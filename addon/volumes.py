@@ -208,6 +208,7 @@ def after_load(*_: Any) -> None:
                 states = [read_vdb(path) for path in storage.files_of_states(item.data)]
                 item.data.filepath = storage.stored_path(write_states(states, storage.folder()))
                 settings.center_shift = compat.VDB_CENTER_SHIFT
+                settings.display_high = settings.display_high  # which draws it: its surface was elsewhere, too
             except InputError as error:
                 print(f"mphDRR: {item.name} is drawn half a voxel off: {error}")
 

@@ -193,7 +193,7 @@ class MPHDRR_OT_check_geometry(selection.OnScanner, bpy.types.Operator):
 
 class MPHDRR_OT_add_map(selection.NeedsScanner, jobs.JobOperator, bpy.types.Operator):
     """Calculate what the scanner, with ideal modules, does in every voxel around the isocentre, and show it as a volume,
-    in place of the last map of this quantity
+    in place of the scanner's last map of this quantity
     """
 
     bl_idname = ids.ADD_MAP

@@ -48,7 +48,10 @@ class MPHDRR_OT_mesh_from_volume(jobs.JobOperator, bpy.types.Operator):
     bl_label = "Mesh from Volume"
     dialog = {"confirm_text": "Make"}
 
-    level: FloatProperty(name="Level", description="The surface's value, in the volume's unit; 0: half of the maximum")
+    level: FloatProperty(
+        name="Level",
+        description="The surface's value, in the unit that the panel shows; 0: halfway from outside to the largest",
+    )
 
     poll = classmethod(volumes.poll_volume)
 

@@ -38,6 +38,7 @@ def test_slices_shells_and_maps(blender_window, work_folder):
     assert parts("shell") == 6 and parts("heart") == 1
     before, after = seen["dragged"]
     assert after[:2] == before[:2] and 5 <= after[2] - before[2] <= 15, "the slice follows the mouse"
+    assert seen["undone"] == [after[2], True, True], "undo brings back what was painted"
     hue, where = colored("map")
     counts = np.bincount(hue[where & (hue > 55) & (hue < 205)].astype(int), minlength=360)
     assert (counts >= 5).sum() >= 20, "a map in Solid view has at least 20 hues"

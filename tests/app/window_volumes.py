@@ -71,7 +71,7 @@ def steps():
     in_view("mphdrr.add_nema", "EXEC_DEFAULT", True, voxels=80)
     in_view("mphdrr.add_slices", "EXEC_DEFAULT", True)
     nema = bpy.context.object
-    settings = nema.mphdrr_volume
+    settings, nema_name = nema.mphdrr_volume, nema.name
     affine = slices._stored(nema).grid.affine
     middle = (-affine[:3, 3] / affine.diagonal()[:3]).round().astype(int).tolist()
     settings.slices = middle
@@ -105,6 +105,19 @@ def steps():
     subprocess.run(["xdotool", "mouseup", "1"], check=True)
     yield 2
     seen["dragged"] = [before, list(settings.slices)]
+    plane = slices.planes_of(nema)[2]
+    image = plane.data.materials[0].node_tree.nodes["Slice"].image
+    bpy.ops.ed.undo_push(message="Before")
+    painted = list(image.pixels)
+    settings.slices = [*settings.slices[:2], before[2]]
+    bpy.ops.ed.undo_push(message="Slice moved")
+    moved = list(image.pixels)
+    in_view("ed.undo")
+    yield 1
+    nema = bpy.data.objects[nema_name]
+    settings = nema.mphdrr_volume
+    image = slices.planes_of(nema)[2].data.materials[0].node_tree.nodes["Slice"].image
+    seen["undone"] = [settings.slices[2], painted != moved, list(image.pixels) == painted]
     settings.look = "CUT"
     yield 4
     picture("cut")

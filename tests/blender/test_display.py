@@ -6,7 +6,7 @@ import pytest
 from bpy_extras.object_utils import world_to_camera_view
 from mathutils import Vector
 
-from mphdrr.addon import ids, images, planes, scanner, selection, tiles, volumes
+from mphdrr.addon import ids, images, module_edits, planes, scanner, selection, tiles, volumes
 from mphdrr.core.errors import InputError
 from mphdrr.core.geometry.grid import Grid
 from mphdrr.core.runs.display import Display
@@ -189,6 +189,18 @@ def test_planes_of_the_active_module_its_ring_or_all_that_are_visible(projected,
     settings.planes = "ACTIVE"
     bpy.context.view_layer.objects.active = made[2]
     assert selection.active_module(bpy.context) == made[2].parent and shown() == [3], "a plane is part of its module"
+
+
+def test_planes_go_with_their_modules(projected, scene):
+    projected()
+    collection = scanner.active_scanner(scene)
+    module_edits.remove(collection, [scanner.module(collection, 1)])
+    assert [plane.mphdrr_module.number for plane in planes.planes(scene)] == [2, 3, 4, 5, 6, 7, 8]
+    assert ids.picture_name(images.projection_name(1, range(8))) in bpy.data.images, "the run's pictures stay"
+    bpy.data.objects.remove(scanner.module(collection, 5))  # as X does
+    bpy.context.view_layer.update()
+    assert [plane.mphdrr_module.number for plane in planes.planes(scene) if plane.hide_viewport] == [5]
+    scene.mphdrr_display.plane_opacity = 0.3
 
 
 def test_planes_stand_where_they_are_told(projected, scene, ring_system):

@@ -116,6 +116,15 @@ def test_slices_of_nema_show_six_spheres_also_after_reopening(nema, tmp_path):
     assert ndimage.label(pixels[..., 3] > 0)[1] == 6
 
 
+def test_a_plane_that_the_user_deleted_leaves_the_others_as_they_are(nema):
+    first, second, _ = slices.add_slices(nema)
+    bpy.data.objects.remove(first)
+    start, step = slices.way(nema, 2)
+    slices.move(nema, 1, 3)
+    assert start.length > 0 and step.length == pytest.approx(nema.mphdrr_volume.spacing[2])
+    assert second.location.length > 0 and slices.names(nema)[0] == ""
+
+
 def test_a_map_has_a_bar_in_the_unit_of_the_panels(scene, small_workbook):
     bpy.ops.mphdrr.import_geometry(filepath=str(small_workbook))
     bpy.ops.mphdrr.add_map(quantity="sensitivity", voxels=9)

@@ -6,9 +6,11 @@ import bpy
 import numpy as np
 import pytest
 
-from mphdrr.addon import scanner, volumes
+from mphdrr.addon import jobs, maps, scanner, volumes
+from mphdrr.core.geometry.grid import Grid
 from mphdrr.core.physics.maps import sensitivity_map
 from mphdrr.core.physics.performance import sensitivity
+from mphdrr.core.volumes.volume import Volume
 
 
 @pytest.fixture
@@ -46,12 +48,45 @@ def test_map_follows_the_scanner_and_is_replaced(collection):
     assert after.array[2, 2, 2] - before.array[2, 2, 2] == pytest.approx(gained, rel=1e-4)
 
 
+def test_each_scanner_has_its_own_map_and_no_other_volume_is_replaced(collection, scene, workbook):
+    volumes.add_volume(Volume(np.ones((3, 3, 3)), Grid.centered(3, 1.0), "sensitivity"), "Measured")
+    bpy.ops.mphdrr.add_map(quantity="sensitivity", voxels=3, within_roi=False)
+    bpy.ops.mphdrr.import_geometry(filepath=str(workbook), name="Other")
+    other = scanner.active_scanner(scene)
+    for camera in scanner.modules(other):
+        camera.mphdrr_module.pinhole_diameter = 4.6
+    for _ in range(2):
+        bpy.ops.mphdrr.add_map(quantity="sensitivity", voxels=3, within_roi=False)
+    of_other, of_first = (bpy.data.objects[name] for name in ("Sensitivity map.001", "Sensitivity map"))
+    assert len(volumes.volume_objects(scene)) == 3 and np.all(volumes.volume_from_object(of_first).array)
+    ratio = volumes.volume_from_object(of_other).array / volumes.volume_from_object(of_first).array
+    assert ratio[1, 1, 1] == pytest.approx(4.0)
+    before = volumes.volume_from_object(of_first).array
+    jobs.run(maps.again(scene, of_first))  # while the other scanner is active
+    assert np.array_equal(volumes.volume_from_object(of_first).array, before)
+
+
 def test_maps_are_not_projected(collection):
     bpy.ops.mphdrr.add_map(quantity="modules", voxels=4)
     with pytest.raises(RuntimeError, match="no volume of activity or mu in the scene"):
         bpy.ops.mphdrr.render_projections(width=4, height=4)
     bpy.ops.mphdrr.add_derenzo(voxels=16)
     assert bpy.ops.mphdrr.render_projections(width=4, height=4) == {"FINISHED"}
+
+
+def test_a_maps_surface_is_at_a_value_of_the_windows_unit(collection):
+    bpy.ops.mphdrr.add_map(quantity="sensitivity", voxels=12, within_roi=False)
+    item = the_map()
+    bpy.context.view_layer.objects.active = item
+    settings = item.mphdrr_volume
+    level = 0.7 * settings.maximum
+    assert level > 100, "cps/MBq"
+    assert bpy.ops.mphdrr.mesh_from_volume(level=level) == {"FINISHED"}
+    mesh = bpy.data.meshes[f"{item.name} surface"]
+    system = scanner.read_scanner(collection)
+    places = np.array([vertex.co for vertex in mesh.vertices])
+    values = 1e6 * sensitivity(system, places).sum(axis=1)
+    assert np.median(values) == pytest.approx(level, rel=0.1)
 
 
 @pytest.mark.parametrize("quantity", ["modules", "resolution", "completeness"])

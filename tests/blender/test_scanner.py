@@ -274,3 +274,24 @@ def test_python_ends_with_the_extension_registered():
     """Blender 4.5's module hangs if classes are still registered when Python ends."""
     script = "from mphdrr.addon import registration as r; r.register(); r.unregister(); r.register()"
     subprocess.run([sys.executable, "-c", script], check=True, timeout=60)
+
+
+def test_numbers_that_are_animated_or_driven_are_followed(scene, ring_system):
+    collection = scanner.build_scanner(scene, ring_system)
+    bpy.context.view_layer.update()
+    keyed, driven = (scanner.module(collection, number) for number in (1, 2))
+    usual = [camera.mphdrr_module.sensitivity for camera in (keyed, driven)]
+    for frame, diameter in ((1, 2.3), (10, 4.6)):
+        keyed.mphdrr_module.pinhole_diameter = diameter
+        keyed.mphdrr_module.keyframe_insert("pinhole_diameter", frame=frame)
+    for frame, ratio in ((1, 1.0), (10, 4.0)):
+        scene.frame_set(frame)
+        assert keyed.mphdrr_module.sensitivity == pytest.approx(ratio * usual[0], rel=1e-5)
+    driver = driven.driver_add("mphdrr_module.pinhole_diameter").driver
+    variable = driver.variables.new()
+    variable.type = "TRANSFORMS"
+    variable.targets[0].id = bpy.data.objects["Cube"]
+    driver.expression = f"2.3 + {variable.name}"
+    bpy.data.objects["Cube"].location.x = 2.3
+    bpy.context.view_layer.update()
+    assert driven.mphdrr_module.sensitivity == pytest.approx(4 * usual[1], rel=1e-5)

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from mathutils import Matrix
 
-from mphdrr.addon import compat, storage, stored_volumes, volume_materials, volumes
+from mphdrr.addon import compat, looks, storage, stored_volumes, volume_materials, volumes
 from mphdrr.core.errors import InputError
 from mphdrr.core.geometry.frames import euler_pose
 from mphdrr.core.geometry.grid import Grid
@@ -258,11 +258,14 @@ def test_volumes_are_within_eevees_reach(scene):
 
 def test_volume_drawn_for_another_blender_is_rewritten_on_load(tmp_path, sparse_volume, monkeypatch):
     monkeypatch.setattr(compat, "VDB_CENTER_SHIFT", -0.5 - compat.VDB_CENTER_SHIFT)
-    volumes.add_volume(sparse_volume, "Sample")
+    item = volumes.add_volume(sparse_volume, "Sample")
+    item.mphdrr_volume.look = "SHELL"
+    elsewhere = looks.surface_of(item).location.copy()
     bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "a.blend"))
     monkeypatch.undo()
     bpy.ops.wm.open_mainfile(filepath=str(tmp_path / "a.blend"))
     item = bpy.data.objects["Sample"]
     assert item.mphdrr_volume.center_shift == compat.VDB_CENTER_SHIFT
     assert np.array_equal(volumes.volume_from_object(item).array, sparse_volume.array)
+    assert looks.surface_of(item).location != elsewhere, "the surface goes along"
     assert len({p.name for p in (tmp_path / "a_mphdrr").iterdir()}) == 2

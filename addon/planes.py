@@ -75,8 +75,9 @@ def remove(scene: bpy.types.Scene, collection: bpy.types.Collection | None = Non
 def update(scene: bpy.types.Scene) -> None:
     """Place and show the planes and backgrounds as the scene's settings say."""
     settings = scene.mphdrr_display
+    part = images.share_shown()
     for plane, shown in _wanted(scene):
-        _place(plane, settings)
+        _place(plane, settings, part)
         plane.color[3] = settings.plane_opacity
         if plane.hide_viewport == shown:
             plane.hide_viewport = not shown
@@ -85,28 +86,26 @@ def update(scene: bpy.types.Scene) -> None:
             background.alpha = settings.plane_opacity
 
 
-def _place(plane: bpy.types.Object, settings: bpy.types.PropertyGroup) -> None:
+def _place(plane: bpy.types.Object, settings: bpy.types.PropertyGroup, part: tuple[float, float]) -> None:
     """Put a plane where it belongs on its camera, and the background where the camera sees it."""
-    camera, field, part = plane.parent, np.array(plane[_KEY]), images.share_shown()
-    x, y, depth, width, height = field * share_of_way(settings, camera.mphdrr_module, field[2])
+    field = np.array(plane[_KEY])
+    x, y, depth, width, height = field * share_of_way(settings, plane.parent.mphdrr_module, field[2])
     width, height = width * part[0], height * part[1]
     # A picture's longer side is as long as the empty; pixels that are not square are stretched.
     columns, rows = plane.data.size
     plane.empty_display_size = max(columns, rows)
     grabbing.place(plane, Matrix.LocRotScale((x, y, -depth), None, (width / columns, height / rows, 1.0)))
+    _place_background(plane, part[0])
+
+
+def _place_background(plane: bpy.types.Object, share: float) -> None:
+    """Make the picture over the camera's view as large as what it shows is seen there."""
+    camera, (x, y, depth, width, _) = plane.parent.data, plane[_KEY]
+    seen = camera.sensor_width / camera.lens * depth  # how much the camera sees there
+    scale = share * abs(width) / seen
     for background in _backgrounds(plane):
-        seen = camera.data.sensor_width / camera.data.lens * field[2]  # how much the camera sees there
-        background.scale = part[0] * abs(field[3]) / seen
-        background.offset = field[0] / seen, field[1] / seen
-
-
-def _is_placed(plane: bpy.types.Object, settings: bpy.types.PropertyGroup) -> bool:
-    """Whether a plane stands, and its background lies, where the numbers of its module want them now."""
-    camera, field = plane.parent, plane[_KEY]
-    depth = field[2] * share_of_way(settings, camera.mphdrr_module, field[2])
-    scale = images.share_shown()[0] * abs(field[3]) * camera.data.lens / (camera.data.sensor_width * field[2])
-    places = [(depth, -plane.location[2]), *((scale, background.scale) for background in _backgrounds(plane))]
-    return all(math.isclose(wanted, now, rel_tol=_NEAR) for wanted, now in places)
+        if not math.isclose(background.scale, scale, rel_tol=_NEAR):  # writing is an update of the scene
+            background.scale, background.offset = scale, (x / seen, y / seen)
 
 
 def _backgrounds(plane: bpy.types.Object) -> list[bpy.types.CameraBackgroundImage]:
@@ -123,14 +122,15 @@ def share_of_way(settings: bpy.types.PropertyGroup, module: bpy.types.PropertyGr
 
 @bpy.app.handlers.persistent
 def after_update(scene: bpy.types.Scene, depsgraph: bpy.types.Depsgraph) -> None:
-    """Another module is active, modules were shown or hidden, or their numbers were edited: their planes follow."""
+    """Another module is active, modules were shown or hidden, or `l` was edited: planes and backgrounds follow."""
     if depsgraph.id_type_updated("SCENE") and any(plane.hide_viewport == shown for plane, shown in _wanted(scene)):
         update(scene)
     changed = {selection.module_of(each.id.original) for each in depsgraph.updates if each.id.id_type == "OBJECT"}
     if changed - {None}:
-        for plane, _ in _wanted(scene):
-            if plane.parent in changed and not (grabbing.is_dragged(plane) or _is_placed(plane, scene.mphdrr_display)):
-                _place(plane, scene.mphdrr_display)
+        share = images.share_shown()[0]
+        for plane in planes(scene):
+            if plane.parent in changed:
+                _place_background(plane, share)
 
 
 def _wanted(scene: bpy.types.Scene) -> list[tuple[bpy.types.Object, bool]]:

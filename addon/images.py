@@ -102,12 +102,12 @@ def showing_again(display: Display, kept: dict[int, NDArray[np.float32]]) -> Gen
     projections = kept[uid]
     file, drawn = yield from _in_thread(lambda progress: _mosaic(projections, numbers, rings, unit, display), False)
     mosaic = _fill(bpy.data.images[ids.MOSAIC], file)
-    _describe(mosaic, drawn, numbers, rings, unit, None)
+    _describe(_read_now(mosaic), drawn, numbers, rings, unit, None)
     files = yield from _in_thread(lambda progress: _colored(projections, display, progress), True)
     for name, file in zip(names, files, strict=True):
         picture = bpy.data.images.get(ids.picture_name(name))
         if picture is not None:
-            _fill(picture, file)
+            _read_now(_fill(picture, file))
             yield True
     _describe(bpy.data.images[ids.MOSAIC], drawn, numbers, rings, unit, display)
 
@@ -315,8 +315,12 @@ def _fit(context: bpy.types.Context, window: bpy.types.Window, area: bpy.types.A
 
 
 def _new_picture(name: str, png: bytes) -> bpy.types.Image:
-    image = _fill(bpy.data.images.new(name, 1, 1), png)
-    len(image.pixels)  # reads it now, in a step of its own, and not when all are first drawn
+    return _read_now(_fill(bpy.data.images.new(name, 1, 1), png))
+
+
+def _read_now(image: bpy.types.Image) -> bpy.types.Image:
+    """Have an image's pixels read in a step of its own, and not when all are first drawn."""
+    len(image.pixels)
     return image
 
 

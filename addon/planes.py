@@ -126,7 +126,8 @@ def after_update(scene: bpy.types.Scene, depsgraph: bpy.types.Depsgraph) -> None
     if depsgraph.id_type_updated("SCENE") and any(plane.hide_viewport == shown for plane, shown in _wanted(scene)):
         update(scene)
     changed = {selection.module_of(each.id.original) for each in depsgraph.updates if each.id.id_type == "OBJECT"}
-    if changed - {None}:
+    changed.discard(None)
+    if changed:
         share = images.share_shown()[0]
         for plane in planes(scene):
             if plane.parent in changed:

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from . import ids, images, planes
 
 _REST = 0.05  # s after an edit of the display until the pictures are made anew
-_INTERVAL, _STEP = 0.02, 0.01  # s between turns of the main thread, and that one takes
+_INTERVAL, _STEP = 0.02, 0.03  # s between turns of the main thread, after each of which it may draw, and of a turn
 _asked = False  # for pictures of the display as it is now
 _steps: Generator[None, None, None] | None = None
 

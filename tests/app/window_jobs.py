@@ -47,25 +47,6 @@ def measured(name: str, operator, **settings):
     start(operator, **settings)
     while jobs.is_running():
         yield 0.02
-    yield from noted(name)
-
-
-def dragged(name: str):
-    """Drag the window's upper end, as a mouse does; note as `measured`, and when the pictures show it."""
-    display, mosaic = bpy.context.scene.mphdrr_display, bpy.data.images["mphDRR mosaic"]
-    display.low, display.high, display.automatic = 0.0, 50.0, False
-    beats.clear()
-    for k in range(20):
-        display.high = 50.0 + k
-        yield 0.05
-    released = time.perf_counter()
-    while mosaic["mphdrr_tiles"]["display"] != repr(display.display()):
-        yield 0.02
-    seen["pictures_after"] = round(time.perf_counter() - released, 3)
-    yield from noted(name)
-
-
-def noted(name: str):
     yield 0.3
     during = longest()
     beats.clear()
@@ -125,7 +106,6 @@ def steps():
     yield from measured("phantom", mph.add_derenzo, voxels=128)
     yield from measured("projecting", mph.render_projections, **render)
     yield from measured("projecting again", mph.render_projections, **render)
-    yield from dragged("dragging the window")
     yield from measured("dataset", mph.export_dataset, filepath=str(folder / "a.h5"))
     yield from measured("volume", mph.export_volume, filepath=str(folder / "a.nii.gz"))
     yield from measured("solids", mph.export_for_program, format="stl", filepath=str(folder / "a.stl"))

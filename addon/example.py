@@ -25,31 +25,31 @@ def example_job(context: bpy.types.Context) -> jobs.Job:
     """The job that puts the example into the context's scene and shows it."""
     scene, system = context.scene, read_system(EXAMPLE)
     pose = euler_pose(*np.deg2rad(EULER_DEGREES))
-    adding = phantoms.adding(plain_settings("derenzo", voxels=_VOXELS), "Derenzo", pose)
+    settings = plain_settings("derenzo", voxels=_VOXELS)
+    adding = phantoms.adding(settings, "Derenzo", pose)
     detector = {"detector.rows": _PIXELS, "detector.columns": _PIXELS}
-    placed = {"phantom.kind": "derenzo", "phantom.euler_degrees": EULER_DEGREES, "phantom.voxels": _VOXELS}
-    recipe = Recipe({"system.file": str(EXAMPLE), **placed, **detector})
-    scene_name, path, display = scene.name, rendering.run_path(scene), scene.mphdrr_display.display()
+    recipe = rendering.of_phantom(Recipe({"system.file": str(EXAMPLE), **detector}), settings, pose)
+    scene_uid, path, display = scene.session_uid, rendering.run_path(scene), scene.mphdrr_display.display()
 
     def work(progress: Progress) -> Any:
         stages = stages_of(progress)
         stored = adding.work(progress)
-        (run,) = run_recipe(recipe, system, stages=stages)
+        (run,) = run_recipe(recipe, system, stored[0].volume, stages=stages)
         stages("writing the run file")
         write_run(run, path)
         return stored, run, images.pictures(run, display, stages("packing"))
 
     def finish(result: Any) -> jobs.Finishing:
         stored, run, made = result
-        scene = bpy.data.scenes[scene_name]
-        mosaic = yield from images.storing(run, display, made)
+        scene = rendering.scene_again(scene_uid)
+        mosaic = yield from images.storing(run, made)
         collection = scanner.build_scanner(scene, system)
         yield None
         adding.finish(stored)
         yield None
         rendering.place(scene, run, collection)
         runs.add(scene, run, path, rendering.taken_over(scene, run, bpy.context.object), collection)
-        _hide_startup(scene)
+        _hide_startup(scene, collection)
         studio.light(scene)
         images.show_below(mosaic, bpy.context)
         scanner.set_up_scene(scene, collection, _VIEW.to_quaternion())
@@ -58,11 +58,11 @@ def example_job(context: bpy.types.Context) -> jobs.Job:
     return jobs.Job("Loading the example", work, finish, lambda: path.unlink(missing_ok=True))
 
 
-def _hide_startup(scene: bpy.types.Scene) -> None:
+def _hide_startup(scene: bpy.types.Scene, collection: bpy.types.Collection) -> None:
     """Hide what Blender's own startup file has in the scene, and look through a module instead of its camera."""
     for name in _STARTUP:
         item = scene.objects.get(name)
         if item is not None:
             item.hide_viewport = item.hide_render = True
             if scene.camera == item:
-                scene.camera = scanner.modules(scanner.required_scanner(scene))[0]
+                scene.camera = scanner.modules(collection)[0]

@@ -19,12 +19,13 @@ from ..core.runs.display import Display
 from ..core.runs.exr import exr_bytes
 from ..core.runs.mosaic import Sheet, as_seen, png, sheet, smaller
 from ..core.runs.run import ProjectionRun
-from . import ids
+from . import ids, jobs
 
 _KEY = "mphdrr_projection"  # custom property: marks the images that a new run replaces
 _PIXELS = 2.2e7
 """Of all pictures together, about: larger images are shown smaller, since a picture takes memory again when it is drawn."""
 _PNG_LEVEL = 1  # fast
+_WAIT = 0.005  # s between two looks at a thread
 _SCANNER = "mphdrr_scanner"  # custom property of the mosaic: the collection of the scanner that the run is of
 _TEXT = "mphdrr_difference"  # custom property of a difference: its numbers, in words
 _TILES = "mphdrr_tiles"  # custom property of the mosaic: its modules, unit, and where in it which one's image is
@@ -46,19 +47,17 @@ def pictures(run: ProjectionRun, display: Display, progress: Progress | None = N
     count = 2 * len(run.views)
     exact = _in_threads(exr_bytes, as_seen(run.projections), progress, 0, count)
     numbers, rings = run.system.numbers.tolist(), run.system.rings().tolist()
-    return Pictures(display, exact, *_colored(run.projections, numbers, rings, run.unit, display, progress))
+    colored = _colored(run.projections, display, progress, count // 2)
+    return Pictures(display, exact, colored, *_mosaic(run.projections, numbers, rings, run.unit, display))
 
 
-def storing(
-    run: ProjectionRun, display: Display, made: Pictures | None = None
-) -> Generator[tuple[str, int, int] | None, None, bpy.types.Image]:
+def storing(run: ProjectionRun, made: Pictures) -> Generator[tuple[str, int, int] | None, None, bpy.types.Image]:
     """Make images of a run, packed into the .blend, in place of those of an earlier run.
 
     For each module one of the exact numbers, float32, and one to look at; and the mosaic, which is returned. Yields
     between steps, so that a window can be drawn; what ends it there leaves the earlier run's images as they are.
     `made` is what `pictures` has made.
     """
-    made = made or pictures(run, display)
     numbers = run.system.numbers.tolist()
     new: dict[str, bpy.types.Image] = {}
     try:
@@ -74,32 +73,58 @@ def storing(
         bpy.data.batch_remove(new.values())
         raise
     _put_in_place(new)
-    _describe(new[ids.MOSAIC], made.drawn, numbers, run.system.rings().tolist(), run.unit)
-    if made.display != display:  # which was edited meanwhile
-        show_again(display)
+    _describe(new[ids.MOSAIC], made.drawn, numbers, run.system.rings().tolist(), run.unit, made.display)
     return new[ids.MOSAIC]
 
 
-def show_again(display: Display) -> None:
-    """Make the pictures anew from the exact images, as `display` says; nothing where there is no run."""
-    shown = tiles(bpy.data.images.get(ids.MOSAIC))
-    if shown is None:
+def showing_again(display: Display, kept: dict[int, NDArray[np.float32]]) -> Generator[bool, None, None]:
+    """Make the pictures anew from the exact images, as `display` says; nothing where there is no run.
+
+    Yields between its steps whether the mosaic, which is the first, is made. `kept` holds the numbers that were read, by the
+    mosaic's `session_uid`, for the next time.
+    """
+    mosaic = bpy.data.images.get(ids.MOSAIC)
+    shown = tiles(mosaic)
+    if mosaic is None or shown is None:
         return
     numbers, rings, unit = (shown[name] for name in ("numbers", "rings", "unit"))
-    found = [bpy.data.images.get(projection_name(number, numbers)) for number in numbers]
-    if None in found:
-        return
-    first = projection_array(found[0])
-    projections = np.empty((len(found), *first.shape), np.float32)
-    for m, image in enumerate(found):
-        projections[m] = projection_array(image)
-    colored, mosaic, drawn = _colored(projections, numbers, rings, unit, display)
-    for number, data in zip(numbers, colored, strict=True):
-        picture = bpy.data.images.get(ids.picture_name(projection_name(number, numbers)))
+    names, uid = [projection_name(number, numbers) for number in numbers], mosaic.session_uid
+    if uid not in kept:
+        found = []
+        for name in names:
+            if (exact := bpy.data.images.get(name)) is None:
+                return
+            found.append(projection_array(exact))
+            yield False
+        kept.clear()
+        kept[uid] = np.stack(found)
+        del found
+    projections = kept[uid]
+    file, drawn = yield from _in_thread(lambda progress: _mosaic(projections, numbers, rings, unit, display), False)
+    mosaic = _fill(bpy.data.images[ids.MOSAIC], file)
+    _describe(_read_now(mosaic), drawn, numbers, rings, unit, None)
+    files = yield from _in_thread(lambda progress: _colored(projections, display, progress), True)
+    for name, file in zip(names, files, strict=True):
+        picture = bpy.data.images.get(ids.picture_name(name))
         if picture is not None:
-            _fill(picture, data)
-    _fill(bpy.data.images[ids.MOSAIC], mosaic)
-    _describe(bpy.data.images[ids.MOSAIC], drawn, numbers, rings, unit)
+            _read_now(_fill(picture, file))
+            yield True
+    _describe(bpy.data.images[ids.MOSAIC], drawn, numbers, rings, unit, display)
+
+
+def _in_thread(make: Callable[[Progress], Any], said: bool) -> Generator[bool, None, Any]:
+    """What `make` makes in a thread; yields what is `said` meanwhile."""
+    worker = jobs.Worker("Colours", make)
+    worker.start()
+    try:
+        while worker.is_alive():
+            worker.join(_WAIT)
+            yield said
+    finally:
+        worker.cancel.set()
+    if worker.error is not None:
+        raise worker.error
+    return worker.result
 
 
 def tiles(image: bpy.types.Image | None) -> dict[str, Any] | None:
@@ -107,7 +132,8 @@ def tiles(image: bpy.types.Image | None) -> dict[str, Any] | None:
 
     Rows and columns are counted from the top left. `window` is that of the colours; `totals` are what `summed` says of each
     image, "sum" or "mean", `maxima` their largest numbers, and `half` whether only their middle halves are meant and shown.
-    Files of earlier versions lack these five.
+    `display` is how all pictures are shown, "None" while they are made. Files
+    of earlier versions lack these six.
     """
     return None if image is None or _TILES not in image else image[_TILES].to_dict()
 
@@ -131,28 +157,37 @@ def scanner_of(mosaic: bpy.types.Image) -> bpy.types.Collection | None:
     return mosaic.get(_SCANNER)
 
 
+def is_of(scene: bpy.types.Scene) -> bool:
+    """Whether the images are of a run of that scene, as far as is known."""
+    mosaic = bpy.data.images.get(ids.MOSAIC)
+    owner = None if mosaic is None else scanner_of(mosaic)
+    return owner is None or owner in scene.collection.children_recursive[:]
+
+
 def projection_name(number: int, numbers: list[int]) -> str:
     """Name of the exact image of the module `number` of a run of the modules `numbers`."""
     return ids.projection_name(number, max(numbers))
 
 
 def _colored(
-    projections: NDArray[np.float32],
-    numbers: list[int],
-    rings: list[int],
-    unit: str,
-    display: Display,
-    progress: Progress | None = None,
-) -> tuple[list[bytes], bytes, Sheet]:
-    """The pictures of projections (M, n_v, n_u) in one window, and the mosaic, as PNG files; and what is where in it."""
-    window, count = display.window(projections), len(numbers)
+    projections: NDArray[np.float32], display: Display, progress: Progress | None = None, done: int = 0
+) -> list[bytes]:
+    """The pictures of projections (M, n_v, n_u) in one window, as PNG files; `progress` counts them after those `done`."""
+    window = display.window(projections)
 
     def file(picture: NDArray[np.float32]) -> bytes:
         return png(display.colored(picture, window), _PNG_LEVEL)
 
-    colored = _in_threads(file, smaller(as_seen(display.part(projections)), _PIXELS), progress, count, 2 * count)
+    shown = smaller(as_seen(display.part(projections)), _PIXELS)
+    return _in_threads(file, shown, progress, done, done + len(shown))
+
+
+def _mosaic(
+    projections: NDArray[np.float32], numbers: list[int], rings: list[int], unit: str, display: Display
+) -> tuple[bytes, Sheet]:
+    """The mosaic of projections (M, n_v, n_u) as a PNG file, and what is where in it."""
     drawn = sheet(projections, numbers, rings, unit, display)
-    return colored, png(drawn.picture, _PNG_LEVEL), drawn
+    return png(drawn.picture, _PNG_LEVEL), drawn
 
 
 def _in_threads(
@@ -168,12 +203,15 @@ def _in_threads(
     return files
 
 
-def _describe(image: bpy.types.Image, drawn: Sheet, numbers: list[int], rings: list[int], unit: str) -> None:
-    """Note on the mosaic what is where in it."""
+def _describe(
+    image: bpy.types.Image, drawn: Sheet, numbers: list[int], rings: list[int], unit: str, display: Display | None
+) -> None:
+    """Note on the mosaic what is where in it, and which display the pictures show; None: not all of them one."""
     image[_TILES] = {
         "numbers": numbers, "rings": rings, "unit": unit, "corners": drawn.corners.ravel().tolist(), "tile": drawn.tile,
         "window": drawn.window, "summed": drawn.summed, "totals": drawn.totals.tolist(), "maxima": drawn.maxima.tolist(),
         "half": drawn.half, "share": drawn.share,
+        "display": repr(display),
     }  # fmt: skip
 
 
@@ -183,7 +221,7 @@ def store_difference(drawn: Sheet, numbers: list[int], unit: str, text: str) -> 
     old = bpy.data.images.get(ids.DIFFERENCE)
     image = _new_picture(ids.DIFFERENCE, file) if old is None else _fill(old, file)
     image.use_fake_user, image[_KEY] = True, True
-    _describe(image, drawn, numbers, [], unit)
+    _describe(image, drawn, numbers, [], unit, None)
     image[_TEXT] = text
     return image
 
@@ -277,8 +315,12 @@ def _fit(context: bpy.types.Context, window: bpy.types.Window, area: bpy.types.A
 
 
 def _new_picture(name: str, png: bytes) -> bpy.types.Image:
-    image = _fill(bpy.data.images.new(name, 1, 1), png)
-    len(image.pixels)  # reads it now, in a step of its own, and not when all are first drawn
+    return _read_now(_fill(bpy.data.images.new(name, 1, 1), png))
+
+
+def _read_now(image: bpy.types.Image) -> bpy.types.Image:
+    """Have an image's pixels read in a step of its own, and not when all are first drawn."""
+    len(image.pixels)
     return image
 
 

@@ -75,6 +75,11 @@ def _finishing(job: Job, result: Any) -> Finishing:
     return (yield from finished) if isinstance(finished, Generator) else finished
 
 
+def found_again(datablocks: Any, uid: int) -> Any:
+    """What had this `session_uid` when a job began, under whatever name now; None where it is gone."""
+    return next((item for item in datablocks if item.session_uid == uid), None)
+
+
 class Worker(threading.Thread):
     """The thread that does a job's work, with its stage and the warnings that it gave; later, the steps that finish it."""
 

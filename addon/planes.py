@@ -4,6 +4,8 @@ A plane is an image empty, a child of its module's camera, in a collection of it
 looks through the camera sees the scene, and the picture over it as the camera's background image.
 """
 
+import math
+
 import bpy
 import numpy as np
 from mathutils import Matrix
@@ -17,6 +19,7 @@ from . import grabbing, ids, images, scanner, selection
 _KEY = (
     "mphdrr_field"  # custom property of a plane: middle and size (5,) of the virtual detector in the camera's frame, mm
 )
+_NEAR = 1e-5  # rounding
 _BETWEEN = 0.3  # of the way from the pinhole to the ROI's surface: where a plane is unless told otherwise
 
 
@@ -25,7 +28,8 @@ def make(scene: bpy.types.Scene, run: ProjectionRun, collection: bpy.types.Colle
 
     Modules that the scanner does not have any more get none.
     """
-    remove(scene)
+    for each in bpy.data.scenes:  # the images are those of this run now, also where another scene's planes show them
+        remove(each)
     if collection is None:
         return []
     home = bpy.data.collections.new(ids.PLANES)
@@ -76,19 +80,38 @@ def update(scene: bpy.types.Scene) -> None:
         _show(plane, shown)
         if plane.parent is None:
             continue
-        camera, field = plane.parent, np.array(plane[_KEY])
-        x, y, depth, width, height = field * share_of_way(settings, camera.mphdrr_module, field[2])
-        width, height = width * part[0], height * part[1]
-        # A picture's longer side is as long as the empty; pixels that are not square are stretched.
-        columns, rows = plane.data.size
-        plane.empty_display_size = max(columns, rows)
-        grabbing.place(plane, Matrix.LocRotScale((x, y, -depth), None, (width / columns, height / rows, 1.0)))
+        _place(plane, settings, part)
         plane.color[3] = settings.plane_opacity
-        for background in camera.data.background_images:
-            if background.image == plane.data:
-                background.show_background_image = settings.backgrounds
-                background.alpha = settings.plane_opacity
-                _place_background(background, camera.data, field, part[0])
+        for background in _backgrounds(plane):
+            background.show_background_image = settings.backgrounds
+            background.alpha = settings.plane_opacity
+
+
+def _place(plane: bpy.types.Object, settings: bpy.types.PropertyGroup, part: tuple[float, float]) -> None:
+    """Put a plane where it belongs on its camera, and the background where the camera sees it."""
+    field = np.array(plane[_KEY])
+    x, y, depth, width, height = field * share_of_way(settings, plane.parent.mphdrr_module, field[2])
+    width, height = width * part[0], height * part[1]
+    # A picture's longer side is as long as the empty; pixels that are not square are stretched.
+    columns, rows = plane.data.size
+    plane.empty_display_size = max(columns, rows)
+    grabbing.place(plane, Matrix.LocRotScale((x, y, -depth), None, (width / columns, height / rows, 1.0)))
+    _place_background(plane, part[0])
+
+
+def _place_background(plane: bpy.types.Object, share: float) -> None:
+    """Make the picture over the camera's view as large as what it shows is seen there."""
+    camera, (x, y, depth, width, _) = plane.parent.data, plane[_KEY]
+    seen = camera.sensor_width / camera.lens * depth  # how much the camera sees there
+    scale = share * abs(width) / seen
+    for background in _backgrounds(plane):
+        if not math.isclose(background.scale, scale, rel_tol=_NEAR):  # writing is an update of the scene
+            background.scale, background.offset = scale, (x / seen, y / seen)
+
+
+def _backgrounds(plane: bpy.types.Object) -> list[bpy.types.CameraBackgroundImage]:
+    """The backgrounds of the plane's camera that show its picture."""
+    return [found for found in plane.parent.data.background_images if found.image == plane.data]
 
 
 def _show(plane: bpy.types.Object, shown: bool) -> None:
@@ -105,10 +128,17 @@ def share_of_way(settings: bpy.types.PropertyGroup, module: bpy.types.PropertyGr
 
 @bpy.app.handlers.persistent
 def after_update(scene: bpy.types.Scene, depsgraph: bpy.types.Depsgraph) -> None:
-    """Another module is active, or modules were shown or hidden: so are their planes."""
+    """Another module is active, modules were shown or hidden, or `l` was edited: planes and backgrounds follow."""
     if depsgraph.id_type_updated("SCENE") and scene == bpy.context.scene:
         for plane, shown in _wanted(scene):
             _show(plane, shown)
+    changed = {selection.module_of(each.id.original) for each in depsgraph.updates if each.id.id_type == "OBJECT"}
+    changed.discard(None)
+    if changed:
+        share = images.share_shown()[0]
+        for plane in planes(scene):
+            if plane.parent in changed:
+                _place_background(plane, share)
 
 
 def _wanted(scene: bpy.types.Scene) -> list[tuple[bpy.types.Object, bool]]:
@@ -145,16 +175,6 @@ def _set_background(camera: bpy.types.Camera, field: NDArray[np.float64], pictur
     background.frame_method, background.display_depth = "STRETCH", "FRONT"
     background.use_flip_x, background.use_flip_y = bool(field[3] < 0), bool(field[4] < 0)
     camera.show_background_images = True
-
-
-def _place_background(
-    background: bpy.types.CameraBackgroundImage, camera: bpy.types.Camera, field: NDArray[np.float64], share: float
-) -> None:
-    """Make a picture as large as the `share` of the field that it shows is seen from the camera."""
-    x, y, distance, width, _ = field
-    seen = camera.sensor_width / camera.lens * distance  # how much the camera sees there
-    background.scale = share * abs(width) / seen
-    background.offset = x / seen, y / seen
 
 
 def _remove_background(camera: bpy.types.Camera, picture: bpy.types.Image | None) -> None:

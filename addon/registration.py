@@ -24,6 +24,7 @@ from . import (
     preferences,
     preview,
     properties,
+    recoloring,
     recovery,
     rendering,
     run_notes,
@@ -121,6 +122,9 @@ HANDLERS: tuple[tuple[list[Any], Any], ...] = (
     (bpy.app.handlers.load_post, recovery.after_load),
     (bpy.app.handlers.load_post, live_scanner.after_load),
     (bpy.app.handlers.load_post, runs.after_load),
+    (bpy.app.handlers.load_post, recoloring.check),
+    (bpy.app.handlers.undo_post, recoloring.check),
+    (bpy.app.handlers.redo_post, recoloring.check),
     (bpy.app.handlers.depsgraph_update_post, live_scanner.after_update),
     (bpy.app.handlers.depsgraph_update_post, selection.after_update),
     (bpy.app.handlers.depsgraph_update_post, planes.after_update),
@@ -170,7 +174,7 @@ UPDATES: dict[str, Callable[..., None]] = {
     "slices": slices.update,
     "look": slices.look_changed,
     "sight_lines": sight_lines.redraw,
-    "display": rendering.display_changed,
+    "display": recoloring.display_changed,
     "planes": planes.update,
     "active_run": rendering.active_run_changed,
 }
@@ -223,6 +227,7 @@ def unregister() -> None:
     live_scanner.stop()
     live_phantoms.stop()
     runs.stop()
+    recoloring.stop()
     _registered.close()
 
 

@@ -11,6 +11,8 @@ from pathlib import Path
 from typing import Any
 
 import bpy
+import numpy as np
+from numpy.typing import NDArray
 
 from ..core.errors import InputError, InputWarning
 from ..core.geometry.system import chosen_modules
@@ -23,10 +25,10 @@ from ..core.runs.recipe import Recipe, read_recipe
 from ..core.runs.run import ProjectionRun
 from ..core.runs.run_recipe import recipe_model, run_recipe, with_phantom
 from ..core.volumes.volume import require_quantity
-from . import following, ids, images, jobs, phantoms, planes, runs, scanner, storage, volumes
+from . import following, ids, images, jobs, phantoms, planes, recoloring, runs, scanner, storage, volumes
 from .projection_properties import OPENING_ANGLE, set_panel
 
-_REST = 0.05  # s without an edit of the display before the pictures are made anew
+_REST = 0.05  # s until the run that was chosen in the list is shown
 
 
 def render_job(context: bpy.types.Context, recipe: Recipe, volume: str = "", mu: str = "") -> jobs.Job:
@@ -51,7 +53,7 @@ def render_job(context: bpy.types.Context, recipe: Recipe, volume: str = "", mu:
     energy = mu_item and phantoms.mu_energy(mu_item)
     path, display = run_path(scene), scene.mphdrr_display.display()
     state = runs.state_of(system, recipe, item, mu_item)
-    scene_name, scanner_name, start = scene.name, collection.name, time.perf_counter()
+    scene_uid, scanner_uid, start = scene.session_uid, collection.session_uid, time.perf_counter()
 
     def work(progress: Progress) -> tuple[ProjectionRun, images.Pictures]:
         stages = stages_of(progress)
@@ -65,16 +67,22 @@ def render_job(context: bpy.types.Context, recipe: Recipe, volume: str = "", mu:
 
     def finish(result: tuple[ProjectionRun, images.Pictures]) -> jobs.Finishing:
         run, made = result
-        scene = bpy.data.scenes.get(scene_name)
-        if scene is None:
-            raise InputError(f"the scene {scene_name!r} is gone, and its projections with it")
-        owner = bpy.data.collections.get(scanner_name)  # which need not be the panel's any more
+        scene = scene_again(scene_uid)
+        owner = jobs.found_again(bpy.data.collections, scanner_uid)  # which need not be the panel's any more
         images.show((yield from storing(scene, run, path, state, owner, made)), bpy.context)
         where = path if bpy.data.filepath else f"{path} until the .blend is saved"
         seconds = time.perf_counter() - start
         return f"Projected {recipe['volume.object']!r} into {len(run.views)} modules in {seconds:.1f} s: {where}"
 
     return jobs.Job("Projecting", work, finish, lambda: path.unlink(missing_ok=True))
+
+
+def scene_again(uid: int) -> bpy.types.Scene:
+    """The scene that a job was started for, by its `session_uid`; `InputError` where it is gone."""
+    scene = jobs.found_again(bpy.data.scenes, uid)
+    if scene is None:
+        raise InputError("the scene that the projections are for is gone")
+    return scene
 
 
 def sources(
@@ -87,6 +95,14 @@ def sources(
     if mu_item is not None:
         require_quantity(volumes.quantity_of(mu_item), ("mu",), f"{mu_item.name!r} for attenuation")
     return item, mu_item
+
+
+def integrates_activity(context: bpy.types.Context) -> bool:
+    """Whether the panel's settings ask for a radiograph of activity, whatever volume is meant: few want one."""
+    settings, known = context.scene.mphdrr_projections, volumes.volume_objects(context.scene)
+    meant = [settings.volume] if settings.volume else [context.object] if context.object in known else known
+    is_radiograph = settings.model == "TRANSMISSION" and not settings.photons
+    return is_radiograph and bool(meant) and all(volumes.quantity_of(item) == "activity" for item in meant)
 
 
 def run_path(scene: bpy.types.Scene) -> Path:
@@ -188,7 +204,7 @@ def showing(
     made: images.Pictures | None = None,
 ) -> Generator[tuple[str, int, int] | None, None, bpy.types.Image]:
     """Make images and planes of a run of the scanner `collection`, in place of another's; returns the mosaic."""
-    mosaic = yield from images.storing(run, scene.mphdrr_display.display(), made)
+    mosaic = yield from images.storing(run, made or images.pictures(run, scene.mphdrr_display.display()))
     yield None
     place(scene, run, collection)
     return mosaic
@@ -198,12 +214,13 @@ def place(scene: bpy.types.Scene, run: ProjectionRun, collection: bpy.types.Coll
     """Make the planes of a run of the scanner `collection`, of which there are images."""
     images.set_scanner(bpy.data.images[ids.MOSAIC], collection)
     planes.make(scene, run, collection)
+    recoloring.check()  # the display may have been edited meanwhile
 
 
 def showing_job(scene: bpy.types.Scene, index: int) -> jobs.Job:
     """The job that shows a run of the scene's list."""
     item = scene.mphdrr_projections.runs[index]
-    scene_name, name, file, path = scene.name, item.name, item.file, file_of(item.file)
+    uid, name, file, path = scene.session_uid, item.name, item.file, file_of(item.file)
     display = scene.mphdrr_display.display()
 
     def work(progress: Progress) -> tuple[ProjectionRun, images.Pictures]:
@@ -212,7 +229,7 @@ def showing_job(scene: bpy.types.Scene, index: int) -> jobs.Job:
 
     def finish(result: tuple[ProjectionRun, images.Pictures]) -> jobs.Finishing:
         run, made = result
-        scene = bpy.data.scenes[scene_name]
+        scene = scene_again(uid)
         files = [item.file for item in scene.mphdrr_projections.runs]
         if file not in files:  # it was removed meanwhile
             raise InputError(f"the run {name!r} is gone")
@@ -259,30 +276,16 @@ def remove_run(scene: bpy.types.Scene, index: int) -> str:
     text = f"Removed {name!r}" + ("" if runs.remove_file(item) else f"; its file stays: {storage.absolute(item.file)}")
     settings.runs.remove(index)
     if not is_shown:
-        runs.mark_shown(scene, [item.file for item in settings.runs].index(shown) if shown else -1)
+        runs.mark_shown(scene, next((i for i, item in enumerate(settings.runs) if item.file == shown), -1))
     elif not settings.runs:
-        images.clear()
+        if images.is_of(scene):
+            images.clear()
         planes.remove(scene)
         runs.mark_shown(scene, -1)
     else:
         settings.run_file = settings.run_summary = ""  # until the other one is shown
         settings.active_run = min(index, len(settings.runs) - 1)
     return text
-
-
-def display_changed(scene: bpy.types.Scene) -> None:
-    """Show the last run in other colours or another window, once the settings rest."""
-    if bpy.app.background:
-        _display_again()
-    elif not bpy.app.timers.is_registered(_display_again):
-        bpy.app.timers.register(_display_again, first_interval=_REST)
-
-
-def _display_again() -> None:
-    settings = bpy.context.scene.mphdrr_display
-    if not settings.problem:  # which there is between the typing of the window's two ends
-        images.show_again(settings.display())
-        planes.update(bpy.context.scene)  # the pictures' sizes may be others now
 
 
 def _with_volume(recipe: Recipe, item: bpy.types.Object) -> Recipe:
@@ -292,16 +295,19 @@ def _with_volume(recipe: Recipe, item: bpy.types.Object) -> Recipe:
         state = volumes.state_text(item)
         recipe = recipe.updated({"volume.state": state})
     settings = phantoms.settings_of(item)
-    if settings is None:
-        return recipe
+    number = 0 if state == "none" else int(state.split()[0]) - 1
+    return recipe if settings is None else of_phantom(recipe, settings, volumes.pose_of_object(item), number)
+
+
+def of_phantom(recipe: Recipe, settings: phantoms.PhantomSettings, pose: NDArray[np.float64], state: int = 0) -> Recipe:
+    """The recipe with the phantom of these settings, at a world-from-phantom pose (4, 4), mm, in a state, from 0."""
     made = phantoms.recipe_of(settings)
     values: dict[str, Any] = {
         "phantom.voxels": made.grid.shape, "phantom.spacing": made.grid.spacing.tolist(), "phantom.turn_grid": True,
     }  # fmt: skip
-    if settings.bl_rna.properties.get("text") is not None:
-        values["phantom.text"] = settings.text.as_string()
-    shown = made.states[0 if state == "none" else int(state.split()[0]) - 1]
-    return with_phantom(recipe.updated(values), shown, volumes.pose_of_object(item))
+    if "text" in made.settings:
+        values["phantom.text"] = made.settings["text"]
+    return with_phantom(recipe.updated(values), made.states[state], pose)
 
 
 def _chosen_volume(context: bpy.types.Context, name: str, taken: Sequence[str], model: str) -> bpy.types.Object:

@@ -6,8 +6,8 @@ import bpy
 from . import images, runs
 
 _COLOR = (1.0, 0.45, 0.35, 1.0)
-_SIZE = 13  # of the letters, pixels at a resolution scale of 1
-_LEFT, _TOP = 70, 40  # the same, from the region's left, beside the tools, and top
+# Of the letters, and from the region's left, beside the tools, and from its top; pixels at a resolution scale of 1.
+_SIZE, _LEFT, _TOP = 13, 70, 40
 
 
 def draw() -> None:
@@ -16,6 +16,8 @@ def draw() -> None:
     if not images.is_ours(context.space_data.image):
         return
     lines = runs.change_lines(context.scene)
+    if not images.is_of(context.scene):
+        lines = ["the projections of another scene"]
     if not lines or lines == [runs.UNKNOWN]:
         return
     scale = context.preferences.system.ui_scale

@@ -19,9 +19,9 @@ from ..core.memory import readable_size
 from ..core.runs.recipe import Recipe, fitting_recipe
 from ..core.runs.run import ProjectionRun
 from ..core.runs.settings import SETTINGS, Setting
-from . import following, ids, phantoms, scanner, storage, volumes
+from . import cameras, following, ids, phantoms, scanner, storage, volumes
 from .decimals import typed
-from .module_values import FROM_ROI, module_numbers
+from .module_values import FROM_ROI, numbers_of
 from .projection_properties import OPENING_ANGLE, settings_recipe
 from .scanner_parts import modules_text
 
@@ -229,13 +229,15 @@ def _of_modules(collection: bpy.types.Collection | None, old: Mapping[str, Any])
     if collection is None:
         yield "the scanner is gone"
         return
-    cameras = {str(camera.mphdrr_module.number): camera for camera in scanner.modules(collection)}
+    found = scanner.modules(collection)
+    now_all = numbers_of(found, cameras.world_matrices(found))
+    modules = {str(now.number): (camera, now) for camera, now in zip(found, now_all, strict=True)}
     moved: list[int] = []
     changed: dict[int, dict[str, tuple[float, float]]] = {}
     for number, values in old["modules"].items():
-        if number not in cameras:
+        if number not in modules:
             continue
-        now = module_numbers(cameras[number])
+        camera, now = modules[number]
         is_moved = not all(map(_equal, values[:3], now.center.tolist()))
         if is_moved:
             moved.append(int(number))
@@ -244,12 +246,12 @@ def _of_modules(collection: bpy.types.Collection | None, old: Mapping[str, Any])
             for name, value in zip(LENGTHS, values[3:], strict=True)
             if not _equal(value, getattr(now, name))
         }
-        follows = cameras[number].mphdrr_module.length_mode == FROM_ROI and (is_moved or len(other) > 1)
+        follows = camera.mphdrr_module.length_mode == FROM_ROI and (is_moved or len(other) > 1)
         if follows:
             other.pop("collimator_length", None)
         if other:
             changed[int(number)] = other
-    count = len(cameras)
+    count = len(modules)
     if moved:
         yield f"{_modules(moved, count)} moved"
     for name, text in LENGTHS.items():
@@ -258,10 +260,10 @@ def _of_modules(collection: bpy.types.Collection | None, old: Mapping[str, Any])
             first, *others = set(pairs.values())
             said = "changed" if others else _now(*first, "mm")
             yield f"{_modules(list(pairs), count)}: {text.partition(':')[0]} {said}"
-    gone = [int(number) for number in old["modules"] if number not in cameras]
+    gone = [int(number) for number in old["modules"] if number not in modules]
     if gone:
         yield f"{_modules(gone, count)} {'are' if len(gone) > 1 else 'is'} gone"
-    new = [] if "system.modules" in old["settings"] else [int(n) for n in cameras if n not in old["modules"]]
+    new = [] if "system.modules" in old["settings"] else [int(n) for n in modules if n not in old["modules"]]
     if new:
         yield f"{_modules(new, count)} added"
 

@@ -22,7 +22,7 @@ from ..core.geometry.system import PinholeSystem
 from ..core.workbook import ColumnMap, QuantityCells, SystemSource
 from . import cameras, following, framing, ids
 from .following import modules
-from .module_values import is_edited, is_moved, module_numbers, off_aim, remember, system_of
+from .module_values import is_edited, is_moved, numbers_of, off_aim, remember, system_of
 from .scanner_parts import NewScanner, clear, losses, modules_text
 
 _DEFAULT = Construction()
@@ -221,7 +221,7 @@ def read_scanner(collection: bpy.types.Collection, *, aimed: bool = False) -> Pi
     as_imported = len(found) == collection.mphdrr_scanner.n_modules and not any(
         camera.mphdrr_module.added or is_moved(camera) or is_edited(camera) for camera in found
     )
-    numbers = [module_numbers(camera) for camera in found]
+    numbers = numbers_of(found, cameras.world_matrices(found))
     return system_of(numbers, source(collection) if as_imported else None)
 
 

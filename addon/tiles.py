@@ -98,17 +98,25 @@ def _index(place: float, pixels: int, of_tile: int) -> int:
     return int(place) // (of_tile // pixels)
 
 
+def active_tile(context: bpy.types.Context, image: bpy.types.Image | None) -> int | None:
+    """Which of the mosaic's images is the active module's; None where it is of another scanner, or has none."""
+    shown = images.tiles(image)
+    camera = selection.active_module(context) if shown is not None else None
+    if shown is None or camera is None or camera.mphdrr_module.number not in shown["numbers"]:
+        return None
+    if scanner.scanner_of(context.scene, camera) != images.scanner_of(image):
+        return None
+    return int(shown["numbers"].index(camera.mphdrr_module.number))
+
+
 def draw() -> None:
     """Draw the frame; Blender calls this for every Image Editor."""
     context = bpy.context
     image = context.space_data.image
-    tiles = images.tiles(image)
-    camera = selection.active_module(context) if tiles is not None else None
-    if tiles is None or camera is None or camera.mphdrr_module.number not in tiles["numbers"]:
+    index, tiles = active_tile(context, image), images.tiles(image)
+    if index is None or tiles is None:
         return
-    if scanner.scanner_of(context.scene, camera) != images.scanner_of(image):
-        return
-    row, column = np.reshape(tiles["corners"], (-1, 2))[tiles["numbers"].index(camera.mphdrr_module.number)]
+    row, column = np.reshape(tiles["corners"], (-1, 2))[index]
     (rows, columns), (width, height) = tiles["tile"], image.size
     to_region = context.region.view2d.view_to_region
     left, top = to_region(column / width, 1.0 - row / height, clip=False)

@@ -3,7 +3,7 @@
 import bpy
 from bpy.app.translations import pgettext_iface as iface
 
-from ..addon import ids, images, selection
+from ..addon import ids, images, selection, tiles
 from .geometry import Sidebar
 
 
@@ -39,10 +39,10 @@ class _Display:
 
 def _draw_totals(layout: bpy.types.UILayout, context: bpy.types.Context) -> None:
     """What sums up the active module's image of the last run."""
-    shown, camera = images.tiles(bpy.data.images[ids.MOSAIC]), selection.active_module(context)
-    if not shown or "totals" not in shown or camera is None or camera.mphdrr_module.number not in shown["numbers"]:
+    mosaic, camera = bpy.data.images[ids.MOSAIC], selection.active_module(context)
+    shown, index = images.tiles(mosaic) or {}, tiles.active_tile(context, mosaic)
+    if camera is None or index is None or "totals" not in shown:
         return
-    index = shown["numbers"].index(camera.mphdrr_module.number)
     column = layout.column(align=True)
     text = iface("{name}, central half ({unit})") if shown["half"] else "{name} ({unit})"
     column.label(text=text.format(name=camera.name, unit=shown["unit"]), translate=False)
@@ -60,8 +60,7 @@ class MPHDRR_PT_display(_Display, Sidebar, bpy.types.Panel):
     def draw(self, context: bpy.types.Context) -> None:
         super().draw(context)
         layout, settings = self.layout, context.scene.mphdrr_display
-        row = layout.row(align=True)
-        row.prop(settings, "planes", expand=True)
+        layout.prop(settings, "planes")
         column = layout.column()
         column.active = settings.planes != "NONE"
         column.prop(settings, "plane_at_detector")

@@ -5,7 +5,7 @@ from collections.abc import Container
 import bpy
 from bpy.app.translations import pgettext_iface as iface
 
-from ..addon import ids, jobs, runs, scanner, volumes
+from ..addon import ids, jobs, rendering, runs, scanner, volumes
 from ..addon.projection_properties import drawn, makes_counts
 from .geometry import Sidebar, draw_hint, draw_text
 from .runs import draw_changes
@@ -48,6 +48,8 @@ class MPHDRR_PT_projections(Sidebar, bpy.types.Panel):
             draw_hint(layout, "Needs a scanner: Load Example.")
         elif not has_volume:
             draw_hint(layout, "Needs a volume: Add Phantom.")
+        elif rendering.integrates_activity(context):
+            draw_text(layout, "Line integrals of activity: for counts choose the model SPECT Counts.", icon="INFO")
         if settings.run_file:
             layout.operator(ids.SHOW_PROJECTIONS, text="Show Mosaic", icon="IMAGE_DATA")
             draw_changes(layout, context.scene)

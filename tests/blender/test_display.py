@@ -6,7 +6,19 @@ import pytest
 from bpy_extras.object_utils import world_to_camera_view
 from mathutils import Vector
 
-from mphdrr.addon import ids, images, module_edits, planes, scanner, selection, tiles, volumes
+from mphdrr.addon import (
+    ids,
+    images,
+    module_edits,
+    planes,
+    recoloring,
+    rendering,
+    scanner,
+    selection,
+    tiles,
+    updates,
+    volumes,
+)
 from mphdrr.core.errors import InputError
 from mphdrr.core.geometry.grid import Grid
 from mphdrr.core.runs.display import Display
@@ -235,3 +247,62 @@ def test_pictures_and_planes_survive_the_file(projected, scene, tmp_path):
     assert brightest(bpy.data.images[name]) == seen
     bpy.context.scene.mphdrr_display.colors = "VIRIDIS"
     assert brightest(bpy.data.images[name]) == seen
+
+
+def test_backgrounds_are_as_large_as_their_camera_sees_them(projected, scene):
+    plane = projected()[2]
+    camera, (background,) = plane.parent, plane.parent.data.background_images
+    before, angle = background.scale, camera.data.angle_x
+    camera.mphdrr_module.collimator_length *= 1.25  # the camera sees less, and so more of its view is covered
+    bpy.context.view_layer.update()
+    assert background.scale == pytest.approx(before * np.tan(angle / 2) / np.tan(camera.data.angle_x / 2), rel=1e-4)
+    assert background.scale > 1.2 * before
+
+
+def test_planes_of_another_scene_never_show_this_ones_run(projected, scene, ring_system):
+    projected()
+    other = bpy.data.scenes.new("Other")
+    bpy.context.window.scene = other
+    scanner.build_scanner(other, ring_system, "Other Ring")
+    volumes.add_volume(Volume(np.ones((2, 2, 2), np.float32), Grid.centered(2, 2.0)), "Other Point")
+    assert bpy.ops.mphdrr.render_projections(width=8, height=8) == {"FINISHED"}
+    assert len(planes.planes(other)) == 8 and not planes.planes(scene)
+    assert images.is_of(other) and not images.is_of(scene)
+    assert not any(c.data.background_images for c in scanner.modules(scanner.active_scanner(scene)))
+    assert rendering.remove_run(scene, 0) and ids.MOSAIC in bpy.data.images, "the images are not of this run"
+
+
+def shows(display: Display) -> bool:
+    """Whether all pictures show the exact numbers so."""
+    found = [images.projection_array(bpy.data.images[ids.projection_name(k, 8)]) for k in range(1, 9)]
+    window = display.window(np.stack(found))
+    for number, exact in enumerate(found, 1):
+        picture = bpy.data.images[ids.picture_name(ids.projection_name(number, 8))]
+        pixels = np.array(picture.pixels[:]).reshape(*exact.shape, 4)[::-1, :, :3]
+        if not np.array_equal(np.rint(255 * pixels), display.colored(as_seen(exact), window)):
+            return False
+    return images.tiles(bpy.data.images[ids.MOSAIC])["display"] == repr(display)
+
+
+def test_the_newest_display_wins_and_no_earlier_run_is_painted(projected, scene, monkeypatch):
+    projected()
+    monkeypatch.setitem(updates.FUNCTIONS, "display", lambda *_: setattr(recoloring, "_asked", True))  # as in a window
+    scene.mphdrr_display.colors = "GREY"
+    steps = recoloring.recoloring()
+    next(steps)  # numbers are being read
+    projected(width=20, height=20)
+    for _ in steps:
+        assert images.projection_array(bpy.data.images[ids.projection_name(8, 8)]).shape == (20, 20)
+    assert shows(Display("grey"))
+    scene.mphdrr_display.colors = "MAGMA"
+    steps = recoloring.recoloring()
+    while images.tiles(bpy.data.images[ids.MOSAIC])["display"] != "None":  # until the mosaic is made
+        next(steps)
+    scene.mphdrr_display.scale = "LOG"
+    for _ in steps:
+        pass
+    assert shows(Display("magma", "log"))
+    scene.mphdrr_display.colors = "VIRIDIS"
+    assert not shows(Display("viridis", "log"))
+    recoloring.check()  # as after an undo
+    assert shows(Display("viridis", "log"))

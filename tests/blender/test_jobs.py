@@ -14,6 +14,7 @@ from mphdrr.addon import (
     jobs,
     maps,
     phantoms,
+    planes,
     rendering,
     scanner,
     scanner_files,
@@ -280,3 +281,17 @@ def test_exact_numbers_take_no_memory_until_they_are_looked_at(scanned):
     bpy.ops.wm.open_mainfile(filepath=f"{bpy.app.tempdir}/run.blend")
     assert np.array_equal(images.projection_array(bpy.data.images[ids.projection_name(1, 8)]), numbers)
     assert volumes.volume_objects(bpy.context.scene)
+
+
+def test_a_run_is_shown_whatever_is_renamed_or_edited_meanwhile(scanned, scene, tmp_path):
+    job = projecting(tmp_path)
+    result = job.work(lambda done, total: None)
+    scene.name, scanner.active_scanner(scene).name = "Another", "Other Ring"
+    settings = scene.mphdrr_display
+    settings.automatic, settings.low, settings.high = False, 2.0, 1.0  # half typed
+    for _ in job.finish(result):
+        pass
+    made = planes.planes(scene)
+    assert settings.problem and len(scene.mphdrr_projections.runs) == 2 and len(made) == 8
+    settings.low = 0.5
+    assert images.tiles(bpy.data.images[ids.MOSAIC])["window"] == [0.5, 1.0]

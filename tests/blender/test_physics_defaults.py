@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from types import SimpleNamespace
+from typing import Any
 
 import bpy
 import numpy as np
 import pytest
 
-from mphdrr.addon import scanner, volumes
+from mphdrr.addon import rendering, scanner, volumes
 from mphdrr.addon.projection_properties import USUAL_TIME, _volume_chosen, recipe_values
 from mphdrr.core.geometry.grid import Grid
 from mphdrr.core.runs.presets import PRESETS
@@ -60,6 +61,20 @@ def test_a_volume_chosen_in_the_panel_sets_the_model_until_the_user_does(setting
 def test_scripts_get_line_integrals_unless_they_say_otherwise(settings, objects):
     settings.volume = objects["activity"]
     assert settings.model == "TRANSMISSION" and settings.time == 1.0
+
+
+def test_a_radiograph_of_activity_is_said(settings, objects):
+    def said(**values: Any) -> bool:
+        for name, value in values.items():
+            setattr(settings, name, value)
+        return rendering.integrates_activity(bpy.context)
+
+    volumes.make_active(bpy.context, objects["activity"])
+    assert said()
+    assert not said(volume=objects["mu"]) and said(volume=objects["activity"]) and said(volume=None)
+    assert not said(model="EMISSION") and not said(model="TRANSMISSION", photons=1e5) and said(photons=0.0)
+    volumes.make_active(bpy.context, objects["mu"])
+    assert not said()
 
 
 def test_a_recipe_says_the_model_whatever_its_volume_holds(settings, objects, tmp_path):

@@ -273,6 +273,12 @@ def test_the_difference_of_two_runs_is_drawn_and_said(render, scene, capfd):
 def test_the_example_is_current(scene):
     assert bpy.ops.mphdrr.load_example() == {"FINISHED"}
     assert runs.changes(scene) == [] and len(scene.mphdrr_projections.runs) == 1
+    run = read_run(rendering.file_of(scene.mphdrr_projections.run_file))
+    shown = volumes.reader(bpy.data.objects["Derenzo"])()
+    np.testing.assert_array_equal(run.volume.array, shown.array)
+    np.testing.assert_allclose(run.volume.grid.affine, shown.grid.affine, atol=1e-4)
+    (again,) = run_recipe(run.recipe, run.system)
+    np.testing.assert_allclose(again.projections, run.projections, rtol=1e-3, atol=1e-3 * run.projections.max())
     move(module(30), 1.0)
     assert runs.changes(scene) == ["Module 30 moved"]
 

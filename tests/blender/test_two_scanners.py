@@ -95,6 +95,7 @@ def test_a_run_belongs_to_its_scanner(scene, a_and_b):
     found = images.tiles(mosaic)
     row, column = np.reshape(found["corners"], (-1, 2))[found["numbers"].index(6)]
     width, height = mosaic.size
+    assert tiles.active_tile(bpy.context, mosaic) is None, "module 6 of B has no image here"
     view = SimpleNamespace(region_to_view=lambda x, y: (x, y))
     context = SimpleNamespace(
         space_data=SimpleNamespace(image=mosaic), region=SimpleNamespace(view2d=view), scene=scene,
@@ -103,7 +104,7 @@ def test_a_run_belongs_to_its_scanner(scene, a_and_b):
     place = (column + 3) / width, 1 - (row + 3) / height
     assert tiles.pick(context, *place) == scanner.module(a, 6).name
     bpy.context.view_layer.update()
-    assert shown(scene) == ("A", 6, 6)
+    assert shown(scene) == ("A", 6, 6) and tiles.active_tile(bpy.context, mosaic) == found["numbers"].index(6)
     bpy.data.collections.remove(a)
     with pytest.raises(InputError, match="not in the scene"):
         tiles.pick(context, *place)

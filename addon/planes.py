@@ -29,11 +29,15 @@ def make(scene: bpy.types.Scene, run: ProjectionRun, collection: bpy.types.Colle
     Modules that the scanner does not have any more get none.
     """
     for each in bpy.data.scenes:  # the images are those of this run now, also where another scene's planes show them
-        remove(each)
+        if each != scene or collection is None:
+            remove(each)
     if collection is None:
         return []
-    home = bpy.data.collections.new(ids.PLANES)
-    scene.collection.children.link(home)
+    old = {plane.parent: plane for plane in planes(scene)}  # used again: Blender need not sort the scene's objects anew
+    home = next(iter(_homes(scene)), None)
+    if home is None:
+        home = bpy.data.collections.new(ids.PLANES)
+        scene.collection.children.link(home)
     cameras = {camera.mphdrr_module.number: camera for camera in scanner.modules(collection)}
     made = []
     numbers = run.system.numbers.tolist()
@@ -42,34 +46,48 @@ def make(scene: bpy.types.Scene, run: ProjectionRun, collection: bpy.types.Colle
             continue
         camera = cameras[number]
         picture = bpy.data.images[ids.picture_name(images.projection_name(number, numbers))]
-        plane = bpy.data.objects.new(ids.part_name(camera.name, "projection"), None)
-        plane.empty_display_type, plane.data = "IMAGE", picture
-        plane.empty_image_side, plane.use_empty_image_alpha = "BACK", True
-        plane.parent, plane.mphdrr_module.part, plane.mphdrr_module.number = camera, "PLANE", number
-        plane.lock_scale = (True, True, True)
-        plane[_KEY] = field.tolist()
-        home.objects.link(plane)
+        plane = old.pop(camera, None)
+        if plane is None:
+            plane = bpy.data.objects.new(ids.part_name(camera.name, "projection"), None)
+            plane.empty_display_type, plane.empty_image_side, plane.use_empty_image_alpha = "IMAGE", "BACK", True
+            plane.parent, plane.lock_scale = camera, (True, True, True)
+            plane.mphdrr_module.part, plane.mphdrr_module.number = "PLANE", number
+            home.objects.link(plane)
+        else:
+            _remove_background(camera.data, plane.data)
+        plane.data, plane[_KEY] = picture, field.tolist()
         _set_background(camera.data, field, picture)
         made.append(plane)
+    for plane in old.values():
+        _remove(plane)
     update(scene)
     return made
 
 
 def planes(scene: bpy.types.Scene) -> list[bpy.types.Object]:
     """The planes in the scene."""
-    return [o for c in scene.collection.children if c.name.startswith(ids.PLANES) for o in c.objects if _KEY in o]
+    return [o for home in _homes(scene) for o in home.objects if _KEY in o]
 
 
 def remove(scene: bpy.types.Scene, collection: bpy.types.Collection | None = None) -> None:
     """Remove the planes and the cameras' backgrounds, of one scanner or of all."""
     for plane in planes(scene):
-        if collection is not None and plane.parent not in scanner.modules(collection):
-            continue
-        if plane.parent is not None:
-            _remove_background(plane.parent.data, plane.data)
-        bpy.data.objects.remove(plane)
-    for home in [c for c in scene.collection.children if c.name.startswith(ids.PLANES) and not c.all_objects]:
-        bpy.data.collections.remove(home)
+        if collection is None or plane.parent in scanner.modules(collection):
+            _remove(plane)
+    for home in _homes(scene):
+        if not home.all_objects:
+            bpy.data.collections.remove(home)
+
+
+def _remove(plane: bpy.types.Object) -> None:
+    if plane.parent is not None:
+        _remove_background(plane.parent.data, plane.data)
+    bpy.data.objects.remove(plane)
+
+
+def _homes(scene: bpy.types.Scene) -> list[bpy.types.Collection]:
+    """The collections of planes in the scene."""
+    return [home for home in scene.collection.children if home.name.startswith(ids.PLANES)]
 
 
 def update(scene: bpy.types.Scene) -> None:

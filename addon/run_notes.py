@@ -6,8 +6,7 @@ import bpy
 from . import images, runs
 
 _COLOR = (1.0, 0.45, 0.35, 1.0)
-# Of the letters, and from the region's left, beside the tools, and from its top; pixels at a resolution scale of 1.
-_SIZE, _LEFT, _TOP = 13, 70, 40
+_SIZE, _LEFT, _BOTTOM = 13, 12, 12  # of the letters, and from the region's corner; pixels at a resolution scale of 1
 
 
 def draw() -> None:
@@ -25,6 +24,6 @@ def draw() -> None:
     blf.color(0, *_COLOR)
     blf.enable(0, blf.SHADOW)
     blf.shadow(0, 5, 0.0, 0.0, 0.0, 1.0)
-    blf.position(0, _LEFT * scale, context.region.height - _TOP * scale, 0)
+    blf.position(0, _LEFT * scale, _BOTTOM * scale, 0)
     blf.draw(0, f"Not of the scene as it is now: {', '.join(lines)}")
     blf.disable(0, blf.SHADOW)

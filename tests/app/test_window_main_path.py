@@ -24,4 +24,4 @@ def test_main_path_runs_in_the_window(blender_window, work_folder):
     screen = np.asarray(Image.open(picture).convert("RGB")).astype(int)
     x, y = result["phantom_at"]
     red, green, blue = screen[y - 30 : y + 30, x - 30 : x + 30].reshape(-1, 3).T
-    assert np.mean((red > 150) & (red - green > 30) & (blue - green > 10)) > 0.2
+    assert np.mean((red > 110) & (red - green > 20) & (blue - green > 5)) > 0.3

@@ -162,8 +162,8 @@ def _write_npz(arrays: dict[str, NDArray[Any]], attributes: dict[str, Any], path
 
 
 def _read_npz(path: Path) -> _Contents:
-    with np.load(path, allow_pickle=False) as file:
-        arrays = dict(file)
+    with open(path, "rb") as opened:  # not by numpy, which leaves a damaged archive open
+        arrays = dict(np.load(opened, allow_pickle=False))
     return arrays, json.loads(str(arrays.pop(_ATTRIBUTES, "{}")))
 
 

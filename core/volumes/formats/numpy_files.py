@@ -11,17 +11,17 @@ from .contents import Contents
 
 def read(path: Path) -> Contents:
     """Read .npz with the arrays array, affine, quantity and optionally unit; or .npy, which has no affine."""
-    with open(path, "rb") as start:
-        if not start.read(6).startswith((b"\x93NUMPY", b"PK")):  # numpy would take it for pickled objects
+    with open(path, "rb") as opened:  # not by numpy, which leaves a damaged archive open
+        if not opened.read(6).startswith((b"\x93NUMPY", b"PK")):  # numpy would take it for pickled objects
             raise InputError("not a file of numpy")
-    file = np.load(path, allow_pickle=False)
-    if path.suffix.lower() == ".npy":
-        if not isinstance(file, np.ndarray):
-            raise InputError("expected a single array, found an npz archive")
-        return Contents(file, None)
-    if not isinstance(file, np.lib.npyio.NpzFile):
-        raise InputError("expected an npz archive, found a single array")
-    with file:
+        opened.seek(0)
+        file = np.load(opened, allow_pickle=False)
+        if path.suffix.lower() == ".npy":
+            if not isinstance(file, np.ndarray):
+                raise InputError("expected a single array, found an npz archive")
+            return Contents(file, None)
+        if not isinstance(file, np.lib.npyio.NpzFile):
+            raise InputError("expected an npz archive, found a single array")
         missing = {"array", "affine", "quantity"} - set(file.files)
         if missing:
             raise InputError(f"expected the arrays array, affine and quantity; {', '.join(sorted(missing))} not found")

@@ -76,7 +76,7 @@ for name in ("h5py", "openjpeg", "psutil", "openpyxl", "nibabel", "trimesh"):
 cpu = importlib.import_module("{MODULE}.core.projector.backends.cpu")
 assert cpu.levels(), "the kernels"
 cache = importlib.import_module("{MODULE}.core.cache")
-assert str(cache.folder()).startswith(bpy.utils.extension_path_user("{MODULE}")), cache.folder()
+assert str(cache.folder()) == bpy.utils.extension_path_user("{MODULE}", path="cache"), cache.folder()
 assert not [finder for finder in sys.meta_path if "mphdrr" in type(finder).__module__]
 print("ENABLED", sys.modules["{MODULE}"].__file__)
 """)

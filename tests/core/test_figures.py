@@ -13,6 +13,7 @@ from PIL import Image
 
 import mphdrr.core as mph
 from mphdrr.addon.cli import main
+from mphdrr.addon.cli.scene import INSTALL_BLENDER
 from mphdrr.core.figures.kinds import KINDS
 from mphdrr.core.figures.page import Page
 from mphdrr.core.figures.subject import Subject
@@ -219,5 +220,5 @@ def test_figures_that_are_drawn_need_no_blender(tmp_path):
     )
     done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, timeout=120)
     assert done.returncode == 1, done.stderr
-    assert "this command needs Blender: pip install" in done.stderr
+    assert f"this command needs Blender: {INSTALL_BLENDER}" in done.stderr
     assert (tmp_path / "a.png").is_file()

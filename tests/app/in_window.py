@@ -1,7 +1,8 @@
 """Run a script in a Blender with its window on a virtual screen; capture the screen once it is done, or when time is up.
 
 Arguments: the PNG to write, the script, the seconds that it may take, the folder in which it says how it went, and its own
-arguments. It is done when a JSON file in that folder has "error", or a true "ok". Runs on the real Blender's own Python.
+arguments. It is done when a JSON file in that folder has "error", or a true "ok"; log.txt there is what Blender printed.
+Runs on the real Blender's own Python.
 """
 
 import json
@@ -39,7 +40,8 @@ def main(picture: str, script: str, seconds: str, folder: str, *arguments: str) 
     with os.fdopen(reading) as number:
         os.environ["DISPLAY"] = f":{number.readline().strip()}"
     place = ["--window-geometry", "0", "0", str(width), str(height)]
-    blender = subprocess.Popen(["blender", *place, "--python", script, "--", *arguments])
+    with open(Path(folder, "log.txt"), "w") as log:
+        blender = subprocess.Popen(["blender", *place, "--python", script, "--", *arguments], stdout=log, stderr=log)
     end = time.monotonic() + float(seconds)
     while time.monotonic() < end and blender.poll() is None and not is_done(Path(folder)):
         time.sleep(0.3)

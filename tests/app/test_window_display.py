@@ -14,6 +14,8 @@ def test_the_example_is_seen_and_tiles_planes_list_and_mosaic_show_one_module(bl
     picture = blender_window(SCRIPT.read_text(encoding="utf-8"), result_file, seconds=50)
     seen = json.loads(result_file.read_text())
     assert seen["ok"], seen
+    log = (work_folder / "log.txt").read_text()
+    assert not [word for word in ("Traceback", "Error", "mphDRR:") if word in log], log
     assert seen["seconds"] < 15 and seen["hidden"] == ["Camera", "Cube", "Light"]
     assert seen["clicked"] == [30, 30] and seen["selected"] == [55, 55] and seen["planes"] == 80
     screen = np.asarray(Image.open(picture).convert("RGB")).astype(int)

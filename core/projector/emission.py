@@ -2,11 +2,12 @@
 
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from functools import partial
-from typing import Any, Literal
+from typing import Any, Literal, Self
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ..arrays import ArrayOrTensor, is_tensor, namespace
 from ..errors import InputError
@@ -237,6 +238,10 @@ class Emission(Model):
     def unit(self, volume: Volume) -> str:
         """Unit of the images of `volume`."""
         return "counts"
+
+    def of_views(self, which: NDArray[np.integer]) -> Self:
+        """The model of the modules `which` (indices) alone."""
+        return replace(self, system=self.system[which])
 
     def check(self, views: Views) -> None:
         """Raise `InputError` unless `views` are of this system."""

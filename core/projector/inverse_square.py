@@ -1,9 +1,11 @@
 """A sum along rays that weights every voxel with the sensitivity to a point source; it is not a number of counts."""
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import Self
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ..geometry.grid import Grid
 from ..geometry.system import PinholeSystem
@@ -39,6 +41,10 @@ class InverseSquareSum(Model):
 
     def __post_init__(self) -> None:
         instance(self.system, PinholeSystem, "inverse square sum")
+
+    def of_views(self, which: NDArray[np.integer]) -> Self:
+        """The model of the modules `which` (indices) alone."""
+        return replace(self, system=self.system[which])
 
     def check(self, views: Views) -> None:
         """Raise `InputError` unless `views` are of this system."""

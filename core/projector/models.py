@@ -45,6 +45,10 @@ class Model(ABC):
         """A warning for users who project `grid` into `views`, if there is one."""
         return None
 
+    def of_views(self, which: NDArray[np.integer]) -> "Model":
+        """The model of the views `which` (indices) alone."""
+        return self
+
     def check_volume(self, volume: Volume) -> None:
         """Raise `InputError` where the model is not for such a volume."""
         require_quantity(volume.quantity, self.takes, self.name)

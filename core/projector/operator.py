@@ -22,6 +22,7 @@ from .execution import Execution
 from .lattices import require_no_negative, same_lattice
 from .models import Model, Transmission
 from .parallel import thread_count
+from .subsets import balanced_subsets
 
 
 class LinearOperator(ABC):
@@ -130,7 +131,7 @@ class Projector(LinearOperator):
         model.check(views)
         if caution := model.caution(views, grid):
             warnings.warn(caution, InputWarning, stacklevel=2)
-        self._auto = backend == "auto"
+        self._asked, self._auto = backend, backend == "auto"
         self._backend = backends.choose(backend)
         self.threads = thread_count(threads)
         self._bundles = Bundles(len(views), self._bundle)
@@ -208,6 +209,18 @@ class Projector(LinearOperator):
         """
         volume = self._check(volume)
         return (to_caller(image, volume) for image in self._images(volume))
+
+    def subsets(self, n: int) -> list[Projector]:
+        """`n` projectors of parts of the views, balanced over rings and angles, their sizes differing by one at most.
+
+        `balanced_subsets` says which views each has. Raises InputError where `n` is not from 1 to the number of views.
+        """
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", InputWarning)  # this projector has given them
+            return [
+                Projector(self.grid, self.views[which], self.model.of_views(which), self._asked, self.threads)
+                for which in balanced_subsets(self.views, n)
+            ]
 
     def __repr__(self) -> str:
         n_v, n_u = self.views.shape

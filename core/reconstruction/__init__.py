@@ -1,0 +1,1 @@
+"""From counts or line integrals back to a volume, and scores of it."""

@@ -43,6 +43,8 @@ from .physics.performance import ModulePerformance, isocentre_performance, magni
 from .physics.sampling import sampling_gaps
 from .progress import Cancelled, Progress
 from .projector import Emission, InverseSquareSum, Projector, Transmission, intensity, trace_rays
+from .reconstruction.expectation import mlem, osem
+from .reconstruction.result import Reconstruction
 from .runs.files import read_run, write_run
 from .runs.mosaic import as_seen, mosaic
 from .runs.projecting import project_run

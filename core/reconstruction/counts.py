@@ -45,6 +45,10 @@ class CountData:
     def __getitem__(self, which: NDArray[np.int64]) -> "CountData":
         return CountData(self.counts[which], self.background[which])
 
+    def record(self) -> dict[str, float]:
+        """For a reconstruction's settings."""
+        return {"counts": float(self.counts.sum(dtype=float)), "background": float(self.background.sum(dtype=float))}
+
     def ratio(self, images: Array) -> Array:
         """Measured by expected counts, where a volume's are `images`; 0 where neither is above 0.
 

@@ -11,8 +11,12 @@ from ..projector import Projector
 from ..projector.subsets import access_order, balanced_subsets
 from .counts import LEAST, CountData
 from .loop import Loop, Start, waiting
+from .priors import Prior, penalty_of
 from .result import Array, Callback, Reconstruction
 from .stopping import StopWhen
+
+# Of the sensitivity: less than this share a prior leaves nowhere.
+_LEAST_SHARE = 0.1
 
 
 def mlem(
@@ -25,6 +29,7 @@ def mlem(
     callback: Callback | None = None,
     progress: Progress | None = None,
     stop: StopWhen | None = None,
+    prior: Prior | None = None,
 ) -> Reconstruction:
     """The activity for which the counts are most likely, by MLEM: ``x <- x / A.T(1) * A.T(counts / (A x + background))``.
 
@@ -50,25 +55,35 @@ def mlem(
         before as its `reconstruction`.
     stop : StopWhen, optional
         Ends it earlier.
+    prior : Quadratic, RelativeDifference or TotalVariation, optional
+        Penalises noise, one step late: its gradient at the volume before the update is added to the sensitivity that divides
+        (Green 1990). Where the sum is below a tenth of the sensitivity it is that tenth, so that the volume stays positive
+        and a strong prior's update goes at most ten times as far. The penalised likelihood may fall; `bsrem` makes it as
+        large as it can be.
 
     Returns
     -------
     Reconstruction
-        `objective` is the log-likelihood after each iteration, without terms that no volume changes. Voxels that no pixel
-        sees are 0. Pixels with counts which neither the volume nor the background can have caused are left out.
+        `objective` is the log-likelihood after each iteration, without terms that no volume changes, less the prior's
+        penalty. Voxels that no pixel sees are 0. Pixels with counts which neither the volume nor the background can have
+        caused are left out.
 
     Raises
     ------
     InputError
-        Counts, background, start or mask have another shape or grid, or are negative or not finite.
+        Counts, background, start or mask have another shape or grid, or are negative or not finite; `prior` is none, or its
+        anatomy has another grid.
 
     References
     ----------
     L. A. Shepp, Y. Vardi, "Maximum likelihood reconstruction for emission tomography", IEEE Transactions on Medical Imaging
     1 (1982) 113-122.
+
+    P. J. Green, "Bayesian reconstructions from emission tomography data using a modified EM algorithm", IEEE Transactions on
+    Medical Imaging 9 (1990) 84-93.
     """
     loop = Loop("MLEM", A, iterations, start, mask, callback, progress, stop)
-    return _em(loop, A, CountData.of("MLEM", A, counts, background), 1)
+    return _em(loop, A, CountData.of("MLEM", A, counts, background), 1, prior)
 
 
 def osem(
@@ -82,6 +97,7 @@ def osem(
     callback: Callback | None = None,
     progress: Progress | None = None,
     stop: StopWhen | None = None,
+    prior: Prior | None = None,
 ) -> Reconstruction:
     """As `mlem`, but each iteration updates the volume once for each subset of the views (OSEM).
 
@@ -95,7 +111,8 @@ def osem(
     Transactions on Medical Imaging 13 (1994) 601-609.
     """
     loop = Loop("OSEM", A, iterations, start, mask, callback, progress, stop)
-    return _em(loop, A, CountData.of("OSEM", A, counts, background), usual_subsets(A) if subsets is None else subsets)
+    data = CountData.of("OSEM", A, counts, background)
+    return _em(loop, A, data, usual_subsets(A) if subsets is None else subsets, prior)
 
 
 def usual_subsets(A: Projector) -> int:
@@ -103,7 +120,8 @@ def usual_subsets(A: Projector) -> int:
     return max(1, len(A.views) // 5)
 
 
-def _em(loop: Loop, A: Projector, data: CountData, subsets: Any) -> Reconstruction:
+def _em(loop: Loop, A: Projector, data: CountData, subsets: Any, prior: Prior | None) -> Reconstruction:
+    penalty = penalty_of(prior, A.grid)
     parts = subsets_of(A, data, subsets)
     n = len(parts)
     seen = sensitivities(A, parts, loop.preparing())
@@ -115,16 +133,19 @@ def _em(loop: Loop, A: Projector, data: CountData, subsets: Any) -> Reconstructi
         for k, s in enumerate(access_order(n)):
             part, own = parts[s]
             asked = waiting(progress, k, n)
-            expected = images if n == 1 and images is not None else part(x, asked)
-            factor = part.T(own.ratio(expected), asked)
-            np.divide(factor, seen[s], out=factor, where=seen[s] > LEAST)
-            x = np.multiply(x, factor, out=factor) if n == 1 else np.where(seen[s] > LEAST, x * factor, x)
+            factor = part.T(own.ratio(part(x, asked) if images is None or n > 1 else images), asked)
+            divisor = seen[s]
+            if penalty is not None:
+                divisor = np.maximum(divisor + penalty.gradient(x) / n, _LEAST_SHARE * divisor)
+            factor = np.divide(factor, divisor, out=np.ones_like(x), where=seen[s] > LEAST)
+            x = np.multiply(x, factor, out=factor)
             if progress is not None:
                 progress(k + 1, n)
         images = A(x, waiting(progress, n, n))
-        return x, data.log_likelihood(images)
+        objective = data.log_likelihood(images)
+        return x, objective if penalty is None else objective - penalty.value(x)
 
-    return loop.run(step, {"subsets": n})
+    return loop.run(step, {"subsets": n, **data.record(), **({} if prior is None else prior.record())})
 
 
 def subsets_of(A: Projector, data: CountData, n: Any) -> list[tuple[Projector, CountData]]:

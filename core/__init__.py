@@ -43,6 +43,7 @@ from .physics.performance import ModulePerformance, isocentre_performance, magni
 from .physics.sampling import sampling_gaps
 from .progress import Cancelled, Progress
 from .projector import Emission, InverseSquareSum, Projector, Transmission, intensity, trace_rays
+from .reconstruction.bsrem import bsrem
 from .reconstruction.expectation import mlem, osem
 from .reconstruction.files import read_reconstruction, write_reconstruction
 from .reconstruction.priors import Prior, Quadratic, RelativeDifference, TotalVariation

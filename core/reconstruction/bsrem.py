@@ -17,7 +17,10 @@ from .stopping import StopWhen
 # Of a voxel's value: no update leaves less, so that one bad step can be mended.
 _LEAST_SHARE = np.float32(0.1)
 
-# Of the mean activity: what counts as 0, from where a voxel can still grow.
+# Of the mean activity: voxels are moved as if they had so much more, so that those of 0 can grow.
+_LIFT = 0.01
+
+# Of the mean activity: less is 0.
 _NOTHING = 1e-6
 
 # Of the objective: less is rounding.
@@ -47,10 +50,10 @@ def bsrem(
     """The activity with the largest penalised likelihood, ``log-likelihood - prior``: it ends there, as OSEM does not.
 
     Each iteration takes a step for each subset of the views, ``x <- x + step * x / (s + x c) * gradient``, with s the
-    sensitivity and c the prior's curvature. In the first iteration the subset's gradient stands for that of all. From the
-    second on it is corrected by what the subset's gradient was at the iteration's beginning, where that of all views is
-    known (Johnson & Zhang 2013, Twyman et al. 2023): so it ends at the maximum without the steps having to shrink, in tens
-    of iterations instead of thousands. Each costs about two of `osem`.
+    sensitivity and c the prior's curvature (and x lifted a little, so that zeros can grow). In the first iteration the
+    subset's gradient stands for that of all. From the second on it is corrected by what it was at the iteration's beginning,
+    where that of all views is known (Johnson & Zhang 2013, Twyman et al. 2023): so it ends at the maximum without the steps
+    having to shrink, in tens of iterations instead of thousands. Each costs about two of `osem`.
 
     Parameters
     ----------
@@ -68,7 +71,7 @@ def bsrem(
     -------
     Reconstruction
         `objective` is the penalised log-likelihood after each iteration, without terms that no volume changes. Voxels that
-        no pixel sees are 0. Those that are 0 at the maximum are a millionth of the mean activity or less.
+        no pixel sees are 0.
 
     Raises
     ------
@@ -103,8 +106,8 @@ def bsrem(
     n_counts = data.counts.sum(dtype=float)
     most = np.divide(np.float32(n_counts), total, out=np.zeros_like(total), where=visible)
     mean = n_counts / max(float(total.sum(where=visible, dtype=float)), float(LEAST))
-    least = np.where(visible, np.float32(_NOTHING * mean), np.float32(0))
-    loop.values = np.clip(loop.values if start is not None else np.float32(mean), least, most)
+    lift, nothing = np.float32(_LIFT * mean), np.float32(_NOTHING * mean)
+    loop.values = np.minimum(loop.values if start is not None else np.float32(mean), most)
     images: list[Array] | None = None  # of the current volume in each subset, where they are known
 
     def gradient(s: int, its_images: Array, asked: Progress | None) -> Array:
@@ -117,18 +120,20 @@ def bsrem(
 
     def moved(x: Array, upwards: Array, scale: Array, size: float) -> Array:
         """The volume a step further up a gradient, within its bounds."""
-        found = np.divide(x, scale, out=np.zeros_like(x), where=visible)
+        found = np.divide(x + lift, scale, out=np.zeros_like(x), where=visible)
         found *= np.float32(size)
         found *= upwards
         found += x
-        return np.clip(np.maximum(found, _LEAST_SHARE * x), least, most)
+        found = np.clip(found, _LEAST_SHARE * x, most)
+        found[found < nothing] = 0
+        return found
 
     def step(number: int, x: Array, progress: Progress | None) -> tuple[Array, float]:
         nonlocal images
         if images is None:
             images = [part(x, waiting(progress, 0, 2 * n)) for part, _ in parts]
         halvings = int(loop.state.get("halvings", np.zeros(()))[()])
-        scale = total if penalty is None else total + x * penalty.curvature(x)
+        scale = total if penalty is None else total + (x + lift) * penalty.curvature(x)
         before, least_gain = -np.inf, 0.0
         at_start: list[Array] = []
         overall = np.zeros_like(x)

@@ -46,6 +46,7 @@ from .projector import Emission, InverseSquareSum, Projector, Transmission, inte
 from .reconstruction.expectation import mlem, osem
 from .reconstruction.result import Reconstruction
 from .reconstruction.scores.derenzo import DerenzoScore, DerenzoSector, RodProfile, derenzo_score
+from .reconstruction.scores.images import BiasAndDeviation, bias_and_deviation, contrast_to_noise, nrmse, psnr, ssim
 from .runs.files import read_run, write_run
 from .runs.mosaic import as_seen, mosaic
 from .runs.projecting import project_run

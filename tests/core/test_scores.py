@@ -7,6 +7,7 @@ import functools
 import numpy as np
 import pytest
 from scipy.integrate import quad
+from scipy.ndimage import gaussian_filter
 from scipy.special import i0e
 
 import mphdrr.core as mph
@@ -166,3 +167,120 @@ def test_derenzo_score_refuses_what_it_cannot_take(truth):
         mph.derenzo_score(mph.Volume(truth.array, truth.grid, "hu"), PHANTOM)
     with pytest.raises(mph.InputError, match="phantom pose"):
         mph.derenzo_score(truth, PHANTOM, np.zeros((4, 4)))
+
+
+GRID = mph.Grid.centered((20, 24, 16), 1.0)
+
+
+@pytest.fixture
+def pair(rng) -> tuple[mph.Volume, mph.Volume]:
+    """A truth of blobs, and the same with noise."""
+    values = gaussian_filter(rng.random(GRID.shape), 2.0) * 40
+    return mph.Volume(values + 0.5 * rng.standard_normal(GRID.shape), GRID), mph.Volume(values, GRID)
+
+
+def test_scores_of_the_truth_itself(pair):
+    _, truth = pair
+    assert mph.nrmse(truth, truth) == 0
+    assert mph.psnr(truth, truth) == np.inf
+    assert mph.ssim(truth, truth) == pytest.approx(1.0, abs=1e-12)
+    assert mph.nrmse(uniform(0, GRID), truth) == 1
+
+
+def test_errors_are_those_of_the_definitions(pair):
+    volume, truth = pair
+    error = volume.array.astype(float) - truth.array
+    assert mph.nrmse(volume, truth) == pytest.approx(np.linalg.norm(error) / np.linalg.norm(truth.array), rel=1e-6)
+    span = np.ptp(truth.array)
+    assert mph.psnr(volume, truth) == pytest.approx(10 * np.log10(span**2 / np.mean(error**2)), rel=1e-6)
+    assert mph.psnr(volume, truth, data_range=10 * span) == pytest.approx(mph.psnr(volume, truth) + 20)
+    mask = truth.array > np.median(truth.array)
+    expected = np.linalg.norm(error[mask]) / np.linalg.norm(truth.array[mask])
+    assert mph.nrmse(volume.array, truth.array, mask=mask) == pytest.approx(expected, rel=1e-6)
+
+
+def ssim_by_scipy(x: np.ndarray, y: np.ndarray, span: float) -> float:
+    """As scikit-image's structural_similarity with gaussian_weights and without use_sample_covariance."""
+
+    def windowed(values: np.ndarray) -> np.ndarray:
+        return gaussian_filter(values, 1.5, truncate=3.5)[(slice(5, -5),) * values.ndim]
+
+    mx, my = windowed(x), windowed(y)
+    vx, vy, vxy = windowed(x * x) - mx**2, windowed(y * y) - my**2, windowed(x * y) - mx * my
+    c1, c2 = (0.01 * span) ** 2, (0.03 * span) ** 2
+    return float(np.mean((2 * mx * my + c1) * (2 * vxy + c2) / ((mx**2 + my**2 + c1) * (vx + vy + c2))))
+
+
+def test_ssim_is_that_of_other_programs(pair):
+    x, y = (volume.array.astype(float) for volume in pair)
+    assert 0.2 < mph.ssim(*pair) < 0.98
+    assert mph.ssim(*pair) == pytest.approx(ssim_by_scipy(x, y, np.ptp(y)), abs=1e-9)
+    assert mph.ssim(x, y, data_range=50) == pytest.approx(mph.ssim(y, x, data_range=50), abs=1e-12)
+    # A slice has one of two dimensions.
+    assert mph.ssim(x[:, :, :1], y[:, :, :1]) == pytest.approx(ssim_by_scipy(x[..., 0], y[..., 0], np.ptp(y[..., 0])))
+
+
+def test_similarity_and_errors_do_not_depend_on_the_unit(pair):
+    volume, truth = (mph.Volume(1000 * x.array, GRID) for x in pair)
+    for score in (mph.nrmse, mph.psnr, mph.ssim):
+        assert score(volume, truth) == pytest.approx(score(*pair), rel=1e-5)
+
+
+def test_volumes_on_different_grids_are_not_compared(pair):
+    volume, truth = pair
+    moved = mph.Volume(truth.array, mph.Grid.centered(GRID.shape, 1.0, center=(0.5, 0, 0)))
+    finer = mph.Volume(truth.array, mph.Grid.centered(GRID.shape, 0.5))
+    for score in (mph.nrmse, mph.psnr, mph.ssim):
+        for other in (moved, finer):
+            with pytest.raises(mph.InputError, match=r"different grids; mph\.resample\(truth, volume\.grid"):
+                score(volume, other)
+        with pytest.raises(mph.InputError, match="volume of activity, truth of mu"):
+            score(volume, mph.Volume(truth.array, GRID, "mu"))
+        with pytest.raises(mph.InputError, match="volume of 20 x 24 x 16, truth of 3 x 3 voxels"):
+            score(volume, np.ones((3, 3)))
+    assert mph.nrmse(volume, mph.resample(moved, GRID, "mean")) > mph.nrmse(volume, truth)
+
+
+def test_contrast_to_noise(rng):
+    values = rng.normal(10, 2, GRID.shape)
+    inside = np.zeros(GRID.shape, bool)
+    inside[8:12, 8:12, 8:12] = True
+    values[inside] += 6
+    assert mph.contrast_to_noise(mph.Volume(values, GRID), inside, ~inside) == pytest.approx(3, abs=0.5)
+    assert mph.contrast_to_noise(-values, inside, ~inside) == -mph.contrast_to_noise(values, inside, ~inside)
+    assert mph.contrast_to_noise(inside.astype(float), inside, ~inside) == np.inf
+    for wrong in (inside.astype(int), inside[1:], np.zeros(GRID.shape, bool)):
+        with pytest.raises(mph.InputError, match="contrast_to_noise: target: expected"):
+            mph.contrast_to_noise(values, wrong, ~inside)
+
+
+def test_bias_and_deviation_make_the_error(pair, rng):
+    _, truth = pair
+    draws = [mph.Volume(0.9 * truth.array + rng.normal(0, 0.3, GRID.shape), GRID) for _ in range(12)]
+    bias, deviation = mph.bias_and_deviation(iter(draws), truth)
+    stack = np.stack([draw.array for draw in draws]).astype(float)
+    assert np.allclose(bias.array, stack.mean(axis=0) - truth.array, atol=1e-5)
+    assert np.allclose(deviation.array, stack.std(axis=0, ddof=1), atol=1e-5)
+    squares = np.mean((stack - truth.array) ** 2, axis=0)
+    assert np.allclose(bias.array**2 + 11 / 12 * deviation.array**2, squares, atol=1e-4)
+    assert deviation.array.mean() == pytest.approx(0.3, rel=0.05) and bias.unit == "kBq/mL"
+    with pytest.raises(mph.InputError, match="expected two volumes or more, got 1"):
+        mph.bias_and_deviation(draws[:1], truth)
+    with pytest.raises(mph.InputError, match="volume 2: volume and truth are on different grids"):
+        mph.bias_and_deviation([truth, uniform(1, mph.Grid.centered(8, 1))], truth)
+
+
+@pytest.mark.parametrize(
+    ("wrong", "message"),
+    [
+        (lambda v: mph.nrmse(v, uniform(0, GRID)), "nrmse: the truth is 0 everywhere"),
+        (lambda v: mph.psnr(v, uniform(2, GRID)), "psnr: the truth is the same everywhere"),
+        (lambda v: mph.ssim(v, v, data_range=-1), "ssim: data_range: expected more than 0"),
+        (lambda v: mph.ssim(np.ones((20, 20, 5)), np.ones((20, 20, 5)), 1), "at least 11 voxels along each axis"),
+        (lambda v: mph.nrmse(np.full(3, np.nan), np.ones(3)), "nrmse: nan at index 0|nrmse: nan is not a finite"),
+        (lambda v: mph.nrmse("volume", v), "nrmse: expected real numbers"),
+    ],
+)
+def test_images_that_cannot_be_scored(pair, wrong, message):
+    with pytest.raises(mph.InputError, match=message):
+        wrong(pair[0])

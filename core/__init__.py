@@ -50,7 +50,7 @@ from .runs.mosaic import as_seen, mosaic
 from .runs.projecting import project_run
 from .runs.recipe import Recipe, read_recipe, write_recipe
 from .runs.run import ProjectionRun
-from .runs.run_recipe import run_recipe
+from .runs.run_recipe import projector_of_run, run_recipe
 from .volumes.meshes.mesh import Mesh, read_mesh, write_mesh
 from .volumes.meshes.surface import volume_to_mesh
 from .volumes.meshes.voxelization import voxelize_mesh

@@ -46,7 +46,10 @@ from .projector import Emission, InverseSquareSum, Projector, Transmission, inte
 from .reconstruction.expectation import mlem, osem
 from .reconstruction.result import Reconstruction
 from .runs.files import read_run, write_run
+from .runs.frame_files import read_counts
+from .runs.measured import counts_run
 from .runs.mosaic import as_seen, mosaic
+from .runs.orientations import ORIENTATIONS
 from .runs.projecting import project_run
 from .runs.recipe import Recipe, read_recipe, write_recipe
 from .runs.run import ProjectionRun

@@ -25,7 +25,8 @@ class CountData:
     def of(cls, A: Projector, counts: ArrayLike, background: ArrayLike = 0.0) -> "CountData":
         """Checked: counts and background are at least 0, of the projector's shape.
 
-        The background is one number, one for each module (M,), or images. Raises InputError.
+        The background is one number, one for each module (M,), or images; that of the projector's model is added to it.
+        Raises InputError.
         """
         if not isinstance(A, Projector):
             raise InputError(f"reconstruction: expected a Projector, got {type(A).__name__}")
@@ -40,7 +41,7 @@ class CountData:
             raise InputError(f"background: expected {shapes}, got {' x '.join(map(str, extra.shape))}")
         if not np.isfinite(extra).all() or extra.min(initial=0.0) < 0:
             raise InputError("background: expected finite numbers, 0 or more")
-        return cls(measured, np.broadcast_to(extra, A.shape_out))
+        return cls(measured, np.broadcast_to(extra + A.background.astype(np.float32), A.shape_out))
 
     def __getitem__(self, which: NDArray[np.int64]) -> "CountData":
         return CountData(self.counts[which], self.background[which])

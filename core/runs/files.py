@@ -47,6 +47,7 @@ _ARRAYS: dict[str, tuple[str, Callable[[ProjectionRun], Any]]] = {
     **{f"views/{name}": ("mm", attrgetter(f"views.{name}")) for name in _RAYS},
     "volume/affine": ("mm", lambda run: run.volume.grid.affine),
 }
+_BACKGROUND = "background"  # in the unit of the projections; where there is none, nothing but the volume was projected
 _ATTRIBUTES = "attributes"
 _COMPRESS_FROM = 1 << 16  # bytes: below, compressing costs more than it saves
 
@@ -62,6 +63,8 @@ def write_run(run: ProjectionRun, path: str | os.PathLike[str]) -> None:
     write, _ = _format(Path(path))
     arrays = {"projections": run.projections, "volume/array": run.volume.array}
     arrays |= {name: get(run) for name, (_, get) in _ARRAYS.items()}
+    if np.any(run.background):
+        arrays[_BACKGROUND] = np.asarray(run.background)
     attributes = {
         "format": _FORMAT,
         "format_version": _FORMAT_VERSION,
@@ -118,6 +121,7 @@ def _run_of(arrays: dict[str, NDArray[Any]], attributes: dict[str, Any]) -> Proj
         workbook=str(attributes["workbook"]),
         workbook_sha256=str(attributes["workbook_sha256"]),
         versions=json.loads(attributes["versions"]),
+        background=arrays.get(_BACKGROUND, 0.0),  # type: ignore[arg-type]  # checked there
     )
 
 
@@ -125,7 +129,8 @@ def _write_hdf5(arrays: dict[str, NDArray[Any]], attributes: dict[str, Any], pat
     """Arrays as datasets with a `unit`, in chunks of one view each, so that one view reads alone; attributes on the root."""
     import h5py
 
-    units = {"projections": attributes["projections_unit"], "volume/array": attributes["volume_unit"]}
+    unit = attributes["projections_unit"]
+    units = {"projections": unit, _BACKGROUND: unit, "volume/array": attributes["volume_unit"]}
     units |= {name: unit for name, (unit, _) in _ARRAYS.items()}
     with h5py.File(path, "w") as file:
         file.attrs.update(attributes)

@@ -15,6 +15,7 @@ from ..geometry.views import Views
 from ..validation import freeze, positive, real_array, shape_text
 from ..volumes.volume import LINE_INTEGRALS, Volume, require_quantity
 from .bundles import Beam
+from .depth_response import DepthResponses
 from .pixel_points import TOLERANCE, offsets, points_needed, require_points, shadow_edges
 from .rays import Fan
 
@@ -72,6 +73,10 @@ class Model(ABC):
     def voxel_weights(self, views: Views, m: int, grid: Grid) -> Array:
         """Factors of the voxels in view m, ``grid.shape``; used if `weights_voxels`."""
         return np.ones(grid.shape)
+
+    def by_depth(self, views: Views, grid: Grid) -> DepthResponses | None:
+        """What projects in place of rays, if the model is of that kind."""
+        return None
 
     def response(self, views: Views, m: int) -> tuple[Array, Array] | None:
         """The detector's response in view m: matrices (n_v, n_v) along v and (n_u, n_u) along u, None if ideal."""

@@ -2,9 +2,7 @@
 
 #include "kernels.h"
 
-typedef void Kernel(const Job *);
-
-// Level by level, what siddon.c is compiled to.
+// Level by level, what siddon.c and depth.c are compiled to.
 #ifdef __x86_64__
 #define EACH(name) name##_0_float, name##_0_double, name##_1_float, name##_1_double, name##_2_float, name##_2_double
 static const char *const names[] = {"SSE2", "AVX2", "AVX-512"};
@@ -19,26 +17,34 @@ static const char *const names[] = {"NEON"};
 #else
 #define EXPORT __attribute__((visibility("default")))
 #endif
-#define DISPATCH(name)                                  \
-    Kernel EACH(name);                                  \
-    EXPORT void name(int64_t level, const Job *job) {   \
-        static Kernel *const kernels[] = {EACH(name)};  \
-        kernels[2 * level + job->is_double](job);       \
+#define DISPATCH(name, Task)                                 \
+    Kernel##Task EACH(name);                                 \
+    EXPORT void name(int64_t level, const Task *job) {       \
+        static Kernel##Task *const kernels[] = {EACH(name)}; \
+        kernels[2 * level + job->is_double](job);            \
     }
 
-DISPATCH(forward)
-DISPATCH(backproject)
-DISPATCH(differentiate)
-DISPATCH(differentiate_by_mu)
+typedef void KernelJob(const Job *);
+typedef void KernelDepthJob(const DepthJob *);
+
+DISPATCH(forward, Job)
+DISPATCH(backproject, Job)
+DISPATCH(differentiate, Job)
+DISPATCH(differentiate_by_mu, Job)
+DISPATCH(voxels_to_cells, DepthJob)
+DISPATCH(cells_to_voxels, DepthJob)
+DISPATCH(cells_to_pixels, DepthJob)
+DISPATCH(pixels_to_cells, DepthJob)
 
 EXPORT const char *level_name(int64_t level) {
     return level < (int64_t)(sizeof(names) / sizeof(names[0])) ? names[level] : 0;
 }
 
-EXPORT void contract(int64_t numbers[3]) {
+EXPORT void contract(int64_t numbers[4]) {
     numbers[0] = CONTRACT;
     numbers[1] = sizeof(Job);
     numbers[2] = sizeof(Fan);
+    numbers[3] = sizeof(DepthJob);
 }
 
 #ifdef __x86_64__

@@ -1,7 +1,7 @@
 """Compile the C kernels of the projector into the library of one platform, with the compiler in the package ziglang.
 
 Zig compiles for every platform on any other. The sources are in core/projector/backends/kernels/; siddon.c is compiled once
-per level of processor and number type.
+per level of processor and number type, backprojection.c once per level.
 """
 
 from __future__ import annotations
@@ -70,6 +70,7 @@ def compiled(name: str, folder: str | Path, flags: tuple[str, ...] = FLAGS) -> l
     for level, options in enumerate(made_for.levels):
         for real in ("float", "double"):
             calls.append((f"{real}{level}.o", "siddon.c", (*options, f"-DLEVEL={level}", f"-DREAL={real}")))
+        calls.append((f"smear{level}.o", "backprojection.c", (*options, f"-DLEVEL={level}", "-DREAL=float")))
 
     def compile_one(call: tuple[str, str, tuple[str, ...]]) -> str:
         made, source, options = call

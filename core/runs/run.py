@@ -47,6 +47,7 @@ class ProjectionRun:
     versions: Mapping[str, str] = field(default_factory=versions)  # of mphDRR and what it ran on
 
     def __post_init__(self) -> None:
+        self.views.require_pinholes("run")
         if len(self.views) != len(self.system):
             raise InputError(f"run: {len(self.system)} modules, but {len(self.views)} views")
         shape = (len(self.views), *self.views.shape)

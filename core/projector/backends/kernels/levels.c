@@ -3,13 +3,16 @@
 #include "kernels.h"
 
 typedef void Kernel(const Job *);
+typedef void SmearKernel(const Smear *);
 
-// Level by level, what siddon.c is compiled to.
+// Level by level, what siddon.c and backprojection.c are compiled to.
 #ifdef __x86_64__
 #define EACH(name) name##_0_float, name##_0_double, name##_1_float, name##_1_double, name##_2_float, name##_2_double
+#define EACH_LEVEL(name) name##_0, name##_1, name##_2
 static const char *const names[] = {"SSE2", "AVX2", "AVX-512"};
 #else // arm64
 #define EACH(name) name##_0_float, name##_0_double
+#define EACH_LEVEL(name) name##_0
 static const char *const names[] = {"NEON"};
 #endif
 
@@ -31,14 +34,21 @@ DISPATCH(backproject)
 DISPATCH(differentiate)
 DISPATCH(differentiate_by_mu)
 
+SmearKernel EACH_LEVEL(smear);
+EXPORT void smear(int64_t level, const Smear *job) {
+    static SmearKernel *const kernels[] = {EACH_LEVEL(smear)};
+    kernels[level](job);
+}
+
 EXPORT const char *level_name(int64_t level) {
     return level < (int64_t)(sizeof(names) / sizeof(names[0])) ? names[level] : 0;
 }
 
-EXPORT void contract(int64_t numbers[3]) {
+EXPORT void contract(int64_t numbers[4]) {
     numbers[0] = CONTRACT;
     numbers[1] = sizeof(Job);
     numbers[2] = sizeof(Fan);
+    numbers[3] = sizeof(Smear);
 }
 
 #ifdef __x86_64__

@@ -280,6 +280,7 @@ class Emission(Model):
             raise InputError(
                 f"emission: {len(self.system)} modules but {len(views)} views; give the system whose views they are"
             )
+        views.require_pinholes("emission")
         u, v, k = self.system.frames().transpose(1, 0, 2)
         moved = np.linalg.norm(views.sources - self.system.centers, axis=1) > _SAME_PLACE
         turned = np.zeros(len(views), dtype=bool)

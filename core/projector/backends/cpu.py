@@ -24,12 +24,21 @@ Array = NDArray[Any]  # of float32 or float64
 LEVEL_VARIABLE = "MPHDRR_CPU_LEVEL"
 """Environment variable that names a lower level of processor, `levels`, than this one's."""
 
-_CONTRACT = 3
+_CONTRACT = 4
 _NAMES = {"win32": "siddon.dll", "darwin": "libsiddon.dylib"}
 _MOST_VOXELS = 2**31 - 1  # their indices are of 32 bits
 _MOST_ALONG = 2**12  # where float32 knows the length of a segment to 0.1 %
 
-_FAN = np.dtype([("volume", "(4,3)f8"), ("mu", "(4,3)f8"), ("world", "(3,3)f8"), ("rows", "i8"), ("columns", "i8")])
+_FAN = np.dtype(
+    [
+        ("volume", "(4,3)f8"),
+        ("mu", "(4,3)f8"),
+        ("world", "(3,3)f8"),
+        ("rows", "i8"),
+        ("columns", "i8"),
+        ("parallel", "f8"),
+    ]
+)
 
 
 class _Lattice(Structure):
@@ -58,15 +67,23 @@ class _DepthJob(Structure):
     ]  # fmt: skip
 
 
+class _Smear(Structure):
+    _fields_ = [
+        ("images", c_void_p), ("matrices", c_void_p), ("views", c_int64), ("rows", c_int64), ("columns", c_int64),
+        ("volume", c_void_p), ("n", c_int64 * 3),
+    ]  # fmt: skip
+
+
 def _load() -> ctypes.CDLL:
     """The library in this package."""
     path = Path(__file__).with_name("kernels") / _NAMES.get(sys.platform, "libsiddon.so")
     if not path.is_file():
         raise ImportError(f"no compiled kernels for this platform: {path.name} is not in {path.parent}")
     library = ctypes.CDLL(str(path))
-    numbers = (c_int64 * 4)()
+    numbers = (c_int64 * 5)()
     library.contract(numbers)
-    if list(numbers) != [_CONTRACT, ctypes.sizeof(_Job), _FAN.itemsize, ctypes.sizeof(_DepthJob)]:
+    sizes = (ctypes.sizeof(_Job), _FAN.itemsize, ctypes.sizeof(_DepthJob), ctypes.sizeof(_Smear))
+    if tuple(numbers) != (_CONTRACT, *sizes):
         raise ImportError(f"{path} belongs to another version of mphDRR: install it anew")
     library.best_level.restype, library.level_name.restype = c_int64, c_char_p
     library.level_name.argtypes = [c_int64]
@@ -76,6 +93,7 @@ def _load() -> ctypes.CDLL:
     for name in ("voxels_to_cells", "cells_to_voxels", "cells_to_pixels", "pixels_to_cells"):
         function = getattr(library, name)
         function.argtypes, function.restype = [c_int64, POINTER(_DepthJob)], None
+    library.smear.argtypes, library.smear.restype = [c_int64, POINTER(_Smear)], None
     return library
 
 
@@ -124,6 +142,18 @@ def mu_gradient(gradient: Array, volume: Array, values: Array, rays: Rays, atten
     _run(_library.differentiate_by_mu, volume, rays, attenuation, values, integrals=integrals, gradient=gradient)
 
 
+def smear(volume: Array, images: Array, matrices: NDArray[np.float64]) -> None:
+    """Add to `volume`, float32, what each image has at its voxels' places, as `voxel_driven.smear` describes it."""
+    if not (volume.flags.c_contiguous and images.flags.c_contiguous and matrices.flags.c_contiguous):
+        raise ValueError("expected arrays in C order")
+    if (volume.dtype, images.dtype, matrices.dtype) != (np.float32, np.float32, np.float64):
+        raise TypeError("expected voxels and images of float32, matrices of float64")
+    if matrices.shape != (len(images), 3, 4) or not volume.flags.writeable or min(images.shape[1:]) < 4:
+        raise ValueError("expected a matrix for each image, images with margins, and a volume that can be written")
+    addresses = images.ctypes.data, matrices.ctypes.data
+    _library.smear(level, _Smear(*addresses, *images.shape, volume.ctypes.data, (c_int64 * 3)(*volume.shape)))
+
+
 def _run(
     kernel: Any, volume: Array, rays: Rays, attenuation: Attenuation | None, values: Array | None = None, **others: Any
 ) -> None:
@@ -165,6 +195,8 @@ def _fans(rays: IndexFans, mu_rays: Any) -> Array:
     if mu_rays is not None:
         fans["mu"] = mu_rays.table[:, :4]
     fans["rows"], fans["columns"] = rays.shape
+    if rays.parallel:
+        fans["parallel"], fans["world"][:, 1:] = 1, 0
     return fans
 
 

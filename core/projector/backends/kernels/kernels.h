@@ -13,7 +13,7 @@
 #pragma once
 #include <stdint.h>
 
-#define CONTRACT 3 // counted up with every change of this file: cpu.py takes no other
+#define CONTRACT 4 // counted up with every change of this file: cpu.py takes no other
 
 // Voxels (n[0], n[1], n[2]) in C order, of a job's kind of number.
 typedef struct {
@@ -25,8 +25,9 @@ typedef struct {
 typedef struct {
     double volume[4][3]; // source, corner, row step, column step in the volume's index space
     double mu[4][3];     // the same in mu's, where that has a lattice of its own
-    double world[3][3];  // source to corner, row step, column step in mm
+    double world[3][3];  // source to corner, row step, column step in mm; the steps are 0 where rays are parallel
     int64_t rows, columns;
+    double parallel; // 1: the sources move along with the points, as far as these; 0: there is one source
 } Fan;
 
 // Rays one by one, columns of arrays (3, count) and (count).
@@ -75,12 +76,22 @@ typedef struct {
     int64_t pixels[2];
 } DepthJob;
 
+// Images that are interpolated at the places of voxels. All numbers are float; an image is at most 2^31 numbers large and
+// has a margin of zeros: a row above, two below, a column on the left, two on the right.
+typedef struct {
+    const float *images;    // (views, rows, columns), margins included
+    const double *matrices; // (views, 3, 4): from a voxel's indices, 1 to (column, row, 1) depth; 0 is the image's first
+    int64_t views, rows, columns;
+    float *volume; // (n[0], n[1], n[2])
+    int64_t n[3];
+} Smear;
+
 // What level of processor the kernels are compiled for; any processor of the platform runs level 0.
 int64_t best_level(void);
 const char *level_name(int64_t level); // null if there is no such level
 
-// CONTRACT, and the bytes of a Job, a Fan and a DepthJob: cpu.py compares them with its own.
-void contract(int64_t numbers[4]);
+// CONTRACT, and the bytes of a Job, a Fan, a DepthJob and a Smear: cpu.py compares them with its own.
+void contract(int64_t numbers[5]);
 
 // values = integrals
 void forward(int64_t level, const Job *job);
@@ -92,6 +103,9 @@ void backproject(int64_t level, const Job *job);
 // where f jumps; with mu, for which the integrals are needed, also by start (3) and end (3) in mu's index space through
 // the planes of mu, all at constant L, and by L at constant ends.
 void differentiate(int64_t level, const Job *job);
+
+// volume += the sum over all images of what is at the voxel's place there, interpolated linearly, divided by its depth^2
+void smear(int64_t level, const Smear *job);
 
 // gradient += the derivative by mu of the sum of values times integrals; the integrals are needed
 void differentiate_by_mu(int64_t level, const Job *job);

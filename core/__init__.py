@@ -44,7 +44,13 @@ from .physics.sampling import sampling_gaps
 from .progress import Cancelled, Progress
 from .projector import Emission, InverseSquareSum, Projector, Transmission, intensity, trace_rays
 from .reconstruction.expectation import mlem, osem
+from .reconstruction.files import read_reconstruction, write_reconstruction
+from .reconstruction.priors import Prior, Quadratic, RelativeDifference, TotalVariation
 from .reconstruction.result import Reconstruction
+from .reconstruction.scores.derenzo import DerenzoScore, DerenzoSector, RodProfile, derenzo_score
+from .reconstruction.scores.images import BiasAndDeviation, bias_and_deviation, contrast_to_noise, nrmse, psnr, ssim
+from .reconstruction.scores.nema import NemaScore, NemaSphere, nema_score
+from .reconstruction.stopping import StopWhen
 from .runs.files import read_run, write_run
 from .runs.frame_files import read_counts
 from .runs.measured import counts_run

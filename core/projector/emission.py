@@ -23,7 +23,7 @@ from ..physics.materials import module_coefficients
 from ..validation import instance, positive, real_array
 from ..volumes.volume import Volume, require_quantity
 from .bundles import Beam
-from .models import Array, Model, view_rays
+from .models import Array, Model, checked_background, view_rays
 from .pixel_points import TOLERANCE, expected_error, lattice, offsets, points_needed, require_points, shadow_edges
 from .rays import Fan
 
@@ -115,6 +115,10 @@ class Emission(Model):
         straight from the hole's rim to the edges of the crystal's front, so they stop no others.
     within_cone : bool
         Whether rays steeper than the knife edge's cone, psi > alpha / 2, count nothing, with either edge.
+    background : float or array (M,) or (M, n_v, n_u)
+        Counts that each pixel is expected to have besides those of the volume, such as scatter and dark counts: in the whole
+        acquisition, so they do not grow with `time`. One number, one for each module, or images. ``A(x)`` is linear and
+        leaves them out; runs add them before noise is drawn (`project_run`), and reconstructions expect them.
 
     Raises
     ------
@@ -147,6 +151,7 @@ class Emission(Model):
     within_cone: bool = False
     pixel_points: int | None = None
     tolerance: float = TOLERANCE
+    background: float | Array = 0.0  # type: ignore[assignment]  # no class of mutable values: checked, and frozen
 
     name = "emission"
     takes = ("activity",)
@@ -186,6 +191,7 @@ class Emission(Model):
             raise InputError("emission: depth_layers needs crystal_mu, of the crystal's material")
         for name in ("within_crystal", "within_walls", "within_cone"):
             self._set(name, bool(getattr(self, name)))
+        self._set("background", checked_background(self.background, "emission: background", len(self.system)))
 
     def _set(self, name: str, value: Any) -> None:
         object.__setattr__(self, name, value)
@@ -222,10 +228,12 @@ class Emission(Model):
                 self._set(name, positive(value, f"emission: {name}"))
 
     def record(self) -> dict[str, Any]:
-        """The settings, for a run's record; of mu only its grid, of the isotope its name."""
+        """The settings, for a run's record: of mu its grid, of the isotope its name, of a background's images a word."""
         settings = {f.name: getattr(self, f.name) for f in fields(self) if f.name not in ("system", "mu")}
         settings["isotope"] = None if self.isotope is None else self.isotope.name  # type: ignore[union-attr]
         settings["window"] = None if self.window is None else list(self.window)
+        if isinstance(self.background, np.ndarray):
+            settings["background"] = self.background.tolist() if self.background.ndim == 1 else "images"
         if self.mu is not None:
             settings["mu"] = {"shape": list(self.mu.grid.shape), "affine": self.mu.grid.affine.tolist()}
         return settings
@@ -241,7 +249,8 @@ class Emission(Model):
 
     def of_views(self, which: NDArray[np.integer]) -> Self:
         """The model of the modules `which` (indices) alone."""
-        return replace(self, system=self.system[which])
+        background = self.background[which] if isinstance(self.background, np.ndarray) else self.background
+        return replace(self, system=self.system[which], background=background)
 
     def check(self, views: Views) -> None:
         """Raise `InputError` unless `views` are of this system."""
@@ -263,6 +272,7 @@ class Emission(Model):
         ):
             if bad.any():
                 raise InputError(f"emission: view {int(np.argmax(bad))}: {why}")
+        checked_background(self.background, "emission: background", len(views), views.shape)
 
     @property
     def effective_diameter(self) -> Array:

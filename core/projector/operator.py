@@ -8,6 +8,7 @@ from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ..arrays import ArrayOrTensor, cast_like, checked, is_double, is_tensor, promote, to_caller, zeros
 from ..errors import InputError, InputWarning
@@ -196,6 +197,12 @@ class Projector(LinearOperator):
     def shape_out(self) -> tuple[int, int, int]:
         """Shape of the images, (M, n_v, n_u)."""
         return (len(self.views), *self.views.shape)
+
+    @property
+    def background(self) -> NDArray[np.floating[Any]]:
+        """What the model expects besides the volume's images, (M, n_v, n_u), read-only: ``A(x) + A.background``."""
+        values = np.asarray(self.model.background)
+        return np.broadcast_to(values[:, None, None] if values.ndim == 1 else values, self.shape_out)
 
     @property
     def T(self) -> AdjointProjector:

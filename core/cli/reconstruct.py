@@ -1,0 +1,122 @@
+"""``mphdrr reconstruct RUN -o volume.nii.gz``: from a run's images back to a volume."""
+
+import argparse
+import sys
+import time
+from typing import Any
+
+from ..errors import InputError
+from ..figures.page import SUFFIXES, Page
+from ..figures.reconstructions import SIZE, SIZE_BESIDE_TRUTH, draw
+from ..progress import Progress
+from ..reconstruction.methods import METHODS
+from ..runs.files import FORMATS, read_run
+from ..runs.recipe import Recipe, read_recipe, write_recipe
+from ..runs.reconstructing import TABLES, is_simulated, recipe_of, reconstruct_run
+from ..runs.run import ProjectionRun
+from ..runs.settings import SETTINGS
+from ..volumes.volume_files import VOLUME_FORMATS, read_volume, write_volume
+from .options import add_command, output_path, progress_bar
+from .recipe_options import add_entries, add_setting, typed_entries
+
+_OTHERS = ("attenuation.file", "attenuation.energy", "compute.backend", "compute.threads")
+"""Settings that are options beside those of the reconstruction."""
+
+
+def add_parser(subparsers) -> None:  # type: ignore[no-untyped-def]
+    """Add the command."""
+    parser = add_command(
+        subparsers,
+        "reconstruct",
+        "reconstruct the volume that a run's images are of",
+        "mphdrr reconstruct run.h5 --iterations 20 --subsets 16 --voxels 64 --spacing 1.6 -o volume.nii.gz --picture "
+        "slices.png\n"
+        "example: mphdrr reconstruct run.h5 --recipe study.toml -o volume.nii.gz\n"
+        "example: mphdrr reconstruct run.h5 --set model.intrinsic_fwhm=3 -o volume.nii.gz",
+    )
+    parser.add_argument("file", metavar="RUN", help=f"a run of mphDRR: {', '.join(FORMATS)}")
+    text = f"recipe (.toml) whose tables {', '.join(f'[{table}]' for table in TABLES)} say how; options override it"
+    parser.add_argument("--recipe", metavar="FILE", help=text)
+    for setting in SETTINGS.values():
+        if setting.key.startswith("reconstruction.") or setting.key in _OTHERS:
+            add_setting(parser, setting)
+    add_entries(parser, "model.intrinsic_fwhm=3")
+    text = "begin with this volume, on the same voxels, instead of 1 everywhere"
+    parser.add_argument("--start", metavar="FILE", help=text)
+    parser.add_argument("-o", "--output", metavar="FILE", help=f"the volume: {', '.join(VOLUME_FORMATS)}")
+    text = f"also draw slices and the objective ({', '.join(SUFFIXES)}), of a simulated run beside the truth"
+    parser.add_argument("--picture", metavar="FILE", help=text)
+    parser.add_argument("--quiet", action="store_true", help="no line for each iteration on standard error")
+    text = "write the recipe (.toml) of these options instead of reconstructing"
+    parser.add_argument("--write-recipe", metavar="FILE", help=text)
+    parser.set_defaults(run=_run)
+
+
+def _chosen(arguments: argparse.Namespace, run: ProjectionRun) -> Recipe:
+    recipe = recipe_of(run, None if arguments.recipe is None else read_recipe(arguments.recipe))
+    changes = typed_entries(arguments)
+    for key in changes:
+        if key.partition(".")[0] not in TABLES:
+            raise InputError(f"--set {key}: expected an entry of {', '.join(f'[{table}]' for table in TABLES)}")
+    if changes.get("attenuation.file") is not None:  # instead of what attenuated in the run
+        changes = {"attenuation.of_phantom": None, "attenuation.object": None} | changes
+    return recipe.updated(changes)
+
+
+def _run(arguments: argparse.Namespace) -> None:
+    if arguments.write_recipe:
+        path = output_path(arguments.write_recipe, (".toml",))
+        write_recipe(_chosen(arguments, read_run(arguments.file)), path)
+        print(path)
+        return
+    if not arguments.output and not arguments.picture:
+        raise InputError("nothing to write: give --output FILE, --picture FILE or --write-recipe FILE")
+    path = output_path(arguments.output, VOLUME_FORMATS) if arguments.output else None
+    picture = output_path(arguments.picture, SUFFIXES) if arguments.picture else None
+    run = read_run(arguments.file)
+    recipe = _chosen(arguments, run)
+    start = None if arguments.start is None else read_volume(arguments.start, run.volume.quantity)
+    log = _Log(recipe, arguments.quiet)
+    found = reconstruct_run(run, recipe, start=start, watch=log, stages=log.stage)
+    if path is not None:
+        write_volume(found.volume, path)
+    method = METHODS[recipe["reconstruction.method"]]
+    if picture is not None:
+        truth = run.volume if is_simulated(run) else None
+        page = Page(*(SIZE if truth is None else SIZE_BESIDE_TRUTH))
+        draw(page, found.volume, found.objective.tolist(), truth, f"{method.label} of {arguments.file}",
+             [settings_line(found.iterations, recipe)], method.objective)  # fmt: skip
+        page.write(picture)
+    voxels = " x ".join(map(str, found.volume.grid.shape))
+    iterations = f"{found.iterations} iteration{'s' * (found.iterations > 1)}"
+    largest = f"largest {float(found.volume.array.max()):.4g} {found.volume.unit}"
+    print(f"{path or picture}: {method.label}, {iterations}, {voxels} voxels, {largest}")
+
+
+def settings_line(iterations: int, recipe: Recipe) -> str:
+    """What a picture says of a reconstruction."""
+    said = [f"{iterations} iterations"]
+    if recipe["reconstruction.subsets"] is not None:
+        said.append(f"{recipe['reconstruction.subsets']} subsets")
+    return ", ".join(said)
+
+
+class _Log:
+    """A line on standard error after each iteration; before the first, the stages' bars."""
+
+    def __init__(self, recipe: Recipe, quiet: bool) -> None:
+        self.total, self.quiet = recipe["reconstruction.iterations"], quiet
+        self.name = METHODS[recipe["reconstruction.method"]].objective
+        self.begun = time.monotonic()
+
+    def stage(self, words: str) -> Progress | None:
+        self.begun = time.monotonic()
+        return None if words == "reconstructing" else progress_bar(words)
+
+    def __call__(self, iteration: int, values: Any, objective: list[float]) -> None:
+        if not self.quiet:
+            said = f"{self.name} {objective[-1]:.8g}, " if objective else ""
+            seconds = time.monotonic() - self.begun
+            line = f"iteration {iteration} of {self.total}: {said}largest {float(values.max()):.4g}, {seconds:.1f} s\n"
+            sys.stderr.write(line)
+            sys.stderr.flush()

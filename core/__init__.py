@@ -44,7 +44,10 @@ from .physics.sampling import sampling_gaps
 from .progress import Cancelled, Progress
 from .projector import Emission, InverseSquareSum, Projector, Transmission, intensity, trace_rays
 from .reconstruction.expectation import mlem, osem
+from .reconstruction.files import read_reconstruction, write_reconstruction
+from .reconstruction.priors import Prior, Quadratic, RelativeDifference, TotalVariation
 from .reconstruction.result import Reconstruction
+from .reconstruction.stopping import StopWhen
 from .runs.files import read_run, write_run
 from .runs.mosaic import as_seen, mosaic
 from .runs.projecting import project_run

@@ -47,6 +47,8 @@ from .reconstruction.expectation import mlem, osem
 from .reconstruction.files import read_reconstruction, write_reconstruction
 from .reconstruction.priors import Prior, Quadratic, RelativeDifference, TotalVariation
 from .reconstruction.result import Reconstruction
+from .reconstruction.scores.derenzo import DerenzoScore, DerenzoSector, RodProfile, derenzo_score
+from .reconstruction.scores.images import BiasAndDeviation, bias_and_deviation, contrast_to_noise, nrmse, psnr, ssim
 from .reconstruction.stopping import StopWhen
 from .runs.files import read_run, write_run
 from .runs.mosaic import as_seen, mosaic

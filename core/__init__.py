@@ -54,6 +54,7 @@ from .runs.files import read_run, write_run
 from .runs.mosaic import as_seen, mosaic
 from .runs.projecting import project_run
 from .runs.recipe import Recipe, read_recipe, write_recipe
+from .runs.reconstructing import reconstruct_run
 from .runs.run import ProjectionRun
 from .runs.run_recipe import projector_of_run, run_recipe
 from .volumes.meshes.mesh import Mesh, read_mesh, write_mesh

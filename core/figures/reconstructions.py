@@ -12,7 +12,7 @@ from ..volumes.volume import Volume
 from .page import Page, Point, box
 from .parts import FAINT, INK, bar_width, color_bar, heading, number, ticks
 
-SIZE, SIZE_BESIDE_TRUTH = (1600, 620), (1600, 1000)
+SIZE, SIZE_BESIDE_TRUTH = (1600, 500), (1600, 850)
 """Width and height, pixels, that suit a reconstruction alone, and one beside the truth."""
 
 # The axis across a slice, and those to the right and upward: seen from the head, from the front and from the left.

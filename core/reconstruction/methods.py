@@ -7,6 +7,7 @@ from collections.abc import Callable
 from typing import NamedTuple
 
 from .expectation import mlem, osem
+from .priors import Prior, Quadratic, RelativeDifference, TotalVariation
 from .result import Reconstruction
 
 
@@ -25,9 +26,31 @@ class Method(NamedTuple):
 METHODS = {
     method.name: method
     for method in (
-        Method("osem", "OSEM", "Likeliest activity, by subsets of the modules (fast)", osem, ("subsets", "background")),
+        Method("osem", "OSEM", "Likeliest activity, by subsets of the modules (fast)", osem,
+               ("subsets", "background", "prior")),
         Method("mlem", "MLEM", "Likeliest activity, by all modules at once (slow, and the likelihood never falls)",
-               mlem, ("background",)),
+               mlem, ("background", "prior")),
+    )
+}  # fmt: skip
+
+
+class PriorKind(NamedTuple):
+    """A penalty on noise, and what it is told."""
+
+    name: str
+    label: str
+    text: str
+    prior: type[Prior]
+    takes: tuple[str, ...] = ()  # its arguments besides the weight
+
+
+PRIORS = {
+    kind.name: kind
+    for kind in (
+        PriorKind("quadratic", "Quadratic", "Smooth everywhere, edges too", Quadratic),
+        PriorKind("relative-difference", "Relative Difference", "Smooth, but large differences are spared",
+                  RelativeDifference, ("gamma", "edge")),
+        PriorKind("total-variation", "Total Variation", "Areas of one value with sharp edges", TotalVariation, ("edge",)),
     )
 }  # fmt: skip
 

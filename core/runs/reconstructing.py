@@ -1,7 +1,7 @@
 """From a run's images back to a volume: the job of ``mphdrr reconstruct`` and of Blender's Reconstruction panel."""
 
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -12,16 +12,24 @@ from ..errors import InputError, InputWarning
 from ..geometry.grid import Grid
 from ..memory import require
 from ..progress import Stages
-from ..reconstruction.methods import METHODS
+from ..reconstruction.methods import METHODS, PRIORS
+from ..reconstruction.priors import Prior
 from ..reconstruction.result import Reconstruction
+from ..reconstruction.stopping import StopWhen
+from ..volumes.resampling import resample
 from ..volumes.volume import Volume
+from ..volumes.volume_files import read_volume
 from .recipe import Recipe
 from .run import ProjectionRun
 from .run_recipe import projector_of_run
 
-Watch = Callable[[int, NDArray[np.float32], list[float]], bool | None]
-"""Called as ``watch(iteration, values, objective)`` after each iteration, with the volume's values and the objective after all
-iterations so far; what is true ends the reconstruction there."""
+Watch = Callable[[int, NDArray[Any], Sequence[float]], bool | None]
+"""Called as ``watch(iteration, values, objective)`` after each iteration, with the volume's values and the objective after
+all iterations so far; what is true ends the reconstruction there."""
+
+_ALONG = ((-1, 1, 1), (1, -1, 1), (1, 1, -1))
+_POINTS = 7
+"""Of the hole: enough for its blur, and few enough for an iteration in a fraction of a second."""
 
 TABLES = ("reconstruction", "model", "attenuation", "compute")
 """Of a recipe: what says how a run is reconstructed. The other tables say how its images were made."""
@@ -83,23 +91,69 @@ def reconstruct_run(
     _warn_if_flattering(run, grid, modelled)
     if recipe["reconstruction.ignore_attenuation"]:
         mu = None
-    A = projector_of_run(run, grid, mu, modelled, recipe["compute.backend"], recipe["compute.threads"], stages=stages)
-    given: dict[str, Any] = {
-        "subsets": recipe["reconstruction.subsets"],
-        "background": recipe["reconstruction.background"],
-    }
-    arguments = {name: given[name] for name in method.takes}
+    A = projector_of_run(run, grid, mu, modelled, recipe["compute.backend"], recipe["compute.threads"], stages)
+    given: dict[str, Any] = {name: recipe[f"reconstruction.{name}"] for name in method.takes}
+    if "prior" in method.takes:
+        given["prior"] = _prior(recipe, grid, stages)
+    rules = _rules(recipe, grid)
     found = method.function(
         A,
         line_integrals(run, recipe),
         recipe["reconstruction.iterations"],
         start=start,
-        callback=None if watch is None else lambda iteration, values: watch(iteration, values, []),
+        stop=rules if watch is None else _Watched(watch, rules),
         progress=stages("reconstructing"),
-        **arguments,
+        **given,
     )
     volume = found.volume if is_counts else Volume(found.volume.array, grid, run.volume.quantity)
     return replace(found, volume=volume, settings={**found.settings, "recipe": recipe.tables()})
+
+
+class _Watched(StopWhen):
+    """The user's rules and a watcher: of all that a reconstruction calls, its rules alone are told the objective."""
+
+    def __init__(self, watch: Watch, rules: StopWhen | None) -> None:
+        object.__setattr__(self, "_watch", watch)
+        object.__setattr__(self, "_rules", rules)
+
+    def check(self, shape: tuple[int, ...]) -> None:
+        if self._rules is not None:
+            self._rules.check(shape)
+
+    def reason(self, objective: Sequence[float], values: NDArray[Any], seconds: float) -> str | None:
+        if self._watch(len(objective), values, objective):
+            return "watch"
+        return None if self._rules is None else self._rules.reason(objective, values, seconds)
+
+
+def _prior(recipe: Recipe, grid: Grid, stages: Stages) -> Prior | None:
+    if recipe["reconstruction.prior"] is None:
+        return None
+    kind, weight = PRIORS[recipe["reconstruction.prior"]], recipe["reconstruction.weight"]
+    if weight is None:
+        raise InputError(
+            f"reconstruction.weight (--weight): missing; say how much the {kind.label.lower()} prior counts"
+        )
+    given = {name: recipe[f"reconstruction.{name}"] for name in kind.takes}
+    anatomy = recipe["reconstruction.anatomy"]
+    if anatomy is not None:
+        given["anatomy"] = resample(read_volume(anatomy, progress=stages("reading")), grid)
+    return kind.prior(weight, **{name: value for name, value in given.items() if value is not None})
+
+
+def _rules(recipe: Recipe, grid: Grid) -> StopWhen | None:
+    given = {name: recipe[f"reconstruction.stop_{name}"] for name in ("change", "noise", "seconds")}
+    if all(value is None for value in given.values()):
+        return None
+    region = None
+    if recipe["reconstruction.stop_region"] is not None:
+        *middle, radius = recipe["reconstruction.stop_region"]
+        axes = [
+            origin + spacing * np.arange(n) - center
+            for origin, spacing, n, center in zip(grid.affine[:3, 3], grid.spacing, grid.shape, middle, strict=True)
+        ]
+        region = sum(np.square(axis).reshape(shape) for axis, shape in zip(axes, _ALONG, strict=True)) <= radius**2
+    return StopWhen(**given, region=region)
 
 
 def recipe_of(run: ProjectionRun, recipe: Recipe | None = None) -> Recipe:
@@ -123,9 +177,18 @@ def is_simulated(run: ProjectionRun) -> bool:
 
 def model_of(recipe: Recipe) -> Recipe:
     """The recipe of the model that a reconstruction reckons with."""
-    changes: dict[str, Any] = {}
-    if recipe["reconstruction.aperture_points"] is not None:
-        changes |= {"model.aperture_points": recipe["reconstruction.aperture_points"], "model.aperture_tolerance": None}
+    if recipe["model.kind"] != "emission":
+        return recipe
+    points = recipe["reconstruction.aperture_points"]
+    if points is None:
+        points = _POINTS if recipe["model.aperture_tolerance"] else min(_POINTS, recipe["model.aperture_points"])
+    changes: dict[str, Any] = {
+        "model.aperture_points": points,
+        "model.aperture_tolerance": None,
+        "model.pixel_points": recipe["reconstruction.pixel_points"],
+        # The tolerance is for images of single voxels; neighbours make up for each other's errors.
+        "model.tolerance": 1e9,
+    }
     if recipe["reconstruction.ignore_blur"]:
         changes["model.intrinsic_fwhm"] = None
     if recipe["reconstruction.ignore_attenuation"]:

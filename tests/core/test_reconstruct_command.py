@@ -143,7 +143,8 @@ def test_data_of_the_model_itself_are_warned_of(run, file, tmp_path, capsys):
 
 
 def test_the_attenuation_of_the_run_is_modelled_unless_it_is_to_be_ignored(scanner):
-    water = {"phantom.cylinder_radius": 45.0, "phantom.cylinder_height": 60.0, "attenuation.of_phantom": True}
+    water = {"phantom.cylinder_radius": 45.0, "phantom.cylinder_height": 60.0, "attenuation.of_phantom": True,
+             "phantom.voxels": 20, "phantom.spacing": 5.0, "detector.rows": 8, "detector.columns": 8}  # fmt: skip
     (run,) = mph.run_recipe(mph.Recipe(COUNTS | water), scanner[::8])
     how = {"reconstruction.voxels": 12, "reconstruction.spacing": 8, "reconstruction.iterations": 3}
     totals = [

@@ -49,9 +49,13 @@ from .reconstruction.priors import Prior, Quadratic, RelativeDifference, TotalVa
 from .reconstruction.result import Reconstruction
 from .reconstruction.scores.derenzo import DerenzoScore, DerenzoSector, RodProfile, derenzo_score
 from .reconstruction.scores.images import BiasAndDeviation, bias_and_deviation, contrast_to_noise, nrmse, psnr, ssim
+from .reconstruction.scores.nema import NemaScore, NemaSphere, nema_score
 from .reconstruction.stopping import StopWhen
 from .runs.files import read_run, write_run
+from .runs.frame_files import read_counts
+from .runs.measured import counts_run
 from .runs.mosaic import as_seen, mosaic
+from .runs.orientations import ORIENTATIONS
 from .runs.projecting import project_run
 from .runs.recipe import Recipe, read_recipe, write_recipe
 from .runs.reconstructing import reconstruct_run

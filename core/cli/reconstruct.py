@@ -16,7 +16,7 @@ from ..reconstruction.methods import METHODS
 from ..reconstruction.result import Reconstruction
 from ..runs.files import FORMATS, read_run
 from ..runs.recipe import Recipe, read_recipe, write_recipe
-from ..runs.reconstructing import TABLES, is_simulated, recipe_of, reconstruct_run
+from ..runs.reconstructing import TABLES, recipe_of, reconstruct_run
 from ..runs.run import ProjectionRun
 from ..runs.settings import SETTINGS
 from ..volumes.volume import Volume
@@ -88,7 +88,7 @@ def _run(arguments: argparse.Namespace) -> None:
     recipe = _chosen(arguments, run)
     start: Volume | Reconstruction | None = None
     if arguments.start is not None:
-        start = read_volume(arguments.start, run.volume.quantity)
+        start = read_volume(arguments.start, "activity" if run.volume is None else run.volume.quantity)
     elif arguments.resume is not None:
         start = read_reconstruction(arguments.resume)
     log = _Log(recipe, arguments.quiet, start)
@@ -110,9 +110,8 @@ def _run(arguments: argparse.Namespace) -> None:
         write_volume(found.volume, path)
     method = METHODS[recipe["reconstruction.method"]]
     if picture is not None:
-        truth = run.volume if is_simulated(run) else None
-        page = Page(*(SIZE if truth is None else SIZE_BESIDE_TRUTH))
-        draw(page, found.volume, found.objective.tolist(), truth, f"{method.label} of {arguments.file}",
+        page = Page(*(SIZE if run.volume is None else SIZE_BESIDE_TRUTH))
+        draw(page, found.volume, found.objective.tolist(), run.volume, f"{method.label} of {arguments.file}",
              [settings_line(found.iterations, recipe)], method.objective)  # fmt: skip
         page.write(picture)
     voxels = " x ".join(map(str, found.volume.grid.shape))

@@ -105,7 +105,9 @@ def reconstruct_run(
         progress=stages("reconstructing"),
         **given,
     )
-    volume = found.volume if is_counts else Volume(found.volume.array, grid, run.volume.quantity)
+    volume = found.volume
+    if run.volume is not None:  # a radiograph's is not of activity
+        volume = Volume(volume.array, grid, run.volume.quantity)
     return replace(found, volume=volume, settings={**found.settings, "recipe": recipe.tables()})
 
 
@@ -170,11 +172,6 @@ def reconstruction_grid(run: ProjectionRun, recipe: Recipe) -> Grid:
     return Grid.centered((n_x, n_y, n_z), np.broadcast_to(spacing, 3), recipe["reconstruction.center"])
 
 
-def is_simulated(run: ProjectionRun) -> bool:
-    """Whether the run's images were made from its volume, not measured."""
-    return any(key.startswith(("volume.", "phantom.")) for key in run.recipe.given)
-
-
 def model_of(recipe: Recipe) -> Recipe:
     """The recipe of the model that a reconstruction reckons with."""
     if recipe["model.kind"] != "emission":
@@ -209,7 +206,7 @@ def line_integrals(run: ProjectionRun, recipe: Recipe) -> NDArray[np.float32]:
 
 def _warn_if_flattering(run: ProjectionRun, grid: Grid, model: Recipe) -> None:
     """Warn where a run was simulated with a model that is hardly better than that of the reconstruction."""
-    if not is_simulated(run):
+    if run.volume is None:  # measured
         return
     made = run.recipe
     fine, coarse = float(run.volume.grid.spacing.max()), float(grid.spacing.min())

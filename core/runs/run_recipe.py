@@ -24,10 +24,10 @@ from ..volumes.rearranging import centered
 from ..volumes.volume import Volume
 from ..volumes.volume_files import read_volume, read_volume_of
 from ..workbook import read_system
+from .measured import recipe_counts
 from .projecting import project_run, warn_of_energy
-from .recipe import Recipe, fitting_recipe
+from .recipe import Recipe, recorded_recipe
 from .run import ProjectionRun
-from .settings import SETTINGS
 
 _MODELS: dict[str, Any] = {"transmission": Transmission, "emission": Emission, "inverse-square": InverseSquareSum}
 _MOST_MU = 500.0
@@ -44,7 +44,7 @@ def run_recipe(
     mu: Volume | None = None,
     stages: Stages = lambda stage: None,
 ) -> Iterator[ProjectionRun]:
-    """Make what a recipe asks for: one run, or one for each of ``volume.states``.
+    """Make what a recipe asks for: one run, or one for each of ``volume.states``; of measured counts, the run of these.
 
     Parameters
     ----------
@@ -68,9 +68,10 @@ def run_recipe(
     model = recipe_model(recipe, system)
     if mu is None:
         mu = _attenuation(recipe, model, stages)
-    of_images = ("model.", "detector.", "compute.")
-    defaults = {key: setting.default for key, setting in SETTINGS.items() if key.startswith(of_images)}
-    recorded = fitting_recipe({**defaults, **recipe.given}, recipe.given)
+    if recipe["counts.files"] is not None and volume is None:
+        yield recipe_counts(recipe, system, stages)
+        return
+    recorded = recorded_recipe(recipe)
     sources: Iterator[_Source]
     if volume is not None:
         if mu is None and recipe["attenuation.of_phantom"]:

@@ -1,9 +1,7 @@
 """What a reconstruction resolves of a Derenzo phantom's rods, sector by sector."""
 
-from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, overload
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -14,8 +12,9 @@ from ...phantoms.derenzo import DerenzoRods
 from ...phantoms.phantom import QUANTITIES, Phantom
 from ...progress import Progress
 from ...validation import freeze, instance
-from ...volumes.resampling import interpolated
+from ...volumes.resampling import values_at
 from ...volumes.volume import Volume, require_quantity
+from .rows import Rows
 
 Floats = NDArray[np.float64]
 
@@ -84,47 +83,28 @@ class DerenzoSector:
     """Why something is NaN."""
 
 
-@dataclass(frozen=True, eq=False)
-class DerenzoScore(Sequence[DerenzoSector]):
+class DerenzoScore(Rows[DerenzoSector]):
     """The scores of all sectors, in the phantom's order; its attributes are arrays (S,), as of `DerenzoSector`."""
-
-    sectors: tuple[DerenzoSector, ...]
 
     @property
     def rod_diameter(self) -> Floats:
         """mm; 0 of a sector without rods."""
-        return self._column("rod_diameter")
+        return self.column("rod_diameter")
 
     @property
     def valley_to_peak(self) -> Floats:
         """Mean valley by mean peak."""
-        return self._column("valley_to_peak")
+        return self.column("valley_to_peak")
 
     @property
     def resolved(self) -> Floats:
         """Shares of the pairs of neighbours."""
-        return self._column("resolved")
+        return self.column("resolved")
 
     @property
     def contrast_recovery(self) -> Floats:
         """Of the phantom's contrast."""
-        return self._column("contrast_recovery")
-
-    def _column(self, name: str) -> Floats:
-        return np.array([getattr(sector, name) for sector in self.sectors])
-
-    def __len__(self) -> int:
-        return len(self.sectors)
-
-    @overload
-    def __getitem__(self, index: int) -> DerenzoSector: ...
-    @overload
-    def __getitem__(self, index: slice) -> tuple[DerenzoSector, ...]: ...
-    def __getitem__(self, index: Any) -> Any:
-        return self.sectors[index]
-
-    def __iter__(self) -> Iterator[DerenzoSector]:
-        return iter(self.sectors)
+        return self.column("contrast_recovery")
 
 
 def derenzo_score(
@@ -281,7 +261,7 @@ class _Sector:
         for first in range(0, len(lines), step):
             part = slice(first, first + step)
             points = lines[part, :, None, None] + offsets[part, None]
-            samples = interpolated(self.volume, points.reshape(-1, 3) @ world[:3, :3].T + world[:3, 3])
+            samples = values_at(self.volume, points.reshape(-1, 3) @ world[:3, :3].T + world[:3, 3])
             values[part] = samples.reshape(points.shape[:-1]).mean(axis=(2, 3), dtype=np.float64)
         lines = lines @ world[:3, :3].T + world[:3, 3]
         return [RodProfile(freeze(p), freeze(v), is_hot) for p, v in zip(lines, values, strict=True)]

@@ -59,6 +59,7 @@ from .runs.mosaic import as_seen, mosaic
 from .runs.orientations import ORIENTATIONS
 from .runs.projecting import project_run
 from .runs.recipe import Recipe, read_recipe, write_recipe
+from .runs.reconstructing import reconstruct_run
 from .runs.run import ProjectionRun
 from .runs.run_recipe import projector_of_run, run_recipe
 from .volumes.meshes.mesh import Mesh, read_mesh, write_mesh

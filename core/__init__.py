@@ -45,6 +45,8 @@ from .physics.sampling import sampling_gaps
 from .progress import Cancelled, Progress
 from .projector import Emission, InverseSquareSum, Projector, Transmission, intensity, trace_rays
 from .reconstruction.expectation import mlem, osem
+from .reconstruction.fbp import fbp
+from .reconstruction.fdk import fdk
 from .reconstruction.files import read_reconstruction, write_reconstruction
 from .reconstruction.priors import Prior, Quadratic, RelativeDifference, TotalVariation
 from .reconstruction.result import Reconstruction

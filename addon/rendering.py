@@ -154,17 +154,17 @@ def file_of(run_file: str) -> Path:
     return path
 
 
-def show_run(scene: bpy.types.Scene, run: ProjectionRun, path: Path, volume: bpy.types.Object) -> None:
+def show_run(scene: bpy.types.Scene, run: ProjectionRun, path: Path, volume: bpy.types.Object | None) -> None:
     """Put `run`, which is kept in the file `path`, into the scene's list and show it; the panel says what it was made with.
 
-    `volume` is the object of what was projected.
+    `volume` is the object of what was projected, None where the run was measured.
     """
     state = taken_over(scene, run, volume)
     for _ in storing(scene, run, path, state, scanner.active_scanner(scene)):
         pass
 
 
-def taken_over(scene: bpy.types.Scene, run: ProjectionRun, volume: bpy.types.Object) -> dict[str, Any]:
+def taken_over(scene: bpy.types.Scene, run: ProjectionRun, volume: bpy.types.Object | None) -> dict[str, Any]:
     """Set the panel as a run that was made outside the scene says; returns the scene's state that it belongs to.
 
     That is empty where the run does not say how it was made.

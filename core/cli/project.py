@@ -22,6 +22,7 @@ from .options import add_command, number_or_name, numbered_path, output_path, pr
 
 _LISTED = (
     *("system.columns", "system.modules", "volume.file", "volume.states", "volume.center", "phantom.file"),
+    *("counts.files", "counts.frames", "counts.frames_file", "counts.orientation", "counts.expected"),
     *("attenuation.file", "model.time", "model.isotope", "detector.plane", "detector.magnification", "noise.seed"),
     *("compute.backend", "compute.threads"),
 )
@@ -46,11 +47,13 @@ def add_parser(subparsers) -> None:  # type: ignore[no-untyped-def]
     parser = add_command(
         subparsers,
         "project",
-        "project a volume, or a phantom, into every module",
+        "project a volume, or a phantom, into every module; or take measured counts for the projections",
         "mphdrr project scanner.xlsx --volume ct.nii.gz --energy 60 --size 250 250 -o run.h5\n"
         "example: mphdrr project scanner.xlsx --volume heart.nii.gz --mu ct-mu.nii.gz --preset tc99m-tungsten-czt "
         "--time 600 --write-recipe heart.toml\n"
-        "example: mphdrr project heart.toml --noise 1 -o counts.h5",
+        "example: mphdrr project heart.toml --noise 1 -o counts.h5\n"
+        "example: mphdrr project scanner.xlsx --counts counts.npy --frames 1-80 --orientation front+v --time 600 "
+        "-o run.h5 --mosaic check.png",
     )
     text = "geometry workbook (.xlsx, .xlsm), recipe (.toml), or run (.h5, .npz, .pt), to be made again"
     parser.add_argument("file", nargs="?", metavar="FILE", help=text)
@@ -122,6 +125,8 @@ def _changes(arguments: argparse.Namespace, recipe: Recipe) -> dict[str, Any]:
         changes[key.strip()] = _value(text) if text.strip() else None
     if changes.get("model.photons") is not None:
         changes.setdefault("model.kind", "transmission")
+    if changes.get("counts.files") is not None:
+        changes.setdefault("model.kind", "emission")
     if "energy" in typed:
         # Counts are of activity: the CT numbers are those of the attenuation.
         is_counts = changes.get("model.kind", recipe["model.kind"]) == "emission"
@@ -156,6 +161,10 @@ def _chosen(arguments: argparse.Namespace) -> tuple[Recipe, dict[str, Any]]:
     # An attenuation that is made with the volume, or moved with it, needs the volume made anew.
     together = recipe["attenuation.of_phantom"] or (recipe["volume.center"] and "attenuation" in now)
     if not together and all(now.get(table) == before.get(table) for table in ("volume", "phantom")):
+        if run.volume is None and recipe["counts.files"] is None:
+            raise InputError(
+                f"{file}: it holds measured counts, not what was measured; name a volume, a phantom, or --counts"
+            )
         kept["volume"] = run.volume
     return recipe, kept
 
@@ -175,7 +184,8 @@ def _run(arguments: argparse.Namespace) -> None:
     states = recipe["volume.states"] or ()
     count = max(1, len(states))
     outputs = {numbered_path(path, number, count).resolve() for number in range(1, count + 1)}
-    for file in (*states, recipe["volume.file"], recipe["attenuation.file"]):
+    counts = recipe["counts.files"] or ()
+    for file in (*states, *counts, recipe["volume.file"], recipe["attenuation.file"]):
         if file is not None and Path(file).resolve() in outputs:
             raise InputError(f"{file}: the projections would replace what they are made from; choose another --output")
     for number, run in enumerate(run_recipe(recipe, **kept, stages=progress_bar), 1):

@@ -46,11 +46,11 @@ class NemaBody(Phantom):
         super().__post_init__()
         inside = f"{self.title}: sphere diameters"
         lung = self.lung_diameter
-        require_at_most(lung, 2 * _room(0.0, 0.0), f"{self.title}: lung diameter", "in the body")
-        for diameter, (x, y) in zip(self.sphere_diameters, _ring(), strict=True):
+        require_at_most(lung, 2 * room(0.0, 0.0), f"{self.title}: lung diameter", "in the body")
+        for diameter, (x, y) in zip(self.sphere_diameters, sphere_places(), strict=True):
             if not diameter:
                 continue
-            require_at_most(diameter, 2 * _room(x, y), inside, "in the body")
+            require_at_most(diameter, 2 * room(x, y), inside, "in the body")
             require_at_most(diameter, 2 * _TO_LID, inside, "beneath the lid")
             least = _TO_LID + diameter / 2
             if self.length < least * (1 - 1e-9):
@@ -76,21 +76,21 @@ class NemaBody(Phantom):
         if self.lung_diameter:
             lung: dict[str, Any] = {"activity": 0.0, "mu": _LUNG_DENSITY * self.mu, "name": "lung insert"}
             shapes.append(Cylinder(radius=self.lung_diameter / 2, height=self.length, position=(0, 0, z), **lung))
-        for diameter, (x, y) in zip(self.sphere_diameters, _ring(), strict=True):
+        for diameter, (x, y) in zip(self.sphere_diameters, sphere_places(), strict=True):
             if diameter:
                 name, holds = f"sphere {diameter:g} mm", {**water, "activity": self.sphere_activity}
                 shapes.append(Sphere(radius=diameter / 2, position=(x, y, 0.0), name=name, **holds))
         return shapes
 
 
-def _ring() -> list[tuple[float, float]]:
-    """x and y of the spheres' centres, mm."""
+def sphere_places() -> list[tuple[float, float]]:
+    """x and y of the spheres' centres, mm, in the order of their diameters."""
     angles = [math.radians(60.0 * (i - 2)) for i in range(6)]
     return [(_RING_RADIUS * math.cos(angle), _RING_RADIUS * math.sin(angle)) for angle in angles]
 
 
-def _room(x: float, y: float) -> float:
-    """Distance, mm, from a point inside the body to its outline."""
+def room(x: float, y: float) -> float:
+    """Distance, mm, from a point inside the body to its outline; negative outside."""
     x, y = abs(x), y - _CIRCLES_Y
     front = math.hypot(x, y) if y > 0 else x
     aside, behind = x - _BACK_WIDTH / 2, -y

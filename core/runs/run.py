@@ -34,12 +34,15 @@ def versions() -> dict[str, str]:
 
 @dataclass(frozen=True, eq=False)
 class ProjectionRun:
-    """The images of one run, with geometry, volume and provenance; `InputError` where the parts do not fit together."""
+    """The images of one run, with geometry, volume and provenance; `InputError` where the parts do not fit together.
+
+    A measured run (`counts_run`) has no volume: nobody knows what was in the scanner.
+    """
 
     projections: NDArray[np.float32]  # (M, n_v, n_u), column index along +u, row index along +v
     system: PinholeSystem  # the M modules
     views: Views  # the M images' rays
-    volume: Volume  # what was projected
+    volume: Volume | None = None  # what was projected; None where the images were measured
     unit: str = ""  # of the projections, such as "kBq/mL mm"
     settings: Mapping[str, Any] = field(default_factory=dict)  # how they were made: anything JSON can hold
     seed: int | None = None  # of the noise; None where the projections have none
@@ -61,11 +64,18 @@ class ProjectionRun:
         background = checked_background(self.background, "run: background", len(self.views), self.views.shape)
         object.__setattr__(self, "background", background)
         if not self.unit:
+            if self.volume is None:
+                raise InputError("run: without a volume, say the unit of the projections, such as counts")
             object.__setattr__(self, "unit", f"{self.volume.unit} mm")
         source = self.system.source
         if source is not None and not self.workbook_sha256:
             object.__setattr__(self, "workbook", source.path.name)
             object.__setattr__(self, "workbook_sha256", source.sha256)
+
+    @property
+    def is_measured(self) -> bool:
+        """Whether the images are counts of a real or another simulator's scanner."""
+        return "frames" in self.settings
 
     @property
     def recipe(self) -> Recipe:

@@ -20,6 +20,8 @@ from ..physics.materials import APERTURES, CRYSTALS
 from ..projector.backends import BACKENDS, OLD_NAMES
 from ..validation import real_array
 from ..volumes.volume import LINE_INTEGRALS
+from .frame_files import RAW_TYPES
+from .orientations import ORIENTATIONS
 
 Words = Mapping[str, tuple[str, str]]
 """The words that a setting may be, each with its label and description."""
@@ -109,7 +111,8 @@ def _named(names: Iterable[str], text: str) -> Words:
 _COUNTS = "model.kind=emission"
 _RAYS = "no model.kind=inverse-square"
 _FILE = "volume.file or volume.states"
-_PHANTOM = ("no volume.file", "no volume.states")
+_MADE = "no counts.files"
+_PHANTOM = ("no volume.file", "no volume.states", _MADE)
 _NO_PHANTOM = ("no phantom.kind", "no phantom.file", "no phantom.text")
 _SERIES = "The DICOM series with this number, description or UID, where the folder holds several"
 _AT_ENERGY = "Convert CT numbers to attenuation (1/mm) at this energy, or at an isotope's strongest line"
@@ -122,9 +125,9 @@ _DECLARED = (
             "geometry show --write-columns makes a draft", is_path=True),
     Setting("system.modules", str, None, "Numbers of the modules, such as 1-40 or 1-20,41", "all"),
     Setting("volume.file", str, None, "Volume, or folder of a DICOM series", "a phantom is made", is_path=True,
-            needs=("no volume.states", *_NO_PHANTOM), option="--volume"),
+            needs=("no volume.states", _MADE, *_NO_PHANTOM), option="--volume"),
     Setting("volume.states", str, None, "Volumes of what changes, such as a beating heart: a run of each, as OUTPUT-1, "
-            "OUTPUT-2 …", is_path=True, sizes=(), needs=("no volume.file", *_NO_PHANTOM)),
+            "OUTPUT-2 …", is_path=True, sizes=(), needs=("no volume.file", _MADE, *_NO_PHANTOM)),
     Setting("volume.object", str, None, "Name of the volume's object in a Blender scene", needs=_PHANTOM),
     Setting("volume.state", str, None, "State of the object's sequence", needs=("volume.object",)),
     Setting("volume.series", str, None, _SERIES, needs=("volume.file",)),
@@ -161,6 +164,26 @@ _DECLARED = (
             needs=("attenuation.file",), option="--mu-energy"),
     Setting("attenuation.of_phantom", bool, False, "The phantom attenuates by its own coefficients",
             needs=(_COUNTS, *_PHANTOM, "no attenuation.file"), option="--phantom-mu"),
+    Setting("counts.files", str, None, "Measured counts instead of a volume: files with a frame a module, of a real or "
+            "another simulator's scanner (.npy, .npz, .h5, DICOM, .mhd, Interfile's .hdr, raw numbers)", is_path=True,
+            sizes=(), needs=(_COUNTS, "no volume.file", "no volume.states", *_NO_PHANTOM), option="--counts"),
+    Setting("counts.frames", str, None, "Which module each frame is of: the modules' numbers in the frames' order, such as "
+            "1-80, 80-1 or 3,1,2", needs=("counts.files", "no counts.frames_file"), option="--frames"),
+    Setting("counts.frames_file", str, None, "Text file with these numbers", is_path=True, needs=("counts.files",
+            "no counts.frames")),
+    Setting("counts.orientation", str, None, "How a frame, as a picture with row 0 at the top, lies on the crystal: seen "
+            "from the front (the pinhole) or from the back, with which of the module's axes at the top; one word, or one "
+            "for each frame", words=ORIENTATIONS, sizes=(), needs=("counts.files",)),
+    Setting("counts.expected", bool, False, "The numbers are expected means, which may be fractions",
+            needs=("counts.files",)),
+    Setting("counts.dataset", str, None, "Name of the array in .npz and .h5", "the only one of three axes",
+            needs=("counts.files",)),
+    Setting("counts.raw_shape", int, None, "Frames, rows and columns of a raw file", least=1, sizes=(3,),
+            needs=("counts.files",)),
+    Setting("counts.raw_type", str, None, "Type of a raw file's numbers", words=_named(RAW_TYPES, ""),
+            needs=("counts.files",)),
+    Setting("counts.raw_big_endian", bool, False, "The most significant byte of a raw file's numbers comes first",
+            needs=("counts.files",)),
     Setting("model.kind", str, "transmission", "What a pixel holds", label="Model", option="--model", words={
         "transmission": ("Radiograph", "Line integrals of the volume"),
         "emission": ("SPECT Counts", "Photons of a volume of activity that the crystal counts"),
@@ -222,7 +245,7 @@ _DECLARED = (
     Setting("detector.pitch", float, None, "Pixel size", "the image covers the crystal's whole side", unit="mm", above=0,
             slider=10, label="Pixel Size (mm)"),
     Setting("noise.seed", int, None, "Draw Poisson counts with this seed; of several states with SEED, SEED + 1 …",
-            "their expected means", least=0, needs=("model.kind=emission or model.photons",), option="--noise"),
+            "their expected means", least=0, needs=("model.kind=emission or model.photons", _MADE), option="--noise"),
     Setting("compute.backend", str, "auto", "What computes the line integrals", words={
         "auto": ("Automatic", "The fastest that works here"), **{b.name: (b.label, b.text) for b in BACKENDS.values()},
     }),

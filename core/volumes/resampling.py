@@ -57,6 +57,12 @@ def resample(
     return Volume(freeze(result), grid, volume.quantity)
 
 
+def values_at(volume: Volume, points: NDArray[np.float64], method: str = "linear") -> Floats:
+    """Values (N,) at world `points` (N, 3), mm; `method` as of `resample`, but for ``"mean"``; 0 outside the grid."""
+    index = volume.grid.index_from_world
+    return _samples(volume.array, index[:3, :3] @ points.T + index[:3, 3:], _TAPS[method])
+
+
 def _along_axes(
     array: Floats, index_from_index: NDArray[np.float64], method: str, result: Floats, progress: Progress
 ) -> None:

@@ -1,0 +1,231 @@
+"""How far a volume is from the truth, voxel by voxel: errors, similarity, contrast to noise, bias and deviation."""
+
+from collections.abc import Iterable
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from ...errors import InputError
+from ...memory import require
+from ...progress import Progress, in_threads
+from ...validation import instance, positive, real_array, shape_text
+from ...volumes.volume import Volume
+
+Floats = NDArray[np.float64]
+Values = Volume | ArrayLike
+
+_SIGMA, _RADIUS = 1.5, 5  # of the window of Wang et al., voxels
+_K1, _K2 = 0.01, 0.03  # their constants
+_SLAB = 1 << 18  # voxels at once
+
+
+def nrmse(volume: Values, truth: Values, mask: ArrayLike | None = None) -> float:
+    """Normalised root mean square error: rms of volume - truth, by the rms of the truth.
+
+    0 for the truth itself, 1 for a volume of zeros. This normalisation, by the truth's Euclidean norm, is one of several in
+    use (Fienup 1997, "Invariant error metrics for image reconstruction", Appl. Opt. 36(32)).
+
+    Parameters
+    ----------
+    volume, truth
+        Volumes on the same grid, of the same quantity, or arrays of the same shape. Volumes on different grids are refused:
+        bring one to the other's grid first, ``mph.resample(truth, volume.grid, "mean")``.
+    mask
+        Booleans of that shape: the voxels that count. Default: all.
+
+    Raises
+    ------
+    InputError
+        If the volumes do not fit together, or the truth is 0 everywhere.
+    """
+    values, true = _pair(volume, truth, "nrmse", mask)
+    norm = float(np.sqrt(np.mean(true**2)))
+    if not norm:
+        raise InputError("nrmse: the truth is 0 everywhere: there is nothing to normalise by")
+    return float(np.sqrt(np.mean((values - true) ** 2))) / norm
+
+
+def psnr(volume: Values, truth: Values, data_range: float | None = None, mask: ArrayLike | None = None) -> float:
+    """Peak signal-to-noise ratio, dB: 20 log10(range / rms of volume - truth).
+
+    Infinite for the truth itself. (Huynh-Thu, Ghanbari 2008, "Scope of validity of PSNR in image/video quality assessment",
+    Electron. Lett. 44(13).)
+
+    Parameters
+    ----------
+    volume, truth, mask
+        As for `nrmse`.
+    data_range
+        Largest minus smallest value that there can be. Default: of the truth.
+    """
+    values, true = _pair(volume, truth, "psnr", mask)
+    span = _span(true, data_range, "psnr")
+    error = float(np.sqrt(np.mean((values - true) ** 2)))
+    return 20 * float(np.log10(span / error)) if error else np.inf
+
+
+def ssim(volume: Values, truth: Values, data_range: float | None = None, progress: Progress | None = None) -> float:
+    """Structural similarity, in three dimensions: 1 for the truth itself.
+
+    The mean of the SSIM index over all places where a window of 11 voxels along each axis fits: a Gaussian of 1.5 voxels,
+    C1 = (0.01 range)^2 and C2 = (0.03 range)^2, as in Wang et al. 2004, "Image quality assessment: from error visibility to
+    structural similarity", IEEE Trans. Image Process. 13(4). An axis of one voxel is left out: a slice has its SSIM in two
+    dimensions. The same for both orders of volume and truth, if `data_range` is given.
+
+    Parameters
+    ----------
+    volume, truth
+        As for `nrmse`, with one voxel or at least 11 along each axis.
+    data_range
+        As for `psnr`.
+    progress
+        Called as ``progress(done, total)`` between slabs; may raise `Cancelled`.
+    """
+    values, true = _pair(volume, truth, "ssim")
+    span = _span(true, data_range, "ssim")
+    shape = tuple(n for n in values.shape if n > 1)
+    if not shape or min(shape) < 2 * _RADIUS + 1:
+        text = f"one or at least {2 * _RADIUS + 1} voxels along each axis"
+        raise InputError(f"ssim: expected {text}, got {shape_text(values.shape)}")
+    values, true = values.reshape(shape), true.reshape(shape)
+    c1, c2 = (_K1 * span) ** 2, (_K2 * span) ** 2
+    inner = shape[0] - 2 * _RADIUS
+    step = max(1, _SLAB // (values.size // shape[0]))
+    sums = np.zeros(inner)
+
+    def work(first: int) -> None:
+        slab = slice(first, min(first + step, inner) + 2 * _RADIUS)
+        x, y = values[slab], true[slab]
+        mean_x, mean_y, xx, yy, xy = (_windowed(moment) for moment in (x, y, x * x, y * y, x * y))
+        both, squares = mean_x * mean_y, mean_x**2 + mean_y**2
+        index = (2 * both + c1) * (2 * (xy - both) + c2) / ((squares + c1) * (xx + yy - squares + c2))
+        sums[first : first + len(index)] = index.reshape(len(index), -1).mean(axis=1)
+
+    in_threads(work, range(0, inner, step), progress)
+    return float(sums.mean())
+
+
+def contrast_to_noise(volume: Values, target: ArrayLike, background: ArrayLike) -> float:
+    """Contrast-to-noise ratio: mean of the target minus mean of the background, by the background's standard deviation.
+
+    Negative for a target colder than its background; infinite if the background is the same everywhere and the target is
+    not. (Cherry, Sorenson, Phelps 2012, Physics in Nuclear Medicine, 4th edition, chapter 15.)
+
+    Parameters
+    ----------
+    volume
+        A volume, or an array.
+    target, background
+        Booleans of its shape: the voxels of each; at least two of the background.
+    """
+    values = _values(volume, "contrast_to_noise")
+    inside, around = (
+        values[_mask(mask, values.shape, f"contrast_to_noise: {name}", least)]
+        for mask, name, least in ((target, "target", 1), (background, "background", 2))
+    )
+    contrast, noise = float(inside.mean() - around.mean()), float(around.std(ddof=1))
+    if not noise:
+        return float(np.copysign(np.inf, contrast)) if contrast else 0.0
+    return contrast / noise
+
+
+class BiasAndDeviation(NamedTuple):
+    """What `bias_and_deviation` gives."""
+
+    bias: Volume
+    deviation: Volume
+
+
+def bias_and_deviation(volumes: Iterable[Volume], truth: Volume) -> BiasAndDeviation:
+    """Bias and standard deviation of reconstructions of several noise draws of the same counts, in each voxel.
+
+    The bias is the mean of the draws minus the truth, the deviation the sample standard deviation (n - 1). The mean square
+    error of n draws is the bias squared plus (n - 1) / n times the deviation squared (Barrett, Myers 2004, Foundations of
+    Image Science, chapter 14).
+
+    Parameters
+    ----------
+    volumes
+        Two or more on the truth's grid, of its quantity; they are taken one after the other, so a generator will do.
+    truth
+
+    Returns
+    -------
+    BiasAndDeviation
+        Volumes ``bias`` and ``deviation``, in the truth's unit.
+    """
+    instance(truth, Volume, "bias_and_deviation: truth")
+    if isinstance(volumes, Volume):
+        raise InputError("bias_and_deviation: expected two volumes or more, got one")
+    mean, squares, count = np.zeros(truth.grid.shape), np.zeros(truth.grid.shape), 0
+    for count, volume in enumerate(volumes, 1):  # Welford's recurrence: nothing cancels
+        instance(volume, Volume, f"bias_and_deviation: volume {count}")
+        _require_fit(volume, truth, f"bias_and_deviation: volume {count}")
+        apart = volume.array - mean
+        mean += apart / count
+        squares += apart * (volume.array - mean)
+    if count < 2:
+        raise InputError(f"bias_and_deviation: expected two volumes or more, got {count}")
+    found = (mean - truth.array, np.sqrt(squares / (count - 1)))
+    return BiasAndDeviation(*(Volume(values.astype(np.float32), truth.grid, truth.quantity) for values in found))
+
+
+def _pair(volume: Values, truth: Values, name: str, mask: ArrayLike | None = None) -> tuple[Floats, Floats]:
+    """The values of both, float64, checked to belong to the same voxels; those of the mask, if there is one."""
+    if isinstance(volume, Volume) and isinstance(truth, Volume):
+        _require_fit(volume, truth, name)
+    values, true = _values(volume, name), _values(truth, f"{name}: truth")
+    if values.shape != true.shape:
+        raise InputError(f"{name}: volume of {shape_text(values.shape)}, truth of {shape_text(true.shape)} voxels")
+    if not values.size:
+        raise InputError(f"{name}: the volume has no voxels")
+    if mask is None:
+        return values, true
+    inside = _mask(mask, values.shape, f"{name}: mask", 1)
+    return values[inside], true[inside]
+
+
+def _values(volume: Values, name: str) -> Floats:
+    if isinstance(volume, Volume):
+        require(8.0 * volume.grid.n_voxels, f"{name} of {shape_text(volume.grid.shape)} voxels")
+        return volume.array.astype(np.float64)
+    return real_array(volume, name, None)
+
+
+def _require_fit(volume: Volume, truth: Volume, name: str) -> None:
+    """Raise `InputError` unless both hold the same quantity on the same grid, up to a thousandth of a voxel."""
+    if volume.quantity != truth.quantity:
+        raise InputError(f"{name}: volume of {volume.quantity}, truth of {truth.quantity}")
+    one, other = volume.grid, truth.grid
+    if one.shape != other.shape or np.abs(one.corners() - other.corners()).max() > 1e-3 * one.spacing.min():
+        advice = 'mph.resample(truth, volume.grid, "mean") brings the truth to the volume\'s'
+        raise InputError(f"{name}: volume and truth are on different grids; {advice}")
+
+
+def _mask(mask: ArrayLike, shape: tuple[int, ...], name: str, least: int) -> NDArray[np.bool_]:
+    inside = np.asarray(mask)
+    if inside.dtype != bool or inside.shape != shape:
+        raise InputError(f"{name}: expected booleans of shape {shape_text(shape)}")
+    if np.count_nonzero(inside) < least:
+        raise InputError(f"{name}: expected at least {least} voxels, got {np.count_nonzero(inside)}")
+    return inside
+
+
+def _span(true: Floats, data_range: Any, name: str) -> float:
+    if data_range is not None:
+        return positive(data_range, f"{name}: data_range")
+    span = float(true.max() - true.min())
+    if not span:
+        raise InputError(f"{name}: the truth is the same everywhere; data_range says what range its values have")
+    return span
+
+
+def _windowed(values: Floats) -> Floats:
+    """Means under the Gaussian window, where it fits."""
+    weights = np.exp(-0.5 * (np.arange(-_RADIUS, _RADIUS + 1) / _SIGMA) ** 2)
+    weights /= weights.sum()
+    for axis in range(values.ndim):
+        windows = np.lib.stride_tricks.sliding_window_view(values, len(weights), axis)
+        values = np.ascontiguousarray(windows @ weights)
+    return values

@@ -55,7 +55,7 @@ bench: env-dev
 	$(BIN)/python benchmarks/projector.py $(BENCH)
 
 bench-reconstruction:
-	$(ENVIRONMENT) --extras dev,peers --torch "$(TORCH)"
+	$(ENVIRONMENT) --extras peers --torch "$(TORCH)"
 	$(BIN)/python benchmarks/reconstruction.py $(BENCH)
 
 docs:
@@ -83,11 +83,11 @@ test-kernels: env-dev
 		tests/core/test_emission.py tests/core/test_emission_gradients.py tests/core/test_geometry_gradients.py || exit 1; done
 
 test-gate:
-	$(ENVIRONMENT) --extras dev,gate
+	$(ENVIRONMENT) --extras gate
 	$(BIN)/python -m pytest tests/core/test_monte_carlo.py
 
 test-peers:
-	$(ENVIRONMENT) --extras dev,peers --torch "$(TORCH)"
+	$(ENVIRONMENT) --extras peers --torch "$(TORCH)"
 	@# a missing one would only be skipped; deepinv needs a word before it is imported, which its tests say
 	@$(BIN)/python -c "import astra, cv2, itk, kornia, lib3mf, pytomography.algorithms, scipy; from importlib.metadata import version; version('deepinv')"
 	$(BIN)/python -m pytest tests/core/test_geometry_export_peers.py tests/core/test_adapters.py

@@ -31,7 +31,7 @@ DIFFDRR_IMPORTS = ("einops", "fastcore", "pandas<3.1", "torchio")
 # For tests/core/test_adapters.py, with the extra "peers": the packages without the dependencies that their tested modules do
 # not import (a second OpenCV, uproot, matplotlib, ...), and those that they import and "peers" lacks.
 ADAPTED = ("deepinv==0.5.0", "pytomography==3.4.0", "rt-utils==1.2.7")
-ADAPTED_IMPORTS = ("fft-conv-pytorch", "natsort", "pandas", "requests", "torchvision", "tqdm")
+ADAPTED_IMPORTS = ("fft-conv-pytorch", "natsort", "pandas", "requests", "scipy", "torchvision", "tqdm")
 
 # System library that bpy loads -> the Debian package that contains it.
 LIBRARIES = {

@@ -15,14 +15,16 @@ from ..geometry.collimator import OPENING_ANGLE, edge_slope
 from ..geometry.grid import Grid
 from ..geometry.system import PinholeSystem
 from ..geometry.views import Views
-from ..physics.aperture import KnifeEdge, Opening, openings, paix_diameter, within_cone
+from ..physics.aperture import KnifeEdge, Opening, openings, paix_diameter, throughput, within_cone
 from ..physics.aperture import points_needed as hole_points_needed
 from ..physics.crystal import absorbed_share, gaussian_blur, share_inside
 from ..physics.isotopes import Isotope, isotope
 from ..physics.materials import module_coefficients
-from ..validation import instance, positive, real_array
+from ..validation import instance, positive, real_array, strict_whole
 from ..volumes.volume import Volume, require_quantity
 from .bundles import Beam
+from .depth_response import DepthResponse, DepthResponses
+from .hole_response import hole_response
 from .models import Array, Model, checked_background, view_rays
 from .pixel_points import TOLERANCE, expected_error, lattice, offsets, points_needed, require_points, shadow_edges
 from .rays import Fan
@@ -36,6 +38,7 @@ _FWHM_PER_SIGMA = 2 * math.sqrt(2 * math.log(2))
 _BOX_PER_SIGMA = math.sqrt(12)
 
 Edge = Literal["paix", "path"]
+Hole = Literal["rays", "depth"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -116,9 +119,8 @@ class Emission(Model):
     within_cone : bool
         Whether rays steeper than the knife edge's cone, psi > alpha / 2, count nothing, with either edge.
     background : float or array (M,) or (M, n_v, n_u)
-        Counts that each pixel is expected to have besides those of the volume, such as scatter and dark counts: in the whole
-        acquisition, so they do not grow with `time`. One number, one for each module, or images. ``A(x)`` is linear and
-        leaves them out; runs add them before noise is drawn (`project_run`), and reconstructions expect them.
+        Counts of each pixel in the whole acquisition besides those of the volume, such as scatter and dark counts. ``A(x)``
+        leaves them out; runs add them before noise is drawn, and reconstructions expect them.
 
     Raises
     ------
@@ -152,6 +154,7 @@ class Emission(Model):
     pixel_points: int | None = None
     tolerance: float = TOLERANCE
     background: float | Array = 0.0  # type: ignore[assignment]  # no class of mutable values: checked, and frozen
+    hole: Hole = "rays"
 
     name = "emission"
     takes = ("activity",)
@@ -176,7 +179,7 @@ class Emission(Model):
         self._set("intrinsic_fwhm", float(real_array(self.intrinsic_fwhm, "emission: intrinsic_fwhm", ())))
         if self.intrinsic_fwhm < 0:
             raise InputError(f"emission: intrinsic_fwhm must not be negative, got {self.intrinsic_fwhm:g} mm")
-        self._set("aperture_points", _whole(self.aperture_points, "aperture_points", "1, 3 or more"))
+        self._set("aperture_points", strict_whole(self.aperture_points, "emission: aperture_points", "1, 3 or more"))
         if self.aperture_points == 2:
             raise InputError("emission: aperture_points: expected 1, 3 or more, got 2")
         if self.aperture_tolerance is not None and self.aperture_points != 1:
@@ -186,12 +189,27 @@ class Emission(Model):
         if self.edge == "path" and self.aperture_mu is None:
             raise InputError("emission: edge 'path' needs aperture_mu, of the aperture's material")
         self._set("pixel_points", require_points(self.pixel_points, "emission: pixel_points"))
-        self._set("depth_layers", _whole(self.depth_layers, "depth_layers", "1 or more"))
+        self._set("depth_layers", strict_whole(self.depth_layers, "emission: depth_layers", "1 or more"))
         if self.depth_layers > 1 and self.crystal_mu is None:
             raise InputError("emission: depth_layers needs crystal_mu, of the crystal's material")
         for name in ("within_crystal", "within_walls", "within_cone"):
             self._set(name, bool(getattr(self, name)))
         self._set("background", checked_background(self.background, "emission: background", len(self.system)))
+        self._check_hole()
+
+    def _check_hole(self) -> None:
+        if self.hole not in ("rays", "depth"):
+            raise InputError(f"emission: hole: expected 'rays' or 'depth', got {self.hole!r}")
+        if self.hole == "rays":
+            return
+        for given, what in (
+            (self.mu is not None, "attenuation, mu"),
+            (self.edge != "paix", "edge 'path'"),
+            (self.depth_layers > 1, "depth_layers"),
+            (self.aperture_points > 1 or self.aperture_tolerance is not None, "points of the hole: it is whole"),
+        ):
+            if given:
+                raise InputError(f"emission: hole 'depth' takes no {what}; use hole 'rays', or leave that out")
 
     def _set(self, name: str, value: Any) -> None:
         object.__setattr__(self, name, value)
@@ -258,6 +276,7 @@ class Emission(Model):
             raise InputError(
                 f"emission: {len(self.system)} modules but {len(views)} views; give the system whose views they are"
             )
+        views.require_pinholes("emission")
         u, v, k = self.system.frames().transpose(1, 0, 2)
         moved = np.linalg.norm(views.sources - self.system.centers, axis=1) > _SAME_PLACE
         turned = np.zeros(len(views), dtype=bool)
@@ -377,6 +396,21 @@ class Emission(Model):
                 weights = weights * share_inside(shrink * along - (1 - shrink) * start, shrink * size / cells, side)
         return weights
 
+    def _direction_weights(self, m: int, along_u: Array, along_v: Array) -> Array:
+        """Counts per mm^3 times its squared depth, for lines through the hole's middle to places on the crystal's front."""
+        l = float(self.system.collimator_length[m])
+        whole = Opening(0.0, 0.0, math.pi / 4 * float(self.effective_diameter[m]) ** 2)
+        anywhere = replace(self, within_crystal=False, within_walls=False)
+        along_u, along_v = along_u[None, :], along_v[:, None]
+        weights = anywhere.pixel_weights(m, along_u, along_v, (1.0, 1.0), l, whole)
+        return weights * np.sqrt(1 + (along_u**2 + along_v**2) / l**2)  # type: ignore[no-any-return]
+
+    def _pixel_shares(self, m: int, pitch: tuple[float, float], along_u: Array, along_v: Array) -> Array:
+        """The parts of pixels that are on the crystal."""
+        side = float(self.system.detector_side[m]) if self.within_crystal or self.within_walls else math.inf
+        on_u, on_v = (share_inside(along, size, side) for along, size in zip((along_u, along_v), pitch, strict=True))
+        return on_v[:, None] * on_u  # type: ignore[no-any-return]
+
     def response(self, views: Views, m: int) -> tuple[Array, Array] | None:
         """The intrinsic blur of view m: matrices (n_v, n_v) along v and (n_u, n_u) along u."""
         if self.intrinsic_fwhm == 0:
@@ -386,6 +420,21 @@ class Emission(Model):
         n_v, n_u = views.shape
         return gaussian_blur(n_v, sigma / pitch_v), gaussian_blur(n_u, sigma / pitch_u)
 
+    def by_depth(self, views: Views, grid: Grid) -> DepthResponses | None:
+        """What projects in place of rays, for hole "depth"."""
+        if self.hole != "depth":
+            return None
+
+        def make(m: int) -> DepthResponse:
+            l, d = float(self.system.collimator_length[m]), float(self.effective_diameter[m])
+            weigh, shares = (
+                partial(self._direction_weights, m),
+                partial(self._pixel_shares, m, self._crystal_pitch(views, m)),
+            )
+            return hole_response(views, m, grid, self.system.frames()[m], l, d, weigh, shares)
+
+        return DepthResponses(len(views), grid.shape, make)
+
     def rays(self, views: Views, m: int, grid: Grid) -> int:
         """Rays of each pixel of view m."""
         holes = len(self.openings(m, self.hole_points(views, m, grid)))
@@ -393,6 +442,8 @@ class Emission(Model):
 
     def caution(self, views: Views, grid: Grid) -> str | None:
         """A warning where there are too few rays for the tolerance."""
+        if self.hole == "depth":  # has none
+            return None
         worst, module = 0.0, 0
         for m in range(len(views)):
             edges = shadow_edges(views, m, grid)
@@ -446,19 +497,3 @@ class Emission(Model):
         """Size of a pixel on the crystal, mm along u and v."""
         scale = self._crystal_scale(views, m)
         return scale * float(np.linalg.norm(views.u_steps[m])), scale * float(np.linalg.norm(views.v_steps[m]))
-
-
-def throughput(cosine: ArrayOrTensor, distance: float) -> ArrayOrTensor:
-    """Photons that cross an mm^2 of the pinhole's plane and one of a plane behind it, per photon emitted along a mm.
-
-    Both planes lie across the axis, `distance` mm apart; the photons cross them at an angle of this `cosine` to it. With
-    the hole's area pi d^2 / 4 that is ``d^2 cos^4(psi) / (16 l^2)``.
-    """
-    squared = cosine * cosine  # many times faster than a power
-    return squared * squared / (4 * math.pi * distance**2)
-
-
-def _whole(value: Any, name: str, expected: str) -> int:
-    if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < 1:
-        raise InputError(f"emission: {name}: expected {expected}, got {value!r}")
-    return int(value)

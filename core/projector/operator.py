@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..arrays import ArrayOrTensor, cast_like, checked, is_double, is_tensor, promote, to_caller, zeros
+from ..arrays import ArrayOrTensor, cast_like, checked, is_double, is_tensor, promote, to_caller, to_numpy, zeros
 from ..errors import InputError, InputWarning
 from ..geometry.grid import Grid
 from ..geometry.views import Views
@@ -166,6 +166,7 @@ class Projector(LinearOperator):
         self._backend = backends.choose(backend)
         self.threads = thread_count(threads)
         self._bundles = Bundles(len(views), self._bundle)
+        self._depths = model.by_depth(views, grid)
         self._adjoint = AdjointProjector(self)
 
     def __call__(
@@ -304,6 +305,9 @@ class Projector(LinearOperator):
 
     def _projected(self, execution: Execution, x: ArrayOrTensor, mu: ArrayOrTensor) -> Iterator[ArrayOrTensor]:
         """The images before the detector's response."""
+        if self._depths is not None:
+            yield from self._depths.images(*self._depth_arguments(x))
+            return
         if not self.model.weights_voxels:
             yield from execution.images(x, self._bundles, self._mu(mu))
             return
@@ -342,6 +346,12 @@ class Projector(LinearOperator):
         backend = backends.for_tensor(x) if on_gpu else self._backend
         mu_grid = None if self.model.mu is None else self.model.mu.grid
         return Execution(backend, self.grid, mu_grid, backend.always_float64 or is_double(x), self.threads)
+
+    def _depth_arguments(self, x: ArrayOrTensor) -> tuple[ArrayOrTensor, Any, int]:
+        """What `DepthResponses` takes: the array, the functions and the threads."""
+        double = self._backend.always_float64 or is_double(x)
+        functions = backends.load("cpu" if self._backend.name == "cpu" else "reference_depth")
+        return np.ascontiguousarray(to_numpy(x, np.float64 if double else np.float32)), functions, self.threads
 
     def _mu(self, mu: ArrayOrTensor) -> ArrayOrTensor:
         return self.model.mu.array if mu is None and self.model.mu is not None else mu
@@ -413,7 +423,9 @@ class AdjointProjector(LinearOperator):
         n = len(A.views)
         _report(progress, 0, n)
         images = A._responded(images)
-        if not A.model.weights_voxels:
+        if A._depths is not None:
+            volume = A._depths.backproject(*A._depth_arguments(images), lambda done: _report(progress, done, n))
+        elif not A.model.weights_voxels:
             volume = execution.backproject(images, A._bundles, A._mu(mu), lambda done: _report(progress, done, n))
         else:  # each view's volume is weighted before it is added to the total
             volume = zeros(A.grid.shape, images)

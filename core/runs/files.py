@@ -49,8 +49,7 @@ _ARRAYS: dict[str, tuple[str, Callable[[ProjectionRun], Any]]] = {
 }
 _VOLUME = ("volume/array", "volume/affine")
 """Which a measured run does not have."""
-_BACKGROUND = "background"
-"""In the unit of the projections; where there is none, nothing but the volume is in them."""
+_BACKGROUND = "background"  # in the unit of the projections; where there is none, nothing but the volume was projected
 _ATTRIBUTES = "attributes"
 _COMPRESS_FROM = 1 << 16  # bytes: below, compressing costs more than it saves
 
@@ -138,7 +137,8 @@ def _write_hdf5(arrays: dict[str, NDArray[Any]], attributes: dict[str, Any], pat
     """Arrays as datasets with a `unit`, in chunks of one view each, so that one view reads alone; attributes on the root."""
     import h5py
 
-    units = dict.fromkeys(("projections", _BACKGROUND), attributes["projections_unit"])
+    unit = attributes["projections_unit"]
+    units = {"projections": unit, _BACKGROUND: unit}
     units |= dict(zip(_VOLUME, (attributes.get("volume_unit"), "mm"), strict=True))
     units |= {name: unit for name, (unit, _) in _ARRAYS.items()}
     with h5py.File(path, "w") as file:

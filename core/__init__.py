@@ -45,6 +45,7 @@ from .physics.sampling import sampling_gaps
 from .progress import Cancelled, Progress
 from .projector import Emission, InverseSquareSum, Projector, Transmission, intensity, trace_rays
 from .reconstruction.bsrem import bsrem
+from .reconstruction.adapters import deepinv_physics, parallelproj_operator, pytomography_matrix, scipy_operator
 from .reconstruction.expectation import mlem, osem
 from .reconstruction.fbp import fbp
 from .reconstruction.fdk import fdk

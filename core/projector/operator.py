@@ -136,6 +136,8 @@ class Projector(LinearOperator):
         self.threads = thread_count(threads)
         self._bundles = Bundles(len(views), self._bundle)
         self._depths = model.by_depth(views, grid)
+        if self._depths is not None and self._backend.name == "cuda":
+            raise InputError("projector: hole 'depth' runs on the backends cpu and numpy, not on 'cuda'")
         self._adjoint = AdjointProjector(self)
 
     def __call__(

@@ -28,6 +28,7 @@ from .hole_response import hole_response
 from .models import Array, Model, view_rays
 from .pixel_points import TOLERANCE, expected_error, lattice, offsets, points_needed, require_points, shadow_edges
 from .rays import Fan
+from .transmittance import Transmittances
 
 # Views may differ from their system by a file's rounding (mm; sine of an angle).
 _SAME_PLACE = 1e-3
@@ -84,7 +85,7 @@ class Emission(Model):
     hole : str
         ``"rays"``: the hole's blur is by rays through `aperture_points`. ``"depth"``: it is of the whole hole, without rays
         (`hole_response`). Every voxel's total is exact, and its image within 1 % (2 % without intrinsic blur) of the
-        converged one, at any size of voxels, in about the time of seven rays. It takes no `mu`, ``edge="path"`` or
+        converged one, at any size of voxels, in about the time of seven rays. It takes no ``edge="path"`` or
         `depth_layers`, no grid that comes close to a pinhole, and only the backends numpy, torch on the CPU and cpu.
     aperture_points : int
         Points of the hole's disk that rays pass, all with the same weight: the blur of a hole of diameter d_e.
@@ -201,7 +202,7 @@ class Emission(Model):
         if self.hole not in ("rays", "depth"):
             raise InputError(f"emission: hole: expected 'rays' or 'depth', got {self.hole!r}")
         points = self.aperture_points > 1 or self.aperture_tolerance is not None
-        refused = {"attenuation": self.mu, "edge 'path'": self.edge == "path", "depth_layers": self.depth_layers > 1}
+        refused = {"edge 'path'": self.edge == "path", "depth_layers": self.depth_layers > 1}
         for what, given in {**refused, "points: it is the whole hole": points}.items():
             if self.hole == "depth" and given:
                 raise InputError(f"emission: hole 'depth' takes no {what}; use hole 'rays', or leave that out")
@@ -412,7 +413,8 @@ class Emission(Model):
 
             return hole_response(views, m, grid, self.system.frames()[m], l, d, side, weigh)
 
-        return DepthResponses(len(views), grid.shape, make)
+        passes = None if self.mu is None else Transmittances(self.mu, grid, views)
+        return DepthResponses(len(views), grid.shape, make, passes)
 
     def rays(self, views: Views, m: int, grid: Grid) -> int:
         """Rays of each pixel of view m."""

@@ -168,6 +168,8 @@ class Projector(LinearOperator):
         x = self._check(x)
         if self.model.mu is None:
             raise InputError("mu: the projector's model has none; give it one to say on which grid mu is")
+        if self._depths is not None:
+            raise InputError("mu: the projector's model has hole 'depth', whose attenuation is that of the model alone")
         x, mu = promote(x, require_no_negative(checked(mu, "mu", self.model.mu.grid.shape, self._float64)))
         if not is_tensor(x):
             return self._run(x, progress, mu)

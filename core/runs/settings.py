@@ -205,7 +205,7 @@ _DECLARED = (
             needs=(_COUNTS,), label="Hole Tolerance"),
     Setting("model.hole", str, "rays", "How the hole's blur is computed", label="Hole's Blur", option="--hole", words={
         "rays": ("Rays", "By rays through points of the hole"),
-        "depth": ("By Depth", "Of the whole hole, depth by depth, without rays: for reconstruction. Nothing attenuates"),
+        "depth": ("By Depth", "Of the whole hole, depth by depth, without rays: for reconstruction"),
     }, needs=(_COUNTS,)),
     Setting("model.aperture_mu", float, None, "Material of the aperture's edge, or its attenuation coefficient at the "
             "photons' energy", "nothing penetrates it", unit="1/mm", words=_named(APERTURES, _BY_NAME), above=0,

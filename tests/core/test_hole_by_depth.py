@@ -122,8 +122,31 @@ def test_what_it_does_not_take_is_refused(changes, said):
     refused(lambda: mph.Emission(SYSTEM, **changes), said)
 
 
-def test_attenuation_and_near_grids_are_refused():
-    mu = mph.Volume(np.zeros((4, 4, 4)), mph.Grid.centered((4, 4, 4), 10.0), "mu")
-    refused(lambda: mph.Emission(SYSTEM, mu, hole="depth"), "hole 'depth' takes no attenuation")
+@pytest.mark.parametrize("backend", [b for b in BACKENDS if b in ("cpu", "numpy")])
+def test_attenuated_it_agrees_with_rays(backend, rng):
+    """An active ball, off the middle of a water cylinder on a grid of its own; and the adjoint."""
+    n = 20 if backend == "cpu" else 8
+    grid = mph.Grid.centered((n, n, n), 60 / n)
+    water = mph.Grid.centered((40, 40, 40), 4.0, (1.0, 2.0, 3.0))
+    x, y, _ = np.moveaxis(centres(water), -1, 0)
+    mu = mph.Volume((np.hypot(x, y) < 60) * 0.0154, water, "mu")
+    A = depth_projector(grid, 24, backend, mu=mu)
+    assert_adjoint(A, rng)
+    if backend == "cpu":
+        middle = np.linalg.norm(centres(grid) - (10, 5, 0), axis=-1) < 15
+        rays = mph.Emission(SYSTEM, mu, aperture_points=61, pixel_points=13, tolerance=0.2)
+        exact = mph.Projector(grid, A.views, rays)(middle.astype(float))
+        assert np.abs(A(middle.astype(float)) - exact).sum() < 0.01 * exact.sum()
+
+
+def centres(grid):
+    """World places (n_x, n_y, n_z, 3) of a grid's voxels."""
+    return np.moveaxis(np.indices(grid.shape), 0, -1) @ grid.affine[:3, :3].T + grid.affine[:3, 3]
+
+
+def test_grids_near_the_pinhole_and_other_attenuation_are_refused():
     A = depth_projector(mph.Grid.centered((4, 4, 4), 90.0), 8)
     refused(lambda: A(np.ones(A.shape_in)), "take a smaller grid")
+    mu = mph.Volume(np.zeros((4, 4, 4)), mph.Grid.centered((4, 4, 4), 10.0), "mu")
+    A = depth_projector(mu.grid, 8, mu=mu)
+    refused(lambda: A(np.ones(A.shape_in), mu=mu.array), "that of the model alone")

@@ -28,6 +28,7 @@ from .hole_response import hole_response
 from .models import Array, Model, checked_background, view_rays
 from .pixel_points import TOLERANCE, expected_error, lattice, offsets, points_needed, require_points, shadow_edges
 from .rays import Fan
+from .transmittance import Transmittances
 
 # Views may differ from their system by a file's rounding (mm; sine of an angle).
 _SAME_PLACE = 1e-3
@@ -81,6 +82,11 @@ class Emission(Model):
     tolerance : float
         Largest relative error of the total counts of a single voxel in any module, wherever it lies between the rays: 2 %
         by default. Larger sources are more accurate.
+    hole : str
+        ``"rays"``: the hole's blur is by rays through `aperture_points`. ``"depth"``: it is of the whole hole, without rays
+        (`hole_response`). Every voxel's total is exact, and its image within 1 % (2 % without intrinsic blur) of the
+        converged one, at any size of voxels, in about the time of seven rays. It takes no ``edge="path"`` or
+        `depth_layers`, no grid that comes close to a pinhole, and only the backends numpy, torch on the CPU and cpu.
     aperture_points : int
         Points of the hole's disk that rays pass, all with the same weight: the blur of a hole of diameter d_e.
         With 1 all rays pass the centre and there is no blur; otherwise at least 3.
@@ -200,15 +206,10 @@ class Emission(Model):
     def _check_hole(self) -> None:
         if self.hole not in ("rays", "depth"):
             raise InputError(f"emission: hole: expected 'rays' or 'depth', got {self.hole!r}")
-        if self.hole == "rays":
-            return
-        for given, what in (
-            (self.mu is not None, "attenuation, mu"),
-            (self.edge != "paix", "edge 'path'"),
-            (self.depth_layers > 1, "depth_layers"),
-            (self.aperture_points > 1 or self.aperture_tolerance is not None, "points of the hole: it is whole"),
-        ):
-            if given:
+        points = self.aperture_points > 1 or self.aperture_tolerance is not None
+        refused = {"edge 'path'": self.edge == "path", "depth_layers": self.depth_layers > 1}
+        for what, given in {**refused, "points: it is the whole hole": points}.items():
+            if self.hole == "depth" and given:
                 raise InputError(f"emission: hole 'depth' takes no {what}; use hole 'rays', or leave that out")
 
     def _set(self, name: str, value: Any) -> None:
@@ -396,21 +397,6 @@ class Emission(Model):
                 weights = weights * share_inside(shrink * along - (1 - shrink) * start, shrink * size / cells, side)
         return weights
 
-    def _direction_weights(self, m: int, along_u: Array, along_v: Array) -> Array:
-        """Counts per mm^3 times its squared depth, for lines through the hole's middle to places on the crystal's front."""
-        l = float(self.system.collimator_length[m])
-        whole = Opening(0.0, 0.0, math.pi / 4 * float(self.effective_diameter[m]) ** 2)
-        anywhere = replace(self, within_crystal=False, within_walls=False)
-        along_u, along_v = along_u[None, :], along_v[:, None]
-        weights = anywhere.pixel_weights(m, along_u, along_v, (1.0, 1.0), l, whole)
-        return weights * np.sqrt(1 + (along_u**2 + along_v**2) / l**2)  # type: ignore[no-any-return]
-
-    def _pixel_shares(self, m: int, pitch: tuple[float, float], along_u: Array, along_v: Array) -> Array:
-        """The parts of pixels that are on the crystal."""
-        side = float(self.system.detector_side[m]) if self.within_crystal or self.within_walls else math.inf
-        on_u, on_v = (share_inside(along, size, side) for along, size in zip((along_u, along_v), pitch, strict=True))
-        return on_v[:, None] * on_u  # type: ignore[no-any-return]
-
     def response(self, views: Views, m: int) -> tuple[Array, Array] | None:
         """The intrinsic blur of view m: matrices (n_v, n_v) along v and (n_u, n_u) along u."""
         if self.intrinsic_fwhm == 0:
@@ -427,13 +413,18 @@ class Emission(Model):
 
         def make(m: int) -> DepthResponse:
             l, d = float(self.system.collimator_length[m]), float(self.effective_diameter[m])
-            weigh, shares = (
-                partial(self._direction_weights, m),
-                partial(self._pixel_shares, m, self._crystal_pitch(views, m)),
-            )
-            return hole_response(views, m, grid, self.system.frames()[m], l, d, weigh, shares)
+            on_crystal = self.within_crystal or self.within_walls
+            side = float(self.system.detector_side[m]) if on_crystal else math.inf
+            whole = Opening(0.0, 0.0, math.pi / 4 * d**2)
+            anywhere = replace(self, within_crystal=False, within_walls=False)
 
-        return DepthResponses(len(views), grid.shape, make)
+            def weigh(u: Array, v: Array) -> Array:
+                return anywhere.pixel_weights(m, u, v, (1.0, 1.0), l, whole)  # type: ignore[return-value]
+
+            return hole_response(views, m, grid, self.system.frames()[m], l, d, side, weigh)
+
+        passes = None if self.mu is None else Transmittances(self.mu, grid, views)
+        return DepthResponses(len(views), grid.shape, make, passes)
 
     def rays(self, views: Views, m: int, grid: Grid) -> int:
         """Rays of each pixel of view m."""

@@ -216,6 +216,10 @@ _DECLARED = (
     Setting("model.aperture_tolerance", float, None, "In place of a number of points, as many as bring a voxel's image "
             "this close, such as 0.1, to that of the whole hole", "the number of points holds", above=0, slider=1,
             needs=(_COUNTS,), label="Hole Tolerance"),
+    Setting("model.hole", str, "rays", "How the hole's blur is computed", label="Hole's Blur", option="--hole", words={
+        "rays": ("Rays", "By rays through points of the hole"),
+        "depth": ("By Depth", "Of the whole hole, depth by depth, without rays: for reconstruction"),
+    }, needs=(_COUNTS,)),
     Setting("model.aperture_mu", float, None, "Material of the aperture's edge, or its attenuation coefficient at the "
             "photons' energy", "nothing penetrates it", unit="1/mm", words=_named(APERTURES, _BY_NAME), above=0,
             slider=10, needs=(_COUNTS,), label="Aperture"),

@@ -48,6 +48,7 @@ from .reconstruction.result import Reconstruction
 from .reconstruction.scores.derenzo import DerenzoScore, DerenzoSector, RodProfile, derenzo_score
 from .reconstruction.scores.images import BiasAndDeviation, bias_and_deviation, contrast_to_noise, nrmse, psnr, ssim
 from .reconstruction.scores.nema import NemaScore, NemaSphere, nema_score
+from .reconstruction.scores.summary import VolumeScore, score_volume
 from .runs.files import read_run, write_run
 from .runs.mosaic import as_seen, mosaic
 from .runs.projecting import project_run

@@ -67,7 +67,8 @@ dist: env-dev
 
 test-app: env-dev
 	$(BIN)/python tools/build_extension.py --platform linux-x64
-	$(BIN)/python -m pytest tests/app
+	$(BIN)/python -m pytest tests/app -m "not alone" -n 2 --dist worksteal
+	$(BIN)/python -m pytest tests/app -m alone
 
 test-kernels: env-dev
 	$(BIN)/python -m pytest tests/kernels

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from ..core.progress import Progress
 from ..core.runs.display import Display
 from ..core.runs.exr import exr_bytes
-from ..core.runs.mosaic import Sheet, as_seen, png, sheet, smaller
+from ..core.runs.mosaic import Sheet, as_seen, labels, png, sheet, smaller
 from ..core.runs.run import ProjectionRun
 from . import ids, jobs
 
@@ -28,6 +28,7 @@ _PNG_LEVEL = 1  # fast
 _WAIT = 0.005  # s between two looks at a thread
 _SCANNER = "mphdrr_scanner"  # custom property of the mosaic: the collection of the scanner that the run is of
 _TEXT = "mphdrr_difference"  # custom property of a difference: its numbers, in words
+_LABELS = "mphdrr_labels"  # custom property of the mosaic: what stands in each of its images, line by line
 _TILES = "mphdrr_tiles"  # custom property of the mosaic: its modules, unit, and where in it which one's image is
 
 
@@ -46,9 +47,9 @@ def pictures(run: ProjectionRun, display: Display, progress: Progress | None = N
     """Make the contents of a run's images; leaves bpy alone. `progress` counts the files."""
     count = 2 * len(run.views)
     exact = _in_threads(exr_bytes, as_seen(run.projections), progress, 0, count)
-    numbers, rings = run.system.numbers.tolist(), run.system.rings().tolist()
+    rings = run.system.rings().tolist()
     colored = _colored(run.projections, display, progress, count // 2)
-    return Pictures(display, exact, colored, *_mosaic(run.projections, numbers, rings, run.unit, display))
+    return Pictures(display, exact, colored, *_mosaic(run.projections, labels(run), rings, run.unit, display))
 
 
 def storing(run: ProjectionRun, made: Pictures) -> Generator[tuple[str, int, int] | None, None, bpy.types.Image]:
@@ -73,8 +74,10 @@ def storing(run: ProjectionRun, made: Pictures) -> Generator[tuple[str, int, int
         bpy.data.batch_remove(new.values())
         raise
     _put_in_place(new)
-    _describe(new[ids.MOSAIC], made.drawn, numbers, run.system.rings().tolist(), run.unit, made.display)
-    return new[ids.MOSAIC]
+    mosaic = new[ids.MOSAIC]
+    _describe(mosaic, made.drawn, numbers, run.system.rings().tolist(), run.unit, made.display)
+    mosaic[_LABELS] = "\n".join(labels(run))
+    return mosaic
 
 
 def showing_again(display: Display, kept: dict[int, NDArray[np.float32]]) -> Generator[bool, None, None]:
@@ -88,6 +91,7 @@ def showing_again(display: Display, kept: dict[int, NDArray[np.float32]]) -> Gen
     if mosaic is None or shown is None:
         return
     numbers, rings, unit = (shown[name] for name in ("numbers", "rings", "unit"))
+    texts = str(mosaic[_LABELS]).split("\n") if _LABELS in mosaic else list(map(str, numbers))
     names, uid = [projection_name(number, numbers) for number in numbers], mosaic.session_uid
     if uid not in kept:
         found = []
@@ -100,7 +104,7 @@ def showing_again(display: Display, kept: dict[int, NDArray[np.float32]]) -> Gen
         kept[uid] = np.stack(found)
         del found
     projections = kept[uid]
-    file, drawn = yield from _in_thread(lambda progress: _mosaic(projections, numbers, rings, unit, display), False)
+    file, drawn = yield from _in_thread(lambda progress: _mosaic(projections, texts, rings, unit, display), False)
     mosaic = _fill(bpy.data.images[ids.MOSAIC], file)
     _describe(_read_now(mosaic), drawn, numbers, rings, unit, None)
     files = yield from _in_thread(lambda progress: _colored(projections, display, progress), True)
@@ -183,10 +187,10 @@ def _colored(
 
 
 def _mosaic(
-    projections: NDArray[np.float32], numbers: list[int], rings: list[int], unit: str, display: Display
+    projections: NDArray[np.float32], texts: list[str], rings: list[int], unit: str, display: Display
 ) -> tuple[bytes, Sheet]:
-    """The mosaic of projections (M, n_v, n_u) as a PNG file, and what is where in it."""
-    drawn = sheet(projections, numbers, rings, unit, display)
+    """The mosaic of projections (M, n_v, n_u), with a text in each, as a PNG file, and what is where in it."""
+    drawn = sheet(projections, texts, rings, unit, display)
     return png(drawn.picture, _PNG_LEVEL), drawn
 
 

@@ -26,8 +26,8 @@ from ..core.recording import recorded_warnings
 from . import ids
 from .reports import warnings_reported
 
-_INTERVAL = 0.1  # s between two looks at the thread
-_STEP = 0.05  # s that finishing may take of the main thread before the window is drawn again
+_INTERVAL = 0.1  # s between two looks at the thread, and between two drawings of how far it is
+_STEP = 0.02  # s that finishing may take of the main thread before the window has its turn, which is as long
 _PATIENCE = 10.0  # s that `stop` waits for a thread
 _STATUS_UNITS = 16  # the job's width in the status bar
 _SOON = 1.0  # s of a stage after which the time left is guessed
@@ -194,6 +194,7 @@ class JobOperator:
     _job: Job | None = None
     _run: Worker | None = None
     _timer: bpy.types.Timer | None = None
+    _drawn = 0.0
 
     if TYPE_CHECKING:  # what every bpy.types.Operator has
         bl_idname: str
@@ -244,9 +245,8 @@ class JobOperator:
         except Exception as error:
             return self._failed(error)
         self._enqueue(job)
-        manager = context.window_manager
-        self._timer = manager.event_timer_add(_INTERVAL, window=context.window)
-        manager.modal_handler_add(self)
+        self._tick(context, _INTERVAL)
+        context.window_manager.modal_handler_add(self)
         return {"RUNNING_MODAL"}
 
     def modal(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str]:
@@ -263,11 +263,15 @@ class JobOperator:
         if worker in _waiting and not worker.cancel.is_set():
             self._begin_if_first()
             return {"PASS_THROUGH"}
-        _redraw(context)
+        if time.monotonic() >= self._drawn + _INTERVAL:
+            self._drawn = time.monotonic()
+            _redraw(context)
+            return {"PASS_THROUGH"}  # drawing is work enough for one turn
         if worker.is_alive():
             return {"PASS_THROUGH"}
         try:
             if worker.steps is None:
+                self._tick(context, _STEP)
                 for text in worker.caught:
                     self.report({"WARNING"}, text)
                 if worker.error is not None or worker.cancel.is_set():
@@ -319,11 +323,17 @@ class JobOperator:
             self.report({"ERROR"}, str(error).removeprefix("Error: ").strip())
         return {"CANCELLED"}
 
-    def _end(self, context: bpy.types.Context) -> None:
-        global _current
+    def _tick(self, context: bpy.types.Context, interval: float | None) -> None:
+        """Have `modal` called every `interval` seconds from now on, or no more."""
         if self._timer is not None:
             context.window_manager.event_timer_remove(self._timer)
-            self._timer = None
+        self._timer = (
+            None if interval is None else context.window_manager.event_timer_add(interval, window=context.window)
+        )
+
+    def _end(self, context: bpy.types.Context) -> None:
+        global _current
+        self._tick(context, None)
         if _current is self._run:
             _current = None
         elif self._run in _waiting:

@@ -20,6 +20,7 @@ from ..core.memory import require
 from ..core.progress import Progress, stages_of
 from ..core.projector import Model
 from ..core.runs.files import read_run, write_run
+from ..core.runs.mosaic import caption
 from ..core.runs.projecting import warn_of_energy
 from ..core.runs.recipe import Recipe, read_recipe
 from ..core.runs.run import ProjectionRun
@@ -154,17 +155,17 @@ def file_of(run_file: str) -> Path:
     return path
 
 
-def show_run(scene: bpy.types.Scene, run: ProjectionRun, path: Path, volume: bpy.types.Object) -> None:
+def show_run(scene: bpy.types.Scene, run: ProjectionRun, path: Path, volume: bpy.types.Object | None) -> None:
     """Put `run`, which is kept in the file `path`, into the scene's list and show it; the panel says what it was made with.
 
-    `volume` is the object of what was projected.
+    `volume` is the object of what was projected, None where the run was measured.
     """
     state = taken_over(scene, run, volume)
     for _ in storing(scene, run, path, state, scanner.active_scanner(scene)):
         pass
 
 
-def taken_over(scene: bpy.types.Scene, run: ProjectionRun, volume: bpy.types.Object) -> dict[str, Any]:
+def taken_over(scene: bpy.types.Scene, run: ProjectionRun, volume: bpy.types.Object | None) -> dict[str, Any]:
     """Set the panel as a run that was made outside the scene says; returns the scene's state that it belongs to.
 
     That is empty where the run does not say how it was made.
@@ -176,6 +177,8 @@ def taken_over(scene: bpy.types.Scene, run: ProjectionRun, volume: bpy.types.Obj
     with contextlib.suppress(InputError):  # what the panel cannot show is said to have changed
         set_panel(scene.mphdrr_projections, recipe)
     state = runs.state_of(run.system, recipe, volume, None)
+    if volume is None:
+        return state | {"measured": caption(run)}
     attenuates = [value for key, value in recipe.given.items() if key.startswith("attenuation.") and value]
     return state | {"mu": {"name": f"of {run.settings['volume']}"}} if attenuates else state
 

@@ -39,14 +39,17 @@ _looked: dict[str, list[str]] = {}  # by scene: the lines that its panels show
 
 
 def state_of(
-    system: PinholeSystem, recipe: Recipe, item: bpy.types.Object, mu: bpy.types.Object | None
+    system: PinholeSystem, recipe: Recipe, item: bpy.types.Object | None, mu: bpy.types.Object | None
 ) -> dict[str, Any]:
-    """What a run of `system` as `recipe` says is made from: the objects of its volume and attenuation."""
+    """What a run of `system` as `recipe` says is made from: the objects of its volume and attenuation.
+
+    A measured run has no volume (None): only its scanner can differ from the scene's.
+    """
     lengths = [getattr(system, name).tolist() for name in LENGTHS]
     numbers = [[*center, *own] for center, *own in zip(system.centers.tolist(), *lengths, strict=True)]
     return {
         "modules": dict(zip(map(str, system.numbers.tolist()), numbers, strict=True)),
-        "volume": _volume_state(item),
+        "volume": item and _volume_state(item),
         "mu": mu and _volume_state(mu),
         "settings": _settings(recipe),
     }
@@ -69,7 +72,7 @@ def add(
         if not settings.runs[index].is_saved:
             remove_file(settings.runs[index])
         settings.runs.remove(index)
-    name = ", ".join(run.settings[key] for key in ("volume", "model") if run.settings.get(key)) or "Run"
+    name = ", ".join(run.settings[key] for key in ("volume", "counts", "model") if run.settings.get(key)) or "Run"
     known, number = {item.name for item in settings.runs}, 2
     unique = name
     while unique in known:
@@ -94,7 +97,7 @@ def mark_shown(scene: bpy.types.Scene, index: int) -> None:
 def summary_of(run: ProjectionRun) -> str:
     """How many images of which size a run has, of what, computed by what."""
     n_v, n_u = run.views.shape
-    what = [run.settings.get("volume"), run.settings.get("backend")]
+    what = [run.settings.get(name) for name in ("volume", "counts", "backend")]
     return ", ".join([f"{len(run.views)} views of {n_u} × {n_v}", *(text for text in what if text)])
 
 
@@ -131,6 +134,12 @@ def volume_to_render(scene: bpy.types.Scene) -> str:
         return ""
     found = _found(scene, json.loads(item.state)["volume"])
     return "" if found is None else str(found.name)
+
+
+def measured_text(scene: bpy.types.Scene) -> str:
+    """What was said of the shown run's counts, where they were measured; else ""."""
+    item = shown(scene)
+    return str(json.loads(item.state).get("measured", "")) if item is not None and item.state else ""
 
 
 def size_text(items: Any) -> str:
@@ -217,6 +226,8 @@ def _settings(recipe: Recipe) -> dict[str, Any]:
 def _differences(scene: bpy.types.Scene, old: Mapping[str, Any], own: bpy.types.Collection | None) -> Iterator[str]:
     collection = own if own in scanner.scanners(scene) else scanner.active_scanner(scene)
     yield from _of_modules(collection, old)
+    if old["volume"] is None:
+        return
     settings = _settings(panel_recipe(scene))
     panel = scene.mphdrr_projections
     chosen = panel.volume or _found(scene, old["volume"])
@@ -279,8 +290,10 @@ def _modules(numbers: list[int], count: int) -> str:
     return ids.module_name(numbers[0], count) if len(numbers) == 1 else modules_text(numbers)
 
 
-def _found(scene: bpy.types.Scene, old: Mapping[str, Any]) -> bpy.types.Object | None:
-    """The volume of a run: by its name, or, if it was given another, by its voxels."""
+def _found(scene: bpy.types.Scene, old: Mapping[str, Any] | None) -> bpy.types.Object | None:
+    """The volume of a run: by its name, or, if it was given another, by its voxels; None of a measured run."""
+    if old is None:
+        return None
     known = volumes.volume_objects(scene)
     by_name = [item for item in known if item.name == old["name"]]
     return next(iter(by_name or [item for item in known if volumes.content_of(item) == old["content"]]), None)

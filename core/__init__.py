@@ -19,6 +19,7 @@ from .geometry.design_formulas import collimator_length, roi_radius_seen
 from .geometry.frames import euler_pose
 from .geometry.generators import ellipse_rings, plate_rings, regular_polygon
 from .geometry.grid import Grid
+from .geometry.parallel_views import parallel_views
 from .geometry.presets import c_arm_views, pinhole_views
 from .geometry.ring_fits import RingFit, fit_rings, ring_order
 from .geometry.system import PinholeSystem
@@ -44,17 +45,24 @@ from .physics.sampling import sampling_gaps
 from .progress import Cancelled, Progress
 from .projector import Emission, InverseSquareSum, Projector, Transmission, intensity, trace_rays
 from .reconstruction.expectation import mlem, osem
+from .reconstruction.files import read_reconstruction, write_reconstruction
+from .reconstruction.priors import Prior, Quadratic, RelativeDifference, TotalVariation
 from .reconstruction.result import Reconstruction
 from .reconstruction.scores.derenzo import DerenzoScore, DerenzoSector, RodProfile, derenzo_score
 from .reconstruction.scores.images import BiasAndDeviation, bias_and_deviation, contrast_to_noise, nrmse, psnr, ssim
 from .reconstruction.scores.nema import NemaScore, NemaSphere, nema_score
 from .reconstruction.scores.summary import VolumeScore, score_volume
+from .reconstruction.stopping import StopWhen
 from .runs.files import read_run, write_run
+from .runs.frame_files import read_counts
+from .runs.measured import counts_run
 from .runs.mosaic import as_seen, mosaic
+from .runs.orientations import ORIENTATIONS
 from .runs.projecting import project_run
 from .runs.recipe import Recipe, read_recipe, write_recipe
+from .runs.reconstructing import reconstruct_run
 from .runs.run import ProjectionRun
-from .runs.run_recipe import run_recipe
+from .runs.run_recipe import projector_of_run, run_recipe
 from .volumes.meshes.mesh import Mesh, read_mesh, write_mesh
 from .volumes.meshes.surface import volume_to_mesh
 from .volumes.meshes.voxelization import voxelize_mesh

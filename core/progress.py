@@ -3,7 +3,7 @@
 import os
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from typing import TypeVar
+from typing import Any, TypeVar
 
 Part = TypeVar("Part")
 
@@ -15,6 +15,9 @@ Stages = Callable[[str], Progress | None]
 
 class Cancelled(Exception):
     """Raised by a progress callback to stop the work. Nothing half-done is left behind."""
+
+    reconstruction: Any = None
+    """Of an iterative reconstruction: the `Reconstruction` after its last whole iteration, which can be resumed."""
 
 
 class StagedProgress:

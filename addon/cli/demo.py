@@ -83,6 +83,7 @@ def _make_scene(scene: Any, run: ProjectionRun, out: Path) -> None:
     with _step("scene"):
         scanner.build_scanner(scene, run.system)
         pose, phantom = run.recipe["phantom.matrix"], run.recipe.tables()["phantom"]
+        assert run.volume is not None
         item = volumes.add_volume(run.volume, "Derenzo phantom", pose, phantom)
         rendering.show_run(scene, run, out / "run.h5", item)
         save_scene(out / "scanner.blend")

@@ -62,7 +62,7 @@ def _run(arguments: argparse.Namespace) -> None:
     if mu is not None:
         blender_scene.mphdrr_projections.mu = volumes.add_volume(mu, Path(arguments.mu).name)
     if run is not None:
-        projected = volumes.add_volume(run.volume, "Projected volume")
+        projected = None if run.volume is None else volumes.add_volume(run.volume, "Projected volume")
         rendering.show_run(blender_scene, run, Path(arguments.run_file), projected)
     save_scene(path)
     print(path)

@@ -4,7 +4,6 @@ Every setting of `runs.settings` is an option; the help lists the most used ones
 """
 
 import argparse
-import tomllib
 from pathlib import Path
 from typing import Any
 
@@ -18,10 +17,12 @@ from ..runs.presets import PRESETS
 from ..runs.recipe import Recipe, read_recipe, write_recipe
 from ..runs.run_recipe import run_recipe
 from ..runs.settings import SETTINGS
-from .options import add_command, number_or_name, numbered_path, output_path, progress_bar
+from .options import add_command, numbered_path, output_path, progress_bar
+from .recipe_options import add_entries, add_option, add_setting, typed_entries
 
 _LISTED = (
     *("system.columns", "system.modules", "volume.file", "volume.states", "volume.center", "phantom.file"),
+    *("counts.files", "counts.frames", "counts.frames_file", "counts.orientation", "counts.expected"),
     *("attenuation.file", "model.time", "model.isotope", "detector.plane", "detector.magnification", "noise.seed"),
     *("compute.backend", "compute.threads"),
 )
@@ -46,43 +47,33 @@ def add_parser(subparsers) -> None:  # type: ignore[no-untyped-def]
     parser = add_command(
         subparsers,
         "project",
-        "project a volume, or a phantom, into every module",
+        "project a volume, or a phantom, into every module; or take measured counts for the projections",
         "mphdrr project scanner.xlsx --volume ct.nii.gz --energy 60 --size 250 250 -o run.h5\n"
         "example: mphdrr project scanner.xlsx --volume heart.nii.gz --mu ct-mu.nii.gz --preset tc99m-tungsten-czt "
         "--time 600 --write-recipe heart.toml\n"
-        "example: mphdrr project heart.toml --noise 1 -o counts.h5",
+        "example: mphdrr project heart.toml --noise 1 -o counts.h5\n"
+        "example: mphdrr project scanner.xlsx --counts counts.npy --frames 1-80 --orientation front+v --time 600 "
+        "-o run.h5 --mosaic check.png",
     )
     text = "geometry workbook (.xlsx, .xlsm), recipe (.toml), or run (.h5, .npz, .pt), to be made again"
     parser.add_argument("file", nargs="?", metavar="FILE", help=text)
     for setting in SETTINGS.values():
-        if setting.key in _BY_HAND:
-            continue
-        text = argparse.SUPPRESS
-        if setting.key in _LISTED:
-            text = setting.help + (f" (default: {setting.default})" if setting.default not in (None, False) else "")
-        details: dict[str, Any] = {"type": str} if setting.kind is str else {}
-        if setting.kind is bool:
-            details["action"] = "store_true"
-        else:
-            details["metavar"] = "FILE" if setting.is_path else "NAME" if details else setting.unit.upper() or "VALUE"
-        if setting.sizes is not None or setting.kind is list:
-            details["nargs"] = "+"
-        _add(parser, setting.option, (setting.key,), text, **details)
+        if setting.key not in _BY_HAND and not setting.key.startswith("reconstruction."):
+            add_setting(parser, setting, setting.key in _LISTED)
     size = ("detector.rows", "detector.columns")
-    _add(parser, "--size", size, "Pixels, rows and columns (default: 256 256)", nargs=2)
-    _add(parser, "--energy", ("energy",), SETTINGS["volume.energy"].help, metavar="KEV")
+    add_option(parser, "--size", size, "Pixels, rows and columns (default: 256 256)", nargs=2)
+    add_option(parser, "--energy", ("energy",), SETTINGS["volume.energy"].help, metavar="KEV")
     model = parser.add_mutually_exclusive_group()
     for word, (_, text) in SETTINGS["model.kind"].words.items():
-        _add(model, f"--{word}", ("model.kind",), text, action="store_const", const=word)
-    _add(model, "--photons", ("model.photons",), SETTINGS["model.photons"].help)
+        add_option(model, f"--{word}", ("model.kind",), text, action="store_const", const=word)
+    add_option(model, "--photons", ("model.photons",), SETTINGS["model.photons"].help)
     text = "physics of counts in one choice, which options override: "
     text += ", ".join(PRESETS)
     parser.add_argument("--preset", choices=PRESETS, metavar="NAME", help=text)
     for option, keys in _DERENZO.items():
         nargs = "+" if option == "--rods" else len(keys) if len(keys) > 1 else None
-        _add(parser, option, keys, argparse.SUPPRESS, nargs=nargs)
-    text = "any entry of a recipe, such as model.aperture_points=7; KEY= takes it away"
-    parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", dest="entries", help=text)
+        add_option(parser, option, keys, argparse.SUPPRESS, nargs=nargs)
+    add_entries(parser)
     text = "write the recipe (.toml) of these options, all settings explained in it, instead of projecting"
     parser.add_argument("--write-recipe", metavar="FILE", help=text)
     parser.add_argument("-o", "--output", metavar="FILE", help=", ".join(FORMATS))
@@ -90,38 +81,13 @@ def add_parser(subparsers) -> None:  # type: ignore[no-untyped-def]
     parser.set_defaults(run=_run)
 
 
-def _add(parser: Any, option: str, keys: tuple[str, ...], text: str, **details: Any) -> None:
-    """Add an option for an entry of the recipe, or for several; it is in the namespace only where it is typed."""
-    if "action" not in details:
-        details = {"type": _value, "metavar": "VALUE", **details}
-    if text != argparse.SUPPRESS:
-        text = text.replace("%", "%%")
-        text = text[0].lower() + text[1:] if text[1].islower() else text  # as in the other options' help
-    parser.add_argument(option, dest=" ".join(keys), default=argparse.SUPPRESS, help=text, **details)
-
-
-def _value(text: str) -> Any:
-    """A value as in TOML, or a text without quotes."""
-    try:
-        return tomllib.loads(f"value = {text}")["value"]
-    except tomllib.TOMLDecodeError:
-        return number_or_name(text.strip())
-
-
 def _changes(arguments: argparse.Namespace, recipe: Recipe) -> dict[str, Any]:
     """What the options say, by the keys of recipes."""
-    typed = vars(arguments)
-    changes: dict[str, Any] = {}
-    for dest, value in typed.items():
-        keys = dest.split()
-        changes |= dict(zip(keys, value if len(keys) > 1 else [value], strict=True)) if "." in dest else {}
-    for entry in arguments.entries:
-        key, equals, text = entry.partition("=")
-        if not equals:
-            raise InputError(f"--set {entry}: expected KEY=VALUE, such as model.aperture_points=7")
-        changes[key.strip()] = _value(text) if text.strip() else None
+    typed, changes = vars(arguments), typed_entries(arguments)
     if changes.get("model.photons") is not None:
         changes.setdefault("model.kind", "transmission")
+    if changes.get("counts.files") is not None:
+        changes.setdefault("model.kind", "emission")
     if "energy" in typed:
         # Counts are of activity: the CT numbers are those of the attenuation.
         is_counts = changes.get("model.kind", recipe["model.kind"]) == "emission"
@@ -156,6 +122,10 @@ def _chosen(arguments: argparse.Namespace) -> tuple[Recipe, dict[str, Any]]:
     # An attenuation that is made with the volume, or moved with it, needs the volume made anew.
     together = recipe["attenuation.of_phantom"] or (recipe["volume.center"] and "attenuation" in now)
     if not together and all(now.get(table) == before.get(table) for table in ("volume", "phantom")):
+        if run.volume is None and recipe["counts.files"] is None:
+            raise InputError(
+                f"{file}: it holds measured counts, not what was measured; name a volume, a phantom, or --counts"
+            )
         kept["volume"] = run.volume
     return recipe, kept
 
@@ -175,7 +145,8 @@ def _run(arguments: argparse.Namespace) -> None:
     states = recipe["volume.states"] or ()
     count = max(1, len(states))
     outputs = {numbered_path(path, number, count).resolve() for number in range(1, count + 1)}
-    for file in (*states, recipe["volume.file"], recipe["attenuation.file"]):
+    counts = recipe["counts.files"] or ()
+    for file in (*states, *counts, recipe["volume.file"], recipe["attenuation.file"]):
         if file is not None and Path(file).resolve() in outputs:
             raise InputError(f"{file}: the projections would replace what they are made from; choose another --output")
     for number, run in enumerate(run_recipe(recipe, **kept, stages=progress_bar), 1):

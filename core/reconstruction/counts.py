@@ -1,17 +1,18 @@
 """Counts with an additive background: their log-likelihood, and checks of what a reconstruction is given."""
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..errors import InputError
 from ..projector import Projector
-from ..validation import real_array
-from ..volumes.volume import Volume
+from ..validation import instance, real_array, shape_text
+from .loop import plain
+from .result import Array
 
-Array = NDArray[np.floating[Any]]
+# Less is nothing: float32 could not hold what it would be divided into.
+LEAST = np.float32(1e-30)
 
 
 @dataclass(frozen=True, eq=False)
@@ -22,28 +23,32 @@ class CountData:
     background: Array
 
     @classmethod
-    def of(cls, A: Projector, counts: ArrayLike, background: ArrayLike = 0.0) -> "CountData":
-        """Checked: counts and background are at least 0, of the projector's shape.
+    def of(cls, method: str, A: Projector, counts: ArrayLike, background: ArrayLike = 0.0) -> "CountData":
+        """Checked: `A` is of emission; counts and background are at least 0, of the projector's shape.
 
-        The background is one number, one for each module (M,), or images. Raises InputError.
+        The background is one number, one for each module (M,), or images; that of the projector's model is added to it.
+        Raises InputError.
         """
-        if not isinstance(A, Projector):
-            raise InputError(f"reconstruction: expected a Projector, got {type(A).__name__}")
-        measured = real_array(counts, "counts", A.shape_out, np.float32)
-        if measured.min() < 0:
-            raise InputError(f"counts: expected 0 or more, got {measured.min():g}")
-        extra = np.asarray(background, dtype=np.float32)
+        instance(A, Projector, method)
+        if A.model.takes != ("activity",):
+            raise InputError(f"{method}: expected a projector of emission, got one of {A.model.name}")
+        measured = real_array(plain(counts), "counts", A.shape_out, np.float32)
+        _require_none_below_0(measured, "counts")
+        extra = real_array(plain(background), "background", None, np.float32)
+        _require_none_below_0(extra, "background")
         if extra.shape == A.shape_out[:1]:
             extra = extra[:, None, None]
         elif extra.shape not in ((), A.shape_out):
-            shapes = f"one number, {A.shape_out[0]} numbers or images of {' x '.join(map(str, A.shape_out))}"
-            raise InputError(f"background: expected {shapes}, got {' x '.join(map(str, extra.shape))}")
-        if not np.isfinite(extra).all() or extra.min(initial=0.0) < 0:
-            raise InputError("background: expected finite numbers, 0 or more")
-        return cls(measured, np.broadcast_to(extra, A.shape_out))
+            shapes = f"one number, {A.shape_out[0]} numbers or images of {shape_text(A.shape_out)}"
+            raise InputError(f"background: expected {shapes}, got {shape_text(extra.shape)}")
+        return cls(measured, np.broadcast_to(extra + A.background.astype(np.float32), A.shape_out))
 
     def __getitem__(self, which: NDArray[np.int64]) -> "CountData":
         return CountData(self.counts[which], self.background[which])
+
+    def record(self) -> dict[str, float]:
+        """For a reconstruction's settings."""
+        return {"counts": float(self.counts.sum(dtype=float)), "background": float(self.background.sum(dtype=float))}
 
     def ratio(self, images: Array) -> Array:
         """Measured by expected counts, where a volume's are `images`; 0 where neither is above 0.
@@ -51,7 +56,7 @@ class CountData:
         A pixel that counted something which nothing can have caused is left out: it says nothing about the volume.
         """
         expected = images + self.background
-        return np.divide(self.counts, expected, out=np.zeros_like(expected), where=expected > 0)
+        return np.divide(self.counts, expected, out=np.zeros_like(expected), where=expected > LEAST)
 
     def log_likelihood(self, images: Array) -> float:
         """Of the counts (Poisson) where a volume's images are `images`, without the terms that no volume changes.
@@ -59,23 +64,12 @@ class CountData:
         Pixels with counts that nothing can have caused are left out, as in `ratio`.
         """
         expected = images.astype(np.float64) + self.background
-        possible = expected > 0
-        logs = np.log(expected, out=np.zeros_like(expected), where=possible)
+        logs = np.log(expected, out=np.zeros_like(expected), where=expected > LEAST)
         return float(np.sum(self.counts * logs) - expected.sum())
 
 
-def starting_values(A: Projector, start: Volume | ArrayLike | None, mask: ArrayLike | None) -> Array:
-    """The values that an algorithm begins with, float32: those of `start`, or 1; 0 outside `mask`. Raises InputError."""
-    if start is None:
-        values = np.ones(A.shape_in, np.float32)
-    else:
-        array = A._check(start) if isinstance(start, Volume) else start
-        values = real_array(array, "start", A.shape_in, np.float32)
-        if values.min() < 0:
-            raise InputError(f"start: expected 0 or more, got {values.min():g}")
-    if mask is not None:
-        inside = np.asarray(mask)
-        if inside.shape != A.shape_in or inside.dtype != bool:
-            raise InputError(f"mask: expected booleans of shape {' x '.join(map(str, A.shape_in))}")
-        values[~inside] = 0.0
-    return values
+def _require_none_below_0(numbers: Array, name: str) -> None:
+    if numbers.min(initial=0.0) < 0:
+        index = np.unravel_index(numbers.argmin(), numbers.shape)
+        where = f" at index {tuple(int(i) for i in index)}" if index else ""
+        raise InputError(f"{name}: expected 0 or more, got {numbers.min():g}{where}")

@@ -1,6 +1,6 @@
-"""What a reconstruction gives, and when it stops."""
+"""What a reconstruction gives."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -9,22 +9,26 @@ from numpy.typing import NDArray
 
 from ..volumes.volume import Volume
 
-Callback = Callable[[int, NDArray[np.floating[Any]]], bool | None]
-"""Called as ``callback(iteration, array)`` after each iteration, counted from 1, with the volume's values, which it must not
-change; what is true ends the reconstruction."""
+Array = NDArray[np.floating[Any]]
+
+Callback = Callable[[int, Array], bool | None]
+"""Called as ``callback(iteration, values)`` after each iteration, counted from 1, with the volume's values, which cannot be
+changed; what is true ends the reconstruction. A resumed one counts on."""
 
 
 @dataclass(frozen=True, eq=False)
 class Reconstruction:
-    """A reconstructed volume, and how it came about."""
+    """A reconstructed volume, and how it came about; as ``start=`` of the same algorithm it goes on where it ended."""
 
     volume: Volume
     objective: NDArray[np.float64]
     """After each iteration (n,): what the algorithm makes as large, or as small, as it can."""
-    settings: dict[str, Any] = field(default_factory=dict)
-    """The algorithm's name and arguments: anything JSON can hold."""
+    settings: Mapping[str, Any] = field(default_factory=dict)
+    """The algorithm's name ("method"), its arguments, and why it ended ("stopped"): anything JSON can hold."""
+    state: Mapping[str, Array] = field(default_factory=dict)
+    """What else the algorithm needs to go on as if it had not ended, by name; most need the volume alone."""
 
     @property
     def iterations(self) -> int:
-        """How many were done."""
+        """How many were done, those before it was resumed included."""
         return len(self.objective)

@@ -22,7 +22,8 @@ from ..volumes.volume import Volume
 from .run import ProjectionRun
 
 _FORMAT = "mphDRR run"
-_FORMAT_VERSION = 1
+_FORMAT_VERSION = 2
+"""Of files of measured runs, which hold no volume; others stay what earlier versions of mphDRR read, version 1."""
 
 _CONVENTIONS = (
     "Lengths in mm. World: right-handed, origin at the isocentre, +z along the patient. "
@@ -45,8 +46,10 @@ _ARRAYS: dict[str, tuple[str, Callable[[ProjectionRun], Any]]] = {
     "geometry/intrinsics": ("pixel", lambda run: run.intrinsics()),
     "geometry/projection_matrix": ("pixel", lambda run: run.views.projection_matrices()),
     **{f"views/{name}": ("mm", attrgetter(f"views.{name}")) for name in _RAYS},
-    "volume/affine": ("mm", lambda run: run.volume.grid.affine),
 }
+_VOLUME = ("volume/array", "volume/affine")
+"""Which a measured run does not have."""
+_BACKGROUND = "background"  # in the unit of the projections; where there is none, nothing but the volume was projected
 _ATTRIBUTES = "attributes"
 _COMPRESS_FROM = 1 << 16  # bytes: below, compressing costs more than it saves
 
@@ -60,15 +63,19 @@ def write_run(run: ProjectionRun, path: str | os.PathLike[str]) -> None:
     `InputError` for another suffix, where torch is missing for .pt, or the file cannot be written: the old one then stays.
     """
     write, _ = _format(Path(path))
-    arrays = {"projections": run.projections, "volume/array": run.volume.array}
-    arrays |= {name: get(run) for name, (_, get) in _ARRAYS.items()}
+    arrays = {"projections": run.projections} | {name: get(run) for name, (_, get) in _ARRAYS.items()}
+    of_volume: dict[str, Any] = {}
+    if run.volume is not None:
+        arrays |= dict(zip(_VOLUME, (run.volume.array, run.volume.grid.affine), strict=True))
+        of_volume = {"volume_quantity": run.volume.quantity, "volume_unit": run.volume.unit}
+    if np.any(run.background):
+        arrays[_BACKGROUND] = np.asarray(run.background)
     attributes = {
         "format": _FORMAT,
-        "format_version": _FORMAT_VERSION,
+        "format_version": 1 if of_volume else _FORMAT_VERSION,
         "conventions": _CONVENTIONS,
         "projections_unit": run.unit,
-        "volume_quantity": run.volume.quantity,
-        "volume_unit": run.volume.unit,
+        **of_volume,
         "seed": "none" if run.seed is None else int(run.seed),
         "workbook": run.workbook,
         "workbook_sha256": run.workbook_sha256,
@@ -99,25 +106,30 @@ def _run_of(arrays: dict[str, NDArray[Any]], attributes: dict[str, Any]) -> Proj
         raise InputError(f"expected a file marked {_FORMAT!r}, found {attributes.get('format', 'no mark')!r}")
     if int(attributes["format_version"]) > _FORMAT_VERSION:
         raise InputError(f"written by a newer mphDRR (format {attributes['format_version']}); update to read it")
-    for name in ("projections", "volume/array", *_ARRAYS):
+    is_measured = int(attributes["format_version"]) == _FORMAT_VERSION
+    for name in ("projections", *(() if is_measured else _VOLUME), *_ARRAYS):
         if name not in arrays and name.removeprefix("geometry/") not in LATER_LENGTHS:
             raise InputError(f"array {name} is missing")
     lengths: Any = {name: arrays[f"geometry/{name}"] for name in LENGTHS if f"geometry/{name}" in arrays}
     rays: Any = {name: arrays[f"views/{name}"] for name in _RAYS}
-    volume, seed = arrays["volume/array"], attributes["seed"]
+    volume, seed = None, attributes["seed"]
+    if not is_measured:
+        values = arrays["volume/array"]
+        n_x, n_y, n_z = values.shape
+        volume = Volume(values, Grid((n_x, n_y, n_z), arrays["volume/affine"]), str(attributes["volume_quantity"]))
     n_v, n_u = arrays["projections"].shape[1:]
-    n_x, n_y, n_z = volume.shape
     return ProjectionRun(
         projections=np.asarray(arrays["projections"], np.float32),
         system=PinholeSystem(arrays["geometry/center"], **lengths, numbers=arrays["geometry/number"]),
         views=Views(**rays, shape=(n_v, n_u)),
-        volume=Volume(volume, Grid((n_x, n_y, n_z), arrays["volume/affine"]), str(attributes["volume_quantity"])),
+        volume=volume,
         unit=str(attributes["projections_unit"]),
         settings=json.loads(attributes["settings"]),
         seed=None if seed == "none" else int(seed),
         workbook=str(attributes["workbook"]),
         workbook_sha256=str(attributes["workbook_sha256"]),
         versions=json.loads(attributes["versions"]),
+        background=arrays.get(_BACKGROUND, 0.0),  # type: ignore[arg-type]  # checked there
     )
 
 
@@ -125,7 +137,9 @@ def _write_hdf5(arrays: dict[str, NDArray[Any]], attributes: dict[str, Any], pat
     """Arrays as datasets with a `unit`, in chunks of one view each, so that one view reads alone; attributes on the root."""
     import h5py
 
-    units = {"projections": attributes["projections_unit"], "volume/array": attributes["volume_unit"]}
+    unit = attributes["projections_unit"]
+    units = {"projections": unit, _BACKGROUND: unit}
+    units |= dict(zip(_VOLUME, (attributes.get("volume_unit"), "mm"), strict=True))
     units |= {name: unit for name, (unit, _) in _ARRAYS.items()}
     with h5py.File(path, "w") as file:
         file.attrs.update(attributes)

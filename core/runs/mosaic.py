@@ -98,7 +98,8 @@ def sheet(
 ) -> Sheet:
     """Draw the images (M, n_v, n_u) of modules with these `numbers` and `rings` (M,), a ring in a row, with a colour bar.
 
-    Rings follow each other in the order of their modules; one of more than `COLUMNS` modules takes several rows. Where the
+    The numbers may be texts. Rings follow each other in the order of their modules; one of more than `COLUMNS` modules
+    takes several rows. Where the
     images have more than `pixels` together, they are shown smaller, as means over blocks of pixels; small ones are shown
     larger, so that the numbers do not hide them. The colour bar's ends are the window of `display`, which is by default
     that of all exact numbers. Each image has what `totals` says of the part that is shown in a corner if there is room.
@@ -130,8 +131,36 @@ def sheet(
 
 def write_sheet(run: ProjectionRun, path: str | os.PathLike[str], display: Display | None = None) -> None:
     """Write all images of a run in one picture, a PNG; see `sheet`."""
-    drawn = sheet(run.projections, run.system.numbers, run.system.rings(), run.unit, display)
-    write_png(drawn.picture, path)
+    drawn = sheet(run.projections, labels(run), run.system.rings(), run.unit, display)
+    write_png(_captioned(drawn.picture, caption(run)), path)
+
+
+def labels(run: ProjectionRun) -> list[str]:
+    """What each image of a run is called in a sheet: its module's number, and that of its frame of measured counts."""
+    numbers = run.system.numbers.tolist()
+    frames = {number: k for k, number in enumerate(run.settings.get("frames") or (), 1)}
+    return [f"{number} ({frames[number]})" if number in frames else str(number) for number in numbers]
+
+
+def caption(run: ProjectionRun) -> str:
+    """What was said of measured counts and how a sheet shows them, in a line; empty for other runs."""
+    if not run.is_measured:
+        return ""
+    words = run.settings["orientation"]
+    lay = words if isinstance(words, str) else "each its own way"
+    side = "crystals seen from behind" if run.settings["detector"] == "real" else "what the pinholes see"
+    said = f"{run.settings['counts']}, {run.recipe['model.time']:g} s, frames {lay}"
+    return f"{said}. Module (frame): {side}, +v at the top, +u at the left"
+
+
+def _captioned(picture: NDArray[np.uint8], text: str) -> NDArray[np.uint8]:
+    """A picture with a line of text below, as large as fits."""
+    if not text:
+        return picture
+    size = max(_SMALL_TEXT, min(picture.shape[0] / 25, 0.95 * picture.shape[1] / letters.width(text, 1.0)))
+    strip = np.full((math.ceil(1.5 * size), *picture.shape[1:]), _BORDER, np.uint8)
+    _write(strip, text, round(0.15 * size), round(0.5 * size), size, shade=1.0)
+    return np.concatenate([picture, strip])
 
 
 def smaller(images: NDArray[np.float32], pixels: float) -> NDArray[np.float32]:

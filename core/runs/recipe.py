@@ -89,6 +89,13 @@ def fitting_recipe(values: Mapping[str, Any], kept: Collection[str] = ()) -> Rec
     return Recipe(values)
 
 
+def recorded_recipe(recipe: Recipe) -> Recipe:
+    """The recipe as a run keeps it: with this version's defaults of what the images depend on."""
+    of_images = ("model.", "detector.", "compute.")
+    defaults = {key: setting.default for key, setting in SETTINGS.items() if key.startswith(of_images)}
+    return fitting_recipe({**defaults, **recipe.given}, recipe.given)
+
+
 def recipe_of_tables(tables: Mapping[str, Any]) -> Recipe:
     """The recipe of values by table and name, as `Recipe.tables` gives them; `InputError` as of `Recipe`."""
     values: dict[str, Any] = {}

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from ..errors import InputError
 from ..geometry.system import PinholeSystem
 from ..geometry.views import Views
+from ..projector.models import checked_background
 from ..validation import freeze, real_array
 from ..version import VERSION
 from ..volumes.volume import Volume
@@ -33,20 +34,25 @@ def versions() -> dict[str, str]:
 
 @dataclass(frozen=True, eq=False)
 class ProjectionRun:
-    """The images of one run, with geometry, volume and provenance; `InputError` where the parts do not fit together."""
+    """The images of one run, with geometry, volume and provenance; `InputError` where the parts do not fit together.
+
+    A measured run (`counts_run`) has no volume: nobody knows what was in the scanner.
+    """
 
     projections: NDArray[np.float32]  # (M, n_v, n_u), column index along +u, row index along +v
     system: PinholeSystem  # the M modules
     views: Views  # the M images' rays
-    volume: Volume  # what was projected
+    volume: Volume | None = None  # what was projected; None where the images were measured
     unit: str = ""  # of the projections, such as "kBq/mL mm"
     settings: Mapping[str, Any] = field(default_factory=dict)  # how they were made: anything JSON can hold
     seed: int | None = None  # of the noise; None where the projections have none
     workbook: str = ""  # name of the geometry workbook, and its SHA-256; empty where there is none
     workbook_sha256: str = ""
     versions: Mapping[str, str] = field(default_factory=versions)  # of mphDRR and what it ran on
+    background: float | NDArray[np.float64] = 0.0  # expected besides the volume's, as of `Emission`: (), (M,) or images
 
     def __post_init__(self) -> None:
+        self.views.require_pinholes("run")
         if len(self.views) != len(self.system):
             raise InputError(f"run: {len(self.system)} modules, but {len(self.views)} views")
         shape = (len(self.views), *self.views.shape)
@@ -56,12 +62,21 @@ class ProjectionRun:
         if projections.shape != shape:
             raise InputError(f"run: expected projections of shape {shape}, got {projections.shape}")
         object.__setattr__(self, "projections", freeze(projections.view()))
+        background = checked_background(self.background, "run: background", len(self.views), self.views.shape)
+        object.__setattr__(self, "background", background)
         if not self.unit:
+            if self.volume is None:
+                raise InputError("run: without a volume, say the unit of the projections, such as counts")
             object.__setattr__(self, "unit", f"{self.volume.unit} mm")
         source = self.system.source
         if source is not None and not self.workbook_sha256:
             object.__setattr__(self, "workbook", source.path.name)
             object.__setattr__(self, "workbook_sha256", source.sha256)
+
+    @property
+    def is_measured(self) -> bool:
+        """Whether the images are counts of a real or another simulator's scanner."""
+        return "frames" in self.settings
 
     @property
     def recipe(self) -> Recipe:

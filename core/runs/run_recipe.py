@@ -19,15 +19,15 @@ from ..phantoms.settings import setting_names
 from ..physics.ct_numbers import hu_to_mu
 from ..physics.isotopes import photon_energy
 from ..progress import Progress, Stages
-from ..projector import Emission, InverseSquareSum, Model, Transmission
+from ..projector import Emission, InverseSquareSum, Model, Projector, Transmission
 from ..volumes.rearranging import centered
 from ..volumes.volume import Volume
 from ..volumes.volume_files import read_volume, read_volume_of
 from ..workbook import read_system
+from .measured import recipe_counts
 from .projecting import project_run, warn_of_energy
-from .recipe import Recipe, fitting_recipe
+from .recipe import Recipe, recorded_recipe
 from .run import ProjectionRun
-from .settings import SETTINGS
 
 _MODELS: dict[str, Any] = {"transmission": Transmission, "emission": Emission, "inverse-square": InverseSquareSum}
 _MOST_MU = 500.0
@@ -44,7 +44,7 @@ def run_recipe(
     mu: Volume | None = None,
     stages: Stages = lambda stage: None,
 ) -> Iterator[ProjectionRun]:
-    """Make what a recipe asks for: one run, or one for each of ``volume.states``.
+    """Make what a recipe asks for: one run, or one for each of ``volume.states``; of measured counts, the run of these.
 
     Parameters
     ----------
@@ -68,9 +68,10 @@ def run_recipe(
     model = recipe_model(recipe, system)
     if mu is None:
         mu = _attenuation(recipe, model, stages)
-    of_images = ("model.", "detector.", "compute.")
-    defaults = {key: setting.default for key, setting in SETTINGS.items() if key.startswith(of_images)}
-    recorded = fitting_recipe({**defaults, **recipe.given}, recipe.given)
+    if recipe["counts.files"] is not None and volume is None:
+        yield recipe_counts(recipe, system, stages)
+        return
+    recorded = recorded_recipe(recipe)
     sources: Iterator[_Source]
     if volume is not None:
         if mu is None and recipe["attenuation.of_phantom"]:
@@ -115,6 +116,52 @@ def recipe_model(recipe: Recipe, system: PinholeSystem, mu: Volume | None = None
         given["mu"] = mu
     model: Model = cls(**given) if cls is Transmission else cls(system, **given)
     return model
+
+
+def projector_of_run(
+    run: ProjectionRun,
+    grid: Grid,
+    mu: Volume | None = None,
+    recipe: Recipe | None = None,
+    backend: str = "auto",
+    threads: int | None = None,
+    stages: Stages = lambda stage: None,
+) -> Projector:
+    """The projector from volumes on `grid` to the images of a run, with the model that the run's recipe says.
+
+    Parameters
+    ----------
+    run
+        Simulated or measured.
+    grid
+        Of the volumes.
+    mu
+        What attenuates (1/mm), on any grid, instead of what the recipe says: a file, which is read again, or the phantom,
+        which is voxelized on `grid`.
+    recipe
+        Instead of the run's own, such as ``run.recipe.updated({"model.aperture_points": 19})``.
+    backend, threads
+        As of `Projector`.
+    stages
+        Begins each stage: reading, voxelizing.
+
+    Raises
+    ------
+    InputError
+        The run holds no recipe and none is given, or the attenuation cannot be made again from it.
+    """
+    recipe = run.recipe if recipe is None else recipe
+    if mu is None and recipe["model.kind"] == "emission":
+        model = recipe_model(recipe, run.system)
+        if recipe["attenuation.of_phantom"]:
+            mu = _mu_of_phantom(_phantom_of(recipe), phantom_pose(recipe), grid, model, stages)
+        elif recipe["volume.center"] and recipe["attenuation.file"] is not None:
+            raise InputError(
+                "attenuation.file: it was moved with the volume (volume.center); give mu where it was then"
+            )
+        else:
+            mu = _attenuation(recipe, model, stages)
+    return Projector(grid, run.views, recipe_model(recipe, run.system, mu), backend, threads)
 
 
 def _volume_name(record: Recipe) -> str:
@@ -197,15 +244,7 @@ def _from_phantom(recipe: Recipe, record: Recipe, model: Model, mu: Volume | Non
     if recipe["volume.object"] is not None and not any(key.startswith("phantom.") for key in recipe.given):
         name = recipe["volume.object"]
         raise InputError(f"volume.object: {name!r} is in a Blender scene; give --volume FILE instead")
-    phantom: Phantom
-    if recipe["phantom.file"] is not None:
-        phantom = read_phantom(recipe["phantom.file"])
-    elif recipe["phantom.text"] is not None:
-        phantom = parse_phantom(recipe["phantom.text"])
-    else:
-        (kind,) = (kind for kind in KINDS if kind.name == recipe["phantom.kind"])
-        phantom = kind.phantom(**{**kind.usual, **recipe.fields("phantom", kind.phantom)})
-    pose = phantom_pose(recipe)
+    phantom, pose = _phantom_of(recipe), phantom_pose(recipe)
     n_x, n_y, n_z = np.broadcast_to(recipe["phantom.voxels"], 3).tolist()
     # Where no spacing is given, the phantom fits however it is turned, and a voxel is kept free all around.
     spacing = np.broadcast_to(recipe["phantom.spacing"] or phantom.extent / max(1, min(n_x, n_y, n_z) - 2), 3)
@@ -216,14 +255,30 @@ def _from_phantom(recipe: Recipe, record: Recipe, model: Model, mu: Volume | Non
     else:
         grid = Grid.centered((n_x, n_y, n_z), spacing, pose[:3, 3])
     if recipe["attenuation.of_phantom"]:
-        if all(shape.mu is None for shape in phantom.shapes):
-            raise InputError(f"attenuation.of_phantom (--phantom-mu): no shape of the {phantom.title} has a mu")
-        warn_of_energy(model, phantom.mu_energy, f"the mu of the {phantom.title}")
-        mu = phantom.voxelize(grid, pose, stages("voxelizing"), "mu")
+        mu = _mu_of_phantom(phantom, pose, grid, model, stages)
     is_described = recipe["phantom.file"] is not None or recipe["phantom.text"] is not None
     quantity = "mu" if is_described and recipe["model.photons"] is not None else "activity"
     volume = phantom.voxelize(grid, pose, stages("voxelizing"), quantity)
     yield volume, mu, with_phantom(record, phantom, pose)
+
+
+def _phantom_of(recipe: Recipe) -> Phantom:
+    """The phantom that a recipe describes, without its pose."""
+    if recipe["phantom.file"] is not None:
+        return read_phantom(recipe["phantom.file"])
+    if recipe["phantom.text"] is not None:
+        return parse_phantom(recipe["phantom.text"])
+    (kind,) = (kind for kind in KINDS if kind.name == recipe["phantom.kind"])
+    phantom: Phantom = kind.phantom(**{**kind.usual, **recipe.fields("phantom", kind.phantom)})
+    return phantom
+
+
+def _mu_of_phantom(phantom: Phantom, pose: NDArray[np.float64], grid: Grid, model: Model, stages: Stages) -> Volume:
+    """What the phantom attenuates, on a grid."""
+    if all(shape.mu is None for shape in phantom.shapes):
+        raise InputError(f"attenuation.of_phantom (--phantom-mu): no shape of the {phantom.title} has a mu")
+    warn_of_energy(model, phantom.mu_energy, f"the mu of the {phantom.title}")
+    return phantom.voxelize(grid, pose, stages("voxelizing"), "mu")
 
 
 def phantom_pose(recipe: Recipe) -> NDArray[np.float64]:

@@ -18,8 +18,11 @@ from ..phantoms.kinds import KINDS
 from ..physics.isotopes import ISOTOPES
 from ..physics.materials import APERTURES, CRYSTALS
 from ..projector.backends import BACKENDS, OLD_NAMES
+from ..reconstruction.methods import METHODS, PRIORS, taking
 from ..validation import real_array
 from ..volumes.volume import LINE_INTEGRALS
+from .frame_files import RAW_TYPES
+from .orientations import ORIENTATIONS
 
 Words = Mapping[str, tuple[str, str]]
 """The words that a setting may be, each with its label and description."""
@@ -107,14 +110,27 @@ def _named(names: Iterable[str], text: str) -> Words:
 
 
 _COUNTS = "model.kind=emission"
+_METHOD_OF_COUNTS = " or ".join(f"reconstruction.method={m.name}" for m in METHODS.values() if m.of_counts)
 _RAYS = "no model.kind=inverse-square"
 _FILE = "volume.file or volume.states"
-_PHANTOM = ("no volume.file", "no volume.states")
+_MADE = "no counts.files"
+_PHANTOM = ("no volume.file", "no volume.states", _MADE)
 _NO_PHANTOM = ("no phantom.kind", "no phantom.file", "no phantom.text")
 _SERIES = "The DICOM series with this number, description or UID, where the folder holds several"
 _AT_ENERGY = "Convert CT numbers to attenuation (1/mm) at this energy, or at an isotope's strongest line"
 _ISOTOPES = _named(ISOTOPES, "Energy window 10 % around its strongest line")
 _BY_NAME = "As it attenuates the isotope's photons"
+
+
+def _methods(argument: str) -> str:
+    """The condition that a method takes an argument."""
+    return " or ".join(f"reconstruction.method={name}" for name in taking(argument))
+
+
+def _priors(argument: str) -> str:
+    """The condition that a prior takes an argument."""
+    return " or ".join(f"reconstruction.prior={prior.name}" for prior in PRIORS.values() if argument in prior.takes)
+
 
 _DECLARED = (
     Setting("system.file", str, None, "Geometry workbook (.xlsx, .xlsm)", is_path=True, option="--system"),
@@ -122,9 +138,9 @@ _DECLARED = (
             "geometry show --write-columns makes a draft", is_path=True),
     Setting("system.modules", str, None, "Numbers of the modules, such as 1-40 or 1-20,41", "all"),
     Setting("volume.file", str, None, "Volume, or folder of a DICOM series", "a phantom is made", is_path=True,
-            needs=("no volume.states", *_NO_PHANTOM), option="--volume"),
+            needs=("no volume.states", _MADE, *_NO_PHANTOM), option="--volume"),
     Setting("volume.states", str, None, "Volumes of what changes, such as a beating heart: a run of each, as OUTPUT-1, "
-            "OUTPUT-2 …", is_path=True, sizes=(), needs=("no volume.file", *_NO_PHANTOM)),
+            "OUTPUT-2 …", is_path=True, sizes=(), needs=("no volume.file", _MADE, *_NO_PHANTOM)),
     Setting("volume.object", str, None, "Name of the volume's object in a Blender scene", needs=_PHANTOM),
     Setting("volume.state", str, None, "State of the object's sequence", needs=("volume.object",)),
     Setting("volume.series", str, None, _SERIES, needs=("volume.file",)),
@@ -161,6 +177,26 @@ _DECLARED = (
             needs=("attenuation.file",), option="--mu-energy"),
     Setting("attenuation.of_phantom", bool, False, "The phantom attenuates by its own coefficients",
             needs=(_COUNTS, *_PHANTOM, "no attenuation.file"), option="--phantom-mu"),
+    Setting("counts.files", str, None, "Measured counts instead of a volume: files with a frame a module, of a real or "
+            "another simulator's scanner (.npy, .npz, .h5, DICOM, .mhd, Interfile's .hdr, raw numbers)", is_path=True,
+            sizes=(), needs=(_COUNTS, "no volume.file", "no volume.states", *_NO_PHANTOM), option="--counts"),
+    Setting("counts.frames", str, None, "Which module each frame is of: the modules' numbers in the frames' order, such as "
+            "1-80, 80-1 or 3,1,2", needs=("counts.files", "no counts.frames_file"), option="--frames"),
+    Setting("counts.frames_file", str, None, "Text file with these numbers", is_path=True, needs=("counts.files",
+            "no counts.frames")),
+    Setting("counts.orientation", str, None, "How a frame, as a picture with row 0 at the top, lies on the crystal: seen "
+            "from the front (the pinhole) or from the back, with which of the module's axes at the top; one word, or one "
+            "for each frame", words=ORIENTATIONS, sizes=(), needs=("counts.files",)),
+    Setting("counts.expected", bool, False, "The numbers are expected means, which may be fractions",
+            needs=("counts.files",)),
+    Setting("counts.dataset", str, None, "Name of the array in .npz and .h5", "the only one of three axes",
+            needs=("counts.files",)),
+    Setting("counts.raw_shape", int, None, "Frames, rows and columns of a raw file", least=1, sizes=(3,),
+            needs=("counts.files",)),
+    Setting("counts.raw_type", str, None, "Type of a raw file's numbers", words=_named(RAW_TYPES, ""),
+            needs=("counts.files",)),
+    Setting("counts.raw_big_endian", bool, False, "The most significant byte of a raw file's numbers comes first",
+            needs=("counts.files",)),
     Setting("model.kind", str, "transmission", "What a pixel holds", label="Model", option="--model", words={
         "transmission": ("Radiograph", "Line integrals of the volume"),
         "emission": ("SPECT Counts", "Photons of a volume of activity that the crystal counts"),
@@ -202,6 +238,8 @@ _DECLARED = (
             needs=(_COUNTS,), label="Collimator Walls"),
     Setting("model.within_crystal", bool, False, "Pixels beyond the crystal's side count nothing", needs=(_COUNTS,),
             label="Crystal's Side"),
+    Setting("model.background", float, 0.0, "Counts of each pixel besides those of the volume, in the whole acquisition: "
+            "scatter and dark counts", least=0, slider=100, needs=(_COUNTS,), option="--background-counts"),
     Setting("model.pixel_points", int, None, "Points of each pixel's area, for each point of the hole; auto: as many as "
             "the tolerance asks for, which takes longer for small voxels", "auto for counts, 1, its centre, for "
             "radiographs", words={"auto": ("Automatic", "")}, least=1, slider=100, needs=(_RAYS,)),
@@ -220,7 +258,44 @@ _DECLARED = (
     Setting("detector.pitch", float, None, "Pixel size", "the image covers the crystal's whole side", unit="mm", above=0,
             slider=10, label="Pixel Size (mm)"),
     Setting("noise.seed", int, None, "Draw Poisson counts with this seed; of several states with SEED, SEED + 1 …",
-            "their expected means", least=0, needs=("model.kind=emission or model.photons",), option="--noise"),
+            "their expected means", least=0, needs=("model.kind=emission or model.photons", _MADE), option="--noise"),
+    Setting("reconstruction.method", str, "osem", "How the volume is found",
+            words={method.name: (method.label, method.text) for method in METHODS.values()}),
+    Setting("reconstruction.iterations", int, 10, "How often all images are used", least=1, slider=100),
+    Setting("reconstruction.subsets", int, None, "Of the modules: each of an iteration's updates uses one of them",
+            "about a fifth of the modules' number", least=1, slider=80, needs=(_methods("subsets"),)),
+    Setting("reconstruction.voxels", int, (64,), "Voxels along x y z, or one number for all", least=1, sizes=(1, 3)),
+    Setting("reconstruction.spacing", float, None, "Voxel size, one or three", "the voxels cover the ROI", unit="mm",
+            above=0, slider=10, sizes=(1, 3), label="Voxel Size (mm)"),
+    Setting("reconstruction.center", float, (0.0, 0.0, 0.0), "Middle of the volume, x y z", unit="mm", sizes=(3,)),
+    Setting("reconstruction.aperture_points", int, None, "Points of the hole that the reconstruction reckons with; 1: no "
+            "recovery of its blur", "7, or those of the run if it was made with fewer", least=1, slider=64,
+            label="Hole Points", needs=(_METHOD_OF_COUNTS,), option="--aperture-points"),
+    Setting("reconstruction.pixel_points", int, 1, "Points of each pixel's area that it reckons with, for each point of the "
+            "hole", least=1, slider=16, needs=(_METHOD_OF_COUNTS,)),
+    Setting("reconstruction.ignore_attenuation", bool, False, "Reckon without the attenuation of the run",
+            needs=(_METHOD_OF_COUNTS,)),
+    Setting("reconstruction.ignore_blur", bool, False, "Reckon without the detector's own blur: no recovery of it",
+            needs=(_METHOD_OF_COUNTS,), label="Ignore Detector Blur"),
+    Setting("reconstruction.background", float, 0.0, "Counts expected in each pixel besides those of the volume, such as "
+            "scatter", least=0, slider=100, needs=(_methods("background"),)),
+    Setting("reconstruction.prior", str, None, "Penalty on noise", "none", needs=(_methods("prior"),),
+            words={prior.name: (prior.label, prior.text) for prior in PRIORS.values()}),
+    Setting("reconstruction.weight", float, None, "How much the penalty counts beside the data", above=0, slider=1,
+            needs=("reconstruction.prior",)),
+    Setting("reconstruction.gamma", float, 2.0, "How much large differences are spared", least=0, slider=10,
+            needs=(_priors("gamma"),)),
+    Setting("reconstruction.edge", float, None, "Value below which differences count as noise", "what suits the penalty",
+            above=0, slider=10, needs=(_priors("edge"),)),
+    Setting("reconstruction.anatomy", str, None, "Volume across whose edges differences are not penalised, such as a CT",
+            is_path=True, needs=("reconstruction.prior",)),
+    Setting("reconstruction.stop_change", float, None, "End when an iteration changes the objective by less than this share "
+            "of it, such as 1e-5", "all iterations are done", above=0, slider=0.01),
+    Setting("reconstruction.stop_noise", float, None, "End when the standard deviation in the region is this share of its "
+            "mean", above=0, slider=1, needs=("reconstruction.stop_region",)),
+    Setting("reconstruction.stop_region", float, None, "Ball of even activity in which noise is measured: x y z radius",
+            unit="mm", sizes=(4,), needs=("reconstruction.stop_noise",)),
+    Setting("reconstruction.stop_seconds", float, None, "End after so much time", unit="s", above=0, slider=3600),
     Setting("compute.backend", str, "auto", "What computes the line integrals", words={
         "auto": ("Automatic", "The fastest that works here"), **{b.name: (b.label, b.text) for b in BACKENDS.values()},
     }),

@@ -24,6 +24,8 @@ MODULE = "bl_ext.user_default.mphdrr"
 # Where the script binds the top folder of this repository's path into Blender's root.
 BOUND = Path(os.environ.get("REAL_BLENDER_ROOT", "/opt/real-blender")).joinpath(*ROOT.parts[1:2])
 
+PATIENCE = 300  # s after which a window that has not said that it is done is closed
+
 Run = Callable[..., subprocess.CompletedProcess[str]]
 
 
@@ -61,6 +63,12 @@ def run_blender(
     return done
 
 
+def _emptied(folder: Path) -> Path:
+    shutil.rmtree(folder, ignore_errors=True)
+    folder.mkdir(parents=True)
+    return folder
+
+
 @pytest.fixture(scope="session")
 def extension_zip() -> Path:
     """The built zip for Linux; it must be of this tree."""
@@ -79,9 +87,7 @@ def extension_zip() -> Path:
 def home(extension_zip: Path) -> Path:
     """A clean home of Blender with the extension installed from the zip and enabled."""
     subprocess.run([REAL_BLENDER, "setup"], check=True, capture_output=True)
-    shutil.rmtree(OUTPUT, ignore_errors=True)
-    folder = OUTPUT / "home"
-    folder.mkdir(parents=True)
+    folder = _emptied(OUTPUT / f"home-{os.environ.get('PYTEST_XDIST_WORKER', 'alone')}")
     run_blender("--command", "extension", "install-file", "-r", "user_default", "-e", extension_zip, home=folder)
     return folder
 
@@ -89,9 +95,7 @@ def home(extension_zip: Path) -> Path:
 @pytest.fixture
 def work_folder(home: Path, request: pytest.FixtureRequest) -> Path:
     """An empty folder of this test's own that Blender sees at the same path."""
-    folder = OUTPUT / request.node.name.replace("/", "-")
-    folder.mkdir()
-    return folder
+    return _emptied(OUTPUT / request.node.name.replace("/", "-"))
 
 
 @pytest.fixture
@@ -118,18 +122,18 @@ def blender_script(blender: Run, work_folder: Path) -> Run:
 
 @pytest.fixture
 def blender_window(home: Path, work_folder: Path) -> Callable[..., Path]:
-    """`blender_window(text, *arguments, seconds=12)`: run Python in a Blender with its window; return a PNG of the screen.
+    """`blender_window(text, *arguments)`: run Python in a Blender with its window; return a PNG of the screen.
 
     The script writes its findings to a JSON file in `work_folder`; the window is closed when that has "error" or a
-    true "ok", and at the latest after `seconds`.
+    true "ok", and at the latest after some minutes.
     """
 
-    def run(text: str, *arguments: str | Path, seconds: float = 12) -> Path:
+    def run(text: str, *arguments: str | Path) -> Path:
         script, picture = work_folder / "window.py", work_folder / "window.png"
         script.write_text(text, encoding="utf-8")
         driver = Path(__file__).with_name("in_window.py")
         done = real_blender(
-            "python", driver, picture, script, str(seconds), work_folder, *arguments, home=home, timeout=seconds + 120
+            "python", driver, picture, script, str(PATIENCE), work_folder, *arguments, home=home, timeout=PATIENCE + 60
         )
         if not picture.is_file():
             pytest.fail(f"no screenshot\n{done.stdout[-4000:]}\n{done.stderr[-4000:]}")

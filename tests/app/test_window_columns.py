@@ -29,7 +29,7 @@ def test_a_refused_workbook_is_imported_by_its_columns(blender_window, work_fold
         work_folder / "result.json",
         [work_folder / f"{name}.png" for name in ("opened", "complete", "replace")],
     )
-    blender_window(SCRIPT.read_text(encoding="utf-8"), path, result, *pictures, seconds=60)
+    blender_window(SCRIPT.read_text(encoding="utf-8"), path, result, *pictures)
     seen = json.loads(result.read_text())
     assert seen["ok"], seen
     assert seen["opened"]["refusal"] and "x1" in seen["opened"]["doubts"]

@@ -26,7 +26,7 @@ def consistent(state: dict) -> None:
 
 def test_modules_follow_in_the_window(blender_window, work_folder):
     result = work_folder / "result.json"
-    blender_window(SCRIPT.read_text(encoding="utf-8"), WORKBOOK, result, seconds=75)
+    blender_window(SCRIPT.read_text(encoding="utf-8"), WORKBOOK, result)
     seen = json.loads(result.read_text())
     assert seen["ok"], seen
     before = seen["before"]

@@ -4,14 +4,16 @@ import json
 from pathlib import Path
 
 import numpy as np
+import pytest
 from PIL import Image
 
 SCRIPT = Path(__file__).with_name("window_display.py")
 
 
+@pytest.mark.alone
 def test_the_example_is_seen_and_tiles_planes_list_and_mosaic_show_one_module(blender_window, work_folder):
     result_file = work_folder / "seen.json"
-    picture = blender_window(SCRIPT.read_text(encoding="utf-8"), result_file, seconds=50)
+    picture = blender_window(SCRIPT.read_text(encoding="utf-8"), result_file)
     seen = json.loads(result_file.read_text())
     assert seen["ok"], seen
     log = (work_folder / "log.txt").read_text()

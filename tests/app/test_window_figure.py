@@ -23,7 +23,7 @@ def ssim(a: np.ndarray, b: np.ndarray, side: int = 8) -> float:
 
 def test_window_and_command_draw_the_same_figures(blender, blender_window, work_folder):
     result_file, blend = work_folder / "seen.json", work_folder / "scene.blend"
-    blender_window(SCRIPT.read_text(encoding="utf-8"), WORKBOOK, work_folder, result_file, seconds=75)
+    blender_window(SCRIPT.read_text(encoding="utf-8"), WORKBOOK, work_folder, result_file)
     seen = json.loads(result_file.read_text())
     assert seen["ok"], seen
     assert seen["scenes"] == 1 and seen["display"] == ["WINDOW", "WINDOW"]

@@ -4,13 +4,16 @@ import json
 import re
 from pathlib import Path
 
+import pytest
+
 SCRIPT = Path(__file__).with_name("window_jobs.py")
 WORKBOOK = Path(__file__).resolve().parents[2] / "examples" / "dc-spect-80.xlsx"
 
 
+@pytest.mark.alone
 def test_jobs_leave_the_window_alive_and_are_cancelled_without_a_trace(blender_window, work_folder):
     result = work_folder / "result.json"
-    blender_window(SCRIPT.read_text(encoding="utf-8"), result, WORKBOOK, seconds=75)
+    blender_window(SCRIPT.read_text(encoding="utf-8"), result, WORKBOOK)
     seen = json.loads(result.read_text())
     assert seen["ok"], seen
     assert seen["changed"] == [] and seen["undone"] == 0.0

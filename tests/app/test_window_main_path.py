@@ -15,7 +15,7 @@ WORKBOOK = Path(__file__).resolve().parents[2] / "examples" / "dc-spect-80.xlsx"
 def test_main_path_runs_in_the_window(blender_window, work_folder):
     files = work_folder / "files"
     files.mkdir()
-    picture = blender_window(SCRIPT.read_text(encoding="utf-8"), WORKBOOK, files, seconds=80)
+    picture = blender_window(SCRIPT.read_text(encoding="utf-8"), WORKBOOK, files)
     result = json.loads((files / "result.json").read_text())
     assert result["ok"], result
     assert {"run.npz", "scanner.blend", "scanner_mphdrr"} <= set(result["files"])

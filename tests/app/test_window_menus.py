@@ -9,7 +9,7 @@ WORKBOOK = Path(__file__).parents[2] / "examples" / "dc-spect-80.xlsx"
 
 def test_commands_are_found_and_started_by_search(blender_window, work_folder):
     result_file = work_folder / "seen.json"
-    blender_window(SCRIPT.read_text(encoding="utf-8"), WORKBOOK, result_file, seconds=75)
+    blender_window(SCRIPT.read_text(encoding="utf-8"), WORKBOOK, result_file)
     seen = json.loads(result_file.read_text())
     assert seen["ok"], seen
     assert seen["before"] == [False, "TRANSMISSION"] and seen["after"] == [True, "EMISSION"]

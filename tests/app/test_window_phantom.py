@@ -5,12 +5,15 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
+import pytest
+
 SCRIPT = Path(__file__).with_name("window_phantom.py")
 
 
+@pytest.mark.alone
 def test_phantom_follows_its_slider_and_beats_in_the_window(blender_window, work_folder):
     result = work_folder / "result.json"
-    blender_window(SCRIPT.read_text(encoding="utf-8"), result, seconds=75)
+    blender_window(SCRIPT.read_text(encoding="utf-8"), result)
     seen = json.loads(result.read_text())
     assert seen["ok"], seen
     before, rested = seen["before"], seen["rested"]

@@ -3,12 +3,15 @@
 import json
 from pathlib import Path
 
+import pytest
+
 SCRIPT = Path(__file__).with_name("window_preview.py")
 
 
+@pytest.mark.alone
 def test_a_live_preview_follows_module_phantom_and_numbers(blender_window, work_folder):
     result_file = work_folder / "seen.json"
-    blender_window(SCRIPT.read_text(encoding="utf-8"), result_file, seconds=140)
+    blender_window(SCRIPT.read_text(encoding="utf-8"), result_file)
     seen = json.loads(result_file.read_text())
     assert seen["ok"], seen
     assert seen["off"]["median"] < 0.2

@@ -13,7 +13,7 @@ SCRIPT = Path(__file__).with_name("window_rendered.py")
 
 def test_the_rendered_view_shows_the_scanner(blender_window, work_folder):
     result = work_folder / "seen.json"
-    screen = blender_window(SCRIPT.read_text(encoding="utf-8"), result, seconds=60)
+    screen = blender_window(SCRIPT.read_text(encoding="utf-8"), result)
     seen = json.loads(result.read_text())
     assert seen["ok"], seen
     left, top, right, bottom = seen["frame"]

@@ -11,7 +11,7 @@ SCRIPT = Path(__file__).with_name("window_runs.py")
 
 def test_stale_runs_are_said_and_compared_in_the_window(blender_window, work_folder):
     result_file = work_folder / "seen.json"
-    picture = blender_window(SCRIPT.read_text(encoding="utf-8"), result_file, seconds=100)
+    picture = blender_window(SCRIPT.read_text(encoding="utf-8"), result_file)
     seen = json.loads(result_file.read_text())
     assert seen["ok"], seen
     moved = ["Module 30 moved"]

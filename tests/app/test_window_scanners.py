@@ -13,7 +13,7 @@ WORKBOOK = Path(__file__).resolve().parents[2] / "examples" / "dc-spect-80.xlsx"
 
 def test_a_crystal_moves_its_module_and_the_panels_follow(blender_window, work_folder):
     result = work_folder / "result.json"
-    blender_window(SCRIPT.read_text(encoding="utf-8"), WORKBOOK, result, seconds=150)
+    blender_window(SCRIPT.read_text(encoding="utf-8"), WORKBOOK, result)
     seen = json.loads(result.read_text())
     assert seen["ok"], seen
     before = seen["before"]

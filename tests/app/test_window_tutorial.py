@@ -11,7 +11,7 @@ PAGE = Path(__file__).resolve().parents[2] / "docs" / "tutorial.md"
 
 
 def test_tutorial(blender_window, work_folder, monkeypatch):
-    blender_window(SCRIPT.read_text(encoding="utf-8"), work_folder, seconds=300)
+    blender_window(SCRIPT.read_text(encoding="utf-8"), work_folder)
     said = json.loads((work_folder / "said.json").read_text())
     assert said.pop("ok", False), said
     sections = re.split(r"^## ", PAGE.read_text(encoding="utf-8"), flags=re.MULTILINE)

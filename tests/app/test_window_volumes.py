@@ -14,7 +14,7 @@ SCRIPT = Path(__file__).with_name("window_volumes.py")
 
 def test_slices_shells_and_maps(blender_window, work_folder):
     result = work_folder / "seen.json"
-    blender_window(SCRIPT.read_text(encoding="utf-8"), result, work_folder, seconds=150)
+    blender_window(SCRIPT.read_text(encoding="utf-8"), result, work_folder)
     seen = json.loads(result.read_text())
     assert seen["ok"], seen
     left, top, right, bottom = seen["frame"]

@@ -99,3 +99,30 @@ def number_text(value: float) -> str:
 
 def save(data: Dataset) -> None:
     data.save_as(data.filename, enforce_file_format=True)
+
+
+def write_frames(frames: np.ndarray, path: Path, milliseconds: int | None = None, **changes) -> Dataset:
+    """A nuclear medicine file of planar frames (n, rows, columns) of counts; `changes` are tags, None removes one."""
+    data = Dataset()
+    data.file_meta = FileMetaDataset()
+    data.file_meta.TransferSyntaxUID = ExplicitVRLittleEndian
+    data.SOPClassUID = data.file_meta.MediaStorageSOPClassUID = NuclearMedicineImageStorage
+    data.SOPInstanceUID = data.file_meta.MediaStorageSOPInstanceUID = generate_uid()
+    data.SeriesInstanceUID, data.Modality = generate_uid(), "NM"
+    data.ImageType = ["ORIGINAL", "PRIMARY", "STATIC", "EMISSION"]
+    data.NumberOfFrames, data.Rows, data.Columns = frames.shape
+    data.NumberOfDetectors, data.DetectorVector = len(frames), list(range(1, len(frames) + 1))
+    data.FrameIncrementPointer = 0x00540020
+    data.SamplesPerPixel, data.PhotometricInterpretation = 1, "MONOCHROME2"
+    data.BitsAllocated, data.BitsStored, data.HighBit, data.PixelRepresentation = 16, 16, 15, 0
+    if milliseconds is not None:
+        data.ActualFrameDuration = milliseconds
+    data.PixelData = frames.astype("<u2").tobytes()
+    for name, value in changes.items():
+        if value is None:
+            delattr(data, name)
+        else:
+            setattr(data, name, value)
+    data.filename = str(path)
+    save(data)
+    return data

@@ -1,0 +1,395 @@
+"""Priors: penalties of differences between neighbouring voxels, for reconstructions with noise."""
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable
+from dataclasses import KW_ONLY, dataclass, fields
+from itertools import product
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..errors import InputError
+from ..geometry.grid import Grid
+from ..memory import require
+from ..projector.lattices import same_lattice
+from ..projector.parallel import run_all, thread_count
+from ..validation import instance, one_of, positive, real_array, whole_number
+from ..volumes.volume import Volume
+from .result import Array
+
+# Voxels that are worked on at once: their numbers and some arrays as large stay in a core's cache.
+_SLAB_VOXELS = 2**14
+
+
+@dataclass(frozen=True)
+class Pairs:
+    """Neighbours in a slab, all the same step apart: their places in it, and the weights of their differences."""
+
+    first: tuple[slice, slice, slice]
+    second: tuple[slice, slice, slice]
+    closeness: float  # the smallest distance of two voxels by that of these
+    share: NDArray[np.uint8] | None  # how many of the two have chosen the other by anatomy
+
+    @property
+    def weight(self) -> Any:
+        """Of psi: one number for all, or an array."""
+        return self._shared(self.closeness)
+
+    @property
+    def squared(self) -> Any:
+        """Of squares of differences."""
+        return self._shared(self.closeness**2)
+
+    def _shared(self, weight: float) -> Any:
+        return weight if self.share is None else self.share * np.float32(weight / 2)
+
+
+@dataclass(frozen=True, eq=False)
+class Prior(ABC):
+    """A penalty ``weight * sum over pairs of neighbours of w_jk psi(x_j, x_k)``; `psi` is the subclass's.
+
+    The w_jk are the smallest distance of two voxels divided by that of these two, so that all are 1 or less, and voxels
+    that are longer in one direction count less there.
+
+    Attributes
+    ----------
+    weight : float
+        How much it counts beside the log-likelihood, 0 or more.
+    anatomy : Volume, optional
+        Of the reconstruction's grid, such as a CT or its segments: differences across its edges are not penalised. Of each
+        voxel's neighbours only those `similar` count whose anatomical values are closest to its own, and all as close as the
+        last of these (Bowsher 2004); a pair where only one chose the other counts half.
+    similar : int, optional
+        By default about a quarter of the neighbours.
+    neighbors : int
+        6 (those that share a face), or 26: smoother, and four times the work.
+
+    Raises
+    ------
+    InputError
+        A number is negative or not finite, or `anatomy` is no volume.
+
+    References
+    ----------
+    J. E. Bowsher et al., "Utilizing MRI information to estimate F18-FDG distributions in rat flank tumors", IEEE Nuclear
+    Science Symposium Conference Record (2004) 2488-2492.
+    """
+
+    weight: float
+    _: KW_ONLY
+    anatomy: Volume | None = None
+    similar: int | None = None
+    neighbors: Literal[6, 26] = 6
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "weight", _at_least_0(self.weight, "prior: weight"))
+        one_of(self.neighbors, (6, 26), "prior: neighbors")
+        if self.anatomy is not None:
+            instance(self.anatomy, Volume, "prior: anatomy")
+        elif self.similar is not None:
+            raise InputError("prior: similar needs anatomy, of which it is")
+        if self.similar is not None and whole_number(self.similar, "prior: similar") > self.neighbors:
+            raise InputError(f"prior: similar: expected at most the {self.neighbors} neighbors, got {self.similar}")
+
+    def on(self, grid: Grid) -> "Penalty":
+        """The penalty of volumes on a grid. Raises InputError where `anatomy` has another."""
+        return Penalty(self, grid)
+
+    def record(self) -> dict[str, Any]:
+        """For a reconstruction's settings."""
+        names = [field.name for field in fields(self) if field.name not in ("anatomy", "similar")]
+        known = {"prior": type(self).__name__, **{name: getattr(self, name) for name in names}}
+        if self.anatomy is not None:
+            known |= {"anatomy": self.anatomy.quantity, "similar": self._similar}
+        return known
+
+    @property
+    def _similar(self) -> int:
+        return self.similar or -(-self.neighbors // 4)
+
+    # Of a slab's values and its pairs of neighbours:
+
+    @abstractmethod
+    def _value(self, x: Array, pairs: list[Pairs]) -> float: ...
+
+    @abstractmethod
+    def _add_gradient(self, x: Array, pairs: list[Pairs], out: Array) -> None: ...
+
+    @abstractmethod
+    def _add_curvature(self, x: Array, pairs: list[Pairs], out: Array) -> None: ...
+
+
+class _PairPrior(Prior):
+    """A prior whose `psi` is a function of the two values alone."""
+
+    @abstractmethod
+    def _psi(self, a: Array, b: Array) -> Array: ...
+
+    @abstractmethod
+    def _slopes(self, a: Array, b: Array) -> tuple[Array, Array]:
+        """Derivatives of psi by a and by b."""
+
+    @abstractmethod
+    def _bends(self, a: Array, b: Array) -> tuple[Any, Any]:
+        """Second derivatives of psi by a and by b."""
+
+    def _value(self, x: Array, pairs: list[Pairs]) -> float:
+        return sum(float(np.sum(p.weight * self._psi(x[p.first], x[p.second]), dtype=float)) for p in pairs)
+
+    def _add_gradient(self, x: Array, pairs: list[Pairs], out: Array) -> None:
+        self._add(self._slopes, x, pairs, out)
+
+    def _add_curvature(self, x: Array, pairs: list[Pairs], out: Array) -> None:
+        self._add(self._bends, x, pairs, out)
+
+    @staticmethod
+    def _add(of: Callable[[Array, Array], tuple[Any, Any]], x: Array, pairs: list[Pairs], out: Array) -> None:
+        for p in pairs:
+            by_first, by_second = of(x[p.first], x[p.second])
+            out[p.first] += p.weight * by_first
+            out[p.second] += p.weight * by_second
+
+
+@dataclass(frozen=True, eq=False)
+class Quadratic(_PairPrior):
+    """Penalises squares of differences, ``psi = (x_j - x_k)^2 / 2``: smooth everywhere, and blurs edges."""
+
+    def _psi(self, a: Array, b: Array) -> Array:
+        return np.square(a - b) / 2
+
+    def _slopes(self, a: Array, b: Array) -> tuple[Array, Array]:
+        difference = a - b
+        return difference, -difference
+
+    def _bends(self, a: Array, b: Array) -> tuple[Any, Any]:
+        return np.ones_like(a), np.ones_like(a)
+
+
+@dataclass(frozen=True, eq=False)
+class RelativeDifference(_PairPrior):
+    """Penalises differences relative to the values: ``psi = (x_j - x_k)^2 / (x_j + x_k + gamma |x_j - x_k| + edge)``.
+
+    Noise grows with the activity, and so may differences. For values of 0 or more.
+
+    Attributes
+    ----------
+    gamma : float
+        How much large differences are spared: those far above the values divided by `gamma` count linearly. 2 by default, as
+        scanners use it; 0 spares none.
+    edge : float
+        kBq/mL, more than 0: values far below count as if they were this large, so that the penalty is smooth at 0.
+
+    References
+    ----------
+    J. Nuyts, D. Beque, P. Dupont, L. Mortelmans, "A concave prior penalizing relative differences for
+    maximum-a-posteriori reconstruction in emission tomography", IEEE Transactions on Nuclear Science 49 (2002) 56-60.
+    """
+
+    gamma: float = 2.0
+    edge: float = 0.1
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        object.__setattr__(self, "gamma", _at_least_0(self.gamma, "prior: gamma"))
+        object.__setattr__(self, "edge", positive(self.edge, "prior: edge", "kBq/mL"))
+
+    def _parts(self, a: Array, b: Array) -> tuple[Array, Array]:
+        """The difference, and what it is divided by."""
+        difference = a - b
+        size = np.abs(difference)
+        size *= self.gamma
+        size += a
+        size += b
+        size += self.edge
+        return difference, size
+
+    def _psi(self, a: Array, b: Array) -> Array:
+        difference, size = self._parts(a, b)
+        return difference * difference / size
+
+    def _slopes(self, a: Array, b: Array) -> tuple[Array, Array]:
+        difference, size = self._parts(a, b)
+        ratio = difference / size
+        # (a - b) (size + 2 b + edge) / size^2, and the same with a and b exchanged
+        by_a = (2 * b + self.edge) / size
+        by_b = (2 * a + self.edge) / size
+        by_a += 1
+        by_b += 1
+        by_a *= ratio
+        by_b *= ratio
+        return by_a, np.negative(by_b, out=by_b)
+
+    def _bends(self, a: Array, b: Array) -> tuple[Any, Any]:
+        cube = self._parts(a, b)[1] ** 3
+        return 2 * np.square(2 * b + self.edge) / cube, 2 * np.square(2 * a + self.edge) / cube
+
+
+@dataclass(frozen=True, eq=False)
+class TotalVariation(Prior):
+    """Penalises the gradient's size: in each voxel ``sqrt(sum of (w_jk (x_j - x_k))^2 + edge^2) - edge``.
+
+    The sum is over the neighbours on one side, half of all: with 6 neighbours the differences along the three axes. It makes
+    areas of one value with sharp edges.
+
+    Attributes
+    ----------
+    edge : float
+        kBq/mL, more than 0: differences far below are penalised as by `Quadratic`, so that the penalty is smooth.
+
+    References
+    ----------
+    L. I. Rudin, S. Osher, E. Fatemi, "Nonlinear total variation based noise removal algorithms", Physica D 60 (1992)
+    259-268.
+    """
+
+    edge: float = 1.0
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        object.__setattr__(self, "edge", positive(self.edge, "prior: edge", "kBq/mL"))
+
+    def _sizes(self, x: Array, pairs: list[Pairs]) -> Array:
+        """Of the gradient in the slab's voxels."""
+        squares = np.full(x.shape, self.edge**2, x.dtype)
+        for p in pairs:
+            squares[p.first] += p.squared * np.square(x[p.first] - x[p.second])
+        return np.sqrt(squares, out=squares)
+
+    def _value(self, x: Array, pairs: list[Pairs]) -> float:
+        return float(np.sum(self._sizes(x, pairs) - self.edge, dtype=float))
+
+    def _add_gradient(self, x: Array, pairs: list[Pairs], out: Array) -> None:
+        sizes = self._sizes(x, pairs)
+        for p in pairs:
+            slope = p.squared * (x[p.first] - x[p.second]) / sizes[p.first]
+            out[p.first] += slope
+            out[p.second] -= slope
+
+    def _add_curvature(self, x: Array, pairs: list[Pairs], out: Array) -> None:
+        sizes = self._sizes(x, pairs)
+        for p in pairs:
+            bend = p.squared / sizes[p.first]
+            out[p.first] += bend
+            out[p.second] += bend
+
+
+class Penalty:
+    """A prior on a grid: its value, gradient and curvature for volumes (arrays of the grid's shape).
+
+    Results are of the array's type, float32 or float64; the value is a float.
+    """
+
+    def __init__(self, prior: Prior, grid: Grid) -> None:
+        self._prior, self._shape, self._threads = prior, grid.shape, thread_count(None)
+        steps = _half_of_neighbors(prior.neighbors)
+        lengths = [float(np.linalg.norm(grid.affine[:3, :3] @ step)) for step in steps]
+        self._closeness = [min(lengths) / length for length in lengths]
+        self._steps = steps
+        self._shares = None if prior.anatomy is None else self._similarity(prior.anatomy, grid)
+
+    def value(self, x: Array) -> float:
+        """The penalty."""
+        found = np.zeros(len(self._slabs()))
+
+        def work(slab: tuple[int, int, int]) -> None:
+            number, first, end = slab
+            found[number] = self._prior._value(x[first : end + 1], self._pairs(first, end))
+
+        run_all(work, self._slabs(), self._threads)
+        return self._prior.weight * float(found.sum())
+
+    def gradient(self, x: Array) -> Array:
+        """Its derivatives by the voxels' values."""
+        return self._summed(self._prior._add_gradient, x)
+
+    def curvature(self, x: Array) -> Array:
+        """Its second derivatives by each voxel's own value; of total variation an upper bound of them."""
+        return self._summed(self._prior._add_curvature, x)
+
+    def _summed(self, add: Callable[[Array, list[Pairs], Array], None], x: Array) -> Array:
+        out = np.zeros(x.shape, x.dtype)
+
+        def work(slab: tuple[int, int, int]) -> None:
+            _, first, end = slab
+            add(x[first : end + 1], self._pairs(first, end), out[first : end + 1])
+
+        # A slab adds to the next one's first plane, too: so no two neighbours at the same time.
+        for parity in (0, 1):
+            run_all(work, self._slabs()[parity::2], self._threads)
+        out *= self._prior.weight
+        return out
+
+    def _slabs(self) -> list[tuple[int, int, int]]:
+        """Number, first plane along x and the one after the last."""
+        n = self._shape[0]
+        planes = max(1, _SLAB_VOXELS // (self._shape[1] * self._shape[2]))
+        return [(number, first, min(first + planes, n)) for number, first in enumerate(range(0, n, planes))]
+
+    def _pairs(self, first: int, end: int) -> list[Pairs]:
+        """The pairs whose first voxel is in the planes from `first` to `end`."""
+        found = []
+        for number, step in enumerate(self._steps):
+            planes = min(end, self._shape[0] - step[0]) - first
+            ranges = [(slice(0, planes), slice(step[0], step[0] + planes)), *map(_shifted, step[1:])]
+            one, other = zip(*ranges, strict=True)
+            share = None if self._shares is None else self._shares[number][first : first + planes][:, one[1], one[2]]
+            found.append(Pairs(one, other, self._closeness[number], share))
+        return found
+
+    def _similarity(self, anatomy: Volume, grid: Grid) -> list[NDArray[np.uint8]]:
+        """For each step and voxel, how many of it and its neighbour have chosen the other: 0, 1 or 2."""
+        if not same_lattice(anatomy.grid, grid):
+            raise InputError("prior: anatomy's grid is not the reconstruction's: resample it (resample(volume, grid))")
+        require((len(self._steps) + 8) * grid.n_voxels, "the prior's anatomy")
+        padded = np.pad(anatomy.array, 1, constant_values=np.inf)
+        limits = np.empty(grid.shape, np.float32)
+        both = [sign * np.array(step) for step in self._steps for sign in (1, -1)]
+        for _, first, end in self._slabs():
+            own = anatomy.array[first:end]
+            box = (slice(first, end), slice(0, grid.shape[1]), slice(0, grid.shape[2]))
+            differences = np.stack([np.abs(padded[_moved(box, step + 1)] - own) for step in both])
+            limits[first:end] = np.partition(differences, self._prior._similar - 1, axis=0)[self._prior._similar - 1]
+        shares = []
+        for step in self._steps:
+            share = np.zeros(grid.shape, np.uint8)
+            one, other = zip(*map(_shifted, step), strict=True)
+            difference = np.abs(anatomy.array[one] - anatomy.array[other])
+            share[one] = (difference <= limits[one]).astype(np.uint8) + (difference <= limits[other])
+            shares.append(share)
+        return shares
+
+
+def penalty_of(prior: Prior | None, grid: Grid) -> Penalty | None:
+    """The penalty on a grid; None without a prior or weight. Raises InputError where it is no prior, or not for the grid."""
+    if prior is None:
+        return None
+    if not isinstance(prior, Prior):
+        known = "Quadratic, RelativeDifference or TotalVariation"
+        raise InputError(f"prior: expected {known}, got {type(prior).__name__}")
+    penalty = prior.on(grid)
+    return penalty if prior.weight else None
+
+
+def _half_of_neighbors(n: int) -> list[tuple[int, int, int]]:
+    """Steps to one neighbour of each opposite pair; along x 0 or 1."""
+    steps = [step for step in product((0, 1), (-1, 0, 1), (-1, 0, 1)) if step > (0, 0, 0)]
+    return [step for step in steps if n == 26 or sum(map(abs, step)) == 1]
+
+
+def _shifted(step: int) -> tuple[slice, slice]:
+    """Places along an axis that have a neighbour `step` on, and those of these neighbours."""
+    if step < 0:
+        return slice(-step, None), slice(None, step)
+    return slice(None, -step or None), slice(step, None)
+
+
+def _moved(box: tuple[slice, slice, slice], step: Any) -> tuple[slice, ...]:
+    return tuple(slice(part.start + int(n), part.stop + int(n)) for part, n in zip(box, step, strict=True))
+
+
+def _at_least_0(value: Any, name: str) -> float:
+    number = float(real_array(value, name, ()))
+    if number < 0:
+        raise InputError(f"{name}: expected 0 or more, got {number:g}")
+    return number

@@ -1,0 +1,354 @@
+"""Files with frames of counts, as scanners and simulators write them: numpy, HDF5, raw, DICOM, MetaImage, Interfile.
+
+A file says at most what its frames are: which module each is of, and how it lies on the crystal, stands in none of them.
+"""
+
+import math
+import os
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..errors import InputError
+from ..memory import require
+from ..progress import Progress
+from ..recording import recorded_warnings
+from ..volumes.formats import metaimage
+from ..volumes.formats.contents import first_line, reading
+from ..volumes.formats.dicom import is_dicom
+
+RAW_TYPES = ("uint8", "int8", "uint16", "int16", "uint32", "int32", "uint64", "int64", "float32", "float64")
+"""Types of the numbers in raw files."""
+_NUMPY = (".npy", ".npz")
+_HDF5 = (".h5", ".hdf5")
+_META = (".mhd", ".mha")
+_INTERFILE = (".hdr", ".h33", ".hs")
+COUNTS_FORMATS = (*_NUMPY, *_HDF5, ".dcm", *_META, *_INTERFILE, ".raw", ".bin", ".dat")
+"""Endings of files with counts; DICOM files may have any name, and so may raw ones."""
+_TOMOGRAMS = ("RECON TOMO", "RECON GATED TOMO")
+_SAME_SIZE = 1e-3  # relative; files round pixel sizes
+
+
+@dataclass(frozen=True, eq=False)
+class Frames:
+    """The frames of a file, and what it says about them, None where it says nothing."""
+
+    array: NDArray[Any]  # (frames, rows, columns), of any real type
+    time: float | None = None  # s, of each frame
+    pixel: tuple[float, float] | None = None  # mm, along a row and down the columns
+    kind: str = ""  # of what the frames are, such as "2 energy windows"
+
+
+@dataclass(frozen=True)
+class Layout:
+    """What the user says about a file."""
+
+    dataset: str | None = None
+    shape: tuple[int, int, int] | None = None
+    type: str | None = None
+    big_endian: bool = False
+
+    @property
+    def is_raw(self) -> bool:
+        """Whether it describes raw numbers."""
+        return self.shape is not None or self.type is not None or self.big_endian
+
+
+def read_counts(
+    path: str | os.PathLike[str] | Sequence[str | os.PathLike[str]],
+    *,
+    dataset: str | None = None,
+    shape: tuple[int, int, int] | None = None,
+    type: str | None = None,
+    big_endian: bool = False,
+) -> NDArray[Any]:
+    """Read frames of counts (frames, rows, columns) as they are in a file, or in several, one after the other.
+
+    Parameters
+    ----------
+    path
+        .npy, .npz, .h5, nuclear medicine DICOM of several frames (.dcm), MetaImage (.mhd, .mha, as GATE 10 writes), the
+        header of an Interfile pair (.hdr, as GATE 9 writes), or raw numbers. A file of one frame may have only two axes.
+    dataset
+        Name of the array in .npz and .h5, where they hold several of three axes.
+    shape, type, big_endian
+        Of raw files: (frames, rows, columns), one of uint8, int8, … float64, and the order of the bytes.
+
+    Returns
+    -------
+    array (frames, rows, columns)
+        Of the file's own type; `counts_run` checks the numbers.
+
+    Raises
+    ------
+    InputError
+        A file cannot be read, holds something else, or has frames of another size than the one before.
+    """
+    return read_frames(path, Layout(dataset, shape, type, big_endian)).array
+
+
+def read_frames(
+    path: str | os.PathLike[str] | Sequence[str | os.PathLike[str]],
+    layout: Layout = Layout(),
+    progress: Progress | None = None,
+) -> Frames:
+    """The frames of one or several files with what these say; `progress` counts files. See `read_counts`."""
+    paths = [Path(path)] if isinstance(path, str | os.PathLike) else list(map(Path, path))
+    if not paths:
+        raise InputError("counts: expected a file, or several")
+    found: list[Frames] = []
+    for number, one in enumerate(paths, 1):
+        found.append(_read(one, layout))
+        first, last = found[0].array.shape[1:], found[-1].array.shape[1:]
+        if first != last:
+            size = f"{last[0]} x {last[1]} pixels, {paths[0]} of {first[0]} x {first[1]}"
+            raise InputError(f"{one}: it holds frames of {size}; expected one size")
+        if progress is not None:
+            progress(number, len(paths))
+    array = found[0].array if len(found) == 1 else np.concatenate([one.array for one in found])
+    times, pixels, kinds = ({getattr(one, name) for one in found} for name in ("time", "pixel", "kind"))
+    said = (one.pop() if len(one) == 1 else None for one in (times, pixels))
+    return Frames(array, next(said), next(said), ", ".join(sorted(kinds - {""})))
+
+
+def _read(path: Path, layout: Layout) -> Frames:
+    if not path.is_file():
+        raise InputError(
+            f"{path}: is a folder; expected a file with counts" if path.is_dir() else f"{path}: no such file"
+        )
+    ending = path.suffix.lower()
+    with reading(path, ending or "counts"):
+        if layout.is_raw:
+            return _require_frames(Frames(_raw(path, layout)))
+        if layout.dataset is not None and ending not in (".npz", *_HDF5):
+            raise InputError("dataset (--dataset) names an array in .npz and .h5; this file has no names")
+        return _require_frames(_reader(path, ending)(path, layout))
+
+
+def _reader(path: Path, ending: str) -> Callable[[Path, Layout], Frames]:
+    """What reads a file."""
+    for endings, read in ((_NUMPY, _numpy), (_HDF5, _hdf5), (_META, _metaimage), (_INTERFILE, _interfile)):
+        if ending in endings:
+            return read
+    if ending == ".dcm" or is_dicom(path):
+        return _dicom
+    header = path.with_suffix(".hdr")
+    beside = f"its header {header.name}, which is beside it, or " if header.is_file() else ""
+    raise InputError(
+        f"expected {beside}a name ending in {', '.join(COUNTS_FORMATS)}; of raw numbers say the shape (--raw-shape "
+        "FRAMES ROWS COLUMNS) and the type (--raw-type uint16)"
+    )
+
+
+def _require_frames(frames: Frames) -> Frames:
+    """Checked, and with an axis of frames also where there is only one."""
+    array = frames.array
+    if array.ndim == 2:
+        array = array[None]
+    if array.ndim != 3 or not array.size:
+        raise InputError(f"expected (frames, rows, columns), got shape {' x '.join(map(str, array.shape)) or '()'}")
+    if array.dtype.kind not in "fiu":
+        raise InputError(f"expected whole or real numbers, found {array.dtype}")
+    return replace(frames, array=array)
+
+
+def _require_memory(shape: Sequence[int], itemsize: int) -> None:
+    # The numbers, their float32 images, and the checks of them.
+    require((itemsize + 9.0) * math.prod(map(int, shape)), f"counts of {' x '.join(map(str, shape))}")
+
+
+def _raw(path: Path, layout: Layout) -> NDArray[Any]:
+    if layout.shape is None or layout.type is None:
+        missing = (
+            "shape (--raw-shape FRAMES ROWS COLUMNS)" if layout.shape is None else "type (--raw-type, uint16 or so)"
+        )
+        raise InputError(f"raw numbers need their {missing}")
+    if layout.type not in RAW_TYPES:
+        raise InputError(f"raw type {layout.type!r}: expected one of {', '.join(RAW_TYPES)}")
+    kind = np.dtype(layout.type).newbyteorder(">" if layout.big_endian else "<")
+    return _numbers(path, kind, tuple(layout.shape))
+
+
+def _numbers(path: Path, kind: np.dtype[Any], shape: tuple[int, ...], skip: int = 0) -> NDArray[Any]:
+    """All numbers of a file behind its first `skip` bytes."""
+    needed, size = skip + kind.itemsize * math.prod(shape), path.stat().st_size
+    if needed != size:
+        what = f"{' x '.join(map(str, shape))} numbers of {kind.itemsize} bytes" + (
+            f" behind {skip} bytes" if skip else ""
+        )
+        raise InputError(f"expected {needed} bytes ({what}), {path.name} has {size}")
+    _require_memory(shape, kind.itemsize)
+    return np.fromfile(path, kind, offset=skip).reshape(shape)
+
+
+def _numpy(path: Path, layout: Layout) -> Frames:
+    with open(path, "rb") as opened:  # not by numpy, which leaves a damaged archive open
+        if not opened.read(6).startswith((b"\x93NUMPY", b"PK")):  # numpy would take it for pickled objects
+            raise InputError("not a file of numpy")
+        opened.seek(0)
+        if path.suffix.lower() == ".npy":
+            found = np.load(opened, allow_pickle=False)
+            if not isinstance(found, np.ndarray):
+                raise InputError("expected a single array, found an npz archive")
+            return Frames(found)
+        archive = np.load(opened, allow_pickle=False)
+        if isinstance(archive, np.ndarray):
+            raise InputError("expected an npz archive, found a single array")
+        arrays = {name: archive[name] for name in archive.files}
+        return Frames(arrays[_chosen(arrays, layout)])
+
+
+def _hdf5(path: Path, layout: Layout) -> Frames:
+    import h5py
+
+    arrays: dict[str, Any] = {}
+
+    def take(name: str, item: Any) -> None:
+        if isinstance(item, h5py.Dataset):
+            arrays[name] = item
+
+    with h5py.File(path, "r") as file:
+        file.visititems(take)
+        dataset = arrays[_chosen(arrays, layout)]
+        _require_memory(dataset.shape, dataset.dtype.itemsize)
+        return Frames(dataset[()])
+
+
+def _chosen(arrays: dict[str, Any], layout: Layout) -> str:
+    """The name of the array that is meant: the one that is named, or the only one of three axes."""
+    found = [name for name, array in arrays.items() if array.ndim == 3]
+    if layout.dataset is not None:
+        name = layout.dataset.strip("/")
+        if name not in arrays:
+            raise InputError(f"no dataset {layout.dataset!r} in it; there are: {', '.join(arrays) or 'none'}")
+        return name
+    if len(found) != 1:
+        there = ", ".join(f"{name} ({' x '.join(map(str, a.shape))})" for name, a in arrays.items()) or "none"
+        raise InputError(f"{len(found) or 'no'} arrays of three axes in it; say which (--dataset NAME): {there}")
+    return found[0]
+
+
+def _metaimage(path: Path, layout: Layout) -> Frames:
+    """GATE 10's projections: x along a row, y down the rows, a frame in each z."""
+    with recorded_warnings() as unsaid:  # that it does not say how it lies, which is asked anyway
+        contents = metaimage.read(path)
+    sizes = np.linalg.norm(contents.affine[:3, :2], axis=0) if contents.affine is not None and not unsaid else None
+    pixel = None if sizes is None else (float(sizes[0]), float(sizes[1]))
+    return Frames(np.ascontiguousarray(contents.array.transpose(2, 1, 0)), None, pixel)
+
+
+def _interfile(path: Path, layout: Layout) -> Frames:
+    """An Interfile 3.3 header and the file of numbers that it names, as GATE 9's projections are.
+
+    Reference: A. Todd-Pokropek, T. D. Cradduck, F. Deconinck, "A file format for the exchange of nuclear medicine image
+    data: a specification of Interfile version 3.3", Nuclear Medicine Communications 13 (1992) 673-699.
+    """
+    header = _interfile_header(path)
+
+    def number(key: str, default: float | None = None) -> float:
+        text = header.get(key, "" if default is None else str(default))
+        try:
+            value = float(text)
+        except ValueError:
+            value = math.nan
+        if not math.isfinite(value):
+            raise InputError(f"{key} := {text}: expected a number" if text else f"it has no {key!r}")
+        return value
+
+    columns, rows = (int(number(f"matrix size [{i}]")) for i in (1, 2))
+    size, kind = int(number("number of bytes per pixel")), header.get("number format", "nothing").lower()
+    letter = {"unsigned integer": "u", "signed integer": "i"}.get(kind, "f" if kind.endswith("float") else "")
+    if letter + str(size) not in ("u1", "u2", "u4", "u8", "i1", "i2", "i4", "i8", "f4", "f8"):
+        raise InputError(f"number format {kind} of {size} bytes: expected integers, or floats of 4 or 8 bytes")
+    order = header.get("imagedata byte order", "").upper()
+    if size > 1 and order not in ("LITTLEENDIAN", "BIGENDIAN"):
+        raise InputError(f"imagedata byte order {order or 'missing'}: expected LITTLEENDIAN or BIGENDIAN")
+    type_ = np.dtype((">" if order == "BIGENDIAN" else "<") + letter + str(size))
+    data = _interfile_data(path, header.get("name of data file", ""))
+    skip = int(number("data offset in bytes", 2048 * number("data starting block", 0)))
+    frame = rows * columns * size
+    count = int(number("total number of images", (data.stat().st_size - skip) // frame if frame else 0))
+    time = header.get("time per projection (sec)") or header.get("study duration (sec)")
+    scales = [header.get(f"scaling factor (mm/pixel) [{i}]") for i in (1, 2)]
+    windows = int(number("number of energy windows", 1))
+    return Frames(
+        _numbers(data, type_, (count, rows, columns), skip),
+        None if time is None else float(time),
+        None if None in scales else (float(scales[0] or 0), float(scales[1] or 0)),
+        f"{windows} energy windows" if windows > 1 else "",
+    )
+
+
+def _interfile_header(path: Path) -> dict[str, str]:
+    """Keys, in lower case, and values; of a key that stands there several times the first."""
+    lines = path.read_bytes()[: 1 << 20].decode("latin-1").splitlines()
+    if not lines or not lines[0].lstrip("!").strip().upper().startswith("INTERFILE"):
+        raise InputError("not an Interfile header: expected !INTERFILE in the first line")
+    header: dict[str, str] = {}
+    for line in lines:
+        key, assigned, value = line.partition(":=")
+        if assigned and not line.lstrip().startswith(";"):
+            header.setdefault(" ".join(key.strip().lstrip("!").lower().split()), value.strip())
+    return header
+
+
+def _interfile_data(path: Path, name: str) -> Path:
+    """The file of numbers: where the header says, or of that name beside it, since it may have been moved with it."""
+    for found in (path.parent / name, path.parent / Path(name.replace("\\", "/")).name):
+        if name and found.is_file():
+            return found
+    raise InputError(f"its numbers are in {name or 'no file that it names'}, which is not beside it")
+
+
+def _dicom(path: Path, layout: Layout) -> Frames:
+    """A nuclear medicine image of several frames (DICOM part 3, C.8.4.8): planar images or projections."""
+    import pydicom
+
+    data = pydicom.dcmread(path)
+    kinds: Any = data.get("ImageType") or ()
+    kind = str(kinds[2]) if not isinstance(kinds, str) and len(kinds) > 2 else ""
+    if data.get("Modality") != "NM":
+        raise InputError(
+            f"modality {data.get('Modality') or 'unsaid'}: expected nuclear medicine (NM) with a frame a module"
+        )
+    if kind in _TOMOGRAMS or "SliceVector" in data:
+        raise InputError("it holds a reconstructed tomogram; expected a frame a module")
+    if data.get("SamplesPerPixel", 1) != 1:
+        raise InputError(f"expected one value per pixel, found {data.SamplesPerPixel} (a colour image)")
+    shape = int(data.get("NumberOfFrames") or 1), int(data.Rows), int(data.Columns)
+    _require_memory(shape, 4)
+    try:
+        array = data.pixel_array.reshape(shape)
+    except Exception as error:  # truncated, or compressed by a method that is not installed
+        raise InputError(f"its pixels cannot be read ({first_line(error)})") from error
+    slope, intercept = float(data.get("RescaleSlope") or 1), float(data.get("RescaleIntercept") or 0)
+    if (slope, intercept) != (1.0, 0.0):
+        array = array * slope + intercept
+    spacing = data.get("PixelSpacing")
+    several = {name: int(data.get(f"NumberOf{name.replace(' ', '')}s") or 1) for name in _VECTORS}
+    return Frames(
+        array,
+        _dicom_time(data),
+        None if not spacing else (float(spacing[1]), float(spacing[0])),
+        ", ".join(f"{n} {name.lower()}s" for name, n in several.items() if n > 1),
+    )
+
+
+_VECTORS = ("Energy Window", "Detector", "Phase", "Rotation", "RR Interval", "Time Slot")
+"""What a nuclear medicine image may have several of."""
+
+
+def _dicom_time(data: Any) -> float | None:
+    """The duration of each frame, s, where it is the same of all."""
+    places = [data, *(data.get("RotationInformationSequence") or ()), *(data.get("PhaseInformationSequence") or ())]
+    times = {float(place.ActualFrameDuration) for place in places if place.get("ActualFrameDuration")}
+    return times.pop() / 1000 if len(times) == 1 else None
+
+
+def differs(one: float, other: float) -> bool:
+    """Whether two lengths or times are more than a file's rounding apart."""
+    return not math.isclose(one, other, rel_tol=_SAME_SIZE)

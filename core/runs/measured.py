@@ -1,0 +1,281 @@
+"""Measured counts become a run of a scanner: which frame is which module, how it lies on the crystal, and how long it took.
+
+None of these is guessed, not even where the number of frames is that of the modules: whoever imports the counts says it.
+"""
+
+import re
+import warnings
+from collections.abc import Mapping, Sequence
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from ..errors import InputError, InputWarning
+from ..geometry.system import Detector, PinholeSystem
+from ..memory import require
+from ..progress import Stages
+from ..validation import instance, one_of, positive, require_finite, shape_text
+from .frame_files import Frames, Layout, differs, read_frames
+from .orientations import ORIENTATIONS, on_crystal
+from .recipe import Recipe, recorded_recipe
+from .run import ProjectionRun
+
+_MOST_NUMBERS = 1 << 20  # in a list of frames
+_MOST_EXACT = 1 << 24  # whole numbers above are rounded in float32
+_KEPT = ("system.", "attenuation.", "counts.", "model.", "detector.", "compute.")
+
+
+def counts_run(
+    counts: ArrayLike,
+    system: PinholeSystem,
+    frames: str | Sequence[int] | None = None,
+    orientation: str | Sequence[str] | None = None,
+    time: float | None = None,
+    *,
+    expected: bool = False,
+    detector: Detector = "real",
+    magnification: float = 10.0,
+    pitch: ArrayLike | None = None,
+    recipe: Recipe | None = None,
+    settings: Mapping[str, Any] | None = None,
+) -> ProjectionRun:
+    """The run of a scanner that has measured `counts`.
+
+    Parameters
+    ----------
+    counts : array (M, rows, columns)
+        A frame for each module, of whole numbers, as they are in the file (`read_counts`).
+    system
+        The M modules.
+    frames
+        Which module each frame is of: the modules' numbers in the frames' order, as a list, or a text such as ``"1-80"``,
+        ``"80-1"`` or ``"3,1,2"``.
+    orientation
+        How the frames lie on the crystals, one of `ORIENTATIONS`, or one for each frame: ``"front+v"`` where a frame, drawn
+        with row 0 at the top and column 0 at the left, is the crystal as seen from the pinhole with +v at the top.
+    time
+        Exposure, s.
+    expected
+        Whether the numbers are expected means, which may be fractions.
+    detector, magnification, pitch
+        Where the run's images are taken, as of `PinholeSystem.views`; a `pitch` on the real detector is the size of the
+        crystal's pixels, by default the crystal's side divided by their number.
+    recipe
+        Says the rest of the model, for reconstruction: isotope, aperture, crystal, attenuation.
+    settings
+        More to record in the run.
+
+    Returns
+    -------
+    ProjectionRun
+        Of counts, without a volume, its modules in the order of `system`.
+
+    Raises
+    ------
+    InputError
+        `frames`, `orientation` or `time` is missing, `frames` is not the modules' numbers in some order, or the numbers are
+        no counts.
+    """
+    instance(system, PinholeSystem, "counts: system")
+    array = np.asarray(counts)
+    if array.ndim != 3 or not array.size or array.dtype.kind not in "fiu":
+        raise InputError(
+            f"counts: expected numbers (frames, rows, columns), got {array.dtype} {shape_text(array.shape)}"
+        )
+    require_told(frames, orientation, time, Frames(array))
+    numbers = frame_numbers(frames, len(array), system)
+    words = _words(orientation, len(array))
+    time = positive(time, "time (--time)", "s")
+    _require_counts(array, expected)
+    require(4.0 * array.size, f"counts of {shape_text(array.shape)}")
+    turned = [on_crystal(frame, word) for frame, word in zip(array, words, strict=True)]
+    if len({image.shape for image in turned}) > 1:
+        raise InputError("orientation (--orientation): frames that are not square cannot lie both upright and turned")
+    place = {number: k for k, number in enumerate(numbers)}
+    images = np.stack([turned[place[int(number)]] for number in system.numbers]).astype(np.float32)
+    if detector == "virtual":  # upright, the crystal's image point-inverted
+        images = images[:, ::-1, ::-1]
+    n_v, n_u = images.shape[1:]
+    views = system.views((n_v, n_u), detector, magnification, pitch)
+    given = {
+        key: value for key, value in (Recipe() if recipe is None else recipe).given.items() if key.startswith(_KEPT)
+    }
+    given |= {"model.kind": "emission", "model.time": time, "detector.plane": detector}
+    given |= {"detector.rows": n_v, "detector.columns": n_u, "detector.magnification": float(magnification)}
+    record = {
+        "counts": "measured",
+        "frames": numbers,
+        "orientation": words[0] if len(set(words)) == 1 else words,
+        "detector": detector,
+        "magnification": float(magnification),
+        "pitch_mm": None if pitch is None else np.broadcast_to(pitch, 2).tolist(),
+        "model": "emission",
+        **(settings or {}),
+        "recipe": recorded_recipe(Recipe(given)).tables(),
+    }
+    return ProjectionRun(images, system, views, unit="counts", settings=record)
+
+
+def recipe_counts(recipe: Recipe, system: PinholeSystem, stages: Stages = lambda stage: None) -> ProjectionRun:
+    """The run of the measured counts that a recipe names; `InputError` as of `read_counts` and `counts_run`.
+
+    Warns where a file says another exposure time or pixel size than is given.
+    """
+    files = recipe["counts.files"]
+    layout = Layout(*(recipe[f"counts.{name}"] for name in ("dataset", "raw_shape", "raw_type", "raw_big_endian")))
+    found = read_frames(files, layout, stages("reading"))
+    frames, orientation = recipe["counts.frames"], recipe["counts.orientation"]
+    if recipe["counts.frames_file"] is not None:
+        frames = _read_numbers(Path(recipe["counts.frames_file"]))
+    names = ", ".join(Path(file).name for file in (*files[:3], *(["…"] if len(files) > 3 else [])))
+    time = recipe.given.get("model.time")
+    try:
+        require_told(frames, orientation, time, found)
+        run = counts_run(
+            found.array,
+            system,
+            frames,
+            orientation[0] if len(orientation) == 1 else orientation,
+            time,
+            expected=recipe["counts.expected"],
+            detector=recipe.given.get("detector.plane", "real"),
+            magnification=recipe["detector.magnification"],
+            pitch=recipe["detector.pitch"],
+            recipe=recipe,
+            settings={"counts": names},
+        )
+    except InputError as error:
+        raise InputError(f"{names}: {error}") from None
+    _require_size(recipe, run, names)
+    _warn_of_others(found, run, recipe, names)
+    return run
+
+
+def require_told(frames: Any, orientation: Any, time: Any, found: Frames) -> None:
+    """Raise `InputError`, which says all that is missing and what is known, unless the three are given."""
+    count, rows, columns = found.array.shape
+    said = "" if found.time is None else f"; the file says {found.time:g} s: confirm it"
+    missing = [
+        text
+        for value, text in (
+            (frames, "which module each frame is of (--frames, such as 1-80 or 3,1,2)"),
+            (orientation, f"how frames lie on the crystal (--orientation, one of {', '.join(ORIENTATIONS)})"),
+            (time, f"the exposure time in seconds (--time{said})"),
+        )
+        if value is None
+    ]
+    if missing:
+        what = f"{count} frame{'s' * (count > 1)} of {rows} x {columns} pixels" + (
+            f" ({found.kind})" if found.kind else ""
+        )
+        raise InputError(f"{what}; say {', and '.join(missing)}")
+
+
+def frame_numbers(frames: Any, count: int, system: PinholeSystem) -> list[int]:
+    """The modules' numbers in the order of `count` frames; `InputError` unless each module has one frame."""
+    numbers = _parsed(frames) if isinstance(frames, str) else _whole(frames)
+    name = "frames (--frames)"
+    if len(numbers) != count:
+        raise InputError(f"{name}: expected the modules of {count} frames, got {len(numbers)} numbers")
+    if twice := sorted({number for number in numbers if numbers.count(number) > 1}):
+        raise InputError(f"{name}: module {_listed(twice)} has several frames")
+    own = set(map(int, system.numbers))
+    if unknown := sorted(set(numbers) - own):
+        raise InputError(f"{name}: the scanner has no module {_listed(unknown)}; it has {_listed(sorted(own))}")
+    if without := sorted(own - set(numbers)):
+        raise InputError(f"{name}: module {_listed(without)} has no frame; leave such modules out with --modules")
+    return numbers
+
+
+def _parsed(text: str) -> list[int]:
+    """The numbers of a text such as "1-20, 45, 40-21"."""
+    numbers: list[int] = []
+    for part in filter(None, re.split(r"[\s,;]+", re.sub(r"\s*-\s*", "-", text.strip()))):
+        found = re.fullmatch(r"(\d+)(?:-(\d+))?", part)
+        if found is None:
+            raise InputError(f"frames (--frames): {part!r} is neither a number nor a range such as 1-20 or 20-1")
+        first, last = int(found[1]), int(found[2] or found[1])
+        if abs(last - first) + len(numbers) >= _MOST_NUMBERS:
+            raise InputError(f"frames (--frames): {part} is more than a scanner has modules")
+        numbers += range(first, last + 1) if last >= first else range(first, last - 1, -1)
+    return numbers
+
+
+def _whole(values: Any) -> list[int]:
+    array = np.asarray(values)
+    if array.ndim != 1 or array.dtype.kind not in "iu":
+        raise InputError(f"frames (--frames): expected the modules' numbers, got {values!r:.40}")
+    return [int(value) for value in array]
+
+
+def _read_numbers(path: Path) -> str:
+    try:
+        return path.read_text(encoding="utf-8")
+    except (OSError, ValueError) as error:
+        raise InputError(f"{path}: {getattr(error, 'strerror', None) or 'not a text file'}") from None
+
+
+def _words(orientation: Any, count: int) -> list[str]:
+    words = [orientation] * count if isinstance(orientation, str) else list(orientation)
+    if len(words) != count:
+        raise InputError(f"orientation (--orientation): expected 1 or {count} words, got {len(words)}")
+    for word in words:
+        one_of(word, ORIENTATIONS, "orientation (--orientation)")
+    return words
+
+
+def _require_counts(array: NDArray[Any], expected: bool) -> None:
+    """Raise `InputError` naming frame, row and column, from 1, unless the numbers are counts."""
+    if array.dtype.kind == "f":
+        require_finite(array, "counts")
+    for wrong, what in (
+        (array < 0, "is below 0"),
+        (array > _MOST_EXACT, "is more than a pixel can hold exactly"),
+        (array != np.rint(array) if array.dtype.kind == "f" and not expected else None, "is no whole number of counts"),
+    ):
+        if wrong is not None and wrong.any():
+            frame, row, column = np.unravel_index(int(np.argmax(wrong)), array.shape)
+            hint = "; for expected means say so (--expected)" if "whole" in what else ""
+            where = f"frame {frame + 1}, row {row + 1}, column {column + 1}"
+            raise InputError(f"counts: {array[frame, row, column]:g} {what} ({where}){hint}")
+
+
+def _require_size(recipe: Recipe, run: ProjectionRun, names: str) -> None:
+    """Refuse a number of pixels, given in the recipe, that the frames do not have."""
+    for name, found in zip(("rows", "columns"), run.views.shape, strict=True):
+        given = recipe.given.get(f"detector.{name}", found)
+        if given != found:
+            raise InputError(f"detector.{name}: {given}, but the images of {names} have {found}")
+
+
+def _warn_of_others(found: Frames, run: ProjectionRun, recipe: Recipe, names: str) -> None:
+    """Warn where the file says another time or pixel size."""
+    time = recipe["model.time"]
+    if found.time is not None and differs(found.time, time):
+        _warn(f"{names}: the file says an exposure of {found.time:g} s; taken as {time:g} s, as given")
+    if found.pixel is None or recipe["detector.pitch"] is not None:
+        return
+    n_v, n_u = run.views.shape
+    own = run.system.detector_side / n_u
+    others = own[[any(differs(size, side) for size in found.pixel) for side in own.tolist()]]
+    if n_u == n_v and len(others):
+        size = " x ".join(f"{size:g}" for size in found.pixel)
+        _warn(
+            f"{names}: the file says pixels of {size} mm; taken as {others[0]:.4g} mm, the crystal's side divided by {n_u}; "
+            "if the file is right, give its number (--pitch)"
+        )
+
+
+def _listed(numbers: Sequence[int]) -> str:
+    """Numbers as ranges: "1-3, 7"."""
+    cuts = [0, *(i for i in range(1, len(numbers)) if numbers[i] != numbers[i - 1] + 1), len(numbers)]
+    parts = [(numbers[a], numbers[b - 1]) for a, b in pairwise(cuts)]
+    texts = [f"{a}-{b}" if b > a else str(a) for a, b in parts]
+    return ", ".join(texts if len(texts) <= 6 else [*texts[:5], "…"])
+
+
+def _warn(text: str) -> None:
+    warnings.warn(text, InputWarning, stacklevel=4)

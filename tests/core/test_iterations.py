@@ -1,0 +1,182 @@
+"""Laws of every iterative reconstruction: resume, callbacks, cancelling, stopping, masks and what is refused."""
+
+import numpy as np
+import pytest
+
+import mphdrr.core as mph
+
+METHODS = [
+    pytest.param(lambda *given, **more: mph.mlem(*given, **more), id="mlem"),
+    pytest.param(lambda *given, **more: mph.osem(*given, subsets=3, **more), id="osem"),
+]
+
+
+@pytest.fixture(scope="module")
+def problem(scanner):
+    """Eight modules around 10^3 voxels: projector, counts, truth."""
+    system = scanner[::10]
+    grid = mph.Grid.centered(10, 8.0)
+    with pytest.warns(mph.InputWarning):
+        A = mph.Projector(
+            grid, system.views((12, 12), detector="real"), mph.Emission(system, time=600.0, pixel_points=4)
+        )
+    truth = np.zeros(grid.shape, np.float32)
+    truth[3:7, 3:7, 3:7] = np.random.default_rng(1).uniform(20, 100, (4, 4, 4))
+    return A, mph.sample_counts(A(truth), 2), truth
+
+
+def assert_same(a, b):
+    np.testing.assert_array_equal(a.volume.array, b.volume.array)
+    np.testing.assert_array_equal(a.objective, b.objective)
+    assert a.iterations == b.iterations and a.settings == b.settings
+
+
+@pytest.mark.parametrize("method", METHODS)
+class TestEveryMethod:
+    def test_a_break_changes_nothing(self, problem, method):
+        A, counts, _ = problem
+        seen, whole = [], method(A, counts, 5)
+        half = method(A, counts, 2)
+        assert half.iterations == 2 and whole.settings["stopped"] == "iterations"
+        rest = method(A, counts, 3, start=half, callback=lambda i, x: seen.append(i))
+        assert_same(rest, whole)
+        assert seen == [3, 4, 5]
+
+    def test_cancelled_in_the_middle_it_can_be_resumed(self, problem, method):
+        A, counts, _ = problem
+        calls = 0
+
+        def progress(done, total):
+            nonlocal calls
+            calls += 1
+            if done / total > 0.55:
+                raise mph.Cancelled
+
+        with pytest.raises(mph.Cancelled) as caught:
+            method(A, counts, 4, progress=progress)
+        found = caught.value.reconstruction
+        assert found.iterations == 2 and found.settings["stopped"] == "cancelled" and calls > 4
+        assert_same(method(A, counts, 2, start=found), method(A, counts, 4))
+
+    def test_cancelled_by_the_callback_the_iteration_counts(self, problem, method):
+        A, counts, _ = problem
+
+        def callback(i, x):
+            if i == 3:
+                raise mph.Cancelled
+
+        with pytest.raises(mph.Cancelled) as caught:
+            method(A, counts, 4, callback=callback)
+        assert_same(method(A, counts, 1, start=caught.value.reconstruction), method(A, counts, 4))
+
+    def test_the_callback_sees_each_volume_and_ends_it(self, problem, method):
+        A, counts, _ = problem
+        seen = []
+
+        def callback(i, x):
+            seen.append(x.copy())
+            assert not x.flags.writeable
+            return i == 2
+
+        found = method(A, counts, 9, callback=callback)
+        assert found.iterations == len(seen) == 2 and found.settings["stopped"] == "callback"
+        np.testing.assert_array_equal(seen[-1], found.volume.array)
+
+    def test_progress_ends_full(self, problem, method):
+        A, counts, _ = problem
+        said = []
+        method(A, counts, 2, progress=lambda done, total: said.append((done, total)))
+        assert said[-1][0] == said[-1][1] and (np.diff([done / total for done, total in said]) >= 0).all()
+
+    def test_it_stops_by_change_noise_and_time(self, problem, method):
+        A, counts, truth = problem
+        region = truth > 0
+        change = method(A, counts, 500, stop=mph.StopWhen(change=1e-3))
+        last, before = change.objective[-1], change.objective[-2]
+        assert change.settings["stopped"] == "change" and abs(last - before) <= 1e-3 * abs(last)
+        assert (np.abs(np.diff(change.objective[:-1])) > 1e-3 * np.abs(change.objective[1:-1])).all()
+        noise = method(A, counts, 500, stop=mph.StopWhen(noise=0.3, region=region))
+        inside = noise.volume.array[region]
+        assert noise.settings["stopped"] == "noise" and inside.std() >= 0.3 * inside.mean()
+        assert method(A, counts, 500, stop=mph.StopWhen(seconds=1e-9)).iterations == 1
+
+    def test_outside_the_mask_nothing_is(self, problem, method):
+        A, counts, truth = problem
+        mask = truth > 0
+        found = method(A, counts, 2, start=truth + 1, mask=mask)
+        assert (found.volume.array[~mask] == 0).all() and (found.volume.array[mask] > 0).all()
+
+    @pytest.mark.parametrize(
+        ("wrong", "words"),
+        [
+            (lambda A, y: {"counts": -y}, "counts: expected 0 or more, got"),
+            (lambda A, y: {"counts": y * np.nan}, "counts: nan is not a finite number"),
+            (lambda A, y: {"counts": y[1:]}, "counts: expected shape 8 x 12 x 12"),
+            (lambda A, y: {"counts": "many"}, "counts: expected real numbers"),
+            (lambda A, y: {"background": -1}, "background: expected 0 or more"),
+            (lambda A, y: {"background": [1, 2]}, "background: expected one number, 8 numbers or images"),
+            (lambda A, y: {"background": "some"}, "background: expected real numbers"),
+            (lambda A, y: {"background": np.inf}, "background: inf is not a finite"),
+            (lambda A, y: {"iterations": 0}, "iterations: expected a whole number"),
+            (lambda A, y: {"start": np.ones((2, 2, 2))}, "start: expected shape 10 x 10 x 10"),
+            (lambda A, y: {"start": -np.ones(A.shape_in)}, "start: expected 0 or more"),
+            (lambda A, y: {"start": other_grid()}, "start: volume: its grid"),
+            (lambda A, y: {"start": mph.Reconstruction(other_grid(), np.zeros(1))}, "start: volume: its grid"),
+            (
+                lambda A, y: {"start": mph.Volume(np.ones(A.shape_in), A.grid, "hu")},
+                "start: .*expected a volume of activity",
+            ),
+            (lambda A, y: {"mask": np.ones(A.shape_in)}, "mask: expected booleans"),
+            (lambda A, y: {"mask": np.ones(3, bool)}, "mask: expected booleans of 10 x 10 x 10"),
+            (lambda A, y: {"stop": 3}, "stop: expected a StopWhen"),
+            (lambda A, y: {"stop": mph.StopWhen(noise=1, region=np.ones(2, bool))}, "stop: region: expected booleans"),
+            (lambda A, y: {"A": mph.Projector(A.grid, A.views)}, "expected a projector of emission"),
+            (lambda A, y: {"A": A.views}, "expected a Projector"),
+        ],
+    )
+    def test_what_cannot_be_is_refused_in_a_line(self, problem, method, wrong, words):
+        A, counts, _ = problem
+        given = {"A": A, "counts": counts, "iterations": 1} | wrong(A, counts)
+        with pytest.raises(mph.InputError, match=words) as caught:
+            method(given.pop("A"), given.pop("counts"), given.pop("iterations"), **given)
+        assert "\n" not in str(caught.value)
+
+    def test_tensors_are_taken(self, problem, method):
+        torch = pytest.importorskip("torch")
+        A, counts, truth = problem
+        found = method(A, torch.tensor(counts), 2, background=torch.tensor(0.5), start=torch.tensor(truth + 1))
+        assert_same(found, method(A, counts, 2, background=0.5, start=truth + 1))
+
+
+def other_grid():
+    return mph.Volume(np.ones((10, 10, 10)), mph.Grid.centered(10, 7.0))
+
+
+@pytest.mark.parametrize(
+    "given", [{}, {"change": 0}, {"noise": 0.1}, {"region": np.ones(3, bool)}, {"seconds": -1}, {"change": "soon"}]
+)
+def test_rules_that_say_nothing_are_refused(given):
+    with pytest.raises(mph.InputError, match="stop: "):
+        mph.StopWhen(**given)
+
+
+def test_another_methods_result_is_only_a_start(problem):
+    A, counts, _ = problem
+    first = mph.osem(A, counts, 2, subsets=4)
+    assert_same(mph.mlem(A, counts, 3, start=first), mph.mlem(A, counts, 3, start=first.volume))
+
+
+def test_what_nothing_can_have_caused_and_what_nobody_sees(problem):
+    """Zero start values stay, counts with no cause are left out, voxels without sensitivity are 0, no counts give 0."""
+    A, counts, truth = problem
+    found = mph.mlem(A, counts, 3, start=np.where(truth > 0, 1, 0))
+    assert (found.volume.array[truth == 0] == 0).all() and np.isfinite(found.objective).all()
+    assert not mph.mlem(A, counts, 2, start=np.zeros(A.shape_in)).volume.array.any()
+    empty = mph.osem(A, np.zeros_like(counts), 2, subsets=4)
+    assert not empty.volume.array.any() and np.isfinite(empty.objective).all()
+    far = mph.Grid.centered((30, 10, 10), 30.0)  # its corners are behind the scanner
+    with pytest.warns(mph.InputWarning):
+        B = mph.Projector(far, A.views, A.model)
+    blind = B.T(np.ones(B.shape_out, np.float32)) == 0
+    found = mph.osem(B, counts, 2, subsets=4).volume.array
+    assert blind.any() and (found[blind] == 0).all() and (found[~blind] > 0).any()

@@ -1,0 +1,130 @@
+"""Laws of priors: derivatives, what counts as an edge, voxel sizes, anatomy."""
+
+from itertools import product
+
+import numpy as np
+import pytest
+
+import mphdrr.core as mph
+
+KINDS = [mph.Quadratic, mph.RelativeDifference, mph.TotalVariation]
+SHAPE, SPACING = (4, 5, 6), (1.0, 2.0, 1.5)
+
+
+@pytest.fixture
+def grid():
+    return mph.Grid.centered(SHAPE, SPACING)
+
+
+@pytest.fixture
+def anatomy(grid, rng):
+    return mph.Volume(rng.integers(0, 3, SHAPE), grid, "mu")
+
+
+def derivative(function, x, h=1e-5):
+    found = np.zeros_like(x)
+    for index in np.ndindex(x.shape):
+        step = np.zeros_like(x)
+        step[index] = h
+        found[index] = (function(x + step, index) - function(x - step, index)) / (2 * h)
+    return found
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("neighbors", [6, 26])
+@pytest.mark.parametrize("with_anatomy", [False, True])
+def test_gradient_and_curvature_are_those_of_the_value(grid, anatomy, rng, kind, neighbors, with_anatomy):
+    penalty = kind(0.7, neighbors=neighbors, anatomy=anatomy if with_anatomy else None).on(grid)
+    x = rng.uniform(0, 5, SHAPE)
+    gradient, curvature = penalty.gradient(x), penalty.curvature(x)
+    np.testing.assert_allclose(gradient, derivative(lambda y, i: penalty.value(y), x), rtol=1e-6, atol=1e-7)
+    second = derivative(lambda y, i: penalty.gradient(y)[i], x)
+    if kind is mph.TotalVariation:
+        assert (curvature >= second - 1e-6).all()
+    else:
+        np.testing.assert_allclose(curvature, second, rtol=1e-6, atol=1e-7)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("neighbors", [6, 26])
+def test_the_value_is_the_sum_that_the_docs_say(grid, rng, kind, neighbors):
+    """Over neighbours found by their distances, one by one."""
+    x = rng.uniform(0, 5, SHAPE)
+    prior = kind(0.7, neighbors=neighbors)
+    total = 0.0
+    steps = [step for step in product((0, 1), (-1, 0, 1), (-1, 0, 1)) if step > (0, 0, 0)]
+    for j in np.ndindex(SHAPE):
+        squares = 0.0
+        for step in steps:
+            k = tuple(np.add(j, step))
+            if (neighbors == 6 and np.abs(step).sum() > 1) or not all(
+                0 <= i < n for i, n in zip(k, SHAPE, strict=True)
+            ):
+                continue
+            w, d = 1 / np.linalg.norm(np.multiply(step, SPACING)), x[j] - x[k]
+            squares += (w * d) ** 2
+            if kind is mph.Quadratic:
+                total += w * d**2 / 2
+            elif kind is mph.RelativeDifference:
+                total += w * d**2 / (x[j] + x[k] + 2 * abs(d) + prior.edge)
+        if kind is mph.TotalVariation:
+            total += np.sqrt(squares + prior.edge**2) - prior.edge
+    assert prior.on(grid).value(x) == pytest.approx(0.7 * total, rel=1e-12)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("neighbors", [6, 26])
+def test_edges_of_the_anatomy_cost_nothing(kind, neighbors):
+    """A step along x where the anatomy has one, and one where it has none; large enough for several slabs."""
+    grid = mph.Grid.centered((12, 70, 80), 2.0)
+    step = (np.arange(12) >= 5)[:, None, None] * np.ones(grid.shape)
+    anatomy = mph.Volume(step * 7, grid, "mu")
+    aware, plain = (kind(1.0, neighbors=neighbors, anatomy=each).on(grid) for each in (anatomy, None))
+    x = 1 + 3 * step
+    assert aware.value(x) == 0 and not aware.gradient(x).any()
+    assert plain.value(x) > 100 and plain.gradient(x).any()
+    shifted = np.roll(x, 1, axis=0)
+    shifted[0] = x[0]
+    assert aware.value(shifted) == pytest.approx(plain.value(shifted))
+    noisy, along = np.random.default_rng(1).uniform(1, 2, (2, *grid.shape))
+    slope = (aware.value(noisy + 1e-5 * along) - aware.value(noisy - 1e-5 * along)) / 2e-5
+    assert float(np.sum(along * aware.gradient(noisy))) == pytest.approx(slope, rel=1e-6)
+    single = aware.gradient(np.float32(noisy))
+    assert single.dtype == np.float32
+    np.testing.assert_allclose(single, aware.gradient(noisy), rtol=1e-3, atol=1e-4)
+
+
+def test_the_most_similar_neighbours_are_chosen(grid, rng):
+    """Without ties and with all neighbours as similar, anatomy changes nothing."""
+    x = rng.uniform(0, 5, SHAPE)
+    anatomy = mph.Volume(rng.uniform(0, 1, SHAPE), grid, "mu")
+    plain = mph.Quadratic(1.0).on(grid).value(x)
+    assert mph.Quadratic(1.0, anatomy=anatomy, similar=6).on(grid).value(x) == pytest.approx(plain, rel=1e-6)
+    fewer = [mph.Quadratic(1.0, anatomy=anatomy, similar=n).on(grid).value(x) for n in range(1, 7)]
+    assert (np.diff(fewer) > 0).all()
+
+
+@pytest.mark.parametrize(
+    ("make", "words"),
+    [
+        (lambda: mph.Quadratic(-1), "prior: weight: expected 0 or more"),
+        (lambda: mph.Quadratic("much"), "prior: weight: expected real numbers"),
+        (lambda: mph.Quadratic(np.nan), "prior: weight: nan is not"),
+        (lambda: mph.Quadratic(1, neighbors=18), "prior: neighbors 18: expected one of 6, 26"),
+        (lambda: mph.Quadratic(1, anatomy=np.ones(SHAPE)), "prior: anatomy: expected a Volume"),
+        (lambda: mph.Quadratic(1, similar=3), "prior: similar needs anatomy"),
+        (lambda: mph.RelativeDifference(1, gamma=-1), "prior: gamma: expected 0 or more"),
+        (lambda: mph.RelativeDifference(1, edge=0), "prior: edge: expected more than 0 kBq/mL"),
+        (lambda: mph.TotalVariation(1, edge=-1), "prior: edge: expected more than 0 kBq/mL"),
+    ],
+)
+def test_wrong_numbers_are_refused(make, words):
+    with pytest.raises(mph.InputError, match=words):
+        make()
+
+
+def test_anatomy_on_another_grid_is_refused(grid, anatomy):
+    with pytest.raises(mph.InputError, match="anatomy's grid is not"):
+        mph.Quadratic(1, anatomy=anatomy).on(mph.Grid.centered(SHAPE, 1.0))
+    with pytest.raises(mph.InputError, match="prior: similar: expected at most the 6"):
+        mph.Quadratic(1, anatomy=anatomy, similar=7)

@@ -4,12 +4,17 @@ import argparse
 from pathlib import Path
 from typing import Any
 
-from ..errors import InputError
+import numpy as np
+from numpy.typing import NDArray
+
+from ..errors import InputError, naming
 from ..figures.page import SUFFIXES, Page
 from ..figures.scores import SIZE, draw
 from ..phantoms.language import read_phantom
 from ..phantoms.phantom import Phantom
 from ..reconstruction.scores.summary import score_volume
+from ..runs.files import FORMATS, read_run
+from ..runs.run_recipe import truth_of_run
 from ..volumes.volume import UNITS, Volume
 from ..volumes.volume_files import read_volume
 from .options import add_command, output_path, print_answer, progress_bar, refuse
@@ -21,12 +26,12 @@ def add_parser(subparsers) -> None:  # type: ignore[no-untyped-def]
     score = add_command(
         subparsers,
         "score",
-        "score a reconstructed volume beside the truth: a volume, or a phantom",
-        "mphdrr score volume.nii.gz --truth truth.nii.gz --picture score.png\n"
+        "score a reconstructed volume beside the truth: what a run was simulated of, a phantom, or a volume",
+        "mphdrr score volume.nii.gz --truth run.h5 --picture score.png\n"
         "example: mphdrr score volume.nii.gz derenzo --rods 8 6 5 4 3 2 --activity 100 --euler 0 90 0",
     )
     score.add_argument("volume", metavar="VOLUME", help="to score (formats: docs/volumes.md)")
-    truth = "a volume, or a phantom's .toml; one on another grid is resampled onto VOLUME's voxels"
+    truth = "a simulated run, a phantom's .toml, or a volume; one on another grid is resampled onto VOLUME's voxels"
     score.add_argument("--truth", metavar="FILE", help=truth)
     add_pose(score)
     _add_options(score, {"quantity": None, "json": False, "picture": None})
@@ -57,10 +62,7 @@ def _run(arguments: argparse.Namespace) -> None:
         raise InputError("score: expected --truth FILE or a kind of phantom, see mphdrr score --help")
     if arguments.make is not None and arguments.truth is not None:
         raise InputError("score: expected either --truth or a kind of phantom, got both")
-    truth = _truth(arguments)
-    if isinstance(truth, Volume):
-        refuse(arguments, ("position", "euler"), "is of a phantom; a volume's place is in its file")
-    pose = read_pose(arguments) if isinstance(truth, Phantom) else None
+    truth, pose = _truth(arguments)
     volume = read_volume(arguments.volume, arguments.quantity, progress=progress_bar("reading"))
     score = score_volume(volume, truth, pose, progress_bar("truth"))
     if picture is not None:
@@ -70,10 +72,21 @@ def _run(arguments: argparse.Namespace) -> None:
     print_answer(arguments, score.record, score.lines, score.notes)
 
 
-def _truth(arguments: argparse.Namespace) -> Volume | Phantom:
+def _truth(arguments: argparse.Namespace) -> tuple[Volume | Phantom, NDArray[np.float64] | None]:
+    """The truth, and the pose of a phantom."""
     if arguments.make is not None:
-        phantom: Phantom = arguments.make(arguments)
-        return phantom
-    if arguments.truth.lower().endswith(".toml"):
-        return read_phantom(arguments.truth)
-    return read_volume(arguments.truth, arguments.quantity, progress=progress_bar("reading the truth"))
+        return arguments.make(arguments), read_pose(arguments)
+    file = Path(arguments.truth)
+    if file.suffix.lower() == ".toml":
+        return read_phantom(file), read_pose(arguments)
+    refuse(arguments, ("position", "euler"), "is for a kind of phantom or a .toml; a run or a volume knows its place")
+    try:
+        run = read_run(file) if file.suffix.lower() in FORMATS else None
+    except InputError:  # volumes may have the same endings
+        if file.suffix.lower() == ".pt" or not file.is_file():
+            raise
+        run = None
+    if run is not None:
+        with naming(file):
+            return truth_of_run(run)
+    return read_volume(file, arguments.quantity, progress=progress_bar("reading the truth")), None

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import re
 
@@ -133,6 +134,32 @@ def test_the_picture_shows_volume_and_truth(files, tmp_path, capsys, suffix):
         assert ">reconstruction<" in text and ">3 mm: " in text
 
 
+def test_a_run_knows_its_phantom_or_its_volume(files, system, tmp_path, capsys):
+    volume, run = str(files / "volume.nii.gz"), tmp_path / "run.h5"
+    numbers = {
+        "kind": "derenzo",
+        "radius": 24.0,
+        "rod_diameters": RODS,
+        "height": 20.0,
+        "activity": 100.0,
+        "voxels": 24,
+    }
+    numbers |= {"position": (1, 2, 3), "euler_degrees": (0, 20, 0)}
+    recipe = mph.Recipe({f"phantom.{name}": value for name, value in numbers.items()} | {"compute.backend": "numpy"})
+    (made,) = mph.run_recipe(recipe.updated({"detector.rows": 4, "detector.columns": 4}), system)
+    mph.write_run(made, run)
+    assert main(["score", volume, "--truth", str(run), "--json"]) == 0
+    record = json.loads(capsys.readouterr().out)
+    expected = mph.score_volume(mph.read_volume(volume), PHANTOM, POSE)
+    assert record["derenzo"][0]["valley_to_peak"] == pytest.approx(expected.derenzo[0].valley_to_peak, rel=1e-4)
+    mph.write_run(dataclasses.replace(made, settings={}), run)
+    assert main(["score", volume, "--truth", str(run), "--json"]) == 0
+    assert "derenzo" not in json.loads(capsys.readouterr().out)
+    mph.write_run(dataclasses.replace(made, volume=None, unit="counts"), run)
+    assert main(["score", volume, "--truth", str(run)]) == 1
+    assert "run.h5: the run was measured: nobody knows the truth" in capsys.readouterr().err
+
+
 def test_a_truth_volume_on_the_command_line(files, tmp_path, capsys):
     picture = str(tmp_path / "score.png")
     names = [str(files / f"{name}.nii.gz") for name in ("volume", "truth")]
@@ -148,7 +175,11 @@ def test_a_truth_volume_on_the_command_line(files, tmp_path, capsys):
     [
         ([], 1, "expected --truth FILE or a kind of phantom"),
         (["--truth", "none.nii.gz"], 1, "none.nii.gz: no such file"),
-        (["--truth", "TRUTH", "--euler", "0", "1", "2"], 1, "--euler is of a phantom; a volume's place is in its file"),
+        (
+            ["--truth", "TRUTH", "--euler", "0", "1", "2"],
+            1,
+            "--euler is for a kind of phantom or a .toml; a run or a volume knows its place",
+        ),
         (["--truth", "TRUTH", *OPTIONS], 1, "expected either --truth or a kind of phantom, got both"),
         (["--truth", "TRUTH", "--picture", "score.pdf"], 1, "score.pdf: expected a name ending in .png, .svg"),
         (["--quantity", "hu", *OPTIONS], 1, "expected a volume of activity or mu, got hu"),

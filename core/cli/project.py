@@ -4,7 +4,6 @@ Every setting of `runs.settings` is an option; the help lists the most used ones
 """
 
 import argparse
-import tomllib
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +17,8 @@ from ..runs.presets import PRESETS
 from ..runs.recipe import Recipe, read_recipe, write_recipe
 from ..runs.run_recipe import run_recipe
 from ..runs.settings import SETTINGS
-from .options import add_command, number_or_name, numbered_path, output_path, progress_bar
+from .options import add_command, numbered_path, output_path, progress_bar
+from .recipe_options import add_entries, add_option, add_setting, typed_entries
 
 _LISTED = (
     *("system.columns", "system.modules", "volume.file", "volume.states", "volume.center", "phantom.file"),
@@ -58,34 +58,22 @@ def add_parser(subparsers) -> None:  # type: ignore[no-untyped-def]
     text = "geometry workbook (.xlsx, .xlsm), recipe (.toml), or run (.h5, .npz, .pt), to be made again"
     parser.add_argument("file", nargs="?", metavar="FILE", help=text)
     for setting in SETTINGS.values():
-        if setting.key in _BY_HAND:
-            continue
-        text = argparse.SUPPRESS
-        if setting.key in _LISTED:
-            text = setting.help + (f" (default: {setting.default})" if setting.default not in (None, False) else "")
-        details: dict[str, Any] = {"type": str} if setting.kind is str else {}
-        if setting.kind is bool:
-            details["action"] = "store_true"
-        else:
-            details["metavar"] = "FILE" if setting.is_path else "NAME" if details else setting.unit.upper() or "VALUE"
-        if setting.sizes is not None or setting.kind is list:
-            details["nargs"] = "+"
-        _add(parser, setting.option, (setting.key,), text, **details)
+        if setting.key not in _BY_HAND and not setting.key.startswith("reconstruction."):
+            add_setting(parser, setting, setting.key in _LISTED)
     size = ("detector.rows", "detector.columns")
-    _add(parser, "--size", size, "Pixels, rows and columns (default: 256 256)", nargs=2)
-    _add(parser, "--energy", ("energy",), SETTINGS["volume.energy"].help, metavar="KEV")
+    add_option(parser, "--size", size, "Pixels, rows and columns (default: 256 256)", nargs=2)
+    add_option(parser, "--energy", ("energy",), SETTINGS["volume.energy"].help, metavar="KEV")
     model = parser.add_mutually_exclusive_group()
     for word, (_, text) in SETTINGS["model.kind"].words.items():
-        _add(model, f"--{word}", ("model.kind",), text, action="store_const", const=word)
-    _add(model, "--photons", ("model.photons",), SETTINGS["model.photons"].help)
+        add_option(model, f"--{word}", ("model.kind",), text, action="store_const", const=word)
+    add_option(model, "--photons", ("model.photons",), SETTINGS["model.photons"].help)
     text = "physics of counts in one choice, which options override: "
     text += ", ".join(PRESETS)
     parser.add_argument("--preset", choices=PRESETS, metavar="NAME", help=text)
     for option, keys in _DERENZO.items():
         nargs = "+" if option == "--rods" else len(keys) if len(keys) > 1 else None
-        _add(parser, option, keys, argparse.SUPPRESS, nargs=nargs)
-    text = "any entry of a recipe, such as model.aperture_points=7; KEY= takes it away"
-    parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", dest="entries", help=text)
+        add_option(parser, option, keys, argparse.SUPPRESS, nargs=nargs)
+    add_entries(parser)
     text = "write the recipe (.toml) of these options, all settings explained in it, instead of projecting"
     parser.add_argument("--write-recipe", metavar="FILE", help=text)
     parser.add_argument("-o", "--output", metavar="FILE", help=", ".join(FORMATS))
@@ -93,36 +81,9 @@ def add_parser(subparsers) -> None:  # type: ignore[no-untyped-def]
     parser.set_defaults(run=_run)
 
 
-def _add(parser: Any, option: str, keys: tuple[str, ...], text: str, **details: Any) -> None:
-    """Add an option for an entry of the recipe, or for several; it is in the namespace only where it is typed."""
-    if "action" not in details:
-        details = {"type": _value, "metavar": "VALUE", **details}
-    if text != argparse.SUPPRESS:
-        text = text.replace("%", "%%")
-        text = text[0].lower() + text[1:] if text[1].islower() else text  # as in the other options' help
-    parser.add_argument(option, dest=" ".join(keys), default=argparse.SUPPRESS, help=text, **details)
-
-
-def _value(text: str) -> Any:
-    """A value as in TOML, or a text without quotes."""
-    try:
-        return tomllib.loads(f"value = {text}")["value"]
-    except tomllib.TOMLDecodeError:
-        return number_or_name(text.strip())
-
-
 def _changes(arguments: argparse.Namespace, recipe: Recipe) -> dict[str, Any]:
     """What the options say, by the keys of recipes."""
-    typed = vars(arguments)
-    changes: dict[str, Any] = {}
-    for dest, value in typed.items():
-        keys = dest.split()
-        changes |= dict(zip(keys, value if len(keys) > 1 else [value], strict=True)) if "." in dest else {}
-    for entry in arguments.entries:
-        key, equals, text = entry.partition("=")
-        if not equals:
-            raise InputError(f"--set {entry}: expected KEY=VALUE, such as model.aperture_points=7")
-        changes[key.strip()] = _value(text) if text.strip() else None
+    typed, changes = vars(arguments), typed_entries(arguments)
     if changes.get("model.photons") is not None:
         changes.setdefault("model.kind", "transmission")
     if changes.get("counts.files") is not None:

@@ -15,6 +15,7 @@ from ..geometry.views import Views
 from ..validation import freeze, positive, real_array, shape_text
 from ..volumes.volume import LINE_INTEGRALS, Volume, require_quantity
 from .bundles import Beam
+from .depth_response import DepthResponses
 from .pixel_points import TOLERANCE, offsets, points_needed, require_points, shadow_edges
 from .rays import Fan
 
@@ -73,6 +74,10 @@ class Model(ABC):
         """Factors of the voxels in view m, ``grid.shape``; used if `weights_voxels`."""
         return np.ones(grid.shape)
 
+    def by_depth(self, views: Views, grid: Grid) -> DepthResponses | None:
+        """What projects in place of rays, if the model is of that kind."""
+        return None
+
     def response(self, views: Views, m: int) -> tuple[Array, Array] | None:
         """The detector's response in view m: matrices (n_v, n_v) along v and (n_u, n_u) along u, None if ideal."""
         return None
@@ -111,7 +116,7 @@ class Transmission(Model):
 
     def beams(self, views: Views, m: int, grid: Grid) -> Iterator[Beam]:
         """The rays of `views`, or to more points of their pixels, weights summing to 1."""
-        rays = view_rays(views, m)
+        rays = view_rays(views, m, grid)
         if self.pixel_points == 1:
             yield Beam(rays)
             return
@@ -175,9 +180,22 @@ def checked_background(
     return freeze(array) if array.ndim else float(array)
 
 
-def view_rays(views: Views, m: int) -> Fan:
-    """The rays of view m, from its source to the pixels' centres: a row for every row of pixels."""
+def view_rays(views: Views, m: int, grid: Grid | None = None) -> Fan:
+    """The rays of view m, from its source to the pixels' centres: a row for every row of pixels.
+
+    Parallel rays begin and end outside `grid`, close to it; without a grid, as those of `Views.rays`.
+    """
     n_v, n_u = views.shape
     u_step, v_step = views.u_steps[m], views.v_steps[m]
     corner = views.detector_centers[m] - (n_u - 1) / 2 * u_step - (n_v - 1) / 2 * v_step
-    return Fan(views.sources[m], corner, v_step, u_step, views.shape)
+    if not views.parallel:
+        return Fan(views.sources[m], corner, v_step, u_step, views.shape)
+    along = views.detector_centers[m] - views.sources[m]
+    if grid is None:
+        return Fan(corner - along, corner, v_step, u_step, views.shape, parallel=True)
+    along = along / np.linalg.norm(along)
+    outermost = [corner + i * (n_v - 1) * v_step + j * (n_u - 1) * u_step for i in (0, 1) for j in (0, 1)]
+    distances = (grid.corners()[:, None] - outermost) @ along  # from pixels to the grid
+    margin = float(grid.spacing.max() + np.linalg.norm(u_step) + np.linalg.norm(v_step))
+    first, last = (corner + distance * along for distance in (distances.min() - margin, distances.max() + margin))
+    return Fan(first, last, v_step, u_step, views.shape, parallel=True)

@@ -52,6 +52,7 @@ class ProjectionRun:
     background: float | NDArray[np.float64] = 0.0  # expected besides the volume's, as of `Emission`: (), (M,) or images
 
     def __post_init__(self) -> None:
+        self.views.require_pinholes("run")
         if len(self.views) != len(self.system):
             raise InputError(f"run: {len(self.system)} modules, but {len(self.views)} views")
         shape = (len(self.views), *self.views.shape)

@@ -18,6 +18,7 @@ from ..phantoms.kinds import KINDS
 from ..physics.isotopes import ISOTOPES
 from ..physics.materials import APERTURES, CRYSTALS
 from ..projector.backends import BACKENDS, OLD_NAMES
+from ..reconstruction.methods import METHODS, PRIORS, taking
 from ..validation import real_array
 from ..volumes.volume import LINE_INTEGRALS
 from .frame_files import RAW_TYPES
@@ -109,6 +110,7 @@ def _named(names: Iterable[str], text: str) -> Words:
 
 
 _COUNTS = "model.kind=emission"
+_METHOD_OF_COUNTS = " or ".join(f"reconstruction.method={m.name}" for m in METHODS.values() if m.of_counts)
 _RAYS = "no model.kind=inverse-square"
 _FILE = "volume.file or volume.states"
 _MADE = "no counts.files"
@@ -118,6 +120,17 @@ _SERIES = "The DICOM series with this number, description or UID, where the fold
 _AT_ENERGY = "Convert CT numbers to attenuation (1/mm) at this energy, or at an isotope's strongest line"
 _ISOTOPES = _named(ISOTOPES, "Energy window 10 % around its strongest line")
 _BY_NAME = "As it attenuates the isotope's photons"
+
+
+def _methods(argument: str) -> str:
+    """The condition that a method takes an argument."""
+    return " or ".join(f"reconstruction.method={name}" for name in taking(argument))
+
+
+def _priors(argument: str) -> str:
+    """The condition that a prior takes an argument."""
+    return " or ".join(f"reconstruction.prior={prior.name}" for prior in PRIORS.values() if argument in prior.takes)
+
 
 _DECLARED = (
     Setting("system.file", str, None, "Geometry workbook (.xlsx, .xlsm)", is_path=True, option="--system"),
@@ -247,6 +260,43 @@ _DECLARED = (
             slider=10, label="Pixel Size (mm)"),
     Setting("noise.seed", int, None, "Draw Poisson counts with this seed; of several states with SEED, SEED + 1 …",
             "their expected means", least=0, needs=("model.kind=emission or model.photons", _MADE), option="--noise"),
+    Setting("reconstruction.method", str, "osem", "How the volume is found",
+            words={method.name: (method.label, method.text) for method in METHODS.values()}),
+    Setting("reconstruction.iterations", int, 10, "How often all images are used", least=1, slider=100),
+    Setting("reconstruction.subsets", int, None, "Of the modules: each of an iteration's updates uses one of them",
+            "about a fifth of the modules' number", least=1, slider=80, needs=(_methods("subsets"),)),
+    Setting("reconstruction.voxels", int, (64,), "Voxels along x y z, or one number for all", least=1, sizes=(1, 3)),
+    Setting("reconstruction.spacing", float, None, "Voxel size, one or three", "the voxels cover the ROI", unit="mm",
+            above=0, slider=10, sizes=(1, 3), label="Voxel Size (mm)"),
+    Setting("reconstruction.center", float, (0.0, 0.0, 0.0), "Middle of the volume, x y z", unit="mm", sizes=(3,)),
+    Setting("reconstruction.aperture_points", int, None, "Points of the hole that the reconstruction reckons with; 1: no "
+            "recovery of its blur", "7, or those of the run if it was made with fewer", least=1, slider=64,
+            label="Hole Points", needs=(_METHOD_OF_COUNTS,), option="--aperture-points"),
+    Setting("reconstruction.pixel_points", int, 1, "Points of each pixel's area that it reckons with, for each point of the "
+            "hole", least=1, slider=16, needs=(_METHOD_OF_COUNTS,)),
+    Setting("reconstruction.ignore_attenuation", bool, False, "Reckon without the attenuation of the run",
+            needs=(_METHOD_OF_COUNTS,)),
+    Setting("reconstruction.ignore_blur", bool, False, "Reckon without the detector's own blur: no recovery of it",
+            needs=(_METHOD_OF_COUNTS,), label="Ignore Detector Blur"),
+    Setting("reconstruction.background", float, 0.0, "Counts expected in each pixel besides those of the volume, such as "
+            "scatter", least=0, slider=100, needs=(_methods("background"),)),
+    Setting("reconstruction.prior", str, None, "Penalty on noise", "none", needs=(_methods("prior"),),
+            words={prior.name: (prior.label, prior.text) for prior in PRIORS.values()}),
+    Setting("reconstruction.weight", float, None, "How much the penalty counts beside the data", above=0, slider=1,
+            needs=("reconstruction.prior",)),
+    Setting("reconstruction.gamma", float, 2.0, "How much large differences are spared", least=0, slider=10,
+            needs=(_priors("gamma"),)),
+    Setting("reconstruction.edge", float, None, "Value below which differences count as noise", "what suits the penalty",
+            above=0, slider=10, needs=(_priors("edge"),)),
+    Setting("reconstruction.anatomy", str, None, "Volume across whose edges differences are not penalised, such as a CT",
+            is_path=True, needs=("reconstruction.prior",)),
+    Setting("reconstruction.stop_change", float, None, "End when an iteration changes the objective by less than this share "
+            "of it, such as 1e-5", "all iterations are done", above=0, slider=0.01),
+    Setting("reconstruction.stop_noise", float, None, "End when the standard deviation in the region is this share of its "
+            "mean", above=0, slider=1, needs=("reconstruction.stop_region",)),
+    Setting("reconstruction.stop_region", float, None, "Ball of even activity in which noise is measured: x y z radius",
+            unit="mm", sizes=(4,), needs=("reconstruction.stop_noise",)),
+    Setting("reconstruction.stop_seconds", float, None, "End after so much time", unit="s", above=0, slider=3600),
     Setting("compute.backend", str, "auto", "What computes the line integrals", words={
         "auto": ("Automatic", "The fastest that works here"), **{b.name: (b.label, b.text) for b in BACKENDS.values()},
     }),

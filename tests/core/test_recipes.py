@@ -234,8 +234,10 @@ def test_every_argument_of_a_model_is_a_setting():
     names -= {"system", "mu", "photons_per_decay"}  # the recipe has tables of the first two; the isotope says the third
     declared = {key.removeprefix("model.").removesuffix("_degrees") for key in SETTINGS if key.startswith("model.")}
     assert names == declared - {"kind", "photons"}
-    options = [setting.option for setting in SETTINGS.values()]
-    assert len(set(options)) == len(options)
+    of_reconstruct = [key.startswith("reconstruction.") for key in SETTINGS]
+    for is_reconstruct in (False, True):  # each command has options of its own
+        options = [s.option for s, own in zip(SETTINGS.values(), of_reconstruct, strict=True) if own == is_reconstruct]
+        assert len(set(options)) == len(options)
 
 
 def test_counts_beside_the_crystal_are_said(system):

@@ -1,0 +1,158 @@
+"""``mphdrr reconstruct RUN -o volume.nii.gz``: from a run's images back to a volume."""
+
+import argparse
+import signal
+import sys
+import time
+from collections.abc import Sequence
+from typing import Any
+
+from ..errors import InputError
+from ..figures.page import SUFFIXES, Page
+from ..figures.reconstructions import SIZE, SIZE_BESIDE_TRUTH, draw
+from ..progress import Cancelled, Progress
+from ..reconstruction.files import read_reconstruction, write_reconstruction
+from ..reconstruction.methods import METHODS
+from ..reconstruction.result import Reconstruction
+from ..runs.files import FORMATS, read_run
+from ..runs.recipe import Recipe, read_recipe, write_recipe
+from ..runs.reconstructing import TABLES, recipe_of, reconstruct_run
+from ..runs.run import ProjectionRun
+from ..runs.settings import SETTINGS
+from ..volumes.volume import Volume
+from ..volumes.volume_files import VOLUME_FORMATS, read_volume, write_volume
+from .options import add_command, output_path, progress_bar
+from .recipe_options import add_entries, add_setting, typed_entries
+
+_OTHERS = ("attenuation.file", "attenuation.energy", "compute.backend", "compute.threads")
+"""Settings that are options beside those of the reconstruction."""
+
+
+def add_parser(subparsers) -> None:  # type: ignore[no-untyped-def]
+    """Add the command."""
+    parser = add_command(
+        subparsers,
+        "reconstruct",
+        "reconstruct the volume that a run's images are of",
+        "mphdrr reconstruct run.h5 --iterations 20 --subsets 16 --voxels 64 --spacing 1.6 -o volume.nii.gz --picture "
+        "slices.png\n"
+        "example: mphdrr reconstruct run.h5 --recipe study.toml -o volume.nii.gz\n"
+        "example: mphdrr reconstruct run.h5 --set model.intrinsic_fwhm=3 -o volume.nii.gz",
+    )
+    parser.add_argument("file", metavar="RUN", help=f"a run of mphDRR: {', '.join(FORMATS)}")
+    text = f"recipe (.toml) whose tables {', '.join(f'[{table}]' for table in TABLES)} say how; options override it"
+    parser.add_argument("--recipe", metavar="FILE", help=text)
+    for setting in SETTINGS.values():
+        if setting.key.startswith("reconstruction.") or setting.key in _OTHERS:
+            add_setting(parser, setting)
+    add_entries(parser, "model.intrinsic_fwhm=3")
+    text = "begin with this volume, on the same voxels, instead of 1 everywhere"
+    start = parser.add_mutually_exclusive_group()
+    start.add_argument("--start", metavar="FILE", help=text)
+    text = "go on where the reconstruction in this file ended: the iterations are done in addition"
+    start.add_argument("--resume", metavar="H5", help=text)
+    text = "keep all that is needed to resume; where Ctrl-C ends the reconstruction, too"
+    parser.add_argument("--save-state", metavar="H5", help=text)
+    parser.add_argument("-o", "--output", metavar="FILE", help=f"the volume: {', '.join(VOLUME_FORMATS)}")
+    text = f"also draw slices and the objective ({', '.join(SUFFIXES)}), of a simulated run beside the truth"
+    parser.add_argument("--picture", metavar="FILE", help=text)
+    parser.add_argument("--quiet", action="store_true", help="no line for each iteration on standard error")
+    text = "write the recipe (.toml) of these options instead of reconstructing"
+    parser.add_argument("--write-recipe", metavar="FILE", help=text)
+    parser.set_defaults(run=_run)
+
+
+def _chosen(arguments: argparse.Namespace, run: ProjectionRun) -> Recipe:
+    recipe = recipe_of(run, None if arguments.recipe is None else read_recipe(arguments.recipe))
+    changes = typed_entries(arguments)
+    for key in changes:
+        if key.partition(".")[0] not in TABLES:
+            raise InputError(f"--set {key}: expected an entry of {', '.join(f'[{table}]' for table in TABLES)}")
+    if changes.get("attenuation.file") is not None:  # instead of what attenuated in the run
+        changes = {"attenuation.of_phantom": None, "attenuation.object": None} | changes
+    return recipe.updated(changes)
+
+
+def _run(arguments: argparse.Namespace) -> None:
+    if arguments.write_recipe:
+        path = output_path(arguments.write_recipe, (".toml",))
+        write_recipe(_chosen(arguments, read_run(arguments.file)), path)
+        print(path)
+        return
+    if not arguments.output and not arguments.picture:
+        raise InputError("nothing to write: give --output FILE, --picture FILE or --write-recipe FILE")
+    path = output_path(arguments.output, VOLUME_FORMATS) if arguments.output else None
+    picture = output_path(arguments.picture, SUFFIXES) if arguments.picture else None
+    state = output_path(arguments.save_state, (".h5", ".hdf5")) if arguments.save_state else None
+    run = read_run(arguments.file)
+    recipe = _chosen(arguments, run)
+    start: Volume | Reconstruction | None = None
+    if arguments.start is not None:
+        start = read_volume(arguments.start, "activity" if run.volume is None else run.volume.quantity)
+    elif arguments.resume is not None:
+        start = read_reconstruction(arguments.resume)
+    log = _Log(recipe, arguments.quiet, start)
+    usual = signal.signal(signal.SIGINT, log.interrupt) if state is not None else None
+    try:
+        found = reconstruct_run(run, recipe, start=start, watch=log, stages=log.stage)
+    except Cancelled as cancelled:
+        if state is not None and cancelled.reconstruction is not None:
+            write_reconstruction(cancelled.reconstruction, state)
+            done = cancelled.reconstruction.iterations
+            sys.stderr.write(f"mphdrr: {state}: iterations done: {done}; --resume goes on\n")
+        raise
+    finally:
+        if usual is not None:
+            signal.signal(signal.SIGINT, usual)
+    if state is not None:
+        write_reconstruction(found, state)
+    if path is not None:
+        write_volume(found.volume, path)
+    method = METHODS[recipe["reconstruction.method"]]
+    if picture is not None:
+        page = Page(*(SIZE if run.volume is None else SIZE_BESIDE_TRUTH))
+        draw(page, found.volume, found.objective.tolist(), run.volume, f"{method.label} of {arguments.file}",
+             [settings_line(found.iterations, recipe)], method.objective)  # fmt: skip
+        page.write(picture)
+    voxels = " x ".join(map(str, found.volume.grid.shape))
+    largest = f"largest {float(found.volume.array.max()):.4g} {found.volume.unit}"
+    print(f"{path or picture}: {method.label}, {settings_line(found.iterations, recipe)}, {voxels} voxels, {largest}")
+
+
+def settings_line(iterations: int, recipe: Recipe) -> str:
+    """What a picture says of a reconstruction."""
+    said = [f"{iterations} iteration{'s' * (iterations > 1)}"]
+    if recipe["reconstruction.subsets"] is not None:
+        said.append(f"{recipe['reconstruction.subsets']} subsets")
+    return ", ".join(said)
+
+
+class _Log:
+    """A line on standard error after each iteration; before the first, the stages' bars."""
+
+    def __init__(self, recipe: Recipe, quiet: bool, start: Any) -> None:
+        before = start.iterations if isinstance(start, Reconstruction) else 0
+        self.total, self.quiet = before + recipe["reconstruction.iterations"], quiet
+        self.name = METHODS[recipe["reconstruction.method"]].objective
+        self.begun, self.interrupted = time.monotonic(), False
+
+    def stage(self, words: str) -> Progress | None:
+        if words != "reconstructing":
+            return progress_bar(words)
+        self.begun = time.monotonic()
+        return self._check
+
+    def interrupt(self, *_: Any) -> None:
+        """Ctrl-C was typed: stop after the update that is being made."""
+        self.interrupted = True
+
+    def _check(self, done: int, total: int) -> None:
+        if self.interrupted:
+            raise Cancelled
+
+    def __call__(self, iteration: int, values: Any, objective: Sequence[float]) -> None:
+        if not self.quiet:
+            seconds = time.monotonic() - self.begun
+            said = f"{self.name} {objective[-1]:.8g}, largest {float(values.max()):.4g}, {seconds:.1f} s"
+            sys.stderr.write(f"iteration {iteration} of {self.total}: {said}\n")
+            sys.stderr.flush()

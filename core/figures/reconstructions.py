@@ -1,0 +1,142 @@
+"""A reconstruction as a picture: three slices, beside those of the truth where it is known, and the objective."""
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from ..geometry.grid import Grid
+from ..runs.display import Display
+from ..volumes.resampling import resample
+from ..volumes.volume import Volume
+from .page import Page, Point, box
+from .parts import FAINT, INK, bar_width, color_bar, heading, number, ticks
+
+SIZE, SIZE_BESIDE_TRUTH = (1600, 500), (1600, 850)
+"""Width and height, pixels, that suit a reconstruction alone, and one beside the truth."""
+
+# The axis across a slice, and those to the right and upward: seen from the head, from the front and from the left.
+_SLICES = ((2, 0, 1), (1, 0, 2), (0, 1, 2))
+_NAMES = "xyz"
+_CURVE = "#c8442b"
+_PLOT = 0.27  # of the page's width
+
+
+def draw(
+    page: Page,
+    volume: Volume,
+    objective: Sequence[float] = (),
+    truth: Volume | None = None,
+    title: str = "Reconstruction",
+    lines: Sequence[str] = (),
+    objective_name: str = "log-likelihood",
+) -> None:
+    """Draw slices through the middle of a volume, in the same colours those of `truth`, and the objective by iteration.
+
+    The truth is drawn on the reconstruction's voxels, as the mean over each. The volume's axes are along the world's.
+    """
+    em = page.em
+    top = heading(page, title, lines) + round(0.6 * em)
+    rows = [("Reconstruction", volume)] + ([] if truth is None else [("Truth", truth)])
+    pictures = [[_slice(each, volume.grid, axis) for axis, _, _ in _SLICES] for _, each in rows]
+    display = Display(colors="inferno" if volume.quantity == "activity" else "grey")
+    # A hot voxel of the reconstruction must not darken all others: the truth says how bright things are.
+    window = display.window(np.concatenate([picture.ravel() for picture in pictures[-1]]))
+    extent = volume.grid.spacing * volume.grid.shape
+    gap, left = 0.8 * em, 2.6 * em
+    bar = bar_width(page, display, window, volume.unit)
+    right = page.width * (1 - _PLOT if len(objective) else 1) - bar - 3.0 * em
+    height = (page.height - top - 0.6 * em) / len(rows) - 1.9 * em
+    pixels = (right - left - 2 * gap) / sum(extent[across] for _, across, _ in _SLICES)
+    pixels = max(min(pixels, height / max(extent[up] for _, _, up in _SLICES)), 1e-9)
+    y = float(top)
+    for (name, _), row in zip(rows, pictures, strict=True):
+        tall = max(extent[up] for _, _, up in _SLICES) * pixels
+        page.text(name, 1.5 * em, y + 1.5 * em + tall / 2, em, INK, "middle", upward=True)
+        x = left
+        for (axis, across, up), picture in zip(_SLICES, row, strict=True):
+            shape = max(1, round(extent[across] * pixels)), max(1, round(extent[up] * pixels))
+            place = round(x), round(y + 1.5 * em + (tall - extent[up] * pixels) / 2)
+            at = (
+                volume.grid.center[axis]
+                + (volume.grid.shape[axis] // 2 - (volume.grid.shape[axis] - 1) / 2) * (volume.grid.spacing[axis])
+            )
+            text = f"{_NAMES[across]} {_NAMES[up]},  {_NAMES[axis]} = {number(round(float(at), 2) + 0.0)} mm"
+            page.text(text, x + shape[0] / 2, y + 1.1 * em, 0.9 * em, FAINT, "middle")
+            page.image(display.colored(picture.T[::-1], window), *place, *shape)
+            x += extent[across] * pixels + gap
+        y += tall + 1.9 * em
+    _scale_bar(page, pixels, float(extent[0]), left + 0.6 * em, y - 1.0 * em)
+    first = round(top + 1.5 * em)
+    color_bar(page, display, window, volume.unit, round(x + 0.4 * em), first, max(2, round(y - 0.4 * em) - first))
+    if len(objective):
+        plot_left = x + bar + 7.5 * em
+        plot = (
+            plot_left,
+            top + 1.5 * em,
+            page.width - plot_left - 1.5 * em,
+            min(0.45 * page.width * _PLOT * 2, y - top - 4.5 * em),
+        )
+        draw_objective(page, objective, plot, objective_name)
+
+
+def draw_objective(
+    page: Page,
+    objective: ArrayLike,
+    place: tuple[float, float, float, float],
+    name: str = "",
+    color: str = _CURVE,
+    ink: str = INK,
+) -> None:
+    """Draw the objective by iteration into (left, top, width, height), with axes where it has a name."""
+    values = np.asarray(objective, float)
+    left, top, width, height = place
+    em = page.em
+    low, high = float(values.min()), float(values.max())
+    spread = (high - low) or abs(high) or 1.0
+    low, high = low - 0.06 * spread, high + 0.06 * spread
+    last = max(len(values), 2)
+
+    def at(iteration: float, value: float) -> Point:
+        return left + width * (iteration - 1) / (last - 1), top + height * (high - value) / (high - low)
+
+    page.line([*box(left, top, width, height), (left, top)], ink, 0.06 * em)
+    points = [at(i, value) for i, value in enumerate(values, 1)]
+    if len(points) > 1:
+        page.line(points, color, 0.16 * em)
+    for x, y in points if len(points) <= 30 else points[-1:]:
+        r = 0.22 * em
+        page.area([(x - r, y), (x, y - r), (x + r, y), (x, y + r)], color)
+    if not name:
+        return
+    size = 0.85 * em
+    for value in ticks(low, high, 5):
+        y = at(1, value)[1]
+        page.line([(left - 0.3 * em, y), (left, y)], ink, 0.06 * em)
+        page.text(number(value), left - 0.5 * em, y + 0.3 * em, size, ink, "end")
+    for value in ticks(1, last, 6):
+        if value == round(value):
+            x = at(value, low)[0]
+            page.line([(x, top + height), (x, top + height + 0.3 * em)], ink, 0.06 * em)
+            page.text(number(value), x, top + height + 1.3 * em, size, ink, "middle")
+    page.text(name[:1].upper() + name[1:], left + width / 2, top - 0.5 * em, em, ink, "middle")
+    page.text("iteration", left + width / 2, top + height + 2.6 * em, size, ink, "middle")
+
+
+def _slice(volume: Volume, grid: Grid, axis: int) -> NDArray[np.float32]:
+    """The middle slice of a grid across one of its axes, of a volume on any grid."""
+    index = grid.shape[axis] // 2
+    shape = [*grid.shape]
+    shape[axis] = 1
+    affine = grid.affine.copy()
+    affine[:3, 3] += index * grid.affine[:3, axis]
+    plane = Grid((shape[0], shape[1], shape[2]), affine)
+    values = volume.array.take([index], axis) if volume.grid is grid else resample(volume, plane, "mean").array
+    return np.asarray(values.squeeze(axis), np.float32)
+
+
+def _scale_bar(page: Page, pixels: float, extent: float, left: float, bottom: float) -> None:
+    """A bar of a round length, about a quarter of a slice, over its lower left corner."""
+    length = [step for step in (1, 2, 5, 10, 20, 50, 100, 200, 500) if step <= max(1.0, extent / 4)][-1]
+    page.line([(left, bottom), (left + length * pixels, bottom)], "#ffffff", 0.16 * page.em)
+    page.text(f"{length} mm", left, bottom - 0.4 * page.em, 0.85 * page.em, "#ffffff")

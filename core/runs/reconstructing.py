@@ -1,0 +1,227 @@
+"""From a run's images back to a volume: the job of ``mphdrr reconstruct`` and of Blender's Reconstruction panel."""
+
+import warnings
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..errors import InputError, InputWarning
+from ..geometry.grid import Grid
+from ..memory import require
+from ..progress import Stages
+from ..reconstruction.methods import METHODS, PRIORS
+from ..reconstruction.priors import Prior
+from ..reconstruction.result import Reconstruction
+from ..reconstruction.stopping import StopWhen
+from ..volumes.resampling import resample
+from ..volumes.volume import Volume
+from ..volumes.volume_files import read_volume
+from .recipe import Recipe
+from .run import ProjectionRun
+from .run_recipe import projector_of_run
+
+Watch = Callable[[int, NDArray[Any], Sequence[float]], bool | None]
+"""Called as ``watch(iteration, values, objective)`` after each iteration, with the volume's values and the objective after
+all iterations so far; what is true ends the reconstruction there."""
+
+_ALONG = ((-1, 1, 1), (1, -1, 1), (1, 1, -1))
+_POINTS = 7
+"""Of the hole: enough for its blur, and few enough for an iteration in a fraction of a second."""
+
+TABLES = ("reconstruction", "model", "attenuation", "compute")
+"""Of a recipe: what says how a run is reconstructed. The other tables say how its images were made."""
+
+
+def reconstruct_run(
+    run: ProjectionRun,
+    recipe: Recipe | None = None,
+    mu: Volume | None = None,
+    start: Volume | Reconstruction | None = None,
+    watch: Watch | None = None,
+    stages: Stages = lambda stage: None,
+) -> Reconstruction:
+    """Reconstruct the volume that the images of a run are of.
+
+    Parameters
+    ----------
+    run : ProjectionRun
+        Simulated or measured, with a recipe.
+    recipe : Recipe
+        Its tables `TABLES` say how; by default the run's own. What is modelled is what made the run, unless the settings of
+        the reconstruction say otherwise: fewer points of the hole, no attenuation, no blur.
+    mu : Volume
+        What attenuates, instead of what the recipe says.
+    start : Volume or Reconstruction
+        Begin with this volume, on the same grid; a reconstruction by the same method goes on.
+    watch : callable
+        See `Watch`.
+    stages
+        Begins each stage: reading, voxelizing, reconstructing.
+
+    Returns
+    -------
+    Reconstruction
+        Its settings hold the recipe, too.
+
+    Raises
+    ------
+    InputError
+        The run holds no recipe, the method needs other images than it has, its attenuation cannot be made again, or memory
+        does not suffice.
+
+    Warns
+    -----
+    InputWarning
+        The images were made from voxels that are not at least twice as fine as those of the reconstruction, or with no more
+        points of the hole: model and data then share errors that a real scanner's data does not have.
+    """
+    recipe = recipe_of(run, recipe)
+    method = METHODS[recipe["reconstruction.method"]]
+    is_counts = recipe["model.kind"] == "emission"
+    if method.of_counts and not is_counts:
+        others = ", ".join(other.name for other in METHODS.values() if not other.of_counts)
+        also = f"; for these images: {others}" if others else ""
+        raise InputError(f"reconstruction.method: {method.name} needs a run of counts, not of line integrals{also}")
+    grid = reconstruction_grid(run, recipe)
+    require(16.0 * grid.n_voxels, "a reconstruction of {} x {} x {} voxels".format(*grid.shape))
+    modelled = model_of(recipe)
+    _warn_if_flattering(run, grid, modelled)
+    if recipe["reconstruction.ignore_attenuation"]:
+        mu = None
+    A = projector_of_run(run, grid, mu, modelled, recipe["compute.backend"], recipe["compute.threads"], stages)
+    given: dict[str, Any] = {name: recipe[f"reconstruction.{name}"] for name in method.takes}
+    if "prior" in method.takes:
+        given["prior"] = _prior(recipe, grid, stages)
+    rules = _rules(recipe, grid)
+    found = method.function(
+        A,
+        line_integrals(run, recipe),
+        recipe["reconstruction.iterations"],
+        start=start,
+        stop=rules if watch is None else _Watched(watch, rules),
+        progress=stages("reconstructing"),
+        **given,
+    )
+    volume = found.volume
+    if run.volume is not None:  # a radiograph's is not of activity
+        volume = Volume(volume.array, grid, run.volume.quantity)
+    return replace(found, volume=volume, settings={**found.settings, "recipe": recipe.tables()})
+
+
+class _Watched(StopWhen):
+    """The user's rules and a watcher: of all that a reconstruction calls, its rules alone are told the objective."""
+
+    def __init__(self, watch: Watch, rules: StopWhen | None) -> None:
+        object.__setattr__(self, "_watch", watch)
+        object.__setattr__(self, "_rules", rules)
+
+    def check(self, shape: tuple[int, ...]) -> None:
+        if self._rules is not None:
+            self._rules.check(shape)
+
+    def reason(self, objective: Sequence[float], values: NDArray[Any], seconds: float) -> str | None:
+        if self._watch(len(objective), values, objective):
+            return "watch"
+        return None if self._rules is None else self._rules.reason(objective, values, seconds)
+
+
+def _prior(recipe: Recipe, grid: Grid, stages: Stages) -> Prior | None:
+    if recipe["reconstruction.prior"] is None:
+        return None
+    kind, weight = PRIORS[recipe["reconstruction.prior"]], recipe["reconstruction.weight"]
+    if weight is None:
+        raise InputError(
+            f"reconstruction.weight (--weight): missing; say how much the {kind.label.lower()} prior counts"
+        )
+    given = {name: recipe[f"reconstruction.{name}"] for name in kind.takes}
+    anatomy = recipe["reconstruction.anatomy"]
+    if anatomy is not None:
+        given["anatomy"] = resample(read_volume(anatomy, progress=stages("reading")), grid)
+    return kind.prior(weight, **{name: value for name, value in given.items() if value is not None})
+
+
+def _rules(recipe: Recipe, grid: Grid) -> StopWhen | None:
+    given = {name: recipe[f"reconstruction.stop_{name}"] for name in ("change", "noise", "seconds")}
+    if all(value is None for value in given.values()):
+        return None
+    region = None
+    if recipe["reconstruction.stop_region"] is not None:
+        *middle, radius = recipe["reconstruction.stop_region"]
+        axes = [
+            origin + spacing * np.arange(n) - center
+            for origin, spacing, n, center in zip(grid.affine[:3, 3], grid.spacing, grid.shape, middle, strict=True)
+        ]
+        region = sum(np.square(axis).reshape(shape) for axis, shape in zip(axes, _ALONG, strict=True)) <= radius**2
+    return StopWhen(**given, region=region)
+
+
+def recipe_of(run: ProjectionRun, recipe: Recipe | None = None) -> Recipe:
+    """The run's recipe, where `recipe` does not say how to reconstruct, in `TABLES`, otherwise."""
+    if recipe is None:
+        return run.recipe
+    return run.recipe.updated({key: value for key, value in recipe.given.items() if key.partition(".")[0] in TABLES})
+
+
+def reconstruction_grid(run: ProjectionRun, recipe: Recipe) -> Grid:
+    """The voxels that a recipe asks for: by default a cube around the run's ROI, of 64 voxels along each side."""
+    n_x, n_y, n_z = np.broadcast_to(recipe["reconstruction.voxels"], 3).tolist()
+    spacing = recipe["reconstruction.spacing"] or 2 * float(run.system.roi_radius.max()) / np.array([n_x, n_y, n_z])
+    return Grid.centered((n_x, n_y, n_z), np.broadcast_to(spacing, 3), recipe["reconstruction.center"])
+
+
+def model_of(recipe: Recipe) -> Recipe:
+    """The recipe of the model that a reconstruction reckons with."""
+    if recipe["model.kind"] != "emission":
+        return recipe
+    points = recipe["reconstruction.aperture_points"]
+    if points is None:
+        points = _POINTS if recipe["model.aperture_tolerance"] else min(_POINTS, recipe["model.aperture_points"])
+    changes: dict[str, Any] = {
+        "model.aperture_points": points,
+        "model.aperture_tolerance": None,
+        "model.pixel_points": recipe["reconstruction.pixel_points"],
+        # The tolerance is for images of single voxels; neighbours make up for each other's errors.
+        "model.tolerance": 1e9,
+    }
+    if recipe["reconstruction.ignore_blur"]:
+        changes["model.intrinsic_fwhm"] = None
+    if recipe["reconstruction.ignore_attenuation"]:
+        changes |= {key: None for key in recipe.given if key.startswith("attenuation.")}
+    return recipe.updated(changes)
+
+
+def line_integrals(run: ProjectionRun, recipe: Recipe) -> NDArray[np.float32]:
+    """What a run's pixels say of its volume linearly: counts as they are, of photons that pass the line integrals.
+
+    Where no photon has passed, half a photon is taken for it.
+    """
+    photons = recipe["model.photons"]
+    if photons is None:
+        return run.projections
+    return np.asarray(np.log(photons / np.maximum(run.projections, 0.5)), np.float32)
+
+
+def _warn_if_flattering(run: ProjectionRun, grid: Grid, model: Recipe) -> None:
+    """Warn where a run was simulated with a model that is hardly better than that of the reconstruction."""
+    if run.volume is None:  # measured
+        return
+    made = run.recipe
+    fine, coarse = float(run.volume.grid.spacing.max()), float(grid.spacing.min())
+    if 2 * fine > 1.001 * coarse:
+        _warn(
+            f"the run was made from voxels of {fine:.3g} mm: figures of a reconstruction in voxels of {coarse:.3g} mm "
+            f"flatter, unless its voxels are {coarse / 2:.3g} mm or less"
+        )
+    points = "model.aperture_points"
+    if made["model.aperture_tolerance"] is None and 1 < made[points] <= model[points]:
+        _warn(
+            f"the run was made with {made[points]} points of the hole, and the reconstruction reckons with {model[points]}: "
+            "its figures flatter, unless the run has more points"
+        )
+
+
+def _warn(text: str) -> None:
+    warnings.warn(text, InputWarning, stacklevel=4)

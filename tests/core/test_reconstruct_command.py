@@ -1,0 +1,218 @@
+"""``mphdrr reconstruct``: options, recipes and Python do the same; what is logged, drawn, kept and refused."""
+
+from __future__ import annotations
+
+import re
+
+import numpy as np
+import pytest
+from PIL import Image
+
+import mphdrr.core as mph
+from mphdrr.addon.cli import main
+from mphdrr.core.cli.reconstruct import settings_line
+from mphdrr.core.figures.page import Page
+from mphdrr.core.figures.reconstructions import draw
+from mphdrr.core.reconstruction.methods import METHODS
+from mphdrr.core.runs.reconstructing import model_of, reconstruction_grid
+
+COUNTS = {"model.kind": "emission", "model.time": 600.0, "model.aperture_points": 9, "model.intrinsic_fwhm": 1.0,
+          "model.pixel_points": 2, "model.tolerance": 9.0, "detector.rows": 16, "detector.columns": 16,
+          "detector.plane": "real", "phantom.kind": "derenzo", "phantom.voxels": 36, "phantom.spacing": 2.5}  # fmt: skip
+SMALL = ["--voxels", "20", "--spacing", "5", "--iterations", "3"]
+
+
+@pytest.fixture(scope="module")
+def run(scanner) -> mph.ProjectionRun:
+    (run,) = mph.run_recipe(mph.Recipe(COUNTS), scanner[::8])
+    return run
+
+
+@pytest.fixture
+def file(run, tmp_path) -> str:
+    mph.write_run(run, tmp_path / "run.npz")
+    return str(tmp_path / "run.npz")
+
+
+def command(*words: object, said: str = "") -> None:
+    assert main(["reconstruct", *map(str, words)]) == 0, said
+
+
+def refused(capsys, *words: object) -> str:
+    assert main(["reconstruct", *map(str, words)]) == 1
+    text = capsys.readouterr().err
+    (line,) = [line for line in text.splitlines() if not line.startswith(("mphdrr: warning", "iteration"))]
+    return line
+
+
+def test_the_command_does_what_python_does_and_logs_each_iteration(run, file, tmp_path, capsys):
+    output = tmp_path / "new" / "v.nii.gz"
+    command(file, *SMALL, "--subsets", "4", "-o", output)
+    printed = capsys.readouterr()
+    lines = [line for line in printed.err.splitlines() if line.startswith("iteration")]
+    found = mph.read_volume(output)
+    A = mph.projector_of_run(run, found.grid, recipe=run.recipe.updated(
+        {"model.aperture_points": 7, "model.pixel_points": 1, "model.tolerance": 1e9}))  # fmt: skip
+    expected = mph.osem(A, run.projections, 3, subsets=4)
+    np.testing.assert_allclose(found.array, expected.volume.array, rtol=1e-5, atol=1e-5)
+    assert found.quantity == "activity" and found.grid == mph.Grid.centered(20, 5.0)
+    logged = [float(re.search(r"log-likelihood ([\d.e+-]+),", line)[1]) for line in lines]
+    assert len(lines) == 3 and lines[2].startswith("iteration 3 of 3: ")
+    np.testing.assert_allclose(logged, expected.objective, rtol=1e-6)
+    assert printed.out.startswith(f"{output}: OSEM, 3 iterations, 4 subsets, 20 x 20 x 20 voxels, largest ")
+
+
+def test_a_recipe_says_how_and_options_override_it(run, file, tmp_path, capsys):
+    recipe = tmp_path / "how.toml"
+    recipe.write_text('[reconstruction]\nmethod = "mlem"\niterations = 2\nvoxels = [20]\nspacing = [5.0]\n'
+                      "[detector]\nrows = 3\n")  # fmt: skip
+    one, two, three, again = (tmp_path / f"{name}.npz" for name in ("one", "two", "three", "again"))
+    command(file, "--recipe", recipe, "--quiet", "-o", one)
+    assert "iteration" not in capsys.readouterr().err.replace("reconstruction", "")
+    command(file, *SMALL, "--method", "mlem", "--iterations", "2", "-o", two)
+    command(file, "--recipe", recipe, "--method", "osem", "--subsets", "4", "--write-recipe", tmp_path / "all.toml")
+    command(file, "--recipe", tmp_path / "all.toml", "-o", three)
+    command(file, *SMALL, "--iterations", "2", "--subsets", "4", "-o", again)
+    volumes = [mph.read_volume(path).array for path in (one, two, three, again)]
+    np.testing.assert_array_equal(volumes[0], volumes[1])
+    np.testing.assert_array_equal(volumes[2], volumes[3])
+    assert not np.allclose(volumes[0], volumes[2])
+    result = mph.reconstruct_run(run, mph.read_recipe(recipe))
+    np.testing.assert_allclose(result.volume.array, volumes[0], rtol=1e-6)
+    assert result.settings["recipe"]["reconstruction"]["method"] == "mlem" and result.iterations == 2
+
+
+def test_a_kept_state_goes_on_as_without_a_break(file, tmp_path, capsys):
+    pytest.importorskip("h5py")
+    small = ["--voxels", "20", "--spacing", "5", "--subsets", "4"]
+    command(file, *small, "--iterations", "4", "-o", tmp_path / "whole.npz")
+    command(file, *small, "--iterations", "1", "-o", tmp_path / "half.npz", "--save-state", tmp_path / "s.h5")
+    capsys.readouterr()
+    command(file, *small, "--iterations", "3", "-o", tmp_path / "rest.npz", "--resume", tmp_path / "s.h5")
+    assert "iteration 2 of 4: " in capsys.readouterr().err
+    whole, rest = (mph.read_volume(tmp_path / f"{name}.npz").array for name in ("whole", "rest"))
+    np.testing.assert_array_equal(rest, whole)
+
+
+def test_stopping_and_watching(run):
+    how = {"reconstruction.voxels": 16, "reconstruction.spacing": 6, "reconstruction.iterations": 6}
+    seen = []
+
+    def watch(iteration, values, objective):
+        seen.append((iteration, float(values.max()), len(objective)))
+        return iteration == 2
+
+    assert mph.reconstruct_run(run, mph.Recipe(how), watch=watch).iterations == 2
+    assert [(iteration, count) for iteration, _, count in seen] == [(1, 1), (2, 2)]
+    easy = mph.reconstruct_run(run, mph.Recipe(how | {"reconstruction.stop_change": 0.5}))
+    assert easy.iterations == 2 and easy.settings["stopped"] == "change"
+    noisy = how | {"reconstruction.stop_noise": 1e-6, "reconstruction.stop_region": (0, 0, 0, 20)}
+    assert mph.reconstruct_run(run, mph.Recipe(noisy), watch=lambda *_: None).settings["stopped"] == "noise"
+
+
+def test_a_prior_makes_it_smoother(run):
+    how = {"reconstruction.voxels": 20, "reconstruction.spacing": 5, "reconstruction.iterations": 4}
+    smooth = how | {"reconstruction.prior": "relative-difference", "reconstruction.weight": 0.5}
+    plain, found = (mph.reconstruct_run(run, mph.Recipe(entries)).volume.array for entries in (how, smooth))
+
+    def roughness(array):
+        return np.abs(np.diff(array, axis=0)).sum() / array.sum()
+
+    assert roughness(found) < 0.9 * roughness(plain)
+
+
+def test_voxels_cover_the_roi_and_the_model_is_that_of_the_run_or_simpler(run):
+    grid = reconstruction_grid(run, run.recipe)
+    assert grid.shape == (64, 64, 64)
+    np.testing.assert_allclose(grid.spacing * 64, 2 * run.system.roi_radius.max())
+    assert model_of(run.recipe)["model.aperture_points"] == 7 and model_of(run.recipe)["model.intrinsic_fwhm"] == 1.0
+    other = run.recipe.updated({"reconstruction.aperture_points": 1, "reconstruction.ignore_blur": True})
+    assert model_of(other)["model.aperture_points"] == 1 and model_of(other)["model.intrinsic_fwhm"] == 0
+    few = run.recipe.updated({"model.aperture_points": 3})
+    assert model_of(few)["model.aperture_points"] == 3
+    centre = reconstruction_grid(run, run.recipe.updated({"reconstruction.center": (1, 2, 3)})).center
+    np.testing.assert_allclose(centre, (1, 2, 3))
+
+
+def test_data_of_the_model_itself_are_warned_of(run, file, tmp_path, capsys):
+    command(file, *SMALL, "--spacing", "4", "--aperture-points", "9", "-o", tmp_path / "v.npz")
+    said = capsys.readouterr().err
+    assert "made from voxels of 2.5 mm" in said and "2 mm or less" in said and "9 points of the hole" in said
+    command(file, *SMALL, "-o", tmp_path / "v.npz")
+    assert "warning" not in capsys.readouterr().err
+
+
+def test_the_attenuation_of_the_run_is_modelled_unless_it_is_to_be_ignored(scanner):
+    water = {"phantom.cylinder_radius": 45.0, "phantom.cylinder_height": 60.0, "attenuation.of_phantom": True,
+             "phantom.voxels": 20, "phantom.spacing": 5.0, "detector.rows": 8, "detector.columns": 8}  # fmt: skip
+    (run,) = mph.run_recipe(mph.Recipe(COUNTS | water), scanner[::8])
+    how = {"reconstruction.voxels": 12, "reconstruction.spacing": 8, "reconstruction.iterations": 3}
+    totals = [
+        mph.reconstruct_run(run, mph.Recipe(how | more)).volume.array.sum()
+        for more in ({}, {"reconstruction.ignore_attenuation": True})
+    ]
+    assert totals[1] < 0.8 * totals[0]
+
+
+def test_the_picture_shows_slices_beside_the_truth_and_the_objective(run, file, tmp_path, capsys):
+    command(file, *SMALL, "--picture", tmp_path / "p.png")
+    with Image.open(tmp_path / "p.png") as picture:
+        assert picture.size == (1600, 850)
+    command(file, *SMALL, "--picture", tmp_path / "p.svg")
+    text = (tmp_path / "p.svg").read_text(encoding="utf-8")
+    for words in ("Reconstruction", "Truth", "x y,  z = 2.5 mm", "Log-likelihood", "kBq/mL", "3 iterations", "20 mm"):
+        assert f">{words}<" in text, words
+    assert text.count("<image") == 7  # two rows of slices and a colour bar
+    assert settings_line(1, run.recipe) == "1 iteration"
+
+
+@pytest.mark.parametrize("size", [(240, 240), (1600, 500), (500, 900)])
+def test_slices_lie_on_the_page_and_have_the_right_colours(size):
+    grid = mph.Grid.centered((12, 10, 8), 2.0)
+    array = np.zeros(grid.shape, np.float32)
+    array[9:, :, :] = 50.0
+    page = Page(*size)
+    draw(page, mph.Volume(array, grid, "activity"), [], None)
+    picture = page.picture
+    hot = (np.abs(picture.astype(int) - (252, 255, 164)).max(axis=2) < 8).sum()
+    cold = (picture.max(axis=2) < 6).sum()
+    assert hot > 0 and cold > 0 and hot < cold
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        (["--subsets", "11"], "subsets: expected at most the 10 views, got 11"),
+        (
+            ["--method", "mlem", "--subsets", "4"],
+            "reconstruction.subsets (--subsets) needs reconstruction.method = osem",
+        ),
+        (["--method", "magic"], "reconstruction.method: expected one of osem, mlem"),
+        (["--iterations", "0"], "reconstruction.iterations: expected a whole number of 1 or more"),
+        (["--prior", "quadratic"], "reconstruction.weight (--weight): missing"),
+        (["--weight", "1"], "reconstruction.weight (--weight) needs reconstruction.prior"),
+        (["--background", "-1"], "reconstruction.background: expected a number of 0 or more"),
+        (["--set", "detector.rows=5"], "--set detector.rows: expected an entry of [reconstruction], [model]"),
+        (["--start", "missing.npz"], "missing.npz"),
+        (["--stop-noise", "0.1"], "reconstruction.stop_noise (--stop-noise) needs reconstruction.stop_region"),
+        (["--voxels", "100000"], "memory"),
+        (["--picture", "p.jpg"], "p.jpg: expected a name ending in .png, .svg"),
+    ],
+)
+def test_what_cannot_be_is_refused_in_one_line(options, said, file, tmp_path, capsys):
+    assert said in refused(capsys, file, *options, "-o", tmp_path / "v.npz")
+    assert not (tmp_path / "v.npz").exists()
+
+
+def test_wrong_runs_are_refused(run, file, tmp_path, capsys, scanner):
+    assert "nothing to write" in refused(capsys, file)
+    (radiograph,) = mph.run_recipe(
+        mph.Recipe({"phantom.voxels": 8, "detector.rows": 4, "detector.columns": 4}), scanner[:4]
+    )
+    mph.write_run(radiograph, tmp_path / "drr.npz")
+    said = refused(capsys, tmp_path / "drr.npz", "-o", tmp_path / "v.npz")
+    assert "osem needs a run of counts, not of line integrals" in said
+    bare = mph.project_run(scanner[:4], radiograph.volume, (4, 4))
+    with pytest.raises(mph.InputError, match="holds no recipe"):
+        mph.reconstruct_run(bare)
+    assert set(METHODS) >= {"osem", "mlem"}

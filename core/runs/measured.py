@@ -118,7 +118,8 @@ def counts_run(
         **(settings or {}),
         "recipe": recorded_recipe(Recipe(given)).tables(),
     }
-    return ProjectionRun(images, system, views, unit="counts", settings=record)
+    background = given.get("model.background", 0.0)
+    return ProjectionRun(images, system, views, unit="counts", settings=record, background=background)
 
 
 def recipe_counts(recipe: Recipe, system: PinholeSystem, stages: Stages = lambda stage: None) -> ProjectionRun:

@@ -214,6 +214,9 @@ def test_frames_may_each_lie_their_own_way_and_come_from_several_files(system, m
 def test_a_measured_run_is_reconstructed_as_the_simulated_one(system, measured):
     frames = foreign(measured, system.numbers.tolist(), "front-u")
     run = mph.counts_run(frames, system, system.numbers, "front-u", 600.0, recipe=measured.recipe)
+    assert run.background == 0
+    scattered = measured.recipe.updated({"model.background": 1.5})
+    assert mph.counts_run(frames, system, system.numbers, "front-u", 600, recipe=scattered).background == 1.5
     grid = mph.Grid.centered(6, 20.0)
     found, expected = (mph.mlem(mph.projector_of_run(one, grid), one.projections, 2) for one in (run, measured))
     np.testing.assert_allclose(found.volume.array, expected.volume.array, rtol=1e-6)

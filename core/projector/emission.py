@@ -15,12 +15,12 @@ from ..geometry.collimator import OPENING_ANGLE, edge_slope
 from ..geometry.grid import Grid
 from ..geometry.system import PinholeSystem
 from ..geometry.views import Views
-from ..physics.aperture import KnifeEdge, Opening, openings, paix_diameter, within_cone
+from ..physics.aperture import KnifeEdge, Opening, openings, paix_diameter, throughput, within_cone
 from ..physics.aperture import points_needed as hole_points_needed
 from ..physics.crystal import absorbed_share, gaussian_blur, share_inside
 from ..physics.isotopes import Isotope, isotope
 from ..physics.materials import module_coefficients
-from ..validation import instance, positive, real_array
+from ..validation import instance, positive, real_array, strict_whole
 from ..volumes.volume import Volume, require_quantity
 from .bundles import Beam
 from .depth_response import DepthResponse, DepthResponses
@@ -119,9 +119,8 @@ class Emission(Model):
     within_cone : bool
         Whether rays steeper than the knife edge's cone, psi > alpha / 2, count nothing, with either edge.
     background : float or array (M,) or (M, n_v, n_u)
-        Counts that each pixel is expected to have besides those of the volume, such as scatter and dark counts: in the whole
-        acquisition, so they do not grow with `time`. One number, one for each module, or images. ``A(x)`` is linear and
-        leaves them out; runs add them before noise is drawn (`project_run`), and reconstructions expect them.
+        Counts of each pixel in the whole acquisition besides those of the volume, such as scatter and dark counts. ``A(x)``
+        leaves them out; runs add them before noise is drawn, and reconstructions expect them.
 
     Raises
     ------
@@ -180,7 +179,7 @@ class Emission(Model):
         self._set("intrinsic_fwhm", float(real_array(self.intrinsic_fwhm, "emission: intrinsic_fwhm", ())))
         if self.intrinsic_fwhm < 0:
             raise InputError(f"emission: intrinsic_fwhm must not be negative, got {self.intrinsic_fwhm:g} mm")
-        self._set("aperture_points", _whole(self.aperture_points, "aperture_points", "1, 3 or more"))
+        self._set("aperture_points", strict_whole(self.aperture_points, "emission: aperture_points", "1, 3 or more"))
         if self.aperture_points == 2:
             raise InputError("emission: aperture_points: expected 1, 3 or more, got 2")
         if self.aperture_tolerance is not None and self.aperture_points != 1:
@@ -190,7 +189,7 @@ class Emission(Model):
         if self.edge == "path" and self.aperture_mu is None:
             raise InputError("emission: edge 'path' needs aperture_mu, of the aperture's material")
         self._set("pixel_points", require_points(self.pixel_points, "emission: pixel_points"))
-        self._set("depth_layers", _whole(self.depth_layers, "depth_layers", "1 or more"))
+        self._set("depth_layers", strict_whole(self.depth_layers, "emission: depth_layers", "1 or more"))
         if self.depth_layers > 1 and self.crystal_mu is None:
             raise InputError("emission: depth_layers needs crystal_mu, of the crystal's material")
         for name in ("within_crystal", "within_walls", "within_cone"):
@@ -207,10 +206,7 @@ class Emission(Model):
             (self.mu is not None, "attenuation, mu"),
             (self.edge != "paix", "edge 'path'"),
             (self.depth_layers > 1, "depth_layers"),
-            (
-                self.aperture_points > 1 or self.aperture_tolerance is not None,
-                "points of the hole: it is the whole hole",
-            ),
+            (self.aperture_points > 1 or self.aperture_tolerance is not None, "points of the hole: it is whole"),
         ):
             if given:
                 raise InputError(f"emission: hole 'depth' takes no {what}; use hole 'rays', or leave that out")
@@ -501,19 +497,3 @@ class Emission(Model):
         """Size of a pixel on the crystal, mm along u and v."""
         scale = self._crystal_scale(views, m)
         return scale * float(np.linalg.norm(views.u_steps[m])), scale * float(np.linalg.norm(views.v_steps[m]))
-
-
-def throughput(cosine: ArrayOrTensor, distance: float) -> ArrayOrTensor:
-    """Photons that cross an mm^2 of the pinhole's plane and one of a plane behind it, per photon emitted along a mm.
-
-    Both planes lie across the axis, `distance` mm apart; the photons cross them at an angle of this `cosine` to it. With
-    the hole's area pi d^2 / 4 that is ``d^2 cos^4(psi) / (16 l^2)``.
-    """
-    squared = cosine * cosine  # many times faster than a power
-    return squared * squared / (4 * math.pi * distance**2)
-
-
-def _whole(value: Any, name: str, expected: str) -> int:
-    if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < 1:
-        raise InputError(f"emission: {name}: expected {expected}, got {value!r}")
-    return int(value)

@@ -181,7 +181,8 @@ _DECLARED = (
             "another simulator's scanner (.npy, .npz, .h5, DICOM, .mhd, Interfile's .hdr, raw numbers)", is_path=True,
             sizes=(), needs=(_COUNTS, "no volume.file", "no volume.states", *_NO_PHANTOM), option="--counts"),
     Setting("counts.frames", str, None, "Which module each frame is of: the modules' numbers in the frames' order, such as "
-            "1-80, 80-1 or 3,1,2", needs=("counts.files", "no counts.frames_file"), option="--frames"),
+            "1-80, 80-1 or 3,1,2; none for one that is not used", needs=("counts.files", "no counts.frames_file"),
+            option="--frames"),
     Setting("counts.frames_file", str, None, "Text file with these numbers", is_path=True, needs=("counts.files",
             "no counts.frames")),
     Setting("counts.orientation", str, None, "How a frame, as a picture with row 0 at the top, lies on the crystal: seen "

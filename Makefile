@@ -77,11 +77,11 @@ test-kernels: env-dev
 		tests/core/test_emission.py tests/core/test_emission_gradients.py tests/core/test_geometry_gradients.py || exit 1; done
 
 test-gate:
-	$(ENVIRONMENT) --extras dev,gate
+	$(ENVIRONMENT) --extras gate
 	$(BIN)/python -m pytest tests/core/test_monte_carlo.py
 
 test-peers:
-	$(ENVIRONMENT) --extras dev,peers --torch "$(TORCH)"
+	$(ENVIRONMENT) --extras peers --torch "$(TORCH)"
 	@$(BIN)/python -c "import astra, cv2, itk, kornia, lib3mf"  # a missing one would only be skipped
 	$(BIN)/python -m pytest tests/core/test_geometry_export_peers.py
 

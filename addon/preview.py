@@ -5,6 +5,7 @@ same recipe as a run: with few pixels while something changes, with those of the
 thread at a time, and the next request is made when it is done: of the scene as it is then. Nothing of a run is touched.
 """
 
+import math
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -145,6 +146,9 @@ def quick_recipe(recipe: Recipe) -> Recipe:
     fewer = {"detector.rows": max(1, round(rows / factor)), "detector.columns": max(1, round(columns / factor))}
     if recipe["detector.pitch"] is not None:
         fewer["detector.pitch"] = recipe["detector.pitch"] * factor
+    if "model.background" in recipe.given:  # of larger pixels
+        shares = (recipe[name] / fewer[name] for name in ("detector.rows", "detector.columns"))
+        fewer["model.background"] = recipe["model.background"] * math.prod(shares)
     return recipe.updated(fewer)
 
 

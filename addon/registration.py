@@ -65,6 +65,7 @@ ENTRIES = {
         ids.IMPORT_GEOMETRY: "Pinhole Geometry (.xlsx)",
         ids.IMPORT_VOLUME: "Volume for Projection (.nii, DICOM, .nrrd, .vdb, ...)",
         ids.IMPORT_VOLUME_SEQUENCE: "Volume Sequence (.nii, .nrrd, .vdb, ...)",
+        ids.IMPORT_COUNTS: "Measured Counts (.npy, .h5, DICOM, .mhd, .hdr, ...)",
     },
     bpy.types.TOPBAR_MT_file_export: {
         ids.EXPORT_GEOMETRY: "Pinhole Geometry (.xlsx)",

@@ -20,6 +20,7 @@ from ..core.memory import require
 from ..core.progress import Progress, stages_of
 from ..core.projector import Model
 from ..core.runs.files import read_run, write_run
+from ..core.runs.mosaic import caption
 from ..core.runs.projecting import warn_of_energy
 from ..core.runs.recipe import Recipe, read_recipe
 from ..core.runs.run import ProjectionRun
@@ -176,6 +177,8 @@ def taken_over(scene: bpy.types.Scene, run: ProjectionRun, volume: bpy.types.Obj
     with contextlib.suppress(InputError):  # what the panel cannot show is said to have changed
         set_panel(scene.mphdrr_projections, recipe)
     state = runs.state_of(run.system, recipe, volume, None)
+    if volume is None:
+        return state | {"measured": caption(run)}
     attenuates = [value for key, value in recipe.given.items() if key.startswith("attenuation.") and value]
     return state | {"mu": {"name": f"of {run.settings['volume']}"}} if attenuates else state
 

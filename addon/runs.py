@@ -136,6 +136,12 @@ def volume_to_render(scene: bpy.types.Scene) -> str:
     return "" if found is None else str(found.name)
 
 
+def measured_text(scene: bpy.types.Scene) -> str:
+    """What was said of the shown run's counts, where they were measured; else ""."""
+    item = shown(scene)
+    return str(json.loads(item.state).get("measured", "")) if item is not None and item.state else ""
+
+
 def size_text(items: Any) -> str:
     """How much of the disk the files of runs need."""
     sizes = [storage.size_of(storage.absolute(item.file)) for item in items]

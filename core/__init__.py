@@ -19,6 +19,7 @@ from .geometry.design_formulas import collimator_length, roi_radius_seen
 from .geometry.frames import euler_pose
 from .geometry.generators import ellipse_rings, plate_rings, regular_polygon
 from .geometry.grid import Grid
+from .geometry.parallel_views import parallel_views
 from .geometry.presets import c_arm_views, pinhole_views
 from .geometry.ring_fits import RingFit, fit_rings, ring_order
 from .geometry.system import PinholeSystem

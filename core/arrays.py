@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .errors import InputError
-from .validation import real_array, require_finite, shape_text
+from .validation import batch_shape, real_array, require_finite, shape_text
 
 ArrayOrTensor = Any  # a numpy array or a torch tensor; torch may not be installed
 
@@ -28,28 +28,33 @@ def is_double(value: object) -> bool:
     return is_tensor(value) and str(value.dtype) == "torch.float64"  # type: ignore[attr-defined]
 
 
-def checked(value: ArrayOrTensor, name: str, shape: tuple[int, ...], float64: bool) -> ArrayOrTensor:
+def checked(
+    value: ArrayOrTensor, name: str, shape: tuple[int, ...], float64: bool, batch: bool = False
+) -> ArrayOrTensor:
     """`value` as float32 or float64 numbers, still an array or still a tensor on its device; not copied without need.
 
-    A float64 tensor stays float64.
+    A float64 tensor stays float64. Of a `batch`, any axes may come before those of `shape`.
     """
     if is_tensor(value):
         import torch
 
         require_numbers(value, name)
-        if tuple(value.shape) != shape:
-            raise InputError(f"{name}: expected shape {shape_text(shape)}, got {shape_text(value.shape)}")
+        wanted = batch_shape(shape, tuple(value.shape)) if batch else shape
+        if tuple(value.shape) != wanted:
+            raise InputError(f"{name}: expected shape {shape_text(wanted)}, got {shape_text(value.shape)}")
         if value.dtype != torch.float64:
             value = value.to(torch.float64 if float64 else torch.float32)
         if not bool(torch.isfinite(value.detach().sum())):
             require_finite(value.detach().cpu().numpy(), name)
         return value
     dtype = np.float64 if float64 else np.float32
-    if isinstance(value, np.ndarray) and value.dtype == dtype and value.shape == shape and value.flags.c_contiguous:
-        require_finite(value, name)
-        return value
+    if isinstance(value, np.ndarray) and value.dtype == dtype and value.flags.c_contiguous:
+        wanted = batch_shape(shape, value.shape) if batch else shape
+        if value.shape == wanted:
+            require_finite(value, name)
+            return value
     with np.errstate(over="ignore"):  # what overflows float32 is refused as not finite
-        return real_array(value, name, shape, dtype)
+        return real_array(value, name, shape, dtype, batch)
 
 
 def require_numbers(tensor: Any, name: str) -> None:

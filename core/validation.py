@@ -14,12 +14,12 @@ _MANY = 2**20
 
 
 def real_array(
-    value: ArrayLike, name: str, shape: tuple[int | None, ...] | None, dtype: Any = np.float64
+    value: ArrayLike, name: str, shape: tuple[int | None, ...] | None, dtype: Any = np.float64, batch: bool = False
 ) -> NDArray[Any]:
     """A copy of `value` as a C-ordered array of real, finite numbers.
 
-    In the expected `shape` None is any length; None alone is any shape. Error messages say `name`, and the first index
-    that is not finite.
+    In the expected `shape` None is any length; None alone is any shape; of a `batch`, any axes may come before it. Error
+    messages say `name`, and the first index that is not finite.
     """
     try:
         raw = np.asarray(value)
@@ -32,6 +32,8 @@ def real_array(
     if raw.size > _MANY:
         require(raw.size * np.dtype(dtype).itemsize, f"{name} of {shape_text(raw.shape)} numbers")
     array = np.array(raw, dtype=dtype, order="C")
+    if shape is not None and batch:
+        shape = batch_shape(shape, array.shape)
     if shape is not None and (
         array.ndim != len(shape) or any(n is not None and n != m for n, m in zip(shape, array.shape, strict=True))
     ):
@@ -39,6 +41,11 @@ def real_array(
         raise InputError(f"{name}: expected shape {expected}, got {shape_text(array.shape)}")
     require_finite(array, name)
     return array
+
+
+def batch_shape(shape: tuple[Any, ...], given: tuple[int, ...]) -> tuple[Any, ...]:
+    """What `given` must be where any axes may come before those of `shape`."""
+    return given[: max(0, len(given) - len(shape))] + shape
 
 
 def require_finite(array: NDArray[Any], name: str) -> None:

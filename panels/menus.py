@@ -87,6 +87,7 @@ class MPHDRR_MT_projections(bpy.types.Menu):
         layout = self.layout
         layout.operator_context = "INVOKE_DEFAULT"
         layout.operator(ids.RENDER_PROJECTIONS, icon="RENDER_STILL")
+        layout.operator(ids.IMPORT_COUNTS, icon="IMPORT")
         layout.operator(ids.LIVE_PREVIEW, icon="VIEW_CAMERA")
         layout.operator(ids.SHOW_PROJECTIONS, icon="IMAGE_DATA")
         layout.operator_menu_enum(ids.PICK_WINDOW, "end", icon="EYEDROPPER")

@@ -40,6 +40,8 @@ class _Runs:
         layout = self.layout  # type: ignore[attr-defined]
         settings = context.scene.mphdrr_projections
         draw_changes(layout, context.scene)
+        if text := runs.measured_text(context.scene):
+            draw_text(layout, text, icon="INFO")
         row = layout.row()
         row.enabled = not jobs.is_running()
         row.template_list("MPHDRR_UL_runs", "", settings, "runs", settings, "active_run", rows=2, maxrows=6)
@@ -79,6 +81,8 @@ def draw_changes(layout: bpy.types.UILayout, scene: bpy.types.Scene) -> None:
     column = box.column(align=True)
     for line in lines:
         draw_text(column, line, icon="DOT")
+    if runs.measured_text(scene):
+        return
     row = box.row()
     row.alert, row.enabled = False, not jobs.is_running()
     row.operator_context = "INVOKE_DEFAULT"

@@ -60,6 +60,7 @@ def write_geometry(
     instance(views, Views, "views")
     if len(views) == 0:
         raise InputError("views: expected one or more, got none")
+    views.require_pinholes(f"format {format}")
     chosen, path = FORMATS[format], Path(path)
     for name in sorted(options.keys() - chosen.options.keys()):
         raise InputError(f"format {format}: no option {name!r}, it has {', '.join(chosen.options) or 'none'}")

@@ -19,6 +19,9 @@ class Views:
     ``detector_centers[m] + (j - (n_u - 1)/2) u_steps[m] + (i - (n_v - 1)/2) v_steps[m]``; its ray runs from
     ``sources[m]`` to there.
     The arrays are (M, 3), mm. A source must not lie in its detector's plane.
+
+    Where `parallel`, the sources are at infinity: the rays of view m are whole lines through its pixels, all in the
+    direction from ``sources[m]`` to ``detector_centers[m]``. How far these two are apart does not matter.
     """
 
     sources: NDArray[np.float64]  # pinholes, or X-ray sources
@@ -26,9 +29,13 @@ class Views:
     u_steps: NDArray[np.float64]  # from one pixel to the next along a row (column index + 1)
     v_steps: NDArray[np.float64]  # along a column (row index + 1)
     shape: tuple[int, int]  # pixels (n_v, n_u): rows, columns
+    parallel: bool = False  # whether the sources are at infinity; of all views or of none
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "shape", whole_shape(self.shape, "image shape", 2))
+        if not isinstance(self.parallel, bool | np.bool_):
+            raise InputError(f"parallel: expected True or False, got {self.parallel!r}")
+        object.__setattr__(self, "parallel", bool(self.parallel))
         sources = real_array(self.sources, "sources", (None, 3))
         object.__setattr__(self, "sources", freeze(sources))
         for name in ("detector_centers", "u_steps", "v_steps"):
@@ -49,33 +56,47 @@ class Views:
     def __getitem__(self, which: int | slice | NDArray[np.integer]) -> Views:
         """The views `which` (an index, a slice or an array of indices) as Views."""
         index = np.atleast_1d(np.arange(len(self))[which])
-        return Views(
-            self.sources[index], self.detector_centers[index], self.u_steps[index], self.v_steps[index], self.shape
-        )
+        arrays = (self.sources, self.detector_centers, self.u_steps, self.v_steps)
+        return Views(*(array[index] for array in arrays), self.shape, self.parallel)
 
     def rays(self, m: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Ends of view m's rays: sources and targets, each (n_v * n_u, 3) in mm, row by row.
 
-        All sources are the same point (a read-only view).
+        All sources are the same point (a read-only view). Parallel rays begin in the plane through ``sources[m]`` that is
+        parallel to the detector; the projector follows them farther, through all of its grid.
         """
         n_v, n_u = self.shape
         column = (np.arange(n_u) - (n_u - 1) / 2)[None, :, None]
         row = (np.arange(n_v) - (n_v - 1) / 2)[:, None, None]
         targets = self.detector_centers[m] + row * self.v_steps[m] + column * self.u_steps[m]
-        return np.broadcast_to(self.sources[m], (n_v * n_u, 3)), targets.reshape(-1, 3)
+        targets = targets.reshape(-1, 3)
+        if self.parallel:
+            return targets + (self.sources[m] - self.detector_centers[m]), targets
+        return np.broadcast_to(self.sources[m], (n_v * n_u, 3)), targets
 
     def projection_matrices(self) -> NDArray[np.float64]:
         """Matrices (M, 3, 4) from homogeneous world points, mm, to ``(column, row, 1)`` times a factor.
 
         Columns and rows are in pixels, 0 at the centre of pixel 0. The factor is the depth in units of the distance from
-        source to detector: 1 on the detector, positive on its side of the source.
+        source to detector: 1 on the detector, positive on its side of the source. Of parallel views it is 1 everywhere: the
+        last row of their matrices is 0 0 0 1.
         """
         n_v, n_u = self.shape
         from_detector = np.array([[1.0, 0.0, (n_u - 1) / 2], [0.0, 1.0, (n_v - 1) / 2], [0.0, 0.0, 1.0]])
         # x - source = t (a u_step + b v_step + (center - source)): solve for t (a, b, 1).
-        linear = from_detector @ np.linalg.inv(self._axes())
-        offset = -np.einsum("mij,mj->mi", linear, self.sources)
+        solve = np.linalg.inv(self._axes())
+        if self.parallel:  # x - center = a u_step + b v_step + t (center - source): (a, b, 1)
+            solve[:, 2] = 0.0
+        linear = from_detector @ solve
+        offset = -np.einsum("mij,mj->mi", linear, self.detector_centers if self.parallel else self.sources)
+        if self.parallel:
+            offset += from_detector[:, 2]
         return np.concatenate([linear, offset[:, :, None]], axis=2)
+
+    def require_pinholes(self, name: str) -> None:
+        """Raise `InputError`, which begins with `name`, if the views are parallel."""
+        if self.parallel:
+            raise InputError(f"{name}: expected views with a source each; parallel views have theirs at infinity")
 
     def _axes(self) -> NDArray[np.float64]:
         """(M, 3, 3) with columns u_step, v_step and source-to-detector."""

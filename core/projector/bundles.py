@@ -76,6 +76,7 @@ class Part:
     transposed: bool = False
     # (F, rows, columns), weights of the integrals, with 1 row or column where all are the same; None: 1 everywhere
     weights: Array | None = None
+    parallel: bool = False  # as of `Fan`; fans of one part are all alike in this
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -86,7 +87,7 @@ class Part:
         """The rays as a backend takes them, and what attenuates them."""
         if isinstance(self.rays, Ends):
             return lattices.between(self.rays)
-        return lattices.fans(self.rays, self.shape)
+        return lattices.fans(self.rays, self.shape, self.parallel)
 
     def pixels(self, image: ArrayOrTensor) -> ArrayOrTensor:
         """The part of an image that the rays belong to, (rows, columns), as a view."""
@@ -245,4 +246,4 @@ def _part(pieces: list[tuple[int, Beam, slice]], rows: slice, columns: slice, tr
             for _, beam, shifts in pieces
         ]
         weights = each[0] if len(each) == 1 else np.concatenate(each)
-    return Part(images, vectors, rows, columns, transposed, weights)
+    return Part(images, vectors, rows, columns, transposed, weights, pieces[0][1].rays.parallel)

@@ -23,7 +23,9 @@ from ..physics.materials import module_coefficients
 from ..validation import instance, positive, real_array
 from ..volumes.volume import Volume, require_quantity
 from .bundles import Beam
-from .models import Array, Model, view_rays
+from .depth_response import DepthResponse, DepthResponses
+from .hole_response import hole_response
+from .models import Array, Model, checked_background, view_rays
 from .pixel_points import TOLERANCE, expected_error, lattice, offsets, points_needed, require_points, shadow_edges
 from .rays import Fan
 
@@ -36,6 +38,7 @@ _FWHM_PER_SIGMA = 2 * math.sqrt(2 * math.log(2))
 _BOX_PER_SIGMA = math.sqrt(12)
 
 Edge = Literal["paix", "path"]
+Hole = Literal["rays", "depth"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -115,6 +118,10 @@ class Emission(Model):
         straight from the hole's rim to the edges of the crystal's front, so they stop no others.
     within_cone : bool
         Whether rays steeper than the knife edge's cone, psi > alpha / 2, count nothing, with either edge.
+    background : float or array (M,) or (M, n_v, n_u)
+        Counts that each pixel is expected to have besides those of the volume, such as scatter and dark counts: in the whole
+        acquisition, so they do not grow with `time`. One number, one for each module, or images. ``A(x)`` is linear and
+        leaves them out; runs add them before noise is drawn (`project_run`), and reconstructions expect them.
 
     Raises
     ------
@@ -147,6 +154,8 @@ class Emission(Model):
     within_cone: bool = False
     pixel_points: int | None = None
     tolerance: float = TOLERANCE
+    background: float | Array = 0.0  # type: ignore[assignment]  # no class of mutable values: checked, and frozen
+    hole: Hole = "rays"
 
     name = "emission"
     takes = ("activity",)
@@ -186,6 +195,25 @@ class Emission(Model):
             raise InputError("emission: depth_layers needs crystal_mu, of the crystal's material")
         for name in ("within_crystal", "within_walls", "within_cone"):
             self._set(name, bool(getattr(self, name)))
+        self._set("background", checked_background(self.background, "emission: background", len(self.system)))
+        self._check_hole()
+
+    def _check_hole(self) -> None:
+        if self.hole not in ("rays", "depth"):
+            raise InputError(f"emission: hole: expected 'rays' or 'depth', got {self.hole!r}")
+        if self.hole == "rays":
+            return
+        for given, what in (
+            (self.mu is not None, "attenuation, mu"),
+            (self.edge != "paix", "edge 'path'"),
+            (self.depth_layers > 1, "depth_layers"),
+            (
+                self.aperture_points > 1 or self.aperture_tolerance is not None,
+                "points of the hole: it is the whole hole",
+            ),
+        ):
+            if given:
+                raise InputError(f"emission: hole 'depth' takes no {what}; use hole 'rays', or leave that out")
 
     def _set(self, name: str, value: Any) -> None:
         object.__setattr__(self, name, value)
@@ -222,10 +250,12 @@ class Emission(Model):
                 self._set(name, positive(value, f"emission: {name}"))
 
     def record(self) -> dict[str, Any]:
-        """The settings, for a run's record; of mu only its grid, of the isotope its name."""
+        """The settings, for a run's record: of mu its grid, of the isotope its name, of a background's images a word."""
         settings = {f.name: getattr(self, f.name) for f in fields(self) if f.name not in ("system", "mu")}
         settings["isotope"] = None if self.isotope is None else self.isotope.name  # type: ignore[union-attr]
         settings["window"] = None if self.window is None else list(self.window)
+        if isinstance(self.background, np.ndarray):
+            settings["background"] = self.background.tolist() if self.background.ndim == 1 else "images"
         if self.mu is not None:
             settings["mu"] = {"shape": list(self.mu.grid.shape), "affine": self.mu.grid.affine.tolist()}
         return settings
@@ -241,7 +271,8 @@ class Emission(Model):
 
     def of_views(self, which: NDArray[np.integer]) -> Self:
         """The model of the modules `which` (indices) alone."""
-        return replace(self, system=self.system[which])
+        background = self.background[which] if isinstance(self.background, np.ndarray) else self.background
+        return replace(self, system=self.system[which], background=background)
 
     def check(self, views: Views) -> None:
         """Raise `InputError` unless `views` are of this system."""
@@ -249,6 +280,7 @@ class Emission(Model):
             raise InputError(
                 f"emission: {len(self.system)} modules but {len(views)} views; give the system whose views they are"
             )
+        views.require_pinholes("emission")
         u, v, k = self.system.frames().transpose(1, 0, 2)
         moved = np.linalg.norm(views.sources - self.system.centers, axis=1) > _SAME_PLACE
         turned = np.zeros(len(views), dtype=bool)
@@ -263,6 +295,7 @@ class Emission(Model):
         ):
             if bad.any():
                 raise InputError(f"emission: view {int(np.argmax(bad))}: {why}")
+        checked_background(self.background, "emission: background", len(views), views.shape)
 
     @property
     def effective_diameter(self) -> Array:
@@ -367,6 +400,21 @@ class Emission(Model):
                 weights = weights * share_inside(shrink * along - (1 - shrink) * start, shrink * size / cells, side)
         return weights
 
+    def _direction_weights(self, m: int, along_u: Array, along_v: Array) -> Array:
+        """Counts per mm^3 times its squared depth, for lines through the hole's middle to places on the crystal's front."""
+        l = float(self.system.collimator_length[m])
+        whole = Opening(0.0, 0.0, math.pi / 4 * float(self.effective_diameter[m]) ** 2)
+        anywhere = replace(self, within_crystal=False, within_walls=False)
+        along_u, along_v = along_u[None, :], along_v[:, None]
+        weights = anywhere.pixel_weights(m, along_u, along_v, (1.0, 1.0), l, whole)
+        return weights * np.sqrt(1 + (along_u**2 + along_v**2) / l**2)  # type: ignore[no-any-return]
+
+    def _pixel_shares(self, m: int, pitch: tuple[float, float], along_u: Array, along_v: Array) -> Array:
+        """The parts of pixels that are on the crystal."""
+        side = float(self.system.detector_side[m]) if self.within_crystal or self.within_walls else math.inf
+        on_u, on_v = (share_inside(along, size, side) for along, size in zip((along_u, along_v), pitch, strict=True))
+        return on_v[:, None] * on_u  # type: ignore[no-any-return]
+
     def response(self, views: Views, m: int) -> tuple[Array, Array] | None:
         """The intrinsic blur of view m: matrices (n_v, n_v) along v and (n_u, n_u) along u."""
         if self.intrinsic_fwhm == 0:
@@ -376,6 +424,21 @@ class Emission(Model):
         n_v, n_u = views.shape
         return gaussian_blur(n_v, sigma / pitch_v), gaussian_blur(n_u, sigma / pitch_u)
 
+    def by_depth(self, views: Views, grid: Grid) -> DepthResponses | None:
+        """What projects in place of rays, for hole "depth"."""
+        if self.hole != "depth":
+            return None
+
+        def make(m: int) -> DepthResponse:
+            l, d = float(self.system.collimator_length[m]), float(self.effective_diameter[m])
+            weigh, shares = (
+                partial(self._direction_weights, m),
+                partial(self._pixel_shares, m, self._crystal_pitch(views, m)),
+            )
+            return hole_response(views, m, grid, self.system.frames()[m], l, d, weigh, shares)
+
+        return DepthResponses(len(views), grid.shape, make)
+
     def rays(self, views: Views, m: int, grid: Grid) -> int:
         """Rays of each pixel of view m."""
         holes = len(self.openings(m, self.hole_points(views, m, grid)))
@@ -383,6 +446,8 @@ class Emission(Model):
 
     def caution(self, views: Views, grid: Grid) -> str | None:
         """A warning where there are too few rays for the tolerance."""
+        if self.hole == "depth":  # has none
+            return None
         worst, module = 0.0, 0
         for m in range(len(views)):
             edges = shadow_edges(views, m, grid)

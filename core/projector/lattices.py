@@ -27,9 +27,11 @@ class Lattices:
     mu_grid: Grid | None = None
     mu_origin: Index = (0, 0, 0)
 
-    def fans(self, vectors: Array, shape: tuple[int, int]) -> tuple[IndexFans, Attenuation | None]:
+    def fans(
+        self, vectors: Array, shape: tuple[int, int], parallel: bool = False
+    ) -> tuple[IndexFans, Attenuation | None]:
         """Fans (F, 4, 3), as of `Fan.vectors`, of one shape in index space, and what attenuates them."""
-        return self._mapped(index_fans, vectors, shape)
+        return self._mapped(index_fans, vectors, shape, parallel)
 
     def between(self, rays: Ends) -> tuple[IndexRays, Attenuation | None]:
         """Rays from point to point in index space, and what attenuates them."""

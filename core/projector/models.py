@@ -6,14 +6,16 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from ..arrays import ArrayOrTensor, is_tensor, namespace
+from ..errors import InputError
 from ..geometry.grid import Grid
 from ..geometry.views import Views
-from ..validation import positive, real_array
+from ..validation import freeze, positive, real_array, shape_text
 from ..volumes.volume import LINE_INTEGRALS, Volume, require_quantity
 from .bundles import Beam
+from .depth_response import DepthResponses
 from .pixel_points import TOLERANCE, offsets, points_needed, require_points, shadow_edges
 from .rays import Fan
 
@@ -34,6 +36,9 @@ class Model(ABC):
 
     takes: tuple[str, ...] = LINE_INTEGRALS
     """Quantities of volumes that can be projected; arrays and tensors have none and are not checked."""
+
+    background: float | Array = 0.0
+    """What each pixel measures besides the volume: a number, one for each view (M,), or images (M, n_v, n_u)."""
 
     weights_voxels: bool = False
     """Whether each view has its own voxel weights (`voxel_weights`)."""
@@ -68,6 +73,10 @@ class Model(ABC):
     def voxel_weights(self, views: Views, m: int, grid: Grid) -> Array:
         """Factors of the voxels in view m, ``grid.shape``; used if `weights_voxels`."""
         return np.ones(grid.shape)
+
+    def by_depth(self, views: Views, grid: Grid) -> DepthResponses | None:
+        """What projects in place of rays, if the model is of that kind."""
+        return None
 
     def response(self, views: Views, m: int) -> tuple[Array, Array] | None:
         """The detector's response in view m: matrices (n_v, n_v) along v and (n_u, n_u) along u, None if ideal."""
@@ -107,7 +116,7 @@ class Transmission(Model):
 
     def beams(self, views: Views, m: int, grid: Grid) -> Iterator[Beam]:
         """The rays of `views`, or to more points of their pixels, weights summing to 1."""
-        rays = view_rays(views, m)
+        rays = view_rays(views, m, grid)
         if self.pixel_points == 1:
             yield Beam(rays)
             return
@@ -140,9 +149,53 @@ def intensity(line_integrals: ArrayOrTensor, photons: float) -> ArrayOrTensor:
     return positive(photons, "photons") * namespace(line_integrals).exp(-line_integrals)
 
 
-def view_rays(views: Views, m: int) -> Fan:
-    """The rays of view m, from its source to the pixels' centres: a row for every row of pixels."""
+def checked_background(
+    value: ArrayLike, name: str, n: int, pixels: tuple[int, int] | None = None
+) -> float | NDArray[np.float64]:
+    """Counts besides a volume's: a number, or read-only those of `n` views (M,), or their images (M, n_v, n_u).
+
+    Parameters
+    ----------
+    value, name
+        What to check, and how messages call it.
+    n, pixels
+        Number of views and their shape (n_v, n_u), if that is known.
+
+    Raises
+    ------
+    InputError
+        Another shape, not real, not finite, or below 0.
+    """
+    array = real_array(value, name, None)
+    if (
+        array.ndim not in (0, 1, 3)
+        or array.shape[:1] not in ((), (n,))
+        or (array.ndim == 3 and pixels not in (None, array.shape[1:]))
+    ):
+        images = "" if pixels is None else f" of {shape_text(pixels)}"
+        expected = f"one number, {n} numbers (one for each view), or {n} images{images}"
+        raise InputError(f"{name}: expected {expected}, got {shape_text(array.shape)}")
+    if array.min(initial=0.0) < 0:
+        raise InputError(f"{name}: expected 0 or more, got {array.min():g}")
+    return freeze(array) if array.ndim else float(array)
+
+
+def view_rays(views: Views, m: int, grid: Grid | None = None) -> Fan:
+    """The rays of view m, from its source to the pixels' centres: a row for every row of pixels.
+
+    Parallel rays begin and end outside `grid`, close to it; without a grid, as those of `Views.rays`.
+    """
     n_v, n_u = views.shape
     u_step, v_step = views.u_steps[m], views.v_steps[m]
     corner = views.detector_centers[m] - (n_u - 1) / 2 * u_step - (n_v - 1) / 2 * v_step
-    return Fan(views.sources[m], corner, v_step, u_step, views.shape)
+    if not views.parallel:
+        return Fan(views.sources[m], corner, v_step, u_step, views.shape)
+    along = views.detector_centers[m] - views.sources[m]
+    if grid is None:
+        return Fan(corner - along, corner, v_step, u_step, views.shape, parallel=True)
+    along = along / np.linalg.norm(along)
+    outermost = [corner + i * (n_v - 1) * v_step + j * (n_u - 1) * u_step for i in (0, 1) for j in (0, 1)]
+    distances = (grid.corners()[:, None] - outermost) @ along  # from pixels to the grid
+    margin = float(grid.spacing.max() + np.linalg.norm(u_step) + np.linalg.norm(v_step))
+    first, last = (corner + distance * along for distance in (distances.min() - margin, distances.max() + margin))
+    return Fan(first, last, v_step, u_step, views.shape, parallel=True)

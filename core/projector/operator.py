@@ -2,19 +2,21 @@
 
 from __future__ import annotations
 
+import math
 import warnings
 from abc import ABC, abstractmethod
 from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
-from ..arrays import ArrayOrTensor, cast_like, checked, is_double, is_tensor, promote, to_caller, zeros
+from ..arrays import ArrayOrTensor, cast_like, checked, is_double, is_tensor, promote, to_caller, to_numpy, zeros
 from ..errors import InputError, InputWarning
 from ..geometry.grid import Grid
 from ..geometry.views import Views
 from ..memory import require
-from ..progress import Progress
+from ..progress import Progress, part_of
 from ..volumes.volume import Volume
 from . import backends
 from .bundles import Bundle, Bundles
@@ -26,7 +28,10 @@ from .subsets import balanced_subsets
 
 
 class LinearOperator(ABC):
-    """``A(x)``, with the exact adjoint ``A.T(y)``; differentiable in torch."""
+    """``A(x)``, with the exact adjoint ``A.T(y)``; differentiable in torch.
+
+    Both take a batch: whatever axes come before those of `shape_in` come before those of `shape_out`.
+    """
 
     def __call__(self, x: Volume | ArrayOrTensor, progress: Progress | None = None) -> ArrayOrTensor:
         """Apply the operator.
@@ -34,13 +39,13 @@ class LinearOperator(ABC):
         Parameters
         ----------
         x
-            Numpy array or torch tensor (a projector also takes a `Volume`).
+            Numpy array or torch tensor (..., *shape_in); a projector also takes a `Volume`.
         progress
-            Called as ``progress(views done, views)``; what it raises stops the work.
+            Called as ``progress(views done, views)``, of a batch over all of it; what it raises stops the work.
 
         Returns
         -------
-        array or tensor
+        array or tensor (..., *shape_out)
             A tensor on the device of `x` if that is a tensor (part of torch's graph if it requires a
             gradient, for every backend), else a numpy array.
 
@@ -61,12 +66,38 @@ class LinearOperator(ABC):
     def T(self) -> LinearOperator:
         """The exact adjoint, <A x, y> = <x, A.T y>."""
 
+    @property
+    @abstractmethod
+    def shape_in(self) -> tuple[int, int, int]:
+        """Shape of what it takes."""
+
+    @property
+    @abstractmethod
+    def shape_out(self) -> tuple[int, int, int]:
+        """Shape of what it gives."""
+
     @abstractmethod
     def _check(self, x: Any) -> ArrayOrTensor: ...
 
+    def _run(
+        self, x: ArrayOrTensor, progress: Progress | None = None, mu: ArrayOrTensor | None = None
+    ) -> ArrayOrTensor:
+        """Apply to a checked array or tensor, one by one to those of a batch; nothing is recorded in a graph."""
+        batch = tuple(x.shape[:-3])
+        if not batch:
+            return self._run_one(x, progress, mu)
+        n = math.prod(batch)
+        require(x.itemsize * n * math.prod(self.shape_out), f"a batch of {n} times {_times(self.shape_out)} numbers")
+        results = zeros((*batch, *self.shape_out), x)
+        for done, index in enumerate(np.ndindex(batch)):
+            results[index] = self._run_one(x[index], part_of(progress, done, n), mu)
+        return results
+
     @abstractmethod
-    def _run(self, x: ArrayOrTensor, progress: Progress | None = None) -> ArrayOrTensor:
-        """Apply to an array or tensor of the right shape, without checks and without recording a graph."""
+    def _run_one(
+        self, x: ArrayOrTensor, progress: Progress | None = None, mu: ArrayOrTensor | None = None
+    ) -> ArrayOrTensor:
+        """Apply to an array or tensor of `shape_in`."""
 
 
 class Projector(LinearOperator):
@@ -135,6 +166,7 @@ class Projector(LinearOperator):
         self._backend = backends.choose(backend)
         self.threads = thread_count(threads)
         self._bundles = Bundles(len(views), self._bundle)
+        self._depths = model.by_depth(views, grid)
         self._adjoint = AdjointProjector(self)
 
     def __call__(
@@ -147,7 +179,8 @@ class Projector(LinearOperator):
         x, progress
             As of `LinearOperator`; `x` may also be a `Volume`.
         mu
-            Attenuation coefficients, 1/mm, in place of the model's: an array or tensor on the grid of its `mu`.
+            Attenuation coefficients, 1/mm, in place of the model's: an array or tensor on the grid of its `mu`, one for a
+            whole batch.
 
         Returns
         -------
@@ -198,6 +231,12 @@ class Projector(LinearOperator):
         return (len(self.views), *self.views.shape)
 
     @property
+    def background(self) -> NDArray[np.floating[Any]]:
+        """What the model expects besides the volume's images, (M, n_v, n_u), read-only: ``A(x) + A.background``."""
+        values = np.asarray(self.model.background)
+        return np.broadcast_to(values[:, None, None] if values.ndim == 1 else values, self.shape_out)
+
+    @property
     def T(self) -> AdjointProjector:
         """The exact adjoint: images (M, n_v, n_u) to an array of ``grid.shape``."""
         return self._adjoint
@@ -207,7 +246,7 @@ class Projector(LinearOperator):
 
         Leave the volume as it is until the last: images are made ahead of need.
         """
-        volume = self._check(volume)
+        volume = self._check(volume, batch=False)
         return (to_caller(image, volume) for image in self._images(volume))
 
     def subsets(self, n: int) -> list[Projector]:
@@ -226,7 +265,7 @@ class Projector(LinearOperator):
         n_v, n_u = self.views.shape
         return f"Projector({_times(self.grid.shape)} voxels, {len(self.views)} views of {n_v} x {n_u}, {self.backend})"
 
-    def _check(self, x: Volume | ArrayOrTensor) -> ArrayOrTensor:
+    def _check(self, x: Volume | ArrayOrTensor, batch: bool = True) -> ArrayOrTensor:
         if isinstance(x, Volume):
             if not same_lattice(x.grid, self.grid):
                 raise InputError(
@@ -234,9 +273,9 @@ class Projector(LinearOperator):
                 )
             self.model.check_volume(x)
             return x.array
-        return checked(x, "volume", self.shape_in, self._float64)
+        return checked(x, "volume", self.shape_in, self._float64, batch)
 
-    def _run(
+    def _run_one(
         self, x: ArrayOrTensor, progress: Progress | None = None, mu: ArrayOrTensor | None = None
     ) -> ArrayOrTensor:
         n_views, n_v, n_u = self.shape_out
@@ -266,6 +305,9 @@ class Projector(LinearOperator):
 
     def _projected(self, execution: Execution, x: ArrayOrTensor, mu: ArrayOrTensor) -> Iterator[ArrayOrTensor]:
         """The images before the detector's response."""
+        if self._depths is not None:
+            yield from self._depths.images(*self._depth_arguments(x))
+            return
         if not self.model.weights_voxels:
             yield from execution.images(x, self._bundles, self._mu(mu))
             return
@@ -274,11 +316,14 @@ class Projector(LinearOperator):
             yield from execution.images(x * self._voxel_weights(m, x), self._bundles_of(m))
 
     def _mu_gradient(self, images: ArrayOrTensor, x: ArrayOrTensor, mu: ArrayOrTensor) -> ArrayOrTensor:
-        """The gradient of <A x, images> by mu, on mu's whole grid."""
+        """The gradient of <A x, images> by mu, on mu's whole grid; of a batch the sum."""
         execution = self._execution(x)
-        responded = self._responded(execution.to_backend(images))
-        gradient = execution.mu_gradient(responded, self._bundles, x.detach(), mu.detach())
-        return to_caller(self._finished(gradient, images), images)
+        total = zeros(mu.shape, images)
+        for index in np.ndindex(x.shape[:-3]):
+            responded = self._responded(execution.to_backend(images[index]))
+            gradient = execution.mu_gradient(responded, self._bundles, x[index].detach(), mu.detach())
+            total += to_caller(self._finished(gradient, images), images)
+        return total
 
     def _responded(self, images: ArrayOrTensor) -> ArrayOrTensor:
         """`images` with the adjoint of the detector's response."""
@@ -301,6 +346,12 @@ class Projector(LinearOperator):
         backend = backends.for_tensor(x) if on_gpu else self._backend
         mu_grid = None if self.model.mu is None else self.model.mu.grid
         return Execution(backend, self.grid, mu_grid, backend.always_float64 or is_double(x), self.threads)
+
+    def _depth_arguments(self, x: ArrayOrTensor) -> tuple[ArrayOrTensor, Any, int]:
+        """What `DepthResponses` takes: the array, the functions and the threads."""
+        double = self._backend.always_float64 or is_double(x)
+        functions = backends.load("cpu" if self._backend.name == "cpu" else "reference_depth")
+        return np.ascontiguousarray(to_numpy(x, np.float64 if double else np.float32)), functions, self.threads
 
     def _mu(self, mu: ArrayOrTensor) -> ArrayOrTensor:
         return self.model.mu.array if mu is None and self.model.mu is not None else mu
@@ -358,9 +409,9 @@ class AdjointProjector(LinearOperator):
         return f"{self._projector!r}.T"
 
     def _check(self, x: ArrayOrTensor) -> ArrayOrTensor:
-        return checked(x, "images", self.shape_in, self._projector._float64)
+        return checked(x, "images", self.shape_in, self._projector._float64, batch=True)
 
-    def _run(
+    def _run_one(
         self, x: ArrayOrTensor, progress: Progress | None = None, mu: ArrayOrTensor | None = None
     ) -> ArrayOrTensor:
         A = self._projector
@@ -372,7 +423,9 @@ class AdjointProjector(LinearOperator):
         n = len(A.views)
         _report(progress, 0, n)
         images = A._responded(images)
-        if not A.model.weights_voxels:
+        if A._depths is not None:
+            volume = A._depths.backproject(*A._depth_arguments(images), lambda done: _report(progress, done, n))
+        elif not A.model.weights_voxels:
             volume = execution.backproject(images, A._bundles, A._mu(mu), lambda done: _report(progress, done, n))
         else:  # each view's volume is weighted before it is added to the total
             volume = zeros(A.grid.shape, images)

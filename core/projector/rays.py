@@ -26,8 +26,9 @@ _ALL = slice(None)
 class Fan:
     """Rays from one point to the points of a lattice on a plane, world mm: the rays of an image.
 
-    The ray of row i and column j goes from `source` to ``corner + i row_step + j column_step``. With S shifts there are S
-    such lattices, each moved by a number of rows and columns: more points of every pixel.
+    The ray of row i and column j goes from `source` to ``corner + i row_step + j column_step``; a parallel one, from
+    ``source + i row_step + j column_step``. With S shifts there are S such lattices, each moved by a number of rows and
+    columns: more points of every pixel.
     """
 
     source: Array  # (3,), mm
@@ -36,18 +37,25 @@ class Fan:
     column_step: Array  # (3,), mm
     shape: tuple[int, int]  # rows and columns
     shifts: Array = field(default_factory=lambda: _UNSHIFTED)  # (S, 2), in rows and columns
+    parallel: bool = False
 
     def part(self, rows: slice, columns: slice, shifts: slice = _ALL) -> Fan:
         """Some rows, some columns of these, and some of the shifts."""
         row, last_row, _ = rows.indices(self.shape[0])
         column, last_column, _ = columns.indices(self.shape[1])
-        corner = self.corner + row * self.row_step + column * self.column_step
-        return replace(self, corner=corner, shape=(last_row - row, last_column - column), shifts=self.shifts[shifts])
+        offset = row * self.row_step + column * self.column_step
+        return replace(
+            self,
+            source=self.source + offset if self.parallel else self.source,
+            corner=self.corner + offset,
+            shape=(last_row - row, last_column - column),
+            shifts=self.shifts[shifts],
+        )
 
     def transposed(self) -> Fan:
         """The same rays with rows and columns exchanged."""
         shifts = self.shifts if self.shifts is _UNSHIFTED else self.shifts[:, ::-1]
-        return Fan(self.source, self.corner, self.column_step, self.row_step, self.shape[::-1], shifts)
+        return Fan(self.source, self.corner, self.column_step, self.row_step, self.shape[::-1], shifts, self.parallel)
 
     def lies_across(self, grid: Grid) -> bool:
         """Whether neighbours in the voxels' memory are neighbours in a column rather than in a row."""
@@ -59,7 +67,10 @@ class Fan:
         vectors = np.empty((len(self.shifts), 4, 3))
         vectors[:] = self.source, self.corner, self.row_step, self.column_step
         if self.shifts is not _UNSHIFTED:
-            vectors[:, 1] += self.shifts @ vectors[0, 2:]
+            moved = self.shifts @ vectors[0, 2:]
+            vectors[:, 1] += moved
+            if self.parallel:
+                vectors[:, 0] += moved
         return vectors
 
     def targets(self) -> Array:
@@ -108,6 +119,8 @@ def window(fans: Sequence[Fan], points: Array) -> tuple[slice, slice]:
     w_row, w_column, w = np.einsum("kfi,fpi->kfp", across, points - source[:, None])
     volume = np.einsum("fi,fi->f", row_step, across[0])[:, None]
     w = w / volume
+    if fans[0].parallel:  # point - source = i row_step + j column_step + w to_corner
+        w = np.ones_like(w)
     if not (w > 1e-6 * np.abs(w).max(axis=1, keepdims=True)).all():  # some points lie beside or behind a source
         return slice(0, shape[0]), slice(0, shape[1])
     windows = []
@@ -145,6 +158,7 @@ class IndexFans:
     # same in world mm
     table: Array
     shape: tuple[int, int]  # rows and columns
+    parallel: bool = False  # as of `Fan`
 
     def __len__(self) -> int:
         return len(self.table) * self.shape[0] * self.shape[1]
@@ -152,8 +166,11 @@ class IndexFans:
     def listed(self) -> IndexRays:
         """The rays one by one, snapped to the planes that they lie in."""
         of_each = self.shape[0] * self.shape[1]
-        starts, sources = (np.repeat(self.table[:, k], of_each, axis=0) for k in (0, 4))
         ends, targets = (_targets(self.table[:, k : k + 4], self.shape) for k in (0, 4))
+        if self.parallel:
+            along, mm = (np.repeat(self.table[:, k + 1] - self.table[:, k], of_each, axis=0) for k in (0, 4))
+            return _snapped(ends - along, ends, np.linalg.norm(mm, axis=1))
+        starts, sources = (np.repeat(self.table[:, k], of_each, axis=0) for k in (0, 4))
         return _snapped(starts, ends, np.linalg.norm(targets - sources, axis=1))
 
 
@@ -169,15 +186,15 @@ class Attenuation:
 
 
 def index_fans(
-    grid: Grid, vectors: Array, shape: tuple[int, int], origin: tuple[int, int, int] = (0, 0, 0)
+    grid: Grid, vectors: Array, shape: tuple[int, int], parallel: bool = False, origin: tuple[int, int, int] = (0, 0, 0)
 ) -> IndexFans:
-    """Fans (F, 4, 3) in world mm, as of `Fan.vectors`, in `grid`'s index space; see `index_rays`."""
+    """Fans (F, 4, 3) in world mm, as of `Fan.vectors`, parallel or not, in `grid`'s index space; see `index_rays`."""
     affine = _index_from_world(grid, origin)
     table = np.empty((len(vectors), 8, 3))
     table[:, 4:] = vectors
     table[:, :4] = np.einsum("fvi,ji->fvj", vectors, affine[:3, :3])
     table[:, :2] += affine[:3, 3]
-    return IndexFans(table, shape)
+    return IndexFans(table, shape, parallel)
 
 
 def index_rays(grid: Grid, sources: Array, targets: Array, origin: tuple[int, int, int] = (0, 0, 0)) -> IndexRays:

@@ -26,7 +26,8 @@ class CountData:
     def of(cls, method: str, A: Projector, counts: ArrayLike, background: ArrayLike = 0.0) -> "CountData":
         """Checked: `A` is of emission; counts and background are at least 0, of the projector's shape.
 
-        The background is one number, one for each module (M,), or images. Raises InputError.
+        The background is one number, one for each module (M,), or images; that of the projector's model is added to it.
+        Raises InputError.
         """
         instance(A, Projector, method)
         if A.model.takes != ("activity",):
@@ -40,7 +41,7 @@ class CountData:
         elif extra.shape not in ((), A.shape_out):
             shapes = f"one number, {A.shape_out[0]} numbers or images of {shape_text(A.shape_out)}"
             raise InputError(f"background: expected {shapes}, got {shape_text(extra.shape)}")
-        return cls(measured, np.broadcast_to(extra, A.shape_out))
+        return cls(measured, np.broadcast_to(extra + A.background.astype(np.float32), A.shape_out))
 
     def __getitem__(self, which: NDArray[np.int64]) -> "CountData":
         return CountData(self.counts[which], self.background[which])

@@ -49,6 +49,7 @@ _ARRAYS: dict[str, tuple[str, Callable[[ProjectionRun], Any]]] = {
 }
 _VOLUME = ("volume/array", "volume/affine")
 """Which a measured run does not have."""
+_BACKGROUND = "background"  # in the unit of the projections; where there is none, nothing but the volume was projected
 _ATTRIBUTES = "attributes"
 _COMPRESS_FROM = 1 << 16  # bytes: below, compressing costs more than it saves
 
@@ -67,6 +68,8 @@ def write_run(run: ProjectionRun, path: str | os.PathLike[str]) -> None:
     if run.volume is not None:
         arrays |= dict(zip(_VOLUME, (run.volume.array, run.volume.grid.affine), strict=True))
         of_volume = {"volume_quantity": run.volume.quantity, "volume_unit": run.volume.unit}
+    if np.any(run.background):
+        arrays[_BACKGROUND] = np.asarray(run.background)
     attributes = {
         "format": _FORMAT,
         "format_version": 1 if of_volume else _FORMAT_VERSION,
@@ -126,6 +129,7 @@ def _run_of(arrays: dict[str, NDArray[Any]], attributes: dict[str, Any]) -> Proj
         workbook=str(attributes["workbook"]),
         workbook_sha256=str(attributes["workbook_sha256"]),
         versions=json.loads(attributes["versions"]),
+        background=arrays.get(_BACKGROUND, 0.0),  # type: ignore[arg-type]  # checked there
     )
 
 
@@ -133,7 +137,8 @@ def _write_hdf5(arrays: dict[str, NDArray[Any]], attributes: dict[str, Any], pat
     """Arrays as datasets with a `unit`, in chunks of one view each, so that one view reads alone; attributes on the root."""
     import h5py
 
-    units = {"projections": attributes["projections_unit"]}
+    unit = attributes["projections_unit"]
+    units = {"projections": unit, _BACKGROUND: unit}
     units |= dict(zip(_VOLUME, (attributes.get("volume_unit"), "mm"), strict=True))
     units |= {name: unit for name, (unit, _) in _ARRAYS.items()}
     with h5py.File(path, "w") as file:

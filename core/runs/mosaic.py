@@ -136,10 +136,10 @@ def write_sheet(run: ProjectionRun, path: str | os.PathLike[str], display: Displ
 
 
 def labels(run: ProjectionRun) -> list[str]:
-    """What each image of a run is called in a sheet: its module's number, and of measured counts the frame, from 1."""
+    """What each image of a run is called in a sheet: its module's number, and that of its frame of measured counts."""
     numbers = run.system.numbers.tolist()
     frames = {number: k for k, number in enumerate(run.settings.get("frames") or (), 1)}
-    return [f"{number} (frame {frames[number]})" if number in frames else str(number) for number in numbers]
+    return [f"{number} ({frames[number]})" if number in frames else str(number) for number in numbers]
 
 
 def caption(run: ProjectionRun) -> str:
@@ -149,8 +149,8 @@ def caption(run: ProjectionRun) -> str:
     words = run.settings["orientation"]
     lay = words if isinstance(words, str) else "each its own way"
     side = "crystals seen from behind" if run.settings["detector"] == "real" else "what the pinholes see"
-    time = run.recipe["model.time"]
-    return f"{run.settings['counts']}: frames lay {lay}, {time:g} s. Shown: {side}, +v at the top, +u at the left"
+    said = f"{run.settings['counts']}, {run.recipe['model.time']:g} s, frames {lay}"
+    return f"{said}. Module (frame): {side}, +v at the top, +u at the left"
 
 
 def _captioned(picture: NDArray[np.uint8], text: str) -> NDArray[np.uint8]:

@@ -79,7 +79,7 @@ def project_run(
     projector = Projector(volume.grid, views, model=model, backend=backend, threads=threads)
     images = np.empty((len(views), n_v, n_u), np.float32)
     for m, image in enumerate(projector.iter_views(volume)):
-        images[m] = image if photons is None else intensity(image, photons)
+        images[m] = image + projector.background[m] if photons is None else intensity(image, photons)
         if progress is not None:
             progress(m + 1, len(views))
     if noise_seed is not None:
@@ -95,7 +95,9 @@ def project_run(
         **(settings or {}),
     }
     unit = model.unit(volume) if photons is None else "photons"
-    return ProjectionRun(images, system, views, volume, unit=unit, settings=record, seed=noise_seed)
+    return ProjectionRun(
+        images, system, views, volume, unit=unit, settings=record, seed=noise_seed, background=model.background
+    )
 
 
 def warn_of_energy(model: Model, energy: float, what: str) -> None:

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from ..errors import InputError
 from ..geometry.system import PinholeSystem
 from ..geometry.views import Views
+from ..projector.models import checked_background
 from ..validation import freeze, real_array
 from ..version import VERSION
 from ..volumes.volume import Volume
@@ -48,8 +49,10 @@ class ProjectionRun:
     workbook: str = ""  # name of the geometry workbook, and its SHA-256; empty where there is none
     workbook_sha256: str = ""
     versions: Mapping[str, str] = field(default_factory=versions)  # of mphDRR and what it ran on
+    background: float | NDArray[np.float64] = 0.0  # expected besides the volume's, as of `Emission`: (), (M,) or images
 
     def __post_init__(self) -> None:
+        self.views.require_pinholes("run")
         if len(self.views) != len(self.system):
             raise InputError(f"run: {len(self.system)} modules, but {len(self.views)} views")
         shape = (len(self.views), *self.views.shape)
@@ -59,6 +62,8 @@ class ProjectionRun:
         if projections.shape != shape:
             raise InputError(f"run: expected projections of shape {shape}, got {projections.shape}")
         object.__setattr__(self, "projections", freeze(projections.view()))
+        background = checked_background(self.background, "run: background", len(self.views), self.views.shape)
+        object.__setattr__(self, "background", background)
         if not self.unit:
             if self.volume is None:
                 raise InputError("run: without a volume, say the unit of the projections, such as counts")

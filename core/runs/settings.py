@@ -238,6 +238,8 @@ _DECLARED = (
             needs=(_COUNTS,), label="Collimator Walls"),
     Setting("model.within_crystal", bool, False, "Pixels beyond the crystal's side count nothing", needs=(_COUNTS,),
             label="Crystal's Side"),
+    Setting("model.background", float, 0.0, "Counts of each pixel besides those of the volume, in the whole acquisition: "
+            "scatter and dark counts", least=0, slider=100, needs=(_COUNTS,), option="--background-counts"),
     Setting("model.pixel_points", int, None, "Points of each pixel's area, for each point of the hole; auto: as many as "
             "the tolerance asks for, which takes longer for small voxels", "auto for counts, 1, its centre, for "
             "radiographs", words={"auto": ("Automatic", "")}, least=1, slider=100, needs=(_RAYS,)),

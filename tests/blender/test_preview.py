@@ -43,9 +43,10 @@ def test_a_preview_is_what_the_projector_says(scanned, scene, settings):
         assert f"{shape[1]} × {shape[0]} pixels" in made.lines[1]
 
 
-def test_counts_are_shown_per_pixel_of_the_panel_whatever_the_number_of_pixels(scanned, scene):
+@pytest.mark.parametrize("background", [0.0, 0.5])
+def test_counts_are_shown_per_pixel_of_the_panel_whatever_the_number_of_pixels(scanned, scene, background):
     settings = scene.mphdrr_projections
-    settings.model, settings.width, settings.height = "EMISSION", 512, 512
+    settings.model, settings.width, settings.height, settings.background = "EMISSION", 512, 512, background
     quick, full = shown(True), shown(False)
     assert quick.run.projections.sum() == pytest.approx(full.run.projections.sum(), rel=0.02)
     assert quick.window[1] == pytest.approx(full.window[1], rel=0.3)

@@ -356,13 +356,14 @@ def test_the_command_takes_counts_for_projections(workbook, tmp_path, capsys):
         workbook.name,
         [4, 3, 2, 1],
     )
-    assert labels(made) == ["1 (frame 4)", "2 (frame 3)", "3 (frame 2)", "4 (frame 1)"]
-    assert caption(made).startswith("c.npy: frames lay back-v, 60 s. Shown: crystals seen from behind")
+    assert labels(made) == ["1 (4)", "2 (3)", "3 (2)", "4 (1)"]
+    assert caption(made).startswith("c.npy, 60 s, frames back-v. Module (frame): crystals seen from behind")
     assert main([*command, *told, "--write-recipe", str(tmp_path / "c.toml")]) == 0
     assert main(["project", str(tmp_path / "c.toml"), "-o", str(tmp_path / "again.npz")]) == 0
     np.testing.assert_array_equal(mph.read_run(tmp_path / "again.npz").projections, made.projections)
     assert main(["export", str(run), "-o", str(tmp_path / "copy.npz")]) == 0
-    assert main(["project", str(run), "--phantom", "points", "--voxels", "8", "-o", str(tmp_path / "p.h5")]) == 0
+    mph.write_volume(mph.Volume(np.ones((3, 3, 3)), mph.Grid.centered(3, 9.0), "activity"), tmp_path / "v.npz")
+    assert main(["project", str(run), "--volume", str(tmp_path / "v.npz"), "-o", str(tmp_path / "p.h5")]) == 0
     simulated = mph.read_run(tmp_path / "p.h5")
     assert simulated.volume is not None and simulated.views.shape == (8, 8) and simulated.unit == "counts"
     capsys.readouterr()

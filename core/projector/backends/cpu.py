@@ -8,7 +8,7 @@ float64, all others in float32.
 import ctypes
 import os
 import sys
-from ctypes import POINTER, Structure, c_char_p, c_int64, c_void_p
+from ctypes import POINTER, Structure, c_char_p, c_double, c_int64, c_void_p
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...errors import InputError
+from ..depth_response import PLANES, DepthResponse
 from ..rays import Attenuation, IndexFans, IndexRays, Rays
 
 Array = NDArray[Any]  # of float32 or float64
@@ -23,12 +24,21 @@ Array = NDArray[Any]  # of float32 or float64
 LEVEL_VARIABLE = "MPHDRR_CPU_LEVEL"
 """Environment variable that names a lower level of processor, `levels`, than this one's."""
 
-_CONTRACT = 2
+_CONTRACT = 4
 _NAMES = {"win32": "siddon.dll", "darwin": "libsiddon.dylib"}
 _MOST_VOXELS = 2**31 - 1  # their indices are of 32 bits
 _MOST_ALONG = 2**12  # where float32 knows the length of a segment to 0.1 %
 
-_FAN = np.dtype([("volume", "(4,3)f8"), ("mu", "(4,3)f8"), ("world", "(3,3)f8"), ("rows", "i8"), ("columns", "i8")])
+_FAN = np.dtype(
+    [
+        ("volume", "(4,3)f8"),
+        ("mu", "(4,3)f8"),
+        ("world", "(3,3)f8"),
+        ("rows", "i8"),
+        ("columns", "i8"),
+        ("parallel", "f8"),
+    ]
+)
 
 
 class _Lattice(Structure):
@@ -48,21 +58,42 @@ class _Job(Structure):
     ]  # fmt: skip
 
 
+class _DepthJob(Structure):
+    _fields_ = [
+        ("is_double", c_int64), ("volume", _Lattice), ("first", c_int64), ("last", c_int64), ("matrix", c_double * 12),
+        ("nearest", c_double), ("first_plane", c_double), ("planes_per_inverse", c_double), ("passes", c_void_p),
+        ("cells", c_void_p), ("rows", c_int64), ("columns", c_int64), ("kernel", c_void_p), ("taps", c_int64 * 2),
+        ("step", c_int64 * 2), ("image", c_void_p), ("pixels", c_int64 * 2),
+    ]  # fmt: skip
+
+
+class _Smear(Structure):
+    _fields_ = [
+        ("images", c_void_p), ("matrices", c_void_p), ("views", c_int64), ("rows", c_int64), ("columns", c_int64),
+        ("volume", c_void_p), ("n", c_int64 * 3),
+    ]  # fmt: skip
+
+
 def _load() -> ctypes.CDLL:
     """The library in this package."""
     path = Path(__file__).with_name("kernels") / _NAMES.get(sys.platform, "libsiddon.so")
     if not path.is_file():
         raise ImportError(f"no compiled kernels for this platform: {path.name} is not in {path.parent}")
     library = ctypes.CDLL(str(path))
-    numbers = (c_int64 * 3)()
+    numbers = (c_int64 * 5)()
     library.contract(numbers)
-    if list(numbers) != [_CONTRACT, ctypes.sizeof(_Job), _FAN.itemsize]:
+    sizes = (ctypes.sizeof(_Job), _FAN.itemsize, ctypes.sizeof(_DepthJob), ctypes.sizeof(_Smear))
+    if tuple(numbers) != (_CONTRACT, *sizes):
         raise ImportError(f"{path} belongs to another version of mphDRR: install it anew")
     library.best_level.restype, library.level_name.restype = c_int64, c_char_p
     library.level_name.argtypes = [c_int64]
     for name in ("forward", "backproject", "differentiate", "differentiate_by_mu"):
         function = getattr(library, name)
         function.argtypes, function.restype = [c_int64, POINTER(_Job)], None
+    for name in ("voxels_to_cells", "cells_to_voxels", "cells_to_pixels", "pixels_to_cells"):
+        function = getattr(library, name)
+        function.argtypes, function.restype = [c_int64, POINTER(_DepthJob)], None
+    library.smear.argtypes, library.smear.restype = [c_int64, POINTER(_Smear)], None
     return library
 
 
@@ -111,6 +142,18 @@ def mu_gradient(gradient: Array, volume: Array, values: Array, rays: Rays, atten
     _run(_library.differentiate_by_mu, volume, rays, attenuation, values, integrals=integrals, gradient=gradient)
 
 
+def smear(volume: Array, images: Array, matrices: NDArray[np.float64]) -> None:
+    """Add to `volume`, float32, what each image has at its voxels' places, as `voxel_driven.smear` describes it."""
+    if not (volume.flags.c_contiguous and images.flags.c_contiguous and matrices.flags.c_contiguous):
+        raise ValueError("expected arrays in C order")
+    if (volume.dtype, images.dtype, matrices.dtype) != (np.float32, np.float32, np.float64):
+        raise TypeError("expected voxels and images of float32, matrices of float64")
+    if matrices.shape != (len(images), 3, 4) or not volume.flags.writeable or min(images.shape[1:]) < 4:
+        raise ValueError("expected a matrix for each image, images with margins, and a volume that can be written")
+    addresses = images.ctypes.data, matrices.ctypes.data
+    _library.smear(level, _Smear(*addresses, *images.shape, volume.ctypes.data, (c_int64 * 3)(*volume.shape)))
+
+
 def _run(
     kernel: Any, volume: Array, rays: Rays, attenuation: Attenuation | None, values: Array | None = None, **others: Any
 ) -> None:
@@ -152,6 +195,8 @@ def _fans(rays: IndexFans, mu_rays: Any) -> Array:
     if mu_rays is not None:
         fans["mu"] = mu_rays.table[:, :4]
     fans["rows"], fans["columns"] = rays.shape
+    if rays.parallel:
+        fans["parallel"], fans["world"][:, 1:] = 1, 0
     return fans
 
 
@@ -168,3 +213,60 @@ def _lattice(voxels: Array, like: Array, written: bool = False) -> _Lattice:
     if not of_the_kind or not flags.c_contiguous or written > flags.writeable:
         raise TypeError(f"expected C-ordered voxels of {like.dtype}, got {kind}, strides {voxels.strides}")
     return _Lattice(voxels.ctypes.data, voxels.shape)
+
+
+def voxels_to_cells(volume: Array, of: DepthResponse, passes: Array | None = None) -> Array:
+    """What `volume` (n_x, n_y, n_z) gives to the cells (rows, columns, PLANES) of a view's fine image.
+
+    `passes`, of the volume's shape, are the shares of photons that attenuation leaves.
+    """
+    cells = np.zeros((*of.cells, PLANES), volume.dtype)
+    _run_depth(_library.voxels_to_cells, of, cells, volume, passes)
+    return cells
+
+
+def cells_to_voxels(volume: Array, cells: Array, of: DepthResponse, passes: Array | None, slab: slice) -> None:
+    """Add to the `slab` of `volume` along x, in place, what the adjoint of `voxels_to_cells` gives."""
+    _run_depth(_library.cells_to_voxels, of, cells, volume, passes, slab)
+
+
+def cells_to_pixels(cells: Array, of: DepthResponse) -> Array:
+    """The image (n_v, n_u) of a view's cells."""
+    image = np.empty(of.after.shape, cells.dtype)
+    _run_depth(_library.cells_to_pixels, of, cells, image=image)
+    return image
+
+
+def pixels_to_cells(image: Array, of: DepthResponse) -> Array:
+    """The adjoint of `cells_to_pixels`."""
+    cells = np.zeros((*of.cells, PLANES), image.dtype)
+    _run_depth(_library.pixels_to_cells, of, cells, image=np.ascontiguousarray(image))
+    return cells
+
+
+def _run_depth(
+    kernel: Any,
+    of: DepthResponse,
+    cells: Array,
+    volume: Array | None = None,
+    passes: Array | None = None,
+    slab: slice = slice(None),
+    image: Array | None = None,
+) -> None:
+    """Run a kernel on one view."""
+    taps = np.ascontiguousarray(of.kernel, cells.dtype)
+    job = _DepthJob(
+        is_double=cells.dtype == np.float64,
+        matrix=tuple(of.matrix.ravel().tolist()),
+        nearest=of.nearest, first_plane=of.first_plane, planes_per_inverse=of.planes_per_inverse,
+        cells=cells.ctypes.data, rows=of.cells[0], columns=of.cells[1],
+        kernel=taps.ctypes.data, taps=taps.shape[:2], step=of.steps, pixels=of.after.shape,
+        passes=None if passes is None else passes.ctypes.data,
+        image=None if image is None else image.ctypes.data,
+    )  # fmt: skip
+    if volume is not None:
+        job.volume = _lattice(volume, cells, kernel is _library.cells_to_voxels)
+        job.first, job.last, _ = slab.indices(len(volume))
+    if passes is not None and (passes.shape != volume.shape or passes.dtype != cells.dtype):  # type: ignore[union-attr]
+        raise ValueError(f"expected passes of the volume's shape and type, got {passes.shape}, {passes.dtype}")
+    kernel(level, job)

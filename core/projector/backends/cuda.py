@@ -40,7 +40,7 @@ DEVICE_VARIABLE = "MPHDRR_CUDA_DEVICE"
 
 _RAYS_AT_ONCE = 2**24
 _FEWEST_RAYS = 2**14  # some megabytes; torch may hold memory that it does not use
-_BYTES_OF_A_FAN = 2 * 8 * 24  # in the index space of the volume and of mu
+_BYTES_OF_A_FAN = 2 * 9 * 24  # in the index space of the volume and of mu
 _BYTES_OF_A_PLANE = 2**31  # Warp's strides are 32 bits wide; offsets are 64
 
 _ROOM_FOR_KERNELS = 16 * 2**20
@@ -218,14 +218,17 @@ class _Call:
 
 
 def _table(rays: Rays) -> tuple[NDArray[np.float64], int, int]:
-    """Rays as the kernels take them: fans (F, 8, 3), their rows and columns. A single ray is a fan, too."""
+    """Rays as the kernels take them: fans (F, 9, 3), their rows and columns. A single ray is a fan, too."""
+    table = np.zeros((len(rays) if isinstance(rays, IndexRays) else len(rays.table), 9, 3))
     if isinstance(rays, IndexRays):
-        table = np.zeros((len(rays), 8, 3))
         table[:, 0] = rays.starts
         table[:, 1] = rays.starts + rays.directions
         table[:, 5, 0] = rays.lengths
         return table, 1, 1
-    return rays.table, *rays.shape
+    table[:, :8] = rays.table
+    if rays.parallel:
+        table[:, 6:8], table[:, 8] = 0.0, 1.0
+    return table, *rays.shape
 
 
 def _copy_back(array: Any, to: ArrayOrTensor) -> None:

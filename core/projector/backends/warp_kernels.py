@@ -42,7 +42,8 @@ _Volume: Any = wp.array3d(dtype=wp.float32)
 _Numbers: Any = wp.array3d(dtype=wp.float32)  # one per ray: fan, row, column
 _Rows: Any = wp.array4d(dtype=wp.float32)  # several per ray
 _Fans: Any = wp.array2d(dtype=wp.vec3d)
-"""Source, corner, row step and column step of each fan, in index space and then in world mm."""
+"""Source, corner, row step and column step of each fan, in index space and then in world mm; then 1 where its rays are
+parallel, which have no steps in world mm, 0 where they are not."""
 
 
 @wp.struct
@@ -110,6 +111,8 @@ def _ray(fans: _Fans, fan: int, row: int, column: int):
     """Start and direction of a ray in index space."""
     s = fans[fan, 0]
     e = fans[fan, 1] + fans[fan, 2] * wp.float64(row) + fans[fan, 3] * wp.float64(column)
+    if fans[fan, 8][0] != wp.float64(0.0):
+        s = e - (fans[fan, 1] - s)
     sx, dx = _snapped(s[0], e[0])
     sy, dy = _snapped(s[1], e[1])
     sz, dz = _snapped(s[2], e[2])

@@ -2,14 +2,14 @@
 
 #include "kernels.h"
 
-typedef void Kernel(const Job *);
-
-// Level by level, what siddon.c is compiled to.
+// Level by level, what siddon.c and depth.c are compiled to; backprojection.c is compiled for float alone.
 #ifdef __x86_64__
 #define EACH(name) name##_0_float, name##_0_double, name##_1_float, name##_1_double, name##_2_float, name##_2_double
+#define EACH_LEVEL(name) name##_0, name##_1, name##_2
 static const char *const names[] = {"SSE2", "AVX2", "AVX-512"};
 #else // arm64
 #define EACH(name) name##_0_float, name##_0_double
+#define EACH_LEVEL(name) name##_0
 static const char *const names[] = {"NEON"};
 #endif
 
@@ -19,26 +19,42 @@ static const char *const names[] = {"NEON"};
 #else
 #define EXPORT __attribute__((visibility("default")))
 #endif
-#define DISPATCH(name)                                  \
-    Kernel EACH(name);                                  \
-    EXPORT void name(int64_t level, const Job *job) {   \
-        static Kernel *const kernels[] = {EACH(name)};  \
-        kernels[2 * level + job->is_double](job);       \
+#define DISPATCH(name, Task)                                 \
+    Kernel##Task EACH(name);                                 \
+    EXPORT void name(int64_t level, const Task *job) {       \
+        static Kernel##Task *const kernels[] = {EACH(name)}; \
+        kernels[2 * level + job->is_double](job);            \
     }
 
-DISPATCH(forward)
-DISPATCH(backproject)
-DISPATCH(differentiate)
-DISPATCH(differentiate_by_mu)
+typedef void KernelJob(const Job *);
+typedef void KernelDepthJob(const DepthJob *);
+typedef void KernelSmear(const Smear *);
+
+DISPATCH(forward, Job)
+DISPATCH(backproject, Job)
+DISPATCH(differentiate, Job)
+DISPATCH(differentiate_by_mu, Job)
+DISPATCH(voxels_to_cells, DepthJob)
+DISPATCH(cells_to_voxels, DepthJob)
+DISPATCH(cells_to_pixels, DepthJob)
+DISPATCH(pixels_to_cells, DepthJob)
+
+KernelSmear EACH_LEVEL(smear);
+EXPORT void smear(int64_t level, const Smear *job) {
+    static KernelSmear *const kernels[] = {EACH_LEVEL(smear)};
+    kernels[level](job);
+}
 
 EXPORT const char *level_name(int64_t level) {
     return level < (int64_t)(sizeof(names) / sizeof(names[0])) ? names[level] : 0;
 }
 
-EXPORT void contract(int64_t numbers[3]) {
+EXPORT void contract(int64_t numbers[5]) {
     numbers[0] = CONTRACT;
     numbers[1] = sizeof(Job);
     numbers[2] = sizeof(Fan);
+    numbers[3] = sizeof(DepthJob);
+    numbers[4] = sizeof(Smear);
 }
 
 #ifdef __x86_64__

@@ -64,8 +64,9 @@ typedef struct {
 } Rays;
 
 // One axis of the rays to the points (row, column) of a fan; rays that nearly lie in a plane of voxel faces lie in it.
-INLINE void fan_ray(const double fan[4][3], int a, D row, D column, D *start, D *direction) {
-    const D from = fan[0][a], to = column * fan[3][a] + (row * fan[2][a] + fan[1][a]), plane = rounded(from);
+INLINE void fan_ray(const double fan[4][3], double parallel, int a, D row, D column, D *start, D *direction) {
+    const D to = column * fan[3][a] + (row * fan[2][a] + fan[1][a]);
+    const D from = parallel != 0 ? to - (fan[1][a] - fan[0][a]) : (D)fan[0][a], plane = rounded(from);
     const B in_plane = (ABS(from - plane) <= (D)SNAP) & (ABS(to - plane) <= (D)SNAP);
     *start = in_plane ? plane : from;
     *direction = (in_plane | (ABS(to - *start) <= (D)SNAP)) ? (D)0 : to - *start;
@@ -75,8 +76,8 @@ INLINE void fan_rays(const Fan *fan, D number, const int own, Rays *r) {
     const D row = whole((number + 0.5) * (1.0 / fan->columns)), column = number - row * fan->columns;
     D squared = 0;
     EACH_AXIS(a) {
-        fan_ray(fan->volume, a, row, column, &r->start[a], &r->direction[a]);
-        if (own) fan_ray(fan->mu, a, row, column, &r->mu_start[a], &r->mu_direction[a]);
+        fan_ray(fan->volume, fan->parallel, a, row, column, &r->start[a], &r->direction[a]);
+        if (own) fan_ray(fan->mu, fan->parallel, a, row, column, &r->mu_start[a], &r->mu_direction[a]);
         const D mm = column * fan->world[2][a] + (row * fan->world[1][a] + fan->world[0][a]);
         squared += mm * mm;
     }

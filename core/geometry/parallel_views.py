@@ -1,0 +1,67 @@
+"""Views from infinity: parallel rays, as in a parallel-beam tomograph."""
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from ..errors import InputError
+from ..validation import lengths, one_for_all, real_array, whole_shape
+from .frames import module_frames
+from .views import Views
+
+
+def parallel_views(
+    angles: ArrayLike,
+    shape: tuple[int, int],
+    pitch: ArrayLike,
+    elevation: ArrayLike = 0.0,
+    center: ArrayLike = (0.0, 0.0, 0.0),
+) -> Views:
+    """Views whose sources are at infinity, around the z axis.
+
+    They are what `PinholeSystem.views` shows of modules ever farther away: the source of angle phi and elevation theta lies
+    in the direction ``(cos theta cos phi, cos theta sin phi, sin theta)``, the rays run the other way, and images have u
+    and v of `module_frames`. At elevation 0 columns go along ``u = (sin phi, -cos phi, 0)`` and rows along +z.
+
+    Parameters
+    ----------
+    angles : array (M,)
+        Of the sources around z, from x towards y, rad.
+    shape
+        Pixels (n_v, n_u).
+    pitch
+        Of the pixels, mm: one number, or (pitch_u, pitch_v).
+    elevation : number or array (M,)
+        Of the sources over the plane z = 0, rad, from -pi/2 to pi/2.
+    center
+        World point (3,), mm, that all images have in their middle.
+
+    Returns
+    -------
+    Views
+        Parallel ones. Their detectors and, in place of the sources, the points from which `Views.rays` begins, are 1 m and
+        four diagonals of the image from `center`; a projector's rays are whole lines.
+
+    Raises
+    ------
+    InputError
+        No angles, or an argument of another shape or out of its range.
+
+    Examples
+    --------
+    >>> views = parallel_views(np.arange(180) * np.pi / 180, (128, 128), 1.0)
+    >>> images = Projector(grid, views)(volume)
+    """
+    angles = real_array(angles, "angles", (None,))
+    if not len(angles):
+        raise InputError("angles: expected one or more, got none")
+    shape = whole_shape(shape, "image shape", 2)
+    pitch_u, pitch_v = lengths(pitch, "pixel pitch", 2)
+    elevation = one_for_all(elevation, "elevation", len(angles))
+    if np.abs(elevation).max() > np.pi / 2 + 1e-12:
+        raise InputError(f"elevation: expected from -pi/2 to pi/2 rad, got {elevation[np.abs(elevation).argmax()]:g}")
+    center = real_array(center, "center", (3,))
+    across = np.cos(elevation)
+    towards = np.stack([across * np.cos(angles), across * np.sin(angles), np.sin(elevation)], axis=1)
+    u, v, k = module_frames(towards).transpose(1, 0, 2)
+    reach = 1000.0 + 4.0 * float(np.hypot(shape[0] * pitch_v, shape[1] * pitch_u))
+    return Views(center - reach * k, center + reach * k, pitch_u * u, pitch_v * v, shape, parallel=True)

@@ -1,0 +1,80 @@
+"""A hole's image depth by depth, written to be read: the reference, in numpy. The functions are those of `cpu`."""
+
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..depth_response import PLANES, DepthResponse
+
+Array = NDArray[Any]
+
+
+def voxels_to_cells(volume: Array, of: DepthResponse, passes: Array | None = None) -> Array:
+    """What `volume` (n_x, n_y, n_z) gives to the cells (rows, columns, PLANES) of a view's fine image.
+
+    `passes`, of the volume's shape, are the shares of photons that attenuation leaves.
+    """
+    cells = np.zeros((*of.cells, PLANES))
+    for x in range(len(volume)):
+        given = volume[x] if passes is None else volume[x] * passes[x]
+        for where, weights in _shares(of, volume.shape, x):
+            np.add.at(cells, where, given * weights)
+    return cells
+
+
+def cells_to_voxels(volume: Array, cells: Array, of: DepthResponse, passes: Array | None, slab: slice) -> None:
+    """Add to the `slab` of `volume` along x, in place, what the adjoint of `voxels_to_cells` gives."""
+    for x in range(*slab.indices(len(volume))):
+        taken = sum(weights * cells[where] for where, weights in _shares(of, volume.shape, x))
+        volume[x] += taken if passes is None else taken * passes[x]
+
+
+def cells_to_pixels(cells: Array, of: DepthResponse) -> Array:
+    """The image (n_v, n_u) of a view's cells."""
+    image = np.zeros(of.after.shape)
+    for where, tap in _taps(of):
+        image += cells[where] @ tap
+    return image
+
+
+def pixels_to_cells(image: Array, of: DepthResponse) -> Array:
+    """The adjoint of `cells_to_pixels`."""
+    cells = np.zeros((*of.cells, PLANES))
+    for where, tap in _taps(of):
+        cells[where] += image[..., None] * tap
+    return cells
+
+
+def _taps(of: DepthResponse) -> Iterator[tuple[tuple[slice, slice], Array]]:
+    """For every tap of the kernel: the cells that it takes, as many as pixels, and its weights of the planes."""
+    for a, row in enumerate(of.kernel):
+        for b, tap in enumerate(row):
+            first = zip((a, b), of.steps, of.after.shape, strict=True)
+            rows, columns = (slice(start, start + step * (n - 1) + 1, step) for start, step, n in first)
+            yield (rows, columns), tap
+
+
+def _shares(of: DepthResponse, shape: tuple[int, ...], x: int) -> Iterator[tuple[tuple[Array, ...], Array]]:
+    """For a layer of voxels, all (n_y, n_z): indices of 3 x 3 x 2 cells each, and weights."""
+    y, z = np.meshgrid(np.arange(shape[1]), np.arange(shape[2]), indexing="ij")
+    column, row, depth = np.einsum("ij,jyz->iyz", of.matrix, np.stack([np.full(y.shape, x), y, z, np.ones(y.shape)]))
+    inverse = 1 / np.where(depth > of.nearest, depth, np.inf)
+    column, row = column * inverse, row * inverse
+    rows, columns = of.cells
+    inside = (inverse > 0) & (column >= 1) & (column <= columns - 2) & (row >= 1) & (row <= rows - 2)
+    column, row = np.where(inside, column, 1.0), np.where(inside, row, 1.0)
+    weight = inside * inverse**2
+    plane = np.clip((inverse - of.first_plane) * of.planes_per_inverse, 0, PLANES - 1)
+    lower = np.minimum(plane.astype(int), PLANES - 2)
+    middle_row, middle_column = (np.floor(place + 0.5).astype(int) for place in (row, column))
+    for a, by_row in enumerate(_spline(row - middle_row), -1):
+        for b, by_column in enumerate(_spline(column - middle_column), -1):
+            for k, by_plane in enumerate((1 - (plane - lower), plane - lower)):
+                yield (middle_row + a, middle_column + b, lower + k), weight * by_row * by_column * by_plane
+
+
+def _spline(offset: Array) -> tuple[Array, Array, Array]:
+    """The quadratic B-spline's shares of the cell before, the nearest and the one after."""
+    return (0.5 - offset) ** 2 / 2, 0.75 - offset**2, (0.5 + offset) ** 2 / 2

@@ -1,0 +1,107 @@
+"""File > Import > Measured Counts: frames of a real or another simulator's scanner become a run of the scene's scanner."""
+
+from typing import Any
+
+import bpy
+from bpy.props import (
+    BoolProperty,
+    CollectionProperty,
+    EnumProperty,
+    FloatProperty,
+    IntVectorProperty,
+    StringProperty,
+)
+
+from ..addon import choices, counts_import, ids, jobs, storage
+from ..addon.decimals import typed
+from ..core.runs.frame_files import COUNTS_FORMATS, RAW_TYPES
+from ..core.runs.orientations import ORIENTATIONS
+
+_UNSAID = "UNSAID"
+
+
+def _items(words: Any, text: str) -> choices.Items:
+    return choices.items({}, [(_UNSAID, "Not Said", text), *words])
+
+
+class MPHDRR_OT_import_counts(jobs.JobOperator, bpy.types.Operator):
+    """Read measured counts, a frame for each module of the scanner, as projections. Which frame is which module, how frames
+    lie on the crystals and the exposure time are never guessed: say them, and check the mosaic
+    """
+
+    bl_idname = ids.IMPORT_COUNTS
+    bl_label = "Import Measured Counts"
+    asks_for = "filepath"
+
+    filepath: StringProperty(name="File", description="With the counts", subtype="FILE_PATH", options={"SKIP_SAVE"})
+    directory: StringProperty(description="Where the files are", subtype="DIR_PATH", options={"SKIP_SAVE"})
+    files: CollectionProperty(
+        description="With counts, if several: their frames follow each other in the order of the names",
+        type=bpy.types.OperatorFileListElement, options={"SKIP_SAVE"},
+    )  # fmt: skip
+    filter_glob: StringProperty(default=";".join(f"*{ending}" for ending in COUNTS_FORMATS), options={"HIDDEN"})
+    frames: StringProperty(
+        name="Frames", description="Which module each frame is of: the modules' numbers in the frames' order, such as 1-80, "
+        "80-1 or 3,1,2",
+    )  # fmt: skip
+    orientation: EnumProperty(
+        name="Orientation",
+        description="How a frame, as a picture with row 0 at the top, lies on the crystal: seen from which side, with which "
+        "of the module's axes at the top",
+        items=_items([(word, *said) for word, said in ORIENTATIONS.items()], "Nothing is imported until it is said"),
+        default=_UNSAID,
+    )
+    time: FloatProperty(
+        name="Time (s)", description="Exposure of the frames in seconds; 0: not said", default=0.0, min=0.0,
+        options={"SKIP_SAVE"},
+    )  # fmt: skip
+    pixel: FloatProperty(
+        name="Pixel (mm)",
+        description="Side in mm of a pixel on the crystal; 0: the crystal's side divided by the number of pixels",
+        default=0.0, min=0.0,
+    )  # fmt: skip
+    modules: StringProperty(name="Modules", description="That have frames, such as 1-40. Empty: all")
+    expected: BoolProperty(name="Expected Means", description="The numbers are expected counts, which may be fractions")
+    dataset: StringProperty(name="Array", description="Its name in .npz and .h5. Empty: the only one of three axes")
+    raw_type: EnumProperty(
+        name="Type", description="Of the numbers in a raw file",
+        items=_items([(name, name, "") for name in RAW_TYPES], "The file is not raw"), default=_UNSAID,
+    )  # fmt: skip
+    raw_shape: IntVectorProperty(
+        name="Shape", description="Frames, rows and columns of a raw file", size=3, default=(0, 0, 0), min=0
+    )
+    raw_big_endian: BoolProperty(name="Big-Endian", description="The most significant byte of a number comes first")
+
+    def draw(self, context: bpy.types.Context) -> None:
+        layout = self.layout
+        layout.use_property_split = True
+        layout.use_property_decorate = False
+        for name in ("frames", "orientation", "time"):
+            layout.prop(self, name)
+        column = layout.column(heading="If Needed")
+        for name in ("modules", "pixel", "expected", "dataset"):
+            column.prop(self, name)
+        column = layout.column(heading="Raw File")
+        for name in ("raw_type", "raw_shape", "raw_big_endian"):
+            column.prop(self, name)
+
+    def job(self, context: bpy.types.Context) -> jobs.Job:
+        names = sorted({item.name for item in self.files if item.name})
+        folder = storage.absolute(self.directory)
+        paths = [folder / name for name in names] if len(names) > 1 else [storage.absolute(self.filepath)]
+        return counts_import.importing(context, paths if self.filepath or names else [], self._said())
+
+    def _said(self) -> dict[str, Any]:
+        """The entries of a recipe that are given; None for the others."""
+        return {
+            "counts.frames": self.frames or None,
+            "counts.orientation": None if self.orientation == _UNSAID else [self.orientation],
+            "counts.expected": self.expected or None,
+            "counts.dataset": self.dataset or None,
+            "counts.raw_type": None if self.raw_type == _UNSAID else self.raw_type,
+            "counts.raw_shape": tuple(self.raw_shape) if any(self.raw_shape) else None,
+            "counts.raw_big_endian": self.raw_big_endian or None,
+            "model.time": typed(self.time) or None,
+            "detector.pitch": typed(self.pixel) or None,
+            "system.modules": self.modules or None,
+        }

@@ -1,0 +1,88 @@
+"""File > Import > Measured Counts: a run of the scene's scanner like those that it projects, once all is said."""
+
+from __future__ import annotations
+
+import bpy
+import numpy as np
+import pytest
+
+from mphdrr.addon import ids, images, runs, scanner, storage
+from mphdrr.core.geometry.system import PinholeSystem
+from mphdrr.core.runs.files import read_run
+
+
+@pytest.fixture
+def scanned(scene, ring_system) -> PinholeSystem:
+    scanner.build_scanner(scene, ring_system, "Ring")
+    return ring_system
+
+
+@pytest.fixture
+def counts(tmp_path) -> np.ndarray:
+    frames = np.random.default_rng(2).poisson(5.0, (8, 6, 6))
+    np.save(tmp_path / "counts.npy", frames)
+    return frames
+
+
+SAID = {"frames": "8-1", "orientation": "back-v", "time": 60.0}
+
+
+def test_counts_become_the_shown_run(scanned, counts, scene, tmp_path):
+    settings = scene.mphdrr_projections
+    settings.model = "EMISSION"
+    settings.isotope, settings.width, settings.detector = "Tc-99m", 99, "VIRTUAL"
+    path = str(tmp_path / "counts.npy")
+    assert bpy.ops.mphdrr.import_counts(filepath=path, **SAID) == {"FINISHED"}
+    run = read_run(storage.absolute(settings.run_file))
+    np.testing.assert_array_equal(run.projections, counts[::-1])
+    np.testing.assert_allclose(run.system.centers, scanned.centers, rtol=1e-12)
+    assert (run.volume, run.unit, run.settings["orientation"]) == (None, "counts", "back-v")
+    assert (run.recipe["model.isotope"], run.recipe["model.time"]) == ("Tc-99m", 60.0)
+    for m, number in enumerate(run.system.numbers):
+        assert np.array_equal(images.projection_array(bpy.data.images[ids.projection_name(number, 8)]), counts[7 - m])
+    assert len(settings.runs) == 1 and settings.runs[0].name == "counts.npy, emission"
+    assert runs.measured_text(scene).startswith("counts.npy, 60 s, frames back-v.") and not runs.changes(scene)
+    assert runs.volume_to_render(scene) == ""
+    bpy.data.objects["Module 03"].location.x += 1.0
+    bpy.context.view_layer.update()
+    assert runs.changes(scene) == ["Module 03 moved"]
+    assert bpy.ops.mphdrr.export_dataset(filepath=str(tmp_path / "out.npz")) == {"FINISHED"}
+    assert read_run(tmp_path / "out.npz").volume is None
+    settings.runs[0].keep = True
+    assert bpy.ops.mphdrr.import_counts(filepath=path, **(SAID | {"frames": "1-8"})) == {"FINISHED"}
+    assert bpy.ops.mphdrr.compare_runs(other="0") == {"FINISHED"}
+    assert bpy.ops.mphdrr.load_recipe(filepath=str(tmp_path / "out.npz")) == {"FINISHED"}
+    assert (settings.model, settings.time, settings.detector) == ("EMISSION", 60.0, "REAL")
+
+
+def test_frames_of_some_modules_from_several_files(scanned, scene, tmp_path):
+    for number in (3, 4):
+        np.save(tmp_path / f"head{number}.npy", np.full((4, 4), number))
+    said = {"frames": "3,4", "orientation": "front+u", "time": 5.0, "modules": "3-4", "pixel": 2.0}
+    files = [{"name": "head4.npy"}, {"name": "head3.npy"}]
+    given = {"filepath": str(tmp_path / "head3.npy"), "directory": str(tmp_path), "files": files}
+    assert bpy.ops.mphdrr.import_counts(**given, **said) == {"FINISHED"}
+    run = read_run(storage.absolute(scene.mphdrr_projections.run_file))
+    assert run.projections.mean(axis=(1, 2)).tolist() == [3, 4] and run.system.numbers.tolist() == [3, 4]
+    assert run.recipe["detector.pitch"] == 2.0 and not runs.changes(scene)
+
+
+@pytest.mark.parametrize(
+    ("said", "message"),
+    [
+        ({"frames": ""}, "8 frames of 6 x 6 pixels; say which module each frame is of"),
+        ({"orientation": "UNSAID"}, "say how frames lie on the crystal"),
+        ({"time": 0.0}, "say the exposure time in seconds"),
+        ({"frames": "1-7,7"}, "module 7 has several frames"),
+        ({"filepath": ""}, "no file given"),
+    ],
+)
+def test_what_is_not_said_is_asked_for(scanned, counts, scene, tmp_path, said, message):
+    with pytest.raises(RuntimeError, match=message):
+        bpy.ops.mphdrr.import_counts(**({"filepath": str(tmp_path / "counts.npy")} | SAID | said))
+    assert not scene.mphdrr_projections.runs
+
+
+def test_without_a_scanner_there_is_nothing_to_import_into(scene, counts, tmp_path):
+    with pytest.raises(RuntimeError, match="scanner"):
+        bpy.ops.mphdrr.import_counts(filepath=str(tmp_path / "counts.npy"), **SAID)

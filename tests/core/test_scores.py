@@ -69,6 +69,12 @@ def test_a_uniform_volume_resolves_nothing():
     )
 
 
+def test_noise_alone_has_no_valleys_on_average(rng):
+    grid = mph.Grid.centered((64, 64, 24), 1.0)
+    score = mph.derenzo_score(mph.Volume(rng.gamma(2.0, 5.0, grid.shape), grid), PHANTOM)
+    assert score.valley_to_peak[2:5] == pytest.approx(1.0, abs=0.1) and (score.resolved[:5] < 0.3).all()
+
+
 @pytest.mark.parametrize("sigma", [1.2, 2.0])
 def test_blurred_rods_have_the_valleys_of_theory(sigma):
     grid = mph.Grid.centered((160, 160, 14), (0.4, 0.4, 1.0))

@@ -44,7 +44,11 @@ from .physics.performance import ModulePerformance, isocentre_performance, magni
 from .physics.sampling import sampling_gaps
 from .progress import Cancelled, Progress
 from .projector import Emission, InverseSquareSum, Projector, Transmission, intensity, trace_rays
+from .reconstruction.adapters import deepinv_physics, parallelproj_operator, pytomography_matrix, scipy_operator
+from .reconstruction.bsrem import bsrem
 from .reconstruction.expectation import mlem, osem
+from .reconstruction.fbp import fbp
+from .reconstruction.fdk import fdk
 from .reconstruction.files import read_reconstruction, write_reconstruction
 from .reconstruction.priors import Prior, Quadratic, RelativeDifference, TotalVariation
 from .reconstruction.result import Reconstruction

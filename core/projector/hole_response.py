@@ -25,6 +25,7 @@ from numpy.typing import NDArray
 from ..errors import InputError
 from ..geometry.grid import Grid
 from ..geometry.views import Views
+from ..physics.crystal import share_inside
 from .depth_response import PLANES, DepthResponse
 from .models import view_rays
 
@@ -38,13 +39,13 @@ _MOST_RATIO = 1.8
 
 
 def hole_response(
-    views: Views, m: int, grid: Grid, frame: Array, l: float, d: float, weigh: Weigh, shares: Weigh
+    views: Views, m: int, grid: Grid, frame: Array, l: float, d: float, side: float, weigh: Weigh
 ) -> DepthResponse:
     """The response of view m to a hole of diameter d.
 
-    `frame` has the module's u, v, k and `l` is the collimator's length. ``weigh(along_u, along_v)`` and ``shares(...)`` give
-    arrays (rows, columns) for places on the crystal, mm, point-inverted: what a mm^3 counts times its squared depth in mm^2
-    along lines through the hole's middle, and what part of a pixel there is on the crystal.
+    `frame` has the module's u, v, k, `l` is the collimator's length, and pixels count only within the crystal's `side`.
+    ``weigh(along_u, along_v)`` is what a mm^2 of the crystal counts per (decay / (s mm^3) mm) along lines through the hole's
+    middle to these places on the crystal, mm, point-inverted.
 
     Raises
     ------
@@ -77,13 +78,20 @@ def hole_response(
     # A photon's direction, on which its counts depend, lies between that of the voxel and that of the pixel as seen from
     # the hole's middle, l / (l + h) of the way: so the factors of either are powers that are 1 together.
     share = l / (l + 2 / (1 / near + 1 / far))
-    of_direction = weigh(*along[::-1]) ** (1 - share)
-    of_pixel = weigh(*pixels[::-1]) ** share * shares(*pixels[::-1])
+    of_direction, of_pixel = _weights(weigh, along, l) ** (1 - share), _weights(weigh, pixels, l) ** share
+    on_v, on_u = (share_inside(at, abs(pitch), side) for at, pitch in zip(pixels, pitches, strict=True))
+    of_pixel = of_pixel * (on_v[:, None] * on_u)
     spacing = (inverses[-1] - inverses[0]) / (PLANES - 1)
     return DepthResponse(
         matrix, near / 2, float(inverses[0]), float(1 / spacing), n_cells,  # type: ignore[arg-type]
         grid.voxel_volume * l**2 * of_direction, kernel, steps, of_pixel,  # type: ignore[arg-type]
     )  # fmt: skip
+
+
+def _weights(weigh: Weigh, places: list[Array], l: float) -> Array:
+    """What a mm^3 counts, times its squared depth by l^2, along lines to `places` (rows, columns) on the crystal."""
+    v, u = places[0][:, None], places[1][None, :]
+    return weigh(u, v) * np.sqrt(1 + (u**2 + v**2) / l**2)
 
 
 def _depths(grid: Grid, pinhole: Array, k: Array, l: float) -> tuple[float, float]:

@@ -283,7 +283,7 @@ def truth_of_run(run: ProjectionRun) -> tuple[Volume | Phantom, NDArray[np.float
     recipe = run.recipe if "recipe" in run.settings else None
     if recipe is None or "phantom.matrix" not in recipe.given:
         return run.volume, None
-    return _phantom_of(recipe), phantom_pose(recipe)
+    return recipe_phantom(recipe), phantom_pose(recipe)
 
 
 def _mu_of_phantom(phantom: Phantom, pose: NDArray[np.float64], grid: Grid, model: Model, stages: Stages) -> Volume:

@@ -113,7 +113,8 @@ def nema_score(volume: Volume, phantom: NemaBody, pose: ArrayLike | None = None)
         for diameter, (x, y) in zip(phantom.sphere_diameters, sphere_places(), strict=True)
         if diameter
     ]
-    around = np.array([(x, y, z) for z in _SLICES for x, y in _background_places(phantom)])
+    places = _background_places(phantom)
+    around = np.array([(x, y, z) for z in _SLICES for x, y in places])
     true_contrast = phantom.sphere_activity / phantom.background - 1
     rows = []
     for diameter, place in spheres:

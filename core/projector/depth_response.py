@@ -21,6 +21,9 @@ Array = NDArray[Any]
 PLANES = 4
 """Planes of depth, evenly spaced in 1 / h: between two, an image is interpolated."""
 
+TAPS_TOGETHER = 4
+"""A row of a kernel is a multiple of so many taps."""
+
 # Layers of voxels that a thread adds to before it takes others, and views whose cells are in memory.
 _SLAB, _VIEWS_AT_ONCE = 4, 16
 

@@ -26,7 +26,7 @@ from ..errors import InputError
 from ..geometry.grid import Grid
 from ..geometry.views import Views
 from ..physics.crystal import share_inside
-from .depth_response import PLANES, DepthResponse
+from .depth_response import PLANES, TAPS_TOGETHER, DepthResponse
 from .models import view_rays
 
 Array = NDArray[np.float64]
@@ -35,7 +35,7 @@ Weigh = Callable[[Array, Array], Array]
 # Cells across the hole's shadow, at least.
 _CELLS_ACROSS = 15
 # Largest ratio of the largest and the smallest shadow of the hole: beyond, interpolation between planes shows.
-_MOST_RATIO = 1.8
+_MOST_RATIO = 2.2
 
 
 def hole_response(
@@ -67,12 +67,13 @@ def hole_response(
     shadows = [np.multiply(to_camera[axis, :3], np.sign(pitch)) for axis, pitch in zip((1, 0), pitches, strict=True)]
     kernel = _kernel(d, l * inverses, np.stack(shadows), np.abs(pitches), steps)
     margin = kernel.shape[0] // 2, kernel.shape[1] // 2
+    kernel = np.pad(kernel, ((0, 0), (0, -kernel.shape[1] % TAPS_TOGETHER), (0, 0)))
     matrix = np.empty((3, 4))
     for row, axis, i in ((1, 1, 0), (0, 0, 1)):  # rows follow v, columns u
         per_slope = steps[i] * l / pitches[i]
         matrix[row] = per_slope * to_camera[axis] + (margin[i] - steps[i] * firsts[i] / pitches[i]) * to_camera[2]
     matrix[2] = to_camera[2]
-    n_cells = tuple(steps[i] * (views.shape[i] - 1) + 1 + 2 * margin[i] for i in range(2))
+    n_cells = tuple(steps[i] * (views.shape[i] - 1) + kernel.shape[i] for i in range(2))
     along = [firsts[i] + pitches[i] / steps[i] * (np.arange(n_cells[i]) - margin[i]) for i in range(2)]
     pixels = [firsts[i] + pitches[i] * np.arange(views.shape[i]) for i in range(2)]
     # A photon's direction, on which its counts depend, lies between that of the voxel and that of the pixel as seen from

@@ -15,7 +15,7 @@ def test_a_reconstruction_is_seen_while_it_runs(blender_window, work_folder):
     seen = json.loads(result_file.read_text())
     assert seen["ok"], seen
     first, second = seen["iterations"]
-    assert 1 <= first < second < 90
+    assert 1 <= first < second < 20000
     assert seen["while"] == seen["volume"] == seen["active"] and seen["volume"].endswith("OSEM")
     assert seen["title"].startswith("OSEM, ") and seen["scores"][:2] == ["NRMSE", "8 mm rods"]
     assert seen["image"] == "mphDRR reconstruction"

@@ -44,7 +44,7 @@ def prepare() -> None:
         bpy.utils.unregister_class(cls)
         bpy.utils.register_class(type(cls.__name__, (cls,), {"bl_options": {"DEFAULT_CLOSED"}}))
     settings = bpy.context.scene.mphdrr_reconstruction
-    settings.voxels, settings.spacing, settings.iterations, settings.subsets = 32, 3.0, 90, 4
+    settings.voxels, settings.spacing, settings.iterations, settings.subsets = 32, 3.0, 20000, 4
     bpy.ops.object.select_all(action="DESELECT")
     for item in bpy.context.scene.objects:
         if item.type == "VOLUME":

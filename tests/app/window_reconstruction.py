@@ -14,7 +14,6 @@ result_file = Path(sys.argv[sys.argv.index("--") + 1])
 bpy.context.preferences.view.show_splash = False
 WORKBOOK = str(Path(bpy.utils.user_resource("EXTENSIONS")) / "user_default/mphdrr/examples/dc-spect-80.xlsx")
 seen: dict = {"ok": False, "iterations": []}
-PANELS = ("geometry", "phantom", "projections", "runs", "export")
 
 
 def view(kind: str = "VIEW_3D"):
@@ -36,13 +35,13 @@ def load() -> None:
 
 
 def prepare() -> None:
-    """Only this panel is open, so that all of it is on the screen."""
+    """Only this panel is there, so that all of it is on the screen."""
     sidebar = next(region for region in view()["area"].regions if region.type == "UI")
     sidebar.active_panel_category = "mphDRR"
-    for name in PANELS:
-        cls = getattr(bpy.types, f"MPHDRR_PT_{name}")
+    ours = [getattr(bpy.types, name) for name in dir(bpy.types) if name.startswith("MPHDRR_PT_")]
+    others = [cls for cls in ours if "reconstruction" not in cls.__name__]
+    for cls in sorted(others, key=lambda cls: not hasattr(cls, "bl_parent_id")):  # a panel after those in it
         bpy.utils.unregister_class(cls)
-        bpy.utils.register_class(type(cls.__name__, (cls,), {"bl_options": {"DEFAULT_CLOSED"}}))
     settings = bpy.context.scene.mphdrr_reconstruction
     settings.voxels, settings.spacing, settings.iterations, settings.subsets = 32, 3.0, 20000, 4
     bpy.ops.object.select_all(action="DESELECT")

@@ -44,13 +44,18 @@ from .physics.performance import ModulePerformance, isocentre_performance, magni
 from .physics.sampling import sampling_gaps
 from .progress import Cancelled, Progress
 from .projector import Emission, InverseSquareSum, Projector, Transmission, intensity, trace_rays
+from .reconstruction.adapters import deepinv_physics, parallelproj_operator, pytomography_matrix, scipy_operator
+from .reconstruction.bsrem import bsrem
 from .reconstruction.expectation import mlem, osem
+from .reconstruction.fbp import fbp
+from .reconstruction.fdk import fdk
 from .reconstruction.files import read_reconstruction, write_reconstruction
 from .reconstruction.priors import Prior, Quadratic, RelativeDifference, TotalVariation
 from .reconstruction.result import Reconstruction
 from .reconstruction.scores.derenzo import DerenzoScore, DerenzoSector, RodProfile, derenzo_score
 from .reconstruction.scores.images import BiasAndDeviation, bias_and_deviation, contrast_to_noise, nrmse, psnr, ssim
 from .reconstruction.scores.nema import NemaScore, NemaSphere, nema_score
+from .reconstruction.scores.summary import VolumeScore, score_volume
 from .reconstruction.stopping import StopWhen
 from .runs.files import read_run, write_run
 from .runs.frame_files import read_counts

@@ -83,7 +83,7 @@ class Prior(ABC):
     neighbors: Literal[6, 26] = 6
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "weight", _at_least_0(self.weight, "prior: weight"))
+        object.__setattr__(self, "weight", at_least_0(self.weight, "prior: weight"))
         one_of(self.neighbors, (6, 26), "prior: neighbors")
         if self.anatomy is not None:
             instance(self.anatomy, Volume, "prior: anatomy")
@@ -191,7 +191,7 @@ class RelativeDifference(_PairPrior):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        object.__setattr__(self, "gamma", _at_least_0(self.gamma, "prior: gamma"))
+        object.__setattr__(self, "gamma", at_least_0(self.gamma, "prior: gamma"))
         object.__setattr__(self, "edge", positive(self.edge, "prior: edge", "kBq/mL"))
 
     def _parts(self, a: Array, b: Array) -> tuple[Array, Array]:
@@ -388,7 +388,8 @@ def _moved(box: tuple[slice, slice, slice], step: Any) -> tuple[slice, ...]:
     return tuple(slice(part.start + int(n), part.stop + int(n)) for part, n in zip(box, step, strict=True))
 
 
-def _at_least_0(value: Any, name: str) -> float:
+def at_least_0(value: Any, name: str) -> float:
+    """`value` as a finite number, 0 or more, or `InputError`."""
     number = float(real_array(value, name, ()))
     if number < 0:
         raise InputError(f"{name}: expected 0 or more, got {number:g}")

@@ -273,6 +273,19 @@ def recipe_phantom(recipe: Recipe) -> Phantom:
     return phantom
 
 
+def truth_of_run(run: ProjectionRun) -> tuple[Volume | Phantom, NDArray[np.float64] | None]:
+    """What a simulated run's images are of: the phantom that its recipe describes and its pose, else its volume and None.
+
+    `InputError` of a measured run.
+    """
+    if run.volume is None:
+        raise InputError("the run was measured: nobody knows the truth; give a volume or a phantom")
+    recipe = run.recipe if "recipe" in run.settings else None
+    if recipe is None or "phantom.matrix" not in recipe.given:
+        return run.volume, None
+    return recipe_phantom(recipe), phantom_pose(recipe)
+
+
 def _mu_of_phantom(phantom: Phantom, pose: NDArray[np.float64], grid: Grid, model: Model, stages: Stages) -> Volume:
     """What the phantom attenuates, on a grid."""
     if all(shape.mu is None for shape in phantom.shapes):

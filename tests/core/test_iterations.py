@@ -5,9 +5,19 @@ import pytest
 
 import mphdrr.core as mph
 
+from .conftest import BACKENDS
+
 METHODS = [
     pytest.param(lambda *given, **more: mph.mlem(*given, **more), id="mlem"),
     pytest.param(lambda *given, **more: mph.osem(*given, subsets=3, **more), id="osem"),
+    pytest.param(
+        lambda *given, **more: mph.osem(*given, subsets=2, prior=mph.Quadratic(0.01), **more), id="osem with prior"
+    ),
+    pytest.param(lambda *given, **more: mph.bsrem(*given, subsets=2, **more), id="bsrem"),
+    pytest.param(
+        lambda *given, **more: mph.bsrem(*given, subsets=2, prior=mph.RelativeDifference(0.1), relaxation=0.1, **more),
+        id="bsrem with prior",
+    ),
 ]
 
 
@@ -57,6 +67,17 @@ class TestEveryMethod:
         found = caught.value.reconstruction
         assert found.iterations == 2 and found.settings["stopped"] == "cancelled" and calls > 4
         assert_same(method(A, counts, 2, start=found), method(A, counts, 4))
+
+    def test_a_file_of_it_can_be_resumed(self, problem, method, tmp_path):
+        A, counts, _ = problem
+        half, path = method(A, counts, 2), tmp_path / "half.h5"
+        mph.write_reconstruction(half, path)
+        read = mph.read_reconstruction(path)
+        assert_same(read, half)
+        assert_same(method(A, counts, 2, start=read), method(A, counts, 4))
+        volume = mph.read_volume(path)
+        np.testing.assert_array_equal(volume.array, half.volume.array)
+        assert volume.grid == half.volume.grid and volume.quantity == "activity"
 
     def test_cancelled_by_the_callback_the_iteration_counts(self, problem, method):
         A, counts, _ = problem
@@ -141,6 +162,16 @@ class TestEveryMethod:
             method(given.pop("A"), given.pop("counts"), given.pop("iterations"), **given)
         assert "\n" not in str(caught.value)
 
+    @pytest.mark.long
+    @pytest.mark.parametrize("backend", BACKENDS)
+    def test_every_backend_finds_the_same(self, problem, method, backend):
+        A, counts, _ = problem
+        other = mph.Projector(A.grid, A.views, A.model, backend)
+        found, expected = method(other, counts, 2), method(A, counts, 2)
+        scale = expected.volume.array.max()
+        np.testing.assert_allclose(found.volume.array, expected.volume.array, rtol=1e-3, atol=1e-4 * scale)
+        assert_same(method(other, counts, 1, start=method(other, counts, 1)), found)
+
     def test_tensors_are_taken(self, problem, method):
         torch = pytest.importorskip("torch")
         A, counts, truth = problem
@@ -180,3 +211,30 @@ def test_what_nothing_can_have_caused_and_what_nobody_sees(problem):
     blind = B.T(np.ones(B.shape_out, np.float32)) == 0
     found = mph.osem(B, counts, 2, subsets=4).volume.array
     assert blind.any() and (found[blind] == 0).all() and (found[~blind] > 0).any()
+
+
+def test_files_that_hold_no_reconstruction_are_refused(problem, tmp_path):
+    A, counts, truth = problem
+    path = tmp_path / "volume.h5"
+    with pytest.raises(mph.InputError, match="no such file"):
+        mph.read_reconstruction(path)
+    mph.write_volume(mph.Volume(truth, A.grid), path)
+    with pytest.raises(mph.InputError, match=r"volume\.h5: it holds a volume, but no reconstruction"):
+        mph.read_reconstruction(path)
+    path.write_bytes(b"no HDF5")
+    with pytest.raises(mph.InputError, match=r"volume\.h5: cannot be read as"):
+        mph.read_reconstruction(path)
+    with pytest.raises(mph.InputError, match=r"ending in \.h5 or \.hdf5"):
+        mph.read_reconstruction(tmp_path / "volume.nii")
+    found = mph.mlem(A, counts, 1)
+    with pytest.raises(mph.InputError, match="no such folder"):
+        mph.write_reconstruction(found, tmp_path / "none" / "a.h5")
+    with pytest.raises(mph.InputError, match="expected a Reconstruction"):
+        mph.write_reconstruction(found.volume, tmp_path / "a.h5")
+    assert path.read_bytes() == b"no HDF5"
+    mph.write_reconstruction(found, path)
+    whole = path.read_bytes()
+    for end in range(200, len(whole), len(whole) // 7):
+        path.write_bytes(whole[:end])
+        with pytest.raises(mph.InputError):
+            mph.read_reconstruction(path)

@@ -1,0 +1,173 @@
+"""Penalised likelihood to its maximum, by relaxed steps of subsets: BSREM."""
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from ..memory import require
+from ..progress import Progress
+from ..projector import Projector
+from ..projector.subsets import access_order
+from .counts import LEAST, CountData
+from .expectation import sensitivities, subsets_of, usual_subsets
+from .loop import Loop, Start, waiting
+from .priors import Prior, at_least_0, penalty_of
+from .result import Array, Callback, Reconstruction
+from .stopping import StopWhen
+
+# Of a voxel's value: no update leaves less, so that one bad step can be mended.
+_LEAST_SHARE = np.float32(0.1)
+
+# Of the mean activity: voxels are moved as if they had so much more, so that those of 0 can grow.
+_LIFT = 0.01
+
+# Of the mean activity: less is 0.
+_NOTHING = 1e-6
+
+# Of the objective: less is rounding.
+_ROUNDING = 2e-9
+
+# Of what one step of all views promises: an iteration that gains less goes in circles, because its steps are too long.
+_LEAST_GAIN = 0.5
+
+# Of the steps: after so many nothing is gained by smaller ones.
+_MOST_HALVINGS = 20
+
+
+def bsrem(
+    A: Projector,
+    counts: ArrayLike,
+    iterations: int = 30,
+    subsets: int | None = None,
+    prior: Prior | None = None,
+    relaxation: float = 0.0,
+    background: ArrayLike = 0.0,
+    start: Start = None,
+    mask: ArrayLike | None = None,
+    callback: Callback | None = None,
+    progress: Progress | None = None,
+    stop: StopWhen | None = None,
+) -> Reconstruction:
+    """The activity with the largest penalised likelihood, ``log-likelihood - prior``: it ends there, as OSEM does not.
+
+    Each iteration takes a step for each subset of the views, ``x <- x + step * x / (s + x c) * gradient``, with s the
+    sensitivity and c the prior's curvature (and x lifted a little, so that zeros can grow). In the first iteration the
+    subset's gradient stands for that of all. From the second on it is corrected by what it was at the iteration's beginning,
+    where that of all views is known (Johnson & Zhang 2013, Twyman et al. 2023): so it ends at the maximum without the steps
+    having to shrink, in tens of iterations instead of thousands. Each costs about two of `osem`.
+
+    Parameters
+    ----------
+    A, counts, iterations, background, start, mask, callback, progress, stop
+        As of `mlem`, but zeros in `start` may grow, and without `start` it begins with the mean activity.
+    subsets : int, optional
+        By default about a fifth of the views' number.
+    prior : Quadratic, RelativeDifference or TotalVariation, optional
+        Without one it ends at the maximum of the likelihood, as `mlem` does, but sooner.
+    relaxation : float
+        Steps are ``1 / (1 + relaxation n)`` in iteration n, from 0. Besides, an iteration in which the objective would fall,
+        other than the first, is done again with half the step, and so are all that follow.
+
+    Returns
+    -------
+    Reconstruction
+        `objective` is the penalised log-likelihood after each iteration, without terms that no volume changes. Voxels that
+        no pixel sees are 0.
+
+    Raises
+    ------
+    InputError
+        As of `mlem`; and `relaxation` is negative.
+
+    References
+    ----------
+    A. R. De Pierro, M. E. B. Yamagishi, "Fast EM-like methods for maximum a posteriori estimates in emission tomography",
+    IEEE Transactions on Medical Imaging 20 (2001) 280-288.
+
+    S. Ahn, J. A. Fessler, "Globally convergent image reconstruction for emission tomography using relaxed ordered subsets
+    algorithms", IEEE Transactions on Medical Imaging 22 (2003) 613-626: bounds and scaling of the steps.
+
+    R. Johnson, T. Zhang, "Accelerating stochastic gradient descent using predictive variance reduction", Advances in Neural
+    Information Processing Systems 26 (2013) 315-323.
+
+    R. Twyman et al., "An investigation of stochastic variance reduction algorithms for relative difference penalized 3D PET
+    image reconstruction", IEEE Transactions on Medical Imaging 42 (2023) 29-41.
+    """
+    loop = Loop("BSREM", A, iterations, start, mask, callback, progress, stop)
+    data = CountData.of("BSREM", A, counts, background)
+    relaxation = at_least_0(relaxation, "relaxation")
+    penalty = penalty_of(prior, A.grid)
+    parts = subsets_of(A, data, usual_subsets(A) if subsets is None else subsets)
+    n = len(parts)
+    require(8 * n * A.grid.n_voxels, f"the gradients of {n} subsets")
+    seen = sensitivities(A, parts, loop.preparing())
+    total = np.sum(seen, axis=0)
+    visible = total > LEAST if loop.mask is None else (total > LEAST) & loop.mask
+    # At the maximum no voxel gives more counts than there are.
+    n_counts = data.counts.sum(dtype=float)
+    most = np.divide(np.float32(n_counts), total, out=np.zeros_like(total), where=visible)
+    mean = n_counts / max(float(total.sum(where=visible, dtype=float)), float(LEAST))
+    lift, nothing = np.float32(_LIFT * mean), np.float32(_NOTHING * mean)
+    loop.values = np.minimum(loop.values if start is not None else np.float32(mean), most)
+    images: list[Array] | None = None  # of the current volume in each subset, where they are known
+
+    def gradient(s: int, its_images: Array, asked: Progress | None) -> Array:
+        part, own = parts[s]
+        return part.T(own.ratio(its_images), asked) - seen[s]
+
+    def objective(x: Array, its_images: list[Array]) -> float:
+        likelihood = sum(own.log_likelihood(its) for (_, own), its in zip(parts, its_images, strict=True))
+        return likelihood - (0.0 if penalty is None else penalty.value(x))
+
+    def moved(x: Array, upwards: Array, scale: Array, size: float) -> Array:
+        """The volume a step further up a gradient, within its bounds."""
+        found = np.divide(x + lift, scale, out=np.zeros_like(x), where=visible)
+        found *= np.float32(size)
+        found *= upwards
+        found += x
+        found = np.clip(found, _LEAST_SHARE * x, most)
+        found[found < nothing] = 0
+        return found
+
+    def step(number: int, x: Array, progress: Progress | None) -> tuple[Array, float]:
+        nonlocal images
+        if images is None:
+            images = [part(x, waiting(progress, 0, 2 * n)) for part, _ in parts]
+        halvings = int(loop.state.get("halvings", np.zeros(()))[()])
+        scale = total if penalty is None else total + (x + lift) * penalty.curvature(x)
+        before, least_gain = -np.inf, 0.0
+        at_start: list[Array] = []
+        overall = np.zeros_like(x)
+        if number:  # far from the maximum the plain steps, which are those of OSEM, get on faster
+            before = objective(x, images)
+            at_start = [gradient(s, images[s], waiting(progress, s, 2 * n)) for s in range(n)]
+            overall = np.sum(at_start, axis=0)
+            whole = overall if penalty is None else overall - penalty.gradient(x)
+            least_gain = _LEAST_GAIN * float(np.sum(whole * (moved(x, whole, scale, 1.0) - x), dtype=float))
+        while True:
+            size = 0.5**halvings / (1 + relaxation * number)
+            found = x
+            for k, s in enumerate(access_order(n)):
+                asked = waiting(progress, n + k, 2 * n)
+                if at_start and k == 0:  # the volume has not changed yet
+                    upwards = overall
+                else:
+                    upwards = n * gradient(s, parts[s][0](found, asked), asked)
+                    if at_start:
+                        upwards += overall - n * at_start[s]
+                if penalty is not None:
+                    upwards = upwards - penalty.gradient(found)
+                found = moved(found, upwards, scale, size)
+            images = [part(found, waiting(progress, 2 * n - 1, 2 * n)) for part, _ in parts]
+            reached = objective(found, images)
+            rounding = _ROUNDING * abs(reached)
+            if halvings < _MOST_HALVINGS and reached < before + size * least_gain - rounding:
+                halvings += 1
+            if reached >= before - rounding or halvings == _MOST_HALVINGS:
+                break
+        loop.state["halvings"] = np.array(float(halvings))
+        if progress is not None:
+            progress(2 * n, 2 * n)
+        return found, reached
+
+    settings = {"subsets": n, "relaxation": relaxation, **data.record(), **({} if prior is None else prior.record())}
+    return loop.run(step, settings)

@@ -1,0 +1,122 @@
+"""What FBP and FDK have in common: images weighted, filtered row by row, and backprojected."""
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from ..errors import InputError
+from ..geometry.grid import Grid
+from ..geometry.views import Views
+from ..memory import require
+from ..progress import Progress
+from ..projector.parallel import run_all, thread_count
+from ..validation import instance, real_array
+from .loop import plain
+from .ramp import ramp_matrix
+from .voxel_driven import backproject, with_margin
+
+Array = NDArray[np.floating[Any]]
+
+_BYTES_AT_ONCE = 2**26  # of filtered images
+
+_SMALL_GAP, _OUTSTANDING = np.radians(20), 3
+"""A gap between neighbouring views belongs to their spacing if it is at most so large, or so many times the median one."""
+
+_MOST_TILT = np.radians(15)
+"""Between an image's rows and the plane in which the views turn."""
+
+
+def checked_images(images: ArrayLike, views: Views, grid: Grid, name: str) -> Array:
+    """`images` as float32, or `InputError`, also where views or grid are none, or too few."""
+    instance(views, Views, f"{name}: views")
+    instance(grid, Grid, f"{name}: grid")
+    if len(views) < 2:
+        raise InputError(f"{name}: expected two views or more, got {len(views)}")
+    return real_array(plain(images), f"{name}: images", (len(views), *views.shape), np.float32)
+
+
+def rows_across(images: Array, views: Views, axis: Array, name: str) -> tuple[Array, Views]:
+    """Images and views whose rows lie about in the plane across `axis`: as they are, or rows and columns exchanged."""
+    along_rows, along_columns = (
+        np.abs(steps @ axis) / np.linalg.norm(steps, axis=1) for steps in (views.u_steps, views.v_steps)
+    )
+    if along_columns.max() < along_rows.min():
+        turned = Views(
+            views.sources, views.detector_centers, views.v_steps, views.u_steps, views.shape[::-1], views.parallel
+        )
+        images, views, along_rows = images.swapaxes(1, 2), turned, along_columns
+    worst = int(along_rows.argmax())
+    if along_rows[worst] > np.sin(_MOST_TILT):
+        raise InputError(
+            f"{name}: view {worst}: its rows are tilted by {np.degrees(np.arcsin(along_rows[worst])):.0f} degrees against "
+            f"the plane in which the views turn, more than {np.degrees(_MOST_TILT):.0f}: turn the images, or use sirt"
+        )
+    return images, views
+
+
+def filtered_backprojection(
+    images: Array,
+    views: Views,
+    grid: Grid,
+    window: str,
+    weights: Callable[[int], Array | float],
+    progress: Progress | None = None,
+) -> Array:
+    """The sum over views of ``(images * weights(m))`` filtered along rows, at the voxels' places, by depth^2; float32."""
+    n, (n_v, n_u) = len(images), views.shape
+    matrices = views.projection_matrices()
+    beyond = _columns_beyond(matrices, grid, n_u)
+    matrix = ramp_matrix(n_u, window, beyond)
+    matrices[:, 0] += beyond * matrices[:, 2]
+    bytes_of_a_view = 4 * n_v * (matrix.shape[1] + n_u)
+    at_once = int(np.clip(_BYTES_AT_ONCE // bytes_of_a_view, 1, n))
+    require(4 * grid.n_voxels + at_once * bytes_of_a_view, f"a volume of {' x '.join(map(str, grid.shape))} voxels")
+    volume = np.zeros(grid.shape, np.float32)
+    room, inside = with_margin((at_once, n_v, matrix.shape[1]))
+    if progress is not None:
+        progress(0, n)
+    for first in range(0, n, at_once):
+        end = min(first + at_once, n)
+
+        def filter_view(m: int, first: int = first) -> None:
+            inside[m - first] = (images[m] * weights(m)).astype(np.float32, copy=False) @ matrix
+
+        run_all(filter_view, range(first, end), thread_count(None))
+        backproject(volume, grid, room[: end - first], matrices[first:end])
+        if progress is not None:
+            progress(end, n)
+    return volume
+
+
+def _columns_beyond(matrices: Array, grid: Grid, n_u: int) -> int:
+    """Columns by which voxels lie beside the images, at most as many as these have.
+
+    There filtered images are not 0, and an object that lies within the images has values around it that cancel out.
+    """
+    column, _, depth = np.einsum("mij,pj->imp", matrices, np.insert(grid.corners(), 3, 1.0, axis=1))
+    if (depth < 1e-3).any():
+        return n_u
+    column /= depth
+    return int(np.clip(np.ceil(max(-column.min(), column.max() - (n_u - 1))), 0, n_u))
+
+
+def shares_of_turn(angles: Array, turn: float) -> tuple[Array, float, float]:
+    """How much of a circle of circumference `turn` each angle stands for (M,): half the way to both neighbours.
+
+    Then the first angle after the largest gap, and that gap, if there is one: a gap that is large and far larger than the
+    others is an end and a beginning, and not half of it is added to these. Else the gap is 0.
+    """
+    order = np.argsort(angles % turn, kind="stable")
+    angles = (angles % turn)[order]
+    gaps = np.diff(angles, append=angles[0] + turn)  # from each to the next
+    widest, usual = int(gaps.argmax()), float(np.median(gaps))
+    gap = float(gaps[widest])
+    if gap > max(_SMALL_GAP, _OUTSTANDING * usual):
+        gaps[widest] = usual
+    else:
+        gap = 0.0
+    shares = np.empty(len(angles))
+    shares[order] = (gaps + np.roll(gaps, 1)) / 2
+    return shares, float(angles[(widest + 1) % len(angles)]), gap

@@ -1,0 +1,45 @@
+"""The band-limited ramp filter and its windows, as a matrix that acts on rows of pixels."""
+
+import math
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..validation import one_of
+
+Array = NDArray[np.floating[Any]]
+
+WINDOWS: dict[str, Callable[[Array], Array]] = {
+    "ramp": np.ones_like,
+    "shepp-logan": lambda f: np.sinc(f / 2),
+    "cosine": lambda f: np.cos(np.pi * f / 2),
+    "hamming": lambda f: 0.54 + 0.46 * np.cos(np.pi * f),
+    "hann": lambda f: 0.5 + 0.5 * np.cos(np.pi * f),
+}
+"""What the ramp is multiplied with, by name: functions of the frequency, 1 at the Nyquist frequency."""
+
+
+def ramp_matrix(n: int, window: str, beyond: int = 0) -> Array:
+    """Matrix (n, n + 2 beyond), float32: ``rows @ matrix`` are the filtered rows, going on by `beyond` <= n at both ends.
+
+    The linear convolution of n pixels of size 1 with the ramp's band-limited kernel: 1/4 at 0, ``-1 / (pi k)^2`` at odd k.
+    As a matrix there is nothing to pad.
+
+    Raises
+    ------
+    InputError
+        There is no such window.
+
+    References
+    ----------
+    A. C. Kak, M. Slaney, "Principles of Computerized Tomographic Imaging", IEEE Press (1988), section 3.3.3.
+    """
+    one_of(window, WINDOWS, "window")
+    length = 8 * 2 ** math.ceil(math.log2(max(n, 16)))  # the kernel's period: no lag is met twice
+    lag = np.fft.fftfreq(length, 1 / length)
+    kernel = np.where(lag % 2 == 1, -1 / (np.pi * np.where(lag == 0, 1, lag)) ** 2, 0.0)
+    kernel[0] = 0.25
+    kernel = np.fft.irfft(np.fft.rfft(kernel) * WINDOWS[window](np.fft.rfftfreq(length, 0.5)), length)
+    return kernel[(np.arange(-beyond, n + beyond) - np.arange(n)[:, None]) % length].astype(np.float32)

@@ -1,0 +1,162 @@
+"""BSREM, and one-step-late priors: their optimum, found by others too."""
+
+from typing import NamedTuple
+
+import numpy as np
+import pytest
+
+import mphdrr.core as mph
+from mphdrr.core.reconstruction.priors import Penalty
+
+PRIORS = [mph.Quadratic(0.1), mph.RelativeDifference(2.0), mph.TotalVariation(1.0, edge=5.0)]
+
+
+class Problem(NamedTuple):
+    A: mph.Projector
+    counts: np.ndarray
+    background: float
+
+    def images(self, x):
+        return self.A(x).astype(float) + self.background
+
+    def objective(self, x, penalty: Penalty | None = None):
+        expected = self.images(x)
+        logs = np.log(expected, out=np.zeros_like(expected), where=expected > 0)
+        return float((self.counts * logs).sum() - expected.sum()) - (penalty.value(x) if penalty else 0.0)
+
+    def gradient(self, x, penalty: Penalty | None = None):
+        expected = self.images(x)
+        ratio = np.divide(self.counts, expected, out=np.zeros_like(expected), where=expected > 0)
+        gradient = self.A.T((ratio - 1).astype(np.float32))
+        return gradient - (penalty.gradient(x) if penalty else 0)
+
+
+def make(scanner, n, pixels, every):
+    """Noisy counts of a Derenzo phantom around a box of half its activity."""
+    system = scanner[::every]
+    grid = mph.Grid.centered(n, 96 / n)
+    with pytest.warns(mph.InputWarning):
+        A = mph.Projector(
+            grid,
+            system.views((pixels, pixels), detector="real"),
+            mph.Emission(system, time=120.0, pixel_points=4, intrinsic_fwhm=2.0),
+            threads=1,
+        )
+    truth = 50 * mph.DerenzoPhantom(40, (14, 12, 10, 8, 6, 5), 40).voxelize(grid).array
+    truth[n // 3 : n // 2, n // 3 : n // 2, n // 3 : n // 2] += 25
+    return Problem(A, mph.sample_counts(A(truth) + 0.3, 3), 0.3)
+
+
+@pytest.fixture(scope="module")
+def small(scanner):
+    return make(scanner, 8, 10, 8)
+
+
+def optimum(problem, penalty, scale, iterations=3000):
+    """By L-BFGS-B, an algorithm and a program that have nothing in common with ours."""
+    optimize = pytest.importorskip("scipy.optimize")
+    shape = problem.A.shape_in
+
+    def negative(z):
+        x = (z * scale).reshape(shape).astype(np.float32)
+        return -problem.objective(x, penalty), -(problem.gradient(x, penalty).ravel() * scale).astype(float)
+
+    options = {"maxiter": iterations, "maxfun": 2 * iterations, "maxcor": 30, "ftol": 1e-15, "gtol": 1e-7}
+    found = optimize.minimize(
+        negative, np.ones(scale.size), jac=True, method="L-BFGS-B", bounds=[(0, None)] * scale.size, options=options
+    )
+    return (found.x * scale).reshape(shape), -found.fun
+
+
+def compare_with_optimum(problem, prior, subsets, iterations):
+    penalty = None if prior is None else prior.on(problem.A.grid)
+    found = mph.bsrem(problem.A, problem.counts, iterations, subsets, prior, background=problem.background)
+    scale = np.sqrt(np.maximum(found.volume.array.ravel(), 0.1)).astype(float)
+    best, best_value = optimum(problem, penalty, scale)
+    assert found.objective[-1] == pytest.approx(problem.objective(found.volume.array, penalty), rel=1e-7)
+    assert found.objective[-1] >= best_value - 1e-6 * abs(best_value)
+    if prior is not None:  # without one many volumes are about as likely
+        assert np.linalg.norm(found.volume.array - best) <= 1e-3 * np.linalg.norm(best)
+    return found, best
+
+
+@pytest.mark.parametrize("prior", PRIORS, ids=lambda prior: type(prior).__name__)
+def test_it_ends_at_the_optimum(small, prior):
+    found, _ = compare_with_optimum(small, prior, 5, 40)
+    assert (np.diff(found.objective[1:]) >= -1e-8 * np.abs(found.objective[2:])).all()
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("prior", [mph.RelativeDifference(1.0), mph.Quadratic(0.05)], ids=["relative", "quadratic"])
+def test_it_ends_at_the_optimum_of_24_voxels_a_side(scanner, prior):
+    problem = make(scanner, 24, 24, 4)
+    found, best = compare_with_optimum(problem, prior, 5, 150)
+    assert np.linalg.norm(found.volume.array - best) <= 1e-4 * np.linalg.norm(best)
+
+
+def test_without_prior_it_is_as_likely_as_mlem_gets(small):
+    ours = mph.bsrem(small.A, small.counts, 50, 5, background=small.background)
+    mlem = mph.mlem(small.A, small.counts, 250, background=small.background)
+    assert ours.objective[-1] >= mlem.objective[-1] - 1e-6 * abs(mlem.objective[-1])
+
+
+def test_a_prior_of_no_weight_is_none(small):
+    given = (small.A, small.counts, 3, 2)
+    plain = mph.bsrem(*given, background=0.3)
+    np.testing.assert_array_equal(plain.volume.array, mph.bsrem(*given, mph.Quadratic(0), background=0.3).volume.array)
+    plain = mph.osem(*given, background=0.3)
+    late = mph.osem(*given, background=0.3, prior=mph.Quadratic(0))
+    np.testing.assert_array_equal(plain.volume.array, late.volume.array)
+
+
+@pytest.mark.parametrize("prior", PRIORS[1:2], ids=lambda prior: type(prior).__name__)
+def test_one_step_late_ends_at_the_same_optimum(small, prior):
+    """With one subset, where the prior is weak enough for it to end at all."""
+    weak = type(prior)(prior.weight / 4)
+    best = mph.bsrem(small.A, small.counts, 40, 5, weak, background=0.3)
+    late = mph.mlem(small.A, small.counts, 120, 0.3, prior=weak)
+    assert late.objective[-1] == pytest.approx(best.objective[-1], rel=1e-4)
+    assert np.linalg.norm(late.volume.array - best.volume.array) <= 5e-2 * np.linalg.norm(best.volume.array)
+
+
+def test_a_prior_that_is_too_strong_stays_positive(small):
+    found = mph.osem(small.A, small.counts, 5, 4, 0.3, prior=mph.Quadratic(1e4)).volume.array
+    assert np.isfinite(found).all() and (found >= 0).all() and found.any()
+    found = mph.bsrem(small.A, small.counts, 5, 4, mph.Quadratic(1e4), background=0.3).volume.array
+    assert found.std() < 0.05 * found.mean()
+
+
+def test_relaxed_steps_are_shorter_and_zeros_and_masks_are_kept(small):
+    start = np.ones(small.A.shape_in)
+    start[:3] = 0
+    mask = np.ones(small.A.shape_in, bool)
+    mask[:, :2] = False
+    found = mph.bsrem(small.A, small.counts, 10, 2, PRIORS[0], relaxation=0.5, start=start, mask=mask)
+    assert not found.volume.array[:, :2].any() and (found.volume.array[:3, 2:] > 0).any()
+    assert found.settings["relaxation"] == 0.5 and found.settings["prior"] == "Quadratic"
+
+
+def test_no_counts_are_no_activity(small):
+    found = mph.bsrem(small.A, np.zeros_like(small.counts), 3, 2, PRIORS[1])
+    assert not found.volume.array.any() and np.isfinite(found.objective).all()
+
+
+@pytest.mark.parametrize(
+    ("given", "words"),
+    [
+        ({"subsets": 11}, "subsets: expected at most the 10 views, got 11"),
+        ({"subsets": 0}, "subsets: expected a whole number"),
+        ({"prior": 3}, "prior: expected Quadratic, RelativeDifference or TotalVariation, got int"),
+        ({"prior": mph.Quadratic}, "prior: expected Quadratic"),
+        (
+            {"prior": mph.Quadratic(1, anatomy=mph.Volume(np.ones((2, 2, 2)), mph.Grid.centered(2, 1), "mu"))},
+            "prior: anatomy's grid",
+        ),
+    ],
+)
+@pytest.mark.parametrize("method", [mph.osem, mph.bsrem])
+def test_what_cannot_be_is_refused(small, method, given, words):
+    with pytest.raises(mph.InputError, match=words):
+        method(small.A, small.counts, 1, **given)
+    with pytest.raises(mph.InputError, match="relaxation: expected 0 or more"):
+        mph.bsrem(small.A, small.counts, 1, relaxation=-1)

@@ -1,0 +1,194 @@
+"""Filtered backprojection of parallel views: values, windows, angles, and the kernel beside numpy."""
+
+import numpy as np
+import pytest
+
+import mphdrr.core as mph
+from mphdrr.core.reconstruction import voxel_driven
+from mphdrr.core.reconstruction.ramp import WINDOWS, ramp_matrix
+
+SIDE = 64.0
+
+
+def views_of(angles, columns=64, pitch=1.0, rows=3, **options):
+    return mph.parallel_views(angles, (rows, columns), pitch, **options)
+
+
+def disc(n, radius, center=(0.0, 0.0)):
+    """A disc of 1 on a grid of n x n x 3 voxels of a side of 64 mm, averaged over 4 x 4 points a voxel."""
+    grid = mph.Grid.centered((n, n, 4), (SIDE / n, SIDE / n, 1.5))
+    points = (np.arange(4 * n) + 0.5) * SIDE / (4 * n) - SIDE / 2
+    inside = (points[:, None] - center[0]) ** 2 + (points - center[1]) ** 2 < radius**2
+    plane = inside.reshape(n, 4, n, 4).mean(axis=(1, 3))
+    return grid, np.repeat(plane[:, :, None], 4, axis=2).astype(np.float32)
+
+
+def images_of(views, radius=20.0, center=(3.0, -5.0)):
+    grid, values = disc(192, radius, center)
+    return mph.Projector(grid, views)(values)
+
+
+def relative_error(found, truth):
+    return float(np.sqrt(np.mean((found - truth) ** 2) / np.mean(truth**2)))
+
+
+GRID = mph.Grid.centered((64, 64, 3), 1.0)
+DISC = disc(64, 20.0, (3.0, -5.0))[1][:, :, :3]
+
+
+@pytest.mark.parametrize(
+    "angles",
+    [
+        np.arange(120) * np.pi / 120,  # half a circle
+        np.arange(240) * np.pi / 120,
+        0.3 - np.arange(120) * np.pi / 120,
+        np.random.default_rng(0).permutation(np.arange(121) * 2 * np.pi / 121),
+        np.pi * np.sort(np.random.default_rng(1).random(240)),
+        np.pi * np.linspace(0, 1, 160, endpoint=False) ** 1.3,
+    ],
+)
+def test_a_disc_comes_back_from_any_half_or_full_circle_of_angles(angles):
+    views = views_of(angles)
+    volume = mph.fbp(images_of(views), views, GRID)
+    assert volume.quantity == "mu" and volume.grid == GRID
+    inner = disc(64, 17.0, (3.0, -5.0))[1][:, :, :3] == 1
+    assert volume.array[inner].mean() == pytest.approx(1.0, abs=0.005)
+    assert volume.array[disc(64, 23.0, (3.0, -5.0))[1][:, :, :3] == 0].mean() == pytest.approx(0.0, abs=0.005)
+    assert relative_error(volume.array, DISC) < 0.13
+
+
+@pytest.mark.parametrize("window", list(WINDOWS))
+def test_windows_keep_the_mean_and_lower_the_noise(window):
+    views = views_of(np.arange(90) * np.pi / 90)
+    noise = np.random.default_rng(2).standard_normal((90, 3, 64)).astype(np.float32)
+    smooth = mph.fbp(noise, views, GRID, window).array.std()
+    order = ["ramp", "shepp-logan", "cosine", "hamming", "hann"]
+    if window != "ramp":
+        before = mph.fbp(noise, views, GRID, order[order.index(window) - 1]).array.std()
+        assert smooth < before
+    volume = mph.fbp(images_of(views), views, GRID, window)
+    assert volume.array[30:36, 24:30].mean() == pytest.approx(1.0, abs=0.01)
+
+
+def test_the_ramp_is_that_of_kak_and_slaney():
+    matrix = ramp_matrix(8, "ramp", 2)
+    assert matrix.shape == (8, 12)
+    kernel = {0: 0.25, 1: -1 / np.pi**2, 2: 0.0, 3: -1 / (9 * np.pi**2)}
+    for out in range(12):
+        for into in range(8):
+            lag = abs(out - 2 - into)
+            if lag in kernel:
+                assert matrix[into, out] == pytest.approx(kernel[lag], abs=1e-7)
+
+
+def test_turned_tilted_and_shifted_views_of_other_pixels_give_the_same_volume():
+    angles = np.arange(120) * np.pi / 120
+    views = views_of(angles)
+    images = images_of(views)
+    straight = mph.fbp(images, views, GRID).array
+    # Everything turned in space together.
+    pose = mph.euler_pose(0.4, 0.8, -0.3, (5, 6, 7))
+    turn = pose[:3, :3]
+    turned = mph.Views(
+        views.sources @ turn.T + pose[:3, 3],
+        views.detector_centers @ turn.T + pose[:3, 3],
+        views.u_steps @ turn.T,
+        views.v_steps @ turn.T,
+        views.shape,
+        parallel=True,
+    )
+    grid = mph.Grid(GRID.shape, pose @ GRID.affine)
+    np.testing.assert_allclose(mph.fbp(images, turned, grid).array, straight, atol=1e-4)
+    # Rows and columns exchanged.
+    exchanged = mph.Views(
+        views.sources, views.detector_centers, views.v_steps, views.u_steps, views.shape[::-1], parallel=True
+    )
+    np.testing.assert_allclose(mph.fbp(images.swapaxes(1, 2), exchanged, GRID).array, straight, atol=1e-5)
+    # Finer pixels, and detectors that lean.
+    fine = views_of(angles, 128, 0.5, rows=8)
+    lean = np.cross([0, 0, 1.0], fine.u_steps) * 0.7 + fine.u_steps
+    leaning = mph.Views(fine.sources, fine.detector_centers, lean, fine.v_steps, fine.shape, parallel=True)
+    for other in (fine, leaning):
+        found = mph.fbp(images_of(other), other, mph.Grid.centered((64, 64, 1), 1.0)).array
+        assert relative_error(found, DISC[:, :, :1]) < 0.13
+
+
+def test_a_volume_larger_than_the_images_is_empty_beside_the_object():
+    views = views_of(np.arange(120) * np.pi / 120, columns=56)
+    grid = mph.Grid.centered((96, 96, 1), 1.0)
+    volume = mph.fbp(images_of(views, 15.0), views, grid).array
+    assert np.abs(volume[:20]).max() < 0.05
+    assert abs(volume[:20].mean()) < 2e-3
+
+
+def test_the_kernel_is_numpys_and_threads_change_nothing(monkeypatch):
+    if voxel_driven._kernel is None:
+        pytest.skip("no compiled kernels here")
+    views = views_of(np.arange(7) * np.pi / 7)
+    images = np.random.default_rng(3).random((7, 3, 64)).astype(np.float32)
+    grid = mph.Grid((13, 9, 11), mph.euler_pose(0.3, 0.2, 0.1) @ mph.Grid.centered((13, 9, 11), (4.0, 6.0, 0.4)).affine)
+    compiled = mph.fbp(images, views, grid).array
+    monkeypatch.setattr(voxel_driven, "_kernel", None)
+    np.testing.assert_allclose(mph.fbp(images, views, grid).array, compiled, atol=1e-4 * np.abs(compiled).max())
+
+
+def test_derenzo_meets_its_errors():
+    """NRMSE: root mean square of the error by that of the truth; data from voxels half as large."""
+    phantom = mph.DerenzoPhantom(40, (8, 6, 5, 4, 3, 2), 40)
+    grid, fine = mph.Grid.centered((128, 128, 2), 1.0), mph.Grid.centered((256, 256, 4), 0.5)
+    with pytest.warns(mph.InputWarning, match="outside the grid"):
+        truth, source = phantom.voxelize(grid).array, phantom.voxelize(fine)
+    for n, most in ((96, 0.25), (256, 0.16)):
+        views = mph.parallel_views(np.arange(n) * np.pi / n, (2, 128), 1.0)
+        images = mph.Projector(fine, views)(source)
+        assert relative_error(mph.fbp(images, views, grid).array, truth) < most
+
+
+def test_missing_directions_are_said():
+    views = views_of(np.linspace(0, 2.0, 60))
+    with pytest.warns(mph.InputWarning, match="65 degrees of the half circle have no view"):
+        mph.fbp(images_of(views), views, GRID)
+
+
+def test_progress_counts_views_and_stops():
+    views = views_of(np.arange(30) * np.pi / 30)
+    images = np.zeros((30, 3, 64))
+    calls = []
+    mph.fbp(images, views, GRID, progress=lambda *done: calls.append(done))
+    assert calls[0] == (0, 30) and calls[-1] == (30, 30)
+
+    def stop(done, total):
+        raise mph.Cancelled
+
+    with pytest.raises(mph.Cancelled):
+        mph.fbp(images, views, GRID, progress=stop)
+
+
+def test_wrong_input_is_named():
+    views = views_of([0.0, 1.0, 2.0])
+    images = np.zeros((3, 3, 64))
+    broken = images.copy()
+    broken[1, 2, 3] = np.nan
+    cone = mph.Views(views.sources, views.detector_centers, views.u_steps, views.v_steps, views.shape)
+    lifted = views_of([0.0, 1.0, 2.0], elevation=[0, 0.2, 0])
+    diagonal = mph.Views(
+        views.sources,
+        views.detector_centers,
+        views.u_steps + views.v_steps,
+        views.v_steps - views.u_steps,
+        (3, 64),
+        True,
+    )
+    for arguments, words in (
+        ((images[:2], views, GRID), "fbp: images: expected shape 3 x 3 x 64"),
+        ((broken, views, GRID), "fbp: images: nan is not a finite number at index"),
+        ((images, cone, GRID), "fbp: expected parallel views"),
+        ((images, views, GRID, "boxcar"), "window 'boxcar': expected one of ramp, shepp-logan"),
+        ((images, lifted, GRID), "fbp: view .*: its rays do not lie in the plane"),
+        ((images, diagonal, GRID), "fbp: view 0: its rows are tilted by 45 degrees"),
+        ((images, "views", GRID), "fbp: views: expected a Views"),
+        ((images, views, (64, 64, 3)), "fbp: grid: expected a Grid"),
+        ((images[:1], views[:1], GRID), "fbp: expected two views or more"),
+    ):
+        with pytest.raises(mph.InputError, match=words):
+            mph.fbp(*arguments)

@@ -75,9 +75,9 @@ def _chosen(arguments: argparse.Namespace, run: ProjectionRun) -> Recipe:
 
 def _run(arguments: argparse.Namespace) -> None:
     if arguments.write_recipe:
-        path = output_path(arguments.write_recipe, (".toml",))
-        write_recipe(_chosen(arguments, read_run(arguments.file)), path)
-        print(path)
+        recipe_path = output_path(arguments.write_recipe, (".toml",))
+        write_recipe(_chosen(arguments, read_run(arguments.file)), recipe_path)
+        print(recipe_path)
         return
     if not arguments.output and not arguments.picture:
         raise InputError("nothing to write: give --output FILE, --picture FILE or --write-recipe FILE")

@@ -114,6 +114,9 @@ def reconstruct_run(
 class _Watched(StopWhen):
     """The user's rules and a watcher: of all that a reconstruction calls, its rules alone are told the objective."""
 
+    _watch: Watch
+    _rules: StopWhen | None
+
     def __init__(self, watch: Watch, rules: StopWhen | None) -> None:
         object.__setattr__(self, "_watch", watch)
         object.__setattr__(self, "_rules", rules)

@@ -49,12 +49,14 @@ from .reconstruction.expectation import mlem, osem
 from .reconstruction.fbp import fbp
 from .reconstruction.fdk import fdk
 from .reconstruction.files import read_reconstruction, write_reconstruction
+from .reconstruction.least_squares import cgls, sirt
 from .reconstruction.priors import Prior, Quadratic, RelativeDifference, TotalVariation
 from .reconstruction.result import Reconstruction
 from .reconstruction.scores.derenzo import DerenzoScore, DerenzoSector, RodProfile, derenzo_score
 from .reconstruction.scores.images import BiasAndDeviation, bias_and_deviation, contrast_to_noise, nrmse, psnr, ssim
 from .reconstruction.scores.nema import NemaScore, NemaSphere, nema_score
 from .reconstruction.stopping import StopWhen
+from .reconstruction.tv import tv
 from .runs.files import read_run, write_run
 from .runs.frame_files import read_counts
 from .runs.measured import counts_run

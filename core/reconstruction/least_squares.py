@@ -166,7 +166,7 @@ class Problem:
     @classmethod
     def of(cls, A: Projector, images: ArrayLike, loop: Loop) -> "Problem":
         """Checked: the images without the model's background. Raises InputError."""
-        measured = real_array(plain(images), "images", A.shape_out, np.float32) - A.background.astype(np.float32)
+        measured: Array = real_array(plain(images), "images", A.shape_out, np.float32) - A.background.astype(np.float32)
         everywhere = np.ones(A.shape_in, np.float32)
         return cls(A, measured, everywhere if loop.mask is None else loop.mask.astype(np.float32))
 

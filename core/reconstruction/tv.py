@@ -102,9 +102,8 @@ def _gradient(x: Array, factors: Array) -> Array:
     """Differences to the next voxel along each axis, times the axis's factor, (3, ...); 0 at the end."""
     slopes = np.zeros((3, *x.shape), x.dtype)
     for axis, factor in enumerate(factors):
-        inner = [slice(None)] * 3
-        inner[axis] = slice(0, -1)
-        slopes[(axis, *inner)] = factor * np.diff(x, axis=axis)
+        inner = tuple(slice(0, -1) if a == axis else slice(None) for a in range(3))
+        slopes[axis][inner] = factor * np.diff(x, axis=axis)
     return slopes
 
 
@@ -114,7 +113,7 @@ def _gradient_adjoint(slopes: Array, factors: Array) -> Array:
     for axis, factor in enumerate(factors):
         lower, upper = [slice(None)] * 3, [slice(None)] * 3
         lower[axis], upper[axis] = slice(0, -1), slice(1, None)
-        part = factor * slopes[(axis, *lower)]
+        part = factor * slopes[axis][tuple(lower)]
         total[tuple(lower)] -= part
         total[tuple(upper)] += part
     return total

@@ -2,6 +2,7 @@
 # make test    linters, types and tests (tests/core, tests/blender)
 # make test-long   the tests that take minutes: long property runs, workbooks through LibreOffice
 # make bench   speed, accuracy and memory beside other projectors, into docs/; BENCH=--quick: a minute or two, into out/
+# make bench-reconstruction   an iteration beside other packages' own loops over our operators; wants VENV=.venvpeers
 # make gallery   the documentation's pictures of phantoms, of a CT (CT=FILE), of the scanner's sensitivity and of the demo, into docs/images
 # make docs    docs/ as a site in out/docs, with links and references checked; wrong ones are errors
 # make tutorial   the tutorial's steps in a real Blender, and its pictures anew in docs/images/tutorial
@@ -9,7 +10,8 @@
 # make test-app   the Linux zip in a real Blender (see tests/app)
 # make test-kernels   the C kernels under sanitizers, for arm64 under qemu, for Windows under Wine (see tests/kernels)
 # make test-gate  the Monte Carlo exports with GATE 10 itself; wants an environment of its own (2 GB): VENV=.venvgate
-# make test-peers   the exported geometry in the programs that read it; wants an environment of its own: VENV=.venvpeers
+# make test-peers   the exported geometry in the programs that read it, the projector in the packages that it has adapters for;
+#               wants an environment of its own: VENV=.venvpeers
 # make clean   removes what the others made, environments included
 #
 # The environment is made in VENV on the first call. PYTHON picks its interpreter (3.11: Blender 4.5, 3.13: Blender 5.2);
@@ -27,7 +29,7 @@ ANY_PYTHON = $$(for p in "$(PYTHON)" python3 python3.11 python3.13; do "$$p" -c 
 ENVIRONMENT = @p=$(ANY_PYTHON); [ -n "$$p" ] || { echo "no Python found; name one: make PYTHON=/path/to/python3.11"; exit 1; }; \
 	"$$p" tools/environment.py $(VENV) --python "$(PYTHON)"
 
-.PHONY: demo gallery test test-long lint test-app test-kernels test-gate test-peers bench docs tutorial dist clean env env-dev
+.PHONY: demo gallery test test-long lint test-app test-kernels test-gate test-peers bench bench-reconstruction docs tutorial dist clean env env-dev
 
 demo: env
 	$(BIN)/mphdrr demo --output $(OUTPUT)
@@ -51,6 +53,10 @@ lint: env-dev
 
 bench: env-dev
 	$(BIN)/python benchmarks/projector.py $(BENCH)
+
+bench-reconstruction:
+	$(ENVIRONMENT) --extras peers --torch "$(TORCH)"
+	$(BIN)/python benchmarks/reconstruction.py $(BENCH)
 
 docs:
 	$(ENVIRONMENT) --extras docs
@@ -82,8 +88,9 @@ test-gate:
 
 test-peers:
 	$(ENVIRONMENT) --extras peers --torch "$(TORCH)"
-	@$(BIN)/python -c "import astra, cv2, itk, kornia, lib3mf"  # a missing one would only be skipped
-	$(BIN)/python -m pytest tests/core/test_geometry_export_peers.py
+	@# a missing one would only be skipped; deepinv needs a word before it is imported, which its tests say
+	@$(BIN)/python -c "import astra, cv2, itk, kornia, lib3mf, pytomography.algorithms, scipy; from importlib.metadata import version; version('deepinv')"
+	$(BIN)/python -m pytest tests/core/test_geometry_export_peers.py tests/core/test_adapters.py
 
 env:
 	$(ENVIRONMENT) --extras blender

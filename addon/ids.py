@@ -52,15 +52,19 @@ PICK_MODULE = "mphdrr.pick_module"
 PICK_WINDOW = "mphdrr.pick_window"
 CLEAN_CACHE = "mphdrr.clean_cache"
 CANCEL_JOB = "mphdrr.cancel_job"
+FINISH_JOB = "mphdrr.finish_job"
+RECONSTRUCT = "mphdrr.reconstruct"
+SHOW_RECONSTRUCTION = "mphdrr.show_reconstruction"
 
 # --- Panels, drawn in the order of the work: bl_order -----------------------------------------------------------------
-ORDER_GEOMETRY, ORDER_PHANTOM, ORDER_PROJECTIONS, ORDER_RUNS, ORDER_EXPORT = 0, 10, 20, 25, 30
+ORDER_GEOMETRY, ORDER_PHANTOM, ORDER_PROJECTIONS, ORDER_RUNS, ORDER_RECONSTRUCTION, ORDER_EXPORT = 0, 10, 20, 25, 27, 30
 
 # --- Datablocks ---------------------------------------------------------------------------------------------
 SCANNER = "Scanner"  # default name of a scanner's collection
 PARTS = ("NONE", "CAMERA", "COLLIMATOR", "CRYSTAL", "ROI", "PLANE")  # `Object.mphdrr_module.part`
 MOSAIC = "mphDRR mosaic"
 DIFFERENCE = "mphDRR difference"
+RECONSTRUCTION = "mphDRR reconstruction"  # slices of the last one, and its objective
 PLANES = "mphDRR projections"  # the collection of the planes that show them
 STUDIO = "mphDRR studio"  # the collection of the lights, and a world
 PREVIEW = ".preview"  # in the names of coarser copies of large volumes, for display only

@@ -230,6 +230,18 @@ def store_difference(drawn: Sheet, numbers: list[int], unit: str, text: str) -> 
     return image
 
 
+def store_reconstruction(file: bytes) -> bpy.types.Image:
+    """Make the image of a reconstruction, a PNG of it, until other projections are shown."""
+    old = bpy.data.images.get(ids.RECONSTRUCTION)
+    image = _new_picture(ids.RECONSTRUCTION, file) if old is None else _fill(old, file)
+    image.use_fake_user, image[_KEY] = True, True
+    for window in bpy.context.window_manager.windows:
+        for area in window.screen.areas:
+            if area.type == "IMAGE_EDITOR" and area.spaces.active.image == image:
+                area.tag_redraw()
+    return image
+
+
 def difference_text() -> str:
     """The numbers of the difference that was drawn last; "" where there is none."""
     image = bpy.data.images.get(ids.DIFFERENCE)

@@ -46,14 +46,19 @@ class Job:
     ``work(progress)`` runs in a thread and must not touch bpy; ``progress(done, total)`` raises `Cancelled` when the user
     wants to stop, `stages_of` gives its stages. ``finish(result)`` runs in the main thread and returns the line to report;
     if that takes long, it is a generator (`Finishing`). Where the user cancels, its last yield raises `Cancelled`: by then
-    it has changed nothing that it does not take back. ``discard()`` removes what the work has left on disk, where the job
-    ends before it has finished.
+    it has changed nothing that it does not take back. ``discard()`` removes what the work has left on disk and what
+    ``look()`` has shown, where the job ends before it has finished.
+
+    ``look()`` is called in the main thread while the work runs in another, ten times a second: it may show what there is so
+    far. A work that sees that `enough` is set ends early, as if it were done: the user has pressed Finish Now.
     """
 
     label: str
     work: Callable[[Progress], Any]
     finish: Callable[[Any], str | Finishing]
     discard: Callable[[], None] = lambda: None
+    look: Callable[[], None] = lambda: None
+    enough: threading.Event | None = None
 
 
 def run(job: Job, progress: Progress = lambda done, total: None) -> str:
@@ -85,9 +90,9 @@ class Worker(threading.Thread):
 
     _numbers = itertools.count(1)
 
-    def __init__(self, label: str, work: Callable[[Progress], Any]) -> None:
+    def __init__(self, label: str, work: Callable[[Progress], Any], enough: threading.Event | None = None) -> None:
         super().__init__(name=f"mphDRR: {label}", daemon=True)
-        self.label, self.work, self.number = label, work, next(self._numbers)
+        self.label, self.work, self.number, self.enough = label, work, next(self._numbers), enough
         self.stage, self.since = label, time.monotonic()
         self.done = self.total = 0
         self.result: Any = None
@@ -268,6 +273,7 @@ class JobOperator:
             _redraw(context)
             return {"PASS_THROUGH"}  # drawing is work enough for one turn
         if worker.is_alive():
+            job.look()
             return {"PASS_THROUGH"}
         try:
             if worker.steps is None:
@@ -302,7 +308,7 @@ class JobOperator:
 
     def _enqueue(self, job: Job) -> None:
         """Let a job begin when those that wait have."""
-        self._job, self._run = job, Worker(job.label, job.work)
+        self._job, self._run = job, Worker(job.label, job.work, job.enough)
         _waiting.append(self._run)
         self._begin_if_first()
 
@@ -385,12 +391,28 @@ class MPHDRR_OT_cancel_job(bpy.types.Operator):
         return {"FINISHED"}
 
 
+class MPHDRR_OT_finish_job(bpy.types.Operator):
+    """End the running job after the step that it is at, and keep what it has made so far"""
+
+    bl_idname = ids.FINISH_JOB
+    bl_label = "Finish Now"
+    bl_options = {"INTERNAL"}
+
+    def execute(self, context: bpy.types.Context) -> set[str]:
+        """Ask it to come to its end."""
+        if _current is not None and _current.enough is not None:
+            _current.enough.set()
+        return {"FINISHED"}
+
+
 def draw_job(layout: bpy.types.UILayout) -> None:
     """Draw the running job's stage and those that wait, each with its Cancel button; nothing where there is none."""
     for worker in filter(None, (_current, *_waiting)):
         row = layout.row(align=True)
         if worker is _current:
             row.progress(factor=worker.share, type="BAR", text=worker.text)
+            if worker.enough is not None:
+                row.operator(ids.FINISH_JOB, text="", icon="CHECKMARK")
         else:
             row.label(text=iface("{job}: waits").format(job=iface(worker.label)), translate=False, icon="TIME")
         row.operator(ids.CANCEL_JOB, text="", icon="CANCEL").number = worker.number

@@ -9,9 +9,6 @@ import bpy
 from bpy.props import (
     BoolProperty,
     CollectionProperty,
-    EnumProperty,
-    FloatProperty,
-    FloatVectorProperty,
     IntProperty,
     PointerProperty,
     StringProperty,
@@ -20,10 +17,18 @@ from bpy.props import (
 from ..core.errors import InputError
 from ..core.physics.maps import MAPS
 from ..core.runs.presets import PRESETS
-from ..core.runs.recipe import Recipe, fitting_recipe, is_met
-from ..core.runs.settings import SETTINGS, Setting
-from . import choices, scanner, volumes
-from .decimals import typed
+from ..core.runs.recipe import Recipe, fitting_recipe
+from ..core.runs.settings import SETTINGS
+from . import scanner, volumes
+from .setting_properties import (
+    drawn_of,
+    given_of,
+    identifier,
+    material_of,
+    properties_of,
+    set_property,
+    values_of,
+)
 from .updates import on_edit
 
 OPENING_ANGLE = "model.opening_angle_degrees"
@@ -35,67 +40,12 @@ USUAL_TIME = 600.0
 _NAMES = {"model.kind": "model", "detector.plane": "detector", "detector.rows": "height", "detector.columns": "width"}
 """Names that .blend files keep, where they are not those of the settings."""
 
-_NUMBERS = {
-    "model": choices.MODELS,
-    "isotope": choices.ISOTOPES,
-    "aperture_material": choices.APERTURES,
-    "edge": choices.EDGES,
-    "crystal_material": choices.CRYSTALS,
-    "detector": choices.DETECTORS,
-    "backend": choices.BACKENDS,
-}
-
 PROPERTIES = {
     _NAMES.get(key, key.partition(".")[2]): setting
     for key, setting in SETTINGS.items()
     if key.startswith(("model.", "detector.", "compute.")) and key != OPENING_ANGLE
 }
 """The settings by the names of their properties. A coefficient has a second property, of its material."""
-
-
-def _material(name: str, setting: Setting) -> str | None:
-    """The property of a coefficient's material; None for other settings."""
-    return name.replace("_mu", "_material") if setting.kind is float and setting.words else None
-
-
-def _identifier(name: str, word: str) -> str:
-    """How an enumeration calls a word: isotopes and materials by their names, others in capitals."""
-    return word if name == "isotope" or name.endswith("_material") else word.upper().replace("-", "_")
-
-
-def _enumeration(name: str, setting: Setting, none: tuple[str, str, str] | None) -> Any:
-    words = [(_identifier(name, word), label, text) for word, (label, text) in setting.words.items()]
-    items = choices.items(_NUMBERS.get(name, {}), ([none] if none else []) + words)
-    default = none[0] if none else _identifier(name, setting.default)
-    return EnumProperty(name=setting.label, description=setting.text, items=items, default=default)
-
-
-def _properties() -> dict[str, Any]:
-    made: dict[str, Any] = {}
-    for name, setting in PROPERTIES.items():
-        absent = f"; 0: {setting.absent}" if setting.default is None else ""
-        common: dict[str, Any] = {"name": setting.label, "description": setting.text + absent}
-        if setting.kind in (int, float):
-            least = 1e-6 if setting.least is None else setting.least
-            limits = {"min": 0 if setting.default is None else least, "max": setting.most, "soft_max": setting.slider}
-            limits["precision"] = 3 if setting.kind is float else None
-            common |= {key: value for key, value in limits.items() if value is not None}
-        material = _material(name, setting)
-        if material is not None:
-            none = ("NUMBER", "By Coefficient", f"By its attenuation coefficient{absent}")
-            made[material] = _enumeration(material, setting, none)
-            common["name"] = f"µ ({setting.unit})"  # below the material's menu
-        if setting.kind is bool:
-            made[name] = BoolProperty(name=setting.label, description=setting.text, default=setting.default)
-        elif setting.kind is str:
-            absent_item = ("NONE", "None", setting.absent.capitalize()) if setting.default is None else None
-            made[name] = _enumeration(name, setting, absent_item)
-        elif setting.sizes:
-            made[name] = FloatVectorProperty(size=setting.sizes[0], default=(0.0,) * setting.sizes[0], **common)
-        else:
-            make: Callable[..., Any] = IntProperty if setting.kind is int else FloatProperty
-            made[name] = make(default=setting.default or 0, **common)
-    return made
 
 
 class ProjectionSettings:
@@ -107,27 +57,12 @@ class ProjectionSettings:
     last: IntProperty(name="Last Module", description="Its number; 0: to the last", default=0, min=0)
 
 
-ProjectionSettings.__annotations__.update(_properties())
+ProjectionSettings.__annotations__.update(properties_of(PROPERTIES))
 
 
 def recipe_values(get: Callable[[str], Any]) -> dict[str, Any]:
     """The values of the settings by their keys in a recipe, None for none; `get` gives a property's."""
-    values: dict[str, Any] = {}
-    for name, setting in PROPERTIES.items():
-        material = _material(name, setting)
-        value = get(name)
-        if material is not None and get(material) != "NUMBER":
-            name, value = material, get(material)
-        if isinstance(value, str):
-            words = {_identifier(name, word): word for word in setting.words} | {"NONE": None}
-            if value not in words:
-                raise InputError(f"{setting.label}: {value!r} is not known to this version; choose another")
-            values[setting.key] = words[value]
-        elif setting.sizes:
-            values[setting.key] = tuple(map(typed, value)) if any(value) else None
-        else:
-            number = typed(value) if isinstance(value, float) else value
-            values[setting.key] = number if number or setting.default is not None else None
+    values = values_of(PROPERTIES, get)
     values["noise.seed"] = get("seed") if get("noise") else None
     return values
 
@@ -143,7 +78,7 @@ def settings_recipe(get: Callable[[str], Any], is_given: Callable[[str], bool], 
     given = [
         setting.key
         for name, setting in PROPERTIES.items()
-        if (is_given(name) or is_given(_material(name, setting) or name)) and values[setting.key] != setting.default
+        if (is_given(name) or is_given(material_of(name, setting) or name)) and values[setting.key] != setting.default
     ]
     return fitting_recipe(values, given)
 
@@ -159,26 +94,13 @@ def set_panel(settings: ProjectionProperties, recipe: Recipe) -> None:
     except ValueError:
         raise InputError(f"system.modules: the panel has one range of modules, not {text!r}") from None
     for name, setting in PROPERTIES.items():
-        _set(settings, name, recipe.given.get(setting.key))
+        set_property(settings, PROPERTIES, name, recipe.given.get(setting.key))
     settings.fitted = ""  # the model is the recipe's, whatever the volume holds
-    settings.model = _identifier("model", recipe["model.kind"])
+    settings.model = identifier("model", recipe["model.kind"])
     settings.noise = recipe["noise.seed"] is not None
     if settings.noise:
         settings.seed = recipe["noise.seed"]
     settings.first, settings.last = modules
-
-
-def _set(settings: ProjectionProperties, name: str, value: Any) -> None:
-    """Set a property to a value of a recipe; None and "auto" are its default."""
-    setting = PROPERTIES[name]
-    material = _material(name, setting)
-    for own in filter(None, (name, material)):
-        settings.property_unset(own)
-    if isinstance(value, str) and value != "auto":
-        own = material or name
-        setattr(settings, own, _identifier(own, value))
-    elif value not in (None, "auto"):
-        setattr(settings, name, value)
 
 
 def use_preset(settings: ProjectionProperties, preset: str) -> None:
@@ -186,7 +108,7 @@ def use_preset(settings: ProjectionProperties, preset: str) -> None:
     changes = PRESETS[preset].changes
     for name, setting in PROPERTIES.items():
         if setting.key in changes:
-            _set(settings, name, changes[setting.key])
+            set_property(settings, PROPERTIES, name, changes[setting.key])
     _set_time(settings)
 
 
@@ -208,22 +130,9 @@ def _set_time(settings: ProjectionProperties) -> None:
 
 def drawn(settings: ProjectionProperties, table: str) -> Iterator[tuple[str, bool]]:
     """The properties of a table that the chosen model has, each with whether it has an effect."""
-    try:
-        known = recipe_values(lambda name: getattr(settings, name))
-    except InputError:  # a choice of a later version: rendering refuses it
-        known = {}
-    values = {key: value for key, value in known.items() if value is not None}
-    for name, setting in PROPERTIES.items():
-        if not setting.key.startswith(f"{table}."):
-            continue
-        unmet = [need for need in setting.needs if not is_met(values, need)]
-        if any("model.kind" in need for need in unmet):
-            continue
-        material = _material(name, setting)
-        if material is not None:
-            yield material, not unmet
-        if material is None or getattr(settings, material) == "NUMBER":
-            yield name, not unmet
+    values = given_of(PROPERTIES, lambda name: getattr(settings, name))
+    own = {name: setting for name, setting in PROPERTIES.items() if setting.key.startswith(f"{table}.")}
+    return drawn_of(own, settings, values, lambda need: "model.kind" in need)
 
 
 def makes_counts(settings: ProjectionProperties) -> bool:

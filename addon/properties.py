@@ -22,7 +22,15 @@ from bpy.props import (
 )
 
 from ..core.geometry.system import LENGTHS
-from . import choices, column_maps, display_properties, ids, phantom_properties, projection_properties
+from . import (
+    choices,
+    column_maps,
+    display_properties,
+    ids,
+    phantom_properties,
+    projection_properties,
+    reconstruction_properties,
+)
 from .updates import FUNCTIONS, on_edit
 
 
@@ -221,6 +229,7 @@ CLASSES = (
     GeometryProperties,
     *phantom_properties.CLASSES,
     *projection_properties.CLASSES,
+    *reconstruction_properties.CLASSES,
     *display_properties.CLASSES,
     *column_maps.CLASSES,
 )
@@ -232,6 +241,7 @@ POINTERS = (
     (bpy.types.Scene, "mphdrr_geometry", GeometryProperties),
     (bpy.types.Object, "mphdrr_volume", phantom_properties.VolumeProperties),
     (bpy.types.Scene, "mphdrr_projections", projection_properties.ProjectionProperties),
+    (bpy.types.Scene, "mphdrr_reconstruction", reconstruction_properties.ReconstructionProperties),
     (bpy.types.Scene, "mphdrr_display", display_properties.DisplayProperties),
     (bpy.types.WindowManager, "mphdrr_columns", column_maps.ColumnMapProperties),
 )

@@ -21,6 +21,7 @@ from . import (
     live_phantoms,
     live_scanner,
     planes,
+    plots,
     preferences,
     preview,
     properties,
@@ -228,6 +229,7 @@ def unregister() -> None:
     live_scanner.stop()
     live_phantoms.stop()
     runs.stop()
+    plots.stop()
     recoloring.stop()
     _registered.close()
 

@@ -44,6 +44,7 @@ from .physics.performance import ModulePerformance, isocentre_performance, magni
 from .physics.sampling import sampling_gaps
 from .progress import Cancelled, Progress
 from .projector import Emission, InverseSquareSum, Projector, Transmission, intensity, trace_rays
+from .reconstruction.adapters import deepinv_physics, parallelproj_operator, pytomography_matrix, scipy_operator
 from .reconstruction.bsrem import bsrem
 from .reconstruction.expectation import mlem, osem
 from .reconstruction.fbp import fbp
@@ -55,6 +56,7 @@ from .reconstruction.result import Reconstruction
 from .reconstruction.scores.derenzo import DerenzoScore, DerenzoSector, RodProfile, derenzo_score
 from .reconstruction.scores.images import BiasAndDeviation, bias_and_deviation, contrast_to_noise, nrmse, psnr, ssim
 from .reconstruction.scores.nema import NemaScore, NemaSphere, nema_score
+from .reconstruction.scores.summary import VolumeScore, score_volume
 from .reconstruction.stopping import StopWhen
 from .reconstruction.tv import tv
 from .runs.files import read_run, write_run

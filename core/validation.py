@@ -95,6 +95,13 @@ def whole_number(value: Any, name: str) -> int:
         raise InputError(f"{name}: expected a whole number of at least 1, got {_short(value)}") from None
 
 
+def strict_whole(value: Any, name: str, expected: str) -> int:
+    """`value` as a whole number of at least 1, not of a type for fractions, or `InputError` with what is `expected`."""
+    if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < 1:
+        raise InputError(f"{name}: expected {expected}, got {value!r}")
+    return int(value)
+
+
 def positive(value: Any, name: str, unit: str = "") -> float:
     """`value` as a finite number above 0, or `InputError`."""
     number = float(real_array(value, name, ()))

@@ -42,7 +42,7 @@ class MPHDRR_OT_import_counts(jobs.JobOperator, bpy.types.Operator):
     filter_glob: StringProperty(default=";".join(f"*{ending}" for ending in COUNTS_FORMATS), options={"HIDDEN"})
     frames: StringProperty(
         name="Frames", description="Which module each frame is of: the modules' numbers in the frames' order, such as 1-80, "
-        "80-1 or 3,1,2",
+        "80-1 or 3,1,2; none for a frame that is not used, none*80 for 80 of them",
     )  # fmt: skip
     orientation: EnumProperty(
         name="Orientation",

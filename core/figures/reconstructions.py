@@ -87,11 +87,15 @@ def draw_objective(
     name: str = "",
     color: str = _CURVE,
     ink: str = INK,
+    em: float | None = None,
 ) -> None:
-    """Draw the objective by iteration into (left, top, width, height), with axes where it has a name."""
+    """Draw the objective by iteration into (left, top, width, height), with axes where it has a name.
+
+    `em` is the size of its text, which lines are in proportion to.
+    """
     values = np.asarray(objective, float)
     left, top, width, height = place
-    em = page.em
+    em = em or page.em
     low, high = float(values.min()), float(values.max())
     spread = (high - low) or abs(high) or 1.0
     low, high = low - 0.06 * spread, high + 0.06 * spread

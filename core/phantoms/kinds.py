@@ -30,9 +30,7 @@ class Kind(NamedTuple):
 _HOT = {"activity": 100.0}
 KINDS = (
     Kind("derenzo", DerenzoPhantom, "Derenzo", "a Derenzo phantom: sectors of hot rods", "--rods 8 6 5 4 3 2", _HOT),
-    Kind(
-        "nema", NemaBody, "NEMA Body", "the NEMA (IEC) body phantom: six spheres", "--sphere-activity 40 --voxels 200"
-    ),
+    Kind("nema", NemaBody, "NEMA Body", "the NEMA (IEC) body phantom: six spheres", "--sphere-activity 40"),
     Kind("jaszczak", JaszczakPhantom, "Jaszczak", "a Jaszczak phantom: rods and spheres", "--activity 50"),
     Kind("defrise", DefrisePhantom, "Defrise", "a Defrise phantom: hot disks", "--disks 7 --spacing-of-disks 12"),
     Kind("shepp-logan", SheppLogan, "Shepp-Logan Head", "the 3-D Shepp-Logan head", "--contrast original"),

@@ -15,12 +15,12 @@ from ..geometry.collimator import OPENING_ANGLE, edge_slope
 from ..geometry.grid import Grid
 from ..geometry.system import PinholeSystem
 from ..geometry.views import Views
-from ..physics.aperture import KnifeEdge, Opening, openings, paix_diameter, within_cone
+from ..physics.aperture import KnifeEdge, Opening, openings, paix_diameter, throughput, within_cone
 from ..physics.aperture import points_needed as hole_points_needed
 from ..physics.crystal import absorbed_share, gaussian_blur, share_inside
 from ..physics.isotopes import Isotope, isotope
 from ..physics.materials import module_coefficients
-from ..validation import instance, positive, real_array
+from ..validation import instance, positive, real_array, strict_whole
 from ..volumes.volume import Volume, require_quantity
 from .bundles import Beam
 from .depth_response import DepthResponse, DepthResponses
@@ -28,6 +28,7 @@ from .hole_response import hole_response
 from .models import Array, Model, checked_background, view_rays
 from .pixel_points import TOLERANCE, expected_error, lattice, offsets, points_needed, require_points, shadow_edges
 from .rays import Fan
+from .transmittance import Transmittances
 
 # Views may differ from their system by a file's rounding (mm; sine of an angle).
 _SAME_PLACE = 1e-3
@@ -81,6 +82,11 @@ class Emission(Model):
     tolerance : float
         Largest relative error of the total counts of a single voxel in any module, wherever it lies between the rays: 2 %
         by default. Larger sources are more accurate.
+    hole : str
+        ``"rays"``: the hole's blur is by rays through `aperture_points`. ``"depth"``: it is of the whole hole, without rays
+        (`hole_response`). Every voxel's total is exact, and its image within 1 % (2 % without intrinsic blur) of the
+        converged one, at any size of voxels, in about the time of seven rays. It takes no ``edge="path"`` or
+        `depth_layers`, no grid that comes close to a pinhole, and only the backends numpy, torch on the CPU and cpu.
     aperture_points : int
         Points of the hole's disk that rays pass, all with the same weight: the blur of a hole of diameter d_e.
         With 1 all rays pass the centre and there is no blur; otherwise at least 3.
@@ -119,9 +125,8 @@ class Emission(Model):
     within_cone : bool
         Whether rays steeper than the knife edge's cone, psi > alpha / 2, count nothing, with either edge.
     background : float or array (M,) or (M, n_v, n_u)
-        Counts that each pixel is expected to have besides those of the volume, such as scatter and dark counts: in the whole
-        acquisition, so they do not grow with `time`. One number, one for each module, or images. ``A(x)`` is linear and
-        leaves them out; runs add them before noise is drawn (`project_run`), and reconstructions expect them.
+        Counts of each pixel in the whole acquisition besides those of the volume, such as scatter and dark counts. ``A(x)``
+        leaves them out; runs add them before noise is drawn, and reconstructions expect them.
 
     Raises
     ------
@@ -180,7 +185,7 @@ class Emission(Model):
         self._set("intrinsic_fwhm", float(real_array(self.intrinsic_fwhm, "emission: intrinsic_fwhm", ())))
         if self.intrinsic_fwhm < 0:
             raise InputError(f"emission: intrinsic_fwhm must not be negative, got {self.intrinsic_fwhm:g} mm")
-        self._set("aperture_points", _whole(self.aperture_points, "aperture_points", "1, 3 or more"))
+        self._set("aperture_points", strict_whole(self.aperture_points, "emission: aperture_points", "1, 3 or more"))
         if self.aperture_points == 2:
             raise InputError("emission: aperture_points: expected 1, 3 or more, got 2")
         if self.aperture_tolerance is not None and self.aperture_points != 1:
@@ -190,7 +195,7 @@ class Emission(Model):
         if self.edge == "path" and self.aperture_mu is None:
             raise InputError("emission: edge 'path' needs aperture_mu, of the aperture's material")
         self._set("pixel_points", require_points(self.pixel_points, "emission: pixel_points"))
-        self._set("depth_layers", _whole(self.depth_layers, "depth_layers", "1 or more"))
+        self._set("depth_layers", strict_whole(self.depth_layers, "emission: depth_layers", "1 or more"))
         if self.depth_layers > 1 and self.crystal_mu is None:
             raise InputError("emission: depth_layers needs crystal_mu, of the crystal's material")
         for name in ("within_crystal", "within_walls", "within_cone"):
@@ -201,18 +206,10 @@ class Emission(Model):
     def _check_hole(self) -> None:
         if self.hole not in ("rays", "depth"):
             raise InputError(f"emission: hole: expected 'rays' or 'depth', got {self.hole!r}")
-        if self.hole == "rays":
-            return
-        for given, what in (
-            (self.mu is not None, "attenuation, mu"),
-            (self.edge != "paix", "edge 'path'"),
-            (self.depth_layers > 1, "depth_layers"),
-            (
-                self.aperture_points > 1 or self.aperture_tolerance is not None,
-                "points of the hole: it is the whole hole",
-            ),
-        ):
-            if given:
+        points = self.aperture_points > 1 or self.aperture_tolerance is not None
+        refused = {"edge 'path'": self.edge == "path", "depth_layers": self.depth_layers > 1}
+        for what, given in {**refused, "points: it is the whole hole": points}.items():
+            if self.hole == "depth" and given:
                 raise InputError(f"emission: hole 'depth' takes no {what}; use hole 'rays', or leave that out")
 
     def _set(self, name: str, value: Any) -> None:
@@ -400,21 +397,6 @@ class Emission(Model):
                 weights = weights * share_inside(shrink * along - (1 - shrink) * start, shrink * size / cells, side)
         return weights
 
-    def _direction_weights(self, m: int, along_u: Array, along_v: Array) -> Array:
-        """Counts per mm^3 times its squared depth, for lines through the hole's middle to places on the crystal's front."""
-        l = float(self.system.collimator_length[m])
-        whole = Opening(0.0, 0.0, math.pi / 4 * float(self.effective_diameter[m]) ** 2)
-        anywhere = replace(self, within_crystal=False, within_walls=False)
-        along_u, along_v = along_u[None, :], along_v[:, None]
-        weights = anywhere.pixel_weights(m, along_u, along_v, (1.0, 1.0), l, whole)
-        return weights * np.sqrt(1 + (along_u**2 + along_v**2) / l**2)  # type: ignore[no-any-return]
-
-    def _pixel_shares(self, m: int, pitch: tuple[float, float], along_u: Array, along_v: Array) -> Array:
-        """The parts of pixels that are on the crystal."""
-        side = float(self.system.detector_side[m]) if self.within_crystal or self.within_walls else math.inf
-        on_u, on_v = (share_inside(along, size, side) for along, size in zip((along_u, along_v), pitch, strict=True))
-        return on_v[:, None] * on_u  # type: ignore[no-any-return]
-
     def response(self, views: Views, m: int) -> tuple[Array, Array] | None:
         """The intrinsic blur of view m: matrices (n_v, n_v) along v and (n_u, n_u) along u."""
         if self.intrinsic_fwhm == 0:
@@ -431,13 +413,18 @@ class Emission(Model):
 
         def make(m: int) -> DepthResponse:
             l, d = float(self.system.collimator_length[m]), float(self.effective_diameter[m])
-            weigh, shares = (
-                partial(self._direction_weights, m),
-                partial(self._pixel_shares, m, self._crystal_pitch(views, m)),
-            )
-            return hole_response(views, m, grid, self.system.frames()[m], l, d, weigh, shares)
+            on_crystal = self.within_crystal or self.within_walls
+            side = float(self.system.detector_side[m]) if on_crystal else math.inf
+            whole = Opening(0.0, 0.0, math.pi / 4 * d**2)
+            anywhere = replace(self, within_crystal=False, within_walls=False)
 
-        return DepthResponses(len(views), grid.shape, make)
+            def weigh(u: Array, v: Array) -> Array:
+                return anywhere.pixel_weights(m, u, v, (1.0, 1.0), l, whole)  # type: ignore[return-value]
+
+            return hole_response(views, m, grid, self.system.frames()[m], l, d, side, weigh)
+
+        passes = None if self.mu is None else Transmittances(self.mu, grid, views)
+        return DepthResponses(len(views), grid.shape, make, passes)
 
     def rays(self, views: Views, m: int, grid: Grid) -> int:
         """Rays of each pixel of view m."""
@@ -501,19 +488,3 @@ class Emission(Model):
         """Size of a pixel on the crystal, mm along u and v."""
         scale = self._crystal_scale(views, m)
         return scale * float(np.linalg.norm(views.u_steps[m])), scale * float(np.linalg.norm(views.v_steps[m]))
-
-
-def throughput(cosine: ArrayOrTensor, distance: float) -> ArrayOrTensor:
-    """Photons that cross an mm^2 of the pinhole's plane and one of a plane behind it, per photon emitted along a mm.
-
-    Both planes lie across the axis, `distance` mm apart; the photons cross them at an angle of this `cosine` to it. With
-    the hole's area pi d^2 / 4 that is ``d^2 cos^4(psi) / (16 l^2)``.
-    """
-    squared = cosine * cosine  # many times faster than a power
-    return squared * squared / (4 * math.pi * distance**2)
-
-
-def _whole(value: Any, name: str, expected: str) -> int:
-    if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < 1:
-        raise InputError(f"emission: {name}: expected {expected}, got {value!r}")
-    return int(value)

@@ -25,7 +25,8 @@ from numpy.typing import NDArray
 from ..errors import InputError
 from ..geometry.grid import Grid
 from ..geometry.views import Views
-from .depth_response import PLANES, DepthResponse
+from ..physics.crystal import share_inside
+from .depth_response import PLANES, TAPS_TOGETHER, DepthResponse
 from .models import view_rays
 
 Array = NDArray[np.float64]
@@ -34,17 +35,17 @@ Weigh = Callable[[Array, Array], Array]
 # Cells across the hole's shadow, at least.
 _CELLS_ACROSS = 15
 # Largest ratio of the largest and the smallest shadow of the hole: beyond, interpolation between planes shows.
-_MOST_RATIO = 1.8
+_MOST_RATIO = 2.2
 
 
 def hole_response(
-    views: Views, m: int, grid: Grid, frame: Array, l: float, d: float, weigh: Weigh, shares: Weigh
+    views: Views, m: int, grid: Grid, frame: Array, l: float, d: float, side: float, weigh: Weigh
 ) -> DepthResponse:
     """The response of view m to a hole of diameter d.
 
-    `frame` has the module's u, v, k and `l` is the collimator's length. ``weigh(along_u, along_v)`` and ``shares(...)`` give
-    arrays (rows, columns) for places on the crystal, mm, point-inverted: what a mm^3 counts times its squared depth in mm^2
-    along lines through the hole's middle, and what part of a pixel there is on the crystal.
+    `frame` has the module's u, v, k, `l` is the collimator's length, and pixels count only within the crystal's `side`.
+    ``weigh(along_u, along_v)`` is what a mm^2 of the crystal counts per (decay / (s mm^3) mm) along lines through the hole's
+    middle to these places on the crystal, mm, point-inverted.
 
     Raises
     ------
@@ -66,24 +67,32 @@ def hole_response(
     shadows = [np.multiply(to_camera[axis, :3], np.sign(pitch)) for axis, pitch in zip((1, 0), pitches, strict=True)]
     kernel = _kernel(d, l * inverses, np.stack(shadows), np.abs(pitches), steps)
     margin = kernel.shape[0] // 2, kernel.shape[1] // 2
+    kernel = np.pad(kernel, ((0, 0), (0, -kernel.shape[1] % TAPS_TOGETHER), (0, 0)))
     matrix = np.empty((3, 4))
     for row, axis, i in ((1, 1, 0), (0, 0, 1)):  # rows follow v, columns u
         per_slope = steps[i] * l / pitches[i]
         matrix[row] = per_slope * to_camera[axis] + (margin[i] - steps[i] * firsts[i] / pitches[i]) * to_camera[2]
     matrix[2] = to_camera[2]
-    n_cells = tuple(steps[i] * (views.shape[i] - 1) + 1 + 2 * margin[i] for i in range(2))
+    n_cells = tuple(steps[i] * (views.shape[i] - 1) + kernel.shape[i] for i in range(2))
     along = [firsts[i] + pitches[i] / steps[i] * (np.arange(n_cells[i]) - margin[i]) for i in range(2)]
     pixels = [firsts[i] + pitches[i] * np.arange(views.shape[i]) for i in range(2)]
     # A photon's direction, on which its counts depend, lies between that of the voxel and that of the pixel as seen from
     # the hole's middle, l / (l + h) of the way: so the factors of either are powers that are 1 together.
     share = l / (l + 2 / (1 / near + 1 / far))
-    of_direction = weigh(*along[::-1]) ** (1 - share)
-    of_pixel = weigh(*pixels[::-1]) ** share * shares(*pixels[::-1])
+    of_direction, of_pixel = _weights(weigh, along, l) ** (1 - share), _weights(weigh, pixels, l) ** share
+    on_v, on_u = (share_inside(at, abs(pitch), side) for at, pitch in zip(pixels, pitches, strict=True))
+    of_pixel = of_pixel * (on_v[:, None] * on_u)
     spacing = (inverses[-1] - inverses[0]) / (PLANES - 1)
     return DepthResponse(
         matrix, near / 2, float(inverses[0]), float(1 / spacing), n_cells,  # type: ignore[arg-type]
         grid.voxel_volume * l**2 * of_direction, kernel, steps, of_pixel,  # type: ignore[arg-type]
     )  # fmt: skip
+
+
+def _weights(weigh: Weigh, places: list[Array], l: float) -> Array:
+    """What a mm^3 counts, times its squared depth by l^2, along lines to `places` (rows, columns) on the crystal."""
+    v, u = places[0][:, None], places[1][None, :]
+    return weigh(u, v) * np.sqrt(1 + (u**2 + v**2) / l**2)
 
 
 def _depths(grid: Grid, pinhole: Array, k: Array, l: float) -> tuple[float, float]:

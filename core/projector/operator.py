@@ -167,6 +167,8 @@ class Projector(LinearOperator):
         self.threads = thread_count(threads)
         self._bundles = Bundles(len(views), self._bundle)
         self._depths = model.by_depth(views, grid)
+        if self._depths is not None and self._backend.name == "cuda":
+            raise InputError("projector: hole 'depth' runs on the backends cpu and numpy, not on 'cuda'")
         self._adjoint = AdjointProjector(self)
 
     def __call__(
@@ -198,6 +200,8 @@ class Projector(LinearOperator):
         x = self._check(x)
         if self.model.mu is None:
             raise InputError("mu: the projector's model has none; give it one to say on which grid mu is")
+        if self._depths is not None:
+            raise InputError("mu: the projector's model has hole 'depth', whose attenuation is that of the model alone")
         x, mu = promote(x, require_no_negative(checked(mu, "mu", self.model.mu.grid.shape, self._float64)))
         if not is_tensor(x):
             return self._run(x, progress, mu)

@@ -15,11 +15,10 @@ from torch import Tensor
 from ..errors import InputError
 from ..geometry.grid import Grid
 from ..geometry.views import Views
-from ..physics.aperture import disk_points
+from ..physics.aperture import disk_points, throughput
 from ..physics.crystal import absorbed_share
 from ..validation import positive, whole_shape
 from ..volumes.volume import Volume, require_quantity
-from .emission import throughput
 from .pixel_points import TOLERANCE, lattice, points_needed, require_points, shadow_edges
 from .tracing import trace_fans
 

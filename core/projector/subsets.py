@@ -45,6 +45,12 @@ def access_order(n: int) -> list[int]:
     return [k * step % n for k in range(n)]
 
 
+def ordered_subsets(views: Views, n: int) -> list[tuple[int, NDArray[np.int64]]]:
+    """The subsets of `balanced_subsets` with their indices there, in the order in which they are used."""
+    subsets = balanced_subsets(views, n)
+    return [(s, subsets[s]) for s in access_order(len(subsets))]
+
+
 def _rings(z: NDArray[np.float64], gap: float) -> NDArray[np.int64]:
     """Index of each source's ring along z: sources at about the same z form one."""
     order = np.argsort(z, kind="stable")

@@ -160,12 +160,9 @@ def bsrem(
             images = [part(found, waiting(progress, 2 * n - 1, 2 * n)) for part, _ in parts]
             reached = objective(found, images)
             rounding = _ROUNDING * abs(reached)
-            fell = reached < before - rounding
-            if halvings < _MOST_HALVINGS and (fell or reached < before + size * least_gain - rounding):
+            if halvings < _MOST_HALVINGS and reached < before + size * least_gain - rounding:
                 halvings += 1
-            else:
-                fell = False
-            if not fell:
+            if reached >= before - rounding or halvings == _MOST_HALVINGS:
                 break
         loop.state["halvings"] = np.array(float(halvings))
         if progress is not None:

@@ -6,6 +6,7 @@
 from collections.abc import Callable
 from typing import NamedTuple
 
+from .bsrem import bsrem
 from .expectation import mlem, osem
 from .priors import Prior, Quadratic, RelativeDifference, TotalVariation
 from .result import Reconstruction
@@ -30,6 +31,8 @@ METHODS = {
                ("subsets", "background", "prior")),
         Method("mlem", "MLEM", "Likeliest activity, by all modules at once (slow, and the likelihood never falls)",
                mlem, ("background", "prior")),
+        Method("bsrem", "BSREM", "Likeliest activity, less the penalty of a prior: the very maximum", bsrem,
+               ("subsets", "background", "prior")),
     )
 }  # fmt: skip
 

@@ -17,6 +17,7 @@ from ..errors import InputError
 from ..memory import require
 from ..progress import Progress
 from ..recording import recorded_warnings
+from ..validation import whole_shape
 from ..volumes.formats import metaimage
 from ..volumes.formats.contents import first_line, reading
 from ..volumes.formats.dicom import is_dicom
@@ -170,7 +171,7 @@ def _raw(path: Path, layout: Layout) -> NDArray[Any]:
     if layout.type not in RAW_TYPES:
         raise InputError(f"raw type {layout.type!r}: expected one of {', '.join(RAW_TYPES)}")
     kind = np.dtype(layout.type).newbyteorder(">" if layout.big_endian else "<")
-    return _numbers(path, kind, tuple(layout.shape))
+    return _numbers(path, kind, whole_shape(layout.shape, "raw shape (--raw-shape)", 3))
 
 
 def _numbers(path: Path, kind: np.dtype[Any], shape: tuple[int, ...], skip: int = 0) -> NDArray[Any]:

@@ -3,6 +3,7 @@
 None of these is guessed, not even where the number of frames is that of the modules: whoever imports the counts says it.
 """
 
+import operator
 import re
 import warnings
 from collections.abc import Mapping, Sequence
@@ -31,7 +32,7 @@ _KEPT = ("system.", "attenuation.", "counts.", "model.", "detector.", "compute."
 def counts_run(
     counts: ArrayLike,
     system: PinholeSystem,
-    frames: str | Sequence[int] | None = None,
+    frames: str | Sequence[int | None] | None = None,
     orientation: str | Sequence[str] | None = None,
     time: float | None = None,
     *,
@@ -46,13 +47,14 @@ def counts_run(
 
     Parameters
     ----------
-    counts : array (M, rows, columns)
-        A frame for each module, of whole numbers, as they are in the file (`read_counts`).
+    counts : array (frames, rows, columns)
+        A frame for each module, of whole numbers, as they are in the file (`read_counts`), and others that are not used.
     system
         The M modules.
     frames
         Which module each frame is of: the modules' numbers in the frames' order, as a list, or a text such as ``"1-80"``,
-        ``"80-1"`` or ``"3,1,2"``.
+        ``"80-1"`` or ``"3,1,2"``; None, in a text ``none``, of a frame that is not used, such as one of another energy
+        window (``"1-80, none*80"``).
     orientation
         How the frames lie on the crystals, one of `ORIENTATIONS`, or one for each frame: ``"front+v"`` where a frame, drawn
         with row 0 at the top and column 0 at the left, is the crystal as seen from the pinhole with +v at the top.
@@ -94,7 +96,7 @@ def counts_run(
     turned = [on_crystal(frame, word) for frame, word in zip(array, words, strict=True)]
     if len({image.shape for image in turned}) > 1:
         raise InputError("orientation (--orientation): frames that are not square cannot lie both upright and turned")
-    place = {number: k for k, number in enumerate(numbers)}
+    place = {number: k for k, number in enumerate(numbers) if number is not None}
     images = np.stack([turned[place[int(number)]] for number in system.numbers]).astype(np.float32)
     if detector == "virtual":  # upright, the crystal's image point-inverted
         images = images[:, ::-1, ::-1]
@@ -116,7 +118,8 @@ def counts_run(
         **(settings or {}),
         "recipe": recorded_recipe(Recipe(given)).tables(),
     }
-    return ProjectionRun(images, system, views, unit="counts", settings=record)
+    background = given.get("model.background", 0.0)
+    return ProjectionRun(images, system, views, unit="counts", settings=record, background=background)
 
 
 def recipe_counts(recipe: Recipe, system: PinholeSystem, stages: Stages = lambda stage: None) -> ProjectionRun:
@@ -174,12 +177,17 @@ def require_told(frames: Any, orientation: Any, time: Any, found: Frames) -> Non
         raise InputError(f"{what}; say {', and '.join(missing)}")
 
 
-def frame_numbers(frames: Any, count: int, system: PinholeSystem) -> list[int]:
-    """The modules' numbers in the order of `count` frames; `InputError` unless each module has one frame."""
-    numbers = _parsed(frames) if isinstance(frames, str) else _whole(frames)
+def frame_numbers(frames: Any, count: int, system: PinholeSystem) -> list[int | None]:
+    """The modules' numbers in the order of `count` frames; `InputError` unless each module has one frame.
+
+    None of a frame that is not used.
+    """
+    found = _parsed(frames) if isinstance(frames, str) else _whole(frames)
     name = "frames (--frames)"
-    if len(numbers) != count:
-        raise InputError(f"{name}: expected the modules of {count} frames, got {len(numbers)} numbers")
+    if len(found) != count:
+        hint = "; say none for a frame that is not used, none*80 for 80 of them" if len(found) < count else ""
+        raise InputError(f"{name}: expected the modules of {count} frames, got {len(found)} numbers{hint}")
+    numbers = [number for number in found if number is not None]
     if twice := sorted({number for number in numbers if numbers.count(number) > 1}):
         raise InputError(f"{name}: module {_listed(twice)} has several frames")
     own = set(map(int, system.numbers))
@@ -187,28 +195,29 @@ def frame_numbers(frames: Any, count: int, system: PinholeSystem) -> list[int]:
         raise InputError(f"{name}: the scanner has no module {_listed(unknown)}; it has {_listed(sorted(own))}")
     if without := sorted(own - set(numbers)):
         raise InputError(f"{name}: module {_listed(without)} has no frame; leave such modules out with --modules")
-    return numbers
+    return found
 
 
-def _parsed(text: str) -> list[int]:
-    """The numbers of a text such as "1-20, 45, 40-21"."""
-    numbers: list[int] = []
-    for part in filter(None, re.split(r"[\s,;]+", re.sub(r"\s*-\s*", "-", text.strip()))):
-        found = re.fullmatch(r"(\d+)(?:-(\d+))?", part)
+def _parsed(text: str) -> list[int | None]:
+    """The numbers of a text such as "1-20, 45, 40-21, none*2"."""
+    numbers: list[int | None] = []
+    for part in filter(None, re.split(r"[\s,;]+", re.sub(r"\s*([-*])\s*", r"\1", text.strip().lower()))):
+        found = re.fullmatch(r"(?:(\d+)(?:-(\d+))?|none(?:\*(\d+))?)", part)
         if found is None:
-            raise InputError(f"frames (--frames): {part!r} is neither a number nor a range such as 1-20 or 20-1")
-        first, last = int(found[1]), int(found[2] or found[1])
+            raise InputError(f"frames (--frames): {part!r} is no number, no range such as 1-20 or 20-1, and not none")
+        first, last = int(found[1] or 1), int(found[2] or found[1] or found[3] or 1)
         if abs(last - first) + len(numbers) >= _MOST_NUMBERS:
             raise InputError(f"frames (--frames): {part} is more than a scanner has modules")
-        numbers += range(first, last + 1) if last >= first else range(first, last - 1, -1)
+        step = 1 if last >= first else -1
+        numbers += [number if found[1] else None for number in range(first, last + step, step)]
     return numbers
 
 
-def _whole(values: Any) -> list[int]:
-    array = np.asarray(values)
-    if array.ndim != 1 or array.dtype.kind not in "iu":
-        raise InputError(f"frames (--frames): expected the modules' numbers, got {values!r:.40}")
-    return [int(value) for value in array]
+def _whole(values: Any) -> list[int | None]:
+    try:
+        return [None if value is None else operator.index(value) for value in values]
+    except TypeError:
+        raise InputError(f"frames (--frames): expected the modules' numbers, got {values!r:.40}") from None
 
 
 def _read_numbers(path: Path) -> str:

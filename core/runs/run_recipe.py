@@ -154,7 +154,7 @@ def projector_of_run(
     if mu is None and recipe["model.kind"] == "emission":
         model = recipe_model(recipe, run.system)
         if recipe["attenuation.of_phantom"]:
-            mu = _mu_of_phantom(_phantom_of(recipe), phantom_pose(recipe), grid, model, stages)
+            mu = _mu_of_phantom(recipe_phantom(recipe), phantom_pose(recipe), grid, model, stages)
         elif recipe["volume.center"] and recipe["attenuation.file"] is not None:
             raise InputError(
                 "attenuation.file: it was moved with the volume (volume.center); give mu where it was then"
@@ -244,7 +244,7 @@ def _from_phantom(recipe: Recipe, record: Recipe, model: Model, mu: Volume | Non
     if recipe["volume.object"] is not None and not any(key.startswith("phantom.") for key in recipe.given):
         name = recipe["volume.object"]
         raise InputError(f"volume.object: {name!r} is in a Blender scene; give --volume FILE instead")
-    phantom, pose = _phantom_of(recipe), phantom_pose(recipe)
+    phantom, pose = recipe_phantom(recipe), phantom_pose(recipe)
     n_x, n_y, n_z = np.broadcast_to(recipe["phantom.voxels"], 3).tolist()
     # Where no spacing is given, the phantom fits however it is turned, and a voxel is kept free all around.
     spacing = np.broadcast_to(recipe["phantom.spacing"] or phantom.extent / max(1, min(n_x, n_y, n_z) - 2), 3)
@@ -262,7 +262,7 @@ def _from_phantom(recipe: Recipe, record: Recipe, model: Model, mu: Volume | Non
     yield volume, mu, with_phantom(record, phantom, pose)
 
 
-def _phantom_of(recipe: Recipe) -> Phantom:
+def recipe_phantom(recipe: Recipe) -> Phantom:
     """The phantom that a recipe describes, without its pose."""
     if recipe["phantom.file"] is not None:
         return read_phantom(recipe["phantom.file"])
@@ -271,6 +271,19 @@ def _phantom_of(recipe: Recipe) -> Phantom:
     (kind,) = (kind for kind in KINDS if kind.name == recipe["phantom.kind"])
     phantom: Phantom = kind.phantom(**{**kind.usual, **recipe.fields("phantom", kind.phantom)})
     return phantom
+
+
+def truth_of_run(run: ProjectionRun) -> tuple[Volume | Phantom, NDArray[np.float64] | None]:
+    """What a simulated run's images are of: the phantom that its recipe describes and its pose, else its volume and None.
+
+    `InputError` of a measured run.
+    """
+    if run.volume is None:
+        raise InputError("the run was measured: nobody knows the truth; give a volume or a phantom")
+    recipe = run.recipe if "recipe" in run.settings else None
+    if recipe is None or "phantom.matrix" not in recipe.given:
+        return run.volume, None
+    return recipe_phantom(recipe), phantom_pose(recipe)
 
 
 def _mu_of_phantom(phantom: Phantom, pose: NDArray[np.float64], grid: Grid, model: Model, stages: Stages) -> Volume:

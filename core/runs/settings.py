@@ -181,7 +181,8 @@ _DECLARED = (
             "another simulator's scanner (.npy, .npz, .h5, DICOM, .mhd, Interfile's .hdr, raw numbers)", is_path=True,
             sizes=(), needs=(_COUNTS, "no volume.file", "no volume.states", *_NO_PHANTOM), option="--counts"),
     Setting("counts.frames", str, None, "Which module each frame is of: the modules' numbers in the frames' order, such as "
-            "1-80, 80-1 or 3,1,2", needs=("counts.files", "no counts.frames_file"), option="--frames"),
+            "1-80, 80-1 or 3,1,2; none for one that is not used", needs=("counts.files", "no counts.frames_file"),
+            option="--frames"),
     Setting("counts.frames_file", str, None, "Text file with these numbers", is_path=True, needs=("counts.files",
             "no counts.frames")),
     Setting("counts.orientation", str, None, "How a frame, as a picture with row 0 at the top, lies on the crystal: seen "
@@ -216,6 +217,10 @@ _DECLARED = (
     Setting("model.aperture_tolerance", float, None, "In place of a number of points, as many as bring a voxel's image "
             "this close, such as 0.1, to that of the whole hole", "the number of points holds", above=0, slider=1,
             needs=(_COUNTS,), label="Hole Tolerance"),
+    Setting("model.hole", str, "rays", "How the hole's blur is computed", label="Hole's Blur", option="--hole", words={
+        "rays": ("Rays", "By rays through points of the hole"),
+        "depth": ("By Depth", "Of the whole hole, depth by depth, without rays: for reconstruction"),
+    }, needs=(_COUNTS,)),
     Setting("model.aperture_mu", float, None, "Material of the aperture's edge, or its attenuation coefficient at the "
             "photons' energy", "nothing penetrates it", unit="1/mm", words=_named(APERTURES, _BY_NAME), above=0,
             slider=10, needs=(_COUNTS,), label="Aperture"),

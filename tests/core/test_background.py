@@ -118,3 +118,11 @@ def test_images_of_other_views_are_refused(system):
     model = mph.Emission(system, background=np.ones((12, 4, 6)))
     with pytest.raises(mph.InputError, match=r"background: .* 12 images of 8 x 8, got 12 x 4 x 6"):
         mph.Projector(mph.Grid.centered(4, 10.0), system.views((8, 8)), model)
+
+
+def test_measured_counts_have_the_recipes_background(system):
+    counts, numbers = np.ones((12, 4, 4)), list(map(int, system.numbers))
+    recipe = mph.Recipe({"model.kind": "emission", "model.background": 0.5})
+    run = mph.counts_run(counts, system, numbers, "front+v", 60.0, recipe=recipe)
+    assert run.background == 0.5 and run.recipe["model.background"] == 0.5
+    assert mph.counts_run(counts, system, numbers, "front+v", 60.0).background == 0.0

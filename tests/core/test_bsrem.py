@@ -114,9 +114,9 @@ def test_one_step_late_ends_at_the_same_optimum(small, prior):
     """With one subset, where the prior is weak enough for it to end at all."""
     weak = type(prior)(prior.weight / 4)
     best = mph.bsrem(small.A, small.counts, 40, 5, weak, background=0.3)
-    late = mph.mlem(small.A, small.counts, 250, 0.3, prior=weak)
-    assert late.objective[-1] == pytest.approx(best.objective[-1], rel=1e-5)
-    assert np.linalg.norm(late.volume.array - best.volume.array) <= 2e-2 * np.linalg.norm(best.volume.array)
+    late = mph.mlem(small.A, small.counts, 120, 0.3, prior=weak)
+    assert late.objective[-1] == pytest.approx(best.objective[-1], rel=1e-4)
+    assert np.linalg.norm(late.volume.array - best.volume.array) <= 5e-2 * np.linalg.norm(best.volume.array)
 
 
 def test_a_prior_that_is_too_strong_stays_positive(small):

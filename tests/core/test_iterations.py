@@ -5,6 +5,8 @@ import pytest
 
 import mphdrr.core as mph
 
+from .conftest import BACKENDS
+
 METHODS = [
     pytest.param(lambda *given, **more: mph.mlem(*given, **more), id="mlem"),
     pytest.param(lambda *given, **more: mph.osem(*given, subsets=3, **more), id="osem"),
@@ -159,6 +161,16 @@ class TestEveryMethod:
         with pytest.raises(mph.InputError, match=words) as caught:
             method(given.pop("A"), given.pop("counts"), given.pop("iterations"), **given)
         assert "\n" not in str(caught.value)
+
+    @pytest.mark.long
+    @pytest.mark.parametrize("backend", BACKENDS)
+    def test_every_backend_finds_the_same(self, problem, method, backend):
+        A, counts, _ = problem
+        other = mph.Projector(A.grid, A.views, A.model, backend)
+        found, expected = method(other, counts, 2), method(A, counts, 2)
+        scale = expected.volume.array.max()
+        np.testing.assert_allclose(found.volume.array, expected.volume.array, rtol=1e-3, atol=1e-4 * scale)
+        assert_same(method(other, counts, 1, start=method(other, counts, 1)), found)
 
     def test_tensors_are_taken(self, problem, method):
         torch = pytest.importorskip("torch")

@@ -214,6 +214,9 @@ def test_frames_may_each_lie_their_own_way_and_come_from_several_files(system, m
 def test_a_measured_run_is_reconstructed_as_the_simulated_one(system, measured):
     frames = foreign(measured, system.numbers.tolist(), "front-u")
     run = mph.counts_run(frames, system, system.numbers, "front-u", 600.0, recipe=measured.recipe)
+    assert run.background == 0
+    scattered = measured.recipe.updated({"model.background": 1.5})
+    assert mph.counts_run(frames, system, system.numbers, "front-u", 600, recipe=scattered).background == 1.5
     grid = mph.Grid.centered(6, 20.0)
     found, expected = (mph.mlem(mph.projector_of_run(one, grid), one.projections, 2) for one in (run, measured))
     np.testing.assert_allclose(found.volume.array, expected.volume.array, rtol=1e-6)
@@ -233,7 +236,7 @@ GOOD = {"frames": "101-112", "orientation": "back-v", "time": 3.0}
         ({"frames": "101-111"}, "expected the modules of 12 frames, got 11 numbers"),
         ({"frames": "101-111,101"}, "module 101 has several frames"),
         ({"frames": "1,102-112"}, "no module 1; it has 101-112"),
-        ({"frames": "101-111,oops"}, "'oops' is neither a number nor a range"),
+        ({"frames": "101-111,oops"}, "'oops' is no number, no range"),
         ({"frames": "1-99999999"}, "more than a scanner has modules"),
         ({"frames": [101.5] * 12}, "expected the modules' numbers"),
         ({"orientation": "up"}, r"expected one of front\+v, front-v"),
@@ -276,6 +279,16 @@ def test_modules_without_a_frame_are_named(system):
     with pytest.raises(mph.InputError, match="module 107-112 has no frame; leave such modules out with --modules"):
         mph.counts_run(np.ones((6, 5, 6), int), system, "101-106", "back-v", 3)
     assert len(mph.counts_run(np.ones((6, 5, 6), int), system[:6], "106-101", "back-v", 3).views) == 6
+
+
+def test_frames_that_are_not_used_are_left_out(system):
+    counts = np.arange(5 * 36).reshape(5, 6, 6)
+    for frames in ("none,102,NONE * 2 101", [None, 102, None, None, np.int64(101)]):
+        run = mph.counts_run(counts, system[:2], frames, "back-v", 3)
+        np.testing.assert_array_equal(run.projections, counts[[4, 1]])
+        assert labels(run) == ["101 (5)", "102 (2)"]
+    with pytest.raises(mph.InputError, match="say none for a frame that is not used"):
+        mph.counts_run(counts, system[:2], "101-102", "back-v", 3)
 
 
 def test_files_that_hold_no_frames_are_refused_in_one_line(tmp_path):

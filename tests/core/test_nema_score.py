@@ -88,9 +88,9 @@ def test_background_regions_keep_their_distances():
 def test_cold_spheres_and_no_insert():
     cold = mph.NemaBody(sphere_activity=0.0, lung_diameter=0.0, sphere_diameters=(0, 0, 17, 0, 0, 37))
     with pytest.warns(mph.InputWarning, match="outside the grid"):
-        score = mph.nema_score(cold.voxelize(GRID), cold)
+        score = mph.nema_score(cold.voxelize(mph.Grid.centered((80, 62, 11), 4.0)), cold)
     assert score.diameter.tolist() == [17, 37] and np.isnan(score.lung_residual)
-    assert score.contrast_recovery[1] == pytest.approx(96, abs=3)
+    assert score.contrast_recovery[1] == pytest.approx(93, abs=5)
 
 
 @pytest.mark.parametrize(

@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import re
+import runpy
+import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -216,3 +219,13 @@ def test_wrong_runs_are_refused(run, file, tmp_path, capsys, scanner):
     with pytest.raises(mph.InputError, match="holds no recipe"):
         mph.reconstruct_run(bare)
     assert set(METHODS) >= {"osem", "mlem"}
+
+
+def test_the_example_goes_from_workbook_to_score(tmp_path, monkeypatch, capsys):
+    small = ["--iterations", "2", "--voxels", "24", "--pixels", "16", "--fine", "48"]
+    monkeypatch.setattr(sys, "argv", ["reconstruct.py", "--picture", str(tmp_path / "p.png"), *small])
+    runpy.run_path(str(Path(__file__).parents[2] / "examples/reconstruct.py"), run_name="__main__")
+    said = capsys.readouterr().out
+    assert "iteration 2 of 2" in said and "8 mm rods:" in said and "2 mm rods:" in said
+    assert 0 < float(re.search(r"NRMSE ([\d.]+)", said)[1]) < 1.2
+    assert (tmp_path / "p.png").stat().st_size > 10_000

@@ -116,9 +116,10 @@ def derenzo_score(
     linear interpolation of the voxels, as the mean over the middle half of the rods' length and over half a diameter across
     the line. Its peak is the mean of both centres, its valley lies halfway between them: at these known places, not where
     values are largest and smallest, as these differ by noise alone. (Of cold rods, the peak is halfway and the valley in the
-    rods.) A pair is resolved if valley / peak < 0.735, Rayleigh's criterion, as Hallen et al. propose for hot-rod
-    phantoms. Contrast recovery is the mean peak minus the mean valley, by the same of the phantom: it is 1 only where the
-    volume's values are right, too.
+    rods.) A pair is resolved if valley / peak < 0.735, Rayleigh's criterion, as Hallen et al. propose for hot-rod phantoms.
+    Of rods that cannot be seen at all, noise resolves some pairs by chance, while the sector's own valley-to-peak, of the
+    means of all pairs, stays near 1. Contrast recovery is the mean peak minus the mean valley, by the same of the phantom:
+    it is 1 only where the volume's values are right, too.
 
     Parameters
     ----------

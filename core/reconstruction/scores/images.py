@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ...errors import InputError
+from ...geometry.grid import Grid
 from ...memory import require
 from ...progress import Progress, in_threads
 from ...validation import instance, positive, real_array, shape_text
@@ -171,6 +172,11 @@ def bias_and_deviation(volumes: Iterable[Volume], truth: Volume) -> BiasAndDevia
     return BiasAndDeviation(*(Volume(values.astype(np.float32), truth.grid, truth.quantity) for values in found))
 
 
+def same_grid(one: Grid, other: Grid) -> bool:
+    """Whether two grids have the same voxels, up to a thousandth of a voxel, which files may round away."""
+    return one.shape == other.shape and bool(np.abs(one.corners() - other.corners()).max() <= 1e-3 * one.spacing.min())
+
+
 def _pair(volume: Values, truth: Values, name: str, mask: ArrayLike | None = None) -> tuple[Floats, Floats]:
     """The values of both, float64, checked to belong to the same voxels; those of the mask, if there is one."""
     if isinstance(volume, Volume) and isinstance(truth, Volume):
@@ -194,11 +200,10 @@ def _values(volume: Values, name: str) -> Floats:
 
 
 def _require_fit(volume: Volume, truth: Volume, name: str) -> None:
-    """Raise `InputError` unless both hold the same quantity on the same grid, up to a thousandth of a voxel."""
+    """Raise `InputError` unless both hold the same quantity on the same grid."""
     if volume.quantity != truth.quantity:
         raise InputError(f"{name}: volume of {volume.quantity}, truth of {truth.quantity}")
-    one, other = volume.grid, truth.grid
-    if one.shape != other.shape or np.abs(one.corners() - other.corners()).max() > 1e-3 * one.spacing.min():
+    if not same_grid(volume.grid, truth.grid):
         advice = 'mph.resample(truth, volume.grid, "mean") brings the truth to the volume\'s'
         raise InputError(f"{name}: volume and truth are on different grids; {advice}")
 

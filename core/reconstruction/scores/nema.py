@@ -22,7 +22,7 @@ _LARGEST = 37.0  # diameter of the background regions that are placed; smaller o
 _CLEAR = 15.0  # from such a region to the body's outline, to spheres and to the lung insert
 _LUNG = 0.6  # of the lung insert's diameter: 30 mm of 50 mm
 _STEP = 2.0  # between the places that a background region may take
-_POINTS = 1000  # of a region
+_POINTS = 8  # of a region, to each of the smallest voxels' faces
 
 
 @dataclass(frozen=True, eq=False)
@@ -113,7 +113,8 @@ def nema_score(volume: Volume, phantom: NemaBody, pose: ArrayLike | None = None)
         for diameter, (x, y) in zip(phantom.sphere_diameters, sphere_places(), strict=True)
         if diameter
     ]
-    around = np.array([(x, y, z) for z in _SLICES for x, y in _background_places(phantom)])
+    places = _background_places(phantom)
+    around = np.array([(x, y, z) for z in _SLICES for x, y in places])
     true_contrast = phantom.sphere_activity / phantom.background - 1
     rows = []
     for diameter, place in spheres:
@@ -142,9 +143,10 @@ def _means(volume: Volume, world: Floats, centers: Floats, diameter: float, name
     """Means (n,) over circles in the phantom's planes, around `centers` (n, 3) in its frame."""
     grid = volume.grid
     # Points that stand for equal areas of a circle, along a spiral with turns of the golden angle (Vogel 1979).
-    number = np.arange(_POINTS)
-    radius, angle = diameter / 2 * np.sqrt((number + 0.5) / _POINTS), number * math.pi * (3 - math.sqrt(5))
-    circle = np.stack([radius * np.cos(angle), radius * np.sin(angle), np.zeros(_POINTS)], axis=1)
+    count = math.ceil(_POINTS * math.pi / 4 * max(5.0, diameter / grid.spacing.min()) ** 2)
+    number = np.arange(count)
+    radius, angle = diameter / 2 * np.sqrt((number + 0.5) / count), number * math.pi * (3 - math.sqrt(5))
+    circle = np.stack([radius * np.cos(angle), radius * np.sin(angle), np.zeros(count)], axis=1)
     points = (centers[:, None] + circle) @ world[:3, :3].T + world[:3, 3]
     index = points @ grid.index_from_world[:3, :3].T + grid.index_from_world[:3, 3]
     outside = ((index < -0.5) | (index > np.array(grid.shape) - 0.5)).any(axis=(1, 2))

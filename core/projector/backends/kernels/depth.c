@@ -103,17 +103,25 @@ INLINE void between(const DepthJob *job, const int gathers) {
 void KERNEL(voxels_to_cells)(const DepthJob *job) { between(job, 0); }
 void KERNEL(cells_to_voxels)(const DepthJob *job) { between(job, 1); }
 
-// A pixel is a sum over the cells around its centre, row by row: the taps of all planes are one run of numbers.
+// A pixel is a sum over the cells around its centre, row by row: the taps of all planes are one run of numbers, a multiple
+// of RUN long, and as many sums run side by side.
+typedef REAL Run __attribute__((ext_vector_type(RUN), aligned(sizeof(REAL))));
+
 void KERNEL(cells_to_pixels)(const DepthJob *job) {
     const int64_t run = job->taps[1] * PLANES, width = job->columns * PLANES;
     for (int64_t i = 0; i < job->pixels[0]; i++) for (int64_t j = 0; j < job->pixels[1]; j++) {
         const REAL *taps = job->kernel;
         const REAL *cells = (const REAL *)job->cells + i * job->step[0] * width + j * job->step[1] * PLANES;
-        Cell sum = 0;
+        Run sums[2] = {0, 0}; // of even and odd rows: none waits for the other
         for (int64_t a = 0; a < job->taps[0]; a++, taps += run, cells += width) {
-            for (int64_t b = 0; b < run; b += PLANES) sum += *(const Cell *)(taps + b) * *(const Cell *)(cells + b);
+            Run sum = sums[a % 2];
+            for (int64_t b = 0; b < run; b += RUN) sum += *(const Run *)(taps + b) * *(const Run *)(cells + b);
+            sums[a % 2] = sum;
         }
-        ((REAL *)job->image)[i * job->pixels[1] + j] = sum_of(sum);
+        const Run sum = sums[0] + sums[1];
+        REAL total = 0;
+        UNROLLED for (int b = 0; b < RUN; b++) total += sum[b];
+        ((REAL *)job->image)[i * job->pixels[1] + j] = total;
     }
 }
 
@@ -125,7 +133,7 @@ void KERNEL(pixels_to_cells)(const DepthJob *job) {
         const REAL value = ((const REAL *)job->image)[i * job->pixels[1] + j];
         if (value == 0) continue;
         for (int64_t a = 0; a < job->taps[0]; a++, taps += run, cells += width) {
-            for (int64_t b = 0; b < run; b += PLANES) *(Cell *)(cells + b) += value * *(const Cell *)(taps + b);
+            for (int64_t b = 0; b < run; b += RUN) *(Run *)(cells + b) += value * *(const Run *)(taps + b);
         }
     }
 }

@@ -59,6 +59,7 @@ typedef struct {
 // counts value / h^2, and nothing outside the fine image or nearer than `nearest`. Its plane is a number from 0 to PLANES - 1,
 // (1 / h - first_plane) planes_per_inverse.
 #define PLANES 4
+#define RUN 16 // taps[1] PLANES is a multiple of it
 
 typedef struct {
     int64_t is_double;

@@ -1,0 +1,67 @@
+"""The Reconstruction panel's settings: Blender properties made from `core.runs.settings`, and what they say."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Iterator, Mapping
+from typing import Any
+
+import bpy
+from bpy.props import PointerProperty, StringProperty
+
+from ..core.runs.recipe import Recipe, fitting_recipe
+from ..core.runs.settings import SETTINGS
+from . import volumes
+from .setting_properties import drawn_of, given_of, properties_of, values_of
+
+_BY_COMMAND_LINE = ("anatomy", "stop_change", "stop_noise", "stop_region", "stop_seconds")
+"""Settings that the panel does not have: of files, and of ends that Finish Now is for."""
+
+PROPERTIES = {
+    key.partition(".")[2]: setting
+    for key, setting in SETTINGS.items()
+    if key.startswith("reconstruction.") and not key.endswith(_BY_COMMAND_LINE)
+}
+"""The settings by the names of their properties."""
+
+
+class ReconstructionSettings:
+    """How to reconstruct; mixed into the scene's properties (the panel) and into the operator (scripts)."""
+
+
+ReconstructionSettings.__annotations__ = properties_of(PROPERTIES)
+
+
+def settings_recipe(get: Callable[[str], Any], is_given: Callable[[str], bool]) -> Recipe:
+    """The recipe's [reconstruction]; `get` gives a property's value, `is_given` whether a script has set it.
+
+    Raises InputError where a setting that is given has no effect.
+    """
+    values = values_of(PROPERTIES, get)
+    given = [s.key for name, s in PROPERTIES.items() if is_given(name) and values[s.key] != s.default]
+    return fitting_recipe(values, given)
+
+
+def drawn(settings: ReconstructionProperties) -> Iterator[tuple[str, bool]]:
+    """The properties that the chosen method and prior have, each with whether it has an effect."""
+    values = given_of(PROPERTIES, lambda name: getattr(settings, name))
+    return drawn_of(PROPERTIES, settings, values, lambda need: True)
+
+
+class ReconstructionProperties(ReconstructionSettings, bpy.types.PropertyGroup):
+    """State of the Reconstruction panel; `Scene.mphdrr_reconstruction`."""
+
+    volume: PointerProperty(
+        name="Reconstruction", description="The last reconstructed volume", type=bpy.types.Object,
+        poll=lambda self, item: volumes.is_volume(item), options={"HIDDEN"},
+    )  # fmt: skip
+    record: StringProperty(name="Record", description="What is known of it, JSON", options={"HIDDEN"})
+
+    @property
+    def known(self) -> Mapping[str, Any]:
+        """What is known of the last reconstruction: `title`, `objective` by iteration, its name, and `scores`."""
+        found: Mapping[str, Any] = json.loads(self.record) if self.record else {}
+        return found
+
+
+CLASSES = (ReconstructionProperties,)

@@ -1,0 +1,148 @@
+"""The projector as the operators of other packages, so that their algorithms run on this scanner.
+
+The packages are imported when they are asked for. Their operators compute with `Projector` alone: the same numbers, kernels
+and exact adjoint.
+"""
+
+import importlib
+import warnings
+from typing import Any
+
+from ...errors import InputError
+from ...projector import Projector
+from ...projector.operator import LinearOperator
+from ...validation import instance
+from .parallelproj_operator import ParallelprojOperator
+
+
+def scipy_operator(A: LinearOperator) -> Any:
+    """`A` as a ``scipy.sparse.linalg.LinearOperator`` on flat arrays, for its ``lsqr``, ``lsmr``, ``svds``, …
+
+    Parameters
+    ----------
+    A : Projector or its adjoint
+        From arrays of ``A.shape_in`` to those of ``A.shape_out``.
+
+    Returns
+    -------
+    scipy.sparse.linalg.LinearOperator
+        Its shape is (pixels, voxels), in C order. Several columns go through `A` as one batch.
+
+    Raises
+    ------
+    InputError
+        scipy is missing, or `A` is no projector.
+
+    Examples
+    --------
+    >>> from scipy.sparse.linalg import lsqr
+    >>> volume = lsqr(scipy_operator(A), images.ravel(), iter_lim=20)[0].reshape(A.shape_in)  # doctest: +SKIP
+    """
+    instance(A, LinearOperator, "scipy_operator: A")
+    return _module("scipy_operator", "scipy").ScipyOperator(A)
+
+
+def deepinv_physics(A: Projector, **options: Any) -> Any:
+    """`A` as a ``deepinv.physics.LinearPhysics``, for deepinv's algorithms and networks.
+
+    Parameters
+    ----------
+    A : Projector
+        From volumes to images.
+    options
+        As of ``LinearPhysics``, such as ``noise_model=deepinv.physics.PoissonNoise()``.
+
+    Returns
+    -------
+    deepinv.physics.LinearPhysics
+        Takes volumes (B, C, n_x, n_y, n_z) and gives images (B, C, M, n_v, n_u), float32 or float64, on any device. Where
+        the model has a background, that is its ``background``, which deepinv's MLEM and OSEM expect in the counts.
+        ``split_physics(n)`` and ``split_measurements(y, n)`` are the balanced subsets of its OSEM, in the order of `osem`.
+
+    Raises
+    ------
+    InputError
+        deepinv is missing, or `A` is no projector.
+
+    References
+    ----------
+    J. Tachella et al., "DeepInverse: A Python package for solving imaging inverse problems with deep learning",
+    Journal of Open Source Software 10 (2025) 8923.
+
+    Examples
+    --------
+    >>> physics = deepinv_physics(A)
+    >>> volume = deepinv.optim.MLEM(max_iter=50)(counts[None, None], physics)[0, 0]  # doctest: +SKIP
+    """
+    instance(A, Projector, "deepinv_physics: A")
+    return _module("deepinv_physics", "deepinv").ProjectorPhysics(A, **options)
+
+
+def pytomography_matrix(A: Projector) -> Any:
+    """`A` as a PyTomography ``SystemMatrix``, for its OSEM, BSREM and other algorithms.
+
+    Parameters
+    ----------
+    A : Projector
+        From volumes to images.
+
+    Returns
+    -------
+    pytomography.projectors.SystemMatrix
+        Takes objects (n_x, n_y, n_z) and gives projections (M, n_v, n_u); lengths are cm, as PyTomography's. Its subsets are
+        balanced over rings and angles, in the order of `osem`. A background goes to the likelihood:
+        ``additive_term=torch.tensor(A.background)``.
+
+    Raises
+    ------
+    InputError
+        PyTomography is missing, or `A` is no projector.
+
+    References
+    ----------
+    L. Polson et al., "PyTomography: A Python library for medical image reconstruction", SoftwareX 29 (2025) 102020.
+
+    Examples
+    --------
+    >>> likelihood = PoissonLogLikelihood(pytomography_matrix(A), counts)  # doctest: +SKIP
+    >>> volume = OSEM(likelihood)(n_iters=4, n_subsets=16)  # doctest: +SKIP
+    """
+    instance(A, Projector, "pytomography_matrix: A")
+    with warnings.catch_warnings():  # PyTomography silences all warnings when it is imported
+        return _module("pytomography_matrix", "pytomography").ProjectorMatrix(A)
+
+
+def parallelproj_operator(A: LinearOperator) -> ParallelprojOperator:
+    """`A` with the methods of a ``parallelproj`` linear operator, for algorithms that are written for these.
+
+    Parameters
+    ----------
+    A : Projector or its adjoint
+        From arrays of ``A.shape_in`` to those of ``A.shape_out``.
+
+    Returns
+    -------
+    ParallelprojOperator
+        `parallelproj` need not be there; its own operators combine with this one.
+
+    Raises
+    ------
+    InputError
+        `A` is no projector.
+
+    References
+    ----------
+    G. Schramm, K. Thielemans, "PARALLELPROJ: an open-source framework for fast calculation of projections in tomography",
+    Frontiers in Nuclear Medicine 3 (2024) 1324562.
+    """
+    instance(A, LinearOperator, "parallelproj_operator: A")
+    return ParallelprojOperator(A)
+
+
+def _module(name: str, package: str) -> Any:
+    """A module of this folder, which imports the package; `InputError` where that, or something it needs, is missing."""
+    try:
+        return importlib.import_module(f".{name}", __package__)
+    except ModuleNotFoundError as error:
+        missing = (error.name or package).partition(".")[0]
+        raise InputError(f"{package}: {missing} is missing: pip install {missing}") from None

@@ -1,0 +1,48 @@
+"""deepinv's linear physics."""
+
+from typing import Any
+
+import torch
+from deepinv.physics import LinearPhysics, StackedLinearPhysics
+from deepinv.utils import TensorList
+from torch import Tensor
+
+from ...projector import Projector
+from ...projector.subsets import ordered_subsets
+
+
+class ProjectorPhysics(LinearPhysics):
+    """A projector of tensors with axes of batch and channel."""
+
+    def __init__(self, A: Projector, **options: Any) -> None:
+        super().__init__(img_size=(1, *A.shape_in), **options)
+        self.projector = A
+        if A.background.any():  # deepinv's algorithms look whether there is this attribute
+            self.register_buffer("background", torch.tensor(A.background, dtype=torch.float32), persistent=False)
+
+    def A(self, x: Tensor, add_background: bool = False, **_: Any) -> Tensor:
+        """Images (B, C, M, n_v, n_u) of volumes, with the model's background if asked for."""
+        images: Tensor = self.projector(x)
+        if add_background and hasattr(self, "background"):
+            images = images + self.background
+        return images
+
+    def A_adjoint(self, y: Tensor, **_: Any) -> Tensor:
+        """The exact adjoint of the linear part."""
+        volumes: Tensor = self.projector.T(y)
+        return volumes
+
+    def forward(self, x: Tensor, **options: Any) -> Tensor:
+        """Measurements: the expected counts with background, through the noise model and the sensor."""
+        measured: Tensor = self.sensor(self.noise(self.A(x, add_background=True, **options)))
+        return measured
+
+    def split_physics(self, n: int) -> StackedLinearPhysics:
+        """The physics of `n` balanced subsets of the views."""
+        parts = self.projector.subsets(n)
+        order = [s for s, _ in ordered_subsets(self.projector.views, n)]
+        return StackedLinearPhysics([ProjectorPhysics(parts[s], noise_model=self.noise_model) for s in order])
+
+    def split_measurements(self, y: Tensor, n: int) -> TensorList:
+        """Their measurements, of those of all views (B, C, M, n_v, n_u)."""
+        return TensorList([y[:, :, which] for _, which in ordered_subsets(self.projector.views, n)])

@@ -1,0 +1,75 @@
+"""Sidebar, after the runs: from the shown run back to a volume, and what that is worth."""
+
+import bpy
+from bpy.app.translations import pgettext_iface as iface
+
+from ..addon import ids, jobs, plots, runs
+from ..addon.reconstruction_properties import drawn
+from .geometry import Sidebar, draw_hint
+
+_MAIN = ("method", "iterations", "subsets", "voxels", "spacing")
+"""Settings that the panel itself shows; the others stand under Model and Prior."""
+_PLOT = 6.0  # of a button's heights
+
+
+class MPHDRR_PT_reconstruction(Sidebar, bpy.types.Panel):
+    bl_label = "Reconstruction"
+    bl_order = ids.ORDER_RECONSTRUCTION
+
+    def draw(self, context: bpy.types.Context) -> None:
+        layout = self.layout
+        layout.use_property_split = True
+        layout.use_property_decorate = False
+        settings = context.scene.mphdrr_reconstruction
+        run = runs.shown(context.scene)
+        if run is None:
+            draw_hint(layout, "Render projections first.")
+        else:
+            jobs.draw_job(layout)
+            layout.label(text=iface("Of {run}").format(run=run.name), translate=False, icon="RENDER_STILL")
+        column = layout.column()
+        _draw(column, settings, True)
+        row = layout.row()
+        row.scale_y = 1.4
+        row.operator_context = "INVOKE_DEFAULT"
+        row.operator(ids.RECONSTRUCT, text="Reconstruct", icon="OUTLINER_OB_VOLUME")
+        known = settings.known
+        if known and settings.volume is not None:
+            _draw_result(layout, settings, known)
+
+
+def _draw_result(layout: bpy.types.UILayout, settings: bpy.types.PropertyGroup, known: dict) -> None:
+    """The objective's plot, and the scores beside the truth."""
+    box = layout.box()
+    box.label(text=known["title"], translate=False, icon="OUTLINER_DATA_VOLUME")
+    split = box.split(factor=0.4)
+    split.template_icon(icon_value=plots.objective_icon(known["objective"]), scale=_PLOT)
+    column = split.column(align=True)
+    column.label(text=known["name"].capitalize())
+    column.label(text=f"{known['objective'][-1]:.7g}", translate=False)
+    scores = box.column(align=True)
+    for name, value in known["scores"]:
+        row = scores.split(factor=0.3)
+        row.label(text=name, translate=False)
+        row.label(text=value, translate=False)
+    box.operator(ids.SHOW_RECONSTRUCTION, text="Show Slices", icon="IMAGE_DATA")
+
+
+def _draw(layout: bpy.types.UILayout, settings: bpy.types.PropertyGroup, main: bool) -> None:
+    for name, is_active in drawn(settings):
+        if (name in _MAIN) == main:
+            row = layout.row()
+            row.active = is_active
+            row.prop(settings, name)
+
+
+class MPHDRR_PT_reconstruction_model(Sidebar, bpy.types.Panel):
+    bl_label = "Model and Prior"
+    bl_parent_id = "MPHDRR_PT_reconstruction"
+    bl_options = {"DEFAULT_CLOSED"}
+
+    def draw(self, context: bpy.types.Context) -> None:
+        layout = self.layout
+        layout.use_property_split = True
+        layout.use_property_decorate = False
+        _draw(layout.column(), context.scene.mphdrr_reconstruction, False)

@@ -1,0 +1,200 @@
+"""The Reconstruction panel and its job: settings, the volume in the scene, updates, Cancel and Finish Now."""
+
+from __future__ import annotations
+
+from unittest.mock import MagicMock
+
+import bpy
+import numpy as np
+import pytest
+
+import mphdrr.core as mph
+from mphdrr.addon import ids, jobs, plots, reconstructions, registration, scanner, storage, volumes
+from mphdrr.addon.reconstruction_properties import PROPERTIES, drawn, settings_recipe
+from mphdrr.core.progress import Cancelled
+from mphdrr.core.runs.files import read_run
+from mphdrr.core.runs.settings import SETTINGS
+
+SMALL = {"voxels": 14, "spacing": 7.0, "iterations": 3, "subsets": 2}
+
+
+@pytest.fixture
+def render(scene, ring_system):
+    """A scanner of eight modules, a phantom and a run of counts."""
+    scanner.build_scanner(scene, ring_system, "Ring")
+    bpy.ops.mphdrr.add_derenzo(voxels=32, location=(5, -3, 2), phi=0.2)
+    settings = scene.mphdrr_projections
+    settings.width, settings.height, settings.model, settings.time = 12, 10, "EMISSION", 600.0
+    settings.pixel_points, settings.tolerance = 2, 9.0
+
+    def now(**changes):
+        for name, value in changes.items():
+            setattr(settings, name, value)
+        assert bpy.ops.mphdrr.render_projections() == {"FINISHED"}
+
+    now()
+    return now
+
+
+def reconstructed() -> bpy.types.Object:
+    return bpy.context.scene.mphdrr_reconstruction.volume
+
+
+def state() -> tuple:
+    """What a cancelled job leaves as it was."""
+    scene = bpy.context.scene
+    return (
+        sorted(item.name for item in bpy.data.objects),
+        sorted(data.name for data in bpy.data.volumes),
+        sorted(material.name for material in bpy.data.materials),
+        sorted(image.name for image in bpy.data.images),
+        sorted(path.name for path in storage.folder().iterdir()),
+        scene.mphdrr_reconstruction.record,
+    )
+
+
+def test_the_volume_is_that_of_the_command_line(render, scene):
+    assert bpy.ops.mphdrr.reconstruct(**SMALL) == {"FINISHED"}
+    item = reconstructed()
+    assert item.name == f"{scene.mphdrr_projections.runs[0].name} OSEM"
+    assert bpy.context.object == item and item.mphdrr_volume.quantity == "activity"
+    run = read_run(storage.absolute(scene.mphdrr_projections.run_file))
+    expected = mph.reconstruct_run(run, mph.Recipe({f"reconstruction.{name}": value for name, value in SMALL.items()}))
+    found = volumes.volume_from_object(item)
+    np.testing.assert_allclose(found.array, expected.volume.array, rtol=1e-6)
+    np.testing.assert_allclose(found.grid.affine, expected.volume.grid.affine, atol=1e-6)
+    known = scene.mphdrr_reconstruction.known
+    assert known["title"] == "OSEM, 3 iterations" and known["name"] == "log-likelihood"
+    np.testing.assert_allclose(known["objective"], expected.objective)
+    assert known["scores"][0][0] == "NRMSE" and len(known["scores"]) == 7
+    assert bpy.data.images[ids.RECONSTRUCTION].size[:] == (1600, 850)
+
+
+def test_panel_settings_count_and_scripts_override_them(render, scene):
+    panel = scene.mphdrr_reconstruction
+    panel.method, panel.iterations, panel.voxels, panel.spacing = "MLEM", 2, 10, 9.0
+    assert bpy.ops.mphdrr.reconstruct() == {"FINISHED"}
+    assert panel.known["title"] == "MLEM, 2 iterations" and reconstructed().mphdrr_volume.shape[:] == (10, 10, 10)
+    assert bpy.ops.mphdrr.reconstruct(iterations=1) == {"FINISHED"}
+    assert panel.known["title"] == "MLEM, 1 iteration"
+    with pytest.raises(RuntimeError, match=r"needs reconstruction\.method = osem"):
+        bpy.ops.mphdrr.reconstruct(subsets=2)
+    with pytest.raises(RuntimeError, match="weight"):
+        bpy.ops.mphdrr.reconstruct(prior="QUADRATIC")
+
+
+def test_every_setting_is_in_the_panel_or_left_to_files(scene):
+    panel = scene.mphdrr_reconstruction
+    all_names = {key.partition(".")[2] for key in SETTINGS if key.startswith("reconstruction.")}
+    assert all_names - set(PROPERTIES) == {"anatomy", "stop_change", "stop_noise", "stop_region", "stop_seconds"}
+    recipe = settings_recipe(lambda name: getattr(panel, name), lambda name: False)
+    assert all(recipe[setting.key] == setting.default for setting in PROPERTIES.values())
+    assert "weight" not in dict(drawn(panel)) and "subsets" in dict(drawn(panel))
+    panel.prior = "RELATIVE_DIFFERENCE"
+    assert {"weight", "gamma", "edge"} <= dict(drawn(panel)).keys()
+    panel.method, panel.prior = "MLEM", "NONE"
+    assert "subsets" not in dict(drawn(panel))
+
+
+def test_without_a_run_the_button_says_why(scene):
+    with pytest.raises(RuntimeError, match="poll"):
+        bpy.ops.mphdrr.reconstruct()
+    with pytest.raises(RuntimeError, match="poll"):
+        bpy.ops.mphdrr.show_reconstruction()
+
+
+def test_a_radiograph_is_refused_by_methods_of_counts(render):
+    render(model="TRANSMISSION")
+    with pytest.raises(RuntimeError, match="osem needs a run of counts"):
+        bpy.ops.mphdrr.reconstruct(**SMALL)
+
+
+def job_of(scene) -> jobs.Job:
+    panel = scene.mphdrr_reconstruction
+    for name, value in SMALL.items():
+        setattr(panel, name, value)
+    return reconstructions.reconstructing(
+        bpy.context, settings_recipe(lambda name: getattr(panel, name), lambda name: False)
+    )
+
+
+def test_it_is_shown_while_it_runs_and_cancelled_without_a_trace(render, scene, monkeypatch):
+    before = state()
+    monkeypatch.setattr(reconstructions, "_BETWEEN", -1.0)
+    monkeypatch.setattr(reconstructions, "_is_watched", lambda: True)
+    job, seen = job_of(scene), []
+
+    def progress(done: int, total: int) -> None:
+        job.look()  # the window does so from time to time
+        if reconstructed() is not None:
+            seen.append(len(scene.mphdrr_reconstruction.known["objective"]))
+            assert scene.mphdrr_reconstruction.known["scores"] == []
+            if seen[-1] == 2:
+                raise Cancelled
+
+    with pytest.raises(Cancelled):
+        jobs.run(job, progress)
+    assert sorted(set(seen)) == [1, 2]
+    assert state() == before and reconstructed() is None
+
+
+def test_finish_now_keeps_what_there_is(render, scene, monkeypatch):
+    monkeypatch.setattr(reconstructions, "_BETWEEN", -1.0)
+    monkeypatch.setattr(reconstructions, "_is_watched", lambda: True)
+    files = set(storage.folder().iterdir())
+    job = job_of(scene)
+
+    def progress(done: int, total: int) -> None:
+        job.look()
+        if reconstructed() is not None:
+            job.enough.set()
+
+    text = jobs.run(job, progress)
+    assert "OSEM, 2 iterations" in text and len(scene.mphdrr_reconstruction.known["objective"]) == 2
+    assert len(set(storage.folder().iterdir()) - files) == 1, "files of states that were shown meanwhile are gone"
+    assert len([item for item in volumes.volume_objects(scene) if "OSEM" in item.name]) == 1
+
+
+def test_a_second_one_stands_beside_the_first(render, scene):
+    bpy.ops.mphdrr.reconstruct(**SMALL)
+    first = reconstructed()
+    bpy.ops.mphdrr.reconstruct(**SMALL | {"iterations": 1})
+    assert reconstructed() != first and first.name in bpy.data.objects
+    array = [volumes.volume_from_object(item).array for item in (first, reconstructed())]
+    assert not np.allclose(*array)
+
+
+def test_the_scenes_attenuation_is_modelled_and_missed(render, scene):
+    bpy.ops.mphdrr.add_derenzo(voxels=12, cylinder_radius=45.0, cylinder_height=60.0, quantity="mu", background=0.0)
+    mu = bpy.context.object
+    scene.mphdrr_projections.volume = bpy.data.objects["Derenzo"]
+    render(mu=mu)
+    bpy.ops.mphdrr.reconstruct(**SMALL)
+    total = volumes.volume_from_object(reconstructed()).array.sum()
+    bpy.ops.mphdrr.reconstruct(**SMALL, ignore_attenuation=True)
+    assert volumes.volume_from_object(reconstructed()).array.sum() < 0.95 * total
+    bpy.data.objects.remove(mu)
+    with pytest.raises(RuntimeError, match="is not in the scene any more"):
+        bpy.ops.mphdrr.reconstruct(**SMALL)
+
+
+def test_the_panel_draws_the_result(render, scene):
+    bpy.ops.mphdrr.reconstruct(**SMALL)
+    (cls,) = (cls for cls in registration.CLASSES if cls.__name__ == "MPHDRR_PT_reconstruction")
+    layout = MagicMock()
+    for part in ("box", "column", "row", "split"):
+        getattr(layout, part).return_value = layout
+    cls.draw(MagicMock(layout=layout), bpy.context)
+    said = [options["text"] for _, _, options in layout.mock_calls if options.get("text")]
+    assert {"OSEM, 3 iterations", "Log-likelihood", "NRMSE", "8 mm rods", "Show Slices", "Reconstruct"} <= set(said)
+    assert layout.template_icon.call_args.kwargs["icon_value"] > 0 or bpy.app.background
+    plots.stop()
+    assert plots.objective_icon([1.0]) >= 0
+
+
+def test_a_saved_file_opens_with_its_reconstruction(render, scene, tmp_path):
+    bpy.ops.mphdrr.reconstruct(**SMALL)
+    bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "a.blend"))
+    bpy.ops.wm.open_mainfile(filepath=str(tmp_path / "a.blend"))
+    assert volumes.volume_from_object(reconstructed()).array.max() > 0
+    assert bpy.context.scene.mphdrr_reconstruction.known["title"] == "OSEM, 3 iterations"

@@ -50,6 +50,7 @@ from .reconstruction.expectation import mlem, osem
 from .reconstruction.fbp import fbp
 from .reconstruction.fdk import fdk
 from .reconstruction.files import read_reconstruction, write_reconstruction
+from .reconstruction.least_squares import cgls, sirt
 from .reconstruction.priors import Prior, Quadratic, RelativeDifference, TotalVariation
 from .reconstruction.result import Reconstruction
 from .reconstruction.scores.derenzo import DerenzoScore, DerenzoSector, RodProfile, derenzo_score
@@ -57,6 +58,7 @@ from .reconstruction.scores.images import BiasAndDeviation, bias_and_deviation, 
 from .reconstruction.scores.nema import NemaScore, NemaSphere, nema_score
 from .reconstruction.scores.summary import VolumeScore, score_volume
 from .reconstruction.stopping import StopWhen
+from .reconstruction.tv import tv
 from .runs.files import read_run, write_run
 from .runs.frame_files import read_counts
 from .runs.measured import counts_run

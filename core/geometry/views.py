@@ -56,8 +56,10 @@ class Views:
     def __getitem__(self, which: int | slice | NDArray[np.integer]) -> Views:
         """The views `which` (an index, a slice or an array of indices) as Views."""
         index = np.atleast_1d(np.arange(len(self))[which])
-        arrays = (self.sources, self.detector_centers, self.u_steps, self.v_steps)
-        return Views(*(array[index] for array in arrays), self.shape, self.parallel)
+        sources, centers, u_steps, v_steps = (
+            array[index] for array in (self.sources, self.detector_centers, self.u_steps, self.v_steps)
+        )
+        return Views(sources, centers, u_steps, v_steps, self.shape, self.parallel)
 
     def rays(self, m: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Ends of view m's rays: sources and targets, each (n_v * n_u, 3) in mm, row by row.

@@ -1,0 +1,207 @@
+"""Least squares by iteration: SIRT and CGLS, and what they have in common with TV."""
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from ..errors import InputError
+from ..progress import Progress
+from ..projector import Projector
+from ..validation import instance, positive, real_array
+from .loop import Loop, Start, plain, waiting
+from .result import Array, Callback, Reconstruction
+from .stopping import StopWhen
+
+
+def sirt(
+    A: Projector,
+    images: ArrayLike,
+    iterations: int = 100,
+    relaxation: float = 1.0,
+    nonnegative: bool = True,
+    start: Start = None,
+    mask: ArrayLike | None = None,
+    callback: Callback | None = None,
+    progress: Progress | None = None,
+    stop: StopWhen | None = None,
+) -> Reconstruction:
+    """The volume whose images are nearest to `images`, by SIRT: ``x <- x + relaxation C A.T(R (images - A x))``.
+
+    R is 1 by the pixels' sums of weights, ``A(1)``, C 1 by the voxels', ``A.T(1)``. Early iterations are smooth, later ones
+    sharper and noisier. Slow and steady; for any projector.
+
+    Parameters
+    ----------
+    A : Projector
+        Of any model. Its background, if it has any, is taken off the images.
+    images : array (M, n_v, n_u)
+        Line integrals of `Transmission`, or counts of `Emission`.
+    iterations : int
+        Each takes one projection and one backprojection.
+    relaxation : float
+        Length of the steps, more than 0 and less than 2.
+    nonnegative : bool
+        Whether values below 0 become 0 after each step.
+    start : Volume, Reconstruction or array, optional
+        Begin with this; by default with 0 everywhere. A reconstruction by SIRT goes on where it ended.
+    mask : array of bool, optional
+        Of the grid's shape; outside it the volume is 0.
+    callback
+        See `Callback`.
+    progress
+        Called as ``progress(steps done, steps)``; what it raises stops the work.
+    stop : StopWhen, optional
+        Ends it before the last iteration.
+
+    Returns
+    -------
+    Reconstruction
+        `objective` is half the sum of squares of ``images - A x``, weighted with R, after each iteration; it never rises.
+        Pixels whose rays miss the grid count nothing, voxels that no ray meets stay as they are. The volume is of mu for
+        projectors of line integrals, else of activity, unless `start` is of another quantity.
+
+    Raises
+    ------
+    InputError
+        Images, start or mask have another shape, or are not finite; a number is out of its range.
+
+    References
+    ----------
+    P. Gilbert, "Iterative methods for the three-dimensional reconstruction of an object from projections", Journal of
+    Theoretical Biology 36 (1972) 105-117. J. Gregor, T. Benson, "Computational analysis and improvement of SIRT", IEEE
+    Transactions on Medical Imaging 27 (2008) 918-924.
+    """
+    loop = least_squares_loop("SIRT", A, iterations, start, mask, callback, progress, stop, nonnegative=nonnegative)
+    relaxation = positive(relaxation, "relaxation")
+    if relaxation >= 2:
+        raise InputError(f"relaxation: expected less than 2, got {relaxation:g}")
+    problem = Problem.of(A, images, loop)
+    per_pixel = inverse(problem.forward(problem.inside, loop.preparing()))
+    per_voxel = np.float32(relaxation) * inverse(problem.adjoint(np.ones(A.shape_out, np.float32), loop.preparing()))
+    residual: Array | None = None
+
+    def step(number: int, x: Array, progress: Progress | None) -> tuple[Array, float]:
+        nonlocal residual
+        if residual is None:
+            residual = problem.images - problem.forward(x, waiting(progress, 0, 2))
+        x = x + per_voxel * problem.adjoint(per_pixel * residual, waiting(progress, 0, 2))
+        if nonnegative:
+            x = np.maximum(x, np.float32(0))
+        residual = problem.images - problem.forward(x, waiting(progress, 1, 2))
+        said(progress)
+        return x, 0.5 * float(np.sum(per_pixel * np.square(residual, dtype=float)))
+
+    return loop.run(step, {"relaxation": relaxation, "nonnegative": nonnegative})
+
+
+def cgls(
+    A: Projector,
+    images: ArrayLike,
+    iterations: int = 20,
+    start: Start = None,
+    mask: ArrayLike | None = None,
+    callback: Callback | None = None,
+    progress: Progress | None = None,
+    stop: StopWhen | None = None,
+) -> Reconstruction:
+    """The volume whose images are nearest to `images`, by conjugate gradients on the normal equations (CGLS).
+
+    The fastest way to the least squares, whose values may be negative. It ends early where there is noise: about 5 to 20
+    iterations are as sharp as hundreds of `sirt`.
+
+    Parameters
+    ----------
+    A, images, iterations, start, mask, callback, progress, stop
+        As of `sirt`.
+
+    Returns
+    -------
+    Reconstruction
+        `objective` is half the sum of squares of ``images - A x`` after each iteration; it never rises.
+
+    Raises
+    ------
+    InputError
+        As of `sirt`.
+
+    References
+    ----------
+    A. Bjorck, "Numerical Methods for Least Squares Problems", SIAM (1996), section 7.4.
+    """
+    loop = least_squares_loop("CGLS", A, iterations, start, mask, callback, progress, stop, nonnegative=False)
+    problem = Problem.of(A, images, loop)
+
+    def step(number: int, x: Array, progress: Progress | None) -> tuple[Array, float]:
+        if not loop.state:
+            residual = problem.images - problem.forward(x, waiting(progress, 0, 2))
+            direction = problem.adjoint(residual, waiting(progress, 0, 2))
+            loop.state = {"residual": residual, "direction": direction, "gradient": _squares(direction)}
+        residual, direction, before = (loop.state[name] for name in ("residual", "direction", "gradient"))
+        change = problem.forward(direction, waiting(progress, 0, 2))
+        length = _squares(change)
+        if length > 0:  # else the least squares are reached
+            share = (before / length).astype(np.float32)
+            x = x + share * direction
+            residual = residual - share * change
+            gradient = problem.adjoint(residual, waiting(progress, 1, 2))
+            after = _squares(gradient)
+            direction = gradient + (after / before).astype(np.float32) * direction
+            loop.state = {"residual": residual, "direction": direction, "gradient": after}
+        said(progress)
+        return x, 0.5 * float(_squares(residual))
+
+    return loop.run(step, {})
+
+
+@dataclass(frozen=True, eq=False)
+class Problem:
+    """Find x with ``A x`` near `images`, 0 outside a mask."""
+
+    A: Projector
+    images: Array
+    inside: Array  # 1 where x may be other than 0
+
+    @classmethod
+    def of(cls, A: Projector, images: ArrayLike, loop: Loop) -> "Problem":
+        """Checked: the images without the model's background. Raises InputError."""
+        measured: Array = real_array(plain(images), "images", A.shape_out, np.float32) - A.background.astype(np.float32)
+        everywhere = np.ones(A.shape_in, np.float32)
+        return cls(A, measured, everywhere if loop.mask is None else loop.mask.astype(np.float32))
+
+    def forward(self, x: Array, progress: Progress | None) -> Array:
+        """``A x``, float32."""
+        return np.asarray(self.A(x, progress), np.float32)
+
+    def adjoint(self, y: Array, progress: Progress | None) -> Array:
+        """``A.T y`` inside the mask, float32."""
+        return np.asarray(self.A.T(y, progress), np.float32) * self.inside
+
+
+def quantity_of(A: Projector) -> str:
+    """Of a reconstruction: activity for projectors of emission, mu for those of line integrals."""
+    return "activity" if A.model.takes == ("activity",) else "mu"
+
+
+def inverse(sums: Array) -> Array:
+    """1 by sums of weights; 0 where there are none, or next to none beside the others."""
+    least = 1e-6 * sums.max(initial=0.0)
+    return np.divide(1, sums, out=np.zeros_like(sums), where=sums > least)
+
+
+def said(progress: Progress | None) -> None:
+    """The end of a step of two."""
+    if progress is not None:
+        progress(2, 2)
+
+
+def least_squares_loop(name: str, A: Any, iterations: int, *arguments: Any, nonnegative: bool) -> Loop:
+    """The loop of an algorithm whose volume begins with 0. Raises InputError."""
+    instance(A, Projector, name)
+    instance(nonnegative, bool, "nonnegative")
+    return Loop(name, A, iterations, *arguments, default=0.0, negative=not nonnegative, quantity=quantity_of(A))
+
+
+def _squares(numbers: Array) -> Array:
+    return np.asarray(np.sum(np.square(numbers, dtype=float)))

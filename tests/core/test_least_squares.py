@@ -1,0 +1,209 @@
+"""SIRT, CGLS and TV: falling objectives, known solutions, resuming, and what they are given."""
+
+import numpy as np
+import pytest
+
+import mphdrr.core as mph
+from mphdrr.core.reconstruction.tv import _gradient, _gradient_adjoint, total_variation
+
+GRID = mph.Grid.centered((7, 6, 5), (2.0, 2.0, 3.0))
+VIEWS = mph.parallel_views(np.arange(12) * np.pi / 12, (10, 14), 1.5, elevation=np.tile([0.0, 0.5], 6))
+A = mph.Projector(GRID, VIEWS)
+RNG = np.random.default_rng(0)
+TRUTH = np.zeros(GRID.shape, np.float32)
+TRUTH[2:5, 1:5, 1:4] = 1.0
+TRUTH[3, 3, 2] = 3.0
+IMAGES = A(TRUTH)
+NOISY = IMAGES + RNG.normal(0, 0.5, IMAGES.shape).astype(np.float32)
+
+
+def matrix():
+    """`A` as a dense matrix."""
+    unit = np.eye(GRID.n_voxels, dtype=np.float32).reshape(-1, *GRID.shape)
+    return np.stack([A(x).ravel() for x in unit], axis=1).astype(float)
+
+
+ALGORITHMS = {
+    "sirt": lambda *a, **k: mph.sirt(*a, **k),
+    "cgls": lambda *a, **k: mph.cgls(*a, **k),
+    "tv": lambda A, y, *a, **k: mph.tv(A, y, 0.5, *a, **k),
+}
+
+
+@pytest.mark.parametrize("nonnegative", [True, False])
+@pytest.mark.parametrize("relaxation", [1.0, 1.9])
+def test_sirts_objective_never_rises_and_is_what_it_says(nonnegative, relaxation):
+    result = mph.sirt(A, NOISY, 60, relaxation, nonnegative)
+    assert len(result.objective) == result.iterations == 60
+    assert (np.diff(result.objective) <= 1e-6 * result.objective[:-1]).all()
+    x = result.volume.array
+    assert (x.min() >= 0) == nonnegative
+    sums = A(np.ones(GRID.shape, np.float32))
+    weights = np.divide(1, sums, out=np.zeros_like(sums), where=sums > 0)
+    assert result.objective[-1] == pytest.approx(0.5 * np.sum(weights * (NOISY - A(x)) ** 2), rel=1e-4)
+    assert result.volume.quantity == "mu"
+    assert result.settings["method"] == "SIRT"
+
+
+def test_sirt_finds_the_truth_of_exact_images():
+    result = mph.sirt(A, IMAGES, 400, relaxation=1.9)
+    assert np.sqrt(np.mean((result.volume.array - TRUTH) ** 2)) < 0.03
+
+
+def test_cgls_reaches_the_solution_of_numpys_lstsq():
+    solution = np.linalg.lstsq(matrix(), NOISY.ravel().astype(float), rcond=None)[0].reshape(GRID.shape)
+    result = mph.cgls(A, NOISY, 200)
+    np.testing.assert_allclose(result.volume.array, solution, atol=1e-3)
+    assert (np.diff(result.objective) <= 1e-6 * result.objective[:-1]).all()
+    residual = 0.5 * np.sum((A(result.volume.array) - NOISY) ** 2)
+    assert result.objective[-1] == pytest.approx(residual, rel=1e-4)
+
+
+def test_cgls_is_much_faster_than_sirt():
+    def misfit(x):
+        return np.sum((A(x) - IMAGES) ** 2)
+
+    assert misfit(mph.cgls(A, IMAGES, 12).volume.array) < 0.2 * misfit(mph.sirt(A, IMAGES, 12).volume.array)
+
+
+def test_cgls_stays_where_nothing_is_left_to_do():
+    result = mph.cgls(A, np.zeros_like(IMAGES), 5)
+    assert not result.volume.array.any() and not result.objective.any()
+
+
+def test_the_gradients_adjoint_is_exact():
+    factors = np.array([1.0, 0.7, 0.4])
+    x, p = RNG.random((4, 5, 6)), RNG.random((3, 4, 5, 6))
+    assert np.vdot(_gradient(x, factors), p) == pytest.approx(np.vdot(x, _gradient_adjoint(p, factors)), rel=1e-12)
+
+
+def test_total_variation_of_a_block_is_its_surface():
+    grid = mph.Grid.centered((9, 9, 9), 1.0)
+    block = np.zeros(grid.shape)
+    block[3:6, :, :] = 2.0
+    assert total_variation(block, grid) == pytest.approx(2 * 2.0 * 81)
+    ramp = np.ones((4, 1, 1)) * np.arange(3)[None, :, None] * np.ones((1, 1, 5))
+    assert total_variation(ramp, mph.Grid.centered((4, 3, 5), (1, 2, 1))) == pytest.approx(4 * 2 * 5 / 2)
+
+
+@pytest.mark.parametrize(("weight", "nonnegative"), [(0.3, True), pytest.param(5.0, False, marks=pytest.mark.long)])
+def test_tv_reaches_the_minimum_that_another_solver_finds(weight, nonnegative):
+    optimize = pytest.importorskip("scipy.optimize")
+    dense, measured = matrix(), NOISY.ravel().astype(float)
+    factors = GRID.spacing.min() / GRID.spacing
+
+    def smoothed(x, edge=3e-4):
+        residual = dense @ x - measured
+        slopes = _gradient(x.reshape(GRID.shape), factors)
+        sizes = np.sqrt(np.sum(slopes**2, axis=0) + edge**2)
+        gradient = dense.T @ residual + weight * _gradient_adjoint(slopes / sizes, factors).ravel()
+        return 0.5 * residual @ residual + weight * np.sum(sizes - edge), gradient
+
+    bounds = [(0, None) if nonnegative else (None, None)] * GRID.n_voxels
+    best = optimize.minimize(smoothed, np.zeros(GRID.n_voxels), jac=True, method="L-BFGS-B", bounds=bounds,
+                             options={"maxiter": 2000, "maxfun": 2500, "maxcor": 30, "ftol": 1e-13})  # fmt: skip
+    result = mph.tv(A, NOISY, weight, 800, nonnegative)
+    x = result.volume.array
+    least = smoothed(best.x, 0.0 + 1e-12)[0]
+    assert result.objective[-1] == pytest.approx(least, rel=1e-3)
+    exact = 0.5 * np.sum((A(x) - NOISY) ** 2, dtype=float) + weight * total_variation(x, GRID)
+    assert result.objective[-1] == pytest.approx(exact, rel=1e-4)
+    assert not nonnegative or x.min() >= 0
+
+
+def test_tv_is_nearer_to_the_truth_than_least_squares_with_few_noisy_views():
+    rng = np.random.default_rng(5)
+    grid = mph.Grid.centered((24, 24, 3), 1.0)
+    truth = np.zeros(grid.shape, np.float32)
+    truth[6:18, 8:16] = 1.0
+    few = mph.Projector(grid, mph.parallel_views(np.arange(9) * np.pi / 9, (3, 36), 1.0))
+    images = few(truth) + rng.normal(0, 0.4, few.shape_out)
+    flat = mph.tv(few, images, 1.0, 200).volume.array
+    rough = mph.sirt(few, images, 200).volume.array
+    assert np.mean((flat - truth) ** 2) < 0.3 * np.mean((rough - truth) ** 2)
+
+
+@pytest.mark.parametrize("name", ALGORITHMS)
+def test_a_resumed_one_gives_the_same_numbers(name, tmp_path):
+    run = ALGORITHMS[name]
+    whole = run(A, NOISY, iterations=9)
+    first = run(A, NOISY, iterations=4)
+    mph.write_reconstruction(first, tmp_path / "first.h5")
+    for half in (first, mph.read_reconstruction(tmp_path / "first.h5")):
+        resumed = run(A, NOISY, iterations=5, start=half)
+        np.testing.assert_array_equal(resumed.volume.array, whole.volume.array)
+        np.testing.assert_array_equal(resumed.objective, whole.objective)
+
+
+@pytest.mark.parametrize("name", ALGORITHMS)
+def test_masks_starts_callbacks_stops_and_progress(name):
+    run = ALGORITHMS[name]
+    mask = TRUTH > 0
+    seen, steps = [], []
+
+    def watch(iteration, values):
+        seen.append((iteration, values.copy()))
+        return iteration == 3
+
+    result = run(A, IMAGES, iterations=10, mask=mask, callback=watch, progress=lambda *done: steps.append(done))
+    assert [iteration for iteration, _ in seen] == [1, 2, 3] and result.iterations == 3
+    assert not result.volume.array[~mask].any() and result.volume.array[mask].any()
+    assert steps[-1][0] < steps[-1][1] and [done for done, _ in steps] == sorted(done for done, _ in steps)
+    started = run(A, IMAGES, iterations=2, start=mph.Volume(TRUTH, GRID, "activity"))
+    np.testing.assert_allclose(started.volume.array, TRUTH, atol=0.15 if name == "tv" else 1e-3)
+    assert started.volume.quantity == "activity"
+    stopped = run(A, NOISY, iterations=500, stop=mph.StopWhen(change=1e-3))
+    assert stopped.iterations < 500 and stopped.settings["stopped"] == "change"
+
+    def cancel(done, total):
+        raise mph.Cancelled
+
+    with pytest.raises(mph.Cancelled):
+        run(A, IMAGES, iterations=2, progress=cancel)
+
+
+@pytest.mark.parametrize("name", ALGORITHMS)
+def test_counts_of_pinholes_lose_their_background(name):
+    angles = np.arange(8) * np.pi / 4
+    places = 60 * np.stack([np.cos(angles), np.sin(angles), 0 * angles], axis=1)
+    system = mph.PinholeSystem(places, *np.outer([4.0, 40, 60, 5, 20], np.ones(8)))
+    grid = mph.Grid.centered(5, 6.0)
+    B = mph.Projector(grid, system.views((8, 8), "real"), mph.Emission(system, background=50.0, time=1000.0))
+    truth = np.zeros(grid.shape, np.float32)
+    truth[1:4, 2:4, 2] = 10.0
+    counts = B(truth) + 50.0
+    result = ALGORITHMS[name](B, counts, iterations=15)
+    assert result.volume.quantity == "activity"
+    assert B(truth).mean() > 10
+    assert np.abs(B(result.volume.array) + 50.0 - counts).mean() < 0.4 * B(truth).mean()
+
+
+@pytest.mark.parametrize("name", ALGORITHMS)
+def test_wrong_input_is_named(name):
+    run = ALGORITHMS[name]
+    broken = IMAGES.copy()
+    broken[0, 1, 2] = np.nan
+    for arguments, options, words in (
+        ((A, IMAGES[:3]), {}, "images: expected shape 12 x 10 x 14"),
+        ((A, broken), {}, r"images: nan is not a finite number at index \(0, 1, 2\)"),
+        (("A", IMAGES), {}, "expected a Projector, got str"),
+        ((A, IMAGES), {"iterations": 0}, "iterations: expected a whole number"),
+        ((A, IMAGES), {"start": np.ones((2, 2, 2))}, "start: expected shape"),
+        ((A, IMAGES), {"mask": np.ones(GRID.shape)}, "mask: expected booleans"),
+    ):
+        with pytest.raises(mph.InputError, match=words):
+            run(*arguments, **options)
+
+
+def test_wrong_numbers_are_named():
+    for relaxation in (0, 2, np.nan):
+        with pytest.raises(mph.InputError, match="relaxation"):
+            mph.sirt(A, IMAGES, relaxation=relaxation)
+    for weight in (0, -1, np.inf):
+        with pytest.raises(mph.InputError, match="weight"):
+            mph.tv(A, IMAGES, weight)
+    with pytest.raises(mph.InputError, match="nonnegative: expected a bool"):
+        mph.sirt(A, IMAGES, nonnegative="yes")
+    with pytest.raises(mph.InputError, match="start: expected 0 or more"):
+        mph.sirt(A, IMAGES, start=-TRUTH)
+    assert mph.cgls(A, IMAGES, 1, start=-TRUTH).volume.array.min() < 0

@@ -117,7 +117,9 @@ def picture(folder: Path, names: list[str], path: Path, tile: int = 260) -> None
     """The middle slices of the truth and of reconstructions in `folder`, side by side, black and white as of the truth."""
     from PIL import Image
 
-    truth = PHANTOM.voxelize(mph.Grid.centered((256, 256, 1), (FIELD / 256, FIELD / 256, FIELD / 256))).array[:, :, 0]
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", mph.InputWarning)  # a slice does not contain the phantom
+        truth = PHANTOM.voxelize(mph.Grid.centered((256, 256, 1), FIELD / 256)).array[:, :, 0]
     slices = [truth] + [volume[:, :, volume.shape[2] // 2] for volume in (np.load(folder / f"{n}.npy") for n in names)]
     page = Image.new("L", (len(slices) * tile + (len(slices) - 1) * 8, tile), 255)
     for i, values in enumerate(slices):

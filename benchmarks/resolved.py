@@ -96,11 +96,11 @@ def cylinder(folder: Path, diameter: float = 200.0, height: float = 60.0, iterat
         x, y, z = (np.indices(shape).T * spacing + place.affine[:3, 3]).T
         return place, (np.hypot(x, y) < diameter / 2) & (abs(z) < height / 2)
 
-    fine, filled = water(220, 1.0)
+    fine, filled = water(200, 1.0)
     mu = mph.Volume(filled * WATER_MU, fine, "mu")
     exact = mph.Emission(SYSTEM, mu, intrinsic_fwhm=1.0, aperture_points=19, pixel_points=3, tolerance=2.0, **CAMERA)
     data = mph.Projector(fine, views, exact)(filled * 100.0)
-    coarse, _ = water(55, 4.0)
+    coarse, _ = water(50, 4.0)
     found = {}
     for name, of_model in (("corrected", mu), ("uncorrected", None)):
         A = mph.Projector(coarse, views, mph.Emission(SYSTEM, of_model, intrinsic_fwhm=1.0, hole="depth", **CAMERA))
@@ -111,6 +111,23 @@ def cylinder(folder: Path, diameter: float = 200.0, height: float = 60.0, iterat
         print("cylinder", name, found[name], flush=True)
     (folder / "cylinder.json").write_text(json.dumps(found))
     return found
+
+
+def picture(folder: Path, names: list[str], path: Path, tile: int = 260) -> None:
+    """The middle slices of the truth and of reconstructions in `folder`, side by side, black and white as of the truth."""
+    from PIL import Image
+
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", mph.InputWarning)  # a slice does not contain the phantom
+        truth = PHANTOM.voxelize(mph.Grid.centered((256, 256, 1), FIELD / 256)).array[:, :, 0]
+    slices = [truth] + [volume[:, :, volume.shape[2] // 2] for volume in (np.load(folder / f"{n}.npy") for n in names)]
+    page = Image.new("L", (len(slices) * tile + (len(slices) - 1) * 8, tile), 255)
+    for i, values in enumerate(slices):
+        grey = np.clip(values.T[::-1] / PHANTOM.activity, 0, 1) ** 0.7 * 255
+        page.paste(
+            Image.fromarray(grey.astype(np.uint8)).resize((tile, tile), Image.Resampling.BICUBIC), (i * (tile + 8), 0)
+        )
+    page.save(path, quality=85)
 
 
 def scores(volume: mph.Volume) -> list[dict[str, float]]:
@@ -132,9 +149,13 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("folder", type=Path)
     parser.add_argument("studies", nargs="+")
+    parser.add_argument("--picture", type=Path, help="draw the studies' results to this file instead")
     parser.add_argument("--iterations", type=int, default=ITERATIONS)
     arguments = parser.parse_args()
     folder, n = arguments.folder, arguments.iterations
+    if arguments.picture:
+        picture(folder, arguments.studies, arguments.picture)
+        return
     folder.mkdir(parents=True, exist_ok=True)
     for study in arguments.studies:
         data = counts(folder, 3.0 if study == "blur-3" else 1.0)

@@ -35,7 +35,7 @@ Weigh = Callable[[Array, Array], Array]
 # Cells across the hole's shadow, at least.
 _CELLS_ACROSS = 15
 # Largest ratio of the largest and the smallest shadow of the hole: beyond, interpolation between planes shows.
-_MOST_RATIO = 2.2
+_MOST_RATIO = 2.5
 
 
 def hole_response(

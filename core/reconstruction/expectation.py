@@ -159,9 +159,4 @@ def subsets_of(A: Projector, data: CountData, n: Any) -> list[tuple[Projector, C
 def sensitivities(A: Projector, parts: list[tuple[Projector, CountData]], progress: Progress | None) -> list[Array]:
     """Counts that one unit of activity in each voxel gives in each subset."""
     require(4 * A.grid.n_voxels * len(parts), f"the sensitivities of {len(parts)} subsets")
-<<<<<<< HEAD
     return [part.T(np.ones(part.shape_out, np.float32), progress).astype(np.float32, copy=False) for part, _ in parts]
-=======
-    ones = (np.ones(part.shape_out, np.float32) for part, _ in parts)
-    return [part.T(one, progress).astype(np.float32, copy=False) for (part, _), one in zip(parts, ones, strict=True)]
->>>>>>> h-algo

@@ -167,7 +167,7 @@ def test_radiographs_are_reconstructed_by_least_squares(method, photons, scanner
     command(tmp_path / "run.npz", "--method", *how, "-o", tmp_path / "v.npz", "--picture", tmp_path / "p.svg")
     found = mph.read_volume(tmp_path / "v.npz")
     inside = mph.resample(ball, found.grid, "mean").array > 0.0199
-    assert found.quantity == "mu" and found.array[inside].mean() == pytest.approx(0.02, rel=0.05)
+    assert found.quantity == "mu" and found.array[inside].mean() == pytest.approx(0.02, rel=0.1)
     assert "squared error" in capsys.readouterr().err
 
 

@@ -200,7 +200,9 @@ def test_the_picture_shows_slices_beside_the_truth_and_the_objective(run, file, 
     for words in ("Reconstruction", "Truth", "x y,  z = 2.5 mm", "Log-likelihood", "kBq/mL", "3 iterations", "20 mm"):
         assert f">{words}<" in text, words
     assert text.count("<image") == 7  # two rows of slices and a colour bar
-    assert settings_line(1, run.recipe) == "1 iteration"
+    volume = mph.Volume(np.zeros((2, 2, 2)), mph.Grid.centered(2, 1.0))
+    assert settings_line(mph.Reconstruction(volume, np.zeros(1))) == "1 iteration"
+    assert settings_line(mph.Reconstruction(volume, np.zeros(2), {"subsets": 4})) == "2 iterations, 4 subsets"
 
 
 @pytest.mark.parametrize("size", [(240, 240), (1600, 500), (500, 900)])

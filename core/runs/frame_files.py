@@ -81,8 +81,8 @@ def read_counts(
 
     Returns
     -------
-    array (frames, rows, columns)
-        Of the file's own type; `counts_run` checks the numbers.
+    array of three axes
+        Frames, rows and columns, of the file's own type; `counts_run` checks the numbers.
 
     Raises
     ------

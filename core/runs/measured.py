@@ -47,7 +47,7 @@ def counts_run(
 
     Parameters
     ----------
-    counts : array (frames, rows, columns)
+    counts : array of three axes
         A frame for each module, of whole numbers, as they are in the file (`read_counts`), and others that are not used.
     system
         The M modules.

@@ -195,9 +195,10 @@ def test_the_picture_shows_slices_beside_the_truth_and_the_objective(run, file, 
     command(file, *SMALL, "--picture", tmp_path / "p.png")
     with Image.open(tmp_path / "p.png") as picture:
         assert picture.size == (1600, 850)
-    command(file, *SMALL, "--picture", tmp_path / "p.svg")
+    command(file, *SMALL, "--subsets", "5", "--picture", tmp_path / "p.svg")
     text = (tmp_path / "p.svg").read_text(encoding="utf-8")
-    for words in ("Reconstruction", "Truth", "x y,  z = 2.5 mm", "Log-likelihood", "kBq/mL", "3 iterations", "20 mm"):
+    settings = "3 iterations, 5 subsets"
+    for words in ("Reconstruction", "Truth", "x y,  z = 2.5 mm", "Log-likelihood", "kBq/mL", settings, "20 mm"):
         assert f">{words}<" in text, words
     assert text.count("<image") == 7  # two rows of slices and a colour bar
     volume = mph.Volume(np.zeros((2, 2, 2)), mph.Grid.centered(2, 1.0))

@@ -122,7 +122,7 @@ def _run(arguments: argparse.Namespace) -> None:
 def settings_line(found: Reconstruction) -> str:
     """What a picture says of a reconstruction."""
     said = [f"{found.iterations} iteration{'s' * (found.iterations > 1)}"]
-    if "subsets" in found.settings:
+    if found.settings.get("subsets", 1) > 1:
         said.append(f"{found.settings['subsets']} subsets")
     return ", ".join(said)
 
@@ -131,9 +131,10 @@ class _Log:
     """A line on standard error after each iteration; before the first, the stages' bars."""
 
     def __init__(self, recipe: Recipe, quiet: bool, start: Any) -> None:
-        before = start.iterations if isinstance(start, Reconstruction) else 0
-        self.total, self.quiet = before + recipe["reconstruction.iterations"], quiet
-        self.name = METHODS[recipe["reconstruction.method"]].objective
+        method = METHODS[recipe["reconstruction.method"]]
+        goes_on = isinstance(start, Reconstruction) and start.settings.get("method") == method.label
+        self.total, self.quiet = (start.iterations if goes_on else 0) + recipe["reconstruction.iterations"], quiet
+        self.name = method.objective
         self.begun, self.interrupted = time.monotonic(), False
 
     def stage(self, words: str) -> Progress | None:

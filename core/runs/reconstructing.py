@@ -12,6 +12,7 @@ from ..errors import InputError, InputWarning
 from ..geometry.grid import Grid
 from ..memory import require
 from ..progress import Stages
+from ..projector.backends import choose
 from ..projector.hole_response import depths_of
 from ..reconstruction.methods import METHODS, PRIORS
 from ..reconstruction.priors import Prior
@@ -211,14 +212,14 @@ def model_of(run: ProjectionRun, recipe: Recipe, grid: Grid) -> Recipe:
 
 
 def _whole_hole(run: ProjectionRun, recipe: Recipe, grid: Grid) -> bool:
-    """Whether `hole` "depth" is possible; a warning says why not."""
-    why = None
+    """Whether `hole` "depth" is possible, and fast; a warning says why not."""
+    why, backend = None, choose(recipe["compute.backend"]).name
     if recipe["model.edge"] == "path":
         why = "the run's edge is 'path'"
     elif recipe["model.depth_layers"] > 1:
         why = "the run has depth_layers"
-    elif recipe["compute.backend"] == "cuda":
-        why = "the backend is cuda"
+    elif backend != "cpu":  # others refuse it, or take minutes for an iteration
+        why = f"the backend is {backend}, not cpu"
     else:
         system = run.system
         try:

@@ -93,6 +93,10 @@ def test_a_kept_state_goes_on_as_without_a_break(file, tmp_path, capsys):
     capsys.readouterr()
     command(file, *small, "--iterations", "3", "-o", tmp_path / "rest.npz", "--resume", tmp_path / "s.h5")
     assert "iteration 2 of 4: " in capsys.readouterr().err
+    other = ["--voxels", "20", "--spacing", "5", "--method", "mlem", "--iterations", "1"]
+    command(file, *other, "-o", tmp_path / "other.npz", "--resume", tmp_path / "s.h5")
+    said = capsys.readouterr()
+    assert "iteration 1 of 1: " in said.err and "MLEM, 1 iteration, 20 x" in said.out
     whole, rest = (mph.read_volume(tmp_path / f"{name}.npz").array for name in ("whole", "rest"))
     np.testing.assert_array_equal(rest, whole)
 
@@ -147,6 +151,8 @@ def test_voxels_cover_the_roi_and_the_model_is_that_of_the_run(run):
         mph.InputWarning, match="rays through 7 points, not of the whole hole by depth: the run has depth"
     ):
         assert model(model__crystal_mu="NaI", model__depth_layers=2) == ("rays", 7, 1.0)
+    with pytest.warns(mph.InputWarning, match="the backend is numpy, not cpu"):
+        assert model(compute__backend="numpy") == ("rays", 7, 1.0)
     with pytest.warns(mph.InputWarning, match="voxels come close to a pinhole"):
         assert model_of(run, run.recipe, mph.Grid.centered(8, 40.0))["model.aperture_points"] == 7
     centre = reconstruction_grid(run, run.recipe.updated({"reconstruction.center": (1, 2, 3)})).center

@@ -2,10 +2,10 @@
 
     python -m benchmarks.resolved FOLDER STUDY ...
 
-STUDY: data (first), whole-hole, no-recovery (neither the hole's blur nor the crystal's), seven-rays, fine (voxels half as large), noise (five draws, whole hole),
-blur-3 (intrinsic blur of 3 mm), cylinder (200 mm of water). Every study writes its scores, JSON, and its volume into
-FOLDER. The data come from 256^3 voxels and rays through many points of the hole, which no model of the studies uses. One
-takes minutes, fine about an hour.
+STUDY: data (first), whole-hole, no-recovery (neither the hole's blur nor the crystal's), seven-rays, fine (voxels half as
+large), noise (five draws, whole hole), blur-3 (intrinsic blur of 3 mm), cylinder (200 mm of water). Every study writes its
+scores, JSON, and its volume into FOLDER. The data come from 256^3 voxels and rays through many points of the hole, which no
+model of the studies uses. One takes a minute or two, fine several.
 """
 
 from __future__ import annotations

@@ -18,12 +18,13 @@ from ..core.figures.page import Page
 from ..core.figures.reconstructions import SIZE, SIZE_BESIDE_TRUTH, draw
 from ..core.progress import Progress, stages_of
 from ..core.reconstruction.methods import METHODS
+from ..core.reconstruction.scores.summary import score_volume
 from ..core.runs.files import read_run
 from ..core.runs.mosaic import png
 from ..core.runs.recipe import Recipe
 from ..core.runs.reconstructing import reconstruct_run, reconstruction_grid
 from ..core.runs.run import ProjectionRun
-from ..core.runs.scoring import score_lines
+from ..core.runs.run_recipe import truth_of_run
 from ..core.volumes.volume import Volume
 from . import cameras, ids, images, jobs, plots, rendering, runs, storage, volumes
 from .stored_volumes import StoredVolume, store_volume
@@ -83,8 +84,7 @@ def reconstructing(context: bpy.types.Context, recipe: Recipe) -> jobs.Job:
             return shelf.enough.is_set()
 
         found = reconstruct_run(run, recipe, _mu(run, recipe, readers), watch=watch, stages=stages)
-        scores = score_lines(run, found.volume, stages("scoring"))
-        return shown_of(found.volume.array, found.objective.tolist(), scores)
+        return shown_of(found.volume.array, found.objective.tolist(), _scores(run, found.volume, stages("scoring")))
 
     def finish(result: _Shown) -> str:
         scene = jobs.found_again(bpy.data.scenes, uid)
@@ -174,6 +174,33 @@ def _picture(run: ProjectionRun, volume: Volume, record: dict[str, Any], name: s
     ]
     draw(page, volume, record["objective"], run.volume, f"Reconstruction of {name}", [", ".join(lines)], record["name"])
     return png(page.picture, _PNG_LEVEL)
+
+
+def _scores(run: ProjectionRun, volume: Volume, progress: Progress | None) -> list[tuple[str, str]]:
+    """The scores beside the truth, as names and values in words; none of a measured run."""
+    if run.volume is None:
+        return []
+    truth, pose = truth_of_run(run)
+    try:
+        record = score_volume(volume, truth, pose, progress).record
+    except InputError as error:  # such as a truth that is the same everywhere: the reconstruction is worth keeping
+        return [("No score", str(error))]
+    lines = [("NRMSE", f"{record['nrmse']:.3g}")]
+    for rods in record.get("derenzo", []):
+        said = (
+            f"{rods['resolved']:.0%} resolved, valley/peak {_number(rods['valley_to_peak'])}"
+            if not rods["note"]
+            else ""
+        )
+        lines.append((f"{rods['rod_diameter']:g} mm rods", said or rods["note"]))
+    for sphere in record.get("nema", []):
+        said = f"{sphere['contrast_recovery']:.1f} % contrast, {sphere['background_variability']:.1f} % variability"
+        lines.append((f"{sphere['diameter']:g} mm sphere", said))
+    return lines
+
+
+def _number(value: float | None) -> str:
+    return "unknown" if value is None else f"{value:.2f}"
 
 
 def _is_watched() -> bool:

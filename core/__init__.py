@@ -57,7 +57,7 @@ from .reconstruction.scores.derenzo import DerenzoScore, DerenzoSector, RodProfi
 from .reconstruction.scores.images import BiasAndDeviation, bias_and_deviation, contrast_to_noise, nrmse, psnr, ssim
 from .reconstruction.scores.nema import NemaScore, NemaSphere, nema_score
 from .reconstruction.scores.summary import VolumeScore, score_volume
-from .reconstruction.stopping import StopWhen
+from .reconstruction.stopping import StoppingRule, StopWhen
 from .reconstruction.tv import tv
 from .runs.files import read_run, write_run
 from .runs.frame_files import read_counts

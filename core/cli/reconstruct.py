@@ -112,18 +112,18 @@ def _run(arguments: argparse.Namespace) -> None:
     if picture is not None:
         page = Page(*(SIZE if run.volume is None else SIZE_BESIDE_TRUTH))
         draw(page, found.volume, found.objective.tolist(), run.volume, f"{method.label} of {arguments.file}",
-             [settings_line(found.iterations, recipe)], method.objective)  # fmt: skip
+             [settings_line(found)], method.objective)  # fmt: skip
         page.write(picture)
     voxels = " x ".join(map(str, found.volume.grid.shape))
     largest = f"largest {float(found.volume.array.max()):.4g} {found.volume.unit}"
-    print(f"{path or picture}: {method.label}, {settings_line(found.iterations, recipe)}, {voxels} voxels, {largest}")
+    print(f"{path or picture}: {method.label}, {settings_line(found)}, {voxels} voxels, {largest}")
 
 
-def settings_line(iterations: int, recipe: Recipe) -> str:
+def settings_line(found: Reconstruction) -> str:
     """What a picture says of a reconstruction."""
-    said = [f"{iterations} iteration{'s' * (iterations > 1)}"]
-    if recipe["reconstruction.subsets"] is not None:
-        said.append(f"{recipe['reconstruction.subsets']} subsets")
+    said = [f"{found.iterations} iteration{'s' * (found.iterations > 1)}"]
+    if "subsets" in found.settings:
+        said.append(f"{found.settings['subsets']} subsets")
     return ", ".join(said)
 
 

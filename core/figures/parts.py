@@ -41,9 +41,9 @@ def ticks(low: float, high: float, most: int) -> list[float]:
     return [float(step * n) for n in np.arange(first, np.floor(high / step + 1e-9) + 1)]
 
 
-def number(value: float) -> str:
+def number(value: float, digits: int = 4) -> str:
     """A number with a proper minus sign."""
-    return f"{value + 0.0:.4g}".replace("-", "−")  # -0 is 0
+    return f"{value + 0.0:.{digits}g}".replace("-", "−")  # -0 is 0
 
 
 def color_bar(

@@ -1,5 +1,6 @@
 """A reconstruction as a picture: three slices, beside those of the truth where it is known, and the objective."""
 
+import math
 from collections.abc import Sequence
 
 import numpy as np
@@ -114,10 +115,13 @@ def draw_objective(
     if not name:
         return
     size = 0.85 * em
-    for value in ticks(low, high, 5):
+    marks = ticks(low, high, 5)
+    # The objective changes little beside its size: as many digits as tell the numbers from each other.
+    digits = max(4, math.ceil(math.log10(max(abs(low), abs(high)) / (marks[1] - marks[0]))) + 1) if marks[1:] else 4
+    for value in marks:
         y = at(1, value)[1]
         page.line([(left - 0.3 * em, y), (left, y)], ink, 0.06 * em)
-        page.text(number(value), left - 0.5 * em, y + 0.3 * em, size, ink, "end")
+        page.text(number(value, digits), left - 0.5 * em, y + 0.3 * em, size, ink, "end")
     for value in ticks(1, last, 6):
         if value == round(value):
             x = at(value, low)[0]

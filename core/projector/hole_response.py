@@ -61,7 +61,7 @@ def hole_response(
     pitches = scale * float(rays.row_step @ v), scale * float(rays.column_step @ u)
     to_camera = frame @ grid.affine[:3]
     to_camera[:, 3] -= frame @ pinhole
-    near, far = _depths(grid, pinhole, k, l)
+    near, far = depths_of(grid, pinhole, k, l)
     inverses = np.linspace(1 / far, 1 / near, PLANES)
     steps = tuple(max(1, math.ceil(_CELLS_ACROSS * abs(pitch) / (d * (1 + l / far)))) for pitch in pitches)
     shadows = [np.multiply(to_camera[axis, :3], np.sign(pitch)) for axis, pitch in zip((1, 0), pitches, strict=True)]
@@ -95,8 +95,8 @@ def _weights(weigh: Weigh, places: list[Array], l: float) -> Array:
     return weigh(u, v) * np.sqrt(1 + (u**2 + v**2) / l**2)
 
 
-def _depths(grid: Grid, pinhole: Array, k: Array, l: float) -> tuple[float, float]:
-    """Depths of the nearest and the farthest voxel, a little wider."""
+def depths_of(grid: Grid, pinhole: Array, k: Array, l: float) -> tuple[float, float]:
+    """Depths of the nearest and the farthest voxel, a little wider; `InputError` as of `hole_response`."""
     depths = (grid.corners() - pinhole) @ k
     near, far = 0.99 * float(depths.min()), 1.01 * float(depths.max())
     if near <= 0 or (1 + l / near) / (1 + l / far) > _MOST_RATIO:

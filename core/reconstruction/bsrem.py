@@ -12,7 +12,7 @@ from .expectation import sensitivities, subsets_of, usual_subsets
 from .loop import Loop, Start, waiting
 from .priors import Prior, at_least_0, penalty_of
 from .result import Array, Callback, Reconstruction
-from .stopping import StopWhen
+from .stopping import StoppingRule
 
 # Of a voxel's value: no update leaves less, so that one bad step can be mended.
 _LEAST_SHARE = np.float32(0.1)
@@ -45,7 +45,7 @@ def bsrem(
     mask: ArrayLike | None = None,
     callback: Callback | None = None,
     progress: Progress | None = None,
-    stop: StopWhen | None = None,
+    stop: StoppingRule | None = None,
 ) -> Reconstruction:
     """The activity with the largest penalised likelihood, ``log-likelihood - prior``: it ends there, as OSEM does not.
 

@@ -13,7 +13,7 @@ from .counts import LEAST, CountData
 from .loop import Loop, Start, waiting
 from .priors import Prior, penalty_of
 from .result import Array, Callback, Reconstruction
-from .stopping import StopWhen
+from .stopping import StoppingRule
 
 # Of the sensitivity: less than this share a prior leaves nowhere.
 _LEAST_SHARE = 0.1
@@ -28,7 +28,7 @@ def mlem(
     mask: ArrayLike | None = None,
     callback: Callback | None = None,
     progress: Progress | None = None,
-    stop: StopWhen | None = None,
+    stop: StoppingRule | None = None,
     prior: Prior | None = None,
 ) -> Reconstruction:
     """The activity for which the counts are most likely, by MLEM: ``x <- x / A.T(1) * A.T(counts / (A x + background))``.
@@ -53,8 +53,8 @@ def mlem(
     progress
         Called as ``progress(updates done, updates)``; what it raises stops the work. A `Cancelled` has what was done
         before as its `reconstruction`.
-    stop : StopWhen, optional
-        Ends it earlier.
+    stop : StoppingRule, optional
+        Such as `StopWhen`; ends it earlier.
     prior : Quadratic, RelativeDifference or TotalVariation, optional
         Penalises noise, one step late: its gradient at the volume before the update is added to the sensitivity that divides
         (Green 1990). Where the sum is below a tenth of the sensitivity it is that tenth, so that the volume stays positive
@@ -96,7 +96,7 @@ def osem(
     mask: ArrayLike | None = None,
     callback: Callback | None = None,
     progress: Progress | None = None,
-    stop: StopWhen | None = None,
+    stop: StoppingRule | None = None,
     prior: Prior | None = None,
 ) -> Reconstruction:
     """As `mlem`, but each iteration updates the volume once for each subset of the views (OSEM).

@@ -12,7 +12,7 @@ from ..projector import Projector
 from ..validation import instance, positive, real_array
 from .loop import Loop, Start, plain, waiting
 from .result import Array, Callback, Reconstruction
-from .stopping import StopWhen
+from .stopping import StoppingRule
 
 
 def sirt(
@@ -25,7 +25,7 @@ def sirt(
     mask: ArrayLike | None = None,
     callback: Callback | None = None,
     progress: Progress | None = None,
-    stop: StopWhen | None = None,
+    stop: StoppingRule | None = None,
 ) -> Reconstruction:
     """The volume whose images are nearest to `images`, by SIRT: ``x <- x + relaxation C A.T(R (images - A x))``.
 
@@ -52,8 +52,8 @@ def sirt(
         See `Callback`.
     progress
         Called as ``progress(steps done, steps)``; what it raises stops the work.
-    stop : StopWhen, optional
-        Ends it before the last iteration.
+    stop : StoppingRule, optional
+        Such as `StopWhen`; ends it before the last iteration.
 
     Returns
     -------
@@ -104,7 +104,7 @@ def cgls(
     mask: ArrayLike | None = None,
     callback: Callback | None = None,
     progress: Progress | None = None,
-    stop: StopWhen | None = None,
+    stop: StoppingRule | None = None,
 ) -> Reconstruction:
     """The volume whose images are nearest to `images`, by conjugate gradients on the normal equations (CGLS).
 

@@ -14,7 +14,7 @@ from ..projector import Projector
 from ..validation import freeze, instance, real_array, whole_number
 from ..volumes.volume import Volume
 from .result import Array, Callback, Reconstruction
-from .stopping import StopWhen, inside
+from .stopping import StoppingRule, StopWhen, inside
 
 Start = Volume | Reconstruction | ArrayLike | None
 
@@ -73,7 +73,7 @@ class Loop:
         mask: ArrayLike | None = None,
         callback: Callback | None = None,
         progress: Progress | None = None,
-        stop: StopWhen | None = None,
+        stop: StoppingRule | None = None,
         *,
         default: float = 1.0,
         negative: bool = False,
@@ -84,7 +84,8 @@ class Loop:
         self._method, self._A, self._callback, self._progress, self._stop = method, A, callback, progress, stop
         self._iterations = whole_number(iterations, "iterations")
         if stop is not None:
-            instance(stop, StopWhen, "stop")
+            if not isinstance(stop, StoppingRule):
+                instance(stop, StopWhen, "stop")  # the rule that users know
             stop.check(A.shape_in)
         self.mask = None if mask is None else inside(mask, "mask", A.shape_in)
         self.state: dict[str, Array] = {}

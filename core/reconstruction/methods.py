@@ -8,8 +8,10 @@ from typing import NamedTuple
 
 from .bsrem import bsrem
 from .expectation import mlem, osem
+from .least_squares import cgls, sirt
 from .priors import Prior, Quadratic, RelativeDifference, TotalVariation
 from .result import Reconstruction
+from .tv import tv
 
 
 class Method(NamedTuple):
@@ -33,6 +35,12 @@ METHODS = {
                mlem, ("background", "prior")),
         Method("bsrem", "BSREM", "Likeliest activity, less the penalty of a prior: the very maximum", bsrem,
                ("subsets", "background", "prior")),
+        Method("sirt", "SIRT", "Least squares of line integrals, steadily (about 100 iterations)", sirt, (), False,
+               "squared error"),
+        Method("cgls", "CGLS", "Least squares of line integrals, fast (about 10 iterations); values may be negative", cgls,
+               (), False, "squared error"),
+        Method("tv", "TV", "Areas of one value with sharp edges, from line integrals (about 200 iterations)", tv,
+               ("weight",), False, "squared error with variation"),
     )
 }  # fmt: skip
 

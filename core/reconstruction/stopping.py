@@ -11,8 +11,29 @@ from ..validation import positive
 from .result import Array
 
 
+class StoppingRule:
+    """Says after each iteration whether a reconstruction ends there; `StopWhen` has the usual rules."""
+
+    def check(self, shape: tuple[int, ...]) -> None:
+        """Raise `InputError` unless the rule fits a volume of this shape; called before the first iteration."""
+
+    def reason(self, objective: Sequence[float], values: Array, seconds: float) -> str | None:
+        """Why it ends, in a word for ``settings["stopped"]``, or None.
+
+        Parameters
+        ----------
+        objective
+            After each iteration so far.
+        values
+            Of the volume (n_x, n_y, n_z), read-only.
+        seconds
+            Since the reconstruction was called.
+        """
+        raise NotImplementedError
+
+
 @dataclass(frozen=True, eq=False)
-class StopWhen:
+class StopWhen(StoppingRule):
     """Ends a reconstruction after the first iteration for which a rule holds; its ``settings["stopped"]`` says which.
 
     Attributes

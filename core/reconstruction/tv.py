@@ -11,7 +11,7 @@ from ..validation import positive
 from .least_squares import Problem, inverse, least_squares_loop, said
 from .loop import Start, waiting
 from .result import Array, Callback, Reconstruction
-from .stopping import StopWhen
+from .stopping import StoppingRule
 
 
 def tv(
@@ -24,7 +24,7 @@ def tv(
     mask: ArrayLike | None = None,
     callback: Callback | None = None,
     progress: Progress | None = None,
-    stop: StopWhen | None = None,
+    stop: StoppingRule | None = None,
 ) -> Reconstruction:
     """The volume with the least ``||A x - images||^2 / 2 + weight TV(x)``: areas of one value with sharp edges.
 

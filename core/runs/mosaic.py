@@ -38,7 +38,7 @@ _SMALL_TEXT = 11.0
 def mosaic(images: ArrayLike, columns: int = COLUMNS) -> NDArray:
     """Pictures of all images (M, n_v, n_u) in one (rows * n_v, columns * n_u), row 0 at the top; empty places are 0.
 
-    They follow each other row by row from the top left: 80 modules in 4 rings and 20 `columns` show a ring a row.
+    They follow each other row by row from the top left: 80 modules in 4 rings and 20 columns show a ring a row.
     """
     images = as_seen(images)
     if images.ndim != 3:

@@ -12,10 +12,11 @@ from ..errors import InputError, InputWarning
 from ..geometry.grid import Grid
 from ..memory import require
 from ..progress import Stages
+from ..projector.hole_response import depths_of
 from ..reconstruction.methods import METHODS, PRIORS
 from ..reconstruction.priors import Prior
 from ..reconstruction.result import Reconstruction
-from ..reconstruction.stopping import StopWhen
+from ..reconstruction.stopping import StoppingRule, StopWhen
 from ..volumes.resampling import resample
 from ..volumes.volume import Volume
 from ..volumes.volume_files import read_volume
@@ -51,7 +52,7 @@ def reconstruct_run(
         Simulated or measured, with a recipe.
     recipe : Recipe
         Its tables `TABLES` say how; by default the run's own. What is modelled is what made the run, unless the settings of
-        the reconstruction say otherwise: fewer points of the hole, no attenuation, no blur.
+        the reconstruction say otherwise: another model of the hole, no attenuation, no blur.
     mu : Volume
         What attenuates, instead of what the recipe says.
     start : Volume or Reconstruction
@@ -75,8 +76,9 @@ def reconstruct_run(
     Warns
     -----
     InputWarning
-        The images were made from voxels that are not at least twice as fine as those of the reconstruction, or with no more
-        points of the hole: model and data then share errors that a real scanner's data does not have.
+        The images were made from voxels that are not at least twice as fine as those of the reconstruction, or with no
+        better model of the hole: model and data then share errors that a real scanner's data does not have. Or the whole
+        hole cannot be reckoned with, and few rays take its place.
     """
     recipe = recipe_of(run, recipe)
     method = METHODS[recipe["reconstruction.method"]]
@@ -87,7 +89,7 @@ def reconstruct_run(
         raise InputError(f"reconstruction.method: {method.name} needs a run of counts, not of line integrals{also}")
     grid = reconstruction_grid(run, recipe)
     require(16.0 * grid.n_voxels, "a reconstruction of {} x {} x {} voxels".format(*grid.shape))
-    modelled = model_of(recipe)
+    modelled = model_of(run, recipe, grid)
     _warn_if_flattering(run, grid, modelled)
     if recipe["reconstruction.ignore_attenuation"]:
         mu = None
@@ -95,11 +97,13 @@ def reconstruct_run(
     given: dict[str, Any] = {name: recipe[f"reconstruction.{name}"] for name in method.takes}
     if "prior" in method.takes:
         given["prior"] = _prior(recipe, grid, stages)
+    if "weight" in method.takes:
+        given["weight"] = _weight(recipe, f"the variation in {method.label}")
     rules = _rules(recipe, grid)
     found = method.function(
         A,
         line_integrals(run, recipe),
-        recipe["reconstruction.iterations"],
+        iterations=recipe["reconstruction.iterations"],
         start=start,
         stop=rules if watch is None else _Watched(watch, rules),
         progress=stages("reconstructing"),
@@ -111,15 +115,11 @@ def reconstruct_run(
     return replace(found, volume=volume, settings={**found.settings, "recipe": recipe.tables()})
 
 
-class _Watched(StopWhen):
+class _Watched(StoppingRule):
     """The user's rules and a watcher: of all that a reconstruction calls, its rules alone are told the objective."""
 
-    _watch: Watch
-    _rules: StopWhen | None
-
-    def __init__(self, watch: Watch, rules: StopWhen | None) -> None:
-        object.__setattr__(self, "_watch", watch)
-        object.__setattr__(self, "_rules", rules)
+    def __init__(self, watch: Watch, rules: StoppingRule | None) -> None:
+        self._watch, self._rules = watch, rules
 
     def check(self, shape: tuple[int, ...]) -> None:
         if self._rules is not None:
@@ -134,16 +134,20 @@ class _Watched(StopWhen):
 def _prior(recipe: Recipe, grid: Grid, stages: Stages) -> Prior | None:
     if recipe["reconstruction.prior"] is None:
         return None
-    kind, weight = PRIORS[recipe["reconstruction.prior"]], recipe["reconstruction.weight"]
-    if weight is None:
-        raise InputError(
-            f"reconstruction.weight (--weight): missing; say how much the {kind.label.lower()} prior counts"
-        )
+    kind = PRIORS[recipe["reconstruction.prior"]]
+    weight = _weight(recipe, f"the {kind.label.lower()} prior")
     given = {name: recipe[f"reconstruction.{name}"] for name in kind.takes}
     anatomy = recipe["reconstruction.anatomy"]
     if anatomy is not None:
         given["anatomy"] = resample(read_volume(anatomy, progress=stages("reading")), grid)
     return kind.prior(weight, **{name: value for name, value in given.items() if value is not None})
+
+
+def _weight(recipe: Recipe, of: str) -> float:
+    weight: float | None = recipe["reconstruction.weight"]
+    if weight is None:
+        raise InputError(f"reconstruction.weight (--weight): missing; say how much {of} counts")
+    return weight
 
 
 def _rules(recipe: Recipe, grid: Grid) -> StopWhen | None:
@@ -175,15 +179,25 @@ def reconstruction_grid(run: ProjectionRun, recipe: Recipe) -> Grid:
     return Grid.centered((n_x, n_y, n_z), np.broadcast_to(spacing, 3), recipe["reconstruction.center"])
 
 
-def model_of(recipe: Recipe) -> Recipe:
-    """The recipe of the model that a reconstruction reckons with."""
+def model_of(run: ProjectionRun, recipe: Recipe, grid: Grid) -> Recipe:
+    """The recipe of the model that a reconstruction reckons with.
+
+    Of the hole's blur it is, unless `recipe` says which: the whole hole by depth, where the run's counts have its blur and
+    `hole` "depth" is possible; else rays, through as many points as the run has, but 7 at most.
+    """
     if recipe["model.kind"] != "emission":
         return recipe
-    points = recipe["reconstruction.aperture_points"]
-    if points is None:
-        points = _POINTS if recipe["model.aperture_tolerance"] else min(_POINTS, recipe["model.aperture_points"])
+    hole, points = recipe["reconstruction.hole"], recipe["reconstruction.aperture_points"]
+    is_blurred = run.is_measured or recipe["model.hole"] == "depth" or bool(recipe["model.aperture_tolerance"])
+    if hole is None:
+        is_free = points is None and recipe["reconstruction.pixel_points"] == 1
+        is_whole = is_blurred or recipe["model.aperture_points"] >= _POINTS
+        hole = "depth" if is_free and is_whole and _whole_hole(run, recipe, grid) else "rays"
+    if hole == "rays" and points is None:
+        points = _POINTS if is_blurred else min(_POINTS, recipe["model.aperture_points"])
     changes: dict[str, Any] = {
-        "model.aperture_points": points,
+        "model.hole": hole,
+        "model.aperture_points": None if hole == "depth" else points,
         "model.aperture_tolerance": None,
         "model.pixel_points": recipe["reconstruction.pixel_points"],
         # The tolerance is for images of single voxels; neighbours make up for each other's errors.
@@ -194,6 +208,27 @@ def model_of(recipe: Recipe) -> Recipe:
     if recipe["reconstruction.ignore_attenuation"]:
         changes |= {key: None for key in recipe.given if key.startswith("attenuation.")}
     return recipe.updated(changes)
+
+
+def _whole_hole(run: ProjectionRun, recipe: Recipe, grid: Grid) -> bool:
+    """Whether `hole` "depth" is possible; a warning says why not."""
+    why = None
+    if recipe["model.edge"] == "path":
+        why = "the run's edge is 'path'"
+    elif recipe["model.depth_layers"] > 1:
+        why = "the run has depth_layers"
+    elif recipe["compute.backend"] == "cuda":
+        why = "the backend is cuda"
+    else:
+        system = run.system
+        try:
+            for m, (_, _, k) in enumerate(system.frames()):
+                depths_of(grid, run.views.sources[m], k, float(system.collimator_length[m]))
+        except InputError:
+            why = "voxels come close to a pinhole"
+    if why is not None:
+        _warn(f"the hole's blur is that of rays through {_POINTS} points, not of the whole hole by depth: {why}")
+    return why is None
 
 
 def line_integrals(run: ProjectionRun, recipe: Recipe) -> NDArray[np.float32]:
@@ -219,6 +254,11 @@ def _warn_if_flattering(run: ProjectionRun, grid: Grid, model: Recipe) -> None:
             f"flatter, unless its voxels are {coarse / 2:.3g} mm or less"
         )
     points = "model.aperture_points"
+    if made["model.hole"] == model["model.hole"] == "depth":
+        _warn(
+            "the run was made with the hole by depth, as the reconstruction reckons: its figures flatter, unless the run is "
+            "made with rays"
+        )
     if made["model.aperture_tolerance"] is None and 1 < made[points] <= model[points]:
         _warn(
             f"the run was made with {made[points]} points of the hole, and the reconstruction reckons with {model[points]}: "

@@ -273,11 +273,16 @@ _DECLARED = (
     Setting("reconstruction.spacing", float, None, "Voxel size, one or three", "the voxels cover the ROI", unit="mm",
             above=0, slider=10, sizes=(1, 3), label="Voxel Size (mm)"),
     Setting("reconstruction.center", float, (0.0, 0.0, 0.0), "Middle of the volume, x y z", unit="mm", sizes=(3,)),
-    Setting("reconstruction.aperture_points", int, None, "Points of the hole that the reconstruction reckons with; 1: no "
-            "recovery of its blur", "7, or those of the run if it was made with fewer", least=1, slider=64,
-            label="Hole Points", needs=(_METHOD_OF_COUNTS,), option="--aperture-points"),
-    Setting("reconstruction.pixel_points", int, 1, "Points of each pixel's area that it reckons with, for each point of the "
-            "hole", least=1, slider=16, needs=(_METHOD_OF_COUNTS,)),
+    Setting("reconstruction.hole", str, None, "How the hole's blur is reckoned with", "by depth, where the run's model "
+            "allows it and no points are given", label="Hole's Blur", option="--hole", needs=(_METHOD_OF_COUNTS,), words={
+        "depth": ("By Depth", "The whole hole, depth by depth: sharpest"),
+        "rays": ("Rays", "Rays through some points of the hole: fast"),
+    }),
+    Setting("reconstruction.aperture_points", int, None, "Points of the hole that rays pass; 1: no recovery of its blur",
+            "7 for rays, or those of the run if it was made with fewer", least=1, slider=64, label="Hole Points",
+            needs=(_METHOD_OF_COUNTS, "no reconstruction.hole=depth"), option="--aperture-points"),
+    Setting("reconstruction.pixel_points", int, 1, "Points of each pixel's area, for each point of the hole", least=1,
+            slider=16, needs=(_METHOD_OF_COUNTS, "no reconstruction.hole=depth")),
     Setting("reconstruction.ignore_attenuation", bool, False, "Reckon without the attenuation of the run",
             needs=(_METHOD_OF_COUNTS,)),
     Setting("reconstruction.ignore_blur", bool, False, "Reckon without the detector's own blur: no recovery of it",
@@ -287,7 +292,7 @@ _DECLARED = (
     Setting("reconstruction.prior", str, None, "Penalty on noise", "none", needs=(_methods("prior"),),
             words={prior.name: (prior.label, prior.text) for prior in PRIORS.values()}),
     Setting("reconstruction.weight", float, None, "How much the penalty counts beside the data", above=0, slider=1,
-            needs=("reconstruction.prior",)),
+            needs=(f"reconstruction.prior or {_methods('weight')}",)),
     Setting("reconstruction.gamma", float, 2.0, "How much large differences are spared", least=0, slider=10,
             needs=(_priors("gamma"),)),
     Setting("reconstruction.edge", float, None, "Value below which differences count as noise", "what suits the penalty",

@@ -55,7 +55,7 @@ def test_the_command_does_what_python_does_and_logs_each_iteration(run, file, tm
     lines = [line for line in printed.err.splitlines() if line.startswith("iteration")]
     found = mph.read_volume(output)
     A = mph.projector_of_run(run, found.grid, recipe=run.recipe.updated(
-        {"model.aperture_points": 7, "model.pixel_points": 1, "model.tolerance": 1e9}))  # fmt: skip
+        {"model.hole": "depth", "model.aperture_points": None, "model.tolerance": 1e9}))  # fmt: skip
     expected = mph.osem(A, run.projections, 3, subsets=4)
     np.testing.assert_allclose(found.array, expected.volume.array, rtol=1e-5, atol=1e-5)
     assert found.quantity == "activity" and found.grid == mph.Grid.centered(20, 5.0)
@@ -114,7 +114,8 @@ def test_stopping_and_watching(run):
 
 
 def test_a_prior_makes_it_smoother(run):
-    how = {"reconstruction.voxels": 20, "reconstruction.spacing": 5, "reconstruction.iterations": 4}
+    how = {"reconstruction.voxels": 20, "reconstruction.spacing": 5, "reconstruction.iterations": 4,
+           "reconstruction.hole": "rays"}  # fmt: skip
     smooth = how | {"reconstruction.prior": "relative-difference", "reconstruction.weight": 0.5}
     plain, found = (mph.reconstruct_run(run, mph.Recipe(entries)).volume.array for entries in (how, smooth))
 
@@ -124,17 +125,50 @@ def test_a_prior_makes_it_smoother(run):
     assert roughness(found) < 0.9 * roughness(plain)
 
 
-def test_voxels_cover_the_roi_and_the_model_is_that_of_the_run_or_simpler(run):
+def test_voxels_cover_the_roi_and_the_model_is_that_of_the_run(run):
     grid = reconstruction_grid(run, run.recipe)
     assert grid.shape == (64, 64, 64)
     np.testing.assert_allclose(grid.spacing * 64, 2 * run.system.roi_radius.max())
-    assert model_of(run.recipe)["model.aperture_points"] == 7 and model_of(run.recipe)["model.intrinsic_fwhm"] == 1.0
-    other = run.recipe.updated({"reconstruction.aperture_points": 1, "reconstruction.ignore_blur": True})
-    assert model_of(other)["model.aperture_points"] == 1 and model_of(other)["model.intrinsic_fwhm"] == 0
-    few = run.recipe.updated({"model.aperture_points": 3})
-    assert model_of(few)["model.aperture_points"] == 3
+
+    def model(**changes):
+        recipe = run.recipe.updated({key.replace("__", "."): value for key, value in changes.items()})
+        found = model_of(run, recipe, grid)
+        return found["model.hole"], found["model.aperture_points"], found["model.intrinsic_fwhm"]
+
+    assert model() == ("depth", 1, 1.0)  # the whole hole has no points
+    assert model(reconstruction__hole="rays") == ("rays", 7, 1.0)
+    assert model(reconstruction__pixel_points=3) == ("rays", 7, 1.0)
+    assert model(reconstruction__aperture_points=1, reconstruction__ignore_blur=True) == ("rays", 1, 0)
+    assert model(model__aperture_points=3) == ("rays", 3, 1.0)
+    assert model(model__aperture_points=1) == ("rays", 1, 1.0)  # counts of an ideal hole
+    assert model(model__aperture_points=None, model__aperture_tolerance=0.1) == ("depth", 1, 1.0)
+    assert model(model__hole="depth", model__aperture_points=None) == ("depth", 1, 1.0)
+    with pytest.warns(
+        mph.InputWarning, match="rays through 7 points, not of the whole hole by depth: the run has depth"
+    ):
+        assert model(model__crystal_mu="NaI", model__depth_layers=2) == ("rays", 7, 1.0)
+    with pytest.warns(mph.InputWarning, match="voxels come close to a pinhole"):
+        assert model_of(run, run.recipe, mph.Grid.centered(8, 40.0))["model.aperture_points"] == 7
     centre = reconstruction_grid(run, run.recipe.updated({"reconstruction.center": (1, 2, 3)})).center
     np.testing.assert_allclose(centre, (1, 2, 3))
+
+
+@pytest.mark.parametrize("method", [["sirt", "--iterations", "100"], ["cgls", "--iterations", "8"],
+                                    ["tv", "--weight", "0.02", "--iterations", "80"]])  # fmt: skip
+@pytest.mark.parametrize("photons", [None, 1e5])
+def test_radiographs_are_reconstructed_by_least_squares(method, photons, scanner, tmp_path, capsys):
+    grid = mph.Grid.centered(20, 4.0)
+    x, y, z = np.meshgrid(*(np.arange(20) * 4.0 - 38,) * 3, indexing="ij")
+    ball = mph.Volume(np.where(x**2 + y**2 + z**2 < 24**2, 0.02, 0).astype(np.float32), grid, "mu")
+    made = {"detector.rows": 16, "detector.columns": 16} | ({} if photons is None else {"model.photons": photons})
+    (run,) = mph.run_recipe(mph.Recipe(made), scanner[::4], ball)
+    mph.write_run(run, tmp_path / "run.npz")
+    how = [*method, "--voxels", "10", "--spacing", "8"]
+    command(tmp_path / "run.npz", "--method", *how, "-o", tmp_path / "v.npz", "--picture", tmp_path / "p.svg")
+    found = mph.read_volume(tmp_path / "v.npz")
+    inside = mph.resample(ball, found.grid, "mean").array > 0.0199
+    assert found.quantity == "mu" and found.array[inside].mean() == pytest.approx(0.02, rel=0.1)
+    assert "squared error" in capsys.readouterr().err
 
 
 def test_data_of_the_model_itself_are_warned_of(run, file, tmp_path, capsys):
@@ -166,7 +200,9 @@ def test_the_picture_shows_slices_beside_the_truth_and_the_objective(run, file, 
     for words in ("Reconstruction", "Truth", "x y,  z = 2.5 mm", "Log-likelihood", "kBq/mL", "3 iterations", "20 mm"):
         assert f">{words}<" in text, words
     assert text.count("<image") == 7  # two rows of slices and a colour bar
-    assert settings_line(1, run.recipe) == "1 iteration"
+    volume = mph.Volume(np.zeros((2, 2, 2)), mph.Grid.centered(2, 1.0))
+    assert settings_line(mph.Reconstruction(volume, np.zeros(1))) == "1 iteration"
+    assert settings_line(mph.Reconstruction(volume, np.zeros(2), {"subsets": 4})) == "2 iterations, 4 subsets"
 
 
 @pytest.mark.parametrize("size", [(240, 240), (1600, 500), (500, 900)])
@@ -185,6 +221,11 @@ def test_slices_lie_on_the_page_and_have_the_right_colours(size):
 @pytest.mark.parametrize(
     ("options", "said"),
     [
+        (
+            ["--hole", "depth", "--aperture-points", "7"],
+            "--aperture-points) does not go with reconstruction.hole = depth",
+        ),
+        (["--method", "tv"], "reconstruction.weight (--weight): missing; say how much the variation in TV counts"),
         (["--subsets", "11"], "subsets: expected at most the 10 views, got 11"),
         (
             ["--method", "mlem", "--subsets", "4"],
@@ -214,7 +255,7 @@ def test_wrong_runs_are_refused(run, file, tmp_path, capsys, scanner):
     )
     mph.write_run(radiograph, tmp_path / "drr.npz")
     said = refused(capsys, tmp_path / "drr.npz", "-o", tmp_path / "v.npz")
-    assert "osem needs a run of counts, not of line integrals" in said
+    assert "osem needs a run of counts, not of line integrals; for these images: sirt, cgls, tv" in said
     bare = mph.project_run(scanner[:4], radiograph.volume, (4, 4))
     with pytest.raises(mph.InputError, match="holds no recipe"):
         mph.reconstruct_run(bare)
@@ -226,6 +267,6 @@ def test_the_example_goes_from_workbook_to_score(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(sys, "argv", ["reconstruct.py", "--picture", str(tmp_path / "p.png"), *small])
     runpy.run_path(str(Path(__file__).parents[2] / "examples/reconstruct.py"), run_name="__main__")
     said = capsys.readouterr().out
-    assert "iteration 2 of 2" in said and "8 mm rods:" in said and "2 mm rods:" in said
+    assert "iteration 2 of 2" in said and "\n8 mm  " in said and "\n2 mm  " in said
     assert 0 < float(re.search(r"NRMSE ([\d.]+)", said)[1]) < 1.2
     assert (tmp_path / "p.png").stat().st_size > 10_000

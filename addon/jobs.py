@@ -268,10 +268,10 @@ class JobOperator:
         if worker in _waiting and not worker.cancel.is_set():
             self._begin_if_first()
             return {"PASS_THROUGH"}
-        if time.monotonic() >= self._drawn + _INTERVAL:
+        is_drawing = time.monotonic() >= self._drawn + _INTERVAL
+        if is_drawing:
             self._drawn = time.monotonic()
             _redraw(context)
-            return {"PASS_THROUGH"}  # drawing is work enough for one turn
         if worker.is_alive():
             job.look()
             return {"PASS_THROUGH"}
@@ -284,10 +284,12 @@ class JobOperator:
                     raise worker.error or Cancelled()
                 worker.steps = _finishing(job, worker.result)
                 worker.result = None
-            enough = time.perf_counter() + _STEP
-            while time.perf_counter() < enough:
+            enough = time.perf_counter() + (0.0 if is_drawing else _STEP)  # drawing is work, too
+            while True:
                 step = worker.steps.throw(Cancelled()) if worker.is_stoppable else next(worker.steps)
                 worker.show_step(step)
+                if time.perf_counter() >= enough:
+                    break
         except StopIteration as end:
             self._end(context)
             self.report({"INFO"}, end.value)

@@ -2,10 +2,10 @@
 
     python -m benchmarks.resolved FOLDER STUDY ...
 
-STUDY: data (first), whole-hole, no-recovery, seven-rays, fine (voxels half as large), noise (five draws, whole hole),
-blur-3 (intrinsic blur of 3 mm), cylinder (200 mm of water). Every study writes its scores, JSON, and its volume into
-FOLDER. The data come from 256^3 voxels and rays through many points of the hole, which no model of the studies uses. One
-takes minutes, fine about an hour.
+STUDY: data (first), whole-hole, no-recovery (neither the hole's blur nor the crystal's), seven-rays, fine (voxels half as
+large), noise (five draws, whole hole), blur-3 (intrinsic blur of 3 mm), cylinder (200 mm of water). Every study writes its
+scores, JSON, and its volume into FOLDER. The data come from 256^3 voxels and rays through many points of the hole, which no
+model of the studies uses. One takes a minute or two, fine several.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ CAMERA: dict[str, Any] = {
 TRUE_POINTS = {"aperture_points": 91, "pixel_points": 3}
 MODELS: dict[str, dict[str, Any]] = {
     "whole-hole": {"hole": "depth"},
-    "no-recovery": {"pixel_points": 5},
+    "no-recovery": {"blur": 0.0, "pixel_points": 5},
     "seven-rays": {"aperture_points": 7, "pixel_points": 1},
 }
 ITERATIONS, SUBSETS, DRAWS = 80, 16, 5

@@ -17,6 +17,7 @@ from ..geometry.grid import Grid
 from ..geometry.views import Views
 from ..memory import require
 from ..progress import Progress, part_of
+from ..recording import recorded_warnings
 from ..volumes.volume import Volume
 from . import backends
 from .bundles import Bundle, Bundles
@@ -258,8 +259,7 @@ class Projector(LinearOperator):
 
         `balanced_subsets` says which views each has. Raises InputError where `n` is not from 1 to the number of views.
         """
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", InputWarning)  # this projector has given them
+        with recorded_warnings():  # this projector has given them
             return [
                 Projector(self.grid, self.views[which], self.model.of_views(which), self._asked, self.threads)
                 for which in balanced_subsets(self.views, n)

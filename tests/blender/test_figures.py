@@ -70,6 +70,7 @@ def test_a_volume_is_shown_in_its_look(example, tmp_path):
         assert np.count_nonzero(shown[..., 0] - shown[..., 1] > 40) > 200, f"{look}: the phantom's purple"
 
 
+@pytest.mark.long
 def test_a_scanner_fits_its_figure_with_even_margins(example, tmp_path):
     for size in ((480, 240), (240, 420)):
         path = tmp_path / f"{size[0]}.png"
@@ -83,6 +84,7 @@ def test_a_scanner_fits_its_figure_with_even_margins(example, tmp_path):
         assert min(free) < margin + 6, "it is as large as fits"
 
 
+@pytest.mark.long
 def test_modules_alone_stand_where_they_stand_in_the_whole(example, tmp_path):
     shown = {}
     for modules in (None, "1-20", "61-80"):
@@ -95,6 +97,7 @@ def test_modules_alone_stand_where_they_stand_in_the_whole(example, tmp_path):
     assert (np.abs(shown["61-80"] - some).max(axis=2) > 40).mean() > 0.02
 
 
+@pytest.mark.long
 def test_window_and_command_draw_the_same(example, tmp_path):
     save_scene(tmp_path / "scene.blend")
     for kind in ("sums", "mosaic"):

@@ -70,6 +70,7 @@ def test_what_lies_in_front_of_the_slices_is_cut_away_and_comes_back(nema):
     assert after == before
 
 
+@pytest.mark.long
 def test_a_surface_follows_a_phantom_that_changes(nema):
     settings = nema.mphdrr_volume
     settings.look = "SHELL"

@@ -48,6 +48,7 @@ def total(volume: Volume) -> float:
     return float(volume.array.sum(dtype=np.float64)) * volume.grid.voxel_volume * 1e-3
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("kind", KINDS, ids=lambda kind: kind.name)
 def test_every_kind_is_core_s_at_its_pose(kind):
     item = add(kind.name, voxels=20, **POSE)
@@ -100,6 +101,7 @@ def test_scripts_add_what_operators_add():
         phantom_properties.plain_settings("head")
 
 
+@pytest.mark.long
 def test_settings_that_cannot_be_leave_the_voxels_and_say_why():
     item = add("defrise", voxels=24)
     before, settings = voxels_of(item), item.mphdrr_volume.defrise
@@ -168,6 +170,7 @@ def test_toml_that_is_no_phantom_adds_nothing(text, message, tmp_path):
     assert (len(bpy.data.objects), len(bpy.data.texts)) == before
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("scale", [(1, 1, 1, 1), (1.2, 0.8, 1, 1)], ids=["turned", "sheared"])
 def test_applied_pose_keeps_activity_and_projections(ring_system, scale):
     item = add("shepp-logan", voxels=100, attenuation=True)

@@ -26,6 +26,7 @@ def beats() -> list[Volume]:
     return [Volume(array, Grid.centered(array.shape, 10.0)) for array in arrays]
 
 
+@pytest.mark.long
 def test_every_frame_has_its_state_of_the_torso(scene):
     assert bpy.ops.mphdrr.add_torso(voxels=12, frames=2) == {"FINISHED"}
     item, recipe = bpy.context.object, phantoms.recipe_of(plain_settings("torso", voxels=12, frames=2))

@@ -162,6 +162,7 @@ def test_projectors_agree_with_exact_projections(system):
     assert np.sqrt(np.mean((images - exact) ** 2)) < 0.02 * exact.max()
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("phantom", KINDS, ids=title)
 def test_total_activity_does_not_depend_on_grid_or_pose(phantom, rng):
     """To 0.01 %, also where voxels are larger than the parts."""

@@ -76,6 +76,7 @@ def test_bad_input_is_one_clear_line():
         refused(call, word)
 
 
+@pytest.mark.long
 @pytest.mark.skipif(not CHEST.is_file(), reason="the chest CT is not there")
 def test_example_on_the_chest_ct(monkeypatch, capsys):
     """From 10 degrees and 20 mm away to within 0.2 degrees and 0.5 mm."""

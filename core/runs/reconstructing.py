@@ -190,7 +190,7 @@ def model_of(run: ProjectionRun, recipe: Recipe, grid: Grid) -> Recipe:
         return recipe
     hole, points = recipe["reconstruction.hole"], recipe["reconstruction.aperture_points"]
     is_blurred = run.is_measured or recipe["model.hole"] == "depth" or bool(recipe["model.aperture_tolerance"])
-    if hole is None:
+    if hole == "auto":
         is_free = points is None and recipe["reconstruction.pixel_points"] == 1
         is_whole = is_blurred or recipe["model.aperture_points"] >= _POINTS
         hole = "depth" if is_free and is_whole and _whole_hole(run, recipe, grid) else "rays"

@@ -273,8 +273,9 @@ _DECLARED = (
     Setting("reconstruction.spacing", float, None, "Voxel size, one or three", "the voxels cover the ROI", unit="mm",
             above=0, slider=10, sizes=(1, 3), label="Voxel Size (mm)"),
     Setting("reconstruction.center", float, (0.0, 0.0, 0.0), "Middle of the volume, x y z", unit="mm", sizes=(3,)),
-    Setting("reconstruction.hole", str, None, "How the hole's blur is reckoned with", "by depth, where the run's model "
-            "allows it and no points are given", label="Hole's Blur", option="--hole", needs=(_METHOD_OF_COUNTS,), words={
+    Setting("reconstruction.hole", str, "auto", "How the hole's blur is reckoned with: auto is by depth, where the run's "
+            "model allows it and no points are given", label="Hole's Blur", needs=(_METHOD_OF_COUNTS,), words={
+        "auto": ("Automatic", "By depth, where the run's model allows it and no points are given; else by rays"),
         "depth": ("By Depth", "The whole hole, depth by depth: sharpest"),
         "rays": ("Rays", "Rays through some points of the hole: fast"),
     }),

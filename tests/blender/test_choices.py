@@ -97,7 +97,7 @@ DEFAULTS = {
     "isotope": "NONE", "aperture_material": "NUMBER", "edge": "PAIX", "crystal_material": "NUMBER",
     "detector": "VIRTUAL", "backend": "AUTO", "rows": "BY_NUMBER", "unit": "NONE",
     "colors": "INFERNO", "scale": "LINEAR", "planes": "ALL", "look": "DENSITY", "figure": "SCANNER",
-    "method": "OSEM", "prior": "NONE", "hole": "RAYS",
+    "method": "OSEM", "prior": "NONE", "hole": "RAYS", "ReconstructionProperties.hole": "AUTO",
 }  # fmt: skip
 """What files mean that do not hold a choice, because nobody has made it."""
 
@@ -135,7 +135,8 @@ def test_every_choice_has_the_number_that_files_keep():
 def test_files_without_a_choice_mean_what_they_did():
     for name, prop in _registered():
         if "_OT_" not in name:
-            assert prop.default == DEFAULTS.get(prop.identifier, "activity"), f"{name}.{prop.identifier}"
+            own = f"{name}.{prop.identifier}"
+            assert prop.default == DEFAULTS.get(own, DEFAULTS.get(prop.identifier, "activity")), own
 
 
 def test_a_new_choice_has_a_number_of_its_own():

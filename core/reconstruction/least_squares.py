@@ -174,7 +174,9 @@ class Problem:
         measured: Array = real_array(plain(images), "images", A.shape_out, np.float32) - A.background.astype(np.float32)
         everywhere = np.ones(A.shape_in, np.float32)
         problem = cls(A, measured, everywhere if loop.mask is None else loop.mask.astype(np.float32))
-        if loop.state and not np.allclose(loop.state.get("problem", np.nan), problem.known["problem"], rtol=1e-9, atol=0):
+        if loop.state and not np.allclose(
+            loop.state.get("problem", np.nan), problem.known["problem"], rtol=1e-9, atol=0
+        ):
             raise InputError(
                 "start: this reconstruction is of other images, views or mask; give its volume to begin with that"
             )

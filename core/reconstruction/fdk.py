@@ -19,6 +19,9 @@ Array = NDArray[np.floating[Any]]
 _OFF_CIRCLE = 0.1
 """Sources may be so far from their circle, as a share of its radius."""
 
+_LEAST_RADIUS = 1e-6
+"""Of the circle, as a share of the distance from source to detector: less is rounding."""
+
 
 def fdk(
     images: ArrayLike,
@@ -129,6 +132,8 @@ class _Orbit:
         solution = np.linalg.lstsq(np.insert(2 * flat, 2, 1.0, axis=1), (flat**2).sum(axis=1), rcond=None)[0]
         center = mean + solution[0] * first + solution[1] * second
         radius = float(np.sqrt(max(solution[2] + solution[0] ** 2 + solution[1] ** 2, 0.0)))
+        if radius < _LEAST_RADIUS * np.linalg.norm(views.detector_centers - sources, axis=1).max():
+            raise InputError("fdk: expected sources on a circle around the object, got all at one place")
         x, y = flat[:, 0] - solution[0], flat[:, 1] - solution[1]
         off = np.hypot(np.hypot(x, y) - radius, (sources - mean) @ axis)
         if not off.max() <= _OFF_CIRCLE * radius:

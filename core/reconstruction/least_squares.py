@@ -137,7 +137,12 @@ def cgls(
         if not loop.state:
             residual = problem.images - problem.forward(x, waiting(progress, 0, 2))
             direction = problem.adjoint(residual, waiting(progress, 0, 2))
-            loop.state = {"residual": residual, "direction": direction, "gradient": _squares(direction)}
+            loop.state = {
+                **problem.known,
+                "residual": residual,
+                "direction": direction,
+                "gradient": _squares(direction),
+            }
         residual, direction, before = (loop.state[name] for name in ("residual", "direction", "gradient"))
         change = problem.forward(direction, waiting(progress, 0, 2))
         length = _squares(change)
@@ -148,7 +153,7 @@ def cgls(
             gradient = problem.adjoint(residual, waiting(progress, 1, 2))
             after = _squares(gradient)
             direction = gradient + (after / before).astype(np.float32) * direction
-            loop.state = {"residual": residual, "direction": direction, "gradient": after}
+            loop.state = {**problem.known, "residual": residual, "direction": direction, "gradient": after}
         said(progress)
         return x, 0.5 * float(_squares(residual))
 
@@ -165,10 +170,23 @@ class Problem:
 
     @classmethod
     def of(cls, A: Projector, images: ArrayLike, loop: Loop) -> "Problem":
-        """Checked: the images without the model's background. Raises InputError."""
+        """Checked: the images without the model's background. Raises InputError, also where a resumed one had others."""
         measured: Array = real_array(plain(images), "images", A.shape_out, np.float32) - A.background.astype(np.float32)
         everywhere = np.ones(A.shape_in, np.float32)
-        return cls(A, measured, everywhere if loop.mask is None else loop.mask.astype(np.float32))
+        problem = cls(A, measured, everywhere if loop.mask is None else loop.mask.astype(np.float32))
+        if loop.state and not np.allclose(
+            loop.state.get("problem", np.nan), problem.known["problem"], rtol=1e-9, atol=0
+        ):
+            raise InputError(
+                "start: this reconstruction is of other images, views or mask; give its volume to begin with that"
+            )
+        return problem
+
+    @property
+    def known(self) -> dict[str, Array]:
+        """For an algorithm's state: by what images and mask are known again when it is resumed."""
+        sums = (self.images.sum(dtype=float), self.inside.sum(dtype=float))
+        return {"problem": np.array([*self.images.shape, *sums])}
 
     def forward(self, x: Array, progress: Progress | None) -> Array:
         """``A x``, float32."""

@@ -82,6 +82,9 @@ class Loop:
         instance(A, Projector, method)
         self._begun = time.monotonic()
         self._method, self._A, self._callback, self._progress, self._stop = method, A, callback, progress, stop
+        for name, function in (("callback", callback), ("progress", progress)):
+            if function is not None and not callable(function):
+                raise InputError(f"{name}: expected a function, got {type(function).__name__}")
         self._iterations = whole_number(iterations, "iterations")
         if stop is not None:
             if not isinstance(stop, StoppingRule):

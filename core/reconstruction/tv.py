@@ -84,7 +84,10 @@ def tv(
         if nonnegative:
             new = np.maximum(new, np.float32(0))
         now = problem.forward(new, waiting(progress, 1, 2))
-        loop.state = {"seen": now, "ahead": 2 * now - seen, "beyond": 2 * new - x, "misfit": misfit, "slopes": slopes}
+        ahead, beyond = 2 * now - seen, 2 * new - x
+        loop.state = {
+            **problem.known, "seen": now, "ahead": ahead, "beyond": beyond, "misfit": misfit, "slopes": slopes
+        }  # fmt: skip
         said(progress)
         squares = float(np.sum(np.square(now - problem.images, dtype=float)))
         return new, 0.5 * squares + weight * total_variation(new, A.grid)

@@ -159,6 +159,10 @@ def test_wrong_input_is_named():
         ((broken, views, GRID), "fdk: images: inf is not a finite number"),
         ((images, mph.parallel_views(FULL[::20], (64, 80), 1.0), GRID), "fdk: expected views from sources"),
         ((images, line, GRID), "fdk: view .: its source is .* mm off the circle"),
+        (
+            (images, views[np.zeros(6, int)], GRID),
+            "fdk: expected sources on a circle around the object, got all at one place",
+        ),
         ((images, orbit(FULL[::20], roll=0.8), GRID), "fdk: view .: its rows are tilted"),
         ((images[:2], views[:2], GRID), "fdk: expected three views or more, got 2"),
         ((images, views, GRID, "none"), "window 'none': expected one of"),

@@ -135,6 +135,20 @@ def test_a_resumed_one_gives_the_same_numbers(name, tmp_path):
         np.testing.assert_array_equal(resumed.objective, whole.objective)
 
 
+@pytest.mark.parametrize("name", ["cgls", "tv"])
+def test_other_images_views_or_masks_cannot_go_on_with_what_is_known_of_the_first(name):
+    run = ALGORITHMS[name]
+    half = run(A, NOISY, iterations=2)
+    fewer = mph.Projector(GRID, A.views[1:])
+    mask = np.zeros(GRID.shape, bool)
+    mask[1:] = True
+    for other, images, more in ((A, NOISY + 1, {}), (fewer, NOISY[1:], {}), (A, NOISY, {"mask": mask})):
+        with pytest.raises(mph.InputError, match="start: this reconstruction is of other images, views or mask"):
+            run(other, images, iterations=1, start=half, **more)
+        begun = run(other, images, iterations=1, start=half.volume, **more)
+        assert begun.iterations == 1
+
+
 @pytest.mark.parametrize("name", ALGORITHMS)
 def test_masks_starts_callbacks_stops_and_progress(name):
     run = ALGORITHMS[name]

@@ -91,13 +91,13 @@ def osem(
     counts: ArrayLike,
     iterations: int = 10,
     subsets: int | None = None,
+    prior: Prior | None = None,
     background: ArrayLike = 0.0,
     start: Start = None,
     mask: ArrayLike | None = None,
     callback: Callback | None = None,
     progress: Progress | None = None,
     stop: StoppingRule | None = None,
-    prior: Prior | None = None,
 ) -> Reconstruction:
     """As `mlem`, but each iteration updates the volume once for each subset of the views (OSEM).
 

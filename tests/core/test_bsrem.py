@@ -120,7 +120,7 @@ def test_one_step_late_ends_at_the_same_optimum(small, prior):
 
 
 def test_a_prior_that_is_too_strong_stays_positive(small):
-    found = mph.osem(small.A, small.counts, 5, 4, 0.3, prior=mph.Quadratic(1e4)).volume.array
+    found = mph.osem(small.A, small.counts, 5, 4, mph.Quadratic(1e4), background=0.3).volume.array
     assert np.isfinite(found).all() and (found >= 0).all() and found.any()
     found = mph.bsrem(small.A, small.counts, 5, 4, mph.Quadratic(1e4), background=0.3).volume.array
     assert found.std() < 0.05 * found.mean()

@@ -48,6 +48,7 @@ def picture(path) -> np.ndarray:
     return np.asarray(Image.open(path).convert("RGB")).astype(int)
 
 
+@pytest.mark.long
 def test_a_rendered_figure_leaves_the_scene_as_it_was(example, tmp_path):
     for _ in range(2):  # the parts' materials may be made the first time
         before = state()
@@ -59,6 +60,7 @@ def test_a_rendered_figure_leaves_the_scene_as_it_was(example, tmp_path):
     assert 40 < shown.mean() < 150
 
 
+@pytest.mark.long
 def test_a_volume_is_shown_in_its_look(example, tmp_path):
     (item,) = volumes.volume_objects(example)
     for look in ("DENSITY", "SHELL"):  # smoke, and a surface that is an object of its own

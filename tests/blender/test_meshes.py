@@ -93,6 +93,7 @@ def test_scanner_parts_are_not_voxelized(workbook):
         bpy.ops.mphdrr.voxelize_objects()
 
 
+@pytest.mark.long
 def test_volume_to_mesh_and_back():
     select(new_sphere())
     bpy.ops.mphdrr.voxelize_objects(value=1.0, voxels=60)

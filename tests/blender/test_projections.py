@@ -411,6 +411,7 @@ def test_only_a_ct_is_converted(scanned):
         bpy.ops.mphdrr.ct_to_attenuation()
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("source", ["phantom", "ct"])
 def test_attenuation_at_another_energy_is_said(scanned, scene, source, capfd):
     if source == "phantom":

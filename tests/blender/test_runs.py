@@ -270,6 +270,7 @@ def test_the_difference_of_two_runs_is_drawn_and_said(render, scene, capfd):
         bpy.ops.mphdrr.compare_runs(other="0")
 
 
+@pytest.mark.long
 def test_the_example_is_current(scene):
     assert bpy.ops.mphdrr.load_example() == {"FINISHED"}
     assert runs.changes(scene) == [] and len(scene.mphdrr_projections.runs) == 1

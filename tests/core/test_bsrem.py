@@ -80,6 +80,7 @@ def compare_with_optimum(problem, prior, subsets, iterations):
     return found, best
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("prior", PRIORS, ids=lambda prior: type(prior).__name__)
 def test_it_ends_at_the_optimum(small, prior):
     found, _ = compare_with_optimum(small, prior, 5, 40)
@@ -94,6 +95,7 @@ def test_it_ends_at_the_optimum_of_24_voxels_a_side(scanner, prior):
     assert np.linalg.norm(found.volume.array - best) <= 1e-4 * np.linalg.norm(best)
 
 
+@pytest.mark.long
 def test_without_prior_it_is_as_likely_as_mlem_gets(small):
     ours = mph.bsrem(small.A, small.counts, 50, 5, background=small.background)
     mlem = mph.mlem(small.A, small.counts, 250, background=small.background)

@@ -55,6 +55,7 @@ def test_a_ball_on_a_full_circle_is_right_within_two_percent():
     assert abs(values[(distance > 36)].mean()) < 0.01
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     "angles",
     [
@@ -79,6 +80,7 @@ def test_any_circle_and_any_arc_that_is_long_enough(angles, center=(12.0, -15.0,
     assert np.abs(volume.array - reference).mean() < 0.02 * MU
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     "misaligned",
     [

@@ -176,6 +176,7 @@ def test_masks_starts_callbacks_stops_and_progress(name):
         run(A, IMAGES, iterations=2, progress=cancel)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", ALGORITHMS)
 def test_counts_of_pinholes_lose_their_background(name):
     angles = np.arange(8) * np.pi / 4

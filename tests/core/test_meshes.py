@@ -90,6 +90,7 @@ def test_walls_cavities_and_parts_that_overlap():
     assert content(mph.voxelize_mesh(apart, grid)) == pytest.approx(16, rel=1e-6)
 
 
+@pytest.mark.long
 def test_what_several_parts_cover_counts_once(rng):
     """Parts that overlap, share faces or lie in one another, in voxels of any size."""
     crossing = joined(box((4.0, 2, 2), (-0.5, 0, 0)), box((4.0, 2, 2), (0.5, 0.4, 0.3)))

@@ -94,6 +94,7 @@ def test_a_phantom_of_shapes_is_projected(workbook, tmp_path, capsys):
     assert mph.read_run(tmp_path / "photons.npz").unit == "photons"
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("is_file", [True, False], ids=["file", "Derenzo"])
 def test_a_phantoms_own_mu_attenuates_as_its_volume_would(is_file, workbook, tmp_path, capsys):
     (tmp_path / "thorax.toml").write_text(THORAX)

@@ -128,6 +128,7 @@ def test_a_run_made_again_is_attenuated_again(centered, workbook, tmp_path, caps
             next(mph.run_recipe(runs[0].recipe, volume=runs[0].volume))
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("kind", KINDS, ids=lambda kind: kind.name)
 def test_a_phantom_has_settings_apart_from_those_of_its_grid(kind, workbook, tmp_path, capsys):
     """Defrise's disks and the grid of points have a spacing, as the voxels have."""

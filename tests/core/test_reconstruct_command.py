@@ -185,6 +185,7 @@ def test_data_of_the_model_itself_are_warned_of(run, file, tmp_path, capsys):
     assert "warning" not in capsys.readouterr().err
 
 
+@pytest.mark.long
 def test_the_attenuation_of_the_run_is_modelled_unless_it_is_to_be_ignored(scanner):
     water = {"phantom.cylinder_radius": 45.0, "phantom.cylinder_height": 60.0, "attenuation.of_phantom": True,
              "phantom.voxels": 20, "phantom.spacing": 5.0, "detector.rows": 8, "detector.columns": 8}  # fmt: skip
@@ -269,6 +270,7 @@ def test_wrong_runs_are_refused(run, file, tmp_path, capsys, scanner):
     assert set(METHODS) >= {"osem", "mlem"}
 
 
+@pytest.mark.long
 def test_the_example_goes_from_workbook_to_score(tmp_path, monkeypatch, capsys):
     small = ["--iterations", "2", "--voxels", "24", "--pixels", "16", "--fine", "48"]
     monkeypatch.setattr(sys, "argv", ["reconstruct.py", "--picture", str(tmp_path / "p.png"), *small])

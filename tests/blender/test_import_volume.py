@@ -144,6 +144,7 @@ def test_slices_follow_new_voxels_and_go(ct):
     assert (len(bpy.data.objects), len(bpy.data.images), len(bpy.data.meshes), len(bpy.data.materials)) == before
 
 
+@pytest.mark.long
 def test_slices_of_a_large_volume_are_quick():
     array = np.random.default_rng(0).random((256, 256, 256), np.float32)
     item = volumes.add_volume(Volume(array, Grid.centered(256, 1.0), "activity"), "Large")

@@ -100,6 +100,7 @@ def test_counts_with_attenuation_and_noise(workbook, tmp_path, capsys):
     np.testing.assert_array_equal(drawn.projections, mph.sample_counts(mean.projections, 5))
 
 
+@pytest.mark.long
 def test_every_part_of_the_emission_model_is_an_option(workbook, tmp_path):
     """Options reach the model and the record; for omitted ones the model's defaults hold."""
     run_file = tmp_path / "run.h5"

@@ -48,6 +48,7 @@ def test_pose_error():
     assert pose_error(a, a) == pytest.approx((0, 0), abs=1e-6)
 
 
+@pytest.mark.long
 def test_pose_of_a_camera_is_recovered(rng):
     """Balls of different size, 47 x 49 pixels: remainders at the coarse levels must not shift the image."""
     grid = Grid.centered((24, 24, 24), 4.0, (10.0, -5.0, 3.0))

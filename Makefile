@@ -29,7 +29,7 @@ ANY_PYTHON = $$(for p in "$(PYTHON)" python3 python3.11 python3.13; do "$$p" -c 
 ENVIRONMENT = @p=$(ANY_PYTHON); [ -n "$$p" ] || { echo "no Python found; name one: make PYTHON=/path/to/python3.11"; exit 1; }; \
 	"$$p" tools/environment.py $(VENV) --python "$(PYTHON)"
 
-.PHONY: demo gallery test test-long lint test-app test-kernels test-gate test-peers bench bench-reconstruction docs tutorial dist clean env env-dev
+.PHONY: demo gallery test test-long lint test-app test-kernels test-gate test-peers bench bench-reconstruction docs tutorial dist clean env env-dev env-gate env-peers
 
 demo: env
 	$(BIN)/mphdrr demo --output $(OUTPUT)
@@ -54,8 +54,7 @@ lint: env-dev
 bench: env-dev
 	$(BIN)/python benchmarks/projector.py $(BENCH)
 
-bench-reconstruction:
-	$(ENVIRONMENT) --extras peers --torch "$(TORCH)"
+bench-reconstruction: env-peers
 	$(BIN)/python benchmarks/reconstruction.py $(BENCH)
 
 docs:
@@ -82,12 +81,10 @@ test-kernels: env-dev
 		echo "accuracy of $$level"; MPHDRR_CPU_LEVEL=$$level $(BIN)/python -m pytest -k cpu tests/core/test_projector.py \
 		tests/core/test_emission.py tests/core/test_emission_gradients.py tests/core/test_geometry_gradients.py || exit 1; done
 
-test-gate:
-	$(ENVIRONMENT) --extras gate
+test-gate: env-gate
 	$(BIN)/python -m pytest tests/core/test_monte_carlo.py
 
-test-peers:
-	$(ENVIRONMENT) --extras peers --torch "$(TORCH)"
+test-peers: env-peers
 	@# a missing one would only be skipped; deepinv needs a word before it is imported, which its tests say
 	@$(BIN)/python -c "import astra, cv2, itk, kornia, lib3mf, pytomography.algorithms, scipy; from importlib.metadata import version; version('deepinv')"
 	$(BIN)/python -m pytest tests/core/test_geometry_export_peers.py tests/core/test_adapters.py
@@ -97,6 +94,12 @@ env:
 
 env-dev:
 	$(ENVIRONMENT) --extras blender,dev --torch "$(TORCH)"
+
+env-gate:
+	$(ENVIRONMENT) --extras gate
+
+env-peers:
+	$(ENVIRONMENT) --extras peers --torch "$(TORCH)"
 
 clean:
 	rm -f core/projector/backends/kernels/*.so core/projector/backends/kernels/*.dylib core/projector/backends/kernels/*.dll

@@ -272,10 +272,10 @@ class JobOperator:
         if is_drawing:
             self._drawn = time.monotonic()
             _redraw(context)
-        if worker.is_alive():
-            job.look()
-            return {"PASS_THROUGH"}
         try:
+            if worker.is_alive():
+                job.look()
+                return {"PASS_THROUGH"}
             if worker.steps is None:
                 self._tick(context, _STEP)
                 for text in worker.caught:
@@ -295,6 +295,7 @@ class JobOperator:
             self.report({"INFO"}, end.value)
             return {"FINISHED"}
         except BaseException as error:
+            worker.cancel.set()  # what was looked at cannot be shown: the thread has nothing to go on for
             self._end(context)
             job.discard()
             return self._failed(error)

@@ -5,6 +5,10 @@ from __future__ import annotations
 import atexit
 import os
 
+# Each of several processes leaves the other cores to the others; BLAS and torch would wait for theirs, busily.
+if "PYTEST_XDIST_WORKER" in os.environ:
+    os.environ |= {name: "1" for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")}
+
 
 @atexit.register
 def _silence_blender() -> None:

@@ -18,6 +18,7 @@ discs. M. Unser, A. Aldroubi, M. Eden, "B-spline signal processing", IEEE Transa
 import functools
 import math
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -89,7 +90,7 @@ def hole_response(
     )  # fmt: skip
 
 
-def _weights(weigh: Weigh, places: list[Array], l: float) -> Array:
+def _weights(weigh: Weigh, places: list[NDArray[Any]], l: float) -> Array:
     """What a mm^3 counts, times its squared depth by l^2, along lines to `places` (rows, columns) on the crystal."""
     v, u = places[0][:, None], places[1][None, :]
     return weigh(u, v) * np.sqrt(1 + (u**2 + v**2) / l**2)

@@ -85,7 +85,7 @@ def sirt(
     def step(number: int, x: Array, progress: Progress | None) -> tuple[Array, float]:
         nonlocal residual
         if residual is None:
-            residual = problem.images - problem.forward(x, waiting(progress, 0, 2))
+            residual: Array = problem.images - problem.forward(x, waiting(progress, 0, 2))
         x = x + per_voxel * problem.adjoint(per_pixel * residual, waiting(progress, 0, 2))
         if nonnegative:
             x = np.maximum(x, np.float32(0))
@@ -135,7 +135,7 @@ def cgls(
 
     def step(number: int, x: Array, progress: Progress | None) -> tuple[Array, float]:
         if not loop.state:
-            residual = problem.images - problem.forward(x, waiting(progress, 0, 2))
+            residual: Array = problem.images - problem.forward(x, waiting(progress, 0, 2))
             direction = problem.adjoint(residual, waiting(progress, 0, 2))
             loop.state = {
                 **problem.known,

@@ -64,7 +64,7 @@ def tv(
     per_pixel = inverse(problem.forward(problem.inside, loop.preparing()))
     weights = problem.adjoint(np.ones(A.shape_out, np.float32), loop.preparing())
     # The gradient is scaled so that it has as much weight in a voxel as its rays have.
-    scale = float(weights.mean() / max(problem.inside.mean(), 1e-6) / (2 * closeness.sum())) or 1.0
+    scale = float(weights.mean()) / max(float(problem.inside.mean()), 1e-6) / float(2 * closeness.sum()) or 1.0
     factors = (scale * closeness).astype(np.float32)
     per_voxel = inverse(weights + np.float32(2 * factors.sum()) * problem.inside)
     per_gradient = np.float32(1 / (2 * factors.max()))

@@ -7,7 +7,7 @@ import os
 
 # Each of several processes leaves the other cores to the others; BLAS and torch would wait for theirs, busily.
 if "PYTEST_XDIST_WORKER" in os.environ:
-    os.environ |= {name: "1" for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")}
+    os.environ |= dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
 
 
 @atexit.register

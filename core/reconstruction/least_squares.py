@@ -85,7 +85,7 @@ def sirt(
     def step(number: int, x: Array, progress: Progress | None) -> tuple[Array, float]:
         nonlocal residual
         if residual is None:
-            residual: Array = problem.images - problem.forward(x, waiting(progress, 0, 2))
+            residual = problem.images - problem.forward(x, waiting(progress, 0, 2))
         x = x + per_voxel * problem.adjoint(per_pixel * residual, waiting(progress, 0, 2))
         if nonnegative:
             x = np.maximum(x, np.float32(0))

@@ -187,20 +187,11 @@ def _scores(run: ProjectionRun, volume: Volume, progress: Progress | None) -> li
         return [("No score", str(error))]
     lines = [("NRMSE", f"{record['nrmse']:.3g}")]
     for rods in record.get("derenzo", []):
-        said = (
-            f"{rods['resolved']:.0%} resolved, valley/peak {_number(rods['valley_to_peak'])}"
-            if not rods["note"]
-            else ""
-        )
-        lines.append((f"{rods['rod_diameter']:g} mm rods", said or rods["note"]))
+        lines.append((f"{rods['rod_diameter']:g} mm rods", rods["note"] or f"{rods['resolved']:.0%} resolved"))
     for sphere in record.get("nema", []):
         said = f"{sphere['contrast_recovery']:.1f} % contrast, {sphere['background_variability']:.1f} % variability"
         lines.append((f"{sphere['diameter']:g} mm sphere", said))
     return lines
-
-
-def _number(value: float | None) -> str:
-    return "unknown" if value is None else f"{value:.2f}"
 
 
 def _is_watched() -> bool:

@@ -28,6 +28,7 @@ from .reports import warnings_reported
 
 _INTERVAL = 0.1  # s between two looks at the thread, and between two drawings of how far it is
 _STEP = 0.02  # s that finishing may take of the main thread before the window has its turn, which is as long
+_SHARE, _MOST = 0.1, 0.05  # of the time since the last step, and s, that it may take where the window is drawn slowly
 _PATIENCE = 10.0  # s that `stop` waits for a thread
 _STATUS_UNITS = 16  # the job's width in the status bar
 _SOON = 1.0  # s of a stage after which the time left is guessed
@@ -199,7 +200,7 @@ class JobOperator:
     _job: Job | None = None
     _run: Worker | None = None
     _timer: bpy.types.Timer | None = None
-    _drawn = 0.0
+    _drawn = _left = 0.0
 
     if TYPE_CHECKING:  # what every bpy.types.Operator has
         bl_idname: str
@@ -278,18 +279,22 @@ class JobOperator:
                 return {"PASS_THROUGH"}
             if worker.steps is None:
                 self._tick(context, _STEP)
+                self._left = time.perf_counter()
                 for text in worker.caught:
                     self.report({"WARNING"}, text)
                 if worker.error is not None or worker.cancel.is_set():
                     raise worker.error or Cancelled()
                 worker.steps = _finishing(job, worker.result)
                 worker.result = None
-            enough = time.perf_counter() + (0.0 if is_drawing else _STEP)  # drawing is work, too
+            # Drawing is work, too. A window that is drawn slowly has few turns, and does more in each.
+            since = time.perf_counter() - self._left
+            enough = time.perf_counter() + max(0.0 if is_drawing else _STEP, min(_SHARE * since, _MOST))
             while True:
                 step = worker.steps.throw(Cancelled()) if worker.is_stoppable else next(worker.steps)
                 worker.show_step(step)
                 if time.perf_counter() >= enough:
                     break
+            self._left = time.perf_counter()
         except StopIteration as end:
             self._end(context)
             self.report({"INFO"}, end.value)

@@ -24,6 +24,8 @@ from .geometry.presets import c_arm_views, pinhole_views
 from .geometry.ring_fits import RingFit, fit_rings, ring_order
 from .geometry.system import PinholeSystem
 from .geometry.views import Views
+from .perspective.coordinates import line_through, transform_lines, transform_points
+from .perspective.perspective_grid import PerspectiveGrid, depth_ranges, perspective_grids
 from .phantoms.defrise import DefrisePhantom
 from .phantoms.derenzo import DerenzoPhantom, DerenzoRods
 from .phantoms.jaszczak import JaszczakPhantom

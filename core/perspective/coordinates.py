@@ -1,0 +1,68 @@
+"""Points and lines under homogeneous transforms, such as those of `Views.perspective_matrices`."""
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from ..errors import InputError
+from ..validation import real_array
+
+Floats = NDArray[np.float64]
+
+
+def transform_points(matrix: ArrayLike, points: ArrayLike) -> Floats:
+    """Points after a homogeneous transform: multiplied by its matrix, divided by the last number.
+
+    Parameters
+    ----------
+    matrix : array (4, 4)
+    points : array (…, 3)
+
+    Returns
+    -------
+    array (…, 3)
+        Infinite, or not a number, where a point is taken to infinity.
+    """
+    matrix = real_array(matrix, "transform", (4, 4))
+    points = real_array(points, "points", (3,), batch=True)
+    moved = points @ matrix[:, :3].T + matrix[:, 3]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return np.asarray(moved[..., :3] / moved[..., 3:])
+
+
+def line_through(first: ArrayLike, second: ArrayLike) -> Floats:
+    """The lines through two points each, (…, 3), as Plücker matrices (…, 4, 4): ``a b^T - b a^T`` of homogeneous points."""
+    a, b = (_homogeneous(real_array(each, "points of a line", (3,), batch=True)) for each in (first, second))
+    outer = a[..., :, None] * b[..., None, :]
+    return outer - outer.swapaxes(-1, -2)
+
+
+def transform_lines(matrix: ArrayLike, lines: ArrayLike) -> Floats:
+    """Lines after a homogeneous transform `matrix` (4, 4), as Plücker matrices (…, 4, 4): ``H L H^T``.
+
+    It is the line through what `transform_points` makes of the line's points, times a factor.
+    """
+    matrix = real_array(matrix, "transform", (4, 4))
+    return np.asarray(matrix @ real_array(lines, "lines", (4, 4), batch=True) @ matrix.T)
+
+
+def distance_to_line(points: ArrayLike, line: ArrayLike) -> Floats:
+    """Distances (…) of points (…, 3) to a line, a Plücker matrix (4, 4); in the points' unit.
+
+    Raises
+    ------
+    InputError
+        The line is at infinity, or no line.
+    """
+    points = real_array(points, "points", (3,), batch=True)
+    line = real_array(line, "line", (4, 4))
+    direction = line[:3, 3]
+    length = np.linalg.norm(direction)
+    if length == 0:
+        raise InputError("line: expected a Plücker matrix of a line that is not at infinity")
+    moment = np.array([line[1, 2], line[2, 0], line[0, 1]])  # a x b
+    # a x b = x x (b - a) for all points x of the line, and the matrix holds a - b.
+    return np.asarray(np.linalg.norm(moment + np.cross(points, direction), axis=-1) / length)
+
+
+def _homogeneous(points: Floats) -> Floats:
+    return np.concatenate([points, np.ones((*points.shape[:-1], 1))], axis=-1)

@@ -1,0 +1,221 @@
+"""The lattice of one view's own coordinates: a cell for each pixel and plane of depth."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from ..arrays import ArrayOrTensor, cast_like, is_tensor
+from ..errors import InputError
+from ..geometry.grid import Grid
+from ..geometry.views import Views
+from ..validation import freeze, instance, one_for_all, one_of, real_array, whole_number
+from .coordinates import transform_points
+
+Floats = NDArray[np.float64]
+
+UNIFORM = ("k", "depth")
+"""What the planes of a perspective grid may be evenly spaced in."""
+
+
+@dataclass(frozen=True, eq=False)
+class PerspectiveGrid:
+    """Cells of view `m` in its own coordinates (column, row, k): arrays on it are (n_u, n_v, n_k), indexed [column, row, plane].
+
+    A cell is what a pixel sees between two planes parallel to the detector; its place is the pixel's centre, in the middle of
+    the planes. Column and row are in pixels, as in the image, 0 at the centre of pixel 0; ``k = D / depth`` is the
+    magnification: the depth is measured from the source across the detector's plane, at distance D. k falls, and depth
+    grows, from plane 0, next to `near`, to the last, next to `far`.
+
+    For a parallel view k is 1 everywhere and says nothing of depth: the third coordinate is the depth itself, mm, from the
+    plane through ``views.sources[m]``, and planes are evenly spaced in it.
+
+    Parameters
+    ----------
+    views : Views
+    m : int
+        Which of them.
+    n_k : int
+        Planes.
+    near, far : float
+        Depths, mm, at which the first cells begin and the last ones end.
+    uniform : str
+        What planes are evenly spaced in: "k", so that they are densest near the source, or "depth".
+
+    Raises
+    ------
+    InputError
+        No such view, or depths that are not in front of the source and in this order.
+    """
+
+    views: Views
+    m: int
+    n_k: int
+    near: float
+    far: float
+    uniform: str = "k"
+
+    def __post_init__(self) -> None:
+        instance(self.views, Views, "perspective grid")
+        one_of(self.uniform, UNIFORM, "uniform")
+        if isinstance(self.m, bool) or not isinstance(self.m, int | np.integer):
+            raise InputError(f"perspective grid: expected the index of a view, got {self.m!r}")
+        if not -len(self.views) <= self.m < len(self.views):
+            raise InputError(f"perspective grid: there is no view {self.m} among {len(self.views)}")
+        object.__setattr__(self, "m", int(self.m) % len(self.views))
+        object.__setattr__(self, "n_k", whole_number(self.n_k, "planes of a perspective grid"))
+        for name in ("near", "far"):
+            object.__setattr__(self, name, float(real_array(getattr(self, name), name, ())))
+        if not self.near < self.far or (self.near <= 0 and not self.views.parallel):
+            least = "" if self.views.parallel else "0 < "
+            raise InputError(
+                f"perspective grid: expected depths {least}near < far, got {self.near:g} and {self.far:g} mm"
+            )
+
+    @property
+    def shape(self) -> tuple[int, int, int]:
+        """Of arrays: (n_u, n_v, n_k)."""
+        n_v, n_u = self.views.shape
+        return n_u, n_v, self.n_k
+
+    @cached_property
+    def matrix(self) -> Floats:
+        """The transform (4, 4) from world points, mm, to (column, row, k); of a parallel view, (column, row, depth)."""
+        matrix = self.views[self.m].perspective_matrices()[0]
+        if self.views.parallel:
+            matrix[2] = [*self._normal, -self._normal @ self.views.sources[self.m]]
+        return freeze(matrix)
+
+    @cached_property
+    def edges(self) -> Floats:
+        """The third coordinate (n_k + 1,) at the borders of planes: k, or the depth of a parallel view."""
+        if self.views.parallel or self.uniform == "depth":
+            depths = np.linspace(self.near, self.far, self.n_k + 1)
+            return freeze(depths if self.views.parallel else self._distance / depths)
+        return freeze(np.linspace(self._distance / self.near, self._distance / self.far, self.n_k + 1))
+
+    @cached_property
+    def planes(self) -> Floats:
+        """The third coordinate (n_k,) of the cells' places: k, or the depth of a parallel view."""
+        if self.views.parallel or self.uniform == "k":
+            return freeze((self.edges[1:] + self.edges[:-1]) / 2)
+        return freeze(2 / (1 / self.edges[1:] + 1 / self.edges[:-1]))
+
+    @property
+    def depths(self) -> Floats:
+        """The depth (n_k,) of the cells' places, mm."""
+        return self.planes if self.views.parallel else self._distance / self.planes
+
+    def to_world(self, points: ArrayLike) -> Floats:
+        """World points (…, 3), mm, of points (…, 3) given as (column, row, k); of a parallel view, (column, row, depth)."""
+        return transform_points(self._inverse, points)
+
+    def from_world(self, points: ArrayLike) -> Floats:
+        """The coordinates (column, row, k) (…, 3) of world points (…, 3), mm; of a parallel view, (column, row, depth)."""
+        return transform_points(self.matrix, points)
+
+    def centers(self) -> Floats:
+        """World points (n_u, n_v, n_k, 3), mm, of the cells' places."""
+        columns, rows = (np.arange(n, dtype=np.float64) for n in self.shape[:2])
+        return self.to_world(np.stack(np.meshgrid(columns, rows, self.planes, indexing="ij"), axis=-1))
+
+    def ray_lengths(self) -> Floats:
+        """How long each cell's ray is in it (n_u, n_v, n_k), mm."""
+        starts, targets = self.views.rays(self.m)
+        rays = targets - starts
+        n_v, n_u = self.views.shape
+        per_depth = np.linalg.norm(rays, axis=1) / (rays @ self._normal)
+        return np.asarray(per_depth.reshape(n_v, n_u).T[..., None] * np.diff(self._edge_depths))
+
+    def cell_volumes(self) -> Floats:
+        """The volume of a cell of each plane (n_k,), mm^3; it is the same for all pixels."""
+        area = np.linalg.norm(np.cross(self.views.u_steps[self.m], self.views.v_steps[self.m]))
+        if self.views.parallel:
+            return np.asarray(area * np.diff(self.edges))
+        return np.asarray(area * np.diff(self._edge_depths**3) / (3 * self._distance**2))
+
+    def image(self, array: ArrayOrTensor) -> ArrayOrTensor:
+        """Line integrals (…, n_v, n_u) along the pixels' rays: the sum over planes of values times lengths of rays, value x mm.
+
+        `array` (…, n_u, n_v, n_k), numpy or torch, holds values that keep density, as of `to_perspective`. A tensor's
+        gradient follows.
+        """
+        if tuple(array.shape[-3:]) != self.shape:
+            raise InputError(
+                f"perspective array: expected shape {self.shape} after any batch axes, got {tuple(array.shape)}"
+            )
+        lengths: Any = (
+            cast_like(self.ray_lengths(), array) if is_tensor(array) else self.ray_lengths().astype(array.dtype)
+        )
+        return (array * lengths).sum(-1).swapaxes(-1, -2)
+
+    @cached_property
+    def index_matrix(self) -> Floats:
+        """(5, 4): from homogeneous world points to numbers p with column p0 / p3, row p1 / p3 and plane p2 / p4.
+
+        A plane's number is that of the array's third index, at the cells' places.
+        """
+        column, row, third, last = self.matrix
+        if self.views.parallel or self.uniform == "k":
+            step = (self.edges[-1] - self.edges[0]) / self.n_k
+            plane, divisor = third - (self.edges[0] + step / 2) * last, last
+        else:
+            step = (self.far - self.near) / self.n_k
+            plane, divisor = self._distance * last - (self.near + step / 2) * third, third
+        return freeze(np.stack([column, row, plane / step, last, divisor]))
+
+    @cached_property
+    def _inverse(self) -> Floats:
+        return freeze(np.linalg.inv(self.matrix))
+
+    @cached_property
+    def _normal(self) -> Floats:
+        """(3,): across the detector's plane, away from the source."""
+        normal = np.cross(self.views.u_steps[self.m], self.views.v_steps[self.m])
+        normal /= np.linalg.norm(normal)
+        ahead = normal @ (self.views.detector_centers[self.m] - self.views.sources[self.m])
+        return np.asarray(normal * np.sign(ahead))
+
+    @property
+    def _distance(self) -> float:
+        """From the source to the detector's plane, mm."""
+        return float(self._normal @ (self.views.detector_centers[self.m] - self.views.sources[self.m]))
+
+    @property
+    def _edge_depths(self) -> Floats:
+        return self.edges if self.views.parallel else self._distance / self.edges
+
+
+def perspective_grids(
+    views: Views, n_k: int, near: ArrayLike, far: ArrayLike, uniform: str = "k"
+) -> tuple[PerspectiveGrid, ...]:
+    """A `PerspectiveGrid` of every view; `near` and `far` are depths, mm, one for all or (M,), as of `depth_ranges`."""
+    instance(views, Views, "perspective grids")
+    nears, fars = (one_for_all(each, name, len(views)) for each, name in ((near, "near"), (far, "far")))
+    return tuple(PerspectiveGrid(views, m, n_k, nears[m], fars[m], uniform) for m in range(len(views)))
+
+
+def depth_ranges(views: Views, grid: Grid) -> tuple[Floats, Floats]:
+    """The depths, mm, between which `grid` lies in each view: near (M,) and far (M,).
+
+    Raises
+    ------
+    InputError
+        A part of the grid is not in front of a view's source.
+    """
+    instance(views, Views, "depths: views")
+    instance(grid, Grid, "depths: grid")
+    normals = np.cross(views.u_steps, views.v_steps)
+    ahead = np.einsum("mi,mi->m", normals, views.detector_centers - views.sources)
+    normals *= (np.sign(ahead) / np.linalg.norm(normals, axis=1))[:, None]
+    depths = np.einsum("mpi,mi->mp", grid.corners() - views.sources[:, None], normals)
+    near, far = depths.min(axis=1), depths.max(axis=1)
+    if not views.parallel and near.min() <= 0:
+        raise InputError(
+            f"view {int(near.argmin())}: expected a grid in front of its source, but it begins {-near.min():.3g} mm behind"
+        )
+    return near, far

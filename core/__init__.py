@@ -26,6 +26,7 @@ from .geometry.system import PinholeSystem
 from .geometry.views import Views
 from .perspective.coordinates import line_through, transform_lines, transform_points
 from .perspective.perspective_grid import PerspectiveGrid, depth_ranges, perspective_grids
+from .perspective.resampling import camera_to_camera, from_perspective, to_perspective
 from .phantoms.defrise import DefrisePhantom
 from .phantoms.derenzo import DerenzoPhantom, DerenzoRods
 from .phantoms.jaszczak import JaszczakPhantom

@@ -249,8 +249,8 @@ def _fans(rays: IndexFans, mu_rays: Any) -> Array:
     if mu_rays is not None:
         fans["mu"] = mu_rays.table[:, :4]
     fans["rows"], fans["columns"] = rays.shape
-    if rays.parallel:
-        fans["parallel"], fans["world"][:, 1:] = 1, 0
+    fans["parallel"] = rays.parallel
+    fans["world"][:, 1:] *= 1 - rays.parallel
     return fans
 
 

@@ -25,9 +25,9 @@ typedef struct {
 typedef struct {
     double volume[4][3]; // source, corner, row step, column step in the volume's index space
     double mu[4][3];     // the same in mu's, where that has a lattice of its own
-    double world[3][3];  // source to corner, row step, column step in mm; the steps are 0 where rays are parallel
+    double world[3][3];  // source to corner in mm, and by how much a ray changes with its row and column
     int64_t rows, columns;
-    double parallel; // 1: the sources move along with the points, as far as these; 0: there is one source
+    double parallel; // the sources move along with the points, this many times as far: 0 if there is one source
 } Fan;
 
 // Rays one by one, columns of arrays (3, count) and (count).

@@ -65,8 +65,9 @@ def to_perspective(
 
     Notes
     -----
-    "density" follows each ray exactly (Siddon 1985). Voxels are shared out among cells at several points each, evenly spaced:
-    two along each axis for every cell that one covers, up to 8. So the cells of an even volume differ by up to 3 % along each axis.
+    "density" follows each ray exactly (Siddon 1985). Voxels are shared out among cells at several points each, evenly
+    spaced: two along each axis for every cell that one covers, up to 8. So the cells of an even volume differ by up to 3 %
+    along each axis.
 
     `from_perspective` with the other `keep` is the adjoint: ``<to_perspective(x, g), y> = v <x, from_perspective(y, g,
     grid, "activity")>`` and ``<to_perspective(x, g, "activity"), y> = v <x, from_perspective(y, g, grid)>``, with v the
@@ -140,8 +141,8 @@ def camera_to_camera(
     g_m, g_n : PerspectiveGrid
         Of `array`, and of the result.
     keep : str
-        "density": the mean over each cell of the values, interpolated linearly. "activity": what lies in each cell is shared out among the cells around it; it is
-        the adjoint of "density" the other way, from `g_n` to `g_m`.
+        "density": the mean over each cell of the values, interpolated linearly. "activity": what lies in each cell is
+        shared out among the cells around it; it is the adjoint of "density" the other way, from `g_n` to `g_m`.
 
     Returns
     -------

@@ -145,6 +145,7 @@ def test_tensors_and_their_gradients(parallel):
         np.testing.assert_allclose(x.grad.numpy(), adjoint(y).numpy(), atol=1e-12 * float(adjoint(y).max()))
 
 
+@pytest.mark.long
 @pytest.mark.filterwarnings("ignore::mphdrr.core.errors.InputWarning")
 def test_gradcheck():
     torch = pytest.importorskip("torch")
@@ -167,7 +168,7 @@ def test_the_kernels_are_numpys_and_threads_change_nothing(monkeypatch):
     if places._take_kernel is None:
         pytest.skip("no compiled kernels here")
     rng = np.random.default_rng(3)
-    for forward, adjoint, shape_in, shape_out in maps(odd_views(coarse=5), 13):
+    for forward, adjoint, shape_in, shape_out in maps(odd_views(coarse=11), 9):
         x, y = rng.random(shape_in, dtype=np.float32), rng.random(shape_out, dtype=np.float32)
         compiled = forward(x), adjoint(y)
         with monkeypatch.context() as patch:

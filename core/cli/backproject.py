@@ -18,8 +18,7 @@ def add_parser(subparsers) -> None:  # type: ignore[no-untyped-def]
     parser = add_command(
         subparsers,
         "backproject",
-        "put together what all views of a run say of each voxel: the sum, the geometric mean or the least of their line "
-        "integrals; no reconstruction",
+        "put together what a run's views say of each voxel: sum, geometric mean or minimum",
         "mphdrr backproject run.h5 --how product --voxels 128 128 64 --spacing 1 -o product.nii.gz",
     )
     parser.add_argument("file", metavar="RUN", help=f"a run of mphDRR: {', '.join(FORMATS)}")

@@ -93,18 +93,18 @@ def backproject(
     if kind == PRODUCT:
         _require_no_negative(images, "backproject: images", "product", ("view", "row", "column"))
     require(
-        (12.0 if kind == PRODUCT else 4.0) * np.prod(grid.shape),
+        (12.0 if kind == PRODUCT else 4.0) * float(np.prod(grid.shape)),
         "a back-projection to {} x {} x {}".format(*grid.shape),
     )
     points = np.full(grid.shape, _NEUTRAL[kind], np.float32)
     seen, exponents = (np.zeros(grid.shape, np.int32) if kind == PRODUCT else None for _ in range(2))
-    given = {"how": kind, "seen": seen, "exponents": exponents}
+    given: dict[str, Any] = {"how": kind, "seen": seen, "exponents": exponents}
     if depth is None:
         matrices = _pixel_rows(views) @ lattice.to_world
         take(points, lattice.thirds, images[..., None], matrices, flat=True, progress=progress, **given)
     else:
         for m, (g, distribution) in enumerate(_distributions(depth, views)):
-            values = images[m].T[..., None] * distribution
+            values = np.multiply(images[m].T[..., None], distribution, order="C")
             matrix = g.index_matrix @ lattice.to_world
             take(points, lattice.thirds, values[None], matrix[None], progress=part_of(progress, m, len(views)), **given)
     if kind == LEAST:
@@ -137,7 +137,7 @@ def views_that_see(views: Views, grid: Grid | PerspectiveGrid, progress: Progres
     """
     instance(views, Views, "views_that_see: views")
     lattice = _Lattice(grid, "views_that_see: grid")
-    require(8.0 * np.prod(grid.shape), "numbers of views at {} x {} x {} places".format(*grid.shape))
+    require(8.0 * float(np.prod(grid.shape)), "numbers of views at {} x {} x {} places".format(*grid.shape))
     seen = np.zeros(grid.shape, np.int32)
     points, image = np.zeros(grid.shape, np.float32), np.zeros((1, *views.shape, 1), np.float32)
     for m, matrix in enumerate(_pixel_rows(views) @ lattice.to_world):

@@ -72,11 +72,14 @@ def project_points(views: Views, points: ArrayLike) -> Floats:
     """
     instance(views, Views, "project_points: views")
     points = real_array(points, "points", (None, 3))
-    matrices = views.projection_matrices()
-    homogeneous = np.einsum("mij,nj->mni", matrices[:, :, :3], points) + matrices[:, None, :, 3]
+    return np.stack([pixels_of(matrix, points) for matrix in views.projection_matrices()])
+
+
+def pixels_of(matrix: Floats, points: Floats) -> Floats:
+    """Pixels (…, 2) of world points (…, 3) by one projection matrix (3, 4); NaN behind the source."""
+    homogeneous = points @ matrix[:, :3].T + matrix[:, 3]
     with np.errstate(divide="ignore", invalid="ignore"):
-        pixels = homogeneous[..., :2] / homogeneous[..., 2:]
-    return np.where(homogeneous[..., 2:] > 0, pixels, np.nan)
+        return np.where(homogeneous[..., 2:] > 0, homogeneous[..., :2] / homogeneous[..., 2:], np.nan)
 
 
 def points_at_depths(views: Views, m: int, pixels: ArrayLike, depths: ArrayLike) -> Floats:
@@ -108,7 +111,7 @@ def lines_of_pixels(views: Views, m: NDArray[np.intp], origin: Floats) -> tuple[
     """Matrices (…, 3, 3) from (column, row, 1) to the direction and the moment about `origin` (…, 3) of a pixel's ray.
 
     The direction is, in mm, the vector from the source to the pixel's place on the detector, and in parallel views, for all
-    pixels, to the detector's centre. The moment is the cross product of a vector from `origin` to the ray with the direction.
+    pixels, to the detector's centre. The moment is the vector from `origin` to any point of the ray, crossed with it.
     """
     to_detector = _to_detector(views)[m]
     if not views.parallel:

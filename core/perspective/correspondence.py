@@ -19,6 +19,9 @@ from ..validation import instance, real_array, whole_number
 from .perspective_grid import PerspectiveGrid
 from .view_rays import Floats, Indices, pixels_of, rays_by_depth, view_indices
 
+# Of an image's range: what varies less is of one value, stored as float32.
+_ROUNDING = 1e-6
+
 
 @dataclass(frozen=True, eq=False)
 class Correspondences:
@@ -102,8 +105,9 @@ def find_correspondences(
     images = _images(images, grid)
     pixels = real_array(pixels, "pixels", (2,), batch=True)
     half_width = whole_number(half_width, "half width")
-    chosen = np.delete(np.arange(len(images)), grid.m) if others is None else view_indices(grid.views, others, "others")
-    chosen = np.atleast_1d(chosen)
+    chosen = np.delete(np.arange(len(images)), grid.m)
+    if others is not None:
+        chosen = np.atleast_1d(view_indices(grid.views, others, "others")) if np.size(others) else chosen[:0]
     if not len(chosen) or grid.m in chosen:
         raise InputError(f"correspondences: expected one or more views besides {grid.m}, got {chosen.tolist()}")
     flat = pixels.reshape(-1, 2)
@@ -131,7 +135,7 @@ def _scores(
     """Scores of one pixel at all planes, and how many views each is of: (n_k,) each."""
     around = np.arange(-half_width, half_width + 1, dtype=np.float64)
     square = pixel + np.stack(np.meshgrid(around, around), axis=-1).reshape(-1, 2)
-    wanted, shape = _normalised(_interpolated(images[grid.m], square)[:, None])
+    wanted, shape = _normalised(_interpolated(images[grid.m], square)[:, None], images[grid.m])
     none = np.full(grid.n_k, np.nan), np.zeros(grid.n_k, np.intp)
     if not shape.all():
         return none
@@ -141,16 +145,16 @@ def _scores(
         values = _interpolated(images[m], pixels_of(matrix, points))
         seen = np.isfinite(values).all(axis=0)
         # Where a view has nothing but one value, it does not have what is looked for: 0.
-        total[seen] += (wanted * _normalised(values[:, seen])[0]).sum(axis=0)
+        total[seen] += (wanted * _normalised(values[:, seen], images[m])[0]).sum(axis=0)
         count += seen
     return np.where(count > 0, total / np.maximum(count, 1), np.nan), count
 
 
-def _normalised(values: Floats) -> tuple[Floats, NDArray[np.bool_]]:
-    """Columns less their mean, of length 1, and which can be so; the others, which are of one value or not finite, are 0."""
+def _normalised(values: Floats, image: Floats) -> tuple[Floats, NDArray[np.bool_]]:
+    """Columns less their mean, of length 1, and which can be so: those that vary by more than rounding; others are 0."""
     away = values - values.mean(axis=0)
     length = np.linalg.norm(away, axis=0)
-    varied = length > 1e-9 * np.abs(values).max(axis=0, initial=0.0)
+    varied = length > _ROUNDING * np.ptp(image)
     return np.where(varied, away, 0.0) / np.where(varied, length, 1.0), varied
 
 

@@ -88,7 +88,10 @@ def test_k_is_the_magnification():
 @CASES
 def test_planes_are_evenly_spaced_in_what_they_say(parallel, uniform):
     for grid in grids(parallel, uniform):
-        depths = np.array([grid.views.detector_centers[grid.m] - grid.views.sources[grid.m]]) @ mph.view_frames(grid.views)[grid.m, 2]
+        depths = (
+            np.array([grid.views.detector_centers[grid.m] - grid.views.sources[grid.m]])
+            @ mph.view_frames(grid.views)[grid.m, 2]
+        )
         edges = grid.edges if parallel else depths / grid.edges
         np.testing.assert_allclose(edges[[0, -1]], [120, 330])
         assert (np.diff(edges) > 0).all() and (np.diff(grid.depths) > 0).all()

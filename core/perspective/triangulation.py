@@ -155,8 +155,8 @@ def _fitted(
     state = _residuals(matrices, offsets, shift, pixels, whitening)
     if state is None:
         raise InputError(
-            f"triangulation: the rays meet behind the source of image {offsets[:, 2].argmin() + 1} of {len(index)}; expected "
-            "the images of one point in front of all sources, as (column, row)"
+            f"triangulation: the rays meet behind the source of image {offsets[:, 2].argmin() + 1} of {len(index)}; "
+            "expected the images of one point in front of all sources, as (column, row)"
         )
     last = math.inf
     for _ in range(_STEPS):

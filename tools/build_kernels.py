@@ -1,7 +1,7 @@
 """Compile the C kernels of the projector into the library of one platform, with the compiler in the package ziglang.
 
-Zig compiles for every platform on any other. The sources are in core/projector/backends/kernels/; siddon.c and depth.c
-are compiled once per level of processor and number type, backprojection.c once per level.
+Zig compiles for every platform on any other. The sources are in core/projector/backends/kernels/; each is compiled
+once per level of processor and number type.
 """
 
 from __future__ import annotations
@@ -69,10 +69,9 @@ def compiled(name: str, folder: str | Path, flags: tuple[str, ...] = FLAGS) -> l
     calls: list[tuple[str, str, tuple[str, ...]]] = [("levels.o", "levels.c", ())]
     for level, options in enumerate(made_for.levels):
         for real in ("float", "double"):
-            for source in ("siddon", "depth"):
+            for source in ("siddon", "depth", "places"):
                 made = f"{source}_{real}{level}.o"
                 calls.append((made, f"{source}.c", (*options, f"-DLEVEL={level}", f"-DREAL={real}")))
-        calls.append((f"smear{level}.o", "backprojection.c", (*options, f"-DLEVEL={level}", "-DREAL=float")))
 
     def compile_one(call: tuple[str, str, tuple[str, ...]]) -> str:
         made, source, options = call

@@ -99,9 +99,9 @@ class Views:
         """Transforms (M, 4, 4) from homogeneous world points, mm, to ``(column, row, k, 1)`` times a factor.
 
         Columns, rows and the factor are those of `projection_matrices`. ``k = D / depth`` is the magnification: D is the
-        distance from the source to the detector's plane, and the depth is measured across that plane. It is 1 on the detector and
-        grows towards the source. Straight lines stay straight, and the inverse matrix leads back. Of parallel views k is 1
-        everywhere, and their matrices have no inverse: a `PerspectiveGrid` has the depth in its place.
+        distance from the source to the detector's plane, and the depth is measured across that plane. It is 1 on the
+        detector and grows towards the source. Straight lines stay straight, and the inverse matrix leads back. Of parallel
+        views k is 1 everywhere, and their matrices have no inverse: a `PerspectiveGrid` has the depth in its place.
         """
         column, row, factor = np.moveaxis(self.projection_matrices(), 1, 0)
         return np.stack([column, row, np.broadcast_to([0.0, 0.0, 0.0, 1.0], factor.shape), factor], axis=1)

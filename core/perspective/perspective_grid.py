@@ -24,10 +24,10 @@ UNIFORM = ("k", "depth")
 
 @dataclass(frozen=True, eq=False)
 class PerspectiveGrid:
-    """Cells of view `m` in its own coordinates (column, row, k): arrays on it are (n_u, n_v, n_k), indexed [column, row, plane].
+    """Cells of view `m` in its own coordinates: arrays on it are (n_u, n_v, n_k), indexed [column, row, plane].
 
-    A cell is what a pixel sees between two planes parallel to the detector; its place is the pixel's centre, in the middle of
-    the planes. Column and row are in pixels, as in the image, 0 at the centre of pixel 0; ``k = D / depth`` is the
+    A cell is what a pixel sees between two planes parallel to the detector; its place is the pixel's centre, in the middle
+    of the planes. Column and row are in pixels, as in the image, 0 at the centre of pixel 0; ``k = D / depth`` is the
     magnification: the depth is measured from the source across the detector's plane, at distance D. k falls, and depth
     grows, from plane 0, next to `near`, to the last, next to `far`.
 
@@ -91,19 +91,29 @@ class PerspectiveGrid:
         return freeze(matrix)
 
     @cached_property
+    def inverse(self) -> Floats:
+        """The transform (4, 4) back, from (column, row, k) to world points, mm."""
+        return freeze(np.linalg.inv(self.matrix))
+
+    @cached_property
     def edges(self) -> Floats:
         """The third coordinate (n_k + 1,) at the borders of planes: k, or the depth of a parallel view."""
-        if self.views.parallel or self.uniform == "depth":
-            depths = np.linspace(self.near, self.far, self.n_k + 1)
-            return freeze(depths if self.views.parallel else self._distance / depths)
-        return freeze(np.linspace(self._distance / self.near, self._distance / self.far, self.n_k + 1))
+        return freeze(self.third_at(np.arange(self.n_k + 1) - 0.5))
 
     @cached_property
     def planes(self) -> Floats:
         """The third coordinate (n_k,) of the cells' places: k, or the depth of a parallel view."""
-        if self.views.parallel or self.uniform == "k":
-            return freeze((self.edges[1:] + self.edges[:-1]) / 2)
-        return freeze(2 / (1 / self.edges[1:] + 1 / self.edges[:-1]))
+        return freeze(self.third_at(np.arange(self.n_k)))
+
+    def third_at(self, index: ArrayLike) -> Floats:
+        """The third coordinate, k or depth, where the third index is `index`, also between the cells' places."""
+        share = (np.asarray(index, np.float64) + 0.5) / self.n_k
+        depths = self.near + share * (self.far - self.near)
+        if self.views.parallel:
+            return depths
+        if self.uniform == "depth":
+            return np.asarray(self._distance / depths)
+        return np.asarray(self._distance * (1 / self.near + share * (1 / self.far - 1 / self.near)))
 
     @property
     def depths(self) -> Floats:
@@ -112,7 +122,7 @@ class PerspectiveGrid:
 
     def to_world(self, points: ArrayLike) -> Floats:
         """World points (…, 3), mm, of points (…, 3) given as (column, row, k); of a parallel view, (column, row, depth)."""
-        return transform_points(self._inverse, points)
+        return transform_points(self.inverse, points)
 
     def from_world(self, points: ArrayLike) -> Floats:
         """The coordinates (column, row, k) (…, 3) of world points (…, 3), mm; of a parallel view, (column, row, depth)."""
@@ -139,7 +149,7 @@ class PerspectiveGrid:
         return np.asarray(area * np.diff(self._edge_depths**3) / (3 * self._distance**2))
 
     def image(self, array: ArrayOrTensor) -> ArrayOrTensor:
-        """Line integrals (…, n_v, n_u) along the pixels' rays: the sum over planes of values times lengths of rays, value x mm.
+        """Line integrals (…, n_v, n_u) along the pixels' rays, value x mm: sums over planes of values times rays' lengths.
 
         `array` (…, n_u, n_v, n_k), numpy or torch, holds values that keep density, as of `to_perspective`. A tensor's
         gradient follows.
@@ -167,10 +177,6 @@ class PerspectiveGrid:
             step = (self.far - self.near) / self.n_k
             plane, divisor = self._distance * last - (self.near + step / 2) * third, third
         return freeze(np.stack([column, row, plane / step, last, divisor]))
-
-    @cached_property
-    def _inverse(self) -> Floats:
-        return freeze(np.linalg.inv(self.matrix))
 
     @cached_property
     def _normal(self) -> Floats:

@@ -158,20 +158,26 @@ class IndexFans:
     # same in world mm
     table: Array
     shape: tuple[int, int]  # rows and columns
-    parallel: bool = False  # as of `Fan`
+    # How far the sources move along with the points: 0 if there is one source, 1 where rays are parallel. Between are rays
+    # of one source that begin in a plane on their way; the backend cuda takes none of those.
+    parallel: float = 0.0
 
     def __len__(self) -> int:
         return len(self.table) * self.shape[0] * self.shape[1]
 
     def listed(self) -> IndexRays:
         """The rays one by one, snapped to the planes that they lie in."""
-        of_each = self.shape[0] * self.shape[1]
-        ends, targets = (_targets(self.table[:, k : k + 4], self.shape) for k in (0, 4))
-        if self.parallel:
-            along, mm = (np.repeat(self.table[:, k + 1] - self.table[:, k], of_each, axis=0) for k in (0, 4))
-            return _snapped(ends - along, ends, np.linalg.norm(mm, axis=1))
-        starts, sources = (np.repeat(self.table[:, k], of_each, axis=0) for k in (0, 4))
-        return _snapped(starts, ends, np.linalg.norm(targets - sources, axis=1))
+        ends = _targets(self.table[:, :4], self.shape)
+        starts, sources = (_targets(self._of_sources(k), self.shape) for k in (0, 4))
+        mm = _targets(self.table[:, 4:], self.shape) - sources
+        return _snapped(starts, ends, np.linalg.norm(mm, axis=1))
+
+    def _of_sources(self, first: int) -> Array:
+        """The fans (F, 4, 3) whose points are the sources, in index space (`first` 0) or in world mm (4)."""
+        vectors = self.table[:, first : first + 4].copy()
+        vectors[:, 1] = vectors[:, 0]
+        vectors[:, 2:] *= self.parallel
+        return vectors
 
 
 Rays = IndexRays | IndexFans
@@ -186,7 +192,7 @@ class Attenuation:
 
 
 def index_fans(
-    grid: Grid, vectors: Array, shape: tuple[int, int], parallel: bool = False, origin: tuple[int, int, int] = (0, 0, 0)
+    grid: Grid, vectors: Array, shape: tuple[int, int], parallel: float = 0.0, origin: tuple[int, int, int] = (0, 0, 0)
 ) -> IndexFans:
     """Fans (F, 4, 3) in world mm, as of `Fan.vectors`, parallel or not, in `grid`'s index space; see `index_rays`."""
     affine = _index_from_world(grid, origin)

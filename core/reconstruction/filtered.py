@@ -10,16 +10,18 @@ from ..errors import InputError
 from ..geometry.grid import Grid
 from ..geometry.views import Views
 from ..memory import require
+from ..perspective.places import take
 from ..progress import Progress
 from ..projector.parallel import run_all, thread_count
 from ..validation import instance, real_array
 from .loop import plain
 from .ramp import ramp_matrix
-from .voxel_driven import backproject, with_margin
 
 Array = NDArray[np.floating[Any]]
 
 _BYTES_AT_ONCE = 2**26  # of filtered images
+
+_BEHIND = 1e-3  # of the distance from source to detector: nearer to the source, nothing is taken
 
 _SMALL_GAP, _OUTSTANDING = np.radians(20), 3
 """A gap between neighbouring views belongs to their spacing if it is at most so large, or so many times the median one."""
@@ -69,12 +71,16 @@ def filtered_backprojection(
     matrices = views.projection_matrices()
     beyond = _columns_beyond(matrices, grid, n_u)
     matrix = ramp_matrix(n_u, window, beyond)
-    matrices[:, 0] += beyond * matrices[:, 2]
+    column, row, depth = np.moveaxis(matrices, 1, 0)
+    # Images have a margin of zeros, so that beyond their edge they fall to 0 over one pixel.
+    of_place = np.stack([row + depth, column + (beyond + 1) * depth, 0 * depth, depth, 0 * depth], axis=1) @ grid.affine
     bytes_of_a_view = 4 * n_v * (matrix.shape[1] + n_u)
     at_once = int(np.clip(_BYTES_AT_ONCE // bytes_of_a_view, 1, n))
     require(4 * grid.n_voxels + at_once * bytes_of_a_view, f"a volume of {' x '.join(map(str, grid.shape))} voxels")
     volume = np.zeros(grid.shape, np.float32)
-    room, inside = with_margin((at_once, n_v, matrix.shape[1]))
+    room = np.zeros((at_once, n_v + 2, matrix.shape[1] + 2, 1), np.float32)
+    inside = room[:, 1:-1, 1:-1, 0]
+    planes = np.arange(grid.shape[2], dtype=np.float64)
     if progress is not None:
         progress(0, n)
     for first in range(0, n, at_once):
@@ -84,7 +90,8 @@ def filtered_backprojection(
             inside[m - first] = (images[m] * weights(m)).astype(np.float32, copy=False) @ matrix
 
         run_all(filter_view, range(first, end), thread_count(None))
-        backproject(volume, grid, room[: end - first], matrices[first:end])
+        taken = room[: end - first], of_place[first:end]
+        take(volume, planes, *taken, flat=True, by_depth=True, nearest=_BEHIND)
         if progress is not None:
             progress(end, n)
     return volume

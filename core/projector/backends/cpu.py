@@ -24,7 +24,7 @@ Array = NDArray[Any]  # of float32 or float64
 LEVEL_VARIABLE = "MPHDRR_CPU_LEVEL"
 """Environment variable that names a lower level of processor, `levels`, than this one's."""
 
-_CONTRACT = 4
+_CONTRACT = 5
 _NAMES = {"win32": "siddon.dll", "darwin": "libsiddon.dylib"}
 _MOST_VOXELS = 2**31 - 1  # their indices are of 32 bits
 _MOST_ALONG = 2**12  # where float32 knows the length of a segment to 0.1 %
@@ -67,10 +67,12 @@ class _DepthJob(Structure):
     ]  # fmt: skip
 
 
-class _Smear(Structure):
+class _PlacesJob(Structure):
     _fields_ = [
-        ("images", c_void_p), ("matrices", c_void_p), ("views", c_int64), ("rows", c_int64), ("columns", c_int64),
-        ("volume", c_void_p), ("n", c_int64 * 3),
+        ("is_double", c_int64), ("how", c_int64), ("flat", c_int64), ("by_depth", c_int64), ("points", c_void_p),
+        ("n", c_int64 * 3), ("first", c_int64), ("last", c_int64), ("thirds", c_void_p), ("middle", c_double),
+        ("nearest", c_double), ("values", c_void_p), ("arrays", c_int64), ("m", c_int64 * 3), ("matrices", c_void_p),
+        ("seen", c_void_p), ("exponents", c_void_p),
     ]  # fmt: skip
 
 
@@ -82,7 +84,7 @@ def _load() -> ctypes.CDLL:
     library = ctypes.CDLL(str(path))
     numbers = (c_int64 * 5)()
     library.contract(numbers)
-    sizes = (ctypes.sizeof(_Job), _FAN.itemsize, ctypes.sizeof(_DepthJob), ctypes.sizeof(_Smear))
+    sizes = (ctypes.sizeof(_Job), _FAN.itemsize, ctypes.sizeof(_DepthJob), ctypes.sizeof(_PlacesJob))
     if tuple(numbers) != (_CONTRACT, *sizes):
         raise ImportError(f"{path} belongs to another version of mphDRR: install it anew")
     library.best_level.restype, library.level_name.restype = c_int64, c_char_p
@@ -93,7 +95,9 @@ def _load() -> ctypes.CDLL:
     for name in ("voxels_to_cells", "cells_to_voxels", "cells_to_pixels", "pixels_to_cells"):
         function = getattr(library, name)
         function.argtypes, function.restype = [c_int64, POINTER(_DepthJob)], None
-    library.smear.argtypes, library.smear.restype = [c_int64, POINTER(_Smear)], None
+    for name in ("take_at", "give_at"):
+        function = getattr(library, name)
+        function.argtypes, function.restype = [c_int64, POINTER(_PlacesJob)], None
     return library
 
 
@@ -142,16 +146,66 @@ def mu_gradient(gradient: Array, volume: Array, values: Array, rays: Rays, atten
     _run(_library.differentiate_by_mu, volume, rays, attenuation, values, integrals=integrals, gradient=gradient)
 
 
-def smear(volume: Array, images: Array, matrices: NDArray[np.float64]) -> None:
-    """Add to `volume`, float32, what each image has at its voxels' places, as `voxel_driven.smear` describes it."""
-    if not (volume.flags.c_contiguous and images.flags.c_contiguous and matrices.flags.c_contiguous):
-        raise ValueError("expected arrays in C order")
-    if (volume.dtype, images.dtype, matrices.dtype) != (np.float32, np.float32, np.float64):
-        raise TypeError("expected voxels and images of float32, matrices of float64")
-    if matrices.shape != (len(images), 3, 4) or not volume.flags.writeable or min(images.shape[1:]) < 4:
-        raise ValueError("expected a matrix for each image, images with margins, and a volume that can be written")
-    addresses = images.ctypes.data, matrices.ctypes.data
-    _library.smear(level, _Smear(*addresses, *images.shape, volume.ctypes.data, (c_int64 * 3)(*volume.shape)))
+def take_at(
+    points: Array,
+    thirds: NDArray[np.float64],
+    arrays: Array,
+    matrices: NDArray[np.float64],
+    how: int = 0,
+    seen: Array | None = None,
+    exponents: Array | None = None,
+    **others: Any,
+) -> None:
+    """Combine `points` in place with what `arrays` have at their places, as `perspective.places.take` describes it."""
+    _run_places(_library.take_at, points, thirds, arrays, matrices, len(points), how, seen, exponents, **others)
+
+
+def give_at(
+    points: Array, thirds: NDArray[np.float64], array: Array, matrix: NDArray[np.float64], slab: slice, **others: Any
+) -> None:
+    """Add to the `slab` of `array` along its first axis, in place, what the adjoint of `take_at` gives."""
+    first, last, _ = slab.indices(len(array))
+    _run_places(_library.give_at, points, thirds, array[None], matrix[None], last, first=first, **others)
+
+
+def _run_places(
+    kernel: Any,
+    points: Array,
+    thirds: NDArray[np.float64],
+    arrays: Array,
+    matrices: NDArray[np.float64],
+    last: int,
+    how: int = 0,
+    seen: Array | None = None,
+    exponents: Array | None = None,
+    first: int = 0,
+    flat: bool = False,
+    by_depth: bool = False,
+    nearest: float = 0.0,
+) -> None:
+    kind, written = points.dtype, points if kernel is _library.take_at else arrays
+    if kind not in (np.float32, np.float64) or arrays.dtype != kind or matrices.dtype != np.float64:
+        raise TypeError("expected points and arrays of one type, float32 or float64, and matrices of float64")
+    counts = [each for each in (seen, exponents) if each is not None]
+    if any(each.dtype != np.int32 or each.shape != points.shape for each in counts):
+        raise TypeError("expected counts of int32 and of the points' shape")
+    if not all(each.flags.c_contiguous for each in (points, arrays, matrices, *counts)) or not written.flags.writeable:
+        raise ValueError("expected arrays in C order, that can be written")
+    if matrices.shape != (len(arrays), 5, 4) or thirds.shape != points.shape[2:] or (flat and arrays.shape[3] != 1):
+        raise ValueError("expected a matrix (5, 4) for each array, a third coordinate for each plane of points")
+    if arrays[0].size > _MOST_VOXELS:
+        raise InputError(f"expected an array of at most {_MOST_VOXELS} numbers, got {arrays[0].size}")
+    middle = float(thirds[len(thirds) // 2])
+    relative = np.ascontiguousarray(thirds - middle, kind)
+    job = _PlacesJob(
+        is_double=kind == np.float64, how=how, flat=flat, by_depth=by_depth,
+        points=points.ctypes.data, n=points.shape, first=first, last=last,
+        thirds=relative.ctypes.data, middle=middle, nearest=nearest,
+        values=arrays.ctypes.data, arrays=len(arrays), m=arrays.shape[1:], matrices=matrices.ctypes.data,
+        seen=None if seen is None else seen.ctypes.data,
+        exponents=None if exponents is None else exponents.ctypes.data,
+    )  # fmt: skip
+    kernel(level, job)
 
 
 def _run(
@@ -195,8 +249,8 @@ def _fans(rays: IndexFans, mu_rays: Any) -> Array:
     if mu_rays is not None:
         fans["mu"] = mu_rays.table[:, :4]
     fans["rows"], fans["columns"] = rays.shape
-    if rays.parallel:
-        fans["parallel"], fans["world"][:, 1:] = 1, 0
+    fans["parallel"] = rays.parallel
+    fans["world"][:, 1:] *= 1 - rays.parallel
     return fans
 
 

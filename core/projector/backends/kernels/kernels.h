@@ -13,7 +13,7 @@
 #pragma once
 #include <stdint.h>
 
-#define CONTRACT 4 // counted up with every change of this file: cpu.py takes no other
+#define CONTRACT 5 // counted up with every change of this file: cpu.py takes no other
 
 // Voxels (n[0], n[1], n[2]) in C order, of a job's kind of number.
 typedef struct {
@@ -25,9 +25,9 @@ typedef struct {
 typedef struct {
     double volume[4][3]; // source, corner, row step, column step in the volume's index space
     double mu[4][3];     // the same in mu's, where that has a lattice of its own
-    double world[3][3];  // source to corner, row step, column step in mm; the steps are 0 where rays are parallel
+    double world[3][3];  // source to corner in mm, and by how much a ray changes with its row and column
     int64_t rows, columns;
-    double parallel; // 1: the sources move along with the points, as far as these; 0: there is one source
+    double parallel; // the sources move along with the points, this many times as far: 0 if there is one source
 } Fan;
 
 // Rays one by one, columns of arrays (3, count) and (count).
@@ -77,21 +77,34 @@ typedef struct {
     int64_t pixels[2];
 } DepthJob;
 
-// Images that are interpolated at the places of voxels. All numbers are float; an image is at most 2^31 numbers large and
-// has a margin of zeros: a row above, two below, a column on the left, two on the right.
+// Arrays that are interpolated linearly at the places of a lattice's points, or that are given the points' numbers, shared out with
+// the same weights. The place of point (i, j, k) is that of (i, j, middle + thirds[k], 1) under an array's matrix: of the five
+// numbers p that it makes, (p0 / p3, p1 / p3, p2 / p4) are indices in the array. Places up to half an element outside belong to
+// the outermost elements; others, and those with p3 <= nearest or p4 <= 0, are not in the array.
+enum { SUM, LEAST, PRODUCT };
+
 typedef struct {
-    const float *images;    // (views, rows, columns), margins included
-    const double *matrices; // (views, 3, 4): from a voxel's indices, 1 to (column, row, 1) depth; 0 is the image's first
-    int64_t views, rows, columns;
-    float *volume; // (n[0], n[1], n[2])
+    int64_t is_double;
+    int64_t how;     // in which way take_at combines a point's number with what it takes
+    int64_t flat;    // 1: the arrays are one plane (m[2] = 1), whose third coordinate nothing depends on
+    int64_t by_depth; // 1: what is taken or given is divided by p3^2
+    void *points;    // (n[0], n[1], n[2])
     int64_t n[3];
-} Smear;
+    int64_t first, last; // take_at: of the points' first axis; give_at: of the array's, which alone are written
+    const void *thirds;  // (n[2]), ascending or descending
+    double middle, nearest;
+    void *values; // (arrays, m[0], m[1], m[2]), an array of fewer than 2^31 numbers
+    int64_t arrays, m[3];
+    const double *matrices; // (arrays, 5, 4)
+    int32_t *seen;          // of the points' shape, or null: counted up where an array has the point
+    int32_t *exponents; // of the points' shape, with PRODUCT: a point's product is its number times 2 to this power
+} PlacesJob;
 
 // What level of processor the kernels are compiled for; any processor of the platform runs level 0.
 int64_t best_level(void);
 const char *level_name(int64_t level); // null if there is no such level
 
-// CONTRACT, and the bytes of a Job, a Fan, a DepthJob and a Smear: cpu.py compares them with its own.
+// CONTRACT, and the bytes of a Job, a Fan, a DepthJob and a PlacesJob: cpu.py compares them with its own.
 void contract(int64_t numbers[5]);
 
 // values = integrals
@@ -105,9 +118,6 @@ void backproject(int64_t level, const Job *job);
 // the planes of mu, all at constant L, and by L at constant ends.
 void differentiate(int64_t level, const Job *job);
 
-// volume += the sum over all images of what is at the voxel's place there, interpolated linearly, divided by its depth^2
-void smear(int64_t level, const Smear *job);
-
 // gradient += the derivative by mu of the sum of values times integrals; the integrals are needed
 void differentiate_by_mu(int64_t level, const Job *job);
 
@@ -118,3 +128,9 @@ void cells_to_voxels(int64_t level, const DepthJob *job);
 // image = weighted sums of cells, and the adjoint: cells += image, with the same weights
 void cells_to_pixels(int64_t level, const DepthJob *job);
 void pixels_to_cells(int64_t level, const DepthJob *job);
+
+// points = points combined with what all arrays have at their places, array by array
+void take_at(int64_t level, const PlacesJob *job);
+
+// the one array += the points' numbers, shared out: the adjoint of take_at's sum
+void give_at(int64_t level, const PlacesJob *job);

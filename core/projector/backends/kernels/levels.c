@@ -2,14 +2,12 @@
 
 #include "kernels.h"
 
-// Level by level, what siddon.c and depth.c are compiled to; backprojection.c is compiled for float alone.
+// What every file is compiled to, level by level.
 #ifdef __x86_64__
 #define EACH(name) name##_0_float, name##_0_double, name##_1_float, name##_1_double, name##_2_float, name##_2_double
-#define EACH_LEVEL(name) name##_0, name##_1, name##_2
 static const char *const names[] = {"SSE2", "AVX2", "AVX-512"};
 #else // arm64
 #define EACH(name) name##_0_float, name##_0_double
-#define EACH_LEVEL(name) name##_0
 static const char *const names[] = {"NEON"};
 #endif
 
@@ -28,7 +26,7 @@ static const char *const names[] = {"NEON"};
 
 typedef void KernelJob(const Job *);
 typedef void KernelDepthJob(const DepthJob *);
-typedef void KernelSmear(const Smear *);
+typedef void KernelPlacesJob(const PlacesJob *);
 
 DISPATCH(forward, Job)
 DISPATCH(backproject, Job)
@@ -38,12 +36,8 @@ DISPATCH(voxels_to_cells, DepthJob)
 DISPATCH(cells_to_voxels, DepthJob)
 DISPATCH(cells_to_pixels, DepthJob)
 DISPATCH(pixels_to_cells, DepthJob)
-
-KernelSmear EACH_LEVEL(smear);
-EXPORT void smear(int64_t level, const Smear *job) {
-    static KernelSmear *const kernels[] = {EACH_LEVEL(smear)};
-    kernels[level](job);
-}
+DISPATCH(take_at, PlacesJob)
+DISPATCH(give_at, PlacesJob)
 
 EXPORT const char *level_name(int64_t level) {
     return level < (int64_t)(sizeof(names) / sizeof(names[0])) ? names[level] : 0;
@@ -54,7 +48,7 @@ EXPORT void contract(int64_t numbers[5]) {
     numbers[1] = sizeof(Job);
     numbers[2] = sizeof(Fan);
     numbers[3] = sizeof(DepthJob);
-    numbers[4] = sizeof(Smear);
+    numbers[4] = sizeof(PlacesJob);
 }
 
 #ifdef __x86_64__

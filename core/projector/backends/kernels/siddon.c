@@ -66,7 +66,7 @@ typedef struct {
 // One axis of the rays to the points (row, column) of a fan; rays that nearly lie in a plane of voxel faces lie in it.
 INLINE void fan_ray(const double fan[4][3], double parallel, int a, D row, D column, D *start, D *direction) {
     const D to = column * fan[3][a] + (row * fan[2][a] + fan[1][a]);
-    const D from = parallel != 0 ? to - (fan[1][a] - fan[0][a]) : (D)fan[0][a], plane = rounded(from);
+    const D from = fan[0][a] + parallel * (to - fan[1][a]), plane = rounded(from);
     const B in_plane = (ABS(from - plane) <= (D)SNAP) & (ABS(to - plane) <= (D)SNAP);
     *start = in_plane ? plane : from;
     *direction = (in_plane | (ABS(to - *start) <= (D)SNAP)) ? (D)0 : to - *start;

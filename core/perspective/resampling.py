@@ -1,0 +1,368 @@
+"""Volumes in the coordinates of views and back, and from one view's to another's."""
+
+import warnings
+from abc import abstractmethod
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..arrays import ArrayOrTensor, checked, to_caller, to_numpy
+from ..errors import InputError, InputWarning
+from ..geometry.grid import Grid
+from ..memory import require
+from ..progress import Progress
+from ..projector import backends
+from ..projector.operator import LinearOperator
+from ..projector.parallel import run_all, sum_of, thread_count
+from ..projector.rays import IndexFans, index_fans
+from ..validation import instance, one_of
+from ..volumes.volume import UNITS, Volume, require_quantity
+from .perspective_grid import PerspectiveGrid
+from .places import give, take
+
+KEEP = ("density", "activity")
+"""What resampling may keep: the values, or their sums."""
+
+_PER_CELL = 2  # points of one lattice along a cell of the other: what is shared out then varies by 3 % at most
+_MOST_POINTS = 8  # in a cell, along each axis
+_LOOKED_AT = 9  # cells along each axis, to find how many points one needs
+
+_MOST_VOLUMES = 8  # of an adjoint along rays, each of a thread: more would gain little and take much memory
+_GAP = 1.5  # voxels from ray to ray
+
+Lattice = Grid | PerspectiveGrid
+Array = NDArray[np.floating[Any]]
+Floats = NDArray[np.float64]
+
+
+def to_perspective(
+    volume: Volume | ArrayOrTensor, g: PerspectiveGrid, keep: str = "density", *, grid: Grid | None = None
+) -> ArrayOrTensor:
+    """A volume in the coordinates of a view.
+
+    Parameters
+    ----------
+    volume : Volume, or array or tensor (…, n_x, n_y, n_z)
+        Of an array or tensor, `grid` is the grid. It may be a batch.
+    g : PerspectiveGrid
+    keep : str
+        "density": the mean of the volume along a pixel's ray, from the plane before a cell to the one behind. Voxels are
+        filled evenly, as everywhere, and 0 outside the grid: ``g.image`` of it is the projector's image. "activity":
+        what lies in each cell, value x mm^3 (of kBq/mL that is Bq): every voxel's value times its volume, shared out
+        among the cells around it; what lies outside `g` is left out, and nothing is lost otherwise.
+
+    Returns
+    -------
+    array or tensor (…, n_u, n_v, n_k)
+        Float32, or float64 of a tensor of float64; a tensor is part of torch's graph.
+
+    Raises
+    ------
+    InputError
+        Another shape, values that are not finite, CT numbers, more memory needed than there is.
+
+    Notes
+    -----
+    "density" follows each ray exactly (Siddon 1985). Voxels are shared out among cells at several points each, evenly
+    spaced: two along each axis for every cell that one covers, up to 8. So the cells of an even volume differ by up to 3 %
+    along each axis.
+
+    `from_perspective` with the other `keep` is the adjoint: ``<to_perspective(x, g), y> = v <x, from_perspective(y, g,
+    grid, "activity")>`` and ``<to_perspective(x, g, "activity"), y> = v <x, from_perspective(y, g, grid)>``, with v the
+    voxels' volume.
+    """
+    one_of(keep, KEEP, "keep")
+    instance(g, PerspectiveGrid, "to_perspective")
+    if isinstance(volume, Volume):
+        require_quantity(volume.quantity, [name for name in UNITS if name != "hu"], "to_perspective")
+        if grid is not None and grid != volume.grid:
+            raise InputError("to_perspective: a volume has its own grid; leave `grid` out")
+        volume, grid = volume.array, volume.grid
+    if grid is None:
+        raise InputError(
+            "to_perspective: expected a Volume, or the grid of the array: to_perspective(array, g, grid=...)"
+        )
+    instance(grid, Grid, "to_perspective")
+    if keep == "density":
+        return _AlongRays(grid, g)(volume)
+    return _Taking(g, grid).T(volume) * grid.voxel_volume
+
+
+def from_perspective(array: ArrayOrTensor, g: PerspectiveGrid, grid: Grid, keep: str = "density") -> ArrayOrTensor:
+    """What is given in the coordinates of a view, on a grid of voxels.
+
+    Parameters
+    ----------
+    array : array or tensor (…, n_u, n_v, n_k)
+    g : PerspectiveGrid
+        Of `array`.
+    grid : Grid
+    keep : str
+        "density": the mean over each voxel of the array's values, interpolated linearly between cells' places; 0 outside
+        `g`.
+        "activity": the array holds what lies in each cell, value x mm^3, as of ``to_perspective(…, "activity")``. It is
+        spread evenly along the cell's ray over the voxels that this crosses, and divided by their volume. What lies
+        outside `grid` is left out.
+
+    Returns
+    -------
+    array or tensor (…, n_x, n_y, n_z)
+        Values, such as kBq/mL, in both cases; of the kind of `to_perspective`.
+
+    Raises
+    ------
+    InputError
+        As of `to_perspective`.
+
+    Warns
+    -----
+    InputWarning
+        "activity": rays are so far apart that voxels between them get nothing.
+    """
+    one_of(keep, KEEP, "keep")
+    instance(g, PerspectiveGrid, "from_perspective")
+    instance(grid, Grid, "from_perspective")
+    if keep == "density":
+        return _Taking(g, grid)(array)
+    _warn_of_gaps(g, grid)
+    return _AlongRays(grid, g).T(array) / grid.voxel_volume
+
+
+def camera_to_camera(
+    array: ArrayOrTensor, g_m: PerspectiveGrid, g_n: PerspectiveGrid, keep: str = "density"
+) -> ArrayOrTensor:
+    """What is given in the coordinates of one view, in those of another.
+
+    Parameters
+    ----------
+    array : array or tensor (…, n_u, n_v, n_k)
+    g_m, g_n : PerspectiveGrid
+        Of `array`, and of the result.
+    keep : str
+        "density": the mean over each cell of the values, interpolated linearly. "activity": what lies in each cell is
+        shared out among the cells around it; it is the adjoint of "density" the other way, from `g_n` to `g_m`.
+
+    Returns
+    -------
+    array or tensor (…, n_u, n_v, n_k)
+        Of the kind of `to_perspective`.
+
+    Raises
+    ------
+    InputError
+        As of `to_perspective`.
+    """
+    one_of(keep, KEEP, "keep")
+    instance(g_m, PerspectiveGrid, "camera_to_camera")
+    instance(g_n, PerspectiveGrid, "camera_to_camera")
+    return _Taking(g_m, g_n)(array) if keep == "density" else _Taking(g_n, g_m).T(array)
+
+
+class _Pair(LinearOperator):
+    """A linear map from arrays of one lattice to arrays of another, which its subclasses compute, and the adjoint."""
+
+    def __init__(self, source: Lattice, target: Lattice) -> None:
+        self.source, self.target = source, target
+
+    @property
+    def T(self) -> "_Adjoint":
+        return _Adjoint(self)
+
+    @property
+    def shape_in(self) -> tuple[int, int, int]:
+        return self.source.shape
+
+    @property
+    def shape_out(self) -> tuple[int, int, int]:
+        return self.target.shape
+
+    def _check(self, x: Any) -> ArrayOrTensor:
+        return checked(x, "array", self.shape_in, False, batch=True)
+
+    def _run_one(self, x: ArrayOrTensor, progress: Progress | None = None, mu: Any = None) -> ArrayOrTensor:
+        array = _plain(x, self.shape_out)
+        return to_caller(self.forward(array).astype(array.dtype, copy=False), x)
+
+    @abstractmethod
+    def forward(self, x: Array) -> Array:
+        """The map of an array of float32 or float64."""
+
+    @abstractmethod
+    def adjoint(self, y: Array) -> Array:
+        """The adjoint of an array of float32 or float64."""
+
+
+class _Adjoint(LinearOperator):
+    """The adjoint of a `_Pair`."""
+
+    def __init__(self, pair: _Pair) -> None:
+        self._pair = pair
+
+    @property
+    def T(self) -> _Pair:
+        return self._pair
+
+    @property
+    def shape_in(self) -> tuple[int, int, int]:
+        return self._pair.shape_out
+
+    @property
+    def shape_out(self) -> tuple[int, int, int]:
+        return self._pair.shape_in
+
+    def _check(self, x: Any) -> ArrayOrTensor:
+        return checked(x, "array", self.shape_in, False, batch=True)
+
+    def _run_one(self, x: ArrayOrTensor, progress: Progress | None = None, mu: Any = None) -> ArrayOrTensor:
+        array = _plain(x, self.shape_out)
+        return to_caller(self._pair.adjoint(array).astype(array.dtype, copy=False), x)
+
+
+def _plain(x: ArrayOrTensor, result: tuple[int, int, int]) -> Array:
+    """`x` as kernels take it; there must be memory for a `result`."""
+    array = to_numpy(x, np.float64 if str(x.dtype).endswith("float64") else np.float32)
+    require(2 * array.itemsize * float(np.prod(result)), "resampling to {} x {} x {} numbers".format(*result))
+    return array
+
+
+class _AlongRays(_Pair):
+    """Means of a volume along the rays of a perspective grid's cells."""
+
+    source: Grid
+    target: PerspectiveGrid
+
+    def forward(self, x: Array) -> Array:
+        functions, x = self._functions(x)
+        result = np.empty(self.shape_out, x.dtype)
+
+        def work(plane: int) -> None:
+            result[..., plane] = functions.forward(x, self._rays(plane)).reshape(self.shape_out[:2])
+
+        run_all(work, range(self.target.n_k), thread_count(None))
+        result /= self.target.ray_lengths()
+        return result
+
+    def adjoint(self, y: Array) -> Array:
+        functions, y = self._functions(y)
+        y = y / self.target.ray_lengths().astype(y.dtype)
+        workers = min(thread_count(None), _MOST_VOLUMES, self.target.n_k)
+        volumes = [np.zeros(self.shape_in, y.dtype) for _ in range(workers)]
+
+        def work(worker: int) -> None:
+            for plane in range(worker, self.target.n_k, workers):
+                values = np.ascontiguousarray(y[..., plane]).reshape(-1)
+                functions.backproject(volumes[worker], values, self._rays(plane))
+
+        run_all(work, range(workers), workers)
+        return np.asarray(sum_of(volumes, workers))
+
+    @staticmethod
+    def _functions(array: Array) -> tuple[Any, Array]:
+        """Those of the backend for arrays, and the array as it takes it."""
+        if backends.choose("auto").name == "cpu":
+            return backends.load("cpu"), array
+        return backends.load("reference"), array.astype(np.float64)
+
+    def _rays(self, plane: int) -> IndexFans:
+        """The cells' rays of a plane: from the plane before to the one behind, columns after columns."""
+        edges = self.target.edges[plane : plane + 2]
+        places = np.array([[[0, 0, edge], [1, 0, edge], [0, 1, edge]] for edge in edges], np.float64)
+        (start, next_start, _), (end, next_end, above) = self.target.to_world(places)
+        follows = np.linalg.norm(next_start - start) / np.linalg.norm(next_end - end)
+        vectors = np.array([[start, end, next_end - end, above - end]])
+        return index_fans(self.source, vectors, self.shape_out[:2], float(follows))
+
+
+class _Taking(_Pair):
+    """Means over the cells of one lattice of another's values, interpolated linearly."""
+
+    def __init__(self, source: Lattice, target: Lattice) -> None:
+        super().__init__(source, target)
+        from_world = source.index_matrix if isinstance(source, PerspectiveGrid) else _with_ones(source.index_from_world)
+        self._matrix = from_world @ (target.affine if isinstance(target, Grid) else target.inverse)
+        self._points = _points_in_cells(self._matrix, source, target)
+
+    def forward(self, x: Array) -> Array:
+        result = np.zeros(self.shape_out, x.dtype)
+        for matrix, thirds in self._shifted():
+            take(result, thirds, x[None], matrix[None])
+        return np.asarray(result / self._points.prod(dtype=x.dtype))
+
+    def adjoint(self, y: Array) -> Array:
+        result = np.zeros(self.shape_in, y.dtype)
+        y = np.asarray(y / self._points.prod(dtype=y.dtype))
+        for matrix, thirds in self._shifted():
+            give(y, thirds, result, matrix)
+        return result
+
+    def _shifted(self) -> Iterator[tuple[Floats, Floats]]:
+        """For each of a cell's points, the matrix and the third coordinates of that point in all cells."""
+        fractions = [(np.arange(n) + 0.5) / n - 0.5 for n in self._points]
+        for i in fractions[0]:
+            for j in fractions[1]:
+                matrix = self._matrix.copy()
+                matrix[:, 3] += i * matrix[:, 0] + j * matrix[:, 1]
+                for k in fractions[2]:
+                    yield matrix, _thirds(self.target, np.arange(self.target.shape[2]) + k)
+
+
+def _with_ones(matrix: Floats) -> Floats:
+    """Rows (5, 4), as `places.take` needs them, of an affine one (4, 4)."""
+    return np.insert(matrix, 4, [0.0, 0.0, 0.0, 1.0], axis=0)
+
+
+def _thirds(lattice: Lattice, index: Floats) -> Floats:
+    """The third coordinate, as of places, at (fractional) indices of the third axis."""
+    return index if isinstance(lattice, Grid) else lattice.third_at(index)
+
+
+def _points_in_cells(matrix: Floats, source: Lattice, target: Lattice) -> NDArray[np.int64]:
+    """Points (3,) along each axis of the target's cells, `_PER_CELL` for each of the source's cells that one covers."""
+    index = _some_cells(target)
+    here = _places(matrix, target, index)
+    index = index[((here >= -0.5) & (here <= np.array(source.shape) - 0.5)).all(axis=1)]
+    steps = [_longest_step(matrix, target, index, axis) for axis in range(3)]
+    return np.clip(np.ceil(_PER_CELL * np.array(steps) - 0.1), 1, _MOST_POINTS).astype(int)
+
+
+def _warn_of_gaps(g: PerspectiveGrid, grid: Grid) -> None:
+    """Warn where rays are so far apart that they leave voxels out."""
+    index = _some_cells(g)
+    world = g.to_world(np.column_stack([index[:, :2], g.third_at(index[:, 2])]))
+    places = world @ grid.index_from_world[:3, :3].T + grid.index_from_world[:3, 3]
+    index = index[((places >= -0.5) & (places <= np.array(grid.shape) - 0.5)).all(axis=1)]
+    matrix = _with_ones(grid.index_from_world) @ g.inverse
+    apart = max(_longest_step(matrix, g, index, axis) for axis in (0, 1))
+    if apart > _GAP:
+        warnings.warn(
+            f"from_perspective: rays are up to {apart:.2g} voxels apart, and voxels between them get nothing: give coarser "
+            'voxels or finer pixels, or keep "density"',
+            InputWarning,
+            stacklevel=3,
+        )
+
+
+def _some_cells(lattice: Lattice) -> Floats:
+    """Indices (N, 3) of some cells, all corners among them."""
+    axes = [np.unique(np.linspace(0, n - 1, min(n, _LOOKED_AT)).round()) for n in lattice.shape]
+    return np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
+
+
+def _places(matrix: Floats, target: Lattice, index: Floats) -> Floats:
+    """Where cells (N, 3) of `target` lie in the other lattice, as indices (N, 3); NaN of what is not in front."""
+    third = _thirds(target, index[:, 2])
+    p = np.column_stack([index[:, :2], third, np.ones(len(index))]) @ matrix.T
+    front = (p[:, 3] > 0) & (p[:, 4] > 0)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return np.where(front[:, None], p[:, :3] / p[:, [3, 3, 4]], np.nan)
+
+
+def _longest_step(matrix: Floats, target: Lattice, index: Floats, axis: int) -> float:
+    """How far apart neighbours along an axis are in the other lattice, in its cells, at most; 0 where nothing is known."""
+    half = 0.5 * np.eye(3)[axis]
+    steps = np.abs(_places(matrix, target, index + half) - _places(matrix, target, index - half)).max(
+        axis=1, initial=0.0
+    )
+    return float(steps[np.isfinite(steps)].max(initial=0.0))

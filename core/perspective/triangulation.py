@@ -155,7 +155,7 @@ def _fitted(
     state = _residuals(matrices, offsets, shift, pixels, whitening)
     if state is None:
         raise InputError(
-            f"triangulation: the rays of the {len(index)} images meet behind the source of image {offsets[:, 2].argmin() + 1}; "
+            f"triangulation: the rays meet behind the source of image {offsets[:, 2].argmin() + 1} of {len(index)}; "
             "expected the images of one point in front of all sources, as (column, row)"
         )
     last = math.inf

@@ -138,7 +138,7 @@ def test_the_module_that_does_not_fit_is_found(wrong):
 def test_of_two_images_none_is_called_wrong():
     views = odd_views()
     pixels = mph.project_points(views, [POINT])[[0, 3], 0]
-    fit = mph.fit_marker(views, [0, 3], pixels + [[0, 0], [0, 5]], 0.3)
+    fit = mph.fit_marker(views, [0, 3], pixels + np.array([[0, 0], [0, 5]]), 0.3)
     assert fit.worst is None and np.isnan(fit.misfits).all() and fit.degrees == 1 and fit.p_value < 1e-6
 
 
@@ -161,7 +161,7 @@ def test_images_that_give_no_place_are_refused(scanner):
 def pair(apart, parallel=False):
     """Two views 200 mm from the origin, their sources `apart` mm from each other, looking in one direction."""
     sources = np.array([[0, 0, -200.0], [apart, 0, -200]])
-    return mph.Views(sources, sources + [0, 0, 400], [[1, 0, 0]] * 2, [[0, 1, 0]] * 2, (256, 256), parallel)
+    return mph.Views(sources, sources + np.array([0, 0, 400]), [[1, 0, 0]] * 2, [[0, 1, 0]] * 2, (256, 256), parallel)
 
 
 def test_rays_that_leave_the_depth_unknown_are_refused():

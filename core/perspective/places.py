@@ -115,7 +115,7 @@ def _shifted(matrices: NDArray[np.float64], first: int) -> NDArray[np.float64]:
 
 
 def _places(
-    n: tuple[int, int], thirds: Array, matrix: Array, m: tuple[int, int, int], flat: bool, nearest: float
+    n: tuple[int, int], thirds: Array, matrix: Array, m: tuple[int, ...], flat: bool, nearest: float
 ) -> tuple[Array, Array, Array, Array]:
     """Of all points: whether the array has them, the first of the elements around (3, …), the second ones' shares, p3."""
     i, j = np.ogrid[: n[0], : n[1]]
@@ -133,7 +133,7 @@ def _places(
     return inside, np.stack(at), np.stack(share), depth
 
 
-def _corners(at: Array, share: Array, m: tuple[int, int, int]) -> Any:
+def _corners(at: Array, share: Array, m: tuple[int, ...]) -> Any:
     """Indices of the elements around the places, and their shares, one corner after the other."""
     for corner in np.ndindex(2, 2, 2):
         weight = np.prod([s if second else 1 - s for s, second in zip(share, corner, strict=True)], axis=0)

@@ -87,7 +87,7 @@ def to_perspective(
         require_quantity(volume.quantity, [name for name in UNITS if name != "hu"], "to_perspective")
         if grid is not None and grid != volume.grid:
             raise InputError("to_perspective: a volume has its own grid; leave `grid` out")
-        volume, grid = volume.array, volume.grid
+        grid, volume = volume.grid, volume.array
     if grid is None:
         raise InputError(
             "to_perspective: expected a Volume, or the grid of the array: to_perspective(array, g, grid=...)"

@@ -105,13 +105,14 @@ def bundles() -> Iterator[Bundle]:
             vectors = rng.uniform(-1, 1, (rng.integers(1, 4), 4, 3)) * [[30], [6], [2], [2]]
             vectors[:, :2] += np.array(volume.shape) / 2
             table = np.concatenate([vectors, vectors * 1.5], axis=1)
-            rays: IndexRays | IndexFans = IndexFans(table, shape)
+            parallel = float(rng.choice([0.0, 0.0, 0.6, 1.0]))
+            rays: IndexRays | IndexFans = IndexFans(table, shape, parallel)
             mu_rays: IndexRays | IndexFans | None = None
             if attenuated == "own":
                 mu_table = table.copy()
                 mu_table[:, :4] = table[:, :4] * 0.7
                 mu_table[:, :2] += 0.3
-                mu_rays = IndexFans(mu_table, shape)
+                mu_rays = IndexFans(mu_table, shape, parallel)
             tame, by_ends = np.ones(len(rays), bool), True
         else:
             count = int(rng.integers(1, 40))

@@ -25,8 +25,12 @@ from .geometry.ring_fits import RingFit, fit_rings, ring_order
 from .geometry.system import PinholeSystem
 from .geometry.views import Views
 from .perspective.coordinates import line_through, transform_lines, transform_points
+from .perspective.correspondence import Correspondences, find_correspondences, samples_along_rays
+from .perspective.epipolar import epipolar_lines, epipolar_segments, epipole, essential_matrix, fundamental_matrix
 from .perspective.perspective_grid import PerspectiveGrid, depth_ranges, perspective_grids
 from .perspective.resampling import camera_to_camera, from_perspective, to_perspective
+from .perspective.triangulation import MarkerFit, fit_marker, triangulate
+from .perspective.view_rays import intrinsic_matrices, points_at_depths, project_points, view_frames
 from .phantoms.defrise import DefrisePhantom
 from .phantoms.derenzo import DerenzoPhantom, DerenzoRods
 from .phantoms.jaszczak import JaszczakPhantom

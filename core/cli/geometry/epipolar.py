@@ -1,0 +1,168 @@
+"""``mphdrr geometry epipolar FILE --pixel MODULE:COLUMN,ROW``."""
+
+import argparse
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ...errors import InputError
+from ...geometry.system import PinholeSystem
+from ...geometry.views import Views
+from ...perspective.epipolar import epipolar_lines, epipolar_segments, epipole
+from ...perspective.triangulation import fit_marker
+from ...perspective.view_rays import points_at_depths
+from ..options import chosen_modules, print_answer, read_workbook
+from .arguments import add_action, table_rows
+
+# A module is named as one that does not fit if the chance of its misfit is below this, counted for all modules.
+_CHANCE = 0.01
+
+
+def add_parser(actions) -> None:  # type: ignore[no-untyped-def]
+    """Add the action."""
+    example = (
+        " --pixel 7:120,130\nexample: mphdrr geometry epipolar scanner.xlsx --pixel 7:120,130 --pixel 31:99.4,140.2"
+    )
+    summary = "say where all modules see what a pixel of one sees; or where a point is, by its pixels in several"
+    parser = add_action(actions, "epipolar", summary, example + " --pixel 52:131,88 --sigma 0.5", _run)
+    add = parser.add_argument
+    pixel = "module number, column and row of its image, counted from 0; several: of one point, whose place is sought"
+    add("--pixel", action="append", required=True, metavar="MODULE:COLUMN,ROW", help=pixel)
+    depth = "of one pixel: where its ray begins and ends, or a single depth, mm from the pinhole; default: at the ROI"
+    add("--depth", type=float, nargs="+", metavar="MM", help=depth)
+    add("--sigma", type=float, metavar="PX", help="of several: standard deviation of columns and rows (default: 1)")
+    add("--modules", metavar="RANGE", help="those to list, such as 1-40 or 1-20,41; default: all")
+    add("--size", type=int, nargs=2, default=[256, 256], metavar=("ROWS", "COLUMNS"), help="pixels of the images")
+    add("--detector", choices=("virtual", "real"), default="virtual", help="upright in front, or crystal")
+    add("--magnification", type=float, default=10.0, help="virtual detector's distance in units of l")
+    add("--pitch", type=float, metavar="MM", help="pixel size; default: the crystal's whole side")
+
+
+def _run(arguments: argparse.Namespace) -> None:
+    system = read_workbook(arguments)
+    pixels = [_pixel(system, text) for text in arguments.pixel]
+    views = system.views(tuple(arguments.size), arguments.detector, arguments.magnification, arguments.pitch)
+    if len(pixels) == 1:
+        if arguments.sigma is not None:
+            raise InputError("--sigma: expected several --pixel, whose point is sought")
+        _print_ray(arguments, system, views, *pixels[0])
+        return
+    for name in ("depth", "modules"):
+        if getattr(arguments, name) is not None:
+            raise InputError(f"--{name}: expected one --pixel; the place sought is the same for several")
+    _print_point(arguments, system, views, pixels)
+
+
+def _print_ray(arguments: argparse.Namespace, system: PinholeSystem, views: Views, m: int, pixel: list[float]) -> None:
+    near, far = _depths(arguments.depth, system, m)
+    segments = epipolar_segments(views, m, pixel, near, far)
+    ends = points_at_depths(views, m, pixel, np.array([near, far]))
+    n_v, n_u = views.shape
+    rows = []
+    listed = np.isin(system.numbers, chosen_modules(system, arguments.modules).numbers)
+    for n in map(int, np.flatnonzero(listed)):
+        rows.append({"number": int(system.numbers[n]), "from": _listed(segments[n, 0]), "to": _listed(segments[n, 1])})
+        if n == m:
+            rows[-1] |= {"line": None, "epipole": None}
+            continue
+        at = epipole(views, m, n)
+        place = at[:2] / at[2] if at[2] > 0 else np.full(2, np.nan)
+        inside = (place >= -0.5).all() and (place <= [n_u - 0.5, n_v - 0.5]).all()
+        rows[-1] |= {"line": _listed(epipolar_lines(views, m, n, pixel)), "epipole": _listed(place) if inside else None}
+    number = int(system.numbers[m])
+    record = {"module": number, "pixel": pixel, "depths": [near, far], "points": ends.tolist(), "modules": rows}
+    text = f"module {number}, pixel ({pixel[0]:g}, {pixel[1]:g})"
+    start, end = (" ".join(f"{x:.2f}" for x in point) for point in ends)
+    if near == far:
+        lines = [f"{text} at a depth of {near:.2f} mm: ({start}) mm", " module     column, row      epipole"]
+    else:
+        lines = [f"{text} from a depth of {near:.2f} to {far:.2f} mm: from ({start}) to ({end}) mm"]
+        lines += [" module  from column, row    to column, row       epipole"]
+    for row in rows:
+        shown = [_text(row[name]) for name in (("from",) if near == far else ("from", "to"))]
+        lines.append(
+            f"{row['number']:7d}" + "".join(f"{each:>18}" for each in (*shown, _text(row["epipole"]))).rstrip()
+        )
+    seeing = sum(row["from"] is not None for row in rows)
+    lines += [f"{seeing} of {len(rows)} modules have it in their image; the epipole is where a module has the pinhole"]
+    print_answer(arguments, {**record, "units": "pixels, mm"}, lines)
+
+
+def _print_point(
+    arguments: argparse.Namespace, system: PinholeSystem, views: Views, pixels: list[tuple[int, list[float]]]
+) -> None:
+    index = np.array([m for m, _ in pixels])
+    numbers = system.numbers[index].tolist()
+    twice = [number for number in numbers if numbers.count(number) > 1]
+    if twice:
+        raise InputError(f"--pixel: expected one pixel of each module, got several of module {twice[0]}")
+    sigma = 1.0 if arguments.sigma is None else arguments.sigma
+    fit = fit_marker(views, index, [pixel for _, pixel in pixels], sigma)
+    odd = fit.worst if fit.worst is not None and fit.misfit_p_values[fit.worst] < _CHANCE / len(numbers) else None
+    columns = {"number": system.numbers[index], "column": fit.residuals[:, 0], "row": fit.residuals[:, 1]}
+    rows = table_rows({**columns, "misfit": fit.misfits, "p_value": fit.misfit_p_values})
+    modules = [{name: None if x != x else x for name, x in row.items()} for row in rows]  # no NaN in JSON
+    record = {
+        "point": fit.point.tolist(),
+        "standard_deviations": fit.standard_deviations.tolist(),
+        "covariance": fit.covariance.tolist(),
+        "sigma": sigma,
+        "chi2": fit.chi2,
+        "degrees": fit.degrees,
+        "p_value": fit.p_value,
+        "modules": modules,
+        "misfitting": None if odd is None else numbers[odd],
+        "units": "mm, mm^2, pixels",
+    }
+    axes = zip("xyz", fit.point, fit.standard_deviations, strict=True)
+    lines = ["point " + "   ".join(f"{axis} {x:.3f} +- {sd:.3f}" for axis, x, sd in axes) + " mm"]
+    lines += [" module  residual column       row    misfit     chance"]
+    line = "{number:7d} {column:16.3f} {row:9.3f}"
+    for row in rows:
+        known = row["misfit"] == row["misfit"]
+        lines += [
+            line.format(**row) + (" {misfit:9.2f} {p_value:10.2g}".format(**row) if known else "         -          -")
+        ]
+    lines += [
+        f"chi2 {fit.chi2:.2f} of {fit.degrees} degrees of freedom, a chance of {fit.p_value:.2g} if sigma is {sigma:g} px"
+    ]
+    if odd is not None:
+        lines += [f"module {numbers[odd]} does not fit: without it chi2 falls by {fit.misfits[odd]:.2f}"]
+    elif fit.p_value < _CHANCE:
+        lines += ["they do not fit together, and nothing says which is wrong"]
+    else:
+        lines += ["they fit together"]
+    print_answer(arguments, record, lines)
+
+
+def _pixel(system: PinholeSystem, text: str) -> tuple[int, list[float]]:
+    """Index of the module, and its column and row, of a ``MODULE:COLUMN,ROW``."""
+    module, _, place = text.partition(":")
+    try:
+        number, (column, row) = int(module), map(float, place.split(","))
+    except ValueError:
+        raise InputError(f"--pixel {text!r}: expected MODULE:COLUMN,ROW, such as 7:120,130.5") from None
+    index = np.flatnonzero(system.numbers == number)
+    if not len(index):
+        lowest, highest = system.numbers.min(), system.numbers.max()
+        raise InputError(f"--pixel {text!r}: no module {number}; there are {lowest} to {highest}")
+    return int(index[0]), [column, row]
+
+
+def _depths(given: list[float] | None, system: PinholeSystem, m: int) -> tuple[float, float]:
+    if given is None:
+        distance, radius = float(system.pinhole_distance[m]), float(system.roi_radius[m])
+        return max(distance - radius, 0.0), distance + radius
+    if len(given) > 2:
+        raise InputError(f"--depth: expected one depth or two, got {len(given)}")
+    return given[0], given[-1]
+
+
+def _listed(values: NDArray[Any]) -> list[float] | None:
+    """Numbers for JSON, which has no NaN."""
+    return None if np.isnan(values).any() else values.tolist()
+
+
+def _text(pixel: list[float] | None) -> str:
+    return "-" if pixel is None else f"{pixel[0]:.2f}, {pixel[1]:.2f}"

@@ -1,0 +1,265 @@
+"""Epipolar geometry: what two views see of one point, of one ray and of each other."""
+
+import itertools
+
+import numpy as np
+import pytest
+
+import mphdrr.core as mph
+from mphdrr.core.perspective.coordinates import distance_to_line
+from mphdrr.core.perspective.view_rays import pixels_of
+
+from .conftest import refused
+from .odd_views import odd_views
+
+BOTH = pytest.mark.parametrize("parallel", [False, True])
+
+
+def pairs(views):
+    return np.array(list(itertools.permutations(range(len(views)), 2))).T
+
+
+def homogeneous(pixels):
+    return np.concatenate([pixels, np.ones((*pixels.shape[:-1], 1))], axis=-1)
+
+
+def distances_from_lines(matrices, first, second):
+    """Of pixels (P, N, 2) of the second views, in px, from the epipolar lines of pixels (P, N, 2) of the first ones."""
+    lines = np.einsum("pij,pkj->pki", matrices, homogeneous(first))
+    return np.einsum("pki,pki->pk", lines, homogeneous(second)) / np.hypot(lines[..., 0], lines[..., 1])
+
+
+def scanner_views(scanner, **options):
+    return scanner.views((256, 240), **options)
+
+
+@pytest.mark.parametrize("detector", ["virtual", "real"])
+def test_the_epipolar_constraint_holds_for_all_ordered_pairs_of_the_scanner(scanner, rng, detector):
+    views = scanner_views(scanner, detector=detector)
+    m, n = pairs(views)
+    assert len(m) == 6320
+    pixels = mph.project_points(views, rng.uniform(-60, 60, (40, 3)))
+    distances = distances_from_lines(mph.fundamental_matrix(views, m, n), pixels[m], pixels[n])
+    assert np.abs(distances).max() < 1e-9
+
+
+@BOTH
+def test_the_epipolar_constraint_holds_for_odd_views(rng, parallel):
+    views = odd_views(parallel)
+    m, n = pairs(views)
+    matrices = mph.fundamental_matrix(views, m, n)
+    pixels = mph.project_points(views, rng.uniform(-40, 40, (40, 3)))
+    assert np.abs(distances_from_lines(matrices, pixels[m], pixels[n])).max() < 1e-9
+    lines = mph.epipolar_lines(views, 4, 5, pixels[4])
+    np.testing.assert_allclose(np.hypot(*lines[:, :2].T), 1)
+    assert np.abs((lines * homogeneous(pixels[5])).sum(axis=1)).max() < 1e-9
+    np.testing.assert_allclose(matrices, mph.fundamental_matrix(views, n, m).swapaxes(1, 2), atol=1e-9 * np.abs(matrices).max())
+    np.testing.assert_allclose(np.linalg.det(matrices / np.abs(matrices).max(axis=(1, 2), keepdims=True)), 0, atol=1e-12)
+
+
+@BOTH
+def test_a_fundamental_matrix_measures_how_far_rays_miss_each_other(rng, parallel):
+    views = odd_views(parallel)
+    m, n = pairs(views)
+    pixels = rng.uniform(0, 90, (2, len(m), 2))
+    found = np.einsum(
+        "pi,pij,pj->p", homogeneous(pixels[1]), mph.fundamental_matrix(views, m, n), homogeneous(pixels[0])
+    )
+    ends = []
+    for i in range(2):
+        columns, rows = pixels[i].T
+        of = (m, n)[i]
+        targets = views.detector_centers[of] + (columns - 49.5)[:, None] * views.u_steps[of]
+        targets = targets + (rows - 44.5)[:, None] * views.v_steps[of]
+        direction = views.detector_centers[of] - views.sources[of] if parallel else targets - views.sources[of]
+        ends.append((targets, direction))
+    (a, first), (b, second) = ends
+    across = np.cross(first, second)
+    np.testing.assert_allclose(np.abs(found), np.abs(((a - b) * across).sum(axis=1)), rtol=1e-9)
+    area = np.linalg.norm(across, axis=1)
+    line = mph.line_through(b[0], b[0] + second[0])
+    along = np.linspace(-1000, 1000, 200001)[:, None] / np.linalg.norm(first[0])
+    nearest = distance_to_line(a[0] + along * first[0], line).min()
+    np.testing.assert_allclose(np.abs(found[0]) / area[0], nearest, rtol=1e-6)
+
+
+def test_an_essential_matrix_is_the_pose_between_two_cameras(rng):
+    views = odd_views()
+    m, n = pairs(views)
+    matrices, frames = mph.essential_matrix(views, m, n), mph.view_frames(views)
+    points = rng.uniform(-40, 40, (40, 3))
+    own = np.einsum("mij,mkj->mki", frames, points - views.sources[:, None])
+    assert (own[..., 2] > 0).all()
+    np.testing.assert_allclose(np.cross(frames[:, 2], frames[:, 0]), frames[:, 1], atol=1e-15)
+    seen = own / own[..., 2:]
+    np.testing.assert_allclose(np.einsum("pki,pij,pkj->pk", seen[n], matrices, seen[m]), 0, atol=1e-11)
+    rotation = frames[n] @ frames[m].swapaxes(1, 2)
+    shift = np.einsum("pij,pj->pi", frames[n], views.sources[m] - views.sources[n])
+    np.testing.assert_allclose(own[n], np.einsum("pij,pkj->pki", rotation, own[m]) + shift[:, None], atol=1e-11)
+    np.testing.assert_allclose(matrices @ np.swapaxes(rotation, 1, 2), -np.swapaxes(matrices @ np.swapaxes(rotation, 1, 2), 1, 2), atol=1e-11)
+    distance = np.linalg.norm(views.sources[m] - views.sources[n], axis=1)
+    values = np.linalg.svd(matrices)[1]
+    np.testing.assert_allclose(values, distance[:, None] * [1, 1, 0], atol=1e-11)
+    intrinsic = mph.intrinsic_matrices(views)
+    np.testing.assert_allclose(np.einsum("mij,mkj->mki", intrinsic, seen)[..., :2], mph.project_points(views, points), atol=1e-10)
+    inverse = np.linalg.inv(intrinsic)
+    by_pixels = inverse[n].swapaxes(1, 2) @ matrices @ inverse[m]
+    fundamental = mph.fundamental_matrix(views, m, n)
+    factor = (by_pixels * fundamental).sum(axis=(1, 2)) / (by_pixels**2).sum(axis=(1, 2))
+    np.testing.assert_allclose(by_pixels * factor[:, None, None], fundamental, atol=1e-11 * np.abs(fundamental).max())
+
+
+def test_intrinsic_matrices_say_pitch_principal_point_skew_and_mirror():
+    u, v, k = mph.euler_pose(0.3, 0.8, -1.1)[:3, :3]
+    views = mph.Views([-200 * k], [300 * k + 14 * u - 6 * v], [2 * u], [-3 * v + 0.5 * u], (31, 41))
+    # The foot of the perpendicular is 6 mm = -2 rows along v, and from there (-14 - -2 * 0.5) / 2 columns.
+    expected = [[250, 500 / 3 / 4, 20 - 6.5], [0, -500 / 3, 15 - 2], [0, 0, 1]]
+    np.testing.assert_allclose(mph.intrinsic_matrices(views), [expected], atol=1e-10)
+    np.testing.assert_allclose(mph.view_frames(views), [[u, v, k]], atol=1e-14)
+
+
+@BOTH
+def test_epipoles_are_images_of_sources_and_on_all_lines(parallel):
+    views = odd_views(parallel)
+    away = views.detector_centers.copy()
+    away[3] = 2 * views.sources[3] - away[3]  # one looks away from the others
+    views = mph.Views(views.sources, away, views.u_steps, views.v_steps, views.shape, parallel)
+    m, n = pairs(views)
+    points = mph.epipole(views, m, n)
+    matrices = mph.fundamental_matrix(views, m, n)
+    scale = np.abs(matrices).max(axis=(1, 2)) * np.abs(points).max(axis=1)
+    assert (np.abs(np.einsum("pji,pj->pi", matrices, points)).max(axis=1) < 1e-11 * scale).all()
+    if parallel:
+        assert (points[:, 2] == 0).all()
+        return
+    frames = mph.view_frames(views)
+    depth = np.einsum("pi,pi->p", frames[n, 2], views.sources[m] - views.sources[n])
+    distance = np.einsum("mi,mi->m", frames[:, 2], views.detector_centers - views.sources)
+    np.testing.assert_allclose(points[:, 2], depth / distance[n], atol=1e-12)
+    seen = mph.project_points(views, views.sources)[n, m]
+    ahead = points[:, 2] > 0
+    assert 0 < ahead.sum() < len(m) and np.isnan(seen[~ahead]).all()
+    np.testing.assert_allclose(points[ahead, :2] / points[ahead, 2:], seen[ahead], rtol=1e-10)
+
+
+def test_parallel_views_are_the_limit_of_ever_farther_sources():
+    parallel = odd_views(parallel=True)
+    m, n = pairs(parallel)
+    toward = parallel.detector_centers - parallel.sources
+    wanted = mph.fundamental_matrix(parallel, m, n)
+    errors = []
+    for times in (1e2, 1e3, 1e4):
+        sources = parallel.detector_centers - times * toward
+        far = mph.Views(sources, parallel.detector_centers, parallel.u_steps, parallel.v_steps, parallel.shape)
+        points = np.array([[10.0, -20, 30]])
+        pixels = np.abs(mph.project_points(far, points) - mph.project_points(parallel, points)).max()
+        matrices = mph.fundamental_matrix(far, m, n) / times**2
+        # Coefficients of columns and rows count by pixels of an image of about 100.
+        sizes = np.array([100.0, 100, 1])
+        error = np.abs((matrices - wanted) * sizes * sizes[:, None]).max() / np.abs(wanted[:, 2, 2]).max()
+        k = far.perspective_matrices() @ [10.0, -20, 30, 1]
+        errors.append([pixels, error, np.abs(k[:, 2] / k[:, 3] - 1).max()])
+    assert (np.array(errors[2]) < [2e-3, 2e-2, 1e-4]).all(), errors
+    np.testing.assert_allclose(np.array(errors[1:]) * 10, errors[:-1], rtol=0.1)
+
+
+@BOTH
+def test_segments_are_what_views_see_of_a_ray(rng, parallel):
+    views = odd_views(parallel)
+    seen = np.zeros(len(views), int)
+    for _ in range(40):
+        m, pixel = int(rng.integers(6)), rng.uniform(0, 89, 2)
+        near, far = np.sort(rng.uniform(20, 900, 2))
+        ends = mph.epipolar_segments(views, m, pixel, near, far)
+        depths = np.linspace(near, far, 4001)
+        points = mph.points_at_depths(views, m, pixel, depths)
+        pixels = mph.project_points(views, points)
+        np.testing.assert_allclose(pixels[m], np.broadcast_to(pixel, (4001, 2)), atol=1e-9)
+        inside = ((pixels >= -0.5) & (pixels <= [99.5, 89.5])).all(axis=-1)
+        for n in range(len(views)):
+            where = np.flatnonzero(inside[n])
+            if not len(where):  # it may pass a corner between two depths
+                assert np.isnan(ends[n]).all() or np.linalg.norm(ends[n, 1] - ends[n, 0]) < 1
+                continue
+            seen[n] += 1
+            for end, i in zip(ends[n], where[[0, -1]], strict=True):
+                if i in (0, 4000):
+                    np.testing.assert_allclose(end, pixels[n, i], atol=1e-9)
+                else:  # cut off: at an edge, between two depths
+                    least = np.abs([end[0] + 0.5, end[0] - 99.5, end[1] + 0.5, end[1] - 89.5]).min()
+                    assert least < 1e-9
+                    step = np.nanmax(np.linalg.norm(np.diff(pixels[n, i - 1 : i + 2], axis=0), axis=1))
+                    assert np.linalg.norm(end - pixels[n, i]) <= step + 1e-9
+            if n != m:
+                lines = mph.epipolar_lines(views, m, n, pixel)
+                assert np.abs(homogeneous(ends[n]) @ lines).max() < 1e-8
+    assert (seen > 5).all()
+
+
+def test_rays_without_end_rays_from_the_source_and_rays_through_another_source():
+    views = odd_views()
+    pixel = [40.0, 50.0]
+    endless, long = mph.epipolar_segments(views, 0, pixel, 100), mph.epipolar_segments(views, 0, pixel, 100, 1e9)
+    np.testing.assert_allclose(endless, long, atol=1e-4)
+    assert np.isfinite(endless).all(axis=(1, 2)).sum() >= 3
+    from_source = mph.epipolar_segments(views, 0, pixel, 0, 300)
+    assert np.isfinite(from_source).any(axis=(1, 2)).sum() >= 3
+    np.testing.assert_array_equal(from_source[0], [pixel, pixel])
+    point = mph.epipolar_segments(views, 0, pixel, 230, 230)
+    np.testing.assert_allclose(point[:, 0], point[:, 1], atol=1e-12)
+    # A camera whose source is on the ray, looking along it, against it and across it.
+    source, target = (mph.points_at_depths(views, 0, pixel, depth) for depth in (150.0, 400.0))
+    k = (target - source) / np.linalg.norm(target - source)
+    u = np.cross(k, [0, 0, 1.0])
+    around = np.array([k, -k, u / np.linalg.norm(u)])
+    across = np.array([u, u, k])
+    more = mph.Views(
+        [*views.sources[:1], source, source, source],
+        [*views.detector_centers[:1], *(source + 100 * around)],
+        [*views.u_steps[:1], *across],
+        [*views.v_steps[:1], *np.cross(around, across)],
+        views.shape,
+    )
+    ends = mph.epipolar_segments(more, 0, pixel, 100, 300)
+    middle = [(100 - 1) / 2, (90 - 1) / 2]
+    np.testing.assert_allclose(ends[1:3], np.broadcast_to(middle, (2, 2, 2)), atol=1e-6)
+    assert np.isnan(ends[3]).all()  # at the right angle to all that it sees
+    np.testing.assert_allclose(mph.epipolar_segments(more, 0, pixel, 160, 300)[1], [middle, middle], atol=1e-6)
+    assert np.isnan(mph.epipolar_segments(more, 0, pixel, 160, 300)[2]).all()
+    assert np.isnan(mph.epipolar_lines(more, 0, 1, [pixel, [0, 0]])).all(axis=1).tolist() == [True, False]
+    assert np.isnan(mph.epipolar_segments(views, 0, [-0.6, 3], 100)[0]).all()
+
+
+@BOTH
+def test_points_project_to_their_pixels_and_not_from_behind(rng, parallel):
+    views = odd_views(parallel)
+    pixels = rng.uniform(0, 90, (7, 2))
+    for m in range(len(views)):
+        points = mph.points_at_depths(views, m, pixels, np.linspace(50, 500, 7))
+        np.testing.assert_allclose(mph.project_points(views, points)[m], pixels, atol=1e-10)
+        np.testing.assert_allclose(mph.view_frames(views)[m, 2] @ (points - views.sources[m]).T, np.linspace(50, 500, 7), atol=1e-10)
+        behind = mph.points_at_depths(views, m, pixels, -5.0)
+        assert np.isfinite(mph.project_points(views, behind)[m]).all() == parallel
+        np.testing.assert_array_equal(
+            pixels_of(views.projection_matrices()[m], points), mph.project_points(views, points)[m]
+        )
+
+
+def test_what_has_no_epipolar_geometry_is_refused():
+    views = odd_views()
+    refused(lambda: mph.fundamental_matrix(views, 2, 2), "fundamental matrix", "view 2 twice")
+    refused(lambda: mph.fundamental_matrix(views, 0, -6), "view 0 twice")
+    refused(lambda: mph.epipole(views, 0, 6), "epipole", "no view 6 among 6")
+    refused(lambda: mph.epipolar_lines(views, 0, 1.0, [0, 0]), "index of a view", "1.0")
+    refused(lambda: mph.epipolar_lines(views, [0, 1], 2, [0, 0]), "one index")
+    refused(lambda: mph.fundamental_matrix("views", 0, 1), "Views")
+    same = mph.Views(views.sources[[0, 0]], views.detector_centers[:2], views.u_steps[:2], views.v_steps[:2], (3, 4))
+    refused(lambda: mph.essential_matrix(same, 0, 1), "views 0 and 1", "the same source")
+    opposite = mph.parallel_views([0.4, 0.4 + np.pi], (8, 8), 1.0)
+    refused(lambda: mph.fundamental_matrix(opposite, 0, 1), "views 0 and 1", "opposite direction")
+    refused(lambda: mph.essential_matrix(odd_views(True), 0, 1), "essential matrix", "parallel")
+    refused(lambda: mph.intrinsic_matrices(odd_views(True)), "intrinsic", "parallel")
+    refused(lambda: mph.epipolar_segments(views, 0, [0, 0], -1, 5), "0 <= near <= far", "-1 and 5")
+    refused(lambda: mph.epipolar_segments(views, 0, [0, 0], 9, 5), "9 and 5")
+    refused(lambda: mph.epipolar_segments(views, 0, [0, 0], 9, np.nan), "far")
+    refused(lambda: mph.epipolar_segments(views, [0], [0, 0], 9), "one index")

@@ -1,0 +1,199 @@
+"""The coordinates (u, v, k) of views and the lattices in them."""
+
+import numpy as np
+import pytest
+
+import mphdrr.core as mph
+from mphdrr.core.perspective.coordinates import distance_to_line
+
+from .conftest import refused
+from .odd_views import odd_views
+
+CASES = pytest.mark.parametrize(("parallel", "uniform"), [(p, u) for p in (False, True) for u in ("k", "depth")])
+
+
+def grids(parallel=False, uniform="k", n_k=7):
+    return mph.perspective_grids(odd_views(parallel), n_k, 120.0, 330.0, uniform)
+
+
+def test_round_trips_keep_world_points_pixels_and_k(scanner, rng):
+    points = rng.uniform(-60, 60, (500, 3))
+    for views in (scanner.views((256, 240)), scanner.views((256, 240), "real"), odd_views()):
+        for matrix in views.perspective_matrices():
+            there = mph.transform_points(matrix, points)
+            back = mph.transform_points(np.linalg.inv(matrix), there)
+            assert np.abs(back - points).max() < 1e-11
+    for parallel in (False, True):
+        for grid in grids(parallel):
+            assert np.abs(grid.to_world(grid.from_world(points)) - points).max() < 1e-11
+
+
+@pytest.mark.parametrize("parallel", [False, True])
+def test_from_camera_to_camera_pixels_stay(rng, parallel):
+    points = rng.uniform(-40, 40, (500, 3))
+    views = odd_views(parallel)
+    seen = mph.project_points(views, points)
+    for a in grids(parallel):
+        for b in grids(parallel):
+            moved = mph.transform_points(b.matrix @ np.linalg.inv(a.matrix), a.from_world(points))
+            assert np.abs(moved[:, :2] - seen[b.m]).max() < 1e-10
+            np.testing.assert_allclose(moved, b.from_world(a.to_world(a.from_world(points))), atol=1e-10)
+
+
+def test_from_camera_to_camera_pixels_of_the_scanner_stay(scanner, rng):
+    views = scanner.views((256, 240))
+    points = rng.uniform(-60, 60, (100, 3))
+    matrices, seen = views.perspective_matrices(), mph.project_points(views, points)
+    for m in range(0, 80, 7):
+        back = np.linalg.inv(matrices[m])
+        own = mph.transform_points(matrices[m], points)
+        for n in range(80):
+            assert np.abs(mph.transform_points(matrices[n] @ back, own)[:, :2] - seen[n]).max() < 1e-10
+
+
+@pytest.mark.parametrize("parallel", [False, True])
+def test_straight_lines_stay_straight(rng, parallel):
+    """To 1e-12 of the length that is looked at, in units in which a pixel and the whole range of k are of one size."""
+    for grid in grids(parallel):
+        first, second = rng.uniform(-40, 40, (2, 3))
+        points = first + np.linspace(-1, 2, 301)[:, None] * (second - first)
+        scale = np.diag([1.0, 1.0, 100 / abs(grid.edges[-1] - grid.edges[0]), 1.0])
+        images = mph.transform_points(scale @ grid.matrix, points)
+        through = mph.line_through(images[0], images[-1])
+        moved = mph.transform_lines(scale @ grid.matrix, mph.line_through(first, second))
+        length = np.linalg.norm(images[-1] - images[0])
+        for line in (through, moved):
+            assert distance_to_line(images, line).max() < 1e-12 * max(length, 100)
+        back = mph.transform_lines(np.linalg.inv(scale @ grid.matrix), moved)
+        assert distance_to_line(points, back).max() < 1e-12 * np.linalg.norm(points[-1] - points[0])
+
+
+def test_k_is_the_magnification():
+    views = odd_views()
+    for m, matrix in enumerate(views.perspective_matrices()):
+        middle, source = views.detector_centers[m], views.sources[m]
+        n = mph.view_frames(views)[m, 2]
+        distance = n @ (middle - source)
+        np.testing.assert_allclose(mph.transform_points(matrix, middle), [49.5, 44.5, 1], atol=1e-12)
+        near = source + 0.25 * (middle - source)
+        np.testing.assert_allclose(mph.transform_points(matrix, near), [49.5, 44.5, 4], atol=1e-11)
+        # A step across, parallel to the detector, is k steps on the detector.
+        aside = mph.transform_points(matrix, near + views.u_steps[m] + 2 * views.v_steps[m])
+        np.testing.assert_allclose(aside, [53.5, 52.5, 4], atol=1e-11)
+        deeper = mph.transform_points(matrix, source + 60 * n)
+        np.testing.assert_allclose(deeper[2], distance / 60, rtol=1e-12)
+    assert (mph.transform_points(odd_views(True).perspective_matrices()[4], np.eye(3))[:, 2] == 1).all()
+
+
+@CASES
+def test_planes_are_evenly_spaced_in_what_they_say(parallel, uniform):
+    for grid in grids(parallel, uniform):
+        depths = np.array([grid.views.detector_centers[grid.m] - grid.views.sources[grid.m]]) @ mph.view_frames(grid.views)[grid.m, 2]
+        edges = grid.edges if parallel else depths / grid.edges
+        np.testing.assert_allclose(edges[[0, -1]], [120, 330])
+        assert (np.diff(edges) > 0).all() and (np.diff(grid.depths) > 0).all()
+        assert ((grid.depths > edges[:-1]) & (grid.depths < edges[1:])).all()
+        even = edges if parallel or uniform == "depth" else grid.edges
+        np.testing.assert_allclose(np.diff(even, 2), 0, atol=1e-11)
+        places = grid.depths if parallel or uniform == "depth" else grid.planes
+        np.testing.assert_allclose(places, (even[1:] + even[:-1]) / 2)
+
+
+@CASES
+def test_index_matrices_number_the_centers(parallel, uniform):
+    for grid in grids(parallel, uniform):
+        index = np.moveaxis(np.indices(grid.shape), 0, -1)
+        centers = np.concatenate([grid.centers(), np.ones((*grid.shape, 1))], axis=-1)
+        p = centers @ grid.index_matrix.T
+        assert (p[..., 3:] > 0).all()
+        found = np.stack([p[..., 0] / p[..., 3], p[..., 1] / p[..., 3], p[..., 2] / p[..., 4]], axis=-1)
+        np.testing.assert_allclose(found, index, atol=1e-10)
+        np.testing.assert_allclose(grid.from_world(grid.centers())[..., :2], index[..., :2], atol=1e-10)
+        depth = mph.view_frames(grid.views)[grid.m, 2] @ (grid.centers() - grid.views.sources[grid.m])[..., None]
+        np.testing.assert_allclose(depth[..., 0], np.broadcast_to(grid.depths, grid.shape), rtol=1e-12)
+
+
+@CASES
+def test_rays_have_their_whole_length_from_near_to_far(parallel, uniform):
+    for grid in grids(parallel, uniform):
+        n_v, n_u = grid.views.shape
+        pixels = np.stack(np.meshgrid(np.arange(n_u), np.arange(n_v)), axis=-1)
+        ends = [mph.points_at_depths(grid.views, grid.m, pixels, depth) for depth in (120.0, 330.0)]
+        whole = np.linalg.norm(ends[1] - ends[0], axis=-1)
+        lengths = grid.ray_lengths()
+        assert lengths.shape == grid.shape
+        np.testing.assert_allclose(lengths.sum(axis=-1).T, whole, rtol=1e-12)
+        i, j = 13, 71
+        borders = grid.to_world(np.column_stack([np.full((8, 1), i), np.full((8, 1), j), grid.edges]))
+        np.testing.assert_allclose(lengths[i, j], np.linalg.norm(np.diff(borders, axis=0), axis=1), rtol=1e-10)
+
+
+@CASES
+def test_cell_volumes_are_integrals_of_the_jacobian(parallel, uniform):
+    nodes, weights = np.polynomial.legendre.leggauss(12)
+    for grid in grids(parallel, uniform):
+        found = []
+        for low, high in zip(grid.edges[:-1], grid.edges[1:], strict=True):
+            thirds = (low + high) / 2 + nodes * (high - low) / 2
+            at = np.column_stack([np.full((12, 2), [31.0, 60.0]), thirds])  # the same for all pixels and in them
+            steps = np.diag([1e-4, 1e-4, 1e-4 * abs(high - low)])
+            slopes = [(grid.to_world(at + step) - grid.to_world(at - step)) / (2 * step.max()) for step in steps]
+            jacobian = np.abs(np.linalg.det(np.stack(slopes, axis=-1)))
+            found.append((weights * jacobian).sum() * abs(high - low) / 2)
+        np.testing.assert_allclose(grid.cell_volumes(), found, rtol=1e-6)
+    whole = np.array([g.cell_volumes().sum() for g in grids(parallel, uniform)])
+    area = np.linalg.norm(np.cross(grid.views.u_steps, grid.views.v_steps), axis=1)
+    if not parallel:
+        direction = grid.views.detector_centers - grid.views.sources
+        distances = np.einsum("mi,mi->m", direction, mph.view_frames(grid.views)[:, 2])
+        np.testing.assert_allclose(whole, area * (330**3 - 120**3) / (3 * distances**2), rtol=1e-10)
+    else:
+        np.testing.assert_allclose(whole, area * 210, rtol=1e-12)
+
+
+@CASES
+def test_images_are_sums_of_values_times_lengths(parallel, uniform, rng):
+    grid = grids(parallel, uniform)[5]
+    array = rng.random((2, *grid.shape))
+    image = grid.image(array)
+    assert image.shape == (2, 90, 100) and image.dtype == np.float64
+    np.testing.assert_allclose(image[1, 7, 63], array[1, 63, 7] @ grid.ray_lengths()[63, 7])
+    assert grid.image(array.astype(np.float32)).dtype == np.float32
+    torch = pytest.importorskip("torch", reason="torch is not installed")
+    tensor = torch.tensor(array, requires_grad=True)
+    seen = grid.image(tensor)
+    np.testing.assert_allclose(seen.detach(), image)
+    (gradient,) = torch.autograd.grad(seen[0].sum(), tensor)
+    np.testing.assert_allclose(gradient[0], grid.ray_lengths())
+    assert (gradient[1] == 0).all()
+
+
+def test_depth_ranges_hold_the_grid(rng):
+    views = odd_views()
+    grid = mph.Grid((5, 6, 7), mph.euler_pose(0.4, 1, 2) @ mph.Grid.centered((5, 6, 7), (8, 7, 6), (3, 2, 1)).affine)
+    near, far = mph.depth_ranges(views, grid)
+    corners = grid.corners()
+    for m in range(len(views)):
+        depths = (corners - views.sources[m]) @ mph.view_frames(views)[m, 2]
+        np.testing.assert_allclose([near[m], far[m]], [depths.min(), depths.max()])
+    per_view = mph.perspective_grids(views, 4, near, far)
+    assert [g.m for g in per_view] == list(range(6)) and per_view[3].near == near[3]
+    wide = mph.Grid.centered(50, 10)
+    refused(lambda: mph.depth_ranges(views, wide), "in front of its source", "behind")
+    mph.depth_ranges(odd_views(True), wide)
+
+
+def test_grids_that_cannot_be_are_refused():
+    views = odd_views()
+    refused(lambda: mph.PerspectiveGrid("x", 0, 4, 1, 2), "Views")
+    refused(lambda: mph.PerspectiveGrid(views, 6, 4, 1, 2), "no view 6 among 6")
+    refused(lambda: mph.PerspectiveGrid(views, 1.0, 4, 1, 2), "index of a view")
+    refused(lambda: mph.PerspectiveGrid(views, 0, 0, 1, 2), "planes")
+    refused(lambda: mph.PerspectiveGrid(views, 0, 4, 0, 2), "0 < near < far")
+    refused(lambda: mph.PerspectiveGrid(views, 0, 4, 5, 5), "near < far")
+    refused(lambda: mph.PerspectiveGrid(views, 0, 4, 1, np.inf), "far")
+    refused(lambda: mph.PerspectiveGrid(views, 0, 4, 1, 2, "z"), "k, depth")
+    refused(lambda: mph.PerspectiveGrid(odd_views(True), 0, 4, 3, 2), "near < far")
+    refused(lambda: mph.PerspectiveGrid(views, 0, 4, 1, 2).image(np.zeros((3, 3, 3))), "(100, 90, 4)", "(3, 3, 3)")
+    refused(lambda: mph.perspective_grids(views, 4, [1, 2], 3), "near")
+    assert mph.PerspectiveGrid(odd_views(True), -1, 4, -3, 2).m == 5

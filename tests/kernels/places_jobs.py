@@ -51,8 +51,8 @@ def _matrix(rng: np.random.Generator, kind: str, n: Array, m: Array, middle: flo
 def _rounding(job: dict[str, Any], thirds: Array, relative: Array, matrix: Array) -> tuple[Array, Array, Array]:
     """Of all points: whether numbers are within rounding of a border or out of range, by what share a value may be off.
 
-    A value's share is of the largest number of the array, divided by p3^2 where the job says so. A point is compared where it
-    surely is in the array, or surely is not; all places that are computed exactly are.
+    A value's share is of the largest number of the array, divided by p3^2 where the job says so. A point is compared where
+    it surely is in the array, or surely is not; all places that are computed exactly are.
     """
     kind, n, m, flat, nearest = (job[name] for name in ("kind", "n", "m", "flat", "nearest"))
     e, double = np.finfo(kind).eps, np.finfo(float).eps

@@ -1,4 +1,4 @@
-"""Draw the pictures of docs/conventions.md: ``python tools/draw_conventions.py``."""
+"""Draw the pictures of docs/conventions.md and docs/perspective.md: ``python tools/draw_conventions.py``."""
 
 # ruff: noqa: RUF005 (arrays plus lists are sums here)
 
@@ -205,7 +205,54 @@ def draw_arrays() -> None:
     picture.write("arrays.svg")
 
 
+def draw_perspective() -> None:
+    """One view's cells in the world, and in its own coordinates."""
+    picture = Picture("The cells of a perspective grid in the world, and in the view's own coordinates", 760, 430)
+    pinhole, distance, pitch, columns = np.array([40.0, 205.0]), 320.0, 52.0, 5
+    ks = np.linspace(4.0, 1.0, 7)
+
+    def world(column: float, k: float) -> np.ndarray:
+        return pinhole + [distance / k, -(column - (columns - 1) / 2) * pitch / k]
+
+    def own(column: float, k: float) -> np.ndarray:
+        return np.array([684 - 74 * (k - 1), 205 - (column - (columns - 1) / 2) * pitch])
+
+    borders = np.arange(columns + 1) - 0.5
+    for at in (world, own):
+        corners = [at(0.5, ks[4]), at(1.5, ks[4]), at(1.5, ks[5]), at(0.5, ks[5])]
+        picture.path(corners, "area", closed=True)
+        for border in borders:
+            picture.path([at(border, ks[0]), at(border, ks[-1])], "soft")
+        for k in ks:
+            picture.path([at(borders[0], k), at(borders[-1], k)], "thick" if k == 1 else "soft")
+        start, end = np.array([0.4, 3.6]), np.array([3.9, 1.25])  # column, k
+        # A straight line of the world is one of these coordinates, too.
+        picture.path([at(*start), at(*end)], "v thick")
+    for border in borders[[0, -1]]:
+        picture.path([pinhole, world(border, ks[0])], "dashed")
+    picture.dot(pinhole)
+    picture.text(pinhole + [-4, 30], "source", "", "start")
+    picture.text((200, 34), "world, mm")
+    picture.text((573, 34), "the view's column and k")
+    for at in (world, own):
+        for k in (4, 2, 1):
+            picture.text(at(borders[0], k) + [0, 22 if at is own or k < 4 else 34], f"{k}", "mono k")
+    picture.arrow(pinhole + [distance + 22, 205 - 150], pinhole + [distance + 22, -60], "u thick")
+    picture.text(pinhole + [distance + 32, 0], "column", "u", "start")
+    picture.text(world(borders[-1], 1) + [0, -10], "detector")
+    picture.arrow((700, 255), (700, 145), "u thick")
+    picture.text((712, 134), "column", "u")
+    picture.arrow((40, 386), (360, 386), "soft")
+    picture.text((200, 378), "depth, D at the detector", "soft")
+    picture.arrow((360, 408), (40, 408), "k thick")
+    picture.text((200, 425), "k = D / depth", "k")
+    picture.arrow((684, 386), (462, 386), "k thick")
+    picture.text((573, 404), "k", "k")
+    picture.write("perspective.svg")
+
+
 if __name__ == "__main__":
     draw_frames()
     draw_detectors()
     draw_arrays()
+    draw_perspective()

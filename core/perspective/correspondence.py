@@ -15,9 +15,14 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..errors import InputError
+from ..memory import require
+from ..progress import Progress
 from ..validation import instance, real_array, whole_number
 from .perspective_grid import PerspectiveGrid
 from .view_rays import Floats, Indices, pixels_of, rays_by_depth, view_indices
+
+# Of an image's range: what varies less is of one value, stored as float32.
+_ROUNDING = 1e-6
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,6 +62,8 @@ def samples_along_rays(images: ArrayLike, grid: PerspectiveGrid, pixels: ArrayLi
     """
     images = _images(images, grid)
     pixels = real_array(pixels, "pixels", (2,), batch=True)
+    n = pixels.size // 2 * grid.n_k
+    require(8 * n * (2 * len(images) + 20), f"samples along {pixels.size // 2} rays at {grid.n_k} planes")
     points = _points(grid, pixels).reshape(-1, 3)
     matrices = grid.views.projection_matrices()
     values = [_interpolated(image, pixels_of(matrix, points)) for image, matrix in zip(images, matrices, strict=True)]
@@ -64,7 +71,12 @@ def samples_along_rays(images: ArrayLike, grid: PerspectiveGrid, pixels: ArrayLi
 
 
 def find_correspondences(
-    images: ArrayLike, grid: PerspectiveGrid, pixels: ArrayLike, others: Indices | None = None, half_width: int = 3
+    images: ArrayLike,
+    grid: PerspectiveGrid,
+    pixels: ArrayLike,
+    others: Indices | None = None,
+    half_width: int = 3,
+    progress: Progress | None = None,
 ) -> Correspondences:
     """The depths at which other views look most like the surroundings of `pixels`, and where these are in the others.
 
@@ -88,6 +100,8 @@ def find_correspondences(
         The views to compare with; default: all others.
     half_width : int
         The squares have 2 `half_width` + 1 pixels along columns and rows.
+    progress
+        Called as ``progress(done, total)`` after each pixel; what it raises stops the work.
 
     Returns
     -------
@@ -102,14 +116,17 @@ def find_correspondences(
     images = _images(images, grid)
     pixels = real_array(pixels, "pixels", (2,), batch=True)
     half_width = whole_number(half_width, "half width")
-    chosen = np.delete(np.arange(len(images)), grid.m) if others is None else view_indices(grid.views, others, "others")
-    chosen = np.atleast_1d(chosen)
+    chosen = np.delete(np.arange(len(images)), grid.m)
+    if others is not None:
+        chosen = np.atleast_1d(view_indices(grid.views, others, "others")) if np.size(others) else chosen[:0]
     if not len(chosen) or grid.m in chosen:
         raise InputError(f"correspondences: expected one or more views besides {grid.m}, got {chosen.tolist()}")
     flat = pixels.reshape(-1, 2)
     curves, counts = np.full((len(flat), grid.n_k), np.nan), np.zeros((len(flat), grid.n_k), np.intp)
     for i, pixel in enumerate(flat):
         curves[i], counts[i] = _scores(images, grid, pixel, chosen, half_width)
+        if progress is not None:
+            progress(i + 1, len(flat))
     depths, scores = _highest(curves, grid)
     starts, per_depth = rays_by_depth(grid.views, grid.m, flat)
     points = starts + depths[:, None] * per_depth
@@ -131,7 +148,7 @@ def _scores(
     """Scores of one pixel at all planes, and how many views each is of: (n_k,) each."""
     around = np.arange(-half_width, half_width + 1, dtype=np.float64)
     square = pixel + np.stack(np.meshgrid(around, around), axis=-1).reshape(-1, 2)
-    wanted, shape = _normalised(_interpolated(images[grid.m], square)[:, None])
+    wanted, shape = _normalised(_interpolated(images[grid.m], square)[:, None], images[grid.m])
     none = np.full(grid.n_k, np.nan), np.zeros(grid.n_k, np.intp)
     if not shape.all():
         return none
@@ -141,16 +158,16 @@ def _scores(
         values = _interpolated(images[m], pixels_of(matrix, points))
         seen = np.isfinite(values).all(axis=0)
         # Where a view has nothing but one value, it does not have what is looked for: 0.
-        total[seen] += (wanted * _normalised(values[:, seen])[0]).sum(axis=0)
+        total[seen] += (wanted * _normalised(values[:, seen], images[m])[0]).sum(axis=0)
         count += seen
     return np.where(count > 0, total / np.maximum(count, 1), np.nan), count
 
 
-def _normalised(values: Floats) -> tuple[Floats, NDArray[np.bool_]]:
-    """Columns less their mean, of length 1, and which can be so; the others, which are of one value or not finite, are 0."""
+def _normalised(values: Floats, image: Floats) -> tuple[Floats, NDArray[np.bool_]]:
+    """Columns less their mean, of length 1, and which can be so: those that vary by more than rounding; others are 0."""
     away = values - values.mean(axis=0)
     length = np.linalg.norm(away, axis=0)
-    varied = length > 1e-9 * np.abs(values).max(axis=0, initial=0.0)
+    varied = length > _ROUNDING * np.ptp(image)
     return np.where(varied, away, 0.0) / np.where(varied, length, 1.0), varied
 
 

@@ -3,13 +3,14 @@
 All resampling to and from perspective grids, and all backprojections, are this; in C, or else in numpy.
 """
 
+from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..progress import Progress
-from ..projector.parallel import in_order, run_all, thread_count
+from ..projector.parallel import in_order, thread_count
 
 try:
     from ..projector.backends.cpu import give_at as _give_kernel
@@ -78,12 +79,16 @@ def take(
         shifted = _shifted(matrices, first)
         kernel(points[part], thirds, arrays, shifted, how, *counts, flat=flat, by_depth=by_depth, nearest=nearest)
 
-    for done, _ in enumerate(in_order(work, range(0, n, size), workers), 1):
-        if progress is not None:
-            progress(min(done * size, n), n)
+    see_through(in_order(work, range(0, n, size), workers), size, n, progress)
 
 
-def give(points: Array, thirds: NDArray[np.float64], array: Array, matrix: NDArray[np.float64]) -> None:
+def give(
+    points: Array,
+    thirds: NDArray[np.float64],
+    array: Array,
+    matrix: NDArray[np.float64],
+    progress: Progress | None = None,
+) -> None:
     """Add to `array` (m_x, m_y, m_z) the points' numbers, shared out at their places: the adjoint of `take`'s sum.
 
     Each thread has planes of the array of its own, so the result does not depend on their number.
@@ -91,7 +96,15 @@ def give(points: Array, thirds: NDArray[np.float64], array: Array, matrix: NDArr
     m, workers = len(array), thread_count(None)
     size = max(1, -(-m // (_SLABS * workers)))
     kernel = _give_in_numpy if _give_kernel is None else _give_kernel
-    run_all(lambda first: kernel(points, thirds, array, matrix, slice(first, first + size)), range(0, m, size), workers)
+    parts = (slice(first, first + size) for first in range(0, m, size))
+    see_through(in_order(lambda part: kernel(points, thirds, array, matrix, part), parts, workers), size, m, progress)
+
+
+def see_through(parts: Iterator[None], size: int, total: int, progress: Progress | None) -> None:
+    """Have all parts, of `size` each, done, and say how far they are."""
+    for done, _ in enumerate(parts, 1):
+        if progress is not None:
+            progress(min(done * size, total), total)
 
 
 def _shifted(matrices: NDArray[np.float64], first: int) -> NDArray[np.float64]:
@@ -102,7 +115,7 @@ def _shifted(matrices: NDArray[np.float64], first: int) -> NDArray[np.float64]:
 
 
 def _places(
-    n: tuple[int, int], thirds: Array, matrix: Array, m: tuple[int, int, int], flat: bool, nearest: float
+    n: tuple[int, int], thirds: Array, matrix: Array, m: tuple[int, ...], flat: bool, nearest: float
 ) -> tuple[Array, Array, Array, Array]:
     """Of all points: whether the array has them, the first of the elements around (3, …), the second ones' shares, p3."""
     i, j = np.ogrid[: n[0], : n[1]]
@@ -120,7 +133,7 @@ def _places(
     return inside, np.stack(at), np.stack(share), depth
 
 
-def _corners(at: Array, share: Array, m: tuple[int, int, int]) -> Any:
+def _corners(at: Array, share: Array, m: tuple[int, ...]) -> Any:
     """Indices of the elements around the places, and their shares, one corner after the other."""
     for corner in np.ndindex(2, 2, 2):
         weight = np.prod([s if second else 1 - s for s, second in zip(share, corner, strict=True)], axis=0)

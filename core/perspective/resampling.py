@@ -12,15 +12,15 @@ from ..arrays import ArrayOrTensor, checked, to_caller, to_numpy
 from ..errors import InputError, InputWarning
 from ..geometry.grid import Grid
 from ..memory import require
-from ..progress import Progress
+from ..progress import Progress, part_of
 from ..projector import backends
 from ..projector.operator import LinearOperator
-from ..projector.parallel import run_all, sum_of, thread_count
+from ..projector.parallel import in_order, run_all, sum_of, thread_count
 from ..projector.rays import IndexFans, index_fans
 from ..validation import instance, one_of
 from ..volumes.volume import UNITS, Volume, require_quantity
 from .perspective_grid import PerspectiveGrid
-from .places import give, take
+from .places import give, see_through, take
 
 KEEP = ("density", "activity")
 """What resampling may keep: the values, or their sums."""
@@ -30,6 +30,7 @@ _MOST_POINTS = 8  # in a cell, along each axis
 _LOOKED_AT = 9  # cells along each axis, to find how many points one needs
 
 _MOST_VOLUMES = 8  # of an adjoint along rays, each of a thread: more would gain little and take much memory
+_PLANES_AT_ONCE = 8  # of each thread, before the threads wait for each other
 _GAP = 1.5  # voxels from ray to ray
 
 Lattice = Grid | PerspectiveGrid
@@ -38,7 +39,12 @@ Floats = NDArray[np.float64]
 
 
 def to_perspective(
-    volume: Volume | ArrayOrTensor, g: PerspectiveGrid, keep: str = "density", *, grid: Grid | None = None
+    volume: Volume | ArrayOrTensor,
+    g: PerspectiveGrid,
+    keep: str = "density",
+    *,
+    grid: Grid | None = None,
+    progress: Progress | None = None,
 ) -> ArrayOrTensor:
     """A volume in the coordinates of a view.
 
@@ -52,6 +58,8 @@ def to_perspective(
         filled evenly, as everywhere, and 0 outside the grid: ``g.image`` of it is the projector's image. "activity":
         what lies in each cell, value x mm^3 (of kBq/mL that is Bq): every voxel's value times its volume, shared out
         among the cells around it; what lies outside `g` is left out, and nothing is lost otherwise.
+    progress
+        Called as ``progress(done, total)`` between parts; what it raises stops the work.
 
     Returns
     -------
@@ -79,18 +87,20 @@ def to_perspective(
         require_quantity(volume.quantity, [name for name in UNITS if name != "hu"], "to_perspective")
         if grid is not None and grid != volume.grid:
             raise InputError("to_perspective: a volume has its own grid; leave `grid` out")
-        volume, grid = volume.array, volume.grid
+        grid, volume = volume.grid, volume.array
     if grid is None:
         raise InputError(
             "to_perspective: expected a Volume, or the grid of the array: to_perspective(array, g, grid=...)"
         )
     instance(grid, Grid, "to_perspective")
     if keep == "density":
-        return _AlongRays(grid, g)(volume)
-    return _Taking(g, grid).T(volume) * grid.voxel_volume
+        return _AlongRays(grid, g)(volume, progress)
+    return _Taking(g, grid).T(volume, progress) * grid.voxel_volume
 
 
-def from_perspective(array: ArrayOrTensor, g: PerspectiveGrid, grid: Grid, keep: str = "density") -> ArrayOrTensor:
+def from_perspective(
+    array: ArrayOrTensor, g: PerspectiveGrid, grid: Grid, keep: str = "density", *, progress: Progress | None = None
+) -> ArrayOrTensor:
     """What is given in the coordinates of a view, on a grid of voxels.
 
     Parameters
@@ -105,6 +115,8 @@ def from_perspective(array: ArrayOrTensor, g: PerspectiveGrid, grid: Grid, keep:
         "activity": the array holds what lies in each cell, value x mm^3, as of ``to_perspective(…, "activity")``. It is
         spread evenly along the cell's ray over the voxels that this crosses, and divided by their volume. What lies
         outside `grid` is left out.
+    progress
+        As of `to_perspective`.
 
     Returns
     -------
@@ -125,13 +137,18 @@ def from_perspective(array: ArrayOrTensor, g: PerspectiveGrid, grid: Grid, keep:
     instance(g, PerspectiveGrid, "from_perspective")
     instance(grid, Grid, "from_perspective")
     if keep == "density":
-        return _Taking(g, grid)(array)
+        return _Taking(g, grid)(array, progress)
     _warn_of_gaps(g, grid)
-    return _AlongRays(grid, g).T(array) / grid.voxel_volume
+    return _AlongRays(grid, g).T(array, progress) / grid.voxel_volume
 
 
 def camera_to_camera(
-    array: ArrayOrTensor, g_m: PerspectiveGrid, g_n: PerspectiveGrid, keep: str = "density"
+    array: ArrayOrTensor,
+    g_m: PerspectiveGrid,
+    g_n: PerspectiveGrid,
+    keep: str = "density",
+    *,
+    progress: Progress | None = None,
 ) -> ArrayOrTensor:
     """What is given in the coordinates of one view, in those of another.
 
@@ -143,6 +160,8 @@ def camera_to_camera(
     keep : str
         "density": the mean over each cell of the values, interpolated linearly. "activity": what lies in each cell is
         shared out among the cells around it; it is the adjoint of "density" the other way, from `g_n` to `g_m`.
+    progress
+        As of `to_perspective`.
 
     Returns
     -------
@@ -157,7 +176,8 @@ def camera_to_camera(
     one_of(keep, KEEP, "keep")
     instance(g_m, PerspectiveGrid, "camera_to_camera")
     instance(g_n, PerspectiveGrid, "camera_to_camera")
-    return _Taking(g_m, g_n)(array) if keep == "density" else _Taking(g_n, g_m).T(array)
+    operator = _Taking(g_m, g_n) if keep == "density" else _Taking(g_n, g_m).T
+    return operator(array, progress)
 
 
 class _Pair(LinearOperator):
@@ -183,14 +203,14 @@ class _Pair(LinearOperator):
 
     def _run_one(self, x: ArrayOrTensor, progress: Progress | None = None, mu: Any = None) -> ArrayOrTensor:
         array = _plain(x, self.shape_out)
-        return to_caller(self.forward(array).astype(array.dtype, copy=False), x)
+        return to_caller(self.forward(array, progress).astype(array.dtype, copy=False), x)
 
     @abstractmethod
-    def forward(self, x: Array) -> Array:
+    def forward(self, x: Array, progress: Progress | None) -> Array:
         """The map of an array of float32 or float64."""
 
     @abstractmethod
-    def adjoint(self, y: Array) -> Array:
+    def adjoint(self, y: Array, progress: Progress | None) -> Array:
         """The adjoint of an array of float32 or float64."""
 
 
@@ -217,7 +237,7 @@ class _Adjoint(LinearOperator):
 
     def _run_one(self, x: ArrayOrTensor, progress: Progress | None = None, mu: Any = None) -> ArrayOrTensor:
         array = _plain(x, self.shape_out)
-        return to_caller(self._pair.adjoint(array).astype(array.dtype, copy=False), x)
+        return to_caller(self._pair.adjoint(array, progress).astype(array.dtype, copy=False), x)
 
 
 def _plain(x: ArrayOrTensor, result: tuple[int, int, int]) -> Array:
@@ -233,29 +253,35 @@ class _AlongRays(_Pair):
     source: Grid
     target: PerspectiveGrid
 
-    def forward(self, x: Array) -> Array:
+    def forward(self, x: Array, progress: Progress | None) -> Array:
         functions, x = self._functions(x)
         result = np.empty(self.shape_out, x.dtype)
 
         def work(plane: int) -> None:
             result[..., plane] = functions.forward(x, self._rays(plane)).reshape(self.shape_out[:2])
 
-        run_all(work, range(self.target.n_k), thread_count(None))
+        n = self.target.n_k
+        see_through(in_order(work, range(n), thread_count(None)), 1, n, progress)
         result /= self.target.ray_lengths()
         return result
 
-    def adjoint(self, y: Array) -> Array:
+    def adjoint(self, y: Array, progress: Progress | None) -> Array:
         functions, y = self._functions(y)
         y = y / self.target.ray_lengths().astype(y.dtype)
-        workers = min(thread_count(None), _MOST_VOLUMES, self.target.n_k)
+        n = self.target.n_k
+        workers = min(thread_count(None), _MOST_VOLUMES, n)
+        require(workers * y.itemsize * float(np.prod(self.shape_in)), f"a volume for each of {workers} threads")
         volumes = [np.zeros(self.shape_in, y.dtype) for _ in range(workers)]
 
-        def work(worker: int) -> None:
-            for plane in range(worker, self.target.n_k, workers):
+        def work(worker: int, first: int) -> None:
+            for plane in range(first + worker, min(first + _PLANES_AT_ONCE * workers, n), workers):
                 values = np.ascontiguousarray(y[..., plane]).reshape(-1)
                 functions.backproject(volumes[worker], values, self._rays(plane))
 
-        run_all(work, range(workers), workers)
+        for first in range(0, n, _PLANES_AT_ONCE * workers):
+            run_all(lambda worker, first=first: work(worker, first), range(workers), workers)  # type: ignore[misc]
+            if progress is not None:
+                progress(min(first + _PLANES_AT_ONCE * workers, n), n)
         return np.asarray(sum_of(volumes, workers))
 
     @staticmethod
@@ -284,17 +310,18 @@ class _Taking(_Pair):
         self._matrix = from_world @ (target.affine if isinstance(target, Grid) else target.inverse)
         self._points = _points_in_cells(self._matrix, source, target)
 
-    def forward(self, x: Array) -> Array:
+    def forward(self, x: Array, progress: Progress | None) -> Array:
         result = np.zeros(self.shape_out, x.dtype)
-        for matrix, thirds in self._shifted():
-            take(result, thirds, x[None], matrix[None])
+        for n, (matrix, thirds) in enumerate(self._shifted()):
+            part = part_of(progress, n, int(self._points.prod()))
+            take(result, thirds, x[None], matrix[None], progress=part)
         return np.asarray(result / self._points.prod(dtype=x.dtype))
 
-    def adjoint(self, y: Array) -> Array:
+    def adjoint(self, y: Array, progress: Progress | None) -> Array:
         result = np.zeros(self.shape_in, y.dtype)
         y = np.asarray(y / self._points.prod(dtype=y.dtype))
-        for matrix, thirds in self._shifted():
-            give(y, thirds, result, matrix)
+        for n, (matrix, thirds) in enumerate(self._shifted()):
+            give(y, thirds, result, matrix, part_of(progress, n, int(self._points.prod())))
         return result
 
     def _shifted(self) -> Iterator[tuple[Floats, Floats]]:

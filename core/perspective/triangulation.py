@@ -20,9 +20,12 @@ from ..geometry.views import Views
 from ..validation import freeze, real_array
 from .view_rays import Floats, Indices, rays_by_depth, view_indices
 
-_STEPS = 50
-# As a share of the pixels' numbers: some roundings.
-_LEAST_STEP = 1e-13
+_STEPS = 200
+_HALVINGS = 40
+# How far a step moves the images, as a share of the pixels' numbers: steps below the first change the sum of squares, which
+# has its least value there, by little more than rounding; those below the second are rounding.
+_NEAR, _ROUNDING = 1e-6, 1e-11
+_NO_PLACE = "triangulation: found no place in front of the sources; expected rays that meet there"
 # Rays that are less apart, rad, meet where rounding has them meet.
 _LEAST_ANGLE = 1e-7
 
@@ -152,26 +155,31 @@ def _fitted(
     state = _residuals(matrices, offsets, shift, pixels, whitening)
     if state is None:
         raise InputError(
-            f"triangulation: the rays of the {len(index)} images meet behind the source of image {offsets[:, 2].argmin() + 1}; "
+            f"triangulation: the rays meet behind the source of image {offsets[:, 2].argmin() + 1} of {len(index)}; "
             "expected the images of one point in front of all sources, as (column, row)"
         )
+    last = math.inf
     for _ in range(_STEPS):
         residuals, slopes = state
         step = np.linalg.lstsq(slopes.reshape(-1, 3), residuals.ravel(), rcond=None)[0]
-        before = float((residuals**2).sum())
-        moved = np.abs(np.linalg.solve(whitening, (slopes @ step)[..., None])).max()  # pixels
-        taken = None
-        for halving in range(30):
+        moved = np.abs(np.linalg.solve(whitening, (slopes @ step)[..., None])).max() / largest
+        near = moved <= _NEAR
+        if near and moved >= last:
+            if moved > _ROUNDING:
+                raise InputError(_NO_PLACE)
+            break
+        most = math.inf if near else float((residuals**2).sum())
+        for halving in range(_HALVINGS):
             taken = _residuals(matrices, offsets, shift + step / 2**halving, pixels, whitening)
-            if taken is not None and float((taken[0] ** 2).sum()) <= before * (1 + 1e-12) + 1e-20:
+            if taken is not None and float((taken[0] ** 2).sum()) <= most:
                 break
         else:
-            break  # no way down but rounding
-        shift, state = shift + step / 2**halving, taken
-        if moved <= _LEAST_STEP * largest:
+            raise InputError(_NO_PLACE)
+        shift, state, last = shift + step / 2**halving, taken, moved
+        if moved == 0:
             break
     else:
-        raise InputError("triangulation: found no place in front of the sources; expected rays that meet there")
+        raise InputError(_NO_PLACE)
     residuals, slopes = state
     return center + shift, index, np.linalg.solve(whitening, residuals[..., None])[..., 0], whitening, slopes
 
@@ -191,8 +199,7 @@ def _residuals(
 
 def _nearest_to_rays(views: Views, index: NDArray[np.intp], pixels: Floats) -> Floats:
     """The point with the smallest sum of squared distances from the pixels' rays."""
-    rays = [rays_by_depth(views, int(m), pixel) for m, pixel in zip(index, pixels, strict=True)]
-    starts, directions = (np.stack(each) for each in zip(*rays, strict=True))
+    starts, directions = rays_by_depth(views, index, pixels)
     directions = directions / np.linalg.norm(directions, axis=1, keepdims=True)
     angle = float(np.linalg.norm(np.cross(directions[:, None], directions[None]), axis=-1).max())
     if angle < _LEAST_ANGLE:

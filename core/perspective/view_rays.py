@@ -94,17 +94,19 @@ def points_at_depths(views: Views, m: int, pixels: ArrayLike, depths: ArrayLike)
     return np.asarray(starts + real_array(depths, "depths", None)[..., None] * per_depth)
 
 
-def rays_by_depth(views: Views, m: int, pixels: Floats) -> tuple[Floats, Floats]:
-    """Of view m's pixels (…, 2): where their rays begin, at depth 0, and how far they lead per mm of depth: (…, 3) each."""
-    to_detector = _to_detector(views)[m]
-    on_detector = pixels @ to_detector[:, :2].T + to_detector[:, 2]  # from the source
-    normal = view_frames(views)[m, 2]
+def rays_by_depth(views: Views, m: int | NDArray[np.intp], pixels: Floats) -> tuple[Floats, Floats]:
+    """Of pixels (…, 2): where their rays begin, at depth 0, and how far they lead per mm of depth: (…, 3) each.
+
+    m is the view of all pixels, or an array that broadcasts with them.
+    """
+    to_detector, normal = _to_detector(views)[m], view_frames(views)[m, 2]
+    on_detector = np.einsum("...ij,...j->...i", to_detector[..., :2], pixels) + to_detector[..., 2]  # from the source
+    sources = np.broadcast_to(views.sources[m], on_detector.shape)
     if views.parallel:
         direction = views.detector_centers[m] - views.sources[m]
-        starts = views.sources[m] + on_detector - direction
-        return starts, np.broadcast_to(direction / (normal @ direction), starts.shape)
-    per_depth = on_detector / (on_detector @ normal)[..., None]
-    return np.broadcast_to(views.sources[m], per_depth.shape), per_depth
+        per_depth = direction / np.einsum("...i,...i->...", normal, direction)[..., None]
+        return sources + on_detector - direction, np.broadcast_to(per_depth, on_detector.shape)
+    return sources, on_detector / np.einsum("...i,...i->...", on_detector, normal)[..., None]
 
 
 def lines_of_pixels(views: Views, m: NDArray[np.intp], origin: Floats) -> tuple[Floats, Floats]:

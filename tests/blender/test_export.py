@@ -14,7 +14,7 @@ from mphdrr.core.runs.files import read_run
 def rendered(scene, ring_system):
     """A scene whose projections are rendered."""
     scanner.build_scanner(scene, ring_system, "Ring")
-    bpy.ops.mphdrr.add_derenzo(voxels=16)
+    bpy.ops.mphdrr.add_derenzo(voxels=16, rod_diameters=(10, 8, 0, 0, 0, 0))
     bpy.ops.mphdrr.render_projections(width=8, height=6)
     return scene
 

@@ -70,7 +70,7 @@ def test_maps_are_not_projected(collection):
     bpy.ops.mphdrr.add_map(quantity="modules", voxels=4)
     with pytest.raises(RuntimeError, match="no volume of activity or mu in the scene"):
         bpy.ops.mphdrr.render_projections(width=4, height=4)
-    bpy.ops.mphdrr.add_derenzo(voxels=16)
+    bpy.ops.mphdrr.add_derenzo(voxels=16, rod_diameters=(10, 8, 0, 0, 0, 0))
     assert bpy.ops.mphdrr.render_projections(width=4, height=4) == {"FINISHED"}
 
 

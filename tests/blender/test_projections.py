@@ -35,7 +35,7 @@ from mphdrr.panels.projections import MPHDRR_PT_physics
 def scanned(scene, ring_system) -> PinholeSystem:
     """A scene with a scanner of eight modules and a small phantom, off centre and rotated."""
     scanner.build_scanner(scene, ring_system, "Ring")
-    bpy.ops.mphdrr.add_derenzo(voxels=32, location=(5, -3, 2), phi=0.2, theta=0.3)
+    bpy.ops.mphdrr.add_derenzo(voxels=32, rod_diameters=(10, 8, 0, 0, 0, 0), location=(5, -3, 2), phi=0.2, theta=0.3)
     return ring_system
 
 
@@ -202,7 +202,7 @@ def test_images_and_arrays_survive_save_and_reopen(scanned, scene, tmp_path):
     assert re.fullmatch(r"//study_mphdrr/Scene-projections-[0-9a-f]{8}\.h5", run_file)
     run = read_run(storage.absolute(run_file))
     assert np.array_equal(run.projections[0], before)
-    assert run.recipe["phantom.kind"] == "derenzo" and run.recipe["phantom.rod_diameters"] == (8, 6, 5, 4, 3, 2)
+    assert run.recipe["phantom.kind"] == "derenzo" and run.recipe["phantom.rod_diameters"] == (10, 8, 0, 0, 0, 0)
     # The reopened scene can be projected again, to the last bit.
     bpy.ops.mphdrr.render_projections(width=24, height=20)
     assert np.array_equal(images.projection_array(bpy.data.images[name]), before)

@@ -22,7 +22,7 @@ SMALL = {"voxels": 14, "spacing": 7.0, "iterations": 3, "subsets": 2}
 def render(scene, ring_system):
     """A scanner of eight modules, a phantom and a run of counts."""
     scanner.build_scanner(scene, ring_system, "Ring")
-    bpy.ops.mphdrr.add_derenzo(voxels=32, location=(5, -3, 2), phi=0.2)
+    bpy.ops.mphdrr.add_derenzo(voxels=32, rod_diameters=(10, 8, 0, 0, 0, 0), location=(5, -3, 2), phi=0.2)
     settings = scene.mphdrr_projections
     settings.width, settings.height, settings.model, settings.time = 12, 10, "EMISSION", 600.0
     settings.pixel_points, settings.tolerance = 2, 9.0

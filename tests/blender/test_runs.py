@@ -25,7 +25,7 @@ DATA = Path(__file__).parent / "data"
 def render(scene, ring_system):
     """A scanner of eight modules and a phantom; the result renders what the panel says."""
     scanner.build_scanner(scene, ring_system, "Ring")
-    bpy.ops.mphdrr.add_derenzo(voxels=16, location=(5, -3, 2), phi=0.2)
+    bpy.ops.mphdrr.add_derenzo(voxels=16, rod_diameters=(10, 8, 0, 0, 0, 0), location=(5, -3, 2), phi=0.2)
     settings = scene.mphdrr_projections
     settings.width, settings.height, settings.model = 12, 10, "EMISSION"
 

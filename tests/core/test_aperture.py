@@ -103,7 +103,7 @@ def voxel_image(n, fwhm):
     return image[0] / image.sum()
 
 
-@pytest.mark.parametrize("fwhm", [0.0, 1.0])
+@pytest.mark.parametrize("fwhm", [0.0, pytest.param(1.0, marks=pytest.mark.long)])
 def test_points_for_a_tolerance_keep_it(fwhm):
     """A voxel's counts, integrated over whole pixels at any offset; a third of the points would not suffice."""
     system = one_module()

@@ -53,8 +53,12 @@ def test_the_epipolar_constraint_holds_for_odd_views(rng, parallel):
     lines = mph.epipolar_lines(views, 4, 5, pixels[4])
     np.testing.assert_allclose(np.hypot(*lines[:, :2].T), 1)
     assert np.abs((lines * homogeneous(pixels[5])).sum(axis=1)).max() < 1e-9
-    np.testing.assert_allclose(matrices, mph.fundamental_matrix(views, n, m).swapaxes(1, 2), atol=1e-9 * np.abs(matrices).max())
-    np.testing.assert_allclose(np.linalg.det(matrices / np.abs(matrices).max(axis=(1, 2), keepdims=True)), 0, atol=1e-12)
+    np.testing.assert_allclose(
+        matrices, mph.fundamental_matrix(views, n, m).swapaxes(1, 2), atol=1e-9 * np.abs(matrices).max()
+    )
+    np.testing.assert_allclose(
+        np.linalg.det(matrices / np.abs(matrices).max(axis=(1, 2), keepdims=True)), 0, atol=1e-12
+    )
 
 
 @BOTH
@@ -96,12 +100,16 @@ def test_an_essential_matrix_is_the_pose_between_two_cameras(rng):
     rotation = frames[n] @ frames[m].swapaxes(1, 2)
     shift = np.einsum("pij,pj->pi", frames[n], views.sources[m] - views.sources[n])
     np.testing.assert_allclose(own[n], np.einsum("pij,pkj->pki", rotation, own[m]) + shift[:, None], atol=1e-11)
-    np.testing.assert_allclose(matrices @ np.swapaxes(rotation, 1, 2), -np.swapaxes(matrices @ np.swapaxes(rotation, 1, 2), 1, 2), atol=1e-11)
+    np.testing.assert_allclose(
+        matrices @ np.swapaxes(rotation, 1, 2), -np.swapaxes(matrices @ np.swapaxes(rotation, 1, 2), 1, 2), atol=1e-11
+    )
     distance = np.linalg.norm(views.sources[m] - views.sources[n], axis=1)
     values = np.linalg.svd(matrices)[1]
     np.testing.assert_allclose(values, distance[:, None] * [1, 1, 0], atol=1e-11)
     intrinsic = mph.intrinsic_matrices(views)
-    np.testing.assert_allclose(np.einsum("mij,mkj->mki", intrinsic, seen)[..., :2], mph.project_points(views, points), atol=1e-10)
+    np.testing.assert_allclose(
+        np.einsum("mij,mkj->mki", intrinsic, seen)[..., :2], mph.project_points(views, points), atol=1e-10
+    )
     inverse = np.linalg.inv(intrinsic)
     by_pixels = inverse[n].swapaxes(1, 2) @ matrices @ inverse[m]
     fundamental = mph.fundamental_matrix(views, m, n)
@@ -237,7 +245,9 @@ def test_points_project_to_their_pixels_and_not_from_behind(rng, parallel):
     for m in range(len(views)):
         points = mph.points_at_depths(views, m, pixels, np.linspace(50, 500, 7))
         np.testing.assert_allclose(mph.project_points(views, points)[m], pixels, atol=1e-10)
-        np.testing.assert_allclose(mph.view_frames(views)[m, 2] @ (points - views.sources[m]).T, np.linspace(50, 500, 7), atol=1e-10)
+        np.testing.assert_allclose(
+            mph.view_frames(views)[m, 2] @ (points - views.sources[m]).T, np.linspace(50, 500, 7), atol=1e-10
+        )
         behind = mph.points_at_depths(views, m, pixels, -5.0)
         assert np.isfinite(mph.project_points(views, behind)[m]).all() == parallel
         np.testing.assert_array_equal(

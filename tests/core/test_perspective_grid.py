@@ -68,6 +68,15 @@ def test_straight_lines_stay_straight(rng, parallel):
         assert distance_to_line(points, back).max() < 1e-12 * np.linalg.norm(points[-1] - points[0])
 
 
+def test_lines_at_infinity_and_points_on_no_plane_are_known():
+    line = mph.line_through([1, 2, 3], [1, 2, 5])
+    np.testing.assert_allclose(distance_to_line([[4, 6, -8], [1, 2, 0]], line), [5, 0])
+    refused(lambda: distance_to_line([0, 0, 0], np.zeros((4, 4))), "not at infinity")
+    matrix = odd_views().perspective_matrices()[0]
+    assert not np.isfinite(mph.transform_points(matrix, odd_views().sources[0])).any()
+    refused(lambda: mph.transform_points(np.eye(3), [0, 0, 0]), "transform", "4 x 4")
+
+
 def test_k_is_the_magnification():
     views = odd_views()
     for m, matrix in enumerate(views.perspective_matrices()):
@@ -88,7 +97,10 @@ def test_k_is_the_magnification():
 @CASES
 def test_planes_are_evenly_spaced_in_what_they_say(parallel, uniform):
     for grid in grids(parallel, uniform):
-        depths = np.array([grid.views.detector_centers[grid.m] - grid.views.sources[grid.m]]) @ mph.view_frames(grid.views)[grid.m, 2]
+        depths = (
+            np.array([grid.views.detector_centers[grid.m] - grid.views.sources[grid.m]])
+            @ mph.view_frames(grid.views)[grid.m, 2]
+        )
         edges = grid.edges if parallel else depths / grid.edges
         np.testing.assert_allclose(edges[[0, -1]], [120, 330])
         assert (np.diff(edges) > 0).all() and (np.diff(grid.depths) > 0).all()

@@ -228,3 +228,25 @@ def test_rays_that_leave_voxels_out_are_said():
 def test_what_is_not_understood_is_refused(call, message):
     with pytest.raises(mph.InputError, match=message):
         call(grids(odd_views())[0])
+
+
+def test_work_says_how_far_it_is_and_can_be_stopped():
+    g, h = grids(odd_views())
+    volume = mph.Volume(BLOB, GRID)
+    calls = {
+        "to": lambda progress, keep: mph.to_perspective(volume, g, keep, progress=progress),
+        "from": lambda progress, keep: mph.from_perspective(np.ones(g.shape), g, GRID, keep, progress=progress),
+        "across": lambda progress, keep: mph.camera_to_camera(np.ones(g.shape), g, h, keep, progress=progress),
+    }
+
+    def stop(done, total):
+        raise mph.Cancelled
+
+    for call in calls.values():
+        for keep in ("density", "activity"):
+            said = []
+            call(lambda *args, said=said: said.append(args), keep)
+            shares = [done / total for done, total in said]
+            assert len(shares) > 1 and shares == sorted(shares) and shares[-1] == 1
+            with pytest.raises(mph.Cancelled):
+                call(stop, keep)

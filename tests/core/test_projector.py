@@ -313,6 +313,7 @@ def test_threads_change_nothing(backend):
     np.testing.assert_array_equal(two.T(y), two.T(y))
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("backend", BACKENDS)
 def test_hypothesis_box_in_any_affine(backend):
     hypothesis = pytest.importorskip("hypothesis", reason="hypothesis is not installed")

@@ -311,6 +311,7 @@ def test_short_memory_means_more_launches(monkeypatch, rng):
     assert launches[0] == (4, 7, 30) and len(launches) > 8 and {dim[0] for dim in launches[1:]} == {1}
 
 
+@pytest.mark.long
 @pytest.mark.skipif(sys.platform == "darwin", reason="Warp has no CUDA on macOS")
 def test_kernels_compile_for_gpus_without_one(tmp_path):
     from mphdrr.core.projector.backends import warp_kernels

@@ -59,7 +59,7 @@ def _print_ray(arguments: argparse.Namespace, system: PinholeSystem, views: View
     segments = epipolar_segments(views, m, pixel, near, far)
     ends = points_at_depths(views, m, pixel, np.array([near, far]))
     n_v, n_u = views.shape
-    rows = []
+    rows: list[dict[str, Any]] = []
     listed = np.isin(system.numbers, chosen_modules(system, arguments.modules).numbers)
     for n in map(int, np.flatnonzero(listed)):
         rows.append({"number": int(system.numbers[n]), "from": _listed(segments[n, 0]), "to": _listed(segments[n, 1])})

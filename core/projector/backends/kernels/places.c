@@ -39,7 +39,7 @@ INLINE F along(const Line *line, int row, F third) { return third * (F)(REAL)lin
 
 INLINE I place(F x, int64_t n, I inside, I *first, F *share) {
     inside &= (x >= (F)-0.5) & (x <= (F)((REAL)n - (REAL)0.5));
-    const F within = MIN(MAX(inside ? x : (F)0, (F)0), (F)(REAL)(n - 1));
+    const F within = MIN(MAX(x, (F)0), (F)(REAL)(n - 1)); // 0 of what is not a number
     const F low = MIN(within, (F)(REAL)(n > 1 ? n - 2 : 0));
     *first = AS(I, low);
     *share = within - AS(F, *first);

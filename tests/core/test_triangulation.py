@@ -1,0 +1,180 @@
+"""The place of a marker from its images, its covariance, and the image that does not fit."""
+
+import numpy as np
+import pytest
+
+import mphdrr.core as mph
+
+from .conftest import refused
+from .odd_views import odd_views
+
+POINT = np.array([12.0, -21, 17])
+
+
+def noisy_fits(views, modules, covariances, n, seed):
+    """Fits of n draws of a marker's images with noise of these covariances (N, 2, 2)."""
+    exact = mph.project_points(views, [POINT])[modules, 0]
+    noise = np.random.default_rng(seed).normal(size=(n, len(modules), 2))
+    noise = np.einsum("nij,knj->kni", np.linalg.cholesky(covariances), noise)
+    return [mph.fit_marker(views, modules, exact + each, covariances) for each in noise], mph.fit_marker(
+        views, modules, exact, covariances
+    )
+
+
+def general_covariances(n):
+    parts = np.random.default_rng(3).normal(size=(n, 2, 2)) * 0.3
+    return parts @ parts.swapaxes(1, 2) + 0.04 * np.eye(2)
+
+
+@pytest.mark.parametrize("detector", ["virtual", "real"])
+def test_exact_images_give_the_point(scanner, rng, detector):
+    views = scanner.views((256, 240), detector)
+    points = rng.uniform(-60, 60, (60, 3))
+    pixels = mph.project_points(views, points)
+    for i, point in enumerate(points):
+        modules = rng.choice(80, rng.integers(2, 9), replace=False)
+        assert np.abs(mph.triangulate(views, modules, pixels[modules, i]) - point).max() < 1e-9
+    everywhere = mph.fit_marker(views, np.arange(80), pixels[:, 0])
+    assert np.abs(everywhere.point - points[0]).max() < 1e-9 and everywhere.degrees == 157 and everywhere.p_value == 1
+
+
+@pytest.mark.parametrize("parallel", [False, True])
+def test_exact_images_of_odd_views_give_the_point(rng, parallel):
+    views = odd_views(parallel)
+    points = rng.uniform(-40, 40, (10, 3))
+    pixels = mph.project_points(views, points)
+    for i, point in enumerate(points):
+        for modules in ([0, 1], [5, 2], [4, 3, 5], range(6)):
+            modules = list(modules)
+            sigma = general_covariances(len(modules))
+            assert np.abs(mph.triangulate(views, modules, pixels[modules, i], sigma) - point).max() < 1e-9
+
+
+def test_the_place_is_the_most_likely_one():
+    views = odd_views()
+    modules, sigma = [0, 2, 4, 5], np.array([0.5, 1.0, 0.7, 2.0])
+    pixels = mph.project_points(views, [POINT])[modules, 0] + [[1, -2], [0.5, 3], [-2, 1], [4, 0]]
+    fit = mph.fit_marker(views, modules, pixels, sigma)
+
+    def chi2(point):
+        return (((pixels - mph.project_points(views, [point])[modules, 0]) / sigma[:, None]) ** 2).sum()
+
+    np.testing.assert_allclose(fit.residuals, pixels - mph.project_points(views, [fit.point])[modules, 0], atol=1e-10)
+    np.testing.assert_allclose(fit.chi2, chi2(fit.point), rtol=1e-10)
+    for axis in np.eye(3):
+        assert abs(chi2(fit.point + 1e-4 * axis) - chi2(fit.point - 1e-4 * axis)) < 1e-7
+        assert chi2(fit.point + 0.01 * axis) > fit.chi2
+    np.testing.assert_array_equal(mph.triangulate(views, modules, pixels, sigma), fit.point)
+    # Only the ratios of sigmas count for the place; the covariance grows by their square.
+    wider = mph.fit_marker(views, modules, pixels, 3 * sigma)
+    np.testing.assert_allclose(wider.point, fit.point, atol=1e-9)
+    np.testing.assert_allclose(wider.covariance, 9 * fit.covariance, rtol=1e-8)
+    by_matrix = mph.fit_marker(views, modules, pixels, sigma[:, None, None] ** 2 * np.eye(2))
+    np.testing.assert_allclose(by_matrix.covariance, fit.covariance, rtol=1e-8)
+    np.testing.assert_allclose(fit.standard_deviations**2, np.diag(fit.covariance))
+
+
+@pytest.mark.parametrize("parallel", [False, True])
+def test_the_stated_covariance_holds_on_average(parallel):
+    modules = [1, 4, 5]
+    fits, exact = noisy_fits(odd_views(parallel), modules, general_covariances(3), 1000, 1)
+    away = np.array([fit.point for fit in fits]) - POINT
+    own = np.array([d @ np.linalg.solve(fit.covariance, d) for d, fit in zip(away, fits, strict=True)])
+    # The mean of 1000 numbers of standard deviation sqrt(6) is known to 2.6 % of 3.
+    np.testing.assert_allclose([own.mean(), np.mean([f.chi2 for f in fits])], 3, rtol=0.05)
+    np.testing.assert_allclose(np.mean([f.misfits for f in fits]), 2, rtol=0.05)
+    counts = np.histogram([f.p_value for f in fits], 5, (0, 1))[0]
+    assert np.abs(counts - 200).max() < 45  # 3.5 standard deviations
+    assert np.linalg.eigvalsh(exact.covariance).min() > 0
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("modules", [[1, 4, 5], [0, 3]])
+def test_the_stated_covariance_holds(modules):
+    """All of it to 5 %, measured in its own axes; 20 000 draws know a variance to 1 %."""
+    fits, exact = noisy_fits(odd_views(), modules, general_covariances(len(modules)), 20000, 2)
+    points = np.array([fit.point for fit in fits])
+    found = np.linalg.solve(np.linalg.cholesky(exact.covariance), (points - POINT).T)
+    np.testing.assert_allclose(found @ found.T / len(fits), np.eye(3), atol=0.05)
+
+
+@pytest.mark.long
+def test_the_stated_covariance_holds_for_a_marker_in_the_scanner(scanner):
+    modules = [0, 17, 44, 71]
+    fits, exact = noisy_fits(scanner.views(), modules, np.tile(0.25 * np.eye(2), (4, 1, 1)), 20000, 4)
+    found = np.linalg.solve(np.linalg.cholesky(exact.covariance), (np.array([f.point for f in fits]) - POINT).T)
+    np.testing.assert_allclose(found @ found.T / len(fits), np.eye(3), atol=0.05)
+
+
+def test_p_values_are_those_of_chi2():
+    stats = pytest.importorskip("scipy.stats", reason="scipy is not installed")
+    views = odd_views()
+    pixels = mph.project_points(views, [POINT])[:, 0]
+    for modules in ([0, 1], [0, 1, 2], [0, 1, 2, 3, 4, 5]):
+        for size in (0.1, 1.0, 6.0):
+            fit = mph.fit_marker(
+                views, modules, pixels[modules] + size * np.array([1, -1])[np.arange(len(modules)) % 2][:, None]
+            )
+            np.testing.assert_allclose(fit.p_value, stats.chi2.sf(fit.chi2, fit.degrees), rtol=1e-8)
+            if len(modules) > 2:
+                np.testing.assert_allclose(fit.misfit_p_values, stats.chi2.sf(fit.misfits, 2), rtol=1e-8)
+
+
+@pytest.mark.parametrize("wrong", range(6))
+def test_the_module_that_does_not_fit_is_found(wrong):
+    views = odd_views()
+    pixels = mph.project_points(views, [POINT])[:, 0] + np.random.default_rng(wrong).normal(size=(6, 2)) * 0.3
+    fit = mph.fit_marker(views, range(6), pixels, 0.3)
+    assert fit.p_value > 0.001 and fit.misfit_p_values.min() > 0.0005
+    pixels[wrong] += [4, -3]
+    fit = mph.fit_marker(views, range(6), pixels, 0.3)
+    assert fit.p_value < 1e-6 and fit.worst == wrong and fit.misfit_p_values[wrong] < 1e-6
+    others = np.delete(np.arange(6), wrong)
+    without = mph.fit_marker(views, others, pixels[others], 0.3)
+    # By as much chi2 falls without it; to first order, for an image that is wrong by 17 sigma.
+    np.testing.assert_allclose(fit.misfits[wrong], fit.chi2 - without.chi2, rtol=0.02)
+
+
+def test_of_two_images_none_is_called_wrong():
+    views = odd_views()
+    pixels = mph.project_points(views, [POINT])[[0, 3], 0]
+    fit = mph.fit_marker(views, [0, 3], pixels + np.array([[0, 0], [0, 5]]), 0.3)
+    assert fit.worst is None and np.isnan(fit.misfits).all() and fit.degrees == 1 and fit.p_value < 1e-6
+
+
+def test_images_that_give_no_place_are_refused(scanner):
+    views = odd_views()
+    pixels = mph.project_points(views, [POINT])[:, 0]
+    refused(lambda: mph.triangulate(views, [2], pixels[:1]), "two or more views", "got 1")
+    refused(lambda: mph.triangulate(views, 2, pixels[:1]), "two or more views")
+    refused(lambda: mph.triangulate(views, [2, 1, -4], pixels[:3]), "each view once", "view 2 2 times")
+    refused(lambda: mph.triangulate(views, [2, 6], pixels[:2]), "no view 6 among 6")
+    refused(lambda: mph.triangulate(views, [0.0, 1.0], pixels[:2]), "index of a view")
+    refused(lambda: mph.triangulate(views, [0, 1], pixels[:3]), "pixels", "2 x 2")
+    refused(lambda: mph.triangulate(views, [0, 1], pixels[:2], 0), "sigma", "more than 0")
+    refused(lambda: mph.triangulate(views, [0, 1], pixels[:2], [1, 2, 3]), "sigma", "shape 2")
+    lopsided = [np.eye(2), [[1, 2], [0, 1]]]
+    refused(lambda: mph.triangulate(views, [0, 1], pixels[:2], lopsided), "sigma", "1 is not")
+    refused(lambda: mph.triangulate(views, [0, 1], pixels[:2], [np.eye(2), np.ones((2, 2))]), "sigma", "1 is not")
+
+
+def pair(apart, parallel=False):
+    """Two views 200 mm from the origin, their sources `apart` mm from each other, looking in one direction."""
+    sources = np.array([[0, 0, -200.0], [apart, 0, -200]])
+    return mph.Views(sources, sources + np.array([0, 0, 400]), [[1, 0, 0]] * 2, [[0, 1, 0]] * 2, (256, 256), parallel)
+
+
+def test_rays_that_leave_the_depth_unknown_are_refused():
+    refused(lambda: mph.triangulate(pair(40), [0, 1], [[30, 40], [30, 40]]), "parallel", "how deep")
+    refused(lambda: mph.triangulate(pair(40, True), [0, 1], [[30, 40], [20, 40]]), "parallel", "how deep")
+    # These meet behind the sources, as if swapped.
+    refused(lambda: mph.triangulate(pair(40), [0, 1], [[30, 40], [80, 40]]), "behind the source of image")
+    pixels = mph.project_points(pair(0.5), [[3, 4, 0]])[:, 0]
+    np.testing.assert_allclose(mph.triangulate(pair(0.5), [0, 1], pixels), [3, 4, 0], atol=1e-9)
+    refused(lambda: mph.fit_marker(pair(0.5), [0, 1], pixels), "nearly parallel", "200 mm from a source")
+    fit = mph.fit_marker(pair(0.5), [0, 1], pixels, 0.01)
+    # Depth z from the disparity d: dz = z^2 / (f b) dd, with f b = 400 px mm * 0.5 and dd = 0.01 sqrt(2) px.
+    np.testing.assert_allclose(fit.standard_deviations[2], 200**2 / (400 * 0.5) * 0.01 * np.sqrt(2), rtol=1e-6)
+    near = np.array([pair(1e-5).sources, pair(1e-5).detector_centers])
+    views = mph.Views(near[0], near[1], [[1, 0, 0]] * 2, [[0, 1, 0]] * 2, (256, 256))
+    refused(lambda: mph.triangulate(views, [0, 1], mph.project_points(views, [[3, 4, 0]])[:, 0]), "parallel")

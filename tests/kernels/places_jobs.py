@@ -12,7 +12,7 @@ from mphdrr.core.projector.backends.cpu import _PlacesJob
 
 from .jobs import BAD, Array, Made, Read, close, packed
 
-JOBS = 2000
+JOBS = 1_000
 
 
 def places_jobs() -> Iterator[Made]:

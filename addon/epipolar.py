@@ -103,6 +103,18 @@ def run_views(scene: bpy.types.Scene) -> RunViews | None:
     return _runs[uid]
 
 
+def required_views(scene: bpy.types.Scene) -> RunViews:
+    """As `run_views`; `InputError` where there are none."""
+    run = run_views(scene)
+    if run is not None:
+        return run
+    if not images.is_of(scene):
+        raise InputError("the projections are of another scene: render this one's first")
+    raise InputError(
+        "the shown run was kept by an earlier version, without its views: show it anew, or render it again"
+    )
+
+
 def picked(scene: bpy.types.Scene) -> Picked | None:
     """What there is to see; None where no pixel was picked in views such as those of the shown run.
 
@@ -135,11 +147,7 @@ def pick(scene: bpy.types.Scene, module: int, column: float, row: float, k: floa
 
     Raises InputError where there is no such module or pixel.
     """
-    settings, run = scene.mphdrr_epipolar, run_views(scene)
-    if run is None:
-        raise InputError(
-            "the shown run was kept by an earlier version, without its views: show it anew, or render it again"
-        )
+    settings, run = scene.mphdrr_epipolar, required_views(scene)
     if not k:
         detector, middle, *_ = run.depths(run.index(module))
         k = settings.k if (settings.views, settings.module) == (run.name, module) else detector / middle

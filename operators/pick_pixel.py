@@ -9,6 +9,7 @@ from ..addon import epipolar, epipolar_drawing, ids, tiles
 from ..addon.decimals import typed
 from ..addon.eyedropper import Eyedropper, region_under
 from ..addon.reports import polled, run_reported
+from ..core.errors import InputError
 
 
 class MPHDRR_OT_pick_pixel(Eyedropper, bpy.types.Operator):
@@ -39,6 +40,14 @@ class MPHDRR_OT_pick_pixel(Eyedropper, bpy.types.Operator):
     @classmethod
     def poll(cls, context: bpy.types.Context) -> bool:
         return polled(cls, ids.MOSAIC in bpy.data.images, "No projections yet: render them first")
+
+    def invoke(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str]:
+        try:
+            epipolar.required_views(context.scene)
+        except InputError as error:
+            self.report({"ERROR"}, str(error))
+            return {"CANCELLED"}
+        return super().invoke(context, event)
 
     def execute(self, context: bpy.types.Context) -> set[str]:
         def pick() -> str:

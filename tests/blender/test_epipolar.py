@@ -8,6 +8,7 @@ import pytest
 from mathutils import Matrix
 
 from mphdrr.addon import epipolar, epipolar_drawing, ids, images, planes, scanner, tiles, volumes
+from mphdrr.core.errors import InputError
 from mphdrr.core.geometry.grid import Grid
 from mphdrr.core.perspective.perspective_grid import PerspectiveGrid
 from mphdrr.core.volumes.volume import Volume
@@ -248,3 +249,5 @@ def test_a_run_of_another_scene_has_no_lines_here(projected, scene):
     other = bpy.data.scenes.new("Other")
     other.mphdrr_epipolar.views = scene.mphdrr_epipolar.views
     assert epipolar.picked(other) is None and epipolar.picked(scene) is not None
+    with pytest.raises(InputError, match="of another scene"):
+        epipolar.pick(other, 2, 33, 21)

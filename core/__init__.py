@@ -24,10 +24,12 @@ from .geometry.presets import c_arm_views, pinhole_views
 from .geometry.ring_fits import RingFit, fit_rings, ring_order
 from .geometry.system import PinholeSystem
 from .geometry.views import Views
+from .perspective.backprojection import backproject, views_that_see
 from .perspective.coordinates import line_through, transform_lines, transform_points
 from .perspective.correspondence import Correspondences, find_correspondences, samples_along_rays
 from .perspective.epipolar import epipolar_lines, epipolar_segments, epipole, essential_matrix, fundamental_matrix
 from .perspective.perspective_grid import PerspectiveGrid, depth_ranges, perspective_grids
+from .perspective.predictions import predict_views, prediction_errors, spread_along_rays
 from .perspective.resampling import camera_to_camera, from_perspective, to_perspective
 from .perspective.triangulation import MarkerFit, fit_marker, triangulate
 from .perspective.view_rays import intrinsic_matrices, points_at_depths, project_points, view_frames
@@ -66,6 +68,7 @@ from .reconstruction.scores.nema import NemaScore, NemaSphere, nema_score
 from .reconstruction.scores.summary import VolumeScore, score_volume
 from .reconstruction.stopping import StoppingRule, StopWhen
 from .reconstruction.tv import tv
+from .runs.backprojecting import backproject_run, run_line_integrals
 from .runs.files import read_run, write_run
 from .runs.frame_files import read_counts
 from .runs.measured import counts_run

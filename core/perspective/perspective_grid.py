@@ -215,13 +215,18 @@ def depth_ranges(views: Views, grid: Grid) -> tuple[Floats, Floats]:
     """
     instance(views, Views, "depths: views")
     instance(grid, Grid, "depths: grid")
-    normals = np.cross(views.u_steps, views.v_steps)
-    ahead = np.einsum("mi,mi->m", normals, views.detector_centers - views.sources)
-    normals *= (np.sign(ahead) / np.linalg.norm(normals, axis=1))[:, None]
-    depths = np.einsum("mpi,mi->mp", grid.corners() - views.sources[:, None], normals)
+    depths = depths_in_views(views, grid.corners())
     near, far = depths.min(axis=1), depths.max(axis=1)
     if not views.parallel and near.min() <= 0:
         raise InputError(
             f"view {int(near.argmin())}: expected a grid in front of its source, but it begins {-near.min():.3g} mm behind"
         )
     return near, far
+
+
+def depths_in_views(views: Views, points: ArrayLike) -> Floats:
+    """The depths (M, N), mm, of world points (N, 3) in each view: from its source across its detector's plane."""
+    normals = np.cross(views.u_steps, views.v_steps)
+    ahead = np.einsum("mi,mi->m", normals, views.detector_centers - views.sources)
+    normals *= (np.sign(ahead) / np.linalg.norm(normals, axis=1))[:, None]
+    return np.asarray(np.einsum("mpi,mi->mp", np.asarray(points) - views.sources[:, None], normals))

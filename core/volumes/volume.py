@@ -19,6 +19,7 @@ UNITS = {
     "modules": "1",
     "resolution": "mm",
     "completeness": "1",
+    "backprojection": "images' unit",  # of what views say together (core.perspective.backprojection)
 }
 """The quantities that a volume may hold, and their units."""
 

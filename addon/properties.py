@@ -27,6 +27,7 @@ from . import (
     column_maps,
     display_properties,
     ids,
+    perspective_properties,
     phantom_properties,
     projection_properties,
     reconstruction_properties,
@@ -231,6 +232,7 @@ CLASSES = (
     *projection_properties.CLASSES,
     *reconstruction_properties.CLASSES,
     *display_properties.CLASSES,
+    *perspective_properties.CLASSES,
     *column_maps.CLASSES,
 )
 
@@ -243,5 +245,6 @@ POINTERS = (
     (bpy.types.Scene, "mphdrr_projections", projection_properties.ProjectionProperties),
     (bpy.types.Scene, "mphdrr_reconstruction", reconstruction_properties.ReconstructionProperties),
     (bpy.types.Scene, "mphdrr_display", display_properties.DisplayProperties),
+    (bpy.types.Scene, "mphdrr_perspective", perspective_properties.PerspectiveProperties),
     (bpy.types.WindowManager, "mphdrr_columns", column_maps.ColumnMapProperties),
 )

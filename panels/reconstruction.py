@@ -73,3 +73,16 @@ class MPHDRR_PT_reconstruction_model(Sidebar, bpy.types.Panel):
         layout.use_property_split = True
         layout.use_property_decorate = False
         _draw(layout.column(), context.scene.mphdrr_reconstruction, False)
+
+
+class MPHDRR_PT_backprojection(Sidebar, bpy.types.Panel):
+    bl_label = "Back-Projection"
+    bl_parent_id = "MPHDRR_PT_reconstruction"
+    bl_options = {"DEFAULT_CLOSED"}
+
+    def draw(self, context: bpy.types.Context) -> None:
+        layout = self.layout
+        layout.operator_context = "INVOKE_DEFAULT"
+        settings = context.scene.mphdrr_reconstruction
+        layout.row().prop(settings, "how", expand=True)
+        layout.operator(ids.BACKPROJECT, text="Back-Project", icon="OUTLINER_DATA_VOLUME")

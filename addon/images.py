@@ -14,6 +14,7 @@ import bpy
 import numpy as np
 from numpy.typing import NDArray
 
+from ..core.geometry.views import Views
 from ..core.progress import Progress
 from ..core.runs.display import Display
 from ..core.runs.exr import exr_bytes
@@ -22,6 +23,7 @@ from ..core.runs.run import ProjectionRun
 from . import ids, jobs
 
 _KEY = "mphdrr_projection"  # custom property: marks the images that a new run replaces
+_ARRAYS = ("sources", "detector_centers", "u_steps", "v_steps")
 _PIXELS = 2.2e7
 """Of all pictures together, about: larger images are shown smaller, since a picture takes memory again when it is drawn."""
 _PNG_LEVEL = 1  # fast
@@ -30,6 +32,7 @@ _SCANNER = "mphdrr_scanner"  # custom property of the mosaic: the collection of 
 _TEXT = "mphdrr_difference"  # custom property of a difference: its numbers, in words
 _LABELS = "mphdrr_labels"  # custom property of the mosaic: what stands in each of its images, line by line
 _TILES = "mphdrr_tiles"  # custom property of the mosaic: its modules, unit, and where in it which one's image is
+_VIEWS = "mphdrr_views"  # custom property of the mosaic: the run's views, as arrays of `Views`, and their ROI radii
 
 
 @dataclass(frozen=True)
@@ -77,6 +80,8 @@ def storing(run: ProjectionRun, made: Pictures) -> Generator[tuple[str, int, int
     mosaic = new[ids.MOSAIC]
     _describe(mosaic, made.drawn, numbers, run.system.rings().tolist(), run.unit, made.display)
     mosaic[_LABELS] = "\n".join(labels(run))
+    arrays = {name: getattr(run.views, name).ravel().tolist() for name in _ARRAYS}
+    mosaic[_VIEWS] = arrays | {"shape": run.views.shape, "roi_radius": run.system.roi_radius.tolist()}
     return mosaic
 
 
@@ -140,6 +145,19 @@ def tiles(image: bpy.types.Image | None) -> dict[str, Any] | None:
     of earlier versions lack these six.
     """
     return None if image is None or _TILES not in image else image[_TILES].to_dict()
+
+
+def views_of(mosaic: bpy.types.Image) -> tuple[Views, NDArray[np.float64]] | None:
+    """The views of the mosaic's run, in its modules' order, and the radii of their ROIs (M,), mm.
+
+    None in files of versions that did not keep them, until a run is shown anew.
+    """
+    if _VIEWS not in mosaic:
+        return None
+    kept = mosaic[_VIEWS].to_dict()
+    arrays = {name: np.reshape(kept[name], (-1, 3)) for name in _ARRAYS}
+    n_v, n_u = kept["shape"]
+    return Views(**arrays, shape=(n_v, n_u)), np.array(kept["roi_radius"])
 
 
 def share_shown() -> tuple[float, float]:

@@ -26,6 +26,7 @@ from . import (
     choices,
     column_maps,
     display_properties,
+    epipolar_properties,
     ids,
     perspective_properties,
     phantom_properties,
@@ -232,6 +233,7 @@ CLASSES = (
     *projection_properties.CLASSES,
     *reconstruction_properties.CLASSES,
     *display_properties.CLASSES,
+    *epipolar_properties.CLASSES,
     *perspective_properties.CLASSES,
     *column_maps.CLASSES,
 )
@@ -245,6 +247,7 @@ POINTERS = (
     (bpy.types.Scene, "mphdrr_projections", projection_properties.ProjectionProperties),
     (bpy.types.Scene, "mphdrr_reconstruction", reconstruction_properties.ReconstructionProperties),
     (bpy.types.Scene, "mphdrr_display", display_properties.DisplayProperties),
+    (bpy.types.Scene, "mphdrr_epipolar", epipolar_properties.EpipolarProperties),
     (bpy.types.Scene, "mphdrr_perspective", perspective_properties.PerspectiveProperties),
     (bpy.types.WindowManager, "mphdrr_columns", column_maps.ColumnMapProperties),
 )

@@ -14,6 +14,7 @@ from .. import operators, panels
 from ..operators import add_phantom
 from . import (
     color_bar,
+    epipolar_drawing,
     following,
     framing,
     frustums,
@@ -159,9 +160,11 @@ HANDLERS: tuple[tuple[list[Any], Any], ...] = (
 # What is drawn over Blender's editors, in a window.
 DRAWINGS = (
     (bpy.types.SpaceImageEditor, tiles.draw, "POST_PIXEL"),
+    (bpy.types.SpaceImageEditor, epipolar_drawing.draw_over_pictures, "POST_PIXEL"),
     (bpy.types.SpaceImageEditor, run_notes.draw, "POST_PIXEL"),
     (bpy.types.SpaceView3D, color_bar.draw, "POST_PIXEL"),
     (bpy.types.SpaceView3D, sight_lines.draw, "POST_VIEW"),
+    (bpy.types.SpaceView3D, epipolar_drawing.draw_in_scene, "POST_VIEW"),
 )
 
 # What edited properties call (`addon/updates.py`).
@@ -180,6 +183,7 @@ UPDATES: dict[str, Callable[..., None]] = {
     "sight_lines": sight_lines.redraw,
     "display": recoloring.display_changed,
     "planes": planes.update,
+    "epipolar": epipolar_drawing.redraw,
     "active_run": rendering.active_run_changed,
 }
 

@@ -1,4 +1,5 @@
-"""Pictures of every phantom, a CT, the scanner's sensitivity and the demo: `make gallery` writes them to docs/images.
+"""Pictures of every phantom, a CT, the scanner's sensitivity, back-projections and the demo: `make gallery` writes them to
+docs/images.
 
     python examples/gallery.py FOLDER [CT]
 
@@ -45,6 +46,7 @@ def main(folder: Path, ct: Path | None) -> None:
         hounsfield = mph.centered(mph.read_volume(ct))
         volumes["chest CT"] = mph.hu_to_mu(hounsfield)
     keep(sheet(system, volumes), folder / "gallery.webp")
+    keep(back_projections(system), folder / "back-projections.webp")
     in_the_scanner(system, folder, hounsfield)
 
 
@@ -84,6 +86,28 @@ def sheet(system: mph.PinholeSystem, volumes: dict[str, mph.Volume]) -> Image.Im
         for column, picture in enumerate([*(s[::-1] for s in slices), image]):
             tile = colored(picture, volume.quantity != "activity").resize((TILE, TILE), Image.Resampling.BILINEAR)
             page.paste(tile, (left + column * (TILE + MARGIN), top + TEXT))
+    return page
+
+
+def back_projections(system: mph.PinholeSystem) -> Image.Image:
+    """A row for ideal holes and one for the scanner's: truth, sum, product and minimum, each from 0 to its largest."""
+    views, size = system.views((128, 128)), 2 * TILE - MARGIN
+    grid = mph.Grid.centered((84, 84, 42), 1.0)
+    truth = PHANTOMS["Derenzo"].voxelize(mph.Grid.centered((168, 168, 84), 0.5))
+    page = Image.new("RGB", (4 * (size + MARGIN) + MARGIN, 2 * (size + TEXT + MARGIN) + MARGIN), (24, 26, 29))
+    write = ImageDraw.Draw(page)
+    ideal, real = mph.Emission(system, pixel_points=1, tolerance=1e9), mph.Emission(system, hole="depth")
+    for row, (name, model) in enumerate({"ideal holes": ideal, "the scanner's holes": real}.items()):
+        counts = mph.Projector(truth.grid, views, model)(truth)
+        settings = {"recipe": {"model": {"kind": "emission"}}}
+        run = mph.ProjectionRun(counts, system, views, unit="counts", settings=settings)
+        said = {how: mph.backproject_run(run, how, grid=grid) for how in ("sum", "product", "minimum")}
+        for column, (label, volume) in enumerate({"truth": truth, **said}.items()):
+            middle = volume.grid.shape[2] // 2
+            picture = colored(volume.array[:, :, middle].T[::-1], grey=False)
+            left, top = column * (size + MARGIN) + MARGIN, row * (size + TEXT + MARGIN) + MARGIN
+            write.text((left, top + 4), f"{label}; {name}" if column else label, fill=(220, 222, 226))
+            page.paste(picture.resize((size, size), Image.Resampling.BICUBIC), (left, top + TEXT))
     return page
 
 

@@ -4,11 +4,12 @@ import bpy
 from bpy.props import EnumProperty
 
 from ..addon import choices, ids, images, tiles
+from ..addon.eyedropper import Eyedropper, region_under
 from ..addon.reports import polled
 from ..core.errors import InputError
 
 
-class MPHDRR_OT_pick_window(bpy.types.Operator):
+class MPHDRR_OT_pick_window(Eyedropper, bpy.types.Operator):
     """Click on a picture of the projections: the exact number there becomes the window's low or high end. The number under
     the mouse stands in the status bar; Esc or a right click leaves all as it was
     """
@@ -32,32 +33,11 @@ class MPHDRR_OT_pick_window(bpy.types.Operator):
             cls, shown, "No Image Editor is open: press Show Mosaic"
         )
 
-    def invoke(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str]:
-        context.window.cursor_modal_set("EYEDROPPER")
-        context.window_manager.modal_handler_add(self)
-        self._say(context, event)
-        return {"RUNNING_MODAL"}
-
-    def modal(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str]:
-        if event.type in {"ESC", "RIGHTMOUSE"}:
-            return self._end(context, "CANCELLED")
-        if event.type == "LEFTMOUSE" and event.value == "PRESS":
-            return self._pick(context, event)
-        if event.type == "MOUSEMOVE":
-            self._say(context, event)
-        return (
-            {"PASS_THROUGH"} if event.type in {"MIDDLEMOUSE", "WHEELUPMOUSE", "WHEELDOWNMOUSE"} else {"RUNNING_MODAL"}
-        )
-
-    def cancel(self, context: bpy.types.Context) -> None:
-        """Blender ends the operator: another file is loaded, or the window is closed."""
-        self._end(context, "CANCELLED")
-
-    def _pick(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str]:
+    def takes(self, context: bpy.types.Context, event: bpy.types.Event) -> bool:
         found = _under(context, event)
         if found is None:
             self.report({"WARNING"}, "Click on a picture of the projections, or press Esc")
-            return {"RUNNING_MODAL"}
+            return False
         shown = images.tiles(bpy.data.images[ids.MOSAIC]) or {}
         settings = context.scene.mphdrr_display
         window = shown.get("window", (settings.low, settings.high))
@@ -65,30 +45,21 @@ class MPHDRR_OT_pick_window(bpy.types.Operator):
             tiles.set_window(settings, self.end.lower(), found[1], window)
         except InputError as error:
             self.report({"WARNING"}, str(error))
-            return {"RUNNING_MODAL"}
+            return False
         self.report({"INFO"}, f"Window {self.end.lower()} is {found[1]:g} {shown['unit']}: {found[0]}")
-        return self._end(context, "FINISHED")
+        return True
 
-    def _say(self, context: bpy.types.Context, event: bpy.types.Event) -> None:
-        """Show the number under the mouse in the status bar."""
+    def says(self, context: bpy.types.Context, event: bpy.types.Event) -> str:
         found = _under(context, event)
         unit = (images.tiles(bpy.data.images.get(ids.MOSAIC)) or {}).get("unit", "")
         text = f"{found[0]}: {found[1]:g} {unit}" if found else "Click on a picture of the projections"
-        context.workspace.status_text_set(f"{text}   (click: window {self.end.lower()}; Esc: cancel)")
-
-    def _end(self, context: bpy.types.Context, result: str) -> set[str]:
-        context.window.cursor_modal_restore()
-        context.workspace.status_text_set(None)
-        return {result}
+        return f"{text}   (click: window {self.end.lower()}; Esc: cancel)"
 
 
 def _under(context: bpy.types.Context, event: bpy.types.Event) -> tuple[str, float] | None:
     """The exact number under the mouse, and what it is; None where there is none."""
-    for area in context.window.screen.areas:
-        region = next((region for region in area.regions if region.type == "WINDOW"), None)
-        if area.type != "IMAGE_EDITOR" or region is None:
-            continue
-        x, y = event.mouse_x - region.x, event.mouse_y - region.y
-        if 0 <= x < region.width and 0 <= y < region.height:
-            return tiles.value_at(area.spaces.active.image, *region.view2d.region_to_view(x, y))
-    return None
+    found = region_under(context, event)
+    if found is None or found[0].type != "IMAGE_EDITOR":
+        return None
+    area, region, place = found
+    return tiles.value_at(area.spaces.active.image, *region.view2d.region_to_view(*place))

@@ -94,6 +94,8 @@ class MPHDRR_MT_projections(bpy.types.Menu):
         layout.operator(ids.LIVE_PREVIEW, icon="VIEW_CAMERA")
         layout.operator(ids.SHOW_PROJECTIONS, icon="IMAGE_DATA")
         layout.operator_menu_enum(ids.PICK_WINDOW, "end", icon="EYEDROPPER")
+        layout.operator(ids.PICK_PIXEL, icon="EYEDROPPER")
+        layout.operator(ids.CLEAR_PIXEL, icon="X")
         layout.separator()
         layout.operator(ids.RECONSTRUCT, icon="OUTLINER_OB_VOLUME")
         layout.operator(ids.SHOW_RECONSTRUCTION, icon="IMAGE_DATA")

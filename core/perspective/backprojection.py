@@ -108,7 +108,8 @@ def backproject(
             matrix = g.index_matrix @ lattice.to_world
             take(points, lattice.thirds, values[None], matrix[None], progress=part_of(progress, m, len(views)), **given)
     if kind == LEAST:
-        points[np.isinf(points)] = 0.0
+        for plane in points:  # in little memory
+            plane[np.isinf(plane)] = 0.0
     elif kind == PRODUCT:
         _take_roots(points, seen, exponents)  # type: ignore[arg-type]
     return lattice.finished(points, "backprojection")
@@ -190,8 +191,11 @@ def _require_no_negative(values: Array, name: str, what: str, axes: tuple[str, .
 
 def _distributions(depth: Depth, views: Views) -> Iterator[tuple[PerspectiveGrid, Array]]:
     """Each view's perspective grid and distribution, checked."""
-    if not callable(depth) and len(depth) != len(views):
-        raise InputError(f"depth: expected a pair for each of {len(views)} views, got {len(depth)}")
+    if not callable(depth):
+        if not isinstance(depth, Sequence):
+            raise InputError(f"depth: expected a function or a list of pairs, got {type(depth).__name__}")
+        if len(depth) != len(views):
+            raise InputError(f"depth: expected a pair for each of {len(views)} views, got {len(depth)}")
     for m in range(len(views)):
         pair = depth(m) if callable(depth) else depth[m]
         if not (isinstance(pair, tuple | list) and len(pair) == 2 and isinstance(pair[0], PerspectiveGrid)):

@@ -15,6 +15,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..errors import InputError
+from ..memory import require
+from ..progress import Progress
 from ..validation import instance, real_array, whole_number
 from .perspective_grid import PerspectiveGrid
 from .view_rays import Floats, Indices, pixels_of, rays_by_depth, view_indices
@@ -60,6 +62,8 @@ def samples_along_rays(images: ArrayLike, grid: PerspectiveGrid, pixels: ArrayLi
     """
     images = _images(images, grid)
     pixels = real_array(pixels, "pixels", (2,), batch=True)
+    n = pixels.size // 2 * grid.n_k
+    require(8 * n * (2 * len(images) + 20), f"samples along {pixels.size // 2} rays at {grid.n_k} planes")
     points = _points(grid, pixels).reshape(-1, 3)
     matrices = grid.views.projection_matrices()
     values = [_interpolated(image, pixels_of(matrix, points)) for image, matrix in zip(images, matrices, strict=True)]
@@ -67,7 +71,12 @@ def samples_along_rays(images: ArrayLike, grid: PerspectiveGrid, pixels: ArrayLi
 
 
 def find_correspondences(
-    images: ArrayLike, grid: PerspectiveGrid, pixels: ArrayLike, others: Indices | None = None, half_width: int = 3
+    images: ArrayLike,
+    grid: PerspectiveGrid,
+    pixels: ArrayLike,
+    others: Indices | None = None,
+    half_width: int = 3,
+    progress: Progress | None = None,
 ) -> Correspondences:
     """The depths at which other views look most like the surroundings of `pixels`, and where these are in the others.
 
@@ -91,6 +100,8 @@ def find_correspondences(
         The views to compare with; default: all others.
     half_width : int
         The squares have 2 `half_width` + 1 pixels along columns and rows.
+    progress
+        Called as ``progress(done, total)`` after each pixel; what it raises stops the work.
 
     Returns
     -------
@@ -114,6 +125,8 @@ def find_correspondences(
     curves, counts = np.full((len(flat), grid.n_k), np.nan), np.zeros((len(flat), grid.n_k), np.intp)
     for i, pixel in enumerate(flat):
         curves[i], counts[i] = _scores(images, grid, pixel, chosen, half_width)
+        if progress is not None:
+            progress(i + 1, len(flat))
     depths, scores = _highest(curves, grid)
     starts, per_depth = rays_by_depth(grid.views, grid.m, flat)
     points = starts + depths[:, None] * per_depth

@@ -194,7 +194,7 @@ def test_what_is_at_hand_is_memory_enough(scanner):
     views, grid = scanner[:10].views((40, 40)), mph.Grid.centered((96, 96, 64), 1.5)
     images = np.ones((10, 40, 40), np.float32)
     volume = 4 * grid.n_voxels
-    for how, volumes in (("sum", 1), ("product", 3), ("minimum", 1.3)):  # a minimum also flags what no view sees
+    for how, volumes in (("sum", 1), ("product", 3), ("minimum", 1)):
         tracemalloc.start()
         mph.backproject(images, views, grid, how)
         _, peak = tracemalloc.get_traced_memory()
@@ -257,6 +257,7 @@ def test_what_is_not_understood_is_refused(rng, grid):
     refused(lambda: mph.backproject(images, views, grid.affine), "expected a Grid or a PerspectiveGrid")
     refused(lambda: mph.views_that_see(views, (3, 3, 3)), "expected a Grid or a PerspectiveGrid")
     refused(lambda: mph.backproject(images, grid, grid), "Views")
+    refused(lambda: mph.backproject(images, views, grid, depth=np.ones((4, 3))), "a function or a list", "ndarray")
     refused(lambda: mph.backproject(images, views, grid, depth=pairs[:3]), "each of 4 views", "3")
     refused(lambda: mph.backproject(images, views, grid, depth=[each for _, each in pairs]), "view 0", "pair")
     refused(lambda: mph.backproject(images, views, grid, depth=swapped), "view 0", "of another")

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 import mphdrr.core as mph
+from mphdrr.core import memory
 
 from .conftest import refused
 from .odd_views import odd_views
@@ -32,7 +33,7 @@ def linear_images(views):
 
 @pytest.mark.parametrize("uniform", ["k", "depth"])
 @pytest.mark.parametrize("parallel", [False, True])
-def test_samples_are_the_views_values_where_the_point_is(parallel, uniform):
+def test_samples_are_the_views_values_where_the_point_is(parallel, uniform, monkeypatch):
     views = odd_views(parallel)
     images = linear_images(views)
     pixels = np.array([[[49.0, 44], [10.3, 71.8]], [[88, 3.25], [-0.4, 89.4]]])
@@ -48,6 +49,9 @@ def test_samples_are_the_views_values_where_the_point_is(parallel, uniform):
         expected = 3 + 0.5 * columns - (np.arange(6)[:, None] + 1) * 0.25 * rows
         np.testing.assert_allclose(values[i][inside], expected[inside], atol=1e-9)
     assert np.isfinite(values).any(axis=(0, 1, 3)).all() and np.isnan(values).any()
+    monkeypatch.setattr(memory, "available", lambda: 1000)
+    refused(lambda: mph.samples_along_rays(images, grid, pixels), "4 rays at 9 planes", "of memory")
+    monkeypatch.undo()
     single = mph.samples_along_rays(images, grid, [49, 44])
     np.testing.assert_array_equal(single, values[0, 0])
 
@@ -83,7 +87,9 @@ def test_neither_scale_nor_offset_of_an_image_counts():
     images = spot_images(views)
     grid = mph.PerspectiveGrid(views, 2, 20, 150, 300)
     pixel = mph.project_points(views, SPOTS)[2, 1].round()
-    found = mph.find_correspondences(images, grid, pixel)
+    steps = []
+    found = mph.find_correspondences(images, grid, pixel, progress=lambda *step: steps.append(step))
+    assert steps == [(1, 1)]
     other = mph.find_correspondences(images * np.arange(1, 7)[:, None, None] + 5, grid, pixel)
     np.testing.assert_allclose(other.curves, found.curves, atol=1e-8)
     np.testing.assert_allclose(other.depths, found.depths, rtol=1e-7)

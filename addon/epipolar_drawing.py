@@ -1,0 +1,190 @@
+"""The picked pixel, its ray and epipolar lines, drawn over the pictures and in the 3D views; never rendered."""
+
+from typing import Any
+
+import bpy
+import gpu
+import numpy as np
+from gpu_extras.batch import batch_for_shader
+from numpy.typing import NDArray
+
+from . import epipolar, ids, images, planes, tiles
+
+Floats = NDArray[np.float64]
+
+_LINE, _FAINT = (0.2, 0.85, 1.0, 1.0), (0.2, 0.85, 1.0, 0.35)  # colours: in the ROI, and outside
+_MARKER, _PIXEL = (0.45, 1.0, 0.3, 1.0), (1.0, 1.0, 1.0, 1.0)
+_OUTLINE = (0.0, 0.0, 0.0, 0.6)
+_WIDTH, _MARKER_WIDTH = 1.3, 2.0  # of lines, in pixels of the screen at a resolution scale of 1
+_RADIUS = 4.5  # of a marker over a picture, in such pixels
+_SHARE = 0.025  # of a plane's width, or of the ROI's radius twice: that of a marker in the scene
+_BEFORE = 1.005  # of the way from the pinhole to a plane: where lines on it are drawn, so that it does not hide them
+
+_angles = np.linspace(0.0, 2.0 * np.pi, 25)
+_CIRCLE = np.stack([np.cos(_angles), np.sin(_angles)], axis=1).repeat(2, axis=0)[1:-1].reshape(-1, 2, 2)
+_CROSS = np.array([[(-1, -1), (1, 1)], [(-1, 1), (1, -1)]], np.float64)
+_SQUARE = np.array([[(-1, -1), (1, -1)], [(1, -1), (1, 1)], [(1, 1), (-1, 1)], [(-1, 1), (-1, -1)]], np.float64)
+_Drawn = list[tuple[Floats, tuple[float, ...], float]]  # ends of lines, their colour and width
+
+
+def draw_over_pictures() -> None:
+    """Draw what the pictures' modules see; Blender calls this for every Image Editor."""
+    context = bpy.context
+    image, (found, _) = context.space_data.image, epipolar.shown(context.scene)
+    shown = tiles.pictures(image) if found is not None else []
+    if found is None or not shown:
+        return
+    shape, unit = found.run.views.shape, context.preferences.system.ui_scale
+    to_region = _to_region(context, image)
+
+    def placed(picture: tiles.Picture, pixels: Floats) -> Floats:
+        return to_region(picture.places(pixels, shape))
+
+    gathered: dict[str, list[Floats]] = {name: [] for name in ("faint", "lines", "epipoles", "pixel", "markers")}
+    for picture in shown:
+        if picture.number not in found.run.numbers:
+            continue
+        index = found.run.index(picture.number)
+        place, epipole = placed(picture, found.places[index]), placed(picture, found.epipoles[index])
+        if index == found.index:
+            corners = placed(picture, found.pixel + np.array([(-0.5, -0.5), (0.5, 0.5)]))
+            half = np.maximum(np.abs(corners[1] - corners[0]) / 2, unit * _RADIUS)
+            gathered["pixel"].append(place + half * _SQUARE)
+            continue
+        gathered["faint"].append(placed(picture, found.lines[index])[None])
+        gathered["lines"].append(placed(picture, found.lines_in_roi[index])[None])
+        gathered["epipoles"].append(epipole + unit * _RADIUS * _CROSS)
+        gathered["markers"].append(place + unit * _RADIUS * _CIRCLE)
+    colors = {"faint": _FAINT, "lines": _LINE, "epipoles": _LINE, "pixel": _PIXEL, "markers": _MARKER}
+    gpu.state.blend_set("ALPHA")
+    for name, pieces in gathered.items():
+        width = unit * (_MARKER_WIDTH if name in ("pixel", "markers") else _WIDTH)
+        ends = np.concatenate(pieces) if pieces else np.empty((0, 2, 2))
+        if name != "faint":
+            _lines(ends, _OUTLINE, width + 2 * unit)
+        _lines(ends, colors[name], width)
+    gpu.state.blend_set("NONE")
+
+
+def draw_in_scene() -> None:
+    """Draw the ray with its marker, and on the planes what their modules see; Blender calls this for every 3D view."""
+    context = bpy.context
+    found, _ = epipolar.shown(context.scene)
+    if found is None or not context.space_data.overlay.show_overlays:
+        return
+    unit = context.preferences.system.ui_scale
+    gpu.state.blend_set("ALPHA")
+    gpu.state.depth_test_set("LESS_EQUAL")
+    for ends, color, width in _on_planes(context, found):
+        _lines(ends, color, unit * width)
+    whole, in_roi = found.ray[[0, 2]][None], found.ray[1:][None]
+    back = np.array(context.region_data.view_matrix.inverted())
+    radius = 2 * _SHARE * found.run.roi_radius[found.index]
+    ring = found.marker + radius * _CIRCLE @ back[:3, :2].T
+    _lines(in_roi, _LINE, unit * _MARKER_WIDTH)
+    gpu.state.depth_test_set("NONE")  # also where a phantom hides it
+    _lines(whole, _FAINT, unit * _WIDTH)
+    _lines(ring, _MARKER, unit * _MARKER_WIDTH)
+    gpu.state.blend_set("NONE")
+
+
+def redraw(*_: Any) -> None:
+    """Have the editors drawn again: the pixel or the marker was changed, perhaps by a script."""
+    for window in bpy.context.window_manager.windows:
+        for area in window.screen.areas:
+            if area.type in ("VIEW_3D", "IMAGE_EDITOR"):
+                area.tag_redraw()
+
+
+def plane_pixel(
+    context: bpy.types.Context, run: epipolar.RunViews, origin: Floats, direction: Floats
+) -> tuple[int, int, int] | None:
+    """The module's number, and column and row, of the pixel that a line of sight meets on the nearest plane it can see.
+
+    `origin` and `direction` (3,) are world ones.
+    """
+    shown, index, picture = _planes(context, run)
+    if picture is None:
+        return None
+    rows, columns = picture.size
+    met = []
+    for plane, i in zip(shown, index, strict=True):
+        inverse = np.linalg.inv(np.array(plane.matrix_world, np.float64))
+        start, way = inverse[:3, :3] @ origin + inverse[:3, 3], inverse[:3, :3] @ direction
+        distance = -start[2] / way[2] if way[2] > 0 else -1.0  # seen from behind, it is not there
+        right, up = (start + distance * way)[:2] + np.array([columns, rows]) / 2
+        if distance > 0 and 0 <= right < columns and 0 < up <= rows:
+            met.append((distance, run.numbers[i], *picture.pixel((rows - up, right), run.views.shape)))
+    return min(met)[1:] if met else None
+
+
+def _planes(
+    context: bpy.types.Context, run: epipolar.RunViews
+) -> tuple[list[bpy.types.Object], NDArray[np.intp], tiles.Picture | None]:
+    """The planes that are shown, which of the run's modules each is of, and a picture as theirs all are."""
+    names = [ids.picture_name(images.projection_name(number, run.numbers)) for number in run.numbers]
+    places = {name: i for i, name in enumerate(names)}
+    kept = [o for o in planes.planes(context.scene) if o.parent and o.data and o.data.name in places]
+    shown = [plane for plane in kept if plane.visible_get()]
+    picture = next(iter(tiles.pictures(shown[0].data)), None) if shown else None
+    return shown, np.array([places[plane.data.name] for plane in shown], np.intp), picture
+
+
+def _on_planes(context: bpy.types.Context, found: epipolar.Picked) -> _Drawn:
+    """What is drawn on the planes that are seen from where the view is: ends (N, 2, 3) of lines, world mm."""
+    run = found.run
+    shown, index, picture = _planes(context, run)
+    if picture is None:
+        return []
+    matrices = np.array([plane.matrix_world for plane in shown], np.float64)
+    view = context.region_data
+    back = np.array(view.view_matrix.inverted())
+    towards = back[:3, 3] - matrices[:, :3, 3] if view.is_perspective else back[:3, 2]
+    seen = np.sum(towards * matrices[:, :3, 2], axis=1) < 0  # a plane's -z leads to the ROI
+    rows, columns = picture.size
+    pinholes = np.array([plane.parent.matrix_world.translation for plane in shown], np.float64)[:, None, None]
+
+    def on_planes(chosen: NDArray[np.bool_], pixels: Floats, shape: Floats) -> Floats:
+        """Lines (…, 2, 3) on the planes of `chosen` modules: between pixels (M, 2, 2), or `shape` around pixels (M, 2)."""
+        down, right = np.moveaxis(picture.places(pixels[index[chosen]], run.views.shape), -1, 0)
+        middles = np.stack([right - columns / 2, rows / 2 - down], axis=-1)
+        ends = middles.reshape(len(middles), -1, *middles.shape[-1:])[:, None] + _SHARE * columns * shape
+        points = np.einsum("pij,pnej->pnei", matrices[chosen][:, :3, :2], ends) + matrices[chosen][:, None, None, :3, 3]
+        return ((1 - _BEFORE) * pinholes[chosen] + _BEFORE * points).reshape(-1, 2, 3)
+
+    others, own, line = seen & (index != found.index), seen & (index == found.index), np.zeros((1, 2, 2))
+    return [
+        (on_planes(others, found.lines, line), _FAINT, _WIDTH),
+        (on_planes(others, found.lines_in_roi, line), _LINE, _WIDTH),
+        (on_planes(others, found.epipoles, _CROSS), _LINE, _WIDTH),
+        (on_planes(others, found.places, _CIRCLE), _MARKER, _MARKER_WIDTH),
+        (on_planes(own, found.places, _SQUARE), _PIXEL, _MARKER_WIDTH),
+    ]
+
+
+def _to_region(context: bpy.types.Context, image: bpy.types.Image) -> Any:
+    """A function from rows and columns (…, 2) of an image, from its top left, to places (…, 2) in the editor's region."""
+    region, (width, height) = context.region, image.size
+    # `view_to_region` rounds to pixels; this way around does not.
+    first = np.array(region.view2d.region_to_view(0, 0))
+    last = np.array(region.view2d.region_to_view(region.width, region.height))
+
+    def to_region(places: Floats) -> Floats:
+        seen = np.stack([places[..., 1] / width, 1.0 - places[..., 0] / height], axis=-1)
+        return np.asarray((seen - first) / (last - first) * [region.width, region.height])
+
+    return to_region
+
+
+def _lines(ends: Floats, color: tuple[float, ...], width: float) -> None:
+    """Draw lines between ends (N, 2, 2 or 3), but for those that are NaN."""
+    ends = ends[np.isfinite(ends).all(axis=(1, 2))]
+    if not len(ends):
+        return
+    points = np.zeros((2 * len(ends), 3), np.float32)
+    points[:, : ends.shape[-1]] = ends.reshape(-1, ends.shape[-1])
+    shader = gpu.shader.from_builtin("POLYLINE_UNIFORM_COLOR")
+    shader.uniform_float("viewportSize", gpu.state.viewport_get()[2:])
+    shader.uniform_float("lineWidth", width)
+    shader.uniform_float("color", color)
+    batch_for_shader(shader, "LINES", {"pos": points}).draw(shader)

@@ -1,0 +1,98 @@
+"""Pick a pixel whose ray and epipolar lines are drawn."""
+
+import bpy
+import numpy as np
+from bpy.props import FloatProperty, IntProperty
+from bpy_extras import view3d_utils
+
+from ..addon import epipolar, epipolar_drawing, ids, tiles
+from ..addon.decimals import typed
+from ..addon.eyedropper import Eyedropper, region_under
+from ..addon.reports import polled, run_reported
+
+
+class MPHDRR_OT_pick_pixel(Eyedropper, bpy.types.Operator):
+    """Click on a pixel of a projection, in the Image Editor or on a plane in the scene: its ray is drawn there, and on the
+    other modules' projections its epipolar lines. Esc or a right click leaves all as it was
+    """
+
+    bl_idname = ids.PICK_PIXEL
+    bl_label = "Pick Pixel"
+    bl_options = {"REGISTER", "UNDO"}
+
+    module: IntProperty(name="Module", description="Number of the module", default=1, options={"SKIP_SAVE"})
+    column: FloatProperty(
+        name="Column",
+        description="Of the pixel, counted as in the arrays; 0: the centre of pixel 0",
+        options={"SKIP_SAVE"},
+    )
+    row: FloatProperty(
+        name="Row",
+        description="Of the pixel, counted as in the arrays; 0: the centre of pixel 0",
+        options={"SKIP_SAVE"},
+    )
+    k: FloatProperty(
+        name="k", description="Magnification of the marker in this module; 0: as it was, or that of the isocentre", min=0.0,
+        options={"SKIP_SAVE"},
+    )  # fmt: skip
+
+    @classmethod
+    def poll(cls, context: bpy.types.Context) -> bool:
+        return polled(cls, ids.MOSAIC in bpy.data.images, "No projections yet: render them first")
+
+    def execute(self, context: bpy.types.Context) -> set[str]:
+        def pick() -> str:
+            pixel = (typed(each) for each in (self.column, self.row, self.k))
+            found = epipolar.pick(context.scene, self.module, *pixel)
+            column, row = found.pixel
+            return f"Module {self.module}, column {column:g}, row {row:g}: {found.seen_by} modules see the marker"
+
+        return run_reported(self, pick)
+
+    def says(self, context: bpy.types.Context, event: bpy.types.Event) -> str:
+        found = _under(context, event)
+        if found is None:
+            return "Click on a pixel of a projection, in the Image Editor or on a plane   (Esc: cancel)"
+        return "Module {}, column {}, row {}   (click: pick; Esc: cancel)".format(*found)
+
+    def takes(self, context: bpy.types.Context, event: bpy.types.Event) -> bool:
+        found = _under(context, event)
+        if found is None:
+            self.report({"WARNING"}, "Click on a pixel of a projection, or press Esc")
+            return False
+        self.module, self.column, self.row = found
+        return self.execute(context) == {"FINISHED"}
+
+
+class MPHDRR_OT_clear_pixel(bpy.types.Operator):
+    """Draw no ray and no epipolar lines any more"""
+
+    bl_idname = ids.CLEAR_PIXEL
+    bl_label = "Clear Picked Pixel"
+    bl_options = {"REGISTER", "UNDO"}
+
+    @classmethod
+    def poll(cls, context: bpy.types.Context) -> bool:
+        return polled(cls, bool(context.scene.mphdrr_epipolar.views), "No pixel is picked")
+
+    def execute(self, context: bpy.types.Context) -> set[str]:
+        epipolar.clear(context.scene)
+        return {"FINISHED"}
+
+
+def _under(context: bpy.types.Context, event: bpy.types.Event) -> tuple[int, int, int] | None:
+    """The module's number, and column and row, of the pixel under the mouse; None where there is none."""
+    found, run = region_under(context, event), epipolar.run_views(context.scene)
+    if found is None or run is None:
+        return None
+    area, region, place = found
+    if area.type == "IMAGE_EDITOR":
+        at = tiles.picture_at(area.spaces.active.image, *region.view2d.region_to_view(*place))
+        return None if at is None else (at[0].number, *at[0].pixel(at[1], run.views.shape))
+    if area.type != "VIEW_3D":
+        return None
+    origin, direction = (
+        np.array(function(region, region.data, place), np.float64)
+        for function in (view3d_utils.region_2d_to_origin_3d, view3d_utils.region_2d_to_vector_3d)
+    )
+    return epipolar_drawing.plane_pixel(context, run, origin, direction)

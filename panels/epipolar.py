@@ -1,0 +1,57 @@
+"""The picked pixel, its ray and epipolar lines: in the 3D view's sidebar, and in the Image Editor's."""
+
+import bpy
+from bpy.app.translations import pgettext_iface as iface
+
+from ..addon import epipolar, ids
+from .geometry import Sidebar, draw_facts, draw_text
+
+
+class _Epipolar:
+    """Mix into a panel that shows the picked pixel."""
+
+    bl_label = "Epipolar Lines"
+    bl_options = {"DEFAULT_CLOSED"}
+
+    @classmethod
+    def poll(cls, context: bpy.types.Context) -> bool:
+        return ids.MOSAIC in bpy.data.images
+
+    def draw(self, context: bpy.types.Context) -> None:
+        layout = self.layout  # type: ignore[attr-defined]
+        layout.use_property_split = True
+        layout.use_property_decorate = False
+        settings = context.scene.mphdrr_epipolar
+        row = layout.row(align=True)
+        row.operator_context = "INVOKE_DEFAULT"
+        row.operator(ids.PICK_PIXEL, icon="EYEDROPPER")
+        row.operator(ids.CLEAR_PIXEL, text="", icon="X")
+        run = epipolar.run_views(context.scene)
+        if run is None or settings.views != run.name:
+            return
+        column = layout.column(align=True)
+        column.prop(settings, "module")
+        column.prop(settings, "column")
+        column.prop(settings, "row")
+        found, problem = epipolar.shown(context.scene)
+        if problem:
+            draw_text(layout, problem)
+        if found is None:
+            return
+        column = layout.column(align=True)
+        column.prop(settings, "along", slider=True)
+        column.prop(settings, "k")
+        draw_facts(
+            layout.split(factor=0.4),
+            ("Depth", f"{found.depth:.2f} mm"),
+            ("Marker", ", ".join(f"{x:.2f}" for x in found.marker) + " mm"),
+            ("Seen by", iface("{seen} of {count} modules").format(seen=found.seen_by, count=len(found.run.numbers))),
+        )
+
+
+class MPHDRR_PT_epipolar(_Epipolar, Sidebar, bpy.types.Panel):
+    bl_parent_id = "MPHDRR_PT_projections"
+
+
+class MPHDRR_PT_epipolar_of_images(_Epipolar, bpy.types.Panel):
+    bl_space_type, bl_region_type, bl_category = "IMAGE_EDITOR", "UI", ids.CATEGORY

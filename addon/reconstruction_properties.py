@@ -59,7 +59,8 @@ BackprojectionSettings.__annotations__["how"] = _PUT_TOGETHER
 
 def voxels_recipe(get: Callable[[str], Any]) -> Recipe:
     """The recipe's voxels alone; `get` gives a property's value."""
-    return Recipe(values_of({name: PROPERTIES[name] for name in _OF_VOXELS}, get))
+    values = values_of({name: PROPERTIES[name] for name in _OF_VOXELS}, get)
+    return Recipe({key: value for key, value in values.items() if value is not None})
 
 
 def settings_recipe(get: Callable[[str], Any], is_given: Callable[[str], bool]) -> Recipe:

@@ -64,7 +64,14 @@ def expected_corners(g: mph.PerspectiveGrid, plane: int) -> np.ndarray:
 
 
 def names() -> tuple:
-    kinds = (bpy.data.objects, bpy.data.meshes, bpy.data.images, bpy.data.collections, bpy.data.volumes, bpy.data.materials)
+    kinds = (
+        bpy.data.objects,
+        bpy.data.meshes,
+        bpy.data.images,
+        bpy.data.collections,
+        bpy.data.volumes,
+        bpy.data.materials,
+    )
     return tuple(sorted(block.name for block in kind) for kind in kinds)
 
 

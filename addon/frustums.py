@@ -188,6 +188,16 @@ def changes(scene: bpy.types.Scene, frustum: bpy.types.Object) -> str:
     return "; ".join(text)
 
 
+def seen_volumes(scene: bpy.types.Scene) -> list[bpy.types.Object]:
+    """The volumes of frustums that are seen, where these have the colours that the volumes have now."""
+    found = []
+    for frustum in frustums(scene):
+        was, item = json.loads(frustum[_KEY]), scene.objects.get(volume_of(frustum))
+        if frustum.visible_get() and volumes.is_volume(item) and was["colors"] == list(_shown_range(item)):
+            found.append(item)
+    return found
+
+
 def remove(scene: bpy.types.Scene, modules: list[bpy.types.Object] | None = None) -> int:
     """Remove the frustums of modules (their cameras), or of all, with what belongs to them; returns how many."""
     found = [frustum for frustum in frustums(scene) if modules is None or frustum.parent in modules]

@@ -149,7 +149,9 @@ def test_it_goes_with_its_module_and_says_what_is_not_true_any_more(shown, scene
     scene.mphdrr_projections.width = 30
     assert "other pixels" in frustums.changes(scene, frustum)
     scene.mphdrr_projections.width = SHAPE[1]
+    assert frustums.seen_volumes(scene) == [shown]  # whose colour bar is drawn
     shown.mphdrr_volume.display_high *= 0.5
+    assert frustums.seen_volumes(scene) == []
     assert frustums.changes(scene, frustum) == "other colours of Derenzo"
     shown.location.x += 4.0
     bpy.context.view_layer.update()
@@ -200,12 +202,25 @@ def test_it_is_hidden_and_removed_with_its_module(shown, scene):
     scanner.set_visible(frustum.parent, True)
     bpy.context.view_layer.update()
     assert not frustum.hide_viewport and not any(layer.hide_viewport for layer in frustum.children)
-    module_edits.remove(scanner.active_scanner(scene), [frustum.parent])
+    camera = frustum.parent
+    module_edits.remove(scanner.active_scanner(scene), [camera])
     assert frustums.frustums(scene) == [] and names()[2] == before[2]
     choose(4)
     bpy.ops.mphdrr.show_in_perspective(planes=2)
     module_edits.remove_scanner(scene, scanner.active_scanner(scene))
     assert frustums.frustums(scene) == [] and names()[2:4] == (before[2], [n for n in before[3] if "Ring" not in n])
+
+
+def test_it_is_hidden_where_its_modules_camera_was_deleted(shown, scene):
+    bpy.ops.mphdrr.show_in_perspective(planes=2)
+    (frustum,) = frustums.frustums(scene)
+    bpy.data.objects.remove(frustum.parent)
+    bpy.context.view_layer.update()
+    assert frustums.changes(scene, frustum) == "its module is gone"
+    frustums.after_update(scene, type("Updated", (), {"id_type_updated": lambda self, kind: True})())
+    assert frustum.hide_viewport and all(layer.hide_viewport for layer in frustum.children)
+    bpy.ops.mphdrr.clear_perspective()
+    assert frustums.frustums(scene) == []
 
 
 def test_what_cannot_be_shown_is_refused_in_a_line(shown, scene):

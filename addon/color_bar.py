@@ -1,4 +1,4 @@
-"""The colour bar of a volume with slices, or in perspective, in the 3D views: what the colours mean, with numbers and their unit."""
+"""The colour bar of a volume with slices, or in perspective, in the 3D views: what colours mean, numbers and their unit."""
 
 import blf
 import bpy

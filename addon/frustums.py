@@ -17,7 +17,6 @@ from mathutils import Matrix
 from numpy.typing import NDArray
 
 from ..core.errors import InputError
-from ..core.geometry.grid import Grid
 from ..core.geometry.views import Views
 from ..core.memory import require
 from ..core.perspective.perspective_grid import PerspectiveGrid
@@ -69,13 +68,13 @@ def showing(context: bpy.types.Context, planes: int, uniform: str) -> jobs.Job:
         stages = stages_of(progress)
         stages("reading the voxels")
         volume = asked.read()
-        g = _grid(asked, volume.grid, planes, uniform)
+        g = _grid(asked, volume, planes, uniform)
         array = in_perspective(volume, g, stages("following the rays"))
-        packing = stages("packing")
-        files = []
+        packing, files = stages("packing"), list[bytes]()
         for layer in np.moveaxis(array, 2, 0):
-            packing(len(files), planes)
             files.append(png(colored(as_seen(layer.T), quantity, low, high), _PNG_LEVEL))
+            if packing is not None:
+                packing(len(files), planes)
         return g, files
 
     def finish(made: tuple[PerspectiveGrid, list[bytes]]) -> str:
@@ -110,7 +109,7 @@ def resampling(context: bpy.types.Context, cells: int, uniform: str) -> jobs.Job
         stages = stages_of(progress)
         stages("reading the voxels")
         volume = asked.read()
-        g = _grid(asked, volume.grid, cells, uniform)
+        g = _grid(asked, volume, cells, uniform)
         array = in_perspective(volume, g, stages("following the rays"))
         found = on_voxels(array, g, volume, stages("back on voxels"))
         stages("writing the voxels")
@@ -261,16 +260,29 @@ def _display_range(item: bpy.types.Object) -> tuple[float, float]:
     return low / factor, high / factor
 
 
-def _grid(asked: _Request, grid: Grid, layers: int, uniform: str) -> PerspectiveGrid:
+def _grid(asked: _Request, volume: Volume, layers: int, uniform: str) -> PerspectiveGrid:
     """The module's cells from where the volume begins, or at least is not too close to the pinhole, to where it ends."""
-    views = asked.views
+    begin, end = _depths(asked.views, volume)
+    near = max(begin, asked.nearest)
+    if not near < end:
+        raise InputError(f"{asked.name!r} is not in front of the pinhole of {asked.module}")
+    return PerspectiveGrid(asked.views, 0, layers, near, end, uniform.lower())
+
+
+def _depths(views: Views, volume: Volume) -> tuple[float, float]:
+    """Between which depths a volume's voxels are that are not empty, or all of them if none is; mm."""
     normal = np.cross(views.u_steps[0], views.v_steps[0])
     normal *= np.sign(normal @ (views.detector_centers[0] - views.sources[0])) / np.linalg.norm(normal)
-    depths = (grid.corners() - views.sources[0]) @ normal
-    near, far = max(float(depths.min()), asked.nearest), float(depths.max())
-    if not near < far:
-        raise InputError(f"{asked.name!r} is not in front of the pinhole of {asked.module}")
-    return PerspectiveGrid(views, 0, layers, near, far, uniform.lower())
+    per_step, grid = normal @ volume.grid.affine[:3, :3], volume.grid
+    filled = volume.array != outside_value(volume)
+    if not filled.any():
+        filled = np.ones(grid.shape, bool)
+    across = per_step[1] * np.arange(grid.shape[1])[:, None] + per_step[2] * np.arange(grid.shape[2])
+    planes = ((n, across[plane]) for n, plane in enumerate(filled) if plane.any())  # one by one, in little memory
+    ends = np.array([[n * per_step[0] + found.min(), n * per_step[0] + found.max()] for n, found in planes])
+    first = float(normal @ (grid.affine[:3, 3] - views.sources[0]))
+    half = 0.5 * float(np.abs(per_step).sum())
+    return first + float(ends.min()) - half, first + float(ends.max()) + half
 
 
 def _build(

@@ -120,7 +120,7 @@ def steps():
     yield 4
     picture("through")
     for item in bpy.context.scene.objects:
-        if item.type == "VOLUME" or item.parent is not None and item.parent.type == "VOLUME":
+        if item.type == "VOLUME" or (item.parent is not None and item.parent.type == "VOLUME"):
             item.hide_set(True)
     call("show_modules", mode="ALL")
     settings = scene.mphdrr_projections

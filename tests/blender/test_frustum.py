@@ -39,10 +39,12 @@ def choose(number: int) -> bpy.types.Object:
 
 
 def grid_of(item, system, m: int, n_k: int, uniform: str) -> mph.PerspectiveGrid:
-    """The cells that a frustum of a module should show."""
-    views = system[m : m + 1].views(SHAPE)
-    near, far = mph.depth_ranges(views, volumes.volume_from_object(item).grid)
-    return mph.PerspectiveGrid(views, 0, n_k, near[0], far[0], uniform)
+    """The cells that a frustum of a module should show: between the depths of the first and last voxels' corners."""
+    views, volume = system[m : m + 1].views(SHAPE), volumes.volume_from_object(item)
+    filled = np.argwhere(volume.array != 0)[:, None] + np.reshape(np.indices((2, 2, 2)), (3, -1)).T - 0.5
+    places = filled @ volume.grid.affine[:3, :3].T + volume.grid.affine[:3, 3]
+    depths = (places - views.sources[0]) @ system.frames()[m, 2]
+    return mph.PerspectiveGrid(views, 0, n_k, depths.min(), depths.max(), uniform)
 
 
 def corners(layer: bpy.types.Object) -> np.ndarray:

@@ -17,7 +17,7 @@ _MARKER, _PIXEL = (0.45, 1.0, 0.3, 1.0), (1.0, 1.0, 1.0, 1.0)
 _OUTLINE = (0.0, 0.0, 0.0, 0.6)
 _WIDTH, _MARKER_WIDTH = 1.3, 2.0  # of lines, in pixels of the screen at a resolution scale of 1
 _RADIUS = 4.5  # of a marker over a picture, in such pixels
-_SHARE = 0.025  # of a plane's width, or of the ROI's radius twice: that of a marker in the scene
+_SHARE = 0.05  # of a plane's width, or of the ROI's radius: the radius of a marker in the scene
 _BEFORE = 1.005  # of the way from the pinhole to a plane: where lines on it are drawn, so that it does not hide them
 
 _angles = np.linspace(0.0, 2.0 * np.pi, 25)
@@ -31,38 +31,41 @@ def draw_over_pictures() -> None:
     """Draw what the pictures' modules see; Blender calls this for every Image Editor."""
     context = bpy.context
     image, (found, _) = context.space_data.image, epipolar.shown(context.scene)
-    shown = tiles.pictures(image) if found is not None else []
+    shown = [each for each in tiles.pictures(image) if each.number in found.run.numbers] if found is not None else []
     if found is None or not shown:
         return
-    shape, unit = found.run.views.shape, context.preferences.system.ui_scale
-    to_region = _to_region(context, image)
+    index = np.array([found.run.index(picture.number) for picture in shown])
+    corners, (width, height) = np.array([picture.corner for picture in shown]), image.size
+    # `view_to_region` rounds to pixels; this way around does not.
+    region = context.region
+    first = np.array(region.view2d.region_to_view(0, 0))
+    last = np.array(region.view2d.region_to_view(region.width, region.height))
 
-    def placed(picture: tiles.Picture, pixels: Floats) -> Floats:
-        return to_region(picture.places(pixels, shape))
+    def placed(pixels: Floats) -> Floats:
+        """Places (P, …, 2) in the region of pixels (M, …, 2) of the modules whose pictures these are."""
+        within = shown[0].places(pixels[index], found.run.views.shape) - shown[0].corner
+        at = within + corners.reshape(len(corners), *(1,) * (within.ndim - 2), 2)
+        seen = np.stack([at[..., 1] / width, 1.0 - at[..., 0] / height], axis=-1)
+        return np.asarray((seen - first) / (last - first) * [region.width, region.height])
 
-    gathered: dict[str, list[Floats]] = {name: [] for name in ("faint", "lines", "epipoles", "pixel", "markers")}
-    for picture in shown:
-        if picture.number not in found.run.numbers:
-            continue
-        index = found.run.index(picture.number)
-        place, epipole = placed(picture, found.places[index]), placed(picture, found.epipoles[index])
-        if index == found.index:
-            corners = placed(picture, found.pixel + np.array([(-0.5, -0.5), (0.5, 0.5)]))
-            half = np.maximum(np.abs(corners[1] - corners[0]) / 2, unit * _RADIUS)
-            gathered["pixel"].append(place + half * _SQUARE)
-            continue
-        gathered["faint"].append(placed(picture, found.lines[index])[None])
-        gathered["lines"].append(placed(picture, found.lines_in_roi[index])[None])
-        gathered["epipoles"].append(epipole + unit * _RADIUS * _CROSS)
-        gathered["markers"].append(place + unit * _RADIUS * _CIRCLE)
-    colors = {"faint": _FAINT, "lines": _LINE, "epipoles": _LINE, "pixel": _PIXEL, "markers": _MARKER}
+    unit = context.preferences.system.ui_scale
+    radius, others, own = unit * _RADIUS, index != found.index, index == found.index
+    places = placed(found.places)
+    faint, lines = (_open_at(placed(ends), places, radius)[others] for ends in (found.lines, found.lines_in_roi))
+    epipoles = placed(found.epipoles)[others, None, None] + radius * _CROSS
+    markers = places[others, None, None] + radius * _CIRCLE
+    edges = placed(found.pixel + np.full((len(found.places), 1, 2), 0.5))[own, 0]
+    half = np.maximum(np.abs(edges - places[own]), radius)[:, None, None]
     gpu.state.blend_set("ALPHA")
-    for name, pieces in gathered.items():
-        width = unit * (_MARKER_WIDTH if name in ("pixel", "markers") else _WIDTH)
-        ends = np.concatenate(pieces) if pieces else np.empty((0, 2, 2))
-        if name != "faint":
-            _lines(ends, _OUTLINE, width + 2 * unit)
-        _lines(ends, colors[name], width)
+    _lines(faint, _FAINT, unit * _WIDTH)
+    for ends, color, thick in (
+        (lines, _LINE, _WIDTH),
+        (epipoles, _LINE, _WIDTH),
+        (places[own, None, None] + half * _SQUARE, _PIXEL, _MARKER_WIDTH),
+        (markers, _MARKER, _MARKER_WIDTH),
+    ):
+        _lines(ends, _OUTLINE, unit * (thick + 2.0))
+        _lines(ends, color, unit * thick)
     gpu.state.blend_set("NONE")
 
 
@@ -79,7 +82,7 @@ def draw_in_scene() -> None:
         _lines(ends, color, unit * width)
     whole, in_roi = found.ray[[0, 2]][None], found.ray[1:][None]
     back = np.array(context.region_data.view_matrix.inverted())
-    radius = 2 * _SHARE * found.run.roi_radius[found.index]
+    radius = _SHARE * found.run.roi_radius[found.index]
     ring = found.marker + radius * _CIRCLE @ back[:3, :2].T
     _lines(in_roi, _LINE, unit * _MARKER_WIDTH)
     gpu.state.depth_test_set("NONE")  # also where a phantom hides it
@@ -142,42 +145,48 @@ def _on_planes(context: bpy.types.Context, found: epipolar.Picked) -> _Drawn:
     towards = back[:3, 3] - matrices[:, :3, 3] if view.is_perspective else back[:3, 2]
     seen = np.sum(towards * matrices[:, :3, 2], axis=1) < 0  # a plane's -z leads to the ROI
     rows, columns = picture.size
+    radius = _SHARE * columns
     pinholes = np.array([plane.parent.matrix_world.translation for plane in shown], np.float64)[:, None, None]
 
-    def on_planes(chosen: NDArray[np.bool_], pixels: Floats, shape: Floats) -> Floats:
-        """Lines (…, 2, 3) on the planes of `chosen` modules: between pixels (M, 2, 2), or `shape` around pixels (M, 2)."""
-        down, right = np.moveaxis(picture.places(pixels[index[chosen]], run.views.shape), -1, 0)
-        middles = np.stack([right - columns / 2, rows / 2 - down], axis=-1)
-        ends = middles.reshape(len(middles), -1, *middles.shape[-1:])[:, None] + _SHARE * columns * shape
-        points = np.einsum("pij,pnej->pnei", matrices[chosen][:, :3, :2], ends) + matrices[chosen][:, None, None, :3, 3]
-        return ((1 - _BEFORE) * pinholes[chosen] + _BEFORE * points).reshape(-1, 2, 3)
+    def local(pixels: Floats) -> Floats:
+        """Places (P, …, 2) on the planes of pixels (M, …, 2) of their modules."""
+        down, right = np.moveaxis(picture.places(pixels[index], run.views.shape), -1, 0)
+        return np.stack([right - columns / 2, rows / 2 - down], axis=-1)
 
-    others, own, line = seen & (index != found.index), seen & (index == found.index), np.zeros((1, 2, 2))
+    def world(chosen: NDArray[np.bool_], ends: Floats) -> Floats:
+        """Ends (N, 2, 3) of lines (P, n, 2, 2) on planes, of the `chosen` ones."""
+        points = np.einsum("pij,pnej->pnei", matrices[:, :3, :2], ends) + matrices[:, None, None, :3, 3]
+        return ((1 - _BEFORE) * pinholes + _BEFORE * points)[chosen].reshape(-1, 2, 3)
+
+    others, own = seen & (index != found.index), seen & (index == found.index)
+    places, epipoles = (local(pixels)[:, None, None] for pixels in (found.places, found.epipoles))
+    faint, lines = (_open_at(local(ends), places[:, 0, 0], radius) for ends in (found.lines, found.lines_in_roi))
     return [
-        (on_planes(others, found.lines, line), _FAINT, _WIDTH),
-        (on_planes(others, found.lines_in_roi, line), _LINE, _WIDTH),
-        (on_planes(others, found.epipoles, _CROSS), _LINE, _WIDTH),
-        (on_planes(others, found.places, _CIRCLE), _MARKER, _MARKER_WIDTH),
-        (on_planes(own, found.places, _SQUARE), _PIXEL, _MARKER_WIDTH),
+        (world(others, faint), _FAINT, _WIDTH),
+        (world(others, lines), _LINE, _WIDTH),
+        (world(others, epipoles + radius * _CROSS), _LINE, _WIDTH),
+        (world(others, places + radius * _CIRCLE), _MARKER, _MARKER_WIDTH),
+        (world(own, places + radius * _SQUARE), _PIXEL, _MARKER_WIDTH),
     ]
 
 
-def _to_region(context: bpy.types.Context, image: bpy.types.Image) -> Any:
-    """A function from rows and columns (…, 2) of an image, from its top left, to places (…, 2) in the editor's region."""
-    region, (width, height) = context.region, image.size
-    # `view_to_region` rounds to pixels; this way around does not.
-    first = np.array(region.view2d.region_to_view(0, 0))
-    last = np.array(region.view2d.region_to_view(region.width, region.height))
-
-    def to_region(places: Floats) -> Floats:
-        seen = np.stack([places[..., 1] / width, 1.0 - places[..., 0] / height], axis=-1)
-        return np.asarray((seen - first) / (last - first) * [region.width, region.height])
-
-    return to_region
+def _open_at(ends: Floats, places: Floats, radius: float) -> Floats:
+    """The two parts (P, 2, 2, 2) of lines (P, 2, 2) outside circles around places (P, 2) on them, so that one sees what is
+    there; NaN where there is none.
+    """
+    first, way = ends[:, 0], ends[:, 1] - ends[:, 0]
+    length = np.linalg.norm(way, axis=1)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        at = np.sum((places - first) * way, axis=1) / length
+        at = np.where(np.isfinite(at), at, np.inf)  # no circle: the first part is the whole line
+        parts = np.array([[np.zeros_like(at), np.minimum(at - radius, length)], [np.maximum(at + radius, 0.0), length]])
+        shares = np.where(parts[:, :1] < parts[:, 1:], parts / length, np.nan)  # (part, end, P)
+    return np.asarray(first[:, None, None] + shares.transpose(2, 0, 1)[..., None] * way[:, None, None])
 
 
 def _lines(ends: Floats, color: tuple[float, ...], width: float) -> None:
-    """Draw lines between ends (N, 2, 2 or 3), but for those that are NaN."""
+    """Draw lines between ends (…, 2, 2 or 3), but for those that are NaN."""
+    ends = ends.reshape(-1, *ends.shape[-2:])
     ends = ends[np.isfinite(ends).all(axis=(1, 2))]
     if not len(ends):
         return

@@ -155,7 +155,7 @@ def views_of(mosaic: bpy.types.Image) -> tuple[Views, NDArray[np.float64]] | Non
     if _VIEWS not in mosaic:
         return None
     kept = mosaic[_VIEWS].to_dict()
-    arrays = {name: np.reshape(kept[name], (-1, 3)) for name in _ARRAYS}
+    arrays: dict[str, Any] = {name: np.reshape(kept[name], (-1, 3)) for name in _ARRAYS}
     n_v, n_u = kept["shape"]
     return Views(**arrays, shape=(n_v, n_u)), np.array(kept["roi_radius"])
 

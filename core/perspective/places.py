@@ -126,7 +126,7 @@ def _places(
     for axis, divisor in enumerate((depth, depth, np.where(inside, p[4], 1.0))):
         place = np.zeros_like(depth) if flat and axis == 2 else p[axis] / divisor
         inside = inside & (place >= -0.5) & (place <= m[axis] - 0.5)
-        place = place.clip(0, m[axis] - 1)
+        place = np.where(inside, place, 0.0).clip(0, m[axis] - 1)  # what is not a number is nowhere
         first = np.minimum(place, max(m[axis] - 2, 0)).astype(np.intp)
         at.append(first)
         share.append(place - first)

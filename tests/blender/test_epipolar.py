@@ -216,13 +216,30 @@ def test_lines_on_planes_are_on_the_lines_of_sight_to_the_ray(projected, scene):
     _, (roi, _, _), _, (rings, _, _), (square, _, _) = epipolar_drawing._on_planes(context, found)
     shown = [plane.mphdrr_module.number for plane in planes.planes(scene)]
     others = [number for number in shown if number != 8]
-    assert len(roi) == 7 and len(square) == 4 and len(rings) == 7 * 24
-    for number, ends, ring in zip(others, roi, rings.reshape(7, 24, 2, 3), strict=True):
+    assert len(square) == 4
+    for number, ends, ring in zip(others, roi.reshape(7, 4, 3), rings.reshape(7, 24, 2, 3), strict=True):
         i = run.numbers.index(number)
-        drawn = epipolar.project_points(run.views, ends)[i]
-        assert np.abs(drawn - found.lines_in_roi[i]).max() < 1e-3, "on the same line of sight"
-        middle = epipolar.project_points(run.views, ring.reshape(-1, 3))[i].mean(axis=0)
-        assert np.abs(middle - found.places[i]).max() < 1e-2
+        drawn = epipolar.project_points(run.views, ends[np.isfinite(ends).all(axis=1)])[i]
+        place, line = found.places[i], found.lines_in_roi[i]
+        radius = np.linalg.norm(epipolar.project_points(run.views, ring.reshape(-1, 3))[i] - place, axis=1)
+        at_end = np.abs(drawn[:, None] - line).max(axis=2).min(axis=1) < 1e-3  # so on the same line of sight
+        at_circle = np.isclose(np.linalg.norm(drawn - place, axis=1), 0.05 * 90, rtol=0.01)
+        assert (at_end != at_circle).all() and at_end.sum() == at_circle.sum() == len(drawn) / 2
+        np.testing.assert_allclose(radius, 0.05 * 90, rtol=0.01, err_msg="a circle around the marker's image")
+
+
+def test_a_line_is_open_where_the_marker_is(scene):
+    ends = np.array([[(0, 0), (10, 0)], [(0, 0), (0, 10)], [(0, 0), (10, 0)], [(np.nan, 0), (3, 3)], [(0, 0), (8, 6)]])
+    places = np.array([(4, 0), (0, 9), (np.nan, np.nan), (0, 0), (0, 0)])
+    nothing = np.full((2, 2), np.nan)
+    expected = [
+        ([(0, 0), (2, 0)], [(6, 0), (10, 0)]),
+        ([(0, 0), (0, 7)], nothing),
+        ([(0, 0), (10, 0)], nothing),
+        (nothing, nothing),
+        (nothing, [(1.6, 1.2), (8, 6)]),
+    ]
+    np.testing.assert_allclose(epipolar_drawing._open_at(ends, places, 2.0), np.array(expected), atol=1e-12)
 
 
 def test_a_run_of_another_scene_has_no_lines_here(projected, scene):

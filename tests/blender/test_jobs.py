@@ -34,7 +34,7 @@ from mphdrr.core.volumes.volume_files import write_volume
 def scanned(scene, ring_system):
     """A scanner, a phantom that is active, and a run of its projections."""
     scanner.build_scanner(scene, ring_system, "Ring")
-    jobs.run(phantoms.adding(plain_settings("derenzo", voxels=16), "Derenzo"))
+    jobs.run(phantoms.adding(plain_settings("derenzo", voxels=16, rod_diameters=(10, 8, 0, 0, 0, 0)), "Derenzo"))
     bpy.ops.mphdrr.render_projections(width=10, height=12)
 
 
@@ -75,12 +75,15 @@ def everything() -> dict[str, object]:
     return found
 
 
+TANK = {"rod_diameters": (0,) * 6, "sphere_diameters": (30, 0, 0, 0, 0, 0)}  # little to paint
+
+
 def projecting(tmp_path):
     return rendering.render_job(bpy.context, Recipe({"detector.rows": 9, "detector.columns": 14}), "Derenzo")
 
 
 def adding(tmp_path):
-    return phantoms.adding(plain_settings("nema", voxels=16), "Body", attenuation=True)
+    return phantoms.adding(plain_settings("jaszczak", voxels=16, **TANK), "Body", attenuation=True)
 
 
 def updating(tmp_path):

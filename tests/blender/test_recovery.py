@@ -12,14 +12,16 @@ from mphdrr.addon import jobs, phantom_properties, phantoms, recovery, storage, 
 from mphdrr.core.geometry.grid import Grid
 from mphdrr.core.volumes.volume import Volume
 
+TANK = {"rod_diameters": (0,) * 6, "sphere_diameters": (30, 0, 0, 0, 0, 0)}  # little to paint
+
 
 @pytest.fixture
 def crashed(scene, small_workbook, tmp_path, capsys):
     """A scene with volumes of every origin, opened again after their files have gone; returns their voxels by name."""
     bpy.ops.mphdrr.import_geometry(filepath=str(small_workbook))
-    job = phantoms.adding(phantom_properties.plain_settings("nema", voxels=24), "NEMA", None, True)
+    job = phantoms.adding(phantom_properties.plain_settings("jaszczak", voxels=24, **TANK), "Tank", None, True)
     jobs.run(job)
-    bpy.data.objects["NEMA"].location = (3.0, 4.0, 5.0)
+    bpy.data.objects["Tank"].location = (3.0, 4.0, 5.0)
     bpy.ops.mphdrr.add_map(quantity="modules", voxels=6, side=90, within_roi=False)
     bpy.context.view_layer.update()
     made = {item.name: volumes.volume_from_object(item) for item in volumes.volume_objects(scene)}
@@ -29,18 +31,18 @@ def crashed(scene, small_workbook, tmp_path, capsys):
     storage._size_at.cache_clear()
     bpy.ops.wm.open_mainfile(filepath=str(tmp_path / "study.blend"))
     said = capsys.readouterr().out
-    assert "Modules map, NEMA are missing: press Make Again" in said
+    assert "Modules map, Tank are missing: press Make Again" in said
     assert "CT are missing: Find Missing Volume Files, or import again" in said
     return made
 
 
 def test_one_update_gives_one_grid(crashed):
-    item = bpy.data.objects["NEMA"]
+    item = bpy.data.objects["Tank"]
     bpy.context.view_layer.objects.active = item
     assert not item.data.grids.load()
     assert bpy.ops.mphdrr.update_phantom() == {"FINISHED"}
     assert item.data.grids.load() and [grid.name for grid in item.data.grids] == ["activity"]
-    assert np.array_equal(volumes.volume_from_object(item).array, crashed["NEMA"].array)
+    assert np.array_equal(volumes.volume_from_object(item).array, crashed["Tank"].array)
 
 
 def test_all_with_a_recipe_are_made_again_where_they_were(crashed, capsys):
@@ -50,7 +52,7 @@ def test_all_with_a_recipe_are_made_again_where_they_were(crashed, capsys):
     storage._size_at.cache_clear()
     again, others = recovery.missing(bpy.context.scene)
     assert again == [] and [item.name for item in others] == ["CT"]
-    assert set(crashed) == {"NEMA", "NEMA mu", "Modules map"}
+    assert set(crashed) == {"Tank", "Tank mu", "Modules map"}
     for name, volume in crashed.items():
         back = volumes.volume_from_object(bpy.data.objects[name])
         assert np.array_equal(back.array, volume.array)

@@ -250,3 +250,21 @@ def test_work_says_how_far_it_is_and_can_be_stopped():
             assert len(shares) > 1 and shares == sorted(shares) and shares[-1] == 1
             with pytest.raises(mph.Cancelled):
                 call(stop, keep)
+
+
+@pytest.mark.parametrize("compiled", [True, False])
+@pytest.mark.parametrize("kind", [np.float32, np.float64])
+def test_what_is_not_finite_is_not_lost(monkeypatch, compiled, kind):
+    """Of two arrays, whose numbers meet in one point each, in both orders."""
+    if compiled and places._take_kernel is None:
+        pytest.skip("no compiled kernels here")
+    if not compiled:
+        monkeypatch.setattr(places, "_take_kernel", None)
+    for how, strange in ((places.LEAST, np.nan), (places.PRODUCT, np.nan), (places.PRODUCT, np.inf)):
+        for order in (1, -1):
+            points, arrays = np.ones((1, 1, 1), kind), np.array([strange, 3.0][::order], kind).reshape(2, 1, 1, 1)
+            matrix = np.zeros((2, 5, 4))
+            matrix[:, 3:, 3] = 1
+            with np.errstate(invalid="ignore"):
+                places.take(points, np.zeros(1), arrays, matrix, how=how, exponents=np.zeros((1, 1, 1), np.int32))
+            assert not np.isfinite(points).any()

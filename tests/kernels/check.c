@@ -1,25 +1,28 @@
-// Runs the kernels without Python: bundles of rays from the file "jobs", what comes of them into the file "results".
+// Runs the kernels without Python: jobs from the file "jobs", what comes of them into the file "results".
 //
-// A bundle is a Header and arrays, each padded to 8 bytes: voxels of the volume, voxels of mu if there is mu, the fans or the
-// list's columns, values. Its results are what forward, backproject into an empty volume, differentiate and, with mu,
-// differentiate_by_mu give, in this order. test_kernels.py writes and reads the files.
+// A job is its kind, its level, and what the function of that kind reads: numbers and arrays, each padded to 8 bytes.
+// test_kernels.py writes and reads the files.
 
 #include "../../core/projector/backends/kernels/kernels.h"
 #include <stdio.h>
 #include <stdlib.h>
 #include <string.h>
 
+enum { RAYS, TAKE, GIVE };
+
+// Of a bundle of rays. With it come voxels of the volume, voxels of mu if there is mu, the fans or the list's columns, and
+// values.
 typedef struct {
-    int64_t level, is_double, attenuation, n[3], mu_n[3], n_fans, count;
+    int64_t is_double, attenuation, n[3], mu_n[3], n_fans, count;
 } Header;
 
-// Arrays of a bundle. Each ends where memory ends, or begins where it begins, bundle by bundle; the address sanitizer and
-// Windows get plain ones.
+// Arrays of a job. Each ends where memory ends, or begins where it begins, job by job; the address sanitizer and Windows
+// get plain ones.
 static struct {
     void *base;
     size_t bytes;
 } blocks[20];
-static int n_blocks, n_bundles;
+static int n_blocks, n_jobs;
 
 #if defined(_WIN32) || __has_feature(address_sanitizer)
 static void *block(size_t bytes) {
@@ -36,7 +39,7 @@ static void *block(size_t bytes) {
     char *base = mmap(0, inner + 2 * page, PROT_NONE, MAP_PRIVATE | MAP_ANONYMOUS, -1, 0);
     if (base == MAP_FAILED || mprotect(base + page, inner, PROT_READ | PROT_WRITE)) abort();
     blocks[n_blocks].base = base, blocks[n_blocks++].bytes = inner + 2 * page;
-    return base + page + (n_bundles % 2 ? 0 : inner - bytes);
+    return base + page + (n_jobs % 2 ? 0 : inner - bytes);
 }
 static void give_back(void) {
     while (n_blocks--) munmap(blocks[n_blocks].base, blocks[n_blocks].bytes);
@@ -53,10 +56,12 @@ static void *taken(size_t bytes) {
     return array;
 }
 
-static void run(const Header *h) {
+// Writes what forward, backproject into an empty volume, differentiate and, with mu, differentiate_by_mu give.
+static void run_rays(int64_t level) {
+    Header header, *h = &header;
+    if (!fread(h, sizeof header, 1, jobs)) abort();
     const size_t real = h->is_double ? 8 : 4, voxels = h->n[0] * h->n[1] * h->n[2], count = h->count;
     const size_t mus = h->attenuation ? h->mu_n[0] * h->mu_n[1] * h->mu_n[2] : 0;
-    const int64_t levels = best_level() + 1, level = h->level % levels;
     Job job = {.is_double = h->is_double, .attenuation = h->attenuation, .n_fans = h->n_fans};
     memcpy(job.volume.n, h->n, sizeof h->n);
     memcpy(job.mu.n, h->mu_n, sizeof h->mu_n);
@@ -86,12 +91,35 @@ static void run(const Header *h) {
     fwrite(job.gradient, real, mus, results);
 }
 
+// With a PlacesJob come the points' numbers, thirds, values and matrices; its `seen` and `exponents` are 1 where there shall
+// be such arrays. Writes points, values, seen and exponents.
+static void run_places(int64_t level, void (*kernel)(int64_t, const PlacesJob *)) {
+    PlacesJob job;
+    if (!fread(&job, sizeof job, 1, jobs)) abort();
+    const size_t real = job.is_double ? 8 : 4, points = job.n[0] * job.n[1] * job.n[2];
+    const size_t numbers = job.arrays * job.m[0] * job.m[1] * job.m[2];
+    job.points = taken(points * real), job.thirds = taken(job.n[2] * real);
+    job.values = taken(numbers * real), job.matrices = taken(job.arrays * 160);
+    if (job.seen) job.seen = block(points * 4);
+    if (job.exponents) job.exponents = block(points * 4);
+    kernel(level, &job);
+    fwrite(job.points, real, points, results);
+    fwrite(job.values, real, numbers, results);
+    if (job.seen) fwrite(job.seen, 4, points, results);
+    if (job.exponents) fwrite(job.exponents, 4, points, results);
+}
+
 static int all(void) {
-    Header header;
+    int64_t kind_and_level[2];
     jobs = fopen("jobs", "rb"), results = fopen("results", "wb");
     if (!jobs || !results) return 1;
-    for (; fread(&header, sizeof header, 1, jobs); n_bundles++) {
-        run(&header);
+    for (; fread(kind_and_level, sizeof kind_and_level, 1, jobs); n_jobs++) {
+        const int64_t level = kind_and_level[1] % (best_level() + 1);
+        switch (kind_and_level[0]) {
+        case RAYS: run_rays(level); break;
+        case TAKE: run_places(level, take_at); break;
+        default: run_places(level, give_at);
+        }
         give_back();
     }
     return fclose(results);

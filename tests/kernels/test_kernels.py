@@ -1,11 +1,13 @@
-"""The kernels without Python, on hostile rays: under sanitizers, for arm64 under qemu, for Windows under Wine.
+"""The kernels without Python, on hostile jobs: under sanitizers, for arm64 under qemu, for Windows under Wine.
 
-check.c runs thousands of bundles of rays from a file. Their results are compared with the float64 reference in numpy; that
-nothing is read or written outside its array is seen by sanitizers, and elsewhere by pages that cannot be touched.
+check.c runs thousands of jobs from a file: bundles of rays, and places in arrays. Their results are
+compared with the float64 references in numpy; that nothing is read or written outside its array is seen by sanitizers, and
+elsewhere by pages that cannot be touched.
 """
 
 from __future__ import annotations
 
+import math
 import shutil
 import subprocess
 import sys
@@ -20,6 +22,9 @@ import pytest
 from mphdrr.core.projector.backends import reference
 from mphdrr.core.projector.backends.cpu import _fans
 from mphdrr.core.projector.rays import Attenuation, IndexFans, IndexRays
+
+from .jobs import Made, Read, close, packed
+from .places_jobs import places_jobs
 
 ROOT = Path(__file__).resolve().parents[2]
 sys.path.insert(0, str(ROOT / "tools"))
@@ -129,14 +134,14 @@ def bundles() -> Iterator[Bundle]:
         yield Bundle(volume, rays, attenuation, values, tame, by_ends, tolerance)
 
 
-def packed(bundle: Bundle, level: int) -> bytes:
+def packed_rays(bundle: Bundle, level: int) -> bytes:
     """A bundle as check.c reads it."""
     rays, attenuation = bundle.rays, bundle.attenuation
     mu = bundle.volume if attenuation is None else attenuation.mu
     mu_rays = None if attenuation is None else attenuation.rays
     how = 0 if attenuation is None else 1 if mu_rays is None else 2
     fans = len(rays.table) if isinstance(rays, IndexFans) else 0
-    header = (level, bundle.volume.itemsize == 8, how, *bundle.volume.shape, *mu.shape, fans, len(rays))
+    header = (bundle.volume.itemsize == 8, how, *bundle.volume.shape, *mu.shape, fans, len(rays))
     arrays = [np.array(header, np.int64), bundle.volume]
     if attenuation is not None:
         arrays.append(mu)
@@ -146,7 +151,7 @@ def packed(bundle: Bundle, level: int) -> bytes:
         arrays += [column.T for r in (rays, mu_rays) if r is not None for column in (r.starts, r.directions)]
         arrays.append(rays.lengths)
     arrays.append(bundle.values)
-    return b"".join(data + bytes(-len(data) % 8) for data in (array.tobytes() for array in arrays))
+    return packed("rays", level, *arrays)
 
 
 def expected(bundle: Bundle) -> list[tuple[Array, float]]:
@@ -183,27 +188,49 @@ def _of(rays: IndexRays, which: Array) -> IndexRays:
     return IndexRays(rays.starts[which], rays.directions[which], rays.lengths[which])
 
 
+def rays_jobs() -> Iterator[Made]:
+    for i, bundle in enumerate(bundles()):
+        arrays = expected(bundle)
+
+        def check(read: Read, bundle: Bundle = bundle, arrays: list[tuple[Array, float]] = arrays) -> None:
+            kind = bundle.volume.dtype
+            for k, (right, size) in enumerate(
+                arrays
+            ):  # of derivatives by the ends, differences are summed: they round more
+                of_ends = k == 2
+                given = read(np.dtype(float) if of_ends else kind, right.shape)
+                allowed = bundle.tolerance * size * (10 if of_ends else 1) + np.finfo(kind).tiny
+                close(f"result {k}", given, right, allowed)
+
+        yield Made(packed_rays(bundle, i // 6), check)
+
+
 @pytest.fixture(scope="module")
-def jobs() -> list[tuple[Bundle, bytes, list[tuple[Array, float]]]]:
-    return [(bundle, packed(bundle, i // 6), expected(bundle)) for i, bundle in enumerate(bundles())]
+def jobs() -> dict[str, list[Made]]:
+    return {"rays": list(rays_jobs()), "places": list(places_jobs())}
 
 
-def compare(jobs: list[Any], command: list[str | Path], folder: Path, **options: Any) -> None:
-    """Run all `jobs` in `folder` and compare; derivatives by the ends are sums of differences, which round more."""
-    (folder / "jobs").write_bytes(b"".join(data for _, data, _ in jobs))
+def compare(jobs: dict[str, list[Made]], command: list[str | Path], folder: Path, **options: Any) -> None:
+    """Run all `jobs` in `folder` and compare."""
+    (folder / "jobs").write_bytes(b"".join(job.data for some in jobs.values() for job in some))
     done = subprocess.run(command, cwd=folder, capture_output=True, text=True, timeout=600, **options)
     assert done.returncode == 0, f"{done.returncode}\n{done.stderr[-6000:]}"
-    read = (folder / "results").read_bytes()
+    results = (folder / "results").read_bytes()
     at = 0
-    for i, (bundle, _, arrays) in enumerate(jobs):
-        for k, (right, size) in enumerate(arrays):
-            kind = np.dtype(float) if k == 2 else bundle.volume.dtype
-            given = np.frombuffer(read, kind, right.size, at).reshape(right.shape)
-            at += given.nbytes
-            error = np.max(np.abs(given - right), where=~np.isnan(right), initial=0.0)
-            allowed = bundle.tolerance * size * (10 if k == 2 else 1) + np.finfo(bundle.volume.dtype).tiny
-            assert error <= allowed, f"bundle {i}, result {k}: off by {error} where {size} is summed up"
-    assert at == len(read)
+
+    def read(kind: np.dtype[Any], shape: tuple[int, ...]) -> Array:
+        nonlocal at
+        given = np.frombuffer(results, kind, math.prod(shape), at).reshape(shape)
+        at += given.nbytes
+        return given
+
+    for name, some in jobs.items():
+        for i, job in enumerate(some):
+            try:
+                job.check(read)
+            except AssertionError as error:
+                raise AssertionError(f"{name}, job {i}: {error}") from None
+    assert at == len(results)
 
 
 def compile_driver(name: str, folder: Path, *links: str | Path, entry: str) -> None:

@@ -27,6 +27,8 @@ LEVEL_VARIABLE = "MPHDRR_CPU_LEVEL"
 _CONTRACT = 5
 _NAMES = {"win32": "siddon.dll", "darwin": "libsiddon.dylib"}
 _MOST_VOXELS = 2**31 - 1  # their indices are of 32 bits
+_PRODUCT = 2  # in kernels.h
+_MOST_PLACES_ALONG = 2**16  # where float32 knows a place to 1/256 of an element; beyond 2^24 it would miss whole ones
 _MOST_ALONG = 2**12  # where float32 knows the length of a segment to 0.1 %
 
 _FAN = np.dtype(
@@ -193,8 +195,16 @@ def _run_places(
         raise ValueError("expected arrays in C order, that can be written")
     if matrices.shape != (len(arrays), 5, 4) or thirds.shape != points.shape[2:] or (flat and arrays.shape[3] != 1):
         raise ValueError("expected a matrix (5, 4) for each array, a third coordinate for each plane of points")
-    if arrays[0].size > _MOST_VOXELS:
-        raise InputError(f"expected an array of at most {_MOST_VOXELS} numbers, got {arrays[0].size}")
+    if how == _PRODUCT and exponents is None:
+        raise ValueError("expected exponents, which a product needs")
+    if not points.size or not arrays.size:
+        return
+    most_along = _MOST_PLACES_ALONG if kind == np.float32 else _MOST_VOXELS
+    if arrays[0].size > _MOST_VOXELS or max(arrays.shape[1:]) > most_along:
+        raise InputError(
+            f"expected an array of at most {_MOST_VOXELS} numbers, and {most_along} along an axis in {kind}; got "
+            f"{' x '.join(map(str, arrays.shape[1:]))}"
+        )
     middle = float(thirds[len(thirds) // 2])
     relative = np.ascontiguousarray(thirds - middle, kind)
     job = _PlacesJob(

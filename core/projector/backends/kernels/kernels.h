@@ -80,7 +80,8 @@ typedef struct {
 // Arrays that are interpolated linearly at the places of a lattice's points, or that are given the points' numbers, shared out with
 // the same weights. The place of point (i, j, k) is that of (i, j, middle + thirds[k], 1) under an array's matrix: of the five
 // numbers p that it makes, (p0 / p3, p1 / p3, p2 / p4) are indices in the array. Places up to half an element outside belong to
-// the outermost elements; others, and those with p3 <= nearest or p4 <= 0, are not in the array.
+// the outermost elements; others, and those with p3 <= nearest or p4 <= 0, are not in the array. There are points and elements, of
+// elements at most 2^16 along an axis if they are float. In a product, what is less than the least normal number counts as 0.
 enum { SUM, LEAST, PRODUCT };
 
 typedef struct {

@@ -117,17 +117,22 @@ INLINE F value_at(const PlacesJob *job, const REAL *array, const Places *p, cons
                    p->share[2]);
 }
 
-// A product of many numbers is kept as one from 1 to 2 and a power of 2: neither grows too large or too small.
+// A product of many numbers is kept as one from 1 to 2 and a power of 2: neither grows too large or too small. What is not finite
+// stays as it is.
 #define FRACTION_BITS (sizeof(REAL) == 4 ? 23 : 52)
 #define BIAS (sizeof(REAL) == 4 ? 127 : 1023)
 
 INLINE F normalised(F product, I *exponent) {
     I bits = (I)product;
     const I zero = product < (F)(sizeof(REAL) == 4 ? 1.17549435e-38 : 2.2250738585072014e-308);
-    *exponent = zero ? (I)0 : (bits >> FRACTION_BITS) - BIAS;
+    const I usual = (product < (F)__builtin_inf()) & ~zero;
+    *exponent = usual ? (bits >> FRACTION_BITS) - BIAS : (I)0;
     bits = (bits & (((I)1 << FRACTION_BITS) - 1)) | ((I)BIAS << FRACTION_BITS);
-    return zero ? (F)0 : (F)bits;
+    return zero ? (F)0 : usual ? (F)bits : product;
 }
+
+// What is not a number stays so.
+INLINE F least(F x, F y) { return ((x < y) | (x != x)) ? x : y; }
 
 INLINE void combine(const PlacesJob *job, const REAL *array, const double *matrix, int64_t i, int64_t j, const int flat, const int how) {
     const int64_t n = job->n[2], start = (i * job->n[1] + j) * n;
@@ -140,7 +145,7 @@ INLINE void combine(const PlacesJob *job, const REAL *array, const double *matri
         if (!ANY(p.inside)) continue;
         const F value = value_at(job, array, &p, flat) * p.weight, old = some(values + k, lanes);
         I exponent = 0;
-        const F changed = how == SUM ? old + value : how == LEAST ? MIN(old, value) : normalised(old * value, &exponent);
+        const F changed = how == SUM ? old + value : how == LEAST ? least(old, value) : normalised(old * value, &exponent);
         put(values + k, lanes, p.inside ? changed : old);
         if (job->exponents) add(job->exponents + start + k, lanes, p.inside ? exponent : (I)0);
         if (job->seen) add(job->seen + start + k, lanes, -p.inside); // true is -1
@@ -178,12 +183,15 @@ INLINE int may_give(const PlacesJob *job, const Line *line) {
         if (!(depth > 0)) return 1; // a part of it may: between points in front, places change in one direction
         place[end] = (line->at[0] + third * line->step[0]) / depth;
     }
-    return MAX(place[0], place[1]) + 1 >= job->first && MIN(place[0], place[1]) - 1 < job->last;
+    const int before = place[0] + 1 < job->first && place[1] + 1 < job->first; // never of what is not a number
+    return !before && !(place[0] - 1 >= job->last && place[1] - 1 >= job->last);
 }
 
 INLINE void give_all(const PlacesJob *job, const int flat) {
     const int64_t *n = job->n, *m = job->m;
-    const int64_t along_axes[3] = {m[1] * m[2], m[2], 1};
+    // Where there is only one element along an axis, it is both neighbours: the second one's share is 0, but not a number if
+    // the point's number is not finite. Along the first axis the second is no plane of this job's.
+    const int64_t along_axes[3] = {m[1] * m[2], m[1] > 1 ? m[2] : 0, m[2] > 1};
     for (int64_t i = 0; i < n[0]; i++) for (int64_t j = 0; j < n[1]; j++) {
         const Line line = line_of(job, job->matrices, i, j);
         if (!may_give(job, &line)) continue;

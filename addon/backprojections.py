@@ -7,9 +7,10 @@ import bpy
 
 from ..core.errors import InputError
 from ..core.progress import Progress, stages_of
-from ..core.runs.backprojecting import backproject_run, backprojection_grid
+from ..core.runs.backprojecting import backproject_run
 from ..core.runs.files import read_run
 from ..core.runs.recipe import Recipe
+from ..core.runs.reconstructing import reconstruction_grid
 from . import jobs, rendering, runs, slices, storage, volumes
 from .reconstruction_properties import HOW_LABELS
 from .stored_volumes import StoredVolume, store_volume
@@ -30,7 +31,7 @@ def backprojecting(context: bpy.types.Context, recipe: Recipe, how: str) -> jobs
         stages = stages_of(progress)
         stages("reading the run")
         run = read_run(path)
-        grid = backprojection_grid(run, recipe)
+        grid = reconstruction_grid(run, recipe)
         volume = backproject_run(run, how, grid=grid, stages=stages)
         stages("writing the voxels")
         provenance: dict[str, Any] = {"back_projection_of": name, "how": how, **recipe.tables()}

@@ -32,7 +32,7 @@ _HOW = {
     "product": ("Geometric Mean", "Multiply the views: nothing where one view sees nothing"),
     "minimum": ("Minimum", "The least that a view sees there"),
 }
-HOW_LABELS = {how: label for how, (label, _) in _HOW.items()}
+HOW_LABELS = {how: _HOW.get(how, (how.capitalize(), ""))[0] for how in HOW}
 """What the ways to put views together are called."""
 
 
@@ -45,7 +45,7 @@ ReconstructionSettings.__annotations__ = properties_of(PROPERTIES)
 
 _PUT_TOGETHER = EnumProperty(
     name="Back-Project", description="How the views that see a voxel are put together",
-    items=choices.items({}, ((how.upper(), *_HOW[how]) for how in HOW)), default="SUM",
+    items=choices.items({}, ((how.upper(), HOW_LABELS[how], _HOW.get(how, ("", ""))[1]) for how in HOW)), default="SUM",
 )  # fmt: skip
 
 

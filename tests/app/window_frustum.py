@@ -82,7 +82,7 @@ def steps():
         i for i, o in enumerate(scene.mphdrr_geometry.scanner.all_objects) if o == camera
     )
     bpy.context.view_layer.objects.active = phantom
-    only("MPHDRR_PT_phantom", "MPHDRR_PT_perspective")
+    only("MPHDRR_PT_phantom", "MPHDRR_PT_perspective", "MPHDRR_PT_reconstruction", "MPHDRR_PT_backprojection")
     sidebar = next(region for region in viewport()[1].regions if region.type == "UI")
     yield 1
     sidebar.active_panel_category = "mphDRR"
@@ -127,6 +127,8 @@ def steps():
     settings.volume, settings.model, settings.width, settings.height = phantom, "TRANSMISSION", 128, 128
     call("render_projections", "INVOKE_DEFAULT")
     yield from idle()
+    for name in ("MPHDRR_PT_perspective", "MPHDRR_PT_phantom"):  # the others are in sight
+        bpy.utils.unregister_class(getattr(bpy.types, name))
     scene.mphdrr_display.planes = "NONE"
     scene.mphdrr_reconstruction.voxels, scene.mphdrr_reconstruction.how = 96, "PRODUCT"
     call("backproject", "INVOKE_DEFAULT")

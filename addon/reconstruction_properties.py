@@ -44,7 +44,7 @@ ReconstructionSettings.__annotations__ = properties_of(PROPERTIES)
 
 
 _PUT_TOGETHER = EnumProperty(
-    name="Back-Project", description="How the views that see a voxel are put together",
+    name="Combine By", description="How the views that see a voxel are put together",
     items=choices.items({}, ((how.upper(), HOW_LABELS[how], _HOW.get(how, ("", ""))[1]) for how in HOW)), default="SUM",
 )  # fmt: skip
 

@@ -82,7 +82,8 @@ class MPHDRR_PT_backprojection(Sidebar, bpy.types.Panel):
 
     def draw(self, context: bpy.types.Context) -> None:
         layout = self.layout
+        layout.use_property_split = True
+        layout.use_property_decorate = False
+        layout.prop(context.scene.mphdrr_reconstruction, "how")
         layout.operator_context = "INVOKE_DEFAULT"
-        settings = context.scene.mphdrr_reconstruction
-        layout.row().prop(settings, "how", expand=True)
         layout.operator(ids.BACKPROJECT, text="Back-Project", icon="OUTLINER_DATA_VOLUME")

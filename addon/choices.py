@@ -38,8 +38,12 @@ UNITS = {
 }  # fmt: skip
 
 
+_MOST = 0xFFFFFF
+"""Blender's buttons that show choices side by side keep numbers as float32: a larger one would be set as another."""
+
+
 def items(numbers: Mapping[str, int], chosen: Iterable[tuple[str, str, str]]) -> Items:
     """Items (identifier, label, description) with their numbers: a table's above, or else a checksum of the identifier."""
     return tuple(
-        (name, label, text, numbers.get(name, zlib.crc32(name.encode()) & 0x7FFFFFFF)) for name, label, text in chosen
+        (name, label, text, numbers.get(name, zlib.crc32(name.encode()) & _MOST)) for name, label, text in chosen
     )

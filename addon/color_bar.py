@@ -1,4 +1,4 @@
-"""The colour bar of a volume with slices, in the 3D views: what the colours mean, with numbers and their unit."""
+"""The colour bar of a volume with slices, or in perspective, in the 3D views: what colours mean, numbers and their unit."""
 
 import blf
 import bpy
@@ -6,7 +6,7 @@ import gpu
 import numpy as np
 from gpu_extras.batch import batch_for_shader
 
-from . import slices, volumes
+from . import frustums, slices, volumes
 
 _LEFT, _BOTTOM, _WIDTH, _HEIGHT, _LETTERS = 90, 60, 14, 180, 12  # at a resolution scale of 1, pixels
 _MARKS = (0.0, 0.25, 0.5, 0.75, 1.0)
@@ -27,11 +27,11 @@ def marks(item: bpy.types.Object) -> tuple[str, list[str]]:
 
 
 def _shown(context: bpy.types.Context) -> bpy.types.Object | None:
-    """The volume whose bar is drawn: the active one, or another with slices that are seen."""
+    """The volume whose bar is drawn: the active one, or another with slices that are seen, or of a frustum that is."""
     for item in (slices.sliced(context), *volumes.volume_objects(context.scene)):
         if item is not None and any(plane.visible_get() for plane in slices.planes_of(item)):
             return item
-    return None
+    return next(iter(frustums.seen_volumes(context.scene)), None)
 
 
 def draw() -> None:

@@ -57,6 +57,10 @@ CANCEL_JOB = "mphdrr.cancel_job"
 FINISH_JOB = "mphdrr.finish_job"
 RECONSTRUCT = "mphdrr.reconstruct"
 SHOW_RECONSTRUCTION = "mphdrr.show_reconstruction"
+BACKPROJECT = "mphdrr.backproject"
+SHOW_IN_PERSPECTIVE = "mphdrr.show_in_perspective"
+CLEAR_PERSPECTIVE = "mphdrr.clear_perspective"
+RESAMPLE_IN_PERSPECTIVE = "mphdrr.resample_in_perspective"
 
 # --- Panels, drawn in the order of the work: bl_order -----------------------------------------------------------------
 ORDER_GEOMETRY, ORDER_PHANTOM, ORDER_PROJECTIONS, ORDER_RUNS, ORDER_RECONSTRUCTION, ORDER_EXPORT = 0, 10, 20, 25, 27, 30
@@ -68,6 +72,7 @@ MOSAIC = "mphDRR mosaic"
 DIFFERENCE = "mphDRR difference"
 RECONSTRUCTION = "mphDRR reconstruction"  # slices of the last one, and its objective
 PLANES = "mphDRR projections"  # the collection of the planes that show them
+PERSPECTIVES = "mphDRR perspective"  # the collection of volumes in modules' coordinates (`frustums.py`)
 STUDIO = "mphDRR studio"  # the collection of the lights, and a world
 PREVIEW = ".preview"  # in the names of coarser copies of large volumes, for display only
 

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from ..core.errors import InputError
 from ..core.geometry.ring_fits import ring_order
 from ..core.recording import recorded_warnings
-from . import cameras, collimators, following, ids, planes, scanner
+from . import cameras, collimators, following, frustums, ids, planes, scanner
 from .following import PARTS
 from .module_values import add_module, module_numbers
 from .scanner_parts import clear, new_part, parts_and_others
@@ -182,6 +182,8 @@ def remove(collection: bpy.types.Collection, modules: Sequence[bpy.types.Object]
     """Remove modules with their parts and projections in the scene; other objects parented to them stay where they are."""
     if len(modules) >= len(scanner.modules(collection)):
         raise InputError("a scanner needs at least one module: keep one, or press Remove Scanner")
+    for scene in bpy.data.scenes:
+        frustums.remove(scene, list(modules))
     children = [child for camera in modules for child in camera.children]
     parts = [child for child in children if child.mphdrr_module.part in (*PARTS, "PLANE")]
     for child in children:
@@ -194,6 +196,7 @@ def remove(collection: bpy.types.Collection, modules: Sequence[bpy.types.Object]
 def remove_scanner(scene: bpy.types.Scene, collection: bpy.types.Collection) -> None:
     """Remove a scanner, with its projections in the scene; the user's objects in it move to the scene's collection."""
     planes.remove(scene, collection)
+    frustums.remove(scene, scanner.modules(collection))
     _, others = parts_and_others(collection)
     cameras.remove_objects([item for item in others if item.mphdrr_module.part != "NONE"])  # copies
     clear(scene, collection, {})

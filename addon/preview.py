@@ -24,7 +24,7 @@ from ..core.runs.display import Display
 from ..core.runs.mosaic import as_seen, sized, totals
 from ..core.runs.recipe import Recipe
 from ..core.runs.run import ProjectionRun
-from ..core.runs.run_recipe import recipe_model, run_recipe
+from ..core.runs.run_recipe import recipe_model, recipe_views, run_recipe
 from ..core.volumes.volume import Volume
 from . import jobs, phantoms, planes, preview_drawing, rendering, runs, scanner, selection, volumes
 from .module_values import module_numbers, off_aim, system_of
@@ -125,7 +125,7 @@ def make(asked: Request, quick: bool, voxels: dict[Path, Volume]) -> Preview:
     (run,) = run_recipe(quick_recipe(recipe) if quick else recipe, system, volume, mu[0] if mu else None)
     shown = run.projections
     if run.unit == "counts" and quick:  # shown per pixel of the panel's size, as the full picture and the runs are
-        shown = shown * np.float32(_pixel_area(_views(recipe, system)) / _pixel_area(run.views))
+        shown = shown * np.float32(_pixel_area(recipe_views(recipe, system)) / _pixel_area(run.views))
     word, (total,) = totals(asked.display.part(run.projections), run.unit)
     low, high = window = asked.display.window(shown)
     part = asked.display.part(shown)
@@ -150,13 +150,6 @@ def quick_recipe(recipe: Recipe) -> Recipe:
         shares = (recipe[name] / fewer[name] for name in ("detector.rows", "detector.columns"))
         fewer["model.background"] = recipe["model.background"] * math.prod(shares)
     return recipe.updated(fewer)
-
-
-def _views(recipe: Recipe, system: PinholeSystem) -> Views:
-    """The views of a recipe's detector."""
-    shape = recipe["detector.rows"], recipe["detector.columns"]
-    plane, magnification, pitch = (recipe[f"detector.{name}"] for name in ("plane", "magnification", "pitch"))
-    return system.views(shape, plane, magnification, pitch)
 
 
 def _pixel_area(views: Views) -> float:

@@ -28,6 +28,7 @@ from . import (
     display_properties,
     epipolar_properties,
     ids,
+    perspective_properties,
     phantom_properties,
     projection_properties,
     reconstruction_properties,
@@ -233,6 +234,7 @@ CLASSES = (
     *reconstruction_properties.CLASSES,
     *display_properties.CLASSES,
     *epipolar_properties.CLASSES,
+    *perspective_properties.CLASSES,
     *column_maps.CLASSES,
 )
 
@@ -246,5 +248,6 @@ POINTERS = (
     (bpy.types.Scene, "mphdrr_reconstruction", reconstruction_properties.ReconstructionProperties),
     (bpy.types.Scene, "mphdrr_display", display_properties.DisplayProperties),
     (bpy.types.Scene, "mphdrr_epipolar", epipolar_properties.EpipolarProperties),
+    (bpy.types.Scene, "mphdrr_perspective", perspective_properties.PerspectiveProperties),
     (bpy.types.WindowManager, "mphdrr_columns", column_maps.ColumnMapProperties),
 )

@@ -7,11 +7,12 @@ from collections.abc import Callable, Iterator, Mapping
 from typing import Any
 
 import bpy
-from bpy.props import PointerProperty, StringProperty
+from bpy.props import EnumProperty, PointerProperty, StringProperty
 
+from ..core.perspective.backprojection import HOW
 from ..core.runs.recipe import Recipe, fitting_recipe
 from ..core.runs.settings import SETTINGS
-from . import volumes
+from . import choices, volumes
 from .setting_properties import drawn_of, given_of, properties_of, values_of
 
 _BY_COMMAND_LINE = ("anatomy", "stop_change", "stop_noise", "stop_region", "stop_seconds")
@@ -25,11 +26,41 @@ PROPERTIES = {
 """The settings by the names of their properties."""
 
 
+_OF_VOXELS = ("voxels", "spacing", "center")
+_HOW = {
+    "sum": ("Sum", "Add up the views: large wherever many rays cross something"),
+    "product": ("Geometric Mean", "Multiply the views: nothing where one view sees nothing"),
+    "minimum": ("Minimum", "The least that a view sees there"),
+}
+HOW_LABELS = {how: _HOW.get(how, (how.capitalize(), ""))[0] for how in HOW}
+"""What the ways to put views together are called."""
+
+
 class ReconstructionSettings:
     """How to reconstruct; mixed into the scene's properties (the panel) and into the operator (scripts)."""
 
 
 ReconstructionSettings.__annotations__ = properties_of(PROPERTIES)
+
+
+_PUT_TOGETHER = EnumProperty(
+    name="Combine By", description="How the views that see a voxel are put together",
+    items=choices.items({}, ((how.upper(), HOW_LABELS[how], _HOW.get(how, ("", ""))[1]) for how in HOW)), default="SUM",
+)  # fmt: skip
+
+
+class BackprojectionSettings:
+    """How to back-project; mixed into the operator (scripts)."""
+
+
+BackprojectionSettings.__annotations__ = properties_of({name: PROPERTIES[name] for name in _OF_VOXELS})
+BackprojectionSettings.__annotations__["how"] = _PUT_TOGETHER
+
+
+def voxels_recipe(get: Callable[[str], Any]) -> Recipe:
+    """The recipe's voxels alone; `get` gives a property's value."""
+    values = values_of({name: PROPERTIES[name] for name in _OF_VOXELS}, get)
+    return Recipe({key: value for key, value in values.items() if value is not None})
 
 
 def settings_recipe(get: Callable[[str], Any], is_given: Callable[[str], bool]) -> Recipe:
@@ -63,5 +94,7 @@ class ReconstructionProperties(ReconstructionSettings, bpy.types.PropertyGroup):
         found: Mapping[str, Any] = json.loads(self.record) if self.record else {}
         return found
 
+
+ReconstructionProperties.__annotations__["how"] = _PUT_TOGETHER
 
 CLASSES = (ReconstructionProperties,)

@@ -42,7 +42,7 @@ def properties_of(settings: Settings) -> dict[str, Any]:
         absent = f"; 0: {setting.absent}" if setting.default is None else ""
         common: dict[str, Any] = {"name": setting.label, "description": setting.text + absent}
         if setting.kind in (int, float):
-            least = 1e-6 if setting.least is None else setting.least
+            least = setting.least if setting.above is None else 1e-6
             limits = {"min": 0 if setting.default is None else least, "max": setting.most, "soft_max": setting.slider}
             limits["precision"] = 3 if setting.kind is float else None
             common |= {key: value for key, value in limits.items() if value is not None}

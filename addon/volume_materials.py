@@ -30,7 +30,8 @@ _GREENS = (
 )
 _GREYS = ((0.00, (0.02, 0.02, 0.02)), (1.00, (0.80, 0.80, 0.80)))
 _XRAY = ("mu", "hu")
-_SHOWN_AS = {"sensitivity": ("cps/MBq", 1e6)}  # not in the voxels' own unit: as every other sensitivity in the window
+# Not in the voxels' own unit: as every other sensitivity in the window, and in few letters.
+_SHOWN_AS = {"sensitivity": ("cps/MBq", 1e6), "backprojection": ("as images", 1.0)}
 _CT_WINDOW = (-200.0, 1000.0)  # HU: skin to bone
 # Extinction times the volume's size: a rod of a twentieth of it looks solid; attenuation and maps can be looked through.
 _OPACITY, _OPACITY_THROUGH = 60.0, 20.0

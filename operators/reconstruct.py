@@ -1,12 +1,22 @@
-"""Reconstruct the shown run, as a job; show what came of the last one."""
+"""Reconstruct or back-project the shown run, as jobs; show what came of the last reconstruction."""
 
 from typing import Any
 
 import bpy
 
-from ..addon import ids, images, jobs, reconstructions, runs
-from ..addon.reconstruction_properties import ReconstructionSettings, settings_recipe
+from ..addon import backprojections, ids, images, jobs, reconstructions, runs
+from ..addon.reconstruction_properties import (
+    BackprojectionSettings,
+    ReconstructionSettings,
+    settings_recipe,
+    voxels_recipe,
+)
 from ..addon.reports import polled
+
+
+def _poll_run(operator: type[bpy.types.Operator], context: bpy.types.Context) -> bool:
+    """`poll` of operators that need a run."""
+    return polled(operator, runs.shown(context.scene) is not None, "No run yet: render the projections first")
 
 
 class MPHDRR_OT_reconstruct(ReconstructionSettings, jobs.JobOperator, bpy.types.Operator):
@@ -17,10 +27,7 @@ class MPHDRR_OT_reconstruct(ReconstructionSettings, jobs.JobOperator, bpy.types.
     bl_idname = ids.RECONSTRUCT
     bl_label = "Reconstruct Projections"
 
-    @classmethod
-    def poll(cls, context: bpy.types.Context) -> bool:
-        is_met = runs.shown(context.scene) is not None
-        return polled(cls, is_met, "No run yet: render the projections first")  # type: ignore[arg-type]
+    poll = classmethod(_poll_run)
 
     def job(self, context: bpy.types.Context) -> jobs.Job:
         return reconstructions.reconstructing(
@@ -30,6 +37,25 @@ class MPHDRR_OT_reconstruct(ReconstructionSettings, jobs.JobOperator, bpy.types.
     def _setting(self, scene: bpy.types.Scene, name: str) -> Any:
         """A setting given to the operator, else the panel's."""
         return getattr(self if self.properties.is_property_set(name) else scene.mphdrr_reconstruction, name)
+
+
+class MPHDRR_OT_backproject(BackprojectionSettings, jobs.JobOperator, bpy.types.Operator):
+    """Put together what the shown run's modules say of each voxel along their rays, as a volume. It is no reconstruction: a
+    value is that of whole rays, not of the voxel. Voxels are those of a reconstruction, as the panel says now, unless a
+    script gives others
+    """
+
+    bl_idname = ids.BACKPROJECT
+    bl_label = "Back-Project Projections"
+
+    poll = classmethod(_poll_run)
+
+    def job(self, context: bpy.types.Context) -> jobs.Job:
+        def get(name: str) -> Any:
+            """A setting given to the operator, else the panel's."""
+            return getattr(self if self.properties.is_property_set(name) else context.scene.mphdrr_reconstruction, name)
+
+        return backprojections.backprojecting(context, voxels_recipe(get), get("how").lower())
 
 
 class MPHDRR_OT_show_reconstruction(bpy.types.Operator):

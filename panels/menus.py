@@ -71,6 +71,9 @@ class MPHDRR_MT_volumes(bpy.types.Menu):
         layout.operator(ids.CT_TO_ATTENUATION, icon="MOD_FLUIDSIM")
         layout.operator(ids.ADD_SLICES, icon="MESH_PLANE")
         layout.operator(ids.REMOVE_SLICES, icon="X")
+        layout.operator(ids.SHOW_IN_PERSPECTIVE, icon="VIEW_PERSPECTIVE")
+        layout.operator(ids.RESAMPLE_IN_PERSPECTIVE, icon="OUTLINER_DATA_VOLUME")
+        layout.operator(ids.CLEAR_PERSPECTIVE, icon="X")
         layout.operator(ids.VOXELIZE_OBJECTS, icon="OUTLINER_DATA_MESH")
         layout.operator(ids.MESH_FROM_VOLUME, icon="MESH_DATA")
         layout.separator()
@@ -96,6 +99,7 @@ class MPHDRR_MT_projections(bpy.types.Menu):
         layout.separator()
         layout.operator(ids.RECONSTRUCT, icon="OUTLINER_OB_VOLUME")
         layout.operator(ids.SHOW_RECONSTRUCTION, icon="IMAGE_DATA")
+        layout.operator_menu_enum(ids.BACKPROJECT, "how", icon="OUTLINER_DATA_VOLUME")
         layout.separator()
         settings = context.scene.mphdrr_projections
         layout.operator_menu_enum(ids.COMPARE_RUNS, "other", icon="SELECT_DIFFERENCE")

@@ -73,3 +73,17 @@ class MPHDRR_PT_reconstruction_model(Sidebar, bpy.types.Panel):
         layout.use_property_split = True
         layout.use_property_decorate = False
         _draw(layout.column(), context.scene.mphdrr_reconstruction, False)
+
+
+class MPHDRR_PT_backprojection(Sidebar, bpy.types.Panel):
+    bl_label = "Back-Projection"
+    bl_parent_id = "MPHDRR_PT_reconstruction"
+    bl_options = {"DEFAULT_CLOSED"}
+
+    def draw(self, context: bpy.types.Context) -> None:
+        layout = self.layout
+        layout.use_property_split = True
+        layout.use_property_decorate = False
+        layout.prop(context.scene.mphdrr_reconstruction, "how")
+        layout.operator_context = "INVOKE_DEFAULT"
+        layout.operator(ids.BACKPROJECT, text="Back-Project", icon="OUTLINER_DATA_VOLUME")

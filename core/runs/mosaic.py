@@ -235,14 +235,15 @@ def write_png(picture: ArrayLike, path: str | os.PathLike[str]) -> None:
 def png(picture: ArrayLike, level: int = -1) -> bytes:
     """A picture, row 0 at the top, as an 8-bit PNG: colours (height, width, 3) of uint8, or numbers (height, width).
 
-    Of numbers, 0 is black, or the smallest if that is negative, and the largest is white. `level` is zlib's.
+    Colours may have a fourth number, their opacity. Of numbers, 0 is black, or the smallest if that is negative, and the
+    largest is white. `level` is zlib's.
     """
     pixels = np.asarray(picture)
     if pixels.ndim == 2:
         low, high = float(pixels.min(initial=0.0)), float(pixels.max(initial=0.0))
         pixels = np.rint((pixels - low) / ((high - low) or 1.0) * 255).astype(np.uint8)[..., None]
     height, width, channels = pixels.shape
-    header = struct.pack(">2I5B", width, height, 8, {1: 0, 3: 2}[channels], 0, 0, 0)  # 8 bits, grey or colours
+    header = struct.pack(">2I5B", width, height, 8, {1: 0, 3: 2, 4: 6}[channels], 0, 0, 0)  # 8 bits, grey or colours
     rows = zlib.compress(np.pad(pixels.reshape(height, -1), ((0, 0), (1, 0))).tobytes(), level)  # 0 before each: as is
     data = b"\x89PNG\r\n\x1a\n"
     for name, part in ((b"IHDR", header), (b"IDAT", rows), (b"IEND", b"")):

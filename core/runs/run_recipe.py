@@ -12,6 +12,7 @@ from ..errors import InputError
 from ..geometry.frames import euler_pose
 from ..geometry.grid import Grid
 from ..geometry.system import PinholeSystem, chosen_modules
+from ..geometry.views import Views
 from ..phantoms.kinds import KINDS
 from ..phantoms.language import parse_phantom, read_phantom
 from ..phantoms.phantom import Phantom
@@ -102,6 +103,13 @@ def run_recipe(
             noise_seed=record["noise.seed"],
             progress=stages("projecting"),
         )
+
+
+def recipe_views(recipe: Recipe, system: PinholeSystem) -> Views:
+    """The views of a recipe's detector."""
+    shape = recipe["detector.rows"], recipe["detector.columns"]
+    plane, magnification, pitch = (recipe[f"detector.{name}"] for name in ("plane", "magnification", "pitch"))
+    return system.views(shape, plane, magnification, pitch)
 
 
 def recipe_model(recipe: Recipe, system: PinholeSystem, mu: Volume | None = None) -> Model:

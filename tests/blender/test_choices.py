@@ -9,6 +9,7 @@ import zlib
 from pathlib import Path
 
 import bpy
+import numpy as np
 import pytest
 
 from mphdrr.addon import choices, registration
@@ -98,6 +99,7 @@ DEFAULTS = {
     "detector": "VIRTUAL", "backend": "AUTO", "rows": "BY_NUMBER", "unit": "NONE",
     "colors": "INFERNO", "scale": "LINEAR", "planes": "ALL", "look": "DENSITY", "figure": "SCANNER",
     "method": "OSEM", "prior": "NONE", "hole": "RAYS", "ReconstructionProperties.hole": "AUTO",
+    "how": "SUM", "uniform": "K",
 }  # fmt: skip
 """What files mean that do not hold a choice, because nobody has made it."""
 
@@ -125,9 +127,11 @@ def test_every_choice_has_the_number_that_files_keep():
     for name, properties in found.items():
         for prop, numbers in properties.items():
             first = FROZEN.get(name, {}).get(prop, {})
-            expected = {choice: first.get(choice, zlib.crc32(choice.encode()) & 0x7FFFFFFF) for choice in numbers}
+            expected = {choice: first.get(choice, zlib.crc32(choice.encode()) & 0xFFFFFF) for choice in numbers}
             assert numbers == expected, f"{name}.{prop}: a choice was moved or renumbered: see addon/choices.py"
             assert len(set(numbers.values())) == len(numbers)
+            # Buttons side by side keep numbers as float32: a click would set another number.
+            assert all(np.float32(number) == number for number in numbers.values()), f"{name}.{prop}"
             if "_OT_" not in name:
                 assert first.keys() <= numbers.keys(), f"{name}.{prop}: files hold a choice that is gone"
 
@@ -141,7 +145,7 @@ def test_files_without_a_choice_mean_what_they_did():
 
 def test_a_new_choice_has_a_number_of_its_own():
     ((_, _, _, old), (_, _, _, new)) = choices.items(choices.ISOTOPES, [("F-18", "", ""), ("Co-57", "Co-57", "")])
-    assert old == 1 and new == zlib.crc32(b"Co-57") & 0x7FFFFFFF
+    assert old == 1 and new == zlib.crc32(b"Co-57") & 0xFFFFFF
 
 
 # In a new Python: enumerations are made when the extension is imported.

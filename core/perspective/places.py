@@ -142,7 +142,14 @@ def _corners(at: Array, share: Array, m: tuple[int, ...]) -> Any:
 
 
 def _take_in_numpy(
-    points: Array, thirds: Array, arrays: Array, matrices: Array, how: int, seen: Any, exponents: Any, **others: Any
+    points: Array,
+    thirds: Array,
+    arrays: Array,
+    matrices: NDArray[np.float64],
+    how: int,
+    seen: Any,
+    exponents: Any,
+    **others: Any,
 ) -> None:
     flat, by_depth, nearest = others["flat"], others["by_depth"], others["nearest"]
     for array, matrix in zip(arrays, matrices, strict=True):
@@ -166,7 +173,7 @@ def _take_in_numpy(
                 seen[i] += inside
 
 
-def _give_in_numpy(points: Array, thirds: Array, array: Array, matrix: Array, slab: slice) -> None:
+def _give_in_numpy(points: Array, thirds: Array, array: Array, matrix: NDArray[np.float64], slab: slice) -> None:
     part = array[slab]
     first = slab.indices(len(array))[0]
     for i in range(len(points)):

@@ -95,6 +95,8 @@ def predict_views(
     """
     instance(g, PerspectiveGrid, "predict_views")
     instance(views, Views, "predict_views")
+    if not len(views):
+        raise InputError("predict_views: expected one or more views, got none")
     array = checked(array, "perspective array", g.shape, False, batch=True)
     n_k = max(g.shape) if planes is None else whole_number(planes, "planes")
     n_u, n_v, _ = g.shape

@@ -90,8 +90,9 @@ def predict_views(
 
     Notes
     -----
-    The values are interpolated between the cells' places, twice as densely at least as these are. That smooths them by about
-    a cell, and so are the images.
+    The values are interpolated between the cells' places, twice as densely at least as these are, but at no more than 8
+    points along each axis of a new cell. With pixels or planes that cover more than 4 cells, details between are missed.
+    Interpolation smooths the values by about a cell, and so the images.
     """
     instance(g, PerspectiveGrid, "predict_views")
     instance(views, Views, "predict_views")

@@ -19,7 +19,7 @@ from ..memory import require
 from ..progress import Progress
 from ..validation import instance, real_array, whole_number
 from .perspective_grid import PerspectiveGrid
-from .view_rays import Floats, Indices, pixels_of, rays_by_depth, view_indices
+from .view_rays import Floats, Indices, pixels_of, points_at_depths, rays_by_depth, view_indices
 
 # Of an image's range: what varies less is of one value, stored as float32.
 _ROUNDING = 1e-6
@@ -190,8 +190,7 @@ def _highest(curves: Floats, grid: PerspectiveGrid) -> tuple[Floats, Floats]:
 
 def _points(grid: PerspectiveGrid, pixels: Floats) -> Floats:
     """World points (…, n_k, 3) of pixels (…, 2) at the grid's planes."""
-    starts, per_depth = rays_by_depth(grid.views, grid.m, pixels)
-    return np.asarray(starts[..., None, :] + grid.depths[:, None] * per_depth[..., None, :])
+    return points_at_depths(grid.views, grid.m, pixels[..., None, :], grid.depths)
 
 
 def _interpolated(image: Floats, pixels: Floats) -> Floats:

@@ -17,7 +17,16 @@ from numpy.typing import ArrayLike
 from ..errors import InputError
 from ..geometry.views import Views
 from ..validation import instance, real_array
-from .view_rays import Floats, Indices, cross_matrix, lines_of_pixels, rays_by_depth, view_frames, view_indices
+from .view_rays import (
+    Floats,
+    Indices,
+    broadcast,
+    cross_matrix,
+    lines_of_pixels,
+    rays_by_depth,
+    view_frames,
+    view_indices,
+)
 
 # What is less than this share of what it is the difference of, is rounding.
 _ROUNDING = 1e-12
@@ -213,7 +222,8 @@ def _in_image(pixel: Floats, shape: tuple[int, int]) -> bool:
 def _pair(views: Views, m: Indices, n: Indices, name: str) -> tuple[np.ndarray, np.ndarray]:
     """Indices of two views that have not the same source, or of many pairs, of one shape."""
     instance(views, Views, f"{name}: views")
-    first, second = np.broadcast_arrays(view_indices(views, m, name), view_indices(views, n, name))
+    first, second = view_indices(views, m, name), view_indices(views, n, name)
+    first, second = broadcast(first, second, f"{name}: expected as many views m as n")
     if views.parallel:
         directions = views.detector_centers - views.sources
         apart = np.linalg.norm(np.cross(directions[first], directions[second]), axis=-1)

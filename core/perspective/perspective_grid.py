@@ -9,12 +9,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ..arrays import ArrayOrTensor, cast_like, is_tensor
+from ..arrays import ArrayOrTensor, cast_like, checked
 from ..errors import InputError
 from ..geometry.grid import Grid
 from ..geometry.views import Views
 from ..validation import freeze, instance, one_for_all, one_of, real_array, whole_number
 from .coordinates import transform_points
+from .view_rays import view_frames
 
 Floats = NDArray[np.float64]
 
@@ -154,14 +155,10 @@ class PerspectiveGrid:
         `array` (…, n_u, n_v, n_k), numpy or torch, holds values that keep density, as of `to_perspective`. A tensor's
         gradient follows.
         """
-        if tuple(array.shape[-3:]) != self.shape:
-            raise InputError(
-                f"perspective array: expected shape {self.shape} after any batch axes, got {tuple(array.shape)}"
-            )
-        lengths: Any = (
-            cast_like(self.ray_lengths(), array) if is_tensor(array) else self.ray_lengths().astype(array.dtype)
-        )
-        return (array * lengths).sum(-1).swapaxes(-1, -2)
+        double = str(getattr(array, "dtype", None)).endswith("float64")
+        array = checked(array, "perspective array", self.shape, double, batch=True)
+        values: Any = array * cast_like(self.ray_lengths(), array)
+        return values.sum(-1).swapaxes(-1, -2)
 
     @cached_property
     def index_matrix(self) -> Floats:
@@ -181,10 +178,7 @@ class PerspectiveGrid:
     @cached_property
     def _normal(self) -> Floats:
         """(3,): across the detector's plane, away from the source."""
-        normal = np.cross(self.views.u_steps[self.m], self.views.v_steps[self.m])
-        normal /= np.linalg.norm(normal)
-        ahead = normal @ (self.views.detector_centers[self.m] - self.views.sources[self.m])
-        return np.asarray(normal * np.sign(ahead))
+        return np.asarray(view_frames(self.views[self.m])[0, 2])
 
     @property
     def _distance(self) -> float:
@@ -217,7 +211,7 @@ def depth_ranges(views: Views, grid: Grid) -> tuple[Floats, Floats]:
     instance(grid, Grid, "depths: grid")
     depths = depths_in_views(views, grid.corners())
     near, far = depths.min(axis=1), depths.max(axis=1)
-    if not views.parallel and near.min() <= 0:
+    if not views.parallel and (near <= 0).any():
         raise InputError(
             f"view {int(near.argmin())}: expected a grid in front of its source, but it begins {-near.min():.3g} mm behind"
         )
@@ -226,7 +220,4 @@ def depth_ranges(views: Views, grid: Grid) -> tuple[Floats, Floats]:
 
 def depths_in_views(views: Views, points: ArrayLike) -> Floats:
     """The depths (M, N), mm, of world points (N, 3) in each view: from its source across its detector's plane."""
-    normals = np.cross(views.u_steps, views.v_steps)
-    ahead = np.einsum("mi,mi->m", normals, views.detector_centers - views.sources)
-    normals *= (np.sign(ahead) / np.linalg.norm(normals, axis=1))[:, None]
-    return np.asarray(np.einsum("mpi,mi->mp", np.asarray(points) - views.sources[:, None], normals))
+    return np.asarray(np.einsum("mpi,mi->mp", np.asarray(points) - views.sources[:, None], view_frames(views)[:, 2]))

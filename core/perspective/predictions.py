@@ -90,11 +90,14 @@ def predict_views(
 
     Notes
     -----
-    The values are interpolated between the cells' places, twice as densely at least as these are. That smooths them by about
-    a cell, and so are the images.
+    The values are interpolated between the cells' places, twice as densely at least as these are, but at no more than 8
+    points along each axis of a new cell. With pixels or planes that cover more than 4 cells, details between are missed.
+    Interpolation smooths the values by about a cell, and so the images.
     """
     instance(g, PerspectiveGrid, "predict_views")
     instance(views, Views, "predict_views")
+    if not len(views):
+        raise InputError("predict_views: expected one or more views, got none")
     array = checked(array, "perspective array", g.shape, False, batch=True)
     n_k = max(g.shape) if planes is None else whole_number(planes, "planes")
     n_u, n_v, _ = g.shape

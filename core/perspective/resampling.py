@@ -27,6 +27,7 @@ KEEP = ("density", "activity")
 
 _PER_CELL = 2  # points of one lattice along a cell of the other: what is shared out then varies by 3 % at most
 _MOST_POINTS = 8  # in a cell, along each axis
+_APART = 1.0  # cells from point to point: farther apart, cells between them get little or nothing
 _LOOKED_AT = 9  # cells along each axis, to find how many points one needs
 
 _MOST_VOLUMES = 8  # of an adjoint along rays, each of a thread: more would gain little and take much memory
@@ -71,11 +72,16 @@ def to_perspective(
     InputError
         Another shape, values that are not finite, CT numbers, more memory needed than there is.
 
+    Warns
+    -----
+    InputWarning
+        "activity": voxels cover so many cells that single cells get too much or too little.
+
     Notes
     -----
     "density" follows each ray exactly (Siddon 1985). Voxels are shared out among cells at several points each, evenly
     spaced: two along each axis for every cell that one covers, up to 8. So the cells of an even volume differ by up to 3 %
-    along each axis.
+    along each axis where a voxel covers up to 4 cells, and by up to 10 % where it covers 8.
 
     `from_perspective` with the other `keep` is the adjoint: ``<to_perspective(x, g), y> = v <x, from_perspective(y, g,
     grid, "activity")>`` and ``<to_perspective(x, g, "activity"), y> = v <x, from_perspective(y, g, grid)>``, with v the
@@ -95,7 +101,9 @@ def to_perspective(
     instance(grid, Grid, "to_perspective")
     if keep == "density":
         return _AlongRays(grid, g)(volume, progress)
-    return _Taking(g, grid).T(volume, progress) * grid.voxel_volume
+    operator = _Taking(g, grid)
+    _warn_of_few_points(operator, "to_perspective: voxels")
+    return operator.T(volume, progress) * grid.voxel_volume
 
 
 def from_perspective(
@@ -172,12 +180,20 @@ def camera_to_camera(
     ------
     InputError
         As of `to_perspective`.
+
+    Warns
+    -----
+    InputWarning
+        "activity": cells of `g_m` cover so many of `g_n` that single ones get too much or too little.
     """
     one_of(keep, KEEP, "keep")
     instance(g_m, PerspectiveGrid, "camera_to_camera")
     instance(g_n, PerspectiveGrid, "camera_to_camera")
-    operator = _Taking(g_m, g_n) if keep == "density" else _Taking(g_n, g_m).T
-    return operator(array, progress)
+    if keep == "density":
+        return _Taking(g_m, g_n)(array, progress)
+    operator = _Taking(g_n, g_m)
+    _warn_of_few_points(operator, "camera_to_camera: cells of the array")
+    return operator.T(array, progress)
 
 
 class _Pair(LinearOperator):
@@ -308,7 +324,9 @@ class _Taking(_Pair):
         super().__init__(source, target)
         from_world = source.index_matrix if isinstance(source, PerspectiveGrid) else _with_ones(source.index_from_world)
         self._matrix = from_world @ (target.affine if isinstance(target, Grid) else target.inverse)
-        self._points = _points_in_cells(self._matrix, source, target)
+        steps = _cells_covered(self._matrix, source, target)
+        self._points = np.clip(np.ceil(_PER_CELL * steps - 0.1), 1, _MOST_POINTS).astype(int)
+        self.apart = float((steps / self._points).max())  # from point to point, in the source's cells, at most
 
     def forward(self, x: Array, progress: Progress | None) -> Array:
         result = np.zeros(self.shape_out, x.dtype)
@@ -345,13 +363,25 @@ def _thirds(lattice: Lattice, index: Floats) -> Floats:
     return index if isinstance(lattice, Grid) else lattice.third_at(index)
 
 
-def _points_in_cells(matrix: Floats, source: Lattice, target: Lattice) -> NDArray[np.int64]:
-    """Points (3,) along each axis of the target's cells, `_PER_CELL` for each of the source's cells that one covers."""
+def _cells_covered(matrix: Floats, source: Lattice, target: Lattice) -> Floats:
+    """How many of the source's cells one of the target's covers along each of its axes (3,), at most."""
     index = _some_cells(target)
     here = _places(matrix, target, index)
     index = index[((here >= -0.5) & (here <= np.array(source.shape) - 0.5)).all(axis=1)]
-    steps = [_longest_step(matrix, target, index, axis) for axis in range(3)]
-    return np.clip(np.ceil(_PER_CELL * np.array(steps) - 0.1), 1, _MOST_POINTS).astype(int)
+    return np.array([_longest_step(matrix, target, index, axis) for axis in range(3)])
+
+
+def _warn_of_few_points(operator: _Taking, what: str) -> None:
+    """Warn where what is shared out at a cell's points leaves some of the cells between them out."""
+    if operator.apart > _APART:
+        covered = operator.apart * _MOST_POINTS
+        warnings.warn(
+            f"{what} cover up to {covered:.2g} cells along an axis and are shared out at {_MOST_POINTS} points: the total "
+            "is kept, but single cells get too much or too little; give fewer pixels and planes, or finer "
+            + what.split()[1],
+            InputWarning,
+            stacklevel=3,
+        )
 
 
 def _warn_of_gaps(g: PerspectiveGrid, grid: Grid) -> None:

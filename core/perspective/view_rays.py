@@ -27,6 +27,15 @@ def view_indices(views: Views, which: Indices, name: str) -> NDArray[np.intp]:
     return index % len(views)
 
 
+def broadcast(first: NDArray[Any], second: NDArray[Any], expected: str) -> tuple[NDArray[Any], NDArray[Any]]:
+    """Two arrays made of one shape, or `InputError` with what is `expected`."""
+    try:
+        one, other = np.broadcast_arrays(first, second)
+    except ValueError:
+        raise InputError(f"{expected}, or one for all, got {first.size} and {second.size}") from None
+    return one, other
+
+
 def view_frames(views: Views) -> Floats:
     """The views' frames (M, 3, 3), rows u, v, k: unit vectors, right-handed, whatever the pixels are.
 
@@ -72,7 +81,8 @@ def project_points(views: Views, points: ArrayLike) -> Floats:
     """
     instance(views, Views, "project_points: views")
     points = real_array(points, "points", (None, 3))
-    return np.stack([pixels_of(matrix, points) for matrix in views.projection_matrices()])
+    pixels = [pixels_of(matrix, points) for matrix in views.projection_matrices()]
+    return np.reshape(pixels, (len(views), len(points), 2))
 
 
 def pixels_of(matrix: Floats, points: Floats) -> Floats:
@@ -91,7 +101,9 @@ def points_at_depths(views: Views, m: int, pixels: ArrayLike, depths: ArrayLike)
     """
     index = view_indices(views, m, "points at depths")
     starts, per_depth = rays_by_depth(views, int(index), real_array(pixels, "pixels", (2,), batch=True))
-    return np.asarray(starts + real_array(depths, "depths", None)[..., None] * per_depth)
+    steps = real_array(depths, "depths", None)[..., None]
+    broadcast(steps, per_depth[..., :1], "points at depths: expected as many depths as pixels")
+    return np.asarray(starts + steps * per_depth)
 
 
 def rays_by_depth(views: Views, m: int | NDArray[np.intp], pixels: Floats) -> tuple[Floats, Floats]:

@@ -263,6 +263,8 @@ def test_what_has_no_epipolar_geometry_is_refused():
     refused(lambda: mph.epipolar_lines(views, 0, 1.0, [0, 0]), "index of a view", "1.0")
     refused(lambda: mph.epipolar_lines(views, [0, 1], 2, [0, 0]), "one index")
     refused(lambda: mph.fundamental_matrix("views", 0, 1), "Views")
+    refused(lambda: mph.fundamental_matrix(views, [0, 1], [2, 3, 4]), "as many views m as n", "2 and 3")
+    refused(lambda: mph.points_at_depths(views, 0, np.zeros((3, 2)), [100, 200]), "as many depths as pixels", "2 and 3")
     same = mph.Views(views.sources[[0, 0]], views.detector_centers[:2], views.u_steps[:2], views.v_steps[:2], (3, 4))
     refused(lambda: mph.essential_matrix(same, 0, 1), "views 0 and 1", "the same source")
     opposite = mph.parallel_views([0.4, 0.4 + np.pi], (8, 8), 1.0)

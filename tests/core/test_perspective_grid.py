@@ -171,10 +171,14 @@ def test_images_are_sums_of_values_times_lengths(parallel, uniform, rng):
     assert image.shape == (2, 90, 100) and image.dtype == np.float64
     np.testing.assert_allclose(image[1, 7, 63], array[1, 63, 7] @ grid.ray_lengths()[63, 7])
     assert grid.image(array.astype(np.float32)).dtype == np.float32
+    ones = np.ones(grid.shape, int)
+    for whole in (ones, ones.tolist()):  # lengths are not rounded to whole mm
+        np.testing.assert_allclose(grid.image(whole)[7, 63], grid.ray_lengths()[63, 7].sum(), rtol=1e-6)
     torch = pytest.importorskip("torch", reason="torch is not installed")
     tensor = torch.tensor(array, requires_grad=True)
     seen = grid.image(tensor)
     np.testing.assert_allclose(seen.detach(), image)
+    np.testing.assert_allclose(grid.image(torch.ones(grid.shape, dtype=torch.int32)), grid.image(ones), rtol=1e-6)
     (gradient,) = torch.autograd.grad(seen[0].sum(), tensor)
     np.testing.assert_allclose(gradient[0], grid.ray_lengths())
     assert (gradient[1] == 0).all()
@@ -195,6 +199,12 @@ def test_depth_ranges_hold_the_grid(rng):
     mph.depth_ranges(odd_views(True), wide)
 
 
+def test_no_views_have_no_depths_and_no_pixels():
+    none = odd_views()[0:0]
+    assert [each.shape for each in mph.depth_ranges(none, mph.Grid.centered((4, 4, 4), 1.0))] == [(0,), (0,)]
+    assert mph.project_points(none, [[0, 0, 0], [1, 2, 3]]).shape == (0, 2, 2)
+
+
 def test_grids_that_cannot_be_are_refused():
     views = odd_views()
     refused(lambda: mph.PerspectiveGrid("x", 0, 4, 1, 2), "Views")
@@ -206,6 +216,6 @@ def test_grids_that_cannot_be_are_refused():
     refused(lambda: mph.PerspectiveGrid(views, 0, 4, 1, np.inf), "far")
     refused(lambda: mph.PerspectiveGrid(views, 0, 4, 1, 2, "z"), "k, depth")
     refused(lambda: mph.PerspectiveGrid(odd_views(True), 0, 4, 3, 2), "near < far")
-    refused(lambda: mph.PerspectiveGrid(views, 0, 4, 1, 2).image(np.zeros((3, 3, 3))), "(100, 90, 4)", "(3, 3, 3)")
+    refused(lambda: mph.PerspectiveGrid(views, 0, 4, 1, 2).image(np.zeros((3, 3, 3))), "100 x 90 x 4", "3 x 3 x 3")
     refused(lambda: mph.perspective_grids(views, 4, [1, 2], 3), "near")
     assert mph.PerspectiveGrid(odd_views(True), -1, 4, -3, 2).m == 5

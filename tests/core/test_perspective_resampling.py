@@ -208,6 +208,16 @@ def test_rays_that_leave_voxels_out_are_said():
         mph.from_perspective(np.ones(g.shape), g, fine, keep="activity")
 
 
+def test_activity_shared_out_unevenly_is_said():
+    g = mph.PerspectiveGrid(odd_views(), 0, 40, 180, 220)
+    coarse = mph.Grid.centered((3, 3, 3), 20.0)
+    with pytest.warns(mph.InputWarning, match="voxels cover up to .* finer voxels"):
+        mph.to_perspective(np.ones(coarse.shape), g, "activity", grid=coarse)
+    few = mph.PerspectiveGrid(odd_views(coarse=6), 1, 2, 100, 200)
+    with pytest.warns(mph.InputWarning, match="cells of the array cover up to .* finer cells"):
+        mph.camera_to_camera(np.ones(few.shape), few, g, "activity")
+
+
 @pytest.mark.parametrize(
     ("call", "message"),
     [

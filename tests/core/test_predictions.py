@@ -156,6 +156,7 @@ def test_what_is_not_understood_is_refused(rng):
     refused(lambda: mph.spread_along_rays(image, np.nan * shares, g), "finite")
     refused(lambda: mph.predict_views(image, g, views), "expected shape")
     refused(lambda: mph.predict_views(shares, views, views), "PerspectiveGrid")
+    refused(lambda: mph.predict_views(shares, g, views[0:0]), "one or more views")
     refused(lambda: mph.predict_views(shares, g, views, 0), "planes")
     predicted, covered = mph.predict_views(shares, g, views, 4)
     refused(lambda: mph.prediction_errors(image, predicted, covered), "one shape", "23 x 26")

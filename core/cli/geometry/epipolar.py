@@ -1,6 +1,7 @@
 """``mphdrr geometry epipolar FILE --pixel MODULE:COLUMN,ROW``."""
 
 import argparse
+import math
 from typing import Any
 
 import numpy as np
@@ -141,6 +142,8 @@ def _pixel(system: PinholeSystem, text: str) -> tuple[int, list[float]]:
     module, _, place = text.partition(":")
     try:
         number, (column, row) = int(module), map(float, place.split(","))
+        if not (math.isfinite(column) and math.isfinite(row)):
+            raise ValueError
     except ValueError:
         raise InputError(f"--pixel {text!r}: expected MODULE:COLUMN,ROW, such as 7:120,130.5") from None
     index = np.flatnonzero(system.numbers == number)
@@ -156,7 +159,11 @@ def _depths(given: list[float] | None, system: PinholeSystem, m: int) -> tuple[f
         return max(distance - radius, 0.0), distance + radius
     if len(given) > 2:
         raise InputError(f"--depth: expected one depth or two, got {len(given)}")
-    return given[0], given[-1]
+    near, far = given[0], given[-1]
+    if not 0 <= near <= far < math.inf:
+        got = " ".join(f"{depth:g}" for depth in given)
+        raise InputError(f"--depth: expected one depth of 0 mm or more, or two in ascending order, got {got}")
+    return near, far
 
 
 def _listed(values: NDArray[Any]) -> list[float] | None:

@@ -42,9 +42,11 @@ def _run(arguments: argparse.Namespace) -> None:
     run = read_run(arguments.file)
     recipe = run.recipe.updated(typed_entries(arguments))
     grid = backprojection_grid(run, recipe)
-    volume = backproject_run(run, arguments.how, grid=grid, stages=progress_bar)
     seeing = views_that_see(run.views, grid, progress_bar("counting views"))
     assert isinstance(seeing, Volume)
+    if not seeing.array.any():
+        raise InputError("--center: no view sees any of these voxels; expected some in the field of view")
+    volume = backproject_run(run, arguments.how, grid=grid, stages=progress_bar)
     write_volume(volume, path)
     if counted is not None:
         write_volume(seeing, counted)

@@ -1,6 +1,6 @@
 """Back-projections: what many views say of a place, each along its rays, as sum, geometric mean or minimum."""
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import Any
 
 import numpy as np
@@ -15,12 +15,13 @@ from ..progress import Progress, part_of
 from ..validation import freeze, instance, one_of
 from ..volumes.volume import Volume
 from .perspective_grid import PerspectiveGrid
-from .places import LEAST, PRODUCT, SUM, take
+from .places import LEAST, PRODUCT, SUM, shifted, take
 
 HOW = {"sum": SUM, "product": PRODUCT, "minimum": LEAST}
 """In which ways a voxel's values in the views may be put together."""
 
 _NEUTRAL = {SUM: 0.0, PRODUCT: 1.0, LEAST: np.inf}
+_PARTS = 8  # of a volume, one after the other
 _SAME = 1e-6  # mm: between places of the same view
 
 Array = NDArray[np.float32]
@@ -79,8 +80,8 @@ def backproject(
 
     Notes
     -----
-    Besides images and result, the product takes two arrays of the result's size, a minimum and a sum none; with `depth`,
-    each also one array of one view's cells.
+    Besides images and result, little memory is needed; with `depth`, one array of one view's cells, and for the product two
+    of the result's size.
 
     For gradients, sum what `from_perspective` makes of each view's image times its distribution: it is the same sum, but
     for the cells' means.
@@ -92,26 +93,23 @@ def backproject(
     images = _plain(images, "backproject: images", (len(views), *views.shape))
     if kind == PRODUCT:
         _require_no_negative(images, "backproject: images", "product", ("view", "row", "column"))
-    require(
-        (12.0 if kind == PRODUCT else 4.0) * float(np.prod(grid.shape)),
-        "a back-projection to {} x {} x {}".format(*grid.shape),
-    )
-    points = np.full(grid.shape, _NEUTRAL[kind], np.float32)
-    seen, exponents = (np.zeros(grid.shape, np.int32) if kind == PRODUCT else None for _ in range(2))
-    given: dict[str, Any] = {"how": kind, "seen": seen, "exponents": exponents}
+    besides = 2 if kind == PRODUCT and depth is not None else 0
+    require(4.0 * (1 + besides) * float(np.prod(grid.shape)), "a back-projection to {} x {} x {}".format(*grid.shape))
+    points = np.empty(grid.shape, np.float32)
+    taken: Iterable[tuple[Array, Floats]]
     if depth is None:
         matrices = _pixel_rows(views) @ lattice.to_world
-        take(points, lattice.thirds, images[..., None], matrices, flat=True, progress=progress, **given)
+        size = -(-len(points) // _PARTS)
+        parts = range(0, len(points), size)  # so that what a product needs besides is small
+        for number, first in enumerate(parts):
+            taken, said = [(images[..., None], shifted(matrices, first))], part_of(progress, number, len(parts))
+            _fill(points[first : first + size], kind, lattice.thirds, taken, 1, said, flat=True)
     else:
-        for m, (g, distribution) in enumerate(_distributions(depth, views)):
-            values = np.multiply(images[m].T[..., None], distribution, order="C")
-            matrix = g.index_matrix @ lattice.to_world
-            take(points, lattice.thirds, values[None], matrix[None], progress=part_of(progress, m, len(views)), **given)
-    if kind == LEAST:
-        for plane in points:  # in little memory
-            plane[np.isinf(plane)] = 0.0
-    elif kind == PRODUCT:
-        _take_roots(points, seen, exponents)  # type: ignore[arg-type]
+        taken = (
+            (np.multiply(images[m].T[None, ..., None], array, order="C"), (g.index_matrix @ lattice.to_world)[None])
+            for m, (g, array) in enumerate(_distributions(depth, views))
+        )
+        _fill(points, kind, lattice.thirds, taken, len(views), progress)
     return lattice.finished(points, "backprojection")
 
 
@@ -216,6 +214,28 @@ def _is_view(g: PerspectiveGrid, views: Views, m: int) -> bool:
         return False
     names = ("sources", "detector_centers", "u_steps", "v_steps")
     return all(np.allclose(getattr(g.views, n)[g.m], getattr(views, n)[m], rtol=0, atol=_SAME) for n in names)
+
+
+def _fill(
+    points: Array,
+    kind: int,
+    thirds: Floats,
+    taken: Iterable[tuple[Array, Floats]],
+    n: int,
+    progress: Progress | None,
+    flat: bool = False,
+) -> None:
+    """Combine what is taken, `n` times arrays with their matrices, into `points`."""
+    points[...] = _NEUTRAL[kind]
+    names = ("seen", "exponents") if kind == PRODUCT else ()
+    counts: dict[str, Any] = {name: np.zeros(points.shape, np.int32) for name in names}
+    for done, (arrays, matrices) in enumerate(taken):
+        take(points, thirds, arrays, matrices, how=kind, flat=flat, progress=part_of(progress, done, n), **counts)
+    if kind == LEAST:
+        for plane in points:  # in little memory
+            plane[np.isinf(plane)] = 0.0
+    elif kind == PRODUCT:
+        _take_roots(points, **counts)
 
 
 def _take_roots(points: Array, seen: Counts, exponents: Counts) -> None:

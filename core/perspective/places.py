@@ -76,8 +76,8 @@ def take(
     def work(first: int) -> None:
         part = slice(first, first + size)
         counts = [None if each is None else each[part] for each in (seen, exponents)]
-        shifted = _shifted(matrices, first)
-        kernel(points[part], thirds, arrays, shifted, how, *counts, flat=flat, by_depth=by_depth, nearest=nearest)
+        own = shifted(matrices, first)
+        kernel(points[part], thirds, arrays, own, how, *counts, flat=flat, by_depth=by_depth, nearest=nearest)
 
     see_through(in_order(work, range(0, n, size), workers), size, n, progress)
 
@@ -107,7 +107,7 @@ def see_through(parts: Iterator[None], size: int, total: int, progress: Progress
             progress(min(done * size, total), total)
 
 
-def _shifted(matrices: NDArray[np.float64], first: int) -> NDArray[np.float64]:
+def shifted(matrices: NDArray[np.float64], first: int) -> NDArray[np.float64]:
     """Matrices for points whose first index is counted from `first`."""
     shifted = matrices.copy()
     shifted[..., 3] += first * shifted[..., 0]
@@ -154,9 +154,10 @@ def _take_in_numpy(
     flat, by_depth, nearest = others["flat"], others["by_depth"], others["nearest"]
     for array, matrix in zip(arrays, matrices, strict=True):
         for i in range(len(points)):  # plane by plane, in little memory
-            places = _places((1, points.shape[1]), thirds, _shifted(matrix, i), array.shape, flat, nearest)
+            places = _places((1, points.shape[1]), thirds, shifted(matrix, i), array.shape, flat, nearest)
             inside, at, share, depth = (each[..., 0, :, :] for each in places)
-            value = sum(array[index] * weight for index, weight in _corners(at, share, array.shape))
+            with np.errstate(invalid="ignore"):  # infinity times a share of 0
+                value = sum(array[index] * weight for index, weight in _corners(at, share, array.shape))
             if by_depth:
                 value = value / depth**2
             plane = points[i]
@@ -177,7 +178,7 @@ def _give_in_numpy(points: Array, thirds: Array, array: Array, matrix: NDArray[n
     part = array[slab]
     first = slab.indices(len(array))[0]
     for i in range(len(points)):
-        places = _places((1, points.shape[1]), thirds, _shifted(matrix, i), array.shape, False, 0.0)
+        places = _places((1, points.shape[1]), thirds, shifted(matrix, i), array.shape, False, 0.0)
         inside, at, share, _ = (each[..., 0, :, :] for each in places)
         for index, weight in _corners(at, share, array.shape):
             mine = inside & (index[0] >= first) & (index[0] < first + len(part))

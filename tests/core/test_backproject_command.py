@@ -120,6 +120,7 @@ def test_what_is_not_understood_is_refused_before_anything_is_written(scanner, r
     assert ".nii.gz" in refused(capsys, file, "-o", tmp_path / "b.txt")
     assert "same file as --output" in refused(capsys, file, "-o", output, "--views-that-see", output)
     assert "voxels" in refused(capsys, file, "--voxels", "0", "-o", output)
+    assert "no view sees any" in refused(capsys, file, *SMALL, "--center", "0", "0", "5000", "-o", output)
     assert main(["backproject", file, "--how", "mean", "-o", str(output)]) == 2
     assert main(["backproject", file]) == 2
     capsys.readouterr()

@@ -270,6 +270,7 @@ def test_modules_are_shown_by_range(scene, ring_system):
         scanner.show_modules(collection, 9, 20)
 
 
+@pytest.mark.long
 def test_python_ends_with_the_extension_registered():
     """Blender 4.5's module hangs if classes are still registered when Python ends."""
     script = "from mphdrr.addon import registration as r; r.register(); r.unregister(); r.register()"

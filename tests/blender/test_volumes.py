@@ -221,7 +221,7 @@ def test_derenzo_operator_makes_the_phantom_of_core(scene):
 
 
 def test_derenzo_update_remakes_the_voxels_in_place():
-    bpy.ops.mphdrr.add_derenzo(voxels=32, location=(10, 0, 0))
+    bpy.ops.mphdrr.add_derenzo(voxels=32, rod_diameters=(10, 8, 0, 0, 0, 0), location=(10, 0, 0))
     item = bpy.context.object
     item.mphdrr_volume.derenzo.radius = 30
     assert bpy.ops.mphdrr.update_phantom() == {"FINISHED"}

@@ -62,7 +62,7 @@ def test_mu_given_is_the_models_mu(backend, which, system, rng):
     np.testing.assert_allclose(volume.grad, expected.T(values), rtol=1e-5, atol=1e-5 * float(volume.grad.abs().max()))
 
 
-@pytest.mark.parametrize("backend", ["numpy", "torch"])
+@pytest.mark.parametrize("backend", ["numpy", pytest.param("torch", marks=pytest.mark.long)])
 @pytest.mark.parametrize("which", ["shared", "own"])
 def test_gradcheck_by_activity_and_mu(backend, which, system, rng):
     """Also of the whole camera, whose rays start in several points and whose images are blurred."""

@@ -135,7 +135,7 @@ def test_partners_are_adjoint(parallel):
 def test_tensors_and_their_gradients(parallel):
     torch = pytest.importorskip("torch")
     rng = np.random.default_rng(2)
-    for forward, adjoint, shape_in, shape_out in maps(odd_views(parallel)):
+    for forward, adjoint, shape_in, shape_out in maps(odd_views(parallel, coarse=3)):
         x = torch.from_numpy(rng.random(shape_in)).requires_grad_()
         y = torch.from_numpy(rng.random(shape_out))
         result = forward(x)

@@ -8,6 +8,8 @@ import subprocess
 import sys
 from pathlib import Path
 
+import pytest
+
 ROOT = Path(__file__).resolve().parents[2]
 
 ENTRY = """
@@ -22,7 +24,10 @@ SETTING = """
 USE = """
 import sys, warnings
 from pathlib import Path
-import numpy as np, openpyxl
+
+import pytest
+import numpy as np
+import pytest, openpyxl
 import mphdrr.core as mph
 from mphdrr.core.errors import InputError
 
@@ -76,6 +81,7 @@ assert "which is not understood and may mean Ns" in refusal(mph.read_system, "un
 """
 
 
+@pytest.mark.long
 def test_a_typed_column_is_one_entry_and_one_field(workbook, tmp_path):
     package = tmp_path / "mphdrr"
     shutil.copytree(ROOT / "core", package / "core", ignore=shutil.ignore_patterns("__pycache__"))

@@ -24,10 +24,7 @@ SETTING = """
 USE = """
 import sys, warnings
 from pathlib import Path
-
-import pytest
-import numpy as np
-import pytest, openpyxl
+import numpy as np, openpyxl
 import mphdrr.core as mph
 from mphdrr.core.errors import InputError
 

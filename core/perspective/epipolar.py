@@ -182,14 +182,19 @@ def epipolar_segments(views: Views, m: int, pixel: ArrayLike, near: float, far: 
     first = np.append(start + near * per_depth, 1.0)
     last = np.append(per_depth, 0.0) if far == math.inf else np.append(start + far * per_depth, 1.0)
     # (M, 2, 3): all images between are sums of these two with weights of at least 0.
-    ends = np.einsum("mij,ej->mei", views.projection_matrices(), np.stack([first, last]))
-    ends = _within_image(ends, views.shape)
+    matrices, both = views.projection_matrices(), np.stack([first, last])
+    # What the last number was summed of: against it, that of a source is rounding.
+    scale = np.einsum("mj,ej->me", np.abs(matrices[:, 2]), np.abs(both))
+    ends = _within_image(np.einsum("mij,ej->mei", matrices, both), scale, views.shape)
     ends[index] = pixel if _in_image(pixel, views.shape) else np.nan
     return ends
 
 
-def _within_image(ends: Floats, shape: tuple[int, int]) -> Floats:
-    """Pixels (M, 2, 2) of the part in the image of segments between homogeneous pixels (M, 2, 3)."""
+def _within_image(ends: Floats, scale: Floats, shape: tuple[int, int]) -> Floats:
+    """Pixels (M, 2, 2) of the part in the image of segments between homogeneous pixels (M, 2, 3).
+
+    A last number is 0 if it is a rounding error beside `scale` (M, 2).
+    """
     column, row, factor = np.moveaxis(ends, -1, 0)
     n_v, n_u = shape
     # At least 0 in the image: linear along a segment. In front of the source follows from the sum of two.
@@ -205,8 +210,7 @@ def _within_image(ends: Floats, shape: tuple[int, int]) -> Floats:
     share = np.stack([enter, leave], axis=1)[..., None]
     clipped = (1 - share) * ends[:, :1] + share * ends[:, 1:]
     # In the image the last number is 0 at the source alone; a ray through there has one pixel.
-    scale = np.abs(ends[..., 2]).max(axis=1)[:, None]
-    at_source = clipped[..., 2] <= _ROUNDING * scale
+    at_source = clipped[..., 2] <= _ROUNDING * scale.max(axis=1)[:, None]
     with np.errstate(divide="ignore", invalid="ignore"):
         pixels = clipped[..., :2] / clipped[..., 2:]
     pixels = np.where(at_source[..., None], pixels[:, ::-1], pixels)

@@ -72,8 +72,8 @@ def test_lines_at_infinity_and_points_on_no_plane_are_known():
     line = mph.line_through([1, 2, 3], [1, 2, 5])
     np.testing.assert_allclose(distance_to_line([[4, 6, -8], [1, 2, 0]], line), [5, 0])
     refused(lambda: distance_to_line([0, 0, 0], np.zeros((4, 4))), "not at infinity")
-    matrix = odd_views().perspective_matrices()[0]
-    assert not np.isfinite(mph.transform_points(matrix, odd_views().sources[0])).any()
+    from_the_origin = np.array([[1.0, 0, 0, 0], [0, 1, 0, 0], [0, 0, 0, 1], [0, 0, 1, 0]])  # (x / z, y / z, 1 / z)
+    assert not np.isfinite(mph.transform_points(from_the_origin, [0, 0, 0])).any()
     refused(lambda: mph.transform_points(np.eye(3), [0, 0, 0]), "transform", "4 x 4")
 
 

@@ -71,7 +71,8 @@ def storing(run: ProjectionRun, made: Pictures) -> Generator[tuple[str, int, int
             new[name] = bpy.data.images.new(name, 1, 1, float_buffer=True, is_data=True)
             _fill(new[name], exact)
             new[ids.picture_name(name)] = _new_picture(ids.picture_name(name), colored)
-        new[ids.MOSAIC] = _new_picture(ids.MOSAIC, made.mosaic)
+        yield "storing", len(numbers), len(numbers)
+        new[ids.MOSAIC] = _new_picture(ids.MOSAIC, made.mosaic)  # as large as all: it has a turn of its own
         yield "storing", len(numbers), len(numbers)
     except BaseException:
         bpy.data.batch_remove(new.values())

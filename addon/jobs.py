@@ -36,7 +36,8 @@ _SOON = 1.0  # s of a stage after which the time left is guessed
 Finishing = Generator[tuple[str, int, int] | None, None, str]
 """Steps of the main thread, between which the window is drawn; returns the line to report.
 
-A step that can be cancelled yields its stage, what is done of it, and its total; one that can not yields None.
+A step that can be cancelled yields its stage, what is done of it, and its total; one that can not yields None. Where all of
+a stage is done, the window has its turn.
 """
 
 
@@ -292,7 +293,7 @@ class JobOperator:
             while True:
                 step = worker.steps.throw(Cancelled()) if worker.is_stoppable else next(worker.steps)
                 worker.show_step(step)
-                if time.perf_counter() >= enough:
+                if time.perf_counter() >= enough or (step is not None and step[1] == step[2]):
                     break
             self._left = time.perf_counter()
         except StopIteration as end:

@@ -164,7 +164,7 @@ def test_only_what_is_left_unchanged_can_be_stopped(scanned, tmp_path):
     stoppable = []
     for step in steps:
         stoppable.append(step)
-    assert stoppable == [*(("storing", k, 8) for k in range(9)), None]
+    assert stoppable == [*(("storing", k, 8) for k in range(9)), ("storing", 8, 8), None]  # the mosaic is a step
     assert everything() != before
     assert tuple(bpy.data.images["mphDRR 01"].size) == (14, 9)
 

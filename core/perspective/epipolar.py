@@ -58,9 +58,8 @@ def fundamental_matrix(views: Views, m: Indices, n: Indices) -> Floats:
     """
     first, second = _pair(views, m, n, "fundamental matrix")
     if views.parallel:
-        origin = (views.sources + views.detector_centers)[first] / 4 + (views.sources + views.detector_centers)[
-            second
-        ] / 4
+        middles = (views.sources + views.detector_centers) / 2
+        origin = (middles[first] + middles[second]) / 2
     else:
         origin = (views.sources[first] + views.sources[second]) / 2
     directions_m, moments_m = lines_of_pixels(views, first, origin)

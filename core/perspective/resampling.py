@@ -203,7 +203,7 @@ class _Pair(LinearOperator):
         self.source, self.target = source, target
 
     @property
-    def T(self) -> "_Adjoint":
+    def T(self) -> "_Pair":
         return _Adjoint(self)
 
     @property
@@ -230,30 +230,22 @@ class _Pair(LinearOperator):
         """The adjoint of an array of float32 or float64."""
 
 
-class _Adjoint(LinearOperator):
-    """The adjoint of a `_Pair`."""
+class _Adjoint(_Pair):
+    """The adjoint of a pair."""
 
     def __init__(self, pair: _Pair) -> None:
+        super().__init__(pair.target, pair.source)
         self._pair = pair
 
     @property
     def T(self) -> _Pair:
         return self._pair
 
-    @property
-    def shape_in(self) -> tuple[int, int, int]:
-        return self._pair.shape_out
+    def forward(self, x: Array, progress: Progress | None) -> Array:
+        return self._pair.adjoint(x, progress)
 
-    @property
-    def shape_out(self) -> tuple[int, int, int]:
-        return self._pair.shape_in
-
-    def _check(self, x: Any) -> ArrayOrTensor:
-        return checked(x, "array", self.shape_in, False, batch=True)
-
-    def _run_one(self, x: ArrayOrTensor, progress: Progress | None = None, mu: Any = None) -> ArrayOrTensor:
-        array = _plain(x, self.shape_out)
-        return to_caller(self._pair.adjoint(array, progress).astype(array.dtype, copy=False), x)
+    def adjoint(self, y: Array, progress: Progress | None) -> Array:
+        return self._pair.forward(y, progress)
 
 
 def _plain(x: ArrayOrTensor, result: tuple[int, int, int]) -> Array:

@@ -1,5 +1,7 @@
 """Module frames, rotations and 4x4 poses. World: right-handed, mm, origin at the isocentre, +z along the patient."""
 
+import math
+
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
@@ -57,8 +59,8 @@ def euler_pose(
     for axis, angle in zip((2, 1, 2), angles, strict=True):
         i, j = (axis + 1) % 3, (axis + 2) % 3
         turn = np.eye(3)
-        turn[i, i] = turn[j, j] = np.cos(angle)
-        turn[j, i] = np.sin(angle)
+        turn[i, i] = turn[j, j] = math.cos(angle)  # numpy's last digit depends on its version
+        turn[j, i] = math.sin(angle)
         turn[i, j] = -turn[j, i]
         rotation = rotation @ turn
     return affine_matrix(rotation, real_array(translation, "translation", (3,)))

@@ -1,0 +1,13 @@
+"""``mphdrr events ACTION``: an action is a module here with ``add_parser(actions)``."""
+
+from ..options import add_command
+from . import make
+
+
+def add_parser(subparsers) -> None:  # type: ignore[no-untyped-def]
+    """Add the command."""
+    example = "mphdrr events make set -n 1000 --recipe derenzo.toml"
+    events = add_command(subparsers, "events", "make sets of training events from a recipe", example)
+    actions = events.add_subparsers(metavar="ACTION", required=True)
+    for action in (make,):
+        action.add_parser(actions)

@@ -1,0 +1,131 @@
+"""``mphdrr events make SET -n 1000``."""
+
+import argparse
+import shutil
+import sys
+import time
+
+from ...errors import InputError
+from ...events.folders import SetFolder
+from ...events.making import EventMaker
+from ...events.recipe import EventRecipe, read_recipe
+from ...events.work import Made, making
+from ...memory import readable_size
+from ..options import add_command
+
+
+def add_parser(actions) -> None:  # type: ignore[no-untyped-def]
+    """Add the action."""
+    parser = add_command(
+        actions,
+        "make",
+        "make the events of a set that are missing",
+        "mphdrr events make set --recipe derenzo.toml -n 1000 --workers 2\n"
+        "example: mphdrr events make set\n"
+        "example: mphdrr events make set -n 100000 --shard 3/50",
+    )
+    parser.add_argument("folder", metavar="SET", help="folder of the set, with recipe.toml in it, or a new one")
+    parser.add_argument("--recipe", metavar="FILE", help="recipe (.toml) of a new set; the folder keeps a copy")
+    parser.add_argument(
+        "-n", "--count", type=int, metavar="N", help="events; default: as many as were asked for before"
+    )
+    parser.add_argument("--first", type=int, default=0, metavar="I", help="number of the first event")
+    parser.add_argument(
+        "--workers", type=int, default=1, metavar="N", help="processes, which share the processor's cores"
+    )
+    text = "only part I of N, for several machines that work on one folder"
+    parser.add_argument("--shard", type=_shard, default=(1, 1), metavar="I/N", help=text)
+    parser.add_argument("--quiet", action="store_true", help="say nothing on standard error but warnings")
+    parser.set_defaults(run=_run)
+
+
+def chosen_recipe(folder: str, recipe: str | None) -> EventRecipe:
+    """The recipe in a file, or that of a set's folder."""
+    if recipe is not None:
+        return read_recipe(recipe)
+    if not SetFolder(folder).recipe_path.is_file():
+        raise InputError(f"{folder}: it holds no recipe.toml: give --recipe FILE (mphdrr events new writes one)")
+    return SetFolder(folder).recipe
+
+
+def _run(arguments: argparse.Namespace) -> None:
+    recipe = chosen_recipe(arguments.folder, arguments.recipe)
+    work = making(recipe, arguments.folder, arguments.count, arguments.first, arguments.workers, arguments.shard)
+    report = _Report(SetFolder(arguments.folder), arguments.quiet)
+    done = 0
+    try:
+        for made in work:
+            done = made.done
+            report(made)
+    finally:
+        report.end()
+    folder = SetFolder(arguments.folder)
+    there = len(folder.numbers())
+    print(f"{arguments.folder}: {there} of {len(folder.planned())} events, {done} made now")
+
+
+class _Report:
+    """Says how large the set becomes, and what is left, on standard error."""
+
+    def __init__(self, folder: SetFolder, quiet: bool) -> None:
+        self.folder, self.quiet, self.shows = folder, quiet, sys.stderr.isatty() and not quiet
+        self.started, self.bytes, self.open_line = time.monotonic(), 0, False
+        if quiet:
+            return
+        missing = [n for n in folder.planned() if not folder.event_path(n).exists()]
+        sizes = [folder.event_path(n).stat().st_size for n in folder.numbers()[:100]]
+        raw = EventMaker(folder.recipe).raw_bytes
+        if sizes:
+            each = sum(sizes) / len(sizes)
+            size = f"about {readable_size(each)} each, {readable_size(each * len(missing))} in all"
+        else:
+            size = f"up to {readable_size(raw)} each before they are compressed"
+        self._say(f"{len(missing)} events are missing, {size}; {readable_size(self._free())} are free")
+
+    def __call__(self, made: Made) -> None:
+        self.bytes += made.size
+        left = made.total - made.done
+        each, seconds = self.bytes / made.done, (time.monotonic() - self.started) / made.done
+        if made.done == 1 and not self.quiet:
+            said = f"{readable_size(made.size)} in {made.seconds:.1f} s"
+            self._say(
+                f"event {made.number}: {said}; {left} more: {readable_size(each * left)}, {_time(seconds * left)}"
+            )
+        if made.done in (1, 10, 100, 1000) and each * left > self._free():
+            self._say(f"warning: only {readable_size(self._free())} are free on the disk of {self.folder.path}")
+        if self.shows:
+            filled = 30 * made.done // made.total
+            bar = f"[{'#' * filled}{'.' * (30 - filled)}] {made.done}/{made.total}"
+            more = f"{readable_size(each * left)} and {_time(seconds * left)} left"
+            sys.stderr.write(f"\r{bar}  {more}\x1b[K")
+            sys.stderr.flush()
+            self.open_line = True
+
+    def end(self) -> None:
+        """The line with the bar is done."""
+        if self.open_line:
+            sys.stderr.write("\n")
+            self.open_line = False
+
+    def _say(self, text: str) -> None:
+        self.end()
+        sys.stderr.write(f"mphdrr: {text}\n")
+        sys.stderr.flush()
+
+    def _free(self) -> int:
+        return shutil.disk_usage(self.folder.path).free
+
+
+def _shard(text: str) -> tuple[int, int]:
+    part, _, parts = text.partition("/")
+    try:
+        return int(part), int(parts)
+    except ValueError:
+        raise argparse.ArgumentTypeError(f"expected I/N, such as 1/3, got {text}") from None
+
+
+def _time(seconds: float) -> str:
+    """A duration, such as "85 min"."""
+    if seconds < 100:
+        return f"{seconds:.0f} s"
+    return f"{seconds / 60:.0f} min" if seconds < 6000 else f"{seconds / 3600:.1f} h"

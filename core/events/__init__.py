@@ -1,0 +1,17 @@
+"""Event sets: thousands of phantoms with their images, for training, each made from a recipe, a seed and its number.
+
+>>> recipe = mph.events.read_recipe("derenzo.toml")
+>>> events = mph.events.make(recipe, "set", 1000, workers=2)
+>>> events[0].truth, events[0].images("emission", noise_seed=1), events[0].radon(96)
+"""
+
+from .event_set import Event, EventSet
+from .making import EventArrays, EventMaker
+from .planning import PlannedEvent, plan
+from .recipe import EventRecipe, read_recipe
+from .work import Made, make, making
+
+__all__ = [
+    "Event", "EventArrays", "EventMaker", "EventRecipe", "EventSet", "Made", "PlannedEvent", "make", "making", "plan",
+    "read_recipe",
+]  # fmt: skip

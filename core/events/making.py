@@ -1,0 +1,203 @@
+"""The arrays of one event: truth, images of every model, Radon images."""
+
+import math
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..errors import InputError, naming
+from ..geometry.grid import Grid
+from ..geometry.parallel_views import parallel_views
+from ..geometry.system import PinholeSystem, chosen_modules
+from ..geometry.views import Views
+from ..memory import require
+from ..progress import Progress
+from ..projector import Emission, Projector, intensity
+from ..recording import recorded_warnings
+from ..runs.recipe import Recipe
+from ..runs.run_recipe import recipe_model, recipe_views
+from ..validation import freeze
+from ..volumes.rearranging import centered
+from ..volumes.resampling import resample
+from ..volumes.volume import Volume
+from ..workbook import read_system
+from .planning import PlannedEvent, plan
+from .recipe import EventRecipe
+
+
+@dataclass(frozen=True, eq=False)
+class EventArrays:
+    """What an event's file holds besides its settings."""
+
+    planned: PlannedEvent
+    truth: Volume
+    images: dict[str, NDArray[np.float32]]  # by model, (M, n_v, n_u): expected means, background included
+    units: dict[str, str]  # by model
+    radon: dict[int, NDArray[np.float32]]  # by number of angles, (n, n_v, n_u), value x mm
+    gains: NDArray[np.float64]  # (M,)
+    warnings: tuple[str, ...] = ()  # of the truth, such as a phantom that lies outside its grid in part
+
+
+class EventMaker:
+    """Makes events of a recipe; what all of them share (scanner, rays) is made once.
+
+    `threads` is how many a projection takes, by default one per core. The numbers do not depend on it.
+    """
+
+    def __init__(self, recipe: EventRecipe, threads: int | None = None) -> None:
+        self.recipe, self.threads = recipe, threads
+
+    @cached_property
+    def system(self) -> PinholeSystem:
+        """The scanner."""
+        return recipe_system(self.recipe)
+
+    @cached_property
+    def views(self) -> Views:
+        """Of the scanner's images."""
+        return recipe_views(self.recipe.system, self.system)
+
+    @property
+    def raw_bytes(self) -> int:
+        """How large an event is before it is packed."""
+        recipe = self.recipe
+        n = recipe.grid.n_voxels + len(recipe.models) * len(self.views) * math.prod(self.views.shape)
+        if recipe.radon is not None:
+            n += sum(recipe.radon.counts) * math.prod(recipe.radon.shape)
+        return 4 * n
+
+    def plan(self, number: int) -> PlannedEvent:
+        """What an event is."""
+        return plan(self.recipe, number)
+
+    def make(self, number: int, progress: Progress | None = None) -> EventArrays:
+        """Compute an event; `progress` is called as ``progress(steps done, steps)`` and may raise `Cancelled`."""
+        planned, recipe = self.plan(number), self.recipe
+        require(2.5 * self.raw_bytes, f"an event of {self.raw_bytes / 1e6:.0f} MB")
+        done, steps = 0, 1 + len(recipe.models) + (0 if recipe.radon is None else len(recipe.radon.counts))
+
+        def step() -> None:
+            nonlocal done
+            done += 1
+            if progress is not None:
+                progress(done, steps)
+
+        if progress is not None:
+            progress(0, steps)
+        with naming(f"event {number}"):
+            with recorded_warnings() as warnings:
+                truth = self.truth(planned)
+            step()
+            gains = planned.gains(len(self.system))
+            images, units = {}, {}
+            for name in recipe.models:
+                with naming(name):
+                    images[name], units[name] = self._images(name, planned, truth, gains)
+                step()
+            radon = {}
+            for count, projector in self._radon.items():
+                radon[count] = projector(truth)
+                step()
+        return EventArrays(planned, truth, images, units, radon, gains, tuple(warnings))
+
+    def truth(self, planned: PlannedEvent) -> Volume:
+        """The event's volume."""
+        factor = planned.activity_factor
+        volume = self._voxels(planned, self.recipe.quantity)
+        if factor == 1.0:
+            return volume
+        return Volume(freeze(volume.array * np.float32(factor)), volume.grid, volume.quantity)
+
+    def _voxels(self, planned: PlannedEvent, quantity: str) -> Volume:
+        """The mean of the event's phantoms, or its file's volume, on the grid of the truth."""
+        grid, placement = self.recipe.grid, planned.placement
+        if planned.entry.is_volume:
+            file = planned.file if quantity == self.recipe.quantity else planned.mu_file
+            if file is None:
+                raise InputError(f'phantoms: {planned.name}: mu_file: missing, but attenuation = "phantom" needs it')
+            return _placed(self.recipe.input(file).volume(), placement, grid, planned.entry.center)
+        volumes = [phantom.voxelize(grid, placement, quantity=quantity) for phantom in planned.phantoms]
+        if len(volumes) == 1:
+            return volumes[0]
+        mean = sum(volume.array.astype(np.float64) for volume in volumes) / len(volumes)
+        return Volume(freeze(np.asarray(mean, np.float32)), grid, quantity)
+
+    def _images(
+        self, name: str, planned: PlannedEvent, truth: Volume, gains: NDArray[np.float64]
+    ) -> tuple[NDArray[np.float32], str]:
+        """A model's images, and their unit."""
+        recipe = self.recipe.models[name]
+        own_mu = recipe["attenuation.of_phantom"]
+        if own_mu:
+            phantom = planned.phantom
+            if phantom is not None and all(shape.mu is None for shape in phantom.shapes):
+                raise InputError(f"attenuation: no shape of the {phantom.title} has a mu")
+        if own_mu and recipe["model.hole"] == "depth":  # this model's attenuation cannot be changed
+            mu = self._voxels(planned, "mu")
+            projector = Projector(truth.grid, self.views, recipe_model(recipe, self.system, mu), threads=self.threads)
+            images = projector(truth)
+        elif own_mu:
+            projector = self._projectors[name]
+            images = projector(truth, mu=self._voxels(planned, "mu").array)
+        else:
+            projector = self._projectors[name]
+            images = projector(truth)
+        photons, unit = recipe["model.photons"], projector.model.unit(truth)
+        if photons is not None:
+            images, unit = intensity(images, photons), "photons"
+        images = np.asarray(images, np.float32) + projector.background.astype(np.float32)
+        if isinstance(projector.model, Emission) and self.recipe.augmentation.module_gain:
+            images *= gains.astype(np.float32)[:, None, None]
+        return images, unit
+
+    @cached_property
+    def _projectors(self) -> dict[str, Projector]:
+        found = {}
+        for name, recipe in self.recipe.models.items():
+            with naming(f"models.{name}"):
+                found[name] = self._projector(recipe)
+        return found
+
+    def _projector(self, recipe: Recipe) -> Projector:
+        mu, grid = None, self.recipe.grid
+        if recipe["attenuation.of_phantom"]:  # each event has its own: here, to say on which grid
+            mu = Volume(freeze(np.zeros(grid.shape, np.float32)), grid, "mu")
+        elif recipe["attenuation.file"] is not None:
+            mu = self.recipe.input(recipe["attenuation.file"]).volume()
+        return Projector(grid, self.views, recipe_model(recipe, self.system, mu), threads=self.threads)
+
+    @cached_property
+    def _radon(self) -> dict[int, Projector]:
+        radon = self.recipe.radon
+        if radon is None:
+            return {}
+        return {n: Projector(self.recipe.grid, radon_views(self.recipe, n), threads=self.threads) for n in radon.counts}
+
+
+def recipe_system(recipe: EventRecipe) -> PinholeSystem:
+    """The scanner that a recipe names."""
+    given = recipe.system
+    columns = given["system.columns"]
+    path = recipe.input(given["system.file"]).path
+    system = read_system(path, columns=None if columns is None else recipe.input(columns).path)
+    return chosen_modules(system, given["system.modules"], "system.modules")
+
+
+def radon_views(recipe: EventRecipe, count: int) -> Views:
+    """The parallel views of a recipe with so many angles."""
+    if recipe.radon is None or count not in recipe.radon.counts:
+        known = () if recipe.radon is None else recipe.radon.counts
+        raise InputError(f"radon: no images of {count} angles; there are {', '.join(map(str, known)) or 'none'}")
+    angles = math.radians(recipe.radon.degrees) / count * np.arange(count)
+    return parallel_views(angles, recipe.radon.shape, recipe.radon.pitch, center=recipe.grid.center)
+
+
+def _placed(volume: Volume, placement: NDArray[Any], grid: Grid, is_centered: bool) -> Volume:
+    """A file's volume, moved by a placement, on a grid: interpolated, or where the voxels are coarser, their means."""
+    volume = centered(volume) if is_centered else volume
+    moved = Volume(volume.array, Grid(volume.grid.shape, placement @ volume.grid.affine), volume.quantity)
+    coarser = bool(np.any(grid.spacing > 1.5 * moved.grid.spacing.max()))
+    return resample(moved, grid, "mean" if coarser else "linear")

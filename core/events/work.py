@@ -1,0 +1,204 @@
+"""Making the events of a set: which are missing, one after the other, each written whole."""
+
+import os
+import re
+import time
+import warnings
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from ..errors import InputError, InputWarning
+from ..files import replacing
+from ..progress import Progress
+from ..recording import recorded_warnings
+from ..validation import whole_number
+from .event_files import packed
+from .event_set import EventSet
+from .folders import SetFolder
+from .making import EventMaker
+from .planning import plan
+from .recipe import EventRecipe
+
+
+class Written(NamedTuple):
+    """An event's file, as a worker wrote it."""
+
+    number: int
+    size: int  # bytes
+    seconds: float
+    warnings: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class Made:
+    """An event that is in the set now."""
+
+    number: int
+    path: Path
+    size: int  # bytes
+    seconds: float  # that it took
+    done: int  # events made by this work so far
+    total: int  # that it makes in all
+
+
+class EventWriter:
+    """Makes events of a set that is prepared and writes their files: what a worker does.
+
+    `threads` is how many an event takes, by default one per core.
+    """
+
+    def __init__(self, folder: str | os.PathLike[str], threads: int | None = None) -> None:
+        self.folder = SetFolder(folder)
+        self.maker = EventMaker(self.folder.recipe, threads)
+
+    def write(self, number: int, progress: Progress | None = None) -> Written:
+        """Make an event and write its file; `progress` as of `EventMaker.make`."""
+        started, folder = time.monotonic(), self.folder
+        folder.remove_leftovers(number)
+        with recorded_warnings() as said:
+            event = self.maker.make(number, progress)
+        data = packed(event, folder.recipe, self._geometry(), self.maker.threads)
+        with replacing(folder.event_path(number)) as temporary:
+            temporary.write_bytes(data)
+        return Written(number, len(data), time.monotonic() - started, (*event.warnings, *said))
+
+    def _geometry(self) -> dict[str, Any]:
+        maker = self.maker
+        matrices = maker.views.projection_matrices()
+        return {"projection_matrix": (matrices, "pixel"), "number": (maker.system.numbers, "1")}
+
+
+def making(
+    recipe: EventRecipe,
+    folder: str | os.PathLike[str],
+    count: int | None = None,
+    first: int = 0,
+    workers: int = 1,
+    shard: tuple[int, int] = (1, 1),
+    progress: Progress | None = None,
+) -> Iterator[Made]:
+    """Make the events of a set that are missing, one by one, as `make` does.
+
+    Parameters
+    ----------
+    recipe, folder, count, first, workers
+        As of `make`. Without a count: the events that were asked for before.
+    shard
+        ``(i, n)``: only part i, from 1, of n equal ones; several machines may work on one folder so.
+    progress
+        Called as ``progress(steps done, steps)`` within an event, with one worker; may raise `Cancelled`.
+
+    Yields
+    ------
+    Made
+        Each event, once it is in the set.
+
+    Raises
+    ------
+    InputError
+        As of `make`.
+    """
+    target, missing = prepare(recipe, folder, count, first, shard)
+    workers = whole_number(workers, "workers")
+    if workers > 1 and len(missing) > 1:
+        from .pool import in_processes
+
+        written = in_processes(target, missing, min(workers, len(missing)))
+    else:
+        written = _in_turn(target, missing, progress)
+    return followed(target, written, len(missing))
+
+
+def followed(target: SetFolder, written: Iterator[Written], total: int) -> Iterator[Made]:
+    """What is said of events as they are written; each warning is given once, for the first event that it is of."""
+    said: set[str] = set()
+    for done, event in enumerate(written, 1):
+        for text in event.warnings:
+            if (words := re.sub(r"[\d.]+", "", text)) not in said:  # the same with other numbers says nothing new
+                said.add(words)
+                warnings.warn(f"event {event.number}: {text}", InputWarning, stacklevel=3)
+        yield Made(event.number, target.event_path(event.number), event.size, event.seconds, done, total)
+
+
+def prepare(
+    recipe: EventRecipe,
+    folder: str | os.PathLike[str],
+    count: int | None = None,
+    first: int = 0,
+    shard: tuple[int, int] = (1, 1),
+) -> tuple[SetFolder, list[int]]:
+    """Put recipe, copies and index into a set's folder; and the numbers of the shard's events that are still missing."""
+    if isinstance(first, bool) or not isinstance(first, int) or first < 0:
+        raise InputError(f"first: expected a whole number of at least 0, got {first!r}")
+    part, parts = shard
+    if not (isinstance(part, int) and isinstance(parts, int) and 1 <= part <= parts):
+        raise InputError(f"shard: expected i/n with i from 1 to n, got {part}/{parts}")
+    target = SetFolder(folder)
+    numbers = target.planned() if count is None else list(range(first, first + whole_number(count, "count")))
+    if not numbers:
+        raise InputError(f"{target.path}: it holds no events: say how many to make (-n)")
+    for number in numbers:  # what does not fit together shows before the first is computed
+        _ = plan(recipe, number).phantom
+    recipe = target.prepare(recipe)
+    target.write_index([*target.planned(), *numbers])
+    mine = [number for number in numbers if number % parts == part - 1]
+    return target, [number for number in mine if not target.is_made(number, recipe.fingerprint)]
+
+
+def _in_turn(target: SetFolder, missing: list[int], progress: Progress | None) -> Iterator[Written]:
+    writer = EventWriter(target.path)
+    for number in missing:
+        yield writer.write(number, progress)
+
+
+def make(
+    recipe: EventRecipe,
+    folder: str | os.PathLike[str],
+    count: int,
+    first: int = 0,
+    workers: int = 1,
+    progress: Progress | None = None,
+) -> EventSet:
+    """Make events `first` to ``first + count - 1`` of a recipe; those that the folder holds already are kept.
+
+    Event i depends on the recipe, its seed and i alone: a set may be made in parts, by any number of workers, on several
+    machines. Each file is written whole or not at all, so work that is stopped, in whatever way, goes on where it was.
+
+    Parameters
+    ----------
+    recipe : EventRecipe
+        As of `read_recipe`. The folder keeps its text and copies of the files that it names.
+    folder
+        New, or that of an event set of the same recipe.
+    count, first
+        How many events, from which number.
+    workers
+        Processes; they share the processor's cores. With more than one, a script calls this under
+        ``if __name__ == "__main__":``, as of all of Python's processes.
+    progress
+        Called as ``progress(events done, events)``; may raise `Cancelled`.
+
+    Returns
+    -------
+    EventSet
+        All events in the folder.
+
+    Raises
+    ------
+    InputError
+        Another recipe in the folder, settings that do not go together (before anything is made), or a file that cannot be
+        written.
+
+    Examples
+    --------
+    >>> events = mph.events.make(mph.events.read_recipe("derenzo.toml"), "set", 1000, workers=2)
+    >>> events[0].images("emission", noise_seed=1).shape
+    (80, 256, 256)
+    """
+    count = whole_number(count, "count")
+    for made in making(recipe, folder, count, first, workers):
+        if progress is not None:
+            progress(made.done, made.total)
+    return EventSet(folder)

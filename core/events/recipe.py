@@ -259,12 +259,6 @@ class EventRecipe:
                 known[name] = self.inputs.get(name) or original_input(name, self.folder, self.files[name])
         return known[name]
 
-    def plan(self, number: int) -> Any:
-        """What event `number` is (`planning.plan`)."""
-        from .planning import plan
-
-        return plan(self, number)
-
     @cached_property
     def fingerprint(self) -> str:
         """SHA-256 of what the recipe says and of the contents of all files that it names; comments do not count."""

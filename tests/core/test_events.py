@@ -58,7 +58,7 @@ def test_an_event_depends_on_recipe_seed_and_number_alone(tmp_path, small):
     assert alone[0].path.read_bytes() == small[3].path.read_bytes()
     other = small_recipe(tmp_path / "other", TEXT.replace("seed = 5", "seed = 6"))
     assert other.fingerprint != recipe.fingerprint
-    assert other.plan(3).position != recipe.plan(3).position
+    assert events.plan(other, 3).position != events.plan(recipe, 3).position
 
 
 def test_a_setting_that_is_added_changes_no_other(tmp_path):
@@ -67,7 +67,7 @@ def test_a_setting_that_is_added_changes_no_other(tmp_path):
         tmp_path, TEXT.replace('kind = "derenzo"', 'kind = "derenzo"\nheight = { from = 20, to = 40 }')
     )
     for number in range(20):
-        a, b = before.plan(number), after.plan(number)
+        a, b = events.plan(before, number), events.plan(after, number)
         assert (a.name, a.position, a.euler_degrees, a.noise_seed) == (
             b.name,
             b.position,
@@ -87,7 +87,7 @@ def test_comments_and_the_place_of_files_do_not_change_a_recipe(tmp_path):
 
 def test_draws_lie_in_their_ranges_and_have_their_odds(tmp_path):
     recipe = small_recipe(tmp_path)
-    plans = [recipe.plan(number) for number in range(2000)]
+    plans = [events.plan(recipe, number) for number in range(2000)]
     rods = [plan for plan in plans if plan.name == "derenzo"]
     assert abs(len(rods) / len(plans) - 2 / 3) < 4 * math.sqrt(2 / 9 / len(plans))
     for values, low, high in (
@@ -119,7 +119,9 @@ def test_uniform_turns_are_uniform(tmp_path):
         TEXT[TEXT.index("euler_degrees") : TEXT.index('[[phantoms]]\nkind = "points"')], 'turn = "uniform"\n\n'
     )
     recipe = small_recipe(tmp_path, text)
-    poses = np.array([plan.pose for plan in map(recipe.plan, range(3000)) if plan.name == "derenzo"])
+    poses = np.array(
+        [plan.pose for plan in (events.plan(recipe, number) for number in range(3000)) if plan.name == "derenzo"]
+    )
     axes = poses[:, :3, 2]  # of the rods: uniform on the sphere, so each part is uniform from -1 to 1
     assert np.abs(axes.mean(axis=0)).max() < 4 / math.sqrt(3 * len(axes))
     assert np.abs((axes**2).mean(axis=0) - 1 / 3).max() < 0.03
@@ -192,7 +194,7 @@ def test_augmentation(tmp_path):
     more = "\n[augmentation]\nmirror = 0.5\nsize = { from = 0.8, to = 1.2 }\nactivity = { one_of = [0.5, 2.0] }\n"
     more += "module_gain = 0.1\n"
     recipe = small_recipe(tmp_path, TEXT + more)
-    plans = [recipe.plan(number) for number in range(400)]
+    plans = [events.plan(recipe, number) for number in range(400)]
     assert 0.4 < np.mean([plan.mirror for plan in plans]) < 0.6
     assert {plan.activity_factor for plan in plans} == {0.5, 2.0}
     mirrored = next(plan for plan in plans if plan.mirror)
@@ -247,7 +249,7 @@ def test_a_beating_torso_is_the_mean_of_its_gates(tmp_path):
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         recipe = small_recipe(tmp_path, text)
-        truth = events.EventMaker(recipe).truth(recipe.plan(0)).array
+        truth = events.EventMaker(recipe).truth(events.plan(recipe, 0)).array
         gates = [mph.CardiacTorso(defect_severity=0.5, phase=i / 2).voxelize(recipe.grid).array for i in range(2)]
     np.testing.assert_allclose(truth, np.mean(gates, axis=0), rtol=1e-5, atol=1e-5)
 

@@ -184,6 +184,9 @@ class EventRecipe:
                 if not name.replace("-", "").replace("_", "").isalnum() or name in ("truth", "pose", "radon"):
                     raise InputError("expected a name of letters, digits, - and _, and not truth, pose or radon")
                 found[name] = self._model(dict(entries))
+        for entry in self.phantoms if any(model["attenuation.of_phantom"] for model in found.values()) else ():
+            if entry.is_volume and entry.mu_file is None:
+                raise InputError(f'phantoms: {entry.name}: mu_file: missing, but a model has attenuation = "phantom"')
         if not found and self.radon is None:
             raise InputError("models: expected one [models.NAME] or more, or [radon]")
         return found

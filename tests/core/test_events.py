@@ -232,6 +232,15 @@ def test_volumes_are_placed_like_phantoms(tmp_path):
     bright = events.EventMaker(plain).make(0).images["emission"] - 0.25
     ratio = (event.images("emission") - 0.25).sum() / bright.sum()
     assert 0.6 < ratio < 0.95  # 10 to 24 mm of 0.02 / mm
+    moved = np.diag([1.0, 1, 1, 1])
+    moved[:3, 3] = (500, 20, -30)  # elsewhere: center = true brings both back together
+    for name in ("heart.nii.gz", "mu.nii.gz"):
+        volume = mph.read_volume(tmp_path / name)
+        volume = mph.Volume(volume.array, mph.Grid(volume.grid.shape, moved @ volume.grid.affine), volume.quantity)
+        mph.write_volume(volume, tmp_path / f"far-{name}")
+    far = text.replace('file = "heart', 'center = true\nfile = "far-heart').replace('"mu.nii', '"far-mu.nii')
+    again = events.EventMaker(small_recipe(tmp_path, far)).make(0)
+    np.testing.assert_allclose(again.images["emission"], event.images("emission"), rtol=1e-3)
     (tmp_path / "heart.nii.gz").unlink()
     (tmp_path / "mu.nii.gz").unlink()
     again = list(events.making(events.EventSet(tmp_path / "set").recipe, tmp_path / "set", 2))  # from its own copies

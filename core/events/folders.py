@@ -83,13 +83,16 @@ class SetFolder:
         `InputError` where the folder holds another recipe, events of another one, or files that are no event set.
         """
         ensure_folder(self.path)
+        for folder in (self.path, self.inputs):  # of a work that was killed
+            for path in folder.glob(".????????-*"):
+                if is_leftover(path.name):
+                    path.unlink(missing_ok=True)
         if not self.recipe_path.exists():
             if others := [name for name in os.listdir(self.path) if not _LEFTOVER.fullmatch(name)]:
                 raise InputError(
                     f"{self.path}: holds {others[0]} and no {RECIPE}: choose a new folder for the event set"
                 )
-            with replacing(self.recipe_path) as temporary:
-                temporary.write_text(recipe.text, encoding="utf-8", newline="")
+            _write_text(self.recipe_path, recipe.text)
         there = read_recipe(self.recipe_path)
         if there.values != recipe.values:
             raise InputError(f"{self.recipe_path}: another recipe: choose another folder for {recipe.name}")
@@ -127,8 +130,7 @@ class SetFolder:
         listed = {
             name: {"file": copy.path.name, "what": copy.what, "sha256": copy.sha256} for name, copy in copies.items()
         }
-        with replacing(self.inputs / _INPUT_LIST) as temporary:
-            temporary.write_text(json.dumps(listed, indent=1, sort_keys=True) + "\n", encoding="utf-8")
+        _write_text(self.inputs / _INPUT_LIST, json.dumps(listed, indent=1, sort_keys=True) + "\n")
         for name in os.listdir(self.inputs):
             if name != _INPUT_LIST and name not in [copy.path.name for copy in copies.values()]:
                 (self.inputs / name).unlink(missing_ok=True)  # of a recipe that was changed before its first event
@@ -163,13 +165,24 @@ class SetFolder:
         """Write the index of these events unless it is there."""
         text = self.index_text(numbers)
         if not self.index_path.is_file() or self.index_path.read_text(encoding="utf-8") != text:
-            with replacing(self.index_path) as temporary:
-                temporary.write_text(text, encoding="utf-8", newline="")
+            _write_text(self.index_path, text)
 
     def remove_leftovers(self, number: int) -> None:
         """Remove what a write of this event has left that was interrupted."""
         for path in self.events.glob(f".????????-{self.event_path(number).name}"):
             path.unlink(missing_ok=True)
+
+
+def _write_text(path: Path, text: str) -> None:
+    """Write a file that other shards may write at the same time: what one begins another may remove (`prepare`)."""
+    for attempt in range(3):
+        try:
+            with replacing(path) as temporary:
+                temporary.write_text(text, encoding="utf-8", newline="")
+            return
+        except InputError:
+            if attempt == 2:
+                raise
 
 
 def is_leftover(name: str) -> bool:

@@ -33,6 +33,8 @@ class Input:
         stem, ending = (self.path.stem, self.path.suffix) if self.what == "copy" else (_stem(self.path), ".h5")
         target, number = folder / f"{stem}{ending}", 1
         while target.exists():
+            if _hash(target, self.what, True) == self.sha256:  # another shard was faster
+                return Input(target, self.what, self.sha256, True)
             number += 1
             target = folder / f"{stem}-{number}{ending}"
         if self.what == "copy":

@@ -1,28 +1,86 @@
-"""Events made in several processes."""
+"""Events made in several processes, of which any may be killed."""
 
 import os
 import signal
+import threading
+from collections import deque
 from collections.abc import Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor
-from multiprocessing import get_context
+from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
+from concurrent.futures.process import BrokenProcessPool
+from multiprocessing import get_context, parent_process
+from pathlib import Path
 
+from ..errors import InputError
+from ..memory import require
 from .folders import SetFolder
+from .making import EventMaker
 from .writing import EventWriter, Written
+
+_MOST_BREAKS = 3
+"""How often workers may end one after the other without an event made between."""
 
 _writer: EventWriter | None = None
 
 
 def in_processes(target: SetFolder, numbers: Sequence[int], workers: int) -> Iterator[Written]:
-    """Make events of a set that is prepared, in any order."""
-    threads = max(1, (os.cpu_count() or 1) // workers)
-    with ProcessPoolExecutor(workers, get_context("spawn"), _begin, (target.path, threads)) as pool:
-        yield from pool.map(_write, numbers)
+    """Make events of a set that is prepared, as they come. What was under way in a worker that died is done again.
+
+    Raises
+    ------
+    InputError
+        That of a worker, such as a full disk; there is not enough memory; or workers die again and again.
+    """
+    if not numbers:
+        return
+    require(workers * 2.5 * EventMaker(target.recipe).raw_bytes, f"{workers} workers")
+    waiting, breaks = deque(numbers), 0
+    while waiting:
+        under_way: dict[Future[Written], int] = {}
+        pool = ProcessPoolExecutor(workers, get_context("spawn"), _begin, (target.path, _threads(workers)))
+        try:
+            while waiting or under_way:
+                while waiting and len(under_way) < workers + 1:  # one more, so that no worker waits for the next
+                    under_way[pool.submit(_write, waiting[0])] = waiting[0]
+                    waiting.popleft()
+                done, _ = wait(under_way, return_when=FIRST_COMPLETED)
+                for future in sorted(done, key=under_way.__getitem__):
+                    written = future.result()
+                    del under_way[future]
+                    breaks = 0
+                    yield written
+        except BrokenProcessPool:
+            breaks += 1
+            missing = sorted(under_way.values())
+            if breaks == _MOST_BREAKS:
+                raise InputError(
+                    f"event {missing[0] if missing else waiting[0]}: its worker ended {breaks} times before it was made "
+                    "(killed, or out of memory: try fewer workers; a script calls this under if __name__ == "
+                    '"__main__":)'
+                ) from None
+            waiting.extendleft(reversed(missing))
+        finally:
+            pool.shutdown(wait=True, cancel_futures=True)  # what is under way is finished: it counts
 
 
-def _begin(folder: os.PathLike[str], threads: int) -> None:
+def _threads(workers: int) -> int:
+    """Of each worker: together they use all cores."""
+    return max(1, (os.cpu_count() or 1) // workers)
+
+
+def _begin(folder: Path, threads: int) -> None:
+    """Begin a worker."""
     global _writer
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent ends the work
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches all processes: the parent ends the work
+    threading.Thread(target=_end_with_parent, daemon=True).start()
     _writer = EventWriter(folder, threads)
+
+
+def _end_with_parent() -> None:
+    """End this process when its parent is killed, which would otherwise leave it waiting for ever."""
+    parent = parent_process()
+    if parent is not None:
+        parent.join()
+        os._exit(1)
 
 
 def _write(number: int) -> Written:

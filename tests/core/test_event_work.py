@@ -1,0 +1,202 @@
+"""Making event sets: the same bytes by any number of workers, after any interruption."""
+
+from __future__ import annotations
+
+import os
+import random
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import psutil
+import pytest
+
+import mphdrr.core as mph
+from mphdrr.addon.cli import main
+from mphdrr.core import events
+from mphdrr.core.progress import Cancelled
+
+from .small_events import TEXT, small_recipe
+
+COUNT = 6
+
+
+def tree(folder: Path) -> dict[str, bytes]:
+    """All files of a folder, hidden ones, too."""
+    return {str(path.relative_to(folder)): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+
+
+@pytest.fixture(scope="module")
+def undisturbed(tmp_path_factory) -> dict[str, bytes]:
+    folder = tmp_path_factory.mktemp("undisturbed")
+    events.make(small_recipe(folder), folder / "set", COUNT)
+    return tree(folder / "set")
+
+
+def begin(folder: Path, *options: str) -> subprocess.Popen[str]:
+    """The command, begun."""
+    command = [
+        sys.executable,
+        "-m",
+        "mphdrr",
+        "events",
+        "make",
+        str(folder / "set"),
+        "--recipe",
+        str(folder / "small.toml"),
+    ]
+    command += ["-n", str(COUNT), *options]
+    return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, cwd=folder)
+
+
+def test_workers_and_shards_make_the_same_bytes(tmp_path, undisturbed):
+    recipe = small_recipe(tmp_path)
+    events.make(recipe, tmp_path / "two", COUNT, workers=2)
+    assert tree(tmp_path / "two") == undisturbed
+    for part in (2, 3, 1):
+        made = [made.number for made in events.making(recipe, tmp_path / "shards", COUNT, shard=(part, 3))]
+        assert made == [part - 1, part + 2]
+    assert tree(tmp_path / "shards") == undisturbed
+
+
+def test_parts_of_a_set_are_the_whole(tmp_path, undisturbed):
+    recipe = small_recipe(tmp_path)
+    events.make(recipe, tmp_path / "set", 2, first=4)
+    assert events.make(recipe, tmp_path / "set", COUNT).numbers == list(range(COUNT))
+    assert tree(tmp_path / "set") == undisturbed
+
+
+def test_cancelled_work_goes_on(tmp_path, undisturbed):
+    def stop(done: int, total: int) -> None:
+        if done == 3:
+            raise Cancelled
+
+    recipe = small_recipe(tmp_path)
+    with pytest.raises(Cancelled):
+        events.make(recipe, tmp_path / "set", COUNT, progress=stop)
+    assert len(events.EventSet(tmp_path / "set")) == 3
+
+    def stop_within(done: int, total: int) -> None:
+        if done == 2:
+            raise Cancelled
+
+    with pytest.raises(Cancelled):
+        list(events.making(recipe, tmp_path / "set", COUNT, progress=stop_within))
+    events.make(recipe, tmp_path / "set", COUNT)
+    assert tree(tmp_path / "set") == undisturbed
+
+
+@pytest.mark.long
+@pytest.mark.parametrize(("moments", "workers"), [(20, "1"), (5, "2")])
+def test_killed_work_goes_on_bit_for_bit(tmp_path, undisturbed, moments, workers):
+    """Killed at random moments of its whole time, and resumed once."""
+    chance = random.Random(4)
+    small_recipe(tmp_path)
+    started = time.monotonic()
+    assert begin(tmp_path, "--workers", workers).wait(120) == 0
+    whole = time.monotonic() - started
+    left = set()
+    for moment in range(moments):
+        folder = tmp_path / str(moment)
+        small_recipe(folder)
+        work = begin(folder, "--workers", workers)
+        children: list[psutil.Process] = []
+        end = time.monotonic() + whole * chance.uniform(0.2, 1.0)
+        while time.monotonic() < end and work.poll() is None:
+            time.sleep(0.005)
+            children = psutil.Process(work.pid).children(recursive=True) or children
+        work.send_signal(signal.SIGKILL)
+        work.wait()
+        psutil.wait_procs(children, timeout=20)
+        assert not any(child.is_running() for child in children)  # none is left behind
+        left.add(len(list(folder.glob("set/events/[0-9]*"))))
+        assert (
+            main(["events", "make", str(folder / "set"), "--recipe", str(folder / "small.toml"), "-n", str(COUNT)]) == 0
+        )
+        assert tree(folder / "set") == undisturbed
+    assert moments < 20 or len(left) > 2  # they were killed at different places
+
+
+@pytest.mark.long
+def test_a_killed_worker_costs_nothing_but_time(tmp_path, undisturbed):
+    small_recipe(tmp_path)
+    work = begin(tmp_path, "--workers", "2")
+    killed = 0
+    while work.poll() is None and killed < 2:
+        workers = [p for p in psutil.Process(work.pid).children() if "spawn_main" in " ".join(p.cmdline())]
+        if workers and list(tmp_path.glob("set/events/*.h5")):
+            workers[0].kill()
+            killed += 1
+            time.sleep(0.3)
+        time.sleep(0.005)
+    assert work.wait(120) == 0, work.communicate()
+    assert tree(tmp_path / "set") == undisturbed
+
+
+def test_workers_that_die_again_and_again_are_refused(tmp_path, monkeypatch):
+    recipe = small_recipe(tmp_path)
+    monkeypatch.setenv("PYTHONPATH", str(tmp_path))
+    (tmp_path / "sitecustomize.py").write_text("import os, sys\nif '--multiprocessing-fork' in sys.argv: os._exit(9)\n")
+    with pytest.raises(mph.InputError, match=r"event 0: its worker ended 3 times before it was made .*fewer workers"):
+        events.make(recipe, tmp_path / "set", 3, workers=2)
+
+
+def test_what_a_worker_refuses_is_one_line(tmp_path, capsys):
+    text = TEXT.replace("pixel_points = 1", 'pixel_points = 1\nattenuation = "phantom"').replace(
+        'kind = "points"', 'kind = "points"\nspheres = 3'
+    )
+    folder = tmp_path
+    (folder / "small.toml").write_text(text)
+    status = main(
+        ["events", "make", str(folder / "set"), "--recipe", str(folder / "small.toml"), "-n", "3", "--workers", "2"]
+    )
+    said = capsys.readouterr().err
+    assert status == 1 and "points: spheres: no such setting of points" in said and "Traceback" not in said
+
+
+@pytest.fixture
+def small_disk(tmp_path):
+    """A disk of 400 KiB; where there may be none, skip."""
+    disk = tmp_path / "disk"
+    disk.mkdir()
+    mounted = sys.platform == "linux" and os.geteuid() == 0
+    if mounted:
+        command = ["mount", "-t", "tmpfs", "-o", "size=400k", "tmpfs", str(disk)]
+        mounted = subprocess.run(command, capture_output=True).returncode == 0
+    if not mounted:
+        pytest.skip("no right to mount a small disk")
+    yield disk
+    subprocess.run(["umount", str(disk)], check=True)
+
+
+@pytest.mark.parametrize("workers", ["1", "2"])
+def test_a_full_disk_ends_with_one_line_and_a_set_that_resumes(tmp_path, small_disk, undisturbed, capsys, workers):
+    small_recipe(tmp_path)
+    command = ["events", "make", str(small_disk / "set"), "--recipe", str(tmp_path / "small.toml"), "--quiet"]
+    (small_disk / "other").write_bytes(b"x" * 150_000)
+    assert main([*command, "-n", str(COUNT), "--workers", workers]) == 1
+    said = [line for line in capsys.readouterr().err.splitlines() if "warning: only" not in line]
+    assert len(said) == 1 and "cannot be written (No space left on device)" in said[0], said
+    there = len(events.EventSet(small_disk / "set"))
+    assert 0 < there < COUNT
+    assert not list(small_disk.glob("set/events/.*"))
+    (small_disk / "other").unlink()
+    assert main([*command, "-n", str(COUNT), "--workers", workers]) == 0
+    assert tree(small_disk / "set") == undisturbed
+
+
+def test_the_command_says_what_it_does(tmp_path, capsys):
+    small_recipe(tmp_path)
+    folder = str(tmp_path / "set")
+    assert main(["events", "make", folder, "-n", "2"]) == 1
+    assert "it holds no recipe.toml: give --recipe FILE" in capsys.readouterr().err
+    assert main(["events", "make", folder, "--recipe", str(tmp_path / "small.toml"), "-n", "2", "--shard", "2/3"]) == 0
+    out = capsys.readouterr()
+    assert "1 of 2 events, 1 made now" in out.out and "up to" in out.err and "are free" in out.err
+    assert main(["events", "make", folder]) == 0
+    assert "2 of 2 events, 1 made now" in capsys.readouterr().out
+    assert main(["events", "make", folder, "--shard", "4/3"]) == 1
+    assert "shard: expected i/n with i from 1 to n, got 4/3" in capsys.readouterr().err
+    assert main(["events", "make", folder, "--shard", "x"]) == 2

@@ -5,6 +5,7 @@
 >>> events[0].truth, events[0].images("emission", noise_seed=1), events[0].radon(96)
 """
 
+from .checking import Fault, Status, check, repair, status
 from .event_set import Event, EventSet
 from .making import EventArrays, EventMaker
 from .planning import PlannedEvent, plan
@@ -12,6 +13,20 @@ from .recipe import EventRecipe, read_recipe
 from .work import Made, make, making
 
 __all__ = [
-    "Event", "EventArrays", "EventMaker", "EventRecipe", "EventSet", "Made", "PlannedEvent", "make", "making", "plan",
+    "Event",
+    "EventArrays",
+    "EventMaker",
+    "EventRecipe",
+    "EventSet",
+    "Fault",
+    "Made",
+    "PlannedEvent",
+    "Status",
+    "check",
+    "make",
+    "making",
+    "plan",
     "read_recipe",
-]  # fmt: skip
+    "repair",
+    "status",
+]

@@ -18,7 +18,7 @@ from .planning import plan
 from .recipe import EventRecipe, read_recipe
 
 RECIPE, INDEX, INPUTS, EVENTS = "recipe.toml", "index.csv", "inputs", "events"
-_INPUT_LIST = "inputs.json"
+INPUT_LIST = "inputs.json"
 _EVENT = re.compile(r"(\d{6,})\.h5")
 _LEFTOVER = re.compile(r"\.[0-9a-f]{8}-.+")
 """Names of files that are being written (`files.replacing`)."""
@@ -65,7 +65,7 @@ class SetFolder:
 
     def copies(self) -> dict[str, Input]:
         """The set's copies of the files that the recipe names, by their names there; empty where none are made yet."""
-        path = self.inputs / _INPUT_LIST
+        path = self.inputs / INPUT_LIST
         try:
             listed = json.loads(path.read_text(encoding="utf-8"))
             return {
@@ -130,9 +130,9 @@ class SetFolder:
         listed = {
             name: {"file": copy.path.name, "what": copy.what, "sha256": copy.sha256} for name, copy in copies.items()
         }
-        _write_text(self.inputs / _INPUT_LIST, json.dumps(listed, indent=1, sort_keys=True) + "\n")
+        _write_text(self.inputs / INPUT_LIST, json.dumps(listed, indent=1, sort_keys=True) + "\n")
         for name in os.listdir(self.inputs):
-            if name != _INPUT_LIST and name not in [copy.path.name for copy in copies.values()]:
+            if name != INPUT_LIST and name not in [copy.path.name for copy in copies.values()]:
                 (self.inputs / name).unlink(missing_ok=True)  # of a recipe that was changed before its first event
         return copies
 
@@ -144,11 +144,16 @@ class SetFolder:
         """The rows of the index, one for each event that was asked for; empty where there is no index."""
         try:
             with open(self.index_path, newline="", encoding="utf-8") as file:
-                return [{key: _value(key, text) for key, text in row.items()} for row in csv.DictReader(file)]
+                rows = [{key: _value(key, text) for key, text in row.items()} for row in csv.DictReader(file)]
         except FileNotFoundError:
             return []
         except (OSError, ValueError, csv.Error) as error:
             raise InputError(f"{self.index_path}: cannot be read ({error})") from None
+        if not all(isinstance(row.get("event"), int) for row in rows):
+            raise InputError(
+                f"{self.index_path}: cannot be read: mphdrr events check {self.path} --repair writes it anew"
+            )
+        return rows
 
     def index_text(self, numbers: Iterable[int]) -> str:
         """The index of events, CSV: drawn from the recipe alone, so that all shards of a set write the same."""

@@ -3,7 +3,7 @@
 import os
 import re
 import warnings
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -61,6 +61,15 @@ def making(
         As of `make`.
     """
     target, missing = prepare(recipe, folder, count, first, shard)
+    return _made(target, missing, workers, progress)
+
+
+def making_again(folder: str | os.PathLike[str], numbers: Sequence[int], workers: int = 1) -> Iterator[Made]:
+    """Make some events of a set anew, as `making` does, whatever is there."""
+    return _made(SetFolder(folder), numbers, workers)
+
+
+def _made(target: SetFolder, missing: Sequence[int], workers: int, progress: Progress | None = None) -> Iterator[Made]:
     workers = whole_number(workers, "workers")
     if workers > 1 and len(missing) > 1:
         written = in_processes(target, missing, min(workers, len(missing)))
@@ -105,7 +114,7 @@ def prepare(
     return target, [number for number in mine if not target.is_made(number, recipe.fingerprint)]
 
 
-def _in_turn(target: SetFolder, missing: list[int], progress: Progress | None) -> Iterator[Written]:
+def _in_turn(target: SetFolder, missing: Sequence[int], progress: Progress | None) -> Iterator[Written]:
     writer = EventWriter(target.path)
     for number in missing:
         yield writer.write(number, progress)

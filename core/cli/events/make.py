@@ -4,6 +4,7 @@ import argparse
 import shutil
 import sys
 import time
+from collections.abc import Iterator
 
 from ...errors import InputError
 from ...events.folders import SetFolder
@@ -51,17 +52,22 @@ def chosen_recipe(folder: str, recipe: str | None) -> EventRecipe:
 def _run(arguments: argparse.Namespace) -> None:
     recipe = chosen_recipe(arguments.folder, arguments.recipe)
     work = making(recipe, arguments.folder, arguments.count, arguments.first, arguments.workers, arguments.shard)
-    report = _Report(SetFolder(arguments.folder), arguments.quiet)
-    done = 0
+    done = watched(work, SetFolder(arguments.folder), arguments.quiet)
+    folder = SetFolder(arguments.folder)
+    there = len(folder.numbers())
+    print(f"{arguments.folder}: {there} of {len(folder.planned())} events, {done} made now")
+
+
+def watched(work: Iterator[Made], folder: SetFolder, quiet: bool) -> int:
+    """Do the work and say how far it is; the number of events that it made."""
+    report, done = _Report(folder, quiet), 0
     try:
         for made in work:
             done = made.done
             report(made)
     finally:
         report.end()
-    folder = SetFolder(arguments.folder)
-    there = len(folder.numbers())
-    print(f"{arguments.folder}: {there} of {len(folder.planned())} events, {done} made now")
+    return done
 
 
 class _Report:

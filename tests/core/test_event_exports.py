@@ -218,6 +218,29 @@ def test_exports_go_on_where_they_stopped_and_are_the_same_bytes(program, event_
     assert {path: path.stat().st_ino for path in there} == there, "what was there is kept"
 
 
+def test_what_a_killed_export_was_writing_is_removed(event_set, tmp_path):
+    """Programs take all files of a folder, hidden ones as well."""
+    out = tmp_path / "out"
+    out.mkdir()
+    (out / ".0a1b2c3d-export.json").write_text("{")
+    export_events(event_set, out, "3dunet", models="rays")
+    whole = contents(out)
+    (out / "train" / ".0a1b2c3d-000000.h5").write_bytes(b"half")
+    (out / ".0a1b2c3d-events.csv").write_text("i")
+    export_events(event_set, out, "3dunet", models="rays")
+    assert contents(out) == whole
+
+
+def test_another_table_of_slots_is_another_export(event_set, tmp_path):
+    slots = tmp_path / "slots.csv"
+    slots.write_text(row_slots(event_set.system).table(event_set.system))
+    export_events(event_set, tmp_path / "out", "3dunet", models="rays")
+    export_events(event_set, tmp_path / "out", "3dunet", models="rays", slots=slots, raw="slots")
+    slots.write_text(slots.read_text().replace(",1\n", ",0\n"))
+    with pytest.raises(InputError, match="another options"):
+        export_events(event_set, tmp_path / "out", "3dunet", models="rays", slots=slots)
+
+
 @pytest.mark.parametrize("program", PROGRAMS)
 def test_an_export_of_more_events_adds_them(program, event_set, tmp_path):
     if program == "legacy":

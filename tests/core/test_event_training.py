@@ -42,6 +42,16 @@ def test_own_noise_is_that_of_the_set_in_every_epoch(event_set):
         assert np.array_equal(item["rays"], event.images("rays")), "only counts have noise"
 
 
+def test_levels_are_the_recipes_and_with_own_noise_the_same_in_every_epoch(event_set):
+    dataset = events.torch_dataset(event_set, ("counts",), noise="own")
+    first = [dataset[i] for i in range(5)]
+    assert {float(item["level"]) for item in first} <= set(event_set.recipe.levels) == {1.0}
+    dataset = events.torch_dataset(event_set, ("counts",), noise="own", levels=(1.0, 0.5, 0.25))
+    first = [dataset[i] for i in range(5)]
+    dataset.set_epoch(1)
+    assert all(same(item, dataset[i]) for i, item in enumerate(first))
+
+
 def test_noise_of_epochs_differs_and_repeats(event_set):
     dataset = events.torch_dataset(event_set, ("counts",), noise="epoch", seed=4)
     seen = []
@@ -149,7 +159,7 @@ def test_datasets_pickle(event_set):
         ({"fields": ("counts",), "crop": 4}, "crop: 'truth': expected one of the fields"),
         ({"fields": ("counts", "radon6"), "crop": {("counts", "radon6"): 4}}, "expected fields of one shape"),
         ({"fields": ("rays",), "noise": "own"}, "only counts and photons have it"),
-        ({"fields": ("counts",), "levels": 0.5}, "levels: expected one or more, and noise"),
+        ({"fields": ("counts",), "levels": 0.5}, "levels: they are of the noise"),
         ({"fields": ("counts",), "noise": "each"}, "noise 'each'"),
         ({"fields": ("truth",), "seed": -1}, "seed: expected a whole number"),
     ],

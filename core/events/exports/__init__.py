@@ -82,8 +82,8 @@ def planned_export(
     if noise is not None:
         require_counted(events, names)
     chosen = Chosen(events, tuple(dict.fromkeys(names)), noise, level)
-    said = {name: os.fspath(value) if isinstance(value, os.PathLike) else value for name, value in options.items()}
-    return plan_export(chosen_program.layout(chosen, **options), chosen, Path(folder), program, said)
+    layout = chosen_program.layout(chosen, **options)
+    return plan_export(layout, chosen, Path(folder), program, {**options, **layout.contained()})
 
 
 def export_events(

@@ -81,6 +81,10 @@ class Layout:
         """The arrays of an event that are written, by their names in `Chosen.shapes`; here all."""
         return ("truth", *self.chosen.models, *(f"radon{n}" for n in self.chosen.radon_counts))
 
+    def contained(self) -> dict[str, Any]:
+        """Instead of the options that name files, what is in these: whether two exports are the same is told by it."""
+        return {}
+
     def files(self, row: Row) -> tuple[str, ...]:
         """Paths of an event's files."""
         raise NotImplementedError

@@ -14,6 +14,7 @@ Rows of images go along +v and columns along +u, as everywhere in mphDRR.
 
 import os
 from collections.abc import Iterator
+from typing import Any
 
 import numpy as np
 
@@ -40,6 +41,10 @@ class Legacy(Layout):
         """More than that of the set's arrays, by the mirrored images."""
         n_v, n_u = self.chosen.shapes[self.model][1:]
         return super().event_bytes + float32_bytes([(len(self.slots) - len(self.chosen.events.system), n_v, n_u)])
+
+    def contained(self) -> dict[str, Any]:
+        """The table of slots."""
+        return {"slots": self.slots.table(self.chosen.events.system)}
 
     def files(self, row: Row) -> tuple[str, ...]:
         """Truth, projections, and a file for each number of angles."""

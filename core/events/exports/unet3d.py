@@ -67,6 +67,12 @@ class Unet3d(Layout):
         """The label, and raw, which has its shape."""
         return (self.label, self.label)
 
+    def contained(self) -> dict[str, Any]:
+        """The table of slots, and what raw is where it was not said."""
+        return {"raw": self.raw} | (
+            {"slots": self.slots.table(self.chosen.events.system)} if self.raw == "slots" else {}
+        )
+
     def files(self, row: Row) -> tuple[str, ...]:
         """One, in the folder of its split."""
         return (f"{row['split']}/{row['i']:06d}.h5",)

@@ -16,11 +16,14 @@ from ...errors import InputError
 from ...files import ensure_folder, replacing
 from ...memory import readable_size
 from ...progress import Progress
+from ..folders import is_leftover
 from ..noise_choice import chosen_seed
 from .layout import Chosen, Layout, Part, Row
 
 REQUEST, TABLE = "export.json", "events.csv"
 _FORMAT = "mphDRR export"
+_MARK = len(".01234567-")
+"""Of files that are being written, what stands before their names."""
 
 
 @dataclass(frozen=True)
@@ -59,6 +62,7 @@ class Plan:
         self._require_room()
         for name in {str(Path(file).parent) for part in self.missing for file in part.files}:
             ensure_folder(self.folder / name)
+        self._remove_leftovers()
         self._remove_changed()
         # First, so that whatever there is of an unfinished export is known to be of it.
         _write(self.folder / REQUEST, json.dumps(self.request, indent=1).encode() + b"\n")
@@ -75,6 +79,13 @@ class Plan:
 
         for part in self.missing:
             self.layout.write(part, self.rows, self.folder, written)
+
+    def _remove_leftovers(self) -> None:
+        """Remove what a killed export was writing: readers of whole folders would find it."""
+        known = {self.folder / file for part in self.layout.parts(self.rows) for file in part.files}
+        for path in (*self.folder.glob(".*"), *self.folder.glob("*/.*")):
+            if is_leftover(path.name) and (path.with_name(path.name[_MARK:]) in known or path.parent == self.folder):
+                path.unlink(missing_ok=True)
 
     def _remove_changed(self) -> None:
         """Of an earlier export of fewer events, remove the files that will have more in them."""
@@ -128,7 +139,7 @@ def plan_export(layout: Layout, chosen: Chosen, folder: Path, program: str, opti
 
 def _require_same(folder: Path, request: dict[str, Any], rows: list[Row]) -> int:
     """How many events the same export had in the folder before; `InputError` if something else is in it."""
-    if not any(folder.iterdir()):
+    if all(is_leftover(path.name) for path in folder.iterdir()):
         return 0
     try:
         asked = json.loads((folder / REQUEST).read_text(encoding="utf-8"))

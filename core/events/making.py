@@ -27,6 +27,8 @@ from ..workbook import read_system
 from .planning import PlannedEvent, plan
 from .recipe import EventRecipe
 
+_KEPT_VOLUMES = 2
+
 
 @dataclass(frozen=True, eq=False)
 class EventArrays:
@@ -49,6 +51,7 @@ class EventMaker:
 
     def __init__(self, recipe: EventRecipe, threads: int | None = None) -> None:
         self.recipe, self.threads = recipe, threads
+        self._volumes: dict[str, Volume] = {}
 
     @cached_property
     def system(self) -> PinholeSystem:
@@ -116,14 +119,24 @@ class EventMaker:
         grid, placement = self.recipe.grid, planned.placement
         if planned.entry.is_volume:
             file = planned.file if quantity == self.recipe.quantity else planned.mu_file
-            if file is None:
-                raise InputError(f'phantoms: {planned.name}: mu_file: missing, but attenuation = "phantom" needs it')
-            return _placed(self.recipe.input(file).volume(), placement, grid, planned.entry.center)
+            assert file is not None  # the recipe refuses attenuation by a volume without a mu_file
+            volume = self._read(file)
+            if planned.entry.center and planned.file is not None:  # what attenuates moves as far as the activity
+                volume = centered(volume, volume.grid.center - self._read(planned.file).grid.center)
+            return _placed(volume, placement, grid)
         volumes = [phantom.voxelize(grid, placement, quantity=quantity) for phantom in planned.phantoms]
         if len(volumes) == 1:
             return volumes[0]
         mean = sum(volume.array.astype(np.float64) for volume in volumes) / len(volumes)
         return Volume(freeze(np.asarray(mean, np.float32)), grid, quantity)
+
+    def _read(self, file: str) -> Volume:
+        """A file's volume; the last few are kept, since events may share them."""
+        if file not in self._volumes:
+            while len(self._volumes) >= _KEPT_VOLUMES:
+                del self._volumes[next(iter(self._volumes))]
+            self._volumes[file] = self.recipe.input(file).volume()
+        return self._volumes[file]
 
     def _images(
         self, name: str, planned: PlannedEvent, truth: Volume, gains: NDArray[np.float64]
@@ -195,9 +208,8 @@ def radon_views(recipe: EventRecipe, count: int) -> Views:
     return parallel_views(angles, recipe.radon.shape, recipe.radon.pitch, center=recipe.grid.center)
 
 
-def _placed(volume: Volume, placement: NDArray[Any], grid: Grid, is_centered: bool) -> Volume:
+def _placed(volume: Volume, placement: NDArray[Any], grid: Grid) -> Volume:
     """A file's volume, moved by a placement, on a grid: interpolated, or where the voxels are coarser, their means."""
-    volume = centered(volume) if is_centered else volume
     moved = Volume(volume.array, Grid(volume.grid.shape, placement @ volume.grid.affine), volume.quantity)
     coarser = bool(np.any(grid.spacing > 1.5 * moved.grid.spacing.max()))
     return resample(moved, grid, "mean" if coarser else "linear")

@@ -7,7 +7,7 @@ from concurrent.futures import ProcessPoolExecutor
 from multiprocessing import get_context
 
 from .folders import SetFolder
-from .work import EventWriter, Written
+from .writing import EventWriter, Written
 
 _writer: EventWriter | None = None
 

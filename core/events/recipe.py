@@ -187,6 +187,9 @@ class EventRecipe:
                 if name in _TAKEN or name.startswith("radon"):
                     raise InputError(f"other arrays are called so: expected a name but {', '.join(_TAKEN)} and radon…")
                 found[name] = self._model(dict(entries))
+        for entry in self.phantoms if any(model["attenuation.of_phantom"] for model in found.values()) else ():
+            if entry.is_volume and entry.mu_file is None:
+                raise InputError(f'phantoms: {entry.name}: mu_file: missing, but a model has attenuation = "phantom"')
         if not found and self.radon is None:
             raise InputError("models: expected one [models.NAME] or more, or [radon]")
         return found
@@ -263,12 +266,6 @@ class EventRecipe:
             with naming(self.name):
                 known[name] = self.inputs.get(name) or original_input(name, self.folder, self.files[name])
         return known[name]
-
-    def plan(self, number: int) -> Any:
-        """What event `number` is (`planning.plan`)."""
-        from .planning import plan
-
-        return plan(self, number)
 
     @cached_property
     def fingerprint(self) -> str:

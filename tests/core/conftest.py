@@ -22,6 +22,8 @@ from mphdrr.core.projector import Emission
 from mphdrr.core.volumes.volume import Volume
 from mphdrr.core.workbook import read_system
 
+from .small_events import small_recipe
+
 WORKBOOK = Path(__file__).parents[2] / "examples" / "dc-spect-80.xlsx"
 
 _needs_torch = pytest.mark.skipif(importlib.util.find_spec("torch") is None, reason="torch is not installed")
@@ -147,5 +149,4 @@ test = 0.4
 def event_set(tmp_path_factory: pytest.TempPathFactory) -> events.EventSet:
     """Five events of 8 modules, tiny."""
     folder = tmp_path_factory.mktemp("events")
-    (folder / "recipe.toml").write_text(EVENT_RECIPE)
-    return events.make(events.read_recipe(folder / "recipe.toml"), folder / "set", 5)
+    return events.make(small_recipe(folder, EVENT_RECIPE), folder / "set", 5)

@@ -17,7 +17,8 @@ from ..noise_choice import NoiseChoice, chosen_seed, noisy_images
 
 Images = NDArray[np.float32]
 Row = dict[str, Any]
-"""Of events.csv: i, the export's running number from 0; the event's number, split and name; the noise's seed, or ""."""
+"""Of events.csv: i, the export's running number from 0; the event's number, split and name, and what besides its pose places
+its phantom; the noise's seed, or ""."""
 
 
 @dataclass(frozen=True)

@@ -112,6 +112,8 @@ def plan_export(layout: Layout, chosen: Chosen, folder: Path, program: str, opti
             "event": row["event"],
             "split": row["split"] or "all",
             "name": row["phantom"],
+            "mirror": int(row["mirror"]),
+            "size": row["size"],
             "noise_seed": "" if (seed := chosen_seed(row["noise_seed"], chosen.noise)) is None else seed,
         }
         for i, row in enumerate(chosen.events.index)

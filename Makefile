@@ -10,8 +10,8 @@
 # make test-app   the Linux zip in a real Blender (see tests/app)
 # make test-kernels   the C kernels under sanitizers, for arm64 under qemu, for Windows under Wine (see tests/kernels)
 # make test-gate  the Monte Carlo exports with GATE 10 itself; wants an environment of its own (2 GB): VENV=.venvgate
-# make test-peers   the exported geometry in the programs that read it, the projector in the packages that it has adapters for;
-#               wants an environment of its own: VENV=.venvpeers
+# make test-peers   the exported geometry and event sets in the programs that read them, the projector in the packages
+#               that it has adapters for; wants an environment of its own: VENV=.venvpeers
 # make clean   removes what the others made, environments included
 #
 # The environment is made in VENV on the first call. PYTHON picks its interpreter (3.11: Blender 4.5, 3.13: Blender 5.2);
@@ -86,8 +86,8 @@ test-gate: env-gate
 
 test-peers: env-peers
 	@# a missing one would only be skipped; deepinv needs a word before it is imported, which its tests say
-	@$(BIN)/python -c "import astra, cv2, itk, kornia, lib3mf, pytomography.algorithms, scipy; from importlib.metadata import version; version('deepinv')"
-	$(BIN)/python -m pytest tests/core/test_geometry_export_peers.py tests/core/test_adapters.py
+	@$(BIN)/python -c "import astra, cv2, itk, kornia, lib3mf, pytomography.algorithms, pytorch3dunet.datasets.hdf5, scipy, webdataset; from importlib.metadata import version; version('deepinv')"
+	$(BIN)/python -m pytest tests/core/test_geometry_export_peers.py tests/core/test_adapters.py tests/core/test_event_exports_peers.py
 
 env:
 	$(ENVIRONMENT) --extras blender

@@ -28,10 +28,11 @@ VERSION_WITH_TORCH = "3.11"
 DIFFDRR = "diffdrr==0.6.1"
 DIFFDRR_IMPORTS = ("einops", "fastcore", "pandas<3.1", "torchio")
 
-# For tests/core/test_adapters.py, with the extra "peers": the packages without the dependencies that their tested modules do
-# not import (a second OpenCV, uproot, matplotlib, ...), and those that they import and "peers" lacks.
-ADAPTED = ("deepinv==0.5.0", "pytomography==3.4.0", "rt-utils==1.2.7")
-ADAPTED_IMPORTS = ("fft-conv-pytorch", "natsort", "pandas", "requests", "scipy", "torchvision", "tqdm")
+# For tests/core/test_adapters.py and test_event_exports_peers.py, with the extra "peers": the packages without the
+# dependencies that their tested modules do not import (a second OpenCV, uproot, tensorboard, ...), and those that
+# they import and "peers" lacks.
+ADAPTED = ("deepinv==0.5.0", "pytomography==3.4.0", "pytorch3dunet==1.9.6", "rt-utils==1.2.7")
+ADAPTED_IMPORTS = ("fft-conv-pytorch", "natsort", "pandas", "requests", "scikit-image", "scipy", "torchvision", "tqdm")
 
 # System library that bpy loads -> the Debian package that contains it.
 LIBRARIES = {
@@ -110,7 +111,7 @@ def add_diffdrr(venv: Path) -> bool:
 
 
 def add_adapted(venv: Path, torch: str) -> bool:
-    """Install the packages that the projector has adapters for; return whether it succeeded."""
+    """Install the packages that the projector has adapters for, and pytorch-3dunet; return whether it succeeded."""
     # torchvision would fetch another torch than ours.
     return pip(venv, "install", *ADAPTED_IMPORTS, torch) and pip(venv, "install", "--no-deps", *ADAPTED)
 

@@ -7,9 +7,11 @@
 
 from .checking import Fault, Status, check, repair, status
 from .event_set import Event, EventSet
+from .exports import export_events
 from .making import EventArrays, EventMaker
 from .planning import PlannedEvent, plan
 from .recipe import EventRecipe, read_recipe
+from .training import torch_dataset
 from .work import Made, make, making
 
 __all__ = [
@@ -23,10 +25,12 @@ __all__ = [
     "PlannedEvent",
     "Status",
     "check",
+    "export_events",
     "make",
     "making",
     "plan",
     "read_recipe",
     "repair",
     "status",
+    "torch_dataset",
 ]

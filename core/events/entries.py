@@ -33,6 +33,13 @@ def unknown(values: Mapping[str, Any], known: Collection[str], before: str) -> N
             raise InputError(f"{before}{key}: no such entry; expected {', '.join(known)}")
 
 
+def plain_name(name: Any, what: str) -> str:
+    """A name that may also be that of a file: letters, digits, - and _."""
+    if not isinstance(name, str) or not name.replace("-", "").replace("_", "").isalnum():
+        raise InputError(f"{what}: expected a name of letters, digits, - and _, got {name!r}")
+    return name
+
+
 def share(value: Any, name: str) -> float:
     """A number from 0 to 1."""
     number = float(real_array(value, name, ()))
@@ -97,8 +104,8 @@ def phantom_entry(values: dict[str, Any], number: int, quantity: str) -> Phantom
         if not isinstance(name, str) or not name:
             raise InputError(f"name: expected a text, got {name!r}")
         split = values.get("split")
-        if split is not None and not isinstance(split, str):
-            raise InputError(f"split: expected a text, got {split!r}")
+        if split is not None:
+            plain_name(split, "split")
         odds = float(real_array(values.get("odds", 1.0), "odds", ()))
         gates = whole_number(values.get("gates", 1), "gates")
         if gates > 1 and (kind is None or kind.phantom is not CardiacTorso or "phase" in values):

@@ -66,6 +66,11 @@ class Event:
         self._source, self.number = source, number
 
     @property
+    def recipe(self) -> EventRecipe:
+        """Of its set."""
+        return self._source.recipe
+
+    @property
     def path(self) -> Path:
         """Its file."""
         return self._source.folder.event_path(self.number)

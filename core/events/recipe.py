@@ -18,7 +18,7 @@ from ..runs.recipe import Recipe
 from ..toml import parse_toml
 from ..validation import lengths, one_of, real_array, whole_number, whole_shape
 from .draws import check_draw, check_odds, options
-from .entries import PhantomEntry, phantom_entry, seed_of, share, table, unknown
+from .entries import PhantomEntry, phantom_entry, plain_name, seed_of, share, table, unknown
 from .inputs import Input, original_input
 
 VERSION = 1
@@ -26,6 +26,8 @@ VERSION = 1
 TRUTH_STORES = ("float32", "float16", "sparse")
 IMAGE_STORES = ("float32", "float16")
 QUANTITIES = ("activity", "mu")
+_TAKEN = ("truth", "truth_affine", "affine", "pose", "position", "euler_degrees", "number", "level", "record", "json")
+"""What else exports and batches of an event hold, besides the images of models."""
 
 _TABLES = (
     "version",
@@ -181,8 +183,9 @@ class EventRecipe:
             with naming(f"models.{name}"):
                 if not isinstance(entries, dict):
                     raise InputError(f"expected a table [models.{name}]")
-                if not name.replace("-", "").replace("_", "").isalnum() or name in ("truth", "pose", "radon"):
-                    raise InputError("expected a name of letters, digits, - and _, and not truth, pose or radon")
+                plain_name(name, "model")
+                if name in _TAKEN or name.startswith("radon"):
+                    raise InputError(f"other arrays are called so: expected a name but {', '.join(_TAKEN)} and radon…")
                 found[name] = self._model(dict(entries))
         for entry in self.phantoms if any(model["attenuation.of_phantom"] for model in found.values()) else ():
             if entry.is_volume and entry.mu_file is None:
@@ -244,6 +247,8 @@ class EventRecipe:
         splits = table(self.values, "splits")
         if splits:
             check_odds(list(splits.values()), len(splits), "splits")
+            for name in splits:
+                plain_name(name, "splits")
         total = sum(splits.values())
         return {name: value / total for name, value in splits.items()}
 

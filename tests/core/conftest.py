@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from mphdrr.core import events
 from mphdrr.core.errors import InputError
 from mphdrr.core.geometry.frames import euler_pose
 from mphdrr.core.geometry.grid import Grid
@@ -20,6 +21,8 @@ from mphdrr.core.geometry.system import PinholeSystem
 from mphdrr.core.projector import Emission
 from mphdrr.core.volumes.volume import Volume
 from mphdrr.core.workbook import read_system
+
+from .small_events import small_recipe
 
 WORKBOOK = Path(__file__).parents[2] / "examples" / "dc-spect-80.xlsx"
 
@@ -102,3 +105,48 @@ def run_python(
     """What a Python of its own says to `code`."""
     together = os.environ | (environment or {})
     return subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, env=together, **options)
+
+
+EVENT_RECIPE = f"""
+version = 1
+seed = 3
+[system]
+file = '{WORKBOOK}'
+modules = "1-4,21-24"
+[detector]
+rows = 12
+columns = 12
+[truth]
+voxels = [10, 9, 8]
+spacing = 14
+[[phantoms]]
+kind = "derenzo"
+radius = 40
+rod_diameters = [14, 12, 10, 9, 8, 7]
+height = 60
+activity = {{ from = 50, to = 90 }}
+[phantoms.pose]
+position = [{{ from = -9, to = 9 }}, 0, {{ from = -5, to = 5 }}]
+turn = "uniform"
+[models.counts]
+kind = "emission"
+time = 600
+[models.rays]
+kind = "transmission"
+[radon]
+angles = [16, 6]
+rows = 12
+columns = 12
+pitch = 12
+[splits]
+train = 0.6
+test = 0.4
+"""
+"""Of 8 modules in two rings: rows of 4 and their 4 mirror images are 16 slots."""
+
+
+@pytest.fixture(scope="session")
+def event_set(tmp_path_factory: pytest.TempPathFactory) -> events.EventSet:
+    """Five events of 8 modules, tiny."""
+    folder = tmp_path_factory.mktemp("events")
+    return events.make(small_recipe(folder, EVENT_RECIPE), folder / "set", 5)

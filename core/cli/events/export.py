@@ -1,0 +1,68 @@
+"""``mphdrr events export SET --to PROGRAM -o FOLDER``."""
+
+import argparse
+import sys
+
+from ...events.event_set import EventSet
+from ...events.exports import PROGRAMS, planned_export
+from ...events.exports.unet3d import RAW
+from ..options import add_command, progress_bar
+
+
+def add_parser(actions) -> None:  # type: ignore[no-untyped-def]
+    """Add the action."""
+    parser = add_command(
+        actions,
+        "export",
+        "write a set's events for another program",
+        "mphdrr events export set --to 3dunet --model counts --noise own -o unet\n"
+        "example: mphdrr events export set --to webdataset --split train -o shards",
+    )
+    add = parser.add_argument
+    add("folder", metavar="SET", help="folder of the set")
+    add("--to", required=True, choices=PROGRAMS, metavar="PROGRAM", help="see the list below")
+    folder = "a new one, or one that holds the beginning of the same export, which is gone on with"
+    add("-o", "--output", required=True, metavar="FOLDER", help=folder)
+    text = "whose images are written, by its name in the recipe; may be repeated; default: all, of which some take one only"
+    add("--model", action="append", metavar="NAME", help=text)
+    add("--split", metavar="NAME", help="only the events of this split, such as train")
+    add("--noise", type=_noise, metavar="own|SEED", help="with each event's own noise, or another; default: none")
+    add("--level", type=float, default=1.0, metavar="SHARE", help="of the acquisition time, with --noise")
+    add("--slots", metavar="CSV", help="legacy, 3dunet: which module each slot shows, as slots.csv says")
+    add(
+        "--raw",
+        choices=RAW,
+        help="3dunet: images by slots, to Radon images (the default); or back-projection, to truth",
+    )
+    add("--events-per-shard", type=int, metavar="N", help="webdataset; default: as many as make about a gigabyte")
+    programs = "\n".join(f"  {program.name:<13}{program.title}" for program in PROGRAMS.values())
+    parser.epilog = f"programs:\n{programs}\n{parser.epilog}"
+    parser.set_defaults(run=_run)
+
+
+def _run(arguments: argparse.Namespace) -> None:
+    events = EventSet(arguments.folder)
+    if arguments.split is not None:
+        events = events.split(arguments.split)
+    plan = planned_export(
+        events,
+        arguments.output,
+        arguments.to,
+        models=arguments.model,
+        noise=arguments.noise,
+        level=arguments.level,
+        slots=arguments.slots,
+        raw=arguments.raw,
+        events_per_shard=arguments.events_per_shard,
+    )
+    sys.stderr.write(f"mphdrr: {plan.says()}\n")
+    sys.stderr.flush()
+    plan.write(progress_bar("exporting"))
+    print(f"{arguments.output}: {len(plan.rows)} events, {PROGRAMS[arguments.to].title}")
+
+
+def _noise(text: str) -> int | str:
+    try:
+        return text if text == "own" else int(text)
+    except ValueError:
+        raise argparse.ArgumentTypeError(f"expected own, or a seed: a whole number, got {text}") from None

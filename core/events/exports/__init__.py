@@ -1,0 +1,129 @@
+"""Exports of event sets for other programs.
+
+To add a program, write its `Layout` in a module here, and list it below; `mphdrr events export` takes it from the list.
+"""
+
+import inspect
+import os
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from ...errors import InputError
+from ...progress import Progress
+from ...validation import instance, one_of, positive
+from ..event_set import EventSet
+from ..fields import field_shapes
+from ..noise_choice import NoiseChoice, checked_noise, require_counted
+from .layout import Chosen, Layout
+from .legacy import Legacy
+from .npz import Npz
+from .unet3d import Unet3d
+from .webdataset import WebDataset
+from .writing import Plan, plan_export
+
+__all__ = ["PROGRAMS", "Plan", "Program", "export_events", "planned_export"]
+
+
+@dataclass(frozen=True)
+class Program:
+    """A program, or a layout, that sets are exported for."""
+
+    name: str  # on the command line
+    title: str  # what is written, in one line
+    layout: type[Layout]  # made of what is chosen, with the program's options as keyword-only parameters
+
+    @property
+    def options(self) -> tuple[str, ...]:
+        """Names of its options."""
+        parameters = inspect.signature(self.layout).parameters.values()
+        return tuple(p.name for p in parameters if p.kind is p.KEYWORD_ONLY)
+
+
+_PROGRAMS = (
+    Program(
+        "legacy", "truth_i.pt, Projections_i.pt by slots, ProjRadonN_i.pt, RunTranslate.npy, RunRotate.npy", Legacy
+    ),
+    Program("3dunet", "pytorch-3dunet: an HDF5 file an event with raw and label, in a folder for each split", Unet3d),
+    Program("webdataset", "tar archives for WebDataset, of one split each", WebDataset),
+    Program("npz", "an archive of numpy an event, with all that is known of it", Npz),
+)
+PROGRAMS: dict[str, Program] = {program.name: program for program in _PROGRAMS}
+
+
+def planned_export(
+    events: EventSet,
+    folder: str | os.PathLike[str],
+    program: str,
+    *,
+    models: str | Sequence[str] | None = None,
+    noise: NoiseChoice = None,
+    level: float = 1.0,
+    **options: Any,
+) -> Plan:
+    """What `export_events` would write, and how much of it is there already: `Plan.says`, and `Plan.write` to do it."""
+    instance(events, EventSet, "export")
+    one_of(program, PROGRAMS, "program")
+    chosen_program = PROGRAMS[program]
+    options = {name: value for name, value in options.items() if value is not None}
+    for name in sorted(options.keys() - set(chosen_program.options)):
+        had = ", ".join(chosen_program.options) or "none"
+        raise InputError(f"{program}: no option {name!r}, it has {had}")
+    _ = field_shapes(events)  # of all joined sets
+    known = tuple(events.recipe.models)
+    names = known if models is None else (models,) if isinstance(models, str) else tuple(models)
+    for name in names:
+        one_of(name, known, "model")
+    noise = checked_noise(noise)
+    level = positive(level, "level")
+    if level != 1 and noise is None:
+        raise InputError("level: it is of the noise; choose noise as well, or leave it out")
+    if noise is not None:
+        require_counted(events, names)
+    chosen = Chosen(events, tuple(dict.fromkeys(names)), noise, level)
+    layout = chosen_program.layout(chosen, **options)
+    return plan_export(layout, chosen, Path(folder), program, {**options, **layout.contained()})
+
+
+def export_events(
+    events: EventSet,
+    folder: str | os.PathLike[str],
+    program: str,
+    *,
+    models: str | Sequence[str] | None = None,
+    noise: NoiseChoice = None,
+    level: float = 1.0,
+    progress: Progress | None = None,
+    **options: Any,
+) -> None:
+    """Write a set, or a part of one, for another program.
+
+    Parameters
+    ----------
+    events : EventSet
+        For instance ``set.split("train")``.
+    folder
+        A new or empty one, or one that holds the beginning of the same export, which is gone on with. Besides the
+        program's files it has ``events.csv``: which event each number of the files' names is.
+    program
+        A name of `PROGRAMS`.
+    models
+        Whose images are written, a name or several; default: all. "legacy" and "3dunet" take one.
+    noise
+        None: the mean images. "own": with the noise of each event's own seed. A whole number: another noise of that seed.
+    level
+        Share of the acquisition time, with noise.
+    progress
+        Called as ``progress(done, total)`` after each event; what it raises stops the work, which can be gone on with.
+    options
+        The program's own: ``PROGRAMS[program].options``.
+
+    Raises
+    ------
+    InputError
+        For an unknown program, model or option, a set that the program cannot hold, and a folder that holds something else
+        or cannot be written.
+    """
+    plan = planned_export(events, folder, program, models=models, noise=noise, level=level, **options)
+    plan.write(progress)

@@ -1,0 +1,48 @@
+"""Arrays of an event as the bytes of files; the same arrays are the same bytes."""
+
+import io
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ...errors import InputError
+
+
+def npy(array: NDArray[Any]) -> bytes:
+    """An array as an .npy file."""
+    buffer = io.BytesIO()
+    np.save(buffer, array, allow_pickle=False)
+    return buffer.getvalue()
+
+
+def npz(arrays: Mapping[str, Any]) -> bytes:
+    """Arrays as an .npz file, compressed."""
+    buffer = io.BytesIO()
+    np.savez_compressed(buffer, **arrays)
+    return buffer.getvalue()
+
+
+def pt(array: NDArray[Any]) -> bytes:
+    """An array as a .pt file: one tensor, which ``torch.load(path, weights_only=True)`` gives."""
+    try:
+        import torch
+    except ImportError:
+        raise InputError("files of tensors (.pt) need torch, which is missing: pip install torch") from None
+    buffer = io.BytesIO()  # torch writes a file's own name into it, and that of a temporary one is random
+    torch.save(torch.from_numpy(np.array(array, order="C")), buffer)
+    return buffer.getvalue()
+
+
+def hdf5(arrays: Mapping[str, NDArray[Any]], attributes: Mapping[str, Any]) -> bytes:
+    """Arrays as an HDF5 file, compressed, a chunk for each of their last two axes' pictures."""
+    import h5py
+
+    buffer = io.BytesIO()
+    with h5py.File(buffer, "w") as file:
+        file.attrs.update(attributes)
+        for name, array in arrays.items():
+            chunks = (1,) * (array.ndim - 2) + array.shape[-2:]
+            file.create_dataset(name, data=array, chunks=chunks, compression="gzip", compression_opts=1, shuffle=True)
+    return buffer.getvalue()

@@ -1,0 +1,31 @@
+"""One archive of numpy an event: ``000012.npz`` with the truth, the images of each model, Radon images and the pose."""
+
+import json
+from collections.abc import Iterator
+
+from ..event_set import Event
+from .arrays import npz
+from .layout import Layout, Row
+from .record import record
+
+
+class Npz(Layout):
+    """Names: truth (x, y, z), truth_affine, those of the models (M, n_v, n_u), radon96 (96, n_v, n_u), pose, record."""
+
+    packed = True
+
+    def files(self, row: Row) -> tuple[str, ...]:
+        """One."""
+        return (f"{row['i']:06d}.npz",)
+
+    def contents(self, row: Row, event: Event) -> Iterator[tuple[str, bytes]]:
+        """All that there is of the event; `record` is text, as JSON."""
+        arrays = {
+            "truth": event.truth.array,
+            "truth_affine": event.recipe.grid.affine,
+            **{model: self.chosen.images(event, model) for model in self.chosen.models},
+            **{f"radon{n}": event.radon(n) for n in self.chosen.radon_counts},
+            "pose": event.pose,
+            "record": json.dumps(record(self.chosen, event)),
+        }
+        yield self.files(row)[0], npz(arrays)

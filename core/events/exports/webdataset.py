@@ -1,0 +1,64 @@
+"""WebDataset: tar archives, shards, whose members of one key are an event: 000012.truth.npy, 000012.radon96.npy, ...
+
+A model's images are 000012.NAME.npy, 000012.json says the rest (`record`). Shards are of one split each,
+``train-000003.tar``, so that a brace pattern or a glob names what is trained on. The same set makes the same bytes.
+"""
+
+import io
+import json
+import tarfile
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+from ...files import replacing
+from ...validation import strict_whole
+from ..event_set import Event
+from .arrays import npy
+from .layout import Chosen, Layout, Part, Row
+from .record import record
+
+SHARD_BYTES = 10**9
+"""About how large a shard is unless its number of events is given."""
+
+
+class WebDataset(Layout):
+    """`events_per_shard`: how many events are in a shard; default: as many as make about a gigabyte."""
+
+    def __init__(self, chosen: Chosen, *, events_per_shard: int | None = None) -> None:
+        super().__init__(chosen)
+        if events_per_shard is None:
+            events_per_shard = max(1, SHARD_BYTES // self.event_bytes)
+        self.events_per_shard = strict_whole(events_per_shard, "events_per_shard", "a whole number of at least 1")
+
+    def parts(self, rows: list[Row]) -> list[Part]:
+        """A shard each."""
+        parts = []
+        for split in dict.fromkeys(row["split"] for row in rows):
+            members = [row["i"] for row in rows if row["split"] == split]
+            for first in range(0, len(members), self.events_per_shard):
+                name = f"{split}-{first // self.events_per_shard:06d}.tar"
+                parts.append(Part((name,), tuple(members[first : first + self.events_per_shard])))
+        return parts
+
+    def write(self, part: Part, rows: list[Row], folder: Path, written: Callable[[], None]) -> None:
+        """Write a shard."""
+        with (
+            replacing(folder / part.files[0]) as temporary,
+            tarfile.open(temporary, "w", format=tarfile.USTAR_FORMAT) as tar,
+        ):
+            for i in part.events:
+                for name, content in self.contents(rows[i], self.chosen.events[i]):
+                    member = tarfile.TarInfo(name)  # of no time and nobody
+                    member.size = len(content)
+                    tar.addfile(member, io.BytesIO(content))
+                written()
+
+    def contents(self, row: Row, event: Event) -> Iterator[tuple[str, bytes]]:
+        """The members of an event."""
+        key = f"{row['i']:06d}"
+        yield f"{key}.truth.npy", npy(event.truth.array)
+        for model in self.chosen.models:
+            yield f"{key}.{model}.npy", npy(self.chosen.images(event, model))
+        for n in self.chosen.radon_counts:
+            yield f"{key}.radon{n}.npy", npy(event.radon(n))
+        yield f"{key}.json", json.dumps(record(self.chosen, event)).encode()

@@ -1,0 +1,184 @@
+"""Writes an export into a folder: every file whole or not at all, and again where it stopped.
+
+``export.json`` says what was asked for, ``events.csv`` which event each number is. A folder that holds the same export is
+gone on with: files that are there stay, those of more events are added. Any other folder with something in it is refused.
+"""
+
+import csv
+import io
+import json
+import shutil
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from ...errors import InputError
+from ...files import ensure_folder, replacing
+from ...memory import readable_size
+from ...progress import Progress
+from ..folders import is_leftover
+from ..noise_choice import chosen_seed
+from .layout import Chosen, Layout, Part, Row
+
+REQUEST, TABLE = "export.json", "events.csv"
+_FORMAT = "mphDRR export"
+_MARK = len(".01234567-")
+"""Of files that are being written, what stands before their names."""
+
+
+@dataclass(frozen=True)
+class Plan:
+    """What an export will write; nothing is written yet."""
+
+    layout: Layout
+    folder: Path
+    rows: list[Row]
+    missing: list[Part]
+    """What is not there yet."""
+    request: dict[str, Any]
+    event_bytes: int
+
+    @property
+    def events(self) -> int:
+        """How many events are to be written."""
+        return sum(len(part.events) for part in self.missing)
+
+    @property
+    def size(self) -> int:
+        """Bytes of all that is to be written; of compressed files the most that it can be."""
+        return self.events * self.event_bytes
+
+    def says(self) -> str:
+        """How much there is to do, in a line."""
+        there = len(self.rows) - self.events
+        most = "at most " if self.layout.packed else ""
+        kept = f", {there} are there already" if there else ""
+        return (
+            f"{self.events} events of {most}{readable_size(self.event_bytes)}, {readable_size(self.size)} in all{kept}"
+        )
+
+    def write(self, progress: Progress | None = None) -> None:
+        """Write what is missing, and the tables; `progress` counts events."""
+        self._require_room()
+        for name in {str(Path(file).parent) for part in self.missing for file in part.files}:
+            ensure_folder(self.folder / name)
+        self._remove_leftovers()
+        self._remove_changed()
+        # First, so that whatever there is of an unfinished export is known to be of it.
+        _write(self.folder / REQUEST, json.dumps(self.request, indent=1).encode() + b"\n")
+        tables = {TABLE: table(self.rows), **self.layout.tables(self.rows)}
+        for name, content in tables.items():
+            _write(self.folder / name, content)
+        done = len(self.rows) - self.events
+
+        def written() -> None:
+            nonlocal done
+            done += 1
+            if progress is not None:
+                progress(done, len(self.rows))
+
+        for part in self.missing:
+            self.layout.write(part, self.rows, self.folder, written)
+
+    def _remove_leftovers(self) -> None:
+        """Remove what a killed export was writing: readers of whole folders would find it."""
+        known = {self.folder / file for part in self.layout.parts(self.rows) for file in part.files}
+        for path in (*self.folder.glob(".*"), *self.folder.glob("*/.*")):
+            if is_leftover(path.name) and (path.with_name(path.name[_MARK:]) in known or path.parent == self.folder):
+                path.unlink(missing_ok=True)
+
+    def _remove_changed(self) -> None:
+        """Of an earlier export of fewer events, remove the files that will have more in them."""
+        before = _rows_of(self.folder)
+        if before is not None and len(before) < len(self.rows):
+            for part in set(self.layout.parts(self.rows[: len(before)])) - set(self.layout.parts(self.rows)):
+                for file in part.files:
+                    (self.folder / file).unlink(missing_ok=True)
+
+    def _require_room(self) -> None:
+        free = shutil.disk_usage(self.folder).free
+        if not self.layout.packed and self.size > free:
+            raise InputError(
+                f"{self.folder}: the export needs {readable_size(self.size)}, but the disk has {readable_size(free)} left; "
+                "choose another folder, or one split of the set"
+            )
+
+
+def plan_export(layout: Layout, chosen: Chosen, folder: Path, program: str, options: dict[str, Any]) -> Plan:
+    """What is to be written into `folder`, which is made; `InputError` if it holds something else."""
+    rows = [
+        {
+            "i": i,
+            "event": row["event"],
+            "split": row["split"] or "all",
+            "name": row["phantom"],
+            "mirror": int(row["mirror"]),
+            "size": row["size"],
+            "noise_seed": "" if (seed := chosen_seed(row["noise_seed"], chosen.noise)) is None else seed,
+        }
+        for i, row in enumerate(chosen.events.index)
+    ]
+    request = {
+        "format": _FORMAT,
+        "version": 1,
+        "program": program,
+        "recipes": list(dict.fromkeys(event.recipe.fingerprint for event in chosen.events)),
+        "models": list(chosen.models),
+        "noise": chosen.noise,
+        "level": chosen.level,
+        "options": options,
+    }
+    folder = ensure_folder(folder)
+    before = _require_same(folder, request, rows)
+    kept = set(layout.parts(rows[:before]))
+    missing = [
+        part
+        for part in layout.parts(rows)
+        if part not in kept or not all((folder / file).is_file() for file in part.files)
+    ]
+    return Plan(layout, folder, rows, missing, request, layout.event_bytes)
+
+
+def _require_same(folder: Path, request: dict[str, Any], rows: list[Row]) -> int:
+    """How many events the same export had in the folder before; `InputError` if something else is in it."""
+    if all(is_leftover(path.name) for path in folder.iterdir()):
+        return 0
+    try:
+        asked = json.loads((folder / REQUEST).read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        asked = {}
+    if not isinstance(asked, dict) or asked.get("format") != _FORMAT:
+        raise InputError(f"{folder}: expected a new folder, an empty one, or one with an export to go on with")
+    changed = [name for name in request if asked.get(name) != request[name]]
+    if changed:
+        raise InputError(f"{folder}: holds an export of another {', '.join(changed)}; choose another folder")
+    before = _rows_of(folder)
+    if before is None:
+        return 0
+    same = [line.split(",") for line in table(rows).decode().splitlines()[1 : len(before) + 1]]
+    if same != before:
+        raise InputError(f"{folder}: holds an export of other events (see {TABLE}); choose another folder")
+    return len(before)
+
+
+def table(rows: list[Row]) -> bytes:
+    """The events as CSV."""
+    text = io.StringIO()
+    lines = csv.DictWriter(text, list(rows[0]), lineterminator="\n")
+    lines.writeheader()
+    lines.writerows(rows)
+    return text.getvalue().encode()
+
+
+def _rows_of(folder: Path) -> list[list[str]] | None:
+    """The fields of the lines of events.csv without its heading; None where there is none."""
+    try:
+        text = (folder / TABLE).read_text(encoding="utf-8")
+    except OSError:
+        return None
+    return list(csv.reader(io.StringIO(text)))[1:]
+
+
+def _write(path: Path, content: bytes) -> None:
+    with replacing(path) as temporary:
+        temporary.write_bytes(content)

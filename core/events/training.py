@@ -1,0 +1,140 @@
+"""Event sets for training with torch."""
+
+import os
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any, Literal
+
+from ..errors import InputError
+from ..validation import instance, one_of, positive, strict_whole
+from .event_set import EventSet
+from .exports.slots import read_slots, row_slots
+from .fields import Shapes, field_shapes
+from .noise_choice import require_counted
+
+if TYPE_CHECKING:
+    from torch.utils.data import Dataset
+
+_PLACES: Shapes = {"affine": (4, 4), "pose": (4, 4), "position": (3,), "euler_degrees": (3,)}
+"""Fields besides those of `field_shapes`."""
+_SLOTS = "/slots"
+
+Size = int | Sequence[int | None]
+Crop = Size | Mapping[str | tuple[str, ...], Size] | None
+
+
+def torch_dataset(
+    events: EventSet,
+    fields: Sequence[str] = ("truth",),
+    *,
+    crop: Crop = None,
+    crop_at: Literal["random", "center"] = "random",
+    noise: Literal["own", "epoch"] | None = None,
+    levels: float | Sequence[float] | None = None,
+    seed: int = 0,
+    slots: str | os.PathLike[str] | None = None,
+) -> "Dataset[dict[str, Any]]":
+    """The events as a torch `Dataset` of dicts of float32 tensors, for a `DataLoader` with any number of workers.
+
+    An item depends on the set, the event, the epoch and `seed` alone, not on workers or order. No file stays open, so
+    workers may fork or spawn.
+
+    Parameters
+    ----------
+    events : EventSet
+        For instance ``set.split("train")``.
+    fields
+        Which tensors an item has: "truth" (n_x, n_y, n_z), "affine" (4, 4) of its voxels, "pose" (4, 4), "position" (3,),
+        mm, "euler_degrees" (3,), "radon96" (96, n_v, n_u), the name of a model for its images (M, n_v, n_u), and
+        "NAME/slots" for these in the order of the users' layout (S, n_v, n_u). Besides, each item has its event's "number"
+        and, with noise, its "level".
+    crop
+        Size of a part of the truth, voxels: one number or three; or by fields, such as
+        ``{"truth": 64, ("counts/slots", "radon96"): (None, 128, 128)}``. Fields that are named together are cut at the same
+        place; along an axis of None nothing is cut. Where a part begins is in the item, as "truth_start"; "affine" is that
+        of the part.
+    crop_at
+        "random": in each epoch elsewhere. "center": in the middle.
+    noise
+        None: mean images. "own": the noise of each event's own seed. "epoch": another noise in each epoch
+        (``dataset.set_epoch(epoch)``).
+    levels
+        With noise, shares of the acquisition time, one or several; default: those of the recipe. One is drawn for each
+        event, with the noise of "epoch" for each epoch anew.
+    seed
+        Of random crops, levels and the noise of "epoch": a whole number of at least 0.
+    slots
+        A table of them (`read_slots`), for "NAME/slots", instead of a row of images and its mirrored ones.
+
+    Returns
+    -------
+    Dataset
+        Of torch, with ``set_epoch(epoch)``, which also reaches workers that a loader keeps (``persistent_workers=True``):
+        call it before each epoch.
+
+    Raises
+    ------
+    InputError
+        A field that the set does not have, a part larger than the field, or torch is missing.
+
+    Examples
+    --------
+    >>> dataset = events.torch_dataset(set.split("train"), ("counts", "truth"), noise="epoch", levels=(1.0, 0.25))
+    >>> loader = torch.utils.data.DataLoader(dataset, batch_size=4, shuffle=True, num_workers=2)
+    >>> for epoch in range(100):
+    ...     dataset.set_epoch(epoch)
+    ...     for batch in loader:
+    ...         batch["counts"], batch["truth"]  # (4, 80, 256, 256), (4, 256, 256, 256)
+    """
+    try:
+        from .torch_events import TorchEvents
+    except ImportError:
+        raise InputError("torch_dataset: torch is missing: pip install torch") from None
+
+    instance(events, EventSet, "torch_dataset")
+    arrays = field_shapes(events)
+    one_of(crop_at, ("random", "center"), "crop_at")
+    one_of(noise, (None, "own", "epoch"), "noise")
+    if isinstance(seed, bool) or not isinstance(seed, int) or seed < 0:
+        raise InputError(f"seed: expected a whole number of at least 0, got {seed!r}")
+    if levels is None:
+        levels = (1.0,) if noise is None else events.recipe.levels
+    elif noise is None:
+        raise InputError("levels: they are of the noise; choose noise as well, or leave them out")
+    chosen_levels = [positive(level, "levels") for level in (levels if isinstance(levels, Sequence) else (levels,))]
+    if not chosen_levels:
+        raise InputError("levels: expected one or more, got none")
+    known, chosen_slots = arrays | _PLACES, None
+    models = tuple(events.recipe.models)
+    names = (fields,) if isinstance(fields, str) else tuple(dict.fromkeys(fields))
+    if any(name.endswith(_SLOTS) for name in names):
+        chosen_slots = row_slots(events.system) if slots is None else read_slots(slots, events.system)
+        known |= {f"{model}{_SLOTS}": (len(chosen_slots), *known[model][1:]) for model in models}
+    for name in names:
+        one_of(name, known if chosen_slots else [*known, *(f"{model}{_SLOTS}" for model in models)], "field")
+    if noise is not None:
+        require_counted(events, [name for name in models if name in names or f"{name}{_SLOTS}" in names])
+    shapes = {name: known[name] for name in names}
+    crops = _crops(crop, shapes)
+    return TorchEvents(events, names, crops, crop_at == "random", noise, chosen_levels, seed, chosen_slots)
+
+
+def _crops(crop: Crop, shapes: Mapping[str, tuple[int, ...]]) -> dict[tuple[str, ...], tuple[int | None, ...]]:
+    """The sizes of parts by the fields that they are cut from together."""
+    if crop is None:
+        return {}
+    found: dict[tuple[str, ...], tuple[int | None, ...]] = {}
+    for key, size in (crop if isinstance(crop, Mapping) else {"truth": crop}).items():
+        names = (key,) if isinstance(key, str) else tuple(key)
+        for name in names:
+            if name not in shapes or len(shapes[name]) != 3 or any(name in others for others in found):
+                raise InputError(f"crop: {name!r}: expected one of the fields of three axes that are read, each once")
+            if shapes[name] != shapes[names[0]]:
+                raise InputError(f"crop: {', '.join(names)}: expected fields of one shape")
+        sizes = (size,) * 3 if isinstance(size, int) else tuple(size)
+        if len(sizes) != 3:
+            raise InputError(f"crop: {', '.join(names)}: expected one number or three, got {size}")
+        for n, length in zip(sizes, shapes[names[0]], strict=True):
+            if n is not None and strict_whole(n, "crop", "whole numbers of at least 1, or None") > length:
+                raise InputError(f"crop: {', '.join(names)}: a part of {n} along an axis of {length}")
+        found[names] = sizes
+    return found

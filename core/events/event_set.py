@@ -17,7 +17,7 @@ from ..geometry.grid import Grid
 from ..geometry.system import PinholeSystem
 from ..geometry.views import Views
 from ..physics.noise import sample_counts
-from ..runs.recipe import recorded_recipe
+from ..runs.recipe import Recipe, recorded_recipe
 from ..runs.run import ProjectionRun
 from ..runs.run_recipe import recipe_model, recipe_views, with_phantom
 from ..validation import freeze, positive
@@ -218,21 +218,38 @@ class Event:
         return radon_views(self._source.recipe, count)
 
     def run(self, model: str, noise_seed: int | None = None) -> ProjectionRun:
-        """The images of a model as a projection run, with truth, scanner and recipe: to show, write or reconstruct."""
-        planned, models = self.planned, self._source.recipe.models
+        """The images of a model as a projection run, with truth, scanner and recipe: to show, write or reconstruct.
+
+        The recipe is left out where what attenuates is a phantom that no recipe of projections describes: with a factor of
+        its activity, the mean of several gates, or a volume.
+        """
+        models = self._source.recipe.models
         if model not in models:
             raise InputError(f"{model!r}: no such model; there are {', '.join(models) or 'none'}")
-        recipe = models[model]
-        background = recipe_model(recipe, self.system).background
-        record = recorded_recipe(recipe)
-        if planned.phantom is not None:
-            record = with_phantom(record, planned.phantom, planned.placement)
-        unit = self.unit(model)
-        settings = {"model": model, "event": self.number, "volume": self.name, "recipe": record.tables()}
+        settings: dict[str, Any] = {"model": model, "event": self.number, "volume": self.name}
+        record = self._record(models[model])
+        if record is not None:
+            settings["recipe"] = record.tables()
+        background, unit = recipe_model(models[model], self.system).background, self.unit(model)
         return ProjectionRun(
             self.images(model, noise_seed), self.system, self.views, self.truth, unit=unit, settings=settings,
             seed=noise_seed, background=background,
         )  # fmt: skip
+
+    def _record(self, model: Recipe) -> Recipe | None:
+        """The recipe of a run of a model's images; None where none can say what attenuates."""
+        planned, recipe = self.planned, self._source.recipe
+        files = {key: model[key] for key in ("system.file", "system.columns", "attenuation.file")}
+        changes: dict[str, Any] = {key: str(recipe.input(name).path) for key, name in files.items() if name is not None}
+        if "attenuation.file" in changes:
+            changes |= {"attenuation.energy": None}  # the set's copy holds mu
+        record = recorded_recipe(model.updated(changes))
+        if planned.phantom is not None and planned.entry.gates == 1 and planned.activity_factor == 1:
+            own: dict[str, Any] = {"phantom.voxels": recipe.grid.shape, "phantom.spacing": recipe.grid.spacing.tolist()}
+            if planned.file is not None:
+                own["phantom.file"] = str(recipe.input(planned.file).path)
+            return with_phantom(record.updated(own), planned.phantom, planned.placement)
+        return None if model["attenuation.of_phantom"] else record
 
     def __repr__(self) -> str:
         return f"Event({self.number}, {self.path})"

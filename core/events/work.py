@@ -10,6 +10,7 @@ from pathlib import Path
 from ..errors import InputError, InputWarning
 from ..progress import Progress
 from ..validation import whole_number
+from .dask_work import in_cluster
 from .event_set import EventSet
 from .folders import SetFolder
 from .planning import plan
@@ -38,6 +39,7 @@ def making(
     workers: int = 1,
     shard: tuple[int, int] = (1, 1),
     progress: Progress | None = None,
+    dask: str | None = None,
 ) -> Iterator[Made]:
     """Make the events of a set that are missing, one by one, as `make` does.
 
@@ -49,6 +51,9 @@ def making(
         ``(i, n)``: only part i, from 1, of n equal ones; several machines may work on one folder so.
     progress
         Called as ``progress(steps done, steps)`` within an event, with one worker; may raise `Cancelled`.
+    dask
+        Address of a Dask scheduler, whose workers make the events and see `folder` under the same path; ``"local"``: as many
+        workers as `workers` on this machine.
 
     Yields
     ------
@@ -61,6 +66,8 @@ def making(
         As of `make`.
     """
     target, missing = prepare(recipe, folder, count, first, shard)
+    if dask is not None and missing:
+        return followed(target, in_cluster(target, missing, dask, whole_number(workers, "workers")), len(missing))
     return _made(target, missing, workers, progress)
 
 

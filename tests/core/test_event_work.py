@@ -61,6 +61,36 @@ def test_workers_and_shards_make_the_same_bytes(tmp_path, undisturbed):
     assert tree(tmp_path / "shards") == undisturbed
 
 
+@pytest.mark.long
+def test_dask_makes_the_same_bytes_though_a_worker_dies(tmp_path, undisturbed):
+    pytest.importorskip("distributed")
+    small_recipe(tmp_path)
+    work = begin(tmp_path, "--workers", "2", "--dask", "local")
+    killed = 0
+    while work.poll() is None:
+        children = psutil.Process(work.pid).children(recursive=True)
+        workers = [child for child in children if not killed and "spawn_main" in " ".join(child.cmdline())]
+        if workers and list(tmp_path.glob("set/events/*.h5")):
+            workers[0].kill()
+            killed += 1
+        time.sleep(0.01)
+    assert work.returncode == 0, work.communicate()
+    assert killed == 1
+    assert tree(tmp_path / "set") == undisturbed
+
+
+def test_a_cluster_that_does_not_answer_is_one_line(tmp_path, capsys, monkeypatch):
+    small_recipe(tmp_path)
+    command = ["events", "make", str(tmp_path / "set"), "--recipe", str(tmp_path / "small.toml"), "-n", "2", "--quiet"]
+    pytest.importorskip("distributed")
+    monkeypatch.setattr("mphdrr.core.events.dask_work._ANSWER_SECONDS", 1)
+    assert main([*command, "--dask", "tcp://127.0.0.1:1"]) == 1
+    assert "mphdrr: --dask tcp://127.0.0.1:1: no scheduler answers there" in capsys.readouterr().err
+    monkeypatch.setitem(sys.modules, "distributed", None)
+    assert main([*command, "--dask", "local"]) == 1
+    assert 'Dask, which is missing: pip install "mphdrr[dask]"' in capsys.readouterr().err
+
+
 def test_parts_of_a_set_are_the_whole(tmp_path, undisturbed):
     recipe = small_recipe(tmp_path)
     events.make(recipe, tmp_path / "set", 2, first=4)

@@ -36,6 +36,8 @@ def add_parser(actions) -> None:  # type: ignore[no-untyped-def]
     )
     text = "only part I of N, for several machines that work on one folder"
     parser.add_argument("--shard", type=_shard, default=(1, 1), metavar="I/N", help=text)
+    text = "let the workers of a Dask cluster make them, which see SET under the same path; local: --workers of this machine"
+    parser.add_argument("--dask", metavar="ADDRESS|local", help=text)
     parser.add_argument("--quiet", action="store_true", help="say nothing on standard error but warnings")
     parser.set_defaults(run=_run)
 
@@ -51,7 +53,15 @@ def chosen_recipe(folder: str, recipe: str | None) -> EventRecipe:
 
 def _run(arguments: argparse.Namespace) -> None:
     recipe = chosen_recipe(arguments.folder, arguments.recipe)
-    work = making(recipe, arguments.folder, arguments.count, arguments.first, arguments.workers, arguments.shard)
+    work = making(
+        recipe,
+        arguments.folder,
+        arguments.count,
+        arguments.first,
+        arguments.workers,
+        arguments.shard,
+        dask=arguments.dask,
+    )
     done = watched(work, SetFolder(arguments.folder), arguments.quiet)
     folder = SetFolder(arguments.folder)
     there = len(folder.numbers())

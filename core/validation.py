@@ -112,7 +112,8 @@ def positive(value: Any, name: str, unit: str = "") -> float:
 
 def one_for_all(value: ArrayLike, name: str, n: int) -> NDArray[np.float64]:
     """`value` as `n` numbers, where one number stands for all, or `InputError`."""
-    return real_array(np.broadcast_to(value, n) if np.ndim(value) == 0 else value, name, (n,))
+    is_one = not isinstance(value, list | tuple) and np.ndim(value) == 0
+    return real_array(np.broadcast_to(value, n) if is_one else value, name, (n,))
 
 
 def lengths(value: ArrayLike, name: str, n: int) -> NDArray[np.float64]:

@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 
 from ..errors import InputError
+from ..validation import real_array
 
 _NORMAL = statistics.NormalDist()
 
@@ -88,6 +89,16 @@ def check_draw(value: Any, name: str, whole: bool = False) -> None:
             raise InputError(f"{name}: expected {kind} after from and to, got {number!r}")
     if low > high:
         raise InputError(f"{name}: expected from {low:g} to no less, got {high:g}")
+
+
+def check_number(value: Any, name: str) -> None:
+    """Raise `InputError` unless `value` is a number or a draw of numbers."""
+    check_draw(value, name)
+    if isinstance(value, Mapping):
+        for option in value.get("one_of", ()):
+            check_number(option, name)
+    else:
+        real_array(value, name, ())
 
 
 def _check_choice(value: Mapping[str, Any], name: str, whole: bool) -> None:

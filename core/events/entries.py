@@ -12,7 +12,7 @@ from ..phantoms.settings import setting_names
 from ..phantoms.torso import CardiacTorso
 from ..physics.isotopes import photon_energy
 from ..validation import one_of, real_array, whole_number
-from .draws import check_draw, options
+from .draws import check_draw, check_number, options
 
 _OWN = ("name", "odds", "split", "pose")
 _OF_FILE = ("file", "mu_file", "center", "energy")
@@ -162,8 +162,7 @@ def _placed(values: dict[str, Any]) -> dict[str, Any]:
             if not isinstance(option, list) or len(option) != 3:
                 raise InputError(f"pose.{key}: expected three numbers or draws, got {option!r}")
             for value in option:
-                if not isinstance(value, dict):
-                    real_array(value, f"pose.{key}", ())
+                check_number(value, f"pose.{key}")
         found[key] = pose[key]
     if "turn" in pose:
         one_of(pose["turn"], ("uniform",), "pose.turn")

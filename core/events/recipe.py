@@ -17,7 +17,7 @@ from ..geometry.grid import Grid
 from ..runs.recipe import Recipe
 from ..toml import parse_toml
 from ..validation import lengths, one_of, real_array, whole_number, whole_shape
-from .draws import check_draw, check_odds, options
+from .draws import check_number, check_odds, options
 from .entries import PhantomEntry, phantom_entry, plain_name, seed_of, share, table, unknown
 from .inputs import Input, original_input
 
@@ -222,7 +222,7 @@ class EventRecipe:
         values = table(self.values, "augmentation")
         unknown(values, ("mirror", "size", "activity", "module_gain"), "augmentation.")
         for name in ("size", "activity"):
-            check_draw(values.get(name, 1.0), f"augmentation.{name}")
+            check_number(values.get(name, 1.0), f"augmentation.{name}")
         if "activity" in values and self.quantity != "activity":
             raise InputError(f"augmentation.activity: the truth is {self.quantity}")
         gain = float(real_array(values.get("module_gain", 0.0), "augmentation.module_gain", ()))

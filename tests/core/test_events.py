@@ -291,6 +291,7 @@ def test_volumes_are_placed_like_phantoms(tmp_path):
     assert [made.number for made in again] == [1]
 
 
+@pytest.mark.long
 def test_a_beating_torso_is_the_mean_of_its_gates(tmp_path):
     start, end = TEXT.index("[[phantoms]]"), TEXT.index("[models.lines]")
     entry = '[[phantoms]]\nkind = "torso"\ngates = 2\ndefect_severity = 0.5\n\n'
